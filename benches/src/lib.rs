@@ -1,0 +1,2 @@
+//! Benchmarks with conditions and competitors.
+#![forbid(unsafe_code)]

@@ -1,0 +1,2 @@
+//! Closed-loop cell positioner for a PZT-driven PDMS microchannel.
+#![forbid(unsafe_code)]

@@ -1,0 +1,4 @@
+//! The `cellpos` program.
+#![forbid(unsafe_code)]
+
+fn main() {}

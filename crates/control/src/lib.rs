@@ -1,0 +1,2 @@
+//! Controllers, estimators, references, output limits and loop design.
+#![forbid(unsafe_code)]

@@ -1,0 +1,2 @@
+//! Excitation, frequency response, delay, and model fit with confidence intervals.
+#![forbid(unsafe_code)]

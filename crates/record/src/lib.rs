@@ -1,0 +1,2 @@
+//! Run folders: append-only columns while running, read back, export.
+#![forbid(unsafe_code)]

@@ -1,0 +1,2 @@
+//! Self-contained HTML reports with SVG plots.
+#![forbid(unsafe_code)]

@@ -1,0 +1,6 @@
+//! The 1 kHz loop: threads, rings, pacing, deadline account, safe states.
+#![forbid(unsafe_code)]
+
+mod tick_record;
+
+pub use tick_record::{CONTROLLER_STATE_LEN, TickFlags, TickRecord};

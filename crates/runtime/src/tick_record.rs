@@ -1,0 +1,96 @@
+//! The plain record that each tick of the loop hands to the recorder ring.
+
+/// Numbers of controller and estimator state kept in each record, so that a replay can resume after a gap.
+pub const CONTROLLER_STATE_LEN: usize = 16;
+
+/// What happened in a tick, as bits.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct TickFlags(pub u32);
+
+impl TickFlags {
+    /// The tick was started by the timer: no frame arrived.
+    pub const TIMER: u32 = 1 << 0;
+    /// The command was handed over later than the tick's budget.
+    pub const LATE: u32 = 1 << 1;
+    /// The newest measurement was older than allowed, or repeated a frame already seen.
+    pub const STALE: u32 = 1 << 2;
+    /// At least one frame id is missing before this one.
+    pub const DROPPED_FRAME: u32 = 1 << 3;
+    /// A frame id came twice.
+    pub const DOUBLED_FRAME: u32 = 1 << 4;
+    /// The frame has no valid bead position.
+    pub const LOST: u32 = 1 << 5;
+    /// The estimator ran on prediction alone.
+    pub const COASTING: u32 = 1 << 6;
+    /// The command was clipped to the range.
+    pub const RANGE_LIMITED: u32 = 1 << 7;
+    /// The command was clipped to the slew limit.
+    pub const SLEW_LIMITED: u32 = 1 << 8;
+    /// The controller's output was not finite and was replaced.
+    pub const NOT_FINITE: u32 = 1 << 9;
+    /// A measurement was refused because it was too far from the prediction.
+    pub const GATED: u32 = 1 << 10;
+    /// The actuator ring was full: the command was not handed over.
+    pub const ACTUATOR_RING_FULL: u32 = 1 << 11;
+    /// The bead is frozen: the PZT is held at, or moving to, the estimate of neutral.
+    pub const FREEZE: u32 = 1 << 12;
+    /// Records were lost before this one because the recorder ring was full.
+    pub const RECORDS_LOST: u32 = 1 << 13;
+
+    /// Whether all bits of `mask` are set.
+    pub fn has(self, mask: u32) -> bool {
+        self.0 & mask == mask
+    }
+
+    /// Sets the bits of `mask`.
+    pub fn set(&mut self, mask: u32) {
+        self.0 |= mask;
+    }
+}
+
+/// Everything about one tick, in a fixed size. Times are nanoseconds since the start of the run.
+///
+/// A number that does not exist (no bead in the frame, no truth on a real rig) is NaN.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct TickRecord {
+    /// Sequence number; runs on when records are lost, so that a gap shows.
+    pub seq: u64,
+    /// Start of the tick.
+    pub time_ns: i64,
+    /// Unwrapped id of the frame used, or of the last one seen on a timer tick.
+    pub frame_id: u64,
+    /// Mid-exposure time of that frame.
+    pub mid_exposure_ns: i64,
+    /// Measured bead position, um.
+    pub measured_um: f64,
+    /// Variance of the measured position, um^2.
+    pub variance_um2: f64,
+    /// Verdict of vision ([`cellpos_vision::Verdict`] as a number; 255: no frame).
+    pub verdict: u8,
+    /// Reference, um.
+    pub target_um: f64,
+    /// Estimated bead position at the tick, um.
+    pub estimate_um: f64,
+    /// Estimated PZT displacement at which the bead is at rest, um.
+    pub neutral_um: f64,
+    /// Output of the controller before the limits, um.
+    pub requested_um: f64,
+    /// Commanded PZT displacement, um.
+    pub command_um: f64,
+    /// PZT displacement last reported by the board, um.
+    pub applied_um: f64,
+    /// True bead position at the tick, um (emulated rig only).
+    pub true_um: f64,
+    /// Life-cycle state (number of the runtime's state).
+    pub life: u8,
+    /// What happened.
+    pub flags: TickFlags,
+    /// Measurements found in the ring at this tick (one is used, the rest counted).
+    pub drained: u8,
+    /// From the due time to the start of the tick, ns; 0 on the virtual clock.
+    pub wake_ns: u32,
+    /// From the start of the tick to the hand-over of the command, ns; 0 on the virtual clock.
+    pub compute_ns: u32,
+    /// State of estimator and controller after the tick.
+    pub controller_state: [f64; CONTROLLER_STATE_LEN],
+}

@@ -1,0 +1,2 @@
+//! Setpoint scripts.
+#![forbid(unsafe_code)]

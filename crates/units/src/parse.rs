@@ -1,0 +1,265 @@
+//! The one parser behind every quantity.
+
+use crate::Quantity;
+use core::fmt;
+
+/// What is wrong with a text that should have been a quantity.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Problem {
+    /// Nothing was written.
+    Empty,
+    /// No number at the start.
+    NotANumber,
+    /// The number is infinite, not a number, or overflows.
+    NotFinite,
+    /// A number without a unit.
+    NoUnit,
+    /// A unit that does not belong to this quantity.
+    WrongUnit,
+}
+
+/// A text that is not the quantity asked for; its message says what to write instead.
+///
+/// Holds the first characters of the text (at most 23 bytes), so that the message can repeat the number.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct UnitError {
+    /// What is wrong.
+    pub problem: Problem,
+    noun: &'static str,
+    base: &'static str,
+    symbols: &'static str,
+    number: Excerpt,
+    unit: Excerpt,
+}
+
+const EXCERPT: usize = 23;
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+struct Excerpt {
+    bytes: [u8; EXCERPT],
+    len: u8,
+}
+
+impl Excerpt {
+    fn new(text: &str) -> Self {
+        let mut len = text.len().min(EXCERPT);
+        while !text.is_char_boundary(len) {
+            len -= 1;
+        }
+        let mut bytes = [0; EXCERPT];
+        bytes[..len].copy_from_slice(&text.as_bytes()[..len]);
+        Self {
+            bytes,
+            len: len as u8,
+        }
+    }
+
+    fn text(&self) -> &str {
+        core::str::from_utf8(&self.bytes[..usize::from(self.len)]).unwrap_or("")
+    }
+}
+
+impl fmt::Display for UnitError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let (noun, base, symbols) = (self.noun, self.base, self.symbols);
+        let (number, unit) = (self.number.text(), self.unit.text());
+        match self.problem {
+            Problem::Empty => write!(
+                f,
+                "{noun} is missing: write for example 1{base} ({symbols})"
+            ),
+            Problem::NotANumber => write!(
+                f,
+                "`{number}{unit}` is not {noun}: write a number and a unit, for example 1{base} ({symbols})"
+            ),
+            Problem::NotFinite => write!(
+                f,
+                "{noun} must be finite: write a number and a unit, for example 1{base} ({symbols})"
+            ),
+            Problem::NoUnit => write!(
+                f,
+                "{noun} needs a unit: write for example {number}{base} ({symbols})"
+            ),
+            Problem::WrongUnit => write!(
+                f,
+                "`{unit}` is not a unit of {noun}: write for example {number}{base} ({symbols})"
+            ),
+        }
+    }
+}
+
+impl core::error::Error for UnitError {}
+
+/// Length in bytes of the longest prefix that reads as a decimal number: sign, digits, point, exponent.
+fn number_prefix(text: &str) -> usize {
+    let bytes = text.as_bytes();
+    let mut at = 0;
+    if matches!(bytes.first(), Some(b'+' | b'-')) {
+        at = 1;
+    }
+    let digits = |from: usize| {
+        bytes[from..]
+            .iter()
+            .take_while(|b| b.is_ascii_digit())
+            .count()
+    };
+    let whole = digits(at);
+    at += whole;
+    let mut fraction = 0;
+    if bytes.get(at) == Some(&b'.') {
+        fraction = digits(at + 1);
+        at += 1 + fraction;
+    }
+    if whole + fraction == 0 {
+        return 0;
+    }
+    if matches!(bytes.get(at), Some(b'e' | b'E')) {
+        let mut after = at + 1;
+        if matches!(bytes.get(after), Some(b'+' | b'-')) {
+            after += 1;
+        }
+        let exponent = digits(after);
+        if exponent > 0 {
+            at = after + exponent;
+        }
+    }
+    at
+}
+
+pub(crate) fn parse(text: &str, quantity: &Quantity) -> Result<f64, UnitError> {
+    let text = text.trim();
+    let (number, unit) = text.split_at(number_prefix(text));
+    let unit = unit.trim_start();
+    let fail = |problem| UnitError {
+        problem,
+        noun: quantity.noun,
+        base: quantity.base,
+        symbols: quantity.symbols,
+        number: Excerpt::new(number),
+        unit: Excerpt::new(unit),
+    };
+    if text.is_empty() {
+        return Err(fail(Problem::Empty));
+    }
+    let lower_is = |word: &str| {
+        unit.trim_start_matches(['+', '-'])
+            .eq_ignore_ascii_case(word)
+    };
+    if number.is_empty() && (lower_is("nan") || lower_is("inf") || lower_is("infinity")) {
+        return Err(fail(Problem::NotFinite));
+    }
+    let value: f64 = number.parse().map_err(|_| fail(Problem::NotANumber))?;
+    if unit.is_empty() {
+        return Err(fail(Problem::NoUnit));
+    }
+    let factor = quantity
+        .units
+        .iter()
+        .find(|candidate| candidate.symbol == unit)
+        .ok_or_else(|| fail(Problem::WrongUnit))?
+        .factor;
+    // Dividing by a power of ten rounds once where multiplying by its inverse rounds twice: 250nm is 0.25um exactly.
+    let value = if factor < 1.0 {
+        value / rounded_reciprocal(factor)
+    } else {
+        value * factor
+    };
+    if value.is_finite() {
+        Ok(value)
+    } else {
+        Err(fail(Problem::NotFinite))
+    }
+}
+
+/// The whole number nearest to `1 / factor` for the sub-unit factors of this crate (all are 10^-n).
+fn rounded_reciprocal(factor: f64) -> f64 {
+    (1.0 / factor + 0.5) as u64 as f64
+}
+
+#[cfg(test)]
+mod tests {
+    use crate::{Degrees, Hertz, Micrometers, MicrometersPerSecond, Problem, Seconds, Volts};
+    use std::format;
+    use std::string::ToString;
+
+    #[test]
+    fn every_unit_of_the_issue_is_read_exactly() {
+        assert_eq!("0um".parse(), Ok(Micrometers(0.0)));
+        assert_eq!("-250nm".parse(), Ok(Micrometers(-0.25)));
+        assert_eq!("1.5ms".parse(), Ok(Seconds(0.0015)));
+        assert_eq!("40V".parse(), Ok(Volts(40.0)));
+        assert_eq!("2Hz".parse(), Ok(Hertz(2.0)));
+        assert_eq!("1.5 kHz".parse(), Ok(Hertz(1500.0)));
+        assert_eq!(" +3e-1 µm ".parse(), Ok(Micrometers(0.3)));
+        assert_eq!(".5um".parse(), Ok(Micrometers(0.5)));
+        assert_eq!("2um/ms".parse(), Ok(MicrometersPerSecond(2000.0)));
+        assert_eq!("90deg".parse(), Ok(Degrees(90.0)));
+        assert_eq!("10min".parse(), Ok(Seconds(600.0)));
+    }
+
+    #[test]
+    fn a_bare_number_is_refused_and_the_message_says_what_to_write() {
+        let error = "5".parse::<Micrometers>().unwrap_err();
+        assert_eq!(error.problem, Problem::NoUnit);
+        assert!(error.to_string().contains("5um"), "{error}");
+    }
+
+    #[test]
+    fn a_wrong_unit_names_itself_and_the_right_ones() {
+        let error = "5V".parse::<Micrometers>().unwrap_err();
+        assert_eq!(error.problem, Problem::WrongUnit);
+        assert_eq!(
+            error.to_string(),
+            "`V` is not a unit of a length: write for example 5um (nm, um, mm, m)"
+        );
+        assert!(
+            "5UM".parse::<Micrometers>().is_err(),
+            "units are case-sensitive: MHz is not mHz"
+        );
+    }
+
+    #[test]
+    fn nan_infinity_overflow_and_nonsense_are_refused() {
+        for (text, problem) in [
+            ("", Problem::Empty),
+            ("NaNum", Problem::NotANumber),
+            ("nan", Problem::NotFinite),
+            ("-inf", Problem::NotFinite),
+            ("1e999um", Problem::NotFinite),
+            ("um", Problem::NotANumber),
+            ("--1um", Problem::NotANumber),
+            ("1.2.3um", Problem::WrongUnit),
+            ("1e", Problem::WrongUnit),
+        ] {
+            assert_eq!(
+                text.parse::<Micrometers>().unwrap_err().problem,
+                problem,
+                "{text:?}"
+            );
+        }
+    }
+
+    #[test]
+    fn display_reads_back_to_the_same_value() {
+        let mut state = 1u64;
+        for _ in 0..10_000 {
+            state = state
+                .wrapping_mul(6_364_136_223_846_793_005)
+                .wrapping_add(1);
+            let value = ((state >> 11) as f64 / (1u64 << 53) as f64 - 0.5) * 1e6;
+            assert_eq!(
+                format!("{}", Micrometers(value)).parse(),
+                Ok(Micrometers(value))
+            );
+        }
+        assert_eq!(format!("{:.2}", Seconds(1.0 / 3.0)), "0.33s");
+    }
+
+    #[test]
+    fn a_long_text_in_an_error_is_cut_at_a_character() {
+        let error = "1µµµµµµµµµµµµµµµµµµµµµµµ"
+            .parse::<Micrometers>()
+            .unwrap_err();
+        assert!(error.to_string().starts_with("`µ"));
+    }
+}

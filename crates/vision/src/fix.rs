@@ -1,0 +1,42 @@
+//! The result of localising a bead in one frame.
+
+/// Whether a fix can be used, and if not, why.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[repr(u8)]
+pub enum Verdict {
+    /// The position and its covariance are valid.
+    Good = 0,
+    /// Nothing stands out of the background by the required signal-to-noise ratio.
+    NoSignal = 1,
+    /// Something is there, but it does not look like the template (another object, two beads merged, out of focus).
+    BadFit = 2,
+    /// The bead is cut by the border of the frame.
+    AtBorder = 3,
+    /// The fit did not converge.
+    NotConverged = 4,
+}
+
+/// Position of a bead in one frame, in pixels, with its covariance and the figures behind the verdict.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Fix {
+    /// Position along the row, px.
+    pub x_px: f64,
+    /// Position along the column, px.
+    pub y_px: f64,
+    /// Variance of `x_px`, px^2, from the Fisher information of the template.
+    pub var_x_px2: f64,
+    /// Variance of `y_px`, px^2.
+    pub var_y_px2: f64,
+    /// Covariance of `x_px` and `y_px`, px^2.
+    pub cov_xy_px2: f64,
+    /// Peak contrast of the fitted template, grey levels.
+    pub amplitude: f64,
+    /// Fitted background, grey levels.
+    pub background: f64,
+    /// Residual sum of squares over what the noise predicts (chi^2 per degree of freedom): about 1 for a true bead.
+    pub residual_ratio: f64,
+    /// Peak contrast over the noise of one pixel.
+    pub snr: f64,
+    /// Whether the fix can be used.
+    pub verdict: Verdict,
+}

@@ -1,0 +1,2 @@
+//! The PZT board's firmware as a library, and a whole rig in a box as a program.
+#![forbid(unsafe_code)]
