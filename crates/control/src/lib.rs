@@ -1,2 +1,30 @@
 //! Controllers, estimators, references, output limits and loop design.
+//!
+//! Everything here is a pure step function: configuration is immutable and kept apart from a `Copy` state, no device
+//! and no clock is known, and a step neither allocates nor can panic. The same [`ControlLoop`] runs on the real clock,
+//! on the virtual one, in a replay and in [`design`]'s simulations.
+//!
+//! Units: micrometres, seconds and 1/s throughout. A displacement is of the PZT unless the name says `bead`.
+//!
+//! Sampling convention: at tick `k` a command `u_k` takes effect and is held until tick `k + 1`; the position `p_k` is
+//! that just before `u_k` takes effect. The measurement that arrives at tick `k` is of the position `delay` earlier.
 #![forbid(unsafe_code)]
+
+mod control_loop;
+mod error;
+mod estimator;
+mod limits;
+mod loop_model;
+mod pi;
+mod state;
+
+pub use control_loop::{
+    ControlLoop, Controller, ControllerConfig, LoopConfig, LoopFlags, LoopInput, LoopOutput,
+    Measurement, Mode, SolverReport, SolverStatus,
+};
+pub use error::{BuildError, Parameter};
+pub use estimator::{Estimator, EstimatorConfig, EstimatorState};
+pub use limits::{Limited, Limits};
+pub use loop_model::{LoopMode, LoopModel};
+pub use pi::{Lead, Pi, PiState};
+pub use state::{LoopState, STATE_LEN};

@@ -1,0 +1,376 @@
+//! One tick of the loop: estimate, controller, limits.
+
+use crate::error::BuildError;
+use crate::estimator::{Estimate, Estimator, EstimatorConfig, Fix};
+use crate::limits::Limits;
+use crate::loop_model::LoopModel;
+use crate::pi::{Pi, PiState, PiStep};
+use crate::state::{LoopState, STATE_LEN};
+
+/// A bead position from vision.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Measurement {
+    /// Position along the channel, um.
+    pub position_um: f64,
+    /// Variance of the position, um^2; 0 where vision states none.
+    pub variance_um2: f64,
+    /// Whole ticks by which the frame is older than the nominal delay (0: on time).
+    pub age_samples: u16,
+}
+
+/// What the loop is to do.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Mode {
+    /// Control the bead.
+    #[default]
+    Run,
+    /// Stop the bead: slew to the running estimate of neutral.
+    Freeze,
+    /// Make the hardware safe: slew to the park displacement. The bead is lost.
+    Park,
+}
+
+/// What a tick is given.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct LoopInput<'a> {
+    /// The newest bead position, if there is one.
+    pub measurement: Option<Measurement>,
+    /// Reference of this tick, um of bead.
+    pub reference_um: f64,
+    /// References of the coming ticks, the next one first; may be empty.
+    pub preview_um: &'a [f64],
+    /// What to do.
+    pub mode: Mode,
+    /// When an optimising controller must be done; `None` (always on the virtual clock) sets no deadline.
+    pub deadline: Option<std::time::Instant>,
+}
+
+/// What happened in a tick.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct LoopFlags {
+    /// The request was outside the range.
+    pub range_limited: bool,
+    /// The request was further away than one tick's slew.
+    pub slew_limited: bool,
+    /// The request, the reference or the measurement was not a finite number.
+    pub not_finite: bool,
+    /// No measurement was used: the estimate is a prediction.
+    pub coasting: bool,
+    /// The measurement was refused by the innovation gate.
+    pub gated: bool,
+    /// The bead does not follow the PZT and is taken for stuck.
+    pub stuck: bool,
+}
+
+/// How the optimiser of a tick ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[repr(u8)]
+pub enum SolverStatus {
+    /// The controller does not optimise.
+    #[default]
+    NotUsed = 0,
+    /// Solved.
+    Solved = 1,
+    /// Out of time or iterations: the shifted previous plan was used.
+    PreviousPlan = 2,
+    /// No plan was left: PI was used.
+    FallbackPi = 3,
+}
+
+/// Account of the optimiser of a tick.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct SolverReport {
+    /// How it ended.
+    pub status: SolverStatus,
+    /// Iterations.
+    pub iterations: u16,
+    /// Constraints active at the solution.
+    pub active: u16,
+}
+
+/// What a tick gives.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct LoopOutput {
+    /// The command: finite, within range, within slew of the previous one, um.
+    pub command_um: f64,
+    /// The controller's wish before the limits, um.
+    pub requested_um: f64,
+    /// Bead position now (just before the command takes effect), um.
+    pub estimate_um: f64,
+    /// Predicted (or, with a measurement, filtered) position at the nominal time of this tick's measurement, um.
+    pub predicted_measurement_um: f64,
+    /// PZT displacement at which the bead rests, um.
+    pub neutral_um: f64,
+    /// Measurement less its prediction, um; 0 without measurement.
+    pub innovation_um: f64,
+    /// What happened.
+    pub flags: LoopFlags,
+    /// The optimiser's account.
+    pub solver: SolverReport,
+}
+
+/// Which control law.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum ControllerConfig {
+    /// PI, with or without lead.
+    Pi(Pi),
+}
+
+/// Everything that a loop is built from.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct LoopConfig {
+    /// The plant.
+    pub model: LoopModel,
+    /// Estimator.
+    pub estimator: EstimatorConfig,
+    /// Control law.
+    pub controller: ControllerConfig,
+    /// Limits of the command.
+    pub limits: Limits,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Law {
+    Pi(PiStep),
+}
+
+/// A loop without workspace: estimator, controller and limits. Immutable; the state is apart and `Copy`.
+///
+/// ```
+/// use cellpos_control::*;
+/// let config = LoopConfig {
+///     model: LoopModel::eq6(2e-3),
+///     estimator: EstimatorConfig::default(),
+///     controller: ControllerConfig::Pi(Pi::new(0.46, 19.5)),
+///     limits: Limits::default(),
+/// };
+/// let control = ControlLoop::new(config)?;
+/// let mut state = control.start(20.0, 20.0);
+/// let fix = Measurement { position_um: 1.0, variance_um2: 4e-4, age_samples: 0 };
+/// let out = control.step(&mut state, &LoopInput { measurement: Some(fix), ..LoopInput::default() });
+/// assert!(out.command_um < 20.0, "the bead is beyond the reference: pull");
+/// # Ok::<(), BuildError>(())
+/// ```
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct ControlLoop {
+    config: LoopConfig,
+    estimator: Estimator,
+    law: Law,
+}
+
+/// Largest position that counts as one, um.
+const FAR_UM: f64 = 1e6;
+
+impl ControlLoop {
+    /// Builds a loop.
+    ///
+    /// # Errors
+    /// [`BuildError`] naming the parameter.
+    pub fn new(config: LoopConfig) -> Result<Self, BuildError> {
+        config.limits.validate()?;
+        let estimator = Estimator::new(config.estimator, config.model)?;
+        let law = match config.controller {
+            ControllerConfig::Pi(pi) => {
+                pi.validate()?;
+                Law::Pi(PiStep::new(pi, config.model.sample_time_s))
+            }
+        };
+        Ok(Self {
+            config,
+            estimator,
+            law,
+        })
+    }
+
+    /// What it was built from.
+    pub fn config(&self) -> &LoopConfig {
+        &self.config
+    }
+
+    /// Its estimator.
+    pub fn estimator(&self) -> &Estimator {
+        &self.estimator
+    }
+
+    /// A state at rest at a command, with a first belief of neutral (both um).
+    pub fn start(&self, command_um: f64, neutral_um: f64) -> LoopState {
+        let command = self.config.limits.to_grid(command_um);
+        let neutral = if neutral_um.is_finite() {
+            neutral_um
+        } else {
+            command
+        };
+        LoopState {
+            estimator: self.estimator.start(command, neutral),
+            pi: PiState {
+                integral_um: command,
+                lead_um: 0.0,
+            },
+        }
+    }
+
+    /// The state as 16 numbers, for the records.
+    pub fn pack(&self, state: &LoopState) -> [f64; STATE_LEN] {
+        state.pack(&self.config.limits)
+    }
+
+    /// The state of [`ControlLoop::pack`].
+    pub fn unpack(&self, packed: &[f64; STATE_LEN]) -> LoopState {
+        LoopState::unpack(packed, &self.config.limits)
+    }
+
+    fn fix(&self, measurement: &Measurement) -> Option<Fix> {
+        let Measurement {
+            position_um,
+            variance_um2,
+            age_samples,
+        } = *measurement;
+        let stated = variance_um2.is_finite() && variance_um2 > 0.0;
+        let assumed = self.config.estimator.fix_noise_um.powi(2);
+        (position_um.abs() < FAR_UM).then_some(Fix {
+            position_um,
+            variance_um2: if stated {
+                variance_um2.clamp(1e-8, 1e6)
+            } else {
+                assumed
+            },
+            age: usize::from(age_samples),
+        })
+    }
+
+    /// One tick.
+    pub fn step(&self, state: &mut LoopState, input: &LoopInput) -> LoopOutput {
+        let fix = input.measurement.as_ref().and_then(|m| self.fix(m));
+        let estimate = self.estimator.step(&mut state.estimator, fix);
+        // What the controller sees: the fix itself where there is one, else what the model says it would be.
+        let bead_um = match fix {
+            Some(fix) if estimate.fresh => fix.position_um,
+            _ => estimate.predicted_measurement_um,
+        };
+        let reference_ok = input.reference_um.abs() < FAR_UM;
+        let controls = input.mode == Mode::Run && reference_ok && estimate.seen;
+        let reference_um = if reference_ok {
+            input.reference_um
+        } else {
+            bead_um
+        };
+
+        let mut pi = state.pi;
+        let Law::Pi(law) = &self.law;
+        let proportional_um = law.proportional(&mut pi, reference_um, bead_um);
+        let requested_um = match input.mode {
+            Mode::Park => self.config.limits.park_um,
+            _ if controls => proportional_um + pi.integral_um,
+            _ => estimate.neutral_um,
+        };
+        let output = self.limit(
+            state,
+            input,
+            &estimate,
+            fix.is_some(),
+            reference_ok,
+            requested_um,
+        );
+        if controls {
+            let hold = estimate.coasting || estimate.stuck;
+            law.integrate(
+                &mut pi,
+                reference_um - bead_um,
+                requested_um,
+                output.command_um,
+                hold,
+            );
+        } else {
+            law.track(&mut pi, proportional_um, output.command_um);
+        }
+        if pi.integral_um.abs() < FAR_UM && pi.lead_um.abs() < FAR_UM {
+            state.pi = pi;
+        } else {
+            state.pi = PiState {
+                integral_um: output.command_um,
+                lead_um: 0.0,
+            };
+        }
+        self.estimator.push(&mut state.estimator, output.command_um);
+        output
+    }
+
+    /// The limits and the account of the tick.
+    fn limit(
+        &self,
+        state: &LoopState,
+        input: &LoopInput,
+        estimate: &Estimate,
+        fix_ok: bool,
+        reference_ok: bool,
+        requested_um: f64,
+    ) -> LoopOutput {
+        let mut wanted_um = requested_um;
+        if estimate.stuck && input.mode == Mode::Run {
+            let most = self.estimator.stuck_authority_um();
+            wanted_um = wanted_um.clamp(estimate.neutral_um - most, estimate.neutral_um + most);
+        }
+        let limited = self.config.limits.apply(
+            wanted_um,
+            state.previous_command_um(),
+            self.config.model.sample_time_s,
+        );
+        LoopOutput {
+            command_um: limited.command_um,
+            requested_um,
+            estimate_um: estimate.position_um,
+            predicted_measurement_um: estimate.predicted_measurement_um,
+            neutral_um: estimate.neutral_um,
+            innovation_um: estimate.innovation_um,
+            flags: LoopFlags {
+                range_limited: limited.range,
+                slew_limited: limited.slew,
+                not_finite: limited.not_finite
+                    || !reference_ok
+                    || (input.measurement.is_some() && !fix_ok),
+                coasting: estimate.coasting,
+                gated: estimate.gated,
+                stuck: estimate.stuck,
+            },
+            solver: SolverReport::default(),
+        }
+    }
+}
+
+/// A loop of any kind, with the workspace of an optimiser where it needs one. What the runtime holds.
+#[derive(Debug)]
+pub struct Controller {
+    control: ControlLoop,
+}
+
+impl Controller {
+    /// Builds a controller; allocates whatever its steps will need.
+    ///
+    /// # Errors
+    /// [`BuildError`] naming the parameter.
+    pub fn new(config: LoopConfig) -> Result<Self, BuildError> {
+        Ok(Self {
+            control: ControlLoop::new(config)?,
+        })
+    }
+
+    /// The loop.
+    pub fn control_loop(&self) -> &ControlLoop {
+        &self.control
+    }
+
+    /// A state at rest: see [`ControlLoop::start`].
+    pub fn start(&self, command_um: f64, neutral_um: f64) -> LoopState {
+        self.control.start(command_um, neutral_um)
+    }
+
+    /// References of the coming ticks that a step can use.
+    pub fn preview_len(&self) -> usize {
+        0
+    }
+
+    /// One tick.
+    pub fn step(&mut self, state: &mut LoopState, input: &LoopInput) -> LoopOutput {
+        self.control.step(state, input)
+    }
+}

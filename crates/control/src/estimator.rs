@@ -1,0 +1,497 @@
+//! Kalman filter of the bead with input delay, per-fix variance, missing and late measurements, and an innovation gate.
+//!
+//! State: integrator position `q` and neutral `n` with their covariance; the fast modes are known functions of the
+//! commands. The filter stands at the time of the newest measurement it has used; the present is predicted from there
+//! through the commands since. A missing measurement just leaves the filter where it is (for up to
+//! [`Estimator::longest_lag`] ticks), so a late one is used at the time at which its frame was exposed, exactly.
+//!
+//! Brownian motion drives `q` with variance `2 D Ts` per tick, neutral is a random walk, and a relative uncertainty of
+//! the gain widens the covariance in proportion to the motion it predicts.
+
+use crate::error::{BuildError, check};
+use crate::loop_model::{LoopModel, MODES};
+
+/// Past commands held.
+pub const HISTORY: usize = 6;
+
+/// Noise and gate of the estimator.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct EstimatorConfig {
+    /// Diffusion coefficient D of the bead, um^2/s.
+    pub diffusion_um2_per_s: f64,
+    /// Random walk of neutral, um/sqrt(s).
+    pub neutral_walk_um_per_sqrt_s: f64,
+    /// Relative standard uncertainty of the plant's gain.
+    pub gain_uncertainty: f64,
+    /// Standard uncertainty of neutral at the start, um.
+    pub neutral_initial_um: f64,
+    /// Localisation noise assumed where a fix states none, um (standard deviation).
+    pub fix_noise_um: f64,
+    /// An innovation larger than this many standard deviations is refused.
+    pub gate_sigma: f64,
+    /// ... unless it is smaller than this, um.
+    pub gate_floor_um: f64,
+    /// After this many refused measurements in a row the next one is believed.
+    pub gate_most: u8,
+    /// Bead speed granted while the bead is taken for stuck, um per tick: bounds the jump when it comes free.
+    pub stuck_speed_um_per_tick: f64,
+}
+
+impl Default for EstimatorConfig {
+    /// A 1 um bead mid-slit (D = 0.33 um^2/s) with 20 nm fixes.
+    fn default() -> Self {
+        Self {
+            diffusion_um2_per_s: 0.33,
+            neutral_walk_um_per_sqrt_s: 0.015,
+            gain_uncertainty: 0.2,
+            neutral_initial_um: 2.0,
+            fix_noise_um: 0.020,
+            gate_sigma: 6.0,
+            gate_floor_um: 0.5,
+            gate_most: 20,
+            stuck_speed_um_per_tick: 0.5,
+        }
+    }
+}
+
+/// State of the estimator.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct EstimatorState {
+    /// Integrator part of the position at the filter's time, um.
+    pub integrator_um: f64,
+    /// Neutral at the filter's time, um.
+    pub neutral_um: f64,
+    /// Covariance: position-position, position-neutral, neutral-neutral, um^2.
+    pub covariance_um2: [f64; 3],
+    /// Fast modes at the filter's time, um s.
+    pub modes: [f64; MODES],
+    /// Commands of the previous ticks, newest first, um.
+    pub history_um: [f64; HISTORY],
+    /// Evidence that the bead is stuck, natural logarithm of the odds, 0 or more.
+    pub stuck_evidence: f64,
+    /// Exponentially forgotten sum of predicted motion squared, um^2 (gain estimate).
+    pub excitation_um2: f64,
+    /// Exponentially forgotten sum of predicted times observed motion, um^2 (gain estimate).
+    pub response_um2: f64,
+    /// Ticks by which the filter's time lies behind the nominal delay.
+    pub lag: u8,
+    /// Refused measurements in a row.
+    pub gated: u8,
+    /// A measurement has been used.
+    pub seen: bool,
+    /// The bead is taken for stuck.
+    pub stuck: bool,
+}
+
+/// What the estimator knows after a measurement (or its absence).
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Estimate {
+    pub position_um: f64,
+    pub neutral_um: f64,
+    pub predicted_measurement_um: f64,
+    pub innovation_um: f64,
+    /// The measurement was used, at its nominal time.
+    pub fresh: bool,
+    /// No measurement was used.
+    pub coasting: bool,
+    pub gated: bool,
+    pub seen: bool,
+    pub stuck: bool,
+    /// The present as a state, for state feedback.
+    pub now: Moment,
+}
+
+/// Deterministic part of the state at one time.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub(crate) struct Moment {
+    pub q: f64,
+    pub n: f64,
+    pub modes: [f64; MODES],
+    /// Command in force just before this time.
+    pub last_um: f64,
+}
+
+/// A fix as the estimator takes it: finite and within reason.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Fix {
+    pub position_um: f64,
+    pub variance_um2: f64,
+    pub age: usize,
+}
+
+/// Transition over a time, exact for a constant command.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Transition {
+    gain: f64,
+    a: [f64; MODES],
+    b: [f64; MODES],
+    fraction: f64,
+}
+
+impl Transition {
+    fn new(model: &LoopModel, fraction: f64) -> Self {
+        let t = model.sample_time_s * fraction;
+        let mut this = Self {
+            gain: model.gain_per_s * t,
+            a: [0.0; MODES],
+            b: [0.0; MODES],
+            fraction,
+        };
+        for (i, mode) in model.modes.iter().enumerate() {
+            if mode.pole_rad_per_s < 0.0 {
+                this.a[i] = (mode.pole_rad_per_s * t).exp();
+                this.b[i] = (this.a[i] - 1.0) / mode.pole_rad_per_s;
+            }
+        }
+        this
+    }
+
+    fn advance(&self, m: &Moment, command_um: f64) -> Moment {
+        let drive = command_um - m.n;
+        let mut next = Moment {
+            q: m.q + self.gain * drive,
+            n: m.n,
+            modes: m.modes,
+            last_um: command_um,
+        };
+        for ((x, a), b) in next.modes.iter_mut().zip(&self.a).zip(&self.b) {
+            *x = a * *x + b * drive;
+        }
+        if self.fraction == 0.0 {
+            next.last_um = m.last_um;
+        }
+        next
+    }
+}
+
+/// A Kalman filter for one model and sample time.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Estimator {
+    config: EstimatorConfig,
+    model: LoopModel,
+    tick: Transition,
+    /// From the last whole tick before a nominal measurement to that measurement.
+    part: Transition,
+    /// Whole ticks of delay, rounded up.
+    delay_ticks: usize,
+    longest_lag: usize,
+}
+
+impl Estimator {
+    /// Builds the filter.
+    ///
+    /// # Errors
+    /// A value out of range, or a delay that needs more than [`HISTORY`] past commands.
+    pub fn new(config: EstimatorConfig, model: LoopModel) -> Result<Self, BuildError> {
+        model.validate()?;
+        let c = &config;
+        check(
+            "diffusion_um2_per_s",
+            "um^2/s",
+            c.diffusion_um2_per_s,
+            c.diffusion_um2_per_s > 0.0,
+            "positive",
+        )?;
+        let walk = c.neutral_walk_um_per_sqrt_s;
+        check(
+            "neutral_walk_um_per_sqrt_s",
+            "um/sqrt(s)",
+            walk,
+            walk >= 0.0,
+            "0 or more",
+        )?;
+        check(
+            "gain_uncertainty",
+            "",
+            c.gain_uncertainty,
+            (0.0..=10.0).contains(&c.gain_uncertainty),
+            "0 to 10",
+        )?;
+        check(
+            "neutral_initial_um",
+            "um",
+            c.neutral_initial_um,
+            c.neutral_initial_um > 0.0,
+            "positive",
+        )?;
+        check(
+            "fix_noise_um",
+            "um",
+            c.fix_noise_um,
+            c.fix_noise_um > 0.0,
+            "positive",
+        )?;
+        check(
+            "gate_sigma",
+            "",
+            c.gate_sigma,
+            c.gate_sigma > 0.0,
+            "positive",
+        )?;
+        check(
+            "gate_floor_um",
+            "um",
+            c.gate_floor_um,
+            c.gate_floor_um >= 0.0,
+            "0 or more",
+        )?;
+        let speed = c.stuck_speed_um_per_tick;
+        check(
+            "stuck_speed_um_per_tick",
+            "um",
+            speed,
+            speed > 0.0,
+            "positive",
+        )?;
+        let samples = model.delay_samples();
+        let delay_ticks = (samples - 1e-9).ceil().max(0.0) as usize;
+        if delay_ticks + 1 > HISTORY {
+            return Err(BuildError::DelayTooLong {
+                delay_ms: model.delay_s * 1e3,
+                longest_ms: (HISTORY - 1) as f64 * model.sample_time_s * 1e3,
+            });
+        }
+        let part = (delay_ticks as f64 - samples).max(0.0);
+        Ok(Self {
+            config,
+            model,
+            tick: Transition::new(&model, 1.0),
+            part: Transition::new(&model, if part < 1e-9 { 0.0 } else { part }),
+            delay_ticks,
+            longest_lag: HISTORY - 1 - delay_ticks,
+        })
+    }
+
+    /// The configuration it was built from.
+    pub fn config(&self) -> &EstimatorConfig {
+        &self.config
+    }
+
+    /// The plant it was built for.
+    pub fn model(&self) -> &LoopModel {
+        &self.model
+    }
+
+    /// Ticks by which a frame may be late and still be used at its own time.
+    pub fn longest_lag(&self) -> usize {
+        self.longest_lag
+    }
+
+    /// A state at rest: every past command was `command_um`, neutral is believed to be `neutral_um`, no bead seen.
+    pub fn start(&self, command_um: f64, neutral_um: f64) -> EstimatorState {
+        EstimatorState {
+            integrator_um: 0.0,
+            neutral_um,
+            covariance_um2: [1e4, 0.0, self.config.neutral_initial_um.powi(2)],
+            modes: [0.0; MODES],
+            history_um: [command_um; HISTORY],
+            stuck_evidence: 0.0,
+            excitation_um2: 0.0,
+            response_um2: 0.0,
+            lag: 0,
+            gated: 0,
+            seen: false,
+            stuck: false,
+        }
+    }
+
+    /// Position from the state at one time, um.
+    pub(crate) fn position(&self, m: &Moment) -> f64 {
+        let modes: f64 = m
+            .modes
+            .iter()
+            .zip(&self.model.modes)
+            .map(|(x, mode)| mode.residue_per_s * x)
+            .sum();
+        m.q + modes + self.model.feedthrough * (m.last_um - m.n)
+    }
+
+    /// The command that was in force `ticks_ago` (1: that of the previous tick).
+    fn command(state: &EstimatorState, ticks_ago: usize) -> f64 {
+        let last = state.history_um[HISTORY - 1];
+        state
+            .history_um
+            .get(ticks_ago.saturating_sub(1))
+            .copied()
+            .unwrap_or(last)
+    }
+
+    fn filter_moment(&self, state: &EstimatorState) -> Moment {
+        let back = self.delay_ticks + usize::from(state.lag);
+        Moment {
+            q: state.integrator_um,
+            n: state.neutral_um,
+            modes: state.modes,
+            last_um: Self::command(state, back + 1),
+        }
+    }
+
+    /// Moves the filter one tick towards the present.
+    fn advance_filter(&self, state: &mut EstimatorState) {
+        let back = self.delay_ticks + usize::from(state.lag);
+        let command = if back == 0 {
+            Self::command(state, 1)
+        } else {
+            Self::command(state, back)
+        };
+        let m = self.filter_moment(state);
+        let next = self.tick.advance(&m, command);
+        state.integrator_um = next.q;
+        state.modes = next.modes;
+        let motion = self.config.gain_uncertainty * self.tick.gain * (command - m.n);
+        let ts = self.model.sample_time_s;
+        let [p11, p12, p22] = state.covariance_um2;
+        let g = self.tick.gain;
+        let p11n = p11 - 2.0 * g * p12
+            + g * g * p22
+            + 2.0 * self.config.diffusion_um2_per_s * ts
+            + motion * motion;
+        let p12n = p12 - g * p22;
+        let p22n = p22 + self.config.neutral_walk_um_per_sqrt_s.powi(2) * ts;
+        state.covariance_um2 = if p11n < 1e6 && p22n < 1e6 {
+            [p11n, p12n, p22n]
+        } else {
+            [1e6, 0.0, p22n.min(1e6)]
+        };
+        state.lag = state.lag.saturating_sub(1);
+    }
+
+    /// From the filter's time to that of its measurement.
+    fn at_measurement(&self, m: &Moment, command_um: f64) -> Moment {
+        if self.part.fraction == 0.0 {
+            *m
+        } else {
+            self.part.advance(m, command_um)
+        }
+    }
+
+    /// One tick: time moves on, the measurement (if any) is used, the present is predicted.
+    pub(crate) fn step(&self, state: &mut EstimatorState, fix: Option<Fix>) -> Estimate {
+        state.lag = state.lag.saturating_add(1);
+        let mut innovation_um = 0.0;
+        let (mut used, mut fresh, mut gated) = (false, false, false);
+        match fix {
+            Some(fix) if fix.age <= usize::from(state.lag) && fix.age <= self.longest_lag => {
+                let steps = usize::from(state.lag) - fix.age;
+                let before = self.position(&self.at_measurement(
+                    &self.filter_moment(state),
+                    Self::command(state, self.delay_ticks + usize::from(state.lag)),
+                ));
+                for _ in 0..steps {
+                    self.advance_filter(state);
+                }
+                let (accepted, innovation) = self.update(state, &fix, before);
+                innovation_um = innovation;
+                gated = !accepted;
+                used = accepted;
+                fresh = accepted && fix.age == 0;
+            }
+            _ => {
+                while usize::from(state.lag) > self.longest_lag {
+                    self.advance_filter(state);
+                }
+            }
+        }
+        let mut m = self.filter_moment(state);
+        let mut predicted = m;
+        let back = self.delay_ticks + usize::from(state.lag);
+        for ticks_ago in (1..=back).rev() {
+            if ticks_ago == self.delay_ticks {
+                predicted = m;
+            }
+            m = self.tick.advance(&m, Self::command(state, ticks_ago));
+        }
+        if self.delay_ticks == 0 {
+            predicted = m;
+        }
+        let predicted = self.at_measurement(&predicted, Self::command(state, self.delay_ticks));
+        Estimate {
+            position_um: self.position(&m),
+            neutral_um: state.neutral_um,
+            predicted_measurement_um: self.position(&predicted),
+            innovation_um,
+            fresh,
+            coasting: !used,
+            gated,
+            seen: state.seen,
+            stuck: state.stuck,
+            now: m,
+        }
+    }
+
+    /// Uses a fix at the filter's time. Returns whether it was accepted, and the innovation.
+    fn update(&self, state: &mut EstimatorState, fix: &Fix, before_um: f64) -> (bool, f64) {
+        let command = Self::command(state, self.delay_ticks + usize::from(state.lag));
+        let predicted = self.position(&self.at_measurement(&self.filter_moment(state), command));
+        let innovation = fix.position_um - predicted;
+        if !state.seen {
+            self.place(state, innovation, fix.variance_um2);
+            return (true, 0.0);
+        }
+        let [p11, p12, p22] = state.covariance_um2;
+        let h = -self.part.gain;
+        let (ph1, ph2) = (p11 + h * p12, p12 + h * p22);
+        let spread = ph1 + h * ph2 + fix.variance_um2;
+        let gate = (self.config.gate_sigma * spread.sqrt()).max(self.config.gate_floor_um);
+        if innovation.abs() > gate {
+            state.gated = state.gated.saturating_add(1);
+            if state.gated > self.config.gate_most {
+                self.place(state, innovation, fix.variance_um2);
+                return (true, innovation);
+            }
+            return (false, innovation);
+        }
+        state.gated = 0;
+        self.weigh_stuck(state, innovation, predicted - before_um, fix.variance_um2);
+        if state.stuck {
+            // The motion says nothing of neutral while something holds the bead.
+            self.place(state, innovation, fix.variance_um2);
+            return (true, innovation);
+        }
+        let (k1, k2) = (ph1 / spread, ph2 / spread);
+        state.integrator_um += k1 * innovation;
+        state.neutral_um += k2 * innovation;
+        state.covariance_um2 = [p11 - k1 * ph1, p12 - k1 * ph2, p22 - k2 * ph2];
+        (true, innovation)
+    }
+
+    /// Takes the position from the fix alone, keeping neutral.
+    fn place(&self, state: &mut EstimatorState, innovation_um: f64, variance_um2: f64) {
+        state.integrator_um += innovation_um;
+        state.covariance_um2[0] = variance_um2;
+        state.covariance_um2[1] = 0.0;
+        state.gated = 0;
+        state.seen = true;
+    }
+
+    /// Likelihood of "the bead does not move" against "it moves as predicted", forgotten over 50 fixes. A gain of
+    /// 0.3 is the watershed, so that a bead twice as slow as the model is not taken for stuck.
+    fn weigh_stuck(
+        &self,
+        state: &mut EstimatorState,
+        innovation_um: f64,
+        motion_um: f64,
+        variance_um2: f64,
+    ) {
+        let noise = 2.0
+            * (2.0 * self.config.diffusion_um2_per_s * self.model.sample_time_s
+                + 2.0 * variance_um2);
+        let still = innovation_um + motion_um;
+        let odds =
+            (innovation_um * innovation_um - still * still - 0.4 * motion_um * motion_um) / noise;
+        state.stuck_evidence = (0.98 * state.stuck_evidence + odds).clamp(0.0, 25.0);
+        state.stuck = state.stuck_evidence > if state.stuck { 3.0 } else { 10.0 };
+    }
+
+    /// Hands the command of this tick to the history.
+    pub(crate) fn push(&self, state: &mut EstimatorState, command_um: f64) {
+        state.history_um.copy_within(0..HISTORY - 1, 1);
+        state.history_um[0] = command_um;
+    }
+
+    /// Largest distance of the command from neutral while the bead is taken for stuck, um.
+    pub(crate) fn stuck_authority_um(&self) -> f64 {
+        let per_tick = self.tick.gain.abs().max(1e-12);
+        self.config.stuck_speed_um_per_tick / per_tick
+    }
+}

@@ -1,0 +1,144 @@
+//! Limits of the command: finite, within range, within slew. The last step of every tick, whatever went before.
+
+use crate::error::{BuildError, check};
+
+/// Range, slew and park displacement of the PZT.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Limits {
+    /// Smallest displacement, um.
+    pub low_um: f64,
+    /// Largest displacement, um.
+    pub high_um: f64,
+    /// Largest change of the command, um/s.
+    pub slew_um_per_s: f64,
+    /// Where a safe stop ends, um.
+    pub park_um: f64,
+}
+
+impl Default for Limits {
+    /// The drive of the paper: 0..40 um. The slew serves 0.5 um of bead amplitude at 300 Hz.
+    fn default() -> Self {
+        Self {
+            low_um: 0.0,
+            high_um: 40.0,
+            slew_um_per_s: 10_000.0,
+            park_um: 0.0,
+        }
+    }
+}
+
+/// A command after the limits, and which of them acted.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Limited {
+    /// Finite, within range, within slew of the previous command, um.
+    pub command_um: f64,
+    /// The request was outside the range.
+    pub range: bool,
+    /// The request was further away than one tick's slew.
+    pub slew: bool,
+    /// The request was not a finite number; the previous command was kept.
+    pub not_finite: bool,
+}
+
+/// Commands lie on a grid of this many steps over the range (2.4 pm for 40 um), so that two pack exactly into the
+/// integer part of one `f64` of the recorded state.
+pub(crate) const GRID_STEPS: f64 = 16_777_215.0;
+
+impl Limits {
+    /// Checks that the range is a range, the slew positive and the park displacement within the range.
+    ///
+    /// # Errors
+    /// [`BuildError::OutOfRange`] naming the key.
+    pub fn validate(&self) -> Result<(), BuildError> {
+        check(
+            "low_um",
+            "um",
+            self.low_um,
+            self.low_um.abs() <= 1e6,
+            "finite",
+        )?;
+        let high_ok = self.high_um > self.low_um && self.high_um.abs() <= 1e6;
+        check("high_um", "um", self.high_um, high_ok, "larger than low_um")?;
+        check(
+            "slew_um_per_s",
+            "um/s",
+            self.slew_um_per_s,
+            self.slew_um_per_s > 0.0,
+            "positive",
+        )?;
+        let park_ok = (self.low_um..=self.high_um).contains(&self.park_um);
+        check(
+            "park_um",
+            "um",
+            self.park_um,
+            park_ok,
+            "within low_um..high_um",
+        )
+    }
+
+    /// Grid index of a displacement within the range.
+    pub(crate) fn index(&self, command_um: f64) -> f64 {
+        let steps = (command_um - self.low_um) / (self.high_um - self.low_um) * GRID_STEPS;
+        if steps.is_finite() {
+            steps.round().clamp(0.0, GRID_STEPS)
+        } else {
+            0.0
+        }
+    }
+
+    /// Displacement of a grid index, um.
+    pub(crate) fn at_index(&self, index: f64) -> f64 {
+        (self.low_um + index * (self.high_um - self.low_um) / GRID_STEPS)
+            .clamp(self.low_um, self.high_um)
+    }
+
+    /// The nearest displacement within the range and on the command grid, um; park for a number that is not finite.
+    pub fn to_grid(&self, displacement_um: f64) -> f64 {
+        let wanted = if displacement_um.is_finite() {
+            displacement_um
+        } else {
+            self.park_um
+        };
+        self.at_index(self.index(wanted.clamp(self.low_um, self.high_um)))
+    }
+
+    /// Limits a request, given the previous command (already within the range) and the sample time.
+    ///
+    /// The result is on the command grid, rounded towards the previous command, so that rounding breaks no limit.
+    pub fn apply(&self, requested_um: f64, previous_um: f64, sample_time_s: f64) -> Limited {
+        let not_finite = !requested_um.is_finite();
+        let wanted = if not_finite {
+            previous_um
+        } else {
+            requested_um
+        };
+        let in_range = wanted.clamp(self.low_um, self.high_um);
+        let most = self.slew_um_per_s * sample_time_s;
+        let limited = in_range.clamp(previous_um - most, previous_um + most);
+        let mut index = self.index(limited);
+        let mut command_um = self.at_index(index);
+        let overshoots = if limited >= previous_um {
+            command_um > limited
+        } else {
+            command_um < limited
+        };
+        if overshoots {
+            index += if limited >= previous_um { -1.0 } else { 1.0 };
+            command_um = self.at_index(index.clamp(0.0, GRID_STEPS));
+            let passed = if limited >= previous_um {
+                command_um < previous_um
+            } else {
+                command_um > previous_um
+            };
+            if passed {
+                command_um = previous_um;
+            }
+        }
+        Limited {
+            command_um,
+            range: in_range != wanted,
+            slew: limited != in_range,
+            not_finite,
+        }
+    }
+}

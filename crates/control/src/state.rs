@@ -1,0 +1,81 @@
+//! The state of a loop, and its exact packing into 16 numbers for the records.
+
+use crate::estimator::{EstimatorState, HISTORY};
+use crate::limits::{GRID_STEPS, Limits};
+use crate::loop_model::MODES;
+use crate::pi::PiState;
+
+/// Numbers in a packed state.
+pub const STATE_LEN: usize = 16;
+
+/// Estimator and controller state of one loop.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct LoopState {
+    /// Estimator.
+    pub estimator: EstimatorState,
+    /// PI controller (unused by the others, but kept tracking so that a fallback is bumpless).
+    pub pi: PiState,
+}
+
+impl LoopState {
+    /// Command of the previous tick, um.
+    pub fn previous_command_um(&self) -> f64 {
+        self.estimator.history_um[0]
+    }
+
+    /// The state as 16 numbers, exactly. Past commands lie on the grid of `limits`, so that two of them are the
+    /// digits of one integer.
+    pub fn pack(&self, limits: &Limits) -> [f64; STATE_LEN] {
+        let e = &self.estimator;
+        let flags = u32::from(e.lag)
+            | u32::from(e.gated) << 8
+            | u32::from(e.seen) << 16
+            | u32::from(e.stuck) << 17;
+        let mut out = [0.0; STATE_LEN];
+        out[0] = e.integrator_um;
+        out[1] = e.neutral_um;
+        out[2..5].copy_from_slice(&e.covariance_um2);
+        out[5..5 + MODES].copy_from_slice(&e.modes);
+        out[7] = self.pi.integral_um;
+        out[8] = self.pi.lead_um;
+        out[9] = e.excitation_um2;
+        out[10] = e.response_um2;
+        out[11] = e.stuck_evidence;
+        out[12] = f64::from(flags);
+        for (slot, pair) in out[13..].iter_mut().zip(e.history_um.chunks_exact(2)) {
+            *slot = limits.index(pair[0]) * (GRID_STEPS + 1.0) + limits.index(pair[1]);
+        }
+        out
+    }
+
+    /// The state of [`LoopState::pack`].
+    pub fn unpack(packed: &[f64; STATE_LEN], limits: &Limits) -> Self {
+        let flags = packed[12] as u32;
+        let mut history_um = [0.0; HISTORY];
+        for (pair, slot) in history_um.chunks_exact_mut(2).zip(&packed[13..]) {
+            let high = (slot / (GRID_STEPS + 1.0)).floor();
+            pair[0] = limits.at_index(high);
+            pair[1] = limits.at_index(slot - high * (GRID_STEPS + 1.0));
+        }
+        Self {
+            estimator: EstimatorState {
+                integrator_um: packed[0],
+                neutral_um: packed[1],
+                covariance_um2: [packed[2], packed[3], packed[4]],
+                modes: [packed[5], packed[6]],
+                history_um,
+                stuck_evidence: packed[11],
+                excitation_um2: packed[9],
+                response_um2: packed[10],
+                lag: flags as u8,
+                gated: (flags >> 8) as u8,
+                seen: flags & 1 << 16 != 0,
+                stuck: flags & 1 << 17 != 0,
+            },
+            pi: PiState {
+                integral_um: packed[7],
+                lead_um: packed[8],
+            },
+        }
+    }
+}
