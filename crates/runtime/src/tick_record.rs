@@ -83,6 +83,12 @@ pub struct TickRecord {
     pub true_um: f64,
     /// Life-cycle state (number of the runtime's state).
     pub life: u8,
+    /// What the operator or the program asked for at this tick (number of the runtime's request).
+    pub request: u8,
+    /// State that the board last reported (number of the link's board state; 255: none yet).
+    pub board: u8,
+    /// Latched fault that the board last reported (number of the link's fault; 0: none).
+    pub board_fault: u8,
     /// What happened.
     pub flags: TickFlags,
     /// Measurements found in the ring at this tick (one is used, the rest counted).

@@ -1,0 +1,21 @@
+//! One module a command: `Args` (read by clap), `run(args)` (calls the libraries, prints the result).
+
+pub mod doctor;
+
+use crate::outcome::CommandResult;
+
+/// The commands, in the order in which a lab needs them.
+#[derive(Debug, clap::Subcommand)]
+pub enum Command {
+    /// Is this machine fit for a 1 kHz loop: verdict, reasons, what to change.
+    Doctor(doctor::Args),
+}
+
+impl Command {
+    /// Runs the command.
+    pub fn run(self) -> CommandResult {
+        match self {
+            Self::Doctor(args) => doctor::run(args),
+        }
+    }
+}

@@ -1,2 +1,0 @@
-//! Closed-loop cell positioner for a PZT-driven PDMS microchannel.
-#![forbid(unsafe_code)]

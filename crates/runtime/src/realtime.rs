@@ -1,0 +1,357 @@
+//! Real time asked of the operating system, and an honest account of what was obtained.
+//!
+//! Each grant (policy and priority, CPU, locked memory) is asked for, then read back. What was refused becomes a line
+//! of [`Conditions::degraded`], which is printed beside every timing figure.
+
+use crate::clock::{monotonic_ns, sleep_until_ns};
+use crate::latency::{Latency, Quantiles};
+use rustix::mm::{MlockAllFlags, mlockall};
+use rustix::thread::{CpuSet, sched_getaffinity, sched_setaffinity};
+use serde::Serialize;
+use std::fmt;
+use std::time::Duration;
+use thread_priority::{
+    RealtimeThreadSchedulePolicy, ThreadPriority, ThreadPriorityValue, ThreadSchedulePolicy,
+    set_thread_priority_and_policy, thread_native_id, thread_schedule_policy_param,
+};
+
+/// What a thread asks for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Request {
+    /// SCHED_FIFO priority, 1 (low) to 99; `None` leaves the ordinary scheduler.
+    pub fifo_priority: Option<u8>,
+    /// CPU to stay on; `None` lets the scheduler choose.
+    pub cpu: Option<usize>,
+    /// Lock all pages, present and future (of the process).
+    pub lock_memory: bool,
+}
+
+impl Request {
+    /// What the control thread asks for: priority 80, the last allowed CPU (interrupts favour the first), locked memory.
+    pub fn control_thread() -> Self {
+        Self {
+            fifo_priority: Some(80),
+            cpu: allowed_cpus().last().copied(),
+            lock_memory: true,
+        }
+    }
+
+    /// What the threads around it ask for: a FIFO priority below control, no CPU of their own.
+    pub fn io_thread(priority: u8) -> Self {
+        Self {
+            fifo_priority: Some(priority),
+            cpu: None,
+            lock_memory: false,
+        }
+    }
+
+    /// Nothing at all: the named opt-out.
+    pub fn best_effort() -> Self {
+        Self {
+            fifo_priority: None,
+            cpu: None,
+            lock_memory: false,
+        }
+    }
+}
+
+/// What was obtained, and what was not.
+#[derive(Debug, Clone, PartialEq, Serialize, Default)]
+pub struct Conditions {
+    /// Scheduling policy read back after the request.
+    pub policy: String,
+    /// FIFO priority read back; 0 under the ordinary scheduler.
+    pub priority: i32,
+    /// CPU the thread is pinned to.
+    pub cpu: Option<usize>,
+    /// Whether all memory is locked.
+    pub memory_locked: bool,
+    /// CPUs this process may use.
+    pub cpus: usize,
+    /// Kernel release and version.
+    pub kernel: String,
+    /// Frequency governor of the CPU in use; `unknown` where the machine does not say.
+    pub governor: String,
+    /// CPUs isolated from the scheduler at boot; empty for none.
+    pub isolated: String,
+    /// What was asked for and not obtained, or is known to spoil timing: one sentence each.
+    pub degraded: Vec<String>,
+}
+
+/// CPUs the process may run on, in order.
+pub fn allowed_cpus() -> Vec<usize> {
+    sched_getaffinity(None)
+        .map(|set| {
+            (0..CpuSet::MAX_CPU)
+                .filter(|&cpu| set.is_set(cpu))
+                .collect()
+        })
+        .unwrap_or_default()
+}
+
+fn first_line(path: &str) -> Option<String> {
+    let text = std::fs::read_to_string(path).ok()?;
+    Some(text.lines().next().unwrap_or("").trim().to_string())
+}
+
+/// Applies a request to the calling thread and says what was obtained.
+pub fn apply(request: &Request) -> Conditions {
+    let mut degraded = Vec::new();
+    if let Some(priority) = request.fifo_priority {
+        let fifo = ThreadSchedulePolicy::Realtime(RealtimeThreadSchedulePolicy::Fifo);
+        let granted = ThreadPriorityValue::try_from(priority)
+            .map_err(|error| error.to_string())
+            .and_then(|value| {
+                set_thread_priority_and_policy(
+                    thread_native_id(),
+                    ThreadPriority::Crossplatform(value),
+                    fifo,
+                )
+                .map_err(|error| format!("{error:?}"))
+            });
+        if let Err(error) = granted {
+            degraded.push(format!(
+                "SCHED_FIFO priority {priority} was refused ({error}): allow it with `ulimit -r {priority}`, \
+                 an rtprio line in limits.conf, or CAP_SYS_NICE"
+            ));
+        }
+    } else {
+        degraded.push("best effort: real-time scheduling was not asked for".to_string());
+    }
+    let mut pinned = None;
+    if let Some(cpu) = request.cpu {
+        let mut set = CpuSet::new();
+        set.set(cpu.min(CpuSet::MAX_CPU - 1));
+        match sched_setaffinity(None, &set) {
+            Ok(()) => pinned = Some(cpu),
+            Err(error) => degraded.push(format!("pinning to CPU {cpu} was refused ({error})")),
+        }
+    }
+    let mut memory_locked = false;
+    if request.lock_memory {
+        match mlockall(MlockAllFlags::CURRENT | MlockAllFlags::FUTURE) {
+            Ok(()) => memory_locked = true,
+            Err(error) => degraded.push(format!(
+                "mlockall was refused ({error}): raise `ulimit -l` or grant CAP_IPC_LOCK; a page fault can stall a tick"
+            )),
+        }
+    }
+    let (policy, priority) = match thread_schedule_policy_param(thread_native_id()) {
+        Ok((policy, parameters)) => (policy_name(policy), parameters.sched_priority),
+        Err(_) => ("unknown".to_string(), 0),
+    };
+    let governor = first_line(&format!(
+        "/sys/devices/system/cpu/cpu{}/cpufreq/scaling_governor",
+        pinned.unwrap_or(0)
+    ))
+    .unwrap_or_else(|| "unknown".to_string());
+    if governor != "performance" && governor != "unknown" && request.fifo_priority.is_some() {
+        degraded.push(format!(
+            "the CPU frequency governor is `{governor}`: set `performance` (cpupower frequency-set -g performance)"
+        ));
+    }
+    let cpus = allowed_cpus().len().max(1);
+    let processors = std::thread::available_parallelism().map_or(cpus, usize::from);
+    if pinned.is_none() && processors < 2 {
+        degraded.push("one CPU only: camera, control and recording share it".to_string());
+    }
+    Conditions {
+        policy,
+        priority,
+        cpu: pinned,
+        memory_locked,
+        cpus: processors.max(cpus),
+        kernel: kernel(),
+        governor,
+        isolated: first_line("/sys/devices/system/cpu/isolated").unwrap_or_default(),
+        degraded,
+    }
+}
+
+fn policy_name(policy: ThreadSchedulePolicy) -> String {
+    match policy {
+        ThreadSchedulePolicy::Realtime(RealtimeThreadSchedulePolicy::Fifo) => {
+            "SCHED_FIFO".to_string()
+        }
+        ThreadSchedulePolicy::Normal(_) => "SCHED_OTHER".to_string(),
+        other => format!("{other:?}"),
+    }
+}
+
+fn kernel() -> String {
+    let read = |name| first_line(&format!("/proc/sys/kernel/{name}")).unwrap_or_default();
+    format!("{} {}", read("osrelease"), read("version"))
+}
+
+/// The verdict of `cellpos doctor`.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Examination {
+    /// Whether the machine can be trusted with a 1 kHz loop.
+    pub fit: bool,
+    /// The verdict in a sentence.
+    pub verdict: String,
+    /// What was obtained.
+    pub conditions: Conditions,
+    /// Wake-ups measured at 1 kHz.
+    pub wakeups: u64,
+    /// From the due time to the wake-up, us.
+    pub wake_us: Quantiles,
+    /// Wake-ups later than one period: ticks that a loop would have missed.
+    pub missed: u64,
+}
+
+/// Runs a bare 1 kHz absolute-sleep loop for `duration` on a thread of its own under `request`.
+///
+/// Fit means that nothing asked for was refused, the 99.9th percentile of the wake-up latency is under 200 us (a fifth
+/// of the period, so that frame, fit and solve still find their place) and fewer than 1 wake-up in 1000 was missed.
+pub fn examine(request: &Request, duration: Duration) -> Examination {
+    let request = *request;
+    let measured = std::thread::Builder::new()
+        .name("cellpos-doctor".to_string())
+        .spawn(move || {
+            let conditions = apply(&request);
+            let (latency, missed) = bare_loop(duration);
+            (conditions, latency, missed)
+        })
+        .map(std::thread::JoinHandle::join);
+    let Ok(Ok((conditions, latency, missed))) = measured else {
+        return Examination {
+            fit: false,
+            verdict: "the measuring thread could not be run".to_string(),
+            conditions: Conditions::default(),
+            wakeups: 0,
+            wake_us: Quantiles::default(),
+            missed: 0,
+        };
+    };
+    let wake_us = latency.quantiles_us();
+    let quiet = wake_us.p999 < 200.0 && missed * 1000 <= latency.count();
+    let fit = conditions.degraded.is_empty() && quiet;
+    let verdict = match (conditions.degraded.is_empty(), quiet) {
+        (true, true) => "fit for a 1 kHz loop".to_string(),
+        (false, true) => "timing is good now, but not everything asked for was granted: a busy machine will stall the loop"
+            .to_string(),
+        (_, false) => format!(
+            "not fit for a 1 kHz loop: p99.9 of the wake-up latency is {:.0} us (200 us allowed), {missed} of {} wake-ups \
+             came a whole period late",
+            wake_us.p999,
+            latency.count()
+        ),
+    };
+    Examination {
+        fit,
+        verdict,
+        conditions,
+        wakeups: latency.count(),
+        wake_us,
+        missed,
+    }
+}
+
+/// A bare absolute-sleep loop at 1 kHz on the calling thread: its wake-up latencies and the periods it missed.
+///
+/// It is the yardstick beside every timing of the real loop: stalls seen here are the machine's own.
+pub fn bare_loop(duration: Duration) -> (Latency, u64) {
+    const PERIOD_NS: i64 = 1_000_000;
+    let mut latency = Latency::new();
+    let mut missed = 0;
+    let start = monotonic_ns() + PERIOD_NS;
+    let ticks = (duration.as_nanos() / PERIOD_NS as u128) as i64;
+    let mut tick = 0;
+    while tick < ticks {
+        let due = start + tick * PERIOD_NS;
+        sleep_until_ns(due);
+        let late = (monotonic_ns() - due).max(0);
+        latency.record(late as u64);
+        let skipped = late / PERIOD_NS;
+        missed += skipped as u64;
+        tick += 1 + skipped;
+    }
+    (latency, missed)
+}
+
+impl fmt::Display for Conditions {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        writeln!(f, "  kernel        {}", self.kernel)?;
+        writeln!(
+            f,
+            "  policy        {} priority {}",
+            self.policy, self.priority
+        )?;
+        match self.cpu {
+            Some(cpu) => writeln!(f, "  CPU           pinned to {cpu} of {}", self.cpus)?,
+            None => writeln!(f, "  CPU           not pinned, {} available", self.cpus)?,
+        }
+        let isolated = if self.isolated.is_empty() {
+            "none"
+        } else {
+            &self.isolated
+        };
+        writeln!(f, "  isolated CPUs {isolated}")?;
+        writeln!(f, "  governor      {}", self.governor)?;
+        writeln!(
+            f,
+            "  memory        {}",
+            if self.memory_locked {
+                "locked"
+            } else {
+                "not locked"
+            }
+        )?;
+        for line in &self.degraded {
+            writeln!(f, "  DEGRADED      {line}")?;
+        }
+        Ok(())
+    }
+}
+
+impl fmt::Display for Examination {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let q = &self.wake_us;
+        writeln!(f, "{}", self.verdict)?;
+        write!(f, "{}", self.conditions)?;
+        writeln!(
+            f,
+            "  wake-up       p50 {:.1} us, p99 {:.1} us, p99.9 {:.1} us, max {:.1} us over {} wake-ups, {} missed",
+            q.p50, q.p99, q.p999, q.max, self.wakeups, self.missed
+        )
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_cannot_be_granted_is_named_and_nothing_else_is_claimed() {
+        let conditions = std::thread::spawn(|| {
+            apply(&Request {
+                fifo_priority: Some(200),
+                cpu: Some(CpuSet::MAX_CPU - 1),
+                lock_memory: false,
+            })
+        })
+        .join()
+        .expect("the thread ends");
+        assert_eq!(conditions.priority, 0);
+        assert_eq!(conditions.cpu, None);
+        assert!(!conditions.memory_locked);
+        let text = conditions.degraded.join("\n");
+        assert!(
+            text.contains("SCHED_FIFO priority 200") && text.contains("pinning"),
+            "{text}"
+        );
+    }
+
+    #[test]
+    fn best_effort_is_always_shown_as_degraded() {
+        let examination = examine(&Request::best_effort(), Duration::from_millis(50));
+        assert!(!examination.fit);
+        assert!(
+            examination
+                .to_string()
+                .contains("DEGRADED      best effort")
+        );
+        assert!(examination.wakeups > 0);
+    }
+}
