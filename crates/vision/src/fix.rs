@@ -40,3 +40,21 @@ pub struct Fix {
     /// Whether the fix can be used.
     pub verdict: Verdict,
 }
+
+impl Fix {
+    /// A fix without a position: the place looked at and the reason.
+    pub fn none(x_px: f64, y_px: f64, verdict: Verdict) -> Self {
+        Fix {
+            x_px,
+            y_px,
+            var_x_px2: f64::INFINITY,
+            var_y_px2: f64::INFINITY,
+            cov_xy_px2: 0.0,
+            amplitude: 0.0,
+            background: 0.0,
+            residual_ratio: 0.0,
+            snr: 0.0,
+            verdict,
+        }
+    }
+}

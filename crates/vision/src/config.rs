@@ -1,0 +1,338 @@
+//! Settings of the localiser: made once, checked once, never changed while frames run.
+
+use crate::profile::{PixelResponse, ProfileSpec, Template};
+use serde::{Deserialize, Serialize};
+
+/// Largest side of the fitted window, px. The buffers are of fixed size.
+pub const MAX_WINDOW_PX: usize = 63;
+
+/// Noise of one pixel, grey levels.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+#[serde(tag = "kind", rename_all = "kebab-case", deny_unknown_fields)]
+pub enum Noise {
+    /// The same in every pixel, measured on the border of each window and averaged over the frames.
+    #[default]
+    Estimated,
+    /// Known: variance `read_sd_grey^2 + shot_grey_per_electron * (grey - black_level_grey)`.
+    Known {
+        /// Standard deviation without light, grey levels.
+        read_sd_grey: f64,
+        /// Grey levels per photo-electron; 0 for no shot noise.
+        #[serde(default)]
+        shot_grey_per_electron: f64,
+        /// Grey level without light.
+        #[serde(default)]
+        black_level_grey: f64,
+    },
+}
+
+/// Whether beads have a core brighter or darker than the background.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Polarity {
+    /// Core brighter than the background.
+    #[default]
+    Bright,
+    /// Core darker than the background.
+    Dark,
+}
+
+/// Settings of a [`crate::Localiser`].
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct LocaliserConfig {
+    /// Profile of the bead.
+    pub profile: ProfileSpec,
+    /// Side of the square window fitted, px: odd, 7 to 63, wide enough for the whole ring.
+    pub window_px: usize,
+    /// Core brighter or darker than the background.
+    #[serde(default)]
+    pub polarity: Polarity,
+    /// What a pixel reads of the profile.
+    #[serde(default)]
+    pub pixel_response: PixelResponse,
+    /// Noise of a pixel.
+    #[serde(default)]
+    pub noise: Noise,
+    /// Peak contrast over the noise of a pixel below which there is no signal.
+    #[serde(default = "defaults::min_snr")]
+    pub min_snr: f64,
+    /// Residual variance over noise variance above which the fit is bad ...
+    #[serde(default = "defaults::max_residual_ratio")]
+    pub max_residual_ratio: f64,
+    /// ... unless the residual is explained by a template wrong by this fraction of the amplitude (RMS over the window).
+    #[serde(default = "defaults::template_tolerance")]
+    pub template_tolerance: f64,
+    /// Passes over the window after which the fit counts as not converged, 3 to 50.
+    #[serde(default = "defaults::max_passes")]
+    pub max_passes: u32,
+}
+
+mod defaults {
+    pub fn min_snr() -> f64 {
+        3.0
+    }
+    pub fn max_residual_ratio() -> f64 {
+        1.5
+    }
+    pub fn template_tolerance() -> f64 {
+        0.06
+    }
+    pub fn max_passes() -> u32 {
+        12
+    }
+}
+
+/// A setting that cannot be used.
+#[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
+#[error("{key} = {value}: must be {must_be}")]
+pub struct ConfigError {
+    /// Name of the setting.
+    pub key: &'static str,
+    /// Its value.
+    pub value: f64,
+    /// What would be right, with the unit.
+    pub must_be: &'static str,
+}
+
+impl LocaliserConfig {
+    /// Default settings for a profile: the smallest odd window that holds the bead and its ring, at least 15 px.
+    pub fn new(profile: ProfileSpec) -> Self {
+        // The dark ring of a bead ends at 1.85 edge radii; four standard deviations hold a Gaussian.
+        let reach_px = match profile {
+            ProfileSpec::Ring { edge_px } => 1.85 * edge_px,
+            ProfileSpec::Gaussian { sigma_px } => 4.0 * sigma_px,
+        };
+        let window_px = (2 * reach_px.ceil() as usize + 1).clamp(15, MAX_WINDOW_PX);
+        LocaliserConfig {
+            profile,
+            window_px,
+            polarity: Polarity::default(),
+            pixel_response: PixelResponse::default(),
+            noise: Noise::default(),
+            min_snr: defaults::min_snr(),
+            max_residual_ratio: defaults::max_residual_ratio(),
+            template_tolerance: defaults::template_tolerance(),
+            max_passes: defaults::max_passes(),
+        }
+    }
+
+    /// Checks every setting and tabulates the profile.
+    ///
+    /// # Errors
+    /// Names the first setting that cannot be used.
+    pub fn template(&self) -> Result<Template, ConfigError> {
+        let check = |ok: bool, key, value, must_be| {
+            if ok {
+                Ok(())
+            } else {
+                Err(ConfigError {
+                    key,
+                    value,
+                    must_be,
+                })
+            }
+        };
+        let (key, size_px) = match self.profile {
+            ProfileSpec::Ring { edge_px } => ("profile.edge_px", edge_px),
+            ProfileSpec::Gaussian { sigma_px } => ("profile.sigma_px", sigma_px),
+        };
+        check(
+            (0.5..=1000.0).contains(&size_px),
+            key,
+            size_px,
+            "between 0.5 and 1000 px",
+        )?;
+        let side_ok = (7..=MAX_WINDOW_PX).contains(&self.window_px) && self.window_px % 2 == 1;
+        check(
+            side_ok,
+            "window_px",
+            self.window_px as f64,
+            "an odd number of pixels from 7 to 63",
+        )?;
+        let wide_enough = self.window_px as f64 >= 2.0 * size_px;
+        check(
+            wide_enough,
+            "window_px",
+            self.window_px as f64,
+            "at least as wide as the bead, in px",
+        )?;
+        let at_least = |v: f64, low: f64| v.is_finite() && v >= low;
+        check(
+            at_least(self.min_snr, 1.0),
+            "min_snr",
+            self.min_snr,
+            "1 or more",
+        )?;
+        check(
+            at_least(self.max_residual_ratio, 1.0),
+            "max_residual_ratio",
+            self.max_residual_ratio,
+            "1 or more",
+        )?;
+        let tolerance = self.template_tolerance;
+        check(
+            (0.0..1.0).contains(&tolerance),
+            "template_tolerance",
+            tolerance,
+            "a fraction from 0 to below 1",
+        )?;
+        let passes = self.max_passes;
+        check(
+            (3..=50).contains(&passes),
+            "max_passes",
+            f64::from(passes),
+            "between 3 and 50 passes",
+        )?;
+        if let Noise::Known {
+            read_sd_grey,
+            shot_grey_per_electron,
+            black_level_grey,
+        } = self.noise
+        {
+            let positive = read_sd_grey.is_finite() && read_sd_grey > 0.0;
+            check(
+                positive,
+                "noise.read_sd_grey",
+                read_sd_grey,
+                "above 0 grey levels",
+            )?;
+            let gain = shot_grey_per_electron;
+            check(
+                at_least(gain, 0.0),
+                "noise.shot_grey_per_electron",
+                gain,
+                "0 grey levels per electron or more",
+            )?;
+            check(
+                black_level_grey.is_finite(),
+                "noise.black_level_grey",
+                black_level_grey,
+                "a finite grey level",
+            )?;
+        }
+        let refused = ConfigError {
+            key,
+            value: size_px,
+            must_be: "a finite size above 0 px",
+        };
+        self.profile.template(self.pixel_response).ok_or(refused)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn default_window_for_the_measured_bead_is_25_px() {
+        assert_eq!(
+            LocaliserConfig::new(ProfileSpec::Ring { edge_px: 6.373 }).window_px,
+            25
+        );
+        assert_eq!(
+            LocaliserConfig::new(ProfileSpec::Gaussian { sigma_px: 3.0 }).window_px,
+            25
+        );
+    }
+
+    #[test]
+    fn every_bad_setting_is_refused_by_name() {
+        let good = LocaliserConfig::new(ProfileSpec::Ring { edge_px: 5.0 });
+        assert!(good.template().is_ok());
+        let known = |read_sd_grey, shot_grey_per_electron, black_level_grey| Noise::Known {
+            read_sd_grey,
+            shot_grey_per_electron,
+            black_level_grey,
+        };
+        let cases = [
+            (
+                LocaliserConfig {
+                    profile: ProfileSpec::Ring { edge_px: f64::NAN },
+                    ..good.clone()
+                },
+                "profile.edge_px",
+            ),
+            (
+                LocaliserConfig {
+                    profile: ProfileSpec::Gaussian { sigma_px: 0.0 },
+                    ..good.clone()
+                },
+                "profile.sigma_px",
+            ),
+            (
+                LocaliserConfig {
+                    window_px: 24,
+                    ..good.clone()
+                },
+                "window_px",
+            ),
+            (
+                LocaliserConfig {
+                    window_px: 65,
+                    ..good.clone()
+                },
+                "window_px",
+            ),
+            (
+                LocaliserConfig {
+                    window_px: 9,
+                    ..good.clone()
+                },
+                "window_px",
+            ),
+            (
+                LocaliserConfig {
+                    min_snr: 0.0,
+                    ..good.clone()
+                },
+                "min_snr",
+            ),
+            (
+                LocaliserConfig {
+                    max_residual_ratio: 0.5,
+                    ..good.clone()
+                },
+                "max_residual_ratio",
+            ),
+            (
+                LocaliserConfig {
+                    template_tolerance: 1.0,
+                    ..good.clone()
+                },
+                "template_tolerance",
+            ),
+            (
+                LocaliserConfig {
+                    max_passes: 1,
+                    ..good.clone()
+                },
+                "max_passes",
+            ),
+            (
+                LocaliserConfig {
+                    noise: known(0.0, 0.0, 0.0),
+                    ..good.clone()
+                },
+                "noise.read_sd_grey",
+            ),
+            (
+                LocaliserConfig {
+                    noise: known(1.0, -1.0, 0.0),
+                    ..good.clone()
+                },
+                "noise.shot_grey_per_electron",
+            ),
+            (
+                LocaliserConfig {
+                    noise: known(1.0, 0.0, f64::NAN),
+                    ..good.clone()
+                },
+                "noise.black_level_grey",
+            ),
+        ];
+        for (config, key) in cases {
+            assert_eq!(config.template().unwrap_err().key, key);
+        }
+    }
+}

@@ -1,0 +1,172 @@
+//! The window around a bead, copied out of the frame into a buffer of fixed size.
+
+use crate::config::MAX_WINDOW_PX;
+use crate::frame::{Frame, Pixels};
+
+/// Pixels that are computed on together.
+pub(crate) const LANES: usize = 4;
+/// Row length of the buffer: the largest window rounded up to whole lanes.
+pub(crate) const STRIDE: usize = MAX_WINDOW_PX.next_multiple_of(LANES);
+
+/// One row of a window.
+pub(crate) type Row = [f32; STRIDE];
+
+/// A window of the frame, clipped at the frame's border, as grey levels above `pedestal`.
+#[derive(Debug, Clone)]
+pub(crate) struct Crop {
+    pub rows: Box<[Row; MAX_WINDOW_PX]>,
+    /// 1 in the columns of the window, 0 in those that fill up the lanes.
+    pub mask: Row,
+    pub x0: usize,
+    pub y0: usize,
+    pub width: usize,
+    pub height: usize,
+    /// Grey level taken off every pixel, so that single precision loses nothing.
+    pub pedestal: f32,
+}
+
+impl Crop {
+    pub fn new() -> Self {
+        let rows = Box::new([[0.0; STRIDE]; MAX_WINDOW_PX]);
+        Crop {
+            rows,
+            mask: [0.0; STRIDE],
+            x0: 0,
+            y0: 0,
+            width: 0,
+            height: 0,
+            pedestal: 0.0,
+        }
+    }
+
+    /// Copies the window of side `side` centred on the pixel nearest to (`x_px`, `y_px`). False when less than 5 x 5
+    /// pixels of it lie within the frame, or the frame holds fewer pixels than it claims.
+    pub fn take(&mut self, frame: &Frame, x_px: f64, y_px: f64, side: usize) -> bool {
+        let half = (side.min(MAX_WINDOW_PX) / 2) as f64;
+        let first = |c: f64| (c.round() - half).max(0.0) as usize;
+        let end = |c: f64, len: usize| ((c.round() + half + 1.0).max(0.0) as usize).min(len);
+        let (x0, x1) = (first(x_px), end(x_px, frame.width));
+        let (y0, y1) = (first(y_px), end(y_px, frame.height));
+        if !(x_px.is_finite() && y_px.is_finite()) || x1 < x0 + 5 || y1 < y0 + 5 {
+            return false;
+        }
+        (self.x0, self.y0, self.width, self.height) = (x0, y0, x1 - x0, y1 - y0);
+        for (i, m) in self.mask.iter_mut().enumerate() {
+            *m = f32::from(u8::from(i < self.width));
+        }
+        let copied = match frame.pixels {
+            Pixels::Mono8(p) => self.copy(p, frame.width),
+            Pixels::Mono16(p) => self.copy(p, frame.width),
+        };
+        if copied {
+            self.take_off_pedestal();
+        }
+        copied
+    }
+
+    fn copy<T: Copy>(&mut self, pixels: &[T], frame_width: usize) -> bool
+    where
+        f32: From<T>,
+    {
+        for (j, row) in self.rows.iter_mut().enumerate().take(self.height) {
+            let start = (self.y0 + j) * frame_width + self.x0;
+            let Some(source) = pixels.get(start..start + self.width) else {
+                return false;
+            };
+            for (to, from) in row.iter_mut().zip(source) {
+                *to = f32::from(*from);
+            }
+        }
+        true
+    }
+
+    fn take_off_pedestal(&mut self) {
+        let (mut sum, mut count) = (0.0, 0.0_f32);
+        self.border(|v, _| {
+            sum += v;
+            count += 1.0;
+        });
+        self.pedestal = sum / count.max(1.0);
+        let (width, pedestal) = (self.width, self.pedestal);
+        for row in self.rows.iter_mut().take(self.height) {
+            for v in row.iter_mut().take(width) {
+                *v -= pedestal;
+            }
+        }
+    }
+
+    /// Visits the pixels along the window's border; the second argument tells whether the one before was its neighbour.
+    fn border(&self, mut visit: impl FnMut(f32, bool)) {
+        let (last_row, last_column) = (self.height.saturating_sub(1), self.width.saturating_sub(1));
+        for j in [0, last_row] {
+            for (i, v) in self.rows[j.min(MAX_WINDOW_PX - 1)]
+                .iter()
+                .enumerate()
+                .take(self.width)
+            {
+                visit(*v, i > 0);
+            }
+        }
+        for i in [0, last_column] {
+            for (j, row) in self.rows.iter().enumerate().take(last_row).skip(1) {
+                visit(row[i.min(STRIDE - 1)], j > 1);
+            }
+        }
+    }
+
+    /// Noise variance of a pixel from differences of neighbours along the border, grey levels squared. Differences are
+    /// blind to uneven light; those above four times the mean (another bead's edge) are left out.
+    pub fn noise_variance(&self) -> f64 {
+        let mut limit = f32::INFINITY;
+        for _ in 0..2 {
+            let (mut previous, mut sum, mut count) = (0.0_f32, 0.0_f32, 0.0_f32);
+            self.border(|v, neighbour| {
+                let d = (v - previous).abs();
+                previous = v;
+                if neighbour && d < limit {
+                    sum += d;
+                    count += 1.0;
+                }
+            });
+            limit = 4.0 * sum / count.max(1.0);
+        }
+        // The mean of |d| for normal noise is sigma * 2 / sqrt(pi). `limit` holds four times it.
+        let sd = f64::from(limit) / 4.0 * core::f64::consts::PI.sqrt() / 2.0;
+        sd * sd
+    }
+
+    /// Centroid of the pixels on the bead's side of half the largest contrast, within `reach_px` of the brightest, in
+    /// frame coordinates. `sign` is -1 for a dark core.
+    pub fn centroid(&self, sign: f32, reach_px: f64) -> Option<(f64, f64)> {
+        // A sum of three pixels in a row, so that one hot pixel does not lead astray.
+        let (mut best, mut at) = (0.0_f32, None);
+        for (j, row) in self.rows.iter().enumerate().take(self.height) {
+            for (i, w) in row
+                .windows(3)
+                .enumerate()
+                .take(self.width.saturating_sub(2))
+            {
+                let sum = sign * w.iter().sum::<f32>();
+                if sum > best {
+                    (best, at) = (sum, Some((i + 1, j)));
+                }
+            }
+        }
+        let (i0, j0) = at?;
+        let threshold = best / 6.0;
+        let (mut sx, mut sy, mut s) = (0.0_f64, 0.0_f64, 0.0_f64);
+        for (j, row) in self.rows.iter().enumerate().take(self.height) {
+            for (i, v) in row.iter().enumerate().take(self.width) {
+                let above = sign * v - threshold;
+                let near = f64::hypot(i as f64 - i0 as f64, j as f64 - j0 as f64) <= 2.0 * reach_px;
+                if above > 0.0 && near {
+                    let above = f64::from(above);
+                    sx += above * i as f64;
+                    sy += above * j as f64;
+                    s += above;
+                }
+            }
+        }
+        (s > 0.0).then(|| (self.x0 as f64 + sx / s, self.y0 as f64 + sy / s))
+    }
+}

@@ -1,0 +1,98 @@
+//! Localising a frame allocates nothing, whatever the verdict.
+#![allow(unsafe_code)]
+
+use cellpos_vision::{
+    Frame, Localiser, LocaliserConfig, Noise, PixelResponse, Pixels, ProfileSpec, Verdict,
+};
+use std::alloc::{GlobalAlloc, Layout, System};
+use std::cell::Cell;
+
+thread_local! {
+    static ALLOCATIONS: Cell<u64> = const { Cell::new(0) };
+}
+
+struct Counting;
+
+// SAFETY: every call is handed on unchanged to the system's allocator; the counter is a thread-local without a
+// destructor and without lazy initialisation, so counting cannot allocate.
+unsafe impl GlobalAlloc for Counting {
+    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
+        ALLOCATIONS.with(|c| c.set(c.get() + 1));
+        // SAFETY: the caller's promise about `layout` is passed on.
+        unsafe { System.alloc(layout) }
+    }
+    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
+        // SAFETY: `pointer` came from `System.alloc` with this `layout`.
+        unsafe { System.dealloc(pointer, layout) }
+    }
+}
+
+#[global_allocator]
+static ALLOCATOR: Counting = Counting;
+
+fn allocations() -> u64 {
+    ALLOCATIONS.with(Cell::get)
+}
+
+#[test]
+fn locating_allocates_nothing_for_any_verdict() {
+    let before = allocations();
+    drop(std::hint::black_box(vec![0_u8; 100]));
+    assert_eq!(allocations(), before + 1, "the counter must count");
+
+    let spec = ProfileSpec::Ring { edge_px: 5.0 };
+    let template = spec.template(PixelResponse::Point).unwrap();
+    let mut image = vec![100.0_f32; 64 * 64];
+    template.draw(&mut image, 64, 30.3, 31.7, 80.0);
+    let mut ripple = 0.7_f32;
+    for v in &mut image {
+        ripple = 3.9 * ripple * (1.0 - ripple);
+        *v += 4.0 * (ripple - 0.5);
+    }
+    let bead: Vec<u8> = image.iter().map(|v| v.round() as u8).collect();
+    let bead16: Vec<u16> = image.iter().map(|v| (v * 16.0) as u16).collect();
+    let blank = vec![100_u8; 64 * 64];
+    let shot = Noise::Known {
+        read_sd_grey: 1.2,
+        shot_grey_per_electron: 0.01,
+        black_level_grey: 0.0,
+    };
+    for noise in [Noise::Estimated, shot] {
+        let mut localiser = Localiser::new(LocaliserConfig {
+            noise,
+            ..LocaliserConfig::new(spec)
+        })
+        .unwrap();
+        let guesses = [
+            None,
+            Some((30.0, 32.0)),
+            Some((36.0, 30.0)),
+            Some((2.0, 2.0)),
+            Some((-9.0, 4.0)),
+            Some((f64::NAN, 0.0)),
+        ];
+        let frames = [
+            Pixels::Mono8(&bead),
+            Pixels::Mono16(&bead16),
+            Pixels::Mono8(&blank),
+            Pixels::Mono8(&bead[..50]),
+        ];
+        let mut good = 0;
+        let before = allocations();
+        for pixels in frames {
+            for guess in guesses {
+                let fix = localiser.locate(
+                    &Frame {
+                        width: 64,
+                        height: 64,
+                        pixels,
+                    },
+                    guess,
+                );
+                good += u32::from(fix.verdict == Verdict::Good);
+            }
+        }
+        assert_eq!(allocations(), before);
+        assert!(good >= 3, "{good}");
+    }
+}
