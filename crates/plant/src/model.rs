@@ -1,0 +1,140 @@
+//! [`Model`]: the plant with its working point, effects and noise; the one artifact that identify writes, the
+//! emulator runs, design reads, reconcile extends and track carries.
+
+use crate::effect::Effect;
+use crate::error::ModelError;
+use crate::model_file;
+use crate::transfer::TransferFunction;
+use std::collections::BTreeMap;
+use std::path::Path;
+
+/// Noise that is always present and no discrepancy unless its size is wrong.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Noise {
+    /// Diffusion coefficient D of the bead, um^2/s: increments over dt have the variance 2 D dt.
+    pub diffusion_um2_per_s: f64,
+    /// Standard deviation of the localisation noise, um RMS, white.
+    pub localisation_um: f64,
+}
+
+impl Noise {
+    /// Neither Brownian motion nor localisation noise.
+    pub const NONE: Self = Self {
+        diffusion_um2_per_s: 0.0,
+        localisation_um: 0.0,
+    };
+}
+
+/// Covariance of fitted parameters, as identify and reconcile write it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Covariance {
+    /// Names of the parameters, for example `plant.num[0]` or `time-delay.delay_s`.
+    pub parameters: Vec<String>,
+    /// Row by row, in the units of the parameters.
+    pub matrix: Vec<Vec<f64>>,
+}
+
+/// A plant with its effects and noise, read from and written to model.toml.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Model {
+    /// A short name.
+    pub name: String,
+    /// What it is a model of; may be empty.
+    pub description: String,
+    /// From PZT displacement (from the working point, um) to bead position (um).
+    pub plant: TransferFunction,
+    /// The displacement at which the bead is at rest, um.
+    pub working_point_um: f64,
+    /// Effects, in any order: they act in the order of [`Effect::order`].
+    pub effects: Vec<Effect>,
+    /// Brownian motion and localisation noise.
+    pub noise: Noise,
+    /// Covariance of the fitted parameters, if they were fitted.
+    pub covariance: Option<Covariance>,
+    /// 95 % confidence intervals \[low, high\] by parameter name.
+    pub intervals: BTreeMap<String, [f64; 2]>,
+    /// Where the model comes from: free keys and texts (command, data files and their hashes, versions).
+    pub provenance: BTreeMap<String, String>,
+}
+
+impl Model {
+    /// Eq. (6) about a working point of 4 um, without effects, with the Brownian motion of a 1 um bead in mid-slit
+    /// (D = 0.33 um^2/s) and 30 nm of localisation noise.
+    pub fn eq6() -> Self {
+        Self {
+            name: "eq6".to_owned(),
+            description: "Eq. (6) of Mizoue et al. 2017, the nominal plant".to_owned(),
+            plant: TransferFunction::eq6(),
+            working_point_um: 4.0,
+            effects: Vec::new(),
+            noise: Noise {
+                diffusion_um2_per_s: 0.33,
+                localisation_um: 0.03,
+            },
+            covariance: None,
+            intervals: BTreeMap::new(),
+            provenance: BTreeMap::new(),
+        }
+    }
+
+    /// The model that a name or a path stands for: `eq6` is built in, anything else is a file.
+    ///
+    /// # Errors
+    /// A file that cannot be read, and all that [`Self::from_toml_str`] refuses.
+    pub fn load(name_or_path: &str) -> Result<Self, ModelError> {
+        if name_or_path == "eq6" {
+            Ok(Self::eq6())
+        } else {
+            Self::load_file(Path::new(name_or_path))
+        }
+    }
+
+    /// Reads a model file.
+    ///
+    /// # Errors
+    /// A file that cannot be read, and all that [`Self::from_toml_str`] refuses.
+    pub fn load_file(path: &Path) -> Result<Self, ModelError> {
+        let file = path.display().to_string();
+        let text = std::fs::read_to_string(path).map_err(|error| ModelError::Unreadable {
+            file: file.clone(),
+            reason: if error.kind() == std::io::ErrorKind::NotFound {
+                "there is no such file (a model is a TOML file; `eq6` is built in)".to_owned()
+            } else {
+                error.to_string()
+            },
+        })?;
+        Self::from_toml_str(&text, &file)
+    }
+
+    /// Reads a model from the text of a TOML file; `file_name` is for the messages only.
+    ///
+    /// # Errors
+    /// Text that is not TOML, unknown keys, missing keys, wrong types, numbers that are not finite or out of range,
+    /// coefficients that make no plant: each with line, column and what would be right.
+    pub fn from_toml_str(text: &str, file_name: &str) -> Result<Self, ModelError> {
+        model_file::read(text, file_name)
+    }
+
+    /// The model as the text of a TOML file. Reading it back gives the same model to the bit.
+    pub fn to_toml_string(&self) -> String {
+        model_file::write(self)
+    }
+
+    /// The first effect with this id.
+    pub fn effect(&self, id: &str) -> Option<&Effect> {
+        self.effects.iter().find(|e| e.id() == id)
+    }
+
+    /// The same model with an effect added.
+    pub fn with_effect(mut self, effect: Effect) -> Self {
+        self.effects.push(effect);
+        self
+    }
+
+    /// The effects in the order in which they act.
+    pub fn ordered_effects(&self) -> Vec<&Effect> {
+        let mut effects: Vec<&Effect> = self.effects.iter().collect();
+        effects.sort_by_key(|e| e.order());
+        effects
+    }
+}
