@@ -1,2 +1,41 @@
-//! Self-contained HTML reports with SVG plots.
+//! Self-contained HTML reports with inline SVG plots.
+//!
+//! A [`Report`] is a title and a sequence of sections, paragraphs, notes, tables and [`Figure`]s. It is written as one
+//! HTML file without scripts, fonts or anything else from the network, readable on light and dark screens, and, if
+//! wanted, every figure beside it as SVG and as CSV. The same calls always give the same bytes: nothing here reads a
+//! clock, a locale or a random number.
+//!
+//! Long traces are thinned to what a screen can show (minimum and maximum per pixel column), so that an hour at 1 kHz
+//! stays a small picture with every spike in it; [`Figure::to_csv`] writes the data as given. Axes carry their unit.
+//!
+//! Not for interactive plots, and not for numbers that a program should read: write JSON beside the report for that.
+//!
+//! ```
+//! use cellpos_report::{Axis, Figure, Panel, Report, Series};
+//! let frequency_hz = [2.0, 20.0, 200.0];
+//! let mut report = Report::new("Frequency response");
+//! report.paragraph("Gain of the nominal plant.");
+//! report.figure(
+//!     Figure::new("gain", "Gain against frequency").panel(
+//!         Panel::new(Axis::log("frequency", "Hz"), Axis::linear("gain", "dB"))
+//!             .series(Series::line("Eq. (6)", &frequency_hz, &[30.62, 9.88, -10.42])),
+//!     ),
+//! );
+//! assert!(report.to_html().contains("<svg"));
+//! ```
 #![forbid(unsafe_code)]
+
+mod axis;
+mod csv;
+mod draw;
+mod figure;
+mod heat;
+mod html;
+mod series;
+mod svg;
+mod thin;
+
+pub use axis::{Axis, Scale};
+pub use figure::{Figure, HeatMap, Panel};
+pub use html::{Column, Report, ReportError, Status, Table};
+pub use series::{Kind, Series};

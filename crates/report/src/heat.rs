@@ -1,0 +1,127 @@
+//! Heat maps to SVG.
+
+use crate::draw::WIDTH_PX;
+use crate::figure::HeatMap;
+use crate::svg::{self, Anchor, Svg, px};
+use std::fmt::Write;
+
+/// Draws a heat map with its colour bar and returns the height.
+pub(crate) fn heat_map(svg: &mut Svg, map: &HeatMap) -> f64 {
+    let widest = map
+        .rows
+        .iter()
+        .map(|name| svg::text_width_px(name))
+        .fold(40.0, f64::max);
+    let left = (widest + 16.0).min(WIDTH_PX / 3.0);
+    let count = map.columns.len().max(1) as f64;
+    let cell_w = ((WIDTH_PX - left - 90.0) / count).min(110.0);
+    let cell_h = 26.0;
+    let top = 30.0;
+    let (low, high) = heat_range(map);
+    for (column, name) in map.columns.iter().enumerate() {
+        let x = left + (column as f64 + 0.5) * cell_w;
+        svg.text(
+            "",
+            (x, top - 9.0),
+            Anchor::Middle,
+            &svg::fit(name, cell_w - 2.0),
+        );
+    }
+    for (row, name) in map.rows.iter().enumerate() {
+        let y = top + row as f64 * cell_h;
+        svg.text(
+            "",
+            (left - 8.0, y + cell_h / 2.0 + 4.0),
+            Anchor::End,
+            &svg::fit(name, left - 10.0),
+        );
+        for column in 0..map.columns.len() {
+            let x = left + column as f64 * cell_w;
+            let Some(value) = map.value(row, column) else {
+                svg.rect("nil", (x + 0.5, y + 0.5), (cell_w - 1.0, cell_h - 1.0));
+                continue;
+            };
+            let (fill, dark) = heat_color(value, low, high);
+            heat_rect(svg, fill, (x + 0.5, y + 0.5), (cell_w - 1.0, cell_h - 1.0));
+            let text = format!("{value:.*}", map.decimals).replace('-', "\u{2212}");
+            if svg::text_width_px(&text) < cell_w {
+                let class = if dark { "cellw" } else { "cell" };
+                let at = (x + cell_w / 2.0, y + cell_h / 2.0 + 4.0);
+                svg.text(class, at, Anchor::Middle, &text);
+            }
+        }
+    }
+    let bottom = top + map.rows.len() as f64 * cell_h;
+    let bar_y = bottom + 14.0;
+    let bar_w = (cell_w * count).min(300.0);
+    for index in 0..60 {
+        let share = f64::from(index) / 59.0;
+        let (fill, _) = heat_color(low + share * (high - low), low, high);
+        let x = left + f64::from(index) * bar_w / 60.0;
+        heat_rect(svg, fill, (x, bar_y), (bar_w / 60.0 + 0.3, 10.0));
+    }
+    let number = |value: f64| format!("{value:.*}", map.decimals).replace('-', "\u{2212}");
+    svg.text("mut", (left, bar_y + 24.0), Anchor::Start, &number(low));
+    svg.text(
+        "mut",
+        (left + bar_w, bar_y + 24.0),
+        Anchor::End,
+        &number(high),
+    );
+    svg.text(
+        "",
+        (left + bar_w + 12.0, bar_y + 10.0),
+        Anchor::Start,
+        &svg::fit(&map.label, WIDTH_PX - left - bar_w - 16.0),
+    );
+    bar_y + 34.0
+}
+
+fn heat_rect(svg: &mut Svg, (r, g, b): (u8, u8, u8), at: (f64, f64), size: (f64, f64)) {
+    let _ = write!(
+        svg.out,
+        "<rect fill=\"#{r:02x}{g:02x}{b:02x}\" x=\"{}\" y=\"{}\" width=\"{}\" height=\"{}\"/>",
+        px(at.0),
+        px(at.1),
+        px(size.0),
+        px(size.1)
+    );
+}
+
+/// Ends of the colours: symmetric about zero when the values have both signs.
+fn heat_range(map: &HeatMap) -> (f64, f64) {
+    if let Some(range) = map.range {
+        return range;
+    }
+    let finite = map.values.iter().copied().filter(|value| value.is_finite());
+    let (low, high) = finite.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), v| {
+        (low.min(v), high.max(v))
+    });
+    if low > high {
+        (0.0, 1.0)
+    } else if low < 0.0 {
+        let size = low.abs().max(high.abs());
+        (-size, size)
+    } else if high > 0.0 {
+        (0.0, high)
+    } else {
+        (0.0, 1.0)
+    }
+}
+
+/// Colour of a value, and whether text on it should be white.
+fn heat_color(value: f64, low: f64, high: f64) -> ((u8, u8, u8), bool) {
+    const PALE: [f64; 3] = [247.0, 247.0, 244.0];
+    const WARM: [f64; 3] = [179.0, 74.0, 0.0];
+    const COLD: [f64; 3] = [0.0, 88.0, 148.0];
+    let (end, share) = if low < 0.0 && value < 0.0 {
+        (COLD, value / low)
+    } else if low < 0.0 {
+        (WARM, if high > 0.0 { value / high } else { 0.0 })
+    } else {
+        (WARM, (value - low) / (high - low))
+    };
+    let share = share.clamp(0.0, 1.0);
+    let mix = |index: usize| (PALE[index] + (end[index] - PALE[index]) * share).round() as u8;
+    ((mix(0), mix(1), mix(2)), share > 0.6)
+}

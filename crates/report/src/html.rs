@@ -1,0 +1,412 @@
+//! The page: title, sections, paragraphs, notes, tables and figures.
+
+use crate::draw;
+use crate::figure::Figure;
+use crate::svg::{STYLE, escape};
+use std::fmt::Write;
+use std::path::{Path, PathBuf};
+
+/// A report that could not be written.
+#[derive(Debug, thiserror::Error)]
+pub enum ReportError {
+    /// A file or folder could not be written.
+    #[error("cannot write {path}: {source}")]
+    Write {
+        /// What was to be written.
+        path: PathBuf,
+        /// Why it failed.
+        source: std::io::Error,
+    },
+}
+
+/// How a note or a row is meant.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Status {
+    /// Neither good nor bad.
+    #[default]
+    Plain,
+    /// Holds, passed.
+    Good,
+    /// To be looked at.
+    Warning,
+    /// Failed, broken.
+    Bad,
+}
+
+impl Status {
+    fn class(self) -> &'static str {
+        match self {
+            Status::Plain => "plain",
+            Status::Good => "good",
+            Status::Warning => "warning",
+            Status::Bad => "bad",
+        }
+    }
+
+    /// A sign beside the colour, for readers who do not see colours and for prints.
+    fn sign(self) -> &'static str {
+        match self {
+            Status::Plain => "",
+            Status::Good => "\u{2713} ",
+            Status::Warning => "\u{25b2} ",
+            Status::Bad => "\u{2717} ",
+        }
+    }
+}
+
+/// Head of a column and the side its cells stand on.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Column {
+    head: String,
+    right: bool,
+}
+
+impl Column {
+    /// Text, on the left.
+    pub fn left(head: &str) -> Self {
+        Self {
+            head: head.to_owned(),
+            right: false,
+        }
+    }
+
+    /// Numbers, on the right, in figures of equal width. Write the unit in the head.
+    pub fn right(head: &str) -> Self {
+        Self {
+            head: head.to_owned(),
+            right: true,
+        }
+    }
+}
+
+/// A table.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Table {
+    columns: Vec<Column>,
+    rows: Vec<(Status, Vec<String>)>,
+    caption: String,
+}
+
+impl Table {
+    /// A table without rows.
+    pub fn new<const N: usize>(columns: [Column; N]) -> Self {
+        Self::with_columns(columns.to_vec())
+    }
+
+    /// A table without rows, for a number of columns known only when running.
+    pub fn with_columns(columns: Vec<Column>) -> Self {
+        Self {
+            columns,
+            rows: Vec::new(),
+            caption: String::new(),
+        }
+    }
+
+    /// A table of names and values.
+    pub fn key_values<K: AsRef<str>, V: AsRef<str>>(pairs: &[(K, V)]) -> Self {
+        let mut table = Self::new([Column::left(""), Column::left("")]);
+        for (key, value) in pairs {
+            table.row([key.as_ref(), value.as_ref()]);
+        }
+        table
+    }
+
+    /// A line of text below the table.
+    pub fn caption(&mut self, caption: &str) -> &mut Self {
+        caption.clone_into(&mut self.caption);
+        self
+    }
+
+    /// Adds a row. Surplus cells are dropped, missing ones left empty.
+    pub fn row<I>(&mut self, cells: I) -> &mut Self
+    where
+        I: IntoIterator,
+        I::Item: AsRef<str>,
+    {
+        self.row_with(Status::Plain, cells)
+    }
+
+    /// Adds a row that is marked as good, to be looked at, or bad.
+    pub fn row_with<I>(&mut self, status: Status, cells: I) -> &mut Self
+    where
+        I: IntoIterator,
+        I::Item: AsRef<str>,
+    {
+        let cells = cells
+            .into_iter()
+            .take(self.columns.len())
+            .map(|cell| cell.as_ref().to_owned())
+            .collect();
+        self.rows.push((status, cells));
+        self
+    }
+
+    fn html(&self, out: &mut String) {
+        out.push_str("<div class=\"scroll\"><table>");
+        if !self.caption.is_empty() {
+            let _ = write!(out, "<caption>{}</caption>", escape(&self.caption));
+        }
+        let side = |column: &Column| if column.right { " class=\"num\"" } else { "" };
+        if self.columns.iter().any(|column| !column.head.is_empty()) {
+            out.push_str("<thead><tr>");
+            for column in &self.columns {
+                let _ = write!(out, "<th{}>{}</th>", side(column), escape(&column.head));
+            }
+            out.push_str("</tr></thead>");
+        }
+        out.push_str("<tbody>\n");
+        for (status, cells) in &self.rows {
+            let _ = write!(out, "<tr class=\"{}\">", status.class());
+            for (index, column) in self.columns.iter().enumerate() {
+                let cell = cells.get(index).map_or("", String::as_str);
+                let sign = if index == 0 { status.sign() } else { "" };
+                let _ = write!(out, "<td{}>{sign}{}</td>", side(column), escape(cell));
+            }
+            out.push_str("</tr>\n");
+        }
+        out.push_str("</tbody></table></div>\n");
+    }
+}
+
+#[derive(Debug, Clone)]
+enum Block {
+    Section(String),
+    Subsection(String),
+    Paragraph(String),
+    Note(Status, String),
+    List(Vec<String>),
+    Verbatim(String),
+    Table(Table),
+    Figure(Figure),
+}
+
+/// A report: see the crate's documentation.
+#[derive(Debug, Clone)]
+pub struct Report {
+    title: String,
+    blocks: Vec<Block>,
+}
+
+impl Report {
+    /// A report without content.
+    pub fn new(title: &str) -> Self {
+        Self {
+            title: title.to_owned(),
+            blocks: Vec::new(),
+        }
+    }
+
+    fn push(&mut self, block: Block) -> &mut Self {
+        self.blocks.push(block);
+        self
+    }
+
+    /// Starts a section; sections are listed at the top of a long report.
+    pub fn section(&mut self, title: &str) -> &mut Self {
+        self.push(Block::Section(title.to_owned()))
+    }
+
+    /// Starts a part of a section.
+    pub fn subsection(&mut self, title: &str) -> &mut Self {
+        self.push(Block::Subsection(title.to_owned()))
+    }
+
+    /// Adds a paragraph of plain text (markup is shown as written).
+    pub fn paragraph(&mut self, text: &str) -> &mut Self {
+        self.push(Block::Paragraph(text.to_owned()))
+    }
+
+    /// Adds a note that stands out: a verdict, a warning.
+    pub fn note(&mut self, status: Status, text: &str) -> &mut Self {
+        self.push(Block::Note(status, text.to_owned()))
+    }
+
+    /// Adds a list.
+    pub fn list<S: AsRef<str>>(&mut self, items: &[S]) -> &mut Self {
+        let items = items.iter().map(|item| item.as_ref().to_owned()).collect();
+        self.push(Block::List(items))
+    }
+
+    /// Adds text as it stands, in letters of equal width: a command line, a file.
+    pub fn verbatim(&mut self, text: &str) -> &mut Self {
+        self.push(Block::Verbatim(text.to_owned()))
+    }
+
+    /// Adds a table.
+    pub fn table(&mut self, table: Table) -> &mut Self {
+        self.push(Block::Table(table))
+    }
+
+    /// Adds a figure. A name already taken gets a number, so that no file overwrites another.
+    pub fn figure(&mut self, mut figure: Figure) -> &mut Self {
+        let wanted = figure.name.clone();
+        let mut number = 2;
+        while self.figures().any(|other| other.name == figure.name) {
+            figure.name = format!("{wanted}-{number}");
+            number += 1;
+        }
+        self.push(Block::Figure(figure))
+    }
+
+    /// The figures, in order.
+    pub fn figures(&self) -> impl Iterator<Item = &Figure> {
+        self.blocks.iter().filter_map(|block| match block {
+            Block::Figure(figure) => Some(figure),
+            _ => None,
+        })
+    }
+
+    /// The whole report as one HTML page.
+    pub fn to_html(&self) -> String {
+        let title = escape(&self.title);
+        let mut out = String::new();
+        let _ = write!(
+            out,
+            "<!DOCTYPE html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\">\n\
+             <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\n\
+             <meta name=\"color-scheme\" content=\"light dark\">\n<title>{title}</title>\n\
+             <style>{PAGE_STYLE}{STYLE}</style>\n</head>\n<body>\n<main>\n<h1>{title}</h1>\n"
+        );
+        let sections: Vec<&String> = self
+            .blocks
+            .iter()
+            .filter_map(|block| match block {
+                Block::Section(title) => Some(title),
+                _ => None,
+            })
+            .collect();
+        if sections.len() > 3 {
+            out.push_str("<nav><ul>\n");
+            for (index, title) in sections.iter().enumerate() {
+                let _ = writeln!(
+                    out,
+                    "<li><a href=\"#section-{}\">{}</a></li>",
+                    index + 1,
+                    escape(title)
+                );
+            }
+            out.push_str("</ul></nav>\n");
+        }
+        let mut section = 0;
+        for block in &self.blocks {
+            match block {
+                Block::Section(title) => {
+                    section += 1;
+                    let _ = writeln!(out, "<h2 id=\"section-{section}\">{}</h2>", escape(title));
+                }
+                Block::Subsection(title) => {
+                    let _ = writeln!(out, "<h3>{}</h3>", escape(title));
+                }
+                Block::Paragraph(text) => {
+                    let _ = writeln!(out, "<p>{}</p>", escape(text));
+                }
+                Block::Note(status, text) => {
+                    let (class, sign) = (status.class(), status.sign());
+                    let _ = writeln!(out, "<p class=\"note {class}\">{sign}{}</p>", escape(text));
+                }
+                Block::List(items) => {
+                    out.push_str("<ul>\n");
+                    for item in items {
+                        let _ = writeln!(out, "<li>{}</li>", escape(item));
+                    }
+                    out.push_str("</ul>\n");
+                }
+                Block::Verbatim(text) => {
+                    let _ = writeln!(out, "<pre>{}</pre>", escape(text));
+                }
+                Block::Table(table) => table.html(&mut out),
+                Block::Figure(figure) => {
+                    let _ = write!(out, "<figure>\n{}", draw::figure(figure, false));
+                    if !figure.caption.is_empty() {
+                        let caption = escape(&figure.caption);
+                        let _ = writeln!(out, "<figcaption>{caption}</figcaption>");
+                    }
+                    out.push_str("</figure>\n");
+                }
+            }
+        }
+        out.push_str("</main>\n</body>\n</html>\n");
+        out
+    }
+
+    /// Writes the page to `path`; folders are made as needed, and an existing file is replaced in one step, so that a
+    /// reader never sees half a report.
+    ///
+    /// # Errors
+    /// [`ReportError::Write`] names the file.
+    pub fn write(&self, path: &Path) -> Result<(), ReportError> {
+        write_file(path, &self.to_html())
+    }
+
+    /// As [`Report::write`], and every figure beside it: `report.html` gets a folder `report-figures` with
+    /// `NAME.svg` and `NAME.csv`.
+    ///
+    /// # Errors
+    /// [`ReportError::Write`] names the file.
+    pub fn write_with_figures(&self, path: &Path) -> Result<(), ReportError> {
+        self.write(path)?;
+        let stem = path.file_stem().map_or_else(
+            || "report".into(),
+            |stem| stem.to_string_lossy().into_owned(),
+        );
+        let folder = path.with_file_name(format!("{stem}-figures"));
+        for figure in self.figures() {
+            write_file(
+                &folder.join(format!("{}.svg", figure.name)),
+                &figure.to_svg(),
+            )?;
+            write_file(
+                &folder.join(format!("{}.csv", figure.name)),
+                &figure.to_csv(),
+            )?;
+        }
+        Ok(())
+    }
+}
+
+fn write_file(path: &Path, text: &str) -> Result<(), ReportError> {
+    let attempt = || {
+        if let Some(folder) = path.parent()
+            && !folder.as_os_str().is_empty()
+        {
+            std::fs::create_dir_all(folder)?;
+        }
+        let mut name = path.file_name().unwrap_or_default().to_owned();
+        name.push(".part");
+        let part = path.with_file_name(name);
+        std::fs::write(&part, text)
+            .and_then(|()| std::fs::rename(&part, path))
+            .inspect_err(|_| {
+                let _ = std::fs::remove_file(&part);
+            })
+    };
+    attempt().map_err(|source| ReportError::Write {
+        path: path.to_owned(),
+        source,
+    })
+}
+
+const PAGE_STYLE: &str = "\
+:root{color-scheme:light dark}\
+body{margin:0;background:#fff;color:#1d2127;font:15px/1.55 system-ui,'DejaVu Sans','Segoe UI',Helvetica,Arial,sans-serif}\
+main{max-width:860px;margin:0 auto;padding:24px 20px 60px}\
+h1{font-size:26px;line-height:1.25;margin:8px 0 16px}h2{font-size:20px;margin:38px 0 10px;padding-top:8px;border-top:1px solid #dfe3e8}\
+h3{font-size:16px;margin:24px 0 6px}p{margin:8px 0}ul{margin:8px 0;padding-left:22px}\
+nav ul{columns:2;list-style:none;padding:10px 14px;background:#f5f7f9;border-radius:6px;font-size:14px}\
+a{color:#0063a0}figure{margin:18px 0}figure svg{max-width:100%;height:auto;display:block}\
+figcaption{color:#5c6470;font-size:13px;margin-top:4px}\
+.scroll{overflow-x:auto;margin:12px 0}table{border-collapse:collapse;font-size:13.5px}\
+caption{caption-side:bottom;text-align:left;color:#5c6470;font-size:13px;padding-top:4px}\
+th{text-align:left;font-weight:600;border-bottom:2px solid #c3cad2;padding:4px 14px 4px 6px;vertical-align:bottom}\
+td{border-bottom:1px solid #e8ebef;padding:4px 14px 4px 6px;vertical-align:top}\
+.num{text-align:right;font-variant-numeric:tabular-nums;padding:4px 8px}\
+tr.good td:first-child{color:#00724f}tr.warning td:first-child{color:#8a5a00}tr.bad td:first-child{color:#b3261e;font-weight:600}\
+.note{padding:10px 14px;border-left:4px solid #9aa3ae;background:#f5f7f9;border-radius:0 6px 6px 0;margin:12px 0}\
+.note.good{border-color:#009e73;background:#eaf6f1}.note.warning{border-color:#d99a00;background:#fdf6e3}.note.bad{border-color:#c8372d;background:#fcecea}\
+pre{background:#f5f7f9;padding:10px 14px;border-radius:6px;overflow-x:auto;font-size:13px;line-height:1.4}\
+@media (prefers-color-scheme:dark){\
+body{background:#14171b;color:#e4e7eb}h2{border-color:#2f353d}a{color:#6cb8ee}figcaption,caption{color:#a3acb8}\
+nav ul,.note,pre{background:#1e2329}th{border-color:#4a525d}td{border-color:#2a2f37}\
+tr.good td:first-child{color:#3ccf9f}tr.warning td:first-child{color:#f0b429}tr.bad td:first-child{color:#ff8078}\
+.note.good{background:#10281f}.note.warning{background:#2c2410}.note.bad{background:#301614}}\
+@media print{main{max-width:none}h2{break-after:avoid}figure,table{break-inside:avoid}}";

@@ -1,0 +1,188 @@
+//! Writing SVG elements: numbers, text, styles.
+
+use std::fmt::Write;
+
+/// Style shared by all figures. Plain rules instead of CSS variables: several SVG viewers know no variables.
+pub(crate) const STYLE: &str = "\
+.fg{font-family:system-ui,'DejaVu Sans','Segoe UI',Helvetica,Arial,sans-serif;font-size:12px}\
+.fg text{fill:#2b2f36}.fg .mut{fill:#5c6470}.fg .ttl{font-weight:600}\
+.fg .bg{fill:#fff}.fg .frm{fill:none;stroke:#9aa3ae;stroke-width:1}\
+.fg .grd{stroke:#e3e7ec;stroke-width:1;fill:none}.fg .grm{stroke:#f1f3f6;stroke-width:1;fill:none}\
+.fg .mrk{stroke:#5c6470;stroke-width:1;stroke-dasharray:2 3;fill:none}\
+.fg .ln{fill:none;stroke-width:1.6;stroke-linejoin:round;stroke-linecap:round}.fg .thn{stroke-width:.8}.fg .spk{stroke-width:2.4}\
+.fg .dsh{stroke-dasharray:6 4}.fg .bnd{stroke:none;fill-opacity:.2}.fg .bar{stroke:none;fill-opacity:.75}\
+.fg .dot{stroke:none}\
+.fg .s0{stroke:#0072b2}.fg .s1{stroke:#d55e00}.fg .s2{stroke:#009e73}.fg .s3{stroke:#b2589a}\
+.fg .s4{stroke:#b98200}.fg .s5{stroke:#3f9bd1}.fg .s6{stroke:#6b5fc7}.fg .s7{stroke:#444b55}\
+.fg .f0{fill:#0072b2}.fg .f1{fill:#d55e00}.fg .f2{fill:#009e73}.fg .f3{fill:#b2589a}\
+.fg .f4{fill:#b98200}.fg .f5{fill:#3f9bd1}.fg .f6{fill:#6b5fc7}.fg .f7{fill:#444b55}\
+@media (prefers-color-scheme:dark){\
+.fg text{fill:#e4e7eb}.fg .mut{fill:#a3acb8}.fg .bg{fill:#14171b}.fg .frm{stroke:#6a7380}\
+.fg .grd{stroke:#2a2f37}.fg .grm{stroke:#1f242a}.fg .mrk{stroke:#a3acb8}\
+.fg .s0{stroke:#4fb0ea}.fg .s1{stroke:#ff8a3d}.fg .s2{stroke:#2ecc9b}.fg .s3{stroke:#e093c6}\
+.fg .s4{stroke:#f0b429}.fg .s5{stroke:#8fd0f5}.fg .s6{stroke:#a89df5}.fg .s7{stroke:#c9ced6}\
+.fg .f0{fill:#4fb0ea}.fg .f1{fill:#ff8a3d}.fg .f2{fill:#2ecc9b}.fg .f3{fill:#e093c6}\
+.fg .f4{fill:#f0b429}.fg .f5{fill:#8fd0f5}.fg .f6{fill:#a89df5}.fg .f7{fill:#c9ced6}\
+.fg text.cell{fill:#1b1e23}.fg text.cellw{fill:#fff}}\
+.fg text.cell{fill:#1b1e23}.fg text.cellw{fill:#fff}.fg .nil{fill:#8a929c;fill-opacity:.25}";
+
+/// Number of colours of the palette (Okabe and Ito's, darkened where white paper asks for it).
+pub(crate) const COLORS: usize = 8;
+
+/// Where a text is held.
+#[derive(Debug, Clone, Copy)]
+pub(crate) enum Anchor {
+    Start,
+    Middle,
+    End,
+}
+
+/// Text made safe for HTML and XML: markup escaped, characters that XML forbids replaced.
+pub(crate) fn escape(text: &str) -> String {
+    let mut out = String::with_capacity(text.len());
+    for c in text.chars() {
+        match c {
+            '&' => out.push_str("&amp;"),
+            '<' => out.push_str("&lt;"),
+            '>' => out.push_str("&gt;"),
+            '"' => out.push_str("&quot;"),
+            '\'' => out.push_str("&#39;"),
+            '\t' | '\n' => out.push(c),
+            c if c.is_control() || matches!(c, '\u{fffe}' | '\u{ffff}') => out.push('\u{fffd}'),
+            c => out.push(c),
+        }
+    }
+    out
+}
+
+/// A coordinate to a tenth of a pixel, as short as it goes.
+pub(crate) fn px(value: f64) -> String {
+    let tenths = if value.is_finite() {
+        (value * 10.0).round().clamp(-1e9, 1e9) as i64
+    } else {
+        0
+    };
+    let sign = if tenths < 0 { "-" } else { "" };
+    let tenths = tenths.abs();
+    if tenths % 10 == 0 {
+        format!("{sign}{}", tenths / 10)
+    } else {
+        format!("{sign}{}.{}", tenths / 10, tenths % 10)
+    }
+}
+
+/// Width of a text in the figures' font, px; an estimate that errs on the wide side.
+pub(crate) fn text_width_px(text: &str) -> f64 {
+    text.chars()
+        .map(|c| match c {
+            'i' | 'j' | 'l' | 't' | 'f' | 'r' | '.' | ',' | ':' | ';' | '|' | '\'' | '(' | ')'
+            | ' ' => 4.4,
+            'm' | 'w' | 'M' | 'W' => 10.5,
+            c if c.is_ascii_uppercase() => 8.4,
+            _ => 7.3,
+        })
+        .sum()
+}
+
+/// Cuts a text to a width with an ellipsis.
+pub(crate) fn fit(text: &str, width_px: f64) -> String {
+    if text_width_px(text) <= width_px {
+        return text.to_owned();
+    }
+    let mut out = String::new();
+    for c in text.chars() {
+        out.push(c);
+        if text_width_px(&out) + 8.0 > width_px {
+            out.pop();
+            break;
+        }
+    }
+    out.push('\u{2026}');
+    out
+}
+
+/// Elements of one drawing.
+pub(crate) struct Svg {
+    pub(crate) out: String,
+}
+
+impl Svg {
+    pub(crate) fn line(&mut self, class: &str, from: (f64, f64), to: (f64, f64)) {
+        let _ = write!(
+            self.out,
+            "<path class=\"{class}\" d=\"M{} {}L{} {}\"/>",
+            px(from.0),
+            px(from.1),
+            px(to.0),
+            px(to.1)
+        );
+    }
+
+    pub(crate) fn rect(&mut self, class: &str, at: (f64, f64), size: (f64, f64)) {
+        let _ = write!(
+            self.out,
+            "<rect class=\"{class}\" x=\"{}\" y=\"{}\" width=\"{}\" height=\"{}\"/>",
+            px(at.0),
+            px(at.1),
+            px(size.0.max(0.0)),
+            px(size.1.max(0.0))
+        );
+    }
+
+    pub(crate) fn text(&mut self, class: &str, at: (f64, f64), anchor: Anchor, text: &str) {
+        if text.is_empty() {
+            return;
+        }
+        let anchor = match anchor {
+            Anchor::Start => "start",
+            Anchor::Middle => "middle",
+            Anchor::End => "end",
+        };
+        let _ = write!(
+            self.out,
+            "<text class=\"{class}\" x=\"{}\" y=\"{}\" text-anchor=\"{anchor}\">{}</text>",
+            px(at.0),
+            px(at.1),
+            escape(text)
+        );
+    }
+
+    /// A text that reads upwards, centred on `at`.
+    pub(crate) fn upright(&mut self, class: &str, at: (f64, f64), text: &str) {
+        let (x, y) = (px(at.0), px(at.1));
+        let _ = write!(
+            self.out,
+            "<text class=\"{class}\" x=\"{x}\" y=\"{y}\" text-anchor=\"middle\" transform=\"rotate(-90 {x} {y})\">{}</text>",
+            escape(text)
+        );
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn coordinates_are_short_and_never_negative_zero() {
+        assert_eq!(px(1.0), "1");
+        assert_eq!(px(-0.01), "0");
+        assert_eq!(px(-1.25), "-1.3");
+        assert_eq!(px(f64::NAN), "0");
+    }
+
+    #[test]
+    fn markup_and_control_characters_cannot_get_out() {
+        assert_eq!(
+            escape("<b a=\"1\">&'"),
+            "&lt;b a=&quot;1&quot;&gt;&amp;&#39;"
+        );
+        assert_eq!(escape("a\0b\u{1b}"), "a\u{fffd}b\u{fffd}");
+    }
+
+    #[test]
+    fn long_texts_are_cut_with_an_ellipsis() {
+        let cut = fit("a rather long label that cannot fit", 60.0);
+        assert!(cut.ends_with('\u{2026}') && text_width_px(&cut) <= 68.0);
+        assert_eq!(fit("short", 60.0), "short");
+    }
+}
