@@ -1,2 +1,22 @@
-//! Camera and Actuator traits, drivers, and the emulated rig.
+//! The rig: where bead positions come from and where PZT commands go.
+//!
+//! Two traits, [`PositionSource`] and [`Actuator`], are all that the loop knows. Behind the first stand cameras (trait
+//! [`Camera`]) with a localiser and a calibration, or positions without pictures; behind the second the PZT board, at
+//! the end of any byte [`Port`]: a serial line, or the emulated board in this process. Drivers may block, allocate and
+//! take locks: they run on the I/O threads, never in a tick.
 #![forbid(unsafe_code)]
+
+pub mod actuator;
+pub mod board;
+pub mod clock;
+pub mod measurement;
+pub mod source;
+
+pub use actuator::{Actuator, ActuatorError, ActuatorInfo, BoardReport};
+pub use board::{BoardHost, Port};
+pub use clock::Clock;
+pub use measurement::Measurement;
+pub use source::{
+    Calibration, Camera, CameraError, FrameBuffer, FrameStamp, PositionSource, SourceInfo,
+    VisionSource,
+};

@@ -1,7 +1,6 @@
 //! The 1 kHz loop: threads, rings, pacing, deadline account, safe states.
 #![forbid(unsafe_code)]
 
-pub mod clock;
 pub mod latency;
 pub mod realtime;
 mod tick_record;

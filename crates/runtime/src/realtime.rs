@@ -3,8 +3,8 @@
 //! Each grant (policy and priority, CPU, locked memory) is asked for, then read back. What was refused becomes a line
 //! of [`Conditions::degraded`], which is printed beside every timing figure.
 
-use crate::clock::{monotonic_ns, sleep_until_ns};
 use crate::latency::{Latency, Quantiles};
+use cellpos_rig::clock::{monotonic_ns, sleep_until_ns};
 use rustix::mm::{MlockAllFlags, mlockall};
 use rustix::thread::{CpuSet, sched_getaffinity, sched_setaffinity};
 use serde::Serialize;

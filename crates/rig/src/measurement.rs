@@ -1,0 +1,26 @@
+//! One bead position on its way from vision to the loop.
+
+use cellpos_vision::Verdict;
+
+/// A bead position as it travels through the measurement ring. Times are nanoseconds of the run's clock.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Measurement {
+    /// Id of the frame, unwrapped: rises by one per exposed frame, so that a gap means lost frames.
+    pub frame_id: u64,
+    /// Middle of the exposure.
+    pub mid_exposure_ns: i64,
+    /// When the position was ready to be used.
+    pub ready_ns: i64,
+    /// Position along the channel, um; NaN when there is none.
+    pub position_um: f64,
+    /// Variance of the position, um^2; NaN when there is none.
+    pub variance_um2: f64,
+    /// Verdict of vision: only [`Verdict::Good`] may be controlled on.
+    pub verdict: Verdict,
+    /// Peak contrast over pixel noise; NaN without picture.
+    pub snr: f64,
+    /// True bead position at `ready_ns`, um (emulated rig only, else NaN).
+    pub true_um: f64,
+    /// True PZT displacement at `ready_ns`, um (emulated rig only, else NaN).
+    pub true_pzt_um: f64,
+}
