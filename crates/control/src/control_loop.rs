@@ -19,7 +19,7 @@ pub struct Measurement {
 }
 
 /// What the loop is to do.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub enum Mode {
     /// Control the bead.
     #[default]
@@ -28,6 +28,8 @@ pub enum Mode {
     Freeze,
     /// Make the hardware safe: slew to the park displacement. The bead is lost.
     Park,
+    /// Open loop: this PZT displacement, um, within the limits. The estimator goes on.
+    Direct(f64),
 }
 
 /// What a tick is given.
@@ -41,6 +43,8 @@ pub struct LoopInput<'a> {
     pub preview_um: &'a [f64],
     /// What to do.
     pub mode: Mode,
+    /// Added to the controller's wish in [`Mode::Run`], um of PZT: excitation for identification in closed loop.
+    pub excitation_um: f64,
     /// When an optimising controller must be done; `None` (always on the virtual clock) sets no deadline.
     pub deadline: Option<std::time::Instant>,
 }
@@ -260,16 +264,18 @@ impl ControlLoop {
         let proportional_um = law.proportional(&mut pi, reference_um, bead_um);
         let requested_um = match input.mode {
             Mode::Park => self.config.limits.park_um,
+            Mode::Direct(displacement_um) => displacement_um,
             _ if controls => proportional_um + pi.integral_um,
             _ => estimate.neutral_um,
         };
+        let excitation_um = if controls { input.excitation_um } else { 0.0 };
         let output = self.limit(
             state,
             input,
             &estimate,
             fix.is_some(),
             reference_ok,
-            requested_um,
+            requested_um + excitation_um,
         );
         if controls {
             let hold = estimate.coasting || estimate.stuck;
@@ -277,7 +283,8 @@ impl ControlLoop {
                 &mut pi,
                 reference_um - bead_um,
                 requested_um,
-                output.command_um,
+                // The excitation is no saturation: the integrator must not be pulled along with it.
+                output.command_um - excitation_um,
                 hold,
             );
         } else {
