@@ -1,0 +1,281 @@
+//! A table of fields, before anything is known of their meaning.
+
+use crate::error::{Problem, TableError};
+use crate::mapping::ColumnRef;
+use std::path::{Path, PathBuf};
+
+/// A text file of rows and columns: separated by commas, semicolons, tabs or white space, with or without a header.
+/// Blank lines and lines that start with `#` are skipped; a byte-order mark and Windows line ends do no harm.
+#[derive(Debug, Clone)]
+pub struct Table<'a> {
+    path: PathBuf,
+    /// Names of the columns; `1`, `2`, ... without a header.
+    pub names: Vec<String>,
+    /// Fields of each row.
+    rows: Vec<Vec<&'a str>>,
+    /// Line of each row in the file, counted from 1.
+    lines: Vec<usize>,
+}
+
+/// How fields are told apart.
+#[derive(Debug, Clone, Copy)]
+enum Separator {
+    Char(char),
+    White,
+}
+
+impl Separator {
+    fn of(line: &str) -> Self {
+        [',', ';', '\t']
+            .into_iter()
+            .find(|separator| line.contains(*separator))
+            .map_or(Self::White, Self::Char)
+    }
+
+    fn split(self, line: &str) -> Vec<&str> {
+        match self {
+            Self::White => line.split_whitespace().collect(),
+            Self::Char(separator) => line.split(separator).map(unquote).collect(),
+        }
+    }
+}
+
+fn unquote(field: &str) -> &str {
+    let field = field.trim();
+    field
+        .strip_prefix('"')
+        .and_then(|field| field.strip_suffix('"'))
+        .map_or(field, str::trim)
+}
+
+/// A number in the notation of any program, "nan" and "inf" included; None if it is something else.
+fn number(field: &str) -> Option<f64> {
+    field.parse().ok()
+}
+
+impl<'a> Table<'a> {
+    /// Takes a text apart. `path` is only for messages.
+    ///
+    /// A first line without any number is the header.
+    ///
+    /// # Errors
+    /// [`Problem::Empty`], [`Problem::Fields`], [`Problem::DuplicateColumn`].
+    pub fn parse(path: &Path, text: &'a str) -> Result<Self, TableError> {
+        let fail = |line, problem| TableError {
+            path: path.to_owned(),
+            line,
+            problem,
+        };
+        let text = text.strip_prefix('\u{feff}').unwrap_or(text);
+        let mut lines = text
+            .lines()
+            .enumerate()
+            .map(|(index, line)| (index + 1, line))
+            .filter(|(_, line)| !line.trim().is_empty() && !line.trim_start().starts_with('#'));
+        let Some((first_line, first)) = lines.next() else {
+            return Err(fail(None, Problem::Empty));
+        };
+        let separator = Separator::of(first);
+        let fields = separator.split(first);
+        let is_header = fields.iter().all(|field| number(field).is_none());
+        let names: Vec<String> = if is_header {
+            fields.iter().map(|&name| name.to_owned()).collect()
+        } else {
+            (1..=fields.len()).map(|place| place.to_string()).collect()
+        };
+        for (place, name) in names.iter().enumerate() {
+            if !name.is_empty() && names.iter().take(place).any(|other| other == name) {
+                return Err(fail(
+                    Some(first_line),
+                    Problem::DuplicateColumn(name.clone()),
+                ));
+            }
+        }
+        let mut table = Self {
+            path: path.to_owned(),
+            names,
+            rows: Vec::new(),
+            lines: Vec::new(),
+        };
+        if !is_header {
+            table.rows.push(fields);
+            table.lines.push(first_line);
+        }
+        for (line, text) in lines {
+            let fields = separator.split(text);
+            if fields.len() != table.names.len() {
+                let problem = Problem::Fields {
+                    expected: table.names.len(),
+                    found: fields.len(),
+                };
+                return Err(fail(Some(line), problem));
+            }
+            table.rows.push(fields);
+            table.lines.push(line);
+        }
+        if table.rows.is_empty() {
+            return Err(fail(None, Problem::Empty));
+        }
+        Ok(table)
+    }
+
+    /// Whether the file names its columns.
+    pub fn has_header(&self) -> bool {
+        self.names.first().is_none_or(|name| name != "1")
+    }
+
+    /// Number of rows.
+    pub fn len(&self) -> usize {
+        self.rows.len()
+    }
+
+    /// Whether there are no rows (never after [`Table::parse`]).
+    pub fn is_empty(&self) -> bool {
+        self.rows.is_empty()
+    }
+
+    /// Line in the file of a row, counted from 1.
+    pub fn line(&self, row: usize) -> Option<usize> {
+        self.lines.get(row).copied()
+    }
+
+    /// The fields of a column, by its place counted from 0.
+    pub fn fields(&self, place: usize) -> impl Iterator<Item = &'a str> {
+        self.rows
+            .iter()
+            .map(move |row| row.get(place).copied().unwrap_or(""))
+    }
+
+    /// Place of a column, counted from 0, if it exists.
+    pub fn find(&self, column: &ColumnRef) -> Option<usize> {
+        match column {
+            ColumnRef::Name(name) => self.names.iter().position(|other| other == name),
+            ColumnRef::Number(number) => number
+                .checked_sub(1)
+                .filter(|place| *place < self.names.len()),
+        }
+    }
+
+    /// A column as finite numbers; an empty field becomes NaN if `allow_empty`.
+    ///
+    /// # Errors
+    /// [`Problem::MissingColumn`], [`Problem::WrongUnit`], [`Problem::Cell`].
+    pub fn numbers(&self, column: &ColumnRef, allow_empty: bool) -> Result<Vec<f64>, TableError> {
+        let Some(place) = self.find(column) else {
+            return Err(self.missing(column));
+        };
+        let help = if allow_empty {
+            "leave the field empty where there is no bead"
+        } else {
+            "write a decimal number with a point"
+        };
+        self.fields(place)
+            .enumerate()
+            .map(|(row, field)| match number(field) {
+                Some(value) if value.is_finite() => Ok(value),
+                None if field.is_empty() && allow_empty => Ok(f64::NAN),
+                _ => Err(self.fail(
+                    self.line(row),
+                    Problem::Cell {
+                        column: self.names.get(place).cloned().unwrap_or_default(),
+                        text: field.chars().take(40).collect(),
+                        help,
+                    },
+                )),
+            })
+            .collect()
+    }
+
+    pub(crate) fn fail(&self, line: Option<usize>, problem: Problem) -> TableError {
+        TableError {
+            path: self.path.clone(),
+            line,
+            problem,
+        }
+    }
+
+    /// Why a column is not there: no header, another unit, another spelling, or not at all.
+    fn missing(&self, column: &ColumnRef) -> TableError {
+        let ColumnRef::Name(wanted) = column else {
+            return self.fail(
+                None,
+                Problem::MissingColumn {
+                    wanted: column.to_string(),
+                    found: self.names.clone(),
+                    hint: Some("columns are counted from 1".to_owned()),
+                },
+            );
+        };
+        if !self.has_header() {
+            return self.fail(self.line(0), Problem::NoHeader);
+        }
+        for name in &self.names {
+            if let Some((unit, factor)) = other_unit(name, wanted) {
+                return self.fail(
+                    None,
+                    Problem::WrongUnit {
+                        column: name.clone(),
+                        unit,
+                        wanted: wanted.clone(),
+                        factor,
+                    },
+                );
+            }
+        }
+        let like = |name: &&String| {
+            let plain = |text: &str| {
+                text.to_lowercase()
+                    .replace(['\u{b5}', '\u{3bc}'], "u")
+                    .replace(|c: char| !c.is_ascii_alphanumeric(), "")
+            };
+            plain(name) == plain(wanted) || plain(wanted).starts_with(&plain(name))
+        };
+        let hint = self
+            .names
+            .iter()
+            .filter(|name| !name.is_empty())
+            .find(like)
+            .map(|name| format!("rename `{name}` if it is `{wanted}`"));
+        self.fail(
+            None,
+            Problem::MissingColumn {
+                wanted: wanted.clone(),
+                found: self.names.clone(),
+                hint,
+            },
+        )
+    }
+}
+
+/// If `name` is `wanted` with another unit: that unit, and the factor from it to the wanted one.
+fn other_unit(name: &str, wanted: &str) -> Option<(&'static str, Option<f64>)> {
+    const LENGTHS: [(&str, &str, Option<f64>); 7] = [
+        ("nm", "nanometres", Some(1e-3)),
+        ("mm", "millimetres", Some(1e3)),
+        ("m", "metres", Some(1e6)),
+        ("v", "volts", None),
+        ("mv", "millivolts", None),
+        ("px", "pixels", None),
+        ("pm", "picometres", Some(1e-6)),
+    ];
+    const TIMES: [(&str, &str, Option<f64>); 4] = [
+        ("ms", "milliseconds", Some(1e-3)),
+        ("us", "microseconds", Some(1e-6)),
+        ("ns", "nanoseconds", Some(1e-9)),
+        ("min", "minutes", Some(60.0)),
+    ];
+    let (stem, unit) = wanted.rsplit_once('_')?;
+    let (name_stem, name_unit) = name.trim().rsplit_once('_')?;
+    if !name_stem.eq_ignore_ascii_case(stem) {
+        return None;
+    }
+    let units: &[_] = match unit {
+        "um" => &LENGTHS,
+        "s" => &TIMES,
+        _ => return None,
+    };
+    units
+        .iter()
+        .find(|(symbol, ..)| name_unit.eq_ignore_ascii_case(symbol))
+        .map(|(_, noun, factor)| (*noun, *factor))
+}
