@@ -11,11 +11,15 @@
 #![forbid(unsafe_code)]
 
 mod control_loop;
+pub mod design;
 mod error;
 mod estimator;
 mod limits;
+mod linear;
 mod loop_model;
 mod pi;
+mod reference;
+mod simulation;
 mod state;
 
 pub use control_loop::{
@@ -25,6 +29,9 @@ pub use control_loop::{
 pub use error::{BuildError, Parameter};
 pub use estimator::{Estimator, EstimatorConfig, EstimatorState};
 pub use limits::{Limited, Limits};
+pub use linear::LinearLaw;
 pub use loop_model::{LoopMode, LoopModel};
 pub use pi::{Lead, Pi, PiState};
+pub use reference::{Points, Profile, Reference, Shape, fill_preview};
+pub use simulation::{RigConfig, SimulatedRig};
 pub use state::{LoopState, STATE_LEN};

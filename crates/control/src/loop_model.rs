@@ -130,3 +130,55 @@ impl LoopModel {
         self.gain_per_s + self.modes.iter().map(|m| m.residue_per_s).sum::<f64>()
     }
 }
+
+/// Poles slower than this count as integrators, rad/s: the drift state takes up what they lack.
+const SLOWEST_RAD_PER_S: f64 = 0.5;
+
+impl LoopModel {
+    /// The partial fractions of a transfer function from displacement (relative to neutral) to bead position.
+    ///
+    /// # Errors
+    /// No integrator, complex or unstable poles, more than [`MODES`] modes besides the integrator.
+    pub fn from_transfer_function(
+        plant: &cellpos_plant::TransferFunction,
+        delay_s: f64,
+        sample_time_s: f64,
+    ) -> Result<Self, BuildError> {
+        let space = cellpos_plant::StateSpace::from_transfer_function(plant);
+        let n = space.order();
+        let mut this = Self {
+            gain_per_s: 0.0,
+            modes: [LoopMode::default(); MODES],
+            feedthrough: space.d,
+            delay_s,
+            sample_time_s,
+        };
+        let mut integrators = 0;
+        let mut modes = Vec::new();
+        for i in 0..n {
+            let off = (0..n).filter(|&j| j != i).map(|j| space.a[(i, j)].abs()).fold(0.0, f64::max);
+            let pole = space.a[(i, i)];
+            if off > 0.0 || pole > SLOWEST_RAD_PER_S {
+                return Err(BuildError::Pole { re: pole, im: off });
+            }
+            let residue = space.b[i] * space.c[i];
+            if pole.abs() <= SLOWEST_RAD_PER_S {
+                integrators += 1;
+                this.gain_per_s += residue;
+            } else {
+                modes.push(LoopMode { pole_rad_per_s: pole, residue_per_s: residue });
+            }
+        }
+        if integrators == 0 || this.gain_per_s == 0.0 {
+            return Err(BuildError::NoIntegrator { slowest_rad_per_s: SLOWEST_RAD_PER_S });
+        }
+        if modes.len() > MODES {
+            return Err(BuildError::TooManyModes { given: modes.len(), most: MODES });
+        }
+        for (slot, mode) in this.modes.iter_mut().zip(modes) {
+            *slot = mode;
+        }
+        this.validate()?;
+        Ok(this)
+    }
+}

@@ -1,0 +1,23 @@
+//! Loop design: margins, predicted figures and bounds of a controller on a plant with a loop delay.
+//!
+//! All on the discrete loop: the plant under a zero-order hold with the camera path's delay, fractional if need be,
+//! in the strictly proper form of the sampling convention. The loop delay `T` of the command line includes the half
+//! sample of hold, so the discrete delay is `T / Ts - 1/2` samples.
+
+mod bound;
+mod margins;
+mod noise;
+mod plant;
+mod report;
+mod search;
+mod spread;
+mod step;
+
+pub use bound::{bound_rms_um, kalman_posterior_um2};
+pub use margins::{Margins, margins};
+pub use noise::{NoiseFigures, noise_figures};
+pub use plant::{DesignPlant, DesignWarning};
+pub use report::{BrokenLimit, DesignError, DesignLimits, DesignReport, DesignRequest, Requested, design};
+pub use search::{PiSearch, search_pi};
+pub use spread::{SpreadRow, spread};
+pub use step::{DisturbanceFigures, StepFigures, disturbance_figures, step_figures};

@@ -1,0 +1,276 @@
+//! The whole design in one call: what `cellpos design` prints.
+
+use crate::control_loop::{ControllerConfig, LoopConfig};
+use crate::design::bound::bound_rms_um;
+use crate::design::margins::{Margins, margins};
+use crate::design::noise::{NoiseFigures, noise_figures};
+use crate::design::plant::{DesignPlant, DesignWarning};
+use crate::design::search::{PiSearch, search_pi};
+use crate::design::spread::{SpreadRow, spread};
+use crate::design::step::{
+    DisturbanceFigures, SetUpError, StepFigures, disturbance_figures, step_figures,
+};
+use crate::error::BuildError;
+use crate::estimator::EstimatorConfig;
+use crate::limits::Limits;
+use crate::linear::LinearLaw;
+use crate::pi::{Lead, Pi};
+use cellpos_plant::PlantError;
+use serde::Deserialize;
+use thiserror::Error;
+
+/// Why a design is not possible.
+#[derive(Debug, Clone, PartialEq, Error)]
+pub enum DesignError {
+    /// The plant cannot be discretised.
+    #[error(transparent)]
+    Plant(#[from] PlantError),
+    /// The controller cannot be built.
+    #[error(transparent)]
+    Build(#[from] BuildError),
+    /// The delay is shorter than the half sample of hold that it contains.
+    #[error(
+        "delay {delay_ms} ms is below {hold_ms} ms: the loop delay contains half a sample of hold (camera path 2 ms: write 2.5ms)"
+    )]
+    DelayBelowHold {
+        /// Given, ms.
+        delay_ms: f64,
+        /// Half a sample, ms.
+        hold_ms: f64,
+    },
+    /// No gains keep the limits.
+    #[error("no gains keep Ms <= {max_ms} and Mt <= {max_mt} at this delay: allow more, or shorten the delay")]
+    NoGains {
+        /// Limit on Ms.
+        max_ms: f64,
+        /// Limit on Mt.
+        max_mt: f64,
+    },
+}
+
+impl From<SetUpError> for DesignError {
+    fn from(error: SetUpError) -> Self {
+        match error {
+            SetUpError::Plant(e) => Self::Plant(e),
+            SetUpError::Loop(e) => Self::Build(e),
+        }
+    }
+}
+
+/// Limits that a design must keep; a missing one is not checked. Also the form of a limits file.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct DesignLimits {
+    /// Largest peak of S.
+    pub max_ms: Option<f64>,
+    /// Largest peak of T.
+    pub max_mt: Option<f64>,
+    /// Smallest phase margin, deg.
+    pub min_pm_deg: Option<f64>,
+    /// Smallest gain margin, dB.
+    pub min_gm_db: Option<f64>,
+    /// Smallest delay margin, ms.
+    pub min_delay_margin_ms: Option<f64>,
+    /// Largest predicted hold error, nm RMS.
+    pub max_rms_nm: Option<f64>,
+    /// Largest overshoot of a 10 um step, percent.
+    pub max_overshoot_percent: Option<f64>,
+    /// Longest settling of a 10 um step to 5 %, ms.
+    pub max_settling_ms: Option<f64>,
+    /// Whether every point of the spread must be stable.
+    pub stable_over_spread: Option<bool>,
+}
+
+/// A limit that a design breaks.
+#[derive(Debug, Clone, PartialEq, Error)]
+#[error("{key}: {value} {unit} against the limit {limit} {unit}")]
+pub struct BrokenLimit {
+    /// Key of [`DesignLimits`], or `stable`.
+    pub key: &'static str,
+    /// Reached.
+    pub value: f64,
+    /// Allowed.
+    pub limit: f64,
+    /// Unit.
+    pub unit: &'static str,
+}
+
+/// Which controller is wanted.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Requested {
+    /// PI (with lead, if set) with these gains.
+    Pi(Pi),
+    /// PI gains by [`search_pi`].
+    SearchPi(PiSearch),
+}
+
+/// What to design.
+#[derive(Debug, Clone, PartialEq)]
+pub struct DesignRequest {
+    /// Plant and delay.
+    pub plant: DesignPlant,
+    /// Controller.
+    pub controller: Requested,
+    /// Set-point weight, where not the default.
+    pub setpoint_weight: Option<f64>,
+    /// Limits of the command.
+    pub command_limits: Limits,
+    /// Limits of the design.
+    pub limits: DesignLimits,
+}
+
+/// A design and its figures.
+#[derive(Debug, Clone, PartialEq)]
+pub struct DesignReport {
+    /// The controller.
+    pub controller: ControllerConfig,
+    /// The whole loop, where the running loop can hold the plant.
+    pub config: Option<LoopConfig>,
+    /// Nominal margins.
+    pub margins: Margins,
+    /// Step of 10 um.
+    pub step: Option<StepFigures>,
+    /// Drift of 10 um/s.
+    pub disturbance: Option<DisturbanceFigures>,
+    /// Predicted hold error; `None` if unstable.
+    pub noise: Option<NoiseFigures>,
+    /// Minimum-variance bound on it, um.
+    pub bound_rms_um: f64,
+    /// Margins over the spread.
+    pub spread: Vec<SpreadRow>,
+    /// Broken limits.
+    pub limits_broken: Vec<BrokenLimit>,
+    /// What the user must know.
+    pub warnings: Vec<DesignWarning>,
+}
+
+/// Designs or checks a controller.
+///
+/// # Errors
+/// A plant or controller that cannot be built, or limits that no gains keep.
+pub fn design(request: &DesignRequest) -> Result<DesignReport, DesignError> {
+    let plant = &request.plant;
+    if !(plant.delay_s >= 0.0) {
+        let hold_ms = 0.5e3 * plant.sample_time_s;
+        return Err(DesignError::DelayBelowHold { delay_ms: plant.loop_delay_s() * 1e3, hold_ms });
+    }
+    let mut pi = match request.controller {
+        Requested::Pi(pi) => pi,
+        Requested::SearchPi(search) => search_pi(plant, search)?
+            .ok_or(DesignError::NoGains { max_ms: search.max_ms, max_mt: search.max_mt })?,
+    };
+    if let Some(b) = request.setpoint_weight {
+        pi.setpoint_weight = b;
+    }
+    pi.validate()?;
+    let controller = ControllerConfig::Pi(pi);
+    let law = LinearLaw::Pi { pi, sample_time_s: plant.sample_time_s };
+    let mut warnings = plant.warnings.clone();
+    let config = loop_config(plant, controller, request.command_limits, &mut warnings);
+    let (step, disturbance) = match &config {
+        Some(config) => {
+            (Some(step_figures(plant, config, 10.0)?), Some(disturbance_figures(plant, config, 10.0)?))
+        }
+        None => (None, None),
+    };
+    let spread = spread(plant, &law)?;
+    for row in spread.iter().filter(|row| !row.margins.stable) {
+        warnings.push(DesignWarning::UnstableInSpread {
+            gain_factor: row.gain_factor,
+            extra_samples: row.extra_samples,
+            why: if row.extra_samples > 0 {
+                "the delay margin does not hold the added sample at this gain"
+            } else {
+                "the gain margin does not hold this factor"
+            },
+        });
+    }
+    let mut report = DesignReport {
+        controller,
+        config,
+        margins: margins(plant, &law)?,
+        step,
+        disturbance,
+        noise: noise_figures(plant, &law)?,
+        bound_rms_um: bound_rms_um(
+            plant.diffusion_um2_per_s,
+            plant.fix_noise_um,
+            plant.delay_s,
+            plant.sample_time_s,
+        ),
+        spread,
+        limits_broken: Vec::new(),
+        warnings,
+    };
+    report.limits_broken = broken(&report, &request.limits);
+    Ok(report)
+}
+
+fn loop_config(
+    plant: &DesignPlant,
+    controller: ControllerConfig,
+    limits: Limits,
+    warnings: &mut Vec<DesignWarning>,
+) -> Option<LoopConfig> {
+    let built = plant.loop_model().and_then(|model| {
+        let estimator = EstimatorConfig {
+            diffusion_um2_per_s: positive_or(plant.diffusion_um2_per_s, 0.33),
+            fix_noise_um: positive_or(plant.fix_noise_um, 0.020),
+            ..EstimatorConfig::default()
+        };
+        let config = LoopConfig { model, estimator, controller, limits };
+        crate::control_loop::ControlLoop::new(config).map(|_| config)
+    });
+    built.map_err(|error| warnings.push(DesignWarning::NoLoop(error))).ok()
+}
+
+fn positive_or(value: f64, otherwise: f64) -> f64 {
+    if value > 0.0 { value } else { otherwise }
+}
+
+fn broken(report: &DesignReport, limits: &DesignLimits) -> Vec<BrokenLimit> {
+    let m = &report.margins;
+    let mut broken = Vec::new();
+    if !m.stable {
+        broken.push(BrokenLimit { key: "stable", value: m.spectral_radius, limit: 1.0, unit: "(largest pole)" });
+    }
+    let mut most = |key, value: f64, limit: Option<f64>, unit| {
+        // A figure that does not exist (NaN) does not keep its limit.
+        if let Some(limit) = limit.filter(|&limit| !(value <= limit)) {
+            broken.push(BrokenLimit { key, value, limit, unit });
+        }
+    };
+    most("max_ms", m.ms, limits.max_ms, "");
+    most("max_mt", m.mt, limits.max_mt, "");
+    most("max_rms_nm", report.noise.map_or(f64::NAN, |n| n.rms_um * 1e3), limits.max_rms_nm, "nm");
+    let step = report.step;
+    most(
+        "max_overshoot_percent",
+        step.map_or(f64::NAN, |s| s.overshoot_percent),
+        limits.max_overshoot_percent,
+        "%",
+    );
+    most(
+        "max_settling_ms",
+        step.map_or(f64::NAN, |s| s.settling_5_percent_s * 1e3),
+        limits.max_settling_ms,
+        "ms",
+    );
+    let unstable = report.spread.iter().filter(|row| !row.margins.stable).count() as f64;
+    most("stable_over_spread", unstable, (limits.stable_over_spread == Some(true)).then_some(0.0), "unstable points");
+    let mut least = |key, value: f64, limit: Option<f64>, unit| {
+        if let Some(limit) = limit.filter(|&limit| !(value >= limit)) {
+            broken.push(BrokenLimit { key, value, limit, unit });
+        }
+    };
+    least("min_pm_deg", m.pm_deg, limits.min_pm_deg, "deg");
+    least("min_gm_db", m.gm_db, limits.min_gm_db, "dB");
+    least("min_delay_margin_ms", m.delay_margin_s * 1e3, limits.min_delay_margin_ms, "ms");
+    broken
+}
+
+/// A lead that recovers phase around the crossover of a loop with delay `T`: zero at 1/(2 pi T), pole four times as far.
+pub fn default_lead(loop_delay_s: f64) -> Lead {
+    let zero_hz = 1.0 / (std::f64::consts::TAU * loop_delay_s);
+    Lead { zero_hz, pole_hz: 4.0 * zero_hz }
+}

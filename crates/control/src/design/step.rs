@@ -1,0 +1,161 @@
+//! Step and disturbance figures, from the running loop itself (estimator, controller, limits) without noise.
+
+use crate::control_loop::{Controller, LoopConfig, LoopInput};
+use crate::design::plant::DesignPlant;
+use crate::error::BuildError;
+use crate::simulation::{RigConfig, SimulatedRig};
+use cellpos_plant::PlantError;
+use thiserror::Error;
+
+/// Why a simulation cannot be set up.
+#[derive(Debug, Clone, PartialEq, Error)]
+pub enum SetUpError {
+    /// The plant.
+    #[error(transparent)]
+    Plant(#[from] PlantError),
+    /// The loop.
+    #[error(transparent)]
+    Loop(#[from] BuildError),
+}
+
+/// Figures of a reference step.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct StepFigures {
+    /// Size of the step, um.
+    pub size_um: f64,
+    /// From 10 % to 90 %, s.
+    pub rise_s: f64,
+    /// Largest excess, percent of the step.
+    pub overshoot_percent: f64,
+    /// After this the error stays below 5 % of the step, s; infinite if it does not settle.
+    pub settling_5_percent_s: f64,
+    /// After this the error stays below 2 % of the step, s; infinite if it does not settle.
+    pub settling_2_percent_s: f64,
+    /// Largest command change per tick, um.
+    pub largest_move_um: f64,
+}
+
+/// Figures of a sudden flow drift while holding.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct DisturbanceFigures {
+    /// Drift that sets in, um/s.
+    pub drift_um_per_s: f64,
+    /// Largest error, um.
+    pub peak_um: f64,
+    /// After this the error stays below 10 % of its peak, s; infinite if it does not.
+    pub recovery_s: f64,
+    /// Error at the end of the simulation (4 s), um.
+    pub steady_error_um: f64,
+}
+
+const SETTLE_TICKS: usize = 1000;
+
+fn rig(plant: &DesignPlant) -> Result<SimulatedRig, PlantError> {
+    SimulatedRig::new(RigConfig {
+        plant: plant.plant.clone(),
+        sample_time_s: plant.sample_time_s,
+        delay_s: plant.delay_s,
+        neutral_um: plant.neutral_um,
+        diffusion_um2_per_s: 0.0,
+        fix_noise_um: 0.0,
+        seed: 0,
+    })
+}
+
+/// True positions of a noise-free run: `reference(k)` at each tick, a drift from `SETTLE_TICKS` on.
+fn run(
+    plant: &DesignPlant,
+    config: &LoopConfig,
+    ticks: usize,
+    drift_um_per_s: f64,
+    reference: impl Fn(usize) -> f64,
+) -> Result<(Vec<f64>, f64), SetUpError> {
+    let mut controller = Controller::new(*config)?;
+    let mut rig = rig(plant)?;
+    let mut state = controller.start(plant.neutral_um, plant.neutral_um);
+    let mut preview = vec![0.0; controller.preview_len()];
+    let mut last = state.previous_command_um();
+    let mut largest: f64 = 0.0;
+    let mut positions = Vec::with_capacity(ticks);
+    for k in 0..SETTLE_TICKS + ticks {
+        if k == SETTLE_TICKS {
+            rig.drift_um_per_s = drift_um_per_s;
+        }
+        let tick = k.saturating_sub(SETTLE_TICKS);
+        let active = k >= SETTLE_TICKS;
+        let at = |t: usize| if active { reference(t) } else { 0.0 };
+        for (ahead, slot) in preview.iter_mut().enumerate() {
+            *slot = at(tick + ahead + 1);
+        }
+        if active {
+            positions.push(rig.true_um());
+        }
+        let input = LoopInput {
+            measurement: Some(rig.measure()),
+            reference_um: at(tick),
+            preview_um: &preview,
+            ..LoopInput::default()
+        };
+        let out = controller.step(&mut state, &input);
+        if active {
+            largest = largest.max((out.command_um - last).abs());
+        }
+        last = out.command_um;
+        rig.advance(out.command_um);
+    }
+    Ok((positions, largest))
+}
+
+fn settled_after(errors: impl Iterator<Item = f64>, band: f64, sample_time_s: f64) -> f64 {
+    let (mut count, mut last_outside) = (0usize, None);
+    for (k, e) in errors.enumerate() {
+        count = k + 1;
+        if e.abs() > band || !e.is_finite() {
+            last_outside = Some(k);
+        }
+    }
+    match last_outside {
+        None => 0.0,
+        Some(k) if k + 1 >= count => f64::INFINITY,
+        Some(k) => (k + 1) as f64 * sample_time_s,
+    }
+}
+
+/// Response to a step of the reference, noise-free, through the loop's limits. The reference steps unannounced.
+///
+/// # Errors
+/// A plant or a loop that cannot be built.
+pub fn step_figures(plant: &DesignPlant, config: &LoopConfig, size_um: f64) -> Result<StepFigures, SetUpError> {
+    let (y, largest_move_um) = run(plant, config, 2000, 0.0, |_| size_um)?;
+    let ts = plant.sample_time_s;
+    let first = |level: f64| y.iter().position(|&p| p / size_um >= level).map_or(f64::INFINITY, |k| k as f64 * ts);
+    let highest = y.iter().map(|p| p / size_um).fold(f64::NEG_INFINITY, f64::max);
+    let settled = |part: f64| settled_after(y.iter().map(|p| p - size_um), part * size_um.abs(), ts);
+    Ok(StepFigures {
+        size_um,
+        rise_s: first(0.9) - first(0.1),
+        overshoot_percent: 100.0 * (highest - 1.0).max(0.0),
+        settling_5_percent_s: settled(0.05),
+        settling_2_percent_s: settled(0.02),
+        largest_move_um,
+    })
+}
+
+/// Response to a drift that sets in while the loop holds, noise-free.
+///
+/// # Errors
+/// A plant or a loop that cannot be built.
+pub fn disturbance_figures(
+    plant: &DesignPlant,
+    config: &LoopConfig,
+    drift_um_per_s: f64,
+) -> Result<DisturbanceFigures, SetUpError> {
+    let (y, _) = run(plant, config, 4000, drift_um_per_s, |_| 0.0)?;
+    let peak_um = y.iter().fold(0.0_f64, |m, p| m.max(p.abs()));
+    Ok(DisturbanceFigures {
+        drift_um_per_s,
+        peak_um,
+        recovery_s: settled_after(y.iter().copied(), 0.1 * peak_um, plant.sample_time_s),
+        steady_error_um: y.last().copied().unwrap_or(f64::NAN),
+    })
+}
