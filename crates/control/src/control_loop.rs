@@ -246,6 +246,10 @@ impl ControlLoop {
     pub fn step(&self, state: &mut LoopState, input: &LoopInput) -> LoopOutput {
         let fix = input.measurement.as_ref().and_then(|m| self.fix(m));
         let estimate = self.estimator.step(&mut state.estimator, fix);
+        let Limits {
+            low_um, high_um, ..
+        } = self.config.limits;
+        state.estimator.neutral_um = state.estimator.neutral_um.clamp(low_um, high_um);
         // What the controller sees: the fix itself where there is one, else what the model says it would be.
         let bead_um = match fix {
             Some(fix) if estimate.fresh => fix.position_um,

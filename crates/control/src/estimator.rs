@@ -14,6 +14,16 @@ use crate::loop_model::{LoopModel, MODES};
 /// Past commands held.
 pub const HISTORY: usize = 6;
 
+/// Uncertainty of neutral once the filter has been wrong for many fixes, um: half the range of the PZT.
+const LOST_NEUTRAL_UM: f64 = 20.0;
+
+/// Weight of a fix in the average position of a stuck bead.
+const STUCK_AVERAGE: f64 = 0.05;
+
+/// Uncertainty of neutral after a bead came free, um: it may have drifted meanwhile, or the verdict may have been
+/// wrong because neutral was.
+const RELEASED_NEUTRAL_UM: f64 = 0.5;
+
 /// Noise and gate of the estimator.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct EstimatorConfig {
@@ -48,7 +58,7 @@ impl Default for EstimatorConfig {
             fix_noise_um: 0.020,
             gate_sigma: 6.0,
             gate_floor_um: 0.5,
-            gate_most: 20,
+            gate_most: 10,
             stuck_speed_um_per_tick: 0.5,
         }
     }
@@ -322,43 +332,50 @@ impl Estimator {
             q: state.integrator_um,
             n: state.neutral_um,
             modes: state.modes,
-            last_um: Self::command(state, back + 1),
+            // Nothing of the PZT's motion reaches a stuck bead.
+            last_um: if state.stuck {
+                state.neutral_um
+            } else {
+                Self::command(state, back + 1)
+            },
         }
     }
 
-    /// Moves the filter one tick towards the present.
-    fn advance_filter(&self, state: &mut EstimatorState) {
+    /// Moves the filter one tick towards the present. Returns the motion that the model predicts for that tick, um.
+    fn advance_filter(&self, state: &mut EstimatorState) -> f64 {
         let back = self.delay_ticks + usize::from(state.lag);
-        let command = if back == 0 {
-            Self::command(state, 1)
-        } else {
-            Self::command(state, back)
-        };
+        let command = Self::command(state, back.max(1));
         let m = self.filter_moment(state);
+        let motion = self.tick.gain * (command - m.n);
+        let ts = self.model.sample_time_s;
+        let [p11, p12, p22] = state.covariance_um2;
+        let p22n = (p22 + self.config.neutral_walk_um_per_sqrt_s.powi(2) * ts).min(1e6);
+        state.lag = state.lag.saturating_sub(1);
+        if state.stuck {
+            state.modes = [0.0; MODES];
+            state.covariance_um2 = [p11, 0.0, p22n];
+            return motion;
+        }
         let next = self.tick.advance(&m, command);
         state.integrator_um = next.q;
         state.modes = next.modes;
-        let motion = self.config.gain_uncertainty * self.tick.gain * (command - m.n);
-        let ts = self.model.sample_time_s;
-        let [p11, p12, p22] = state.covariance_um2;
         let g = self.tick.gain;
+        let spread = self.config.gain_uncertainty * motion;
         let p11n = p11 - 2.0 * g * p12
             + g * g * p22
             + 2.0 * self.config.diffusion_um2_per_s * ts
-            + motion * motion;
-        let p12n = p12 - g * p22;
-        let p22n = p22 + self.config.neutral_walk_um_per_sqrt_s.powi(2) * ts;
-        state.covariance_um2 = if p11n < 1e6 && p22n < 1e6 {
-            [p11n, p12n, p22n]
+            + spread * spread;
+        state.covariance_um2 = if p11n < 1e6 {
+            [p11n, p12 - g * p22, p22n]
         } else {
-            [1e6, 0.0, p22n.min(1e6)]
+            [1e6, 0.0, p22n]
         };
-        state.lag = state.lag.saturating_sub(1);
+        motion
     }
 
     /// From the filter's time to that of its measurement.
-    fn at_measurement(&self, m: &Moment, command_um: f64) -> Moment {
-        if self.part.fraction == 0.0 {
+    fn at_measurement(&self, m: &Moment, command_um: f64, stuck: bool) -> Moment {
+        if self.part.fraction == 0.0 || stuck {
             *m
         } else {
             self.part.advance(m, command_um)
@@ -373,14 +390,8 @@ impl Estimator {
         match fix {
             Some(fix) if fix.age <= usize::from(state.lag) && fix.age <= self.longest_lag => {
                 let steps = usize::from(state.lag) - fix.age;
-                let before = self.position(&self.at_measurement(
-                    &self.filter_moment(state),
-                    Self::command(state, self.delay_ticks + usize::from(state.lag)),
-                ));
-                for _ in 0..steps {
-                    self.advance_filter(state);
-                }
-                let (accepted, innovation) = self.update(state, &fix, before);
+                let motion_um: f64 = (0..steps).map(|_| self.advance_filter(state)).sum();
+                let (accepted, innovation) = self.update(state, &fix, motion_um);
                 innovation_um = innovation;
                 gated = !accepted;
                 used = accepted;
@@ -399,12 +410,19 @@ impl Estimator {
             if ticks_ago == self.delay_ticks {
                 predicted = m;
             }
-            m = self.tick.advance(&m, Self::command(state, ticks_ago));
+            let command = Self::command(state, ticks_ago);
+            if !state.stuck {
+                m = self.tick.advance(&m, command);
+            }
         }
         if self.delay_ticks == 0 {
             predicted = m;
         }
-        let predicted = self.at_measurement(&predicted, Self::command(state, self.delay_ticks));
+        let predicted = self.at_measurement(
+            &predicted,
+            Self::command(state, self.delay_ticks),
+            state.stuck,
+        );
         Estimate {
             position_um: self.position(&m),
             neutral_um: state.neutral_um,
@@ -420,9 +438,10 @@ impl Estimator {
     }
 
     /// Uses a fix at the filter's time. Returns whether it was accepted, and the innovation.
-    fn update(&self, state: &mut EstimatorState, fix: &Fix, before_um: f64) -> (bool, f64) {
+    fn update(&self, state: &mut EstimatorState, fix: &Fix, motion_um: f64) -> (bool, f64) {
         let command = Self::command(state, self.delay_ticks + usize::from(state.lag));
-        let predicted = self.position(&self.at_measurement(&self.filter_moment(state), command));
+        let predicted =
+            self.position(&self.at_measurement(&self.filter_moment(state), command, state.stuck));
         let innovation = fix.position_um - predicted;
         if !state.seen {
             self.place(state, innovation, fix.variance_um2);
@@ -432,20 +451,38 @@ impl Estimator {
         let h = -self.part.gain;
         let (ph1, ph2) = (p11 + h * p12, p12 + h * p22);
         let spread = ph1 + h * ph2 + fix.variance_um2;
-        let gate = (self.config.gate_sigma * spread.sqrt()).max(self.config.gate_floor_um);
+        // A stuck bead that comes free may move far in a frame.
+        let widest = if state.stuck { 10.0 } else { 1.0 };
+        let gate = widest * (self.config.gate_sigma * spread.sqrt()).max(self.config.gate_floor_um);
         if innovation.abs() > gate {
             state.gated = state.gated.saturating_add(1);
             if state.gated > self.config.gate_most {
                 self.place(state, innovation, fix.variance_um2);
+                // So many refusals in a row can mean that neutral is wrong: it is learned anew.
+                state.covariance_um2[2] = LOST_NEUTRAL_UM.powi(2);
+                state.stuck_evidence = 0.0;
+                state.stuck = false;
                 return (true, innovation);
             }
             return (false, innovation);
         }
         state.gated = 0;
-        self.weigh_stuck(state, innovation, predicted - before_um, fix.variance_um2);
+        let was_stuck = state.stuck;
+        self.weigh_stuck(state, innovation, motion_um, fix.variance_um2);
         if state.stuck {
-            // The motion says nothing of neutral while something holds the bead.
+            // The position is a constant to be averaged; it says nothing of neutral while something holds the bead.
+            if was_stuck {
+                state.integrator_um += STUCK_AVERAGE * innovation;
+            } else {
+                state.integrator_um = fix.position_um;
+            }
+            state.modes = [0.0; MODES];
+            state.covariance_um2 = [fix.variance_um2, 0.0, p22];
+            return (true, innovation);
+        }
+        if was_stuck {
             self.place(state, innovation, fix.variance_um2);
+            state.covariance_um2[2] = p22.max(RELEASED_NEUTRAL_UM.powi(2));
             return (true, innovation);
         }
         let (k1, k2) = (ph1 / spread, ph2 / spread);
@@ -465,7 +502,8 @@ impl Estimator {
     }
 
     /// Likelihood of "the bead does not move" against "it moves as predicted", forgotten over 50 fixes. A gain of
-    /// 0.3 is the watershed, so that a bead twice as slow as the model is not taken for stuck.
+    /// 0.3 is the watershed, so that a bead twice as slow as the model is not taken for stuck. A bead that has moved,
+    /// if only by its Brownian motion, is not stuck: that ends the verdict at once.
     fn weigh_stuck(
         &self,
         state: &mut EstimatorState,
@@ -473,12 +511,27 @@ impl Estimator {
         motion_um: f64,
         variance_um2: f64,
     ) {
-        let noise = 2.0
-            * (2.0 * self.config.diffusion_um2_per_s * self.model.sample_time_s
-                + 2.0 * variance_um2);
-        let still = innovation_um + motion_um;
-        let odds =
-            (innovation_um * innovation_um - still * still - 0.4 * motion_um * motion_um) / noise;
+        let (still, moving) = if state.stuck {
+            (innovation_um, innovation_um - motion_um)
+        } else {
+            (innovation_um + motion_um, innovation_um)
+        };
+        let walk = 2.0 * self.config.diffusion_um2_per_s * self.model.sample_time_s;
+        let noise = 2.0 * (walk + 2.0 * variance_um2);
+        let moved = still * still
+            > if state.stuck {
+                25.0 * variance_um2
+            } else {
+                4.5 * noise
+            };
+        if state.stuck && moved {
+            state.stuck_evidence = 0.0;
+            state.stuck = false;
+            return;
+        }
+        let odds = (moving * moving - still * still - 0.4 * motion_um * motion_um) / noise;
+        // One fix decides little: an outlier or a jolt must not make a verdict.
+        let odds = odds.clamp(-2.0, if moved { 0.0 } else { 2.0 });
         state.stuck_evidence = (0.98 * state.stuck_evidence + odds).clamp(0.0, 25.0);
         state.stuck = state.stuck_evidence > if state.stuck { 3.0 } else { 10.0 };
     }

@@ -27,10 +27,10 @@ pub use control_loop::{
     Measurement, Mode, SolverReport, SolverStatus,
 };
 pub use error::{BuildError, Parameter};
-pub use estimator::{Estimator, EstimatorConfig, EstimatorState};
+pub use estimator::{Estimator, EstimatorConfig, EstimatorState, HISTORY};
 pub use limits::{Limited, Limits};
 pub use linear::LinearLaw;
-pub use loop_model::{LoopMode, LoopModel};
+pub use loop_model::{LoopMode, LoopModel, MODES};
 pub use pi::{Lead, Pi, PiState};
 pub use reference::{Points, Profile, Reference, Shape, fill_preview};
 pub use simulation::{RigConfig, SimulatedRig};

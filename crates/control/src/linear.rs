@@ -47,9 +47,16 @@ impl LinearLaw {
                     diagonal - a[(i, j)]
                 });
                 let b = b.map(|v| Complex::new(v, 0.0));
-                system.lu().solve(&b).map_or(Complex::new(f64::INFINITY, 0.0), |x| {
-                    c.iter().zip(x.iter()).map(|(c, x)| x * *c).sum::<Complex<f64>>() + *d
-                })
+                system
+                    .lu()
+                    .solve(&b)
+                    .map_or(Complex::new(f64::INFINITY, 0.0), |x| {
+                        c.iter()
+                            .zip(x.iter())
+                            .map(|(c, x)| x * *c)
+                            .sum::<Complex<f64>>()
+                            + *d
+                    })
             }
         }
     }
@@ -60,9 +67,11 @@ impl LinearLaw {
             Self::StateSpace { a, b, c, d } => (a.clone(), b.clone(), c.clone(), *d),
             Self::Pi { pi, sample_time_s } => {
                 let integral = pi.ki_per_s * sample_time_s;
+                // Without integral gain the integrator is not part of the loop, and must not count as its pole at 1.
+                let keep = if integral == 0.0 { 0.0 } else { 1.0 };
                 match pi.lead {
                     None => (
-                        DMatrix::from_element(1, 1, 1.0),
+                        DMatrix::from_element(1, 1, keep),
                         DVector::from_element(1, integral),
                         RowDVector::from_element(1, 1.0),
                         pi.kp,
@@ -70,7 +79,7 @@ impl LinearLaw {
                     Some(lead) => {
                         let (b0, b1, a1) = lead.coefficients(*sample_time_s);
                         (
-                            DMatrix::from_row_slice(2, 2, &[1.0, 0.0, 0.0, -a1]),
+                            DMatrix::from_row_slice(2, 2, &[keep, 0.0, 0.0, -a1]),
                             DVector::from_vec(vec![integral, b1 - a1 * b0]),
                             RowDVector::from_vec(vec![1.0, pi.kp]),
                             pi.kp * b0,

@@ -156,7 +156,10 @@ impl LoopModel {
         let mut integrators = 0;
         let mut modes = Vec::new();
         for i in 0..n {
-            let off = (0..n).filter(|&j| j != i).map(|j| space.a[(i, j)].abs()).fold(0.0, f64::max);
+            let off = (0..n)
+                .filter(|&j| j != i)
+                .map(|j| space.a[(i, j)].abs())
+                .fold(0.0, f64::max);
             let pole = space.a[(i, i)];
             if off > 0.0 || pole > SLOWEST_RAD_PER_S {
                 return Err(BuildError::Pole { re: pole, im: off });
@@ -166,14 +169,22 @@ impl LoopModel {
                 integrators += 1;
                 this.gain_per_s += residue;
             } else {
-                modes.push(LoopMode { pole_rad_per_s: pole, residue_per_s: residue });
+                modes.push(LoopMode {
+                    pole_rad_per_s: pole,
+                    residue_per_s: residue,
+                });
             }
         }
         if integrators == 0 || this.gain_per_s == 0.0 {
-            return Err(BuildError::NoIntegrator { slowest_rad_per_s: SLOWEST_RAD_PER_S });
+            return Err(BuildError::NoIntegrator {
+                slowest_rad_per_s: SLOWEST_RAD_PER_S,
+            });
         }
         if modes.len() > MODES {
-            return Err(BuildError::TooManyModes { given: modes.len(), most: MODES });
+            return Err(BuildError::TooManyModes {
+                given: modes.len(),
+                most: MODES,
+            });
         }
         for (slot, mode) in this.modes.iter_mut().zip(modes) {
             *slot = mode;

@@ -121,10 +121,22 @@ impl Points {
     /// # Errors
     /// No point, a number that is not finite, times that do not grow.
     pub fn new(points: Vec<(f64, f64)>) -> Result<Self, BuildError> {
-        check("points", "points", points.len() as f64, !points.is_empty(), "at least one point")?;
+        check(
+            "points",
+            "points",
+            points.len() as f64,
+            !points.is_empty(),
+            "at least one point",
+        )?;
         let mut last = f64::NEG_INFINITY;
         for &(time_s, position_um) in &points {
-            check("points.time_s", "s", time_s, time_s > last, "later than the point before")?;
+            check(
+                "points.time_s",
+                "s",
+                time_s,
+                time_s > last,
+                "later than the point before",
+            )?;
             check("points.position_um", "um", position_um, true, "finite")?;
             last = time_s;
         }
@@ -142,7 +154,13 @@ impl Points {
     }
 }
 
-fn move_um(from_um: f64, to_um: f64, duration_s: f64, time_s: f64, shape: impl Fn(f64) -> f64) -> f64 {
+fn move_um(
+    from_um: f64,
+    to_um: f64,
+    duration_s: f64,
+    time_s: f64,
+    shape: impl Fn(f64) -> f64,
+) -> f64 {
     if time_s <= 0.0 {
         from_um
     } else if time_s >= duration_s {
@@ -160,20 +178,56 @@ impl Profile {
     pub fn validate(&self) -> Result<(), BuildError> {
         match self {
             Self::Hold { position_um } => check("position_um", "um", *position_um, true, "finite"),
-            Self::Ramp { from_um, to_um, duration_s } | Self::MinimumJerk { from_um, to_um, duration_s } => {
+            Self::Ramp {
+                from_um,
+                to_um,
+                duration_s,
+            }
+            | Self::MinimumJerk {
+                from_um,
+                to_um,
+                duration_s,
+            } => {
                 check("from_um", "um", *from_um, true, "finite")?;
                 check("to_um", "um", *to_um, true, "finite")?;
-                check("duration_s", "s", *duration_s, *duration_s >= 0.0, "0 or more")
+                check(
+                    "duration_s",
+                    "s",
+                    *duration_s,
+                    *duration_s >= 0.0,
+                    "0 or more",
+                )
             }
-            Self::Wave { centre_um, amplitude_um, frequency_hz, fade_s, .. } => {
+            Self::Wave {
+                centre_um,
+                amplitude_um,
+                frequency_hz,
+                fade_s,
+                ..
+            } => {
                 check("centre_um", "um", *centre_um, true, "finite")?;
                 check("amplitude_um", "um", *amplitude_um, true, "finite")?;
-                check("frequency_hz", "Hz", *frequency_hz, *frequency_hz > 0.0, "positive")?;
+                check(
+                    "frequency_hz",
+                    "Hz",
+                    *frequency_hz,
+                    *frequency_hz > 0.0,
+                    "positive",
+                )?;
                 check("fade_s", "s", *fade_s, *fade_s >= 0.0, "0 or more")
             }
             Self::Points(_) => Ok(()),
-            Self::Waveform { samples_um, period_s } => {
-                check("samples_um", "samples", samples_um.len() as f64, samples_um.len() > 1, "at least two")?;
+            Self::Waveform {
+                samples_um,
+                period_s,
+            } => {
+                check(
+                    "samples_um",
+                    "samples",
+                    samples_um.len() as f64,
+                    samples_um.len() > 1,
+                    "at least two",
+                )?;
                 for sample in samples_um {
                     check("samples_um", "um", *sample, true, "finite")?;
                 }
@@ -187,21 +241,40 @@ impl Reference for Profile {
     fn at_um(&self, time_s: f64) -> f64 {
         match self {
             Self::Hold { position_um } => *position_um,
-            Self::Ramp { from_um, to_um, duration_s } => {
-                move_um(*from_um, *to_um, *duration_s, time_s, |x| x)
-            }
-            Self::MinimumJerk { from_um, to_um, duration_s } => {
-                move_um(*from_um, *to_um, *duration_s, time_s, |x| x * x * x * (10.0 + x * (6.0 * x - 15.0)))
-            }
-            Self::Wave { shape, centre_um, amplitude_um, frequency_hz, fade_s } => {
+            Self::Ramp {
+                from_um,
+                to_um,
+                duration_s,
+            } => move_um(*from_um, *to_um, *duration_s, time_s, |x| x),
+            Self::MinimumJerk {
+                from_um,
+                to_um,
+                duration_s,
+            } => move_um(*from_um, *to_um, *duration_s, time_s, |x| {
+                x * x * x * (10.0 + x * (6.0 * x - 15.0))
+            }),
+            Self::Wave {
+                shape,
+                centre_um,
+                amplitude_um,
+                frequency_hz,
+                fade_s,
+            } => {
                 if time_s <= 0.0 {
                     return *centre_um;
                 }
-                let fade = if time_s >= *fade_s { 1.0 } else { 0.5 - 0.5 * (PI * time_s / fade_s).cos() };
+                let fade = if time_s >= *fade_s {
+                    1.0
+                } else {
+                    0.5 - 0.5 * (PI * time_s / fade_s).cos()
+                };
                 centre_um + fade * amplitude_um * shape.at(frequency_hz * time_s)
             }
             Self::Points(points) => points.at_um(time_s),
-            Self::Waveform { samples_um, period_s } => {
+            Self::Waveform {
+                samples_um,
+                period_s,
+            } => {
                 let n = samples_um.len();
                 let phase = (time_s.max(0.0) / period_s).fract() * n as f64;
                 let index = phase.floor();
@@ -214,7 +287,9 @@ impl Reference for Profile {
 
     fn duration_s(&self) -> Option<f64> {
         match self {
-            Self::Ramp { duration_s, .. } | Self::MinimumJerk { duration_s, .. } => Some(*duration_s),
+            Self::Ramp { duration_s, .. } | Self::MinimumJerk { duration_s, .. } => {
+                Some(*duration_s)
+            }
             Self::Points(points) => points.points.last().map(|&(t, _)| t.max(0.0)),
             Self::Hold { .. } | Self::Wave { .. } | Self::Waveform { .. } => None,
         }
@@ -228,20 +303,40 @@ mod tests {
     #[test]
     fn waves_pass_through_their_corners() {
         let at = |shape: Shape, x: f64| shape.at(x);
-        for (x, sine, triangle, trapezoid) in
-            [(0.0, 0.0, 0.0, 0.0), (0.25, 1.0, 1.0, 1.0), (0.5, 0.0, 0.0, 0.0), (0.75, -1.0, -1.0, -1.0), (1.125, 0.5_f64.sqrt(), 0.5, 1.0)]
-        {
+        for (x, sine, triangle, trapezoid) in [
+            (0.0, 0.0, 0.0, 0.0),
+            (0.25, 1.0, 1.0, 1.0),
+            (0.5, 0.0, 0.0, 0.0),
+            (0.75, -1.0, -1.0, -1.0),
+            (1.125, 0.5_f64.sqrt(), 0.5, 1.0),
+        ] {
             assert!((at(Shape::Sine, x) - sine).abs() < 1e-12);
-            assert!((at(Shape::Triangle, x) - triangle).abs() < 1e-12, "triangle at {x}");
-            assert!((at(Shape::Trapezoid, x) - trapezoid).abs() < 1e-12, "trapezoid at {x}");
+            assert!(
+                (at(Shape::Triangle, x) - triangle).abs() < 1e-12,
+                "triangle at {x}"
+            );
+            assert!(
+                (at(Shape::Trapezoid, x) - trapezoid).abs() < 1e-12,
+                "trapezoid at {x}"
+            );
         }
-        assert_eq!((at(Shape::Square, 0.1), at(Shape::Square, 0.6)), (1.0, -1.0));
+        assert_eq!(
+            (at(Shape::Square, 0.1), at(Shape::Square, 0.6)),
+            (1.0, -1.0)
+        );
     }
 
     #[test]
     fn a_minimum_jerk_move_starts_and_ends_at_rest_and_is_symmetric() {
-        let p = Profile::MinimumJerk { from_um: -2.0, to_um: 8.0, duration_s: 0.1 };
-        assert_eq!((p.at_um(-1.0), p.at_um(0.1), p.at_um(5.0)), (-2.0, 8.0, 8.0));
+        let p = Profile::MinimumJerk {
+            from_um: -2.0,
+            to_um: 8.0,
+            duration_s: 0.1,
+        };
+        assert_eq!(
+            (p.at_um(-1.0), p.at_um(0.1), p.at_um(5.0)),
+            (-2.0, 8.0, 8.0)
+        );
         assert!((p.at_um(0.05) - 3.0).abs() < 1e-12);
         assert!((p.at_um(1e-4) + 2.0).abs() < 1e-6, "jerk-limited start");
         assert!((p.at_um(0.03) + p.at_um(0.07) - 6.0).abs() < 1e-12);
@@ -250,15 +345,25 @@ mod tests {
     #[test]
     fn points_are_joined_by_straight_lines_and_held_outside() {
         let p = Profile::Points(Points::new(vec![(0.0, 1.0), (1.0, 3.0), (1.5, 3.0)]).unwrap());
-        assert_eq!((p.at_um(-1.0), p.at_um(0.5), p.at_um(1.2), p.at_um(9.0)), (1.0, 2.0, 3.0, 3.0));
+        assert_eq!(
+            (p.at_um(-1.0), p.at_um(0.5), p.at_um(1.2), p.at_um(9.0)),
+            (1.0, 2.0, 3.0, 3.0)
+        );
         assert_eq!(p.duration_s(), Some(1.5));
         let error = Points::new(vec![(0.0, 1.0), (0.0, 2.0)]).unwrap_err();
-        assert!(error.to_string().contains("later than the point before"), "{error}");
+        assert!(
+            error.to_string().contains("later than the point before"),
+            "{error}"
+        );
     }
 
     #[test]
     fn preview_is_the_reference_of_the_coming_ticks() {
-        let p = Profile::Ramp { from_um: 0.0, to_um: 10.0, duration_s: 0.01 };
+        let p = Profile::Ramp {
+            from_um: 0.0,
+            to_um: 10.0,
+            duration_s: 0.01,
+        };
         let mut preview = [0.0; 3];
         fill_preview(&p, 4, 1e-3, &mut preview);
         assert_eq!(preview.map(|x| (x * 1e9).round() / 1e9), [5.0, 6.0, 7.0]);
@@ -266,7 +371,10 @@ mod tests {
 
     #[test]
     fn a_waveform_repeats_and_joins_its_last_sample_to_its_first() {
-        let p = Profile::Waveform { samples_um: vec![0.0, 1.0, 0.0, -1.0], period_s: 0.4 };
+        let p = Profile::Waveform {
+            samples_um: vec![0.0, 1.0, 0.0, -1.0],
+            period_s: 0.4,
+        };
         assert!((p.at_um(0.15) - 0.5).abs() < 1e-12);
         assert!((p.at_um(0.35) + 0.5).abs() < 1e-12);
         assert!((p.at_um(0.55) - p.at_um(0.15)).abs() < 1e-12);

@@ -119,8 +119,13 @@ impl SimulatedRig {
 
     /// The fix that arrives now.
     pub fn measure(&mut self) -> Measurement {
-        let free = self.seen.output_um(&self.seen_state) + self.walk.get(self.whole).map_or(0.0, |w| w.1);
-        let position_um = self.held.as_ref().and_then(|(_, past)| past.get(self.whole).copied()).unwrap_or(free);
+        let free =
+            self.seen.output_um(&self.seen_state) + self.walk.get(self.whole).map_or(0.0, |w| w.1);
+        let position_um = self
+            .held
+            .as_ref()
+            .and_then(|(_, past)| past.get(self.whole).copied())
+            .unwrap_or(free);
         let noise = self.config.fix_noise_um;
         Measurement {
             position_um: position_um + noise * self.random.draw(),
@@ -141,7 +146,13 @@ impl SimulatedRig {
         let drift = self.drift_um_per_s * ts;
         let (early, late) = (1.0 - self.fraction, self.fraction);
         let middle = now + drift * early + spread * early.sqrt() * self.random.draw();
-        let next = middle + drift * late + if late > 0.0 { spread * late.sqrt() * self.random.draw() } else { 0.0 };
+        let next = middle
+            + drift * late
+            + if late > 0.0 {
+                spread * late.sqrt() * self.random.draw()
+            } else {
+                0.0
+            };
         self.walk.push_front((next, middle));
         self.walk.truncate(self.whole + 1);
         self.hold(before);
@@ -175,7 +186,10 @@ struct Gaussian {
 
 impl Gaussian {
     fn new(seed: u64) -> Self {
-        Self { source: Xoshiro256PlusPlus::seed_from_u64(seed), spare: None }
+        Self {
+            source: Xoshiro256PlusPlus::seed_from_u64(seed),
+            spare: None,
+        }
     }
 
     fn uniform(&mut self) -> f64 {

@@ -22,7 +22,12 @@ pub fn kalman_posterior_um2(step_um2: f64, fix_um2: f64) -> f64 {
 /// assert!((1e3 * bound_rms_um(0.33, 0.0, 2e-3, 1e-3) - 44.5).abs() < 0.05);
 /// assert!((1e3 * bound_rms_um(0.33, 0.0, 3e-3, 1e-3) - 51.4).abs() < 0.05);
 /// ```
-pub fn bound_rms_um(diffusion_um2_per_s: f64, fix_noise_um: f64, delay_s: f64, sample_time_s: f64) -> f64 {
+pub fn bound_rms_um(
+    diffusion_um2_per_s: f64,
+    fix_noise_um: f64,
+    delay_s: f64,
+    sample_time_s: f64,
+) -> f64 {
     let step_um2 = 2.0 * diffusion_um2_per_s * sample_time_s;
     let blind = 2.0 * diffusion_um2_per_s * (delay_s + sample_time_s);
     (blind + kalman_posterior_um2(step_um2, fix_noise_um * fix_noise_um)).sqrt()

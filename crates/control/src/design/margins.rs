@@ -56,7 +56,11 @@ impl Grid {
                 (hz, z, measured.at(z))
             })
             .collect();
-        Ok(Self { plant: measured, sample_time_s: plant.sample_time_s, points })
+        Ok(Self {
+            plant: measured,
+            sample_time_s: plant.sample_time_s,
+            points,
+        })
     }
 
     fn loop_gain(&self, law: &LinearLaw, hz: f64) -> Complex<f64> {
@@ -66,15 +70,21 @@ impl Grid {
 
     /// Peaks of |S| and |T| only, on the grid: for searches.
     pub(crate) fn peaks(&self, law: &LinearLaw) -> (f64, f64) {
-        self.points.iter().fold((0.0_f64, 0.0_f64), |(ms, mt), (_, z, p)| {
-            let l = law.at(*z) * p;
-            let s = (l + 1.0).inv().norm();
-            (ms.max(s), mt.max(s * l.norm()))
-        })
+        self.points
+            .iter()
+            .fold((0.0_f64, 0.0_f64), |(ms, mt), (_, z, p)| {
+                let l = law.at(*z) * p;
+                let s = (l + 1.0).inv().norm();
+                (ms.max(s), mt.max(s * l.norm()))
+            })
     }
 
     pub(crate) fn margins(&self, law: &LinearLaw) -> Margins {
-        let curve: Vec<(f64, Complex<f64>)> = self.points.iter().map(|(hz, z, p)| (*hz, law.at(*z) * p)).collect();
+        let curve: Vec<(f64, Complex<f64>)> = self
+            .points
+            .iter()
+            .map(|(hz, z, p)| (*hz, law.at(*z) * p))
+            .collect();
         let spectral_radius = spectral_radius(&closed_loop(&self.plant, law));
         let mut m = Margins {
             stable: spectral_radius < 1.0,
@@ -156,7 +166,9 @@ fn closed_loop(plant: &DiscretePlant, law: &LinearLaw) -> DMatrix<f64> {
     let (a, b, c, d) = law.matrices();
     let (n, m) = (pa.nrows(), a.nrows());
     let mut closed = DMatrix::zeros(n + m, n + m);
-    closed.view_mut((0, 0), (n, n)).copy_from(&(&pa - &pb * &pc * d));
+    closed
+        .view_mut((0, 0), (n, n))
+        .copy_from(&(&pa - &pb * &pc * d));
     closed.view_mut((0, n), (n, m)).copy_from(&(-(&pb * &c)));
     closed.view_mut((n, 0), (m, n)).copy_from(&(&b * &pc));
     closed.view_mut((n, n), (m, m)).copy_from(&a);
@@ -164,14 +176,21 @@ fn closed_loop(plant: &DiscretePlant, law: &LinearLaw) -> DMatrix<f64> {
 }
 
 fn spectral_radius(a: &DMatrix<f64>) -> f64 {
-    a.complex_eigenvalues().iter().map(|v| v.norm()).fold(0.0, f64::max)
+    a.complex_eigenvalues()
+        .iter()
+        .map(|v| v.norm())
+        .fold(0.0, f64::max)
 }
 
 fn bisect(mut low: f64, mut high: f64, f: impl Fn(f64) -> f64) -> f64 {
     let sign = f(low);
     for _ in 0..60 {
         let middle = (low * high).sqrt();
-        if (f(middle) > 0.0) == (sign > 0.0) { low = middle } else { high = middle }
+        if (f(middle) > 0.0) == (sign > 0.0) {
+            low = middle
+        } else {
+            high = middle
+        }
     }
     (low * high).sqrt()
 }
@@ -183,16 +202,29 @@ fn peak(
     at: impl Fn(Complex<f64>) -> f64,
 ) -> (f64, f64) {
     let values: Vec<f64> = curve.iter().map(|(_, l)| at(*l)).collect();
-    let best = (0..values.len()).max_by(|&i, &j| values[i].total_cmp(&values[j])).unwrap_or(0);
-    let (mut low, mut high) = (curve[best.saturating_sub(1)].0, curve[(best + 1).min(curve.len() - 1)].0);
+    let best = (0..values.len())
+        .max_by(|&i, &j| values[i].total_cmp(&values[j]))
+        .unwrap_or(0);
+    let (mut low, mut high) = (
+        curve[best.saturating_sub(1)].0,
+        curve[(best + 1).min(curve.len() - 1)].0,
+    );
     let ratio = 0.5 * (5.0_f64.sqrt() - 1.0);
     for _ in 0..40 {
         let (a, b) = (high - ratio * (high - low), low + ratio * (high - low));
-        if exact(a) > exact(b) { high = b } else { low = a }
+        if exact(a) > exact(b) {
+            high = b
+        } else {
+            low = a
+        }
     }
     let hz = 0.5 * (low + high);
     let refined = exact(hz);
-    if refined > values[best] { (hz, refined) } else { (curve[best].0, values[best]) }
+    if refined > values[best] {
+        (hz, refined)
+    } else {
+        (curve[best].0, values[best])
+    }
 }
 
 #[cfg(test)]
@@ -202,14 +234,20 @@ mod tests {
     use cellpos_plant::TransferFunction;
 
     fn law(kp: f64, ki: f64) -> LinearLaw {
-        LinearLaw::Pi { pi: Pi::new(kp, ki), sample_time_s: 1e-3 }
+        LinearLaw::Pi {
+            pi: Pi::new(kp, ki),
+            sample_time_s: 1e-3,
+        }
     }
 
     #[test]
     fn a_proportional_loop_on_an_integrator_has_the_margins_of_the_closed_form() {
         // L = a / (z^d (z - 1)): |L| = a / (2 sin(w/2)), arg = -90 deg - w/2 - d w.
         let (k, kp, d) = (400.0, 0.3, 2.0);
-        let plant = DesignPlant { plant: TransferFunction::integrator(k).unwrap(), ..DesignPlant::eq6(2.5e-3) };
+        let plant = DesignPlant {
+            plant: TransferFunction::integrator(k).unwrap(),
+            ..DesignPlant::eq6(2.5e-3)
+        };
         let m = margins(&plant, &law(kp, 0.0)).unwrap();
         let a: f64 = k * kp * 1e-3;
         let wc = 2.0 * (0.5 * a).asin();
@@ -230,7 +268,11 @@ mod tests {
         let factor = 10f64.powf(m.gm_db / 20.0);
         for (f, stable) in [(0.999 * factor, true), (1.001 * factor, false)] {
             let changed = plant.changed(f, 0).unwrap();
-            assert_eq!(margins(&changed, &law(0.46, 19.5)).unwrap().stable, stable, "at {f}");
+            assert_eq!(
+                margins(&changed, &law(0.46, 19.5)).unwrap().stable,
+                stable,
+                "at {f}"
+            );
         }
     }
 
@@ -239,15 +281,24 @@ mod tests {
         let plant = DesignPlant::eq6(2.5e-3);
         let m = margins(&plant, &law(0.46, 19.5)).unwrap();
         for (f, stable) in [(0.98, true), (1.02, false)] {
-            let changed = DesignPlant { delay_s: plant.delay_s + f * m.delay_margin_s, ..plant.clone() };
-            assert_eq!(margins(&changed, &law(0.46, 19.5)).unwrap().stable, stable, "at {f}");
+            let changed = DesignPlant {
+                delay_s: plant.delay_s + f * m.delay_margin_s,
+                ..plant.clone()
+            };
+            assert_eq!(
+                margins(&changed, &law(0.46, 19.5)).unwrap().stable,
+                stable,
+                "at {f}"
+            );
         }
     }
 
     #[test]
     fn the_published_gains_have_the_published_margins() {
         let m = margins(&DesignPlant::eq6(2.5e-3), &law(0.46, 19.5)).unwrap();
-        let near = |value: f64, wanted: f64| assert!((value / wanted - 1.0).abs() < 0.02, "{value} for {wanted}");
+        let near = |value: f64, wanted: f64| {
+            assert!((value / wanted - 1.0).abs() < 0.02, "{value} for {wanted}")
+        };
         near(m.pm_deg, 48.7);
         near(m.gm_db, 10.6);
         near(m.delay_margin_s * 1e3, 4.66);
@@ -259,6 +310,10 @@ mod tests {
     fn the_ideal_predictor_limit_bounds_the_rejection_of_a_good_loop() {
         // |S| < 1 ends at 1/(6T) for the ideal predictor: 67 Hz at 2.5 ms. PI stays below.
         let m = margins(&DesignPlant::eq6(2.5e-3), &law(0.46, 19.5)).unwrap();
-        assert!(m.s_below_1_hz < 67.0 && m.s_below_1_hz > 10.0, "{}", m.s_below_1_hz);
+        assert!(
+            m.s_below_1_hz < 67.0 && m.s_below_1_hz > 10.0,
+            "{}",
+            m.s_below_1_hz
+        );
     }
 }

@@ -17,7 +17,10 @@ pub use bound::{bound_rms_um, kalman_posterior_um2};
 pub use margins::{Margins, margins};
 pub use noise::{NoiseFigures, noise_figures};
 pub use plant::{DesignPlant, DesignWarning};
-pub use report::{BrokenLimit, DesignError, DesignLimits, DesignReport, DesignRequest, Requested, design};
+pub use report::{
+    BrokenLimit, DesignError, DesignLimits, DesignReport, DesignRequest, Requested, default_lead,
+    design,
+};
 pub use search::{PiSearch, search_pi};
 pub use spread::{SpreadRow, spread};
-pub use step::{DisturbanceFigures, StepFigures, disturbance_figures, step_figures};
+pub use step::{DisturbanceFigures, SetUpError, StepFigures, disturbance_figures, step_figures};

@@ -32,7 +32,11 @@ enum Impulse {
 }
 
 /// Sums of squares of the true position and of the command after an impulse; `None` if they do not die out.
-fn squares(plant: &DesignPlant, law: &LinearLaw, impulse: Impulse) -> Result<Option<(f64, f64)>, PlantError> {
+fn squares(
+    plant: &DesignPlant,
+    law: &LinearLaw,
+    impulse: Impulse,
+) -> Result<Option<(f64, f64)>, PlantError> {
     const LONGEST: usize = 200_000;
     let (truth, measured) = (plant.truth()?, plant.measured()?);
     let (mut x, mut y) = (truth.state(0.0), measured.state(0.0));
@@ -40,7 +44,11 @@ fn squares(plant: &DesignPlant, law: &LinearLaw, impulse: Impulse) -> Result<Opt
     let mut state = DVector::zeros(a.nrows());
     let (mut position2, mut command2, mut recent, mut last) = (0.0, 0.0, 0.0, 0.0);
     for k in 0..LONGEST {
-        let jump = if matches!(impulse, Impulse::Walk(_)) { 1.0 } else { 0.0 };
+        let jump = if matches!(impulse, Impulse::Walk(_)) {
+            1.0
+        } else {
+            0.0
+        };
         let position = truth.output_um(&x) + jump;
         let seen = match impulse {
             Impulse::Walk(after) if k >= after => 1.0,
@@ -73,7 +81,10 @@ fn squares(plant: &DesignPlant, law: &LinearLaw, impulse: Impulse) -> Result<Opt
 ///
 /// # Errors
 /// A sample time or delay that cannot be discretised.
-pub fn noise_figures(plant: &DesignPlant, law: &LinearLaw) -> Result<Option<NoiseFigures>, PlantError> {
+pub fn noise_figures(
+    plant: &DesignPlant,
+    law: &LinearLaw,
+) -> Result<Option<NoiseFigures>, PlantError> {
     let samples = plant.delay_s / plant.sample_time_s;
     let whole = (samples + 1e-9).floor();
     let late = (samples - whole).max(0.0);

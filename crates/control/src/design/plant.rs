@@ -3,7 +3,8 @@
 use crate::error::BuildError;
 use crate::loop_model::LoopModel;
 use cellpos_plant::{
-    DiscretePlant, Effect, Hertz, Model, PlantError, ProbablyPerHertz, Seconds, TransferFunction, probably_per_hertz,
+    DiscretePlant, Effect, Hertz, Model, PlantError, ProbablyPerHertz, Seconds, TransferFunction,
+    probably_per_hertz,
 };
 use std::f64::consts::TAU;
 use thiserror::Error;
@@ -23,7 +24,9 @@ pub enum DesignWarning {
         id: &'static str,
     },
     /// The loop delay was given and differs from what the model contains.
-    #[error("the loop delay {used_ms} ms was asked for; the model's own effects make it {model_ms} ms")]
+    #[error(
+        "the loop delay {used_ms} ms was asked for; the model's own effects make it {model_ms} ms"
+    )]
     DelayDiffers {
         /// Delay designed for, ms.
         used_ms: f64,
@@ -31,7 +34,9 @@ pub enum DesignWarning {
         model_ms: f64,
     },
     /// A controller that cannot be stable at some point of the spread.
-    #[error("unstable at {gain_factor} x the gain with {extra_samples} more samples of delay: {why}")]
+    #[error(
+        "unstable at {gain_factor} x the gain with {extra_samples} more samples of delay: {why}"
+    )]
     UnstableInSpread {
         /// Factor on the plant's gain.
         gain_factor: f64,
@@ -76,14 +81,21 @@ impl DesignPlant {
     ///
     /// # Errors
     /// Lags that make the plant's order too high.
-    pub fn from_model(model: &Model, loop_delay_s: Option<f64>, sample_time_s: f64) -> Result<Self, PlantError> {
+    pub fn from_model(
+        model: &Model,
+        loop_delay_s: Option<f64>,
+        sample_time_s: f64,
+    ) -> Result<Self, PlantError> {
         let mut plant = model.plant.clone();
         let mut warnings = Vec::new();
         let mut dead_s = 0.0;
         for effect in model.ordered_effects() {
             match effect {
                 Effect::DriverLag { bandwidth_hz } => {
-                    plant = plant.series(&TransferFunction::new(vec![1.0], vec![1.0 / (TAU * bandwidth_hz), 1.0])?)?;
+                    plant = plant.series(&TransferFunction::new(
+                        vec![1.0],
+                        vec![1.0 / (TAU * bandwidth_hz), 1.0],
+                    )?)?;
                 }
                 Effect::GainError { factor } => plant = plant.scaled(*factor)?,
                 Effect::TimeDelay { delay_s } => dead_s += delay_s,
@@ -99,20 +111,30 @@ impl DesignPlant {
             Some(t) => {
                 if dead_s > 0.0 && (t - hold_s - dead_s).abs() > 1e-5 {
                     let model_ms = (dead_s + hold_s) * 1e3;
-                    warnings.push(DesignWarning::DelayDiffers { used_ms: t * 1e3, model_ms });
+                    warnings.push(DesignWarning::DelayDiffers {
+                        used_ms: t * 1e3,
+                        model_ms,
+                    });
                 }
                 t - hold_s
             }
             None => dead_s,
         };
-        if let Some(hint) = [1.0, 10.0].iter().find_map(|&f| probably_per_hertz(plant.velocity_gain_at(Hertz(f)))) {
+        if let Some(hint) = [1.0, 10.0]
+            .iter()
+            .find_map(|&f| probably_per_hertz(plant.velocity_gain_at(Hertz(f))))
+        {
             warnings.push(DesignWarning::ProbablyPerHertz(hint));
         }
         if model.noise.diffusion_um2_per_s == 0.0 {
-            warnings.push(DesignWarning::NoNoise { what: "diffusion coefficient" });
+            warnings.push(DesignWarning::NoNoise {
+                what: "diffusion coefficient",
+            });
         }
         if model.noise.localisation_um == 0.0 {
-            warnings.push(DesignWarning::NoNoise { what: "localisation noise" });
+            warnings.push(DesignWarning::NoNoise {
+                what: "localisation noise",
+            });
         }
         Ok(Self {
             plant,
@@ -160,7 +182,11 @@ impl DesignPlant {
     /// # Errors
     /// A sample time or delay out of range.
     pub fn measured(&self) -> Result<DiscretePlant, PlantError> {
-        DiscretePlant::new(&self.plant, Seconds(self.sample_time_s), Seconds(self.delay_s))
+        DiscretePlant::new(
+            &self.plant,
+            Seconds(self.sample_time_s),
+            Seconds(self.delay_s),
+        )
     }
 
     /// The plant from command to true position.

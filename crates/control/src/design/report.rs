@@ -39,7 +39,9 @@ pub enum DesignError {
         hold_ms: f64,
     },
     /// No gains keep the limits.
-    #[error("no gains keep Ms <= {max_ms} and Mt <= {max_mt} at this delay: allow more, or shorten the delay")]
+    #[error(
+        "no gains keep Ms <= {max_ms} and Mt <= {max_mt} at this delay: allow more, or shorten the delay"
+    )]
     NoGains {
         /// Limit on Ms.
         max_ms: f64,
@@ -152,25 +154,34 @@ pub fn design(request: &DesignRequest) -> Result<DesignReport, DesignError> {
     let plant = &request.plant;
     if !(plant.delay_s >= 0.0) {
         let hold_ms = 0.5e3 * plant.sample_time_s;
-        return Err(DesignError::DelayBelowHold { delay_ms: plant.loop_delay_s() * 1e3, hold_ms });
+        return Err(DesignError::DelayBelowHold {
+            delay_ms: plant.loop_delay_s() * 1e3,
+            hold_ms,
+        });
     }
     let mut pi = match request.controller {
         Requested::Pi(pi) => pi,
-        Requested::SearchPi(search) => search_pi(plant, search)?
-            .ok_or(DesignError::NoGains { max_ms: search.max_ms, max_mt: search.max_mt })?,
+        Requested::SearchPi(search) => search_pi(plant, search)?.ok_or(DesignError::NoGains {
+            max_ms: search.max_ms,
+            max_mt: search.max_mt,
+        })?,
     };
     if let Some(b) = request.setpoint_weight {
         pi.setpoint_weight = b;
     }
     pi.validate()?;
     let controller = ControllerConfig::Pi(pi);
-    let law = LinearLaw::Pi { pi, sample_time_s: plant.sample_time_s };
+    let law = LinearLaw::Pi {
+        pi,
+        sample_time_s: plant.sample_time_s,
+    };
     let mut warnings = plant.warnings.clone();
     let config = loop_config(plant, controller, request.command_limits, &mut warnings);
     let (step, disturbance) = match &config {
-        Some(config) => {
-            (Some(step_figures(plant, config, 10.0)?), Some(disturbance_figures(plant, config, 10.0)?))
-        }
+        Some(config) => (
+            Some(step_figures(plant, config, 10.0)?),
+            Some(disturbance_figures(plant, config, 10.0)?),
+        ),
         None => (None, None),
     };
     let spread = spread(plant, &law)?;
@@ -218,10 +229,17 @@ fn loop_config(
             fix_noise_um: positive_or(plant.fix_noise_um, 0.020),
             ..EstimatorConfig::default()
         };
-        let config = LoopConfig { model, estimator, controller, limits };
+        let config = LoopConfig {
+            model,
+            estimator,
+            controller,
+            limits,
+        };
         crate::control_loop::ControlLoop::new(config).map(|_| config)
     });
-    built.map_err(|error| warnings.push(DesignWarning::NoLoop(error))).ok()
+    built
+        .map_err(|error| warnings.push(DesignWarning::NoLoop(error)))
+        .ok()
 }
 
 fn positive_or(value: f64, otherwise: f64) -> f64 {
@@ -232,17 +250,32 @@ fn broken(report: &DesignReport, limits: &DesignLimits) -> Vec<BrokenLimit> {
     let m = &report.margins;
     let mut broken = Vec::new();
     if !m.stable {
-        broken.push(BrokenLimit { key: "stable", value: m.spectral_radius, limit: 1.0, unit: "(largest pole)" });
+        broken.push(BrokenLimit {
+            key: "stable",
+            value: m.spectral_radius,
+            limit: 1.0,
+            unit: "(largest pole)",
+        });
     }
     let mut most = |key, value: f64, limit: Option<f64>, unit| {
         // A figure that does not exist (NaN) does not keep its limit.
         if let Some(limit) = limit.filter(|&limit| !(value <= limit)) {
-            broken.push(BrokenLimit { key, value, limit, unit });
+            broken.push(BrokenLimit {
+                key,
+                value,
+                limit,
+                unit,
+            });
         }
     };
     most("max_ms", m.ms, limits.max_ms, "");
     most("max_mt", m.mt, limits.max_mt, "");
-    most("max_rms_nm", report.noise.map_or(f64::NAN, |n| n.rms_um * 1e3), limits.max_rms_nm, "nm");
+    most(
+        "max_rms_nm",
+        report.noise.map_or(f64::NAN, |n| n.rms_um * 1e3),
+        limits.max_rms_nm,
+        "nm",
+    );
     let step = report.step;
     most(
         "max_overshoot_percent",
@@ -256,21 +289,43 @@ fn broken(report: &DesignReport, limits: &DesignLimits) -> Vec<BrokenLimit> {
         limits.max_settling_ms,
         "ms",
     );
-    let unstable = report.spread.iter().filter(|row| !row.margins.stable).count() as f64;
-    most("stable_over_spread", unstable, (limits.stable_over_spread == Some(true)).then_some(0.0), "unstable points");
+    let unstable = report
+        .spread
+        .iter()
+        .filter(|row| !row.margins.stable)
+        .count() as f64;
+    most(
+        "stable_over_spread",
+        unstable,
+        (limits.stable_over_spread == Some(true)).then_some(0.0),
+        "unstable points",
+    );
     let mut least = |key, value: f64, limit: Option<f64>, unit| {
         if let Some(limit) = limit.filter(|&limit| !(value >= limit)) {
-            broken.push(BrokenLimit { key, value, limit, unit });
+            broken.push(BrokenLimit {
+                key,
+                value,
+                limit,
+                unit,
+            });
         }
     };
     least("min_pm_deg", m.pm_deg, limits.min_pm_deg, "deg");
     least("min_gm_db", m.gm_db, limits.min_gm_db, "dB");
-    least("min_delay_margin_ms", m.delay_margin_s * 1e3, limits.min_delay_margin_ms, "ms");
+    least(
+        "min_delay_margin_ms",
+        m.delay_margin_s * 1e3,
+        limits.min_delay_margin_ms,
+        "ms",
+    );
     broken
 }
 
 /// A lead that recovers phase around the crossover of a loop with delay `T`: zero at 1/(2 pi T), pole four times as far.
 pub fn default_lead(loop_delay_s: f64) -> Lead {
     let zero_hz = 1.0 / (std::f64::consts::TAU * loop_delay_s);
-    Lead { zero_hz, pole_hz: 4.0 * zero_hz }
+    Lead {
+        zero_hz,
+        pole_hz: 4.0 * zero_hz,
+    }
 }

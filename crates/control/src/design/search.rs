@@ -23,7 +23,11 @@ pub struct PiSearch {
 
 impl Default for PiSearch {
     fn default() -> Self {
-        Self { max_ms: 1.6, max_mt: 1.3, lead: None }
+        Self {
+            max_ms: 1.6,
+            max_mt: 1.3,
+            lead: None,
+        }
     }
 }
 
@@ -36,14 +40,22 @@ struct Problem<'a> {
 
 impl Problem<'_> {
     fn law(&self, kp: f64, ki: f64) -> LinearLaw {
-        let pi = Pi { lead: self.search.lead, ..Pi::new(self.sign * kp, self.sign * ki) };
-        LinearLaw::Pi { pi, sample_time_s: self.plant.sample_time_s }
+        let pi = Pi {
+            lead: self.search.lead,
+            ..Pi::new(self.sign * kp, self.sign * ki)
+        };
+        LinearLaw::Pi {
+            pi,
+            sample_time_s: self.plant.sample_time_s,
+        }
     }
 
     fn allowed(&self, kp: f64, ki: f64) -> bool {
         let law = self.law(kp, ki);
         let (ms, mt) = self.grid.peaks(&law);
-        ms <= self.search.max_ms && mt <= self.search.max_mt && is_stable(self.plant, &law).unwrap_or(false)
+        ms <= self.search.max_ms
+            && mt <= self.search.max_mt
+            && is_stable(self.plant, &law).unwrap_or(false)
     }
 
     /// Largest integral gain for a proportional one, 0 if none is allowed.
@@ -55,7 +67,11 @@ impl Problem<'_> {
         }
         for _ in 0..40 {
             let middle = (low * high).sqrt();
-            if self.allowed(kp, middle) { low = middle } else { high = middle }
+            if self.allowed(kp, middle) {
+                low = middle
+            } else {
+                high = middle
+            }
         }
         low
     }
@@ -71,7 +87,12 @@ pub fn search_pi(plant: &DesignPlant, search: PiSearch) -> Result<Option<Pi>, Pl
         Ok(model) => model.gain_per_s.signum(),
         Err(_) => 1.0,
     };
-    let problem = Problem { plant, grid: Grid::new(plant, 80)?, search, sign };
+    let problem = Problem {
+        plant,
+        grid: Grid::new(plant, 80)?,
+        search,
+        sign,
+    };
     // A pure integrator with delay T becomes unstable at kp = pi / (2 K T).
     let highest = 2.0 / (velocity_gain * plant.loop_delay_s());
     let scan: Vec<(f64, f64)> = (1..=60)
@@ -89,14 +110,21 @@ pub fn search_pi(plant: &DesignPlant, search: PiSearch) -> Result<Option<Pi>, Pl
     let ratio = 0.5 * (5.0_f64.sqrt() - 1.0);
     for _ in 0..20 {
         let (a, b) = (high - ratio * (high - low), low + ratio * (high - low));
-        if problem.best_ki(a) > problem.best_ki(b) { high = b } else { low = a }
+        if problem.best_ki(a) > problem.best_ki(b) {
+            high = b
+        } else {
+            low = a
+        }
     }
     let refined = 0.5 * (low + high);
     let (kp, ki) = std::iter::once((refined, problem.best_ki(refined)))
         .chain(std::iter::once(scan[best]))
         .max_by(|a, b| a.1.total_cmp(&b.1))
         .unwrap_or(scan[best]);
-    Ok(Some(Pi { lead: search.lead, ..Pi::new(sign * kp, sign * ki) }))
+    Ok(Some(Pi {
+        lead: search.lead,
+        ..Pi::new(sign * kp, sign * ki)
+    }))
 }
 
 #[cfg(test)]
@@ -109,7 +137,14 @@ mod tests {
         for (delay_s, published_ki) in [(2.5e-3, 19.5), (3.5e-3, 9.6)] {
             let plant = DesignPlant::eq6(delay_s);
             let pi = search_pi(&plant, PiSearch::default()).unwrap().unwrap();
-            let m = margins(&plant, &LinearLaw::Pi { pi, sample_time_s: 1e-3 }).unwrap();
+            let m = margins(
+                &plant,
+                &LinearLaw::Pi {
+                    pi,
+                    sample_time_s: 1e-3,
+                },
+            )
+            .unwrap();
             assert!(m.stable && m.ms <= 1.601 && m.mt <= 1.301, "{m:?}");
             assert!(pi.ki_per_s >= published_ki, "{pi:?}");
         }
@@ -119,14 +154,21 @@ mod tests {
     fn a_plant_of_opposite_sign_gets_gains_of_opposite_sign() {
         let plant = DesignPlant::eq6(2.5e-3);
         let turned = plant.changed(-1.0, 0).unwrap();
-        let (a, b) = (search_pi(&plant, PiSearch::default()).unwrap(), search_pi(&turned, PiSearch::default()).unwrap());
+        let (a, b) = (
+            search_pi(&plant, PiSearch::default()).unwrap(),
+            search_pi(&turned, PiSearch::default()).unwrap(),
+        );
         let (a, b) = (a.unwrap(), b.unwrap());
         assert!((a.kp + b.kp).abs() < 1e-9 && (a.ki_per_s + b.ki_per_s).abs() < 1e-9);
     }
 
     #[test]
     fn limits_that_no_gain_keeps_give_no_gains() {
-        let search = PiSearch { max_ms: 1.01, max_mt: 1.0001, lead: None };
+        let search = PiSearch {
+            max_ms: 1.01,
+            max_mt: 1.0001,
+            lead: None,
+        };
         assert_eq!(search_pi(&DesignPlant::eq6(2.5e-3), search).unwrap(), None);
     }
 }

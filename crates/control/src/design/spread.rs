@@ -28,7 +28,11 @@ pub fn spread(plant: &DesignPlant, law: &LinearLaw) -> Result<Vec<SpreadRow>, Pl
     for extra_samples in 0..2 {
         for gain_factor in GAIN_FACTORS {
             let margins = margins(&plant.changed(gain_factor, extra_samples)?, law)?;
-            rows.push(SpreadRow { gain_factor, extra_samples, margins });
+            rows.push(SpreadRow {
+                gain_factor,
+                extra_samples,
+                margins,
+            });
         }
     }
     Ok(rows)
@@ -42,7 +46,10 @@ mod tests {
     #[test]
     fn published_pi_gains_are_stable_over_the_spread() {
         for (delay_s, pi) in [(2.5e-3, Pi::new(0.46, 19.5)), (3.5e-3, Pi::new(0.33, 9.6))] {
-            let law = LinearLaw::Pi { pi, sample_time_s: 1e-3 };
+            let law = LinearLaw::Pi {
+                pi,
+                sample_time_s: 1e-3,
+            };
             let rows = spread(&DesignPlant::eq6(delay_s), &law).unwrap();
             assert_eq!(rows.len(), 10);
             assert!(rows.iter().all(|row| row.margins.stable), "{rows:?}");

@@ -125,12 +125,24 @@ fn settled_after(errors: impl Iterator<Item = f64>, band: f64, sample_time_s: f6
 ///
 /// # Errors
 /// A plant or a loop that cannot be built.
-pub fn step_figures(plant: &DesignPlant, config: &LoopConfig, size_um: f64) -> Result<StepFigures, SetUpError> {
+pub fn step_figures(
+    plant: &DesignPlant,
+    config: &LoopConfig,
+    size_um: f64,
+) -> Result<StepFigures, SetUpError> {
     let (y, largest_move_um) = run(plant, config, 2000, 0.0, |_| size_um)?;
     let ts = plant.sample_time_s;
-    let first = |level: f64| y.iter().position(|&p| p / size_um >= level).map_or(f64::INFINITY, |k| k as f64 * ts);
-    let highest = y.iter().map(|p| p / size_um).fold(f64::NEG_INFINITY, f64::max);
-    let settled = |part: f64| settled_after(y.iter().map(|p| p - size_um), part * size_um.abs(), ts);
+    let first = |level: f64| {
+        y.iter()
+            .position(|&p| p / size_um >= level)
+            .map_or(f64::INFINITY, |k| k as f64 * ts)
+    };
+    let highest = y
+        .iter()
+        .map(|p| p / size_um)
+        .fold(f64::NEG_INFINITY, f64::max);
+    let settled =
+        |part: f64| settled_after(y.iter().map(|p| p - size_um), part * size_um.abs(), ts);
     Ok(StepFigures {
         size_um,
         rise_s: first(0.9) - first(0.1),

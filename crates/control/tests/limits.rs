@@ -1,0 +1,121 @@
+//! Whatever comes in, the command is finite, within range and within slew of the previous one.
+
+use cellpos_control::*;
+use proptest::prelude::*;
+
+fn any_number() -> impl Strategy<Value = f64> {
+    prop_oneof![
+        6 => -100.0..100.0_f64,
+        1 => any::<f64>(),
+        1 => prop_oneof![
+            Just(f64::NAN), Just(f64::INFINITY), Just(f64::NEG_INFINITY), Just(1e300), Just(-1e300), Just(0.0),
+            Just(f64::MIN_POSITIVE)
+        ],
+    ]
+}
+
+fn any_measurement() -> impl Strategy<Value = Option<Measurement>> {
+    proptest::option::weighted(
+        0.8,
+        (any_number(), any_number(), 0u16..9).prop_map(
+            |(position_um, variance_um2, age_samples)| Measurement {
+                position_um,
+                variance_um2,
+                age_samples,
+            },
+        ),
+    )
+}
+
+fn any_mode() -> impl Strategy<Value = Mode> {
+    prop_oneof![6 => Just(Mode::Run), 1 => Just(Mode::Freeze), 1 => Just(Mode::Park)]
+}
+
+prop_compose! {
+    fn any_config()(
+        gain in prop_oneof![-3000.0..-1.0_f64, 1.0..3000.0_f64],
+        delay_s in 0.0..5e-3_f64,
+        kp in -5.0..5.0_f64,
+        ki in -500.0..500.0_f64,
+        weight in 0.0..=1.0_f64,
+        lead in proptest::option::of(0.1..300.0_f64),
+        low in -50.0..50.0_f64,
+        span in 0.001..100.0_f64,
+        slew in 0.01..1e6_f64,
+        park in 0.0..=1.0_f64,
+    ) -> LoopConfig {
+        let pi = Pi {
+            setpoint_weight: weight,
+            lead: lead.map(|zero_hz| Lead { zero_hz, pole_hz: 4.0 * zero_hz }),
+            tracking_time_s: 0.05,
+            ..Pi::new(kp, ki)
+        };
+        LoopConfig {
+            model: LoopModel { gain_per_s: gain, ..LoopModel::eq6(delay_s) },
+            estimator: EstimatorConfig::default(),
+            controller: ControllerConfig::Pi(pi),
+            limits: Limits {
+                low_um: low,
+                high_um: low + span,
+                slew_um_per_s: slew,
+                park_um: (low + park * span).clamp(low, low + span),
+            },
+        }
+    }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 400, failure_persistence: None, ..ProptestConfig::default() })]
+
+    #[test]
+    fn no_command_leaves_range_or_slew_whatever_the_measurements(
+        config in any_config(),
+        start in any_number(),
+        ticks in proptest::collection::vec((any_measurement(), any_number(), any_mode()), 1..200),
+    ) {
+        let mut controller = Controller::new(config).unwrap();
+        let mut state = controller.start(start, start);
+        let Limits { low_um, high_um, slew_um_per_s, .. } = config.limits;
+        let mut last = state.previous_command_um();
+        prop_assert!((low_um..=high_um).contains(&last));
+        for (measurement, reference_um, mode) in ticks {
+            let input = LoopInput { measurement, reference_um, mode, ..LoopInput::default() };
+            let out = controller.step(&mut state, &input);
+            prop_assert!(out.command_um.is_finite());
+            prop_assert!((low_um..=high_um).contains(&out.command_um));
+            let rounding = 1e-12 * (1.0 + last.abs());
+            prop_assert!((out.command_um - last).abs() <= slew_um_per_s * 1e-3 + rounding);
+            prop_assert!(out.estimate_um.is_finite() && out.neutral_um.is_finite());
+            last = out.command_um;
+        }
+    }
+
+    #[test]
+    fn a_loop_comes_back_from_any_garbage(
+        garbage in proptest::collection::vec((any_measurement(), any_number(), any_mode()), 1..100),
+        seed in 0u64..1000,
+    ) {
+        let config = LoopConfig {
+            model: LoopModel::eq6(2e-3),
+            estimator: EstimatorConfig::default(),
+            controller: ControllerConfig::Pi(Pi::new(0.46, 19.5)),
+            limits: Limits::default(),
+        };
+        let mut controller = Controller::new(config).unwrap();
+        let mut state = controller.start(20.0, 20.0);
+        for (measurement, reference_um, mode) in garbage {
+            controller.step(&mut state, &LoopInput { measurement, reference_um, mode, ..LoopInput::default() });
+        }
+        let mut rig = SimulatedRig::new(RigConfig::eq6(seed)).unwrap();
+        let mut worst: f64 = 0.0;
+        for k in 0..8000 {
+            let input = LoopInput { measurement: Some(rig.measure()), ..LoopInput::default() };
+            let out = controller.step(&mut state, &input);
+            rig.advance(out.command_um);
+            if k > 7500 {
+                worst = worst.max(rig.true_um().abs());
+            }
+        }
+        prop_assert!(worst < 0.5, "{worst} um from the target");
+    }
+}
