@@ -37,6 +37,43 @@ pub enum Polarity {
     Dark,
 }
 
+impl Polarity {
+    /// 1 for bright cores, -1 for dark ones.
+    pub fn sign(self) -> f64 {
+        match self {
+            Polarity::Bright => 1.0,
+            Polarity::Dark => -1.0,
+        }
+    }
+}
+
+/// Learning of the template from the beads themselves.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Learning {
+    /// Good fixes averaged into the first learnt template, 5 or more.
+    #[serde(default = "defaults::first_fixes")]
+    pub first_fixes: u32,
+    /// Good fixes between refreshes after that; 0 for no refresh.
+    #[serde(default = "defaults::refresh_fixes")]
+    pub refresh_fixes: u32,
+    /// Largest change of the profile from the configured one that the first template may bring, and a quarter of it the
+    /// largest drift by refreshes: RMS over the window, as a fraction of the amplitude. A larger one is refused. Until the first template is
+    /// taken, a residual up to this is tolerated in place of `template_tolerance`.
+    #[serde(default = "defaults::max_change")]
+    pub max_change: f64,
+}
+
+impl Default for Learning {
+    fn default() -> Self {
+        Learning {
+            first_fixes: defaults::first_fixes(),
+            refresh_fixes: defaults::refresh_fixes(),
+            max_change: defaults::max_change(),
+        }
+    }
+}
+
 /// Settings of a [`crate::Localiser`].
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -66,6 +103,9 @@ pub struct LocaliserConfig {
     /// Passes over the window after which the fit counts as not converged, 3 to 50.
     #[serde(default = "defaults::max_passes")]
     pub max_passes: u32,
+    /// Learn the template from the first good fixes and refresh it; left out: the configured profile stays.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub learning: Option<Learning>,
 }
 
 mod defaults {
@@ -77,6 +117,15 @@ mod defaults {
     }
     pub fn template_tolerance() -> f64 {
         0.06
+    }
+    pub fn first_fixes() -> u32 {
+        50
+    }
+    pub fn refresh_fixes() -> u32 {
+        5000
+    }
+    pub fn max_change() -> f64 {
+        0.2
     }
     pub fn max_passes() -> u32 {
         12
@@ -114,6 +163,7 @@ impl LocaliserConfig {
             max_residual_ratio: defaults::max_residual_ratio(),
             template_tolerance: defaults::template_tolerance(),
             max_passes: defaults::max_passes(),
+            learning: None,
         }
     }
 
@@ -184,6 +234,26 @@ impl LocaliserConfig {
             f64::from(passes),
             "between 3 and 50 passes",
         )?;
+        if let Some(Learning {
+            first_fixes,
+            max_change,
+            ..
+        }) = self.learning
+        {
+            check(
+                first_fixes >= 5,
+                "learning.first_fixes",
+                f64::from(first_fixes),
+                "5 fixes or more",
+            )?;
+            let allowed = max_change > 0.0 && max_change <= 0.5;
+            check(
+                allowed,
+                "learning.max_change",
+                max_change,
+                "a fraction above 0, at most 0.5",
+            )?;
+        }
         if let Noise::Known {
             read_sd_grey,
             shot_grey_per_electron,

@@ -7,7 +7,8 @@
 
 use crate::crop::{Crop, LANES, Row, STRIDE};
 use crate::profile::Template;
-use nalgebra::{Matrix2, Matrix4, Vector4};
+use nalgebra::{Matrix2, Matrix3, Matrix4, Vector3, Vector4};
+use wide::f32x4;
 
 /// How the noise of a pixel depends on its grey level.
 #[derive(Debug, Clone, Copy)]
@@ -36,24 +37,24 @@ pub(crate) struct Pass {
     pub covariance: Matrix2<f64>,
 }
 
-/// Sums over the window, one lane each.
+/// Sums over the window, lane by lane.
 #[derive(Clone, Copy, Default)]
 struct Sums {
-    w: [f32; LANES],
-    wf: [f32; LANES],
-    wx: [f32; LANES],
-    wy: [f32; LANES],
-    wff: [f32; LANES],
-    wxf: [f32; LANES],
-    wyf: [f32; LANES],
-    wxx: [f32; LANES],
-    wxy: [f32; LANES],
-    wyy: [f32; LANES],
-    wp: [f32; LANES],
-    wfp: [f32; LANES],
-    wxp: [f32; LANES],
-    wyp: [f32; LANES],
-    wpp: [f32; LANES],
+    w: f32x4,
+    wf: f32x4,
+    wx: f32x4,
+    wy: f32x4,
+    wff: f32x4,
+    wxf: f32x4,
+    wyf: f32x4,
+    wxx: f32x4,
+    wxy: f32x4,
+    wyy: f32x4,
+    wp: f32x4,
+    wfp: f32x4,
+    wxp: f32x4,
+    wyp: f32x4,
+    wpp: f32x4,
 }
 
 /// One pass at the position (`x_px`, `y_px`), frame coordinates. `None` when the normal matrix is singular.
@@ -71,6 +72,8 @@ pub(crate) fn pass(
     for (i, d) in dx.iter_mut().enumerate() {
         *d = i as f32 - x;
     }
+    let mut entry = [0_u32; STRIDE];
+    let mut offset: Row = [0.0; STRIDE];
     let mut value: Row = [0.0; STRIDE];
     // Minus twice the derivative with respect to the squared radius: times dx it is the derivative by the centre.
     let mut inward: Row = [0.0; STRIDE];
@@ -82,8 +85,12 @@ pub(crate) fn pass(
     for (j, pixels) in crop.rows.iter().enumerate().take(crop.height) {
         let dy = j as f32 - y;
         let dy2 = dy * dy;
-        for ((v, g), d) in value.iter_mut().zip(&mut inward).zip(&dx).take(lanes_end) {
-            let (f, df) = template.at(d * d + dy2);
+        for ((e, t), d) in entry[..lanes_end].iter_mut().zip(&mut offset).zip(&dx) {
+            (*e, *t) = template.place(d * d + dy2);
+        }
+        let places = entry[..lanes_end].iter().zip(&offset);
+        for ((v, g), (e, t)) in value.iter_mut().zip(&mut inward).zip(places) {
+            let (f, df) = template.read((*e, *t));
             *v = f;
             *g = -2.0 * df;
         }
@@ -134,34 +141,33 @@ impl Sums {
             .zip(inward.as_chunks::<LANES>().0)
             .zip(dx.as_chunks::<LANES>().0);
         let mut s = *self;
+        let dy = f32x4::splat(dy);
         for ((((w, f), g), d), p) in chunks.zip(pixels.as_chunks::<LANES>().0) {
-            for l in 0..LANES {
-                let (w, f, p) = (w[l], f[l], p[l]);
-                let fx = g[l] * d[l];
-                let fy = g[l] * dy;
-                let (wf, wx, wy, wp) = (w * f, w * fx, w * fy, w * p);
-                s.w[l] += w;
-                s.wf[l] += wf;
-                s.wx[l] += wx;
-                s.wy[l] += wy;
-                s.wff[l] += wf * f;
-                s.wxf[l] += wx * f;
-                s.wyf[l] += wy * f;
-                s.wxx[l] += wx * fx;
-                s.wxy[l] += wx * fy;
-                s.wyy[l] += wy * fy;
-                s.wp[l] += wp;
-                s.wfp[l] += wf * p;
-                s.wxp[l] += wx * p;
-                s.wyp[l] += wy * p;
-                s.wpp[l] += wp * p;
-            }
+            let [w, f, g, d, p] = [w, f, g, d, p].map(|lanes| f32x4::from(*lanes));
+            let fx = g * d;
+            let fy = g * dy;
+            let (wf, wx, wy, wp) = (w * f, w * fx, w * fy, w * p);
+            s.w += w;
+            s.wf += wf;
+            s.wx += wx;
+            s.wy += wy;
+            s.wff += wf * f;
+            s.wxf += wx * f;
+            s.wyf += wy * f;
+            s.wxx += wx * fx;
+            s.wxy += wx * fy;
+            s.wyy += wy * fy;
+            s.wp += wp;
+            s.wfp += wf * p;
+            s.wxp += wx * p;
+            s.wyp += wy * p;
+            s.wpp += wp * p;
         }
         *self = s;
     }
 
     fn solve(&self) -> Option<Pass> {
-        let t = |lanes: &[f32; LANES]| lanes.iter().map(|v| f64::from(*v)).sum::<f64>();
+        let t = |lanes: &f32x4| lanes.to_array().iter().map(|v| f64::from(*v)).sum::<f64>();
         let normal = Matrix4::new(
             t(&self.wxx),
             t(&self.wxy),
@@ -197,4 +203,37 @@ impl Sums {
             pass.step_x_px.is_finite() && pass.step_y_px.is_finite() && pass.chi2.is_finite();
         finite.then_some(pass)
     }
+}
+
+/// Relative change of the template's radius that fits the window best at a fixed position, beside amplitude and
+/// background, and its standard deviation for an even noise `variance` (grey^2).
+pub(crate) fn scale(
+    crop: &Crop,
+    template: &Template,
+    x_px: f64,
+    y_px: f64,
+    variance: f64,
+) -> Option<(f64, f64)> {
+    let (x, y) = (
+        (x_px - crop.x0 as f64) as f32,
+        (y_px - crop.y0 as f64) as f32,
+    );
+    let (mut normal, mut right) = (Matrix3::zeros(), Vector3::zeros());
+    for (j, row) in crop.rows.iter().enumerate().take(crop.height) {
+        let dy = j as f32 - y;
+        for (i, p) in row.iter().enumerate().take(crop.width) {
+            let dx = i as f32 - x;
+            let q = dx * dx + dy * dy;
+            let (f, df) = template.at(q);
+            // f(r / s) changes by -r f'(r) per unit of s, and r f' = 2 q df/dq.
+            let g = Vector3::new(f64::from(f), 1.0, f64::from(-2.0 * q * df));
+            normal += g * g.transpose();
+            right += g * f64::from(*p);
+        }
+    }
+    let inverse = normal.cholesky()?.inverse();
+    let solution = inverse * right;
+    let change = solution[2] / solution[0];
+    let sd = (inverse[(2, 2)] * variance).sqrt() / solution[0].abs();
+    (change.is_finite() && sd.is_finite()).then_some((change, sd))
 }

@@ -4,19 +4,28 @@
 //! uses buffers made beforehand and allocates nothing. Not for devices or files: frames come in as slices.
 #![forbid(unsafe_code)]
 
+pub mod account;
+pub mod blobs;
 pub mod config;
 mod crop;
 mod fit;
 mod fix;
 mod frame;
+mod learn;
 mod localiser;
 pub mod profile;
 mod seed;
+pub mod symmetry;
 
-pub use config::{ConfigError, LocaliserConfig, Noise, Polarity};
+pub use account::{FrameAccount, FrameCounts, FrameKind, IdKind};
+pub use blobs::{Blob, Blobs};
+pub use config::{ConfigError, Learning, LocaliserConfig, Noise, Polarity};
 pub use fix::{Fix, Verdict};
 pub use frame::{Frame, Pixels};
+pub use learn::LearningReport;
 pub use localiser::Localiser;
 pub use profile::{
     GaussianProfile, PixelResponse, ProfileSpec, RadialProfile, RingProfile, Template,
 };
+pub use seed::Detector;
+pub use symmetry::RadialSymmetry;

@@ -1,10 +1,11 @@
 //! Position of one bead in a frame: seed, template fit, covariance, verdict.
 
-use crate::config::{ConfigError, LocaliserConfig, Noise, Polarity};
+use crate::config::{ConfigError, LocaliserConfig, Noise};
 use crate::crop::Crop;
 use crate::fit::{self, Pass, Weights};
 use crate::fix::{Fix, Verdict};
 use crate::frame::Frame;
+use crate::learn::{Learner, LearningReport};
 use crate::profile::Template;
 use crate::seed;
 
@@ -14,6 +15,8 @@ const CONVERGED_PX: f64 = 0.01;
 const RECENTRE_PX: f64 = 1.0;
 /// How often the window may be taken anew.
 const MAX_RECENTRES: u32 = 4;
+/// Half-width in bead radii of the window that leaves neighbours out.
+const NARROW_RADII: f64 = 1.3;
 /// Share of a new frame in the running noise estimate.
 const NOISE_FORGETTING: f64 = 1.0 / 64.0;
 /// Variance of rounding to whole grey levels, grey^2: the least that a pixel's noise can be.
@@ -31,6 +34,7 @@ pub struct Localiser {
     sign: f64,
     /// Running noise variance of a pixel, grey^2; `None` before the first frame.
     noise_variance: Option<f64>,
+    learner: Option<Learner>,
 }
 
 /// A fit at rest or given up.
@@ -48,7 +52,18 @@ impl Localiser {
     /// Names the first setting that cannot be used.
     pub fn new(config: LocaliserConfig) -> Result<Self, ConfigError> {
         let template = config.template()?;
-        Ok(Self::with_template(config, template))
+        let sign = config.polarity.sign();
+        let learner = config
+            .learning
+            .map(|l| Learner::new(l, config.window_px, &template));
+        Ok(Localiser {
+            config,
+            template,
+            crop: Crop::new(),
+            sign,
+            noise_variance: None,
+            learner,
+        })
     }
 
     /// The settings.
@@ -61,23 +76,22 @@ impl Localiser {
         &self.template
     }
 
+    /// 1 for bright cores, -1 for dark ones.
+    pub fn sign(&self) -> f64 {
+        self.sign
+    }
+
     /// Noise variance of a pixel in use at the background, grey^2; `None` before the first frame.
     pub fn noise_variance(&self) -> Option<f64> {
         self.noise_variance
     }
 
-    fn with_template(config: LocaliserConfig, template: Template) -> Self {
-        let sign = match config.polarity {
-            Polarity::Bright => 1.0,
-            Polarity::Dark => -1.0,
-        };
-        Localiser {
-            config,
-            template,
-            crop: Crop::new(),
-            sign,
-            noise_variance: None,
-        }
+    /// How far the learning of the template has come.
+    pub fn learning(&self) -> LearningReport {
+        self.learner
+            .as_ref()
+            .map(Learner::report)
+            .unwrap_or_default()
     }
 
     /// Position of the bead nearest to `guess` (px), or of the strongest in the frame when there is no guess.
@@ -85,39 +99,36 @@ impl Localiser {
     /// A fix whose verdict is not [`Verdict::Good`] carries what was found, for the record; it must not be used as a
     /// position.
     pub fn locate(&mut self, frame: &Frame, guess: Option<(f64, f64)>) -> Fix {
-        let start = match guess {
-            Some(g) => Some(g),
-            None => seed::strongest(
-                frame,
-                self.sign,
-                self.template.radius_px(),
-                self.config.min_snr,
-            ),
-        };
+        let radius_px = self.template.radius_px();
+        let start =
+            guess.or_else(|| seed::strongest(frame, self.sign, radius_px, self.config.min_snr));
         let Some((x_px, y_px)) = start else {
             return Fix::none(0.0, 0.0, Verdict::NoSignal);
         };
-        if !self.crop.take(frame, x_px, y_px, self.config.window_px) {
-            return Fix::none(x_px, y_px, Verdict::AtBorder);
+        let window_px = self.config.window_px;
+        let fix = self.attempt(frame, (x_px, y_px), window_px);
+        if fix.verdict == Verdict::Good {
+            self.learn(&fix);
         }
-        self.update_noise();
-        let first = self.fit(frame, x_px, y_px);
-        let fix = self.judge(frame, first, (x_px, y_px));
         if matches!(fix.verdict, Verdict::Good | Verdict::AtBorder) {
             return fix;
         }
+        // A neighbour may have come into the window's corner: once more with a window that just holds the bead.
+        let narrow_px = 2 * (NARROW_RADII * radius_px).ceil() as usize + 1;
+        if narrow_px < window_px {
+            let again = self.attempt(frame, (x_px, y_px), narrow_px);
+            if again.verdict == Verdict::Good {
+                return again;
+            }
+        }
         // The guess may have been out of the fit's reach: once more from the centroid.
-        if !self.crop.take(frame, x_px, y_px, self.config.window_px) {
+        if !self.crop.take(frame, x_px, y_px, window_px) {
             return fix;
         }
-        let Some((cx_px, cy_px)) = self
-            .crop
-            .centroid(self.sign as f32, self.template.radius_px())
-        else {
+        let Some(centroid) = self.crop.centroid(self.sign as f32, radius_px) else {
             return fix;
         };
-        let second = self.fit(frame, cx_px, cy_px);
-        let again = self.judge(frame, second, (x_px, y_px));
+        let again = self.attempt(frame, centroid, window_px);
         if matches!(again.verdict, Verdict::Good | Verdict::AtBorder) {
             again
         } else {
@@ -125,6 +136,42 @@ impl Localiser {
         }
     }
 
+    /// Size of the bead of the last fix relative to the template, and its standard deviation: the template's scale fitted
+    /// beside amplitude and background at the fix's position. Valid near 1, for telling beads apart; `None` when the
+    /// fix was not from this window.
+    pub fn relative_size(&self, fix: &Fix) -> Option<(f64, f64)> {
+        let variance = self.noise_variance.unwrap_or(1.0);
+        let (change, sd) = fit::scale(&self.crop, &self.template, fix.x_px, fix.y_px, variance)?;
+        Some((1.0 + change, sd))
+    }
+
+    fn attempt(&mut self, frame: &Frame, (x_px, y_px): (f64, f64), side_px: usize) -> Fix {
+        if !self.crop.take(frame, x_px, y_px, side_px) {
+            return Fix::none(x_px, y_px, Verdict::AtBorder);
+        }
+        let fitted = self.fit(frame, x_px, y_px, side_px);
+        self.update_noise();
+        self.judge(frame, fitted, (x_px, y_px))
+    }
+
+    fn learn(&mut self, fix: &Fix) {
+        let Some(learner) = &mut self.learner else {
+            return;
+        };
+        let background = fix.background - f64::from(self.crop.pedestal);
+        if learner.take_in(
+            &self.crop,
+            (fix.x_px, fix.y_px),
+            fix.amplitude,
+            background,
+            fix.snr,
+        ) {
+            learner.refresh(&mut self.template);
+        }
+    }
+
+    /// Noise from the window as it lies after the fit, centred on the bead: a window off centre has the bead's edge on
+    /// its border.
     fn update_noise(&mut self) {
         self.noise_variance = Some(match self.config.noise {
             Noise::Known { read_sd_grey, .. } => read_sd_grey * read_sd_grey,
@@ -138,18 +185,18 @@ impl Localiser {
         });
     }
 
-    /// Weights for the next pass, given what the pass before found.
+    /// Weights for the next pass, given what the pass before found: relative to [`Localiser::weight_unit`].
     fn weights(&self, before: Option<&Pass>) -> Weights {
-        let variance = self.noise_variance.unwrap_or(1.0);
         match (self.config.noise, before) {
             (
                 Noise::Known {
+                    read_sd_grey,
                     shot_grey_per_electron: gain,
                     black_level_grey: black,
-                    ..
                 },
                 Some(p),
             ) if gain > 0.0 => {
+                let variance = read_sd_grey * read_sd_grey;
                 let light = p.background + f64::from(self.crop.pedestal) - black;
                 Weights::Shot {
                     base: (variance + gain * light.max(0.0)) as f32,
@@ -157,13 +204,31 @@ impl Localiser {
                     floor: variance as f32,
                 }
             }
-            _ => Weights::Even {
-                variance: variance as f32,
-            },
+            _ => Weights::Even { variance: 1.0 },
         }
     }
 
-    fn fit(&mut self, frame: &Frame, x_px: f64, y_px: f64) -> Option<Fitted> {
+    /// Until the first template is learnt, as much is tolerated as learning may change: it could not start otherwise.
+    fn template_tolerance(&self) -> f64 {
+        let configured = self.config.template_tolerance;
+        match &self.learner {
+            Some(l) if l.report().taken == 0 => configured.max(l.max_change()),
+            _ => configured,
+        }
+    }
+
+    /// Noise variance that a weight of 1 stands for: even weights are relative, those with shot noise absolute.
+    fn weight_unit(&self) -> f64 {
+        match self.config.noise {
+            Noise::Known {
+                shot_grey_per_electron,
+                ..
+            } if shot_grey_per_electron > 0.0 => 1.0,
+            _ => self.noise_variance.unwrap_or(1.0),
+        }
+    }
+
+    fn fit(&mut self, frame: &Frame, x_px: f64, y_px: f64, side_px: usize) -> Option<Fitted> {
         let shot = matches!(self.config.noise, Noise::Known { shot_grey_per_electron, .. } if shot_grey_per_electron > 0.0);
         let reach_px = 0.4 * self.template.radius_px();
         let (mut x_px, mut y_px) = (x_px, y_px);
@@ -195,7 +260,7 @@ impl Localiser {
             );
             if off_centre > RECENTRE_PX && recentres < MAX_RECENTRES {
                 let (x0, y0) = (self.crop.x0, self.crop.y0);
-                if !self.crop.take(frame, x_px, y_px, self.config.window_px) {
+                if !self.crop.take(frame, x_px, y_px, side_px) {
                     return Some(Fitted {
                         x_px,
                         y_px,
@@ -232,14 +297,14 @@ impl Localiser {
         let amplitude = f.pass.amplitude;
         let background = f.pass.background + f64::from(self.crop.pedestal);
         let pixels = (self.crop.width * self.crop.height) as f64;
-        let residual_ratio = f.pass.chi2.max(0.0) / (pixels - 4.0);
+        let unit = self.weight_unit();
+        let residual_ratio = f.pass.chi2.max(0.0) / (unit * (pixels - 4.0));
         let variance = match self.weights(Some(&f.pass)) {
-            Weights::Even { variance } => f64::from(variance),
+            Weights::Even { .. } => unit,
             Weights::Shot { base, .. } => f64::from(base),
         };
         let snr = self.sign * amplitude / variance.sqrt();
-        let tolerated =
-            self.config.max_residual_ratio + (self.config.template_tolerance * snr).powi(2);
+        let tolerated = self.config.max_residual_ratio + (self.template_tolerance() * snr).powi(2);
         let margin_px = self.template.radius_px();
         let inside = |c: f64, len: usize| c >= margin_px && c <= len as f64 - 1.0 - margin_px;
         let in_window =
@@ -260,9 +325,9 @@ impl Localiser {
         Fix {
             x_px: f.x_px,
             y_px: f.y_px,
-            var_x_px2: f.pass.covariance[(0, 0)],
-            var_y_px2: f.pass.covariance[(1, 1)],
-            cov_xy_px2: f.pass.covariance[(0, 1)],
+            var_x_px2: unit * f.pass.covariance[(0, 0)],
+            var_y_px2: unit * f.pass.covariance[(1, 1)],
+            cov_xy_px2: unit * f.pass.covariance[(0, 1)],
             amplitude,
             background,
             residual_ratio,

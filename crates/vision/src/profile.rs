@@ -78,9 +78,11 @@ impl SplineProfile {
         {
             return None;
         }
+        let (mut upper, mut curvatures) = (vec![0.0; values.len()], vec![0.0; values.len()]);
+        clamped_curvatures(values, &mut upper, &mut curvatures);
         Some(SplineProfile {
             values: values.to_vec(),
-            curvatures: clamped_curvatures(values),
+            curvatures,
             knot_px,
             radius_px,
         })
@@ -101,12 +103,7 @@ impl SplineProfile {
 
 impl RadialProfile for SplineProfile {
     fn value(&self, r_px: f64) -> f64 {
-        let Some((i, t)) = self.place(r_px) else {
-            return 0.0;
-        };
-        let (a, b) = (1.0 - t, t);
-        let bend = (a * a * a - a) * self.curvatures[i] + (b * b * b - b) * self.curvatures[i + 1];
-        a * self.values[i] + b * self.values[i + 1] + bend / 6.0
+        spline_value(&self.values, &self.curvatures, r_px.abs() / self.knot_px)
     }
 
     fn slope(&self, r_px: f64) -> f64 {
@@ -128,31 +125,40 @@ impl RadialProfile for SplineProfile {
     }
 }
 
-/// Second derivatives of the cubic spline with zero slope at both ends (tridiagonal elimination), unit knot distance.
-fn clamped_curvatures(values: &[f64]) -> Vec<f64> {
+/// Value of the spline at `u` knot distances from the centre, nought beyond the last knot.
+pub(crate) fn spline_value(values: &[f64], curvatures: &[f64], u: f64) -> f64 {
+    let i = u as usize;
+    let (Some([v0, v1]), Some([c0, c1])) = (values.get(i..i + 2), curvatures.get(i..i + 2)) else {
+        return 0.0;
+    };
+    let b = u - i as f64;
+    let a = 1.0 - b;
+    a * v0 + b * v1 + ((a * a * a - a) * c0 + (b * b * b - b) * c1) / 6.0
+}
+
+/// Second derivatives of the cubic spline with zero slope at both ends (tridiagonal elimination), unit knot distance,
+/// into `curvatures`; `upper` is scratch. Both as long as `values`, three or more.
+pub(crate) fn clamped_curvatures(values: &[f64], upper: &mut [f64], curvatures: &mut [f64]) {
     let n = values.len();
     let right_side = |i: usize| match i {
         0 => 6.0 * (values[1] - values[0]),
         i if i == n - 1 => 6.0 * (values[n - 2] - values[n - 1]),
         i => 6.0 * (values[i + 1] - 2.0 * values[i] + values[i - 1]),
     };
-    let mut upper = vec![0.0; n];
-    let mut reduced = vec![0.0; n];
     for i in 0..n {
         let diagonal = if i == 0 || i == n - 1 { 2.0 } else { 4.0 };
         let (previous_upper, previous) = if i == 0 {
             (0.0, 0.0)
         } else {
-            (upper[i - 1], reduced[i - 1])
+            (upper[i - 1], curvatures[i - 1])
         };
         let pivot = diagonal - previous_upper;
         upper[i] = 1.0 / pivot;
-        reduced[i] = (right_side(i) - previous) / pivot;
+        curvatures[i] = (right_side(i) - previous) / pivot;
     }
     for i in (0..n - 1).rev() {
-        reduced[i] -= upper[i] * reduced[i + 1];
+        curvatures[i] -= upper[i] * curvatures[i + 1];
     }
-    reduced
 }
 
 /// Bright core with a dark ring, as a bead shows in bright field slightly out of focus: the measured profile, scaled.
@@ -264,11 +270,11 @@ pub enum PixelResponse {
 /// Entries of a [`Template`]: a power of two, so that masking an index replaces a bounds check.
 pub(crate) const TABLE_LEN: usize = 1024;
 
-/// One entry: value, its difference to the next entry, derivative with respect to the squared radius, its difference.
+/// One entry: value, its change per entry, derivative with respect to the squared radius, its change per entry.
 pub(crate) type Entry = [f32; 4];
 
 /// A profile tabulated over the squared radius, so that a pixel costs no square root: value and derivative by linear
-/// interpolation between 1024 entries. The interpolation error is below 3e-4 of the amplitude.
+/// expansion about the nearest of 1024 entries. The interpolation error is below 3e-4 of the amplitude.
 #[derive(Debug, Clone)]
 pub struct Template {
     pub(crate) table: Box<[Entry; TABLE_LEN]>,
@@ -280,50 +286,75 @@ pub struct Template {
 impl Template {
     /// Tabulates a profile. Allocates; done once, before frames come.
     pub fn new<P: RadialProfile + ?Sized>(profile: &P, response: PixelResponse) -> Self {
-        let support_px = profile.support_px();
-        let last = (TABLE_LEN - 1) as f64;
-        let step_px2 = support_px * support_px / last;
-        let value = |i: usize| {
-            let r_px = (i as f64 * step_px2).sqrt();
-            match response {
-                _ if i >= TABLE_LEN - 1 => 0.0,
-                PixelResponse::Point => profile.value(r_px),
-                PixelResponse::Area => profile.pixel_value(r_px),
+        let mut template = Template {
+            table: Box::new([[0.0; 4]; TABLE_LEN]),
+            entries_per_px2: 1.0,
+            radius_px: profile.radius_px(),
+            support_px: profile.support_px(),
+        };
+        template.fill(profile.support_px(), |r_px| match response {
+            PixelResponse::Point => profile.value(r_px),
+            PixelResponse::Area => profile.pixel_value(r_px),
+        });
+        template
+    }
+
+    /// Tabulates another function of the radius in place; the bead's radius stays. Allocates nothing.
+    pub(crate) fn fill(&mut self, support_px: f64, value: impl Fn(f64) -> f64) {
+        let step_px2 = support_px * support_px / (TABLE_LEN - 1) as f64;
+        let at = |i: usize| {
+            if i < TABLE_LEN - 1 {
+                value((i as f64 * step_px2).sqrt())
+            } else {
+                0.0
             }
         };
-        let values: Vec<f64> = (0..TABLE_LEN).map(value).collect();
-        // Derivatives from the table itself: value and derivative then belong to the same function.
-        let derivative = |i: usize| match i {
-            0 => (-3.0 * values[0] + 4.0 * values[1] - values[2]) / (2.0 * step_px2),
-            i if i >= TABLE_LEN - 1 => 0.0,
-            i => (values[i + 1] - values[i - 1]) / (2.0 * step_px2),
-        };
-        let mut table = Box::new([[0.0; 4]; TABLE_LEN]);
-        for (i, entry) in table.iter_mut().enumerate().take(TABLE_LEN - 1) {
-            let (d0, d1) = (derivative(i), derivative(i + 1));
-            *entry = [
-                values[i] as f32,
-                (values[i + 1] - values[i]) as f32,
-                d0 as f32,
-                (d1 - d0) as f32,
-            ];
+        // Five neighbouring values; those before the centre continue the first three as a parabola.
+        let (v0, v1, v2) = (at(0), at(1), at(2));
+        let mut v = [
+            6.0 * v0 - 8.0 * v1 + 3.0 * v2,
+            3.0 * v0 - 3.0 * v1 + v2,
+            v0,
+            v1,
+            v2,
+        ];
+        for (i, entry) in self.table.iter_mut().enumerate() {
+            // Derivatives from the table itself, so that value and derivative belong to the same function. An entry
+            // serves the half step on either side of it.
+            let slope = (v[3] - v[1]) / 2.0;
+            let bend = (v[4] - 2.0 * v[2] + v[0]) / 4.0;
+            *entry = [v[2], slope, slope / step_px2, bend / step_px2].map(|e| e as f32);
+            v = [v[1], v[2], v[3], v[4], at(i + 3)];
         }
-        Template {
-            table,
-            entries_per_px2: (1.0 / step_px2) as f32,
-            radius_px: profile.radius_px(),
-            support_px,
-        }
+        // Beyond the support there is nothing.
+        self.table[TABLE_LEN - 1] = [0.0; 4];
+        self.entries_per_px2 = (1.0 / step_px2) as f32;
+        self.support_px = support_px;
+    }
+
+    /// Place in the table of the squared radius `q_px2`: entry number in the low bits, and the distance to it.
+    ///
+    /// Adding 2^23 leaves no room for a fraction in the mantissa: it rounds to the nearest whole number and puts that
+    /// number into the low bits. Unlike a float-to-integer cast this is done for several pixels at once.
+    #[inline(always)]
+    pub(crate) fn place(&self, q_px2: f32) -> (u32, f32) {
+        const TWO_TO_23: f32 = 8_388_608.0;
+        let u = (q_px2 * self.entries_per_px2).min((TABLE_LEN - 1) as f32);
+        let shifted = u + TWO_TO_23;
+        (shifted.to_bits(), u - (shifted - TWO_TO_23))
+    }
+
+    /// Value and derivative with respect to the squared radius (1/px^2) at a [`Template::place`].
+    #[inline(always)]
+    pub(crate) fn read(&self, (entry, t): (u32, f32)) -> (f32, f32) {
+        let e = &self.table[entry as usize & (TABLE_LEN - 1)];
+        (e[0] + t * e[1], e[2] + t * e[3])
     }
 
     /// Value and derivative with respect to the squared radius (1/px^2) at the squared radius `q_px2`.
     #[inline(always)]
     pub(crate) fn at(&self, q_px2: f32) -> (f32, f32) {
-        let u = (q_px2 * self.entries_per_px2).min((TABLE_LEN - 1) as f32);
-        let i = u as i32;
-        let t = u - i as f32;
-        let e = &self.table[i as usize & (TABLE_LEN - 1)];
-        (e[0] + t * e[1], e[2] + t * e[3])
+        self.read(self.place(q_px2))
     }
 
     /// Normalised value at the squared radius `q_px2` (px^2).

@@ -1,0 +1,353 @@
+//! Connected components of a thresholded frame, in arrays of fixed size.
+//!
+//! One pass over the rows joins runs of pixels above the threshold (8-connected) with a union-find over a bounded
+//! table of labels. Nothing is allocated after [`Blobs::new`]; what does not fit is counted, not lost silently.
+
+/// A connected region of pixels above a threshold.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Blob {
+    /// Pixels in the region.
+    pub area_px: f64,
+    /// Centroid weighted with the contrast, px.
+    pub x_px: f64,
+    /// Centroid weighted with the contrast, px.
+    pub y_px: f64,
+    /// Sum of the contrast over the region, grey levels.
+    pub contrast_sum: f64,
+    /// Largest contrast, grey levels.
+    pub peak: f64,
+    /// Full length along the long axis of the ellipse with the region's second moments, px.
+    pub length_px: f64,
+    /// Full width along its short axis, px.
+    pub width_px: f64,
+    /// Angle of the long axis from the x axis towards y, rad, -pi/2 to pi/2.
+    pub angle_rad: f64,
+    /// Whether the region touches the frame's border.
+    pub at_border: bool,
+}
+
+/// Sums over a region.
+#[derive(Debug, Clone, Copy)]
+struct Label {
+    parent: u32,
+    n: f64,
+    sx: f64,
+    sy: f64,
+    sxx: f64,
+    sxy: f64,
+    syy: f64,
+    w: f64,
+    wx: f64,
+    wy: f64,
+    peak: f64,
+    at_border: bool,
+}
+
+#[derive(Debug, Clone, Copy)]
+struct Run {
+    start: u32,
+    end: u32,
+    label: u32,
+}
+
+/// Buffers for the labelling.
+#[derive(Debug, Clone)]
+pub struct Blobs {
+    labels: Vec<Label>,
+    before: Vec<Run>,
+    now: Vec<Run>,
+    found: Vec<Blob>,
+    dropped_runs: u64,
+    max_runs: usize,
+    max_labels: usize,
+}
+
+impl Blobs {
+    /// Room for `max_labels` provisional regions (a region shaped like a comb takes one for each tooth) and for
+    /// `max_runs` runs in a row.
+    pub fn new(max_runs: usize, max_labels: usize) -> Self {
+        Blobs {
+            labels: Vec::with_capacity(max_labels),
+            before: Vec::with_capacity(max_runs),
+            now: Vec::with_capacity(max_runs),
+            found: Vec::with_capacity(max_labels),
+            dropped_runs: 0,
+            max_runs,
+            max_labels,
+        }
+    }
+
+    /// Runs of pixels left out of the last frame for want of room: when not nought, the frame is not a picture of a
+    /// few objects.
+    pub fn dropped_runs(&self) -> u64 {
+        self.dropped_runs
+    }
+
+    /// Regions of the last frame, largest contrast sum first.
+    pub fn found(&self) -> &[Blob] {
+        &self.found
+    }
+
+    /// Labels a frame of `width` x `height`; `contrast(x, y)` is a pixel's contrast, and pixels above `threshold` belong
+    /// to a region. Regions of fewer than `min_area_px` pixels are left out.
+    pub fn label(
+        &mut self,
+        (width, height): (usize, usize),
+        threshold: f32,
+        min_area_px: f64,
+        mut contrast: impl FnMut(usize, usize) -> f32,
+    ) -> &[Blob] {
+        self.labels.clear();
+        self.before.clear();
+        self.now.clear();
+        self.found.clear();
+        self.dropped_runs = 0;
+        for y in 0..height {
+            let edge_row = y == 0 || y + 1 == height;
+            let mut x = 0;
+            while x < width {
+                let first = contrast(x, y);
+                if first <= threshold {
+                    x += 1;
+                    continue;
+                }
+                let start = x;
+                let mut sums = Label::at(first, x, y);
+                x += 1;
+                while x < width {
+                    let v = contrast(x, y);
+                    if v <= threshold {
+                        break;
+                    }
+                    sums.add(&Label::at(v, x, y));
+                    x += 1;
+                }
+                sums.at_border = edge_row || start == 0 || x == width;
+                self.join(start as u32, x as u32, sums);
+            }
+            std::mem::swap(&mut self.before, &mut self.now);
+            self.now.clear();
+        }
+        for (i, label) in self.labels.iter().enumerate() {
+            if label.parent as usize == i && label.n >= min_area_px {
+                self.found.push(label.blob());
+            }
+        }
+        self.found
+            .sort_unstable_by(|a, b| b.contrast_sum.total_cmp(&a.contrast_sum));
+        &self.found
+    }
+
+    /// Gives a run the label of the runs of the row above that touch it, or a new one.
+    fn join(&mut self, start: u32, end: u32, sums: Label) {
+        if self.now.len() >= self.max_runs {
+            self.dropped_runs += 1;
+            return;
+        }
+        let mut label: Option<u32> = None;
+        for k in 0..self.before.len() {
+            let Some(above) = self.before.get(k).copied() else {
+                break;
+            };
+            // Touching by a corner counts.
+            if above.end < start || above.start > end {
+                continue;
+            }
+            let root = self.root(above.label);
+            label = Some(match label {
+                None => root,
+                Some(l) => self.unite(l, root),
+            });
+        }
+        let label = match label {
+            Some(l) => {
+                if let Some(to) = self.labels.get_mut(l as usize) {
+                    to.add(&sums);
+                }
+                l
+            }
+            None if self.labels.len() < self.max_labels => {
+                let l = self.labels.len() as u32;
+                self.labels.push(Label { parent: l, ..sums });
+                l
+            }
+            None => {
+                self.dropped_runs += 1;
+                return;
+            }
+        };
+        self.now.push(Run { start, end, label });
+    }
+
+    fn root(&self, mut label: u32) -> u32 {
+        while let Some(l) = self.labels.get(label as usize) {
+            if l.parent == label {
+                break;
+            }
+            label = l.parent;
+        }
+        label
+    }
+
+    fn unite(&mut self, a: u32, b: u32) -> u32 {
+        let (keep, give) = (a.min(b), a.max(b));
+        if keep != give
+            && let Some(given) = self.labels.get(give as usize).copied()
+        {
+            if let Some(to) = self.labels.get_mut(keep as usize) {
+                to.add(&given);
+            }
+            if let Some(from) = self.labels.get_mut(give as usize) {
+                from.parent = keep;
+            }
+        }
+        keep
+    }
+}
+
+impl Label {
+    fn at(contrast: f32, x: usize, y: usize) -> Self {
+        let (v, x, y) = (f64::from(contrast), x as f64, y as f64);
+        Label {
+            parent: 0,
+            n: 1.0,
+            sx: x,
+            sy: y,
+            sxx: x * x,
+            sxy: x * y,
+            syy: y * y,
+            w: v,
+            wx: v * x,
+            wy: v * y,
+            peak: v,
+            at_border: false,
+        }
+    }
+
+    fn add(&mut self, other: &Label) {
+        self.n += other.n;
+        self.sx += other.sx;
+        self.sy += other.sy;
+        self.sxx += other.sxx;
+        self.sxy += other.sxy;
+        self.syy += other.syy;
+        self.w += other.w;
+        self.wx += other.wx;
+        self.wy += other.wy;
+        self.peak = self.peak.max(other.peak);
+        self.at_border |= other.at_border;
+    }
+
+    fn blob(&self) -> Blob {
+        let (mx, my) = (self.sx / self.n, self.sy / self.n);
+        // The second moment of a pixel about its own centre is 1/12.
+        let vxx = (self.sxx / self.n - mx * mx).max(0.0) + 1.0 / 12.0;
+        let vyy = (self.syy / self.n - my * my).max(0.0) + 1.0 / 12.0;
+        let vxy = self.sxy / self.n - mx * my;
+        let (mean, half) = (0.5 * (vxx + vyy), 0.5 * f64::hypot(vxx - vyy, 2.0 * vxy));
+        let weighted = self.w > 0.0;
+        Blob {
+            area_px: self.n,
+            x_px: if weighted { self.wx / self.w } else { mx },
+            y_px: if weighted { self.wy / self.w } else { my },
+            contrast_sum: self.w,
+            peak: self.peak,
+            // A uniform ellipse of full axis L has the second moment L^2 / 16 along it.
+            length_px: 4.0 * (mean + half).sqrt(),
+            width_px: 4.0 * (mean - half).max(0.0).sqrt(),
+            angle_rad: 0.5 * (2.0 * vxy).atan2(vxx - vyy),
+            at_border: self.at_border,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn label(blobs: &mut Blobs, picture: &[&str], min_area_px: f64) -> Vec<Blob> {
+        let rows: Vec<&[u8]> = picture.iter().map(|r| r.as_bytes()).collect();
+        let contrast = |x: usize, y: usize| {
+            if rows[y][x] == b'.' {
+                0.0
+            } else {
+                f32::from(rows[y][x] - b'0')
+            }
+        };
+        blobs
+            .label((rows[0].len(), rows.len()), 0.5, min_area_px, contrast)
+            .to_vec()
+    }
+
+    #[test]
+    fn regions_that_touch_by_a_corner_are_one_and_others_are_apart() {
+        let mut blobs = Blobs::new(16, 16);
+        let found = label(
+            &mut blobs,
+            &["........", ".11...1.", "...1....", ".......1"],
+            1.0,
+        );
+        assert_eq!(found.len(), 3);
+        assert_eq!(found[0].area_px, 3.0);
+        assert!(!found[0].at_border && found.iter().filter(|b| b.at_border).count() == 1);
+    }
+
+    #[test]
+    fn a_comb_of_separate_teeth_joined_at_the_bottom_is_one_region() {
+        let mut blobs = Blobs::new(16, 16);
+        let found = label(&mut blobs, &["1.1.1.1", "1.1.1.1", "1111111"], 1.0);
+        assert_eq!(found.len(), 1);
+        assert_eq!(found[0].area_px, 15.0);
+        assert!((found[0].x_px - 3.0).abs() < 1e-12);
+    }
+
+    #[test]
+    fn small_regions_are_left_out_and_the_rest_come_largest_first() {
+        let mut blobs = Blobs::new(16, 16);
+        let found = label(&mut blobs, &["1.....22", "......22", "333....."], 2.0);
+        assert_eq!(
+            found.iter().map(|b| b.area_px).collect::<Vec<_>>(),
+            [3.0, 4.0]
+        );
+        assert_eq!(found[0].peak, 3.0);
+    }
+
+    #[test]
+    fn an_ellipse_gets_its_axes_area_and_angle_back() {
+        let mut blobs = Blobs::new(64, 64);
+        let (length, width, angle) = (40.0_f64, 16.0_f64, 0.5_f64);
+        let inside = |x: usize, y: usize| {
+            let (dx, dy) = (x as f64 - 40.3, y as f64 - 31.8);
+            let (u, v) = (
+                dx * angle.cos() + dy * angle.sin(),
+                -dx * angle.sin() + dy * angle.cos(),
+            );
+            if (2.0 * u / length).powi(2) + (2.0 * v / width).powi(2) < 1.0 {
+                1.0
+            } else {
+                0.0
+            }
+        };
+        let b = blobs.label((80, 64), 0.5, 4.0, inside)[0];
+        assert!(
+            (b.length_px - length).abs() < 0.3 && (b.width_px - width).abs() < 0.3,
+            "{b:?}"
+        );
+        assert!(
+            (b.area_px / (std::f64::consts::PI / 4.0 * length * width) - 1.0).abs() < 0.02,
+            "{b:?}"
+        );
+        assert!((b.angle_rad - angle).abs() < 0.01, "{b:?}");
+        assert!(
+            (b.x_px - 40.3).abs() < 0.1 && (b.y_px - 31.8).abs() < 0.1,
+            "{b:?}"
+        );
+    }
+
+    #[test]
+    fn what_does_not_fit_is_counted() {
+        let mut blobs = Blobs::new(2, 2);
+        let found = label(&mut blobs, &["1.1.1.1.1", "........."], 1.0);
+        assert_eq!((found.len(), blobs.dropped_runs()), (2, 3));
+    }
+}

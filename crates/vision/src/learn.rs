@@ -1,0 +1,195 @@
+//! The template learnt in place: the radial mean of good fixes, guarded against learning something else.
+
+use crate::config::Learning;
+use crate::crop::Crop;
+use crate::profile::{Template, clamped_curvatures, spline_value};
+
+/// Knots of the learnt profile.
+const KNOTS: usize = 48;
+/// Fixes of which one is taken, once the first template is learnt: refreshing is slow and must cost next to nothing.
+const REFRESH_STRIDE: u32 = 16;
+/// Share of a refresh in the profile.
+const REFRESH_SHARE: f64 = 0.25;
+/// The least good signal-to-noise ratio that is learnt from.
+const LEAST_SNR: f64 = 8.0;
+
+type Knots = [f64; KNOTS];
+
+/// How far the learning has come.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct LearningReport {
+    /// Good fixes taken in so far.
+    pub fixes: u64,
+    /// Templates taken over, the first included.
+    pub taken: u32,
+    /// Templates refused because they differed too much.
+    pub refused: u32,
+}
+
+/// Accumulates the radial profile and replaces the template.
+#[derive(Debug, Clone)]
+pub(crate) struct Learner {
+    settings: Learning,
+    knot_px: f64,
+    weight: Knots,
+    sum: Knots,
+    /// The profile in use and the one that refreshes may not drift away from.
+    profile: Knots,
+    anchor: Knots,
+    since: u32,
+    report: LearningReport,
+}
+
+impl Learner {
+    /// For windows of side `window_px`; `template` is the configured one.
+    pub fn new(settings: Learning, window_px: usize, template: &Template) -> Self {
+        // The corner of the window is the last pixel that can contribute.
+        let knot_px = (window_px as f64 / 2.0 * core::f64::consts::SQRT_2) / (KNOTS - 1) as f64;
+        let configured = core::array::from_fn(|k| {
+            let r_px = k as f64 * knot_px;
+            f64::from(template.value_at_squared((r_px * r_px) as f32))
+        });
+        Learner {
+            settings,
+            knot_px,
+            weight: [0.0; KNOTS],
+            sum: [0.0; KNOTS],
+            profile: configured,
+            anchor: configured,
+            since: 0,
+            report: LearningReport::default(),
+        }
+    }
+
+    pub fn max_change(&self) -> f64 {
+        self.settings.max_change
+    }
+
+    pub fn report(&self) -> LearningReport {
+        self.report
+    }
+
+    /// Takes in a good fix: position in frame coordinates, amplitude and background (above the crop's pedestal).
+    pub fn take_in(
+        &mut self,
+        crop: &Crop,
+        (x_px, y_px): (f64, f64),
+        amplitude: f64,
+        background: f64,
+        snr: f64,
+    ) -> bool {
+        self.since = self.since.saturating_add(1);
+        let learnt = self.report.taken > 0;
+        if snr < LEAST_SNR
+            || (learnt
+                && (self.settings.refresh_fixes == 0 || !self.since.is_multiple_of(REFRESH_STRIDE)))
+        {
+            return false;
+        }
+        self.report.fixes += 1;
+        let (x, y) = (
+            (x_px - crop.x0 as f64) as f32,
+            (y_px - crop.y0 as f64) as f32,
+        );
+        let (scale, background) = (1.0 / amplitude, background);
+        let per_px = (1.0 / self.knot_px) as f32;
+        for (j, row) in crop.rows.iter().enumerate().take(crop.height) {
+            let dy = j as f32 - y;
+            for (i, p) in row.iter().enumerate().take(crop.width) {
+                let dx = i as f32 - x;
+                let u = (dx * dx + dy * dy).sqrt() * per_px;
+                let k = u as usize;
+                let t = f64::from(u - k as f32);
+                let v = (f64::from(*p) - background) * scale;
+                if let (Some([w0, w1]), Some([s0, s1])) =
+                    (self.weight.get_mut(k..k + 2), self.sum.get_mut(k..k + 2))
+                {
+                    *w0 += 1.0 - t;
+                    *w1 += t;
+                    *s0 += (1.0 - t) * v;
+                    *s1 += t * v;
+                }
+            }
+        }
+        self.since
+            >= if learnt {
+                self.settings.refresh_fixes
+            } else {
+                self.settings.first_fixes
+            }
+    }
+
+    /// Replaces the template by what has been gathered, unless that differs too much. Allocates nothing.
+    pub fn refresh(&mut self, template: &mut Template) {
+        self.since = 0;
+        let mut fresh = self.mean();
+        self.weight = [0.0; KNOTS];
+        self.sum = [0.0; KNOTS];
+        let first = self.report.taken == 0;
+        let allowed = if first {
+            self.settings.max_change
+        } else {
+            0.25 * self.settings.max_change
+        };
+        if !first {
+            for (f, p) in fresh.iter_mut().zip(&self.profile) {
+                *f = p + REFRESH_SHARE * (*f - p);
+            }
+        }
+        let difference = difference(&fresh, &self.anchor);
+        if difference.is_nan() || difference > allowed {
+            self.report.refused = self.report.refused.saturating_add(1);
+            return;
+        }
+        self.report.taken = self.report.taken.saturating_add(1);
+        self.profile = fresh;
+        if first {
+            self.anchor = fresh;
+        }
+        let (mut upper, mut curvatures) = ([0.0; KNOTS], [0.0; KNOTS]);
+        clamped_curvatures(&fresh, &mut upper, &mut curvatures);
+        let knot_px = self.knot_px;
+        template.fill(knot_px * (KNOTS - 1) as f64, |r_px| {
+            spline_value(&fresh, &curvatures, r_px / knot_px)
+        });
+    }
+
+    /// The gathered profile: 1 at the centre, 0 at the last knots. Knots that no pixel reached keep their value.
+    fn mean(&self) -> Knots {
+        let mut v = self.profile;
+        for ((v, s), w) in v.iter_mut().zip(&self.sum).zip(&self.weight) {
+            if *w > 1.0 {
+                *v = s / w;
+            }
+        }
+        // Amplitude and background are free in every fit: the profile's own are fixed here, at the centre (area mean
+        // of the first knots) and over the outer fifth.
+        let mean = |range: core::ops::Range<usize>, v: &Knots| {
+            let part = v.iter().zip(&self.weight).take(range.end).skip(range.start);
+            let (s, w) = part.fold((0.0, 0.0), |(s, w), (v, n)| (s + v * n, w + n));
+            s / w
+        };
+        let floor = mean(KNOTS * 4 / 5..KNOTS, &v);
+        let top = mean(0..4, &v);
+        for (k, v) in v.iter_mut().enumerate() {
+            let fade = ((KNOTS - 1 - k) as f64 / 4.0).min(1.0);
+            *v = fade * (*v - floor) / (top - floor);
+        }
+        // The innermost knot sees less than a pixel per frame: smooth there, as any image is.
+        v[0] = v[1] + (v[1] - v[2]) / 3.0;
+        v
+    }
+}
+
+/// RMS difference of two profiles over the area of the disc, after the best match of scale.
+fn difference(a: &Knots, b: &Knots) -> f64 {
+    let (mut ab, mut bb, mut aa, mut area) = (0.0, 0.0, 0.0, 0.0);
+    for (k, (a, b)) in a.iter().zip(b).enumerate() {
+        let w = k as f64;
+        ab += w * a * b;
+        bb += w * b * b;
+        aa += w * a * a;
+        area += w;
+    }
+    ((aa - ab * ab / bb).max(0.0) / area).sqrt()
+}
