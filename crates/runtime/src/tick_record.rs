@@ -36,6 +36,8 @@ impl TickFlags {
     pub const FREEZE: u32 = 1 << 12;
     /// Records were lost before this one because the recorder ring was full.
     pub const RECORDS_LOST: u32 = 1 << 13;
+    /// A report of the board came since the previous tick.
+    pub const BOARD_HEARD: u32 = 1 << 14;
 
     /// Whether all bits of `mask` are set.
     pub fn has(self, mask: u32) -> bool {

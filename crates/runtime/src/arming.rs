@@ -1,0 +1,286 @@
+//! The check before the loop is closed: is the plant there, with the sign and roughly the gain of the model?
+//!
+//! The PZT makes a small doublet (up, down, back) about the displacement at which it stood; the bead's frame-to-frame
+//! increments are fitted with `drift + ratio * increments predicted by the model`. Increments, because Brownian motion
+//! makes positions a random walk; a doublet, because it leaves the bead where it was.
+
+use crate::life::Refusal;
+use cellpos_plant::{DiscretePlant, PlantError, TransferFunction};
+use cellpos_units::Seconds;
+use serde::{Deserialize, Serialize};
+
+/// How arming goes. In TOML every key may be left out.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct ArmingConfig {
+    /// Whether the plant is checked at all; without, the loop is closed as soon as the bead is steadily seen.
+    pub check: bool,
+    /// Good positions in a row before the pulse.
+    pub steady_ticks: u32,
+    /// Ticks after which arming is given up when the bead is not steadily seen.
+    pub patience_ticks: u32,
+    /// Height of the doublet, um of PZT.
+    pub pulse_um: f64,
+    /// Ticks up, and ticks down.
+    pub pulse_ticks: u32,
+    /// Smallest gain over the model's that is accepted.
+    pub lowest_ratio: f64,
+    /// Largest gain over the model's that is accepted.
+    pub highest_ratio: f64,
+}
+
+impl Default for ArmingConfig {
+    /// 0.5 um for 10 ms each way: 2 um of bead at 400 /s, against 0.1 um of Brownian motion. The controllers are stable
+    /// for 0.5 to 2 times the gain; the interval here is wider by the check's own uncertainty.
+    fn default() -> Self {
+        Self {
+            check: true,
+            steady_ticks: 20,
+            patience_ticks: 2_000,
+            pulse_um: 0.5,
+            pulse_ticks: 10,
+            lowest_ratio: 0.4,
+            highest_ratio: 2.5,
+        }
+    }
+}
+
+/// What the check found.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Verdict {
+    /// Measured gain over the model's.
+    pub gain_ratio: f64,
+    /// Half width of its 95 % interval.
+    pub ci95: f64,
+    /// Why the plant is refused, if it is.
+    pub refusal: Option<Refusal>,
+}
+
+/// The doublet and what the model says of it; everything is computed before the run.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Arming {
+    config: ArmingConfig,
+    /// Displacement at each tick of the pulse less the one before the pulse, um.
+    program_um: Vec<f64>,
+    /// Increment of the measured position at each tick, um, as the model says.
+    increments_um: Vec<f64>,
+}
+
+/// How far the check has come.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct ArmingState {
+    ticks: u32,
+    steady: u32,
+    /// Tick of the pulse; `None` before it.
+    pulse: Option<u32>,
+    base_um: f64,
+    last_um: Option<f64>,
+    n: f64,
+    sum_x: f64,
+    sum_y: f64,
+    sum_xx: f64,
+    sum_xy: f64,
+    sum_yy: f64,
+}
+
+/// What to do in this tick of arming.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Step {
+    /// Hold this displacement, um.
+    Command(f64),
+    /// The check is over.
+    Done(Verdict),
+}
+
+impl Arming {
+    /// Prepares the pulse for a plant seen through a camera path of `camera_delay` and a sample time.
+    ///
+    /// # Errors
+    /// The plant cannot be discretised.
+    pub fn new(
+        config: ArmingConfig,
+        plant: &TransferFunction,
+        sample: Seconds,
+        camera_delay: Seconds,
+    ) -> Result<Self, PlantError> {
+        let discrete = DiscretePlant::new(plant, sample, camera_delay)?;
+        let rest = (camera_delay.value() / sample.value()).ceil() as u32 + 4;
+        let up = config.pulse_ticks;
+        let program_um: Vec<f64> = (0..2 * up + rest)
+            .map(|tick| match tick {
+                tick if tick < up => config.pulse_um,
+                tick if tick < 2 * up => -config.pulse_um,
+                _ => 0.0,
+            })
+            .collect();
+        let mut state = discrete.state(0.0);
+        let mut last = discrete.output_um(&state);
+        let increments_um = program_um
+            .iter()
+            .map(|&command_um| {
+                let now = discrete.output_um(&state);
+                let increment = now - last;
+                last = now;
+                discrete.step(&mut state, command_um);
+                increment
+            })
+            .collect();
+        Ok(Self {
+            config,
+            program_um,
+            increments_um,
+        })
+    }
+
+    /// One tick: the position, if there is a good one, and the displacement commanded so far.
+    pub fn step(&self, state: &mut ArmingState, position_um: Option<f64>, command_um: f64) -> Step {
+        state.ticks += 1;
+        let Some(pulse) = state.pulse else {
+            state.steady = if position_um.is_some() { state.steady + 1 } else { 0 };
+            state.last_um = position_um;
+            if state.steady >= self.config.steady_ticks {
+                if !self.config.check {
+                    return Step::Done(Verdict {
+                        gain_ratio: f64::NAN,
+                        ci95: f64::NAN,
+                        refusal: None,
+                    });
+                }
+                state.pulse = Some(0);
+                state.base_um = command_um;
+                return Step::Command(command_um + self.program_um.first().copied().unwrap_or(0.0));
+            }
+            if state.ticks > self.config.patience_ticks {
+                return Step::Done(Verdict {
+                    gain_ratio: f64::NAN,
+                    ci95: f64::NAN,
+                    refusal: Some(Refusal::NoBead),
+                });
+            }
+            return Step::Command(command_um);
+        };
+        let tick = pulse + 1;
+        state.pulse = Some(tick);
+        if let (Some(now), Some(before), Some(&x)) = (position_um, state.last_um, self.increments_um.get(tick as usize))
+        {
+            let y = now - before;
+            state.n += 1.0;
+            state.sum_x += x;
+            state.sum_y += y;
+            state.sum_xx += x * x;
+            state.sum_xy += x * y;
+            state.sum_yy += y * y;
+        }
+        state.last_um = position_um;
+        match self.program_um.get(tick as usize) {
+            Some(offset_um) => Step::Command(state.base_um + offset_um),
+            None => Step::Done(self.judge(state)),
+        }
+    }
+
+    /// Straight-line fit of the increments.
+    fn judge(&self, s: &ArmingState) -> Verdict {
+        let sxx = s.sum_xx - s.sum_x * s.sum_x / s.n.max(1.0);
+        let sxy = s.sum_xy - s.sum_x * s.sum_y / s.n.max(1.0);
+        let syy = s.sum_yy - s.sum_y * s.sum_y / s.n.max(1.0);
+        // Half of the pulse must have been seen, or the ratio means nothing.
+        if s.n < f64::from(self.config.pulse_ticks) || sxx.is_nan() || sxx <= 0.0 {
+            return Verdict {
+                gain_ratio: f64::NAN,
+                ci95: f64::NAN,
+                refusal: Some(Refusal::NoBead),
+            };
+        }
+        let gain_ratio = sxy / sxx;
+        let variance = ((syy - gain_ratio * sxy) / (s.n - 2.0).max(1.0)).max(0.0);
+        let ci95 = 1.96 * (variance / sxx).sqrt();
+        let refusal = if gain_ratio.abs() <= 2.0 * ci95 {
+            Some(Refusal::NoResponse)
+        } else if gain_ratio < 0.0 {
+            Some(Refusal::WrongSign)
+        } else if !(self.config.lowest_ratio..=self.config.highest_ratio).contains(&gain_ratio) {
+            Some(Refusal::WrongGain)
+        } else {
+            None
+        };
+        Verdict {
+            gain_ratio,
+            ci95,
+            refusal,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const SAMPLE: Seconds = Seconds(1e-3);
+    const DELAY: Seconds = Seconds(2e-3);
+
+    /// A plant of `factor` times Eq. (6) with drift and a reproducible jitter of the position.
+    fn run(config: ArmingConfig, factor: f64, blind: impl Fn(u32) -> bool) -> (Verdict, f64) {
+        let arming = Arming::new(config, &TransferFunction::eq6(), SAMPLE, DELAY).expect("eq6 is a plant");
+        let plant = DiscretePlant::new(&TransferFunction::eq6(), SAMPLE, DELAY).expect("eq6 is a plant");
+        let mut truth = plant.state(0.0);
+        let mut state = ArmingState::default();
+        let mut command = 20.0;
+        let mut largest: f64 = 0.0;
+        for tick in 0..10_000u32 {
+            let jitter = 0.02 * (f64::from(tick.wrapping_mul(2_654_435_761)) / f64::from(u32::MAX) - 0.5);
+            let position = factor * plant.output_um(&truth) + 0.01 * f64::from(tick) + jitter;
+            let seen = (!blind(tick)).then_some(position);
+            match arming.step(&mut state, seen, command) {
+                Step::Command(next) => command = next,
+                Step::Done(verdict) => return (verdict, largest),
+            }
+            largest = largest.max((command - 20.0).abs());
+            plant.step(&mut truth, command - 20.0);
+        }
+        panic!("arming never ended");
+    }
+
+    #[test]
+    fn the_plant_of_the_model_passes_with_a_ratio_of_one() {
+        let (verdict, largest) = run(ArmingConfig::default(), 1.0, |_| false);
+        assert_eq!(verdict.refusal, None);
+        assert!((verdict.gain_ratio - 1.0).abs() < verdict.ci95.max(0.02), "{verdict:?}");
+        assert_eq!(largest, 0.5);
+    }
+
+    #[test]
+    fn a_wrong_sign_a_dead_bead_and_a_factor_of_four_are_told_apart() {
+        for (factor, refusal) in [
+            (-1.0, Refusal::WrongSign),
+            (0.0, Refusal::NoResponse),
+            (4.0, Refusal::WrongGain),
+            (0.2, Refusal::WrongGain),
+        ] {
+            let (verdict, _) = run(ArmingConfig::default(), factor, |_| false);
+            assert_eq!(verdict.refusal, Some(refusal), "factor {factor}: {verdict:?}");
+        }
+        for factor in [0.5, 2.0] {
+            let (verdict, _) = run(ArmingConfig::default(), factor, |_| false);
+            assert_eq!(verdict.refusal, None, "factor {factor}");
+        }
+    }
+
+    #[test]
+    fn without_a_steady_bead_the_pzt_never_moves() {
+        let (verdict, largest) = run(ArmingConfig::default(), 1.0, |tick| tick % 10 == 0);
+        assert_eq!(verdict.refusal, Some(Refusal::NoBead));
+        assert_eq!(largest, 0.0);
+    }
+
+    #[test]
+    fn a_bead_lost_during_the_pulse_is_no_bead() {
+        let (verdict, _) = run(ArmingConfig::default(), 1.0, |tick| tick > 22);
+        assert_eq!(verdict.refusal, Some(Refusal::NoBead));
+    }
+
+    #[test]
+    fn a_few_missing_frames_do_not_matter() {
+        let (verdict, _) = run(ArmingConfig::default(), 1.0, |tick| tick > 25 && tick % 7 == 0);
+        assert_eq!(verdict.refusal, None);
+    }
+}

@@ -1,0 +1,762 @@
+//! One tick of the loop as a pure function of what came in: life cycle, freshness, arming, control, limits, account.
+//!
+//! # The loop contract
+//! 1. A tick starts on the arrival of a frame; a timer stands in when frames stop.
+//! 2. The measurement ring is drained: the newest is kept, the rest counted.
+//! 3. The age of the newest is checked by frame id AND mid-exposure time stamp.
+//! 4. Estimate. 5. Controller. 6. Finite, range, slew.
+//! 7. The command goes into the actuator ring.
+//! 8. The tick's record goes into the recorder ring (full: dropped, counted, the sequence number runs on).
+//!
+//! Steps 3 to 6 are [`Core::step`]; the drivers ([`crate::live`], [`crate::virtual_run`]) do the rest around it. The
+//! core knows no clock and no device: its input is [`TickInput`], so that the same code runs in real time, on a
+//! virtual clock, and in a replay of a recorded run, to the bit. A step allocates nothing, takes no lock, makes no
+//! system call, formats nothing and logs nothing.
+//!
+//! Late means that a command was handed over later than the tick's start plus its budget; the driver finds out and
+//! tells the core with the next tick. Late ticks are counted, never made up for. N late or stale ticks in a row latch
+//! [`Life::Safe`].
+
+use crate::arming::{Arming, ArmingConfig, ArmingState, Step};
+use crate::life::{Event, EventKind, Events, FreezeReason, Life, Request, SafeReason};
+use crate::tick_record::{TickFlags, TickRecord};
+use cellpos_control::{
+    BuildError, Controller, LoopConfig, LoopInput, LoopOutput, LoopState, Measurement as LoopMeasurement, Mode,
+    Reference,
+};
+use cellpos_link::{BoardState, Fault};
+use cellpos_plant::{PlantError, TransferFunction};
+use cellpos_rig::{BoardReport, Measurement};
+use cellpos_units::Seconds;
+use cellpos_vision::Verdict;
+use serde::{Deserialize, Serialize};
+
+/// Times and counts of the loop. In TOML every key may be left out.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Timing {
+    /// Period of the loop, us: that of the camera.
+    pub period_us: f64,
+    /// From the start of a tick to the latest hand-over of its command, us.
+    pub budget_us: f64,
+    /// From the middle of an exposure to the tick that uses it, ms: the camera path.
+    pub camera_delay_ms: f64,
+    /// Oldest exposure that may still be controlled on, ms.
+    pub oldest_ms: f64,
+    /// Late ticks, or stale frames, in a row that latch Safe.
+    pub faults_in_a_row: u32,
+    /// Ticks on prediction alone before the bead is frozen.
+    pub coast_ticks: u32,
+    /// Ticks without a position before Safe is latched.
+    pub lost_ticks: u32,
+    /// Silence of the board that latches Safe, ms.
+    pub board_silence_ms: f64,
+}
+
+impl Default for Timing {
+    fn default() -> Self {
+        Self {
+            period_us: 1000.0,
+            budget_us: 500.0,
+            camera_delay_ms: 2.0,
+            oldest_ms: 5.0,
+            faults_in_a_row: 5,
+            coast_ticks: 20,
+            lost_ticks: 1000,
+            board_silence_ms: 200.0,
+        }
+    }
+}
+
+impl Timing {
+    /// Period of the loop, ns.
+    pub fn period_ns(&self) -> i64 {
+        (self.period_us * 1e3).round() as i64
+    }
+
+    /// Budget of a tick, ns.
+    pub fn budget_ns(&self) -> i64 {
+        (self.budget_us * 1e3).round() as i64
+    }
+
+    fn ms_to_ns(ms: f64) -> i64 {
+        (ms * 1e6).round() as i64
+    }
+
+    /// Checks every value.
+    ///
+    /// # Errors
+    /// Key, value and what would be right.
+    pub fn validate(&self) -> Result<(), CoreError> {
+        let positive = |key, value: f64, most| {
+            if value.is_finite() && value > 0.0 && value <= most {
+                Ok(())
+            } else {
+                Err(CoreError::Timing { key, value, most })
+            }
+        };
+        positive("period_us", self.period_us, 1e6)?;
+        positive("budget_us", self.budget_us, self.period_us)?;
+        positive("camera_delay_ms", self.camera_delay_ms, 1e3)?;
+        positive("oldest_ms", self.oldest_ms, 1e4)?;
+        positive("board_silence_ms", self.board_silence_ms, 1e5)?;
+        positive("faults_in_a_row", f64::from(self.faults_in_a_row), 1e6)?;
+        positive("coast_ticks", f64::from(self.coast_ticks), 1e6)?;
+        positive("lost_ticks", f64::from(self.lost_ticks), 1e9)
+    }
+}
+
+/// Why a core cannot be built.
+#[derive(Debug, thiserror::Error)]
+pub enum CoreError {
+    /// A number of [`Timing`].
+    #[error("timing: {key} = {value}: must be above 0 and at most {most}")]
+    Timing {
+        /// Key.
+        key: &'static str,
+        /// Value found.
+        value: f64,
+        /// Largest value allowed.
+        most: f64,
+    },
+    /// Controller, estimator or limits.
+    #[error("controller: {0}")]
+    Control(#[from] BuildError),
+    /// The plant of the arming check.
+    #[error("plant: {0}")]
+    Plant(#[from] PlantError),
+}
+
+/// What a tick is given by its driver.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct TickInput {
+    /// Start of the tick since the start of the run, ns.
+    pub time_ns: i64,
+    /// The newest measurement in the ring; `None` on a timer tick. Its times, too, count from the start of the run.
+    pub measurement: Option<Measurement>,
+    /// Measurements found in the ring.
+    pub drained: u32,
+    /// How long the previous tick took, ns, if it was late.
+    pub previous_late_ns: Option<u32>,
+    /// The previous tick's command found the actuator ring full.
+    pub previous_refused: bool,
+    /// The newest report of the board, if one came since the previous tick.
+    pub board: Option<BoardReport>,
+    /// What the operator asks for.
+    pub request: Request,
+}
+
+/// What the actuator thread is to do.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Action {
+    /// Hand this command to the board.
+    Command {
+        /// PZT displacement, um: finite, within range and slew.
+        command_um: f64,
+        /// Estimate of neutral, um: where the board would freeze.
+        neutral_um: f64,
+    },
+    /// Tell the board to ramp to park.
+    Park,
+    /// Nothing.
+    None,
+}
+
+/// What a tick gives.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct TickOutput {
+    /// What to do.
+    pub action: Action,
+    /// The record, less what only the driver knows (wake-up, compute time, late, ring full).
+    pub record: TickRecord,
+    /// What happened.
+    pub events: Events,
+}
+
+/// What went wrong so far, by kind.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
+pub struct Counts {
+    /// Ticks.
+    pub ticks: u64,
+    /// Ticks started by the timer: no frame came.
+    pub timer: u64,
+    /// Commands handed over late.
+    pub late: u64,
+    /// Ticks that never came.
+    pub skipped: u64,
+    /// Frames that were repeated, out of order, or older than allowed.
+    pub stale: u64,
+    /// Frame ids missing.
+    pub frames_lost: u64,
+    /// Frames that arrived behind a newer one and were not used.
+    pub superseded: u64,
+    /// Frames without a valid bead position.
+    pub fixes_lost: u64,
+    /// Positions refused as too far from the prediction.
+    pub gated: u64,
+    /// Ticks on prediction alone.
+    pub coasted: u64,
+    /// Ticks frozen.
+    pub frozen: u64,
+    /// Commands clipped to the range.
+    pub range_limited: u64,
+    /// Commands clipped to the slew limit.
+    pub slew_limited: u64,
+    /// Commands that found the actuator ring full.
+    pub refused: u64,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct State {
+    seq: u64,
+    counts: Counts,
+    life: Life,
+    safe_reason: Option<SafeReason>,
+    last_time_ns: i64,
+    control: LoopState,
+    arming: ArmingState,
+    /// Tick at which the loop was closed.
+    running_since: u64,
+    last_frame: Option<(u64, i64)>,
+    stale_in_a_row: u32,
+    late_in_a_row: u32,
+    refused_in_a_row: u32,
+    /// Ticks in a row without a position that was used.
+    missing: u32,
+    frames_silent: bool,
+    coasting_since: Option<u64>,
+    frozen: Option<(FreezeReason, u64)>,
+    stuck_since: Option<u64>,
+    saturated_since: Option<u64>,
+    board: Option<BoardReport>,
+    board_heard_ns: i64,
+    parked_at: Option<u64>,
+}
+
+/// The loop, ready to tick.
+#[derive(Debug)]
+pub struct Core<R> {
+    controller: Controller,
+    reference: R,
+    timing: Timing,
+    arming: Arming,
+    sample_s: f64,
+    preview_um: Vec<f64>,
+    state: State,
+}
+
+impl<R: Reference> Core<R> {
+    /// Builds the loop for a board that is armed and stands at `displacement_um`, with `neutral_um` as the first belief
+    /// of the displacement at which the bead rests.
+    ///
+    /// # Errors
+    /// A value that cannot be, named.
+    pub fn new(
+        config: LoopConfig,
+        reference: R,
+        timing: Timing,
+        arming: ArmingConfig,
+        plant: &TransferFunction,
+        displacement_um: f64,
+        neutral_um: f64,
+    ) -> Result<Self, CoreError> {
+        timing.validate()?;
+        let controller = Controller::new(config)?;
+        let sample_s = timing.period_us * 1e-6;
+        let arming = Arming::new(
+            arming,
+            plant,
+            Seconds(sample_s),
+            Seconds(timing.camera_delay_ms * 1e-3),
+        )?;
+        let control = controller.start(displacement_um, neutral_um);
+        Ok(Self {
+            preview_um: vec![0.0; controller.preview_len()],
+            controller,
+            reference,
+            timing,
+            arming,
+            sample_s,
+            state: State {
+                seq: 0,
+                counts: Counts::default(),
+                life: Life::Armed,
+                safe_reason: None,
+                last_time_ns: 0,
+                control,
+                arming: ArmingState::default(),
+                running_since: 0,
+                last_frame: None,
+                stale_in_a_row: 0,
+                late_in_a_row: 0,
+                refused_in_a_row: 0,
+                missing: 0,
+                frames_silent: false,
+                coasting_since: None,
+                frozen: None,
+                stuck_since: None,
+                saturated_since: None,
+                board: None,
+                board_heard_ns: 0,
+                parked_at: None,
+            },
+        })
+    }
+
+    /// Where the run stands.
+    pub fn life(&self) -> Life {
+        self.state.life
+    }
+
+    /// Why Safe was latched, if it was.
+    pub fn safe_reason(&self) -> Option<SafeReason> {
+        self.state.safe_reason
+    }
+
+    /// What went wrong so far.
+    pub fn counts(&self) -> &Counts {
+        &self.state.counts
+    }
+
+    /// The times and counts it was built with.
+    pub fn timing(&self) -> &Timing {
+        &self.timing
+    }
+
+    /// Time since the loop was closed, s; `None` when it is not.
+    pub fn running_for_s(&self) -> Option<f64> {
+        (self.state.life == Life::Running)
+            .then(|| self.state.seq.saturating_sub(self.state.running_since) as f64 * self.sample_s)
+    }
+
+    /// The reference.
+    pub fn reference(&self) -> &R {
+        &self.reference
+    }
+
+    /// One tick.
+    pub fn step(&mut self, input: &TickInput) -> TickOutput {
+        let mut tick = Tick {
+            seq: self.state.seq,
+            time_ns: input.time_ns,
+            flags: TickFlags::default(),
+            events: Events::default(),
+        };
+        if tick.seq == 0 {
+            tick.event(EventKind::Armed);
+            self.state.board_heard_ns = input.time_ns;
+        } else {
+            self.catch_up(input.time_ns, &mut tick);
+        }
+        self.state.last_time_ns = input.time_ns;
+        let fix = self.check_frame(input, &mut tick);
+        self.check_driver(input, &mut tick);
+        self.check_board(input, &mut tick);
+        match input.request {
+            Request::Park => self.latch(SafeReason::Operator, &mut tick),
+            Request::Freeze => self.freeze(FreezeReason::Operator, &mut tick),
+            Request::None => {
+                if matches!(self.state.frozen, Some((FreezeReason::Operator, _))) {
+                    self.thaw(&mut tick);
+                }
+            }
+        }
+        let mode = self.advance_life(fix.map(|fix| fix.position_um), &mut tick);
+        let (output, reference_um) = self.control(fix, mode);
+        if output.requested_um.is_nan() {
+            self.latch(SafeReason::NotFinite, &mut tick);
+        }
+        self.account(&output, &mut tick);
+        let action = self.action(&output, tick.seq);
+        self.count(input, tick.flags);
+        let record = self.record(input, &output, reference_um, tick.flags);
+        self.state.seq += 1;
+        TickOutput {
+            action,
+            record,
+            events: tick.events,
+        }
+    }
+
+    /// Accounts for ticks that never came: the last command was held, the bead moved on.
+    fn catch_up(&mut self, time_ns: i64, tick: &mut Tick) {
+        const MOST: i64 = 100;
+        let period = self.timing.period_ns();
+        let skipped = (time_ns - self.state.last_time_ns + period / 2) / period - 1;
+        if skipped <= 0 {
+            return;
+        }
+        tick.event(EventKind::TicksSkipped { count: skipped as u64 });
+        self.state.counts.skipped += skipped as u64;
+        for _ in 0..skipped.min(MOST) {
+            let held = self.state.control.previous_command_um();
+            let input = LoopInput {
+                mode: Mode::Direct(held),
+                ..LoopInput::default()
+            };
+            self.controller.step(&mut self.state.control, &input);
+        }
+    }
+
+    /// Freshness by id and by time stamp; gives the measurement that may be controlled on.
+    fn check_frame(&mut self, input: &TickInput, tick: &mut Tick) -> Option<LoopMeasurement> {
+        let Some(m) = &input.measurement else {
+            tick.flags.set(TickFlags::TIMER);
+            self.state.frames_silent = true;
+            return None;
+        };
+        self.state.frames_silent = false;
+        let age_ns = input.time_ns - m.mid_exposure_ns;
+        let mut stale = false;
+        if let Some((last_id, last_exposure_ns)) = self.state.last_frame {
+            if m.frame_id <= last_id {
+                tick.flags.set(TickFlags::DOUBLED_FRAME);
+                tick.event(EventKind::FrameRepeated { frame_id: m.frame_id });
+                stale = true;
+            } else {
+                let missing = (m.frame_id - last_id).saturating_sub(u64::from(input.drained.max(1)));
+                if missing > 0 {
+                    tick.flags.set(TickFlags::DROPPED_FRAME);
+                    tick.event(EventKind::FramesDropped { count: missing });
+                    self.state.counts.frames_lost += missing;
+                }
+                if m.mid_exposure_ns <= last_exposure_ns {
+                    tick.event(EventKind::FrameStale {
+                        age_ms: age_ns as f64 * 1e-6,
+                    });
+                    stale = true;
+                }
+            }
+        }
+        if !stale && age_ns > Timing::ms_to_ns(self.timing.oldest_ms) {
+            tick.event(EventKind::FrameStale {
+                age_ms: age_ns as f64 * 1e-6,
+            });
+            stale = true;
+        }
+        if stale {
+            tick.flags.set(TickFlags::STALE);
+            self.state.stale_in_a_row += 1;
+            if self.state.stale_in_a_row >= self.timing.faults_in_a_row {
+                self.latch(SafeReason::StaleFrames, tick);
+            }
+            return None;
+        }
+        self.state.stale_in_a_row = 0;
+        self.state.last_frame = Some((m.frame_id, m.mid_exposure_ns));
+        if m.verdict != Verdict::Good || !m.position_um.is_finite() {
+            tick.flags.set(TickFlags::LOST);
+            return None;
+        }
+        let beyond_ns = age_ns - Timing::ms_to_ns(self.timing.camera_delay_ms);
+        let period = self.timing.period_ns();
+        let age_samples = ((beyond_ns + period / 2).max(0) / period).min(i64::from(u16::MAX)) as u16;
+        Some(LoopMeasurement {
+            position_um: m.position_um,
+            variance_um2: m.variance_um2,
+            age_samples,
+        })
+    }
+
+    /// What the driver says of the previous tick.
+    fn check_driver(&mut self, input: &TickInput, tick: &mut Tick) {
+        match input.previous_late_ns {
+            Some(compute_ns) => {
+                tick.event(EventKind::LateTick {
+                    compute_us: f64::from(compute_ns) * 1e-3,
+                });
+                self.state.late_in_a_row += 1;
+                if self.state.late_in_a_row >= self.timing.faults_in_a_row {
+                    self.latch(SafeReason::LateTicks, tick);
+                }
+            }
+            None => self.state.late_in_a_row = 0,
+        }
+        if input.previous_refused {
+            self.state.refused_in_a_row += 1;
+            if self.state.refused_in_a_row >= self.timing.faults_in_a_row {
+                self.latch(SafeReason::ActuatorRingFull, tick);
+            }
+        } else {
+            self.state.refused_in_a_row = 0;
+        }
+    }
+
+    /// What the board says, or its silence.
+    fn check_board(&mut self, input: &TickInput, tick: &mut Tick) {
+        if let Some(report) = input.board {
+            tick.flags.set(TickFlags::BOARD_HEARD);
+            self.state.board_heard_ns = input.time_ns;
+            let before = self.state.board.replace(report);
+            let unchanged = |b: BoardReport| b.state == report.state && b.fault == report.fault;
+            if !before.is_some_and(unchanged) {
+                tick.event(EventKind::BoardChanged {
+                    state: report.state,
+                    fault: report.fault,
+                });
+            }
+            let damaged = report.bad_frames.saturating_sub(before.map_or(0, |b| b.bad_frames));
+            if damaged > 0 {
+                tick.event(EventKind::LinkGarbage { count: damaged });
+            }
+            if !matches!(report.state, BoardState::Armed | BoardState::Running) {
+                self.latch(SafeReason::Board, tick);
+            }
+        } else if input.time_ns - self.state.board_heard_ns > Timing::ms_to_ns(self.timing.board_silence_ms) {
+            self.latch(SafeReason::LinkLost, tick);
+        }
+    }
+
+    /// Life cycle; gives what the controller is to do.
+    fn advance_life(&mut self, position_um: Option<f64>, tick: &mut Tick) -> Mode {
+        if self.state.life == Life::Armed {
+            let held = self.state.control.previous_command_um();
+            match self.arming.step(&mut self.state.arming, position_um, held) {
+                Step::Command(command_um) => return Mode::Direct(command_um),
+                Step::Done(verdict) => match verdict.refusal {
+                    Some(refusal) => {
+                        tick.event(EventKind::ArmingRefused {
+                            refusal,
+                            gain_ratio: verdict.gain_ratio,
+                            ci95: verdict.ci95,
+                        });
+                        self.latch(SafeReason::ArmingRefused, tick);
+                    }
+                    None => {
+                        if verdict.gain_ratio.is_finite() {
+                            tick.event(EventKind::ArmingPassed {
+                                gain_ratio: verdict.gain_ratio,
+                                ci95: verdict.ci95,
+                            });
+                        }
+                        tick.event(EventKind::Running);
+                        self.state.life = Life::Running;
+                        self.state.running_since = tick.seq;
+                        self.state.missing = 0;
+                    }
+                },
+            }
+        }
+        if self.state.life == Life::Running {
+            let cause = if self.state.frames_silent {
+                (FreezeReason::CameraStalled, SafeReason::CameraLost)
+            } else {
+                (FreezeReason::BeadLost, SafeReason::BeadLost)
+            };
+            if self.state.missing >= self.timing.lost_ticks {
+                self.latch(cause.1, tick);
+            } else if self.state.missing >= self.timing.coast_ticks {
+                self.freeze(cause.0, tick);
+            } else if self.state.missing == 0
+                && matches!(self.state.frozen, Some((reason, _)) if reason != FreezeReason::Operator)
+            {
+                self.thaw(tick);
+            }
+        }
+        match (self.state.life, self.state.frozen) {
+            (Life::Running, None) => Mode::Run,
+            (Life::Running, Some(_)) => {
+                tick.flags.set(TickFlags::FREEZE);
+                Mode::Freeze
+            }
+            _ => Mode::Park,
+        }
+    }
+
+    fn control(&mut self, fix: Option<LoopMeasurement>, mode: Mode) -> (LoopOutput, f64) {
+        let since = match self.state.life {
+            Life::Running => self.state.seq - self.state.running_since,
+            _ => 0,
+        };
+        let reference_um = self.reference.at_um(since as f64 * self.sample_s);
+        cellpos_control::fill_preview(&self.reference, since, self.sample_s, &mut self.preview_um);
+        let input = LoopInput {
+            measurement: fix,
+            reference_um,
+            preview_um: &self.preview_um,
+            mode,
+            ..LoopInput::default()
+        };
+        (self.controller.step(&mut self.state.control, &input), reference_um)
+    }
+
+    /// Flags and events that follow from the controller's output.
+    fn account(&mut self, output: &LoopOutput, tick: &mut Tick) {
+        let flags = output.flags;
+        for (set, mask) in [
+            (flags.range_limited, TickFlags::RANGE_LIMITED),
+            (flags.slew_limited, TickFlags::SLEW_LIMITED),
+            (flags.not_finite, TickFlags::NOT_FINITE),
+            (flags.coasting, TickFlags::COASTING),
+            (flags.gated, TickFlags::GATED),
+        ] {
+            if set {
+                tick.flags.set(mask);
+            }
+        }
+        self.state.missing = if flags.coasting { self.state.missing.saturating_add(1) } else { 0 };
+        if self.state.life != Life::Running {
+            return;
+        }
+        /// A gap shorter than this is the daily bread of a camera and no event of its own.
+        const WORTH_AN_EVENT: u32 = 3;
+        let coasts = self.state.missing >= WORTH_AN_EVENT
+            || (self.state.coasting_since.is_some() && self.state.missing > 0);
+        tick.span(
+            &mut self.state.coasting_since,
+            coasts,
+            self.timing.period_us,
+            EventKind::CoastingStarted,
+            |lasted_ms| EventKind::CoastingEnded { lasted_ms },
+        );
+        tick.span(
+            &mut self.state.stuck_since,
+            flags.stuck,
+            self.timing.period_us,
+            EventKind::StuckStarted,
+            |lasted_ms| EventKind::StuckEnded { lasted_ms },
+        );
+        tick.span(
+            &mut self.state.saturated_since,
+            flags.range_limited,
+            self.timing.period_us,
+            EventKind::SaturationStarted,
+            |lasted_ms| EventKind::SaturationEnded { lasted_ms },
+        );
+    }
+
+    fn action(&mut self, output: &LoopOutput, seq: u64) -> Action {
+        /// Ticks after which an order to park that the board has not confirmed is given again.
+        const REPEAT: u64 = 10;
+        if self.state.life != Life::Safe {
+            return Action::Command {
+                command_um: output.command_um,
+                neutral_um: output.neutral_um,
+            };
+        }
+        let confirmed = self
+            .state
+            .board
+            .is_some_and(|b| matches!(b.state, BoardState::Safe | BoardState::Disarmed));
+        match self.state.parked_at {
+            Some(at) if confirmed || seq < at + REPEAT => Action::None,
+            _ => {
+                self.state.parked_at = Some(seq);
+                Action::Park
+            }
+        }
+    }
+
+    fn count(&mut self, input: &TickInput, flags: TickFlags) {
+        let counts = &mut self.state.counts;
+        counts.ticks += 1;
+        counts.superseded += u64::from(input.drained.saturating_sub(1));
+        counts.late += u64::from(input.previous_late_ns.is_some());
+        counts.refused += u64::from(input.previous_refused);
+        for (mask, counter) in [
+            (TickFlags::TIMER, &mut counts.timer),
+            (TickFlags::STALE, &mut counts.stale),
+            (TickFlags::LOST, &mut counts.fixes_lost),
+            (TickFlags::GATED, &mut counts.gated),
+            (TickFlags::COASTING, &mut counts.coasted),
+            (TickFlags::FREEZE, &mut counts.frozen),
+            (TickFlags::RANGE_LIMITED, &mut counts.range_limited),
+            (TickFlags::SLEW_LIMITED, &mut counts.slew_limited),
+        ] {
+            *counter += u64::from(flags.has(mask));
+        }
+    }
+
+    fn latch(&mut self, reason: SafeReason, tick: &mut Tick) {
+        if self.state.life != Life::Safe {
+            self.state.life = Life::Safe;
+            self.state.safe_reason = Some(reason);
+            self.state.frozen = None;
+            tick.event(EventKind::SafeLatched { reason });
+        }
+    }
+
+    fn freeze(&mut self, reason: FreezeReason, tick: &mut Tick) {
+        if self.state.life == Life::Running && self.state.frozen.is_none() {
+            self.state.frozen = Some((reason, tick.seq));
+            tick.event(EventKind::FreezeStarted { reason });
+        }
+    }
+
+    fn thaw(&mut self, tick: &mut Tick) {
+        if let Some((_, since)) = self.state.frozen.take() {
+            tick.event(EventKind::FreezeEnded {
+                lasted_ms: (tick.seq - since) as f64 * self.timing.period_us * 1e-3,
+            });
+        }
+    }
+
+    fn record(&self, input: &TickInput, output: &LoopOutput, target_um: f64, flags: TickFlags) -> TickRecord {
+        let m = input.measurement;
+        let (last_id, last_exposure) = self.state.last_frame.unwrap_or((0, 0));
+        TickRecord {
+            seq: self.state.seq,
+            time_ns: input.time_ns,
+            frame_id: m.map_or(last_id, |m| m.frame_id),
+            mid_exposure_ns: m.map_or(last_exposure, |m| m.mid_exposure_ns),
+            measured_um: m.map_or(f64::NAN, |m| m.position_um),
+            variance_um2: m.map_or(f64::NAN, |m| m.variance_um2),
+            verdict: m.map_or(255, |m| m.verdict as u8),
+            target_um,
+            estimate_um: output.estimate_um,
+            neutral_um: output.neutral_um,
+            requested_um: output.requested_um,
+            command_um: output.command_um,
+            applied_um: self.state.board.map_or(f64::NAN, |b| b.applied_um),
+            true_um: m.map_or(f64::NAN, |m| m.true_um),
+            life: self.state.life as u8,
+            request: input.request as u8,
+            board: self.state.board.map_or(255, |b| b.state as u8),
+            board_fault: self.state.board.map_or(Fault::None as u8, |b| b.fault as u8),
+            flags,
+            drained: input.drained.min(255) as u8,
+            wake_ns: 0,
+            compute_ns: 0,
+            controller_state: self.controller.control_loop().pack(&self.state.control),
+        }
+    }
+}
+
+struct Tick {
+    seq: u64,
+    time_ns: i64,
+    flags: TickFlags,
+    events: Events,
+}
+
+impl Tick {
+    fn event(&mut self, kind: EventKind) {
+        self.events.push(Event {
+            seq: self.seq,
+            time_ns: self.time_ns,
+            kind,
+        });
+    }
+
+    /// Start and end of a condition as a pair of events.
+    fn span(
+        &mut self,
+        since: &mut Option<u64>,
+        holds: bool,
+        period_us: f64,
+        started: EventKind,
+        ended: impl Fn(f64) -> EventKind,
+    ) {
+        match (*since, holds) {
+            (None, true) => {
+                *since = Some(self.seq);
+                self.event(started);
+            }
+            (Some(from), false) => {
+                *since = None;
+                self.event(ended((self.seq - from) as f64 * period_us * 1e-3));
+            }
+            _ => {}
+        }
+    }
+}

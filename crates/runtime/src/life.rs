@@ -1,0 +1,310 @@
+//! Life cycle of a run, and the events that mark its way.
+//!
+//! Disarmed -> Armed -> Running -> Safe. Safe is latched: only a new run, with a new arming of the board, leaves it.
+//! Freezing (slew to the estimate of neutral, so that the bead all but stops) is a mode within Running and is left
+//! when its cause goes away; safe (ramp to park: the bead is lost, the hardware is not) is not.
+
+use cellpos_link::{BoardState, Fault};
+use serde::Serialize;
+
+/// Where a run stands.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "kebab-case")]
+#[repr(u8)]
+pub enum Life {
+    /// No session: the board is at park or on its way there.
+    Disarmed = 0,
+    /// The board follows; the bead is being found and the plant's sign and gain are being checked.
+    Armed = 1,
+    /// The loop is closed.
+    Running = 2,
+    /// Latched: the board ramps to park.
+    Safe = 3,
+}
+
+impl Life {
+    /// The state of a number in a record.
+    pub fn from_number(number: u8) -> Option<Self> {
+        [Self::Disarmed, Self::Armed, Self::Running, Self::Safe]
+            .into_iter()
+            .find(|life| *life as u8 == number)
+    }
+
+    /// Its name, as in JSON.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Disarmed => "disarmed",
+            Self::Armed => "armed",
+            Self::Running => "running",
+            Self::Safe => "safe",
+        }
+    }
+}
+
+/// What the operator or the program asks for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
+#[serde(rename_all = "kebab-case")]
+#[repr(u8)]
+pub enum Request {
+    /// Nothing: go on.
+    #[default]
+    None = 0,
+    /// Stop the bead where it is.
+    Freeze = 1,
+    /// Ramp to park.
+    Park = 2,
+}
+
+impl Request {
+    /// The request of a number in a record; anything unknown is the safest, [`Request::Park`].
+    pub fn from_number(number: u8) -> Self {
+        match number {
+            0 => Self::None,
+            1 => Self::Freeze,
+            _ => Self::Park,
+        }
+    }
+}
+
+/// Why Safe was latched.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum SafeReason {
+    /// The operator asked for park.
+    Operator,
+    /// No bead for longer than allowed, though frames came.
+    BeadLost,
+    /// No frames for longer than allowed.
+    CameraLost,
+    /// Frames that were old or repeated, too many in a row.
+    StaleFrames,
+    /// Commands handed over late, too many in a row.
+    LateTicks,
+    /// The controller's output was not a finite number.
+    NotFinite,
+    /// The board went safe, disarmed or was armed by another host.
+    Board,
+    /// Nothing was heard of the board for longer than allowed.
+    LinkLost,
+    /// Commands could not be handed over, too many in a row.
+    ActuatorRingFull,
+    /// The plant did not answer the arming pulse as the model says.
+    ArmingRefused,
+}
+
+/// Why the bead is frozen.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum FreezeReason {
+    /// The operator asked for it.
+    Operator,
+    /// No bead in the frames.
+    BeadLost,
+    /// No frames.
+    CameraStalled,
+}
+
+/// Why arming was refused.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Refusal {
+    /// No steady bead was seen in the time given.
+    NoBead,
+    /// The bead did not move with the PZT beyond its own noise.
+    NoResponse,
+    /// The bead moved the other way.
+    WrongSign,
+    /// The gain is outside the range that the controller is safe for.
+    WrongGain,
+}
+
+/// What happened. Times in milliseconds, positions in micrometres.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+#[serde(tag = "event", rename_all = "kebab-case", rename_all_fields = "snake_case")]
+pub enum EventKind {
+    /// The board is armed; the bead is being looked for.
+    Armed,
+    /// The plant answered the pulse: its gain over the model's, with the 95 % interval.
+    ArmingPassed {
+        /// Measured gain over the model's.
+        gain_ratio: f64,
+        /// Half width of its 95 % interval.
+        ci95: f64,
+    },
+    /// The plant did not answer the pulse as the model says.
+    ArmingRefused {
+        /// Why.
+        refusal: Refusal,
+        /// Measured gain over the model's; NaN when none was measured.
+        gain_ratio: f64,
+        /// Half width of its 95 % interval.
+        ci95: f64,
+    },
+    /// The loop is closed.
+    Running,
+    /// No usable position: the loop runs on prediction.
+    CoastingStarted,
+    /// Positions are back.
+    CoastingEnded {
+        /// How long it ran on prediction.
+        lasted_ms: f64,
+    },
+    /// The bead is being stopped.
+    FreezeStarted {
+        /// Why.
+        reason: FreezeReason,
+    },
+    /// Control goes on.
+    FreezeEnded {
+        /// How long it lasted.
+        lasted_ms: f64,
+    },
+    /// Safe is latched.
+    SafeLatched {
+        /// Why.
+        reason: SafeReason,
+    },
+    /// Frame ids are missing.
+    FramesDropped {
+        /// How many.
+        count: u64,
+    },
+    /// A frame came twice, or after a newer one.
+    FrameRepeated {
+        /// Its id.
+        frame_id: u64,
+    },
+    /// A frame with a new id is older than allowed, or its time stamp does not advance.
+    FrameStale {
+        /// Age of its exposure.
+        age_ms: f64,
+    },
+    /// The command was handed over late.
+    LateTick {
+        /// From the start of the tick to the hand-over, us.
+        compute_us: f64,
+    },
+    /// Ticks were skipped: the loop was not woken in time.
+    TicksSkipped {
+        /// How many.
+        count: u64,
+    },
+    /// The bead does not follow the PZT.
+    StuckStarted,
+    /// It follows again.
+    StuckEnded {
+        /// How long it did not.
+        lasted_ms: f64,
+    },
+    /// The PZT is at an end of its range.
+    SaturationStarted,
+    /// It is off the end.
+    SaturationEnded {
+        /// How long it was there.
+        lasted_ms: f64,
+    },
+    /// The board reports another state or fault.
+    BoardChanged {
+        /// State.
+        #[serde(serialize_with = "as_debug")]
+        state: BoardState,
+        /// Latched fault.
+        #[serde(serialize_with = "as_debug")]
+        fault: Fault,
+    },
+    /// Frames on the link were damaged.
+    LinkGarbage {
+        /// Damaged frames since the last such event.
+        count: u32,
+    },
+    /// The run was ended by its duration.
+    Finished,
+}
+
+fn as_debug<S: serde::Serializer>(value: &impl std::fmt::Debug, serializer: S) -> Result<S::Ok, S::Error> {
+    serializer.collect_str(&format_args!("{value:?}"))
+}
+
+/// An event with its place in the run.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Event {
+    /// Tick.
+    pub seq: u64,
+    /// Start of the tick since the start of the run, ns.
+    pub time_ns: i64,
+    /// What happened.
+    #[serde(flatten)]
+    pub kind: EventKind,
+}
+
+/// Most events of one tick; more are counted in [`Events::lost`].
+pub const EVENTS_PER_TICK: usize = 8;
+
+/// The events of one tick, in a fixed size.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Events {
+    events: [Option<Event>; EVENTS_PER_TICK],
+    count: usize,
+    /// Events beyond [`EVENTS_PER_TICK`].
+    pub lost: u32,
+}
+
+impl Events {
+    /// Adds one.
+    pub fn push(&mut self, event: Event) {
+        match self.events.get_mut(self.count) {
+            Some(slot) => {
+                *slot = Some(event);
+                self.count += 1;
+            }
+            None => self.lost += 1,
+        }
+    }
+
+    /// All of them, in order.
+    pub fn iter(&self) -> impl Iterator<Item = &Event> {
+        self.events.iter().flatten()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_event_reads_as_one_flat_json_object() {
+        let event = Event {
+            seq: 7,
+            time_ns: 8_000_000,
+            kind: EventKind::SafeLatched {
+                reason: SafeReason::StaleFrames,
+            },
+        };
+        assert_eq!(
+            serde_json::to_string(&event).expect("plain data"),
+            r#"{"seq":7,"time_ns":8000000,"event":"safe-latched","reason":"stale-frames"}"#
+        );
+        let board = EventKind::BoardChanged {
+            state: BoardState::Safe,
+            fault: Fault::CommandTimeout,
+        };
+        assert_eq!(
+            serde_json::to_string(&board).expect("plain data"),
+            r#"{"event":"board-changed","state":"Safe","fault":"CommandTimeout"}"#
+        );
+    }
+
+    #[test]
+    fn events_beyond_the_room_of_a_tick_are_counted() {
+        let mut events = Events::default();
+        for seq in 0..EVENTS_PER_TICK as u64 + 3 {
+            events.push(Event {
+                seq,
+                time_ns: 0,
+                kind: EventKind::Armed,
+            });
+        }
+        assert_eq!(events.iter().count(), EVENTS_PER_TICK);
+        assert_eq!(events.lost, 3);
+    }
+}

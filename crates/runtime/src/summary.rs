@@ -1,0 +1,167 @@
+//! What a run amounts to: errors, losses and timing, gathered as the records go by.
+
+use crate::core::Counts;
+use crate::latency::Quantiles;
+use crate::life::{Life, SafeReason};
+use crate::tick_record::TickRecord;
+use crate::ticker::Account;
+use serde::Serialize;
+
+/// Running sums of one error.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+struct Moments {
+    n: u64,
+    sum: f64,
+    sum_of_squares: f64,
+    peak: f64,
+}
+
+impl Moments {
+    fn add(&mut self, error_um: f64) {
+        if error_um.is_finite() {
+            self.n += 1;
+            self.sum += error_um;
+            self.sum_of_squares += error_um * error_um;
+            self.peak = self.peak.max(error_um.abs());
+        }
+    }
+
+    fn rms_nm(&self) -> Option<f64> {
+        (self.n > 0).then(|| (self.sum_of_squares / self.n as f64).sqrt() * 1e3)
+    }
+
+    fn mean_nm(&self) -> Option<f64> {
+        (self.n > 0).then(|| self.sum / self.n as f64 * 1e3)
+    }
+}
+
+/// How long after closing the loop errors are counted from, s, unless the run says otherwise.
+pub const SETTLED_AFTER_S: f64 = 2.0;
+
+/// Statistics over the records of a run.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Statistics {
+    settled_after_ns: i64,
+    running_since_ns: Option<i64>,
+    measured: Moments,
+    truth: Moments,
+    last: Option<TickRecord>,
+}
+
+impl Default for Statistics {
+    fn default() -> Self {
+        Self::new(SETTLED_AFTER_S)
+    }
+}
+
+impl Statistics {
+    /// Counts errors from `settled_after_s` after the loop was closed.
+    pub fn new(settled_after_s: f64) -> Self {
+        Self {
+            settled_after_ns: (settled_after_s * 1e9) as i64,
+            running_since_ns: None,
+            measured: Moments::default(),
+            truth: Moments::default(),
+            last: None,
+        }
+    }
+
+    /// Takes one record.
+    pub fn add(&mut self, record: &TickRecord) {
+        if record.life == Life::Running as u8 {
+            let since = *self.running_since_ns.get_or_insert(record.time_ns);
+            if record.time_ns - since >= self.settled_after_ns {
+                self.measured.add(record.measured_um - record.target_um);
+                self.truth.add(record.true_um - record.target_um);
+            }
+        }
+        self.last = Some(*record);
+    }
+
+    /// The newest record.
+    pub fn last(&self) -> Option<&TickRecord> {
+        self.last.as_ref()
+    }
+
+    /// RMS of measured position less reference so far, nm.
+    pub fn rms_measured_nm(&self) -> Option<f64> {
+        self.measured.rms_nm()
+    }
+}
+
+/// How a run ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum End {
+    /// Its time was over.
+    Duration,
+    /// The operator ended it.
+    Operator,
+    /// Safe was latched.
+    Safe,
+}
+
+/// The figures of a run. Errors count from two seconds after the loop was closed; `None` where there is nothing to say.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Summary {
+    /// Life-cycle state in which the run ended: `running` unless something went wrong.
+    pub state: Life,
+    /// Why it ended.
+    pub end: End,
+    /// Why Safe was latched, if it was.
+    pub safe_reason: Option<SafeReason>,
+    /// From the first tick to the last, s.
+    pub duration_s: f64,
+    /// Losses and limits by kind.
+    #[serde(flatten)]
+    pub counts: Counts,
+    /// Records that found the recorder ring full.
+    pub records_lost: u64,
+    /// Events that found their ring full.
+    pub events_lost: u64,
+    /// RMS of measured position less reference, nm.
+    pub rms_measured_nm: Option<f64>,
+    /// RMS of true position less reference, nm (emulated rig).
+    pub rms_true_nm: Option<f64>,
+    /// Mean of measured position less reference, nm.
+    pub mean_error_nm: Option<f64>,
+    /// Largest distance of the measured position from the reference, nm.
+    pub peak_error_nm: Option<f64>,
+    /// Median loop delay: exposure to command, and half a period of hold, ms.
+    pub loop_delay_ms: f64,
+    /// From the start of a tick to the hand-over of its command, us.
+    pub tick_us: Quantiles,
+    /// From the arrival of a position to the start of its tick, us.
+    pub wake_us: Quantiles,
+}
+
+impl Summary {
+    /// Joins what the control thread and the records say.
+    pub fn new(
+        life: Life,
+        safe_reason: Option<SafeReason>,
+        end: End,
+        counts: Counts,
+        account: &Account,
+        statistics: &Statistics,
+        period_us: f64,
+    ) -> Self {
+        let last_ns = statistics.last().map_or(0, |record| record.time_ns);
+        Self {
+            state: life,
+            end,
+            safe_reason,
+            duration_s: (last_ns as f64 + period_us * 1e3) * 1e-9,
+            counts,
+            records_lost: account.records_lost,
+            events_lost: account.events_lost,
+            rms_measured_nm: statistics.measured.rms_nm(),
+            rms_true_nm: statistics.truth.rms_nm(),
+            mean_error_nm: statistics.measured.mean_nm(),
+            peak_error_nm: (statistics.measured.n > 0).then_some(statistics.measured.peak * 1e3),
+            loop_delay_ms: account.exposure_to_command.quantiles_us().p50 * 1e-3 + 0.5e-3 * period_us,
+            tick_us: account.tick.quantiles_us(),
+            wake_us: account.wake.quantiles_us(),
+        }
+    }
+}

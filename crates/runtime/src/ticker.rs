@@ -1,0 +1,234 @@
+//! The tick around the core: rings in, rings out, the deadline account. The same on both clocks.
+
+use crate::core::{Action, Core, TickInput};
+use crate::latency::Latency;
+use crate::life::{Event, Life, Request};
+use crate::tick_record::{TickFlags, TickRecord};
+use cellpos_control::Reference;
+use cellpos_rig::clock::monotonic_ns;
+use cellpos_rig::{BoardReport, Clock, Measurement};
+use rtrb::{Consumer, Producer, RingBuffer};
+
+/// An order to the actuator thread.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Order {
+    /// What to do.
+    pub action: Action,
+    /// Hand-over since the start of the run, us.
+    pub time_us: u64,
+}
+
+/// The I/O threads' ends of the rings.
+#[derive(Debug)]
+pub struct Ends {
+    /// For the camera thread. Full: the newest is refused and counted as lost by the gap in its frame id.
+    pub measurements: Producer<Measurement>,
+    /// For the actuator thread.
+    pub orders: Consumer<Order>,
+    /// For the actuator thread.
+    pub reports: Producer<BoardReport>,
+    /// For the recorder thread.
+    pub records: Consumer<TickRecord>,
+    /// For the recorder thread.
+    pub events: Consumer<Event>,
+}
+
+/// Sizes of the rings.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct RingSizes {
+    /// Measurements: a burst after a stall of the control thread must fit, so that the newest is never refused.
+    pub measurements: usize,
+    /// Orders to the actuator thread.
+    pub orders: usize,
+    /// Tick records: how long the recorder may stall, in ticks.
+    pub records: usize,
+    /// Events.
+    pub events: usize,
+}
+
+impl Default for RingSizes {
+    /// The recorder may stall for 16 s (a disk that spins up, a directory on a slow network).
+    fn default() -> Self {
+        Self {
+            measurements: 1024,
+            orders: 64,
+            records: 16_384,
+            events: 16_384,
+        }
+    }
+}
+
+/// Timing and losses of a run as the control thread saw them.
+#[derive(Debug, Clone)]
+pub struct Account {
+    /// From the start of a tick to the hand-over of its command.
+    pub tick: Latency,
+    /// From the arrival of a position (or the timer's due time) to the start of its tick.
+    pub wake: Latency,
+    /// From the middle of the exposure to the hand-over of the command computed from it.
+    pub exposure_to_command: Latency,
+    /// Records that found the recorder ring full.
+    pub records_lost: u64,
+    /// Events that found their ring, or their tick, full.
+    pub events_lost: u64,
+}
+
+/// Core, rings and account.
+#[derive(Debug)]
+pub struct Ticker<R> {
+    core: Core<R>,
+    clock: Clock,
+    start_ns: i64,
+    budget_ns: i64,
+    measurements: Consumer<Measurement>,
+    orders: Producer<Order>,
+    reports: Consumer<BoardReport>,
+    records: Producer<TickRecord>,
+    events: Producer<Event>,
+    previous_late_ns: Option<u32>,
+    previous_refused: bool,
+    records_lost_before: bool,
+    account: Account,
+}
+
+impl<R: Reference> Ticker<R> {
+    /// Puts rings around a core. `start_ns` is the start of the run on `clock`.
+    pub fn new(core: Core<R>, clock: Clock, start_ns: i64, sizes: RingSizes) -> (Self, Ends) {
+        let (measurements_in, measurements) = RingBuffer::new(sizes.measurements.max(1));
+        let (orders, orders_out) = RingBuffer::new(sizes.orders.max(1));
+        let (reports_in, reports) = RingBuffer::new(64);
+        let (records, records_out) = RingBuffer::new(sizes.records.max(1));
+        let (events, events_out) = RingBuffer::new(sizes.events.max(1));
+        let ticker = Self {
+            budget_ns: core.timing().budget_ns(),
+            core,
+            clock,
+            start_ns,
+            measurements,
+            orders,
+            reports,
+            records,
+            events,
+            previous_late_ns: None,
+            previous_refused: false,
+            records_lost_before: false,
+            account: Account {
+                tick: Latency::new(),
+                wake: Latency::new(),
+                exposure_to_command: Latency::new(),
+                records_lost: 0,
+                events_lost: 0,
+            },
+        };
+        let ends = Ends {
+            measurements: measurements_in,
+            orders: orders_out,
+            reports: reports_in,
+            records: records_out,
+            events: events_out,
+        };
+        (ticker, ends)
+    }
+
+    /// The core.
+    pub fn core(&self) -> &Core<R> {
+        &self.core
+    }
+
+    /// Timing and losses so far.
+    pub fn account(&self) -> &Account {
+        &self.account
+    }
+
+    /// Whether a measurement waits.
+    pub fn has_measurement(&self) -> bool {
+        !self.measurements.is_empty()
+    }
+
+    /// Whether the camera's end of the ring is gone.
+    pub fn camera_is_gone(&self) -> bool {
+        self.measurements.is_abandoned()
+    }
+
+    /// One tick. `due_ns`: when a timer tick was due; a frame's tick is due when its position was ready.
+    pub fn tick(&mut self, due_ns: i64, request: Request) -> Life {
+        let start_ns = self.clock.now_ns();
+        let compute_from_ns = monotonic_ns();
+        let mut newest = None;
+        let mut drained = 0;
+        while let Ok(measurement) = self.measurements.pop() {
+            newest = Some(measurement);
+            drained += 1;
+        }
+        let mut board = None;
+        while let Ok(report) = self.reports.pop() {
+            board = Some(report);
+        }
+        let since_start = |ns: i64| ns - self.start_ns;
+        let ready_ns = newest.map_or(due_ns, |m: Measurement| m.ready_ns);
+        let input = TickInput {
+            time_ns: since_start(start_ns),
+            measurement: newest.map(|m| Measurement {
+                mid_exposure_ns: since_start(m.mid_exposure_ns),
+                ready_ns: since_start(m.ready_ns),
+                ..m
+            }),
+            drained,
+            previous_late_ns: self.previous_late_ns,
+            previous_refused: self.previous_refused,
+            board,
+            request,
+        };
+        let output = self.core.step(&input);
+        let mut record = output.record;
+        self.previous_refused = false;
+        if output.action != Action::None {
+            let order = Order {
+                action: output.action,
+                time_us: (input.time_ns / 1000).max(0) as u64,
+            };
+            if self.orders.push(order).is_err() {
+                self.previous_refused = true;
+                record.flags.set(TickFlags::ACTUATOR_RING_FULL);
+            }
+        }
+        // Hand-over: from here on the command is on its way.
+        let handed_ns = self.clock.now_ns();
+        let wake_ns = (start_ns - ready_ns).max(0);
+        let compute_ns = handed_ns - start_ns;
+        self.account.tick.record((monotonic_ns() - compute_from_ns).max(0) as u64);
+        self.account.wake.record(wake_ns as u64);
+        if let Some(m) = newest {
+            self.account
+                .exposure_to_command
+                .record((handed_ns - m.mid_exposure_ns).max(0) as u64);
+        }
+        self.previous_late_ns = None;
+        if compute_ns > self.budget_ns {
+            self.previous_late_ns = Some(clamp_u32(compute_ns));
+            record.flags.set(TickFlags::LATE);
+        }
+        record.wake_ns = clamp_u32(wake_ns);
+        record.compute_ns = clamp_u32(compute_ns);
+        self.hand_over_record(record);
+        self.account.events_lost += u64::from(output.events.lost);
+        for event in output.events.iter() {
+            if self.events.push(*event).is_err() {
+                self.account.events_lost += 1;
+            }
+        }
+        self.core.life()
+    }
+
+    fn hand_over_record(&mut self, mut record: TickRecord) {
+        if self.records_lost_before {
+            record.flags.set(TickFlags::RECORDS_LOST);
+        }
+        self.records_lost_before = self.records.push(record).is_err();
+        self.account.records_lost += u64::from(self.records_lost_before);
+    }
+}
+
+fn clamp_u32(ns: i64) -> u32 {
+    ns.clamp(0, i64::from(u32::MAX)) as u32
+}
