@@ -136,7 +136,11 @@ impl Arming {
     pub fn step(&self, state: &mut ArmingState, position_um: Option<f64>, command_um: f64) -> Step {
         state.ticks += 1;
         let Some(pulse) = state.pulse else {
-            state.steady = if position_um.is_some() { state.steady + 1 } else { 0 };
+            state.steady = if position_um.is_some() {
+                state.steady + 1
+            } else {
+                0
+            };
             state.last_um = position_um;
             if state.steady >= self.config.steady_ticks {
                 if !self.config.check {
@@ -161,8 +165,11 @@ impl Arming {
         };
         let tick = pulse + 1;
         state.pulse = Some(tick);
-        if let (Some(now), Some(before), Some(&x)) = (position_um, state.last_um, self.increments_um.get(tick as usize))
-        {
+        if let (Some(now), Some(before), Some(&x)) = (
+            position_um,
+            state.last_um,
+            self.increments_um.get(tick as usize),
+        ) {
             let y = now - before;
             state.n += 1.0;
             state.sum_x += x;
@@ -220,14 +227,17 @@ mod tests {
 
     /// A plant of `factor` times Eq. (6) with drift and a reproducible jitter of the position.
     fn run(config: ArmingConfig, factor: f64, blind: impl Fn(u32) -> bool) -> (Verdict, f64) {
-        let arming = Arming::new(config, &TransferFunction::eq6(), SAMPLE, DELAY).expect("eq6 is a plant");
-        let plant = DiscretePlant::new(&TransferFunction::eq6(), SAMPLE, DELAY).expect("eq6 is a plant");
+        let arming =
+            Arming::new(config, &TransferFunction::eq6(), SAMPLE, DELAY).expect("eq6 is a plant");
+        let plant =
+            DiscretePlant::new(&TransferFunction::eq6(), SAMPLE, DELAY).expect("eq6 is a plant");
         let mut truth = plant.state(0.0);
         let mut state = ArmingState::default();
         let mut command = 20.0;
         let mut largest: f64 = 0.0;
         for tick in 0..10_000u32 {
-            let jitter = 0.02 * (f64::from(tick.wrapping_mul(2_654_435_761)) / f64::from(u32::MAX) - 0.5);
+            let jitter =
+                0.02 * (f64::from(tick.wrapping_mul(2_654_435_761)) / f64::from(u32::MAX) - 0.5);
             let position = factor * plant.output_um(&truth) + 0.01 * f64::from(tick) + jitter;
             let seen = (!blind(tick)).then_some(position);
             match arming.step(&mut state, seen, command) {
@@ -244,7 +254,10 @@ mod tests {
     fn the_plant_of_the_model_passes_with_a_ratio_of_one() {
         let (verdict, largest) = run(ArmingConfig::default(), 1.0, |_| false);
         assert_eq!(verdict.refusal, None);
-        assert!((verdict.gain_ratio - 1.0).abs() < verdict.ci95.max(0.02), "{verdict:?}");
+        assert!(
+            (verdict.gain_ratio - 1.0).abs() < verdict.ci95.max(0.02),
+            "{verdict:?}"
+        );
         assert_eq!(largest, 0.5);
     }
 
@@ -257,7 +270,11 @@ mod tests {
             (0.2, Refusal::WrongGain),
         ] {
             let (verdict, _) = run(ArmingConfig::default(), factor, |_| false);
-            assert_eq!(verdict.refusal, Some(refusal), "factor {factor}: {verdict:?}");
+            assert_eq!(
+                verdict.refusal,
+                Some(refusal),
+                "factor {factor}: {verdict:?}"
+            );
         }
         for factor in [0.5, 2.0] {
             let (verdict, _) = run(ArmingConfig::default(), factor, |_| false);
@@ -280,7 +297,9 @@ mod tests {
 
     #[test]
     fn a_few_missing_frames_do_not_matter() {
-        let (verdict, _) = run(ArmingConfig::default(), 1.0, |tick| tick > 25 && tick % 7 == 0);
+        let (verdict, _) = run(ArmingConfig::default(), 1.0, |tick| {
+            tick > 25 && tick % 7 == 0
+        });
         assert_eq!(verdict.refusal, None);
     }
 }

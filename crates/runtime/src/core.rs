@@ -21,8 +21,8 @@ use crate::arming::{Arming, ArmingConfig, ArmingState, Step};
 use crate::life::{Event, EventKind, Events, FreezeReason, Life, Request, SafeReason};
 use crate::tick_record::{TickFlags, TickRecord};
 use cellpos_control::{
-    BuildError, Controller, LoopConfig, LoopInput, LoopOutput, LoopState, Measurement as LoopMeasurement, Mode,
-    Reference,
+    BuildError, Controller, LoopConfig, LoopInput, LoopOutput, LoopState,
+    Measurement as LoopMeasurement, Mode, Reference,
 };
 use cellpos_link::{BoardState, Fault};
 use cellpos_plant::{PlantError, TransferFunction};
@@ -386,7 +386,9 @@ impl<R: Reference> Core<R> {
         if skipped <= 0 {
             return;
         }
-        tick.event(EventKind::TicksSkipped { count: skipped as u64 });
+        tick.event(EventKind::TicksSkipped {
+            count: skipped as u64,
+        });
         self.state.counts.skipped += skipped as u64;
         for _ in 0..skipped.min(MOST) {
             let held = self.state.control.previous_command_um();
@@ -411,10 +413,13 @@ impl<R: Reference> Core<R> {
         if let Some((last_id, last_exposure_ns)) = self.state.last_frame {
             if m.frame_id <= last_id {
                 tick.flags.set(TickFlags::DOUBLED_FRAME);
-                tick.event(EventKind::FrameRepeated { frame_id: m.frame_id });
+                tick.event(EventKind::FrameRepeated {
+                    frame_id: m.frame_id,
+                });
                 stale = true;
             } else {
-                let missing = (m.frame_id - last_id).saturating_sub(u64::from(input.drained.max(1)));
+                let missing =
+                    (m.frame_id - last_id).saturating_sub(u64::from(input.drained.max(1)));
                 if missing > 0 {
                     tick.flags.set(TickFlags::DROPPED_FRAME);
                     tick.event(EventKind::FramesDropped { count: missing });
@@ -450,7 +455,8 @@ impl<R: Reference> Core<R> {
         }
         let beyond_ns = age_ns - Timing::ms_to_ns(self.timing.camera_delay_ms);
         let period = self.timing.period_ns();
-        let age_samples = ((beyond_ns + period / 2).max(0) / period).min(i64::from(u16::MAX)) as u16;
+        let age_samples =
+            ((beyond_ns + period / 2).max(0) / period).min(i64::from(u16::MAX)) as u16;
         Some(LoopMeasurement {
             position_um: m.position_um,
             variance_um2: m.variance_um2,
@@ -495,14 +501,18 @@ impl<R: Reference> Core<R> {
                     fault: report.fault,
                 });
             }
-            let damaged = report.bad_frames.saturating_sub(before.map_or(0, |b| b.bad_frames));
+            let damaged = report
+                .bad_frames
+                .saturating_sub(before.map_or(0, |b| b.bad_frames));
             if damaged > 0 {
                 tick.event(EventKind::LinkGarbage { count: damaged });
             }
             if !matches!(report.state, BoardState::Armed | BoardState::Running) {
                 self.latch(SafeReason::Board, tick);
             }
-        } else if input.time_ns - self.state.board_heard_ns > Timing::ms_to_ns(self.timing.board_silence_ms) {
+        } else if input.time_ns - self.state.board_heard_ns
+            > Timing::ms_to_ns(self.timing.board_silence_ms)
+        {
             self.latch(SafeReason::LinkLost, tick);
         }
     }
@@ -577,7 +587,10 @@ impl<R: Reference> Core<R> {
             mode,
             ..LoopInput::default()
         };
-        (self.controller.step(&mut self.state.control, &input), reference_um)
+        (
+            self.controller.step(&mut self.state.control, &input),
+            reference_um,
+        )
     }
 
     /// Flags and events that follow from the controller's output.
@@ -594,7 +607,11 @@ impl<R: Reference> Core<R> {
                 tick.flags.set(mask);
             }
         }
-        self.state.missing = if flags.coasting { self.state.missing.saturating_add(1) } else { 0 };
+        self.state.missing = if flags.coasting {
+            self.state.missing.saturating_add(1)
+        } else {
+            0
+        };
         if self.state.life != Life::Running {
             return;
         }
@@ -691,7 +708,13 @@ impl<R: Reference> Core<R> {
         }
     }
 
-    fn record(&self, input: &TickInput, output: &LoopOutput, target_um: f64, flags: TickFlags) -> TickRecord {
+    fn record(
+        &self,
+        input: &TickInput,
+        output: &LoopOutput,
+        target_um: f64,
+        flags: TickFlags,
+    ) -> TickRecord {
         let m = input.measurement;
         let (last_id, last_exposure) = self.state.last_frame.unwrap_or((0, 0));
         TickRecord {
@@ -712,7 +735,10 @@ impl<R: Reference> Core<R> {
             life: self.state.life as u8,
             request: input.request as u8,
             board: self.state.board.map_or(255, |b| b.state as u8),
-            board_fault: self.state.board.map_or(Fault::None as u8, |b| b.fault as u8),
+            board_fault: self
+                .state
+                .board
+                .map_or(Fault::None as u8, |b| b.fault as u8),
             flags,
             drained: input.drained.min(255) as u8,
             wake_ns: 0,

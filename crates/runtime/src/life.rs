@@ -120,7 +120,11 @@ pub enum Refusal {
 
 /// What happened. Times in milliseconds, positions in micrometres.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
-#[serde(tag = "event", rename_all = "kebab-case", rename_all_fields = "snake_case")]
+#[serde(
+    tag = "event",
+    rename_all = "kebab-case",
+    rename_all_fields = "snake_case"
+)]
 pub enum EventKind {
     /// The board is armed; the bead is being looked for.
     Armed,
@@ -221,7 +225,10 @@ pub enum EventKind {
     Finished,
 }
 
-fn as_debug<S: serde::Serializer>(value: &impl std::fmt::Debug, serializer: S) -> Result<S::Ok, S::Error> {
+fn as_debug<S: serde::Serializer>(
+    value: &impl std::fmt::Debug,
+    serializer: S,
+) -> Result<S::Ok, S::Error> {
     serializer.collect_str(&format_args!("{value:?}"))
 }
 

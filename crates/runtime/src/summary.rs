@@ -159,7 +159,8 @@ impl Summary {
             rms_true_nm: statistics.truth.rms_nm(),
             mean_error_nm: statistics.measured.mean_nm(),
             peak_error_nm: (statistics.measured.n > 0).then_some(statistics.measured.peak * 1e3),
-            loop_delay_ms: account.exposure_to_command.quantiles_us().p50 * 1e-3 + 0.5e-3 * period_us,
+            loop_delay_ms: account.exposure_to_command.quantiles_us().p50 * 1e-3
+                + 0.5e-3 * period_us,
             tick_us: account.tick.quantiles_us(),
             wake_us: account.wake.quantiles_us(),
         }

@@ -196,7 +196,9 @@ impl<R: Reference> Ticker<R> {
         let handed_ns = self.clock.now_ns();
         let wake_ns = (start_ns - ready_ns).max(0);
         let compute_ns = handed_ns - start_ns;
-        self.account.tick.record((monotonic_ns() - compute_from_ns).max(0) as u64);
+        self.account
+            .tick
+            .record((monotonic_ns() - compute_from_ns).max(0) as u64);
         self.account.wake.record(wake_ns as u64);
         if let Some(m) = newest {
             self.account
