@@ -1,0 +1,305 @@
+//! What to drive the plant with: stepped sines, log sweep, random-phase multisine, steps and rest.
+//!
+//! Signals are displacements to add to a command (um, peak amplitudes), one value per tick. Amplitudes are shaped by
+//! the expected plant so that the bead stays in view: in open loop 1.6 um peak to peak at 2 Hz would move it 54 um.
+//! Not for running an experiment: see [`crate::experiment`].
+
+use nalgebra::Complex;
+
+use crate::error::IdentError;
+use crate::random::Random;
+
+/// The ten drive frequencies of the paper's Fig. 4 and 7, Hz.
+pub const PAPER_FREQUENCIES_HZ: [f64; 10] = [2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 120.0, 150.0, 200.0, 300.0];
+
+/// One sine of a signal.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Tone {
+    /// Frequency, Hz.
+    pub frequency_hz: f64,
+    /// Peak amplitude, um of PZT displacement.
+    pub amplitude_um: f64,
+    /// Phase at the start of the signal, rad (0: a sine starting at zero, rising).
+    pub phase_rad: f64,
+}
+
+/// A signal to add to the PZT command.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Signal {
+    /// No excitation: what the noise does.
+    Rest,
+    /// A sum of sines, faded in over `fade_in_s`.
+    Tones {
+        /// The sines.
+        tones: Vec<Tone>,
+        /// Time to rise to full amplitude (half a cosine), s.
+        fade_in_s: f64,
+    },
+    /// A sine whose frequency rises exponentially; its amplitude is proportional to frequency up to `flat_from_hz`
+    /// (constant bead amplitude on an integrator), constant above.
+    LogSweep {
+        /// First frequency, Hz.
+        from_hz: f64,
+        /// Last frequency, Hz.
+        to_hz: f64,
+        /// Duration of the sweep, s.
+        duration_s: f64,
+        /// Peak amplitude above `flat_from_hz`, um.
+        amplitude_um: f64,
+        /// Frequency from which the amplitude is constant, Hz.
+        flat_from_hz: f64,
+    },
+    /// A staircase: up, back, down, back, each level held for `hold_s`.
+    Steps {
+        /// Height, um.
+        height_um: f64,
+        /// Time on each level, s.
+        hold_s: f64,
+    },
+}
+
+impl Signal {
+    /// Displacement at `time_s` after the signal's start, um.
+    pub fn value_um(&self, time_s: f64) -> f64 {
+        let two_pi = 2.0 * std::f64::consts::PI;
+        match self {
+            Signal::Rest => 0.0,
+            Signal::Tones { tones, fade_in_s } => {
+                let fade = if time_s < *fade_in_s { 0.5 - 0.5 * (std::f64::consts::PI * time_s / fade_in_s).cos() } else { 1.0 };
+                let sum: f64 = tones.iter().map(|t| t.amplitude_um * (two_pi * t.frequency_hz * time_s + t.phase_rad).sin()).sum();
+                fade * sum
+            }
+            Signal::LogSweep { from_hz, to_hz, duration_s, amplitude_um, flat_from_hz } => {
+                if time_s < 0.0 || time_s > *duration_s {
+                    return 0.0;
+                }
+                let rate = (to_hz / from_hz).ln() / duration_s;
+                let frequency = from_hz * (rate * time_s).exp();
+                let phase = two_pi * from_hz * (rate * time_s).exp_m1() / rate;
+                amplitude_um * (frequency / flat_from_hz).min(1.0) * phase.sin()
+            }
+            Signal::Steps { height_um, hold_s } => match (time_s / hold_s) as i64 % 4 {
+                0 => *height_um,
+                2 => -height_um,
+                _ => 0.0,
+            },
+        }
+    }
+}
+
+/// Checks that no harmonic up to `harmonics` of any line falls, folded by sampling at `rate_hz`, within
+/// `resolution_hz` of another line.
+///
+/// # Errors
+/// [`IdentError::AliasOnGrid`] with the first clash; [`IdentError::OutOfRange`] for a line at or above half the rate.
+pub fn check_grid(lines_hz: &[f64], rate_hz: f64, harmonics: usize, resolution_hz: f64) -> Result<(), IdentError> {
+    for &f in lines_hz {
+        if !(f > 0.0 && f < 0.5 * rate_hz) {
+            return Err(IdentError::OutOfRange {
+                key: "frequency_hz",
+                value: f,
+                unit: "Hz",
+                expected: "a drive line lies above 0 and below half the sampling rate",
+            });
+        }
+        for harmonic in 2..=harmonics {
+            let folded = fold(f * harmonic as f64, rate_hz);
+            if let Some(&onto_hz) = lines_hz.iter().find(|&&g| (g - folded).abs() < resolution_hz) {
+                return Err(IdentError::AliasOnGrid { from_hz: f, harmonic, onto_hz, rate_hz });
+            }
+        }
+    }
+    Ok(())
+}
+
+/// Where a frequency shows after sampling, Hz in 0..rate/2.
+pub fn fold(frequency_hz: f64, rate_hz: f64) -> f64 {
+    let wrapped = frequency_hz.rem_euclid(rate_hz);
+    wrapped.min(rate_hz - wrapped)
+}
+
+/// `count` drive lines from `low_hz` to `high_hz`, spaced evenly in the logarithm, each moved to the nearest multiple
+/// of `resolution_hz` from which harmonics 2..=`harmonics` do not fall on any other line.
+///
+/// # Errors
+/// [`IdentError::OutOfRange`] when the band is empty, reaches half the rate, or no such grid fits in it.
+pub fn drive_grid(low_hz: f64, high_hz: f64, count: usize, resolution_hz: f64, rate_hz: f64, harmonics: usize) -> Result<Vec<f64>, IdentError> {
+    if !(low_hz > 0.0 && high_hz > low_hz && high_hz < 0.5 * rate_hz && resolution_hz > 0.0 && count >= 1) {
+        return Err(IdentError::OutOfRange {
+            key: "high_hz",
+            value: high_hz,
+            unit: "Hz",
+            expected: "0 < low_hz < high_hz < half the sampling rate, with a positive resolution",
+        });
+    }
+    let mut lines: Vec<f64> = Vec::with_capacity(count);
+    // From the top: high lines fold most, and low ones have the finest relative choice left.
+    for i in (0..count).rev() {
+        let share = if count == 1 { 1.0 } else { i as f64 / (count - 1) as f64 };
+        let centre = (low_hz * (high_hz / low_hz).powf(share) / resolution_hz).round() as i64;
+        let candidate = (0..4000i64)
+            .map(|n| centre + if n % 2 == 0 { n / 2 } else { -(n + 1) / 2 })
+            .filter(|&bin| bin >= 1)
+            .map(|bin| bin as f64 * resolution_hz)
+            .filter(|&f| f >= 0.999 * low_hz && f <= high_hz * 1.001)
+            .find(|&f| {
+                let mut trial = lines.clone();
+                trial.push(f);
+                let apart = lines.iter().all(|&g| (g - f).abs() > 0.5 * resolution_hz);
+                apart && check_grid(&trial, rate_hz, harmonics, 0.5 * resolution_hz).is_ok()
+            });
+        match candidate {
+            Some(f) => lines.push(f),
+            None => {
+                return Err(IdentError::OutOfRange {
+                    key: "resolution_hz",
+                    value: resolution_hz,
+                    unit: "Hz",
+                    expected: "a finer grid (a longer period): no free line is left near one of the wanted frequencies",
+                });
+            }
+        }
+    }
+    lines.reverse();
+    Ok(lines)
+}
+
+/// A periodic multisine: its drive lines and the lines left out to detect nonlinearity.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Multisine {
+    /// Driven sines with random phases.
+    pub tones: Vec<Tone>,
+    /// Odd lines left undriven: odd nonlinearity shows here.
+    pub odd_detection_hz: Vec<f64>,
+    /// Even lines near the driven ones: even nonlinearity shows here.
+    pub even_detection_hz: Vec<f64>,
+    /// Period, s.
+    pub period_s: f64,
+}
+
+/// A random-phase multisine of period `period_s` on odd lines from `low_hz` to `high_hz`: of each group of
+/// `group` odd lines one, drawn at random, stays undriven. `amplitude_um(f)` shapes the spectrum.
+///
+/// # Errors
+/// [`IdentError::OutOfRange`] when fewer than four odd lines fit in the band.
+pub fn odd_multisine(
+    low_hz: f64,
+    high_hz: f64,
+    period_s: f64,
+    group: usize,
+    amplitude_um: impl Fn(f64) -> f64,
+    seed: u64,
+) -> Result<Multisine, IdentError> {
+    let mut random = Random::new(seed);
+    let odd: Vec<usize> = (1usize..)
+        .step_by(2)
+        .skip_while(|&k| (k as f64) < low_hz * period_s * (1.0 - 1e-12))
+        .take_while(|&k| k as f64 <= high_hz * period_s * (1.0 + 1e-12))
+        .collect();
+    if odd.len() < 4 {
+        return Err(IdentError::OutOfRange {
+            key: "period_s",
+            value: period_s,
+            unit: "s",
+            expected: "a period long enough for four odd lines in the band",
+        });
+    }
+    let group = group.max(2);
+    let mut tones = Vec::new();
+    let mut odd_detection_hz = Vec::new();
+    for lines in odd.chunks(group) {
+        let silent = if lines.len() == group { random.below(group) } else { usize::MAX };
+        for (i, &k) in lines.iter().enumerate() {
+            let frequency_hz = k as f64 / period_s;
+            if i == silent {
+                odd_detection_hz.push(frequency_hz);
+            } else {
+                let phase_rad = 2.0 * std::f64::consts::PI * random.uniform();
+                tones.push(Tone { frequency_hz, amplitude_um: amplitude_um(frequency_hz), phase_rad });
+            }
+        }
+    }
+    let even_detection_hz = odd.chunks(group).map(|lines| (lines[0] + 1) as f64 / period_s).collect();
+    Ok(Multisine { tones, odd_detection_hz, even_detection_hz, period_s })
+}
+
+/// Limits that an excitation must respect.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Limits {
+    /// Largest bead amplitude (peak) that stays in view, um.
+    pub bead_um: f64,
+    /// Largest PZT amplitude (peak), um.
+    pub pzt_um: f64,
+    /// Largest PZT speed, um/s.
+    pub slew_um_per_s: f64,
+}
+
+/// Amplitude (peak) to add to the command at `frequency_hz` so that neither the bead, the PZT nor its speed leaves
+/// `limits`. `plant` is the expected `X2/X1`; `loop_gain` is plant times controller with delay (0 in open loop): the
+/// feedback divides the excitation by `1 + loop_gain`.
+pub fn shaped_amplitude_um(frequency_hz: f64, plant: Complex<f64>, loop_gain: Complex<f64>, limits: Limits) -> f64 {
+    let sensitivity = (1.0 / (1.0 + loop_gain)).norm();
+    let w = 2.0 * std::f64::consts::PI * frequency_hz;
+    let pzt_um = (limits.bead_um / plant.norm()).min(limits.pzt_um).min(limits.slew_um_per_s / w);
+    pzt_um / sensitivity
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_papers_grid_aliases_onto_itself_and_the_drive_grid_does_not() {
+        let clash = check_grid(&PAPER_FREQUENCIES_HZ, 1000.0, 5, 0.25).unwrap_err();
+        assert!(matches!(clash, IdentError::AliasOnGrid { .. }), "{clash}");
+        let high = check_grid(&[100.0, 200.0, 300.0], 1000.0, 7, 0.25).unwrap_err();
+        assert!(matches!(high, IdentError::AliasOnGrid { .. }));
+        let grid = drive_grid(2.0, 300.0, 12, 0.5, 1000.0, 7).unwrap();
+        assert_eq!(grid.len(), 12);
+        assert_eq!(check_grid(&grid, 1000.0, 7, 0.25), Ok(()));
+        assert!(grid.windows(2).all(|w| w[0] < w[1]));
+    }
+
+    #[test]
+    fn folding_shows_where_a_harmonic_lands() {
+        assert_eq!(fold(900.0, 1000.0), 100.0);
+        assert_eq!(fold(1200.0, 1000.0), 200.0);
+        assert_eq!(fold(293.0, 1000.0), 293.0);
+    }
+
+    #[test]
+    fn a_multisine_drives_odd_lines_only_and_its_detection_lines_are_silent() {
+        let m = odd_multisine(2.0, 60.0, 1.0, 4, |_| 0.5, 11).unwrap();
+        assert!(m.tones.iter().all(|t| (t.frequency_hz as usize) % 2 == 1));
+        let signal = Signal::Tones { tones: m.tones.clone(), fade_in_s: 0.0 };
+        let samples: Vec<f64> = (0..1000).map(|k| signal.value_um(k as f64 * 1e-3)).collect();
+        for f in m.odd_detection_hz.iter().chain(&m.even_detection_hz) {
+            let sum: Complex<f64> =
+                samples.iter().enumerate().map(|(k, x)| Complex::from_polar(*x, -2.0 * std::f64::consts::PI * f * k as f64 * 1e-3)).sum();
+            assert!(sum.norm() < 1e-8, "{f} Hz");
+        }
+        assert!(m.odd_detection_hz.len() >= 6);
+    }
+
+    #[test]
+    fn shaped_amplitudes_keep_the_bead_in_view_in_open_and_closed_loop() {
+        let limits = Limits { bead_um: 8.0, pzt_um: 15.0, slew_um_per_s: 1e9 };
+        let plant = Complex::new(0.0, -34.0);
+        assert!((shaped_amplitude_um(2.0, plant, Complex::from(0.0), limits) * 34.0 - 8.0).abs() < 1e-9);
+        let closed = shaped_amplitude_um(2.0, plant, Complex::new(3.0, -16.0), limits);
+        let bead = closed * plant.norm() / (1.0 + Complex::new(3.0, -16.0)).norm();
+        assert!((bead - 8.0).abs() < 1e-9);
+    }
+
+    #[test]
+    fn a_sweep_passes_its_end_frequencies() {
+        let sweep = Signal::LogSweep { from_hz: 2.0, to_hz: 300.0, duration_s: 20.0, amplitude_um: 1.0, flat_from_hz: 100.0 };
+        // Zero crossings in the last 0.1 s count the last frequency.
+        let crossings = (0..10_000)
+            .map(|i| (sweep.value_um(19.9 + i as f64 * 1e-5), sweep.value_um(19.9 + (i + 1) as f64 * 1e-5)))
+            .filter(|(a, b)| a.signum() != b.signum())
+            .count();
+        assert!((57..=60).contains(&crossings), "{crossings}");
+        assert_eq!(sweep.value_um(25.0), 0.0);
+    }
+}

@@ -1,0 +1,163 @@
+//! The models of the ladder as functions of physical parameters, from a bare integrator to Eq. (4).
+//!
+//! `G(s) = K (1 + s/z) (1 + s tau) / ((s + q) (1 + s/p)) e^(-s L)`: integrator gain `K`, pole-zero pair `z`, `p`, far
+//! zero at `-1/tau`, slow pole at `-q`, delay `L`. With all of them this is Eq. (4) with real poles and zeros
+//! (`alpha = K tau p/z`); without the far zero and with `q = 0` a pole-zero pair on an integrator; with `z = p` a bare
+//! integrator. Eq. (5) read rightly is `K = 2 pi 63 /s`. Not for resonances: see [`crate::rational`].
+
+use nalgebra::Complex;
+
+use crate::sampled::{PartialFractions, Sampling};
+
+/// Parameters of Eq. (4) with real poles and zeros, and a delay.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct LadderModel {
+    /// Integrator gain `K`, bead speed per PZT displacement, 1/s.
+    pub gain_per_s: f64,
+    /// Zero of the pair, rad/s (a zero at `-zero_rad_per_s`).
+    pub zero_rad_per_s: f64,
+    /// Pole of the pair, rad/s.
+    pub pole_rad_per_s: f64,
+    /// `1/far zero`, s: the lead of the far zero. 0: no far zero, no feedthrough.
+    pub far_lead_s: f64,
+    /// Slow pole, rad/s. 0: an integrator.
+    pub slow_pole_rad_per_s: f64,
+    /// Delay from the command to the middle of the exposure, s.
+    pub delay_s: f64,
+}
+
+impl LadderModel {
+    /// A bare integrator behind a delay: Eq. (5) with its unit put right.
+    pub fn integrator(gain_per_s: f64, delay_s: f64) -> Self {
+        Self {
+            gain_per_s,
+            zero_rad_per_s: 1.0,
+            pole_rad_per_s: 1.0,
+            far_lead_s: 0.0,
+            slow_pole_rad_per_s: 0.0,
+            delay_s,
+        }
+    }
+
+    /// Eq. (6), the nominal plant, behind a delay.
+    pub fn eq6(delay_s: f64) -> Self {
+        let (alpha, b1, b0, a1, a0): (f64, f64, f64, f64, f64) = (0.01872, 20261.5, 1_745_041.0, 76.3, 0.13);
+        let root = |b: f64, c: f64| {
+            let far = 0.5 * (b + (b * b - 4.0 * c).sqrt());
+            (far, c / far)
+        };
+        let (far_zero, zero) = root(b1, b0);
+        let (pole, slow) = root(a1, a0);
+        Self {
+            gain_per_s: alpha * b0 / pole,
+            zero_rad_per_s: zero,
+            pole_rad_per_s: pole,
+            far_lead_s: 1.0 / far_zero,
+            slow_pole_rad_per_s: slow,
+            delay_s,
+        }
+    }
+
+    /// Delay less the lead of the far zero, s. Behind a zero-order hold the two trade exactly for an integrator, so
+    /// that this difference is what the phase of a record determines.
+    pub fn effective_delay_s(&self) -> f64 {
+        self.delay_s - self.far_lead_s
+    }
+
+    /// The plant without its delay, as partial fractions.
+    pub fn partial_fractions(&self) -> PartialFractions {
+        let (k, z, p, tau, q) =
+            (self.gain_per_s, self.zero_rad_per_s, self.pole_rad_per_s, self.far_lead_s, self.slow_pole_rad_per_s);
+        let direct = k * tau * p / z;
+        let at = |s: f64| k * (1.0 + s / z) * (1.0 + s * tau);
+        let slow = at(-q) / (1.0 - q / p);
+        if (z / p - 1.0).abs() < 1e-12 {
+            return PartialFractions { direct, terms: vec![(Complex::from(-q), Complex::from(slow))] };
+        }
+        let pair = at(-p) * p / (q - p);
+        PartialFractions {
+            direct,
+            terms: vec![(Complex::from(-q), Complex::from(slow)), (Complex::from(-p), Complex::from(pair))],
+        }
+    }
+
+    /// `G(j 2 pi f)` without the delay.
+    pub fn response(&self, frequency_hz: f64) -> Complex<f64> {
+        self.partial_fractions().response(frequency_hz)
+    }
+
+    /// What a record sampled as `sampling` shows at `frequency_hz`, delay included.
+    pub fn sampled_response(&self, frequency_hz: f64, sampling: Sampling) -> Complex<f64> {
+        self.partial_fractions().sampled_response(frequency_hz, self.delay_s, sampling)
+    }
+
+    /// Numerator and denominator of the plant without delay, highest power of s first, the denominator monic; of lower
+    /// degree where parameters are absent.
+    pub fn polynomials(&self) -> (Vec<f64>, Vec<f64>) {
+        let (k, z, p, tau, q) =
+            (self.gain_per_s, self.zero_rad_per_s, self.pole_rad_per_s, self.far_lead_s, self.slow_pole_rad_per_s);
+        if (z / p - 1.0).abs() < 1e-12 {
+            return if tau == 0.0 { (vec![k], vec![1.0, q]) } else { (vec![k * tau, k], vec![1.0, q]) };
+        }
+        let scale = k * p;
+        let numerator = if tau == 0.0 {
+            vec![scale / z, scale]
+        } else {
+            vec![scale * tau / z, scale * (tau + 1.0 / z), scale]
+        };
+        (numerator, vec![1.0, p + q, p * q])
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn eq6_in_these_parameters_has_the_gain_and_phase_of_the_papers_frequencies() {
+        let model = LadderModel::eq6(0.0);
+        let table = [
+            (2.0, 30.62, -91.04),
+            (5.0, 22.55, -92.33),
+            (10.0, 16.26, -93.30),
+            (20.0, 9.88, -92.92),
+            (50.0, 1.67, -90.85),
+            (100.0, -4.40, -89.13),
+            (120.0, -5.99, -88.63),
+            (150.0, -7.93, -87.94),
+            (200.0, -10.42, -86.90),
+            (300.0, -13.92, -84.97),
+        ];
+        for (f, gain_db, phase_deg) in table {
+            let g = model.response(f);
+            assert!((20.0 * g.norm().log10() - gain_db).abs() < 0.006, "{f} Hz");
+            assert!((g.arg().to_degrees() - phase_deg).abs() < 0.006, "{f} Hz");
+        }
+        assert!((model.gain_per_s - 428.1).abs() < 0.1);
+        assert!((1.0 / model.far_lead_s - 20175.0).abs() < 1.0);
+    }
+
+    #[test]
+    fn polynomials_and_partial_fractions_are_the_same_plant() {
+        let model = LadderModel { slow_pole_rad_per_s: 0.7, ..LadderModel::eq6(0.0) };
+        let (numerator, denominator) = model.polynomials();
+        let horner = |c: &[f64], s: Complex<f64>| c.iter().fold(Complex::from(0.0), |a, &c| a * s + c);
+        for f in [0.3, 7.0, 150.0] {
+            let s = Complex::new(0.0, 2.0 * std::f64::consts::PI * f);
+            let ratio = horner(&numerator, s) / horner(&denominator, s);
+            assert!((ratio - model.response(f)).norm() < 1e-12 * ratio.norm());
+        }
+        assert!((denominator[1] - (model.pole_rad_per_s + 0.7)).abs() < 1e-12);
+    }
+
+    #[test]
+    fn behind_a_hold_the_far_zero_and_the_delay_of_an_integrator_cannot_be_told_apart() {
+        let sampling = Sampling::held(1000.0);
+        let plain = LadderModel::integrator(400.0, 0.0021);
+        let traded = LadderModel { far_lead_s: 0.0005, delay_s: 0.0026, ..plain };
+        for f in [2.0, 50.0, 300.0, 480.0] {
+            let (a, b) = (plain.sampled_response(f, sampling), traded.sampled_response(f, sampling));
+            assert!((a - b).norm() < 1e-12 * a.norm());
+        }
+    }
+}

@@ -1,0 +1,190 @@
+//! Least-squares fit of sines plus polynomial drift to a record, block by block.
+//!
+//! A bare FFT puts `v/(pi f)` of a drift `v` into every bin, whatever the record's length; here the drift has
+//! regressors of its own. A freely diffusing bead makes the noise a random walk: it is white in the increments, where
+//! least squares is the best linear estimate, so increments are fitted and the phasors carried back exactly
+//! (`Y = dY/(1 - e^(-jw))`). Rows without a bead (`NaN`) are left out. Not for records whose input is not periodic.
+
+use nalgebra::{Complex, DMatrix, DVector};
+
+/// In which form the noise of a signal is closest to white.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Whitening {
+    /// Fit the samples themselves: white measurement noise.
+    Levels,
+    /// Fit the differences of neighbouring samples: a random walk.
+    Increments,
+}
+
+/// What to fit besides the sines.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct ToneFit {
+    /// Degree of the drift polynomial in each block: 0 an offset, 1 a steady drift, 2 a drift that changes steadily.
+    pub drift_degree: usize,
+    /// The form in which the noise is white.
+    pub whitening: Whitening,
+}
+
+impl Default for ToneFit {
+    fn default() -> Self {
+        Self { drift_degree: 2, whitening: Whitening::Increments }
+    }
+}
+
+/// Phasors of one block: the signal holds `Re(phasor e^(j 2 pi f k T))` with `k` counted from the start of the record.
+#[derive(Debug, Clone, PartialEq)]
+pub struct BlockPhasors {
+    /// One phasor per frequency, in the signal's unit (peak amplitude).
+    pub phasors: Vec<Complex<f64>>,
+    /// Residual variance per real row (levels or increments), unit^2.
+    pub residual_variance: f64,
+    /// Rows that took part.
+    pub rows: usize,
+}
+
+/// Fits `frequencies_hz` and drift to rows `from..to` of `signal`; `None` when too few rows hold a value or the
+/// frequencies cannot be told apart in so short a block.
+pub fn fit_block(
+    signal: &[f64],
+    from: usize,
+    to: usize,
+    period_s: f64,
+    frequencies_hz: &[f64],
+    fit: ToneFit,
+) -> Option<BlockPhasors> {
+    let to = to.min(signal.len());
+    let increments = fit.whitening == Whitening::Increments;
+    let first = if increments { from + 1 } else { from };
+    let drift_columns = if increments { fit.drift_degree } else { fit.drift_degree + 1 };
+    let columns = 2 * frequencies_hz.len() + drift_columns;
+    let angles: Vec<f64> = frequencies_hz.iter().map(|f| 2.0 * std::f64::consts::PI * f * period_s).collect();
+    let middle = 0.5 * (from + to) as f64;
+    let half = (0.5 * to.saturating_sub(from) as f64).max(1.0);
+
+    let mut normal = DMatrix::<f64>::zeros(columns, columns);
+    let mut right = DVector::<f64>::zeros(columns);
+    let mut sum_squares = 0.0;
+    let mut rows = 0usize;
+    let mut row = vec![0.0; columns];
+    let mut rotors: Vec<Complex<f64>> =
+        angles.iter().map(|a| Complex::from_polar(1.0, (a * first as f64) % (2.0 * std::f64::consts::PI))).collect();
+    let steps: Vec<Complex<f64>> = angles.iter().map(|&a| Complex::from_polar(1.0, a)).collect();
+    for k in first..to {
+        let value = if increments { signal[k] - signal[k - 1] } else { signal[k] };
+        if value.is_finite() {
+            for (i, r) in rotors.iter().enumerate() {
+                row[2 * i] = r.re;
+                row[2 * i + 1] = r.im;
+            }
+            let x = (k as f64 - middle) / half;
+            for d in 0..drift_columns {
+                row[2 * angles.len() + d] = x.powi(d as i32);
+            }
+            for (i, &a) in row.iter().enumerate() {
+                right[i] += a * value;
+                for (j, &b) in row[..=i].iter().enumerate() {
+                    normal[(i, j)] += a * b;
+                }
+            }
+            sum_squares += value * value;
+            rows += 1;
+        }
+        for (r, s) in rotors.iter_mut().zip(&steps) {
+            *r *= s;
+        }
+    }
+    if rows < columns + 2 {
+        return None;
+    }
+    for i in 0..columns {
+        for j in 0..i {
+            normal[(j, i)] = normal[(i, j)];
+        }
+    }
+    let diagonal_floor = 1e-9 * rows as f64;
+    let factor = normal.cholesky()?;
+    if (0..columns).any(|i| factor.l_dirty()[(i, i)].powi(2) < diagonal_floor * 1e-3) {
+        return None;
+    }
+    let solved = factor.solve(&right);
+    let explained = solved.dot(&right);
+    let phasors = angles
+        .iter()
+        .enumerate()
+        .map(|(i, &angle)| {
+            let phasor = Complex::new(solved[2 * i], -solved[2 * i + 1]);
+            if increments { phasor / (1.0 - Complex::from_polar(1.0, -angle)) } else { phasor }
+        })
+        .collect();
+    Some(BlockPhasors { phasors, residual_variance: ((sum_squares - explained) / (rows - columns) as f64).max(0.0), rows })
+}
+
+/// Cuts `rows` into blocks that each hold a whole number of periods of `frequency_hz` as nearly as rows allow, at
+/// least `min_periods` of them, and at most `most` blocks. Returns the blocks' borders (one more than blocks).
+pub fn block_borders(from: usize, to: usize, period_s: f64, frequency_hz: f64, min_periods: f64, most: usize) -> Vec<usize> {
+    let rows = to.saturating_sub(from) as f64;
+    let per_period = 1.0 / (frequency_hz * period_s);
+    let periods = rows / per_period;
+    let blocks = ((periods / min_periods).floor() as usize).min(most).min((rows / 24.0) as usize).max(1);
+    // Whole periods per block, where that loses little of the record.
+    let per_block = (periods / blocks as f64).floor().max(1.0) * per_period;
+    let length = if per_block * blocks as f64 > 0.9 * rows { per_block } else { rows / blocks as f64 };
+    (0..=blocks).map(|i| from + (i as f64 * length).round().min(rows) as usize).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const TWO_PI: f64 = 2.0 * std::f64::consts::PI;
+
+    fn record(n: usize, f: &[(f64, Complex<f64>)], drift_um_per_s: f64) -> Vec<f64> {
+        (0..n)
+            .map(|k| {
+                let t = k as f64 * 1e-3;
+                let tones: f64 = f.iter().map(|(f, a)| (a * Complex::from_polar(1.0, TWO_PI * f * t)).re).sum();
+                3.0 + drift_um_per_s * t + 0.4 * t * t + tones
+            })
+            .collect()
+    }
+
+    #[test]
+    fn sines_over_drift_are_recovered_exactly_from_levels_and_from_increments() {
+        let truth = [(7.3, Complex::new(1.0, -0.4)), (120.0, Complex::new(-0.02, 0.05))];
+        let signal = record(1500, &truth, 10.0);
+        for whitening in [Whitening::Levels, Whitening::Increments] {
+            let fit = ToneFit { drift_degree: 2, whitening };
+            let block = fit_block(&signal, 100, 1337, 1e-3, &[7.3, 120.0], fit).unwrap();
+            for (found, (_, expected)) in block.phasors.iter().zip(&truth) {
+                assert!((found - expected).norm() < 1e-9, "{found} against {expected}");
+            }
+            assert!(block.residual_variance < 1e-10);
+        }
+    }
+
+    #[test]
+    fn rows_without_a_bead_are_left_out() {
+        let truth = [(5.0, Complex::new(0.7, 0.1))];
+        let mut signal = record(1000, &truth, -3.0);
+        for k in (0..1000).step_by(37) {
+            signal[k] = f64::NAN;
+        }
+        let block = fit_block(&signal, 0, 1000, 1e-3, &[5.0], ToneFit::default()).unwrap();
+        assert!((block.phasors[0] - truth[0].1).norm() < 1e-9);
+        // 999 increments; 26 missing rows inside take two each, the first and the last row one each.
+        assert_eq!(block.rows, 999 - 2 * 26 - 2);
+    }
+
+    #[test]
+    fn frequencies_that_a_block_cannot_tell_apart_are_refused() {
+        let signal = record(60, &[(5.0, Complex::new(1.0, 0.0))], 0.0);
+        assert_eq!(fit_block(&signal, 0, 60, 1e-3, &[5.0, 5.000_1], ToneFit::default()), None);
+    }
+
+    #[test]
+    fn blocks_hold_whole_periods() {
+        let borders = block_borders(200, 5200, 1e-3, 2.0, 1.0, 20);
+        assert_eq!(borders.len(), 11);
+        assert!(borders.windows(2).all(|w| w[1] - w[0] == 500));
+    }
+}

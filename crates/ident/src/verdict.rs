@@ -1,0 +1,385 @@
+//! What each parameter is worth: intervals by covariance and by bootstrap, and a verdict for every one.
+//!
+//! No parameter leaves without an interval and a verdict. A parameter is identified when the chosen rung holds it and
+//! its 95 % interval is narrower than half the value on either side; the slow pole and the far zero are judged on the
+//! profile of the fit, where a delay may trade against the far zero. Not for choosing a model: [`crate::ladder`].
+
+use nalgebra::Complex;
+
+use crate::ladder::{DelayPrior, LadderFit, LadderProblem, Rung, index, model_of};
+use crate::ladder_model::LadderModel;
+use crate::random::Random;
+use crate::stats::{quantile, student_t_quantile};
+
+/// Whether the data determine a parameter.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Verdict {
+    /// The interval can be relied on.
+    Identified,
+    /// The band excited does not determine it; the reason in a sentence.
+    NotIdentifiable {
+        /// What the data do say, and what trades against it.
+        reason: String,
+    },
+}
+
+impl Verdict {
+    /// `identified` or `not identifiable from this band`.
+    pub fn label(&self) -> &'static str {
+        match self {
+            Verdict::Identified => "identified",
+            Verdict::NotIdentifiable { .. } => "not identifiable from this band",
+        }
+    }
+
+    /// Whether it is [`Verdict::Identified`].
+    pub fn is_identified(&self) -> bool {
+        matches!(self, Verdict::Identified)
+    }
+}
+
+/// One parameter with everything that is known of it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Parameter {
+    /// Name with unit, for example `gain_per_s`.
+    pub name: &'static str,
+    /// What it is, in words.
+    pub meaning: &'static str,
+    /// Unit.
+    pub unit: &'static str,
+    /// Best value.
+    pub value: f64,
+    /// 95 % interval by covariance (infinite ends where the data give no bound).
+    pub ci95: [f64; 2],
+    /// 95 % interval by bootstrap, where one was run.
+    pub bootstrap95: Option<[f64; 2]>,
+    /// The verdict.
+    pub verdict: Verdict,
+}
+
+/// The parameters of a ladder fit with verdicts, and the model to go on with.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Judged {
+    /// One entry per parameter of Eq. (4) with delay.
+    pub parameters: Vec<Parameter>,
+    /// The chosen model, with the delay of the prior where there is one.
+    pub model: LadderModel,
+    /// Interval of the delay from the phase slope alone, far zero included (upper end infinite where unbounded), s.
+    pub phase_delay95_s: [f64; 2],
+    /// Best delay from the phase slope alone, s: the smallest far-zero lead that the data allow.
+    pub phase_delay_s: f64,
+}
+
+impl Judged {
+    /// The parameter called `name`.
+    pub fn parameter(&self, name: &str) -> Option<&Parameter> {
+        self.parameters.iter().find(|p| p.name == name)
+    }
+}
+
+/// Half-width, relative to the value, above which an interval no longer identifies a parameter.
+const WIDEST_RELATIVE: f64 = 0.5;
+
+/// 95 % threshold of a profile's rise, chi-squared with one degree of freedom.
+const PROFILE_RISE: f64 = 3.841;
+
+/// Profile interval of the far zero's lead, ms, searched in 0..`LEAD_MOST_MS` sampling periods.
+fn lead_interval_ms(problem: &LadderProblem<'_>, fit: &LadderFit, data: &[Complex<f64>], period_ms: f64) -> Option<[f64; 2]> {
+    let far = fit.rungs.iter().find(|r| r.rung == Rung::FarZero)?;
+    // The delay is tried on both sides of each whole sample: there the feedthrough moves to another row at once.
+    let chi2_at = |lead_ms: f64| -> f64 {
+        [0.0, 0.08, -0.08]
+            .iter()
+            .map(|shift| {
+                let mut start = far.parameters.clone();
+                start[index::EFFECTIVE_DELAY_MS] += shift * period_ms;
+                problem.fit_from(data, Rung::FarZero, &start, Some((index::FAR_LEAD_MS, lead_ms))).chi2
+            })
+            .fold(f64::INFINITY, f64::min)
+    };
+    let grid: Vec<f64> =
+        [0.0, 0.01, 0.02, 0.035, 0.05, 0.075, 0.1, 0.15, 0.2, 0.3, 0.5, 0.8, 1.2, 2.0].iter().map(|g| g * period_ms).collect();
+    let costs: Vec<f64> = grid.iter().map(|&g| chi2_at(g)).collect();
+    let best = costs.iter().copied().fold(far.chi2, f64::min);
+    let limit = best + PROFILE_RISE * fit.scale;
+    let inside = |c: f64| c <= limit;
+    let edge = |mut out: f64, mut within: f64| {
+        for _ in 0..12 {
+            let mid = 0.5 * (out + within);
+            if inside(chi2_at(mid)) {
+                within = mid;
+            } else {
+                out = mid;
+            }
+        }
+        within
+    };
+    let own = far.parameters[index::FAR_LEAD_MS];
+    let first = costs.iter().position(|&c| inside(c));
+    let last = costs.iter().rposition(|&c| inside(c));
+    let low = match first {
+        Some(0) => 0.0,
+        Some(i) => edge(grid[i - 1], grid[i]),
+        None => own.max(0.0),
+    };
+    let high = match last {
+        Some(i) if i + 1 == grid.len() => f64::INFINITY,
+        Some(i) => edge(grid[i + 1], grid[i]),
+        None => own.max(0.0),
+    };
+    Some([low, high])
+}
+
+fn log_interval(value: f64, sd_log: f64, t: f64) -> [f64; 2] {
+    [value * (-t * sd_log).exp(), value * (t * sd_log).exp()]
+}
+
+fn judge_width(value: f64, interval: [f64; 2], why_not: &str) -> Verdict {
+    let widest = (interval[1] - value).abs().max((value - interval[0]).abs());
+    if widest.is_finite() && widest < WIDEST_RELATIVE * value.abs() {
+        Verdict::Identified
+    } else {
+        Verdict::NotIdentifiable { reason: why_not.to_owned() }
+    }
+}
+
+/// Judges a ladder that was fitted without a delay prior; `prior` is then brought in for the model to go on with.
+///
+/// `replicates` bootstrap fits (0: none) resample the blocks of every line with replacement.
+pub fn judge(
+    problem: &LadderProblem<'_>,
+    fit: &LadderFit,
+    prior: Option<DelayPrior>,
+    replicates: usize,
+    seed: u64,
+) -> Judged {
+    let data = problem.data();
+    let best = fit.best();
+    let t = student_t_quantile(0.975, fit.interval_dof.min(1e6));
+    let period_ms = problem.sampling().period_s * 1e3;
+    let lead_ms = lead_interval_ms(problem, fit, &data, period_ms);
+    let draws = bootstrap(problem, fit, replicates, seed);
+    let drawn = |f: &dyn Fn(&[f64]) -> f64| -> Option<[f64; 2]> {
+        (draws.len() >= 40).then(|| {
+            let values: Vec<f64> = draws.iter().map(|x| f(x)).collect();
+            [quantile(&values, 0.025), quantile(&values, 0.975)]
+        })
+    };
+    let sd = |i: usize| best.covariance[(i, i)].sqrt();
+    let mut parameters = Vec::new();
+
+    let gain = best.parameters[index::LN_GAIN].exp();
+    let gain95 = log_interval(gain, sd(index::LN_GAIN), t);
+    parameters.push(Parameter {
+        name: "gain_per_s",
+        meaning: "integrator gain K: bead speed per PZT displacement",
+        unit: "1/s",
+        value: gain,
+        ci95: gain95,
+        bootstrap95: drawn(&|x| x[index::LN_GAIN].exp()),
+        verdict: judge_width(gain, gain95, "the gain's interval is wider than half its value: excite more strongly or longer"),
+    });
+    for (name, meaning, i) in [
+        ("pair_zero_rad_per_s", "zero of the pole-zero pair", index::LN_ZERO),
+        ("pair_pole_rad_per_s", "pole of the pole-zero pair", index::LN_POLE),
+    ] {
+        let source = if best.rung >= Rung::PoleZeroPair { Some(best) } else { fit.rungs.iter().find(|r| r.rung == Rung::PoleZeroPair) };
+        let Some(source) = source else { continue };
+        let value = source.parameters[i].exp();
+        let ci95 = log_interval(value, source.covariance[(i, i)].sqrt(), t);
+        let chosen = best.rung >= Rung::PoleZeroPair;
+        parameters.push(Parameter {
+            name,
+            meaning,
+            unit: "rad/s",
+            value,
+            ci95,
+            bootstrap95: if chosen { drawn(&|x| x[i].exp()) } else { None },
+            verdict: if chosen {
+                judge_width(value, ci95, "the pair is seen, but not where it lies: excite more lines about it")
+            } else {
+                Verdict::NotIdentifiable { reason: "the data do not need a pole-zero pair".to_owned() }
+            },
+        });
+    }
+
+    let effective = best.parameters[index::EFFECTIVE_DELAY_MS];
+    let half = t * sd(index::EFFECTIVE_DELAY_MS);
+    parameters.push(Parameter {
+        name: "effective_delay_ms",
+        meaning: "delay less the far zero's lead: what the phase slope determines",
+        unit: "ms",
+        value: effective,
+        ci95: [effective - half, effective + half],
+        bootstrap95: drawn(&|x| x[index::EFFECTIVE_DELAY_MS]),
+        // A delay may be near zero: its scale is the sampling period, not its own value.
+        verdict: if half < 0.25 * period_ms {
+            Verdict::Identified
+        } else {
+            Verdict::NotIdentifiable { reason: "the phase slope is too uncertain: excite higher frequencies".to_owned() }
+        },
+    });
+
+    let lead = lead_ms.unwrap_or([0.0, f64::INFINITY]);
+    let phase_low = effective + lead[0] - half;
+    let phase_high = effective + lead[1] + half;
+    let model = with_prior(problem, fit, prior);
+    let delay = delay_parameter(&model, prior, effective, half, lead, period_ms);
+    parameters.push(delay);
+    parameters.push(far_zero_parameter(fit, &model, prior, lead, period_ms));
+    if let Some(full) = fit.rungs.iter().find(|r| r.rung == Rung::Eq4) {
+        parameters.push(slow_pole_parameter(full.parameters[index::SLOW_POLE], full.covariance[(index::SLOW_POLE, index::SLOW_POLE)].sqrt() * t, best.rung));
+    }
+    Judged {
+        parameters,
+        model,
+        phase_delay95_s: [phase_low * 1e-3, phase_high * 1e-3],
+        phase_delay_s: (effective + lead[0]) * 1e-3,
+    }
+}
+
+/// The chosen rung fitted again with the delay measured otherwise, and the far zero free to make up the difference.
+fn with_prior(problem: &LadderProblem<'_>, fit: &LadderFit, prior: Option<DelayPrior>) -> LadderModel {
+    let best = fit.best();
+    let Some(prior) = prior else { return best.model };
+    let with = problem.clone().with_prior(Some(prior));
+    let data = problem.data();
+    let far = fit.rungs.iter().find(|r| r.rung == Rung::FarZero);
+    let Some(far) = far else {
+        let found = with.fit_from(&data, best.rung, &best.parameters, None);
+        return model_of(&found.parameters, best.rung);
+    };
+    let rung = best.rung.max(Rung::FarZero);
+    let source = if rung == Rung::Eq4 { best } else { far };
+    let found = [0.0, 0.05, 0.2]
+        .iter()
+        .map(|extra| {
+            let mut start = source.parameters.clone();
+            start[index::FAR_LEAD_MS] = prior.delay_s * 1e3 - start[index::EFFECTIVE_DELAY_MS] + extra;
+            with.fit_from(&data, rung, &start, None)
+        })
+        .min_by(|a, b| a.chi2.total_cmp(&b.chi2));
+    found.map_or(best.model, |f| model_of(&f.parameters, rung))
+}
+
+fn delay_parameter(
+    model: &LadderModel,
+    prior: Option<DelayPrior>,
+    effective_ms: f64,
+    half_ms: f64,
+    lead_ms: [f64; 2],
+    period_ms: f64,
+) -> Parameter {
+    let meaning = "delay from the command to the middle of the exposure";
+    match prior {
+        Some(prior) => {
+            let half = 1.96 * prior.sd_s * 1e3;
+            let value = model.delay_s * 1e3;
+            Parameter {
+                name: "delay_ms",
+                meaning,
+                unit: "ms",
+                value,
+                ci95: [value - half, value + half],
+                bootstrap95: None,
+                verdict: Verdict::Identified,
+            }
+        }
+        None => {
+            let (low, high) = (effective_ms + lead_ms[0] - half_ms, effective_ms + lead_ms[1] + half_ms);
+            let narrow = high - low < 0.25 * period_ms;
+            Parameter {
+                name: "delay_ms",
+                meaning,
+                unit: "ms",
+                value: effective_ms + lead_ms[0],
+                ci95: [low, high],
+                bootstrap95: None,
+                verdict: if narrow {
+                    Verdict::Identified
+                } else {
+                    Verdict::NotIdentifiable {
+                        reason: "a far zero's lead trades against it behind a zero-order hold; the LED test tells them apart".to_owned(),
+                    }
+                },
+            }
+        }
+    }
+}
+
+fn far_zero_parameter(fit: &LadderFit, model: &LadderModel, prior: Option<DelayPrior>, lead_ms: [f64; 2], period_ms: f64) -> Parameter {
+    let invert = |ms: f64| if ms > 0.0 { 1e3 / ms } else { f64::INFINITY };
+    let ci95 = [if lead_ms[1].is_finite() { invert(lead_ms[1]) } else { 0.0 }, invert(lead_ms[0])];
+    let middle = if lead_ms[1].is_finite() { 0.5 * (lead_ms[0] + lead_ms[1]) } else { lead_ms[0] };
+    let width = 0.5 * (lead_ms[1] - lead_ms[0]);
+    let identified = fit.best().rung >= Rung::FarZero && width.is_finite() && width < WIDEST_RELATIVE * middle;
+    let value = if prior.is_some() && model.far_lead_s > 0.0 { 1.0 / model.far_lead_s } else { invert(middle.max(1e-3 * period_ms)) };
+    let verdict = if identified {
+        Verdict::Identified
+    } else {
+        let mut reason = format!(
+            "its lead trades against the delay: the record alone allows leads of {:.3} to {} ms",
+            lead_ms[0],
+            if lead_ms[1].is_finite() { format!("{:.3}", lead_ms[1]) } else { "any number of".to_owned() }
+        );
+        if prior.is_some() {
+            reason.push_str("; the value shown takes the LED test's delay as given");
+        }
+        Verdict::NotIdentifiable { reason }
+    };
+    Parameter {
+        name: "far_zero_rad_per_s",
+        meaning: "far zero of Eq. (4)",
+        unit: "rad/s",
+        value,
+        ci95,
+        bootstrap95: None,
+        verdict,
+    }
+}
+
+fn slow_pole_parameter(value: f64, half: f64, chosen: Rung) -> Parameter {
+    let identified = chosen == Rung::Eq4 && half < WIDEST_RELATIVE * value;
+    let high = value + half;
+    Parameter {
+        name: "slow_pole_rad_per_s",
+        meaning: "slow pole of Eq. (4)",
+        unit: "rad/s",
+        value: value.max(0.0),
+        ci95: [(value - half).max(0.0), high.max(0.0)],
+        bootstrap95: None,
+        verdict: if identified {
+            Verdict::Identified
+        } else {
+            Verdict::NotIdentifiable {
+                reason: format!("it lies far below the lowest line; the data only say that it is below {:.2} rad/s", high.max(0.0)),
+            }
+        },
+    }
+}
+
+/// Parameter vectors of the chosen rung fitted to resampled blocks.
+pub fn bootstrap(problem: &LadderProblem<'_>, fit: &LadderFit, replicates: usize, seed: u64) -> Vec<Vec<f64>> {
+    let mut random = Random::new(seed);
+    let best = fit.best();
+    (0..replicates)
+        .filter_map(|_| {
+            let data: Vec<Complex<f64>> = problem
+                .points()
+                .iter()
+                .map(|p| {
+                    let n = p.block_errors.len();
+                    if n < 2 {
+                        return p.response;
+                    }
+                    let sum: Complex<f64> = (0..n).map(|_| p.block_errors[random.below(n)]).sum();
+                    // Resampled means are narrower than the truth by (n-1)/n; the noise model sets the size.
+                    let size = (p.variance / p.scatter_variance.max(f64::MIN_POSITIVE) * n as f64 / (n as f64 - 1.0)).sqrt();
+                    p.response + sum / n as f64 * size
+                })
+                .collect();
+            let found = problem.fit_from(&data, best.rung, &best.parameters, None);
+            found.chi2.is_finite().then_some(found.parameters)
+        })
+        .collect()
+}
