@@ -19,7 +19,10 @@ pub struct Spectrum {
 pub fn spectrum(signal: &[f64], period_s: f64) -> Spectrum {
     let n = signal.len();
     if n < 2 {
-        return Spectrum { frequency_hz: Vec::new(), phasor: Vec::new() };
+        return Spectrum {
+            frequency_hz: Vec::new(),
+            phasor: Vec::new(),
+        };
     }
     let mean = signal.iter().sum::<f64>() / n as f64;
     let plan = RealFftPlanner::<f64>::new().plan_fft_forward(n);
@@ -27,12 +30,20 @@ pub fn spectrum(signal: &[f64], period_s: f64) -> Spectrum {
     let mut output = plan.make_output_vec();
     // The only errors are wrong lengths, and the plan made both buffers.
     if plan.process(&mut input, &mut output).is_err() {
-        return Spectrum { frequency_hz: Vec::new(), phasor: Vec::new() };
+        return Spectrum {
+            frequency_hz: Vec::new(),
+            phasor: Vec::new(),
+        };
     }
     let scale = 2.0 / n as f64;
     Spectrum {
-        frequency_hz: (0..output.len()).map(|k| k as f64 / (n as f64 * period_s)).collect(),
-        phasor: output.iter().map(|c| Complex::new(c.re, c.im) * scale).collect(),
+        frequency_hz: (0..output.len())
+            .map(|k| k as f64 / (n as f64 * period_s))
+            .collect(),
+        phasor: output
+            .iter()
+            .map(|c| Complex::new(c.re, c.im) * scale)
+            .collect(),
     }
 }
 
@@ -58,7 +69,10 @@ mod tests {
             for f in [2.0, 10.0, 50.0] {
                 let bin = (f * n as f64 * 1e-3).round() as usize;
                 let expected = 10.0 / (std::f64::consts::PI * f);
-                assert!((s.phasor[bin].norm() / expected - 1.0).abs() < 0.01, "{n} rows, {f} Hz");
+                assert!(
+                    (s.phasor[bin].norm() / expected - 1.0).abs() < 0.01,
+                    "{n} rows, {f} Hz"
+                );
             }
         }
     }

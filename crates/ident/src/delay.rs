@@ -35,7 +35,13 @@ pub struct DelayEstimate {
 /// Times at which to switch the light: `count` edges, `spacing_s` apart, each dithered over one frame period. The
 /// dither is stratified (one draw in each of `count` equal parts of the period, in random order), which covers the
 /// period more evenly than independent draws.
-pub fn dithered_edges(count: usize, spacing_s: f64, frame_period_s: f64, start_s: f64, seed: u64) -> Vec<f64> {
+pub fn dithered_edges(
+    count: usize,
+    spacing_s: f64,
+    frame_period_s: f64,
+    start_s: f64,
+    seed: u64,
+) -> Vec<f64> {
     let mut random = Random::new(seed);
     let mut strata: Vec<usize> = (0..count).collect();
     for i in (1..count).rev() {
@@ -44,7 +50,11 @@ pub fn dithered_edges(count: usize, spacing_s: f64, frame_period_s: f64, start_s
     strata
         .iter()
         .enumerate()
-        .map(|(i, &s)| start_s + i as f64 * spacing_s + (s as f64 + random.uniform()) / count as f64 * frame_period_s)
+        .map(|(i, &s)| {
+            start_s
+                + i as f64 * spacing_s
+                + (s as f64 + random.uniform()) / count as f64 * frame_period_s
+        })
         .collect()
 }
 
@@ -53,9 +63,16 @@ pub fn dithered_edges(count: usize, spacing_s: f64, frame_period_s: f64, start_s
 ///
 /// # Errors
 /// [`IdentError::EdgesNotSeen`] when fewer than half the edges show, [`IdentError::Lengths`].
-pub fn find_edges(sent_s: &[f64], frame_s: &[f64], brightness: &[f64]) -> Result<Vec<SeenEdge>, IdentError> {
+pub fn find_edges(
+    sent_s: &[f64],
+    frame_s: &[f64],
+    brightness: &[f64],
+) -> Result<Vec<SeenEdge>, IdentError> {
     if frame_s.len() != brightness.len() {
-        return Err(IdentError::Lengths { input: frame_s.len(), output: brightness.len() });
+        return Err(IdentError::Lengths {
+            input: frame_s.len(),
+            output: brightness.len(),
+        });
     }
     let low = brightness.iter().copied().fold(f64::INFINITY, f64::min);
     let high = brightness.iter().copied().fold(f64::NEG_INFINITY, f64::max);
@@ -70,13 +87,23 @@ pub fn find_edges(sent_s: &[f64], frame_s: &[f64], brightness: &[f64]) -> Result
         if start == 0 || start >= frame_s.len() || lit(start - 1) {
             continue;
         }
-        let found = (start..frame_s.len()).take_while(|&k| frame_s[k] < until).find(|&k| lit(k));
+        let found = (start..frame_s.len())
+            .take_while(|&k| frame_s[k] < until)
+            .find(|&k| lit(k));
         if let Some(k) = found {
-            seen.push(SeenEdge { sent_s: sent, before_s: frame_s[k - 1], after_s: frame_s[k] });
+            seen.push(SeenEdge {
+                sent_s: sent,
+                before_s: frame_s[k - 1],
+                after_s: frame_s[k],
+            });
         }
     }
     if seen.len() * 2 < sent_s.len() || seen.is_empty() {
-        return Err(IdentError::EdgesNotSeen { seen: seen.len(), sent: sent_s.len(), threshold });
+        return Err(IdentError::EdgesNotSeen {
+            seen: seen.len(),
+            sent: sent_s.len(),
+            threshold,
+        });
     }
     Ok(seen)
 }
@@ -92,21 +119,44 @@ pub fn find_edges(sent_s: &[f64], frame_s: &[f64], brightness: &[f64]) -> Result
 pub fn delay_from_edges(edges: &[SeenEdge]) -> Result<DelayEstimate, IdentError> {
     let n = edges.len();
     if n < 4 {
-        return Err(IdentError::TooShort { what: "a delay test", rows: n, needed: 4 });
+        return Err(IdentError::TooShort {
+            what: "a delay test",
+            rows: n,
+            needed: 4,
+        });
     }
-    let low = edges.iter().map(|e| e.before_s - e.sent_s).fold(f64::NEG_INFINITY, f64::max);
-    let high = edges.iter().map(|e| e.after_s - e.sent_s).fold(f64::INFINITY, f64::min);
+    let low = edges
+        .iter()
+        .map(|e| e.before_s - e.sent_s)
+        .fold(f64::NEG_INFINITY, f64::max);
+    let high = edges
+        .iter()
+        .map(|e| e.after_s - e.sent_s)
+        .fold(f64::INFINITY, f64::min);
     if low < high {
         let width = high - low;
         let (delay_s, sd_s) = (0.5 * (low + high), width / 12f64.sqrt());
-        return Ok(DelayEstimate { delay_s, sd_s, ci95_s: [low, high], edges: n });
+        return Ok(DelayEstimate {
+            delay_s,
+            sd_s,
+            ci95_s: [low, high],
+            edges: n,
+        });
     }
-    let middles: Vec<f64> = edges.iter().map(|e| 0.5 * (e.before_s + e.after_s) - e.sent_s).collect();
+    let middles: Vec<f64> = edges
+        .iter()
+        .map(|e| 0.5 * (e.before_s + e.after_s) - e.sent_s)
+        .collect();
     let mean = middles.iter().sum::<f64>() / n as f64;
     let variance = middles.iter().map(|m| (m - mean).powi(2)).sum::<f64>() / (n - 1) as f64;
     let sd_s = (variance / n as f64).sqrt();
     let t = crate::stats::student_t_quantile(0.975, (n - 1) as f64);
-    Ok(DelayEstimate { delay_s: mean, sd_s, ci95_s: [mean - t * sd_s, mean + t * sd_s], edges: n })
+    Ok(DelayEstimate {
+        delay_s: mean,
+        sd_s,
+        ci95_s: [mean - t * sd_s, mean + t * sd_s],
+        edges: n,
+    })
 }
 
 /// Whether two delays contradict each other: the intervals of LED test and phase slope do not touch, allowing
@@ -124,12 +174,19 @@ mod tests {
     fn test_record(edges_s: &[f64], delay_s: f64, jitter_s: f64) -> (Vec<f64>, Vec<f64>) {
         let mut random = Random::new(5);
         let last = edges_s[edges_s.len() - 1] + 0.05;
-        let frames: Vec<f64> = (0..(last * 1e3) as usize).map(|k| k as f64 * 1e-3).collect();
+        let frames: Vec<f64> = (0..(last * 1e3) as usize)
+            .map(|k| k as f64 * 1e-3)
+            .collect();
         let brightness = frames
             .iter()
             .map(|t| {
-                let switched = edges_s.partition_point(|e| *e <= t - delay_s + jitter_s * random.normal());
-                if switched % 2 == 1 { 200.0 + random.normal() } else { 20.0 + random.normal() }
+                let switched =
+                    edges_s.partition_point(|e| *e <= t - delay_s + jitter_s * random.normal());
+                if switched % 2 == 1 {
+                    200.0 + random.normal()
+                } else {
+                    20.0 + random.normal()
+                }
             })
             .collect();
         (frames, brightness)
@@ -144,7 +201,10 @@ mod tests {
                     let (frames, brightness) = test_record(&sent, delay_s, jitter_s);
                     let edges = find_edges(&sent, &frames, &brightness).unwrap();
                     let found = delay_from_edges(&edges).unwrap();
-                    assert!((found.delay_s - delay_s).abs() < 1e-4, "{delay_s} s, seed {seed}: {found:?}");
+                    assert!(
+                        (found.delay_s - delay_s).abs() < 1e-4,
+                        "{delay_s} s, seed {seed}: {found:?}"
+                    );
                 }
             }
         }
@@ -154,14 +214,33 @@ mod tests {
     fn edges_that_never_show_are_an_error_that_counts_them() {
         let sent = dithered_edges(20, 0.011, 1e-3, 0.01, 1);
         let frames: Vec<f64> = (0..400).map(|k| k as f64 * 1e-3).collect();
-        let dark: Vec<f64> = frames.iter().map(|t| (t * 700.0).sin()).map(|v| v.min(0.0) * 0.0).collect();
+        let dark: Vec<f64> = frames
+            .iter()
+            .map(|t| (t * 700.0).sin())
+            .map(|v| v.min(0.0) * 0.0)
+            .collect();
         let error = find_edges(&sent, &frames, &dark).unwrap_err();
-        assert!(matches!(error, IdentError::EdgesNotSeen { seen: 0, sent: 20, .. }), "{error}");
+        assert!(
+            matches!(
+                error,
+                IdentError::EdgesNotSeen {
+                    seen: 0,
+                    sent: 20,
+                    ..
+                }
+            ),
+            "{error}"
+        );
     }
 
     #[test]
     fn two_delays_that_contradict_each_other_are_reported_with_the_gap() {
-        let led = DelayEstimate { delay_s: 0.002, sd_s: 1e-6, ci95_s: [0.00199, 0.00201], edges: 100 };
+        let led = DelayEstimate {
+            delay_s: 0.002,
+            sd_s: 1e-6,
+            ci95_s: [0.00199, 0.00201],
+            edges: 100,
+        };
         assert_eq!(disagreement_s(&led, [0.0015, 0.0025], 1e-5), None);
         let gap = disagreement_s(&led, [0.0026, 0.0028], 1e-5).unwrap();
         assert!((gap - 0.00059).abs() < 1e-9);

@@ -36,7 +36,9 @@ pub enum IdentError {
         needed: usize,
     },
     /// The input does not move at a frequency where a response is asked for.
-    #[error("the input holds no signal at {frequency_hz} Hz (amplitude {amplitude}): excite it there or leave it out")]
+    #[error(
+        "the input holds no signal at {frequency_hz} Hz (amplitude {amplitude}): excite it there or leave it out"
+    )]
     NoInput {
         /// The frequency, Hz.
         frequency_hz: f64,
@@ -44,7 +46,9 @@ pub enum IdentError {
         amplitude: f64,
     },
     /// A drive line or one of its low harmonics folds onto another drive line at this sampling rate.
-    #[error("harmonic {harmonic} of {from_hz} Hz falls on the drive line {onto_hz} Hz at {rate_hz} Hz sampling: move one of them (for example to a prime number of hertz)")]
+    #[error(
+        "harmonic {harmonic} of {from_hz} Hz falls on the drive line {onto_hz} Hz at {rate_hz} Hz sampling: move one of them (for example to a prime number of hertz)"
+    )]
     AliasOnGrid {
         /// Frequency whose harmonic folds, Hz.
         from_hz: f64,
@@ -56,7 +60,9 @@ pub enum IdentError {
         rate_hz: f64,
     },
     /// Too few points for the parameters of a model.
-    #[error("{points} frequencies cannot support {parameters} parameters: measure at least {needed}")]
+    #[error(
+        "{points} frequencies cannot support {parameters} parameters: measure at least {needed}"
+    )]
     TooFewPoints {
         /// Frequencies given.
         points: usize,
@@ -66,7 +72,9 @@ pub enum IdentError {
         needed: usize,
     },
     /// The least-squares iteration found no minimum.
-    #[error("the fit of {what} did not converge ({reason}): check units and signs of input and output")]
+    #[error(
+        "the fit of {what} did not converge ({reason}): check units and signs of input and output"
+    )]
     NoFit {
         /// Which model.
         what: &'static str,
@@ -74,7 +82,9 @@ pub enum IdentError {
         reason: &'static str,
     },
     /// The bead was lost; what was measured before is kept and the experiment can resume.
-    #[error("the bead was lost in segment {segment} of {segments} ({frames} frames in a row without a position): bring it back and resume at that segment")]
+    #[error(
+        "the bead was lost in segment {segment} of {segments} ({frames} frames in a row without a position): bring it back and resume at that segment"
+    )]
     BeadLost {
         /// Segment (from 0) in which it happened.
         segment: usize,
@@ -84,7 +94,9 @@ pub enum IdentError {
         frames: usize,
     },
     /// Not enough edges were seen in the delay test.
-    #[error("only {seen} of {sent} edges were seen in the delay test: check that the light reaches the camera and the threshold of {threshold}")]
+    #[error(
+        "only {seen} of {sent} edges were seen in the delay test: check that the light reaches the camera and the threshold of {threshold}"
+    )]
     EdgesNotSeen {
         /// Edges seen.
         seen: usize,

@@ -10,7 +10,9 @@ use crate::error::IdentError;
 use crate::random::Random;
 
 /// The ten drive frequencies of the paper's Fig. 4 and 7, Hz.
-pub const PAPER_FREQUENCIES_HZ: [f64; 10] = [2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 120.0, 150.0, 200.0, 300.0];
+pub const PAPER_FREQUENCIES_HZ: [f64; 10] = [
+    2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 120.0, 150.0, 200.0, 300.0,
+];
 
 /// One sine of a signal.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -65,11 +67,26 @@ impl Signal {
         match self {
             Signal::Rest => 0.0,
             Signal::Tones { tones, fade_in_s } => {
-                let fade = if time_s < *fade_in_s { 0.5 - 0.5 * (std::f64::consts::PI * time_s / fade_in_s).cos() } else { 1.0 };
-                let sum: f64 = tones.iter().map(|t| t.amplitude_um * (two_pi * t.frequency_hz * time_s + t.phase_rad).sin()).sum();
+                let fade = if time_s < *fade_in_s {
+                    0.5 - 0.5 * (std::f64::consts::PI * time_s / fade_in_s).cos()
+                } else {
+                    1.0
+                };
+                let sum: f64 = tones
+                    .iter()
+                    .map(|t| {
+                        t.amplitude_um * (two_pi * t.frequency_hz * time_s + t.phase_rad).sin()
+                    })
+                    .sum();
                 fade * sum
             }
-            Signal::LogSweep { from_hz, to_hz, duration_s, amplitude_um, flat_from_hz } => {
+            Signal::LogSweep {
+                from_hz,
+                to_hz,
+                duration_s,
+                amplitude_um,
+                flat_from_hz,
+            } => {
                 if time_s < 0.0 || time_s > *duration_s {
                     return 0.0;
                 }
@@ -92,7 +109,12 @@ impl Signal {
 ///
 /// # Errors
 /// [`IdentError::AliasOnGrid`] with the first clash; [`IdentError::OutOfRange`] for a line at or above half the rate.
-pub fn check_grid(lines_hz: &[f64], rate_hz: f64, harmonics: usize, resolution_hz: f64) -> Result<(), IdentError> {
+pub fn check_grid(
+    lines_hz: &[f64],
+    rate_hz: f64,
+    harmonics: usize,
+    resolution_hz: f64,
+) -> Result<(), IdentError> {
     for &f in lines_hz {
         if !(f > 0.0 && f < 0.5 * rate_hz) {
             return Err(IdentError::OutOfRange {
@@ -104,8 +126,16 @@ pub fn check_grid(lines_hz: &[f64], rate_hz: f64, harmonics: usize, resolution_h
         }
         for harmonic in 2..=harmonics {
             let folded = fold(f * harmonic as f64, rate_hz);
-            if let Some(&onto_hz) = lines_hz.iter().find(|&&g| (g - folded).abs() < resolution_hz) {
-                return Err(IdentError::AliasOnGrid { from_hz: f, harmonic, onto_hz, rate_hz });
+            if let Some(&onto_hz) = lines_hz
+                .iter()
+                .find(|&&g| (g - folded).abs() < resolution_hz)
+            {
+                return Err(IdentError::AliasOnGrid {
+                    from_hz: f,
+                    harmonic,
+                    onto_hz,
+                    rate_hz,
+                });
             }
         }
     }
@@ -123,8 +153,20 @@ pub fn fold(frequency_hz: f64, rate_hz: f64) -> f64 {
 ///
 /// # Errors
 /// [`IdentError::OutOfRange`] when the band is empty, reaches half the rate, or no such grid fits in it.
-pub fn drive_grid(low_hz: f64, high_hz: f64, count: usize, resolution_hz: f64, rate_hz: f64, harmonics: usize) -> Result<Vec<f64>, IdentError> {
-    if !(low_hz > 0.0 && high_hz > low_hz && high_hz < 0.5 * rate_hz && resolution_hz > 0.0 && count >= 1) {
+pub fn drive_grid(
+    low_hz: f64,
+    high_hz: f64,
+    count: usize,
+    resolution_hz: f64,
+    rate_hz: f64,
+    harmonics: usize,
+) -> Result<Vec<f64>, IdentError> {
+    if !(low_hz > 0.0
+        && high_hz > low_hz
+        && high_hz < 0.5 * rate_hz
+        && resolution_hz > 0.0
+        && count >= 1)
+    {
         return Err(IdentError::OutOfRange {
             key: "high_hz",
             value: high_hz,
@@ -135,7 +177,11 @@ pub fn drive_grid(low_hz: f64, high_hz: f64, count: usize, resolution_hz: f64, r
     let mut lines: Vec<f64> = Vec::with_capacity(count);
     // From the top: high lines fold most, and low ones have the finest relative choice left.
     for i in (0..count).rev() {
-        let share = if count == 1 { 1.0 } else { i as f64 / (count - 1) as f64 };
+        let share = if count == 1 {
+            1.0
+        } else {
+            i as f64 / (count - 1) as f64
+        };
         let centre = (low_hz * (high_hz / low_hz).powf(share) / resolution_hz).round() as i64;
         let candidate = (0..4000i64)
             .map(|n| centre + if n % 2 == 0 { n / 2 } else { -(n + 1) / 2 })
@@ -160,7 +206,7 @@ pub fn drive_grid(low_hz: f64, high_hz: f64, count: usize, resolution_hz: f64, r
             }
         }
     }
-    lines.reverse();
+    lines.sort_by(f64::total_cmp);
     Ok(lines)
 }
 
@@ -208,19 +254,35 @@ pub fn odd_multisine(
     let mut tones = Vec::new();
     let mut odd_detection_hz = Vec::new();
     for lines in odd.chunks(group) {
-        let silent = if lines.len() == group { random.below(group) } else { usize::MAX };
+        let silent = if lines.len() == group {
+            random.below(group)
+        } else {
+            usize::MAX
+        };
         for (i, &k) in lines.iter().enumerate() {
             let frequency_hz = k as f64 / period_s;
             if i == silent {
                 odd_detection_hz.push(frequency_hz);
             } else {
                 let phase_rad = 2.0 * std::f64::consts::PI * random.uniform();
-                tones.push(Tone { frequency_hz, amplitude_um: amplitude_um(frequency_hz), phase_rad });
+                tones.push(Tone {
+                    frequency_hz,
+                    amplitude_um: amplitude_um(frequency_hz),
+                    phase_rad,
+                });
             }
         }
     }
-    let even_detection_hz = odd.chunks(group).map(|lines| (lines[0] + 1) as f64 / period_s).collect();
-    Ok(Multisine { tones, odd_detection_hz, even_detection_hz, period_s })
+    let even_detection_hz = odd
+        .chunks(group)
+        .map(|lines| (lines[0] + 1) as f64 / period_s)
+        .collect();
+    Ok(Multisine {
+        tones,
+        odd_detection_hz,
+        even_detection_hz,
+        period_s,
+    })
 }
 
 /// Limits that an excitation must respect.
@@ -237,10 +299,17 @@ pub struct Limits {
 /// Amplitude (peak) to add to the command at `frequency_hz` so that neither the bead, the PZT nor its speed leaves
 /// `limits`. `plant` is the expected `X2/X1`; `loop_gain` is plant times controller with delay (0 in open loop): the
 /// feedback divides the excitation by `1 + loop_gain`.
-pub fn shaped_amplitude_um(frequency_hz: f64, plant: Complex<f64>, loop_gain: Complex<f64>, limits: Limits) -> f64 {
+pub fn shaped_amplitude_um(
+    frequency_hz: f64,
+    plant: Complex<f64>,
+    loop_gain: Complex<f64>,
+    limits: Limits,
+) -> f64 {
     let sensitivity = (1.0 / (1.0 + loop_gain)).norm();
     let w = 2.0 * std::f64::consts::PI * frequency_hz;
-    let pzt_um = (limits.bead_um / plant.norm()).min(limits.pzt_um).min(limits.slew_um_per_s / w);
+    let pzt_um = (limits.bead_um / plant.norm())
+        .min(limits.pzt_um)
+        .min(limits.slew_um_per_s / w);
     pzt_um / sensitivity
 }
 
@@ -271,11 +340,21 @@ mod tests {
     fn a_multisine_drives_odd_lines_only_and_its_detection_lines_are_silent() {
         let m = odd_multisine(2.0, 60.0, 1.0, 4, |_| 0.5, 11).unwrap();
         assert!(m.tones.iter().all(|t| (t.frequency_hz as usize) % 2 == 1));
-        let signal = Signal::Tones { tones: m.tones.clone(), fade_in_s: 0.0 };
-        let samples: Vec<f64> = (0..1000).map(|k| signal.value_um(k as f64 * 1e-3)).collect();
+        let signal = Signal::Tones {
+            tones: m.tones.clone(),
+            fade_in_s: 0.0,
+        };
+        let samples: Vec<f64> = (0..1000)
+            .map(|k| signal.value_um(k as f64 * 1e-3))
+            .collect();
         for f in m.odd_detection_hz.iter().chain(&m.even_detection_hz) {
-            let sum: Complex<f64> =
-                samples.iter().enumerate().map(|(k, x)| Complex::from_polar(*x, -2.0 * std::f64::consts::PI * f * k as f64 * 1e-3)).sum();
+            let sum: Complex<f64> = samples
+                .iter()
+                .enumerate()
+                .map(|(k, x)| {
+                    Complex::from_polar(*x, -2.0 * std::f64::consts::PI * f * k as f64 * 1e-3)
+                })
+                .sum();
             assert!(sum.norm() < 1e-8, "{f} Hz");
         }
         assert!(m.odd_detection_hz.len() >= 6);
@@ -283,20 +362,38 @@ mod tests {
 
     #[test]
     fn shaped_amplitudes_keep_the_bead_in_view_in_open_and_closed_loop() {
-        let limits = Limits { bead_um: 8.0, pzt_um: 15.0, slew_um_per_s: 1e9 };
+        let limits = Limits {
+            bead_um: 8.0,
+            pzt_um: 15.0,
+            slew_um_per_s: 1e9,
+        };
         let plant = Complex::new(0.0, -34.0);
-        assert!((shaped_amplitude_um(2.0, plant, Complex::from(0.0), limits) * 34.0 - 8.0).abs() < 1e-9);
+        assert!(
+            (shaped_amplitude_um(2.0, plant, Complex::new(0.0, 0.0), limits) * 34.0 - 8.0).abs()
+                < 1e-9
+        );
         let closed = shaped_amplitude_um(2.0, plant, Complex::new(3.0, -16.0), limits);
-        let bead = closed * plant.norm() / (1.0 + Complex::new(3.0, -16.0)).norm();
+        let bead = closed * plant.norm() / Complex::<f64>::new(4.0, -16.0).norm();
         assert!((bead - 8.0).abs() < 1e-9);
     }
 
     #[test]
     fn a_sweep_passes_its_end_frequencies() {
-        let sweep = Signal::LogSweep { from_hz: 2.0, to_hz: 300.0, duration_s: 20.0, amplitude_um: 1.0, flat_from_hz: 100.0 };
+        let sweep = Signal::LogSweep {
+            from_hz: 2.0,
+            to_hz: 300.0,
+            duration_s: 20.0,
+            amplitude_um: 1.0,
+            flat_from_hz: 100.0,
+        };
         // Zero crossings in the last 0.1 s count the last frequency.
         let crossings = (0..10_000)
-            .map(|i| (sweep.value_um(19.9 + i as f64 * 1e-5), sweep.value_um(19.9 + (i + 1) as f64 * 1e-5)))
+            .map(|i| {
+                (
+                    sweep.value_um(19.9 + i as f64 * 1e-5),
+                    sweep.value_um(19.9 + (i + 1) as f64 * 1e-5),
+                )
+            })
             .filter(|(a, b)| a.signum() != b.signum())
             .count();
         assert!((57..=60).contains(&crossings), "{crossings}");

@@ -9,7 +9,7 @@
 use nalgebra::Complex;
 
 use crate::error::IdentError;
-use crate::tone_fit::{ToneFit, block_borders, fit_block};
+use crate::tone_fit::{ToneFit, Whitening, block_borders, fit_block};
 
 /// One stretch of a record during which a fixed set of lines was driven.
 #[derive(Debug, Clone, Copy)]
@@ -55,7 +55,12 @@ pub struct Settings {
 
 impl Default for Settings {
     fn default() -> Self {
-        Self { fit: ToneFit::default(), min_periods: 1.0, most_blocks: 16, estimator: Estimator::Joint }
+        Self {
+            fit: ToneFit::default(),
+            min_periods: 1.0,
+            most_blocks: 16,
+            estimator: Estimator::Joint,
+        }
     }
 }
 
@@ -140,26 +145,57 @@ pub struct SegmentResponse {
 /// [`IdentError::Lengths`], [`IdentError::TooShort`] (fewer than two usable blocks), [`IdentError::NoInput`].
 pub fn measure(segment: &Segment<'_>, settings: &Settings) -> Result<SegmentResponse, IdentError> {
     if segment.input.len() != segment.output.len() {
-        return Err(IdentError::Lengths { input: segment.input.len(), output: segment.output.len() });
+        return Err(IdentError::Lengths {
+            input: segment.input.len(),
+            output: segment.output.len(),
+        });
     }
-    let all: Vec<f64> = segment.lines_hz.iter().chain(segment.detection_hz).copied().collect();
+    let all: Vec<f64> = segment
+        .lines_hz
+        .iter()
+        .chain(segment.detection_hz)
+        .copied()
+        .collect();
     let lowest = all.iter().copied().fold(f64::INFINITY, f64::min);
     let columns = 2 * all.len() + settings.fit.drift_degree + 1;
     let to = segment.to.min(segment.input.len());
     let rows = to.saturating_sub(segment.from);
     if rows < 2 * (columns + 4) || rows as f64 * segment.period_s * lowest < 2.0 {
         let periods = (2.0 / (lowest * segment.period_s)).ceil() as usize;
-        return Err(IdentError::TooShort { what: "a frequency response", rows, needed: periods.max(2 * (columns + 4)) });
+        return Err(IdentError::TooShort {
+            what: "a frequency response",
+            rows,
+            needed: periods.max(2 * (columns + 4)),
+        });
     }
     // Blocks long enough for the regressors, so that a multisine is cut into fewer of them.
     let most = settings.most_blocks.min(rows / (2 * columns)).max(2);
-    let borders = block_borders(segment.from, to, segment.period_s, lowest, settings.min_periods, most);
+    let borders = block_borders(
+        segment.from,
+        to,
+        segment.period_s,
+        lowest,
+        settings.min_periods,
+        most,
+    );
     let mut inputs: Vec<Vec<Complex<f64>>> = Vec::new();
     let mut outputs: Vec<Vec<Complex<f64>>> = Vec::new();
     let (mut used, mut residual) = (0, 0.0);
+    // On an integrating plant the increments of the output answer the levels of the input. Increments on both sides
+    // would let the input's noise at a block's two ends in, multiplied by the large gain of a low line.
+    let input_fit = match settings.fit.whitening {
+        Whitening::Levels => settings.fit,
+        Whitening::Increments => ToneFit {
+            drift_degree: settings.fit.drift_degree.saturating_sub(1),
+            whitening: Whitening::Levels,
+        },
+    };
     for w in borders.windows(2) {
-        let fit = |signal| fit_block(signal, w[0], w[1], segment.period_s, &all, settings.fit);
-        if let (Some(u), Some(y)) = (fit(segment.input), fit(segment.output)) {
+        let fit = |signal, how| fit_block(signal, w[0], w[1], segment.period_s, &all, how);
+        if let (Some(u), Some(y)) = (
+            fit(segment.input, input_fit),
+            fit(segment.output, settings.fit),
+        ) {
             // A block that lost half its frames would weigh as much as a full one.
             if 2 * y.rows > w[1] - w[0] {
                 used += y.rows;
@@ -171,16 +207,36 @@ pub fn measure(segment: &Segment<'_>, settings: &Settings) -> Result<SegmentResp
     }
     let blocks = inputs.len();
     if blocks < 2 {
-        return Err(IdentError::TooShort { what: "variances from at least two blocks", rows: used, needed: 2 * (columns + 4) });
+        return Err(IdentError::TooShort {
+            what: "variances from at least two blocks",
+            rows: used,
+            needed: 2 * (columns + 4),
+        });
     }
     let driven = segment.lines_hz.len();
-    let column = |data: &[Vec<Complex<f64>>], i: usize| -> Vec<Complex<f64>> { data.iter().map(|b| b[i]).collect() };
+    let column = |data: &[Vec<Complex<f64>>], i: usize| -> Vec<Complex<f64>> {
+        data.iter().map(|b| b[i]).collect()
+    };
     let points = (0..driven)
-        .map(|i| point(all[i], &column(&inputs, i), &column(&outputs, i), used, settings.estimator))
+        .map(|i| {
+            point(
+                all[i],
+                &column(&inputs, i),
+                &column(&outputs, i),
+                used,
+                settings.estimator,
+            )
+        })
         .collect::<Result<Vec<_>, _>>()?;
-    let detection =
-        (driven..all.len()).map(|i| detection_line(all[i], &column(&inputs, i), &column(&outputs, i))).collect();
-    Ok(SegmentResponse { points, detection, blocks, output_residual_variance: residual / blocks as f64 })
+    let detection = (driven..all.len())
+        .map(|i| detection_line(all[i], &column(&inputs, i), &column(&outputs, i)))
+        .collect();
+    Ok(SegmentResponse {
+        points,
+        detection,
+        blocks,
+        output_residual_variance: residual / blocks as f64,
+    })
 }
 
 fn mean(values: &[Complex<f64>]) -> Complex<f64> {
@@ -198,7 +254,10 @@ fn point(
     let (input, output) = (mean(inputs), mean(outputs));
     let largest = inputs.iter().map(|u| u.norm()).fold(0.0, f64::max);
     if input.norm() < 1e-12 || input.norm() < 1e-9 * largest {
-        return Err(IdentError::NoInput { frequency_hz, amplitude: input.norm() });
+        return Err(IdentError::NoInput {
+            frequency_hz,
+            amplitude: input.norm(),
+        });
     }
     let response = match estimator {
         Estimator::Joint => output / input,
@@ -207,9 +266,13 @@ fn point(
             cross / inputs.iter().map(|u| u.norm_sqr()).sum::<f64>()
         }
     };
-    let block_errors: Vec<Complex<f64>> =
-        inputs.iter().zip(outputs).map(|(u, y)| (y - response * u) / input).collect();
-    let scatter = block_errors.iter().map(|e| e.norm_sqr()).sum::<f64>() / (blocks * (blocks - 1.0));
+    let block_errors: Vec<Complex<f64>> = inputs
+        .iter()
+        .zip(outputs)
+        .map(|(u, y)| (y - response * u) / input)
+        .collect();
+    let scatter =
+        block_errors.iter().map(|e| e.norm_sqr()).sum::<f64>() / (blocks * (blocks - 1.0));
     let power = outputs.iter().map(|y| y.norm_sqr()).sum::<f64>() / blocks;
     Ok(FrequencyPoint {
         frequency_hz,
@@ -217,7 +280,11 @@ fn point(
         scatter_variance: scatter,
         variance: scatter,
         variance_dof: 2.0 * (blocks - 1.0),
-        coherence: if power > 0.0 { output.norm_sqr() / power } else { 0.0 },
+        coherence: if power > 0.0 {
+            output.norm_sqr() / power
+        } else {
+            0.0
+        },
         input,
         output,
         block_errors,
@@ -225,11 +292,26 @@ fn point(
     })
 }
 
-fn detection_line(frequency_hz: f64, inputs: &[Complex<f64>], outputs: &[Complex<f64>]) -> DetectionLine {
+fn detection_line(
+    frequency_hz: f64,
+    inputs: &[Complex<f64>],
+    outputs: &[Complex<f64>],
+) -> DetectionLine {
     let blocks = outputs.len() as f64;
     let output = mean(outputs);
-    let variance = outputs.iter().map(|y| (y - output).norm_sqr()).sum::<f64>() / (blocks * (blocks - 1.0));
+    let variance =
+        outputs.iter().map(|y| (y - output).norm_sqr()).sum::<f64>() / (blocks * (blocks - 1.0));
     let dof = 2.0 * (blocks - 1.0);
-    let p_value = if variance > 0.0 { crate::stats::f_exceeds(output.norm_sqr() / variance, 2.0, dof) } else { 0.0 };
-    DetectionLine { frequency_hz, output, input: mean(inputs), output_sd: variance.sqrt(), p_value }
+    let p_value = if variance > 0.0 {
+        crate::stats::f_exceeds(output.norm_sqr() / variance, 2.0, dof)
+    } else {
+        0.0
+    };
+    DetectionLine {
+        frequency_hz,
+        output,
+        input: mean(inputs),
+        output_sd: variance.sqrt(),
+        p_value,
+    }
 }

@@ -29,7 +29,12 @@ pub enum Rung {
 
 impl Rung {
     /// All rungs, lowest first.
-    pub const ALL: [Rung; 4] = [Rung::Integrator, Rung::PoleZeroPair, Rung::FarZero, Rung::Eq4];
+    pub const ALL: [Rung; 4] = [
+        Rung::Integrator,
+        Rung::PoleZeroPair,
+        Rung::FarZero,
+        Rung::Eq4,
+    ];
 
     /// Real parameters.
     pub fn parameters(self) -> usize {
@@ -135,7 +140,8 @@ pub struct LadderProblem<'a> {
 
 /// The model that a parameter vector stands for.
 pub fn model_of(x: &[f64], rung: Rung) -> LadderModel {
-    let mut model = LadderModel::integrator(x[index::LN_GAIN].exp(), x[index::EFFECTIVE_DELAY_MS] * 1e-3);
+    let mut model =
+        LadderModel::integrator(x[index::LN_GAIN].exp(), x[index::EFFECTIVE_DELAY_MS] * 1e-3);
     if rung >= Rung::PoleZeroPair {
         model.zero_rad_per_s = x[index::LN_ZERO].exp();
         model.pole_rad_per_s = x[index::LN_POLE].exp();
@@ -158,11 +164,22 @@ impl<'a> LadderProblem<'a> {
     ///
     /// # Errors
     /// [`IdentError::TooFewPoints`] below two points, [`IdentError::OutOfRange`] for a variance that is not positive.
-    pub fn new(points: &'a [FrequencyPoint], sampling: Sampling, prior: Option<DelayPrior>) -> Result<Self, IdentError> {
+    pub fn new(
+        points: &'a [FrequencyPoint],
+        sampling: Sampling,
+        prior: Option<DelayPrior>,
+    ) -> Result<Self, IdentError> {
         if points.len() < 2 {
-            return Err(IdentError::TooFewPoints { points: points.len(), parameters: 2, needed: 2 });
+            return Err(IdentError::TooFewPoints {
+                points: points.len(),
+                parameters: 2,
+                needed: 2,
+            });
         }
-        let bad = points.iter().map(|p| p.variance).find(|v| !(v.is_finite() && *v > 0.0));
+        let bad = points
+            .iter()
+            .map(|p| p.variance)
+            .find(|v| !(v.is_finite() && *v > 0.0));
         if let Some(value) = bad {
             return Err(IdentError::OutOfRange {
                 key: "variance",
@@ -172,7 +189,12 @@ impl<'a> LadderProblem<'a> {
             });
         }
         let weights = points.iter().map(|p| (2.0 / p.variance).sqrt()).collect();
-        Ok(Self { points, sampling, prior, weights })
+        Ok(Self {
+            points,
+            sampling,
+            prior,
+            weights,
+        })
     }
 
     fn rows(&self) -> usize {
@@ -182,7 +204,8 @@ impl<'a> LadderProblem<'a> {
     fn residuals(&self, data: &[Complex<f64>], model: &LadderModel, out: &mut [f64]) {
         let fractions = model.partial_fractions();
         for (i, (p, y)) in self.points.iter().zip(data).enumerate() {
-            let e = (y - fractions.sampled_response(p.frequency_hz, model.delay_s, self.sampling)) * self.weights[i];
+            let e = (y - fractions.sampled_response(p.frequency_hz, model.delay_s, self.sampling))
+                * self.weights[i];
             out[2 * i] = e.re;
             out[2 * i + 1] = e.im;
         }
@@ -220,9 +243,17 @@ impl<'a> LadderProblem<'a> {
     }
 
     /// Fits `data` on `rung` from one start; parameters in `fixed` keep their value.
-    pub fn fit_from(&self, data: &[Complex<f64>], rung: Rung, start: &[f64], fixed: Option<(usize, f64)>) -> Minimum {
+    pub fn fit_from(
+        &self,
+        data: &[Complex<f64>],
+        rung: Rung,
+        start: &[f64],
+        fixed: Option<(usize, f64)>,
+    ) -> Minimum {
         let n = rung.parameters();
-        let free: Vec<usize> = (0..n).filter(|&i| fixed.is_none_or(|(f, _)| f != i)).collect();
+        let free: Vec<usize> = (0..n)
+            .filter(|&i| fixed.is_none_or(|(f, _)| f != i))
+            .collect();
         let mut base = start[..n].to_vec();
         if let Some((i, value)) = fixed {
             base[i] = value;
@@ -247,7 +278,11 @@ impl<'a> LadderProblem<'a> {
     fn first_guess(&self, data: &[Complex<f64>]) -> [f64; 2] {
         let mut best = (f64::INFINITY, [0.0, 0.0]);
         let period_ms = self.sampling.period_s * 1e3;
-        let fastest = self.points.iter().map(|p| p.frequency_hz).fold(0.0, f64::max);
+        let fastest = self
+            .points
+            .iter()
+            .map(|p| p.frequency_hz)
+            .fold(0.0, f64::max);
         let step = (100.0 / fastest.max(1e-9)).min(period_ms);
         let mut delay_ms = -2.0 * period_ms;
         while delay_ms <= 20.0 * period_ms {
@@ -270,7 +305,12 @@ impl<'a> LadderProblem<'a> {
     }
 
     /// The best fit of `rung` over several starts, the rung below included.
-    fn fit_rung(&self, data: &[Complex<f64>], rung: Rung, below: Option<&[f64]>) -> Minimum {
+    fn fit_rung(
+        &self,
+        data: &[Complex<f64>],
+        rung: Rung,
+        below: Option<&[f64]>,
+    ) -> Option<Minimum> {
         let [ln_gain, delay_ms] = self.first_guess(data);
         let mut starts: Vec<Vec<f64>> = Vec::new();
         let mut extend = |base: &[f64], tail: &[f64]| {
@@ -279,7 +319,9 @@ impl<'a> LadderProblem<'a> {
             starts.push(x);
         };
         match (rung, below) {
-            (Rung::Integrator, _) | (_, None) => extend(&[ln_gain, delay_ms], &[1.0f64.ln(), 1.0f64.ln(), 0.0, 0.0][..rung.parameters() - 2]),
+            (Rung::Integrator, _) | (_, None) => {
+                extend(&[ln_gain, delay_ms], &[0.0; 4][..rung.parameters() - 2])
+            }
             (Rung::PoleZeroPair, Some(x)) => {
                 let (low, high) = self.band_rad_per_s();
                 for share in [0.2, 0.4, 0.6, 0.8] {
@@ -290,8 +332,17 @@ impl<'a> LadderProblem<'a> {
                 }
             }
             (Rung::FarZero, Some(x)) => {
-                for lead_ms in [0.0, 0.06, 0.2] {
-                    extend(x, &[lead_ms]);
+                // First with the lead held: at each whole sample of delay the feedthrough moves to another row at once,
+                // and a long first step would cross into the wrong one.
+                for share in [0.0, 0.03, 0.1, 0.3, 0.6] {
+                    let lead_ms = share * self.sampling.period_s * 1e3;
+                    let mut start = x.to_vec();
+                    start.push(lead_ms);
+                    let held =
+                        self.fit_from(data, rung, &start, Some((index::FAR_LEAD_MS, lead_ms)));
+                    if held.parameters.iter().all(|v| v.is_finite()) {
+                        extend(&held.parameters, &[]);
+                    }
                 }
             }
             (Rung::Eq4, Some(x)) => {
@@ -300,14 +351,27 @@ impl<'a> LadderProblem<'a> {
                 }
             }
         }
-        let fits = starts.iter().map(|s| self.fit_from(data, rung, s, None));
-        fits.min_by(|a, b| sort_key(a).total_cmp(&sort_key(b))).expect("every rung has a start")
+        let sane = |m: &Minimum| {
+            m.chi2.is_finite()
+                && m.parameters
+                    .iter()
+                    .chain(m.jacobian.iter())
+                    .all(|v| v.is_finite())
+        };
+        let fits = starts
+            .iter()
+            .map(|s| self.fit_from(data, rung, s, None))
+            .filter(sane);
+        fits.min_by(|a, b| a.chi2.total_cmp(&b.chi2))
     }
 
     fn band_rad_per_s(&self) -> (f64, f64) {
         let hz = self.points.iter().map(|p| p.frequency_hz);
         let (low, high) = hz.fold((f64::INFINITY, 0.0f64), |(a, b), f| (a.min(f), b.max(f)));
-        (2.0 * std::f64::consts::PI * low, 2.0 * std::f64::consts::PI * high)
+        (
+            2.0 * std::f64::consts::PI * low,
+            2.0 * std::f64::consts::PI * high,
+        )
     }
 
     /// Fits every rung that the points allow, lowest first.
@@ -318,7 +382,9 @@ impl<'a> LadderProblem<'a> {
                 break;
             }
             let below = out.last().map(|(_, m)| m.parameters.clone());
-            let found = self.fit_rung(data, rung, below.as_deref());
+            let Some(found) = self.fit_rung(data, rung, below.as_deref()) else {
+                break;
+            };
             out.push((rung, found));
         }
         out
@@ -361,28 +427,53 @@ impl<'a> LadderProblem<'a> {
         let fits = self.fit_rungs(&data);
         let held_out = self.held_out(&fits);
         let n = self.rows() as f64;
-        let variance_dof = self.points.iter().map(|p| p.variance_dof).fold(f64::INFINITY, f64::min);
-        let from_scatter = self.points.iter().all(|p| p.variance_dof <= 2.0 * p.block_errors.len() as f64);
-        let interval_dof =
-            if from_scatter { self.points.iter().map(|p| p.variance_dof).sum() } else { variance_dof };
+        let variance_dof = self
+            .points
+            .iter()
+            .map(|p| p.variance_dof)
+            .fold(f64::INFINITY, f64::min);
+        let from_scatter = self
+            .points
+            .iter()
+            .all(|p| p.variance_dof <= 2.0 * p.block_errors.len() as f64);
+        let interval_dof = if from_scatter {
+            self.points.iter().map(|p| p.variance_dof).sum()
+        } else {
+            variance_dof
+        };
         // Weights that are themselves estimated from few blocks make intervals too short by this factor.
-        let weight_noise =
-            if from_scatter && variance_dof > 2.5 { variance_dof / (variance_dof - 2.0) } else { 1.0 };
-        let best_reduced =
-            fits.iter().map(|(r, m)| m.chi2 / (n - r.parameters() as f64)).fold(f64::INFINITY, f64::min);
+        let weight_noise = if from_scatter && variance_dof > 2.5 {
+            variance_dof / (variance_dof - 2.0)
+        } else {
+            1.0
+        };
+        let best_reduced = fits
+            .iter()
+            .map(|(r, m)| m.chi2 / (n - r.parameters() as f64))
+            .fold(f64::INFINITY, f64::min);
         let scale = best_reduced.max(1.0) * weight_noise;
         let mut rungs: Vec<RungFit> = Vec::new();
         for ((rung, m), held_out) in fits.into_iter().zip(held_out) {
             let k = rung.parameters() as f64;
             let step_p_value = rungs.last().map_or(1.0, |below| {
-                let gained = (below.chi2 - m.chi2).max(0.0) / (k - below.rung.parameters() as f64) / scale;
-                f_exceeds(gained, k - below.rung.parameters() as f64, interval_dof.min(1e4))
+                let gained =
+                    (below.chi2 - m.chi2).max(0.0) / (k - below.rung.parameters() as f64) / scale;
+                f_exceeds(
+                    gained,
+                    k - below.rung.parameters() as f64,
+                    interval_dof.min(1e4),
+                )
             });
-            let correction = if n - k - 1.0 > 0.0 { 2.0 * k * (k + 1.0) / (n - k - 1.0) } else { f64::INFINITY };
+            let correction = if n - k - 1.0 > 0.0 {
+                2.0 * k * (k + 1.0) / (n - k - 1.0)
+            } else {
+                f64::INFINITY
+            };
             rungs.push(RungFit {
                 rung,
                 model: model_of(&m.parameters, rung),
-                covariance: covariance(&m.jacobian) * scale,
+                covariance: covariance(&with_lead_bound(&m.jacobian, self.sampling.period_s * 1e3))
+                    * scale,
                 chi2: m.chi2,
                 dof: n - k,
                 aicc: m.chi2 / scale + 2.0 * k + correction,
@@ -393,7 +484,10 @@ impl<'a> LadderProblem<'a> {
             });
         }
         if !rungs.first().is_some_and(|r| r.converged) {
-            return Err(IdentError::NoFit { what: "an integrator with delay", reason: "no start led to a minimum" });
+            return Err(IdentError::NoFit {
+                what: "an integrator with delay",
+                reason: "no start led to a minimum",
+            });
         }
         let mut chosen = 0;
         for i in 1..rungs.len() {
@@ -405,10 +499,24 @@ impl<'a> LadderProblem<'a> {
                 chosen = i;
             }
         }
-        Ok(LadderFit { rungs, chosen, scale, interval_dof })
+        Ok(LadderFit {
+            rungs,
+            chosen,
+            scale,
+            interval_dof,
+        })
     }
 }
 
-fn sort_key(m: &Minimum) -> f64 {
-    if m.chi2.is_finite() { m.chi2 } else { f64::INFINITY }
+/// The Jacobian with one more row: a lead of a sampling period or more would show, so the far zero's lead is known to
+/// about a third of a period beforehand. Without it the exact trade between delay and lead makes every covariance
+/// infinite, though the other parameters hardly move along it.
+fn with_lead_bound(jacobian: &DMatrix<f64>, period_ms: f64) -> DMatrix<f64> {
+    if jacobian.ncols() <= index::FAR_LEAD_MS {
+        return jacobian.clone();
+    }
+    let rows = jacobian.nrows();
+    let mut out = jacobian.clone().insert_row(rows, 0.0);
+    out[(rows, index::FAR_LEAD_MS)] = 1.0 / (0.3 * period_ms);
+    out
 }

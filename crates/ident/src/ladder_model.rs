@@ -41,7 +41,8 @@ impl LadderModel {
 
     /// Eq. (6), the nominal plant, behind a delay.
     pub fn eq6(delay_s: f64) -> Self {
-        let (alpha, b1, b0, a1, a0): (f64, f64, f64, f64, f64) = (0.01872, 20261.5, 1_745_041.0, 76.3, 0.13);
+        let (alpha, b1, b0, a1, a0): (f64, f64, f64, f64, f64) =
+            (0.01872, 20261.5, 1_745_041.0, 76.3, 0.13);
         let root = |b: f64, c: f64| {
             let far = 0.5 * (b + (b * b - 4.0 * c).sqrt());
             (far, c / far)
@@ -66,18 +67,29 @@ impl LadderModel {
 
     /// The plant without its delay, as partial fractions.
     pub fn partial_fractions(&self) -> PartialFractions {
-        let (k, z, p, tau, q) =
-            (self.gain_per_s, self.zero_rad_per_s, self.pole_rad_per_s, self.far_lead_s, self.slow_pole_rad_per_s);
+        let (k, z, p, tau, q) = (
+            self.gain_per_s,
+            self.zero_rad_per_s,
+            self.pole_rad_per_s,
+            self.far_lead_s,
+            self.slow_pole_rad_per_s,
+        );
         let direct = k * tau * p / z;
         let at = |s: f64| k * (1.0 + s / z) * (1.0 + s * tau);
         let slow = at(-q) / (1.0 - q / p);
         if (z / p - 1.0).abs() < 1e-12 {
-            return PartialFractions { direct, terms: vec![(Complex::from(-q), Complex::from(slow))] };
+            return PartialFractions {
+                direct,
+                terms: vec![(Complex::from(-q), Complex::from(slow))],
+            };
         }
         let pair = at(-p) * p / (q - p);
         PartialFractions {
             direct,
-            terms: vec![(Complex::from(-q), Complex::from(slow)), (Complex::from(-p), Complex::from(pair))],
+            terms: vec![
+                (Complex::from(-q), Complex::from(slow)),
+                (Complex::from(-p), Complex::from(pair)),
+            ],
         }
     }
 
@@ -88,16 +100,26 @@ impl LadderModel {
 
     /// What a record sampled as `sampling` shows at `frequency_hz`, delay included.
     pub fn sampled_response(&self, frequency_hz: f64, sampling: Sampling) -> Complex<f64> {
-        self.partial_fractions().sampled_response(frequency_hz, self.delay_s, sampling)
+        self.partial_fractions()
+            .sampled_response(frequency_hz, self.delay_s, sampling)
     }
 
     /// Numerator and denominator of the plant without delay, highest power of s first, the denominator monic; of lower
     /// degree where parameters are absent.
     pub fn polynomials(&self) -> (Vec<f64>, Vec<f64>) {
-        let (k, z, p, tau, q) =
-            (self.gain_per_s, self.zero_rad_per_s, self.pole_rad_per_s, self.far_lead_s, self.slow_pole_rad_per_s);
+        let (k, z, p, tau, q) = (
+            self.gain_per_s,
+            self.zero_rad_per_s,
+            self.pole_rad_per_s,
+            self.far_lead_s,
+            self.slow_pole_rad_per_s,
+        );
         if (z / p - 1.0).abs() < 1e-12 {
-            return if tau == 0.0 { (vec![k], vec![1.0, q]) } else { (vec![k * tau, k], vec![1.0, q]) };
+            return if tau == 0.0 {
+                (vec![k], vec![1.0, q])
+            } else {
+                (vec![k * tau, k], vec![1.0, q])
+            };
         }
         let scale = k * p;
         let numerator = if tau == 0.0 {
@@ -139,9 +161,13 @@ mod tests {
 
     #[test]
     fn polynomials_and_partial_fractions_are_the_same_plant() {
-        let model = LadderModel { slow_pole_rad_per_s: 0.7, ..LadderModel::eq6(0.0) };
+        let model = LadderModel {
+            slow_pole_rad_per_s: 0.7,
+            ..LadderModel::eq6(0.0)
+        };
         let (numerator, denominator) = model.polynomials();
-        let horner = |c: &[f64], s: Complex<f64>| c.iter().fold(Complex::from(0.0), |a, &c| a * s + c);
+        let horner =
+            |c: &[f64], s: Complex<f64>| c.iter().fold(Complex::from(0.0), |a, &c| a * s + c);
         for f in [0.3, 7.0, 150.0] {
             let s = Complex::new(0.0, 2.0 * std::f64::consts::PI * f);
             let ratio = horner(&numerator, s) / horner(&denominator, s);
@@ -154,9 +180,16 @@ mod tests {
     fn behind_a_hold_the_far_zero_and_the_delay_of_an_integrator_cannot_be_told_apart() {
         let sampling = Sampling::held(1000.0);
         let plain = LadderModel::integrator(400.0, 0.0021);
-        let traded = LadderModel { far_lead_s: 0.0005, delay_s: 0.0026, ..plain };
+        let traded = LadderModel {
+            far_lead_s: 0.0005,
+            delay_s: 0.0026,
+            ..plain
+        };
         for f in [2.0, 50.0, 300.0, 480.0] {
-            let (a, b) = (plain.sampled_response(f, sampling), traded.sampled_response(f, sampling));
+            let (a, b) = (
+                plain.sampled_response(f, sampling),
+                traded.sampled_response(f, sampling),
+            );
             assert!((a - b).norm() < 1e-12 * a.norm());
         }
     }

@@ -86,8 +86,18 @@ impl<F: Fn(&[f64], &mut [f64])> LeastSquaresProblem<f64, Dyn, Dyn> for Problem<'
 }
 
 /// Minimises the sum of squares of `rows` residuals from `start`; `steps` are the finite differences per parameter.
-pub fn minimise<F: Fn(&[f64], &mut [f64])>(start: &[f64], steps: &[f64], rows: usize, residuals: F) -> Minimum {
-    let problem = Problem { residuals: &residuals, rows, x: DVector::from_column_slice(start), steps };
+pub fn minimise<F: Fn(&[f64], &mut [f64])>(
+    start: &[f64],
+    steps: &[f64],
+    rows: usize,
+    residuals: F,
+) -> Minimum {
+    let problem = Problem {
+        residuals: &residuals,
+        rows,
+        x: DVector::from_column_slice(start),
+        steps,
+    };
     let (problem, report) = LevenbergMarquardt::new()
         .with_ftol(1e-12)
         .with_xtol(1e-10)
@@ -109,7 +119,12 @@ pub fn minimise<F: Fn(&[f64], &mut [f64])>(start: &[f64], steps: &[f64], rows: u
     };
     let jacobian = problem.differences();
     let residual = problem.evaluate(problem.x.as_slice());
-    Minimum { parameters: problem.x.as_slice().to_vec(), chi2: residual.norm_squared(), jacobian, converged }
+    Minimum {
+        parameters: problem.x.as_slice().to_vec(),
+        chi2: residual.norm_squared(),
+        jacobian,
+        converged,
+    }
 }
 
 /// Inverse of `J^T J`, computed with scaled columns; directions that the data do not see at all (relative singular
@@ -119,11 +134,19 @@ pub fn covariance(jacobian: &DMatrix<f64>) -> DMatrix<f64> {
     let scales: Vec<f64> = (0..n).map(|i| jacobian.column(i).norm()).collect();
     let scaled = DMatrix::from_fn(n, n, |i, j| {
         let product = scales[i] * scales[j];
-        if product > 0.0 { jacobian.column(i).dot(&jacobian.column(j)) / product } else { f64::from(u8::from(i == j)) }
+        if product > 0.0 {
+            jacobian.column(i).dot(&jacobian.column(j)) / product
+        } else {
+            f64::from(u8::from(i == j))
+        }
     });
     let eigen = scaled.symmetric_eigen();
     let mut out = DMatrix::zeros(n, n);
-    for (value, vector) in eigen.eigenvalues.iter().zip(eigen.eigenvectors.column_iter()) {
+    for (value, vector) in eigen
+        .eigenvalues
+        .iter()
+        .zip(eigen.eigenvectors.column_iter())
+    {
         let seen = *value > 1e-14;
         for i in 0..n {
             for j in 0..n {

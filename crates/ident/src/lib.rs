@@ -10,6 +10,7 @@ pub mod bare_fft;
 pub mod delay;
 mod error;
 pub mod excitation;
+pub mod experiment;
 pub mod frequency_response;
 pub mod ladder;
 pub mod ladder_model;

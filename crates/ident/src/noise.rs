@@ -65,7 +65,10 @@ pub fn apply_noise_model(points: &mut [FrequencyPoint], period_s: f64) -> Option
             b2 += weight * x * s;
         }
         let determinant = a11 * a22 - a12 * a12;
-        let (mut w, mut l) = ((b1 * a22 - b2 * a12) / determinant, (a11 * b2 - a12 * b1) / determinant);
+        let (mut w, mut l) = (
+            (b1 * a22 - b2 * a12) / determinant,
+            (a11 * b2 - a12 * b1) / determinant,
+        );
         if !(w.is_finite() && l.is_finite()) || determinant <= 1e-12 * a11 * a22 || l < 0.0 {
             (w, l) = (b1 / a11, 0.0);
         } else if w < 0.0 {
@@ -73,12 +76,22 @@ pub fn apply_noise_model(points: &mut [FrequencyPoint], period_s: f64) -> Option
         }
         let moved = (w - walk).abs() + (l - white).abs();
         (walk, white) = (w.max(1e-9 * mean), l);
-        information = if l > 0.0 { (a11 * a22 - a12 * a12) / a22 } else { a11 };
+        information = if l > 0.0 {
+            (a11 * a22 - a12 * a12) / a22
+        } else {
+            a11
+        };
         if moved < 1e-12 * mean {
             break;
         }
     }
-    let deviance: f64 = data.iter().map(|&(s, x, v)| { let r = s / (walk + white * x); v * (r - 1.0 - r.ln()) }).sum();
+    let deviance: f64 = data
+        .iter()
+        .map(|&(s, x, v)| {
+            let r = s / (walk + white * x);
+            v * (r - 1.0 - r.ln())
+        })
+        .sum();
     let p_value = chi2_exceeds(deviance, data.len() as f64 - 2.0);
     let used = p_value > 0.005;
     if used {
@@ -90,7 +103,9 @@ pub fn apply_noise_model(points: &mut [FrequencyPoint], period_s: f64) -> Option
     }
     Some(NoiseModel {
         diffusion_um2_per_s: walk / (2.0 * period_s),
-        diffusion_ci95_um2_per_s: student_t_quantile(0.975, dof) / information.sqrt() / (2.0 * period_s),
+        diffusion_ci95_um2_per_s: student_t_quantile(0.975, dof)
+            / information.sqrt()
+            / (2.0 * period_s),
         localisation_um: white.sqrt(),
         dof,
         p_value,

@@ -34,7 +34,11 @@ pub enum Hold {
 impl Sampling {
     /// A commanded record at `rate_hz` with instantaneous exposure.
     pub fn held(rate_hz: f64) -> Self {
-        Self { period_s: 1.0 / rate_hz, exposure_s: 0.0, hold: Hold::ZeroOrder }
+        Self {
+            period_s: 1.0 / rate_hz,
+            exposure_s: 0.0,
+            hold: Hold::ZeroOrder,
+        }
     }
 }
 
@@ -74,12 +78,19 @@ impl PartialFractions {
     /// `G(j 2 pi f)`.
     pub fn response(&self, frequency_hz: f64) -> Complex<f64> {
         let s = Complex::new(0.0, 2.0 * std::f64::consts::PI * frequency_hz);
-        self.terms.iter().fold(Complex::from(self.direct), |sum, (p, r)| sum + r / (s - p))
+        self.terms
+            .iter()
+            .fold(Complex::from(self.direct), |sum, (p, r)| sum + r / (s - p))
     }
 
     /// The ratio of output to input of a record at `frequency_hz`, behind a delay of `delay_s` (to the middle of the
     /// exposure).
-    pub fn sampled_response(&self, frequency_hz: f64, delay_s: f64, sampling: Sampling) -> Complex<f64> {
+    pub fn sampled_response(
+        &self,
+        frequency_hz: f64,
+        delay_s: f64,
+        sampling: Sampling,
+    ) -> Complex<f64> {
         let w = 2.0 * std::f64::consts::PI * frequency_hz;
         match sampling.hold {
             Hold::None => {
@@ -98,7 +109,8 @@ impl PartialFractions {
         if high - start < 1e-6 {
             let n = whole_periods(delay_s / period);
             let m = (n + 1.0) * period - delay_s;
-            return Complex::from_polar(1.0, -angle * (n + 1.0)) * self.intersample(angle, period, |p| (p * m).exp(), |p| phi(p, m));
+            return Complex::from_polar(1.0, -angle * (n + 1.0))
+                * self.intersample(angle, period, |p| (p * m).exp(), |p| phi(p, m));
         }
         let mut sum = Complex::from(0.0);
         let mut low = start;
@@ -129,9 +141,11 @@ impl PartialFractions {
         growth: impl Fn(Complex<f64>) -> Complex<f64>,
     ) -> Complex<f64> {
         let z = Complex::from_polar(1.0, angle);
-        self.terms.iter().fold(Complex::from(self.direct), |sum, &(p, r)| {
-            sum + r * (decay(p) * phi(p, period) / (z - (p * period).exp()) + growth(p))
-        })
+        self.terms
+            .iter()
+            .fold(Complex::from(self.direct), |sum, &(p, r)| {
+                sum + r * (decay(p) * phi(p, period) / (z - (p * period).exp()) + growth(p))
+            })
     }
 }
 
@@ -149,11 +163,19 @@ mod tests {
         let (k, z, p) = (400.0, 90.0, 60.0);
         let at_zero = Complex::from(k);
         let at_p = Complex::from(k * (1.0 - p / z) / -p * p);
-        PartialFractions { direct: 0.02, terms: vec![(Complex::from(0.0), at_zero), (Complex::from(-p), at_p)] }
+        PartialFractions {
+            direct: 0.02,
+            terms: vec![(Complex::from(0.0), at_zero), (Complex::from(-p), at_p)],
+        }
     }
 
     /// Simulates the plant in closed form between commands, far from the formula under test, and projects on a sine.
-    fn simulated(plant: &PartialFractions, f: f64, delay_s: f64, sampling: Sampling) -> Complex<f64> {
+    fn simulated(
+        plant: &PartialFractions,
+        f: f64,
+        delay_s: f64,
+        sampling: Sampling,
+    ) -> Complex<f64> {
         let fine = 200usize;
         let dt = sampling.period_s / fine as f64;
         let n = 6000usize;
@@ -200,17 +222,28 @@ mod tests {
             }
         });
         let target = nalgebra::DVector::from_iterator(rows.len(), rows.iter().map(|r| r.1));
-        let solved = (design.transpose() * &design).lu().solve(&(design.transpose() * target)).unwrap();
+        let solved = (design.transpose() * &design)
+            .lu()
+            .solve(&(design.transpose() * target))
+            .unwrap();
         Complex::new(solved[0], -solved[1])
     }
 
     #[test]
     fn the_sampled_response_is_what_a_simulated_record_shows() {
         let plant = pair();
-        for (f, delay_s, exposure_s) in
-            [(10.0, 0.002, 0.0), (293.0, 0.002, 0.0), (197.0, 0.0017, 0.0), (97.0, 0.002, 0.0004), (293.0, 0.0013, 0.0008)]
-        {
-            let sampling = Sampling { period_s: 0.001, exposure_s, hold: Hold::ZeroOrder };
+        for (f, delay_s, exposure_s) in [
+            (10.0, 0.002, 0.0),
+            (293.0, 0.002, 0.0),
+            (197.0, 0.0017, 0.0),
+            (97.0, 0.002, 0.0004),
+            (293.0, 0.0013, 0.0008),
+        ] {
+            let sampling = Sampling {
+                period_s: 0.001,
+                exposure_s,
+                hold: Hold::ZeroOrder,
+            };
             let exact = plant.sampled_response(f, delay_s, sampling);
             let shown = simulated(&plant, f, delay_s, sampling);
             let tolerance = if exposure_s > 0.0 { 2e-3 } else { 1e-6 };
@@ -223,7 +256,10 @@ mod tests {
 
     #[test]
     fn the_hold_of_one_kilohertz_is_worth_54_degrees_at_300_hz() {
-        let integrator = PartialFractions { direct: 0.0, terms: vec![(Complex::from(0.0), Complex::from(1.0))] };
+        let integrator = PartialFractions {
+            direct: 0.0,
+            terms: vec![(Complex::from(0.0), Complex::from(1.0))],
+        };
         let h = integrator.sampled_response(300.0, 0.0, Sampling::held(1000.0));
         let g = integrator.response(300.0);
         assert!(((h / g).arg().to_degrees() + 54.0).abs() < 1e-9);
@@ -233,7 +269,12 @@ mod tests {
     fn a_short_exposure_tends_to_an_instant() {
         let plant = pair();
         let instant = plant.sampled_response(150.0, 0.0024, Sampling::held(1000.0));
-        let short = Sampling { exposure_s: 1e-7, ..Sampling::held(1000.0) };
-        assert!((plant.sampled_response(150.0, 0.0024, short) - instant).norm() < 1e-6 * instant.norm());
+        let short = Sampling {
+            exposure_s: 1e-7,
+            ..Sampling::held(1000.0)
+        };
+        assert!(
+            (plant.sampled_response(150.0, 0.0024, short) - instant).norm() < 1e-6 * instant.norm()
+        );
     }
 }

@@ -22,7 +22,11 @@ pub fn ln_gamma(x: f64) -> f64 {
     }
     let x = x - 1.0;
     let t = x + G + 0.5;
-    let sum = C.iter().enumerate().skip(1).fold(C[0], |a, (i, c)| a + c / (x + i as f64));
+    let sum = C
+        .iter()
+        .enumerate()
+        .skip(1)
+        .fold(C[0], |a, (i, c)| a + c / (x + i as f64));
     0.5 * (2.0 * std::f64::consts::PI).ln() + (x + 0.5) * t.ln() - t + sum.ln()
 }
 
@@ -37,7 +41,8 @@ pub fn incomplete_beta(a: f64, b: f64, x: f64) -> f64 {
     if x > (a + 1.0) / (a + b + 2.0) {
         return 1.0 - incomplete_beta(b, a, 1.0 - x);
     }
-    let front = (a * x.ln() + b * (-x).ln_1p() + ln_gamma(a + b) - ln_gamma(a) - ln_gamma(b)).exp() / a;
+    let front =
+        (a * x.ln() + b * (-x).ln_1p() + ln_gamma(a + b) - ln_gamma(a) - ln_gamma(b)).exp() / a;
     let tiny = 1e-300;
     let clamp = |v: f64| if v.abs() < tiny { tiny } else { v };
     let mut c = 1.0;
@@ -140,14 +145,18 @@ pub fn student_t_quantile(probability: f64, dof: f64) -> f64 {
 
 /// Quantile of chi-squared with `dof` degrees of freedom, for `probability` in (0, 1).
 pub fn chi2_quantile(probability: f64, dof: f64) -> f64 {
-    invert(probability, 0.0, 20.0 * dof + 200.0, |x| incomplete_gamma(dof / 2.0, x / 2.0))
+    invert(probability, 0.0, 20.0 * dof + 200.0, |x| {
+        incomplete_gamma(dof / 2.0, x / 2.0)
+    })
 }
 
 /// The `probability` quantile of a sample (linear interpolation between order statistics; `NaN` for an empty one).
 pub fn quantile(sample: &[f64], probability: f64) -> f64 {
     let mut sorted: Vec<f64> = sample.iter().copied().filter(|v| v.is_finite()).collect();
     sorted.sort_by(f64::total_cmp);
-    let Some(last) = sorted.len().checked_sub(1) else { return f64::NAN };
+    let Some(last) = sorted.len().checked_sub(1) else {
+        return f64::NAN;
+    };
     let at = probability.clamp(0.0, 1.0) * last as f64;
     let low = at.floor() as usize;
     let high = at.ceil() as usize;

@@ -27,7 +27,10 @@ pub struct ToneFit {
 
 impl Default for ToneFit {
     fn default() -> Self {
-        Self { drift_degree: 2, whitening: Whitening::Increments }
+        Self {
+            drift_degree: 2,
+            whitening: Whitening::Increments,
+        }
     }
 }
 
@@ -55,9 +58,16 @@ pub fn fit_block(
     let to = to.min(signal.len());
     let increments = fit.whitening == Whitening::Increments;
     let first = if increments { from + 1 } else { from };
-    let drift_columns = if increments { fit.drift_degree } else { fit.drift_degree + 1 };
+    let drift_columns = if increments {
+        fit.drift_degree
+    } else {
+        fit.drift_degree + 1
+    };
     let columns = 2 * frequencies_hz.len() + drift_columns;
-    let angles: Vec<f64> = frequencies_hz.iter().map(|f| 2.0 * std::f64::consts::PI * f * period_s).collect();
+    let angles: Vec<f64> = frequencies_hz
+        .iter()
+        .map(|f| 2.0 * std::f64::consts::PI * f * period_s)
+        .collect();
     let middle = 0.5 * (from + to) as f64;
     let half = (0.5 * to.saturating_sub(from) as f64).max(1.0);
 
@@ -66,11 +76,20 @@ pub fn fit_block(
     let mut sum_squares = 0.0;
     let mut rows = 0usize;
     let mut row = vec![0.0; columns];
-    let mut rotors: Vec<Complex<f64>> =
-        angles.iter().map(|a| Complex::from_polar(1.0, (a * first as f64) % (2.0 * std::f64::consts::PI))).collect();
-    let steps: Vec<Complex<f64>> = angles.iter().map(|&a| Complex::from_polar(1.0, a)).collect();
+    let mut rotors: Vec<Complex<f64>> = angles
+        .iter()
+        .map(|a| Complex::from_polar(1.0, (a * first as f64) % (2.0 * std::f64::consts::PI)))
+        .collect();
+    let steps: Vec<Complex<f64>> = angles
+        .iter()
+        .map(|&a| Complex::from_polar(1.0, a))
+        .collect();
     for k in first..to {
-        let value = if increments { signal[k] - signal[k - 1] } else { signal[k] };
+        let value = if increments {
+            signal[k] - signal[k - 1]
+        } else {
+            signal[k]
+        };
         if value.is_finite() {
             for (i, r) in rotors.iter().enumerate() {
                 row[2 * i] = r.re;
@@ -113,23 +132,47 @@ pub fn fit_block(
         .enumerate()
         .map(|(i, &angle)| {
             let phasor = Complex::new(solved[2 * i], -solved[2 * i + 1]);
-            if increments { phasor / (1.0 - Complex::from_polar(1.0, -angle)) } else { phasor }
+            if increments {
+                phasor / (1.0 - Complex::from_polar(1.0, -angle))
+            } else {
+                phasor
+            }
         })
         .collect();
-    Some(BlockPhasors { phasors, residual_variance: ((sum_squares - explained) / (rows - columns) as f64).max(0.0), rows })
+    Some(BlockPhasors {
+        phasors,
+        residual_variance: ((sum_squares - explained) / (rows - columns) as f64).max(0.0),
+        rows,
+    })
 }
 
 /// Cuts `rows` into blocks that each hold a whole number of periods of `frequency_hz` as nearly as rows allow, at
 /// least `min_periods` of them, and at most `most` blocks. Returns the blocks' borders (one more than blocks).
-pub fn block_borders(from: usize, to: usize, period_s: f64, frequency_hz: f64, min_periods: f64, most: usize) -> Vec<usize> {
+pub fn block_borders(
+    from: usize,
+    to: usize,
+    period_s: f64,
+    frequency_hz: f64,
+    min_periods: f64,
+    most: usize,
+) -> Vec<usize> {
     let rows = to.saturating_sub(from) as f64;
     let per_period = 1.0 / (frequency_hz * period_s);
     let periods = rows / per_period;
-    let blocks = ((periods / min_periods).floor() as usize).min(most).min((rows / 24.0) as usize).max(1);
+    let blocks = ((periods / min_periods).floor() as usize)
+        .min(most)
+        .min((rows / 24.0) as usize)
+        .max(1);
     // Whole periods per block, where that loses little of the record.
     let per_block = (periods / blocks as f64).floor().max(1.0) * per_period;
-    let length = if per_block * blocks as f64 > 0.9 * rows { per_block } else { rows / blocks as f64 };
-    (0..=blocks).map(|i| from + (i as f64 * length).round().min(rows) as usize).collect()
+    let length = if per_block * blocks as f64 > 0.9 * rows {
+        per_block
+    } else {
+        rows / blocks as f64
+    };
+    (0..=blocks)
+        .map(|i| from + (i as f64 * length).round().min(rows) as usize)
+        .collect()
 }
 
 #[cfg(test)]
@@ -142,7 +185,10 @@ mod tests {
         (0..n)
             .map(|k| {
                 let t = k as f64 * 1e-3;
-                let tones: f64 = f.iter().map(|(f, a)| (a * Complex::from_polar(1.0, TWO_PI * f * t)).re).sum();
+                let tones: f64 = f
+                    .iter()
+                    .map(|(f, a)| (a * Complex::from_polar(1.0, TWO_PI * f * t)).re)
+                    .sum();
                 3.0 + drift_um_per_s * t + 0.4 * t * t + tones
             })
             .collect()
@@ -150,13 +196,22 @@ mod tests {
 
     #[test]
     fn sines_over_drift_are_recovered_exactly_from_levels_and_from_increments() {
-        let truth = [(7.3, Complex::new(1.0, -0.4)), (120.0, Complex::new(-0.02, 0.05))];
+        let truth = [
+            (7.3, Complex::new(1.0, -0.4)),
+            (120.0, Complex::new(-0.02, 0.05)),
+        ];
         let signal = record(1500, &truth, 10.0);
         for whitening in [Whitening::Levels, Whitening::Increments] {
-            let fit = ToneFit { drift_degree: 2, whitening };
+            let fit = ToneFit {
+                drift_degree: 2,
+                whitening,
+            };
             let block = fit_block(&signal, 100, 1337, 1e-3, &[7.3, 120.0], fit).unwrap();
             for (found, (_, expected)) in block.phasors.iter().zip(&truth) {
-                assert!((found - expected).norm() < 1e-9, "{found} against {expected}");
+                assert!(
+                    (found - expected).norm() < 1e-9,
+                    "{found} against {expected}"
+                );
             }
             assert!(block.residual_variance < 1e-10);
         }
@@ -178,7 +233,10 @@ mod tests {
     #[test]
     fn frequencies_that_a_block_cannot_tell_apart_are_refused() {
         let signal = record(60, &[(5.0, Complex::new(1.0, 0.0))], 0.0);
-        assert_eq!(fit_block(&signal, 0, 60, 1e-3, &[5.0, 5.000_1], ToneFit::default()), None);
+        assert_eq!(
+            fit_block(&signal, 0, 60, 1e-3, &[5.0, 5.000_1], ToneFit::default()),
+            None
+        );
     }
 
     #[test]

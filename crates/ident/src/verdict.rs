@@ -84,7 +84,12 @@ const WIDEST_RELATIVE: f64 = 0.5;
 const PROFILE_RISE: f64 = 3.841;
 
 /// Profile interval of the far zero's lead, ms, searched in 0..`LEAD_MOST_MS` sampling periods.
-fn lead_interval_ms(problem: &LadderProblem<'_>, fit: &LadderFit, data: &[Complex<f64>], period_ms: f64) -> Option<[f64; 2]> {
+fn lead_interval_ms(
+    problem: &LadderProblem<'_>,
+    fit: &LadderFit,
+    data: &[Complex<f64>],
+    period_ms: f64,
+) -> Option<[f64; 2]> {
     let far = fit.rungs.iter().find(|r| r.rung == Rung::FarZero)?;
     // The delay is tried on both sides of each whole sample: there the feedthrough moves to another row at once.
     let chi2_at = |lead_ms: f64| -> f64 {
@@ -93,12 +98,23 @@ fn lead_interval_ms(problem: &LadderProblem<'_>, fit: &LadderFit, data: &[Comple
             .map(|shift| {
                 let mut start = far.parameters.clone();
                 start[index::EFFECTIVE_DELAY_MS] += shift * period_ms;
-                problem.fit_from(data, Rung::FarZero, &start, Some((index::FAR_LEAD_MS, lead_ms))).chi2
+                problem
+                    .fit_from(
+                        data,
+                        Rung::FarZero,
+                        &start,
+                        Some((index::FAR_LEAD_MS, lead_ms)),
+                    )
+                    .chi2
             })
             .fold(f64::INFINITY, f64::min)
     };
-    let grid: Vec<f64> =
-        [0.0, 0.01, 0.02, 0.035, 0.05, 0.075, 0.1, 0.15, 0.2, 0.3, 0.5, 0.8, 1.2, 2.0].iter().map(|g| g * period_ms).collect();
+    let grid: Vec<f64> = [
+        0.0, 0.01, 0.02, 0.035, 0.05, 0.075, 0.1, 0.15, 0.2, 0.3, 0.5, 0.8, 1.2, 2.0,
+    ]
+    .iter()
+    .map(|g| g * period_ms)
+    .collect();
     let costs: Vec<f64> = grid.iter().map(|&g| chi2_at(g)).collect();
     let best = costs.iter().copied().fold(far.chi2, f64::min);
     let limit = best + PROFILE_RISE * fit.scale;
@@ -139,7 +155,9 @@ fn judge_width(value: f64, interval: [f64; 2], why_not: &str) -> Verdict {
     if widest.is_finite() && widest < WIDEST_RELATIVE * value.abs() {
         Verdict::Identified
     } else {
-        Verdict::NotIdentifiable { reason: why_not.to_owned() }
+        Verdict::NotIdentifiable {
+            reason: why_not.to_owned(),
+        }
     }
 }
 
@@ -177,13 +195,29 @@ pub fn judge(
         value: gain,
         ci95: gain95,
         bootstrap95: drawn(&|x| x[index::LN_GAIN].exp()),
-        verdict: judge_width(gain, gain95, "the gain's interval is wider than half its value: excite more strongly or longer"),
+        verdict: judge_width(
+            gain,
+            gain95,
+            "the gain's interval is wider than half its value: excite more strongly or longer",
+        ),
     });
     for (name, meaning, i) in [
-        ("pair_zero_rad_per_s", "zero of the pole-zero pair", index::LN_ZERO),
-        ("pair_pole_rad_per_s", "pole of the pole-zero pair", index::LN_POLE),
+        (
+            "pair_zero_rad_per_s",
+            "zero of the pole-zero pair",
+            index::LN_ZERO,
+        ),
+        (
+            "pair_pole_rad_per_s",
+            "pole of the pole-zero pair",
+            index::LN_POLE,
+        ),
     ] {
-        let source = if best.rung >= Rung::PoleZeroPair { Some(best) } else { fit.rungs.iter().find(|r| r.rung == Rung::PoleZeroPair) };
+        let source = if best.rung >= Rung::PoleZeroPair {
+            Some(best)
+        } else {
+            fit.rungs.iter().find(|r| r.rung == Rung::PoleZeroPair)
+        };
         let Some(source) = source else { continue };
         let value = source.parameters[i].exp();
         let ci95 = log_interval(value, source.covariance[(i, i)].sqrt(), t);
@@ -196,9 +230,15 @@ pub fn judge(
             ci95,
             bootstrap95: if chosen { drawn(&|x| x[i].exp()) } else { None },
             verdict: if chosen {
-                judge_width(value, ci95, "the pair is seen, but not where it lies: excite more lines about it")
+                judge_width(
+                    value,
+                    ci95,
+                    "the pair is seen, but not where it lies: excite more lines about it",
+                )
             } else {
-                Verdict::NotIdentifiable { reason: "the data do not need a pole-zero pair".to_owned() }
+                Verdict::NotIdentifiable {
+                    reason: "the data do not need a pole-zero pair".to_owned(),
+                }
             },
         });
     }
@@ -216,7 +256,9 @@ pub fn judge(
         verdict: if half < 0.25 * period_ms {
             Verdict::Identified
         } else {
-            Verdict::NotIdentifiable { reason: "the phase slope is too uncertain: excite higher frequencies".to_owned() }
+            Verdict::NotIdentifiable {
+                reason: "the phase slope is too uncertain: excite higher frequencies".to_owned(),
+            }
         },
     });
 
@@ -228,7 +270,11 @@ pub fn judge(
     parameters.push(delay);
     parameters.push(far_zero_parameter(fit, &model, prior, lead, period_ms));
     if let Some(full) = fit.rungs.iter().find(|r| r.rung == Rung::Eq4) {
-        parameters.push(slow_pole_parameter(full.parameters[index::SLOW_POLE], full.covariance[(index::SLOW_POLE, index::SLOW_POLE)].sqrt() * t, best.rung));
+        parameters.push(slow_pole_parameter(
+            full.parameters[index::SLOW_POLE],
+            full.covariance[(index::SLOW_POLE, index::SLOW_POLE)].sqrt() * t,
+            best.rung,
+        ));
     }
     Judged {
         parameters,
@@ -239,9 +285,15 @@ pub fn judge(
 }
 
 /// The chosen rung fitted again with the delay measured otherwise, and the far zero free to make up the difference.
-fn with_prior(problem: &LadderProblem<'_>, fit: &LadderFit, prior: Option<DelayPrior>) -> LadderModel {
+fn with_prior(
+    problem: &LadderProblem<'_>,
+    fit: &LadderFit,
+    prior: Option<DelayPrior>,
+) -> LadderModel {
     let best = fit.best();
-    let Some(prior) = prior else { return best.model };
+    let Some(prior) = prior else {
+        return best.model;
+    };
     let with = problem.clone().with_prior(Some(prior));
     let data = problem.data();
     let far = fit.rungs.iter().find(|r| r.rung == Rung::FarZero);
@@ -255,7 +307,8 @@ fn with_prior(problem: &LadderProblem<'_>, fit: &LadderFit, prior: Option<DelayP
         .iter()
         .map(|extra| {
             let mut start = source.parameters.clone();
-            start[index::FAR_LEAD_MS] = prior.delay_s * 1e3 - start[index::EFFECTIVE_DELAY_MS] + extra;
+            start[index::FAR_LEAD_MS] =
+                prior.delay_s * 1e3 - start[index::EFFECTIVE_DELAY_MS] + extra;
             with.fit_from(&data, rung, &start, None)
         })
         .min_by(|a, b| a.chi2.total_cmp(&b.chi2));
@@ -286,7 +339,10 @@ fn delay_parameter(
             }
         }
         None => {
-            let (low, high) = (effective_ms + lead_ms[0] - half_ms, effective_ms + lead_ms[1] + half_ms);
+            let (low, high) = (
+                effective_ms + lead_ms[0] - half_ms,
+                effective_ms + lead_ms[1] + half_ms,
+            );
             let narrow = high - low < 0.25 * period_ms;
             Parameter {
                 name: "delay_ms",
@@ -307,20 +363,46 @@ fn delay_parameter(
     }
 }
 
-fn far_zero_parameter(fit: &LadderFit, model: &LadderModel, prior: Option<DelayPrior>, lead_ms: [f64; 2], period_ms: f64) -> Parameter {
+fn far_zero_parameter(
+    fit: &LadderFit,
+    model: &LadderModel,
+    prior: Option<DelayPrior>,
+    lead_ms: [f64; 2],
+    period_ms: f64,
+) -> Parameter {
     let invert = |ms: f64| if ms > 0.0 { 1e3 / ms } else { f64::INFINITY };
-    let ci95 = [if lead_ms[1].is_finite() { invert(lead_ms[1]) } else { 0.0 }, invert(lead_ms[0])];
-    let middle = if lead_ms[1].is_finite() { 0.5 * (lead_ms[0] + lead_ms[1]) } else { lead_ms[0] };
+    let ci95 = [
+        if lead_ms[1].is_finite() {
+            invert(lead_ms[1])
+        } else {
+            0.0
+        },
+        invert(lead_ms[0]),
+    ];
+    let middle = if lead_ms[1].is_finite() {
+        0.5 * (lead_ms[0] + lead_ms[1])
+    } else {
+        lead_ms[0]
+    };
     let width = 0.5 * (lead_ms[1] - lead_ms[0]);
-    let identified = fit.best().rung >= Rung::FarZero && width.is_finite() && width < WIDEST_RELATIVE * middle;
-    let value = if prior.is_some() && model.far_lead_s > 0.0 { 1.0 / model.far_lead_s } else { invert(middle.max(1e-3 * period_ms)) };
+    let identified =
+        fit.best().rung >= Rung::FarZero && width.is_finite() && width < WIDEST_RELATIVE * middle;
+    let value = if prior.is_some() && model.far_lead_s > 0.0 {
+        1.0 / model.far_lead_s
+    } else {
+        invert(middle.max(1e-3 * period_ms))
+    };
     let verdict = if identified {
         Verdict::Identified
     } else {
         let mut reason = format!(
             "its lead trades against the delay: the record alone allows leads of {:.3} to {} ms",
             lead_ms[0],
-            if lead_ms[1].is_finite() { format!("{:.3}", lead_ms[1]) } else { "any number of".to_owned() }
+            if lead_ms[1].is_finite() {
+                format!("{:.3}", lead_ms[1])
+            } else {
+                "any number of".to_owned()
+            }
         );
         if prior.is_some() {
             reason.push_str("; the value shown takes the LED test's delay as given");
@@ -352,14 +434,22 @@ fn slow_pole_parameter(value: f64, half: f64, chosen: Rung) -> Parameter {
             Verdict::Identified
         } else {
             Verdict::NotIdentifiable {
-                reason: format!("it lies far below the lowest line; the data only say that it is below {:.2} rad/s", high.max(0.0)),
+                reason: format!(
+                    "it lies far below the lowest line; the data only say that it is below {:.2} rad/s",
+                    high.max(0.0)
+                ),
             }
         },
     }
 }
 
 /// Parameter vectors of the chosen rung fitted to resampled blocks.
-pub fn bootstrap(problem: &LadderProblem<'_>, fit: &LadderFit, replicates: usize, seed: u64) -> Vec<Vec<f64>> {
+pub fn bootstrap(
+    problem: &LadderProblem<'_>,
+    fit: &LadderFit,
+    replicates: usize,
+    seed: u64,
+) -> Vec<Vec<f64>> {
     let mut random = Random::new(seed);
     let best = fit.best();
     (0..replicates)
@@ -374,7 +464,9 @@ pub fn bootstrap(problem: &LadderProblem<'_>, fit: &LadderFit, replicates: usize
                     }
                     let sum: Complex<f64> = (0..n).map(|_| p.block_errors[random.below(n)]).sum();
                     // Resampled means are narrower than the truth by (n-1)/n; the noise model sets the size.
-                    let size = (p.variance / p.scatter_variance.max(f64::MIN_POSITIVE) * n as f64 / (n as f64 - 1.0)).sqrt();
+                    let size = (p.variance / p.scatter_variance.max(f64::MIN_POSITIVE) * n as f64
+                        / (n as f64 - 1.0))
+                        .sqrt();
                     p.response + sum / n as f64 * size
                 })
                 .collect();

@@ -1,0 +1,275 @@
+//! An identification experiment: a plan of excitation segments, run tick by tick on anything that moves a bead.
+//!
+//! The plan is data, the rig is a [`Bench`]. When the bead is lost the run ends cleanly with what was measured so far,
+//! and resumes at the segment that failed. Not for real-time pacing: a bench does that.
+
+use nalgebra::Complex;
+
+use crate::error::IdentError;
+use crate::excitation::{Limits, Signal, Tone, fold, shaped_amplitude_um};
+use crate::frequency_response::{FrequencyPoint, Segment, SegmentResponse, Settings, measure};
+use crate::noise::{NoiseModel, apply_noise_model};
+
+/// One tick of a record.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Row {
+    /// Displacement commanded from this tick on, um.
+    pub command_um: f64,
+    /// The bead position that the tick saw, um; `None` where no frame showed a bead.
+    pub bead_um: Option<f64>,
+}
+
+/// A rig, real or emulated, that adds an excitation to whatever holds the bead.
+pub trait Bench {
+    /// What can go wrong in the rig itself.
+    type Error;
+    /// Runs one tick with `excitation_um` added to the command (closed loop) or about the working point (open loop).
+    ///
+    /// # Errors
+    /// The rig's own: a lost camera, a board that does not answer.
+    fn tick(&mut self, excitation_um: f64) -> Result<Row, Self::Error>;
+}
+
+/// One stretch of an experiment.
+#[derive(Debug, Clone, PartialEq)]
+pub struct PlannedSegment {
+    /// What it is, for reports.
+    pub label: String,
+    /// What to add to the command.
+    pub signal: Signal,
+    /// Lines driven, Hz.
+    pub lines_hz: Vec<f64>,
+    /// Lines fitted along to detect nonlinearity, Hz.
+    pub detection_hz: Vec<f64>,
+    /// Time for transients to die, s; recorded, not used.
+    pub settle_s: f64,
+    /// Time used, s.
+    pub measure_s: f64,
+}
+
+/// A list of segments at one sampling period.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Plan {
+    /// Time between ticks, s.
+    pub period_s: f64,
+    /// Segments in order.
+    pub segments: Vec<PlannedSegment>,
+    /// Frames in a row without a bead that end the run.
+    pub lost_frames: usize,
+}
+
+/// The expected plant and loop that amplitudes are shaped by, at one frequency: `X2/X1`, and plant times controller
+/// (0 in open loop).
+pub type Expected<'a> = &'a dyn Fn(f64) -> (Complex<f64>, Complex<f64>);
+
+impl Plan {
+    /// Stepped sines, one segment per line, lowest first. Low lines last longer: Brownian motion makes the noise of a
+    /// line fall as 1/f.
+    pub fn stepped_sines(
+        lines_hz: &[f64],
+        expected: Expected<'_>,
+        limits: Limits,
+        period_s: f64,
+        seconds_at_1_hz: f64,
+    ) -> Self {
+        let segments = lines_hz
+            .iter()
+            .map(|&f| {
+                let (plant, loop_gain) = expected(f);
+                let amplitude_um = shaped_amplitude_um(f, plant, loop_gain, limits);
+                let whole = |s: f64| ((s * f).round() / f).max(1.0 / f);
+                let settle_s = 0.4;
+                PlannedSegment {
+                    label: format!("{f} Hz"),
+                    signal: Signal::Tones {
+                        tones: vec![Tone {
+                            frequency_hz: f,
+                            amplitude_um,
+                            phase_rad: 0.0,
+                        }],
+                        fade_in_s: 0.2,
+                    },
+                    lines_hz: vec![f],
+                    detection_hz: harmonics_to_watch(f, 1.0 / period_s),
+                    settle_s,
+                    measure_s: whole((seconds_at_1_hz / f).clamp(2.0, 15.0)),
+                }
+            })
+            .collect();
+        Self {
+            period_s,
+            segments,
+            lost_frames: 50,
+        }
+    }
+
+    /// Total duration, s.
+    pub fn duration_s(&self) -> f64 {
+        self.segments.iter().map(|s| s.settle_s + s.measure_s).sum()
+    }
+
+    /// Ticks in all.
+    pub fn ticks(&self) -> usize {
+        self.segments
+            .iter()
+            .map(|s| rows(s.settle_s, self.period_s) + rows(s.measure_s, self.period_s))
+            .sum()
+    }
+
+    /// Runs the segments from index `first` on; `progress` hears the ticks done so far.
+    ///
+    /// # Errors
+    /// [`Stopped`] with the finished segments and the cause.
+    pub fn run<B: Bench>(
+        &self,
+        bench: &mut B,
+        first: usize,
+        mut progress: impl FnMut(usize),
+    ) -> Result<Vec<RecordedSegment>, Stopped<B::Error>> {
+        let mut done = Vec::new();
+        let mut ticks = 0;
+        for (index, segment) in self.segments.iter().enumerate().skip(first) {
+            let settle = rows(segment.settle_s, self.period_s);
+            let total = settle + rows(segment.measure_s, self.period_s);
+            let mut record = RecordedSegment {
+                index,
+                from: settle,
+                input: Vec::with_capacity(total),
+                output: Vec::with_capacity(total),
+            };
+            let mut missing = 0usize;
+            for k in 0..total {
+                let row = match bench.tick(segment.signal.value_um(k as f64 * self.period_s)) {
+                    Ok(row) => row,
+                    Err(error) => {
+                        return Err(Stopped {
+                            done,
+                            cause: Cause::Rig(error),
+                        });
+                    }
+                };
+                record.input.push(row.command_um);
+                record.output.push(row.bead_um.unwrap_or(f64::NAN));
+                missing = if row.bead_um.is_some() {
+                    0
+                } else {
+                    missing + 1
+                };
+                if missing >= self.lost_frames {
+                    let error = IdentError::BeadLost {
+                        segment: index,
+                        segments: self.segments.len(),
+                        frames: missing,
+                    };
+                    return Err(Stopped {
+                        done,
+                        cause: Cause::BeadLost(error),
+                    });
+                }
+                ticks += 1;
+                if ticks % 256 == 0 {
+                    progress(ticks);
+                }
+            }
+            done.push(record);
+        }
+        Ok(done)
+    }
+
+    /// Measures the response at every driven line of the recorded segments and brings the noise model in.
+    ///
+    /// # Errors
+    /// Those of [`measure`].
+    pub fn analyse(
+        &self,
+        records: &[RecordedSegment],
+        settings: &Settings,
+    ) -> Result<Measured, IdentError> {
+        let mut points: Vec<FrequencyPoint> = Vec::new();
+        let mut segments = Vec::new();
+        for record in records {
+            let planned = &self.segments[record.index];
+            if planned.lines_hz.is_empty() {
+                continue;
+            }
+            let segment = Segment {
+                input: &record.input,
+                output: &record.output,
+                from: record.from,
+                to: record.input.len(),
+                period_s: self.period_s,
+                lines_hz: &planned.lines_hz,
+                detection_hz: &planned.detection_hz,
+            };
+            let response = measure(&segment, settings)?;
+            points.extend(response.points.iter().cloned());
+            segments.push(response);
+        }
+        let noise = apply_noise_model(&mut points, self.period_s);
+        points.sort_by(|a, b| a.frequency_hz.total_cmp(&b.frequency_hz));
+        Ok(Measured {
+            points,
+            noise,
+            segments,
+        })
+    }
+}
+
+/// Second and third harmonic of a line, folded, where they fall on neither the line, zero nor half the rate.
+fn harmonics_to_watch(frequency_hz: f64, rate_hz: f64) -> Vec<f64> {
+    let mut out: Vec<f64> = Vec::new();
+    for h in [2.0, 3.0] {
+        let folded = fold(h * frequency_hz, rate_hz);
+        let free = |g: f64| (folded - g).abs() > 0.8 * frequency_hz.min(5.0);
+        if free(frequency_hz) && free(0.0) && free(0.5 * rate_hz) && out.iter().all(|&g| free(g)) {
+            out.push(folded);
+        }
+    }
+    out
+}
+
+fn rows(seconds: f64, period_s: f64) -> usize {
+    (seconds / period_s).round() as usize
+}
+
+/// What a segment recorded.
+#[derive(Debug, Clone, PartialEq)]
+pub struct RecordedSegment {
+    /// Its place in the plan.
+    pub index: usize,
+    /// First row after settling.
+    pub from: usize,
+    /// Commanded displacement per row, um.
+    pub input: Vec<f64>,
+    /// Bead position per row, um; `NaN` where there was none.
+    pub output: Vec<f64>,
+}
+
+/// Why a run ended early, and what it had by then.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Stopped<E> {
+    /// Segments finished before.
+    pub done: Vec<RecordedSegment>,
+    /// What happened.
+    pub cause: Cause<E>,
+}
+
+/// What ended a run early.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Cause<E> {
+    /// The rig failed.
+    Rig(E),
+    /// [`IdentError::BeadLost`]; resume at the segment that it names.
+    BeadLost(IdentError),
+}
+
+/// A measured frequency response.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Measured {
+    /// Driven lines in order of frequency.
+    pub points: Vec<FrequencyPoint>,
+    /// The noise model, where there were enough lines for one.
+    pub noise: Option<NoiseModel>,
+    /// Per segment, detection lines included.
+    pub segments: Vec<SegmentResponse>,
+}

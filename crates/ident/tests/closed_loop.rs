@@ -1,0 +1,167 @@
+//! Identification of a held bead from positions: accuracy, coverage, verdicts.
+
+mod common;
+
+use cellpos_ident::excitation::{Limits, PAPER_FREQUENCIES_HZ};
+use cellpos_ident::experiment::{Measured, Plan};
+use cellpos_ident::frequency_response::Settings;
+use cellpos_ident::ladder::{DelayPrior, LadderFit, LadderProblem};
+use cellpos_ident::ladder_model::LadderModel;
+use cellpos_ident::sampled::Sampling;
+use cellpos_ident::verdict::{Judged, judge};
+use cellpos_plant::TransferFunction;
+use common::{PERIOD_S, PositionRig, expected};
+
+const LIMITS: Limits = Limits {
+    bead_um: 8.0,
+    pzt_um: 3.5,
+    slew_um_per_s: 40_000.0,
+};
+
+fn plan() -> Plan {
+    Plan::stepped_sines(
+        &PAPER_FREQUENCIES_HZ,
+        &expected(0.002),
+        LIMITS,
+        PERIOD_S,
+        40.0,
+    )
+}
+
+fn measured(rig: &mut PositionRig) -> Measured {
+    let plan = plan();
+    let records = plan.run(rig, 0, |_| {}).expect("the bead stays");
+    plan.analyse(&records, &Settings::default()).unwrap()
+}
+
+fn fitted(m: &Measured, prior: Option<DelayPrior>, replicates: usize) -> (LadderFit, Judged) {
+    let problem = LadderProblem::new(&m.points, Sampling::held(1.0 / PERIOD_S), None).unwrap();
+    let fit = problem.fit().unwrap();
+    let judged = judge(&problem, &fit, prior, replicates, 1);
+    (fit, judged)
+}
+
+#[test]
+fn a_held_bead_gives_gain_and_delay_and_says_what_it_cannot_tell() {
+    let mut rig = PositionRig::new(&TransferFunction::eq6(), 0.002, 3);
+    let m = measured(&mut rig);
+    let prior = DelayPrior {
+        delay_s: 0.002002,
+        sd_s: 4e-6,
+    };
+    let start = std::time::Instant::now();
+    for p in &m.points {
+        let e = p.response
+            / LadderModel::eq6(0.002).sampled_response(p.frequency_hz, Sampling::held(1000.0))
+            - 1.0;
+        println!(
+            "{} Hz: {:.6} rel err {e:.6}, rel sd {:.6} blocks {} u {:.3} y {:.3} rows {}",
+            p.frequency_hz,
+            p.response,
+            p.variance.sqrt() / p.response.norm(),
+            p.block_errors.len(),
+            p.input.norm(),
+            p.output.norm(),
+            p.rows
+        );
+    }
+    let (fit, judged) = fitted(&m, Some(prior), 200);
+    println!("{:?} fit {:?}", m.noise, start.elapsed());
+    for r in &fit.rungs {
+        println!(
+            "{:?} chi2 {:.1} dof {} aicc {:.1} held out {:.3} p {:.2e} {:?}",
+            r.rung, r.chi2, r.dof, r.aicc, r.held_out, r.step_p_value, r.parameters
+        );
+    }
+    for p in &judged.parameters {
+        println!(
+            "{} = {:.5} {} {:?} {:?} {:?}",
+            p.name, p.value, p.unit, p.ci95, p.bootstrap95, p.verdict
+        );
+    }
+    let truth = LadderModel::eq6(0.002);
+    let gain = judged.parameter("gain_per_s").unwrap();
+    assert!((gain.value / truth.gain_per_s - 1.0).abs() < 0.01);
+    assert!(gain.ci95[0] < truth.gain_per_s && truth.gain_per_s < gain.ci95[1]);
+    assert!((judged.parameter("delay_ms").unwrap().value - 2.0).abs() < 0.05);
+    for name in ["far_zero_rad_per_s", "slow_pole_rad_per_s"] {
+        assert!(
+            !judged.parameter(name).unwrap().verdict.is_identified(),
+            "{name}"
+        );
+    }
+    // What the record shows over what the model says a hold and a delay make of it.
+    let sampling = Sampling::held(1.0 / PERIOD_S);
+    for p in &m.points {
+        let hold = judged.model.sampled_response(p.frequency_hz, sampling)
+            / judged.model.response(p.frequency_hz);
+        let ratio = p.response / hold / truth.response(p.frequency_hz);
+        let (db, deg) = (20.0 * ratio.norm().log10(), ratio.arg().to_degrees());
+        println!(
+            "{} Hz: {db:+.4} dB {deg:+.4} deg, sd {:.4} dB {:.4} deg, coherence {:.5}",
+            p.frequency_hz,
+            p.gain_sd_db(),
+            p.phase_sd_deg(),
+            p.coherence
+        );
+        assert!(
+            db.abs() < 0.2 && deg.abs() < 1.0,
+            "{} Hz: {db} dB, {deg} deg",
+            p.frequency_hz
+        );
+    }
+    let noise = m.noise.unwrap();
+    assert!(noise.used);
+    assert!((noise.diffusion_um2_per_s - 0.33).abs() < 2.0 * noise.diffusion_ci95_um2_per_s);
+}
+
+#[test]
+fn ninety_five_percent_intervals_cover_the_truth_in_ninety_to_ninety_nine_of_a_hundred_seeds() {
+    let truth = LadderModel::eq6(0.002);
+    let values = [
+        ("gain_per_s", truth.gain_per_s),
+        ("pair_zero_rad_per_s", truth.zero_rad_per_s),
+        ("pair_pole_rad_per_s", truth.pole_rad_per_s),
+        ("effective_delay_ms", truth.effective_delay_s() * 1e3),
+    ];
+    let mut covered = [0usize; 4];
+    let mut called = [0usize; 4];
+    let (mut diffusion, mut localisation) = (0.0, 0.0);
+    for seed in 0..100 {
+        let mut rig = PositionRig::new(&TransferFunction::eq6(), 0.002, 1000 + seed);
+        let m = measured(&mut rig);
+        diffusion += m.noise.unwrap().diffusion_um2_per_s / 100.0;
+        localisation += m.noise.unwrap().localisation_um / 100.0;
+        let (_, judged) = fitted(&m, None, 0);
+        for name in ["far_zero_rad_per_s", "slow_pole_rad_per_s"] {
+            assert!(
+                !judged.parameter(name).unwrap().verdict.is_identified(),
+                "{name}, seed {seed}"
+            );
+        }
+        for (i, (name, value)) in values.iter().enumerate() {
+            let p = judged.parameter(name).unwrap();
+            if p.verdict.is_identified() {
+                called[i] += 1;
+                covered[i] += usize::from(p.ci95[0] <= *value && *value <= p.ci95[1]);
+            }
+        }
+    }
+    println!(
+        "called identified {called:?}, covered {covered:?}; diffusion {diffusion:.3} um^2/s, localisation {localisation:.4} um on average"
+    );
+    for (i, (name, _)) in values.iter().enumerate() {
+        assert!(
+            called[i] >= 95,
+            "{name}: called identified in {} of 100",
+            called[i]
+        );
+        let share = 100 * covered[i] / called[i];
+        assert!(
+            (90..=99).contains(&share),
+            "{name}: {} of {}",
+            covered[i],
+            called[i]
+        );
+    }
+}
