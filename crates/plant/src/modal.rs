@@ -87,9 +87,15 @@ pub(crate) fn separate(poles: &mut [Complex<f64>]) {
         }
         let mean: Complex<f64> =
             cluster.iter().map(|&j| poles[j]).sum::<Complex<f64>>() / cluster.len() as f64;
+        // Three or more lose digits with the square of their distance: they are moved further apart.
+        let distance = if cluster.len() > 2 {
+            10.0 * SPLIT
+        } else {
+            SPLIT
+        };
         for (m, &j) in cluster.iter().enumerate() {
             let old = poles[j];
-            let shift = SPLIT * scale * (m as f64 - 0.5 * (cluster.len() - 1) as f64);
+            let shift = distance * scale * (m as f64 - 0.5 * (cluster.len() - 1) as f64);
             let new = mean + shift;
             if old.im > 0.0 {
                 if let Some(partner) = poles.iter().position(|p| *p == old.conj()) {

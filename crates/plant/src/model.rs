@@ -1,11 +1,15 @@
 //! [`Model`]: the plant with its working point, effects and noise; the one artifact that identify writes, the
 //! emulator runs, design reads, reconcile extends and track carries.
 
+use crate::chain::linear_part;
 use crate::effect::Effect;
 use crate::error::ModelError;
 use crate::model_file;
 use crate::transfer::TransferFunction;
+use cellpos_units::Hertz;
+use nalgebra::Complex;
 use std::collections::BTreeMap;
+use std::f64::consts::TAU;
 use std::path::Path;
 
 /// Noise that is always present and no discrepancy unless its size is wrong.
@@ -118,6 +122,36 @@ impl Model {
     /// The model as the text of a TOML file. Reading it back gives the same model to the bit.
     pub fn to_toml_string(&self) -> String {
         model_file::write(self)
+    }
+
+    /// The frequency response of all that is linear: plant, linear effects, delay and exposure, from command to record.
+    ///
+    /// Effects that are not linear, clock skew and what is added (drift, hum) are left out; a drifting gain and a
+    /// dissolving bubble count as at the start.
+    pub fn linear_response(&self, frequency: Hertz) -> Complex<f64> {
+        let w = TAU * frequency.value();
+        let s = Complex::new(0.0, w);
+        let mut value = self.plant.at(s);
+        for effect in &self.effects {
+            value *= match *effect {
+                Effect::TimeDelay { delay_s } => Complex::from_polar(1.0, -w * delay_s),
+                Effect::ExposureAveraging { exposure_s } => {
+                    let half = 0.5 * w * exposure_s;
+                    let sinc = if half.abs() < 1e-9 {
+                        1.0
+                    } else {
+                        half.sin() / half
+                    };
+                    Complex::from_polar(sinc, -half)
+                }
+                Effect::Bubble { lag_s, .. } => (s * lag_s + 1.0).inv(),
+                ref other => match linear_part(other) {
+                    Some(part) => part.at(s),
+                    None => continue,
+                },
+            };
+        }
+        value
     }
 
     /// The first effect with this id.

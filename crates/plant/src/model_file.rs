@@ -183,6 +183,8 @@ const TOP: [&str; 9] = [
     "provenance",
 ];
 
+const HYSTERESIS_FORMS: [&str; 3] = ["bouc-wen", "bouc-wen-explicit", "play"];
+
 pub(crate) fn read(text: &str, file: &str) -> Result<Model, ModelError> {
     let document = DeTable::parse(text).map_err(|error| ModelError::Syntax {
         file: file.to_owned(),
@@ -375,8 +377,8 @@ fn read_effect(table: &Table<'_, '_>) -> Result<Effect, ModelError> {
             None => Some("bouc-wen".to_owned()),
             Some(v) => {
                 let form = table.text_of("form", v)?;
-                if form != "bouc-wen" && form != "play" {
-                    return Err(unknown("form", v, form, &["bouc-wen", "play"]));
+                if !HYSTERESIS_FORMS.contains(&form.as_str()) {
+                    return Err(unknown("form", v, form, &HYSTERESIS_FORMS));
                 }
                 Some(form)
             }

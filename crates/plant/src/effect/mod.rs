@@ -42,21 +42,33 @@ impl fmt::Display for Place {
     }
 }
 
-/// Forms of the piezo's hysteresis. Both act on the displacement from the working point, are independent of rate,
-/// and are integrated exactly.
+/// Forms of the piezo's hysteresis. All act on the displacement from the working point and are independent of rate.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "form", rename_all = "kebab-case", deny_unknown_fields)]
 pub enum Hysteresis {
-    /// Bouc-Wen: `x = (1 - fraction) u + fraction h`, `dh/dt = du/dt - beta |du/dt| h - gamma du/dt |h|`.
+    /// Bouc-Wen: `x = u - fraction h`, `dh/dt = du/dt - beta |du/dt| h - gamma du/dt |h|`.
     ///
-    /// Bouc 1967, Wen 1976 (J. Eng. Mech. Div. ASCE 102:249) with exponent 1 and A = 1. At small amplitude h = u, and
-    /// nothing is lost; at large amplitude h saturates at `1/(beta + gamma)`.
+    /// Bouc 1967, Wen 1976 (J. Eng. Mech. Div. ASCE 102:249) with exponent 1 and A = 1, in the form used for piezos
+    /// (Low, Guo 1995, IEEE Trans. Control Syst. Technol. 3:119). At small amplitude h = u and the gain is
+    /// `1 - fraction`; at large amplitude h saturates at `1/(beta + gamma)` and the gain approaches 1. The equation is
+    /// integrated in closed form along the straight way of each change of u.
     BoucWen {
-        /// Part of the stroke that passes through h, 0..1.
+        /// Part of the stroke lost at small amplitude, 0..1.
         fraction: f64,
         /// Width of the loop, 1/um.
         beta_per_um: f64,
         /// Shape of the loop, 1/um; `|gamma| <= beta` keeps the loop dissipative.
+        gamma_per_um: f64,
+    },
+    /// The same equation as it is often programmed for sampled commands: one explicit step per change of the command,
+    /// `h += du - beta |du| h - gamma du |h|`. It differs from [`Hysteresis::BoucWen`] where a single change `du` is
+    /// not small against `1/(beta + gamma)`.
+    BoucWenExplicit {
+        /// Part of the stroke lost at small amplitude, 0..1.
+        fraction: f64,
+        /// Width of the loop, 1/um.
+        beta_per_um: f64,
+        /// Shape of the loop, 1/um.
         gamma_per_um: f64,
     },
     /// Play operators (Prandtl-Ishlinskii): `x = v + quadratic_per_um v^2`,

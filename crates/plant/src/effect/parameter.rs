@@ -208,6 +208,11 @@ impl Effect {
                 fraction,
                 beta_per_um,
                 gamma_per_um,
+            })
+            | Self::PztHysteresis(Hysteresis::BoucWenExplicit {
+                fraction,
+                beta_per_um,
+                gamma_per_um,
             }) => vec![fraction, beta_per_um, gamma_per_um],
             Self::PztHysteresis(Hysteresis::Play {
                 quadratic_per_um, ..
@@ -261,6 +266,13 @@ impl Effect {
                 weights: Vec::new(),
                 quadratic_per_um: at(0)?,
             }),
+            "pzt-hysteresis" if form == Some("bouc-wen-explicit") => {
+                Self::PztHysteresis(Hysteresis::BoucWenExplicit {
+                    fraction: at(0)?,
+                    beta_per_um: at(1)?,
+                    gamma_per_um: at(2)?,
+                })
+            }
             "pzt-hysteresis" => Self::PztHysteresis(Hysteresis::BoucWen {
                 fraction: at(0)?,
                 beta_per_um: at(1)?,
@@ -308,10 +320,11 @@ impl Effect {
         })
     }
 
-    /// The form of an effect that has several: `"bouc-wen"` or `"play"`.
+    /// The form of an effect that has several: `"bouc-wen"`, `"bouc-wen-explicit"` or `"play"`.
     pub fn form(&self) -> Option<&'static str> {
         match self {
             Self::PztHysteresis(Hysteresis::BoucWen { .. }) => Some("bouc-wen"),
+            Self::PztHysteresis(Hysteresis::BoucWenExplicit { .. }) => Some("bouc-wen-explicit"),
             Self::PztHysteresis(Hysteresis::Play { .. }) => Some("play"),
             _ => None,
         }
@@ -436,11 +449,18 @@ impl Effect {
             Self::GainError { factor } if *factor == 0.0 => {
                 inconsistent("factor must not be zero: the bead would never move")
             }
-            Self::PztHysteresis(Hysteresis::BoucWen {
-                beta_per_um,
-                gamma_per_um,
-                ..
-            }) if gamma_per_um.abs() > *beta_per_um => inconsistent(
+            Self::PztHysteresis(
+                Hysteresis::BoucWen {
+                    beta_per_um,
+                    gamma_per_um,
+                    ..
+                }
+                | Hysteresis::BoucWenExplicit {
+                    beta_per_um,
+                    gamma_per_um,
+                    ..
+                },
+            ) if gamma_per_um.abs() > *beta_per_um => inconsistent(
                 "gamma_per_um must lie within -beta_per_um..beta_per_um, else the loop would feed energy back",
             ),
             Self::PztHysteresis(Hysteresis::Play {

@@ -1,0 +1,316 @@
+//! [`Chain`]: a model as a time-stepping machine, from the command to the bead.
+//!
+//! Between two changes of the command the linear part is propagated exactly, whatever the length of the step: the
+//! plant's far zero, a driver lag and a resonance need no small steps. Hysteresis and backlash on a held command are
+//! exact as well. Where a block that is not linear follows one with dynamics (a driver lag before hysteresis, the
+//! plant before wall adhesion), sub-steps are chosen from the fastest time constant before it.
+//!
+//! Not here: what the camera makes of the position (see [`crate::Simulator`]).
+
+mod blocks;
+mod compile;
+mod linear;
+
+#[cfg(test)]
+mod tests;
+
+pub(crate) use compile::linear_part;
+
+use crate::effect::EffectError;
+use crate::model::Model;
+use crate::random::Gaussian;
+use blocks::Block;
+use compile::{Compiled, Stage};
+use linear::Segment;
+
+/// A model that cannot be run.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum ChainError {
+    /// An effect with parameters out of range.
+    #[error(transparent)]
+    Effect(#[from] EffectError),
+    /// A number of the model that is not finite or out of range.
+    #[error("{name} = {value} {unit}: it must be a finite number in {lower}..{upper} {unit}")]
+    OutOfRange {
+        /// The quantity.
+        name: &'static str,
+        /// Its value.
+        value: f64,
+        /// Its unit.
+        unit: &'static str,
+        /// Lower bound.
+        lower: f64,
+        /// Upper bound.
+        upper: f64,
+    },
+    /// An effect that can act only once stands twice in the model.
+    #[error("{id} stands twice in the model: it can act only once")]
+    Repeated {
+        /// The effect.
+        id: &'static str,
+    },
+}
+
+pub(crate) fn in_range(
+    name: &'static str,
+    value: f64,
+    unit: &'static str,
+    lower: f64,
+    upper: f64,
+) -> Result<(), ChainError> {
+    if value.is_finite() && value >= lower && value <= upper {
+        Ok(())
+    } else {
+        Err(ChainError::OutOfRange {
+            name,
+            value,
+            unit,
+            lower,
+            upper,
+        })
+    }
+}
+
+/// The rig from the command to the bead: driver, PZT, chip and bead of a model.
+///
+/// At rest at the working point when new. [`Chain::advance`] allocates nothing, cannot panic and is deterministic; a
+/// clone is a snapshot. A step of 1 ms of Eq. (6) is two multiply-adds per pole.
+///
+/// ```
+/// use cellpos_plant::{Chain, Model};
+/// let mut chain = Chain::new(&Model::eq6()).unwrap();
+/// for _ in 0..10 {
+///     chain.advance(5.0, 1e-3); // 1 um beyond the working point of 4 um, for 10 ms
+/// }
+/// assert!((chain.bead_um() - 3.95).abs() < 0.02); // 379 um/s at first, rising to 428 um/s
+/// ```
+#[derive(Debug, Clone)]
+pub struct Chain {
+    compiled: Compiled,
+    working_point_um: f64,
+    brownian: Option<Brownian>,
+    time_s: f64,
+    command_um: f64,
+    driver_um: f64,
+    output: Segment,
+    offset_um: f64,
+    area_um_s: f64,
+    wants_area: bool,
+}
+
+/// Diffusion of the bead.
+#[derive(Debug, Clone)]
+struct Brownian {
+    diffusion_um2_per_s: f64,
+    gaussian: Gaussian,
+    on: bool,
+}
+
+impl Chain {
+    /// The chain of a model, without Brownian motion.
+    ///
+    /// # Errors
+    /// Parameters out of range (a model read from a file has none).
+    pub fn new(model: &Model) -> Result<Self, ChainError> {
+        for effect in &model.effects {
+            effect.validate()?;
+        }
+        in_range("working_point_um", model.working_point_um, "um", -1e4, 1e4)?;
+        in_range(
+            "diffusion_um2_per_s",
+            model.noise.diffusion_um2_per_s,
+            "um^2/s",
+            0.0,
+            1e4,
+        )?;
+        Ok(Self {
+            compiled: compile::compile(model),
+            working_point_um: model.working_point_um,
+            brownian: None,
+            time_s: 0.0,
+            command_um: 0.0,
+            driver_um: 0.0,
+            output: Segment::default(),
+            offset_um: 0.0,
+            area_um_s: 0.0,
+            wants_area: false,
+        })
+    }
+
+    /// The chain of a model with the bead's Brownian motion, fixed by the seed.
+    ///
+    /// # Errors
+    /// As [`Self::new`].
+    pub fn with_brownian_motion(model: &Model, seed: u64) -> Result<Self, ChainError> {
+        let mut chain = Self::new(model)?;
+        chain.brownian = Some(Brownian {
+            diffusion_um2_per_s: model.noise.diffusion_um2_per_s,
+            gaussian: Gaussian::new(seed),
+            on: true,
+        });
+        Ok(chain)
+    }
+
+    /// Switches Brownian motion off and on again (a chain made without it has none to switch on).
+    pub fn set_brownian_motion(&mut self, on: bool) {
+        if let Some(b) = &mut self.brownian {
+            b.on = on;
+        }
+    }
+
+    /// Keeps the integral of the bead position from now on, for exposures.
+    pub(crate) fn keep_area(&mut self) {
+        self.wants_area = true;
+    }
+
+    /// Back to rest at the working point at time 0, the bead at 0 um. The random numbers go on.
+    pub fn reset(&mut self) {
+        for stage in &mut self.compiled.stages {
+            match stage {
+                Stage::Linear(group) => group.reset(),
+                Stage::Block(block) => block.reset(),
+            }
+        }
+        self.time_s = 0.0;
+        self.command_um = 0.0;
+        self.driver_um = 0.0;
+        self.output = Segment::default();
+        self.offset_um = 0.0;
+        self.area_um_s = 0.0;
+    }
+
+    /// Holds a command \[um of PZT displacement, absolute\] for `dt_s`.
+    ///
+    /// `dt_s = 0` lets the command take effect without letting time pass: the bead then stands just after its jump.
+    /// A command or a time that is not finite, and a negative time, are ignored: the last command is held.
+    pub fn advance(&mut self, command_um: f64, dt_s: f64) {
+        if command_um.is_finite() {
+            self.command_um = command_um - self.working_point_um;
+        }
+        if !(dt_s.is_finite() && dt_s >= 0.0) {
+            return;
+        }
+        let target = self
+            .command_um
+            .max(self.compiled.low)
+            .min(self.compiled.high);
+        let way = target - self.driver_um;
+        let reach_s = way.abs() / self.compiled.rate;
+        if reach_s > 0.0 && dt_s > 0.0 {
+            // The ramp up to the target, or as far as the time allows, and then the rest at the target: no corner
+            // falls within a piece.
+            let ramp_s = reach_s.min(dt_s);
+            let end = if reach_s <= dt_s {
+                target
+            } else {
+                self.driver_um + self.compiled.rate.copysign(way) * dt_s
+            };
+            self.divided(ramp_s, self.driver_um, end);
+            self.driver_um = end;
+            if dt_s > ramp_s {
+                self.divided(dt_s - ramp_s, end, end);
+            }
+        } else {
+            if reach_s == 0.0 {
+                self.driver_um = target;
+            }
+            self.divided(dt_s, self.driver_um, self.driver_um);
+        }
+    }
+
+    /// A straight line of the driver's output, in sub-steps where they are needed.
+    fn divided(&mut self, h_s: f64, start: f64, end: f64) {
+        if h_s <= self.compiled.substep_s {
+            self.piece(h_s, start, end);
+            return;
+        }
+        let n = (h_s / self.compiled.substep_s).ceil().min(1e6);
+        let h = h_s / n;
+        let rise = (end - start) / n;
+        let mut i = 0.0;
+        while i < n {
+            self.piece(h, start + rise * i, start + rise * (i + 1.0));
+            i += 1.0;
+        }
+    }
+
+    fn piece(&mut self, h_s: f64, start: f64, end: f64) {
+        let want = self.compiled.needs_slopes || self.wants_area;
+        let mut signal = Segment::line(start, end, h_s);
+        for stage in &mut self.compiled.stages {
+            signal = match stage {
+                Stage::Linear(group) => group.advance(h_s, signal, want),
+                Stage::Block(block) => block.advance(self.time_s, h_s, signal),
+            };
+        }
+        self.output = signal;
+        if self.wants_area {
+            self.area_um_s += signal.integral + h_s * self.offset_um;
+        }
+        if let Some(b) = &mut self.brownian {
+            if b.on && h_s > 0.0 {
+                let variance = 2.0 * b.diffusion_um2_per_s * h_s;
+                let step = variance.sqrt() * b.gaussian.next_normal();
+                if self.wants_area {
+                    // The integral of a Brownian path given its ends: mean of the ends, variance 2 D h^3/12.
+                    self.area_um_s +=
+                        h_s * (0.5 * step + (variance / 12.0).sqrt() * b.gaussian.next_normal());
+                }
+                self.offset_um += step;
+            }
+        }
+        self.time_s += h_s;
+    }
+
+    /// Time since the start, s.
+    pub fn time_s(&self) -> f64 {
+        self.time_s
+    }
+
+    /// The true bead position now, um.
+    pub fn bead_um(&self) -> f64 {
+        self.output.end + self.offset_um
+    }
+
+    /// Integral of the bead position since the start, um s; kept only after [`Self::keep_area`].
+    pub(crate) fn area_um_s(&self) -> f64 {
+        self.area_um_s
+    }
+
+    /// The displacement that the PZT has really reached, um, absolute: after driver, hysteresis, creep, resonance and
+    /// backlash.
+    pub fn pzt_um(&self) -> f64 {
+        let reached = match self.compiled.stages.get(self.compiled.plant) {
+            Some(Stage::Linear(group)) => group.tapped(),
+            _ => self.driver_um,
+        };
+        self.working_point_um + reached
+    }
+
+    /// The displacement that the driver asks of the PZT after saturation and slew limit, um, absolute.
+    pub fn driver_um(&self) -> f64 {
+        self.working_point_um + self.driver_um
+    }
+
+    /// The speed of the flow that carries the bead, um/s, before adhesion holds the bead back.
+    pub fn flow_um_per_s(&self) -> f64 {
+        let mut speed = 0.0;
+        for stage in &self.compiled.stages {
+            match stage {
+                Stage::Linear(group) => speed = group.speed(),
+                Stage::Block(Block::GainDrift { per_s, .. }) => {
+                    speed *= 1.0 + per_s * self.time_s;
+                }
+                Stage::Block(Block::FlowDrift { speed: drift }) => speed += drift,
+                Stage::Block(Block::Dissolving { speed: own, .. }) => speed = *own,
+                Stage::Block(_) => {}
+            }
+        }
+        speed
+    }
+
+    /// Puts the bead somewhere else, um: another bead is chosen, or the origin is moved.
+    pub fn place_bead(&mut self, bead_um: f64) {
+        self.offset_um += bead_um - self.bead_um();
+    }
+}
