@@ -1,0 +1,256 @@
+//! The camera of the emulated world: when it exposes, what it saw, when it delivers, and what goes wrong on the way.
+
+use crate::config::WorldConfig;
+use crate::faults::{FaultKind, Faults};
+use crate::random::{stream_of, uniform};
+use cellpos_plant::{Effect, Model};
+use cellpos_vision::Verdict;
+use rand_xoshiro::Xoshiro256PlusPlus;
+use std::collections::VecDeque;
+
+/// The path during an exposure is sampled at both ends and in between, this many intervals.
+pub(crate) const EXPOSURE_STEPS: usize = 4;
+/// Frames that wait for delivery at most; beyond that the oldest are lost, as in any camera's buffer.
+const QUEUE_LEN: usize = 256;
+/// A stale frame shows what was seen this many frames before.
+const STALE_BY: usize = 5;
+
+/// What is known of a delivered frame besides its pixels. Times are those given to the world.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct FrameInfo {
+    /// Rises by one per exposed frame, from 0.
+    pub id: u64,
+    /// Middle of the exposure, ns.
+    pub mid_exposure_ns: i64,
+    /// Exposure time, ns.
+    pub exposure_ns: i64,
+    /// Delivery, ns.
+    pub delivery_ns: i64,
+    /// True bead position along the channel, mean over the exposure, um.
+    pub true_um: f64,
+    /// True bead position across the channel, mean over the exposure, um.
+    pub true_lateral_um: f64,
+    /// Part of the exposure for which the LED was lit, 0..1.
+    pub lit: f64,
+}
+
+/// A position delivered without a picture.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PositionFix {
+    /// As of the frame that would have been delivered.
+    pub info: FrameInfo,
+    /// Measured position along the channel, um; NaN unless the verdict is good.
+    pub x_um: f64,
+    /// Variance of the measured position, um^2; NaN unless the verdict is good.
+    pub variance_um2: f64,
+    /// Peak contrast over the noise of one background pixel.
+    pub snr: f64,
+    /// What vision would say of the picture.
+    pub verdict: Verdict,
+}
+
+/// One point of the path: true and apparent position, um.
+#[derive(Debug, Clone, Copy, Default)]
+pub(crate) struct Sample {
+    pub true_um: f64,
+    pub lateral_um: f64,
+    pub seen_um: f64,
+    /// Position of a second bead, if there is one.
+    pub second_um: Option<(f64, f64)>,
+    pub visible: bool,
+    pub lit: bool,
+}
+
+/// What one exposure saw.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Exposure {
+    pub id: u64,
+    pub mid_ns: i64,
+    pub samples: [Sample; EXPOSURE_STEPS + 1],
+}
+
+#[derive(Debug, Clone, Copy)]
+struct Pending {
+    exposure: Exposure,
+    delivery_ns: i64,
+}
+
+#[derive(Debug, Clone)]
+pub(crate) struct Camera {
+    start_ns: i64,
+    period_ns: f64,
+    pub(crate) exposure_ns: i64,
+    latency_ns: i64,
+    faults: Faults,
+    next_id: u64,
+    samples: [Sample; EXPOSURE_STEPS + 1],
+    taken: usize,
+    queue: VecDeque<Pending>,
+    recent: VecDeque<Exposure>,
+    rng: Xoshiro256PlusPlus,
+}
+
+impl Camera {
+    pub(crate) fn new(config: &WorldConfig, model: &Model, start_ns: i64) -> Self {
+        let mut camera = Self {
+            start_ns,
+            period_ns: 1e9 / config.rate_hz,
+            exposure_ns: (config.exposure_ms * 1e6).round() as i64,
+            latency_ns: (config.latency_ms * 1e6).round() as i64,
+            faults: config.faults.clone(),
+            next_id: 0,
+            samples: [Sample::default(); EXPOSURE_STEPS + 1],
+            taken: 0,
+            queue: VecDeque::with_capacity(QUEUE_LEN + 2),
+            recent: VecDeque::with_capacity(STALE_BY + 1),
+            rng: stream_of(config.seed, 20),
+        };
+        camera.take_over(model);
+        camera
+    }
+
+    /// Effects at the camera's place say what this camera is like; they take the place of the world's own figures.
+    fn take_over(&mut self, model: &Model) {
+        let mut delay_ns = None;
+        for effect in &model.effects {
+            match *effect {
+                Effect::ExposureAveraging { exposure_s } => {
+                    self.exposure_ns = ((exposure_s * 1e9) as i64).min(self.period_ns as i64);
+                }
+                Effect::TimeDelay { delay_s } => delay_ns = Some((delay_s * 1e9).round() as i64),
+                Effect::FrameDrops { rate } => self.faults.drop_rate = rate,
+                Effect::FrameRepeats { rate } => self.faults.double_rate = rate,
+                Effect::ClockSkew { ppm } => self.period_ns *= 1.0 + 1e-6 * ppm,
+                _ => {}
+            }
+        }
+        if let Some(delay_ns) = delay_ns {
+            // In a model the exposure ends with the frame, so its middle is half an exposure older.
+            self.latency_ns = delay_ns + self.exposure_ns / 2;
+        }
+        self.latency_ns = self.latency_ns.max(self.exposure_ns - self.exposure_ns / 2);
+    }
+
+    fn mid_ns(&self, id: u64) -> i64 {
+        self.start_ns + ((id + 1) as f64 * self.period_ns).round() as i64
+    }
+
+    /// When the bead has to be looked at next.
+    pub(crate) fn next_sample_ns(&self) -> i64 {
+        self.mid_ns(self.next_id) - self.exposure_ns / 2
+            + self.exposure_ns * self.taken as i64 / EXPOSURE_STEPS as i64
+    }
+
+    /// Takes the sample that was due; `true` when it was the last of an exposure.
+    pub(crate) fn sample(&mut self, sample: Sample) -> bool {
+        if self.exposure_ns == 0 {
+            self.samples = [sample; EXPOSURE_STEPS + 1];
+            self.taken = EXPOSURE_STEPS;
+        } else if let Some(place) = self.samples.get_mut(self.taken) {
+            *place = sample;
+        }
+        if self.taken < EXPOSURE_STEPS {
+            self.taken += 1;
+            return false;
+        }
+        self.taken = 0;
+        self.expose();
+        self.next_id += 1;
+        true
+    }
+
+    fn expose(&mut self) {
+        let now = Exposure {
+            id: self.next_id,
+            mid_ns: self.mid_ns(self.next_id),
+            samples: self.samples,
+        };
+        // All four are drawn for every frame, so that one rate does not shift the others' luck.
+        let luck: [f64; 4] = core::array::from_fn(|_| uniform(&mut self.rng));
+        let elapsed_ns = now.mid_ns - self.start_ns;
+        let hit = |kind, luck: f64, rate: f64| luck < rate || self.faults.active(kind, elapsed_ns);
+        let dropped = hit(FaultKind::DropFrames, luck[0], self.faults.drop_rate);
+        let stale = hit(FaultKind::StaleFrames, luck[1], self.faults.stale_rate);
+        let doubled = hit(FaultKind::DoubleFrames, luck[2], self.faults.double_rate);
+        let reordered = luck[3] < self.faults.reorder_rate
+            || (now.id.is_multiple_of(2)
+                && self.faults.active(FaultKind::ReorderFrames, elapsed_ns));
+        let shown = match self.recent.front() {
+            Some(old) if stale && self.recent.len() == STALE_BY => Exposure { id: now.id, ..*old },
+            _ => now,
+        };
+        if self.recent.len() == STALE_BY {
+            self.recent.pop_front();
+        }
+        self.recent.push_back(now);
+        if dropped {
+            return;
+        }
+        let mut delivery_ns = now.mid_ns + self.latency_ns;
+        if reordered {
+            delivery_ns += (1.5 * self.period_ns) as i64;
+        }
+        if let Some(end_ns) = self
+            .faults
+            .end_ns(FaultKind::StallCamera, delivery_ns - self.start_ns)
+        {
+            if end_ns == i64::MAX {
+                return;
+            }
+            delivery_ns = self.start_ns + end_ns;
+        }
+        self.enqueue(shown, delivery_ns);
+        if doubled {
+            self.enqueue(shown, delivery_ns + (0.5 * self.period_ns) as i64);
+        }
+    }
+
+    fn enqueue(&mut self, exposure: Exposure, delivery_ns: i64) {
+        let place = self
+            .queue
+            .iter()
+            .rposition(|waiting| waiting.delivery_ns <= delivery_ns)
+            .map_or(0, |before| before + 1);
+        self.queue.insert(
+            place,
+            Pending {
+                exposure,
+                delivery_ns,
+            },
+        );
+        if self.queue.len() > QUEUE_LEN {
+            self.queue.pop_front();
+        }
+    }
+
+    /// When the next frame is delivered, of those exposed so far.
+    pub(crate) fn next_delivery_ns(&self) -> Option<i64> {
+        self.queue.front().map(|pending| pending.delivery_ns)
+    }
+
+    /// The next frame that has been delivered by `now_ns`.
+    pub(crate) fn take(&mut self, now_ns: i64) -> Option<(Exposure, FrameInfo)> {
+        if self.next_delivery_ns()? > now_ns {
+            return None;
+        }
+        let Pending {
+            exposure,
+            delivery_ns,
+        } = self.queue.pop_front()?;
+        let path = exposure.samples.map(|s| (s.true_um, s.lateral_um));
+        let (true_um, true_lateral_um) =
+            crate::render::mean_between(&path, 0.0, EXPOSURE_STEPS as f64);
+        let light = exposure.samples.map(|s| (f64::from(u8::from(s.lit)), 0.0));
+        let (lit, _) = crate::render::mean_between(&light, 0.0, EXPOSURE_STEPS as f64);
+        let info = FrameInfo {
+            lit,
+            id: exposure.id,
+            mid_exposure_ns: exposure.mid_ns,
+            exposure_ns: self.exposure_ns,
+            delivery_ns,
+            true_um,
+            true_lateral_um,
+        };
+        Some((exposure, info))
+    }
+}

@@ -1,0 +1,248 @@
+//! How the emulated world is set up.
+
+use crate::faults::Faults;
+use serde::{Deserialize, Serialize};
+
+/// The emulated world, the table `[emulator]` of rig.toml. Every key may be left out.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct WorldConfig {
+    /// Fixes every random number.
+    pub seed: u64,
+    /// Plant and effects: `eq6` or the path of a model.toml.
+    pub model: String,
+    /// PZT displacement at which the bead is at rest, um. Takes the place of the model's working point.
+    pub neutral_um: f64,
+    /// Diffusion coefficient of the bead, um^2/s. Takes the place of the model's.
+    pub diffusion_um2_per_s: f64,
+    /// Flow that passes whatever the PZT does, um/s; added to a flow-drift of the model.
+    pub drift_um_per_s: f64,
+    /// Bead position at the start, um from the middle of the frame.
+    pub start_um: f64,
+    /// The frame follows the bead across the channel to within this distance of its middle line, um.
+    pub lateral_um: f64,
+    /// Pixels per row.
+    pub width_px: u16,
+    /// Rows.
+    pub height_px: u16,
+    /// Size of a pixel in the object plane, um.
+    pub pixel_um: f64,
+    /// Frames per second, Hz.
+    pub rate_hz: f64,
+    /// Exposure time, ms.
+    pub exposure_ms: f64,
+    /// From the middle of an exposure to the delivery of its frame, ms.
+    pub latency_ms: f64,
+    /// Radius of the bead, um: where its profile first crosses the background.
+    pub bead_radius_um: f64,
+    /// Contrast of the bead's middle against the background, grey levels of 8 bits.
+    pub contrast_grey: f64,
+    /// Background, grey levels.
+    pub background_grey: f64,
+    /// Noise without light, grey levels RMS.
+    pub read_noise_grey: f64,
+    /// Photo-electrons per grey level: shot noise of variance `grey / electrons_per_grey`.
+    pub electrons_per_grey: f64,
+    /// Localisation noise of positions delivered without pictures, um RMS. Left out: what the pictures would give.
+    pub localisation_um: Option<f64>,
+    /// When the bead has been out of the frame for this long and the flow is slow, a new one comes, ms. Left out: never.
+    pub new_bead_after_ms: Option<f64>,
+    /// What goes wrong.
+    pub faults: Faults,
+}
+
+impl Default for WorldConfig {
+    fn default() -> Self {
+        Self {
+            seed: 1,
+            model: "eq6".to_owned(),
+            neutral_um: 20.0,
+            diffusion_um2_per_s: 0.33,
+            drift_um_per_s: 3.0,
+            start_um: 0.0,
+            lateral_um: 0.25,
+            width_px: 256,
+            height_px: 32,
+            pixel_um: 0.1,
+            rate_hz: 1000.0,
+            exposure_ms: 0.5,
+            latency_ms: 2.0,
+            bead_radius_um: 0.5,
+            contrast_grey: 80.0,
+            background_grey: 100.0,
+            read_noise_grey: 1.0,
+            electrons_per_grey: 40.0,
+            localisation_um: None,
+            new_bead_after_ms: None,
+            faults: Faults::default(),
+        }
+    }
+}
+
+/// Why there is no such world.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum WorldError {
+    /// A value that cannot be.
+    #[error("[emulator] `{key}` is {value}, must be {must}")]
+    Value {
+        /// Key.
+        key: &'static str,
+        /// Value found.
+        value: f64,
+        /// What would be right, with the unit.
+        must: &'static str,
+    },
+    /// The model cannot be run.
+    #[error("[emulator] `model`: {0}")]
+    Model(String),
+}
+
+impl WorldConfig {
+    /// Column of position 0: the middle of the frame, px (pixel centres at whole numbers).
+    pub fn origin_x_px(&self) -> f64 {
+        0.5 * (f64::from(self.width_px) - 1.0)
+    }
+
+    /// Row of the middle line of the frame, px.
+    pub fn origin_y_px(&self) -> f64 {
+        0.5 * (f64::from(self.height_px) - 1.0)
+    }
+
+    /// Position along the channel of a column, um.
+    pub fn um_from_px(&self, x_px: f64) -> f64 {
+        (x_px - self.origin_x_px()) * self.pixel_um
+    }
+
+    /// Column of a position along the channel, px.
+    pub fn px_from_um(&self, x_um: f64) -> f64 {
+        self.origin_x_px() + x_um / self.pixel_um
+    }
+
+    /// Radius of the bead, px.
+    pub fn bead_radius_px(&self) -> f64 {
+        self.bead_radius_um / self.pixel_um
+    }
+
+    /// Time from frame to frame, ns.
+    pub fn period_ns(&self) -> i64 {
+        (1e9 / self.rate_hz).round() as i64
+    }
+
+    /// Checks every value.
+    ///
+    /// # Errors
+    /// [`WorldError::Value`] for the first value that cannot be.
+    pub fn validate(&self) -> Result<(), WorldError> {
+        let within = |key, value: f64, low: f64, high: f64, must| {
+            if (low..=high).contains(&value) {
+                Ok(())
+            } else {
+                Err(WorldError::Value { key, value, must })
+            }
+        };
+        within(
+            "neutral_um",
+            self.neutral_um,
+            -2000.0,
+            2000.0,
+            "-2000..2000 um",
+        )?;
+        within(
+            "diffusion_um2_per_s",
+            self.diffusion_um2_per_s,
+            0.0,
+            1e4,
+            "0..10000 um^2/s",
+        )?;
+        within(
+            "drift_um_per_s",
+            self.drift_um_per_s,
+            -1e4,
+            1e4,
+            "-10000..10000 um/s",
+        )?;
+        within("start_um", self.start_um, -1e4, 1e4, "-10000..10000 um")?;
+        within(
+            "width_px",
+            f64::from(self.width_px),
+            8.0,
+            4096.0,
+            "8..4096 px",
+        )?;
+        within(
+            "height_px",
+            f64::from(self.height_px),
+            8.0,
+            4096.0,
+            "8..4096 px",
+        )?;
+        within("pixel_um", self.pixel_um, 1e-3, 100.0, "0.001..100 um")?;
+        let half_height_um = 0.5 * f64::from(self.height_px) * self.pixel_um;
+        within(
+            "lateral_um",
+            self.lateral_um,
+            0.0,
+            half_height_um,
+            "0 um to half the frame's height",
+        )?;
+        within("rate_hz", self.rate_hz, 1.0, 20_000.0, "1..20000 Hz")?;
+        let period_ms = 1000.0 / self.rate_hz;
+        within(
+            "exposure_ms",
+            self.exposure_ms,
+            0.0,
+            period_ms,
+            "0 ms to one frame period",
+        )?;
+        let least_ms = 0.5 * self.exposure_ms;
+        within(
+            "latency_ms",
+            self.latency_ms,
+            least_ms,
+            100.0 * period_ms,
+            "half the exposure to 100 frame periods, in ms",
+        )?;
+        within(
+            "bead_radius_um",
+            self.bead_radius_um,
+            self.pixel_um,
+            100.0 * self.pixel_um,
+            "1..100 pixels, in um",
+        )?;
+        within(
+            "contrast_grey",
+            self.contrast_grey,
+            -255.0,
+            255.0,
+            "-255..255 grey levels",
+        )?;
+        within(
+            "background_grey",
+            self.background_grey,
+            0.0,
+            255.0,
+            "0..255 grey levels",
+        )?;
+        within(
+            "read_noise_grey",
+            self.read_noise_grey,
+            0.0,
+            100.0,
+            "0..100 grey levels",
+        )?;
+        within(
+            "electrons_per_grey",
+            self.electrons_per_grey,
+            1e-3,
+            1e9,
+            "above 0",
+        )?;
+        if let Some(um) = self.localisation_um {
+            within("localisation_um", um, 0.0, 100.0, "0..100 um")?;
+        }
+        if let Some(ms) = self.new_bead_after_ms {
+            within("new_bead_after_ms", ms, 0.0, 1e9, "0 or more ms")?;
+        }
+        self.faults.validate()
+    }
+}

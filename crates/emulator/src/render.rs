@@ -1,0 +1,328 @@
+//! From bead positions to grey values.
+//!
+//! Only the neighbourhood of a bead is computed; everything else is background, whose noise is drawn beforehand into a
+//! long strip of grey values from which each row takes a piece at a random place. A piece comes again after some hundred
+//! thousand pixels, at another place of another frame.
+
+use crate::config::WorldConfig;
+use crate::random::{Gaussian, stream_of};
+use cellpos_vision::{PixelResponse, RadialProfile, RingProfile, Template};
+use rand_core::Rng;
+use rand_xoshiro::Xoshiro256PlusPlus;
+
+/// A bead's path is replaced by points no further apart than this; the error of the blur is of second order in it.
+const POINT_SPACING_PX: f64 = 0.25;
+const MAX_POINTS: usize = 16;
+const STRIP_LEN: usize = 1 << 18;
+/// Light of the LED over a whole exposure, grey levels.
+const LED_GREY: f64 = 60.0;
+const GAUSSIAN_LEN: usize = 1 << 16;
+
+/// Points that stand for the path of a bead during an exposure, px.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Blur {
+    points: [(f32, f32); MAX_POINTS],
+    count: usize,
+}
+
+impl Blur {
+    /// Reduces a path, sampled at equal times with the weights of the trapezoidal rule, to as few points as the spacing allows.
+    pub(crate) fn along(path: &[(f64, f64)]) -> Self {
+        let mut blur = Self {
+            points: [(0.0, 0.0); MAX_POINTS],
+            count: 1,
+        };
+        let length_px = path
+            .windows(2)
+            .map(|w| (w[1].0 - w[0].0).hypot(w[1].1 - w[0].1))
+            .sum::<f64>();
+        let wanted = (length_px / POINT_SPACING_PX).ceil().max(1.0);
+        blur.count = (wanted as usize).min(MAX_POINTS);
+        let last = path.len().saturating_sub(1);
+        for (k, point) in blur.points.iter_mut().enumerate().take(blur.count) {
+            // The mean over the k-th of `count` equal parts of the exposure.
+            let (from, to) = (
+                last as f64 * k as f64 / blur.count as f64,
+                last as f64 * (k + 1) as f64 / blur.count as f64,
+            );
+            let (x, y) = mean_between(path, from, to);
+            *point = (x as f32, y as f32);
+        }
+        blur
+    }
+
+    pub(crate) fn points(&self) -> &[(f32, f32)] {
+        &self.points[..self.count]
+    }
+}
+
+/// Time average of the piecewise linear path between the sample numbers `from` and `to`.
+pub(crate) fn mean_between(path: &[(f64, f64)], from: f64, to: f64) -> (f64, f64) {
+    let at = |u: f64| {
+        let i = (u as usize).min(path.len().saturating_sub(2));
+        let t = u - i as f64;
+        match (path.get(i), path.get(i + 1)) {
+            (Some(a), Some(b)) => (a.0 + t * (b.0 - a.0), a.1 + t * (b.1 - a.1)),
+            (Some(a), None) => *a,
+            _ => (0.0, 0.0),
+        }
+    };
+    if to <= from {
+        return at(from);
+    }
+    let (mut x, mut y) = (0.0, 0.0);
+    let mut u = from;
+    while u < to {
+        let next = (u.floor() + 1.0).min(to);
+        let (a, b) = (at(u), at(next));
+        x += 0.5 * (a.0 + b.0) * (next - u);
+        y += 0.5 * (a.1 + b.1) * (next - u);
+        u = next;
+    }
+    (x / (to - from), y / (to - from))
+}
+
+/// Draws frames.
+#[derive(Debug, Clone)]
+pub(crate) struct Renderer {
+    width: usize,
+    height: usize,
+    background: f32,
+    contrast: f32,
+    read_variance: f32,
+    grey_per_electron: f32,
+    template: Template,
+    support_px: f32,
+    /// Grey values of background with noise.
+    strip: Vec<u8>,
+    gaussian: Vec<f32>,
+    rng: Xoshiro256PlusPlus,
+}
+
+impl Renderer {
+    /// `None` when the bead's radius makes no profile.
+    pub(crate) fn new(config: &WorldConfig) -> Option<Self> {
+        let profile = RingProfile::new(config.bead_radius_px())?;
+        let template = Template::new(&profile, PixelResponse::Point);
+        let mut noise = Gaussian::new(config.seed, 10);
+        let gaussian: Vec<f32> = (0..GAUSSIAN_LEN).map(|_| noise.normal() as f32).collect();
+        let read_variance = (config.read_noise_grey * config.read_noise_grey) as f32;
+        let grey_per_electron = (1.0 / config.electrons_per_grey) as f32;
+        let background = config.background_grey as f32;
+        let sd = f64::from(background * grey_per_electron + read_variance).sqrt();
+        let strip = (0..STRIP_LEN + usize::from(config.width_px))
+            .map(|_| grey(background + (sd * noise.normal()) as f32))
+            .collect();
+        Some(Self {
+            width: usize::from(config.width_px),
+            height: usize::from(config.height_px),
+            background,
+            contrast: config.contrast_grey as f32,
+            read_variance,
+            grey_per_electron,
+            support_px: profile.support_px() as f32,
+            template,
+            strip,
+            gaussian,
+            rng: stream_of(config.seed, 11),
+        })
+    }
+
+    /// Draws the beads (none, one or two) into `pixels`, which is brought to the frame's size. `lit` is the part of the
+    /// exposure for which the LED added its light.
+    pub(crate) fn draw(&mut self, beads: &[Blur], lit: f64, pixels: &mut Vec<u8>) {
+        self.draw_beads(beads, pixels);
+        let light = grey((lit * LED_GREY) as f32);
+        if light > 0 {
+            for pixel in pixels {
+                *pixel = pixel.saturating_add(light);
+            }
+        }
+    }
+
+    fn draw_beads(&mut self, beads: &[Blur], pixels: &mut Vec<u8>) {
+        pixels.resize(self.width * self.height, 0);
+        for row in pixels.chunks_exact_mut(self.width) {
+            let from = (self.rng.next_u64() >> 40) as usize % STRIP_LEN;
+            if let Some(piece) = self.strip.get(from..from + row.len()) {
+                row.copy_from_slice(piece);
+            }
+        }
+        let Some((columns, rows)) = self.neighbourhood(beads) else {
+            return;
+        };
+        let (first_column, reach2) = (columns.0, self.support_px * self.support_px);
+        for (y, row) in pixels
+            .chunks_exact_mut(self.width)
+            .enumerate()
+            .take(rows.1)
+            .skip(rows.0)
+        {
+            let Some(row) = row.get_mut(columns.0..columns.1) else {
+                continue;
+            };
+            let mut at = (self.rng.next_u64() >> 48) as usize;
+            for (i, pixel) in row.iter_mut().enumerate() {
+                let x = (first_column + i) as f32;
+                let mut value = 0.0;
+                let mut near = false;
+                for bead in beads {
+                    let mut sum = 0.0;
+                    for &(bx, by) in bead.points() {
+                        let (dx, dy) = (x - bx, y as f32 - by);
+                        let q = dx * dx + dy * dy;
+                        if q < reach2 {
+                            sum += self.template.value_at_squared(q);
+                            near = true;
+                        }
+                    }
+                    value += sum / bead.points().len() as f32;
+                }
+                if near {
+                    let level = (self.background + self.contrast * value).max(0.0);
+                    let sd = (level * self.grey_per_electron + self.read_variance).sqrt();
+                    at = (at + 1) & (GAUSSIAN_LEN - 1);
+                    *pixel = grey(level + sd * self.gaussian.get(at).copied().unwrap_or(0.0));
+                }
+            }
+        }
+    }
+
+    /// Columns and rows (from, to) that hold all beads' neighbourhoods; `None` when none is in the frame.
+    fn neighbourhood(&self, beads: &[Blur]) -> Option<((usize, usize), (usize, usize))> {
+        let span = |low: f32, high: f32, length: usize| {
+            // `as` takes what is below 0 to 0.
+            let from = ((low - self.support_px).floor().max(0.0) as usize).min(length);
+            let to = ((high + self.support_px).ceil() + 1.0).max(0.0) as usize;
+            (from, to.min(length))
+        };
+        let points = || beads.iter().flat_map(|bead| bead.points());
+        let bounds = |pick: fn(&(f32, f32)) -> f32| {
+            points()
+                .map(pick)
+                .fold((f32::INFINITY, f32::NEG_INFINITY), |(a, b), v| {
+                    (a.min(v), b.max(v))
+                })
+        };
+        let (x, y) = (bounds(|p| p.0), bounds(|p| p.1));
+        if x.0 > x.1 {
+            return None;
+        }
+        let (columns, rows) = (span(x.0, x.1, self.width), span(y.0, y.1, self.height));
+        (columns.0 < columns.1 && rows.0 < rows.1).then_some((columns, rows))
+    }
+}
+
+/// A grey value as the camera's converter makes it: rounded, clipped to 0..255.
+fn grey(level: f32) -> u8 {
+    (level + 0.5) as u8
+}
+
+/// Smallest standard deviation of x that any unbiased localiser can reach on the rendered frames of a bead in mid-frame,
+/// um: the Cramer-Rao bound for position, contrast and background unknown.
+///
+/// By symmetry x is uncorrelated with y, contrast and background, so the information of x alone decides.
+pub(crate) fn localisation_bound_um(config: &WorldConfig) -> Option<f64> {
+    let profile = RingProfile::new(config.bead_radius_px())?;
+    let (x0, y0) = (config.origin_x_px(), config.origin_y_px());
+    let mut information = 0.0;
+    for y in 0..config.height_px {
+        for x in 0..config.width_px {
+            let (dx, dy) = (f64::from(x) - x0, f64::from(y) - y0);
+            let r = dx.hypot(dy);
+            if r > profile.support_px() {
+                continue;
+            }
+            let level = (config.background_grey + config.contrast_grey * profile.value(r)).max(0.0);
+            // Rounding to whole grey levels adds a twelfth.
+            let variance = level / config.electrons_per_grey
+                + config.read_noise_grey * config.read_noise_grey
+                + 1.0 / 12.0;
+            let slope = if r > 0.0 {
+                config.contrast_grey * profile.slope(r) * dx / r
+            } else {
+                0.0
+            };
+            information += slope * slope / variance;
+        }
+    }
+    (information > 0.0).then(|| config.pixel_um / information.sqrt())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_short_path_becomes_one_point_and_a_long_one_many_with_the_same_mean() {
+        let still = Blur::along(&[(5.0, 1.0); 5]);
+        assert_eq!(still.points(), [(5.0, 1.0)]);
+        let path = [(0.0, 0.0), (1.0, 0.0), (3.0, 0.0), (3.5, 0.0), (4.0, 0.0)];
+        let blur = Blur::along(&path);
+        assert_eq!(blur.points().len(), 16);
+        let mean = blur.points().iter().map(|p| f64::from(p.0)).sum::<f64>() / 16.0;
+        let trapezoid = (0.5 * 0.0 + 1.0 + 3.0 + 3.5 + 0.5 * 4.0) / 4.0;
+        assert!((mean - trapezoid).abs() < 1e-6);
+        assert!((mean_between(&path, 0.0, 4.0).0 - trapezoid).abs() < 1e-12);
+    }
+
+    #[test]
+    fn the_background_has_the_level_and_the_noise_that_were_set() {
+        let config = WorldConfig::default();
+        let mut renderer = Renderer::new(&config).unwrap();
+        let mut pixels = Vec::new();
+        let (mut sum, mut square, mut n) = (0.0, 0.0, 0.0);
+        for _ in 0..50 {
+            renderer.draw(&[], 0.0, &mut pixels);
+            for &pixel in &pixels {
+                sum += f64::from(pixel);
+                square += f64::from(pixel) * f64::from(pixel);
+                n += 1.0;
+            }
+        }
+        let mean = sum / n;
+        let variance = square / n - mean * mean;
+        let expected = 100.0 / 40.0 + 1.0 + 1.0 / 12.0;
+        assert!((mean - 100.0).abs() < 0.03, "{mean}");
+        assert!(
+            (variance / expected - 1.0).abs() < 0.02,
+            "{variance} against {expected}"
+        );
+    }
+
+    #[test]
+    fn pixels_on_the_bead_have_the_shot_noise_of_their_own_level() {
+        let config = WorldConfig::default();
+        let mut renderer = Renderer::new(&config).unwrap();
+        let bead = Blur::along(&[(128.0, 16.0)]);
+        let centre = 16 * 256 + 128;
+        let mut pixels = Vec::new();
+        let values: Vec<f64> = (0..4000)
+            .map(|_| {
+                renderer.draw(&[bead], 0.0, &mut pixels);
+                f64::from(pixels[centre])
+            })
+            .collect();
+        let mean = values.iter().sum::<f64>() / 4000.0;
+        let variance = values.iter().map(|v| (v - mean).powi(2)).sum::<f64>() / 4000.0;
+        let expected = 180.0 / 40.0 + 1.0 + 1.0 / 12.0;
+        assert!((mean - 180.0).abs() < 0.2, "{mean}");
+        assert!(
+            (variance / expected - 1.0).abs() < 0.12,
+            "{variance} against {expected}"
+        );
+    }
+
+    #[test]
+    fn a_bead_beyond_the_border_draws_nothing_and_one_on_it_is_cut() {
+        let config = WorldConfig::default();
+        let mut renderer = Renderer::new(&config).unwrap();
+        let mut pixels = Vec::new();
+        for x in [-1e6, -40.0, 300.0, 1e9] {
+            renderer.draw(&[Blur::along(&[(x, 16.0)])], 0.0, &mut pixels);
+            assert!(pixels.iter().all(|&p| p < 130), "bead at {x}");
+        }
+        renderer.draw(&[Blur::along(&[(0.0, 16.0)])], 0.0, &mut pixels);
+        assert!(pixels[16 * 256] > 150);
+    }
+}

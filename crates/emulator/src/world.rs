@@ -1,0 +1,372 @@
+//! The world: everything between the board's output and the camera's delivery.
+
+use crate::camera::{Camera, EXPOSURE_STEPS, Exposure, FrameInfo, PositionFix, Sample};
+use crate::config::{WorldConfig, WorldError};
+use crate::faults::FaultKind;
+use crate::random::Gaussian;
+use crate::render::{Blur, Renderer, localisation_bound_um, mean_between};
+use cellpos_plant::{Chain, Effect, Model, Noise};
+use cellpos_vision::Verdict;
+use std::f64::consts::TAU;
+
+/// The emulated world. Times are nanoseconds of whatever clock the caller keeps, starting at `start_ns`.
+///
+/// ```
+/// use cellpos_emulator::{World, WorldConfig};
+/// use cellpos_plant::Model;
+/// let mut world = World::new(&WorldConfig::default(), &Model::eq6(), 0).unwrap();
+/// let mut pixels = Vec::new();
+/// while let None = world.take_frame(&mut pixels) {
+///     // The board's output stands at 20 um, where the bead is at rest, for another 0.1 ms.
+///     world.advance_to(world.now_ns() + 100_000, 20.0);
+/// }
+/// // The first frame is exposed about 1 ms and delivered 2 ms later.
+/// assert_eq!(world.now_ns(), 3_000_000);
+/// assert_eq!(pixels.len(), 256 * 32);
+/// ```
+#[derive(Debug, Clone)]
+pub struct World {
+    config: WorldConfig,
+    chain: Chain,
+    camera: Camera,
+    renderer: Renderer,
+    start_ns: i64,
+    now_ns: i64,
+    /// From the chain's bead to the one in view: start, drift, a new bead, time spent stuck.
+    offset_um: f64,
+    lateral_um: f64,
+    /// Second bead: distance along the channel from the first, and position across it.
+    second_um: Option<(f64, f64)>,
+    stuck_um: Option<f64>,
+    brownian: Gaussian,
+    localisation: Gaussian,
+    localisation_um: f64,
+    snr: f64,
+    /// Exposure since which the bead has been out of the frame.
+    out_since_ns: Option<i64>,
+    /// Effects of the model on light and table.
+    image_effects: Vec<Effect>,
+    led: bool,
+    has_events: bool,
+}
+
+impl World {
+    /// A world at `start_ns` with the bead at [`WorldConfig::start_um`] and the PZT resting at neutral.
+    ///
+    /// The configuration's neutral and diffusion take the place of the model's; effects of the model at the camera's
+    /// place (delay, exposure, drops, repeats, clock skew) take the place of the configuration's figures.
+    ///
+    /// # Errors
+    /// [`WorldError`] names the value that cannot be.
+    pub fn new(config: &WorldConfig, model: &Model, start_ns: i64) -> Result<Self, WorldError> {
+        config.validate()?;
+        let mut running = model.clone();
+        running.working_point_um = config.neutral_um;
+        running.noise = Noise {
+            diffusion_um2_per_s: config.diffusion_um2_per_s,
+            localisation_um: 0.0,
+        };
+        let chain = Chain::with_brownian_motion(&running, config.seed)
+            .map_err(|error| WorldError::Model(error.to_string()))?;
+        let radius = WorldError::Value {
+            key: "bead_radius_um",
+            value: config.bead_radius_um,
+            must: "above 0 um",
+        };
+        let renderer = Renderer::new(config).ok_or(radius)?;
+        let localisation_um = match config.localisation_um {
+            Some(um) => um,
+            None => localisation_bound_um(config).ok_or(WorldError::Value {
+                key: "contrast_grey",
+                value: config.contrast_grey,
+                must: "different from 0, or `localisation_um` given",
+            })?,
+        };
+        let pixel_variance = config.background_grey / config.electrons_per_grey
+            + config.read_noise_grey * config.read_noise_grey
+            + 1.0 / 12.0;
+        Ok(Self {
+            camera: Camera::new(config, model, start_ns),
+            offset_um: config.start_um - chain.bead_um(),
+            chain,
+            renderer,
+            start_ns,
+            now_ns: start_ns,
+            lateral_um: 0.0,
+            second_um: None,
+            stuck_um: None,
+            brownian: Gaussian::new(config.seed, 1),
+            localisation: Gaussian::new(config.seed, 2),
+            localisation_um,
+            snr: config.contrast_grey.abs() / pixel_variance.sqrt(),
+            out_since_ns: None,
+            image_effects: model
+                .effects
+                .iter()
+                .filter(|e| matches!(e, Effect::PixelLocking { .. } | Effect::MainsHum { .. }))
+                .cloned()
+                .collect(),
+            led: false,
+            has_events: !config.faults.event.is_empty(),
+            config: config.clone(),
+        })
+    }
+
+    /// The configuration it was made from.
+    pub fn config(&self) -> &WorldConfig {
+        &self.config
+    }
+
+    /// Time up to which the world has been advanced, ns.
+    pub fn now_ns(&self) -> i64 {
+        self.now_ns
+    }
+
+    /// True bead position along the channel now, um.
+    pub fn bead_um(&self) -> f64 {
+        self.stuck_um
+            .unwrap_or(self.chain.bead_um() + self.offset_um)
+    }
+
+    /// True bead position across the channel now, um from the middle line of the frame.
+    pub fn lateral_um(&self) -> f64 {
+        self.lateral_um
+    }
+
+    /// True PZT displacement now, um.
+    pub fn pzt_um(&self) -> f64 {
+        self.chain.pzt_um()
+    }
+
+    /// Standard deviation of positions delivered without pictures, um RMS.
+    pub fn localisation_um(&self) -> f64 {
+        self.localisation_um
+    }
+
+    /// Whether any part of the bead's disc is within the frame.
+    pub fn bead_in_frame(&self) -> bool {
+        self.is_in_frame(self.bead_um())
+    }
+
+    fn is_in_frame(&self, x_um: f64) -> bool {
+        let half_um = 0.5 * f64::from(self.config.width_px) * self.config.pixel_um;
+        x_um.abs() < half_um + self.config.bead_radius_um
+    }
+
+    /// Advances to `t_ns` while the board's output stands at `applied_um`; does nothing for a time that is past.
+    ///
+    /// A new output takes effect at the world's present time: call this up to the instant of the change with the old output, then
+    /// go on with the new one.
+    pub fn advance_to(&mut self, t_ns: i64, applied_um: f64) {
+        loop {
+            let sample_ns = self.camera.next_sample_ns();
+            if sample_ns > t_ns {
+                break;
+            }
+            self.step_to(sample_ns, applied_um);
+            let sample = self.look();
+            if self.camera.sample(sample) {
+                self.after_frame();
+            }
+        }
+        self.step_to(t_ns, applied_um);
+    }
+
+    fn active(&self, kind: FaultKind) -> bool {
+        self.has_events && self.config.faults.active(kind, self.now_ns - self.start_ns)
+    }
+
+    fn step_to(&mut self, t_ns: i64, applied_um: f64) {
+        if t_ns <= self.now_ns {
+            return;
+        }
+        let dt_s = (t_ns - self.now_ns) as f64 * 1e-9;
+        self.chain.advance(applied_um, dt_s);
+        self.offset_um += self.config.drift_um_per_s * dt_s;
+        let spread_um = (2.0 * self.config.diffusion_um2_per_s * dt_s).sqrt();
+        self.lateral_um = confined(
+            self.lateral_um + spread_um * self.brownian.normal(),
+            self.config.lateral_um,
+        );
+        self.now_ns = t_ns;
+        if self.has_events {
+            self.follow_events(spread_um);
+        }
+    }
+
+    fn follow_events(&mut self, spread_um: f64) {
+        self.second_um = if self.active(FaultKind::SecondBead) {
+            let (along, across) = self
+                .second_um
+                .unwrap_or((self.config.faults.second_bead_um, 0.0));
+            // Both beads diffuse: their distance spreads with twice the variance.
+            Some((
+                along + std::f64::consts::SQRT_2 * spread_um * self.brownian.normal(),
+                confined(
+                    across + spread_um * self.brownian.normal(),
+                    self.config.lateral_um,
+                ),
+            ))
+        } else {
+            None
+        };
+        match (self.active(FaultKind::StickBead), self.stuck_um) {
+            (true, None) => self.stuck_um = Some(self.bead_um()),
+            (false, Some(stuck_um)) => {
+                self.offset_um = stuck_um - self.chain.bead_um();
+                self.stuck_um = None;
+            }
+            _ => {}
+        }
+    }
+
+    fn look(&self) -> Sample {
+        let true_um = self.bead_um();
+        Sample {
+            true_um,
+            lateral_um: self.lateral_um,
+            seen_um: self.apparent_um(true_um),
+            second_um: self
+                .second_um
+                .map(|(along, across)| (self.apparent_um(true_um + along), across)),
+            visible: !self.active(FaultKind::LoseBead),
+            lit: self.led,
+        }
+    }
+
+    /// Where the camera sees what is at `x_um`: the model's effects on light and table.
+    fn apparent_um(&self, x_um: f64) -> f64 {
+        let mut seen_um = x_um;
+        for effect in &self.image_effects {
+            match *effect {
+                Effect::PixelLocking {
+                    pixel_um,
+                    amplitude,
+                    phase_deg,
+                } => {
+                    seen_um += amplitude
+                        * pixel_um
+                        * (TAU * x_um / pixel_um + phase_deg.to_radians()).sin();
+                }
+                Effect::MainsHum { hz, um, phase_deg } => {
+                    let t_s = (self.now_ns - self.start_ns) as f64 * 1e-9;
+                    seen_um += um * (TAU * hz * t_s + phase_deg.to_radians()).sin();
+                }
+                _ => {}
+            }
+        }
+        seen_um
+    }
+
+    fn after_frame(&mut self) {
+        let bead_um = self.bead_um();
+        let Some(after_ms) = self.config.new_bead_after_ms else {
+            return;
+        };
+        if self.is_in_frame(bead_um) {
+            self.out_since_ns = None;
+            return;
+        }
+        let since_ns = *self.out_since_ns.get_or_insert(self.now_ns);
+        // A bead that crosses the frame in less than five hundred exposures is no use to anybody.
+        let flow_um_per_s = self.chain.flow_um_per_s() + self.config.drift_um_per_s;
+        let field_um = f64::from(self.config.width_px) * self.config.pixel_um;
+        let slow = flow_um_per_s.abs() < 0.002 * field_um * self.config.rate_hz;
+        if slow && (self.now_ns - since_ns) as f64 * 1e-6 >= after_ms {
+            self.offset_um = -self.chain.bead_um();
+            self.out_since_ns = None;
+        }
+    }
+
+    /// Switches the LED in front of the camera, from now on.
+    pub fn set_led(&mut self, on: bool) {
+        self.led = on;
+    }
+
+    /// When the next frame will be delivered, ns, of those exposed so far. Exposures still to come are delivered later than
+    /// that, unless frames are reordered.
+    pub fn next_delivery_ns(&self) -> Option<i64> {
+        self.camera.next_delivery_ns()
+    }
+
+    /// Draws the next frame that has been delivered by now into `pixels` (rows contiguous, one byte per pixel).
+    pub fn take_frame(&mut self, pixels: &mut Vec<u8>) -> Option<FrameInfo> {
+        let (exposure, info) = self.camera.take(self.now_ns)?;
+        let px = |um: (f64, f64)| {
+            (
+                self.config.px_from_um(um.0),
+                self.config.origin_y_px() + um.1 / self.config.pixel_um,
+            )
+        };
+        let first = Blur::along(&exposure.samples.map(|s| px((s.seen_um, s.lateral_um))));
+        let second = second_path(&exposure).map(|path| Blur::along(&path.map(px)));
+        match (is_visible(&exposure), second) {
+            (true, None) => self.renderer.draw(&[first], info.lit, pixels),
+            (true, Some(second)) => self.renderer.draw(&[first, second], info.lit, pixels),
+            (false, Some(second)) => self.renderer.draw(&[second], info.lit, pixels),
+            (false, None) => self.renderer.draw(&[], info.lit, pixels),
+        }
+        Some(info)
+    }
+
+    /// The position in the next frame that has been delivered by now, with the noise that its picture would give.
+    ///
+    /// Frames and positions come from the same queue: take either the one or the other.
+    pub fn take_position(&mut self) -> Option<PositionFix> {
+        let (exposure, info) = self.camera.take(self.now_ns)?;
+        let path = exposure.samples.map(|s| (s.seen_um, s.lateral_um));
+        let (mean_um, _) = mean_between(&path, 0.0, EXPOSURE_STEPS as f64);
+        // Drawn for every frame, so that a lost bead does not shift the noise of later ones.
+        let noise_um = self.localisation_um * self.localisation.normal();
+        let verdict = self.verdict(&exposure, mean_um);
+        let good = verdict == Verdict::Good;
+        let or_nan = |value| if good { value } else { f64::NAN };
+        Some(PositionFix {
+            info,
+            x_um: or_nan(mean_um + noise_um),
+            variance_um2: or_nan(self.localisation_um * self.localisation_um),
+            snr: self.snr,
+            verdict,
+        })
+    }
+
+    fn verdict(&self, exposure: &Exposure, mean_um: f64) -> Verdict {
+        let config = &self.config;
+        let half_um = 0.5 * f64::from(config.width_px) * config.pixel_um;
+        if !is_visible(exposure) || !self.is_in_frame(mean_um) {
+            return Verdict::NoSignal;
+        }
+        if mean_um.abs() > half_um - config.bead_radius_um {
+            return Verdict::AtBorder;
+        }
+        let merged = second_path(exposure)
+            .is_some_and(|path| (path[0].0 - mean_um).abs() < 2.0 * config.bead_radius_um);
+        if merged {
+            Verdict::BadFit
+        } else {
+            Verdict::Good
+        }
+    }
+}
+
+fn is_visible(exposure: &Exposure) -> bool {
+    exposure.samples.iter().all(|s| s.visible)
+}
+
+/// Path of the second bead, if it was there for the whole exposure.
+fn second_path(exposure: &Exposure) -> Option<[(f64, f64); EXPOSURE_STEPS + 1]> {
+    let mut path = [(0.0, 0.0); EXPOSURE_STEPS + 1];
+    for (place, sample) in path.iter_mut().zip(&exposure.samples) {
+        *place = sample.second_um?;
+    }
+    Some(path)
+}
+
+/// Reflects a position across the channel at the borders of what the frame follows.
+fn confined(lateral_um: f64, limit_um: f64) -> f64 {
+    if lateral_um.abs() <= limit_um {
+        lateral_um
+    } else {
+        (2.0 * limit_um.copysign(lateral_um) - lateral_um).clamp(-limit_um, limit_um)
+    }
+}
