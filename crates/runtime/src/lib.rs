@@ -5,12 +5,17 @@ pub mod arming;
 pub mod core;
 pub mod latency;
 pub mod life;
+pub mod live;
 pub mod realtime;
+pub mod run;
 pub mod summary;
 mod tick_record;
 pub mod ticker;
+pub mod virtual_run;
 
 pub use crate::core::{Action, Core, CoreError, TickInput, TickOutput, Timing};
 pub use arming::ArmingConfig;
 pub use life::{Event, EventKind, Life, Request, SafeReason};
+pub use run::{EndRule, Finished, NoSink, RunError, RunSink};
+pub use summary::{End, Statistics, Summary};
 pub use tick_record::{CONTROLLER_STATE_LEN, TickFlags, TickRecord};

@@ -1,0 +1,186 @@
+//! What both drivers share: the recorder's sink, when a run ends, and how the actuator is served.
+
+use crate::core::{Action, CoreError};
+use crate::life::{Event, Life, Request};
+use crate::realtime::Conditions;
+use crate::summary::{End, Statistics, Summary};
+use crate::tick_record::TickRecord;
+use crate::ticker::Order;
+use cellpos_rig::{Actuator, ActuatorError, BoardReport, CameraError};
+use rtrb::{Consumer, Producer};
+use std::time::Duration;
+
+/// Where records and events go. Called on the recorder thread; may block, allocate and fail in its own way: a sink that
+/// cannot write counts what it loses, reports it in the end, and never stops a run.
+pub trait RunSink: Send {
+    /// One tick.
+    fn tick(&mut self, record: &TickRecord);
+    /// One event.
+    fn event(&mut self, event: &Event);
+    /// Called about ten times a second of the run, and at its end.
+    fn progress(&mut self, statistics: &Statistics);
+}
+
+/// A sink for runs of which only the summary is wanted.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct NoSink;
+
+impl RunSink for NoSink {
+    fn tick(&mut self, _: &TickRecord) {}
+    fn event(&mut self, _: &Event) {}
+    fn progress(&mut self, _: &Statistics) {}
+}
+
+/// Why a run could not be carried through. A run that ends in Safe is no error: see [`Summary::safe_reason`].
+#[derive(Debug, thiserror::Error)]
+pub enum RunError {
+    /// The loop cannot be built.
+    #[error(transparent)]
+    Core(#[from] CoreError),
+    /// The board.
+    #[error(transparent)]
+    Actuator(#[from] ActuatorError),
+    /// The camera.
+    #[error(transparent)]
+    Camera(#[from] CameraError),
+    /// A thread could not be started.
+    #[error("thread {thread} could not be started")]
+    Thread {
+        /// Which.
+        thread: &'static str,
+        /// What the operating system said.
+        #[source]
+        source: std::io::Error,
+    },
+    /// A thread panicked: a defect of this program. The board has been told to park, or parks by its watchdog.
+    #[error("thread {thread} panicked; the PZT was parked")]
+    Panicked {
+        /// Which.
+        thread: &'static str,
+    },
+}
+
+/// When a run ends.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct EndRule {
+    /// Ticks of the run; `None`: until the operator or a fault ends it.
+    pub ticks: Option<u64>,
+    /// Ticks frozen by the operator before the run ends.
+    pub freeze_ticks: u64,
+    /// Ticks recorded after Safe was latched: long enough to see the board park.
+    pub safe_ticks: u64,
+}
+
+impl Default for EndRule {
+    fn default() -> Self {
+        Self {
+            ticks: None,
+            freeze_ticks: 500,
+            safe_ticks: 100,
+        }
+    }
+}
+
+/// Applies an [`EndRule`] tick by tick.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct EndWatch {
+    rule: EndRule,
+    ticks: u64,
+    frozen: u64,
+    safe: u64,
+}
+
+impl EndWatch {
+    pub(crate) fn new(rule: EndRule) -> Self {
+        Self {
+            rule,
+            ticks: 0,
+            frozen: 0,
+            safe: 0,
+        }
+    }
+
+    /// To be asked once after each tick.
+    pub(crate) fn after_tick(&mut self, life: Life, request: Request) -> Option<End> {
+        self.ticks += 1;
+        self.frozen = if request == Request::Freeze {
+            self.frozen + 1
+        } else {
+            0
+        };
+        if life == Life::Safe {
+            self.safe += 1;
+            let by_operator = request == Request::Park;
+            return (self.safe > self.rule.safe_ticks).then_some(if by_operator {
+                End::Operator
+            } else {
+                End::Safe
+            });
+        }
+        if self.frozen > self.rule.freeze_ticks {
+            return Some(End::Operator);
+        }
+        match self.rule.ticks {
+            Some(ticks) if self.ticks >= ticks => Some(End::Duration),
+            _ => None,
+        }
+    }
+}
+
+/// Carries out what waits in the order ring and reads what the board says. A newer command replaces an older one that
+/// has not been sent: a burst after a stall would only make the PZT rattle through the past.
+pub(crate) fn serve_actuator(
+    actuator: &mut dyn Actuator,
+    orders: &mut Consumer<Order>,
+    reports: &mut Producer<BoardReport>,
+) -> Result<(), ActuatorError> {
+    let mut newest = None;
+    let mut park = false;
+    while let Ok(order) = orders.pop() {
+        match order.action {
+            Action::Command {
+                command_um,
+                neutral_um,
+            } => newest = Some((command_um, neutral_um, order.time_us)),
+            Action::Park => park = true,
+            Action::None => {}
+        }
+    }
+    if park {
+        actuator.park()?;
+    } else if let Some((command_um, neutral_um, time_us)) = newest {
+        actuator.command(command_um, neutral_um, time_us)?;
+    }
+    if let Some(report) = actuator.poll()? {
+        // A full ring means that the loop is not running: it will hear the next one.
+        let _ = reports.push(report);
+    }
+    Ok(())
+}
+
+/// Leaves the hardware in a defined state after the last tick: frozen at neutral for a moment, then at park.
+pub(crate) fn close_session(
+    actuator: &mut dyn Actuator,
+    life: Life,
+    wait: impl Fn(Duration),
+) -> Result<(), ActuatorError> {
+    if life == Life::Safe {
+        return actuator.park();
+    }
+    actuator.freeze()?;
+    wait(Duration::from_millis(20));
+    actuator.disarm()
+}
+
+/// A finished run.
+#[derive(Debug)]
+pub struct Finished<S> {
+    /// Its figures.
+    pub summary: Summary,
+    /// Real-time conditions of the control thread.
+    pub conditions: Conditions,
+    /// The sink, with all that it was given.
+    pub sink: S,
+    /// What went wrong on an I/O thread, if anything did; the loop has seen it as silence and acted on it.
+    pub io_error: Option<RunError>,
+}
