@@ -9,12 +9,16 @@
 pub mod actuator;
 pub mod board;
 pub mod clock;
+pub mod emulated;
 pub mod measurement;
+pub mod serial;
+pub mod socket;
 pub mod source;
 
 pub use actuator::{Actuator, ActuatorError, ActuatorInfo, BoardReport};
 pub use board::{BoardHost, Port};
 pub use clock::Clock;
+pub use emulated::EmulatedRig;
 pub use measurement::Measurement;
 pub use source::{
     Calibration, Camera, CameraError, FrameBuffer, FrameStamp, PositionSource, SourceInfo,
