@@ -1,0 +1,257 @@
+//! Identification of anybody's records: input and output columns at a rate, plant unknown.
+//!
+//! Lines are found in the input; gain and lag are coherent with them; harmonics in the output that the input does not
+//! hold are listed, because no linear model of any order makes them. Broadband inputs go through averaged spectra.
+//! Not for naming what makes the harmonics: that is reconciliation.
+
+use crate::error::IdentError;
+use crate::frequency_response::{DetectionLine, FrequencyPoint, Segment, Settings, measure};
+use crate::rational::{RationalFit, fit_orders};
+use crate::sampled::{Hold, Sampling};
+use crate::spectral::{find_lines, residual_of, welch};
+use crate::stats::student_t_quantile;
+use crate::tone_fit::{ToneFit, Whitening};
+
+/// What to do with a foreign record.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct ForeignSettings {
+    /// Rows per second.
+    pub rate_hz: f64,
+    /// Highest order of a linear model tried.
+    pub most_order: usize,
+    /// What the input does between rows.
+    pub hold: Hold,
+}
+
+/// How the record was excited.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Excitation {
+    /// By a few sines.
+    Lines,
+    /// By something broadband: averaged spectra.
+    Broadband,
+}
+
+/// Gain and lag at one driven line.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct LineResult {
+    /// Frequency, Hz.
+    pub frequency_hz: f64,
+    /// Coherent gain, output unit per input unit.
+    pub gain: f64,
+    /// Half-width of its 95 % interval.
+    pub gain_ci95: f64,
+    /// Phase, deg (negative: the output lags).
+    pub phase_deg: f64,
+    /// Half-width of its 95 % interval, deg.
+    pub phase_ci95_deg: f64,
+    /// The phase as a time by which the output lags, ms.
+    pub lag_ms: f64,
+    /// Coherence.
+    pub coherence: f64,
+}
+
+/// A harmonic in the output.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Harmonic {
+    /// The driven line, Hz.
+    pub fundamental_hz: f64,
+    /// Which harmonic.
+    pub number: usize,
+    /// Amplitude over that of the fundamental, in the output.
+    pub output_ratio: f64,
+    /// The same in the input.
+    pub input_ratio: f64,
+    /// Probability that noise alone shows this much.
+    pub p_value: f64,
+    /// Whether it is beyond both noise and anything that the input holds.
+    pub unexplained: bool,
+}
+
+/// What a foreign record says.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ForeignResult {
+    /// How it was excited.
+    pub excitation: Excitation,
+    /// Driven lines, strongest first (empty for broadband).
+    pub lines: Vec<LineResult>,
+    /// The response, in order of frequency.
+    pub points: Vec<FrequencyPoint>,
+    /// Harmonics looked for.
+    pub harmonics: Vec<Harmonic>,
+    /// Linear models fitted, best AICc first.
+    pub models: Vec<RationalFit>,
+    /// RMS of the output about its own offset and ramp, output unit.
+    pub output_rms: f64,
+    /// RMS of what the coherent linear response at the lines leaves (lines only), output unit.
+    pub linear_residual_rms: Option<f64>,
+    /// How the record was sampled.
+    pub sampling: Sampling,
+}
+
+impl ForeignResult {
+    /// Whether harmonics remain that no linear model explains.
+    pub fn harmonics_remain(&self) -> bool {
+        self.harmonics.iter().any(|h| h.unexplained)
+    }
+}
+
+fn rms(x: &[f64]) -> f64 {
+    (x.iter().map(|v| v * v).sum::<f64>() / x.len().max(1) as f64).sqrt()
+}
+
+/// Identifies a record.
+///
+/// # Errors
+/// [`IdentError::Lengths`], [`IdentError::OutOfRange`] (rate, constant input), [`IdentError::TooShort`],
+/// [`IdentError::NoInput`].
+pub fn identify(input: &[f64], output: &[f64], settings: &ForeignSettings) -> Result<ForeignResult, IdentError> {
+    if input.len() != output.len() {
+        return Err(IdentError::Lengths { input: input.len(), output: output.len() });
+    }
+    if !(settings.rate_hz.is_finite() && settings.rate_hz > 0.0) {
+        return Err(IdentError::OutOfRange { key: "rate_hz", value: settings.rate_hz, unit: "Hz", expected: "the rows per second, above 0" });
+    }
+    let n = input.len();
+    if n < 64 {
+        return Err(IdentError::TooShort { what: "an identification", rows: n, needed: 64 });
+    }
+    let period_s = 1.0 / settings.rate_hz;
+    let sampling = Sampling { period_s, exposure_s: 0.0, hold: settings.hold };
+    let input_rms = rms(&residual_of(input, period_s, &[]));
+    let size = input.iter().fold(0.0f64, |a, v| a.max(v.abs()));
+    if !(input_rms > 1e-9 * size.max(f64::MIN_POSITIVE)) {
+        return Err(IdentError::OutOfRange {
+            key: "input_rms",
+            value: input_rms,
+            unit: "(input unit)",
+            expected: "an input that moves: this column is constant or a straight line",
+        });
+    }
+    let found = find_lines(input, period_s, 24);
+    let output_rms = rms(&residual_of(output, period_s, &[]));
+    let lowest = found.frequency_hz.iter().copied().fold(f64::INFINITY, f64::min);
+    let periods = n as f64 * period_s * lowest;
+    if found.explained > 0.97 && periods >= 3.0 {
+        from_lines(input, output, sampling, &found.frequency_hz, settings, output_rms)
+    } else {
+        from_spectra(input, output, sampling, settings, output_rms)
+    }
+}
+
+fn from_lines(
+    input: &[f64],
+    output: &[f64],
+    sampling: Sampling,
+    lines_hz: &[f64],
+    settings: &ForeignSettings,
+    output_rms: f64,
+) -> Result<ForeignResult, IdentError> {
+    let period_s = sampling.period_s;
+    let resolution = 1.5 / (input.len() as f64 * period_s);
+    let mut wanted: Vec<(f64, usize, f64)> = Vec::new();
+    for &f in lines_hz.iter().take(4) {
+        for number in 2..=7usize {
+            let at = f * number as f64;
+            let free = |g: f64| (g - at).abs() > resolution;
+            if at < 0.47 * settings.rate_hz && lines_hz.iter().all(|&g| free(g)) && wanted.iter().all(|w| free(w.2)) {
+                wanted.push((f, number, at));
+            }
+        }
+    }
+    let detection_hz: Vec<f64> = wanted.iter().map(|w| w.2).collect();
+    let mut all = lines_hz.to_vec();
+    all.extend(&detection_hz);
+    let rest = residual_of(output, period_s, &all);
+    let increments: f64 = rest.windows(2).map(|w| (w[1] - w[0]).powi(2)).sum();
+    let levels: f64 = rest.iter().map(|r| r * r).sum();
+    // Durbin and Watson: far below 2 the residual is a random walk.
+    let whitening = if levels > 0.0 && increments / levels < 0.1 { Whitening::Increments } else { Whitening::Levels };
+    let segment = Segment { input, output, from: 0, to: input.len(), period_s, lines_hz, detection_hz: &detection_hz };
+    let fit = ToneFit { drift_degree: 2, whitening };
+    let response = measure(&segment, &Settings { fit, min_periods: 2.0, most_blocks: 20, ..Settings::default() })?;
+    let mut points = response.points.clone();
+    let lines: Vec<LineResult> = points.iter().map(line_result).collect();
+    let harmonics: Vec<Harmonic> =
+        wanted.iter().zip(&response.detection).filter_map(|(w, d)| harmonic(*w, d, &points)).collect();
+    points.sort_by(|a, b| a.frequency_hz.total_cmp(&b.frequency_hz));
+    let floor = |p: &FrequencyPoint| p.response.norm_sqr() * 1e-12;
+    for p in &mut points {
+        p.variance = p.variance.max(floor(p));
+    }
+    let models = fit_orders(&points, sampling, settings.most_order)?;
+    let linear_residual_rms = Some(rms(&residual_of(output, period_s, lines_hz)));
+    Ok(ForeignResult { excitation: Excitation::Lines, lines, points, harmonics, models, output_rms, linear_residual_rms, sampling })
+}
+
+fn from_spectra(
+    input: &[f64],
+    output: &[f64],
+    sampling: Sampling,
+    settings: &ForeignSettings,
+    output_rms: f64,
+) -> Result<ForeignResult, IdentError> {
+    let stretch = (input.len() / 10).clamp(64, 4096);
+    let spread = |x: &[f64]| rms(&residual_of(x, sampling.period_s, &[]));
+    let change: Vec<f64> = output.windows(2).map(|w| w[1] - w[0]).collect();
+    let difference = spread(&change) < 0.1 * spread(output);
+    let all = welch(input, output, sampling.period_s, stretch, 0.4, difference);
+    if all.len() < 3 {
+        return Err(IdentError::TooShort { what: "a coherent frequency response (coherence above 0.4)", rows: input.len(), needed: 10 * input.len() });
+    }
+    // Evenly in the logarithm, so that the many high bins do not drown the few low ones.
+    let keep = 80usize;
+    let (low, high) = (all[0].frequency_hz, all[all.len() - 1].frequency_hz);
+    let mut points: Vec<FrequencyPoint> = Vec::new();
+    let mut next = low;
+    for p in all {
+        if p.frequency_hz >= next * (1.0 - 1e-9) {
+            next = p.frequency_hz * (high / low).powf(1.0 / keep as f64);
+            points.push(p);
+        }
+    }
+    for p in &mut points {
+        p.variance = p.variance.max(p.response.norm_sqr() * 1e-8);
+    }
+    let models = fit_orders(&points, sampling, settings.most_order)?;
+    Ok(ForeignResult {
+        excitation: Excitation::Broadband,
+        lines: Vec::new(),
+        points,
+        harmonics: Vec::new(),
+        models,
+        output_rms,
+        linear_residual_rms: None,
+        sampling,
+    })
+}
+
+fn line_result(p: &FrequencyPoint) -> LineResult {
+    let t = student_t_quantile(0.975, p.variance_dof.min(1e6));
+    let sd = (0.5 * p.variance).sqrt();
+    let phase_deg = p.phase_deg();
+    LineResult {
+        frequency_hz: p.frequency_hz,
+        gain: p.response.norm(),
+        gain_ci95: t * sd,
+        phase_deg,
+        phase_ci95_deg: (t * sd / p.response.norm()).to_degrees(),
+        lag_ms: -phase_deg / 360.0 / p.frequency_hz * 1e3,
+        coherence: p.coherence,
+    }
+}
+
+fn harmonic((fundamental_hz, number, _): (f64, usize, f64), d: &DetectionLine, points: &[FrequencyPoint]) -> Option<Harmonic> {
+    let p = points.iter().find(|p| p.frequency_hz == fundamental_hz)?;
+    let output_ratio = d.output.norm() / p.output.norm();
+    let input_ratio = d.input.norm() / p.input.norm();
+    Some(Harmonic {
+        fundamental_hz,
+        number,
+        output_ratio,
+        input_ratio,
+        p_value: d.p_value,
+        // A linear plant passes the input's own harmonics, at most a few times better than the fundamental.
+        unexplained: d.p_value < 1e-3 && output_ratio > 1e-3 && output_ratio > 5.0 * input_ratio,
+    })
+}
