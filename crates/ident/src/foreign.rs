@@ -105,19 +105,39 @@ fn rms(x: &[f64]) -> f64 {
 /// # Errors
 /// [`IdentError::Lengths`], [`IdentError::OutOfRange`] (rate, constant input), [`IdentError::TooShort`],
 /// [`IdentError::NoInput`].
-pub fn identify(input: &[f64], output: &[f64], settings: &ForeignSettings) -> Result<ForeignResult, IdentError> {
+pub fn identify(
+    input: &[f64],
+    output: &[f64],
+    settings: &ForeignSettings,
+) -> Result<ForeignResult, IdentError> {
     if input.len() != output.len() {
-        return Err(IdentError::Lengths { input: input.len(), output: output.len() });
+        return Err(IdentError::Lengths {
+            input: input.len(),
+            output: output.len(),
+        });
     }
     if !(settings.rate_hz.is_finite() && settings.rate_hz > 0.0) {
-        return Err(IdentError::OutOfRange { key: "rate_hz", value: settings.rate_hz, unit: "Hz", expected: "the rows per second, above 0" });
+        return Err(IdentError::OutOfRange {
+            key: "rate_hz",
+            value: settings.rate_hz,
+            unit: "Hz",
+            expected: "the rows per second, above 0",
+        });
     }
     let n = input.len();
     if n < 64 {
-        return Err(IdentError::TooShort { what: "an identification", rows: n, needed: 64 });
+        return Err(IdentError::TooShort {
+            what: "an identification",
+            rows: n,
+            needed: 64,
+        });
     }
     let period_s = 1.0 / settings.rate_hz;
-    let sampling = Sampling { period_s, exposure_s: 0.0, hold: settings.hold };
+    let sampling = Sampling {
+        period_s,
+        exposure_s: 0.0,
+        hold: settings.hold,
+    };
     let input_rms = rms(&residual_of(input, period_s, &[]));
     let size = input.iter().fold(0.0f64, |a, v| a.max(v.abs()));
     if !(input_rms > 1e-9 * size.max(f64::MIN_POSITIVE)) {
@@ -130,10 +150,21 @@ pub fn identify(input: &[f64], output: &[f64], settings: &ForeignSettings) -> Re
     }
     let found = find_lines(input, period_s, 24);
     let output_rms = rms(&residual_of(output, period_s, &[]));
-    let lowest = found.frequency_hz.iter().copied().fold(f64::INFINITY, f64::min);
+    let lowest = found
+        .frequency_hz
+        .iter()
+        .copied()
+        .fold(f64::INFINITY, f64::min);
     let periods = n as f64 * period_s * lowest;
     if found.explained > 0.97 && periods >= 3.0 {
-        from_lines(input, output, sampling, &found.frequency_hz, settings, output_rms)
+        from_lines(
+            input,
+            output,
+            sampling,
+            &found.frequency_hz,
+            settings,
+            output_rms,
+        )
     } else {
         from_spectra(input, output, sampling, settings, output_rms)
     }
@@ -154,7 +185,10 @@ fn from_lines(
         for number in 2..=7usize {
             let at = f * number as f64;
             let free = |g: f64| (g - at).abs() > resolution;
-            if at < 0.47 * settings.rate_hz && lines_hz.iter().all(|&g| free(g)) && wanted.iter().all(|w| free(w.2)) {
+            if at < 0.47 * settings.rate_hz
+                && lines_hz.iter().all(|&g| free(g))
+                && wanted.iter().all(|w| free(w.2))
+            {
                 wanted.push((f, number, at));
             }
         }
@@ -166,14 +200,40 @@ fn from_lines(
     let increments: f64 = rest.windows(2).map(|w| (w[1] - w[0]).powi(2)).sum();
     let levels: f64 = rest.iter().map(|r| r * r).sum();
     // Durbin and Watson: far below 2 the residual is a random walk.
-    let whitening = if levels > 0.0 && increments / levels < 0.1 { Whitening::Increments } else { Whitening::Levels };
-    let segment = Segment { input, output, from: 0, to: input.len(), period_s, lines_hz, detection_hz: &detection_hz };
-    let fit = ToneFit { drift_degree: 2, whitening };
-    let response = measure(&segment, &Settings { fit, min_periods: 2.0, most_blocks: 20, ..Settings::default() })?;
+    let whitening = if levels > 0.0 && increments / levels < 0.1 {
+        Whitening::Increments
+    } else {
+        Whitening::Levels
+    };
+    let segment = Segment {
+        input,
+        output,
+        from: 0,
+        to: input.len(),
+        period_s,
+        lines_hz,
+        detection_hz: &detection_hz,
+    };
+    let fit = ToneFit {
+        drift_degree: 2,
+        whitening,
+    };
+    let response = measure(
+        &segment,
+        &Settings {
+            fit,
+            min_periods: 2.0,
+            most_blocks: 20,
+            ..Settings::default()
+        },
+    )?;
     let mut points = response.points.clone();
     let lines: Vec<LineResult> = points.iter().map(line_result).collect();
-    let harmonics: Vec<Harmonic> =
-        wanted.iter().zip(&response.detection).filter_map(|(w, d)| harmonic(*w, d, &points)).collect();
+    let harmonics: Vec<Harmonic> = wanted
+        .iter()
+        .zip(&response.detection)
+        .filter_map(|(w, d)| harmonic(*w, d, &points))
+        .collect();
     points.sort_by(|a, b| a.frequency_hz.total_cmp(&b.frequency_hz));
     let floor = |p: &FrequencyPoint| p.response.norm_sqr() * 1e-12;
     for p in &mut points {
@@ -181,7 +241,16 @@ fn from_lines(
     }
     let models = fit_orders(&points, sampling, settings.most_order)?;
     let linear_residual_rms = Some(rms(&residual_of(output, period_s, lines_hz)));
-    Ok(ForeignResult { excitation: Excitation::Lines, lines, points, harmonics, models, output_rms, linear_residual_rms, sampling })
+    Ok(ForeignResult {
+        excitation: Excitation::Lines,
+        lines,
+        points,
+        harmonics,
+        models,
+        output_rms,
+        linear_residual_rms,
+        sampling,
+    })
 }
 
 fn from_spectra(
@@ -197,7 +266,11 @@ fn from_spectra(
     let difference = spread(&change) < 0.1 * spread(output);
     let all = welch(input, output, sampling.period_s, stretch, 0.4, difference);
     if all.len() < 3 {
-        return Err(IdentError::TooShort { what: "a coherent frequency response (coherence above 0.4)", rows: input.len(), needed: 10 * input.len() });
+        return Err(IdentError::TooShort {
+            what: "a coherent frequency response (coherence above 0.4)",
+            rows: input.len(),
+            needed: 10 * input.len(),
+        });
     }
     // Evenly in the logarithm, so that the many high bins do not drown the few low ones.
     let keep = 80usize;
@@ -241,7 +314,11 @@ fn line_result(p: &FrequencyPoint) -> LineResult {
     }
 }
 
-fn harmonic((fundamental_hz, number, _): (f64, usize, f64), d: &DetectionLine, points: &[FrequencyPoint]) -> Option<Harmonic> {
+fn harmonic(
+    (fundamental_hz, number, _): (f64, usize, f64),
+    d: &DetectionLine,
+    points: &[FrequencyPoint],
+) -> Option<Harmonic> {
     let p = points.iter().find(|p| p.frequency_hz == fundamental_hz)?;
     let output_ratio = d.output.norm() / p.output.norm();
     let input_ratio = d.input.norm() / p.input.norm();

@@ -48,7 +48,11 @@ impl RationalFit {
 
     /// What a record sampled as `sampling` shows at `frequency_hz`.
     pub fn sampled_response(&self, frequency_hz: f64, sampling: Sampling) -> Complex<f64> {
-        fractions(&self.numerator, &self.denominator).sampled_response(frequency_hz, self.delay_s, sampling)
+        fractions(&self.numerator, &self.denominator).sampled_response(
+            frequency_hz,
+            self.delay_s,
+            sampling,
+        )
     }
 }
 
@@ -78,7 +82,11 @@ pub fn roots(c: &[f64]) -> Vec<Complex<f64>> {
 /// moved apart by a millionth of their size, which is far below what any record resolves.
 pub fn fractions(numerator: &[f64], denominator: &[f64]) -> PartialFractions {
     let n = denominator.len() - 1;
-    let direct = if numerator.len() == n + 1 { numerator[0] / denominator[0] } else { 0.0 };
+    let direct = if numerator.len() == n + 1 {
+        numerator[0] / denominator[0]
+    } else {
+        0.0
+    };
     let mut poles = roots(denominator);
     let size = poles.iter().map(|p| p.norm()).fold(0.0, f64::max).max(1e-9);
     for i in 0..n {
@@ -104,13 +112,30 @@ pub fn fractions(numerator: &[f64], denominator: &[f64]) -> PartialFractions {
 ///
 /// # Errors
 /// [`IdentError::TooFewPoints`], [`IdentError::NoFit`], [`IdentError::OutOfRange`] for a variance that is not positive.
-pub fn fit_rational(points: &[FrequencyPoint], sampling: Sampling, order: usize, zeros: usize) -> Result<RationalFit, IdentError> {
+pub fn fit_rational(
+    points: &[FrequencyPoint],
+    sampling: Sampling,
+    order: usize,
+    zeros: usize,
+) -> Result<RationalFit, IdentError> {
     let parameters = order + zeros + 2;
     if 2 * points.len() < parameters || points.is_empty() {
-        return Err(IdentError::TooFewPoints { points: points.len(), parameters, needed: parameters.div_ceil(2) });
+        return Err(IdentError::TooFewPoints {
+            points: points.len(),
+            parameters,
+            needed: parameters.div_ceil(2),
+        });
     }
-    if let Some(p) = points.iter().find(|p| !(p.variance.is_finite() && p.variance > 0.0)) {
-        return Err(IdentError::OutOfRange { key: "variance", value: p.variance, unit: "1", expected: "a positive variance per point" });
+    if let Some(p) = points
+        .iter()
+        .find(|p| !(p.variance.is_finite() && p.variance > 0.0))
+    {
+        return Err(IdentError::OutOfRange {
+            key: "variance",
+            value: p.variance,
+            unit: "1",
+            expected: "a positive variance per point",
+        });
     }
     let zeros = zeros.min(order);
     let two_pi = 2.0 * std::f64::consts::PI;
@@ -119,16 +144,26 @@ pub fn fit_rational(points: &[FrequencyPoint], sampling: Sampling, order: usize,
     // No point weighs more than a thousandth of its own size allows: a start must not hang on one line.
     let weights: Vec<f64> = points.iter().map(|p| (2.0 / p.variance).sqrt()).collect();
     let unscale = |x: &[f64]| -> (Vec<f64>, Vec<f64>, f64) {
-        let numerator = x[..=zeros].iter().enumerate().map(|(i, b)| b * scale.powi((order as i32) - (zeros - i) as i32)).collect();
+        let numerator = x[..=zeros]
+            .iter()
+            .enumerate()
+            .map(|(i, b)| b * scale.powi((order as i32) - (zeros - i) as i32))
+            .collect();
         let mut denominator = vec![1.0];
-        denominator.extend(x[zeros + 1..zeros + 1 + order].iter().enumerate().map(|(i, a)| a * scale.powi(i as i32 + 1)));
+        denominator.extend(
+            x[zeros + 1..zeros + 1 + order]
+                .iter()
+                .enumerate()
+                .map(|(i, a)| a * scale.powi(i as i32 + 1)),
+        );
         (numerator, denominator, x[zeros + 1 + order] / scale)
     };
     let fill = |x: &[f64], out: &mut [f64]| {
         let (numerator, denominator, delay_s) = unscale(x);
         let parts = fractions(&numerator, &denominator);
         for (i, p) in points.iter().enumerate() {
-            let e = (p.response - parts.sampled_response(p.frequency_hz, delay_s, sampling)) * weights[i];
+            let e = (p.response - parts.sampled_response(p.frequency_hz, delay_s, sampling))
+                * weights[i];
             out[2 * i] = e.re;
             out[2 * i + 1] = e.im;
         }
@@ -138,7 +173,11 @@ pub fn fit_rational(points: &[FrequencyPoint], sampling: Sampling, order: usize,
     let mut best: Option<crate::least_squares::Minimum> = None;
     for i in 0..delays {
         let delay_s = i as f64 * 0.5 * sampling.period_s;
-        let Some(start) = sanathanan_koerner(points, &weights, sampling, order, zeros, scale, delay_s) else { continue };
+        let Some(start) =
+            sanathanan_koerner(points, &weights, sampling, order, zeros, scale, delay_s)
+        else {
+            continue;
+        };
         let mut x = start;
         x.push(delay_s * scale);
         let mut r = vec![0.0; 2 * points.len()];
@@ -152,12 +191,23 @@ pub fn fit_rational(points: &[FrequencyPoint], sampling: Sampling, order: usize,
         }
     }
     let Some(found) = best else {
-        return Err(IdentError::NoFit { what: "a rational model", reason: "no start led to a finite residual" });
+        return Err(IdentError::NoFit {
+            what: "a rational model",
+            reason: "no start led to a finite residual",
+        });
     };
     let (numerator, denominator, delay_s) = unscale(&found.parameters);
     let dof = 2.0 * points.len() as f64 - parameters as f64;
-    let spread = if dof > 0.0 { (found.chi2 / dof).max(1.0) } else { 1.0 };
-    let sd: Vec<f64> = covariance(&found.jacobian).diagonal().iter().map(|v| (v * spread).sqrt()).collect();
+    let spread = if dof > 0.0 {
+        (found.chi2 / dof).max(1.0)
+    } else {
+        1.0
+    };
+    let sd: Vec<f64> = covariance(&found.jacobian)
+        .diagonal()
+        .iter()
+        .map(|v| (v * spread).sqrt())
+        .collect();
     let mut sd_unit = sd.clone();
     for (i, v) in sd_unit.iter_mut().enumerate().take(zeros + 1) {
         *v *= scale.powi((order as i32) - (zeros - i) as i32);
@@ -166,7 +216,11 @@ pub fn fit_rational(points: &[FrequencyPoint], sampling: Sampling, order: usize,
     denominator_sd.extend((0..order).map(|i| sd[zeros + 1 + i] * scale.powi(i as i32 + 1)));
     let n = 2.0 * points.len() as f64;
     let k = parameters as f64;
-    let correction = if n - k - 1.0 > 0.0 { 2.0 * k * (k + 1.0) / (n - k - 1.0) } else { f64::INFINITY };
+    let correction = if n - k - 1.0 > 0.0 {
+        2.0 * k * (k + 1.0) / (n - k - 1.0)
+    } else {
+        f64::INFINITY
+    };
     Ok(RationalFit {
         order,
         poles: roots(&denominator),
@@ -235,20 +289,37 @@ fn sanathanan_koerner(
     found.filter(|x| x.iter().all(|v| v.is_finite()))
 }
 
-/// Fits orders 0..=`most` (numerator degrees one below and equal) and returns them, best AICc first.
+/// Fits orders 0..=`most` (numerator degrees 0, one below and equal) and returns them, the chosen one first.
 ///
 /// # Errors
 /// [`IdentError::TooFewPoints`] when not even a static gain with delay can be fitted.
-pub fn fit_orders(points: &[FrequencyPoint], sampling: Sampling, most: usize) -> Result<Vec<RationalFit>, IdentError> {
+pub fn fit_orders(
+    points: &[FrequencyPoint],
+    sampling: Sampling,
+    most: usize,
+) -> Result<Vec<RationalFit>, IdentError> {
     let mut fits = vec![fit_rational(points, sampling, 0, 0)?];
     for order in 1..=most {
-        for zeros in [order - 1, order] {
+        for zeros in [0, order - 1, order]
+            .into_iter()
+            .skip(usize::from(order == 1))
+        {
             if let Ok(fit) = fit_rational(points, sampling, order, zeros) {
                 fits.push(fit);
             }
         }
     }
     fits.sort_by(|a, b| a.aicc.total_cmp(&b.aicc));
+    // Among fits that the criterion hardly tells apart the one with fewest parameters leads: a zero that is not needed
+    // trades against the delay.
+    let best = fits[0].aicc;
+    let size = |f: &RationalFit| f.order + f.numerator.len();
+    let simplest = (0..fits.len())
+        .filter(|&i| fits[i].aicc <= best + 6.0)
+        .min_by_key(|&i| size(&fits[i]));
+    if let Some(i) = simplest {
+        fits[..=i].rotate_right(1);
+    }
     Ok(fits)
 }
 
@@ -257,7 +328,12 @@ mod tests {
     use super::*;
     use crate::random::Random;
 
-    fn points_of(truth: &PartialFractions, delay_s: f64, sampling: Sampling, relative: f64) -> Vec<FrequencyPoint> {
+    fn points_of(
+        truth: &PartialFractions,
+        delay_s: f64,
+        sampling: Sampling,
+        relative: f64,
+    ) -> Vec<FrequencyPoint> {
         let mut random = Random::new(8);
         (1..40)
             .map(|i| {
@@ -285,13 +361,20 @@ mod tests {
         let (w, damping) = (2.0 * std::f64::consts::PI * 90.0, 0.08);
         let truth = fractions(&[3.0 * w * w], &[1.0, 2.0 * damping * w, w * w]);
         for hold in [Hold::ZeroOrder, Hold::None] {
-            let sampling = Sampling { period_s: 1e-3, exposure_s: 0.0, hold };
+            let sampling = Sampling {
+                period_s: 1e-3,
+                exposure_s: 0.0,
+                hold,
+            };
             let points = points_of(&truth, 0.0013, sampling, 0.003);
             let fits = fit_orders(&points, sampling, 3).unwrap();
             let best = &fits[0];
             assert_eq!(best.order, 2, "{best:?}");
             assert!((best.denominator[2].sqrt() / w - 1.0).abs() < 2e-3);
-            assert!((best.delay_s - 0.0013).abs() < 3.0 * best.delay_sd_s + 1e-6, "{best:?}");
+            assert!(
+                (best.delay_s - 0.0013).abs() < 3.0 * best.delay_sd_s + 1e-6,
+                "{best:?}"
+            );
             assert!((best.response(1.0).norm() - 3.0).abs() < 0.02);
         }
     }
@@ -299,11 +382,17 @@ mod tests {
     #[test]
     fn one_line_supports_a_gain_and_a_lag_and_nothing_more() {
         let truth = fractions(&[2.0], &[1.0]);
-        let sampling = Sampling { period_s: 5e-3, exposure_s: 0.0, hold: Hold::None };
+        let sampling = Sampling {
+            period_s: 5e-3,
+            exposure_s: 0.0,
+            hold: Hold::None,
+        };
         let mut points = points_of(&truth, 0.003, sampling, 1e-4);
         points.truncate(1);
         let fits = fit_orders(&points, sampling, 3).unwrap();
         assert_eq!(fits.len(), 1);
-        assert!((fits[0].delay_s - 0.003).abs() < 1e-4 && (fits[0].numerator[0] - 2.0).abs() < 1e-2);
+        assert!(
+            (fits[0].delay_s - 0.003).abs() < 1e-4 && (fits[0].numerator[0] - 2.0).abs() < 1e-2
+        );
     }
 }

@@ -21,14 +21,21 @@ pub struct Lines {
     pub explained: f64,
 }
 
-const LEVELS: ToneFit = ToneFit { drift_degree: 1, whitening: Whitening::Levels };
+const LEVELS: ToneFit = ToneFit {
+    drift_degree: 1,
+    whitening: Whitening::Levels,
+};
 
 /// Finds at most `most` sines in `signal` by taking off the strongest again and again; stops when 99.9 % of the
 /// variance is explained or a further line would add less than 0.05 %.
 pub fn find_lines(signal: &[f64], period_s: f64, most: usize) -> Lines {
     let n = signal.len();
     let Some(base) = fit_block(signal, 0, n, period_s, &[], LEVELS) else {
-        return Lines { frequency_hz: Vec::new(), amplitude: Vec::new(), explained: 0.0 };
+        return Lines {
+            frequency_hz: Vec::new(),
+            amplitude: Vec::new(),
+            explained: 0.0,
+        };
     };
     let total = base.residual_variance;
     let bin = 1.0 / (n as f64 * period_s);
@@ -36,11 +43,14 @@ pub fn find_lines(signal: &[f64], period_s: f64, most: usize) -> Lines {
     let mut left = total;
     while lines.len() < most && total > 0.0 && left > 1e-3 * total {
         let residual = residual_of(signal, period_s, &lines);
-        let Some(peak) = strongest(&residual, period_s) else { break };
+        let Some(peak) = strongest(&residual, period_s) else {
+            break;
+        };
         let cost = |f: f64| {
             let mut trial = lines.clone();
             trial.push(f);
-            fit_block(signal, 0, n, period_s, &trial, LEVELS).map_or(f64::INFINITY, |b| b.residual_variance)
+            fit_block(signal, 0, n, period_s, &trial, LEVELS)
+                .map_or(f64::INFINITY, |b| b.residual_variance)
         };
         let refined = golden(peak - bin, peak + bin, &cost);
         let after = cost(refined);
@@ -65,15 +75,20 @@ pub fn find_lines(signal: &[f64], period_s: f64, most: usize) -> Lines {
 /// `signal` less its sines, offset and ramp; `NaN` rows become 0.
 pub fn residual_of(signal: &[f64], period_s: f64, lines: &[f64]) -> Vec<f64> {
     let n = signal.len();
-    let phasors = fit_block(signal, 0, n, period_s, lines, LEVELS).map(|b| b.phasors).unwrap_or_default();
+    let phasors = fit_block(signal, 0, n, period_s, lines, LEVELS)
+        .map(|b| b.phasors)
+        .unwrap_or_default();
     let two_pi = 2.0 * std::f64::consts::PI;
     let rest: Vec<f64> = signal
         .iter()
         .enumerate()
         .map(|(k, x)| {
             let t = k as f64 * period_s;
-            let tones: f64 =
-                phasors.iter().zip(lines).map(|(p, f)| (p * Complex::from_polar(1.0, two_pi * f * t)).re).sum();
+            let tones: f64 = phasors
+                .iter()
+                .zip(lines)
+                .map(|(p, f)| (p * Complex::from_polar(1.0, two_pi * f * t)).re)
+                .sum();
             x - tones
         })
         .collect();
@@ -97,16 +112,26 @@ fn detrended(signal: &[f64]) -> Vec<f64> {
     let slope = (count * sxy - sx * s1) / (count * sxx - sx * sx);
     let offset = (s1 - slope * sx) / count;
     let line = |k: usize| offset + slope * (k as f64 - 0.5 * n);
-    signal.iter().enumerate().map(|(k, y)| if y.is_finite() { y - line(k) } else { 0.0 }).collect()
+    signal
+        .iter()
+        .enumerate()
+        .map(|(k, y)| if y.is_finite() { y - line(k) } else { 0.0 })
+        .collect()
 }
 
 fn hann(n: usize) -> Vec<f64> {
-    (0..n).map(|k| 0.5 - 0.5 * (2.0 * std::f64::consts::PI * (k as f64 + 0.5) / n as f64).cos()).collect()
+    (0..n)
+        .map(|k| 0.5 - 0.5 * (2.0 * std::f64::consts::PI * (k as f64 + 0.5) / n as f64).cos())
+        .collect()
 }
 
 fn windowed_spectrum(signal: &[f64]) -> Vec<Complex<f64>> {
     let plan = RealFftPlanner::<f64>::new().plan_fft_forward(signal.len());
-    let mut input: Vec<f64> = signal.iter().zip(hann(signal.len())).map(|(x, w)| x * w).collect();
+    let mut input: Vec<f64> = signal
+        .iter()
+        .zip(hann(signal.len()))
+        .map(|(x, w)| x * w)
+        .collect();
     let mut output = plan.make_output_vec();
     match plan.process(&mut input, &mut output) {
         Ok(()) => output.iter().map(|c| Complex::new(c.re, c.im)).collect(),
@@ -120,7 +145,8 @@ fn strongest(residual: &[f64], period_s: f64) -> Option<f64> {
         return None;
     }
     let spectrum = windowed_spectrum(residual);
-    let best = (1..spectrum.len().saturating_sub(1)).max_by(|&a, &b| spectrum[a].norm_sqr().total_cmp(&spectrum[b].norm_sqr()))?;
+    let best = (1..spectrum.len().saturating_sub(1))
+        .max_by(|&a, &b| spectrum[a].norm_sqr().total_cmp(&spectrum[b].norm_sqr()))?;
     Some(best as f64 / (residual.len() as f64 * period_s))
 }
 
@@ -149,14 +175,29 @@ fn golden(low: f64, high: f64, cost: &impl Fn(f64) -> f64) -> f64 {
 /// Response by averaged spectra (H1, Hann windows overlapping by half, each stretch detrended), `stretch` rows each.
 /// Points whose coherence is below `least_coherence` are left out. Increments of both signals are used when
 /// `difference` is set (an integrating plant), which leaves their ratio as it is.
-pub fn welch(input: &[f64], output: &[f64], period_s: f64, stretch: usize, least_coherence: f64, difference: bool) -> Vec<FrequencyPoint> {
+pub fn welch(
+    input: &[f64],
+    output: &[f64],
+    period_s: f64,
+    stretch: usize,
+    least_coherence: f64,
+    difference: bool,
+) -> Vec<FrequencyPoint> {
     let stretch = stretch.max(16).min(input.len());
     let prepared = |x: &[f64]| -> Vec<f64> {
-        if difference { x.windows(2).map(|w| w[1] - w[0]).collect() } else { x.to_vec() }
+        if difference {
+            x.windows(2).map(|w| w[1] - w[0]).collect()
+        } else {
+            x.to_vec()
+        }
     };
     let (u, y) = (prepared(input), prepared(output));
     let bins = stretch / 2 + 1;
-    let (mut uu, mut yy, mut yu) = (vec![0.0; bins], vec![0.0; bins], vec![Complex::from(0.0); bins]);
+    let (mut uu, mut yy, mut yu) = (
+        vec![0.0; bins],
+        vec![0.0; bins],
+        vec![Complex::from(0.0); bins],
+    );
     let mut count = 0.0;
     let mut start = 0;
     while start + stretch <= u.len() {
@@ -165,7 +206,10 @@ pub fn welch(input: &[f64], output: &[f64], period_s: f64, stretch: usize, least
         if a.iter().chain(b).any(|v| !v.is_finite()) {
             continue;
         }
-        let (fu, fy) = (windowed_spectrum(&detrended(a)), windowed_spectrum(&detrended(b)));
+        let (fu, fy) = (
+            windowed_spectrum(&detrended(a)),
+            windowed_spectrum(&detrended(b)),
+        );
         for i in 0..bins.min(fu.len()) {
             uu[i] += fu[i].norm_sqr();
             yy[i] += fy[i].norm_sqr();
@@ -211,13 +255,18 @@ mod tests {
         let signal: Vec<f64> = (0..4000)
             .map(|k| {
                 let t = k as f64 / 200.0;
-                1.8 + 1.8 * (2.0 * std::f64::consts::PI * 1.037 * t).sin() + 0.3 * (2.0 * std::f64::consts::PI * 13.4 * t).cos()
+                1.8 + 1.8 * (2.0 * std::f64::consts::PI * 1.037 * t).sin()
+                    + 0.3 * (2.0 * std::f64::consts::PI * 13.4 * t).cos()
             })
             .collect();
         let lines = find_lines(&signal, 1.0 / 200.0, 8);
         assert_eq!(lines.frequency_hz.len(), 2, "{lines:?}");
-        assert!((lines.frequency_hz[0] - 1.037).abs() < 1e-5 && (lines.amplitude[0] - 1.8).abs() < 1e-4);
-        assert!((lines.frequency_hz[1] - 13.4).abs() < 1e-4 && (lines.amplitude[1] - 0.3).abs() < 1e-4);
+        assert!(
+            (lines.frequency_hz[0] - 1.037).abs() < 1e-5 && (lines.amplitude[0] - 1.8).abs() < 1e-4
+        );
+        assert!(
+            (lines.frequency_hz[1] - 13.4).abs() < 1e-4 && (lines.amplitude[1] - 0.3).abs() < 1e-4
+        );
         assert!(lines.explained > 0.999);
     }
 

@@ -5,19 +5,34 @@ use cellpos_ident::sampled::Hold;
 
 fn column(path: &std::path::Path, number: usize) -> Option<Vec<f64>> {
     let text = std::fs::read_to_string(path).ok()?;
-    Some(text.lines().filter_map(|l| l.split_whitespace().nth(number - 1)?.parse().ok()).collect())
+    Some(
+        text.lines()
+            .filter_map(|l| l.split_whitespace().nth(number - 1)?.parse().ok())
+            .collect(),
+    )
 }
 
 #[test]
-fn a_measured_piezo_has_a_coherent_gain_and_lag_at_one_hertz_and_harmonics_that_no_linear_model_explains() {
-    let path = std::path::Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../../../shared/data/piezo-picma/Model_Vi_Do.dat"));
+fn a_measured_piezo_has_a_coherent_gain_and_lag_at_one_hertz_and_harmonics_that_no_linear_model_explains()
+ {
+    let path = std::path::Path::new(concat!(
+        env!("CARGO_MANIFEST_DIR"),
+        "/../../../shared/data/piezo-picma/Model_Vi_Do.dat"
+    ));
     let (Some(input), Some(output)) = (column(path, 1), column(path, 5)) else {
         println!("skipped: {} is not there", path.display());
         return;
     };
-    let settings = ForeignSettings { rate_hz: 200.0, most_order: 3, hold: Hold::None };
+    let settings = ForeignSettings {
+        rate_hz: 200.0,
+        most_order: 3,
+        hold: Hold::None,
+    };
     let result = identify(&input, &output, &settings).unwrap();
-    println!("{:?} {:?} rms {} left {:?}", result.lines, result.harmonics, result.output_rms, result.linear_residual_rms);
+    println!(
+        "{:?} {:?} rms {} left {:?}",
+        result.lines, result.harmonics, result.output_rms, result.linear_residual_rms
+    );
     assert_eq!(result.excitation, Excitation::Lines);
     let line = &result.lines[0];
     assert!((line.frequency_hz - 1.0).abs() < 0.02);
@@ -26,7 +41,14 @@ fn a_measured_piezo_has_a_coherent_gain_and_lag_at_one_hertz_and_harmonics_that_
     assert!(result.harmonics_remain());
     // The record's own description: second harmonic 1.9 %, third 2.0 %.
     for number in [2, 3] {
-        let h = result.harmonics.iter().find(|h| h.number == number).unwrap();
-        assert!(h.unexplained && (0.015..0.025).contains(&h.output_ratio), "{h:?}");
+        let h = result
+            .harmonics
+            .iter()
+            .find(|h| h.number == number)
+            .unwrap();
+        assert!(
+            h.unexplained && (0.015..0.025).contains(&h.output_ratio),
+            "{h:?}"
+        );
     }
 }
