@@ -1,0 +1,60 @@
+//! What stops the program.
+
+use cellpos_firmware_sim::BoxError;
+use std::io;
+use std::path::PathBuf;
+
+/// Why the box does not run.
+#[derive(Debug, thiserror::Error)]
+pub enum ProgramError {
+    /// A file that cannot be used.
+    #[error("{path}: {doing}: {source}")]
+    File {
+        /// Which.
+        path: PathBuf,
+        /// What was being done.
+        doing: &'static str,
+        /// What the operating system says.
+        source: io::Error,
+    },
+    /// A rig file that does not read.
+    #[error("{path}: {problem}")]
+    RigFile {
+        /// Which.
+        path: PathBuf,
+        /// What is wrong, with line and column.
+        problem: String,
+    },
+    /// A model that does not read.
+    #[error("{0}")]
+    Model(String),
+    /// Values that cannot be.
+    #[error(transparent)]
+    Box(#[from] BoxError),
+    /// The operating system refused something.
+    #[error("{doing}: {source}")]
+    System {
+        /// What was being done.
+        doing: &'static str,
+        /// What the operating system says.
+        source: io::Error,
+    },
+}
+
+impl ProgramError {
+    /// 2 for input that is wrong, 1 for everything else.
+    pub fn exit_code(&self) -> u8 {
+        match self {
+            Self::RigFile { .. } | Self::Model(_) | Self::Box(_) => 2,
+            Self::File { .. } | Self::System { .. } => 1,
+        }
+    }
+
+    /// For [`Result::map_err`] on a call to the operating system.
+    pub fn system<E: Into<io::Error>>(doing: &'static str) -> impl FnOnce(E) -> Self {
+        move |source| Self::System {
+            doing,
+            source: source.into(),
+        }
+    }
+}

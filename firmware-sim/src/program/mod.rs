@@ -1,0 +1,12 @@
+//! The program around the box: arguments, pseudo-terminal, socket, log, pacing.
+
+mod args;
+mod error;
+mod frame_server;
+mod line;
+mod log;
+mod run;
+
+pub use args::Args;
+pub use error::ProgramError;
+pub use run::run;
