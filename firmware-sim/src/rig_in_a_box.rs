@@ -164,24 +164,18 @@ impl RigInABox {
         const MS_NS: i64 = 1_000_000;
         let faults = &self.world.config().faults;
         let elapsed_ns = now_ns - self.start_ns;
-        let scheduled = faults
-            .event
-            .iter()
-            .filter(|event| event.kind == FaultKind::LinkGarbage)
-            .filter_map(|_| {
-                if faults.active(FaultKind::LinkGarbage, elapsed_ns + MS_NS) {
-                    Some(now_ns + MS_NS)
-                } else {
-                    faults
-                        .event
-                        .iter()
-                        .filter(|event| event.kind == FaultKind::LinkGarbage)
-                        .map(|event| self.start_ns + (event.at_s * 1e9) as i64)
-                        .filter(|&at_ns| at_ns > now_ns)
-                        .min()
-                }
-            })
-            .min();
+        let scheduled = if faults.active(FaultKind::LinkGarbage, elapsed_ns + MS_NS) {
+            Some(now_ns + MS_NS)
+        } else {
+            // The next span to begin, if any.
+            faults
+                .event
+                .iter()
+                .filter(|event| event.kind == FaultKind::LinkGarbage)
+                .map(|event| self.start_ns.saturating_add((event.at_s * 1e9) as i64))
+                .filter(|&at_ns| at_ns > now_ns)
+                .min()
+        };
         let rate = faults.garbage_per_s;
         let random = (rate > 0.0).then(|| {
             let wait_s = -(1.0 - self.garbage.uniform()).ln() / rate;

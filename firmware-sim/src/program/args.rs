@@ -39,7 +39,7 @@ pub struct Args {
     #[arg(long)]
     pub best_effort: bool,
     /// Bring a new bead when the old one has been out of the frame for this long and the flow is slow
-    #[arg(long, value_name = "TIME", default_value = "1s")]
+    #[arg(long, value_name = "TIME", default_value = "300ms")]
     pub new_bead_after: Seconds,
 
     /// Lose frames: a rate (0.01 or 1%) or a time span

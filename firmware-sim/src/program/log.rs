@@ -63,10 +63,14 @@ impl Log {
     pub fn note(&mut self, rig: &RigInABox) -> Result<(), ProgramError> {
         let now_ns = rig.now_ns();
         let state = rig.board().state();
-        if now_ns < self.next_ns && state as u8 == self.last_state {
+        let changed = state as u8 != self.last_state;
+        if now_ns < self.next_ns && !changed {
             return Ok(());
         }
-        self.next_ns = now_ns + PERIOD_NS;
+        // On the grid, unless a stall has put the log behind it.
+        if now_ns >= self.next_ns {
+            self.next_ns = (self.next_ns + PERIOD_NS).max(now_ns - PERIOD_NS);
+        }
         self.last_state = state as u8;
         self.write(format_args!(
             "{:.6},{},{:.6},{:.6},{:.6},{:?},{:?}\n",
