@@ -14,7 +14,7 @@ use std::str::FromStr;
 #[derive(Debug, Parser)]
 #[command(name = "firmware-sim", version, after_help = EXAMPLE)]
 pub struct Args {
-    /// Rig file; its tables [emulator] and [board] are used, the others belong to the host
+    /// Rig file; its tables `emulator` and `board` are used, the others belong to the host
     #[arg(long, value_name = "FILE")]
     pub rig: Option<PathBuf>,
     /// Plant and effects: eq6 or a model.toml
