@@ -2,6 +2,7 @@
 
 use crate::config::MAX_WINDOW_PX;
 use crate::frame::{Frame, Pixels};
+use crate::profile::Template;
 
 /// Pixels that are computed on together.
 pub(crate) const LANES: usize = 4;
@@ -62,6 +63,22 @@ impl Crop {
             self.take_off_pedestal();
         }
         copied
+    }
+
+    /// Takes the image of a bead off the window.
+    pub fn take_off(&mut self, template: &Template, x_px: f64, y_px: f64, amplitude: f64) {
+        let (x, y) = (
+            (x_px - self.x0 as f64) as f32,
+            (y_px - self.y0 as f64) as f32,
+        );
+        let (width, amplitude) = (self.width, amplitude as f32);
+        for (j, row) in self.rows.iter_mut().enumerate().take(self.height) {
+            let dy = j as f32 - y;
+            for (i, v) in row.iter_mut().enumerate().take(width) {
+                let dx = i as f32 - x;
+                *v -= amplitude * template.value_at_squared(dx * dx + dy * dy);
+            }
+        }
     }
 
     fn copy<T: Copy>(&mut self, pixels: &[T], frame_width: usize) -> bool

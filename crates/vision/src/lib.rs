@@ -6,6 +6,7 @@
 
 pub mod account;
 pub mod blobs;
+pub mod cells;
 pub mod config;
 mod crop;
 mod fit;
@@ -13,19 +14,24 @@ mod fix;
 mod frame;
 mod learn;
 mod localiser;
+pub mod many;
 pub mod profile;
 mod seed;
 pub mod symmetry;
+pub mod track;
 
 pub use account::{FrameAccount, FrameCounts, FrameKind, IdKind};
 pub use blobs::{Blob, Blobs};
+pub use cells::{CellConfig, CellError, CellFinder};
 pub use config::{ConfigError, Learning, LocaliserConfig, Noise, Polarity};
 pub use fix::{Fix, Verdict};
 pub use frame::{Frame, Pixels};
 pub use learn::LearningReport;
 pub use localiser::Localiser;
+pub use many::{LinkConfig, ManyTracker, Sight};
 pub use profile::{
     GaussianProfile, PixelResponse, ProfileSpec, RadialProfile, RingProfile, Template,
 };
 pub use seed::Detector;
 pub use symmetry::RadialSymmetry;
+pub use track::{Decision, TrackState, TrackStep, Tracker, TrackerConfig};

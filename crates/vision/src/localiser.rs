@@ -17,6 +17,8 @@ const RECENTRE_PX: f64 = 1.0;
 const MAX_RECENTRES: u32 = 4;
 /// Half-width in bead radii of the window that leaves neighbours out.
 const NARROW_RADII: f64 = 1.3;
+/// Beads that can be taken off a window.
+const MAX_OTHERS: usize = 8;
 /// Share of a new frame in the running noise estimate.
 const NOISE_FORGETTING: f64 = 1.0 / 64.0;
 /// Variance of rounding to whole grey levels, grey^2: the least that a pixel's noise can be.
@@ -35,6 +37,8 @@ pub struct Localiser {
     /// Running noise variance of a pixel, grey^2; `None` before the first frame.
     noise_variance: Option<f64>,
     learner: Option<Learner>,
+    /// Beads taken off the window: x, y, amplitude.
+    others: [(f64, f64, f64); MAX_OTHERS],
 }
 
 /// A fit at rest or given up.
@@ -63,6 +67,7 @@ impl Localiser {
             sign,
             noise_variance: None,
             learner,
+            others: [(0.0, 0.0, 0.0); MAX_OTHERS],
         })
     }
 
@@ -145,13 +150,51 @@ impl Localiser {
         Some((1.0 + change, sd))
     }
 
+    /// Position of the bead `own` of `beads` (x and y in px, amplitude in grey levels) near `guess`, with the images of
+    /// the others taken off the window: for beads that overlap. The template is not learnt from such a fix.
+    pub fn locate_beside(
+        &mut self,
+        frame: &Frame,
+        guess: (f64, f64),
+        beads: &[(f64, f64, f64)],
+        own: usize,
+    ) -> Fix {
+        self.others = [(0.0, 0.0, 0.0); MAX_OTHERS];
+        let others = beads.iter().enumerate().filter(|(k, _)| *k != own);
+        for (slot, (_, bead)) in self.others.iter_mut().zip(others) {
+            *slot = *bead;
+        }
+        let fix = self.attempt(frame, guess, self.config.window_px);
+        self.others = [(0.0, 0.0, 0.0); MAX_OTHERS];
+        fix
+    }
+
+    /// Copies a window, with the images of other beads taken off.
+    fn take_window(&mut self, frame: &Frame, x_px: f64, y_px: f64, side_px: usize) -> bool {
+        let taken = self.crop.take(frame, x_px, y_px, side_px);
+        for (x, y, amplitude) in self.others {
+            if taken && amplitude != 0.0 {
+                self.crop.take_off(&self.template, x, y, amplitude);
+            }
+        }
+        taken
+    }
+
     fn attempt(&mut self, frame: &Frame, (x_px, y_px): (f64, f64), side_px: usize) -> Fix {
-        if !self.crop.take(frame, x_px, y_px, side_px) {
+        if !self.take_window(frame, x_px, y_px, side_px) {
             return Fix::none(x_px, y_px, Verdict::AtBorder);
         }
         let fitted = self.fit(frame, x_px, y_px, side_px);
-        self.update_noise();
-        self.judge(frame, fitted, (x_px, y_px))
+        // The noise is read off the border of a whole window that holds one bead in its middle; anywhere else edges
+        // would count as noise.
+        if self.noise_variance.is_none() {
+            self.update_noise();
+        }
+        let fix = self.judge(frame, fitted, (x_px, y_px));
+        if fix.verdict == Verdict::Good && side_px == self.config.window_px {
+            self.update_noise();
+        }
+        fix
     }
 
     fn learn(&mut self, fix: &Fix) {
@@ -170,8 +213,6 @@ impl Localiser {
         }
     }
 
-    /// Noise from the window as it lies after the fit, centred on the bead: a window off centre has the bead's edge on
-    /// its border.
     fn update_noise(&mut self) {
         self.noise_variance = Some(match self.config.noise {
             Noise::Known { read_sd_grey, .. } => read_sd_grey * read_sd_grey,
@@ -260,7 +301,7 @@ impl Localiser {
             );
             if off_centre > RECENTRE_PX && recentres < MAX_RECENTRES {
                 let (x0, y0) = (self.crop.x0, self.crop.y0);
-                if !self.crop.take(frame, x_px, y_px, side_px) {
+                if !self.take_window(frame, x_px, y_px, side_px) {
                     return Some(Fitted {
                         x_px,
                         y_px,

@@ -157,6 +157,11 @@ impl Detector {
         }
     }
 
+    /// What the last call of [`Detector::detect`] found.
+    pub fn found(&self) -> &[Blob] {
+        self.blobs.found()
+    }
+
     /// Bead-like regions of the frame, the largest contrast first. Empty when nothing stands out of the noise.
     pub fn detect(&mut self, frame: &Frame) -> &[Blob] {
         match frame.pixels {

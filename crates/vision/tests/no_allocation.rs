@@ -2,7 +2,8 @@
 #![allow(unsafe_code)]
 
 use cellpos_vision::{
-    Frame, Localiser, LocaliserConfig, Noise, PixelResponse, Pixels, ProfileSpec, Verdict,
+    CellConfig, CellFinder, Frame, Learning, Localiser, LocaliserConfig, Noise, PixelResponse,
+    Pixels, ProfileSpec, Tracker, TrackerConfig, Verdict,
 };
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
@@ -95,4 +96,76 @@ fn locating_allocates_nothing_for_any_verdict() {
         assert_eq!(allocations(), before);
         assert!(good >= 3, "{good}");
     }
+}
+
+#[test]
+fn tracking_through_an_encounter_and_a_loss_allocates_nothing() {
+    let spec = ProfileSpec::Ring { edge_px: 4.5 };
+    let template = spec.template(PixelResponse::Point).unwrap();
+    let learning = Some(Learning {
+        first_fixes: 5,
+        refresh_fixes: 16,
+        ..Learning::default()
+    });
+    let localiser = Localiser::new(LocaliserConfig {
+        learning,
+        ..LocaliserConfig::new(spec)
+    })
+    .unwrap();
+    let mut tracker = Tracker::new(localiser, TrackerConfig::default()).unwrap();
+    let (width, height) = (96, 64);
+    let mut ripple = 0.7_f32;
+    let frames: Vec<Vec<u8>> = (0..240)
+        .map(|n| {
+            let mut image = vec![100.0_f32; width * height];
+            if n < 160 {
+                template.draw(&mut image, width, 40.0, 30.0, 80.0);
+                template.draw(&mut image, width, 0.6 * f64::from(n), 36.0, 80.0);
+            }
+            let mut noisy = |v: &f32| {
+                ripple = 3.9 * ripple * (1.0 - ripple);
+                (v + 4.0 * (ripple - 0.5)).round() as u8
+            };
+            image.iter().map(&mut noisy).collect()
+        })
+        .collect();
+    let mut states = [0_u32; 4];
+    tracker.choose(Some((40.0, 30.0)));
+    let before = allocations();
+    for (n, pixels) in frames.iter().enumerate() {
+        let frame = Frame {
+            width,
+            height,
+            pixels: Pixels::Mono8(pixels),
+        };
+        let step = tracker.step(Some(&frame), n as f64 * 1e-3, (0.0, 0.0));
+        states[step.state as usize] += 1;
+    }
+    assert_eq!(allocations(), before);
+    assert!(
+        states.iter().all(|n| *n > 0),
+        "every state must have been passed through: {states:?}"
+    );
+    assert!(tracker.localiser().learning().taken >= 1);
+}
+
+#[test]
+fn finding_cells_allocates_nothing() {
+    let mut finder = CellFinder::new(64, 48, CellConfig::default()).unwrap();
+    let empty = vec![100_u8; 64 * 48];
+    let mut cell = empty.clone();
+    for k in 0..200 {
+        cell[(10 + k / 20) * 64 + 20 + k % 20] = 150;
+    }
+    let frame = |pixels| Frame {
+        width: 64,
+        height: 48,
+        pixels: Pixels::Mono8(pixels),
+    };
+    let before = allocations();
+    finder.take_background(&frame(&empty)).unwrap();
+    finder.take_background(&frame(&empty)).unwrap();
+    let found = finder.find(&frame(&cell)).unwrap().len();
+    assert_eq!(allocations(), before);
+    assert_eq!(found, 1);
 }

@@ -1,0 +1,57 @@
+//! What tells the tracked bead from others: intensity, size, residual.
+
+use super::config::TrackerConfig;
+use crate::fix::Fix;
+
+/// Share of a new fix in the running signature.
+const FORGETTING: f64 = 0.01;
+/// Standard deviations granted beyond the allowed change of size.
+const SIZE_SIGMA: f64 = 3.0;
+
+/// Running signature of a bead.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Identity {
+    amplitude: f64,
+    residual: f64,
+    size: Option<f64>,
+    fixes: f64,
+}
+
+impl Identity {
+    pub fn new(fix: &Fix, size: Option<(f64, f64)>) -> Self {
+        Identity {
+            amplitude: fix.amplitude,
+            residual: fix.residual_ratio,
+            size: size.map(|s| s.0),
+            fixes: 1.0,
+        }
+    }
+
+    /// Peak contrast, grey levels.
+    pub fn amplitude(&self) -> f64 {
+        self.amplitude
+    }
+
+    pub fn agrees(&self, config: &TrackerConfig, fix: &Fix, size: Option<(f64, f64)>) -> bool {
+        let amplitude = (fix.amplitude / self.amplitude - 1.0).abs() <= config.max_amplitude_change;
+        let residual = fix.residual_ratio <= config.max_residual_growth * self.residual.max(1.0);
+        let size = match (self.size, size) {
+            (Some(own), Some((other, sd))) => {
+                (other / own - 1.0).abs() <= config.max_size_change + SIZE_SIGMA * sd
+            }
+            _ => true,
+        };
+        amplitude && residual && size
+    }
+
+    /// Follows slow changes of light and focus.
+    pub fn update(&mut self, fix: &Fix, size: Option<(f64, f64)>) {
+        self.fixes += 1.0;
+        let share = FORGETTING.max(1.0 / self.fixes);
+        self.amplitude += share * (fix.amplitude - self.amplitude);
+        self.residual += share * (fix.residual_ratio - self.residual);
+        if let Some((other, _)) = size {
+            self.size = Some(self.size.map_or(other, |own| own + share * (other - own)));
+        }
+    }
+}

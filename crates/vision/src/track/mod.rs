@@ -1,0 +1,483 @@
+//! Following one bead from frame to frame, never on to another without saying so.
+//!
+//! Each frame ends in one of four states and one decision. The bead's motion is predicted from the commanded flow and
+//! an estimated drift; a fix is taken when it lies within the gate of the prediction and agrees in intensity, size and
+//! residual. Other beads near by are followed too: when two beads have touched, a fix is taken only if every reading in
+//! which it belongs to the other is less likely by a set margin. Otherwise the tracker coasts and, after its limit, is
+//! lost: being lost is an answer, following another bead is not.
+
+mod config;
+mod identity;
+mod motion;
+mod neighbours;
+
+use crate::config::ConfigError;
+use crate::fix::{Fix, Verdict};
+use crate::frame::Frame;
+use crate::localiser::Localiser;
+use crate::seed::Detector;
+pub use config::{Decision, TrackState, TrackStep, TrackerConfig};
+use identity::Identity;
+use motion::{Motion, Randomness};
+use neighbours::{Claim, MAX_BEADS, Neighbours};
+
+/// Frames between measurements of the size while tracking.
+const SIZE_STRIDE: u32 = 8;
+
+/// Share of the chosen bead's amplitude below which a candidate is not a bead.
+const LEAST_SHARE: f64 = 0.3;
+/// Beads nearer than this many radii are fitted together.
+const TOUCHING_RADII: f64 = 4.0;
+/// Times that beads fitted together are each gone through.
+const SWEEPS: usize = 5;
+
+/// The bead chosen, or on the way to it.
+#[derive(Debug, Clone, Copy)]
+struct Chosen {
+    motion: Motion,
+    identity: Identity,
+    confirmed: u32,
+    last_fix_s: f64,
+}
+
+/// A bead seen in the frame, fitted.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Candidate {
+    pub fix: Fix,
+    pub size: Option<(f64, f64)>,
+}
+
+/// Tracks one bead. Allocates only when made.
+#[derive(Debug, Clone)]
+pub struct Tracker {
+    config: TrackerConfig,
+    randomness: Randomness,
+    localiser: Localiser,
+    detector: Detector,
+    neighbours: Neighbours,
+    state: TrackState,
+    chosen: Option<Chosen>,
+    aim: Option<(f64, f64)>,
+    time_s: Option<f64>,
+    frames: u32,
+    candidates: [Option<Candidate>; MAX_BEADS],
+}
+
+impl Tracker {
+    /// A tracker that searches.
+    ///
+    /// # Errors
+    /// Names the first setting that cannot be used.
+    pub fn new(localiser: Localiser, config: TrackerConfig) -> Result<Self, ConfigError> {
+        config.check()?;
+        let detector = Detector::new(&localiser, 4 * MAX_BEADS);
+        let randomness = Randomness {
+            diffusion_px2_per_s: config.diffusion_px2_per_s,
+            velocity_walk: config.velocity_walk_px_per_s15,
+            flow_error: config.flow_error,
+        };
+        Ok(Tracker {
+            config,
+            randomness,
+            localiser,
+            detector,
+            neighbours: Neighbours::default(),
+            state: TrackState::Searching,
+            chosen: None,
+            aim: None,
+            time_s: None,
+            frames: 0,
+            candidates: [None; MAX_BEADS],
+        })
+    }
+
+    /// Where the tracker stands.
+    pub fn state(&self) -> TrackState {
+        self.state
+    }
+
+    /// The localiser in use.
+    pub fn localiser(&self) -> &Localiser {
+        &self.localiser
+    }
+
+    /// Forgets the bead and searches for the one nearest to `aim` (px), or for the strongest without an aim. This is
+    /// the operator's way to settle what the tracker calls ambiguous.
+    pub fn choose(&mut self, aim: Option<(f64, f64)>) {
+        self.aim = aim;
+        self.chosen = None;
+        self.neighbours = Neighbours::default();
+        self.state = TrackState::Searching;
+    }
+
+    /// Takes in the frame exposed about `time_s`, with the flow velocity (px/s) commanded since the frame before.
+    /// Without a frame, or with a time that has not moved on, the prediction is carried on.
+    pub fn step(
+        &mut self,
+        frame: Option<&Frame>,
+        time_s: f64,
+        flow_px_per_s: (f64, f64),
+    ) -> TrackStep {
+        let dt_s = self.time_s.map_or(0.0, |before| (time_s - before).max(0.0));
+        let dt_s = if dt_s.is_finite() { dt_s } else { 0.0 };
+        let time_s = self
+            .time_s
+            .unwrap_or(if time_s.is_finite() { time_s } else { 0.0 })
+            + dt_s;
+        self.time_s = Some(time_s);
+        self.frames = self.frames.wrapping_add(1);
+        if let Some(chosen) = &mut self.chosen {
+            chosen.motion.predict(dt_s, flow_px_per_s, &self.randomness);
+        }
+        self.neighbours
+            .predict(dt_s, flow_px_per_s, &self.randomness);
+        let before = self.chosen;
+        let (decision, fix) = match (frame, self.chosen) {
+            (None, _) => (Decision::NoFrame, None),
+            (Some(frame), None) => self.search(frame, time_s),
+            (Some(frame), Some(chosen)) if chosen.confirmed < self.config.confirm_frames => {
+                self.confirm(frame, chosen, time_s)
+            }
+            (Some(frame), Some(chosen)) => self.follow(frame, chosen, time_s),
+        };
+        self.settle(decision, time_s);
+        self.describe(decision, fix, before, time_s)
+    }
+
+    fn search(&mut self, frame: &Frame, time_s: f64) -> (Decision, Option<Fix>) {
+        self.look_around(frame);
+        let aim = self.aim;
+        let distance = |c: &Candidate| match aim {
+            Some((x, y)) => f64::hypot(c.fix.x_px - x, c.fix.y_px - y),
+            None => -c.fix.snr,
+        };
+        let good = self
+            .candidates
+            .iter()
+            .flatten()
+            .filter(|c| c.fix.verdict == Verdict::Good);
+        let Some(best) = good
+            .min_by(|a, b| distance(a).total_cmp(&distance(b)))
+            .copied()
+        else {
+            let seen = self.candidates.iter().flatten().next().map(|c| c.fix);
+            return (
+                seen.map_or(Decision::NothingFound, |f| refusal(f.verdict)),
+                seen,
+            );
+        };
+        self.chosen = Some(Chosen {
+            motion: Motion::new(&best.fix),
+            identity: Identity::new(&best.fix, best.size),
+            confirmed: 1,
+            last_fix_s: time_s,
+        });
+        (Decision::Confirming, Some(best.fix))
+    }
+
+    fn confirm(
+        &mut self,
+        frame: &Frame,
+        mut chosen: Chosen,
+        time_s: f64,
+    ) -> (Decision, Option<Fix>) {
+        let fix = self.localiser.locate(frame, Some(chosen.motion.position()));
+        let size = self.localiser.relative_size(&fix);
+        let near = self.within_gate(&chosen.motion, &fix);
+        if fix.verdict == Verdict::Good && near && chosen.identity.agrees(&self.config, &fix, size)
+        {
+            chosen.motion.update(&fix);
+            chosen.identity.update(&fix, size);
+            chosen.confirmed += 1;
+            chosen.last_fix_s = time_s;
+            self.chosen = Some(chosen);
+            let done = chosen.confirmed >= self.config.confirm_frames;
+            return (
+                if done {
+                    Decision::Accepted
+                } else {
+                    Decision::Confirming
+                },
+                Some(fix),
+            );
+        }
+        // Not a bead that stays: search again with the next frame.
+        self.chosen = None;
+        (refusal(fix.verdict), Some(fix))
+    }
+
+    fn follow(&mut self, frame: &Frame, chosen: Chosen, time_s: f64) -> (Decision, Option<Fix>) {
+        let tracking = self.state == TrackState::Tracking;
+        let look =
+            self.frames.is_multiple_of(self.config.neighbour_stride) || self.neighbours.count() > 0;
+        if tracking && !look {
+            let fix = self.localiser.locate(frame, Some(chosen.motion.position()));
+            let size = if self.frames.is_multiple_of(SIZE_STRIDE) {
+                self.localiser.relative_size(&fix)
+            } else {
+                None
+            };
+            let good = fix.verdict == Verdict::Good && self.within_gate(&chosen.motion, &fix);
+            if good && chosen.identity.agrees(&self.config, &fix, size) {
+                self.take(chosen, &Candidate { fix, size }, time_s);
+                return (Decision::Accepted, Some(fix));
+            }
+        }
+        self.follow_among_others(frame, chosen, time_s)
+    }
+
+    /// The careful way: every bead in the frame is located and the whole frame is explained.
+    fn follow_among_others(
+        &mut self,
+        frame: &Frame,
+        chosen: Chosen,
+        time_s: f64,
+    ) -> (Decision, Option<Fix>) {
+        self.look_around(frame);
+        // The detector misses a bead that touches a stronger one; the fit at the prediction may still see it.
+        let fix = self.localiser.locate(frame, Some(chosen.motion.position()));
+        let size = self.localiser.relative_size(&fix);
+        self.add_candidate(Candidate { fix, size });
+        self.part_touching_beads(frame, &chosen);
+
+        let (mut best, mut nearest) = (None::<usize>, None::<Fix>);
+        let mut misfit = None;
+        for (k, c) in self.candidates.iter().enumerate() {
+            let Some(c) = c else { continue };
+            let nearer = nearest
+                .is_none_or(|n| chosen.motion.distance2(&c.fix) < chosen.motion.distance2(&n));
+            if nearer {
+                nearest = Some(c.fix);
+                misfit = Some(if c.fix.verdict != Verdict::Good {
+                    refusal(c.fix.verdict)
+                } else if !self.within_gate(&chosen.motion, &c.fix) {
+                    Decision::OutsideGate
+                } else {
+                    Decision::OtherBead
+                });
+            }
+            let mut ok = c.fix.verdict == Verdict::Good
+                && chosen.identity.agrees(&self.config, &c.fix, c.size);
+            // A lost bead may come back anywhere; a coasting one only near its prediction.
+            ok &= self.state == TrackState::Lost || self.within_gate(&chosen.motion, &c.fix);
+            let surprise = |i: usize| {
+                let other = self.candidates.get(i).copied().flatten();
+                other.map_or(f64::INFINITY, |o| chosen.motion.surprise(&o.fix))
+            };
+            if ok && best.is_none_or(|b| surprise(k) < surprise(b)) {
+                best = Some(k);
+            }
+        }
+        let least_amplitude = LEAST_SHARE * chosen.identity.amplitude().abs();
+        let claim = best.map(|b| {
+            let certainty = self.config.certainty;
+            self.neighbours.claim(
+                &chosen.motion,
+                &self.candidates,
+                b,
+                least_amplitude,
+                certainty,
+            )
+        });
+        let taken = match claim {
+            Some(Claim::Ours) => best,
+            _ => None,
+        };
+        self.neighbours.update(
+            &chosen.motion,
+            &self.candidates,
+            taken,
+            time_s,
+            &self.config,
+            (frame.width, frame.height),
+        );
+        match (
+            taken.and_then(|k| self.candidates.get(k).copied().flatten()),
+            claim,
+        ) {
+            (Some(c), _) => {
+                let decision = match self.state {
+                    TrackState::Tracking | TrackState::Searching => Decision::Accepted,
+                    TrackState::Coasting => Decision::Regained,
+                    TrackState::Lost => Decision::Reacquired,
+                };
+                let restarted = if decision == Decision::Reacquired {
+                    Chosen {
+                        motion: Motion::new(&c.fix),
+                        ..chosen
+                    }
+                } else {
+                    chosen
+                };
+                self.take(restarted, &c, time_s);
+                (decision, Some(c.fix))
+            }
+            (None, Some(_)) => (Decision::Ambiguous, nearest),
+            (None, None) => (misfit.unwrap_or(Decision::NothingFound), nearest),
+        }
+    }
+
+    /// Fits beads whose images overlap: in turn, each with the others' images taken off the frame. The results replace
+    /// the candidates near by that were fitted as if they were alone.
+    fn part_touching_beads(&mut self, frame: &Frame, chosen: &Chosen) {
+        let reach_px = TOUCHING_RADII * self.localiser.template().radius_px();
+        let apart_px = 0.5 * self.localiser.template().radius_px();
+        let own = (chosen.motion.position(), chosen.identity.amplitude());
+        let mut beads = [(0.0, 0.0, 0.0); MAX_BEADS];
+        let mut n = 0;
+        let neighbours = self.neighbours.predictions().filter(|(x, y, _)| {
+            let distance_px = f64::hypot(x - own.0.0, y - own.0.1);
+            distance_px < reach_px
+        });
+        for (slot, bead) in beads
+            .iter_mut()
+            .zip(std::iter::once((own.0.0, own.0.1, own.1)).chain(neighbours))
+        {
+            *slot = bead;
+            n += 1;
+        }
+        if n < 2 {
+            return;
+        }
+        let Some(beads) = beads.get_mut(..n) else {
+            return;
+        };
+        let mut fixes = [None; MAX_BEADS];
+        for _ in 0..SWEEPS {
+            for k in 0..n {
+                let Some(&(x, y, _)) = beads.get(k) else {
+                    continue;
+                };
+                let fix = self.localiser.locate_beside(frame, (x, y), beads, k);
+                let near = f64::hypot(fix.x_px - x, fix.y_px - y) < 2.0 * apart_px;
+                let usable =
+                    near && !matches!(fix.verdict, Verdict::NoSignal | Verdict::NotConverged);
+                if let (true, Some(bead)) = (usable, beads.get_mut(k)) {
+                    *bead = (fix.x_px, fix.y_px, fix.amplitude);
+                }
+                if let Some(slot) = fixes.get_mut(k) {
+                    *slot = Some(fix);
+                }
+            }
+        }
+        // Two fits that met are one image fitted twice: no better than before.
+        let met = beads.iter().enumerate().any(|(i, a)| {
+            beads
+                .iter()
+                .skip(i + 1)
+                .any(|b| f64::hypot(a.0 - b.0, a.1 - b.1) < apart_px)
+        });
+        if met {
+            return;
+        }
+        for fix in fixes
+            .iter()
+            .flatten()
+            .filter(|f| f.verdict == Verdict::Good)
+        {
+            for slot in &mut self.candidates {
+                // A fit as if alone is drawn towards the other bead.
+                let beside = |c: &Candidate| {
+                    f64::hypot(c.fix.x_px - fix.x_px, c.fix.y_px - fix.y_px) < 2.0 * apart_px
+                };
+                if slot.is_some_and(|c| beside(&c) && !fixes.contains(&Some(c.fix))) {
+                    *slot = None;
+                }
+            }
+            self.add_candidate(Candidate {
+                fix: *fix,
+                size: None,
+            });
+        }
+    }
+
+    fn take(&mut self, mut chosen: Chosen, c: &Candidate, time_s: f64) {
+        chosen.motion.update(&c.fix);
+        chosen.identity.update(&c.fix, c.size);
+        chosen.last_fix_s = time_s;
+        self.chosen = Some(chosen);
+    }
+
+    fn within_gate(&self, motion: &Motion, fix: &Fix) -> bool {
+        let (x, y) = motion.position();
+        motion.distance2(fix) <= self.config.gate_sigma * self.config.gate_sigma
+            || f64::hypot(fix.x_px - x, fix.y_px - y) <= self.config.least_gate_px
+    }
+
+    /// Locates every bead that the detector sees.
+    fn look_around(&mut self, frame: &Frame) {
+        self.candidates = [None; MAX_BEADS];
+        self.detector.detect(frame);
+        for k in 0..MAX_BEADS {
+            let Some(blob) = self.detector.found().get(k).copied() else {
+                break;
+            };
+            let fix = self.localiser.locate(frame, Some((blob.x_px, blob.y_px)));
+            let size = self.localiser.relative_size(&fix);
+            self.add_candidate(Candidate { fix, size });
+        }
+    }
+
+    /// Adds a candidate unless one is already there.
+    fn add_candidate(&mut self, c: Candidate) {
+        let apart_px = 0.5 * self.localiser.template().radius_px();
+        let good = |c: &Candidate| c.fix.verdict == Verdict::Good;
+        let same =
+            |o: &Candidate| f64::hypot(o.fix.x_px - c.fix.x_px, o.fix.y_px - c.fix.y_px) < apart_px;
+        if let Some(other) = self.candidates.iter_mut().flatten().find(|o| same(o)) {
+            if good(&c) && !good(other) {
+                *other = c;
+            }
+        } else if let Some(free) = self.candidates.iter_mut().find(|s| s.is_none()) {
+            *free = Some(c);
+        }
+    }
+
+    fn settle(&mut self, decision: Decision, time_s: f64) {
+        self.state = match self.chosen {
+            None => TrackState::Searching,
+            Some(c) if c.confirmed < self.config.confirm_frames => TrackState::Searching,
+            Some(_) if decision.is_accepted() => TrackState::Tracking,
+            Some(_) if self.state == TrackState::Lost => TrackState::Lost,
+            Some(c) if time_s - c.last_fix_s > self.config.coast_limit_s => TrackState::Lost,
+            Some(_) => TrackState::Coasting,
+        };
+    }
+
+    fn describe(
+        &self,
+        decision: Decision,
+        fix: Option<Fix>,
+        before: Option<Chosen>,
+        time_s: f64,
+    ) -> TrackStep {
+        let motion = self.chosen.map(|c| c.motion);
+        let (x_px, y_px) = motion.map_or((f64::NAN, f64::NAN), |m| m.position());
+        let innovation = match (before, fix) {
+            (Some(b), Some(f)) => b.motion.distance2(&f).sqrt(),
+            _ => f64::NAN,
+        };
+        TrackStep {
+            state: self.state,
+            decision,
+            fix: fix.unwrap_or(Fix::none(x_px, y_px, Verdict::NoSignal)),
+            x_px,
+            y_px,
+            sd_px: motion.map_or(f64::INFINITY, |m| m.sd_px()),
+            innovation_sigma: innovation,
+            coasted_s: self.chosen.map_or(0.0, |c| time_s - c.last_fix_s),
+            neighbours: self.neighbours.count() as u8,
+        }
+    }
+}
+
+/// The decision for a fix that cannot be used.
+fn refusal(verdict: Verdict) -> Decision {
+    match verdict {
+        Verdict::NoSignal => Decision::NoSignal,
+        Verdict::BadFit => Decision::Merged,
+        Verdict::AtBorder => Decision::AtBorder,
+        Verdict::NotConverged => Decision::NotConverged,
+        Verdict::Good => Decision::OtherBead,
+    }
+}

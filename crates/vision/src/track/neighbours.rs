@@ -1,0 +1,191 @@
+//! Other beads in the frame, followed so that the chosen one is not taken for one of them.
+
+use super::Candidate;
+use super::config::TrackerConfig;
+use super::motion::{Motion, Randomness};
+use crate::fix::Verdict;
+
+/// Beads looked at in a frame.
+pub(crate) const MAX_BEADS: usize = 8;
+/// Time without a sight after which a neighbour that was last seen within the frame is forgotten, s.
+const MEMORY_S: f64 = 2.0;
+/// Share of a new fix in a neighbour's amplitude.
+const AMPLITUDE_SHARE: f64 = 0.05;
+/// Cost of not seeing a bead that should be there, on the scale of minus twice the log likelihood.
+const MISS: f64 = 30.0;
+
+/// Whose a fix is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Claim {
+    Ours,
+    Unclear,
+}
+
+/// Whether a fix tells where a neighbour is: one cut by the border still does.
+fn is_sight(verdict: Verdict) -> bool {
+    matches!(verdict, Verdict::Good | Verdict::AtBorder)
+}
+
+#[derive(Debug, Clone, Copy)]
+struct Neighbour {
+    motion: Motion,
+    amplitude: f64,
+    seen_s: f64,
+}
+
+/// Beads beside the chosen one.
+#[derive(Debug, Clone, Copy, Default)]
+pub(crate) struct Neighbours {
+    beads: [Option<Neighbour>; MAX_BEADS],
+}
+
+type Candidates = [Option<Candidate>; MAX_BEADS];
+
+impl Neighbours {
+    /// Predicted positions (px) and amplitudes (grey levels) of the neighbours.
+    pub fn predictions(&self) -> impl Iterator<Item = (f64, f64, f64)> {
+        self.beads.iter().flatten().map(|n| {
+            let (x, y) = n.motion.position();
+            (x, y, n.amplitude)
+        })
+    }
+
+    pub fn count(&self) -> usize {
+        self.beads.iter().flatten().count()
+    }
+
+    pub fn predict(&mut self, dt_s: f64, flow_px_per_s: (f64, f64), randomness: &Randomness) {
+        for n in self.beads.iter_mut().flatten() {
+            n.motion.predict(dt_s, flow_px_per_s, randomness);
+        }
+    }
+
+    /// Whether the candidate `best` is surely the chosen bead, whose motion is `ours`: every other reading of the frame
+    /// (the chosen bead is another candidate, however badly fitted, or hidden, and `best` is a neighbour) must cost more
+    /// by `certainty`.
+    pub fn claim(
+        &self,
+        ours: &Motion,
+        candidates: &Candidates,
+        best: usize,
+        least_amplitude: f64,
+        certainty: f64,
+    ) -> Claim {
+        let best_cost = self.cost(ours, candidates, Some(best));
+        let mut other_cost = f64::INFINITY;
+        for (k, c) in candidates.iter().enumerate() {
+            // Where there is next to nothing, the chosen bead is not.
+            if k != best && c.is_some_and(|c| c.fix.amplitude.abs() > least_amplitude) {
+                other_cost = other_cost.min(self.cost(ours, candidates, Some(k)));
+            }
+        }
+        // Hidden only if a neighbour could be what is seen.
+        if self.count() > 0 {
+            other_cost = other_cost.min(self.cost(ours, candidates, None));
+        }
+        if other_cost - best_cost > certainty {
+            Claim::Ours
+        } else {
+            Claim::Unclear
+        }
+    }
+
+    /// Cost of the reading in which the chosen bead is the candidate `own`, or hidden: the neighbours take the nearest
+    /// of what is left, each candidate once.
+    fn cost(&self, ours: &Motion, candidates: &Candidates, own: Option<usize>) -> f64 {
+        let mut used = [false; MAX_BEADS];
+        let mut cost = MISS;
+        if let Some(k) = own
+            && let (Some(Some(c)), Some(flag)) = (candidates.get(k), used.get_mut(k))
+        {
+            *flag = true;
+            cost = ours.surprise(&c.fix);
+        }
+        for n in self.beads.iter().flatten() {
+            let mut least = (MISS, None);
+            for (k, c) in candidates.iter().enumerate() {
+                let Some(c) = c else { continue };
+                let free = used.get(k).is_some_and(|u| !u);
+                let surprise = n.motion.surprise(&c.fix);
+                if free && is_sight(c.fix.verdict) && surprise < least.0 {
+                    least = (surprise, Some(k));
+                }
+            }
+            cost += least.0;
+            if let Some(flag) = least.1.and_then(|k| used.get_mut(k)) {
+                *flag = true;
+            }
+        }
+        cost
+    }
+
+    /// Takes in what was seen beside the chosen bead (`taken`, whose motion is `ours`). While the chosen bead itself is
+    /// not seen, a candidate that it could be does not count as a sight of a neighbour.
+    pub fn update(
+        &mut self,
+        ours: &Motion,
+        candidates: &Candidates,
+        taken: Option<usize>,
+        time_s: f64,
+        config: &TrackerConfig,
+        (width, height): (usize, usize),
+    ) {
+        let mut used = [false; MAX_BEADS];
+        if let Some(flag) = taken.and_then(|k| used.get_mut(k)) {
+            *flag = true;
+        }
+        let gate2 = config.gate_sigma * config.gate_sigma;
+        for slot in &mut self.beads {
+            let Some(n) = slot else { continue };
+            let mut nearest = (gate2, None);
+            for (k, c) in candidates.iter().enumerate() {
+                let Some(c) = c else { continue };
+                let distance2 = n.motion.distance2(&c.fix);
+                let lead = ours.surprise(&c.fix) - n.motion.surprise(&c.fix);
+                if taken.is_none() && lead < config.certainty {
+                    continue;
+                }
+                if is_sight(c.fix.verdict)
+                    && used.get(k).is_some_and(|u| !u)
+                    && distance2 < nearest.0
+                {
+                    nearest = (distance2, Some((k, c.fix)));
+                }
+            }
+            if let Some((k, fix)) = nearest.1 {
+                n.motion.update(&fix);
+                n.amplitude += AMPLITUDE_SHARE * (fix.amplitude - n.amplitude);
+                n.seen_s = time_s;
+                if let Some(flag) = used.get_mut(k) {
+                    *flag = true;
+                }
+            }
+            // While the chosen bead is out of sight nobody is forgotten: it may have been hidden by just this one.
+            let (x, y) = n.motion.position();
+            let sure_px = 3.0 * n.motion.sd_px();
+            let beyond = |c: f64, len: usize| c < -sure_px || c > len as f64 - 1.0 + sure_px;
+            let left = beyond(x, width) || beyond(y, height);
+            let memory_s = if left { config.coast_limit_s } else { MEMORY_S };
+            if taken.is_some() && time_s - n.seen_s > memory_s {
+                *slot = None;
+            }
+        }
+        // What is left over is a new neighbour, as long as the chosen bead itself is in sight: otherwise it may be it.
+        if taken.is_none() {
+            return;
+        }
+        for (c, used) in candidates.iter().zip(used) {
+            if let Some(c) = c
+                && !used
+                && is_sight(c.fix.verdict)
+                && let Some(free) = self.beads.iter_mut().find(|n| n.is_none())
+            {
+                *free = Some(Neighbour {
+                    motion: Motion::new(&c.fix),
+                    amplitude: c.fix.amplitude,
+                    seen_s: time_s,
+                });
+            }
+        }
+    }
+}
