@@ -54,7 +54,7 @@ fn us_per_ms(take: Take, commands: bool, milliseconds: u32) -> f64 {
                 session: 1,
                 seq: k,
                 time_us: u64::from(k) * 1000,
-                displacement_pm: 20_000_000 + (k % 7) as i32 * 20_000,
+                displacement_pm: 20_000_000 + ((k % 7) as i32 - 3) * 20_000,
                 neutral_pm: 20_000_000,
             });
             say(&mut rig, &command, t_ns + 30_000);

@@ -1,7 +1,7 @@
 //! From bead positions to grey values.
 //!
 //! Only the neighbourhood of a bead is computed; everything else is background, whose noise is drawn beforehand into a
-//! long strip of grey values from which each row takes a piece at a random place. A piece comes again after some hundred
+//! long strip of grey values from which each row takes a piece at a random place. A piece comes again after a hundred
 //! thousand pixels, at another place of another frame.
 
 use crate::config::WorldConfig;
@@ -13,10 +13,11 @@ use rand_xoshiro::Xoshiro256PlusPlus;
 /// A bead's path is replaced by points no further apart than this; the error of the blur is of second order in it.
 const POINT_SPACING_PX: f64 = 0.25;
 const MAX_POINTS: usize = 16;
-const STRIP_LEN: usize = 1 << 18;
+/// Small enough to stay in a core's own cache.
+const STRIP_LEN: usize = 1 << 17;
 /// Light of the LED over a whole exposure, grey levels.
 const LED_GREY: f64 = 60.0;
-const GAUSSIAN_LEN: usize = 1 << 16;
+const GAUSSIAN_LEN: usize = 1 << 14;
 
 /// Points that stand for the path of a bead during an exposure, px.
 #[derive(Debug, Clone, Copy)]
@@ -96,6 +97,8 @@ pub(crate) struct Renderer {
     /// Grey values of background with noise.
     strip: Vec<u8>,
     gaussian: Vec<f32>,
+    /// Room for the beads' light in a piece of one row.
+    values: Vec<f32>,
     rng: Xoshiro256PlusPlus,
 }
 
@@ -105,7 +108,9 @@ impl Renderer {
         let profile = RingProfile::new(config.bead_radius_px())?;
         let template = Template::new(&profile, PixelResponse::Point);
         let mut noise = Gaussian::new(config.seed, 10);
-        let gaussian: Vec<f32> = (0..GAUSSIAN_LEN).map(|_| noise.normal() as f32).collect();
+        let gaussian: Vec<f32> = (0..GAUSSIAN_LEN + usize::from(config.width_px))
+            .map(|_| noise.normal() as f32)
+            .collect();
         let read_variance = (config.read_noise_grey * config.read_noise_grey) as f32;
         let grey_per_electron = (1.0 / config.electrons_per_grey) as f32;
         let background = config.background_grey as f32;
@@ -124,6 +129,7 @@ impl Renderer {
             template,
             strip,
             gaussian,
+            values: vec![0.0; usize::from(config.width_px)],
             rng: stream_of(config.seed, 11),
         })
     }
@@ -151,39 +157,50 @@ impl Renderer {
         let Some((columns, rows)) = self.neighbourhood(beads) else {
             return;
         };
-        let (first_column, reach2) = (columns.0, self.support_px * self.support_px);
+        let reach2 = self.support_px * self.support_px;
         for (y, row) in pixels
             .chunks_exact_mut(self.width)
             .enumerate()
             .take(rows.1)
             .skip(rows.0)
         {
-            let Some(row) = row.get_mut(columns.0..columns.1) else {
+            let (Some(row), Some(values)) = (
+                row.get_mut(columns.0..columns.1),
+                self.values.get_mut(..columns.1 - columns.0),
+            ) else {
                 continue;
             };
-            let mut at = (self.rng.next_u64() >> 48) as usize;
-            for (i, pixel) in row.iter_mut().enumerate() {
-                let x = (first_column + i) as f32;
-                let mut value = 0.0;
-                let mut near = false;
-                for bead in beads {
-                    let mut sum = 0.0;
-                    for &(bx, by) in bead.points() {
-                        let (dx, dy) = (x - bx, y as f32 - by);
-                        let q = dx * dx + dy * dy;
-                        if q < reach2 {
-                            sum += self.template.value_at_squared(q);
-                            near = true;
-                        }
+            values.fill(0.0);
+            for bead in beads {
+                let weight = self.contrast / bead.points().len() as f32;
+                for &(bx, by) in bead.points() {
+                    let (x, dy) = (bx - columns.0 as f32, y as f32 - by);
+                    let room2 = reach2 - dy * dy;
+                    if room2 <= 0.0 {
+                        continue;
                     }
-                    value += sum / bead.points().len() as f32;
+                    let half = room2.sqrt();
+                    // `as` takes what is below 0 to 0.
+                    let from = (x - half).ceil() as usize;
+                    let to = ((x + half).floor() + 1.0) as usize;
+                    let to = to.min(values.len());
+                    let Some(chord) = values.get_mut(from.min(to)..to) else {
+                        continue;
+                    };
+                    for (i, value) in chord.iter_mut().enumerate() {
+                        let dx = (from + i) as f32 - x;
+                        *value += weight * self.template.value_at_squared(dx * dx + dy * dy);
+                    }
                 }
-                if near {
-                    let level = (self.background + self.contrast * value).max(0.0);
-                    let sd = (level * self.grey_per_electron + self.read_variance).sqrt();
-                    at = (at + 1) & (GAUSSIAN_LEN - 1);
-                    *pixel = grey(level + sd * self.gaussian.get(at).copied().unwrap_or(0.0));
-                }
+            }
+            let at = (self.rng.next_u64() >> 40) as usize % GAUSSIAN_LEN;
+            let Some(noise) = self.gaussian.get(at..at + row.len()) else {
+                continue;
+            };
+            for ((pixel, value), noise) in row.iter_mut().zip(&*values).zip(noise) {
+                let level = (self.background + value).max(0.0);
+                let sd = (level * self.grey_per_electron + self.read_variance).sqrt();
+                *pixel = grey(level + sd * noise);
             }
         }
     }
