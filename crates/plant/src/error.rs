@@ -89,34 +89,57 @@ impl Position {
     }
 }
 
-/// A model that cannot be read, or that is read and refused.
+/// A model that cannot be read, or that is read and refused: which file, where in it, and why.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ModelError {
+    /// The file.
+    pub file: String,
+    /// Where in the file, if the problem is at a place.
+    pub at: Option<Position>,
+    /// What is wrong, and what would be right.
+    pub problem: Box<ModelProblem>,
+}
+
+impl std::fmt::Display for ModelError {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self.at {
+            Some(at) => write!(
+                f,
+                "{}:{}:{}: {}",
+                self.file, at.line, at.column, self.problem
+            ),
+            None => write!(f, "{}: {}", self.file, self.problem),
+        }
+    }
+}
+
+impl std::error::Error for ModelError {
+    fn source(&self) -> Option<&(dyn std::error::Error + 'static)> {
+        match self.problem.as_ref() {
+            ModelProblem::Plant(source) => Some(source),
+            _ => None,
+        }
+    }
+}
+
+/// What is wrong with a model file.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
-pub enum ModelError {
+pub enum ModelProblem {
     /// The file cannot be read.
-    #[error("{file}: {reason}")]
+    #[error("{reason}")]
     Unreadable {
-        /// The file.
-        file: String,
         /// The operating system's words.
         reason: String,
     },
     /// The text is not TOML.
-    #[error("{file}:{}:{}: {message}", at.line, at.column)]
+    #[error("{message}")]
     Syntax {
-        /// The file.
-        file: String,
-        /// Where.
-        at: Position,
         /// What the TOML parser says.
         message: String,
     },
     /// A key that no model has.
-    #[error("{file}:{}:{}: unknown key `{key}`{}", at.line, at.column, suggestion_text(suggestion.as_deref(), known))]
+    #[error("unknown key `{key}`{}", suggestion_text(suggestion.as_deref(), known))]
     UnknownKey {
-        /// The file.
-        file: String,
-        /// Where.
-        at: Position,
         /// The key, with the path to it.
         key: String,
         /// The nearest known key.
@@ -125,12 +148,8 @@ pub enum ModelError {
         known: Vec<String>,
     },
     /// An effect id that is not in the catalogue, or a form that the effect does not have.
-    #[error("{file}:{}:{}: `{key}` = \"{value}\" is not known{}", at.line, at.column, suggestion_text(suggestion.as_deref(), known))]
+    #[error("`{key}` = \"{value}\" is not known{}", suggestion_text(suggestion.as_deref(), known))]
     UnknownName {
-        /// The file.
-        file: String,
-        /// Where.
-        at: Position,
         /// The key, with the path to it.
         key: String,
         /// What is written there.
@@ -140,25 +159,17 @@ pub enum ModelError {
         /// The names that are known here.
         known: Vec<String>,
     },
-    /// A key that must be there is missing.
-    #[error("{file}:{}:{}: `{key}` is missing: {what}", at.line, at.column)]
+    /// A key that must be there is missing; the position is that of its table.
+    #[error("`{key}` is missing: {what}")]
     MissingKey {
-        /// The file.
-        file: String,
-        /// Where the table begins.
-        at: Position,
         /// The key, with the path to it.
         key: String,
         /// What to write.
         what: String,
     },
     /// A value of the wrong type.
-    #[error("{file}:{}:{}: `{key}` is {found}: {expected} is wanted", at.line, at.column)]
+    #[error("`{key}` is {found}: {expected} is wanted")]
     WrongType {
-        /// The file.
-        file: String,
-        /// Where.
-        at: Position,
         /// The key, with the path to it.
         key: String,
         /// What is there.
@@ -167,59 +178,44 @@ pub enum ModelError {
         expected: &'static str,
     },
     /// A number that is not finite or outside its range.
-    #[error("{file}:{}:{}: `{key}` = {value} {unit}: it must be a finite number in {lower}..{upper} {unit}", at.line, at.column)]
+    #[error("`{key}` = {}: it must be a finite number{}", with_unit(*value, unit), range_text(*lower, *upper, unit))]
     OutOfRange {
-        /// The file.
-        file: String,
-        /// Where.
-        at: Position,
         /// The key, with the path to it.
         key: String,
         /// The value.
         value: f64,
-        /// The unit.
-        unit: String,
+        /// The unit; empty for a pure number.
+        unit: &'static str,
         /// Smallest value accepted.
         lower: f64,
         /// Largest value accepted.
         upper: f64,
     },
     /// Values that are each right and together wrong.
-    #[error("{file}:{}:{}: {message}", at.line, at.column)]
+    #[error("{message}")]
     Inconsistent {
-        /// The file.
-        file: String,
-        /// Where.
-        at: Position,
         /// What is wrong, and what would be right.
         message: String,
     },
     /// The plant's coefficients are refused.
-    #[error("{file}:{}:{}: plant: {source}", at.line, at.column)]
-    Plant {
-        /// The file.
-        file: String,
-        /// Where.
-        at: Position,
-        /// Why.
-        source: PlantError,
-    },
+    #[error("plant: {0}")]
+    Plant(PlantError),
 }
 
-impl ModelError {
-    /// Where the error is in the file, if it is at a place.
-    pub fn position(&self) -> Option<Position> {
-        match self {
-            Self::Unreadable { .. } => None,
-            Self::Syntax { at, .. }
-            | Self::UnknownKey { at, .. }
-            | Self::UnknownName { at, .. }
-            | Self::MissingKey { at, .. }
-            | Self::WrongType { at, .. }
-            | Self::OutOfRange { at, .. }
-            | Self::Inconsistent { at, .. }
-            | Self::Plant { at, .. } => Some(*at),
-        }
+fn with_unit(value: f64, unit: &str) -> String {
+    if unit.is_empty() {
+        value.to_string()
+    } else {
+        format!("{value} {unit}")
+    }
+}
+
+/// The words for a range, none where any finite number will do.
+fn range_text(lower: f64, upper: f64, unit: &str) -> String {
+    if lower <= -f64::MAX && upper >= f64::MAX {
+        String::new()
+    } else {
+        format!(" in {lower}..{}", with_unit(upper, unit))
     }
 }
 

@@ -21,7 +21,7 @@ pub use cellpos_units::{Decibels, Degrees, Hertz, Micrometers, Seconds};
 pub use chain::{Chain, ChainError};
 pub use discrete::{DiscretePlant, DiscreteState};
 pub use effect::{EFFECT_IDS, Effect, EffectError, Hysteresis, Parameter, ParameterSpec, Place};
-pub use error::{ModelError, PlantError, Position};
+pub use error::{ModelError, ModelProblem, PlantError, Position};
 pub use frames::{FrameFate, apply_frame_fates, frame_fates};
 pub use model::{Covariance, Model, Noise};
 pub use nalgebra::Complex;

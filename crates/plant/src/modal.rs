@@ -97,10 +97,10 @@ pub(crate) fn separate(poles: &mut [Complex<f64>]) {
             let old = poles[j];
             let shift = distance * scale * (m as f64 - 0.5 * (cluster.len() - 1) as f64);
             let new = mean + shift;
-            if old.im > 0.0 {
-                if let Some(partner) = poles.iter().position(|p| *p == old.conj()) {
-                    poles[partner] = new.conj();
-                }
+            if old.im > 0.0
+                && let Some(partner) = poles.iter().position(|p| *p == old.conj())
+            {
+                poles[partner] = new.conj();
             }
             poles[j] = new;
         }

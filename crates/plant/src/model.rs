@@ -3,7 +3,7 @@
 
 use crate::chain::linear_part;
 use crate::effect::Effect;
-use crate::error::ModelError;
+use crate::error::{ModelError, ModelProblem};
 use crate::model_file;
 use crate::transfer::TransferFunction;
 use cellpos_units::Hertz;
@@ -99,13 +99,16 @@ impl Model {
     /// A file that cannot be read, and all that [`Self::from_toml_str`] refuses.
     pub fn load_file(path: &Path) -> Result<Self, ModelError> {
         let file = path.display().to_string();
-        let text = std::fs::read_to_string(path).map_err(|error| ModelError::Unreadable {
+        let text = std::fs::read_to_string(path).map_err(|error| ModelError {
             file: file.clone(),
-            reason: if error.kind() == std::io::ErrorKind::NotFound {
-                "there is no such file (a model is a TOML file; `eq6` is built in)".to_owned()
-            } else {
-                error.to_string()
-            },
+            at: None,
+            problem: Box::new(ModelProblem::Unreadable {
+                reason: if error.kind() == std::io::ErrorKind::NotFound {
+                    "there is no such file (a model is a TOML file; `eq6` is built in)".to_owned()
+                } else {
+                    error.to_string()
+                },
+            }),
         })?;
         Self::from_toml_str(&text, &file)
     }

@@ -323,10 +323,10 @@ impl Simulator {
         };
         let row = self.row;
         self.hold(command_um);
-        if seen.is_some() {
-            if let Some(slot) = self.ends.get_mut(row % n) {
-                *slot = now;
-            }
+        if seen.is_some()
+            && let Some(slot) = self.ends.get_mut(row % n)
+        {
+            *slot = now;
         }
         y
     }

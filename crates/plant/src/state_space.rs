@@ -65,6 +65,9 @@ impl StateSpace {
     /// The value at a complex frequency s \[rad/s\], `C (sI - A)^-1 B + D`; `None` at a pole.
     pub fn at(&self, s: Complex<f64>) -> Option<Complex<f64>> {
         let n = self.order();
+        if n == 0 {
+            return Some(Complex::new(self.d, 0.0));
+        }
         let system = DMatrix::from_fn(n, n, |i, j| {
             let diagonal = if i == j { s } else { Complex::new(0.0, 0.0) };
             diagonal - self.a[(i, j)]

@@ -1,4 +1,4 @@
-//! Rational transfer functions in s [rad/s], and Eq. (6), the nominal plant.
+//! Rational transfer functions in s \[rad/s\], and Eq. (6), the nominal plant.
 
 use crate::error::PlantError;
 use crate::roots;
@@ -10,9 +10,9 @@ use std::f64::consts::TAU;
 /// The largest degree of a plant's denominator.
 pub const MAX_ORDER: usize = 12;
 
-/// A rational transfer function with real coefficients, from PZT displacement [um] to bead position [um].
+/// A rational transfer function with real coefficients, from PZT displacement \[um\] to bead position \[um\].
 ///
-/// Coefficients stand from the highest power of s [rad/s] down. The numerator's degree is at most the
+/// Coefficients stand from the highest power of s \[rad/s\] down. The numerator's degree is at most the
 /// denominator's: a static gain, a strictly proper and a biproper function are all allowed.
 ///
 /// ```
@@ -52,7 +52,7 @@ impl From<TransferFunction> for Coefficients {
 }
 
 impl TransferFunction {
-    /// A transfer function from its coefficients, highest power of s [rad/s] first. Leading zeros are dropped.
+    /// A transfer function from its coefficients, highest power of s \[rad/s\] first. Leading zeros are dropped.
     ///
     /// # Errors
     /// Coefficients that are not finite, polynomials without a coefficient other than zero (a numerator of zero is
@@ -249,7 +249,7 @@ pub struct ProbablyPerHertz {
 /// ```
 pub fn probably_per_hertz(velocity_gain_per_s: f64) -> Option<ProbablyPerHertz> {
     let percent = 100.0 * (velocity_gain_per_s.abs() / EQ5_LITERAL_PER_S - 1.0).abs();
-    (percent <= 5.0).then(|| ProbablyPerHertz {
+    (percent <= 5.0).then_some(ProbablyPerHertz {
         given_per_s: velocity_gain_per_s,
         meant_per_s: TAU * velocity_gain_per_s,
         percent,

@@ -11,9 +11,6 @@ mod blocks;
 mod compile;
 mod linear;
 
-#[cfg(test)]
-mod tests;
-
 pub(crate) use compile::linear_part;
 
 use crate::effect::EffectError;
@@ -247,17 +244,18 @@ impl Chain {
         if self.wants_area {
             self.area_um_s += signal.integral + h_s * self.offset_um;
         }
-        if let Some(b) = &mut self.brownian {
-            if b.on && h_s > 0.0 {
-                let variance = 2.0 * b.diffusion_um2_per_s * h_s;
-                let step = variance.sqrt() * b.gaussian.next_normal();
-                if self.wants_area {
-                    // The integral of a Brownian path given its ends: mean of the ends, variance 2 D h^3/12.
-                    self.area_um_s +=
-                        h_s * (0.5 * step + (variance / 12.0).sqrt() * b.gaussian.next_normal());
-                }
-                self.offset_um += step;
+        if let Some(b) = &mut self.brownian
+            && b.on
+            && h_s > 0.0
+        {
+            let variance = 2.0 * b.diffusion_um2_per_s * h_s;
+            let step = variance.sqrt() * b.gaussian.next_normal();
+            if self.wants_area {
+                // The integral of a Brownian path given its ends: mean of the ends, variance 2 D h^3/12.
+                self.area_um_s +=
+                    h_s * (0.5 * step + (variance / 12.0).sqrt() * b.gaussian.next_normal());
             }
+            self.offset_um += step;
         }
         self.time_s += h_s;
     }

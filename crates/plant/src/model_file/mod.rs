@@ -1,0 +1,312 @@
+//! model.toml: reading with positions and suggestions, writing so that it reads back to the bit.
+
+mod table;
+mod write;
+
+#[cfg(test)]
+mod tests;
+
+pub(crate) use write::write;
+
+use crate::effect::{EFFECT_IDS, Effect, EffectError, Hysteresis, ParameterSpec};
+use crate::effect::{play_lists, specs};
+use crate::error::{ModelError, ModelProblem, Position};
+use crate::model::{Covariance, Model, Noise};
+use crate::transfer::TransferFunction;
+use std::collections::BTreeMap;
+use table::{Table, Value, nearest};
+use toml::de::DeTable;
+
+const fn range(unit: &'static str, lower: f64, upper: f64) -> ParameterSpec {
+    ParameterSpec {
+        name: "",
+        unit,
+        lower,
+        upper,
+        log_scaled: false,
+        fixed: false,
+        default: None,
+    }
+}
+
+/// Any finite number.
+const FINITE: ParameterSpec = range("", -f64::MAX, f64::MAX);
+const WORKING_POINT: ParameterSpec = range("um", -1e4, 1e4);
+const DIFFUSION: ParameterSpec = range("um^2/s", 0.0, 1e4);
+const LOCALISATION: ParameterSpec = range("um", 0.0, 100.0);
+
+const TOP: [&str; 9] = [
+    "name",
+    "description",
+    "working_point_um",
+    "plant",
+    "effects",
+    "noise",
+    "covariance",
+    "intervals",
+    "provenance",
+];
+
+const HYSTERESIS_FORMS: [&str; 3] = ["bouc-wen", "bouc-wen-explicit", "play"];
+
+pub(crate) fn read(text: &str, file: &str) -> Result<Model, ModelError> {
+    let document = DeTable::parse(text).map_err(|error| ModelError {
+        file: file.to_owned(),
+        at: Some(Position::of(text, error.span().unwrap_or(0..0))),
+        problem: Box::new(ModelProblem::Syntax {
+            message: error.message().to_owned(),
+        }),
+    })?;
+    let top = Table {
+        file,
+        text,
+        path: String::new(),
+        span: 0..0,
+        entries: document.get_ref(),
+    };
+    top.only(&TOP)?;
+    let name = match top.get("name") {
+        Some(v) => top.text_of("name", v)?,
+        None => String::new(),
+    };
+    let description = match top.get("description") {
+        Some(v) => top.text_of("description", v)?,
+        None => String::new(),
+    };
+    let working_point = top.need(
+        "working_point_um",
+        "the PZT displacement at which the bead is at rest, for example working_point_um = 4.0",
+    )?;
+    let working_point_um = top.number("working_point_um", working_point, &WORKING_POINT)?;
+    let plant = top.need(
+        "plant",
+        "a table with the coefficients num and den, highest power of s first",
+    )?;
+    let plant = read_plant(&top.table("plant", plant)?)?;
+    let effects = match top.get("effects") {
+        None => Vec::new(),
+        Some(v) => top.list(
+            "effects",
+            v,
+            "an array of tables, [[effects]]",
+            |name, v| read_effect(&top.table(name, v)?),
+        )?,
+    };
+    let noise = match top.get("noise") {
+        None => Noise::NONE,
+        Some(v) => read_noise(&top.table("noise", v)?)?,
+    };
+    let covariance = top
+        .get("covariance")
+        .map(|v| read_covariance(&top.table("covariance", v)?))
+        .transpose()?;
+    let intervals = match top.get("intervals") {
+        None => BTreeMap::new(),
+        Some(v) => read_intervals(&top.table("intervals", v)?)?,
+    };
+    let provenance = match top.get("provenance") {
+        None => BTreeMap::new(),
+        Some(v) => {
+            let table = top.table("provenance", v)?;
+            let mut map = BTreeMap::new();
+            for (key, value) in table.entries {
+                map.insert(
+                    key.get_ref().to_string(),
+                    table.text_of(key.get_ref(), value)?,
+                );
+            }
+            map
+        }
+    };
+    Ok(Model {
+        name,
+        description,
+        plant,
+        working_point_um,
+        effects,
+        noise,
+        covariance,
+        intervals,
+        provenance,
+    })
+}
+
+fn read_plant(table: &Table<'_, '_>) -> Result<TransferFunction, ModelError> {
+    table.only(&["num", "den"])?;
+    let list = |name: &'static str, what: &str| {
+        table.list(
+            name,
+            table.need(name, what)?,
+            "a list of numbers",
+            |name, v| table.number(name, v, &FINITE),
+        )
+    };
+    let num = list(
+        "num",
+        "the numerator's coefficients in um/um, highest power of s first",
+    )?;
+    let den = list(
+        "den",
+        "the denominator's coefficients, highest power of s first",
+    )?;
+    TransferFunction::new(num, den)
+        .map_err(|source| table.refuse(table.span.clone(), ModelProblem::Plant(source)))
+}
+
+fn read_noise(table: &Table<'_, '_>) -> Result<Noise, ModelError> {
+    table.only(&["diffusion_um2_per_s", "localisation_um"])?;
+    let number = |name: &str, spec: &ParameterSpec| match table.get(name) {
+        None => Ok(0.0),
+        Some(v) => table.number(name, v, spec),
+    };
+    Ok(Noise {
+        diffusion_um2_per_s: number("diffusion_um2_per_s", &DIFFUSION)?,
+        localisation_um: number("localisation_um", &LOCALISATION)?,
+    })
+}
+
+fn read_covariance(table: &Table<'_, '_>) -> Result<Covariance, ModelError> {
+    table.only(&["parameters", "matrix"])?;
+    let parameters = table.list(
+        "parameters",
+        table.need("parameters", "the names of the parameters")?,
+        "a list of names",
+        |name, v| table.text_of(name, v),
+    )?;
+    let matrix = table.list(
+        "matrix",
+        table.need("matrix", "the covariance, row by row")?,
+        "a list of rows",
+        |name, v| {
+            table.list(name, v, "a list of numbers", |name, v| {
+                table.number(name, v, &FINITE)
+            })
+        },
+    )?;
+    if matrix.len() != parameters.len() || matrix.iter().any(|r| r.len() != parameters.len()) {
+        return Err(table.inconsistent(
+            table.span.clone(),
+            format!(
+                "covariance: matrix must be square with one row and column for each of the {} parameters",
+                parameters.len()
+            ),
+        ));
+    }
+    Ok(Covariance { parameters, matrix })
+}
+
+fn read_intervals(table: &Table<'_, '_>) -> Result<BTreeMap<String, [f64; 2]>, ModelError> {
+    let mut map = BTreeMap::new();
+    for (key, value) in table.entries {
+        let name: &str = key.get_ref();
+        let pair = table.list(name, value, "a pair [low, high]", |name, v| {
+            table.number(name, v, &FINITE)
+        })?;
+        match pair[..] {
+            [low, high] if low <= high => map.insert(name.to_owned(), [low, high]),
+            _ => {
+                return Err(table.inconsistent(
+                    value.span(),
+                    format!(
+                        "`{}` must be a pair [low, high] with low <= high",
+                        table.key(name)
+                    ),
+                ));
+            }
+        };
+    }
+    Ok(map)
+}
+
+fn read_effect(table: &Table<'_, '_>) -> Result<Effect, ModelError> {
+    let unknown = |key: &str, value: &Value<'_>, found: String, known: &[&str]| {
+        table.refuse(
+            value.span(),
+            ModelProblem::UnknownName {
+                key: table.key(key),
+                suggestion: nearest(&found, known),
+                value: found,
+                known: known.iter().map(|k| (*k).to_owned()).collect(),
+            },
+        )
+    };
+    let id_value = table.need(
+        "id",
+        format!("the name of the effect, one of {}", EFFECT_IDS.join(", ")),
+    )?;
+    let id = table.text_of("id", id_value)?;
+    let mut known = vec!["id"];
+    let form = if id == "pzt-hysteresis" {
+        known.push("form");
+        match table.get("form") {
+            None => Some("bouc-wen".to_owned()),
+            Some(v) => {
+                let form = table.text_of("form", v)?;
+                if !HYSTERESIS_FORMS.contains(&form.as_str()) {
+                    return Err(unknown("form", v, form, &HYSTERESIS_FORMS));
+                }
+                Some(form)
+            }
+        }
+    } else {
+        None
+    };
+    let Some(specs) = specs(&id, form.as_deref()) else {
+        return Err(unknown("id", id_value, id, &EFFECT_IDS));
+    };
+    known.extend(specs.iter().map(|s| s.name));
+    let lists = if form.as_deref() == Some("play") {
+        play_lists()
+    } else {
+        &[]
+    };
+    known.extend(lists.iter().map(|s| s.name));
+    table.only(&known)?;
+    let mut scalars = Vec::with_capacity(specs.len());
+    for spec in specs {
+        scalars.push(match (table.get(spec.name), spec.default) {
+            (Some(v), _) => table.number(spec.name, v, spec)?,
+            (None, Some(default)) => default,
+            (None, None) => {
+                let unit = if spec.unit.is_empty() {
+                    "no unit".to_owned()
+                } else {
+                    spec.unit.to_owned()
+                };
+                let what = format!(
+                    "effect {id} needs it, a number in {}..{} ({unit})",
+                    spec.lower, spec.upper
+                );
+                return Err(table
+                    .need(spec.name, what)
+                    .err()
+                    .unwrap_or_else(|| unknown("id", id_value, id.clone(), &EFFECT_IDS)));
+            }
+        });
+    }
+    let mut effect = Effect::from_scalars(&id, form.as_deref(), &scalars)
+        .ok_or_else(|| unknown("id", id_value, id.clone(), &EFFECT_IDS))?;
+    if let Effect::PztHysteresis(Hysteresis::Play {
+        thresholds_um,
+        weights,
+        ..
+    }) = &mut effect
+    {
+        for (spec, values) in lists.iter().zip([thresholds_um, weights]) {
+            let value = table.need(spec.name, "a list of numbers, one per play operator")?;
+            *values = table.list(spec.name, value, "a list of numbers", |name, v| {
+                table.number(name, v, spec)
+            })?;
+        }
+    }
+    effect.validate().map_err(|error| {
+        let message = match error {
+            EffectError::Inconsistent { message, .. } => {
+                format!("{} ({id}): {message}", table.path)
+            }
+            other => format!("{}: {other}", table.path),
+        };
+        table.inconsistent(id_value.span(), message)
+    })?;
+    Ok(effect)
+}
