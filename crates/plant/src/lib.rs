@@ -1,4 +1,16 @@
-//! The plant of Mizoue et al. 2017, Eq. (1)-(7), its discretisation, effect blocks and model files.
+//! The plant of Mizoue et al. 2017 (doi 10.3390/mi8030080), Eq. (1)-(7), its discretisation, effect blocks and model
+//! files.
+//!
+//! - [`TransferFunction`] with Eq. (6) built in, [`PhysicalParameters`] for Eq. (1)-(4), [`StateSpace`] for analysis.
+//! - [`DiscretePlant`]: exact zero-order hold with any delay, for controllers and estimators.
+//! - [`Model`]: plant, [`Effect`]s and [`Noise`], the one artifact that all commands share; `model.toml` on disk.
+//! - [`Chain`]: a model as a time-stepping machine from the command to the true bead position; [`Simulator`] adds the
+//!   camera at a fixed sample time; [`simulate`] and [`simulate_at`] answer whole records.
+//!
+//! Sampling convention everywhere: row k holds the displacement commanded from its time on, and the bead's position
+//! just before that command takes effect.
+//!
+//! Not here: controllers, estimation, fitting, images.
 #![forbid(unsafe_code)]
 
 mod chain;

@@ -1,0 +1,96 @@
+//! A step of the loop allocates nothing, shown by an allocator that counts.
+#![allow(unsafe_code)]
+
+use cellpos_plant::{
+    Chain, DiscretePlant, Effect, Hysteresis, Model, Seconds, Simulator, TransferFunction,
+};
+use std::alloc::{GlobalAlloc, Layout, System};
+use std::cell::Cell;
+
+thread_local! {
+    static COUNT: Cell<usize> = const { Cell::new(0) };
+}
+
+struct Counting;
+
+// SAFETY: every call is passed on to the system's allocator unchanged.
+unsafe impl GlobalAlloc for Counting {
+    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
+        let _ = COUNT.try_with(|c| c.set(c.get() + 1));
+        unsafe { System.alloc(layout) }
+    }
+    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
+        unsafe { System.dealloc(pointer, layout) }
+    }
+}
+
+#[global_allocator]
+static ALLOCATOR: Counting = Counting;
+
+fn allocations(mut work: impl FnMut()) -> usize {
+    let before = COUNT.with(Cell::get);
+    work();
+    COUNT.with(Cell::get) - before
+}
+
+fn everything() -> Model {
+    let mut model = Model::load(concat!(
+        env!("CARGO_MANIFEST_DIR"),
+        "/../../examples/model.toml"
+    ))
+    .unwrap();
+    for effect in [
+        Effect::PztHysteresis(Hysteresis::Play {
+            thresholds_um: vec![0.0, 0.1],
+            weights: vec![0.9, 0.1],
+            quadratic_per_um: 0.0,
+        }),
+        Effect::PztResonance {
+            frequency_hz: 900.0,
+            damping: 0.05,
+        },
+        Effect::Backlash { width_um: 0.05 },
+        Effect::Bubble {
+            lag_s: 1e-3,
+            dissolution_per_s: 0.01,
+        },
+        Effect::GainDrift { per_s: 1e-3 },
+        Effect::WallAdhesion {
+            speed_um_per_s: 20.0,
+        },
+        Effect::MainsHum {
+            hz: 50.0,
+            um: 0.1,
+            phase_deg: 0.0,
+        },
+    ] {
+        model = model.with_effect(effect);
+    }
+    model
+}
+
+#[test]
+fn the_counter_counts() {
+    assert_eq!(allocations(|| drop(std::hint::black_box(vec![1_u8]))), 1);
+}
+
+#[test]
+fn no_step_allocates_whatever_its_length_and_the_effects() {
+    let mut chain = Chain::with_brownian_motion(&everything(), 1).unwrap();
+    let mut simulator = Simulator::new(&everything(), 1e-3, Some(1)).unwrap();
+    let plant =
+        DiscretePlant::new(&TransferFunction::eq6(), Seconds(1e-3), Seconds(2.5e-3)).unwrap();
+    let mut state = plant.state(0.0);
+    let count = allocations(|| {
+        for k in 0..200 {
+            let command = 4.0 + f64::from(k % 13) * 0.3;
+            chain.advance(command, 1e-3 + 1e-6 * f64::from(k % 7));
+            std::hint::black_box((chain.bead_um(), chain.pzt_um(), chain.flow_um_per_s()));
+            std::hint::black_box(simulator.measure());
+            simulator.hold(command);
+            plant.step(&mut state, command);
+            std::hint::black_box(plant.output_um(&state));
+        }
+    });
+    assert_eq!(count, 0);
+}
