@@ -8,15 +8,18 @@
 
 pub mod actuator;
 pub mod board;
+pub mod calibration_file;
 pub mod clock;
 pub mod emulated;
 pub mod measurement;
 pub mod serial;
 pub mod socket;
 pub mod source;
+pub mod sources;
 
 pub use actuator::{Actuator, ActuatorError, ActuatorInfo, BoardReport};
 pub use board::{BoardHost, Port};
+pub use calibration_file::{CalibrationError, CalibrationFile};
 pub use clock::Clock;
 pub use emulated::EmulatedRig;
 pub use measurement::Measurement;
