@@ -9,6 +9,7 @@ pub mod photron;
 pub mod playback;
 pub mod png;
 pub mod region;
+pub mod scene;
 pub mod tiff;
 
 use crate::source::FrameBuffer;
