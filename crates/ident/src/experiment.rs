@@ -9,6 +9,7 @@ use crate::error::IdentError;
 use crate::excitation::{Limits, Signal, Tone, fold, shaped_amplitude_um};
 use crate::frequency_response::{FrequencyPoint, Segment, SegmentResponse, Settings, measure};
 use crate::noise::{NoiseModel, apply_noise_model};
+use crate::random::Random;
 
 /// One tick of a record.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -101,6 +102,55 @@ impl Plan {
             segments,
             lost_frames: 50,
         }
+    }
+
+    /// All lines at once with random phases, after a settling time. Each line gets the share of the bead's and the PZT's
+    /// amplitude that keeps the expected peak (three times the RMS) within `limits`. Lines are moved to whole multiples
+    /// of 0.5 Hz (odd ones, so that even nonlinearity falls between them); the even neighbours of every third line are
+    /// watched as detection lines.
+    pub fn multisine(
+        lines_hz: &[f64],
+        expected: Expected<'_>,
+        limits: Limits,
+        period_s: f64,
+        seconds_at_1_hz: f64,
+        seed: u64,
+    ) -> Self {
+        let grid = 0.5;
+        let mut odd: Vec<f64> = lines_hz
+            .iter()
+            .map(|f| (2.0 * ((f / grid - 1.0) / 2.0).round().max(0.0) + 1.0) * grid)
+            .collect();
+        odd.sort_by(f64::total_cmp);
+        odd.dedup();
+        let peak = 3.0 * (0.5 * odd.len() as f64).sqrt();
+        let share = Limits {
+            bead_um: limits.bead_um / peak,
+            pzt_um: limits.pzt_um / peak,
+            slew_um_per_s: limits.slew_um_per_s / peak,
+        };
+        let mut random = Random::new(seed);
+        let tones = odd
+            .iter()
+            .map(|&f| {
+                let (plant, loop_gain) = expected(f);
+                Tone {
+                    frequency_hz: f,
+                    amplitude_um: shaped_amplitude_um(f, plant, loop_gain, share),
+                    phase_rad: 2.0 * std::f64::consts::PI * random.uniform(),
+                }
+            })
+            .collect();
+        let detection_hz = odd.iter().step_by(3).map(|f| f + grid).collect();
+        let segment = PlannedSegment {
+            label: format!("multisine, {} lines", odd.len()),
+            signal: Signal::Tones { tones, fade_in_s: 0.2 },
+            lines_hz: odd,
+            detection_hz,
+            settle_s: 0.5,
+            measure_s: (2.0 * seconds_at_1_hz).clamp(4.0, 600.0),
+        };
+        Self { period_s, segments: vec![segment], lost_frames: 50 }
     }
 
     /// Total duration, s.

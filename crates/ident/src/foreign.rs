@@ -140,7 +140,7 @@ pub fn identify(
     };
     let input_rms = rms(&residual_of(input, period_s, &[]));
     let size = input.iter().fold(0.0f64, |a, v| a.max(v.abs()));
-    if !(input_rms > 1e-9 * size.max(f64::MIN_POSITIVE)) {
+    if input_rms.is_nan() || input_rms <= 1e-9 * size.max(f64::MIN_POSITIVE) {
         return Err(IdentError::OutOfRange {
             key: "input_rms",
             value: input_rms,

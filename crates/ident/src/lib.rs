@@ -22,6 +22,7 @@ pub mod rational;
 pub mod sampled;
 pub mod spectral;
 pub mod stats;
+pub mod summary;
 pub mod tone_fit;
 pub mod verdict;
 

@@ -1,6 +1,7 @@
 //! One module a command: `Args` (read by clap), `run(args)` (calls the libraries, prints the result).
 
 pub mod doctor;
+pub mod identify;
 
 use crate::outcome::CommandResult;
 
@@ -9,6 +10,8 @@ use crate::outcome::CommandResult;
 pub enum Command {
     /// Is this machine fit for a 1 kHz loop: verdict, reasons, what to change.
     Doctor(doctor::Args),
+    /// Measure the rig's frequency response and fit a model to it, or fit one to records.
+    Identify(Box<identify::Args>),
 }
 
 impl Command {
@@ -16,6 +19,7 @@ impl Command {
     pub fn run(self) -> CommandResult {
         match self {
             Self::Doctor(args) => doctor::run(args),
+            Self::Identify(args) => identify::run(*args),
         }
     }
 }

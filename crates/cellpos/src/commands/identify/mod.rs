@@ -1,0 +1,231 @@
+//! `cellpos identify`: excite, measure the frequency response, fit, write model.toml and a report.
+
+pub mod bench;
+mod columns;
+mod foreign;
+pub mod json;
+pub mod report;
+pub mod run;
+
+use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
+use bench::Setup;
+use cellpos_emulator::WorldConfig;
+use cellpos_ident::excitation::{Limits, PAPER_FREQUENCIES_HZ};
+use cellpos_plant::Model;
+use cellpos_rig::Clock;
+use cellpos_units::{Hertz, Micrometers};
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+
+/// On or off.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+pub enum Switch {
+    /// On.
+    On,
+    /// Off.
+    Off,
+}
+
+/// Which clock.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+pub enum ClockKind {
+    /// As fast as this machine can, the same to the bit for a seed.
+    Virtual,
+    /// The machine's clock.
+    Real,
+}
+
+/// How to excite.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+pub enum Excitation {
+    /// One sine after the other.
+    Stepped,
+    /// All lines at once, random phases, odd lines with detection lines between.
+    Multisine,
+}
+
+/// Arguments of `cellpos identify`.
+#[derive(Debug, clap::Args)]
+#[command(after_help = "Examples:\n  \
+    cellpos identify --seed 3 --out model.toml --report identify.html\n  \
+    cellpos identify --data record.csv --input pzt_um --output bead_um --rate 1kHz\n  \
+    cellpos identify --data Model_Vi_Do.dat --input 1 --output 5 --rate 200Hz --hold none")]
+pub struct Args {
+    /// Records of any rig instead of the emulated one; several files are identified one after the other.
+    #[arg(long, num_args = 1.., requires_all = ["input", "output", "rate"])]
+    data: Vec<PathBuf>,
+    /// Input column: a name of the header, or a number from 1.
+    #[arg(long)]
+    input: Option<String>,
+    /// Output column: a name of the header, or a number from 1.
+    #[arg(long)]
+    output: Option<String>,
+    /// Rows per second of the records.
+    #[arg(long)]
+    rate: Option<Hertz>,
+    /// What the records' input does between rows: a command is held (zero-order), a measured signal is not (none).
+    #[arg(long, value_enum, default_value_t = HoldKind::ZeroOrder)]
+    hold: HoldKind,
+    /// Highest order of a linear model tried on records.
+    #[arg(long, default_value_t = 4, value_parser = clap::value_parser!(u8).range(0..=8))]
+    order: u8,
+    /// Plant of the emulated rig, and what amplitudes are shaped by: `eq6` or a model.toml.
+    #[arg(long, default_value = "eq6")]
+    model: String,
+    /// Seed of the emulated rig, the excitation and the bootstrap.
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+    /// Clock of the emulated rig.
+    #[arg(long, value_enum, default_value_t = ClockKind::Virtual)]
+    clock: ClockKind,
+    /// Frames through the localiser, or positions with the noise that frames would give.
+    #[arg(long, value_enum, default_value_t = Switch::On)]
+    frames: Switch,
+    /// How to excite.
+    #[arg(long, value_enum, default_value_t = Excitation::Stepped)]
+    excitation: Excitation,
+    /// Lines to drive (default: the paper's ten).
+    #[arg(long, num_args = 1.., value_delimiter = ',')]
+    frequency: Vec<Hertz>,
+    /// Largest bead amplitude (peak) while a line is driven.
+    #[arg(long, default_value = "8um")]
+    bead_amplitude: Micrometers,
+    /// Largest PZT amplitude (peak).
+    #[arg(long, default_value = "10um")]
+    pzt_amplitude: Micrometers,
+    /// Move the PZT about neutral without holding the bead; drift and low lines will take it out of view.
+    #[arg(long)]
+    open_loop: bool,
+    /// Edges of the LED delay test; 0 leaves it out.
+    #[arg(long, default_value_t = 300)]
+    led_edges: usize,
+    /// Bootstrap replicates; 0 leaves it out.
+    #[arg(long, default_value_t = 200)]
+    bootstrap: usize,
+    /// Where to write the model [default: model.toml in a new folder of runs/].
+    #[arg(long)]
+    out: Option<PathBuf>,
+    /// Where to write the report, figures beside it [default: report.html in a new folder of runs/].
+    #[arg(long)]
+    report: Option<PathBuf>,
+    /// Print one JSON object on standard output.
+    #[arg(long)]
+    json: bool,
+}
+
+/// What the records' input does between rows.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+pub enum HoldKind {
+    /// Keeps its value until the next row.
+    ZeroOrder,
+    /// Samples of a smooth signal.
+    None,
+}
+
+/// The command line as typed.
+pub fn command_line() -> String {
+    std::env::args().skip(1).fold("cellpos".to_owned(), |line, a| line + " " + &a)
+}
+
+/// A new folder below runs/, named by the time and `name`.
+pub fn new_run_folder(name: &str) -> Result<PathBuf, Failure> {
+    let time = jiff::Timestamp::now().strftime("%Y%m%dT%H%M%SZ").to_string();
+    for attempt in 0..100 {
+        let tail = if attempt == 0 { String::new() } else { format!("-{attempt}") };
+        let folder = PathBuf::from("runs").join(format!("{time}-{name}{tail}"));
+        match std::fs::create_dir_all("runs").and_then(|()| std::fs::create_dir(&folder)) {
+            Ok(()) => return Ok(folder),
+            Err(error) if error.kind() == std::io::ErrorKind::AlreadyExists => {}
+            Err(error) => return Err(Failure::failed(error)),
+        }
+    }
+    Err(Failure::Failed(miette::miette!("runs/ holds a hundred folders of this second already")))
+}
+
+fn checked(args: &Args) -> Result<(), Failure> {
+    let positive = |name: &str, value: f64, unit: &str| {
+        if value.is_finite() && value > 0.0 {
+            Ok(())
+        } else {
+            Err(Failure::bad_input(format!("--{name} is {value}{unit}"), format!("give a length above 0, for example --{name} 8{unit}")))
+        }
+    };
+    positive("bead-amplitude", args.bead_amplitude.0, "um")?;
+    positive("pzt-amplitude", args.pzt_amplitude.0, "um")?;
+    if let Some(f) = args.frequency.iter().find(|f| !(f.0.is_finite() && f.0 >= 0.2 && f.0 < 480.0)) {
+        return Err(Failure::bad_input(format!("--frequency {f}"), "lines lie between 0.2Hz and 480Hz at 1000 frames a second"));
+    }
+    if args.led_edges != 0 && args.led_edges < 20 {
+        return Err(Failure::bad_input(format!("--led-edges {}", args.led_edges), "give 0 (no delay test) or at least 20 edges"));
+    }
+    Ok(())
+}
+
+fn job(args: &Args) -> Result<run::Job, Failure> {
+    let model = Model::load(&args.model).map_err(Failure::input)?;
+    let mut lines_hz: Vec<f64> =
+        if args.frequency.is_empty() { PAPER_FREQUENCIES_HZ.to_vec() } else { args.frequency.iter().map(|f| f.0).collect() };
+    lines_hz.sort_by(f64::total_cmp);
+    lines_hz.dedup();
+    let setup = Setup {
+        world: WorldConfig { seed: args.seed, model: args.model.clone(), ..WorldConfig::default() },
+        model,
+        frames: args.frames == Switch::On,
+        clock: match args.clock {
+            ClockKind::Virtual => Clock::virtual_at(0),
+            ClockKind::Real => Clock::Real,
+        },
+        closed_loop: !args.open_loop,
+    };
+    Ok(run::Job {
+        // The board follows steps of up to 4 um within its first update; beyond that its slew would bend the drive.
+        limits: Limits { bead_um: args.bead_amplitude.0, pzt_um: args.pzt_amplitude.0, slew_um_per_s: 3_200.0 },
+        setup,
+        lines_hz,
+        multisine: args.excitation == Excitation::Multisine,
+        seconds_at_1_hz: 40.0,
+        led_edges: args.led_edges,
+        bootstrap: args.bootstrap,
+        seed: args.seed,
+    })
+}
+
+/// Runs `cellpos identify`.
+pub fn run(args: Args) -> CommandResult {
+    if !args.data.is_empty() {
+        return foreign::run(&args);
+    }
+    checked(&args)?;
+    let job = job(&args)?;
+    let bar = indicatif::ProgressBar::new(0);
+    bar.set_style(
+        indicatif::ProgressStyle::with_template("{bar:40} {pos}/{len} ticks, {eta} left").unwrap_or_else(|_| indicatif::ProgressStyle::default_bar()),
+    );
+    let done = run::run(&job, |ticks, total| {
+        bar.set_length(total as u64);
+        bar.set_position(ticks as u64);
+    })?;
+    bar.finish_and_clear();
+
+    let folder = if args.out.is_none() || args.report.is_none() { Some(new_run_folder("identify")?) } else { None };
+    let place = |given: &Option<PathBuf>, name: &str| given.clone().unwrap_or_else(|| folder.clone().unwrap_or_default().join(name));
+    let (model_path, report_path) = (place(&args.out, "model.toml"), place(&args.report, "report.html"));
+    let provenance = BTreeMap::from([
+        ("command".to_owned(), command_line()),
+        ("version".to_owned(), env!("CARGO_PKG_VERSION").to_owned()),
+        ("lines_hz".to_owned(), job.lines_hz.iter().map(f64::to_string).collect::<Vec<_>>().join(" ")),
+        ("rig".to_owned(), format!("emulated, model {}, seed {}", args.model, args.seed)),
+    ]);
+    let model = done.result.model("identified", done.neutral_um, provenance).map_err(Failure::failed)?;
+    if let Some(parent) = model_path.parent().filter(|p| !p.as_os_str().is_empty()) {
+        std::fs::create_dir_all(parent).map_err(Failure::failed)?;
+    }
+    std::fs::write(&model_path, model.to_toml_string()).map_err(Failure::failed)?;
+    report::report(&done, &command_line()).write_with_figures(&report_path).map_err(Failure::failed)?;
+    if args.json {
+        print_json(&json::identification(&done, &job, &model_path, &report_path))?;
+    } else {
+        print_text(&json::text(&done, &model_path, &report_path))?;
+    }
+    Ok(Outcome::Done)
+}

@@ -1,0 +1,338 @@
+//! The report of an identification: Bode with bands, Nyquist, residuals, traces, delay test, parameters.
+
+use super::run::Done;
+use cellpos_ident::ladder_model::LadderModel;
+use cellpos_ident::summary::Identification;
+use cellpos_ident::verdict::{Parameter, Verdict};
+use cellpos_plant::{EQ5_VELOCITY_GAIN_PER_S, Hertz, TransferFunction};
+use cellpos_report::{Axis, Column, Figure, Panel, Report, Series, Status, Table};
+
+/// Frequencies for curves, Hz: `count` evenly in the logarithm.
+pub fn log_grid(low_hz: f64, high_hz: f64, count: usize) -> Vec<f64> {
+    (0..count).map(|i| low_hz * (high_hz / low_hz).powf(i as f64 / (count - 1) as f64)).collect()
+}
+
+fn unwrapped_deg(phase: f64) -> f64 {
+    phase - 360.0 * ((phase + 90.0) / 360.0).round()
+}
+
+/// Bode plot of the compensated points, the fitted model with its 95 % band, Eq. (6) and 2 pi 63/s.
+pub fn bode(name: &str, caption: &str, result: &Identification, high_hz: f64) -> Figure {
+    let points = &result.compensated;
+    let f: Vec<f64> = points.iter().map(|p| p.frequency_hz).collect();
+    let lowest = f.iter().copied().fold(f64::INFINITY, f64::min);
+    let grid = log_grid(0.7 * lowest, high_hz, 160);
+    let bands: Vec<_> = grid.iter().map(|&f| result.band(f)).collect();
+    let pick = |g: &dyn Fn(&([f64; 2], [f64; 2])) -> f64| -> Vec<f64> { bands.iter().map(g).collect() };
+    let ends = |value: &dyn Fn(usize) -> f64, sd: &dyn Fn(usize) -> f64| -> (Vec<f64>, Vec<f64>, Vec<f64>) {
+        let n = points.len();
+        (
+            (0..n).map(value).collect(),
+            (0..n).map(|i| value(i) - 1.96 * sd(i)).collect(),
+            (0..n).map(|i| value(i) + 1.96 * sd(i)).collect(),
+        )
+    };
+    let (gain, gain_low, gain_high) = ends(&|i| points[i].gain_db, &|i| points[i].gain_sd_db);
+    let (phase, phase_low, phase_high) = ends(&|i| points[i].phase_deg, &|i| points[i].phase_sd_deg);
+    let model = result.judged.model;
+    let curve = |g: &dyn Fn(f64) -> cellpos_plant::Complex<f64>| -> (Vec<f64>, Vec<f64>) {
+        grid.iter().map(|&f| g(f)).map(|c| (20.0 * c.norm().log10(), unwrapped_deg(c.arg().to_degrees()))).unzip()
+    };
+    let (model_gain, model_phase) = curve(&|f| model.response(f));
+    let eq6 = TransferFunction::eq6();
+    let (eq6_gain, eq6_phase) = curve(&|f| eq6.response(Hertz(f)));
+    let integrator = LadderModel::integrator(EQ5_VELOCITY_GAIN_PER_S, 0.0);
+    let (eq5_gain, eq5_phase) = curve(&|f| integrator.response(f));
+    let delayed: Vec<f64> = points.iter().map(|p| p.delayed_phase_deg).collect();
+    Figure::bode(name, caption)
+        .bode_series(
+            Series::band("95 % of the fit", &grid, &pick(&|b| b.0[0]), &pick(&|b| b.0[1])),
+            Series::band("95 % of the fit", &grid, &pick(&|b| b.1[0]), &pick(&|b| b.1[1])),
+        )
+        .bode_series(Series::line("fit", &grid, &model_gain), Series::line("fit", &grid, &model_phase))
+        .bode_series(
+            Series::line("Eq. (6)", &grid, &eq6_gain).dashed(),
+            Series::line("Eq. (6)", &grid, &eq6_phase).dashed(),
+        )
+        .bode_series(
+            Series::line("2\u{3c0} 63/s", &grid, &eq5_gain).thin(),
+            Series::line("2\u{3c0} 63/s", &grid, &eq5_phase).thin(),
+        )
+        .bode_series(
+            Series::intervals("measured", &f, &gain, &gain_low, &gain_high),
+            Series::intervals("measured, delay taken off", &f, &phase, &phase_low, &phase_high),
+        )
+        .bode_series(
+            Series::points("measured", &[], &[]),
+            Series::points("measured, delay left in", &f, &delayed),
+        )
+}
+
+/// Nyquist plot of what the record shows against the fitted model with hold and delay.
+pub fn nyquist(result: &Identification) -> Figure {
+    let (re, im): (Vec<f64>, Vec<f64>) = result
+        .measured
+        .points
+        .iter()
+        .filter(|p| p.response.norm() < 12.0)
+        .map(|p| (p.response.re, p.response.im))
+        .unzip();
+    let lowest = result.measured.points.iter().map(|p| p.frequency_hz).fold(f64::INFINITY, f64::min);
+    let grid = log_grid(lowest, 0.45 / result.sampling.period_s, 300);
+    let (mre, mim): (Vec<f64>, Vec<f64>) = grid
+        .iter()
+        .map(|&f| result.judged.model.sampled_response(f, result.sampling))
+        .filter(|c| c.norm() < 12.0)
+        .map(|c| (c.re, c.im))
+        .unzip();
+    Figure::nyquist("nyquist", "What the record shows of the plant in the complex plane, hold and delay included; lines below 12 um/um.")
+        .series(Series::line("model with hold and delay", &mre, &mim))
+        .series(Series::points("measured", &re, &im))
+}
+
+/// Residuals of the fit over their standard deviations.
+pub fn residuals(result: &Identification) -> Figure {
+    let mut f = Vec::new();
+    let (mut re, mut im) = (Vec::new(), Vec::new());
+    for p in &result.measured.points {
+        let model = result.ladder.best().model.sampled_response(p.frequency_hz, result.sampling);
+        // Along the response: gain; across it: phase.
+        let e = (p.response - model) / (p.response / p.response.norm()) / (0.5 * p.variance).sqrt();
+        f.push(p.frequency_hz);
+        re.push(e.re);
+        im.push(e.im);
+    }
+    Figure::new("residuals", "Residuals of the chosen rung over their standard deviations; 95 % of them belong between the lines.").panel(
+        Panel::new(Axis::log("frequency", "Hz"), Axis::linear("residual", "standard deviations"))
+            .series(Series::points("gain", &f, &re))
+            .series(Series::points("phase", &f, &im))
+            .horizontal(-1.96, "")
+            .horizontal(1.96, ""),
+    )
+}
+
+/// Time traces: command about its mean and bead, the last part of each segment.
+pub fn traces(done: &Done) -> Figure {
+    let mut figure = Figure::new(
+        "traces",
+        "Commanded displacement (times 4) and bead position of each segment, about their means: three periods, 50 ms at least.",
+    )
+    .columns(2);
+    let period_s = done.plan.period_s;
+    for record in &done.records {
+        let planned = &done.plan.segments[record.index];
+        let lowest = planned.lines_hz.iter().copied().fold(f64::INFINITY, f64::min);
+        let rows = ((3.0 / lowest).max(0.05) / period_s) as usize;
+        let from = record.input.len().saturating_sub(rows);
+        let mean = |x: &[f64]| {
+            let finite: Vec<f64> = x.iter().copied().filter(|v| v.is_finite()).collect();
+            finite.iter().sum::<f64>() / finite.len().max(1) as f64
+        };
+        let (u, y) = (&record.input[from..], &record.output[from..]);
+        let (mu, my) = (mean(u), mean(y));
+        let t: Vec<f64> = (0..u.len()).map(|k| k as f64 * period_s * 1e3).collect();
+        figure = figure.panel(
+            Panel::new(Axis::linear("time", "ms"), Axis::linear("", "um"))
+                .title(&planned.label)
+                .height_px(140.0)
+                .series(Series::step("4 x PZT", &t, &u.iter().map(|v| 4.0 * (v - mu)).collect::<Vec<_>>()))
+                .series(Series::points("bead", &t, &y.iter().map(|v| v - my).collect::<Vec<_>>())),
+        );
+    }
+    figure
+}
+
+/// The delay test: light sent and seen, and the intervals that the edges leave for the delay.
+pub fn delay_test(name: &str, caption: &str, led: &super::bench::DelayTest) -> Figure {
+    let first = led.switched_s.first().copied().unwrap_or(0.0);
+    let until = led.switched_s.get(4).copied().unwrap_or(first) + 0.006;
+    let (mut t, mut grey) = (Vec::new(), Vec::new());
+    for (s, g) in led.frame_s.iter().zip(&led.grey) {
+        if *s > first - 0.004 && *s < until {
+            t.push((s - first) * 1e3);
+            grey.push(*g);
+        }
+    }
+    let low = grey.iter().copied().fold(f64::INFINITY, f64::min);
+    let high = grey.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+    let mut sent_t = vec![-4.0];
+    let mut sent = vec![low];
+    for (i, s) in led.switched_s.iter().take_while(|s| **s < until).enumerate() {
+        sent_t.push((s - first) * 1e3);
+        sent.push(if i % 2 == 0 { high } else { low });
+    }
+    sent_t.push((until - first) * 1e3);
+    sent.push(*sent.last().unwrap_or(&low));
+    let middle: Vec<f64> = led.seen.iter().map(|e| (0.5 * (e.before_s + e.after_s) - e.sent_s) * 1e3).collect();
+    let low_ms: Vec<f64> = led.seen.iter().map(|e| (e.before_s - e.sent_s) * 1e3).collect();
+    let high_ms: Vec<f64> = led.seen.iter().map(|e| (e.after_s - e.sent_s) * 1e3).collect();
+    let number: Vec<f64> = (1..=led.seen.len()).map(|i| i as f64).collect();
+    Figure::new(name, caption)
+        .panel(
+            Panel::new(Axis::linear("time after the first edge", "ms"), Axis::linear("mean grey level", "grey"))
+                .series(Series::step("light sent", &sent_t, &sent))
+                .series(Series::points("frames as they arrive", &t, &grey)),
+        )
+        .panel(
+            Panel::new(Axis::linear("edge", ""), Axis::linear("delay that the edge allows", "ms"))
+                .series(Series::intervals("each edge", &number, &middle, &low_ms, &high_ms))
+                .horizontal(led.estimate.delay_s * 1e3, &format!("{:.3} ms", led.estimate.delay_s * 1e3)),
+        )
+}
+
+/// A number with digits fit for reading.
+pub fn number(value: f64) -> String {
+    if value == 0.0 {
+        "0".to_owned()
+    } else if !value.is_finite() {
+        if value.is_nan() { "not known".to_owned() } else if value > 0.0 { "no bound".to_owned() } else { "no lower bound".to_owned() }
+    } else if value.abs() >= 1000.0 {
+        format!("{value:.0}")
+    } else if value.abs() >= 100.0 {
+        format!("{value:.1}")
+    } else if value.abs() >= 1.0 {
+        format!("{value:.3}")
+    } else {
+        format!("{value:.4}")
+    }
+}
+
+fn interval(ends: [f64; 2]) -> String {
+    format!("{} .. {}", number(ends[0]), number(ends[1]))
+}
+
+/// The table of parameters with verdicts.
+pub fn parameters(parameters: &[Parameter]) -> Table {
+    let mut table = Table::new([
+        Column::left("parameter"),
+        Column::right("value"),
+        Column::left("unit"),
+        Column::right("95 % interval"),
+        Column::right("by bootstrap"),
+        Column::left("verdict"),
+    ]);
+    for p in parameters {
+        let (status, verdict) = match &p.verdict {
+            Verdict::Identified => (Status::Good, "identified".to_owned()),
+            Verdict::NotIdentifiable { reason } => (Status::Warning, format!("not identifiable from this band: {reason}")),
+        };
+        table.row_with(
+            status,
+            [
+                format!("{} ({})", p.name, p.meaning),
+                number(p.value),
+                p.unit.to_owned(),
+                interval(p.ci95),
+                p.bootstrap95.map(interval).unwrap_or_default(),
+                verdict,
+            ],
+        );
+    }
+    table
+}
+
+/// The table of lines beside Eq. (6).
+pub fn lines(result: &Identification) -> Table {
+    let eq6 = TransferFunction::eq6();
+    let mut table = Table::new([
+        Column::right("Hz"),
+        Column::right("gain dB"),
+        Column::right("+-95 %"),
+        Column::right("Eq. (6) dB"),
+        Column::right("phase deg"),
+        Column::right("+-95 %"),
+        Column::right("Eq. (6) deg"),
+        Column::right("with delay deg"),
+        Column::right("in the record deg"),
+        Column::right("coherence"),
+    ]);
+    for p in &result.compensated {
+        table.row([
+            format!("{}", p.frequency_hz),
+            format!("{:.3}", p.gain_db),
+            format!("{:.3}", 1.96 * p.gain_sd_db),
+            format!("{:.2}", eq6.gain_db(Hertz(p.frequency_hz)).0),
+            format!("{:.2}", p.phase_deg),
+            format!("{:.2}", 1.96 * p.phase_sd_deg),
+            format!("{:.2}", eq6.phase_deg(Hertz(p.frequency_hz)).0),
+            format!("{:.1}", p.delayed_phase_deg),
+            format!("{:.1}", p.raw_phase_deg),
+            format!("{:.5}", p.coherence),
+        ]);
+    }
+    table
+}
+
+/// The table of rungs.
+pub fn ladder(result: &Identification) -> Table {
+    let mut table = Table::new([
+        Column::left("model"),
+        Column::right("chi2"),
+        Column::right("dof"),
+        Column::right("AICc"),
+        Column::right("held out, per datum"),
+        Column::right("p of this step"),
+    ]);
+    for (i, r) in result.ladder.rungs.iter().enumerate() {
+        table.row_with(
+            if i == result.ladder.chosen { Status::Good } else { Status::Plain },
+            [
+                r.rung.formula().to_owned(),
+                format!("{:.1}", r.chi2),
+                format!("{:.0}", r.dof),
+                format!("{:.1}", r.aicc),
+                format!("{:.3}", r.held_out),
+                format!("{:.1e}", r.step_p_value),
+            ],
+        );
+    }
+    table
+}
+
+/// The whole report.
+pub fn report(done: &Done, command_line: &str) -> Report {
+    let result = &done.result;
+    let mut report = Report::new("Identification");
+    report.paragraph(&format!("`{command_line}`; {} rows of record.", done.records.iter().map(|r| r.input.len()).sum::<usize>()));
+    for warning in &result.warnings {
+        report.note(Status::Warning, warning);
+    }
+    report.section("Parameters").table(parameters(&result.judged.parameters));
+    if let Some(noise) = result.measured.noise {
+        report.paragraph(&format!(
+            "Noise from the scatter of all lines: diffusion {:.3} +- {:.3} um^2/s, localisation {:.1} nm RMS (p = {:.2}{}).",
+            noise.diffusion_um2_per_s,
+            noise.diffusion_ci95_um2_per_s,
+            noise.localisation_um * 1e3,
+            noise.p_value,
+            if noise.used { ", used for the weights" } else { ", not used: the scatter of each line weighs it" }
+        ));
+    }
+    report.section("Frequency response").figure(bode(
+        "bode",
+        "Gain and phase of the plant with the 95 % band of the fit; hold, exposure and delay taken off.",
+        result,
+        480.0,
+    ));
+    report.table(lines(result)).figure(nyquist(result)).figure(residuals(result));
+    report.section("Choice of the model").table(ladder(result));
+    report.section("Delay");
+    let phase = result.judged.phase_delay95_s;
+    report.paragraph(&format!(
+        "From the phase slope, any far zero included: {} ms.",
+        interval([phase[0] * 1e3, phase[1] * 1e3])
+    ));
+    if let Some(led) = &done.led {
+        let e = &led.estimate;
+        report.paragraph(&format!(
+            "From {} dithered edges of the LED: {:.4} ms, 95 % {:.4} .. {:.4} ms.",
+            e.edges,
+            e.delay_s * 1e3,
+            e.ci95_s[0] * 1e3,
+            e.ci95_s[1] * 1e3
+        ));
+        report.figure(delay_test("delay-test", "Light sent by the board and seen by the camera, and what each edge allows the delay to be.", led));
+    }
+    report.section("Traces").figure(traces(done));
+    report
+}

@@ -1,0 +1,291 @@
+//! From measured points and a delay test to one result: judged parameters, compensated response, model, warnings.
+//!
+//! What `cellpos identify` prints, as a library call. Not for acquiring data.
+
+use std::collections::BTreeMap;
+
+use cellpos_plant::{Covariance, EQ5_LITERAL_PER_S, Model, Noise, PlantError, TransferFunction};
+use nalgebra::{Complex, DMatrix};
+
+use crate::delay::{DelayEstimate, disagreement_s};
+use crate::error::IdentError;
+use crate::experiment::Measured;
+use crate::ladder::{DelayPrior, LadderFit, LadderProblem, Rung, index, model_of};
+use crate::ladder_model::LadderModel;
+use crate::sampled::Sampling;
+use crate::verdict::{Judged, judge};
+
+/// One line of the compensated response.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct CompensatedPoint {
+    /// Frequency, Hz.
+    pub frequency_hz: f64,
+    /// Gain of the plant, hold and exposure taken off, dB.
+    pub gain_db: f64,
+    /// Standard deviation of the gain, dB.
+    pub gain_sd_db: f64,
+    /// Phase as the record shows it, hold and delay included, deg in (-360, 0].
+    pub raw_phase_deg: f64,
+    /// Phase with the hold taken off and the delay left in, deg, continued below -180.
+    pub delayed_phase_deg: f64,
+    /// Phase of the plant: hold, exposure and delay taken off, deg.
+    pub phase_deg: f64,
+    /// Standard deviation of the phase, deg, without that of the delay.
+    pub phase_sd_deg: f64,
+    /// Coherence.
+    pub coherence: f64,
+}
+
+/// Everything that an identification of the rig found.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Identification {
+    /// The measured points and the noise.
+    pub measured: Measured,
+    /// How the record was sampled.
+    pub sampling: Sampling,
+    /// The ladder.
+    pub ladder: LadderFit,
+    /// Parameters with verdicts, and the model to go on with.
+    pub judged: Judged,
+    /// The delay test, where one was run.
+    pub led: Option<DelayEstimate>,
+    /// By how much LED test and phase slope contradict each other, s.
+    pub disagreement_s: Option<f64>,
+    /// The response with hold, exposure and delay taken off.
+    pub compensated: Vec<CompensatedPoint>,
+    /// What a user must know before using the model.
+    pub warnings: Vec<String>,
+}
+
+/// Response of the plant itself at a measured point: what the record shows, divided by what sampling and delay make of
+/// the model and multiplied by the model. Exact where the model is right, and insensitive where it is not, since only
+/// the ratio of the model with and without sampling enters.
+pub fn compensated(measured: Complex<f64>, frequency_hz: f64, model: &LadderModel, sampling: Sampling) -> Complex<f64> {
+    measured * model.response(frequency_hz) / model.sampled_response(frequency_hz, sampling)
+}
+
+/// Fits, judges and compensates. `bootstrap` replicates (0: none) are drawn with `seed`.
+///
+/// # Errors
+/// Those of [`LadderProblem::new`] and [`LadderProblem::fit`].
+pub fn summarise(
+    measured: Measured,
+    sampling: Sampling,
+    led: Option<DelayEstimate>,
+    bootstrap: usize,
+    seed: u64,
+) -> Result<Identification, IdentError> {
+    let problem = LadderProblem::new(&measured.points, sampling, None)?;
+    let ladder = problem.fit()?;
+    let prior = led.map(|l| DelayPrior { delay_s: l.delay_s, sd_s: l.sd_s.max(1e-7) });
+    let judged = judge(&problem, &ladder, prior, bootstrap, seed);
+    let disagreement = led.and_then(|l| disagreement_s(&l, judged.phase_delay95_s, 2e-5));
+    let compensated = measured
+        .points
+        .iter()
+        .map(|p| {
+            let plant = compensated(p.response, p.frequency_hz, &judged.model, sampling);
+            let phase_deg = continued(plant.arg().to_degrees(), -90.0);
+            CompensatedPoint {
+                frequency_hz: p.frequency_hz,
+                gain_db: 20.0 * plant.norm().log10(),
+                gain_sd_db: p.gain_sd_db(),
+                raw_phase_deg: continued(p.phase_deg(), -180.0),
+                delayed_phase_deg: phase_deg - 360.0 * p.frequency_hz * judged.model.delay_s,
+                phase_deg,
+                phase_sd_deg: p.phase_sd_deg(),
+                coherence: p.coherence,
+            }
+        })
+        .collect();
+    let mut result =
+        Identification { measured, sampling, ladder, judged, led, disagreement_s: disagreement, compensated, warnings: Vec::new() };
+    result.warnings = warnings(&result);
+    Ok(result)
+}
+
+/// A phase moved by whole turns to within half a turn of `near`.
+fn continued(phase_deg: f64, near: f64) -> f64 {
+    phase_deg - 360.0 * ((phase_deg - near) / 360.0).round()
+}
+
+/// Recognises a stated gain that is a measured one divided by 2 pi: Eq. (5)'s `63/s`, where 63 is the gain at 1 Hz.
+/// Returns the measured over the stated gain when it lies within 12 % of 2 pi.
+pub fn literal_per_hertz(measured_per_s: f64, stated_per_s: f64) -> Option<f64> {
+    let ratio = measured_per_s / stated_per_s;
+    let turn = 2.0 * std::f64::consts::PI;
+    ((ratio / turn - 1.0).abs() < 0.12).then_some(ratio)
+}
+
+fn warnings(result: &Identification) -> Vec<String> {
+    let mut out = Vec::new();
+    if let (Some(gap), Some(led)) = (result.disagreement_s, result.led) {
+        out.push(format!(
+            "the LED test's delay ({:.3} ms) and the phase slope's ({:.3} to {:.3} ms) miss each other by {:.3} ms: \
+             something between the board's output and the bead delays too (amplifier, tube), or one of the tests is wrong",
+            led.delay_s * 1e3,
+            result.judged.phase_delay95_s[0] * 1e3,
+            result.judged.phase_delay95_s[1] * 1e3,
+            gap * 1e3
+        ));
+    }
+    if result.ladder.scale > 2.0 {
+        out.push(format!(
+            "the residuals of the best rung are {:.1} times the noise (as standard deviations): the plant holds something that \
+             Eq. (4) does not; the intervals were widened by that factor",
+            result.ladder.scale.sqrt()
+        ));
+    }
+    let gain = result.judged.model.gain_per_s;
+    if let Some(ratio) = literal_per_hertz(gain, EQ5_LITERAL_PER_S) {
+        out.push(format!(
+            "Eq. (5) prints 63/s; the measured gain is {ratio:.2} times that, a factor of 2 pi: 63 is the gain at 1 Hz, so the \
+             plant is 2 pi 63/s = 396/s. A controller designed on 63/s has 6.3 times too much loop gain"
+        ));
+    }
+    if gain < 0.0 {
+        out.push("the gain is negative: check the camera's axis or the sign of the PZT before closing a loop".to_owned());
+    }
+    let distorted: Vec<String> = result
+        .measured
+        .segments
+        .iter()
+        .filter_map(|s| {
+            let point = s.points.first()?;
+            let worst = s
+                .detection
+                .iter()
+                .filter(|d| d.p_value < 1e-4 && d.output.norm() > 0.01 * point.output.norm())
+                .max_by(|a, b| a.output.norm().total_cmp(&b.output.norm()))?;
+            // Feedback passes a harmonic of the input on: only what the input does not hold speaks of a nonlinearity.
+            let linear = point.response.norm() * worst.input.norm() * 3.0;
+            (worst.output.norm() > linear).then(|| {
+                format!("{} Hz ({:.1} % at {:.1} Hz)", point.frequency_hz, 100.0 * worst.output.norm() / point.output.norm(), worst.frequency_hz)
+            })
+        })
+        .collect();
+    if !distorted.is_empty() {
+        out.push(format!("the output holds harmonics that no linear model explains, driven at {}", distorted.join(", ")));
+    }
+    out
+}
+
+impl Identification {
+    /// The identified plant as a model file: transfer function without the delay, noise, intervals, covariance of the
+    /// coefficients, and the delay among the provenance (it belongs to the rig's camera path, not to the plant).
+    ///
+    /// # Errors
+    /// [`PlantError`] when the coefficients make no plant.
+    pub fn model(&self, name: &str, working_point_um: f64, provenance: BTreeMap<String, String>) -> Result<Model, PlantError> {
+        let best = self.judged.model;
+        let (num, den) = best.polynomials();
+        let plant = TransferFunction::new(num, den)?;
+        let mut intervals = BTreeMap::new();
+        for p in &self.judged.parameters {
+            if p.verdict.is_identified() && p.ci95.iter().all(|v| v.is_finite()) {
+                intervals.insert(p.name.to_owned(), p.ci95);
+            }
+        }
+        let mut provenance = provenance;
+        provenance.insert("delay_ms".to_owned(), format!("{:.4}", best.delay_s * 1e3));
+        provenance.insert("rung".to_owned(), self.ladder.best().rung.formula().to_owned());
+        for p in &self.judged.parameters {
+            provenance.insert(format!("verdict.{}", p.name), p.verdict.label().to_owned());
+        }
+        let noise = self.measured.noise.map_or(Noise::NONE, |n| Noise {
+            diffusion_um2_per_s: n.diffusion_um2_per_s,
+            localisation_um: n.localisation_um,
+        });
+        Ok(Model {
+            name: name.to_owned(),
+            description: format!("identified from {} lines, {}", self.measured.points.len(), self.ladder.best().rung.formula()),
+            plant,
+            working_point_um,
+            effects: Vec::new(),
+            noise,
+            covariance: Some(self.coefficient_covariance()),
+            intervals,
+            provenance,
+        })
+    }
+
+    /// Covariance of the transfer function's coefficients, carried over from that of the fitted parameters.
+    fn coefficient_covariance(&self) -> Covariance {
+        let best = self.judged.model;
+        let rung = if best.slow_pole_rad_per_s != 0.0 {
+            Rung::Eq4
+        } else if best.far_lead_s != 0.0 {
+            Rung::FarZero
+        } else if best.zero_rad_per_s != best.pole_rad_per_s {
+            Rung::PoleZeroPair
+        } else {
+            Rung::Integrator
+        };
+        let source = self.ladder.rungs.iter().find(|r| r.rung == rung).unwrap_or(self.ladder.best());
+        let mut x = vec![0.0; source.rung.parameters()];
+        let values = [
+            (index::LN_GAIN, best.gain_per_s.ln()),
+            (index::EFFECTIVE_DELAY_MS, best.effective_delay_s() * 1e3),
+            (index::LN_ZERO, best.zero_rad_per_s.ln()),
+            (index::LN_POLE, best.pole_rad_per_s.ln()),
+            (index::FAR_LEAD_MS, best.far_lead_s * 1e3),
+            (index::SLOW_POLE, best.slow_pole_rad_per_s),
+        ];
+        for (i, value) in values {
+            if let Some(place) = x.get_mut(i) {
+                *place = value;
+            }
+        }
+        let coefficients = |x: &[f64]| -> Vec<f64> {
+            let (num, den) = model_of(x, source.rung).polynomials();
+            num.into_iter().chain(den.into_iter().skip(1)).collect()
+        };
+        let here = coefficients(&x);
+        let mut jacobian = DMatrix::zeros(here.len(), x.len());
+        for j in 0..x.len() {
+            let step = 1e-6 * x[j].abs().max(1.0);
+            let mut moved = x.clone();
+            moved[j] += step;
+            for (i, (a, b)) in coefficients(&moved).iter().zip(&here).enumerate() {
+                jacobian[(i, j)] = (a - b) / step;
+            }
+        }
+        let spread = source.covariance.map(|v| if v.is_finite() { v } else { 0.0 });
+        let matrix = &jacobian * spread * jacobian.transpose();
+        let (num, _) = model_of(&x, source.rung).polynomials();
+        let names = (0..num.len())
+            .map(|i| format!("plant.num[{i}]"))
+            .chain((1..=here.len() - num.len()).map(|i| format!("plant.den[{i}]")))
+            .collect();
+        Covariance { parameters: names, matrix: (0..here.len()).map(|i| matrix.row(i).iter().copied().collect()).collect() }
+    }
+
+    /// Band of the fitted plant at `frequency_hz`: gain (dB) and phase (deg), each low and high at 95 %, delay
+    /// excluded. From the covariance of the chosen rung.
+    pub fn band(&self, frequency_hz: f64) -> ([f64; 2], [f64; 2]) {
+        let best = self.ladder.best();
+        let here = best.model.response(frequency_hz);
+        let (mut gain_variance, mut phase_variance) = (0.0, 0.0);
+        let n = best.parameters.len();
+        let gradient: Vec<(f64, f64)> = (0..n)
+            .map(|j| {
+                let step = 1e-5 * best.parameters[j].abs().max(0.1);
+                let mut moved = best.parameters.clone();
+                moved[j] += step;
+                let ratio = model_of(&moved, best.rung).response(frequency_hz) / here;
+                (20.0 * ratio.norm().log10() / step, ratio.arg().to_degrees() / step)
+            })
+            .collect();
+        for i in 0..n {
+            for j in 0..n {
+                let c = best.covariance[(i, j)];
+                gain_variance += gradient[i].0 * c * gradient[j].0;
+                phase_variance += gradient[i].1 * c * gradient[j].1;
+            }
+        }
+        let model = self.judged.model.response(frequency_hz);
+        let (gain, phase) = (20.0 * model.norm().log10(), continued(model.arg().to_degrees(), -90.0));
+        let (g, p) = (1.96 * gain_variance.max(0.0).sqrt(), 1.96 * phase_variance.max(0.0).sqrt());
+        ([gain - g, gain + g], [phase - p, phase + p])
+    }
+}
