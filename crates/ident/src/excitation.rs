@@ -290,6 +290,8 @@ pub fn odd_multisine(
 pub struct Limits {
     /// Largest bead amplitude (peak) that stays in view, um.
     pub bead_um: f64,
+    /// Largest bead speed (peak), um/s: beyond a few pixels per exposure the image is a smear that no localiser trusts.
+    pub bead_um_per_s: f64,
     /// Largest PZT amplitude (peak), um.
     pub pzt_um: f64,
     /// Largest PZT speed, um/s.
@@ -307,7 +309,8 @@ pub fn shaped_amplitude_um(
 ) -> f64 {
     let sensitivity = (1.0 / (1.0 + loop_gain)).norm();
     let w = 2.0 * std::f64::consts::PI * frequency_hz;
-    let pzt_um = (limits.bead_um / plant.norm())
+    let bead_um = limits.bead_um.min(limits.bead_um_per_s / w);
+    let pzt_um = (bead_um / plant.norm())
         .min(limits.pzt_um)
         .min(limits.slew_um_per_s / w);
     pzt_um / sensitivity
@@ -363,6 +366,7 @@ mod tests {
     #[test]
     fn shaped_amplitudes_keep_the_bead_in_view_in_open_and_closed_loop() {
         let limits = Limits {
+            bead_um_per_s: 1e9,
             bead_um: 8.0,
             pzt_um: 15.0,
             slew_um_per_s: 1e9,

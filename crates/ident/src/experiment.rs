@@ -48,6 +48,9 @@ pub struct PlannedSegment {
     pub measure_s: f64,
 }
 
+/// Time over which a segment's excitation fades out, s.
+const RELEASE_S: f64 = 0.2;
+
 /// A list of segments at one sampling period.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Plan {
@@ -126,6 +129,7 @@ impl Plan {
         let peak = 3.0 * (0.5 * odd.len() as f64).sqrt();
         let share = Limits {
             bead_um: limits.bead_um / peak,
+            bead_um_per_s: limits.bead_um_per_s / peak,
             pzt_um: limits.pzt_um / peak,
             slew_um_per_s: limits.slew_um_per_s / peak,
         };
@@ -155,14 +159,14 @@ impl Plan {
 
     /// Total duration, s.
     pub fn duration_s(&self) -> f64 {
-        self.segments.iter().map(|s| s.settle_s + s.measure_s).sum()
+        self.segments.iter().map(|s| s.settle_s + s.measure_s + RELEASE_S).sum()
     }
 
     /// Ticks in all.
     pub fn ticks(&self) -> usize {
         self.segments
             .iter()
-            .map(|s| rows(s.settle_s, self.period_s) + rows(s.measure_s, self.period_s))
+            .map(|s| rows(s.settle_s, self.period_s) + rows(s.measure_s, self.period_s) + rows(RELEASE_S, self.period_s))
             .sum()
     }
 
@@ -220,6 +224,17 @@ impl Plan {
                 if ticks % 256 == 0 {
                     progress(ticks);
                 }
+            }
+            // Fade out: in closed loop the excitation balances the controller's share, and dropping it at once would
+            // fling the bead out of view.
+            let release = rows(RELEASE_S, self.period_s);
+            for k in 0..release {
+                let fade = 0.5 + 0.5 * (std::f64::consts::PI * (k + 1) as f64 / release as f64).cos();
+                let excitation_um = fade * segment.signal.value_um((total + k) as f64 * self.period_s);
+                if let Err(error) = bench.tick(excitation_um) {
+                    return Err(Stopped { done, cause: Cause::Rig(error) });
+                }
+                ticks += 1;
             }
             done.push(record);
         }

@@ -41,8 +41,8 @@ impl Rung {
         match self {
             Rung::Integrator => 2,
             Rung::PoleZeroPair => 4,
-            Rung::FarZero => 5,
-            Rung::Eq4 => 6,
+            Rung::FarZero => 6,
+            Rung::Eq4 => 7,
         }
     }
 
@@ -57,8 +57,8 @@ impl Rung {
     }
 }
 
-/// Index of each parameter in a parameter vector: `ln K`, effective delay (ms), `ln z`, `ln p`, far lead (ms), slow
-/// pole (rad/s).
+/// Index of each parameter in a parameter vector: `ln K`, effective delay (ms), `ln z`, `ln p`, far lead (ms),
+/// share of the feedthrough one row later, slow pole (rad/s).
 pub mod index {
     /// `ln` of the integrator gain in 1/s.
     pub const LN_GAIN: usize = 0;
@@ -70,8 +70,10 @@ pub mod index {
     pub const LN_POLE: usize = 3;
     /// Lead of the far zero, ms.
     pub const FAR_LEAD_MS: usize = 4;
+    /// Share of the feedthrough that shows one row later (a nuisance, see the model).
+    pub const FEEDTHROUGH_SHARE: usize = 5;
     /// Slow pole, rad/s.
-    pub const SLOW_POLE: usize = 5;
+    pub const SLOW_POLE: usize = 6;
 }
 
 /// A delay measured otherwise (an LED test), used as a further datum.
@@ -149,6 +151,7 @@ pub fn model_of(x: &[f64], rung: Rung) -> LadderModel {
     if rung >= Rung::FarZero {
         model.far_lead_s = x[index::FAR_LEAD_MS] * 1e-3;
         model.delay_s += model.far_lead_s;
+        model.feedthrough_share = Some(x[index::FEEDTHROUGH_SHARE]);
     }
     if rung >= Rung::Eq4 {
         model.slow_pole_rad_per_s = x[index::SLOW_POLE];
@@ -157,7 +160,14 @@ pub fn model_of(x: &[f64], rung: Rung) -> LadderModel {
 }
 
 /// Finite-difference steps of the parameter vector.
-const STEPS: [f64; 6] = [1e-5, 1e-5, 1e-4, 1e-4, 1e-5, 1e-4];
+const STEPS: [f64; 7] = [1e-5, 1e-5, 1e-4, 1e-4, 1e-5, 1e-4, 1e-4];
+
+/// What is known of the far zero's lead before any fit: about zero, to this part of a sampling period. A lead of a
+/// period or more would be a second delay.
+const LEAD_SD_PERIODS: f64 = 0.3;
+
+/// What is known of the feedthrough's share one row later: between 0 and 1.
+const SHARE_MIDDLE_SD: (f64, f64) = (0.5, 0.5);
 
 impl<'a> LadderProblem<'a> {
     /// A problem from points with variances.
@@ -198,20 +208,23 @@ impl<'a> LadderProblem<'a> {
     }
 
     fn rows(&self) -> usize {
-        2 * self.points.len() + usize::from(self.prior.is_some())
+        2 * self.points.len() + 3
     }
 
     fn residuals(&self, data: &[Complex<f64>], model: &LadderModel, out: &mut [f64]) {
-        let fractions = model.partial_fractions();
+        let sampler = model.sampler(self.sampling);
         for (i, (p, y)) in self.points.iter().zip(data).enumerate() {
-            let e = (y - fractions.sampled_response(p.frequency_hz, model.delay_s, self.sampling))
-                * self.weights[i];
+            let e = (y - sampler.response(p.frequency_hz)) * self.weights[i];
             out[2 * i] = e.re;
             out[2 * i + 1] = e.im;
         }
-        if let Some(prior) = self.prior {
-            out[2 * self.points.len()] = (model.delay_s - prior.delay_s) / prior.sd_s;
-        }
+        let last = 2 * self.points.len();
+        out[last] = self.prior.map_or(0.0, |prior| (model.delay_s - prior.delay_s) / prior.sd_s);
+        // Behind a hold the lead trades exactly with the delay, and the share with the lead: without these two weak
+        // bounds the directions would be open.
+        let (middle, sd) = SHARE_MIDDLE_SD;
+        out[last + 1] = model.feedthrough_share.map_or(0.0, |share| (share - middle) / sd);
+        out[last + 2] = model.far_lead_s / (LEAD_SD_PERIODS * self.sampling.period_s);
     }
 
     /// Weighted sum of squares of `data` about `model`, without the delay prior.
@@ -320,7 +333,7 @@ impl<'a> LadderProblem<'a> {
         };
         match (rung, below) {
             (Rung::Integrator, _) | (_, None) => {
-                extend(&[ln_gain, delay_ms], &[0.0; 4][..rung.parameters() - 2])
+                extend(&[ln_gain, delay_ms], &[0.0; 5][..rung.parameters() - 2])
             }
             (Rung::PoleZeroPair, Some(x)) => {
                 let (low, high) = self.band_rad_per_s();
@@ -332,14 +345,13 @@ impl<'a> LadderProblem<'a> {
                 }
             }
             (Rung::FarZero, Some(x)) => {
-                // First with the lead held: at each whole sample of delay the feedthrough moves to another row at once,
-                // and a long first step would cross into the wrong one.
-                for share in [0.0, 0.03, 0.1, 0.3, 0.6] {
+                // First with the lead held: where the delay crosses half a sample the feedthrough moves to another
+                // row at once, and a long first step would cross into the wrong one.
+                for share in [0.03, 0.1, 0.3] {
                     let lead_ms = share * self.sampling.period_s * 1e3;
                     let mut start = x.to_vec();
-                    start.push(lead_ms);
-                    let held =
-                        self.fit_from(data, rung, &start, Some((index::FAR_LEAD_MS, lead_ms)));
+                    start.extend([lead_ms, 0.5]);
+                    let held = self.fit_from(data, rung, &start, Some((index::FAR_LEAD_MS, lead_ms)));
                     if held.parameters.iter().all(|v| v.is_finite()) {
                         extend(&held.parameters, &[]);
                     }
@@ -378,7 +390,7 @@ impl<'a> LadderProblem<'a> {
     fn fit_rungs(&self, data: &[Complex<f64>]) -> Vec<(Rung, Minimum)> {
         let mut out: Vec<(Rung, Minimum)> = Vec::new();
         for rung in Rung::ALL {
-            if self.rows() <= rung.parameters() {
+            if 2 * self.points.len() <= rung.parameters() {
                 break;
             }
             let below = out.last().map(|(_, m)| m.parameters.clone());
@@ -426,7 +438,7 @@ impl<'a> LadderProblem<'a> {
         let data = self.data();
         let fits = self.fit_rungs(&data);
         let held_out = self.held_out(&fits);
-        let n = self.rows() as f64;
+        let n = 2.0 * self.points.len() as f64;
         let variance_dof = self
             .points
             .iter()
@@ -472,8 +484,7 @@ impl<'a> LadderProblem<'a> {
             rungs.push(RungFit {
                 rung,
                 model: model_of(&m.parameters, rung),
-                covariance: covariance(&with_lead_bound(&m.jacobian, self.sampling.period_s * 1e3))
-                    * scale,
+                covariance: covariance(&m.jacobian) * scale,
                 chi2: m.chi2,
                 dof: n - k,
                 aicc: m.chi2 / scale + 2.0 * k + correction,
@@ -506,17 +517,4 @@ impl<'a> LadderProblem<'a> {
             interval_dof,
         })
     }
-}
-
-/// The Jacobian with one more row: a lead of a sampling period or more would show, so the far zero's lead is known to
-/// about a third of a period beforehand. Without it the exact trade between delay and lead makes every covariance
-/// infinite, though the other parameters hardly move along it.
-fn with_lead_bound(jacobian: &DMatrix<f64>, period_ms: f64) -> DMatrix<f64> {
-    if jacobian.ncols() <= index::FAR_LEAD_MS {
-        return jacobian.clone();
-    }
-    let rows = jacobian.nrows();
-    let mut out = jacobian.clone().insert_row(rows, 0.0);
-    out[(rows, index::FAR_LEAD_MS)] = 1.0 / (0.3 * period_ms);
-    out
 }

@@ -7,7 +7,7 @@
 
 use nalgebra::Complex;
 
-use crate::sampled::{PartialFractions, Sampling};
+use crate::sampled::{Hold, PartialFractions, Sampling};
 
 /// Parameters of Eq. (4) with real poles and zeros, and a delay.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -24,6 +24,10 @@ pub struct LadderModel {
     pub slow_pole_rad_per_s: f64,
     /// Delay from the command to the middle of the exposure, s.
     pub delay_s: f64,
+    /// Which part of the feedthrough a record shows one row later than the rest. `None`: what the exposure and an
+    /// output that steps at once make of it. It hangs on where within the exposure the output really steps, a matter of
+    /// microseconds that no band below half the sampling rate tells; a fit therefore leaves it free.
+    pub feedthrough_share: Option<f64>,
 }
 
 impl LadderModel {
@@ -36,6 +40,7 @@ impl LadderModel {
             far_lead_s: 0.0,
             slow_pole_rad_per_s: 0.0,
             delay_s,
+            feedthrough_share: None,
         }
     }
 
@@ -56,6 +61,7 @@ impl LadderModel {
             far_lead_s: 1.0 / far_zero,
             slow_pole_rad_per_s: slow,
             delay_s,
+            feedthrough_share: None,
         }
     }
 
@@ -100,8 +106,17 @@ impl LadderModel {
 
     /// What a record sampled as `sampling` shows at `frequency_hz`, delay included.
     pub fn sampled_response(&self, frequency_hz: f64, sampling: Sampling) -> Complex<f64> {
-        self.partial_fractions()
-            .sampled_response(frequency_hz, self.delay_s, sampling)
+        self.sampler(sampling).response(frequency_hz)
+    }
+
+    /// The same for many frequencies.
+    pub fn sampler(&self, sampling: Sampling) -> Sampler {
+        let mut fractions = self.partial_fractions();
+        let late = self.feedthrough_share.filter(|_| sampling.hold == Hold::ZeroOrder).map(|share| {
+            let direct = std::mem::take(&mut fractions.direct);
+            (direct * (1.0 - share), direct * share)
+        });
+        Sampler { fractions, delay_s: self.delay_s, sampling, late }
     }
 
     /// Numerator and denominator of the plant without delay, highest power of s first, the denominator monic; of lower
@@ -128,6 +143,27 @@ impl LadderModel {
             vec![scale * tau / z, scale * (tau + 1.0 / z), scale]
         };
         (numerator, vec![1.0, p + q, p * q])
+    }
+}
+
+/// A [`LadderModel`] prepared for evaluation at many frequencies.
+#[derive(Debug, Clone)]
+pub struct Sampler {
+    fractions: PartialFractions,
+    delay_s: f64,
+    sampling: Sampling,
+    /// Feedthrough in the row nearest to the delay and in the one after it.
+    late: Option<(f64, f64)>,
+}
+
+impl Sampler {
+    /// What the record shows at `frequency_hz`.
+    pub fn response(&self, frequency_hz: f64) -> Complex<f64> {
+        let smooth = self.fractions.sampled_response(frequency_hz, self.delay_s, self.sampling);
+        let Some((early, late)) = self.late else { return smooth };
+        let angle = 2.0 * std::f64::consts::PI * frequency_hz * self.sampling.period_s;
+        let row = (self.delay_s / self.sampling.period_s).round();
+        smooth + Complex::from_polar(early, -angle * row) + Complex::from_polar(late, -angle * (row + 1.0))
     }
 }
 

@@ -229,6 +229,7 @@ impl Identification {
             (index::LN_ZERO, best.zero_rad_per_s.ln()),
             (index::LN_POLE, best.pole_rad_per_s.ln()),
             (index::FAR_LEAD_MS, best.far_lead_s * 1e3),
+            (index::FEEDTHROUGH_SHARE, best.feedthrough_share.unwrap_or(0.5)),
             (index::SLOW_POLE, best.slow_pole_rad_per_s),
         ];
         for (i, value) in values {

@@ -91,23 +91,18 @@ fn lead_interval_ms(
     period_ms: f64,
 ) -> Option<[f64; 2]> {
     let far = fit.rungs.iter().find(|r| r.rung == Rung::FarZero)?;
-    // The delay is tried on both sides of each whole sample: there the feedthrough moves to another row at once.
+    // The weak bound on the lead itself must not decide how far the data let it go.
+    let bound = |lead_ms: f64| (lead_ms / (0.3 * period_ms)).powi(2);
     let chi2_at = |lead_ms: f64| -> f64 {
         [0.0, 0.08, -0.08]
             .iter()
             .map(|shift| {
                 let mut start = far.parameters.clone();
                 start[index::EFFECTIVE_DELAY_MS] += shift * period_ms;
-                problem
-                    .fit_from(
-                        data,
-                        Rung::FarZero,
-                        &start,
-                        Some((index::FAR_LEAD_MS, lead_ms)),
-                    )
-                    .chi2
+                problem.fit_from(data, Rung::FarZero, &start, Some((index::FAR_LEAD_MS, lead_ms))).chi2
             })
             .fold(f64::INFINITY, f64::min)
+            - bound(lead_ms)
     };
     let grid: Vec<f64> = [
         0.0, 0.01, 0.02, 0.035, 0.05, 0.075, 0.1, 0.15, 0.2, 0.3, 0.5, 0.8, 1.2, 2.0,
@@ -116,7 +111,9 @@ fn lead_interval_ms(
     .map(|g| g * period_ms)
     .collect();
     let costs: Vec<f64> = grid.iter().map(|&g| chi2_at(g)).collect();
-    let best = costs.iter().copied().fold(far.chi2, f64::min);
+    let own = far.parameters[index::FAR_LEAD_MS];
+    let at_own = if (0.0..=2.0 * period_ms).contains(&own) { chi2_at(own) } else { f64::INFINITY };
+    let best = costs.iter().copied().fold(at_own, f64::min);
     let limit = best + PROFILE_RISE * fit.scale;
     let inside = |c: f64| c <= limit;
     let edge = |mut out: f64, mut within: f64| {
@@ -130,18 +127,17 @@ fn lead_interval_ms(
         }
         within
     };
-    let own = far.parameters[index::FAR_LEAD_MS];
     let first = costs.iter().position(|&c| inside(c));
     let last = costs.iter().rposition(|&c| inside(c));
     let low = match first {
         Some(0) => 0.0,
         Some(i) => edge(grid[i - 1], grid[i]),
-        None => own.max(0.0),
+        None => 0.0,
     };
     let high = match last {
         Some(i) if i + 1 == grid.len() => f64::INFINITY,
         Some(i) => edge(grid[i + 1], grid[i]),
-        None => own.max(0.0),
+        None => f64::INFINITY,
     };
     Some([low, high])
 }

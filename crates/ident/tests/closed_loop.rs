@@ -13,6 +13,7 @@ use cellpos_plant::TransferFunction;
 use common::{PERIOD_S, PositionRig, expected};
 
 const LIMITS: Limits = Limits {
+    bead_um_per_s: 1e9,
     bead_um: 8.0,
     pzt_um: 3.5,
     slew_um_per_s: 40_000.0,

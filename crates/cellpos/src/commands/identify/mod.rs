@@ -13,7 +13,7 @@ use cellpos_emulator::WorldConfig;
 use cellpos_ident::excitation::{Limits, PAPER_FREQUENCIES_HZ};
 use cellpos_plant::Model;
 use cellpos_rig::Clock;
-use cellpos_units::{Hertz, Micrometers};
+use cellpos_units::{Hertz, Micrometers, MicrometersPerSecond};
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 
@@ -90,6 +90,9 @@ pub struct Args {
     /// Largest bead amplitude (peak) while a line is driven.
     #[arg(long, default_value = "8um")]
     bead_amplitude: Micrometers,
+    /// Largest bead speed (peak): its image must not smear by more than about two pixels during an exposure.
+    #[arg(long, default_value = "400um/s")]
+    bead_speed: MicrometersPerSecond,
     /// Largest PZT amplitude (peak).
     #[arg(long, default_value = "10um")]
     pzt_amplitude: Micrometers,
@@ -147,10 +150,11 @@ fn checked(args: &Args) -> Result<(), Failure> {
         if value.is_finite() && value > 0.0 {
             Ok(())
         } else {
-            Err(Failure::bad_input(format!("--{name} is {value}{unit}"), format!("give a length above 0, for example --{name} 8{unit}")))
+            Err(Failure::bad_input(format!("--{name} is {value}{unit}"), format!("give a value above 0, for example --{name} 8{unit}")))
         }
     };
     positive("bead-amplitude", args.bead_amplitude.0, "um")?;
+    positive("bead-speed", args.bead_speed.0, "um/s")?;
     positive("pzt-amplitude", args.pzt_amplitude.0, "um")?;
     if let Some(f) = args.frequency.iter().find(|f| !(f.0.is_finite() && f.0 >= 0.2 && f.0 < 480.0)) {
         return Err(Failure::bad_input(format!("--frequency {f}"), "lines lie between 0.2Hz and 480Hz at 1000 frames a second"));
@@ -179,7 +183,7 @@ fn job(args: &Args) -> Result<run::Job, Failure> {
     };
     Ok(run::Job {
         // The board follows steps of up to 4 um within its first update; beyond that its slew would bend the drive.
-        limits: Limits { bead_um: args.bead_amplitude.0, pzt_um: args.pzt_amplitude.0, slew_um_per_s: 3_200.0 },
+        limits: Limits { bead_um: args.bead_amplitude.0, bead_um_per_s: args.bead_speed.0, pzt_um: args.pzt_amplitude.0, slew_um_per_s: 3_200.0 },
         setup,
         lines_hz,
         multisine: args.excitation == Excitation::Multisine,
