@@ -148,25 +148,39 @@ impl Plan {
         let detection_hz = odd.iter().step_by(3).map(|f| f + grid).collect();
         let segment = PlannedSegment {
             label: format!("multisine, {} lines", odd.len()),
-            signal: Signal::Tones { tones, fade_in_s: 0.2 },
+            signal: Signal::Tones {
+                tones,
+                fade_in_s: 0.2,
+            },
             lines_hz: odd,
             detection_hz,
             settle_s: 0.5,
             measure_s: (2.0 * seconds_at_1_hz).clamp(4.0, 600.0),
         };
-        Self { period_s, segments: vec![segment], lost_frames: 50 }
+        Self {
+            period_s,
+            segments: vec![segment],
+            lost_frames: 50,
+        }
     }
 
     /// Total duration, s.
     pub fn duration_s(&self) -> f64 {
-        self.segments.iter().map(|s| s.settle_s + s.measure_s + RELEASE_S).sum()
+        self.segments
+            .iter()
+            .map(|s| s.settle_s + s.measure_s + RELEASE_S)
+            .sum()
     }
 
     /// Ticks in all.
     pub fn ticks(&self) -> usize {
         self.segments
             .iter()
-            .map(|s| rows(s.settle_s, self.period_s) + rows(s.measure_s, self.period_s) + rows(RELEASE_S, self.period_s))
+            .map(|s| {
+                rows(s.settle_s, self.period_s)
+                    + rows(s.measure_s, self.period_s)
+                    + rows(RELEASE_S, self.period_s)
+            })
             .sum()
     }
 
@@ -229,10 +243,15 @@ impl Plan {
             // fling the bead out of view.
             let release = rows(RELEASE_S, self.period_s);
             for k in 0..release {
-                let fade = 0.5 + 0.5 * (std::f64::consts::PI * (k + 1) as f64 / release as f64).cos();
-                let excitation_um = fade * segment.signal.value_um((total + k) as f64 * self.period_s);
+                let fade =
+                    0.5 + 0.5 * (std::f64::consts::PI * (k + 1) as f64 / release as f64).cos();
+                let excitation_um =
+                    fade * segment.signal.value_um((total + k) as f64 * self.period_s);
                 if let Err(error) = bench.tick(excitation_um) {
-                    return Err(Stopped { done, cause: Cause::Rig(error) });
+                    return Err(Stopped {
+                        done,
+                        cause: Cause::Rig(error),
+                    });
                 }
                 ticks += 1;
             }

@@ -219,11 +219,15 @@ impl<'a> LadderProblem<'a> {
             out[2 * i + 1] = e.im;
         }
         let last = 2 * self.points.len();
-        out[last] = self.prior.map_or(0.0, |prior| (model.delay_s - prior.delay_s) / prior.sd_s);
+        out[last] = self
+            .prior
+            .map_or(0.0, |prior| (model.delay_s - prior.delay_s) / prior.sd_s);
         // Behind a hold the lead trades exactly with the delay, and the share with the lead: without these two weak
         // bounds the directions would be open.
         let (middle, sd) = SHARE_MIDDLE_SD;
-        out[last + 1] = model.feedthrough_share.map_or(0.0, |share| (share - middle) / sd);
+        out[last + 1] = model
+            .feedthrough_share
+            .map_or(0.0, |share| (share - middle) / sd);
         out[last + 2] = model.far_lead_s / (LEAD_SD_PERIODS * self.sampling.period_s);
     }
 
@@ -351,7 +355,8 @@ impl<'a> LadderProblem<'a> {
                     let lead_ms = share * self.sampling.period_s * 1e3;
                     let mut start = x.to_vec();
                     start.extend([lead_ms, 0.5]);
-                    let held = self.fit_from(data, rung, &start, Some((index::FAR_LEAD_MS, lead_ms)));
+                    let held =
+                        self.fit_from(data, rung, &start, Some((index::FAR_LEAD_MS, lead_ms)));
                     if held.parameters.iter().all(|v| v.is_finite()) {
                         extend(&held.parameters, &[]);
                     }

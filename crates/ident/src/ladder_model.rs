@@ -112,11 +112,19 @@ impl LadderModel {
     /// The same for many frequencies.
     pub fn sampler(&self, sampling: Sampling) -> Sampler {
         let mut fractions = self.partial_fractions();
-        let late = self.feedthrough_share.filter(|_| sampling.hold == Hold::ZeroOrder).map(|share| {
-            let direct = std::mem::take(&mut fractions.direct);
-            (direct * (1.0 - share), direct * share)
-        });
-        Sampler { fractions, delay_s: self.delay_s, sampling, late }
+        let late = self
+            .feedthrough_share
+            .filter(|_| sampling.hold == Hold::ZeroOrder)
+            .map(|share| {
+                let direct = std::mem::take(&mut fractions.direct);
+                (direct * (1.0 - share), direct * share)
+            });
+        Sampler {
+            fractions,
+            delay_s: self.delay_s,
+            sampling,
+            late,
+        }
     }
 
     /// Numerator and denominator of the plant without delay, highest power of s first, the denominator monic; of lower
@@ -159,11 +167,17 @@ pub struct Sampler {
 impl Sampler {
     /// What the record shows at `frequency_hz`.
     pub fn response(&self, frequency_hz: f64) -> Complex<f64> {
-        let smooth = self.fractions.sampled_response(frequency_hz, self.delay_s, self.sampling);
-        let Some((early, late)) = self.late else { return smooth };
+        let smooth = self
+            .fractions
+            .sampled_response(frequency_hz, self.delay_s, self.sampling);
+        let Some((early, late)) = self.late else {
+            return smooth;
+        };
         let angle = 2.0 * std::f64::consts::PI * frequency_hz * self.sampling.period_s;
         let row = (self.delay_s / self.sampling.period_s).round();
-        smooth + Complex::from_polar(early, -angle * row) + Complex::from_polar(late, -angle * (row + 1.0))
+        smooth
+            + Complex::from_polar(early, -angle * row)
+            + Complex::from_polar(late, -angle * (row + 1.0))
     }
 }
 

@@ -60,7 +60,12 @@ pub struct Identification {
 /// Response of the plant itself at a measured point: what the record shows, divided by what sampling and delay make of
 /// the model and multiplied by the model. Exact where the model is right, and insensitive where it is not, since only
 /// the ratio of the model with and without sampling enters.
-pub fn compensated(measured: Complex<f64>, frequency_hz: f64, model: &LadderModel, sampling: Sampling) -> Complex<f64> {
+pub fn compensated(
+    measured: Complex<f64>,
+    frequency_hz: f64,
+    model: &LadderModel,
+    sampling: Sampling,
+) -> Complex<f64> {
     measured * model.response(frequency_hz) / model.sampled_response(frequency_hz, sampling)
 }
 
@@ -77,7 +82,10 @@ pub fn summarise(
 ) -> Result<Identification, IdentError> {
     let problem = LadderProblem::new(&measured.points, sampling, None)?;
     let ladder = problem.fit()?;
-    let prior = led.map(|l| DelayPrior { delay_s: l.delay_s, sd_s: l.sd_s.max(1e-7) });
+    let prior = led.map(|l| DelayPrior {
+        delay_s: l.delay_s,
+        sd_s: l.sd_s.max(1e-7),
+    });
     let judged = judge(&problem, &ladder, prior, bootstrap, seed);
     let disagreement = led.and_then(|l| disagreement_s(&l, judged.phase_delay95_s, 2e-5));
     let compensated = measured
@@ -98,8 +106,16 @@ pub fn summarise(
             }
         })
         .collect();
-    let mut result =
-        Identification { measured, sampling, ladder, judged, led, disagreement_s: disagreement, compensated, warnings: Vec::new() };
+    let mut result = Identification {
+        measured,
+        sampling,
+        ladder,
+        judged,
+        led,
+        disagreement_s: disagreement,
+        compensated,
+        warnings: Vec::new(),
+    };
     result.warnings = warnings(&result);
     Ok(result)
 }
@@ -160,12 +176,20 @@ fn warnings(result: &Identification) -> Vec<String> {
             // Feedback passes a harmonic of the input on: only what the input does not hold speaks of a nonlinearity.
             let linear = point.response.norm() * worst.input.norm() * 3.0;
             (worst.output.norm() > linear).then(|| {
-                format!("{} Hz ({:.1} % at {:.1} Hz)", point.frequency_hz, 100.0 * worst.output.norm() / point.output.norm(), worst.frequency_hz)
+                format!(
+                    "{} Hz ({:.1} % at {:.1} Hz)",
+                    point.frequency_hz,
+                    100.0 * worst.output.norm() / point.output.norm(),
+                    worst.frequency_hz
+                )
             })
         })
         .collect();
     if !distorted.is_empty() {
-        out.push(format!("the output holds harmonics that no linear model explains, driven at {}", distorted.join(", ")));
+        out.push(format!(
+            "the output holds harmonics that no linear model explains, driven at {}",
+            distorted.join(", ")
+        ));
     }
     out
 }
@@ -176,7 +200,12 @@ impl Identification {
     ///
     /// # Errors
     /// [`PlantError`] when the coefficients make no plant.
-    pub fn model(&self, name: &str, working_point_um: f64, provenance: BTreeMap<String, String>) -> Result<Model, PlantError> {
+    pub fn model(
+        &self,
+        name: &str,
+        working_point_um: f64,
+        provenance: BTreeMap<String, String>,
+    ) -> Result<Model, PlantError> {
         let best = self.judged.model;
         let (num, den) = best.polynomials();
         let plant = TransferFunction::new(num, den)?;
@@ -188,7 +217,10 @@ impl Identification {
         }
         let mut provenance = provenance;
         provenance.insert("delay_ms".to_owned(), format!("{:.4}", best.delay_s * 1e3));
-        provenance.insert("rung".to_owned(), self.ladder.best().rung.formula().to_owned());
+        provenance.insert(
+            "rung".to_owned(),
+            self.ladder.best().rung.formula().to_owned(),
+        );
         for p in &self.judged.parameters {
             provenance.insert(format!("verdict.{}", p.name), p.verdict.label().to_owned());
         }
@@ -198,7 +230,11 @@ impl Identification {
         });
         Ok(Model {
             name: name.to_owned(),
-            description: format!("identified from {} lines, {}", self.measured.points.len(), self.ladder.best().rung.formula()),
+            description: format!(
+                "identified from {} lines, {}",
+                self.measured.points.len(),
+                self.ladder.best().rung.formula()
+            ),
             plant,
             working_point_um,
             effects: Vec::new(),
@@ -221,7 +257,12 @@ impl Identification {
         } else {
             Rung::Integrator
         };
-        let source = self.ladder.rungs.iter().find(|r| r.rung == rung).unwrap_or(self.ladder.best());
+        let source = self
+            .ladder
+            .rungs
+            .iter()
+            .find(|r| r.rung == rung)
+            .unwrap_or(self.ladder.best());
         let mut x = vec![0.0; source.rung.parameters()];
         let values = [
             (index::LN_GAIN, best.gain_per_s.ln()),
@@ -229,7 +270,10 @@ impl Identification {
             (index::LN_ZERO, best.zero_rad_per_s.ln()),
             (index::LN_POLE, best.pole_rad_per_s.ln()),
             (index::FAR_LEAD_MS, best.far_lead_s * 1e3),
-            (index::FEEDTHROUGH_SHARE, best.feedthrough_share.unwrap_or(0.5)),
+            (
+                index::FEEDTHROUGH_SHARE,
+                best.feedthrough_share.unwrap_or(0.5),
+            ),
             (index::SLOW_POLE, best.slow_pole_rad_per_s),
         ];
         for (i, value) in values {
@@ -251,14 +295,21 @@ impl Identification {
                 jacobian[(i, j)] = (a - b) / step;
             }
         }
-        let spread = source.covariance.map(|v| if v.is_finite() { v } else { 0.0 });
+        let spread = source
+            .covariance
+            .map(|v| if v.is_finite() { v } else { 0.0 });
         let matrix = &jacobian * spread * jacobian.transpose();
         let (num, _) = model_of(&x, source.rung).polynomials();
         let names = (0..num.len())
             .map(|i| format!("plant.num[{i}]"))
             .chain((1..=here.len() - num.len()).map(|i| format!("plant.den[{i}]")))
             .collect();
-        Covariance { parameters: names, matrix: (0..here.len()).map(|i| matrix.row(i).iter().copied().collect()).collect() }
+        Covariance {
+            parameters: names,
+            matrix: (0..here.len())
+                .map(|i| matrix.row(i).iter().copied().collect())
+                .collect(),
+        }
     }
 
     /// Band of the fitted plant at `frequency_hz`: gain (dB) and phase (deg), each low and high at 95 %, delay
@@ -274,7 +325,10 @@ impl Identification {
                 let mut moved = best.parameters.clone();
                 moved[j] += step;
                 let ratio = model_of(&moved, best.rung).response(frequency_hz) / here;
-                (20.0 * ratio.norm().log10() / step, ratio.arg().to_degrees() / step)
+                (
+                    20.0 * ratio.norm().log10() / step,
+                    ratio.arg().to_degrees() / step,
+                )
             })
             .collect();
         for i in 0..n {
@@ -285,8 +339,14 @@ impl Identification {
             }
         }
         let model = self.judged.model.response(frequency_hz);
-        let (gain, phase) = (20.0 * model.norm().log10(), continued(model.arg().to_degrees(), -90.0));
-        let (g, p) = (1.96 * gain_variance.max(0.0).sqrt(), 1.96 * phase_variance.max(0.0).sqrt());
+        let (gain, phase) = (
+            20.0 * model.norm().log10(),
+            continued(model.arg().to_degrees(), -90.0),
+        );
+        let (g, p) = (
+            1.96 * gain_variance.max(0.0).sqrt(),
+            1.96 * phase_variance.max(0.0).sqrt(),
+        );
         ([gain - g, gain + g], [phase - p, phase + p])
     }
 }

@@ -99,7 +99,14 @@ fn lead_interval_ms(
             .map(|shift| {
                 let mut start = far.parameters.clone();
                 start[index::EFFECTIVE_DELAY_MS] += shift * period_ms;
-                problem.fit_from(data, Rung::FarZero, &start, Some((index::FAR_LEAD_MS, lead_ms))).chi2
+                problem
+                    .fit_from(
+                        data,
+                        Rung::FarZero,
+                        &start,
+                        Some((index::FAR_LEAD_MS, lead_ms)),
+                    )
+                    .chi2
             })
             .fold(f64::INFINITY, f64::min)
             - bound(lead_ms)
@@ -112,7 +119,11 @@ fn lead_interval_ms(
     .collect();
     let costs: Vec<f64> = grid.iter().map(|&g| chi2_at(g)).collect();
     let own = far.parameters[index::FAR_LEAD_MS];
-    let at_own = if (0.0..=2.0 * period_ms).contains(&own) { chi2_at(own) } else { f64::INFINITY };
+    let at_own = if (0.0..=2.0 * period_ms).contains(&own) {
+        chi2_at(own)
+    } else {
+        f64::INFINITY
+    };
     let best = costs.iter().copied().fold(at_own, f64::min);
     let limit = best + PROFILE_RISE * fit.scale;
     let inside = |c: f64| c <= limit;
@@ -381,8 +392,10 @@ fn far_zero_parameter(
         lead_ms[0]
     };
     let width = 0.5 * (lead_ms[1] - lead_ms[0]);
-    let identified =
-        fit.best().rung >= Rung::FarZero && width.is_finite() && width < WIDEST_RELATIVE * middle;
+    // A lead that may reach half a sampling period is told from a delay only by which rows show it.
+    let identified = fit.best().rung >= Rung::FarZero
+        && lead_ms[1] < 0.5 * period_ms
+        && width < WIDEST_RELATIVE * middle;
     let value = if prior.is_some() && model.far_lead_s > 0.0 {
         1.0 / model.far_lead_s
     } else {

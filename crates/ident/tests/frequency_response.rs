@@ -19,7 +19,8 @@ const TWO_PI: f64 = 2.0 * std::f64::consts::PI;
 
 /// An open-loop record of Eq. (6) at one line: the paper's 0.8 um amplitude, a drift of 10 um/s, no noise.
 fn drifting(frequency_hz: f64, rows: usize, drift_um_per_s: f64) -> (Vec<f64>, Vec<f64>) {
-    let plant = DiscretePlant::new(&TransferFunction::eq6(), Seconds(PERIOD_S), Seconds(0.0)).unwrap();
+    let plant =
+        DiscretePlant::new(&TransferFunction::eq6(), Seconds(PERIOD_S), Seconds(0.0)).unwrap();
     let mut state = plant.state(0.0);
     let (mut input, mut output) = (Vec::new(), Vec::new());
     for k in 0..rows + 500 {
@@ -35,7 +36,8 @@ fn drifting(frequency_hz: f64, rows: usize, drift_um_per_s: f64) -> (Vec<f64>, V
 }
 
 #[test]
-fn a_drift_of_10_um_per_s_biases_the_sine_fit_by_less_than_a_fifth_of_a_percent_and_the_bare_fft_by_several_percent() {
+fn a_drift_of_10_um_per_s_biases_the_sine_fit_by_less_than_a_fifth_of_a_percent_and_the_bare_fft_by_several_percent()
+ {
     let model = LadderModel::eq6(0.0);
     for f in PAPER_FREQUENCIES_HZ {
         let (input, output) = drifting(f, 2000, 10.0);
@@ -57,7 +59,10 @@ fn a_drift_of_10_um_per_s_biases_the_sine_fit_by_less_than_a_fifth_of_a_percent_
         let bare = (bare_fft::response(&input, &output, PERIOD_S, f) / truth - 1.0).norm();
         let predicted = 10.0 / (std::f64::consts::PI * f) / (0.8 * truth.norm());
         assert!(bare > 0.03, "{f} Hz: {bare}");
-        assert!((bare / predicted - 1.0).abs() < 0.1 || f > 190.0, "{f} Hz: {bare} against {predicted}");
+        assert!(
+            (bare / predicted - 1.0).abs() < 0.1 || f > 190.0,
+            "{f} Hz: {bare} against {predicted}"
+        );
     }
 }
 
@@ -66,7 +71,10 @@ fn the_papers_phase_at_10_hz_is_explained_by_its_drift() {
     // Half a second of record: two or three degrees of lag too much from 10 um/s, as Appendix B's -96.76 deg shows.
     let (input, output) = drifting(10.0, 500, 10.0);
     let hold_deg = 180.0 * 10.0 * PERIOD_S;
-    let bare = bare_fft::response(&input, &output, PERIOD_S, 10.0).arg().to_degrees() + hold_deg;
+    let bare = bare_fft::response(&input, &output, PERIOD_S, 10.0)
+        .arg()
+        .to_degrees()
+        + hold_deg;
     assert!((-97.5..-95.0).contains(&bare), "{bare} deg");
 }
 
@@ -86,7 +94,11 @@ fn feedback_at_low_coherence_biases_the_direct_estimate_and_not_the_joint_one() 
             segments: vec![PlannedSegment {
                 label: "20 Hz".to_owned(),
                 signal: Signal::Tones {
-                    tones: vec![Tone { frequency_hz: f, amplitude_um: 0.12, phase_rad: 0.0 }],
+                    tones: vec![Tone {
+                        frequency_hz: f,
+                        amplitude_um: 0.12,
+                        phase_rad: 0.0,
+                    }],
                     fade_in_s: 0.1,
                 },
                 lines_hz: vec![f],
@@ -98,7 +110,11 @@ fn feedback_at_low_coherence_biases_the_direct_estimate_and_not_the_joint_one() 
         };
         let records = plan.run(&mut rig, 0, |_| {}).unwrap();
         for (sum, estimator) in sums.iter_mut().zip([Estimator::Joint, Estimator::Direct]) {
-            let settings = Settings { estimator, most_blocks: 80, ..Settings::default() };
+            let settings = Settings {
+                estimator,
+                most_blocks: 80,
+                ..Settings::default()
+            };
             let measured = plan.analyse(&records, &settings).unwrap();
             *sum += measured.points[0].response / truth / runs as f64;
             coherence += 0.5 * measured.points[0].coherence / runs as f64;
@@ -113,13 +129,29 @@ fn feedback_at_low_coherence_biases_the_direct_estimate_and_not_the_joint_one() 
 
 #[test]
 fn a_lost_bead_ends_the_run_cleanly_and_the_experiment_resumes_at_its_segment() {
-    let limits = Limits { bead_um_per_s: 1e9, bead_um: 5.0, pzt_um: 3.0, slew_um_per_s: 40_000.0 };
-    let plan = Plan::stepped_sines(&[10.0, 20.0, 50.0], &expected(0.002), limits, PERIOD_S, 40.0);
+    let limits = Limits {
+        bead_um_per_s: 1e9,
+        bead_um: 5.0,
+        pzt_um: 3.0,
+        slew_um_per_s: 40_000.0,
+    };
+    let plan = Plan::stepped_sines(
+        &[10.0, 20.0, 50.0],
+        &expected(0.002),
+        limits,
+        PERIOD_S,
+        40.0,
+    );
     let mut rig = PositionRig::new(&TransferFunction::eq6(), 0.002, 5);
     rig.lost_from = 5_000;
     let stopped = plan.run(&mut rig, 0, |_| {}).unwrap_err();
     assert_eq!(stopped.done.len(), 1);
-    let Cause::BeadLost(IdentError::BeadLost { segment: 1, segments: 3, frames: 50 }) = stopped.cause else {
+    let Cause::BeadLost(IdentError::BeadLost {
+        segment: 1,
+        segments: 3,
+        frames: 50,
+    }) = stopped.cause
+    else {
         panic!("{:?}", stopped.cause);
     };
     let mut again = PositionRig::new(&TransferFunction::eq6(), 0.002, 6);
@@ -131,32 +163,60 @@ fn a_lost_bead_ends_the_run_cleanly_and_the_experiment_resumes_at_its_segment() 
 
 #[test]
 fn one_lost_frame_in_ten_costs_precision_and_no_accuracy() {
-    let limits = Limits { bead_um_per_s: 1e9, bead_um: 5.0, pzt_um: 3.0, slew_um_per_s: 40_000.0 };
+    let limits = Limits {
+        bead_um_per_s: 1e9,
+        bead_um: 5.0,
+        pzt_um: 3.0,
+        slew_um_per_s: 40_000.0,
+    };
     let plan = Plan::stepped_sines(&[20.0, 150.0], &expected(0.002), limits, PERIOD_S, 40.0);
     let mut rig = PositionRig::new(&TransferFunction::eq6(), 0.002, 9);
     rig.lose_every = 10;
     let records = plan.run(&mut rig, 0, |_| {}).unwrap();
     let measured = plan.analyse(&records, &Settings::default()).unwrap();
     for p in &measured.points {
-        let truth = LadderModel::eq6(0.002).sampled_response(p.frequency_hz, Sampling::held(1.0 / PERIOD_S));
-        assert!((p.response - truth).norm_sqr() < 9.0 * p.scatter_variance, "{} Hz", p.frequency_hz);
+        let truth = LadderModel::eq6(0.002)
+            .sampled_response(p.frequency_hz, Sampling::held(1.0 / PERIOD_S));
+        assert!(
+            (p.response - truth).norm_sqr() < 9.0 * p.scatter_variance,
+            "{} Hz",
+            p.frequency_hz
+        );
     }
 }
 
 #[test]
 fn a_multisine_gives_the_same_plant_in_one_go_and_its_detection_lines_stay_silent() {
-    let lines: Vec<f64> = (0..16).map(|i| 2.0 * 150f64.powf(f64::from(i) / 15.0)).collect();
-    let limits = Limits { bead_um_per_s: 1e9, bead_um: 9.0, pzt_um: 3.5, slew_um_per_s: 40_000.0 };
+    let lines: Vec<f64> = (0..16)
+        .map(|i| 2.0 * 150f64.powf(f64::from(i) / 15.0))
+        .collect();
+    let limits = Limits {
+        bead_um_per_s: 1e9,
+        bead_um: 9.0,
+        pzt_um: 3.5,
+        slew_um_per_s: 40_000.0,
+    };
     let plan = Plan::multisine(&lines, &expected(0.002), limits, PERIOD_S, 20.0, 4);
     let mut rig = PositionRig::new(&TransferFunction::eq6(), 0.002, 12);
     let records = plan.run(&mut rig, 0, |_| {}).unwrap();
     let measured = plan.analyse(&records, &Settings::default()).unwrap();
-    let silent = measured.segments[0].detection.iter().filter(|d| d.p_value > 0.01).count();
-    assert!(silent + 1 >= measured.segments[0].detection.len(), "{silent}");
-    let problem = LadderProblem::new(&measured.points, Sampling::held(1.0 / PERIOD_S), None).unwrap();
+    let silent = measured.segments[0]
+        .detection
+        .iter()
+        .filter(|d| d.p_value > 0.01)
+        .count();
+    assert!(
+        silent + 1 >= measured.segments[0].detection.len(),
+        "{silent}"
+    );
+    let problem =
+        LadderProblem::new(&measured.points, Sampling::held(1.0 / PERIOD_S), None).unwrap();
     let fit = problem.fit().unwrap();
     let gain = fit.best().model.gain_per_s;
-    assert!((gain / LadderModel::eq6(0.0).gain_per_s - 1.0).abs() < 0.03, "{gain}");
+    assert!(
+        (gain / LadderModel::eq6(0.0).gain_per_s - 1.0).abs() < 0.03,
+        "{gain}"
+    );
 }
 
 #[test]
@@ -164,23 +224,50 @@ fn a_literal_63_per_s_is_flagged_as_a_factor_of_two_pi() {
     assert!(literal_per_hertz(428.0, 63.0).is_some());
     assert!(literal_per_hertz(379.0, 63.0).is_some());
     assert!(literal_per_hertz(428.0, 2.0 * std::f64::consts::PI * 63.0).is_none());
-    let limits = Limits { bead_um_per_s: 1e9, bead_um: 6.0, pzt_um: 3.0, slew_um_per_s: 40_000.0 };
-    let plan = Plan::stepped_sines(&[2.0, 5.0, 10.0, 20.0, 60.0, 150.0], &expected(0.002), limits, PERIOD_S, 20.0);
+    let limits = Limits {
+        bead_um_per_s: 1e9,
+        bead_um: 6.0,
+        pzt_um: 3.0,
+        slew_um_per_s: 40_000.0,
+    };
+    let plan = Plan::stepped_sines(
+        &[2.0, 5.0, 10.0, 20.0, 60.0, 150.0],
+        &expected(0.002),
+        limits,
+        PERIOD_S,
+        20.0,
+    );
     let mut rig = PositionRig::new(&TransferFunction::eq6(), 0.002, 21);
     let records = plan.run(&mut rig, 0, |_| {}).unwrap();
     let measured = plan.analyse(&records, &Settings::default()).unwrap();
     let result = summarise(measured, Sampling::held(1.0 / PERIOD_S), None, 0, 1).unwrap();
-    assert!(result.warnings.iter().any(|w| w.contains("2 pi")), "{:?}", result.warnings);
-    let model = result.model("identified", 4.0, std::collections::BTreeMap::new()).unwrap();
+    assert!(
+        result.warnings.iter().any(|w| w.contains("2 pi")),
+        "{:?}",
+        result.warnings
+    );
+    let model = result
+        .model("identified", 4.0, std::collections::BTreeMap::new())
+        .unwrap();
     let text = model.to_toml_string();
     let back = cellpos_plant::Model::from_toml_str(&text, "model.toml").unwrap();
     assert_eq!(back, model);
-    let gain = back.plant.velocity_gain_below_pair().unwrap_or_else(|| back.plant.velocity_gain_at(cellpos_plant::Hertz(2.0)));
+    let gain = back
+        .plant
+        .velocity_gain_below_pair()
+        .unwrap_or_else(|| back.plant.velocity_gain_at(cellpos_plant::Hertz(2.0)));
     assert!((gain / 428.0 - 1.0).abs() < 0.05, "{gain}");
     let covariance = back.covariance.unwrap();
     assert_eq!(covariance.parameters.len(), covariance.matrix.len());
     // The slow pole is held at zero: the last coefficient of the denominator has no spread.
-    assert!(covariance.matrix.iter().enumerate().all(|(i, row)| row[i] >= 0.0) && covariance.matrix[0][0] > 0.0);
+    assert!(
+        covariance
+            .matrix
+            .iter()
+            .enumerate()
+            .all(|(i, row)| row[i] >= 0.0)
+            && covariance.matrix[0][0] > 0.0
+    );
 }
 
 #[test]
@@ -188,7 +275,24 @@ fn an_input_that_does_not_move_is_named() {
     let mut random = Random::new(1);
     let output: Vec<f64> = (0..4000).map(|_| random.normal()).collect();
     let input = vec![4.0; 4000];
-    let segment = Segment { input: &input, output: &output, from: 0, to: 4000, period_s: PERIOD_S, lines_hz: &[10.0], detection_hz: &[] };
+    let segment = Segment {
+        input: &input,
+        output: &output,
+        from: 0,
+        to: 4000,
+        period_s: PERIOD_S,
+        lines_hz: &[10.0],
+        detection_hz: &[],
+    };
     let error = measure(&segment, &Settings::default()).unwrap_err();
-    assert!(matches!(error, IdentError::NoInput { frequency_hz: 10.0, .. }), "{error}");
+    assert!(
+        matches!(
+            error,
+            IdentError::NoInput {
+                frequency_hz: 10.0,
+                ..
+            }
+        ),
+        "{error}"
+    );
 }

@@ -6,7 +6,8 @@
 
 use crate::outcome::Failure;
 use cellpos_control::{
-    Controller, ControllerConfig, EstimatorConfig, Limits, LoopConfig, LoopInput, LoopModel, LoopState, Measurement as Fix, Mode, Pi,
+    Controller, ControllerConfig, EstimatorConfig, Limits, LoopConfig, LoopInput, LoopModel,
+    LoopState, Measurement as Fix, Mode, Pi,
 };
 use cellpos_emulator::WorldConfig;
 use cellpos_firmware_sim::BoardConfig;
@@ -16,7 +17,9 @@ use cellpos_ident::sampled::{Hold, Sampling};
 use cellpos_plant::{Complex, DiscretePlant, Hertz, Model, Seconds};
 use cellpos_rig::actuator::Session;
 use cellpos_rig::emulated::EmulatedPort;
-use cellpos_rig::{Actuator, BoardHost, Camera, Clock, EmulatedRig, FrameBuffer, PositionSource, VisionSource};
+use cellpos_rig::{
+    Actuator, BoardHost, Camera, Clock, EmulatedRig, FrameBuffer, PositionSource, VisionSource,
+};
 use cellpos_vision::{Localiser, LocaliserConfig, ProfileSpec, Verdict};
 
 /// PI gains for the nominal gain of Eq. (6) at a loop delay of 2.5 ms (Ms <= 1.6, Mt <= 1.3), scaled to the model's.
@@ -42,18 +45,31 @@ pub struct Setup {
 impl Setup {
     /// How records of this rig are sampled: 1 kHz hold, the world's exposure.
     pub fn sampling(&self) -> Sampling {
-        Sampling { period_s: 1.0 / self.world.rate_hz, exposure_s: self.world.exposure_ms * 1e-3, hold: Hold::ZeroOrder }
+        Sampling {
+            period_s: 1.0 / self.world.rate_hz,
+            exposure_s: self.world.exposure_ms * 1e-3,
+            hold: Hold::ZeroOrder,
+        }
     }
 
     fn pi(&self) -> Pi {
-        let scale = NOMINAL_GAIN_PER_S / self.model.plant.velocity_gain_at(Hertz(2.0)).abs().max(1e-9);
+        let scale = NOMINAL_GAIN_PER_S
+            / self
+                .model
+                .plant
+                .velocity_gain_at(Hertz(2.0))
+                .abs()
+                .max(1e-9);
         Pi::new(KP * scale, KI_PER_S * scale)
     }
 
     /// Expected `X2/X1` as a record shows it, and loop gain (0 in open loop), at a frequency in Hz.
-    pub fn expected(&self) -> Result<impl Fn(f64) -> (Complex<f64>, Complex<f64>) + use<>, Failure> {
+    pub fn expected(
+        &self,
+    ) -> Result<impl Fn(f64) -> (Complex<f64>, Complex<f64>) + use<>, Failure> {
         let delay = Seconds(self.world.latency_ms * 1e-3);
-        let plant = DiscretePlant::new(&self.model.plant, Seconds(1.0 / self.world.rate_hz), delay).map_err(Failure::input)?;
+        let plant = DiscretePlant::new(&self.model.plant, Seconds(1.0 / self.world.rate_hz), delay)
+            .map_err(Failure::input)?;
         let pi = self.pi();
         let closed = f64::from(u8::from(self.closed_loop));
         Ok(move |f: f64| {
@@ -81,10 +97,21 @@ pub struct HeldBead {
 impl HeldBead {
     /// Switches the rig on, arms the board and lets the loop settle for half a second.
     pub fn open(setup: Setup) -> Result<Self, Failure> {
-        let rig = EmulatedRig::new(BoardConfig::default(), &setup.world, &setup.model, setup.clock.clone()).map_err(Failure::input)?;
+        let rig = EmulatedRig::new(
+            BoardConfig::default(),
+            &setup.world,
+            &setup.model,
+            setup.clock.clone(),
+        )
+        .map_err(Failure::input)?;
         let mut board = rig.actuator().map_err(Failure::failed)?;
         let info = board.info();
-        let limits = Limits { low_um: info.low_um, high_um: info.high_um, slew_um_per_s: info.slew_um_per_s, park_um: 0.0 };
+        let limits = Limits {
+            low_um: info.low_um,
+            high_um: info.high_um,
+            slew_um_per_s: info.slew_um_per_s,
+            park_um: 0.0,
+        };
         let session = Session {
             id: 1,
             park_um: limits.park_um,
@@ -94,15 +121,24 @@ impl HeldBead {
         let report = board.arm(&session).map_err(Failure::failed)?;
         let source: Box<dyn PositionSource> = if setup.frames {
             let edge_px = setup.world.bead_radius_px();
-            let localiser = Localiser::new(LocaliserConfig::new(ProfileSpec::Ring { edge_px })).map_err(Failure::input)?;
-            Box::new(VisionSource::new(rig.camera(), localiser, rig.calibration(), setup.clock.clone()))
+            let localiser = Localiser::new(LocaliserConfig::new(ProfileSpec::Ring { edge_px }))
+                .map_err(Failure::input)?;
+            Box::new(VisionSource::new(
+                rig.camera(),
+                localiser,
+                rig.calibration(),
+                setup.clock.clone(),
+            ))
         } else {
             Box::new(rig.positions())
         };
         let gain_per_s = setup.model.plant.velocity_gain_at(Hertz(2.0));
         let controller = Controller::new(LoopConfig {
             model: LoopModel::integrator(gain_per_s, setup.world.latency_ms * 1e-3),
-            estimator: EstimatorConfig { gain_uncertainty: 0.5, ..EstimatorConfig::default() },
+            estimator: EstimatorConfig {
+                gain_uncertainty: 0.5,
+                ..EstimatorConfig::default()
+            },
             controller: ControllerConfig::Pi(setup.pi()),
             limits,
         })
@@ -133,7 +169,9 @@ impl HeldBead {
 
     /// The newest measurement of the frames delivered by `now_ns`.
     fn newest(&mut self, now_ns: i64) -> Result<Option<cellpos_rig::Measurement>, Failure> {
-        let Some(source) = &mut self.source else { return Ok(None) };
+        let Some(source) = &mut self.source else {
+            return Ok(None);
+        };
         let mut newest = None;
         while let Some(measurement) = source.next(now_ns).map_err(Failure::failed)? {
             newest = Some(measurement);
@@ -143,7 +181,9 @@ impl HeldBead {
 
     fn send(&mut self, command_um: f64, neutral_um: f64) -> Result<(), Failure> {
         let time_us = u64::try_from((self.next_ns - self.start_ns) / 1000).unwrap_or(0);
-        self.board.command(command_um, neutral_um, time_us).map_err(Failure::failed)?;
+        self.board
+            .command(command_um, neutral_um, time_us)
+            .map_err(Failure::failed)?;
         self.board.poll().map_err(Failure::failed)?;
         Ok(())
     }
@@ -174,7 +214,10 @@ impl HeldBead {
                 waiting.next();
             }
             self.setup.clock.sleep_until_ns(self.next_ns);
-            while let Some(stamp) = camera.next_frame(&mut buffer, self.next_ns).map_err(Failure::failed)? {
+            while let Some(stamp) = camera
+                .next_frame(&mut buffer, self.next_ns)
+                .map_err(Failure::failed)?
+            {
                 frame_s.push(stamp.arrival_ns as f64 * 1e-9);
                 let sum: f64 = buffer.mono8.iter().map(|&p| f64::from(p)).sum();
                 grey.push(sum / buffer.mono8.len().max(1) as f64);
@@ -184,7 +227,13 @@ impl HeldBead {
         }
         let seen = find_edges(&switched_s, &frame_s, &grey).map_err(Failure::failed)?;
         let estimate = delay_from_edges(&seen).map_err(Failure::failed)?;
-        Ok(DelayTest { estimate, seen, switched_s, frame_s, grey })
+        Ok(DelayTest {
+            estimate,
+            seen,
+            switched_s,
+            frame_s,
+            grey,
+        })
     }
 
     /// Rests at neutral until a bead has been seen for 100 ms on end, at most for 10 s, then holds it for half a second.
@@ -192,7 +241,9 @@ impl HeldBead {
         let mut seen = 0;
         for _ in 0..10_000 {
             self.setup.clock.sleep_until_ns(self.next_ns);
-            let good = self.newest(self.next_ns)?.is_some_and(|m| m.verdict == Verdict::Good);
+            let good = self
+                .newest(self.next_ns)?
+                .is_some_and(|m| m.verdict == Verdict::Good);
             self.send(self.neutral_um, self.neutral_um)?;
             self.next_ns += self.period_ns;
             seen = if good { seen + 1 } else { 0 };
@@ -204,7 +255,9 @@ impl HeldBead {
                 return Ok(());
             }
         }
-        Err(Failure::Failed(miette::miette!("no bead came into view within 10 s")))
+        Err(Failure::Failed(miette::miette!(
+            "no bead came into view within 10 s"
+        )))
     }
 
     /// Ends the session: the board ramps to park.
@@ -233,10 +286,20 @@ impl Bench for HeldBead {
         let good = newest.filter(|m| m.verdict == Verdict::Good);
         let age_ns = good.map_or(0, |m| now_ns - m.mid_exposure_ns);
         let late_ns = age_ns - (self.setup.world.latency_ms * 1e6).round() as i64;
-        let age_samples = u16::try_from(((late_ns as f64 / self.period_ns as f64).round() as i64).max(0)).unwrap_or(u16::MAX);
+        let age_samples =
+            u16::try_from(((late_ns as f64 / self.period_ns as f64).round() as i64).max(0))
+                .unwrap_or(u16::MAX);
         let input = LoopInput {
-            measurement: good.map(|m| Fix { position_um: m.position_um, variance_um2: m.variance_um2, age_samples }),
-            mode: if self.setup.closed_loop { Mode::Run } else { Mode::Direct(self.neutral_um + excitation_um) },
+            measurement: good.map(|m| Fix {
+                position_um: m.position_um,
+                variance_um2: m.variance_um2,
+                age_samples,
+            }),
+            mode: if self.setup.closed_loop {
+                Mode::Run
+            } else {
+                Mode::Direct(self.neutral_um + excitation_um)
+            },
             excitation_um,
             ..LoopInput::default()
         };
@@ -245,7 +308,10 @@ impl Bench for HeldBead {
         self.next_ns += self.period_ns;
         // A row is a position of the nominal age: an older one belongs to an earlier row and is left out.
         let on_time = good.filter(|_| age_samples == 0);
-        Ok(Row { command_um: out.command_um, bead_um: on_time.map(|m| m.position_um) })
+        Ok(Row {
+            command_um: out.command_um,
+            bead_um: on_time.map(|m| m.position_um),
+        })
     }
 }
 

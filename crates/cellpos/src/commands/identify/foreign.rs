@@ -18,7 +18,10 @@ const NO_LINEAR: &str = "harmonics remain in the output that the input does not 
 /// Runs the command on records.
 pub fn run(args: &Args) -> CommandResult {
     let (Some(input), Some(output), Some(rate)) = (&args.input, &args.output, args.rate) else {
-        return Err(Failure::bad_input("--data needs --input, --output and --rate", "for example --input pzt_um --output bead_um --rate 1kHz"));
+        return Err(Failure::bad_input(
+            "--data needs --input, --output and --rate",
+            "for example --input pzt_um --output bead_um --rate 1kHz",
+        ));
     };
     let settings = ForeignSettings {
         rate_hz: rate.0,
@@ -31,15 +34,21 @@ pub fn run(args: &Args) -> CommandResult {
     let mut results = Vec::new();
     for path in &args.data {
         let (u, y) = columns::read(path, input, output).map_err(Failure::input)?;
-        let result = identify(&u, &y, &settings)
-            .map_err(|e| Failure::bad_input(format!("{}: {e}", path.display()), "check --input, --output and --rate"))?;
+        let result = identify(&u, &y, &settings).map_err(|e| {
+            Failure::bad_input(
+                format!("{}: {e}", path.display()),
+                "check --input, --output and --rate",
+            )
+        })?;
         results.push((path.clone(), result));
     }
     if let (Some(path), Some((_, first))) = (&args.out, results.first()) {
         write_model(path, first)?;
     }
     if let Some(path) = &args.report {
-        report(&results).write_with_figures(path).map_err(Failure::failed)?;
+        report(&results)
+            .write_with_figures(path)
+            .map_err(Failure::failed)?;
     }
     if args.json {
         let files: Vec<Value> = results.iter().map(|(p, r)| to_json(p, r)).collect();
@@ -52,8 +61,11 @@ pub fn run(args: &Args) -> CommandResult {
 }
 
 fn write_model(path: &Path, result: &ForeignResult) -> Result<(), Failure> {
-    let Some(best) = result.models.first() else { return Ok(()) };
-    let plant = TransferFunction::new(best.numerator.clone(), best.denominator.clone()).map_err(Failure::failed)?;
+    let Some(best) = result.models.first() else {
+        return Ok(());
+    };
+    let plant = TransferFunction::new(best.numerator.clone(), best.denominator.clone())
+        .map_err(Failure::failed)?;
     let model = Model {
         name: "identified".to_owned(),
         description: format!("linear model of order {} from records", best.order),
@@ -64,7 +76,10 @@ fn write_model(path: &Path, result: &ForeignResult) -> Result<(), Failure> {
         covariance: None,
         intervals: BTreeMap::from([(
             "delay_ms".to_owned(),
-            [(best.delay_s - 1.96 * best.delay_sd_s) * 1e3, (best.delay_s + 1.96 * best.delay_sd_s) * 1e3],
+            [
+                (best.delay_s - 1.96 * best.delay_sd_s) * 1e3,
+                (best.delay_s + 1.96 * best.delay_sd_s) * 1e3,
+            ],
         )]),
         provenance: BTreeMap::from([
             ("command".to_owned(), super::command_line()),
@@ -138,16 +153,34 @@ fn to_text(path: &Path, r: &ForeignResult) -> String {
         );
     }
     for h in r.harmonics.iter().filter(|h| h.unexplained) {
-        let _ = writeln!(out, "  harmonic {} of {:.4} Hz: {:.2} % of the fundamental", h.number, h.fundamental_hz, 100.0 * h.output_ratio);
+        let _ = writeln!(
+            out,
+            "  harmonic {} of {:.4} Hz: {:.2} % of the fundamental",
+            h.number,
+            h.fundamental_hz,
+            100.0 * h.output_ratio
+        );
     }
     if r.harmonics_remain() {
         let _ = writeln!(out, "  {NO_LINEAR}");
     }
     if let Some(m) = r.models.first() {
-        let _ = writeln!(out, "  linear model of order {}: num {:?}, den {:?}, delay {:.3} ms", m.order, m.numerator, m.denominator, m.delay_s * 1e3);
+        let _ = writeln!(
+            out,
+            "  linear model of order {}: num {:?}, den {:?}, delay {:.3} ms",
+            m.order,
+            m.numerator,
+            m.denominator,
+            m.delay_s * 1e3
+        );
     }
     if let Some(left) = r.linear_residual_rms {
-        let _ = writeln!(out, "  the coherent linear part leaves {} RMS of {} RMS", number(left), number(r.output_rms));
+        let _ = writeln!(
+            out,
+            "  the coherent linear part leaves {} RMS of {} RMS",
+            number(left),
+            number(r.output_rms)
+        );
     }
     out
 }
@@ -179,14 +212,23 @@ fn report(results: &[(std::path::PathBuf, ForeignResult)]) -> Report {
             report.table(table);
         }
         if !r.harmonics.is_empty() {
-            let mut table =
-                Table::new([Column::left("harmonic"), Column::right("output %"), Column::right("input %"), Column::left("linear?")]);
+            let mut table = Table::new([
+                Column::left("harmonic"),
+                Column::right("output %"),
+                Column::right("input %"),
+                Column::left("linear?"),
+            ]);
             for h in &r.harmonics {
                 table.row([
                     format!("{} x {:.4} Hz", h.number, h.fundamental_hz),
                     format!("{:.3}", 100.0 * h.output_ratio),
                     format!("{:.3}", 100.0 * h.input_ratio),
-                    if h.unexplained { "no linear model explains it" } else { "within noise or the input's own" }.to_owned(),
+                    if h.unexplained {
+                        "no linear model explains it"
+                    } else {
+                        "within noise or the input's own"
+                    }
+                    .to_owned(),
                 ]);
             }
             report.table(table);
@@ -203,13 +245,22 @@ fn bode(index: usize, r: &ForeignResult) -> Figure {
     let low = f.iter().copied().fold(f64::INFINITY, f64::min);
     let high = f.iter().copied().fold(0.0, f64::max);
     let grid = log_grid(0.5 * low, (2.0 * high).min(0.49 / r.sampling.period_s), 200);
-    let figure = Figure::new(&format!("bode-{}", index + 1), "Response in the record and the chosen linear model with delay.").share_x();
+    let figure = Figure::new(
+        &format!("bode-{}", index + 1),
+        "Response in the record and the chosen linear model with delay.",
+    )
+    .share_x();
     let mut panels = [
-        Panel::new(Axis::log("frequency", "Hz"), Axis::linear("gain", "dB")).series(Series::points("record", &f, &gain)),
-        Panel::new(Axis::log("frequency", "Hz"), Axis::linear("phase", "deg")).series(Series::points("record", &f, &phase)),
+        Panel::new(Axis::log("frequency", "Hz"), Axis::linear("gain", "dB"))
+            .series(Series::points("record", &f, &gain)),
+        Panel::new(Axis::log("frequency", "Hz"), Axis::linear("phase", "deg"))
+            .series(Series::points("record", &f, &phase)),
     ];
     if let Some(m) = r.models.first() {
-        let curve: Vec<_> = grid.iter().map(|&f| m.sampled_response(f, r.sampling)).collect();
+        let curve: Vec<_> = grid
+            .iter()
+            .map(|&f| m.sampled_response(f, r.sampling))
+            .collect();
         let g: Vec<f64> = curve.iter().map(|c| 20.0 * c.norm().log10()).collect();
         let p: Vec<f64> = curve.iter().map(|c| c.arg().to_degrees()).collect();
         panels[0] = panels[0].clone().series(Series::line("model", &grid, &g));

@@ -10,7 +10,11 @@ use std::path::Path;
 
 /// A number for JSON; what is not finite becomes `null`.
 fn finite(value: f64) -> Value {
-    if value.is_finite() { json!(value) } else { Value::Null }
+    if value.is_finite() {
+        json!(value)
+    } else {
+        Value::Null
+    }
 }
 
 fn ends(interval: [f64; 2]) -> Value {
@@ -25,7 +29,9 @@ pub fn identification(done: &Done, job: &Job, model: &Path, report: &Path) -> Va
     for p in &result.judged.parameters {
         let (verdict, reason) = match &p.verdict {
             Verdict::Identified => ("identified", Value::Null),
-            Verdict::NotIdentifiable { reason } => ("not identifiable from this band", json!(reason)),
+            Verdict::NotIdentifiable { reason } => {
+                ("not identifiable from this band", json!(reason))
+            }
         };
         parameters.insert(
             p.name.to_owned(),
@@ -117,11 +123,20 @@ pub fn text(done: &Done, model: &Path, report: &Path) -> String {
         );
     }
     if let Some(led) = result.led {
-        let _ = writeln!(out, "delay  LED test {:.3} ms; phase slope {:.3} ms or more", led.delay_s * 1e3, result.judged.phase_delay95_s[0] * 1e3);
+        let _ = writeln!(
+            out,
+            "delay  LED test {:.3} ms; phase slope {:.3} ms or more",
+            led.delay_s * 1e3,
+            result.judged.phase_delay95_s[0] * 1e3
+        );
     }
     let _ = writeln!(out, "line Hz   gain dB   phase deg   coherence");
     for p in &result.compensated {
-        let _ = writeln!(out, "{:>7}  {:>8.3}  {:>10.2}  {:>10.5}", p.frequency_hz, p.gain_db, p.phase_deg, p.coherence);
+        let _ = writeln!(
+            out,
+            "{:>7}  {:>8.3}  {:>10.2}  {:>10.5}",
+            p.frequency_hz, p.gain_db, p.phase_deg, p.coherence
+        );
     }
     for warning in &result.warnings {
         let _ = writeln!(out, "warning: {warning}");

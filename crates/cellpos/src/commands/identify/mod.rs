@@ -127,14 +127,22 @@ pub enum HoldKind {
 
 /// The command line as typed.
 pub fn command_line() -> String {
-    std::env::args().skip(1).fold("cellpos".to_owned(), |line, a| line + " " + &a)
+    std::env::args()
+        .skip(1)
+        .fold("cellpos".to_owned(), |line, a| line + " " + &a)
 }
 
 /// A new folder below runs/, named by the time and `name`.
 pub fn new_run_folder(name: &str) -> Result<PathBuf, Failure> {
-    let time = jiff::Timestamp::now().strftime("%Y%m%dT%H%M%SZ").to_string();
+    let time = jiff::Timestamp::now()
+        .strftime("%Y%m%dT%H%M%SZ")
+        .to_string();
     for attempt in 0..100 {
-        let tail = if attempt == 0 { String::new() } else { format!("-{attempt}") };
+        let tail = if attempt == 0 {
+            String::new()
+        } else {
+            format!("-{attempt}")
+        };
         let folder = PathBuf::from("runs").join(format!("{time}-{name}{tail}"));
         match std::fs::create_dir_all("runs").and_then(|()| std::fs::create_dir(&folder)) {
             Ok(()) => return Ok(folder),
@@ -142,7 +150,9 @@ pub fn new_run_folder(name: &str) -> Result<PathBuf, Failure> {
             Err(error) => return Err(Failure::failed(error)),
         }
     }
-    Err(Failure::Failed(miette::miette!("runs/ holds a hundred folders of this second already")))
+    Err(Failure::Failed(miette::miette!(
+        "runs/ holds a hundred folders of this second already"
+    )))
 }
 
 fn checked(args: &Args) -> Result<(), Failure> {
@@ -150,29 +160,49 @@ fn checked(args: &Args) -> Result<(), Failure> {
         if value.is_finite() && value > 0.0 {
             Ok(())
         } else {
-            Err(Failure::bad_input(format!("--{name} is {value}{unit}"), format!("give a value above 0, for example --{name} 8{unit}")))
+            Err(Failure::bad_input(
+                format!("--{name} is {value}{unit}"),
+                format!("give a value above 0, for example --{name} 8{unit}"),
+            ))
         }
     };
     positive("bead-amplitude", args.bead_amplitude.0, "um")?;
     positive("bead-speed", args.bead_speed.0, "um/s")?;
     positive("pzt-amplitude", args.pzt_amplitude.0, "um")?;
-    if let Some(f) = args.frequency.iter().find(|f| !(f.0.is_finite() && f.0 >= 0.2 && f.0 < 480.0)) {
-        return Err(Failure::bad_input(format!("--frequency {f}"), "lines lie between 0.2Hz and 480Hz at 1000 frames a second"));
+    if let Some(f) = args
+        .frequency
+        .iter()
+        .find(|f| !(f.0.is_finite() && f.0 >= 0.2 && f.0 < 480.0))
+    {
+        return Err(Failure::bad_input(
+            format!("--frequency {f}"),
+            "lines lie between 0.2Hz and 480Hz at 1000 frames a second",
+        ));
     }
     if args.led_edges != 0 && args.led_edges < 20 {
-        return Err(Failure::bad_input(format!("--led-edges {}", args.led_edges), "give 0 (no delay test) or at least 20 edges"));
+        return Err(Failure::bad_input(
+            format!("--led-edges {}", args.led_edges),
+            "give 0 (no delay test) or at least 20 edges",
+        ));
     }
     Ok(())
 }
 
 fn job(args: &Args) -> Result<run::Job, Failure> {
     let model = Model::load(&args.model).map_err(Failure::input)?;
-    let mut lines_hz: Vec<f64> =
-        if args.frequency.is_empty() { PAPER_FREQUENCIES_HZ.to_vec() } else { args.frequency.iter().map(|f| f.0).collect() };
+    let mut lines_hz: Vec<f64> = if args.frequency.is_empty() {
+        PAPER_FREQUENCIES_HZ.to_vec()
+    } else {
+        args.frequency.iter().map(|f| f.0).collect()
+    };
     lines_hz.sort_by(f64::total_cmp);
     lines_hz.dedup();
     let setup = Setup {
-        world: WorldConfig { seed: args.seed, model: args.model.clone(), ..WorldConfig::default() },
+        world: WorldConfig {
+            seed: args.seed,
+            model: args.model.clone(),
+            ..WorldConfig::default()
+        },
         model,
         frames: args.frames == Switch::On,
         clock: match args.clock {
@@ -183,7 +213,12 @@ fn job(args: &Args) -> Result<run::Job, Failure> {
     };
     Ok(run::Job {
         // The board follows steps of up to 4 um within its first update; beyond that its slew would bend the drive.
-        limits: Limits { bead_um: args.bead_amplitude.0, bead_um_per_s: args.bead_speed.0, pzt_um: args.pzt_amplitude.0, slew_um_per_s: 3_200.0 },
+        limits: Limits {
+            bead_um: args.bead_amplitude.0,
+            bead_um_per_s: args.bead_speed.0,
+            pzt_um: args.pzt_amplitude.0,
+            slew_um_per_s: 3_200.0,
+        },
         setup,
         lines_hz,
         multisine: args.excitation == Excitation::Multisine,
@@ -203,7 +238,8 @@ pub fn run(args: Args) -> CommandResult {
     let job = job(&args)?;
     let bar = indicatif::ProgressBar::new(0);
     bar.set_style(
-        indicatif::ProgressStyle::with_template("{bar:40} {pos}/{len} ticks, {eta} left").unwrap_or_else(|_| indicatif::ProgressStyle::default_bar()),
+        indicatif::ProgressStyle::with_template("{bar:40} {pos}/{len} ticks, {eta} left")
+            .unwrap_or_else(|_| indicatif::ProgressStyle::default_bar()),
     );
     let done = run::run(&job, |ticks, total| {
         bar.set_length(total as u64);
@@ -211,23 +247,54 @@ pub fn run(args: Args) -> CommandResult {
     })?;
     bar.finish_and_clear();
 
-    let folder = if args.out.is_none() || args.report.is_none() { Some(new_run_folder("identify")?) } else { None };
-    let place = |given: &Option<PathBuf>, name: &str| given.clone().unwrap_or_else(|| folder.clone().unwrap_or_default().join(name));
-    let (model_path, report_path) = (place(&args.out, "model.toml"), place(&args.report, "report.html"));
+    let folder = if args.out.is_none() || args.report.is_none() {
+        Some(new_run_folder("identify")?)
+    } else {
+        None
+    };
+    let place = |given: &Option<PathBuf>, name: &str| {
+        given
+            .clone()
+            .unwrap_or_else(|| folder.clone().unwrap_or_default().join(name))
+    };
+    let (model_path, report_path) = (
+        place(&args.out, "model.toml"),
+        place(&args.report, "report.html"),
+    );
     let provenance = BTreeMap::from([
         ("command".to_owned(), command_line()),
         ("version".to_owned(), env!("CARGO_PKG_VERSION").to_owned()),
-        ("lines_hz".to_owned(), job.lines_hz.iter().map(f64::to_string).collect::<Vec<_>>().join(" ")),
-        ("rig".to_owned(), format!("emulated, model {}, seed {}", args.model, args.seed)),
+        (
+            "lines_hz".to_owned(),
+            job.lines_hz
+                .iter()
+                .map(f64::to_string)
+                .collect::<Vec<_>>()
+                .join(" "),
+        ),
+        (
+            "rig".to_owned(),
+            format!("emulated, model {}, seed {}", args.model, args.seed),
+        ),
     ]);
-    let model = done.result.model("identified", done.neutral_um, provenance).map_err(Failure::failed)?;
+    let model = done
+        .result
+        .model("identified", done.neutral_um, provenance)
+        .map_err(Failure::failed)?;
     if let Some(parent) = model_path.parent().filter(|p| !p.as_os_str().is_empty()) {
         std::fs::create_dir_all(parent).map_err(Failure::failed)?;
     }
     std::fs::write(&model_path, model.to_toml_string()).map_err(Failure::failed)?;
-    report::report(&done, &command_line()).write_with_figures(&report_path).map_err(Failure::failed)?;
+    report::report(&done, &command_line())
+        .write_with_figures(&report_path)
+        .map_err(Failure::failed)?;
     if args.json {
-        print_json(&json::identification(&done, &job, &model_path, &report_path))?;
+        print_json(&json::identification(
+            &done,
+            &job,
+            &model_path,
+            &report_path,
+        ))?;
     } else {
         print_text(&json::text(&done, &model_path, &report_path))?;
     }

@@ -9,7 +9,9 @@ use cellpos_report::{Axis, Column, Figure, Panel, Report, Series, Status, Table}
 
 /// Frequencies for curves, Hz: `count` evenly in the logarithm.
 pub fn log_grid(low_hz: f64, high_hz: f64, count: usize) -> Vec<f64> {
-    (0..count).map(|i| low_hz * (high_hz / low_hz).powf(i as f64 / (count - 1) as f64)).collect()
+    (0..count)
+        .map(|i| low_hz * (high_hz / low_hz).powf(i as f64 / (count - 1) as f64))
+        .collect()
 }
 
 fn unwrapped_deg(phase: f64) -> f64 {
@@ -23,8 +25,11 @@ pub fn bode(name: &str, caption: &str, result: &Identification, high_hz: f64) ->
     let lowest = f.iter().copied().fold(f64::INFINITY, f64::min);
     let grid = log_grid(0.7 * lowest, high_hz, 160);
     let bands: Vec<_> = grid.iter().map(|&f| result.band(f)).collect();
-    let pick = |g: &dyn Fn(&([f64; 2], [f64; 2])) -> f64| -> Vec<f64> { bands.iter().map(g).collect() };
-    let ends = |value: &dyn Fn(usize) -> f64, sd: &dyn Fn(usize) -> f64| -> (Vec<f64>, Vec<f64>, Vec<f64>) {
+    let pick =
+        |g: &dyn Fn(&([f64; 2], [f64; 2])) -> f64| -> Vec<f64> { bands.iter().map(g).collect() };
+    let ends = |value: &dyn Fn(usize) -> f64,
+                sd: &dyn Fn(usize) -> f64|
+     -> (Vec<f64>, Vec<f64>, Vec<f64>) {
         let n = points.len();
         (
             (0..n).map(value).collect(),
@@ -33,10 +38,14 @@ pub fn bode(name: &str, caption: &str, result: &Identification, high_hz: f64) ->
         )
     };
     let (gain, gain_low, gain_high) = ends(&|i| points[i].gain_db, &|i| points[i].gain_sd_db);
-    let (phase, phase_low, phase_high) = ends(&|i| points[i].phase_deg, &|i| points[i].phase_sd_deg);
+    let (phase, phase_low, phase_high) =
+        ends(&|i| points[i].phase_deg, &|i| points[i].phase_sd_deg);
     let model = result.judged.model;
     let curve = |g: &dyn Fn(f64) -> cellpos_plant::Complex<f64>| -> (Vec<f64>, Vec<f64>) {
-        grid.iter().map(|&f| g(f)).map(|c| (20.0 * c.norm().log10(), unwrapped_deg(c.arg().to_degrees()))).unzip()
+        grid.iter()
+            .map(|&f| g(f))
+            .map(|c| (20.0 * c.norm().log10(), unwrapped_deg(c.arg().to_degrees())))
+            .unzip()
     };
     let (model_gain, model_phase) = curve(&|f| model.response(f));
     let eq6 = TransferFunction::eq6();
@@ -46,10 +55,23 @@ pub fn bode(name: &str, caption: &str, result: &Identification, high_hz: f64) ->
     let delayed: Vec<f64> = points.iter().map(|p| p.delayed_phase_deg).collect();
     Figure::bode(name, caption)
         .bode_series(
-            Series::band("95 % of the fit", &grid, &pick(&|b| b.0[0]), &pick(&|b| b.0[1])),
-            Series::band("95 % of the fit", &grid, &pick(&|b| b.1[0]), &pick(&|b| b.1[1])),
+            Series::band(
+                "95 % of the fit",
+                &grid,
+                &pick(&|b| b.0[0]),
+                &pick(&|b| b.0[1]),
+            ),
+            Series::band(
+                "95 % of the fit",
+                &grid,
+                &pick(&|b| b.1[0]),
+                &pick(&|b| b.1[1]),
+            ),
         )
-        .bode_series(Series::line("fit", &grid, &model_gain), Series::line("fit", &grid, &model_phase))
+        .bode_series(
+            Series::line("fit", &grid, &model_gain),
+            Series::line("fit", &grid, &model_phase),
+        )
         .bode_series(
             Series::line("Eq. (6)", &grid, &eq6_gain).dashed(),
             Series::line("Eq. (6)", &grid, &eq6_phase).dashed(),
@@ -60,7 +82,13 @@ pub fn bode(name: &str, caption: &str, result: &Identification, high_hz: f64) ->
         )
         .bode_series(
             Series::intervals("measured", &f, &gain, &gain_low, &gain_high),
-            Series::intervals("measured, delay taken off", &f, &phase, &phase_low, &phase_high),
+            Series::intervals(
+                "measured, delay taken off",
+                &f,
+                &phase,
+                &phase_low,
+                &phase_high,
+            ),
         )
         .bode_series(
             Series::points("measured", &[], &[]),
@@ -77,7 +105,12 @@ pub fn nyquist(result: &Identification) -> Figure {
         .filter(|p| p.response.norm() < 12.0)
         .map(|p| (p.response.re, p.response.im))
         .unzip();
-    let lowest = result.measured.points.iter().map(|p| p.frequency_hz).fold(f64::INFINITY, f64::min);
+    let lowest = result
+        .measured
+        .points
+        .iter()
+        .map(|p| p.frequency_hz)
+        .fold(f64::INFINITY, f64::min);
     let grid = log_grid(lowest, 0.45 / result.sampling.period_s, 300);
     let (mre, mim): (Vec<f64>, Vec<f64>) = grid
         .iter()
@@ -95,7 +128,11 @@ pub fn residuals(result: &Identification) -> Figure {
     let mut f = Vec::new();
     let (mut re, mut im) = (Vec::new(), Vec::new());
     for p in &result.measured.points {
-        let model = result.ladder.best().model.sampled_response(p.frequency_hz, result.sampling);
+        let model = result
+            .ladder
+            .best()
+            .model
+            .sampled_response(p.frequency_hz, result.sampling);
         // Along the response: gain; across it: phase.
         let e = (p.response - model) / (p.response / p.response.norm()) / (0.5 * p.variance).sqrt();
         f.push(p.frequency_hz);
@@ -121,7 +158,11 @@ pub fn traces(done: &Done) -> Figure {
     let period_s = done.plan.period_s;
     for record in &done.records {
         let planned = &done.plan.segments[record.index];
-        let lowest = planned.lines_hz.iter().copied().fold(f64::INFINITY, f64::min);
+        let lowest = planned
+            .lines_hz
+            .iter()
+            .copied()
+            .fold(f64::INFINITY, f64::min);
         let rows = ((3.0 / lowest).max(0.05) / period_s) as usize;
         let from = record.input.len().saturating_sub(rows);
         let mean = |x: &[f64]| {
@@ -135,8 +176,16 @@ pub fn traces(done: &Done) -> Figure {
             Panel::new(Axis::linear("time", "ms"), Axis::linear("", "um"))
                 .title(&planned.label)
                 .height_px(140.0)
-                .series(Series::step("4 x PZT", &t, &u.iter().map(|v| 4.0 * (v - mu)).collect::<Vec<_>>()))
-                .series(Series::points("bead", &t, &y.iter().map(|v| v - my).collect::<Vec<_>>())),
+                .series(Series::step(
+                    "4 x PZT",
+                    &t,
+                    &u.iter().map(|v| 4.0 * (v - mu)).collect::<Vec<_>>(),
+                ))
+                .series(Series::points(
+                    "bead",
+                    &t,
+                    &y.iter().map(|v| v - my).collect::<Vec<_>>(),
+                )),
         );
     }
     figure
@@ -157,26 +206,58 @@ pub fn delay_test(name: &str, caption: &str, led: &super::bench::DelayTest) -> F
     let high = grey.iter().copied().fold(f64::NEG_INFINITY, f64::max);
     let mut sent_t = vec![-4.0];
     let mut sent = vec![low];
-    for (i, s) in led.switched_s.iter().take_while(|s| **s < until).enumerate() {
+    for (i, s) in led
+        .switched_s
+        .iter()
+        .take_while(|s| **s < until)
+        .enumerate()
+    {
         sent_t.push((s - first) * 1e3);
         sent.push(if i % 2 == 0 { high } else { low });
     }
     sent_t.push((until - first) * 1e3);
     sent.push(*sent.last().unwrap_or(&low));
-    let middle: Vec<f64> = led.seen.iter().map(|e| (0.5 * (e.before_s + e.after_s) - e.sent_s) * 1e3).collect();
-    let low_ms: Vec<f64> = led.seen.iter().map(|e| (e.before_s - e.sent_s) * 1e3).collect();
-    let high_ms: Vec<f64> = led.seen.iter().map(|e| (e.after_s - e.sent_s) * 1e3).collect();
+    let middle: Vec<f64> = led
+        .seen
+        .iter()
+        .map(|e| (0.5 * (e.before_s + e.after_s) - e.sent_s) * 1e3)
+        .collect();
+    let low_ms: Vec<f64> = led
+        .seen
+        .iter()
+        .map(|e| (e.before_s - e.sent_s) * 1e3)
+        .collect();
+    let high_ms: Vec<f64> = led
+        .seen
+        .iter()
+        .map(|e| (e.after_s - e.sent_s) * 1e3)
+        .collect();
     let number: Vec<f64> = (1..=led.seen.len()).map(|i| i as f64).collect();
     Figure::new(name, caption)
         .panel(
-            Panel::new(Axis::linear("time after the first edge", "ms"), Axis::linear("mean grey level", "grey"))
-                .series(Series::step("light sent", &sent_t, &sent))
-                .series(Series::points("frames as they arrive", &t, &grey)),
+            Panel::new(
+                Axis::linear("time after the first edge", "ms"),
+                Axis::linear("mean grey level", "grey"),
+            )
+            .series(Series::step("light sent", &sent_t, &sent))
+            .series(Series::points("frames as they arrive", &t, &grey)),
         )
         .panel(
-            Panel::new(Axis::linear("edge", ""), Axis::linear("delay that the edge allows", "ms"))
-                .series(Series::intervals("each edge", &number, &middle, &low_ms, &high_ms))
-                .horizontal(led.estimate.delay_s * 1e3, &format!("{:.3} ms", led.estimate.delay_s * 1e3)),
+            Panel::new(
+                Axis::linear("edge", ""),
+                Axis::linear("delay that the edge allows", "ms"),
+            )
+            .series(Series::intervals(
+                "each edge",
+                &number,
+                &middle,
+                &low_ms,
+                &high_ms,
+            ))
+            .horizontal(
+                led.estimate.delay_s * 1e3,
+                &format!("{:.3} ms", led.estimate.delay_s * 1e3),
+            ),
         )
 }
 
@@ -185,7 +266,13 @@ pub fn number(value: f64) -> String {
     if value == 0.0 {
         "0".to_owned()
     } else if !value.is_finite() {
-        if value.is_nan() { "not known".to_owned() } else if value > 0.0 { "no bound".to_owned() } else { "no lower bound".to_owned() }
+        if value.is_nan() {
+            "not known".to_owned()
+        } else if value > 0.0 {
+            "no bound".to_owned()
+        } else {
+            "no lower bound".to_owned()
+        }
     } else if value.abs() >= 1000.0 {
         format!("{value:.0}")
     } else if value.abs() >= 100.0 {
@@ -214,7 +301,10 @@ pub fn parameters(parameters: &[Parameter]) -> Table {
     for p in parameters {
         let (status, verdict) = match &p.verdict {
             Verdict::Identified => (Status::Good, "identified".to_owned()),
-            Verdict::NotIdentifiable { reason } => (Status::Warning, format!("not identifiable from this band: {reason}")),
+            Verdict::NotIdentifiable { reason } => (
+                Status::Warning,
+                format!("not identifiable from this band: {reason}"),
+            ),
         };
         table.row_with(
             status,
@@ -275,7 +365,11 @@ pub fn ladder(result: &Identification) -> Table {
     ]);
     for (i, r) in result.ladder.rungs.iter().enumerate() {
         table.row_with(
-            if i == result.ladder.chosen { Status::Good } else { Status::Plain },
+            if i == result.ladder.chosen {
+                Status::Good
+            } else {
+                Status::Plain
+            },
             [
                 r.rung.formula().to_owned(),
                 format!("{:.1}", r.chi2),
@@ -293,11 +387,16 @@ pub fn ladder(result: &Identification) -> Table {
 pub fn report(done: &Done, command_line: &str) -> Report {
     let result = &done.result;
     let mut report = Report::new("Identification");
-    report.paragraph(&format!("`{command_line}`; {} rows of record.", done.records.iter().map(|r| r.input.len()).sum::<usize>()));
+    report.paragraph(&format!(
+        "`{command_line}`; {} rows of record.",
+        done.records.iter().map(|r| r.input.len()).sum::<usize>()
+    ));
     for warning in &result.warnings {
         report.note(Status::Warning, warning);
     }
-    report.section("Parameters").table(parameters(&result.judged.parameters));
+    report
+        .section("Parameters")
+        .table(parameters(&result.judged.parameters));
     if let Some(noise) = result.measured.noise {
         report.paragraph(&format!(
             "Noise from the scatter of all lines: diffusion {:.3} +- {:.3} um^2/s, localisation {:.1} nm RMS (p = {:.2}{}).",
@@ -314,7 +413,10 @@ pub fn report(done: &Done, command_line: &str) -> Report {
         result,
         480.0,
     ));
-    report.table(lines(result)).figure(nyquist(result)).figure(residuals(result));
+    report
+        .table(lines(result))
+        .figure(nyquist(result))
+        .figure(residuals(result));
     report.section("Choice of the model").table(ladder(result));
     report.section("Delay");
     let phase = result.judged.phase_delay95_s;

@@ -47,29 +47,69 @@ pub fn run(job: &Job, mut progress: impl FnMut(usize, usize)) -> Result<Done, Fa
     let expected = job.setup.expected()?;
     let period_s = job.setup.sampling().period_s;
     let plan = if job.multisine {
-        Plan::multisine(&job.lines_hz, &expected, job.limits, period_s, job.seconds_at_1_hz, job.seed)
+        Plan::multisine(
+            &job.lines_hz,
+            &expected,
+            job.limits,
+            period_s,
+            job.seconds_at_1_hz,
+            job.seed,
+        )
     } else {
-        Plan::stepped_sines(&job.lines_hz, &expected, job.limits, period_s, job.seconds_at_1_hz)
+        Plan::stepped_sines(
+            &job.lines_hz,
+            &expected,
+            job.limits,
+            period_s,
+            job.seconds_at_1_hz,
+        )
     };
     let total = plan.ticks() + job.led_edges * 11;
     let mut bead = HeldBead::open(job.setup.clone())?;
     let records = acquire(&plan, &mut bead, |ticks| progress(ticks, total))?;
-    let measured = plan.analyse(&records, &Settings::default()).map_err(Failure::failed)?;
-    let led = if job.led_edges > 0 { Some(bead.delay_test(job.led_edges, job.seed)?) } else { None };
+    let measured = plan
+        .analyse(&records, &Settings::default())
+        .map_err(Failure::failed)?;
+    let led = if job.led_edges > 0 {
+        Some(bead.delay_test(job.led_edges, job.seed)?)
+    } else {
+        None
+    };
     let neutral_um = bead.neutral_um();
     bead.close()?;
     progress(total, total);
     let result = conclude(job, measured, led.as_ref())?;
-    Ok(Done { plan, records, result, led, neutral_um })
+    Ok(Done {
+        plan,
+        records,
+        result,
+        led,
+        neutral_um,
+    })
 }
 
-fn conclude(job: &Job, measured: Measured, led: Option<&DelayTest>) -> Result<Identification, Failure> {
-    summarise(measured, job.setup.sampling(), led.map(|l| l.estimate), job.bootstrap, job.seed).map_err(Failure::failed)
+fn conclude(
+    job: &Job,
+    measured: Measured,
+    led: Option<&DelayTest>,
+) -> Result<Identification, Failure> {
+    summarise(
+        measured,
+        job.setup.sampling(),
+        led.map(|l| l.estimate),
+        job.bootstrap,
+        job.seed,
+    )
+    .map_err(Failure::failed)
 }
 
 /// Runs a plan. A bead that is lost once is given up and a new one waited for: the experiment resumes at the segment
 /// that failed, at most three times.
-fn acquire(plan: &Plan, bead: &mut HeldBead, mut progress: impl FnMut(usize)) -> Result<Vec<RecordedSegment>, Failure> {
+fn acquire(
+    plan: &Plan,
+    bead: &mut HeldBead,
+    mut progress: impl FnMut(usize),
+) -> Result<Vec<RecordedSegment>, Failure> {
     let mut records: Vec<RecordedSegment> = Vec::new();
     for attempt in 0..4 {
         match plan.run(bead, records.len(), &mut progress) {
@@ -81,7 +121,9 @@ fn acquire(plan: &Plan, bead: &mut HeldBead, mut progress: impl FnMut(usize)) ->
                 records.extend(stopped.done);
                 match stopped.cause {
                     Cause::Rig(failure) => return Err(failure),
-                    Cause::BeadLost(error) if attempt == 3 || bead.setup().world.new_bead_after_ms.is_none() => {
+                    Cause::BeadLost(error)
+                        if attempt == 3 || bead.setup().world.new_bead_after_ms.is_none() =>
+                    {
                         return Err(Failure::failed(error));
                     }
                     Cause::BeadLost(error) => {
