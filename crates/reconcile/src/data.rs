@@ -1,0 +1,204 @@
+//! Records as the workflow sees them: an even time grid, the command in micrometres, the bead where there was one.
+
+use crate::error::ReconcileError;
+
+/// One record on an even grid.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Record {
+    /// Name shown in results, for example the file's stem.
+    pub name: String,
+    /// Sample time \[s\].
+    pub sample_s: f64,
+    /// Displacement commanded from each row on \[um\].
+    pub pzt_um: Vec<f64>,
+    /// Bead position just before that command acts \[um\]; NaN without a bead.
+    pub bead_um: Vec<f64>,
+    /// Rows that were missing from the record and were filled in (their command is interpolated).
+    pub filled: Vec<bool>,
+    /// Finest step of the position column \[um\], for telling repeats from chance.
+    pub resolution_um: f64,
+}
+
+impl Record {
+    /// Puts rows on an even grid. Rows missing in time are filled in without a bead; a time stamp that comes twice is
+    /// kept once.
+    ///
+    /// # Errors
+    /// Columns of different length, fewer than 16 rows, times that do not rise or are not even, values not finite.
+    pub fn from_rows(name: &str, time_s: &[f64], pzt_um: &[f64], bead_um: &[f64]) -> Result<Self, ReconcileError> {
+        let bad = |row: usize, message: String| ReconcileError::Record { record: name.to_owned(), row, message };
+        let n = time_s.len();
+        if pzt_um.len() != n || bead_um.len() != n {
+            return Err(bad(0, format!("columns of {n}, {} and {} rows", pzt_um.len(), bead_um.len())));
+        }
+        if n < 16 {
+            return Err(bad(n, format!("{n} rows are too few to say anything: at least 16 are needed")));
+        }
+        for k in 0..n {
+            if !time_s[k].is_finite() {
+                return Err(bad(k, "time_s is not a finite number".to_owned()));
+            }
+            if !pzt_um[k].is_finite() {
+                return Err(bad(k, "pzt_um is not a finite number".to_owned()));
+            }
+            if bead_um[k].is_infinite() {
+                return Err(bad(k, "bead_um is infinite".to_owned()));
+            }
+        }
+        let mut steps: Vec<f64> = time_s.windows(2).map(|w| w[1] - w[0]).filter(|d| *d > 0.0).collect();
+        if steps.is_empty() {
+            return Err(bad(0, "time_s does not rise".to_owned()));
+        }
+        steps.sort_by(f64::total_cmp);
+        let rough = steps[steps.len() / 2];
+        // The grid's step from the whole span, so that rounded time stamps do not add up.
+        let span = time_s[n - 1] - time_s[0];
+        let count = (span / rough).round();
+        let sample_s = if count >= 1.0 { span / count } else { rough };
+        let sample_s = if (sample_s / rough - 1.0).abs() < 0.02 { sample_s } else { rough };
+        let rows = (span / sample_s).round() as usize + 1;
+        if rows > 20 * n + 1000 {
+            return Err(bad(0, format!("{rows} sample times of {sample_s} s but only {n} rows: the record is mostly gaps")));
+        }
+        let mut pzt = vec![f64::NAN; rows];
+        let mut bead = vec![f64::NAN; rows];
+        let mut last = -1i64;
+        for k in 0..n {
+            let x = (time_s[k] - time_s[0]) / sample_s;
+            let i = x.round() as i64;
+            if i < last {
+                return Err(bad(k, format!("time_s goes back to {} s", time_s[k])));
+            }
+            if i == last || i as usize >= rows {
+                continue;
+            }
+            last = i;
+            pzt[i as usize] = pzt_um[k];
+            bead[i as usize] = bead_um[k];
+        }
+        let filled: Vec<bool> = pzt.iter().map(|v| v.is_nan()).collect();
+        fill(&mut pzt);
+        let resolution_um = resolution(&bead);
+        Ok(Self { name: name.to_owned(), sample_s, pzt_um: pzt, bead_um: bead, filled, resolution_um })
+    }
+
+    /// Number of rows.
+    pub fn rows(&self) -> usize {
+        self.pzt_um.len()
+    }
+
+    /// Duration \[s\].
+    pub fn duration_s(&self) -> f64 {
+        self.rows() as f64 * self.sample_s
+    }
+
+    /// Rows with a bead.
+    pub fn frames(&self) -> usize {
+        self.bead_um.iter().filter(|b| b.is_finite()).count()
+    }
+
+    /// Whether the command never changes.
+    pub fn is_rest(&self) -> bool {
+        let (low, high) = self.pzt_range_um();
+        high - low < 1e-9
+    }
+
+    /// Smallest and largest command \[um\].
+    pub fn pzt_range_um(&self) -> (f64, f64) {
+        self.pzt_um.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), &v| (a.min(v), b.max(v)))
+    }
+
+    /// The smallest period, in rows, at which the whole command repeats itself; `None` without one (or at rest).
+    pub fn period_rows(&self) -> Option<usize> {
+        let n = self.rows();
+        let (low, high) = self.pzt_range_um();
+        let tolerance = 1e-4 * (high - low) + 1.1e-5;
+        if high - low < 1e-9 {
+            return None;
+        }
+        let u = &self.pzt_um;
+        // A multisine may need one period of run-in; compare the later part only.
+        (20..=n / 2).find(|&p| {
+            (n - p..n).rev().step_by(7).all(|k| (u[k] - u[k - p]).abs() <= tolerance)
+                && (p..n).step_by(3).all(|k| (u[k] - u[k - p]).abs() <= tolerance)
+        })
+    }
+
+    /// The part of a record between two rows, as a record of its own.
+    pub fn part(&self, from: usize, to: usize) -> Self {
+        Self {
+            name: self.name.clone(),
+            sample_s: self.sample_s,
+            pzt_um: self.pzt_um[from..to].to_vec(),
+            bead_um: self.bead_um[from..to].to_vec(),
+            filled: self.filled[from..to].to_vec(),
+            resolution_um: self.resolution_um,
+        }
+    }
+}
+
+/// Fills gaps of the command: from one period away where the command repeats itself, else straight between neighbours.
+fn fill(u: &mut [f64]) {
+    if !u.iter().any(|v| v.is_nan()) {
+        return;
+    }
+    let n = u.len();
+    let known: Vec<f64> = u.to_vec();
+    let scale = known.iter().filter(|v| v.is_finite()).fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), &v| (a.min(v), b.max(v)));
+    let tolerance = 1e-4 * (scale.1 - scale.0) + 1.1e-5;
+    let agrees = |p: usize| {
+        (p..n).step_by(3).all(|k| {
+            known[k].is_nan() || known[k - p].is_nan() || (known[k] - known[k - p]).abs() <= tolerance
+        })
+    };
+    let period = (20..=n / 2).find(|&p| agrees(p));
+    let mut k = 0;
+    while k < n {
+        if !u[k].is_nan() {
+            k += 1;
+            continue;
+        }
+        let mut end = k;
+        while end < n && known[end].is_nan() {
+            end += 1;
+        }
+        for i in k..end {
+            let mut value = f64::NAN;
+            if let Some(p) = period {
+                let mut j = i % p;
+                while j < n && value.is_nan() {
+                    value = known[j];
+                    j += p;
+                }
+            }
+            if value.is_nan() {
+                let (a, b) = (if k > 0 { u[k - 1] } else { f64::NAN }, if end < n { known[end] } else { f64::NAN });
+                value = match (a.is_nan(), b.is_nan()) {
+                    (false, false) => a + (b - a) * (i + 1 - k) as f64 / (end + 1 - k) as f64,
+                    (false, true) => a,
+                    (true, false) => b,
+                    (true, true) => 0.0,
+                };
+            }
+            u[i] = value;
+        }
+        k = end;
+    }
+}
+
+/// The largest power-of-ten-like step of which all values are multiples; 0 for values of full precision.
+fn resolution(values: &[f64]) -> f64 {
+    for e in 0..10 {
+        let step = 10f64.powi(-e);
+        let mut seen = false;
+        let fits = values.iter().filter(|v| v.is_finite()).take(4000).all(|v| {
+            seen = true;
+            let x = v / step;
+            (x - x.round()).abs() < 1e-5 + 1e-12 * x.abs()
+        });
+        if seen && fits {
+            return step;
+        }
+    }
+    0.0
+}

@@ -1,0 +1,69 @@
+//! What can be wrong with what the workflow is given.
+
+/// Why no verdict was reached.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum ReconcileError {
+    /// A record that cannot be read as one.
+    #[error("record `{record}`, row {row}: {message}")]
+    Record {
+        /// Name of the record.
+        record: String,
+        /// Row, counted from 0 without the header.
+        row: usize,
+        /// What is wrong, and what would be right.
+        message: String,
+    },
+    /// No record at all.
+    #[error("no records: give at least one CSV file or run folder with time_s, pzt_um and bead_um")]
+    NoRecords,
+    /// Records of different sample times.
+    #[error("record `{record}` is sampled every {found_s} s, the others every {expected_s} s: resample or run them apart")]
+    SampleTime {
+        /// The record that differs.
+        record: String,
+        /// Its sample time \[s\].
+        found_s: f64,
+        /// That of the first record \[s\].
+        expected_s: f64,
+    },
+    /// Nothing moves: nothing can be said about the response.
+    #[error(
+        "the command never changes in any record: a constant input shows drift and noise, but no effect of the chain can be told; record sines or a multisine (0.5..300 Hz, two amplitudes), steps and a rest"
+    )]
+    ConstantInput,
+    /// Too little data.
+    #[error(
+        "only {seconds:.1} s of record ({rows} frames with a bead): at least {needed_s:.0} s with a changing command are needed to tell effects apart"
+    )]
+    TooShort {
+        /// Length of all records with a changing command \[s\].
+        seconds: f64,
+        /// Frames.
+        rows: usize,
+        /// What is needed \[s\].
+        needed_s: f64,
+    },
+    /// Looks like other units.
+    #[error("{what}: the measured motion is {ratio:.3} times the model's; {hint}")]
+    Units {
+        /// What looks wrong.
+        what: &'static str,
+        /// Measured over simulated gain.
+        ratio: f64,
+        /// What to do.
+        hint: &'static str,
+    },
+    /// Does not follow the model at all.
+    #[error(
+        "these records do not follow this model: only {explained_percent:.0} % of the measured motion goes with the command as the model says (at any gain and delay up to 20 ms){detail}; a record of another rig, swapped columns, or the wrong model file"
+    )]
+    AnotherRig {
+        /// Part of the motion explained by the best gain and delay, percent.
+        explained_percent: f64,
+        /// More about it.
+        detail: String,
+    },
+    /// The model file asks for something that this workflow cannot do.
+    #[error("model: {0}")]
+    Model(String),
+}

@@ -1,0 +1,198 @@
+//! What is always present: Brownian motion of the bead and white localisation noise, and the filter that knows them.
+//!
+//! The free-run residual of a PERFECT model is a random walk plus white noise: its size says nothing. Its innovations in
+//! the Kalman filter of that process (state: the walk; measurement: walk plus noise) are white with variance 1 in the
+//! units used here, whatever the length of the record. All scores of this crate are sums of squares of those
+//! innovations, so a log-likelihood is half their difference. Missing frames are predictions without an update.
+
+/// Sizes of the two noises.
+#[derive(Debug, Clone, Copy, PartialEq, serde::Serialize)]
+pub struct Noise {
+    /// Variance gained by the walk in one sample, `2 D dt` \[um^2\].
+    pub walk_um2: f64,
+    /// Variance of the localisation noise \[um^2\].
+    pub white_um2: f64,
+}
+
+impl Noise {
+    /// Brownian motion of coefficient `d_um2_per_s` sampled every `sample_s`, and white noise of `localisation_um` RMS.
+    pub fn new(d_um2_per_s: f64, sample_s: f64, localisation_um: f64) -> Self {
+        Self { walk_um2: 2.0 * d_um2_per_s * sample_s, white_um2: localisation_um * localisation_um }
+    }
+
+    /// From variance and lag-1 covariance of increments, `q + 2 R` and `-R`, kept physical.
+    pub fn from_increments(variance: f64, lag1: f64) -> Self {
+        let variance = variance.max(1e-14);
+        let white = (-lag1).clamp(0.005 * variance, 0.4995 * variance);
+        Self { walk_um2: variance - 2.0 * white, white_um2: white }
+    }
+
+    /// Diffusion coefficient \[um^2/s\].
+    pub fn diffusion_um2_per_s(&self, sample_s: f64) -> f64 {
+        self.walk_um2 / (2.0 * sample_s)
+    }
+
+    /// Localisation noise, RMS \[um\].
+    pub fn localisation_um(&self) -> f64 {
+        self.white_um2.sqrt()
+    }
+
+    /// Standard deviation of the innovation in the steady state \[um\]: the floor.
+    pub fn innovation_um(&self) -> f64 {
+        let (q, r) = (self.walk_um2, self.white_um2);
+        let p = 0.5 * (q + (q * q + 4.0 * q * r).sqrt());
+        (p + r).sqrt()
+    }
+}
+
+/// The whitening filter of one record: gains of its Kalman filter, zero where a frame is missing.
+#[derive(Debug, Clone)]
+pub(crate) struct Whitener {
+    gain: Vec<f64>,
+    inverse_sigma: Vec<f64>,
+}
+
+impl Whitener {
+    /// `present[k]`: the frame counts. `extra_walk[k]`: variance added to the walk before frame k \[um^2\].
+    pub fn new(noise: &Noise, present: &[bool], extra_walk: Option<&[f64]>) -> Self {
+        let n = present.len();
+        let (mut gain, mut inverse_sigma) = (vec![0.0; n], vec![0.0; n]);
+        let mut p = f64::INFINITY;
+        for k in 0..n {
+            p += noise.walk_um2 + extra_walk.map_or(0.0, |w| w[k]);
+            if !present[k] {
+                continue;
+            }
+            if p.is_finite() {
+                let s = p + noise.white_um2;
+                gain[k] = p / s;
+                inverse_sigma[k] = 1.0 / s.sqrt();
+                p *= 1.0 - gain[k];
+            } else {
+                // The first frame only says where the bead is: the start is a nuisance.
+                gain[k] = 1.0;
+                p = noise.white_um2;
+            }
+        }
+        Self { gain, inverse_sigma }
+    }
+
+    /// Innovations of a residual, in standard deviations. The filter is linear: columns of a Jacobian go through it too.
+    pub fn apply(&self, r: &[f64], e: &mut [f64]) {
+        let mut m = 0.0;
+        for (((r, e), k), s) in r.iter().zip(e).zip(&self.gain).zip(&self.inverse_sigma) {
+            let d = r - m;
+            *e = d * s;
+            m += k * d;
+        }
+    }
+
+    /// Smooths a residual: the walk without the white noise, from both sides.
+    pub fn smooth(&self, r: &[f64]) -> Vec<f64> {
+        let pass = |forward: bool| {
+            let mut m = 0.0;
+            let mut before = vec![0.0; r.len()];
+            let mut started = false;
+            for i in 0..r.len() {
+                let k = if forward { i } else { r.len() - 1 - i };
+                if self.gain[k] > 0.0 {
+                    if started {
+                        let g = if self.gain[k] < 1.0 { self.gain[k] } else { 0.5 };
+                        m += g * (r[k] - m);
+                    } else {
+                        m = r[k];
+                        started = true;
+                    }
+                }
+                before[k] = m;
+            }
+            before
+        };
+        let (a, b) = (pass(true), pass(false));
+        a.iter().zip(&b).map(|(a, b)| 0.5 * (a + b)).collect()
+    }
+
+    /// Number of innovations that count.
+    pub fn count(&self) -> usize {
+        self.inverse_sigma.iter().filter(|s| **s > 0.0).count()
+    }
+
+    /// Whether the innovation of row k counts.
+    pub fn counts(&self, k: usize) -> bool {
+        self.inverse_sigma[k] > 0.0
+    }
+
+    /// Innovation standard deviation of row k \[um\]; `None` when it does not count.
+    pub fn sigma_um(&self, k: usize) -> Option<f64> {
+        (self.inverse_sigma[k] > 0.0).then(|| 1.0 / self.inverse_sigma[k])
+    }
+}
+
+/// Variance and lag-1 covariance of increments over runs of present frames, and how many increments.
+pub(crate) fn increment_moments(r: &[f64], present: &[bool]) -> (f64, f64, usize) {
+    let (mut c0, mut c1, mut n0, mut n1, mut mean) = (0.0, 0.0, 0usize, 0usize, 0.0);
+    let valid = |k: usize| k >= 1 && present[k] && present[k - 1];
+    for k in 1..r.len() {
+        if valid(k) {
+            mean += r[k] - r[k - 1];
+            n0 += 1;
+        }
+    }
+    if n0 == 0 {
+        return (0.0, 0.0, 0);
+    }
+    mean /= n0 as f64;
+    for k in 1..r.len() {
+        if valid(k) {
+            let d = r[k] - r[k - 1] - mean;
+            c0 += d * d;
+            if valid(k - 1) {
+                c1 += d * (r[k - 1] - r[k - 2] - mean);
+                n1 += 1;
+            }
+        }
+    }
+    (c0 / n0 as f64, if n1 > 0 { c1 / n1 as f64 } else { 0.0 }, n0)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_innovation_floor_of_the_nominal_rig_is_45_nanometres() {
+        // theta of the MA(1) increments solves theta/(1+theta^2) = R/(q+2R); the innovation variance is R/theta.
+        let n = Noise::new(0.33, 1e-3, 0.030);
+        let c = n.white_um2 / (n.walk_um2 + 2.0 * n.white_um2);
+        let theta = (1.0 - (1.0 - 4.0 * c * c).sqrt()) / (2.0 * c);
+        let expected = (n.white_um2 / theta).sqrt();
+        assert!((n.innovation_um() - expected).abs() < 1e-12);
+        assert!((n.innovation_um() - 0.045_48).abs() < 1e-4);
+    }
+
+    #[test]
+    fn whitening_a_ramp_gives_its_closed_form_and_an_offset_gives_nothing() {
+        let n = Noise::new(0.33, 1e-3, 0.030);
+        let w = Whitener::new(&n, &vec![true; 2000], None);
+        let mut e = vec![0.0; 2000];
+        w.apply(&vec![7.0; 2000], &mut e);
+        assert!(e.iter().all(|e| e.abs() < 1e-9));
+        let ramp: Vec<f64> = (0..2000).map(|k| 0.01 * f64::from(k)).collect();
+        w.apply(&ramp, &mut e);
+        // Steady state of a constant increment v: v / (1 - theta) / sigma.
+        let theta = n.white_um2 / n.innovation_um().powi(2);
+        let expected = 0.01 / (1.0 - theta) / n.innovation_um();
+        assert!((e[1999] - expected).abs() < 1e-9, "{} {expected}", e[1999]);
+    }
+
+    #[test]
+    fn a_missing_frame_counts_nothing_and_widens_the_next_innovation() {
+        let n = Noise::new(0.33, 1e-3, 0.030);
+        let mut present = vec![true; 100];
+        present[50] = false;
+        let w = Whitener::new(&n, &present, None);
+        assert_eq!(w.count(), 98);
+        assert!(w.sigma_um(51).unwrap() > w.sigma_um(49).unwrap());
+        assert!(w.sigma_um(50).is_none());
+    }
+}

@@ -1,0 +1,187 @@
+//! Bead and camera blocks: what acts on the motion, and how the frames sample it.
+
+use super::block::Block;
+use super::modal::Trace;
+
+/// Gain drift and flow drift when nothing later needs the motion inside a step.
+pub(crate) fn bead_without_motion(pos: &mut [f64], blocks: &[Block], h: f64) {
+    for b in blocks {
+        match *b {
+            Block::GainDrift { per_s } => {
+                let (mut before, mut sum) = (0.0, 0.0);
+                for (j, p) in pos.iter_mut().enumerate() {
+                    sum += (*p - before) * (1.0 + per_s * (j as f64 - 0.5) * h);
+                    before = *p;
+                    *p = sum;
+                }
+            }
+            Block::FlowDrift { um_per_s } => {
+                for (j, p) in pos.iter_mut().enumerate() {
+                    *p += um_per_s * h * j as f64;
+                }
+            }
+            _ => {}
+        }
+    }
+}
+
+/// Integral over a step of the dead zone of a speed that changes linearly from `a` to `b`.
+fn dead_zone_mean(a: f64, b: f64, limit: f64) -> f64 {
+    // Antiderivative of the dead zone.
+    let f = |v: f64| 0.5 * (v.abs() - limit).max(0.0).powi(2);
+    let d = b - a;
+    if d.abs() < 1e-9 * limit.max(1.0) {
+        return dead(0.5 * (a + b), limit);
+    }
+    (f(b) - f(a)) / d
+}
+
+fn dead(v: f64, limit: f64) -> f64 {
+    v.signum() * (v.abs() - limit).max(0.0)
+}
+
+/// Bead blocks on a trace: gain drift, flow drift, adhesion.
+pub(crate) fn bead(t: &mut Trace, blocks: &[Block], h: f64) {
+    let n = t.pos.len();
+    for b in blocks {
+        match *b {
+            Block::GainDrift { per_s } => {
+                let mut sum = 0.0;
+                for j in 0..n {
+                    let at = j as f64 * h;
+                    let flow = if j + 1 < n { t.pos[j + 1] - t.pos[j] - t.jump[j] } else { 0.0 };
+                    t.pos[j] = sum;
+                    t.jump[j] *= 1.0 + per_s * at;
+                    t.start_slope[j] *= 1.0 + per_s * at;
+                    t.end_slope[j] *= 1.0 + per_s * (at + h);
+                    sum += t.jump[j] + flow * (1.0 + per_s * (at + 0.5 * h));
+                }
+            }
+            Block::FlowDrift { um_per_s } => {
+                for j in 0..n {
+                    t.pos[j] += um_per_s * h * j as f64;
+                    t.start_slope[j] += um_per_s;
+                    t.end_slope[j] += um_per_s;
+                }
+            }
+            Block::Adhesion { um_per_s } => {
+                let mut sum = 0.0;
+                for j in 0..n {
+                    let flow = if j + 1 < n { t.pos[j + 1] - t.pos[j] - t.jump[j] } else { 0.0 };
+                    let (a, b) = (t.start_slope[j], t.end_slope[j]);
+                    // The mean of a linear speed differs from the true flow by the curvature: keep that part.
+                    let bend = flow / h - 0.5 * (a + b);
+                    let moved = dead_zone_mean(a + bend, b + bend, um_per_s) * h;
+                    t.pos[j] = sum;
+                    t.start_slope[j] = dead(a, um_per_s);
+                    t.end_slope[j] = dead(b, um_per_s);
+                    sum += t.jump[j] + moved;
+                }
+            }
+            _ => {}
+        }
+    }
+}
+
+/// Positions at the frames: clock skew, delay and exposure on a trace with `fine` steps per sample.
+pub(crate) fn sample(t: &Trace, blocks: &[Block], h: f64, fine: usize, rows: usize, y: &mut Vec<f64>) {
+    let (mut skew, mut delay, mut exposure) = (0.0, 0.0, 0.0);
+    for b in blocks {
+        match *b {
+            Block::ClockSkew { e } => skew = e,
+            Block::Delay { s } => delay = s,
+            Block::Exposure { s } => exposure = s,
+            _ => {}
+        }
+    }
+    y.clear();
+    y.reserve(rows);
+    if skew == 0.0 && delay == 0.0 && exposure == 0.0 {
+        y.extend(t.pos.iter().step_by(fine));
+        return;
+    }
+    let path = Path::new(t, h, exposure > 0.0);
+    let sample_s = h * fine as f64;
+    for k in 0..rows {
+        let at = k as f64 * sample_s * (1.0 + skew) - delay;
+        y.push(if exposure > 0.0 {
+            (path.integral(at) - path.integral(at - exposure)) / exposure
+        } else {
+            path.position(at)
+        });
+    }
+}
+
+/// The position as a function of time: a cubic in every step, jumps between them.
+struct Path<'a> {
+    t: &'a Trace,
+    h: f64,
+    /// Integral of the position from the start to each step.
+    area: Vec<f64>,
+}
+
+impl<'a> Path<'a> {
+    fn new(t: &'a Trace, h: f64, with_area: bool) -> Self {
+        let n = t.pos.len();
+        let mut path = Self { t, h, area: Vec::new() };
+        if with_area {
+            let mut area = Vec::with_capacity(n);
+            let mut sum = 0.0;
+            for j in 0..n {
+                area.push(sum);
+                sum += path.partial_area(j, h);
+            }
+            path.area = area;
+        }
+        path
+    }
+
+    /// Coefficients of `c0 + c1 f + c2 f^2 + c3 f^3`, f in 0..1 of step j.
+    #[inline]
+    fn cubic(&self, j: usize) -> [f64; 4] {
+        let t = self.t;
+        let start = t.pos[j] + t.jump[j];
+        let (a, b) = (t.start_slope[j] * self.h, t.end_slope[j] * self.h);
+        let d = match t.pos.get(j + 1) {
+            Some(end) => end - start,
+            None => 0.5 * (a + b),
+        };
+        [start, a, 3.0 * d - 2.0 * a - b, a + b - 2.0 * d]
+    }
+
+    fn step_of(&self, at: f64) -> (usize, f64) {
+        // Limits from the left: a command that acts at the very instant is not seen yet.
+        let x = at / self.h;
+        let j = ((x - 1e-7).ceil() - 1.0).max(0.0).min(self.t.pos.len() as f64 - 1.0);
+        (j as usize, (x - j).max(0.0))
+    }
+
+    #[inline]
+    fn position(&self, at: f64) -> f64 {
+        if at <= 1e-7 * self.h {
+            return self.t.pos[0];
+        }
+        let (j, f) = self.step_of(at);
+        let c = self.cubic(j);
+        if f > 1.0 {
+            // Past the record's end: go on straight.
+            return c[0] + c[1] + c[2] + c[3] + (f - 1.0) * self.t.end_slope[j] * self.h;
+        }
+        c[0] + f * (c[1] + f * (c[2] + f * c[3]))
+    }
+
+    fn partial_area(&self, j: usize, upto: f64) -> f64 {
+        let f = upto / self.h;
+        let c = self.cubic(j);
+        self.h * f * (c[0] + f * (c[1] / 2.0 + f * (c[2] / 3.0 + f * c[3] / 4.0)))
+    }
+
+    #[inline]
+    fn integral(&self, at: f64) -> f64 {
+        if at <= 0.0 {
+            return at * self.t.pos[0];
+        }
+        let (j, f) = self.step_of(at);
+        self.area[j] + self.partial_area(j, f.min(1.5) * self.h)
+    }
+}
