@@ -87,6 +87,18 @@ impl Whitener {
         }
     }
 
+    /// As [`Self::apply`] on the rows `from..to` only, with a run-in from `start`.
+    pub fn apply_range(&self, r: &[f64], start: usize, from: usize, to: usize, e: &mut [f64]) {
+        let mut m = r.get(start).copied().unwrap_or(0.0);
+        for k in start..to {
+            let d = r[k] - m;
+            if k >= from {
+                e[k - from] = d * self.inverse_sigma[k];
+            }
+            m += self.gain[k] * d;
+        }
+    }
+
     /// Smooths a residual: the walk without the white noise, from both sides.
     pub fn smooth(&self, r: &[f64]) -> Vec<f64> {
         let pass = |forward: bool| {

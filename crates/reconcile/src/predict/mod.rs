@@ -27,9 +27,12 @@ pub(crate) struct Base {
 /// Simulates a record: displacement from the working point \[um\] in, bead position \[um\] out.
 ///
 /// `blocks` must be sorted by rank. Lines and pixel locking are additive and fitted elsewhere: ignored here.
-pub(crate) fn simulate(base: &Base, u: &[f64], blocks: &[Block], y: &mut Vec<f64>) {
+///
+/// `edge`, where asked for, receives the step of the plant's input that acts at the instant of each frame, in parts of
+/// the plant's direct path: what a frame that straddles the edge may already show.
+pub(crate) fn simulate(base: &Base, u: &[f64], blocks: &[Block], y: &mut Vec<f64>, edge: Option<&mut Vec<f64>>) {
     let chain = Chain::new(base, blocks);
-    chain.run(u, y);
+    chain.run(u, y, edge);
 }
 
 struct Chain<'a> {
@@ -82,7 +85,7 @@ impl<'a> Chain<'a> {
         Self { base, blocks, fine }
     }
 
-    fn run(&self, u: &[f64], y: &mut Vec<f64>) {
+    fn run(&self, u: &[f64], y: &mut Vec<f64>, edge: Option<&mut Vec<f64>>) {
         let n = u.len();
         let h = self.base.sample_s / self.fine as f64;
         let mut x: Vec<f64> = if self.base.interpolated_input {
@@ -121,6 +124,9 @@ impl<'a> Chain<'a> {
         }
         pending.times(&self.base.zpk);
         let modal = Modal::new(&pending, h);
+        if let Some(edge) = edge {
+            self.edges(&x, modal.direct, n, edge);
+        }
         if self.blocks.iter().any(is_motion) {
             let mut t = Trace::default();
             modal.trace(&x, &mut t);
@@ -132,6 +138,38 @@ impl<'a> Chain<'a> {
             camera::bead_without_motion(&mut pos, self.blocks, h);
             y.clear();
             y.extend(pos.into_iter().step_by(self.fine));
+        }
+    }
+}
+
+impl Chain<'_> {
+    /// Steps of the direct path at the instants of the frames.
+    fn edges(&self, x: &[f64], direct: f64, n: usize, edge: &mut Vec<f64>) {
+        edge.clear();
+        edge.resize(n, 0.0);
+        let base = if self.base.zpk.zeros.len() == self.base.zpk.poles.len() { self.base.zpk.gain } else { 0.0 };
+        if base == 0.0 || direct == 0.0 {
+            return;
+        }
+        let mut delay = 0.0;
+        for b in self.blocks {
+            match *b {
+                Block::Delay { s } => delay = s / self.base.sample_s,
+                // The window of an exposure ends with the frame: its edge is already averaged.
+                Block::Exposure { .. } => return,
+                _ => {}
+            }
+        }
+        // Edges lie on the grid of the samples: a delay between samples puts the frames between the edges.
+        let whole = delay.round();
+        if (delay - whole).abs() > 0.06 {
+            return;
+        }
+        let (shift, share) = (whole as usize, direct / base);
+        for k in shift..n {
+            let j = (k - shift) * self.fine;
+            let before = if j == 0 { x[0] } else { x[j - 1] };
+            edge[k] = share * (x[j] - before);
         }
     }
 }

@@ -1,0 +1,21 @@
+use cellpos_reconcile::*;
+fn main() {
+    for dir in std::env::args().skip(1) {
+        let mut recs = vec![];
+        let mut files: Vec<_> = std::fs::read_dir(&dir).unwrap().map(|e| e.unwrap().path()).collect();
+        files.sort();
+        for f in files {
+            let text = std::fs::read_to_string(&f).unwrap();
+            let (mut t, mut u, mut y) = (vec![], vec![], vec![]);
+            for l in text.lines().skip(1) {
+                let mut c = l.split(',');
+                t.push(c.next().unwrap().parse().unwrap());
+                u.push(c.next().unwrap().parse().unwrap());
+                y.push(c.next().unwrap().trim().parse().unwrap_or(f64::NAN));
+            }
+            recs.push(Record::from_rows(f.file_stem().unwrap().to_str().unwrap(), &t, &u, &y).unwrap());
+        }
+        println!("== {dir}");
+        debug_search(&cellpos_plant::Model::eq6(), &recs);
+    }
+}

@@ -1,0 +1,538 @@
+//! Joint fit of any set of candidates by Levenberg-Marquardt on the innovations.
+//!
+//! Every fit, that of the null included, also has the linear nuisances: the share of the newest command in a frame,
+//! and (inside the whitening filter) each record's start.
+
+use crate::catalogue::{Kind, Param, Scope, VARIANTS, Variant};
+use crate::predict::{Block, simulate};
+use crate::problem::{Mask, Problem};
+use nalgebra::{DMatrix, DVector};
+use std::f64::consts::TAU;
+
+/// One candidate with its parameters, in the fit's coordinates.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct Part {
+    pub variant: usize,
+    pub theta: Vec<f64>,
+}
+
+impl Part {
+    /// From natural values.
+    pub fn new(variant: usize, natural: &[f64]) -> Self {
+        let theta = VARIANTS[variant].params.iter().zip(natural).map(|(p, v)| p.coordinate(*v)).collect();
+        Self { variant, theta }
+    }
+
+    pub fn variant(&self) -> &'static Variant {
+        &VARIANTS[self.variant]
+    }
+
+    /// Parameter values in their units.
+    pub fn natural(&self) -> Vec<f64> {
+        self.variant().params.iter().zip(&self.theta).map(|(p, x)| p.natural(*x)).collect()
+    }
+
+    fn block(&self, scope: &Scope) -> Block {
+        (self.variant().build)(&self.natural(), scope)
+    }
+}
+
+/// What the fit needs to know apart from the data: ranges, and the effects that the model already has.
+#[derive(Debug, Clone)]
+pub(crate) struct Context<'a> {
+    pub problem: &'a Problem,
+    pub scope: Scope,
+    pub fixed: Vec<Block>,
+}
+
+/// A fitted set of candidates.
+#[derive(Debug, Clone)]
+pub(crate) struct Fit {
+    pub parts: Vec<Part>,
+    /// Share of the newest command \[um per um\].
+    pub soft: f64,
+    /// Sine and cosine of each line in each record \[um\].
+    pub lines: Vec<Vec<[f64; 2]>>,
+    /// Sine and cosine of each position-periodic error \[um\].
+    pub positions: Vec<[f64; 2]>,
+    /// Sum of squares over the mask.
+    pub chi2: f64,
+    /// Innovations that count under the mask.
+    pub count: usize,
+    /// Innovations of all rows, masked or not.
+    pub innovations: Vec<Vec<f64>>,
+    /// Covariance of the parameters of the parts, in the fit's coordinates, in order.
+    pub covariance: DMatrix<f64>,
+}
+
+impl Fit {
+    /// Free parameters that describe effects: of the parts, and the amplitudes of lines.
+    pub fn freedom(&self) -> usize {
+        self.parts.iter().map(|p| freedom_of(p.variant(), self.innovations.len())).sum()
+    }
+
+    pub fn has(&self, id: &str) -> bool {
+        self.parts.iter().any(|p| p.variant().id == id)
+    }
+
+    /// Sum of squares of the innovations under another mask.
+    pub fn chi2_on(&self, mask: &Mask) -> f64 {
+        self.innovations
+            .iter()
+            .zip(mask)
+            .map(|(e, ranges)| ranges.iter().map(|r| e[r.clone()].iter().map(|x| x * x).sum::<f64>()).sum::<f64>())
+            .sum()
+    }
+}
+
+/// Number of free numbers that a variant brings.
+pub(crate) fn freedom_of(v: &Variant, records: usize) -> usize {
+    v.params.len()
+        + match v.kind {
+            Kind::Chain => 0,
+            Kind::Line => 2 * records,
+            Kind::Position => 2,
+        }
+}
+
+/// Whitened tangents of a fit: what further candidates are projected against.
+pub(crate) struct Tangents {
+    /// Per record: (index of the parameter, whitened column).
+    columns: Vec<Vec<(usize, Vec<f64>)>>,
+    normal: DMatrix<f64>,
+    inverse: DMatrix<f64>,
+    gradient: DVector<f64>,
+}
+
+/// One evaluation of the model.
+struct State {
+    sim: Vec<Vec<f64>>,
+    /// Raw residual.
+    residual: Vec<Vec<f64>>,
+    innovations: Vec<Vec<f64>>,
+    /// Whitened edges.
+    soft: Vec<Vec<f64>>,
+    chi2: f64,
+}
+
+impl Context<'_> {
+    fn blocks(&self, parts: &[Part]) -> Vec<Block> {
+        let mut blocks = self.fixed.clone();
+        blocks.extend(parts.iter().map(|p| p.block(&self.scope)));
+        blocks.sort_by_key(Block::rank);
+        blocks
+    }
+
+    /// Simulated positions of all records.
+    pub fn simulated(&self, parts: &[Part]) -> Vec<Vec<f64>> {
+        let blocks = self.blocks(parts);
+        self.problem
+            .records
+            .iter()
+            .map(|r| {
+                let mut y = Vec::new();
+                simulate(&self.problem.base, &r.u, &blocks, &mut y, None);
+                y
+            })
+            .collect()
+    }
+
+    fn state(&self, fit: &Fit, mask: &Mask) -> State {
+        let blocks = self.blocks(&fit.parts);
+        let mut edge = Vec::new();
+        let (mut sim, mut soft) = (Vec::new(), Vec::new());
+        for r in &self.problem.records {
+            let mut y = Vec::new();
+            simulate(&self.problem.base, &r.u, &blocks, &mut y, Some(&mut edge));
+            sim.push(y);
+            let mut w = vec![0.0; edge.len()];
+            if edge.iter().any(|e| *e != 0.0) {
+                r.whitener.apply(&edge, &mut w);
+            }
+            soft.push(w);
+        }
+        let mut residual = Vec::with_capacity(sim.len());
+        let mut innovations = Vec::with_capacity(sim.len());
+        for (i, (r, s)) in self.problem.records.iter().zip(&sim).enumerate() {
+            let mut e: Vec<f64> = r.y.iter().zip(s).map(|(y, s)| y - s).collect();
+            let mut line = 0;
+            let mut position = 0;
+            for p in &fit.parts {
+                match p.variant().kind {
+                    Kind::Chain => {}
+                    Kind::Line => {
+                        let [a, b] = fit.lines[line][i];
+                        if a != 0.0 || b != 0.0 {
+                            self.rotate(p.natural()[0], e.len(), |k, sin, cos| e[k] -= a * sin + b * cos);
+                        }
+                        line += 1;
+                    }
+                    Kind::Position => {
+                        let [a, b] = fit.positions[position];
+                        if a != 0.0 || b != 0.0 {
+                            let pixel = p.natural()[0];
+                            let walk = r.whitener.smooth(&e);
+                            for k in 0..e.len() {
+                                let (sin, cos) = (TAU * (s[k] + walk[k]) / pixel).sin_cos();
+                                e[k] -= a * sin + b * cos;
+                            }
+                        }
+                        position += 1;
+                    }
+                }
+            }
+            let mut w = vec![0.0; e.len()];
+            r.whitener.apply(&e, &mut w);
+            for (w, s) in w.iter_mut().zip(&soft[i]) {
+                *w -= fit.soft * s;
+            }
+            residual.push(e);
+            innovations.push(w);
+        }
+        let chi2 = sum_squares(&innovations, mask);
+        State { sim, residual, innovations, soft, chi2 }
+    }
+
+    /// Calls `f(k, sin, cos)` of a line at every row.
+    fn rotate(&self, hz: f64, rows: usize, mut f: impl FnMut(usize, f64, f64)) {
+        for k in 0..rows {
+            let (s, c) = (TAU * hz * k as f64 * self.problem.base.sample_s).sin_cos();
+            f(k, s, c);
+        }
+    }
+
+    /// Whitened derivative columns of the innovations at a state.
+    fn columns(&self, fit: &Fit, state: &State) -> (usize, Vec<Vec<(usize, Vec<f64>)>>) {
+        let records = &self.problem.records;
+        let mut columns: Vec<Vec<(usize, Vec<f64>)>> = records.iter().map(|_| Vec::new()).collect();
+        let mut next = 0;
+        let (mut line, mut position) = (0, 0);
+        for (index, part) in fit.parts.iter().enumerate() {
+            match part.variant().kind {
+                Kind::Chain => {
+                    for (j, p) in part.variant().params.iter().enumerate() {
+                        let (parts, step) = self.nudged(&fit.parts, index, j, p);
+                        let moved = self.simulated(&parts);
+                        for (i, r) in records.iter().enumerate() {
+                            let d: Vec<f64> =
+                                moved[i].iter().zip(&state.sim[i]).map(|(a, b)| (b - a) / step).collect();
+                            let mut c = vec![0.0; d.len()];
+                            r.whitener.apply(&d, &mut c);
+                            columns[i].push((next, c));
+                        }
+                        next += 1;
+                    }
+                }
+                Kind::Line => {
+                    let hz = part.natural()[0];
+                    for (i, r) in records.iter().enumerate() {
+                        let n = r.u.len();
+                        let [a, b] = fit.lines[line][i];
+                        let mut d = [vec![0.0; n], vec![0.0; n], vec![0.0; n]];
+                        self.rotate(hz, n, |k, s, c| {
+                            d[0][k] = -TAU * k as f64 * self.problem.base.sample_s * (a * c - b * s);
+                            d[1][k] = -s;
+                            d[2][k] = -c;
+                        });
+                        for (j, d) in d.iter().enumerate() {
+                            let mut w = vec![0.0; n];
+                            r.whitener.apply(d, &mut w);
+                            // Frequency is common; sine and cosine are this record's own.
+                            let at = if j == 0 { next } else { next + 2 * i + j };
+                            if j > 0 || a != 0.0 || b != 0.0 {
+                                columns[i].push((at, w));
+                            }
+                        }
+                    }
+                    next += 1 + 2 * records.len();
+                    line += 1;
+                }
+                Kind::Position => {
+                    let pixel = part.natural()[0];
+                    let [a, b] = fit.positions[position];
+                    for (i, r) in records.iter().enumerate() {
+                        let n = r.u.len();
+                        let walk = r.whitener.smooth(&state.residual[i]);
+                        let mut d = [vec![0.0; n], vec![0.0; n], vec![0.0; n]];
+                        for k in 0..n {
+                            let angle = TAU * (state.sim[i][k] + walk[k]) / pixel;
+                            let (s, c) = angle.sin_cos();
+                            d[0][k] = angle * (a * c - b * s);
+                            d[1][k] = -s;
+                            d[2][k] = -c;
+                        }
+                        for (j, d) in d.iter().enumerate() {
+                            let mut w = vec![0.0; n];
+                            r.whitener.apply(d, &mut w);
+                            if j > 0 || a != 0.0 || b != 0.0 {
+                                columns[i].push((next + j, w));
+                            }
+                        }
+                    }
+                    next += 3;
+                    position += 1;
+                }
+            }
+        }
+        for (columns, soft) in columns.iter_mut().zip(&state.soft) {
+            columns.push((next, soft.iter().map(|s| -s).collect()));
+        }
+        (next + 1, columns)
+    }
+
+    /// The parts with one parameter moved by its step, towards the inside of its bounds.
+    fn nudged(&self, parts: &[Part], index: usize, j: usize, p: &Param) -> (Vec<Part>, f64) {
+        let mut parts = parts.to_vec();
+        let x = parts[index].theta[j];
+        let mut step = p.step * if p.log { 1.0 } else { (x.abs() / (50.0 * p.step)).clamp(1.0, 10.0) };
+        if (if p.log { (x + step).exp() } else { x + step }) > p.upper {
+            step = -step;
+        }
+        parts[index].theta[j] = x + step;
+        (parts, step)
+    }
+
+    /// Fits a set of candidates from starting values.
+    pub fn fit(&self, parts: Vec<Part>, mask: &Mask, iterations: usize) -> Fit {
+        self.fit_from(parts, None, mask, iterations)
+    }
+
+    /// Carries a fit on.
+    pub fn refit(&self, fit: &Fit, mask: &Mask, iterations: usize) -> Fit {
+        self.run(fit.clone(), mask, iterations)
+    }
+
+    /// As [`Self::fit`], with the nuisances of an earlier fit as starting values where they apply.
+    pub fn fit_from(&self, parts: Vec<Part>, soft: Option<f64>, mask: &Mask, iterations: usize) -> Fit {
+        let records = self.problem.records.len();
+        let lines = parts.iter().filter(|p| p.variant().kind == Kind::Line).count();
+        let positions = parts.iter().filter(|p| p.variant().kind == Kind::Position).count();
+        let fit = Fit {
+            parts,
+            soft: soft.unwrap_or(0.0),
+            lines: vec![vec![[0.0; 2]; records]; lines],
+            positions: vec![[0.0; 2]; positions],
+            chi2: 0.0,
+            count: self.problem.count(mask),
+            innovations: Vec::new(),
+            covariance: DMatrix::zeros(0, 0),
+        };
+        self.run(fit, mask, iterations)
+    }
+
+    fn run(&self, mut fit: Fit, mask: &Mask, iterations: usize) -> Fit {
+        fit.count = self.problem.count(mask);
+        let mut state = self.state(&fit, mask);
+        let mut lambda = 1e-3;
+        let mut size;
+        let mut normal;
+        let mut round = 0;
+        loop {
+            let (n, columns) = self.columns(&fit, &state);
+            size = n;
+            let (a, g) = normal_equations(n, &columns, &state.innovations, mask);
+            normal = a;
+            if round >= iterations {
+                break;
+            }
+            round += 1;
+            let mut improved = 0.0;
+            for _ in 0..8 {
+                let mut damped = normal.clone();
+                for i in 0..n {
+                    damped[(i, i)] += lambda * normal[(i, i)] + 1e-12 + if normal[(i, i)] == 0.0 { 1.0 } else { 0.0 };
+                }
+                let Some(step) = damped.cholesky().map(|c| c.solve(&(-&g))) else {
+                    lambda *= 10.0;
+                    continue;
+                };
+                let trial = self.stepped(&fit, &step);
+                let trial_state = self.state(&trial, mask);
+                if trial_state.chi2 < state.chi2 {
+                    improved = state.chi2 - trial_state.chi2;
+                    fit = trial;
+                    state = trial_state;
+                    lambda = (lambda * 0.2).max(1e-9);
+                    break;
+                }
+                // A step that changes next to nothing: converged.
+                if trial_state.chi2 - state.chi2 < 1e-3 {
+                    break;
+                }
+                lambda = (lambda * 8.0).max(1e-6);
+            }
+            if improved < 0.02 {
+                break;
+            }
+        }
+        fit.chi2 = state.chi2;
+        fit.innovations = state.innovations;
+        let mut regular = normal.clone();
+        for i in 0..size {
+            regular[(i, i)] += 1e-9 * normal[(i, i)] + if normal[(i, i)] == 0.0 { 1e9 } else { 0.0 };
+        }
+        let inverse = regular.try_inverse().unwrap_or_else(|| DMatrix::identity(size, size));
+        fit.covariance = self.effect_covariance(&fit, &inverse);
+        fit
+    }
+
+    fn stepped(&self, fit: &Fit, step: &DVector<f64>) -> Fit {
+        let mut t = fit.clone();
+        let records = self.problem.records.len();
+        let mut next = 0;
+        let (mut line, mut position) = (0, 0);
+        for part in &mut t.parts {
+            let v = part.variant();
+            match v.kind {
+                Kind::Chain => {
+                    for (x, p) in part.theta.iter_mut().zip(v.params) {
+                        // A logarithm that wants to move more than a factor of four is not in its linear range.
+                        let d = if p.log { step[next].clamp(-1.4, 1.4) } else { step[next] };
+                        *x = p.coordinate(p.natural(*x + d));
+                        next += 1;
+                    }
+                }
+                Kind::Line => {
+                    let p = &v.params[0];
+                    part.theta[0] = p.coordinate(p.natural(part.theta[0] + step[next].clamp(-0.05, 0.05)));
+                    for i in 0..records {
+                        t.lines[line][i][0] += step[next + 1 + 2 * i];
+                        t.lines[line][i][1] += step[next + 2 + 2 * i];
+                    }
+                    next += 1 + 2 * records;
+                    line += 1;
+                }
+                Kind::Position => {
+                    let p = &v.params[0];
+                    part.theta[0] = p.coordinate(p.natural(part.theta[0] + step[next].clamp(-0.02, 0.02)));
+                    t.positions[position][0] += step[next + 1];
+                    t.positions[position][1] += step[next + 2];
+                    next += 3;
+                    position += 1;
+                }
+            }
+        }
+        t.soft = (t.soft + step[next]).clamp(self.problem.soft.0, self.problem.soft.1);
+        t
+    }
+
+    /// The rows and columns of the parts' own parameters.
+    fn effect_covariance(&self, fit: &Fit, inverse: &DMatrix<f64>) -> DMatrix<f64> {
+        let mut indices = Vec::new();
+        let mut next = 0;
+        for part in &fit.parts {
+            let n = part.variant().params.len();
+            indices.extend(next..next + n);
+            next += freedom_of(part.variant(), self.problem.records.len());
+        }
+        DMatrix::from_fn(indices.len(), indices.len(), |i, j| inverse[(indices[i], indices[j])])
+    }
+
+    /// Tangents at a fit, for screening further candidates.
+    pub fn tangents(&self, fit: &Fit, mask: &Mask) -> Tangents {
+        let state = self.state(fit, mask);
+        let (n, columns) = self.columns(fit, &state);
+        let (normal, gradient) = normal_equations(n, &columns, &state.innovations, mask);
+        let mut regular = normal.clone();
+        for i in 0..n {
+            regular[(i, i)] += 1e-9 * normal[(i, i)] + if normal[(i, i)] == 0.0 { 1.0 } else { 0.0 };
+        }
+        let inverse = regular.try_inverse().unwrap_or_else(|| DMatrix::identity(n, n));
+        Tangents { columns, normal, inverse, gradient }
+    }
+
+    /// Innovations of a set with given nuisances, without fitting.
+    pub fn innovations(&self, fit: &Fit, mask: &Mask) -> (Vec<Vec<f64>>, f64) {
+        let s = self.state(fit, mask);
+        (s.innovations, s.chi2)
+    }
+
+    /// Raw residual and simulated position of a fit.
+    pub fn residual(&self, fit: &Fit) -> (Vec<Vec<f64>>, Vec<Vec<f64>>) {
+        let s = self.state(fit, &self.problem.all());
+        (s.residual, s.sim)
+    }
+}
+
+/// What a direction in the space of innovations would gain.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Gain {
+    /// Fall of the sum of squares when the direction is added with its best scale, all tangents refitted.
+    pub score: f64,
+    /// That scale.
+    pub scale: f64,
+}
+
+impl Tangents {
+    /// Projects a whitened direction `d` (change of the innovations) against the tangents.
+    pub fn gain(&self, d: &[Vec<f64>], e: &[Vec<f64>], mask: &Mask) -> Gain {
+        let n = self.gradient.len();
+        let mut jd = DVector::zeros(n);
+        let (mut dd, mut de) = (0.0, 0.0);
+        for i in 0..d.len() {
+            for r in &mask[i] {
+                let di = &d[i][r.clone()];
+                dd += dot(di, di);
+                de += dot(di, &e[i][r.clone()]);
+                for (index, c) in &self.columns[i] {
+                    jd[*index] += dot(&c[r.clone()], di);
+                }
+            }
+        }
+        let w = &self.inverse * &jd;
+        let dd2 = dd - jd.dot(&w);
+        let de2 = de - self.gradient.dot(&w);
+        if dd2 <= 1e-6 * dd || dd <= 0.0 {
+            return Gain { score: 0.0, scale: 0.0 };
+        }
+        Gain { score: de2 * de2 / dd2, scale: -de2 / dd2 }
+    }
+
+    /// Number of tangents.
+    pub fn len(&self) -> usize {
+        self.normal.nrows()
+    }
+}
+
+fn sum_squares(e: &[Vec<f64>], mask: &Mask) -> f64 {
+    e.iter().zip(mask).map(|(e, ranges)| ranges.iter().map(|r| dot(&e[r.clone()], &e[r.clone()])).sum::<f64>()).sum()
+}
+
+fn normal_equations(
+    n: usize,
+    columns: &[Vec<(usize, Vec<f64>)>],
+    e: &[Vec<f64>],
+    mask: &Mask,
+) -> (DMatrix<f64>, DVector<f64>) {
+    let mut a = DMatrix::zeros(n, n);
+    let mut g = DVector::zeros(n);
+    for ((columns, e), ranges) in columns.iter().zip(e).zip(mask) {
+        for r in ranges {
+            for (x, (i, ci)) in columns.iter().enumerate() {
+                let ci = &ci[r.clone()];
+                g[*i] += dot(ci, &e[r.clone()]);
+                for (j, cj) in &columns[..=x] {
+                    let v = dot(ci, &cj[r.clone()]);
+                    a[(*i, *j)] += v;
+                    if i != j {
+                        a[(*j, *i)] += v;
+                    }
+                }
+            }
+        }
+    }
+    (a, g)
+}
+
+/// Dot product with four partial sums: fast, and the same on every machine.
+pub(crate) fn dot(a: &[f64], b: &[f64]) -> f64 {
+    let mut s = [0.0f64; 8];
+    let (ac, bc) = (a.chunks_exact(8), b.chunks_exact(8));
+    let rest: f64 = ac.remainder().iter().zip(bc.remainder()).map(|(x, y)| x * y).sum();
+    for (x, y) in ac.zip(bc) {
+        for i in 0..8 {
+            s[i] += x[i] * y[i];
+        }
+    }
+    s.iter().sum::<f64>() + rest
+}

@@ -1,0 +1,189 @@
+//! Screening: what would each candidate gain at each of its starting values, without a full fit.
+//!
+//! One simulation per starting value gives a direction in the space of innovations; projected against the tangents of
+//! the present fit it says how much the sum of squares falls when the candidate is scaled best and all else refitted.
+
+use crate::catalogue::{Kind, VARIANTS};
+use crate::fit::{Context, Fit, Part, Tangents, dot};
+use crate::parallel;
+use crate::problem::Mask;
+use std::f64::consts::TAU;
+
+/// One candidate that may be worth a fit.
+#[derive(Debug, Clone)]
+pub(crate) struct Lead {
+    pub part: Part,
+    /// Expected fall of the sum of squares.
+    pub score: f64,
+}
+
+/// The best start of every variant not excluded, best first.
+pub(crate) fn screen(
+    ctx: &Context<'_>,
+    fit: &Fit,
+    tangents: &Tangents,
+    mask: &Mask,
+    threads: usize,
+    allowed: impl Fn(usize) -> bool,
+) -> Vec<Lead> {
+    let mut jobs: Vec<Part> = Vec::new();
+    for (i, v) in VARIANTS.iter().enumerate() {
+        if allowed(i) && v.kind != Kind::Position {
+            jobs.extend((v.starts)(&ctx.scope).iter().map(|s| Part::new(i, s)));
+        }
+    }
+    let sim = ctx.simulated(&fit.parts);
+    let scores = parallel::map(&jobs, threads, |part| match part.variant().kind {
+        Kind::Line => line_score(ctx, fit, part.natural()[0], mask),
+        _ => {
+            let mut parts = fit.parts.clone();
+            parts.push(part.clone());
+            let moved = ctx.simulated(&parts);
+            let d: Vec<Vec<f64>> = ctx
+                .problem
+                .records
+                .iter()
+                .zip(moved.iter().zip(&sim))
+                .map(|(r, (m, s))| {
+                    let d: Vec<f64> = m.iter().zip(s).map(|(m, s)| s - m).collect();
+                    let mut w = vec![0.0; d.len()];
+                    r.whitener.apply(&d, &mut w);
+                    w
+                })
+                .collect();
+            let g = tangents.gain(&d, &fit.innovations, mask);
+            if g.scale > 0.02 { g.score } else { 0.0 }
+        }
+    });
+    let mut best: Vec<Option<Lead>> = VARIANTS.iter().map(|_| None).collect();
+    for (part, score) in jobs.into_iter().zip(scores) {
+        let slot = &mut best[part.variant];
+        if slot.as_ref().is_none_or(|l| l.score < score) {
+            *slot = Some(Lead { part, score });
+        }
+    }
+    if let Some(v) = VARIANTS.iter().position(|v| v.kind == Kind::Position)
+        && allowed(v)
+        && let Some(lead) = pixel_scan(ctx, fit, v, mask, threads)
+    {
+        best[v] = Some(lead);
+    }
+    let mut leads: Vec<Lead> = best.into_iter().flatten().collect();
+    leads.sort_by(|a, b| b.score.total_cmp(&a.score).then(a.part.variant.cmp(&b.part.variant)));
+    leads
+}
+
+/// Gain of two columns together.
+fn pair_score(s: &[f64], c: &[f64], e: &[f64]) -> f64 {
+    let (ss, cc, sc) = (dot(s, s), dot(c, c), dot(s, c));
+    let (se, ce) = (dot(s, e), dot(c, e));
+    let det = ss * cc - sc * sc;
+    if det <= 1e-9 * ss * cc || !(det > 0.0) {
+        return 0.0;
+    }
+    (cc * se * se - 2.0 * sc * se * ce + ss * ce * ce) / det
+}
+
+/// Gain of a line of a frequency with its own amplitude and phase in every record.
+pub(crate) fn line_score(ctx: &Context<'_>, fit: &Fit, hz: f64, mask: &Mask) -> f64 {
+    ctx.problem
+        .records
+        .iter()
+        .enumerate()
+        .map(|(i, r)| {
+            let n = r.u.len();
+            let (mut s, mut c) = (vec![0.0; n], vec![0.0; n]);
+            for k in 0..n {
+                (s[k], c[k]) = (TAU * hz * k as f64 * ctx.problem.base.sample_s).sin_cos();
+            }
+            let (mut ws, mut wc) = (vec![0.0; n], vec![0.0; n]);
+            r.whitener.apply(&s, &mut ws);
+            r.whitener.apply(&c, &mut wc);
+            mask[i].iter().map(|m| pair_score(&ws[m.clone()], &wc[m.clone()], &fit.innovations[i][m.clone()])).sum::<f64>()
+        })
+        .sum()
+}
+
+/// Rows of a block of the pixel scan.
+const BLOCK: usize = 1000;
+
+/// Looks for an error periodic in position over pixel sizes of 0.05..1.5 um: first over blocks in which the bead stays
+/// within a few micrometres (each with its own phase, so that a coarse grid does), then over everything.
+fn pixel_scan(ctx: &Context<'_>, fit: &Fit, variant: usize, mask: &Mask, threads: usize) -> Option<Lead> {
+    let (residual, sim) = ctx.residual(fit);
+    let positions: Vec<Vec<f64>> = ctx
+        .problem
+        .records
+        .iter()
+        .zip(residual.iter().zip(&sim))
+        .map(|(r, (e, s))| r.whitener.smooth(e).iter().zip(s).map(|(w, s)| w + s).collect())
+        .collect();
+    let mut blocks: Vec<(usize, usize, f64)> = Vec::new();
+    for (i, p) in positions.iter().enumerate() {
+        for range in &mask[i] {
+            let mut k = range.start;
+            while k + BLOCK <= range.end {
+                let (low, high) =
+                    p[k..k + BLOCK].iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), v| (a.min(*v), b.max(*v)));
+                if high - low > 0.3 && high - low < 6.0 {
+                    blocks.push((i, k, high - low));
+                }
+                k += BLOCK;
+            }
+        }
+    }
+    // Every n-th: enough to see a hundredth of a pixel without spending the whole record.
+    let stride = blocks.len().div_ceil(24).max(1);
+    let blocks: Vec<(usize, usize, f64)> = blocks.into_iter().step_by(stride).collect();
+    if blocks.len() < 3 {
+        return None;
+    }
+    let step = 1.0 / 14.0;
+    let waves: Vec<f64> = (0..((20.0 - 0.66) / step) as usize).map(|i| 0.66 + step * i as f64).collect();
+    let score_at = |q: f64, i: usize, from: usize, to: usize| {
+        let r = &ctx.problem.records[i];
+        let n = to - from;
+        let (mut s, mut c) = (vec![0.0; r.u.len()], vec![0.0; r.u.len()]);
+        // The filter needs a short run-in only; start 40 rows early.
+        let start = from.saturating_sub(40);
+        for k in start..to {
+            (s[k], c[k]) = (TAU * q * positions[i][k]).sin_cos();
+        }
+        let (mut ws, mut wc) = (vec![0.0; n], vec![0.0; n]);
+        r.whitener.apply_range(&s, start, from, to, &mut ws);
+        r.whitener.apply_range(&c, start, from, to, &mut wc);
+        (ws, wc)
+    };
+    let coarse = parallel::map(&waves, threads, |&q| {
+        blocks
+            .iter()
+            .map(|&(i, k, _)| {
+                let (s, c) = score_at(q, i, k, k + BLOCK);
+                pair_score(&s, &c, &fit.innovations[i][k..k + BLOCK])
+            })
+            .sum::<f64>()
+    });
+    let n = blocks.len() as f64;
+    let (best, &top) = coarse.iter().enumerate().max_by(|a, b| a.1.total_cmp(b.1))?;
+    // Under the null the sum is chi-square with 2n degrees of freedom; the scan has about 270 trials.
+    if top < 2.0 * n + 5.0 * (4.0 * n).sqrt() {
+        return None;
+    }
+    let all_rows: Vec<(usize, std::ops::Range<usize>)> =
+        mask.iter().enumerate().flat_map(|(i, ranges)| ranges.iter().map(move |r| (i, r.clone()))).collect();
+    let centre = waves[best];
+    // Common phase over all records: the resolution is one over the whole distance travelled.
+    let fine: Vec<f64> = (-60..=60).map(|i| centre + step * f64::from(i) / 50.0).collect();
+    let scores = parallel::map(&fine, threads, |&q| {
+        let (mut s, mut c, mut e) = (Vec::new(), Vec::new(), Vec::new());
+        for (i, r) in &all_rows {
+            let (ws, wc) = score_at(q, *i, r.start, r.end);
+            s.extend(ws);
+            c.extend(wc);
+            e.extend_from_slice(&fit.innovations[*i][r.clone()]);
+        }
+        pair_score(&s, &c, &e)
+    });
+    let (best, &score) = scores.iter().enumerate().max_by(|a, b| a.1.total_cmp(b.1))?;
+    Some(Lead { part: Part::new(variant, &[1.0 / fine[best]]), score })
+}

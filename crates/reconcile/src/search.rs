@@ -1,0 +1,239 @@
+//! The sequential search: add the best candidate, look again, take back what is no longer needed, try replacements.
+
+use crate::catalogue::{VARIANTS, Variant};
+use crate::fit::{Context, Fit, Part, freedom_of};
+use crate::parallel;
+use crate::problem::Mask;
+use crate::screen::screen;
+
+/// How hard to search.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Effort {
+    pub threads: usize,
+    pub max_effects: usize,
+}
+
+/// A set with the rivals met on the way.
+#[derive(Debug, Clone)]
+pub(crate) struct Found {
+    pub fit: Fit,
+    pub null: Fit,
+    /// Sum of squares after each step, with the set of that step.
+    pub steps: Vec<(Vec<&'static str>, f64)>,
+    /// For each effect of the set: rivals in its stead, id and sum of squares of the joint refit.
+    pub rivals: Vec<Vec<Rival>>,
+}
+
+/// Another candidate in the stead of a named one.
+#[derive(Debug, Clone)]
+pub(crate) struct Rival {
+    pub id: &'static str,
+    pub chi2: f64,
+    pub part: Part,
+}
+
+/// Upper quantile of chi-square with `k` degrees of freedom at `z` standard normal deviations (Wilson-Hilferty).
+pub(crate) fn chi2_quantile(k: f64, z: f64) -> f64 {
+    let a = 2.0 / (9.0 * k);
+    k * (1.0 - a + z * a.sqrt()).powi(3)
+}
+
+/// What an addition must gain to count: family-wise 5 % over all variants, their starts and the scan of pixel sizes
+/// (about 2000 trials, 4.1 standard deviations), times 1.3 for the error of the noise estimate.
+pub(crate) fn threshold(freedom: usize) -> f64 {
+    1.3 * chi2_quantile(freedom as f64, 4.1)
+}
+
+/// The same for a variant in a problem of so many records.
+fn bar(v: &Variant, records: usize) -> f64 {
+    threshold(freedom_of(v, records))
+}
+
+/// Sum of squares with a price per parameter, so that a form with many numbers wins only if it is worth them.
+fn priced(fit: &Fit) -> f64 {
+    let typical: f64 = fit.parts.iter().map(implausibility).sum();
+    fit.chi2 + 8.0 * fit.freedom() as f64 + typical
+}
+
+/// A small price for a main parameter outside the range that real rigs show: decides ties between names only.
+fn implausibility(part: &Part) -> f64 {
+    let v = part.variant();
+    let x = part.natural()[0];
+    if x < v.typical.0 || x > v.typical.1 { 12.0 } else { 0.0 }
+}
+
+/// Whether two variants say the same thing.
+fn same_id(a: usize, id: &str) -> bool {
+    VARIANTS[a].id == id
+}
+
+/// Fits the best leads next to a set and returns the fits, best first.
+fn extensions(ctx: &Context<'_>, fit: &Fit, mask: &Mask, effort: Effort, wide: usize, forbidden: &[&str]) -> Vec<Fit> {
+    let tangents = ctx.tangents(fit, mask);
+    let leads = screen(ctx, fit, &tangents, mask, effort.threads, |v| {
+        !fit.parts.iter().any(|p| same_id(v, p.variant().id)) && !forbidden.contains(&VARIANTS[v].id)
+    });
+    let records = ctx.problem.records.len();
+    let worth: Vec<Part> = leads
+        .into_iter()
+        .filter(|l| l.score > 0.5 * bar(l.part.variant(), records))
+        .take(wide)
+        .map(|l| l.part)
+        .collect();
+    // A short fit of all, then the best few to the end.
+    let mut fits = parallel::map(&worth, effort.threads, |part| {
+        let mut parts = fit.parts.clone();
+        parts.push(part.clone());
+        ctx.fit_from(parts, Some(fit.soft), mask, 4)
+    });
+    fits.sort_by(|a, b| priced(a).total_cmp(&priced(b)));
+    let close = fits.first().map_or(0.0, |best| best.chi2 + 0.5 * (fit.chi2 - best.chi2));
+    let rest = fits.split_off(fits.iter().take(4).filter(|f| f.chi2 <= close).count());
+    let mut fits = parallel::map(&fits, effort.threads, |f| ctx.refit(f, mask, 14));
+    fits.extend(rest);
+    fits.sort_by(|a, b| priced(a).total_cmp(&priced(b)));
+    fits
+}
+
+/// What a response to the command must gain, in parts of what is explained already: the equations of the first effect
+/// are not those of nature to the last digit, and what they leave over must not be given a name of its own.
+const RELATIVE: f64 = 0.0015;
+
+/// Whether the part of `bigger` that `smaller` lacks is worth having, where `null` is the sum of squares without effects.
+fn worth_it(smaller: &Fit, bigger: &Fit, null: f64) -> bool {
+    let added = bigger.freedom().saturating_sub(smaller.freedom()).max(1);
+    let off_response = bigger
+        .parts
+        .iter()
+        .filter(|p| !smaller.has(p.variant().id))
+        .all(|p| p.variant().off_response);
+    let least = if off_response { 0.0 } else { RELATIVE * (null - smaller.chi2).max(0.0) };
+    smaller.chi2 - bigger.chi2 > threshold(added).max(least)
+}
+
+/// Takes back effects that are no longer needed.
+fn eliminate(ctx: &Context<'_>, mut fit: Fit, null: f64, mask: &Mask, effort: Effort) -> Fit {
+    while fit.parts.len() > 1 {
+        let indices: Vec<usize> = (0..fit.parts.len()).collect();
+        let without = parallel::map(&indices, effort.threads, |&i| {
+            let mut parts = fit.parts.clone();
+            parts.remove(i);
+            ctx.fit_from(parts, Some(fit.soft), mask, 8)
+        });
+        let Some(best) = without.into_iter().filter(|w| !worth_it(w, &fit, null)).min_by(|a, b| priced(a).total_cmp(&priced(b)))
+        else {
+            break;
+        };
+        fit = best;
+    }
+    fit
+}
+
+/// Replaces single effects by others while that helps; also gathers the rivals of each effect.
+fn replace(ctx: &Context<'_>, mut fit: Fit, mask: &Mask, effort: Effort) -> (Fit, Vec<Vec<Rival>>) {
+    for _ in 0..3 {
+        let mut rivals: Vec<Vec<Rival>> = Vec::new();
+        let mut better: Option<Fit> = None;
+        for i in 0..fit.parts.len() {
+            let mut parts = fit.parts.clone();
+            let id = parts.remove(i).variant().id;
+            let without = ctx.fit_from(parts, Some(fit.soft), mask, 10);
+            let mut list: Vec<Rival> = Vec::new();
+            for other in extensions(ctx, &without, mask, effort, 6, &[id]) {
+                let Some(part) = other.parts.last().cloned() else { continue };
+                list.push(Rival { id: part.variant().id, chi2: other.chi2, part });
+                if priced(&other) < priced(&fit) - 1.0 && better.as_ref().is_none_or(|b| priced(&other) < priced(b)) {
+                    better = Some(other);
+                }
+            }
+            rivals.push(list);
+        }
+        match better {
+            Some(b) => fit = b,
+            None => return (fit, rivals),
+        }
+    }
+    let none = vec![Vec::new(); fit.parts.len()];
+    (fit, none)
+}
+
+/// Tries the other forms of the same effects (play operators for Bouc-Wen, a dissolving bubble, two-sided clipping).
+fn reform(ctx: &Context<'_>, mut fit: Fit, mask: &Mask, effort: Effort) -> Fit {
+    for i in 0..fit.parts.len() {
+        let id = fit.parts[i].variant().id;
+        let others: Vec<Part> = VARIANTS
+            .iter()
+            .enumerate()
+            .filter(|(v, variant)| variant.id == id && *v != fit.parts[i].variant)
+            .flat_map(|(v, variant)| (variant.starts)(&ctx.scope).into_iter().map(move |s| Part::new(v, &s)))
+            .collect();
+        let fits = parallel::map(&others, effort.threads, |part| {
+            let mut parts = fit.parts.clone();
+            parts[i] = part.clone();
+            ctx.fit_from(parts, Some(fit.soft), mask, 10)
+        });
+        if let Some(best) = fits.into_iter().min_by(|a, b| priced(a).total_cmp(&priced(b)))
+            && priced(&best) < priced(&fit) - 20.0
+        {
+            fit = best;
+        }
+    }
+    fit
+}
+
+/// The whole search on the rows of a mask.
+pub(crate) fn search(ctx: &Context<'_>, mask: &Mask, effort: Effort, mut progress: impl FnMut(&str)) -> Found {
+    let null = ctx.fit(Vec::new(), mask, 6);
+    let mut steps = vec![(Vec::new(), null.chi2)];
+    progress("screening single effects");
+    let mut singles = extensions(ctx, &null, mask, effort, 8, &[]);
+    singles.retain(|f| worth_it(&null, f, null.chi2));
+    let Some(best) = singles.first().cloned() else {
+        return Found { fit: null.clone(), null, steps, rivals: Vec::new() };
+    };
+    steps.push((ids(&best), best.chi2));
+    let mut fit = best;
+    let mut beam: Vec<Fit> = singles.into_iter().skip(1).take(2).collect();
+    while fit.parts.len() < effort.max_effects {
+        progress(&format!("looking further beside {}", ids(&fit).join(" + ")));
+        let mut next: Vec<Fit> = extensions(ctx, &fit, mask, effort, 6, &[]);
+        next.retain(|f| worth_it(&fit, f, null.chi2));
+        if next.is_empty() {
+            break;
+        }
+        // Something is left: the first choice may have been a compromise between two. Extend its rivals as well.
+        for other in std::mem::take(&mut beam) {
+            next.extend(extensions(ctx, &other, mask, effort, 4, &[]));
+        }
+        next.sort_by(|a, b| priced(a).total_cmp(&priced(b)));
+        let Some(top) = next.first().cloned() else { break };
+        let top = eliminate(ctx, top, null.chi2, mask, effort);
+        if priced(&top) >= priced(&fit) {
+            break;
+        }
+        let (top, _) = replace(ctx, top, mask, effort);
+        fit = reform(ctx, top, mask, effort);
+        steps.push((ids(&fit), fit.chi2));
+        beam = Vec::new();
+    }
+    if fit.parts.len() == 1 {
+        let reformed = reform(ctx, fit.clone(), mask, effort);
+        if reformed.parts != fit.parts {
+            fit = reformed;
+            steps.push((ids(&fit), fit.chi2));
+        }
+    }
+    progress("refitting all together");
+    let parts = fit.parts.clone();
+    let refined = ctx.fit_from(parts, Some(fit.soft), mask, 12);
+    if refined.chi2 <= fit.chi2 {
+        fit = refined;
+    }
+    let (fit, rivals) = replace(ctx, fit, mask, effort);
+    Found { fit, null, steps, rivals }
+}
+
+/// Ids of a set in the order in which they were found.
+pub(crate) fn ids(fit: &Fit) -> Vec<&'static str> {
+    fit.parts.iter().map(|p| p.variant().id).collect()
+}
