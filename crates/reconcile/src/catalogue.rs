@@ -48,8 +48,6 @@ pub(crate) struct Scope {
     /// Largest excursion from the working point \[um\].
     pub stroke_um: f64,
     pub sample_s: f64,
-    /// Velocity gain of the plant at 20 Hz \[1/s\].
-    pub velocity_gain_per_s: f64,
 }
 
 /// One way of building an effect: most have one, hysteresis and saturation several.
@@ -350,7 +348,10 @@ pub(crate) fn block_of(effect: &Effect, scope: &Scope) -> Option<Block> {
         Effect::DriverLag { bandwidth_hz } => Block::DriverLag { w: TAU * bandwidth_hz },
         Effect::SlewLimit { rate_um_per_s } => Block::SlewLimit { rate: rate_um_per_s },
         Effect::Saturation { low_um, high_um } => Block::Saturation { low_um, high_um },
-        Effect::PztHysteresis(Hysteresis::BoucWen { fraction, beta_per_um, gamma_per_um }) => {
+        Effect::PztHysteresis(
+            Hysteresis::BoucWen { fraction, beta_per_um, gamma_per_um }
+            | Hysteresis::BoucWenExplicit { fraction, beta_per_um, gamma_per_um },
+        ) => {
             Block::BoucWen { fraction, beta: beta_per_um, gamma: gamma_per_um }
         }
         Effect::PztHysteresis(Hysteresis::Play { ref thresholds_um, ref weights, quadratic_per_um }) => {

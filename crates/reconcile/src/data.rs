@@ -9,6 +9,8 @@ pub struct Record {
     pub name: String,
     /// Sample time \[s\].
     pub sample_s: f64,
+    /// Time stamp of the first row \[s\].
+    pub start_s: f64,
     /// Displacement commanded from each row on \[um\].
     pub pzt_um: Vec<f64>,
     /// Bead position just before that command acts \[um\]; NaN without a bead.
@@ -79,7 +81,7 @@ impl Record {
         let filled: Vec<bool> = pzt.iter().map(|v| v.is_nan()).collect();
         fill(&mut pzt);
         let resolution_um = resolution(&bead);
-        Ok(Self { name: name.to_owned(), sample_s, pzt_um: pzt, bead_um: bead, filled, resolution_um })
+        Ok(Self { name: name.to_owned(), sample_s, start_s: time_s[0], pzt_um: pzt, bead_um: bead, filled, resolution_um })
     }
 
     /// Number of rows.
@@ -129,12 +131,56 @@ impl Record {
         Self {
             name: self.name.clone(),
             sample_s: self.sample_s,
+            start_s: self.start_s + from as f64 * self.sample_s,
             pzt_um: self.pzt_um[from..to].to_vec(),
             bead_um: self.bead_um[from..to].to_vec(),
             filled: self.filled[from..to].to_vec(),
             resolution_um: self.resolution_um,
         }
     }
+}
+
+/// Puts records into an order that does not depend on that of the files, and joins parts of one record: a part that
+/// starts one sample after another ends, at a place where the bead goes on.
+pub(crate) fn canonical(mut records: Vec<Record>) -> Vec<Record> {
+    let key = |r: &Record| -> Vec<u64> {
+        let mut k: Vec<u64> = vec![r.start_s.to_bits(), r.rows() as u64];
+        k.extend(r.pzt_um.iter().chain(r.bead_um.iter()).step_by(r.rows() / 16 + 1).map(|v| v.to_bits()));
+        k
+    };
+    records.sort_by(|a, b| a.start_s.total_cmp(&b.start_s).then_with(|| key(a).cmp(&key(b))));
+    let mut joined: Vec<Record> = Vec::new();
+    for r in records {
+        let last_bead = |j: &Record| j.bead_um.iter().rev().take(5).copied().find(|b| b.is_finite());
+        let first_bead = r.bead_um.iter().take(5).copied().find(|b| b.is_finite());
+        let before = joined
+            .iter()
+            .enumerate()
+            .filter(|(_, j)| {
+                let end = j.start_s + j.rows() as f64 * j.sample_s;
+                (r.start_s - end).abs() < 0.2 * r.sample_s && (j.sample_s / r.sample_s - 1.0).abs() < 1e-3
+            })
+            .filter_map(|(i, j)| Some((i, (last_bead(j)? - first_bead?).abs())))
+            // The bead does not jump between two samples: a few micrometres at most at full drive.
+            .filter(|(_, gap)| *gap < 3.0)
+            .min_by(|a, b| a.1.total_cmp(&b.1))
+            .map(|(i, _)| i);
+        match before {
+            Some(i) => {
+                let j = &mut joined[i];
+                j.pzt_um.extend_from_slice(&r.pzt_um);
+                j.bead_um.extend_from_slice(&r.bead_um);
+                j.filled.extend_from_slice(&r.filled);
+                j.resolution_um = j.resolution_um.min(r.resolution_um);
+                if r.name < j.name {
+                    j.name = r.name;
+                }
+            }
+            None => joined.push(r),
+        }
+    }
+    joined.sort_by(|a, b| a.name.cmp(&b.name).then_with(|| key(a).cmp(&key(b))));
+    joined
 }
 
 /// Fills gaps of the command: from one period away where the command repeats itself, else straight between neighbours.

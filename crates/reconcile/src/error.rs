@@ -53,6 +53,18 @@ pub enum ReconcileError {
         /// What to do.
         hint: &'static str,
     },
+    /// Commands that never come near the model's working point.
+    #[error("pzt_um runs from {low_um:.2} to {high_um:.2}, but the model's working point is {working_point_um} um: {hint}")]
+    WorkingPoint {
+        /// Smallest command.
+        low_um: f64,
+        /// Largest command.
+        high_um: f64,
+        /// Working point of the model \[um\].
+        working_point_um: f64,
+        /// What to do.
+        hint: &'static str,
+    },
     /// Does not follow the model at all.
     #[error(
         "these records do not follow this model: only {explained_percent:.0} % of the measured motion goes with the command as the model says (at any gain and delay up to 20 ms){detail}; a record of another rig, swapped columns, or the wrong model file"

@@ -43,6 +43,34 @@ pub(crate) struct Context<'a> {
     pub problem: &'a Problem,
     pub scope: Scope,
     pub fixed: Vec<Block>,
+    pub white: Option<WhiteEvidence>,
+}
+
+/// What the size of the white noise says about averaging in the camera.
+///
+/// With a held command and a bead that follows at once, the path between two commands is straight, and the mean over an
+/// exposure inside that time IS the position in its middle: an exposure Te and a delay Te/2 give the same response. The
+/// Brownian motion tells them apart: averaged over Te it lowers the white part of the noise by `2 D dt Te/(6 dt)`.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct WhiteEvidence {
+    /// Estimated from the records \[um^2\].
+    pub estimate_um2: f64,
+    /// Standard error of that.
+    pub error_um2: f64,
+    /// What the model's localisation noise gives \[um^2\].
+    pub model_um2: f64,
+    /// `2 D dt` \[um^2\].
+    pub walk_um2: f64,
+}
+
+impl WhiteEvidence {
+    /// Squared distance, in standard deviations, between the estimate and what a set of parts leads one to expect.
+    pub fn distance(&self, parts: &[Part], sample_s: f64) -> f64 {
+        let exposure_s: f64 =
+            parts.iter().filter(|p| p.variant().id == "exposure-averaging").map(|p| p.natural()[0]).sum();
+        let expected = self.model_um2 - self.walk_um2 * (exposure_s / sample_s).min(2.0) / 6.0;
+        ((self.estimate_um2 - expected) / self.error_um2).powi(2)
+    }
 }
 
 /// A fitted set of candidates.

@@ -8,8 +8,9 @@ use std::f64::consts::TAU;
 ///
 /// A rest record shows the noise itself (lines at the mains frequency and a drift taken off); of a record whose command
 /// repeats, the difference of successive periods cancels every response that repeats. The smallest of these rules: a
-/// misfit can only add. Without either, increments of the residuals are all there is.
-pub(crate) fn estimate(records: &[Record], present: &[Vec<bool>], residuals: &[Vec<f64>]) -> Noise {
+/// misfit can only add. Without either, increments of the residuals are all there is: then the second answer, the number of
+/// increments that can be trusted, is 0.
+pub(crate) fn estimate(records: &[Record], present: &[Vec<bool>], residuals: &[Vec<f64>]) -> (Noise, usize) {
     let mut found: Vec<(f64, f64, usize, f64)> = Vec::new();
     let mut fallback: Vec<(f64, f64, usize, f64)> = Vec::new();
     for ((r, present), e) in records.iter().zip(present).zip(residuals) {
@@ -35,9 +36,10 @@ pub(crate) fn estimate(records: &[Record], present: &[Vec<bool>], residuals: &[V
         let sigma = Noise::from_increments(c0, c1).innovation_um();
         if good { found.push((c0, c1, n, sigma)) } else { fallback.push((c0, c1, n, sigma)) }
     }
+    let trusted = !found.is_empty();
     let pool = if found.is_empty() { fallback } else { found };
     let Some(least) = pool.iter().map(|f| f.3).min_by(f64::total_cmp) else {
-        return Noise::new(0.33, records.first().map_or(1e-3, |r| r.sample_s), 0.03);
+        return (Noise::new(0.33, records.first().map_or(1e-3, |r| r.sample_s), 0.03), 0);
     };
     let (mut c0, mut c1, mut n) = (0.0, 0.0, 0.0);
     for f in pool.iter().filter(|f| f.3 <= 1.03 * least) {
@@ -45,7 +47,7 @@ pub(crate) fn estimate(records: &[Record], present: &[Vec<bool>], residuals: &[V
         c1 += f.1 * f.2 as f64;
         n += f.2 as f64;
     }
-    Noise::from_increments(c0 / n, c1 / n)
+    (Noise::from_increments(c0 / n, c1 / n), if trusted { n as usize } else { 0 })
 }
 
 /// From the innovations' own model: increments of the raw residuals of a fit that is believed.

@@ -50,9 +50,11 @@ fn bar(v: &Variant, records: usize) -> f64 {
 }
 
 /// Sum of squares with a price per parameter, so that a form with many numbers wins only if it is worth them.
-fn priced(fit: &Fit) -> f64 {
+fn priced(ctx: &Context<'_>, fit: &Fit) -> f64 {
     let typical: f64 = fit.parts.iter().map(implausibility).sum();
-    fit.chi2 + 8.0 * fit.freedom() as f64 + typical
+    // Decides ties only: the localisation noise of a rig need not be that of its model.
+    let white = ctx.white.map_or(0.0, |w| w.distance(&fit.parts, ctx.problem.base.sample_s).min(40.0));
+    fit.chi2 + 8.0 * fit.freedom() as f64 + typical + white
 }
 
 /// A small price for a main parameter outside the range that real rigs show: decides ties between names only.
@@ -68,7 +70,15 @@ fn same_id(a: usize, id: &str) -> bool {
 }
 
 /// Fits the best leads next to a set and returns the fits, best first.
-fn extensions(ctx: &Context<'_>, fit: &Fit, mask: &Mask, effort: Effort, wide: usize, forbidden: &[&str]) -> Vec<Fit> {
+fn extensions(
+    ctx: &Context<'_>,
+    fit: &Fit,
+    mask: &Mask,
+    effort: Effort,
+    wide: usize,
+    forbidden: &[&str],
+    least: f64,
+) -> Vec<Fit> {
     let tangents = ctx.tangents(fit, mask);
     let leads = screen(ctx, fit, &tangents, mask, effort.threads, |v| {
         !fit.parts.iter().any(|p| same_id(v, p.variant().id)) && !forbidden.contains(&VARIANTS[v].id)
@@ -76,7 +86,10 @@ fn extensions(ctx: &Context<'_>, fit: &Fit, mask: &Mask, effort: Effort, wide: u
     let records = ctx.problem.records.len();
     let worth: Vec<Part> = leads
         .into_iter()
-        .filter(|l| l.score > 0.5 * bar(l.part.variant(), records))
+        .filter(|l| {
+            let least = if l.part.variant().off_response { 0.0 } else { least };
+            l.score > 0.5 * bar(l.part.variant(), records).max(least)
+        })
         .take(wide)
         .map(|l| l.part)
         .collect();
@@ -86,12 +99,12 @@ fn extensions(ctx: &Context<'_>, fit: &Fit, mask: &Mask, effort: Effort, wide: u
         parts.push(part.clone());
         ctx.fit_from(parts, Some(fit.soft), mask, 4)
     });
-    fits.sort_by(|a, b| priced(a).total_cmp(&priced(b)));
+    fits.sort_by(|a, b| priced(ctx, a).total_cmp(&priced(ctx, b)));
     let close = fits.first().map_or(0.0, |best| best.chi2 + 0.5 * (fit.chi2 - best.chi2));
     let rest = fits.split_off(fits.iter().take(4).filter(|f| f.chi2 <= close).count());
     let mut fits = parallel::map(&fits, effort.threads, |f| ctx.refit(f, mask, 14));
     fits.extend(rest);
-    fits.sort_by(|a, b| priced(a).total_cmp(&priced(b)));
+    fits.sort_by(|a, b| priced(ctx, a).total_cmp(&priced(ctx, b)));
     fits
 }
 
@@ -120,7 +133,7 @@ fn eliminate(ctx: &Context<'_>, mut fit: Fit, null: f64, mask: &Mask, effort: Ef
             parts.remove(i);
             ctx.fit_from(parts, Some(fit.soft), mask, 8)
         });
-        let Some(best) = without.into_iter().filter(|w| !worth_it(w, &fit, null)).min_by(|a, b| priced(a).total_cmp(&priced(b)))
+        let Some(best) = without.into_iter().filter(|w| !worth_it(w, &fit, null)).min_by(|a, b| priced(ctx, a).total_cmp(&priced(ctx, b)))
         else {
             break;
         };
@@ -139,10 +152,10 @@ fn replace(ctx: &Context<'_>, mut fit: Fit, mask: &Mask, effort: Effort) -> (Fit
             let id = parts.remove(i).variant().id;
             let without = ctx.fit_from(parts, Some(fit.soft), mask, 10);
             let mut list: Vec<Rival> = Vec::new();
-            for other in extensions(ctx, &without, mask, effort, 6, &[id]) {
+            for other in extensions(ctx, &without, mask, effort, 6, &[id], 0.25 * (without.chi2 - fit.chi2)) {
                 let Some(part) = other.parts.last().cloned() else { continue };
                 list.push(Rival { id: part.variant().id, chi2: other.chi2, part });
-                if priced(&other) < priced(&fit) - 1.0 && better.as_ref().is_none_or(|b| priced(&other) < priced(b)) {
+                if priced(ctx, &other) < priced(ctx, &fit) - 1.0 && better.as_ref().is_none_or(|b| priced(ctx, &other) < priced(ctx, b)) {
                     better = Some(other);
                 }
             }
@@ -172,8 +185,8 @@ fn reform(ctx: &Context<'_>, mut fit: Fit, mask: &Mask, effort: Effort) -> Fit {
             parts[i] = part.clone();
             ctx.fit_from(parts, Some(fit.soft), mask, 10)
         });
-        if let Some(best) = fits.into_iter().min_by(|a, b| priced(a).total_cmp(&priced(b)))
-            && priced(&best) < priced(&fit) - 20.0
+        if let Some(best) = fits.into_iter().min_by(|a, b| priced(ctx, a).total_cmp(&priced(ctx, b)))
+            && priced(ctx, &best) < priced(ctx, &fit) - 20.0
         {
             fit = best;
         }
@@ -186,7 +199,7 @@ pub(crate) fn search(ctx: &Context<'_>, mask: &Mask, effort: Effort, mut progres
     let null = ctx.fit(Vec::new(), mask, 6);
     let mut steps = vec![(Vec::new(), null.chi2)];
     progress("screening single effects");
-    let mut singles = extensions(ctx, &null, mask, effort, 8, &[]);
+    let mut singles = extensions(ctx, &null, mask, effort, 8, &[], 0.0);
     singles.retain(|f| worth_it(&null, f, null.chi2));
     let Some(best) = singles.first().cloned() else {
         return Found { fit: null.clone(), null, steps, rivals: Vec::new() };
@@ -196,19 +209,20 @@ pub(crate) fn search(ctx: &Context<'_>, mask: &Mask, effort: Effort, mut progres
     let mut beam: Vec<Fit> = singles.into_iter().skip(1).take(2).collect();
     while fit.parts.len() < effort.max_effects {
         progress(&format!("looking further beside {}", ids(&fit).join(" + ")));
-        let mut next: Vec<Fit> = extensions(ctx, &fit, mask, effort, 6, &[]);
+        let mut next: Vec<Fit> = extensions(ctx, &fit, mask, effort, 6, &[], RELATIVE * (null.chi2 - fit.chi2));
         next.retain(|f| worth_it(&fit, f, null.chi2));
         if next.is_empty() {
             break;
         }
         // Something is left: the first choice may have been a compromise between two. Extend its rivals as well.
+        let top_chi2 = next[0].chi2;
         for other in std::mem::take(&mut beam) {
-            next.extend(extensions(ctx, &other, mask, effort, 4, &[]));
+            next.extend(extensions(ctx, &other, mask, effort, 4, &[], 0.5 * (other.chi2 - top_chi2)));
         }
-        next.sort_by(|a, b| priced(a).total_cmp(&priced(b)));
+        next.sort_by(|a, b| priced(ctx, a).total_cmp(&priced(ctx, b)));
         let Some(top) = next.first().cloned() else { break };
         let top = eliminate(ctx, top, null.chi2, mask, effort);
-        if priced(&top) >= priced(&fit) {
+        if priced(ctx, &top) >= priced(ctx, &fit) {
             break;
         }
         let (top, _) = replace(ctx, top, mask, effort);

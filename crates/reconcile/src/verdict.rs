@@ -1,34 +1,493 @@
-//! scratch
-use crate::*;
-use crate::catalogue::{Scope};
-use crate::fit::Context;
-use crate::predict::{Base, Zpk};
+//! The workflow: guards, null model, search, held-out check, verdict, and the augmented model.
+
+use crate::catalogue::{self, Kind, Scope, VARIANTS};
+use crate::data::{self, Record};
+use crate::error::ReconcileError;
+use crate::fit::{Context, Fit, WhiteEvidence};
+use crate::frames::{self, FrameCounts};
+use crate::guard;
+use crate::held_out::{self, HeldOut};
+use crate::hypothesis::{self, Hypothesis};
+use crate::map::{self, DiscrepancyMap};
+use crate::noise::Noise;
+use crate::predict::{Base, Block, PLAY_LEVELS, Zpk};
 use crate::problem::Problem;
-use cellpos_plant::Model;
-/// scratch
-pub fn debug_search(model: &Model, records: &[Record]) {
-    let t0 = std::time::Instant::now();
-    let zpk = Zpk { zeros: model.plant.zeros(), poles: model.plant.poles(), gain: model.plant.num()[0] / model.plant.den()[0] };
-    let base = Base { zpk, working_point_um: model.working_point_um, sample_s: records[0].sample_s, interpolated_input: false };
-    let (lo, hi) = records.iter().map(|r| r.pzt_range_um()).fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), (c, d)| (a.min(c), b.max(d)));
-    let wp = model.working_point_um;
-    let scope = Scope { working_point_um: wp, low_um: lo, high_um: hi, stroke_um: (hi - wp).max(wp - lo), sample_s: base.sample_s, velocity_gain_per_s: 379.0 };
-    let repeated: Vec<Vec<bool>> = records.iter().map(|r| vec![false; r.rows()]).collect();
-    let problem = Problem::new(base.clone(), records, &repeated, Noise::new(0.33, 1e-3, 0.03));
-    let ctx = Context { problem: &problem, scope, fixed: vec![] };
-    let null = ctx.fit(vec![], &problem.all(), 3);
-    let (res, _) = ctx.residual(&null);
-    let present: Vec<Vec<bool>> = problem.records.iter().map(|r| r.present.clone()).collect();
-    let noise = floor::estimate(records, &present, &res);
-    println!("noise {:?} sigma {:.5} D {:.4} loc {:.4} [{:?}]", noise, noise.innovation_um(), noise.diffusion_um2_per_s(1e-3), noise.localisation_um(), t0.elapsed());
-    let problem = problem.clone().with_noise(noise);
-    let ctx = Context { problem: &problem, scope, fixed: vec![] };
-    let mask = problem.all();
-    let found = search::search(&ctx, &mask, search::Effort { threads: 2, max_effects: 4 }, |s| eprintln!("   {s} [{:?}]", t0.elapsed()));
-    println!("  null {:.0} (n {})", found.null.chi2 - found.null.count as f64, found.null.count);
-    for (s, c) in &found.steps { println!("  step {:?} {:.1}", s, c - found.null.count as f64); }
-    for (i, p) in found.fit.parts.iter().enumerate() {
-        println!("  {} {:?} rivals {:?}", p.variant().id, p.natural(), found.rivals[i].iter().map(|r| (r.id, (r.chi2 - found.fit.chi2).round(), r.part.natural())).collect::<Vec<_>>());
+use crate::result::{Effect as NamedEffect, Gap, GapStep, Interval, Reconciliation, Traces, Verdict};
+use crate::search::{self, Effort, Found, ids};
+use crate::{floor, significance};
+use cellpos_plant::{Effect, Hysteresis, Model};
+use std::collections::BTreeMap;
+
+/// How to run.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Options {
+    /// Threads for candidates; the result does not depend on it.
+    pub threads: usize,
+    /// Most effects to add.
+    pub max_effects: usize,
+    /// The command is an analogue signal sampled together with the output, not held between rows.
+    pub interpolated_input: bool,
+}
+
+impl Default for Options {
+    fn default() -> Self {
+        Self { threads: 2, max_effects: 4, interpolated_input: false }
     }
-    println!("  soft {:.4} final {:.0}  [{:?}]", found.fit.soft, found.fit.chi2 - found.null.count as f64, t0.elapsed());
+}
+
+/// Finds, names and adds what a model lacks.
+///
+/// `progress` is told in words what goes on. The result depends on nothing but the model, the records and the options:
+/// neither on the order of the records nor on the number of threads, and a record cut in two is put together again.
+///
+/// # Errors
+/// Records or a model about which no verdict is possible: see [`ReconcileError`].
+pub fn reconcile(
+    model: &Model,
+    records: &[Record],
+    options: &Options,
+    progress: &mut dyn FnMut(&str),
+) -> Result<Reconciliation, ReconcileError> {
+    let records = data::canonical(records.to_vec());
+    guard::records(&records)?;
+    guard::working_point(&records, model.working_point_um)?;
+    let frames = frames::count(&records);
+    let none: Vec<Vec<bool>> = records.iter().map(|r| vec![false; r.rows()]).collect();
+    let repeated = if frames.repeats_named() { &frames.repeated } else { &none };
+    let base = base_of(model, &records, options)?;
+    let scope = scope_of(model, &records, &base);
+    let fixed = fixed_blocks(model, &scope);
+    let start = Noise::new(model.noise.diffusion_um2_per_s.max(1e-4), base.sample_s, model.noise.localisation_um.max(1e-3));
+    let problem = Problem::new(base, &records, repeated, start);
+    let present: Vec<Vec<bool>> = problem.records.iter().map(|r| r.present.clone()).collect();
+
+    progress("null model and noise floor");
+    let first = context(&problem, scope, &fixed).fit(Vec::new(), &problem.all(), 4);
+    let (residual, _) = context(&problem, scope, &fixed).residual(&first);
+    let (noise, trusted) = floor::estimate(&records, &present, &residual);
+    let problem = problem.with_noise(noise);
+    guard::motion(&context(&problem, scope, &fixed))?;
+
+    let effort = Effort { threads: options.threads, max_effects: options.max_effects };
+    let mut noise = noise;
+    let mut problem = problem;
+    let mut found;
+    let mut round = 0;
+    loop {
+        let ctx = Context { white: evidence(model, &noise, trusted, &problem), ..context(&problem, scope, &fixed) };
+        found = search::search(&ctx, &problem.all(), effort, &mut *progress);
+        // What the final residual shows is at least as good an estimate of the noise, if the fit is good.
+        let (residual, _) = ctx.residual(&found.fit);
+        let refined = floor::from_residuals(&present, &residual);
+        round += 1;
+        if round >= 2 || refined.innovation_um() > 0.97 * noise.innovation_um() {
+            break;
+        }
+        noise = refined;
+        problem = problem.with_noise(noise);
+    }
+    let ctx = Context { white: evidence(model, &noise, trusted, &problem), ..context(&problem, scope, &fixed) };
+    progress("held-out check");
+    let mut held = held_out::check(&ctx, &found.fit, options.threads);
+    // What does not help where it was not fitted is not named.
+    while let Some(i) = held.unconfirmed.first().copied() {
+        progress(&format!("{} does not hold on held-out data: taken back", ids(&found.fit)[i]));
+        let mut parts = found.fit.parts.clone();
+        parts.remove(i);
+        if i < found.rivals.len() {
+            found.rivals.remove(i);
+        }
+        found.fit = ctx.fit(parts, &problem.all(), 12);
+        held = held_out::check(&ctx, &found.fit, options.threads);
+    }
+    progress("map and verdict");
+    Ok(assemble(model, &records, &ctx, found, held, &frames))
+}
+
+fn context<'a>(problem: &'a Problem, scope: Scope, fixed: &[Block]) -> Context<'a> {
+    Context { problem, scope, fixed: fixed.to_vec(), white: None }
+}
+
+fn base_of(model: &Model, records: &[Record], options: &Options) -> Result<Base, ReconcileError> {
+    let (num, den) = (model.plant.num(), model.plant.den());
+    let (Some(n), Some(d)) = (num.first(), den.first()) else {
+        return Err(ReconcileError::Model("the plant has no coefficients".to_owned()));
+    };
+    let zpk = Zpk { zeros: model.plant.zeros(), poles: model.plant.poles(), gain: n / d };
+    if zpk.poles.iter().any(|p| p.re > 1e-6) {
+        return Err(ReconcileError::Model("the plant is unstable: a free run of it cannot be compared with a record".to_owned()));
+    }
+    Ok(Base {
+        zpk,
+        working_point_um: model.working_point_um,
+        sample_s: records[0].sample_s,
+        interpolated_input: options.interpolated_input,
+    })
+}
+
+fn scope_of(model: &Model, records: &[Record], base: &Base) -> Scope {
+    let (low, high) = records
+        .iter()
+        .map(Record::pzt_range_um)
+        .fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), (c, d)| (a.min(c), b.max(d)));
+    let w = model.working_point_um;
+    Scope {
+        working_point_um: w,
+        low_um: low,
+        high_um: high,
+        stroke_um: (high - w).abs().max((w - low).abs()).max(1e-6),
+        sample_s: base.sample_s,
+    }
+}
+
+fn fixed_blocks(model: &Model, scope: &Scope) -> Vec<Block> {
+    model.ordered_effects().into_iter().filter_map(|e| catalogue::block_of(e, scope)).collect()
+}
+
+fn evidence(model: &Model, noise: &Noise, trusted: usize, problem: &Problem) -> Option<WhiteEvidence> {
+    let model_um2 = model.noise.localisation_um.powi(2);
+    if trusted < 5000 || model_um2 <= 0.0 {
+        return None;
+    }
+    let variance = noise.walk_um2 + 2.0 * noise.white_um2;
+    // Only where the walk is that of the model: else the model's noise says nothing about this rig.
+    let walk = 2.0 * model.noise.diffusion_um2_per_s * problem.base.sample_s;
+    if walk <= 0.0 || (noise.walk_um2 / walk - 1.0).abs() > 0.15 {
+        return None;
+    }
+    Some(WhiteEvidence {
+        estimate_um2: noise.white_um2,
+        error_um2: 1.5 * variance / (trusted as f64).sqrt(),
+        model_um2,
+        walk_um2: noise.walk_um2,
+    })
+}
+
+/// Rivals closer than this (twice the log-likelihood) cannot be told from the winner.
+const TIE: f64 = 10.0;
+
+/// Pairs of names that no record of command and bead position can tell apart.
+fn inseparable(a: &str, b: &str) -> bool {
+    matches!((a, b), ("driver-lag", "bubble") | ("bubble", "driver-lag"))
+}
+
+fn assemble(
+    model: &Model,
+    records: &[Record],
+    ctx: &Context<'_>,
+    found: Found,
+    held: HeldOut,
+    frames: &FrameCounts,
+) -> Reconciliation {
+    let Found { fit, null, steps, rivals } = found;
+    let all = ctx.problem.all();
+    let sigma = ctx.problem.noise.innovation_um();
+    let n = null.count as f64;
+    let scatter = (2.0 * n + (0.012 * n).powi(2)).sqrt();
+    let excess = null.chi2 - n;
+    let left = fit.chi2 - n;
+    let null_map = map::map(ctx, &null);
+    let after_map = map::map(ctx, &fit);
+    let mut places = map::sentences(ctx, &null_map);
+
+    let mut effects = Vec::new();
+    let mut ambiguous = false;
+    for (i, part) in fit.parts.iter().enumerate() {
+        let id = part.variant().id;
+        let mut parts = fit.parts.clone();
+        parts.remove(i);
+        let without = ctx.fit_from(parts, Some(fit.soft), &all, 8);
+        let gain = (without.chi2 - fit.chi2).max(0.0);
+        let mut alternatives: Vec<String> = Vec::new();
+        for r in rivals.get(i).map_or(&[][..], Vec::as_slice) {
+            if r.id == id || alternatives.iter().any(|a| a == r.id) {
+                continue;
+            }
+            let decided = ctx.white.is_some_and(|w| {
+                let mut other = fit.parts.clone();
+                other[i] = r.part.clone();
+                let s = ctx.problem.base.sample_s;
+                w.distance(&other, s) - w.distance(&fit.parts, s) > 16.0
+            });
+            if r.chi2 - fit.chi2 < TIE && !decided {
+                if !inseparable(id, r.id) {
+                    ambiguous = true;
+                }
+                alternatives.push(r.id.to_owned());
+            }
+        }
+        // A lag with a plain exponential is both, unless it dissolves.
+        for (a, b) in [("driver-lag", "bubble"), ("bubble", "driver-lag")] {
+            if id == a && part.variant().params.len() == 1 && !alternatives.iter().any(|x| x == b) {
+                alternatives.push(b.to_owned());
+            }
+        }
+        alternatives.sort();
+        let needs_text = !alternatives.is_empty() || id == "gain-error";
+        let freedom = crate::fit::freedom_of(part.variant(), ctx.problem.records.len());
+        effects.push(NamedEffect {
+            id: id.to_owned(),
+            place: place_of(id),
+            parameters: parameters(ctx, &fit, i, left / n),
+            p_value: significance::p_value(gain, freedom),
+            explained: if excess > 0.0 { (gain / excess).clamp(0.0, 1.0) } else { 0.0 },
+            separate_by: needs_text.then(|| catalogue::separate_by(id, &alternatives)),
+            alternatives,
+        });
+    }
+    for (id, named, count, total, rate) in [
+        ("frame-drops", frames.drops_named(), frames.missing, frames.rows, frames.drop_rate()),
+        ("frame-repeats", frames.repeats_named(), frames.repeats, frames.pairs, frames.repeat_rate()),
+    ] {
+        if named {
+            let chance = if id == "frame-repeats" { frames.by_chance } else { 0.0 };
+            let wide = frames::wilson(count as f64, total.max(1) as f64);
+            let off = chance / total.max(1) as f64;
+            effects.push(NamedEffect {
+                id: id.to_owned(),
+                place: "camera",
+                parameters: BTreeMap::from([(
+                    "rate".to_owned(),
+                    Interval { value: rate, ci95: [(wide[0] - off).max(0.0), (wide[1] - off).max(0.0)], unit: String::new() },
+                )]),
+                p_value: significance::p_value(2.0 * (count as f64 - chance), 1),
+                explained: 0.0,
+                alternatives: Vec::new(),
+                separate_by: None,
+            });
+            places.push(format!("{id}: {count} of {total} frames"));
+        }
+    }
+    effects.sort_by(|a, b| b.explained.total_cmp(&a.explained).then_with(|| a.id.cmp(&b.id)));
+
+    // Does the set close the gap?
+    let beyond = null.chi2 - n > 4.0 * scatter || null_map.any_flagged();
+    let closed = if excess > 0.0 { 1.0 - left.max(0.0) / excess } else { 1.0 };
+    let open = left > 5.0 * scatter && closed < CLOSED;
+    let verdict = if !fit.parts.is_empty() && open {
+        Verdict::Unknown
+    } else if effects.is_empty() {
+        if beyond { Verdict::Unknown } else { Verdict::NothingMissing }
+    } else if ambiguous {
+        Verdict::Ambiguous
+    } else {
+        Verdict::Named
+    };
+    let hypothesis =
+        (verdict == Verdict::Unknown).then(|| hypothesis::hypothesis(ctx, &null)).flatten();
+    if verdict == Verdict::Unknown {
+        let best = ids(&fit).join(" + ");
+        places.push(if best.is_empty() {
+            "no effect of the catalogue explains it".to_owned()
+        } else {
+            format!("the best of the catalogue, {best}, closes {:.0} % of it: not enough for a name", 100.0 * closed)
+        });
+    } else if after_map.any_flagged() && left > 4.0 * scatter {
+        places.push(format!("after the addition {:.1} % of the excess is left", 100.0 * left / excess));
+    }
+
+    let named = if verdict == Verdict::Unknown { Vec::new() } else { effects };
+    let rms = |chi2: f64| sigma * (chi2 / n).max(0.0).sqrt();
+    // The noise of these very rows: what the full fit leaves, where that is the floor within its own error.
+    let in_sample = rms(fit.chi2);
+    let floor_um = if in_sample <= 1.01 * sigma { in_sample } else { sigma };
+    let gap = Gap {
+        before: held.before_um,
+        after: held.after_um,
+        floor: floor_um,
+        unit: "um RMS of innovation on held-out records",
+        steps: steps
+            .iter()
+            .map(|(names, chi2)| GapStep { effects: names.iter().map(|s| (*s).to_owned()).collect(), rms: rms(*chi2) })
+            .collect(),
+        per_record: held.per_record.clone(),
+        bands: held_out::bands(&null_map, &after_map),
+    };
+    let base_shift = BTreeMap::from([
+        (
+            "frame_edge_share".to_owned(),
+            Interval { value: fit.soft, ci95: [fit.soft, fit.soft], unit: "um/um".to_owned() },
+        ),
+        ("gain".to_owned(), held.gain_shift.clone()),
+    ]);
+    let augmented = augment(model, ctx, &fit, frames, &named, verdict);
+    let traces = Traces::new(ctx, &null, &fit);
+    Reconciliation {
+        verdict,
+        effects: named,
+        places,
+        gap,
+        base_shift,
+        hypothesis,
+        noise: ctx.problem.noise,
+        sample_s: ctx.problem.base.sample_s,
+        augmented,
+        before: null_map,
+        after: after_map,
+        traces,
+        records: records.iter().map(|r| (r.name.clone(), r.rows(), r.frames())).collect(),
+    }
+}
+
+/// A set that closes less than this part of the excess is no explanation.
+const CLOSED: f64 = 0.80;
+
+fn place_of(id: &str) -> &'static str {
+    match id {
+        "driver-lag" | "slew-limit" | "saturation" => "driver",
+        "pzt-hysteresis" | "pzt-creep" | "pzt-resonance" | "backlash" => "pzt",
+        "pdms-relaxation" | "bubble" | "leak" => "chip",
+        "gain-error" => "bead/camera",
+        "gain-drift" | "wall-adhesion" | "flow-drift" => "bead",
+        _ => "camera",
+    }
+}
+
+/// Parameters of part `index` with 95 % intervals in their units.
+fn parameters(ctx: &Context<'_>, fit: &Fit, index: usize, left_per_row: f64) -> BTreeMap<String, Interval> {
+    let offset: usize = fit.parts[..index].iter().map(|p| p.variant().params.len()).sum();
+    let part = &fit.parts[index];
+    // A fit that leaves something over is less sure than its own curvature says.
+    let wide = (1.0 + left_per_row.max(0.0)).sqrt();
+    let mut out = BTreeMap::new();
+    for (j, p) in part.variant().params.iter().enumerate() {
+        let x = part.theta[j];
+        let sd = fit.covariance[(offset + j, offset + j)].max(0.0).sqrt() * wide;
+        let (low, high) = (p.natural(x - 1.96 * sd), p.natural(x + 1.96 * sd));
+        let name = if p.name == "weights" { format!("weights[{j}]") } else { p.name.to_owned() };
+        out.insert(name, Interval { value: p.natural(x), ci95: [low, high], unit: unit_of(p.name).to_owned() });
+    }
+    match part.variant().kind {
+        Kind::Line => {
+            let line = fit.parts[..index].iter().filter(|p| p.variant().kind == Kind::Line).count();
+            let amplitudes: Vec<f64> = fit.lines[line].iter().map(|[a, b]| a.hypot(*b)).collect();
+            let rows: f64 = ctx.problem.records.iter().map(|r| r.u.len() as f64).sum();
+            let mean = ctx.problem.records.iter().zip(&amplitudes).map(|(r, a)| a * r.u.len() as f64).sum::<f64>() / rows;
+            // One record's amplitude has the error sigma sqrt(2/n) over the filter's gain at the line.
+            let w = std::f64::consts::TAU * part.natural()[0] * ctx.problem.base.sample_s;
+            let theta = ctx.problem.noise.white_um2 / ctx.problem.noise.innovation_um().powi(2);
+            let gain = (2.0 * (w / 2.0).sin()) / (1.0 + theta * theta - 2.0 * theta * w.cos()).sqrt();
+            let sd = ctx.problem.noise.innovation_um() * (2.0 / rows).sqrt() / gain.max(1e-6);
+            out.insert(
+                "um".to_owned(),
+                Interval { value: mean, ci95: [mean - 1.96 * sd, mean + 1.96 * sd], unit: "um".to_owned() },
+            );
+        }
+        Kind::Position => {
+            let at = fit.parts[..index].iter().filter(|p| p.variant().kind == Kind::Position).count();
+            let [a, b] = fit.positions[at];
+            let pixel = part.natural()[0];
+            let rows: f64 = ctx.problem.count(&ctx.problem.all()) as f64;
+            let sd = ctx.problem.noise.innovation_um() * (2.0 / rows).sqrt() / pixel;
+            let amplitude = a.hypot(b) / pixel;
+            out.insert(
+                "amplitude".to_owned(),
+                Interval { value: amplitude, ci95: [amplitude - 1.96 * sd, amplitude + 1.96 * sd], unit: "px".to_owned() },
+            );
+        }
+        Kind::Chain => {}
+    }
+    out
+}
+
+fn unit_of(name: &str) -> &'static str {
+    match name {
+        "bandwidth_hz" | "frequency_hz" | "hz" => "Hz",
+        "rate_um_per_s" | "speed_um_per_s" | "um_per_s" => "um/s",
+        "low_um" | "high_um" | "width_um" | "pixel_um" | "um" => "um",
+        "beta_per_um" | "gamma_per_um" | "quadratic_per_um" => "1/um",
+        "time_s" | "lag_s" | "delay_s" | "exposure_s" => "s",
+        "corner_rad_per_s" => "rad/s",
+        "dissolution_per_s" | "per_s" => "1/s",
+        "ppm" => "ppm",
+        _ => "",
+    }
+}
+
+/// The effect of a model file for part `index`.
+fn effect_of(ctx: &Context<'_>, fit: &Fit, index: usize) -> Option<Effect> {
+    let part = &fit.parts[index];
+    let v = part.natural();
+    let before = |kind| fit.parts[..index].iter().filter(|p| p.variant().kind == kind).count();
+    Some(match (part.variant().build)(&v, &ctx.scope) {
+        Block::Saturation { low_um, high_um } => Effect::Saturation { low_um, high_um },
+        Block::SlewLimit { rate } => Effect::SlewLimit { rate_um_per_s: rate },
+        Block::DriverLag { .. } => Effect::DriverLag { bandwidth_hz: v[0] },
+        Block::BoucWen { fraction, beta, gamma } => {
+            Effect::PztHysteresis(Hysteresis::BoucWenExplicit { fraction, beta_per_um: beta, gamma_per_um: gamma })
+        }
+        Block::Play { stroke_um, weights, quadratic } => Effect::PztHysteresis(Hysteresis::Play {
+            thresholds_um: PLAY_LEVELS.iter().map(|l| l * stroke_um).collect(),
+            weights: weights.to_vec(),
+            quadratic_per_um: quadratic,
+        }),
+        Block::Creep { g } => Effect::PztCreep { per_decade: g },
+        Block::Resonance { zeta, .. } => Effect::PztResonance { frequency_hz: v[0], damping: zeta },
+        Block::Backlash { width_um } => Effect::Backlash { width_um },
+        Block::Relaxation { time_s, strength } => Effect::PdmsRelaxation { time_s, strength },
+        Block::Bubble { lag_s, dissolution } => Effect::Bubble { lag_s, dissolution_per_s: dissolution },
+        Block::Leak { corner } => Effect::Leak { corner_rad_per_s: corner },
+        Block::Gain { factor } => Effect::GainError { factor },
+        Block::GainDrift { per_s } => Effect::GainDrift { per_s },
+        Block::FlowDrift { um_per_s } => Effect::FlowDrift { um_per_s },
+        Block::Adhesion { um_per_s } => Effect::WallAdhesion { speed_um_per_s: um_per_s },
+        Block::ClockSkew { .. } => Effect::ClockSkew { ppm: v[0] },
+        Block::Delay { s } => Effect::TimeDelay { delay_s: s },
+        Block::Exposure { s } => Effect::ExposureAveraging { exposure_s: s },
+        Block::Hum { hz } => {
+            let line = &fit.lines[before(Kind::Line)];
+            let [a, b] = line.first().copied()?;
+            let rows: f64 = ctx.problem.records.iter().map(|r| r.u.len() as f64).sum();
+            let um = ctx.problem.records.iter().zip(line).map(|(r, [a, b])| a.hypot(*b) * r.u.len() as f64).sum::<f64>() / rows;
+            Effect::MainsHum { hz, um, phase_deg: b.atan2(a).to_degrees() }
+        }
+        Block::PixelLocking { pixel_um } => {
+            let [a, b] = fit.positions[before(Kind::Position)];
+            Effect::PixelLocking { pixel_um, amplitude: a.hypot(b) / pixel_um, phase_deg: b.atan2(a).to_degrees() }
+        }
+    })
+}
+
+/// The model with what was found, its intervals and where they come from.
+fn augment(
+    model: &Model,
+    ctx: &Context<'_>,
+    fit: &Fit,
+    frames: &FrameCounts,
+    named: &[NamedEffect],
+    verdict: Verdict,
+) -> Model {
+    let mut out = model.clone();
+    out.name = if named.is_empty() { model.name.clone() } else { format!("{}-augmented", model.name) };
+    out.covariance = None;
+    out.noise.diffusion_um2_per_s = ctx.problem.noise.diffusion_um2_per_s(ctx.problem.base.sample_s);
+    out.noise.localisation_um = ctx.problem.noise.localisation_um();
+    if verdict != Verdict::Unknown {
+        for i in 0..fit.parts.len() {
+            if let Some(e) = effect_of(ctx, fit, i) {
+                out.effects.retain(|old| old.id() != e.id() || !VARIANTS.iter().any(|v| v.id == old.id()));
+                out.effects.push(e);
+            }
+        }
+        if frames.drops_named() {
+            out.effects.push(Effect::FrameDrops { rate: frames.drop_rate() });
+        }
+        if frames.repeats_named() {
+            out.effects.push(Effect::FrameRepeats { rate: frames.repeat_rate() });
+        }
+        for e in named {
+            for (name, p) in &e.parameters {
+                out.intervals.insert(format!("{}.{name}", e.id), p.ci95);
+            }
+        }
+    }
+    out.provenance.insert("reconcile.verdict".to_owned(), verdict.word().to_owned());
+    out.provenance.insert("reconcile.base".to_owned(), model.name.clone());
+    for e in named {
+        out.provenance.insert(
+            format!("reconcile.{}", e.id),
+            format!("p = {:.1e}, explains {:.1} % of the excess over the noise floor", e.p_value, 100.0 * e.explained),
+        );
+    }
+    out
 }

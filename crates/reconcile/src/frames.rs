@@ -1,0 +1,81 @@
+//! Frames that are missing or come twice: counted, not simulated.
+
+use crate::data::Record;
+
+/// What was counted.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct FrameCounts {
+    pub rows: usize,
+    pub missing: usize,
+    pub pairs: usize,
+    pub repeats: usize,
+    /// Exact zero increments that the resolution of the file gives by chance.
+    pub by_chance: f64,
+    /// Rows that repeat the one before, per record.
+    pub repeated: Vec<Vec<bool>>,
+}
+
+impl FrameCounts {
+    pub fn drop_rate(&self) -> f64 {
+        self.missing as f64 / self.rows.max(1) as f64
+    }
+
+    pub fn repeat_rate(&self) -> f64 {
+        ((self.repeats as f64 - self.by_chance) / self.pairs.max(1) as f64).max(0.0)
+    }
+
+    /// More missing frames than a start-up glitch.
+    pub fn drops_named(&self) -> bool {
+        self.missing >= 5 && self.drop_rate() > 2e-4
+    }
+
+    /// Beyond chance by five standard deviations and by a half of what chance gives.
+    pub fn repeats_named(&self) -> bool {
+        let excess = self.repeats as f64 - self.by_chance;
+        self.repeats >= 5
+            && excess > 5.0 * (self.by_chance + 1.0).sqrt()
+            && excess > 0.5 * self.by_chance
+            && self.repeat_rate() > 2e-4
+    }
+}
+
+/// Counts missing frames and exact repeats.
+pub(crate) fn count(records: &[Record]) -> FrameCounts {
+    let mut c = FrameCounts { rows: 0, missing: 0, pairs: 0, repeats: 0, by_chance: 0.0, repeated: Vec::new() };
+    for r in records {
+        let n = r.rows();
+        c.rows += n;
+        c.missing += r.bead_um.iter().filter(|b| b.is_nan()).count();
+        let mut repeated = vec![false; n];
+        let step = r.resolution_um;
+        let mut near = 0usize;
+        for k in 1..n {
+            let (a, b) = (r.bead_um[k - 1], r.bead_um[k]);
+            if a.is_nan() || b.is_nan() {
+                continue;
+            }
+            c.pairs += 1;
+            let d = (b - a).abs();
+            if d == 0.0 || d < 1e-3 * step {
+                repeated[k] = true;
+                c.repeats += 1;
+            } else if step > 0.0 && d < 10.5 * step {
+                near += 1;
+            }
+        }
+        // Twenty neighbouring values of the increment, each as likely as zero by chance.
+        c.by_chance += near as f64 / 20.0;
+        c.repeated.push(repeated);
+    }
+    c
+}
+
+/// 95 % interval of a rate (Wilson).
+pub(crate) fn wilson(k: f64, n: f64) -> [f64; 2] {
+    let z = 1.96;
+    let p = k / n;
+    let d = 1.0 + z * z / n;
+    let m = p + z * z / (2.0 * n);
+    let w = z * (p * (1.0 - p) / n + z * z / (4.0 * n * n)).sqrt();
+    [((m - w) / d).max(0.0), ((m + w) / d).min(1.0)]
+}

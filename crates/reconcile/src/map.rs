@@ -1,0 +1,256 @@
+//! WHERE the model fails: the innovations by record and band, time and excitation, and a sentence about it.
+
+use crate::fit::{Context, Fit};
+use realfft::RealFftPlanner;
+use realfft::num_complex::Complex;
+
+/// Edges of the bands \[Hz\].
+pub const BAND_EDGES_HZ: [f64; 8] = [0.0, 1.0, 4.0, 15.0, 40.0, 80.0, 160.0, 500.0];
+
+/// One cell of the map.
+#[derive(Debug, Clone, PartialEq, serde::Serialize)]
+pub struct Cell {
+    /// RMS of the innovations in the cell \[um\].
+    pub rms_um: f64,
+    /// What noise alone would give \[um\].
+    pub floor_um: f64,
+    /// Excess over the floor in standard deviations of the noise's own scatter.
+    pub z: f64,
+    /// Whether it is beyond what the whole map would show by chance once in twenty times.
+    pub flagged: bool,
+}
+
+/// A line of the map: one record, or one part of the records.
+#[derive(Debug, Clone, PartialEq, serde::Serialize)]
+pub struct MapRow {
+    /// Record or part.
+    pub name: String,
+    /// One cell per band of [`BAND_EDGES_HZ`]; the last is the whole row.
+    pub cells: Vec<Cell>,
+}
+
+/// Ratio of the measured to the simulated motion in a band.
+#[derive(Debug, Clone, PartialEq, serde::Serialize)]
+pub struct BandRatio {
+    /// Middle of the band \[Hz\].
+    pub hz: f64,
+    /// Gain of measured over simulated \[dB\].
+    pub gain_db: f64,
+    /// Phase of measured over simulated \[deg\].
+    pub phase_deg: f64,
+    /// Standard error of the ratio, in parts.
+    pub error: f64,
+}
+
+/// The discrepancy map of a fit.
+#[derive(Debug, Clone, PartialEq, serde::Serialize)]
+pub struct DiscrepancyMap {
+    /// Records, then thirds of the time.
+    pub rows: Vec<MapRow>,
+    /// Response ratio per third-octave band, all records together.
+    pub ratios: Vec<BandRatio>,
+}
+
+impl DiscrepancyMap {
+    /// Whether anything is beyond the floor.
+    pub fn any_flagged(&self) -> bool {
+        self.rows.iter().any(|r| r.cells.iter().any(|c| c.flagged))
+    }
+}
+
+/// Labels of the bands.
+pub fn band_labels() -> Vec<String> {
+    let mut labels: Vec<String> = BAND_EDGES_HZ.windows(2).map(|w| format!("{}..{} Hz", w[0], w[1])).collect();
+    labels.push("all".to_owned());
+    labels
+}
+
+fn cell(energy: f64, n: f64, sigma_um: f64, slack: f64, limit: f64) -> Cell {
+    let n = n.max(1.0);
+    // The floor itself is known to about one percent: an excess below that is none.
+    let z = (energy - n) / (2.0 * n + (slack * n).powi(2)).sqrt();
+    Cell { rms_um: sigma_um * (energy / n).max(0.0).sqrt(), floor_um: sigma_um, z, flagged: z > limit }
+}
+
+/// Makes the map.
+pub(crate) fn map(ctx: &Context<'_>, fit: &Fit) -> DiscrepancyMap {
+    let sample_s = ctx.problem.base.sample_s;
+    let sigma = ctx.problem.noise.innovation_um();
+    let bands = BAND_EDGES_HZ.len() - 1;
+    // Records x (bands + 1) + 3 thirds, one-sided 5 % together: about 3.2 standard deviations for 60 cells.
+    let limit = 3.3;
+    let mut planner = RealFftPlanner::<f64>::new();
+    let mut rows = Vec::new();
+    for (r, e) in ctx.problem.records.iter().zip(&fit.innovations) {
+        let spectrum = transform(&mut planner, e);
+        let n = e.len();
+        let share = r.whitener.count() as f64 / n as f64;
+        let mut energy = vec![0.0; bands];
+        let mut bins = vec![0.0; bands];
+        for (k, x) in spectrum.iter().enumerate() {
+            let hz = k as f64 / (n as f64 * sample_s);
+            let Some(b) = BAND_EDGES_HZ.windows(2).position(|w| hz >= w[0] && hz < w[1]) else { continue };
+            let double = if k == 0 || 2 * k == n { 1.0 } else { 2.0 };
+            energy[b] += double * x.norm_sqr() / n as f64;
+            bins[b] += double * share;
+        }
+        let mut cells: Vec<Cell> =
+            (0..bands).map(|b| cell(energy[b], bins[b], sigma, 0.012, limit)).collect();
+        cells.push(cell(e.iter().map(|x| x * x).sum(), r.whitener.count() as f64, sigma, 0.012, limit));
+        rows.push(MapRow { name: r.name.clone(), cells });
+    }
+    for third in 0..3 {
+        let (mut energy, mut count) = (0.0, 0.0);
+        for (r, e) in ctx.problem.records.iter().zip(&fit.innovations) {
+            let n = e.len();
+            for k in third * n / 3..(third + 1) * n / 3 {
+                energy += e[k] * e[k];
+                count += f64::from(u8::from(r.whitener.counts(k)));
+            }
+        }
+        let name = ["first third", "middle third", "last third"][third];
+        rows.push(MapRow { name: name.to_owned(), cells: vec![cell(energy, count, sigma, 0.012, limit)] });
+    }
+    DiscrepancyMap { rows, ratios: ratios(ctx, fit, &mut planner) }
+}
+
+fn transform(planner: &mut RealFftPlanner<f64>, x: &[f64]) -> Vec<Complex<f64>> {
+    let plan = planner.plan_fft_forward(x.len());
+    let mut input = x.to_vec();
+    let mut output = plan.make_output_vec();
+    // Lengths come from the plan itself, so that this cannot fail; an empty answer would only leave the map blank.
+    if plan.process(&mut input, &mut output).is_err() {
+        output.fill(Complex::new(0.0, 0.0));
+    }
+    output
+}
+
+/// Complex ratio of measured to simulated, on whitened series, in bands a third of an octave wide.
+fn ratios(ctx: &Context<'_>, fit: &Fit, planner: &mut RealFftPlanner<f64>) -> Vec<BandRatio> {
+    let sample_s = ctx.problem.base.sample_s;
+    let sim = ctx.simulated(&fit.parts);
+    let centres: Vec<f64> =
+        (0..30).map(|i| 0.5 * 2f64.powf(f64::from(i) / 3.0)).filter(|f| *f < 0.45 / sample_s).collect();
+    let mut cross = vec![Complex::new(0.0, 0.0); centres.len()];
+    let mut power = vec![0.0; centres.len()];
+    for (i, r) in ctx.problem.records.iter().enumerate() {
+        if r.rest {
+            continue;
+        }
+        let n = r.u.len();
+        let mut s = vec![0.0; n];
+        r.whitener.apply(&sim[i], &mut s);
+        let (fs, fe) = (transform(planner, &s), transform(planner, &fit.innovations[i]));
+        for k in 1..fs.len() {
+            let hz = k as f64 / (n as f64 * sample_s);
+            let Some(b) = centres.iter().position(|c| (hz / c).log2().abs() <= 1.0 / 6.0) else { continue };
+            cross[b] += fe[k] * fs[k].conj() / n as f64;
+            power[b] += fs[k].norm_sqr() / n as f64;
+        }
+    }
+    centres
+        .iter()
+        .zip(cross.iter().zip(&power))
+        .filter(|(_, (_, p))| **p > 50.0)
+        .map(|(hz, (c, p))| {
+            let ratio = Complex::new(1.0, 0.0) + c / p;
+            BandRatio {
+                hz: *hz,
+                gain_db: 20.0 * ratio.norm().log10(),
+                phase_deg: ratio.arg().to_degrees(),
+                error: (1.0 / p).sqrt(),
+            }
+        })
+        .collect()
+}
+
+/// Sentences about where the null model fails.
+pub(crate) fn sentences(ctx: &Context<'_>, map: &DiscrepancyMap) -> Vec<String> {
+    let mut out = Vec::new();
+    let records = &ctx.problem.records;
+    let bands = BAND_EDGES_HZ.len() - 1;
+    let flagged: Vec<&MapRow> = map.rows.iter().take(records.len()).filter(|r| r.cells.iter().any(|c| c.flagged)).collect();
+    if flagged.is_empty() {
+        return vec!["nowhere: every record, band and third of the time is at the noise floor".to_owned()];
+    }
+    let mut hit = [false; BAND_EDGES_HZ.len() - 1];
+    for r in &flagged {
+        for (b, hit) in hit.iter_mut().enumerate() {
+            *hit |= r.cells[b].flagged;
+        }
+    }
+    let first = hit.iter().position(|h| *h);
+    let last = hit.iter().rposition(|h| *h);
+    let span = match (first, last) {
+        (Some(0), Some(l)) if l + 1 == bands => "at all frequencies".to_owned(),
+        (Some(0), Some(l)) => format!("below {} Hz", BAND_EDGES_HZ[l + 1]),
+        (Some(f), Some(l)) if l + 1 == bands => format!("above {} Hz", BAND_EDGES_HZ[f]),
+        (Some(f), Some(l)) => format!("between {} and {} Hz", BAND_EDGES_HZ[f], BAND_EDGES_HZ[l + 1]),
+        _ => "spread over all frequencies".to_owned(),
+    };
+    let names = if flagged.len() == records.len() {
+        "in every record".to_owned()
+    } else {
+        format!("in {}", flagged.iter().map(|r| r.name.as_str()).collect::<Vec<_>>().join(", "))
+    };
+    let rest = records.iter().position(|r| r.rest).map(|i| map.rows[i].cells.iter().any(|c| c.flagged));
+    let rest = match rest {
+        Some(true) => ", at rest too",
+        Some(false) => ", not at rest",
+        None => "",
+    };
+    out.push(format!("{span}, {names}{rest}"));
+    // Gain or phase.
+    let (mut gain, mut phase) = (Vec::new(), Vec::new());
+    for r in &map.ratios {
+        let g = 10f64.powf(r.gain_db / 20.0) - 1.0;
+        if g.abs() > (5.0 * r.error).max(0.01) {
+            gain.push((r.hz, r.gain_db));
+        }
+        if r.phase_deg.to_radians().abs() > (5.0 * r.error).max(0.01) {
+            phase.push((r.hz, r.phase_deg));
+        }
+    }
+    let widest = |v: &[(f64, f64)]| v.iter().copied().max_by(|a, b| a.1.abs().total_cmp(&b.1.abs()));
+    match (widest(&gain), widest(&phase)) {
+        (Some(g), Some(p)) => out.push(format!(
+            "gain and phase: measured over simulated reaches {:+.2} dB at {:.1} Hz and {:+.1} deg at {:.1} Hz",
+            g.1, g.0, p.1, p.0
+        )),
+        (Some(g), None) => out.push(format!("gain only: measured over simulated reaches {:+.2} dB at {:.1} Hz", g.1, g.0)),
+        (None, Some(p)) => out.push(format!("phase only: measured lies {:+.1} deg from simulated at {:.1} Hz", p.1, p.0)),
+        (None, None) => out.push("not in the mean response to the command (neither gain nor phase)".to_owned()),
+    }
+    // Time.
+    let thirds: Vec<f64> = map.rows[records.len()..].iter().map(|r| r.cells[0].rms_um.powi(2) - r.cells[0].floor_um.powi(2)).collect();
+    if let [a, _, c] = thirds[..] {
+        let most = a.max(c);
+        if most > 0.0 {
+            out.push(if a > 0.5 * c && c > 0.5 * a {
+                "from the start and evenly in time".to_owned()
+            } else if c > a {
+                format!("growing in time: the last third of the records has {:.1} times the excess of the first", c / a.max(1e-3 * c))
+            } else {
+                format!("fading in time: the first third of the records has {:.1} times the excess of the last", a / c.max(1e-3 * a))
+            });
+        }
+    }
+    // Amplitude: relative excess of the records by stroke.
+    let mut by_stroke: Vec<(f64, f64, &str)> = records
+        .iter()
+        .zip(&map.rows)
+        .filter(|(r, _)| !r.rest)
+        .map(|(r, m)| {
+            let rms = (r.u.iter().map(|u| u * u).sum::<f64>() / r.u.len() as f64).sqrt();
+            let c = &m.cells[bands];
+            ((c.rms_um.powi(2) - c.floor_um.powi(2)).max(0.0).sqrt(), rms, r.name.as_str())
+        })
+        .collect();
+    by_stroke.sort_by(|a, b| b.0.total_cmp(&a.0));
+    if let Some((excess, rms, name)) = by_stroke.first()
+        && *excess > 0.0
+    {
+        out.push(format!("largest in {name}: {:.3} um RMS of innovation beyond the floor at {rms:.2} um RMS of command", excess));
+    }
+    out
+}
