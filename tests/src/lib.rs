@@ -1,2 +1,4 @@
 //! Whole-system tests.
 #![forbid(unsafe_code)]
+
+pub mod truth;

@@ -18,11 +18,23 @@ pub(crate) struct Param {
 }
 
 const fn log(name: &'static str, lower: f64, upper: f64) -> Param {
-    Param { name, log: true, lower, upper, step: 1e-3 }
+    Param {
+        name,
+        log: true,
+        lower,
+        upper,
+        step: 1e-3,
+    }
 }
 
 const fn lin(name: &'static str, lower: f64, upper: f64, step: f64) -> Param {
-    Param { name, log: false, lower, upper, step }
+    Param {
+        name,
+        log: false,
+        lower,
+        upper,
+        step,
+    }
 }
 
 impl Param {
@@ -79,13 +91,19 @@ fn one<const N: usize>(values: [f64; N]) -> Vec<Vec<f64>> {
 }
 
 fn grid(a: &[f64], b: &[f64]) -> Vec<Vec<f64>> {
-    a.iter().flat_map(|x| b.iter().map(move |y| vec![*x, *y])).collect()
+    a.iter()
+        .flat_map(|x| b.iter().map(move |y| vec![*x, *y]))
+        .collect()
 }
 
 fn play_block(v: &[f64], s: &Scope) -> Block {
     let mut weights = [0.0; PLAY_LEVELS.len()];
     weights.copy_from_slice(&v[..PLAY_LEVELS.len()]);
-    Block::Play { stroke_um: s.stroke_um, weights, quadratic: v[PLAY_LEVELS.len()] }
+    Block::Play {
+        stroke_um: s.stroke_um,
+        weights,
+        quadratic: v[PLAY_LEVELS.len()],
+    }
 }
 
 const ANY: (f64, f64) = (f64::NEG_INFINITY, f64::INFINITY);
@@ -124,7 +142,10 @@ pub(crate) static VARIANTS: &[Variant] = &[
     Variant {
         id: "bubble",
         params: &[log("lag_s", 2e-5, 1.0)],
-        build: |v, _| Block::Bubble { lag_s: v[0], dissolution: 0.0 },
+        build: |v, _| Block::Bubble {
+            lag_s: v[0],
+            dissolution: 0.0,
+        },
         starts: |_| one([1e-4, 5e-4, 2e-3, 6e-3, 0.02, 0.06]),
         typical: (8e-5, 0.15),
         off_response: false,
@@ -132,8 +153,14 @@ pub(crate) static VARIANTS: &[Variant] = &[
     },
     Variant {
         id: "bubble",
-        params: &[log("lag_s", 2e-5, 1.0), lin("dissolution_per_s", -1.0, 1.0, 1e-4)],
-        build: |v, _| Block::Bubble { lag_s: v[0], dissolution: v[1] },
+        params: &[
+            log("lag_s", 2e-5, 1.0),
+            lin("dissolution_per_s", -1.0, 1.0, 1e-4),
+        ],
+        build: |v, _| Block::Bubble {
+            lag_s: v[0],
+            dissolution: v[1],
+        },
         starts: |_| grid(&[1e-3, 8e-3, 0.05], &[0.03]),
         typical: (8e-5, 0.15),
         off_response: false,
@@ -151,8 +178,16 @@ pub(crate) static VARIANTS: &[Variant] = &[
     Variant {
         id: "pzt-resonance",
         params: &[log("frequency_hz", 20.0, 4e4), log("damping", 0.002, 2.0)],
-        build: |v, _| Block::Resonance { w: TAU * v[0], zeta: v[1] },
-        starts: |_| grid(&[120.0, 200.0, 260.0, 330.0, 450.0, 700.0, 1200.0], &[0.03, 0.15, 0.6]),
+        build: |v, _| Block::Resonance {
+            w: TAU * v[0],
+            zeta: v[1],
+        },
+        starts: |_| {
+            grid(
+                &[120.0, 200.0, 260.0, 330.0, 450.0, 700.0, 1200.0],
+                &[0.03, 0.15, 0.6],
+            )
+        },
         typical: (150.0, 4e4),
         off_response: false,
         kind: Kind::Chain,
@@ -164,7 +199,11 @@ pub(crate) static VARIANTS: &[Variant] = &[
             log("beta_per_um", 0.02, 50.0),
             lin("gamma_per_um", -20.0, 20.0, 1e-3),
         ],
-        build: |v, _| Block::BoucWen { fraction: v[0], beta: v[1], gamma: v[2].clamp(-v[1], v[1]) },
+        build: |v, _| Block::BoucWen {
+            fraction: v[0],
+            beta: v[1],
+            gamma: v[2].clamp(-v[1], v[1]),
+        },
         starts: |s| {
             [0.3, 1.0, 3.0, 8.0]
                 .iter()
@@ -219,8 +258,14 @@ pub(crate) static VARIANTS: &[Variant] = &[
     },
     Variant {
         id: "saturation",
-        params: &[lin("low_um", -1e3, 1e4, 1e-3), lin("high_um", -1e3, 1e4, 1e-3)],
-        build: |v, _| Block::Saturation { low_um: v[0], high_um: v[1].max(v[0] + 1e-3) },
+        params: &[
+            lin("low_um", -1e3, 1e4, 1e-3),
+            lin("high_um", -1e3, 1e4, 1e-3),
+        ],
+        build: |v, _| Block::Saturation {
+            low_um: v[0],
+            high_um: v[1].max(v[0] + 1e-3),
+        },
         starts: |s| {
             [0.2, 0.35, 0.5, 0.7, 0.9]
                 .iter()
@@ -239,9 +284,13 @@ pub(crate) static VARIANTS: &[Variant] = &[
     Variant {
         id: "saturation",
         params: &[lin("high_um", -1e3, 1e4, 1e-3)],
-        build: |v, s| Block::Saturation { low_um: (s.low_um - 1.0).min(0.0), high_um: v[0] },
+        build: |v, s| Block::Saturation {
+            low_um: (s.low_um - 1.0).min(0.0),
+            high_um: v[0],
+        },
         starts: |s| {
-            one([0.2, 0.35, 0.5, 0.7, 0.9].map(|c| s.working_point_um + c * (s.high_um - s.working_point_um)))
+            one([0.2, 0.35, 0.5, 0.7, 0.9]
+                .map(|c| s.working_point_um + c * (s.high_um - s.working_point_um)))
         },
         typical: ANY,
         off_response: false,
@@ -250,9 +299,13 @@ pub(crate) static VARIANTS: &[Variant] = &[
     Variant {
         id: "saturation",
         params: &[lin("low_um", -1e3, 1e4, 1e-3)],
-        build: |v, s| Block::Saturation { low_um: v[0], high_um: (s.high_um + 1.0).max(40.0) },
+        build: |v, s| Block::Saturation {
+            low_um: v[0],
+            high_um: (s.high_um + 1.0).max(40.0),
+        },
         starts: |s| {
-            one([0.2, 0.35, 0.5, 0.7, 0.9].map(|c| s.working_point_um + c * (s.low_um - s.working_point_um)))
+            one([0.2, 0.35, 0.5, 0.7, 0.9]
+                .map(|c| s.working_point_um + c * (s.low_um - s.working_point_um)))
         },
         typical: ANY,
         off_response: false,
@@ -270,7 +323,10 @@ pub(crate) static VARIANTS: &[Variant] = &[
     Variant {
         id: "pdms-relaxation",
         params: &[log("time_s", 1e-3, 50.0), lin("strength", -0.8, 5.0, 1e-3)],
-        build: |v, _| Block::Relaxation { time_s: v[0], strength: v[1] },
+        build: |v, _| Block::Relaxation {
+            time_s: v[0],
+            strength: v[1],
+        },
         starts: |_| grid(&[0.01, 0.03, 0.1, 0.3, 1.0, 3.0], &[-0.1, 0.1]),
         typical: (0.03, 2.0),
         off_response: false,
@@ -345,18 +401,37 @@ pub(crate) static VARIANTS: &[Variant] = &[
 /// The flat form of an effect of a model file; `None` for those that are no part of the response.
 pub(crate) fn block_of(effect: &Effect, scope: &Scope) -> Option<Block> {
     Some(match *effect {
-        Effect::DriverLag { bandwidth_hz } => Block::DriverLag { w: TAU * bandwidth_hz },
-        Effect::SlewLimit { rate_um_per_s } => Block::SlewLimit { rate: rate_um_per_s },
+        Effect::DriverLag { bandwidth_hz } => Block::DriverLag {
+            w: TAU * bandwidth_hz,
+        },
+        Effect::SlewLimit { rate_um_per_s } => Block::SlewLimit {
+            rate: rate_um_per_s,
+        },
         Effect::Saturation { low_um, high_um } => Block::Saturation { low_um, high_um },
         Effect::PztHysteresis(
-            Hysteresis::BoucWen { fraction, beta_per_um, gamma_per_um }
-            | Hysteresis::BoucWenExplicit { fraction, beta_per_um, gamma_per_um },
-        ) => {
-            Block::BoucWen { fraction, beta: beta_per_um, gamma: gamma_per_um }
-        }
-        Effect::PztHysteresis(Hysteresis::Play { ref thresholds_um, ref weights, quadratic_per_um }) => {
+            Hysteresis::BoucWen {
+                fraction,
+                beta_per_um,
+                gamma_per_um,
+            }
+            | Hysteresis::BoucWenExplicit {
+                fraction,
+                beta_per_um,
+                gamma_per_um,
+            },
+        ) => Block::BoucWen {
+            fraction,
+            beta: beta_per_um,
+            gamma: gamma_per_um,
+        },
+        Effect::PztHysteresis(Hysteresis::Play {
+            ref thresholds_um,
+            ref weights,
+            quadratic_per_um,
+        }) => {
             // Only thresholds in this crate's own proportions can be held as a flat block.
-            let stroke_um = thresholds_um.last().copied().unwrap_or(scope.stroke_um) / PLAY_LEVELS[PLAY_LEVELS.len() - 1];
+            let stroke_um = thresholds_um.last().copied().unwrap_or(scope.stroke_um)
+                / PLAY_LEVELS[PLAY_LEVELS.len() - 1];
             let mut w = [0.0; PLAY_LEVELS.len()];
             for (i, l) in PLAY_LEVELS.iter().enumerate() {
                 w[i] = thresholds_um
@@ -365,22 +440,45 @@ pub(crate) fn block_of(effect: &Effect, scope: &Scope) -> Option<Block> {
                     .and_then(|j| weights.get(j).copied())
                     .unwrap_or(0.0);
             }
-            Block::Play { stroke_um, weights: w, quadratic: quadratic_per_um }
+            Block::Play {
+                stroke_um,
+                weights: w,
+                quadratic: quadratic_per_um,
+            }
         }
         Effect::PztCreep { per_decade } => Block::Creep { g: per_decade },
-        Effect::PztResonance { frequency_hz, damping } => Block::Resonance { w: TAU * frequency_hz, zeta: damping },
+        Effect::PztResonance {
+            frequency_hz,
+            damping,
+        } => Block::Resonance {
+            w: TAU * frequency_hz,
+            zeta: damping,
+        },
         Effect::Backlash { width_um } => Block::Backlash { width_um },
         Effect::PdmsRelaxation { time_s, strength } => Block::Relaxation { time_s, strength },
-        Effect::Bubble { lag_s, dissolution_per_s } => Block::Bubble { lag_s, dissolution: dissolution_per_s },
-        Effect::Leak { corner_rad_per_s } => Block::Leak { corner: corner_rad_per_s },
+        Effect::Bubble {
+            lag_s,
+            dissolution_per_s,
+        } => Block::Bubble {
+            lag_s,
+            dissolution: dissolution_per_s,
+        },
+        Effect::Leak { corner_rad_per_s } => Block::Leak {
+            corner: corner_rad_per_s,
+        },
         Effect::GainError { factor } => Block::Gain { factor },
         Effect::GainDrift { per_s } => Block::GainDrift { per_s },
-        Effect::WallAdhesion { speed_um_per_s } => Block::Adhesion { um_per_s: speed_um_per_s },
+        Effect::WallAdhesion { speed_um_per_s } => Block::Adhesion {
+            um_per_s: speed_um_per_s,
+        },
         Effect::FlowDrift { um_per_s } => Block::FlowDrift { um_per_s },
         Effect::TimeDelay { delay_s } => Block::Delay { s: delay_s },
         Effect::ExposureAveraging { exposure_s } => Block::Exposure { s: exposure_s },
         Effect::ClockSkew { ppm } => Block::ClockSkew { e: 1e-6 * ppm },
-        Effect::FrameDrops { .. } | Effect::FrameRepeats { .. } | Effect::PixelLocking { .. } | Effect::MainsHum { .. } => {
+        Effect::FrameDrops { .. }
+        | Effect::FrameRepeats { .. }
+        | Effect::PixelLocking { .. }
+        | Effect::MainsHum { .. } => {
             return None;
         }
     })
@@ -399,19 +497,27 @@ pub(crate) fn separate_by(id: &str, alternatives: &[String]) -> String {
         "gain-error" => {
             "actuator gain, pixel scale and bead height give the same factor: image a stage micrometer for the pixel scale, measure the piezo's displacement, and refocus on a bead at another height"
         }
-        "time-delay" => "excite to 300 Hz: a pole rolls off, an exposure follows a sinc, a delay does neither",
+        "time-delay" => {
+            "excite to 300 Hz: a pole rolls off, an exposure follows a sinc, a delay does neither"
+        }
         "driver-lag" | "exposure-averaging" | "bubble" | "pzt-resonance" => {
             "excite to 300 Hz and beyond: a pole rolls off, an exposure follows a sinc, a resonance peaks, a delay changes the phase only"
         }
-        "pzt-hysteresis" => "the same sine at a second amplitude and a second frequency, and its third harmonic",
+        "pzt-hysteresis" => {
+            "the same sine at a second amplitude and a second frequency, and its third harmonic"
+        }
         "backlash" | "wall-adhesion" => {
             "an amplitude sweep: the lag of backlash shrinks to nothing, hysteresis grows, adhesion stops the bead at small amplitude"
         }
         "pzt-creep" | "pdms-relaxation" | "leak" => {
             "steps both ways with holds of a minute: log-time tail (creep), exponential (relaxation), sag to zero (leak)"
         }
-        "saturation" | "slew-limit" => "the same amplitude at a tenth of the frequency: a slew limit vanishes, a clip stays",
-        "gain-drift" | "clock-skew" => "one long record: compare its first and its last third at a low and at a high frequency",
+        "saturation" | "slew-limit" => {
+            "the same amplitude at a tenth of the frequency: a slew limit vanishes, a clip stays"
+        }
+        "gain-drift" | "clock-skew" => {
+            "one long record: compare its first and its last third at a low and at a high frequency"
+        }
         _ => "a longer record with the same excitation",
     };
     text.to_owned()

@@ -27,14 +27,33 @@ impl Record {
     ///
     /// # Errors
     /// Columns of different length, fewer than 16 rows, times that do not rise or are not even, values not finite.
-    pub fn from_rows(name: &str, time_s: &[f64], pzt_um: &[f64], bead_um: &[f64]) -> Result<Self, ReconcileError> {
-        let bad = |row: usize, message: String| ReconcileError::Record { record: name.to_owned(), row, message };
+    pub fn from_rows(
+        name: &str,
+        time_s: &[f64],
+        pzt_um: &[f64],
+        bead_um: &[f64],
+    ) -> Result<Self, ReconcileError> {
+        let bad = |row: usize, message: String| ReconcileError::Record {
+            record: name.to_owned(),
+            row,
+            message,
+        };
         let n = time_s.len();
         if pzt_um.len() != n || bead_um.len() != n {
-            return Err(bad(0, format!("columns of {n}, {} and {} rows", pzt_um.len(), bead_um.len())));
+            return Err(bad(
+                0,
+                format!(
+                    "columns of {n}, {} and {} rows",
+                    pzt_um.len(),
+                    bead_um.len()
+                ),
+            ));
         }
         if n < 16 {
-            return Err(bad(n, format!("{n} rows are too few to say anything: at least 16 are needed")));
+            return Err(bad(
+                n,
+                format!("{n} rows are too few to say anything: at least 16 are needed"),
+            ));
         }
         for k in 0..n {
             if !time_s[k].is_finite() {
@@ -47,7 +66,11 @@ impl Record {
                 return Err(bad(k, "bead_um is infinite".to_owned()));
             }
         }
-        let mut steps: Vec<f64> = time_s.windows(2).map(|w| w[1] - w[0]).filter(|d| *d > 0.0).collect();
+        let mut steps: Vec<f64> = time_s
+            .windows(2)
+            .map(|w| w[1] - w[0])
+            .filter(|d| *d > 0.0)
+            .collect();
         if steps.is_empty() {
             return Err(bad(0, "time_s does not rise".to_owned()));
         }
@@ -57,10 +80,19 @@ impl Record {
         let span = time_s[n - 1] - time_s[0];
         let count = (span / rough).round();
         let sample_s = if count >= 1.0 { span / count } else { rough };
-        let sample_s = if (sample_s / rough - 1.0).abs() < 0.02 { sample_s } else { rough };
+        let sample_s = if (sample_s / rough - 1.0).abs() < 0.02 {
+            sample_s
+        } else {
+            rough
+        };
         let rows = (span / sample_s).round() as usize + 1;
         if rows > 20 * n + 1000 {
-            return Err(bad(0, format!("{rows} sample times of {sample_s} s but only {n} rows: the record is mostly gaps")));
+            return Err(bad(
+                0,
+                format!(
+                    "{rows} sample times of {sample_s} s but only {n} rows: the record is mostly gaps"
+                ),
+            ));
         }
         let mut pzt = vec![f64::NAN; rows];
         let mut bead = vec![f64::NAN; rows];
@@ -81,7 +113,15 @@ impl Record {
         let filled: Vec<bool> = pzt.iter().map(|v| v.is_nan()).collect();
         fill(&mut pzt);
         let resolution_um = resolution(&bead);
-        Ok(Self { name: name.to_owned(), sample_s, start_s: time_s[0], pzt_um: pzt, bead_um: bead, filled, resolution_um })
+        Ok(Self {
+            name: name.to_owned(),
+            sample_s,
+            start_s: time_s[0],
+            pzt_um: pzt,
+            bead_um: bead,
+            filled,
+            resolution_um,
+        })
     }
 
     /// Number of rows.
@@ -107,7 +147,11 @@ impl Record {
 
     /// Smallest and largest command \[um\].
     pub fn pzt_range_um(&self) -> (f64, f64) {
-        self.pzt_um.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), &v| (a.min(v), b.max(v)))
+        self.pzt_um
+            .iter()
+            .fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), &v| {
+                (a.min(v), b.max(v))
+            })
     }
 
     /// The smallest period, in rows, at which the whole command repeats itself; `None` without one (or at rest).
@@ -121,8 +165,13 @@ impl Record {
         let u = &self.pzt_um;
         // A multisine may need one period of run-in; compare the later part only.
         (20..=n / 2).find(|&p| {
-            (n - p..n).rev().step_by(7).all(|k| (u[k] - u[k - p]).abs() <= tolerance)
-                && (p..n).step_by(3).all(|k| (u[k] - u[k - p]).abs() <= tolerance)
+            (n - p..n)
+                .rev()
+                .step_by(7)
+                .all(|k| (u[k] - u[k - p]).abs() <= tolerance)
+                && (p..n)
+                    .step_by(3)
+                    .all(|k| (u[k] - u[k - p]).abs() <= tolerance)
         })
     }
 
@@ -145,20 +194,38 @@ impl Record {
 pub(crate) fn canonical(mut records: Vec<Record>) -> Vec<Record> {
     let key = |r: &Record| -> Vec<u64> {
         let mut k: Vec<u64> = vec![r.start_s.to_bits(), r.rows() as u64];
-        k.extend(r.pzt_um.iter().chain(r.bead_um.iter()).step_by(r.rows() / 16 + 1).map(|v| v.to_bits()));
+        k.extend(
+            r.pzt_um
+                .iter()
+                .chain(r.bead_um.iter())
+                .step_by(r.rows() / 16 + 1)
+                .map(|v| v.to_bits()),
+        );
         k
     };
-    records.sort_by(|a, b| a.start_s.total_cmp(&b.start_s).then_with(|| key(a).cmp(&key(b))));
+    records.sort_by(|a, b| {
+        a.start_s
+            .total_cmp(&b.start_s)
+            .then_with(|| key(a).cmp(&key(b)))
+    });
     let mut joined: Vec<Record> = Vec::new();
     for r in records {
-        let last_bead = |j: &Record| j.bead_um.iter().rev().take(5).copied().find(|b| b.is_finite());
+        let last_bead = |j: &Record| {
+            j.bead_um
+                .iter()
+                .rev()
+                .take(5)
+                .copied()
+                .find(|b| b.is_finite())
+        };
         let first_bead = r.bead_um.iter().take(5).copied().find(|b| b.is_finite());
         let before = joined
             .iter()
             .enumerate()
             .filter(|(_, j)| {
                 let end = j.start_s + j.rows() as f64 * j.sample_s;
-                (r.start_s - end).abs() < 0.2 * r.sample_s && (j.sample_s / r.sample_s - 1.0).abs() < 1e-3
+                (r.start_s - end).abs() < 0.2 * r.sample_s
+                    && (j.sample_s / r.sample_s - 1.0).abs() < 1e-3
             })
             .filter_map(|(i, j)| Some((i, (last_bead(j)? - first_bead?).abs())))
             // The bead does not jump between two samples: a few micrometres at most at full drive.
@@ -190,11 +257,18 @@ fn fill(u: &mut [f64]) {
     }
     let n = u.len();
     let known: Vec<f64> = u.to_vec();
-    let scale = known.iter().filter(|v| v.is_finite()).fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), &v| (a.min(v), b.max(v)));
+    let scale = known
+        .iter()
+        .filter(|v| v.is_finite())
+        .fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), &v| {
+            (a.min(v), b.max(v))
+        });
     let tolerance = 1e-4 * (scale.1 - scale.0) + 1.1e-5;
     let agrees = |p: usize| {
         (p..n).step_by(3).all(|k| {
-            known[k].is_nan() || known[k - p].is_nan() || (known[k] - known[k - p]).abs() <= tolerance
+            known[k].is_nan()
+                || known[k - p].is_nan()
+                || (known[k] - known[k - p]).abs() <= tolerance
         })
     };
     let period = (20..=n / 2).find(|&p| agrees(p));
@@ -218,7 +292,10 @@ fn fill(u: &mut [f64]) {
                 }
             }
             if value.is_nan() {
-                let (a, b) = (if k > 0 { u[k - 1] } else { f64::NAN }, if end < n { known[end] } else { f64::NAN });
+                let (a, b) = (
+                    if k > 0 { u[k - 1] } else { f64::NAN },
+                    if end < n { known[end] } else { f64::NAN },
+                );
                 value = match (a.is_nan(), b.is_nan()) {
                     (false, false) => a + (b - a) * (i + 1 - k) as f64 / (end + 1 - k) as f64,
                     (false, true) => a,

@@ -17,7 +17,9 @@ pub enum ReconcileError {
     #[error("no records: give at least one CSV file or run folder with time_s, pzt_um and bead_um")]
     NoRecords,
     /// Records of different sample times.
-    #[error("record `{record}` is sampled every {found_s} s, the others every {expected_s} s: resample or run them apart")]
+    #[error(
+        "record `{record}` is sampled every {found_s} s, the others every {expected_s} s: resample or run them apart"
+    )]
     SampleTime {
         /// The record that differs.
         record: String,
@@ -54,7 +56,9 @@ pub enum ReconcileError {
         hint: &'static str,
     },
     /// Commands that never come near the model's working point.
-    #[error("pzt_um runs from {low_um:.2} to {high_um:.2}, but the model's working point is {working_point_um} um: {hint}")]
+    #[error(
+        "pzt_um runs from {low_um:.2} to {high_um:.2}, but the model's working point is {working_point_um} um: {hint}"
+    )]
     WorkingPoint {
         /// Smallest command.
         low_um: f64,

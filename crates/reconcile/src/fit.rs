@@ -19,7 +19,12 @@ pub(crate) struct Part {
 impl Part {
     /// From natural values.
     pub fn new(variant: usize, natural: &[f64]) -> Self {
-        let theta = VARIANTS[variant].params.iter().zip(natural).map(|(p, v)| p.coordinate(*v)).collect();
+        let theta = VARIANTS[variant]
+            .params
+            .iter()
+            .zip(natural)
+            .map(|(p, v)| p.coordinate(*v))
+            .collect();
         Self { variant, theta }
     }
 
@@ -29,7 +34,12 @@ impl Part {
 
     /// Parameter values in their units.
     pub fn natural(&self) -> Vec<f64> {
-        self.variant().params.iter().zip(&self.theta).map(|(p, x)| p.natural(*x)).collect()
+        self.variant()
+            .params
+            .iter()
+            .zip(&self.theta)
+            .map(|(p, x)| p.natural(*x))
+            .collect()
     }
 
     fn block(&self, scope: &Scope) -> Block {
@@ -66,8 +76,11 @@ pub(crate) struct WhiteEvidence {
 impl WhiteEvidence {
     /// Squared distance, in standard deviations, between the estimate and what a set of parts leads one to expect.
     pub fn distance(&self, parts: &[Part], sample_s: f64) -> f64 {
-        let exposure_s: f64 =
-            parts.iter().filter(|p| p.variant().id == "exposure-averaging").map(|p| p.natural()[0]).sum();
+        let exposure_s: f64 = parts
+            .iter()
+            .filter(|p| p.variant().id == "exposure-averaging")
+            .map(|p| p.natural()[0])
+            .sum();
         let expected = self.model_um2 - self.walk_um2 * (exposure_s / sample_s).min(2.0) / 6.0;
         ((self.estimate_um2 - expected) / self.error_um2).powi(2)
     }
@@ -96,7 +109,10 @@ pub(crate) struct Fit {
 impl Fit {
     /// Free parameters that describe effects: of the parts, and the amplitudes of lines.
     pub fn freedom(&self) -> usize {
-        self.parts.iter().map(|p| freedom_of(p.variant(), self.innovations.len())).sum()
+        self.parts
+            .iter()
+            .map(|p| freedom_of(p.variant(), self.innovations.len()))
+            .sum()
     }
 
     pub fn has(&self, id: &str) -> bool {
@@ -108,7 +124,12 @@ impl Fit {
         self.innovations
             .iter()
             .zip(mask)
-            .map(|(e, ranges)| ranges.iter().map(|r| e[r.clone()].iter().map(|x| x * x).sum::<f64>()).sum::<f64>())
+            .map(|(e, ranges)| {
+                ranges
+                    .iter()
+                    .map(|r| e[r.clone()].iter().map(|x| x * x).sum::<f64>())
+                    .sum::<f64>()
+            })
             .sum()
     }
 }
@@ -123,11 +144,13 @@ pub(crate) fn freedom_of(v: &Variant, records: usize) -> usize {
         }
 }
 
+/// Columns of one record: (index of the parameter, whitened derivative).
+type Columns = Vec<(usize, Vec<f64>)>;
+
 /// Whitened tangents of a fit: what further candidates are projected against.
 pub(crate) struct Tangents {
     /// Per record: (index of the parameter, whitened column).
-    columns: Vec<Vec<(usize, Vec<f64>)>>,
-    normal: DMatrix<f64>,
+    columns: Vec<Columns>,
     inverse: DMatrix<f64>,
     gradient: DVector<f64>,
 }
@@ -191,7 +214,9 @@ impl Context<'_> {
                     Kind::Line => {
                         let [a, b] = fit.lines[line][i];
                         if a != 0.0 || b != 0.0 {
-                            self.rotate(p.natural()[0], e.len(), |k, sin, cos| e[k] -= a * sin + b * cos);
+                            self.rotate(p.natural()[0], e.len(), |k, sin, cos| {
+                                e[k] -= a * sin + b * cos
+                            });
                         }
                         line += 1;
                     }
@@ -218,7 +243,13 @@ impl Context<'_> {
             innovations.push(w);
         }
         let chi2 = sum_squares(&innovations, mask);
-        State { sim, residual, innovations, soft, chi2 }
+        State {
+            sim,
+            residual,
+            innovations,
+            soft,
+            chi2,
+        }
     }
 
     /// Calls `f(k, sin, cos)` of a line at every row.
@@ -230,9 +261,9 @@ impl Context<'_> {
     }
 
     /// Whitened derivative columns of the innovations at a state.
-    fn columns(&self, fit: &Fit, state: &State) -> (usize, Vec<Vec<(usize, Vec<f64>)>>) {
+    fn columns(&self, fit: &Fit, state: &State) -> (usize, Vec<Columns>) {
         let records = &self.problem.records;
-        let mut columns: Vec<Vec<(usize, Vec<f64>)>> = records.iter().map(|_| Vec::new()).collect();
+        let mut columns: Vec<Columns> = records.iter().map(|_| Vec::new()).collect();
         let mut next = 0;
         let (mut line, mut position) = (0, 0);
         for (index, part) in fit.parts.iter().enumerate() {
@@ -242,8 +273,11 @@ impl Context<'_> {
                         let (parts, step) = self.nudged(&fit.parts, index, j, p);
                         let moved = self.simulated(&parts);
                         for (i, r) in records.iter().enumerate() {
-                            let d: Vec<f64> =
-                                moved[i].iter().zip(&state.sim[i]).map(|(a, b)| (b - a) / step).collect();
+                            let d: Vec<f64> = moved[i]
+                                .iter()
+                                .zip(&state.sim[i])
+                                .map(|(a, b)| (b - a) / step)
+                                .collect();
                             let mut c = vec![0.0; d.len()];
                             r.whitener.apply(&d, &mut c);
                             columns[i].push((next, c));
@@ -258,7 +292,8 @@ impl Context<'_> {
                         let [a, b] = fit.lines[line][i];
                         let mut d = [vec![0.0; n], vec![0.0; n], vec![0.0; n]];
                         self.rotate(hz, n, |k, s, c| {
-                            d[0][k] = -TAU * k as f64 * self.problem.base.sample_s * (a * c - b * s);
+                            d[0][k] =
+                                -TAU * k as f64 * self.problem.base.sample_s * (a * c - b * s);
                             d[1][k] = -s;
                             d[2][k] = -c;
                         });
@@ -312,7 +347,12 @@ impl Context<'_> {
     fn nudged(&self, parts: &[Part], index: usize, j: usize, p: &Param) -> (Vec<Part>, f64) {
         let mut parts = parts.to_vec();
         let x = parts[index].theta[j];
-        let mut step = p.step * if p.log { 1.0 } else { (x.abs() / (50.0 * p.step)).clamp(1.0, 10.0) };
+        let mut step = p.step
+            * if p.log {
+                1.0
+            } else {
+                (x.abs() / (50.0 * p.step)).clamp(1.0, 10.0)
+            };
         if (if p.log { (x + step).exp() } else { x + step }) > p.upper {
             step = -step;
         }
@@ -331,10 +371,22 @@ impl Context<'_> {
     }
 
     /// As [`Self::fit`], with the nuisances of an earlier fit as starting values where they apply.
-    pub fn fit_from(&self, parts: Vec<Part>, soft: Option<f64>, mask: &Mask, iterations: usize) -> Fit {
+    pub fn fit_from(
+        &self,
+        parts: Vec<Part>,
+        soft: Option<f64>,
+        mask: &Mask,
+        iterations: usize,
+    ) -> Fit {
         let records = self.problem.records.len();
-        let lines = parts.iter().filter(|p| p.variant().kind == Kind::Line).count();
-        let positions = parts.iter().filter(|p| p.variant().kind == Kind::Position).count();
+        let lines = parts
+            .iter()
+            .filter(|p| p.variant().kind == Kind::Line)
+            .count();
+        let positions = parts
+            .iter()
+            .filter(|p| p.variant().kind == Kind::Position)
+            .count();
         let fit = Fit {
             parts,
             soft: soft.unwrap_or(0.0),
@@ -368,7 +420,9 @@ impl Context<'_> {
             for _ in 0..8 {
                 let mut damped = normal.clone();
                 for i in 0..n {
-                    damped[(i, i)] += lambda * normal[(i, i)] + 1e-12 + if normal[(i, i)] == 0.0 { 1.0 } else { 0.0 };
+                    damped[(i, i)] += lambda * normal[(i, i)]
+                        + 1e-12
+                        + if normal[(i, i)] == 0.0 { 1.0 } else { 0.0 };
                 }
                 let Some(step) = damped.cholesky().map(|c| c.solve(&(-&g))) else {
                     lambda *= 10.0;
@@ -397,9 +451,12 @@ impl Context<'_> {
         fit.innovations = state.innovations;
         let mut regular = normal.clone();
         for i in 0..size {
-            regular[(i, i)] += 1e-9 * normal[(i, i)] + if normal[(i, i)] == 0.0 { 1e9 } else { 0.0 };
+            regular[(i, i)] +=
+                1e-9 * normal[(i, i)] + if normal[(i, i)] == 0.0 { 1e9 } else { 0.0 };
         }
-        let inverse = regular.try_inverse().unwrap_or_else(|| DMatrix::identity(size, size));
+        let inverse = regular
+            .try_inverse()
+            .unwrap_or_else(|| DMatrix::identity(size, size));
         fit.covariance = self.effect_covariance(&fit, &inverse);
         fit
     }
@@ -415,14 +472,19 @@ impl Context<'_> {
                 Kind::Chain => {
                     for (x, p) in part.theta.iter_mut().zip(v.params) {
                         // A logarithm that wants to move more than a factor of four is not in its linear range.
-                        let d = if p.log { step[next].clamp(-1.4, 1.4) } else { step[next] };
+                        let d = if p.log {
+                            step[next].clamp(-1.4, 1.4)
+                        } else {
+                            step[next]
+                        };
                         *x = p.coordinate(p.natural(*x + d));
                         next += 1;
                     }
                 }
                 Kind::Line => {
                     let p = &v.params[0];
-                    part.theta[0] = p.coordinate(p.natural(part.theta[0] + step[next].clamp(-0.05, 0.05)));
+                    part.theta[0] =
+                        p.coordinate(p.natural(part.theta[0] + step[next].clamp(-0.05, 0.05)));
                     for i in 0..records {
                         t.lines[line][i][0] += step[next + 1 + 2 * i];
                         t.lines[line][i][1] += step[next + 2 + 2 * i];
@@ -432,7 +494,8 @@ impl Context<'_> {
                 }
                 Kind::Position => {
                     let p = &v.params[0];
-                    part.theta[0] = p.coordinate(p.natural(part.theta[0] + step[next].clamp(-0.02, 0.02)));
+                    part.theta[0] =
+                        p.coordinate(p.natural(part.theta[0] + step[next].clamp(-0.02, 0.02)));
                     t.positions[position][0] += step[next + 1];
                     t.positions[position][1] += step[next + 2];
                     next += 3;
@@ -453,7 +516,9 @@ impl Context<'_> {
             indices.extend(next..next + n);
             next += freedom_of(part.variant(), self.problem.records.len());
         }
-        DMatrix::from_fn(indices.len(), indices.len(), |i, j| inverse[(indices[i], indices[j])])
+        DMatrix::from_fn(indices.len(), indices.len(), |i, j| {
+            inverse[(indices[i], indices[j])]
+        })
     }
 
     /// Tangents at a fit, for screening further candidates.
@@ -463,10 +528,17 @@ impl Context<'_> {
         let (normal, gradient) = normal_equations(n, &columns, &state.innovations, mask);
         let mut regular = normal.clone();
         for i in 0..n {
-            regular[(i, i)] += 1e-9 * normal[(i, i)] + if normal[(i, i)] == 0.0 { 1.0 } else { 0.0 };
+            regular[(i, i)] +=
+                1e-9 * normal[(i, i)] + if normal[(i, i)] == 0.0 { 1.0 } else { 0.0 };
         }
-        let inverse = regular.try_inverse().unwrap_or_else(|| DMatrix::identity(n, n));
-        Tangents { columns, normal, inverse, gradient }
+        let inverse = regular
+            .try_inverse()
+            .unwrap_or_else(|| DMatrix::identity(n, n));
+        Tangents {
+            columns,
+            inverse,
+            gradient,
+        }
     }
 
     /// Innovations of a set with given nuisances, without fitting.
@@ -511,24 +583,33 @@ impl Tangents {
         let dd2 = dd - jd.dot(&w);
         let de2 = de - self.gradient.dot(&w);
         if dd2 <= 1e-6 * dd || dd <= 0.0 {
-            return Gain { score: 0.0, scale: 0.0 };
+            return Gain {
+                score: 0.0,
+                scale: 0.0,
+            };
         }
-        Gain { score: de2 * de2 / dd2, scale: -de2 / dd2 }
-    }
-
-    /// Number of tangents.
-    pub fn len(&self) -> usize {
-        self.normal.nrows()
+        Gain {
+            score: de2 * de2 / dd2,
+            scale: -de2 / dd2,
+        }
     }
 }
 
 fn sum_squares(e: &[Vec<f64>], mask: &Mask) -> f64 {
-    e.iter().zip(mask).map(|(e, ranges)| ranges.iter().map(|r| dot(&e[r.clone()], &e[r.clone()])).sum::<f64>()).sum()
+    e.iter()
+        .zip(mask)
+        .map(|(e, ranges)| {
+            ranges
+                .iter()
+                .map(|r| dot(&e[r.clone()], &e[r.clone()]))
+                .sum::<f64>()
+        })
+        .sum()
 }
 
 fn normal_equations(
     n: usize,
-    columns: &[Vec<(usize, Vec<f64>)>],
+    columns: &[Columns],
     e: &[Vec<f64>],
     mask: &Mask,
 ) -> (DMatrix<f64>, DVector<f64>) {
@@ -556,7 +637,12 @@ fn normal_equations(
 pub(crate) fn dot(a: &[f64], b: &[f64]) -> f64 {
     let mut s = [0.0f64; 8];
     let (ac, bc) = (a.chunks_exact(8), b.chunks_exact(8));
-    let rest: f64 = ac.remainder().iter().zip(bc.remainder()).map(|(x, y)| x * y).sum();
+    let rest: f64 = ac
+        .remainder()
+        .iter()
+        .zip(bc.remainder())
+        .map(|(x, y)| x * y)
+        .sum();
     for (x, y) in ac.zip(bc) {
         for i in 0..8 {
             s[i] += x[i] * y[i];

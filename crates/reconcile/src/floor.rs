@@ -10,7 +10,11 @@ use std::f64::consts::TAU;
 /// repeats, the difference of successive periods cancels every response that repeats. The smallest of these rules: a
 /// misfit can only add. Without either, increments of the residuals are all there is: then the second answer, the number of
 /// increments that can be trusted, is 0.
-pub(crate) fn estimate(records: &[Record], present: &[Vec<bool>], residuals: &[Vec<f64>]) -> (Noise, usize) {
+pub(crate) fn estimate(
+    records: &[Record],
+    present: &[Vec<bool>],
+    residuals: &[Vec<f64>],
+) -> (Noise, usize) {
     let mut found: Vec<(f64, f64, usize, f64)> = Vec::new();
     let mut fallback: Vec<(f64, f64, usize, f64)> = Vec::new();
     for ((r, present), e) in records.iter().zip(present).zip(residuals) {
@@ -34,12 +38,19 @@ pub(crate) fn estimate(records: &[Record], present: &[Vec<bool>], residuals: &[V
             continue;
         }
         let sigma = Noise::from_increments(c0, c1).innovation_um();
-        if good { found.push((c0, c1, n, sigma)) } else { fallback.push((c0, c1, n, sigma)) }
+        if good {
+            found.push((c0, c1, n, sigma))
+        } else {
+            fallback.push((c0, c1, n, sigma))
+        }
     }
     let trusted = !found.is_empty();
     let pool = if found.is_empty() { fallback } else { found };
     let Some(least) = pool.iter().map(|f| f.3).min_by(f64::total_cmp) else {
-        return (Noise::new(0.33, records.first().map_or(1e-3, |r| r.sample_s), 0.03), 0);
+        return (
+            Noise::new(0.33, records.first().map_or(1e-3, |r| r.sample_s), 0.03),
+            0,
+        );
     };
     let (mut c0, mut c1, mut n) = (0.0, 0.0, 0.0);
     for f in pool.iter().filter(|f| f.3 <= 1.03 * least) {
@@ -47,7 +58,10 @@ pub(crate) fn estimate(records: &[Record], present: &[Vec<bool>], residuals: &[V
         c1 += f.1 * f.2 as f64;
         n += f.2 as f64;
     }
-    (Noise::from_increments(c0 / n, c1 / n), if trusted { n as usize } else { 0 })
+    (
+        Noise::from_increments(c0 / n, c1 / n),
+        if trusted { n as usize } else { 0 },
+    )
 }
 
 /// From the innovations' own model: increments of the raw residuals of a fit that is believed.
@@ -59,7 +73,11 @@ pub(crate) fn from_residuals(present: &[Vec<bool>], residuals: &[Vec<f64>]) -> N
         c1 += b * m as f64;
         n += m as f64;
     }
-    if n == 0.0 { Noise::new(0.33, 1e-3, 0.03) } else { Noise::from_increments(c0 / n, c1 / n) }
+    if n == 0.0 {
+        Noise::new(0.33, 1e-3, 0.03)
+    } else {
+        Noise::from_increments(c0 / n, c1 / n)
+    }
 }
 
 /// Takes lines at 50 and 60 Hz and their second harmonics off.

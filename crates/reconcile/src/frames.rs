@@ -41,7 +41,14 @@ impl FrameCounts {
 
 /// Counts missing frames and exact repeats.
 pub(crate) fn count(records: &[Record]) -> FrameCounts {
-    let mut c = FrameCounts { rows: 0, missing: 0, pairs: 0, repeats: 0, by_chance: 0.0, repeated: Vec::new() };
+    let mut c = FrameCounts {
+        rows: 0,
+        missing: 0,
+        pairs: 0,
+        repeats: 0,
+        by_chance: 0.0,
+        repeated: Vec::new(),
+    };
     for r in records {
         let n = r.rows();
         c.rows += n;
@@ -49,7 +56,7 @@ pub(crate) fn count(records: &[Record]) -> FrameCounts {
         let mut repeated = vec![false; n];
         let step = r.resolution_um;
         let mut near = 0usize;
-        for k in 1..n {
+        for (k, repeats) in repeated.iter_mut().enumerate().skip(1) {
             let (a, b) = (r.bead_um[k - 1], r.bead_um[k]);
             if a.is_nan() || b.is_nan() {
                 continue;
@@ -57,7 +64,7 @@ pub(crate) fn count(records: &[Record]) -> FrameCounts {
             c.pairs += 1;
             let d = (b - a).abs();
             if d == 0.0 || d < 1e-3 * step {
-                repeated[k] = true;
+                *repeats = true;
                 c.repeats += 1;
             } else if step > 0.0 && d < 10.5 * step {
                 near += 1;

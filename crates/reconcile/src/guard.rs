@@ -9,7 +9,9 @@ pub(crate) const NEEDED_S: f64 = 5.0;
 
 /// What can be seen without a model.
 pub(crate) fn records(records: &[Record]) -> Result<(), ReconcileError> {
-    let Some(first) = records.first() else { return Err(ReconcileError::NoRecords) };
+    let Some(first) = records.first() else {
+        return Err(ReconcileError::NoRecords);
+    };
     for r in records {
         if (r.sample_s / first.sample_s - 1.0).abs() > 1e-3 {
             return Err(ReconcileError::SampleTime {
@@ -25,22 +27,33 @@ pub(crate) fn records(records: &[Record]) -> Result<(), ReconcileError> {
     }
     let seconds: f64 = moving.iter().map(|r| r.frames() as f64 * r.sample_s).sum();
     let rows: usize = records.iter().map(Record::frames).sum();
-    let needed_s = NEEDED_S * (first.sample_s / 1e-3).max(1.0).min(4.0);
+    let needed_s = NEEDED_S * (first.sample_s / 1e-3).clamp(1.0, 4.0);
     if seconds < needed_s || rows < 2000 {
-        return Err(ReconcileError::TooShort { seconds, rows, needed_s });
+        return Err(ReconcileError::TooShort {
+            seconds,
+            rows,
+            needed_s,
+        });
     }
     Ok(())
 }
 
 /// What the working point says about the command's unit.
-pub(crate) fn working_point(records: &[Record], working_point_um: f64) -> Result<(), ReconcileError> {
+pub(crate) fn working_point(
+    records: &[Record],
+    working_point_um: f64,
+) -> Result<(), ReconcileError> {
     let (low, high) = records
         .iter()
         .map(Record::pzt_range_um)
-        .fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), (c, d)| (a.min(c), b.max(d)));
+        .fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), (c, d)| {
+            (a.min(c), b.max(d))
+        });
     let span = (high - low).max(1e-9);
     if working_point_um < low - 0.5 * span || working_point_um > high + 0.5 * span {
-        let volts = low >= -0.5 && high <= 10.5 && (0.5 * (low + high) * 4.0 / working_point_um - 1.0).abs() < 0.5;
+        let volts = low >= -0.5
+            && high <= 10.5
+            && (0.5 * (low + high) * 4.0 / working_point_um - 1.0).abs() < 0.5;
         return Err(ReconcileError::WorkingPoint {
             low_um: low,
             high_um: high,
@@ -77,7 +90,10 @@ pub(crate) fn motion(ctx: &Context<'_>) -> Result<(), ReconcileError> {
     let (mut best, mut gain) = (0.0f64, 0.0f64);
     let ss: f64 = white.iter().map(|(_, s)| dot(s, s)).sum();
     for d in 0..=most {
-        let ys: f64 = white.iter().map(|(y, s)| dot(&y[d.min(y.len())..], &s[..s.len().saturating_sub(d)])).sum();
+        let ys: f64 = white
+            .iter()
+            .map(|(y, s)| dot(&y[d.min(y.len())..], &s[..s.len().saturating_sub(d)]))
+            .sum();
         if ss > 0.0 && ys * ys / ss > best {
             best = ys * ys / ss;
             gain = ys / ss;
@@ -94,26 +110,50 @@ pub(crate) fn motion(ctx: &Context<'_>) -> Result<(), ReconcileError> {
         return Ok(());
     }
     let explained = best / excess;
-    let units = |what, hint| Err(ReconcileError::Units { what, ratio: gain, hint });
+    let units = |what, hint| {
+        Err(ReconcileError::Units {
+            what,
+            ratio: gain,
+            hint,
+        })
+    };
     if explained > 0.25 {
         if gain < 0.0 {
-            return units("sign", "the bead moves against the model: swap the sign of the bead or of the command");
+            return units(
+                "sign",
+                "the bead moves against the model: swap the sign of the bead or of the command",
+            );
         }
         if gain > 100.0 {
-            return units("bead_um looks like nanometres", "divide the column by 1000, or pass its scale with --output-um-per-unit 0.001");
+            return units(
+                "bead_um looks like nanometres",
+                "divide the column by 1000, or pass its scale with --output-um-per-unit 0.001",
+            );
         }
         if gain < 0.01 {
-            return units("bead_um looks like millimetres", "multiply the column by 1000, or pass its scale with --output-um-per-unit 1000");
+            return units(
+                "bead_um looks like millimetres",
+                "multiply the column by 1000, or pass its scale with --output-um-per-unit 1000",
+            );
         }
         if (3.0..5.5).contains(&gain) {
-            return units("pzt_um looks like volts", "convert at 4 um per volt, or pass its scale with --input-um-per-unit 4");
+            return units(
+                "pzt_um looks like volts",
+                "convert at 4 um per volt, or pass its scale with --input-um-per-unit 4",
+            );
         }
         if !(0.3..=3.0).contains(&gain) {
-            return units("the gain of command or position", "check the units of both columns and the model file");
+            return units(
+                "the gain of command or position",
+                "check the units of both columns and the model file",
+            );
         }
         return Ok(());
     }
-    Err(ReconcileError::AnotherRig { explained_percent: 100.0 * explained.clamp(0.0, 1.0), detail: String::new() })
+    Err(ReconcileError::AnotherRig {
+        explained_percent: 100.0 * explained.clamp(0.0, 1.0),
+        detail: String::new(),
+    })
 }
 
 fn without_ramp(y: &[f64], present: &[bool]) -> Vec<f64> {
@@ -133,5 +173,15 @@ fn without_ramp(y: &[f64], present: &[bool]) -> Vec<f64> {
         return y.to_vec();
     }
     let (slope, offset) = ((n * ty - t1 * y1) / det, (t2 * y1 - t1 * ty) / det);
-    y.iter().zip(present).enumerate().map(|(k, (v, p))| if *p { v - offset - slope * k as f64 } else { 0.0 }).collect()
+    y.iter()
+        .zip(present)
+        .enumerate()
+        .map(|(k, (v, p))| {
+            if *p {
+                v - offset - slope * k as f64
+            } else {
+                0.0
+            }
+        })
+        .collect()
 }

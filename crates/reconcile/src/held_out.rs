@@ -44,30 +44,53 @@ pub(crate) fn check(ctx: &Context<'_>, fit: &Fit, threads: usize) -> HeldOut {
         } else {
             fit.clone()
         };
-        (null.chi2_on(&test), refit.chi2_on(&test), ctx.problem.count(&test))
+        (
+            null.chi2_on(&test),
+            refit.chi2_on(&test),
+            ctx.problem.count(&test),
+        )
     });
     let per_record: Vec<RecordGap> = records
         .iter()
         .zip(&results)
         .map(|(r, (before, after, n))| {
             let rms = |c: f64| sigma * (c / (*n).max(1) as f64).sqrt();
-            RecordGap { record: r.name.clone(), before: rms(*before), after: rms(*after) }
+            RecordGap {
+                record: r.name.clone(),
+                before: rms(*before),
+                after: rms(*after),
+            }
         })
         .collect();
     let total: f64 = results.iter().map(|r| r.2 as f64).sum::<f64>().max(1.0);
-    let rms = |pick: fn(&(f64, f64, usize)) -> f64| sigma * (results.iter().map(pick).sum::<f64>() / total).sqrt();
+    let rms = |pick: fn(&(f64, f64, usize)) -> f64| {
+        sigma * (results.iter().map(pick).sum::<f64>() / total).sqrt()
+    };
     // Time: the first 60 % of every record predict the rest.
-    let train: Mask = records.iter().map(|r| std::iter::once(0..r.u.len() * 6 / 10).collect()).collect();
-    let test: Mask = records.iter().map(|r| std::iter::once(r.u.len() * 6 / 10..r.u.len()).collect()).collect();
+    let train: Mask = records
+        .iter()
+        .map(|r| std::iter::once(0..r.u.len() * 6 / 10).collect())
+        .collect();
+    let test: Mask = records
+        .iter()
+        .map(|r| std::iter::once(r.u.len() * 6 / 10..r.u.len()).collect())
+        .collect();
     let indices: Vec<usize> = (0..fit.parts.len()).collect();
     let whole = (!fit.parts.is_empty()).then(|| ctx.refit(fit, &train, 4).chi2_on(&test));
     let unconfirmed = parallel::map(&indices, threads, |&i| {
         let mut parts = fit.parts.clone();
         parts.remove(i);
-        let without = ctx.fit_from(parts, Some(fit.soft), &train, 6).chi2_on(&test);
+        let without = ctx
+            .fit_from(parts, Some(fit.soft), &train, 6)
+            .chi2_on(&test);
         whole.is_some_and(|w| without - w < 2.0)
     });
-    let unconfirmed = indices.into_iter().zip(unconfirmed).filter(|(_, u)| *u).map(|(i, _)| i).collect();
+    let unconfirmed = indices
+        .into_iter()
+        .zip(unconfirmed)
+        .filter(|(_, u)| *u)
+        .map(|(i, _)| i)
+        .collect();
     HeldOut {
         before_um: rms(|r| r.0),
         after_um: rms(|r| r.1),
@@ -81,18 +104,37 @@ pub(crate) fn check(ctx: &Context<'_>, fit: &Fit, threads: usize) -> HeldOut {
 fn gain_shift(ctx: &Context<'_>, fit: &Fit) -> Interval {
     let unit = String::new();
     if fit.has("gain-error") {
-        return Interval { value: 1.0, ci95: [1.0, 1.0], unit };
+        return Interval {
+            value: 1.0,
+            ci95: [1.0, 1.0],
+            unit,
+        };
     }
-    let Some(v) = crate::catalogue::VARIANTS.iter().position(|v| v.id == "gain-error") else {
-        return Interval { value: 1.0, ci95: [1.0, 1.0], unit };
+    let Some(v) = crate::catalogue::VARIANTS
+        .iter()
+        .position(|v| v.id == "gain-error")
+    else {
+        return Interval {
+            value: 1.0,
+            ci95: [1.0, 1.0],
+            unit,
+        };
     };
     let mut parts = fit.parts.clone();
     parts.push(crate::fit::Part::new(v, &[1.0]));
     let free = ctx.fit_from(parts, Some(fit.soft), &ctx.problem.all(), 3);
     let value = free.parts.last().map_or(1.0, |p| p.natural()[0]);
     let n = free.covariance.nrows();
-    let sd = if n > 0 { free.covariance[(n - 1, n - 1)].max(0.0).sqrt() } else { 0.0 };
-    Interval { value, ci95: [value - 1.96 * sd, value + 1.96 * sd], unit }
+    let sd = if n > 0 {
+        free.covariance[(n - 1, n - 1)].max(0.0).sqrt()
+    } else {
+        0.0
+    };
+    Interval {
+        value,
+        ci95: [value - 1.96 * sd, value + 1.96 * sd],
+        unit,
+    }
 }
 
 /// RMS innovation per band before and after, all records together.
@@ -101,11 +143,22 @@ pub(crate) fn bands(before: &DiscrepancyMap, after: &DiscrepancyMap) -> Vec<Band
     (0..n)
         .map(|b| {
             let rms = |m: &DiscrepancyMap| {
-                let cells: Vec<f64> = m.rows.iter().filter(|r| r.cells.len() > n).map(|r| r.cells[b].rms_um.powi(2)).collect();
+                let cells: Vec<f64> = m
+                    .rows
+                    .iter()
+                    .filter(|r| r.cells.len() > n)
+                    .map(|r| r.cells[b].rms_um.powi(2))
+                    .collect();
                 (cells.iter().sum::<f64>() / cells.len().max(1) as f64).sqrt()
             };
             let floor = before.rows.first().map_or(0.0, |r| r.cells[b].floor_um);
-            BandGap { low_hz: BAND_EDGES_HZ[b], high_hz: BAND_EDGES_HZ[b + 1], before: rms(before), after: rms(after), floor }
+            BandGap {
+                low_hz: BAND_EDGES_HZ[b],
+                high_hz: BAND_EDGES_HZ[b + 1],
+                before: rms(before),
+                after: rms(after),
+                floor,
+            }
         })
         .collect()
 }

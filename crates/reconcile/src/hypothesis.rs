@@ -39,8 +39,14 @@ struct Candidate {
 pub(crate) fn hypothesis(ctx: &Context<'_>, fit: &Fit) -> Option<Hypothesis> {
     let dt = ctx.problem.base.sample_s;
     let records = &ctx.problem.records;
-    let train: Mask = records.iter().map(|r| std::iter::once(0..r.u.len() * 6 / 10).collect()).collect();
-    let test: Mask = records.iter().map(|r| std::iter::once(r.u.len() * 6 / 10..r.u.len()).collect()).collect();
+    let train: Mask = records
+        .iter()
+        .map(|r| std::iter::once(0..r.u.len() * 6 / 10).collect())
+        .collect();
+    let test: Mask = records
+        .iter()
+        .map(|r| std::iter::once(r.u.len() * 6 / 10..r.u.len()).collect())
+        .collect();
     let (residual, sim) = ctx.residual(fit);
     let mut library: Vec<Candidate> = Vec::new();
     let mut add = |name: &str, unit: &str, speed: bool, f: &dyn Fn(usize, usize) -> f64| {
@@ -66,10 +72,20 @@ pub(crate) fn hypothesis(ctx: &Context<'_>, fit: &Fit) -> Option<Hypothesis> {
                 w
             })
             .collect();
-        library.push(Candidate { name: name.to_owned(), unit: unit.to_owned(), columns });
+        library.push(Candidate {
+            name: name.to_owned(),
+            unit: unit.to_owned(),
+            columns,
+        });
     };
     let d = |i: usize, k: usize| records[i].u[k];
-    let rate = |i: usize, k: usize| if k == 0 { 0.0 } else { (records[i].u[k] - records[i].u[k - 1]) / dt };
+    let rate = |i: usize, k: usize| {
+        if k == 0 {
+            0.0
+        } else {
+            (records[i].u[k] - records[i].u[k - 1]) / dt
+        }
+    };
     let y = |i: usize, k: usize| sim[i][k] + residual[i][k] - residual[i][0];
     add("1", "um/s", true, &|_, _| 1.0);
     add("d", "1/s", true, &d);
@@ -77,15 +93,24 @@ pub(crate) fn hypothesis(ctx: &Context<'_>, fit: &Fit) -> Option<Hypothesis> {
     add("d^3", "1/(um^2 s)", true, &|i, k| d(i, k).powi(3));
     add("|d|", "1/s", true, &|i, k| d(i, k).abs());
     add("d |d|", "1/(um s)", true, &|i, k| d(i, k) * d(i, k).abs());
-    add("sign(dd/dt)", "um/s", true, &|i, k| rate(i, k).signum() * f64::from(u8::from(rate(i, k) != 0.0)));
+    add("sign(dd/dt)", "um/s", true, &|i, k| {
+        rate(i, k).signum() * f64::from(u8::from(rate(i, k) != 0.0))
+    });
     add("|dd/dt|", "1", true, &|i, k| rate(i, k).abs());
     add("t d", "1/s^2", true, &|i, k| d(i, k) * k as f64 * dt);
     add("t", "um/s^2", true, &|_, k| k as f64 * dt);
     add("y d", "1/(um s)", true, &|i, k| d(i, k) * y(i, k));
-    add("y^2 d", "1/(um^2 s)", true, &|i, k| d(i, k) * y(i, k).powi(2));
+    add("y^2 d", "1/(um^2 s)", true, &|i, k| {
+        d(i, k) * y(i, k).powi(2)
+    });
     add("y", "1/s", true, &|i, k| y(i, k));
     for lag in [1usize, 2, 5, 10, 20, 50, 100, 200] {
-        add(&format!("d(t - {} ms)", lag as f64 * dt * 1e3), "1/s", true, &|i, k| if k >= lag { d(i, k - lag) } else { 0.0 });
+        add(
+            &format!("d(t - {} ms)", lag as f64 * dt * 1e3),
+            "1/s",
+            true,
+            &|i, k| if k >= lag { d(i, k - lag) } else { 0.0 },
+        );
         add(
             &format!("d(t - {} ms)^2", lag as f64 * dt * 1e3),
             "1/(um s)",
@@ -98,12 +123,30 @@ pub(crate) fn hypothesis(ctx: &Context<'_>, fit: &Fit) -> Option<Hypothesis> {
     add("y^2 (position)", "1/um", false, &|i, k| y(i, k).powi(2));
     add("y^3 (position)", "1/um^2", false, &|i, k| y(i, k).powi(3));
     if let Some(hz) = strongest_line(ctx, fit) {
-        add(&format!("sin(2 pi {hz:.2} Hz t) (position)"), "um", false, &|_, k| (TAU * hz * k as f64 * dt).sin());
-        add(&format!("cos(2 pi {hz:.2} Hz t) (position)"), "um", false, &|_, k| (TAU * hz * k as f64 * dt).cos());
+        add(
+            &format!("sin(2 pi {hz:.2} Hz t) (position)"),
+            "um",
+            false,
+            &|_, k| (TAU * hz * k as f64 * dt).sin(),
+        );
+        add(
+            &format!("cos(2 pi {hz:.2} Hz t) (position)"),
+            "um",
+            false,
+            &|_, k| (TAU * hz * k as f64 * dt).cos(),
+        );
     }
     // Forward selection on the first part of every record.
     let inner = |a: &[Vec<f64>], b: &[Vec<f64>], mask: &Mask| -> f64 {
-        a.iter().zip(b).zip(mask).map(|((a, b), m)| m.iter().map(|r| dot(&a[r.clone()], &b[r.clone()])).sum::<f64>()).sum()
+        a.iter()
+            .zip(b)
+            .zip(mask)
+            .map(|((a, b), m)| {
+                m.iter()
+                    .map(|r| dot(&a[r.clone()], &b[r.clone()]))
+                    .sum::<f64>()
+            })
+            .sum()
     };
     let e = &fit.innovations;
     let mut chosen: Vec<usize> = Vec::new();
@@ -125,9 +168,17 @@ pub(crate) fn hypothesis(ctx: &Context<'_>, fit: &Fit) -> Option<Hypothesis> {
         let mut trial = chosen.clone();
         trial.push(best.0);
         let n = trial.len();
-        let a = DMatrix::from_fn(n, n, |i, j| inner(&library[trial[i]].columns, &library[trial[j]].columns, &train));
+        let a = DMatrix::from_fn(n, n, |i, j| {
+            inner(
+                &library[trial[i]].columns,
+                &library[trial[j]].columns,
+                &train,
+            )
+        });
         let b = DVector::from_fn(n, |i, _| inner(&library[trial[i]].columns, e, &train));
-        let Some(x) = a.cholesky().map(|c| c.solve(&b)) else { break };
+        let Some(x) = a.cholesky().map(|c| c.solve(&b)) else {
+            break;
+        };
         let mut next = e.clone();
         for (i, x) in trial.iter().zip(x.iter()) {
             for (next, c) in next.iter_mut().zip(&library[*i].columns) {
@@ -153,12 +204,24 @@ pub(crate) fn hypothesis(ctx: &Context<'_>, fit: &Fit) -> Option<Hypothesis> {
     let terms: Vec<Term> = chosen
         .iter()
         .zip(coefficients.iter())
-        .map(|(i, x)| Term { term: library[*i].name.clone(), coefficient: *x, unit: library[*i].unit.clone() })
+        .map(|(i, x)| Term {
+            term: library[*i].name.clone(),
+            coefficient: *x,
+            unit: library[*i].unit.clone(),
+        })
         .collect();
-    let formula = terms.iter().map(|t| format!("{:+.4} [{}] {}", t.coefficient, t.unit, t.term)).collect::<Vec<_>>().join(" ");
+    let formula = terms
+        .iter()
+        .map(|t| format!("{:+.4} [{}] {}", t.coefficient, t.unit, t.term))
+        .collect::<Vec<_>>()
+        .join(" ");
     Some(Hypothesis {
         formula: format!("d bead/dt or bead (where marked position) += {formula}"),
-        held_out_worth: if before > 0.0 { (1.0 - after / before).clamp(-1.0, 1.0) } else { 0.0 },
+        held_out_worth: if before > 0.0 {
+            (1.0 - after / before).clamp(-1.0, 1.0)
+        } else {
+            0.0
+        },
         terms,
     })
 }
@@ -166,7 +229,10 @@ pub(crate) fn hypothesis(ctx: &Context<'_>, fit: &Fit) -> Option<Hypothesis> {
 /// The frequency of the strongest line in the innovations that is on no line of the command, if any stands out.
 fn strongest_line(ctx: &Context<'_>, fit: &Fit) -> Option<f64> {
     let mask = ctx.problem.all();
-    let coarse: Vec<f64> = (0..480).map(|i| 3.05 + f64::from(i)).filter(|f| f * ctx.problem.base.sample_s < 0.48).collect();
+    let coarse: Vec<f64> = (0..480)
+        .map(|i| 3.05 + f64::from(i))
+        .filter(|f| f * ctx.problem.base.sample_s < 0.48)
+        .collect();
     // The longest record decides; a line is everywhere.
     let longest = (0..ctx.problem.records.len()).max_by_key(|i| ctx.problem.records[*i].u.len())?;
     let e = &fit.innovations[longest];
@@ -191,5 +257,7 @@ fn strongest_line(ctx: &Context<'_>, fit: &Fit) -> Option<f64> {
         return None;
     }
     let fine = (0..41).map(|i| best.0 - 0.1 + f64::from(i) * 0.005);
-    fine.map(|hz| (hz, crate::screen::line_score(ctx, fit, hz, &mask))).max_by(|a, b| a.1.total_cmp(&b.1)).map(|b| b.0)
+    fine.map(|hz| (hz, crate::screen::line_score(ctx, fit, hz, &mask)))
+        .max_by(|a, b| a.1.total_cmp(&b.1))
+        .map(|b| b.0)
 }

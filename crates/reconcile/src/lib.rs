@@ -22,6 +22,7 @@ mod noise;
 mod parallel;
 mod predict;
 mod problem;
+mod report;
 mod result;
 mod screen;
 mod search;
@@ -33,5 +34,8 @@ pub use error::ReconcileError;
 pub use hypothesis::{Hypothesis, Term};
 pub use map::{BAND_EDGES_HZ, BandRatio, Cell, DiscrepancyMap, MapRow, band_labels};
 pub use noise::Noise;
-pub use result::{BandGap, Effect, Gap, GapStep, Interval, Reconciliation, RecordGap, Trace, Traces, Verdict};
-pub use verdict::{Options, reconcile};
+pub use report::report;
+pub use result::{
+    BandGap, Effect, Gap, GapStep, Interval, Reconciliation, RecordGap, Trace, Traces, Verdict,
+};
+pub use verdict::{Options, constant_gain, reconcile};

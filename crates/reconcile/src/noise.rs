@@ -17,14 +17,20 @@ pub struct Noise {
 impl Noise {
     /// Brownian motion of coefficient `d_um2_per_s` sampled every `sample_s`, and white noise of `localisation_um` RMS.
     pub fn new(d_um2_per_s: f64, sample_s: f64, localisation_um: f64) -> Self {
-        Self { walk_um2: 2.0 * d_um2_per_s * sample_s, white_um2: localisation_um * localisation_um }
+        Self {
+            walk_um2: 2.0 * d_um2_per_s * sample_s,
+            white_um2: localisation_um * localisation_um,
+        }
     }
 
     /// From variance and lag-1 covariance of increments, `q + 2 R` and `-R`, kept physical.
     pub fn from_increments(variance: f64, lag1: f64) -> Self {
         let variance = variance.max(1e-14);
         let white = (-lag1).clamp(0.005 * variance, 0.4995 * variance);
-        Self { walk_um2: variance - 2.0 * white, white_um2: white }
+        Self {
+            walk_um2: variance - 2.0 * white,
+            white_um2: white,
+        }
     }
 
     /// Diffusion coefficient \[um^2/s\].
@@ -74,7 +80,10 @@ impl Whitener {
                 p = noise.white_um2;
             }
         }
-        Self { gain, inverse_sigma }
+        Self {
+            gain,
+            inverse_sigma,
+        }
     }
 
     /// Innovations of a residual, in standard deviations. The filter is linear: columns of a Jacobian go through it too.
@@ -109,7 +118,11 @@ impl Whitener {
                 let k = if forward { i } else { r.len() - 1 - i };
                 if self.gain[k] > 0.0 {
                     if started {
-                        let g = if self.gain[k] < 1.0 { self.gain[k] } else { 0.5 };
+                        let g = if self.gain[k] < 1.0 {
+                            self.gain[k]
+                        } else {
+                            0.5
+                        };
                         m += g * (r[k] - m);
                     } else {
                         m = r[k];
@@ -135,6 +148,7 @@ impl Whitener {
     }
 
     /// Innovation standard deviation of row k \[um\]; `None` when it does not count.
+    #[cfg(test)]
     pub fn sigma_um(&self, k: usize) -> Option<f64> {
         (self.inverse_sigma[k] > 0.0).then(|| 1.0 / self.inverse_sigma[k])
     }
@@ -164,7 +178,11 @@ pub(crate) fn increment_moments(r: &[f64], present: &[bool]) -> (f64, f64, usize
             }
         }
     }
-    (c0 / n0 as f64, if n1 > 0 { c1 / n1 as f64 } else { 0.0 }, n0)
+    (
+        c0 / n0 as f64,
+        if n1 > 0 { c1 / n1 as f64 } else { 0.0 },
+        n0,
+    )
 }
 
 #[cfg(test)]

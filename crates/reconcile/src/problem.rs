@@ -20,7 +20,6 @@ pub(crate) struct Prepared {
     pub whitener: Whitener,
     extra_walk: Option<Vec<f64>>,
     pub rest: bool,
-    pub period: Option<usize>,
 }
 
 /// Everything that fits share.
@@ -39,7 +38,11 @@ pub(crate) struct Problem {
 impl Problem {
     /// Prepares records; `repeated[i][k]` marks rows that repeat a frame and count as missing.
     pub fn new(base: Base, records: &[Record], repeated: &[Vec<bool>], noise: Noise) -> Self {
-        let direct = if base.zpk.zeros.len() == base.zpk.poles.len() { base.zpk.gain.abs() } else { 0.0 };
+        let direct = if base.zpk.zeros.len() == base.zpk.poles.len() {
+            base.zpk.gain.abs()
+        } else {
+            0.0
+        };
         let velocity = base.zpk.at(nalgebra::Complex::new(0.0, 125.0)).norm() * 125.0;
         let kick = if base.interpolated_input { 0.0 } else { direct };
         let prepared = records
@@ -47,8 +50,18 @@ impl Problem {
             .zip(repeated)
             .map(|(r, repeated)| {
                 let u: Vec<f64> = r.pzt_um.iter().map(|v| v - base.working_point_um).collect();
-                let present: Vec<bool> = r.bead_um.iter().zip(repeated).map(|(b, rep)| b.is_finite() && !rep).collect();
-                let y = r.bead_um.iter().zip(&present).map(|(b, p)| if *p { *b } else { 0.0 }).collect();
+                let present: Vec<bool> = r
+                    .bead_um
+                    .iter()
+                    .zip(repeated)
+                    .map(|(b, rep)| b.is_finite() && !rep)
+                    .collect();
+                let y = r
+                    .bead_um
+                    .iter()
+                    .zip(&present)
+                    .map(|(b, p)| if *p { *b } else { 0.0 })
+                    .collect();
                 let extra_walk = uncertain_command(r, velocity * base.sample_s);
                 let whitener = Whitener::new(&noise, &present, extra_walk.as_deref());
                 Prepared {
@@ -59,11 +72,15 @@ impl Problem {
                     whitener,
                     extra_walk,
                     rest: r.is_rest(),
-                    period: r.period_rows(),
                 }
             })
             .collect();
-        Self { base, records: prepared, noise, soft: (-0.4 * kick, 1.3 * kick) }
+        Self {
+            base,
+            records: prepared,
+            noise,
+            soft: (-0.4 * kick, 1.3 * kick),
+        }
     }
 
     /// The same problem with other noise.
@@ -77,7 +94,10 @@ impl Problem {
 
     /// All rows.
     pub fn all(&self) -> Mask {
-        self.records.iter().map(|r| std::iter::once(0..r.u.len()).collect()).collect()
+        self.records
+            .iter()
+            .map(|r| std::iter::once(0..r.u.len()).collect())
+            .collect()
     }
 
     /// Number of innovations that count under a mask.
@@ -85,7 +105,13 @@ impl Problem {
         self.records
             .iter()
             .zip(mask)
-            .map(|(r, ranges)| ranges.iter().flat_map(Clone::clone).filter(|&k| r.whitener.counts(k)).count())
+            .map(|(r, ranges)| {
+                ranges
+                    .iter()
+                    .flat_map(Clone::clone)
+                    .filter(|&k| r.whitener.counts(k))
+                    .count()
+            })
             .sum()
     }
 }

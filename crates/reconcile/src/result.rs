@@ -123,7 +123,11 @@ impl Gap {
     /// `1 - (after - floor)/(before - floor)`; 1 when there was no gap.
     pub fn closure(&self) -> f64 {
         let d = self.before - self.floor;
-        if d <= 0.0 { 1.0 } else { 1.0 - (self.after - self.floor) / d }
+        if d <= 0.0 {
+            1.0
+        } else {
+            1.0 - (self.after - self.floor) / d
+        }
     }
 }
 
@@ -162,9 +166,13 @@ impl Traces {
                 .enumerate()
                 .map(|(i, r)| {
                     let n = r.u.len().min((4.0 / sample_s) as usize);
-                    let measured: Vec<f64> = (0..n).map(|k| if r.present[k] { r.y[k] } else { f64::NAN }).collect();
+                    let measured: Vec<f64> = (0..n)
+                        .map(|k| if r.present[k] { r.y[k] } else { f64::NAN })
+                        .collect();
                     let start = |s: &[Vec<f64>]| {
-                        (0..n).find(|&k| r.present[k]).map_or(0.0, |k| r.y[k] - s[i][k])
+                        (0..n)
+                            .find(|&k| r.present[k])
+                            .map_or(0.0, |k| r.y[k] - s[i][k])
                     };
                     let (b0, a0) = (start(&sim_before), start(&sim_after));
                     Trace {
@@ -173,7 +181,10 @@ impl Traces {
                         measured_um: measured,
                         before_um: sim_before[i][..n].iter().map(|s| s + b0).collect(),
                         after_um: sim_after[i][..n].iter().map(|s| s + a0).collect(),
-                        residual_before_um: before[i][..n].iter().map(|e| e - before[i][0]).collect(),
+                        residual_before_um: before[i][..n]
+                            .iter()
+                            .map(|e| e - before[i][0])
+                            .collect(),
                         residual_after_um: after[i][..n].iter().map(|e| e - after[i][0]).collect(),
                     }
                 })

@@ -69,7 +69,11 @@ pub(crate) fn screen(
         best[v] = Some(lead);
     }
     let mut leads: Vec<Lead> = best.into_iter().flatten().collect();
-    leads.sort_by(|a, b| b.score.total_cmp(&a.score).then(a.part.variant.cmp(&b.part.variant)));
+    leads.sort_by(|a, b| {
+        b.score
+            .total_cmp(&a.score)
+            .then(a.part.variant.cmp(&b.part.variant))
+    });
     leads
 }
 
@@ -78,7 +82,7 @@ fn pair_score(s: &[f64], c: &[f64], e: &[f64]) -> f64 {
     let (ss, cc, sc) = (dot(s, s), dot(c, c), dot(s, c));
     let (se, ce) = (dot(s, e), dot(c, e));
     let det = ss * cc - sc * sc;
-    if det <= 1e-9 * ss * cc || !(det > 0.0) {
+    if det <= 1e-9 * ss * cc || det.is_nan() {
         return 0.0;
     }
     (cc * se * se - 2.0 * sc * se * ce + ss * ce * ce) / det
@@ -99,7 +103,16 @@ pub(crate) fn line_score(ctx: &Context<'_>, fit: &Fit, hz: f64, mask: &Mask) -> 
             let (mut ws, mut wc) = (vec![0.0; n], vec![0.0; n]);
             r.whitener.apply(&s, &mut ws);
             r.whitener.apply(&c, &mut wc);
-            mask[i].iter().map(|m| pair_score(&ws[m.clone()], &wc[m.clone()], &fit.innovations[i][m.clone()])).sum::<f64>()
+            mask[i]
+                .iter()
+                .map(|m| {
+                    pair_score(
+                        &ws[m.clone()],
+                        &wc[m.clone()],
+                        &fit.innovations[i][m.clone()],
+                    )
+                })
+                .sum::<f64>()
         })
         .sum()
 }
@@ -109,22 +122,38 @@ const BLOCK: usize = 1000;
 
 /// Looks for an error periodic in position over pixel sizes of 0.05..1.5 um: first over blocks in which the bead stays
 /// within a few micrometres (each with its own phase, so that a coarse grid does), then over everything.
-fn pixel_scan(ctx: &Context<'_>, fit: &Fit, variant: usize, mask: &Mask, threads: usize) -> Option<Lead> {
+fn pixel_scan(
+    ctx: &Context<'_>,
+    fit: &Fit,
+    variant: usize,
+    mask: &Mask,
+    threads: usize,
+) -> Option<Lead> {
     let (residual, sim) = ctx.residual(fit);
     let positions: Vec<Vec<f64>> = ctx
         .problem
         .records
         .iter()
         .zip(residual.iter().zip(&sim))
-        .map(|(r, (e, s))| r.whitener.smooth(e).iter().zip(s).map(|(w, s)| w + s).collect())
+        .map(|(r, (e, s))| {
+            r.whitener
+                .smooth(e)
+                .iter()
+                .zip(s)
+                .map(|(w, s)| w + s)
+                .collect()
+        })
         .collect();
     let mut blocks: Vec<(usize, usize, f64)> = Vec::new();
     for (i, p) in positions.iter().enumerate() {
         for range in &mask[i] {
             let mut k = range.start;
             while k + BLOCK <= range.end {
-                let (low, high) =
-                    p[k..k + BLOCK].iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), v| (a.min(*v), b.max(*v)));
+                let (low, high) = p[k..k + BLOCK]
+                    .iter()
+                    .fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), v| {
+                        (a.min(*v), b.max(*v))
+                    });
                 if high - low > 0.3 && high - low < 6.0 {
                     blocks.push((i, k, high - low));
                 }
@@ -139,7 +168,9 @@ fn pixel_scan(ctx: &Context<'_>, fit: &Fit, variant: usize, mask: &Mask, threads
         return None;
     }
     let step = 1.0 / 14.0;
-    let waves: Vec<f64> = (0..((20.0 - 0.66) / step) as usize).map(|i| 0.66 + step * i as f64).collect();
+    let waves: Vec<f64> = (0..((20.0 - 0.66) / step) as usize)
+        .map(|i| 0.66 + step * i as f64)
+        .collect();
     let score_at = |q: f64, i: usize, from: usize, to: usize| {
         let r = &ctx.problem.records[i];
         let n = to - from;
@@ -164,16 +195,24 @@ fn pixel_scan(ctx: &Context<'_>, fit: &Fit, variant: usize, mask: &Mask, threads
             .sum::<f64>()
     });
     let n = blocks.len() as f64;
-    let (best, &top) = coarse.iter().enumerate().max_by(|a, b| a.1.total_cmp(b.1))?;
+    let (best, &top) = coarse
+        .iter()
+        .enumerate()
+        .max_by(|a, b| a.1.total_cmp(b.1))?;
     // Under the null the sum is chi-square with 2n degrees of freedom; the scan has about 270 trials.
     if top < 2.0 * n + 5.0 * (4.0 * n).sqrt() {
         return None;
     }
-    let all_rows: Vec<(usize, std::ops::Range<usize>)> =
-        mask.iter().enumerate().flat_map(|(i, ranges)| ranges.iter().map(move |r| (i, r.clone()))).collect();
+    let all_rows: Vec<(usize, std::ops::Range<usize>)> = mask
+        .iter()
+        .enumerate()
+        .flat_map(|(i, ranges)| ranges.iter().map(move |r| (i, r.clone())))
+        .collect();
     let centre = waves[best];
     // Common phase over all records: the resolution is one over the whole distance travelled.
-    let fine: Vec<f64> = (-60..=60).map(|i| centre + step * f64::from(i) / 50.0).collect();
+    let fine: Vec<f64> = (-60..=60)
+        .map(|i| centre + step * f64::from(i) / 50.0)
+        .collect();
     let scores = parallel::map(&fine, threads, |&q| {
         let (mut s, mut c, mut e) = (Vec::new(), Vec::new(), Vec::new());
         for (i, r) in &all_rows {
@@ -184,6 +223,12 @@ fn pixel_scan(ctx: &Context<'_>, fit: &Fit, variant: usize, mask: &Mask, threads
         }
         pair_score(&s, &c, &e)
     });
-    let (best, &score) = scores.iter().enumerate().max_by(|a, b| a.1.total_cmp(b.1))?;
-    Some(Lead { part: Part::new(variant, &[1.0 / fine[best]]), score })
+    let (best, &score) = scores
+        .iter()
+        .enumerate()
+        .max_by(|a, b| a.1.total_cmp(b.1))?;
+    Some(Lead {
+        part: Part::new(variant, &[1.0 / fine[best]]),
+        score,
+    })
 }

@@ -53,7 +53,9 @@ fn bar(v: &Variant, records: usize) -> f64 {
 fn priced(ctx: &Context<'_>, fit: &Fit) -> f64 {
     let typical: f64 = fit.parts.iter().map(implausibility).sum();
     // Decides ties only: the localisation noise of a rig need not be that of its model.
-    let white = ctx.white.map_or(0.0, |w| w.distance(&fit.parts, ctx.problem.base.sample_s).min(40.0));
+    let white = ctx.white.map_or(0.0, |w| {
+        w.distance(&fit.parts, ctx.problem.base.sample_s).min(40.0)
+    });
     fit.chi2 + 8.0 * fit.freedom() as f64 + typical + white
 }
 
@@ -61,7 +63,11 @@ fn priced(ctx: &Context<'_>, fit: &Fit) -> f64 {
 fn implausibility(part: &Part) -> f64 {
     let v = part.variant();
     let x = part.natural()[0];
-    if x < v.typical.0 || x > v.typical.1 { 12.0 } else { 0.0 }
+    if x < v.typical.0 || x > v.typical.1 {
+        12.0
+    } else {
+        0.0
+    }
 }
 
 /// Whether two variants say the same thing.
@@ -81,13 +87,18 @@ fn extensions(
 ) -> Vec<Fit> {
     let tangents = ctx.tangents(fit, mask);
     let leads = screen(ctx, fit, &tangents, mask, effort.threads, |v| {
-        !fit.parts.iter().any(|p| same_id(v, p.variant().id)) && !forbidden.contains(&VARIANTS[v].id)
+        !fit.parts.iter().any(|p| same_id(v, p.variant().id))
+            && !forbidden.contains(&VARIANTS[v].id)
     });
     let records = ctx.problem.records.len();
     let worth: Vec<Part> = leads
         .into_iter()
         .filter(|l| {
-            let least = if l.part.variant().off_response { 0.0 } else { least };
+            let least = if l.part.variant().off_response {
+                0.0
+            } else {
+                least
+            };
             l.score > 0.5 * bar(l.part.variant(), records).max(least)
         })
         .take(wide)
@@ -100,7 +111,9 @@ fn extensions(
         ctx.fit_from(parts, Some(fit.soft), mask, 4)
     });
     fits.sort_by(|a, b| priced(ctx, a).total_cmp(&priced(ctx, b)));
-    let close = fits.first().map_or(0.0, |best| best.chi2 + 0.5 * (fit.chi2 - best.chi2));
+    let close = fits
+        .first()
+        .map_or(0.0, |best| best.chi2 + 0.5 * (fit.chi2 - best.chi2));
     let rest = fits.split_off(fits.iter().take(4).filter(|f| f.chi2 <= close).count());
     let mut fits = parallel::map(&fits, effort.threads, |f| ctx.refit(f, mask, 14));
     fits.extend(rest);
@@ -120,7 +133,11 @@ fn worth_it(smaller: &Fit, bigger: &Fit, null: f64) -> bool {
         .iter()
         .filter(|p| !smaller.has(p.variant().id))
         .all(|p| p.variant().off_response);
-    let least = if off_response { 0.0 } else { RELATIVE * (null - smaller.chi2).max(0.0) };
+    let least = if off_response {
+        0.0
+    } else {
+        RELATIVE * (null - smaller.chi2).max(0.0)
+    };
     smaller.chi2 - bigger.chi2 > threshold(added).max(least)
 }
 
@@ -133,7 +150,10 @@ fn eliminate(ctx: &Context<'_>, mut fit: Fit, null: f64, mask: &Mask, effort: Ef
             parts.remove(i);
             ctx.fit_from(parts, Some(fit.soft), mask, 8)
         });
-        let Some(best) = without.into_iter().filter(|w| !worth_it(w, &fit, null)).min_by(|a, b| priced(ctx, a).total_cmp(&priced(ctx, b)))
+        let Some(best) = without
+            .into_iter()
+            .filter(|w| !worth_it(w, &fit, null))
+            .min_by(|a, b| priced(ctx, a).total_cmp(&priced(ctx, b)))
         else {
             break;
         };
@@ -152,10 +172,28 @@ fn replace(ctx: &Context<'_>, mut fit: Fit, mask: &Mask, effort: Effort) -> (Fit
             let id = parts.remove(i).variant().id;
             let without = ctx.fit_from(parts, Some(fit.soft), mask, 10);
             let mut list: Vec<Rival> = Vec::new();
-            for other in extensions(ctx, &without, mask, effort, 6, &[id], 0.25 * (without.chi2 - fit.chi2)) {
-                let Some(part) = other.parts.last().cloned() else { continue };
-                list.push(Rival { id: part.variant().id, chi2: other.chi2, part });
-                if priced(ctx, &other) < priced(ctx, &fit) - 1.0 && better.as_ref().is_none_or(|b| priced(ctx, &other) < priced(ctx, b)) {
+            for other in extensions(
+                ctx,
+                &without,
+                mask,
+                effort,
+                6,
+                &[id],
+                0.25 * (without.chi2 - fit.chi2),
+            ) {
+                let Some(part) = other.parts.last().cloned() else {
+                    continue;
+                };
+                list.push(Rival {
+                    id: part.variant().id,
+                    chi2: other.chi2,
+                    part,
+                });
+                if priced(ctx, &other) < priced(ctx, &fit) - 1.0
+                    && better
+                        .as_ref()
+                        .is_none_or(|b| priced(ctx, &other) < priced(ctx, b))
+                {
                     better = Some(other);
                 }
             }
@@ -178,14 +216,20 @@ fn reform(ctx: &Context<'_>, mut fit: Fit, mask: &Mask, effort: Effort) -> Fit {
             .iter()
             .enumerate()
             .filter(|(v, variant)| variant.id == id && *v != fit.parts[i].variant)
-            .flat_map(|(v, variant)| (variant.starts)(&ctx.scope).into_iter().map(move |s| Part::new(v, &s)))
+            .flat_map(|(v, variant)| {
+                (variant.starts)(&ctx.scope)
+                    .into_iter()
+                    .map(move |s| Part::new(v, &s))
+            })
             .collect();
         let fits = parallel::map(&others, effort.threads, |part| {
             let mut parts = fit.parts.clone();
             parts[i] = part.clone();
             ctx.fit_from(parts, Some(fit.soft), mask, 10)
         });
-        if let Some(best) = fits.into_iter().min_by(|a, b| priced(ctx, a).total_cmp(&priced(ctx, b)))
+        if let Some(best) = fits
+            .into_iter()
+            .min_by(|a, b| priced(ctx, a).total_cmp(&priced(ctx, b)))
             && priced(ctx, &best) < priced(ctx, &fit) - 20.0
         {
             fit = best;
@@ -195,21 +239,39 @@ fn reform(ctx: &Context<'_>, mut fit: Fit, mask: &Mask, effort: Effort) -> Fit {
 }
 
 /// The whole search on the rows of a mask.
-pub(crate) fn search(ctx: &Context<'_>, mask: &Mask, effort: Effort, mut progress: impl FnMut(&str)) -> Found {
+pub(crate) fn search(
+    ctx: &Context<'_>,
+    mask: &Mask,
+    effort: Effort,
+    mut progress: impl FnMut(&str),
+) -> Found {
     let null = ctx.fit(Vec::new(), mask, 6);
     let mut steps = vec![(Vec::new(), null.chi2)];
     progress("screening single effects");
     let mut singles = extensions(ctx, &null, mask, effort, 8, &[], 0.0);
     singles.retain(|f| worth_it(&null, f, null.chi2));
     let Some(best) = singles.first().cloned() else {
-        return Found { fit: null.clone(), null, steps, rivals: Vec::new() };
+        return Found {
+            fit: null.clone(),
+            null,
+            steps,
+            rivals: Vec::new(),
+        };
     };
     steps.push((ids(&best), best.chi2));
     let mut fit = best;
     let mut beam: Vec<Fit> = singles.into_iter().skip(1).take(2).collect();
     while fit.parts.len() < effort.max_effects {
         progress(&format!("looking further beside {}", ids(&fit).join(" + ")));
-        let mut next: Vec<Fit> = extensions(ctx, &fit, mask, effort, 6, &[], RELATIVE * (null.chi2 - fit.chi2));
+        let mut next: Vec<Fit> = extensions(
+            ctx,
+            &fit,
+            mask,
+            effort,
+            6,
+            &[],
+            RELATIVE * (null.chi2 - fit.chi2),
+        );
         next.retain(|f| worth_it(&fit, f, null.chi2));
         if next.is_empty() {
             break;
@@ -217,10 +279,20 @@ pub(crate) fn search(ctx: &Context<'_>, mask: &Mask, effort: Effort, mut progres
         // Something is left: the first choice may have been a compromise between two. Extend its rivals as well.
         let top_chi2 = next[0].chi2;
         for other in std::mem::take(&mut beam) {
-            next.extend(extensions(ctx, &other, mask, effort, 4, &[], 0.5 * (other.chi2 - top_chi2)));
+            next.extend(extensions(
+                ctx,
+                &other,
+                mask,
+                effort,
+                4,
+                &[],
+                0.5 * (other.chi2 - top_chi2),
+            ));
         }
         next.sort_by(|a, b| priced(ctx, a).total_cmp(&priced(ctx, b)));
-        let Some(top) = next.first().cloned() else { break };
+        let Some(top) = next.first().cloned() else {
+            break;
+        };
         let top = eliminate(ctx, top, null.chi2, mask, effort);
         if priced(ctx, &top) >= priced(ctx, &fit) {
             break;
@@ -244,7 +316,12 @@ pub(crate) fn search(ctx: &Context<'_>, mask: &Mask, effort: Effort, mut progres
         fit = refined;
     }
     let (fit, rivals) = replace(ctx, fit, mask, effort);
-    Found { fit, null, steps, rivals }
+    Found {
+        fit,
+        null,
+        steps,
+        rivals,
+    }
 }
 
 /// Ids of a set in the order in which they were found.

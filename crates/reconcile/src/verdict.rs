@@ -7,12 +7,14 @@ use crate::fit::{Context, Fit, WhiteEvidence};
 use crate::frames::{self, FrameCounts};
 use crate::guard;
 use crate::held_out::{self, HeldOut};
-use crate::hypothesis::{self, Hypothesis};
-use crate::map::{self, DiscrepancyMap};
+use crate::hypothesis;
+use crate::map;
 use crate::noise::Noise;
 use crate::predict::{Base, Block, PLAY_LEVELS, Zpk};
 use crate::problem::Problem;
-use crate::result::{Effect as NamedEffect, Gap, GapStep, Interval, Reconciliation, Traces, Verdict};
+use crate::result::{
+    Effect as NamedEffect, Gap, GapStep, Interval, Reconciliation, Traces, Verdict,
+};
 use crate::search::{self, Effort, Found, ids};
 use crate::{floor, significance};
 use cellpos_plant::{Effect, Hysteresis, Model};
@@ -31,7 +33,11 @@ pub struct Options {
 
 impl Default for Options {
     fn default() -> Self {
-        Self { threads: 2, max_effects: 4, interpolated_input: false }
+        Self {
+            threads: 2,
+            max_effects: 4,
+            interpolated_input: false,
+        }
     }
 }
 
@@ -53,11 +59,19 @@ pub fn reconcile(
     guard::working_point(&records, model.working_point_um)?;
     let frames = frames::count(&records);
     let none: Vec<Vec<bool>> = records.iter().map(|r| vec![false; r.rows()]).collect();
-    let repeated = if frames.repeats_named() { &frames.repeated } else { &none };
+    let repeated = if frames.repeats_named() {
+        &frames.repeated
+    } else {
+        &none
+    };
     let base = base_of(model, &records, options)?;
     let scope = scope_of(model, &records, &base);
     let fixed = fixed_blocks(model, &scope);
-    let start = Noise::new(model.noise.diffusion_um2_per_s.max(1e-4), base.sample_s, model.noise.localisation_um.max(1e-3));
+    let start = Noise::new(
+        model.noise.diffusion_um2_per_s.max(1e-4),
+        base.sample_s,
+        model.noise.localisation_um.max(1e-3),
+    );
     let problem = Problem::new(base, &records, repeated, start);
     let present: Vec<Vec<bool>> = problem.records.iter().map(|r| r.present.clone()).collect();
 
@@ -68,13 +82,19 @@ pub fn reconcile(
     let problem = problem.with_noise(noise);
     guard::motion(&context(&problem, scope, &fixed))?;
 
-    let effort = Effort { threads: options.threads, max_effects: options.max_effects };
+    let effort = Effort {
+        threads: options.threads,
+        max_effects: options.max_effects,
+    };
     let mut noise = noise;
     let mut problem = problem;
     let mut found;
     let mut round = 0;
     loop {
-        let ctx = Context { white: evidence(model, &noise, trusted, &problem), ..context(&problem, scope, &fixed) };
+        let ctx = Context {
+            white: evidence(model, &noise, trusted, &problem),
+            ..context(&problem, scope, &fixed)
+        };
         found = search::search(&ctx, &problem.all(), effort, &mut *progress);
         // What the final residual shows is at least as good an estimate of the noise, if the fit is good.
         let (residual, _) = ctx.residual(&found.fit);
@@ -86,12 +106,18 @@ pub fn reconcile(
         noise = refined;
         problem = problem.with_noise(noise);
     }
-    let ctx = Context { white: evidence(model, &noise, trusted, &problem), ..context(&problem, scope, &fixed) };
+    let ctx = Context {
+        white: evidence(model, &noise, trusted, &problem),
+        ..context(&problem, scope, &fixed)
+    };
     progress("held-out check");
     let mut held = held_out::check(&ctx, &found.fit, options.threads);
     // What does not help where it was not fitted is not named.
     while let Some(i) = held.unconfirmed.first().copied() {
-        progress(&format!("{} does not hold on held-out data: taken back", ids(&found.fit)[i]));
+        progress(&format!(
+            "{} does not hold on held-out data: taken back",
+            ids(&found.fit)[i]
+        ));
         let mut parts = found.fit.parts.clone();
         parts.remove(i);
         if i < found.rivals.len() {
@@ -105,17 +131,30 @@ pub fn reconcile(
 }
 
 fn context<'a>(problem: &'a Problem, scope: Scope, fixed: &[Block]) -> Context<'a> {
-    Context { problem, scope, fixed: fixed.to_vec(), white: None }
+    Context {
+        problem,
+        scope,
+        fixed: fixed.to_vec(),
+        white: None,
+    }
 }
 
 fn base_of(model: &Model, records: &[Record], options: &Options) -> Result<Base, ReconcileError> {
     let (num, den) = (model.plant.num(), model.plant.den());
     let (Some(n), Some(d)) = (num.first(), den.first()) else {
-        return Err(ReconcileError::Model("the plant has no coefficients".to_owned()));
+        return Err(ReconcileError::Model(
+            "the plant has no coefficients".to_owned(),
+        ));
     };
-    let zpk = Zpk { zeros: model.plant.zeros(), poles: model.plant.poles(), gain: n / d };
+    let zpk = Zpk {
+        zeros: model.plant.zeros(),
+        poles: model.plant.poles(),
+        gain: n / d,
+    };
     if zpk.poles.iter().any(|p| p.re > 1e-6) {
-        return Err(ReconcileError::Model("the plant is unstable: a free run of it cannot be compared with a record".to_owned()));
+        return Err(ReconcileError::Model(
+            "the plant is unstable: a free run of it cannot be compared with a record".to_owned(),
+        ));
     }
     Ok(Base {
         zpk,
@@ -129,7 +168,9 @@ fn scope_of(model: &Model, records: &[Record], base: &Base) -> Scope {
     let (low, high) = records
         .iter()
         .map(Record::pzt_range_um)
-        .fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), (c, d)| (a.min(c), b.max(d)));
+        .fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), (c, d)| {
+            (a.min(c), b.max(d))
+        });
     let w = model.working_point_um;
     Scope {
         working_point_um: w,
@@ -141,10 +182,19 @@ fn scope_of(model: &Model, records: &[Record], base: &Base) -> Scope {
 }
 
 fn fixed_blocks(model: &Model, scope: &Scope) -> Vec<Block> {
-    model.ordered_effects().into_iter().filter_map(|e| catalogue::block_of(e, scope)).collect()
+    model
+        .ordered_effects()
+        .into_iter()
+        .filter_map(|e| catalogue::block_of(e, scope))
+        .collect()
 }
 
-fn evidence(model: &Model, noise: &Noise, trusted: usize, problem: &Problem) -> Option<WhiteEvidence> {
+fn evidence(
+    model: &Model,
+    noise: &Noise,
+    trusted: usize,
+    problem: &Problem,
+) -> Option<WhiteEvidence> {
     let model_um2 = model.noise.localisation_um.powi(2);
     if trusted < 5000 || model_um2 <= 0.0 {
         return None;
@@ -179,7 +229,12 @@ fn assemble(
     held: HeldOut,
     frames: &FrameCounts,
 ) -> Reconciliation {
-    let Found { fit, null, steps, rivals } = found;
+    let Found {
+        fit,
+        null,
+        steps,
+        rivals,
+    } = found;
     let all = ctx.problem.all();
     let sigma = ctx.problem.noise.innovation_um();
     let n = null.count as f64;
@@ -230,17 +285,37 @@ fn assemble(
             place: place_of(id),
             parameters: parameters(ctx, &fit, i, left / n),
             p_value: significance::p_value(gain, freedom),
-            explained: if excess > 0.0 { (gain / excess).clamp(0.0, 1.0) } else { 0.0 },
+            explained: if excess > 0.0 {
+                (gain / excess).clamp(0.0, 1.0)
+            } else {
+                0.0
+            },
             separate_by: needs_text.then(|| catalogue::separate_by(id, &alternatives)),
             alternatives,
         });
     }
     for (id, named, count, total, rate) in [
-        ("frame-drops", frames.drops_named(), frames.missing, frames.rows, frames.drop_rate()),
-        ("frame-repeats", frames.repeats_named(), frames.repeats, frames.pairs, frames.repeat_rate()),
+        (
+            "frame-drops",
+            frames.drops_named(),
+            frames.missing,
+            frames.rows,
+            frames.drop_rate(),
+        ),
+        (
+            "frame-repeats",
+            frames.repeats_named(),
+            frames.repeats,
+            frames.pairs,
+            frames.repeat_rate(),
+        ),
     ] {
         if named {
-            let chance = if id == "frame-repeats" { frames.by_chance } else { 0.0 };
+            let chance = if id == "frame-repeats" {
+                frames.by_chance
+            } else {
+                0.0
+            };
             let wide = frames::wilson(count as f64, total.max(1) as f64);
             let off = chance / total.max(1) as f64;
             effects.push(NamedEffect {
@@ -248,7 +323,11 @@ fn assemble(
                 place: "camera",
                 parameters: BTreeMap::from([(
                     "rate".to_owned(),
-                    Interval { value: rate, ci95: [(wide[0] - off).max(0.0), (wide[1] - off).max(0.0)], unit: String::new() },
+                    Interval {
+                        value: rate,
+                        ci95: [(wide[0] - off).max(0.0), (wide[1] - off).max(0.0)],
+                        unit: String::new(),
+                    },
                 )]),
                 p_value: significance::p_value(2.0 * (count as f64 - chance), 1),
                 explained: 0.0,
@@ -258,39 +337,66 @@ fn assemble(
             places.push(format!("{id}: {count} of {total} frames"));
         }
     }
-    effects.sort_by(|a, b| b.explained.total_cmp(&a.explained).then_with(|| a.id.cmp(&b.id)));
+    effects.sort_by(|a, b| {
+        b.explained
+            .total_cmp(&a.explained)
+            .then_with(|| a.id.cmp(&b.id))
+    });
 
     // Does the set close the gap?
     let beyond = null.chi2 - n > 4.0 * scatter || null_map.any_flagged();
-    let closed = if excess > 0.0 { 1.0 - left.max(0.0) / excess } else { 1.0 };
+    let closed = if excess > 0.0 {
+        1.0 - left.max(0.0) / excess
+    } else {
+        1.0
+    };
     let open = left > 5.0 * scatter && closed < CLOSED;
     let verdict = if !fit.parts.is_empty() && open {
         Verdict::Unknown
     } else if effects.is_empty() {
-        if beyond { Verdict::Unknown } else { Verdict::NothingMissing }
+        if beyond {
+            Verdict::Unknown
+        } else {
+            Verdict::NothingMissing
+        }
     } else if ambiguous {
         Verdict::Ambiguous
     } else {
         Verdict::Named
     };
-    let hypothesis =
-        (verdict == Verdict::Unknown).then(|| hypothesis::hypothesis(ctx, &null)).flatten();
+    let hypothesis = (verdict == Verdict::Unknown)
+        .then(|| hypothesis::hypothesis(ctx, &null))
+        .flatten();
     if verdict == Verdict::Unknown {
         let best = ids(&fit).join(" + ");
         places.push(if best.is_empty() {
             "no effect of the catalogue explains it".to_owned()
         } else {
-            format!("the best of the catalogue, {best}, closes {:.0} % of it: not enough for a name", 100.0 * closed)
+            format!(
+                "the best of the catalogue, {best}, closes {:.0} % of it: not enough for a name",
+                100.0 * closed
+            )
         });
     } else if after_map.any_flagged() && left > 4.0 * scatter {
-        places.push(format!("after the addition {:.1} % of the excess is left", 100.0 * left / excess));
+        places.push(format!(
+            "after the addition {:.1} % of the excess is left",
+            100.0 * left / excess
+        ));
     }
 
-    let named = if verdict == Verdict::Unknown { Vec::new() } else { effects };
+    let named = if verdict == Verdict::Unknown {
+        Vec::new()
+    } else {
+        effects
+    };
     let rms = |chi2: f64| sigma * (chi2 / n).max(0.0).sqrt();
     // The noise of these very rows: what the full fit leaves, where that is the floor within its own error.
     let in_sample = rms(fit.chi2);
-    let floor_um = if in_sample <= 1.01 * sigma { in_sample } else { sigma };
+    let floor_um = if in_sample <= 1.01 * sigma {
+        in_sample
+    } else {
+        sigma
+    };
     let gap = Gap {
         before: held.before_um,
         after: held.after_um,
@@ -298,7 +404,10 @@ fn assemble(
         unit: "um RMS of innovation on held-out records",
         steps: steps
             .iter()
-            .map(|(names, chi2)| GapStep { effects: names.iter().map(|s| (*s).to_owned()).collect(), rms: rms(*chi2) })
+            .map(|(names, chi2)| GapStep {
+                effects: names.iter().map(|s| (*s).to_owned()).collect(),
+                rms: rms(*chi2),
+            })
             .collect(),
         per_record: held.per_record.clone(),
         bands: held_out::bands(&null_map, &after_map),
@@ -306,7 +415,11 @@ fn assemble(
     let base_shift = BTreeMap::from([
         (
             "frame_edge_share".to_owned(),
-            Interval { value: fit.soft, ci95: [fit.soft, fit.soft], unit: "um/um".to_owned() },
+            Interval {
+                value: fit.soft,
+                ci95: [fit.soft, fit.soft],
+                unit: "um/um".to_owned(),
+            },
         ),
         ("gain".to_owned(), held.gain_shift.clone()),
     ]);
@@ -325,7 +438,10 @@ fn assemble(
         before: null_map,
         after: after_map,
         traces,
-        records: records.iter().map(|r| (r.name.clone(), r.rows(), r.frames())).collect(),
+        records: records
+            .iter()
+            .map(|r| (r.name.clone(), r.rows(), r.frames()))
+            .collect(),
     }
 }
 
@@ -344,8 +460,16 @@ fn place_of(id: &str) -> &'static str {
 }
 
 /// Parameters of part `index` with 95 % intervals in their units.
-fn parameters(ctx: &Context<'_>, fit: &Fit, index: usize, left_per_row: f64) -> BTreeMap<String, Interval> {
-    let offset: usize = fit.parts[..index].iter().map(|p| p.variant().params.len()).sum();
+fn parameters(
+    ctx: &Context<'_>,
+    fit: &Fit,
+    index: usize,
+    left_per_row: f64,
+) -> BTreeMap<String, Interval> {
+    let offset: usize = fit.parts[..index]
+        .iter()
+        .map(|p| p.variant().params.len())
+        .sum();
     let part = &fit.parts[index];
     // A fit that leaves something over is less sure than its own curvature says.
     let wide = (1.0 + left_per_row.max(0.0)).sqrt();
@@ -354,27 +478,56 @@ fn parameters(ctx: &Context<'_>, fit: &Fit, index: usize, left_per_row: f64) -> 
         let x = part.theta[j];
         let sd = fit.covariance[(offset + j, offset + j)].max(0.0).sqrt() * wide;
         let (low, high) = (p.natural(x - 1.96 * sd), p.natural(x + 1.96 * sd));
-        let name = if p.name == "weights" { format!("weights[{j}]") } else { p.name.to_owned() };
-        out.insert(name, Interval { value: p.natural(x), ci95: [low, high], unit: unit_of(p.name).to_owned() });
+        let name = if p.name == "weights" {
+            format!("weights[{j}]")
+        } else {
+            p.name.to_owned()
+        };
+        out.insert(
+            name,
+            Interval {
+                value: p.natural(x),
+                ci95: [low, high],
+                unit: unit_of(p.name).to_owned(),
+            },
+        );
     }
     match part.variant().kind {
         Kind::Line => {
-            let line = fit.parts[..index].iter().filter(|p| p.variant().kind == Kind::Line).count();
+            let line = fit.parts[..index]
+                .iter()
+                .filter(|p| p.variant().kind == Kind::Line)
+                .count();
             let amplitudes: Vec<f64> = fit.lines[line].iter().map(|[a, b]| a.hypot(*b)).collect();
             let rows: f64 = ctx.problem.records.iter().map(|r| r.u.len() as f64).sum();
-            let mean = ctx.problem.records.iter().zip(&amplitudes).map(|(r, a)| a * r.u.len() as f64).sum::<f64>() / rows;
+            let mean = ctx
+                .problem
+                .records
+                .iter()
+                .zip(&amplitudes)
+                .map(|(r, a)| a * r.u.len() as f64)
+                .sum::<f64>()
+                / rows;
             // One record's amplitude has the error sigma sqrt(2/n) over the filter's gain at the line.
             let w = std::f64::consts::TAU * part.natural()[0] * ctx.problem.base.sample_s;
             let theta = ctx.problem.noise.white_um2 / ctx.problem.noise.innovation_um().powi(2);
-            let gain = (2.0 * (w / 2.0).sin()) / (1.0 + theta * theta - 2.0 * theta * w.cos()).sqrt();
+            let gain =
+                (2.0 * (w / 2.0).sin()) / (1.0 + theta * theta - 2.0 * theta * w.cos()).sqrt();
             let sd = ctx.problem.noise.innovation_um() * (2.0 / rows).sqrt() / gain.max(1e-6);
             out.insert(
                 "um".to_owned(),
-                Interval { value: mean, ci95: [mean - 1.96 * sd, mean + 1.96 * sd], unit: "um".to_owned() },
+                Interval {
+                    value: mean,
+                    ci95: [mean - 1.96 * sd, mean + 1.96 * sd],
+                    unit: "um".to_owned(),
+                },
             );
         }
         Kind::Position => {
-            let at = fit.parts[..index].iter().filter(|p| p.variant().kind == Kind::Position).count();
+            let at = fit.parts[..index]
+                .iter()
+                .filter(|p| p.variant().kind == Kind::Position)
+                .count();
             let [a, b] = fit.positions[at];
             let pixel = part.natural()[0];
             let rows: f64 = ctx.problem.count(&ctx.problem.all()) as f64;
@@ -382,7 +535,11 @@ fn parameters(ctx: &Context<'_>, fit: &Fit, index: usize, left_per_row: f64) -> 
             let amplitude = a.hypot(b) / pixel;
             out.insert(
                 "amplitude".to_owned(),
-                Interval { value: amplitude, ci95: [amplitude - 1.96 * sd, amplitude + 1.96 * sd], unit: "px".to_owned() },
+                Interval {
+                    value: amplitude,
+                    ci95: [amplitude - 1.96 * sd, amplitude + 1.96 * sd],
+                    unit: "px".to_owned(),
+                },
             );
         }
         Kind::Chain => {}
@@ -408,29 +565,56 @@ fn unit_of(name: &str) -> &'static str {
 fn effect_of(ctx: &Context<'_>, fit: &Fit, index: usize) -> Option<Effect> {
     let part = &fit.parts[index];
     let v = part.natural();
-    let before = |kind| fit.parts[..index].iter().filter(|p| p.variant().kind == kind).count();
+    let before = |kind| {
+        fit.parts[..index]
+            .iter()
+            .filter(|p| p.variant().kind == kind)
+            .count()
+    };
     Some(match (part.variant().build)(&v, &ctx.scope) {
         Block::Saturation { low_um, high_um } => Effect::Saturation { low_um, high_um },
-        Block::SlewLimit { rate } => Effect::SlewLimit { rate_um_per_s: rate },
+        Block::SlewLimit { rate } => Effect::SlewLimit {
+            rate_um_per_s: rate,
+        },
         Block::DriverLag { .. } => Effect::DriverLag { bandwidth_hz: v[0] },
-        Block::BoucWen { fraction, beta, gamma } => {
-            Effect::PztHysteresis(Hysteresis::BoucWenExplicit { fraction, beta_per_um: beta, gamma_per_um: gamma })
-        }
-        Block::Play { stroke_um, weights, quadratic } => Effect::PztHysteresis(Hysteresis::Play {
+        Block::BoucWen {
+            fraction,
+            beta,
+            gamma,
+        } => Effect::PztHysteresis(Hysteresis::BoucWenExplicit {
+            fraction,
+            beta_per_um: beta,
+            gamma_per_um: gamma,
+        }),
+        Block::Play {
+            stroke_um,
+            weights,
+            quadratic,
+        } => Effect::PztHysteresis(Hysteresis::Play {
             thresholds_um: PLAY_LEVELS.iter().map(|l| l * stroke_um).collect(),
             weights: weights.to_vec(),
             quadratic_per_um: quadratic,
         }),
         Block::Creep { g } => Effect::PztCreep { per_decade: g },
-        Block::Resonance { zeta, .. } => Effect::PztResonance { frequency_hz: v[0], damping: zeta },
+        Block::Resonance { zeta, .. } => Effect::PztResonance {
+            frequency_hz: v[0],
+            damping: zeta,
+        },
         Block::Backlash { width_um } => Effect::Backlash { width_um },
         Block::Relaxation { time_s, strength } => Effect::PdmsRelaxation { time_s, strength },
-        Block::Bubble { lag_s, dissolution } => Effect::Bubble { lag_s, dissolution_per_s: dissolution },
-        Block::Leak { corner } => Effect::Leak { corner_rad_per_s: corner },
+        Block::Bubble { lag_s, dissolution } => Effect::Bubble {
+            lag_s,
+            dissolution_per_s: dissolution,
+        },
+        Block::Leak { corner } => Effect::Leak {
+            corner_rad_per_s: corner,
+        },
         Block::Gain { factor } => Effect::GainError { factor },
         Block::GainDrift { per_s } => Effect::GainDrift { per_s },
         Block::FlowDrift { um_per_s } => Effect::FlowDrift { um_per_s },
-        Block::Adhesion { um_per_s } => Effect::WallAdhesion { speed_um_per_s: um_per_s },
+        Block::Adhesion { um_per_s } => Effect::WallAdhesion {
+            speed_um_per_s: um_per_s,
+        },
         Block::ClockSkew { .. } => Effect::ClockSkew { ppm: v[0] },
         Block::Delay { s } => Effect::TimeDelay { delay_s: s },
         Block::Exposure { s } => Effect::ExposureAveraging { exposure_s: s },
@@ -438,12 +622,27 @@ fn effect_of(ctx: &Context<'_>, fit: &Fit, index: usize) -> Option<Effect> {
             let line = &fit.lines[before(Kind::Line)];
             let [a, b] = line.first().copied()?;
             let rows: f64 = ctx.problem.records.iter().map(|r| r.u.len() as f64).sum();
-            let um = ctx.problem.records.iter().zip(line).map(|(r, [a, b])| a.hypot(*b) * r.u.len() as f64).sum::<f64>() / rows;
-            Effect::MainsHum { hz, um, phase_deg: b.atan2(a).to_degrees() }
+            let um = ctx
+                .problem
+                .records
+                .iter()
+                .zip(line)
+                .map(|(r, [a, b])| a.hypot(*b) * r.u.len() as f64)
+                .sum::<f64>()
+                / rows;
+            Effect::MainsHum {
+                hz,
+                um,
+                phase_deg: b.atan2(a).to_degrees(),
+            }
         }
         Block::PixelLocking { pixel_um } => {
             let [a, b] = fit.positions[before(Kind::Position)];
-            Effect::PixelLocking { pixel_um, amplitude: a.hypot(b) / pixel_um, phase_deg: b.atan2(a).to_degrees() }
+            Effect::PixelLocking {
+                pixel_um,
+                amplitude: a.hypot(b) / pixel_um,
+                phase_deg: b.atan2(a).to_degrees(),
+            }
         }
     })
 }
@@ -458,22 +657,34 @@ fn augment(
     verdict: Verdict,
 ) -> Model {
     let mut out = model.clone();
-    out.name = if named.is_empty() { model.name.clone() } else { format!("{}-augmented", model.name) };
+    out.name = if named.is_empty() {
+        model.name.clone()
+    } else {
+        format!("{}-augmented", model.name)
+    };
     out.covariance = None;
-    out.noise.diffusion_um2_per_s = ctx.problem.noise.diffusion_um2_per_s(ctx.problem.base.sample_s);
+    out.noise.diffusion_um2_per_s = ctx
+        .problem
+        .noise
+        .diffusion_um2_per_s(ctx.problem.base.sample_s);
     out.noise.localisation_um = ctx.problem.noise.localisation_um();
     if verdict != Verdict::Unknown {
         for i in 0..fit.parts.len() {
             if let Some(e) = effect_of(ctx, fit, i) {
-                out.effects.retain(|old| old.id() != e.id() || !VARIANTS.iter().any(|v| v.id == old.id()));
+                out.effects
+                    .retain(|old| old.id() != e.id() || !VARIANTS.iter().any(|v| v.id == old.id()));
                 out.effects.push(e);
             }
         }
         if frames.drops_named() {
-            out.effects.push(Effect::FrameDrops { rate: frames.drop_rate() });
+            out.effects.push(Effect::FrameDrops {
+                rate: frames.drop_rate(),
+            });
         }
         if frames.repeats_named() {
-            out.effects.push(Effect::FrameRepeats { rate: frames.repeat_rate() });
+            out.effects.push(Effect::FrameRepeats {
+                rate: frames.repeat_rate(),
+            });
         }
         for e in named {
             for (name, p) in &e.parameters {
@@ -481,13 +692,50 @@ fn augment(
             }
         }
     }
-    out.provenance.insert("reconcile.verdict".to_owned(), verdict.word().to_owned());
-    out.provenance.insert("reconcile.base".to_owned(), model.name.clone());
+    out.provenance
+        .insert("reconcile.verdict".to_owned(), verdict.word().to_owned());
+    out.provenance
+        .insert("reconcile.base".to_owned(), model.name.clone());
     for e in named {
         out.provenance.insert(
             format!("reconcile.{}", e.id),
-            format!("p = {:.1e}, explains {:.1} % of the excess over the noise floor", e.p_value, 100.0 * e.explained),
+            format!(
+                "p = {:.1e}, explains {:.1} % of the excess over the noise floor",
+                e.p_value,
+                100.0 * e.explained
+            ),
         );
     }
     out
+}
+
+/// A base model for records without one: the constant gain that fits best, and the mean command about which it acts.
+///
+/// # Errors
+/// No records, or a command that never changes.
+pub fn constant_gain(records: &[Record]) -> Result<(f64, f64), ReconcileError> {
+    if records.is_empty() {
+        return Err(ReconcileError::NoRecords);
+    }
+    let rows = || {
+        records
+            .iter()
+            .flat_map(|r| r.pzt_um.iter().zip(&r.bead_um))
+            .filter(|(_, y)| y.is_finite())
+            .map(|(u, y)| (*u, *y))
+    };
+    let n = rows().count().max(1) as f64;
+    let (mean_u, mean_y) = (
+        rows().map(|(u, _)| u).sum::<f64>() / n,
+        rows().map(|(_, y)| y).sum::<f64>() / n,
+    );
+    let (mut uu, mut uy) = (0.0, 0.0);
+    for (u, y) in rows() {
+        uu += (u - mean_u) * (u - mean_u);
+        uy += (u - mean_u) * (y - mean_y);
+    }
+    if uu <= 0.0 {
+        return Err(ReconcileError::ConstantInput);
+    }
+    Ok((uy / uu, mean_u))
 }

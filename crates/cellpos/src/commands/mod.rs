@@ -2,6 +2,7 @@
 
 pub mod doctor;
 pub mod identify;
+pub mod reconcile;
 
 use crate::outcome::CommandResult;
 
@@ -12,6 +13,8 @@ pub enum Command {
     Doctor(doctor::Args),
     /// Measure the rig's frequency response and fit a model to it, or fit one to records.
     Identify(Box<identify::Args>),
+    /// Find where simulation and measurement disagree, name what is missing, add it to the model.
+    Reconcile(reconcile::Args),
 }
 
 impl Command {
@@ -20,6 +23,7 @@ impl Command {
         match self {
             Self::Doctor(args) => doctor::run(args),
             Self::Identify(args) => identify::run(*args),
+            Self::Reconcile(args) => reconcile::run(args),
         }
     }
 }

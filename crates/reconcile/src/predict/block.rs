@@ -10,9 +10,17 @@ pub(crate) enum Block {
     /// Corner \[rad/s\].
     DriverLag { w: f64 },
     /// `x = u - fraction h`, one step of h per increment of u.
-    BoucWen { fraction: f64, beta: f64, gamma: f64 },
+    BoucWen {
+        fraction: f64,
+        beta: f64,
+        gamma: f64,
+    },
     /// Weights of play operators with thresholds `i`-th of [`PLAY_LEVELS`] times `stroke_um`, and the quadratic term.
-    Play { stroke_um: f64, weights: [f64; PLAY_LEVELS.len()], quadratic: f64 },
+    Play {
+        stroke_um: f64,
+        weights: [f64; PLAY_LEVELS.len()],
+        quadratic: f64,
+    },
     /// Per decade.
     Creep { g: f64 },
     /// rad/s and damping ratio.

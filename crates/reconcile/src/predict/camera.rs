@@ -49,7 +49,11 @@ pub(crate) fn bead(t: &mut Trace, blocks: &[Block], h: f64) {
                 let mut sum = 0.0;
                 for j in 0..n {
                     let at = j as f64 * h;
-                    let flow = if j + 1 < n { t.pos[j + 1] - t.pos[j] - t.jump[j] } else { 0.0 };
+                    let flow = if j + 1 < n {
+                        t.pos[j + 1] - t.pos[j] - t.jump[j]
+                    } else {
+                        0.0
+                    };
                     t.pos[j] = sum;
                     t.jump[j] *= 1.0 + per_s * at;
                     t.start_slope[j] *= 1.0 + per_s * at;
@@ -67,7 +71,11 @@ pub(crate) fn bead(t: &mut Trace, blocks: &[Block], h: f64) {
             Block::Adhesion { um_per_s } => {
                 let mut sum = 0.0;
                 for j in 0..n {
-                    let flow = if j + 1 < n { t.pos[j + 1] - t.pos[j] - t.jump[j] } else { 0.0 };
+                    let flow = if j + 1 < n {
+                        t.pos[j + 1] - t.pos[j] - t.jump[j]
+                    } else {
+                        0.0
+                    };
                     let (a, b) = (t.start_slope[j], t.end_slope[j]);
                     // The mean of a linear speed differs from the true flow by the curvature: keep that part.
                     let bend = flow / h - 0.5 * (a + b);
@@ -84,7 +92,14 @@ pub(crate) fn bead(t: &mut Trace, blocks: &[Block], h: f64) {
 }
 
 /// Positions at the frames: clock skew, delay and exposure on a trace with `fine` steps per sample.
-pub(crate) fn sample(t: &Trace, blocks: &[Block], h: f64, fine: usize, rows: usize, y: &mut Vec<f64>) {
+pub(crate) fn sample(
+    t: &Trace,
+    blocks: &[Block],
+    h: f64,
+    fine: usize,
+    rows: usize,
+    y: &mut Vec<f64>,
+) {
     let (mut skew, mut delay, mut exposure) = (0.0, 0.0, 0.0);
     for b in blocks {
         match *b {
@@ -123,7 +138,11 @@ struct Path<'a> {
 impl<'a> Path<'a> {
     fn new(t: &'a Trace, h: f64, with_area: bool) -> Self {
         let n = t.pos.len();
-        let mut path = Self { t, h, area: Vec::new() };
+        let mut path = Self {
+            t,
+            h,
+            area: Vec::new(),
+        };
         if with_area {
             let mut area = Vec::with_capacity(n);
             let mut sum = 0.0;
@@ -152,7 +171,9 @@ impl<'a> Path<'a> {
     fn step_of(&self, at: f64) -> (usize, f64) {
         // Limits from the left: a command that acts at the very instant is not seen yet.
         let x = at / self.h;
-        let j = ((x - 1e-7).ceil() - 1.0).max(0.0).min(self.t.pos.len() as f64 - 1.0);
+        let j = ((x - 1e-7).ceil() - 1.0)
+            .max(0.0)
+            .min(self.t.pos.len() as f64 - 1.0);
         (j as usize, (x - j).max(0.0))
     }
 

@@ -30,7 +30,13 @@ pub(crate) struct Base {
 ///
 /// `edge`, where asked for, receives the step of the plant's input that acts at the instant of each frame, in parts of
 /// the plant's direct path: what a frame that straddles the edge may already show.
-pub(crate) fn simulate(base: &Base, u: &[f64], blocks: &[Block], y: &mut Vec<f64>, edge: Option<&mut Vec<f64>>) {
+pub(crate) fn simulate(
+    base: &Base,
+    u: &[f64],
+    blocks: &[Block],
+    y: &mut Vec<f64>,
+    edge: Option<&mut Vec<f64>>,
+) {
     let chain = Chain::new(base, blocks);
     chain.run(u, y, edge);
 }
@@ -45,7 +51,10 @@ struct Chain<'a> {
 fn is_motion(b: &Block) -> bool {
     matches!(
         b,
-        Block::Adhesion { .. } | Block::ClockSkew { .. } | Block::Delay { .. } | Block::Exposure { .. }
+        Block::Adhesion { .. }
+            | Block::ClockSkew { .. }
+            | Block::Delay { .. }
+            | Block::Exposure { .. }
     )
 }
 
@@ -93,22 +102,34 @@ impl<'a> Chain<'a> {
         } else if self.fine == 1 {
             u.to_vec()
         } else {
-            u.iter().flat_map(|&v| std::iter::repeat_n(v, self.fine)).collect()
+            u.iter()
+                .flat_map(|&v| std::iter::repeat_n(v, self.fine))
+                .collect()
         };
         let mut pending = Zpk::unity();
         for b in self.blocks {
             match *b {
                 Block::Saturation { low_um, high_um } => {
-                    let (low, high) =
-                        (low_um - self.base.working_point_um, high_um - self.base.working_point_um);
+                    let (low, high) = (
+                        low_um - self.base.working_point_um,
+                        high_um - self.base.working_point_um,
+                    );
                     x.iter_mut().for_each(|v| *v = v.min(high).max(low));
                 }
                 Block::SlewLimit { rate } => piezo::slew(&mut x, rate, h),
-                Block::BoucWen { fraction, beta, gamma } => {
+                Block::BoucWen {
+                    fraction,
+                    beta,
+                    gamma,
+                } => {
                     flush(&mut pending, &mut x, h);
                     piezo::bouc_wen(&mut x, fraction, beta, gamma);
                 }
-                Block::Play { stroke_um, ref weights, quadratic } => {
+                Block::Play {
+                    stroke_um,
+                    ref weights,
+                    quadratic,
+                } => {
                     flush(&mut pending, &mut x, h);
                     piezo::play(&mut x, stroke_um, weights, quadratic);
                 }
@@ -147,7 +168,11 @@ impl Chain<'_> {
     fn edges(&self, x: &[f64], direct: f64, n: usize, edge: &mut Vec<f64>) {
         edge.clear();
         edge.resize(n, 0.0);
-        let base = if self.base.zpk.zeros.len() == self.base.zpk.poles.len() { self.base.zpk.gain } else { 0.0 };
+        let base = if self.base.zpk.zeros.len() == self.base.zpk.poles.len() {
+            self.base.zpk.gain
+        } else {
+            0.0
+        };
         if base == 0.0 || direct == 0.0 {
             return;
         }
@@ -166,10 +191,10 @@ impl Chain<'_> {
             return;
         }
         let (shift, share) = (whole as usize, direct / base);
-        for k in shift..n {
+        for (k, edge) in edge.iter_mut().enumerate().skip(shift) {
             let j = (k - shift) * self.fine;
             let before = if j == 0 { x[0] } else { x[j - 1] };
-            edge[k] = share * (x[j] - before);
+            *edge = share * (x[j] - before);
         }
     }
 }

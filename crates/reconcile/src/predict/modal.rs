@@ -19,7 +19,11 @@ pub(crate) struct Zpk {
 impl Zpk {
     /// The factor 1.
     pub fn unity() -> Self {
-        Self { zeros: Vec::new(), poles: Vec::new(), gain: 1.0 }
+        Self {
+            zeros: Vec::new(),
+            poles: Vec::new(),
+            gain: 1.0,
+        }
     }
 
     /// Appends `(1 + s/w_zero) / (1 + s/w_pole)`; `None` leaves a side out.
@@ -43,7 +47,10 @@ impl Zpk {
 
     /// Value at a complex frequency.
     pub fn at(&self, s: C) -> C {
-        let n = self.zeros.iter().fold(C::new(self.gain, 0.0), |a, z| a * (s - z));
+        let n = self
+            .zeros
+            .iter()
+            .fold(C::new(self.gain, 0.0), |a, z| a * (s - z));
         self.poles.iter().fold(n, |a, p| a / (s - p))
     }
 
@@ -120,7 +127,10 @@ impl Modal {
             if p.im < 0.0 {
                 continue;
             }
-            let mut r = zpk.zeros.iter().fold(C::new(zpk.gain, 0.0), |a, z| a * (p - z));
+            let mut r = zpk
+                .zeros
+                .iter()
+                .fold(C::new(zpk.gain, 0.0), |a, z| a * (p - z));
             for (j, q) in poles.iter().enumerate() {
                 if j != i {
                     r /= p - q;
@@ -131,15 +141,29 @@ impl Modal {
             }
             let x = p * h;
             let a = x.exp();
-            let b = if x.norm() < 1e-5 { (C::new(1.0, 0.0) + x * 0.5) * h } else { (a - 1.0) / p };
+            let b = if x.norm() < 1e-5 {
+                (C::new(1.0, 0.0) + x * 0.5) * h
+            } else {
+                (a - 1.0) / p
+            };
             slope_direct += r.re;
             if p.im == 0.0 {
                 real.push([a.re, b.re, r.re, (r * p).re]);
             } else {
-                complex.push(Mode { a, b, weight: r, slope: r * p });
+                complex.push(Mode {
+                    a,
+                    b,
+                    weight: r,
+                    slope: r * p,
+                });
             }
         }
-        Self { real, complex, direct, slope_direct }
+        Self {
+            real,
+            complex,
+            direct,
+            slope_direct,
+        }
     }
 
     /// Positions just before each input acts: `y_k = C x_k + D u_(k-1)`, from rest.
@@ -189,7 +213,8 @@ impl Modal {
             before = u;
         }
         t.start_slope.clear();
-        t.start_slope.extend(u.iter().map(|u| self.slope_direct * u));
+        t.start_slope
+            .extend(u.iter().map(|u| self.slope_direct * u));
         t.end_slope.clear();
         t.end_slope.extend_from_slice(&t.start_slope);
         for &[a, b, _, s] in &self.real {

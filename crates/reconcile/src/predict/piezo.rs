@@ -6,8 +6,19 @@ use nalgebra::Complex;
 
 /// Fastest and slowest lag of the creep bank, as powers of ten of a second; two per decade.
 const CREEP_TAUS_S: [f64; 13] = [
-    1e-3, 3.162_277_66e-3, 1e-2, 3.162_277_66e-2, 0.1, 0.316_227_766, 1.0, 3.162_277_66, 10.0, 31.622_776_6, 100.0,
-    316.227_766, 1000.0,
+    1e-3,
+    3.162_277_66e-3,
+    1e-2,
+    3.162_277_66e-2,
+    0.1,
+    0.316_227_766,
+    1.0,
+    3.162_277_66,
+    10.0,
+    31.622_776_6,
+    100.0,
+    316.227_766,
+    1000.0,
 ];
 
 /// Appends a linear block to a chain; anything else is left out.
@@ -44,7 +55,15 @@ fn creep(g: f64, zpk: &mut Zpk) {
     let n0: f64 = CREEP_TAUS_S.iter().map(|t| 1.0 - (-0.1 / t).exp()).sum();
     let direct = 1.0 - 0.5 * g * n0;
     // Zeros interlace with the poles: one between each pair, one beyond the fastest. Bisection on w = -s.
-    let value = |w: f64| direct + 0.5 * g * CREEP_TAUS_S.iter().map(|t| 1.0 / (1.0 - t * w)).sum::<f64>();
+    let value = |w: f64| {
+        direct
+            + 0.5
+                * g
+                * CREEP_TAUS_S
+                    .iter()
+                    .map(|t| 1.0 / (1.0 - t * w))
+                    .sum::<f64>()
+    };
     if g <= 0.0 || direct <= 0.0 {
         return;
     }
@@ -99,7 +118,12 @@ pub(crate) fn bouc_wen(x: &mut [f64], fraction: f64, beta: f64, gamma: f64) {
 }
 
 /// Prandtl-Ishlinskii: weighted play operators and a quadratic output term.
-pub(crate) fn play(x: &mut [f64], stroke_um: f64, weights: &[f64; PLAY_LEVELS.len()], quadratic: f64) {
+pub(crate) fn play(
+    x: &mut [f64],
+    stroke_um: f64,
+    weights: &[f64; PLAY_LEVELS.len()],
+    quadratic: f64,
+) {
     let radii = PLAY_LEVELS.map(|l| l * stroke_um);
     let mut p = [0.0f64; PLAY_LEVELS.len()];
     for v in x.iter_mut() {

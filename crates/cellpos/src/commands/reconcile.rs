@@ -1,0 +1,297 @@
+//! `cellpos reconcile`: where simulation and measurement disagree, what is missing, added and shown.
+
+use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
+use cellpos_plant::{Model, Noise, TransferFunction};
+use cellpos_reconcile::{Options, ReconcileError, Reconciliation, Record, Verdict, reconcile};
+use cellpos_table::{ColumnRef, Table};
+use std::path::{Path, PathBuf};
+
+/// Find where simulation and measurement disagree, name what is missing, add it to the model.
+#[derive(Debug, clap::Args)]
+#[command(after_help = "\
+Examples:
+  cellpos reconcile --model eq6 --data runs/monday --out augmented.toml --report gap.html --json result.json
+  cellpos reconcile --model fit --data Model_Vi_Do.dat --rows 0:8027 --input-column 1 --output-column 5 --rate 200Hz
+
+Verdicts: named, ambiguous (the data cannot separate, and what would), unknown (nothing in the catalogue closes enough),
+nothing-missing. Exit code 0 whenever a verdict was reached, 2 for bad input.")]
+pub struct Args {
+    /// Model: eq6, the path of a model.toml, or `fit` for a constant gain fitted to the records.
+    #[arg(long, default_value = "eq6")]
+    model: String,
+    /// CSV files, run folders, or folders of both.
+    #[arg(long, required = true, num_args = 1..)]
+    data: Vec<PathBuf>,
+    /// Write the augmented model here (TOML).
+    #[arg(long)]
+    out: Option<PathBuf>,
+    /// Write the report here (HTML).
+    #[arg(long)]
+    report: Option<PathBuf>,
+    /// Print the result as JSON, or write it to FILE.
+    #[arg(long, num_args = 0..=1, default_missing_value = "-", value_name = "FILE")]
+    json: Option<PathBuf>,
+    /// Column of the command: its name, or its number from 1.
+    #[arg(long, default_value = "pzt_um")]
+    input_column: String,
+    /// Column of the position: its name, or its number from 1.
+    #[arg(long, default_value = "bead_um")]
+    output_column: String,
+    /// Column of the time in seconds: its name, or its number from 1.
+    #[arg(long, default_value = "time_s")]
+    time_column: String,
+    /// Sampling rate of files without a time column, with unit (200Hz).
+    #[arg(long)]
+    rate: Option<cellpos_units::Hertz>,
+    /// Factor from the command's column to um (4 for volts).
+    #[arg(long, default_value_t = 1.0)]
+    input_um_per_unit: f64,
+    /// Factor from the position's column to um (0.001 for nanometres).
+    #[arg(long, default_value_t = 1.0)]
+    output_um_per_unit: f64,
+    /// Rows FROM:TO of every file, counted from 0, TO not included.
+    #[arg(long, value_name = "FROM:TO")]
+    rows: Option<String>,
+    /// Most effects to add.
+    #[arg(long, default_value_t = 4)]
+    max_effects: usize,
+    /// Threads; the result does not depend on it.
+    #[arg(long)]
+    threads: Option<usize>,
+}
+
+/// Runs the command.
+pub fn run(args: Args) -> CommandResult {
+    let files = files(&args.data)?;
+    let mut records = Vec::new();
+    for file in &files {
+        records.push(read(file, &args)?);
+    }
+    let threads = args
+        .threads
+        .unwrap_or_else(|| std::thread::available_parallelism().map_or(2, std::num::NonZero::get))
+        .max(1);
+    let mut options = Options {
+        threads,
+        max_effects: args.max_effects,
+        ..Options::default()
+    };
+    let model = if args.model == "fit" {
+        options.interpolated_input = true;
+        fitted(&records)?
+    } else {
+        Model::load(&args.model).map_err(Failure::input)?
+    };
+    let bar = indicatif::ProgressBar::new_spinner();
+    let result = reconcile(&model, &records, &options, &mut |text| {
+        bar.set_message(text.to_owned());
+        bar.tick();
+    });
+    bar.finish_and_clear();
+    let result = result.map_err(refused)?;
+    write(&args, &result)?;
+    Ok(Outcome::Done)
+}
+
+fn refused(error: ReconcileError) -> Failure {
+    Failure::bad_input(
+        error,
+        "no verdict: see docs/reconcile.md for what records are needed",
+    )
+}
+
+fn write(args: &Args, result: &Reconciliation) -> Result<(), Failure> {
+    let io = |path: &Path, e: std::io::Error| {
+        Failure::bad_input(
+            format!("cannot write {}: {e}", path.display()),
+            "check the folder and its permissions",
+        )
+    };
+    if let Some(path) = &args.out {
+        std::fs::write(path, result.augmented.to_toml_string()).map_err(|e| io(path, e))?;
+    }
+    if let Some(path) = &args.report {
+        let title = args
+            .data
+            .iter()
+            .map(|d| d.display().to_string())
+            .collect::<Vec<_>>()
+            .join(", ");
+        std::fs::write(path, cellpos_reconcile::report(result, &title).to_html())
+            .map_err(|e| io(path, e))?;
+    }
+    match &args.json {
+        Some(path) if path.as_os_str() == "-" => return print_json(&result.to_json()),
+        Some(path) => {
+            let text = serde_json::to_string_pretty(&result.to_json()).map_err(Failure::failed)?;
+            std::fs::write(path, text + "\n").map_err(|e| io(path, e))?;
+        }
+        None => {}
+    }
+    print_text(&summary(result))
+}
+
+fn summary(result: &Reconciliation) -> String {
+    use std::fmt::Write as _;
+    let mut s = format!("verdict: {}\n", result.verdict.word());
+    for e in &result.effects {
+        let _ = writeln!(
+            s,
+            "  {} (at the {}), explains {:.1} % of the excess",
+            e.id,
+            e.place,
+            100.0 * e.explained
+        );
+        for (name, p) in &e.parameters {
+            let _ = writeln!(
+                s,
+                "    {name} = {:.6} {} (95 %: {:.6} .. {:.6})",
+                p.value, p.unit, p.ci95[0], p.ci95[1]
+            );
+        }
+        if !e.alternatives.is_empty() {
+            let _ = writeln!(s, "    or: {}", e.alternatives.join(", "));
+        }
+        if let Some(by) = &e.separate_by {
+            let _ = writeln!(s, "    to separate: {by}");
+        }
+    }
+    for p in &result.places {
+        let _ = writeln!(s, "where: {p}");
+    }
+    if let Some(h) = &result.hypothesis {
+        let _ = writeln!(
+            s,
+            "hypothesis ({:.0} % on held-out data): {}",
+            100.0 * h.held_out_worth,
+            h.formula
+        );
+    }
+    let g = &result.gap;
+    if result.verdict == Verdict::NothingMissing {
+        let _ = writeln!(
+            s,
+            "gap: {:.1} nm, at the floor of {:.1} nm RMS of innovation",
+            1e3 * g.before,
+            1e3 * g.floor
+        );
+    } else {
+        let _ = writeln!(
+            s,
+            "gap on held-out records: {:.1} nm before, {:.1} nm after, floor {:.1} nm RMS of innovation",
+            1e3 * g.before,
+            1e3 * g.after,
+            1e3 * g.floor
+        );
+    }
+    s
+}
+
+/// All record files behind the arguments, in a fixed order.
+fn files(data: &[PathBuf]) -> Result<Vec<PathBuf>, Failure> {
+    let mut found = Vec::new();
+    for path in data {
+        if path.is_dir() && !is_run(path) {
+            let entries = std::fs::read_dir(path).map_err(|e| {
+                Failure::bad_input(
+                    format!("cannot read the folder {}: {e}", path.display()),
+                    "check --data",
+                )
+            })?;
+            let mut inside: Vec<PathBuf> = entries
+                .filter_map(Result::ok)
+                .map(|e| e.path())
+                .filter(|p| {
+                    (p.is_dir() && is_run(p))
+                        || p.extension().is_some_and(|e| e == "csv" || e == "dat")
+                })
+                .collect();
+            inside.sort();
+            if inside.is_empty() {
+                return Err(Failure::bad_input(
+                    format!("no CSV file and no run folder in {}", path.display()),
+                    "--data takes CSV files (time_s,pzt_um,bead_um), run folders, or a folder of them",
+                ));
+            }
+            found.extend(inside);
+        } else if path.exists() {
+            found.push(path.clone());
+        } else {
+            return Err(Failure::bad_input(
+                format!("{} does not exist", path.display()),
+                "check --data",
+            ));
+        }
+    }
+    Ok(found)
+}
+
+fn is_run(path: &Path) -> bool {
+    path.join("ticks.arrow").exists()
+}
+
+fn read(path: &Path, args: &Args) -> Result<Record, Failure> {
+    let name = path.file_stem().map_or_else(
+        || path.display().to_string(),
+        |s| s.to_string_lossy().into_owned(),
+    );
+    let bytes = std::fs::read(path).map_err(|e| {
+        Failure::bad_input(
+            format!("cannot read {}: {e}", path.display()),
+            "check --data",
+        )
+    })?;
+    let text = String::from_utf8(bytes).map_err(|_| {
+        Failure::bad_input(
+            format!("{} is not a text file", path.display()),
+            "records are CSV: time_s,pzt_um,bead_um",
+        )
+    })?;
+    let table = Table::parse(path, &text).map_err(Failure::input)?;
+    let column = |c: &str, empty| {
+        table
+            .numbers(&ColumnRef::from(c), empty)
+            .map_err(Failure::input)
+    };
+    let mut u = column(&args.input_column, false)?;
+    let mut y = column(&args.output_column, true)?;
+    let mut t = match args.rate {
+        Some(rate) => (0..u.len()).map(|k| k as f64 / rate.value()).collect(),
+        None => column(&args.time_column, false)?,
+    };
+    if let Some(rows) = &args.rows {
+        let wrong = || {
+            Failure::bad_input(
+                format!("--rows {rows}: not FROM:TO within 0..{}", u.len()),
+                "for example --rows 0:6000",
+            )
+        };
+        let (from, to) = rows.split_once(':').ok_or_else(wrong)?;
+        let (from, to): (usize, usize) = (
+            from.parse().map_err(|_| wrong())?,
+            to.parse().map_err(|_| wrong())?,
+        );
+        if from >= to || to > u.len() {
+            return Err(wrong());
+        }
+        u = u[from..to].to_vec();
+        y = y[from..to].to_vec();
+        t = t[from..to].to_vec();
+    }
+    u.iter_mut().for_each(|v| *v *= args.input_um_per_unit);
+    y.iter_mut().for_each(|v| *v *= args.output_um_per_unit);
+    Record::from_rows(&name, &t, &u, &y).map_err(refused)
+}
+
+/// A base model for data without one: a constant gain about the middle of the command.
+fn fitted(records: &[Record]) -> Result<Model, Failure> {
+    let (gain, working_point_um) = cellpos_reconcile::constant_gain(records).map_err(refused)?;
+    Ok(Model {
+        name: "fit".to_owned(),
+        description: "A constant gain fitted to the records".to_owned(),
+        plant: TransferFunction::new(vec![gain], vec![1.0]).map_err(Failure::input)?,
+        working_point_um,
+        noise: Noise::NONE,
+        ..Model::eq6()
+    })
+}
