@@ -10,6 +10,7 @@
 
 use crate::error::{BuildError, check};
 use crate::loop_model::{LoopModel, MODES};
+use serde::{Deserialize, Serialize};
 
 /// Past commands held.
 pub const HISTORY: usize = 6;
@@ -25,7 +26,8 @@ const STUCK_AVERAGE: f64 = 0.05;
 const RELEASED_NEUTRAL_UM: f64 = 0.5;
 
 /// Noise and gate of the estimator.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
 pub struct EstimatorConfig {
     /// Diffusion coefficient D of the bead, um^2/s.
     pub diffusion_um2_per_s: f64,

@@ -10,6 +10,7 @@
 //! that just before `u_k` takes effect. The measurement that arrives at tick `k` is of the position `delay` earlier.
 #![forbid(unsafe_code)]
 
+mod config;
 mod control_loop;
 pub mod design;
 mod error;
@@ -22,6 +23,7 @@ mod reference;
 mod simulation;
 mod state;
 
+pub use config::{ConfigError, ControllerFile, ControllerKind, PiFile};
 pub use control_loop::{
     ControlLoop, Controller, ControllerConfig, LoopConfig, LoopFlags, LoopInput, LoopOutput,
     Measurement, Mode, SolverReport, SolverStatus,

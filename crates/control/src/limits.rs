@@ -1,9 +1,11 @@
 //! Limits of the command: finite, within range, within slew. The last step of every tick, whatever went before.
 
 use crate::error::{BuildError, check};
+use serde::{Deserialize, Serialize};
 
 /// Range, slew and park displacement of the PZT.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
 pub struct Limits {
     /// Smallest displacement, um.
     pub low_um: f64,

@@ -4,9 +4,11 @@
 //! Gains: `kp` in um of PZT per um of bead, `ki` in 1/s (um of PZT per um of bead and second).
 
 use crate::error::{BuildError, check};
+use serde::{Deserialize, Serialize};
 
 /// A lead `(1 + s/wz) / (1 + s/wp)` with `wz < wp`, discretised by Tustin's rule.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct Lead {
     /// Zero, Hz.
     pub zero_hz: f64,

@@ -1,5 +1,6 @@
 //! One module a command: `Args` (read by clap), `run(args)` (calls the libraries, prints the result).
 
+pub mod design;
 pub mod doctor;
 pub mod identify;
 pub mod reconcile;
@@ -9,6 +10,8 @@ use crate::outcome::CommandResult;
 /// The commands, in the order in which a lab needs them.
 #[derive(Debug, clap::Subcommand)]
 pub enum Command {
+    /// A controller for a model and a loop delay: margins, predicted error, spread, controller.toml.
+    Design(design::Args),
     /// Is this machine fit for a 1 kHz loop: verdict, reasons, what to change.
     Doctor(doctor::Args),
     /// Measure the rig's frequency response and fit a model to it, or fit one to records.
@@ -21,6 +24,7 @@ impl Command {
     /// Runs the command.
     pub fn run(self) -> CommandResult {
         match self {
+            Self::Design(args) => design::run(args),
             Self::Doctor(args) => doctor::run(args),
             Self::Identify(args) => identify::run(*args),
             Self::Reconcile(args) => reconcile::run(args),

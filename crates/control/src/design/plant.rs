@@ -33,6 +33,14 @@ pub enum DesignWarning {
         /// Delay of the model's effects with the half sample of hold, ms.
         model_ms: f64,
     },
+    /// Neither the model nor the caller states a delay.
+    #[error(
+        "no delay is given, neither by the model nor asked for: {assumed_ms} ms is assumed (2 ms camera path and half a sample of hold)"
+    )]
+    DelayAssumed {
+        /// Assumed, ms.
+        assumed_ms: f64,
+    },
     /// A controller that cannot be stable at some point of the spread.
     #[error(
         "unstable at {gain_factor} x the gain with {extra_samples} more samples of delay: {why}"

@@ -1,5 +1,6 @@
 //! The whole design in one call: what `cellpos design` prints.
 
+use crate::config::{ConfigError, text_error};
 use crate::control_loop::{ControllerConfig, LoopConfig};
 use crate::design::bound::bound_rms_um;
 use crate::design::margins::{Margins, margins};
@@ -10,7 +11,7 @@ use crate::design::spread::{SpreadRow, spread};
 use crate::design::step::{
     DisturbanceFigures, SetUpError, StepFigures, disturbance_figures, step_figures,
 };
-use crate::error::BuildError;
+use crate::error::{BuildError, check};
 use crate::estimator::EstimatorConfig;
 use crate::limits::Limits;
 use crate::linear::LinearLaw;
@@ -83,6 +84,50 @@ pub struct DesignLimits {
     pub stable_over_spread: Option<bool>,
 }
 
+impl DesignLimits {
+    /// Reads a limits file.
+    ///
+    /// # Errors
+    /// A file that cannot be read, text that is not TOML, unknown keys, wrong types, a number that is not positive.
+    pub fn load(path: &std::path::Path) -> Result<Self, ConfigError> {
+        let file = path.display().to_string();
+        let text = std::fs::read_to_string(path).map_err(|error| ConfigError::Unreadable {
+            file: file.clone(),
+            reason: error.to_string(),
+        })?;
+        Self::from_toml_str(&text, &file)
+    }
+
+    /// Reads the text of a limits file; `file` is for the messages only.
+    ///
+    /// # Errors
+    /// Text that is not TOML, unknown keys, wrong types, a number that is not positive.
+    pub fn from_toml_str(text: &str, file: &str) -> Result<Self, ConfigError> {
+        let this: Self = toml::from_str(text).map_err(|error| text_error(text, file, &error))?;
+        let values = [
+            ("max_ms", this.max_ms),
+            ("max_mt", this.max_mt),
+            ("min_pm_deg", this.min_pm_deg),
+            ("min_gm_db", this.min_gm_db),
+            ("min_delay_margin_ms", this.min_delay_margin_ms),
+            ("max_rms_nm", this.max_rms_nm),
+            ("max_overshoot_percent", this.max_overshoot_percent),
+            ("max_settling_ms", this.max_settling_ms),
+        ];
+        for (name, value) in values {
+            if let Some(value) = value {
+                check(name, "", value, value > 0.0, "positive").map_err(|error| {
+                    ConfigError::Build {
+                        file: file.to_owned(),
+                        error,
+                    }
+                })?;
+            }
+        }
+        Ok(this)
+    }
+}
+
 /// A limit that a design breaks.
 #[derive(Debug, Clone, PartialEq, Error)]
 #[error("{key}: {value} {unit} against the limit {limit} {unit}")]
@@ -152,7 +197,7 @@ pub struct DesignReport {
 /// A plant or controller that cannot be built, or limits that no gains keep.
 pub fn design(request: &DesignRequest) -> Result<DesignReport, DesignError> {
     let plant = &request.plant;
-    if !(plant.delay_s >= 0.0) {
+    if plant.delay_s.is_nan() || plant.delay_s < 0.0 {
         let hold_ms = 0.5e3 * plant.sample_time_s;
         return Err(DesignError::DelayBelowHold {
             delay_ms: plant.loop_delay_s() * 1e3,
@@ -259,7 +304,7 @@ fn broken(report: &DesignReport, limits: &DesignLimits) -> Vec<BrokenLimit> {
     }
     let mut most = |key, value: f64, limit: Option<f64>, unit| {
         // A figure that does not exist (NaN) does not keep its limit.
-        if let Some(limit) = limit.filter(|&limit| !(value <= limit)) {
+        if let Some(limit) = limit.filter(|&limit| value.is_nan() || value > limit) {
             broken.push(BrokenLimit {
                 key,
                 value,
@@ -301,7 +346,7 @@ fn broken(report: &DesignReport, limits: &DesignLimits) -> Vec<BrokenLimit> {
         "unstable points",
     );
     let mut least = |key, value: f64, limit: Option<f64>, unit| {
-        if let Some(limit) = limit.filter(|&limit| !(value >= limit)) {
+        if let Some(limit) = limit.filter(|&limit| value.is_nan() || value < limit) {
             broken.push(BrokenLimit {
                 key,
                 value,

@@ -1,0 +1,203 @@
+//! `cellpos design`: a controller for a model and a loop delay, with margins, predicted error and spread.
+
+mod print;
+
+use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
+use cellpos_control::design::{
+    DesignLimits, DesignPlant, DesignReport, DesignRequest, DesignWarning, PiSearch, Requested, default_lead, design,
+};
+use cellpos_control::{ConfigError, ControllerFile, Lead, Limits, Pi};
+use cellpos_plant::Model;
+use cellpos_units::{Hertz, Seconds};
+use std::path::PathBuf;
+
+/// Which control law is designed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+enum Kind {
+    /// PI.
+    Pi,
+    /// PI with lead.
+    Lead,
+}
+
+/// Arguments of `cellpos design`.
+#[derive(Debug, clap::Args)]
+#[command(after_help = "Examples:
+  cellpos design --model eq6 --delay 2.5ms
+  cellpos design --model eq6 --delay 2.5ms --kp 0.46 --ki 19.5 --json
+  cellpos design --model model.toml --max-ms 1.6 --min-pm 40 --output controller.toml
+
+The loop delay contains half a sample of hold: a 2 ms camera path at 1 kHz is 2.5ms. Without gains the PI controller of
+largest integral gain (fastest rejection of drift) under --max-ms and --max-mt is searched. Exit code 1 when the loop is
+unstable or a limit is broken, 2 on bad input.")]
+pub struct Args {
+    /// Model file, or `eq6` for the built-in nominal plant.
+    #[arg(long, default_value = "eq6")]
+    model: String,
+    /// Loop delay with half a sample of hold; left out: that of the model's effects (2.5ms where it has none).
+    #[arg(long)]
+    delay: Option<Seconds>,
+    /// Sample time.
+    #[arg(long, default_value = "1ms")]
+    sample: Seconds,
+    /// Control law.
+    #[arg(long, value_enum, default_value = "pi")]
+    controller: Kind,
+    /// Proportional gain, um of PZT per um of bead (needs --ki).
+    #[arg(long, requires = "ki", allow_negative_numbers = true)]
+    kp: Option<f64>,
+    /// Integral gain, 1/s (needs --kp).
+    #[arg(long, requires = "kp", allow_negative_numbers = true)]
+    ki: Option<f64>,
+    /// Weight of the reference in the proportional path, 0 to 1.
+    #[arg(long)]
+    setpoint_weight: Option<f64>,
+    /// Zero of the lead.
+    #[arg(long, requires = "lead_pole")]
+    lead_zero: Option<Hertz>,
+    /// Pole of the lead.
+    #[arg(long, requires = "lead_zero")]
+    lead_pole: Option<Hertz>,
+    /// TOML file with limits: max_ms, max_mt, min_pm_deg, min_gm_db, min_delay_margin_ms, max_rms_nm,
+    /// max_overshoot_percent, max_settling_ms, stable_over_spread.
+    #[arg(long)]
+    limits: Option<PathBuf>,
+    /// Largest peak of the sensitivity S (also the search's; default of the search 1.6).
+    #[arg(long)]
+    max_ms: Option<f64>,
+    /// Largest peak of the complementary sensitivity T (also the search's; default of the search 1.3).
+    #[arg(long)]
+    max_mt: Option<f64>,
+    /// Smallest phase margin, deg.
+    #[arg(long)]
+    min_pm: Option<f64>,
+    /// Smallest gain margin, dB.
+    #[arg(long)]
+    min_gm: Option<f64>,
+    /// Smallest delay margin.
+    #[arg(long)]
+    min_delay_margin: Option<Seconds>,
+    /// Largest predicted hold error, nm RMS.
+    #[arg(long)]
+    max_rms: Option<f64>,
+    /// Every point of the spread (gain x 0.5..2, delay +0/+1 sample) must be stable.
+    #[arg(long)]
+    stable_over_spread: bool,
+    /// Localisation noise, where not the model's.
+    #[arg(long)]
+    fix_noise: Option<cellpos_units::Micrometers>,
+    /// Write the controller to this file.
+    #[arg(long)]
+    output: Option<PathBuf>,
+    /// Print one JSON object on standard output.
+    #[arg(long)]
+    json: bool,
+}
+
+/// Designs or checks a controller, prints its figures.
+pub fn run(args: Args) -> CommandResult {
+    let model = Model::load(&args.model).map_err(Failure::input)?;
+    let sample_time_s = args.sample.value();
+    if !(1e-5..=1.0).contains(&sample_time_s) {
+        return Err(Failure::bad_input(
+            format!("--sample {}: must be 0.01ms to 1s", args.sample),
+            "the rig runs at 1ms",
+        ));
+    }
+    let mut plant = DesignPlant::from_model(&model, args.delay.map(Seconds::value), sample_time_s)
+        .map_err(Failure::input)?;
+    if args.delay.is_none() && plant.delay_s == 0.0 {
+        plant.delay_s = 2e-3;
+        plant.warnings.push(DesignWarning::DelayAssumed { assumed_ms: plant.loop_delay_s() * 1e3 });
+    }
+    if let Some(noise) = args.fix_noise {
+        plant.fix_noise_um = noise.value();
+    }
+    let limits = limits(&args)?;
+    let lead = lead(&args, plant.loop_delay_s())?;
+    let controller = match (args.kp, args.ki) {
+        (Some(kp), Some(ki)) => Requested::Pi(Pi { lead, ..Pi::new(kp, ki) }),
+        _ => {
+            let nominal = PiSearch::default();
+            Requested::SearchPi(PiSearch {
+                max_ms: limits.max_ms.unwrap_or(nominal.max_ms),
+                max_mt: limits.max_mt.unwrap_or(nominal.max_mt),
+                lead,
+            })
+        }
+    };
+    let request = DesignRequest {
+        plant,
+        controller,
+        setpoint_weight: args.setpoint_weight,
+        command_limits: Limits::default(),
+        limits,
+    };
+    let report = design(&request).map_err(Failure::input)?;
+    if let Some(path) = &args.output {
+        let file = controller_file(&request, &report);
+        std::fs::write(path, file.to_toml_string()).map_err(Failure::failed)?;
+    }
+    for warning in &report.warnings {
+        eprintln!("WARNING: {warning}");
+    }
+    for broken in &report.limits_broken {
+        eprintln!("LIMIT BROKEN: {broken}");
+    }
+    if args.json {
+        print_json(&print::json(&args.model, &request, &report))?;
+    } else {
+        print_text(&print::table(&args.model, &request, &report))?;
+    }
+    Ok(if report.limits_broken.is_empty() { Outcome::Done } else { Outcome::Broken })
+}
+
+fn limits(args: &Args) -> Result<DesignLimits, Failure> {
+    let mut limits = match &args.limits {
+        Some(path) => DesignLimits::load(path).map_err(|error: ConfigError| Failure::input(error))?,
+        None => DesignLimits::default(),
+    };
+    let flags = [
+        ("--max-ms", args.max_ms, &mut limits.max_ms),
+        ("--max-mt", args.max_mt, &mut limits.max_mt),
+        ("--min-pm", args.min_pm, &mut limits.min_pm_deg),
+        ("--min-gm", args.min_gm, &mut limits.min_gm_db),
+        ("--min-delay-margin", args.min_delay_margin.map(|d| d.value() * 1e3), &mut limits.min_delay_margin_ms),
+        ("--max-rms", args.max_rms, &mut limits.max_rms_nm),
+    ];
+    for (flag, given, limit) in flags {
+        if let Some(value) = given {
+            if !(value.is_finite() && value > 0.0) {
+                return Err(Failure::bad_input(format!("{flag} {value}: must be a positive number"), "see --help"));
+            }
+            *limit = Some(value);
+        }
+    }
+    if args.stable_over_spread {
+        limits.stable_over_spread = Some(true);
+    }
+    Ok(limits)
+}
+
+fn lead(args: &Args, loop_delay_s: f64) -> Result<Option<Lead>, Failure> {
+    match (args.controller, args.lead_zero, args.lead_pole) {
+        (Kind::Lead, Some(zero), Some(pole)) => Ok(Some(Lead { zero_hz: zero.value(), pole_hz: pole.value() })),
+        (Kind::Lead, ..) => Ok(Some(default_lead(loop_delay_s))),
+        (Kind::Pi, None, None) => Ok(None),
+        (Kind::Pi, ..) => Err(Failure::bad_input(
+            "--lead-zero and --lead-pole belong to --controller lead",
+            "write --controller lead, or leave them out",
+        )),
+    }
+}
+
+fn controller_file(request: &DesignRequest, report: &DesignReport) -> ControllerFile {
+    let cellpos_control::ControllerConfig::Pi(pi) = report.controller;
+    let mut file = ControllerFile::from_pi(pi, request.plant.loop_delay_s());
+    file.sample_time_ms = request.plant.sample_time_s * 1e3;
+    if let Some(config) = &report.config {
+        file.estimator = config.estimator;
+        file.limits = config.limits;
+    }
+    file
+}

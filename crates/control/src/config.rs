@@ -1,0 +1,350 @@
+//! controller.toml: which controller, its gains, the estimator's noise, the limits of the command.
+//!
+//! Unknown keys are refused with a suggestion; every number has its unit in the key. The plant is not part of this
+//! file: it is the model.toml beside it.
+
+use crate::control_loop::{ControllerConfig, LoopConfig};
+use crate::design::DesignPlant;
+use crate::error::BuildError;
+use crate::estimator::EstimatorConfig;
+use crate::limits::Limits;
+use crate::pi::{Lead, Pi};
+use cellpos_plant::{Model, PlantError};
+use serde::{Deserialize, Serialize};
+use std::path::Path;
+use thiserror::Error;
+
+/// Which control law runs.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum ControllerKind {
+    /// PI.
+    Pi,
+    /// PI with lead.
+    Lead,
+}
+
+/// Gains of the PI controller as the file writes them.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct PiFile {
+    /// Proportional gain, um of PZT per um of bead.
+    pub kp_um_per_um: f64,
+    /// Integral gain, 1/s.
+    pub ki_per_s: f64,
+    /// Weight of the reference in the proportional path, 0..1.
+    #[serde(default = "default_weight")]
+    pub setpoint_weight: f64,
+    /// Time constant of the anti-windup, ms; left out: half the integral time.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub tracking_time_ms: Option<f64>,
+    /// Lead on the proportional path; needed by `controller = "lead"`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub lead: Option<Lead>,
+}
+
+fn default_weight() -> f64 {
+    Pi::DEFAULT_SETPOINT_WEIGHT
+}
+
+fn default_sample_time_ms() -> f64 {
+    1.0
+}
+
+/// A controller.toml.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ControllerFile {
+    /// Which control law runs.
+    pub controller: ControllerKind,
+    /// Loop delay it is made for, with the half sample of hold, ms.
+    pub delay_ms: f64,
+    /// Sample time, ms.
+    #[serde(default = "default_sample_time_ms")]
+    pub sample_time_ms: f64,
+    /// PI gains: the law of `pi` and `lead`, the fallback of the others.
+    pub pi: PiFile,
+    /// Noise and gate of the estimator.
+    #[serde(default)]
+    pub estimator: EstimatorConfig,
+    /// Limits of the command.
+    #[serde(default)]
+    pub limits: Limits,
+}
+
+/// A controller file that cannot be used.
+#[derive(Debug, Clone, PartialEq, Error)]
+pub enum ConfigError {
+    /// The file cannot be read.
+    #[error("{file}: {reason}")]
+    Unreadable {
+        /// The file.
+        file: String,
+        /// Why.
+        reason: String,
+    },
+    /// The text does not parse, or has an unknown key or a value of the wrong type.
+    #[error("{file}:{line}:{column}: {message}{}", suggestion.as_ref().map(|s| format!(" (did you mean `{s}`?)")).unwrap_or_default())]
+    Text {
+        /// The file.
+        file: String,
+        /// Line, from 1.
+        line: usize,
+        /// Column, from 1.
+        column: usize,
+        /// What is wrong.
+        message: String,
+        /// A key that was perhaps meant.
+        suggestion: Option<String>,
+    },
+    /// A value is out of range, or the controller does not fit the plant.
+    #[error("{file}: {error}")]
+    Build {
+        /// The file.
+        file: String,
+        /// Which value, and what would be right.
+        error: BuildError,
+    },
+    /// `controller = "lead"` without `[pi.lead]`.
+    #[error(
+        "{file}: controller = \"lead\" needs [pi.lead] with zero_hz and pole_hz (`cellpos design --controller lead` finds them)"
+    )]
+    MissingLead {
+        /// The file.
+        file: String,
+    },
+    /// The model cannot be used in a loop.
+    #[error("model: {0}")]
+    Plant(#[from] PlantError),
+}
+
+impl ControllerFile {
+    /// A PI file with defaults for everything else.
+    pub fn from_pi(pi: Pi, loop_delay_s: f64) -> Self {
+        Self {
+            controller: if pi.lead.is_some() {
+                ControllerKind::Lead
+            } else {
+                ControllerKind::Pi
+            },
+            delay_ms: loop_delay_s * 1e3,
+            sample_time_ms: default_sample_time_ms(),
+            pi: PiFile {
+                kp_um_per_um: pi.kp,
+                ki_per_s: pi.ki_per_s,
+                setpoint_weight: pi.setpoint_weight,
+                tracking_time_ms: Some(pi.tracking_time_s * 1e3),
+                lead: pi.lead,
+            },
+            estimator: EstimatorConfig::default(),
+            limits: Limits::default(),
+        }
+    }
+
+    /// Reads a controller file.
+    ///
+    /// # Errors
+    /// A file that cannot be read, and all of [`ControllerFile::from_toml_str`].
+    pub fn load(path: &Path) -> Result<Self, ConfigError> {
+        let file = path.display().to_string();
+        let text = std::fs::read_to_string(path).map_err(|error| ConfigError::Unreadable {
+            file: file.clone(),
+            reason: error.to_string(),
+        })?;
+        Self::from_toml_str(&text, &file)
+    }
+
+    /// Reads the text of a controller file; `file` is for the messages only.
+    ///
+    /// # Errors
+    /// Text that is not TOML, unknown or missing keys, wrong types, values out of range.
+    pub fn from_toml_str(text: &str, file: &str) -> Result<Self, ConfigError> {
+        let this: Self = toml::from_str(text).map_err(|error| text_error(text, file, &error))?;
+        this.validate().map_err(|error| ConfigError::Build {
+            file: file.to_owned(),
+            error,
+        })?;
+        if this.controller == ControllerKind::Lead && this.pi.lead.is_none() {
+            return Err(ConfigError::MissingLead {
+                file: file.to_owned(),
+            });
+        }
+        Ok(this)
+    }
+
+    /// The file as TOML text; reads back to the same values.
+    pub fn to_toml_string(&self) -> String {
+        // Serialising plain numbers into TOML cannot fail.
+        toml::to_string_pretty(self).unwrap_or_default()
+    }
+
+    fn validate(&self) -> Result<(), BuildError> {
+        use crate::error::check;
+        let ts = self.sample_time_ms;
+        check(
+            "sample_time_ms",
+            "ms",
+            ts,
+            (0.01..=1000.0).contains(&ts),
+            "0.01 to 1000 (1 at 1000 fps)",
+        )?;
+        let delay_ok = self.delay_ms >= 0.5 * ts && self.delay_ms < 1000.0;
+        check(
+            "delay_ms",
+            "ms",
+            self.delay_ms,
+            delay_ok,
+            "at least half a sample of hold (2.5 for a 2 ms camera path)",
+        )?;
+        self.pi_config().validate()?;
+        self.limits.validate()
+    }
+
+    /// The PI controller of the file.
+    pub fn pi_config(&self) -> Pi {
+        let mut pi = Pi {
+            setpoint_weight: self.pi.setpoint_weight,
+            ..Pi::new(self.pi.kp_um_per_um, self.pi.ki_per_s)
+        };
+        if let Some(ms) = self.pi.tracking_time_ms {
+            pi.tracking_time_s = ms * 1e-3;
+        }
+        if self.controller == ControllerKind::Lead {
+            pi.lead = self.pi.lead;
+        }
+        pi
+    }
+
+    /// The loop for a plant: everything that [`crate::Controller::new`] needs.
+    ///
+    /// # Errors
+    /// A plant that cannot be discretised or held by the estimator, a value out of range.
+    pub fn loop_config(&self, model: &Model) -> Result<LoopConfig, ConfigError> {
+        let sample_time_s = self.sample_time_ms * 1e-3;
+        let plant = DesignPlant::from_model(model, Some(self.delay_ms * 1e-3), sample_time_s)?;
+        let file = || "controller".to_owned();
+        let model = plant.loop_model().map_err(|error| ConfigError::Build {
+            file: file(),
+            error,
+        })?;
+        let config = LoopConfig {
+            model,
+            estimator: self.estimator,
+            controller: ControllerConfig::Pi(self.pi_config()),
+            limits: self.limits,
+        };
+        crate::control_loop::ControlLoop::new(config).map_err(|error| ConfigError::Build {
+            file: file(),
+            error,
+        })?;
+        Ok(config)
+    }
+}
+
+pub(crate) fn text_error(text: &str, file: &str, error: &toml::de::Error) -> ConfigError {
+    let start = error.span().map_or(0, |span| span.start.min(text.len()));
+    let before = text.get(..start).unwrap_or(text);
+    let line = before.matches('\n').count() + 1;
+    let column = before.chars().rev().take_while(|&c| c != '\n').count() + 1;
+    let message = error.message().to_owned();
+    let mut quoted = message.split('`').skip(1).step_by(2);
+    let suggestion = message.starts_with("unknown").then(|| {
+        let wrong = quoted.next().unwrap_or_default().to_owned();
+        quoted
+            .map(|known| (edit_distance(&wrong, known), known))
+            .min()
+            .filter(|(distance, known)| *distance <= 2 + known.len() / 3)
+            .map(|(_, known)| known.to_owned())
+    });
+    ConfigError::Text {
+        file: file.to_owned(),
+        line,
+        column,
+        message,
+        suggestion: suggestion.flatten(),
+    }
+}
+
+fn edit_distance(a: &str, b: &str) -> usize {
+    let b: Vec<char> = b.chars().collect();
+    let mut row: Vec<usize> = (0..=b.len()).collect();
+    for (i, ca) in a.chars().enumerate() {
+        let mut diagonal = row[0];
+        row[0] = i + 1;
+        for (j, cb) in b.iter().enumerate() {
+            let substitute = diagonal + usize::from(ca != *cb);
+            diagonal = row[j + 1];
+            row[j + 1] = substitute.min(row[j] + 1).min(diagonal + 1);
+        }
+    }
+    row[b.len()]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const EXAMPLE: &str = concat!(
+        env!("CARGO_MANIFEST_DIR"),
+        "/../../examples/controller.toml"
+    );
+
+    #[test]
+    fn the_example_file_makes_a_loop_for_eq6_and_reads_back_to_itself() {
+        let file = ControllerFile::load(Path::new(EXAMPLE)).unwrap();
+        let config = file.loop_config(&Model::eq6()).unwrap();
+        assert!((config.model.gain_per_s - 428.0).abs() < 1.0);
+        assert!((config.model.delay_s - 2e-3).abs() < 1e-12);
+        assert_eq!(config.controller, ControllerConfig::Pi(file.pi_config()));
+        assert_eq!(
+            ControllerFile::from_toml_str(&file.to_toml_string(), "again").unwrap(),
+            file
+        );
+    }
+
+    #[test]
+    fn an_unknown_key_is_refused_with_its_place_and_a_suggestion() {
+        let text =
+            "controller = \"pi\"\ndelay_ms = 2.5\n[pi]\nkp_um_per_um = 0.4\nki_per_sec = 10.0\n";
+        let error = ControllerFile::from_toml_str(text, "c.toml").unwrap_err();
+        let ConfigError::Text {
+            line, suggestion, ..
+        } = &error
+        else {
+            panic!("{error}")
+        };
+        assert_eq!((*line, suggestion.as_deref()), (5, Some("ki_per_s")));
+        assert!(
+            error.to_string().starts_with("c.toml:5:1: unknown field"),
+            "{error}"
+        );
+    }
+
+    #[test]
+    fn a_value_out_of_range_is_refused_by_its_key() {
+        let text =
+            "controller = \"pi\"\ndelay_ms = 2.5\n[pi]\nkp_um_per_um = nan\nki_per_s = 10.0\n";
+        let error = ControllerFile::from_toml_str(text, "c.toml").unwrap_err();
+        assert!(error.to_string().contains("kp"), "{error}");
+        let text =
+            "controller = \"pi\"\ndelay_ms = 0.2\n[pi]\nkp_um_per_um = 0.4\nki_per_s = 10.0\n";
+        let error = ControllerFile::from_toml_str(text, "c.toml").unwrap_err();
+        assert!(
+            error.to_string().contains("half a sample of hold"),
+            "{error}"
+        );
+    }
+
+    #[test]
+    fn lead_without_its_frequencies_is_refused() {
+        let text =
+            "controller = \"lead\"\ndelay_ms = 2.5\n[pi]\nkp_um_per_um = 0.4\nki_per_s = 10.0\n";
+        let error = ControllerFile::from_toml_str(text, "c.toml").unwrap_err();
+        assert_eq!(
+            error,
+            ConfigError::MissingLead {
+                file: "c.toml".to_owned()
+            }
+        );
+    }
+}
