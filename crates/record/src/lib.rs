@@ -1,2 +1,48 @@
-//! Run folders: append-only columns while running, read back, export.
+//! Run folders: append-only columns while running, read back whatever happened, exported.
+//!
+//! A run is a folder `runs/<UTC time>-<name>/` that is never overwritten:
+//!
+//! | file | what | when |
+//! |---|---|---|
+//! | `run.toml` | command line, configuration, model, controller, versions, conditions, seed, SHA-256 of inputs; the outcome | at the start, replaced in one step at the end |
+//! | `ticks.arrow` | one row a tick ([`cellpos_runtime::TickRecord`]), an Arrow IPC stream | appended, synced at least each second |
+//! | `events.jsonl` | one JSON object a line | each at once |
+//! | `ticks.parquet` | the same rows for other programs | at the end |
+//!
+//! **While running** a [`RunWriter`] belongs to the recorder thread. It may allocate and block on the disk, so nothing
+//! of it is ever called in a tick. A full disk or a failing one never stops the loop: what could not be written is
+//! counted ([`Faults`]), said once, and the run ends readable, because a batch that was cut is taken back.
+//!
+//! **Afterwards** a [`RunReader`] reads what is there: a run cut off anywhere up to its last complete batch, a damaged
+//! one around the damage. It never panics on a damaged file, and says what is missing ([`Lost`]).
+//!
+//! Plain CSV records (`time_s,pzt_um,bead_um`) are read and written by `cellpos-table`, which needs neither Arrow nor
+//! Parquet; [`RunReader::to_record`] makes one from a run.
+//!
+//! Not for data that a tick waits for, and no locking: one writer a folder.
 #![forbid(unsafe_code)]
+
+mod columns;
+mod error;
+mod events;
+mod export;
+mod meta;
+mod reader;
+mod stream;
+mod writer;
+
+pub use error::RecordError;
+pub use events::{Event, Events, read_events};
+pub use export::{CSV_HEAD, Format, export, write_csv, write_parquet};
+pub use meta::{InputFile, RunEnd, RunMeta};
+pub use reader::{Batches, Gap, Lost, RunReader};
+pub use writer::{Faults, Finished, FlushPolicy, RunWriter};
+
+/// Name of the metadata file in a run folder.
+pub const RUN_TOML: &str = "run.toml";
+/// Name of the append-only columns in a run folder.
+pub const TICKS_ARROW: &str = "ticks.arrow";
+/// Name of the columns of a finished run.
+pub const TICKS_PARQUET: &str = "ticks.parquet";
+/// Name of the event log in a run folder.
+pub const EVENTS_JSONL: &str = "events.jsonl";

@@ -1,0 +1,206 @@
+//! `run.toml`: how a run came about, and how it ended.
+
+use crate::error::RecordError;
+use serde::{Deserialize, Serialize};
+use sha2::{Digest, Sha256};
+use std::collections::BTreeMap;
+use std::fmt::Write;
+use std::path::Path;
+
+/// A file that went into a run, with its fingerprint.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct InputFile {
+    /// Path as given by the user.
+    pub path: String,
+    /// Size in bytes.
+    pub bytes: u64,
+    /// SHA-256 in lower-case hexadecimal.
+    pub sha256: String,
+}
+
+impl InputFile {
+    /// Fingerprint of a file.
+    ///
+    /// # Errors
+    /// [`RecordError::Io`] when it cannot be read.
+    pub fn of(path: &Path) -> Result<Self, RecordError> {
+        let bytes = std::fs::read(path).map_err(RecordError::io("cannot read", path))?;
+        Ok(Self::of_bytes(&path.display().to_string(), &bytes))
+    }
+
+    /// Fingerprint of bytes already read.
+    pub fn of_bytes(path: &str, bytes: &[u8]) -> Self {
+        let mut sha256 = String::with_capacity(64);
+        for byte in Sha256::digest(bytes) {
+            // Writing to a String cannot fail.
+            let _ = write!(sha256, "{byte:02x}");
+        }
+        Self {
+            path: path.to_owned(),
+            bytes: bytes.len() as u64,
+            sha256,
+        }
+    }
+}
+
+/// How a run ended; absent from `run.toml` while it runs, and for ever if it was killed.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct RunEnd {
+    /// When, UTC. Set by [`crate::RunWriter::finish`].
+    #[serde(default)]
+    pub ended_utc: String,
+    /// In a word or two: `done`, `interrupted`, `safe`.
+    pub outcome: String,
+    /// Rows written. Set by [`crate::RunWriter::finish`].
+    #[serde(default)]
+    pub rows: u64,
+    /// Rows that could not be written. Set by [`crate::RunWriter::finish`].
+    #[serde(default)]
+    pub rows_lost: u64,
+    /// Events that could not be written. Set by [`crate::RunWriter::finish`].
+    #[serde(default)]
+    pub events_lost: u64,
+    /// Figures of the run, as the command prints them.
+    #[serde(default, skip_serializing_if = "toml::Table::is_empty")]
+    pub summary: toml::Table,
+}
+
+impl RunEnd {
+    /// An end with this outcome and no figures.
+    pub fn new(outcome: &str) -> Self {
+        Self {
+            ended_utc: String::new(),
+            outcome: outcome.to_owned(),
+            rows: 0,
+            rows_lost: 0,
+            events_lost: 0,
+            summary: toml::Table::new(),
+        }
+    }
+}
+
+/// What `run.toml` holds.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct RunMeta {
+    /// Version of the folder's layout.
+    pub format: u32,
+    /// Name of the run, the last part of the folder's name.
+    pub name: String,
+    /// When it started, UTC. Set by [`crate::RunWriter::create`].
+    #[serde(default)]
+    pub started_utc: String,
+    /// The command line, word by word.
+    #[serde(default)]
+    pub command_line: Vec<String>,
+    /// Seed of every random number of the run (as text above 2^63).
+    #[serde(default, with = "seed", skip_serializing_if = "Option::is_none")]
+    pub seed: Option<u64>,
+    /// `real` or `virtual`.
+    #[serde(default)]
+    pub clock: String,
+    /// Versions of the program and of what it ran on.
+    #[serde(default)]
+    pub versions: BTreeMap<String, String>,
+    /// Files that went in.
+    #[serde(default)]
+    pub inputs: Vec<InputFile>,
+    /// Real-time conditions obtained and not obtained, machine, kernel.
+    #[serde(default)]
+    pub conditions: toml::Table,
+    /// The whole configuration in force.
+    #[serde(default)]
+    pub config: toml::Table,
+    /// The model in force.
+    #[serde(default)]
+    pub model: toml::Table,
+    /// The controller in force.
+    #[serde(default)]
+    pub controller: toml::Table,
+    /// How it ended.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub end: Option<RunEnd>,
+}
+
+impl RunMeta {
+    /// Metadata with a name and a clock (`real` or `virtual`), and nothing else yet.
+    pub fn new(name: &str, clock: &str) -> Self {
+        Self {
+            format: 1,
+            name: name.to_owned(),
+            started_utc: String::new(),
+            command_line: Vec::new(),
+            seed: None,
+            clock: clock.to_owned(),
+            versions: BTreeMap::new(),
+            inputs: Vec::new(),
+            conditions: toml::Table::new(),
+            config: toml::Table::new(),
+            model: toml::Table::new(),
+            controller: toml::Table::new(),
+            end: None,
+        }
+    }
+
+    pub(crate) fn to_toml(&self) -> Result<String, RecordError> {
+        toml::to_string(self).map_err(|error| RecordError::Meta(error.to_string()))
+    }
+}
+
+/// TOML integers are signed: a seed beyond them is written as text.
+mod seed {
+    use serde::{Deserialize, Deserializer, Serializer};
+
+    #[derive(Deserialize)]
+    #[serde(untagged)]
+    enum Seed {
+        Number(u64),
+        Text(String),
+    }
+
+    pub(super) fn serialize<S: Serializer>(seed: &Option<u64>, to: S) -> Result<S::Ok, S::Error> {
+        match seed {
+            None => to.serialize_none(),
+            Some(seed) => match i64::try_from(*seed) {
+                Ok(number) => to.serialize_i64(number),
+                Err(_) => to.serialize_str(&seed.to_string()),
+            },
+        }
+    }
+
+    pub(super) fn deserialize<'de, D: Deserializer<'de>>(from: D) -> Result<Option<u64>, D::Error> {
+        match Option::<Seed>::deserialize(from)? {
+            None => Ok(None),
+            Some(Seed::Number(number)) => Ok(Some(number)),
+            Some(Seed::Text(text)) => text.parse().map(Some).map_err(serde::de::Error::custom),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn fingerprints_are_sha256() {
+        let file = InputFile::of_bytes("abc", b"abc");
+        assert_eq!(
+            file.sha256,
+            "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
+        );
+        assert_eq!(file.bytes, 3);
+    }
+
+    #[test]
+    fn metadata_reads_back_with_any_seed() {
+        for seed in [None, Some(7), Some(u64::MAX)] {
+            let mut meta = RunMeta::new("track", "virtual");
+            meta.seed = seed;
+            meta.command_line = vec!["cellpos".into(), "track".into()];
+            meta.config.insert("kp".into(), toml::Value::Float(0.46));
+            meta.inputs.push(InputFile::of_bytes("model.toml", b""));
+            meta.end = Some(RunEnd::new("done"));
+            let text = meta.to_toml().unwrap();
+            assert_eq!(toml::from_str::<RunMeta>(&text).unwrap(), meta, "{text}");
+        }
+    }
+}

@@ -1,0 +1,254 @@
+//! A tolerant reader of `ticks.arrow`.
+//!
+//! The format is Arrow's IPC stream, which any Arrow library reads when it is whole. This reader takes the messages
+//! apart itself, because a file cut off in the middle of a message, or damaged, must give every row around the damage
+//! and must never panic or ask for absurd memory: every length is checked against the file before it is believed.
+
+use crate::columns::{self, Kind};
+use arrow_ipc::{MessageHeader, Type, root_as_message};
+use cellpos_runtime::TickRecord;
+use std::io::{self, Read, Seek, SeekFrom};
+
+/// Marks the start of a message.
+const CONTINUATION: [u8; 4] = [0xff; 4];
+/// Longest description of a message that is believed.
+const MAX_META: u64 = 1 << 20;
+/// Longest body of a message that is believed.
+const MAX_BODY: u64 = 1 << 30;
+/// Bytes looked through at a time when searching for the next message after damage.
+const SEARCH: usize = 1 << 16;
+
+/// What a message turned out to be.
+enum Message {
+    /// The schema, or something without rows.
+    NoRows,
+    /// Rows.
+    Rows(Vec<TickRecord>),
+    /// The end mark of a finished stream.
+    End,
+}
+
+/// Messages of a stream, one after the other, over any damage.
+pub(crate) struct Stream<R> {
+    from: R,
+    length: u64,
+    position: u64,
+    /// For each column of the file: its place in [`columns::columns`] (None: unknown to this version) and its type.
+    layout: Vec<(Option<usize>, Kind)>,
+    /// Bytes passed over because they made no sense, before a message that did.
+    pub(crate) damaged_bytes: u64,
+    /// Bytes after the last message that made sense: a batch cut off.
+    pub(crate) torn_bytes: u64,
+    /// End of the last message that made sense: where appending may go on.
+    pub(crate) good_end: u64,
+    /// Whether the end mark was seen last.
+    pub(crate) ended: bool,
+}
+
+impl<R: Read + Seek> Stream<R> {
+    pub(crate) fn new(mut from: R) -> io::Result<Self> {
+        let length = from.seek(SeekFrom::End(0))?;
+        Ok(Self {
+            from,
+            length,
+            position: 0,
+            // The layout of this version, in case the schema itself is damaged.
+            layout: columns::columns()
+                .into_iter()
+                .enumerate()
+                .map(|(place, (_, kind))| (Some(place), kind))
+                .collect(),
+            damaged_bytes: 0,
+            torn_bytes: 0,
+            good_end: 0,
+            ended: false,
+        })
+    }
+
+    /// The rows of the next batch; None at the end.
+    ///
+    /// # Errors
+    /// Only when the file system refuses to read.
+    pub(crate) fn next_batch(&mut self) -> io::Result<Option<Vec<TickRecord>>> {
+        while self.position < self.length {
+            match self.message(self.position)? {
+                Some((message, end)) => {
+                    self.position = end;
+                    self.good_end = end;
+                    self.ended = matches!(message, Message::End);
+                    if let Message::Rows(rows) = message {
+                        return Ok(Some(rows));
+                    }
+                }
+                None => match self.search(self.position + 8)? {
+                    Some(found) => {
+                        self.damaged_bytes += found - self.position;
+                        self.position = found;
+                    }
+                    None => {
+                        self.torn_bytes = self.length - self.position;
+                        self.position = self.length;
+                    }
+                },
+            }
+        }
+        Ok(None)
+    }
+
+    /// Reads exactly `out.len()` bytes at a place known to be inside the file.
+    fn read_at(&mut self, position: u64, out: &mut [u8]) -> io::Result<()> {
+        self.from.seek(SeekFrom::Start(position))?;
+        self.from.read_exact(out)
+    }
+
+    /// The message at a position and its end; None if there is none.
+    fn message(&mut self, position: u64) -> io::Result<Option<(Message, u64)>> {
+        let left = self.length.saturating_sub(position);
+        if left < 8 {
+            return Ok(None);
+        }
+        let mut head = [0u8; 8];
+        self.read_at(position, &mut head)?;
+        let [a, b, c, d, e, f, g, h] = head;
+        if [a, b, c, d] != CONTINUATION {
+            return Ok(None);
+        }
+        let meta_length = u64::from(u32::from_le_bytes([e, f, g, h]));
+        if meta_length == 0 {
+            return Ok(Some((Message::End, position + 8)));
+        }
+        if meta_length > MAX_META || meta_length > left - 8 {
+            return Ok(None);
+        }
+        let mut meta = vec![0u8; meta_length as usize];
+        self.read_at(position + 8, &mut meta)?;
+        let Ok(message) = root_as_message(&meta) else {
+            return Ok(None);
+        };
+        let Ok(body_length) = u64::try_from(message.bodyLength()) else {
+            return Ok(None);
+        };
+        if body_length > MAX_BODY || body_length > left - 8 - meta_length {
+            return Ok(None);
+        }
+        let end = position + 8 + meta_length + body_length;
+        let kind = message.header_type();
+        if kind == MessageHeader::Schema {
+            if let Some(layout) = layout(&message) {
+                self.layout = layout;
+                return Ok(Some((Message::NoRows, end)));
+            }
+            return Ok(None);
+        }
+        if kind != MessageHeader::RecordBatch {
+            return Ok(None);
+        }
+        let mut body = vec![0u8; body_length as usize];
+        self.read_at(position + 8 + meta_length, &mut body)?;
+        Ok(decode(&message, &body, &self.layout).map(|rows| (Message::Rows(rows), end)))
+    }
+
+    /// The first position at or after `from` at which a message stands. Messages start at multiples of eight.
+    fn search(&mut self, from: u64) -> io::Result<Option<u64>> {
+        let mut base = from - from % 8;
+        let mut block = vec![0u8; SEARCH];
+        while base + 8 <= self.length {
+            let size = (self.length - base).min(SEARCH as u64) as usize;
+            let Some(part) = block.get_mut(..size) else {
+                return Ok(None);
+            };
+            self.from.seek(SeekFrom::Start(base))?;
+            self.from.read_exact(part)?;
+            let candidates: Vec<u64> = part
+                .chunks_exact(8)
+                .enumerate()
+                .filter(|(_, word)| word.starts_with(&CONTINUATION))
+                .map(|(index, _)| base + index as u64 * 8)
+                .collect();
+            for candidate in candidates {
+                // Two NaN in a row look like an end mark: only messages with content count here.
+                if let Some((Message::Rows(_) | Message::NoRows, _)) = self.message(candidate)? {
+                    return Ok(Some(candidate));
+                }
+            }
+            base += SEARCH as u64;
+        }
+        Ok(None)
+    }
+}
+
+/// Places and types of the columns that a schema message names; None if one has a type that this reader does not know.
+fn layout(message: &arrow_ipc::Message) -> Option<Vec<(Option<usize>, Kind)>> {
+    let known = columns::columns();
+    let fields = message.header_as_schema()?.fields()?;
+    fields
+        .iter()
+        .map(|field| {
+            let kind = match field.type_type() {
+                Type::Int => {
+                    let int = field.type_as_int()?;
+                    match (int.bitWidth(), int.is_signed()) {
+                        (64, false) => Kind::U64,
+                        (64, true) => Kind::I64,
+                        (32, false) => Kind::U32,
+                        (8, false) => Kind::U8,
+                        _ => return None,
+                    }
+                }
+                Type::FloatingPoint => {
+                    let float = field.type_as_floating_point()?;
+                    (float.precision() == arrow_ipc::Precision::DOUBLE).then_some(Kind::F64)?
+                }
+                _ => return None,
+            };
+            let name = field.name().unwrap_or("");
+            let place = known
+                .iter()
+                .position(|(other, other_kind)| other == name && *other_kind == kind);
+            Some((place, kind))
+        })
+        .collect()
+}
+
+/// Rows of a batch; None unless every column is whole.
+fn decode(
+    message: &arrow_ipc::Message,
+    body: &[u8],
+    layout: &[(Option<usize>, Kind)],
+) -> Option<Vec<TickRecord>> {
+    let batch = message.header_as_record_batch()?;
+    if batch.compression().is_some() {
+        return None;
+    }
+    let rows = usize::try_from(batch.length()).ok()?;
+    // A row has at least one byte in the body, so that no length can ask for more memory than the file has bytes.
+    if rows > body.len() {
+        return None;
+    }
+    let nodes = batch.nodes()?;
+    let buffers = batch.buffers()?;
+    if nodes.len() != layout.len() || buffers.len() != 2 * layout.len() {
+        return None;
+    }
+    let mut out = vec![columns::unknown(); rows];
+    for (index, (place, kind)) in layout.iter().enumerate() {
+        let node = nodes.get(index);
+        if usize::try_from(node.length()) != Ok(rows) || node.null_count() != 0 {
+            return None;
+        }
+        let buffer = buffers.get(2 * index + 1);
+        let start = usize::try_from(buffer.offset()).ok()?;
+        let bytes = rows.checked_mul(kind.width())?;
+        if usize::try_from(buffer.length()).ok()? < bytes {
+            return None;
+        }
+        let data = body.get(start..start.checked_add(bytes)?)?;
+        let Some(place) = place else { continue };
+        for (row, value) in out.iter_mut().zip(data.chunks_exact(kind.width())) {
+            let mut bits = [0u8; 8];
+            bits.get_mut(..value.len())?.copy_from_slice(value);
+            columns::set(row, *place, u64::from_le_bytes(bits));
+        }
+    }
+    Some(out)
+}
