@@ -39,22 +39,22 @@ pub struct CalibrationFile {
 pub enum CalibrationError {
     /// The file cannot be read.
     #[error(
-        "calibration {}: cannot read: {source}; without a calibration positions are in pixels only",
+        "calibration {}: cannot read: {cause}; without a calibration positions are in pixels only",
         path.display()
     )]
     Unreadable {
         /// Which file.
         path: PathBuf,
         /// What the operating system said.
-        source: std::io::Error,
+        cause: std::io::Error,
     },
     /// The file is no calibration.
-    #[error("calibration {}: {source}", path.display())]
+    #[error("calibration {}: {cause}", path.display())]
     Syntax {
         /// Which file.
         path: PathBuf,
         /// What is wrong, with the line.
-        source: toml::de::Error,
+        cause: toml::de::Error,
     },
     /// A value that cannot be.
     #[error("calibration {}: {key} = {value}: must be {must_be}", path.display())]
@@ -76,11 +76,10 @@ impl CalibrationFile {
     /// # Errors
     /// The file is missing, no calibration, or holds a value that cannot be.
     pub fn read(path: &Path) -> Result<Self, CalibrationError> {
-        let text =
-            std::fs::read_to_string(path).map_err(|source| CalibrationError::Unreadable {
-                path: path.to_path_buf(),
-                source,
-            })?;
+        let text = std::fs::read_to_string(path).map_err(|cause| CalibrationError::Unreadable {
+            path: path.to_path_buf(),
+            cause,
+        })?;
         Self::parse(&text, path)
     }
 
@@ -89,9 +88,9 @@ impl CalibrationFile {
     /// # Errors
     /// The text is no calibration, or holds a value that cannot be.
     pub fn parse(text: &str, path: &Path) -> Result<Self, CalibrationError> {
-        let file: Self = toml::from_str(text).map_err(|source| CalibrationError::Syntax {
+        let file: Self = toml::from_str(text).map_err(|cause| CalibrationError::Syntax {
             path: path.to_path_buf(),
-            source,
+            cause,
         })?;
         file.check(path)?;
         Ok(file)

@@ -4,7 +4,8 @@ mod print;
 
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
 use cellpos_control::design::{
-    DesignLimits, DesignPlant, DesignReport, DesignRequest, DesignWarning, PiSearch, Requested, default_lead, design,
+    DesignLimits, DesignPlant, DesignReport, DesignRequest, DesignWarning, PiSearch, Requested,
+    default_lead, design,
 };
 use cellpos_control::{ConfigError, ControllerFile, Lead, Limits, Pi};
 use cellpos_plant::Model;
@@ -108,7 +109,9 @@ pub fn run(args: Args) -> CommandResult {
         .map_err(Failure::input)?;
     if args.delay.is_none() && plant.delay_s == 0.0 {
         plant.delay_s = 2e-3;
-        plant.warnings.push(DesignWarning::DelayAssumed { assumed_ms: plant.loop_delay_s() * 1e3 });
+        plant.warnings.push(DesignWarning::DelayAssumed {
+            assumed_ms: plant.loop_delay_s() * 1e3,
+        });
     }
     if let Some(noise) = args.fix_noise {
         plant.fix_noise_um = noise.value();
@@ -116,7 +119,10 @@ pub fn run(args: Args) -> CommandResult {
     let limits = limits(&args)?;
     let lead = lead(&args, plant.loop_delay_s())?;
     let controller = match (args.kp, args.ki) {
-        (Some(kp), Some(ki)) => Requested::Pi(Pi { lead, ..Pi::new(kp, ki) }),
+        (Some(kp), Some(ki)) => Requested::Pi(Pi {
+            lead,
+            ..Pi::new(kp, ki)
+        }),
         _ => {
             let nominal = PiSearch::default();
             Requested::SearchPi(PiSearch {
@@ -149,12 +155,18 @@ pub fn run(args: Args) -> CommandResult {
     } else {
         print_text(&print::table(&args.model, &request, &report))?;
     }
-    Ok(if report.limits_broken.is_empty() { Outcome::Done } else { Outcome::Broken })
+    Ok(if report.limits_broken.is_empty() {
+        Outcome::Done
+    } else {
+        Outcome::Broken
+    })
 }
 
 fn limits(args: &Args) -> Result<DesignLimits, Failure> {
     let mut limits = match &args.limits {
-        Some(path) => DesignLimits::load(path).map_err(|error: ConfigError| Failure::input(error))?,
+        Some(path) => {
+            DesignLimits::load(path).map_err(|error: ConfigError| Failure::input(error))?
+        }
         None => DesignLimits::default(),
     };
     let flags = [
@@ -162,13 +174,20 @@ fn limits(args: &Args) -> Result<DesignLimits, Failure> {
         ("--max-mt", args.max_mt, &mut limits.max_mt),
         ("--min-pm", args.min_pm, &mut limits.min_pm_deg),
         ("--min-gm", args.min_gm, &mut limits.min_gm_db),
-        ("--min-delay-margin", args.min_delay_margin.map(|d| d.value() * 1e3), &mut limits.min_delay_margin_ms),
+        (
+            "--min-delay-margin",
+            args.min_delay_margin.map(|d| d.value() * 1e3),
+            &mut limits.min_delay_margin_ms,
+        ),
         ("--max-rms", args.max_rms, &mut limits.max_rms_nm),
     ];
     for (flag, given, limit) in flags {
         if let Some(value) = given {
             if !(value.is_finite() && value > 0.0) {
-                return Err(Failure::bad_input(format!("{flag} {value}: must be a positive number"), "see --help"));
+                return Err(Failure::bad_input(
+                    format!("{flag} {value}: must be a positive number"),
+                    "see --help",
+                ));
             }
             *limit = Some(value);
         }
@@ -181,7 +200,10 @@ fn limits(args: &Args) -> Result<DesignLimits, Failure> {
 
 fn lead(args: &Args, loop_delay_s: f64) -> Result<Option<Lead>, Failure> {
     match (args.controller, args.lead_zero, args.lead_pole) {
-        (Kind::Lead, Some(zero), Some(pole)) => Ok(Some(Lead { zero_hz: zero.value(), pole_hz: pole.value() })),
+        (Kind::Lead, Some(zero), Some(pole)) => Ok(Some(Lead {
+            zero_hz: zero.value(),
+            pole_hz: pole.value(),
+        })),
         (Kind::Lead, ..) => Ok(Some(default_lead(loop_delay_s))),
         (Kind::Pi, None, None) => Ok(None),
         (Kind::Pi, ..) => Err(Failure::bad_input(

@@ -1,9 +1,13 @@
 //! One module a command: `Args` (read by clap), `run(args)` (calls the libraries, prints the result).
 
+pub mod camera;
 pub mod design;
 pub mod doctor;
 pub mod identify;
 pub mod reconcile;
+pub mod vision;
+mod vision_sheet;
+mod vision_summary;
 
 use crate::outcome::CommandResult;
 
@@ -18,6 +22,10 @@ pub enum Command {
     Identify(Box<identify::Args>),
     /// Find where simulation and measurement disagree, name what is missing, add it to the model.
     Reconcile(reconcile::Args),
+    /// Positions and their quality from a recording: CSV, contact sheet, summary.
+    Vision(Box<vision::Args>),
+    /// Which cameras there are; delivered rate, intervals, age and losses of one.
+    Camera(camera::Args),
 }
 
 impl Command {
@@ -28,6 +36,8 @@ impl Command {
             Self::Doctor(args) => doctor::run(args),
             Self::Identify(args) => identify::run(*args),
             Self::Reconcile(args) => reconcile::run(args),
+            Self::Vision(args) => vision::run(*args),
+            Self::Camera(args) => camera::run(args),
         }
     }
 }

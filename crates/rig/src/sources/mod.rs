@@ -28,12 +28,12 @@ pub const MAX_PIXELS: usize = 1 << 26;
 #[derive(Debug, thiserror::Error)]
 pub enum SourceError {
     /// The file or folder cannot be opened or read.
-    #[error("{}: cannot read: {source}", path.display())]
+    #[error("{}: cannot read: {cause}", path.display())]
     Unreadable {
         /// Which file.
         path: PathBuf,
         /// What the operating system said.
-        source: std::io::Error,
+        cause: std::io::Error,
     },
     /// No known kind of recording.
     #[error(
@@ -186,7 +186,7 @@ pub fn open(path: &Path) -> Result<Box<dyn Recording>, SourceError> {
         "png" => Ok(Box::new(PngFolder::of(path, vec![path.to_path_buf()])?)),
         _ if !path.exists() => Err(SourceError::Unreadable {
             path: path.to_path_buf(),
-            source: std::io::ErrorKind::NotFound.into(),
+            cause: std::io::Error::new(std::io::ErrorKind::NotFound, "no such file or folder"),
         }),
         _ => Err(SourceError::UnknownKind {
             path: path.to_path_buf(),

@@ -45,7 +45,7 @@ impl PhotronRecording {
         let (header, mraw) = pair(path);
         let unreadable = |path: &Path| {
             let path = path.to_path_buf();
-            move |source| SourceError::Unreadable { path, source }
+            move |cause| SourceError::Unreadable { path, cause }
         };
         let mut raw = Vec::new();
         let file = File::open(&header).map_err(unreadable(&header))?;

@@ -18,9 +18,9 @@ impl PngFolder {
     /// # Errors
     /// The folder cannot be read, holds no PNG, or its first picture cannot be used.
     pub fn open(folder: &Path) -> Result<Self, SourceError> {
-        let unreadable = |source| SourceError::Unreadable {
+        let unreadable = |cause| SourceError::Unreadable {
             path: folder.to_path_buf(),
-            source,
+            cause,
         };
         let mut pictures = Vec::new();
         for entry in std::fs::read_dir(folder).map_err(unreadable)? {
@@ -84,9 +84,9 @@ impl Recording for PngFolder {
 }
 
 fn decode(path: &Path, frame: usize, buffer: &mut FrameBuffer) -> Result<(), SourceError> {
-    let unreadable = |source| SourceError::Unreadable {
+    let unreadable = |cause| SourceError::Unreadable {
         path: path.to_path_buf(),
-        source,
+        cause,
     };
     let damaged = |e: image::ImageError| SourceError::Damaged {
         path: path.to_path_buf(),

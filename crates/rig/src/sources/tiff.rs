@@ -99,9 +99,9 @@ fn damage(path: &Path, frame: usize, error: &TiffError) -> SourceError {
 }
 
 fn decoder(path: &Path) -> Result<Decoder<BufReader<File>>, SourceError> {
-    let file = File::open(path).map_err(|source| SourceError::Unreadable {
+    let file = File::open(path).map_err(|cause| SourceError::Unreadable {
         path: path.to_path_buf(),
-        source,
+        cause,
     })?;
     let mut limits = Limits::default();
     limits.decoding_buffer_size = 2 * MAX_PIXELS;

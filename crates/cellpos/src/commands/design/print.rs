@@ -103,8 +103,11 @@ fn line(out: &mut String, name: &str, value: f64, decimals: usize, unit: &str) {
 pub fn table(model: &str, request: &DesignRequest, report: &DesignReport) -> String {
     let (m, ts) = (&report.margins, request.plant.sample_time_s);
     let mut out = String::new();
-    let loud: Vec<&DesignWarning> =
-        report.warnings.iter().filter(|w| matches!(w, DesignWarning::ProbablyPerHertz(_))).collect();
+    let loud: Vec<&DesignWarning> = report
+        .warnings
+        .iter()
+        .filter(|w| matches!(w, DesignWarning::ProbablyPerHertz(_)))
+        .collect();
     for warning in loud {
         let _ = writeln!(out, "!!! {warning}\n");
     }
@@ -125,7 +128,11 @@ pub fn table(model: &str, request: &DesignRequest, report: &DesignReport) -> Str
                 pi.setpoint_weight
             );
             if let Some(lead) = pi.lead {
-                let _ = writeln!(out, "lead: zero {:.1} Hz, pole {:.1} Hz", lead.zero_hz, lead.pole_hz);
+                let _ = writeln!(
+                    out,
+                    "lead: zero {:.1} Hz, pole {:.1} Hz",
+                    lead.zero_hz, lead.pole_hz
+                );
             }
         }
     }
@@ -142,18 +149,69 @@ pub fn table(model: &str, request: &DesignRequest, report: &DesignReport) -> Str
     line(&mut out, "|S| < 1 below", m.s_below_1_hz, 1, "Hz");
     line(&mut out, "-3 dB of T", m.bandwidth_3db_hz, 1, "Hz");
     if let Some(s) = &report.step {
-        line(&mut out, "10 um step: overshoot", s.overshoot_percent, 1, "%");
-        line(&mut out, "10 um step: settling to 5 %", s.settling_5_percent_s * 1e3, 0, "ms");
-        line(&mut out, "10 um step: settling to 2 %", s.settling_2_percent_s * 1e3, 0, "ms");
+        line(
+            &mut out,
+            "10 um step: overshoot",
+            s.overshoot_percent,
+            1,
+            "%",
+        );
+        line(
+            &mut out,
+            "10 um step: settling to 5 %",
+            s.settling_5_percent_s * 1e3,
+            0,
+            "ms",
+        );
+        line(
+            &mut out,
+            "10 um step: settling to 2 %",
+            s.settling_2_percent_s * 1e3,
+            0,
+            "ms",
+        );
     }
     if let Some(d) = &report.disturbance {
-        line(&mut out, "10 um/s drift: peak error", d.peak_um * 1e3, 1, "nm");
-        line(&mut out, "10 um/s drift: recovery to 10 %", d.recovery_s * 1e3, 0, "ms");
-        line(&mut out, "10 um/s drift: steady error", d.steady_error_um * 1e3, 3, "nm");
+        line(
+            &mut out,
+            "10 um/s drift: peak error",
+            d.peak_um * 1e3,
+            1,
+            "nm",
+        );
+        line(
+            &mut out,
+            "10 um/s drift: recovery to 10 %",
+            d.recovery_s * 1e3,
+            0,
+            "ms",
+        );
+        line(
+            &mut out,
+            "10 um/s drift: steady error",
+            d.steady_error_um * 1e3,
+            3,
+            "nm",
+        );
     }
-    line(&mut out, "predicted hold error (true, RMS)", report.noise.map_or(f64::NAN, |n| n.rms_um * 1e3), 1, "nm");
-    line(&mut out, "minimum-variance bound on it", report.bound_rms_um * 1e3, 1, "nm");
-    let _ = writeln!(out, "spread:   gain  delay      PM deg   GM dB      Ms      Mt");
+    line(
+        &mut out,
+        "predicted hold error (true, RMS)",
+        report.noise.map_or(f64::NAN, |n| n.rms_um * 1e3),
+        1,
+        "nm",
+    );
+    line(
+        &mut out,
+        "minimum-variance bound on it",
+        report.bound_rms_um * 1e3,
+        1,
+        "nm",
+    );
+    let _ = writeln!(
+        out,
+        "spread:   gain  delay      PM deg   GM dB      Ms      Mt"
+    );
     for row in &report.spread {
         let r = &row.margins;
         let _ = if r.stable {
@@ -163,7 +221,11 @@ pub fn table(model: &str, request: &DesignRequest, report: &DesignReport) -> Str
                 row.gain_factor, row.extra_samples, r.pm_deg, r.gm_db, r.ms, r.mt
             )
         } else {
-            writeln!(out, "        x {:<5} +{}      UNSTABLE", row.gain_factor, row.extra_samples)
+            writeln!(
+                out,
+                "        x {:<5} +{}      UNSTABLE",
+                row.gain_factor, row.extra_samples
+            )
         };
     }
     out
