@@ -4,6 +4,7 @@ pub mod camera;
 pub mod design;
 pub mod doctor;
 pub mod identify;
+pub mod paper;
 pub mod reconcile;
 pub mod vision;
 mod vision_sheet;
@@ -26,6 +27,8 @@ pub enum Command {
     Vision(Box<vision::Args>),
     /// Which cameras there are; delivered rate, intervals, age and losses of one.
     Camera(camera::Args),
+    /// Reproduce the figures and numbers of Mizoue et al. 2017 from the emulated rig, and say where the paper errs.
+    Paper(paper::Args),
 }
 
 impl Command {
@@ -38,6 +41,7 @@ impl Command {
             Self::Reconcile(args) => reconcile::run(args),
             Self::Vision(args) => vision::run(*args),
             Self::Camera(args) => camera::run(args),
+            Self::Paper(args) => paper::run(args),
         }
     }
 }

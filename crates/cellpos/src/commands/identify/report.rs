@@ -25,21 +25,16 @@ pub fn bode(name: &str, caption: &str, result: &Identification, high_hz: f64) ->
     let lowest = f.iter().copied().fold(f64::INFINITY, f64::min);
     let grid = log_grid(0.7 * lowest, high_hz, 160);
     let bands: Vec<_> = grid.iter().map(|&f| result.band(f)).collect();
-    let pick =
-        |g: &dyn Fn(&([f64; 2], [f64; 2])) -> f64| -> Vec<f64> { bands.iter().map(g).collect() };
-    let ends = |value: &dyn Fn(usize) -> f64,
-                sd: &dyn Fn(usize) -> f64|
-     -> (Vec<f64>, Vec<f64>, Vec<f64>) {
-        let n = points.len();
-        (
-            (0..n).map(value).collect(),
-            (0..n).map(|i| value(i) - 1.96 * sd(i)).collect(),
-            (0..n).map(|i| value(i) + 1.96 * sd(i)).collect(),
-        )
+    let band = |phase: bool, end: usize| -> Vec<f64> {
+        bands.iter().map(|(gain, angle)| if phase { angle[end] } else { gain[end] }).collect()
     };
-    let (gain, gain_low, gain_high) = ends(&|i| points[i].gain_db, &|i| points[i].gain_sd_db);
-    let (phase, phase_low, phase_high) =
-        ends(&|i| points[i].phase_deg, &|i| points[i].phase_sd_deg);
+    let gain: Vec<f64> = points.iter().map(|p| p.gain_db).collect();
+    let phase: Vec<f64> = points.iter().map(|p| p.phase_deg).collect();
+    let shifted = |sign: f64| -> (Vec<f64>, Vec<f64>) {
+        points.iter().map(|p| (p.gain_db + sign * 1.96 * p.gain_sd_db, p.phase_deg + sign * 1.96 * p.phase_sd_deg)).unzip()
+    };
+    let (gain_low, phase_low) = shifted(-1.0);
+    let (gain_high, phase_high) = shifted(1.0);
     let model = result.judged.model;
     let curve = |g: &dyn Fn(f64) -> cellpos_plant::Complex<f64>| -> (Vec<f64>, Vec<f64>) {
         grid.iter()
@@ -58,14 +53,14 @@ pub fn bode(name: &str, caption: &str, result: &Identification, high_hz: f64) ->
             Series::band(
                 "95 % of the fit",
                 &grid,
-                &pick(&|b| b.0[0]),
-                &pick(&|b| b.0[1]),
+                &band(false, 0),
+                &band(false, 1),
             ),
             Series::band(
                 "95 % of the fit",
                 &grid,
-                &pick(&|b| b.1[0]),
-                &pick(&|b| b.1[1]),
+                &band(true, 0),
+                &band(true, 1),
             ),
         )
         .bode_series(
