@@ -26,19 +26,33 @@ fn identify_through_frames_finds_eq6_its_delay_and_what_it_cannot_tell() {
     let result = json(
         folder.path(),
         &[
-            "identify", "--seed", "3", "--clock", "virtual", "--json", "--out", "model.toml",
-            "--report", "report.html",
+            "identify",
+            "--seed",
+            "3",
+            "--clock",
+            "virtual",
+            "--json",
+            "--out",
+            "model.toml",
+            "--report",
+            "report.html",
         ],
     );
     let parameter = |name: &str| &result["parameters"][name];
     let gain = parameter("gain_per_s");
     let truth = 428.13;
-    assert!((gain["value"].as_f64().unwrap() / truth - 1.0).abs() < 0.01, "{gain}");
+    assert!(
+        (gain["value"].as_f64().unwrap() / truth - 1.0).abs() < 0.01,
+        "{gain}"
+    );
     let end = |i: usize| gain["ci95"][i].as_f64().unwrap();
     assert!(end(0) < truth && truth < end(1), "{gain}");
     assert!((parameter("delay_ms")["value"].as_f64().unwrap() - 2.0).abs() < 0.05);
     for name in ["far_zero_rad_per_s", "slow_pole_rad_per_s"] {
-        assert_eq!(parameter(name)["verdict"], "not identifiable from this band");
+        assert_eq!(
+            parameter(name)["verdict"],
+            "not identifiable from this band"
+        );
     }
     let lines = result["frequencies"].as_array().unwrap();
     assert_eq!(lines.len(), 10);
@@ -48,7 +62,11 @@ fn identify_through_frames_finds_eq6_its_delay_and_what_it_cannot_tell() {
         assert!(miss("phase_deg", "eq6_phase_deg") < 1.0, "{line}");
     }
     let warnings = result["warnings"].as_array().unwrap();
-    assert!(warnings.iter().any(|w| w.as_str().unwrap().contains("2 pi")));
+    assert!(
+        warnings
+            .iter()
+            .any(|w| w.as_str().unwrap().contains("2 pi"))
+    );
     let model = cellpos_plant::Model::load_file(&folder.path().join("model.toml")).unwrap();
     assert!((model.plant.gain_db(cellpos_plant::Hertz(10.0)).0 - 16.26).abs() < 0.1);
     assert!(folder.path().join("report-figures/bode.svg").exists());
@@ -58,8 +76,18 @@ fn identify_through_frames_finds_eq6_its_delay_and_what_it_cannot_tell() {
 fn the_same_seed_gives_the_same_result_to_the_bit() {
     let folder = tempfile::tempdir().unwrap();
     let args = [
-        "identify", "--seed", "11", "--frames", "off", "--bootstrap", "50", "--json", "--out",
-        "m.toml", "--report", "r.html",
+        "identify",
+        "--seed",
+        "11",
+        "--frames",
+        "off",
+        "--bootstrap",
+        "50",
+        "--json",
+        "--out",
+        "m.toml",
+        "--report",
+        "r.html",
     ];
     assert_eq!(json(folder.path(), &args), json(folder.path(), &args));
 }
@@ -67,20 +95,37 @@ fn the_same_seed_gives_the_same_result_to_the_bit() {
 #[test]
 fn paper_reproduces_the_table_and_names_the_papers_errors() {
     let folder = tempfile::tempdir().unwrap();
-    let result = json(folder.path(), &["paper", "--json", "--report", "paper.html"]);
+    let result = json(
+        folder.path(),
+        &["paper", "--json", "--report", "paper.html"],
+    );
     let table = result["table"].as_array().unwrap();
     for row in table {
         assert_eq!(row["holds"], true, "{row}");
     }
     let row = |key: &str| {
-        table.iter().find(|r| r["key"] == key).unwrap_or_else(|| panic!("no row {key}"))
+        table
+            .iter()
+            .find(|r| r["key"] == key)
+            .unwrap_or_else(|| panic!("no row {key}"))
     };
     let ours = |key: &str| row(key)["ours"].as_f64().unwrap();
-    for key in ["eq5", "a10", "r2", "fft_10hz", "fft_10hz_compensated", "aliases"] {
+    for key in [
+        "eq5",
+        "a10",
+        "r2",
+        "fft_10hz",
+        "fft_10hz_compensated",
+        "aliases",
+    ] {
         assert_eq!(row(key)["verdict"], "the paper is inconsistent", "{key}");
     }
     for key in ["far_zero", "slow_pole"] {
-        assert_eq!(row(key)["verdict"], "not identifiable from 2-300 Hz", "{key}");
+        assert_eq!(
+            row(key)["verdict"],
+            "not identifiable from 2-300 Hz",
+            "{key}"
+        );
     }
     assert!((ours("recorded_amplitude_averaged") - 0.858).abs() < 0.003);
     assert!((0.80..0.90).contains(&ours("recorded_amplitude_peaks")));
@@ -123,15 +168,25 @@ fn a_measured_piezo_record_is_identified_by_column_numbers_and_its_harmonics_are
     let file = &result["files"][0];
     let line = &file["lines"][0];
     assert!((line["frequency_hz"].as_f64().unwrap() - 1.0).abs() < 0.01);
-    assert!((line["lag_ms"].as_f64().unwrap() - 33.0).abs() < 2.0, "{line}");
+    assert!(
+        (line["lag_ms"].as_f64().unwrap() - 33.0).abs() < 2.0,
+        "{line}"
+    );
     assert_eq!(file["harmonics_remain"], true);
-    assert!(file["message"].as_str().unwrap().contains("no linear model"));
+    assert!(
+        file["message"]
+            .as_str()
+            .unwrap()
+            .contains("no linear model")
+    );
 }
 
 #[test]
 fn wrong_arguments_end_with_code_2_and_a_sentence() {
     let folder = tempfile::tempdir().unwrap();
-    let args = ["identify", "--data", "x.csv", "--input", "1", "--output", "2", "--rate", "1kHz"];
+    let args = [
+        "identify", "--data", "x.csv", "--input", "1", "--output", "2", "--rate", "1kHz",
+    ];
     let (code, _, err) = cellpos(folder.path(), &args);
     assert_eq!(code, Some(2), "{err}");
     assert!(err.contains("x.csv"), "{err}");

@@ -26,12 +26,23 @@ pub fn bode(name: &str, caption: &str, result: &Identification, high_hz: f64) ->
     let grid = log_grid(0.7 * lowest, high_hz, 160);
     let bands: Vec<_> = grid.iter().map(|&f| result.band(f)).collect();
     let band = |phase: bool, end: usize| -> Vec<f64> {
-        bands.iter().map(|(gain, angle)| if phase { angle[end] } else { gain[end] }).collect()
+        bands
+            .iter()
+            .map(|(gain, angle)| if phase { angle[end] } else { gain[end] })
+            .collect()
     };
     let gain: Vec<f64> = points.iter().map(|p| p.gain_db).collect();
     let phase: Vec<f64> = points.iter().map(|p| p.phase_deg).collect();
     let shifted = |sign: f64| -> (Vec<f64>, Vec<f64>) {
-        points.iter().map(|p| (p.gain_db + sign * 1.96 * p.gain_sd_db, p.phase_deg + sign * 1.96 * p.phase_sd_deg)).unzip()
+        points
+            .iter()
+            .map(|p| {
+                (
+                    p.gain_db + sign * 1.96 * p.gain_sd_db,
+                    p.phase_deg + sign * 1.96 * p.phase_sd_deg,
+                )
+            })
+            .unzip()
     };
     let (gain_low, phase_low) = shifted(-1.0);
     let (gain_high, phase_high) = shifted(1.0);
@@ -50,18 +61,8 @@ pub fn bode(name: &str, caption: &str, result: &Identification, high_hz: f64) ->
     let delayed: Vec<f64> = points.iter().map(|p| p.delayed_phase_deg).collect();
     Figure::bode(name, caption)
         .bode_series(
-            Series::band(
-                "95 % of the fit",
-                &grid,
-                &band(false, 0),
-                &band(false, 1),
-            ),
-            Series::band(
-                "95 % of the fit",
-                &grid,
-                &band(true, 0),
-                &band(true, 1),
-            ),
+            Series::band("95 % of the fit", &grid, &band(false, 0), &band(false, 1)),
+            Series::band("95 % of the fit", &grid, &band(true, 0), &band(true, 1)),
         )
         .bode_series(
             Series::line("fit", &grid, &model_gain),

@@ -26,7 +26,9 @@ pub fn fig4(done: &Done) -> Figure {
     for record in &done.records {
         let planned = &done.plan.segments[record.index];
         let f = planned.lines_hz[0];
-        let Some(point) = points.iter().find(|p| p.frequency_hz == f) else { continue };
+        let Some(point) = points.iter().find(|p| p.frequency_hz == f) else {
+            continue;
+        };
         let amplitude = point.input.norm();
         let rows = ((if f < 50.0 { 0.5 } else { 0.05 }) / period_s) as usize;
         let to = (record.from + rows).min(record.input.len());
@@ -37,13 +39,26 @@ pub fn fig4(done: &Done) -> Figure {
         };
         let input = centre(&record.input[record.from..to]);
         let output = centre(&record.output[record.from..to]);
-        let t: Vec<f64> = (0..input.len()).map(|k| k as f64 * period_s * 1e3).collect();
+        let t: Vec<f64> = (0..input.len())
+            .map(|k| k as f64 * period_s * 1e3)
+            .collect();
         figure = figure.panel(
             Panel::new(Axis::linear("time", "ms"), Axis::linear("", "a.u."))
                 .title(&planned.label)
                 .height_px(140.0)
-                .series(Series::step("PZT", &t, &input.iter().map(|v| v / amplitude).collect::<Vec<_>>()))
-                .series(Series::line("bead", &t, &output.iter().map(|v| v / amplitude / gain_2hz).collect::<Vec<_>>())),
+                .series(Series::step(
+                    "PZT",
+                    &t,
+                    &input.iter().map(|v| v / amplitude).collect::<Vec<_>>(),
+                ))
+                .series(Series::line(
+                    "bead",
+                    &t,
+                    &output
+                        .iter()
+                        .map(|v| v / amplitude / gain_2hz)
+                        .collect::<Vec<_>>(),
+                )),
         );
     }
     figure
@@ -55,8 +70,15 @@ pub fn fig5a() -> Figure {
     let fine: Vec<f64> = (0..1200).map(|i| i as f64 * GENERATOR_S * 1e3).collect();
     let generated: Vec<f64> = fine.iter().map(|t| (TWO_PI * f * t * 1e-3).sin()).collect();
     let coarse: Vec<f64> = (0..13).map(f64::from).collect();
-    let held: Vec<f64> = coarse.iter().map(|t| (TWO_PI * f * t * 1e-3).sin()).collect();
-    Figure::new("fig5a-record", "A 300 Hz drive as generated at 100 kHz and as recorded at 1 kHz, each sample held.").panel(
+    let held: Vec<f64> = coarse
+        .iter()
+        .map(|t| (TWO_PI * f * t * 1e-3).sin())
+        .collect();
+    Figure::new(
+        "fig5a-record",
+        "A 300 Hz drive as generated at 100 kHz and as recorded at 1 kHz, each sample held.",
+    )
+    .panel(
         Panel::new(Axis::linear("time", "ms"), Axis::linear("signal", "a.u."))
             .series(Series::line("generated", &fine, &generated))
             .series(Series::step("recorded", &coarse, &held))
@@ -79,7 +101,12 @@ pub struct Recorded {
 /// Simulates the record of a generator at 100 kHz through a 1 kHz computer with random phases.
 pub fn recorded_amplitudes() -> Recorded {
     let mut random = Random::new(5);
-    let mut out = Recorded { frequency_hz: Vec::new(), averaged: Vec::new(), peaks: Vec::new(), dft: Vec::new() };
+    let mut out = Recorded {
+        frequency_hz: Vec::new(),
+        averaged: Vec::new(),
+        peaks: Vec::new(),
+        dft: Vec::new(),
+    };
     let per_sample = (RECORD_S / GENERATOR_S).round() as usize;
     let rows = 1000usize;
     for f in PAPER_FREQUENCIES_HZ {
@@ -91,7 +118,9 @@ pub fn recorded_amplitudes() -> Recorded {
             let point: Vec<f64> = (0..rows).map(|k| at(k as f64 * RECORD_S)).collect();
             let mean: Vec<f64> = (0..rows)
                 .map(|k| {
-                    let sum: f64 = (0..per_sample).map(|i| at(k as f64 * RECORD_S + i as f64 * GENERATOR_S)).sum();
+                    let sum: f64 = (0..per_sample)
+                        .map(|i| at(k as f64 * RECORD_S + i as f64 * GENERATOR_S))
+                        .sum();
                     sum / per_sample as f64
                 })
                 .collect();
@@ -148,8 +177,20 @@ pub fn fig_a1(d: &Drifting) -> Figure {
     let input = bare_fft::spectrum(&d.record.input[rows], 1e-3);
     let bin = 5; // 10 Hz in half a second
     let turn = input.phasor.get(bin).map_or(1.0.into(), |u| u / u.norm());
-    let (re, im): (Vec<f64>, Vec<f64>) = spectrum.phasor.iter().skip(1).take(25).map(|y| y / turn).map(|y| (y.re, y.im)).unzip();
-    let at = |i: usize| (re.get(i - 1).copied().unwrap_or(f64::NAN), im.get(i - 1).copied().unwrap_or(f64::NAN));
+    let (re, im): (Vec<f64>, Vec<f64>) = spectrum
+        .phasor
+        .iter()
+        .skip(1)
+        .take(25)
+        .map(|y| y / turn)
+        .map(|y| (y.re, y.im))
+        .unzip();
+    let at = |i: usize| {
+        (
+            re.get(i - 1).copied().unwrap_or(f64::NAN),
+            im.get(i - 1).copied().unwrap_or(f64::NAN),
+        )
+    };
     let ten = at(bin);
     Figure::new(
         "fig-a1-complex-plane",

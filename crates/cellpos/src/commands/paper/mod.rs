@@ -51,7 +51,12 @@ pub struct Drifting {
 
 fn setup(seed: u64, drift_um_per_s: f64, start_um: f64, closed_loop: bool) -> Setup {
     Setup {
-        world: WorldConfig { seed, drift_um_per_s, start_um, ..WorldConfig::default() },
+        world: WorldConfig {
+            seed,
+            drift_um_per_s,
+            start_um,
+            ..WorldConfig::default()
+        },
         model: Model::eq6(),
         frames: true,
         clock: Clock::virtual_at(0),
@@ -69,7 +74,11 @@ fn drifting(seed: u64, delay_s: f64) -> Result<Drifting, Failure> {
         segments: vec![PlannedSegment {
             label: "10 Hz, open loop".to_owned(),
             signal: Signal::Tones {
-                tones: vec![Tone { frequency_hz, amplitude_um: 0.8, phase_rad: 0.0 }],
+                tones: vec![Tone {
+                    frequency_hz,
+                    amplitude_um: 0.8,
+                    phase_rad: 0.0,
+                }],
                 fade_in_s: 0.1,
             },
             lines_hz: vec![frequency_hz],
@@ -80,19 +89,26 @@ fn drifting(seed: u64, delay_s: f64) -> Result<Drifting, Failure> {
         lost_frames: 50,
     };
     let mut bead = HeldBead::open(setup)?;
-    let mut records = plan.run(&mut bead, 0, |_| {}).map_err(|stopped| match stopped.cause {
-        Cause::Rig(failure) => failure,
-        Cause::BeadLost(error) => Failure::failed(error),
-    })?;
+    let mut records = plan
+        .run(&mut bead, 0, |_| {})
+        .map_err(|stopped| match stopped.cause {
+            Cause::Rig(failure) => failure,
+            Cause::BeadLost(error) => Failure::failed(error),
+        })?;
     bead.close()?;
     let Some(record) = records.pop() else {
-        return Err(Failure::Failed(miette::miette!("the open-loop record at 10 Hz is empty")));
+        return Err(Failure::Failed(miette::miette!(
+            "the open-loop record at 10 Hz is empty"
+        )));
     };
     let rows = record.from..record.input.len();
     let (input, output) = (&record.input[rows.clone()], &record.output[rows]);
     let hold_deg = 180.0 * frequency_hz * sampling.period_s;
     let delay_deg = 360.0 * frequency_hz * delay_s;
-    let fft_deg = bare_fft::response(input, output, sampling.period_s, frequency_hz).arg().to_degrees() + hold_deg;
+    let fft_deg = bare_fft::response(input, output, sampling.period_s, frequency_hz)
+        .arg()
+        .to_degrees()
+        + hold_deg;
     let lines = [frequency_hz];
     let segment = Segment {
         input,
@@ -105,7 +121,13 @@ fn drifting(seed: u64, delay_s: f64) -> Result<Drifting, Failure> {
     };
     let fitted = measure(&segment, &Settings::default()).map_err(Failure::failed)?;
     let fit_deg = fitted.points[0].phase_deg() + hold_deg + delay_deg;
-    Ok(Drifting { fft_compensated_deg: fft_deg + delay_deg, fft_deg, fit_deg, drift_um_per_s, record })
+    Ok(Drifting {
+        fft_compensated_deg: fft_deg + delay_deg,
+        fft_deg,
+        fit_deg,
+        drift_um_per_s,
+        record,
+    })
 }
 
 fn job(seed: u64) -> Job {
@@ -113,7 +135,12 @@ fn job(seed: u64) -> Job {
         setup: setup(seed, WorldConfig::default().drift_um_per_s, 0.0, true),
         lines_hz: PAPER_FREQUENCIES_HZ.to_vec(),
         multisine: false,
-        limits: Limits { bead_um: 8.0, bead_um_per_s: 400.0, pzt_um: 10.0, slew_um_per_s: 3_200.0 },
+        limits: Limits {
+            bead_um: 8.0,
+            bead_um_per_s: 400.0,
+            pzt_um: 10.0,
+            slew_um_per_s: 3_200.0,
+        },
         seconds_at_1_hz: 40.0,
         led_edges: 300,
         bootstrap: 200,
@@ -132,19 +159,31 @@ pub fn run(args: Args) -> CommandResult {
         Some(path) => path.clone(),
         None => new_run_folder("paper")?.join("report.html"),
     };
-    report(&done, &drifting, &recorded, &rows).write_with_figures(&path).map_err(Failure::failed)?;
+    report(&done, &drifting, &recorded, &rows)
+        .write_with_figures(&path)
+        .map_err(Failure::failed)?;
     let broken = rows.iter().filter(|r| !r.holds).count();
     if args.json {
         print_json(&table::json(&rows, &path, args.seed))?;
     } else {
         print_text(&table::text(&rows, &path))?;
     }
-    Ok(if broken == 0 { Outcome::Done } else { Outcome::Broken })
+    Ok(if broken == 0 {
+        Outcome::Done
+    } else {
+        Outcome::Broken
+    })
 }
 
-fn report(done: &Done, drifting: &Drifting, recorded: &figures::Recorded, rows: &[table::Row]) -> Report {
+fn report(
+    done: &Done,
+    drifting: &Drifting,
+    recorded: &figures::Recorded,
+    rows: &[table::Row],
+) -> Report {
     use super::identify::report as plots;
-    let mut report = Report::new("Mizoue et al. 2017, Micromachines 8(3):80, from the emulated rig");
+    let mut report =
+        Report::new("Mizoue et al. 2017, Micromachines 8(3):80, from the emulated rig");
     report.paragraph(&format!(
         "`{}`. Every number comes from rendered frames of the emulated rig with Eq. (6) as its plant, through localiser, loop \
          and PZT board. The bead was held by PI while each line was driven, the amplitude shaped to keep it in view; Fig. A1 is \
@@ -178,9 +217,16 @@ fn report(done: &Done, drifting: &Drifting, recorded: &figures::Recorded, rows: 
         );
     }
     report.section("The paper's numbers and ours").table(table);
-    report.section("Parameters with intervals").table(plots::parameters(&done.result.judged.parameters));
-    report.section("Fig. 4: input and output at ten frequencies").figure(figures::fig4(done));
-    report.section("Fig. 5: what a 1 kHz record makes of the drive").figure(figures::fig5a()).figure(figures::fig5b(recorded));
+    report
+        .section("Parameters with intervals")
+        .table(plots::parameters(&done.result.judged.parameters));
+    report
+        .section("Fig. 4: input and output at ten frequencies")
+        .figure(figures::fig4(done));
+    report
+        .section("Fig. 5: what a 1 kHz record makes of the drive")
+        .figure(figures::fig5a())
+        .figure(figures::fig5b(recorded));
     report.section("Fig. 6: delay test");
     if let Some(led) = &done.led {
         report.figure(plots::delay_test("fig6-delay-test", "Light sent by the board and frames as they arrive; the delay that each dithered edge allows.", led));
@@ -199,7 +245,9 @@ fn report(done: &Done, drifting: &Drifting, recorded: &figures::Recorded, rows: 
         1000.0,
     ));
     report.table(plots::ladder(&done.result));
-    report.section("Fig. A1: the complex plane at 10 Hz, with drift").figure(figures::fig_a1(drifting));
+    report
+        .section("Fig. A1: the complex plane at 10 Hz, with drift")
+        .figure(figures::fig_a1(drifting));
     for warning in &done.result.warnings {
         report.note(Status::Warning, warning);
     }
