@@ -69,8 +69,12 @@ pub(crate) fn grid(
         jitter_s = jitter_s.max(off_s);
         places.push(place);
     }
+    let step_s = (last - first) / place as f64;
+    // Dust of decimal times such as 0.001 would otherwise change the last digits of whatever is computed with the step.
+    let whole_rate_hz = (1.0 / step_s).round();
+    let dust = (whole_rate_hz * step_s - 1.0).abs() < 1e-9;
     Ok(Grid {
-        step_s: (last - first) / place as f64,
+        step_s: if dust { 1.0 / whole_rate_hz } else { step_s },
         places,
         jitter_s,
     })

@@ -22,7 +22,7 @@ fn a_record_written_reads_back_to_the_bit() {
     let back = Record::read(&path, &Mapping::default()).unwrap();
     assert_eq!(back.pzt_um, record.pzt_um);
     assert_eq!(back.more, record.more);
-    assert!((back.step_s - 0.001).abs() < 1e-15);
+    assert_eq!(back.step_s, 0.001);
     for (row, (a, b)) in back.bead_um.iter().zip(&record.bead_um).enumerate() {
         assert!(
             a.to_bits() == b.to_bits() || (a.is_nan() && b.is_nan()),

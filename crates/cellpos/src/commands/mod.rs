@@ -9,6 +9,8 @@ pub mod reconcile;
 pub mod vision;
 mod vision_sheet;
 mod vision_summary;
+pub mod export;
+pub mod simulate;
 
 use crate::outcome::CommandResult;
 
@@ -17,6 +19,10 @@ use crate::outcome::CommandResult;
 pub enum Command {
     /// A controller for a model and a loop delay: margins, predicted error, spread, controller.toml.
     Design(design::Args),
+    /// Noise-free response of a model to the commands of a record.
+    Simulate(simulate::Args),
+    /// A run as CSV or Parquet, for other programs.
+    Export(export::Args),
     /// Is this machine fit for a 1 kHz loop: verdict, reasons, what to change.
     Doctor(doctor::Args),
     /// Measure the rig's frequency response and fit a model to it, or fit one to records.
@@ -36,6 +42,8 @@ impl Command {
     pub fn run(self) -> CommandResult {
         match self {
             Self::Design(args) => design::run(args),
+            Self::Simulate(args) => simulate::run(args),
+            Self::Export(args) => export::run(args),
             Self::Doctor(args) => doctor::run(args),
             Self::Identify(args) => identify::run(*args),
             Self::Reconcile(args) => reconcile::run(args),
