@@ -1,2 +1,24 @@
-//! Setpoint scripts.
+//! Setpoint scripts: what the bead or cell shall do, as a TOML file with units.
+//!
+//! [`Script`] is the file, read with errors that name line and column. [`Plan`] is the script laid out in time: the
+//! reference at any instant without allocation ([`Plan::at_um`]), the cycles, and a [`Cursor`] that walks through it,
+//! waits for conditions and ends on stop conditions. [`check()`] compares a plan with a model and limits before
+//! anything moves: peak position, speed and PZT demand, and the largest amplitude that the rig could do.
+//!
+//! The format is described in `docs/scripts.md`. Not here: the loop, devices, and the per-cycle table.
 #![forbid(unsafe_code)]
+
+mod check;
+mod cursor;
+mod error;
+mod node;
+mod plan;
+mod script;
+
+pub use check::{Check, CheckError, CheckLimits, Violation, check};
+pub use cursor::{Cursor, Output, Seen, Status, StopReason};
+pub use error::ScriptError;
+pub use plan::{Cycle, Mark, Motion, Plan, Segment};
+pub use script::{
+    Condition, Load, MoveShape, OnTimeout, Order, Script, Step, StepKind, Stop, WaveShape,
+};

@@ -1,0 +1,228 @@
+//! A plan against a model and limits, before anything moves.
+//!
+//! The PZT displacement that a plan asks for is that of the exact inverse of the model's plant under a zero-order hold
+//! (strictly proper form, minimum phase): u_k is solved from y_(k+1). What noise, drift and a wrong gain ask on top is
+//! covered by a reserve.
+
+use crate::error::ScriptError;
+use crate::plan::Plan;
+use crate::script::Script;
+use cellpos_control::Reference;
+use cellpos_plant::{DiscretePlant, Model, PlantError};
+use cellpos_units::Seconds;
+
+/// What the rig can do.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct CheckLimits {
+    /// Smallest PZT displacement, um.
+    pub low_um: f64,
+    /// Largest PZT displacement, um.
+    pub high_um: f64,
+    /// Largest speed of the PZT, um/s.
+    pub slew_um_per_s: f64,
+    /// PZT displacement at which the bead rests, um.
+    pub neutral_um: f64,
+    /// Half of the field of view along the channel, um.
+    pub view_um: f64,
+    /// Share of range and slew kept free for feedback, noise and drift.
+    pub reserve: f64,
+    /// Sample time of the loop, s.
+    pub sample_s: f64,
+}
+
+impl Default for CheckLimits {
+    /// The paper's drive (0..40 um) from its middle, at 1 kHz, with a tenth in reserve.
+    fn default() -> Self {
+        Self {
+            low_um: 0.0,
+            high_um: 40.0,
+            slew_um_per_s: 10_000.0,
+            neutral_um: 20.0,
+            view_um: 50.0,
+            reserve: 0.1,
+            sample_s: 1e-3,
+        }
+    }
+}
+
+/// Something that the rig cannot do.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Violation {
+    /// What is exceeded: `PZT range`, `PZT slew`, `field of view`.
+    pub what: &'static str,
+    /// Line of the step in the script.
+    pub line: usize,
+    /// First time, s (of the plan with its repeats shortened).
+    pub time_s: f64,
+    /// What is asked for, in `unit`, at the worst.
+    pub asked: f64,
+    /// What is allowed, in `unit`.
+    pub allowed: f64,
+    /// Unit of both.
+    pub unit: &'static str,
+}
+
+/// The result of a check.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Check {
+    /// Duration without waits, s.
+    pub duration_s: f64,
+    /// Cycles.
+    pub cycles: u64,
+    /// Lowest and highest position, um.
+    pub position_um: (f64, f64),
+    /// Highest speed of the bead, um/s.
+    pub speed_um_per_s: f64,
+    /// Lowest and highest PZT displacement, um.
+    pub pzt_um: (f64, f64),
+    /// Highest speed of the PZT, um/s.
+    pub pzt_speed_um_per_s: f64,
+    /// All positions (from the start) times this factor would just be allowed; below 1 the script is refused.
+    pub largest_factor: f64,
+    /// What the rig cannot do; empty: the script can run.
+    pub violations: Vec<Violation>,
+    /// Times of the reference and PZT demand below, s.
+    pub time_s: Vec<f64>,
+    /// The reference, with long repeats shortened, um.
+    pub reference_um: Vec<f64>,
+    /// The PZT demand, um.
+    pub demand_um: Vec<f64>,
+}
+
+/// A check that could not be made.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum CheckError {
+    /// The script cannot be laid out.
+    #[error(transparent)]
+    Script(#[from] ScriptError),
+    /// The model cannot be discretised.
+    #[error(transparent)]
+    Plant(#[from] PlantError),
+    /// A limit that makes no sense, or a model that cannot be inverted.
+    #[error("{0}")]
+    Limits(&'static str),
+    /// Too many different steps to go through.
+    #[error(
+        "the steps last {duration_s} s even with repeats shortened; at most {most_s} s can be checked"
+    )]
+    TooLong {
+        /// Duration, s.
+        duration_s: f64,
+        /// Longest, s.
+        most_s: f64,
+    },
+}
+
+/// Longest stretch of holding still that is gone through tick by tick.
+const MOST_TICKS: f64 = 20e6;
+
+/// Checks a script against a model and limits.
+///
+/// # Errors
+/// [`CheckError`]; a script that asks too much is no error but has [`Check::violations`].
+pub fn check(script: &Script, model: &Model, limits: &CheckLimits) -> Result<Check, CheckError> {
+    let room_up = (limits.high_um - limits.neutral_um) * (1.0 - limits.reserve);
+    let room_down = (limits.neutral_um - limits.low_um) * (1.0 - limits.reserve);
+    let slew = limits.slew_um_per_s * (1.0 - limits.reserve);
+    let sound = room_up > 0.0 && room_down > 0.0 && slew > 0.0 && limits.view_um > 0.0;
+    if !sound || !(0.0..1.0).contains(&limits.reserve) {
+        return Err(CheckError::Limits(
+            "limits: neutral must lie inside the range, slew and view be positive, reserve from 0 to below 1",
+        ));
+    }
+    let full = Plan::new(script)?;
+    let plan = Plan::shortened(script)?;
+    let h = limits.sample_s;
+    let ticks = (plan.total_s() / h).ceil();
+    if ticks > MOST_TICKS {
+        return Err(CheckError::TooLong {
+            duration_s: plan.total_s(),
+            most_s: MOST_TICKS * h,
+        });
+    }
+    let plant = DiscretePlant::new(&model.plant, Seconds(h), Seconds(0.0))?;
+    let mut probe = plant.state(0.0);
+    plant.step(&mut probe, 1.0);
+    let per_um = plant.output_um(&probe);
+    if !(per_um.is_finite() && per_um.abs() > 1e-9) {
+        return Err(CheckError::Limits(
+            "the model's bead does not answer within one sample: its demand cannot be computed",
+        ));
+    }
+
+    let start_um = plan.start_um();
+    let mut state = plant.state(0.0);
+    let mut out = Check {
+        duration_s: full.total_s(),
+        cycles: full.cycle_count(),
+        position_um: (start_um, start_um),
+        speed_um_per_s: 0.0,
+        pzt_um: (limits.neutral_um, limits.neutral_um),
+        pzt_speed_um_per_s: 0.0,
+        largest_factor: f64::INFINITY,
+        violations: Vec::new(),
+        time_s: Vec::new(),
+        reference_um: Vec::new(),
+        demand_um: Vec::new(),
+    };
+    let (mut before_um, mut before_u) = (start_um, 0.0);
+    for tick in 0..ticks as u64 {
+        let time_s = tick as f64 * h;
+        let next_um = plan.at_um(time_s + h);
+        // The answer without a command, then the command that closes the difference.
+        let mut free = state.clone();
+        plant.step(&mut free, 0.0);
+        let u = (next_um - start_um - plant.output_um(&free)) / per_um;
+        plant.step(&mut state, u);
+        let line = plan.segment_at(time_s).map_or(0, |segment| segment.line);
+        let view_um = (next_um - start_um).abs().max(next_um.abs());
+        let pzt_speed = (u - before_u).abs() / h;
+        out.position_um = (
+            out.position_um.0.min(next_um),
+            out.position_um.1.max(next_um),
+        );
+        out.speed_um_per_s = out.speed_um_per_s.max((next_um - before_um).abs() / h);
+        let pzt_um = limits.neutral_um + u;
+        out.pzt_um = (out.pzt_um.0.min(pzt_um), out.pzt_um.1.max(pzt_um));
+        out.pzt_speed_um_per_s = out.pzt_speed_um_per_s.max(pzt_speed);
+        let room = if u > 0.0 { room_up } else { room_down };
+        for (what, asked, allowed, unit) in [
+            ("PZT range", u.abs(), room, "um"),
+            ("PZT slew", pzt_speed, slew, "um/s"),
+            ("field of view", view_um, limits.view_um, "um"),
+        ] {
+            if asked > 0.0 {
+                out.largest_factor = out.largest_factor.min(allowed / asked);
+            }
+            if asked > allowed {
+                out.violation(Violation {
+                    what,
+                    line,
+                    time_s,
+                    asked,
+                    allowed,
+                    unit,
+                });
+            }
+        }
+        out.time_s.push(time_s);
+        out.reference_um.push(plan.at_um(time_s));
+        out.demand_um.push(pzt_um);
+        (before_um, before_u) = (next_um, u);
+    }
+    Ok(out)
+}
+
+impl Check {
+    /// Keeps the worst of each kind at each line.
+    fn violation(&mut self, new: Violation) {
+        let known = self
+            .violations
+            .iter_mut()
+            .find(|old| old.what == new.what && old.line == new.line);
+        match known {
+            Some(old) => old.asked = old.asked.max(new.asked),
+            None => self.violations.push(new),
+        }
+    }
+}

@@ -1,0 +1,290 @@
+//! Typed access to a TOML table, with the place of every value for errors.
+
+use crate::error::{ScriptError, nearest};
+use cellpos_units::UnitError;
+use std::ops::Range;
+use std::str::FromStr;
+use toml::Spanned;
+use toml::de::{DeTable, DeValue};
+
+/// The text being read, for errors.
+#[derive(Clone, Copy)]
+pub(crate) struct Source<'a> {
+    pub(crate) file: &'a str,
+    pub(crate) text: &'a str,
+}
+
+impl Source<'_> {
+    pub(crate) fn fail(
+        &self,
+        span: Range<usize>,
+        message: impl Into<String>,
+        help: Option<&str>,
+    ) -> ScriptError {
+        ScriptError::new(
+            self.file,
+            self.text,
+            span,
+            message.into(),
+            help.map(str::to_owned),
+        )
+    }
+}
+
+/// A table of the file.
+#[derive(Clone, Copy)]
+pub(crate) struct Node<'a> {
+    pub(crate) source: Source<'a>,
+    pub(crate) table: &'a DeTable<'a>,
+    pub(crate) span: (usize, usize),
+    /// Values that stand for `"$name"`: name and text, innermost last.
+    pub(crate) variables: &'a [(String, String)],
+}
+
+/// A value and its place.
+pub(crate) struct At<T> {
+    pub(crate) value: T,
+    pub(crate) span: Range<usize>,
+}
+
+impl<'a> Node<'a> {
+    pub(crate) fn span(&self) -> Range<usize> {
+        self.span.0..self.span.1
+    }
+
+    /// Refuses keys that are not in the list.
+    pub(crate) fn only(&self, keys: &[&str]) -> Result<(), ScriptError> {
+        for key in self.table.keys() {
+            let name = key.get_ref().as_ref();
+            if !keys.contains(&name) {
+                let help = nearest(name, keys).map_or_else(
+                    || format!("keys here: {}", keys.join(", ")),
+                    |near| format!("did you mean `{near}`?"),
+                );
+                return Err(self.source.fail(
+                    key.span(),
+                    format!("unknown key `{name}`"),
+                    Some(&help),
+                ));
+            }
+        }
+        Ok(())
+    }
+
+    fn raw(&self, key: &str) -> Option<&'a Spanned<DeValue<'a>>> {
+        self.table.get(key)
+    }
+
+    /// Where a key's value stands, or the table if it is absent.
+    pub(crate) fn span_of(&self, key: &str) -> Range<usize> {
+        self.raw(key).map_or_else(|| self.span(), Spanned::span)
+    }
+
+    pub(crate) fn has(&self, key: &str) -> bool {
+        self.raw(key).is_some()
+    }
+
+    fn missing(&self, key: &str, help: &str) -> ScriptError {
+        self.source
+            .fail(self.span(), format!("`{key}` is missing"), Some(help))
+    }
+
+    /// A text; `"$name"` is replaced by the value of the sweep of that name.
+    pub(crate) fn text(&self, key: &str) -> Result<Option<At<&'a str>>, ScriptError> {
+        let Some(value) = self.raw(key) else {
+            return Ok(None);
+        };
+        let Some(text) = value.get_ref().as_str() else {
+            let what = value.get_ref().type_str();
+            return Err(self.source.fail(
+                value.span(),
+                format!("`{key}` must be a text in quotes, not {what}"),
+                Some("write quantities with their unit in quotes, for example \"5um\""),
+            ));
+        };
+        let text = match text.strip_prefix('$') {
+            None => text,
+            Some(name) => match self.variables.iter().rev().find(|(other, _)| other == name) {
+                Some((_, text)) => text.as_str(),
+                None => {
+                    return Err(self.source.fail(
+                        value.span(),
+                        format!("`${name}` is not the name of a sweep around this step"),
+                        Some("a sweep has `name = \"...\"` and `values = [...]`"),
+                    ));
+                }
+            },
+        };
+        Ok(Some(At {
+            value: text,
+            span: value.span(),
+        }))
+    }
+
+    pub(crate) fn need_text(&self, key: &str, help: &str) -> Result<At<&'a str>, ScriptError> {
+        self.text(key)?.ok_or_else(|| self.missing(key, help))
+    }
+
+    /// One of several words.
+    pub(crate) fn word<T: Copy>(
+        &self,
+        key: &str,
+        words: &[(&str, T)],
+    ) -> Result<Option<T>, ScriptError> {
+        let Some(text) = self.text(key)? else {
+            return Ok(None);
+        };
+        if let Some((_, value)) = words.iter().find(|(word, _)| *word == text.value) {
+            return Ok(Some(*value));
+        }
+        let names: Vec<&str> = words.iter().map(|(word, _)| *word).collect();
+        let help = nearest(text.value, &names).map_or_else(
+            || format!("one of {}", names.join(", ")),
+            |near| format!("did you mean \"{near}\"?"),
+        );
+        Err(self.source.fail(
+            text.span,
+            format!("`{key}` = \"{}\" is not known", cut(text.value)),
+            Some(&help),
+        ))
+    }
+
+    /// A quantity with its unit, within bounds in its base unit.
+    pub(crate) fn quantity<Q>(
+        &self,
+        key: &str,
+        value_of: fn(Q) -> f64,
+        (low, high): (f64, f64),
+    ) -> Result<Option<f64>, ScriptError>
+    where
+        Q: FromStr<Err = UnitError> + std::fmt::Display,
+    {
+        let Some(raw) = self.raw(key) else {
+            return Ok(None);
+        };
+        if raw.get_ref().is_integer() || raw.get_ref().is_float() {
+            let number = self.source.text.get(raw.span()).unwrap_or("0");
+            let error = number.parse::<Q>().err();
+            return Err(self.source.fail(
+                raw.span(),
+                format!("`{key}` = {number} has no unit"),
+                error.map(|error| error.to_string()).as_deref(),
+            ));
+        }
+        let Some(text) = self.text(key)? else {
+            return Ok(None);
+        };
+        let quantity: Q = text.value.parse().map_err(|error: UnitError| {
+            let message = format!("`{key}` = \"{}\": {error}", cut(text.value));
+            self.source.fail(text.span.clone(), message, None)
+        })?;
+        let shown = quantity.to_string();
+        let value = value_of(quantity);
+        if !(low..=high).contains(&value) {
+            return Err(self.source.fail(
+                text.span,
+                format!("`{key}` = {shown} is out of range"),
+                Some(&format!(
+                    "it must be from {low:e} to {high:e} in the same unit"
+                )),
+            ));
+        }
+        Ok(Some(value))
+    }
+
+    /// A whole number within bounds.
+    pub(crate) fn whole(
+        &self,
+        key: &str,
+        (low, high): (u64, u64),
+    ) -> Result<Option<u64>, ScriptError> {
+        let Some(raw) = self.raw(key) else {
+            return Ok(None);
+        };
+        let value = raw
+            .get_ref()
+            .as_integer()
+            .filter(|integer| integer.radix() == 10)
+            .and_then(|integer| integer.as_str().replace('_', "").parse::<u64>().ok());
+        match value {
+            Some(value) if (low..=high).contains(&value) => Ok(Some(value)),
+            _ => Err(self.source.fail(
+                raw.span(),
+                format!("`{key}` must be a whole number from {low} to {high}"),
+                None,
+            )),
+        }
+    }
+
+    /// A table below this one.
+    pub(crate) fn table(&self, key: &str) -> Result<Option<Node<'a>>, ScriptError> {
+        let Some(raw) = self.raw(key) else {
+            return Ok(None);
+        };
+        match raw.get_ref().as_table() {
+            Some(table) => Ok(Some(Node {
+                table,
+                span: (raw.span().start, raw.span().end),
+                ..*self
+            })),
+            None => Err(self.source.fail(
+                raw.span(),
+                format!("`{key}` must be a table"),
+                Some(&format!("write it as [{key}]")),
+            )),
+        }
+    }
+
+    /// A list of tables below this one.
+    pub(crate) fn tables(&self, key: &str) -> Result<Vec<Node<'a>>, ScriptError> {
+        let Some(raw) = self.raw(key) else {
+            return Ok(Vec::new());
+        };
+        let fail = |span| {
+            self.source.fail(
+                span,
+                format!("`{key}` must be a list of tables"),
+                Some("write each as [[step]], or [[step.step]] inside a repeat"),
+            )
+        };
+        let list = raw.get_ref().as_array().ok_or_else(|| fail(raw.span()))?;
+        list.iter()
+            .map(|item| {
+                let table = item.get_ref().as_table().ok_or_else(|| fail(item.span()))?;
+                Ok(Node {
+                    table,
+                    span: (item.span().start, item.span().end),
+                    ..*self
+                })
+            })
+            .collect()
+    }
+
+    /// A list of texts.
+    pub(crate) fn texts(&self, key: &str) -> Result<Vec<String>, ScriptError> {
+        let Some(raw) = self.raw(key) else {
+            return Ok(Vec::new());
+        };
+        let help = Some("for example values = [\"1um\", \"2um\"]");
+        let fail = |span, message: String| self.source.fail(span, message, help);
+        let list = raw
+            .get_ref()
+            .as_array()
+            .ok_or_else(|| fail(raw.span(), format!("`{key}` must be a list of texts")))?;
+        list.iter()
+            .map(|item| {
+                item.get_ref().as_str().map(str::to_owned).ok_or_else(|| {
+                    fail(
+                        item.span(),
+                        format!("a value of `{key}` is not a text in quotes"),
+                    )
+                })
+            })
+            .collect()
+    }
+}
+
+/// A text short enough for a message.
+pub(crate) fn cut(text: &str) -> String {
+    text.chars().take(40).collect()
+}
