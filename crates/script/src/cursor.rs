@@ -57,8 +57,10 @@ pub struct Output {
 /// A place in a plan. Plain data: it can be copied, kept and compared.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Cursor {
-    /// Time of the plan, s.
+    /// Time of the plan, s: `from_s` and `ticks` samples. A sum of samples would drift by a tick in a long script.
     plan_s: f64,
+    from_s: f64,
+    ticks: u64,
     /// Running time, waits included, s.
     elapsed_s: f64,
     segment: usize,
@@ -86,6 +88,8 @@ impl Plan {
         };
         Cursor {
             plan_s,
+            from_s: plan_s,
+            ticks: 0,
             elapsed_s: 0.0,
             segment,
             waited_s: 0.0,
@@ -107,7 +111,8 @@ impl Plan {
             status: cursor.status,
         };
         if cursor.status == Status::Running {
-            cursor.plan_s += sample_s;
+            cursor.ticks += 1;
+            cursor.plan_s = cursor.from_s + cursor.ticks as f64 * sample_s;
         }
         cursor.elapsed_s += sample_s;
         output
@@ -242,6 +247,7 @@ impl Cursor {
     pub fn skip(&mut self, plan: &Plan) {
         if let Some(segment) = plan.segments().get(self.segment) {
             self.plan_s = self.plan_s.max(segment.start_s + segment.duration_s);
+            (self.from_s, self.ticks) = (self.plan_s, 0);
             self.leave();
         }
     }

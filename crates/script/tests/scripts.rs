@@ -300,9 +300,10 @@ fn too_much_is_refused_with_the_largest_amplitude_that_would_do() {
     let big = check(30.0);
     assert_eq!(big.violations[0].line, 4);
     assert_eq!(big.violations[0].what, "PZT range");
-    // +-20 um of PZT reach 12 um at 100 Hz; a tenth is kept in reserve.
+    // 18 um of PZT (a tenth is in reserve) at |G| = -4.40 dB give 10.85 um; sampled at 1 kHz the held integrator has
+    // 1.017 times that gain, and the ten samples of a cycle may miss the crest by up to cos(18 deg) = 0.951.
     let largest = 30.0 * big.largest_factor;
-    assert!((10.0..11.5).contains(&largest), "{largest}");
+    assert!((10.85..11.7).contains(&largest), "{largest}");
     assert!(check(largest * 0.999).violations.is_empty());
     assert!(!check(largest * 1.01).violations.is_empty());
 }

@@ -76,12 +76,21 @@ pub fn run(args: Args) -> CommandResult {
 fn figures(check: &Check) -> Vec<(&'static str, String)> {
     let range = |(low, high): (f64, f64)| format!("{low:.3} .. {high:.3}");
     vec![
-        ("duration without waits (s)", format!("{:.3}", check.duration_s)),
+        (
+            "duration without waits (s)",
+            format!("{:.3}", check.duration_s),
+        ),
         ("cycles", check.cycles.to_string()),
         ("position (um)", range(check.position_um)),
-        ("bead speed, highest (um/s)", format!("{:.1}", check.speed_um_per_s)),
+        (
+            "bead speed, highest (um/s)",
+            format!("{:.1}", check.speed_um_per_s),
+        ),
         ("PZT displacement (um)", range(check.pzt_um)),
-        ("PZT speed, highest (um/s)", format!("{:.1}", check.pzt_speed_um_per_s)),
+        (
+            "PZT speed, highest (um/s)",
+            format!("{:.1}", check.pzt_speed_um_per_s),
+        ),
         ("largest factor on all positions", factor(check)),
     ]
 }
@@ -168,18 +177,24 @@ fn report(script: &Script, check: &Check, limits: &CheckLimits) -> Report {
     report.table(table);
     let time = || Axis::linear("time", "s");
     report.figure(
-        Figure::new("reference", "Reference and PZT demand; long repeats and waves are shortened, waits take no time.")
-            .panel(
-                Panel::new(time(), Axis::linear("bead", "um"))
-                    .series(Series::line("reference", &check.time_s, &check.reference_um)),
-            )
-            .panel(
-                Panel::new(time(), Axis::linear("PZT", "um"))
-                    .series(Series::step("demand", &check.time_s, &check.demand_um).color(2))
-                    .horizontal(limits.low_um, "lower limit")
-                    .horizontal(limits.high_um, "upper limit"),
-            )
-            .share_x(),
+        Figure::new(
+            "reference",
+            "Reference and PZT demand; long repeats and waves are shortened, waits take no time.",
+        )
+        .panel(
+            Panel::new(time(), Axis::linear("bead", "um")).series(Series::line(
+                "reference",
+                &check.time_s,
+                &check.reference_um,
+            )),
+        )
+        .panel(
+            Panel::new(time(), Axis::linear("PZT", "um"))
+                .series(Series::step("demand", &check.time_s, &check.demand_um).color(2))
+                .horizontal(limits.low_um, "lower limit")
+                .horizontal(limits.high_um, "upper limit"),
+        )
+        .share_x(),
     );
     report.section("Script");
     report.verbatim(&script.text);

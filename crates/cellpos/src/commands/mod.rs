@@ -1,16 +1,17 @@
 //! One module a command: `Args` (read by clap), `run(args)` (calls the libraries, prints the result).
 
 pub mod camera;
+pub mod check;
 pub mod design;
 pub mod doctor;
+pub mod export;
 pub mod identify;
 pub mod paper;
 pub mod reconcile;
+pub mod simulate;
 pub mod vision;
 mod vision_sheet;
 mod vision_summary;
-pub mod export;
-pub mod simulate;
 
 use crate::outcome::CommandResult;
 
@@ -19,6 +20,8 @@ use crate::outcome::CommandResult;
 pub enum Command {
     /// A controller for a model and a loop delay: margins, predicted error, spread, controller.toml.
     Design(design::Args),
+    /// A setpoint script against a model and the rig's limits, before anything moves.
+    Check(check::Args),
     /// Noise-free response of a model to the commands of a record.
     Simulate(simulate::Args),
     /// A run as CSV or Parquet, for other programs.
@@ -42,6 +45,7 @@ impl Command {
     pub fn run(self) -> CommandResult {
         match self {
             Self::Design(args) => design::run(args),
+            Self::Check(args) => check::run(args),
             Self::Simulate(args) => simulate::run(args),
             Self::Export(args) => export::run(args),
             Self::Doctor(args) => doctor::run(args),

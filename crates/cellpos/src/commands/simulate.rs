@@ -8,9 +8,11 @@ use std::path::PathBuf;
 
 /// Arguments of `cellpos simulate`.
 #[derive(Debug, clap::Args)]
-#[command(after_help = "Example:\n  cellpos simulate --model eq6 --input in.csv --out out.csv\n\n\
+#[command(
+    after_help = "Example:\n  cellpos simulate --model eq6 --input in.csv --out out.csv\n\n\
                         The input needs the columns time_s and pzt_um; the output has time_s, pzt_um and bead_um, the \
-                        position just before the row's command takes effect. The bead starts at rest at 0 um.")]
+                        position just before the row's command takes effect. The bead starts at rest at 0 um."
+)]
 pub struct Args {
     /// `eq6`, or a model file.
     #[arg(long)]
