@@ -80,10 +80,6 @@ impl<'a> Node<'a> {
         self.raw(key).map_or_else(|| self.span(), Spanned::span)
     }
 
-    pub(crate) fn has(&self, key: &str) -> bool {
-        self.raw(key).is_some()
-    }
-
     fn missing(&self, key: &str, help: &str) -> ScriptError {
         self.source
             .fail(self.span(), format!("`{key}` is missing"), Some(help))

@@ -192,7 +192,7 @@ impl Plan {
             .checked_sub(1)
             .and_then(|index| self.cycles.get(index))?;
         let within = number - run.first;
-        (within < run.count).then(|| Cycle {
+        (within < run.count).then_some(Cycle {
             number,
             start_s: run.start_s + within as f64 * run.period_s,
             duration_s: run.period_s,
