@@ -13,6 +13,7 @@ mod cursor;
 mod error;
 mod node;
 mod plan;
+mod read;
 mod script;
 
 pub use check::{Check, CheckError, CheckLimits, Violation, check};
