@@ -7,7 +7,9 @@ use crate::control_loop::{ControllerConfig, LoopConfig};
 use crate::design::DesignPlant;
 use crate::error::BuildError;
 use crate::estimator::EstimatorConfig;
+use crate::feedback::Lqg;
 use crate::limits::Limits;
+use crate::mpc::Mpc;
 use crate::pi::{Lead, Pi};
 use cellpos_plant::{Model, PlantError};
 use serde::{Deserialize, Serialize};
@@ -22,6 +24,10 @@ pub enum ControllerKind {
     Pi,
     /// PI with lead.
     Lead,
+    /// State feedback on the estimate.
+    Lqg,
+    /// Model predictive control.
+    Mpc,
 }
 
 /// Gains of the PI controller as the file writes them.
@@ -64,6 +70,12 @@ pub struct ControllerFile {
     pub sample_time_ms: f64,
     /// PI gains: the law of `pi` and `lead`, the fallback of the others.
     pub pi: PiFile,
+    /// Weights of LQG.
+    #[serde(default)]
+    pub lqg: Lqg,
+    /// Weights, solver and field of view of MPC.
+    #[serde(default)]
+    pub mpc: Mpc,
     /// Noise and gate of the estimator.
     #[serde(default)]
     pub estimator: EstimatorConfig,
@@ -136,6 +148,8 @@ impl ControllerFile {
                 tracking_time_ms: Some(pi.tracking_time_s * 1e3),
                 lead: pi.lead,
             },
+            lqg: Lqg::default(),
+            mpc: Mpc::default(),
             estimator: EstimatorConfig::default(),
             limits: Limits::default(),
         }
@@ -197,6 +211,8 @@ impl ControllerFile {
             "at least half a sample of hold (2.5 for a 2 ms camera path)",
         )?;
         self.pi_config().validate()?;
+        self.lqg.validate()?;
+        self.mpc.validate()?;
         self.limits.validate()
     }
 
@@ -215,6 +231,15 @@ impl ControllerFile {
         pi
     }
 
+    /// The control law of the file.
+    pub fn controller_config(&self) -> ControllerConfig {
+        match self.controller {
+            ControllerKind::Pi | ControllerKind::Lead => ControllerConfig::Pi(self.pi_config()),
+            ControllerKind::Lqg => ControllerConfig::Lqg(self.lqg),
+            ControllerKind::Mpc => ControllerConfig::Mpc(self.mpc, self.pi_config()),
+        }
+    }
+
     /// The loop for a plant: everything that [`crate::Controller::new`] needs.
     ///
     /// # Errors
@@ -230,7 +255,7 @@ impl ControllerFile {
         let config = LoopConfig {
             model,
             estimator: self.estimator,
-            controller: ControllerConfig::Pi(self.pi_config()),
+            controller: self.controller_config(),
             limits: self.limits,
         };
         crate::control_loop::ControlLoop::new(config).map_err(|error| ConfigError::Build {

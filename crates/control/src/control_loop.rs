@@ -2,8 +2,12 @@
 
 use crate::error::BuildError;
 use crate::estimator::{Estimate, Estimator, EstimatorConfig, Fix};
+use crate::feedback::{DEVIATION, Feedback, Lqg, deviation};
+use crate::feedforward::{FeedForward, FeedForwardState};
 use crate::limits::Limits;
+use crate::linear::LinearLaw;
 use crate::loop_model::LoopModel;
+use crate::mpc::{HORIZON, Mpc, MpcWorkspace};
 use crate::pi::{Pi, PiState, PiStep};
 use crate::state::{LoopState, STATE_LEN};
 
@@ -118,6 +122,38 @@ pub struct LoopOutput {
 pub enum ControllerConfig {
     /// PI, with or without lead.
     Pi(Pi),
+    /// State feedback on the estimate, with feed-forward of the previewed reference.
+    Lqg(Lqg),
+    /// Model predictive control under the limits, with preview; PI as the last fallback.
+    Mpc(Mpc, Pi),
+}
+
+impl ControllerConfig {
+    fn pi(&self) -> Pi {
+        match self {
+            Self::Pi(pi) | Self::Mpc(_, pi) => *pi,
+            Self::Lqg(_) => Pi::new(0.0, 0.0),
+        }
+    }
+
+    /// The feedback part without limits.
+    ///
+    /// # Errors
+    /// [`BuildError`] naming the parameter, or a Riccati equation without solution.
+    pub fn linear(
+        &self,
+        estimator: &EstimatorConfig,
+        model: &LoopModel,
+    ) -> Result<LinearLaw, BuildError> {
+        match self {
+            Self::Pi(pi) => Ok(LinearLaw::Pi {
+                pi: *pi,
+                sample_time_s: model.sample_time_s,
+            }),
+            Self::Lqg(lqg) => lqg.feedback(model)?.linear(estimator, model),
+            Self::Mpc(mpc, _) => mpc.feedback(model)?.linear(estimator, model),
+        }
+    }
 }
 
 /// Everything that a loop is built from.
@@ -135,7 +171,41 @@ pub struct LoopConfig {
 
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Law {
-    Pi(PiStep),
+    Pi,
+    State(Feedback),
+}
+
+/// A tick between estimate and limits: what a control law decides on.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Prepared {
+    pub estimate: Estimate,
+    fix_ok: bool,
+    reference_ok: bool,
+    pub reference_um: f64,
+    bead_um: f64,
+    /// The law is to decide; otherwise the mode does.
+    pub controls: bool,
+    pi: PiState,
+    proportional_um: f64,
+    /// Deviation from the model on the reference.
+    pub deviation: [f64; DEVIATION],
+    /// Feed-forward displacement from neutral, um.
+    pub feed_forward_um: f64,
+    /// Model on the reference, before and after this tick's feed-forward.
+    pub on_reference: FeedForwardState,
+    next_on_reference: FeedForwardState,
+}
+
+impl Prepared {
+    /// Replaces the feed-forward by one within limits, and the model on the reference by one that follows it.
+    pub(crate) fn set_feed_forward(&mut self, displacement_um: f64, next: FeedForwardState) {
+        self.feed_forward_um = displacement_um;
+        self.next_on_reference = next;
+    }
+
+    fn hold(&self) -> bool {
+        self.estimate.coasting || self.estimate.stuck
+    }
 }
 
 /// A loop without workspace: estimator, controller and limits. Immutable; the state is apart and `Copy`.
@@ -160,6 +230,8 @@ pub struct ControlLoop {
     config: LoopConfig,
     estimator: Estimator,
     law: Law,
+    pi: PiStep,
+    pub(crate) forward: FeedForward,
 }
 
 /// Largest position that counts as one, um.
@@ -173,16 +245,21 @@ impl ControlLoop {
     pub fn new(config: LoopConfig) -> Result<Self, BuildError> {
         config.limits.validate()?;
         let estimator = Estimator::new(config.estimator, config.model)?;
+        let pi = config.controller.pi();
+        pi.validate()?;
         let law = match config.controller {
-            ControllerConfig::Pi(pi) => {
-                pi.validate()?;
-                Law::Pi(PiStep::new(pi, config.model.sample_time_s))
-            }
+            ControllerConfig::Pi(_) => Law::Pi,
+            ControllerConfig::Lqg(lqg) => Law::State(lqg.feedback(&config.model)?),
+            ControllerConfig::Mpc(mpc, _) => Law::State(mpc.feedback(&config.model)?),
         };
+        let ts = config.model.sample_time_s;
+        let forward = FeedForward::new(&config.model);
         Ok(Self {
             config,
             estimator,
             law,
+            pi: PiStep::new(pi, ts),
+            forward,
         })
     }
 
@@ -210,17 +287,18 @@ impl ControlLoop {
                 integral_um: command,
                 lead_um: 0.0,
             },
+            feed_forward: FeedForwardState::default(),
         }
     }
 
     /// The state as 16 numbers, for the records.
     pub fn pack(&self, state: &LoopState) -> [f64; STATE_LEN] {
-        state.pack(&self.config.limits)
+        state.pack(&self.config.limits, self.law != Law::Pi)
     }
 
     /// The state of [`ControlLoop::pack`].
     pub fn unpack(&self, packed: &[f64; STATE_LEN]) -> LoopState {
-        LoopState::unpack(packed, &self.config.limits)
+        LoopState::unpack(packed, &self.config.limits, self.law != Law::Pi)
     }
 
     fn fix(&self, measurement: &Measurement) -> Option<Fix> {
@@ -242,15 +320,32 @@ impl ControlLoop {
         })
     }
 
-    /// One tick.
+    /// One tick. Under [`ControllerConfig::Mpc`] this is its law without constraints: the constrained one needs the
+    /// workspace of a [`Controller`].
     pub fn step(&self, state: &mut LoopState, input: &LoopInput) -> LoopOutput {
+        let prepared = self.prepare(state, input);
+        let wish_um = match &self.law {
+            Law::Pi => self.pi_wish(&prepared),
+            Law::State(feedback) => {
+                prepared.estimate.neutral_um
+                    + prepared.feed_forward_um
+                    + feedback.correction(&prepared.deviation)
+            }
+        };
+        self.finish(state, input, &prepared, wish_um, SolverReport::default())
+    }
+
+    /// Estimate, reference and feed-forward of a tick.
+    pub(crate) fn prepare(&self, state: &mut LoopState, input: &LoopInput) -> Prepared {
         let fix = input.measurement.as_ref().and_then(|m| self.fix(m));
-        let estimate = self.estimator.step(&mut state.estimator, fix);
+        let mut estimate = self.estimator.step(&mut state.estimator, fix);
         let Limits {
             low_um, high_um, ..
         } = self.config.limits;
         state.estimator.neutral_um = state.estimator.neutral_um.clamp(low_um, high_um);
-        // What the controller sees: the fix itself where there is one, else what the model says it would be.
+        estimate.neutral_um = state.estimator.neutral_um;
+        estimate.now.n = state.estimator.neutral_um;
+        // What a PI controller sees: the fix itself where there is one, else what the model says it would be.
         let bead_um = match fix {
             Some(fix) if estimate.fresh => fix.position_um,
             _ => estimate.predicted_measurement_um,
@@ -262,44 +357,109 @@ impl ControlLoop {
         } else {
             bead_um
         };
-
         let mut pi = state.pi;
-        let Law::Pi(law) = &self.law;
-        let proportional_um = law.proportional(&mut pi, reference_um, bead_um);
+        let proportional_um = self.pi.proportional(&mut pi, reference_um, bead_um);
+        let mut on_reference = state.feed_forward;
+        if controls {
+            self.forward.meet(&mut on_reference, reference_um);
+        } else {
+            on_reference = FeedForward::rest(reference_um);
+        }
+        if !on_reference.is_sound() {
+            on_reference = FeedForward::rest(reference_um);
+        }
+        let mut next_on_reference = on_reference;
+        let next_um = self.preview(input, reference_um, 0);
+        let feed_forward_um = self.forward.step(&mut next_on_reference, next_um);
+        Prepared {
+            estimate,
+            fix_ok: fix.is_some(),
+            reference_ok,
+            reference_um,
+            bead_um,
+            controls,
+            pi,
+            proportional_um,
+            deviation: deviation(&estimate.now, &on_reference),
+            feed_forward_um,
+            on_reference,
+            next_on_reference,
+        }
+    }
+
+    /// The reference `ahead + 1` ticks from now; the last one known is held.
+    pub(crate) fn preview(&self, input: &LoopInput, reference_um: f64, ahead: usize) -> f64 {
+        let known = input
+            .preview_um
+            .get(ahead)
+            .or_else(|| input.preview_um.last())
+            .copied()
+            .unwrap_or(reference_um);
+        if known.abs() < FAR_UM {
+            known
+        } else {
+            reference_um
+        }
+    }
+
+    /// What PI asks for, um.
+    pub(crate) fn pi_wish(&self, p: &Prepared) -> f64 {
+        p.proportional_um
+            + self
+                .pi
+                .integral(&p.pi, p.reference_um - p.bead_um, p.hold())
+    }
+
+    /// Mode, limits, anti-windup and the history of commands.
+    pub(crate) fn finish(
+        &self,
+        state: &mut LoopState,
+        input: &LoopInput,
+        prepared: &Prepared,
+        wish_um: f64,
+        solver: SolverReport,
+    ) -> LoopOutput {
         let requested_um = match input.mode {
             Mode::Park => self.config.limits.park_um,
             Mode::Direct(displacement_um) => displacement_um,
-            _ if controls => proportional_um + pi.integral_um,
-            _ => estimate.neutral_um,
+            _ if prepared.controls => wish_um,
+            _ => prepared.estimate.neutral_um,
         };
-        let excitation_um = if controls { input.excitation_um } else { 0.0 };
-        let output = self.limit(
-            state,
-            input,
-            &estimate,
-            fix.is_some(),
-            reference_ok,
-            requested_um + excitation_um,
-        );
-        if controls {
-            let hold = estimate.coasting || estimate.stuck;
-            law.integrate(
+        let excitation_um = if prepared.controls {
+            input.excitation_um
+        } else {
+            0.0
+        };
+        let output = self.limit(state, input, prepared, requested_um + excitation_um, solver);
+        let mut pi = prepared.pi;
+        if prepared.controls && self.law == Law::Pi {
+            self.pi.integrate(
                 &mut pi,
-                reference_um - bead_um,
+                prepared.reference_um - prepared.bead_um,
                 requested_um,
                 // The excitation is no saturation: the integrator must not be pulled along with it.
                 output.command_um - excitation_um,
-                hold,
+                prepared.hold(),
             );
         } else {
-            law.track(&mut pi, proportional_um, output.command_um);
+            self.pi
+                .track(&mut pi, prepared.proportional_um, output.command_um);
         }
-        if pi.integral_um.abs() < FAR_UM && pi.lead_um.abs() < FAR_UM {
-            state.pi = pi;
+        let sound = pi.integral_um.abs() < FAR_UM && pi.lead_um.abs() < FAR_UM;
+        state.pi = if sound {
+            pi
         } else {
-            state.pi = PiState {
+            PiState {
                 integral_um: output.command_um,
                 lead_um: 0.0,
+            }
+        };
+        if self.law != Law::Pi {
+            state.pi.lead_um = 0.0;
+            state.feed_forward = if prepared.controls {
+                prepared.next_on_reference
+            } else {
+                FeedForward::rest(prepared.reference_um)
             };
         }
         self.estimator.push(&mut state.estimator, output.command_um);
@@ -311,11 +471,11 @@ impl ControlLoop {
         &self,
         state: &LoopState,
         input: &LoopInput,
-        estimate: &Estimate,
-        fix_ok: bool,
-        reference_ok: bool,
+        prepared: &Prepared,
         requested_um: f64,
+        solver: SolverReport,
     ) -> LoopOutput {
+        let estimate = &prepared.estimate;
         let mut wanted_um = requested_um;
         if estimate.stuck && input.mode == Mode::Run {
             let most = self.estimator.stuck_authority_um();
@@ -326,6 +486,7 @@ impl ControlLoop {
             state.previous_command_um(),
             self.config.model.sample_time_s,
         );
+        let refused = input.measurement.is_some() && !prepared.fix_ok;
         LoopOutput {
             command_um: limited.command_um,
             requested_um,
@@ -336,14 +497,12 @@ impl ControlLoop {
             flags: LoopFlags {
                 range_limited: limited.range,
                 slew_limited: limited.slew,
-                not_finite: limited.not_finite
-                    || !reference_ok
-                    || (input.measurement.is_some() && !fix_ok),
+                not_finite: limited.not_finite || !prepared.reference_ok || refused,
                 coasting: estimate.coasting,
                 gated: estimate.gated,
                 stuck: estimate.stuck,
             },
-            solver: SolverReport::default(),
+            solver,
         }
     }
 }
@@ -352,6 +511,7 @@ impl ControlLoop {
 #[derive(Debug)]
 pub struct Controller {
     control: ControlLoop,
+    mpc: Option<Box<MpcWorkspace>>,
 }
 
 impl Controller {
@@ -360,9 +520,16 @@ impl Controller {
     /// # Errors
     /// [`BuildError`] naming the parameter.
     pub fn new(config: LoopConfig) -> Result<Self, BuildError> {
-        Ok(Self {
-            control: ControlLoop::new(config)?,
-        })
+        let control = ControlLoop::new(config)?;
+        let mpc = match config.controller {
+            ControllerConfig::Mpc(mpc, _) => Some(Box::new(MpcWorkspace::new(
+                &mpc,
+                &config.model,
+                &config.limits,
+            )?)),
+            _ => None,
+        };
+        Ok(Self { control, mpc })
     }
 
     /// The loop.
@@ -377,11 +544,30 @@ impl Controller {
 
     /// References of the coming ticks that a step can use.
     pub fn preview_len(&self) -> usize {
-        0
+        match self.control.config.controller {
+            ControllerConfig::Pi(_) => 0,
+            ControllerConfig::Lqg(_) => 1,
+            ControllerConfig::Mpc(..) => HORIZON,
+        }
     }
 
     /// One tick.
     pub fn step(&mut self, state: &mut LoopState, input: &LoopInput) -> LoopOutput {
-        self.control.step(state, input)
+        let Some(mpc) = &mut self.mpc else {
+            return self.control.step(state, input);
+        };
+        let mut prepared = self.control.prepare(state, input);
+        if !prepared.controls || prepared.estimate.stuck {
+            mpc.forget();
+            let wish_um = self.control.pi_wish(&prepared);
+            return self
+                .control
+                .finish(state, input, &prepared, wish_um, SolverReport::default());
+        }
+        let previous_um = state.previous_command_um();
+        let (plan_um, report) = mpc.plan(&self.control, input, &mut prepared, previous_um);
+        let wish_um = plan_um.unwrap_or_else(|| self.control.pi_wish(&prepared));
+        self.control
+            .finish(state, input, &prepared, wish_um, report)
     }
 }

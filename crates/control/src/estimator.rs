@@ -18,6 +18,9 @@ pub const HISTORY: usize = 6;
 /// Uncertainty of neutral once the filter has been wrong for many fixes, um: half the range of the PZT.
 const LOST_NEUTRAL_UM: f64 = 20.0;
 
+/// Evidence lies on a grid of this many steps per unit, so that it packs into the recorded state beside the flags.
+pub(crate) const EVIDENCE_GRID: f64 = 65_536.0;
+
 /// Weight of a fix in the average position of a stuck bead.
 const STUCK_AVERAGE: f64 = 0.05;
 
@@ -81,10 +84,6 @@ pub struct EstimatorState {
     pub history_um: [f64; HISTORY],
     /// Evidence that the bead is stuck, natural logarithm of the odds, 0 or more.
     pub stuck_evidence: f64,
-    /// Exponentially forgotten sum of predicted motion squared, um^2 (gain estimate).
-    pub excitation_um2: f64,
-    /// Exponentially forgotten sum of predicted times observed motion, um^2 (gain estimate).
-    pub response_um2: f64,
     /// Ticks by which the filter's time lies behind the nominal delay.
     pub lag: u8,
     /// Refused measurements in a row.
@@ -298,8 +297,6 @@ impl Estimator {
             modes: [0.0; MODES],
             history_um: [command_um; HISTORY],
             stuck_evidence: 0.0,
-            excitation_um2: 0.0,
-            response_um2: 0.0,
             lag: 0,
             gated: 0,
             seen: false,
@@ -534,8 +531,29 @@ impl Estimator {
         let odds = (moving * moving - still * still - 0.4 * motion_um * motion_um) / noise;
         // One fix decides little: an outlier or a jolt must not make a verdict.
         let odds = odds.clamp(-2.0, if moved { 0.0 } else { 2.0 });
-        state.stuck_evidence = (0.98 * state.stuck_evidence + odds).clamp(0.0, 25.0);
+        let evidence = (0.98 * state.stuck_evidence + odds).clamp(0.0, 25.0);
+        state.stuck_evidence = (evidence * EVIDENCE_GRID).round() / EVIDENCE_GRID;
         state.stuck = state.stuck_evidence > if state.stuck { 3.0 } else { 10.0 };
+    }
+
+    /// Whole ticks of delay, rounded up.
+    pub(crate) fn delay_ticks(&self) -> usize {
+        self.delay_ticks
+    }
+
+    /// The moment one tick later.
+    pub(crate) fn tick_moment(&self, m: &Moment, command_um: f64) -> Moment {
+        self.tick.advance(m, command_um)
+    }
+
+    /// The position that a measurement made at the filter's time `m` shows, um; `command_um` is in force after `m`.
+    pub(crate) fn measured_moment(&self, m: &Moment, command_um: f64) -> f64 {
+        self.position(&self.at_measurement(m, command_um, false))
+    }
+
+    /// Change of a measurement per change of neutral, um/um.
+    pub(crate) fn neutral_sensitivity(&self) -> f64 {
+        -self.part.gain
     }
 
     /// Hands the command of this tick to the history.

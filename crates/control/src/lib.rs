@@ -10,16 +10,21 @@
 //! that just before `u_k` takes effect. The measurement that arrives at tick `k` is of the position `delay` earlier.
 #![forbid(unsafe_code)]
 
+pub mod active_set;
 mod config;
 mod control_loop;
 pub mod design;
 mod error;
 mod estimator;
+mod feedback;
+mod feedforward;
 mod limits;
 mod linear;
 mod loop_model;
+mod mpc;
 mod pi;
 mod reference;
+pub mod riccati;
 mod simulation;
 mod state;
 
@@ -30,9 +35,12 @@ pub use control_loop::{
 };
 pub use error::{BuildError, Parameter};
 pub use estimator::{Estimator, EstimatorConfig, EstimatorState, HISTORY};
+pub use feedback::{Feedback, Lqg};
+pub use feedforward::FeedForwardState;
 pub use limits::{Limited, Limits};
 pub use linear::LinearLaw;
 pub use loop_model::{LoopMode, LoopModel, MODES};
+pub use mpc::{HORIZON, Mpc, SolverKind};
 pub use pi::{Lead, Pi, PiState};
 pub use reference::{Points, Profile, Reference, Shape, fill_preview};
 pub use simulation::{RigConfig, SimulatedRig};

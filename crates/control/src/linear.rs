@@ -38,7 +38,7 @@ impl LinearLaw {
                     let w = z.inv();
                     (w * b1 + b0) / (w * a1 + 1.0)
                 });
-                lead * pi.kp + pi.ki_per_s * sample_time_s / (z - 1.0)
+                lead * pi.kp + (z + 1.0) / (z - 1.0) * (0.5 * pi.ki_per_s * sample_time_s)
             }
             Self::StateSpace { a, b, c, d } => {
                 let n = a.nrows();
@@ -74,7 +74,7 @@ impl LinearLaw {
                         DMatrix::from_element(1, 1, keep),
                         DVector::from_element(1, integral),
                         RowDVector::from_element(1, 1.0),
-                        pi.kp,
+                        pi.kp + 0.5 * integral,
                     ),
                     Some(lead) => {
                         let (b0, b1, a1) = lead.coefficients(*sample_time_s);
@@ -82,7 +82,7 @@ impl LinearLaw {
                             DMatrix::from_row_slice(2, 2, &[keep, 0.0, 0.0, -a1]),
                             DVector::from_vec(vec![integral, b1 - a1 * b0]),
                             RowDVector::from_vec(vec![1.0, pi.kp]),
-                            pi.kp * b0,
+                            pi.kp * b0 + 0.5 * integral,
                         )
                     }
                 }

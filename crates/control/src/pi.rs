@@ -1,6 +1,7 @@
 //! PI control with set-point weight, back-calculation anti-windup and an optional lead on the proportional path.
 //!
-//! `u = I + kp Lead(b r - y)`, `I += ki Ts (r - y) + (u_limited - u_requested) Ts / Tt`.
+//! `u = I + kp Lead(b r - y) + ki Ts/2 (r - y)`, `I += ki Ts (r - y) + (u_limited - u_requested) Ts / Tt`: the integral by
+//! Tustin's rule, whose phase is that of the continuous one.
 //! Gains: `kp` in um of PZT per um of bead, `ki` in 1/s (um of PZT per um of bead and second).
 
 use crate::error::{BuildError, check};
@@ -151,7 +152,17 @@ impl PiStep {
         self.config.kp * shaped
     }
 
-    /// Integrates and back-calculates, after the limits have acted. `hold` stops the integration (bead lost or stuck).
+    /// The integral part of this tick's output, um of PZT. `hold` stops the integration (bead lost or stuck).
+    pub(crate) fn integral(&self, state: &PiState, error_um: f64, hold: bool) -> f64 {
+        state.integral_um
+            + if hold {
+                0.0
+            } else {
+                0.5 * self.integral_per_tick * error_um
+            }
+    }
+
+    /// Integrates and back-calculates, after the limits have acted.
     pub(crate) fn integrate(
         &self,
         state: &mut PiState,

@@ -1,12 +1,16 @@
 //! The state of a loop, and its exact packing into 16 numbers for the records.
 
-use crate::estimator::{EstimatorState, HISTORY};
+use crate::estimator::{EVIDENCE_GRID, EstimatorState, HISTORY};
+use crate::feedforward::FeedForwardState;
 use crate::limits::{GRID_STEPS, Limits};
 use crate::loop_model::MODES;
 use crate::pi::PiState;
 
 /// Numbers in a packed state.
 pub const STATE_LEN: usize = 16;
+
+/// Bits of the packed flags below the evidence.
+const FLAG_BITS: f64 = 262_144.0;
 
 /// Estimator and controller state of one loop.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -15,6 +19,8 @@ pub struct LoopState {
     pub estimator: EstimatorState,
     /// PI controller (unused by the others, but kept tracking so that a fallback is bumpless).
     pub pi: PiState,
+    /// Model on the reference (state feedback only).
+    pub feed_forward: FeedForwardState,
 }
 
 impl LoopState {
@@ -23,9 +29,10 @@ impl LoopState {
         self.estimator.history_um[0]
     }
 
-    /// The state as 16 numbers, exactly. Past commands lie on the grid of `limits`, so that two of them are the
-    /// digits of one integer.
-    pub fn pack(&self, limits: &Limits) -> [f64; STATE_LEN] {
+    /// The state as 16 numbers, exactly. Past commands lie on the grid of `limits`, so that two of them are the digits
+    /// of one integer; evidence and flags are another. One number is the lead's memory under PI and the feed-forward's
+    /// last displacement under state feedback, which needs no lead.
+    pub(crate) fn pack(&self, limits: &Limits, state_feedback: bool) -> [f64; STATE_LEN] {
         let e = &self.estimator;
         let flags = u32::from(e.lag)
             | u32::from(e.gated) << 8
@@ -37,11 +44,14 @@ impl LoopState {
         out[2..5].copy_from_slice(&e.covariance_um2);
         out[5..5 + MODES].copy_from_slice(&e.modes);
         out[7] = self.pi.integral_um;
-        out[8] = self.pi.lead_um;
-        out[9] = e.excitation_um2;
-        out[10] = e.response_um2;
-        out[11] = e.stuck_evidence;
-        out[12] = f64::from(flags);
+        out[8] = if state_feedback {
+            self.feed_forward.last_um
+        } else {
+            self.pi.lead_um
+        };
+        out[9] = self.feed_forward.integrator_um;
+        out[10..10 + MODES].copy_from_slice(&self.feed_forward.modes);
+        out[12] = f64::from(flags) + FLAG_BITS * (e.stuck_evidence * EVIDENCE_GRID);
         for (slot, pair) in out[13..].iter_mut().zip(e.history_um.chunks_exact(2)) {
             *slot = limits.index(pair[0]) * (GRID_STEPS + 1.0) + limits.index(pair[1]);
         }
@@ -49,8 +59,9 @@ impl LoopState {
     }
 
     /// The state of [`LoopState::pack`].
-    pub fn unpack(packed: &[f64; STATE_LEN], limits: &Limits) -> Self {
-        let flags = packed[12] as u32;
+    pub(crate) fn unpack(packed: &[f64; STATE_LEN], limits: &Limits, state_feedback: bool) -> Self {
+        let evidence = (packed[12] / FLAG_BITS).floor();
+        let flags = (packed[12] - evidence * FLAG_BITS) as u32;
         let mut history_um = [0.0; HISTORY];
         for (pair, slot) in history_um.chunks_exact_mut(2).zip(&packed[13..]) {
             let high = (slot / (GRID_STEPS + 1.0)).floor();
@@ -64,9 +75,7 @@ impl LoopState {
                 covariance_um2: [packed[2], packed[3], packed[4]],
                 modes: [packed[5], packed[6]],
                 history_um,
-                stuck_evidence: packed[11],
-                excitation_um2: packed[9],
-                response_um2: packed[10],
+                stuck_evidence: evidence / EVIDENCE_GRID,
                 lag: flags as u8,
                 gated: (flags >> 8) as u8,
                 seen: flags & 1 << 16 != 0,
@@ -74,7 +83,12 @@ impl LoopState {
             },
             pi: PiState {
                 integral_um: packed[7],
-                lead_um: packed[8],
+                lead_um: if state_feedback { 0.0 } else { packed[8] },
+            },
+            feed_forward: FeedForwardState {
+                integrator_um: packed[9],
+                modes: [packed[10], packed[11]],
+                last_um: if state_feedback { packed[8] } else { 0.0 },
             },
         }
     }

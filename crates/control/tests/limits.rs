@@ -43,6 +43,8 @@ prop_compose! {
         span in 0.001..100.0_f64,
         slew in 0.01..1e6_f64,
         park in 0.0..=1.0_f64,
+        law in 0..3,
+        effort in 1e-3..100.0_f64,
     ) -> LoopConfig {
         let pi = Pi {
             setpoint_weight: weight,
@@ -50,10 +52,15 @@ prop_compose! {
             tracking_time_s: 0.05,
             ..Pi::new(kp, ki)
         };
+        let controller = match law {
+            0 => ControllerConfig::Pi(pi),
+            1 => ControllerConfig::Lqg(Lqg { effort }),
+            _ => ControllerConfig::Mpc(Mpc { effort, solver: SolverKind::ActiveSet, ..Mpc::default() }, pi),
+        };
         LoopConfig {
             model: LoopModel { gain_per_s: gain, ..LoopModel::eq6(delay_s) },
             estimator: EstimatorConfig::default(),
-            controller: ControllerConfig::Pi(pi),
+            controller,
             limits: Limits {
                 low_um: low,
                 high_um: low + span,

@@ -169,7 +169,7 @@ fn a_lost_bead_is_coasted_and_neither_the_integral_nor_neutral_winds_up() {
         &mut rig,
         6000,
         |k, fix, _| LoopInput {
-            measurement: (k < 3000 || k >= 5000).then_some(fix),
+            measurement: (!(3000..5000).contains(&k)).then_some(fix),
             ..to(5.0, fix)
         },
         |k, rig, out| {

@@ -7,7 +7,9 @@ use cellpos_control::design::{
     DesignLimits, DesignPlant, DesignReport, DesignRequest, DesignWarning, PiSearch, Requested,
     default_lead, design,
 };
-use cellpos_control::{ConfigError, ControllerFile, Lead, Limits, Pi};
+use cellpos_control::{
+    ConfigError, ControllerConfig, ControllerFile, ControllerKind, Lead, Limits, Lqg, Mpc, Pi,
+};
 use cellpos_plant::Model;
 use cellpos_units::{Hertz, Seconds};
 use std::path::PathBuf;
@@ -19,6 +21,10 @@ enum Kind {
     Pi,
     /// PI with lead.
     Lead,
+    /// State feedback on the estimate (a Smith predictor with drift state).
+    Lqg,
+    /// Model predictive control; margins are those of its law without active constraints.
+    Mpc,
 }
 
 /// Arguments of `cellpos design`.
@@ -119,6 +125,12 @@ pub fn run(args: Args) -> CommandResult {
     let limits = limits(&args)?;
     let lead = lead(&args, plant.loop_delay_s())?;
     let controller = match (args.kp, args.ki) {
+        _ if args.controller == Kind::Lqg => {
+            Requested::Given(ControllerConfig::Lqg(Lqg::default()))
+        }
+        _ if args.controller == Kind::Mpc => {
+            Requested::Given(ControllerConfig::Mpc(Mpc::default(), Pi::new(0.33, 9.6)))
+        }
         (Some(kp), Some(ki)) => Requested::Pi(Pi {
             lead,
             ..Pi::new(kp, ki)
@@ -205,8 +217,8 @@ fn lead(args: &Args, loop_delay_s: f64) -> Result<Option<Lead>, Failure> {
             pole_hz: pole.value(),
         })),
         (Kind::Lead, ..) => Ok(Some(default_lead(loop_delay_s))),
-        (Kind::Pi, None, None) => Ok(None),
-        (Kind::Pi, ..) => Err(Failure::bad_input(
+        (_, None, None) => Ok(None),
+        (_, ..) => Err(Failure::bad_input(
             "--lead-zero and --lead-pole belong to --controller lead",
             "write --controller lead, or leave them out",
         )),
@@ -214,8 +226,20 @@ fn lead(args: &Args, loop_delay_s: f64) -> Result<Option<Lead>, Failure> {
 }
 
 fn controller_file(request: &DesignRequest, report: &DesignReport) -> ControllerFile {
-    let cellpos_control::ControllerConfig::Pi(pi) = report.controller;
-    let mut file = ControllerFile::from_pi(pi, request.plant.loop_delay_s());
+    let loop_delay_s = request.plant.loop_delay_s();
+    let mut file = match report.controller {
+        ControllerConfig::Pi(pi) => ControllerFile::from_pi(pi, loop_delay_s),
+        ControllerConfig::Lqg(lqg) => ControllerFile {
+            controller: ControllerKind::Lqg,
+            lqg,
+            ..ControllerFile::from_pi(Pi::new(0.33, 9.6), loop_delay_s)
+        },
+        ControllerConfig::Mpc(mpc, fallback) => ControllerFile {
+            controller: ControllerKind::Mpc,
+            mpc,
+            ..ControllerFile::from_pi(fallback, loop_delay_s)
+        },
+    };
     file.sample_time_ms = request.plant.sample_time_s * 1e3;
     if let Some(config) = &report.config {
         file.estimator = config.estimator;

@@ -147,6 +147,8 @@ pub struct BrokenLimit {
 pub enum Requested {
     /// PI (with lead, if set) with these gains.
     Pi(Pi),
+    /// LQG or MPC with these weights.
+    Given(ControllerConfig),
     /// PI gains by [`search_pi`].
     SearchPi(PiSearch),
 }
@@ -204,21 +206,36 @@ pub fn design(request: &DesignRequest) -> Result<DesignReport, DesignError> {
             hold_ms,
         });
     }
-    let mut pi = match request.controller {
-        Requested::Pi(pi) => pi,
-        Requested::SearchPi(search) => search_pi(plant, search)?.ok_or(DesignError::NoGains {
-            max_ms: search.max_ms,
-            max_mt: search.max_mt,
-        })?,
+    let pi = match request.controller {
+        Requested::Pi(pi) => Some(pi),
+        Requested::SearchPi(search) => {
+            Some(search_pi(plant, search)?.ok_or(DesignError::NoGains {
+                max_ms: search.max_ms,
+                max_mt: search.max_mt,
+            })?)
+        }
+        Requested::Given(_) => None,
     };
-    if let Some(b) = request.setpoint_weight {
-        pi.setpoint_weight = b;
-    }
-    pi.validate()?;
-    let controller = ControllerConfig::Pi(pi);
-    let law = LinearLaw::Pi {
-        pi,
-        sample_time_s: plant.sample_time_s,
+    let controller = match (pi, request.controller) {
+        (Some(mut pi), _) => {
+            pi.setpoint_weight = request.setpoint_weight.unwrap_or(pi.setpoint_weight);
+            pi.validate()?;
+            ControllerConfig::Pi(pi)
+        }
+        (None, Requested::Given(given)) => given,
+        (None, _) => {
+            return Err(DesignError::NoGains {
+                max_ms: f64::NAN,
+                max_mt: f64::NAN,
+            });
+        }
+    };
+    let law = match controller {
+        ControllerConfig::Pi(pi) => LinearLaw::Pi {
+            pi,
+            sample_time_s: plant.sample_time_s,
+        },
+        other => other.linear(&estimator_config(plant), &plant.loop_model()?)?,
     };
     let mut warnings = plant.warnings.clone();
     let config = loop_config(plant, controller, request.command_limits, &mut warnings);
@@ -269,11 +286,7 @@ fn loop_config(
     warnings: &mut Vec<DesignWarning>,
 ) -> Option<LoopConfig> {
     let built = plant.loop_model().and_then(|model| {
-        let estimator = EstimatorConfig {
-            diffusion_um2_per_s: positive_or(plant.diffusion_um2_per_s, 0.33),
-            fix_noise_um: positive_or(plant.fix_noise_um, 0.020),
-            ..EstimatorConfig::default()
-        };
+        let estimator = estimator_config(plant);
         let config = LoopConfig {
             model,
             estimator,
@@ -285,6 +298,15 @@ fn loop_config(
     built
         .map_err(|error| warnings.push(DesignWarning::NoLoop(error)))
         .ok()
+}
+
+/// The estimator for a plant's noise.
+pub fn estimator_config(plant: &DesignPlant) -> EstimatorConfig {
+    EstimatorConfig {
+        diffusion_um2_per_s: positive_or(plant.diffusion_um2_per_s, 0.33),
+        fix_noise_um: positive_or(plant.fix_noise_um, 0.020),
+        ..EstimatorConfig::default()
+    }
 }
 
 fn positive_or(value: f64, otherwise: f64) -> f64 {

@@ -76,13 +76,17 @@ fn controller(report: &DesignReport) -> Value {
             "tracking_time_ms": pi.tracking_time_s * 1e3,
             "lead": pi.lead.map(|l| json!({ "zero_hz": l.zero_hz, "pole_hz": l.pole_hz })),
         }),
+        ControllerConfig::Lqg(lqg) => json!({ "kind": "lqg", "effort": lqg.effort }),
+        ControllerConfig::Mpc(mpc, _) => json!({
+            "kind": "mpc", "effort": mpc.effort, "move_effort": mpc.move_effort, "solver": mpc.solver,
+        }),
     }
 }
 
 fn criterion(request: &DesignRequest) -> Option<String> {
     use cellpos_control::design::Requested;
     match request.controller {
-        Requested::Pi(_) => None,
+        Requested::Pi(_) | Requested::Given(_) => None,
         Requested::SearchPi(s) => Some(format!(
             "largest integral gain (fastest rejection of drift) with Ms <= {} and Mt <= {}",
             s.max_ms, s.max_mt
@@ -134,6 +138,16 @@ pub fn table(model: &str, request: &DesignRequest, report: &DesignReport) -> Str
                     lead.zero_hz, lead.pole_hz
                 );
             }
+        }
+        ControllerConfig::Lqg(lqg) => {
+            let _ = writeln!(out, "LQG: effort {}", lqg.effort);
+        }
+        ControllerConfig::Mpc(mpc, _) => {
+            let _ = writeln!(
+                out,
+                "MPC without active constraints: effort {}, move effort {}",
+                mpc.effort, mpc.move_effort
+            );
         }
     }
     if let Some(criterion) = criterion(request) {

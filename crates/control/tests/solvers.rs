@@ -1,0 +1,223 @@
+//! The active-set solver against clarabel on random condensed problems, and against the optimality conditions.
+
+use cellpos_control::active_set::{QpEnd, QpMatrices, QpVectors, ROWS, VARS, WorkingSet};
+use cellpos_control::*;
+use clarabel::algebra::CscMatrix;
+use clarabel::solver::{
+    DefaultSettingsBuilder, DefaultSolver, IPSolver, SolverStatus, SupportedConeT,
+};
+use nalgebra::DMatrix;
+use rand_core::{Rng, SeedableRng};
+use rand_xoshiro::Xoshiro256PlusPlus;
+
+fn uniform(random: &mut Xoshiro256PlusPlus, low: f64, high: f64) -> f64 {
+    low + (high - low) * (random.next_u64() >> 11) as f64 / (1u64 << 53) as f64
+}
+
+/// Matrices of the shape of MPC: bounds on each variable, on differences, and on random mixtures.
+fn matrices(random: &mut Xoshiro256PlusPlus) -> QpMatrices {
+    let root = DMatrix::from_fn(VARS, VARS, |i, j| {
+        if j <= i {
+            uniform(random, -1.0, 1.0)
+        } else {
+            0.0
+        }
+    });
+    let hessian = &root * root.transpose() + DMatrix::identity(VARS, VARS) * 0.05;
+    let mut rows = DMatrix::zeros(ROWS, VARS);
+    for b in 0..VARS {
+        rows[(b, b)] = 1.0;
+        rows[(VARS + b, b)] = 1.0;
+        if b > 0 {
+            rows[(VARS + b, b - 1)] = -1.0;
+        }
+        for j in 0..=b {
+            rows[(2 * VARS + b, j)] = uniform(random, 0.0, 0.5);
+        }
+    }
+    QpMatrices::new(hessian, rows).unwrap()
+}
+
+/// Bounds that a random point keeps, some of them exactly, so that rows are often active together and dependent.
+fn vectors(m: &QpMatrices, random: &mut Xoshiro256PlusPlus) -> QpVectors {
+    let mut inside = [0.0; VARS];
+    let step = uniform(random, 0.1, 1.0);
+    for b in 0..VARS {
+        let before = if b > 0 { inside[b - 1] } else { 0.0 };
+        inside[b] = (before + uniform(random, -1.2, 1.2) * step)
+            .clamp(before - step, before + step)
+            .clamp(-1.0, 1.0);
+    }
+    let mut v = QpVectors {
+        linear: [0.0; VARS],
+        low: [-1e6; ROWS],
+        high: [1e6; ROWS],
+    };
+    v.linear
+        .iter_mut()
+        .for_each(|f| *f = uniform(random, -8.0, 8.0));
+    for b in 0..VARS {
+        (v.low[b], v.high[b]) = (-1.0, 1.0);
+        (v.low[VARS + b], v.high[VARS + b]) = (-step, step);
+        if uniform(random, 0.0, 1.0) < 0.3 {
+            let at: f64 = (0..VARS)
+                .map(|j| m.rows[(2 * VARS + b, j)] * inside[j])
+                .sum();
+            v.high[2 * VARS + b] = at + uniform(random, 0.0, 0.2);
+        }
+    }
+    v
+}
+
+fn reference_solver(m: &QpMatrices) -> DefaultSolver<f64> {
+    let dense = |rows: usize, at: &dyn Fn(usize, usize) -> f64, upper: bool| {
+        let (mut starts, mut indices, mut values) = (vec![0], Vec::new(), Vec::new());
+        for j in 0..VARS {
+            for i in (0..rows).filter(|i| !upper || *i <= j) {
+                indices.push(i);
+                values.push(at(i, j));
+            }
+            starts.push(indices.len());
+        }
+        CscMatrix::new(rows, VARS, starts, indices, values)
+    };
+    let p = dense(VARS, &|i, j| m.hessian[(i, j)], true);
+    let a = dense(
+        2 * ROWS,
+        &|i, j| {
+            if i < ROWS {
+                m.rows[(i, j)]
+            } else {
+                -m.rows[(i - ROWS, j)]
+            }
+        },
+        false,
+    );
+    let settings = DefaultSettingsBuilder::default()
+        .verbose(false)
+        .presolve_enable(false)
+        .tol_gap_abs(1e-11)
+        .tol_gap_rel(1e-11)
+        .tol_feas(1e-11)
+        .build()
+        .unwrap();
+    let cones = [SupportedConeT::NonnegativeConeT(2 * ROWS)];
+    DefaultSolver::new(&p, &[0.0; VARS], &a, &[1.0; 2 * ROWS], &cones, settings).unwrap()
+}
+
+#[test]
+fn the_active_set_solver_agrees_with_clarabel_to_1_nm_in_the_first_move() {
+    // 100 000 problems in an optimised build; fewer where they would take minutes.
+    let problems = if cfg!(debug_assertions) {
+        4_000
+    } else {
+        100_000
+    };
+    let mut random = Xoshiro256PlusPlus::seed_from_u64(5);
+    let (mut solved, mut infeasible, mut constrained) = (0, 0, 0);
+    let mut set = WorkingSet::default();
+    let mut m = matrices(&mut random);
+    let mut reference = reference_solver(&m);
+    for k in 0..problems {
+        if k % 500 == 0 {
+            m = matrices(&mut random);
+            reference = reference_solver(&m);
+            set = WorkingSet::default();
+        }
+        let v = vectors(&m, &mut random);
+        // The working set of an unrelated problem is the worst warm start there is.
+        let (end, _) = m.solve(&v, &mut set);
+        let bounds: Vec<f64> = v
+            .high
+            .iter()
+            .map(|h| h.min(50.0))
+            .chain(v.low.iter().map(|l| -l.max(-50.0)))
+            .collect();
+        reference.update_q(&v.linear.to_vec()).unwrap();
+        reference.update_b(&bounds).unwrap();
+        reference.solve();
+        match (end, reference.solution.status) {
+            (QpEnd::Solved(w), SolverStatus::Solved | SolverStatus::AlmostSolved) => {
+                solved += 1;
+                constrained += usize::from(!set.is_empty());
+                let difference = (w[0] - reference.solution.x[0]).abs();
+                assert!(difference < 1e-3, "problem {k}: {difference} um");
+            }
+            (
+                QpEnd::Infeasible,
+                SolverStatus::PrimalInfeasible | SolverStatus::AlmostPrimalInfeasible,
+            ) => infeasible += 1,
+            (end, status) => panic!("problem {k}: {end:?} against {status:?}"),
+        }
+    }
+    assert!(
+        solved > problems * 9 / 10 && constrained > problems / 2,
+        "{solved} {constrained} {infeasible}"
+    );
+}
+
+#[test]
+fn a_problem_without_a_point_within_its_bounds_is_called_infeasible() {
+    let mut random = Xoshiro256PlusPlus::seed_from_u64(1);
+    let m = matrices(&mut random);
+    let mut v = vectors(&m, &mut random);
+    // Two neighbours are held apart further than their slew allows.
+    (v.low[0], v.high[0], v.low[1], v.high[1]) = (0.9, 1.0, -1.0, -0.9);
+    (v.low[VARS + 1], v.high[VARS + 1]) = (-0.5, 0.5);
+    assert_eq!(m.solve(&v, &mut WorkingSet::default()).0, QpEnd::Infeasible);
+}
+
+#[test]
+fn both_solvers_steer_the_same_course_through_active_limits() {
+    let limits = Limits {
+        slew_um_per_s: 1000.0,
+        ..Limits::default()
+    };
+    let run = |solver| {
+        let controller = ControllerConfig::Mpc(
+            Mpc {
+                solver,
+                ..Mpc::default()
+            },
+            Pi::new(0.46, 19.5),
+        );
+        let config = LoopConfig {
+            model: LoopModel::eq6(2e-3),
+            estimator: EstimatorConfig::default(),
+            controller,
+            limits,
+        };
+        let mut controller = Controller::new(config).unwrap();
+        let mut rig = SimulatedRig::new(RigConfig::eq6(3)).unwrap();
+        let mut state = controller.start(20.0, 20.0);
+        let mut active = 0;
+        let course: Vec<f64> = (0..600)
+            .map(|k| {
+                let reference_um = if (k / 40) % 2 == 0 { 0.0 } else { 8.0 };
+                let input = LoopInput {
+                    measurement: Some(rig.measure()),
+                    reference_um,
+                    ..LoopInput::default()
+                };
+                let out = controller.step(&mut state, &input);
+                active += usize::from(out.solver.active > 0);
+                assert_eq!(
+                    out.solver.status,
+                    cellpos_control::SolverStatus::Solved,
+                    "tick {k}"
+                );
+                rig.advance(out.command_um);
+                out.command_um
+            })
+            .collect();
+        assert!(
+            active > 100,
+            "{solver:?}: limits are active in {active} ticks"
+        );
+        course
+    };
+    let (a, b) = (run(SolverKind::Clarabel), run(SolverKind::ActiveSet));
+    for (k, (a, b)) in a.iter().zip(&b).enumerate() {
+        assert!((a - b).abs() < 5e-3, "tick {k}: {a} against {b}");
+    }
+}

@@ -1,0 +1,170 @@
+//! LQG and MPC on the simulated rig: hold at the bound, steps, previewed sines, both solvers, the spread.
+
+use cellpos_control::design::{
+    DesignPlant, bound_rms_um, margins, noise_figures, spread, step_figures,
+};
+use cellpos_control::*;
+
+fn mpc(solver: SolverKind) -> ControllerConfig {
+    ControllerConfig::Mpc(
+        Mpc {
+            solver,
+            ..Mpc::default()
+        },
+        Pi::new(0.46, 19.5),
+    )
+}
+
+fn config(controller: ControllerConfig) -> LoopConfig {
+    LoopConfig {
+        model: LoopModel::eq6(2e-3),
+        estimator: EstimatorConfig::default(),
+        controller,
+        limits: Limits::default(),
+    }
+}
+
+/// RMS of the true error from tick `from` on.
+fn rms_um(config: LoopConfig, rig: RigConfig, profile: &Profile, ticks: u64, from: u64) -> f64 {
+    let mut rig = SimulatedRig::new(rig).unwrap();
+    let mut controller = Controller::new(config).unwrap();
+    let mut state = controller.start(20.0, 20.0);
+    let mut preview = vec![0.0; controller.preview_len()];
+    let (mut sum, mut n) = (0.0, 0.0);
+    for k in 0..ticks {
+        let reference_um = profile.at_um(k as f64 * 1e-3);
+        fill_preview(profile, k, 1e-3, &mut preview);
+        if k >= from {
+            sum += (rig.true_um() - reference_um).powi(2);
+            n += 1.0;
+        }
+        let input = LoopInput {
+            measurement: Some(rig.measure()),
+            reference_um,
+            preview_um: &preview,
+            ..LoopInput::default()
+        };
+        let out = controller.step(&mut state, &input);
+        rig.advance(out.command_um);
+    }
+    f64::sqrt(sum / n)
+}
+
+const HOLD: Profile = Profile::Hold { position_um: 0.0 };
+
+fn sine(amplitude_um: f64, frequency_hz: f64) -> Profile {
+    Profile::Wave {
+        shape: Shape::Sine,
+        centre_um: 0.0,
+        amplitude_um,
+        frequency_hz,
+        fade_s: 0.2,
+    }
+}
+
+#[test]
+fn lqg_and_mpc_hold_within_1_12_times_the_noise_free_minimum_variance_bound() {
+    let bound = bound_rms_um(0.33, 0.0, 2e-3, 1e-3);
+    for controller in [
+        ControllerConfig::Lqg(Lqg::default()),
+        mpc(SolverKind::ActiveSet),
+    ] {
+        let mean_square = (0..5)
+            .map(|seed| {
+                rms_um(
+                    config(controller),
+                    RigConfig::eq6(seed),
+                    &HOLD,
+                    12_000,
+                    2000,
+                )
+                .powi(2)
+            })
+            .sum::<f64>()
+            / 5.0;
+        let rms = mean_square.sqrt();
+        assert!(rms <= 1.12 * bound, "{controller:?}: {rms} against {bound}");
+    }
+}
+
+#[test]
+fn the_linear_equivalent_predicts_the_hold_error_and_is_stable_over_the_spread() {
+    let plant = DesignPlant::eq6(2.5e-3);
+    for controller in [
+        ControllerConfig::Lqg(Lqg::default()),
+        mpc(SolverKind::ActiveSet),
+    ] {
+        let law = controller
+            .linear(&EstimatorConfig::default(), &LoopModel::eq6(2e-3))
+            .unwrap();
+        let m = margins(&plant, &law).unwrap();
+        let predicted = noise_figures(&plant, &law).unwrap().unwrap().rms_um;
+        let simulated = rms_um(config(controller), RigConfig::eq6(1), &HOLD, 42_000, 2000);
+        for row in spread(&plant, &law).unwrap() {
+            assert!(row.margins.stable, "{controller:?}: {row:?}");
+        }
+        assert!(m.stable);
+        assert!(
+            (simulated / predicted - 1.0).abs() < 0.05,
+            "{controller:?}: {simulated} against {predicted}"
+        );
+    }
+}
+
+#[test]
+fn previewed_sines_of_5_um_are_followed_within_1_5_times_the_hold_error() {
+    for controller in [
+        ControllerConfig::Lqg(Lqg::default()),
+        mpc(SolverKind::ActiveSet),
+    ] {
+        let hold = rms_um(config(controller), RigConfig::eq6(4), &HOLD, 8000, 2000);
+        for frequency_hz in [50.0, 100.0] {
+            let rms = rms_um(
+                config(controller),
+                RigConfig::eq6(4),
+                &sine(5.0, frequency_hz),
+                8000,
+                2000,
+            );
+            assert!(
+                rms <= 1.5 * hold,
+                "{controller:?} at {frequency_hz} Hz: {rms} against {hold}"
+            );
+        }
+    }
+}
+
+#[test]
+fn mpc_settles_a_10_um_step_to_2_percent_within_10_ms() {
+    for solver in [SolverKind::Clarabel, SolverKind::ActiveSet] {
+        let f = step_figures(&DesignPlant::eq6(2.5e-3), &config(mpc(solver)), 10.0).unwrap();
+        assert!(
+            f.settling_2_percent_s <= 0.010 && f.overshoot_percent < 5.0,
+            "{solver:?}: {f:?}"
+        );
+    }
+}
+
+#[test]
+fn a_deadline_in_the_past_falls_back_to_the_previous_plan_and_then_to_pi() {
+    let mut controller = Controller::new(config(mpc(SolverKind::Clarabel))).unwrap();
+    let mut rig = SimulatedRig::new(RigConfig::eq6(1)).unwrap();
+    let mut state = controller.start(20.0, 20.0);
+    let mut seen = Vec::new();
+    for k in 0..60 {
+        let deadline = (k >= 20).then(std::time::Instant::now);
+        let input = LoopInput {
+            measurement: Some(rig.measure()),
+            deadline,
+            ..LoopInput::default()
+        };
+        let out = controller.step(&mut state, &input);
+        seen.push(out.solver.status);
+        rig.advance(out.command_um);
+    }
+    assert_eq!(
+        (seen[19], seen[20]),
+        (SolverStatus::Solved, SolverStatus::PreviousPlan)
+    );
+    assert_eq!(seen[59], SolverStatus::FallbackPi);
+}
