@@ -31,7 +31,7 @@ pub enum Command {
     /// Measure the rig's frequency response and fit a model to it, or fit one to records.
     Identify(Box<identify::Args>),
     /// Find where simulation and measurement disagree, name what is missing, add it to the model.
-    Reconcile(reconcile::Args),
+    Reconcile(Box<reconcile::Args>),
     /// Positions and their quality from a recording: CSV, contact sheet, summary.
     Vision(Box<vision::Args>),
     /// Which cameras there are; delivered rate, intervals, age and losses of one.
@@ -50,7 +50,7 @@ impl Command {
             Self::Export(args) => export::run(args),
             Self::Doctor(args) => doctor::run(args),
             Self::Identify(args) => identify::run(*args),
-            Self::Reconcile(args) => reconcile::run(args),
+            Self::Reconcile(args) => reconcile::run(*args),
             Self::Vision(args) => vision::run(*args),
             Self::Camera(args) => camera::run(args),
             Self::Paper(args) => paper::run(args),

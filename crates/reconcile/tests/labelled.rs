@@ -1,0 +1,177 @@
+//! The labelled records: made by a program of another make, with the hidden effect in the folder's name.
+
+use cellpos_plant::Model;
+use cellpos_reconcile::{Options, ReconcileError, Reconciliation, Record, Verdict, reconcile};
+use std::path::{Path, PathBuf};
+
+fn data() -> Option<PathBuf> {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared/data/hidden-effects");
+    if path.is_dir() {
+        return Some(path);
+    }
+    println!(
+        "skipped: the labelled records are not beside the repository ({})",
+        path.display()
+    );
+    None
+}
+
+fn read(path: &Path) -> Record {
+    let text = std::fs::read_to_string(path).unwrap();
+    let (mut t, mut u, mut y) = (Vec::new(), Vec::new(), Vec::new());
+    for line in text.lines().skip(1) {
+        let mut cells = line.split(',');
+        t.push(cells.next().unwrap().parse().unwrap());
+        u.push(cells.next().unwrap().parse().unwrap());
+        y.push(cells.next().unwrap().trim().parse().unwrap_or(f64::NAN));
+    }
+    Record::from_rows(path.file_stem().unwrap().to_str().unwrap(), &t, &u, &y).unwrap()
+}
+
+fn case(name: &str) -> Option<Vec<Record>> {
+    let mut files: Vec<PathBuf> = std::fs::read_dir(data()?.join(name))
+        .unwrap()
+        .map(|e| e.unwrap().path())
+        .collect();
+    files.sort();
+    Some(files.iter().map(|f| read(f)).collect())
+}
+
+fn run(records: &[Record]) -> Result<Reconciliation, ReconcileError> {
+    reconcile(&Model::eq6(), records, &Options::default(), &mut |_| {})
+}
+
+fn expect(name: &str, ids: &[&str]) {
+    let Some(records) = case(name) else { return };
+    let result = run(&records).unwrap();
+    let mut named: Vec<&str> = result.effects.iter().map(|e| e.id.as_str()).collect();
+    named.sort_unstable();
+    assert_eq!(named, ids, "{name}: {:?}", result.places);
+    let verdict = if ids.is_empty() {
+        Verdict::NothingMissing
+    } else {
+        Verdict::Named
+    };
+    assert_eq!(result.verdict, verdict, "{name}");
+    if !ids.is_empty() {
+        assert!(
+            result.gap.closure() > 0.9,
+            "{name}: closure {}",
+            result.gap.closure()
+        );
+        for id in ids {
+            assert!(
+                result.augmented.effect(id).is_some(),
+                "{name}: {id} is in the augmented model"
+            );
+        }
+    }
+}
+
+#[test]
+fn a_time_delay_is_named() {
+    expect("time-delay", &["time-delay"]);
+}
+
+#[test]
+fn hysteresis_of_the_piezo_is_named() {
+    expect("pzt-hysteresis", &["pzt-hysteresis"]);
+}
+
+#[test]
+fn a_flow_drift_is_named() {
+    expect("flow-drift", &["flow-drift"]);
+}
+
+#[test]
+fn adhesion_to_the_wall_is_named() {
+    expect("wall-adhesion", &["wall-adhesion"]);
+}
+
+#[test]
+fn averaging_over_the_exposure_is_told_from_a_delay_by_the_noise() {
+    expect("exposure-averaging", &["exposure-averaging"]);
+}
+
+#[test]
+fn a_lag_of_the_driver_is_named_with_the_bubble_as_its_alternative() {
+    expect("driver-lag", &["driver-lag"]);
+}
+
+#[test]
+fn delay_and_hysteresis_together_are_both_named() {
+    expect(
+        "time-delay+pzt-hysteresis",
+        &["pzt-hysteresis", "time-delay"],
+    );
+}
+
+#[test]
+fn leak_and_hum_together_are_both_named() {
+    expect("leak+mains-hum", &["leak", "mains-hum"]);
+}
+
+#[test]
+fn records_that_hide_nothing_get_no_name() {
+    expect("none-1", &[]);
+    expect("none-2", &[]);
+}
+
+#[test]
+fn the_order_of_the_files_and_cutting_one_in_two_change_nothing() {
+    let Some(records) = case("flow-drift") else {
+        return;
+    };
+    let first = run(&records).unwrap();
+    let mut other: Vec<Record> = records.iter().rev().cloned().collect();
+    let cut = other.remove(1);
+    let middle = cut.rows() / 3;
+    other.insert(0, cut.part(middle, cut.rows()));
+    other.push(cut.part(0, middle));
+    let second = run(&other).unwrap();
+    assert_eq!(first.verdict, second.verdict);
+    assert_eq!(first.effects, second.effects);
+}
+
+#[test]
+fn wrong_units_constant_inputs_short_and_foreign_records_get_a_message() {
+    let Some(records) = case("none-1") else {
+        return;
+    };
+    let changed = |f: &dyn Fn(&mut Record)| {
+        let mut all = records.clone();
+        all.iter_mut().for_each(f);
+        run(&all)
+    };
+    let nanometres = changed(&|r| r.bead_um.iter_mut().for_each(|b| *b *= 1000.0));
+    assert!(
+        matches!(nanometres, Err(ReconcileError::Units { ratio, .. }) if ratio > 900.0),
+        "{nanometres:?}"
+    );
+    let volts = changed(&|r| r.pzt_um.iter_mut().for_each(|u| *u /= 4.0));
+    assert!(
+        matches!(volts, Err(ReconcileError::WorkingPoint { .. })),
+        "{volts:?}"
+    );
+    let reversed = changed(&|r| r.bead_um.iter_mut().for_each(|b| *b = -*b));
+    assert!(
+        matches!(reversed, Err(ReconcileError::Units { what: "sign", .. })),
+        "{reversed:?}"
+    );
+    let rest: Vec<Record> = records.iter().filter(|r| r.is_rest()).cloned().collect();
+    assert_eq!(run(&rest), Err(ReconcileError::ConstantInput));
+    let short = vec![records[0].part(0, 1500)];
+    assert!(matches!(run(&short), Err(ReconcileError::TooShort { .. })));
+    // A position that has nothing to do with the command: that of another record.
+    let mut foreign = records.clone();
+    for i in 0..records.len() {
+        let other = &records[(i + 1) % records.len()].bead_um;
+        let n = foreign[i].rows();
+        foreign[i].bead_um = other.iter().copied().cycle().take(n).collect();
+    }
+    assert!(
+        matches!(run(&foreign), Err(ReconcileError::AnotherRig { .. })),
+        "{:?}",
+        run(&foreign).map(|r| r.verdict)
+    );
+}

@@ -1,0 +1,142 @@
+//! Prints how well `reconcile` names effects that a simulator of another make hides: table, confusions, rates.
+//!
+//! `cargo run --release -p cellpos-tests --bin reconcile-table [all|singles|pairs|nulls|outside] [seed]`
+
+#![forbid(unsafe_code)]
+
+use cellpos_reconcile::Verdict;
+use cellpos_tests::truth::cases::{Case, nulls, outside, pairs, singles};
+use cellpos_tests::truth::table::{Row, evaluate};
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Mutex;
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+fn main() {
+    let args: Vec<String> = std::env::args().skip(1).collect();
+    let which = args.first().map_or("all", String::as_str);
+    let seed: u64 = args.get(1).and_then(|s| s.parse().ok()).unwrap_or(1);
+    let mut cases: Vec<Case> = Vec::new();
+    for (name, group) in [
+        ("singles", singles()),
+        ("pairs", pairs()),
+        ("nulls", nulls(40)),
+        ("outside", outside()),
+    ] {
+        if which == "all" || which == name {
+            cases.extend(group);
+        }
+    }
+    let threads = std::thread::available_parallelism().map_or(2, usize::from);
+    let next = AtomicUsize::new(0);
+    let rows: Mutex<BTreeMap<usize, Result<Row, String>>> = Mutex::new(BTreeMap::new());
+    std::thread::scope(|scope| {
+        for _ in 0..threads {
+            scope.spawn(|| {
+                loop {
+                    let i = next.fetch_add(1, Ordering::Relaxed);
+                    let Some(case) = cases.get(i) else { break };
+                    let row = evaluate(case, seed * 1000 + i as u64);
+                    println!("{}", line(case, &row));
+                    if let Ok(mut rows) = rows.lock() {
+                        rows.insert(i, row);
+                    }
+                }
+            });
+        }
+    });
+    let rows = rows.into_inner().unwrap_or_default();
+    let done: Vec<(&Case, &Row)> = rows
+        .iter()
+        .filter_map(|(i, r)| Some((&cases[*i], r.as_ref().ok()?)))
+        .collect();
+    let rate = |group: &str, good: &dyn Fn(&Row) -> bool| {
+        let n = done
+            .iter()
+            .filter(|(c, r)| c.group == group && good(r))
+            .count();
+        (n, cases.iter().filter(|c| c.group == group).count())
+    };
+    println!("\nsummary (good, all)");
+    println!(
+        "singles, exact names       {:?}",
+        rate("single", &|r| r.named == r.hidden)
+    );
+    println!(
+        "singles, truth inside set  {:?}",
+        rate("single", &|r| r.hidden.is_subset(&r.inside))
+    );
+    println!(
+        "pairs, exact names         {:?}",
+        rate("pair", &|r| r.named == r.hidden)
+    );
+    println!(
+        "nulls with a false name    {:?}",
+        rate("null", &|r| !r.named.is_empty())
+    );
+    println!(
+        "outside, called unknown    {:?}",
+        rate("outside", &|r| r.verdict == Verdict::Unknown)
+    );
+    let closures = done
+        .iter()
+        .filter(|(c, _)| c.group == "single")
+        .map(|(_, r)| r.closure)
+        .collect();
+    let fresh = done.iter().filter_map(|(_, r)| r.fresh).collect();
+    for (what, values) in [
+        ("closure on held-out records", closures),
+        ("fall of the RMS error on a fresh excitation", fresh),
+    ] {
+        let mut values: Vec<f64> = values;
+        values.sort_by(f64::total_cmp);
+        if !values.is_empty() {
+            println!(
+                "median over singles: {what}: {:.3}",
+                values[values.len() / 2]
+            );
+        }
+    }
+    println!("\nconfusions (hidden -> verdict and names)");
+    let mut confusions: BTreeMap<(String, String), usize> = BTreeMap::new();
+    for (_, r) in done
+        .iter()
+        .filter(|(c, r)| c.group == "single" && r.named != r.hidden)
+    {
+        *confusions
+            .entry((
+                join(&r.hidden),
+                format!("{} {}", r.verdict.word(), join(&r.named)),
+            ))
+            .or_default() += 1;
+    }
+    for ((hidden, named), n) in confusions {
+        println!("{hidden:24} {named:40} {n}");
+    }
+}
+
+fn join(s: &BTreeSet<String>) -> String {
+    s.iter().cloned().collect::<Vec<_>>().join("+")
+}
+
+fn line(case: &Case, row: &Result<Row, String>) -> String {
+    let hidden = case
+        .hidden
+        .iter()
+        .map(|h| format!("{h:?}"))
+        .collect::<Vec<_>>()
+        .join(" + ");
+    match row {
+        Err(e) => format!("{:8} {:7} {hidden:40} refused: {e}", case.group, case.level),
+        Ok(r) => format!(
+            "{:8} {:7} {hidden:40} {} {:16} {:40} closure {:6.3} fresh {}",
+            case.group,
+            case.level,
+            if r.named == r.hidden { "  " } else { "<>" },
+            r.verdict.word(),
+            join(&r.named),
+            r.closure,
+            r.fresh
+                .map_or_else(|| "-".to_owned(), |f| format!("{f:.3}"))
+        ),
+    }
+}
