@@ -75,6 +75,11 @@ fn same_id(a: usize, id: &str) -> bool {
     VARIANTS[a].id == id
 }
 
+/// Forms with many numbers are tried only once their effect has been found in its simple form: see [`reform`].
+fn late(v: &Variant) -> bool {
+    v.params.len() > 3 || (v.id == "bubble" && v.params.len() == 2)
+}
+
 /// Fits the best leads next to a set and returns the fits, best first.
 fn extensions(
     ctx: &Context<'_>,
@@ -86,9 +91,17 @@ fn extensions(
     least: f64,
 ) -> Vec<Fit> {
     let tangents = ctx.tangents(fit, mask);
-    let leads = screen(ctx, fit, &tangents, mask, effort.threads, |v| {
-        !fit.parts.iter().any(|p| same_id(v, p.variant().id))
+    let mut leads = screen(ctx, fit, &tangents, mask, effort.threads, |v| {
+        !late(&VARIANTS[v])
+            && !fit.parts.iter().any(|p| same_id(v, p.variant().id))
             && !forbidden.contains(&VARIANTS[v].id)
+    });
+    let mut seen: Vec<&str> = Vec::new();
+    leads.retain(|l| {
+        let id = l.part.variant().id;
+        let new = !seen.contains(&id);
+        seen.push(id);
+        new
     });
     let records = ctx.problem.records.len();
     let worth: Vec<Part> = leads
@@ -177,7 +190,7 @@ fn replace(ctx: &Context<'_>, mut fit: Fit, mask: &Mask, effort: Effort) -> (Fit
                 &without,
                 mask,
                 effort,
-                6,
+                4,
                 &[id],
                 0.25 * (without.chi2 - fit.chi2),
             ) {
@@ -212,10 +225,18 @@ fn replace(ctx: &Context<'_>, mut fit: Fit, mask: &Mask, effort: Effort) -> (Fit
 fn reform(ctx: &Context<'_>, mut fit: Fit, mask: &Mask, effort: Effort) -> Fit {
     for i in 0..fit.parts.len() {
         let id = fit.parts[i].variant().id;
+        // Only where something is left beyond the noise is a richer form worth its time.
+        let count = fit.count as f64;
+        let rich = fit.chi2 - count > 0.01 * count;
         let others: Vec<Part> = VARIANTS
             .iter()
             .enumerate()
-            .filter(|(v, variant)| variant.id == id && *v != fit.parts[i].variant)
+            .filter(|(v, variant)| {
+                let form = variant.id == id && *v != fit.parts[i].variant;
+                // A lag that dissolves is a bubble.
+                let dissolving = id == "driver-lag" && variant.id == "bubble" && late(variant);
+                (form || dissolving) && (rich || !late(variant))
+            })
             .flat_map(|(v, variant)| {
                 (variant.starts)(&ctx.scope)
                     .into_iter()
