@@ -6,6 +6,10 @@
 
 mod commands;
 mod outcome;
+mod recording;
+mod rig_file;
+mod setup;
+mod toml_file;
 
 use clap::Parser;
 use std::process::ExitCode;

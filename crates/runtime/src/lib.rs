@@ -7,6 +7,7 @@ pub mod latency;
 pub mod life;
 pub mod live;
 pub mod realtime;
+pub mod replay;
 pub mod run;
 pub mod summary;
 mod tick_record;

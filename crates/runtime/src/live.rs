@@ -160,8 +160,7 @@ pub fn run<R: Reference + Send, S: RunSink>(
         };
         realtime::apply(&threads.actuator);
         let mut io_error = actuate(actuator, &mut orders, &mut reports)
-            .err()
-            .map(RunError::from);
+            .err();
         let control_end = control.join();
         stop.store(true, Ordering::Release);
         let life = match &control_end {

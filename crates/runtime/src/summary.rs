@@ -45,7 +45,47 @@ pub struct Statistics {
     running_since_ns: Option<i64>,
     measured: Moments,
     truth: Moments,
+    variance: Moments,
+    step: Option<StepWatch>,
     last: Option<TickRecord>,
+}
+
+/// How the bead went from where it was to where it should be, after the loop was closed.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct StepWatch {
+    target_um: f64,
+    size_um: f64,
+    overshoot_um: f64,
+    last_outside_ns: i64,
+}
+
+/// Figures of the move to the first reference, if it was one worth the name.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct StepResult {
+    /// From the bead to the reference when the loop was closed, um.
+    pub size_um: f64,
+    /// Largest excursion beyond the reference, percent of the size (Brownian motion included).
+    pub overshoot_percent: f64,
+    /// Until the bead stayed within 5 % of the size, ms.
+    pub settling_ms: f64,
+}
+
+impl StepWatch {
+    /// Moves shorter than this drown in Brownian motion, um.
+    const SMALLEST_UM: f64 = 1.0;
+    /// The move is over after this long, ns: what comes later is another matter.
+    const LONGEST_NS: i64 = 1_000_000_000;
+
+    fn add(&mut self, position_um: f64, since_ns: i64) {
+        if since_ns > Self::LONGEST_NS || !position_um.is_finite() {
+            return;
+        }
+        let beyond_um = (position_um - self.target_um) * self.size_um.signum();
+        self.overshoot_um = self.overshoot_um.max(beyond_um);
+        if beyond_um.abs() > 0.05 * self.size_um.abs() {
+            self.last_outside_ns = since_ns;
+        }
+    }
 }
 
 impl Default for Statistics {
@@ -62,6 +102,8 @@ impl Statistics {
             running_since_ns: None,
             measured: Moments::default(),
             truth: Moments::default(),
+            variance: Moments::default(),
+            step: None,
             last: None,
         }
     }
@@ -69,10 +111,29 @@ impl Statistics {
     /// Takes one record.
     pub fn add(&mut self, record: &TickRecord) {
         if record.life == Life::Running as u8 {
+            let seen_um = if record.true_um.is_finite() {
+                record.true_um
+            } else {
+                record.measured_um
+            };
+            let first = self.running_since_ns.is_none();
             let since = *self.running_since_ns.get_or_insert(record.time_ns);
+            let size_um = record.target_um - seen_um;
+            if first && size_um.abs() >= StepWatch::SMALLEST_UM {
+                self.step = Some(StepWatch {
+                    target_um: record.target_um,
+                    size_um,
+                    overshoot_um: 0.0,
+                    last_outside_ns: 0,
+                });
+            }
+            if let Some(step) = &mut self.step {
+                step.add(seen_um, record.time_ns - since);
+            }
             if record.time_ns - since >= self.settled_after_ns {
                 self.measured.add(record.measured_um - record.target_um);
                 self.truth.add(record.true_um - record.target_um);
+                self.variance.add(record.variance_um2);
             }
         }
         self.last = Some(*record);
@@ -81,6 +142,19 @@ impl Statistics {
     /// The newest record.
     pub fn last(&self) -> Option<&TickRecord> {
         self.last.as_ref()
+    }
+
+    /// Localisation noise as vision states it, um RMS; `None` before the first position.
+    pub fn fix_noise_um(&self) -> Option<f64> {
+        (self.variance.n > 0).then(|| (self.variance.sum / self.variance.n as f64).max(0.0).sqrt())
+    }
+
+    fn step_result(&self) -> Option<StepResult> {
+        self.step.map(|step| StepResult {
+            size_um: step.size_um,
+            overshoot_percent: 100.0 * step.overshoot_um / step.size_um.abs(),
+            settling_ms: step.last_outside_ns as f64 * 1e-6,
+        })
     }
 
     /// RMS of measured position less reference so far, nm.
@@ -127,6 +201,10 @@ pub struct Summary {
     pub mean_error_nm: Option<f64>,
     /// Largest distance of the measured position from the reference, nm.
     pub peak_error_nm: Option<f64>,
+    /// Localisation noise as vision states it, nm RMS.
+    pub fix_noise_nm: Option<f64>,
+    /// The move to the first reference; `None` when the bead was there already.
+    pub step: Option<StepResult>,
     /// Median loop delay: exposure to command, and half a period of hold, ms.
     pub loop_delay_ms: f64,
     /// From the start of a tick to the hand-over of its command, us.
@@ -159,6 +237,8 @@ impl Summary {
             rms_true_nm: statistics.truth.rms_nm(),
             mean_error_nm: statistics.measured.mean_nm(),
             peak_error_nm: (statistics.measured.n > 0).then_some(statistics.measured.peak * 1e3),
+            fix_noise_nm: statistics.fix_noise_um().map(|um| um * 1e3),
+            step: statistics.step_result(),
             loop_delay_ms: account.exposure_to_command.quantiles_us().p50 * 1e-3
                 + 0.5e-3 * period_us,
             tick_us: account.tick.quantiles_us(),

@@ -1,0 +1,318 @@
+//! rig.toml: which camera, which board, their calibration and limits, and the times of the loop.
+
+use crate::outcome::Failure;
+use crate::toml_file;
+use cellpos_control::Limits;
+use cellpos_emulator::WorldConfig;
+use cellpos_firmware_sim::BoardConfig;
+use cellpos_plant::Model;
+use cellpos_rig::serial::SerialLine;
+use cellpos_rig::socket::SocketCamera;
+use cellpos_rig::{
+    Actuator, BoardHost, Calibration, Clock, EmulatedRig, PositionSource, VisionSource,
+};
+use cellpos_runtime::{ArmingConfig, Timing};
+use cellpos_vision::{Localiser, LocaliserConfig, ProfileSpec};
+use serde::{Deserialize, Serialize};
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+/// A rig.toml. Every table and key may be left out: what is left is the emulated rig of the paper.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct RigFile {
+    /// First belief of the PZT displacement at which the bead is at rest, um; the loop finds the rest.
+    pub first_neutral_um: f64,
+    /// The PZT board.
+    pub actuator: ActuatorConfig,
+    /// The camera.
+    pub camera: CameraConfig,
+    /// From pixels to micrometres; the emulated camera brings its own.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub calibration: Option<Calibration>,
+    /// Localisation; left out: a ring profile for the bead of `[emulator]`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub vision: Option<LocaliserConfig>,
+    /// Limits of the command, within those of the board.
+    pub limits: Limits,
+    /// Times and counts of the loop.
+    pub timing: Timing,
+    /// The check before the loop is closed.
+    pub arming: ArmingConfig,
+    /// The emulated board.
+    pub board: BoardConfig,
+    /// The emulated world.
+    pub emulator: WorldConfig,
+}
+
+/// The PZT board.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "kind", rename_all = "kebab-case", deny_unknown_fields)]
+pub enum ActuatorConfig {
+    /// The firmware library in this process.
+    Emulated {},
+    /// A board behind a serial port.
+    Serial {
+        /// Device, for example /dev/ttyUSB0.
+        port: String,
+        /// Baud rate; a pseudo-terminal takes any.
+        #[serde(default = "baud")]
+        baud: u32,
+        /// Watchdog on missing commands, ms; left out: the board's own.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        watchdog_ms: Option<u16>,
+    },
+}
+
+fn baud() -> u32 {
+    3_000_000
+}
+
+/// The camera.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "kind", rename_all = "kebab-case", deny_unknown_fields)]
+pub enum CameraConfig {
+    /// Rendered in this process.
+    Emulated {},
+    /// A camera process behind a Unix socket.
+    Socket {
+        /// Path of the socket.
+        socket: PathBuf,
+        /// Frame rate, Hz.
+        #[serde(default = "rate_hz")]
+        rate_hz: f64,
+    },
+}
+
+fn rate_hz() -> f64 {
+    1000.0
+}
+
+impl Default for RigFile {
+    fn default() -> Self {
+        Self {
+            first_neutral_um: 20.0,
+            actuator: ActuatorConfig::Emulated {},
+            camera: CameraConfig::Emulated {},
+            calibration: None,
+            vision: None,
+            limits: Limits {
+                low_um: 0.0,
+                high_um: 40.0,
+                slew_um_per_s: 20_000.0,
+                park_um: 20.0,
+            },
+            timing: Timing::default(),
+            arming: ArmingConfig::default(),
+            board: BoardConfig::default(),
+            emulator: WorldConfig::default(),
+        }
+    }
+}
+
+/// Whether positions come from rendered frames or are drawn with the noise that frames would give.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+pub enum Frames {
+    /// Render and localise.
+    On,
+    /// Positions with equivalent noise.
+    Off,
+}
+
+/// Which clock.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+pub enum ClockKind {
+    /// The machine's.
+    Real,
+    /// As fast as the machine can; deterministic.
+    Virtual,
+}
+
+/// A rig, connected.
+pub struct Rig {
+    /// Positions.
+    pub source: Box<dyn PositionSource>,
+    /// The PZT.
+    pub actuator: Box<dyn Actuator>,
+    /// Its clock.
+    pub clock: Clock,
+    /// The emulated rig, where it is one.
+    pub emulated: Option<EmulatedRig>,
+    /// What the user should know.
+    pub warnings: Vec<String>,
+}
+
+impl RigFile {
+    /// Reads a rig.toml, or the defaults where there is none.
+    pub fn load(path: Option<&Path>) -> Result<Self, Failure> {
+        let Some(path) = path else {
+            return Ok(Self::default());
+        };
+        let mut file: Self = toml_file::read(path)?;
+        file.validate(&path.display().to_string())?;
+        // Paths in the file are meant from the file's own folder.
+        let folder = path.parent().unwrap_or(Path::new(""));
+        if let CameraConfig::Socket { socket, .. } = &mut file.camera {
+            *socket = folder.join(&*socket);
+        }
+        if file.emulator.model != "eq6" {
+            file.emulator.model = folder.join(&file.emulator.model).display().to_string();
+        }
+        Ok(file)
+    }
+
+    fn validate(&self, name: &str) -> Result<(), Failure> {
+        let say = |error: &dyn std::fmt::Display| {
+            Failure::bad_input(
+                format!("{name}: {error}"),
+                "see the commented files under examples/",
+            )
+        };
+        self.limits.validate().map_err(|error| say(&error))?;
+        self.timing.validate().map_err(|error| say(&error))?;
+        self.board.validate().map_err(|error| say(&error))?;
+        self.emulator.validate().map_err(|error| say(&error))?;
+        if !(self.limits.low_um..=self.limits.high_um).contains(&self.first_neutral_um) {
+            return Err(say(&format!(
+                "first_neutral_um = {}: must be within the limits, {} to {} um",
+                self.first_neutral_um, self.limits.low_um, self.limits.high_um
+            )));
+        }
+        if let Some(calibration) = &self.calibration {
+            let sound = calibration.pixel_um > 0.0
+                && calibration.pixel_um.is_finite()
+                && calibration.origin_px.is_finite()
+                && calibration.sign.abs() == 1.0;
+            if !sound {
+                return Err(say(
+                    &"[calibration]: pixel_um must be above 0, origin_px a number, sign +1 or -1",
+                ));
+            }
+        }
+        Ok(())
+    }
+
+    /// Whether all of it is emulated in this process.
+    pub fn is_emulated(&self) -> bool {
+        matches!(
+            (&self.actuator, &self.camera),
+            (ActuatorConfig::Emulated {}, CameraConfig::Emulated {})
+        )
+    }
+
+    fn localiser(&self) -> Result<Localiser, Failure> {
+        let config = self.vision.clone().unwrap_or_else(|| {
+            LocaliserConfig::new(ProfileSpec::Ring {
+                edge_px: self.emulator.bead_radius_px(),
+            })
+        });
+        Localiser::new(config).map_err(|error| {
+            Failure::bad_input(format!("[vision] {error}"), "see examples/rig.toml")
+        })
+    }
+
+    /// Connects camera and board.
+    pub fn connect(&self, clock: ClockKind, frames: Frames) -> Result<Rig, Failure> {
+        match (&self.actuator, &self.camera) {
+            (ActuatorConfig::Emulated {}, CameraConfig::Emulated {}) => self.emulate(clock, frames),
+            (
+                ActuatorConfig::Serial { port, baud, .. },
+                CameraConfig::Socket { socket, rate_hz },
+            ) => {
+                if clock == ClockKind::Virtual || frames == Frames::Off {
+                    return Err(Failure::bad_input(
+                        "--clock virtual and --frames off are for the emulated rig",
+                        "leave them out, or leave out --rig",
+                    ));
+                }
+                self.open(port, *baud, socket, *rate_hz)
+            }
+            _ => Err(Failure::bad_input(
+                "the emulated board moves the emulated bead only: [actuator] and [camera] must both be emulated, or neither",
+                "run firmware-sim to have both behind a serial port and a socket",
+            )),
+        }
+    }
+
+    fn emulate(&self, clock: ClockKind, frames: Frames) -> Result<Rig, Failure> {
+        let clock = match clock {
+            ClockKind::Real => Clock::Real,
+            ClockKind::Virtual => Clock::virtual_at(0),
+        };
+        let model = Model::load(&self.emulator.model).map_err(Failure::input)?;
+        let emulated = EmulatedRig::new(self.board, &self.emulator, &model, clock.clone())
+            .map_err(Failure::input)?;
+        let source: Box<dyn PositionSource> = match frames {
+            Frames::Off => Box::new(emulated.positions()),
+            Frames::On => Box::new(VisionSource::new(
+                emulated.camera(),
+                self.localiser()?,
+                emulated.calibration(),
+                clock.clone(),
+            )),
+        };
+        let mut warnings = Vec::new();
+        if (self.emulator.latency_ms - self.timing.camera_delay_ms).abs() > 1e-9 {
+            warnings.push(format!(
+                "the emulated camera is {} ms late, the loop is set up for {} ms",
+                self.emulator.latency_ms, self.timing.camera_delay_ms
+            ));
+        }
+        Ok(Rig {
+            source,
+            actuator: Box::new(emulated.actuator().map_err(Failure::failed)?),
+            clock,
+            emulated: Some(emulated),
+            warnings,
+        })
+    }
+
+    fn open(&self, port: &str, baud: u32, socket: &Path, rate_hz: f64) -> Result<Rig, Failure> {
+        let calibration = self.calibration.ok_or_else(|| {
+            Failure::bad_input(
+                "a real camera needs a [calibration] with pixel_um, origin_px and sign",
+                "measure pixel_um with a stage micrometer; see examples/rig.toml",
+            )
+        })?;
+        let line = SerialLine::open(port, baud).map_err(|error| {
+            Failure::bad_input(
+                format!("[actuator] port = \"{port}\": {error}"),
+                "is the board plugged in (or firmware-sim running), and may you read and write the device?",
+            )
+        })?;
+        let mut warnings = Vec::new();
+        if let Some(ms) = SerialLine::latency_timer_ms(port).filter(|&ms| ms > 1) {
+            warnings.push(format!(
+                "the USB adapter of {port} holds answers back for {ms} ms: write 1 to its latency_timer"
+            ));
+        }
+        let actuator = BoardHost::connect(line, Clock::Real).map_err(Failure::failed)?;
+        let camera = SocketCamera::connect(
+            socket,
+            rate_hz,
+            self.timing.camera_delay_ms,
+            Duration::from_secs(2),
+        )
+        .map_err(Failure::failed)?;
+        Ok(Rig {
+            source: Box::new(VisionSource::new(
+                camera,
+                self.localiser()?,
+                calibration,
+                Clock::Real,
+            )),
+            actuator: Box::new(actuator),
+            clock: Clock::Real,
+            emulated: None,
+            warnings,
+        })
+    }
+
+    /// Watchdog asked of the board, ms.
+    pub fn watchdog_ms(&self) -> Option<u16> {
+        match self.actuator {
+            ActuatorConfig::Serial { watchdog_ms, .. } => watchdog_ms,
+            ActuatorConfig::Emulated {} => None,
+        }
+    }
+}
