@@ -8,7 +8,9 @@ pub mod export;
 pub mod identify;
 pub mod paper;
 pub mod reconcile;
+pub mod replay;
 pub mod simulate;
+pub mod track;
 pub mod vision;
 mod vision_sheet;
 mod vision_summary;
@@ -18,12 +20,16 @@ use crate::outcome::CommandResult;
 /// The commands, in the order in which a lab needs them.
 #[derive(Debug, clap::Subcommand)]
 pub enum Command {
+    /// Hold a bead, or go to a position, in closed loop.
+    Track(track::Args),
     /// A controller for a model and a loop delay: margins, predicted error, spread, controller.toml.
     Design(design::Args),
     /// A setpoint script against a model and the rig's limits, before anything moves.
     Check(check::Args),
     /// Noise-free response of a model to the commands of a record.
     Simulate(simulate::Args),
+    /// Run a recorded run through its controller again and compare to the bit.
+    Replay(replay::Args),
     /// A run as CSV or Parquet, for other programs.
     Export(export::Args),
     /// Is this machine fit for a 1 kHz loop: verdict, reasons, what to change.
@@ -44,6 +50,8 @@ impl Command {
     /// Runs the command.
     pub fn run(self) -> CommandResult {
         match self {
+            Self::Track(args) => track::run(args),
+            Self::Replay(args) => replay::run(args),
             Self::Design(args) => design::run(args),
             Self::Check(args) => check::run(args),
             Self::Simulate(args) => simulate::run(args),
