@@ -136,8 +136,6 @@ pub struct Rig {
     pub actuator: Box<dyn Actuator>,
     /// Its clock.
     pub clock: Clock,
-    /// The emulated rig, where it is one.
-    pub emulated: Option<EmulatedRig>,
     /// What the user should know.
     pub warnings: Vec<String>,
 }
@@ -262,7 +260,6 @@ impl RigFile {
             source,
             actuator: Box::new(emulated.actuator().map_err(Failure::failed)?),
             clock,
-            emulated: Some(emulated),
             warnings,
         })
     }
@@ -303,7 +300,6 @@ impl RigFile {
             )),
             actuator: Box::new(actuator),
             clock: Clock::Real,
-            emulated: None,
             warnings,
         })
     }

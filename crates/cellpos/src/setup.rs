@@ -5,7 +5,7 @@ use crate::outcome::Failure;
 use cellpos_control::design::{
     DesignPlant, DesignRequest, PiSearch, Requested, default_lead, design,
 };
-use cellpos_control::{ControllerConfig, ControllerFile, Limits, Pi, Profile};
+use cellpos_control::{ControllerConfig, ControllerFile, ControllerKind, Limits, Profile};
 use cellpos_plant::Model;
 use cellpos_runtime::{ArmingConfig, Core, CoreError, Timing};
 use serde::{Deserialize, Serialize};
@@ -82,13 +82,24 @@ impl Setup {
     }
 }
 
-/// A controller by name (`pi`, `lead`: gains found for the model and the delay) or from a controller.toml.
+/// A controller by name (`pi`, `lead`: gains found for the model and the delay; `lqg`, `mpc`: the default weights) or
+/// from a controller.toml.
 pub fn controller(name: &str, model: &Model, timing: &Timing) -> Result<ControllerFile, Failure> {
     let sample_s = timing.period_us * 1e-6;
     let loop_delay_s = timing.camera_delay_ms * 1e-3 + 0.5 * sample_s;
+    let mut kind = None;
     let lead = match name {
         "pi" => None,
         "lead" => Some(default_lead(loop_delay_s)),
+        // The PI gains found below serve these two as the fallback.
+        "lqg" | "mpc" => {
+            kind = Some(if name == "lqg" {
+                ControllerKind::Lqg
+            } else {
+                ControllerKind::Mpc
+            });
+            None
+        }
         path if path.ends_with(".toml") => {
             let file = ControllerFile::load(Path::new(path)).map_err(Failure::input)?;
             if (file.delay_ms * 1e-3 - loop_delay_s).abs() > 0.05 * sample_s {
@@ -109,7 +120,7 @@ pub fn controller(name: &str, model: &Model, timing: &Timing) -> Result<Controll
         other => {
             return Err(Failure::bad_input(
                 format!("--controller {other}: not a controller"),
-                "write pi, lead, or the path of a controller.toml",
+                "write pi, lead, lqg, mpc, or the path of a controller.toml",
             ));
         }
     };
@@ -126,9 +137,13 @@ pub fn controller(name: &str, model: &Model, timing: &Timing) -> Result<Controll
         limits: Default::default(),
     };
     let report = design(&request).map_err(Failure::input)?;
-    let ControllerConfig::Pi(pi) = report.controller;
-    let pi: Pi = pi;
+    let ControllerConfig::Pi(pi) = report.controller else {
+        unreachable!("a search for PI gains gives PI gains")
+    };
     let mut file = ControllerFile::from_pi(pi, loop_delay_s);
+    if let Some(kind) = kind {
+        file.controller = kind;
+    }
     file.sample_time_ms = sample_s * 1e3;
     if let Some(config) = &report.config {
         file.estimator = config.estimator;

@@ -159,8 +159,7 @@ pub fn run<R: Reference + Send, S: RunSink>(
             }
         };
         realtime::apply(&threads.actuator);
-        let mut io_error = actuate(actuator, &mut orders, &mut reports)
-            .err();
+        let mut io_error = actuate(actuator, &mut orders, &mut reports).err();
         let control_end = control.join();
         stop.store(true, Ordering::Release);
         let life = match &control_end {

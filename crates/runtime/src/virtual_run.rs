@@ -16,7 +16,10 @@ use cellpos_rig::{Actuator, Clock, PositionSource};
 ///
 /// # Errors
 /// The actuator fails in a way that ends the run. A camera that fails is silence: the loop freezes, then parks.
-#[allow(clippy::too_many_arguments, reason = "each is one part of the rig or one rule of the run")]
+#[allow(
+    clippy::too_many_arguments,
+    reason = "each is one part of the rig or one rule of the run"
+)]
 pub fn run<R: Reference, S: RunSink>(
     core: Core<R>,
     clock: &Clock,

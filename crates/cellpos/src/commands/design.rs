@@ -123,6 +123,13 @@ pub fn run(args: Args) -> CommandResult {
         plant.fix_noise_um = noise.value();
     }
     let limits = limits(&args)?;
+    let gains = args.kp.is_some() || args.setpoint_weight.is_some();
+    if gains && matches!(args.controller, Kind::Lqg | Kind::Mpc) {
+        return Err(Failure::bad_input(
+            "--kp, --ki and --setpoint-weight are gains of PI, not of lqg or mpc",
+            "leave them out, or write --controller pi",
+        ));
+    }
     let lead = lead(&args, plant.loop_delay_s())?;
     let controller = match (args.kp, args.ki) {
         _ if args.controller == Kind::Lqg => {
@@ -218,7 +225,7 @@ fn lead(args: &Args, loop_delay_s: f64) -> Result<Option<Lead>, Failure> {
         })),
         (Kind::Lead, ..) => Ok(Some(default_lead(loop_delay_s))),
         (_, None, None) => Ok(None),
-        (_, ..) => Err(Failure::bad_input(
+        _ => Err(Failure::bad_input(
             "--lead-zero and --lead-pole belong to --controller lead",
             "write --controller lead, or leave them out",
         )),

@@ -56,13 +56,19 @@ pub fn run(args: Args) -> CommandResult {
     } else {
         let verdict = match report.first_mismatch {
             None if report.missing_rows == 0 => "every command reproduced to the bit".to_string(),
-            None => format!("{} rows are missing; all others reproduced to the bit", report.missing_rows),
+            None => format!(
+                "{} rows are missing; all others reproduced to the bit",
+                report.missing_rows
+            ),
             Some(m) => format!(
                 "differs first at tick {}: {} recorded {:?}, replayed {:?}",
                 m.seq, m.column, m.recorded, m.replayed
             ),
         };
-        print_text(&format!("{} of {} ticks identical: {verdict}\n", report.identical, report.ticks))?;
+        print_text(&format!(
+            "{} of {} ticks identical: {verdict}\n",
+            report.identical, report.ticks
+        ))?;
     }
     let same = report.first_mismatch.is_none() && report.missing_rows == 0 && report.ticks > 0;
     Ok(if same { Outcome::Done } else { Outcome::Broken })
@@ -72,7 +78,10 @@ pub fn run(args: Args) -> CommandResult {
 pub fn setup(reader: &RunReader) -> Result<Setup, Failure> {
     let meta = reader.meta().map_err(|problem| {
         Failure::bad_input(
-            format!("{}: run.toml cannot be used: {problem}", reader.folder().display()),
+            format!(
+                "{}: run.toml cannot be used: {problem}",
+                reader.folder().display()
+            ),
             "a replay needs the configuration in run.toml",
         )
     })?;
@@ -82,7 +91,8 @@ pub fn setup(reader: &RunReader) -> Result<Setup, Failure> {
     let text = |table: &toml::Table| toml::to_string(table).map_err(Failure::failed);
     Ok(Setup {
         model: Model::from_toml_str(&text(&meta.model)?, &name).map_err(Failure::input)?,
-        controller: ControllerFile::from_toml_str(&text(&meta.controller)?, &name).map_err(Failure::input)?,
+        controller: ControllerFile::from_toml_str(&text(&meta.controller)?, &name)
+            .map_err(Failure::input)?,
         config: crate::toml_file::parse::<SetupConfig>(&text(&config)?, &name)?,
     })
 }

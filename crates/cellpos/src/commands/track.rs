@@ -32,7 +32,7 @@ pub struct Args {
     /// How long; left out: until Ctrl-C.
     #[arg(long)]
     duration: Option<Seconds>,
-    /// pi, lead, or the path of a controller.toml.
+    /// pi, lead, lqg, mpc, or the path of a controller.toml.
     #[arg(long, default_value = "pi")]
     controller: String,
     /// The rig; left out: emulated.
@@ -141,7 +141,14 @@ pub fn run(args: Args) -> CommandResult {
         eprintln!("\n{message}");
     })
     .map_err(Failure::failed)?;
-    let finished = drive(&setup, &mut rig, recording, ticks, args.best_effort, &operator)?;
+    let finished = drive(
+        &setup,
+        &mut rig,
+        recording,
+        ticks,
+        args.best_effort,
+        &operator,
+    )?;
     conclude(&args, &file, &setup, &rig, finished)
 }
 
@@ -233,10 +240,12 @@ fn create_run(args: &Args, file: &RigFile, setup: &Setup) -> Result<RunWriter, F
         inputs.push(Path::new(&args.controller));
     }
     for path in inputs {
-        meta.inputs.push(InputFile::of(path).map_err(Failure::failed)?);
+        meta.inputs
+            .push(InputFile::of(path).map_err(Failure::failed)?);
     }
     meta.config = table(&setup.config)?;
-    meta.config.insert("rig".to_string(), toml::Value::Table(table(file)?));
+    meta.config
+        .insert("rig".to_string(), toml::Value::Table(table(file)?));
     meta.model = setup
         .model
         .to_toml_string()
@@ -250,7 +259,13 @@ fn table(value: &impl Serialize) -> Result<toml::Table, Failure> {
     toml::Table::try_from(value).map_err(Failure::failed)
 }
 
-fn conclude(args: &Args, file: &RigFile, setup: &Setup, rig: &Rig, finished: Finished<Recording>) -> CommandResult {
+fn conclude(
+    args: &Args,
+    file: &RigFile,
+    setup: &Setup,
+    rig: &Rig,
+    finished: Finished<Recording>,
+) -> CommandResult {
     let Finished {
         summary,
         conditions,
@@ -263,7 +278,11 @@ fn conclude(args: &Args, file: &RigFile, setup: &Setup, rig: &Rig, finished: Fin
     }
     let healthy = summary.state == Life::Running && io_error.is_none();
     let run = sink.into_writer().map(|writer| {
-        let mut end = RunEnd::new(if healthy { "done" } else { summary.state.name() });
+        let mut end = RunEnd::new(if healthy {
+            "done"
+        } else {
+            summary.state.name()
+        });
         end.summary = toml::Table::try_from(&summary).unwrap_or_default();
         let done = writer.finish(end);
         if done.faults.rows_lost + done.faults.events_lost > 0 {
@@ -304,7 +323,11 @@ fn conclude(args: &Args, file: &RigFile, setup: &Setup, rig: &Rig, finished: Fin
     } else {
         print_text(&text(&report))?;
     }
-    Ok(if healthy { Outcome::Done } else { Outcome::Broken })
+    Ok(if healthy {
+        Outcome::Done
+    } else {
+        Outcome::Broken
+    })
 }
 
 /// An error with what is behind it, on one line.
@@ -324,16 +347,34 @@ fn text(report: &Report) -> String {
     let nm = |value: Option<f64>| value.map_or_else(|| "-".to_string(), |nm| format!("{nm:.1} nm"));
     let mut out = String::new();
     let mut line = |name: &str, value: String| out.push_str(&format!("{name:<18}{value}\n"));
-    line("state", match s.safe_reason {
-        Some(reason) => format!("{} ({reason:?})", s.state.name()),
-        None => s.state.name().to_string(),
-    });
-    line("duration", format!("{:.3} s, {} ticks", s.duration_s, s.counts.ticks));
-    line("error, measured", format!("{} RMS after 2 s", nm(s.rms_measured_nm)));
+    line(
+        "state",
+        match s.safe_reason {
+            Some(reason) => format!("{} ({reason:?})", s.state.name()),
+            None => s.state.name().to_string(),
+        },
+    );
+    line(
+        "duration",
+        format!("{:.3} s, {} ticks", s.duration_s, s.counts.ticks),
+    );
+    line(
+        "error, measured",
+        format!("{} RMS after 2 s", nm(s.rms_measured_nm)),
+    );
     if s.rms_true_nm.is_some() {
-        line("error, true", format!("{} RMS after 2 s", nm(s.rms_true_nm)));
+        line(
+            "error, true",
+            format!("{} RMS after 2 s", nm(s.rms_true_nm)),
+        );
     }
-    line("lowest possible", format!("{} RMS (Brownian motion, delay and noise in force)", nm(report.bound_rms_nm)));
+    line(
+        "lowest possible",
+        format!(
+            "{} RMS (Brownian motion, delay and noise in force)",
+            nm(report.bound_rms_nm)
+        ),
+    );
     if let Some(step) = s.step {
         line(
             "step",
