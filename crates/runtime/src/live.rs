@@ -19,7 +19,7 @@ use crate::summary::{End, Statistics, Summary};
 use crate::tick_record::TickRecord;
 use crate::ticker::{Ends, Order, RingSizes, Ticker};
 use cellpos_control::Reference;
-use cellpos_rig::clock::monotonic_ns;
+use cellpos_rig::clock::{monotonic_ns, sleep_until_ns};
 use cellpos_rig::{Actuator, BoardReport, Clock, Measurement, PositionSource};
 use rtrb::{Consumer, Producer};
 use std::sync::atomic::{AtomicBool, AtomicU8, Ordering};
@@ -205,10 +205,18 @@ fn see(
     stop: &AtomicBool,
 ) -> Result<(), RunError> {
     const LOOK_UP_NS: i64 = 20_000_000;
+    /// A deadline that is past: only what has arrived already.
+    const NOW_NS: i64 = 0;
+    // Frames that piled up before the run are of no use to it.
+    while source.next(NOW_NS)?.is_some() {}
     while !stop.load(Ordering::Acquire) && !measurements.is_abandoned() {
         if let Some(measurement) = source.next(monotonic_ns() + LOOK_UP_NS)? {
             // A full ring means that control has not run for a second; the gap in the frame ids tells the rest.
             let _ = measurements.push(measurement);
+            // After a stall frames come in a burst: control is woken for the newest, not for each of the past.
+            while let Some(measurement) = source.next(NOW_NS)? {
+                let _ = measurements.push(measurement);
+            }
             control.unpark();
         }
     }
@@ -227,6 +235,7 @@ fn control<R: Reference>(
     let grace_ns = period_ns * 3 / 10;
     let mut watch = EndWatch::new(end);
     let mut last_ns = monotonic_ns();
+    let mut last_tick_ns = last_ns;
     let end = loop {
         let due_ns = last_ns + period_ns + grace_ns;
         let timer = loop {
@@ -239,6 +248,9 @@ fn control<R: Reference>(
             }
             thread::park_timeout(Duration::from_nanos((due_ns - now_ns) as u64));
         };
+        // However the frames come, two ticks are never closer than half a period.
+        sleep_until_ns(last_tick_ns + period_ns / 2);
+        last_tick_ns = monotonic_ns();
         // After a timer tick the next one is due a period later; after a stall the past is not made up for.
         let now_ns = monotonic_ns();
         last_ns = if timer && now_ns - due_ns < period_ns {
