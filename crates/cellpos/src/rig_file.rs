@@ -53,7 +53,7 @@ pub enum ActuatorConfig {
     Emulated {},
     /// A board behind a serial port.
     Serial {
-        /// Device, for example /dev/ttyUSB0.
+        /// Device, for example /dev/ttyUSB0; a relative path is meant from the folder of the file.
         port: String,
         /// Baud rate; a pseudo-terminal takes any.
         #[serde(default = "baud")]
@@ -152,6 +152,13 @@ impl RigFile {
         let folder = path.parent().unwrap_or(Path::new(""));
         if let CameraConfig::Socket { socket, .. } = &mut file.camera {
             *socket = folder.join(&*socket);
+        }
+        if let ActuatorConfig::Serial { port, .. } = &mut file.actuator {
+            // A relative path is a link beside the file if there is one, else a name of the system's own (COM5).
+            let beside = folder.join(&*port);
+            if beside.exists() {
+                *port = beside.display().to_string();
+            }
         }
         if file.emulator.model != "eq6" {
             file.emulator.model = folder.join(&file.emulator.model).display().to_string();
