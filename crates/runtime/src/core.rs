@@ -418,8 +418,16 @@ impl<R: Reference> Core<R> {
                 });
                 stale = true;
             } else {
-                let missing =
-                    (m.frame_id - last_id).saturating_sub(u64::from(input.drained.max(1)));
+                let expected = m.frame_id - last_id;
+                let arrived = u64::from(input.drained.max(1));
+                if arrived > expected {
+                    // More frames than ids: some came twice, or one of them is older than the last tick's.
+                    tick.flags.set(TickFlags::DOUBLED_FRAME);
+                    tick.event(EventKind::FrameRepeated {
+                        frame_id: m.frame_id,
+                    });
+                }
+                let missing = expected.saturating_sub(arrived);
                 if missing > 0 {
                     tick.flags.set(TickFlags::DROPPED_FRAME);
                     tick.event(EventKind::FramesDropped { count: missing });

@@ -175,7 +175,7 @@ pub enum EventKind {
     },
     /// A frame came twice, or after a newer one.
     FrameRepeated {
-        /// Its id.
+        /// Its id; where it came together with newer ones, the newest's.
         frame_id: u64,
     },
     /// A frame with a new id is older than allowed, or its time stamp does not advance.

@@ -154,10 +154,13 @@ impl<R: Reference> Ticker<R> {
     pub fn tick(&mut self, due_ns: i64, request: Request) -> Life {
         let start_ns = self.clock.now_ns();
         let compute_from_ns = monotonic_ns();
-        let mut newest = None;
+        let mut newest: Option<Measurement> = None;
         let mut drained = 0;
         while let Ok(measurement) = self.measurements.pop() {
-            newest = Some(measurement);
+            // The newest by id: a camera may deliver a frame after its successor.
+            if newest.is_none_or(|newest| measurement.frame_id > newest.frame_id) {
+                newest = Some(measurement);
+            }
             drained += 1;
         }
         let mut board = None;
@@ -165,7 +168,7 @@ impl<R: Reference> Ticker<R> {
             board = Some(report);
         }
         let since_start = |ns: i64| ns - self.start_ns;
-        let ready_ns = newest.map_or(due_ns, |m: Measurement| m.ready_ns);
+        let ready_ns = newest.map_or(due_ns, |m| m.ready_ns);
         let input = TickInput {
             time_ns: since_start(start_ns),
             measurement: newest.map(|m| Measurement {

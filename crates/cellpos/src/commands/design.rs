@@ -32,7 +32,7 @@ enum Kind {
 #[command(after_help = "Examples:
   cellpos design --model eq6 --delay 2.5ms
   cellpos design --model eq6 --delay 2.5ms --kp 0.46 --ki 19.5 --json
-  cellpos design --model model.toml --max-ms 1.6 --min-pm 40 --output controller.toml
+  cellpos design --model model.toml --max-ms 1.6 --min-pm 40 --out controller.toml
 
 The loop delay contains half a sample of hold: a 2 ms camera path at 1 kHz is 2.5ms. Without gains the PI controller of
 largest integral gain (fastest rejection of drift) under --max-ms and --max-mt is searched. Exit code 1 when the loop is
@@ -95,7 +95,7 @@ pub struct Args {
     fix_noise: Option<cellpos_units::Micrometers>,
     /// Write the controller to this file.
     #[arg(long)]
-    output: Option<PathBuf>,
+    out: Option<PathBuf>,
     /// Print one JSON object on standard output.
     #[arg(long)]
     json: bool,
@@ -159,7 +159,7 @@ pub fn run(args: Args) -> CommandResult {
         limits,
     };
     let report = design(&request).map_err(Failure::input)?;
-    if let Some(path) = &args.output {
+    if let Some(path) = &args.out {
         let file = controller_file(&request, &report);
         std::fs::write(path, file.to_toml_string()).map_err(Failure::failed)?;
     }

@@ -7,7 +7,7 @@ use std::path::PathBuf;
 /// Arguments of `cellpos export`.
 #[derive(Debug, clap::Args)]
 #[command(
-    after_help = "Example:\n  cellpos export runs/20261121T093000Z-track --format csv --output track.csv\n\n\
+    after_help = "Example:\n  cellpos export runs/20261121T093000Z-track --format csv --out track.csv\n\n\
                   Row k of the CSV: the displacement commanded from time_s on, held until the next row; bead_um is \
                   the position that the camera had delivered just before, empty without a bead."
 )]
@@ -19,7 +19,7 @@ pub struct Args {
     format: ExportFormat,
     /// The file to write; without it `<run>.csv` or `<run>.parquet` beside the folder.
     #[arg(long)]
-    output: Option<PathBuf>,
+    out: Option<PathBuf>,
     /// Print one JSON object on standard output.
     #[arg(long)]
     json: bool,
@@ -38,7 +38,7 @@ pub fn run(args: Args) -> CommandResult {
         ExportFormat::Csv => (Format::Csv, "csv"),
         ExportFormat::Parquet => (Format::Parquet, "parquet"),
     };
-    let output = args.output.unwrap_or_else(|| {
+    let output = args.out.unwrap_or_else(|| {
         let mut name = args.run.file_name().unwrap_or("run".as_ref()).to_owned();
         name.push(format!(".{extension}"));
         args.run.with_file_name(name)
