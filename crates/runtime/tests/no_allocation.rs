@@ -1,0 +1,95 @@
+//! A tick, rings and all, allocates nothing: shown by an allocator that counts.
+#![allow(unsafe_code)]
+
+mod common;
+
+use cellpos_control::ControllerKind;
+use cellpos_rig::Clock;
+use cellpos_runtime::ticker::{RingSizes, Ticker};
+use cellpos_runtime::{Life, Request};
+use cellpos_vision::Verdict;
+use common::{controller, core, measurement};
+use std::alloc::{GlobalAlloc, Layout, System};
+use std::cell::Cell;
+
+thread_local! {
+    static COUNT: Cell<usize> = const { Cell::new(0) };
+}
+
+struct Counting;
+
+// SAFETY: every call is passed on to the system's allocator unchanged.
+unsafe impl GlobalAlloc for Counting {
+    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
+        let _ = COUNT.try_with(|c| c.set(c.get() + 1));
+        unsafe { System.alloc(layout) }
+    }
+    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
+        unsafe { System.dealloc(pointer, layout) }
+    }
+}
+
+#[global_allocator]
+static ALLOCATOR: Counting = Counting;
+
+/// Ticks through arming, running, coasting, freezing, a stale frame, a stop by the operator and Safe.
+fn allocations_per_run(kind: ControllerKind) -> (usize, bool) {
+    let clock = Clock::virtual_at(0);
+    let (mut ticker, mut ends) = Ticker::new(
+        core(&controller(kind), false),
+        clock.clone(),
+        0,
+        RingSizes::default(),
+    );
+    let before = COUNT.with(Cell::get);
+    let mut ran = false;
+    for k in 0..3000_u64 {
+        let due_ns = k as i64 * 1_000_000;
+        clock.sleep_until_ns(due_ns);
+        let wobble_um = 0.1 * ((k * 7919) % 13) as f64 - 0.6;
+        let mut m = measurement(k, wobble_um);
+        match k {
+            500..510 | 700..900 => m.verdict = Verdict::NoSignal,
+            // Nothing comes at all.
+            1000..1030 => m.frame_id = 0,
+            // An old buffer under a new id.
+            1100 => m.mid_exposure_ns -= 10_000_000,
+            _ => {}
+        }
+        if m.frame_id > 0 {
+            ends.measurements.push(m).unwrap();
+        }
+        let request = match k {
+            1500..1600 => Request::Freeze,
+            2500.. => Request::Park,
+            _ => Request::None,
+        };
+        ran |= ticker.tick(due_ns, request) == Life::Running;
+        // The other ends of the rings, which live on threads that may allocate, do not here.
+        while ends.orders.pop().is_ok() {}
+        while ends.records.pop().is_ok() {}
+        while ends.events.pop().is_ok() {}
+    }
+    (COUNT.with(Cell::get) - before, ran)
+}
+
+#[test]
+fn no_tick_allocates_whatever_happens() {
+    for kind in [
+        ControllerKind::Pi,
+        ControllerKind::Lead,
+        ControllerKind::Lqg,
+        ControllerKind::Mpc,
+    ] {
+        let (allocations, ran) = allocations_per_run(kind);
+        assert!(ran, "{kind:?}: the loop was never closed");
+        assert_eq!(allocations, 0, "{kind:?}");
+    }
+}
+
+#[test]
+fn the_allocator_counts() {
+    let before = COUNT.with(Cell::get);
+    std::hint::black_box(vec![1_u8; 64]);
+    assert_eq!(COUNT.with(Cell::get) - before, 1);
+}
