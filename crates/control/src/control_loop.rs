@@ -49,8 +49,20 @@ pub struct LoopInput<'a> {
     pub mode: Mode,
     /// Added to the controller's wish in [`Mode::Run`], um of PZT: excitation for identification in closed loop.
     pub excitation_um: f64,
-    /// When an optimising controller must be done; `None` (always on the virtual clock) sets no deadline.
-    pub deadline: Option<std::time::Instant>,
+    /// How long an optimising controller may take.
+    pub solver: SolverTerms,
+}
+
+/// How long an optimising controller may take in a tick.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum SolverTerms {
+    /// As long as it needs: the virtual clock.
+    #[default]
+    Unlimited,
+    /// Until then; the time that it took is reported.
+    Until(std::time::Instant),
+    /// A recorded tick again: it ends as it ended then. Without this a deadline would not replay to the bit.
+    Recorded(SolverStatus),
 }
 
 /// What happened in a tick.
@@ -85,6 +97,18 @@ pub enum SolverStatus {
     FallbackPi = 3,
 }
 
+impl SolverStatus {
+    /// The status of a number in a record; anything unknown counts as not used.
+    pub fn from_number(number: u8) -> Self {
+        match number {
+            1 => Self::Solved,
+            2 => Self::PreviousPlan,
+            3 => Self::FallbackPi,
+            _ => Self::NotUsed,
+        }
+    }
+}
+
 /// Account of the optimiser of a tick.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct SolverReport {
@@ -94,6 +118,8 @@ pub struct SolverReport {
     pub iterations: u16,
     /// Constraints active at the solution.
     pub active: u16,
+    /// Time it took, ns; 0 where no deadline was set.
+    pub solve_ns: u32,
 }
 
 /// What a tick gives.
@@ -358,7 +384,10 @@ impl ControlLoop {
             bead_um
         };
         let mut pi = state.pi;
-        let proportional_um = self.pi.proportional(&mut pi, reference_um, bead_um);
+        // While something else decides, PI follows as if the reference were where the bead is: the way from there to
+        // the reference is then a step like any other once PI takes over, not an offset for the integrator alone.
+        let followed_um = if controls { reference_um } else { bead_um };
+        let proportional_um = self.pi.proportional(&mut pi, followed_um, bead_um);
         let mut on_reference = state.feed_forward;
         if controls {
             self.forward.meet(&mut on_reference, reference_um);

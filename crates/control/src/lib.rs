@@ -31,7 +31,7 @@ mod state;
 pub use config::{ConfigError, ControllerFile, ControllerKind, PiFile};
 pub use control_loop::{
     ControlLoop, Controller, ControllerConfig, LoopConfig, LoopFlags, LoopInput, LoopOutput,
-    Measurement, Mode, SolverReport, SolverStatus,
+    Measurement, Mode, SolverReport, SolverStatus, SolverTerms,
 };
 pub use error::{BuildError, Parameter};
 pub use estimator::{Estimator, EstimatorConfig, EstimatorState, HISTORY};

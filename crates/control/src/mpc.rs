@@ -8,7 +8,9 @@
 mod clarabel_qp;
 
 use crate::active_set::{ABSENT, QpEnd, QpMatrices, QpVectors, ROWS, VARS, WorkingSet};
-use crate::control_loop::{ControlLoop, LoopInput, Prepared, SolverReport, SolverStatus};
+use crate::control_loop::{
+    ControlLoop, LoopInput, Prepared, SolverReport, SolverStatus, SolverTerms,
+};
 use crate::error::{BuildError, check};
 use crate::feedback::{DEVIATION, Deviation, Feedback};
 use crate::limits::Limits;
@@ -17,6 +19,7 @@ use crate::riccati::lq_feedback;
 use clarabel_qp::ClarabelQp;
 use nalgebra::{DMatrix, RowDVector};
 use serde::{Deserialize, Serialize};
+use std::time::Instant;
 
 /// Ticks that the plan looks ahead.
 pub const HORIZON: usize = 40;
@@ -259,14 +262,27 @@ impl MpcWorkspace {
         let neutral = prepared.estimate.neutral_um;
         let reference = self.reference_plan(control, input, prepared, limits);
         let vectors = self.vectors(prepared, &reference, limits, previous_um);
+        let (from, deadline) = match input.solver {
+            SolverTerms::Until(deadline) => (Some(Instant::now()), Some(deadline)),
+            SolverTerms::Unlimited | SolverTerms::Recorded(_) => (None, None),
+        };
+        let gave_up = matches!(
+            input.solver,
+            SolverTerms::Recorded(SolverStatus::PreviousPlan | SolverStatus::FallbackPi)
+        );
         let (end, iterations, active) = match &mut self.clarabel {
-            Some(solver) => solver.solve(&vectors, input.deadline),
+            Some(_) if gave_up => (QpEnd::GaveUp, 0, 0),
+            Some(solver) => solver.solve(&vectors, deadline),
+            // No deadline: its iterations are bounded, and it ends the same way in a replay.
             None => {
                 let (end, iterations) = self.condensed.matrices.solve(&vectors, &mut self.working);
                 let active = u16::try_from(self.working.len()).unwrap_or(u16::MAX);
                 (end, iterations, active)
             }
         };
+        let solve_ns = from.map_or(0, |from| {
+            u32::try_from(from.elapsed().as_nanos()).unwrap_or(u32::MAX)
+        });
         if let QpEnd::Solved(w) = end {
             let mut tick = 0;
             for (length, w) in BLOCKS.iter().zip(&w) {
@@ -282,6 +298,7 @@ impl MpcWorkspace {
                     status: SolverStatus::Solved,
                     iterations,
                     active,
+                    solve_ns,
                 },
             );
         }
@@ -302,6 +319,7 @@ impl MpcWorkspace {
                 status,
                 iterations,
                 active,
+                solve_ns,
             },
         )
     }

@@ -342,3 +342,46 @@ fn a_state_packed_into_16_numbers_goes_on_to_the_same_bits() {
         rig.advance(out.command_um);
     }
 }
+
+/// True positions over 60 ticks after a loop closes on a reference that stood 10 um away all along.
+fn closing_10_um_away(setpoint_weight: f64, seed: u64) -> Vec<f64> {
+    let pi = Pi {
+        setpoint_weight,
+        ..Pi::new(PUBLISHED.0, PUBLISHED.1)
+    };
+    let control = ControlLoop::new(config(pi, 2e-3)).unwrap();
+    let mut state = control.start(20.0, 20.0);
+    let mut rig = SimulatedRig::new(RigConfig::eq6(seed)).unwrap();
+    (0..160)
+        .filter_map(|k| {
+            let mut input = to(10.0, rig.measure());
+            if k < 100 {
+                // As in arming: something else decides, and the reference is already where it will be.
+                input.mode = Mode::Direct(20.0);
+            }
+            let at = rig.true_um();
+            let out = control.step(&mut state, &input);
+            rig.advance(out.command_um);
+            (k >= 100).then_some(at)
+        })
+        .collect()
+}
+
+#[test]
+fn a_loop_that_closes_away_from_its_reference_goes_there_as_on_a_step() {
+    for seed in 0..20 {
+        let path = closing_10_um_away(Pi::DEFAULT_SETPOINT_WEIGHT, seed);
+        let last_outside = path.iter().rposition(|p| (p - 10.0).abs() > 0.5).unwrap();
+        assert!(last_outside < 20, "seed {seed}: {last_outside} ms");
+        let highest = path.iter().copied().fold(0.0, f64::max);
+        assert!(highest < 11.0, "seed {seed}: {highest} um");
+    }
+    let (low, high) = (closing_10_um_away(0.5, 1), closing_10_um_away(0.9, 1));
+    let most = |path: &[f64]| path.iter().copied().fold(0.0, f64::max);
+    assert!(
+        most(&high) > most(&low) + 0.5,
+        "the set-point weight decides: {} and {}",
+        most(&low),
+        most(&high)
+    );
+}

@@ -152,10 +152,14 @@ fn a_deadline_in_the_past_falls_back_to_the_previous_plan_and_then_to_pi() {
     let mut state = controller.start(20.0, 20.0);
     let mut seen = Vec::new();
     for k in 0..60 {
-        let deadline = (k >= 20).then(std::time::Instant::now);
+        let solver = if k >= 20 {
+            SolverTerms::Until(std::time::Instant::now())
+        } else {
+            SolverTerms::Unlimited
+        };
         let input = LoopInput {
             measurement: Some(rig.measure()),
-            deadline,
+            solver,
             ..LoopInput::default()
         };
         let out = controller.step(&mut state, &input);

@@ -39,7 +39,7 @@ impl Kind {
 }
 
 /// The columns before the controller's state, in the order of [`visit`].
-const FIXED: [(&str, Kind); 22] = [
+const FIXED: [(&str, Kind); 26] = [
     ("seq", Kind::U64),
     ("time_ns", Kind::I64),
     ("frame_id", Kind::U64),
@@ -62,6 +62,10 @@ const FIXED: [(&str, Kind); 22] = [
     ("request", Kind::U8),
     ("board", Kind::U8),
     ("board_fault", Kind::U8),
+    ("solver_status", Kind::U8),
+    ("solver_iterations", Kind::U8),
+    ("solver_active", Kind::U8),
+    ("solver_ns", Kind::U32),
 ];
 
 /// Name and type of every column.
@@ -115,6 +119,10 @@ fn visit(row: &TickRecord, to: &mut impl Take) {
     to.u8(row.request);
     to.u8(row.board);
     to.u8(row.board_fault);
+    to.u8(row.solver_status);
+    to.u8(row.solver_iterations);
+    to.u8(row.solver_active);
+    to.u32(row.solver_ns);
     for value in row.controller_state {
         to.f64(value);
     }
@@ -145,6 +153,10 @@ pub(crate) fn unknown() -> TickRecord {
         drained: 0,
         wake_ns: 0,
         compute_ns: 0,
+        solver_status: 0,
+        solver_iterations: 0,
+        solver_active: 0,
+        solver_ns: 0,
         controller_state: [f64::NAN; CONTROLLER_STATE_LEN],
     }
 }
@@ -175,6 +187,10 @@ pub(crate) fn set(row: &mut TickRecord, column: usize, bits: u64) {
         19 => row.request = bits as u8,
         20 => row.board = bits as u8,
         21 => row.board_fault = bits as u8,
+        22 => row.solver_status = bits as u8,
+        23 => row.solver_iterations = bits as u8,
+        24 => row.solver_active = bits as u8,
+        25 => row.solver_ns = bits as u32,
         _ => {
             if let Some(state) = column
                 .checked_sub(FIXED.len())

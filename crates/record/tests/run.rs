@@ -34,6 +34,10 @@ fn row(seq: u64) -> TickRecord {
         drained: 1,
         wake_ns: 1234,
         compute_ns: 5678,
+        solver_status: 1,
+        solver_iterations: 9,
+        solver_active: 3,
+        solver_ns: 95_000,
         controller_state: std::array::from_fn(|index| index as f64 + x),
     }
 }
@@ -54,6 +58,8 @@ fn bits(row: &TickRecord) -> Vec<u64> {
         row.drained.into(),
         row.wake_ns.into(),
         row.compute_ns.into(),
+        row.solver_ns.into(),
+        row.solver_iterations.into(),
     ];
     let floats = [
         row.measured_um,
@@ -284,7 +290,7 @@ fn exports_carry_units_in_their_names_and_follow_the_row_convention() {
             assert_eq!(value.to_bits(), (20.0 + rows as f64 / 7.0).to_bits());
             rows += 1;
         }
-        assert_eq!(batch.num_columns(), 22 + CONTROLLER_STATE_LEN);
+        assert_eq!(batch.num_columns(), 26 + CONTROLLER_STATE_LEN);
     }
     assert_eq!(rows, 100);
     let names: Vec<_> = std::fs::read_dir(root.path().join("out"))

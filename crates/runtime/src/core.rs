@@ -18,194 +18,20 @@
 //! [`Life::Safe`].
 
 use crate::arming::{Arming, ArmingConfig, ArmingState, Step};
-use crate::life::{Event, EventKind, Events, FreezeReason, Life, Request, SafeReason};
+use crate::life::{EventKind, Events, FreezeReason, Life, Request, SafeReason};
+use crate::tick::Tick;
+pub use crate::tick::{Action, Counts, TickInput, TickOutput};
 use crate::tick_record::{TickFlags, TickRecord};
+pub use crate::timing::{CoreError, Timing};
 use cellpos_control::{
-    BuildError, Controller, LoopConfig, LoopInput, LoopOutput, LoopState,
-    Measurement as LoopMeasurement, Mode, Reference,
+    Controller, LoopConfig, LoopInput, LoopOutput, LoopState, Measurement as LoopMeasurement, Mode,
+    Reference, SolverStatus, SolverTerms,
 };
 use cellpos_link::{BoardState, Fault};
-use cellpos_plant::{PlantError, TransferFunction};
-use cellpos_rig::{BoardReport, Measurement};
+use cellpos_plant::TransferFunction;
+use cellpos_rig::BoardReport;
 use cellpos_units::Seconds;
 use cellpos_vision::Verdict;
-use serde::{Deserialize, Serialize};
-
-/// Times and counts of the loop. In TOML every key may be left out.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct Timing {
-    /// Period of the loop, us: that of the camera.
-    pub period_us: f64,
-    /// From the start of a tick to the latest hand-over of its command, us.
-    pub budget_us: f64,
-    /// From the middle of an exposure to the tick that uses it, ms: the camera path.
-    pub camera_delay_ms: f64,
-    /// Oldest exposure that may still be controlled on, ms.
-    pub oldest_ms: f64,
-    /// Late ticks, or stale frames, in a row that latch Safe.
-    pub faults_in_a_row: u32,
-    /// Ticks on prediction alone before the bead is frozen.
-    pub coast_ticks: u32,
-    /// Ticks without a position before Safe is latched.
-    pub lost_ticks: u32,
-    /// Silence of the board that latches Safe, ms.
-    pub board_silence_ms: f64,
-}
-
-impl Default for Timing {
-    fn default() -> Self {
-        Self {
-            period_us: 1000.0,
-            budget_us: 500.0,
-            camera_delay_ms: 2.0,
-            oldest_ms: 5.0,
-            faults_in_a_row: 5,
-            coast_ticks: 20,
-            lost_ticks: 1000,
-            board_silence_ms: 200.0,
-        }
-    }
-}
-
-impl Timing {
-    /// Period of the loop, ns.
-    pub fn period_ns(&self) -> i64 {
-        (self.period_us * 1e3).round() as i64
-    }
-
-    /// Budget of a tick, ns.
-    pub fn budget_ns(&self) -> i64 {
-        (self.budget_us * 1e3).round() as i64
-    }
-
-    fn ms_to_ns(ms: f64) -> i64 {
-        (ms * 1e6).round() as i64
-    }
-
-    /// Checks every value.
-    ///
-    /// # Errors
-    /// Key, value and what would be right.
-    pub fn validate(&self) -> Result<(), CoreError> {
-        let positive = |key, value: f64, most| {
-            if value.is_finite() && value > 0.0 && value <= most {
-                Ok(())
-            } else {
-                Err(CoreError::Timing { key, value, most })
-            }
-        };
-        positive("period_us", self.period_us, 1e6)?;
-        positive("budget_us", self.budget_us, self.period_us)?;
-        positive("camera_delay_ms", self.camera_delay_ms, 1e3)?;
-        positive("oldest_ms", self.oldest_ms, 1e4)?;
-        positive("board_silence_ms", self.board_silence_ms, 1e5)?;
-        positive("faults_in_a_row", f64::from(self.faults_in_a_row), 1e6)?;
-        positive("coast_ticks", f64::from(self.coast_ticks), 1e6)?;
-        positive("lost_ticks", f64::from(self.lost_ticks), 1e9)
-    }
-}
-
-/// Why a core cannot be built.
-#[derive(Debug, thiserror::Error)]
-pub enum CoreError {
-    /// A number of [`Timing`].
-    #[error("timing: {key} = {value}: must be above 0 and at most {most}")]
-    Timing {
-        /// Key.
-        key: &'static str,
-        /// Value found.
-        value: f64,
-        /// Largest value allowed.
-        most: f64,
-    },
-    /// Controller, estimator or limits.
-    #[error("controller: {0}")]
-    Control(#[from] BuildError),
-    /// The plant of the arming check.
-    #[error("plant: {0}")]
-    Plant(#[from] PlantError),
-}
-
-/// What a tick is given by its driver.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct TickInput {
-    /// Start of the tick since the start of the run, ns.
-    pub time_ns: i64,
-    /// The newest measurement in the ring; `None` on a timer tick. Its times, too, count from the start of the run.
-    pub measurement: Option<Measurement>,
-    /// Measurements found in the ring.
-    pub drained: u32,
-    /// How long the previous tick took, ns, if it was late.
-    pub previous_late_ns: Option<u32>,
-    /// The previous tick's command found the actuator ring full.
-    pub previous_refused: bool,
-    /// The newest report of the board, if one came since the previous tick.
-    pub board: Option<BoardReport>,
-    /// What the operator asks for.
-    pub request: Request,
-}
-
-/// What the actuator thread is to do.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Action {
-    /// Hand this command to the board.
-    Command {
-        /// PZT displacement, um: finite, within range and slew.
-        command_um: f64,
-        /// Estimate of neutral, um: where the board would freeze.
-        neutral_um: f64,
-    },
-    /// Tell the board to ramp to park.
-    Park,
-    /// Nothing.
-    None,
-}
-
-/// What a tick gives.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct TickOutput {
-    /// What to do.
-    pub action: Action,
-    /// The record, less what only the driver knows (wake-up, compute time, late, ring full).
-    pub record: TickRecord,
-    /// What happened.
-    pub events: Events,
-}
-
-/// What went wrong so far, by kind.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
-pub struct Counts {
-    /// Ticks.
-    pub ticks: u64,
-    /// Ticks started by the timer: no frame came.
-    pub timer: u64,
-    /// Commands handed over late.
-    pub late: u64,
-    /// Ticks that never came.
-    pub skipped: u64,
-    /// Frames that were repeated, out of order, or older than allowed.
-    pub stale: u64,
-    /// Frame ids missing.
-    pub frames_lost: u64,
-    /// Frames that arrived behind a newer one and were not used.
-    pub superseded: u64,
-    /// Frames without a valid bead position.
-    pub fixes_lost: u64,
-    /// Positions refused as too far from the prediction.
-    pub gated: u64,
-    /// Ticks on prediction alone.
-    pub coasted: u64,
-    /// Ticks frozen.
-    pub frozen: u64,
-    /// Commands clipped to the range.
-    pub range_limited: u64,
-    /// Commands clipped to the slew limit.
-    pub slew_limited: u64,
-    /// Commands that found the actuator ring full.
-    pub refused: u64,
-}
-
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct State {
     seq: u64,
@@ -362,13 +188,13 @@ impl<R: Reference> Core<R> {
             }
         }
         let mode = self.advance_life(fix.map(|fix| fix.position_um), &mut tick);
-        let (output, reference_um) = self.control(fix, mode);
+        let (output, reference_um) = self.control(fix, mode, input.solver);
         if output.requested_um.is_nan() {
             self.latch(SafeReason::NotFinite, &mut tick);
         }
         self.account(&output, &mut tick);
         let action = self.action(&output, tick.seq);
-        self.count(input, tick.flags);
+        self.count(input, &output, tick.flags);
         let record = self.record(input, &output, reference_um, tick.flags);
         self.state.seq += 1;
         TickOutput {
@@ -581,7 +407,12 @@ impl<R: Reference> Core<R> {
         }
     }
 
-    fn control(&mut self, fix: Option<LoopMeasurement>, mode: Mode) -> (LoopOutput, f64) {
+    fn control(
+        &mut self,
+        fix: Option<LoopMeasurement>,
+        mode: Mode,
+        solver: SolverTerms,
+    ) -> (LoopOutput, f64) {
         let since = match self.state.life {
             Life::Running => self.state.seq - self.state.running_since,
             _ => 0,
@@ -593,6 +424,7 @@ impl<R: Reference> Core<R> {
             reference_um,
             preview_um: &self.preview_um,
             mode,
+            solver,
             ..LoopInput::default()
         };
         (
@@ -672,12 +504,17 @@ impl<R: Reference> Core<R> {
         }
     }
 
-    fn count(&mut self, input: &TickInput, flags: TickFlags) {
+    fn count(&mut self, input: &TickInput, output: &LoopOutput, flags: TickFlags) {
         let counts = &mut self.state.counts;
         counts.ticks += 1;
         counts.superseded += u64::from(input.drained.saturating_sub(1));
         counts.late += u64::from(input.previous_late_ns.is_some());
         counts.refused += u64::from(input.previous_refused);
+        match output.solver.status {
+            SolverStatus::PreviousPlan => counts.plans_reused += 1,
+            SolverStatus::FallbackPi => counts.solver_fallbacks += 1,
+            SolverStatus::NotUsed | SolverStatus::Solved => {}
+        }
         for (mask, counter) in [
             (TickFlags::TIMER, &mut counts.timer),
             (TickFlags::STALE, &mut counts.stale),
@@ -751,46 +588,11 @@ impl<R: Reference> Core<R> {
             drained: input.drained.min(255) as u8,
             wake_ns: 0,
             compute_ns: 0,
+            solver_status: output.solver.status as u8,
+            solver_iterations: output.solver.iterations.min(255) as u8,
+            solver_active: output.solver.active.min(255) as u8,
+            solver_ns: output.solver.solve_ns,
             controller_state: self.controller.control_loop().pack(&self.state.control),
-        }
-    }
-}
-
-struct Tick {
-    seq: u64,
-    time_ns: i64,
-    flags: TickFlags,
-    events: Events,
-}
-
-impl Tick {
-    fn event(&mut self, kind: EventKind) {
-        self.events.push(Event {
-            seq: self.seq,
-            time_ns: self.time_ns,
-            kind,
-        });
-    }
-
-    /// Start and end of a condition as a pair of events.
-    fn span(
-        &mut self,
-        since: &mut Option<u64>,
-        holds: bool,
-        period_us: f64,
-        started: EventKind,
-        ended: impl Fn(f64) -> EventKind,
-    ) {
-        match (*since, holds) {
-            (None, true) => {
-                *since = Some(self.seq);
-                self.event(started);
-            }
-            (Some(from), false) => {
-                *since = None;
-                self.event(ended((self.seq - from) as f64 * period_us * 1e-3));
-            }
-            _ => {}
         }
     }
 }

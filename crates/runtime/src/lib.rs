@@ -11,7 +11,9 @@ pub mod replay;
 pub mod run;
 pub mod summary;
 mod tick_record;
+mod tick;
 pub mod ticker;
+mod timing;
 pub mod virtual_run;
 
 pub use crate::core::{Action, Core, CoreError, TickInput, TickOutput, Timing};

@@ -7,7 +7,7 @@
 use crate::core::{Core, TickInput};
 use crate::life::Request;
 use crate::tick_record::{TickFlags, TickRecord};
-use cellpos_control::Reference;
+use cellpos_control::{Reference, SolverStatus, SolverTerms};
 use cellpos_link::{BoardState, Fault};
 use cellpos_rig::{BoardReport, Measurement};
 use cellpos_vision::Verdict;
@@ -154,6 +154,7 @@ fn input(record: &TickRecord, previous: Option<&TickRecord>) -> TickInput {
         previous_refused: previous.is_some_and(|p| p.flags.has(TickFlags::ACTUATOR_RING_FULL)),
         board,
         request: Request::from_number(record.request),
+        solver: SolverTerms::Recorded(SolverStatus::from_number(record.solver_status)),
     }
 }
 

@@ -99,6 +99,14 @@ pub struct TickRecord {
     pub wake_ns: u32,
     /// From the start of the tick to the hand-over of the command, ns; 0 on the virtual clock.
     pub compute_ns: u32,
+    /// How the optimiser ended (number of [`cellpos_control::SolverStatus`]; 0: none in use).
+    pub solver_status: u8,
+    /// Its iterations, at most 255.
+    pub solver_iterations: u8,
+    /// Constraints active at its solution, at most 255.
+    pub solver_active: u8,
+    /// Time it took, ns; 0 on the virtual clock.
+    pub solver_ns: u32,
     /// State of estimator and controller after the tick.
     pub controller_state: [f64; CONTROLLER_STATE_LEN],
 }

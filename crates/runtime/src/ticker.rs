@@ -4,9 +4,10 @@ use crate::core::{Action, Core, TickInput};
 use crate::latency::Latency;
 use crate::life::{Event, Life, Request};
 use crate::tick_record::{TickFlags, TickRecord};
-use cellpos_control::Reference;
+use cellpos_control::{Reference, SolverTerms};
 use cellpos_rig::clock::monotonic_ns;
 use cellpos_rig::{BoardReport, Clock, Measurement};
+use std::time::{Duration, Instant};
 use rtrb::{Consumer, Producer, RingBuffer};
 
 /// An order to the actuator thread.
@@ -80,6 +81,7 @@ pub struct Ticker<R> {
     clock: Clock,
     start_ns: i64,
     budget_ns: i64,
+    solver_time: Duration,
     measurements: Consumer<Measurement>,
     orders: Producer<Order>,
     reports: Consumer<BoardReport>,
@@ -101,6 +103,7 @@ impl<R: Reference> Ticker<R> {
         let (events, events_out) = RingBuffer::new(sizes.events.max(1));
         let ticker = Self {
             budget_ns: core.timing().budget_ns(),
+            solver_time: Duration::from_secs_f64(core.timing().solver_us * 1e-6),
             core,
             clock,
             start_ns,
@@ -153,6 +156,7 @@ impl<R: Reference> Ticker<R> {
     /// One tick. `due_ns`: when a timer tick was due; a frame's tick is due when its position was ready.
     pub fn tick(&mut self, due_ns: i64, request: Request) -> Life {
         let start_ns = self.clock.now_ns();
+        let tick_from = Instant::now();
         let compute_from_ns = monotonic_ns();
         let mut newest: Option<Measurement> = None;
         let mut drained = 0;
@@ -181,6 +185,12 @@ impl<R: Reference> Ticker<R> {
             previous_refused: self.previous_refused,
             board,
             request,
+            solver: if self.clock.is_virtual() {
+                // The virtual clock stands still while the solver works.
+                SolverTerms::Unlimited
+            } else {
+                SolverTerms::Until(tick_from + self.solver_time)
+            },
         };
         let output = self.core.step(&input);
         let mut record = output.record;
