@@ -7,8 +7,8 @@ use crate::tick_record::{TickFlags, TickRecord};
 use cellpos_control::{Reference, SolverTerms};
 use cellpos_rig::clock::monotonic_ns;
 use cellpos_rig::{BoardReport, Clock, Measurement};
-use std::time::{Duration, Instant};
 use rtrb::{Consumer, Producer, RingBuffer};
+use std::time::{Duration, Instant};
 
 /// An order to the actuator thread.
 #[derive(Debug, Clone, Copy, PartialEq)]

@@ -109,6 +109,7 @@ proptest! {
                 previous_refused: false,
                 board: None,
                 request: if calm { Request::None } else { tick.request },
+                solver: Default::default(),
             });
             if let Action::Command { command_um, neutral_um } = output.action {
                 prop_assert!(command_um.is_finite() && neutral_um.is_finite());
