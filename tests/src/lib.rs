@@ -1,4 +1,5 @@
-//! Whole-system tests.
+//! Whole-system tests: what they share.
 #![forbid(unsafe_code)]
 
+pub mod programs;
 pub mod truth;
