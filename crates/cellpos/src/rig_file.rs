@@ -9,10 +9,12 @@ use cellpos_plant::Model;
 use cellpos_rig::serial::SerialLine;
 use cellpos_rig::socket::SocketCamera;
 use cellpos_rig::{
-    Actuator, BoardHost, Calibration, Clock, EmulatedRig, PositionSource, VisionSource,
+    Actuator, BoardHost, Calibration, CalibrationFile, Camera, Clock, CommandedFlow, EmulatedRig,
+    FlowTap, PositionSource, VisionSource,
 };
 use cellpos_runtime::{ArmingConfig, Timing};
-use cellpos_vision::{Localiser, LocaliserConfig, ProfileSpec};
+use cellpos_units::Hertz;
+use cellpos_vision::{Localiser, LocaliserConfig, ProfileSpec, Tracker, TrackerConfig};
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -30,9 +32,15 @@ pub struct RigFile {
     /// From pixels to micrometres; the emulated camera brings its own.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub calibration: Option<Calibration>,
+    /// A calibration file instead of `[calibration]`, with date and uncertainty; from the folder of rig.toml.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub calibration_file: Option<PathBuf>,
     /// Localisation; left out: a ring profile for the bead of `[emulator]`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub vision: Option<LocaliserConfig>,
+    /// Tracking; left out: for a 1 um bead in water.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub tracking: Option<TrackerConfig>,
     /// Limits of the command, within those of the board.
     pub limits: Limits,
     /// Times and counts of the loop.
@@ -95,7 +103,9 @@ impl Default for RigFile {
             actuator: ActuatorConfig::Emulated {},
             camera: CameraConfig::Emulated {},
             calibration: None,
+            calibration_file: None,
             vision: None,
+            tracking: None,
             limits: Limits {
                 low_um: 0.0,
                 high_um: 40.0,
@@ -138,6 +148,19 @@ pub struct Rig {
     pub clock: Clock,
     /// What the user should know.
     pub warnings: Vec<String>,
+    flow: CommandedFlow,
+}
+
+/// Where a plant's gain from PZT displacement to bead velocity is read for the tracker's prediction.
+const FLOW_GAIN_AT: Hertz = Hertz(20.0);
+
+impl Rig {
+    /// Lets the tracker predict the bead with this plant's gain; until then it takes that of Eq. (6). The prediction
+    /// allows for a gain that is wrong by half.
+    pub fn expect(&self, model: &Model) {
+        self.flow
+            .set_gain_per_s(model.plant.velocity_gain_at(FLOW_GAIN_AT));
+    }
 }
 
 impl RigFile {
@@ -150,6 +173,20 @@ impl RigFile {
         file.validate(&path.display().to_string())?;
         // Paths in the file are meant from the file's own folder.
         let folder = path.parent().unwrap_or(Path::new(""));
+        if let Some(calibration) = &mut file.calibration_file {
+            *calibration = folder.join(&*calibration);
+            if file.calibration.is_some() {
+                return Err(Failure::bad_input(
+                    format!(
+                        "{}: both calibration_file and [calibration]",
+                        path.display()
+                    ),
+                    "keep the one that holds for this camera",
+                ));
+            }
+            let read = CalibrationFile::read(calibration).map_err(Failure::input)?;
+            file.calibration = Some(read.calibration());
+        }
         if let CameraConfig::Socket { socket, .. } = &mut file.camera {
             *socket = folder.join(&*socket);
         }
@@ -183,16 +220,16 @@ impl RigFile {
                 self.first_neutral_um, self.limits.low_um, self.limits.high_um
             )));
         }
-        if let Some(calibration) = &self.calibration {
-            let sound = calibration.pixel_um > 0.0
-                && calibration.pixel_um.is_finite()
-                && calibration.origin_px.is_finite()
-                && calibration.sign.abs() == 1.0;
-            if !sound {
-                return Err(say(
-                    &"[calibration]: pixel_um must be above 0, origin_px a number, sign +1 or -1",
-                ));
-            }
+        let problem = self.calibration.as_ref().and_then(Calibration::problem);
+        if let Some((key, value, must_be)) = problem {
+            return Err(say(&format!(
+                "[calibration] {key} = {value}: must be {must_be}"
+            )));
+        }
+        if let Some(tracking) = &self.tracking {
+            tracking
+                .check()
+                .map_err(|error| say(&format!("[tracking] {error}")))?;
         }
         Ok(())
     }
@@ -214,6 +251,22 @@ impl RigFile {
         Localiser::new(config).map_err(|error| {
             Failure::bad_input(format!("[vision] {error}"), "see examples/rig.toml")
         })
+    }
+
+    /// A camera with its tracker.
+    fn tracked<C: Camera + 'static>(
+        &self,
+        camera: C,
+        calibration: Calibration,
+        clock: &Clock,
+        flow: &CommandedFlow,
+    ) -> Result<Box<dyn PositionSource>, Failure> {
+        let config = self
+            .tracking
+            .unwrap_or_else(|| TrackerConfig::for_pixel_um(calibration.pixel_um));
+        let tracker = Tracker::new(self.localiser()?, config).map_err(Failure::input)?;
+        let source = VisionSource::new(camera, tracker, calibration, clock.clone());
+        Ok(Box::new(source.with_flow(flow.clone())))
     }
 
     /// Connects camera and board.
@@ -247,15 +300,12 @@ impl RigFile {
         let model = Model::load(&self.emulator.model).map_err(Failure::input)?;
         let emulated = EmulatedRig::new(self.board, &self.emulator, &model, clock.clone())
             .map_err(Failure::input)?;
+        let flow = nominal_flow()?;
         let source: Box<dyn PositionSource> = match frames {
             Frames::Off => Box::new(emulated.positions()),
-            Frames::On => Box::new(VisionSource::new(
-                emulated.camera(),
-                self.localiser()?,
-                emulated.calibration(),
-                clock.clone(),
-            )),
+            Frames::On => self.tracked(emulated.camera(), emulated.calibration(), &clock, &flow)?,
         };
+        let board = emulated.actuator().map_err(Failure::failed)?;
         let mut warnings = Vec::new();
         if (self.emulator.latency_ms - self.timing.camera_delay_ms).abs() > 1e-9 {
             warnings.push(format!(
@@ -265,9 +315,10 @@ impl RigFile {
         }
         Ok(Rig {
             source,
-            actuator: Box::new(emulated.actuator().map_err(Failure::failed)?),
+            actuator: Box::new(FlowTap::new(board, flow.clone(), clock.clone())),
             clock,
             warnings,
+            flow,
         })
     }
 
@@ -290,7 +341,8 @@ impl RigFile {
                 "the USB adapter of {port} holds answers back for {ms} ms: write 1 to its latency_timer"
             ));
         }
-        let actuator = BoardHost::connect(line, Clock::Real).map_err(Failure::failed)?;
+        let board = BoardHost::connect(line, Clock::Real).map_err(Failure::failed)?;
+        let flow = nominal_flow()?;
         let camera = SocketCamera::connect(
             socket,
             rate_hz,
@@ -299,15 +351,11 @@ impl RigFile {
         )
         .map_err(Failure::failed)?;
         Ok(Rig {
-            source: Box::new(VisionSource::new(
-                camera,
-                self.localiser()?,
-                calibration,
-                Clock::Real,
-            )),
-            actuator: Box::new(actuator),
+            source: self.tracked(camera, calibration, &Clock::Real, &flow)?,
+            actuator: Box::new(FlowTap::new(board, flow.clone(), Clock::Real)),
             clock: Clock::Real,
             warnings,
+            flow,
         })
     }
 
@@ -318,4 +366,12 @@ impl RigFile {
             ActuatorConfig::Emulated {} => None,
         }
     }
+}
+
+/// The flow of Eq. (6)'s plant, nothing commanded yet.
+fn nominal_flow() -> Result<CommandedFlow, Failure> {
+    let nominal = Model::load("eq6").map_err(Failure::input)?;
+    Ok(CommandedFlow::new(
+        nominal.plant.velocity_gain_at(FLOW_GAIN_AT),
+    ))
 }

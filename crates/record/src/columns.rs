@@ -39,7 +39,7 @@ impl Kind {
 }
 
 /// The columns before the controller's state, in the order of [`visit`].
-const FIXED: [(&str, Kind); 26] = [
+const FIXED: [(&str, Kind); 28] = [
     ("seq", Kind::U64),
     ("time_ns", Kind::I64),
     ("frame_id", Kind::U64),
@@ -66,6 +66,8 @@ const FIXED: [(&str, Kind); 26] = [
     ("solver_iterations", Kind::U8),
     ("solver_active", Kind::U8),
     ("solver_ns", Kind::U32),
+    ("track", Kind::U8),
+    ("decision", Kind::U8),
 ];
 
 /// Name and type of every column.
@@ -123,6 +125,8 @@ fn visit(row: &TickRecord, to: &mut impl Take) {
     to.u8(row.solver_iterations);
     to.u8(row.solver_active);
     to.u32(row.solver_ns);
+    to.u8(row.track);
+    to.u8(row.decision);
     for value in row.controller_state {
         to.f64(value);
     }
@@ -138,6 +142,8 @@ pub(crate) fn unknown() -> TickRecord {
         measured_um: f64::NAN,
         variance_um2: f64::NAN,
         verdict: 255,
+        track: 255,
+        decision: 255,
         target_um: f64::NAN,
         estimate_um: f64::NAN,
         neutral_um: f64::NAN,
@@ -191,6 +197,8 @@ pub(crate) fn set(row: &mut TickRecord, column: usize, bits: u64) {
         23 => row.solver_iterations = bits as u8,
         24 => row.solver_active = bits as u8,
         25 => row.solver_ns = bits as u32,
+        26 => row.track = bits as u8,
+        27 => row.decision = bits as u8,
         _ => {
             if let Some(state) = column
                 .checked_sub(FIXED.len())

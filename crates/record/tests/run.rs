@@ -19,6 +19,8 @@ fn row(seq: u64) -> TickRecord {
         measured_um: (x * 0.1).sin(),
         variance_um2: 4e-4,
         verdict: 0,
+        track: 1,
+        decision: 10,
         target_um: 0.0,
         estimate_um: (x * 0.1).cos(),
         neutral_um: 20.0,
@@ -50,6 +52,8 @@ fn bits(row: &TickRecord) -> Vec<u64> {
         row.frame_id,
         row.mid_exposure_ns as u64,
         row.verdict.into(),
+        row.track.into(),
+        row.decision.into(),
         row.life.into(),
         row.request.into(),
         row.board.into(),
@@ -290,7 +294,7 @@ fn exports_carry_units_in_their_names_and_follow_the_row_convention() {
             assert_eq!(value.to_bits(), (20.0 + rows as f64 / 7.0).to_bits());
             rows += 1;
         }
-        assert_eq!(batch.num_columns(), 26 + CONTROLLER_STATE_LEN);
+        assert_eq!(batch.num_columns(), 28 + CONTROLLER_STATE_LEN);
     }
     assert_eq!(rows, 100);
     let names: Vec<_> = std::fs::read_dir(root.path().join("out"))

@@ -1,18 +1,8 @@
 //! The calibration file: pixel size, axis and sign, with their date and uncertainty.
 
-use crate::source::Calibration;
+use crate::calibration::{Axis, Calibration};
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
-
-/// Along which axis of the picture the channel lies.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Axis {
-    /// Along the rows.
-    X,
-    /// Along the columns.
-    Y,
-}
 
 /// What a calibration file holds.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -28,6 +18,12 @@ pub struct CalibrationFile {
     pub sign: i8,
     /// Coordinate of position 0 along the axis, px.
     pub origin_px: f64,
+    /// Angle from the axis to the channel, positive towards the rising other coordinate, degrees.
+    #[serde(default)]
+    pub tilt_deg: f64,
+    /// Coordinate of position 0 across the axis, px; of no effect without a tilt.
+    #[serde(default)]
+    pub origin_across_px: f64,
     /// Day of the calibration, YYYY-MM-DD.
     pub date: String,
     /// How it was done: stage micrometer, known step, maker's data.
@@ -109,13 +105,9 @@ impl CalibrationFile {
                 })
             }
         };
-        let pixel_ok = self.pixel_um.is_finite() && (1e-4..=1e3).contains(&self.pixel_um);
-        refuse(
-            pixel_ok,
-            "pixel_um",
-            self.pixel_um.to_string(),
-            "between 0.0001 and 1000 um",
-        )?;
+        if let Some((key, value, must_be)) = self.calibration().problem() {
+            refuse(false, key, value.to_string(), must_be)?;
+        }
         let sd_ok = self.pixel_um_sd.is_finite()
             && self.pixel_um_sd >= 0.0
             && self.pixel_um_sd < self.pixel_um;
@@ -124,18 +116,6 @@ impl CalibrationFile {
             "pixel_um_sd",
             self.pixel_um_sd.to_string(),
             "0 um or more and below pixel_um",
-        )?;
-        refuse(
-            self.sign == 1 || self.sign == -1,
-            "sign",
-            self.sign.to_string(),
-            "1 or -1",
-        )?;
-        refuse(
-            self.origin_px.is_finite(),
-            "origin_px",
-            self.origin_px.to_string(),
-            "a finite coordinate, px",
         )?;
         refuse(
             is_date(&self.date),
@@ -151,6 +131,9 @@ impl CalibrationFile {
             pixel_um: self.pixel_um,
             origin_px: self.origin_px,
             sign: f64::from(self.sign),
+            axis: self.axis,
+            tilt_deg: self.tilt_deg,
+            origin_across_px: self.origin_across_px,
         }
     }
 }
@@ -179,7 +162,7 @@ mod tests {
     #[test]
     fn a_calibration_turns_pixels_into_micrometres_with_its_sign() {
         let c = parse(GOOD).unwrap().calibration();
-        assert!((c.position_um(138.0) + 1.5193).abs() < 1e-12);
+        assert!((c.position_um(138.0, 50.0) + 1.5193).abs() < 1e-12);
     }
 
     #[test]
@@ -190,6 +173,8 @@ mod tests {
             ("0.0004", "-1.0", "pixel_um_sd"),
             ("sign = -1", "sign = 2", "sign"),
             ("128.0", "inf", "origin_px"),
+            ("128.0", "128.0\ntilt_deg = 46.0", "tilt_deg"),
+            ("128.0", "128.0\norigin_across_px = nan", "origin_across_px"),
             ("2026-11-20", "20.11.2026", "date"),
             ("2026-11-20", "2026-13-20", "date"),
         ] {

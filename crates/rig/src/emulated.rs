@@ -4,11 +4,10 @@
 //! follows the clock whenever either of them looks; on the virtual clock they do the same and time stands still between.
 
 use crate::board::{BoardHost, Port};
+use crate::calibration::Calibration;
 use crate::clock::Clock;
 use crate::measurement::Measurement;
-use crate::source::{
-    Calibration, Camera, CameraError, FrameBuffer, FrameStamp, PositionSource, SourceInfo,
-};
+use crate::source::{Camera, CameraError, FrameBuffer, FrameStamp, PositionSource, SourceInfo};
 use cellpos_emulator::WorldConfig;
 use cellpos_firmware_sim::{BoardConfig, BoxError, RigInABox};
 use cellpos_plant::Model;
@@ -75,11 +74,7 @@ impl EmulatedRig {
     pub fn calibration(&self) -> Calibration {
         let rig = self.now();
         let config = rig.world().config();
-        Calibration {
-            pixel_um: config.pixel_um,
-            origin_px: config.origin_x_px(),
-            sign: 1.0,
-        }
+        Calibration::along_rows(config.pixel_um, config.origin_x_px(), 1.0)
     }
 
     /// Waits for the next delivery until `deadline_ns` and takes it.
@@ -219,6 +214,7 @@ impl PositionSource for EmulatedPositions {
                 position_um: fix.x_um,
                 variance_um2: fix.variance_um2,
                 verdict: fix.verdict,
+                track: None,
                 snr: fix.snr,
                 true_um,
                 true_pzt_um,

@@ -1,6 +1,6 @@
 //! One bead position on its way from vision to the loop.
 
-use cellpos_vision::Verdict;
+use cellpos_vision::{Decision, TrackState, Verdict};
 
 /// A bead position as it travels through the measurement ring. Times are nanoseconds of the run's clock.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -15,12 +15,22 @@ pub struct Measurement {
     pub position_um: f64,
     /// Variance of the position, um^2; NaN when there is none.
     pub variance_um2: f64,
-    /// Verdict of vision: only [`Verdict::Good`] may be controlled on.
+    /// Verdict of vision on the fix itself.
     pub verdict: Verdict,
+    /// State of the tracker after this frame, and what it decided of it; `None` without a tracker. A good fix that the
+    /// tracker did not take (another bead, too far from the prediction) has no position.
+    pub track: Option<(TrackState, Decision)>,
     /// Peak contrast over pixel noise; NaN without picture.
     pub snr: f64,
     /// True bead position at `ready_ns`, um (emulated rig only, else NaN).
     pub true_um: f64,
     /// True PZT displacement at `ready_ns`, um (emulated rig only, else NaN).
     pub true_pzt_um: f64,
+}
+
+impl Measurement {
+    /// Whether the position may be controlled on: a good fix, and the bead that is followed.
+    pub fn is_usable(&self) -> bool {
+        self.verdict == Verdict::Good && self.position_um.is_finite()
+    }
 }

@@ -31,7 +31,7 @@ use cellpos_link::{BoardState, Fault};
 use cellpos_plant::TransferFunction;
 use cellpos_rig::BoardReport;
 use cellpos_units::Seconds;
-use cellpos_vision::Verdict;
+use cellpos_vision::Decision;
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct State {
     seq: u64,
@@ -283,9 +283,15 @@ impl<R: Reference> Core<R> {
         }
         self.state.stale_in_a_row = 0;
         self.state.last_frame = Some((m.frame_id, m.mid_exposure_ns));
-        if m.verdict != Verdict::Good || !m.position_um.is_finite() {
+        if !m.is_usable() {
             tick.flags.set(TickFlags::LOST);
             return None;
+        }
+        if matches!(m.track, Some((_, Decision::Reacquired))) {
+            tick.event(EventKind::BeadReacquired {
+                position_um: m.position_um,
+            });
+            self.state.counts.reacquired += 1;
         }
         let beyond_ns = age_ns - Timing::ms_to_ns(self.timing.camera_delay_ms);
         let period = self.timing.period_ns();
@@ -570,6 +576,12 @@ impl<R: Reference> Core<R> {
             measured_um: m.map_or(f64::NAN, |m| m.position_um),
             variance_um2: m.map_or(f64::NAN, |m| m.variance_um2),
             verdict: m.map_or(255, |m| m.verdict as u8),
+            track: m
+                .and_then(|m| m.track)
+                .map_or(255, |(state, _)| state as u8),
+            decision: m
+                .and_then(|m| m.track)
+                .map_or(255, |(_, decision)| decision as u8),
             target_um,
             estimate_um: output.estimate_um,
             neutral_um: output.neutral_um,

@@ -183,6 +183,11 @@ pub enum EventKind {
         /// Age of its exposure.
         age_ms: f64,
     },
+    /// Vision took a bead after the one followed had been lost: like it in size and brightness, but it may be another.
+    BeadReacquired {
+        /// Where.
+        position_um: f64,
+    },
     /// The command was handed over late.
     LateTick {
         /// From the start of the tick to the hand-over, us.

@@ -10,7 +10,7 @@ use crate::tick_record::{TickFlags, TickRecord};
 use cellpos_control::{Reference, SolverStatus, SolverTerms};
 use cellpos_link::{BoardState, Fault};
 use cellpos_rig::{BoardReport, Measurement};
-use cellpos_vision::Verdict;
+use cellpos_vision::{Decision, TrackState, Verdict};
 use serde::Serialize;
 
 /// The first difference between a record and its replay.
@@ -128,6 +128,7 @@ fn input(record: &TickRecord, previous: Option<&TickRecord>) -> TickInput {
         position_um: record.measured_um,
         variance_um2: record.variance_um2,
         verdict,
+        track: TrackState::from_number(record.track).zip(Decision::from_number(record.decision)),
         snr: f64::NAN,
         true_um: record.true_um,
         true_pzt_um: f64::NAN,

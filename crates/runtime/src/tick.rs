@@ -75,6 +75,8 @@ pub struct Counts {
     pub fixes_lost: u64,
     /// Positions refused as too far from the prediction.
     pub gated: u64,
+    /// Times that vision took a bead again after it had been lost.
+    pub reacquired: u64,
     /// Ticks on prediction alone.
     pub coasted: u64,
     /// Ticks frozen.

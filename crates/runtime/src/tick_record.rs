@@ -69,6 +69,10 @@ pub struct TickRecord {
     pub variance_um2: f64,
     /// Verdict of vision ([`cellpos_vision::Verdict`] as a number; 255: no frame).
     pub verdict: u8,
+    /// State of the tracker ([`cellpos_vision::TrackState`] as a number; 255: no frame, or no tracker).
+    pub track: u8,
+    /// What the tracker decided of the frame ([`cellpos_vision::Decision`] as a number; 255: no frame, or no tracker).
+    pub decision: u8,
     /// Reference, um.
     pub target_um: f64,
     /// Estimated bead position at the tick, um.

@@ -91,6 +91,7 @@ pub fn run(args: Args) -> CommandResult {
     let mut controller = setup::controller(&args.controller, &model, &file.timing)?;
 
     let mut rig = file.connect(args.clock, args.frames)?;
+    rig.expect(&model);
     check_target(args.target, &rig)?;
     let board = rig.actuator.info();
     let own = controller.limits;
@@ -389,8 +390,8 @@ fn text(report: &Report) -> String {
     line(
         "frames",
         format!(
-            "{} lost, {} stale, {} without a bead, {} ticks coasted",
-            c.frames_lost, c.stale, c.fixes_lost, c.coasted
+            "{} lost, {} stale, {} without the bead, {} ticks coasted, bead re-acquired {} times",
+            c.frames_lost, c.stale, c.fixes_lost, c.coasted, c.reacquired
         ),
     );
     let timing = |name: &str, q: &cellpos_runtime::latency::Quantiles| {

@@ -3,9 +3,8 @@
 use super::vision_sheet::Sheet;
 use super::vision_summary::{Summary, Tally};
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
-use cellpos_rig::calibration_file::{Axis, CalibrationFile};
 use cellpos_rig::sources::{self, Region, SourceError};
-use cellpos_rig::{Calibration, FrameBuffer};
+use cellpos_rig::{CalibrationFile, FrameBuffer};
 use cellpos_vision::{
     CellConfig, CellFinder, Learning, LinkConfig, Localiser, LocaliserConfig, ManyTracker,
     Polarity, ProfileSpec, RingProfile, Verdict,
@@ -312,9 +311,7 @@ fn find_cells(
 
 fn end_row(csv: &mut String, calibration: Option<&CalibrationFile>, x_px: f64, y_px: f64) {
     if let Some(file) = calibration {
-        let along: Calibration = file.calibration();
-        let at_px = if file.axis == Axis::X { x_px } else { y_px };
-        let _ = write!(csv, ",{:.5}", along.position_um(at_px));
+        let _ = write!(csv, ",{:.5}", file.calibration().position_um(x_px, y_px));
     }
     csv.push('\n');
 }

@@ -56,6 +56,17 @@ impl Default for TrackerConfig {
 }
 
 impl TrackerConfig {
+    /// The defaults for another size of the pixel: what they mean in micrometres stays.
+    pub fn for_pixel_um(pixel_um: f64) -> Self {
+        let scale = 0.1 / pixel_um;
+        let default = Self::default();
+        TrackerConfig {
+            diffusion_px2_per_s: default.diffusion_px2_per_s * scale * scale,
+            velocity_walk_px_per_s15: default.velocity_walk_px_per_s15 * scale,
+            ..default
+        }
+    }
+
     /// Checks every setting.
     ///
     /// # Errors
@@ -168,6 +179,20 @@ pub enum TrackState {
     Lost = 3,
 }
 
+impl TrackState {
+    /// The state of a number in a record.
+    pub fn from_number(number: u8) -> Option<Self> {
+        [
+            TrackState::Searching,
+            TrackState::Tracking,
+            TrackState::Coasting,
+            TrackState::Lost,
+        ]
+        .into_iter()
+        .find(|state| *state as u8 == number)
+    }
+}
+
 /// Why a frame was used or not; one per frame, for the record.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "kebab-case")]
@@ -199,9 +224,34 @@ pub enum Decision {
     Reacquired = 11,
     /// No frame.
     NoFrame = 12,
+    /// The frame came twice, out of order or with an old time stamp, and was not looked at.
+    Stale = 13,
 }
 
 impl Decision {
+    /// The decision of a number in a record.
+    pub fn from_number(number: u8) -> Option<Self> {
+        use Decision::*;
+        [
+            Accepted,
+            NothingFound,
+            Confirming,
+            NoSignal,
+            Merged,
+            AtBorder,
+            NotConverged,
+            OutsideGate,
+            OtherBead,
+            Ambiguous,
+            Regained,
+            Reacquired,
+            NoFrame,
+            Stale,
+        ]
+        .into_iter()
+        .find(|decision| *decision as u8 == number)
+    }
+
     /// Whether the frame's fix was taken as the bead's position.
     pub fn is_accepted(self) -> bool {
         matches!(
@@ -232,4 +282,31 @@ pub struct TrackStep {
     pub coasted_s: f64,
     /// Other beads known near by.
     pub neighbours: u8,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn states_and_decisions_come_back_from_their_numbers() {
+        for number in 0..=255 {
+            if let Some(state) = TrackState::from_number(number) {
+                assert_eq!(state as u8, number);
+            }
+            if let Some(decision) = Decision::from_number(number) {
+                assert_eq!(decision as u8, number);
+            }
+        }
+        assert_eq!((0..=255).filter_map(TrackState::from_number).count(), 4);
+        assert_eq!((0..=255).filter_map(Decision::from_number).count(), 14);
+    }
+
+    #[test]
+    fn the_defaults_mean_the_same_in_micrometres_whatever_the_pixel() {
+        let c = TrackerConfig::for_pixel_um(0.2);
+        assert!((c.diffusion_px2_per_s * 0.04 - 0.33).abs() < 1e-12);
+        assert!((c.velocity_walk_px_per_s15 * 0.2 - 30.0).abs() < 1e-12);
+        assert_eq!(TrackerConfig::for_pixel_um(0.1), TrackerConfig::default());
+    }
 }

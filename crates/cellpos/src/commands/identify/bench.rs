@@ -18,9 +18,10 @@ use cellpos_plant::{Complex, DiscretePlant, Hertz, Model, Seconds};
 use cellpos_rig::actuator::Session;
 use cellpos_rig::emulated::EmulatedPort;
 use cellpos_rig::{
-    Actuator, BoardHost, Camera, Clock, EmulatedRig, FrameBuffer, PositionSource, VisionSource,
+    Actuator, BoardHost, Camera, Clock, CommandedFlow, EmulatedRig, FlowTap, FrameBuffer,
+    Measurement, PositionSource, VisionSource,
 };
-use cellpos_vision::{Localiser, LocaliserConfig, ProfileSpec, Verdict};
+use cellpos_vision::{Localiser, LocaliserConfig, ProfileSpec, Tracker, TrackerConfig};
 
 /// PI gains for the nominal gain of Eq. (6) at a loop delay of 2.5 ms (Ms <= 1.6, Mt <= 1.3), scaled to the model's.
 const KP: f64 = 0.46;
@@ -85,7 +86,7 @@ pub struct HeldBead {
     setup: Setup,
     rig: EmulatedRig,
     source: Option<Box<dyn PositionSource>>,
-    board: BoardHost<EmulatedPort>,
+    board: FlowTap<BoardHost<EmulatedPort>>,
     controller: Controller,
     state: LoopState,
     next_ns: i64,
@@ -104,7 +105,10 @@ impl HeldBead {
             setup.clock.clone(),
         )
         .map_err(Failure::input)?;
-        let mut board = rig.actuator().map_err(Failure::failed)?;
+        let gain_per_s = setup.model.plant.velocity_gain_at(Hertz(2.0));
+        let flow = CommandedFlow::new(gain_per_s);
+        let board = rig.actuator().map_err(Failure::failed)?;
+        let mut board = FlowTap::new(board, flow.clone(), setup.clock.clone());
         let info = board.info();
         let limits = Limits {
             low_um: info.low_um,
@@ -123,16 +127,18 @@ impl HeldBead {
             let edge_px = setup.world.bead_radius_px();
             let localiser = Localiser::new(LocaliserConfig::new(ProfileSpec::Ring { edge_px }))
                 .map_err(Failure::input)?;
-            Box::new(VisionSource::new(
+            let tracking = TrackerConfig::for_pixel_um(setup.world.pixel_um);
+            let tracker = Tracker::new(localiser, tracking).map_err(Failure::input)?;
+            let source = VisionSource::new(
                 rig.camera(),
-                localiser,
+                tracker,
                 rig.calibration(),
                 setup.clock.clone(),
-            ))
+            );
+            Box::new(source.with_flow(flow))
         } else {
             Box::new(rig.positions())
         };
-        let gain_per_s = setup.model.plant.velocity_gain_at(Hertz(2.0));
         let controller = Controller::new(LoopConfig {
             model: LoopModel::integrator(gain_per_s, setup.world.latency_ms * 1e-3),
             estimator: EstimatorConfig {
@@ -168,7 +174,7 @@ impl HeldBead {
     }
 
     /// The newest measurement of the frames delivered by `now_ns`.
-    fn newest(&mut self, now_ns: i64) -> Result<Option<cellpos_rig::Measurement>, Failure> {
+    fn newest(&mut self, now_ns: i64) -> Result<Option<Measurement>, Failure> {
         let Some(source) = &mut self.source else {
             return Ok(None);
         };
@@ -210,7 +216,7 @@ impl HeldBead {
                 self.setup.clock.sleep_until_ns(edge_ns);
                 on = !on;
                 switched_s.push(self.setup.clock.now_ns() as f64 * 1e-9);
-                self.board.led(on).map_err(Failure::failed)?;
+                self.board.inner_mut().led(on).map_err(Failure::failed)?;
                 waiting.next();
             }
             self.setup.clock.sleep_until_ns(self.next_ns);
@@ -241,9 +247,7 @@ impl HeldBead {
         let mut seen = 0;
         for _ in 0..10_000 {
             self.setup.clock.sleep_until_ns(self.next_ns);
-            let good = self
-                .newest(self.next_ns)?
-                .is_some_and(|m| m.verdict == Verdict::Good);
+            let good = self.newest(self.next_ns)?.is_some_and(|m| m.is_usable());
             self.send(self.neutral_um, self.neutral_um)?;
             self.next_ns += self.period_ns;
             seen = if good { seen + 1 } else { 0 };
@@ -283,7 +287,7 @@ impl Bench for HeldBead {
         let now_ns = self.next_ns;
         self.setup.clock.sleep_until_ns(now_ns);
         let newest = self.newest(now_ns)?;
-        let good = newest.filter(|m| m.verdict == Verdict::Good);
+        let good = newest.filter(Measurement::is_usable);
         let age_ns = good.map_or(0, |m| now_ns - m.mid_exposure_ns);
         let late_ns = age_ns - (self.setup.world.latency_ms * 1e6).round() as i64;
         let age_samples =

@@ -1,0 +1,108 @@
+//! A camera with a tracker: frames in, positions of one and the same bead out.
+//!
+//! The tracker predicts the bead from the commanded flow, takes a fix only when place, intensity, size and residual
+//! agree, and says of every frame where it stands and why. A fix that it does not take gives no position, so that the
+//! loop coasts rather than follows another bead.
+
+use crate::calibration::Calibration;
+use crate::clock::Clock;
+use crate::flow::CommandedFlow;
+use crate::measurement::Measurement;
+use crate::source::{Camera, CameraError, FrameBuffer, FrameStamp, PositionSource, SourceInfo};
+use cellpos_vision::{Decision, TrackStep, Tracker, Verdict};
+
+/// A camera with a tracker. Allocates nothing per frame once it runs.
+#[derive(Debug)]
+pub struct VisionSource<C> {
+    camera: C,
+    tracker: Tracker,
+    calibration: Calibration,
+    clock: Clock,
+    flow: Option<CommandedFlow>,
+    buffer: FrameBuffer,
+    /// Time stamp of the first frame: the tracker's times count from it.
+    first_ns: Option<i64>,
+    /// Id and time stamp of the newest frame looked at.
+    newest: Option<(u64, i64)>,
+}
+
+impl<C: Camera> VisionSource<C> {
+    /// Joins a camera and a tracker. Without [`VisionSource::with_flow`] the prediction knows no commands.
+    pub fn new(camera: C, tracker: Tracker, calibration: Calibration, clock: Clock) -> Self {
+        Self {
+            camera,
+            tracker,
+            calibration,
+            clock,
+            flow: None,
+            buffer: FrameBuffer::default(),
+            first_ns: None,
+            newest: None,
+        }
+    }
+
+    /// Lets the tracker predict from what is commanded.
+    pub fn with_flow(mut self, flow: CommandedFlow) -> Self {
+        self.flow = Some(flow);
+        self
+    }
+
+    /// The tracker.
+    pub fn tracker(&self) -> &Tracker {
+        &self.tracker
+    }
+
+    /// Looks at the frame in the buffer; `None` for one that came twice, late, or with an old time stamp.
+    fn look(&mut self, stamp: &FrameStamp) -> Option<TrackStep> {
+        let at_ns = stamp.mid_exposure_ns;
+        let before = self.newest;
+        if before.is_some_and(|(id, ns)| stamp.id <= id || at_ns <= ns) {
+            return None;
+        }
+        self.newest = Some((stamp.id, at_ns));
+        let first_ns = *self.first_ns.get_or_insert(at_ns);
+        let flow_um_per_s = match (&self.flow, before) {
+            (Some(flow), Some((_, before_ns))) => flow.mean_um_per_s(before_ns, at_ns),
+            _ => 0.0,
+        };
+        Some(self.tracker.step(
+            Some(&self.buffer.frame()),
+            (at_ns - first_ns) as f64 * 1e-9,
+            self.calibration.flow_px_per_s(flow_um_per_s),
+        ))
+    }
+}
+
+impl<C: Camera> PositionSource for VisionSource<C> {
+    fn next(&mut self, deadline_ns: i64) -> Result<Option<Measurement>, CameraError> {
+        let Some(stamp) = self.camera.next_frame(&mut self.buffer, deadline_ns)? else {
+            return Ok(None);
+        };
+        let step = self.look(&stamp);
+        let fix = step.map(|s| s.fix);
+        let taken = step.filter(|s| s.decision.is_accepted()).map(|s| s.fix);
+        let c = &self.calibration;
+        Ok(Some(Measurement {
+            frame_id: stamp.id,
+            mid_exposure_ns: stamp.mid_exposure_ns,
+            ready_ns: self.clock.now_ns(),
+            position_um: taken.map_or(f64::NAN, |f| c.position_um(f.x_px, f.y_px)),
+            variance_um2: taken.map_or(f64::NAN, |f| {
+                c.variance_um2(f.var_x_px2, f.var_y_px2, f.cov_xy_px2)
+            }),
+            verdict: fix.map_or(Verdict::NoSignal, |f| f.verdict),
+            track: Some(step.map_or((self.tracker.state(), Decision::Stale), |s| {
+                (s.state, s.decision)
+            })),
+            snr: fix.map_or(f64::NAN, |f| f.snr),
+            true_um: stamp.true_um,
+            true_pzt_um: stamp.true_pzt_um,
+        }))
+    }
+
+    fn info(&self) -> SourceInfo {
+        let mut info = self.camera.info();
+        info.field_um = self.calibration.field_um(info.width_px, info.height_px);
+        info
+    }
+}
