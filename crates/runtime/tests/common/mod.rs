@@ -53,6 +53,7 @@ pub fn measurement(k: u64, position_um: f64) -> Measurement {
         position_um,
         variance_um2: 4e-4,
         verdict: Verdict::Good,
+        track: None,
         snr: 40.0,
         true_um: f64::NAN,
         true_pzt_um: f64::NAN,
