@@ -37,6 +37,8 @@ pub struct FrameInfo {
 /// A position delivered without a picture.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PositionFix {
+    /// Length of the cell along the channel, um; NaN for a bead.
+    pub length_um: f64,
     /// As of the frame that would have been delivered.
     pub info: FrameInfo,
     /// Measured position along the channel, um; NaN unless the verdict is good.

@@ -322,6 +322,7 @@ impl World {
         let good = verdict == Verdict::Good;
         let or_nan = |value| if good { value } else { f64::NAN };
         Some(PositionFix {
+            length_um: f64::NAN,
             info,
             x_um: or_nan(mean_um + noise_um),
             variance_um2: or_nan(self.localisation_um * self.localisation_um),

@@ -39,7 +39,7 @@ impl Kind {
 }
 
 /// The columns before the controller's state, in the order of [`visit`].
-const FIXED: [(&str, Kind); 28] = [
+const FIXED: [(&str, Kind); 31] = [
     ("seq", Kind::U64),
     ("time_ns", Kind::I64),
     ("frame_id", Kind::U64),
@@ -68,6 +68,9 @@ const FIXED: [(&str, Kind); 28] = [
     ("solver_ns", Kind::U32),
     ("track", Kind::U8),
     ("decision", Kind::U8),
+    ("plan_ns", Kind::I64),
+    ("stage", Kind::U8),
+    ("length_um", Kind::F64),
 ];
 
 /// Name and type of every column.
@@ -127,6 +130,9 @@ fn visit(row: &TickRecord, to: &mut impl Take) {
     to.u32(row.solver_ns);
     to.u8(row.track);
     to.u8(row.decision);
+    to.i64(row.plan_ns);
+    to.u8(row.stage);
+    to.f64(row.length_um);
     for value in row.controller_state {
         to.f64(value);
     }
@@ -163,6 +169,9 @@ pub(crate) fn unknown() -> TickRecord {
         solver_iterations: 0,
         solver_active: 0,
         solver_ns: 0,
+        plan_ns: -1,
+        stage: 0,
+        length_um: f64::NAN,
         controller_state: [f64::NAN; CONTROLLER_STATE_LEN],
     }
 }
@@ -199,6 +208,9 @@ pub(crate) fn set(row: &mut TickRecord, column: usize, bits: u64) {
         25 => row.solver_ns = bits as u32,
         26 => row.track = bits as u8,
         27 => row.decision = bits as u8,
+        28 => row.plan_ns = bits.cast_signed(),
+        29 => row.stage = bits as u8,
+        30 => row.length_um = float,
         _ => {
             if let Some(state) = column
                 .checked_sub(FIXED.len())

@@ -14,7 +14,8 @@ use std::path::Path;
 /// camera had delivered just before (exposed around `mid_exposure_s`), empty without a bead.
 pub const CSV_HEAD: &str = "time_s,pzt_um,bead_um,seq,frame_id,mid_exposure_s,sigma_um,target_um,estimate_um,\
                             neutral_um,requested_um,applied_um,true_um,verdict,life,request,board,\
-                            board_fault,flags,drained,wake_us,compute_us,track,decision";
+                            board_fault,flags,drained,wake_us,compute_us,track,decision,plan_s,stage,\
+                            length_um";
 
 /// Formats of [`export`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -78,7 +79,7 @@ fn csv_row(row: &TickRecord, out: &mut impl Write) -> io::Result<()> {
     };
     writeln!(
         out,
-        "{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{}",
+        "{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{}",
         seconds(row.time_ns),
         Maybe(row.command_um),
         Maybe(bead_um),
@@ -103,6 +104,13 @@ fn csv_row(row: &TickRecord, out: &mut impl Write) -> io::Result<()> {
         f64::from(row.compute_ns) / 1e3,
         row.track,
         row.decision,
+        Maybe(if row.plan_ns < 0 {
+            f64::NAN
+        } else {
+            seconds(row.plan_ns)
+        }),
+        row.stage,
+        Maybe(row.length_um),
     )
 }
 

@@ -32,6 +32,9 @@ fn row(seq: u64) -> TickRecord {
         request: 2,
         board: 1,
         board_fault: 4,
+        plan_ns: -1,
+        stage: 2,
+        length_um: 9.5,
         flags,
         drained: 1,
         wake_ns: 1234,
@@ -294,7 +297,7 @@ fn exports_carry_units_in_their_names_and_follow_the_row_convention() {
             assert_eq!(value.to_bits(), (20.0 + rows as f64 / 7.0).to_bits());
             rows += 1;
         }
-        assert_eq!(batch.num_columns(), 28 + CONTROLLER_STATE_LEN);
+        assert_eq!(batch.num_columns(), 31 + CONTROLLER_STATE_LEN);
     }
     assert_eq!(rows, 100);
     let names: Vec<_> = std::fs::read_dir(root.path().join("out"))

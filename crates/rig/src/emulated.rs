@@ -216,6 +216,7 @@ impl PositionSource for EmulatedPositions {
                 verdict: fix.verdict,
                 track: None,
                 snr: fix.snr,
+                length_um: fix.length_um,
                 true_um,
                 true_pzt_um,
             }),

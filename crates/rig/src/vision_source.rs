@@ -94,6 +94,7 @@ impl<C: Camera> PositionSource for VisionSource<C> {
             track: Some(step.map_or((self.tracker.state(), Decision::Stale), |s| {
                 (s.state, s.decision)
             })),
+            length_um: f64::NAN,
             snr: fix.map_or(f64::NAN, |f| f.snr),
             true_um: stamp.true_um,
             true_pzt_um: stamp.true_pzt_um,

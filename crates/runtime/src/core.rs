@@ -18,6 +18,7 @@
 //! [`Life::Safe`].
 
 use crate::arming::{Arming, ArmingConfig, ArmingState, Step};
+use crate::guide::{Guide, GuideInput, GuideOutput, Stage};
 use crate::life::{EventKind, Events, FreezeReason, Life, Request, SafeReason};
 use crate::tick::Tick;
 pub use crate::tick::{Action, Counts, TickInput, TickOutput};
@@ -25,7 +26,7 @@ use crate::tick_record::{TickFlags, TickRecord};
 pub use crate::timing::{CoreError, Timing};
 use cellpos_control::{
     Controller, LoopConfig, LoopInput, LoopOutput, LoopState, Measurement as LoopMeasurement, Mode,
-    Reference, SolverStatus, SolverTerms,
+    SolverStatus,
 };
 use cellpos_link::{BoardState, Fault};
 use cellpos_plant::TransferFunction;
@@ -57,13 +58,14 @@ struct State {
     board: Option<BoardReport>,
     board_heard_ns: i64,
     parked_at: Option<u64>,
+    stage: Stage,
 }
 
 /// The loop, ready to tick.
 #[derive(Debug)]
 pub struct Core<R> {
     controller: Controller,
-    reference: R,
+    guide: R,
     timing: Timing,
     arming: Arming,
     sample_s: f64,
@@ -71,7 +73,7 @@ pub struct Core<R> {
     state: State,
 }
 
-impl<R: Reference> Core<R> {
+impl<R: Guide> Core<R> {
     /// Builds the loop for a board that is armed and stands at `displacement_um`, with `neutral_um` as the first belief
     /// of the displacement at which the bead rests.
     ///
@@ -79,7 +81,7 @@ impl<R: Reference> Core<R> {
     /// A value that cannot be, named.
     pub fn new(
         config: LoopConfig,
-        reference: R,
+        guide: R,
         timing: Timing,
         arming: ArmingConfig,
         plant: &TransferFunction,
@@ -99,7 +101,7 @@ impl<R: Reference> Core<R> {
         Ok(Self {
             preview_um: vec![0.0; controller.preview_len()],
             controller,
-            reference,
+            guide,
             timing,
             arming,
             sample_s,
@@ -125,6 +127,7 @@ impl<R: Reference> Core<R> {
                 board: None,
                 board_heard_ns: 0,
                 parked_at: None,
+                stage: Stage::None,
             },
         })
     }
@@ -155,9 +158,9 @@ impl<R: Reference> Core<R> {
             .then(|| self.state.seq.saturating_sub(self.state.running_since) as f64 * self.sample_s)
     }
 
-    /// The reference.
-    pub fn reference(&self) -> &R {
-        &self.reference
+    /// Who says where the bead is to be.
+    pub fn guide(&self) -> &R {
+        &self.guide
     }
 
     /// One tick.
@@ -180,22 +183,25 @@ impl<R: Reference> Core<R> {
         self.check_board(input, &mut tick);
         match input.request {
             Request::Park => self.latch(SafeReason::Operator, &mut tick),
-            Request::Freeze => self.freeze(FreezeReason::Operator, &mut tick),
-            Request::None => {
+            Request::Freeze | Request::Pause => self.freeze(FreezeReason::Operator, &mut tick),
+            Request::None | Request::Skip => {
+                if input.request == Request::Skip {
+                    tick.event(EventKind::StepSkipped);
+                }
                 if matches!(self.state.frozen, Some((FreezeReason::Operator, _))) {
                     self.thaw(&mut tick);
                 }
             }
         }
         let mode = self.advance_life(fix.map(|fix| fix.position_um), &mut tick);
-        let (output, reference_um) = self.control(fix, mode, input.solver);
+        let (output, guided) = self.control(fix, input, mode, &mut tick);
         if output.requested_um.is_nan() {
             self.latch(SafeReason::NotFinite, &mut tick);
         }
         self.account(&output, &mut tick);
         let action = self.action(&output, tick.seq);
         self.count(input, &output, tick.flags);
-        let record = self.record(input, &output, reference_um, tick.flags);
+        let record = self.record(input, &output, &guided, tick.flags);
         self.state.seq += 1;
         TickOutput {
             action,
@@ -416,26 +422,47 @@ impl<R: Reference> Core<R> {
     fn control(
         &mut self,
         fix: Option<LoopMeasurement>,
+        input: &TickInput,
         mode: Mode,
-        solver: SolverTerms,
-    ) -> (LoopOutput, f64) {
-        let since = match self.state.life {
-            Life::Running => self.state.seq - self.state.running_since,
-            _ => 0,
+        tick: &mut Tick,
+    ) -> (LoopOutput, GuideOutput) {
+        let running = self.state.life == Life::Running;
+        let since = if running {
+            self.state.seq - self.state.running_since
+        } else {
+            0
         };
-        let reference_um = self.reference.at_um(since as f64 * self.sample_s);
-        cellpos_control::fill_preview(&self.reference, since, self.sample_s, &mut self.preview_um);
-        let input = LoopInput {
+        let length_um = input.measurement.map(|m| m.length_um);
+        let told = GuideInput {
+            running,
+            frozen: mode == Mode::Freeze,
+            skip: running && input.request == Request::Skip,
+            tick: since,
+            sample_s: self.sample_s,
+            position_um: fix.map(|fix| fix.position_um),
+            age_ticks: fix.map_or(0, |fix| fix.age_samples),
+            length_um: length_um.filter(|um| fix.is_some() && um.is_finite()),
+        };
+        let guided = self.guide.step(&told, &mut self.preview_um);
+        if guided.stage != self.state.stage {
+            self.state.stage = guided.stage;
+            if guided.stage != Stage::None {
+                tick.event(EventKind::Script {
+                    stage: guided.stage,
+                });
+            }
+        }
+        let given = LoopInput {
             measurement: fix,
-            reference_um,
+            reference_um: guided.reference_um,
             preview_um: &self.preview_um,
             mode,
-            solver,
+            solver: input.solver,
             ..LoopInput::default()
         };
         (
-            self.controller.step(&mut self.state.control, &input),
-            reference_um,
+            self.controller.step(&mut self.state.control, &given),
+            guided,
         )
     }
 
@@ -563,7 +590,7 @@ impl<R: Reference> Core<R> {
         &self,
         input: &TickInput,
         output: &LoopOutput,
-        target_um: f64,
+        guided: &GuideOutput,
         flags: TickFlags,
     ) -> TickRecord {
         let m = input.measurement;
@@ -582,7 +609,10 @@ impl<R: Reference> Core<R> {
             decision: m
                 .and_then(|m| m.track)
                 .map_or(255, |(_, decision)| decision as u8),
-            target_um,
+            target_um: guided.reference_um,
+            plan_ns: guided.plan_ns,
+            stage: guided.stage as u8,
+            length_um: m.map_or(f64::NAN, |m| m.length_um),
             estimate_um: output.estimate_um,
             neutral_um: output.neutral_um,
             requested_um: output.requested_um,

@@ -3,6 +3,7 @@
 
 pub mod arming;
 pub mod core;
+pub mod guide;
 pub mod latency;
 pub mod life;
 pub mod live;
@@ -18,6 +19,7 @@ pub mod virtual_run;
 
 pub use crate::core::{Action, Core, CoreError, TickInput, TickOutput, Timing};
 pub use arming::ArmingConfig;
+pub use guide::{Guide, GuideInput, GuideOutput, Stage};
 pub use life::{Event, EventKind, Life, Request, SafeReason};
 pub use run::{EndRule, Finished, NoSink, RunError, RunSink};
 pub use summary::{End, Statistics, Summary};

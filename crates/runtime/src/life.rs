@@ -4,6 +4,7 @@
 //! Freezing (slew to the estimate of neutral, so that the bead all but stops) is a mode within Running and is left
 //! when its cause goes away; safe (ramp to park: the bead is lost, the hardware is not) is not.
 
+use crate::guide::Stage;
 use cellpos_link::{BoardState, Fault};
 use serde::Serialize;
 
@@ -53,6 +54,10 @@ pub enum Request {
     Freeze = 1,
     /// Ramp to park.
     Park = 2,
+    /// Go on with the script's next step; holds for one tick.
+    Skip = 3,
+    /// Stop the bead where it is until something else is asked for; does not end the run.
+    Pause = 4,
 }
 
 impl Request {
@@ -61,6 +66,8 @@ impl Request {
         match number {
             0 => Self::None,
             1 => Self::Freeze,
+            3 => Self::Skip,
+            4 => Self::Pause,
             _ => Self::Park,
         }
     }
@@ -228,6 +235,13 @@ pub enum EventKind {
     },
     /// The run was ended by its duration.
     Finished,
+    /// The script came to another stage.
+    Script {
+        /// Which.
+        stage: Stage,
+    },
+    /// The operator went on with the next step of the script.
+    StepSkipped,
 }
 
 fn as_debug<S: serde::Serializer>(

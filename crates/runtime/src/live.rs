@@ -12,13 +12,13 @@
 //! the process dies the board's watchdog does.
 
 use crate::core::Core;
+use crate::guide::Guide;
 use crate::life::{Event, Life, Request};
 use crate::realtime::{self, Conditions};
 use crate::run::{EndRule, EndWatch, Finished, RunError, RunSink, close_session, serve_actuator};
 use crate::summary::{End, Statistics, Summary};
 use crate::tick_record::TickRecord;
 use crate::ticker::{Ends, Order, RingSizes, Ticker};
-use cellpos_control::Reference;
 use cellpos_rig::clock::{monotonic_ns, sleep_until_ns};
 use cellpos_rig::{Actuator, BoardReport, Clock, Measurement, PositionSource};
 use rtrb::{Consumer, Producer};
@@ -41,10 +41,32 @@ impl Operator {
         Request::from_number(self.0.load(Ordering::Acquire))
     }
 
+    /// What was last asked, to be acted on: asking to skip holds for one tick.
+    pub fn take(&self) -> Request {
+        let asked = self.asked();
+        if asked == Request::Skip {
+            // Something asked meanwhile stays.
+            let _ = self.0.compare_exchange(
+                Request::Skip as u8,
+                Request::None as u8,
+                Ordering::AcqRel,
+                Ordering::Acquire,
+            );
+        }
+        asked
+    }
+
+    /// Replaces one request by another, unless something else was asked meanwhile; says whether it did.
+    pub fn change(&self, from: Request, to: Request) -> bool {
+        self.0
+            .compare_exchange(from as u8, to as u8, Ordering::AcqRel, Ordering::Acquire)
+            .is_ok()
+    }
+
     /// The next step of stopping: first freeze, then park.
     pub fn stop(&self) -> Request {
         let next = match self.asked() {
-            Request::None => Request::Freeze,
+            Request::None | Request::Skip | Request::Pause => Request::Freeze,
             Request::Freeze | Request::Park => Request::Park,
         };
         self.ask(next);
@@ -102,7 +124,7 @@ struct ControlEnd {
     clippy::too_many_arguments,
     reason = "each is one part of the rig or one rule of the run"
 )]
-pub fn run<R: Reference + Send, S: RunSink>(
+pub fn run<R: Guide + Send, S: RunSink>(
     core: Core<R>,
     source: &mut dyn PositionSource,
     actuator: &mut dyn Actuator,
@@ -223,7 +245,7 @@ fn see(
     Ok(())
 }
 
-fn control<R: Reference>(
+fn control<R: Guide>(
     mut ticker: Ticker<R>,
     end: EndRule,
     operator: &Operator,
@@ -258,10 +280,10 @@ fn control<R: Reference>(
         } else {
             now_ns
         };
-        let request = operator.asked();
+        let request = operator.take();
         let life = ticker.tick(due_ns, request);
         actuator.unpark();
-        if let Some(end) = watch.after_tick(life, request) {
+        if let Some(end) = watch.after_tick(life, request, ticker.core().guide().finished()) {
             break end;
         }
     };

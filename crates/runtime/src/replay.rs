@@ -5,9 +5,10 @@
 //! known; the rest of such a run is counted as not replayed rather than compared with something else.
 
 use crate::core::{Core, TickInput};
+use crate::guide::Guide;
 use crate::life::Request;
 use crate::tick_record::{TickFlags, TickRecord};
-use cellpos_control::{Reference, SolverStatus, SolverTerms};
+use cellpos_control::{SolverStatus, SolverTerms};
 use cellpos_link::{BoardState, Fault};
 use cellpos_rig::{BoardReport, Measurement};
 use cellpos_vision::{Decision, TrackState, Verdict};
@@ -46,7 +47,7 @@ pub struct Replay<R> {
     outcome: Outcome,
 }
 
-impl<R: Reference> Replay<R> {
+impl<R: Guide> Replay<R> {
     /// A replay through a loop built as the recorded one was.
     pub fn new(core: Core<R>) -> Self {
         Self {
@@ -85,6 +86,8 @@ impl<R: Reference> Replay<R> {
             ("estimate_um", record.estimate_um, replayed.estimate_um),
             ("neutral_um", record.neutral_um, replayed.neutral_um),
             ("target_um", record.target_um, replayed.target_um),
+            ("plan_ns", record.plan_ns as f64, replayed.plan_ns as f64),
+            ("stage", f64::from(record.stage), f64::from(replayed.stage)),
             ("life", f64::from(record.life), f64::from(replayed.life)),
         ];
         let states = record
@@ -130,6 +133,7 @@ fn input(record: &TickRecord, previous: Option<&TickRecord>) -> TickInput {
         verdict,
         track: TrackState::from_number(record.track).zip(Decision::from_number(record.decision)),
         snr: f64::NAN,
+        length_um: record.length_um,
         true_um: record.true_um,
         true_pzt_um: f64::NAN,
     });

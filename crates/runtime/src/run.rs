@@ -17,6 +17,11 @@ pub trait RunSink: Send {
     fn tick(&mut self, record: &TickRecord);
     /// One event.
     fn event(&mut self, event: &Event);
+    /// Whether it takes a record now. Asked on the virtual clock only, where a sink that waits for its disk cannot block;
+    /// records left in the ring until it is full are lost.
+    fn is_ready(&self) -> bool {
+        true
+    }
     /// Called about ten times a second of the run, and at its end.
     fn progress(&mut self, statistics: &Statistics);
 }
@@ -101,7 +106,12 @@ impl EndWatch {
     }
 
     /// To be asked once after each tick.
-    pub(crate) fn after_tick(&mut self, life: Life, request: Request) -> Option<End> {
+    pub(crate) fn after_tick(
+        &mut self,
+        life: Life,
+        request: Request,
+        guide_finished: bool,
+    ) -> Option<End> {
         self.ticks += 1;
         self.frozen = if request == Request::Freeze {
             self.frozen + 1
@@ -119,6 +129,9 @@ impl EndWatch {
         }
         if self.frozen > self.rule.freeze_ticks {
             return Some(End::Operator);
+        }
+        if guide_finished {
+            return Some(End::Script);
         }
         match self.rule.ticks {
             Some(ticks) if self.ticks >= ticks => Some(End::Duration),

@@ -169,6 +169,8 @@ impl Statistics {
 pub enum End {
     /// Its time was over.
     Duration,
+    /// The script came to its end, or to one of its stop conditions.
+    Script,
     /// The operator ended it.
     Operator,
     /// Safe was latched.

@@ -75,6 +75,13 @@ pub struct TickRecord {
     pub decision: u8,
     /// Reference, um.
     pub target_um: f64,
+    /// Time of the script's plan, ns; stands still while a condition is waited for or the bead is frozen; -1 without a
+    /// script.
+    pub plan_ns: i64,
+    /// What the script is doing (number of [`crate::Stage`]).
+    pub stage: u8,
+    /// Measured length of the cell, um.
+    pub length_um: f64,
     /// Estimated bead position at the tick, um.
     pub estimate_um: f64,
     /// Estimated PZT displacement at which the bead is at rest, um.

@@ -1,10 +1,11 @@
 //! The tick around the core: rings in, rings out, the deadline account. The same on both clocks.
 
 use crate::core::{Action, Core, TickInput};
+use crate::guide::Guide;
 use crate::latency::Latency;
 use crate::life::{Event, Life, Request};
 use crate::tick_record::{TickFlags, TickRecord};
-use cellpos_control::{Reference, SolverTerms};
+use cellpos_control::SolverTerms;
 use cellpos_rig::clock::monotonic_ns;
 use cellpos_rig::{BoardReport, Clock, Measurement};
 use rtrb::{Consumer, Producer, RingBuffer};
@@ -93,7 +94,7 @@ pub struct Ticker<R> {
     account: Account,
 }
 
-impl<R: Reference> Ticker<R> {
+impl<R: Guide> Ticker<R> {
     /// Puts rings around a core. `start_ns` is the start of the run on `clock`.
     pub fn new(core: Core<R>, clock: Clock, start_ns: i64, sizes: RingSizes) -> (Self, Ends) {
         let (measurements_in, measurements) = RingBuffer::new(sizes.measurements.max(1));

@@ -4,12 +4,12 @@
 //! rig fixes every bit of the records; wake-up and compute times in them are zero.
 
 use crate::core::Core;
+use crate::guide::Guide;
 use crate::life::Request;
 use crate::realtime::Conditions;
 use crate::run::{EndRule, EndWatch, Finished, RunError, RunSink, close_session, serve_actuator};
 use crate::summary::{Statistics, Summary};
 use crate::ticker::{RingSizes, Ticker};
-use cellpos_control::Reference;
 use cellpos_rig::{Actuator, Clock, PositionSource};
 
 /// Runs until `end` says so. `request` is asked at each tick with its sequence number.
@@ -20,7 +20,7 @@ use cellpos_rig::{Actuator, Clock, PositionSource};
     clippy::too_many_arguments,
     reason = "each is one part of the rig or one rule of the run"
 )]
-pub fn run<R: Reference, S: RunSink>(
+pub fn run<R: Guide, S: RunSink>(
     core: Core<R>,
     clock: &Clock,
     source: &mut dyn PositionSource,
@@ -53,7 +53,11 @@ pub fn run<R: Reference, S: RunSink>(
         let asked = request(tick);
         let life = ticker.tick(now_ns, asked);
         serve_actuator(actuator, &mut ends.orders, &mut ends.reports)?;
-        while let Ok(record) = ends.records.pop() {
+        // A recorder that waits for its disk leaves records in the ring; a full ring refuses, and the refusal is counted.
+        while sink.is_ready() {
+            let Ok(record) = ends.records.pop() else {
+                break;
+            };
             statistics.add(&record);
             sink.tick(&record);
         }
@@ -64,12 +68,16 @@ pub fn run<R: Reference, S: RunSink>(
             sink.progress(&statistics);
         }
         tick += 1;
-        if let Some(end) = watch.after_tick(life, asked) {
+        if let Some(end) = watch.after_tick(life, asked, ticker.core().guide().finished()) {
             break end;
         }
     };
     let life = ticker.core().life();
     close_session(actuator, life, |span| clock.sleep(span))?;
+    while let Ok(record) = ends.records.pop() {
+        statistics.add(&record);
+        sink.tick(&record);
+    }
     sink.progress(&statistics);
     let summary = Summary::new(
         life,

@@ -11,6 +11,9 @@ pub struct Seen {
     pub position_um: Option<f64>,
     /// Measured length of the cell, um; None: not seen, or a bead.
     pub length_um: Option<f64>,
+    /// Measured position less the reference of the time at which it was measured, um; None: the reference of now is
+    /// taken, which is wrong by the camera's delay while the reference moves.
+    pub error_um: Option<f64>,
 }
 
 /// Why a script stopped before its end.
@@ -77,7 +80,8 @@ impl Plan {
         self.start_at(0.0)
     }
 
-    /// A cursor at a time of the plan, to resume at a whole cycle. Waits before it count as done.
+    /// A cursor at a time of the plan, to resume at a whole cycle. Waits before it count as done, and as having taken no
+    /// time.
     pub fn start_at(&self, plan_s: f64) -> Cursor {
         let segment = self.segments().partition_point(|s| s.start_s < plan_s);
         let segment = match self.segments().get(segment.saturating_sub(1)) {
@@ -90,7 +94,7 @@ impl Plan {
             plan_s,
             from_s: plan_s,
             ticks: 0,
-            elapsed_s: 0.0,
+            elapsed_s: plan_s,
             segment,
             waited_s: 0.0,
             settled_s: 0.0,
@@ -118,7 +122,42 @@ impl Plan {
         output
     }
 
-    fn reference_um(&self, cursor: &Cursor) -> f64 {
+    /// A tick in which the plan's clock stands still: running time and stop conditions go on. Allocates nothing.
+    pub fn stand(&self, cursor: &mut Cursor, sample_s: f64, seen: &Seen) -> Output {
+        if !matches!(cursor.status, Status::Done | Status::Stopped(_)) {
+            let blind = Seen {
+                // A bead that is being held is not tracked: its distance from the reference is no error.
+                error_um: seen.position_um.map(|_| 0.0),
+                ..*seen
+            };
+            if let Some(reason) = self.stop_reason(cursor, sample_s, &blind) {
+                cursor.status = Status::Stopped(reason);
+            }
+        }
+        cursor.elapsed_s += sample_s;
+        Output {
+            reference_um: self.reference_um(cursor),
+            plan_s: cursor.plan_s,
+            status: cursor.status,
+        }
+    }
+
+    /// The reference of the ticks to come, the next one first, as far as it is known: from the next wait on it stays.
+    /// Allocates nothing.
+    pub fn preview(&self, cursor: &Cursor, sample_s: f64, preview_um: &mut [f64]) {
+        if cursor.status != Status::Running {
+            preview_um.fill(self.reference_um(cursor));
+            return;
+        }
+        let until_s = self.next_wait_s(cursor.segment);
+        for (ahead, slot) in (0u64..).zip(preview_um) {
+            let time_s = cursor.from_s + (cursor.ticks + ahead) as f64 * sample_s;
+            *slot = self.at_um(time_s.min(until_s));
+        }
+    }
+
+    /// The reference of a cursor, um.
+    pub fn reference_um(&self, cursor: &Cursor) -> f64 {
         match self.segments().get(cursor.segment) {
             Some(segment) => self.segment_um(segment, cursor.plan_s),
             None => self.at_um(self.total_s()),
@@ -213,7 +252,9 @@ impl Plan {
         if let Some(position_um) = seen.position_um
             && beyond(
                 stop.error_above_um,
-                (position_um - self.reference_um(cursor)).abs(),
+                seen.error_um
+                    .unwrap_or(position_um - self.reference_um(cursor))
+                    .abs(),
             )
         {
             return Some(StopReason::Error);
@@ -250,6 +291,11 @@ impl Cursor {
             (self.from_s, self.ticks) = (self.plan_s, 0);
             self.leave();
         }
+    }
+
+    /// What is going on.
+    pub fn status(&self) -> Status {
+        self.status
     }
 
     /// Time of the plan, s.

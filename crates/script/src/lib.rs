@@ -5,12 +5,13 @@
 //! waits for conditions and ends on stop conditions. [`check()`] compares a plan with a model and limits before
 //! anything moves: peak position, speed and PZT demand, and the largest amplitude that the rig could do.
 //!
-//! The format is described in `docs/scripts.md`. Not here: the loop, devices, and the per-cycle table.
+//! The format is described in `docs/scripts.md`. [`Follower`] makes it the guide of a loop. Not here: the loop, devices, files of a run.
 #![forbid(unsafe_code)]
 
 mod check;
 mod cursor;
 mod error;
+mod follow;
 mod node;
 mod plan;
 mod read;
@@ -19,7 +20,8 @@ mod script;
 pub use check::{Check, CheckError, CheckLimits, Violation, check};
 pub use cursor::{Cursor, Output, Seen, Status, StopReason};
 pub use error::ScriptError;
-pub use plan::{Cycle, Mark, Motion, Plan, Segment};
+pub use follow::Follower;
+pub use plan::{ArmKind, Cycle, Mark, Motion, Plan, Segment};
 pub use script::{
     Condition, Load, MoveShape, OnTimeout, Order, Script, Step, StepKind, Stop, WaveShape,
 };

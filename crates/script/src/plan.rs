@@ -83,11 +83,24 @@ pub struct Mark {
     pub text: String,
 }
 
-/// One cycle: a period of a wave, or a pass of a repeat that holds no wave.
+/// Which arm of a test a cycle belongs to.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum ArmKind {
+    /// The one that moves.
+    #[default]
+    Cyclic,
+    /// The static control beside it.
+    Static,
+}
+
+/// One cycle: a period of a wave, or a pass of a repeat that holds no wave; in a static arm, as much time as a cycle of
+/// the arm that it stands beside takes in the mean.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Cycle {
     /// Number, from 0.
     pub number: u64,
+    /// Its arm.
+    pub arm: ArmKind,
     /// Start, s.
     pub start_s: f64,
     /// Duration, s.
@@ -101,6 +114,7 @@ struct Cycles {
     count: u64,
     start_s: f64,
     period_s: f64,
+    arm: ArmKind,
 }
 
 /// A script laid out in time. Waits take no time in it: a [`crate::Cursor`] stops its clock at them.
@@ -110,6 +124,8 @@ pub struct Plan {
     points: Vec<(f64, f64)>,
     cycles: Vec<Cycles>,
     marks: Vec<Mark>,
+    /// Waits: number of the segment and its time, s.
+    waits: Vec<(usize, f64)>,
     stop: Stop,
     start_um: f64,
     duration_s: f64,
@@ -145,6 +161,7 @@ impl Plan {
                 points: Vec::new(),
                 cycles: Vec::new(),
                 marks: Vec::new(),
+                waits: Vec::new(),
                 stop: script.stop,
                 start_um: script.start_um,
                 duration_s: 0.0,
@@ -180,6 +197,12 @@ impl Plan {
         &self.stop
     }
 
+    /// When the plan's clock next stands still for a wait, from a segment on, s; infinity: never.
+    pub(crate) fn next_wait_s(&self, segment: usize) -> f64 {
+        let index = self.waits.partition_point(|(number, _)| *number < segment);
+        self.waits.get(index).map_or(f64::INFINITY, |wait| wait.1)
+    }
+
     /// Number of cycles.
     pub fn cycle_count(&self) -> u64 {
         self.cycles.last().map_or(0, |run| run.first + run.count)
@@ -194,6 +217,7 @@ impl Plan {
         let within = number - run.first;
         (within < run.count).then_some(Cycle {
             number,
+            arm: run.arm,
             start_s: run.start_s + within as f64 * run.period_s,
             duration_s: run.period_s,
         })
@@ -328,6 +352,7 @@ fn rise(cycles: f64, length: f64) -> f64 {
 /// What is known of a labelled step.
 #[derive(Debug, Clone, Copy)]
 struct Arm {
+    cycles: u64,
     duration_s: f64,
     mean_um: f64,
     peak_um: f64,
@@ -392,7 +417,12 @@ impl Builder<'_> {
     }
 
     fn cycles(&mut self, start_s: f64, period_s: f64, count: u64) {
+        self.arm_cycles(start_s, period_s, count, ArmKind::Cyclic);
+    }
+
+    fn arm_cycles(&mut self, start_s: f64, period_s: f64, count: u64, arm: ArmKind) {
         self.plan.cycles.push(Cycles {
+            arm,
             first: self.next_cycle,
             count,
             start_s,
@@ -423,6 +453,7 @@ impl Builder<'_> {
 
     fn step(&mut self, step: &Step) -> Result<(), ScriptError> {
         let began = (self.time_s, self.integral, self.at_um);
+        let cycles_before = self.next_cycle;
         let outer = std::mem::replace(&mut self.range, self.at_um..self.at_um);
         self.inner(step)?;
         if let Some(label) = &step.label {
@@ -439,6 +470,7 @@ impl Builder<'_> {
                 self.at_um
             };
             let arm = Arm {
+                cycles: self.next_cycle - cycles_before,
                 duration_s,
                 mean_um,
                 peak_um,
@@ -552,7 +584,10 @@ impl Builder<'_> {
                     timeout_s: *timeout_s,
                     on_timeout: *on_timeout,
                 };
-                self.push(step, motion, 0.0, self.at_um, (self.at_um, self.at_um))
+                let wait = (self.plan.segments.len(), self.time_s);
+                self.push(step, motion, 0.0, self.at_um, (self.at_um, self.at_um))?;
+                self.plan.waits.push(wait);
+                Ok(())
             }
             StepKind::Mark { text } => {
                 if self.plan.marks.len() < MAX_SEGMENTS {
@@ -579,10 +614,16 @@ impl Builder<'_> {
                     Load::Mean => arm.mean_um,
                     Load::Peak => arm.peak_um,
                 };
+                let (start_s, cycles) = (self.time_s, arm.cycles);
                 let travel_s = (arm.duration_s * 0.1).min(1.0);
                 self.go(step, load_um, travel_s, MoveShape::MinimumJerk)?;
                 self.hold(step, arm.duration_s - 2.0 * travel_s)?;
-                self.go(step, home_um, travel_s, MoveShape::MinimumJerk)
+                self.go(step, home_um, travel_s, MoveShape::MinimumJerk)?;
+                if cycles > 0 && arm.duration_s > 0.0 {
+                    let period_s = arm.duration_s / cycles as f64;
+                    self.arm_cycles(start_s, period_s, cycles, ArmKind::Static);
+                }
+                Ok(())
             }
         }
     }

@@ -2,7 +2,7 @@
 
 use cellpos_control::Reference;
 use cellpos_plant::{Model, SimulateOptions, simulate};
-use cellpos_script::{CheckLimits, Plan, Script, Seen, Status, StopReason, check};
+use cellpos_script::{ArmKind, CheckLimits, Plan, Script, Seen, Status, StopReason, check};
 use proptest::prelude::*;
 use std::path::{Path, PathBuf};
 
@@ -140,7 +140,15 @@ fn the_static_arm_takes_the_same_time_at_the_mean_load() {
     assert!((plan.total_s() - 40.0).abs() < 1e-9);
     // Each pass: 2 um for 1 s, 4 um for 2 s, 2 um for 1 s: 3 um in the mean.
     assert!((plan.at_um(30.0) - 3.0).abs() < 1e-12);
-    assert_eq!(plan.cycle_count(), 5, "the static arm has no cycles");
+    assert_eq!(plan.cycle_count(), 10);
+    for (number, arm) in [
+        (4, ArmKind::Cyclic),
+        (5, ArmKind::Static),
+        (9, ArmKind::Static),
+    ] {
+        let cycle = plan.cycle(number).unwrap();
+        assert!(cycle.arm == arm && (cycle.duration_s - 4.0).abs() < 1e-9);
+    }
 }
 
 #[test]
@@ -172,6 +180,7 @@ fn a_wait_stops_the_plans_clock_until_its_condition_is_met() {
     let seen = |x: f64| Seen {
         position_um: Some(x),
         length_um: None,
+        error_um: None,
     };
     let mut waiting = 0;
     for tick in 0..1000 {
@@ -212,6 +221,7 @@ fn stop_conditions_end_a_script_and_hold_the_reference() {
             Seen {
                 position_um: Some(0.0),
                 length_um: None,
+                error_um: None,
             },
             StopReason::Cycles,
             300,
@@ -221,6 +231,7 @@ fn stop_conditions_end_a_script_and_hold_the_reference() {
             Seen {
                 position_um: Some(0.0),
                 length_um: None,
+                error_um: None,
             },
             StopReason::Time,
             50,
@@ -236,6 +247,7 @@ fn stop_conditions_end_a_script_and_hold_the_reference() {
             Seen {
                 position_um: Some(5.0),
                 length_um: None,
+                error_um: None,
             },
             StopReason::Error,
             0,
@@ -318,6 +330,7 @@ fn ten_thousand_cycles_are_each_there_once() {
     let seen = Seen {
         position_um: Some(0.0),
         length_um: None,
+        error_um: None,
     };
     let mut last = None;
     let mut cycles = 0;

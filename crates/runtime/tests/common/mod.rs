@@ -54,6 +54,7 @@ pub fn measurement(k: u64, position_um: f64) -> Measurement {
         variance_um2: 4e-4,
         verdict: Verdict::Good,
         track: None,
+        length_um: f64::NAN,
         snr: 40.0,
         true_um: f64::NAN,
         true_pzt_um: f64::NAN,
