@@ -361,6 +361,14 @@ impl ControlLoop {
         self.finish(state, input, &prepared, wish_um, SolverReport::default())
     }
 
+    /// A tick that never came: the command was held and the bead moved on. The estimator follows; integrator and
+    /// feed-forward stay where they are, so that a step in progress goes on as it was.
+    pub fn skip(&self, state: &mut LoopState) {
+        self.estimator.step(&mut state.estimator, None);
+        let held_um = state.previous_command_um();
+        self.estimator.push(&mut state.estimator, held_um);
+    }
+
     /// Estimate, reference and feed-forward of a tick.
     pub(crate) fn prepare(&self, state: &mut LoopState, input: &LoopInput) -> Prepared {
         let fix = input.measurement.as_ref().and_then(|m| self.fix(m));
@@ -578,6 +586,11 @@ impl Controller {
             ControllerConfig::Lqg(_) => 1,
             ControllerConfig::Mpc(..) => HORIZON,
         }
+    }
+
+    /// A tick that never came, see [`ControlLoop::skip`].
+    pub fn skip(&self, state: &mut LoopState) {
+        self.control.skip(state);
     }
 
     /// One tick.

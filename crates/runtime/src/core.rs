@@ -223,12 +223,7 @@ impl<R: Guide> Core<R> {
         });
         self.state.counts.skipped += skipped as u64;
         for _ in 0..skipped.min(MOST) {
-            let held = self.state.control.previous_command_um();
-            let input = LoopInput {
-                mode: Mode::Direct(held),
-                ..LoopInput::default()
-            };
-            self.controller.step(&mut self.state.control, &input);
+            self.controller.skip(&mut self.state.control);
         }
     }
 

@@ -5,7 +5,7 @@ mod common;
 use cellpos_control::ControllerKind;
 use cellpos_runtime::{Action, Life, Request, TickInput};
 use cellpos_vision::Verdict;
-use common::{START_UM, controller, core, measurement};
+use common::{START_UM, controller, core, measurement, report};
 use proptest::prelude::*;
 
 /// What may go wrong with one tick's measurement.
@@ -107,7 +107,7 @@ proptest! {
                 drained,
                 previous_late_ns: None,
                 previous_refused: false,
-                board: None,
+                board: Some(report(k as u64)),
                 request: if calm { Request::None } else { tick.request },
                 solver: Default::default(),
             });

@@ -277,7 +277,10 @@ fn conclude(
     if let Some(error) = &io_error {
         warnings.push(describe(error));
     }
-    let healthy = summary.state == Life::Running && io_error.is_none();
+    // Parked by the operator is ended as asked.
+    let as_asked = summary.state == Life::Running
+        || summary.safe_reason == Some(cellpos_runtime::SafeReason::Operator);
+    let healthy = as_asked && io_error.is_none();
     let run = sink.into_writer().map(|writer| {
         let mut end = RunEnd::new(if healthy {
             "done"

@@ -2,8 +2,9 @@
 #![allow(dead_code, reason = "each test file uses what it needs")]
 
 use cellpos_control::{ControllerFile, ControllerKind, Lead, Pi, Profile, SolverKind};
+use cellpos_link::{BoardState, Fault};
 use cellpos_plant::{Model, TransferFunction};
-use cellpos_rig::Measurement;
+use cellpos_rig::{BoardReport, Measurement};
 use cellpos_runtime::{ArmingConfig, Core, Timing};
 use cellpos_vision::Verdict;
 
@@ -58,5 +59,18 @@ pub fn measurement(k: u64, position_um: f64) -> Measurement {
         snr: 40.0,
         true_um: f64::NAN,
         true_pzt_um: f64::NAN,
+    }
+}
+
+/// What a board that follows says at tick `k`.
+pub fn report(k: u64) -> BoardReport {
+    BoardReport {
+        state: BoardState::Running,
+        fault: Fault::None,
+        applied_um: START_UM,
+        last_seq: u32::try_from(k).ok(),
+        last_time_us: k * 1000,
+        bad_frames: 0,
+        read_ns: k as i64 * 1_000_000,
     }
 }
