@@ -71,8 +71,8 @@ pub struct StepResult {
 }
 
 impl StepWatch {
-    /// Moves shorter than this drown in Brownian motion, um.
-    const SMALLEST_UM: f64 = 1.0;
+    /// Of a shorter move the band of 5 % is within the Brownian motion of a held bead (0.25 um: four times its RMS), um.
+    const SMALLEST_UM: f64 = 5.0;
     /// The move is over after this long, ns: what comes later is another matter.
     const LONGEST_NS: i64 = 1_000_000_000;
 
