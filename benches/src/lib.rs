@@ -4,14 +4,14 @@
 use cellpos_control::{ControllerFile, ControllerKind, Pi, Profile};
 use cellpos_emulator::WorldConfig;
 use cellpos_firmware_sim::BoardConfig;
-use cellpos_plant::{Model, TransferFunction};
-use cellpos_rig::{Clock, EmulatedRig, PositionSource, VisionSource};
+use cellpos_plant::{Hertz, Model, TransferFunction};
+use cellpos_rig::{Clock, CommandedFlow, EmulatedRig, FlowTap, PositionSource, VisionSource};
 use cellpos_runtime::live::{self, Operator, Threads};
 use cellpos_runtime::realtime::Conditions;
 use cellpos_runtime::{
     ArmingConfig, Core, EndRule, NoSink, Statistics, Summary, Timing, virtual_run,
 };
-use cellpos_vision::{Localiser, LocaliserConfig, ProfileSpec};
+use cellpos_vision::{Localiser, LocaliserConfig, ProfileSpec, Tracker, TrackerConfig};
 
 /// A run on the emulated rig, held at 0 um with PI, as `cellpos track --target 0um` does it.
 ///
@@ -22,18 +22,18 @@ pub fn track(clock: Clock, frames: bool, ticks: u64) -> (Summary, Conditions) {
     let model = Model::eq6();
     let rig = EmulatedRig::new(BoardConfig::default(), &world, &model, clock.clone())
         .expect("the default rig runs");
-    let mut actuator = rig.actuator().expect("the board answers");
+    let flow = CommandedFlow::new(model.plant.velocity_gain_at(Hertz(20.0)));
+    let board = rig.actuator().expect("the board answers");
+    let mut actuator = FlowTap::new(board, flow.clone(), clock.clone());
     let mut source: Box<dyn PositionSource> = if frames {
         let profile = ProfileSpec::Ring {
             edge_px: world.bead_radius_px(),
         };
         let localiser = Localiser::new(LocaliserConfig::new(profile)).expect("a sound profile");
-        Box::new(VisionSource::new(
-            rig.camera(),
-            localiser,
-            rig.calibration(),
-            clock.clone(),
-        ))
+        let tracking = TrackerConfig::for_pixel_um(world.pixel_um);
+        let tracker = Tracker::new(localiser, tracking).expect("sound settings");
+        let source = VisionSource::new(rig.camera(), tracker, rig.calibration(), clock.clone());
+        Box::new(source.with_flow(flow))
     } else {
         Box::new(rig.positions())
     };
