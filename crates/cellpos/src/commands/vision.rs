@@ -99,7 +99,7 @@ pub fn run(args: Args) -> CommandResult {
             "give a number of frames above 0",
         ));
     }
-    let out = new_folder(&args)?;
+    let out = out_folder(&args)?;
     let mut reader = |n: usize, buffer: &mut FrameBuffer| -> Result<(), SourceError> {
         recording.read(n, buffer)?;
         args.region.map_or(Ok(()), |r| r.cut(buffer))
@@ -126,6 +126,8 @@ pub fn run(args: Args) -> CommandResult {
         )?
     };
     let summary = tally.summary(&info, frames, calibration.as_ref(), &out);
+    // Made last: a recording that turns out to be damaged leaves nothing behind.
+    std::fs::create_dir_all(&out).map_err(|e| cannot_write(&out, &e))?;
     write(&out.join("positions.csv"), csv.as_bytes())?;
     sheet
         .save(&out.join("sheet.png"))
@@ -326,7 +328,7 @@ fn name(verdict: Verdict) -> &'static str {
     }
 }
 
-fn new_folder(args: &Args) -> Result<PathBuf, Failure> {
+fn out_folder(args: &Args) -> Result<PathBuf, Failure> {
     let stem = args
         .source
         .file_stem()
@@ -340,7 +342,6 @@ fn new_folder(args: &Args) -> Result<PathBuf, Failure> {
         let error = format!("{}: exists already; nothing is overwritten", out.display());
         return Err(Failure::bad_input(error, "give another folder with --out"));
     }
-    std::fs::create_dir_all(&out).map_err(|e| cannot_write(&out, &e))?;
     Ok(out)
 }
 
