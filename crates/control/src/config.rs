@@ -275,11 +275,7 @@ pub(crate) fn text_error(text: &str, file: &str, error: &toml::de::Error) -> Con
     let mut quoted = message.split('`').skip(1).step_by(2);
     let suggestion = message.starts_with("unknown").then(|| {
         let wrong = quoted.next().unwrap_or_default().to_owned();
-        quoted
-            .map(|known| (edit_distance(&wrong, known), known))
-            .min()
-            .filter(|(distance, known)| *distance <= 2 + known.len() / 3)
-            .map(|(_, known)| known.to_owned())
+        cellpos_units::nearest(&wrong, quoted).map(str::to_owned)
     });
     ConfigError::Text {
         file: file.to_owned(),
@@ -288,21 +284,6 @@ pub(crate) fn text_error(text: &str, file: &str, error: &toml::de::Error) -> Con
         message,
         suggestion: suggestion.flatten(),
     }
-}
-
-fn edit_distance(a: &str, b: &str) -> usize {
-    let b: Vec<char> = b.chars().collect();
-    let mut row: Vec<usize> = (0..=b.len()).collect();
-    for (i, ca) in a.chars().enumerate() {
-        let mut diagonal = row[0];
-        row[0] = i + 1;
-        for (j, cb) in b.iter().enumerate() {
-            let substitute = diagonal + usize::from(ca != *cb);
-            diagonal = row[j + 1];
-            row[j + 1] = substitute.min(row[j] + 1).min(diagonal + 1);
-        }
-    }
-    row[b.len()]
 }
 
 #[cfg(test)]

@@ -47,43 +47,12 @@ impl ScriptError {
 
 /// The candidate nearest to a misspelt word, if one is near.
 pub(crate) fn nearest<'a>(word: &str, candidates: &[&'a str]) -> Option<&'a str> {
-    candidates
-        .iter()
-        .map(|candidate| (distance(word, candidate), *candidate))
-        .min_by_key(|(distance, _)| *distance)
-        .filter(|(distance, candidate)| *distance <= candidate.chars().count().max(3) / 3 + 1)
-        .map(|(_, candidate)| candidate)
-}
-
-/// Levenshtein's edit distance, of the first 40 characters.
-fn distance(a: &str, b: &str) -> usize {
-    let b: Vec<char> = b.chars().take(40).collect();
-    let mut row: Vec<usize> = (0..=b.len()).collect();
-    for (i, ca) in a.chars().take(40).enumerate() {
-        let mut diagonal = i;
-        if let Some(first) = row.first_mut() {
-            *first = i + 1;
-        }
-        for (j, cb) in b.iter().enumerate() {
-            let cost = diagonal + usize::from(ca != *cb);
-            diagonal = row[j + 1];
-            row[j + 1] = cost.min(row[j] + 1).min(diagonal + 1);
-        }
-    }
-    row.last().copied().unwrap_or(0)
+    cellpos_units::nearest(word, candidates.iter().copied())
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn a_slip_of_the_keyboard_finds_its_word() {
-        let words = ["amplitude", "frequency", "cycles"];
-        assert_eq!(nearest("amplitud", &words), Some("amplitude"));
-        assert_eq!(nearest("freqency", &words), Some("frequency"));
-        assert_eq!(nearest("colour", &words), None);
-    }
 
     #[test]
     fn places_are_counted_in_lines_and_characters() {

@@ -1,7 +1,7 @@
 //! Setpoint scripts: what the bead or cell shall do, as a TOML file with units.
 //!
 //! [`Script`] is the file, read with errors that name line and column. [`Plan`] is the script laid out in time: the
-//! reference at any instant without allocation ([`Plan::at_um`]), the cycles, and a [`Cursor`] that walks through it,
+//! reference at any instant without allocation (a [`Plan`] is a [`cellpos_control::Reference`]), the cycles, and a [`Cursor`] that walks through it,
 //! waits for conditions and ends on stop conditions. [`check()`] compares a plan with a model and limits before
 //! anything moves: peak position, speed and PZT demand, and the largest amplitude that the rig could do.
 //!

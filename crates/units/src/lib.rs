@@ -18,8 +18,10 @@
 extern crate std;
 
 mod parse;
+mod spelling;
 
 pub use parse::{Problem, UnitError};
+pub use spelling::nearest;
 
 use core::fmt;
 use core::str::FromStr;

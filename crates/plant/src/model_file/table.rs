@@ -156,39 +156,5 @@ impl<'a, 'i> Table<'a, 'i> {
 
 /// The known name nearest to a misspelt one, if it is near enough to be meant.
 pub(super) fn nearest(name: &str, known: &[&str]) -> Option<String> {
-    known
-        .iter()
-        .map(|k| (distance(name, k), *k))
-        .min()
-        .filter(|(d, k)| *d <= 1 + k.len().min(name.len()) / 3)
-        .map(|(_, k)| k.to_owned())
-}
-
-/// Levenshtein distance, where `-` and `_` count as the same letter and case does not count.
-fn distance(a: &str, b: &str) -> usize {
-    let letters = |s: &str| -> Vec<char> {
-        s.chars()
-            .take(64)
-            .map(|c| {
-                if c == '-' {
-                    '_'
-                } else {
-                    c.to_ascii_lowercase()
-                }
-            })
-            .collect()
-    };
-    let (a, b) = (letters(a), letters(b));
-    let mut row: Vec<usize> = (0..=b.len()).collect();
-    for (i, x) in a.iter().enumerate() {
-        let mut diagonal = row[0];
-        row[0] = i + 1;
-        for (j, y) in b.iter().enumerate() {
-            let cost = usize::from(x != y);
-            let next = (diagonal + cost).min(row[j] + 1).min(row[j + 1] + 1);
-            diagonal = row[j + 1];
-            row[j + 1] = next;
-        }
-    }
-    row[b.len()]
+    cellpos_units::nearest(name, known.iter().copied()).map(str::to_owned)
 }
