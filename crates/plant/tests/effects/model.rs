@@ -1,0 +1,105 @@
+//! Effects together, and the model that holds them.
+
+use super::*;
+
+#[test]
+fn a_model_means_the_same_in_whatever_order_its_effects_are_written() {
+    let a = Effect::DriverLag {
+        bandwidth_hz: 150.0,
+    };
+    let b = bouc_wen(false);
+    let c = Effect::WallAdhesion {
+        speed_um_per_s: 20.0,
+    };
+    let u: Vec<f64> = sine(9.0, 1.0, 1e-3, 300).iter().map(|u| u + 4.0).collect();
+    let one = Model::eq6()
+        .with_effect(a.clone())
+        .with_effect(b.clone())
+        .with_effect(c.clone());
+    let two = Model::eq6().with_effect(c).with_effect(b).with_effect(a);
+    assert_eq!(run(&one, &u, 1e-3), run(&two, &u, 1e-3));
+}
+
+#[test]
+fn sub_steps_are_fine_enough_for_hysteresis_behind_a_lag_and_adhesion_behind_the_plant() {
+    let model = Model::eq6()
+        .with_effect(Effect::DriverLag {
+            bandwidth_hz: 300.0,
+        })
+        .with_effect(bouc_wen(false))
+        .with_effect(Effect::Backlash { width_um: 0.05 })
+        .with_effect(Effect::WallAdhesion {
+            speed_um_per_s: 35.0,
+        });
+    let u: Vec<f64> = sine(43.0, 1.0, 1e-3, 500).iter().map(|u| u + 4.0).collect();
+    let mut coarse = Chain::new(&model).unwrap();
+    let mut fine = Chain::new(&model).unwrap();
+    let mut worst = 0.0_f64;
+    for u in &u {
+        coarse.advance(*u, 1e-3);
+        for _ in 0..1000 {
+            fine.advance(*u, 1e-6);
+        }
+        worst = worst.max((coarse.bead_um() - fine.bead_um()).abs());
+    }
+    assert!(worst < 0.02, "{worst} um");
+}
+
+#[test]
+fn rows_at_irregular_times_see_the_same_positions_as_a_regular_record() {
+    let model = Model::eq6()
+        .with_effect(Effect::TimeDelay { delay_s: 1.3e-3 })
+        .with_effect(Effect::ExposureAveraging { exposure_s: 0.4e-3 });
+    let u: Vec<f64> = sine(21.0, 1.0, 1e-3, 400).iter().map(|u| u + 4.0).collect();
+    let regular = run(&model, &u, 1e-3);
+    let times: Vec<f64> = (0..400).map(|k| 17.0 + k as f64 * 1e-3).collect();
+    let at = simulate_at(&model, &times, &u, &SimulateOptions::default()).unwrap();
+    for (a, b) in regular.iter().zip(&at) {
+        assert!((a - b).abs() < 1e-8);
+    }
+    // A missing row where the command did not change changes nothing in the others.
+    let mut flat = u.clone();
+    flat[201] = flat[200];
+    let whole = simulate_at(&model, &times, &flat, &SimulateOptions::default()).unwrap();
+    let (mut t, mut v) = (times, flat);
+    t.remove(201);
+    v.remove(201);
+    let gap = simulate_at(&model, &t, &v, &SimulateOptions::default()).unwrap();
+    assert!((gap[300] - whole[301]).abs() < 1e-9);
+    // Times that do not rise and displacements that are not finite are refused.
+    assert!(simulate_at(&model, &[0.0, 0.0], &[4.0, 4.0], &Default::default()).is_err());
+    assert!(simulate_at(&model, &[0.0, 1.0], &[4.0, f64::NAN], &Default::default()).is_err());
+    assert!(simulate_at(&model, &[0.0], &[4.0, 4.0], &Default::default()).is_err());
+}
+
+#[test]
+fn a_parameter_is_changed_by_name_within_its_bounds_only() {
+    let lag = Effect::DriverLag {
+        bandwidth_hz: 100.0,
+    };
+    let changed = lag.with_parameter("bandwidth_hz", 200.0).unwrap();
+    assert_eq!(
+        changed,
+        Effect::DriverLag {
+            bandwidth_hz: 200.0
+        }
+    );
+    let error = lag.with_parameter("bandwidth_hz", -1.0).unwrap_err();
+    assert_eq!(
+        error.to_string(),
+        "driver-lag: `bandwidth_hz` = -1 Hz: it must be a finite number in 0.1..100000 Hz"
+    );
+    assert!(
+        lag.with_parameter("bandwidth", 1.0)
+            .unwrap_err()
+            .to_string()
+            .contains("bandwidth_hz")
+    );
+    let operators = play(vec![0.0, 0.5], vec![0.6, 0.4], 0.1);
+    let changed = operators.with_parameter("weights[1]", 0.3).unwrap();
+    assert_eq!(changed, play(vec![0.0, 0.5], vec![0.6, 0.3], 0.1));
+    let changed = changed.with_parameter("quadratic_per_um", 0.0).unwrap();
+    assert_eq!(changed, play(vec![0.0, 0.5], vec![0.6, 0.3], 0.0));
+    assert!(operators.with_parameter("weights[2]", 0.3).is_err());
+    assert!(operators.with_parameter("thresholds_um[1]", 0.0).is_err());
+}
