@@ -83,23 +83,6 @@ fn saturation_clips_to_absolute_levels_and_the_camera_sees_flat_tops() {
     assert!(y.iter().filter(|y| **y == high).count() > 50);
 }
 
-fn bouc_wen(explicit: bool) -> Effect {
-    let (fraction, beta_per_um, gamma_per_um) = (0.3, 0.9, 0.2);
-    Effect::PztHysteresis(if explicit {
-        Hysteresis::BoucWenExplicit {
-            fraction,
-            beta_per_um,
-            gamma_per_um,
-        }
-    } else {
-        Hysteresis::BoucWen {
-            fraction,
-            beta_per_um,
-            gamma_per_um,
-        }
-    })
-}
-
 #[test]
 fn bouc_wen_is_its_differential_equation_whatever_the_steps() {
     let path = [0.0, 1.5, -2.0, 0.3, 0.1, 3.0, -0.5];
@@ -147,14 +130,6 @@ fn hysteresis_lags_alike_at_all_frequencies_and_the_gain_rises_with_amplitude() 
     assert!((of(2.0, 1.0) / of(20.0, 1.0) - 1.0).norm() < 0.01);
     assert!(of(5.0, 2.0).norm() > of(5.0, 0.2).norm() + 0.05);
     assert!(of(5.0, 0.01).norm() < 0.71);
-}
-
-fn play(thresholds_um: Vec<f64>, weights: Vec<f64>, quadratic_per_um: f64) -> Effect {
-    Effect::PztHysteresis(Hysteresis::Play {
-        thresholds_um,
-        weights,
-        quadratic_per_um,
-    })
 }
 
 #[test]

@@ -54,3 +54,28 @@ fn relative_response(model: &Model, f: f64, amplitude: f64) -> Complex<f64> {
     let without = harmonic(&run(&base, &u, sample_s), f, sample_s, n);
     with / without
 }
+
+fn play(thresholds_um: Vec<f64>, weights: Vec<f64>, quadratic_per_um: f64) -> Effect {
+    Effect::PztHysteresis(Hysteresis::Play {
+        thresholds_um,
+        weights,
+        quadratic_per_um,
+    })
+}
+
+fn bouc_wen(explicit: bool) -> Effect {
+    let (fraction, beta_per_um, gamma_per_um) = (0.3, 0.9, 0.2);
+    Effect::PztHysteresis(if explicit {
+        Hysteresis::BoucWenExplicit {
+            fraction,
+            beta_per_um,
+            gamma_per_um,
+        }
+    } else {
+        Hysteresis::BoucWen {
+            fraction,
+            beta_per_um,
+            gamma_per_um,
+        }
+    })
+}
