@@ -20,6 +20,8 @@ pub struct Measurement {
     pub variance_um2: f64,
     /// Whole ticks by which the frame is older than the nominal delay (0: on time).
     pub age_samples: u16,
+    /// What its time stamp says beyond that, ticks, -1/2 to 1/2; positive: older still.
+    pub offset_samples: f64,
 }
 
 /// What the loop is to do.
@@ -49,6 +51,9 @@ pub struct LoopInput<'a> {
     pub mode: Mode,
     /// Added to the controller's wish in [`Mode::Run`], um of PZT: excitation for identification in closed loop.
     pub excitation_um: f64,
+    /// A learned correction of the feed-forward, added in [`Mode::Run`], um of PZT. The estimator is not told of it:
+    /// it is what the plant needs beyond what the model says, so that with it the model is right along the reference.
+    pub learned_um: f64,
     /// How long an optimising controller may take.
     pub solver: SolverTerms,
 }
@@ -246,7 +251,7 @@ impl Prepared {
 /// };
 /// let control = ControlLoop::new(config)?;
 /// let mut state = control.start(20.0, 20.0);
-/// let fix = Measurement { position_um: 1.0, variance_um2: 4e-4, age_samples: 0 };
+/// let fix = Measurement { position_um: 1.0, variance_um2: 4e-4, age_samples: 0, offset_samples: 0.0 };
 /// let out = control.step(&mut state, &LoopInput { measurement: Some(fix), ..LoopInput::default() });
 /// assert!(out.command_um < 20.0, "the bead is beyond the reference: pull");
 /// # Ok::<(), BuildError>(())
@@ -309,6 +314,7 @@ impl ControlLoop {
         };
         LoopState {
             estimator: self.estimator.start(command, neutral),
+            learned_um: 0.0,
             pi: PiState {
                 integral_um: command,
                 lead_um: 0.0,
@@ -332,6 +338,7 @@ impl ControlLoop {
             position_um,
             variance_um2,
             age_samples,
+            offset_samples,
         } = *measurement;
         let stated = variance_um2.is_finite() && variance_um2 > 0.0;
         let assumed = self.config.estimator.fix_noise_um.powi(2);
@@ -343,6 +350,11 @@ impl ControlLoop {
                 assumed
             },
             age: usize::from(age_samples),
+            offset: if offset_samples.abs() <= 0.5 {
+                offset_samples
+            } else {
+                0.0
+            },
         })
     }
 
@@ -462,12 +474,16 @@ impl ControlLoop {
             _ if prepared.controls => wish_um,
             _ => prepared.estimate.neutral_um,
         };
-        let excitation_um = if prepared.controls {
-            input.excitation_um
+        let (excitation_um, learned_um) = if prepared.controls {
+            (
+                input.excitation_um,
+                self.config.limits.to_steps(input.learned_um),
+            )
         } else {
-            0.0
+            (0.0, 0.0)
         };
-        let output = self.limit(state, input, prepared, requested_um + excitation_um, solver);
+        let added_um = excitation_um + learned_um;
+        let output = self.limit(state, input, prepared, requested_um + added_um, solver);
         let mut pi = prepared.pi;
         if prepared.controls && self.law == Law::Pi {
             self.pi.integrate(
@@ -475,12 +491,12 @@ impl ControlLoop {
                 prepared.reference_um - prepared.bead_um,
                 requested_um,
                 // The excitation is no saturation: the integrator must not be pulled along with it.
-                output.command_um - excitation_um,
+                output.command_um - added_um,
                 prepared.hold(),
             );
         } else {
             self.pi
-                .track(&mut pi, prepared.proportional_um, output.command_um);
+                .track(&mut pi, prepared.proportional_um, output.command_um - learned_um);
         }
         let sound = pi.integral_um.abs() < FAR_UM && pi.lead_um.abs() < FAR_UM;
         state.pi = if sound {
@@ -499,7 +515,9 @@ impl ControlLoop {
                 FeedForward::rest(prepared.reference_um)
             };
         }
-        self.estimator.push(&mut state.estimator, output.command_um);
+        self.estimator
+            .push(&mut state.estimator, output.command_um - learned_um);
+        state.learned_um = learned_um;
         output
     }
 
@@ -606,7 +624,7 @@ impl Controller {
                 .control
                 .finish(state, input, &prepared, wish_um, SolverReport::default());
         }
-        let previous_um = state.previous_command_um();
+        let previous_um = state.previous_command_um() - state.learned_um;
         let (plan_um, report) = mpc.plan(&self.control, input, &mut prepared, previous_um);
         let wish_um = plan_um.unwrap_or_else(|| self.control.pi_wish(&prepared));
         self.control

@@ -28,6 +28,28 @@ const STUCK_AVERAGE: f64 = 0.05;
 /// wrong because neutral was.
 const RELEASED_NEUTRAL_UM: f64 = 0.5;
 
+/// Variance of spread level 0, um^2.
+const LEAST_SPREAD_UM2: f64 = 1e-6;
+
+fn spread_um2(level: u8) -> f64 {
+    if level == 0 {
+        0.0
+    } else {
+        LEAST_SPREAD_UM2 * (f64::from(level) / 8.0).exp2()
+    }
+}
+
+/// The level after one more tick. It follows the crests: a filter whose gain rose and fell within each cycle of a motion
+/// would rectify the innovations of that cycle into a false neutral.
+fn raised(level: u8, variance_um2: f64) -> u8 {
+    let wanted = if variance_um2 > LEAST_SPREAD_UM2 {
+        (8.0 * (variance_um2 / LEAST_SPREAD_UM2).log2()).min(255.0) as u8
+    } else {
+        0
+    };
+    wanted.max(level.saturating_sub(1))
+}
+
 /// Noise and gate of the estimator.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -84,6 +106,9 @@ pub struct EstimatorState {
     pub history_um: [f64; HISTORY],
     /// Evidence that the bead is stuck, natural logarithm of the odds, 0 or more.
     pub stuck_evidence: f64,
+    /// Level of the variance per tick that a wrong gain may cause: eight to a factor of two, 0 for none. It rises at
+    /// once and falls by one a tick.
+    pub spread_level: u8,
     /// Ticks by which the filter's time lies behind the nominal delay.
     pub lag: u8,
     /// Refused measurements in a row.
@@ -128,6 +153,8 @@ pub(crate) struct Fix {
     pub position_um: f64,
     pub variance_um2: f64,
     pub age: usize,
+    /// Its time stamp beyond that, ticks: positive for older.
+    pub offset: f64,
 }
 
 /// Transition over a time, exact for a constant command.
@@ -297,6 +324,7 @@ impl Estimator {
             modes: [0.0; MODES],
             history_um: [command_um; HISTORY],
             stuck_evidence: 0.0,
+            spread_level: 0,
             lag: 0,
             gated: 0,
             seen: false,
@@ -359,11 +387,12 @@ impl Estimator {
         state.integrator_um = next.q;
         state.modes = next.modes;
         let g = self.tick.gain;
-        let spread = self.config.gain_uncertainty * motion;
+        let spread = self.config.gain_uncertainty * self.net_motion(state, back, m.n);
+        state.spread_level = raised(state.spread_level, spread * spread);
         let p11n = p11 - 2.0 * g * p12
             + g * g * p22
             + 2.0 * self.config.diffusion_um2_per_s * ts
-            + spread * spread;
+            + spread_um2(state.spread_level);
         state.covariance_um2 = if p11n < 1e6 {
             [p11n, p12 - g * p22, p22n]
         } else {
@@ -372,12 +401,36 @@ impl Estimator {
         motion
     }
 
+    /// Root of the mean square per tick that the net motion of the last ticks up to the one `back` ago amounts to, um.
+    /// A wrong gain errs in proportion to where the bead went, not to the way it made: motion to and fro, summed tick by
+    /// tick as if each erred on its own, would hide neutral and let it drift.
+    fn net_motion(&self, state: &EstimatorState, back: usize, neutral_um: f64) -> f64 {
+        const MOST: usize = 4;
+        let first = back.max(1);
+        let ticks = MOST.min((HISTORY + 1).saturating_sub(first)).max(1);
+        let sum: f64 = (first..first + ticks)
+            .map(|ago| self.tick.gain * (Self::command(state, ago) - neutral_um))
+            .sum();
+        sum / (ticks as f64).sqrt()
+    }
+
     /// From the filter's time to that of its measurement.
     fn at_measurement(&self, m: &Moment, command_um: f64, stuck: bool) -> Moment {
         if self.part.fraction == 0.0 || stuck {
             *m
         } else {
             self.part.advance(m, command_um)
+        }
+    }
+
+    /// From the filter's time to that of a fix, by its time stamp.
+    fn part_of(&self, fix: &Fix) -> Transition {
+        /// Differences below this are the noise of time stamps, ticks.
+        const SAME: f64 = 1e-3;
+        if fix.offset.abs() < SAME {
+            self.part
+        } else {
+            Transition::new(&self.model, self.part.fraction - fix.offset)
         }
     }
 
@@ -438,16 +491,24 @@ impl Estimator {
 
     /// Uses a fix at the filter's time. Returns whether it was accepted, and the innovation.
     fn update(&self, state: &mut EstimatorState, fix: &Fix, motion_um: f64) -> (bool, f64) {
-        let command = Self::command(state, self.delay_ticks + usize::from(state.lag));
-        let predicted =
-            self.position(&self.at_measurement(&self.filter_moment(state), command, state.stuck));
+        let from = self.filter_moment(state);
+        let part = self.part_of(fix);
+        // An exposure before the filter's time lies in the tick of the command before.
+        let back = self.delay_ticks + usize::from(state.lag);
+        let command = Self::command(state, if part.fraction < 0.0 { back + 1 } else { back });
+        let at = if part.fraction == 0.0 || state.stuck {
+            from
+        } else {
+            part.advance(&from, command)
+        };
+        let predicted = self.position(&at);
         let innovation = fix.position_um - predicted;
         if !state.seen {
             self.place(state, innovation, fix.variance_um2);
             return (true, 0.0);
         }
         let [p11, p12, p22] = state.covariance_um2;
-        let h = -self.part.gain;
+        let h = -part.gain;
         let (ph1, ph2) = (p11 + h * p12, p12 + h * p22);
         let spread = ph1 + h * ph2 + fix.variance_um2;
         // A stuck bead that comes free may move far in a frame.

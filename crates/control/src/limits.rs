@@ -94,6 +94,17 @@ impl Limits {
             .clamp(self.low_um, self.high_um)
     }
 
+    /// The nearest whole number of steps of the command grid, um; 0 for a number that is not finite. A command less such
+    /// an amount is still on the grid.
+    pub(crate) fn to_steps(self, amount_um: f64) -> f64 {
+        let step_um = (self.high_um - self.low_um) / GRID_STEPS;
+        if amount_um.is_finite() {
+            (amount_um / step_um).round() * step_um
+        } else {
+            0.0
+        }
+    }
+
     /// The nearest displacement within the range and on the command grid, um; park for a number that is not finite.
     pub fn to_grid(&self, displacement_um: f64) -> f64 {
         let wanted = if displacement_um.is_finite() {

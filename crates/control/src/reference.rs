@@ -13,6 +13,13 @@ pub trait Reference {
 
     /// When it ends, s; `None`: never.
     fn duration_s(&self) -> Option<f64>;
+
+    /// Phase of a periodic reference at a time, in cycles; `None` where it is not periodic (or not yet). What is learned
+    /// over cycles is laid on this phase.
+    fn phase(&self, time_s: f64) -> Option<f64> {
+        let _ = time_s;
+        None
+    }
 }
 
 /// Fills `preview_um` with the reference at the ticks that follow `tick`, the next one first.
@@ -24,6 +31,26 @@ pub fn fill_preview(
 ) {
     for (ahead, slot) in (1u64..).zip(preview_um) {
         *slot = reference.at_um(tick.saturating_add(ahead) as f64 * sample_time_s);
+    }
+}
+
+/// Where a bead that is on the reference at every tick is at a time between ticks, um: on the straight line, because
+/// the command is held and the plant integrates. What an exposure that is not made at a tick is compared with.
+pub fn at_exposure_um(
+    reference: &(impl Reference + ?Sized),
+    time_s: f64,
+    sample_time_s: f64,
+) -> f64 {
+    let ticks = time_s / sample_time_s;
+    // Rounding must not put an exposure at a tick a whole tick early.
+    let before = (ticks + 1e-9).floor();
+    let part = (ticks - before).clamp(0.0, 1.0);
+    let at = |tick: f64| reference.at_um(tick * sample_time_s);
+    let here_um = at(before);
+    if part < 1e-6 {
+        here_um
+    } else {
+        here_um + part * (at(before + 1.0) - here_um)
     }
 }
 
@@ -282,6 +309,18 @@ impl Reference for Profile {
                 let (a, b) = (at(index as usize), at(index as usize + 1));
                 a + (b - a) * (phase - index)
             }
+        }
+    }
+
+    fn phase(&self, time_s: f64) -> Option<f64> {
+        match self {
+            Self::Wave {
+                frequency_hz,
+                fade_s,
+                ..
+            } if time_s >= *fade_s => Some(time_s * frequency_hz),
+            Self::Waveform { period_s, .. } if time_s >= 0.0 => Some(time_s / period_s),
+            _ => None,
         }
     }
 

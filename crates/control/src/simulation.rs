@@ -131,6 +131,7 @@ impl SimulatedRig {
             position_um: position_um + noise * self.random.draw(),
             variance_um2: noise * noise,
             age_samples: 0,
+            offset_samples: 0.0,
         }
     }
 

@@ -10,7 +10,7 @@ use crate::pi::PiState;
 pub const STATE_LEN: usize = 16;
 
 /// Bits of the packed flags below the evidence.
-const FLAG_BITS: f64 = 262_144.0;
+const FLAG_BITS: f64 = 67_108_864.0;
 
 /// Estimator and controller state of one loop.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -21,12 +21,14 @@ pub struct LoopState {
     pub pi: PiState,
     /// Model on the reference (state feedback only).
     pub feed_forward: FeedForwardState,
+    /// Learned addition in the previous tick's command, um; not part of the packed state.
+    pub learned_um: f64,
 }
 
 impl LoopState {
     /// Command of the previous tick, um.
     pub fn previous_command_um(&self) -> f64 {
-        self.estimator.history_um[0]
+        self.estimator.history_um[0] + self.learned_um
     }
 
     /// The state as 16 numbers, exactly. Past commands lie on the grid of `limits`, so that two of them are the digits
@@ -37,7 +39,8 @@ impl LoopState {
         let flags = u32::from(e.lag)
             | u32::from(e.gated) << 8
             | u32::from(e.seen) << 16
-            | u32::from(e.stuck) << 17;
+            | u32::from(e.stuck) << 17
+            | u32::from(e.spread_level) << 18;
         let mut out = [0.0; STATE_LEN];
         out[0] = e.integrator_um;
         out[1] = e.neutral_um;
@@ -80,11 +83,13 @@ impl LoopState {
                 gated: (flags >> 8) as u8,
                 seen: flags & 1 << 16 != 0,
                 stuck: flags & 1 << 17 != 0,
+                spread_level: (flags >> 18) as u8,
             },
             pi: PiState {
                 integral_um: packed[7],
                 lead_um: if state_feedback { 0.0 } else { packed[8] },
             },
+            learned_um: 0.0,
             feed_forward: FeedForwardState {
                 integrator_um: packed[9],
                 modes: [packed[10], packed[11]],

@@ -5,6 +5,7 @@
 //! sample of hold, so the discrete delay is `T / Ts - 1/2` samples.
 
 mod bound;
+mod learning;
 mod margins;
 mod noise;
 mod plant;
@@ -14,6 +15,7 @@ mod spread;
 mod step;
 
 pub use bound::{bound_rms_um, kalman_posterior_um2};
+pub use learning::{Uncertainty, harmonic_responses};
 pub use margins::{Margins, margins};
 pub use noise::{NoiseFigures, noise_figures};
 pub use plant::{DesignPlant, DesignWarning};

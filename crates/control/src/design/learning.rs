@@ -1,0 +1,179 @@
+//! The closed loop's response to an addition to the command at the harmonics of a periodic reference, for learning.
+//!
+//! From the running loop itself (estimator, controller, limits) on a noise-free plant, as the difference of two runs along
+//! the same reference, one with a small tone added: so the response is that in force on that reference, with the
+//! estimator's gains and the constraints that it has there. The same at the corners of the plant's uncertainty gives the
+//! bound that the convergence test needs.
+
+use crate::control_loop::{Controller, ControllerConfig, LoopConfig, LoopInput};
+use crate::design::plant::DesignPlant;
+use crate::design::step::SetUpError;
+use crate::learning::{HARMONICS, HIGHEST_PART, HarmonicResponse};
+use crate::mpc::SolverKind;
+use crate::reference::{Reference, fill_preview};
+use crate::simulation::{RigConfig, SimulatedRig};
+use nalgebra::{Complex, DMatrix, DVector};
+use std::f64::consts::TAU;
+
+/// How well the plant is known.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Uncertainty {
+    /// The true gain lies between the model's divided and multiplied by this.
+    pub gain_factor: f64,
+    /// The true delay lies within this of the model's, s.
+    pub delay_s: f64,
+}
+
+impl Default for Uncertainty {
+    fn default() -> Self {
+        Self {
+            gain_factor: 1.3,
+            delay_s: 0.3e-3,
+        }
+    }
+}
+
+const SETTLE_TICKS: u64 = 400;
+const FIT_TICKS: u64 = 240;
+/// The tone moves the bead by about this, um.
+const TONE_UM: f64 = 0.02;
+
+/// True bead positions over the last [`FIT_TICKS`], with a tone `cos(2 pi h phase)` added to the command.
+fn positions(
+    plant: &DesignPlant,
+    config: &LoopConfig,
+    reference: &(impl Reference + ?Sized),
+    from_s: f64,
+    tone_hz: f64,
+    tone_um: f64,
+) -> Result<Vec<f64>, SetUpError> {
+    let ts = plant.sample_time_s;
+    let mut rig = SimulatedRig::new(RigConfig {
+        plant: plant.plant.clone(),
+        sample_time_s: ts,
+        delay_s: plant.delay_s,
+        neutral_um: plant.neutral_um,
+        diffusion_um2_per_s: 0.0,
+        fix_noise_um: 0.0,
+        seed: 0,
+    })?;
+    let mut controller = Controller::new(*config)?;
+    let mut state = controller.start(plant.neutral_um, plant.neutral_um);
+    let mut preview = vec![0.0; controller.preview_len()];
+    let first = (from_s / ts).ceil() as u64;
+    let ticks = first + SETTLE_TICKS + FIT_TICKS;
+    let mut path = Vec::with_capacity(FIT_TICKS as usize);
+    for k in 0..ticks {
+        if k >= ticks - FIT_TICKS {
+            path.push(rig.true_um());
+        }
+        let time_s = k as f64 * ts;
+        fill_preview(reference, k, ts, &mut preview);
+        let input = LoopInput {
+            measurement: Some(rig.measure()),
+            reference_um: reference.at_um(time_s),
+            preview_um: &preview,
+            learned_um: if k >= first {
+                tone_um * (TAU * tone_hz * time_s).cos()
+            } else {
+                0.0
+            },
+            ..LoopInput::default()
+        };
+        let out = controller.step(&mut state, &input);
+        rig.advance(out.command_um);
+    }
+    Ok(path)
+}
+
+/// Response at one frequency: least squares of tone, offset and ramp.
+fn response(with: &[f64], without: &[f64], first_tick: u64, ts: f64, hz: f64) -> Complex<f64> {
+    let angle = |i: usize| TAU * hz * (first_tick + i as u64) as f64 * ts;
+    let design = DMatrix::from_fn(with.len(), 4, |i, j| match j {
+        0 => angle(i).cos(),
+        1 => -angle(i).sin(),
+        2 => 1.0,
+        _ => i as f64 / with.len() as f64,
+    });
+    let moved = DVector::from_iterator(with.len(), with.iter().zip(without).map(|(a, b)| a - b));
+    let normal = design.transpose() * &design;
+    let fit = normal.lu().solve(&(design.transpose() * moved));
+    fit.map_or(Complex::new(f64::NAN, f64::NAN), |x| {
+        Complex::new(x[0], x[1])
+    })
+}
+
+/// Responses at harmonics 1 to `harmonics` of a periodic reference of `frequency_hz` that is in full swing from `from_s`
+/// on; harmonics above the range of learning are left out.
+///
+/// # Errors
+/// A plant or a loop that cannot be built.
+pub fn harmonic_responses(
+    plant: &DesignPlant,
+    config: &LoopConfig,
+    reference: &(impl Reference + ?Sized),
+    from_s: f64,
+    frequency_hz: f64,
+    harmonics: u32,
+    uncertainty: Uncertainty,
+) -> Result<Vec<HarmonicResponse>, SetUpError> {
+    let ts = plant.sample_time_s;
+    let mut config = *config;
+    if let ControllerConfig::Mpc(mpc, _) = &mut config.controller {
+        // Both solvers give the same law; this one takes a tenth of the time.
+        mpc.solver = SolverKind::ActiveSet;
+    }
+    let g = uncertainty.gain_factor.max(1.0);
+    let d = uncertainty.delay_s.max(0.0);
+    let shifted = |gain: f64, delay_s: f64| -> Result<DesignPlant, SetUpError> {
+        let mut other = plant.changed(gain, 0)?;
+        other.delay_s = (plant.delay_s + delay_s).max(0.0);
+        Ok(other)
+    };
+    let mut corners = vec![plant.clone()];
+    for gain in [g, 1.0 / g] {
+        for delay_s in [-d, 0.0, d] {
+            corners.push(shifted(gain, delay_s)?);
+        }
+    }
+    let hz = |h: u32| f64::from(h) * frequency_hz;
+    let wanted: Vec<u32> = (1..=harmonics.min(HARMONICS as u32))
+        .filter(|&h| hz(h) * ts <= HIGHEST_PART)
+        .collect();
+    let first_tick = (from_s / ts).ceil() as u64 + SETTLE_TICKS;
+    let mut table: Vec<Vec<Complex<f64>>> = Vec::with_capacity(corners.len());
+    for corner in &corners {
+        let without = positions(corner, &config, reference, from_s, 0.0, 0.0)?;
+        let mut row = Vec::with_capacity(wanted.len());
+        for &h in &wanted {
+            let size = corner.plant.response(cellpos_plant::Hertz(hz(h))).norm();
+            let tone_um = TONE_UM / size.max(1e-3);
+            let with = positions(corner, &config, reference, from_s, hz(h), tone_um)?;
+            row.push(response(&with, &without, first_tick, ts, hz(h)) / tone_um);
+        }
+        table.push(row);
+    }
+    let Some((nominal, others)) = table.split_first() else {
+        return Ok(Vec::new());
+    };
+    Ok(wanted
+        .iter()
+        .enumerate()
+        .map(|(i, &harmonic)| HarmonicResponse {
+            harmonic,
+            re_um_per_um: nominal[i].re,
+            im_um_per_um: nominal[i].im,
+            relative_uncertainty: others
+                .iter()
+                .map(|row| (row[i] / nominal[i] - 1.0).norm())
+                // A response that cannot be computed is not known at all.
+                .fold(0.0, |most, x| {
+                    if x.is_nan() {
+                        f64::INFINITY
+                    } else {
+                        most.max(x)
+                    }
+                }),
+        })
+        .collect())
+}

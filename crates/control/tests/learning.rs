@@ -1,0 +1,322 @@
+//! Learning over cycles on a rig whose gain is 20 % and whose delay is 0.25 ms off the model.
+
+use cellpos_control::design::{DesignPlant, Uncertainty, harmonic_responses};
+use cellpos_control::*;
+
+const FADE_S: f64 = 0.2;
+
+fn config(controller: ControllerConfig) -> LoopConfig {
+    LoopConfig {
+        model: LoopModel::eq6(2e-3),
+        estimator: EstimatorConfig::default(),
+        controller,
+        limits: Limits::default(),
+    }
+}
+
+fn mpc() -> ControllerConfig {
+    ControllerConfig::Mpc(
+        Mpc {
+            solver: SolverKind::ActiveSet,
+            ..Mpc::default()
+        },
+        Pi::new(0.46, 19.5),
+    )
+}
+
+fn wrong_rig(seed: u64) -> RigConfig {
+    let eq6 = RigConfig::eq6(seed);
+    RigConfig {
+        plant: eq6.plant.scaled(1.2).unwrap(),
+        delay_s: 2.25e-3,
+        ..eq6
+    }
+}
+
+fn sine(amplitude_um: f64, frequency_hz: f64) -> Profile {
+    Profile::Wave {
+        shape: Shape::Sine,
+        centre_um: 0.0,
+        amplitude_um,
+        frequency_hz,
+        fade_s: FADE_S,
+    }
+}
+
+fn learner(controller: ControllerConfig, profile: &Profile, frequency_hz: f64) -> Learner {
+    let responses = harmonic_responses(
+        &DesignPlant::eq6(2.5e-3),
+        &config(controller),
+        profile,
+        FADE_S,
+        frequency_hz,
+        3,
+        Uncertainty::default(),
+    )
+    .unwrap();
+    Learner::new(LearnConfig::default(), frequency_hz, 1e-3, &responses).unwrap()
+}
+
+/// A run along a profile; `each(k, true error, learner's state)` at each tick.
+fn run(
+    controller: ControllerConfig,
+    rig: RigConfig,
+    profile: &Profile,
+    learning: Option<(&Learner, LearnerState)>,
+    ticks: u64,
+    lost: impl Fn(u64) -> bool,
+    mut each: impl FnMut(u64, f64, Option<&LearnerState>),
+) {
+    let delay_s = rig.delay_s;
+    let mut rig = SimulatedRig::new(rig).unwrap();
+    let mut controller = Controller::new(config(controller)).unwrap();
+    let mut state = controller.start(20.0, 20.0);
+    let mut preview = vec![0.0; controller.preview_len()];
+    let mut learning = learning;
+    for k in 0..ticks {
+        let time_s = k as f64 * 1e-3;
+        let reference_um = profile.at_um(time_s);
+        fill_preview(profile, k, 1e-3, &mut preview);
+        each(
+            k,
+            rig.true_um() - reference_um,
+            learning.as_ref().map(|l| &l.1),
+        );
+        let mut fix = rig.measure();
+        // What the frame's time stamp says against the model's delay.
+        fix.offset_samples = (delay_s - 2e-3) / 1e-3;
+        let fix = Some(fix).filter(|_| !lost(k));
+        let mut input = LoopInput {
+            measurement: fix,
+            reference_um,
+            preview_um: &preview,
+            ..LoopInput::default()
+        };
+        if let (Some((learner, state)), Some(phase)) = (&learning, profile.phase(time_s)) {
+            input.learned_um = learner.addition_um(state, phase);
+        }
+        let out = controller.step(&mut state, &input);
+        if let (Some((learner, state)), Some(_)) = (&mut learning, profile.phase(time_s)) {
+            let exposed_s = time_s - delay_s;
+            let error = fix
+                .zip(profile.phase(exposed_s))
+                .map(|(fix, phase)| (phase, fix.position_um - at_exposure_um(profile, exposed_s, 1e-3)));
+            learner.learn(state, error);
+        }
+        rig.advance(out.command_um);
+    }
+}
+
+fn rms_um(
+    controller: ControllerConfig,
+    seed: u64,
+    profile: &Profile,
+    learner: Option<&Learner>,
+    (from, to): (u64, u64),
+) -> f64 {
+    let (mut sum, mut n) = (0.0, 0.0);
+    run(
+        controller,
+        wrong_rig(seed),
+        profile,
+        learner.map(|l| (l, l.start())),
+        to,
+        |_| false,
+        |k, error_um, _| {
+            if k >= from {
+                sum += error_um * error_um;
+                n += 1.0;
+            }
+        },
+    );
+    f64::sqrt(sum / n)
+}
+
+#[test]
+fn learning_brings_cyclic_motion_to_twice_the_hold_error_within_20_cycles() {
+    let hold = Profile::Hold { position_um: 0.0 };
+    for controller in [ControllerConfig::Lqg(Lqg::default()), mpc()] {
+        let hold_um = rms_um(controller, 1, &hold, None, (1000, 5000));
+        for (amplitude_um, frequency_hz) in [
+            (5.0, 50.0),
+            (5.0, 100.0),
+            (1.0, 130.0),
+            (1.0, 200.0),
+            (0.5, 300.0),
+        ] {
+            let profile = sine(amplitude_um, frequency_hz);
+            let learner = learner(controller, &profile, frequency_hz);
+            let start = (FADE_S * 1e3) as u64;
+            let learned = start + (20.0 * 1e3 / frequency_hz) as u64;
+            let span = (learned, learned + 1000);
+            for seed in 0..5 {
+                let without = rms_um(controller, seed, &profile, None, span);
+                let with = rms_um(controller, seed, &profile, Some(&learner), span);
+                println!(
+                    "{amplitude_um} um at {frequency_hz} Hz, seed {seed}: hold {:.1} nm, without {:.1} nm, learned {:.1} nm",
+                    hold_um * 1e3,
+                    without * 1e3,
+                    with * 1e3
+                );
+                assert!(
+                    with <= 2.0 * hold_um && with < without,
+                    "{controller:?}, {amplitude_um} um at {frequency_hz} Hz, seed {seed}: {with} um against a hold of {hold_um} um, {without} um without learning"
+                );
+            }
+        }
+    }
+}
+
+#[test]
+fn a_table_learned_before_serves_from_the_first_cycle() {
+    let controller = ControllerConfig::Lqg(Lqg::default());
+    let profile = sine(5.0, 100.0);
+    let learner = learner(controller, &profile, 100.0);
+    let mut learned = learner.start();
+    run(
+        controller,
+        wrong_rig(1),
+        &profile,
+        Some((&learner, learned)),
+        1500,
+        |_| false,
+        |_, _, state| learned = *state.unwrap(),
+    );
+    let table = learner.table(&learned);
+    assert_eq!(table.retreats, 0);
+    let text = toml::to_string(&table).unwrap();
+    let read: LearnedTable = toml::from_str(&text).unwrap();
+    assert_eq!(read, table);
+    let state = learner.resume(&read).unwrap();
+    let first_cycles = |state| {
+        let mut sum = 0.0;
+        run(
+            controller,
+            wrong_rig(2),
+            &profile,
+            Some((&learner, state)),
+            260,
+            |_| false,
+            |k, e, _| {
+                if k >= 215 {
+                    sum += e * e / 45.0;
+                }
+            },
+        );
+        f64::sqrt(sum)
+    };
+    let (with, without) = (first_cycles(state), first_cycles(learner.start()));
+    assert!(with < 0.2 * without, "{with} against {without}");
+    let other = Learner::new(
+        LearnConfig::default(),
+        50.0,
+        1e-3,
+        &[HarmonicResponse {
+            harmonic: 1,
+            re_um_per_um: 0.0,
+            im_um_per_um: -1.0,
+            relative_uncertainty: 0.3,
+        }],
+    )
+    .unwrap();
+    assert!(matches!(
+        other.resume(&read),
+        Err(LearnError::OtherFrequency { .. })
+    ));
+}
+
+#[test]
+fn nothing_is_learned_while_the_bead_is_lost_and_shortly_after() {
+    let controller = ControllerConfig::Lqg(Lqg::default());
+    let profile = sine(1.0, 100.0);
+    let learner = learner(controller, &profile, 100.0);
+    let mut seen: Vec<LearnedTable> = Vec::new();
+    run(
+        controller,
+        wrong_rig(1),
+        &profile,
+        Some((&learner, learner.start())),
+        520,
+        |k| (450..460).contains(&k),
+        |_, _, state| seen.push(learner.table(state.unwrap())),
+    );
+    assert_ne!(seen[440].harmonics, seen[450].harmonics, "learning before");
+    assert_eq!(seen[451].harmonics, seen[479].harmonics, "frozen");
+    assert_ne!(seen[479].harmonics, seen[500].harmonics, "learning again");
+}
+
+#[test]
+fn a_learner_told_the_opposite_response_retreats_and_gives_up_instead_of_growing() {
+    let controller = ControllerConfig::Lqg(Lqg::default());
+    let profile = sine(1.0, 100.0);
+    let right = harmonic_responses(
+        &DesignPlant::eq6(2.5e-3),
+        &config(controller),
+        &profile,
+        FADE_S,
+        100.0,
+        1,
+        Uncertainty::default(),
+    )
+    .unwrap();
+    let wrong: Vec<_> = right
+        .iter()
+        .map(|r| HarmonicResponse {
+            re_um_per_um: -r.re_um_per_um,
+            im_um_per_um: -r.im_um_per_um,
+            ..*r
+        })
+        .collect();
+    let learner = Learner::new(LearnConfig::default(), 100.0, 1e-3, &wrong).unwrap();
+    let (mut worst, mut last) = (0.0_f64, learner.start());
+    run(
+        controller,
+        wrong_rig(1),
+        &profile,
+        Some((&learner, learner.start())),
+        6000,
+        |_| false,
+        |_, e, state| {
+            worst = worst.max(e.abs());
+            last = *state.unwrap();
+        },
+    );
+    assert_eq!(learner.table(&last).retreats, 3);
+    assert!(worst < 3.0, "{worst} um");
+}
+
+#[test]
+fn a_harmonic_whose_response_is_too_uncertain_is_refused() {
+    let response = |harmonic, relative_uncertainty| HarmonicResponse {
+        harmonic,
+        re_um_per_um: 0.1,
+        im_um_per_um: -0.5,
+        relative_uncertainty,
+    };
+    let learner = |responses: &[HarmonicResponse]| {
+        Learner::new(LearnConfig::default(), 60.0, 1e-3, responses)
+    };
+    let kept = learner(&[response(1, 0.4), response(2, 1.1)]).unwrap();
+    assert_eq!(kept.refused(), &[response(2, 1.1)]);
+    let error = learner(&[response(1, 1.3), response(2, f64::NAN)]).unwrap_err();
+    assert!(matches!(error, LearnError::NotConvergent { uncertainty, .. } if uncertainty == 1.3));
+    let plant = DesignPlant::eq6(2.5e-3);
+    let vague = Uncertainty {
+        gain_factor: 2.0,
+        delay_s: 1e-3,
+    };
+    let at_300_hz = harmonic_responses(
+        &plant,
+        &config(ControllerConfig::Lqg(Lqg::default())),
+        &sine(0.5, 300.0),
+        FADE_S,
+        300.0,
+        1,
+        vague,
+    )
+    .unwrap();
+    assert!(
+        at_300_hz[0].relative_uncertainty > 1.0,
+        "1 ms is 108 deg at 300 Hz: {at_300_hz:?}"
+    );
+}
