@@ -495,8 +495,11 @@ impl ControlLoop {
                 prepared.hold(),
             );
         } else {
-            self.pi
-                .track(&mut pi, prepared.proportional_um, output.command_um - learned_um);
+            self.pi.track(
+                &mut pi,
+                prepared.proportional_um,
+                output.command_um - learned_um,
+            );
         }
         let sound = pi.integral_um.abs() < FAR_UM && pi.lead_um.abs() < FAR_UM;
         state.pi = if sound {

@@ -441,3 +441,69 @@ impl Learner {
         }
     }
 }
+
+/// References of past ticks that a [`CycleLearning`] keeps: the oldest exposure that it can learn from.
+const PAST: usize = 12;
+
+/// A learner beside a loop: it lays each fix on the reference and the phase at the time of its exposure.
+#[derive(Debug, Clone, PartialEq)]
+pub struct CycleLearning {
+    learner: Learner,
+    state: LearnerState,
+    /// References of the last ticks, newest first, and how many of them count.
+    past_um: [f64; PAST],
+    known: usize,
+    phase: f64,
+}
+
+impl CycleLearning {
+    /// Puts a learner beside a loop, with the state of [`Learner::start`] or [`Learner::resume`].
+    pub fn new(learner: Learner, state: LearnerState) -> Self {
+        Self {
+            learner,
+            state,
+            past_um: [0.0; PAST],
+            known: 0,
+            phase: 0.0,
+        }
+    }
+
+    /// What has been learned so far.
+    pub fn table(&self) -> LearnedTable {
+        self.learner.table(&self.state)
+    }
+
+    /// Before the controller's step: the addition for this tick, um of PZT; see [`crate::LoopInput::learned_um`]. `phase`
+    /// is that of the reference in cycles, `None` where it is not periodic now.
+    pub fn addition_um(&mut self, phase: Option<f64>, reference_um: f64) -> f64 {
+        let Some(phase) = phase.filter(|p| p.is_finite()) else {
+            self.known = 0;
+            return 0.0;
+        };
+        self.past_um.copy_within(0..PAST - 1, 1);
+        self.past_um[0] = reference_um;
+        self.known = (self.known + 1).min(PAST);
+        self.phase = phase;
+        self.learner.addition_um(&self.state, phase)
+    }
+
+    /// After the controller's step: learns from a fix (position um, age of its exposure in ticks) that the controller
+    /// has used; `None`: there was none.
+    pub fn learn(&mut self, fix: Option<(f64, f64)>) {
+        let error = fix.and_then(|(position_um, age_ticks)| {
+            let newer = age_ticks.max(0.0).floor();
+            let part = age_ticks.max(0.0) - newer;
+            let newer = newer as usize;
+            // Without a part the older neighbour is not needed, nor perhaps known.
+            let older = if part < 1e-6 { newer } else { newer + 1 };
+            if older >= self.known {
+                return None;
+            }
+            let (a, b) = (self.past_um.get(newer)?, self.past_um.get(older)?);
+            let reference_um = a + part * (b - a);
+            let phase = self.phase - age_ticks * self.learner.advance;
+            Some((phase, position_um - reference_um))
+        });
+        self.learner.learn(&mut self.state, error);
+    }
+}

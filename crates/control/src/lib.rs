@@ -39,13 +39,14 @@ pub use estimator::{Estimator, EstimatorConfig, EstimatorState, HISTORY};
 pub use feedback::{Feedback, Lqg};
 pub use feedforward::FeedForwardState;
 pub use learning::{
-    HarmonicResponse, LearnConfig, LearnError, LearnedHarmonic, LearnedTable, Learner, LearnerState,
+    CycleLearning, HarmonicResponse, LearnConfig, LearnError, LearnedHarmonic, LearnedTable,
+    Learner, LearnerState,
 };
 pub use limits::{Limited, Limits};
 pub use linear::LinearLaw;
 pub use loop_model::{LoopMode, LoopModel, MODES};
 pub use mpc::{HORIZON, Mpc, SolverKind};
 pub use pi::{Lead, Pi, PiState};
-pub use reference::{Points, Profile, Reference, Shape, at_exposure_um, fill_preview};
+pub use reference::{Points, Profile, Reference, Shape, fill_preview};
 pub use simulation::{RigConfig, SimulatedRig};
 pub use state::{LoopState, STATE_LEN};

@@ -34,26 +34,6 @@ pub fn fill_preview(
     }
 }
 
-/// Where a bead that is on the reference at every tick is at a time between ticks, um: on the straight line, because
-/// the command is held and the plant integrates. What an exposure that is not made at a tick is compared with.
-pub fn at_exposure_um(
-    reference: &(impl Reference + ?Sized),
-    time_s: f64,
-    sample_time_s: f64,
-) -> f64 {
-    let ticks = time_s / sample_time_s;
-    // Rounding must not put an exposure at a tick a whole tick early.
-    let before = (ticks + 1e-9).floor();
-    let part = (ticks - before).clamp(0.0, 1.0);
-    let at = |tick: f64| reference.at_um(tick * sample_time_s);
-    let here_um = at(before);
-    if part < 1e-6 {
-        here_um
-    } else {
-        here_um + part * (at(before + 1.0) - here_um)
-    }
-}
-
 /// The periodic shapes of [`Profile::Wave`], all between -1 and 1.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Shape {

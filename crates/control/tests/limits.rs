@@ -22,6 +22,7 @@ fn any_measurement() -> impl Strategy<Value = Option<Measurement>> {
                 position_um,
                 variance_um2,
                 age_samples,
+                offset_samples: 0.0,
             },
         ),
     )

@@ -25,14 +25,15 @@ pub use crate::tick::{Action, Counts, TickInput, TickOutput};
 use crate::tick_record::{TickFlags, TickRecord};
 pub use crate::timing::{CoreError, Timing};
 use cellpos_control::{
-    Controller, LoopConfig, LoopInput, LoopOutput, LoopState, Measurement as LoopMeasurement, Mode,
-    SolverStatus,
+    Controller, CycleLearning, LearnedTable, LoopConfig, LoopInput, LoopOutput, LoopState,
+    Measurement as LoopMeasurement, Mode, SolverStatus,
 };
 use cellpos_link::{BoardState, Fault};
 use cellpos_plant::TransferFunction;
 use cellpos_rig::BoardReport;
 use cellpos_units::Seconds;
 use cellpos_vision::Decision;
+
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct State {
     seq: u64,
@@ -70,6 +71,7 @@ pub struct Core<R> {
     arming: Arming,
     sample_s: f64,
     preview_um: Vec<f64>,
+    learning: Option<CycleLearning>,
     state: State,
 }
 
@@ -105,6 +107,7 @@ impl<R: Guide> Core<R> {
             timing,
             arming,
             sample_s,
+            learning: None,
             state: State {
                 seq: 0,
                 counts: Counts::default(),
@@ -130,6 +133,18 @@ impl<R: Guide> Core<R> {
                 stage: Stage::None,
             },
         })
+    }
+
+    /// The same loop with learning over cycles.
+    #[must_use]
+    pub fn with_learning(mut self, learning: CycleLearning) -> Self {
+        self.learning = Some(learning);
+        self
+    }
+
+    /// What has been learned over cycles; `None` without learning.
+    pub fn learned(&self) -> Option<LearnedTable> {
+        self.learning.as_ref().map(CycleLearning::table)
     }
 
     /// Where the run stands.
@@ -302,6 +317,7 @@ impl<R: Guide> Core<R> {
             position_um: m.position_um,
             variance_um2: m.variance_um2,
             age_samples,
+            offset_samples: (beyond_ns - i64::from(age_samples) * period) as f64 / period as f64,
         })
     }
 
@@ -453,12 +469,25 @@ impl<R: Guide> Core<R> {
             preview_um: &self.preview_um,
             mode,
             solver: input.solver,
+            learned_um: match &mut self.learning {
+                Some(learning) => {
+                    let phase = guided.phase.filter(|_| mode == Mode::Run);
+                    learning.addition_um(phase, guided.reference_um)
+                }
+                None => 0.0,
+            },
             ..LoopInput::default()
         };
-        (
-            self.controller.step(&mut self.state.control, &given),
-            guided,
-        )
+        let output = self.controller.step(&mut self.state.control, &given);
+        if let Some(learning) = &mut self.learning {
+            let nominal = self.timing.camera_delay_ms * 1e-3 / self.sample_s;
+            let used = fix.filter(|_| !output.flags.coasting && !output.flags.stuck);
+            learning.learn(used.map(|fix| {
+                let age = nominal + f64::from(fix.age_samples) + fix.offset_samples;
+                (fix.position_um, age)
+            }));
+        }
+        (output, guided)
     }
 
     /// Flags and events that follow from the controller's output.

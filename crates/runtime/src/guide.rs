@@ -115,6 +115,9 @@ pub struct GuideOutput {
     pub plan_ns: i64,
     /// What the script is doing.
     pub stage: Stage,
+    /// Phase of a periodic reference in cycles, `None` while it is not periodic: what learning is laid on. The same
+    /// motion must have the same phase each time, and the phase must advance by the same amount at each tick.
+    pub phase: Option<f64>,
 }
 
 /// Says where the bead is to be.
@@ -135,6 +138,11 @@ impl<R: Reference> Guide for R {
             reference_um: self.at_um(input.tick as f64 * input.sample_s),
             plan_ns: -1,
             stage: Stage::None,
+            phase: if input.running {
+                self.phase(input.tick as f64 * input.sample_s)
+            } else {
+                None
+            },
         }
     }
 }

@@ -112,6 +112,7 @@ struct ControlEnd {
     safe_reason: Option<crate::life::SafeReason>,
     counts: crate::core::Counts,
     account: crate::ticker::Account,
+    learned: Option<cellpos_control::LearnedTable>,
     period_us: f64,
 }
 
@@ -215,6 +216,7 @@ pub fn run<R: Guide + Send, S: RunSink>(
             control_end.period_us,
         ),
         conditions: control_end.conditions,
+        learned: control_end.learned,
         sink,
         io_error,
     })
@@ -293,6 +295,7 @@ fn control<R: Guide>(
         life: ticker.core().life(),
         safe_reason: ticker.core().safe_reason(),
         counts: *ticker.core().counts(),
+        learned: ticker.core().learned(),
         account: ticker.account().clone(),
         period_us: ticker.core().timing().period_us,
     }

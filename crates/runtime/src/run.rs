@@ -6,6 +6,7 @@ use crate::realtime::Conditions;
 use crate::summary::{End, Statistics, Summary};
 use crate::tick_record::TickRecord;
 use crate::ticker::Order;
+use cellpos_control::LearnedTable;
 use cellpos_rig::{Actuator, ActuatorError, BoardReport, CameraError};
 use rtrb::{Consumer, Producer};
 use std::time::Duration;
@@ -194,6 +195,8 @@ pub struct Finished<S> {
     pub conditions: Conditions,
     /// The sink, with all that it was given.
     pub sink: S,
+    /// What was learned over cycles, if the loop had a learner.
+    pub learned: Option<LearnedTable>,
     /// What went wrong on an I/O thread, if anything did; the loop has seen it as silence and acted on it.
     pub io_error: Option<RunError>,
 }

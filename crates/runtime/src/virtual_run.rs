@@ -96,6 +96,7 @@ pub fn run<R: Guide, S: RunSink>(
         summary,
         conditions,
         sink,
+        learned: ticker.core().learned(),
         io_error,
     })
 }

@@ -210,6 +210,7 @@ impl Guide for Follower {
             plan_s
         };
         GuideOutput {
+            phase: None,
             reference_um: self.reference_um,
             plan_ns: (plan_s * 1e9).round() as i64,
             stage: if input.running {

@@ -298,6 +298,7 @@ impl Bench for HeldBead {
                 position_um: m.position_um,
                 variance_um2: m.variance_um2,
                 age_samples,
+                offset_samples: 0.0,
             }),
             mode: if self.setup.closed_loop {
                 Mode::Run
