@@ -5,11 +5,13 @@
 //! waits for conditions and ends on stop conditions. [`check()`] compares a plan with a model and limits before
 //! anything moves: peak position, speed and PZT demand, and the largest amplitude that the rig could do.
 //!
-//! The format is described in `docs/scripts.md`. [`Follower`] makes it the guide of a loop. Not here: the loop, devices, files of a run.
+//! The format is described in `docs/scripts.md`. [`Follower`] makes it the guide of a loop, [`CycleTable`]
+//! makes a row for each of its cycles from the loop's records. Not here: the loop, devices, files of a run.
 #![forbid(unsafe_code)]
 
 mod check;
 mod cursor;
+mod cycles;
 mod error;
 mod follow;
 mod node;
@@ -19,6 +21,9 @@ mod script;
 
 pub use check::{Check, CheckError, CheckLimits, Violation, check};
 pub use cursor::{Cursor, Output, Seen, Status, StopReason};
+pub use cycles::{
+    Alarm, AmplitudeWatch, CycleFlags, CycleRow, CycleTable, Trend, read_cycles, trend,
+};
 pub use error::ScriptError;
 pub use follow::Follower;
 pub use plan::{ArmKind, Cycle, Mark, Motion, Plan, Segment};

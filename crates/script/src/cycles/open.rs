@@ -1,0 +1,221 @@
+//! A cycle that is going on.
+
+use super::fit::{self, SineFit};
+use super::{CycleFlags, CycleRow, Place, bounds_ns};
+use crate::plan::{Cycle, Plan};
+use cellpos_control::{Reference, SolverStatus};
+use cellpos_runtime::{Stage, TickFlags, TickRecord};
+
+/// Sums over the ticks of a cycle so far.
+#[derive(Debug)]
+pub(super) struct Open {
+    row: CycleRow,
+    fit: SineFit,
+    error_um: f64,
+    error_um2: f64,
+    neutral_um: f64,
+    neutrals: u64,
+    /// Time (ns) and position (um) of the last position seen, for increments.
+    last_seen: Option<(i64, f64)>,
+    /// n, sums of u, v, u u, u v, of the speed v against the displacement u away from neutral.
+    gain: [f64; 5],
+    far_um: f64,
+    lengths: Vec<(f64, f64)>,
+}
+
+impl Open {
+    pub(super) fn new(plan: &Plan, cycle: &Cycle, session: u64, place: &Place) -> Self {
+        const LOOKS: u32 = 64;
+        let start_um = plan.at_um(cycle.start_s);
+        let (mut low, mut high) = (start_um, start_um);
+        for look in 1..=LOOKS {
+            let share = f64::from(look) / f64::from(LOOKS);
+            let um = plan.at_um(cycle.start_s + cycle.duration_s * share);
+            (low, high) = (low.min(um), high.max(um));
+        }
+        let mut row = CycleRow::empty(cycle.number, session, cycle.arm);
+        let into_ns = place.plan_ns - bounds_ns(cycle).0;
+        row.start_s = (place.exposed_ns - into_ns) as f64 * 1e-9;
+        row.plan_s = cycle.start_s;
+        row.duration_s = cycle.duration_s;
+        row.stroke_um = 0.5 * (high - low);
+        row.peak_um = 0.0;
+        row.dwell_s = 0.0;
+        Self {
+            row,
+            fit: SineFit::default(),
+            error_um: 0.0,
+            error_um2: 0.0,
+            neutral_um: 0.0,
+            neutrals: 0,
+            last_seen: None,
+            gain: [0.0; 5],
+            far_um: if high - start_um > start_um - low {
+                high
+            } else {
+                low
+            },
+            lengths: Vec::new(),
+        }
+    }
+
+    pub(super) fn last_seen_ns(&self) -> Option<i64> {
+        self.last_seen.map(|last| last.0)
+    }
+
+    pub(super) fn disturbed(&mut self, flags: CycleFlags) {
+        self.row.flags.set(flags.0, true);
+    }
+
+    /// A tick whose exposure falls into the cycle. `flow_um`: mean distance of the command from neutral since the last
+    /// position; `period_s`: of the loop.
+    pub(super) fn add(
+        &mut self,
+        record: &TickRecord,
+        place: &Place,
+        phase: f64,
+        flow_um: Option<f64>,
+        period_s: f64,
+    ) {
+        self.count(record, place);
+        let good = place.fresh && record.verdict == 0 && record.measured_um.is_finite();
+        if place.stage == Stage::Paused {
+            // Time goes on and the cycle does not.
+            self.last_seen = None;
+        } else if good {
+            self.position(record, place, phase, flow_um, period_s);
+        }
+    }
+
+    fn count(&mut self, record: &TickRecord, place: &Place) {
+        let row = &mut self.row;
+        let has = |mask| record.flags.has(mask);
+        let lost = has(TickFlags::LOST) || !place.fresh;
+        let limited = has(TickFlags::RANGE_LIMITED) || has(TickFlags::SLEW_LIMITED);
+        let unsolved = record.solver_status >= SolverStatus::PreviousPlan as u8;
+        row.ticks += 1;
+        row.lost += u64::from(lost);
+        row.coasted += u64::from(has(TickFlags::COASTING));
+        row.saturated += u64::from(limited);
+        row.frozen += u64::from(has(TickFlags::FREEZE));
+        row.solver_fallbacks += u64::from(unsolved);
+        for (mask, when) in [
+            (CycleFlags::LOST, lost),
+            (
+                CycleFlags::STALE,
+                has(TickFlags::STALE) || has(TickFlags::DOUBLED_FRAME),
+            ),
+            (CycleFlags::DROPPED, has(TickFlags::DROPPED_FRAME)),
+            (CycleFlags::COASTED, has(TickFlags::COASTING)),
+            (CycleFlags::FROZEN, has(TickFlags::FREEZE)),
+            (CycleFlags::SATURATED, limited),
+            (
+                CycleFlags::LATE,
+                has(TickFlags::LATE) || has(TickFlags::ACTUATOR_RING_FULL),
+            ),
+            (CycleFlags::RECORDS_LOST, has(TickFlags::RECORDS_LOST)),
+            (CycleFlags::SOLVER_FALLBACK, unsolved),
+            (CycleFlags::GATED, has(TickFlags::GATED)),
+            (CycleFlags::WAITED, place.stage == Stage::Waiting),
+        ] {
+            row.flags.set(mask, when);
+        }
+        if record.neutral_um.is_finite() {
+            self.neutral_um += record.neutral_um;
+            self.neutrals += 1;
+        }
+    }
+
+    fn position(
+        &mut self,
+        record: &TickRecord,
+        place: &Place,
+        phase: f64,
+        flow_um: Option<f64>,
+        period_s: f64,
+    ) {
+        let at_um = record.measured_um;
+        let error_um = at_um - place.target_um;
+        self.row.seen += 1;
+        self.error_um += error_um;
+        self.error_um2 += error_um * error_um;
+        self.row.peak_um = self.row.peak_um.max(error_um.abs());
+        // In a wait the phase stands still: its samples would only pull on one point of the fit.
+        if place.stage == Stage::Running {
+            self.fit.add(phase, place.target_um, at_um);
+        }
+        if self.row.stroke_um > 0.0 && (at_um - self.far_um).abs() < 0.2 * self.row.stroke_um {
+            self.row.dwell_s += period_s;
+        }
+        if let (Some((then_ns, then_um)), Some(u)) = (self.last_seen, flow_um) {
+            let v = (at_um - then_um) / ((place.exposed_ns - then_ns).max(1) as f64 * 1e-9);
+            for (sum, term) in self.gain.iter_mut().zip([1.0, u, v, u * u, u * v]) {
+                *sum += term;
+            }
+        }
+        self.last_seen = Some((place.exposed_ns, at_um));
+        if record.length_um.is_finite() {
+            self.lengths
+                .push((place.exposed_ns as f64 * 1e-9, record.length_um));
+        }
+    }
+
+    /// The row of the finished cycle.
+    pub(super) fn finish(self) -> CycleRow {
+        let mut row = self.row;
+        if row.seen > 0 {
+            let n = row.seen as f64;
+            row.bias_um = self.error_um / n;
+            row.rms_um = (self.error_um2 / n).sqrt();
+        } else {
+            (row.peak_um, row.dwell_s) = (f64::NAN, f64::NAN);
+        }
+        if let Some(sines) = self.fit.solve() {
+            row.drift_um_per_s = sines.slope_per_cycle / row.duration_s;
+            // A reference that stands still has no amplitude to be reached, and no phase.
+            if sines.commanded > 1e-6 {
+                row.commanded_um = sines.commanded;
+                row.reached_um = sines.reached;
+                row.lag_deg = sines.lag_deg;
+            }
+        }
+        if self.neutrals > 0 {
+            row.neutral_um = self.neutral_um / self.neutrals as f64;
+        }
+        let [n, u, v, uu, uv] = self.gain;
+        let spread = uu - u * u / n.max(1.0);
+        // A command that hardly moves says nothing about the gain: 0.02 um RMS is 8 um/s of bead.
+        if n >= 10.0 && spread / n > 4e-4 {
+            row.gain_per_s = (uv - u * v / n) / spread;
+        }
+        lengths(&mut row, &self.lengths);
+        row
+    }
+}
+
+/// What the cell's length did: `(time s, length um)` of the cycle.
+fn lengths(row: &mut CycleRow, lengths: &[(f64, f64)]) {
+    let (Some(first), Some(last)) = (lengths.first(), lengths.last()) else {
+        return;
+    };
+    row.length_start_um = first.1;
+    row.length_end_um = last.1;
+    let peak = lengths
+        .iter()
+        .enumerate()
+        .max_by(|a, b| a.1.1.total_cmp(&b.1.1));
+    let Some((index, &(_, peak_um))) = peak else {
+        return;
+    };
+    row.length_peak_um = peak_um;
+    // Noise alone must not be taken for a recovery.
+    if peak_um - last.1 < 0.05 * peak_um {
+        return;
+    }
+    let after = lengths.get(index..).unwrap_or(&[]);
+    // From nine tenths of the way down on: the way out of the constriction itself is no relaxation.
+    let level_um = last.1 + 0.9 * (peak_um - last.1);
+    let start = after.iter().position(|(_, um)| *um < level_um);
+    let falling = start.and_then(|start| after.get(start..)).unwrap_or(&[]);
+    row.recovery_s = fit::recovery_s(falling).unwrap_or(f64::NAN);
+}

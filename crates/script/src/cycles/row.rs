@@ -1,0 +1,388 @@
+//! One row of the per-cycle table, as text and back.
+
+use crate::plan::ArmKind;
+
+/// What disturbed a cycle, as bits.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct CycleFlags(pub u32);
+
+/// Names of the bits, in order.
+const NAMES: [&str; 14] = [
+    "lost",
+    "stale",
+    "dropped",
+    "coasted",
+    "frozen",
+    "saturated",
+    "late",
+    "skipped-ticks",
+    "records-lost",
+    "skipped",
+    "solver-fallback",
+    "gated",
+    "safe",
+    "waited",
+];
+
+impl CycleFlags {
+    /// Frames without a valid position.
+    pub const LOST: u32 = 1;
+    /// Stale or repeated frames.
+    pub const STALE: u32 = 1 << 1;
+    /// Frames missing.
+    pub const DROPPED: u32 = 1 << 2;
+    /// Ticks on prediction alone.
+    pub const COASTED: u32 = 1 << 3;
+    /// The bead was frozen: by the operator, or because it was not seen for too long.
+    pub const FROZEN: u32 = 1 << 4;
+    /// Commands clipped to range or slew.
+    pub const SATURATED: u32 = 1 << 5;
+    /// Commands handed over late.
+    pub const LATE: u32 = 1 << 6;
+    /// Ticks that never came.
+    pub const SKIPPED_TICKS: u32 = 1 << 7;
+    /// Records lost on the way to the recorder.
+    pub const RECORDS_LOST: u32 = 1 << 8;
+    /// The cycle, or the rest of it, was skipped by the operator.
+    pub const SKIPPED: u32 = 1 << 9;
+    /// The optimiser gave no plan in time.
+    pub const SOLVER_FALLBACK: u32 = 1 << 10;
+    /// Positions refused as too far from the prediction.
+    pub const GATED: u32 = 1 << 11;
+    /// Safe was latched.
+    pub const SAFE: u32 = 1 << 12;
+    /// A wait of the script fell into it (no disturbance, but it took longer).
+    pub const WAITED: u32 = 1 << 13;
+
+    /// Whether all bits of `mask` are set.
+    pub fn has(self, mask: u32) -> bool {
+        self.0 & mask == mask
+    }
+
+    pub(crate) fn set(&mut self, mask: u32, when: bool) {
+        if when {
+            self.0 |= mask;
+        }
+    }
+
+    /// Whether anything went wrong in the cycle.
+    pub fn is_disturbed(self) -> bool {
+        self.0 & !Self::WAITED != 0
+    }
+}
+
+impl std::fmt::Display for CycleFlags {
+    /// Names joined by `+`; nothing when nothing happened.
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let mut first = true;
+        for (bit, name) in NAMES.iter().enumerate() {
+            if self.0 >> bit & 1 == 1 {
+                write!(f, "{}{name}", if first { "" } else { "+" })?;
+                first = false;
+            }
+        }
+        Ok(())
+    }
+}
+
+impl std::str::FromStr for CycleFlags {
+    type Err = ();
+
+    fn from_str(text: &str) -> Result<Self, ()> {
+        let mut flags = Self::default();
+        if text.is_empty() {
+            return Ok(flags);
+        }
+        for word in text.split('+') {
+            let bit = NAMES.iter().position(|name| *name == word).ok_or(())?;
+            flags.0 |= 1 << bit;
+        }
+        Ok(flags)
+    }
+}
+
+/// One cycle as it went. A number that does not exist is NaN, and an empty cell in the table.
+///
+/// Positions count at the time of their exposure, against the reference of that time: the camera's delay is in the
+/// loop, not in these figures.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct CycleRow {
+    /// Number, from 0 through the whole script.
+    pub cycle: u64,
+    /// Session: 1 for the first, one more for each time that the run was resumed.
+    pub session: u64,
+    /// Its arm.
+    pub arm: ArmKind,
+    /// Start since the start of the session, s; NaN when no record of it is there.
+    pub start_s: f64,
+    /// Start by the plan, s.
+    pub plan_s: f64,
+    /// Duration by the plan, s.
+    pub duration_s: f64,
+    /// Ticks of it that are recorded.
+    pub ticks: u64,
+    /// Of these: with a position that counts.
+    pub seen: u64,
+    /// Frames without a valid position, and ticks without a frame.
+    pub lost: u64,
+    /// Ticks on prediction alone.
+    pub coasted: u64,
+    /// Ticks with the command at range or slew limit.
+    pub saturated: u64,
+    /// Ticks frozen.
+    pub frozen: u64,
+    /// Ticks in which the optimiser gave no plan in time.
+    pub solver_fallbacks: u64,
+    /// Half of peak to peak of the reference, um.
+    pub stroke_um: f64,
+    /// Commanded amplitude at the cycle's frequency, um.
+    pub commanded_um: f64,
+    /// Reached amplitude at the cycle's frequency, um.
+    pub reached_um: f64,
+    /// By how much the bead lags behind the reference, degrees of a cycle.
+    pub lag_deg: f64,
+    /// Mean of position less reference, um.
+    pub bias_um: f64,
+    /// RMS of position less reference, um.
+    pub rms_um: f64,
+    /// Largest distance of position from reference, um.
+    pub peak_um: f64,
+    /// Change of position less reference over the cycle per time, um/s.
+    pub drift_um_per_s: f64,
+    /// Mean of the estimated displacement at which the bead rests, um.
+    pub neutral_um: f64,
+    /// Bead speed per PZT displacement away from neutral, as measured, 1/s.
+    pub gain_per_s: f64,
+    /// Time that the bead spent within a tenth of the stroke of the far end, s.
+    pub dwell_s: f64,
+    /// Length of the cell at the start, um.
+    pub length_start_um: f64,
+    /// Largest length of the cell, um.
+    pub length_peak_um: f64,
+    /// Length of the cell at the end, um.
+    pub length_end_um: f64,
+    /// Time constant of the cell's recovery after its largest length, s.
+    pub recovery_s: f64,
+    /// What disturbed it.
+    pub flags: CycleFlags,
+}
+
+/// Columns of the table that hold numbers with a fraction, with access to them.
+macro_rules! floats {
+    ($($name:ident),*) => {
+        const FLOATS: &[(&str, fn(&CycleRow) -> f64, fn(&mut CycleRow, f64))] =
+            &[$((stringify!($name), |row| row.$name, |row, value| row.$name = value)),*];
+    };
+}
+/// Columns that hold whole numbers.
+macro_rules! wholes {
+    ($($name:ident),*) => {
+        const WHOLES: &[(&str, fn(&CycleRow) -> u64, fn(&mut CycleRow, u64))] =
+            &[$((stringify!($name), |row| row.$name, |row, value| row.$name = value)),*];
+    };
+}
+wholes!(
+    cycle,
+    session,
+    ticks,
+    seen,
+    lost,
+    coasted,
+    saturated,
+    frozen,
+    solver_fallbacks
+);
+floats!(
+    start_s,
+    plan_s,
+    duration_s,
+    stroke_um,
+    commanded_um,
+    reached_um,
+    lag_deg,
+    bias_um,
+    rms_um,
+    peak_um,
+    drift_um_per_s,
+    neutral_um,
+    gain_per_s,
+    dwell_s,
+    length_start_um,
+    length_peak_um,
+    length_end_um,
+    recovery_s
+);
+
+impl CycleRow {
+    /// A cycle of which nothing is known yet.
+    pub fn empty(cycle: u64, session: u64, arm: ArmKind) -> Self {
+        let mut row = Self {
+            cycle,
+            session,
+            arm,
+            start_s: 0.0,
+            plan_s: 0.0,
+            duration_s: 0.0,
+            ticks: 0,
+            seen: 0,
+            lost: 0,
+            coasted: 0,
+            saturated: 0,
+            frozen: 0,
+            solver_fallbacks: 0,
+            stroke_um: 0.0,
+            commanded_um: 0.0,
+            reached_um: 0.0,
+            lag_deg: 0.0,
+            bias_um: 0.0,
+            rms_um: 0.0,
+            peak_um: 0.0,
+            drift_um_per_s: 0.0,
+            neutral_um: 0.0,
+            gain_per_s: 0.0,
+            dwell_s: 0.0,
+            length_start_um: 0.0,
+            length_peak_um: 0.0,
+            length_end_um: 0.0,
+            recovery_s: 0.0,
+            flags: CycleFlags::default(),
+        };
+        for (_, _, set) in FLOATS {
+            set(&mut row, f64::NAN);
+        }
+        row
+    }
+
+    /// The head of the table.
+    pub fn csv_head() -> String {
+        let mut names: Vec<&str> = WHOLES.iter().map(|(name, ..)| *name).collect();
+        names.insert(2, "arm");
+        names.extend(FLOATS.iter().map(|(name, ..)| *name));
+        names.push("flags");
+        names.join(",")
+    }
+
+    /// Names and values of all columns that hold numbers, in the order of the table.
+    pub fn numbers(&self) -> Vec<(&'static str, f64)> {
+        let wholes = WHOLES
+            .iter()
+            .map(|(name, get, _)| (*name, get(self) as f64));
+        wholes
+            .chain(FLOATS.iter().map(|(name, get, _)| (*name, get(self))))
+            .collect()
+    }
+
+    /// The row as a line of the table, without its end.
+    pub fn to_csv(&self) -> String {
+        let mut cells: Vec<String> = WHOLES
+            .iter()
+            .map(|(_, get, _)| get(self).to_string())
+            .collect();
+        let arm = match self.arm {
+            ArmKind::Cyclic => "cyclic",
+            ArmKind::Static => "static",
+        };
+        cells.insert(2, arm.to_owned());
+        cells.extend(FLOATS.iter().map(|(_, get, _)| {
+            let value = get(self);
+            if value.is_finite() {
+                format!("{}", round(value))
+            } else {
+                String::new()
+            }
+        }));
+        cells.push(self.flags.to_string());
+        cells.join(",")
+    }
+
+    /// A line of the table; None if it is none.
+    pub fn parse_csv(line: &str) -> Option<Self> {
+        let mut cells = line.split(',');
+        let mut row = Self::empty(0, 0, ArmKind::Cyclic);
+        for (index, (_, _, set)) in WHOLES.iter().enumerate() {
+            if index == 2 {
+                row.arm = match cells.next()? {
+                    "cyclic" => ArmKind::Cyclic,
+                    "static" => ArmKind::Static,
+                    _ => return None,
+                };
+            }
+            set(&mut row, cells.next()?.parse().ok()?);
+        }
+        for (_, _, set) in FLOATS {
+            let cell = cells.next()?;
+            let value = if cell.is_empty() {
+                f64::NAN
+            } else {
+                cell.parse().ok()?
+            };
+            set(&mut row, value);
+        }
+        row.flags = cells.next()?.parse().ok()?;
+        cells.next().is_none().then_some(row)
+    }
+}
+
+/// To a thousandth of a nanometre or a nanosecond: more digits would be noise in the file.
+fn round(value: f64) -> f64 {
+    (value * 1e6).round() / 1e6
+}
+
+/// The rows of a table, and how many lines behind its head are none.
+pub fn read_cycles(text: &str) -> (Vec<CycleRow>, usize) {
+    let mut rows = Vec::new();
+    let mut unreadable = 0;
+    // A last line without its end was cut off: it may read as a row and still not be the one that was meant.
+    let whole = text.rfind('\n').map_or(0, |end| end + 1);
+    unreadable += usize::from(whole < text.len());
+    for line in text.get(..whole).unwrap_or("").lines().skip(1) {
+        match CycleRow::parse_csv(line) {
+            Some(row) => rows.push(row),
+            None => unreadable += 1,
+        }
+    }
+    (rows, unreadable)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_row_reads_back_as_it_was_written_and_a_torn_one_not_at_all() {
+        let mut row = CycleRow::empty(41, 3, ArmKind::Static);
+        row.ticks = 100;
+        row.seen = 97;
+        row.reached_um = 1.25;
+        row.lag_deg = -0.5;
+        row.flags
+            .set(CycleFlags::LOST | CycleFlags::RECORDS_LOST, true);
+        let line = row.to_csv();
+        assert_eq!(
+            line.split(',').count(),
+            CycleRow::csv_head().split(',').count()
+        );
+        let back = CycleRow::parse_csv(&line).unwrap();
+        assert_eq!(back.to_csv(), line);
+        assert_eq!((back.cycle, back.session, back.flags), (41, 3, row.flags));
+        assert!(back.reached_um == 1.25 && back.gain_per_s.is_nan());
+        let text = format!("{}\n{line}\n{line}", CycleRow::csv_head());
+        let (rows, unreadable) = read_cycles(&text);
+        assert_eq!((rows.len(), unreadable), (1, 1));
+        for end in 0..line.len() {
+            if let Some(part) = CycleRow::parse_csv(&line[..end]) {
+                assert!(line[..end].ends_with(['t', ',']), "{part:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn names_of_quantities_carry_their_unit() {
+        for (name, ..) in FLOATS {
+            let unit = ["_um", "_s", "_deg"]
+                .iter()
+                .any(|unit| name.ends_with(unit));
+            assert!(unit, "{name}");
+        }
+    }
+}
