@@ -8,6 +8,7 @@ mod commands;
 mod outcome;
 mod recording;
 mod rig_file;
+mod session;
 mod setup;
 mod toml_file;
 

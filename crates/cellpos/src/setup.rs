@@ -7,9 +7,12 @@ use cellpos_control::design::{
 };
 use cellpos_control::{ControllerConfig, ControllerFile, ControllerKind, Limits, Profile};
 use cellpos_plant::Model;
-use cellpos_runtime::{ArmingConfig, Core, CoreError, Timing};
+use cellpos_runtime::{ArmingConfig, Core, CoreError, Guide, GuideInput, GuideOutput, Timing};
+use cellpos_script::{Follower, Plan, Script};
 use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
 use std::path::Path;
+use std::sync::Arc;
 
 /// What the bead is to follow.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -20,14 +23,89 @@ pub enum ReferenceSpec {
         /// Position, um.
         position_um: f64,
     },
+    /// Follow a script.
+    Script {
+        /// Its file, for messages.
+        file: String,
+        /// Its text.
+        text: String,
+        /// Time of the plan at which the session begins, s.
+        from_s: f64,
+        /// Texts of the waveforms that it names.
+        #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+        waveforms: BTreeMap<String, String>,
+    },
+}
+
+/// What guides a loop: a position, or a script.
+#[derive(Debug, Clone)]
+pub enum AnyGuide {
+    /// A function of time.
+    Profile(Profile),
+    /// A script.
+    Script(Box<Follower>),
+}
+
+impl Guide for AnyGuide {
+    fn step(&mut self, input: &GuideInput, preview_um: &mut [f64]) -> GuideOutput {
+        match self {
+            Self::Profile(profile) => Guide::step(profile, input, preview_um),
+            Self::Script(follower) => follower.step(input, preview_um),
+        }
+    }
+
+    fn finished(&self) -> bool {
+        match self {
+            Self::Profile(_) => false,
+            Self::Script(follower) => follower.finished(),
+        }
+    }
+}
+
+/// Model and controller, before the board is armed.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Prepared {
+    /// The plant that the controller believes in.
+    pub model: Model,
+    /// Controller, estimator and limits.
+    pub controller: ControllerFile,
 }
 
 impl ReferenceSpec {
-    /// The reference to evaluate.
-    pub fn profile(&self) -> Profile {
-        match *self {
-            Self::Hold { position_um } => Profile::Hold { position_um },
-        }
+    /// The script, if it is one, read and laid out.
+    pub fn script(&self) -> Result<Option<(Script, Plan)>, Failure> {
+        let Self::Script {
+            file,
+            text,
+            waveforms,
+            ..
+        } = self
+        else {
+            return Ok(None);
+        };
+        let load = |name: &str| {
+            waveforms
+                .get(name)
+                .cloned()
+                .ok_or_else(|| "is not kept with the run".to_string())
+        };
+        let script = Script::parse_with(text, file, &load).map_err(Failure::input)?;
+        let plan = Plan::new(&script).map_err(Failure::input)?;
+        Ok(Some((script, plan)))
+    }
+
+    fn guide(&self, timing: &Timing) -> Result<AnyGuide, Failure> {
+        let delay_ticks = (timing.camera_delay_ms * 1e3 / timing.period_us).round() as usize;
+        Ok(match self {
+            Self::Hold { position_um } => AnyGuide::Profile(Profile::Hold {
+                position_um: *position_um,
+            }),
+            Self::Script { from_s, .. } => {
+                let plan = self.script()?.map(|(_, plan)| Arc::new(plan));
+                let plan = plan.unwrap_or_else(|| unreachable!("a script has a plan"));
+                AnyGuide::Script(Box::new(Follower::new(plan, *from_s, delay_ticks)))
+            }
+        })
     }
 }
 
@@ -60,7 +138,7 @@ pub struct SetupConfig {
 
 impl Setup {
     /// Builds the loop.
-    pub fn core(&self) -> Result<Core<Profile>, Failure> {
+    pub fn core(&self) -> Result<Core<AnyGuide>, Failure> {
         let loop_config = self
             .controller
             .loop_config(&self.model)
@@ -71,7 +149,7 @@ impl Setup {
                 .map_err(Failure::input)?;
         Core::new(
             loop_config,
-            self.config.reference.profile(),
+            self.config.reference.guide(&self.config.timing)?,
             self.config.timing,
             self.config.arming,
             &plant.plant,

@@ -152,6 +152,48 @@ pub fn write_parquet(run: &RunReader, path: &Path) -> Result<(), RecordError> {
     }
 }
 
+/// A column of a small table.
+#[derive(Debug, Clone, PartialEq)]
+pub enum TableColumn {
+    /// Numbers; NaN where there is none.
+    Numbers(Vec<f64>),
+    /// Text.
+    Texts(Vec<String>),
+}
+
+/// Writes a small table of named columns as Parquet, in one step.
+///
+/// # Errors
+/// [`RecordError`] names the file; columns of different lengths are refused.
+pub fn write_table_parquet(
+    path: &Path,
+    columns: &[(&str, TableColumn)],
+) -> Result<(), RecordError> {
+    use arrow_array::{ArrayRef, Float64Array, RecordBatch, StringArray};
+    use std::sync::Arc;
+    let encode = |error: &dyn std::fmt::Display| RecordError::Encode {
+        what: "Parquet",
+        message: error.to_string(),
+    };
+    let arrays = columns.iter().map(|(name, column)| {
+        let array: ArrayRef = match column {
+            TableColumn::Numbers(values) => Arc::new(Float64Array::from(values.clone())),
+            TableColumn::Texts(values) => Arc::new(StringArray::from(values.clone())),
+        };
+        (*name, array)
+    });
+    let batch = RecordBatch::try_from_iter(arrays).map_err(|error| encode(&error))?;
+    let mut bytes = Vec::new();
+    let mut writer = parquet::arrow::ArrowWriter::try_new(&mut bytes, batch.schema(), None)
+        .map_err(|error| encode(&error))?;
+    writer
+        .write(&batch)
+        .and_then(|()| writer.close().map(|_| ()))
+        .map_err(|error| encode(&error))?;
+    cellpos_table::write_atomically(path, &bytes)?;
+    Ok(())
+}
+
 /// Writes a file under a temporary name, syncs it, and gives it its name.
 fn whole(path: &Path, write: impl FnOnce(File) -> io::Result<()>) -> io::Result<()> {
     if let Some(folder) = path.parent()

@@ -8,6 +8,9 @@
 //! | `ticks.arrow` | one row a tick ([`cellpos_runtime::TickRecord`]), an Arrow IPC stream | appended, synced at least each second |
 //! | `events.jsonl` | one JSON object a line | each at once |
 //! | `ticks.parquet` | the same rows for other programs | at the end |
+//! | `cycles.csv` | of a script: one row a cycle ([`LineFile`]) | appended, synced at least each second |
+//! | `cycles.parquet` | the same | at the end |
+//! | `sessions/` | of a run that was resumed: a run folder for each further session | |
 //!
 //! **While running** a [`RunWriter`] belongs to the recorder thread. It may allocate and block on the disk, so nothing
 //! of it is ever called in a tick. A full disk or a failing one never stops the loop: what could not be written is
@@ -26,6 +29,7 @@ mod columns;
 mod error;
 mod events;
 mod export;
+mod lines;
 mod meta;
 mod reader;
 mod stream;
@@ -33,7 +37,10 @@ mod writer;
 
 pub use error::RecordError;
 pub use events::{Event, Events, read_events};
-pub use export::{CSV_HEAD, Format, export, write_csv, write_parquet};
+pub use export::{
+    CSV_HEAD, Format, TableColumn, export, write_csv, write_parquet, write_table_parquet,
+};
+pub use lines::{LineFile, whole_text};
 pub use meta::{InputFile, RunEnd, RunMeta};
 pub use reader::{Batches, Gap, Lost, RunReader};
 pub use writer::{Faults, Finished, FlushPolicy, RunWriter};
@@ -44,5 +51,11 @@ pub const RUN_TOML: &str = "run.toml";
 pub const TICKS_ARROW: &str = "ticks.arrow";
 /// Name of the columns of a finished run.
 pub const TICKS_PARQUET: &str = "ticks.parquet";
+/// Name of the per-cycle table in a run folder.
+pub const CYCLES_CSV: &str = "cycles.csv";
+/// Name of the per-cycle table of a finished run.
+pub const CYCLES_PARQUET: &str = "cycles.parquet";
+/// Name of the folder of further sessions in the folder of a run that was resumed.
+pub const SESSIONS: &str = "sessions";
 /// Name of the event log in a run folder.
 pub const EVENTS_JSONL: &str = "events.jsonl";

@@ -453,7 +453,7 @@ impl FlushPolicy {
 }
 
 /// Length of the lines that end with a line end.
-fn whole_lines(bytes: &[u8]) -> u64 {
+pub(crate) fn whole_lines(bytes: &[u8]) -> u64 {
     bytes
         .iter()
         .rposition(|byte| *byte == b'\n')

@@ -44,7 +44,11 @@ impl Script {
         })
     }
 
-    fn parse_with(
+    /// Reads a script from text, with the files that it names (waveforms) from `load`.
+    ///
+    /// # Errors
+    /// [`ScriptError`] with the place.
+    pub fn parse_with(
         text: &str,
         file: &str,
         load: &dyn Fn(&str) -> Result<String, String>,

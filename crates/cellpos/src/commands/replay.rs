@@ -87,6 +87,7 @@ pub fn setup(reader: &RunReader) -> Result<Setup, Failure> {
     })?;
     let mut config = meta.config.clone();
     config.remove("rig");
+    config.remove("session");
     let name = reader.folder().join("run.toml").display().to_string();
     let text = |table: &toml::Table| toml::to_string(table).map_err(Failure::failed);
     Ok(Setup {

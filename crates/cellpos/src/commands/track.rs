@@ -3,17 +3,15 @@
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
 use crate::recording::{LiveLine, Recording};
 use crate::rig_file::{ClockKind, Frames, Rig, RigFile};
-use crate::setup::{self, ReferenceSpec, Setup, SetupConfig};
-use cellpos_control::design::bound_rms_um;
-use cellpos_plant::Model;
-use cellpos_record::{InputFile, RunEnd, RunMeta, RunWriter};
-use cellpos_rig::actuator::Session;
-use cellpos_runtime::live::{Operator, Threads};
+use crate::session;
+use crate::setup::{ReferenceSpec, Setup};
+use cellpos_record::RunWriter;
+use cellpos_runtime::live::Operator;
 use cellpos_runtime::realtime::Conditions;
-use cellpos_runtime::{EndRule, Finished, Life, Request, Statistics, Summary, live, virtual_run};
+use cellpos_runtime::{EndRule, Finished, Life, Summary};
 use cellpos_units::{Micrometers, Seconds};
 use serde::Serialize;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::Arc;
 
 /// Arguments of `cellpos track`.
@@ -87,43 +85,21 @@ pub fn run(args: Args) -> CommandResult {
         file.emulator.seed = seed;
     }
     let ticks = ticks(args.duration, file.timing.period_us)?;
-    let model = Model::load(&args.model).map_err(Failure::input)?;
-    let mut controller = setup::controller(&args.controller, &model, &file.timing)?;
-
-    let mut rig = file.connect(args.clock, args.frames)?;
-    rig.expect(&model);
+    let mut prepared = session::prepare(&args.model, &args.controller, &file)?;
+    let mut rig = session::connect(&file, args.clock, args.frames, &prepared.model)?;
     check_target(args.target, &rig)?;
-    let board = rig.actuator.info();
-    let own = controller.limits;
-    let asked = setup::within(file.limits, [own.low_um, own.high_um, own.slew_um_per_s]);
-    controller.limits = setup::within(asked, [board.low_um, board.high_um, board.slew_um_per_s]);
-    let limits = controller.limits;
-    let armed = rig
-        .actuator
-        .arm(&Session {
-            id: 1,
-            park_um: limits.park_um,
-            limits: [limits.low_um, limits.high_um, limits.slew_um_per_s],
-            watchdog_ms: file.watchdog_ms(),
-        })
-        .map_err(Failure::failed)?;
-    let setup = Setup {
-        model,
-        controller,
-        config: SetupConfig {
-            displacement_um: armed.applied_um,
-            neutral_um: file.first_neutral_um,
-            reference: ReferenceSpec::Hold {
-                position_um: args.target.value(),
-            },
-            timing: file.timing,
-            arming: file.arming,
-        },
+    session::narrow(&mut prepared, &file, &rig);
+    let limits = prepared.controller.limits;
+    let hold = ReferenceSpec::Hold {
+        position_um: args.target.value(),
     };
+    let setup = session::arm(prepared, &file, &mut rig, 1, hold)?;
     let writer = if args.no_record {
         None
     } else {
-        Some(create_run(&args, &file, &setup)?)
+        let inputs = session::inputs(args.rig.as_deref(), &args.model, &args.controller);
+        let meta = session::meta(&args.name, args.clock, &inputs, &file, &setup)?;
+        Some(RunWriter::create(&args.runs, meta).map_err(Failure::failed)?)
     };
     let recording = Recording::new(
         writer,
@@ -133,23 +109,13 @@ pub fn run(args: Args) -> CommandResult {
         }),
     );
     let operator = Arc::new(Operator::default());
-    let stopper = Arc::clone(&operator);
-    ctrlc::set_handler(move || {
-        let message = match stopper.stop() {
-            Request::Freeze => "freezing, then parking; once more to park at once",
-            _ => "parking",
-        };
-        eprintln!("\n{message}");
-    })
-    .map_err(Failure::failed)?;
-    let finished = drive(
-        &setup,
-        &mut rig,
-        recording,
+    session::stop_on_signals(&operator)?;
+    let end = EndRule {
         ticks,
-        args.best_effort,
-        &operator,
-    )?;
+        ..EndRule::default()
+    };
+    let core = setup.core()?;
+    let finished = session::drive(core, &mut rig, recording, end, args.best_effort, &operator)?;
     conclude(&args, &file, &setup, &rig, finished)
 }
 
@@ -178,88 +144,6 @@ fn check_target(target: Micrometers, rig: &Rig) -> Result<(), Failure> {
     ))
 }
 
-/// Runs the loop on the rig's clock.
-fn drive(
-    setup: &Setup,
-    rig: &mut Rig,
-    recording: Recording,
-    ticks: Option<u64>,
-    best_effort: bool,
-    operator: &Operator,
-) -> Result<Finished<Recording>, Failure> {
-    let core = setup.core()?;
-    let end = EndRule {
-        ticks,
-        ..EndRule::default()
-    };
-    if rig.clock.is_virtual() {
-        virtual_run::run(
-            core,
-            &rig.clock,
-            rig.source.as_mut(),
-            rig.actuator.as_mut(),
-            recording,
-            Statistics::default(),
-            end,
-            |_| operator.asked(),
-        )
-    } else {
-        let threads = if best_effort {
-            Threads::best_effort()
-        } else {
-            Threads::real_time()
-        };
-        live::run(
-            core,
-            rig.source.as_mut(),
-            rig.actuator.as_mut(),
-            recording,
-            Statistics::default(),
-            end,
-            &threads,
-            operator,
-        )
-    }
-    .map_err(Failure::failed)
-}
-
-fn create_run(args: &Args, file: &RigFile, setup: &Setup) -> Result<RunWriter, Failure> {
-    let clock = match args.clock {
-        ClockKind::Real => "real",
-        ClockKind::Virtual => "virtual",
-    };
-    let mut meta = RunMeta::new(&args.name, clock);
-    meta.command_line = std::env::args().collect();
-    meta.seed = file.is_emulated().then_some(file.emulator.seed);
-    meta.versions
-        .insert("cellpos".to_string(), env!("CARGO_PKG_VERSION").to_string());
-    let mut inputs: Vec<&Path> = args.rig.iter().map(PathBuf::as_path).collect();
-    if args.model != "eq6" {
-        inputs.push(Path::new(&args.model));
-    }
-    if args.controller.ends_with(".toml") {
-        inputs.push(Path::new(&args.controller));
-    }
-    for path in inputs {
-        meta.inputs
-            .push(InputFile::of(path).map_err(Failure::failed)?);
-    }
-    meta.config = table(&setup.config)?;
-    meta.config
-        .insert("rig".to_string(), toml::Value::Table(table(file)?));
-    meta.model = setup
-        .model
-        .to_toml_string()
-        .parse::<toml::Table>()
-        .map_err(Failure::failed)?;
-    meta.controller = table(&setup.controller)?;
-    RunWriter::create(&args.runs, meta).map_err(Failure::failed)
-}
-
-fn table(value: &impl Serialize) -> Result<toml::Table, Failure> {
-    toml::Table::try_from(value).map_err(Failure::failed)
-}
-
 fn conclude(
     args: &Args,
     file: &RigFile,
@@ -276,44 +160,21 @@ fn conclude(
     } = finished;
     let mut warnings = rig.warnings.clone();
     if let Some(error) = &io_error {
-        warnings.push(describe(error));
+        warnings.push(session::describe(error));
     }
     // Parked by the operator is ended as asked.
     let as_asked = summary.state == Life::Running
         || summary.safe_reason == Some(cellpos_runtime::SafeReason::Operator);
     let healthy = as_asked && io_error.is_none();
-    let run = sink.into_writer().map(|writer| {
-        let mut end = RunEnd::new(if healthy {
-            "done"
-        } else {
-            summary.state.name()
-        });
-        end.summary = toml::Table::try_from(&summary).unwrap_or_default();
-        let done = writer.finish(end);
-        if done.faults.rows_lost + done.faults.events_lost > 0 {
-            warnings.push(format!(
-                "{} rows and {} events could not be written: {}",
-                done.faults.rows_lost,
-                done.faults.events_lost,
-                done.faults.first.unwrap_or_default()
-            ));
-        }
-        done.folder.display().to_string()
-    });
-    let diffusion = if file.is_emulated() {
-        file.emulator.diffusion_um2_per_s
+    let outcome = if healthy {
+        "done"
     } else {
-        setup.model.noise.diffusion_um2_per_s
+        summary.state.name()
     };
-    let bound_rms_nm = summary.fix_noise_nm.map(|noise_nm| {
-        let timing = &setup.config.timing;
-        1e3 * bound_rms_um(
-            diffusion,
-            noise_nm * 1e-3,
-            timing.camera_delay_ms * 1e-3,
-            timing.period_us * 1e-6,
-        )
-    });
+    let run = sink
+        .into_writer()
+        .map(|writer| session::finish(writer, outcome, &summary, &mut warnings));
+    let bound_rms_nm = session::bound_rms_nm(file, setup, &summary);
     let report = Report {
         summary: &summary,
         target_um: args.target.value(),
@@ -333,18 +194,6 @@ fn conclude(
     } else {
         Outcome::Broken
     })
-}
-
-/// An error with what is behind it, on one line.
-fn describe(error: &dyn std::error::Error) -> String {
-    let mut text = error.to_string();
-    let mut source = error.source();
-    while let Some(error) = source {
-        text.push_str(": ");
-        text.push_str(&error.to_string());
-        source = error.source();
-    }
-    text
 }
 
 fn text(report: &Report) -> String {

@@ -1,0 +1,173 @@
+//! A text file that only ever grows by whole lines.
+
+use crate::error::RecordError;
+use crate::writer::{Blocks, Faults, whole_lines};
+use std::fs::{File, OpenOptions};
+use std::io::{Seek, SeekFrom};
+use std::path::Path;
+
+/// Lines that wait for a disk that refuses them, at most, bytes.
+const MOST_WAITING: usize = 1 << 24;
+
+/// A text file with a head line, appended to line by line: a line that was acknowledged is in the file, whole, whatever
+/// happens to this process afterwards.
+///
+/// Only one process can have it open: the file is locked, and the lock dies with the process. Lines that the disk refuses
+/// wait and are tried again with the next ones; when too much waits, the newest are dropped and counted. Belongs to the
+/// recorder thread; may block.
+pub struct LineFile {
+    blocks: Blocks<File>,
+    waiting: String,
+    waiting_lines: u64,
+    sync: bool,
+    faults: Faults,
+}
+
+/// The whole lines of a text: without a last one that was cut off.
+pub fn whole_text(text: &str) -> &str {
+    text.get(..whole_lines(text.as_bytes()) as usize)
+        .unwrap_or("")
+}
+
+impl LineFile {
+    /// Opens or makes a file; a last line that was cut off is cut away, and a file without lines gets the head. `sync`: wait
+    /// for the disk at each write.
+    ///
+    /// # Errors
+    /// [`RecordError::Io`] when it cannot be opened, or another process has it open.
+    pub fn open(path: &Path, head: &str, sync: bool) -> Result<Self, RecordError> {
+        let attempt = || -> std::io::Result<Self> {
+            let mut file = OpenOptions::new()
+                .read(true)
+                .write(true)
+                .create(true)
+                .truncate(false)
+                .open(path)?;
+            file.try_lock().map_err(|error| match error {
+                std::fs::TryLockError::Error(error) => error,
+                std::fs::TryLockError::WouldBlock => std::io::Error::new(
+                    std::io::ErrorKind::WouldBlock,
+                    "another process is writing it: is the run still going on?",
+                ),
+            })?;
+            let whole = whole_lines(&std::fs::read(path)?);
+            file.set_len(whole)?;
+            file.seek(SeekFrom::Start(whole))?;
+            let mut lines = Self {
+                blocks: Blocks::new(file, whole),
+                waiting: String::new(),
+                waiting_lines: 0,
+                sync,
+                faults: Faults::default(),
+            };
+            if whole == 0 {
+                lines.blocks.append(format!("{head}\n").as_bytes(), sync)?;
+            }
+            Ok(lines)
+        };
+        attempt().map_err(RecordError::io("cannot open", path))
+    }
+
+    /// Takes a line (without its end); it goes to the disk with the next [`LineFile::flush`].
+    pub fn push(&mut self, line: &str) {
+        if self.waiting.len() + line.len() >= MOST_WAITING {
+            self.faults.rows_lost += 1;
+            return;
+        }
+        self.waiting.push_str(line);
+        self.waiting.push('\n');
+        self.waiting_lines += 1;
+    }
+
+    /// Writes what waits; says whether nothing waits any more.
+    pub fn flush(&mut self) -> bool {
+        if self.waiting.is_empty() {
+            return true;
+        }
+        match self.blocks.append(self.waiting.as_bytes(), self.sync) {
+            Ok(()) => {
+                self.waiting.clear();
+                self.waiting_lines = 0;
+                true
+            }
+            Err(error) => {
+                self.faults.io_errors += 1;
+                if self.faults.first.is_none() {
+                    tracing::error!("the table is incomplete: {error}; control goes on");
+                    self.faults.first = Some(error.to_string());
+                }
+                false
+            }
+        }
+    }
+
+    /// What could not be written: lines dropped, and those that still wait.
+    pub fn faults(&self) -> Faults {
+        Faults {
+            rows_lost: self.faults.rows_lost + self.waiting_lines,
+            ..self.faults.clone()
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_torn_line_is_cut_away_and_whole_ones_stay() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("cycles.csv");
+        let mut lines = LineFile::open(&path, "a,b", false).unwrap();
+        lines.push("1,2");
+        assert!(lines.flush() && lines.flush());
+        drop(lines);
+        let mut text = std::fs::read_to_string(&path).unwrap();
+        text.push_str("3,");
+        std::fs::write(&path, &text).unwrap();
+        assert_eq!(whole_text(&text), "a,b\n1,2\n");
+        let mut lines = LineFile::open(&path, "a,b", true).unwrap();
+        lines.push("3,4");
+        lines.push("5,6");
+        assert!(lines.flush());
+        assert_eq!(
+            std::fs::read_to_string(&path).unwrap(),
+            "a,b\n1,2\n3,4\n5,6\n"
+        );
+        assert_eq!(lines.faults(), Faults::default());
+    }
+
+    #[test]
+    fn a_file_that_is_being_written_is_not_opened_a_second_time() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("cycles.csv");
+        let first = LineFile::open(&path, "a", false).unwrap();
+        let error = LineFile::open(&path, "a", false).err().unwrap();
+        assert!(error.to_string().contains("cycles.csv"), "{error}");
+        drop(first);
+        assert!(LineFile::open(&path, "a", false).is_ok());
+    }
+
+    #[test]
+    fn lines_that_a_full_disk_refuses_are_counted_and_wait() {
+        // /dev/full refuses every write; it has no length to cut to.
+        let Ok(file) = OpenOptions::new().write(true).open("/dev/full") else {
+            eprintln!("no /dev/full here: nothing tested");
+            return;
+        };
+        let mut lines = LineFile {
+            blocks: Blocks::new(file, 0),
+            waiting: String::new(),
+            waiting_lines: 0,
+            sync: false,
+            faults: Faults::default(),
+        };
+        for _ in 0..3 {
+            lines.push("1,2");
+            assert!(!lines.flush());
+        }
+        let faults = lines.faults();
+        assert_eq!((faults.rows_lost, faults.io_errors), (3, 3));
+        assert!(faults.first.is_some());
+    }
+}
