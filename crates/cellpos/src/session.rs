@@ -127,7 +127,7 @@ pub fn meta(
         .insert("cellpos".to_string(), env!("CARGO_PKG_VERSION").to_string());
     for path in inputs {
         meta.inputs
-            .push(InputFile::of(path).map_err(Failure::failed)?);
+            .push(InputFile::of(path).map_err(Failure::input)?);
     }
     meta.config = table(&setup.config)?;
     meta.config

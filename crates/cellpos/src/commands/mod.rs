@@ -9,6 +9,7 @@ pub mod identify;
 pub mod paper;
 pub mod reconcile;
 pub mod replay;
+pub mod run;
 pub mod simulate;
 pub mod track;
 pub mod vision;
@@ -22,6 +23,8 @@ use crate::outcome::CommandResult;
 pub enum Command {
     /// Hold a bead, or go to a position, in closed loop.
     Track(track::Args),
+    /// Run a setpoint script in closed loop, or go on with one.
+    Run(Box<run::Args>),
     /// A controller for a model and a loop delay: margins, predicted error, spread, controller.toml.
     Design(design::Args),
     /// A setpoint script against a model and the rig's limits, before anything moves.
@@ -51,6 +54,7 @@ impl Command {
     pub fn run(self) -> CommandResult {
         match self {
             Self::Track(args) => track::run(args),
+            Self::Run(args) => run::run(*args),
             Self::Replay(args) => replay::run(args),
             Self::Design(args) => design::run(args),
             Self::Check(args) => check::run(args),

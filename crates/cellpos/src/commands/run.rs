@@ -1,0 +1,391 @@
+//! `cellpos run`: a setpoint script in closed loop, with a row for each cycle; resumed after whatever ended it.
+
+mod keys;
+mod resume;
+mod sink;
+mod text;
+
+use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
+use crate::rig_file::{ActuatorConfig, CameraConfig, ClockKind, Frames, Rig, RigFile};
+use crate::session;
+use crate::setup::{Prepared, ReferenceSpec, Setup};
+use cellpos_record::{InputFile, LineFile, RunWriter};
+use cellpos_runtime::live::Operator;
+use cellpos_runtime::{EndRule, Finished, Life};
+use cellpos_script::{
+    AmplitudeWatch, Check, CheckLimits, CycleRow, CycleTable, Plan, Script, check,
+};
+use serde::{Deserialize, Serialize};
+use sink::ScriptSink;
+use std::cell::RefCell;
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+/// Arguments of `cellpos run`.
+#[derive(Debug, clap::Args)]
+#[command(after_help = "Examples:
+  cellpos run examples/scripts/fatigue.toml --dry
+  cellpos run examples/scripts/step.toml --rig rig.toml --model model.toml --controller controller.toml
+  cellpos run --resume runs/20261121T190000Z-fatigue
+
+The script is checked first, as by cellpos check with the limits of the rig. Keys, where standard input is a terminal: p
+pauses and goes on, s skips to the next step, q freezes the bead, then parks the PZT. Ctrl-C does the same as q; a second
+one parks at once. Every cycle that is over is in cycles.csv in the run folder; --resume goes on behind the last of them,
+after a crash too. Exit code 0: the script came to its end; 1: it did not; 2: bad input, or the rig cannot do it.")]
+pub struct Args {
+    /// The script.
+    #[arg(required_unless_present = "resume", conflicts_with = "resume")]
+    script: Option<PathBuf>,
+    /// Go on with a run that was cut off or stopped, as it was set up.
+    #[arg(long, value_name = "RUN")]
+    resume: Option<PathBuf>,
+    /// Rehearse: on the virtual clock, with an emulated rig that behaves as --model says.
+    #[arg(long)]
+    dry: bool,
+    /// pi, lead, lqg, mpc, or the path of a controller.toml.
+    #[arg(long, default_value = "pi")]
+    controller: String,
+    /// The rig; left out: emulated.
+    #[arg(long)]
+    rig: Option<PathBuf>,
+    /// The plant that the controller is made for: a model.toml, or eq6.
+    #[arg(long, default_value = "eq6")]
+    model: String,
+    /// Seed of the emulated rig; left out: that of rig.toml.
+    #[arg(long)]
+    seed: Option<u64>,
+    /// Clock of the emulated rig; left out: real, and virtual with --dry.
+    #[arg(long, value_enum)]
+    clock: Option<ClockKind>,
+    /// Whether the emulated rig renders frames; left out: on, and off with --dry.
+    #[arg(long, value_enum)]
+    frames: Option<Frames>,
+    /// Amplitude error, in percent of the commanded amplitude (mean of ten cycles), above which an alarm is given.
+    #[arg(long, default_value_t = 10.0)]
+    alarm_percent: f64,
+    /// Do not ask the operating system for real time.
+    #[arg(long)]
+    best_effort: bool,
+    /// Where run folders go.
+    #[arg(long, default_value = "runs")]
+    runs: PathBuf,
+    /// Name of the run; left out: that of the script.
+    #[arg(long)]
+    name: Option<String>,
+    /// Print one JSON object on standard output.
+    #[arg(long)]
+    json: bool,
+}
+
+/// What a session needs to know beside the loop's set-up: the table `config.session` of run.toml.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct SessionConfig {
+    /// 1 for the first, one more each time that the run was resumed.
+    number: u64,
+    /// The cycle that it begins with.
+    first_cycle: u64,
+    /// Whether frames are rendered.
+    frames: bool,
+    /// Whether the operating system was not asked for real time.
+    best_effort: bool,
+    /// Amplitude error that raises an alarm, percent.
+    alarm_percent: f64,
+    /// Seconds from the end of the last record of the session before to the start of this one, s.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    gap_s: Option<f64>,
+    /// Folder of the session before, from the run's folder.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    after: Option<String>,
+}
+
+/// A session before the board is armed.
+struct Ready {
+    file: RigFile,
+    prepared: Prepared,
+    reference: ReferenceSpec,
+    clock: ClockKind,
+    name: String,
+    session: SessionConfig,
+    inputs: Vec<InputFile>,
+    /// The run's folder, and where the session's goes; None: a new run below `--runs`.
+    home: Option<(PathBuf, PathBuf)>,
+}
+
+/// Runs a script, or goes on with one.
+pub fn run(args: Args) -> CommandResult {
+    let ready = match &args.resume {
+        Some(folder) => match resume::ready(folder, args.best_effort)? {
+            Some(ready) => ready,
+            None => {
+                print_text("all cycles are done: nothing to resume\n")?;
+                return Ok(Outcome::Done);
+            }
+        },
+        None => fresh(&args)?,
+    };
+    start(&args, ready)
+}
+
+/// A new run from the arguments.
+fn fresh(args: &Args) -> Result<Ready, Failure> {
+    if !(args.alarm_percent > 0.0 && args.alarm_percent.is_finite()) {
+        return Err(Failure::bad_input(
+            format!("--alarm-percent {}: must be above 0", args.alarm_percent),
+            "write for example 10",
+        ));
+    }
+    let path = args.script.as_deref().unwrap_or(Path::new(""));
+    let (reference, script, mut inputs) = read(path)?;
+    let mut file = RigFile::load(args.rig.as_deref())?;
+    if let Some(seed) = args.seed {
+        file.emulator.seed = seed;
+    }
+    if args.dry {
+        rehearse(&mut file, &args.model);
+    }
+    for path in session::inputs(args.rig.as_deref(), &args.model, &args.controller) {
+        inputs.push(InputFile::of(path).map_err(Failure::input)?);
+    }
+    let (clock, frames) = if args.dry {
+        (ClockKind::Virtual, Frames::Off)
+    } else {
+        (ClockKind::Real, Frames::On)
+    };
+    let name = args.name.clone().unwrap_or_else(|| {
+        let dry = if args.dry { "-dry" } else { "" };
+        format!("{}{dry}", script.name)
+    });
+    Ok(Ready {
+        prepared: session::prepare(&args.model, &args.controller, &file)?,
+        file,
+        reference,
+        clock: args.clock.unwrap_or(clock),
+        name,
+        session: SessionConfig {
+            number: 1,
+            first_cycle: 0,
+            frames: args.frames.unwrap_or(frames) == Frames::On,
+            best_effort: args.best_effort,
+            alarm_percent: args.alarm_percent,
+            gap_s: None,
+            after: None,
+        },
+        inputs,
+        home: None,
+    })
+}
+
+/// The emulated rig as the model says: everything of the rig file but its devices.
+fn rehearse(file: &mut RigFile, model: &str) {
+    file.actuator = ActuatorConfig::Emulated {};
+    file.camera = CameraConfig::Emulated {};
+    file.calibration = None;
+    file.emulator.model = model.to_string();
+    file.emulator.rate_hz = 1e6 / file.timing.period_us;
+    file.emulator.latency_ms = file.timing.camera_delay_ms;
+}
+
+/// A script with everything that it names, in a form that is kept with the run.
+fn read(path: &Path) -> Result<(ReferenceSpec, Script, Vec<InputFile>), Failure> {
+    let file = path.display().to_string();
+    let text = std::fs::read_to_string(path).map_err(|error| {
+        Failure::bad_input(
+            format!("{file}: {error}"),
+            "give the path of a script file; see examples/scripts/",
+        )
+    })?;
+    let folder = path.parent().unwrap_or(Path::new(""));
+    let waveforms = RefCell::new(BTreeMap::new());
+    let script = Script::parse_with(&text, &file, &|name| {
+        let text = std::fs::read_to_string(folder.join(name)).map_err(|error| error.to_string())?;
+        waveforms
+            .borrow_mut()
+            .insert(name.to_string(), text.clone());
+        Ok(text)
+    })
+    .map_err(Failure::input)?;
+    let waveforms = waveforms.into_inner();
+    let mut inputs = vec![InputFile::of_bytes(&file, text.as_bytes())];
+    inputs.extend(waveforms.iter().map(|(name, text)| {
+        InputFile::of_bytes(&folder.join(name).display().to_string(), text.as_bytes())
+    }));
+    let reference = ReferenceSpec::Script {
+        file,
+        text,
+        from_s: 0.0,
+        waveforms,
+    };
+    Ok((reference, script, inputs))
+}
+
+/// The check of `cellpos check`, with the limits that are in force.
+fn allowed(script: &Script, setup: &Prepared, file: &RigFile, rig: &Rig) -> Result<Check, Failure> {
+    let limits = setup.controller.limits;
+    let [low_um, high_um] = rig.source.info().field_um;
+    let result = check(
+        script,
+        &setup.model,
+        &CheckLimits {
+            low_um: limits.low_um,
+            high_um: limits.high_um,
+            slew_um_per_s: limits.slew_um_per_s,
+            neutral_um: file.first_neutral_um,
+            view_um: high_um.min(-low_um),
+            sample_s: file.timing.period_us * 1e-6,
+            ..CheckLimits::default()
+        },
+    )
+    .map_err(Failure::input)?;
+    if let Some(first) = result.violations.first() {
+        return Err(Failure::bad_input(
+            format!(
+                "{}:{}: {}: {:.3} {unit} asked for, {:.3} {unit} allowed: the rig cannot do it",
+                script.file,
+                first.line,
+                first.what,
+                first.asked,
+                first.allowed,
+                unit = first.unit
+            ),
+            format!(
+                "scale all positions by {:.3} or less; see cellpos check",
+                result.largest_factor
+            ),
+        ));
+    }
+    Ok(result)
+}
+
+fn start(args: &Args, ready: Ready) -> CommandResult {
+    let Ready {
+        file,
+        mut prepared,
+        reference,
+        clock,
+        name,
+        session: config,
+        inputs,
+        home,
+    } = ready;
+    let (script, plan) = reference.script()?.ok_or_else(|| {
+        Failure::bad_input("the run has no script", "resume a run of cellpos run")
+    })?;
+    let plan = Arc::new(plan);
+    let frames = if config.frames {
+        Frames::On
+    } else {
+        Frames::Off
+    };
+    let mut rig = session::connect(&file, clock, frames, &prepared.model)?;
+    session::narrow(&mut prepared, &file, &rig);
+    allowed(&script, &prepared, &file, &rig)?;
+    let number = u16::try_from(config.number).unwrap_or(u16::MAX);
+    let setup = session::arm(prepared, &file, &mut rig, number, reference)?;
+
+    let mut meta = session::meta(&name, clock, &[], &file, &setup)?;
+    meta.inputs = inputs;
+    let table = session::table(&config)?;
+    meta.config
+        .insert("session".to_string(), toml::Value::Table(table));
+    let root = home.as_ref().map_or(args.runs.as_path(), |(_, root)| root);
+    let writer = RunWriter::create(root, meta).map_err(Failure::failed)?;
+    let folder = home.map_or_else(|| writer.folder().to_owned(), |(folder, _)| folder);
+    let lines = LineFile::open(
+        &folder.join(cellpos_record::CYCLES_CSV),
+        &CycleRow::csv_head(),
+        !rig.clock.is_virtual(),
+    )
+    .map_err(Failure::failed)?;
+
+    let cycles = CycleTable::new(
+        Arc::clone(&plan),
+        config.number,
+        config.first_cycle,
+        file.timing.camera_delay_ms,
+        file.timing.period_us,
+    );
+    let watch = AmplitudeWatch::new(config.alarm_percent * 1e-2, 10);
+    let sink = ScriptSink::new(writer, lines, cycles, watch, Arc::clone(&plan), &config);
+    let operator = Arc::new(Operator::default());
+    session::stop_on_signals(&operator)?;
+    let keys = keys::listen(&operator);
+    let finished = session::drive(
+        setup.core()?,
+        &mut rig,
+        sink,
+        EndRule::default(),
+        config.best_effort,
+        &operator,
+    )?;
+    drop(keys);
+    conclude(args, &file, &setup, &rig, &plan, &folder, finished)
+}
+
+fn conclude(
+    args: &Args,
+    file: &RigFile,
+    setup: &Setup,
+    rig: &Rig,
+    plan: &Plan,
+    folder: &Path,
+    finished: Finished<ScriptSink>,
+) -> CommandResult {
+    let Finished {
+        summary,
+        conditions,
+        sink,
+        io_error,
+    } = finished;
+    let mut warnings = rig.warnings.clone();
+    if let Some(error) = &io_error {
+        warnings.push(session::describe(error));
+    }
+    let safe = summary.state != Life::Running || io_error.is_some();
+    let ended = sink.end();
+    let outcome = match (safe, ended.complete()) {
+        (true, _) => summary.state.name(),
+        (false, true) => "done",
+        (false, false) if ended.stage.is_over() => "stopped",
+        (false, false) => "aborted",
+    };
+    let (writer, cycle_faults) = sink.close();
+    if cycle_faults.rows_lost > 0 {
+        warnings.push(format!(
+            "{} rows of cycles.csv could not be written: {}",
+            cycle_faults.rows_lost,
+            cycle_faults.first.unwrap_or_default()
+        ));
+    }
+    let run = session::finish(writer, outcome, &summary, &mut warnings);
+    let cycles = resume::cycles(folder)?;
+    if let Err(error) = resume::cycles_parquet(folder, &cycles) {
+        warnings.push(format!("no cycles.parquet: {error}"));
+    }
+    let report = text::Report::new(
+        text::Ending {
+            outcome,
+            stage: ended.stage.name(),
+            alarms: ended.alarms,
+            run,
+            folder: folder.display().to_string(),
+        },
+        &summary,
+        &cycles,
+        plan.cycle_count(),
+        session::bound_rms_nm(file, setup, &summary),
+        &conditions,
+        &warnings,
+    );
+    if args.json {
+        print_json(&report)?;
+    } else {
+        print_text(&report.text())?;
+    }
+    Ok(if outcome == "done" {
+        Outcome::Done
+    } else {
+        Outcome::Broken
+    })
+}

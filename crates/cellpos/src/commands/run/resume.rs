@@ -1,0 +1,178 @@
+//! A run that is gone on with: everything comes from its folder.
+
+use super::{Ready, SessionConfig};
+use crate::commands::replay;
+use crate::outcome::Failure;
+use crate::rig_file::{ClockKind, RigFile};
+use crate::setup::{Prepared, ReferenceSpec};
+use cellpos_record::{
+    CYCLES_CSV, CYCLES_PARQUET, RecordError, RunReader, SESSIONS, TableColumn, write_table_parquet,
+};
+use cellpos_script::{ArmKind, CycleRow, read_cycles};
+use std::path::{Path, PathBuf};
+
+/// The acknowledged cycles of a run.
+pub fn cycles(folder: &Path) -> Result<Vec<CycleRow>, Failure> {
+    let path = folder.join(CYCLES_CSV);
+    let text = std::fs::read_to_string(&path).map_err(|error| {
+        Failure::bad_input(
+            format!("{}: {error}", path.display()),
+            "give the folder of a run of cellpos run",
+        )
+    })?;
+    let (rows, _) = read_cycles(&text);
+    Ok(rows)
+}
+
+/// The per-cycle table for other programs.
+pub fn cycles_parquet(folder: &Path, rows: &[CycleRow]) -> Result<(), RecordError> {
+    let Some(first) = rows.first() else {
+        return Ok(());
+    };
+    let numbers: Vec<Vec<(&str, f64)>> = rows.iter().map(CycleRow::numbers).collect();
+    let mut columns: Vec<(&str, TableColumn)> = first
+        .numbers()
+        .iter()
+        .enumerate()
+        .map(|(index, (name, _))| {
+            let values = numbers
+                .iter()
+                .map(|row| row.get(index).map_or(f64::NAN, |cell| cell.1));
+            (*name, TableColumn::Numbers(values.collect()))
+        })
+        .collect();
+    let arm = |row: &CycleRow| match row.arm {
+        ArmKind::Cyclic => "cyclic".to_string(),
+        ArmKind::Static => "static".to_string(),
+    };
+    columns.push(("arm", TableColumn::Texts(rows.iter().map(arm).collect())));
+    let flags = rows.iter().map(|row| row.flags.to_string()).collect();
+    columns.push(("flags", TableColumn::Texts(flags)));
+    write_table_parquet(&folder.join(CYCLES_PARQUET), &columns)
+}
+
+/// The folders of a run's sessions, in order.
+pub fn sessions(folder: &Path) -> Vec<PathBuf> {
+    let mut found: Vec<(u64, PathBuf)> = vec![(1, folder.to_owned())];
+    let further = std::fs::read_dir(folder.join(SESSIONS))
+        .into_iter()
+        .flatten()
+        .flatten()
+        .map(|entry| entry.path());
+    for path in further {
+        if let Ok(reader) = RunReader::open(&path)
+            && let Some(config) = session_config(&reader)
+        {
+            found.push((config.number, path));
+        }
+    }
+    found.sort();
+    found.into_iter().map(|(_, path)| path).collect()
+}
+
+/// What a session's run.toml says of it.
+pub fn session_config(reader: &RunReader) -> Option<SessionConfig> {
+    let config = reader.meta().ok()?.config.get("session")?.clone();
+    config.try_into().ok()
+}
+
+/// The next session of a run; None when nothing is left to do.
+pub fn ready(folder: &Path, best_effort: bool) -> Result<Option<Ready>, Failure> {
+    let not_a_run = |problem: String| {
+        Failure::bad_input(
+            format!("{}: {problem}", folder.display()),
+            "give the folder of a run of cellpos run",
+        )
+    };
+    let reader = RunReader::open(folder).map_err(Failure::input)?;
+    let setup = replay::setup(&reader)?;
+    let first =
+        session_config(&reader).ok_or_else(|| not_a_run("is no run of a script".to_string()))?;
+    if first.number != 1 {
+        return Err(not_a_run(
+            "is a further session of a run: give the folder that it lies in".to_string(),
+        ));
+    }
+    let meta = reader
+        .meta()
+        .map_err(|problem| not_a_run(problem.to_string()))?;
+    let rig = meta.config.get("rig").and_then(toml::Value::as_table);
+    let rig = rig.ok_or_else(|| not_a_run("run.toml names no rig".to_string()))?;
+    let text = toml::to_string(rig).map_err(Failure::failed)?;
+    let mut file: RigFile =
+        crate::toml_file::parse(&text, &folder.join("run.toml").display().to_string())?;
+
+    let Some((_, plan)) = setup.config.reference.script()? else {
+        return Err(not_a_run("is no run of a script".to_string()));
+    };
+    let done = cycles(folder)?;
+    let next = done.last().map_or(0, |row| row.cycle + 1);
+    let from_s = next
+        .checked_sub(1)
+        .and_then(|last| plan.cycle(last))
+        .map_or(0.0, |last| last.start_s + last.duration_s);
+    let over = meta.end.as_ref().is_some_and(|end| end.outcome == "done");
+    let sessions = sessions(folder);
+    let last = sessions.last().map_or(folder, PathBuf::as_path);
+    let last_done = RunReader::open(last).ok().is_some_and(|reader| {
+        let end = reader.meta().ok().and_then(|meta| meta.end.as_ref());
+        end.is_some_and(|end| end.outcome == "done")
+    });
+    // Without an end of its own a script whose last cycle is done may still have a step to go.
+    if over || last_done {
+        return Ok(None);
+    }
+    let ReferenceSpec::Script {
+        file: script,
+        text,
+        waveforms,
+        ..
+    } = setup.config.reference
+    else {
+        return Err(not_a_run("is no run of a script".to_string()));
+    };
+    let number = sessions.len() as u64 + 1;
+    // Another session sees other noise, and the same each time that it is repeated.
+    file.emulator.seed = file.emulator.seed.wrapping_add(number - 1);
+    let clock = if meta.clock == "virtual" {
+        ClockKind::Virtual
+    } else {
+        ClockKind::Real
+    };
+    Ok(Some(Ready {
+        prepared: Prepared {
+            model: setup.model,
+            controller: setup.controller,
+        },
+        file,
+        reference: ReferenceSpec::Script {
+            file: script,
+            text,
+            from_s,
+            waveforms,
+        },
+        clock,
+        name: meta.name.clone(),
+        session: SessionConfig {
+            number,
+            first_cycle: next,
+            gap_s: gap_s(last),
+            after: last
+                .strip_prefix(folder)
+                .ok()
+                .map(|path| path.display().to_string()),
+            best_effort: best_effort || first.best_effort,
+            ..first
+        },
+        inputs: meta.inputs.clone(),
+        home: Some((folder.to_owned(), folder.join(SESSIONS))),
+    }))
+}
+
+/// From the last write of a session's records to now, s.
+fn gap_s(session: &Path) -> Option<f64> {
+    let written = std::fs::metadata(session.join(cellpos_record::TICKS_ARROW))
+        .and_then(|meta| meta.modified())
+        .ok()?;
+    written.elapsed().ok().map(|gap| gap.as_secs_f64())
+}

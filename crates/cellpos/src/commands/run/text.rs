@@ -1,0 +1,144 @@
+//! What `cellpos run` prints in the end.
+
+use cellpos_runtime::Summary;
+use cellpos_runtime::realtime::Conditions;
+use cellpos_script::CycleRow;
+use serde::Serialize;
+
+/// How the session ended.
+#[derive(Debug, Serialize)]
+pub struct Ending {
+    /// `done`, `stopped`, `aborted`, or the state of the life cycle.
+    pub outcome: &'static str,
+    /// What the script was doing last.
+    pub stage: &'static str,
+    /// Amplitude alarms.
+    pub alarms: u64,
+    /// The session's folder.
+    pub run: String,
+    /// The run's folder.
+    pub folder: String,
+}
+
+/// What `--json` prints.
+#[derive(Debug, Serialize)]
+pub struct Report<'a> {
+    #[serde(flatten)]
+    ending: Ending,
+    /// Cycles of the script.
+    cycles: u64,
+    /// Cycles in the table, those of earlier sessions included.
+    cycles_done: u64,
+    /// Of these: disturbed.
+    cycles_disturbed: u64,
+    /// Mean of reached over commanded amplitude, less 1, percent.
+    amplitude_error_percent: Option<f64>,
+    /// RMS of the tracking error over the cycles at the time of exposure, nm.
+    cycle_rms_nm: Option<f64>,
+    bound_rms_nm: Option<f64>,
+    conditions: &'a Conditions,
+    warnings: &'a [String],
+    summary: &'a Summary,
+}
+
+fn mean(values: impl Iterator<Item = f64>) -> Option<f64> {
+    let (n, sum) = values
+        .filter(|value| value.is_finite())
+        .fold((0u64, 0.0), |(n, sum), value| (n + 1, sum + value));
+    (n > 0).then(|| sum / n as f64)
+}
+
+impl<'a> Report<'a> {
+    /// Joins what there is to say.
+    pub fn new(
+        ending: Ending,
+        summary: &'a Summary,
+        rows: &[CycleRow],
+        cycles: u64,
+        bound_rms_nm: Option<f64>,
+        conditions: &'a Conditions,
+        warnings: &'a [String],
+    ) -> Self {
+        Self {
+            ending,
+            cycles,
+            cycles_done: rows.len() as u64,
+            cycles_disturbed: rows.iter().filter(|r| r.flags.is_disturbed()).count() as u64,
+            amplitude_error_percent: mean(
+                rows.iter()
+                    .map(|r| 100.0 * (r.reached_um / r.commanded_um - 1.0)),
+            ),
+            cycle_rms_nm: mean(rows.iter().map(|r| r.rms_um * r.rms_um))
+                .map(|mean| mean.sqrt() * 1e3),
+            bound_rms_nm,
+            conditions,
+            warnings,
+            summary,
+        }
+    }
+
+    /// For people.
+    pub fn text(&self) -> String {
+        let mut out = String::new();
+        let mut line = |name: &str, value: String| out.push_str(&format!("{name:<18}{value}\n"));
+        let or_dash = |value: Option<f64>, unit: &str| {
+            value.map_or_else(|| "-".to_string(), |value| format!("{value:.1} {unit}"))
+        };
+        line(
+            "outcome",
+            match self.summary.safe_reason {
+                Some(reason) => format!("{} ({reason:?})", self.ending.outcome),
+                None => format!("{} ({})", self.ending.outcome, self.ending.stage),
+            },
+        );
+        line(
+            "cycles",
+            format!(
+                "{} of {} done, {} disturbed",
+                self.cycles_done, self.cycles, self.cycles_disturbed
+            ),
+        );
+        line(
+            "amplitude error",
+            format!(
+                "{} in the mean, {} alarms",
+                or_dash(self.amplitude_error_percent, "%"),
+                self.ending.alarms
+            ),
+        );
+        line(
+            "error",
+            format!("{} RMS over the cycles", or_dash(self.cycle_rms_nm, "nm")),
+        );
+        line("lowest possible", or_dash(self.bound_rms_nm, "nm RMS"));
+        let c = &self.summary.counts;
+        line(
+            "frames",
+            format!(
+                "{} lost, {} stale, {} without a bead, {} ticks coasted",
+                c.frames_lost, c.stale, c.fixes_lost, c.coasted
+            ),
+        );
+        line(
+            "ticks",
+            format!(
+                "{} in {:.3} s, {} late, {} skipped, {} records lost",
+                c.ticks, self.summary.duration_s, c.late, c.skipped, self.summary.records_lost
+            ),
+        );
+        for degraded in &self.conditions.degraded {
+            line("DEGRADED", degraded.clone());
+        }
+        for warning in self.warnings {
+            line("WARNING", warning.clone());
+        }
+        line("run", self.ending.run.clone());
+        if self.ending.outcome != "done" {
+            line(
+                "go on with",
+                format!("cellpos run --resume {}", self.ending.folder),
+            );
+        }
+        out
+    }
+}
