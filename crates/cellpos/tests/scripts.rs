@@ -208,6 +208,10 @@ fn a_rehearsal_behaves_as_the_model_it_is_given() {
 /// and how often it was killed.
 fn killed_and_resumed(folder: &Path, cycles: u32, most: u32, extra: &[&str]) -> (PathBuf, u32) {
     script(folder, cycles);
+    // A machine that stalls must not end a run: that is another test's subject.
+    let patient = "[timing]\noldest_ms = 1000.0\nfaults_in_a_row = 100000\nbudget_us = 1000.0\n\
+                   lost_ticks = 100000\nboard_silence_ms = 10000.0\n[board]\nwatchdog_ms = 1000\n";
+    std::fs::write(folder.join("rig.toml"), patient).unwrap();
     let mut seed = 0x2545_f491_4f6c_dd1d_u64;
     let mut acknowledged: Vec<u64> = Vec::new();
     let mut kills = 0;
@@ -218,7 +222,7 @@ fn killed_and_resumed(folder: &Path, cycles: u32, most: u32, extra: &[&str]) -> 
         match &path {
             Some(path) => args.extend(["--resume", path]),
             None => {
-                args.push("quick.toml");
+                args.extend(["quick.toml", "--rig", "rig.toml"]);
                 args.extend(extra);
             }
         }

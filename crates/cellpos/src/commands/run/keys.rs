@@ -54,18 +54,13 @@ pub fn listen(operator: &Arc<Operator>) -> Option<Keys> {
 
 /// What a key does.
 fn press(key: u8, operator: &Operator) {
+    // Whichever of two requests holds; neither once a stop has been asked for.
+    let toggle = |from, to, back| {
+        let _ = operator.change(Request::None, to) || operator.change(from, back);
+    };
     match key {
-        b'p' | b' ' => {
-            // Whichever of the two holds; neither once a stop has been asked for.
-            if !operator.change(Request::None, Request::Pause) {
-                operator.change(Request::Pause, Request::None);
-            }
-        }
-        b's' => {
-            if !operator.change(Request::None, Request::Skip) {
-                operator.change(Request::Pause, Request::Skip);
-            }
-        }
+        b'p' | b' ' => toggle(Request::Pause, Request::Pause, Request::None),
+        b's' => toggle(Request::Pause, Request::Skip, Request::Skip),
         b'q' => {
             operator.stop();
         }
