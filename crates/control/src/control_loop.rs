@@ -377,7 +377,8 @@ impl ControlLoop {
     /// feed-forward stay where they are, so that a step in progress goes on as it was.
     pub fn skip(&self, state: &mut LoopState) {
         self.estimator.step(&mut state.estimator, None);
-        let held_um = state.previous_command_um();
+        // What the estimator was told of the command; a learned part of it is held as well.
+        let held_um = state.estimator.history_um[0];
         self.estimator.push(&mut state.estimator, held_um);
     }
 

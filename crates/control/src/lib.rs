@@ -22,6 +22,7 @@ pub mod learning;
 mod limits;
 mod linear;
 mod loop_model;
+mod monitor;
 mod mpc;
 mod pi;
 mod reference;
@@ -45,6 +46,7 @@ pub use learning::{
 pub use limits::{Limited, Limits};
 pub use linear::LinearLaw;
 pub use loop_model::{LoopMode, LoopModel, MODES};
+pub use monitor::{PlantEstimate, PlantMonitor, PlantMonitorState, PlantVerdict};
 pub use mpc::{HORIZON, Mpc, SolverKind};
 pub use pi::{Lead, Pi, PiState};
 pub use reference::{Points, Profile, Reference, Shape, fill_preview};

@@ -26,7 +26,7 @@ use crate::tick_record::{TickFlags, TickRecord};
 pub use crate::timing::{CoreError, Timing};
 use cellpos_control::{
     Controller, CycleLearning, LearnedTable, LoopConfig, LoopInput, LoopOutput, LoopState,
-    Measurement as LoopMeasurement, Mode, SolverStatus,
+    Measurement as LoopMeasurement, Mode, PlantMonitor, PlantMonitorState, SolverStatus,
 };
 use cellpos_link::{BoardState, Fault};
 use cellpos_plant::TransferFunction;
@@ -59,6 +59,7 @@ struct State {
     board: Option<BoardReport>,
     board_heard_ns: i64,
     parked_at: Option<u64>,
+    plant: PlantMonitorState,
     stage: Stage,
 }
 
@@ -72,6 +73,7 @@ pub struct Core<R> {
     sample_s: f64,
     preview_um: Vec<f64>,
     learning: Option<CycleLearning>,
+    monitor: PlantMonitor,
     state: State,
 }
 
@@ -99,6 +101,7 @@ impl<R: Guide> Core<R> {
             Seconds(sample_s),
             Seconds(timing.camera_delay_ms * 1e-3),
         )?;
+        let monitor = PlantMonitor::new(config.estimator, config.model)?;
         let control = controller.start(displacement_um, neutral_um);
         Ok(Self {
             preview_um: vec![0.0; controller.preview_len()],
@@ -108,7 +111,9 @@ impl<R: Guide> Core<R> {
             arming,
             sample_s,
             learning: None,
+            monitor,
             state: State {
+                plant: monitor.start(displacement_um),
                 seq: 0,
                 counts: Counts::default(),
                 life: Life::Armed,
@@ -239,6 +244,11 @@ impl<R: Guide> Core<R> {
         self.state.counts.skipped += skipped as u64;
         for _ in 0..skipped.min(MOST) {
             self.controller.skip(&mut self.state.control);
+            let control = &self.state.control;
+            let (neutral_um, held_um) =
+                (control.estimator.neutral_um, control.previous_command_um());
+            self.monitor
+                .step(&mut self.state.plant, None, neutral_um, held_um);
         }
     }
 
@@ -487,7 +497,29 @@ impl<R: Guide> Core<R> {
                 (fix.position_um, age)
             }));
         }
+        self.watch_plant(fix, &output, tick);
         (output, guided)
+    }
+
+    /// Gain and lag of the plant from its motion; their changes are events.
+    fn watch_plant(&mut self, fix: Option<LoopMeasurement>, output: &LoopOutput, tick: &mut Tick) {
+        // Increments are those of one tick only between frames that are on time.
+        let on_time = fix.filter(|fix| fix.age_samples == 0 && fix.offset_samples.abs() < 0.2);
+        let before = self.monitor.verdict(&self.state.plant);
+        let verdict = self.monitor.step(
+            &mut self.state.plant,
+            on_time.map(|fix| fix.position_um),
+            output.neutral_um,
+            output.command_um,
+        );
+        if verdict != before && self.state.life == Life::Running {
+            let estimate = self.monitor.estimate(&self.state.plant);
+            tick.event(EventKind::PlantChanged {
+                verdict,
+                gain_ratio: estimate.map_or(f64::NAN, |e| e.gain_ratio),
+                lag_ms: estimate.map_or(f64::NAN, |e| e.lag_ms),
+            });
+        }
     }
 
     /// Flags and events that follow from the controller's output.
