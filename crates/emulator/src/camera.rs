@@ -54,6 +54,8 @@ pub struct PositionFix {
 /// One point of the path: true and apparent position, um.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct Sample {
+    /// Length of the cell, um; NaN for a bead.
+    pub length_um: f64,
     pub true_um: f64,
     pub lateral_um: f64,
     pub seen_um: f64,

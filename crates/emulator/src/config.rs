@@ -1,5 +1,6 @@
 //! How the emulated world is set up.
 
+use crate::cell::CellConfig;
 use crate::faults::Faults;
 use serde::{Deserialize, Serialize};
 
@@ -47,6 +48,9 @@ pub struct WorldConfig {
     pub localisation_um: Option<f64>,
     /// When the bead has been out of the frame for this long and the flow is slow, a new one comes, ms. Left out: never.
     pub new_bead_after_ms: Option<f64>,
+    /// A cell and its constriction. Left out: a bead.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub cell: Option<CellConfig>,
     /// What goes wrong.
     pub faults: Faults,
 }
@@ -74,6 +78,7 @@ impl Default for WorldConfig {
             electrons_per_grey: 40.0,
             localisation_um: None,
             new_bead_after_ms: None,
+            cell: None,
             faults: Faults::default(),
         }
     }
@@ -242,6 +247,9 @@ impl WorldConfig {
         }
         if let Some(ms) = self.new_bead_after_ms {
             within("new_bead_after_ms", ms, 0.0, 1e9, "0 or more ms")?;
+        }
+        if let Some(cell) = &self.cell {
+            cell.validate()?;
         }
         self.faults.validate()
     }

@@ -10,6 +10,7 @@
 #![forbid(unsafe_code)]
 
 mod camera;
+mod cell;
 mod config;
 mod faults;
 mod random;
@@ -17,6 +18,7 @@ mod render;
 mod world;
 
 pub use camera::{FrameInfo, PositionFix};
+pub use cell::CellConfig;
 pub use config::{WorldConfig, WorldError};
 pub use faults::{FaultEvent, FaultKind, Faults};
 pub use random::Gaussian;

@@ -1,6 +1,7 @@
 //! The world: everything between the board's output and the camera's delivery.
 
 use crate::camera::{Camera, EXPOSURE_STEPS, Exposure, FrameInfo, PositionFix, Sample};
+use crate::cell::Cell;
 use crate::config::{WorldConfig, WorldError};
 use crate::faults::FaultKind;
 use crate::random::Gaussian;
@@ -48,6 +49,7 @@ pub struct World {
     image_effects: Vec<Effect>,
     led: bool,
     has_events: bool,
+    cell: Option<Cell>,
 }
 
 impl World {
@@ -108,6 +110,7 @@ impl World {
                 .collect(),
             led: false,
             has_events: !config.faults.event.is_empty(),
+            cell: config.cell.map(|cell| Cell::new(cell, config.seed)),
             config: config.clone(),
         })
     }
@@ -126,6 +129,11 @@ impl World {
     pub fn bead_um(&self) -> f64 {
         self.stuck_um
             .unwrap_or(self.chain.bead_um() + self.offset_um)
+    }
+
+    /// True length of the cell now, um; `None` for a bead.
+    pub fn length_um(&self) -> Option<f64> {
+        self.cell.as_ref().map(Cell::length_um)
     }
 
     /// True bead position across the channel now, um from the middle line of the frame.
@@ -181,7 +189,13 @@ impl World {
             return;
         }
         let dt_s = (t_ns - self.now_ns) as f64 * 1e-9;
+        let before_um = self.chain.bead_um();
+        let at_um = self.bead_um();
         self.chain.advance(applied_um, dt_s);
+        if let Some(cell) = &mut self.cell {
+            self.offset_um += cell.surplus_um(at_um, self.chain.bead_um() - before_um);
+            cell.advance(at_um, dt_s);
+        }
         self.offset_um += self.config.drift_um_per_s * dt_s;
         let spread_um = (2.0 * self.config.diffusion_um2_per_s * dt_s).sqrt();
         self.lateral_um = confined(
@@ -223,6 +237,7 @@ impl World {
     fn look(&self) -> Sample {
         let true_um = self.bead_um();
         Sample {
+            length_um: self.length_um().unwrap_or(f64::NAN),
             true_um,
             lateral_um: self.lateral_um,
             seen_um: self.apparent_um(true_um),
@@ -322,7 +337,14 @@ impl World {
         let good = verdict == Verdict::Good;
         let or_nan = |value| if good { value } else { f64::NAN };
         Some(PositionFix {
-            length_um: f64::NAN,
+            length_um: match &mut self.cell {
+                // As it was in the middle of the exposure.
+                Some(cell) if good => exposure
+                    .samples
+                    .get(EXPOSURE_STEPS / 2)
+                    .map_or(f64::NAN, |sample| sample.length_um + cell.noise_um()),
+                _ => f64::NAN,
+            },
             info,
             x_um: or_nan(mean_um + noise_um),
             variance_um2: or_nan(self.localisation_um * self.localisation_um),
