@@ -337,6 +337,7 @@ fn conclude(
         conditions,
         sink,
         io_error,
+        learned: _,
     } = finished;
     let mut warnings = rig.warnings.clone();
     if let Some(error) = &io_error {
