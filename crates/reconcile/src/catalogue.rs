@@ -1,5 +1,6 @@
 //! The candidates: every effect of the vocabulary with its parameters, where to start looking, and what tells it apart.
 
+use crate::fit::Part;
 use crate::predict::{Block, PLAY_LEVELS};
 use cellpos_plant::{Effect, Hysteresis};
 use std::f64::consts::TAU;
@@ -73,6 +74,15 @@ pub(crate) struct Variant {
     /// Its signature cannot come from the response to the command: no misfit of a response can look like it.
     pub off_response: bool,
     pub kind: Kind,
+}
+
+impl Variant {
+    /// Whether its parameters include a gain of the whole chain.
+    pub fn holds_gain(&self) -> bool {
+        self.params
+            .iter()
+            .any(|p| p.name == "weights" || p.name == "factor")
+    }
 }
 
 /// How a variant enters the fit.
@@ -177,7 +187,7 @@ pub(crate) static VARIANTS: &[Variant] = &[
     },
     Variant {
         id: "pzt-resonance",
-        params: &[log("frequency_hz", 20.0, 4e4), log("damping", 0.002, 2.0)],
+        params: &[log("frequency_hz", 20.0, 4e4), log("damping", 0.002, 0.9)],
         build: |v, _| Block::Resonance {
             w: TAU * v[0],
             zeta: v[1],
@@ -397,6 +407,24 @@ pub(crate) static VARIANTS: &[Variant] = &[
         kind: Kind::Position,
     },
 ];
+
+/// The forms with one number that delay a slow motion by `lag_s`.
+pub(crate) fn of_lag(lag_s: f64) -> Vec<Part> {
+    VARIANTS
+        .iter()
+        .enumerate()
+        .filter(|(_, v)| v.params.len() == 1)
+        .filter_map(|(i, v)| {
+            let value = match v.id {
+                "time-delay" | "bubble" => lag_s,
+                "driver-lag" => 1.0 / (TAU * lag_s),
+                "exposure-averaging" => 2.0 * lag_s,
+                _ => return None,
+            };
+            Some(Part::new(i, &[value]))
+        })
+        .collect()
+}
 
 /// The flat form of an effect of a model file; `None` for those that are no part of the response.
 pub(crate) fn block_of(effect: &Effect, scope: &Scope) -> Option<Block> {

@@ -309,7 +309,7 @@ fn fill(u: &mut [f64]) {
     }
 }
 
-/// The largest power-of-ten-like step of which all values are multiples; 0 for values of full precision.
+/// The finest step that the values show: a power of ten of which all are multiples, or the smallest increment.
 fn resolution(values: &[f64]) -> f64 {
     for e in 0..10 {
         let step = 10f64.powi(-e);
@@ -320,8 +320,18 @@ fn resolution(values: &[f64]) -> f64 {
             (x - x.round()).abs() < 1e-5 + 1e-12 * x.abs()
         });
         if seen && fits {
-            return step;
+            return step.max(least_increment(values));
         }
     }
-    0.0
+    least_increment(values)
+}
+
+/// The smallest increment that is not zero: the step of a converter whose numbers were scaled.
+fn least_increment(values: &[f64]) -> f64 {
+    values
+        .windows(2)
+        .map(|w| (w[1] - w[0]).abs())
+        .filter(|d| *d > 1e-9)
+        .fold(f64::INFINITY, f64::min)
+        .min(1e9)
 }

@@ -3,7 +3,9 @@
 //! Every fit, that of the null included, also has the linear nuisances: the share of the newest command in a frame,
 //! and (inside the whitening filter) each record's start.
 
+use crate::augment::place_of;
 use crate::catalogue::{Kind, Param, Scope, VARIANTS, Variant};
+use crate::linear::{Columns, Tangents, normal_equations, sum_squares};
 use crate::predict::{Block, simulate};
 use crate::problem::{Mask, Problem};
 use nalgebra::{DMatrix, DVector};
@@ -42,6 +44,20 @@ impl Part {
             .collect()
     }
 
+    /// By how much it delays a slow motion, if that is what it does \[s\].
+    pub fn lag_s(&self) -> Option<f64> {
+        let v = self.natural();
+        let lag_s = match self.variant().id {
+            "time-delay" | "bubble" => v[0],
+            "driver-lag" => 1.0 / (TAU * v[0]),
+            "exposure-averaging" => 0.5 * v[0],
+            "pzt-resonance" => 2.0 * v[1] / (TAU * v[0]),
+            "pdms-relaxation" => -v[0] * v[1],
+            _ => return None,
+        };
+        (1e-5..0.1).contains(&lag_s).then_some(lag_s)
+    }
+
     fn block(&self, scope: &Scope) -> Block {
         (self.variant().build)(&self.natural(), scope)
     }
@@ -53,6 +69,8 @@ pub(crate) struct Context<'a> {
     pub problem: &'a Problem,
     pub scope: Scope,
     pub fixed: Vec<Block>,
+    /// The base model's gain is free in every fit, the null included: a base fitted to these very records.
+    pub free_gain: bool,
     pub white: Option<WhiteEvidence>,
 }
 
@@ -92,6 +110,8 @@ pub(crate) struct Fit {
     pub parts: Vec<Part>,
     /// Share of the newest command \[um per um\].
     pub soft: f64,
+    /// Factor on the base model's gain; 1 unless it is free.
+    pub gain: f64,
     /// Sine and cosine of each line in each record \[um\].
     pub lines: Vec<Vec<[f64; 2]>>,
     /// Sine and cosine of each position-periodic error \[um\].
@@ -144,16 +164,9 @@ pub(crate) fn freedom_of(v: &Variant, records: usize) -> usize {
         }
 }
 
-/// Columns of one record: (index of the parameter, whitened derivative).
-type Columns = Vec<(usize, Vec<f64>)>;
-
-/// Whitened tangents of a fit: what further candidates are projected against.
-pub(crate) struct Tangents {
-    /// Per record: (index of the parameter, whitened column).
-    columns: Vec<Columns>,
-    inverse: DMatrix<f64>,
-    gradient: DVector<f64>,
-}
+/// Precision with which a weight of a play operator keeps its value in one step of a fit: nothing beside what a record
+/// in which the operator moves has to say.
+const WEIGHT_PRECISION: f64 = 100.0;
 
 /// One evaluation of the model.
 struct State {
@@ -167,6 +180,12 @@ struct State {
 }
 
 impl Context<'_> {
+    /// Whether an effect is no candidate: behind a bare actuator there is neither a chip nor a bead, and a free gain
+    /// is no error.
+    pub fn excludes(&self, id: &str) -> bool {
+        self.free_gain && matches!(place_of(id), "chip" | "bead" | "bead/camera")
+    }
+
     fn blocks(&self, parts: &[Part]) -> Vec<Block> {
         let mut blocks = self.fixed.clone();
         blocks.extend(parts.iter().map(|p| p.block(&self.scope)));
@@ -195,6 +214,9 @@ impl Context<'_> {
         for r in &self.problem.records {
             let mut y = Vec::new();
             simulate(&self.problem.base, &r.u, &blocks, &mut y, Some(&mut edge));
+            if fit.gain != 1.0 {
+                y.iter_mut().for_each(|y| *y *= fit.gain);
+            }
             sim.push(y);
             let mut w = vec![0.0; edge.len()];
             if edge.iter().any(|e| *e != 0.0) {
@@ -276,7 +298,7 @@ impl Context<'_> {
                             let d: Vec<f64> = moved[i]
                                 .iter()
                                 .zip(&state.sim[i])
-                                .map(|(a, b)| (b - a) / step)
+                                .map(|(a, b)| (b - fit.gain * a) / step)
                                 .collect();
                             let mut c = vec![0.0; d.len()];
                             r.whitener.apply(&d, &mut c);
@@ -340,7 +362,20 @@ impl Context<'_> {
         for (columns, soft) in columns.iter_mut().zip(&state.soft) {
             columns.push((next, soft.iter().map(|s| -s).collect()));
         }
-        (next + 1, columns)
+        next += 1;
+        if self.free_gain {
+            // The weights of the play operators hold a gain of their own.
+            if !fit.parts.iter().any(|p| p.variant().holds_gain()) {
+                for ((columns, sim), r) in columns.iter_mut().zip(&state.sim).zip(records) {
+                    let d: Vec<f64> = sim.iter().map(|s| -s / fit.gain).collect();
+                    let mut c = vec![0.0; d.len()];
+                    r.whitener.apply(&d, &mut c);
+                    columns.push((next, c));
+                }
+            }
+            next += 1;
+        }
+        (next, columns)
     }
 
     /// The parts with one parameter moved by its step, towards the inside of its bounds.
@@ -390,6 +425,7 @@ impl Context<'_> {
         let fit = Fit {
             parts,
             soft: soft.unwrap_or(0.0),
+            gain: 1.0,
             lines: vec![vec![[0.0; 2]; records]; lines],
             positions: vec![[0.0; 2]; positions],
             chi2: 0.0,
@@ -412,6 +448,16 @@ impl Context<'_> {
             size = n;
             let (a, g) = normal_equations(n, &columns, &state.innovations, mask);
             normal = a;
+            // Operators wider than any swing of the records never move: their weights stay where they are.
+            let mut at = 0;
+            for p in &fit.parts {
+                for (j, q) in p.variant().params.iter().enumerate() {
+                    if q.name == "weights" {
+                        normal[(at + j, at + j)] += WEIGHT_PRECISION;
+                    }
+                }
+                at += freedom_of(p.variant(), self.problem.records.len());
+            }
             if round >= iterations {
                 break;
             }
@@ -504,6 +550,9 @@ impl Context<'_> {
             }
         }
         t.soft = (t.soft + step[next]).clamp(self.problem.soft.0, self.problem.soft.1);
+        if self.free_gain {
+            t.gain = (t.gain + step[next + 1]).clamp(0.05, 20.0);
+        }
         t
     }
 
@@ -552,101 +601,4 @@ impl Context<'_> {
         let s = self.state(fit, &self.problem.all());
         (s.residual, s.sim)
     }
-}
-
-/// What a direction in the space of innovations would gain.
-#[derive(Debug, Clone, Copy)]
-pub(crate) struct Gain {
-    /// Fall of the sum of squares when the direction is added with its best scale, all tangents refitted.
-    pub score: f64,
-    /// That scale.
-    pub scale: f64,
-}
-
-impl Tangents {
-    /// Projects a whitened direction `d` (change of the innovations) against the tangents.
-    pub fn gain(&self, d: &[Vec<f64>], e: &[Vec<f64>], mask: &Mask) -> Gain {
-        let n = self.gradient.len();
-        let mut jd = DVector::zeros(n);
-        let (mut dd, mut de) = (0.0, 0.0);
-        for i in 0..d.len() {
-            for r in &mask[i] {
-                let di = &d[i][r.clone()];
-                dd += dot(di, di);
-                de += dot(di, &e[i][r.clone()]);
-                for (index, c) in &self.columns[i] {
-                    jd[*index] += dot(&c[r.clone()], di);
-                }
-            }
-        }
-        let w = &self.inverse * &jd;
-        let dd2 = dd - jd.dot(&w);
-        let de2 = de - self.gradient.dot(&w);
-        if dd2 <= 1e-6 * dd || dd <= 0.0 {
-            return Gain {
-                score: 0.0,
-                scale: 0.0,
-            };
-        }
-        Gain {
-            score: de2 * de2 / dd2,
-            scale: -de2 / dd2,
-        }
-    }
-}
-
-fn sum_squares(e: &[Vec<f64>], mask: &Mask) -> f64 {
-    e.iter()
-        .zip(mask)
-        .map(|(e, ranges)| {
-            ranges
-                .iter()
-                .map(|r| dot(&e[r.clone()], &e[r.clone()]))
-                .sum::<f64>()
-        })
-        .sum()
-}
-
-fn normal_equations(
-    n: usize,
-    columns: &[Columns],
-    e: &[Vec<f64>],
-    mask: &Mask,
-) -> (DMatrix<f64>, DVector<f64>) {
-    let mut a = DMatrix::zeros(n, n);
-    let mut g = DVector::zeros(n);
-    for ((columns, e), ranges) in columns.iter().zip(e).zip(mask) {
-        for r in ranges {
-            for (x, (i, ci)) in columns.iter().enumerate() {
-                let ci = &ci[r.clone()];
-                g[*i] += dot(ci, &e[r.clone()]);
-                for (j, cj) in &columns[..=x] {
-                    let v = dot(ci, &cj[r.clone()]);
-                    a[(*i, *j)] += v;
-                    if i != j {
-                        a[(*j, *i)] += v;
-                    }
-                }
-            }
-        }
-    }
-    (a, g)
-}
-
-/// Dot product with four partial sums: fast, and the same on every machine.
-pub(crate) fn dot(a: &[f64], b: &[f64]) -> f64 {
-    let mut s = [0.0f64; 8];
-    let (ac, bc) = (a.chunks_exact(8), b.chunks_exact(8));
-    let rest: f64 = ac
-        .remainder()
-        .iter()
-        .zip(bc.remainder())
-        .map(|(x, y)| x * y)
-        .sum();
-    for (x, y) in ac.zip(bc) {
-        for i in 0..8 {
-            s[i] += x[i] * y[i];
-        }
-    }
-    s.iter().sum::<f64>() + rest
 }

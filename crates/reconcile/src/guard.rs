@@ -2,7 +2,8 @@
 
 use crate::data::Record;
 use crate::error::ReconcileError;
-use crate::fit::{Context, dot};
+use crate::fit::Context;
+use crate::linear::dot;
 
 /// Shortest total length of records with a changing command \[s\].
 pub(crate) const NEEDED_S: f64 = 5.0;

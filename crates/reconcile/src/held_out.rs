@@ -103,6 +103,13 @@ pub(crate) fn check(ctx: &Context<'_>, fit: &Fit, threads: usize) -> HeldOut {
 /// Refits with a free gain beside the set (or alone) and says how far it moves from 1.
 fn gain_shift(ctx: &Context<'_>, fit: &Fit) -> Interval {
     let unit = String::new();
+    if ctx.free_gain {
+        return Interval {
+            value: fit.gain,
+            ci95: [fit.gain, fit.gain],
+            unit,
+        };
+    }
     if fit.has("gain-error") {
         return Interval {
             value: 1.0,

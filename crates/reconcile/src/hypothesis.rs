@@ -1,7 +1,8 @@
 //! When nothing in the catalogue closes the gap: a formula for what is left, by sparse regression, with its worth on
 //! data that it has not seen.
 
-use crate::fit::{Context, Fit, dot};
+use crate::fit::{Context, Fit};
+use crate::linear::dot;
 use crate::problem::Mask;
 use nalgebra::{DMatrix, DVector};
 use std::f64::consts::TAU;

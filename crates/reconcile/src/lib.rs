@@ -8,6 +8,7 @@
 //! Not for identifying a plant from nothing (that is `cellpos-ident`), and not for files: records come as columns.
 #![forbid(unsafe_code)]
 
+mod augment;
 mod catalogue;
 mod data;
 mod error;
@@ -17,6 +18,7 @@ mod frames;
 mod guard;
 mod held_out;
 mod hypothesis;
+mod linear;
 mod map;
 mod noise;
 mod parallel;

@@ -96,11 +96,24 @@ impl Whitener {
         }
     }
 
-    /// As [`Self::apply`] on the rows `from..to` only, with a run-in from `start`.
+    /// The walk as predicted for every row from the rows before it: independent of that row's innovation.
+    pub fn predict(&self, r: &[f64]) -> Vec<f64> {
+        let mut m = 0.0;
+        r.iter()
+            .zip(&self.gain)
+            .map(|(r, k)| {
+                let predicted = m;
+                m += k * (r - m);
+                predicted
+            })
+            .collect()
+    }
+
+    /// As [`Self::apply`] on the rows `from..to` only, with a run-in from `start`, where `r` begins.
     pub fn apply_range(&self, r: &[f64], start: usize, from: usize, to: usize, e: &mut [f64]) {
-        let mut m = r.get(start).copied().unwrap_or(0.0);
+        let mut m = r.first().copied().unwrap_or(0.0);
         for k in start..to {
-            let d = r[k] - m;
+            let d = r[k - start] - m;
             if k >= from {
                 e[k - from] = d * self.inverse_sigma[k];
             }

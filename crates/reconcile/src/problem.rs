@@ -5,6 +5,9 @@ use crate::noise::{Noise, Whitener};
 use crate::predict::Base;
 use std::ops::Range;
 
+/// Start of a record with an analogue input that is not scored \[s\].
+const RUN_IN_S: f64 = 0.5;
+
 /// Which rows of which record count in a fit: ranges per record.
 pub(crate) type Mask = Vec<Vec<Range<usize>>>;
 
@@ -49,12 +52,20 @@ impl Problem {
             .iter()
             .zip(repeated)
             .map(|(r, repeated)| {
+                // How a sampled analogue input came from where it was before the record to its first sample is not known.
+                let run_in = if base.interpolated_input {
+                    ((RUN_IN_S / base.sample_s) as usize).min(r.rows() / 10)
+                } else {
+                    0
+                };
                 let u: Vec<f64> = r.pzt_um.iter().map(|v| v - base.working_point_um).collect();
                 let present: Vec<bool> = r
                     .bead_um
                     .iter()
                     .zip(repeated)
                     .map(|(b, rep)| b.is_finite() && !rep)
+                    .enumerate()
+                    .map(|(k, seen)| seen && k >= run_in)
                     .collect();
                 let y = r
                     .bead_um

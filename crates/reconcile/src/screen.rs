@@ -4,7 +4,8 @@
 //! the present fit it says how much the sum of squares falls when the candidate is scaled best and all else refitted.
 
 use crate::catalogue::{Kind, VARIANTS};
-use crate::fit::{Context, Fit, Part, Tangents, dot};
+use crate::fit::{Context, Fit, Part};
+use crate::linear::{Tangents, dot};
 use crate::parallel;
 use crate::problem::Mask;
 use std::f64::consts::TAU;
@@ -45,7 +46,7 @@ pub(crate) fn screen(
                 .iter()
                 .zip(moved.iter().zip(&sim))
                 .map(|(r, (m, s))| {
-                    let d: Vec<f64> = m.iter().zip(s).map(|(m, s)| s - m).collect();
+                    let d: Vec<f64> = m.iter().zip(s).map(|(m, s)| fit.gain * (s - m)).collect();
                     let mut w = vec![0.0; d.len()];
                     r.whitener.apply(&d, &mut w);
                     w
@@ -117,11 +118,52 @@ pub(crate) fn line_score(ctx: &Context<'_>, fit: &Fit, hz: f64, mask: &Mask) -> 
         .sum()
 }
 
-/// Rows of a block of the pixel scan.
-const BLOCK: usize = 1000;
+/// Most rows of a block of the pixel scan, and the fewest worth a phase of their own.
+const BLOCK: (usize, usize) = (1000, 12);
+
+/// Rows of the pixel scan in all: enough to see a hundredth of a pixel without spending the whole record.
+const SCAN_ROWS: usize = 24_000;
+
+/// Most distance travelled in a block \[um\]: what the grid of wave numbers resolves.
+const SPAN_UM: f64 = 7.0;
+
+/// Rows before a block that the whitening filter needs to run in.
+const RUN_IN: usize = 12;
+
+/// Blocks `(record, from, to)` in which the bead stays within a few micrometres but moves enough to tell a pixel.
+fn pixel_blocks(positions: &[Vec<f64>], mask: &Mask) -> Vec<(usize, usize, usize)> {
+    let mut blocks = Vec::new();
+    for (i, p) in positions.iter().enumerate() {
+        for range in &mask[i] {
+            let mut from = range.start;
+            while from < range.end {
+                let (mut low, mut high) = (p[from], p[from]);
+                let mut to = from + 1;
+                while to < range.end && to - from < BLOCK.0 {
+                    let (a, b) = (low.min(p[to]), high.max(p[to]));
+                    if b - a > SPAN_UM {
+                        break;
+                    }
+                    (low, high) = (a, b);
+                    to += 1;
+                }
+                if to - from >= BLOCK.1 && high - low > 0.3 {
+                    blocks.push((i, from, to));
+                }
+                from = to;
+            }
+        }
+    }
+    let rows: usize = blocks.iter().map(|b| b.2 - b.1).sum();
+    let stride = rows.div_ceil(SCAN_ROWS).max(1);
+    blocks.into_iter().step_by(stride).collect()
+}
 
 /// Looks for an error periodic in position over pixel sizes of 0.05..1.5 um: first over blocks in which the bead stays
 /// within a few micrometres (each with its own phase, so that a coarse grid does), then over everything.
+///
+/// Positions are predictions from the rows before: with smoothed ones a row's own noise would be in its position, and
+/// noise would look like an error that depends on position.
 fn pixel_scan(
     ctx: &Context<'_>,
     fit: &Fit,
@@ -137,33 +179,14 @@ fn pixel_scan(
         .zip(residual.iter().zip(&sim))
         .map(|(r, (e, s))| {
             r.whitener
-                .smooth(e)
+                .predict(e)
                 .iter()
                 .zip(s)
                 .map(|(w, s)| w + s)
                 .collect()
         })
         .collect();
-    let mut blocks: Vec<(usize, usize, f64)> = Vec::new();
-    for (i, p) in positions.iter().enumerate() {
-        for range in &mask[i] {
-            let mut k = range.start;
-            while k + BLOCK <= range.end {
-                let (low, high) = p[k..k + BLOCK]
-                    .iter()
-                    .fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), v| {
-                        (a.min(*v), b.max(*v))
-                    });
-                if high - low > 0.3 && high - low < 6.0 {
-                    blocks.push((i, k, high - low));
-                }
-                k += BLOCK;
-            }
-        }
-    }
-    // Every n-th: enough to see a hundredth of a pixel without spending the whole record.
-    let stride = blocks.len().div_ceil(24).max(1);
-    let blocks: Vec<(usize, usize, f64)> = blocks.into_iter().step_by(stride).collect();
+    let blocks = pixel_blocks(&positions, mask);
     if blocks.len() < 3 {
         return None;
     }
@@ -173,13 +196,12 @@ fn pixel_scan(
         .collect();
     let score_at = |q: f64, i: usize, from: usize, to: usize| {
         let r = &ctx.problem.records[i];
+        let start = from.saturating_sub(RUN_IN);
+        let (s, c): (Vec<f64>, Vec<f64>) = positions[i][start..to]
+            .iter()
+            .map(|p| (TAU * q * p).sin_cos())
+            .unzip();
         let n = to - from;
-        let (mut s, mut c) = (vec![0.0; r.u.len()], vec![0.0; r.u.len()]);
-        // The filter needs a short run-in only; start 40 rows early.
-        let start = from.saturating_sub(40);
-        for k in start..to {
-            (s[k], c[k]) = (TAU * q * positions[i][k]).sin_cos();
-        }
         let (mut ws, mut wc) = (vec![0.0; n], vec![0.0; n]);
         r.whitener.apply_range(&s, start, from, to, &mut ws);
         r.whitener.apply_range(&c, start, from, to, &mut wc);
@@ -188,9 +210,9 @@ fn pixel_scan(
     let coarse = parallel::map(&waves, threads, |&q| {
         blocks
             .iter()
-            .map(|&(i, k, _)| {
-                let (s, c) = score_at(q, i, k, k + BLOCK);
-                pair_score(&s, &c, &fit.innovations[i][k..k + BLOCK])
+            .map(|&(i, from, to)| {
+                let (s, c) = score_at(q, i, from, to);
+                pair_score(&s, &c, &fit.innovations[i][from..to])
             })
             .sum::<f64>()
     });
@@ -199,8 +221,12 @@ fn pixel_scan(
         .iter()
         .enumerate()
         .max_by(|a, b| a.1.total_cmp(b.1))?;
-    // Under the null the sum is chi-square with 2n degrees of freedom; the scan has about 270 trials.
-    if top < 2.0 * n + 5.0 * (4.0 * n).sqrt() {
+    // Without an error the sum is chi-square with 2n degrees of freedom, scaled by what else is left over: the scan
+    // itself tells its middle; it has about 270 trials.
+    let mut sorted = coarse.clone();
+    sorted.sort_by(f64::total_cmp);
+    let middle = sorted[sorted.len() / 2].max(2.0 * n);
+    if top < middle * (1.0 + 5.0 / n.sqrt()) {
         return None;
     }
     let all_rows: Vec<(usize, std::ops::Range<usize>)> = mask
@@ -210,7 +236,7 @@ fn pixel_scan(
         .collect();
     let centre = waves[best];
     // Common phase over all records: the resolution is one over the whole distance travelled.
-    let fine: Vec<f64> = (-60..=60)
+    let fine: Vec<f64> = (-75..=75)
         .map(|i| centre + step * f64::from(i) / 50.0)
         .collect();
     let scores = parallel::map(&fine, threads, |&q| {
@@ -227,6 +253,10 @@ fn pixel_scan(
         .iter()
         .enumerate()
         .max_by(|a, b| a.1.total_cmp(b.1))?;
+    // About 40,000 trials, two degrees of freedom.
+    if score < 45.0 {
+        return None;
+    }
     Some(Lead {
         part: Part::new(variant, &[1.0 / fine[best]]),
         score,

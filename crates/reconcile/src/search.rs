@@ -1,6 +1,6 @@
 //! The sequential search: add the best candidate, look again, take back what is no longer needed, try replacements.
 
-use crate::catalogue::{VARIANTS, Variant};
+use crate::catalogue::{self, VARIANTS, Variant};
 use crate::fit::{Context, Fit, Part, freedom_of};
 use crate::parallel;
 use crate::problem::Mask;
@@ -51,7 +51,8 @@ fn bar(v: &Variant, records: usize) -> f64 {
 
 /// Sum of squares with a price per parameter, so that a form with many numbers wins only if it is worth them.
 fn priced(ctx: &Context<'_>, fit: &Fit) -> f64 {
-    let typical: f64 = fit.parts.iter().map(implausibility).sum();
+    let left = left_over(fit);
+    let typical: f64 = fit.parts.iter().map(|p| implausibility(p, left)).sum();
     // Decides ties only: the localisation noise of a rig need not be that of its model.
     let white = ctx.white.map_or(0.0, |w| {
         w.distance(&fit.parts, ctx.problem.base.sample_s).min(40.0)
@@ -59,12 +60,18 @@ fn priced(ctx: &Context<'_>, fit: &Fit) -> f64 {
     fit.chi2 + 8.0 * fit.freedom() as f64 + typical + white
 }
 
-/// A small price for a main parameter outside the range that real rigs show: decides ties between names only.
-fn implausibility(part: &Part) -> f64 {
+/// Sum of squares beyond the noise.
+pub(crate) fn left_over(fit: &Fit) -> f64 {
+    (fit.chi2 - fit.count as f64).max(0.0)
+}
+
+/// A price for a main parameter outside the range that real rigs show: decides ties between names. A fit that leaves
+/// something over (`left`) is wrong somewhere else, and by how much tells how little its last percent decides.
+pub(crate) fn implausibility(part: &Part, left: f64) -> f64 {
     let v = part.variant();
     let x = part.natural()[0];
     if x < v.typical.0 || x > v.typical.1 {
-        12.0
+        12.0 + 0.2 * left
     } else {
         0.0
     }
@@ -93,6 +100,7 @@ fn extensions(
     let tangents = ctx.tangents(fit, mask);
     let mut leads = screen(ctx, fit, &tangents, mask, effort.threads, |v| {
         !late(&VARIANTS[v])
+            && !ctx.excludes(VARIANTS[v].id)
             && !fit.parts.iter().any(|p| same_id(v, p.variant().id))
             && !forbidden.contains(&VARIANTS[v].id)
     });
@@ -210,6 +218,42 @@ fn replace(ctx: &Context<'_>, mut fit: Fit, mask: &Mask, effort: Effort) -> (Fit
                     better = Some(other);
                 }
             }
+            // Screening is linear; a lag of another shape need not look promising from afar. Those of the same length
+            // are fitted for certain.
+            let twins: Vec<Part> = fit.parts[i]
+                .lag_s()
+                .map(|lag_s| {
+                    catalogue::of_lag(lag_s)
+                        .into_iter()
+                        .filter(|p| {
+                            let other = p.variant().id;
+                            other != id
+                                && !ctx.excludes(other)
+                                && !fit.has(other)
+                                && !list.iter().any(|r| r.id == other)
+                        })
+                        .collect()
+                })
+                .unwrap_or_default();
+            for other in parallel::map(&twins, effort.threads, |part| {
+                let mut parts = fit.parts.clone();
+                parts[i] = part.clone();
+                ctx.fit_from(parts, Some(fit.soft), mask, 12)
+            }) {
+                let part = other.parts[i].clone();
+                list.push(Rival {
+                    id: part.variant().id,
+                    chi2: other.chi2,
+                    part,
+                });
+                if priced(ctx, &other) < priced(ctx, &fit) - 1.0
+                    && better
+                        .as_ref()
+                        .is_none_or(|b| priced(ctx, &other) < priced(ctx, b))
+                {
+                    better = Some(other);
+                }
+            }
             rivals.push(list);
         }
         match better {
@@ -234,6 +278,9 @@ fn reform(ctx: &Context<'_>, mut fit: Fit, mask: &Mask, effort: Effort) -> Fit {
             .filter(|(v, variant)| {
                 let form = variant.id == id && *v != fit.parts[i].variant;
                 // A lag that dissolves is a bubble.
+                if ctx.excludes(variant.id) {
+                    return false;
+                }
                 let dissolving = id == "driver-lag" && variant.id == "bubble" && late(variant);
                 (form || dissolving) && (rich || !late(variant))
             })

@@ -1,23 +1,24 @@
 //! The workflow: guards, null model, search, held-out check, verdict, and the augmented model.
 
-use crate::catalogue::{self, Kind, Scope, VARIANTS};
+use crate::augment::{augment, parameters, place_of};
+use crate::catalogue::{self, Scope};
 use crate::data::{self, Record};
 use crate::error::ReconcileError;
-use crate::fit::{Context, Fit, WhiteEvidence};
+use crate::fit::{Context, WhiteEvidence};
 use crate::frames::{self, FrameCounts};
 use crate::guard;
 use crate::held_out::{self, HeldOut};
 use crate::hypothesis;
 use crate::map;
 use crate::noise::Noise;
-use crate::predict::{Base, Block, PLAY_LEVELS, Zpk};
+use crate::predict::{Base, Block, Zpk};
 use crate::problem::Problem;
 use crate::result::{
     Effect as NamedEffect, Gap, GapStep, Interval, Reconciliation, Traces, Verdict,
 };
-use crate::search::{self, Effort, Found, ids};
+use crate::search::{self, Effort, Found, ids, implausibility, left_over};
 use crate::{floor, significance};
-use cellpos_plant::{Effect, Hysteresis, Model};
+use cellpos_plant::Model;
 use std::collections::BTreeMap;
 
 /// How to run.
@@ -29,6 +30,9 @@ pub struct Options {
     pub max_effects: usize,
     /// The command is an analogue signal sampled together with the output, not held between rows.
     pub interpolated_input: bool,
+    /// The base model is a constant gain fitted to these very records, those of a bare actuator and its displacement
+    /// sensor: the gain is free in every fit, the null included, and effects of the chip and of the bead are not looked for.
+    pub free_gain: bool,
 }
 
 impl Default for Options {
@@ -37,6 +41,7 @@ impl Default for Options {
             threads: 2,
             max_effects: 4,
             interpolated_input: false,
+            free_gain: false,
         }
     }
 }
@@ -76,11 +81,11 @@ pub fn reconcile(
     let present: Vec<Vec<bool>> = problem.records.iter().map(|r| r.present.clone()).collect();
 
     progress("null model and noise floor");
-    let first = context(&problem, scope, &fixed).fit(Vec::new(), &problem.all(), 4);
-    let (residual, _) = context(&problem, scope, &fixed).residual(&first);
+    let first = context(&problem, scope, &fixed, options).fit(Vec::new(), &problem.all(), 4);
+    let (residual, _) = context(&problem, scope, &fixed, options).residual(&first);
     let (noise, trusted) = floor::estimate(&records, &present, &residual);
     let problem = problem.with_noise(noise);
-    guard::motion(&context(&problem, scope, &fixed))?;
+    guard::motion(&context(&problem, scope, &fixed, options))?;
 
     let effort = Effort {
         threads: options.threads,
@@ -93,7 +98,7 @@ pub fn reconcile(
     loop {
         let ctx = Context {
             white: evidence(model, &noise, trusted, &problem),
-            ..context(&problem, scope, &fixed)
+            ..context(&problem, scope, &fixed, options)
         };
         found = search::search(&ctx, &problem.all(), effort, &mut *progress);
         // What the final residual shows is at least as good an estimate of the noise, if the fit is good.
@@ -108,7 +113,7 @@ pub fn reconcile(
     }
     let ctx = Context {
         white: evidence(model, &noise, trusted, &problem),
-        ..context(&problem, scope, &fixed)
+        ..context(&problem, scope, &fixed, options)
     };
     progress("held-out check");
     let mut held = held_out::check(&ctx, &found.fit, options.threads);
@@ -130,11 +135,17 @@ pub fn reconcile(
     Ok(assemble(model, &records, &ctx, found, held, &frames))
 }
 
-fn context<'a>(problem: &'a Problem, scope: Scope, fixed: &[Block]) -> Context<'a> {
+fn context<'a>(
+    problem: &'a Problem,
+    scope: Scope,
+    fixed: &[Block],
+    options: &Options,
+) -> Context<'a> {
     Context {
         problem,
         scope,
         fixed: fixed.to_vec(),
+        free_gain: options.free_gain,
         white: None,
     }
 }
@@ -176,7 +187,12 @@ fn scope_of(model: &Model, records: &[Record], base: &Base) -> Scope {
         working_point_um: w,
         low_um: low,
         high_um: high,
-        stroke_um: (high - w).abs().max((w - low).abs()).max(1e-6),
+        // A sampled analogue input starts anywhere; what counts are the swings.
+        stroke_um: if base.interpolated_input {
+            (0.5 * (high - low)).max(1e-6)
+        } else {
+            (high - w).abs().max((w - low).abs()).max(1e-6)
+        },
         sample_s: base.sample_s,
     }
 }
@@ -245,6 +261,7 @@ fn assemble(
     let after_map = map::map(ctx, &fit);
     let mut places = map::sentences(ctx, &null_map);
 
+    let over = left_over(&fit);
     let mut effects = Vec::new();
     let mut ambiguous = false;
     for (i, part) in fit.parts.iter().enumerate() {
@@ -264,7 +281,9 @@ fn assemble(
                 let s = ctx.problem.base.sample_s;
                 w.distance(&other, s) - w.distance(&fit.parts, s) > 16.0
             });
-            if r.chi2 - fit.chi2 < TIE && !decided {
+            // A richer form that only holds the winner as a limit of its numbers is no rival.
+            let price = implausibility(&r.part, over) - implausibility(part, over);
+            if r.chi2 + price - fit.chi2 < TIE && !decided {
                 if !inseparable(id, r.id) {
                     ambiguous = true;
                 }
@@ -448,268 +467,11 @@ fn assemble(
 /// A set that closes less than this part of the excess is no explanation.
 const CLOSED: f64 = 0.80;
 
-fn place_of(id: &str) -> &'static str {
-    match id {
-        "driver-lag" | "slew-limit" | "saturation" => "driver",
-        "pzt-hysteresis" | "pzt-creep" | "pzt-resonance" | "backlash" => "pzt",
-        "pdms-relaxation" | "bubble" | "leak" => "chip",
-        "gain-error" => "bead/camera",
-        "gain-drift" | "wall-adhesion" | "flow-drift" => "bead",
-        _ => "camera",
-    }
-}
-
-/// Parameters of part `index` with 95 % intervals in their units.
-fn parameters(
-    ctx: &Context<'_>,
-    fit: &Fit,
-    index: usize,
-    left_per_row: f64,
-) -> BTreeMap<String, Interval> {
-    let offset: usize = fit.parts[..index]
-        .iter()
-        .map(|p| p.variant().params.len())
-        .sum();
-    let part = &fit.parts[index];
-    // A fit that leaves something over is less sure than its own curvature says.
-    let wide = (1.0 + left_per_row.max(0.0)).sqrt();
-    let mut out = BTreeMap::new();
-    for (j, p) in part.variant().params.iter().enumerate() {
-        let x = part.theta[j];
-        let sd = fit.covariance[(offset + j, offset + j)].max(0.0).sqrt() * wide;
-        let (low, high) = (p.natural(x - 1.96 * sd), p.natural(x + 1.96 * sd));
-        let name = if p.name == "weights" {
-            format!("weights[{j}]")
-        } else {
-            p.name.to_owned()
-        };
-        out.insert(
-            name,
-            Interval {
-                value: p.natural(x),
-                ci95: [low, high],
-                unit: unit_of(p.name).to_owned(),
-            },
-        );
-    }
-    match part.variant().kind {
-        Kind::Line => {
-            let line = fit.parts[..index]
-                .iter()
-                .filter(|p| p.variant().kind == Kind::Line)
-                .count();
-            let amplitudes: Vec<f64> = fit.lines[line].iter().map(|[a, b]| a.hypot(*b)).collect();
-            let rows: f64 = ctx.problem.records.iter().map(|r| r.u.len() as f64).sum();
-            let mean = ctx
-                .problem
-                .records
-                .iter()
-                .zip(&amplitudes)
-                .map(|(r, a)| a * r.u.len() as f64)
-                .sum::<f64>()
-                / rows;
-            // One record's amplitude has the error sigma sqrt(2/n) over the filter's gain at the line.
-            let w = std::f64::consts::TAU * part.natural()[0] * ctx.problem.base.sample_s;
-            let theta = ctx.problem.noise.white_um2 / ctx.problem.noise.innovation_um().powi(2);
-            let gain =
-                (2.0 * (w / 2.0).sin()) / (1.0 + theta * theta - 2.0 * theta * w.cos()).sqrt();
-            let sd = ctx.problem.noise.innovation_um() * (2.0 / rows).sqrt() / gain.max(1e-6);
-            out.insert(
-                "um".to_owned(),
-                Interval {
-                    value: mean,
-                    ci95: [mean - 1.96 * sd, mean + 1.96 * sd],
-                    unit: "um".to_owned(),
-                },
-            );
-        }
-        Kind::Position => {
-            let at = fit.parts[..index]
-                .iter()
-                .filter(|p| p.variant().kind == Kind::Position)
-                .count();
-            let [a, b] = fit.positions[at];
-            let pixel = part.natural()[0];
-            let rows: f64 = ctx.problem.count(&ctx.problem.all()) as f64;
-            let sd = ctx.problem.noise.innovation_um() * (2.0 / rows).sqrt() / pixel;
-            let amplitude = a.hypot(b) / pixel;
-            out.insert(
-                "amplitude".to_owned(),
-                Interval {
-                    value: amplitude,
-                    ci95: [amplitude - 1.96 * sd, amplitude + 1.96 * sd],
-                    unit: "px".to_owned(),
-                },
-            );
-        }
-        Kind::Chain => {}
-    }
-    out
-}
-
-fn unit_of(name: &str) -> &'static str {
-    match name {
-        "bandwidth_hz" | "frequency_hz" | "hz" => "Hz",
-        "rate_um_per_s" | "speed_um_per_s" | "um_per_s" => "um/s",
-        "low_um" | "high_um" | "width_um" | "pixel_um" | "um" => "um",
-        "beta_per_um" | "gamma_per_um" | "quadratic_per_um" => "1/um",
-        "time_s" | "lag_s" | "delay_s" | "exposure_s" => "s",
-        "corner_rad_per_s" => "rad/s",
-        "dissolution_per_s" | "per_s" => "1/s",
-        "ppm" => "ppm",
-        _ => "",
-    }
-}
-
-/// The effect of a model file for part `index`.
-fn effect_of(ctx: &Context<'_>, fit: &Fit, index: usize) -> Option<Effect> {
-    let part = &fit.parts[index];
-    let v = part.natural();
-    let before = |kind| {
-        fit.parts[..index]
-            .iter()
-            .filter(|p| p.variant().kind == kind)
-            .count()
-    };
-    Some(match (part.variant().build)(&v, &ctx.scope) {
-        Block::Saturation { low_um, high_um } => Effect::Saturation { low_um, high_um },
-        Block::SlewLimit { rate } => Effect::SlewLimit {
-            rate_um_per_s: rate,
-        },
-        Block::DriverLag { .. } => Effect::DriverLag { bandwidth_hz: v[0] },
-        Block::BoucWen {
-            fraction,
-            beta,
-            gamma,
-        } => Effect::PztHysteresis(Hysteresis::BoucWenExplicit {
-            fraction,
-            beta_per_um: beta,
-            gamma_per_um: gamma,
-        }),
-        Block::Play {
-            stroke_um,
-            weights,
-            quadratic,
-        } => Effect::PztHysteresis(Hysteresis::Play {
-            thresholds_um: PLAY_LEVELS.iter().map(|l| l * stroke_um).collect(),
-            weights: weights.to_vec(),
-            quadratic_per_um: quadratic,
-        }),
-        Block::Creep { g } => Effect::PztCreep { per_decade: g },
-        Block::Resonance { zeta, .. } => Effect::PztResonance {
-            frequency_hz: v[0],
-            damping: zeta,
-        },
-        Block::Backlash { width_um } => Effect::Backlash { width_um },
-        Block::Relaxation { time_s, strength } => Effect::PdmsRelaxation { time_s, strength },
-        Block::Bubble { lag_s, dissolution } => Effect::Bubble {
-            lag_s,
-            dissolution_per_s: dissolution,
-        },
-        Block::Leak { corner } => Effect::Leak {
-            corner_rad_per_s: corner,
-        },
-        Block::Gain { factor } => Effect::GainError { factor },
-        Block::GainDrift { per_s } => Effect::GainDrift { per_s },
-        Block::FlowDrift { um_per_s } => Effect::FlowDrift { um_per_s },
-        Block::Adhesion { um_per_s } => Effect::WallAdhesion {
-            speed_um_per_s: um_per_s,
-        },
-        Block::ClockSkew { .. } => Effect::ClockSkew { ppm: v[0] },
-        Block::Delay { s } => Effect::TimeDelay { delay_s: s },
-        Block::Exposure { s } => Effect::ExposureAveraging { exposure_s: s },
-        Block::Hum { hz } => {
-            let line = &fit.lines[before(Kind::Line)];
-            let [a, b] = line.first().copied()?;
-            let rows: f64 = ctx.problem.records.iter().map(|r| r.u.len() as f64).sum();
-            let um = ctx
-                .problem
-                .records
-                .iter()
-                .zip(line)
-                .map(|(r, [a, b])| a.hypot(*b) * r.u.len() as f64)
-                .sum::<f64>()
-                / rows;
-            Effect::MainsHum {
-                hz,
-                um,
-                phase_deg: b.atan2(a).to_degrees(),
-            }
-        }
-        Block::PixelLocking { pixel_um } => {
-            let [a, b] = fit.positions[before(Kind::Position)];
-            Effect::PixelLocking {
-                pixel_um,
-                amplitude: a.hypot(b) / pixel_um,
-                phase_deg: b.atan2(a).to_degrees(),
-            }
-        }
-    })
-}
-
-/// The model with what was found, its intervals and where they come from.
-fn augment(
-    model: &Model,
-    ctx: &Context<'_>,
-    fit: &Fit,
-    frames: &FrameCounts,
-    named: &[NamedEffect],
-    verdict: Verdict,
-) -> Model {
-    let mut out = model.clone();
-    out.name = if named.is_empty() {
-        model.name.clone()
-    } else {
-        format!("{}-augmented", model.name)
-    };
-    out.covariance = None;
-    out.noise.diffusion_um2_per_s = ctx
-        .problem
-        .noise
-        .diffusion_um2_per_s(ctx.problem.base.sample_s);
-    out.noise.localisation_um = ctx.problem.noise.localisation_um();
-    if verdict != Verdict::Unknown {
-        for i in 0..fit.parts.len() {
-            if let Some(e) = effect_of(ctx, fit, i) {
-                out.effects
-                    .retain(|old| old.id() != e.id() || !VARIANTS.iter().any(|v| v.id == old.id()));
-                out.effects.push(e);
-            }
-        }
-        if frames.drops_named() {
-            out.effects.push(Effect::FrameDrops {
-                rate: frames.drop_rate(),
-            });
-        }
-        if frames.repeats_named() {
-            out.effects.push(Effect::FrameRepeats {
-                rate: frames.repeat_rate(),
-            });
-        }
-        for e in named {
-            for (name, p) in &e.parameters {
-                out.intervals.insert(format!("{}.{name}", e.id), p.ci95);
-            }
-        }
-    }
-    out.provenance
-        .insert("reconcile.verdict".to_owned(), verdict.word().to_owned());
-    out.provenance
-        .insert("reconcile.base".to_owned(), model.name.clone());
-    for e in named {
-        out.provenance.insert(
-            format!("reconcile.{}", e.id),
-            format!(
-                "p = {:.1e}, explains {:.1} % of the excess over the noise floor",
-                e.p_value,
-                100.0 * e.explained
-            ),
-        );
-    }
-    out
-}
-
-/// A base model for records without one: the constant gain that fits best, and the mean command about which it acts.
+/// A base model for records without one: the constant gain that fits best, and the command at which the output was at
+/// rest before the records began.
+///
+/// That command is read off the first row, which comes before the first command takes effect, through the gain. A piezo
+/// remembers it. An estimate within a tenth of the command's range of zero is zero: not yet switched on.
 ///
 /// # Errors
 /// No records, or a command that never changes.
@@ -725,6 +487,7 @@ pub fn constant_gain(records: &[Record]) -> Result<(f64, f64), ReconcileError> {
             .map(|(u, y)| (*u, *y))
     };
     let n = rows().count().max(1) as f64;
+    // Regression over all records.
     let (mean_u, mean_y) = (
         rows().map(|(u, _)| u).sum::<f64>() / n,
         rows().map(|(_, y)| y).sum::<f64>() / n,
@@ -737,5 +500,37 @@ pub fn constant_gain(records: &[Record]) -> Result<(f64, f64), ReconcileError> {
     if uu <= 0.0 {
         return Err(ReconcileError::ConstantInput);
     }
-    Ok((uy / uu, mean_u))
+    let gain = uy / uu;
+    let mut before = Vec::new();
+    for r in records {
+        let seen: Vec<(f64, f64)> = r
+            .pzt_um
+            .iter()
+            .zip(&r.bead_um)
+            .filter(|(_, y)| y.is_finite())
+            .map(|(u, y)| (*u, *y))
+            .collect();
+        let n = seen.len().max(1) as f64;
+        let (u, y) = (
+            seen.iter().map(|s| s.0).sum::<f64>() / n,
+            seen.iter().map(|s| s.1).sum::<f64>() / n,
+        );
+        if let Some(first) = seen.first() {
+            before.push(u + (first.1 - y) / gain);
+        }
+    }
+    before.sort_by(f64::total_cmp);
+    let (low, high) = records
+        .iter()
+        .map(Record::pzt_range_um)
+        .fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), (c, d)| {
+            (a.min(c), b.max(d))
+        });
+    let at_rest = before[before.len() / 2].clamp(low.min(0.0), high.max(0.0));
+    let at_rest = if at_rest.abs() < 0.1 * (high - low) {
+        0.0
+    } else {
+        at_rest
+    };
+    Ok((gain, at_rest))
 }

@@ -1,6 +1,7 @@
 //! Prints how well `reconcile` names effects that a simulator of another make hides: table, confusions, rates.
 //!
-//! `cargo run --release -p cellpos-tests --bin reconcile-table [all|singles|pairs|nulls|outside] [seed]`
+//! `cargo run --release -p cellpos-tests --bin reconcile-table [all|singles|pairs|nulls|outside] [seed] [text]`, the
+//! last to run only cases whose hidden effects, as printed, contain the text
 
 #![forbid(unsafe_code)]
 
@@ -25,6 +26,9 @@ fn main() {
         if which == "all" || which == name {
             cases.extend(group);
         }
+    }
+    if let Some(text) = args.get(2) {
+        cases.retain(|c| format!("{:?}", c.hidden).contains(text.as_str()));
     }
     let threads = std::thread::available_parallelism().map_or(2, usize::from);
     let next = AtomicUsize::new(0);
@@ -96,6 +100,13 @@ fn main() {
             );
         }
     }
+    let covered = done
+        .iter()
+        .filter(|(c, _)| c.group == "single" || c.group == "pair")
+        .fold((0, 0), |a, (_, r)| (a.0 + r.covered.0, a.1 + r.covered.1));
+    println!("95 % intervals that hold the truth: {covered:?}");
+    let slowest = done.iter().map(|(_, r)| r.seconds).fold(0.0, f64::max);
+    println!("slowest case, one thread: {slowest:.1} s");
     println!("\nconfusions (hidden -> verdict and names)");
     let mut confusions: BTreeMap<(String, String), usize> = BTreeMap::new();
     for (_, r) in done
@@ -128,7 +139,7 @@ fn line(case: &Case, row: &Result<Row, String>) -> String {
     match row {
         Err(e) => format!("{:8} {:7} {hidden:40} refused: {e}", case.group, case.level),
         Ok(r) => format!(
-            "{:8} {:7} {hidden:40} {} {:16} {:40} closure {:6.3} fresh {}",
+            "{:8} {:7} {hidden:40} {} {:16} {:40} closure {:6.3} fresh {:6} covered {}/{} threshold x {:5.1} {:5.1} s or: {}",
             case.group,
             case.level,
             if r.named == r.hidden { "  " } else { "<>" },
@@ -136,7 +147,12 @@ fn line(case: &Case, row: &Result<Row, String>) -> String {
             join(&r.named),
             r.closure,
             r.fresh
-                .map_or_else(|| "-".to_owned(), |f| format!("{f:.3}"))
+                .map_or_else(|| "-".to_owned(), |f| format!("{f:.3}")),
+            r.covered.0,
+            r.covered.1,
+            r.above_threshold,
+            r.seconds,
+            join(&r.alternatives)
         ),
     }
 }

@@ -46,7 +46,7 @@ pub enum Hidden {
     DriverLag(f64),
     SlewLimit(f64),
     Saturation(f64, f64),
-    /// Part lost at small amplitude, width of the relays \[um\].
+    /// Part that switching domains give (lost at small amplitude), mean half width of the relays \[um\].
     Preisach(f64, f64),
     Creep(f64),
     Resonance(f64, f64),
@@ -89,6 +89,31 @@ pub enum Hidden {
 }
 
 impl Hidden {
+    /// Parameters whose equation is that of the catalogue.
+    pub fn parameters(&self) -> Vec<(&'static str, f64)> {
+        match *self {
+            Self::DriverLag(hz) => vec![("bandwidth_hz", hz)],
+            Self::SlewLimit(rate) => vec![("rate_um_per_s", rate)],
+            Self::Saturation(low, high) => vec![("low_um", low), ("high_um", high)],
+            Self::Resonance(hz, zeta) => vec![("frequency_hz", hz), ("damping", zeta)],
+            Self::Backlash(width) => vec![("width_um", width)],
+            Self::Relaxation(tau, strength) => vec![("time_s", tau), ("strength", strength)],
+            Self::Bubble(tau) => vec![("lag_s", tau)],
+            Self::Leak(w) => vec![("corner_rad_per_s", w)],
+            Self::Gain(f) => vec![("factor", f)],
+            Self::GainDrift(r) => vec![("per_s", r)],
+            Self::Adhesion(v) => vec![("speed_um_per_s", v)],
+            Self::FlowDrift(v) => vec![("um_per_s", v)],
+            Self::Delay(d) => vec![("delay_s", d)],
+            Self::Exposure(e) => vec![("exposure_s", e)],
+            Self::ClockSkew(ppm) => vec![("ppm", ppm)],
+            Self::Drops(p) | Self::Repeats(p) => vec![("rate", p)],
+            Self::PixelLocking(pixel, b) => vec![("pixel_um", pixel), ("amplitude", b)],
+            Self::Hum(hz, um) => vec![("hz", hz), ("um", um)],
+            _ => Vec::new(),
+        }
+    }
+
     /// The id of the vocabulary, or `outside`.
     pub fn id(&self) -> &'static str {
         match self {
@@ -243,55 +268,91 @@ pub fn run(script: &Script, hidden: &[Hidden], nuisance: Nuisance, random: &mut 
     }
 }
 
-/// Preisach relays on a triangular grid of switching thresholds, weights falling off from the diagonal.
+/// Classical Preisach model: relays over the half plane up > down, weights falling off from the diagonal and, slowly, from
+/// the middle of the stroke. Evaluated exactly through its Everett function and the stack of extremes that the relays
+/// remember (Mayergoyz, Mathematical Models of Hysteresis, 1991, ch. 1), because a grid of relays moves in steps that no
+/// piezo shows.
 struct Relays {
-    thresholds: Vec<(f64, f64, f64)>,
-    state: Vec<bool>,
+    width_um: f64,
+    span: f64,
+    /// Remembered extremes, alternating minimum and maximum, the outermost first.
+    extremes: Vec<f64>,
+    at: f64,
     scale: f64,
 }
 
 impl Relays {
     fn new(width_um: f64) -> Self {
-        let n = 36;
-        let span = 4.0 * width_um;
-        let step = 2.0 * span / f64::from(n);
-        let mut thresholds = Vec::new();
-        for i in 0..n {
-            for j in 0..=i {
-                let (up, down) = (
-                    -span + step * (f64::from(i) + 0.5),
-                    -span + step * (f64::from(j) + 0.5),
-                );
-                let (mean, half) = (0.5 * (up + down), 0.5 * (up - down));
-                thresholds.push((
-                    up,
-                    down,
-                    (-half / width_um - (mean / (1.5 * width_um)).powi(2)).exp(),
-                ));
-            }
+        let span = 6.0 * width_um;
+        let mut relays = Self {
+            width_um,
+            span,
+            extremes: vec![-span],
+            at: 0.0,
+            scale: 1.0,
+        };
+        // Far from the last reversal the displacement goes with the input: the nominal gain is that of the large stroke.
+        relays.scale = 0.5 / width_um;
+        // Demagnetised by an oscillation that dies out.
+        for k in 0..400 {
+            let a = span * (1.0 - f64::from(k) / 400.0);
+            relays.extremes.push(if k % 2 == 0 { a } else { -a });
         }
-        let total: f64 = thresholds.iter().map(|t| t.2).sum();
-        // Demagnetised: relays below the line up + down = 0 are on.
-        let state = thresholds
-            .iter()
-            .map(|(up, down, _)| up + down < 0.0)
-            .collect();
-        Self {
-            thresholds,
-            state,
-            scale: 2.0 * width_um / total,
-        }
+        relays
     }
 
+    /// Weight of all relays that switch between two extremes: `exp(-half width/width)` integrated over the triangle,
+    /// falling off from the middle over ten widths.
+    fn everett(&self, up: f64, down: f64) -> f64 {
+        let (w, d) = (self.width_um, (up - down).max(0.0));
+        let middle = 0.5 * (up + down) / (10.0 * w);
+        (2.0 * d * w - 4.0 * w * w * (1.0 - (-0.5 * d / w).exp())) * (-middle * middle).exp()
+    }
+
+    /// Displacement after the input has gone straight to `u`.
     fn follow(&mut self, u: f64) -> f64 {
-        let mut sum = 0.0;
-        for ((up, down, w), on) in self.thresholds.iter().zip(&mut self.state) {
-            if u >= *up {
-                *on = true;
-            } else if u <= *down {
-                *on = false;
+        if u != self.at {
+            let rising = u > self.at;
+            let last_is_minimum = self.extremes.len() % 2 == 1;
+            // A reversal is remembered.
+            if rising != last_is_minimum {
+                self.extremes.push(self.at);
             }
-            sum += if *on { *w } else { -*w };
+            // What the input passes is wiped out, pairs of extremes at a time.
+            while self.extremes.len() >= 2 {
+                let before = self.extremes[self.extremes.len() - 2];
+                if (rising && u >= before) || (!rising && u <= before) {
+                    self.extremes.pop();
+                    self.extremes.pop();
+                } else {
+                    break;
+                }
+            }
+            if self.extremes.is_empty() {
+                self.extremes.push(-self.span);
+            }
+            self.at = u;
+        }
+        let mut sum = -0.5 * self.everett(self.span, -self.span);
+        let mut low = self.extremes[0];
+        let mut k = 1;
+        loop {
+            let high = self.extremes.get(k).copied();
+            match high {
+                None => {
+                    sum += self.everett(self.at.max(low), low);
+                    break;
+                }
+                Some(high) => {
+                    let next = self.extremes.get(k + 1).copied().unwrap_or(self.at);
+                    sum += self.everett(high, low) - self.everett(high, next.min(high));
+                    low = next;
+                    if k + 1 >= self.extremes.len() {
+                        break;
+                    }
+                    k += 2;
+                }
+            }
         }
         sum * self.scale
     }
@@ -331,14 +392,16 @@ fn positions(u: &[f64], hidden: &[Hidden], nuisance: Nuisance, random: &mut Rand
             match *e {
                 Hidden::Saturation(low, high) => x = x.clamp(low - 4.0, high - 4.0),
                 Hidden::SlewLimit(rate) => {
+                    let old = slew;
                     slew += (x - slew).clamp(-rate * h, rate * h);
-                    x = slew;
+                    x = 0.5 * (old + slew);
                 }
                 Hidden::DriverLag(hz) => {
                     // Implicit midpoint rule.
                     let w = 0.5 * TAU * hz * h;
+                    let old = lag;
                     lag = (lag * (1.0 - w) + 2.0 * w * x) / (1.0 + w);
-                    x = lag;
+                    x = 0.5 * (old + lag);
                 }
                 Hidden::Preisach(part, _) => {
                     let p = match pressed {
@@ -346,36 +409,45 @@ fn positions(u: &[f64], hidden: &[Hidden], nuisance: Nuisance, random: &mut Rand
                         _ => relays.first_mut().map_or(0.0, |r| r.follow(x)),
                     };
                     pressed = Some((x, p));
-                    x -= part * p;
+                    // The domains that switch add to the elastic part: the gain rises with the amplitude and the loop
+                    // lags, as in every measured piezo.
+                    x = (1.0 - part) * x + part * p;
                 }
                 Hidden::Creep(g) => {
                     // One Kelvin-Voigt element per decade from 1 ms to 1000 s.
                     let mut sum = 0.0;
                     for (i, q) in voigt.iter_mut().enumerate() {
                         let tau = 10f64.powi(i as i32 - 3);
+                        let old = *q;
                         *q += (x - *q) * (1.0 - (-h / tau).exp());
-                        sum += *q;
+                        sum += 0.5 * (old + *q);
                     }
-                    x = x * (1.0 - 2.3 * g) + g * sum;
+                    // The displacement 0.1 s after a step counts as 1.
+                    let at_tenth: f64 =
+                        (0..7).map(|i| 1.0 - (-0.1 / 10f64.powi(i - 3)).exp()).sum();
+                    x = x * (1.0 - at_tenth * g) + g * sum;
                 }
                 Hidden::Resonance(hz, zeta) => {
                     let w = TAU * hz;
                     let f = |r: [f64; 2]| [r[1], w * w * (x - r[0]) - 2.0 * zeta * w * r[1]];
+                    let old = ring[0];
                     ring = rk4(ring, h, f);
-                    x = ring[0];
+                    x = 0.5 * (old + ring[0]);
                 }
                 Hidden::Backlash(width) => {
                     play = f64::clamp(play, x - 0.5 * width, x + 0.5 * width);
                     x = play;
                 }
                 Hidden::Relaxation(tau, strength) => {
+                    let old = solid;
                     solid += (x - solid) * (1.0 - (-h / tau).exp());
-                    x += strength * (x - solid);
+                    x += strength * (x - 0.5 * (old + solid));
                 }
                 Hidden::Bubble(tau) => {
                     let w = 0.5 * h / tau;
+                    let old = gas;
                     gas = (gas * (1.0 - w) + 2.0 * w * x) / (1.0 + w);
-                    x = gas;
+                    x = 0.5 * (old + gas);
                 }
                 Hidden::Echo(c, late) => {
                     let k = (late / h) as usize;
@@ -401,7 +473,7 @@ fn positions(u: &[f64], hidden: &[Hidden], nuisance: Nuisance, random: &mut Rand
                 Hidden::GainDrift(r) => v *= 1.0 + r * t,
                 Hidden::FlowDrift(d) => v += d,
                 Hidden::Adhesion(limit) => v = v.signum() * (v.abs() - limit).max(0.0),
-                Hidden::Leak(w) => lost += w * bead,
+                Hidden::Leak(w) => lost += w * (bead + 0.5 * v * h),
                 Hidden::Square(c) => v += c * x * x,
                 Hidden::Cube(c) => v += c * x * x * x,
                 Hidden::Profile(c) => v *= 1.0 + c * (TAU * bead / 20.0).sin(),

@@ -19,6 +19,14 @@ pub struct Row {
     pub verdict: Verdict,
     /// Closure of the gap on held-out records.
     pub closure: f64,
+    /// Alternatives of the named ones.
+    pub alternatives: BTreeSet<String>,
+    /// 95 % intervals of parameters whose equation is the catalogue's: those that hold the truth, and all.
+    pub covered: (usize, usize),
+    /// Wall time of the search \[s\], one thread.
+    pub seconds: f64,
+    /// How far the hidden effect lies above the threshold of detection, in parts of the amplitude that just reaches it.
+    pub above_threshold: f64,
     /// 1 - RMS error of the augmented over that of the null model, noise-free, on a fresh excitation; singles only.
     pub fresh: Option<f64>,
 }
@@ -42,6 +50,7 @@ pub fn records(case: &Case, seed: u64) -> Vec<Record> {
 /// The message of a refusal.
 pub fn evaluate(case: &Case, seed: u64) -> Result<Row, String> {
     let records = records(case, seed);
+    let start = std::time::Instant::now();
     let result = reconcile(
         &Model::eq6(),
         &records,
@@ -52,6 +61,7 @@ pub fn evaluate(case: &Case, seed: u64) -> Result<Row, String> {
         &mut |_| {},
     )
     .map_err(|e| e.to_string())?;
+    let seconds = start.elapsed().as_secs_f64();
     let hidden: BTreeSet<String> = case
         .hidden
         .iter()
@@ -71,9 +81,44 @@ pub fn evaluate(case: &Case, seed: u64) -> Result<Row, String> {
         named,
         inside,
         verdict: result.verdict,
+        alternatives: result
+            .effects
+            .iter()
+            .flat_map(|e| e.alternatives.iter())
+            .cloned()
+            .collect(),
+        covered: covered(case, &result),
+        seconds,
+        above_threshold: above_threshold(&result),
         closure: result.gap.closure(),
         fresh,
     })
+}
+
+/// Whether the intervals of named effects hold what was hidden, where both have the same equation.
+fn covered(case: &Case, result: &Reconciliation) -> (usize, usize) {
+    let (mut good, mut all) = (0, 0);
+    for h in &case.hidden {
+        let Some(effect) = result.effects.iter().find(|e| e.id == h.id()) else {
+            continue;
+        };
+        for (name, value) in h.parameters() {
+            if let Some(p) = effect.parameters.get(name) {
+                all += 1;
+                good += usize::from(p.ci95[0] <= value && value <= p.ci95[1]);
+            }
+        }
+    }
+    (good, all)
+}
+
+/// Amplitude over that of the threshold: the excess of the sum of squares goes with the square of the amplitude.
+fn above_threshold(result: &Reconciliation) -> f64 {
+    let rows: usize = result.records.iter().map(|r| r.2).sum();
+    let g = &result.gap;
+    let excess = rows as f64 * (g.before * g.before / (g.floor * g.floor) - 1.0);
+    // What one parameter must gain to count: 1.3 times the chi-square quantile at 4.1 standard deviations.
+    (excess.max(0.0) / 22.0).sqrt()
 }
 
 /// Fall of the RMS error on an excitation that was never fitted: another multisine, noise-free.

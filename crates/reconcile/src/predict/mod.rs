@@ -4,6 +4,8 @@
 //! with the same equations, one step per sample where that is exact and a finer grid only where a block needs it, so
 //! that a minute of record takes about a millisecond.
 
+#[cfg(test)]
+mod agreement;
 pub(crate) mod block;
 mod camera;
 mod modal;
@@ -151,6 +153,9 @@ impl<'a> Chain<'a> {
         if self.blocks.iter().any(is_motion) {
             let mut t = Trace::default();
             modal.trace(&x, &mut t);
+            if self.base.interpolated_input {
+                t.straighten(h);
+            }
             camera::bead(&mut t, self.blocks, h);
             camera::sample(&t, self.blocks, h, self.fine, n, y);
         } else {
@@ -207,13 +212,14 @@ fn flush(pending: &mut Zpk, x: &mut Vec<f64>, h: f64) {
     *pending = Zpk::unity();
 }
 
-/// Straight lines between the samples, as means over each step of the grid.
+/// Straight lines between the samples; each step of the grid holds the value at its end, so that a plant without dynamics
+/// is exact at the samples.
 fn interpolate(u: &[f64], fine: usize) -> Vec<f64> {
     let mut x = Vec::with_capacity(u.len() * fine);
     for k in 0..u.len() {
         let next = u.get(k + 1).copied().unwrap_or(u[k]);
         for i in 0..fine {
-            let f = (i as f64 + 0.5) / fine as f64;
+            let f = (i as f64 + 1.0) / fine as f64;
             x.push(u[k] + f * (next - u[k]));
         }
     }

@@ -113,6 +113,22 @@ pub(crate) struct Trace {
     pub end_slope: Vec<f64>,
 }
 
+impl Trace {
+    /// Takes the jumps of a grid of steps for the straight line that they stand for.
+    pub fn straighten(&mut self, h: f64) {
+        let n = self.pos.len();
+        for j in 0..n {
+            let slope = match self.pos.get(j + 1) {
+                Some(next) => (next - self.pos[j]) / h,
+                None => 0.0,
+            };
+            self.jump[j] = 0.0;
+            self.start_slope[j] = slope;
+            self.end_slope[j] = slope;
+        }
+    }
+}
+
 impl Modal {
     /// Partial fractions of a proper transfer function, held-input recursion of step `h`.
     pub fn new(zpk: &Zpk, h: f64) -> Self {
