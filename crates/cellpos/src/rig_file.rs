@@ -359,6 +359,28 @@ impl RigFile {
         })
     }
 
+    /// Camera and board without a tracker, for the LED test.
+    pub fn open_for_led(&self) -> Result<(SocketCamera, BoardHost<SerialLine>), Failure> {
+        let (ActuatorConfig::Serial { port, baud, .. }, CameraConfig::Socket { socket, rate_hz }) =
+            (&self.actuator, &self.camera)
+        else {
+            return Err(Failure::bad_input(
+                "the LED test of a rig needs its board and its camera",
+                "leave the test out with --led-edges 0",
+            ));
+        };
+        let line = SerialLine::open(port, *baud).map_err(Failure::failed)?;
+        let board = BoardHost::connect(line, Clock::Real).map_err(Failure::failed)?;
+        let camera = SocketCamera::connect(
+            socket,
+            *rate_hz,
+            self.timing.camera_delay_ms,
+            Duration::from_secs(2),
+        )
+        .map_err(Failure::failed)?;
+        Ok((camera, board))
+    }
+
     /// Watchdog asked of the board, ms.
     pub fn watchdog_ms(&self) -> Option<u16> {
         match self.actuator {

@@ -61,15 +61,52 @@ fn identify_through_frames_finds_eq6_its_delay_and_what_it_cannot_tell() {
         assert!(miss("gain_db", "eq6_gain_db") < 0.2, "{line}");
         assert!(miss("phase_deg", "eq6_phase_deg") < 1.0, "{line}");
     }
-    let warnings = result["warnings"].as_array().unwrap();
-    assert!(
-        warnings
-            .iter()
-            .any(|w| w.as_str().unwrap().contains("2 pi"))
-    );
+    // A good rig with a good model is warned of nothing.
+    assert_eq!(result["warnings"].as_array().unwrap().len(), 0, "{result}");
     let model = cellpos_plant::Model::load_file(&folder.path().join("model.toml")).unwrap();
     assert!((model.plant.gain_db(cellpos_plant::Hertz(10.0)).0 - 16.26).abs() < 0.1);
     assert!(folder.path().join("report-figures/bode.svg").exists());
+}
+
+#[test]
+fn a_model_with_a_literal_63_per_s_is_flagged_as_a_factor_of_two_pi() {
+    let folder = tempfile::tempdir().unwrap();
+    std::fs::write(
+        folder.path().join("eq5.toml"),
+        "working_point_um = 20.0\n\n[plant]\nnum = [63.0]\nden = [1.0, 0.0]\n",
+    )
+    .unwrap();
+    let result = json(
+        folder.path(),
+        &[
+            "identify",
+            "--model",
+            "eq5.toml",
+            "--frames",
+            "off",
+            "--frequency",
+            "5Hz,20Hz,60Hz,150Hz",
+            "--bootstrap",
+            "0",
+            "--led-edges",
+            "0",
+            "--json",
+            "--out",
+            "m.toml",
+            "--report",
+            "r.html",
+        ],
+    );
+    let warnings = result["warnings"].as_array().unwrap();
+    let flagged = |w: &Value| {
+        let text = w.as_str().unwrap();
+        text.contains("2 pi 63") && text.contains("396/s")
+    };
+    assert_eq!(
+        warnings.iter().filter(|w| flagged(w)).count(),
+        1,
+        "{result}"
+    );
 }
 
 #[test]

@@ -51,6 +51,15 @@ pub enum Signal {
         /// Frequency from which the amplitude is constant, Hz.
         flat_from_hz: f64,
     },
+    /// A signal over and over, each time faded in and out at its ends, so that it can be measured as a periodic one.
+    Repeated {
+        /// The signal.
+        signal: Box<Signal>,
+        /// Time from start to start, s.
+        period_s: f64,
+        /// Time of each fade (half a cosine), s.
+        fade_s: f64,
+    },
     /// A staircase: up, back, down, back, each level held for `hold_s`.
     Steps {
         /// Height, um.
@@ -61,6 +70,14 @@ pub enum Signal {
 }
 
 impl Signal {
+    /// Time after which the signal repeats itself, where only that defines its lines, s.
+    pub fn repeats_s(&self) -> Option<f64> {
+        match self {
+            Signal::Repeated { period_s, .. } => Some(*period_s),
+            _ => None,
+        }
+    }
+
     /// Displacement at `time_s` after the signal's start, um.
     pub fn value_um(&self, time_s: f64) -> f64 {
         let two_pi = 2.0 * std::f64::consts::PI;
@@ -94,6 +111,20 @@ impl Signal {
                 let frequency = from_hz * (rate * time_s).exp();
                 let phase = two_pi * from_hz * (rate * time_s).exp_m1() / rate;
                 amplitude_um * (frequency / flat_from_hz).min(1.0) * phase.sin()
+            }
+            Signal::Repeated {
+                signal,
+                period_s,
+                fade_s,
+            } => {
+                let within_s = time_s.rem_euclid(*period_s);
+                let to_end_s = within_s.min(period_s - within_s);
+                let fade = if to_end_s < *fade_s {
+                    0.5 - 0.5 * (std::f64::consts::PI * to_end_s / fade_s).cos()
+                } else {
+                    1.0
+                };
+                fade * signal.value_um(within_s)
             }
             Signal::Steps { height_um, hold_s } => match (time_s / hold_s) as i64 % 4 {
                 0 => *height_um,
@@ -402,5 +433,17 @@ mod tests {
             .count();
         assert!((57..=60).contains(&crossings), "{crossings}");
         assert_eq!(sweep.value_um(25.0), 0.0);
+        let repeated = Signal::Repeated {
+            signal: Box::new(sweep.clone()),
+            period_s: 20.0,
+            fade_s: 0.2,
+        };
+        assert_eq!(repeated.repeats_s(), Some(20.0));
+        for time_s in [0.7, 3.21, 11.9] {
+            assert_eq!(repeated.value_um(time_s), sweep.value_um(time_s));
+            assert!((repeated.value_um(40.0 + time_s) - sweep.value_um(time_s)).abs() < 1e-9);
+        }
+        // No jump from one round to the next.
+        assert!(repeated.value_um(20.0 - 1e-4).abs() < 1e-4);
     }
 }

@@ -164,6 +164,90 @@ impl Plan {
         }
     }
 
+    /// A logarithmic sweep from the lowest line to the highest, repeated every four seconds and measured at the lines
+    /// (moved to multiples of 0.25 Hz), where it is periodic. Its amplitude is the largest that keeps the expected bead
+    /// and PZT within `limits` at every frequency, so low lines get less than a stepped sine would give them.
+    pub fn log_sweep(
+        lines_hz: &[f64],
+        expected: Expected<'_>,
+        limits: Limits,
+        period_s: f64,
+        seconds_at_1_hz: f64,
+    ) -> Self {
+        const SWEEP_S: f64 = 4.0;
+        let mut lines: Vec<f64> = lines_hz
+            .iter()
+            .map(|f| (f * SWEEP_S).round().max(1.0) / SWEEP_S)
+            .collect();
+        lines.sort_by(f64::total_cmp);
+        lines.dedup();
+        let lowest = lines.first().copied().unwrap_or(1.0);
+        let highest = lines.last().copied().unwrap_or(lowest);
+        // A quarter of an octave beyond the outer lines, so that they are passed at full amplitude.
+        let nyquist_hz = 0.5 / period_s;
+        let (from_hz, to_hz) = (0.84 * lowest, (1.19 * highest).min(0.96 * nyquist_hz));
+        let amplitude_um = (0..=60)
+            .map(|i| from_hz * (to_hz / from_hz).powf(f64::from(i) / 60.0))
+            .map(|f| {
+                let (plant, loop_gain) = expected(f);
+                shaped_amplitude_um(f, plant, loop_gain, limits)
+            })
+            .fold(f64::INFINITY, f64::min);
+        let rounds = (2.0 * seconds_at_1_hz / SWEEP_S).round().clamp(4.0, 16.0);
+        let segment = PlannedSegment {
+            label: format!("sweep {lowest} to {highest} Hz, {rounds} times"),
+            signal: Signal::Repeated {
+                signal: Box::new(Signal::LogSweep {
+                    from_hz,
+                    to_hz,
+                    duration_s: SWEEP_S,
+                    amplitude_um,
+                    flat_from_hz: from_hz,
+                }),
+                period_s: SWEEP_S,
+                fade_s: 0.1,
+            },
+            lines_hz: lines,
+            detection_hz: Vec::new(),
+            settle_s: SWEEP_S,
+            measure_s: rounds * SWEEP_S,
+        };
+        Self {
+            period_s,
+            segments: vec![segment],
+            lost_frames: 50,
+        }
+    }
+
+    /// The excitation of the segments `todo` as one table, for a rig that runs without stopping between them: each
+    /// settled, measured and faded out as [`Plan::run`] does it.
+    pub fn schedule(&self, todo: &[usize]) -> Schedule {
+        let mut schedule = Schedule {
+            excitation_um: Vec::new(),
+            spans: Vec::new(),
+        };
+        for &index in todo {
+            let Some(segment) = self.segments.get(index) else {
+                continue;
+            };
+            let settle = rows(segment.settle_s, self.period_s);
+            let total = settle + rows(segment.measure_s, self.period_s);
+            schedule.spans.push(Span {
+                index,
+                start: schedule.excitation_um.len(),
+                settle,
+                rows: total,
+            });
+            let release = rows(RELEASE_S, self.period_s);
+            let value = |k: usize| segment.signal.value_um(k as f64 * self.period_s);
+            schedule.excitation_um.extend((0..total).map(value));
+            schedule
+                .excitation_um
+                .extend((0..release).map(|k| fade_out(k, release) * value(total + k)));
+        }
+        schedule
+    }
+
     /// Total duration, s.
     pub fn duration_s(&self) -> f64 {
         self.segments
@@ -243,10 +327,8 @@ impl Plan {
             // fling the bead out of view.
             let release = rows(RELEASE_S, self.period_s);
             for k in 0..release {
-                let fade =
-                    0.5 + 0.5 * (std::f64::consts::PI * (k + 1) as f64 / release as f64).cos();
-                let excitation_um =
-                    fade * segment.signal.value_um((total + k) as f64 * self.period_s);
+                let excitation_um = fade_out(k, release)
+                    * segment.signal.value_um((total + k) as f64 * self.period_s);
                 if let Err(error) = bench.tick(excitation_um) {
                     return Err(Stopped {
                         done,
@@ -285,7 +367,11 @@ impl Plan {
                 lines_hz: &planned.lines_hz,
                 detection_hz: &planned.detection_hz,
             };
-            let response = measure(&segment, settings)?;
+            let settings = Settings {
+                block_s: planned.signal.repeats_s(),
+                ..*settings
+            };
+            let response = measure(&segment, &settings)?;
             points.extend(response.points.iter().cloned());
             segments.push(response);
         }
@@ -314,6 +400,33 @@ fn harmonics_to_watch(frequency_hz: f64, rate_hz: f64) -> Vec<f64> {
 
 fn rows(seconds: f64, period_s: f64) -> usize {
     (seconds / period_s).round() as usize
+}
+
+/// Share of the excitation in row `k` of `release` rows of fading out.
+fn fade_out(k: usize, release: usize) -> f64 {
+    0.5 + 0.5 * (std::f64::consts::PI * (k + 1) as f64 / release as f64).cos()
+}
+
+/// Segments laid end to end.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Schedule {
+    /// What to add to the command, um, one value per tick.
+    pub excitation_um: Vec<f64>,
+    /// Where each segment lies.
+    pub spans: Vec<Span>,
+}
+
+/// Where a segment lies in a [`Schedule`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Span {
+    /// The segment's place in the plan.
+    pub index: usize,
+    /// Its first tick.
+    pub start: usize,
+    /// Ticks of settling, not used.
+    pub settle: usize,
+    /// Ticks in all, settling included, fading out not.
+    pub rows: usize,
 }
 
 /// What a segment recorded.
@@ -356,4 +469,51 @@ pub struct Measured {
     pub noise: Option<NoiseModel>,
     /// Per segment, detection lines included.
     pub segments: Vec<SegmentResponse>,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_schedule_is_what_a_run_would_have_added_tick_by_tick() {
+        struct Noting(Vec<f64>);
+        impl Bench for Noting {
+            type Error = std::convert::Infallible;
+            fn tick(&mut self, excitation_um: f64) -> Result<Row, Self::Error> {
+                self.0.push(excitation_um);
+                Ok(Row {
+                    command_um: excitation_um,
+                    bead_um: Some(0.0),
+                })
+            }
+        }
+        let limits = Limits {
+            bead_um: 8.0,
+            bead_um_per_s: 400.0,
+            pzt_um: 10.0,
+            slew_um_per_s: 3200.0,
+        };
+        let integrator = |f: f64| {
+            (
+                Complex::new(0.0, -400.0 / (2.0 * std::f64::consts::PI * f)),
+                Complex::new(0.0, 0.0),
+            )
+        };
+        let plan = Plan::stepped_sines(&[5.0, 20.0, 50.0], &integrator, limits, 1e-3, 10.0);
+        let mut noted = Noting(Vec::new());
+        let records = plan.run(&mut noted, 1, |_| {}).unwrap();
+        let schedule = plan.schedule(&[1, 2]);
+        assert_eq!(schedule.excitation_um, noted.0);
+        for (span, record) in schedule.spans.iter().zip(&records) {
+            assert_eq!(
+                (span.index, span.settle, span.rows),
+                (record.index, record.from, record.input.len())
+            );
+            assert_eq!(
+                schedule.excitation_um[span.start..span.start + span.rows],
+                record.input[..]
+            );
+        }
+    }
 }

@@ -51,6 +51,9 @@ pub struct Settings {
     pub most_blocks: usize,
     /// How the response is formed.
     pub estimator: Estimator,
+    /// Blocks hold whole multiples of this, s, rather than of the lowest line's period: for an excitation with more
+    /// lines than are measured, which are orthogonal over its own period only.
+    pub block_s: Option<f64>,
 }
 
 impl Default for Settings {
@@ -60,6 +63,7 @@ impl Default for Settings {
             min_periods: 1.0,
             most_blocks: 16,
             estimator: Estimator::Joint,
+            block_s: None,
         }
     }
 }
@@ -174,7 +178,7 @@ pub fn measure(segment: &Segment<'_>, settings: &Settings) -> Result<SegmentResp
         segment.from,
         to,
         segment.period_s,
-        lowest,
+        settings.block_s.map_or(lowest, |block_s| 1.0 / block_s),
         settings.min_periods,
         most,
     );

@@ -4,7 +4,7 @@
 
 use std::collections::BTreeMap;
 
-use cellpos_plant::{Covariance, EQ5_LITERAL_PER_S, Model, Noise, PlantError, TransferFunction};
+use cellpos_plant::{Covariance, Model, Noise, PlantError, TransferFunction, probably_per_hertz};
 use nalgebra::{Complex, DMatrix};
 
 use crate::delay::{DelayEstimate, disagreement_s};
@@ -69,7 +69,8 @@ pub fn compensated(
     measured * model.response(frequency_hz) / model.sampled_response(frequency_hz, sampling)
 }
 
-/// Fits, judges and compensates. `bootstrap` replicates (0: none) are drawn with `seed`.
+/// Fits, judges and compensates. `bootstrap` replicates (0: none) are drawn with `seed`. `stated_per_s` is the velocity
+/// gain that somebody believed in before, for a warning where it is the measured one less a factor of 2 pi.
 ///
 /// # Errors
 /// Those of [`LadderProblem::new`] and [`LadderProblem::fit`].
@@ -79,6 +80,7 @@ pub fn summarise(
     led: Option<DelayEstimate>,
     bootstrap: usize,
     seed: u64,
+    stated_per_s: Option<f64>,
 ) -> Result<Identification, IdentError> {
     let problem = LadderProblem::new(&measured.points, sampling, None)?;
     let ladder = problem.fit()?;
@@ -116,7 +118,7 @@ pub fn summarise(
         compensated,
         warnings: Vec::new(),
     };
-    result.warnings = warnings(&result);
+    result.warnings = warnings(&result, stated_per_s);
     Ok(result)
 }
 
@@ -133,7 +135,7 @@ pub fn literal_per_hertz(measured_per_s: f64, stated_per_s: f64) -> Option<f64> 
     ((ratio / turn - 1.0).abs() < 0.12).then_some(ratio)
 }
 
-fn warnings(result: &Identification) -> Vec<String> {
+fn warnings(result: &Identification, stated_per_s: Option<f64>) -> Vec<String> {
     let mut out = Vec::new();
     if let (Some(gap), Some(led)) = (result.disagreement_s, result.led) {
         out.push(format!(
@@ -153,11 +155,20 @@ fn warnings(result: &Identification) -> Vec<String> {
         ));
     }
     let gain = result.judged.model.gain_per_s;
-    if let Some(ratio) = literal_per_hertz(gain, EQ5_LITERAL_PER_S) {
+    if let Some(stated) = stated_per_s
+        && let Some(ratio) = literal_per_hertz(gain, stated)
+    {
+        let source = if probably_per_hertz(stated).is_some() {
+            " (Eq. (5) prints 63/s, where 63 is the gain at 1 Hz: the plant is 2 pi 63/s = 396/s)"
+        } else {
+            ""
+        };
         out.push(format!(
-            "Eq. (5) prints 63/s; the measured gain is {ratio:.2} times that, a factor of 2 pi: 63 is the gain at 1 Hz, so the \
-             plant is 2 pi 63/s = 396/s. A controller designed on 63/s has 6.3 times too much loop gain"
+            "the measured gain, {gain:.0}/s, is {ratio:.2} times that of the model given, {stated:.1}/s: a factor of 2 pi, a gain \
+             per hertz taken for one per rad/s{source}. A controller designed on it has 6.3 times too much loop gain"
         ));
+    } else if let Some(hint) = probably_per_hertz(gain) {
+        out.push(format!("the measured gain: {hint}"));
     }
     if gain < 0.0 {
         out.push("the gain is negative: check the camera's axis or the sign of the PZT before closing a loop".to_owned());

@@ -486,7 +486,7 @@ impl<R: Guide> Core<R> {
                 }
                 None => 0.0,
             },
-            ..LoopInput::default()
+            excitation_um: self.guide.excitation_um(),
         };
         let output = self.controller.step(&mut self.state.control, &given);
         if let Some(learning) = &mut self.learning {

@@ -125,6 +125,12 @@ pub trait Guide {
     /// One tick: the reference now, and in `preview_um` that of the ticks to come, the next one first.
     fn step(&mut self, input: &GuideInput, preview_um: &mut [f64]) -> GuideOutput;
 
+    /// What to add to the controller's command at the tick just stepped, um of PZT displacement: an excitation for
+    /// identification. Added only while the loop controls.
+    fn excitation_um(&self) -> f64 {
+        0.0
+    }
+
     /// Whether the run may end.
     fn finished(&self) -> bool {
         false

@@ -41,6 +41,8 @@ pub struct Setup {
     pub clock: Clock,
     /// Hold the bead by PI; else the excitation moves the PZT about neutral in open loop.
     pub closed_loop: bool,
+    /// The PI; left out: gains for a loop delay of 2.5 ms, scaled to the model's gain.
+    pub pi: Option<Pi>,
 }
 
 impl Setup {
@@ -54,6 +56,9 @@ impl Setup {
     }
 
     fn pi(&self) -> Pi {
+        if let Some(pi) = self.pi {
+            return pi;
+        }
         let scale = NOMINAL_GAIN_PER_S
             / self
                 .model

@@ -4,16 +4,21 @@ pub mod bench;
 mod columns;
 mod foreign;
 pub mod json;
+pub mod on_rig;
+mod partial;
 pub mod report;
 pub mod run;
 
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
+use crate::rig_file::{ClockKind, Frames, RigFile};
+use crate::setup;
 use bench::Setup;
+use cellpos_control::Pi;
 use cellpos_emulator::WorldConfig;
 use cellpos_ident::excitation::{Limits, PAPER_FREQUENCIES_HZ};
 use cellpos_plant::Model;
 use cellpos_rig::Clock;
-use cellpos_units::{Hertz, Micrometers, MicrometersPerSecond};
+use cellpos_units::{Hertz, Micrometers, MicrometersPerSecond, Seconds};
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 
@@ -26,15 +31,6 @@ pub enum Switch {
     Off,
 }
 
-/// Which clock.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
-pub enum ClockKind {
-    /// As fast as this machine can, the same to the bit for a seed.
-    Virtual,
-    /// The machine's clock.
-    Real,
-}
-
 /// How to excite.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
 pub enum Excitation {
@@ -42,12 +38,15 @@ pub enum Excitation {
     Stepped,
     /// All lines at once, random phases, odd lines with detection lines between.
     Multisine,
+    /// A logarithmic sweep through all lines, repeated.
+    Sweep,
 }
 
 /// Arguments of `cellpos identify`.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:\n  \
     cellpos identify --seed 3 --out model.toml --report identify.html\n  \
+    cellpos identify --rig rig.toml --out model.toml\n  \
     cellpos identify --data record.csv --input pzt_um --output bead_um --rate 1kHz\n  \
     cellpos identify --data Model_Vi_Do.dat --input 1 --output 5 --rate 200Hz --hold none")]
 pub struct Args {
@@ -69,15 +68,27 @@ pub struct Args {
     /// Highest order of a linear model tried on records.
     #[arg(long, default_value_t = 4, value_parser = clap::value_parser!(u8).range(0..=8))]
     order: u8,
-    /// Plant of the emulated rig, and what amplitudes are shaped by: `eq6` or a model.toml.
+    /// The rig, through the same loop as `cellpos track`; left out: an emulated one.
+    #[arg(long, conflicts_with_all = ["data", "open_loop"])]
+    rig: Option<PathBuf>,
+    /// Go on from the finished segments of an identification that was stopped.
+    #[arg(long, conflicts_with = "data")]
+    resume: Option<PathBuf>,
+    /// Exposure of the camera of `--rig`; left out: that of its `[emulator]`.
+    #[arg(long, requires = "rig")]
+    exposure: Option<Seconds>,
+    /// Do not ask the operating system for real time.
+    #[arg(long, requires = "rig")]
+    best_effort: bool,
+    /// Plant that amplitudes and the holding loop are made for, and that of the emulated rig: `eq6` or a model.toml.
     #[arg(long, default_value = "eq6")]
     model: String,
-    /// Seed of the emulated rig, the excitation and the bootstrap.
-    #[arg(long, default_value_t = 1)]
-    seed: u64,
-    /// Clock of the emulated rig.
-    #[arg(long, value_enum, default_value_t = ClockKind::Virtual)]
-    clock: ClockKind,
+    /// Seed of the emulated rig, the excitation and the bootstrap [default: that of rig.toml, else 1].
+    #[arg(long)]
+    seed: Option<u64>,
+    /// Clock of the emulated rig [default: virtual; a real rig has the real one].
+    #[arg(long, value_enum)]
+    clock: Option<ClockKind>,
     /// Frames through the localiser, or positions with the noise that frames would give.
     #[arg(long, value_enum, default_value_t = Switch::On)]
     frames: Switch,
@@ -188,6 +199,37 @@ fn checked(args: &Args) -> Result<(), Failure> {
     Ok(())
 }
 
+/// The rig of `--rig`, with a PI for its delay.
+fn on_rig(args: &Args, model: &Model) -> Result<Option<on_rig::OnRig>, Failure> {
+    let Some(path) = &args.rig else {
+        return Ok(None);
+    };
+    let mut file = RigFile::load(Some(path))?;
+    if let Some(seed) = args.seed {
+        file.emulator.seed = seed;
+    }
+    let emulated = file.is_emulated();
+    let clock = args.clock.unwrap_or(if emulated {
+        ClockKind::Virtual
+    } else {
+        ClockKind::Real
+    });
+    let mut controller = setup::controller("pi", model, &file.timing)?;
+    // The rig's own limits alone: a controller's narrower ones are for holding, not for driving.
+    controller.limits = file.limits;
+    Ok(Some(on_rig::OnRig {
+        controller,
+        model: model.clone(),
+        clock,
+        frames: match args.frames {
+            Switch::On => Frames::On,
+            Switch::Off => Frames::Off,
+        },
+        best_effort: args.best_effort,
+        file,
+    }))
+}
+
 fn job(args: &Args) -> Result<run::Job, Failure> {
     let model = Model::load(&args.model).map_err(Failure::input)?;
     let mut lines_hz: Vec<f64> = if args.frequency.is_empty() {
@@ -197,35 +239,65 @@ fn job(args: &Args) -> Result<run::Job, Failure> {
     };
     lines_hz.sort_by(f64::total_cmp);
     lines_hz.dedup();
-    let setup = Setup {
-        world: WorldConfig {
-            seed: args.seed,
+    let rig = on_rig(args, &model)?;
+    let seed = args
+        .seed
+        .or(rig.as_ref().map(|rig| rig.file.emulator.seed))
+        .unwrap_or(1);
+    let mut world = match &rig {
+        Some(rig) => rig.file.emulator.clone(),
+        None => WorldConfig {
             model: args.model.clone(),
             ..WorldConfig::default()
         },
+    };
+    world.seed = seed;
+    if let Some(rig) = &rig {
+        world.rate_hz = 1e6 / rig.file.timing.period_us;
+        world.latency_ms = rig.file.timing.camera_delay_ms;
+    }
+    if let Some(exposure) = args.exposure {
+        world.exposure_ms = exposure.0 * 1e3;
+    }
+    let clock = match (&rig, args.clock) {
+        (Some(rig), _) if !rig.file.is_emulated() => ClockKind::Real,
+        (_, clock) => clock.unwrap_or(ClockKind::Virtual),
+    };
+    let setup = Setup {
+        world,
         model,
         frames: args.frames == Switch::On,
-        clock: match args.clock {
+        clock: match clock {
             ClockKind::Virtual => Clock::virtual_at(0),
             ClockKind::Real => Clock::Real,
         },
         closed_loop: !args.open_loop,
+        pi: rig
+            .as_ref()
+            .map(|rig| Pi::new(rig.controller.pi.kp_um_per_um, rig.controller.pi.ki_per_s)),
     };
+    let slew_um_per_s = rig
+        .as_ref()
+        .map_or(40_000.0, |rig| rig.file.limits.slew_um_per_s.min(40_000.0));
     Ok(run::Job {
-        // The board follows steps of up to 4 um within its first update; beyond that its slew would bend the drive.
+        // The board follows a step within its first update of 0.1 ms if the slew lets it (4 um at 40 um/ms); a larger one
+        // would be late by more, and bend the drive. A fifth is left to the loop that holds the bead.
         limits: Limits {
             bead_um: args.bead_amplitude.0,
             bead_um_per_s: args.bead_speed.0,
             pzt_um: args.pzt_amplitude.0,
-            slew_um_per_s: 3_200.0,
+            slew_um_per_s: 0.08 * slew_um_per_s,
         },
         setup,
         lines_hz,
-        multisine: args.excitation == Excitation::Multisine,
+        excitation: args.excitation,
         seconds_at_1_hz: 40.0,
         led_edges: args.led_edges,
         bootstrap: args.bootstrap,
-        seed: args.seed,
+        seed,
+        rig,
+        resume: args.resume.clone(),
+        keep_in: None,
     })
 }
 
@@ -235,7 +307,18 @@ pub fn run(args: Args) -> CommandResult {
         return foreign::run(&args);
     }
     checked(&args)?;
-    let job = job(&args)?;
+    let mut job = job(&args)?;
+    let folder = if args.out.is_none() || args.report.is_none() {
+        Some(new_run_folder("identify")?)
+    } else {
+        None
+    };
+    // Beside the model that will be written, so that a resumed identification finds it where the user looks.
+    let beside = args
+        .out
+        .as_ref()
+        .map(|out| out.with_extension("partial.json"));
+    job.keep_in = beside.or(folder.as_ref().map(|f| f.join("partial.json")));
     let bar = indicatif::ProgressBar::new(0);
     bar.set_style(
         indicatif::ProgressStyle::with_template("{bar:40} {pos}/{len} ticks, {eta} left")
@@ -247,11 +330,6 @@ pub fn run(args: Args) -> CommandResult {
     })?;
     bar.finish_and_clear();
 
-    let folder = if args.out.is_none() || args.report.is_none() {
-        Some(new_run_folder("identify")?)
-    } else {
-        None
-    };
     let place = |given: &Option<PathBuf>, name: &str| {
         given
             .clone()
@@ -274,7 +352,10 @@ pub fn run(args: Args) -> CommandResult {
         ),
         (
             "rig".to_owned(),
-            format!("emulated, model {}, seed {}", args.model, args.seed),
+            match &args.rig {
+                Some(path) => path.display().to_string(),
+                None => format!("emulated, model {}, seed {}", args.model, job.seed),
+            },
         ),
     ]);
     let model = done

@@ -1,11 +1,16 @@
-//! From arguments to a finished identification of the emulated rig: plan, run, delay test, summary.
+//! From arguments to a finished identification: plan, run, delay test, summary.
 
+use super::Excitation;
 use super::bench::{DelayTest, HeldBead, Setup};
+use super::on_rig::OnRig;
+use super::partial;
 use crate::outcome::Failure;
 use cellpos_ident::excitation::Limits;
 use cellpos_ident::experiment::{Cause, Measured, Plan, RecordedSegment};
 use cellpos_ident::frequency_response::Settings;
 use cellpos_ident::summary::{Identification, summarise};
+use cellpos_plant::Hertz;
+use std::path::PathBuf;
 
 /// What to measure.
 #[derive(Debug, Clone)]
@@ -14,8 +19,8 @@ pub struct Job {
     pub setup: Setup,
     /// Lines, Hz.
     pub lines_hz: Vec<f64>,
-    /// All lines at once (random-phase multisine) or one after the other.
-    pub multisine: bool,
+    /// How to excite.
+    pub excitation: Excitation,
     /// Largest amplitudes.
     pub limits: Limits,
     /// Measuring time per line is this over the frequency, s at 1 Hz.
@@ -26,6 +31,12 @@ pub struct Job {
     pub bootstrap: usize,
     /// Seed of excitation, dither and bootstrap.
     pub seed: u64,
+    /// The rig of a rig.toml; left out: an emulated one in this process, without the loop's threads.
+    pub rig: Option<OnRig>,
+    /// Segments of a stopped identification to go on from.
+    pub resume: Option<PathBuf>,
+    /// Where finished segments go when the identification is stopped.
+    pub keep_in: Option<PathBuf>,
 }
 
 /// What came of it.
@@ -40,44 +51,37 @@ pub struct Done {
     pub led: Option<DelayTest>,
     /// PZT displacement at rest, um.
     pub neutral_um: f64,
+    /// Mean time from the arrival of a frame to its tick, s; contained in the delay.
+    pub wait_s: f64,
 }
 
 /// Runs a job; `progress` hears ticks done and ticks in all.
-pub fn run(job: &Job, mut progress: impl FnMut(usize, usize)) -> Result<Done, Failure> {
-    let expected = job.setup.expected()?;
-    let period_s = job.setup.sampling().period_s;
-    let plan = if job.multisine {
-        Plan::multisine(
-            &job.lines_hz,
-            &expected,
-            job.limits,
-            period_s,
-            job.seconds_at_1_hz,
-            job.seed,
-        )
-    } else {
-        Plan::stepped_sines(
-            &job.lines_hz,
-            &expected,
-            job.limits,
-            period_s,
-            job.seconds_at_1_hz,
-        )
-    };
+pub fn run(job: &Job, mut progress: impl FnMut(usize, usize) + Send) -> Result<Done, Failure> {
+    let plan = plan(job)?;
     let total = plan.ticks() + job.led_edges * 11;
-    let mut bead = HeldBead::open(job.setup.clone())?;
-    let records = acquire(&plan, &mut bead, |ticks| progress(ticks, total))?;
+    let records = match &job.resume {
+        Some(path) => partial::load(path, &plan)?,
+        None => Vec::new(),
+    };
+    let mut heard = |ticks: usize| progress(ticks.min(total), total);
+    let Raw {
+        records,
+        mut led,
+        neutral_um,
+        wait_s,
+    } = match &job.rig {
+        Some(rig) => on_rig(job, rig, &plan, records, &mut heard)?,
+        None => held_bead(job, &plan, records, &mut heard)?,
+    };
     let measured = plan
         .analyse(&records, &Settings::default())
         .map_err(Failure::failed)?;
-    let led = if job.led_edges > 0 {
-        Some(bead.delay_test(job.led_edges, job.seed)?)
-    } else {
-        None
-    };
-    let neutral_um = bead.neutral_um();
-    bead.close()?;
     progress(total, total);
+    // The LED test ends at the frame's arrival, a row of the record at its tick.
+    if let Some(test) = &mut led {
+        test.estimate.delay_s += wait_s;
+        test.estimate.ci95_s = test.estimate.ci95_s.map(|end| end + wait_s);
+    }
     let result = conclude(job, measured, led.as_ref())?;
     Ok(Done {
         plan,
@@ -85,7 +89,152 @@ pub fn run(job: &Job, mut progress: impl FnMut(usize, usize)) -> Result<Done, Fa
         result,
         led,
         neutral_um,
+        wait_s,
     })
+}
+
+fn plan(job: &Job) -> Result<Plan, Failure> {
+    let expected = job.setup.expected()?;
+    let period_s = job.setup.sampling().period_s;
+    let (lines_hz, seconds) = (&job.lines_hz, job.seconds_at_1_hz);
+    Ok(match job.excitation {
+        Excitation::Multisine => {
+            Plan::multisine(lines_hz, &expected, job.limits, period_s, seconds, job.seed)
+        }
+        Excitation::Stepped => {
+            Plan::stepped_sines(lines_hz, &expected, job.limits, period_s, seconds)
+        }
+        Excitation::Sweep => Plan::log_sweep(lines_hz, &expected, job.limits, period_s, seconds),
+    })
+}
+
+/// What was acquired.
+struct Raw {
+    records: Vec<RecordedSegment>,
+    led: Option<DelayTest>,
+    neutral_um: f64,
+    wait_s: f64,
+}
+
+fn held_bead(
+    job: &Job,
+    plan: &Plan,
+    mut records: Vec<RecordedSegment>,
+    progress: &mut dyn FnMut(usize),
+) -> Result<Raw, Failure> {
+    // Segments run in order here: what was measured behind a gap is measured again.
+    let whole = records.iter().zip(0..).take_while(|(r, i)| r.index == *i);
+    records.truncate(whole.count());
+    let mut bead = HeldBead::open(job.setup.clone())?;
+    let records = acquire(job, plan, &mut bead, records, progress)?;
+    let led = if job.led_edges > 0 {
+        Some(bead.delay_test(job.led_edges, job.seed)?)
+    } else {
+        None
+    };
+    let neutral_um = bead.neutral_um();
+    bead.close()?;
+    Ok(Raw {
+        records,
+        led,
+        neutral_um,
+        // Ticks fall on the arrivals of frames here.
+        wait_s: 0.0,
+    })
+}
+
+/// Runs on the rig of a rig.toml until no segment is missing, at most four times.
+fn on_rig(
+    job: &Job,
+    rig: &OnRig,
+    plan: &Plan,
+    mut records: Vec<RecordedSegment>,
+    progress: &mut (dyn FnMut(usize) + Send),
+) -> Result<Raw, Failure> {
+    const ATTEMPTS: usize = 4;
+    let (mut neutral_um, mut wait_s) = (rig.file.first_neutral_um, 0.0);
+    for attempt in 1..=ATTEMPTS {
+        let missing = |index: &usize| records.iter().all(|r| r.index != *index);
+        let todo: Vec<usize> = (0..plan.segments.len()).filter(missing).collect();
+        if todo.is_empty() {
+            break;
+        }
+        let acquired = match rig.acquire(plan, &todo, progress) {
+            Ok(acquired) => acquired,
+            Err(failure) => {
+                kept(job, plan, &records)?;
+                return Err(failure);
+            }
+        };
+        records.extend(acquired.records);
+        records.sort_by_key(|r| r.index);
+        (neutral_um, wait_s) = (acquired.neutral_um, acquired.wait_s);
+        if let Some(trouble) = acquired.trouble {
+            let fatal = trouble.contains("Safe") || attempt == ATTEMPTS;
+            if fatal && records.len() < plan.segments.len() {
+                return Err(stopped(job, plan, &records, &trouble)?);
+            }
+            tracing::warn!("{trouble}; measuring again what is missing");
+        }
+    }
+    let led = match (job.led_edges, rig.file.is_emulated()) {
+        (0, _) => None,
+        (edges, true) => {
+            let mut world = rig.file.emulator.clone();
+            world.faults = Default::default();
+            let model = cellpos_plant::Model::load(&world.model).map_err(Failure::input)?;
+            let clock = job.setup.clock.clone();
+            let setup = Setup {
+                world,
+                model,
+                clock,
+                frames: true,
+                closed_loop: true,
+                pi: None,
+            };
+            Some(HeldBead::open(setup)?.delay_test(edges, job.seed)?)
+        }
+        (edges, false) => Some(rig.delay_test(edges, job.seed)?),
+    };
+    Ok(Raw {
+        records,
+        led,
+        neutral_um,
+        wait_s,
+    })
+}
+
+/// Keeps what is finished; where, if anything is.
+fn kept(job: &Job, plan: &Plan, records: &[RecordedSegment]) -> Result<Option<PathBuf>, Failure> {
+    let Some(path) = job.keep_in.as_ref().filter(|_| !records.is_empty()) else {
+        return Ok(None);
+    };
+    partial::save(path, plan, records)?;
+    Ok(Some(path.clone()))
+}
+
+/// The failure of an identification that was stopped: what is finished is kept, and the message says how to go on.
+fn stopped(
+    job: &Job,
+    plan: &Plan,
+    records: &[RecordedSegment],
+    why: &dyn std::fmt::Display,
+) -> Result<Failure, Failure> {
+    let (done, all) = (records.len(), plan.segments.len());
+    Ok(Failure::Failed(match kept(job, plan, records)? {
+        Some(path) => miette::miette!(
+            help = format!(
+                "bring a bead into view and go on with the same arguments and --resume {}",
+                path.display()
+            ),
+            "{why}; {done} of {all} segments are kept in {}",
+            path.display()
+        ),
+        None => miette::miette!(
+            help = "bring a bead into view and start again",
+            "{why}; none of {all} segments was finished"
+        ),
+    }))
 }
 
 fn conclude(
@@ -99,6 +248,7 @@ fn conclude(
         led.map(|l| l.estimate),
         job.bootstrap,
         job.seed,
+        Some(job.setup.model.plant.velocity_gain_at(Hertz(2.0))),
     )
     .map_err(Failure::failed)
 }
@@ -106,25 +256,29 @@ fn conclude(
 /// Runs a plan. A bead that is lost once is given up and a new one waited for: the experiment resumes at the segment
 /// that failed, at most three times.
 fn acquire(
+    job: &Job,
     plan: &Plan,
     bead: &mut HeldBead,
-    mut progress: impl FnMut(usize),
+    mut records: Vec<RecordedSegment>,
+    mut progress: &mut dyn FnMut(usize),
 ) -> Result<Vec<RecordedSegment>, Failure> {
-    let mut records: Vec<RecordedSegment> = Vec::new();
     for attempt in 0..4 {
         match plan.run(bead, records.len(), &mut progress) {
             Ok(more) => {
                 records.extend(more);
                 return Ok(records);
             }
-            Err(stopped) => {
-                records.extend(stopped.done);
-                match stopped.cause {
-                    Cause::Rig(failure) => return Err(failure),
+            Err(ended) => {
+                records.extend(ended.done);
+                match ended.cause {
+                    Cause::Rig(failure) => {
+                        kept(job, plan, &records)?;
+                        return Err(failure);
+                    }
                     Cause::BeadLost(error)
                         if attempt == 3 || bead.setup().world.new_bead_after_ms.is_none() =>
                     {
-                        return Err(Failure::failed(error));
+                        return Err(stopped(job, plan, &records, &error)?);
                     }
                     Cause::BeadLost(error) => {
                         tracing::warn!("{error}; waiting for another bead");

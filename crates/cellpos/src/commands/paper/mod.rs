@@ -8,7 +8,7 @@ mod table;
 
 use super::identify::bench::{HeldBead, Setup};
 use super::identify::run::{Done, Job, run as identify};
-use super::identify::{command_line, new_run_folder};
+use super::identify::{Excitation, command_line, new_run_folder};
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
 use cellpos_emulator::WorldConfig;
 use cellpos_ident::bare_fft;
@@ -61,6 +61,7 @@ fn setup(seed: u64, drift_um_per_s: f64, start_um: f64, closed_loop: bool) -> Se
         frames: true,
         clock: Clock::virtual_at(0),
         closed_loop,
+        pi: None,
     }
 }
 
@@ -134,7 +135,7 @@ fn job(seed: u64) -> Job {
     Job {
         setup: setup(seed, WorldConfig::default().drift_um_per_s, 0.0, true),
         lines_hz: PAPER_FREQUENCIES_HZ.to_vec(),
-        multisine: false,
+        excitation: Excitation::Stepped,
         limits: Limits {
             bead_um: 8.0,
             bead_um_per_s: 400.0,
@@ -145,6 +146,9 @@ fn job(seed: u64) -> Job {
         led_edges: 300,
         bootstrap: 200,
         seed,
+        rig: None,
+        resume: None,
+        keep_in: None,
     }
 }
 
