@@ -1,5 +1,6 @@
 //! One module a command: `Args` (read by clap), `run(args)` (calls the libraries, prints the result).
 
+pub mod bundle;
 pub mod camera;
 pub mod check;
 pub mod design;
@@ -9,6 +10,7 @@ pub mod identify;
 pub mod paper;
 pub mod reconcile;
 pub mod replay;
+pub mod report;
 pub mod run;
 pub mod simulate;
 pub mod track;
@@ -33,6 +35,10 @@ pub enum Command {
     Simulate(simulate::Args),
     /// Run a recorded run through its controller again and compare to the bit.
     Replay(replay::Args),
+    /// What a run did, on one page: traces, errors, cycles, timing, events, provenance.
+    Report(report::Args),
+    /// A run packed for archiving, with a manifest.
+    Bundle(bundle::Args),
     /// A run as CSV or Parquet, for other programs.
     Export(export::Args),
     /// Is this machine fit for a 1 kHz loop: verdict, reasons, what to change.
@@ -59,6 +65,8 @@ impl Command {
             Self::Design(args) => design::run(args),
             Self::Check(args) => check::run(args),
             Self::Simulate(args) => simulate::run(args),
+            Self::Report(args) => report::run(args),
+            Self::Bundle(args) => bundle::run(args),
             Self::Export(args) => export::run(args),
             Self::Doctor(args) => doctor::run(args),
             Self::Identify(args) => identify::run(*args),

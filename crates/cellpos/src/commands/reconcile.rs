@@ -3,6 +3,7 @@
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
 use cellpos_plant::{Model, Noise, TransferFunction};
 use cellpos_reconcile::{Options, ReconcileError, Reconciliation, Record, Verdict, reconcile};
+use cellpos_record::RunReader;
 use cellpos_table::{ColumnRef, Table};
 use std::path::{Path, PathBuf};
 
@@ -78,6 +79,7 @@ pub fn run(args: Args) -> CommandResult {
     };
     let model = if args.model == "fit" {
         options.interpolated_input = true;
+        options.free_gain = true;
         fitted(&records)?
     } else {
         Model::load(&args.model).map_err(Failure::input)?
@@ -235,6 +237,9 @@ fn read(path: &Path, args: &Args) -> Result<Record, Failure> {
         || path.display().to_string(),
         |s| s.to_string_lossy().into_owned(),
     );
+    if is_run(path) {
+        return read_run(path, &name);
+    }
     let bytes = std::fs::read(path).map_err(|e| {
         Failure::bad_input(
             format!("cannot read {}: {e}", path.display()),
@@ -283,7 +288,17 @@ fn read(path: &Path, args: &Args) -> Result<Record, Failure> {
     Record::from_rows(&name, &t, &u, &y).map_err(refused)
 }
 
-/// A base model for data without one: a constant gain about the middle of the command.
+/// A run folder, of an open or a closed loop: the commands given, and the positions as the camera delivered them.
+fn read_run(path: &Path, name: &str) -> Result<Record, Failure> {
+    let run = RunReader::open(path).map_err(Failure::input)?;
+    let record = run.to_record().map_err(Failure::input)?;
+    let time_s: Vec<f64> = (0..record.len())
+        .map(|k| record.start_s + k as f64 * record.step_s)
+        .collect();
+    Record::from_rows(name, &time_s, &record.pzt_um, &record.bead_um).map_err(refused)
+}
+
+/// A base model for data without one: a constant gain about the command before the records began.
 fn fitted(records: &[Record]) -> Result<Model, Failure> {
     let (gain, working_point_um) = cellpos_reconcile::constant_gain(records).map_err(refused)?;
     Ok(Model {

@@ -1,7 +1,7 @@
 //! `cellpos run`: a setpoint script in closed loop, with a row for each cycle; resumed after whatever ended it.
 
 mod keys;
-mod resume;
+pub(super) mod resume;
 mod sink;
 mod text;
 
@@ -100,8 +100,15 @@ pub struct SessionConfig {
     after: Option<String>,
 }
 
+impl SessionConfig {
+    /// From the last write of the session before to the start of this one, s.
+    pub fn gap_s(&self) -> Option<f64> {
+        self.gap_s
+    }
+}
+
 /// A session before the board is armed.
-struct Ready {
+pub(super) struct Ready {
     file: RigFile,
     prepared: Prepared,
     reference: ReferenceSpec,

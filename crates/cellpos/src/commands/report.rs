@@ -1,0 +1,315 @@
+//! `cellpos report`: what a run did, on one page.
+
+mod cycles;
+mod spectrum;
+mod ticks;
+
+use super::run::resume;
+use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
+use cellpos_record::{CYCLES_CSV, Lost, RunMeta, RunReader};
+use cellpos_report::{Axis, Column, Figure, Panel, Report, Series, Status, Table};
+use cellpos_script::read_cycles;
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use ticks::Ticks;
+
+/// Arguments of `cellpos report`.
+#[derive(Debug, clap::Args)]
+#[command(after_help = "Example:
+  cellpos report runs/20261121T190000Z-fatigue
+
+Writes report.html into the run folder, and beside it report-figures/ with every figure as SVG and its data as CSV. The
+sessions of a run that was resumed are joined; the gaps show.")]
+pub struct Args {
+    /// The run's folder.
+    run: PathBuf,
+    /// The page to write; left out: report.html in the run folder.
+    #[arg(long)]
+    out: Option<PathBuf>,
+    /// Print one JSON object on standard output.
+    #[arg(long)]
+    json: bool,
+}
+
+/// A session as it was read.
+struct Session {
+    folder: PathBuf,
+    meta: Option<RunMeta>,
+    lost: Lost,
+    events: Vec<cellpos_record::Event>,
+    /// Start since the start of the run, s.
+    start_s: f64,
+}
+
+/// Writes the page.
+pub fn run(args: Args) -> CommandResult {
+    let first = RunReader::open(&args.run).map_err(Failure::input)?;
+    let mut ticks = Ticks::default();
+    let mut sessions = Vec::new();
+    for folder in resume::sessions(&args.run) {
+        let reader = RunReader::open(&folder).map_err(Failure::input)?;
+        let gap_s = resume::session_config(&reader).and_then(|config| config.gap_s());
+        let start_s = if sessions.is_empty() {
+            0.0
+        } else {
+            ticks.end_s() + gap_s.unwrap_or(0.0)
+        };
+        let mut batches = reader.batches().map_err(Failure::failed)?;
+        ticks.begin(start_s);
+        for batch in batches.by_ref() {
+            batch.iter().for_each(|record| ticks.add(record));
+        }
+        sessions.push(Session {
+            lost: batches.lost(),
+            events: reader.events().map_err(Failure::failed)?.events,
+            meta: reader.meta().ok().cloned(),
+            folder,
+            start_s,
+        });
+    }
+    let meta = first.meta().ok();
+    let name = meta.map_or("run", |meta| meta.name.as_str());
+    let mut page = Report::new(&format!("Run {name}"));
+    head(&mut page, &sessions, &ticks);
+    let text = std::fs::read_to_string(args.run.join(CYCLES_CSV)).unwrap_or_default();
+    let (rows, unreadable) = read_cycles(&text);
+    traces(&mut page, &ticks);
+    let bound = spectrum::Bound::of(meta, &ticks);
+    errors(&mut page, &ticks, bound.as_ref());
+    let trends = cycles::section(&mut page, &rows, unreadable);
+    timing(&mut page, &sessions, &ticks);
+    events(&mut page, &sessions);
+    provenance(&mut page, &sessions);
+    let out = args.out.unwrap_or_else(|| args.run.join("report.html"));
+    page.write_with_figures(&out).map_err(Failure::failed)?;
+    if args.json {
+        print_json(&serde_json::json!({
+            "out": out,
+            "sessions": sessions.len(),
+            "ticks": ticks.rows,
+            "cycles": rows.len(),
+            "rms_nm": ticks.rms_um().map(|um| um * 1e3),
+            "bound_rms_nm": bound.as_ref().map(|bound| bound.rms_um * 1e3),
+            "trends": trends,
+        }))?;
+    } else {
+        print_text(&format!("{}\n", out.display()))?;
+    }
+    Ok(Outcome::Done)
+}
+
+fn nm(um: Option<f64>) -> String {
+    um.map_or_else(|| "-".to_string(), |um| format!("{:.1}", um * 1e3))
+}
+
+fn head(page: &mut Report, sessions: &[Session], ticks: &Ticks) {
+    for (number, session) in (1..).zip(sessions) {
+        let end = session.meta.as_ref().and_then(|meta| meta.end.as_ref());
+        let (status, text) = match end {
+            Some(end) if end.outcome == "done" => (Status::Good, "came to its end".to_string()),
+            Some(end) => (Status::Warning, format!("ended: {}", end.outcome)),
+            None => (
+                Status::Bad,
+                "was cut off: it reads up to its last flush".to_string(),
+            ),
+        };
+        page.note(status, &format!("Session {number} {text}."));
+        if session.lost.rows > 0 || session.lost.damaged_bytes > 0 {
+            page.note(
+                Status::Warning,
+                &format!(
+                    "Session {number}: {} rows are missing, {} bytes damaged.",
+                    session.lost.rows, session.lost.damaged_bytes
+                ),
+            );
+        }
+        if let Some(end) = end.filter(|end| end.rows_lost + end.events_lost > 0) {
+            page.note(
+                Status::Warning,
+                &format!(
+                    "Session {number}: {} rows and {} events could not be written.",
+                    end.rows_lost, end.events_lost
+                ),
+            );
+        }
+    }
+    let rows = [
+        ("ticks", ticks.rows.to_string()),
+        ("duration (s)", format!("{:.3}", ticks.end_s())),
+        ("error, RMS (nm)", nm(ticks.rms_um())),
+        ("error, mean (nm)", nm(ticks.mean_um())),
+        ("error, largest (nm)", nm(ticks.peak_um())),
+    ];
+    let mut table = Table::key_values(&rows);
+    table.caption("Errors: measured position less the reference of the time of its exposure.");
+    page.table(table);
+}
+
+fn traces(page: &mut Report, ticks: &Ticks) {
+    page.section("Traces");
+    let time = || Axis::linear("time", "s");
+    let every = ticks.stride();
+    page.figure(
+        Figure::new(
+            "traces",
+            &format!("Reference, position, PZT over the whole run; every {every}th tick."),
+        )
+        .panel(
+            Panel::new(time(), Axis::linear("bead", "um"))
+                .series(Series::line("reference", &ticks.time_s, &ticks.target_um))
+                .series(Series::line("measured", &ticks.time_s, &ticks.measured_um).thin()),
+        )
+        .panel(
+            Panel::new(time(), Axis::linear("PZT", "um"))
+                .series(Series::step("command", &ticks.time_s, &ticks.command_um).color(2))
+                .series(Series::line("neutral", &ticks.time_s, &ticks.neutral_um).color(3)),
+        )
+        .share_x(),
+    );
+    let near = &ticks.excerpt;
+    page.figure(
+        Figure::new(
+            "excerpt",
+            "Every tick of the first two seconds of the closed loop.",
+        )
+        .panel(
+            Panel::new(time(), Axis::linear("bead", "um"))
+                .series(Series::line("reference", &near.time_s, &near.target_um))
+                .series(Series::line("measured", &near.time_s, &near.measured_um).thin()),
+        )
+        .panel(
+            Panel::new(time(), Axis::linear("PZT", "um"))
+                .series(Series::step("command", &near.time_s, &near.command_um).color(2)),
+        )
+        .share_x(),
+    );
+}
+
+fn errors(page: &mut Report, ticks: &Ticks, bound: Option<&spectrum::Bound>) {
+    page.section("Error");
+    let finite: Vec<f64> = ticks.error_um.iter().map(|um| um * 1e3).collect();
+    page.figure(
+        Figure::new("error-histogram", "Error of every position, closed loop.").panel(
+            Panel::new(Axis::linear("error", "nm"), Axis::linear("positions", ""))
+                .series(Series::histogram("error", &finite, 80)),
+        ),
+    );
+    let Some(spectrum) = spectrum::welch(&ticks.error_um, ticks.period_s()) else {
+        page.paragraph("The run is too short for a spectrum.");
+        return;
+    };
+    let mut panel = Panel::new(
+        Axis::log("frequency", "Hz"),
+        Axis::log("density", "nm/rtHz"),
+    )
+    .series(Series::line("error", &spectrum.hz, &spectrum.nm_per_rthz));
+    let mut caption = "Amplitude density of the error, one-sided.".to_string();
+    if let Some(bound) = bound {
+        let density: Vec<f64> = spectrum
+            .hz
+            .iter()
+            .map(|hz| bound.nm_per_rthz(*hz))
+            .collect();
+        panel = panel.series(Series::line("bound", &spectrum.hz, &density).dashed());
+        caption.push_str(&format!(
+            " Dashed: what Brownian motion ({} um2/s), delay and localisation noise leave to the best controller while \
+             holding, {:.1} nm RMS.",
+            bound.diffusion_um2_per_s,
+            bound.rms_um * 1e3
+        ));
+    }
+    page.figure(Figure::new("error-spectrum", &caption).panel(panel));
+}
+
+fn timing(page: &mut Report, sessions: &[Session], ticks: &Ticks) {
+    page.section("Loop timing");
+    if ticks.compute_us.iter().all(|us| *us == 0.0) {
+        page.paragraph("Virtual clock: ticks take no time.");
+    } else {
+        page.figure(
+            Figure::new("timing", "Wake-up and compute time of every tick.")
+                .panel(
+                    Panel::new(Axis::linear("wake-up", "us"), Axis::linear("ticks", ""))
+                        .series(Series::histogram("wake-up", &ticks.wake_us, 80)),
+                )
+                .panel(
+                    Panel::new(Axis::linear("compute", "us"), Axis::linear("ticks", ""))
+                        .series(Series::histogram("compute", &ticks.compute_us, 80)),
+                ),
+        );
+    }
+    for (number, session) in (1..).zip(sessions) {
+        let end = session.meta.as_ref().and_then(|meta| meta.end.as_ref());
+        if let Some(end) = end.filter(|end| !end.summary.is_empty()) {
+            page.subsection(&format!("Figures of session {number}"));
+            page.verbatim(&toml::to_string(&end.summary).unwrap_or_default());
+        }
+    }
+}
+
+fn events(page: &mut Report, sessions: &[Session]) {
+    const MOST: usize = 200;
+    page.section("Events");
+    let mut counts: BTreeMap<&str, u64> = BTreeMap::new();
+    for event in sessions.iter().flat_map(|session| &session.events) {
+        *counts.entry(event.event.as_str()).or_default() += 1;
+    }
+    let mut table = Table::new([Column::left("event"), Column::right("how often")]);
+    for (name, count) in &counts {
+        table.row([*name, &count.to_string()]);
+    }
+    page.table(table);
+    // What comes by the thousand is in events.jsonl; here is what a person wants to see.
+    let daily = |name: &str| counts.get(name).is_some_and(|count| *count > 50);
+    let mut table = Table::new([
+        Column::right("time (s)"),
+        Column::left("event"),
+        Column::left("particulars"),
+    ]);
+    let mut left_out = 0;
+    let mut shown = 0;
+    for session in sessions {
+        for event in session.events.iter().filter(|event| !daily(&event.event)) {
+            if shown == MOST {
+                left_out += 1;
+                continue;
+            }
+            shown += 1;
+            let data = serde_json::to_string(&event.data).unwrap_or_default();
+            let time = format!("{:.3}", session.start_s + event.time_s);
+            table.row([time.as_str(), &event.event, &data]);
+        }
+    }
+    table.caption(&format!(
+        "Events that happened at most 50 times; {left_out} more are in events.jsonl."
+    ));
+    page.table(table);
+}
+
+fn provenance(page: &mut Report, sessions: &[Session]) {
+    page.section("Conditions and provenance");
+    let mut table = Table::new([
+        Column::left("input"),
+        Column::right("bytes"),
+        Column::left("SHA-256"),
+    ]);
+    let metas = sessions.iter().filter_map(|session| session.meta.as_ref());
+    for input in metas.flat_map(|meta| &meta.inputs) {
+        table.row([input.path.as_str(), &input.bytes.to_string(), &input.sha256]);
+    }
+    page.table(table);
+    for session in sessions {
+        page.subsection(&folder_name(&session.folder));
+        let path = session.folder.join(cellpos_record::RUN_TOML);
+        match std::fs::read_to_string(&path) {
+            Ok(text) => page.verbatim(&text),
+            Err(error) => page.note(Status::Bad, &format!("{}: {error}", path.display())),
+        };
+    }
+}
+
+fn folder_name(folder: &Path) -> String {
+    folder
+        .file_name()
+        .map_or_else(|| "run".to_string(), |name| name.to_string_lossy().into())
+}

@@ -1,0 +1,174 @@
+//! Spectrum of the error, and the bound that Brownian motion sets.
+
+use super::ticks::Ticks;
+use cellpos_control::design::bound_rms_um;
+use cellpos_record::RunMeta;
+use realfft::RealFftPlanner;
+use std::f64::consts::{PI, TAU};
+
+/// Rows of a stretch.
+const STRETCH: usize = 4096;
+
+/// An amplitude density.
+#[derive(Debug)]
+pub struct Spectrum {
+    pub hz: Vec<f64>,
+    pub nm_per_rthz: Vec<f64>,
+}
+
+/// Averaged spectrum (Hann windows overlapping by half, each stretch less its mean); values that are missing are taken as
+/// the mean, and stretches of which more than a twentieth is missing are left out. None without a whole stretch.
+pub fn welch(values_um: &[f64], period_s: f64) -> Option<Spectrum> {
+    let stretch = if values_um.len() >= STRETCH {
+        STRETCH
+    } else {
+        512
+    };
+    let fft = RealFftPlanner::<f64>::new().plan_fft_forward(stretch);
+    let window: Vec<f64> = (0..stretch)
+        .map(|k| 0.5 - 0.5 * (TAU * k as f64 / stretch as f64).cos())
+        .collect();
+    let power: f64 = window.iter().map(|w| w * w).sum();
+    let mut sum = vec![0.0; stretch / 2 + 1];
+    let mut count = 0.0;
+    let mut out = fft.make_output_vec();
+    let mut start = 0;
+    while let Some(part) = values_um.get(start..start + stretch) {
+        start += stretch / 2;
+        let seen = part.iter().filter(|um| um.is_finite());
+        let n = seen.clone().count();
+        if n * 20 < stretch * 19 {
+            continue;
+        }
+        let mean = seen.sum::<f64>() / n as f64;
+        let mut input: Vec<f64> = part
+            .iter()
+            .zip(&window)
+            .map(|(um, w)| if um.is_finite() { (um - mean) * w } else { 0.0 })
+            .collect();
+        fft.process(&mut input, &mut out).ok()?;
+        for (sum, bin) in sum.iter_mut().zip(&out) {
+            *sum += bin.norm_sqr();
+        }
+        count += 1.0;
+    }
+    if count == 0.0 {
+        return None;
+    }
+    // The mean was taken away, and the window smears it into the first bin.
+    let bins = 2..stretch / 2;
+    Some(Spectrum {
+        hz: bins
+            .clone()
+            .map(|k| k as f64 / (stretch as f64 * period_s))
+            .collect(),
+        nm_per_rthz: bins
+            .map(|k| (2.0 * sum[k] * period_s / (power * count)).sqrt() * 1e3)
+            .collect(),
+    })
+}
+
+/// What Brownian motion, delay and localisation noise leave to the best controller while holding.
+#[derive(Debug)]
+pub struct Bound {
+    pub diffusion_um2_per_s: f64,
+    pub rms_um: f64,
+    /// Time in which a displacement cannot yet be answered, s.
+    blind_s: f64,
+    period_s: f64,
+}
+
+impl Bound {
+    /// The bound of a run, if its run.toml says enough.
+    pub fn of(meta: Option<&RunMeta>, ticks: &Ticks) -> Option<Self> {
+        let meta = meta?;
+        let at = |path: &[&str]| -> Option<f64> {
+            let (first, rest) = path.split_first()?;
+            let mut value = meta.config.get(*first)?;
+            for key in rest {
+                value = value.get(*key)?;
+            }
+            value.as_float()
+        };
+        let kind = |device: &str| {
+            let rig = meta.config.get("rig")?.get(device)?;
+            rig.get("kind")?.as_str()
+        };
+        let emulated = kind("camera") == Some("emulated");
+        let diffusion_um2_per_s = if emulated {
+            at(&["rig", "emulator", "diffusion_um2_per_s"])?
+        } else {
+            meta.model
+                .get("noise")?
+                .get("diffusion_um2_per_s")?
+                .as_float()?
+        };
+        let delay_s = at(&["timing", "camera_delay_ms"])? * 1e-3;
+        let period_s = at(&["timing", "period_us"])? * 1e-6;
+        Some(Self {
+            diffusion_um2_per_s,
+            rms_um: bound_rms_um(diffusion_um2_per_s, ticks.noise_um(), delay_s, period_s),
+            blind_s: delay_s + period_s,
+            period_s,
+        })
+    }
+
+    /// One-sided amplitude density, nm/rtHz: the walk of the blind time, `4 D T^2 sinc^2(f T)`, and the estimate's own
+    /// variance (the rest of the bound) spread evenly up to half the sampling rate.
+    pub fn nm_per_rthz(&self, hz: f64) -> f64 {
+        let x = PI * hz * self.blind_s;
+        let sinc = if x == 0.0 { 1.0 } else { x.sin() / x };
+        let walk = 4.0 * self.diffusion_um2_per_s * (self.blind_s * sinc).powi(2);
+        let rest = self.rms_um * self.rms_um - 2.0 * self.diffusion_um2_per_s * self.blind_s;
+        (walk + rest.max(0.0) * 2.0 * self.period_s).sqrt() * 1e3
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_spectrum_of_white_noise_is_flat_and_holds_its_variance() {
+        let mut seed = 7u64;
+        let mut values: Vec<f64> = (0..60_000)
+            .map(|_| {
+                seed = seed.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1);
+                (seed >> 11) as f64 / (1u64 << 53) as f64 - 0.5
+            })
+            .collect();
+        for k in (0..values.len()).step_by(97) {
+            values[k] = f64::NAN;
+        }
+        let spectrum = welch(&values, 1e-3).unwrap();
+        // Variance 1/12 um^2 over 500 Hz.
+        let expected = (1.0 / 12.0 / 500.0f64).sqrt() * 1e3;
+        let mean = spectrum.nm_per_rthz.iter().map(|d| d * d).sum::<f64>()
+            / spectrum.nm_per_rthz.len() as f64;
+        assert!(
+            (mean.sqrt() / expected - 1.0).abs() < 0.02,
+            "{mean} {expected}"
+        );
+        assert!(welch(&values[..100], 1e-3).is_none());
+    }
+
+    #[test]
+    fn the_bounds_density_holds_the_bounds_variance() {
+        let bound = Bound {
+            diffusion_um2_per_s: 0.33,
+            rms_um: bound_rms_um(0.33, 0.02, 2e-3, 1e-3),
+            blind_s: 3e-3,
+            period_s: 1e-3,
+        };
+        // To 500 Hz, which leaves a few percent of the walk beyond.
+        let sum: f64 = (0..5000)
+            .map(|k| bound.nm_per_rthz(f64::from(k) * 0.1 + 0.05).powi(2) * 0.1)
+            .sum();
+        let rms = bound.rms_um * 1e3;
+        assert!(
+            (sum.sqrt() / rms - 1.0).abs() < 0.05,
+            "{} {rms}",
+            sum.sqrt()
+        );
+    }
+}
