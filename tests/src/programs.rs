@@ -85,7 +85,11 @@ impl RigInABox {
                 "--log",
                 "box.csv",
             ])
-            .args(["--duration", "120s"])
+            .args(if options.contains(&"--duration") {
+                &[][..]
+            } else {
+                &["--duration", "120s"]
+            })
             .args(options)
             .current_dir(working_folder)
             .stdout(Stdio::null())

@@ -381,3 +381,88 @@ fn a_full_disk_does_not_stop_the_run_and_what_is_lost_is_said() {
     let ticks = result["summary"]["ticks"].as_u64().unwrap();
     assert_eq!(rows + lost, ticks, "every tick is there or counted");
 }
+
+#[test]
+fn a_report_shows_the_run_and_a_bundle_is_what_its_manifest_says() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    script(at, 100);
+    std::fs::write(at.join("cell.toml"), "[emulator.cell]\n").unwrap();
+    json(
+        at,
+        &["run", "quick.toml", "--dry", "--rig", "cell.toml", "--json"],
+    );
+    let run = only_run(at);
+    let name = run.strip_prefix(at).unwrap().to_str().unwrap();
+    let report = json(at, &["report", name, "--json"]);
+    assert_eq!(
+        (&report["cycles"], &report["sessions"]),
+        (&100.into(), &1.into())
+    );
+    // PI on a moving reference is far from what the best controller could do while holding.
+    let (rms, bound) = (&report["rms_nm"], report["bound_rms_nm"].as_f64().unwrap());
+    assert!(
+        (bound - 44.5).abs() < 1.0 && rms.as_f64().unwrap() > bound,
+        "{report}"
+    );
+    let trends = report["trends"].as_array().unwrap();
+    let reached = trends
+        .iter()
+        .find(|trend| trend["quantity"] == "reached over commanded amplitude")
+        .unwrap();
+    assert_eq!(
+        (&reached["arm"], &reached["cycles"]),
+        (&"cyclic".into(), &100.into())
+    );
+    let page = std::fs::read_to_string(run.join("report.html")).unwrap();
+    for part in [
+        "Traces",
+        "Error",
+        "Cycles",
+        "Loop timing",
+        "Events",
+        "provenance",
+        "SHA-256",
+    ] {
+        assert!(page.contains(part), "{part}");
+    }
+    assert!(!page.contains("http-equiv") && !page.contains("src=\"http"));
+    for figure in [
+        "traces",
+        "excerpt",
+        "error-histogram",
+        "error-spectrum",
+        "cycles",
+    ] {
+        assert!(
+            run.join(format!("report-figures/{figure}.csv")).exists(),
+            "{figure}"
+        );
+    }
+
+    let packed = json(at, &["bundle", name, "--json"]);
+    assert_eq!(packed["inputs_missing"], serde_json::json!([]));
+    let bundle = PathBuf::from(format!("{}-bundle", run.display()));
+    assert!(bundle.join("inputs/00-quick.toml").exists());
+    let path = bundle.to_str().unwrap();
+    assert_eq!(
+        json(at, &["bundle", "--verify", path, "--json"])["wrong"],
+        serde_json::json!([])
+    );
+    let (code, _, err) = cellpos(at, &["bundle", name]);
+    assert_eq!(code, Some(2), "never overwritten: {err}");
+    let table = bundle.join("cycles.csv");
+    let text = std::fs::read_to_string(&table).unwrap();
+    std::fs::write(&table, text.replacen("cyclic", "static", 1)).unwrap();
+    std::fs::write(bundle.join("more.txt"), "").unwrap();
+    std::fs::remove_file(bundle.join("run.toml")).unwrap();
+    let (code, out, _) = cellpos(at, &["bundle", "--verify", path]);
+    assert_eq!(code, Some(1));
+    for wrong in [
+        "cycles.csv: changed",
+        "run.toml: missing",
+        "more.txt: not in the manifest",
+    ] {
+        assert!(out.contains(wrong), "{out}");
+    }
+}
