@@ -6,6 +6,8 @@ use std::time::Duration;
 
 const PARK_UM: f64 = 12.0;
 const WATCHDOG_MS: f64 = 100.0;
+/// What was on its way to the board when the program died, and a stall within a row.
+const STALL_MARGIN_MS: f64 = 30.0;
 
 fn write_files(folder: &Path, cycles: u32) {
     let rig = format!(
@@ -44,11 +46,19 @@ fn monotonic_ns() -> i64 {
     now.tv_sec * 1_000_000_000 + now.tv_nsec
 }
 
-/// The board's first safe row after a time, and how long after, ms.
+/// How long after a time the board stood in Safe, ms, as the board lived it: what the machine stalled it does not count.
 fn safe_after(rows: &[BoxRow], killed_ns: i64) -> Option<f64> {
-    rows.iter()
-        .find(|row| row.monotonic_ns >= killed_ns && row.state == "safe")
-        .map(|row| (row.monotonic_ns - killed_ns) as f64 * 1e-6)
+    const STALL_MS: f64 = 3.0;
+    let mut lived_ms = 0.0;
+    let mut last_ns = killed_ns;
+    for row in rows.iter().filter(|row| row.monotonic_ns >= killed_ns) {
+        lived_ms += ((row.monotonic_ns - last_ns) as f64 * 1e-6).min(STALL_MS);
+        last_ns = row.monotonic_ns;
+        if row.state == "Safe" {
+            return Some(lived_ms);
+        }
+    }
+    None
 }
 
 /// Kills a run at moments that a seed fixes, resumes it each time, and lets the last session come to its end.
@@ -110,6 +120,7 @@ fn killed(kills: u32, cycles: u32) {
     }
     let rows = rig.finish();
     let mut parked = 0;
+    let mut longest_ms: f64 = 0.0;
     for &at_ns in &killed_ns {
         // A session killed before it had armed the board leaves it as the one before did: disarmed or safe.
         let state = rows
@@ -117,20 +128,22 @@ fn killed(kills: u32, cycles: u32) {
             .rev()
             .find(|row| row.monotonic_ns <= at_ns)
             .map_or("", |row| row.state.as_str());
-        if ["running", "frozen", "armed"].contains(&state) {
+        if ["Running", "Frozen", "Armed"].contains(&state) {
+            let after_ms = safe_after(&rows, at_ns).expect("parked after a kill");
             assert!(
-                safe_after(&rows, at_ns).is_some(),
-                "never parked after a kill"
+                after_ms <= WATCHDOG_MS + STALL_MARGIN_MS,
+                "{after_ms} ms in {state}"
             );
-            if state == "running" {
-                parked += 1;
-                // The watchdog's time and a stall of this machine; the board itself is exact to 0.1 ms in its own tests.
-                let after_ms = safe_after(&rows, at_ns).unwrap();
-                assert!(after_ms <= WATCHDOG_MS + 150.0, "{after_ms} ms");
-            }
+            longest_ms = longest_ms.max(after_ms);
+            parked += 1;
         }
     }
-    eprintln!("{} kills, {parked} while running", killed_ns.len());
+    eprintln!(
+        "{} kills, {parked} while armed, parked after {} ms at most",
+        killed_ns.len(),
+        longest_ms.round()
+    );
+    assert_eq!(killed_ns.len() as u32, kills);
     assert!(parked > 0);
     let last = rows.last().unwrap();
     assert!((last.applied_um - PARK_UM).abs() < 0.01, "{last:?}");
@@ -138,11 +151,11 @@ fn killed(kills: u32, cycles: u32) {
 
 #[test]
 fn a_killed_run_on_a_board_of_its_own_parks_it_and_is_resumed_without_losing_a_cycle() {
-    killed(2, 20);
+    killed(2, 60);
 }
 
 #[test]
 #[ignore = "fifty kills in real time take some minutes"]
 fn fifty_kills_on_a_board_of_its_own_lose_no_cycle_and_park_it_each_time() {
-    killed(50, 500);
+    killed(50, 1250);
 }

@@ -473,6 +473,11 @@ impl CycleLearning {
         self.learner.table(&self.state)
     }
 
+    /// The learner's state.
+    pub fn state(&self) -> LearnerState {
+        self.state
+    }
+
     /// Before the controller's step: the addition for this tick, um of PZT; see [`crate::LoopInput::learned_um`]. `phase`
     /// is that of the reference in cycles, `None` where it is not periodic now.
     pub fn addition_um(&mut self, phase: Option<f64>, reference_um: f64) -> f64 {

@@ -71,6 +71,8 @@ pub struct Arming {
 pub struct ArmingState {
     ticks: u32,
     steady: u32,
+    /// Whether there was a position at all.
+    seen: bool,
     /// Tick of the pulse; `None` before it.
     pulse: Option<u32>,
     base_um: f64,
@@ -82,6 +84,11 @@ pub struct ArmingState {
     sum_xy: f64,
     sum_yy: f64,
 }
+
+/// Ticks without any position after which the PZT goes to where the bead is believed to rest.
+const UNSEEN_TICKS: u32 = 50;
+/// How far it goes in a tick, um: 100 um/s at 1 kHz.
+const SEARCH_UM: f64 = 0.1;
 
 /// What to do in this tick of arming.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -132,9 +139,21 @@ impl Arming {
         })
     }
 
-    /// One tick: the position, if there is a good one, and the displacement commanded so far.
-    pub fn step(&self, state: &mut ArmingState, position_um: Option<f64>, command_um: f64) -> Step {
+    /// One tick: the position, if there is a good one, the displacement commanded so far, and the one at which the bead is
+    /// believed to rest.
+    ///
+    /// The PZT is held where it stands, which may be where a person has brought the bead to rest. Where no bead is to be
+    /// seen (a board that has parked flings it away, and the next one too) it goes to the believed rest, so that one can
+    /// come.
+    pub fn step(
+        &self,
+        state: &mut ArmingState,
+        position_um: Option<f64>,
+        command_um: f64,
+        neutral_um: f64,
+    ) -> Step {
         state.ticks += 1;
+        state.seen |= position_um.is_some();
         let Some(pulse) = state.pulse else {
             state.steady = if position_um.is_some() {
                 state.steady + 1
@@ -161,7 +180,11 @@ impl Arming {
                     refusal: Some(Refusal::NoBead),
                 });
             }
-            return Step::Command(command_um);
+            if state.seen || state.ticks <= UNSEEN_TICKS || !neutral_um.is_finite() {
+                return Step::Command(command_um);
+            }
+            let away_um = neutral_um - command_um;
+            return Step::Command(command_um + away_um.clamp(-SEARCH_UM, SEARCH_UM));
         };
         let tick = pulse + 1;
         state.pulse = Some(tick);
@@ -240,7 +263,7 @@ mod tests {
                 0.02 * (f64::from(tick.wrapping_mul(2_654_435_761)) / f64::from(u32::MAX) - 0.5);
             let position = factor * plant.output_um(&truth) + 0.01 * f64::from(tick) + jitter;
             let seen = (!blind(tick)).then_some(position);
-            match arming.step(&mut state, seen, command) {
+            match arming.step(&mut state, seen, command, 20.0) {
                 Step::Command(next) => command = next,
                 Step::Done(verdict) => return (verdict, largest),
             }
@@ -248,6 +271,33 @@ mod tests {
             plant.step(&mut truth, command - 20.0);
         }
         panic!("arming never ended");
+    }
+
+    #[test]
+    fn the_pzt_goes_to_the_believed_rest_only_where_no_bead_was_ever_seen() {
+        let arming = Arming::new(
+            ArmingConfig::default(),
+            &TransferFunction::eq6(),
+            SAMPLE,
+            DELAY,
+        )
+        .expect("eq6 is a plant");
+        let stands = |seen: bool| {
+            let mut state = ArmingState::default();
+            let mut command = 12.0;
+            for tick in 0..1000 {
+                // Seen once, and lost again: a person may have brought it to rest here.
+                let position = (seen && tick == 10).then_some(0.0);
+                let Step::Command(next) = arming.step(&mut state, position, command, 20.0) else {
+                    panic!("given up too soon");
+                };
+                assert!((next - command).abs() <= 0.1 + 1e-12);
+                command = next;
+            }
+            command
+        };
+        assert_eq!(stands(true), 12.0);
+        assert!((stands(false) - 20.0).abs() < 1e-9);
     }
 
     #[test]

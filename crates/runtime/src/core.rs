@@ -19,20 +19,23 @@
 
 use crate::arming::{Arming, ArmingConfig, ArmingState, Step};
 use crate::guide::{Guide, GuideInput, GuideOutput, Stage};
+use crate::learners::Learners;
 use crate::life::{EventKind, Events, FreezeReason, Life, Request, SafeReason};
 use crate::tick::Tick;
 pub use crate::tick::{Action, Counts, TickInput, TickOutput};
 use crate::tick_record::{TickFlags, TickRecord};
 pub use crate::timing::{CoreError, Timing};
 use cellpos_control::{
-    Controller, CycleLearning, LearnedTable, LoopConfig, LoopInput, LoopOutput, LoopState,
+    Controller, CycleLearning, LoopConfig, LoopInput, LoopOutput, LoopState,
     Measurement as LoopMeasurement, Mode, PlantMonitor, PlantMonitorState, SolverStatus,
+    SolverTerms,
 };
 use cellpos_link::{BoardState, Fault};
 use cellpos_plant::TransferFunction;
 use cellpos_rig::BoardReport;
 use cellpos_units::Seconds;
 use cellpos_vision::Decision;
+use std::ops::Range;
 
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct State {
@@ -72,7 +75,8 @@ pub struct Core<R> {
     arming: Arming,
     sample_s: f64,
     preview_um: Vec<f64>,
-    learning: Option<CycleLearning>,
+    learners: Learners,
+    late_solver_ns: Vec<Range<i64>>,
     monitor: PlantMonitor,
     state: State,
 }
@@ -110,7 +114,8 @@ impl<R: Guide> Core<R> {
             timing,
             arming,
             sample_s,
-            learning: None,
+            learners: Learners::default(),
+            late_solver_ns: Vec::new(),
             monitor,
             state: State {
                 plant: monitor.start(displacement_um),
@@ -140,16 +145,29 @@ impl<R: Guide> Core<R> {
         })
     }
 
-    /// The same loop with learning over cycles.
+    /// The same loop with learning over the cycles of its guide's only periodic motion.
     #[must_use]
-    pub fn with_learning(mut self, learning: CycleLearning) -> Self {
-        self.learning = Some(learning);
+    pub fn with_learning(self, learning: CycleLearning) -> Self {
+        self.with_learners(Learners::new(vec![Some(learning)]))
+    }
+
+    /// The same loop with learning over the cycles of its guide's periodic motions.
+    #[must_use]
+    pub fn with_learners(mut self, learners: Learners) -> Self {
+        self.learners = learners;
         self
     }
 
-    /// What has been learned over cycles; `None` without learning.
-    pub fn learned(&self) -> Option<LearnedTable> {
-        self.learning.as_ref().map(CycleLearning::table)
+    /// The same loop with an optimiser that gives no plan in time in these spans of run time, ns: a fault to be got over.
+    #[must_use]
+    pub fn with_late_solver(mut self, spans_ns: Vec<Range<i64>>) -> Self {
+        self.late_solver_ns = spans_ns;
+        self
+    }
+
+    /// What is being learned over cycles.
+    pub fn learners(&self) -> &Learners {
+        &self.learners
     }
 
     /// Where the run stands.
@@ -388,7 +406,9 @@ impl<R: Guide> Core<R> {
     fn advance_life(&mut self, position_um: Option<f64>, tick: &mut Tick) -> Mode {
         if self.state.life == Life::Armed {
             let held = self.state.control.previous_command_um();
-            match self.arming.step(&mut self.state.arming, position_um, held) {
+            let neutral_um = self.state.control.estimator.neutral_um;
+            let arming = &mut self.state.arming;
+            match self.arming.step(arming, position_um, held, neutral_um) {
                 Step::Command(command_um) => return Mode::Direct(command_um),
                 Step::Done(verdict) => match verdict.refusal {
                     Some(refusal) => {
@@ -478,27 +498,32 @@ impl<R: Guide> Core<R> {
             reference_um: guided.reference_um,
             preview_um: &self.preview_um,
             mode,
-            solver: input.solver,
-            learned_um: match &mut self.learning {
-                Some(learning) => {
-                    let phase = guided.phase.filter(|_| mode == Mode::Run);
-                    learning.addition_um(phase, guided.reference_um)
-                }
-                None => 0.0,
-            },
+            solver: self.solver_terms(input),
+            learned_um: self.learners.addition_um(
+                guided.motion,
+                guided.phase.filter(|_| mode == Mode::Run),
+                guided.reference_um,
+            ),
             excitation_um: self.guide.excitation_um(),
         };
         let output = self.controller.step(&mut self.state.control, &given);
-        if let Some(learning) = &mut self.learning {
-            let nominal = self.timing.camera_delay_ms * 1e-3 / self.sample_s;
-            let used = fix.filter(|_| !output.flags.coasting && !output.flags.stuck);
-            learning.learn(used.map(|fix| {
-                let age = nominal + f64::from(fix.age_samples) + fix.offset_samples;
-                (fix.position_um, age)
-            }));
-        }
+        let nominal = self.timing.camera_delay_ms * 1e-3 / self.sample_s;
+        let used = fix.filter(|_| !output.flags.coasting && !output.flags.stuck);
+        self.learners.learn(used.map(|fix| {
+            let age = nominal + f64::from(fix.age_samples) + fix.offset_samples;
+            (fix.position_um, age)
+        }));
         self.watch_plant(fix, &output, tick);
         (output, guided)
+    }
+
+    fn solver_terms(&self, input: &TickInput) -> SolverTerms {
+        let late = |span: &Range<i64>| span.contains(&input.time_ns);
+        if self.late_solver_ns.iter().any(late) {
+            SolverTerms::Recorded(SolverStatus::PreviousPlan)
+        } else {
+            input.solver
+        }
     }
 
     /// Gain and lag of the plant from its motion; their changes are events.

@@ -118,6 +118,8 @@ pub struct GuideOutput {
     /// Phase of a periodic reference in cycles, `None` while it is not periodic: what learning is laid on. The same
     /// motion must have the same phase each time, and the phase must advance by the same amount at each tick.
     pub phase: Option<f64>,
+    /// Number of the periodic motion that the phase is of; 0 for a guide that has one only.
+    pub motion: u16,
 }
 
 /// Says where the bead is to be.
@@ -144,6 +146,7 @@ impl<R: Reference> Guide for R {
             reference_um: self.at_um(input.tick as f64 * input.sample_s),
             plan_ns: -1,
             stage: Stage::None,
+            motion: 0,
             phase: if input.running {
                 self.phase(input.tick as f64 * input.sample_s)
             } else {

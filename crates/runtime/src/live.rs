@@ -19,6 +19,7 @@ use crate::run::{EndRule, EndWatch, Finished, RunError, RunSink, close_session, 
 use crate::summary::{End, Statistics, Summary};
 use crate::tick_record::TickRecord;
 use crate::ticker::{Ends, Order, RingSizes, Ticker};
+use cellpos_control::{LearnedTable, LearnerState};
 use cellpos_rig::clock::{monotonic_ns, sleep_until_ns};
 use cellpos_rig::{Actuator, BoardReport, Clock, Measurement, PositionSource};
 use rtrb::{Consumer, Producer};
@@ -112,7 +113,7 @@ struct ControlEnd {
     safe_reason: Option<crate::life::SafeReason>,
     counts: crate::core::Counts,
     account: crate::ticker::Account,
-    learned: Option<cellpos_control::LearnedTable>,
+    learned: Vec<Option<LearnedTable>>,
     period_us: f64,
 }
 
@@ -142,6 +143,7 @@ pub fn run<R: Guide + Send, S: RunSink>(
         mut reports,
         records,
         events,
+        learned,
     } = ends;
     let stop = AtomicBool::new(false);
     let start = |thread: &'static str| move |source| RunError::Thread { thread, source };
@@ -149,7 +151,7 @@ pub fn run<R: Guide + Send, S: RunSink>(
         let recorder = thread::Builder::new()
             .name("cellpos-record".to_string())
             .spawn_scoped(scope, || {
-                record(records, events, &mut sink, &mut statistics);
+                record(records, events, learned, &mut sink, &mut statistics);
             })
             .map_err(start("recorder"))?;
         // The actuator thread is this one, so that `actuator` needs no owner of its own; control is told whom to wake.
@@ -295,7 +297,7 @@ fn control<R: Guide>(
         life: ticker.core().life(),
         safe_reason: ticker.core().safe_reason(),
         counts: *ticker.core().counts(),
-        learned: ticker.core().learned(),
+        learned: ticker.core().learners().tables(),
         account: ticker.account().clone(),
         period_us: ticker.core().timing().period_us,
     }
@@ -327,6 +329,7 @@ fn actuate(
 fn record(
     mut records: Consumer<TickRecord>,
     mut events: Consumer<Event>,
+    mut learned: Consumer<(u16, LearnerState)>,
     sink: &mut impl RunSink,
     statistics: &mut Statistics,
 ) {
@@ -342,6 +345,9 @@ fn record(
         }
         while let Ok(event) = events.pop() {
             sink.event(&event);
+        }
+        while let Ok((motion, state)) = learned.pop() {
+            sink.learned(motion, &state);
         }
         if over {
             sink.progress(statistics);

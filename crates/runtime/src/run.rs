@@ -6,7 +6,7 @@ use crate::realtime::Conditions;
 use crate::summary::{End, Statistics, Summary};
 use crate::tick_record::TickRecord;
 use crate::ticker::Order;
-use cellpos_control::LearnedTable;
+use cellpos_control::{LearnedTable, LearnerState};
 use cellpos_rig::{Actuator, ActuatorError, BoardReport, CameraError};
 use rtrb::{Consumer, Producer};
 use std::time::Duration;
@@ -22,6 +22,10 @@ pub trait RunSink: Send {
     /// records left in the ring until it is full are lost.
     fn is_ready(&self) -> bool {
         true
+    }
+    /// What is being learned over the cycles of a periodic motion, as it stands: about four times a second while learning.
+    fn learned(&mut self, motion: u16, state: &LearnerState) {
+        let _ = (motion, state);
     }
     /// Called about ten times a second of the run, and at its end.
     fn progress(&mut self, statistics: &Statistics);
@@ -195,8 +199,8 @@ pub struct Finished<S> {
     pub conditions: Conditions,
     /// The sink, with all that it was given.
     pub sink: S,
-    /// What was learned over cycles, if the loop had a learner.
-    pub learned: Option<LearnedTable>,
+    /// What was learned over cycles, for each periodic motion of the guide; `None`: without a learner.
+    pub learned: Vec<Option<LearnedTable>>,
     /// What went wrong on an I/O thread, if anything did; the loop has seen it as silence and acted on it.
     pub io_error: Option<RunError>,
 }

@@ -5,11 +5,14 @@ use crate::guide::Guide;
 use crate::latency::Latency;
 use crate::life::{Event, Life, Request};
 use crate::tick_record::{TickFlags, TickRecord};
-use cellpos_control::SolverTerms;
+use cellpos_control::{LearnerState, SolverTerms};
 use cellpos_rig::clock::monotonic_ns;
 use cellpos_rig::{BoardReport, Clock, Measurement};
 use rtrb::{Consumer, Producer, RingBuffer};
 use std::time::{Duration, Instant};
+
+/// Ticks between two words to the recorder on what is being learned.
+const LEARNED_EVERY: u64 = 256;
 
 /// An order to the actuator thread.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -33,6 +36,8 @@ pub struct Ends {
     pub records: Consumer<TickRecord>,
     /// For the recorder thread.
     pub events: Consumer<Event>,
+    /// For the recorder thread: what is being learned, of which motion. Full: the next one says more anyway.
+    pub learned: Consumer<(u16, LearnerState)>,
 }
 
 /// Sizes of the rings.
@@ -88,6 +93,8 @@ pub struct Ticker<R> {
     reports: Consumer<BoardReport>,
     records: Producer<TickRecord>,
     events: Producer<Event>,
+    learned: Producer<(u16, LearnerState)>,
+    ticks: u64,
     previous_late_ns: Option<u32>,
     previous_refused: bool,
     records_lost_before: bool,
@@ -102,6 +109,7 @@ impl<R: Guide> Ticker<R> {
         let (reports_in, reports) = RingBuffer::new(64);
         let (records, records_out) = RingBuffer::new(sizes.records.max(1));
         let (events, events_out) = RingBuffer::new(sizes.events.max(1));
+        let (learned, learned_out) = RingBuffer::new(16);
         let ticker = Self {
             budget_ns: core.timing().budget_ns(),
             solver_time: Duration::from_secs_f64(core.timing().solver_us * 1e-6),
@@ -113,6 +121,8 @@ impl<R: Guide> Ticker<R> {
             reports,
             records,
             events,
+            learned,
+            ticks: 0,
             previous_late_ns: None,
             previous_refused: false,
             records_lost_before: false,
@@ -130,6 +140,7 @@ impl<R: Guide> Ticker<R> {
             reports: reports_in,
             records: records_out,
             events: events_out,
+            learned: learned_out,
         };
         (ticker, ends)
     }
@@ -232,6 +243,12 @@ impl<R: Guide> Ticker<R> {
             if self.events.push(*event).is_err() {
                 self.account.events_lost += 1;
             }
+        }
+        self.ticks += 1;
+        if self.ticks.is_multiple_of(LEARNED_EVERY)
+            && let Some(learned) = self.core.learners().current()
+        {
+            let _ = self.learned.push(learned);
         }
         self.core.life()
     }

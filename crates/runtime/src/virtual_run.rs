@@ -64,6 +64,9 @@ pub fn run<R: Guide, S: RunSink>(
         while let Ok(event) = ends.events.pop() {
             sink.event(&event);
         }
+        while let Ok((motion, state)) = ends.learned.pop() {
+            sink.learned(motion, &state);
+        }
         if tick.is_multiple_of(PROGRESS_TICKS) {
             sink.progress(&statistics);
         }
@@ -96,7 +99,7 @@ pub fn run<R: Guide, S: RunSink>(
         summary,
         conditions,
         sink,
-        learned: ticker.core().learned(),
+        learned: ticker.core().learners().tables(),
         io_error,
     })
 }

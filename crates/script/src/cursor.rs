@@ -55,6 +55,8 @@ pub struct Output {
     pub plan_s: f64,
     /// What is going on.
     pub status: Status,
+    /// Number of the periodic motion in full swing ([`Plan::periodic`]), and its phase in cycles.
+    pub swing: Option<(u16, f64)>,
 }
 
 /// A place in a plan. Plain data: it can be copied, kept and compared.
@@ -113,6 +115,11 @@ impl Plan {
             reference_um: self.reference_um(cursor),
             plan_s: cursor.plan_s,
             status: cursor.status,
+            swing: self
+                .segments()
+                .get(cursor.segment)
+                .filter(|_| cursor.status == Status::Running)
+                .and_then(|segment| self.swing(segment, cursor.plan_s)),
         };
         if cursor.status == Status::Running {
             cursor.ticks += 1;
@@ -139,6 +146,7 @@ impl Plan {
             reference_um: self.reference_um(cursor),
             plan_s: cursor.plan_s,
             status: cursor.status,
+            swing: None,
         }
     }
 

@@ -25,6 +25,7 @@ pub struct Follower {
     past: usize,
     reference_um: f64,
     stage: Stage,
+    swing: Option<(u16, f64)>,
     tail: u32,
 }
 
@@ -59,6 +60,7 @@ impl Follower {
             past: 0,
             reference_um,
             stage: Stage::None,
+            swing: None,
             tail: 0,
         }
     }
@@ -167,6 +169,7 @@ impl Follower {
             let output = self.plan.step(&mut self.cursor, input.sample_s, &seen);
             self.reference_um = output.reference_um;
             self.stage = stage(output.status);
+            self.swing = output.swing;
             self.plan.preview(&self.cursor, input.sample_s, preview_um);
         }
         if before.is_over() {
@@ -195,6 +198,7 @@ impl Guide for Follower {
     fn step(&mut self, input: &GuideInput, preview_um: &mut [f64]) -> GuideOutput {
         // The plan's time of this tick: the cursor itself is a sample ahead after its step.
         let plan_s = self.cursor.plan_s();
+        self.swing = None;
         if input.running {
             self.follow(input, preview_um);
         } else {
@@ -210,7 +214,8 @@ impl Guide for Follower {
             plan_s
         };
         GuideOutput {
-            phase: None,
+            phase: self.swing.map(|(_, phase)| phase),
+            motion: self.swing.map_or(0, |(motion, _)| motion),
             reference_um: self.reference_um,
             plan_ns: (plan_s * 1e9).round() as i64,
             stage: if input.running {

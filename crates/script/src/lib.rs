@@ -26,7 +26,7 @@ pub use cycles::{
 };
 pub use error::ScriptError;
 pub use follow::Follower;
-pub use plan::{ArmKind, Cycle, Mark, Motion, Plan, Segment};
+pub use plan::{ArmKind, Cycle, Mark, Motion, Periodic, PeriodicReference, Plan, Segment};
 pub use script::{
     Condition, Load, MoveShape, OnTimeout, Order, Script, Step, StepKind, Stop, WaveShape,
 };

@@ -24,6 +24,17 @@ pub enum WaveShape {
     Trapezoid,
 }
 
+impl WaveShape {
+    /// As it is written in a script.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Sine => "sine",
+            Self::Triangle => "triangle",
+            Self::Trapezoid => "trapezoid",
+        }
+    }
+}
+
 /// What a wait waits for.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Condition {

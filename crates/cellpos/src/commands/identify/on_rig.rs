@@ -70,6 +70,7 @@ impl Guide for Exciting {
             plan_ns: -1,
             stage: Stage::None,
             phase: None,
+            motion: 0,
         }
     }
 

@@ -132,6 +132,12 @@ pub fn ready(folder: &Path, best_effort: bool) -> Result<Option<Ready>, Failure>
         return Err(not_a_run("is no run of a script".to_string()));
     };
     let number = sessions.len() as u64 + 1;
+    // Where the bead rested last is a better first belief than the rig file's.
+    let rested = done.iter().rev().map(|row| row.neutral_um);
+    let within = |um: &f64| (file.limits.low_um..=file.limits.high_um).contains(um);
+    if let Some(neutral_um) = rested.into_iter().find(within) {
+        file.first_neutral_um = neutral_um;
+    }
     // Another session sees other noise, and the same each time that it is repeated.
     file.emulator.seed = file.emulator.seed.wrapping_add(number - 1);
     let clock = if meta.clock == "virtual" {

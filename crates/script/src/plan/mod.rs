@@ -1,0 +1,315 @@
+//! A script laid out in time.
+
+mod layout;
+mod periodic;
+mod shape;
+
+pub use periodic::{Periodic, PeriodicReference};
+
+use crate::error::ScriptError;
+use crate::script::{Condition, MoveShape, OnTimeout, Script, Stop, WaveShape};
+use cellpos_control::Reference;
+use layout::Layout;
+use shape::{progress, rise, wave};
+
+/// What a segment does; it starts at the segment's `from_um`.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Motion {
+    /// Stays.
+    Hold,
+    /// Goes to a position over the segment's duration.
+    Move {
+        /// How.
+        shape: MoveShape,
+        /// Where to, um.
+        to_um: f64,
+    },
+    /// Periodic motion about `from_um`.
+    Wave {
+        /// Shape.
+        shape: WaveShape,
+        /// Amplitude, um.
+        amplitude_um: f64,
+        /// Frequency, Hz.
+        frequency_hz: f64,
+        /// Cycles over which the amplitude grows.
+        ramp_in: f64,
+        /// Cycles over which it falls.
+        ramp_out: f64,
+    },
+    /// Periodic motion through points of the plan.
+    Points {
+        /// First point.
+        first: usize,
+        /// Number of points.
+        count: usize,
+        /// Duration of one cycle, s.
+        period_s: f64,
+    },
+    /// Stays until a condition is met; takes no time in the plan.
+    Wait {
+        /// The condition.
+        condition: Condition,
+        /// Longest time, s.
+        timeout_s: f64,
+        /// What then.
+        on_timeout: OnTimeout,
+    },
+}
+
+/// A piece of the plan.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Segment {
+    /// Start, s.
+    pub start_s: f64,
+    /// Duration, s.
+    pub duration_s: f64,
+    /// Position at the start, um.
+    pub from_um: f64,
+    /// What it does.
+    pub motion: Motion,
+    /// Line of its step in the file.
+    pub line: usize,
+    /// Number of its periodic motion, see [`Plan::periodic`]; None: it is not periodic.
+    pub periodic: Option<u16>,
+}
+
+/// A mark in the record.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Mark {
+    /// When, s.
+    pub time_s: f64,
+    /// What to write.
+    pub text: String,
+}
+
+/// Which arm of a test a cycle belongs to.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum ArmKind {
+    /// The one that moves.
+    #[default]
+    Cyclic,
+    /// The static control beside it.
+    Static,
+}
+
+/// One cycle: a period of a wave, or a pass of a repeat that holds no wave; in a static arm, as much time as a cycle of
+/// the arm that it stands beside takes in the mean.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Cycle {
+    /// Number, from 0.
+    pub number: u64,
+    /// Its arm.
+    pub arm: ArmKind,
+    /// Start, s.
+    pub start_s: f64,
+    /// Duration, s.
+    pub duration_s: f64,
+}
+
+/// Equal cycles one after the other.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Cycles {
+    first: u64,
+    count: u64,
+    start_s: f64,
+    period_s: f64,
+    arm: ArmKind,
+}
+
+/// A script laid out in time. Waits take no time in it: a [`crate::Cursor`] stops its clock at them.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Plan {
+    segments: Vec<Segment>,
+    points: Vec<(f64, f64)>,
+    periodic: Vec<Periodic>,
+    cycles: Vec<Cycles>,
+    marks: Vec<Mark>,
+    /// Waits: number of the segment and its time, s.
+    waits: Vec<(usize, f64)>,
+    stop: Stop,
+    start_um: f64,
+    duration_s: f64,
+}
+
+impl Plan {
+    /// Lays a script out.
+    ///
+    /// # Errors
+    /// [`ScriptError`] when it is too long, or a control arm names a label that is not above it.
+    pub fn new(script: &Script) -> Result<Self, ScriptError> {
+        Self::lay_out(script, false)
+    }
+
+    /// With at most three passes of each repeat and six cycles at full amplitude of each wave: it asks the same of the
+    /// rig and is quick to go through.
+    pub(crate) fn shortened(script: &Script) -> Result<Self, ScriptError> {
+        Self::lay_out(script, true)
+    }
+
+    fn lay_out(script: &Script, short: bool) -> Result<Self, ScriptError> {
+        let empty = Self {
+            segments: Vec::new(),
+            points: Vec::new(),
+            periodic: Vec::new(),
+            cycles: Vec::new(),
+            marks: Vec::new(),
+            waits: Vec::new(),
+            stop: script.stop,
+            start_um: script.start_um,
+            duration_s: 0.0,
+        };
+        Layout::of(script, short, empty)
+    }
+
+    /// Duration without waits, s.
+    pub fn total_s(&self) -> f64 {
+        self.duration_s
+    }
+
+    /// Position at the start, um.
+    pub fn start_um(&self) -> f64 {
+        self.start_um
+    }
+
+    /// The segments, in order of time.
+    pub fn segments(&self) -> &[Segment] {
+        &self.segments
+    }
+
+    /// The marks, in order of time.
+    pub fn marks(&self) -> &[Mark] {
+        &self.marks
+    }
+
+    /// The stop conditions.
+    pub fn stop(&self) -> &Stop {
+        &self.stop
+    }
+
+    /// When the plan's clock next stands still for a wait, from a segment on, s; infinity: never.
+    pub(crate) fn next_wait_s(&self, segment: usize) -> f64 {
+        let index = self.waits.partition_point(|(number, _)| *number < segment);
+        self.waits.get(index).map_or(f64::INFINITY, |wait| wait.1)
+    }
+
+    /// Number of cycles.
+    pub fn cycle_count(&self) -> u64 {
+        self.cycles.last().map_or(0, |run| run.first + run.count)
+    }
+
+    /// A cycle by its number.
+    pub fn cycle(&self, number: u64) -> Option<Cycle> {
+        let index = self.cycles.partition_point(|run| run.first <= number);
+        let run = index
+            .checked_sub(1)
+            .and_then(|index| self.cycles.get(index))?;
+        let within = number - run.first;
+        (within < run.count).then_some(Cycle {
+            number,
+            arm: run.arm,
+            start_s: run.start_s + within as f64 * run.period_s,
+            duration_s: run.period_s,
+        })
+    }
+
+    /// The cycle that a time falls into.
+    pub fn cycle_at(&self, time_s: f64) -> Option<Cycle> {
+        let index = self.cycles.partition_point(|run| run.start_s <= time_s);
+        let run = index
+            .checked_sub(1)
+            .and_then(|index| self.cycles.get(index))?;
+        let within = ((time_s - run.start_s) / run.period_s).floor();
+        (within < run.count as f64)
+            .then(|| run.first + within as u64)
+            .and_then(|number| self.cycle(number))
+    }
+
+    /// Cycles that have ended by a time.
+    pub fn cycles_done(&self, time_s: f64) -> u64 {
+        let index = self.cycles.partition_point(|run| run.start_s <= time_s);
+        index
+            .checked_sub(1)
+            .and_then(|index| self.cycles.get(index))
+            .map_or(0, |run| {
+                // A time at the end of a cycle up to rounding counts as its end.
+                let within = ((time_s - run.start_s) / run.period_s + 1e-9).floor();
+                run.first + (within.max(0.0) as u64).min(run.count)
+            })
+    }
+
+    /// The segment that a time falls into (the first after a wait; the last from the end on).
+    pub fn segment_at(&self, time_s: f64) -> Option<&Segment> {
+        let index = self.segments.partition_point(|s| s.start_s <= time_s);
+        self.segments.get(index.saturating_sub(1))
+    }
+
+    /// Position within a segment, um. Allocates nothing.
+    pub(crate) fn segment_um(&self, segment: &Segment, time_s: f64) -> f64 {
+        let t = (time_s - segment.start_s).clamp(0.0, segment.duration_s);
+        let from = segment.from_um;
+        match segment.motion {
+            Motion::Hold | Motion::Wait { .. } => from,
+            Motion::Move { shape, to_um } => {
+                let share = if segment.duration_s > 0.0 {
+                    t / segment.duration_s
+                } else {
+                    1.0
+                };
+                from + (to_um - from) * progress(shape, share)
+            }
+            Motion::Wave {
+                shape,
+                amplitude_um,
+                frequency_hz,
+                ramp_in,
+                ramp_out,
+            } => {
+                let phase = t * frequency_hz;
+                let left = (segment.duration_s - t) * frequency_hz;
+                from + amplitude_um
+                    * rise(phase, ramp_in)
+                    * rise(left, ramp_out)
+                    * wave(shape, phase)
+            }
+            Motion::Points {
+                first,
+                count,
+                period_s,
+            } => {
+                let within = if t >= segment.duration_s {
+                    0.0
+                } else {
+                    t % period_s
+                };
+                from + self.points_um(first, count, within)
+            }
+        }
+    }
+
+    /// A waveform at a time within its cycle, um from where it starts. Allocates nothing.
+    fn points_um(&self, first: usize, count: usize, within_s: f64) -> f64 {
+        let points = self.points.get(first..first + count).unwrap_or(&[]);
+        let next = points.partition_point(|(time, _)| *time <= within_s);
+        let before = next.checked_sub(1).and_then(|index| points.get(index));
+        match (before, points.get(next)) {
+            (Some((t0, x0)), Some((t1, x1))) => x0 + (x1 - x0) * (within_s - t0) / (t1 - t0),
+            (Some((_, x)), None) | (None, Some((_, x))) => *x,
+            (None, None) => 0.0,
+        }
+    }
+}
+
+impl Reference for Plan {
+    /// The reference at a time of the plan, um: held before the start and after the end. Allocates nothing.
+    fn at_um(&self, time_s: f64) -> f64 {
+        match self.segment_at(time_s) {
+            Some(segment) if time_s >= 0.0 => self.segment_um(segment, time_s),
+            _ => self.start_um,
+        }
+    }
+
+    fn duration_s(&self) -> Option<f64> {
+        Some(self.duration_s)
+    }
+}

@@ -1,0 +1,144 @@
+//! The periodic motions of a plan: what learning over cycles is laid on.
+
+use super::shape::{rise, wave};
+use super::{Motion, Plan, Segment};
+use crate::script::WaveShape;
+use cellpos_control::Reference;
+use std::ops::Range;
+
+/// A periodic motion. Steps that move alike share one, wherever they begin.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Periodic {
+    /// Frequency of its cycles, Hz.
+    pub frequency_hz: f64,
+    /// Cycles of it in full swing, in the whole plan.
+    pub cycles: u64,
+    course: Course,
+}
+
+/// How a periodic motion goes.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Course {
+    Wave { shape: WaveShape, amplitude_um: f64 },
+    Points { first: usize, count: usize },
+}
+
+impl Periodic {
+    /// Most motions that a plan tells apart.
+    pub const MOST: usize = 64;
+
+    pub(super) fn wave(shape: WaveShape, amplitude_um: f64, frequency_hz: f64) -> Self {
+        Self {
+            frequency_hz,
+            cycles: 0,
+            course: Course::Wave {
+                shape,
+                amplitude_um,
+            },
+        }
+    }
+
+    pub(super) fn points(first: usize, count: usize, period_s: f64) -> Self {
+        Self {
+            frequency_hz: 1.0 / period_s,
+            cycles: 0,
+            course: Course::Points { first, count },
+        }
+    }
+
+    /// Whether two motions are the same.
+    pub(super) fn moves_as(&self, other: &Self) -> bool {
+        self.course == other.course && self.frequency_hz == other.frequency_hz
+    }
+
+    /// Where the points of a waveform stand in the plan.
+    pub(super) fn span(&self) -> Option<Range<usize>> {
+        match self.course {
+            Course::Points { first, count } => Some(first..first + count),
+            Course::Wave { .. } => None,
+        }
+    }
+
+    /// In words; the same motion has the same name in every run of a script.
+    pub fn name(&self) -> String {
+        let frequency_hz = self.frequency_hz;
+        match self.course {
+            Course::Wave {
+                shape,
+                amplitude_um,
+            } => format!("{} of {amplitude_um} um at {frequency_hz} Hz", shape.name()),
+            Course::Points { first, count } => {
+                format!("waveform of {count} points (from {first}) at {frequency_hz} Hz")
+            }
+        }
+    }
+}
+
+/// A periodic motion about 0 um by itself, that comes in over [`PeriodicReference::FADE_S`].
+#[derive(Debug, Clone, Copy)]
+pub struct PeriodicReference<'p> {
+    plan: &'p Plan,
+    motion: Periodic,
+}
+
+impl PeriodicReference<'_> {
+    /// Time after which it is in full swing, s.
+    pub const FADE_S: f64 = 0.2;
+}
+
+impl Reference for PeriodicReference<'_> {
+    fn at_um(&self, time_s: f64) -> f64 {
+        let time_s = time_s.max(0.0);
+        let phase = time_s * self.motion.frequency_hz;
+        let um = match self.motion.course {
+            Course::Wave {
+                shape,
+                amplitude_um,
+            } => amplitude_um * wave(shape, phase),
+            Course::Points { first, count } => {
+                let within_s = phase.fract() / self.motion.frequency_hz;
+                self.plan.points_um(first, count, within_s)
+            }
+        };
+        um * rise(time_s, Self::FADE_S)
+    }
+
+    fn duration_s(&self) -> Option<f64> {
+        None
+    }
+}
+
+impl Plan {
+    /// The periodic motions, at most [`Periodic::MOST`]; a segment names its own by number.
+    pub fn periodic(&self) -> &[Periodic] {
+        &self.periodic
+    }
+
+    /// A periodic motion by itself.
+    pub fn periodic_reference(&self, number: usize) -> Option<PeriodicReference<'_>> {
+        self.periodic.get(number).map(|motion| PeriodicReference {
+            plan: self,
+            motion: *motion,
+        })
+    }
+
+    /// Number of the periodic motion that is in full swing at a time within a segment, and its phase in cycles. Allocates
+    /// nothing.
+    pub(crate) fn swing(&self, segment: &Segment, time_s: f64) -> Option<(u16, f64)> {
+        let number = segment.periodic?;
+        let t = time_s - segment.start_s;
+        let (frequency_hz, ramp_in, ramp_out) = match segment.motion {
+            Motion::Wave {
+                frequency_hz,
+                ramp_in,
+                ramp_out,
+                ..
+            } => (frequency_hz, ramp_in, ramp_out),
+            Motion::Points { period_s, .. } => (1.0 / period_s, 0.0, 0.0),
+            Motion::Hold | Motion::Move { .. } | Motion::Wait { .. } => return None,
+        };
+        let last = segment.duration_s * frequency_hz - ramp_out;
+        let phase = t * frequency_hz;
+        (ramp_in..last).contains(&phase).then_some((number, phase))
+    }
+}
