@@ -5,6 +5,7 @@
 #![forbid(unsafe_code)]
 
 mod commands;
+mod cyclic;
 mod outcome;
 mod recording;
 mod rig_file;

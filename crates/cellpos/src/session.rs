@@ -64,6 +64,7 @@ pub fn arm(
             reference,
             timing: file.timing,
             arming: file.arming,
+            learn: None,
         },
     })
 }

@@ -1,11 +1,12 @@
 //! Everything that determines the commands of a run, in a form that is written into the run folder and read back by a
 //! replay.
 
+use crate::cyclic::LearnSpec;
 use crate::outcome::Failure;
 use cellpos_control::design::{
     DesignPlant, DesignRequest, PiSearch, Requested, default_lead, design,
 };
-use cellpos_control::{ControllerConfig, ControllerFile, ControllerKind, Limits, Profile};
+use cellpos_control::{ControllerConfig, ControllerFile, ControllerKind, Limits, Profile, Shape};
 use cellpos_plant::Model;
 use cellpos_runtime::{ArmingConfig, Core, CoreError, Guide, GuideInput, GuideOutput, Timing};
 use cellpos_script::{Follower, Plan, Script};
@@ -22,6 +23,17 @@ pub enum ReferenceSpec {
     Hold {
         /// Position, um.
         position_um: f64,
+    },
+    /// A sine about a position.
+    Sine {
+        /// Position in the middle, um.
+        centre_um: f64,
+        /// Half of peak to peak, um.
+        amplitude_um: f64,
+        /// Frequency, Hz.
+        frequency_hz: f64,
+        /// Time over which it comes in, s.
+        fade_s: f64,
     },
     /// Follow a script.
     Script {
@@ -100,6 +112,18 @@ impl ReferenceSpec {
             Self::Hold { position_um } => AnyGuide::Profile(Profile::Hold {
                 position_um: *position_um,
             }),
+            Self::Sine {
+                centre_um,
+                amplitude_um,
+                frequency_hz,
+                fade_s,
+            } => AnyGuide::Profile(Profile::Wave {
+                shape: Shape::Sine,
+                centre_um: *centre_um,
+                amplitude_um: *amplitude_um,
+                frequency_hz: *frequency_hz,
+                fade_s: *fade_s,
+            }),
             Self::Script { from_s, .. } => {
                 let plan = self.script()?.map(|(_, plan)| Arc::new(plan));
                 let plan = plan.unwrap_or_else(|| unreachable!("a script has a plan"));
@@ -134,6 +158,9 @@ pub struct SetupConfig {
     pub timing: Timing,
     /// The check before the loop is closed.
     pub arming: ArmingConfig,
+    /// Learning over cycles, where it is on.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub learn: Option<LearnSpec>,
 }
 
 impl Setup {
@@ -147,7 +174,7 @@ impl Setup {
         let plant =
             DesignPlant::from_model(&self.model, Some(self.controller.delay_ms * 1e-3), sample_s)
                 .map_err(Failure::input)?;
-        Core::new(
+        let core = Core::new(
             loop_config,
             self.config.reference.guide(&self.config.timing)?,
             self.config.timing,
@@ -156,7 +183,11 @@ impl Setup {
             self.config.displacement_um,
             self.config.neutral_um,
         )
-        .map_err(|error: CoreError| Failure::input(error))
+        .map_err(|error: CoreError| Failure::input(error))?;
+        Ok(match &self.config.learn {
+            Some(learn) => core.with_learning(learn.learning(sample_s)?),
+            None => core,
+        })
     }
 }
 

@@ -310,3 +310,34 @@ fn the_example_files_load() {
     assert_eq!(ran.code, Some(2));
     assert!(ran.err.contains("[actuator] port"), "{}", ran.err);
 }
+
+#[test]
+fn a_sine_is_learned_kept_with_the_run_replayed_and_gone_on_from() {
+    let folder = tempfile::tempdir().unwrap();
+    let line = "track --target 0um --sine 5um@100Hz --controller mpc --solver active-set --duration 2.6s --clock virtual --frames off --seed 3 --json";
+    let without = succeed(folder.path(), line).json();
+    let with = succeed(folder.path(), &format!("{line} --learn")).json();
+    assert!(number(&with, "rms_true_nm") < 100.0, "{with}");
+    assert!(number(&without, "rms_true_nm") > 3.0 * number(&with, "rms_true_nm"));
+    let run = with["run"].as_str().unwrap();
+    assert!(folder.path().join(run).join("learned.toml").is_file());
+    succeed(folder.path(), &format!("replay {run}"));
+    let again = succeed(
+        folder.path(),
+        &format!("{line} --learn --learned {run}/learned.toml"),
+    )
+    .json();
+    let first = number(&again["learned"], "error_before_um");
+    assert!(
+        first < 0.15,
+        "the first cycles are already good: {first} um"
+    );
+    let other = cellpos(
+        folder.path(),
+        &format!(
+            "track --target 0um --sine 5um@50Hz --learn --learned {run}/learned.toml --clock virtual --duration 1s"
+        ),
+    );
+    assert_eq!(other.code, Some(2));
+    assert!(other.err.contains("100 Hz"), "{}", other.err);
+}

@@ -109,12 +109,13 @@ fn reference_solver(m: &QpMatrices) -> DefaultSolver<f64> {
 fn the_active_set_solver_agrees_with_clarabel_to_1_nm_in_the_first_move() {
     // 100 000 problems in an optimised build; fewer where they would take minutes.
     let problems = if cfg!(debug_assertions) {
-        4_000
+        1_000
     } else {
         100_000
     };
     let mut random = Xoshiro256PlusPlus::seed_from_u64(5);
     let (mut solved, mut infeasible, mut constrained) = (0, 0, 0);
+    let mut largest_um: f64 = 0.0;
     let mut set = WorkingSet::default();
     let mut m = matrices(&mut random);
     let mut reference = reference_solver(&m);
@@ -141,6 +142,7 @@ fn the_active_set_solver_agrees_with_clarabel_to_1_nm_in_the_first_move() {
                 solved += 1;
                 constrained += usize::from(!set.is_empty());
                 let difference = (w[0] - reference.solution.x[0]).abs();
+                largest_um = largest_um.max(difference);
                 assert!(difference < 1e-3, "problem {k}: {difference} um");
             }
             (
@@ -150,6 +152,9 @@ fn the_active_set_solver_agrees_with_clarabel_to_1_nm_in_the_first_move() {
             (end, status) => panic!("problem {k}: {end:?} against {status:?}"),
         }
     }
+    println!(
+        "{solved} solved, {constrained} of them with active rows, {infeasible} infeasible; largest difference {largest_um:e} um"
+    );
     assert!(
         solved > problems * 9 / 10 && constrained > problems / 2,
         "{solved} {constrained} {infeasible}"

@@ -146,6 +146,91 @@ fn mpc_settles_a_10_um_step_to_2_percent_within_10_ms() {
 }
 
 #[test]
+fn mpc_takes_a_10_um_step_within_the_limits_on_the_noisy_rig_for_any_seed() {
+    for (solver, seed) in [SolverKind::Clarabel, SolverKind::ActiveSet]
+        .into_iter()
+        .flat_map(|solver| (0..5).map(move |seed| (solver, seed)))
+    {
+        let config = config(mpc(solver));
+        let limits = config.limits;
+        let mut controller = Controller::new(config).unwrap();
+        let mut rig = SimulatedRig::new(RigConfig::eq6(seed)).unwrap();
+        let mut state = controller.start(20.0, 20.0);
+        let mut last_um = state.previous_command_um();
+        let mut after = Vec::new();
+        for k in 0..360 {
+            let reference_um = if k < 300 { 0.0 } else { 10.0 };
+            if k >= 300 {
+                after.push(rig.true_um() - 10.0);
+            }
+            let input = LoopInput {
+                measurement: Some(rig.measure()),
+                reference_um,
+                preview_um: &[reference_um],
+                ..LoopInput::default()
+            };
+            let out = controller.step(&mut state, &input);
+            assert!((limits.low_um..=limits.high_um).contains(&out.command_um));
+            assert!((out.command_um - last_um).abs() <= limits.slew_um_per_s * 1e-3 + 1e-9);
+            assert_eq!(out.solver.status, SolverStatus::Solved);
+            last_um = out.command_um;
+            rig.advance(out.command_um);
+        }
+        let settled = after.iter().rposition(|e| e.abs() > 0.2).unwrap() + 1;
+        let overshoot = after.iter().copied().fold(0.0, f64::max);
+        assert!(
+            settled <= 10 && overshoot < 0.5,
+            "{solver:?}, seed {seed}: {settled} ms, {overshoot} um"
+        );
+    }
+}
+
+#[test]
+fn a_recorded_end_of_the_solver_replays_to_the_bit() {
+    let mut rig = SimulatedRig::new(RigConfig::eq6(1)).unwrap();
+    let run = |rig: Option<&mut SimulatedRig>, told: &[(Measurement, SolverStatus)]| {
+        let mut controller = Controller::new(config(mpc(SolverKind::Clarabel))).unwrap();
+        let mut state = controller.start(20.0, 20.0);
+        let mut rig = rig;
+        (0..80)
+            .map(|k| {
+                let (fix, solver) = match (&mut rig, told.get(k)) {
+                    (Some(rig), _) => (
+                        rig.measure(),
+                        // Now and then the time is up before the solver has begun.
+                        SolverTerms::Until(
+                            std::time::Instant::now()
+                                + std::time::Duration::from_millis(if k % 7 == 3 || k > 60 {
+                                    0
+                                } else {
+                                    10_000
+                                }),
+                        ),
+                    ),
+                    (None, Some((fix, status))) => (*fix, SolverTerms::Recorded(*status)),
+                    (None, None) => unreachable!("as many as were recorded"),
+                };
+                let input = LoopInput {
+                    measurement: Some(fix),
+                    reference_um: if k < 40 { 0.0 } else { 5.0 },
+                    solver,
+                    ..LoopInput::default()
+                };
+                let out = controller.step(&mut state, &input);
+                if let Some(rig) = &mut rig {
+                    rig.advance(out.command_um);
+                }
+                ((fix, out.solver.status), out.command_um.to_bits())
+            })
+            .unzip::<_, _, Vec<_>, Vec<_>>()
+    };
+    let (told, commands) = run(Some(&mut rig), &[]);
+    let ends = |status| told.iter().filter(|(_, s)| *s == status).count();
+    assert!(ends(SolverStatus::PreviousPlan) > 5 && ends(SolverStatus::FallbackPi) > 5);
+    assert_eq!(run(None, &told).1, commands);
+}
+
+#[test]
 fn a_deadline_in_the_past_falls_back_to_the_previous_plan_and_then_to_pi() {
     let mut controller = Controller::new(config(mpc(SolverKind::Clarabel))).unwrap();
     let mut rig = SimulatedRig::new(RigConfig::eq6(1)).unwrap();

@@ -48,7 +48,12 @@ pub struct Statistics {
     variance: Moments,
     step: Option<StepWatch>,
     last: Option<TickRecord>,
+    /// Time (ns) and reference (um) of the last ticks, newest first.
+    targets: [(i64, f64); TARGETS],
 }
+
+/// Ticks whose references are kept: the oldest exposure that is compared with its own reference.
+const TARGETS: usize = 8;
 
 /// How the bead went from where it was to where it should be, after the loop was closed.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -105,11 +110,14 @@ impl Statistics {
             variance: Moments::default(),
             step: None,
             last: None,
+            targets: [(i64::MIN, f64::NAN); TARGETS],
         }
     }
 
     /// Takes one record.
     pub fn add(&mut self, record: &TickRecord) {
+        self.targets.copy_within(0..TARGETS - 1, 1);
+        self.targets[0] = (record.time_ns, record.target_um);
         if record.life == Life::Running as u8 {
             let seen_um = if record.true_um.is_finite() {
                 record.true_um
@@ -131,12 +139,28 @@ impl Statistics {
                 step.add(seen_um, record.time_ns - since);
             }
             if record.time_ns - since >= self.settled_after_ns {
-                self.measured.add(record.measured_um - record.target_um);
+                self.measured
+                    .add(record.measured_um - self.target_at(record.mid_exposure_ns));
                 self.truth.add(record.true_um - record.target_um);
                 self.variance.add(record.variance_um2);
             }
         }
         self.last = Some(*record);
+    }
+
+    /// The reference when a frame was exposed, um: on the line between the ticks before and after.
+    fn target_at(&self, time_ns: i64) -> f64 {
+        self.targets
+            .windows(2)
+            .find(|pair| pair[1].0 <= time_ns)
+            .map_or(f64::NAN, |pair| {
+                let ((late, after_um), (early, before_um)) = (pair[0], pair[1]);
+                if late <= time_ns || !before_um.is_finite() {
+                    return after_um;
+                }
+                let part = (time_ns - early) as f64 / (late - early) as f64;
+                before_um + part * (after_um - before_um)
+            })
     }
 
     /// The newest record.

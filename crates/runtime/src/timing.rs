@@ -33,7 +33,7 @@ impl Default for Timing {
         Self {
             period_us: 1000.0,
             budget_us: 500.0,
-            solver_us: 300.0,
+            solver_us: 250.0,
             camera_delay_ms: 2.0,
             oldest_ms: 5.0,
             faults_in_a_row: 5,

@@ -1,17 +1,19 @@
 //! `cellpos track`: hold a bead, or go to a position, in closed loop.
 
+use crate::cyclic::{self, LearnSpec, Sine};
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
 use crate::recording::{LiveLine, Recording};
 use crate::rig_file::{ClockKind, Frames, Rig, RigFile};
 use crate::session;
 use crate::setup::{ReferenceSpec, Setup};
+use cellpos_control::{ControllerFile, ControllerKind, LearnedTable, SolverKind};
 use cellpos_record::RunWriter;
 use cellpos_runtime::live::Operator;
 use cellpos_runtime::realtime::Conditions;
 use cellpos_runtime::{EndRule, Finished, Life, Summary};
 use cellpos_units::{Micrometers, Seconds};
 use serde::Serialize;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 /// Arguments of `cellpos track`.
@@ -20,6 +22,7 @@ use std::sync::Arc;
   cellpos track --target 0um
   cellpos track --target 10um --duration 5s --clock virtual --seed 7 --json
   cellpos track --target 0um --rig rig.toml --controller controller.toml
+  cellpos track --target 0um --sine 5um@50Hz --controller lqg --learn --duration 5s
 
 Without --rig the rig is emulated: frames are rendered, the board is the firmware library. Ctrl-C freezes the bead, then
 parks the PZT; a second Ctrl-C parks at once. Exit code 0: the run ended as asked; 1: it ended in Safe; 2: bad input.")]
@@ -33,6 +36,18 @@ pub struct Args {
     /// pi, lead, lqg, mpc, or the path of a controller.toml.
     #[arg(long, default_value = "pi")]
     controller: String,
+    /// A sine about the target, amplitude@frequency.
+    #[arg(long, value_name = "5um@50Hz")]
+    sine: Option<Sine>,
+    /// Learn the sine's feed-forward over its cycles; what is learned is kept in the run folder as learned.toml.
+    #[arg(long, requires = "sine")]
+    learn: bool,
+    /// Go on from the learned.toml of an earlier run.
+    #[arg(long, requires = "learn")]
+    learned: Option<PathBuf>,
+    /// Solver of mpc.
+    #[arg(long, value_enum)]
+    solver: Option<Solver>,
     /// The rig; left out: emulated.
     #[arg(long)]
     rig: Option<PathBuf>,
@@ -65,6 +80,15 @@ pub struct Args {
     json: bool,
 }
 
+/// Solvers of mpc.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+enum Solver {
+    /// Interior point.
+    Clarabel,
+    /// Dual active set: faster, no allocation.
+    ActiveSet,
+}
+
 /// What `--json` prints.
 #[derive(Debug, Serialize)]
 struct Report<'a> {
@@ -75,6 +99,7 @@ struct Report<'a> {
     bound_rms_nm: Option<f64>,
     conditions: &'a Conditions,
     warnings: &'a [String],
+    learned: Option<&'a LearnedTable>,
     run: Option<String>,
 }
 
@@ -87,17 +112,38 @@ pub fn run(args: Args) -> CommandResult {
     let ticks = ticks(args.duration, file.timing.period_us)?;
     let mut prepared = session::prepare(&args.model, &args.controller, &file)?;
     let mut rig = session::connect(&file, args.clock, args.frames, &prepared.model)?;
-    check_target(args.target, &rig)?;
+    choose_solver(args.solver, &mut prepared.controller)?;
+    let reach = args.sine.map_or(0.0, |sine| sine.amplitude.value());
+    for end in [-reach, reach] {
+        check_target(Micrometers(args.target.value() + end), &rig)?;
+    }
     session::narrow(&mut prepared, &file, &rig);
     let limits = prepared.controller.limits;
-    let hold = ReferenceSpec::Hold {
-        position_um: args.target.value(),
+    let centre_um = args.target.value();
+    let reference = match args.sine {
+        Some(sine) => ReferenceSpec::Sine {
+            centre_um,
+            amplitude_um: sine.amplitude.value(),
+            frequency_hz: sine.frequency.value(),
+            fade_s: cyclic::FADE_S,
+        },
+        None => ReferenceSpec::Hold {
+            position_um: centre_um,
+        },
     };
-    let setup = session::arm(prepared, &file, &mut rig, 1, hold)?;
+    // Before the board is armed: its watchdog does not wait for simulations.
+    let learn = args
+        .sine
+        .filter(|_| args.learn)
+        .map(|sine| LearnSpec::for_sine(&prepared, &file, sine, args.learned.as_deref()))
+        .transpose()?;
+    let mut setup = session::arm(prepared, &file, &mut rig, 1, reference)?;
+    setup.config.learn = learn;
     let writer = if args.no_record {
         None
     } else {
-        let inputs = session::inputs(args.rig.as_deref(), &args.model, &args.controller);
+        let mut inputs = session::inputs(args.rig.as_deref(), &args.model, &args.controller);
+        inputs.extend(args.learned.as_deref());
         let meta = session::meta(&args.name, args.clock, &inputs, &file, &setup)?;
         Some(RunWriter::create(&args.runs, meta).map_err(Failure::failed)?)
     };
@@ -133,6 +179,23 @@ fn ticks(duration: Option<Seconds>, period_us: f64) -> Result<Option<u64>, Failu
     Ok(Some(ticks as u64))
 }
 
+fn choose_solver(solver: Option<Solver>, controller: &mut ControllerFile) -> Result<(), Failure> {
+    let Some(solver) = solver else {
+        return Ok(());
+    };
+    if controller.controller != ControllerKind::Mpc {
+        return Err(Failure::bad_input(
+            "--solver is a choice of mpc, and the controller is another",
+            "write --controller mpc, or leave --solver out",
+        ));
+    }
+    controller.mpc.solver = match solver {
+        Solver::Clarabel => SolverKind::Clarabel,
+        Solver::ActiveSet => SolverKind::ActiveSet,
+    };
+    Ok(())
+}
+
 fn check_target(target: Micrometers, rig: &Rig) -> Result<(), Failure> {
     let [low_um, high_um] = rig.source.info().field_um;
     if (low_um..=high_um).contains(&target.value()) {
@@ -156,7 +219,7 @@ fn conclude(
         conditions,
         sink,
         io_error,
-        learned: _,
+        learned,
     } = finished;
     let mut warnings = rig.warnings.clone();
     if let Some(error) = &io_error {
@@ -174,6 +237,11 @@ fn conclude(
     let run = sink
         .into_writer()
         .map(|writer| session::finish(writer, outcome, &summary, &mut warnings));
+    if let (Some(run), Some(table)) = (&run, &learned)
+        && let Err(error) = cyclic::save_table(Path::new(run), table)
+    {
+        warnings.push(format!("no learned.toml: {error}"));
+    }
     let bound_rms_nm = session::bound_rms_nm(file, setup, &summary);
     let report = Report {
         summary: &summary,
@@ -182,6 +250,7 @@ fn conclude(
         bound_rms_nm,
         conditions: &conditions,
         warnings: &warnings,
+        learned: learned.as_ref(),
         run,
     };
     if args.json {
@@ -235,6 +304,30 @@ fn text(report: &Report) -> String {
             format!(
                 "{:+.2} um: within 5 % after {:.0} ms, overshoot {:.1} %",
                 step.size_um, step.settling_ms, step.overshoot_percent
+            ),
+        );
+    }
+    if let Some(learned) = report.learned {
+        line(
+            "learning",
+            format!(
+                "{:.0} cycles, measured error {} RMS at first, {} at the end{}",
+                learned.cycles,
+                nm(learned.error_before_um.map(|um| um * 1e3)),
+                nm(learned.error_after_um.map(|um| um * 1e3)),
+                match learned.retreats {
+                    0 => String::new(),
+                    n => format!("; {n} retreats"),
+                }
+            ),
+        );
+    }
+    if s.counts.plans_reused + s.counts.solver_fallbacks > 0 {
+        line(
+            "solver",
+            format!(
+                "{} ticks on the previous plan, {} on PI",
+                s.counts.plans_reused, s.counts.solver_fallbacks
             ),
         );
     }

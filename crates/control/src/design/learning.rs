@@ -69,8 +69,11 @@ fn positions(
         }
         let time_s = k as f64 * ts;
         fill_preview(reference, k, ts, &mut preview);
+        let mut fix = rig.measure();
+        // A frame says by its time stamp how old it is.
+        fix.offset_samples = (plant.delay_s - config.model.delay_s) / ts;
         let input = LoopInput {
-            measurement: Some(rig.measure()),
+            measurement: Some(fix),
             reference_um: reference.at_um(time_s),
             preview_um: &preview,
             learned_um: if k >= first {

@@ -1,0 +1,160 @@
+//! Cyclic motion on the command line: `--sine 5um@50Hz`, `--learn`, and the learned table of a run.
+
+use crate::outcome::Failure;
+use crate::rig_file::RigFile;
+use crate::setup::Prepared;
+use cellpos_control::design::{DesignPlant, Uncertainty, harmonic_responses};
+use cellpos_control::{
+    CycleLearning, HarmonicResponse, LearnConfig, LearnedTable, Learner, Profile, Shape,
+};
+use cellpos_units::{Hertz, Micrometers};
+use serde::{Deserialize, Serialize};
+use std::path::Path;
+use std::str::FromStr;
+
+/// Amplitude and frequency of a sine, as `5um@50Hz`.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Sine {
+    /// Half of peak to peak.
+    pub amplitude: Micrometers,
+    /// Frequency.
+    pub frequency: Hertz,
+}
+
+/// Time over which a sine comes in, s.
+pub const FADE_S: f64 = 0.2;
+
+impl FromStr for Sine {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let (amplitude, frequency) = text
+            .split_once('@')
+            .ok_or("write amplitude@frequency, for example 5um@50Hz")?;
+        let amplitude: Micrometers = amplitude.parse().map_err(|e| format!("amplitude: {e}"))?;
+        let frequency: Hertz = frequency.parse().map_err(|e| format!("frequency: {e}"))?;
+        if amplitude.value() <= 0.0 || frequency.value() <= 0.0 {
+            return Err("amplitude and frequency must be positive".to_string());
+        }
+        Ok(Self {
+            amplitude,
+            frequency,
+        })
+    }
+}
+
+/// What is learned in a run, from what: enough for a replay.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct LearnSpec {
+    /// Frequency of the reference, Hz.
+    pub frequency_hz: f64,
+    /// How.
+    pub config: LearnConfig,
+    /// Responses of the closed loop to the addition, with their uncertainty.
+    pub responses: Vec<HarmonicResponse>,
+    /// What was known before.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub table: Option<LearnedTable>,
+}
+
+/// Harmonics of a sine that are learned: nonlinearities make the third.
+const HARMONICS: u32 = 3;
+
+impl LearnSpec {
+    /// The responses of the loop's own model on a sine; `table`: a learned table to go on from.
+    pub fn for_sine(
+        setup: &Prepared,
+        file: &RigFile,
+        sine: Sine,
+        table: Option<&Path>,
+    ) -> Result<Self, Failure> {
+        let loop_config = setup
+            .controller
+            .loop_config(&setup.model)
+            .map_err(Failure::input)?;
+        let sample_s = file.timing.period_us * 1e-6;
+        let mut plant = DesignPlant::from_model(
+            &setup.model,
+            Some(setup.controller.delay_ms * 1e-3),
+            sample_s,
+        )
+        .map_err(Failure::input)?;
+        plant.neutral_um = file.first_neutral_um;
+        let frequency_hz = sine.frequency.value();
+        let reference = Profile::Wave {
+            shape: Shape::Sine,
+            centre_um: 0.0,
+            amplitude_um: sine.amplitude.value(),
+            frequency_hz,
+            fade_s: FADE_S,
+        };
+        let responses = harmonic_responses(
+            &plant,
+            &loop_config,
+            &reference,
+            FADE_S,
+            frequency_hz,
+            HARMONICS,
+            Uncertainty::default(),
+        )
+        .map_err(Failure::input)?;
+        let table = table.map(load_table).transpose()?;
+        let spec = Self {
+            frequency_hz,
+            config: LearnConfig::default(),
+            responses,
+            table,
+        };
+        spec.learning(sample_s)?;
+        Ok(spec)
+    }
+
+    /// The learner beside the loop.
+    pub fn learning(&self, sample_s: f64) -> Result<CycleLearning, Failure> {
+        let learner = Learner::new(self.config, self.frequency_hz, sample_s, &self.responses)
+            .map_err(Failure::input)?;
+        let state = match &self.table {
+            Some(table) => learner.resume(table).map_err(Failure::input)?,
+            None => learner.start(),
+        };
+        Ok(CycleLearning::new(learner, state))
+    }
+}
+
+fn load_table(path: &Path) -> Result<LearnedTable, Failure> {
+    let name = path.display().to_string();
+    let text = std::fs::read_to_string(path).map_err(|error| {
+        Failure::bad_input(
+            format!("{name}: {error}"),
+            "name the learned.toml of a run with --learn",
+        )
+    })?;
+    crate::toml_file::parse(&text, &name)
+}
+
+/// Writes what was learned into a run folder, as learned.toml.
+///
+/// # Errors
+/// A disk that is full, a folder that is gone.
+pub fn save_table(folder: &Path, table: &LearnedTable) -> std::io::Result<()> {
+    let text = toml::to_string_pretty(table).map_err(std::io::Error::other)?;
+    std::fs::write(folder.join("learned.toml"), text)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_sine_is_read_as_amplitude_and_frequency_with_their_units() {
+        let sine: Sine = "5um@50Hz".parse().expect("a sine");
+        assert_eq!(
+            (sine.amplitude.value(), sine.frequency.value()),
+            (5.0, 50.0)
+        );
+        for wrong in ["5um", "5@50Hz", "5um@50", "-1um@50Hz", "5um@0Hz"] {
+            assert!(wrong.parse::<Sine>().is_err(), "{wrong}");
+        }
+    }
+}
