@@ -134,7 +134,7 @@ fn main() {
         1e3 * bound_rms_um(0.33, 0.020, 2e-3, 1e-3)
     );
     println!(
-        "{:<16} {:>9} {:>13} {:>7}   {:>6} {:>6} {:>9} {:>7}   {:>9} {:>9}   {}",
+        "{:<16} {:>9} {:>13} {:>7}   {:>6} {:>6} {:>9} {:>7}   {:>9} {:>9}   stable x 0.5..2, +0/+1 sample",
         "",
         "hold nm",
         "worst seed",
@@ -144,8 +144,7 @@ fn main() {
         "overshoot",
         "limited",
         "50 Hz nm",
-        "100 Hz nm",
-        "stable x 0.5..2, +0/+1 sample"
+        "100 Hz nm"
     );
     for (name, controller) in controllers {
         let hold: Vec<f64> = (0..SEEDS)
