@@ -1,11 +1,11 @@
-//! Cyclic motion on the command line: `--sine 5um@50Hz`, `--learn`, and the learned table of a run.
+//! Cyclic motion: `--sine 5um@50Hz`, `--learn`, and the learned table of a run.
 
 use crate::outcome::Failure;
 use crate::rig_file::RigFile;
 use crate::setup::Prepared;
 use cellpos_control::design::{DesignPlant, Uncertainty, harmonic_responses};
 use cellpos_control::{
-    CycleLearning, HarmonicResponse, LearnConfig, LearnedTable, Learner, Profile, Shape,
+    CycleLearning, HarmonicResponse, LearnConfig, LearnedTable, Learner, Profile, Reference, Shape,
 };
 use cellpos_units::{Hertz, Micrometers};
 use serde::{Deserialize, Serialize};
@@ -59,15 +59,48 @@ pub struct LearnSpec {
 }
 
 /// Harmonics of a sine that are learned: nonlinearities make the third.
-const HARMONICS: u32 = 3;
+const SINE_HARMONICS: u32 = 3;
+
+/// A periodic motion that is to be learned.
+struct Wanted<'a> {
+    reference: &'a dyn Reference,
+    /// From when on it is in full swing, s.
+    from_s: f64,
+    frequency_hz: f64,
+    harmonics: u32,
+}
 
 impl LearnSpec {
-    /// The responses of the loop's own model on a sine; `table`: a learned table to go on from.
+    /// For a sine of `cellpos track`; `table`: a learned table to go on from.
     pub fn for_sine(
         setup: &Prepared,
         file: &RigFile,
         sine: Sine,
-        table: Option<&Path>,
+        table: Option<LearnedTable>,
+    ) -> Result<Self, Failure> {
+        let frequency_hz = sine.frequency.value();
+        let reference = Profile::Wave {
+            shape: Shape::Sine,
+            centre_um: 0.0,
+            amplitude_um: sine.amplitude.value(),
+            frequency_hz,
+            fade_s: FADE_S,
+        };
+        let wanted = Wanted {
+            reference: &reference,
+            from_s: FADE_S,
+            frequency_hz,
+            harmonics: SINE_HARMONICS,
+        };
+        Self::new(setup, file, &wanted, table)
+    }
+
+    /// The responses are those of the loop's own model along the reference.
+    fn new(
+        setup: &Prepared,
+        file: &RigFile,
+        wanted: &Wanted,
+        table: Option<LearnedTable>,
     ) -> Result<Self, Failure> {
         let loop_config = setup
             .controller
@@ -81,27 +114,18 @@ impl LearnSpec {
         )
         .map_err(Failure::input)?;
         plant.neutral_um = file.first_neutral_um;
-        let frequency_hz = sine.frequency.value();
-        let reference = Profile::Wave {
-            shape: Shape::Sine,
-            centre_um: 0.0,
-            amplitude_um: sine.amplitude.value(),
-            frequency_hz,
-            fade_s: FADE_S,
-        };
         let responses = harmonic_responses(
             &plant,
             &loop_config,
-            &reference,
-            FADE_S,
-            frequency_hz,
-            HARMONICS,
+            wanted.reference,
+            wanted.from_s,
+            wanted.frequency_hz,
+            wanted.harmonics,
             Uncertainty::default(),
         )
         .map_err(Failure::input)?;
-        let table = table.map(load_table).transpose()?;
         let spec = Self {
-            frequency_hz,
+            frequency_hz: wanted.frequency_hz,
             config: LearnConfig::default(),
             responses,
             table,
@@ -122,7 +146,8 @@ impl LearnSpec {
     }
 }
 
-fn load_table(path: &Path) -> Result<LearnedTable, Failure> {
+/// Reads a learned table.
+pub fn load_table(path: &Path) -> Result<LearnedTable, Failure> {
     let name = path.display().to_string();
     let text = std::fs::read_to_string(path).map_err(|error| {
         Failure::bad_input(
@@ -133,13 +158,31 @@ fn load_table(path: &Path) -> Result<LearnedTable, Failure> {
     crate::toml_file::parse(&text, &name)
 }
 
-/// Writes what was learned into a run folder, as learned.toml.
+/// Writes what was learned into a run folder, as learned.toml: whole or not at all.
 ///
 /// # Errors
 /// A disk that is full, a folder that is gone.
 pub fn save_table(folder: &Path, table: &LearnedTable) -> std::io::Result<()> {
     let text = toml::to_string_pretty(table).map_err(std::io::Error::other)?;
-    std::fs::write(folder.join("learned.toml"), text)
+    let part = folder.join("learned.toml.part");
+    std::fs::write(&part, text)?;
+    std::fs::rename(part, folder.join("learned.toml"))
+}
+
+/// What was learned, in a line.
+pub fn learned_text(table: &LearnedTable) -> String {
+    let nm =
+        |um: Option<f64>| um.map_or_else(|| "-".to_string(), |um| format!("{:.1} nm", um * 1e3));
+    format!(
+        "{:.0} cycles, measured error {} RMS at first, {} at the end{}",
+        table.cycles,
+        nm(table.error_before_um),
+        nm(table.error_after_um),
+        match table.retreats {
+            0 => String::new(),
+            n => format!("; {n} retreats"),
+        }
+    )
 }
 
 #[cfg(test)]

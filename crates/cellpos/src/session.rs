@@ -3,6 +3,7 @@
 use crate::outcome::Failure;
 use crate::rig_file::{ClockKind, Frames, Rig, RigFile};
 use crate::setup::{self, AnyGuide, ReferenceSpec, Setup, SetupConfig};
+use cellpos_control::ControllerKind;
 use cellpos_control::design::bound_rms_um;
 use cellpos_plant::Model;
 use cellpos_record::{InputFile, RunEnd, RunMeta, RunWriter};
@@ -28,13 +29,21 @@ pub fn stop_on_signals(operator: &Arc<Operator>) -> Result<(), Failure> {
     .map_err(Failure::failed)
 }
 
-/// Narrows the controller's limits to what rig file and board allow.
+/// Narrows the controller's limits to what rig file and board allow, and the positions that MPC plans for to what the
+/// camera sees.
 pub fn narrow(setup: &mut setup::Prepared, file: &RigFile, rig: &Rig) {
     let board = rig.actuator.info();
     let own = setup.controller.limits;
     let asked = setup::within(file.limits, [own.low_um, own.high_um, own.slew_um_per_s]);
     setup.controller.limits =
         setup::within(asked, [board.low_um, board.high_um, board.slew_um_per_s]);
+    let [low_um, high_um] = rig.source.info().field_um;
+    if setup.controller.controller == ControllerKind::Mpc && low_um < high_um {
+        let mpc = &mut setup.controller.mpc;
+        let given = |view_um: Option<f64>| view_um.filter(|um| um.is_finite());
+        mpc.view_low_um = given(Some(mpc.view_low_um.map_or(low_um, |um| um.max(low_um))));
+        mpc.view_high_um = given(Some(mpc.view_high_um.map_or(high_um, |um| um.min(high_um))));
+    }
 }
 
 /// Arms the board and completes the set-up with where it stands.

@@ -536,8 +536,8 @@ impl ControlLoop {
     ) -> LoopOutput {
         let estimate = &prepared.estimate;
         let mut wanted_um = requested_um;
-        if estimate.stuck && input.mode == Mode::Run {
-            let most = self.estimator.stuck_authority_um();
+        let most = estimate.authority_um;
+        if most.is_finite() && input.mode == Mode::Run {
             wanted_um = wanted_um.clamp(estimate.neutral_um - most, estimate.neutral_um + most);
         }
         let limited = self.config.limits.apply(

@@ -28,6 +28,12 @@ const STUCK_AVERAGE: f64 = 0.05;
 /// wrong because neutral was.
 const RELEASED_NEUTRAL_UM: f64 = 0.5;
 
+/// Ticks after a bead came free for which its speed stays bounded; at most 63, they share a number of the packed state.
+const RELEASED_TICKS: u8 = 50;
+
+/// Speed granted in these ticks, over that of a stuck bead.
+const RELEASED_SPEED: f64 = 2.0;
+
 /// Variance of spread level 0, um^2.
 const LEAST_SPREAD_UM2: f64 = 1e-6;
 
@@ -70,7 +76,8 @@ pub struct EstimatorConfig {
     pub gate_floor_um: f64,
     /// After this many refused measurements in a row the next one is believed.
     pub gate_most: u8,
-    /// Bead speed granted while the bead is taken for stuck, um per tick: bounds the jump when it comes free.
+    /// Bead speed granted while the bead is taken for stuck, um per tick: bounds the jump when it comes free. Twice that
+    /// is granted for 50 ticks afterwards, so that it goes to a far reference without a jerk.
     pub stuck_speed_um_per_tick: f64,
 }
 
@@ -117,6 +124,8 @@ pub struct EstimatorState {
     pub seen: bool,
     /// The bead is taken for stuck.
     pub stuck: bool,
+    /// Ticks for which the speed of a bead that came free stays bounded.
+    pub released_ticks: u8,
 }
 
 /// What the estimator knows after a measurement (or its absence).
@@ -133,6 +142,8 @@ pub(crate) struct Estimate {
     pub gated: bool,
     pub seen: bool,
     pub stuck: bool,
+    /// Largest distance of the command from neutral, um; infinite unless the bead is stuck or has just come free.
+    pub authority_um: f64,
     /// The present as a state, for state feedback.
     pub now: Moment,
 }
@@ -329,6 +340,7 @@ impl Estimator {
             gated: 0,
             seen: false,
             stuck: false,
+            released_ticks: 0,
         }
     }
 
@@ -437,6 +449,8 @@ impl Estimator {
     /// One tick: time moves on, the measurement (if any) is used, the present is predicted.
     pub(crate) fn step(&self, state: &mut EstimatorState, fix: Option<Fix>) -> Estimate {
         state.lag = state.lag.saturating_add(1);
+        state.released_ticks = state.released_ticks.saturating_sub(1);
+        let was_stuck = state.stuck;
         let mut innovation_um = 0.0;
         let (mut used, mut fresh, mut gated) = (false, false, false);
         match fix {
@@ -454,6 +468,9 @@ impl Estimator {
                     self.advance_filter(state);
                 }
             }
+        }
+        if was_stuck && !state.stuck {
+            state.released_ticks = RELEASED_TICKS;
         }
         let mut m = self.filter_moment(state);
         let mut predicted = m;
@@ -485,6 +502,7 @@ impl Estimator {
             gated,
             seen: state.seen,
             stuck: state.stuck,
+            authority_um: self.authority_um(state),
             now: m,
         }
     }
@@ -561,9 +579,11 @@ impl Estimator {
         state.seen = true;
     }
 
-    /// Likelihood of "the bead does not move" against "it moves as predicted", forgotten over 50 fixes. A gain of
-    /// 0.3 is the watershed, so that a bead twice as slow as the model is not taken for stuck. A bead that has moved,
-    /// if only by its Brownian motion, is not stuck: that ends the verdict at once.
+    /// Sum of the logarithms of the odds that the bead does not move against that it moves half as far as predicted, never
+    /// below 0. A gain of a quarter is the watershed: a bead twice as slow as the model is not taken for stuck. Nothing is
+    /// forgotten, for a bead held near its target, where next to no motion is predicted, lets neutral run away slowly,
+    /// and that takes as long to show. A bead that has moved, if only by its Brownian motion, is not stuck: that ends
+    /// the verdict at once.
     fn weigh_stuck(
         &self,
         state: &mut EstimatorState,
@@ -571,30 +591,30 @@ impl Estimator {
         motion_um: f64,
         variance_um2: f64,
     ) {
-        let (still, moving) = if state.stuck {
-            (innovation_um, innovation_um - motion_um)
+        let still_um = if state.stuck {
+            innovation_um
         } else {
-            (innovation_um + motion_um, innovation_um)
+            innovation_um + motion_um
         };
-        let walk = 2.0 * self.config.diffusion_um2_per_s * self.model.sample_time_s;
-        let noise = 2.0 * (walk + 2.0 * variance_um2);
-        let moved = still * still
+        let walk_um2 = 2.0 * self.config.diffusion_um2_per_s * self.model.sample_time_s;
+        let noise_um2 = walk_um2 + 2.0 * variance_um2;
+        let moved = still_um * still_um
             > if state.stuck {
                 25.0 * variance_um2
             } else {
-                4.5 * noise
+                9.0 * noise_um2
             };
         if state.stuck && moved {
             state.stuck_evidence = 0.0;
             state.stuck = false;
             return;
         }
-        let odds = (moving * moving - still * still - 0.4 * motion_um * motion_um) / noise;
+        let odds = motion_um * (0.25 * motion_um - still_um) / (2.0 * noise_um2);
         // One fix decides little: an outlier or a jolt must not make a verdict.
         let odds = odds.clamp(-2.0, if moved { 0.0 } else { 2.0 });
-        let evidence = (0.98 * state.stuck_evidence + odds).clamp(0.0, 25.0);
+        let evidence = (state.stuck_evidence + odds).clamp(0.0, 25.0);
         state.stuck_evidence = (evidence * EVIDENCE_GRID).round() / EVIDENCE_GRID;
-        state.stuck = state.stuck_evidence > if state.stuck { 3.0 } else { 10.0 };
+        state.stuck = state.stuck_evidence > if state.stuck { 3.0 } else { 12.0 };
     }
 
     /// Whole ticks of delay, rounded up.
@@ -623,9 +643,14 @@ impl Estimator {
         state.history_um[0] = command_um;
     }
 
-    /// Largest distance of the command from neutral while the bead is taken for stuck, um.
-    pub(crate) fn stuck_authority_um(&self) -> f64 {
-        let per_tick = self.tick.gain.abs().max(1e-12);
-        self.config.stuck_speed_um_per_tick / per_tick
+    /// Largest distance of the command from neutral that keeps to the speed granted, um.
+    fn authority_um(&self, state: &EstimatorState) -> f64 {
+        let granted_um = self.config.stuck_speed_um_per_tick;
+        let speed_um = match (state.stuck, state.released_ticks) {
+            (true, _) => granted_um,
+            (false, 1..) => RELEASED_SPEED * granted_um,
+            (false, 0) => return f64::INFINITY,
+        };
+        speed_um / self.tick.gain.abs().max(1e-12)
     }
 }

@@ -10,7 +10,7 @@ use crate::pi::PiState;
 pub const STATE_LEN: usize = 16;
 
 /// Bits of the packed flags below the evidence.
-const FLAG_BITS: f64 = 67_108_864.0;
+const FLAG_BITS: f64 = 4_294_967_296.0;
 
 /// Estimator and controller state of one loop.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -40,7 +40,8 @@ impl LoopState {
             | u32::from(e.gated) << 8
             | u32::from(e.seen) << 16
             | u32::from(e.stuck) << 17
-            | u32::from(e.spread_level) << 18;
+            | u32::from(e.spread_level) << 18
+            | u32::from(e.released_ticks) << 26;
         let mut out = [0.0; STATE_LEN];
         out[0] = e.integrator_um;
         out[1] = e.neutral_um;
@@ -84,6 +85,7 @@ impl LoopState {
                 seen: flags & 1 << 16 != 0,
                 stuck: flags & 1 << 17 != 0,
                 spread_level: (flags >> 18) as u8,
+                released_ticks: (flags >> 26) as u8,
             },
             pi: PiState {
                 integral_um: packed[7],

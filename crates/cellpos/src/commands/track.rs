@@ -132,10 +132,15 @@ pub fn run(args: Args) -> CommandResult {
         },
     };
     // Before the board is armed: its watchdog does not wait for simulations.
+    let table = args
+        .learned
+        .as_deref()
+        .map(cyclic::load_table)
+        .transpose()?;
     let learn = args
         .sine
         .filter(|_| args.learn)
-        .map(|sine| LearnSpec::for_sine(&prepared, &file, sine, args.learned.as_deref()))
+        .map(|sine| LearnSpec::for_sine(&prepared, &file, sine, table))
         .transpose()?;
     let mut setup = session::arm(prepared, &file, &mut rig, 1, reference)?;
     setup.config.learn = learn;
@@ -221,6 +226,8 @@ fn conclude(
         io_error,
         learned,
     } = finished;
+    // A sine is one motion.
+    let learned = learned.into_iter().flatten().next();
     let mut warnings = rig.warnings.clone();
     if let Some(error) = &io_error {
         warnings.push(session::describe(error));
@@ -308,19 +315,7 @@ fn text(report: &Report) -> String {
         );
     }
     if let Some(learned) = report.learned {
-        line(
-            "learning",
-            format!(
-                "{:.0} cycles, measured error {} RMS at first, {} at the end{}",
-                learned.cycles,
-                nm(learned.error_before_um.map(|um| um * 1e3)),
-                nm(learned.error_after_um.map(|um| um * 1e3)),
-                match learned.retreats {
-                    0 => String::new(),
-                    n => format!("; {n} retreats"),
-                }
-            ),
-        );
+        line("learning", cyclic::learned_text(learned));
     }
     if s.counts.plans_reused + s.counts.solver_fallbacks > 0 {
         line(

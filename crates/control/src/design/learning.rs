@@ -34,59 +34,72 @@ impl Default for Uncertainty {
 }
 
 const SETTLE_TICKS: u64 = 400;
-const FIT_TICKS: u64 = 240;
+/// Shortest and longest time over which a response is fitted, ticks: a period, where that lies between.
+const FIT_TICKS: (u64, u64) = (240, 10_000);
 /// The tone moves the bead by about this, um.
 const TONE_UM: f64 = 0.02;
 
-/// True bead positions over the last [`FIT_TICKS`], with a tone `cos(2 pi h phase)` added to the command.
-fn positions(
-    plant: &DesignPlant,
-    config: &LoopConfig,
-    reference: &(impl Reference + ?Sized),
-    from_s: f64,
-    tone_hz: f64,
-    tone_um: f64,
-) -> Result<Vec<f64>, SetUpError> {
-    let ts = plant.sample_time_s;
-    let mut rig = SimulatedRig::new(RigConfig {
-        plant: plant.plant.clone(),
-        sample_time_s: ts,
-        delay_s: plant.delay_s,
-        neutral_um: plant.neutral_um,
-        diffusion_um2_per_s: 0.0,
-        fix_noise_um: 0.0,
-        seed: 0,
-    })?;
-    let mut controller = Controller::new(*config)?;
-    let mut state = controller.start(plant.neutral_um, plant.neutral_um);
-    let mut preview = vec![0.0; controller.preview_len()];
-    let first = (from_s / ts).ceil() as u64;
-    let ticks = first + SETTLE_TICKS + FIT_TICKS;
-    let mut path = Vec::with_capacity(FIT_TICKS as usize);
-    for k in 0..ticks {
-        if k >= ticks - FIT_TICKS {
-            path.push(rig.true_um());
-        }
-        let time_s = k as f64 * ts;
-        fill_preview(reference, k, ts, &mut preview);
-        let mut fix = rig.measure();
-        // A frame says by its time stamp how old it is.
-        fix.offset_samples = (plant.delay_s - config.model.delay_s) / ts;
-        let input = LoopInput {
-            measurement: Some(fix),
-            reference_um: reference.at_um(time_s),
-            preview_um: &preview,
-            learned_um: if k >= first {
-                tone_um * (TAU * tone_hz * time_s).cos()
-            } else {
-                0.0
-            },
-            ..LoopInput::default()
-        };
-        let out = controller.step(&mut state, &input);
-        rig.advance(out.command_um);
+/// What a response is measured on.
+struct Bench<'a, R: ?Sized> {
+    config: &'a LoopConfig,
+    reference: &'a R,
+    /// From this tick on the reference is in full swing; the response is fitted over the last ticks.
+    first_tick: u64,
+    fit_ticks: u64,
+}
+
+impl<R: Reference + ?Sized> Bench<'_, R> {
+    /// First tick of the fit.
+    fn fit_from(&self) -> u64 {
+        self.first_tick + SETTLE_TICKS
     }
-    Ok(path)
+
+    /// True bead positions over the fitted ticks, with a tone added to the command.
+    fn positions(
+        &self,
+        plant: &DesignPlant,
+        tone_hz: f64,
+        tone_um: f64,
+    ) -> Result<Vec<f64>, SetUpError> {
+        let ts = plant.sample_time_s;
+        let mut rig = SimulatedRig::new(RigConfig {
+            plant: plant.plant.clone(),
+            sample_time_s: ts,
+            delay_s: plant.delay_s,
+            neutral_um: plant.neutral_um,
+            diffusion_um2_per_s: 0.0,
+            fix_noise_um: 0.0,
+            seed: 0,
+        })?;
+        let mut controller = Controller::new(*self.config)?;
+        let mut state = controller.start(plant.neutral_um, plant.neutral_um);
+        let mut preview = vec![0.0; controller.preview_len()];
+        let mut path = Vec::with_capacity(self.fit_ticks as usize);
+        for k in 0..self.fit_from() + self.fit_ticks {
+            if k >= self.fit_from() {
+                path.push(rig.true_um());
+            }
+            let time_s = k as f64 * ts;
+            fill_preview(self.reference, k, ts, &mut preview);
+            let mut fix = rig.measure();
+            // A frame says by its time stamp how old it is.
+            fix.offset_samples = (plant.delay_s - self.config.model.delay_s) / ts;
+            let input = LoopInput {
+                measurement: Some(fix),
+                reference_um: self.reference.at_um(time_s),
+                preview_um: &preview,
+                learned_um: if k >= self.first_tick {
+                    tone_um * (TAU * tone_hz * time_s).cos()
+                } else {
+                    0.0
+                },
+                ..LoopInput::default()
+            };
+            let out = controller.step(&mut state, &input);
+            rig.advance(out.command_um);
+        }
+        Ok(path)
+    }
 }
 
 /// Response at one frequency: least squares of tone, offset and ramp.
@@ -143,16 +156,22 @@ pub fn harmonic_responses(
     let wanted: Vec<u32> = (1..=harmonics.min(HARMONICS as u32))
         .filter(|&h| hz(h) * ts <= HIGHEST_PART)
         .collect();
-    let first_tick = (from_s / ts).ceil() as u64 + SETTLE_TICKS;
+    let period_ticks = (1.0 / (frequency_hz * ts)).ceil() as u64;
+    let bench = Bench {
+        config: &config,
+        reference,
+        first_tick: (from_s / ts).ceil() as u64,
+        fit_ticks: period_ticks.clamp(FIT_TICKS.0, FIT_TICKS.1),
+    };
     let mut table: Vec<Vec<Complex<f64>>> = Vec::with_capacity(corners.len());
     for corner in &corners {
-        let without = positions(corner, &config, reference, from_s, 0.0, 0.0)?;
+        let without = bench.positions(corner, 0.0, 0.0)?;
         let mut row = Vec::with_capacity(wanted.len());
         for &h in &wanted {
             let size = corner.plant.response(cellpos_plant::Hertz(hz(h))).norm();
             let tone_um = TONE_UM / size.max(1e-3);
-            let with = positions(corner, &config, reference, from_s, hz(h), tone_um)?;
-            row.push(response(&with, &without, first_tick, ts, hz(h)) / tone_um);
+            let with = bench.positions(corner, hz(h), tone_um)?;
+            row.push(response(&with, &without, bench.fit_from(), ts, hz(h)) / tone_um);
         }
         table.push(row);
     }
