@@ -8,6 +8,7 @@ use cellpos_firmware_sim::BoardConfig;
 use cellpos_plant::Model;
 use cellpos_rig::serial::SerialLine;
 use cellpos_rig::socket::SocketCamera;
+use cellpos_rig::sources::Region;
 use cellpos_rig::{
     Actuator, BoardHost, Calibration, CalibrationFile, Camera, Clock, CommandedFlow, EmulatedRig,
     FlowTap, PositionSource, VisionSource,
@@ -90,6 +91,27 @@ pub enum CameraConfig {
         #[serde(default = "rate_hz")]
         rate_hz: f64,
     },
+    /// A GigE or USB3 Vision camera; needs a program built with the feature `aravis`.
+    Industrial {
+        /// IP address of a GigE camera, or the identifier of another (`cellpos camera` lists both).
+        address: String,
+        /// Frame rate, Hz.
+        #[serde(default = "rate_hz")]
+        rate_hz: f64,
+        /// Part of the sensor read out; left out: as the camera is set.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        region: Option<Region>,
+        /// Exposure, us; left out: as the camera is set.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        exposure_us: Option<f64>,
+        /// 8 or 16 bits per pixel.
+        #[serde(default = "bits")]
+        bits: u16,
+    },
+}
+
+fn bits() -> u16 {
+    8
 }
 
 fn rate_hz() -> f64 {
@@ -273,17 +295,16 @@ impl RigFile {
     pub fn connect(&self, clock: ClockKind, frames: Frames) -> Result<Rig, Failure> {
         match (&self.actuator, &self.camera) {
             (ActuatorConfig::Emulated {}, CameraConfig::Emulated {}) => self.emulate(clock, frames),
-            (
-                ActuatorConfig::Serial { port, baud, .. },
-                CameraConfig::Socket { socket, rate_hz },
-            ) => {
+            (ActuatorConfig::Serial { port, baud, .. }, camera)
+                if *camera != (CameraConfig::Emulated {}) =>
+            {
                 if clock == ClockKind::Virtual || frames == Frames::Off {
                     return Err(Failure::bad_input(
                         "--clock virtual and --frames off are for the emulated rig",
                         "leave them out, or leave out --rig",
                     ));
                 }
-                self.open(port, *baud, socket, *rate_hz)
+                self.open(port, *baud)
             }
             _ => Err(Failure::bad_input(
                 "the emulated board moves the emulated bead only: [actuator] and [camera] must both be emulated, or neither",
@@ -322,7 +343,52 @@ impl RigFile {
         })
     }
 
-    fn open(&self, port: &str, baud: u32, socket: &Path, rate_hz: f64) -> Result<Rig, Failure> {
+    /// The camera of a real rig, running.
+    fn open_camera(&self) -> Result<Box<dyn Camera>, Failure> {
+        match &self.camera {
+            CameraConfig::Emulated {} => Err(Failure::bad_input(
+                "the emulated camera sees the emulated bead only",
+                "write [camera] kind = \"socket\" or \"industrial\"",
+            )),
+            CameraConfig::Socket { socket, rate_hz } => {
+                let (delay_ms, patience) = (self.timing.camera_delay_ms, Duration::from_secs(2));
+                let camera = SocketCamera::connect(socket, *rate_hz, delay_ms, patience)
+                    .map_err(Failure::failed)?;
+                Ok(Box::new(camera))
+            }
+            #[cfg(feature = "aravis")]
+            CameraConfig::Industrial {
+                address,
+                rate_hz,
+                region,
+                exposure_us,
+                bits,
+            } => {
+                use cellpos_rig::sources::industrial::{IndustrialCamera, IndustrialSettings};
+                let settings = IndustrialSettings {
+                    address: address.clone(),
+                    region: *region,
+                    rate_hz: *rate_hz,
+                    exposure_us: *exposure_us,
+                    bits: *bits,
+                    latency_ms: self.timing.camera_delay_ms,
+                    buffers: 50,
+                };
+                Ok(Box::new(
+                    IndustrialCamera::open(settings).map_err(Failure::failed)?,
+                ))
+            }
+            #[cfg(not(feature = "aravis"))]
+            CameraConfig::Industrial { address, .. } => Err(Failure::bad_input(
+                format!(
+                    "[camera] address = \"{address}\": this program was built without industrial cameras"
+                ),
+                "install libaravis-dev and libusb-1.0-0-dev, then build with: cargo build --release --features aravis",
+            )),
+        }
+    }
+
+    fn open(&self, port: &str, baud: u32) -> Result<Rig, Failure> {
         let calibration = self.calibration.ok_or_else(|| {
             Failure::bad_input(
                 "a real camera needs a [calibration] with pixel_um, origin_px and sign",
@@ -343,13 +409,7 @@ impl RigFile {
         }
         let board = BoardHost::connect(line, Clock::Real).map_err(Failure::failed)?;
         let flow = nominal_flow()?;
-        let camera = SocketCamera::connect(
-            socket,
-            rate_hz,
-            self.timing.camera_delay_ms,
-            Duration::from_secs(2),
-        )
-        .map_err(Failure::failed)?;
+        let camera = self.open_camera()?;
         Ok(Rig {
             source: self.tracked(camera, calibration, &Clock::Real, &flow)?,
             actuator: Box::new(FlowTap::new(board, flow.clone(), Clock::Real)),
@@ -360,10 +420,8 @@ impl RigFile {
     }
 
     /// Camera and board without a tracker, for the LED test.
-    pub fn open_for_led(&self) -> Result<(SocketCamera, BoardHost<SerialLine>), Failure> {
-        let (ActuatorConfig::Serial { port, baud, .. }, CameraConfig::Socket { socket, rate_hz }) =
-            (&self.actuator, &self.camera)
-        else {
+    pub fn open_for_led(&self) -> Result<(Box<dyn Camera>, BoardHost<SerialLine>), Failure> {
+        let ActuatorConfig::Serial { port, baud, .. } = &self.actuator else {
             return Err(Failure::bad_input(
                 "the LED test of a rig needs its board and its camera",
                 "leave the test out with --led-edges 0",
@@ -371,14 +429,7 @@ impl RigFile {
         };
         let line = SerialLine::open(port, *baud).map_err(Failure::failed)?;
         let board = BoardHost::connect(line, Clock::Real).map_err(Failure::failed)?;
-        let camera = SocketCamera::connect(
-            socket,
-            *rate_hz,
-            self.timing.camera_delay_ms,
-            Duration::from_secs(2),
-        )
-        .map_err(Failure::failed)?;
-        Ok((camera, board))
+        Ok((self.open_camera()?, board))
     }
 
     /// Watchdog asked of the board, ms.

@@ -73,6 +73,34 @@ fn on_the_rig_of_a_rig_toml_the_same_plant_comes_out_through_the_loop_of_track()
     }
 }
 
+#[test]
+fn a_camera_later_than_the_rig_file_says_is_measured_and_the_file_is_said_to_be_wrong() {
+    let folder = tempfile::tempdir().unwrap();
+    // Half the exposure comes on top: 4 ms from its middle to the tick, the file says 2.
+    let mut late = cellpos_plant::Model::eq6();
+    late.effects
+        .push(cellpos_plant::Effect::TimeDelay { delay_s: 0.003_75 });
+    std::fs::write(folder.path().join("late.toml"), late.to_toml_string()).unwrap();
+    rig(
+        folder.path(),
+        "rig.toml",
+        "[emulator]\nseed = 4\nmodel = \"late.toml\"\n",
+    );
+    let line =
+        "identify --rig rig.toml --frames off --bootstrap 0 --json --out m.toml --report r.html";
+    let r = succeed(folder.path(), line).json();
+    assert!((gain(&r) / TRUE_GAIN_PER_S - 1.0).abs() < 0.01, "{r}");
+    let delay_ms = number(&r["parameters"]["delay_ms"], "value");
+    assert!((delay_ms - 4.0).abs() < 0.05, "{delay_ms}");
+    let warnings = r["warnings"].as_array().unwrap();
+    let told = |w: &Value| w.as_str().unwrap().contains("camera_delay_ms = 4.00");
+    assert_eq!(warnings.iter().filter(|w| told(w)).count(), 1, "{r}");
+    for line in r["frequencies"].as_array().unwrap() {
+        let miss = |a: &str, b: &str| (number(line, a) - number(line, b)).abs();
+        assert!(miss("phase_deg", "eq6_phase_deg") < 1.0, "{line}");
+    }
+}
+
 const FEW: &str = "--frequency 5Hz,10Hz,20Hz,50Hz,120Hz --bootstrap 0 --led-edges 0 --json --out m.toml --report r.html";
 
 #[test]

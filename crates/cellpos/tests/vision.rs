@@ -386,3 +386,28 @@ fn a_camera_that_is_unplugged_ends_the_watch_with_a_reason() {
     assert!(message(&ran).contains("camera"), "{}\n{}", ran.out, ran.err);
     assert!(!ran.err.contains("panicked"));
 }
+
+#[test]
+fn a_rig_with_an_industrial_camera_that_does_not_answer_is_told_by_its_address() {
+    let folder = tempfile::tempdir().unwrap();
+    let rig = "[actuator]\nkind = \"emulated\"\n[camera]\nkind = \"industrial\"\naddress = \"127.0.0.99\"\nregion = { x_px = 0, y_px = 0, width_px = 64, height_px = 64 }\n";
+    std::fs::write(folder.path().join("mixed.toml"), rig).unwrap();
+    let ran = cellpos(
+        folder.path(),
+        "track --target 0um --rig mixed.toml --duration 1s",
+    );
+    assert_eq!(ran.code, Some(2), "{}", ran.err);
+    assert!(
+        message(&ran).contains("must both be emulated, or neither"),
+        "{}",
+        ran.err
+    );
+    let misspelt = rig.replace("address", "adress");
+    std::fs::write(folder.path().join("misspelt.toml"), misspelt).unwrap();
+    let ran = cellpos(
+        folder.path(),
+        "track --target 0um --rig misspelt.toml --duration 1s",
+    );
+    assert_eq!(ran.code, Some(2), "{}", ran.err);
+    assert!(message(&ran).contains("misspelt.toml"), "{}", ran.err);
+}

@@ -110,8 +110,8 @@ pub fn find_edges(
 
 /// The delay from edges: the value that contradicts fewest of their intervals, with the spread that is left.
 ///
-/// Each edge says `before - sent < L <= after - sent`. For jitter-free clocks the intersection is the answer and its
-/// width the uncertainty; with jitter the intersection may be empty, and the middle of the edges' intervals is taken
+/// Each edge says `before - sent < L <= after - sent`. For jitter-free clocks the delay lies in the intersection, anywhere
+/// with equal right (the dither covers the period evenly), so the 95 % interval is its middle 95 %; with jitter the intersection may be empty, and the middle of the edges' intervals is taken
 /// with its standard error (about 0.3/sqrt(N) of a frame period).
 ///
 /// # Errors
@@ -136,10 +136,11 @@ pub fn delay_from_edges(edges: &[SeenEdge]) -> Result<DelayEstimate, IdentError>
     if low < high {
         let width = high - low;
         let (delay_s, sd_s) = (0.5 * (low + high), width / 12f64.sqrt());
+        let half = 0.475 * width;
         return Ok(DelayEstimate {
             delay_s,
             sd_s,
-            ci95_s: [low, high],
+            ci95_s: [delay_s - half, delay_s + half],
             edges: n,
         });
     }

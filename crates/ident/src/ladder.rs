@@ -83,6 +83,8 @@ pub struct DelayPrior {
     pub delay_s: f64,
     /// Its standard deviation, s.
     pub sd_s: f64,
+    /// Half of its 95 % interval, s: not 1.96 standard deviations where its error is not normal.
+    pub half95_s: f64,
 }
 
 /// One rung fitted.

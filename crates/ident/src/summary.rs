@@ -87,6 +87,7 @@ pub fn summarise(
     let prior = led.map(|l| DelayPrior {
         delay_s: l.delay_s,
         sd_s: l.sd_s.max(1e-7),
+        half95_s: (0.5 * (l.ci95_s[1] - l.ci95_s[0])).max(1e-7),
     });
     let judged = judge(&problem, &ladder, prior, bootstrap, seed);
     let disagreement = led.and_then(|l| disagreement_s(&l, judged.phase_delay95_s, 2e-5));

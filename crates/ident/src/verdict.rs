@@ -184,10 +184,13 @@ pub fn judge(
     let period_ms = problem.sampling().period_s * 1e3;
     let lead_ms = lead_interval_ms(problem, fit, &data, period_ms);
     let draws = bootstrap(problem, fit, replicates, seed);
+    // Replicates know the noise exactly, the data only estimate it: the spread is widened as Student's t is.
+    let wider = t / 1.959_964;
     let drawn = |f: &dyn Fn(&[f64]) -> f64| -> Option<[f64; 2]> {
         (draws.len() >= 40).then(|| {
             let values: Vec<f64> = draws.iter().map(|x| f(x)).collect();
-            [quantile(&values, 0.025), quantile(&values, 0.975)]
+            let value = f(&best.parameters);
+            [0.025, 0.975].map(|share| value + wider * (quantile(&values, share) - value))
         })
     };
     let sd = |i: usize| best.covariance[(i, i)].sqrt();
@@ -333,7 +336,7 @@ fn delay_parameter(
     let meaning = "delay from the command to the middle of the exposure";
     match prior {
         Some(prior) => {
-            let half = 1.96 * prior.sd_s * 1e3;
+            let half = prior.half95_s * 1e3;
             let value = model.delay_s * 1e3;
             Parameter {
                 name: "delay_ms",
@@ -472,9 +475,11 @@ pub fn bootstrap(
                         return p.response;
                     }
                     let sum: Complex<f64> = (0..n).map(|_| p.block_errors[random.below(n)]).sum();
-                    // Resampled means are narrower than the truth by (n-1)/n; the noise model sets the size.
+                    // Resampled means are narrower than the truth by (n-1)/n; the noise model sets the size, and what the
+                    // rung leaves over widens it as it widens the covariance.
                     let size = (p.variance / p.scatter_variance.max(f64::MIN_POSITIVE) * n as f64
-                        / (n as f64 - 1.0))
+                        / (n as f64 - 1.0)
+                        * fit.scale)
                         .sqrt();
                     p.response + sum / n as f64 * size
                 })

@@ -2,6 +2,7 @@
 
 mod common;
 
+use cellpos_ident::delay::{SeenEdge, delay_from_edges, dithered_edges};
 use cellpos_ident::excitation::{Limits, PAPER_FREQUENCIES_HZ};
 use cellpos_ident::experiment::{Measured, Plan};
 use cellpos_ident::frequency_response::Settings;
@@ -49,6 +50,7 @@ fn a_held_bead_gives_gain_and_delay_and_says_what_it_cannot_tell() {
     let prior = DelayPrior {
         delay_s: 0.002002,
         sd_s: 4e-6,
+        half95_s: 8e-6,
     };
     let start = std::time::Instant::now();
     for p in &m.points {
@@ -116,6 +118,28 @@ fn a_held_bead_gives_gain_and_delay_and_says_what_it_cannot_tell() {
     assert!((noise.diffusion_um2_per_s - 0.33).abs() < 2.0 * noise.diffusion_ci95_um2_per_s);
 }
 
+/// An LED test of 100 edges in front of a camera of 1 kHz whose frames come 2 ms after their exposure.
+fn led_test(seed: u64) -> DelayPrior {
+    let start_s = 0.05 + 0.618e-3 * seed as f64;
+    let seen: Vec<SeenEdge> = dithered_edges(100, 0.011, PERIOD_S, start_s, seed)
+        .into_iter()
+        .map(|sent_s| {
+            let after_s = ((sent_s + 0.002) / PERIOD_S).ceil() * PERIOD_S;
+            SeenEdge {
+                sent_s,
+                before_s: after_s - PERIOD_S,
+                after_s,
+            }
+        })
+        .collect();
+    let led = delay_from_edges(&seen).unwrap();
+    DelayPrior {
+        delay_s: led.delay_s,
+        sd_s: led.sd_s,
+        half95_s: 0.5 * (led.ci95_s[1] - led.ci95_s[0]),
+    }
+}
+
 #[test]
 fn ninety_five_percent_intervals_cover_the_truth_in_ninety_to_ninety_nine_of_a_hundred_seeds() {
     let truth = LadderModel::eq6(0.002);
@@ -124,16 +148,17 @@ fn ninety_five_percent_intervals_cover_the_truth_in_ninety_to_ninety_nine_of_a_h
         ("pair_zero_rad_per_s", truth.zero_rad_per_s),
         ("pair_pole_rad_per_s", truth.pole_rad_per_s),
         ("effective_delay_ms", truth.effective_delay_s() * 1e3),
+        ("delay_ms", truth.delay_s * 1e3),
     ];
-    let mut covered = [0usize; 4];
-    let mut called = [0usize; 4];
+    let mut covered = [0usize; 5];
+    let mut called = [0usize; 5];
     let (mut diffusion, mut localisation) = (0.0, 0.0);
     for seed in 0..100 {
         let mut rig = PositionRig::new(&TransferFunction::eq6(), 0.002, 1000 + seed);
         let m = measured(&mut rig);
         diffusion += m.noise.unwrap().diffusion_um2_per_s / 100.0;
         localisation += m.noise.unwrap().localisation_um / 100.0;
-        let (_, judged) = fitted(&m, None, 0);
+        let (_, judged) = fitted(&m, Some(led_test(seed)), 0);
         for name in ["far_zero_rad_per_s", "slow_pole_rad_per_s"] {
             assert!(
                 !judged.parameter(name).unwrap().verdict.is_identified(),

@@ -105,6 +105,20 @@ pub trait Camera: Send {
     fn info(&self) -> SourceInfo;
 }
 
+impl<C: Camera + ?Sized> Camera for Box<C> {
+    fn next_frame(
+        &mut self,
+        buffer: &mut FrameBuffer,
+        deadline_ns: i64,
+    ) -> Result<Option<FrameStamp>, CameraError> {
+        (**self).next_frame(buffer, deadline_ns)
+    }
+
+    fn info(&self) -> SourceInfo {
+        (**self).info()
+    }
+}
+
 /// A stream of bead positions.
 pub trait PositionSource: Send {
     /// Waits for the next position until `deadline_ns`; `None` when none came in time.

@@ -49,6 +49,8 @@ pub struct Acquired {
     pub neutral_um: f64,
     /// Mean time from the arrival of a frame to its tick, s: part of the record's delay, and not of the camera's.
     pub wait_s: f64,
+    /// From the middle of an exposure to the arrival of its frame, by the stamps of the frames, s.
+    pub path_s: f64,
     /// Why segments are missing, if any are.
     pub trouble: Option<String>,
 }
@@ -207,6 +209,7 @@ impl OnRig {
                 .last()
                 .map_or(self.file.first_neutral_um, |t| t.neutral_um),
             wait_s: rows.wait_s(),
+            path_s: 1e-9 * rows.path_ns as f64,
             trouble,
         })
     }
@@ -291,6 +294,31 @@ struct Rows {
     waited: (i64, i64),
     /// Row of each tick since the loop was closed.
     of_tick: Vec<usize>,
+    /// From the middle of an exposure to the arrival of its frame, ns.
+    path_ns: i64,
+}
+
+/// The camera path: as configured, unless the stamps of most frames say that it is another by half a period or more. Then
+/// it is that of the fastest frames, and what is later than those has waited.
+fn camera_path_ns(ticks: &[TickRecord], period_ns: i64, configured_ms: f64) -> i64 {
+    let configured_ns = (configured_ms * 1e6).round() as i64;
+    let mut ages_ns: Vec<i64> = ticks
+        .iter()
+        .filter(|t| !t.flags.has(TickFlags::TIMER) && !t.flags.has(TickFlags::STALE))
+        .map(|t| t.time_ns - t.mid_exposure_ns)
+        .collect();
+    ages_ns.sort_unstable();
+    match (
+        ages_ns.get(ages_ns.len() / 2),
+        ages_ns.get(ages_ns.len() / 100),
+    ) {
+        (Some(median_ns), Some(fastest_ns))
+            if 2 * (median_ns - configured_ns).abs() >= period_ns =>
+        {
+            *fastest_ns
+        }
+        _ => configured_ns,
+    }
 }
 
 impl Rows {
@@ -301,12 +329,13 @@ impl Rows {
             usable: Vec::new(),
             waited: (0, 0),
             of_tick: Vec::new(),
+            path_ns: 0,
         };
-        let delay_ns = (camera_delay_ms * 1e6).round() as i64;
         let closed = ticks
             .iter()
             .position(|t| t.life == Life::Running as u8)
             .unwrap_or(ticks.len());
+        rows.path_ns = camera_path_ns(&ticks[closed..], period_ns, camera_delay_ms);
         let mut first_id = None;
         let first_seq = ticks.get(closed).map_or(0, |t| t.seq);
         for tick in &ticks[closed..] {
@@ -327,7 +356,7 @@ impl Rows {
                 rows.output.push(f64::NAN);
                 rows.usable.push(true);
             }
-            let late_ns = tick.time_ns - tick.mid_exposure_ns - delay_ns;
+            let late_ns = tick.time_ns - tick.mid_exposure_ns - rows.path_ns;
             let on_time = new_frame && !has(TickFlags::LOST) && 2 * late_ns < period_ns;
             if on_time {
                 rows.waited.0 += late_ns;

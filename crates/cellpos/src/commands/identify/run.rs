@@ -69,6 +69,7 @@ pub fn run(job: &Job, mut progress: impl FnMut(usize, usize) + Send) -> Result<D
         mut led,
         neutral_um,
         wait_s,
+        path_s,
     } = match &job.rig {
         Some(rig) => on_rig(job, rig, &plan, records, &mut heard)?,
         None => held_bead(job, &plan, records, &mut heard)?,
@@ -82,7 +83,16 @@ pub fn run(job: &Job, mut progress: impl FnMut(usize, usize) + Send) -> Result<D
         test.estimate.delay_s += wait_s;
         test.estimate.ci95_s = test.estimate.ci95_s.map(|end| end + wait_s);
     }
-    let result = conclude(job, measured, led.as_ref())?;
+    let mut result = conclude(job, measured, led.as_ref())?;
+    if let (Some(rig), Some(path_s)) = (&job.rig, path_s) {
+        let (found_ms, configured_ms) = (path_s * 1e3, rig.file.timing.camera_delay_ms);
+        if (found_ms - configured_ms).abs() > 1e-6 {
+            result.warnings.push(format!(
+                "frames come {found_ms:.2} ms after the middle of their exposure, rig.toml says {configured_ms} ms: write \
+                 [timing] camera_delay_ms = {found_ms:.2} and design the controller again"
+            ));
+        }
+    }
     Ok(Done {
         plan,
         records,
@@ -114,6 +124,7 @@ struct Raw {
     led: Option<DelayTest>,
     neutral_um: f64,
     wait_s: f64,
+    path_s: Option<f64>,
 }
 
 fn held_bead(
@@ -140,6 +151,7 @@ fn held_bead(
         neutral_um,
         // Ticks fall on the arrivals of frames here.
         wait_s: 0.0,
+        path_s: None,
     })
 }
 
@@ -152,7 +164,7 @@ fn on_rig(
     progress: &mut (dyn FnMut(usize) + Send),
 ) -> Result<Raw, Failure> {
     const ATTEMPTS: usize = 4;
-    let (mut neutral_um, mut wait_s) = (rig.file.first_neutral_um, 0.0);
+    let (mut neutral_um, mut wait_s, mut path_s) = (rig.file.first_neutral_um, 0.0, None);
     for attempt in 1..=ATTEMPTS {
         let missing = |index: &usize| records.iter().all(|r| r.index != *index);
         let todo: Vec<usize> = (0..plan.segments.len()).filter(missing).collect();
@@ -169,6 +181,7 @@ fn on_rig(
         records.extend(acquired.records);
         records.sort_by_key(|r| r.index);
         (neutral_um, wait_s) = (acquired.neutral_um, acquired.wait_s);
+        path_s = Some(acquired.path_s);
         if let Some(trouble) = acquired.trouble {
             let fatal = trouble.contains("Safe") || attempt == ATTEMPTS;
             if fatal && records.len() < plan.segments.len() {
@@ -201,6 +214,7 @@ fn on_rig(
         led,
         neutral_um,
         wait_s,
+        path_s,
     })
 }
 
