@@ -3,12 +3,12 @@
 //! Unknown keys are refused with a suggestion; every number has its unit in the key. The plant is not part of this
 //! file: it is the model.toml beside it.
 
-use crate::control_loop::{ControllerConfig, LoopConfig};
 use crate::design::DesignPlant;
 use crate::error::BuildError;
 use crate::estimator::EstimatorConfig;
 use crate::feedback::Lqg;
 use crate::limits::Limits;
+use crate::loop_io::{ControllerConfig, LoopConfig};
 use crate::mpc::Mpc;
 use crate::pi::{Lead, Pi};
 use cellpos_plant::{Model, PlantError};

@@ -8,9 +8,17 @@
 //! Brownian motion drives `q` with variance `2 D Ts` per tick, neutral is a random walk, and a relative uncertainty of
 //! the gain widens the covariance in proportion to the motion it predicts.
 
+mod stuck;
+mod transition;
+
 use crate::error::{BuildError, check};
 use crate::loop_model::{LoopModel, MODES};
 use serde::{Deserialize, Serialize};
+use stuck::RELEASED_TICKS;
+use transition::Transition;
+
+pub(crate) use stuck::EVIDENCE_GRID;
+pub(crate) use transition::Moment;
 
 /// Past commands held.
 pub const HISTORY: usize = 6;
@@ -18,21 +26,12 @@ pub const HISTORY: usize = 6;
 /// Uncertainty of neutral once the filter has been wrong for many fixes, um: half the range of the PZT.
 const LOST_NEUTRAL_UM: f64 = 20.0;
 
-/// Evidence lies on a grid of this many steps per unit, so that it packs into the recorded state beside the flags.
-pub(crate) const EVIDENCE_GRID: f64 = 65_536.0;
-
 /// Weight of a fix in the average position of a stuck bead.
 const STUCK_AVERAGE: f64 = 0.05;
 
 /// Uncertainty of neutral after a bead came free, um: it may have drifted meanwhile, or the verdict may have been
 /// wrong because neutral was.
 const RELEASED_NEUTRAL_UM: f64 = 0.5;
-
-/// Ticks after a bead came free for which its speed stays bounded; at most 63, they share a number of the packed state.
-const RELEASED_TICKS: u8 = 50;
-
-/// Speed granted in these ticks, over that of a stuck bead.
-const RELEASED_SPEED: f64 = 2.0;
 
 /// Variance of spread level 0, um^2.
 const LEAST_SPREAD_UM2: f64 = 1e-6;
@@ -148,16 +147,6 @@ pub(crate) struct Estimate {
     pub now: Moment,
 }
 
-/// Deterministic part of the state at one time.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub(crate) struct Moment {
-    pub q: f64,
-    pub n: f64,
-    pub modes: [f64; MODES],
-    /// Command in force just before this time.
-    pub last_um: f64,
-}
-
 /// A fix as the estimator takes it: finite and within reason.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Fix {
@@ -166,51 +155,6 @@ pub(crate) struct Fix {
     pub age: usize,
     /// Its time stamp beyond that, ticks: positive for older.
     pub offset: f64,
-}
-
-/// Transition over a time, exact for a constant command.
-#[derive(Debug, Clone, Copy, PartialEq)]
-struct Transition {
-    gain: f64,
-    a: [f64; MODES],
-    b: [f64; MODES],
-    fraction: f64,
-}
-
-impl Transition {
-    fn new(model: &LoopModel, fraction: f64) -> Self {
-        let t = model.sample_time_s * fraction;
-        let mut this = Self {
-            gain: model.gain_per_s * t,
-            a: [0.0; MODES],
-            b: [0.0; MODES],
-            fraction,
-        };
-        for (i, mode) in model.modes.iter().enumerate() {
-            if mode.pole_rad_per_s < 0.0 {
-                this.a[i] = (mode.pole_rad_per_s * t).exp();
-                this.b[i] = (this.a[i] - 1.0) / mode.pole_rad_per_s;
-            }
-        }
-        this
-    }
-
-    fn advance(&self, m: &Moment, command_um: f64) -> Moment {
-        let drive = command_um - m.n;
-        let mut next = Moment {
-            q: m.q + self.gain * drive,
-            n: m.n,
-            modes: m.modes,
-            last_um: command_um,
-        };
-        for ((x, a), b) in next.modes.iter_mut().zip(&self.a).zip(&self.b) {
-            *x = a * *x + b * drive;
-        }
-        if self.fraction == 0.0 {
-            next.last_um = m.last_um;
-        }
-        next
-    }
 }
 
 /// A Kalman filter for one model and sample time.
@@ -579,44 +523,6 @@ impl Estimator {
         state.seen = true;
     }
 
-    /// Sum of the logarithms of the odds that the bead does not move against that it moves half as far as predicted, never
-    /// below 0. A gain of a quarter is the watershed: a bead twice as slow as the model is not taken for stuck. Nothing is
-    /// forgotten, for a bead held near its target, where next to no motion is predicted, lets neutral run away slowly,
-    /// and that takes as long to show. A bead that has moved, if only by its Brownian motion, is not stuck: that ends
-    /// the verdict at once.
-    fn weigh_stuck(
-        &self,
-        state: &mut EstimatorState,
-        innovation_um: f64,
-        motion_um: f64,
-        variance_um2: f64,
-    ) {
-        let still_um = if state.stuck {
-            innovation_um
-        } else {
-            innovation_um + motion_um
-        };
-        let walk_um2 = 2.0 * self.config.diffusion_um2_per_s * self.model.sample_time_s;
-        let noise_um2 = walk_um2 + 2.0 * variance_um2;
-        let moved = still_um * still_um
-            > if state.stuck {
-                25.0 * variance_um2
-            } else {
-                9.0 * noise_um2
-            };
-        if state.stuck && moved {
-            state.stuck_evidence = 0.0;
-            state.stuck = false;
-            return;
-        }
-        let odds = motion_um * (0.25 * motion_um - still_um) / (2.0 * noise_um2);
-        // One fix decides little: an outlier or a jolt must not make a verdict.
-        let odds = odds.clamp(-2.0, if moved { 0.0 } else { 2.0 });
-        let evidence = (state.stuck_evidence + odds).clamp(0.0, 25.0);
-        state.stuck_evidence = (evidence * EVIDENCE_GRID).round() / EVIDENCE_GRID;
-        state.stuck = state.stuck_evidence > if state.stuck { 3.0 } else { 12.0 };
-    }
-
     /// Whole ticks of delay, rounded up.
     pub(crate) fn delay_ticks(&self) -> usize {
         self.delay_ticks
@@ -641,16 +547,5 @@ impl Estimator {
     pub(crate) fn push(&self, state: &mut EstimatorState, command_um: f64) {
         state.history_um.copy_within(0..HISTORY - 1, 1);
         state.history_um[0] = command_um;
-    }
-
-    /// Largest distance of the command from neutral that keeps to the speed granted, um.
-    fn authority_um(&self, state: &EstimatorState) -> f64 {
-        let granted_um = self.config.stuck_speed_um_per_tick;
-        let speed_um = match (state.stuck, state.released_ticks) {
-            (true, _) => granted_um,
-            (false, 1..) => RELEASED_SPEED * granted_um,
-            (false, 0) => return f64::INFINITY,
-        };
-        speed_um / self.tick.gain.abs().max(1e-12)
     }
 }

@@ -21,6 +21,7 @@ mod feedforward;
 pub mod learning;
 mod limits;
 mod linear;
+mod loop_io;
 mod loop_model;
 mod monitor;
 mod mpc;
@@ -31,10 +32,7 @@ mod simulation;
 mod state;
 
 pub use config::{ConfigError, ControllerFile, ControllerKind, PiFile};
-pub use control_loop::{
-    ControlLoop, Controller, ControllerConfig, LoopConfig, LoopFlags, LoopInput, LoopOutput,
-    Measurement, Mode, SolverReport, SolverStatus, SolverTerms,
-};
+pub use control_loop::{ControlLoop, Controller};
 pub use error::{BuildError, Parameter};
 pub use estimator::{Estimator, EstimatorConfig, EstimatorState, HISTORY};
 pub use feedback::{Feedback, Lqg};
@@ -45,6 +43,10 @@ pub use learning::{
 };
 pub use limits::{Limited, Limits};
 pub use linear::LinearLaw;
+pub use loop_io::{
+    ControllerConfig, LoopConfig, LoopFlags, LoopInput, LoopOutput, Measurement, Mode,
+    SolverReport, SolverStatus, SolverTerms,
+};
 pub use loop_model::{LoopMode, LoopModel, MODES};
 pub use monitor::{PlantEstimate, PlantMonitor, PlantMonitorState, PlantVerdict};
 pub use mpc::{HORIZON, Mpc, SolverKind};

@@ -8,12 +8,11 @@
 mod clarabel_qp;
 
 use crate::active_set::{ABSENT, QpEnd, QpMatrices, QpVectors, ROWS, VARS, WorkingSet};
-use crate::control_loop::{
-    ControlLoop, LoopInput, Prepared, SolverReport, SolverStatus, SolverTerms,
-};
+use crate::control_loop::{ControlLoop, Prepared};
 use crate::error::{BuildError, check};
 use crate::feedback::{DEVIATION, Deviation, Feedback};
 use crate::limits::Limits;
+use crate::loop_io::{LoopInput, SolverReport, SolverStatus, SolverTerms};
 use crate::loop_model::LoopModel;
 use crate::riccati::lq_feedback;
 use clarabel_qp::ClarabelQp;

@@ -9,7 +9,7 @@ use rand_core::{Rng, SeedableRng};
 use rand_xoshiro::Xoshiro256PlusPlus;
 use std::collections::VecDeque;
 
-use crate::control_loop::Measurement;
+use crate::loop_io::Measurement;
 
 /// What the simulated rig is made of.
 #[derive(Debug, Clone, PartialEq)]

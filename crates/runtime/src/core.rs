@@ -17,24 +17,26 @@
 //! tells the core with the next tick. Late ticks are counted, never made up for. N late or stale ticks in a row latch
 //! [`Life::Safe`].
 
+mod account;
+mod checks;
+
 use crate::arming::{Arming, ArmingConfig, ArmingState, Step};
 use crate::guide::{Guide, GuideInput, GuideOutput, Stage};
 use crate::learners::Learners;
 use crate::life::{EventKind, Events, FreezeReason, Life, Request, SafeReason};
 use crate::tick::Tick;
 pub use crate::tick::{Action, Counts, TickInput, TickOutput};
-use crate::tick_record::{TickFlags, TickRecord};
+use crate::tick_record::TickFlags;
 pub use crate::timing::{CoreError, Timing};
 use cellpos_control::{
     Controller, CycleLearning, LoopConfig, LoopInput, LoopOutput, LoopState,
     Measurement as LoopMeasurement, Mode, PlantMonitor, PlantMonitorState, SolverStatus,
     SolverTerms,
 };
-use cellpos_link::{BoardState, Fault};
+use cellpos_link::BoardState;
 use cellpos_plant::TransferFunction;
 use cellpos_rig::BoardReport;
 use cellpos_units::Seconds;
-use cellpos_vision::Decision;
 use std::ops::Range;
 
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -248,160 +250,6 @@ impl<R: Guide> Core<R> {
         }
     }
 
-    /// Accounts for ticks that never came: the last command was held, the bead moved on.
-    fn catch_up(&mut self, time_ns: i64, tick: &mut Tick) {
-        const MOST: i64 = 100;
-        let period = self.timing.period_ns();
-        let skipped = (time_ns - self.state.last_time_ns + period / 2) / period - 1;
-        if skipped <= 0 {
-            return;
-        }
-        tick.event(EventKind::TicksSkipped {
-            count: skipped as u64,
-        });
-        self.state.counts.skipped += skipped as u64;
-        for _ in 0..skipped.min(MOST) {
-            self.controller.skip(&mut self.state.control);
-            let control = &self.state.control;
-            let (neutral_um, held_um) =
-                (control.estimator.neutral_um, control.previous_command_um());
-            self.monitor
-                .step(&mut self.state.plant, None, neutral_um, held_um);
-        }
-    }
-
-    /// Freshness by id and by time stamp; gives the measurement that may be controlled on.
-    fn check_frame(&mut self, input: &TickInput, tick: &mut Tick) -> Option<LoopMeasurement> {
-        let Some(m) = &input.measurement else {
-            tick.flags.set(TickFlags::TIMER);
-            self.state.frames_silent = true;
-            return None;
-        };
-        self.state.frames_silent = false;
-        let age_ns = input.time_ns - m.mid_exposure_ns;
-        let mut stale = false;
-        if let Some((last_id, last_exposure_ns)) = self.state.last_frame {
-            if m.frame_id <= last_id {
-                tick.flags.set(TickFlags::DOUBLED_FRAME);
-                tick.event(EventKind::FrameRepeated {
-                    frame_id: m.frame_id,
-                });
-                stale = true;
-            } else {
-                let expected = m.frame_id - last_id;
-                let arrived = u64::from(input.drained.max(1));
-                if arrived > expected {
-                    // More frames than ids: some came twice, or one of them is older than the last tick's.
-                    tick.flags.set(TickFlags::DOUBLED_FRAME);
-                    tick.event(EventKind::FrameRepeated {
-                        frame_id: m.frame_id,
-                    });
-                }
-                let missing = expected.saturating_sub(arrived);
-                if missing > 0 {
-                    tick.flags.set(TickFlags::DROPPED_FRAME);
-                    tick.event(EventKind::FramesDropped { count: missing });
-                    self.state.counts.frames_lost += missing;
-                }
-                if m.mid_exposure_ns <= last_exposure_ns {
-                    tick.event(EventKind::FrameStale {
-                        age_ms: age_ns as f64 * 1e-6,
-                    });
-                    stale = true;
-                }
-            }
-        }
-        if !stale && age_ns > Timing::ms_to_ns(self.timing.oldest_ms) {
-            tick.event(EventKind::FrameStale {
-                age_ms: age_ns as f64 * 1e-6,
-            });
-            stale = true;
-        }
-        if stale {
-            tick.flags.set(TickFlags::STALE);
-            self.state.stale_in_a_row += 1;
-            if self.state.stale_in_a_row >= self.timing.faults_in_a_row {
-                self.latch(SafeReason::StaleFrames, tick);
-            }
-            return None;
-        }
-        self.state.stale_in_a_row = 0;
-        self.state.last_frame = Some((m.frame_id, m.mid_exposure_ns));
-        if !m.is_usable() {
-            tick.flags.set(TickFlags::LOST);
-            return None;
-        }
-        if matches!(m.track, Some((_, Decision::Reacquired))) {
-            tick.event(EventKind::BeadReacquired {
-                position_um: m.position_um,
-            });
-            self.state.counts.reacquired += 1;
-        }
-        let beyond_ns = age_ns - Timing::ms_to_ns(self.timing.camera_delay_ms);
-        let period = self.timing.period_ns();
-        let age_samples =
-            ((beyond_ns + period / 2).max(0) / period).min(i64::from(u16::MAX)) as u16;
-        Some(LoopMeasurement {
-            position_um: m.position_um,
-            variance_um2: m.variance_um2,
-            age_samples,
-            offset_samples: (beyond_ns - i64::from(age_samples) * period) as f64 / period as f64,
-        })
-    }
-
-    /// What the driver says of the previous tick.
-    fn check_driver(&mut self, input: &TickInput, tick: &mut Tick) {
-        match input.previous_late_ns {
-            Some(compute_ns) => {
-                tick.event(EventKind::LateTick {
-                    compute_us: f64::from(compute_ns) * 1e-3,
-                });
-                self.state.late_in_a_row += 1;
-                if self.state.late_in_a_row >= self.timing.faults_in_a_row {
-                    self.latch(SafeReason::LateTicks, tick);
-                }
-            }
-            None => self.state.late_in_a_row = 0,
-        }
-        if input.previous_refused {
-            self.state.refused_in_a_row += 1;
-            if self.state.refused_in_a_row >= self.timing.faults_in_a_row {
-                self.latch(SafeReason::ActuatorRingFull, tick);
-            }
-        } else {
-            self.state.refused_in_a_row = 0;
-        }
-    }
-
-    /// What the board says, or its silence.
-    fn check_board(&mut self, input: &TickInput, tick: &mut Tick) {
-        if let Some(report) = input.board {
-            tick.flags.set(TickFlags::BOARD_HEARD);
-            self.state.board_heard_ns = input.time_ns;
-            let before = self.state.board.replace(report);
-            let unchanged = |b: BoardReport| b.state == report.state && b.fault == report.fault;
-            if !before.is_some_and(unchanged) {
-                tick.event(EventKind::BoardChanged {
-                    state: report.state,
-                    fault: report.fault,
-                });
-            }
-            let damaged = report
-                .bad_frames
-                .saturating_sub(before.map_or(0, |b| b.bad_frames));
-            if damaged > 0 {
-                tick.event(EventKind::LinkGarbage { count: damaged });
-            }
-            if !matches!(report.state, BoardState::Armed | BoardState::Running) {
-                self.latch(SafeReason::Board, tick);
-            }
-        } else if input.time_ns - self.state.board_heard_ns
-            > Timing::ms_to_ns(self.timing.board_silence_ms)
-        {
-            self.latch(SafeReason::LinkLost, tick);
-        }
-    }
-
     /// Life cycle; gives what the controller is to do.
     fn advance_life(&mut self, position_um: Option<f64>, tick: &mut Tick) -> Mode {
         if self.state.life == Life::Armed {
@@ -547,55 +395,6 @@ impl<R: Guide> Core<R> {
         }
     }
 
-    /// Flags and events that follow from the controller's output.
-    fn account(&mut self, output: &LoopOutput, tick: &mut Tick) {
-        let flags = output.flags;
-        for (set, mask) in [
-            (flags.range_limited, TickFlags::RANGE_LIMITED),
-            (flags.slew_limited, TickFlags::SLEW_LIMITED),
-            (flags.not_finite, TickFlags::NOT_FINITE),
-            (flags.coasting, TickFlags::COASTING),
-            (flags.gated, TickFlags::GATED),
-        ] {
-            if set {
-                tick.flags.set(mask);
-            }
-        }
-        self.state.missing = if flags.coasting {
-            self.state.missing.saturating_add(1)
-        } else {
-            0
-        };
-        if self.state.life != Life::Running {
-            return;
-        }
-        /// A gap shorter than this is the daily bread of a camera and no event of its own.
-        const WORTH_AN_EVENT: u32 = 3;
-        let coasts = self.state.missing >= WORTH_AN_EVENT
-            || (self.state.coasting_since.is_some() && self.state.missing > 0);
-        tick.span(
-            &mut self.state.coasting_since,
-            coasts,
-            self.timing.period_us,
-            EventKind::CoastingStarted,
-            |lasted_ms| EventKind::CoastingEnded { lasted_ms },
-        );
-        tick.span(
-            &mut self.state.stuck_since,
-            flags.stuck,
-            self.timing.period_us,
-            EventKind::StuckStarted,
-            |lasted_ms| EventKind::StuckEnded { lasted_ms },
-        );
-        tick.span(
-            &mut self.state.saturated_since,
-            flags.range_limited,
-            self.timing.period_us,
-            EventKind::SaturationStarted,
-            |lasted_ms| EventKind::SaturationEnded { lasted_ms },
-        );
-    }
-
     fn action(&mut self, output: &LoopOutput, seq: u64) -> Action {
         /// Ticks after which an order to park that the board has not confirmed is given again.
         const REPEAT: u64 = 10;
@@ -615,31 +414,6 @@ impl<R: Guide> Core<R> {
                 self.state.parked_at = Some(seq);
                 Action::Park
             }
-        }
-    }
-
-    fn count(&mut self, input: &TickInput, output: &LoopOutput, flags: TickFlags) {
-        let counts = &mut self.state.counts;
-        counts.ticks += 1;
-        counts.superseded += u64::from(input.drained.saturating_sub(1));
-        counts.late += u64::from(input.previous_late_ns.is_some());
-        counts.refused += u64::from(input.previous_refused);
-        match output.solver.status {
-            SolverStatus::PreviousPlan => counts.plans_reused += 1,
-            SolverStatus::FallbackPi => counts.solver_fallbacks += 1,
-            SolverStatus::NotUsed | SolverStatus::Solved => {}
-        }
-        for (mask, counter) in [
-            (TickFlags::TIMER, &mut counts.timer),
-            (TickFlags::STALE, &mut counts.stale),
-            (TickFlags::LOST, &mut counts.fixes_lost),
-            (TickFlags::GATED, &mut counts.gated),
-            (TickFlags::COASTING, &mut counts.coasted),
-            (TickFlags::FREEZE, &mut counts.frozen),
-            (TickFlags::RANGE_LIMITED, &mut counts.range_limited),
-            (TickFlags::SLEW_LIMITED, &mut counts.slew_limited),
-        ] {
-            *counter += u64::from(flags.has(mask));
         }
     }
 
@@ -664,58 +438,6 @@ impl<R: Guide> Core<R> {
             tick.event(EventKind::FreezeEnded {
                 lasted_ms: (tick.seq - since) as f64 * self.timing.period_us * 1e-3,
             });
-        }
-    }
-
-    fn record(
-        &self,
-        input: &TickInput,
-        output: &LoopOutput,
-        guided: &GuideOutput,
-        flags: TickFlags,
-    ) -> TickRecord {
-        let m = input.measurement;
-        let (last_id, last_exposure) = self.state.last_frame.unwrap_or((0, 0));
-        TickRecord {
-            seq: self.state.seq,
-            time_ns: input.time_ns,
-            frame_id: m.map_or(last_id, |m| m.frame_id),
-            mid_exposure_ns: m.map_or(last_exposure, |m| m.mid_exposure_ns),
-            measured_um: m.map_or(f64::NAN, |m| m.position_um),
-            variance_um2: m.map_or(f64::NAN, |m| m.variance_um2),
-            verdict: m.map_or(255, |m| m.verdict as u8),
-            track: m
-                .and_then(|m| m.track)
-                .map_or(255, |(state, _)| state as u8),
-            decision: m
-                .and_then(|m| m.track)
-                .map_or(255, |(_, decision)| decision as u8),
-            target_um: guided.reference_um,
-            plan_ns: guided.plan_ns,
-            stage: guided.stage as u8,
-            length_um: m.map_or(f64::NAN, |m| m.length_um),
-            estimate_um: output.estimate_um,
-            neutral_um: output.neutral_um,
-            requested_um: output.requested_um,
-            command_um: output.command_um,
-            applied_um: self.state.board.map_or(f64::NAN, |b| b.applied_um),
-            true_um: m.map_or(f64::NAN, |m| m.true_um),
-            life: self.state.life as u8,
-            request: input.request as u8,
-            board: self.state.board.map_or(255, |b| b.state as u8),
-            board_fault: self
-                .state
-                .board
-                .map_or(Fault::None as u8, |b| b.fault as u8),
-            flags,
-            drained: input.drained.min(255) as u8,
-            wake_ns: 0,
-            compute_ns: 0,
-            solver_status: output.solver.status as u8,
-            solver_iterations: output.solver.iterations.min(255) as u8,
-            solver_active: output.solver.active.min(255) as u8,
-            solver_ns: output.solver.solve_ns,
-            controller_state: self.controller.control_loop().pack(&self.state.control),
         }
     }
 }

@@ -5,10 +5,11 @@
 //! estimator's gains and the constraints that it has there. The same at the corners of the plant's uncertainty gives the
 //! bound that the convergence test needs.
 
-use crate::control_loop::{Controller, ControllerConfig, LoopConfig, LoopInput};
+use crate::control_loop::Controller;
 use crate::design::plant::DesignPlant;
 use crate::design::step::SetUpError;
 use crate::learning::{HARMONICS, HIGHEST_PART, HarmonicResponse};
+use crate::loop_io::{ControllerConfig, LoopConfig, LoopInput};
 use crate::mpc::SolverKind;
 use crate::reference::{Reference, fill_preview};
 use crate::simulation::{RigConfig, SimulatedRig};

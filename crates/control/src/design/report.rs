@@ -1,7 +1,6 @@
 //! The whole design in one call: what `cellpos design` prints.
 
 use crate::config::{ConfigError, text_error};
-use crate::control_loop::{ControllerConfig, LoopConfig};
 use crate::design::bound::bound_rms_um;
 use crate::design::margins::{Margins, margins};
 use crate::design::noise::{NoiseFigures, noise_figures};
@@ -15,6 +14,7 @@ use crate::error::{BuildError, check};
 use crate::estimator::EstimatorConfig;
 use crate::limits::Limits;
 use crate::linear::LinearLaw;
+use crate::loop_io::{ControllerConfig, LoopConfig};
 use crate::pi::{Lead, Pi};
 use cellpos_plant::PlantError;
 use serde::Deserialize;

@@ -1,8 +1,9 @@
 //! Step and disturbance figures, from the running loop itself (estimator, controller, limits) without noise.
 
-use crate::control_loop::{Controller, LoopConfig, LoopInput};
+use crate::control_loop::Controller;
 use crate::design::plant::DesignPlant;
 use crate::error::BuildError;
+use crate::loop_io::{LoopConfig, LoopInput};
 use crate::simulation::{RigConfig, SimulatedRig};
 use cellpos_plant::PlantError;
 use thiserror::Error;

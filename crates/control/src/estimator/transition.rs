@@ -1,0 +1,58 @@
+//! The deterministic part of the state, and how commands move it.
+
+use crate::loop_model::{LoopModel, MODES};
+
+/// Deterministic part of the state at one time.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub(crate) struct Moment {
+    pub q: f64,
+    pub n: f64,
+    pub modes: [f64; MODES],
+    /// Command in force just before this time.
+    pub last_um: f64,
+}
+
+/// Transition over a time, exact for a constant command.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Transition {
+    pub(super) gain: f64,
+    a: [f64; MODES],
+    b: [f64; MODES],
+    pub(super) fraction: f64,
+}
+
+impl Transition {
+    pub(super) fn new(model: &LoopModel, fraction: f64) -> Self {
+        let t = model.sample_time_s * fraction;
+        let mut this = Self {
+            gain: model.gain_per_s * t,
+            a: [0.0; MODES],
+            b: [0.0; MODES],
+            fraction,
+        };
+        for (i, mode) in model.modes.iter().enumerate() {
+            if mode.pole_rad_per_s < 0.0 {
+                this.a[i] = (mode.pole_rad_per_s * t).exp();
+                this.b[i] = (this.a[i] - 1.0) / mode.pole_rad_per_s;
+            }
+        }
+        this
+    }
+
+    pub(super) fn advance(&self, m: &Moment, command_um: f64) -> Moment {
+        let drive = command_um - m.n;
+        let mut next = Moment {
+            q: m.q + self.gain * drive,
+            n: m.n,
+            modes: m.modes,
+            last_um: command_um,
+        };
+        for ((x, a), b) in next.modes.iter_mut().zip(&self.a).zip(&self.b) {
+            *x = a * *x + b * drive;
+        }
+        if self.fraction == 0.0 {
+            next.last_um = m.last_um;
+        }
+        next
+    }
+}

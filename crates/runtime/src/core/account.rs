@@ -1,0 +1,139 @@
+//! What is kept of a tick: flags, events, counts, the record.
+
+use super::Core;
+use crate::guide::{Guide, GuideOutput};
+use crate::life::{EventKind, Life};
+use crate::tick::{Tick, TickInput};
+use crate::tick_record::{TickFlags, TickRecord};
+use cellpos_control::{LoopOutput, SolverStatus};
+use cellpos_link::Fault;
+
+impl<R: Guide> Core<R> {
+    /// Flags and events that follow from the controller's output.
+    pub(super) fn account(&mut self, output: &LoopOutput, tick: &mut Tick) {
+        let flags = output.flags;
+        for (set, mask) in [
+            (flags.range_limited, TickFlags::RANGE_LIMITED),
+            (flags.slew_limited, TickFlags::SLEW_LIMITED),
+            (flags.not_finite, TickFlags::NOT_FINITE),
+            (flags.coasting, TickFlags::COASTING),
+            (flags.gated, TickFlags::GATED),
+        ] {
+            if set {
+                tick.flags.set(mask);
+            }
+        }
+        self.state.missing = if flags.coasting {
+            self.state.missing.saturating_add(1)
+        } else {
+            0
+        };
+        if self.state.life != Life::Running {
+            return;
+        }
+        /// A gap shorter than this is the daily bread of a camera and no event of its own.
+        const WORTH_AN_EVENT: u32 = 3;
+        let coasts = self.state.missing >= WORTH_AN_EVENT
+            || (self.state.coasting_since.is_some() && self.state.missing > 0);
+        tick.span(
+            &mut self.state.coasting_since,
+            coasts,
+            self.timing.period_us,
+            EventKind::CoastingStarted,
+            |lasted_ms| EventKind::CoastingEnded { lasted_ms },
+        );
+        tick.span(
+            &mut self.state.stuck_since,
+            flags.stuck,
+            self.timing.period_us,
+            EventKind::StuckStarted,
+            |lasted_ms| EventKind::StuckEnded { lasted_ms },
+        );
+        tick.span(
+            &mut self.state.saturated_since,
+            flags.range_limited,
+            self.timing.period_us,
+            EventKind::SaturationStarted,
+            |lasted_ms| EventKind::SaturationEnded { lasted_ms },
+        );
+    }
+
+    /// Adds the tick to the counts.
+    pub(super) fn count(&mut self, input: &TickInput, output: &LoopOutput, flags: TickFlags) {
+        let counts = &mut self.state.counts;
+        counts.ticks += 1;
+        counts.superseded += u64::from(input.drained.saturating_sub(1));
+        counts.late += u64::from(input.previous_late_ns.is_some());
+        counts.refused += u64::from(input.previous_refused);
+        match output.solver.status {
+            SolverStatus::PreviousPlan => counts.plans_reused += 1,
+            SolverStatus::FallbackPi => counts.solver_fallbacks += 1,
+            SolverStatus::NotUsed | SolverStatus::Solved => {}
+        }
+        for (mask, counter) in [
+            (TickFlags::TIMER, &mut counts.timer),
+            (TickFlags::STALE, &mut counts.stale),
+            (TickFlags::LOST, &mut counts.fixes_lost),
+            (TickFlags::GATED, &mut counts.gated),
+            (TickFlags::COASTING, &mut counts.coasted),
+            (TickFlags::FREEZE, &mut counts.frozen),
+            (TickFlags::RANGE_LIMITED, &mut counts.range_limited),
+            (TickFlags::SLEW_LIMITED, &mut counts.slew_limited),
+        ] {
+            *counter += u64::from(flags.has(mask));
+        }
+    }
+
+    /// The tick's record.
+    pub(super) fn record(
+        &self,
+        input: &TickInput,
+        output: &LoopOutput,
+        guided: &GuideOutput,
+        flags: TickFlags,
+    ) -> TickRecord {
+        let m = input.measurement;
+        let (last_id, last_exposure) = self.state.last_frame.unwrap_or((0, 0));
+        TickRecord {
+            seq: self.state.seq,
+            time_ns: input.time_ns,
+            frame_id: m.map_or(last_id, |m| m.frame_id),
+            mid_exposure_ns: m.map_or(last_exposure, |m| m.mid_exposure_ns),
+            measured_um: m.map_or(f64::NAN, |m| m.position_um),
+            variance_um2: m.map_or(f64::NAN, |m| m.variance_um2),
+            verdict: m.map_or(255, |m| m.verdict as u8),
+            track: m
+                .and_then(|m| m.track)
+                .map_or(255, |(state, _)| state as u8),
+            decision: m
+                .and_then(|m| m.track)
+                .map_or(255, |(_, decision)| decision as u8),
+            target_um: guided.reference_um,
+            plan_ns: guided.plan_ns,
+            stage: guided.stage as u8,
+            length_um: m.map_or(f64::NAN, |m| m.length_um),
+            estimate_um: output.estimate_um,
+            neutral_um: output.neutral_um,
+            requested_um: output.requested_um,
+            command_um: output.command_um,
+            applied_um: self.state.board.map_or(f64::NAN, |b| b.applied_um),
+            true_um: m.map_or(f64::NAN, |m| m.true_um),
+            life: self.state.life as u8,
+            request: input.request as u8,
+            board: self.state.board.map_or(255, |b| b.state as u8),
+            board_fault: self
+                .state
+                .board
+                .map_or(Fault::None as u8, |b| b.fault as u8),
+            flags,
+            drained: input.drained.min(255) as u8,
+            wake_ns: 0,
+            compute_ns: 0,
+            solver_status: output.solver.status as u8,
+            solver_iterations: output.solver.iterations.min(255) as u8,
+            solver_active: output.solver.active.min(255) as u8,
+            solver_ns: output.solver.solve_ns,
+            controller_state: self.controller.control_loop().pack(&self.state.control),
+        }
+    }
+}
