@@ -73,13 +73,11 @@ fn killed(kills: u32, cycles: u32) {
     let mut seed = 0x9e37_79b9_7f4a_7c15_u64;
     let mut killed_ns = Vec::new();
     let mut before: Vec<u64> = Vec::new();
-    let mut attempts = 0;
+    // A busy machine ends a session now and then; it must not end them all.
+    let mut in_vain = 0;
     loop {
-        attempts += 1;
-        assert!(
-            attempts < 3 * kills + 10,
-            "sessions end before they do anything"
-        );
+        in_vain += 1;
+        assert!(in_vain < 20, "sessions end before they do anything");
         let line = match run_folder(folder) {
             Some(run) => format!("run --resume {} --best-effort --json", run.display()),
             None => {
@@ -104,6 +102,7 @@ fn killed(kills: u32, cycles: u32) {
         if ended.is_none() {
             child.kill().unwrap();
             child.wait().unwrap();
+            in_vain = 0;
             killed_ns.push(monotonic_ns());
             // The board has to notice by itself, before somebody arms it again.
             std::thread::sleep(Duration::from_millis(300));
@@ -112,6 +111,9 @@ fn killed(kills: u32, cycles: u32) {
             let now = acknowledged(&run);
             assert!(now.starts_with(&before), "an acknowledged row is gone");
             assert_eq!(now, (0..now.len() as u64).collect::<Vec<u64>>());
+            if now.len() > before.len() {
+                in_vain = 0;
+            }
             before = now;
         }
         if before.len() as u32 == cycles {

@@ -2,6 +2,7 @@
 
 use crate::config::WorldError;
 use serde::{Deserialize, Serialize};
+use std::ops::Range;
 
 /// Kinds of faults that are scheduled.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -27,6 +28,11 @@ pub enum FaultKind {
     LinkGarbage,
     /// No byte passes the line to the board or from it.
     LinkLoss,
+    /// The optimiser gives no plan in time. The world knows nothing of it: the program lets its own loop suffer it.
+    SlowSolver,
+    /// The recorder takes nothing, as if its disk hung. The program's own, too, and for the virtual clock, on which no disk
+    /// can hang by itself.
+    StallRecorder,
 }
 
 /// A fault from a time on, for a time.
@@ -103,6 +109,21 @@ impl Faults {
             })
             .filter(|&end_ns| end_ns > elapsed_ns)
             .max()
+    }
+
+    /// When the scheduled faults of a kind are in force, ns from the start.
+    pub fn spans_ns(&self, kind: FaultKind) -> Vec<Range<i64>> {
+        let ns = |s: f64| (s * 1e9) as i64;
+        let spans = self.event.iter().filter(|event| event.kind == kind);
+        spans
+            .map(|event| {
+                let from_ns = ns(event.at_s);
+                from_ns
+                    ..event
+                        .for_s
+                        .map_or(i64::MAX, |for_s| from_ns.saturating_add(ns(for_s)))
+            })
+            .collect()
     }
 
     /// Adds a scheduled fault.

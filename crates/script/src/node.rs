@@ -188,7 +188,41 @@ impl<'a> Node<'a> {
         Ok(Some(value))
     }
 
-    /// A whole number within bounds.
+    /// A share, written in percent.
+    pub(crate) fn percent(
+        &self,
+        key: &str,
+        (low, high): (f64, f64),
+    ) -> Result<Option<f64>, ScriptError> {
+        let Some(raw) = self.raw(key) else {
+            return Ok(None);
+        };
+        let help = Some("write it with its sign, for example \"20%\"");
+        if raw.get_ref().is_integer() || raw.get_ref().is_float() {
+            let number = self.source.text.get(raw.span()).unwrap_or("0");
+            let message = format!("`{key}` = {number} has no unit");
+            return Err(self.source.fail(raw.span(), message, help));
+        }
+        let Some(text) = self.text(key)? else {
+            return Ok(None);
+        };
+        let number = text.value.trim().strip_suffix('%');
+        let value: Option<f64> = number.and_then(|number| number.trim_end().parse().ok());
+        match value {
+            Some(value) if (low..=high).contains(&value) => Ok(Some(value * 1e-2)),
+            Some(_) => Err(self.source.fail(
+                text.span,
+                format!("`{key}` = \"{}\" is out of range", cut(text.value)),
+                Some(&format!("it must be from {low}% to {high}%")),
+            )),
+            None => {
+                let message = format!("`{key}` = \"{}\" is no percentage", cut(text.value));
+                Err(self.source.fail(text.span, message, help))
+            }
+        }
+    }
+
+    /// A whole number within bounds; `"$name"` is replaced as in texts.
     pub(crate) fn whole(
         &self,
         key: &str,
@@ -197,11 +231,15 @@ impl<'a> Node<'a> {
         let Some(raw) = self.raw(key) else {
             return Ok(None);
         };
-        let value = raw
-            .get_ref()
-            .as_integer()
-            .filter(|integer| integer.radix() == 10)
-            .and_then(|integer| integer.as_str().replace('_', "").parse::<u64>().ok());
+        let of_sweep = raw.get_ref().as_str().is_some_and(|s| s.starts_with('$'));
+        let value = if of_sweep {
+            self.text(key)?.and_then(|text| text.value.parse().ok())
+        } else {
+            raw.get_ref()
+                .as_integer()
+                .filter(|integer| integer.radix() == 10)
+                .and_then(|integer| integer.as_str().replace('_', "").parse::<u64>().ok())
+        };
         match value {
             Some(value) if (low..=high).contains(&value) => Ok(Some(value)),
             _ => Err(self.source.fail(

@@ -112,6 +112,7 @@ fn stop(root: &Node) -> Result<Stop, ScriptError> {
     node.only(&[
         "lost_longer_than",
         "error_above",
+        "amplitude_error_above",
         "length_change_above",
         "after",
         "after_cycles",
@@ -119,6 +120,7 @@ fn stop(root: &Node) -> Result<Stop, ScriptError> {
     Ok(Stop {
         lost_longer_than_s: time(&node, "lost_longer_than")?,
         error_above_um: length(&node, "error_above", 1e-3)?,
+        amplitude_error_above: node.percent("amplitude_error_above", (0.1, 1000.0))?,
         length_change_above_um: length(&node, "length_change_above", 1e-3)?,
         after_s: time(&node, "after")?,
         after_cycles: node.whole("after_cycles", (1, u64::MAX))?,

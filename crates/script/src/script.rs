@@ -100,6 +100,9 @@ pub struct Stop {
     pub lost_longer_than_s: Option<f64>,
     /// Tracking error above this, um.
     pub error_above_um: Option<f64>,
+    /// Mean amplitude error of ten cycles above this, as a share of the commanded amplitude. Judged on the rows of the
+    /// per-cycle table, so not by a [`crate::Cursor`] but by whoever keeps the table, see [`crate::AmplitudeWatch`].
+    pub amplitude_error_above: Option<f64>,
     /// Length of the cell changed by more than this since the first frame, um.
     pub length_change_above_um: Option<f64>,
     /// Running time, waits included, s.

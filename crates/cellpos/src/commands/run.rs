@@ -9,6 +9,7 @@ use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
 use crate::rig_file::{ActuatorConfig, CameraConfig, ClockKind, Frames, Rig, RigFile};
 use crate::session;
 use crate::setup::{Prepared, ReferenceSpec, Setup};
+use cellpos_emulator::FaultKind;
 use cellpos_record::{InputFile, LineFile, RunWriter};
 use cellpos_runtime::live::Operator;
 use cellpos_runtime::{EndRule, Finished, Life};
@@ -16,7 +17,7 @@ use cellpos_script::{
     AmplitudeWatch, Check, CheckLimits, CycleRow, CycleTable, Plan, Script, check,
 };
 use serde::{Deserialize, Serialize};
-use sink::ScriptSink;
+use sink::{ScriptSink, Stalls};
 use std::cell::RefCell;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -313,13 +314,30 @@ fn start(args: &Args, ready: Ready) -> CommandResult {
         file.timing.camera_delay_ms,
         file.timing.period_us,
     );
-    let watch = AmplitudeWatch::new(config.alarm_percent * 1e-2, 10);
-    let sink = ScriptSink::new(writer, lines, cycles, watch, Arc::clone(&plan), &config);
+    let watch = AmplitudeWatch::new(config.alarm_percent * 1e-2, AmplitudeWatch::WINDOW);
     let operator = Arc::new(Operator::default());
+    let mut sink = ScriptSink::new(
+        writer,
+        lines,
+        cycles,
+        watch,
+        Arc::clone(&plan),
+        Arc::clone(&operator),
+        &config,
+    );
+    let mut core = setup.core()?;
+    if file.is_emulated() {
+        let faults = &file.emulator.faults;
+        core = core.with_late_solver(faults.spans_ns(FaultKind::SlowSolver));
+        sink = sink.with_stalls(Stalls {
+            spans_ns: faults.spans_ns(FaultKind::StallRecorder),
+            clock: rig.clock.clone(),
+        });
+    }
     session::stop_on_signals(&operator)?;
     let keys = keys::listen(&operator);
     let finished = session::drive(
-        setup.core()?,
+        core,
         &mut rig,
         sink,
         EndRule::default(),
@@ -355,7 +373,7 @@ fn conclude(
     let outcome = match (safe, ended.complete()) {
         (true, _) => summary.state.name(),
         (false, true) => "done",
-        (false, false) if ended.stage.is_over() => "stopped",
+        (false, false) if ended.is_stop() => "stopped",
         (false, false) => "aborted",
     };
     let (writer, cycle_faults) = sink.close();
@@ -374,7 +392,7 @@ fn conclude(
     let report = text::Report::new(
         text::Ending {
             outcome,
-            stage: ended.stage.name(),
+            stage: ended.name(),
             alarms: ended.alarms,
             run,
             folder: folder.display().to_string(),

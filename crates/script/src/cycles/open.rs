@@ -4,7 +4,7 @@ use super::fit::{self, SineFit};
 use super::{CycleFlags, CycleRow, Place, bounds_ns};
 use crate::plan::{Cycle, Plan};
 use cellpos_control::{Reference, SolverStatus};
-use cellpos_runtime::{Stage, TickFlags, TickRecord};
+use cellpos_runtime::{Request, Stage, TickFlags, TickRecord};
 
 /// Sums over the ticks of a cycle so far.
 #[derive(Debug)]
@@ -20,7 +20,15 @@ pub(super) struct Open {
     /// n, sums of u, v, u u, u v, of the speed v against the displacement u away from neutral.
     gain: [f64; 5],
     far_um: f64,
-    lengths: Vec<(f64, f64)>,
+    lengths: Vec<Length>,
+}
+
+/// A measured length of the cell.
+#[derive(Debug, Clone, Copy)]
+struct Length {
+    time_s: f64,
+    um: f64,
+    phase: f64,
 }
 
 impl Open {
@@ -116,6 +124,7 @@ impl Open {
             (CycleFlags::RECORDS_LOST, has(TickFlags::RECORDS_LOST)),
             (CycleFlags::SOLVER_FALLBACK, unsolved),
             (CycleFlags::GATED, has(TickFlags::GATED)),
+            (CycleFlags::PAUSED, record.request == Request::Pause as u8),
             (CycleFlags::WAITED, place.stage == Stage::Waiting),
         ] {
             row.flags.set(mask, when);
@@ -155,8 +164,11 @@ impl Open {
         }
         self.last_seen = Some((place.exposed_ns, at_um));
         if record.length_um.is_finite() {
-            self.lengths
-                .push((place.exposed_ns as f64 * 1e-9, record.length_um));
+            self.lengths.push(Length {
+                time_s: place.exposed_ns as f64 * 1e-9,
+                um: record.length_um,
+                phase,
+            });
         }
     }
 
@@ -193,29 +205,72 @@ impl Open {
     }
 }
 
-/// What the cell's length did: `(time s, length um)` of the cycle.
-fn lengths(row: &mut CycleRow, lengths: &[(f64, f64)]) {
+/// What the cell's length did over the cycle.
+fn lengths(row: &mut CycleRow, lengths: &[Length]) {
     let (Some(first), Some(last)) = (lengths.first(), lengths.last()) else {
         return;
     };
-    row.length_start_um = first.1;
-    row.length_end_um = last.1;
-    let peak = lengths
-        .iter()
-        .enumerate()
-        .max_by(|a, b| a.1.1.total_cmp(&b.1.1));
-    let Some((index, &(_, peak_um))) = peak else {
+    row.length_start_um = first.um;
+    row.length_quarter_um = length_at(lengths, 0.25);
+    row.length_half_um = length_at(lengths, 0.5);
+    row.length_three_quarters_um = length_at(lengths, 0.75);
+    row.length_end_um = last.um;
+    let longest = (0..).zip(lengths).max_by(|a, b| a.1.um.total_cmp(&b.1.um));
+    let Some((index, peak)) = longest else {
         return;
     };
-    row.length_peak_um = peak_um;
+    row.length_peak_um = peak.um;
     // Noise alone must not be taken for a recovery.
-    if peak_um - last.1 < 0.05 * peak_um {
+    if peak.um - last.um < 0.05 * peak.um {
         return;
     }
     let after = lengths.get(index..).unwrap_or(&[]);
     // From nine tenths of the way down on: the way out of the constriction itself is no relaxation.
-    let level_um = last.1 + 0.9 * (peak_um - last.1);
-    let start = after.iter().position(|(_, um)| *um < level_um);
-    let falling = start.and_then(|start| after.get(start..)).unwrap_or(&[]);
-    row.recovery_s = fit::recovery_s(falling).unwrap_or(f64::NAN);
+    let level_um = last.um + 0.9 * (peak.um - last.um);
+    let falling: Vec<(f64, f64)> = after
+        .iter()
+        .skip_while(|length| length.um >= level_um)
+        .map(|length| (length.time_s, length.um))
+        .collect();
+    row.recovery_s = fit::recovery_s(&falling).unwrap_or(f64::NAN);
+}
+
+/// The length at a phase, on the line between its neighbours; NaN where the cell was not seen for a tenth of the cycle.
+fn length_at(lengths: &[Length], phase: f64) -> f64 {
+    let after = lengths.partition_point(|length| length.phase < phase);
+    let before = after.checked_sub(1).and_then(|index| lengths.get(index));
+    match (before, lengths.get(after)) {
+        (Some(a), Some(b)) if b.phase - a.phase < 0.1 => {
+            let share = (phase - a.phase) / (b.phase - a.phase).max(f64::MIN_POSITIVE);
+            a.um + (b.um - a.um) * share
+        }
+        _ => f64::NAN,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::plan::ArmKind;
+
+    #[test]
+    fn lengths_are_taken_at_fixed_phases_and_not_across_a_gap() {
+        let all: Vec<Length> = (0..200)
+            .map(|k| f64::from(k) / 200.0)
+            // Not seen from 0.4 to 0.6.
+            .filter(|phase| !(0.4..0.6).contains(phase))
+            .map(|phase| Length {
+                time_s: phase,
+                um: 10.0 + 8.0 * phase,
+                phase,
+            })
+            .collect();
+        let mut row = CycleRow::empty(0, 1, ArmKind::Cyclic);
+        lengths(&mut row, &all);
+        assert!((row.length_quarter_um - 12.0).abs() < 1e-9);
+        assert!((row.length_three_quarters_um - 16.0).abs() < 1e-9);
+        assert!(row.length_half_um.is_nan());
+        assert!((row.length_start_um - 10.0).abs() < 1e-9 && row.length_end_um > 17.9);
+        assert!(row.recovery_s.is_nan(), "nothing recovers");
+    }
 }

@@ -7,7 +7,7 @@ use crate::plan::ArmKind;
 pub struct CycleFlags(pub u32);
 
 /// Names of the bits, in order.
-const NAMES: [&str; 14] = [
+const NAMES: [&str; 15] = [
     "lost",
     "stale",
     "dropped",
@@ -22,6 +22,7 @@ const NAMES: [&str; 14] = [
     "gated",
     "safe",
     "waited",
+    "paused",
 ];
 
 impl CycleFlags {
@@ -53,6 +54,9 @@ impl CycleFlags {
     pub const SAFE: u32 = 1 << 12;
     /// A wait of the script fell into it (no disturbance, but it took longer).
     pub const WAITED: u32 = 1 << 13;
+
+    /// The operator paused it.
+    pub const PAUSED: u32 = 1 << 14;
 
     /// Whether all bits of `mask` are set.
     pub fn has(self, mask: u32) -> bool {
@@ -157,6 +161,12 @@ pub struct CycleRow {
     pub dwell_s: f64,
     /// Length of the cell at the start, um.
     pub length_start_um: f64,
+    /// Length of the cell after a quarter of the cycle, um.
+    pub length_quarter_um: f64,
+    /// Length of the cell after half of the cycle, um.
+    pub length_half_um: f64,
+    /// Length of the cell after three quarters of the cycle, um.
+    pub length_three_quarters_um: f64,
     /// Largest length of the cell, um.
     pub length_peak_um: f64,
     /// Length of the cell at the end, um.
@@ -208,6 +218,9 @@ floats!(
     gain_per_s,
     dwell_s,
     length_start_um,
+    length_quarter_um,
+    length_half_um,
+    length_three_quarters_um,
     length_peak_um,
     length_end_um,
     recovery_s
@@ -242,6 +255,9 @@ impl CycleRow {
             gain_per_s: 0.0,
             dwell_s: 0.0,
             length_start_um: 0.0,
+            length_quarter_um: 0.0,
+            length_half_um: 0.0,
+            length_three_quarters_um: 0.0,
             length_peak_um: 0.0,
             length_end_um: 0.0,
             recovery_s: 0.0,

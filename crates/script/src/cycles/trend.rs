@@ -82,16 +82,25 @@ pub struct AmplitudeWatch {
     limit: f64,
     window: usize,
     errors: VecDeque<(u64, f64)>,
+    /// Errors of the last [`LONG`] cycles, for the trend.
+    long: VecDeque<(u64, f64)>,
     raised: bool,
 }
 
+/// Cycles over which the live trend is taken.
+const LONG: usize = 200;
+
 impl AmplitudeWatch {
+    /// Cycles of which the mean is judged in a run.
+    pub const WINDOW: usize = 10;
+
     /// A watch with a limit (a share of the commanded amplitude) on the mean of `window` cycles.
     pub fn new(limit: f64, window: usize) -> Self {
         Self {
             limit,
             window: window.max(2),
             errors: VecDeque::new(),
+            long: VecDeque::new(),
             raised: false,
         }
     }
@@ -109,6 +118,10 @@ impl AmplitudeWatch {
         }
         let error = row.reached_um / row.commanded_um - 1.0;
         self.errors.push_back((row.cycle, error));
+        if self.long.len() >= LONG {
+            self.long.pop_front();
+        }
+        self.long.push_back((row.cycle, error));
         let mean = self.error().filter(|_| self.errors.len() >= self.window)?;
         if !self.raised && mean.abs() > self.limit {
             self.raised = true;
@@ -123,6 +136,11 @@ impl AmplitudeWatch {
             return Some(Alarm::Cleared { error: mean });
         }
         None
+    }
+
+    /// Trend of the amplitude error over the last two hundred cycles, as shares.
+    pub fn trend(&self) -> Option<Trend> {
+        trend(self.long.iter().copied())
     }
 
     /// Mean amplitude error of the last cycles, as a share.
@@ -168,6 +186,10 @@ mod tests {
             row.reached_um = 2.0 * (1.0 + error + 0.01 * noise(cycle));
             if let Some(alarm) = watch.add(&row) {
                 alarms.push((cycle, alarm));
+            }
+            if cycle == 19 {
+                let trend = watch.trend().unwrap();
+                assert!(trend.cycles == 20 && !trend.is_significant(), "{trend:?}");
             }
         }
         assert!(

@@ -46,13 +46,29 @@ impl RunSink for Table {
 }
 
 /// Runs a script with a PI controller; `deaf_s`: seconds in which the recorder takes nothing.
+#[allow(dead_code, reason = "not every test file has its scripts as text")]
 pub fn run(
     text: &str,
     world: &WorldConfig,
     timing: Timing,
     deaf_s: Range<u64>,
 ) -> (Summary, Table) {
-    let plan = Arc::new(Plan::new(&Script::parse(text, "t.toml").unwrap()).unwrap());
+    run_script(
+        &Script::parse(text, "t.toml").unwrap(),
+        world,
+        timing,
+        deaf_s,
+    )
+}
+
+/// As [`run`], with a script that was read already.
+pub fn run_script(
+    script: &Script,
+    world: &WorldConfig,
+    timing: Timing,
+    deaf_s: Range<u64>,
+) -> (Summary, Table) {
+    let plan = Arc::new(Plan::new(script).unwrap());
     let clock = Clock::virtual_at(0);
     let model = Model::eq6();
     let rig = EmulatedRig::new(BoardConfig::default(), world, &model, clock.clone()).unwrap();

@@ -3,9 +3,12 @@
 use super::SessionConfig;
 use crate::recording::log_event;
 use cellpos_record::{Event as LogEvent, Faults, LineFile, RunWriter};
-use cellpos_runtime::{Event, RunSink, Stage, Statistics, TickRecord};
+use cellpos_rig::Clock;
+use cellpos_runtime::live::Operator;
+use cellpos_runtime::{Event, Request, RunSink, Stage, Statistics, TickRecord};
 use cellpos_script::{Alarm, AmplitudeWatch, CycleRow, CycleTable, Plan};
 use indicatif::{ProgressBar, ProgressStyle};
+use std::ops::Range;
 use std::sync::Arc;
 
 /// Writes run folder and table, marks and alarms, and shows how far it is.
@@ -14,6 +17,9 @@ pub struct ScriptSink {
     lines: LineFile,
     cycles: CycleTable,
     watch: AmplitudeWatch,
+    /// Ends the run when the amplitude error is too large.
+    limit: Option<AmplitudeWatch>,
+    operator: Arc<Operator>,
     plan: Arc<Plan>,
     bar: ProgressBar,
     /// Rows that are not yet acknowledged: their ticks go to the disk first.
@@ -23,6 +29,19 @@ pub struct ScriptSink {
     last: Option<TickRecord>,
     stage: Stage,
     alarms: u64,
+    amplitude_stop: bool,
+    /// Length of the cell at the start of the first cycle, um.
+    rest_um: Option<f64>,
+    stretch: Option<f64>,
+    stalls: Option<Stalls>,
+}
+
+/// When the recorder takes nothing, to see what becomes of a run then.
+pub struct Stalls {
+    /// Spans of the clock, ns.
+    pub spans_ns: Vec<Range<i64>>,
+    /// The clock of the run.
+    pub clock: Clock,
 }
 
 /// How a script came to its end.
@@ -30,17 +49,31 @@ pub struct ScriptSink {
 pub struct End {
     /// What it was doing last.
     pub stage: Stage,
+    /// Stopped because the amplitude error was too large.
+    pub amplitude_stop: bool,
     /// Alarms given.
     pub alarms: u64,
 }
 
 impl End {
+    /// In words.
+    pub fn name(&self) -> &'static str {
+        if self.amplitude_stop {
+            "stopped: amplitude error too large"
+        } else {
+            self.stage.name()
+        }
+    }
+
+    /// Whether a condition of the script stopped it.
+    pub fn is_stop(&self) -> bool {
+        self.amplitude_stop || self.stage.is_over()
+    }
+
     /// Whether the script did what it was to do.
     pub fn complete(&self) -> bool {
-        matches!(
-            self.stage,
-            Stage::Done | Stage::StoppedCycles | Stage::StoppedTime
-        )
+        let over = [Stage::Done, Stage::StoppedCycles, Stage::StoppedTime];
+        !self.amplitude_stop && over.contains(&self.stage)
     }
 }
 
@@ -52,6 +85,7 @@ impl ScriptSink {
         cycles: CycleTable,
         watch: AmplitudeWatch,
         plan: Arc<Plan>,
+        operator: Arc<Operator>,
         config: &SessionConfig,
     ) -> Self {
         let mut begun = LogEvent::new(0.0, "session")
@@ -75,10 +109,15 @@ impl ScriptSink {
             0
         };
         Self {
+            limit: plan
+                .stop()
+                .amplitude_error_above
+                .map(|limit| AmplitudeWatch::new(limit, AmplitudeWatch::WINDOW)),
             writer,
             lines,
             cycles,
             watch,
+            operator,
             plan,
             bar,
             waiting: Vec::new(),
@@ -87,6 +126,18 @@ impl ScriptSink {
             last: None,
             stage: Stage::None,
             alarms: 0,
+            amplitude_stop: false,
+            rest_um: None,
+            stretch: None,
+            stalls: None,
+        }
+    }
+
+    /// The same sink, that takes nothing in some spans of time.
+    pub fn with_stalls(self, stalls: Stalls) -> Self {
+        Self {
+            stalls: Some(stalls),
+            ..self
         }
     }
 
@@ -94,6 +145,7 @@ impl ScriptSink {
     pub fn end(&self) -> End {
         End {
             stage: self.stage,
+            amplitude_stop: self.amplitude_stop,
             alarms: self.alarms,
         }
     }
@@ -145,7 +197,29 @@ impl ScriptSink {
                 );
             });
         }
+        self.judge(&row, time_s);
+        if row.length_start_um.is_finite() {
+            let rest_um = *self.rest_um.get_or_insert(row.length_start_um);
+            self.stretch = Some(row.length_peak_um / rest_um);
+        }
         self.waiting.push(row);
+    }
+
+    /// The script's own limit of the amplitude error: the bead is frozen and the run ends, as if the operator asked for it.
+    fn judge(&mut self, row: &CycleRow, time_s: f64) {
+        let Some(Alarm::Raised { error, .. }) =
+            self.limit.as_mut().and_then(|limit| limit.add(row))
+        else {
+            return;
+        };
+        let event = LogEvent::new(time_s, "amplitude-stop")
+            .with("cycle", row.cycle)
+            .with("error_percent", error * 100.0);
+        self.writer.event(&event);
+        if !matches!(self.operator.asked(), Request::Freeze | Request::Park) {
+            self.amplitude_stop = true;
+            self.operator.ask(Request::Freeze);
+        }
     }
 
     fn message(&self, r: &TickRecord) -> String {
@@ -163,9 +237,15 @@ impl ScriptSink {
                 )
             },
         );
-        let amplitude = self.watch.error().map_or(String::new(), |error| {
+        let mut amplitude = self.watch.error().map_or(String::new(), |error| {
             format!("  amplitude {:+.1} %", error * 100.0)
         });
+        if let Some(trend) = self.watch.trend() {
+            amplitude.push_str(&format!(" ({:+.2} %/100 cycles)", trend.per_cycle * 1e4));
+        }
+        if let Some(stretch) = self.stretch.filter(|stretch| stretch.is_finite()) {
+            amplitude.push_str(&format!("  stretch {stretch:.2}"));
+        }
         format!(
             "{cycle}  {stage}  {} left{amplitude}  error {:+.0}nm",
             time(left_s),
@@ -218,6 +298,13 @@ impl RunSink for ScriptSink {
 
     fn event(&mut self, event: &Event) {
         self.writer.event(&log_event(event));
+    }
+
+    fn is_ready(&self) -> bool {
+        self.stalls.as_ref().is_none_or(|stalls| {
+            let now_ns = stalls.clock.now_ns();
+            !stalls.spans_ns.iter().any(|span| span.contains(&now_ns))
+        })
     }
 
     fn progress(&mut self, _: &Statistics) {
