@@ -62,12 +62,15 @@ pub struct LearnSpec {
 const SINE_HARMONICS: u32 = 3;
 
 /// A periodic motion that is to be learned.
-struct Wanted<'a> {
-    reference: &'a dyn Reference,
+pub struct Wanted<'a> {
+    /// The motion by itself.
+    pub reference: &'a dyn Reference,
     /// From when on it is in full swing, s.
-    from_s: f64,
-    frequency_hz: f64,
-    harmonics: u32,
+    pub from_s: f64,
+    /// Frequency of its cycles, Hz.
+    pub frequency_hz: f64,
+    /// Harmonics that are learned.
+    pub harmonics: u32,
 }
 
 impl LearnSpec {
@@ -96,7 +99,7 @@ impl LearnSpec {
     }
 
     /// The responses are those of the loop's own model along the reference.
-    fn new(
+    pub fn new(
         setup: &Prepared,
         file: &RigFile,
         wanted: &Wanted,

@@ -35,6 +35,13 @@ impl Failure {
         Self::Failed(miette::Report::from_err(error))
     }
 
+    /// In a line.
+    pub fn text(&self) -> String {
+        match self {
+            Self::BadInput(report) | Self::Failed(report) => report.to_string(),
+        }
+    }
+
     /// Bad input, in the words of a library's error.
     pub fn input(error: impl std::error::Error + Send + Sync + 'static) -> Self {
         Self::BadInput(miette::Report::from_err(error))

@@ -74,6 +74,7 @@ pub fn arm(
             timing: file.timing,
             arming: file.arming,
             learn: None,
+            motions: Vec::new(),
         },
     })
 }

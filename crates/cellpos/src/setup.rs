@@ -8,7 +8,9 @@ use cellpos_control::design::{
 };
 use cellpos_control::{ControllerConfig, ControllerFile, ControllerKind, Limits, Profile, Shape};
 use cellpos_plant::Model;
-use cellpos_runtime::{ArmingConfig, Core, CoreError, Guide, GuideInput, GuideOutput, Timing};
+use cellpos_runtime::{
+    ArmingConfig, Core, CoreError, Guide, GuideInput, GuideOutput, Learners, Timing,
+};
 use cellpos_script::{Follower, Plan, Script};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -161,6 +163,21 @@ pub struct SetupConfig {
     /// Learning over cycles, where it is on.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub learn: Option<LearnSpec>,
+    /// Learning on the periodic motions of a script.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub motions: Vec<MotionSpec>,
+}
+
+/// Learning on a periodic motion of a script.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct MotionSpec {
+    /// Number of the motion in the plan.
+    pub motion: u16,
+    /// The motion in words.
+    pub name: String,
+    /// How it is learned.
+    pub learn: LearnSpec,
 }
 
 impl Setup {
@@ -184,10 +201,16 @@ impl Setup {
             self.config.neutral_um,
         )
         .map_err(|error: CoreError| Failure::input(error))?;
-        Ok(match &self.config.learn {
-            Some(learn) => core.with_learning(learn.learning(sample_s)?),
-            None => core,
-        })
+        if let Some(learn) = &self.config.learn {
+            return Ok(core.with_learning(learn.learning(sample_s)?));
+        }
+        let mut learners = Vec::new();
+        for spec in &self.config.motions {
+            let number = usize::from(spec.motion);
+            learners.resize(learners.len().max(number + 1), None);
+            learners[number] = Some(spec.learn.learning(sample_s)?);
+        }
+        Ok(core.with_learners(Learners::new(learners)))
     }
 }
 

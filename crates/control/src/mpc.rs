@@ -274,7 +274,13 @@ impl MpcWorkspace {
             Some(solver) => solver.solve(&vectors, deadline),
             // No deadline: its iterations are bounded, and it ends the same way in a replay.
             None => {
-                let (end, iterations) = self.condensed.matrices.solve(&vectors, &mut self.working);
+                let (mut end, iterations) =
+                    self.condensed.matrices.solve(&vectors, &mut self.working);
+                if gave_up && matches!(end, QpEnd::Solved(_)) {
+                    // Too late by order: a fault to be got over, or the record of one.
+                    self.working = WorkingSet::default();
+                    end = QpEnd::GaveUp;
+                }
                 let active = u16::try_from(self.working.len()).unwrap_or(u16::MAX);
                 (end, iterations, active)
             }

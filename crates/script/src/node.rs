@@ -222,6 +222,21 @@ impl<'a> Node<'a> {
         }
     }
 
+    /// Yes or no.
+    pub(crate) fn flag(&self, key: &str) -> Result<Option<bool>, ScriptError> {
+        let Some(raw) = self.raw(key) else {
+            return Ok(None);
+        };
+        match raw.get_ref().as_bool() {
+            Some(value) => Ok(Some(value)),
+            None => {
+                Err(self
+                    .source
+                    .fail(raw.span(), format!("`{key}` must be true or false"), None))
+            }
+        }
+    }
+
     /// A whole number within bounds; `"$name"` is replaced as in texts.
     pub(crate) fn whole(
         &self,

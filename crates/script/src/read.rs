@@ -62,7 +62,7 @@ impl Script {
             span: (0, 0),
             variables: &[],
         };
-        root.only(&["name", "notes", "start", "seed", "stop", "step"])?;
+        root.only(&["name", "notes", "start", "seed", "learn", "stop", "step"])?;
         let name = root.text("name")?.map_or("script", |text| text.value);
         let fits = |c: char| c.is_ascii_alphanumeric() || c == '-' || c == '_';
         if name.is_empty() || name.len() > 64 || !name.chars().all(fits) {
@@ -91,6 +91,7 @@ impl Script {
             name: name.to_owned(),
             notes: root.text("notes")?.map_or("", |text| text.value).to_owned(),
             start_um: length(&root, "start", -MAX_UM)?.unwrap_or(0.0),
+            learn: root.flag("learn")?.unwrap_or(false),
             stop: stop(&root)?,
             steps,
         })

@@ -209,6 +209,8 @@ pub struct Script {
     pub notes: String,
     /// Position at which the script starts, um.
     pub start_um: f64,
+    /// Whether the feed-forward of its periodic motions is learned over their cycles.
+    pub learn: bool,
     /// Stop conditions.
     pub stop: Stop,
     /// The steps.

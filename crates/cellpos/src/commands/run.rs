@@ -1,6 +1,7 @@
 //! `cellpos run`: a setpoint script in closed loop, with a row for each cycle; resumed after whatever ended it.
 
 mod keys;
+mod learning;
 pub(super) mod resume;
 mod sink;
 mod text;
@@ -16,6 +17,7 @@ use cellpos_runtime::{EndRule, Finished, Life};
 use cellpos_script::{
     AmplitudeWatch, Check, CheckLimits, CycleRow, CycleTable, Plan, Script, check,
 };
+use learning::Keeper;
 use serde::{Deserialize, Serialize};
 use sink::{ScriptSink, Stalls};
 use std::cell::RefCell;
@@ -53,6 +55,9 @@ pub struct Args {
     /// The plant that the controller is made for: a model.toml, or eq6.
     #[arg(long, default_value = "eq6")]
     model: String,
+    /// Learn the feed-forward of periodic motions over their cycles, as `learn = true` in the script does.
+    #[arg(long, conflicts_with = "resume")]
+    learn: bool,
     /// Seed of the emulated rig; left out: that of rig.toml.
     #[arg(long)]
     seed: Option<u64>,
@@ -93,6 +98,9 @@ pub struct SessionConfig {
     best_effort: bool,
     /// Amplitude error that raises an alarm, percent.
     alarm_percent: f64,
+    /// Whether periodic motions are learned.
+    #[serde(default)]
+    learn: bool,
     /// Seconds from the end of the last record of the session before to the start of this one, s.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     gap_s: Option<f64>,
@@ -177,6 +185,7 @@ fn fresh(args: &Args) -> Result<Ready, Failure> {
             frames: args.frames.unwrap_or(frames) == Frames::On,
             best_effort: args.best_effort,
             alarm_percent: args.alarm_percent,
+            learn: args.learn || script.learn,
             gap_s: None,
             after: None,
         },
@@ -289,8 +298,18 @@ fn start(args: &Args, ready: Ready) -> CommandResult {
     let mut rig = session::connect(&file, clock, frames, &prepared.model)?;
     session::narrow(&mut prepared, &file, &rig);
     allowed(&script, &prepared, &file, &rig)?;
+    // Before the board is armed: its watchdog does not wait for simulations.
+    let mut motions = Vec::new();
+    if config.learn {
+        let known = match &home {
+            Some((folder, _)) => learning::load(folder)?,
+            None => Vec::new(),
+        };
+        motions = learning::motions(&plan, &prepared, &file, &known, &mut rig.warnings);
+    }
     let number = u16::try_from(config.number).unwrap_or(u16::MAX);
-    let setup = session::arm(prepared, &file, &mut rig, number, reference)?;
+    let mut setup = session::arm(prepared, &file, &mut rig, number, reference)?;
+    setup.config.motions = motions;
 
     let mut meta = session::meta(&name, clock, &[], &file, &setup)?;
     meta.inputs = inputs;
@@ -325,6 +344,10 @@ fn start(args: &Args, ready: Ready) -> CommandResult {
         Arc::clone(&operator),
         &config,
     );
+    if let Some(keeper) = Keeper::new(&folder, &setup.config.motions, file.timing.period_us * 1e-6)
+    {
+        sink = sink.with_keeper(keeper, !rig.clock.is_virtual());
+    }
     let mut core = setup.core()?;
     if file.is_emulated() {
         let faults = &file.emulator.faults;
@@ -362,7 +385,7 @@ fn conclude(
         conditions,
         sink,
         io_error,
-        learned: _,
+        learned,
     } = finished;
     let mut warnings = rig.warnings.clone();
     if let Some(error) = &io_error {
@@ -385,6 +408,12 @@ fn conclude(
         ));
     }
     let run = session::finish(writer, outcome, &summary, &mut warnings);
+    let learned = learning::named(&setup.config.motions, &learned);
+    if !learned.is_empty()
+        && let Err(error) = learning::save(folder, learned.clone())
+    {
+        warnings.push(format!("no {}: {error}", learning::LEARNED_TOML));
+    }
     let cycles = resume::cycles(folder)?;
     if let Err(error) = resume::cycles_parquet(folder, &cycles) {
         warnings.push(format!("no cycles.parquet: {error}"));
@@ -403,6 +432,7 @@ fn conclude(
         session::bound_rms_nm(file, setup, &summary),
         &conditions,
         &warnings,
+        &learned,
     );
     if args.json {
         print_json(&report)?;

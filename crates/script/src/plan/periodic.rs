@@ -46,6 +46,17 @@ impl Periodic {
         }
     }
 
+    /// Harmonics of it that are worth learning: a sine has others than its first only from nonlinearities.
+    pub fn harmonics(&self) -> u32 {
+        match self.course {
+            Course::Wave {
+                shape: WaveShape::Sine,
+                ..
+            } => 3,
+            Course::Wave { .. } | Course::Points { .. } => 8,
+        }
+    }
+
     /// Whether two motions are the same.
     pub(super) fn moves_as(&self, other: &Self) -> bool {
         self.course == other.course && self.frequency_hz == other.frequency_hz

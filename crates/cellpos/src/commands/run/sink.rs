@@ -1,7 +1,9 @@
 //! Where the records of a script go: the run folder, the per-cycle table, the progress bar.
 
 use super::SessionConfig;
+use super::learning::Keeper;
 use crate::recording::log_event;
+use cellpos_control::LearnerState;
 use cellpos_record::{Event as LogEvent, Faults, LineFile, RunWriter};
 use cellpos_rig::Clock;
 use cellpos_runtime::live::Operator;
@@ -34,6 +36,9 @@ pub struct ScriptSink {
     rest_um: Option<f64>,
     stretch: Option<f64>,
     stalls: Option<Stalls>,
+    keeper: Option<Keeper>,
+    /// Whether what is learned is written as the run goes: on the virtual clock its end is soon enough.
+    keep_live: bool,
 }
 
 /// When the recorder takes nothing, to see what becomes of a run then.
@@ -130,6 +135,17 @@ impl ScriptSink {
             rest_um: None,
             stretch: None,
             stalls: None,
+            keeper: None,
+            keep_live: false,
+        }
+    }
+
+    /// The same sink, that keeps what is learned: as the run goes, or not at all before its end.
+    pub fn with_keeper(self, keeper: Keeper, live: bool) -> Self {
+        Self {
+            keeper: Some(keeper),
+            keep_live: live,
+            ..self
         }
     }
 
@@ -166,6 +182,11 @@ impl ScriptSink {
             }
         }
         self.lines.flush();
+        if self.keep_live
+            && let Some(keeper) = &mut self.keeper
+        {
+            keeper.save();
+        }
     }
 
     fn row(&mut self, row: CycleRow, time_s: f64) {
@@ -298,6 +319,12 @@ impl RunSink for ScriptSink {
 
     fn event(&mut self, event: &Event) {
         self.writer.event(&log_event(event));
+    }
+
+    fn learned(&mut self, motion: u16, state: &LearnerState) {
+        if let Some(keeper) = &mut self.keeper {
+            keeper.take(motion, state);
+        }
     }
 
     fn is_ready(&self) -> bool {

@@ -1,5 +1,7 @@
 //! What `cellpos run` prints in the end.
 
+use super::learning::NamedTable;
+use crate::cyclic;
 use cellpos_runtime::Summary;
 use cellpos_runtime::realtime::Conditions;
 use cellpos_script::CycleRow;
@@ -38,6 +40,7 @@ pub struct Report<'a> {
     bound_rms_nm: Option<f64>,
     conditions: &'a Conditions,
     warnings: &'a [String],
+    learned: &'a [NamedTable],
     summary: &'a Summary,
 }
 
@@ -50,6 +53,7 @@ fn mean(values: impl Iterator<Item = f64>) -> Option<f64> {
 
 impl<'a> Report<'a> {
     /// Joins what there is to say.
+    #[allow(clippy::too_many_arguments, reason = "each is one part of the report")]
     pub fn new(
         ending: Ending,
         summary: &'a Summary,
@@ -58,6 +62,7 @@ impl<'a> Report<'a> {
         bound_rms_nm: Option<f64>,
         conditions: &'a Conditions,
         warnings: &'a [String],
+        learned: &'a [NamedTable],
     ) -> Self {
         Self {
             ending,
@@ -73,6 +78,7 @@ impl<'a> Report<'a> {
             bound_rms_nm,
             conditions,
             warnings,
+            learned,
             summary,
         }
     }
@@ -126,6 +132,10 @@ impl<'a> Report<'a> {
                 c.ticks, self.summary.duration_s, c.late, c.skipped, self.summary.records_lost
             ),
         );
+        for learned in self.learned {
+            let text = cyclic::learned_text(&learned.table);
+            line("learned", format!("{}: {text}", learned.name));
+        }
         for degraded in &self.conditions.degraded {
             line("DEGRADED", degraded.clone());
         }

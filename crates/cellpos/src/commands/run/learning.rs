@@ -1,0 +1,175 @@
+//! Learning on the periodic motions of a script, and what was learned as a file of the run.
+
+use crate::cyclic::{LearnSpec, Wanted};
+use crate::outcome::Failure;
+use crate::rig_file::RigFile;
+use crate::setup::{MotionSpec, Prepared};
+use cellpos_control::{LearnedTable, Learner, LearnerState};
+use cellpos_script::{PeriodicReference, Plan};
+use serde::{Deserialize, Serialize};
+use std::path::{Path, PathBuf};
+
+/// Name of the file in the run folder.
+pub const LEARNED_TOML: &str = "learned.toml";
+/// Fewest cycles in full swing of a motion that is learned: two are watched, and some must be left to learn from.
+const FEWEST_CYCLES: u64 = 5;
+/// Most motions that are learned: the responses of each take a simulation.
+const MOST_MOTIONS: usize = 16;
+
+/// What was learned on a motion.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct NamedTable {
+    /// The motion in words.
+    pub name: String,
+    /// What was learned.
+    pub table: LearnedTable,
+}
+
+/// The file.
+#[derive(Debug, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct LearnedFile {
+    #[serde(default)]
+    motion: Vec<NamedTable>,
+}
+
+/// What an earlier session learned; nothing when it left no file.
+pub fn load(folder: &Path) -> Result<Vec<NamedTable>, Failure> {
+    let path = folder.join(LEARNED_TOML);
+    match std::fs::read_to_string(&path) {
+        Ok(text) => {
+            let file: LearnedFile = crate::toml_file::parse(&text, &path.display().to_string())?;
+            Ok(file.motion)
+        }
+        Err(_) => Ok(Vec::new()),
+    }
+}
+
+/// Writes what was learned: whole or not at all.
+pub fn save(folder: &Path, motion: Vec<NamedTable>) -> std::io::Result<()> {
+    let file = LearnedFile { motion };
+    let text = toml::to_string_pretty(&file).map_err(std::io::Error::other)?;
+    let part = folder.join("learned.toml.part");
+    std::fs::write(&part, text)?;
+    std::fs::rename(part, folder.join(LEARNED_TOML))
+}
+
+/// How the motions of a plan are learned, going on from `known`; what cannot be learned is a warning.
+pub fn motions(
+    plan: &Plan,
+    setup: &Prepared,
+    file: &RigFile,
+    known: &[NamedTable],
+    warnings: &mut Vec<String>,
+) -> Vec<MotionSpec> {
+    let mut specs = Vec::new();
+    for (number, motion) in (0u16..).zip(plan.periodic()) {
+        let Some(reference) = plan.periodic_reference(usize::from(number)) else {
+            continue;
+        };
+        if motion.cycles < FEWEST_CYCLES {
+            continue;
+        }
+        let name = motion.name();
+        if specs.len() >= MOST_MOTIONS {
+            warnings.push(format!(
+                "not learned: {name}: more than {MOST_MOTIONS} motions"
+            ));
+            continue;
+        }
+        let wanted = Wanted {
+            reference: &reference,
+            from_s: PeriodicReference::FADE_S,
+            frequency_hz: motion.frequency_hz,
+            harmonics: motion.harmonics(),
+        };
+        let table = known.iter().find(|known| known.name == name);
+        let table = table.map(|known| known.table.clone());
+        let had = table.is_some();
+        let spec = LearnSpec::new(setup, file, &wanted, table).or_else(|failure| {
+            if had {
+                warnings.push(format!("learned anew: {name}: {}", failure.text()));
+                LearnSpec::new(setup, file, &wanted, None)
+            } else {
+                Err(failure)
+            }
+        });
+        match spec {
+            Ok(learn) => specs.push(MotionSpec {
+                motion: number,
+                name,
+                learn,
+            }),
+            Err(failure) => warnings.push(format!("not learned: {name}: {}", failure.text())),
+        }
+    }
+    specs
+}
+
+/// Names and tables of what a loop has learned.
+pub fn named(specs: &[MotionSpec], tables: &[Option<LearnedTable>]) -> Vec<NamedTable> {
+    let table = |spec: &MotionSpec| tables.get(usize::from(spec.motion))?.clone();
+    specs
+        .iter()
+        .filter_map(|spec| {
+            Some(NamedTable {
+                name: spec.name.clone(),
+                table: table(spec)?,
+            })
+        })
+        .collect()
+}
+
+/// Keeps the file up to date while the loop learns.
+pub struct Keeper {
+    folder: PathBuf,
+    specs: Vec<MotionSpec>,
+    learners: Vec<Option<Learner>>,
+    tables: Vec<Option<LearnedTable>>,
+    changed: bool,
+}
+
+impl Keeper {
+    /// A keeper for the run's folder; None where nothing is learned.
+    pub fn new(folder: &Path, specs: &[MotionSpec], sample_s: f64) -> Option<Self> {
+        let count = specs
+            .iter()
+            .map(|spec| usize::from(spec.motion) + 1)
+            .max()?;
+        let mut learners = vec![None; count];
+        let mut tables = vec![None; count];
+        for spec in specs {
+            let learn = &spec.learn;
+            let learner =
+                Learner::new(learn.config, learn.frequency_hz, sample_s, &learn.responses);
+            learners[usize::from(spec.motion)] = learner.ok();
+            tables[usize::from(spec.motion)] = learn.table.clone();
+        }
+        Some(Self {
+            folder: folder.to_owned(),
+            specs: specs.to_vec(),
+            learners,
+            tables,
+            changed: false,
+        })
+    }
+
+    /// What the loop knows now.
+    pub fn take(&mut self, motion: u16, state: &LearnerState) {
+        let number = usize::from(motion);
+        if let (Some(Some(learner)), Some(table)) =
+            (self.learners.get(number), self.tables.get_mut(number))
+        {
+            *table = Some(learner.table(state));
+            self.changed = true;
+        }
+    }
+
+    /// Writes what has changed. A disk that refuses is asked again with the next change: the run goes on all the same.
+    pub fn save(&mut self) {
+        if self.changed && save(&self.folder, named(&self.specs, &self.tables)).is_ok() {
+            self.changed = false;
+        }
+    }
+}
