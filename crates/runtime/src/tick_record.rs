@@ -38,6 +38,8 @@ impl TickFlags {
     pub const RECORDS_LOST: u32 = 1 << 13;
     /// A report of the board came since the previous tick.
     pub const BOARD_HEARD: u32 = 1 << 14;
+    /// The bead does not follow the flow: it sticks to a wall.
+    pub const STUCK: u32 = 1 << 15;
 
     /// Whether all bits of `mask` are set.
     pub fn has(self, mask: u32) -> bool {

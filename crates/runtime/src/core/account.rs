@@ -18,6 +18,7 @@ impl<R: Guide> Core<R> {
             (flags.not_finite, TickFlags::NOT_FINITE),
             (flags.coasting, TickFlags::COASTING),
             (flags.gated, TickFlags::GATED),
+            (flags.stuck, TickFlags::STUCK),
         ] {
             if set {
                 tick.flags.set(mask);

@@ -6,6 +6,7 @@
 
 mod fit;
 mod open;
+mod outlier;
 mod row;
 mod trend;
 
@@ -15,6 +16,7 @@ pub use trend::{Alarm, AmplitudeWatch, Trend, trend};
 use crate::plan::{Cycle, Plan};
 use cellpos_runtime::{Life, Request, Stage, TickFlags, TickRecord};
 use open::Open;
+use outlier::Outliers;
 use std::collections::VecDeque;
 use std::sync::Arc;
 
@@ -36,6 +38,7 @@ pub struct CycleTable {
     ready: VecDeque<CycleRow>,
     last_seq: Option<u64>,
     skipped_to_ns: i64,
+    outliers: Outliers,
 }
 
 /// What the loop did at a tick.
@@ -88,6 +91,7 @@ impl CycleTable {
             ready: VecDeque::new(),
             last_seq: None,
             skipped_to_ns: i64::MIN,
+            outliers: Outliers::default(),
         }
     }
 
@@ -200,6 +204,8 @@ impl CycleTable {
             };
             row.flags.set(CycleFlags::SKIPPED, skipped);
             row.flags.set(self.pending.0, true);
+            let outlier = self.outliers.is_one(&row);
+            row.flags.set(CycleFlags::OUTLIER, outlier);
             self.ready.push_back(row);
             self.next += 1;
             // A gap disturbs every cycle that it touches, the one that it ends in included.

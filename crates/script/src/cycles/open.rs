@@ -124,6 +124,7 @@ impl Open {
             (CycleFlags::RECORDS_LOST, has(TickFlags::RECORDS_LOST)),
             (CycleFlags::SOLVER_FALLBACK, unsolved),
             (CycleFlags::GATED, has(TickFlags::GATED)),
+            (CycleFlags::STUCK, has(TickFlags::STUCK)),
             (CycleFlags::PAUSED, record.request == Request::Pause as u8),
             (CycleFlags::WAITED, place.stage == Stage::Waiting),
         ] {

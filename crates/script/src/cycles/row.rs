@@ -7,7 +7,7 @@ use crate::plan::ArmKind;
 pub struct CycleFlags(pub u32);
 
 /// Names of the bits, in order.
-const NAMES: [&str; 15] = [
+const NAMES: [&str; 17] = [
     "lost",
     "stale",
     "dropped",
@@ -23,6 +23,8 @@ const NAMES: [&str; 15] = [
     "safe",
     "waited",
     "paused",
+    "stuck",
+    "outlier",
 ];
 
 impl CycleFlags {
@@ -57,6 +59,11 @@ impl CycleFlags {
 
     /// The operator paused it.
     pub const PAUSED: u32 = 1 << 14;
+    /// The bead stuck to a wall.
+    pub const STUCK: u32 = 1 << 15;
+    /// The error is far from that of the undisturbed cycles before of the same stroke and duration: something went wrong
+    /// that nobody reported.
+    pub const OUTLIER: u32 = 1 << 16;
 
     /// Whether all bits of `mask` are set.
     pub fn has(self, mask: u32) -> bool {
