@@ -76,6 +76,7 @@ fn script(folder: &Path, cycles: u32) {
 #[test]
 fn every_example_passes_the_check_and_a_rehearsal_with_a_row_for_each_cycle() {
     let folder = tempfile::tempdir().unwrap();
+    std::fs::write(folder.path().join("cell.toml"), "[emulator.cell]\n").unwrap();
     for path in examples() {
         let name = path.file_stem().unwrap().to_str().unwrap().to_string();
         let path = path.to_str().unwrap();
@@ -89,7 +90,11 @@ fn every_example_passes_the_check_and_a_rehearsal_with_a_row_for_each_cycle() {
         assert_eq!(check["ok"], true);
         assert!(folder.path().join(&report).exists());
         // The fatigue example lasts twelve minutes and the heartbeat ten: seconds here, and the same code as the others.
-        let run = json(folder.path(), &["run", path, "--dry", "--json"]);
+        let mut args = vec!["run", path, "--dry", "--json"];
+        if name == "fatigue" {
+            args.extend(["--rig", "cell.toml"]);
+        }
+        let run = json(folder.path(), &args);
         assert_eq!(run["outcome"], "done", "{name}");
         let done = run["cycles_done"].as_u64().unwrap();
         let expected = match name.as_str() {
@@ -115,6 +120,14 @@ fn every_example_passes_the_check_and_a_rehearsal_with_a_row_for_each_cycle() {
             "{run:?}"
         );
     }
+    let of = |name: &str| {
+        let run = runs.iter().find(|run| run.to_str().unwrap().contains(name));
+        run.unwrap().to_str().unwrap()
+    };
+    trends_of_the_cell(&json(
+        folder.path(),
+        &["report", of("fatigue-dry"), "--json"],
+    ));
     let step = runs
         .iter()
         .find(|run| run.to_str().unwrap().contains("step-dry"))
@@ -139,6 +152,34 @@ fn every_example_passes_the_check_and_a_rehearsal_with_a_row_for_each_cycle() {
         rows.lines().count() as u64,
         1 + replay["ticks"].as_u64().unwrap()
     );
+}
+
+/// What is hidden in the emulated cell is what the report finds, within 5 %, and nothing in the static arm.
+fn trends_of_the_cell(report: &Value) {
+    let of = |quantity: &str, arm: &str| {
+        let trends = report["trends"].as_array().unwrap();
+        let found = trends
+            .iter()
+            .find(|trend| trend["quantity"] == quantity && trend["arm"] == arm);
+        found.cloned()
+    };
+    for (quantity, first, last) in [("stretch", 3.80, 2.86), ("recovery time", 0.16, 0.37)] {
+        let found = of(quantity, "cyclic").unwrap();
+        assert_eq!(
+            (&found["cycles"], &found["significant"]),
+            (&180.into(), &true.into())
+        );
+        for (key, hidden) in [("first", first), ("last", last)] {
+            let value = found[key].as_f64().unwrap();
+            assert!((value / hidden - 1.0).abs() < 0.05, "{quantity}: {found}");
+        }
+        let still = of(quantity, "static");
+        assert!(
+            still.is_none_or(|trend| trend["significant"] == false),
+            "{quantity}"
+        );
+    }
+    assert_eq!(of("stretch", "static").unwrap()["cycles"], 180);
 }
 
 #[test]

@@ -1,10 +1,11 @@
 //! `cellpos report`: what a run did, on one page.
 
 mod cycles;
+mod envelope;
 mod spectrum;
 mod ticks;
 
-use super::run::resume;
+use super::run::{learning, resume};
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
 use cellpos_record::{CYCLES_CSV, Lost, RunMeta, RunReader};
 use cellpos_report::{Axis, Column, Figure, Panel, Report, Series, Status, Table};
@@ -77,6 +78,7 @@ pub fn run(args: Args) -> CommandResult {
     let bound = spectrum::Bound::of(meta, &ticks);
     errors(&mut page, &ticks, bound.as_ref());
     let trends = cycles::section(&mut page, &rows, unreadable);
+    learned(&mut page, &args.run)?;
     timing(&mut page, &sessions, &ticks);
     events(&mut page, &sessions);
     provenance(&mut page, &sessions);
@@ -148,23 +150,32 @@ fn head(page: &mut Report, sessions: &[Session], ticks: &Ticks) {
 fn traces(page: &mut Report, ticks: &Ticks) {
     page.section("Traces");
     let time = || Axis::linear("time", "s");
-    let every = ticks.stride();
+    let times_s = ticks.traces.times_s();
+    let [target_um, measured_um, command_um, neutral_um] =
+        std::array::from_fn(|column| ticks.traces.column(column));
+    let caption = match ticks.traces.rows() {
+        1 => "Reference, position, PZT over the whole run.".to_string(),
+        rows => format!(
+            "Reference, position, PZT over the whole run: the smallest and the largest of every {rows} ticks."
+        ),
+    };
     page.figure(
-        Figure::new(
-            "traces",
-            &format!("Reference, position, PZT over the whole run; every {every}th tick."),
-        )
-        .panel(
-            Panel::new(time(), Axis::linear("bead", "um"))
-                .series(Series::line("reference", &ticks.time_s, &ticks.target_um))
-                .series(Series::line("measured", &ticks.time_s, &ticks.measured_um).thin()),
-        )
-        .panel(
-            Panel::new(time(), Axis::linear("PZT", "um"))
-                .series(Series::step("command", &ticks.time_s, &ticks.command_um).color(2))
-                .series(Series::line("neutral", &ticks.time_s, &ticks.neutral_um).color(3)),
-        )
-        .share_x(),
+        Figure::new("traces", &caption)
+            .panel(
+                Panel::new(time(), Axis::linear("bead", "um"))
+                    .series(Series::line("measured", &times_s, &measured_um).thin())
+                    .series(Series::line("reference", &times_s, &target_um).thin()),
+            )
+            .panel(
+                Panel::new(time(), Axis::linear("PZT", "um"))
+                    .series(
+                        Series::line("command", &times_s, &command_um)
+                            .thin()
+                            .color(2),
+                    )
+                    .series(Series::line("neutral", &times_s, &neutral_um).color(3)),
+            )
+            .share_x(),
     );
     let near = &ticks.excerpt;
     page.figure(
@@ -219,6 +230,34 @@ fn errors(page: &mut Report, ticks: &Ticks, bound: Option<&spectrum::Bound>) {
         ));
     }
     page.figure(Figure::new("error-spectrum", &caption).panel(panel));
+}
+
+fn learned(page: &mut Report, run: &Path) -> Result<(), Failure> {
+    let motions = learning::load(run)?;
+    if motions.is_empty() {
+        return Ok(());
+    }
+    page.section("Learning");
+    let mut table = Table::new([
+        Column::left("motion"),
+        Column::right("cycles"),
+        Column::right("error at first (nm RMS)"),
+        Column::right("error at the end (nm RMS)"),
+        Column::right("retreats"),
+    ]);
+    for motion in &motions {
+        let learned = &motion.table;
+        table.row([
+            motion.name.as_str(),
+            &format!("{:.0}", learned.cycles),
+            &nm(learned.error_before_um),
+            &nm(learned.error_after_um),
+            &learned.retreats.to_string(),
+        ]);
+    }
+    table.caption("Measured errors over the first and the last cycles in full swing, localisation noise included.");
+    page.table(table);
+    Ok(())
 }
 
 fn timing(page: &mut Report, sessions: &[Session], ticks: &Ticks) {

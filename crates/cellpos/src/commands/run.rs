@@ -1,7 +1,7 @@
 //! `cellpos run`: a setpoint script in closed loop, with a row for each cycle; resumed after whatever ended it.
 
 mod keys;
-mod learning;
+pub(super) mod learning;
 pub(super) mod resume;
 mod sink;
 mod text;
@@ -421,7 +421,10 @@ fn conclude(
     let report = text::Report::new(
         text::Ending {
             outcome,
-            stage: ended.name(),
+            stage: match outcome {
+                "aborted" => "by the operator",
+                _ => ended.name(),
+            },
             alarms: ended.alarms,
             run,
             folder: folder.display().to_string(),

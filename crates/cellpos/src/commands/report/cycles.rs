@@ -6,6 +6,8 @@ use std::collections::BTreeMap;
 
 /// A quantity of the cycles.
 struct Quantity {
+    /// What it says something of: the bead or cell itself, or how well the rig moved it.
+    of_what: &'static str,
     name: &'static str,
     unit: &'static str,
     of: fn(&CycleRow, f64) -> f64,
@@ -14,46 +16,55 @@ struct Quantity {
 /// The second argument is the length of the cell before the first cycle, um.
 const QUANTITIES: [Quantity; 9] = [
     Quantity {
+        of_what: "rig",
         name: "reached over commanded amplitude",
         unit: "",
         of: |row, _| row.reached_um / row.commanded_um,
     },
     Quantity {
+        of_what: "rig",
         name: "lag",
         unit: "deg",
         of: |row, _| row.lag_deg,
     },
     Quantity {
+        of_what: "rig",
         name: "bias",
         unit: "um",
         of: |row, _| row.bias_um,
     },
     Quantity {
+        of_what: "rig",
         name: "error RMS",
         unit: "um",
         of: |row, _| row.rms_um,
     },
     Quantity {
+        of_what: "rig",
         name: "neutral",
         unit: "um",
         of: |row, _| row.neutral_um,
     },
     Quantity {
+        of_what: "bead",
         name: "gain",
         unit: "1/s",
         of: |row, _| row.gain_per_s,
     },
     Quantity {
+        of_what: "cell",
         name: "dwell",
         unit: "s",
         of: |row, _| row.dwell_s,
     },
     Quantity {
+        of_what: "cell",
         name: "stretch",
         unit: "",
         of: |row, rest_um| row.length_peak_um / rest_um,
     },
     Quantity {
+        of_what: "cell",
         name: "recovery time",
         unit: "s",
         of: |row, _| row.recovery_s,
@@ -83,6 +94,7 @@ pub fn section(page: &mut Report, rows: &[CycleRow], unreadable: usize) -> serde
         .find(|um| um.is_finite())
         .unwrap_or(f64::NAN);
     let mut table = Table::new([
+        Column::left("of"),
         Column::left("quantity"),
         Column::left("arm"),
         Column::right("cycles"),
@@ -121,6 +133,7 @@ pub fn section(page: &mut Report, rows: &[CycleRow], unreadable: usize) -> serde
             if let Some(found) = trend(values) {
                 row(&mut table, quantity, name, &found);
                 json.push(serde_json::json!({
+                    "of": quantity.of_what,
                     "quantity": quantity.name,
                     "unit": quantity.unit,
                     "arm": name,
@@ -151,6 +164,7 @@ fn row(table: &mut Table, quantity: &Quantity, arm: &str, found: &Trend) {
         format!("{} ({})", quantity.name, quantity.unit)
     };
     table.row([
+        quantity.of_what,
         name.as_str(),
         arm,
         &found.cycles.to_string(),

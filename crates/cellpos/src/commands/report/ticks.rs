@@ -1,10 +1,9 @@
 //! What a report needs of the ticks, gathered as they go by.
 
+use super::envelope::Envelope;
 use cellpos_runtime::{Life, TickRecord};
 use std::collections::VecDeque;
 
-/// Points of a trace over the whole run, at most twice this many.
-const POINTS: usize = 10_000;
 /// Ticks remembered to find the reference of the time of an exposure.
 const PAST: usize = 64;
 
@@ -22,11 +21,8 @@ pub struct Excerpt {
 pub struct Ticks {
     /// Ticks in all.
     pub rows: u64,
-    pub time_s: Vec<f64>,
-    pub target_um: Vec<f64>,
-    pub measured_um: Vec<f64>,
-    pub command_um: Vec<f64>,
-    pub neutral_um: Vec<f64>,
+    /// Reference, position, command and neutral over the whole run, um.
+    pub traces: Envelope<4>,
     pub excerpt: Excerpt,
     /// Of every tick of the closed loop; NaN without a position.
     pub error_um: Vec<f64>,
@@ -36,7 +32,6 @@ pub struct Ticks {
     variance_um2: (f64, u64),
     start_s: f64,
     end_s: f64,
-    stride: usize,
     first_running_s: Option<f64>,
     period_s: (f64, u64),
     past: VecDeque<(i64, f64)>,
@@ -46,36 +41,8 @@ impl Ticks {
     /// A session begins at a time of the run.
     pub fn begin(&mut self, start_s: f64) {
         self.start_s = start_s;
-        self.stride = self.stride.max(1);
         self.past.clear();
-        if !self.time_s.is_empty() {
-            // A gap in the lines.
-            self.point(start_s, [f64::NAN; 4]);
-        }
-    }
-
-    fn point(&mut self, time_s: f64, [target, measured, command, neutral]: [f64; 4]) {
-        self.time_s.push(time_s);
-        self.target_um.push(target);
-        self.measured_um.push(measured);
-        self.command_um.push(command);
-        self.neutral_um.push(neutral);
-        if self.time_s.len() >= 2 * POINTS {
-            self.stride *= 2;
-            for column in [
-                &mut self.time_s,
-                &mut self.target_um,
-                &mut self.measured_um,
-                &mut self.command_um,
-                &mut self.neutral_um,
-            ] {
-                let mut index = 0;
-                column.retain(|_| {
-                    index += 1;
-                    index % 2 == 1
-                });
-            }
-        }
+        self.traces.gap();
     }
 
     /// The next tick.
@@ -85,10 +52,8 @@ impl Ticks {
             self.period_s.0 += (r.time_ns - last_ns) as f64 * 1e-9;
             self.period_s.1 += 1;
         }
-        if self.rows.is_multiple_of(self.stride as u64) {
-            let values = [r.target_um, r.measured_um, r.command_um, r.neutral_um];
-            self.point(time_s, values);
-        }
+        let values = [r.target_um, r.measured_um, r.command_um, r.neutral_um];
+        self.traces.add(time_s, values);
         self.rows += 1;
         self.end_s = time_s;
         if self.past.len() >= PAST {
@@ -134,11 +99,6 @@ impl Ticks {
     /// End of the last tick, s since the start of the run.
     pub fn end_s(&self) -> f64 {
         self.end_s
-    }
-
-    /// Every how many ticks the traces over the whole run have a point.
-    pub fn stride(&self) -> usize {
-        self.stride.max(1)
     }
 
     /// Mean period of the ticks, s.

@@ -102,7 +102,7 @@ impl ScriptSink {
         writer.event(&begun);
         // Hidden by itself where standard error is no terminal.
         let bar = ProgressBar::new((plan.total_s() * 1e3) as u64);
-        if let Ok(style) = ProgressStyle::with_template("{bar:30} {percent:>3}% {msg}") {
+        if let Ok(style) = ProgressStyle::with_template("{bar:30} {percent:>3}% {wide_msg}") {
             bar.set_style(style);
         }
         let from_s = plan
@@ -261,7 +261,8 @@ impl ScriptSink {
         let mut amplitude = self.watch.error().map_or(String::new(), |error| {
             format!("  amplitude {:+.1} %", error * 100.0)
         });
-        if let Some(trend) = self.watch.trend() {
+        // Fewer cycles give a slope that is chance.
+        if let Some(trend) = self.watch.trend().filter(|trend| trend.cycles >= 20) {
             amplitude.push_str(&format!(" ({:+.2} %/100 cycles)", trend.per_cycle * 1e4));
         }
         if let Some(stretch) = self.stretch.filter(|stretch| stretch.is_finite()) {
