@@ -163,8 +163,16 @@ fn traces(page: &mut Report, ticks: &Ticks) {
         Figure::new("traces", &caption)
             .panel(
                 Panel::new(time(), Axis::linear("bead", "um"))
-                    .series(Series::line("measured", &times_s, &measured_um).thin())
-                    .series(Series::line("reference", &times_s, &target_um).thin()),
+                    .series(
+                        Series::line("measured", &times_s, &measured_um)
+                            .thin()
+                            .color(1),
+                    )
+                    .series(
+                        Series::line("reference", &times_s, &target_um)
+                            .thin()
+                            .color(0),
+                    ),
             )
             .panel(
                 Panel::new(time(), Axis::linear("PZT", "um"))
