@@ -1,6 +1,8 @@
 //! Benchmarks with conditions and competitors: what they share.
 #![forbid(unsafe_code)]
 
+pub mod simulated;
+
 use cellpos_control::{ControllerFile, ControllerKind, Pi, Profile};
 use cellpos_emulator::WorldConfig;
 use cellpos_firmware_sim::BoardConfig;

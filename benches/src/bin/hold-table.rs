@@ -7,67 +7,39 @@
 //! within the band until 60 ms after it, Brownian motion included (2 % are 4 standard deviations of the hold error, so
 //! that an excursion later on is no matter of the step).
 
-use cellpos_control::design::PiSearch;
-use cellpos_control::design::{DesignPlant, bound_rms_um, default_lead, search_pi, spread};
+use cellpos_benches::simulated::{controllers, loop_config, rms, run, sine};
+use cellpos_control::design::{DesignPlant, bound_rms_um, spread};
 use cellpos_control::*;
 
 const SEEDS: u64 = 5;
 
-fn config(controller: ControllerConfig) -> LoopConfig {
-    LoopConfig {
-        model: LoopModel::eq6(2e-3),
-        estimator: EstimatorConfig::default(),
-        controller,
-        limits: Limits::default(),
-    }
-}
-
 /// True errors (um) and the number of commands that met a limit.
-fn run(controller: ControllerConfig, seed: u64, profile: &Profile, ticks: u64) -> (Vec<f64>, u32) {
-    let mut rig = SimulatedRig::new(RigConfig::eq6(seed)).expect("the nominal rig");
-    let mut controller = Controller::new(config(controller)).expect("a default controller");
-    let mut state = controller.start(20.0, 20.0);
-    let mut preview = vec![0.0; controller.preview_len()];
-    let mut limited = 0;
-    let errors = (0..ticks)
-        .map(|k| {
-            let reference_um = profile.at_um(k as f64 * 1e-3);
-            fill_preview(profile, k, 1e-3, &mut preview);
-            let error = rig.true_um() - reference_um;
-            let input = LoopInput {
-                measurement: Some(rig.measure()),
-                reference_um,
-                preview_um: &preview,
-                ..LoopInput::default()
-            };
-            let out = controller.step(&mut state, &input);
-            limited += u32::from(out.flags.range_limited || out.flags.slew_limited);
-            rig.advance(out.command_um);
-            error
-        })
-        .collect();
+fn errors(
+    controller: ControllerConfig,
+    seed: u64,
+    profile: &Profile,
+    ticks: u64,
+) -> (Vec<f64>, u32) {
+    let (mut errors, mut limited) = (Vec::new(), 0);
+    run(
+        loop_config(controller),
+        RigConfig::eq6(seed),
+        profile,
+        None,
+        ticks,
+        |_, _| {},
+        |seen| {
+            errors.push(seen.error_um);
+            let flags = seen.output.flags;
+            limited += u32::from(flags.range_limited || flags.slew_limited);
+        },
+    );
     (errors, limited)
 }
 
 fn rms_nm(controller: ControllerConfig, seed: u64, profile: &Profile) -> f64 {
-    let (errors, _) = run(controller, seed, profile, 12_000);
-    let settled = errors.get(2000..).unwrap_or_default();
-    1e3 * (settled.iter().map(|e| e * e).sum::<f64>() / settled.len() as f64).sqrt()
-}
-
-fn mean(values: impl Iterator<Item = f64>) -> f64 {
-    let (sum, n) = values.fold((0.0, 0.0), |(s, n), v| (s + v, n + 1.0));
-    sum / n
-}
-
-fn sine(frequency_hz: f64) -> Profile {
-    Profile::Wave {
-        shape: Shape::Sine,
-        centre_um: 0.0,
-        amplitude_um: 5.0,
-        frequency_hz,
-        fade_s: 0.5,
-    }
+    let (errors, _) = errors(controller, seed, profile, 12_000);
+    1e3 * rms(errors.get(2000..).unwrap_or_default().iter().copied())
 }
 
 /// Settling to 5 % and 2 % (ms), overshoot (percent), commands at a limit; the worst of the seeds.
@@ -78,7 +50,7 @@ fn step(controller: ControllerConfig) -> (f64, f64, f64, u32) {
     );
     let mut worst = (0.0_f64, 0.0_f64, 0.0_f64, 0);
     for seed in 0..SEEDS {
-        let (errors, limited) = run(controller, seed, &profile, AT as u64 + 60);
+        let (errors, limited) = errors(controller, seed, &profile, AT as u64 + 60);
         let after = errors.get(AT..).unwrap_or_default();
         let settled = |band: f64| {
             after
@@ -97,37 +69,6 @@ fn step(controller: ControllerConfig) -> (f64, f64, f64, u32) {
 
 fn main() {
     let plant = DesignPlant::eq6(2.5e-3);
-    let searched = |lead| {
-        search_pi(
-            &plant,
-            PiSearch {
-                lead,
-                ..PiSearch::default()
-            },
-        )
-        .ok()
-        .flatten()
-        .expect("gains exist at 2.5 ms")
-    };
-    let mpc = |solver| {
-        ControllerConfig::Mpc(
-            Mpc {
-                solver,
-                ..Mpc::default()
-            },
-            Pi::new(0.46, 19.5),
-        )
-    };
-    let controllers = [
-        ("pi", ControllerConfig::Pi(searched(None))),
-        (
-            "lead",
-            ControllerConfig::Pi(searched(Some(default_lead(2.5e-3)))),
-        ),
-        ("lqg", ControllerConfig::Lqg(Lqg::default())),
-        ("mpc, clarabel", mpc(SolverKind::Clarabel)),
-        ("mpc, active set", mpc(SolverKind::ActiveSet)),
-    ];
     let bound_nm = 1e3 * bound_rms_um(0.33, 0.0, 2e-3, 1e-3);
     println!(
         "minimum-variance bound: {bound_nm:.1} nm without localisation noise, {:.1} nm with 20 nm fixes",
@@ -146,27 +87,24 @@ fn main() {
         "50 Hz nm",
         "100 Hz nm"
     );
-    for (name, controller) in controllers {
+    for (name, controller) in controllers() {
         let hold: Vec<f64> = (0..SEEDS)
             .map(|seed| rms_nm(controller, seed, &Profile::Hold { position_um: 0.0 }))
             .collect();
-        let all = mean(hold.iter().map(|v| v * v)).sqrt();
+        let all = rms(hold.iter().copied());
         let worst = hold.iter().copied().fold(0.0, f64::max);
         let (to_5, to_2, overshoot, limited) = step(controller);
-        let sines: Vec<f64> = [50.0, 100.0]
-            .iter()
-            .map(|&hz| mean((0..SEEDS).map(|seed| rms_nm(controller, seed, &sine(hz)))))
-            .collect();
+        let followed =
+            |hz: f64| rms((0..SEEDS).map(|seed| rms_nm(controller, seed, &sine(5.0, hz, 0.5))));
+        let (at_50, at_100) = (followed(50.0), followed(100.0));
         let law = controller
             .linear(&EstimatorConfig::default(), &LoopModel::eq6(2e-3))
             .expect("a default controller");
         let rows = spread(&plant, &law).expect("the nominal plant");
         let stable = rows.iter().filter(|row| row.margins.stable).count();
         println!(
-            "{name:<16} {all:>9.1} {worst:>13.1} {:>7.2}   {to_5:>6.0} {to_2:>6.0} {overshoot:>8.1}% {limited:>7}   {:>9.0} {:>9.0}   {stable} of {}",
+            "{name:<16} {all:>9.1} {worst:>13.1} {:>7.2}   {to_5:>6.0} {to_2:>6.0} {overshoot:>8.1}% {limited:>7}   {at_50:>9.0} {at_100:>9.0}   {stable} of {}",
             all / bound_nm,
-            sines[0],
-            sines[1],
             rows.len()
         );
     }

@@ -54,13 +54,17 @@ pub fn arm(
     session: u16,
     reference: ReferenceSpec,
 ) -> Result<Setup, Failure> {
+    /// The loop limits the change of the command from tick to tick, and counts on it being reached early in the tick: the
+    /// board may go faster by this factor, if it can.
+    const HEADROOM: f64 = 4.0;
     let limits = prepared.controller.limits;
+    let slew_um_per_s = (HEADROOM * limits.slew_um_per_s).min(rig.actuator.info().slew_um_per_s);
     let armed = rig
         .actuator
         .arm(&Session {
             id: session,
             park_um: limits.park_um,
-            limits: [limits.low_um, limits.high_um, limits.slew_um_per_s],
+            limits: [limits.low_um, limits.high_um, slew_um_per_s],
             watchdog_ms: file.watchdog_ms(),
         })
         .map_err(Failure::failed)?;
@@ -206,6 +210,21 @@ pub fn bound_rms_nm(file: &RigFile, setup: &Setup, summary: &Summary) -> Option<
             noise_nm * 1e-3,
             timing.camera_delay_ms * 1e-3,
             timing.period_us * 1e-6,
+        )
+    })
+}
+
+/// What is wrong when the frames of a run were not as old as the rig file says: the loop was made for another delay.
+pub fn delay_warning(file: &RigFile, summary: &Summary) -> Option<String> {
+    /// Part of a period: what time stamps can tell without being a setting.
+    const WORTH_SAYING: f64 = 0.3;
+    let timing = &file.timing;
+    let period_ms = timing.period_us * 1e-3;
+    let found_ms = summary.loop_delay_ms - 0.5 * period_ms;
+    ((found_ms - timing.camera_delay_ms).abs() > WORTH_SAYING * period_ms).then(|| {
+        format!(
+            "the frames were {found_ms:.2} ms old when they were used, camera_delay_ms says {} ms: correct it in rig.toml",
+            timing.camera_delay_ms
         )
     })
 }

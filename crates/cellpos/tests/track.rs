@@ -312,9 +312,28 @@ fn the_example_files_load() {
 }
 
 #[test]
+fn a_sine_of_300_hz_is_learned_to_twice_the_hold_error_with_half_a_millisecond_of_exposure() {
+    let folder = tempfile::tempdir().unwrap();
+    model_with_gain(folder.path(), 1.2);
+    std::fs::write(
+        folder.path().join("rig.toml"),
+        "[emulator]\nmodel = \"plant.toml\"\n[timing]\ncamera_delay_ms = 1.75\n",
+    )
+    .unwrap();
+    let line = "track --target 0um --controller lqg --duration 4s --clock virtual --frames off --seed 5 --no-record --json --rig rig.toml";
+    let hold = number(&succeed(folder.path(), line).json(), "rms_true_nm");
+    for sine in ["5um@100Hz", "1um@200Hz", "0.5um@300Hz"] {
+        let r = succeed(folder.path(), &format!("{line} --sine {sine} --learn")).json();
+        let learned = number(&r, "rms_true_nm");
+        assert!(learned <= 2.0 * hold, "{sine}: {learned} against {hold} nm");
+    }
+}
+
+#[test]
 fn a_sine_is_learned_kept_with_the_run_replayed_and_gone_on_from() {
     let folder = tempfile::tempdir().unwrap();
-    let line = "track --target 0um --sine 5um@100Hz --controller mpc --solver active-set --duration 2.6s --clock virtual --frames off --seed 3 --json";
+    model_with_gain(folder.path(), 0.8);
+    let line = "track --target 0um --sine 5um@100Hz --controller mpc --solver active-set --duration 2.6s --clock virtual --frames off --seed 3 --rig rig.toml --json";
     let without = succeed(folder.path(), line).json();
     let with = succeed(folder.path(), &format!("{line} --learn")).json();
     assert!(number(&with, "rms_true_nm") < 100.0, "{with}");

@@ -26,6 +26,10 @@ pub const HISTORY: usize = 6;
 /// Uncertainty of neutral once the filter has been wrong for many fixes, um: half the range of the PZT.
 const LOST_NEUTRAL_UM: f64 = 20.0;
 
+/// Delay that a model may lack: a bead in fast motion is that many ticks of it away from where it is expected, and is still
+/// the same bead.
+const GATE_LAG_TICKS: f64 = 1.0;
+
 /// Weight of a fix in the average position of a stuck bead.
 const STUCK_AVERAGE: f64 = 0.05;
 
@@ -71,7 +75,7 @@ pub struct EstimatorConfig {
     pub fix_noise_um: f64,
     /// An innovation larger than this many standard deviations is refused.
     pub gate_sigma: f64,
-    /// ... unless it is smaller than this, um.
+    /// ... unless it is smaller than this and the fastest motion of the last ticks, um.
     pub gate_floor_um: f64,
     /// After this many refused measurements in a row the next one is believed.
     pub gate_most: u8,
@@ -370,6 +374,12 @@ impl Estimator {
         sum / (ticks as f64).sqrt()
     }
 
+    /// The furthest that the model says the bead has gone in one of the last ticks, um.
+    fn fastest_motion(&self, state: &EstimatorState) -> f64 {
+        let motion_um = |command: &f64| (self.tick.gain * (command - state.neutral_um)).abs();
+        state.history_um.iter().map(motion_um).fold(0.0, f64::max)
+    }
+
     /// From the filter's time to that of its measurement.
     fn at_measurement(&self, m: &Moment, command_um: f64, stuck: bool) -> Moment {
         if self.part.fraction == 0.0 || stuck {
@@ -475,7 +485,8 @@ impl Estimator {
         let spread = ph1 + h * ph2 + fix.variance_um2;
         // A stuck bead that comes free may move far in a frame.
         let widest = if state.stuck { 10.0 } else { 1.0 };
-        let gate = widest * (self.config.gate_sigma * spread.sqrt()).max(self.config.gate_floor_um);
+        let floor_um = self.config.gate_floor_um + GATE_LAG_TICKS * self.fastest_motion(state);
+        let gate = widest * (self.config.gate_sigma * spread.sqrt()).max(floor_um);
         if innovation.abs() > gate {
             state.gated = state.gated.saturating_add(1);
             if state.gated > self.config.gate_most {

@@ -59,6 +59,10 @@ pub struct LearnConfig {
     pub retreat_growth: f64,
     /// Ticks without learning after the bead was lost.
     pub settle_ticks: u32,
+    /// Exposure of a frame, s; at most 4 ticks. A fix is the mean over it of a path whose velocity changes with each
+    /// command, and is compared with the mean of the reference's path: at 300 Hz the two differ from the positions at the
+    /// middle by a fifth of the amplitude.
+    pub exposure_s: f64,
 }
 
 impl Default for LearnConfig {
@@ -72,6 +76,7 @@ impl Default for LearnConfig {
             most_um: 20.0,
             retreat_growth: 1.5,
             settle_ticks: 20,
+            exposure_s: 0.0,
         }
     }
 }
@@ -153,6 +158,7 @@ pub struct Learner {
     frequency_hz: f64,
     /// Cycles per tick.
     advance: f64,
+    exposure_ticks: f64,
     window_ticks: u32,
     responses: Vec<HarmonicResponse>,
     refused: Vec<HarmonicResponse>,
@@ -212,6 +218,13 @@ impl Learner {
             c.retreat_growth > 1.0,
             "above 1",
         )?;
+        check(
+            "exposure_s",
+            "s",
+            c.exposure_s,
+            (0.0..=4.0 * sample_time_s).contains(&c.exposure_s),
+            "0 to 4 ticks",
+        )?;
         let highest_hz = HIGHEST_PART / sample_time_s;
         check(
             "frequency_hz",
@@ -254,6 +267,7 @@ impl Learner {
             config,
             frequency_hz,
             advance,
+            exposure_ticks: config.exposure_s / sample_time_s,
             window_ticks: ((WINDOW_TICKS * advance).ceil().max(2.0) / advance).round() as u32,
             responses: kept,
             refused,
@@ -496,19 +510,88 @@ impl CycleLearning {
     /// has used; `None`: there was none.
     pub fn learn(&mut self, fix: Option<(f64, f64)>) {
         let error = fix.and_then(|(position_um, age_ticks)| {
-            let newer = age_ticks.max(0.0).floor();
-            let part = age_ticks.max(0.0) - newer;
-            let newer = newer as usize;
-            // Without a part the older neighbour is not needed, nor perhaps known.
-            let older = if part < 1e-6 { newer } else { newer + 1 };
-            if older >= self.known {
-                return None;
-            }
-            let (a, b) = (self.past_um.get(newer)?, self.past_um.get(older)?);
-            let reference_um = a + part * (b - a);
             let phase = self.phase - age_ticks * self.learner.advance;
-            Some((phase, position_um - reference_um))
+            Some((phase, position_um - self.exposed_um(age_ticks)?))
         });
         self.learner.learn(&mut self.state, error);
+    }
+
+    /// Mean of the reference's path over an exposure whose middle is so many ticks old, um; `None` if it is not known.
+    fn exposed_um(&self, age_ticks: f64) -> Option<f64> {
+        let half = 0.5 * self.learner.exposure_ticks;
+        let (mut from, until) = ((age_ticks - half).max(0.0), age_ticks + half);
+        let length = until - from;
+        if length < 1e-6 {
+            return self.past_reference_um(age_ticks);
+        }
+        let mut sum = 0.0;
+        // The path is straight between ticks.
+        while from < until {
+            let to = (from.floor() + 1.0).min(until);
+            sum +=
+                0.5 * (to - from) * (self.past_reference_um(from)? + self.past_reference_um(to)?);
+            from = to;
+        }
+        Some(sum / length)
+    }
+
+    /// The reference's path at an age in ticks, um.
+    fn past_reference_um(&self, age_ticks: f64) -> Option<f64> {
+        let newer = age_ticks.max(0.0).floor();
+        let part = age_ticks.max(0.0) - newer;
+        let newer = newer as usize;
+        // Without a part the older neighbour is not needed, nor perhaps known.
+        let older = if part < 1e-6 { newer } else { newer + 1 };
+        if older >= self.known {
+            return None;
+        }
+        let (a, b) = (self.past_um.get(newer)?, self.past_um.get(older)?);
+        Some(a + part * (b - a))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_bead_that_is_on_the_reference_at_each_tick_has_nothing_to_learn_whatever_the_exposure() {
+        let response = HarmonicResponse {
+            harmonic: 1,
+            re_um_per_um: 0.1,
+            im_um_per_um: -0.2,
+            relative_uncertainty: 0.1,
+        };
+        let reference = |k: i32| 0.5 * (TAU * 0.3 * f64::from(k)).sin();
+        let path = |t: f64| {
+            let k = t.floor();
+            let (a, b) = (reference(k as i32), reference(k as i32 + 1));
+            a + (t - k) * (b - a)
+        };
+        for (exposure_s, age_ticks) in [(0.0, 2.0), (0.5e-3, 2.0), (0.9e-3, 2.3), (2.5e-3, 1.6)] {
+            let config = LearnConfig {
+                exposure_s,
+                ..LearnConfig::default()
+            };
+            let learner = Learner::new(config, 300.0, 1e-3, &[response]).unwrap();
+            let start = learner.start();
+            let mut learning = CycleLearning::new(learner, start);
+            let mut largest_um = 0.0_f64;
+            for k in 0..600 {
+                let phase = 0.3 * f64::from(k);
+                let added_um = learning.addition_um(Some(phase), reference(k));
+                largest_um = largest_um.max(added_um.abs());
+                // What a camera sees: the mean over the exposure, here by many points.
+                let middle = f64::from(k) - age_ticks;
+                let points = 2000;
+                let seen_um: f64 = (0..points)
+                    .map(|i| (f64::from(i) + 0.5) / f64::from(points) - 0.5)
+                    .map(|x| path(middle + x * exposure_s / 1e-3))
+                    .sum::<f64>()
+                    / f64::from(points);
+                learning.learn(Some((seen_um, age_ticks)));
+            }
+            assert!(largest_um < 1e-4, "{exposure_s} s: {largest_um} um");
+        }
     }
 }

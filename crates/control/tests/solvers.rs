@@ -69,7 +69,7 @@ fn vectors(m: &QpMatrices, random: &mut Xoshiro256PlusPlus) -> QpVectors {
     v
 }
 
-fn reference_solver(m: &QpMatrices) -> DefaultSolver<f64> {
+fn reference_solver(m: &QpMatrices, tolerance: f64) -> DefaultSolver<f64> {
     let dense = |rows: usize, at: &dyn Fn(usize, usize) -> f64, upper: bool| {
         let (mut starts, mut indices, mut values) = (vec![0], Vec::new(), Vec::new());
         for j in 0..VARS {
@@ -96,9 +96,9 @@ fn reference_solver(m: &QpMatrices) -> DefaultSolver<f64> {
     let settings = DefaultSettingsBuilder::default()
         .verbose(false)
         .presolve_enable(false)
-        .tol_gap_abs(1e-11)
-        .tol_gap_rel(1e-11)
-        .tol_feas(1e-11)
+        .tol_gap_abs(tolerance)
+        .tol_gap_rel(tolerance)
+        .tol_feas(tolerance)
         .build()
         .unwrap();
     let cones = [SupportedConeT::NonnegativeConeT(2 * ROWS)];
@@ -118,11 +118,14 @@ fn the_active_set_solver_agrees_with_clarabel_to_1_nm_in_the_first_move() {
     let mut largest_um: f64 = 0.0;
     let mut set = WorkingSet::default();
     let mut m = matrices(&mut random);
-    let mut reference = reference_solver(&m);
+    // Where a degenerate problem stops the tight one short of its tolerance, clarabel's own default is asked.
+    let references = |m: &QpMatrices| [1e-11, 1e-8].map(|t| reference_solver(m, t));
+    let mut reference = references(&m);
+    let mut loose = 0;
     for k in 0..problems {
         if k % 500 == 0 {
             m = matrices(&mut random);
-            reference = reference_solver(&m);
+            reference = references(&m);
             set = WorkingSet::default();
         }
         let v = vectors(&m, &mut random);
@@ -134,14 +137,25 @@ fn the_active_set_solver_agrees_with_clarabel_to_1_nm_in_the_first_move() {
             .map(|h| h.min(50.0))
             .chain(v.low.iter().map(|l| -l.max(-50.0)))
             .collect();
-        reference.update_q(&v.linear.to_vec()).unwrap();
-        reference.update_b(&bounds).unwrap();
-        reference.solve();
-        match (end, reference.solution.status) {
+        let [tight, default] = &mut reference;
+        let solve = |solver: &mut DefaultSolver<f64>| {
+            solver.update_q(&v.linear.to_vec()).unwrap();
+            solver.update_b(&bounds).unwrap();
+            solver.solve();
+            solver.solution.status
+        };
+        let mut status = solve(tight);
+        let mut first = tight.solution.x[0];
+        if status == SolverStatus::InsufficientProgress {
+            loose += 1;
+            status = solve(default);
+            first = default.solution.x[0];
+        }
+        match (end, status) {
             (QpEnd::Solved(w), SolverStatus::Solved | SolverStatus::AlmostSolved) => {
                 solved += 1;
                 constrained += usize::from(!set.is_empty());
-                let difference = (w[0] - reference.solution.x[0]).abs();
+                let difference = (w[0] - first).abs();
                 largest_um = largest_um.max(difference);
                 assert!(difference < 1e-3, "problem {k}: {difference} um");
             }
@@ -153,7 +167,7 @@ fn the_active_set_solver_agrees_with_clarabel_to_1_nm_in_the_first_move() {
         }
     }
     println!(
-        "{solved} solved, {constrained} of them with active rows, {infeasible} infeasible; largest difference {largest_um:e} um"
+        "{solved} solved, {constrained} of them with active rows, {infeasible} infeasible; largest difference {largest_um:e} um; {loose} at clarabel's default tolerance"
     );
     assert!(
         solved > problems * 9 / 10 && constrained > problems / 2,

@@ -232,6 +232,7 @@ fn conclude(
     if let Some(error) = &io_error {
         warnings.push(session::describe(error));
     }
+    warnings.extend(session::delay_warning(file, &summary));
     // Parked by the operator is ended as asked.
     let as_asked = summary.state == Life::Running
         || summary.safe_reason == Some(cellpos_runtime::SafeReason::Operator);

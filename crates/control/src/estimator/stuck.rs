@@ -42,9 +42,15 @@ impl Estimator {
             state.stuck = false;
             return;
         }
-        let odds = motion_um * (0.25 * motion_um - still_um) / (2.0 * noise_um2);
-        // One fix decides little: an outlier or a jolt must not make a verdict.
-        let odds = odds.clamp(-2.0, if moved { 0.0 } else { 2.0 });
+        // One fix decides little: an outlier or a jolt must not make a verdict. But nothing that is held moves, however
+        // badly the motion fits the prediction: an unknown lag turns a fast motion to and fro about.
+        const MOST: f64 = 2.0;
+        let odds = if moved {
+            -MOST
+        } else {
+            let odds = motion_um * (0.25 * motion_um - still_um) / (2.0 * noise_um2);
+            odds.clamp(-MOST, MOST)
+        };
         let evidence = (state.stuck_evidence + odds).clamp(0.0, 25.0);
         state.stuck_evidence = (evidence * EVIDENCE_GRID).round() / EVIDENCE_GRID;
         state.stuck = state.stuck_evidence > if state.stuck { 3.0 } else { 12.0 };
