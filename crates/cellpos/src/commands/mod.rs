@@ -3,6 +3,7 @@
 pub mod bundle;
 pub mod camera;
 pub mod check;
+pub mod circle;
 pub mod design;
 pub mod doctor;
 pub mod export;
@@ -47,6 +48,8 @@ pub enum Command {
     Identify(Box<identify::Args>),
     /// Find where simulation and measurement disagree, name what is missing, add it to the model.
     Reconcile(Box<reconcile::Args>),
+    /// Identify, reconcile, design again, track again: margins predicted and true, errors before and after.
+    Circle(Box<circle::Args>),
     /// Positions and their quality from a recording: CSV, contact sheet, summary.
     Vision(Box<vision::Args>),
     /// Which cameras there are; delivered rate, intervals, age and losses of one.
@@ -71,6 +74,7 @@ impl Command {
             Self::Doctor(args) => doctor::run(args),
             Self::Identify(args) => identify::run(*args),
             Self::Reconcile(args) => reconcile::run(*args),
+            Self::Circle(args) => circle::run(*args),
             Self::Vision(args) => vision::run(*args),
             Self::Camera(args) => camera::run(args),
             Self::Paper(args) => paper::run(args),

@@ -1,10 +1,16 @@
 //! `cellpos reconcile`: where simulation and measurement disagree, what is missing, added and shown.
 
+pub mod collect;
+pub mod experiment;
+
+use crate::commands::identify::on_rig::OnRig;
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
+use crate::rig_file::{ClockKind, Frames, RigFile};
 use cellpos_plant::{Model, Noise, TransferFunction};
 use cellpos_reconcile::{Options, ReconcileError, Reconciliation, Record, Verdict, reconcile};
 use cellpos_record::RunReader;
 use cellpos_table::{ColumnRef, Table};
+use collect::{Collected, Collecting};
 use std::path::{Path, PathBuf};
 
 /// Find where simulation and measurement disagree, name what is missing, add it to the model.
@@ -12,6 +18,7 @@ use std::path::{Path, PathBuf};
 #[command(after_help = "\
 Examples:
   cellpos reconcile --model eq6 --data runs/monday --out augmented.toml --report gap.html --json result.json
+  cellpos reconcile --model eq6 --collect more --rig rig.toml --out augmented.toml
   cellpos reconcile --model fit --data Model_Vi_Do.dat --rows 0:8027 --input-column 1 --output-column 5 --rate 200Hz
 
 Verdicts: named, ambiguous (the data cannot separate, and what would), unknown (nothing in the catalogue closes enough),
@@ -21,8 +28,33 @@ pub struct Args {
     #[arg(long, default_value = "eq6")]
     model: String,
     /// CSV files, run folders, or folders of both.
-    #[arg(long, required = true, num_args = 1..)]
+    #[arg(long, required_unless_present = "collect", num_args = 1..)]
     data: Vec<PathBuf>,
+    /// Where the records leave it open, or there are none, run what would decide on the rig, keep its records in FOLDER
+    /// and look again.
+    #[arg(long, value_name = "FOLDER")]
+    collect: Option<PathBuf>,
+    /// The rig to collect on, through the same loop as `cellpos track`; left out: the emulated one.
+    #[arg(long, requires = "collect")]
+    rig: Option<PathBuf>,
+    /// Most experiments to run.
+    #[arg(long, default_value_t = 2, requires = "collect", value_parser = clap::value_parser!(u8).range(1..=10))]
+    rounds: u8,
+    /// Factor on the duration of the experiments, 0.2 to 10.
+    #[arg(long, default_value_t = 1.0, requires = "collect")]
+    effort: f64,
+    /// Seed of the emulated rig and of the excitations [default: that of rig.toml].
+    #[arg(long, requires = "collect")]
+    seed: Option<u64>,
+    /// Clock of the emulated rig [default: virtual; a real rig has the real one].
+    #[arg(long, value_enum, requires = "collect")]
+    clock: Option<ClockKind>,
+    /// Whether the emulated rig renders frames.
+    #[arg(long, value_enum, default_value = "on", requires = "collect")]
+    frames: Frames,
+    /// Do not ask the operating system for real time.
+    #[arg(long, requires = "collect")]
+    best_effort: bool,
     /// Write the augmented model here (TOML).
     #[arg(long)]
     out: Option<PathBuf>,
@@ -63,6 +95,7 @@ pub struct Args {
 
 /// Runs the command.
 pub fn run(args: Args) -> CommandResult {
+    collectable(&args)?;
     let files = files(&args.data)?;
     let mut records = Vec::new();
     for file in &files {
@@ -85,14 +118,71 @@ pub fn run(args: Args) -> CommandResult {
         Model::load(&args.model).map_err(Failure::input)?
     };
     let bar = indicatif::ProgressBar::new_spinner();
-    let result = reconcile(&model, &records, &options, &mut |text| {
+    let mut progress = |text: &str| {
         bar.set_message(text.to_owned());
         bar.tick();
-    });
+    };
+    let mut collected = Vec::new();
+    let result = match &args.collect {
+        None => reconcile(&model, &records, &options, &mut progress).map_err(refused)?,
+        Some(folder) => {
+            let mut model = model;
+            let rig = rig(&args, &model)?;
+            let collecting = Collecting {
+                rig: &rig,
+                folder,
+                rounds: usize::from(args.rounds),
+                share: args.effort,
+                seed: rig.file.emulator.seed,
+            };
+            let found = collect::look(
+                &mut model,
+                &mut records,
+                &options,
+                &collecting,
+                &mut progress,
+            )?;
+            collected = found.1;
+            found.0
+        }
+    };
     bar.finish_and_clear();
-    let result = result.map_err(refused)?;
-    write(&args, &result)?;
+    write(&args, &result, &collected)?;
     Ok(Outcome::Done)
+}
+
+fn collectable(args: &Args) -> Result<(), Failure> {
+    if args.collect.is_none() {
+        return Ok(());
+    }
+    if args.model == "fit" {
+        return Err(Failure::bad_input(
+            "--collect with --model fit: a rig is held in a loop, and the loop needs a model",
+            "name a model file, or eq6",
+        ));
+    }
+    if !(0.2..=10.0).contains(&args.effort) {
+        return Err(Failure::bad_input(
+            format!("--effort {}", args.effort),
+            "give 0.2 to 10",
+        ));
+    }
+    Ok(())
+}
+
+/// The rig to collect on.
+fn rig(args: &Args, model: &Model) -> Result<OnRig, Failure> {
+    let mut file = RigFile::load(args.rig.as_deref())?;
+    if let Some(seed) = args.seed {
+        file.emulator.seed = seed;
+    }
+    OnRig::new(
+        file,
+        model.clone(),
+        args.clock,
+        args.frames,
+        args.best_effort,
+    )
 }
 
 fn refused(error: ReconcileError) -> Failure {
@@ -102,7 +192,7 @@ fn refused(error: ReconcileError) -> Failure {
     )
 }
 
-fn write(args: &Args, result: &Reconciliation) -> Result<(), Failure> {
+fn write(args: &Args, result: &Reconciliation, collected: &[Collected]) -> Result<(), Failure> {
     let io = |path: &Path, e: std::io::Error| {
         Failure::bad_input(
             format!("cannot write {}: {e}", path.display()),
@@ -117,20 +207,37 @@ fn write(args: &Args, result: &Reconciliation) -> Result<(), Failure> {
             .data
             .iter()
             .map(|d| d.display().to_string())
+            .chain(collected.iter().map(|c| c.file.display().to_string()))
             .collect::<Vec<_>>()
             .join(", ");
         std::fs::write(path, cellpos_reconcile::report(result, &title).to_html())
             .map_err(|e| io(path, e))?;
     }
+    let mut json = result.to_json();
+    if args.collect.is_some() {
+        json["collected"] = serde_json::to_value(collected).map_err(Failure::failed)?;
+    }
     match &args.json {
-        Some(path) if path.as_os_str() == "-" => return print_json(&result.to_json()),
+        Some(path) if path.as_os_str() == "-" => return print_json(&json),
         Some(path) => {
-            let text = serde_json::to_string_pretty(&result.to_json()).map_err(Failure::failed)?;
+            let text = serde_json::to_string_pretty(&json).map_err(Failure::failed)?;
             std::fs::write(path, text + "\n").map_err(|e| io(path, e))?;
         }
         None => {}
     }
-    print_text(&summary(result))
+    let mut text = String::new();
+    for c in collected {
+        text.push_str(&format!(
+            "collected: {} ({}), {} rows in {}, then {}\n  because {}\n",
+            c.experiment,
+            c.what,
+            c.rows,
+            c.file.display(),
+            c.verdict,
+            c.why
+        ));
+    }
+    print_text(&(text + &summary(result)))
 }
 
 fn summary(result: &Reconciliation) -> String {

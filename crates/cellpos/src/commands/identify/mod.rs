@@ -11,9 +11,7 @@ pub mod run;
 
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
 use crate::rig_file::{ClockKind, Frames, RigFile};
-use crate::setup;
 use bench::Setup;
-use cellpos_control::Pi;
 use cellpos_emulator::WorldConfig;
 use cellpos_ident::excitation::{Limits, PAPER_FREQUENCIES_HZ};
 use cellpos_plant::Model;
@@ -208,26 +206,11 @@ fn on_rig(args: &Args, model: &Model) -> Result<Option<on_rig::OnRig>, Failure> 
     if let Some(seed) = args.seed {
         file.emulator.seed = seed;
     }
-    let emulated = file.is_emulated();
-    let clock = args.clock.unwrap_or(if emulated {
-        ClockKind::Virtual
-    } else {
-        ClockKind::Real
-    });
-    let mut controller = setup::controller("pi", model, &file.timing)?;
-    // The rig's own limits alone: a controller's narrower ones are for holding, not for driving.
-    controller.limits = file.limits;
-    Ok(Some(on_rig::OnRig {
-        controller,
-        model: model.clone(),
-        clock,
-        frames: match args.frames {
-            Switch::On => Frames::On,
-            Switch::Off => Frames::Off,
-        },
-        best_effort: args.best_effort,
-        file,
-    }))
+    let frames = match args.frames {
+        Switch::On => Frames::On,
+        Switch::Off => Frames::Off,
+    };
+    on_rig::OnRig::new(file, model.clone(), args.clock, frames, args.best_effort).map(Some)
 }
 
 fn job(args: &Args) -> Result<run::Job, Failure> {
@@ -244,50 +227,44 @@ fn job(args: &Args) -> Result<run::Job, Failure> {
         .seed
         .or(rig.as_ref().map(|rig| rig.file.emulator.seed))
         .unwrap_or(1);
-    let mut world = match &rig {
-        Some(rig) => rig.file.emulator.clone(),
-        None => WorldConfig {
-            model: args.model.clone(),
-            ..WorldConfig::default()
+    let mut setup = match &rig {
+        Some(rig) => rig.bench_setup(),
+        None => Setup {
+            world: WorldConfig {
+                model: args.model.clone(),
+                ..WorldConfig::default()
+            },
+            model,
+            frames: args.frames == Switch::On,
+            clock: match args.clock.unwrap_or(ClockKind::Virtual) {
+                ClockKind::Virtual => Clock::virtual_at(0),
+                ClockKind::Real => Clock::Real,
+            },
+            closed_loop: !args.open_loop,
+            pi: None,
         },
     };
-    world.seed = seed;
-    if let Some(rig) = &rig {
-        world.rate_hz = 1e6 / rig.file.timing.period_us;
-        world.latency_ms = rig.file.timing.camera_delay_ms;
-    }
+    setup.world.seed = seed;
     if let Some(exposure) = args.exposure {
-        world.exposure_ms = exposure.0 * 1e3;
+        setup.world.exposure_ms = exposure.0 * 1e3;
     }
-    let clock = match (&rig, args.clock) {
-        (Some(rig), _) if !rig.file.is_emulated() => ClockKind::Real,
-        (_, clock) => clock.unwrap_or(ClockKind::Virtual),
-    };
-    let setup = Setup {
-        world,
-        model,
-        frames: args.frames == Switch::On,
-        clock: match clock {
-            ClockKind::Virtual => Clock::virtual_at(0),
-            ClockKind::Real => Clock::Real,
+    let amplitudes = (
+        args.bead_amplitude.0,
+        args.bead_speed.0,
+        args.pzt_amplitude.0,
+    );
+    let limits = match &rig {
+        Some(rig) => rig.limits(amplitudes.0, amplitudes.1, amplitudes.2),
+        // As [`on_rig::OnRig::limits`] for the emulated board's 40 um/ms.
+        None => Limits {
+            bead_um: amplitudes.0,
+            bead_um_per_s: amplitudes.1,
+            pzt_um: amplitudes.2,
+            slew_um_per_s: 3200.0,
         },
-        closed_loop: !args.open_loop,
-        pi: rig
-            .as_ref()
-            .map(|rig| Pi::new(rig.controller.pi.kp_um_per_um, rig.controller.pi.ki_per_s)),
     };
-    let slew_um_per_s = rig
-        .as_ref()
-        .map_or(40_000.0, |rig| rig.file.limits.slew_um_per_s.min(40_000.0));
     Ok(run::Job {
-        // The board follows a step within its first update of 0.1 ms if the slew lets it (4 um at 40 um/ms); a larger one
-        // would be late by more, and bend the drive. A fifth is left to the loop that holds the bead.
-        limits: Limits {
-            bead_um: args.bead_amplitude.0,
-            bead_um_per_s: args.bead_speed.0,
-            pzt_um: args.pzt_amplitude.0,
-            slew_um_per_s: 0.08 * slew_um_per_s,
-        },
+        limits,
         setup,
         lines_hz,
         excitation: args.excitation,

@@ -3,18 +3,20 @@
 //!
 //! The loop freezes and thaws by its own rules when the bead is lost; a segment in which it did is measured again.
 
-use super::bench::DelayTest;
+use super::bench::{DelayTest, Setup};
 use crate::outcome::Failure;
 use crate::rig_file::{ClockKind, Frames, RigFile};
 use crate::setup;
-use cellpos_control::ControllerFile;
 use cellpos_control::design::DesignPlant;
+use cellpos_control::{ControllerFile, Pi};
+use cellpos_emulator::WorldConfig;
 use cellpos_ident::delay::{delay_from_edges, dithered_edges, find_edges};
+use cellpos_ident::excitation::Limits as ShapeLimits;
 use cellpos_ident::experiment::{Plan, RecordedSegment, Span};
 use cellpos_plant::Model;
 use cellpos_rig::actuator::Session;
 use cellpos_rig::clock::monotonic_ns;
-use cellpos_rig::{Camera, FrameBuffer};
+use cellpos_rig::{Camera, Clock, FrameBuffer};
 use cellpos_runtime::live::{self, Operator, Threads};
 use cellpos_runtime::{
     Core, EndRule, Event, Guide, GuideInput, GuideOutput, Life, RunSink, Stage, Statistics,
@@ -51,6 +53,9 @@ pub struct Acquired {
     pub wait_s: f64,
     /// From the middle of an exposure to the arrival of its frame, by the stamps of the frames, s.
     pub path_s: f64,
+    /// The whole run from where the loop was closed, row by row: commanded displacement, um, and bead position, um, NaN
+    /// without one.
+    pub rows: (Vec<f64>, Vec<f64>),
     /// Why segments are missing, if any are.
     pub trouble: Option<String>,
 }
@@ -106,6 +111,69 @@ impl RunSink for Keeping<'_> {
 }
 
 impl OnRig {
+    /// A rig with a PI for its delay, made for `model`; `clock` left out: virtual where the rig is emulated.
+    pub fn new(
+        file: RigFile,
+        model: Model,
+        clock: Option<ClockKind>,
+        frames: Frames,
+        best_effort: bool,
+    ) -> Result<Self, Failure> {
+        let clock = clock.unwrap_or(if file.is_emulated() {
+            ClockKind::Virtual
+        } else {
+            ClockKind::Real
+        });
+        let mut controller = setup::controller("pi", &model, &file.timing)?;
+        // The rig's own limits alone: a controller's narrower ones are for holding, not for driving.
+        controller.limits = file.limits;
+        Ok(Self {
+            file,
+            model,
+            controller,
+            clock,
+            frames,
+            best_effort,
+        })
+    }
+
+    /// What an excitation is shaped by: the model expected, the loop's PI and delay.
+    pub fn bench_setup(&self) -> Setup {
+        let timing = &self.file.timing;
+        let real = !self.file.is_emulated() || self.clock == ClockKind::Real;
+        Setup {
+            world: WorldConfig {
+                rate_hz: 1e6 / timing.period_us,
+                latency_ms: timing.camera_delay_ms,
+                ..self.file.emulator.clone()
+            },
+            model: self.model.clone(),
+            frames: self.frames == Frames::On,
+            clock: if real {
+                Clock::Real
+            } else {
+                Clock::virtual_at(0)
+            },
+            closed_loop: true,
+            pi: Some(Pi::new(
+                self.controller.pi.kp_um_per_um,
+                self.controller.pi.ki_per_s,
+            )),
+        }
+    }
+
+    /// Amplitudes that keep the bead in view, its image sharp and the board within its slew.
+    pub fn limits(&self, bead_um: f64, bead_um_per_s: f64, pzt_um: f64) -> ShapeLimits {
+        // The board follows a step within its first update of 0.1 ms if the slew lets it (4 um at 40 um/ms); a larger one
+        // would be late by more, and bend the drive. A fifth is left to the loop that holds the bead.
+        ShapeLimits {
+            bead_um,
+            bead_um_per_s,
+            pzt_um,
+            slew_um_per_s: 0.08 * self.file.limits.slew_um_per_s.min(40_000.0),
+        }
+    }
+
     /// Runs the segments `todo` of a plan once.
     pub fn acquire(
         &self,
@@ -210,6 +278,7 @@ impl OnRig {
                 .map_or(self.file.first_neutral_um, |t| t.neutral_um),
             wait_s: rows.wait_s(),
             path_s: 1e-9 * rows.path_ns as f64,
+            rows: (rows.input, rows.output),
             trouble,
         })
     }

@@ -1,0 +1,342 @@
+//! The circle on one page: what was found, margins predicted and true, tracking errors, before and after.
+
+use super::Circle;
+use super::margins::{LoopMargins, Response};
+use super::stage::{Stage, Tracked};
+use cellpos_report::{Axis, Column, Figure, Panel, Report, Series, Status, Table};
+use std::path::Path;
+
+fn effects(stage: &Stage) -> String {
+    stage.effects.join(", ")
+}
+
+fn figure(of: Option<LoopMargins>, f: impl Fn(&LoopMargins) -> Option<f64>, unit: &str) -> String {
+    of.as_ref()
+        .and_then(f)
+        .map_or_else(|| "-".to_owned(), |v| format!("{v:.2}{unit}"))
+}
+
+fn rms(tracked: Option<&Tracked>) -> String {
+    let Some(tracked) = tracked else {
+        return "no loop".to_owned();
+    };
+    match tracked.rms_true_nm.or(tracked.rms_measured_nm) {
+        Some(nm) if tracked.state == "running" => format!("{nm:.1} nm"),
+        Some(nm) => format!("{nm:.1} nm, ended in {}", tracked.state),
+        None => format!("ended in {}", tracked.state),
+    }
+}
+
+/// One line of the table of margins.
+struct Line {
+    name: &'static str,
+    unit: &'static str,
+    value: fn(&LoopMargins) -> Option<f64>,
+}
+
+const LINES: [Line; 5] = [
+    Line {
+        name: "peak of S",
+        unit: "",
+        value: |m| Some(m.ms),
+    },
+    Line {
+        name: "peak of T",
+        unit: "",
+        value: |m| Some(m.mt),
+    },
+    Line {
+        name: "phase margin",
+        unit: " deg",
+        value: |m| Some(m.pm_deg),
+    },
+    Line {
+        name: "gain margin",
+        unit: " dB",
+        value: |m| m.gm_db,
+    },
+    Line {
+        name: "delay margin",
+        unit: " ms",
+        value: |m| Some(m.delay_margin_ms),
+    },
+];
+
+fn bode(circle: &Circle) -> Figure {
+    let mut plot = Figure::bode(
+        "responses",
+        "Bead over command as a record shows it (hold and delay included), for motion of the size of holding: each model, and \
+         the rig's own.",
+    );
+    let mut add = |name: &str, response: &Response, number: usize| {
+        let db: Vec<f64> = response
+            .value
+            .iter()
+            .map(|v| 20.0 * v.norm().log10())
+            .collect();
+        let mut last = 0.0;
+        let deg: Vec<f64> = response
+            .value
+            .iter()
+            .map(|v| {
+                let turn = ((v.arg() - last) / std::f64::consts::TAU).round();
+                last = v.arg() - turn * std::f64::consts::TAU;
+                last.to_degrees()
+            })
+            .collect();
+        let (mut magnitude, mut phase) = (
+            Series::line(name, &response.hz, &db).color(number),
+            Series::line(name, &response.hz, &deg).color(number),
+        );
+        if name == "the rig" {
+            (magnitude, phase) = (magnitude.dashed(), phase.dashed());
+        }
+        plot = std::mem::replace(&mut plot, Figure::new("", "")).bode_series(magnitude, phase);
+    };
+    for (i, stage) in circle.stages.iter().enumerate() {
+        add(stage.name, &stage.response, i);
+    }
+    if let Some(response) = circle
+        .truth
+        .as_ref()
+        .and_then(|truth| Response::of(truth, 1e-3).ok())
+    {
+        add("the rig", &response, circle.stages.len());
+    }
+    plot
+}
+
+/// One of a stage's two runs.
+type OfStage = fn(&Stage) -> Option<&Tracked>;
+
+fn traces(circle: &Circle) -> Figure {
+    let mut plot = Figure::new(
+        "tracking-errors",
+        "Position less reference in the last half second: holding still, and following the sine.",
+    )
+    .share_x();
+    let kinds: [(&str, OfStage); 2] =
+        [("hold", |s| s.hold.as_ref()), ("sine", |s| s.sine.as_ref())];
+    for (title, of) in kinds {
+        let mut panel = Panel::new(Axis::linear("time", "s"), Axis::linear("error", "um"))
+            .title(title)
+            .height_px(180.0);
+        for (i, stage) in circle.stages.iter().enumerate() {
+            let Some((time_s, error_um)) = of(stage).map(|t| &t.trace) else {
+                continue;
+            };
+            panel = panel.series(Series::line(stage.name, time_s, error_um).color(i).thin());
+        }
+        plot = plot.panel(panel);
+    }
+    plot
+}
+
+/// The page.
+pub fn report(circle: &Circle, gap: &Path) -> Report {
+    let mut r = Report::new("Closed circle: identify, reconcile, design again, track");
+    let verdict = circle.reconciled.verdict;
+    let names: Vec<&str> = circle
+        .reconciled
+        .effects
+        .iter()
+        .map(|e| e.id.as_str())
+        .collect();
+    let status = match verdict {
+        cellpos_reconcile::Verdict::Unknown => Status::Bad,
+        cellpos_reconcile::Verdict::Ambiguous => Status::Warning,
+        _ => Status::Good,
+    };
+    r.note(
+        status,
+        &format!("{}: {}", verdict.word(), names.join(" + ")),
+    );
+
+    r.section("Identified");
+    let model = &circle.identified.result.judged.model;
+    r.paragraph(&format!(
+        "K = {:.1} /s, delay {:.3} ms. The model that reconcile extended is the one {}: {}.",
+        model.gain_per_s,
+        model.delay_s * 1e3,
+        circle.base.0,
+        circle.base.1
+    ));
+    if !circle.identified.result.warnings.is_empty() {
+        r.list(&circle.identified.result.warnings);
+    }
+
+    r.section("Reconciled");
+    let mut t = Table::new([
+        Column::left("effect"),
+        Column::left("place"),
+        Column::left("parameters (95 % interval)"),
+        Column::left("or"),
+    ]);
+    for e in &circle.reconciled.effects {
+        let parameters: Vec<String> = e
+            .parameters
+            .iter()
+            .map(|(n, p)| {
+                format!(
+                    "{n} = {:.5} {} [{:.5}, {:.5}]",
+                    p.value, p.unit, p.ci95[0], p.ci95[1]
+                )
+            })
+            .collect();
+        t.row([
+            e.id.clone(),
+            e.place.to_owned(),
+            parameters.join("; "),
+            e.alternatives.join(", "),
+        ]);
+    }
+    r.table(t);
+    let g = &circle.reconciled.gap;
+    r.paragraph(&format!(
+        "Gap on held-out records: {:.1} nm before, {:.1} nm after, floor {:.1} nm RMS of innovation; the whole of it is in {}.",
+        1e3 * g.before,
+        1e3 * g.after,
+        1e3 * g.floor,
+        gap.display()
+    ));
+    let mut t = Table::new([
+        Column::left("recorded"),
+        Column::right("rows"),
+        Column::left("because"),
+        Column::left("verdict then"),
+    ]);
+    for c in &circle.collected {
+        t.row([
+            format!("{}: {}", c.experiment, c.what),
+            c.rows.to_string(),
+            c.why.clone(),
+            c.verdict.clone(),
+        ]);
+    }
+    r.table(t);
+
+    r.section("Margins, predicted and true");
+    r.paragraph(
+        "A controller is designed on each model. Predicted: on that model. True: the same controller on the rig's own model, \
+         with the delay that its frames had. Both for motion of the size of holding, nonlinear effects included.",
+    );
+    r.table(margins_table(circle));
+    for s in &circle.stages {
+        for (which, m) in [("model it was designed on", s.predicted), ("rig", s.real)] {
+            if m.is_some_and(|m| !m.stable) {
+                r.note(
+                    Status::Bad,
+                    &format!(
+                        "{}: unstable on the {which}; the figures describe its open loop only",
+                        s.name
+                    ),
+                );
+            }
+        }
+        if let Some(why) = &s.problem {
+            r.note(
+                Status::Warning,
+                &format!("{}: no controller on this model: {why}", s.name),
+            );
+        }
+    }
+    r.figure(bode(circle));
+
+    r.section("Tracking, before and after");
+    let mut t = Table::new([
+        Column::left("controller designed on the model"),
+        Column::left("effects"),
+        Column::right("kp"),
+        Column::right("ki, 1/s"),
+        Column::right("hold, RMS"),
+        Column::right("sine, RMS"),
+    ]);
+    let number = |v: Option<f64>| v.map_or_else(|| "-".to_owned(), |v| format!("{v:.3}"));
+    for s in &circle.stages {
+        t.row([
+            s.name.to_owned(),
+            effects(s),
+            number(s.kp_um_per_um),
+            number(s.ki_per_s),
+            rms(s.hold.as_ref()),
+            rms(s.sine.as_ref()),
+        ]);
+    }
+    let m = circle.motion;
+    t.caption(&format!(
+        "Hold: 0 um for {} s. Sine: {} um (half of peak to peak) at {} Hz. Error of the true position where it is known, the \
+         first 2 s left out.",
+        m.duration_s, m.amplitude_um, m.frequency_hz
+    ));
+    r.table(t);
+    r.figure(traces(circle));
+    r
+}
+
+fn margins_table(circle: &Circle) -> Table {
+    let mut columns = vec![Column::left("")];
+    for s in &circle.stages {
+        columns.push(Column::right(&format!("{}: predicted", s.name)));
+        columns.push(Column::right("true"));
+    }
+    let mut t = Table::with_columns(columns);
+    for line in &LINES {
+        let mut cells = vec![line.name.to_owned()];
+        for s in &circle.stages {
+            cells.push(figure(s.predicted, line.value, line.unit));
+            cells.push(figure(s.real, line.value, line.unit));
+        }
+        t.row(cells);
+    }
+    t
+}
+
+/// The same for a terminal.
+pub fn text(circle: &Circle, out: &Path, html: &Path) -> String {
+    use std::fmt::Write as _;
+    let mut s = String::new();
+    let names: Vec<&str> = circle
+        .reconciled
+        .effects
+        .iter()
+        .map(|e| e.id.as_str())
+        .collect();
+    let _ = writeln!(
+        s,
+        "verdict: {}: {}",
+        circle.reconciled.verdict.word(),
+        names.join(" + ")
+    );
+    for e in &circle.reconciled.effects {
+        for (name, p) in &e.parameters {
+            let _ = writeln!(
+                s,
+                "  {} {name} = {:.5} {} (95 %: {:.5} .. {:.5})",
+                e.id, p.value, p.unit, p.ci95[0], p.ci95[1]
+            );
+        }
+    }
+    for stage in &circle.stages {
+        let _ = writeln!(s, "{}: {}", stage.name, effects(stage));
+        for line in &LINES {
+            let _ = writeln!(
+                s,
+                "  {:<14}{:>12} predicted{:>12} true",
+                line.name,
+                figure(stage.predicted, line.value, line.unit),
+                figure(stage.real, line.value, line.unit)
+            );
+        }
+        let _ = writeln!(
+            s,
+            "  hold {}, sine {}",
+            rms(stage.hold.as_ref()),
+            rms(stage.sine.as_ref())
+        );
+        if let Some(why) = &stage.problem {
+            let _ = writeln!(s, "  no controller on this model: {why}");
+        }
+    }
+    let _ = writeln!(s, "model   {}\nreport  {}", out.display(), html.display());
+    s
+}

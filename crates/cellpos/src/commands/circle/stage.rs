@@ -1,0 +1,282 @@
+//! One step of the circle: a controller designed on a model, its margins there and on the truth, and a run with it.
+
+use super::margins::{LoopMargins, Response, margins};
+use crate::commands::identify::on_rig::OnRig;
+use crate::outcome::Failure;
+use crate::session;
+use crate::setup::{self, Prepared, ReferenceSpec};
+use cellpos_control::LinearLaw;
+use cellpos_control::design::DesignPlant;
+use cellpos_plant::{Effect, Model};
+use cellpos_runtime::live::Operator;
+use cellpos_runtime::{EndRule, Event, Life, RunSink, Statistics, TickRecord, Timing};
+use serde::Serialize;
+
+/// What is tracked.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Motion {
+    /// Half of peak to peak, um.
+    pub amplitude_um: f64,
+    /// Frequency, Hz.
+    pub frequency_hz: f64,
+    /// Duration of the hold, and of the sine, s.
+    pub duration_s: f64,
+}
+
+/// What a run gave.
+#[derive(Debug, Clone, Serialize)]
+pub struct Tracked {
+    /// State at the end, in words.
+    pub state: &'static str,
+    /// RMS of measured position less reference after 2 s, nm.
+    pub rms_measured_nm: Option<f64>,
+    /// RMS of true position less reference after 2 s, nm; emulated rigs only.
+    pub rms_true_nm: Option<f64>,
+    /// The last half second: time, s, and error (true where it is known), um.
+    #[serde(skip)]
+    pub trace: (Vec<f64>, Vec<f64>),
+}
+
+/// One step.
+#[derive(Debug, Clone, Serialize)]
+pub struct Stage {
+    /// Which.
+    pub name: &'static str,
+    /// Ids of the model's effects.
+    pub effects: Vec<&'static str>,
+    /// Delay from the middle of an exposure to its tick that the loop is set up for, ms.
+    pub delay_ms: f64,
+    /// Proportional gain of a PI, um of PZT per um of bead.
+    pub kp_um_per_um: Option<f64>,
+    /// Integral gain of a PI, 1/s.
+    pub ki_per_s: Option<f64>,
+    /// Margins on the model that it was designed on.
+    pub predicted: Option<LoopMargins>,
+    /// Margins on the truth; emulated rigs only.
+    #[serde(rename = "true")]
+    pub real: Option<LoopMargins>,
+    /// Holding still.
+    pub hold: Option<Tracked>,
+    /// Following the sine.
+    pub sine: Option<Tracked>,
+    /// Why no controller could be designed on this model.
+    pub problem: Option<String>,
+    /// Response of the model.
+    #[serde(skip)]
+    pub response: Response,
+}
+
+impl Stage {
+    /// Whether both runs ended as asked.
+    pub fn ran(&self) -> bool {
+        let running = Life::Running.name();
+        let is_running = |t: &Option<Tracked>| t.as_ref().is_some_and(|t| t.state == running);
+        is_running(&self.hold) && is_running(&self.sine)
+    }
+}
+
+/// The model with this delay of the camera path, and no other.
+pub fn with_delay(mut model: Model, delay_s: f64) -> Model {
+    model.effects.retain(|e| e.id() != "time-delay");
+    model.with_effect(Effect::TimeDelay { delay_s })
+}
+
+/// The linear model that a controller can be designed on: effects without a transfer function give way to the gain that
+/// they leave to small motion.
+fn designable(model: &Model, sample_s: f64) -> Result<Model, Failure> {
+    /// Where the two are compared, Hz: about the crossover of a loop with these delays.
+    const AT_HZ: f64 = 20.0;
+    let mut linear = model.clone();
+    for effect in &mut linear.effects {
+        // One pole is one pole, wherever it sits.
+        if let Effect::Bubble { lag_s, .. } = effect {
+            *effect = Effect::DriverLag {
+                bandwidth_hz: 1.0 / (std::f64::consts::TAU * *lag_s),
+            };
+        }
+    }
+    linear.effects.retain(|e| {
+        matches!(
+            e,
+            Effect::DriverLag { .. }
+                | Effect::GainError { .. }
+                | Effect::TimeDelay { .. }
+                | Effect::ExposureAveraging { .. }
+                | Effect::FlowDrift { .. }
+        )
+    });
+    if linear.effects.len() == model.effects.len() {
+        return Ok(linear);
+    }
+    let gain = |m: &Model| -> Result<f64, Failure> {
+        let response = Response::of(m, sample_s)?;
+        let nearest = (0..response.hz.len()).min_by(|&i, &j| {
+            let off = |k: usize| (response.hz[k] / AT_HZ).ln().abs();
+            off(i).total_cmp(&off(j))
+        });
+        Ok(nearest.map_or(f64::NAN, |i| response.value[i].norm()))
+    };
+    let factor = gain(model)? / gain(&linear)?;
+    if factor.is_finite() && factor > 0.0 {
+        linear.plant = linear.plant.scaled(factor).map_err(Failure::input)?;
+    }
+    Ok(linear)
+}
+
+/// Designs on `model` (which holds its delay), weighs the law on it and on the truth, and runs the rig with it.
+pub fn run(
+    name: &'static str,
+    model: Model,
+    controller: &str,
+    rig: &OnRig,
+    truth: Option<&Model>,
+    motion: Motion,
+) -> Result<Stage, Failure> {
+    let sample_s = rig.file.timing.period_us * 1e-6;
+    let delay_ms = match model.effect("time-delay") {
+        Some(Effect::TimeDelay { delay_s }) => delay_s * 1e3,
+        _ => rig.file.timing.camera_delay_ms,
+    };
+    let timing = Timing {
+        camera_delay_ms: delay_ms,
+        ..rig.file.timing
+    };
+    let response = Response::of(&model, sample_s)?;
+    let mut stage = Stage {
+        name,
+        effects: model.ordered_effects().iter().map(|e| e.id()).collect(),
+        delay_ms,
+        kp_um_per_um: None,
+        ki_per_s: None,
+        predicted: None,
+        real: None,
+        hold: None,
+        sine: None,
+        problem: None,
+        response,
+    };
+    // A fitted model may be one that no loop can be built on; that is a finding, and no reason to stop.
+    let (prepared, law) = match designed(&model, controller, &timing, sample_s) {
+        Ok(designed) => designed,
+        Err(Failure::BadInput(why)) => {
+            stage.problem = Some(why.to_string());
+            return Ok(stage);
+        }
+        Err(failure) => return Err(failure),
+    };
+    if matches!(law, LinearLaw::Pi { .. }) {
+        stage.kp_um_per_um = Some(prepared.controller.pi.kp_um_per_um);
+        stage.ki_per_s = Some(prepared.controller.pi.ki_per_s);
+    }
+    stage.predicted = weighed(&model, &stage.response, &law, sample_s)?;
+    if let Some(truth) = truth {
+        stage.real = weighed(truth, &Response::of(truth, sample_s)?, &law, sample_s)?;
+    }
+    let hold = ReferenceSpec::Hold { position_um: 0.0 };
+    let sine = ReferenceSpec::Sine {
+        centre_um: 0.0,
+        amplitude_um: motion.amplitude_um,
+        frequency_hz: motion.frequency_hz,
+        fade_s: crate::cyclic::FADE_S,
+    };
+    let track = |reference| tracked(prepared.clone(), rig, timing, reference, motion.duration_s);
+    stage.hold = Some(track(hold)?);
+    stage.sine = Some(track(sine)?);
+    Ok(stage)
+}
+
+/// Margins of a law on a model, by its response.
+fn weighed(
+    model: &Model,
+    response: &Response,
+    law: &LinearLaw,
+    sample_s: f64,
+) -> Result<Option<LoopMargins>, Failure> {
+    let linear = designable(model, sample_s)?;
+    let plant = DesignPlant::from_model(&linear, None, sample_s).map_err(Failure::input)?;
+    let exact = cellpos_control::design::margins(&plant, law).map_err(Failure::input)?;
+    Ok(margins(response, law, sample_s, exact.stable))
+}
+
+fn designed(
+    model: &Model,
+    controller: &str,
+    timing: &Timing,
+    sample_s: f64,
+) -> Result<(Prepared, LinearLaw), Failure> {
+    let linear = designable(model, sample_s)?;
+    let prepared = Prepared {
+        controller: setup::controller(controller, &linear, timing)?,
+        model: linear,
+    };
+    let delay_s = prepared.controller.delay_ms * 1e-3;
+    let plant = DesignPlant::from_model(&prepared.model, Some(delay_s), sample_s)
+        .map_err(Failure::input)?;
+    let loop_model = plant.loop_model().map_err(Failure::input)?;
+    // The loop itself refuses what only looks buildable.
+    prepared
+        .controller
+        .loop_config(&prepared.model)
+        .map_err(Failure::input)?;
+    let law = prepared
+        .controller
+        .controller_config()
+        .linear(&prepared.controller.estimator, &loop_model)
+        .map_err(Failure::input)?;
+    Ok((prepared, law))
+}
+
+/// Keeps the errors.
+struct Errors(Vec<(f64, f64)>);
+
+impl RunSink for Errors {
+    fn tick(&mut self, t: &TickRecord) {
+        let position_um = if t.true_um.is_finite() {
+            t.true_um
+        } else {
+            t.estimate_um
+        };
+        self.0
+            .push((t.time_ns as f64 * 1e-9, position_um - t.target_um));
+    }
+    fn event(&mut self, _: &Event) {}
+    fn progress(&mut self, _: &Statistics) {}
+}
+
+fn tracked(
+    mut prepared: Prepared,
+    rig: &OnRig,
+    timing: Timing,
+    reference: ReferenceSpec,
+    duration_s: f64,
+) -> Result<Tracked, Failure> {
+    let file = crate::rig_file::RigFile {
+        timing,
+        ..rig.file.clone()
+    };
+    let mut connected = session::connect(&file, rig.clock, rig.frames, &prepared.model)?;
+    session::narrow(&mut prepared, &file, &connected);
+    let setup = session::arm(prepared, &file, &mut connected, 1, reference)?;
+    let end = EndRule {
+        ticks: Some((duration_s * 1e6 / timing.period_us).round() as u64),
+        ..EndRule::default()
+    };
+    let finished = session::drive(
+        setup.core()?,
+        &mut connected,
+        Errors(Vec::new()),
+        end,
+        rig.best_effort,
+        &Operator::default(),
+    )?;
+    let errors = finished.sink.0;
+    let last = errors
+        .len()
+        .saturating_sub((5e5 / timing.period_us) as usize);
+    Ok(Tracked {
+        state: finished.summary.state.name(),
+        rms_measured_nm: finished.summary.rms_measured_nm,
+        rms_true_nm: finished.summary.rms_true_nm,
+        trace: errors[last..].iter().copied().unzip(),
+    })
+}

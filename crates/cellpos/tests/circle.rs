@@ -1,0 +1,208 @@
+//! The closed circle and `reconcile --collect` as a user runs them: a rig that hides an effect, and a loop that is not told.
+
+mod common;
+
+use cellpos_plant::{Effect, Model};
+use common::{number, succeed};
+use serde_json::Value;
+use std::path::Path;
+
+fn hide(folder: &Path, name: &str, effect: Effect) {
+    let model = Model {
+        working_point_um: 20.0,
+        ..Model::eq6().with_effect(effect)
+    };
+    std::fs::write(folder.join(name), model.to_toml_string()).unwrap();
+}
+
+fn named<'a>(result: &'a Value, id: &str) -> &'a Value {
+    let effects = result["effects"].as_array().unwrap();
+    let found = effects.iter().find(|e| e["id"] == id);
+    found.unwrap_or_else(|| panic!("{id} is not named: {effects:?}"))
+}
+
+/// How far the predicted peak of the sensitivity is from the true one, and the true one.
+fn sensitivity(stage: &Value) -> (f64, f64) {
+    let (predicted, real) = (
+        number(&stage["predicted"], "ms"),
+        number(&stage["true"], "ms"),
+    );
+    (predicted / real, real)
+}
+
+const SHORT: &str = "--seed 5 --frames off --effort 0.2 --max-effects 2 --rounds 0 --duration 6s --json --out augmented.toml --report circle.html";
+
+#[test]
+fn a_delay_that_nobody_told_of_is_found_and_the_margins_come_back() {
+    let folder = tempfile::tempdir().unwrap();
+    // With half an exposure 4 ms from its middle to the tick; the rig file says 2.
+    hide(
+        folder.path(),
+        "hidden.toml",
+        Effect::TimeDelay { delay_s: 3.75e-3 },
+    );
+    let r = succeed(
+        folder.path(),
+        &format!("circle --hidden hidden.toml {SHORT}"),
+    )
+    .json();
+    let delay = &named(&r["reconcile"], "time-delay")["parameters"]["delay_s"];
+    assert!((number(delay, "value") - 4e-3).abs() < 0.1e-3, "{delay}");
+    let (before, peak_before) = sensitivity(&r["before"]);
+    let (after, peak_after) = sensitivity(&r["after"]);
+    println!(
+        "Ms predicted/true: {before:.3} of {peak_before:.2}, then {after:.3} of {peak_after:.2}"
+    );
+    assert!(before < 0.7 && peak_before > 2.3, "{}", r["before"]);
+    assert!(
+        (after - 1.0).abs() < 0.03 && peak_after < 1.65,
+        "{}",
+        r["after"]
+    );
+    assert_eq!(r["after"]["hold"]["state"], "running");
+    let augmented = Model::load_file(&folder.path().join("augmented.toml")).unwrap();
+    assert!(augmented.effect("time-delay").is_some());
+    for file in ["circle.html", "circle-figures/responses.svg"] {
+        assert!(folder.path().join(file).exists(), "{file}");
+    }
+}
+
+#[test]
+fn a_lag_of_the_driver_is_found_and_tracking_gets_better_for_it() {
+    let folder = tempfile::tempdir().unwrap();
+    hide(
+        folder.path(),
+        "hidden.toml",
+        Effect::DriverLag { bandwidth_hz: 80.0 },
+    );
+    let r = succeed(
+        folder.path(),
+        &format!("circle --hidden hidden.toml --controller lqg {SHORT}"),
+    )
+    .json();
+    let lag = &named(&r["reconcile"], "driver-lag")["parameters"]["bandwidth_hz"];
+    assert!((number(lag, "value") / 80.0 - 1.0).abs() < 0.05, "{lag}");
+    let ((before, _), (after, _)) = (sensitivity(&r["before"]), sensitivity(&r["after"]));
+    println!("Ms predicted/true: {before:.3}, then {after:.3}");
+    assert!(
+        before < 0.85 && (after - 1.0).abs() < 0.03,
+        "{before} {after}"
+    );
+    let error = |stage: &str| number(&r[stage]["sine"], "rms_true_nm");
+    println!(
+        "sine: {:.1} nm, then {:.1} nm RMS",
+        error("before"),
+        error("after")
+    );
+    assert!(error("after") < 0.75 * error("before"));
+}
+
+#[test]
+fn without_data_collect_records_on_the_rig_and_keeps_what_it_recorded() {
+    let folder = tempfile::tempdir().unwrap();
+    hide(
+        folder.path(),
+        "hidden.toml",
+        Effect::TimeDelay { delay_s: 2.75e-3 },
+    );
+    std::fs::write(
+        folder.path().join("rig.toml"),
+        "[emulator]\nmodel = \"hidden.toml\"\n",
+    )
+    .unwrap();
+    let r = succeed(
+        folder.path(),
+        "reconcile --model eq6 --collect more --rig rig.toml --frames off --effort 0.3 --max-effects 1 --rounds 1 --seed 7 --json --out a.toml",
+    )
+    .json();
+    let delay = &named(&r, "time-delay")["parameters"]["delay_s"];
+    assert!((number(delay, "value") - 3e-3).abs() < 0.1e-3, "{delay}");
+    let collected = r["collected"].as_array().unwrap();
+    assert_eq!(collected.len(), 1);
+    assert_eq!(collected[0]["experiment"], "survey");
+    let csv = std::fs::read_to_string(folder.path().join("more/survey-1.csv")).unwrap();
+    assert!(csv.starts_with("time_s,pzt_um,bead_um"), "{}", &csv[..60]);
+    assert_eq!(
+        csv.lines().count() as f64,
+        1.0 + number(&collected[0], "rows")
+    );
+}
+
+#[test]
+fn records_that_leave_two_names_open_are_followed_by_the_experiment_that_decides() {
+    let folder = tempfile::tempdir().unwrap();
+    let base = Model {
+        working_point_um: 20.0,
+        ..Model::eq6()
+    };
+    std::fs::write(folder.path().join("base.toml"), base.to_toml_string()).unwrap();
+    let recorded = base.with_effect(Effect::TimeDelay { delay_s: 4e-3 });
+    std::fs::write(folder.path().join("slow.toml"), recorded.to_toml_string()).unwrap();
+    // The same rig behind a camera: half an exposure is added to the delay.
+    hide(
+        folder.path(),
+        "hidden.toml",
+        Effect::TimeDelay { delay_s: 3.75e-3 },
+    );
+    std::fs::write(
+        folder.path().join("rig.toml"),
+        "[emulator]\nmodel = \"hidden.toml\"\n",
+    )
+    .unwrap();
+    // Nothing above 7 Hz: a delay and a lag bend the phase alike.
+    let tau = std::f64::consts::TAU;
+    let rows: String = (0..10_000)
+        .map(|k| {
+            let t = f64::from(k) * 1e-3;
+            let u = 20.0 + 0.3 * (tau * 3.0 * t).sin() + 0.15 * (tau * 7.0 * t).sin();
+            format!("{t:.3},{u:.5}\n")
+        })
+        .collect();
+    std::fs::write(
+        folder.path().join("in.csv"),
+        format!("time_s,pzt_um\n{rows}"),
+    )
+    .unwrap();
+    succeed(
+        folder.path(),
+        "simulate --model slow.toml --input in.csv --out slow.csv --seed 4",
+    );
+    let line = "reconcile --model base.toml --data slow.csv --max-effects 1 --json";
+    let alone = succeed(folder.path(), line).json();
+    assert_eq!(alone["verdict"], "ambiguous", "{alone}");
+    let r = succeed(
+        folder.path(),
+        &format!("{line} --collect more --rig rig.toml --frames off --effort 0.5 --seed 3"),
+    )
+    .json();
+    assert_eq!(r["verdict"], "named", "{r}");
+    let delay = named(&r, "time-delay");
+    assert_eq!(delay["alternatives"].as_array().unwrap().len(), 0, "{r}");
+    let value = number(&delay["parameters"]["delay_s"], "value");
+    assert!((value - 4e-3).abs() < 0.1e-3, "{delay}");
+    let collected = r["collected"].as_array().unwrap();
+    assert_eq!(collected.len(), 1, "{r}");
+    assert_eq!(collected[0]["experiment"], "band");
+    assert_eq!(collected[0]["verdict"], "named");
+}
+
+#[test]
+fn arguments_that_contradict_each_other_end_with_code_2_and_a_sentence() {
+    let folder = tempfile::tempdir().unwrap();
+    for (line, says) in [
+        ("circle --amplitude 40um", "--amplitude 40um"),
+        ("circle --hidden none.toml", "none.toml"),
+        (
+            "reconcile --model fit --collect more",
+            "the loop needs a model",
+        ),
+        ("reconcile --model eq6", "--data"),
+    ] {
+        let ran = common::cellpos(folder.path(), line);
+        assert_eq!(ran.code, Some(2), "{line}\n{}", ran.err);
+        // On one line, without the frame that a terminal gets.
+        let err = ran.err.replace(['│', '\n'], " ");
+        let err = err.split_whitespace().collect::<Vec<_>>().join(" ");
+        assert!(err.contains(says), "{line}\n{}", ran.err);
+    }
+}
