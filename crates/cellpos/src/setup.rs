@@ -45,6 +45,9 @@ pub enum ReferenceSpec {
         text: String,
         /// Time of the plan at which the session begins, s.
         from_s: f64,
+        /// Length of the cell when the run began, um, for a session that goes on with it.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        first_length_um: Option<f64>,
         /// Texts of the waveforms that it names.
         #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
         waveforms: BTreeMap<String, String>,
@@ -126,10 +129,15 @@ impl ReferenceSpec {
                 frequency_hz: *frequency_hz,
                 fade_s: *fade_s,
             }),
-            Self::Script { from_s, .. } => {
+            Self::Script {
+                from_s,
+                first_length_um,
+                ..
+            } => {
                 let plan = self.script()?.map(|(_, plan)| Arc::new(plan));
                 let plan = plan.unwrap_or_else(|| unreachable!("a script has a plan"));
-                AnyGuide::Script(Box::new(Follower::new(plan, *from_s, delay_ticks)))
+                let follower = Follower::new(plan, *from_s, delay_ticks);
+                AnyGuide::Script(Box::new(follower.with_first_length(*first_length_um)))
             }
         })
     }

@@ -331,9 +331,13 @@ impl ControlLoop {
                 FeedForward::rest(prepared.reference_um)
             };
         }
+        // With a feed-forward of its own the loop asks for what moves the model along the reference; what is learned makes
+        // the bead do the same, so the estimator is not told of it. PI has none: there the learned part is what moves the
+        // bead, and an estimator that does not know of it refuses fixes and takes the bead for stuck.
+        let hidden_um = if self.law == Law::Pi { 0.0 } else { learned_um };
         self.estimator
-            .push(&mut state.estimator, output.command_um - learned_um);
-        state.learned_um = learned_um;
+            .push(&mut state.estimator, output.command_um - hidden_um);
+        state.learned_um = hidden_um;
         output
     }
 

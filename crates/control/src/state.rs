@@ -21,7 +21,8 @@ pub struct LoopState {
     pub pi: PiState,
     /// Model on the reference (state feedback only).
     pub feed_forward: FeedForwardState,
-    /// Learned addition in the previous tick's command, um; not part of the packed state.
+    /// Part of the previous tick's command that was learned and that the estimator was not told of, um; not part of the
+    /// packed state.
     pub learned_um: f64,
 }
 

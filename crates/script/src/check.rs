@@ -5,8 +5,8 @@
 //! covered by a reserve.
 
 use crate::error::ScriptError;
-use crate::plan::Plan;
-use crate::script::Script;
+use crate::plan::{Motion, Plan, Segment};
+use crate::script::{Script, WaveShape};
 use cellpos_control::Reference;
 use cellpos_plant::{DiscretePlant, Model, PlantError};
 use cellpos_units::Seconds;
@@ -62,6 +62,21 @@ pub struct Violation {
     pub unit: &'static str,
 }
 
+/// A wave, and how large it could be.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct WaveCheck {
+    /// Line of the step in the script.
+    pub line: usize,
+    /// Its shape.
+    pub shape: WaveShape,
+    /// Its frequency, Hz.
+    pub frequency_hz: f64,
+    /// Its amplitude, um.
+    pub amplitude_um: f64,
+    /// The largest amplitude that the rig could do there, um.
+    pub largest_um: f64,
+}
+
 /// The result of a check.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Check {
@@ -79,6 +94,8 @@ pub struct Check {
     pub pzt_speed_um_per_s: f64,
     /// All positions (from the start) times this factor would just be allowed; below 1 the script is refused.
     pub largest_factor: f64,
+    /// Every wave of the script, with the largest amplitude that the rig could do.
+    pub waves: Vec<WaveCheck>,
     /// What the rig cannot do; empty: the script can run.
     pub violations: Vec<Violation>,
     /// Times of the reference and PZT demand below, s.
@@ -160,6 +177,7 @@ pub fn check(script: &Script, model: &Model, limits: &CheckLimits) -> Result<Che
         pzt_um: (limits.neutral_um, limits.neutral_um),
         pzt_speed_um_per_s: 0.0,
         largest_factor: f64::INFINITY,
+        waves: Vec::new(),
         violations: Vec::new(),
         time_s: Vec::new(),
         reference_um: Vec::new(),
@@ -174,7 +192,8 @@ pub fn check(script: &Script, model: &Model, limits: &CheckLimits) -> Result<Che
         plant.step(&mut free, 0.0);
         let u = (next_um - start_um - plant.output_um(&free)) / per_um;
         plant.step(&mut state, u);
-        let line = plan.segment_at(time_s).map_or(0, |segment| segment.line);
+        let segment = plan.segment_at(time_s);
+        let line = segment.map_or(0, |segment| segment.line);
         let view_um = (next_um - start_um).abs().max(next_um.abs());
         let pzt_speed = (u - before_u).abs() / h;
         out.position_um = (
@@ -186,6 +205,10 @@ pub fn check(script: &Script, model: &Model, limits: &CheckLimits) -> Result<Che
         out.pzt_um = (out.pzt_um.0.min(pzt_um), out.pzt_um.1.max(pzt_um));
         out.pzt_speed_um_per_s = out.pzt_speed_um_per_s.max(pzt_speed);
         let room = if u > 0.0 { room_up } else { room_down };
+        if let Some(segment) = segment {
+            let times = (room / u.abs()).min(slew / pzt_speed);
+            out.wave(segment, times, limits.view_um);
+        }
         for (what, asked, allowed, unit) in [
             ("PZT range", u.abs(), room, "um"),
             ("PZT slew", pzt_speed, slew, "um/s"),
@@ -214,6 +237,36 @@ pub fn check(script: &Script, model: &Model, limits: &CheckLimits) -> Result<Che
 }
 
 impl Check {
+    /// Accounts for a tick of a wave whose PZT demand could be so many times larger.
+    fn wave(&mut self, segment: &Segment, times: f64, view_um: f64) {
+        let Motion::Wave {
+            shape,
+            amplitude_um,
+            frequency_hz,
+            ..
+        } = segment.motion
+        else {
+            return;
+        };
+        // Where it stands takes no PZT: the bead rests anywhere. It does take field of view.
+        let most_um = (amplitude_um * times).min(view_um - segment.from_um.abs());
+        let same = |known: &&mut WaveCheck| {
+            (known.line, known.amplitude_um, known.frequency_hz)
+                == (segment.line, amplitude_um, frequency_hz)
+        };
+        // The last one added is the one in force, but where steps are repeated.
+        match self.waves.iter_mut().rev().find(same) {
+            Some(known) => known.largest_um = known.largest_um.min(most_um),
+            None => self.waves.push(WaveCheck {
+                line: segment.line,
+                shape,
+                frequency_hz,
+                amplitude_um,
+                largest_um: most_um,
+            }),
+        }
+    }
+
     /// Keeps the worst of each kind at each line.
     fn violation(&mut self, new: Violation) {
         let known = self

@@ -285,6 +285,11 @@ impl Plan {
 }
 
 impl Cursor {
+    /// Counts changes of the cell's length from this one; None: from the first that is seen.
+    pub fn expect_length(&mut self, length_um: Option<f64>) {
+        self.first_length_um = length_um;
+    }
+
     /// Goes on to the next segment.
     fn leave(&mut self) {
         self.segment += 1;

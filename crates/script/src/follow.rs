@@ -65,6 +65,13 @@ impl Follower {
         }
     }
 
+    /// The same, with the length that the cell had when the run began, um: what its change is counted from.
+    #[must_use]
+    pub fn with_first_length(mut self, length_um: Option<f64>) -> Self {
+        self.cursor.expect_length(length_um);
+        self
+    }
+
     /// The plan.
     pub fn plan(&self) -> &Plan {
         &self.plan

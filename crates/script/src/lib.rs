@@ -19,7 +19,7 @@ mod plan;
 mod read;
 mod script;
 
-pub use check::{Check, CheckError, CheckLimits, Violation, check};
+pub use check::{Check, CheckError, CheckLimits, Violation, WaveCheck, check};
 pub use cursor::{Cursor, Output, Seen, Status, StopReason};
 pub use cycles::{
     Alarm, AmplitudeWatch, CycleFlags, CycleRow, CycleTable, Trend, read_cycles, trend,

@@ -316,6 +316,9 @@ fn too_much_is_refused_with_the_largest_amplitude_that_would_do() {
     // 1.017 times that gain, and the ten samples of a cycle may miss the crest by up to cos(18 deg) = 0.951.
     let largest = 30.0 * big.largest_factor;
     assert!((10.85..11.7).contains(&largest), "{largest}");
+    let wave = big.waves[0];
+    assert_eq!((wave.line, wave.amplitude_um), (4, 30.0));
+    assert!((wave.largest_um / largest - 1.0).abs() < 1e-9, "{wave:?}");
     assert!(check(largest * 0.999).violations.is_empty());
     assert!(!check(largest * 1.01).violations.is_empty());
 }

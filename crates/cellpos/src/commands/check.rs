@@ -127,6 +127,16 @@ fn text(script: &Script, check: &Check) -> String {
     for (name, value) in figures(check) {
         out.push_str(&format!("{name:34} {value}\n"));
     }
+    for wave in &check.waves {
+        out.push_str(&format!(
+            "line {}: {} of {} um at {} Hz: the rig could do {:.3} um\n",
+            wave.line,
+            wave.shape.name(),
+            wave.amplitude_um,
+            wave.frequency_hz,
+            wave.largest_um.max(0.0)
+        ));
+    }
     for line in violations(script, check) {
         out.push_str(&line);
         out.push('\n');
@@ -148,6 +158,13 @@ fn json(script: &Script, check: &Check) -> serde_json::Value {
         "pzt_um": [check.pzt_um.0, check.pzt_um.1],
         "pzt_speed_um_per_s": check.pzt_speed_um_per_s,
         "largest_factor": check.largest_factor.is_finite().then_some(check.largest_factor),
+        "waves": check.waves.iter().map(|wave| serde_json::json!({
+            "line": wave.line,
+            "shape": wave.shape.name(),
+            "frequency_hz": wave.frequency_hz,
+            "amplitude_um": wave.amplitude_um,
+            "largest_um": wave.largest_um,
+        })).collect::<Vec<_>>(),
         "violations": check.violations.iter().map(|v| serde_json::json!({
             "what": v.what,
             "line": v.line,
@@ -175,6 +192,25 @@ fn report(script: &Script, check: &Check, limits: &CheckLimits) -> Report {
         table.row([name, value.as_str()]);
     }
     report.table(table);
+    if !check.waves.is_empty() {
+        let mut table = Table::new([
+            Column::right("line"),
+            Column::left("wave"),
+            Column::right("frequency (Hz)"),
+            Column::right("amplitude (um)"),
+            Column::right("the rig could do (um)"),
+        ]);
+        for wave in &check.waves {
+            table.row([
+                &wave.line.to_string(),
+                wave.shape.name(),
+                &wave.frequency_hz.to_string(),
+                &wave.amplitude_um.to_string(),
+                &format!("{:.3}", wave.largest_um.max(0.0)),
+            ]);
+        }
+        report.table(table);
+    }
     let time = || Axis::linear("time", "s");
     report.figure(
         Figure::new(

@@ -5,6 +5,7 @@ mod envelope;
 mod spectrum;
 mod ticks;
 
+use super::replay;
 use super::run::{learning, resume};
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
 use cellpos_record::{CYCLES_CSV, Lost, RunMeta, RunReader};
@@ -71,6 +72,9 @@ pub fn run(args: Args) -> CommandResult {
     let meta = first.meta().ok();
     let name = meta.map_or("run", |meta| meta.name.as_str());
     let mut page = Report::new(&format!("Run {name}"));
+    if let Some(notes) = notes(&first) {
+        page.paragraph(&notes);
+    }
     head(&mut page, &sessions, &ticks);
     let text = std::fs::read_to_string(args.run.join(CYCLES_CSV)).unwrap_or_default();
     let (rows, unreadable) = read_cycles(&text);
@@ -98,6 +102,14 @@ pub fn run(args: Args) -> CommandResult {
         print_text(&format!("{}\n", out.display()))?;
     }
     Ok(Outcome::Done)
+}
+
+/// The notes of the script, if the run is one of a script with notes.
+fn notes(reader: &RunReader) -> Option<String> {
+    // A run that cannot be set up again is still worth a report.
+    let setup = replay::setup(reader).ok()?;
+    let (script, _) = setup.config.reference.script().ok()??;
+    Some(script.notes).filter(|notes| !notes.is_empty())
 }
 
 fn nm(um: Option<f64>) -> String {

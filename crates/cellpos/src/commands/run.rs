@@ -33,8 +33,8 @@ use std::sync::Arc;
   cellpos run --resume runs/20261121T190000Z-fatigue
 
 The script is checked first, as by cellpos check with the limits of the rig. Keys, where standard input is a terminal: p
-pauses and goes on, s skips to the next step, q freezes the bead, then parks the PZT. Ctrl-C does the same as q; a second
-one parks at once. Every cycle that is over is in cycles.csv in the run folder; --resume goes on behind the last of them,
+pauses and goes on, s skips to the next step, q freezes the bead, then parks the PZT. SIGUSR1 does what p does, SIGUSR2
+what s does, Ctrl-C and SIGTERM what q does; a second one parks at once. Every cycle that is over is in cycles.csv in the run folder; --resume goes on behind the last of them,
 after a crash too. Exit code 0: the script came to its end; 1: it did not; 2: bad input, or the rig cannot do it.")]
 pub struct Args {
     /// The script.
@@ -232,6 +232,7 @@ fn read(path: &Path) -> Result<(ReferenceSpec, Script, Vec<InputFile>), Failure>
         file,
         text,
         from_s: 0.0,
+        first_length_um: None,
         waveforms,
     };
     Ok((reference, script, inputs))
@@ -358,6 +359,7 @@ fn start(args: &Args, ready: Ready) -> CommandResult {
         });
     }
     session::stop_on_signals(&operator)?;
+    let nudges = keys::listen_to_signals(&operator).map_err(Failure::failed)?;
     let keys = keys::listen(&operator);
     let finished = session::drive(
         core,
@@ -367,7 +369,7 @@ fn start(args: &Args, ready: Ready) -> CommandResult {
         config.best_effort,
         &operator,
     )?;
-    drop(keys);
+    drop((keys, nudges));
     conclude(args, &file, &setup, &rig, &plan, &folder, finished)
 }
 

@@ -1,8 +1,11 @@
-//! Keys while a script runs: p pauses and goes on, s skips, q stops.
+//! Keys while a script runs: p pauses and goes on, s skips, q stops; and the signals that do the same where there is no
+//! keyboard.
 
 use cellpos_runtime::Request;
 use cellpos_runtime::live::Operator;
 use rustix::termios::{self, LocalModes, OptionalActions, SpecialCodeIndex, Termios};
+use signal_hook::consts::{SIGUSR1, SIGUSR2};
+use signal_hook::iterator::{Handle, Signals};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
@@ -50,6 +53,39 @@ pub fn listen(operator: &Arc<Operator>) -> Option<Keys> {
         stop,
         thread,
     })
+}
+
+/// The signals while they are listened to.
+pub struct Nudges {
+    handle: Handle,
+    thread: Option<JoinHandle<()>>,
+}
+
+/// Listens to signals: USR1 does what p does, USR2 what s does.
+pub fn listen_to_signals(operator: &Arc<Operator>) -> std::io::Result<Nudges> {
+    let mut signals = Signals::new([SIGUSR1, SIGUSR2])?;
+    let handle = signals.handle();
+    let operator = Arc::clone(operator);
+    let thread = std::thread::Builder::new()
+        .name("cellpos-signals".to_string())
+        .spawn(move || {
+            for signal in signals.forever() {
+                press(if signal == SIGUSR1 { b'p' } else { b's' }, &operator);
+            }
+        })?;
+    Ok(Nudges {
+        handle,
+        thread: Some(thread),
+    })
+}
+
+impl Drop for Nudges {
+    fn drop(&mut self) {
+        self.handle.close();
+        if let Some(thread) = self.thread.take() {
+            let _ = thread.join();
+        }
+    }
 }
 
 /// What a key does.

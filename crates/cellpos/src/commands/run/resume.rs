@@ -155,6 +155,10 @@ pub fn ready(folder: &Path, best_effort: bool) -> Result<Option<Ready>, Failure>
             file: script,
             text,
             from_s,
+            first_length_um: done
+                .iter()
+                .map(|row| row.length_start_um)
+                .find(|um| um.is_finite()),
             waveforms,
         },
         clock,
