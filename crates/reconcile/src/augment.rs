@@ -92,8 +92,13 @@ pub(crate) fn parameters(
             let [a, b] = fit.positions[at];
             let pixel = part.natural()[0];
             let rows: f64 = ctx.problem.count(&ctx.problem.all()) as f64;
-            let sd = ctx.problem.noise.innovation_um() * (2.0 / rows).sqrt() / pixel;
-            let amplitude = a.hypot(b) / pixel;
+            // The fit sees the error at an uncertain position: less sharp than it is.
+            let scale = pixel * ctx.problem.noise.sharpness(pixel);
+            let sd = ctx.problem.noise.innovation_um() * (2.0 / rows).sqrt() / scale;
+            let amplitude = a.hypot(b) / scale;
+            // Positions carry the error themselves: the second order of its slope, as an error of the method.
+            let bent = amplitude * (std::f64::consts::TAU * amplitude).powi(2) / 16.0;
+            let sd = sd.hypot(bent);
             out.insert(
                 "amplitude".to_owned(),
                 Interval {
@@ -201,7 +206,7 @@ fn effect_of(ctx: &Context<'_>, fit: &Fit, index: usize) -> Option<Effect> {
             let [a, b] = fit.positions[before(Kind::Position)];
             Effect::PixelLocking {
                 pixel_um,
-                amplitude: a.hypot(b) / pixel_um,
+                amplitude: a.hypot(b) / (pixel_um * ctx.problem.noise.sharpness(pixel_um)),
                 phase_deg: b.atan2(a).to_degrees(),
             }
         }

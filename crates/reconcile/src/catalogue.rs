@@ -116,6 +116,9 @@ fn play_block(v: &[f64], s: &Scope) -> Block {
     }
 }
 
+/// The static curvature that play operators hold beside their memory: no effect of the vocabulary.
+pub(crate) const CURVATURE: &str = "curvature";
+
 const ANY: (f64, f64) = (f64::NEG_INFINITY, f64::INFINITY);
 
 const WEIGHT: Param = lin("weights", -3.0, 5.0, 1e-3);
@@ -136,13 +139,13 @@ pub(crate) static VARIANTS: &[Variant] = &[
         params: &[lin("delay_s", 0.0, 0.1, 1e-5)],
         build: |v, _| Block::Delay { s: v[0] },
         starts: |s| one([0.1, 0.3, 1.0, 2.0, 4.0, 8.0].map(|k| k * s.sample_s)),
-        typical: (0.0003, 0.05),
+        typical: (0.0002, 0.05),
         off_response: false,
         kind: Kind::Chain,
     },
     Variant {
         id: "driver-lag",
-        params: &[log("bandwidth_hz", 0.5, 2e4)],
+        params: &[log("bandwidth_hz", 0.5, 2e5)],
         build: |v, _| Block::DriverLag { w: TAU * v[0] },
         starts: |_| one([15.0, 50.0, 120.0, 300.0, 800.0, 2000.0]),
         typical: (50.0, 5000.0),
@@ -151,7 +154,7 @@ pub(crate) static VARIANTS: &[Variant] = &[
     },
     Variant {
         id: "bubble",
-        params: &[log("lag_s", 2e-5, 1.0)],
+        params: &[log("lag_s", 1e-6, 1.0)],
         build: |v, _| Block::Bubble {
             lag_s: v[0],
             dissolution: 0.0,
@@ -164,7 +167,7 @@ pub(crate) static VARIANTS: &[Variant] = &[
     Variant {
         id: "bubble",
         params: &[
-            log("lag_s", 2e-5, 1.0),
+            log("lag_s", 1e-6, 1.0),
             lin("dissolution_per_s", -1.0, 1.0, 1e-4),
         ],
         build: |v, _| Block::Bubble {
@@ -248,6 +251,24 @@ pub(crate) static VARIANTS: &[Variant] = &[
         off_response: false,
         kind: Kind::Chain,
     },
+    // Never looked for: what is left of play operators when they remember nothing. See `Context::mostly_curvature`.
+    Variant {
+        id: CURVATURE,
+        params: &[lin("quadratic_per_um", -0.2, 0.2, 1e-4)],
+        build: |v, s| {
+            let mut weights = [0.0; PLAY_LEVELS.len()];
+            weights[0] = 1.0;
+            Block::Play {
+                stroke_um: s.stroke_um,
+                weights,
+                quadratic: v[0],
+            }
+        },
+        starts: |_| Vec::new(),
+        typical: ANY,
+        off_response: false,
+        kind: Kind::Chain,
+    },
     Variant {
         id: "pzt-creep",
         params: &[lin("per_decade", 1e-5, 0.19, 1e-3)],
@@ -323,9 +344,9 @@ pub(crate) static VARIANTS: &[Variant] = &[
     },
     Variant {
         id: "slew-limit",
-        params: &[log("rate_um_per_s", 1.0, 1e5)],
+        params: &[log("rate_um_per_s", 1.0, 1e6)],
         build: |v, _| Block::SlewLimit { rate: v[0] },
-        starts: |_| one([20.0, 60.0, 150.0, 350.0, 700.0, 1200.0, 2000.0]),
+        starts: |_| one([20.0, 60.0, 150.0, 350.0, 700.0, 1200.0, 2000.0, 8000.0]),
         typical: ANY,
         off_response: false,
         kind: Kind::Chain,

@@ -246,11 +246,16 @@ impl Context<'_> {
                         let [a, b] = fit.positions[position];
                         if a != 0.0 || b != 0.0 {
                             let pixel = p.natural()[0];
-                            let walk = r.whitener.smooth(&e);
-                            for k in 0..e.len() {
-                                let (sin, cos) = (TAU * (s[k] + walk[k]) / pixel).sin_cos();
-                                e[k] -= a * sin + b * cos;
+                            // Once to take the error off the neighbours that tell the position, once in earnest.
+                            let mut straight = e.clone();
+                            for _ in 0..2 {
+                                let walk = r.whitener.around(&straight);
+                                for k in 0..e.len() {
+                                    let (sin, cos) = (TAU * (s[k] + walk[k]) / pixel).sin_cos();
+                                    straight[k] = e[k] - a * sin - b * cos;
+                                }
                             }
+                            e = straight;
                         }
                         position += 1;
                     }
@@ -337,7 +342,7 @@ impl Context<'_> {
                     let [a, b] = fit.positions[position];
                     for (i, r) in records.iter().enumerate() {
                         let n = r.u.len();
-                        let walk = r.whitener.smooth(&state.residual[i]);
+                        let walk = r.whitener.around(&state.residual[i]);
                         let mut d = [vec![0.0; n], vec![0.0; n], vec![0.0; n]];
                         for k in 0..n {
                             let angle = TAU * (state.sim[i][k] + walk[k]) / pixel;

@@ -20,7 +20,7 @@ pub(crate) fn estimate(
     for ((r, present), e) in records.iter().zip(present).zip(residuals) {
         let (c0, c1, n, good) = if r.is_rest() {
             let clean = without_lines(e, present, r.sample_s);
-            let (c0, c1, n) = increment_moments(&clean, present);
+            let (c0, c1, n) = increment_moments(&clean, &without_jumps(&clean, present));
             (c0, c1, n, true)
         } else if let Some(p) = r.period_rows() {
             let from = if r.rows() >= 4 * p { 2 * p } else { p };
@@ -28,7 +28,7 @@ pub(crate) fn estimate(
             let d: Vec<f64> = rows.clone().map(|k| e[k] - e[k - p]).collect();
             let ok: Vec<bool> = rows.map(|k| present[k] && present[k - p]).collect();
             let clean = without_lines(&d, &ok, r.sample_s);
-            let (c0, c1, n) = increment_moments(&clean, &ok);
+            let (c0, c1, n) = increment_moments(&clean, &without_jumps(&clean, &ok));
             (0.5 * c0, 0.5 * c1, n, true)
         } else {
             let (c0, c1, n) = increment_moments(e, present);
@@ -78,6 +78,27 @@ pub(crate) fn from_residuals(present: &[Vec<bool>], residuals: &[Vec<f64>]) -> N
     } else {
         Noise::from_increments(c0 / n, c1 / n)
     }
+}
+
+/// Rows that count, without those after an increment of more than six standard deviations (by the median of their sizes):
+/// a bead that jumps is no noise, and must not raise the floor under which its jumps would then hide.
+fn without_jumps(e: &[f64], present: &[bool]) -> Vec<bool> {
+    let mut sizes: Vec<f64> = (1..e.len())
+        .filter(|&k| present[k] && present[k - 1])
+        .map(|k| (e[k] - e[k - 1]).abs())
+        .collect();
+    if sizes.is_empty() {
+        return present.to_vec();
+    }
+    let middle = sizes.len() / 2;
+    let (_, median, _) = sizes.select_nth_unstable_by(middle, f64::total_cmp);
+    let limit = 6.0 * 1.4826 * *median;
+    (0..e.len())
+        .map(|k| {
+            let jumps = k > 0 && limit > 0.0 && (e[k] - e[k - 1]).abs() > limit;
+            present[k] && !jumps
+        })
+        .collect()
 }
 
 /// Takes lines at 50 and 60 Hz and their second harmonics off.

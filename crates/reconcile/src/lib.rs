@@ -22,6 +22,7 @@ mod linear;
 mod map;
 mod noise;
 mod parallel;
+mod pixel;
 mod predict;
 mod problem;
 mod report;

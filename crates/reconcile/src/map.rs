@@ -209,7 +209,7 @@ fn ratios(ctx: &Context<'_>, fit: &Fit, planner: &mut RealFftPlanner<f64>) -> Ve
 }
 
 /// Sentences about where the null model fails.
-pub(crate) fn sentences(ctx: &Context<'_>, map: &DiscrepancyMap) -> Vec<String> {
+pub(crate) fn sentences(ctx: &Context<'_>, fit: &Fit, map: &DiscrepancyMap) -> Vec<String> {
     let mut out = Vec::new();
     let records = &ctx.problem.records;
     let bands = BAND_EDGES_HZ.len() - 1;
@@ -306,6 +306,29 @@ pub(crate) fn sentences(ctx: &Context<'_>, map: &DiscrepancyMap) -> Vec<String> 
                 format!("fading in time: the first third of the records has {:.1} times the excess of the last", a / c.max(1e-3 * a))
             });
         }
+    }
+    // Single rows: jumps, which no response and no line makes.
+    let (mut jumps, mut energy, mut most) = (0usize, 0.0, (0.0f64, 0usize, 0usize));
+    for (i, e) in fit.innovations.iter().enumerate() {
+        for (k, e) in e.iter().enumerate() {
+            if e.abs() > 6.0 {
+                jumps += 1;
+                energy += e * e;
+                if e.abs() > most.0 {
+                    most = (e.abs(), i, k);
+                }
+            }
+        }
+    }
+    let excess = fit.chi2 - fit.count as f64;
+    if jumps >= 5 && (jumps as f64) < 0.01 * fit.count as f64 && energy > 0.5 * excess {
+        out.push(format!(
+            "in single rows: {jumps} jumps hold {:.0} % of the excess, the largest of about {:.2} um in {} at {:.3} s",
+            100.0 * (energy / excess).min(1.0),
+            most.0 * ctx.problem.noise.innovation_um(),
+            records[most.1].name,
+            most.2 as f64 * ctx.problem.base.sample_s,
+        ));
     }
     // Amplitude: relative excess of the records by stroke.
     let mut by_stroke: Vec<(f64, f64, &str)> = records

@@ -43,6 +43,17 @@ impl Noise {
         self.white_um2.sqrt()
     }
 
+    /// Variance of the position of a row as known from the rows around it \[um^2\].
+    pub fn position_um2(&self) -> f64 {
+        let (q, r) = (self.walk_um2, self.white_um2);
+        0.25 * (q + (q * q + 4.0 * q * r).sqrt())
+    }
+
+    /// Part of an error periodic in position over `pixel_um` that a position so uncertain still shows, 0..1.
+    pub fn sharpness(&self, pixel_um: f64) -> f64 {
+        (-0.5 * self.position_um2() * (std::f64::consts::TAU / pixel_um).powi(2)).exp()
+    }
+
     /// Standard deviation of the innovation in the steady state \[um\]: the floor.
     pub fn innovation_um(&self) -> f64 {
         let (q, r) = (self.walk_um2, self.white_um2);
@@ -96,58 +107,46 @@ impl Whitener {
         }
     }
 
-    /// The walk as predicted for every row from the rows before it: independent of that row's innovation.
-    pub fn predict(&self, r: &[f64]) -> Vec<f64> {
-        let mut m = 0.0;
-        r.iter()
-            .zip(&self.gain)
-            .map(|(r, k)| {
-                let predicted = m;
-                m += k * (r - m);
-                predicted
+    /// The walk at every row from the rows before and after it, but not from the row itself: independent of its noise.
+    pub fn around(&self, r: &[f64]) -> Vec<f64> {
+        let pass = |forward: bool| {
+            let mut m = None;
+            let mut known = vec![None; r.len()];
+            for i in 0..r.len() {
+                let k = if forward { i } else { r.len() - 1 - i };
+                known[k] = m;
+                if self.gain[k] > 0.0 {
+                    let g = if self.gain[k] < 1.0 {
+                        self.gain[k]
+                    } else {
+                        0.5
+                    };
+                    m = Some(m.map_or(r[k], |m: f64| m + g * (r[k] - m)));
+                }
+            }
+            known
+        };
+        pass(true)
+            .into_iter()
+            .zip(pass(false))
+            .map(|(a, b)| match (a, b) {
+                (Some(a), Some(b)) => 0.5 * (a + b),
+                (Some(a), None) | (None, Some(a)) => a,
+                (None, None) => 0.0,
             })
             .collect()
     }
 
-    /// As [`Self::apply`] on the rows `from..to` only, with a run-in from `start`, where `r` begins.
-    pub fn apply_range(&self, r: &[f64], start: usize, from: usize, to: usize, e: &mut [f64]) {
-        let mut m = r.first().copied().unwrap_or(0.0);
-        for k in start..to {
-            let d = r[k - start] - m;
-            if k >= from {
-                e[k - from] = d * self.inverse_sigma[k];
-            }
-            m += self.gain[k] * d;
+    /// The transpose of [`Self::apply`]: what a residual at each row adds to the weighted sum of innovations.
+    pub fn transpose(&self, weights: &[f64]) -> Vec<f64> {
+        let mut z = vec![0.0; weights.len()];
+        let mut later = 0.0;
+        for k in (0..weights.len()).rev() {
+            let own = self.inverse_sigma[k] * weights[k];
+            z[k] = own + self.gain[k] * later;
+            later = (1.0 - self.gain[k]) * later - own;
         }
-    }
-
-    /// Smooths a residual: the walk without the white noise, from both sides.
-    pub fn smooth(&self, r: &[f64]) -> Vec<f64> {
-        let pass = |forward: bool| {
-            let mut m = 0.0;
-            let mut before = vec![0.0; r.len()];
-            let mut started = false;
-            for i in 0..r.len() {
-                let k = if forward { i } else { r.len() - 1 - i };
-                if self.gain[k] > 0.0 {
-                    if started {
-                        let g = if self.gain[k] < 1.0 {
-                            self.gain[k]
-                        } else {
-                            0.5
-                        };
-                        m += g * (r[k] - m);
-                    } else {
-                        m = r[k];
-                        started = true;
-                    }
-                }
-                before[k] = m;
-            }
-            before
-        };
-        let (a, b) = (pass(true), pass(false));
-        a.iter().zip(&b).map(|(a, b)| 0.5 * (a + b)).collect()
+        z
     }
 
     /// Number of innovations that count.
@@ -226,6 +225,25 @@ mod tests {
         let theta = n.white_um2 / n.innovation_um().powi(2);
         let expected = 0.01 / (1.0 - theta) / n.innovation_um();
         assert!((e[1999] - expected).abs() < 1e-9, "{} {expected}", e[1999]);
+    }
+
+    #[test]
+    fn the_transposed_filter_gives_the_same_inner_products() {
+        let n = Noise::new(0.33, 1e-3, 0.030);
+        let mut present = vec![true; 60];
+        present[17] = false;
+        let w = Whitener::new(&n, &present, None);
+        let wave = |a: f64| -> Vec<f64> { (0..60).map(|k| (a * f64::from(k)).sin()).collect() };
+        let (r, weights) = (wave(0.7), wave(1.9));
+        let mut e = vec![0.0; 60];
+        w.apply(&r, &mut e);
+        let direct: f64 = e.iter().zip(&weights).map(|(e, w)| e * w).sum();
+        let z = w.transpose(&weights);
+        let transposed: f64 = z.iter().zip(&r).map(|(z, r)| z * r).sum();
+        assert!(
+            (direct / transposed - 1.0).abs() < 1e-10,
+            "{direct} {transposed}"
+        );
     }
 
     #[test]

@@ -328,6 +328,12 @@ pub(crate) fn search(
     };
     steps.push((ids(&best), best.chi2));
     let mut fit = best;
+    // What a simple form leaves over must not be given a name of its own before the richer form was tried.
+    let reformed = reform(ctx, fit.clone(), mask, effort);
+    if reformed.parts != fit.parts {
+        fit = reformed;
+        steps.push((ids(&fit), fit.chi2));
+    }
     let mut beam: Vec<Fit> = singles.into_iter().skip(1).take(2).collect();
     while fit.parts.len() < effort.max_effects {
         progress(&format!("looking further beside {}", ids(&fit).join(" + ")));
@@ -366,16 +372,18 @@ pub(crate) fn search(
             break;
         }
         let (top, _) = replace(ctx, top, mask, effort);
+        let forms: Vec<usize> = top.parts.iter().map(|p| p.variant).collect();
         fit = reform(ctx, top, mask, effort);
+        if fit
+            .parts
+            .iter()
+            .map(|p| p.variant)
+            .ne(forms.iter().copied())
+        {
+            fit = eliminate(ctx, fit, null.chi2, mask, effort);
+        }
         steps.push((ids(&fit), fit.chi2));
         beam = Vec::new();
-    }
-    if fit.parts.len() == 1 {
-        let reformed = reform(ctx, fit.clone(), mask, effort);
-        if reformed.parts != fit.parts {
-            fit = reformed;
-            steps.push((ids(&fit), fit.chi2));
-        }
     }
     progress("refitting all together");
     let parts = fit.parts.clone();

@@ -1,10 +1,10 @@
 //! The workflow: guards, null model, search, held-out check, verdict, and the augmented model.
 
 use crate::augment::{augment, parameters, place_of};
-use crate::catalogue::{self, Scope};
+use crate::catalogue::{self, CURVATURE, Scope, VARIANTS};
 use crate::data::{self, Record};
 use crate::error::ReconcileError;
-use crate::fit::{Context, WhiteEvidence};
+use crate::fit::{Context, Fit, Part, WhiteEvidence};
 use crate::frames::{self, FrameCounts};
 use crate::guard;
 use crate::held_out::{self, HeldOut};
@@ -259,17 +259,19 @@ fn assemble(
     let left = fit.chi2 - n;
     let null_map = map::map(ctx, &null);
     let after_map = map::map(ctx, &fit);
-    let mut places = map::sentences(ctx, &null_map);
+    let mut places = map::sentences(ctx, &null, &null_map);
 
     let over = left_over(&fit);
     let mut effects = Vec::new();
     let mut ambiguous = false;
+    let mut curvature = false;
     for (i, part) in fit.parts.iter().enumerate() {
         let id = part.variant().id;
         let mut parts = fit.parts.clone();
         parts.remove(i);
         let without = ctx.fit_from(parts, Some(fit.soft), &all, 8);
         let gain = (without.chi2 - fit.chi2).max(0.0);
+        curvature |= mostly_curvature(ctx, &fit, i, gain);
         let mut alternatives: Vec<String> = Vec::new();
         for r in rivals.get(i).map_or(&[][..], Vec::as_slice) {
             if r.id == id || alternatives.iter().any(|a| a == r.id) {
@@ -281,8 +283,14 @@ fn assemble(
                 let s = ctx.problem.base.sample_s;
                 w.distance(&other, s) - w.distance(&fit.parts, s) > 16.0
             });
-            // A richer form that only holds the winner as a limit of its numbers is no rival.
-            let price = implausibility(&r.part, over) - implausibility(part, over);
+            // A richer form that only holds the winner as a limit of its numbers is no rival; one as simple is, however
+            // unusual its size, unless what is left over says that the last percent decides nothing.
+            let rough = over > 0.02 * fit.count as f64;
+            let price = if rough || r.part.theta.len() > part.theta.len() {
+                implausibility(&r.part, over) - implausibility(part, over)
+            } else {
+                0.0
+            };
             if r.chi2 + price - fit.chi2 < TIE && !decided {
                 if !inseparable(id, r.id) {
                     ambiguous = true;
@@ -369,7 +377,7 @@ fn assemble(
     } else {
         1.0
     };
-    let open = left > 5.0 * scatter && closed < CLOSED;
+    let open = (left > 5.0 * scatter && closed < CLOSED) || curvature;
     let verdict = if !fit.parts.is_empty() && open {
         Verdict::Unknown
     } else if effects.is_empty() {
@@ -390,6 +398,10 @@ fn assemble(
         let best = ids(&fit).join(" + ");
         places.push(if best.is_empty() {
             "no effect of the catalogue explains it".to_owned()
+        } else if curvature {
+            format!(
+                "the best of the catalogue, {best}, needs a static curvature more than the memory of a hysteresis: no name"
+            )
         } else {
             format!(
                 "the best of the catalogue, {best}, closes {:.0} % of it: not enough for a name",
@@ -462,6 +474,27 @@ fn assemble(
             .map(|r| (r.name.clone(), r.rows(), r.frames()))
             .collect(),
     }
+}
+
+/// Whether most of what play operators gain is their static quadratic term, which is no hysteresis.
+fn mostly_curvature(ctx: &Context<'_>, fit: &Fit, index: usize, gain: f64) -> bool {
+    let part = &fit.parts[index];
+    let Some(quadratic) = part
+        .variant()
+        .params
+        .iter()
+        .position(|p| p.name == "quadratic_per_um")
+    else {
+        return false;
+    };
+    let Some(v) = VARIANTS.iter().position(|v| v.id == CURVATURE) else {
+        return false;
+    };
+    let mut parts = fit.parts.clone();
+    parts[index] = Part::new(v, &[part.natural()[quadratic]]);
+    let forgetful = ctx.fit_from(parts, Some(fit.soft), &ctx.problem.all(), 12);
+    // What memory adds must be at least a half of the whole.
+    forgetful.chi2 - fit.chi2 < 0.5 * gain
 }
 
 /// A set that closes less than this part of the excess is no explanation.

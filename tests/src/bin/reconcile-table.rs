@@ -1,6 +1,6 @@
 //! Prints how well `reconcile` names effects that a simulator of another make hides: table, confusions, rates.
 //!
-//! `cargo run --release -p cellpos-tests --bin reconcile-table [all|singles|pairs|nulls|outside] [seed] [text]`, the
+//! `cargo run --release -p cellpos-tests --bin reconcile-table [all|singles|pairs|nulls|outside|levels] [seed] [text]`, the
 //! last to run only cases whose hidden effects, as printed, contain the text
 
 #![forbid(unsafe_code)]
@@ -8,6 +8,7 @@
 use cellpos_reconcile::Verdict;
 use cellpos_tests::truth::cases::{Case, nulls, outside, pairs, singles};
 use cellpos_tests::truth::table::{Row, evaluate};
+use cellpos_tests::truth::threshold::above_threshold;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -16,19 +17,36 @@ fn main() {
     let args: Vec<String> = std::env::args().skip(1).collect();
     let which = args.first().map_or("all", String::as_str);
     let seed: u64 = args.get(1).and_then(|s| s.parse().ok()).unwrap_or(1);
-    let mut cases: Vec<Case> = Vec::new();
+    // A case keeps its random numbers whatever else is run beside it.
+    let mut cases: Vec<(Case, u64)> = Vec::new();
+    let mut number = 0;
     for (name, group) in [
         ("singles", singles()),
         ("pairs", pairs()),
         ("nulls", nulls(40)),
         ("outside", outside()),
     ] {
-        if which == "all" || which == name {
-            cases.extend(group);
+        for case in group {
+            if which == "all" || which == name {
+                cases.push((case, seed * 1000 + number));
+            }
+            number += 1;
         }
     }
+    if which == "levels" {
+        // How far each single lies above the threshold of detection, without running the search.
+        for (i, case) in singles().iter().enumerate() {
+            let times = above_threshold(&case.hidden, seed * 1000 + i as u64);
+            println!(
+                "{:7} {:40} {times:6.1}",
+                case.level,
+                format!("{:?}", case.hidden)
+            );
+        }
+        return;
+    }
     if let Some(text) = args.get(2) {
-        cases.retain(|c| format!("{:?}", c.hidden).contains(text.as_str()));
+        cases.retain(|(c, _)| format!("{:?}", c.hidden).contains(text.as_str()));
     }
     let threads = std::thread::available_parallelism().map_or(2, usize::from);
     let next = AtomicUsize::new(0);
@@ -38,8 +56,10 @@ fn main() {
             scope.spawn(|| {
                 loop {
                     let i = next.fetch_add(1, Ordering::Relaxed);
-                    let Some(case) = cases.get(i) else { break };
-                    let row = evaluate(case, seed * 1000 + i as u64);
+                    let Some((case, seed)) = cases.get(i) else {
+                        break;
+                    };
+                    let row = evaluate(case, *seed);
                     println!("{}", line(case, &row));
                     if let Ok(mut rows) = rows.lock() {
                         rows.insert(i, row);
@@ -51,14 +71,14 @@ fn main() {
     let rows = rows.into_inner().unwrap_or_default();
     let done: Vec<(&Case, &Row)> = rows
         .iter()
-        .filter_map(|(i, r)| Some((&cases[*i], r.as_ref().ok()?)))
+        .filter_map(|(i, r)| Some((&cases[*i].0, r.as_ref().ok()?)))
         .collect();
     let rate = |group: &str, good: &dyn Fn(&Row) -> bool| {
         let n = done
             .iter()
             .filter(|(c, r)| c.group == group && good(r))
             .count();
-        (n, cases.iter().filter(|c| c.group == group).count())
+        (n, cases.iter().filter(|(c, _)| c.group == group).count())
     };
     println!("\nsummary (good, all)");
     println!(
@@ -84,7 +104,7 @@ fn main() {
     let closures = done
         .iter()
         .filter(|(c, _)| c.group == "single")
-        .map(|(_, r)| r.closure)
+        .filter_map(|(_, r)| r.closure)
         .collect();
     let fresh = done.iter().filter_map(|(_, r)| r.fresh).collect();
     for (what, values) in [
@@ -139,20 +159,22 @@ fn line(case: &Case, row: &Result<Row, String>) -> String {
     match row {
         Err(e) => format!("{:8} {:7} {hidden:40} refused: {e}", case.group, case.level),
         Ok(r) => format!(
-            "{:8} {:7} {hidden:40} {} {:16} {:40} closure {:6.3} fresh {:6} covered {}/{} threshold x {:5.1} {:5.1} s or: {}",
+            "{:8} {:7} {hidden:40} {} {:16} {:40} closure {:6} fresh {:6} covered {}/{} threshold x {:5.1} {:5.1} s or: {} {}",
             case.group,
             case.level,
             if r.named == r.hidden { "  " } else { "<>" },
             r.verdict.word(),
             join(&r.named),
-            r.closure,
+            r.closure
+                .map_or_else(|| "-".to_owned(), |c| format!("{c:.3}")),
             r.fresh
                 .map_or_else(|| "-".to_owned(), |f| format!("{f:.3}")),
             r.covered.0,
             r.covered.1,
             r.above_threshold,
             r.seconds,
-            join(&r.alternatives)
+            join(&r.alternatives),
+            r.missed.join(", ")
         ),
     }
 }

@@ -13,47 +13,48 @@ pub struct Case {
     pub hidden: Vec<Hidden>,
 }
 
-/// Weak, middle and strong of every effect of the vocabulary. Weak is the lower end of what a rig shows.
+/// Weak, middle and strong of every effect of the vocabulary. Weak is twice the amplitude that can be detected at all, by
+/// [`above_threshold`](super::threshold::above_threshold).
 pub fn singles() -> Vec<Case> {
     use Hidden::*;
     let levels: [[Hidden; 3]; 21] = [
-        [DriverLag(1500.0), DriverLag(400.0), DriverLag(90.0)],
-        [SlewLimit(1200.0), SlewLimit(600.0), SlewLimit(250.0)],
+        [DriverLag(15000.0), DriverLag(400.0), DriverLag(90.0)],
+        [SlewLimit(80000.0), SlewLimit(600.0), SlewLimit(250.0)],
         [
-            Saturation(1.6, 6.4),
+            Saturation(0.7, 7.3),
             Saturation(2.2, 5.8),
             Saturation(2.8, 5.0),
         ],
-        [Preisach(0.02, 1.0), Preisach(0.08, 1.0), Preisach(0.2, 1.0)],
-        [Creep(0.005), Creep(0.015), Creep(0.04)],
+        [Preisach(0.01, 1.0), Preisach(0.08, 1.0), Preisach(0.2, 1.0)],
+        [Creep(0.0037), Creep(0.015), Creep(0.04)],
         [
-            Resonance(2000.0, 0.1),
+            Resonance(3350.0, 0.1),
             Resonance(600.0, 0.1),
             Resonance(260.0, 0.15),
         ],
-        [Backlash(0.01), Backlash(0.06), Backlash(0.3)],
+        [Backlash(0.006), Backlash(0.06), Backlash(0.3)],
         [
-            Relaxation(0.1, 0.02),
+            Relaxation(0.1, 0.0056),
             Relaxation(0.2, 0.1),
             Relaxation(0.4, 0.35),
         ],
-        [Bubble(0.0002), Bubble(0.006), Bubble(0.04)],
-        [Leak(0.1), Leak(0.7), Leak(5.0)],
-        [Gain(1.02), Gain(0.85), Gain(1.5)],
-        [GainDrift(0.0015), GainDrift(-0.005), GainDrift(0.01)],
-        [Adhesion(2.0), Adhesion(12.0), Adhesion(60.0)],
-        [FlowDrift(1.0), FlowDrift(-5.0), FlowDrift(30.0)],
-        [Delay(0.0003), Delay(0.0013), Delay(0.0042)],
-        [Exposure(0.0003), Exposure(0.0006), Exposure(0.00095)],
-        [ClockSkew(20.0), ClockSkew(-90.0), ClockSkew(400.0)],
-        [Drops(0.003), Drops(0.01), Drops(0.04)],
-        [Repeats(0.003), Repeats(0.01), Repeats(0.04)],
+        [Bubble(0.0000105), Bubble(0.006), Bubble(0.04)],
+        [Leak(0.08), Leak(0.7), Leak(5.0)],
+        [Gain(1.005), Gain(0.85), Gain(1.5)],
+        [GainDrift(0.00063), GainDrift(-0.005), GainDrift(0.01)],
+        [Adhesion(1.35), Adhesion(12.0), Adhesion(60.0)],
+        [FlowDrift(0.9), FlowDrift(-5.0), FlowDrift(30.0)],
+        [Delay(0.0000105), Delay(0.0013), Delay(0.0042)],
+        [Exposure(0.000021), Exposure(0.0006), Exposure(0.00095)],
+        [ClockSkew(-1.0), ClockSkew(-90.0), ClockSkew(400.0)],
+        [Drops(0.0004), Drops(0.01), Drops(0.04)],
+        [Repeats(0.001), Repeats(0.01), Repeats(0.04)],
         [
-            PixelLocking(0.15, 0.03),
+            PixelLocking(0.25, 0.015),
             PixelLocking(0.25, 0.06),
             PixelLocking(0.3, 0.1),
         ],
-        [Hum(50.0, 0.01), Hum(60.0, 0.05), Hum(50.0, 0.3)],
+        [Hum(50.0, 0.007), Hum(60.0, 0.05), Hum(50.0, 0.3)],
     ];
     levels
         .into_iter()

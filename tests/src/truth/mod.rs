@@ -1,18 +1,19 @@
 //! A rig that hides effects, written apart from the catalogue of `cellpos-plant`.
 //!
-//! Another integrator (fixed-step Runge-Kutta on Eq. (6) in controllable form, sixteen steps a millisecond, where the
+//! Another integrator (fixed-step Runge-Kutta on Eq. (6) in controllable form, 64 steps a millisecond, where the
 //! catalogue is exact), other equations where the literature offers them (Preisach relays for hysteresis, one
 //! Kelvin-Voigt element per decade for creep, an internal variable for the standard linear solid), and effects that the
 //! catalogue does not have. Nuisances (diffusion, localisation noise, phases) are drawn at random.
 
 pub mod cases;
 pub mod table;
+pub mod threshold;
 
 use cellpos_reconcile::Record;
 use std::f64::consts::TAU;
 
 /// Steps per millisecond.
-const FINE: usize = 16;
+const FINE: usize = 64;
 
 /// xorshift64* with Box-Muller: small, seeded, the project's own.
 #[derive(Debug, Clone)]

@@ -1,6 +1,7 @@
 //! Runs cases and counts.
 
 use super::cases::Case;
+use super::threshold::above_threshold;
 use super::{Nuisance, Random, run, scripts};
 use cellpos_plant::Model;
 use cellpos_reconcile::{Options, Reconciliation, Record, Verdict, reconcile};
@@ -17,15 +18,17 @@ pub struct Row {
     pub inside: BTreeSet<String>,
     /// The verdict.
     pub verdict: Verdict,
-    /// Closure of the gap on held-out records.
-    pub closure: f64,
+    /// Closure of the gap on held-out records; `None` where only frames are missing or repeated, which is no gap.
+    pub closure: Option<f64>,
     /// Alternatives of the named ones.
     pub alternatives: BTreeSet<String>,
     /// 95 % intervals of parameters whose equation is the catalogue's: those that hold the truth, and all.
     pub covered: (usize, usize),
+    /// Those that do not, in words.
+    pub missed: Vec<String>,
     /// Wall time of the search \[s\], one thread.
     pub seconds: f64,
-    /// How far the hidden effect lies above the threshold of detection, in parts of the amplitude that just reaches it.
+    /// How far the hidden effects lie above the threshold of detection: see [`above_threshold`].
     pub above_threshold: f64,
     /// 1 - RMS error of the augmented over that of the null model, noise-free, on a fresh excitation; singles only.
     pub fresh: Option<f64>,
@@ -75,7 +78,11 @@ pub fn evaluate(case: &Case, seed: u64) -> Result<Row, String> {
         .flat_map(|e| e.alternatives.iter().chain([&e.id]))
         .cloned()
         .collect();
-    let fresh = (case.group == "single" && !named.is_empty()).then(|| fresh(case, &result, seed));
+    let (covered, missed) = covered(case, &result);
+    let fresh = (case.group == "single"
+        && !named.is_empty()
+        && !named.iter().all(|n| n.starts_with("frame-")))
+    .then(|| fresh(case, &result, seed));
     Ok(Row {
         hidden,
         named,
@@ -87,17 +94,23 @@ pub fn evaluate(case: &Case, seed: u64) -> Result<Row, String> {
             .flat_map(|e| e.alternatives.iter())
             .cloned()
             .collect(),
-        covered: covered(case, &result),
+        covered,
+        missed,
         seconds,
-        above_threshold: above_threshold(&result),
-        closure: result.gap.closure(),
+        above_threshold: above_threshold(&case.hidden, seed),
+        closure: result
+            .effects
+            .iter()
+            .any(|e| !e.id.starts_with("frame-"))
+            .then(|| result.gap.closure()),
         fresh,
     })
 }
 
 /// Whether the intervals of named effects hold what was hidden, where both have the same equation.
-fn covered(case: &Case, result: &Reconciliation) -> (usize, usize) {
+fn covered(case: &Case, result: &Reconciliation) -> ((usize, usize), Vec<String>) {
     let (mut good, mut all) = (0, 0);
+    let mut missed = Vec::new();
     for h in &case.hidden {
         let Some(effect) = result.effects.iter().find(|e| e.id == h.id()) else {
             continue;
@@ -105,20 +118,18 @@ fn covered(case: &Case, result: &Reconciliation) -> (usize, usize) {
         for (name, value) in h.parameters() {
             if let Some(p) = effect.parameters.get(name) {
                 all += 1;
-                good += usize::from(p.ci95[0] <= value && value <= p.ci95[1]);
+                if p.ci95[0] <= value && value <= p.ci95[1] {
+                    good += 1;
+                } else {
+                    missed.push(format!(
+                        "{name} {value} not in {:.6}..{:.6}",
+                        p.ci95[0], p.ci95[1]
+                    ));
+                }
             }
         }
     }
-    (good, all)
-}
-
-/// Amplitude over that of the threshold: the excess of the sum of squares goes with the square of the amplitude.
-fn above_threshold(result: &Reconciliation) -> f64 {
-    let rows: usize = result.records.iter().map(|r| r.2).sum();
-    let g = &result.gap;
-    let excess = rows as f64 * (g.before * g.before / (g.floor * g.floor) - 1.0);
-    // What one parameter must gain to count: 1.3 times the chi-square quantile at 4.1 standard deviations.
-    (excess.max(0.0) / 22.0).sqrt()
+    ((good, all), missed)
 }
 
 /// Fall of the RMS error on an excitation that was never fitted: another multisine, noise-free.
