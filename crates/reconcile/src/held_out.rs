@@ -106,7 +106,10 @@ fn gain_shift(ctx: &Context<'_>, fit: &Fit) -> Interval {
     if ctx.free_gain {
         return Interval {
             value: fit.gain,
-            ci95: [fit.gain, fit.gain],
+            ci95: [
+                fit.gain - 1.96 * fit.errors[1],
+                fit.gain + 1.96 * fit.errors[1],
+            ],
             unit,
         };
     }

@@ -8,10 +8,13 @@
 //! Not for identifying a plant from nothing (that is `cellpos-ident`), and not for files: records come as columns.
 #![forbid(unsafe_code)]
 
+mod actuator;
+mod assemble;
 mod augment;
 mod catalogue;
 mod data;
 mod error;
+mod evaluate;
 mod fit;
 mod floor;
 mod frames;
@@ -29,9 +32,11 @@ mod report;
 mod result;
 mod screen;
 mod search;
+mod separate;
 mod significance;
 mod verdict;
 
+pub use actuator::constant_gain;
 pub use data::Record;
 pub use error::ReconcileError;
 pub use hypothesis::{Hypothesis, Term};
@@ -41,4 +46,4 @@ pub use report::report;
 pub use result::{
     BandGap, Effect, Gap, GapStep, Interval, Reconciliation, RecordGap, Trace, Traces, Verdict,
 };
-pub use verdict::{Options, constant_gain, reconcile};
+pub use verdict::{Options, reconcile};

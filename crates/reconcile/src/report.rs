@@ -176,7 +176,10 @@ fn gap(r: &mut Report, result: &Reconciliation) {
     let mut t = Table::new([Column::left("step"), Column::right("RMS innovation [nm]")]);
     for s in &g.steps {
         let name = if s.effects.is_empty() {
-            "null model".to_owned()
+            match s.base_gain {
+                Some(gain) => format!("null model, base gain free ({gain:.4})"),
+                None => "null model".to_owned(),
+            }
         } else {
             s.effects.join(" + ")
         };

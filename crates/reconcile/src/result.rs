@@ -72,6 +72,9 @@ pub struct GapStep {
     pub effects: Vec<String>,
     /// RMS innovation with that set.
     pub rms: f64,
+    /// The base model's gain, where it was free in that step: a factor, 1 as in the model.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub base_gain: Option<f64>,
 }
 
 /// The gap of one held-out record.
@@ -109,8 +112,10 @@ pub struct Gap {
     pub after: f64,
     /// Noise alone.
     pub floor: f64,
-    /// Unit and meaning.
+    /// Unit of all figures of the gap.
     pub unit: &'static str,
+    /// What they are.
+    pub quantity: &'static str,
     /// The search, step by step, on all records.
     pub steps: Vec<GapStep>,
     /// Record by record.
