@@ -1,13 +1,12 @@
 //! Cyclic motion: `--sine 5um@50Hz`, `--learn`, and the learned table of a run.
 
 use crate::outcome::Failure;
-use crate::rig_file::{CameraConfig, RigFile};
+use crate::rig_file::RigFile;
 use crate::setup::Prepared;
 use cellpos_control::design::{DesignPlant, Uncertainty, harmonic_responses};
 use cellpos_control::{
     CycleLearning, HarmonicResponse, LearnConfig, LearnedTable, Learner, Profile, Reference, Shape,
 };
-use cellpos_plant::{Effect, Model};
 use cellpos_units::{Hertz, Micrometers};
 use serde::{Deserialize, Serialize};
 use std::path::Path;
@@ -131,7 +130,7 @@ impl LearnSpec {
         let spec = Self {
             frequency_hz: wanted.frequency_hz,
             config: LearnConfig {
-                exposure_s: exposure_s(file, &setup.model),
+                exposure_s: setup.controller.estimator.exposure_ms * 1e-3,
                 ..LearnConfig::default()
             },
             responses,
@@ -151,22 +150,6 @@ impl LearnSpec {
         };
         Ok(CycleLearning::new(learner, state))
     }
-}
-
-/// How long a frame is exposed, s: as the rig file says, else as the model does; 0 where nobody does.
-fn exposure_s(file: &RigFile, model: &Model) -> f64 {
-    let of_camera = match &file.camera {
-        CameraConfig::Emulated {} => Some(file.emulator.exposure_ms * 1e-3),
-        CameraConfig::Industrial { exposure_us, .. } => exposure_us.map(|us| us * 1e-6),
-        CameraConfig::Socket { .. } => None,
-    };
-    let of_model = || {
-        model.effects.iter().find_map(|effect| match effect {
-            Effect::ExposureAveraging { exposure_s } => Some(*exposure_s),
-            _ => None,
-        })
-    };
-    of_camera.or_else(of_model).unwrap_or(0.0)
 }
 
 /// Reads a learned table.

@@ -1,11 +1,11 @@
 //! What every command that closes the loop does: connect and arm a rig, run, stop on signals, write the run's metadata.
 
 use crate::outcome::Failure;
-use crate::rig_file::{ClockKind, Frames, Rig, RigFile};
+use crate::rig_file::{CameraConfig, ClockKind, Frames, Rig, RigFile};
 use crate::setup::{self, AnyGuide, ReferenceSpec, Setup, SetupConfig};
 use cellpos_control::ControllerKind;
 use cellpos_control::design::bound_rms_um;
-use cellpos_plant::Model;
+use cellpos_plant::{Effect, Model};
 use cellpos_record::{InputFile, RunEnd, RunMeta, RunWriter};
 use cellpos_rig::actuator::Session;
 use cellpos_runtime::live::{Operator, Threads};
@@ -30,13 +30,18 @@ pub fn stop_on_signals(operator: &Arc<Operator>) -> Result<(), Failure> {
 }
 
 /// Narrows the controller's limits to what rig file and board allow, and the positions that MPC plans for to what the
-/// camera sees.
+/// camera sees; tells the estimator how long a frame is exposed.
 pub fn narrow(setup: &mut setup::Prepared, file: &RigFile, rig: &Rig) {
     let board = rig.actuator.info();
     let own = setup.controller.limits;
     let asked = setup::within(file.limits, [own.low_um, own.high_um, own.slew_um_per_s]);
     setup.controller.limits =
         setup::within(asked, [board.low_um, board.high_um, board.slew_um_per_s]);
+    let exposure_ms = 1e3 * exposure_s(file, &setup.model);
+    let estimator = &mut setup.controller.estimator;
+    if estimator.exposure_ms == 0.0 && exposure_ms <= file.timing.period_us * 1e-3 {
+        estimator.exposure_ms = exposure_ms;
+    }
     let [low_um, high_um] = rig.source.info().field_um;
     if setup.controller.controller == ControllerKind::Mpc && low_um < high_um {
         let mpc = &mut setup.controller.mpc;
@@ -44,6 +49,22 @@ pub fn narrow(setup: &mut setup::Prepared, file: &RigFile, rig: &Rig) {
         mpc.view_low_um = given(Some(mpc.view_low_um.map_or(low_um, |um| um.max(low_um))));
         mpc.view_high_um = given(Some(mpc.view_high_um.map_or(high_um, |um| um.min(high_um))));
     }
+}
+
+/// How long a frame is exposed, s: as the rig file says, else as the model does; 0 where nobody does.
+fn exposure_s(file: &RigFile, model: &Model) -> f64 {
+    let of_camera = match &file.camera {
+        CameraConfig::Emulated {} => Some(file.emulator.exposure_ms * 1e-3),
+        CameraConfig::Industrial { exposure_us, .. } => exposure_us.map(|us| us * 1e-6),
+        CameraConfig::Socket { .. } => None,
+    };
+    let of_model = || {
+        model.effects.iter().find_map(|effect| match effect {
+            Effect::ExposureAveraging { exposure_s } => Some(*exposure_s),
+            _ => None,
+        })
+    };
+    of_camera.or_else(of_model).unwrap_or(0.0)
 }
 
 /// Arms the board and completes the set-up with where it stands.

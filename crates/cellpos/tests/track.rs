@@ -312,6 +312,32 @@ fn the_example_files_load() {
 }
 
 #[test]
+fn previewed_sines_are_followed_within_1_5_times_the_hold_error_where_the_model_is_right() {
+    let folder = tempfile::tempdir().unwrap();
+    std::fs::write(
+        folder.path().join("rig.toml"),
+        "[emulator]\nlocalisation_um = 0.02\n",
+    )
+    .unwrap();
+    for controller in ["lqg", "mpc --solver active-set"] {
+        let rms = |sine: &str| {
+            let line = format!(
+                "--target 0um --controller {controller} --duration 4s --frames off --seed 5 --no-record --rig rig.toml {sine}"
+            );
+            number(&track(folder.path(), &line), "rms_true_nm")
+        };
+        let hold = rms("");
+        for sine in ["5um@50Hz", "5um@100Hz", "0.5um@300Hz"] {
+            let followed = rms(&format!("--sine {sine}"));
+            assert!(
+                followed <= 1.5 * hold,
+                "{controller}, {sine}: {followed} against {hold} nm"
+            );
+        }
+    }
+}
+
+#[test]
 fn a_sine_of_300_hz_is_learned_to_twice_the_hold_error_with_half_a_millisecond_of_exposure() {
     let folder = tempfile::tempdir().unwrap();
     model_with_gain(folder.path(), 1.2);

@@ -8,6 +8,7 @@
 //! Brownian motion drives `q` with variance `2 D Ts` per tick, neutral is a random walk, and a relative uncertainty of
 //! the gain widens the covariance in proportion to the motion it predicts.
 
+mod exposure;
 mod stuck;
 mod transition;
 
@@ -73,6 +74,8 @@ pub struct EstimatorConfig {
     pub neutral_initial_um: f64,
     /// Localisation noise assumed where a fix states none, um (standard deviation).
     pub fix_noise_um: f64,
+    /// Exposure of a frame, ms; at most a tick. A fix is the mean over it of a path that bends where a command takes effect.
+    pub exposure_ms: f64,
     /// An innovation larger than this many standard deviations is refused.
     pub gate_sigma: f64,
     /// ... unless it is smaller than this and the fastest motion of the last ticks, um.
@@ -93,6 +96,7 @@ impl Default for EstimatorConfig {
             gain_uncertainty: 0.2,
             neutral_initial_um: 2.0,
             fix_noise_um: 0.020,
+            exposure_ms: 0.0,
             gate_sigma: 6.0,
             gate_floor_um: 0.5,
             gate_most: 10,
@@ -217,6 +221,13 @@ impl Estimator {
             c.fix_noise_um,
             c.fix_noise_um > 0.0,
             "positive",
+        )?;
+        check(
+            "exposure_ms",
+            "ms",
+            c.exposure_ms,
+            (0.0..=1e3 * model.sample_time_s).contains(&c.exposure_ms),
+            "0 to a tick",
         )?;
         check(
             "gate_sigma",
@@ -473,7 +484,12 @@ impl Estimator {
         } else {
             part.advance(&from, command)
         };
-        let predicted = self.position(&at);
+        let bend_um = if state.stuck {
+            0.0
+        } else {
+            Self::command(state, back) - Self::command(state, back + 1)
+        };
+        let predicted = self.position(&at) + self.exposed_um(part.fraction, bend_um);
         let innovation = fix.position_um - predicted;
         if !state.seen {
             self.place(state, innovation, fix.variance_um2);

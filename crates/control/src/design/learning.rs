@@ -136,6 +136,8 @@ pub fn harmonic_responses(
 ) -> Result<Vec<HarmonicResponse>, SetUpError> {
     let ts = plant.sample_time_s;
     let mut config = *config;
+    // The simulated rig sees points of the path.
+    config.estimator.exposure_ms = 0.0;
     if let ControllerConfig::Mpc(mpc, _) = &mut config.controller {
         // Both solvers give the same law; this one takes a tenth of the time.
         mpc.solver = SolverKind::ActiveSet;
