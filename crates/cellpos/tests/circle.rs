@@ -206,3 +206,21 @@ fn arguments_that_contradict_each_other_end_with_code_2_and_a_sentence() {
         assert!(err.contains(says), "{line}\n{}", ran.err);
     }
 }
+
+#[test]
+fn a_run_of_track_is_data_wherever_its_bead_rested() {
+    let folder = tempfile::tempdir().unwrap();
+    let track = "track --target 0um --sine 3um@10Hz --duration 10s --clock virtual --frames off --seed 2 --json";
+    let run = succeed(folder.path(), track).json();
+    // Neutral is at 20 um on the emulated rig; the model was made at 4 um.
+    let line = format!(
+        "reconcile --model eq6 --data {} --max-effects 1 --json --out a.toml",
+        run["run"].as_str().unwrap()
+    );
+    let ran = succeed(folder.path(), &line);
+    let delay = named(&ran.json(), "time-delay")["parameters"]["delay_s"].clone();
+    assert!((number(&delay, "value") - 2e-3).abs() < 0.15e-3, "{delay}");
+    assert!(ran.err.contains("rested at"), "{}", ran.err);
+    let augmented = Model::load_file(&folder.path().join("a.toml")).unwrap();
+    assert!((augmented.working_point_um - 20.0).abs() < 0.05);
+}

@@ -9,6 +9,7 @@ use crate::rig_file::{ClockKind, Frames, RigFile};
 use cellpos_plant::{Model, Noise, TransferFunction};
 use cellpos_reconcile::{Options, ReconcileError, Reconciliation, Record, Verdict, reconcile};
 use cellpos_record::RunReader;
+use cellpos_runtime::{Life, TickFlags};
 use cellpos_table::{ColumnRef, Table};
 use collect::{Collected, Collecting};
 use std::path::{Path, PathBuf};
@@ -98,8 +99,12 @@ pub fn run(args: Args) -> CommandResult {
     collectable(&args)?;
     let files = files(&args.data)?;
     let mut records = Vec::new();
+    let mut rests_um = Vec::new();
     for file in &files {
         records.push(read(file, &args)?);
+        if is_run(file) {
+            rests_um.extend(rest_of_run_um(file)?);
+        }
     }
     let threads = args
         .threads
@@ -115,7 +120,9 @@ pub fn run(args: Args) -> CommandResult {
         options.free_gain = true;
         fitted(&records)?
     } else {
-        Model::load(&args.model).map_err(Failure::input)?
+        let mut model = Model::load(&args.model).map_err(Failure::input)?;
+        at_rest_of_runs(&mut model, &records, &rests_um);
+        model
     };
     let bar = indicatif::ProgressBar::new_spinner();
     let mut progress = |text: &str| {
@@ -403,6 +410,37 @@ fn read_run(path: &Path, name: &str) -> Result<Record, Failure> {
         .map(|k| record.start_s + k as f64 * record.step_s)
         .collect();
     Record::from_rows(name, &time_s, &record.pzt_um, &record.bead_um).map_err(refused)
+}
+
+/// Where the bead of a closed loop rested: the mean of what was commanded while the loop ran, um.
+fn rest_of_run_um(path: &Path) -> Result<Option<f64>, Failure> {
+    let run = RunReader::open(path).map_err(Failure::input)?;
+    let (ticks, _) = run.ticks().map_err(Failure::input)?;
+    let held = ticks.iter().filter(|t| {
+        t.life == Life::Running as u8 && !t.flags.has(TickFlags::FREEZE) && t.command_um.is_finite()
+    });
+    let (sum_um, count) = held.fold((0.0, 0_usize), |(s, n), t| (s + t.command_um, n + 1));
+    // Ten seconds of a held bead move it by less than 10 um: 2 nm of PZT.
+    Ok((count >= 1000).then(|| sum_um / count as f64))
+}
+
+/// Runs hold a bead wherever its rest is, and that is another place every day: where no record comes near the model's
+/// working point, the runs' own is taken.
+fn at_rest_of_runs(model: &mut Model, records: &[Record], rests_um: &[f64]) {
+    let inside = records.iter().any(|r| {
+        let (low, high) = r.pzt_range_um();
+        (low..=high).contains(&model.working_point_um)
+    });
+    if inside || rests_um.is_empty() {
+        return;
+    }
+    let rest_um = rests_um.iter().sum::<f64>() / rests_um.len() as f64;
+    tracing::warn!(
+        "the model's working point, {} um, lies outside what was commanded: the bead of these runs rested at {rest_um:.3} um, \
+         which is taken instead",
+        model.working_point_um
+    );
+    model.working_point_um = rest_um;
 }
 
 /// A base model for data without one: a constant gain about the command before the records began.

@@ -15,9 +15,9 @@ use std::f64::consts::{PI, TAU};
 const LOW_HZ: f64 = 1.0;
 const HIGH_HZ: f64 = 450.0;
 const LINES: usize = 36;
-/// Amplitude of the bead, and the most of the PZT's, um: what holding against Brownian motion and drift takes.
-const BEAD_UM: f64 = 0.3;
-const PZT_UM: f64 = 0.3;
+/// Amplitudes of the bead, and the most of the PZT's, um. The first is what holding against Brownian motion and drift takes;
+/// where a dead zone leaves nothing of that, the next.
+pub const AMPLITUDES_UM: [f64; 3] = [0.3, 1.0, 3.0];
 
 /// Bead over command as a record shows it, delay and hold included.
 #[derive(Debug, Clone, PartialEq)]
@@ -29,8 +29,8 @@ pub struct Response {
 }
 
 impl Response {
-    /// The response of a model to sines of the size of holding.
-    pub fn of(model: &Model, sample_s: f64) -> Result<Self, Failure> {
+    /// The response of a model to sines that move the bead by `amplitude_um`, or the PZT where that is less.
+    pub fn of(model: &Model, amplitude_um: f64, sample_s: f64) -> Result<Self, Failure> {
         let mut response = Self {
             hz: Vec::with_capacity(LINES),
             value: Vec::with_capacity(LINES),
@@ -41,12 +41,10 @@ impl Response {
             let periods = (wanted_hz * 0.4).ceil().max(2.0);
             let rows = (periods / (wanted_hz * sample_s)).round() as usize;
             let hz = periods / (rows as f64 * sample_s);
-            let amplitude_um = (BEAD_UM / model.linear_response(Hertz(hz)).norm()).min(PZT_UM);
+            let pzt_um = amplitude_um / model.linear_response(Hertz(hz)).norm().max(1.0);
             let settle = (0.3 / sample_s) as usize / rows * rows + rows;
             let command_um: Vec<f64> = (0..settle + rows)
-                .map(|k| {
-                    model.working_point_um + amplitude_um * (TAU * hz * k as f64 * sample_s).sin()
-                })
+                .map(|k| model.working_point_um + pzt_um * (TAU * hz * k as f64 * sample_s).sin())
                 .collect();
             let bead_um = simulate(model, &command_um, sample_s, &SimulateOptions::default())
                 .map_err(Failure::input)?;
@@ -187,7 +185,7 @@ mod tests {
     #[test]
     fn a_linear_model_has_the_margins_of_its_transfer_function() {
         for delay_s in [2e-3, 3.3e-3] {
-            let simulated = Response::of(&with_delay(delay_s), 1e-3).unwrap();
+            let simulated = Response::of(&with_delay(delay_s), 0.3, 1e-3).unwrap();
             let m = margins(&simulated, &law(), 1e-3, true).unwrap();
             let e = exact(&DesignPlant::eq6(delay_s + 0.5e-3), &law()).unwrap();
             let near = |a: f64, b: f64| assert!((a / b - 1.0).abs() < 0.02, "{a} {b}: {m:?} {e:?}");
@@ -209,7 +207,7 @@ mod tests {
             quadratic_per_um: 0.0,
         });
         let at = |model: &Model| {
-            let simulated = Response::of(model, 1e-3).unwrap();
+            let simulated = Response::of(model, 0.3, 1e-3).unwrap();
             margins(&simulated, &law(), 1e-3, true).unwrap()
         };
         let without = at(&with_delay(2e-3));

@@ -101,6 +101,8 @@ pub(crate) struct Circle {
     /// The rig's own model with the delay that its frames had; emulated rigs only.
     truth: Option<Model>,
     motion: Motion,
+    /// Sample time of the loop, s.
+    sample_s: f64,
 }
 
 /// Runs the command.
@@ -291,6 +293,7 @@ fn close(
         stages,
         truth,
         motion,
+        sample_s: file.timing.period_us * 1e-6,
     })
 }
 

@@ -1,7 +1,7 @@
 //! The circle on one page: what was found, margins predicted and true, tracking errors, before and after.
 
 use super::Circle;
-use super::margins::{LoopMargins, Response};
+use super::margins::{AMPLITUDES_UM, LoopMargins, Response};
 use super::stage::{Stage, Tracked};
 use cellpos_report::{Axis, Column, Figure, Panel, Report, Series, Status, Table};
 use std::path::Path;
@@ -99,7 +99,7 @@ fn bode(circle: &Circle) -> Figure {
     if let Some(response) = circle
         .truth
         .as_ref()
-        .and_then(|truth| Response::of(truth, 1e-3).ok())
+        .and_then(|truth| Response::of(truth, AMPLITUDES_UM[0], circle.sample_s).ok())
     {
         add("the rig", &response, circle.stages.len());
     }
@@ -218,7 +218,8 @@ pub fn report(circle: &Circle, gap: &Path) -> Report {
     r.section("Margins, predicted and true");
     r.paragraph(
         "A controller is designed on each model. Predicted: on that model. True: the same controller on the rig's own model, \
-         with the delay that its frames had. Both for motion of the size of holding, nonlinear effects included.",
+         with the delay that its frames had. Both for motion of the size of holding, nonlinear effects included; where a dead zone \
+         swallows such motion, for the next larger that has a crossover.",
     );
     r.table(margins_table(circle));
     for s in &circle.stages {
@@ -288,6 +289,12 @@ fn margins_table(circle: &Circle) -> Table {
         }
         t.row(cells);
     }
+    let mut cells = vec!["for bead motion of".to_owned()];
+    for s in &circle.stages {
+        cells.push(format!("{} um", s.margins_at_um));
+        cells.push(String::new());
+    }
+    t.row(cells);
     t
 }
 

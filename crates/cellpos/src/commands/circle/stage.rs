@@ -1,6 +1,6 @@
 //! One step of the circle: a controller designed on a model, its margins there and on the truth, and a run with it.
 
-use super::margins::{LoopMargins, Response, margins};
+use super::margins::{AMPLITUDES_UM, LoopMargins, Response, margins};
 use crate::commands::identify::on_rig::OnRig;
 use crate::outcome::Failure;
 use crate::session;
@@ -50,6 +50,8 @@ pub struct Stage {
     pub kp_um_per_um: Option<f64>,
     /// Integral gain of a PI, 1/s.
     pub ki_per_s: Option<f64>,
+    /// Amplitude of the motion that margins are given for, um.
+    pub margins_at_um: f64,
     /// Margins on the model that it was designed on.
     pub predicted: Option<LoopMargins>,
     /// Margins on the truth; emulated rigs only.
@@ -82,7 +84,7 @@ pub fn with_delay(mut model: Model, delay_s: f64) -> Model {
 }
 
 /// The linear model that a controller can be designed on: effects without a transfer function give way to the gain that
-/// they leave to small motion.
+/// they leave to motion, the largest from the size of holding to ten times that, so that no dead zone asks for more gain.
 fn designable(model: &Model, sample_s: f64) -> Result<Model, Failure> {
     /// Where the two are compared, Hz: about the crossover of a loop with these delays.
     const AT_HZ: f64 = 20.0;
@@ -108,16 +110,21 @@ fn designable(model: &Model, sample_s: f64) -> Result<Model, Failure> {
     if linear.effects.len() == model.effects.len() {
         return Ok(linear);
     }
-    let gain = |m: &Model| -> Result<f64, Failure> {
-        let response = Response::of(m, sample_s)?;
+    let gain = |m: &Model, amplitude_um: f64| -> Result<f64, Failure> {
+        let response = Response::of(m, amplitude_um, sample_s)?;
         let nearest = (0..response.hz.len()).min_by(|&i, &j| {
             let off = |k: usize| (response.hz[k] / AT_HZ).ln().abs();
             off(i).total_cmp(&off(j))
         });
         Ok(nearest.map_or(f64::NAN, |i| response.value[i].norm()))
     };
-    let factor = gain(model)? / gain(&linear)?;
-    if factor.is_finite() && factor > 0.0 {
+    let mut factor = 0.0_f64;
+    for amplitude_um in AMPLITUDES_UM {
+        factor = factor.max(gain(model, amplitude_um)? / gain(&linear, amplitude_um)?);
+    }
+    if factor.is_finite() {
+        // The gain that a loop must stand anyway.
+        let factor = factor.clamp(0.5, 2.0);
         linear.plant = linear.plant.scaled(factor).map_err(Failure::input)?;
     }
     Ok(linear)
@@ -141,13 +148,14 @@ pub fn run(
         camera_delay_ms: delay_ms,
         ..rig.file.timing
     };
-    let response = Response::of(&model, sample_s)?;
+    let response = Response::of(&model, AMPLITUDES_UM[0], sample_s)?;
     let mut stage = Stage {
         name,
         effects: model.ordered_effects().iter().map(|e| e.id()).collect(),
         delay_ms,
         kp_um_per_um: None,
         ki_per_s: None,
+        margins_at_um: AMPLITUDES_UM[0],
         predicted: None,
         real: None,
         hold: None,
@@ -168,9 +176,15 @@ pub fn run(
         stage.kp_um_per_um = Some(prepared.controller.pi.kp_um_per_um);
         stage.ki_per_s = Some(prepared.controller.pi.ki_per_s);
     }
-    stage.predicted = weighed(&model, &stage.response, &law, sample_s)?;
-    if let Some(truth) = truth {
-        stage.real = weighed(truth, &Response::of(truth, sample_s)?, &law, sample_s)?;
+    for amplitude_um in AMPLITUDES_UM {
+        let at = |model: &Model| weighed(model, amplitude_um, &law, sample_s);
+        stage.margins_at_um = amplitude_um;
+        stage.predicted = at(&model)?;
+        stage.real = truth.map(at).transpose()?.flatten();
+        // A dead zone has no crossover at motion that it swallows.
+        if stage.predicted.is_some() && (truth.is_none() || stage.real.is_some()) {
+            break;
+        }
     }
     let hold = ReferenceSpec::Hold { position_um: 0.0 };
     let sine = ReferenceSpec::Sine {
@@ -188,14 +202,15 @@ pub fn run(
 /// Margins of a law on a model, by its response.
 fn weighed(
     model: &Model,
-    response: &Response,
+    amplitude_um: f64,
     law: &LinearLaw,
     sample_s: f64,
 ) -> Result<Option<LoopMargins>, Failure> {
     let linear = designable(model, sample_s)?;
     let plant = DesignPlant::from_model(&linear, None, sample_s).map_err(Failure::input)?;
     let exact = cellpos_control::design::margins(&plant, law).map_err(Failure::input)?;
-    Ok(margins(response, law, sample_s, exact.stable))
+    let response = Response::of(model, amplitude_um, sample_s)?;
+    Ok(margins(&response, law, sample_s, exact.stable))
 }
 
 fn designed(
