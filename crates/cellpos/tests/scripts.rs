@@ -127,6 +127,18 @@ fn what_the_rig_cannot_do_is_refused_before_anything_moves() {
         out.contains("wild.toml:1: PZT range") && out.contains("scale all positions by 0."),
         "{out}"
     );
+    // A rig with less room allows less, and what is said on the command line counts more.
+    let narrow = "first_neutral_um = 10.0\n[limits]\nlow_um = 0.0\nhigh_um = 20.0\nslew_um_per_s = 20000.0\npark_um = 10.0\n";
+    std::fs::write(folder.path().join("narrow.toml"), narrow).unwrap();
+    let largest = |extra: &[&str]| {
+        let args = [&["check", "wild.toml", "--json"], extra].concat();
+        let (_, out, _) = cellpos(folder.path(), &args);
+        let check: Value = serde_json::from_str(&out).unwrap();
+        check["waves"][0]["largest_um"].as_f64().unwrap()
+    };
+    let wide = largest(&["--slew", "1000000um/s"]);
+    let narrow = largest(&["--rig", "narrow.toml", "--slew", "1000000um/s"]);
+    assert!((narrow / wide - 0.5).abs() < 1e-6, "{narrow} {wide}");
     let (code, _, err) = cellpos(folder.path(), &["run", "wild.toml", "--dry"]);
     assert_eq!(code, Some(2));
     assert!(err.contains("the rig cannot do it"), "{err}");
@@ -343,4 +355,35 @@ fn a_script_stops_when_the_amplitude_is_not_reached() {
     assert!((10..30).contains(&done), "{done}");
     let events = std::fs::read_to_string(only_run(folder.path()).join("events.jsonl")).unwrap();
     assert!(events.contains("amplitude-stop") && events.contains("freeze-started"));
+}
+
+#[test]
+fn a_run_whose_table_is_damaged_is_not_gone_on_with_and_a_torn_last_line_is_no_damage() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    script(at, 40);
+    json(at, &["run", "quick.toml", "--dry", "--json"]);
+    let run = only_run(at);
+    let meta = std::fs::read_to_string(run.join("run.toml")).unwrap();
+    std::fs::write(run.join("run.toml"), &meta[..meta.find("[end]").unwrap()]).unwrap();
+    let table = std::fs::read_to_string(run.join("cycles.csv")).unwrap();
+    let name = run.to_str().unwrap();
+    std::fs::write(run.join("cycles.csv"), format!("{table}what is this\n")).unwrap();
+    let (code, _, err) = cellpos(at, &["run", "--resume", name]);
+    assert_eq!(code, Some(2), "{err}");
+    assert!(err.contains("was it changed"), "{err}");
+    // Cut off in the middle of its twentieth row.
+    let end = table.match_indices('\n').nth(19).unwrap().0 + 30;
+    std::fs::write(run.join("cycles.csv"), &table[..end]).unwrap();
+    json(at, &["run", "--resume", name, "--json"]);
+    assert_eq!(numbers(&run, "cycle"), (0..40).collect::<Vec<u64>>());
+    let sessions = numbers(&run, "session");
+    assert_eq!((sessions[18], sessions[19]), (1, 2));
+    let report = json(at, &["report", name, "--json"]);
+    assert_eq!(
+        (&report["sessions"], &report["cycles"]),
+        (&2.into(), &40.into())
+    );
+    let page = std::fs::read_to_string(run.join("report.html")).unwrap();
+    assert!(page.contains("The last of 2 sessions came to its end"));
 }

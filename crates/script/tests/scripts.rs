@@ -324,6 +324,18 @@ fn too_much_is_refused_with_the_largest_amplitude_that_would_do() {
 }
 
 #[test]
+fn a_night_of_holding_is_checked_without_going_through_its_ticks() {
+    let text = "[[step]]\ndo = \"hold\"\nlabel = \"long\"\nduration = \"200h\"\n[[step]]\ndo = \"move\"\nto = \"5um\"\nduration = \"1s\"\n\
+                [[step]]\ndo = \"static\"\nlike = \"long\"\n[[step]]\ndo = \"sine\"\namplitude = \"1um\"\nfrequency = \"1mHz\"\ncycles = 20\n";
+    let script = Script::parse(text, "t.toml").unwrap();
+    let check = check(&script, &Model::eq6(), &CheckLimits::default()).unwrap();
+    assert!(check.violations.is_empty());
+    assert!((check.duration_s - (400.0 * 3600.0 + 1.0 + 20_000.0)).abs() < 1e-6);
+    assert!(check.time_s.len() < 7_000_000);
+    assert_eq!(check.position_um, (0.0, 6.0));
+}
+
+#[test]
 fn ten_thousand_cycles_are_each_there_once() {
     let plan = plan(
         "[[step]]\ndo = \"sine\"\namplitude = \"1um\"\nfrequency = \"10Hz\"\ncycles = 10000\n",

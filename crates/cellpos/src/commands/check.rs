@@ -1,6 +1,8 @@
 //! `cellpos check`: a setpoint script against a model and the rig's limits, before anything moves.
 
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
+use crate::rig_file::RigFile;
+use crate::setup;
 use cellpos_plant::Model;
 use cellpos_report::{Axis, Column, Figure, Panel, Report, Series, Status, Table};
 use cellpos_script::{Check, CheckLimits, Script, check};
@@ -19,21 +21,24 @@ pub struct Args {
     /// `eq6`, or a model file.
     #[arg(long, default_value = "eq6")]
     model: String,
-    /// Smallest PZT displacement.
-    #[arg(long, default_value = "0um", allow_hyphen_values = true)]
-    low: Micrometers,
-    /// Largest PZT displacement.
-    #[arg(long, default_value = "40um")]
-    high: Micrometers,
-    /// PZT displacement at which the bead rests.
-    #[arg(long, default_value = "20um", allow_hyphen_values = true)]
-    neutral: Micrometers,
-    /// Largest speed of the PZT.
-    #[arg(long, default_value = "10000um/s")]
-    slew: MicrometersPerSecond,
-    /// Half of the field of view along the channel.
-    #[arg(long, default_value = "50um")]
-    view: Micrometers,
+    /// The rig whose limits hold; left out: 0um to 40um, the bead at rest at 20um, 10000um/s, a view of 50um to either side.
+    #[arg(long)]
+    rig: Option<PathBuf>,
+    /// Smallest PZT displacement, instead of the rig's.
+    #[arg(long, allow_hyphen_values = true)]
+    low: Option<Micrometers>,
+    /// Largest PZT displacement, instead of the rig's.
+    #[arg(long)]
+    high: Option<Micrometers>,
+    /// PZT displacement at which the bead rests, instead of the rig's.
+    #[arg(long, allow_hyphen_values = true)]
+    neutral: Option<Micrometers>,
+    /// Largest speed of the PZT, instead of the rig's.
+    #[arg(long)]
+    slew: Option<MicrometersPerSecond>,
+    /// Half of the field of view along the channel; that of a camera is not in its file.
+    #[arg(long)]
+    view: Option<Micrometers>,
     /// Writes the reference and the PZT demand as a report (HTML, figures beside it).
     #[arg(long)]
     report: Option<PathBuf>,
@@ -46,14 +51,7 @@ pub struct Args {
 pub fn run(args: Args) -> CommandResult {
     let script = Script::read(&args.script).map_err(Failure::input)?;
     let model = Model::load(&args.model).map_err(Failure::input)?;
-    let limits = CheckLimits {
-        low_um: args.low.value(),
-        high_um: args.high.value(),
-        neutral_um: args.neutral.value(),
-        slew_um_per_s: args.slew.value(),
-        view_um: args.view.value(),
-        ..CheckLimits::default()
-    };
+    let limits = limits(&args)?;
     let result = check(&script, &model, &limits).map_err(Failure::input)?;
     if let Some(path) = &args.report {
         report(&script, &result, &limits)
@@ -72,9 +70,44 @@ pub fn run(args: Args) -> CommandResult {
     })
 }
 
+/// The limits of the rig, and what is said instead of them.
+fn limits(args: &Args) -> Result<CheckLimits, Failure> {
+    let mut limits = CheckLimits::default();
+    if let Some(path) = &args.rig {
+        let file = RigFile::load(Some(path))?;
+        let rig = setup::within(
+            file.limits,
+            [limits.low_um, limits.high_um, limits.slew_um_per_s],
+        );
+        limits.low_um = rig.low_um;
+        limits.high_um = rig.high_um;
+        limits.slew_um_per_s = rig.slew_um_per_s;
+        limits.neutral_um = file.first_neutral_um;
+        limits.sample_s = file.timing.period_us * 1e-6;
+        if file.is_emulated() {
+            let world = &file.emulator;
+            limits.view_um = 0.5 * f64::from(world.width_px) * world.pixel_um;
+        }
+    }
+    let instead = |value: &mut f64, said: Option<f64>| {
+        if let Some(said) = said {
+            *value = said;
+        }
+    };
+    instead(&mut limits.low_um, args.low.map(Micrometers::value));
+    instead(&mut limits.high_um, args.high.map(Micrometers::value));
+    instead(&mut limits.neutral_um, args.neutral.map(Micrometers::value));
+    let slew = args.slew.map(MicrometersPerSecond::value);
+    instead(&mut limits.slew_um_per_s, slew);
+    instead(&mut limits.view_um, args.view.map(Micrometers::value));
+    Ok(limits)
+}
+
 /// Figures of a check as names and values.
 fn figures(check: &Check) -> Vec<(&'static str, String)> {
-    let range = |(low, high): (f64, f64)| format!("{low:.3} .. {high:.3}");
+    // Rounded first, so that a rounding error below zero does not read as -0.000.
+    let shown = |value: f64| (value * 1e3).round() / 1e3 + 0.0;
+    let range = |(low, high): (f64, f64)| format!("{:.3} .. {:.3}", shown(low), shown(high));
     vec![
         (
             "duration without waits (s)",

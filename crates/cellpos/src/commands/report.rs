@@ -8,7 +8,7 @@ mod ticks;
 use super::replay;
 use super::run::{learning, resume};
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
-use cellpos_record::{CYCLES_CSV, Lost, RunMeta, RunReader};
+use cellpos_record::{CYCLES_CSV, Lost, RunEnd, RunMeta, RunReader};
 use cellpos_report::{Axis, Column, Figure, Panel, Report, Series, Status, Table};
 use cellpos_script::read_cycles;
 use std::collections::BTreeMap;
@@ -116,36 +116,48 @@ fn nm(um: Option<f64>) -> String {
     um.map_or_else(|| "-".to_string(), |um| format!("{:.1}", um * 1e3))
 }
 
+/// How a session ended.
+fn ending(session: &Session) -> (Status, String) {
+    match session.meta.as_ref().and_then(|meta| meta.end.as_ref()) {
+        Some(end) if end.outcome == "done" => (Status::Good, "came to its end".to_string()),
+        Some(end) => (Status::Warning, format!("ended: {}", end.outcome)),
+        None => (
+            Status::Bad,
+            "was cut off: it reads up to its last flush".to_string(),
+        ),
+    }
+}
+
 fn head(page: &mut Report, sessions: &[Session], ticks: &Ticks) {
-    for (number, session) in (1..).zip(sessions) {
-        let end = session.meta.as_ref().and_then(|meta| meta.end.as_ref());
-        let (status, text) = match end {
-            Some(end) if end.outcome == "done" => (Status::Good, "came to its end".to_string()),
-            Some(end) => (Status::Warning, format!("ended: {}", end.outcome)),
-            None => (
-                Status::Bad,
-                "was cut off: it reads up to its last flush".to_string(),
-            ),
+    if let Some(last) = sessions.last() {
+        let (status, text) = ending(last);
+        let text = match sessions.len() {
+            1 => format!("The run {text}."),
+            many => format!("The last of {many} sessions {text}."),
         };
-        page.note(status, &format!("Session {number} {text}."));
-        if session.lost.rows > 0 || session.lost.damaged_bytes > 0 {
-            page.note(
-                Status::Warning,
-                &format!(
-                    "Session {number}: {} rows are missing, {} bytes damaged.",
-                    session.lost.rows, session.lost.damaged_bytes
-                ),
-            );
-        }
-        if let Some(end) = end.filter(|end| end.rows_lost + end.events_lost > 0) {
-            page.note(
-                Status::Warning,
-                &format!(
-                    "Session {number}: {} rows and {} events could not be written.",
-                    end.rows_lost, end.events_lost
-                ),
-            );
-        }
+        page.note(status, &text);
+    }
+    let end = |session: &Session| session.meta.as_ref()?.end.clone();
+    let missing: u64 = sessions.iter().map(|session| session.lost.rows).sum();
+    let damaged: u64 = sessions
+        .iter()
+        .map(|session| session.lost.damaged_bytes)
+        .sum();
+    if missing + damaged > 0 {
+        let text = format!("{missing} rows are missing, {damaged} bytes damaged.");
+        page.note(Status::Warning, &text);
+    }
+    let unwritten = |of: fn(&RunEnd) -> u64| {
+        let ends = sessions.iter().filter_map(end);
+        ends.map(|end| of(&end)).sum::<u64>()
+    };
+    let (rows, events) = (
+        unwritten(|end| end.rows_lost),
+        unwritten(|end| end.events_lost),
+    );
+    if rows + events > 0 {
+        let text = format!("{rows} rows and {events} events could not be written.");
+        page.note(Status::Warning, &text);
     }
     let rows = [
         ("ticks", ticks.rows.to_string()),
@@ -157,6 +169,23 @@ fn head(page: &mut Report, sessions: &[Session], ticks: &Ticks) {
     let mut table = Table::key_values(&rows);
     table.caption("Errors: measured position less the reference of the time of its exposure.");
     page.table(table);
+    if sessions.len() > 1 {
+        let mut table = Table::new([
+            Column::right("session"),
+            Column::right("start (s)"),
+            Column::right("rows missing"),
+            Column::left("how it ended"),
+        ]);
+        for (number, session) in (1u64..).zip(sessions) {
+            table.row([
+                number.to_string().as_str(),
+                &format!("{:.3}", session.start_s),
+                &session.lost.rows.to_string(),
+                &ending(session).1,
+            ]);
+        }
+        page.table(table);
+    }
 }
 
 fn traces(page: &mut Report, ticks: &Ticks) {
@@ -297,7 +326,7 @@ fn timing(page: &mut Report, sessions: &[Session], ticks: &Ticks) {
                 ),
         );
     }
-    for (number, session) in (1..).zip(sessions) {
+    for (number, session) in ends(sessions) {
         let end = session.meta.as_ref().and_then(|meta| meta.end.as_ref());
         if let Some(end) = end.filter(|end| !end.summary.is_empty()) {
             page.subsection(&format!("Figures of session {number}"));
@@ -357,7 +386,7 @@ fn provenance(page: &mut Report, sessions: &[Session]) {
         table.row([input.path.as_str(), &input.bytes.to_string(), &input.sha256]);
     }
     page.table(table);
-    for session in sessions {
+    for (_, session) in ends(sessions) {
         page.subsection(&folder_name(&session.folder));
         let path = session.folder.join(cellpos_record::RUN_TOML);
         match std::fs::read_to_string(&path) {
@@ -365,6 +394,13 @@ fn provenance(page: &mut Report, sessions: &[Session]) {
             Err(error) => page.note(Status::Bad, &format!("{}: {error}", path.display())),
         };
     }
+}
+
+/// The sessions that are shown in full, with their numbers: the first and the last.
+fn ends(sessions: &[Session]) -> impl Iterator<Item = (usize, &Session)> {
+    let last = sessions.len();
+    let shown = move |(number, _): &(usize, &Session)| *number == 1 || *number == last;
+    (1..).zip(sessions).filter(shown)
 }
 
 fn folder_name(folder: &Path) -> String {

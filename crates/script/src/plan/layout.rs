@@ -10,6 +10,8 @@ use std::ops::Range;
 const MAX_SEGMENTS: usize = 2_000_000;
 /// Longest plan, s: thirty days.
 const MAX_S: f64 = 30.0 * 86_400.0;
+/// Longest hold of a shortened plan, s.
+const SHORT_HOLD_S: f64 = 20.0;
 
 /// What is known of a labelled step.
 #[derive(Debug, Clone, Copy)]
@@ -129,6 +131,12 @@ impl Layout<'_> {
     }
 
     fn hold(&mut self, step: &Step, duration_s: f64) -> Result<(), ScriptError> {
+        // A hold asks for nothing new after a while.
+        let duration_s = if self.short {
+            duration_s.min(SHORT_HOLD_S)
+        } else {
+            duration_s
+        };
         let at = self.at_um;
         self.push(step, Motion::Hold, duration_s, at, (at, at))
     }

@@ -141,7 +141,7 @@ impl Plan {
         Self::lay_out(script, false)
     }
 
-    /// With at most three passes of each repeat and six cycles at full amplitude of each wave: it asks the same of the
+    /// With at most three passes of each repeat, six cycles at full amplitude of each wave, and short holds: it asks the same of the
     /// rig and is quick to go through.
     pub(crate) fn shortened(script: &Script) -> Result<Self, ScriptError> {
         Self::lay_out(script, true)

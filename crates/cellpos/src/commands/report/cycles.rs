@@ -73,15 +73,18 @@ const QUANTITIES: [Quantity; 9] = [
 
 /// Adds the section; gives the trends as they go into the JSON.
 pub fn section(page: &mut Report, rows: &[CycleRow], unreadable: usize) -> serde_json::Value {
-    if rows.is_empty() {
+    if rows.is_empty() && unreadable == 0 {
         return serde_json::Value::Null;
     }
     page.section("Cycles");
     if unreadable > 0 {
         page.note(
             Status::Warning,
-            &format!("{unreadable} lines of cycles.csv are no rows."),
+            &format!("{unreadable} lines of cycles.csv are no rows, or of another version."),
         );
+    }
+    if rows.is_empty() {
+        return serde_json::Value::Null;
     }
     let disturbed = rows.iter().filter(|row| row.flags.is_disturbed()).count();
     page.paragraph(&format!(

@@ -11,16 +11,28 @@ use cellpos_record::{
 use cellpos_script::{ArmKind, CycleRow, read_cycles};
 use std::path::{Path, PathBuf};
 
-/// The acknowledged cycles of a run.
+/// The acknowledged cycles of a run; none where it was cut off before it had a table.
 pub fn cycles(folder: &Path) -> Result<Vec<CycleRow>, Failure> {
     let path = folder.join(CYCLES_CSV);
-    let text = std::fs::read_to_string(&path).map_err(|error| {
-        Failure::bad_input(
-            format!("{}: {error}", path.display()),
-            "give the folder of a run of cellpos run",
-        )
-    })?;
-    let (rows, _) = read_cycles(&text);
+    let text = match std::fs::read_to_string(&path) {
+        Ok(text) => text,
+        Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(Vec::new()),
+        Err(error) => {
+            return Err(Failure::bad_input(
+                format!("{}: {error}", path.display()),
+                "give the folder of a run of cellpos run",
+            ));
+        }
+    };
+    let whole = cellpos_record::whole_text(&text);
+    let (rows, unreadable) = read_cycles(whole);
+    if unreadable > 0 {
+        // Going on from fewer rows than there are would do cycles twice.
+        return Err(Failure::bad_input(
+            format!("{}: {unreadable} lines are no rows", path.display()),
+            "was it changed, or written by another version? put it right, or begin a new run",
+        ));
+    }
     Ok(rows)
 }
 
