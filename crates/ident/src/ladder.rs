@@ -513,7 +513,9 @@ impl<'a> LadderProblem<'a> {
             let more = (high.rung.parameters() - low.rung.parameters()) as f64;
             let gained = (low.chi2 - high.chi2).max(0.0) / more / scale;
             let p_value = f_exceeds(gained, more, interval_dof.min(1e4));
-            if p_value < 0.01 && high.aicc < low.aicc && high.held_out < low.held_out {
+            // Eq. (1)-(3) are passive: a rung that explains more with an unstable pole has found something else.
+            let passive = high.model.slow_pole_rad_per_s >= 0.0;
+            if p_value < 0.01 && high.aicc < low.aicc && high.held_out < low.held_out && passive {
                 chosen = i;
             }
         }

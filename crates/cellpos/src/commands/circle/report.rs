@@ -94,7 +94,10 @@ fn bode(circle: &Circle) -> Figure {
         plot = std::mem::replace(&mut plot, Figure::new("", "")).bode_series(magnitude, phase);
     };
     for (i, stage) in circle.stages.iter().enumerate() {
-        add(stage.name, &stage.response, i);
+        // An unstable model has no response to show.
+        if stage.problem.is_none() {
+            add(stage.name, &stage.response, i);
+        }
     }
     if let Some(response) = circle
         .truth
