@@ -10,6 +10,7 @@
 //! | `ticks.parquet` | the same rows for other programs | at the end |
 //! | `cycles.csv` | of a script: one row a cycle ([`LineFile`]) | appended, synced at least each second |
 //! | `cycles.parquet` | the same | at the end |
+//! | `learned.toml` | of a script: the feed-forward learned over its cycles | replaced in one step each second |
 //! | `sessions/` | of a run that was resumed: a run folder for each further session | |
 //!
 //! **While running** a [`RunWriter`] belongs to the recorder thread. It may allocate and block on the disk, so nothing

@@ -171,16 +171,6 @@ impl Batches {
             ..self.lost.clone()
         }
     }
-
-    /// Where a further batch may be appended: behind the last whole one, in front of an end mark. Valid once the
-    /// iterator has ended.
-    pub(crate) fn append_at(&self) -> u64 {
-        if self.stream.ended {
-            self.stream.good_end.saturating_sub(8)
-        } else {
-            self.stream.good_end
-        }
-    }
 }
 
 impl Iterator for Batches {

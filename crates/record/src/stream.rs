@@ -39,8 +39,6 @@ pub(crate) struct Stream<R> {
     pub(crate) damaged_bytes: u64,
     /// Bytes after the last message that made sense: a batch cut off.
     pub(crate) torn_bytes: u64,
-    /// End of the last message that made sense: where appending may go on.
-    pub(crate) good_end: u64,
     /// Whether the end mark was seen last.
     pub(crate) ended: bool,
 }
@@ -60,7 +58,6 @@ impl<R: Read + Seek> Stream<R> {
                 .collect(),
             damaged_bytes: 0,
             torn_bytes: 0,
-            good_end: 0,
             ended: false,
         })
     }
@@ -74,7 +71,6 @@ impl<R: Read + Seek> Stream<R> {
             match self.message(self.position)? {
                 Some((message, end)) => {
                     self.position = end;
-                    self.good_end = end;
                     self.ended = matches!(message, Message::End);
                     if let Message::Rows(rows) = message {
                         return Ok(Some(rows));

@@ -315,53 +315,6 @@ impl RunWriter {
         })
     }
 
-    /// Goes on writing into the folder of a run that was cut off: whatever was torn is cut away, whole rows and events
-    /// stay. The numbers of the new rows must be larger than the last one's, so that the gap shows.
-    ///
-    /// # Errors
-    /// [`RecordError`] when the folder is no run, or its metadata or files cannot be read or written.
-    pub fn resume(folder: &Path, policy: FlushPolicy) -> Result<Self, RecordError> {
-        let reader = RunReader::open(folder)?;
-        let mut meta = match reader.meta() {
-            Ok(meta) => meta.clone(),
-            Err(problem) => return Err(RecordError::Meta(problem.to_owned())),
-        };
-        meta.end = None;
-        let mut batches = reader.batches()?;
-        let mut rows = 0;
-        for batch in batches.by_ref() {
-            rows += batch.len() as u64;
-        }
-        let good = batches.append_at();
-        let open = |name: &str, keep: Option<u64>| {
-            let path = folder.join(name);
-            let attempt = || {
-                let mut file = OpenOptions::new()
-                    .read(true)
-                    .write(true)
-                    .create(true)
-                    .truncate(false)
-                    .open(&path)?;
-                let keep = match keep {
-                    Some(keep) => keep,
-                    None => whole_lines(&std::fs::read(&path)?),
-                };
-                file.cut(keep)?;
-                Ok(Blocks::new(file, keep))
-            };
-            attempt().map_err(RecordError::io("cannot open", path.clone()))
-        };
-        let ticks = open(TICKS_ARROW, Some(good))?;
-        let events = open(EVENTS_JSONL, None)?;
-        let mut log = Log::new(ticks, events, policy.sane(), good == 0)?;
-        log.rows = rows;
-        Ok(Self {
-            log,
-            folder: folder.to_owned(),
-            meta,
-        })
-    }
-
     /// The run's folder.
     pub fn folder(&self) -> &Path {
         &self.folder
@@ -395,11 +348,6 @@ impl RunWriter {
     /// What could not be written so far.
     pub fn faults(&self) -> &Faults {
         &self.log.faults
-    }
-
-    /// Rows on the disk so far.
-    pub fn rows_written(&self) -> u64 {
-        self.log.rows
     }
 
     /// Writes what waits, the end of `run.toml` (`ended_utc` and the counts are set here), and `ticks.parquet`.

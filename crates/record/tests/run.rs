@@ -219,44 +219,6 @@ fn a_torn_event_line_is_counted_and_the_others_read() {
 }
 
 #[test]
-fn a_run_cut_off_is_resumed_behind_its_last_whole_row() {
-    for keep in [30_000, 60_000, usize::MAX] {
-        let root = tempfile::tempdir().unwrap();
-        let folder = cut_off(root.path(), 300, 25);
-        let path = folder.join("ticks.arrow");
-        let bytes = std::fs::read(&path).unwrap();
-        std::fs::write(&path, &bytes[..keep.min(bytes.len())]).unwrap();
-        std::fs::write(
-            folder.join("events.jsonl"),
-            "{\"time_s\":1.0,\"event\":\"a\"}\n{\"tim",
-        )
-        .unwrap();
-        let (before, _) = RunReader::open(&folder).unwrap().ticks().unwrap();
-        let mut writer = RunWriter::resume(&folder, policy(10)).unwrap();
-        writer.event(&Event::new(9.0, "resumed"));
-        (1000..1035).for_each(|seq| writer.tick(&row(seq)));
-        let finished = writer.finish(RunEnd::new("done"));
-        assert_eq!(finished.rows, before.len() as u64 + 35);
-        let run = RunReader::open(&folder).unwrap();
-        let (after, lost) = run.ticks().unwrap();
-        assert_eq!(after.len(), before.len() + 35);
-        assert_eq!(lost.gaps.len(), 1);
-        assert_eq!(
-            (lost.damaged_bytes, lost.torn_bytes, lost.disordered_rows),
-            (0, 0, 0)
-        );
-        assert_eq!(run.events().unwrap().unreadable_lines, 0);
-        // A finished run can be resumed as well: the end mark gives way.
-        let mut writer = RunWriter::resume(&folder, policy(10)).unwrap();
-        writer.tick(&row(2000));
-        writer.finish(RunEnd::new("done"));
-        let (more, lost) = RunReader::open(&folder).unwrap().ticks().unwrap();
-        assert_eq!(more.len(), after.len() + 1);
-        assert!(lost.finished);
-    }
-}
-
-#[test]
 fn exports_carry_units_in_their_names_and_follow_the_row_convention() {
     let root = tempfile::tempdir().unwrap();
     let folder = cut_off(root.path(), 100, 8);
