@@ -120,6 +120,7 @@ fn without_data_collect_records_on_the_rig_and_keeps_what_it_recorded() {
     let collected = r["collected"].as_array().unwrap();
     assert_eq!(collected.len(), 1);
     assert_eq!(collected[0]["experiment"], "survey");
+    assert!(number(&collected[0], "rows_without_bead") < 20.0, "{r}");
     let csv = std::fs::read_to_string(folder.path().join("more/survey-1.csv")).unwrap();
     assert!(csv.starts_with("time_s,pzt_um,bead_um"), "{}", &csv[..60]);
     assert_eq!(

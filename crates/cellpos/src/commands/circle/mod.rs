@@ -244,6 +244,7 @@ fn close(
             why: "nothing is recorded yet".to_owned(),
             file: survey,
             rows: first.record.rows(),
+            rows_without_bead: first.record.rows() - first.record.frames(),
             verdict: if collected.is_empty() {
                 reconciled.verdict.word().to_owned()
             } else {

@@ -22,6 +22,8 @@ pub struct Collected {
     pub file: PathBuf,
     /// Rows of the record.
     pub rows: usize,
+    /// Of these, rows without a bead: not seen, or its frame came too late for its row.
+    pub rows_without_bead: usize,
     /// Verdict with it.
     pub verdict: String,
 }
@@ -84,6 +86,14 @@ pub fn run_experiment(
         .collect();
     let name = format!("collected-{}-{seed}", experiment.name());
     let record = Record::from_rows(&name, &time_s, &pzt_um, &bead_um).map_err(super::refused)?;
+    let missing = record.rows() - record.frames();
+    if 50 * missing > record.rows() {
+        tracing::warn!(
+            "{missing} of {} rows have no bead, or their frame came too late: this machine did not keep the loop's time, or the bead \
+             was hard to see, and the verdict may suffer from it (cellpos doctor)",
+            record.rows()
+        );
+    }
     Ok(Ran {
         neutral_um: neutral_um(&record, rig.model.plant.velocity_gain_at(Hertz(2.0))),
         record,
@@ -194,6 +204,7 @@ pub fn look(
             why,
             file,
             rows: record.rows(),
+            rows_without_bead: record.rows() - record.frames(),
             verdict: String::new(),
         });
         records.push(record);
