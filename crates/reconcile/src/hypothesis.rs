@@ -123,20 +123,6 @@ pub(crate) fn hypothesis(ctx: &Context<'_>, fit: &Fit) -> Option<Hypothesis> {
     add("d^2 (position)", "1/um", false, &|i, k| d(i, k).powi(2));
     add("y^2 (position)", "1/um", false, &|i, k| y(i, k).powi(2));
     add("y^3 (position)", "1/um^2", false, &|i, k| y(i, k).powi(3));
-    if let Some(hz) = strongest_line(ctx, fit) {
-        add(
-            &format!("sin(2 pi {hz:.2} Hz t) (position)"),
-            "um",
-            false,
-            &|_, k| (TAU * hz * k as f64 * dt).sin(),
-        );
-        add(
-            &format!("cos(2 pi {hz:.2} Hz t) (position)"),
-            "um",
-            false,
-            &|_, k| (TAU * hz * k as f64 * dt).cos(),
-        );
-    }
     // Forward selection on the first part of every record.
     let inner = |a: &[Vec<f64>], b: &[Vec<f64>], mask: &Mask| -> f64 {
         a.iter()
@@ -149,7 +135,13 @@ pub(crate) fn hypothesis(ctx: &Context<'_>, fit: &Fit) -> Option<Hypothesis> {
             })
             .sum()
     };
-    let e = &fit.innovations;
+    // A line first, with an amplitude and a phase of its own in every record.
+    let line = strongest_line(ctx, fit).and_then(|hz| without_line(ctx, fit, hz, &train));
+    let line = line.filter(|l| {
+        inner(&l.left, &l.left, &test) < inner(&fit.innovations, &fit.innovations, &test) - 10.0
+    });
+    let all = &fit.innovations;
+    let e = line.as_ref().map_or(all, |l| &l.left);
     let mut chosen: Vec<usize> = Vec::new();
     let mut coefficients = DVector::zeros(0);
     let mut left = e.clone();
@@ -196,20 +188,27 @@ pub(crate) fn hypothesis(ctx: &Context<'_>, fit: &Fit) -> Option<Hypothesis> {
         coefficients = x;
         left = next;
     }
-    if chosen.is_empty() {
+    if chosen.is_empty() && line.is_none() {
         return None;
     }
     let count = ctx.problem.count(&test) as f64;
-    let before = inner(e, e, &test) - count;
+    let before = inner(all, all, &test) - count;
     let after = inner(&left, &left, &test) - count;
-    let terms: Vec<Term> = chosen
-        .iter()
-        .zip(coefficients.iter())
-        .map(|(i, x)| Term {
+    let line = line.map(|l| Term {
+        term: format!(
+            "sin(2 pi {:.2} Hz t + phase of the record) (position)",
+            l.hz
+        ),
+        coefficient: l.amplitude_um,
+        unit: "um".to_owned(),
+    });
+    let terms: Vec<Term> = line
+        .into_iter()
+        .chain(chosen.iter().zip(coefficients.iter()).map(|(i, x)| Term {
             term: library[*i].name.clone(),
             coefficient: *x,
             unit: library[*i].unit.clone(),
-        })
+        }))
         .collect();
     let formula = terms
         .iter()
@@ -224,6 +223,47 @@ pub(crate) fn hypothesis(ctx: &Context<'_>, fit: &Fit) -> Option<Hypothesis> {
             0.0
         },
         terms,
+    })
+}
+
+/// What a line leaves over.
+struct Line {
+    hz: f64,
+    /// Mean over the records \[um\].
+    amplitude_um: f64,
+    left: Vec<Vec<f64>>,
+}
+
+/// Takes a line off, amplitude and phase of every record from the rows of a mask.
+fn without_line(ctx: &Context<'_>, fit: &Fit, hz: f64, train: &Mask) -> Option<Line> {
+    let mut left = fit.innovations.clone();
+    let mut sum = 0.0;
+    for ((r, e), mask) in ctx.problem.records.iter().zip(&mut left).zip(train) {
+        let n = e.len();
+        let (s, c): (Vec<f64>, Vec<f64>) = (0..n)
+            .map(|k| (TAU * hz * k as f64 * ctx.problem.base.sample_s).sin_cos())
+            .unzip();
+        let (mut ws, mut wc) = (vec![0.0; n], vec![0.0; n]);
+        r.whitener.apply(&s, &mut ws);
+        r.whitener.apply(&c, &mut wc);
+        let rows = mask.first()?.clone();
+        let (ws_in, wc_in, e_in) = (&ws[rows.clone()], &wc[rows.clone()], &e[rows]);
+        let (ss, cc, sc) = (dot(ws_in, ws_in), dot(wc_in, wc_in), dot(ws_in, wc_in));
+        let (se, ce) = (dot(ws_in, e_in), dot(wc_in, e_in));
+        let det = ss * cc - sc * sc;
+        if det <= 1e-9 * ss * cc {
+            continue;
+        }
+        let (a, b) = ((cc * se - sc * ce) / det, (ss * ce - sc * se) / det);
+        sum += a.hypot(b);
+        for (e, (s, c)) in e.iter_mut().zip(ws.iter().zip(&wc)) {
+            *e -= a * s + b * c;
+        }
+    }
+    Some(Line {
+        hz,
+        amplitude_um: sum / ctx.problem.records.len() as f64,
+        left,
     })
 }
 
