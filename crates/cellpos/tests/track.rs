@@ -356,6 +356,20 @@ fn a_sine_of_300_hz_is_learned_to_twice_the_hold_error_with_half_a_millisecond_o
 }
 
 #[test]
+fn a_bead_that_is_drawn_out_over_its_frames_is_seen_in_each_of_them() {
+    let folder = tempfile::tempdir().unwrap();
+    for sine in ["5um@50Hz", "5um@100Hz"] {
+        let line = format!(
+            "--target 0um --controller lqg --duration 3s --seed 5 --no-record --sine {sine}"
+        );
+        let r = track(folder.path(), &line);
+        assert!(number(&r, "fixes_lost") < 10.0, "{sine}: {r}");
+        let rms = number(&r, "rms_true_nm");
+        assert!(rms < 70.0, "{sine}: {rms} nm");
+    }
+}
+
+#[test]
 fn a_sine_is_learned_kept_with_the_run_replayed_and_gone_on_from() {
     let folder = tempfile::tempdir().unwrap();
     model_with_gain(folder.path(), 0.8);

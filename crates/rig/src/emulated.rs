@@ -184,6 +184,7 @@ impl Camera for EmulatedCamera {
         Ok(Some(FrameStamp {
             id: info.id,
             mid_exposure_ns: info.mid_exposure_ns,
+            exposure_ns: info.exposure_ns,
             arrival_ns,
             true_um,
             true_pzt_um,

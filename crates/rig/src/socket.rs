@@ -115,6 +115,7 @@ impl SocketCamera {
         Ok(Some(FrameStamp {
             id: header.frame_id,
             mid_exposure_ns: i64::try_from(header.mid_exposure_ns).unwrap_or(i64::MAX),
+            exposure_ns: i64::from(header.exposure_ns),
             arrival_ns: monotonic_ns(),
             true_um: f64::NAN,
             true_pzt_um: f64::NAN,

@@ -11,6 +11,8 @@ pub struct FrameStamp {
     pub id: u64,
     /// Middle of the exposure.
     pub mid_exposure_ns: i64,
+    /// Length of the exposure; 0 where the camera does not say.
+    pub exposure_ns: i64,
     /// Arrival in this process.
     pub arrival_ns: i64,
     /// True bead position at arrival, um (emulated rig only, else NaN).

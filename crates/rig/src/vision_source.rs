@@ -9,7 +9,7 @@ use crate::clock::Clock;
 use crate::flow::CommandedFlow;
 use crate::measurement::Measurement;
 use crate::source::{Camera, CameraError, FrameBuffer, FrameStamp, PositionSource, SourceInfo};
-use cellpos_vision::{Decision, TrackStep, Tracker, Verdict};
+use cellpos_vision::{Commanded, Decision, TrackStep, Tracker, Verdict};
 
 /// A camera with a tracker. Allocates nothing per frame once it runs.
 #[derive(Debug)]
@@ -61,15 +61,26 @@ impl<C: Camera> VisionSource<C> {
         }
         self.newest = Some((stamp.id, at_ns));
         let first_ns = *self.first_ns.get_or_insert(at_ns);
-        let flow_um_per_s = match (&self.flow, before) {
-            (Some(flow), Some((_, before_ns))) => flow.mean_um_per_s(before_ns, at_ns),
-            _ => 0.0,
+        let mean_px_per_s = |from_ns, to_ns| {
+            let um_per_s = self
+                .flow
+                .as_ref()
+                .map_or(0.0, |flow| flow.mean_um_per_s(from_ns, to_ns));
+            self.calibration.flow_px_per_s(um_per_s)
         };
-        Some(self.tracker.step(
-            Some(&self.buffer.frame()),
-            (at_ns - first_ns) as f64 * 1e-9,
-            self.calibration.flow_px_per_s(flow_um_per_s),
-        ))
+        let exposed_s = stamp.exposure_ns as f64 * 1e-9;
+        let half_ns = stamp.exposure_ns / 2;
+        let (x, y) = mean_px_per_s(at_ns - half_ns, at_ns + half_ns);
+        let commanded = Commanded {
+            flow_px_per_s: before
+                .map_or((0.0, 0.0), |(_, before_ns)| mean_px_per_s(before_ns, at_ns)),
+            streak_px: (x * exposed_s, y * exposed_s),
+        };
+        let time_s = (at_ns - first_ns) as f64 * 1e-9;
+        Some(
+            self.tracker
+                .step(Some(&self.buffer.frame()), time_s, commanded),
+        )
     }
 }
 

@@ -79,6 +79,7 @@ impl Scripted {
         let stamp = FrameStamp {
             id,
             mid_exposure_ns: at_ns,
+            exposure_ns: 0,
             arrival_ns: at_ns + 2 * PERIOD_NS,
             true_um: f64::NAN,
             true_pzt_um: f64::NAN,

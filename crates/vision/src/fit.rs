@@ -7,6 +7,7 @@
 
 use crate::crop::{Crop, LANES, Row, STRIDE};
 use crate::profile::Template;
+use crate::streak::Comb;
 use nalgebra::{Matrix2, Matrix3, Matrix4, Vector3, Vector4};
 use wide::f32x4;
 
@@ -57,43 +58,26 @@ struct Sums {
     wpp: f32x4,
 }
 
-/// One pass at the position (`x_px`, `y_px`), frame coordinates. `None` when the normal matrix is singular.
+/// One pass at the position (`x_px`, `y_px`), frame coordinates, of a bead that went along `comb` while the shutter was
+/// open. `None` when the normal matrix is singular.
 pub(crate) fn pass(
     crop: &Crop,
     template: &Template,
-    x_px: f64,
-    y_px: f64,
+    comb: &Comb,
+    (x_px, y_px): (f64, f64),
     weights: Weights,
 ) -> Option<Pass> {
     let x = (x_px - crop.x0 as f64) as f32;
     let y = (y_px - crop.y0 as f64) as f32;
     let lanes_end = crop.width.next_multiple_of(LANES).min(STRIDE);
-    let mut dx: Row = [0.0; STRIDE];
-    for (i, d) in dx.iter_mut().enumerate() {
-        *d = i as f32 - x;
-    }
-    let mut entry = [0_u32; STRIDE];
-    let mut offset: Row = [0.0; STRIDE];
-    let mut value: Row = [0.0; STRIDE];
-    // Minus twice the derivative with respect to the squared radius: times dx it is the derivative by the centre.
-    let mut inward: Row = [0.0; STRIDE];
+    let mut image = Image::new(lanes_end);
     let mut weight: Row = crop.mask;
     if let Weights::Even { variance } = weights {
         weight.iter_mut().for_each(|w| *w /= variance);
     }
     let mut sums = Sums::default();
     for (j, pixels) in crop.rows.iter().enumerate().take(crop.height) {
-        let dy = j as f32 - y;
-        let dy2 = dy * dy;
-        for ((e, t), d) in entry[..lanes_end].iter_mut().zip(&mut offset).zip(&dx) {
-            (*e, *t) = template.place(d * d + dy2);
-        }
-        let places = entry[..lanes_end].iter().zip(&offset);
-        for ((v, g), (e, t)) in value.iter_mut().zip(&mut inward).zip(places) {
-            let (f, df) = template.read((*e, *t));
-            *v = f;
-            *g = -2.0 * df;
-        }
+        image.draw_row(template, comb, x, j as f32 - y);
         if let Weights::Shot {
             base,
             gain_times_amplitude,
@@ -103,7 +87,7 @@ pub(crate) fn pass(
             for ((w, m), f) in weight
                 .iter_mut()
                 .zip(&crop.mask)
-                .zip(&value)
+                .zip(&image.value)
                 .take(lanes_end)
             {
                 *w = m / (base + gain_times_amplitude * f).max(floor);
@@ -111,41 +95,91 @@ pub(crate) fn pass(
         }
         sums.add_row(
             &weight[..lanes_end],
-            &value[..lanes_end],
-            &inward[..lanes_end],
-            &dx,
-            dy,
+            &image.value[..lanes_end],
+            &image.by_x[..lanes_end],
+            &image.by_y,
             pixels,
         );
     }
     sums.solve()
 }
 
+/// One row of the model's image and its derivatives by the centre.
+struct Image {
+    lanes_end: usize,
+    value: Row,
+    by_x: Row,
+    by_y: Row,
+}
+
+impl Image {
+    fn new(lanes_end: usize) -> Self {
+        Image {
+            lanes_end,
+            value: [0.0; STRIDE],
+            by_x: [0.0; STRIDE],
+            by_y: [0.0; STRIDE],
+        }
+    }
+
+    /// The row `dy` px below the centre, which lies in the column `x`.
+    #[inline(always)]
+    fn draw_row(&mut self, template: &Template, comb: &Comb, x: f32, dy: f32) {
+        let n = self.lanes_end;
+        let mut entry = [0_u32; STRIDE];
+        let mut offset: Row = [0.0; STRIDE];
+        let mut first = true;
+        for (ox, oy) in comb.offsets() {
+            let (x, dy) = (x + ox, dy - oy);
+            let dy2 = dy * dy;
+            for (i, (e, t)) in entry[..n].iter_mut().zip(&mut offset).enumerate() {
+                let dx = i as f32 - x;
+                (*e, *t) = template.place(dx * dx + dy2);
+            }
+            let places = entry[..n].iter().zip(&offset);
+            let rows = self
+                .value
+                .iter_mut()
+                .zip(&mut self.by_x)
+                .zip(&mut self.by_y);
+            for (i, (((v, gx), gy), (e, t))) in rows.zip(places).enumerate() {
+                let (f, df) = template.read((*e, *t));
+                // The derivative by the centre is minus twice that by the squared radius, times the distance.
+                let g = -2.0 * df;
+                let (fx, fy) = (g * (i as f32 - x), g * dy);
+                if first {
+                    (*v, *gx, *gy) = (f, fx, fy);
+                } else {
+                    *v += f;
+                    *gx += fx;
+                    *gy += fy;
+                }
+            }
+            first = false;
+        }
+        if !comb.is_still() {
+            let share = comb.share();
+            for row in [&mut self.value, &mut self.by_x, &mut self.by_y] {
+                row[..n].iter_mut().for_each(|v| *v *= share);
+            }
+        }
+    }
+}
+
 impl Sums {
     #[inline(always)]
-    fn add_row(
-        &mut self,
-        weight: &[f32],
-        value: &[f32],
-        inward: &[f32],
-        dx: &Row,
-        dy: f32,
-        pixels: &Row,
-    ) {
+    fn add_row(&mut self, weight: &[f32], value: &[f32], by_x: &[f32], by_y: &Row, pixels: &Row) {
         let chunks = weight
             .as_chunks::<LANES>()
             .0
             .iter()
             .zip(value.as_chunks::<LANES>().0);
         let chunks = chunks
-            .zip(inward.as_chunks::<LANES>().0)
-            .zip(dx.as_chunks::<LANES>().0);
+            .zip(by_x.as_chunks::<LANES>().0)
+            .zip(by_y.as_chunks::<LANES>().0);
         let mut s = *self;
-        let dy = f32x4::splat(dy);
-        for ((((w, f), g), d), p) in chunks.zip(pixels.as_chunks::<LANES>().0) {
-            let [w, f, g, d, p] = [w, f, g, d, p].map(|lanes| f32x4::from(*lanes));
-            let fx = g * d;
-            let fy = g * dy;
+        for ((((w, f), fx), fy), p) in chunks.zip(pixels.as_chunks::<LANES>().0) {
+            let [w, f, fx, fy, p] = [w, f, fx, fy, p].map(|lanes| f32x4::from(*lanes));
             let (wf, wx, wy, wp) = (w * f, w * fx, w * fy, w * p);
             s.w += w;
             s.wf += wf;
@@ -236,4 +270,35 @@ pub(crate) fn scale(
     let change = solution[2] / solution[0];
     let sd = (inverse[(2, 2)] * variance).sqrt() / solution[0].abs();
     (change.is_finite() && sd.is_finite()).then_some((change, sd))
+}
+
+/// Change of the comb's length, as a fraction of it, that fits the window best at a fixed position, beside amplitude and
+/// background: one secant step.
+pub(crate) fn stretch(
+    crop: &Crop,
+    template: &Template,
+    shorter: &Comb,
+    longer: &Comb,
+    (x_px, y_px): (f64, f64),
+) -> Option<f64> {
+    let (x, y) = (
+        (x_px - crop.x0 as f64) as f32,
+        (y_px - crop.y0 as f64) as f32,
+    );
+    let lanes_end = crop.width.next_multiple_of(LANES).min(STRIDE);
+    let (mut a, mut b) = (Image::new(lanes_end), Image::new(lanes_end));
+    let (mut normal, mut right) = (Matrix3::zeros(), Vector3::zeros());
+    for (j, row) in crop.rows.iter().enumerate().take(crop.height) {
+        let dy = j as f32 - y;
+        a.draw_row(template, shorter, x, dy);
+        b.draw_row(template, longer, x, dy);
+        for ((p, a), b) in row.iter().zip(&a.value).zip(&b.value).take(crop.width) {
+            let g = Vector3::new(f64::from(0.5 * (a + b)), 1.0, f64::from(b - a));
+            normal += g * g.transpose();
+            right += g * f64::from(*p);
+        }
+    }
+    let solution = normal.cholesky()?.inverse() * right;
+    let change = solution[2] / solution[0];
+    change.is_finite().then_some(change)
 }

@@ -17,6 +17,7 @@ mod localiser;
 pub mod many;
 pub mod profile;
 mod seed;
+mod streak;
 pub mod symmetry;
 pub mod track;
 
@@ -34,4 +35,4 @@ pub use profile::{
 };
 pub use seed::Detector;
 pub use symmetry::RadialSymmetry;
-pub use track::{Decision, TrackState, TrackStep, Tracker, TrackerConfig};
+pub use track::{Commanded, Decision, TrackState, TrackStep, Tracker, TrackerConfig};

@@ -8,6 +8,7 @@ use crate::frame::Frame;
 use crate::learn::{Learner, LearningReport};
 use crate::profile::Template;
 use crate::seed;
+use crate::streak::Comb;
 
 /// A step below this ends the fit, px: what is left after it is of second order in it.
 const CONVERGED_PX: f64 = 0.01;
@@ -17,6 +18,12 @@ const RECENTRE_PX: f64 = 1.0;
 const MAX_RECENTRES: u32 = 4;
 /// Half-width in bead radii of the window that leaves neighbours out.
 const NARROW_RADII: f64 = 1.3;
+/// Steps in the length of a streak per fit.
+const STRETCHES: usize = 2;
+/// A streak's length is looked for within this factor of the expected one.
+const MOST_STRETCH: f64 = 2.5;
+/// Relative difference of the lengths of the secant.
+const SECANT: f64 = 0.1;
 /// Beads that can be taken off a window.
 const MAX_OTHERS: usize = 8;
 /// Share of a new frame in the running noise estimate.
@@ -37,6 +44,9 @@ pub struct Localiser {
     /// Running noise variance of a pixel, grey^2; `None` before the first frame.
     noise_variance: Option<f64>,
     learner: Option<Learner>,
+    /// Way of the bead during the exposure, expected and in use (px).
+    streak_px: (f64, f64),
+    comb: Comb,
     /// Beads taken off the window: x, y, amplitude.
     others: [(f64, f64, f64); MAX_OTHERS],
 }
@@ -67,6 +77,8 @@ impl Localiser {
             sign,
             noise_variance: None,
             learner,
+            streak_px: (0.0, 0.0),
+            comb: Comb::STILL,
             others: [(0.0, 0.0, 0.0); MAX_OTHERS],
         })
     }
@@ -97,6 +109,13 @@ impl Localiser {
             .as_ref()
             .map(Learner::report)
             .unwrap_or_default()
+    }
+
+    /// Says how far beads go while the next frames are exposed, from the start to the end of an exposure (px); noughts for
+    /// beads at rest. The length is a start value, refined by the fit; the direction is taken as it is.
+    pub fn expect_streak(&mut self, way_px: (f64, f64)) {
+        self.streak_px = way_px;
+        self.comb = Comb::new(way_px, self.template.radius_px());
     }
 
     /// Position of the bead nearest to `guess` (px), or of the strongest in the frame when there is no guess.
@@ -143,8 +162,11 @@ impl Localiser {
 
     /// Size of the bead of the last fix relative to the template, and its standard deviation: the template's scale fitted
     /// beside amplitude and background at the fix's position. Valid near 1, for telling beads apart; `None` when the
-    /// fix was not from this window.
+    /// fix was not from this window, or of a streak.
     pub fn relative_size(&self, fix: &Fix) -> Option<(f64, f64)> {
+        if !self.comb.is_still() {
+            return None;
+        }
         let variance = self.noise_variance.unwrap_or(1.0);
         let (change, sd) = fit::scale(&self.crop, &self.template, fix.x_px, fix.y_px, variance)?;
         Some((1.0 + change, sd))
@@ -174,7 +196,8 @@ impl Localiser {
         let taken = self.crop.take(frame, x_px, y_px, side_px);
         for (x, y, amplitude) in self.others {
             if taken && amplitude != 0.0 {
-                self.crop.take_off(&self.template, x, y, amplitude);
+                self.crop
+                    .take_off(&self.template, &self.comb, (x, y), amplitude);
             }
         }
         taken
@@ -184,20 +207,56 @@ impl Localiser {
         if !self.take_window(frame, x_px, y_px, side_px) {
             return Fix::none(x_px, y_px, Verdict::AtBorder);
         }
-        let fitted = self.fit(frame, x_px, y_px, side_px);
+        self.comb = Comb::new(self.streak_px, self.template.radius_px());
+        let mut fitted = self.fit(frame, x_px, y_px, side_px);
+        if !self.comb.is_still() {
+            fitted = self.fit_length(frame, fitted, side_px);
+        }
         // The noise is read off the border of a whole window that holds one bead in its middle; anywhere else edges
         // would count as noise.
         if self.noise_variance.is_none() {
             self.update_noise();
         }
         let fix = self.judge(frame, fitted, (x_px, y_px));
-        if fix.verdict == Verdict::Good && side_px == self.config.window_px {
+        let whole = side_px == self.config.window_px && self.comb.is_still();
+        if fix.verdict == Verdict::Good && whole {
             self.update_noise();
         }
         fix
     }
 
+    /// Refines the length of a streak beside the position. By symmetry the two do not depend on each other, so that they
+    /// are fitted in turn.
+    fn fit_length(
+        &mut self,
+        frame: &Frame,
+        first: Option<Fitted>,
+        side_px: usize,
+    ) -> Option<Fitted> {
+        let radius_px = self.template.radius_px();
+        let (x_px, y_px) = self.streak_px;
+        let of = |factor: f64| Comb::new((factor * x_px, factor * y_px), radius_px);
+        let (mut fitted, mut factor) = (first?, 1.0);
+        for _ in 0..STRETCHES {
+            let (shorter, longer) = (of(factor * (1.0 - SECANT)), of(factor * (1.0 + SECANT)));
+            let at = (fitted.x_px, fitted.y_px);
+            let Some(change) = fit::stretch(&self.crop, &self.template, &shorter, &longer, at)
+            else {
+                break;
+            };
+            factor =
+                (factor * (1.0 + 2.0 * SECANT * change)).clamp(1.0 / MOST_STRETCH, MOST_STRETCH);
+            self.comb = of(factor);
+            fitted = self.fit(frame, fitted.x_px, fitted.y_px, side_px)?;
+        }
+        Some(fitted)
+    }
+
     fn learn(&mut self, fix: &Fix) {
+        // A streak would blur what is learnt.
+        if !self.comb.is_still() {
+            return;
+        }
         let Some(learner) = &mut self.learner else {
             return;
         };
@@ -279,8 +338,8 @@ impl Localiser {
             let pass = fit::pass(
                 &self.crop,
                 &self.template,
-                x_px,
-                y_px,
+                &self.comb,
+                (x_px, y_px),
                 self.weights(before.as_ref()),
             )?;
             let length = f64::hypot(pass.step_x_px, pass.step_y_px);

@@ -2,8 +2,8 @@
 #![allow(unsafe_code)]
 
 use cellpos_vision::{
-    CellConfig, CellFinder, Frame, Learning, Localiser, LocaliserConfig, Noise, PixelResponse,
-    Pixels, ProfileSpec, Tracker, TrackerConfig, Verdict,
+    CellConfig, CellFinder, Commanded, Frame, Learning, Localiser, LocaliserConfig, Noise,
+    PixelResponse, Pixels, ProfileSpec, Tracker, TrackerConfig, Verdict,
 };
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
@@ -138,7 +138,12 @@ fn tracking_through_an_encounter_and_a_loss_allocates_nothing() {
             height,
             pixels: Pixels::Mono8(pixels),
         };
-        let step = tracker.step(Some(&frame), n as f64 * 1e-3, (0.0, 0.0));
+        // A streak's template is drawn in place, too.
+        let commanded = Commanded {
+            streak_px: if n % 8 == 7 { (3.0, 0.0) } else { (0.0, 0.0) },
+            ..Commanded::default()
+        };
+        let step = tracker.step(Some(&frame), n as f64 * 1e-3, commanded);
         states[step.state as usize] += 1;
     }
     assert_eq!(allocations(), before);

@@ -289,6 +289,7 @@ impl IndustrialCamera {
         Some(FrameStamp {
             id: self.id,
             mid_exposure_ns,
+            exposure_ns: (self.settings.exposure_us.unwrap_or(0.0) * 1e3) as i64,
             arrival_ns,
             true_um: f64::NAN,
             true_pzt_um: f64::NAN,

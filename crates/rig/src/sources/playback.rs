@@ -84,6 +84,7 @@ impl Camera for Playback {
         Ok(Some(FrameStamp {
             id: self.next as u64,
             mid_exposure_ns: due_ns,
+            exposure_ns: 0,
             arrival_ns: self.clock.now_ns(),
             true_um: f64::NAN,
             true_pzt_um: f64::NAN,

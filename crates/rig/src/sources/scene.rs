@@ -364,6 +364,7 @@ impl Camera for SceneCamera {
         Ok(Some(FrameStamp {
             id: self.frames,
             mid_exposure_ns: due_ns,
+            exposure_ns: (self.config.exposure_share / self.config.rate_hz * 1e9) as i64,
             arrival_ns: self.clock.now_ns(),
             true_um: f64::NAN,
             true_pzt_um: f64::NAN,

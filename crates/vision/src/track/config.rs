@@ -4,6 +4,26 @@ use crate::config::ConfigError;
 use crate::fix::Fix;
 use serde::{Deserialize, Serialize};
 
+/// What was commanded, as far as the next frame goes.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Commanded {
+    /// Mean flow velocity since the frame before, px/s.
+    pub flow_px_per_s: (f64, f64),
+    /// Way that the flow goes while the frame is exposed, px: a fast bead's image is drawn out along it. Noughts where the
+    /// exposure is not known.
+    pub streak_px: (f64, f64),
+}
+
+impl From<(f64, f64)> for Commanded {
+    /// A flow velocity in px/s, and a shutter too fast to matter.
+    fn from(flow_px_per_s: (f64, f64)) -> Self {
+        Commanded {
+            flow_px_per_s,
+            streak_px: (0.0, 0.0),
+        }
+    }
+}
+
 /// Settings of a [`crate::Tracker`].
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]

@@ -16,7 +16,7 @@ use crate::fix::{Fix, Verdict};
 use crate::frame::Frame;
 use crate::localiser::Localiser;
 use crate::seed::Detector;
-pub use config::{Decision, TrackState, TrackStep, TrackerConfig};
+pub use config::{Commanded, Decision, TrackState, TrackStep, TrackerConfig};
 use identity::Identity;
 use motion::{Motion, Randomness};
 use neighbours::{Claim, MAX_BEADS, Neighbours};
@@ -110,14 +110,19 @@ impl Tracker {
         self.state = TrackState::Searching;
     }
 
-    /// Takes in the frame exposed about `time_s`, with the flow velocity (px/s) commanded since the frame before.
-    /// Without a frame, or with a time that has not moved on, the prediction is carried on.
+    /// Takes in the frame exposed about `time_s`, with what was commanded: a flow velocity since the frame before (px/s), or
+    /// all of [`Commanded`]. Without a frame, or with a time that has not moved on, the prediction is carried on.
     pub fn step(
         &mut self,
         frame: Option<&Frame>,
         time_s: f64,
-        flow_px_per_s: (f64, f64),
+        commanded: impl Into<Commanded>,
     ) -> TrackStep {
+        let Commanded {
+            flow_px_per_s,
+            streak_px,
+        } = commanded.into();
+        self.localiser.expect_streak(streak_px);
         let dt_s = self.time_s.map_or(0.0, |before| (time_s - before).max(0.0));
         let dt_s = if dt_s.is_finite() { dt_s } else { 0.0 };
         let time_s = self
