@@ -30,6 +30,10 @@ const BAND_HZ: [f64; 14] = [
     1.5, 2.5, 4.5, 7.5, 12.5, 20.5, 33.5, 54.5, 87.5, 140.5, 197.5, 293.5, 353.5, 431.5,
 ];
 
+/// Largest speed of the bead, um/s: sums of lines peak higher than a sine, and a fix that the tracker refuses because the bead
+/// moved too far looks like a lost frame.
+const BEAD_UM_PER_S: f64 = 250.0;
+
 impl Experiment {
     /// The experiment that tells an effect from the others that would do; `None`: no excitation does.
     pub fn separating(id: &str, alternatives: &[String]) -> Option<Self> {
@@ -99,7 +103,7 @@ impl Experiment {
         let setup = rig.bench_setup();
         let expected = setup.expected()?;
         let period_s = setup.sampling().period_s;
-        let limits = |share: f64| rig.limits(8.0 * share, 400.0 * share, 8.0 * share);
+        let limits = |share: f64| rig.limits(8.0 * share, BEAD_UM_PER_S * share, 8.0 * share);
         let band = |seconds: f64, seed: u64| {
             let mut plan = Plan::multisine(
                 &BAND_HZ,
