@@ -112,6 +112,17 @@ fn every_command_of_the_readme_runs() {
 }
 
 #[test]
+fn every_command_of_the_page_on_control_runs() {
+    let folder = run_page("docs/control.md");
+    let runs = std::fs::read_dir(folder.join("runs")).unwrap();
+    let learned = runs
+        .flatten()
+        .filter(|run| run.path().join("learned.toml").is_file());
+    assert_eq!(learned.count(), 2);
+    std::fs::remove_dir_all(folder).unwrap();
+}
+
+#[test]
 fn the_blocks_of_a_page_are_found() {
     let page = "a\n```sh\none\ntwo\n```\nb\n```toml\nx = 1\n```\n```sh\nthree\n```\n";
     assert_eq!(commands(page), "one\ntwo\nthree\n");

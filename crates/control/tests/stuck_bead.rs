@@ -100,7 +100,8 @@ fn a_stuck_bead_that_comes_free_never_moves_faster_than_2_um_per_frame_under_any
     for (name, controller) in controllers() {
         let slow = name == "mpc by clarabel";
         for case in cases.iter().skip(if slow { 3 } else { 0 }) {
-            for (gain, seed) in [(1.0, 0), (1.0, 1), (1.8, 2)] {
+            let rigs = [(1.0, 0), (1.0, 1), (1.8, 2)];
+            for (gain, seed) in rigs.into_iter().take(if slow { 1 } else { 3 }) {
                 let (fastest_um, flagged, away_um) = release(controller, *case, gain, seed);
                 assert!(
                     fastest_um <= 2.0,

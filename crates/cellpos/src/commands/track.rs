@@ -45,7 +45,7 @@ pub struct Args {
     /// Go on from the learned.toml of an earlier run.
     #[arg(long, requires = "learn")]
     learned: Option<PathBuf>,
-    /// Solver of mpc.
+    /// Solver of mpc; left out: that of controller.toml, active-set where it names none.
     #[arg(long, value_enum)]
     solver: Option<Solver>,
     /// The rig; left out: emulated.
