@@ -270,7 +270,7 @@ impl MpcWorkspace {
             SolverTerms::Recorded(SolverStatus::PreviousPlan | SolverStatus::FallbackPi)
         );
         let (end, iterations, active) = match &mut self.clarabel {
-            Some(_) if gave_up => (QpEnd::GaveUp, 0, 0),
+            _ if gave_up => (QpEnd::GaveUp, 0, 0),
             Some(solver) => solver.solve(&vectors, deadline),
             // No deadline: its iterations are bounded, and it ends the same way in a replay.
             None => {
@@ -307,6 +307,8 @@ impl MpcWorkspace {
                 },
             );
         }
+        // The next tick starts cold, whether the solver ran here or a record says how it ended.
+        self.working = WorkingSet::default();
         let planned = self
             .plan_um
             .get(self.used)
