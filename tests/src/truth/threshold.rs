@@ -52,6 +52,13 @@ pub fn above_threshold(hidden: &[Hidden], seed: u64) -> f64 {
         [Hidden::Repeats(rate)] => return rate / 5e-4,
         _ => {}
     }
+    // Beside others, missing and repeated frames are left out of the account.
+    let hidden: Vec<Hidden> = hidden
+        .iter()
+        .copied()
+        .filter(|h| !matches!(h, Hidden::Drops(_) | Hidden::Repeats(_)))
+        .collect();
+    let hidden = hidden.as_slice();
     let quiet = Nuisance {
         diffusion_um2_per_s: 0.0,
         localisation_um: 0.0,
