@@ -2,7 +2,7 @@
 
 use crate::outcome::Failure;
 use crate::rig_file::{CameraConfig, ClockKind, Frames, Rig, RigFile};
-use crate::setup::{self, AnyGuide, ReferenceSpec, Setup, SetupConfig};
+use crate::setup::{self, ReferenceSpec, Setup, SetupConfig};
 use cellpos_control::ControllerKind;
 use cellpos_control::design::bound_rms_um;
 use cellpos_plant::{Effect, Model};
@@ -10,7 +10,7 @@ use cellpos_record::{InputFile, RunEnd, RunMeta, RunWriter};
 use cellpos_rig::actuator::Session;
 use cellpos_runtime::live::{Operator, Threads};
 use cellpos_runtime::{
-    Core, EndRule, Finished, Request, RunSink, Statistics, Summary, live, virtual_run,
+    Core, EndRule, Finished, Guide, Request, RunSink, Statistics, Summary, live, virtual_run,
 };
 use serde::Serialize;
 use std::path::Path;
@@ -105,8 +105,8 @@ pub fn arm(
 }
 
 /// Runs the loop on the rig's clock.
-pub fn drive<S: RunSink>(
-    core: Core<AnyGuide>,
+pub fn drive<G: Guide + Send, S: RunSink>(
+    core: Core<G>,
     rig: &mut Rig,
     sink: S,
     end: EndRule,

@@ -230,21 +230,12 @@ impl HeldBead {
                 .map_err(Failure::failed)?
             {
                 frame_s.push(stamp.arrival_ns as f64 * 1e-9);
-                let sum: f64 = buffer.mono8.iter().map(|&p| f64::from(p)).sum();
-                grey.push(sum / buffer.mono8.len().max(1) as f64);
+                grey.push(mean_grey(&buffer));
             }
             self.send(self.neutral_um, self.neutral_um)?;
             self.next_ns += self.period_ns;
         }
-        let seen = find_edges(&switched_s, &frame_s, &grey).map_err(Failure::failed)?;
-        let estimate = delay_from_edges(&seen).map_err(Failure::failed)?;
-        Ok(DelayTest {
-            estimate,
-            seen,
-            switched_s,
-            frame_s,
-            grey,
-        })
+        DelayTest::evaluate(switched_s, frame_s, grey)
     }
 
     /// Rests at neutral until a bead has been seen for 100 ms on end, at most for 10 s, then holds it for half a second.
@@ -337,4 +328,34 @@ pub struct DelayTest {
     pub frame_s: Vec<f64>,
     /// Their mean grey levels.
     pub grey: Vec<f64>,
+}
+
+impl DelayTest {
+    /// The delay between the switching times of the LED and what the frames saw.
+    pub fn evaluate(
+        switched_s: Vec<f64>,
+        frame_s: Vec<f64>,
+        grey: Vec<f64>,
+    ) -> Result<Self, Failure> {
+        let seen = find_edges(&switched_s, &frame_s, &grey).map_err(Failure::failed)?;
+        let estimate = delay_from_edges(&seen).map_err(Failure::failed)?;
+        Ok(Self {
+            estimate,
+            seen,
+            switched_s,
+            frame_s,
+            grey,
+        })
+    }
+}
+
+/// Mean grey level of a frame.
+pub fn mean_grey(buffer: &FrameBuffer) -> f64 {
+    if buffer.bits > 8 {
+        let sum: f64 = buffer.mono16.iter().map(|&p| f64::from(p)).sum();
+        sum / buffer.mono16.len().max(1) as f64
+    } else {
+        let sum: f64 = buffer.mono8.iter().map(|&p| f64::from(p)).sum();
+        sum / buffer.mono8.len().max(1) as f64
+    }
 }

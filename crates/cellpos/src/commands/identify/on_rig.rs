@@ -3,24 +3,24 @@
 //!
 //! The loop freezes and thaws by its own rules when the bead is lost; a segment in which it did is measured again.
 
-use super::bench::{DelayTest, Setup};
+use super::bench::{DelayTest, Setup, mean_grey};
 use crate::outcome::Failure;
 use crate::rig_file::{ClockKind, Frames, RigFile};
-use crate::setup;
+use crate::{session, setup};
 use cellpos_control::design::DesignPlant;
 use cellpos_control::{ControllerFile, Pi};
 use cellpos_emulator::WorldConfig;
-use cellpos_ident::delay::{delay_from_edges, dithered_edges, find_edges};
+use cellpos_ident::delay::dithered_edges;
 use cellpos_ident::excitation::Limits as ShapeLimits;
 use cellpos_ident::experiment::{Plan, RecordedSegment, Span};
 use cellpos_plant::Model;
 use cellpos_rig::actuator::Session;
 use cellpos_rig::clock::monotonic_ns;
 use cellpos_rig::{Camera, Clock, FrameBuffer};
-use cellpos_runtime::live::{self, Operator, Threads};
+use cellpos_runtime::live::Operator;
 use cellpos_runtime::{
     Core, EndRule, Event, Guide, GuideInput, GuideOutput, Life, RunSink, Stage, Statistics,
-    Summary, TickFlags, TickRecord, virtual_run,
+    Summary, TickFlags, TickRecord,
 };
 
 /// Ticks at rest between closing the loop and the first segment.
@@ -229,37 +229,14 @@ impl OnRig {
             ticks: Vec::new(),
             progress,
         };
-        let end = EndRule::default();
-        let operator = Operator::default();
-        let finished = if rig.clock.is_virtual() {
-            virtual_run::run(
-                core,
-                &rig.clock,
-                rig.source.as_mut(),
-                rig.actuator.as_mut(),
-                sink,
-                Statistics::default(),
-                end,
-                |_| operator.take(),
-            )
-        } else {
-            let threads = if self.best_effort {
-                Threads::best_effort()
-            } else {
-                Threads::real_time()
-            };
-            live::run(
-                core,
-                rig.source.as_mut(),
-                rig.actuator.as_mut(),
-                sink,
-                Statistics::default(),
-                end,
-                &threads,
-                &operator,
-            )
-        }
-        .map_err(Failure::failed)?;
+        let finished = session::drive(
+            core,
+            &mut rig,
+            sink,
+            EndRule::default(),
+            self.best_effort,
+            &Operator::default(),
+        )?;
         let ticks = finished.sink.ticks;
         let rows = Rows::of(&ticks, timing.period_ns(), timing.camera_delay_ms);
         let records: Vec<RecordedSegment> = schedule
@@ -319,25 +296,7 @@ impl OnRig {
             }
         }
         board.led(false).map_err(Failure::failed)?;
-        let seen = find_edges(&switched_s, &frame_s, &grey).map_err(Failure::failed)?;
-        let estimate = delay_from_edges(&seen).map_err(Failure::failed)?;
-        Ok(DelayTest {
-            estimate,
-            seen,
-            switched_s,
-            frame_s,
-            grey,
-        })
-    }
-}
-
-fn mean_grey(buffer: &FrameBuffer) -> f64 {
-    if buffer.bits > 8 {
-        let sum: f64 = buffer.mono16.iter().map(|&p| f64::from(p)).sum();
-        sum / buffer.mono16.len().max(1) as f64
-    } else {
-        let sum: f64 = buffer.mono8.iter().map(|&p| f64::from(p)).sum();
-        sum / buffer.mono8.len().max(1) as f64
+        DelayTest::evaluate(switched_s, frame_s, grey)
     }
 }
 
