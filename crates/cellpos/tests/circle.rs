@@ -225,3 +225,28 @@ fn a_run_of_track_is_data_wherever_its_bead_rested() {
     let augmented = Model::load_file(&folder.path().join("a.toml")).unwrap();
     assert!((augmented.working_point_um - 20.0).abs() < 0.05);
 }
+
+#[test]
+fn frames_that_came_without_a_fix_are_no_dropped_frames() {
+    let folder = tempfile::tempdir().unwrap();
+    // The bead is hidden for 8 ms, ten times a second: its frames come, and show nothing.
+    let events: Vec<String> = (0..40)
+        .map(|k| {
+            let at_s = 2.0 + 0.1 * f64::from(k);
+            format!("{{ kind = \"lose-bead\", at_s = {at_s}, for_s = 0.008 }}")
+        })
+        .collect();
+    let faults = format!("[emulator.faults]\nevent = [{}]\n", events.join(", "));
+    std::fs::write(folder.path().join("rig.toml"), faults).unwrap();
+    let track =
+        "track --target 0um --sine 3um@10Hz --duration 8s --clock virtual --rig rig.toml --json";
+    let run = succeed(folder.path(), track).json();
+    assert!(number(&run, "fixes_lost") > 200.0, "{run}");
+    let line = format!(
+        "reconcile --model eq6 --data {} --max-effects 1 --json --out a.toml",
+        run["run"].as_str().unwrap()
+    );
+    let r = succeed(folder.path(), &line).json();
+    named(&r, "time-delay");
+    assert_eq!(r["effects"].as_array().unwrap().len(), 1, "{r}");
+}

@@ -19,6 +19,8 @@ pub struct Record {
     pub filled: Vec<bool>,
     /// Finest step of the position column \[um\], for telling repeats from chance.
     pub resolution_um: f64,
+    /// Rows whose frame is known to have come, though it showed no bead that could be trusted: it was not dropped.
+    pub unseen: Vec<bool>,
 }
 
 impl Record {
@@ -121,6 +123,7 @@ impl Record {
             bead_um: bead,
             filled,
             resolution_um,
+            unseen: vec![false; rows],
         })
     }
 
@@ -185,6 +188,7 @@ impl Record {
             bead_um: self.bead_um[from..to].to_vec(),
             filled: self.filled[from..to].to_vec(),
             resolution_um: self.resolution_um,
+            unseen: self.unseen[from..to].to_vec(),
         }
     }
 }
@@ -238,6 +242,7 @@ pub(crate) fn canonical(mut records: Vec<Record>) -> Vec<Record> {
                 j.pzt_um.extend_from_slice(&r.pzt_um);
                 j.bead_um.extend_from_slice(&r.bead_um);
                 j.filled.extend_from_slice(&r.filled);
+                j.unseen.extend_from_slice(&r.unseen);
                 j.resolution_um = j.resolution_um.min(r.resolution_um);
                 if r.name < j.name {
                     j.name = r.name;

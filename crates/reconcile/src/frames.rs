@@ -51,8 +51,18 @@ pub(crate) fn count(records: &[Record]) -> FrameCounts {
     };
     for r in records {
         let n = r.rows();
-        c.rows += n;
-        c.missing += r.bead_um.iter().filter(|b| b.is_nan()).count();
+        // What lies before the first bead seen and behind the last says nothing of the camera.
+        let seen = |b: &f64| b.is_finite();
+        if let (Some(first), Some(last)) = (
+            r.bead_um.iter().position(seen),
+            r.bead_um.iter().rposition(seen),
+        ) {
+            c.rows += last - first + 1;
+            let unseen = |k: usize| r.unseen.get(k).is_some_and(|u| *u);
+            c.missing += (first..=last)
+                .filter(|&k| r.bead_um[k].is_nan() && !unseen(k))
+                .count();
+        }
         let mut repeated = vec![false; n];
         let step = r.resolution_um;
         let mut near = 0usize;

@@ -173,7 +173,10 @@ fn gap(r: &mut Report, result: &Reconciliation) {
         1e3 * g.floor,
         100.0 * g.closure()
     ));
-    let mut t = Table::new([Column::left("step"), Column::right("RMS innovation [nm]")]);
+    let mut t = Table::new([
+        Column::left("model, as the search went on"),
+        Column::right("RMS innovation [nm]"),
+    ]);
     for s in &g.steps {
         let name = if s.effects.is_empty() {
             match s.base_gain {
@@ -239,8 +242,16 @@ fn traces(r: &mut Report, result: &Reconciliation) {
             )
             .panel(
                 Panel::new(Axis::linear("time", "s"), Axis::linear("residual", "um"))
-                    .series(Series::line("before", &t.time_s, &t.residual_before_um).thin())
-                    .series(Series::line("after", &t.time_s, &t.residual_after_um).thin()),
+                    .series(
+                        Series::line("before", &t.time_s, &t.residual_before_um)
+                            .thin()
+                            .color(1),
+                    )
+                    .series(
+                        Series::line("after", &t.time_s, &t.residual_after_um)
+                            .thin()
+                            .color(2),
+                    ),
             )
             .share_x(),
         );

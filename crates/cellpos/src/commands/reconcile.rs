@@ -3,7 +3,7 @@
 pub mod collect;
 pub mod experiment;
 
-use crate::commands::identify::on_rig::OnRig;
+use crate::commands::identify::on_rig::{OnRig, is_unseen};
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
 use crate::rig_file::{ClockKind, Frames, RigFile};
 use cellpos_plant::{Model, Noise, TransferFunction};
@@ -409,7 +409,17 @@ fn read_run(path: &Path, name: &str) -> Result<Record, Failure> {
     let time_s: Vec<f64> = (0..record.len())
         .map(|k| record.start_s + k as f64 * record.step_s)
         .collect();
-    Record::from_rows(name, &time_s, &record.pzt_um, &record.bead_um).map_err(refused)
+    let (ticks, _) = run.ticks().map_err(Failure::input)?;
+    let mut read =
+        Record::from_rows(name, &time_s, &record.pzt_um, &record.bead_um).map_err(refused)?;
+    let first_seq = ticks.first().map_or(0, |t| t.seq);
+    for tick in ticks.iter().filter(|t| is_unseen(t)) {
+        let row = usize::try_from(tick.seq.saturating_sub(first_seq)).unwrap_or(usize::MAX);
+        if let Some(unseen) = read.unseen.get_mut(row) {
+            *unseen = true;
+        }
+    }
+    Ok(read)
 }
 
 /// Where the bead of a closed loop rested: the mean of what was commanded while the loop ran, um.

@@ -56,6 +56,8 @@ pub struct Acquired {
     /// The whole run from where the loop was closed, row by row: commanded displacement, um, and bead position, um, NaN
     /// without one.
     pub rows: (Vec<f64>, Vec<f64>),
+    /// Its rows whose frame came, but showed no bead to be trusted.
+    pub unseen: Vec<bool>,
     /// Why segments are missing, if any are.
     pub trouble: Option<String>,
 }
@@ -256,6 +258,7 @@ impl OnRig {
             wait_s: rows.wait_s(),
             path_s: 1e-9 * rows.path_ns as f64,
             rows: (rows.input, rows.output),
+            unseen: rows.unseen,
             trouble,
         })
     }
@@ -300,6 +303,12 @@ impl OnRig {
     }
 }
 
+/// Whether a frame came at this tick and showed no bead to be trusted.
+pub fn is_unseen(tick: &TickRecord) -> bool {
+    let came = tick.verdict != 255 && !tick.flags.has(TickFlags::TIMER);
+    came && !tick.measured_um.is_finite()
+}
+
 fn trouble(summary: &Summary, done: usize, wanted: usize) -> Option<String> {
     let lost = (done < wanted).then(|| {
         format!(
@@ -318,6 +327,8 @@ struct Rows {
     input: Vec<f64>,
     output: Vec<f64>,
     usable: Vec<bool>,
+    /// The frame came, without a bead to be trusted.
+    unseen: Vec<bool>,
     /// Sum and number of the times from the arrival of a frame to its tick, ns.
     waited: (i64, i64),
     /// Row of each tick since the loop was closed.
@@ -355,6 +366,7 @@ impl Rows {
             input: Vec::new(),
             output: Vec::new(),
             usable: Vec::new(),
+            unseen: Vec::new(),
             waited: (0, 0),
             of_tick: Vec::new(),
             path_ns: 0,
@@ -383,6 +395,7 @@ impl Rows {
                 rows.input.push(held_um);
                 rows.output.push(f64::NAN);
                 rows.usable.push(true);
+                rows.unseen.push(false);
             }
             let late_ns = tick.time_ns - tick.mid_exposure_ns - rows.path_ns;
             let on_time = new_frame && !has(TickFlags::LOST) && 2 * late_ns < period_ns;
@@ -392,6 +405,7 @@ impl Rows {
             }
             rows.input[row] = tick.command_um;
             rows.output[row] = if on_time { tick.measured_um } else { f64::NAN };
+            rows.unseen[row] = is_unseen(tick);
             rows.usable[row] = tick.life == Life::Running as u8 && !has(TickFlags::FREEZE);
             // A record that was lost leaves its tick's place to the one behind it.
             let at = usize::try_from(tick.seq.saturating_sub(first_seq)).unwrap_or(0);

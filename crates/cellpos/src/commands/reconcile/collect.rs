@@ -85,7 +85,9 @@ pub fn run_experiment(
         .map(|k| k as f64 * plan.period_s)
         .collect();
     let name = format!("collected-{}-{seed}", experiment.name());
-    let record = Record::from_rows(&name, &time_s, &pzt_um, &bead_um).map_err(super::refused)?;
+    let mut record =
+        Record::from_rows(&name, &time_s, &pzt_um, &bead_um).map_err(super::refused)?;
+    record.unseen = acquired.unseen;
     let missing = record.rows() - record.frames();
     if 50 * missing > record.rows() {
         tracing::warn!(
