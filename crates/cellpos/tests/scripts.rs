@@ -387,3 +387,29 @@ fn a_run_whose_table_is_damaged_is_not_gone_on_with_and_a_torn_last_line_is_no_d
     let page = std::fs::read_to_string(run.join("report.html")).unwrap();
     assert!(page.contains("The last of 2 sessions came to its end"));
 }
+
+#[test]
+fn a_script_that_looks_at_a_length_is_refused_where_nobody_measures_one() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    std::fs::write(at.join("cell.toml"), "[emulator.cell]\n").unwrap();
+    let hold = "[[step]]\ndo = \"hold\"\nduration = \"200ms\"\n";
+    let stop = format!("name = \"stop\"\n[stop]\nlength_change_above = \"50um\"\n{hold}");
+    let wait = format!(
+        "name = \"wait\"\n{hold}[[step]]\ndo = \"wait\"\nfor = \"cell-length\"\nabove = \"1um\"\ntimeout = \"2s\"\n"
+    );
+    for (name, text) in [("stop.toml", stop), ("wait.toml", wait)] {
+        std::fs::write(at.join(name), text).unwrap();
+        for more in [
+            &["--dry"][..],
+            &["--dry", "--rig", "cell.toml", "--frames", "on"],
+        ] {
+            let (code, _, err) = cellpos(at, &[&["run", name], more].concat());
+            assert_eq!(code, Some(2), "{err}");
+            assert!(err.contains("emulator.cell"), "{err}");
+        }
+        let run = json(at, &["run", name, "--dry", "--rig", "cell.toml", "--json"]);
+        assert_eq!(run["outcome"], "done", "{name}");
+    }
+    assert_eq!(std::fs::read_dir(at.join("runs")).unwrap().count(), 2);
+}

@@ -290,6 +290,17 @@ fn start(args: &Args, ready: Ready) -> CommandResult {
     let (script, plan) = reference.script()?.ok_or_else(|| {
         Failure::bad_input("the run has no script", "resume a run of cellpos run")
     })?;
+    if plan.needs_length() && (config.frames || !file.is_emulated() || file.emulator.cell.is_none())
+    {
+        return Err(Failure::bad_input(
+            format!(
+                "{}: a wait for cell-length or a stop on length_change_above, and nobody measures a length here: the loop follows \
+                 a bead, or the middle of a cell",
+                script.file
+            ),
+            "an emulated rig with a table [emulator.cell] and --frames off (the default of --dry) delivers one",
+        ));
+    }
     let plan = Arc::new(plan);
     let frames = if config.frames {
         Frames::On

@@ -187,6 +187,18 @@ impl Plan {
         &self.stop
     }
 
+    /// Whether a wait or a stop of the script looks at the length of the cell.
+    pub fn needs_length(&self) -> bool {
+        let waits = self.segments.iter().any(|s| {
+            let condition = match &s.motion {
+                Motion::Wait { condition, .. } => Some(*condition),
+                _ => None,
+            };
+            matches!(condition, Some(Condition::CellLength { .. }))
+        });
+        waits || self.stop.length_change_above_um.is_some()
+    }
+
     /// When the plan's clock next stands still for a wait, from a segment on, s; infinity: never.
     pub(crate) fn next_wait_s(&self, segment: usize) -> f64 {
         let index = self.waits.partition_point(|(number, _)| *number < segment);
