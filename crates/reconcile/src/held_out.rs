@@ -4,7 +4,7 @@
 use crate::fit::{Context, Fit};
 use crate::map::{BAND_EDGES_HZ, DiscrepancyMap};
 use crate::parallel;
-use crate::problem::Mask;
+use crate::problem::{Mask, split_in_time};
 use crate::result::{BandGap, Interval, RecordGap};
 
 /// What the held-out check found.
@@ -67,14 +67,7 @@ pub(crate) fn check(ctx: &Context<'_>, fit: &Fit, threads: usize) -> HeldOut {
         sigma * (results.iter().map(pick).sum::<f64>() / total).sqrt()
     };
     // Time: the first 60 % of every record predict the rest.
-    let train: Mask = records
-        .iter()
-        .map(|r| std::iter::once(0..r.u.len() * 6 / 10).collect())
-        .collect();
-    let test: Mask = records
-        .iter()
-        .map(|r| std::iter::once(r.u.len() * 6 / 10..r.u.len()).collect())
-        .collect();
+    let (train, test) = split_in_time(records);
     let indices: Vec<usize> = (0..fit.parts.len()).collect();
     let whole = (!fit.parts.is_empty()).then(|| ctx.refit(fit, &train, 4).chi2_on(&test));
     let unconfirmed = parallel::map(&indices, threads, |&i| {

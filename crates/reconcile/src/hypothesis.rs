@@ -3,7 +3,7 @@
 
 use crate::fit::{Context, Fit};
 use crate::linear::dot;
-use crate::problem::Mask;
+use crate::problem::{Mask, split_in_time};
 use nalgebra::{DMatrix, DVector};
 use std::f64::consts::TAU;
 
@@ -40,14 +40,7 @@ struct Candidate {
 pub(crate) fn hypothesis(ctx: &Context<'_>, fit: &Fit) -> Option<Hypothesis> {
     let dt = ctx.problem.base.sample_s;
     let records = &ctx.problem.records;
-    let train: Mask = records
-        .iter()
-        .map(|r| std::iter::once(0..r.u.len() * 6 / 10).collect())
-        .collect();
-    let test: Mask = records
-        .iter()
-        .map(|r| std::iter::once(r.u.len() * 6 / 10..r.u.len()).collect())
-        .collect();
+    let (train, test) = split_in_time(records);
     let (residual, sim) = ctx.residual(fit);
     let mut library: Vec<Candidate> = Vec::new();
     let mut add = |name: &str, unit: &str, speed: bool, f: &dyn Fn(usize, usize) -> f64| {

@@ -11,6 +11,15 @@ const RUN_IN_S: f64 = 0.5;
 /// Which rows of which record count in a fit: ranges per record.
 pub(crate) type Mask = Vec<Vec<Range<usize>>>;
 
+/// The first 60 % of every record, to fit on, and the rest, to judge by.
+pub(crate) fn split_in_time(records: &[Prepared]) -> (Mask, Mask) {
+    let part = |range: fn(usize) -> Range<usize>| -> Mask {
+        let of = |r: &Prepared| vec![range(r.u.len())];
+        records.iter().map(of).collect()
+    };
+    (part(|n| 0..n * 6 / 10), part(|n| n * 6 / 10..n))
+}
+
 /// One record, ready.
 #[derive(Debug, Clone)]
 pub(crate) struct Prepared {

@@ -188,6 +188,20 @@ fn replace(ctx: &Context<'_>, mut fit: Fit, mask: &Mask, effort: Effort) -> (Fit
     for _ in 0..3 {
         let mut rivals: Vec<Vec<Rival>> = Vec::new();
         let mut better: Option<Fit> = None;
+        let mut consider = |other: Fit, part: Part, list: &mut Vec<Rival>| {
+            list.push(Rival {
+                id: part.variant().id,
+                chi2: other.chi2,
+                part,
+            });
+            if priced(ctx, &other) < priced(ctx, &fit) - 1.0
+                && better
+                    .as_ref()
+                    .is_none_or(|b| priced(ctx, &other) < priced(ctx, b))
+            {
+                better = Some(other);
+            }
+        };
         for i in 0..fit.parts.len() {
             let mut parts = fit.parts.clone();
             let id = parts.remove(i).variant().id;
@@ -205,18 +219,7 @@ fn replace(ctx: &Context<'_>, mut fit: Fit, mask: &Mask, effort: Effort) -> (Fit
                 let Some(part) = other.parts.last().cloned() else {
                     continue;
                 };
-                list.push(Rival {
-                    id: part.variant().id,
-                    chi2: other.chi2,
-                    part,
-                });
-                if priced(ctx, &other) < priced(ctx, &fit) - 1.0
-                    && better
-                        .as_ref()
-                        .is_none_or(|b| priced(ctx, &other) < priced(ctx, b))
-                {
-                    better = Some(other);
-                }
+                consider(other, part, &mut list);
             }
             // Screening is linear; a lag of another shape need not look promising from afar. Those of the same length
             // are fitted for certain.
@@ -241,18 +244,7 @@ fn replace(ctx: &Context<'_>, mut fit: Fit, mask: &Mask, effort: Effort) -> (Fit
                 ctx.fit_from(parts, Some(fit.soft), mask, 12)
             }) {
                 let part = other.parts[i].clone();
-                list.push(Rival {
-                    id: part.variant().id,
-                    chi2: other.chi2,
-                    part,
-                });
-                if priced(ctx, &other) < priced(ctx, &fit) - 1.0
-                    && better
-                        .as_ref()
-                        .is_none_or(|b| priced(ctx, &other) < priced(ctx, b))
-                {
-                    better = Some(other);
-                }
+                consider(other, part, &mut list);
             }
             rivals.push(list);
         }

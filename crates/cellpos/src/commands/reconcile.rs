@@ -9,7 +9,7 @@ use crate::rig_file::{ClockKind, Frames, RigFile};
 use cellpos_plant::{Model, Noise, TransferFunction};
 use cellpos_reconcile::{Options, ReconcileError, Reconciliation, Record, Verdict, reconcile};
 use cellpos_record::RunReader;
-use cellpos_runtime::{Life, TickFlags};
+use cellpos_runtime::{Life, TickFlags, TickRecord};
 use cellpos_table::{ColumnRef, Table};
 use collect::{Collected, Collecting};
 use std::path::{Path, PathBuf};
@@ -101,9 +101,12 @@ pub fn run(args: Args) -> CommandResult {
     let mut records = Vec::new();
     let mut rests_um = Vec::new();
     for file in &files {
-        records.push(read(file, &args)?);
         if is_run(file) {
-            rests_um.extend(rest_of_run_um(file)?);
+            let (record, rest_um) = read_run(file)?;
+            records.push(record);
+            rests_um.extend(rest_um);
+        } else {
+            records.push(read(file, &args)?);
         }
     }
     let threads = args
@@ -346,14 +349,15 @@ fn is_run(path: &Path) -> bool {
     path.join("ticks.arrow").exists()
 }
 
-fn read(path: &Path, args: &Args) -> Result<Record, Failure> {
-    let name = path.file_stem().map_or_else(
+fn record_name(path: &Path) -> String {
+    path.file_stem().map_or_else(
         || path.display().to_string(),
         |s| s.to_string_lossy().into_owned(),
-    );
-    if is_run(path) {
-        return read_run(path, &name);
-    }
+    )
+}
+
+fn read(path: &Path, args: &Args) -> Result<Record, Failure> {
+    let name = record_name(path);
     let bytes = std::fs::read(path).map_err(|e| {
         Failure::bad_input(
             format!("cannot read {}: {e}", path.display()),
@@ -402,16 +406,17 @@ fn read(path: &Path, args: &Args) -> Result<Record, Failure> {
     Record::from_rows(&name, &t, &u, &y).map_err(refused)
 }
 
-/// A run folder, of an open or a closed loop: the commands given, and the positions as the camera delivered them.
-fn read_run(path: &Path, name: &str) -> Result<Record, Failure> {
+/// A run folder, of an open or a closed loop: the commands given, and the positions as the camera delivered them; and where
+/// its bead rested.
+fn read_run(path: &Path) -> Result<(Record, Option<f64>), Failure> {
     let run = RunReader::open(path).map_err(Failure::input)?;
     let record = run.to_record().map_err(Failure::input)?;
     let time_s: Vec<f64> = (0..record.len())
         .map(|k| record.start_s + k as f64 * record.step_s)
         .collect();
     let (ticks, _) = run.ticks().map_err(Failure::input)?;
-    let mut read =
-        Record::from_rows(name, &time_s, &record.pzt_um, &record.bead_um).map_err(refused)?;
+    let mut read = Record::from_rows(&record_name(path), &time_s, &record.pzt_um, &record.bead_um)
+        .map_err(refused)?;
     let first_seq = ticks.first().map_or(0, |t| t.seq);
     for tick in ticks.iter().filter(|t| is_unseen(t)) {
         let row = usize::try_from(tick.seq.saturating_sub(first_seq)).unwrap_or(usize::MAX);
@@ -419,19 +424,17 @@ fn read_run(path: &Path, name: &str) -> Result<Record, Failure> {
             *unseen = true;
         }
     }
-    Ok(read)
+    Ok((read, rest_um(&ticks)))
 }
 
 /// Where the bead of a closed loop rested: the mean of what was commanded while the loop ran, um.
-fn rest_of_run_um(path: &Path) -> Result<Option<f64>, Failure> {
-    let run = RunReader::open(path).map_err(Failure::input)?;
-    let (ticks, _) = run.ticks().map_err(Failure::input)?;
+fn rest_um(ticks: &[TickRecord]) -> Option<f64> {
     let held = ticks.iter().filter(|t| {
         t.life == Life::Running as u8 && !t.flags.has(TickFlags::FREEZE) && t.command_um.is_finite()
     });
     let (sum_um, count) = held.fold((0.0, 0_usize), |(s, n), t| (s + t.command_um, n + 1));
     // Ten seconds of a held bead move it by less than 10 um: 2 nm of PZT.
-    Ok((count >= 1000).then(|| sum_um / count as f64))
+    (count >= 1000).then(|| sum_um / count as f64)
 }
 
 /// Runs hold a bead wherever its rest is, and that is another place every day: where no record comes near the model's

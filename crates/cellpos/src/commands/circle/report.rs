@@ -3,6 +3,7 @@
 use super::Circle;
 use super::margins::{AMPLITUDES_UM, LoopMargins, Response};
 use super::stage::{Stage, Tracked};
+use cellpos_reconcile::Reconciliation;
 use cellpos_report::{Axis, Column, Figure, Panel, Report, Series, Status, Table};
 use std::path::Path;
 
@@ -135,25 +136,24 @@ fn traces(circle: &Circle) -> Figure {
     plot
 }
 
+/// For example `named: driver-lag + time-delay`.
+fn verdict_and_names(circle: &Circle) -> String {
+    let Reconciliation {
+        verdict, effects, ..
+    } = &circle.reconciled;
+    let names: Vec<&str> = effects.iter().map(|e| e.id.as_str()).collect();
+    format!("{}: {}", verdict.word(), names.join(" + "))
+}
+
 /// The page.
 pub fn report(circle: &Circle, gap: &Path) -> Report {
     let mut r = Report::new("Closed circle: identify, reconcile, design again, track");
-    let verdict = circle.reconciled.verdict;
-    let names: Vec<&str> = circle
-        .reconciled
-        .effects
-        .iter()
-        .map(|e| e.id.as_str())
-        .collect();
-    let status = match verdict {
+    let status = match circle.reconciled.verdict {
         cellpos_reconcile::Verdict::Unknown => Status::Bad,
         cellpos_reconcile::Verdict::Ambiguous => Status::Warning,
         _ => Status::Good,
     };
-    r.note(
-        status,
-        &format!("{}: {}", verdict.word(), names.join(" + ")),
-    );
+    r.note(status, &verdict_and_names(circle));
 
     r.section("Identified");
     let model = &circle.identified.result.judged.model;
@@ -305,18 +305,7 @@ fn margins_table(circle: &Circle) -> Table {
 pub fn text(circle: &Circle, out: &Path, html: &Path) -> String {
     use std::fmt::Write as _;
     let mut s = String::new();
-    let names: Vec<&str> = circle
-        .reconciled
-        .effects
-        .iter()
-        .map(|e| e.id.as_str())
-        .collect();
-    let _ = writeln!(
-        s,
-        "verdict: {}: {}",
-        circle.reconciled.verdict.word(),
-        names.join(" + ")
-    );
+    let _ = writeln!(s, "verdict: {}", verdict_and_names(circle));
     for e in &circle.reconciled.effects {
         for (name, p) in &e.parameters {
             let _ = writeln!(

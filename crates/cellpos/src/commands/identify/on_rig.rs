@@ -184,8 +184,7 @@ impl OnRig {
         progress: &mut (dyn FnMut(usize) + Send),
     ) -> Result<Acquired, Failure> {
         let schedule = plan.schedule(todo);
-        let mut rig = self.file.connect(self.clock, self.frames)?;
-        rig.expect(&self.model);
+        let mut rig = session::connect(&self.file, self.clock, self.frames, &self.model)?;
         let mut controller = self.controller;
         let board = rig.actuator.info();
         let own = controller.limits;
