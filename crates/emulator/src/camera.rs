@@ -39,6 +39,8 @@ pub struct FrameInfo {
 pub struct PositionFix {
     /// Length of the cell along the channel, um; NaN for a bead.
     pub length_um: f64,
+    /// Projected area of the cell, um^2; NaN for a bead, or when it is not measured.
+    pub area_um2: f64,
     /// As of the frame that would have been delivered.
     pub info: FrameInfo,
     /// Measured position along the channel, um; NaN unless the verdict is good.

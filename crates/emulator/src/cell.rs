@@ -9,6 +9,7 @@
 use crate::config::WorldError;
 use crate::random::Gaussian;
 use serde::{Deserialize, Serialize};
+use std::f64::consts::FRAC_PI_4;
 
 /// A cell and its constriction, the table `[emulator.cell]` of rig.toml. Every key may be left out.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -34,7 +35,7 @@ pub struct CellConfig {
     pub recovery_last_s: f64,
     /// Passages over which it tires; more change nothing.
     pub fatigue_passages: u32,
-    /// Noise of the measured length, um RMS.
+    /// Noise of the measured length, um RMS; the measured area is that of the measured length.
     pub noise_um: f64,
 }
 
@@ -93,6 +94,20 @@ impl CellConfig {
             within(key, value, 1e-4, 100.0, "0.0001..100 s")?;
         }
         Ok(())
+    }
+
+    /// Width of the cell at a length, um: it keeps its volume.
+    ///
+    /// Length L and width W are the axes of an ellipsoid of revolution that is a sphere of diameter D = `rest_um`
+    /// without load: L W^2 = D^3.
+    pub(crate) fn width_um(&self, length_um: f64) -> f64 {
+        self.rest_um * (self.rest_um / length_um).sqrt()
+    }
+
+    /// Projected area of the cell at a length, um^2: that of the ellipse with the axes L and W of
+    /// [`CellConfig::width_um`], pi/4 D^1.5 L^0.5.
+    pub(crate) fn area_um2(&self, length_um: f64) -> f64 {
+        FRAC_PI_4 * length_um * self.width_um(length_um)
     }
 
     /// How far a position is inside: 0 outside, 1 inside, smooth in between.
@@ -161,9 +176,17 @@ impl Cell {
         self.length_um
     }
 
-    /// Noise of the next measured length, um.
-    pub(crate) fn noise_um(&mut self) -> f64 {
-        self.config.noise_um * self.noise.normal()
+    /// Length (um) and projected area (um^2) as measured of a cell of a true length.
+    ///
+    /// The area is that of the measured length, so that both have the same noise. Both are NaN where the noise would
+    /// leave no length at all.
+    pub(crate) fn measured(&mut self, length_um: f64) -> (f64, f64) {
+        let noisy_um = length_um + self.config.noise_um * self.noise.normal();
+        if noisy_um > 0.0 {
+            (noisy_um, self.config.area_um2(noisy_um))
+        } else {
+            (f64::NAN, f64::NAN)
+        }
     }
 }
 
@@ -194,6 +217,39 @@ mod tests {
         assert!((stretches[179] - 2.86).abs() < 1e-6);
         assert!((stretches[90] - (3.80 - 0.94 * 90.0 / 179.0)).abs() < 1e-6);
         assert_eq!(stretches[199], stretches[180], "it tires no further");
+    }
+
+    #[test]
+    fn the_cell_keeps_its_volume_and_is_a_sphere_at_rest() {
+        let config = CellConfig::default();
+        let rest_um = config.rest_um;
+        assert!((config.width_um(rest_um) - rest_um).abs() < 1e-12);
+        let disc_um2 = std::f64::consts::PI * rest_um * rest_um / 4.0;
+        assert!((config.area_um2(rest_um) - disc_um2).abs() < 1e-12 * disc_um2);
+        let sphere_um3 = std::f64::consts::PI * rest_um.powi(3) / 6.0;
+        for stretch in [0.5, 1.0, 2.86, 3.80] {
+            let length_um = stretch * rest_um;
+            let width_um = config.width_um(length_um);
+            let volume_um3 = std::f64::consts::PI / 6.0 * length_um * width_um * width_um;
+            assert!((volume_um3 / sphere_um3 - 1.0).abs() < 1e-12, "{stretch}");
+            let closed_um2 = FRAC_PI_4 * rest_um.powf(1.5) * length_um.sqrt();
+            assert!((config.area_um2(length_um) / closed_um2 - 1.0).abs() < 1e-12);
+        }
+    }
+
+    #[test]
+    fn length_and_area_are_measured_with_the_same_noise() {
+        let config = CellConfig::default();
+        let mut cell = Cell::new(config, 7);
+        let mut squares = 0.0;
+        for _ in 0..2000 {
+            let (length_um, area_um2) = cell.measured(20.0);
+            squares += (length_um - 20.0).powi(2);
+            assert_eq!(area_um2, config.area_um2(length_um));
+        }
+        let rms_um = (squares / 2000.0).sqrt();
+        // The standard deviation of that estimate is 1/sqrt(2 * 2000) = 1.6 %.
+        assert!((rms_um / config.noise_um - 1.0).abs() < 0.08, "{rms_um}");
     }
 
     #[test]

@@ -336,15 +336,19 @@ impl World {
         let verdict = self.verdict(&exposure, mean_um);
         let good = verdict == Verdict::Good;
         let or_nan = |value| if good { value } else { f64::NAN };
+        let (length_um, area_um2) = match &mut self.cell {
+            // As it was in the middle of the exposure.
+            Some(cell) if good => exposure
+                .samples
+                .get(EXPOSURE_STEPS / 2)
+                .map_or((f64::NAN, f64::NAN), |sample| {
+                    cell.measured(sample.length_um)
+                }),
+            _ => (f64::NAN, f64::NAN),
+        };
         Some(PositionFix {
-            length_um: match &mut self.cell {
-                // As it was in the middle of the exposure.
-                Some(cell) if good => exposure
-                    .samples
-                    .get(EXPOSURE_STEPS / 2)
-                    .map_or(f64::NAN, |sample| sample.length_um + cell.noise_um()),
-                _ => f64::NAN,
-            },
+            length_um,
+            area_um2,
             info,
             x_um: or_nan(mean_um + noise_um),
             variance_um2: or_nan(self.localisation_um * self.localisation_um),

@@ -218,6 +218,7 @@ impl PositionSource for EmulatedPositions {
                 track: None,
                 snr: fix.snr,
                 length_um: fix.length_um,
+                area_um2: fix.area_um2,
                 true_um,
                 true_pzt_um,
             }),

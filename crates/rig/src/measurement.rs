@@ -24,6 +24,8 @@ pub struct Measurement {
     pub snr: f64,
     /// Length of the cell along the channel, um; NaN for a bead, or when it is not measured.
     pub length_um: f64,
+    /// Projected area of the cell, um^2; NaN for a bead, or when it is not measured.
+    pub area_um2: f64,
     /// True bead position at `ready_ns`, um (emulated rig only, else NaN).
     pub true_um: f64,
     /// True PZT displacement at `ready_ns`, um (emulated rig only, else NaN).

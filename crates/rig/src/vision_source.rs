@@ -106,6 +106,7 @@ impl<C: Camera> PositionSource for VisionSource<C> {
                 (s.state, s.decision)
             })),
             length_um: f64::NAN,
+            area_um2: f64::NAN,
             snr: fix.map_or(f64::NAN, |f| f.snr),
             true_um: stamp.true_um,
             true_pzt_um: stamp.true_pzt_um,

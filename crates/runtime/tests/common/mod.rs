@@ -56,6 +56,7 @@ pub fn measurement(k: u64, position_um: f64) -> Measurement {
         verdict: Verdict::Good,
         track: None,
         length_um: f64::NAN,
+        area_um2: f64::NAN,
         snr: 40.0,
         true_um: f64::NAN,
         true_pzt_um: f64::NAN,
