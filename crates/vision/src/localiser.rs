@@ -20,6 +20,8 @@ const MAX_RECENTRES: u32 = 4;
 const NARROW_RADII: f64 = 1.3;
 /// Steps in the length of a streak per fit.
 const STRETCHES: usize = 2;
+/// The same beside neighbours: what is taken off the window for them changes with the length, which slows the search down.
+const STRETCHES_BESIDE: usize = 4;
 /// A streak's length is looked for within this factor of the expected one.
 const MOST_STRETCH: f64 = 2.5;
 /// Relative difference of the lengths of the secant.
@@ -203,11 +205,19 @@ impl Localiser {
         taken
     }
 
+    fn has_others(&self) -> bool {
+        self.others
+            .iter()
+            .any(|(_, _, amplitude)| *amplitude != 0.0)
+    }
+
     fn attempt(&mut self, frame: &Frame, (x_px, y_px): (f64, f64), side_px: usize) -> Fix {
+        // Before the window is taken: neighbours are taken off it as streaks of this length, not of one that an earlier
+        // attempt has come to on something else.
+        self.comb = Comb::new(self.streak_px, self.template.radius_px());
         if !self.take_window(frame, x_px, y_px, side_px) {
             return Fix::none(x_px, y_px, Verdict::AtBorder);
         }
-        self.comb = Comb::new(self.streak_px, self.template.radius_px());
         let mut fitted = self.fit(frame, x_px, y_px, side_px);
         if !self.comb.is_still() {
             fitted = self.fit_length(frame, fitted, side_px);
@@ -237,7 +247,12 @@ impl Localiser {
         let (x_px, y_px) = self.streak_px;
         let of = |factor: f64| Comb::new((factor * x_px, factor * y_px), radius_px);
         let (mut fitted, mut factor) = (first?, 1.0);
-        for _ in 0..STRETCHES {
+        let stretches = if self.has_others() {
+            STRETCHES_BESIDE
+        } else {
+            STRETCHES
+        };
+        for _ in 0..stretches {
             let (shorter, longer) = (of(factor * (1.0 - SECANT)), of(factor * (1.0 + SECANT)));
             let at = (fitted.x_px, fitted.y_px);
             let Some(change) = fit::stretch(&self.crop, &self.template, &shorter, &longer, at)
@@ -247,6 +262,11 @@ impl Localiser {
             factor =
                 (factor * (1.0 + 2.0 * SECANT * change)).clamp(1.0 / MOST_STRETCH, MOST_STRETCH);
             self.comb = of(factor);
+            // The neighbours are in the same flow: their streaks are as long as this one.
+            let (x_px, y_px) = (fitted.x_px, fitted.y_px);
+            if self.has_others() && !self.take_window(frame, x_px, y_px, side_px) {
+                return Some(fitted);
+            }
             fitted = self.fit(frame, fitted.x_px, fitted.y_px, side_px)?;
         }
         Some(fitted)
