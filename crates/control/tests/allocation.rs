@@ -1,29 +1,11 @@
 //! A step of any controller allocates nothing, shown by an allocator that counts; clarabel's are counted and bounded.
-#![allow(unsafe_code)]
+#![forbid(unsafe_code)]
 
 use cellpos_control::*;
-use std::alloc::{GlobalAlloc, Layout, System};
-use std::cell::Cell;
-
-thread_local! {
-    static COUNT: Cell<usize> = const { Cell::new(0) };
-}
-
-struct Counting;
-
-// SAFETY: every call is passed on to the system's allocator unchanged.
-unsafe impl GlobalAlloc for Counting {
-    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
-        let _ = COUNT.try_with(|c| c.set(c.get() + 1));
-        unsafe { System.alloc(layout) }
-    }
-    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
-        unsafe { System.dealloc(pointer, layout) }
-    }
-}
+use cellpos_counting_alloc::{CountingAllocator, allocations};
 
 #[global_allocator]
-static ALLOCATOR: Counting = Counting;
+static ALLOCATOR: CountingAllocator = CountingAllocator;
 
 fn mpc(solver: SolverKind) -> ControllerConfig {
     ControllerConfig::Mpc(
@@ -39,7 +21,7 @@ fn mpc(solver: SolverKind) -> ControllerConfig {
 
 /// Allocations of each step of a run with steps of the reference under a tight slew limit, lost frames, late frames, a
 /// freeze, learning and the plant monitor.
-fn allocations(controller: ControllerConfig) -> Vec<usize> {
+fn allocations_by_step(controller: ControllerConfig) -> Vec<u64> {
     let config = LoopConfig {
         model: LoopModel::eq6(2e-3),
         estimator: EstimatorConfig::default(),
@@ -84,7 +66,7 @@ fn allocations(controller: ControllerConfig) -> Vec<usize> {
             for (ahead, slot) in (1..).zip(&mut preview) {
                 *slot = reference(k + ahead);
             }
-            let before = COUNT.with(Cell::get);
+            let before = allocations();
             let input = LoopInput {
                 measurement: (k % 17 != 3).then_some(fix),
                 reference_um: reference(k),
@@ -105,7 +87,7 @@ fn allocations(controller: ControllerConfig) -> Vec<usize> {
                 out.neutral_um,
                 out.command_um,
             );
-            let count = COUNT.with(Cell::get) - before;
+            let count = allocations() - before;
             rig.advance(out.command_um);
             count
         })
@@ -127,14 +109,14 @@ fn pi_lead_lqg_and_mpc_by_active_set_never_allocate_in_a_step() {
         ControllerConfig::Lqg(Lqg::default()),
         mpc(SolverKind::ActiveSet),
     ] {
-        let counts = allocations(controller);
+        let counts = allocations_by_step(controller);
         assert!(counts.iter().all(|n| *n == 0), "{controller:?}");
     }
 }
 
 #[test]
 fn mpc_by_clarabel_allocates_no_more_than_a_few_times_in_a_step() {
-    let counts = allocations(mpc(SolverKind::Clarabel));
+    let counts = allocations_by_step(mpc(SolverKind::Clarabel));
     let (least, most) = (counts.iter().min(), counts.iter().max());
     println!("clarabel: {least:?} to {most:?} allocations a step");
     assert!(most <= Some(&4), "{least:?} to {most:?}");

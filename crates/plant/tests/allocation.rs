@@ -1,37 +1,13 @@
 //! A step of the loop allocates nothing, shown by an allocator that counts.
-#![allow(unsafe_code)]
+#![forbid(unsafe_code)]
 
+use cellpos_counting_alloc::{CountingAllocator, allocations_of};
 use cellpos_plant::{
     Chain, DiscretePlant, Effect, Hysteresis, Model, Seconds, Simulator, TransferFunction,
 };
-use std::alloc::{GlobalAlloc, Layout, System};
-use std::cell::Cell;
-
-thread_local! {
-    static COUNT: Cell<usize> = const { Cell::new(0) };
-}
-
-struct Counting;
-
-// SAFETY: every call is passed on to the system's allocator unchanged.
-unsafe impl GlobalAlloc for Counting {
-    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
-        let _ = COUNT.try_with(|c| c.set(c.get() + 1));
-        unsafe { System.alloc(layout) }
-    }
-    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
-        unsafe { System.dealloc(pointer, layout) }
-    }
-}
 
 #[global_allocator]
-static ALLOCATOR: Counting = Counting;
-
-fn allocations(mut work: impl FnMut()) -> usize {
-    let before = COUNT.with(Cell::get);
-    work();
-    COUNT.with(Cell::get) - before
-}
+static ALLOCATOR: CountingAllocator = CountingAllocator;
 
 fn everything() -> Model {
     let mut model = Model::load(concat!(
@@ -71,7 +47,7 @@ fn everything() -> Model {
 
 #[test]
 fn the_counter_counts() {
-    assert_eq!(allocations(|| drop(std::hint::black_box(vec![1_u8]))), 1);
+    assert_eq!(allocations_of(|| drop(std::hint::black_box(vec![1_u8]))), 1);
 }
 
 #[test]
@@ -81,7 +57,7 @@ fn no_step_allocates_whatever_its_length_and_the_effects() {
     let plant =
         DiscretePlant::new(&TransferFunction::eq6(), Seconds(1e-3), Seconds(2.5e-3)).unwrap();
     let mut state = plant.state(0.0);
-    let count = allocations(|| {
+    let count = allocations_of(|| {
         for k in 0..200 {
             let command = 4.0 + f64::from(k % 13) * 0.3;
             chain.advance(command, 1e-3 + 1e-6 * f64::from(k % 7));

@@ -1,6 +1,7 @@
 //! From a camera's frames to the positions of one bead: what is taken, what is not, and that nothing is allocated.
-#![allow(unsafe_code)]
+#![forbid(unsafe_code)]
 
+use cellpos_counting_alloc::{CountingAllocator, allocations};
 use cellpos_rig::{
     Axis, Calibration, Camera, CameraError, Clock, CommandedFlow, FrameBuffer, FrameStamp,
     Measurement, PositionSource, SourceInfo, VisionSource,
@@ -9,35 +10,9 @@ use cellpos_vision::{
     Decision, Localiser, LocaliserConfig, PixelResponse, ProfileSpec, Template, TrackState,
     Tracker, TrackerConfig, Verdict,
 };
-use std::alloc::{GlobalAlloc, Layout, System};
-use std::cell::Cell;
-
-thread_local! {
-    static ALLOCATIONS: Cell<u64> = const { Cell::new(0) };
-}
-
-struct Counting;
-
-// SAFETY: every call is handed on unchanged to the system's allocator; the counter is a thread-local without a
-// destructor and without lazy initialisation, so counting cannot allocate.
-unsafe impl GlobalAlloc for Counting {
-    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
-        ALLOCATIONS.with(|c| c.set(c.get() + 1));
-        // SAFETY: the caller's promise about `layout` is passed on.
-        unsafe { System.alloc(layout) }
-    }
-    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
-        // SAFETY: `pointer` came from `System.alloc` with this `layout`.
-        unsafe { System.dealloc(pointer, layout) }
-    }
-}
 
 #[global_allocator]
-static ALLOCATOR: Counting = Counting;
-
-fn allocations() -> u64 {
-    ALLOCATIONS.with(Cell::get)
-}
+static ALLOCATOR: CountingAllocator = CountingAllocator;
 
 const WIDTH: usize = 160;
 const HEIGHT: usize = 64;

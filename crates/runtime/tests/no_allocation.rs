@@ -1,39 +1,21 @@
 //! A tick, rings and all, allocates nothing: shown by an allocator that counts.
-#![allow(unsafe_code)]
+#![forbid(unsafe_code)]
 
 mod common;
 
 use cellpos_control::ControllerKind;
+use cellpos_counting_alloc::{CountingAllocator, allocations, allocations_of};
 use cellpos_rig::Clock;
 use cellpos_runtime::ticker::{RingSizes, Ticker};
 use cellpos_runtime::{Life, Request};
 use cellpos_vision::Verdict;
 use common::{controller, core, measurement, report};
-use std::alloc::{GlobalAlloc, Layout, System};
-use std::cell::Cell;
-
-thread_local! {
-    static COUNT: Cell<usize> = const { Cell::new(0) };
-}
-
-struct Counting;
-
-// SAFETY: every call is passed on to the system's allocator unchanged.
-unsafe impl GlobalAlloc for Counting {
-    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
-        let _ = COUNT.try_with(|c| c.set(c.get() + 1));
-        unsafe { System.alloc(layout) }
-    }
-    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
-        unsafe { System.dealloc(pointer, layout) }
-    }
-}
 
 #[global_allocator]
-static ALLOCATOR: Counting = Counting;
+static ALLOCATOR: CountingAllocator = CountingAllocator;
 
 /// Ticks through arming, running, coasting, freezing, a stale frame, a stop by the operator and Safe.
-fn allocations_per_run(kind: ControllerKind) -> (usize, usize) {
+fn allocations_per_run(kind: ControllerKind) -> (u64, usize) {
     let clock = Clock::virtual_at(0);
     let (mut ticker, mut ends) = Ticker::new(
         core(&controller(kind), false),
@@ -41,7 +23,7 @@ fn allocations_per_run(kind: ControllerKind) -> (usize, usize) {
         0,
         RingSizes::default(),
     );
-    let before = COUNT.with(Cell::get);
+    let before = allocations();
     let mut ran = 0;
     for k in 0..3000_u64 {
         let due_ns = k as i64 * 1_000_000;
@@ -71,7 +53,7 @@ fn allocations_per_run(kind: ControllerKind) -> (usize, usize) {
         while ends.records.pop().is_ok() {}
         while ends.events.pop().is_ok() {}
     }
-    (COUNT.with(Cell::get) - before, ran)
+    (allocations() - before, ran)
 }
 
 #[test]
@@ -82,18 +64,17 @@ fn no_tick_allocates_whatever_happens() {
         ControllerKind::Lqg,
         ControllerKind::Mpc,
     ] {
-        let (allocations, ran) = allocations_per_run(kind);
+        let (count, ran) = allocations_per_run(kind);
         assert!(
             ran > 2400,
             "{kind:?}: the loop was closed for {ran} ticks only"
         );
-        assert_eq!(allocations, 0, "{kind:?}");
+        assert_eq!(count, 0, "{kind:?}");
     }
 }
 
 #[test]
 fn the_allocator_counts() {
-    let before = COUNT.with(Cell::get);
-    std::hint::black_box(vec![1_u8; 64]);
-    assert_eq!(COUNT.with(Cell::get) - before, 1);
+    let count = allocations_of(|| drop(std::hint::black_box(vec![1_u8; 64])));
+    assert_eq!(count, 1);
 }

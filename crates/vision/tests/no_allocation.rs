@@ -1,39 +1,14 @@
 //! Localising a frame allocates nothing, whatever the verdict.
-#![allow(unsafe_code)]
+#![forbid(unsafe_code)]
 
+use cellpos_counting_alloc::{CountingAllocator, allocations};
 use cellpos_vision::{
     CellConfig, CellFinder, Commanded, Frame, Learning, Localiser, LocaliserConfig, Noise,
     PixelResponse, Pixels, ProfileSpec, Tracker, TrackerConfig, Verdict,
 };
-use std::alloc::{GlobalAlloc, Layout, System};
-use std::cell::Cell;
-
-thread_local! {
-    static ALLOCATIONS: Cell<u64> = const { Cell::new(0) };
-}
-
-struct Counting;
-
-// SAFETY: every call is handed on unchanged to the system's allocator; the counter is a thread-local without a
-// destructor and without lazy initialisation, so counting cannot allocate.
-unsafe impl GlobalAlloc for Counting {
-    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
-        ALLOCATIONS.with(|c| c.set(c.get() + 1));
-        // SAFETY: the caller's promise about `layout` is passed on.
-        unsafe { System.alloc(layout) }
-    }
-    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
-        // SAFETY: `pointer` came from `System.alloc` with this `layout`.
-        unsafe { System.dealloc(pointer, layout) }
-    }
-}
 
 #[global_allocator]
-static ALLOCATOR: Counting = Counting;
-
-fn allocations() -> u64 {
-    ALLOCATIONS.with(Cell::get)
-}
+static ALLOCATOR: CountingAllocator = CountingAllocator;
 
 #[test]
 fn locating_allocates_nothing_for_any_verdict() {
