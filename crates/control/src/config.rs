@@ -11,10 +11,10 @@ use crate::limits::Limits;
 use crate::loop_io::{ControllerConfig, LoopConfig};
 use crate::mpc::Mpc;
 use crate::pi::{Lead, Pi};
-use cellpos_plant::{Model, PlantError};
+use crate::toml_file::{self, ConfigError, TomlFile};
+use cellpos_plant::Model;
 use serde::{Deserialize, Serialize};
 use std::path::Path;
-use thiserror::Error;
 
 /// Which control law runs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -84,50 +84,10 @@ pub struct ControllerFile {
     pub limits: Limits,
 }
 
-/// A controller file that cannot be used.
-#[derive(Debug, Clone, PartialEq, Error)]
-pub enum ConfigError {
-    /// The file cannot be read.
-    #[error("{file}: {reason}")]
-    Unreadable {
-        /// The file.
-        file: String,
-        /// Why.
-        reason: String,
-    },
-    /// The text does not parse, or has an unknown key or a value of the wrong type.
-    #[error("{file}:{line}:{column}: {message}{}", suggestion.as_ref().map(|s| format!(" (did you mean `{s}`?)")).unwrap_or_default())]
-    Text {
-        /// The file.
-        file: String,
-        /// Line, from 1.
-        line: usize,
-        /// Column, from 1.
-        column: usize,
-        /// What is wrong.
-        message: String,
-        /// A key that was perhaps meant.
-        suggestion: Option<String>,
-    },
-    /// A value is out of range, or the controller does not fit the plant.
-    #[error("{file}: {error}")]
-    Build {
-        /// The file.
-        file: String,
-        /// Which value, and what would be right.
-        error: BuildError,
-    },
-    /// `controller = "lead"` without `[pi.lead]`.
-    #[error(
-        "{file}: controller = \"lead\" needs [pi.lead] with zero_hz and pole_hz (`cellpos design --controller lead` finds them)"
-    )]
-    MissingLead {
-        /// The file.
-        file: String,
-    },
-    /// The model cannot be used in a loop.
-    #[error("model: {0}")]
-    Plant(#[from] PlantError),
+impl TomlFile for ControllerFile {
+    fn check_values(&self) -> Result<(), BuildError> {
+        self.validate()
+    }
 }
 
 impl ControllerFile {
@@ -160,12 +120,7 @@ impl ControllerFile {
     /// # Errors
     /// A file that cannot be read, and all of [`ControllerFile::from_toml_str`].
     pub fn load(path: &Path) -> Result<Self, ConfigError> {
-        let file = path.display().to_string();
-        let text = std::fs::read_to_string(path).map_err(|error| ConfigError::Unreadable {
-            file: file.clone(),
-            reason: error.to_string(),
-        })?;
-        Self::from_toml_str(&text, &file)
+        toml_file::load::<Self>(path)?.with_lead(&path.display().to_string())
     }
 
     /// Reads the text of a controller file; `file` is for the messages only.
@@ -173,17 +128,16 @@ impl ControllerFile {
     /// # Errors
     /// Text that is not TOML, unknown or missing keys, wrong types, values out of range.
     pub fn from_toml_str(text: &str, file: &str) -> Result<Self, ConfigError> {
-        let this: Self = toml::from_str(text).map_err(|error| text_error(text, file, &error))?;
-        this.validate().map_err(|error| ConfigError::Build {
-            file: file.to_owned(),
-            error,
-        })?;
-        if this.controller == ControllerKind::Lead && this.pi.lead.is_none() {
+        toml_file::parse::<Self>(text, file)?.with_lead(file)
+    }
+
+    fn with_lead(self, file: &str) -> Result<Self, ConfigError> {
+        if self.controller == ControllerKind::Lead && self.pi.lead.is_none() {
             return Err(ConfigError::MissingLead {
                 file: file.to_owned(),
             });
         }
-        Ok(this)
+        Ok(self)
     }
 
     /// The file as TOML text; reads back to the same values.
@@ -247,42 +201,17 @@ impl ControllerFile {
     pub fn loop_config(&self, model: &Model) -> Result<LoopConfig, ConfigError> {
         let sample_time_s = self.sample_time_ms * 1e-3;
         let plant = DesignPlant::from_model(model, Some(self.delay_ms * 1e-3), sample_time_s)?;
-        let file = || "controller".to_owned();
-        let model = plant.loop_model().map_err(|error| ConfigError::Build {
-            file: file(),
-            error,
-        })?;
+        let model = plant
+            .loop_model()
+            .map_err(ConfigError::build("controller"))?;
         let config = LoopConfig {
             model,
             estimator: self.estimator,
             controller: self.controller_config(),
             limits: self.limits,
         };
-        crate::control_loop::ControlLoop::new(config).map_err(|error| ConfigError::Build {
-            file: file(),
-            error,
-        })?;
+        crate::control_loop::ControlLoop::new(config).map_err(ConfigError::build("controller"))?;
         Ok(config)
-    }
-}
-
-pub(crate) fn text_error(text: &str, file: &str, error: &toml::de::Error) -> ConfigError {
-    let start = error.span().map_or(0, |span| span.start.min(text.len()));
-    let before = text.get(..start).unwrap_or(text);
-    let line = before.matches('\n').count() + 1;
-    let column = before.chars().rev().take_while(|&c| c != '\n').count() + 1;
-    let message = error.message().to_owned();
-    let mut quoted = message.split('`').skip(1).step_by(2);
-    let suggestion = message.starts_with("unknown").then(|| {
-        let wrong = quoted.next().unwrap_or_default().to_owned();
-        cellpos_units::nearest(&wrong, quoted).map(str::to_owned)
-    });
-    ConfigError::Text {
-        file: file.to_owned(),
-        line,
-        column,
-        message,
-        suggestion: suggestion.flatten(),
     }
 }
 

@@ -11,11 +11,18 @@ pub struct Parameter {
     pub unit: &'static str,
 }
 
+impl Parameter {
+    /// What stands between a value and its unit.
+    fn gap(self) -> &'static str {
+        if self.unit.is_empty() { "" } else { " " }
+    }
+}
+
 /// A configuration that cannot be built.
 #[derive(Debug, Clone, Copy, PartialEq, Error)]
 pub enum BuildError {
     /// A value is not finite or is outside its range.
-    #[error("{} = {value} {}: must be {wanted}", parameter.name, parameter.unit)]
+    #[error("{} = {value}{}{}: must be {wanted}", parameter.name, parameter.gap(), parameter.unit)]
     OutOfRange {
         /// Which one.
         parameter: Parameter,

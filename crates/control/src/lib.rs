@@ -30,8 +30,9 @@ mod reference;
 pub mod riccati;
 mod simulation;
 mod state;
+mod toml_file;
 
-pub use config::{ConfigError, ControllerFile, ControllerKind, PiFile};
+pub use config::{ControllerFile, ControllerKind, PiFile};
 pub use control_loop::{ControlLoop, Controller};
 pub use error::{BuildError, Parameter};
 pub use estimator::{Estimator, EstimatorConfig, EstimatorState, HISTORY};
@@ -54,3 +55,4 @@ pub use pi::{Lead, Pi, PiState};
 pub use reference::{Points, Profile, Reference, Shape, fill_preview};
 pub use simulation::{RigConfig, SimulatedRig};
 pub use state::{LoopState, STATE_LEN};
+pub use toml_file::ConfigError;

@@ -21,7 +21,7 @@ mod parse;
 mod spelling;
 
 pub use parse::{Problem, UnitError};
-pub use spelling::nearest;
+pub use spelling::{nearest, nearest_in};
 
 use core::fmt;
 use core::str::FromStr;

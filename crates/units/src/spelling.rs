@@ -17,6 +17,17 @@ pub fn nearest<'a>(name: &str, known: impl IntoIterator<Item = &'a str>) -> Opti
         .map(|(_, known)| known)
 }
 
+/// The known name nearest to the unknown one in a message of serde: "unknown field `a`, expected one of `b`, `c`". `None`
+/// for any other message, and where none is near.
+pub fn nearest_in(message: &str) -> Option<&str> {
+    if !message.starts_with("unknown") {
+        return None;
+    }
+    let mut quoted = message.split('`').skip(1).step_by(2);
+    let wrong = quoted.next()?;
+    nearest(wrong, quoted)
+}
+
 fn letter(c: char) -> char {
     if c == '-' {
         '_'
@@ -66,6 +77,25 @@ mod tests {
             assert_eq!(nearest(far, words), None, "{far}");
         }
         assert_eq!(nearest("anything", []), None);
+    }
+
+    #[test]
+    fn the_key_that_was_meant_is_found_in_a_message_of_serde() {
+        for (message, meant) in [
+            (
+                "unknown field `latency`, expected one of `latency_ms`, `rate_hz`",
+                Some("latency_ms"),
+            ),
+            (
+                "unknown variant `lgq`, expected one of `pi`, `lqg`",
+                Some("lqg"),
+            ),
+            ("unknown field `zzzzzzzzz`, expected `rate_hz`", None),
+            ("missing field `rate_hz`", None),
+            ("invalid type", None),
+        ] {
+            assert_eq!(nearest_in(message), meant, "{message}");
+        }
     }
 
     #[test]

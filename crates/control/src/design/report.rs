@@ -1,6 +1,5 @@
 //! The whole design in one call: what `cellpos design` prints.
 
-use crate::config::{ConfigError, text_error};
 use crate::design::bound::bound_rms_um;
 use crate::design::margins::{Margins, margins};
 use crate::design::noise::{NoiseFigures, noise_figures};
@@ -16,6 +15,7 @@ use crate::limits::Limits;
 use crate::linear::LinearLaw;
 use crate::loop_io::{ControllerConfig, LoopConfig};
 use crate::pi::{Lead, Pi};
+use crate::toml_file::{self, ConfigError, TomlFile};
 use cellpos_plant::PlantError;
 use serde::Deserialize;
 use thiserror::Error;
@@ -90,12 +90,7 @@ impl DesignLimits {
     /// # Errors
     /// A file that cannot be read, text that is not TOML, unknown keys, wrong types, a number that is not positive.
     pub fn load(path: &std::path::Path) -> Result<Self, ConfigError> {
-        let file = path.display().to_string();
-        let text = std::fs::read_to_string(path).map_err(|error| ConfigError::Unreadable {
-            file: file.clone(),
-            reason: error.to_string(),
-        })?;
-        Self::from_toml_str(&text, &file)
+        toml_file::load(path)
     }
 
     /// Reads the text of a limits file; `file` is for the messages only.
@@ -103,28 +98,27 @@ impl DesignLimits {
     /// # Errors
     /// Text that is not TOML, unknown keys, wrong types, a number that is not positive.
     pub fn from_toml_str(text: &str, file: &str) -> Result<Self, ConfigError> {
-        let this: Self = toml::from_str(text).map_err(|error| text_error(text, file, &error))?;
+        toml_file::parse(text, file)
+    }
+}
+
+impl TomlFile for DesignLimits {
+    fn check_values(&self) -> Result<(), BuildError> {
         let values = [
-            ("max_ms", this.max_ms),
-            ("max_mt", this.max_mt),
-            ("min_pm_deg", this.min_pm_deg),
-            ("min_gm_db", this.min_gm_db),
-            ("min_delay_margin_ms", this.min_delay_margin_ms),
-            ("max_rms_nm", this.max_rms_nm),
-            ("max_overshoot_percent", this.max_overshoot_percent),
-            ("max_settling_ms", this.max_settling_ms),
+            ("max_ms", "", self.max_ms),
+            ("max_mt", "", self.max_mt),
+            ("min_pm_deg", "deg", self.min_pm_deg),
+            ("min_gm_db", "dB", self.min_gm_db),
+            ("min_delay_margin_ms", "ms", self.min_delay_margin_ms),
+            ("max_rms_nm", "nm", self.max_rms_nm),
+            ("max_overshoot_percent", "%", self.max_overshoot_percent),
+            ("max_settling_ms", "ms", self.max_settling_ms),
         ];
-        for (name, value) in values {
-            if let Some(value) = value {
-                check(name, "", value, value > 0.0, "positive").map_err(|error| {
-                    ConfigError::Build {
-                        file: file.to_owned(),
-                        error,
-                    }
-                })?;
-            }
-        }
-        Ok(this)
+        values.into_iter().try_for_each(|(name, unit, value)| {
+            value.map_or(Ok(()), |value| {
+                check(name, unit, value, value > 0.0, "positive")
+            })
+        })
     }
 }
 
