@@ -3,7 +3,7 @@
 use crate::catalogue::{Kind, VARIANTS};
 use crate::fit::{Context, Fit};
 use crate::frames::FrameCounts;
-use crate::predict::{Block, PLAY_LEVELS};
+use crate::predict::{Block, PLAY_LEVELS, domains};
 use crate::result::{Effect as NamedEffect, Interval, Verdict};
 use cellpos_plant::{Effect, Hysteresis, Model};
 use std::collections::BTreeMap;
@@ -80,6 +80,9 @@ pub(crate) fn parameters(
             let gain =
                 (2.0 * (w / 2.0).sin()) / (1.0 + theta * theta - 2.0 * theta * w.cos()).sqrt();
             let sd = ctx.problem.noise.innovation_um() * (2.0 / rows).sqrt() / gain.max(1e-6);
+            // A sine and a cosine of noise have a length themselves: sd_i^2/(2 A) in the mean of each record's.
+            let mean =
+                (mean - 0.5 * sd * sd * fit.lines[line].len() as f64 / mean.max(1e-12)).max(0.0);
             out.insert(
                 "um".to_owned(),
                 Interval {
@@ -94,6 +97,32 @@ pub(crate) fn parameters(
                 .iter()
                 .filter(|p| p.variant().kind == Kind::Position)
                 .count();
+            if let Some(Some(exact)) = fit.locking.get(index) {
+                let (amplitude, sd) = exact.amplitude_px();
+                let factor = (1.96 * exact.log_pixel_error().hypot(NUMERIC)).exp();
+                let pixel = exact.pixel_um;
+                let sd = sd.hypot(NUMERIC * amplitude);
+                for (name, value, low, high, unit) in [
+                    ("pixel_um", pixel, pixel / factor, pixel * factor, "um"),
+                    (
+                        "amplitude",
+                        amplitude,
+                        amplitude - 1.96 * sd,
+                        amplitude + 1.96 * sd,
+                        "px",
+                    ),
+                ] {
+                    out.insert(
+                        name.to_owned(),
+                        Interval {
+                            value,
+                            ci95: [low, high],
+                            unit: unit.to_owned(),
+                        },
+                    );
+                }
+                return out;
+            }
             let [a, b] = fit.positions[at];
             let pixel = part.natural()[0];
             let rows: f64 = ctx.problem.count(&ctx.problem.all()) as f64;
@@ -166,6 +195,16 @@ fn effect_of(ctx: &Context<'_>, fit: &Fit, index: usize) -> Option<Effect> {
             weights: weights.to_vec(),
             quadratic_per_um: quadratic,
         }),
+        Block::Domains { fraction, width_um } => {
+            let (radii, shares) = domains();
+            let thresholds = std::iter::once(0.0).chain(radii.map(|r| r * width_um));
+            let weights = std::iter::once(1.0 - fraction).chain(shares.map(|s| s * fraction));
+            Effect::PztHysteresis(Hysteresis::Play {
+                thresholds_um: thresholds.collect(),
+                weights: weights.collect(),
+                quadratic_per_um: 0.0,
+            })
+        }
         Block::Creep { g } => Effect::PztCreep { per_decade: g },
         Block::Resonance { zeta, .. } => Effect::PztResonance {
             frequency_hz: v[0],
@@ -204,6 +243,15 @@ fn effect_of(ctx: &Context<'_>, fit: &Fit, index: usize) -> Option<Effect> {
             Effect::MainsHum {
                 hz,
                 um,
+                phase_deg: b.atan2(a).to_degrees(),
+            }
+        }
+        Block::PixelLocking { .. } if matches!(fit.locking.get(index), Some(Some(_))) => {
+            let exact = fit.locking.get(index).copied().flatten()?;
+            let [a, b] = exact.wave_um;
+            Effect::PixelLocking {
+                pixel_um: exact.pixel_um,
+                amplitude: exact.amplitude_px().0,
                 phase_deg: b.atan2(a).to_degrees(),
             }
         }

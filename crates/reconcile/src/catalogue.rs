@@ -230,6 +230,26 @@ pub(crate) static VARIANTS: &[Variant] = &[
     Variant {
         id: "pzt-hysteresis",
         params: &[
+            lin("fraction", 0.0, 1.0, 1e-3),
+            log("width_um", 0.005, 100.0),
+        ],
+        build: |v, _| Block::Domains {
+            fraction: v[0],
+            width_um: v[1],
+        },
+        starts: |s| {
+            grid(&[0.05, 0.3], &[0.03, 0.1, 0.3, 1.0])
+                .into_iter()
+                .map(|v| vec![v[0], v[1] * s.stroke_um])
+                .collect()
+        },
+        typical: (0.0, 0.6),
+        off_response: false,
+        kind: Kind::Chain,
+    },
+    Variant {
+        id: "pzt-hysteresis",
+        params: &[
             WEIGHT,
             WEIGHT,
             WEIGHT,

@@ -6,6 +6,7 @@
 use crate::augment::place_of;
 use crate::catalogue::{Kind, Scope, VARIANTS, Variant};
 use crate::linear::{Tangents, normal_equations};
+use crate::locking::Locking;
 use crate::predict::{Block, simulate};
 use crate::problem::{Mask, Problem};
 use nalgebra::{DMatrix, DVector};
@@ -118,6 +119,8 @@ pub(crate) struct Fit {
     pub lines: Vec<Vec<[f64; 2]>>,
     /// Sine and cosine of each position-periodic error \[um\].
     pub positions: Vec<[f64; 2]>,
+    /// Those errors by the exact filter, once they are looked at so closely: by part.
+    pub locking: Vec<Option<Locking>>,
     /// Sum of squares over the mask.
     pub chi2: f64,
     /// Innovations that count under the mask.
@@ -232,6 +235,7 @@ impl Context<'_> {
             errors: [0.0; 2],
             lines: vec![vec![[0.0; 2]; records]; lines],
             positions: vec![[0.0; 2]; positions],
+            locking: Vec::new(),
             chi2: 0.0,
             count: self.problem.count(mask),
             innovations: Vec::new(),

@@ -22,6 +22,7 @@ mod guard;
 mod held_out;
 mod hypothesis;
 mod linear;
+mod locking;
 mod map;
 mod noise;
 mod parallel;

@@ -98,18 +98,11 @@ fn extensions(
     least: f64,
 ) -> Vec<Fit> {
     let tangents = ctx.tangents(fit, mask);
-    let mut leads = screen(ctx, fit, &tangents, mask, effort.threads, |v| {
+    let leads = screen(ctx, fit, &tangents, mask, effort.threads, |v| {
         !late(&VARIANTS[v])
             && !ctx.excludes(VARIANTS[v].id)
             && !fit.parts.iter().any(|p| same_id(v, p.variant().id))
             && !forbidden.contains(&VARIANTS[v].id)
-    });
-    let mut seen: Vec<&str> = Vec::new();
-    leads.retain(|l| {
-        let id = l.part.variant().id;
-        let new = !seen.contains(&id);
-        seen.push(id);
-        new
     });
     let records = ctx.problem.records.len();
     let worth: Vec<Part> = leads
@@ -122,9 +115,20 @@ fn extensions(
             };
             l.score > 0.5 * bar(l.part.variant(), records).max(least)
         })
-        .take(wide)
         .map(|l| l.part)
         .collect();
+    // The best form of each effect, and the second of those with forms that are no limits of each other.
+    let mut seen: Vec<&str> = Vec::new();
+    let worth = worth.into_iter().filter(|part| {
+        let id = part.variant().id;
+        let before = seen.iter().filter(|s| **s == id).count();
+        let new = before == 0 || (before == 1 && id == "pzt-hysteresis");
+        if new {
+            seen.push(id);
+        }
+        new
+    });
+    let worth: Vec<Part> = worth.take(wide).collect();
     // A short fit of all, then the best few to the end.
     let mut fits = parallel::map(&worth, effort.threads, |part| {
         let mut parts = fit.parts.clone();
@@ -258,12 +262,9 @@ fn replace(ctx: &Context<'_>, mut fit: Fit, mask: &Mask, effort: Effort) -> (Fit
 }
 
 /// Tries the other forms of the same effects (play operators for Bouc-Wen, a dissolving bubble, two-sided clipping).
-fn reform(ctx: &Context<'_>, mut fit: Fit, mask: &Mask, effort: Effort) -> Fit {
+fn reform(ctx: &Context<'_>, mut fit: Fit, mask: &Mask, effort: Effort, rich: bool) -> Fit {
     for i in 0..fit.parts.len() {
         let id = fit.parts[i].variant().id;
-        // Only where something is left beyond the noise is a richer form worth its time.
-        let count = fit.count as f64;
-        let rich = fit.chi2 - count > 0.01 * count;
         let others: Vec<Part> = VARIANTS
             .iter()
             .enumerate()
@@ -298,6 +299,11 @@ fn reform(ctx: &Context<'_>, mut fit: Fit, mask: &Mask, effort: Effort) -> Fit {
     fit
 }
 
+/// Whether so much is left beyond the noise that a richer form is worth its time, whatever else may explain it.
+fn much_left(fit: &Fit) -> bool {
+    left_over(fit) > 0.01 * fit.count as f64
+}
+
 /// The whole search on the rows of a mask.
 pub(crate) fn search(
     ctx: &Context<'_>,
@@ -321,7 +327,7 @@ pub(crate) fn search(
     steps.push((ids(&best), best.chi2));
     let mut fit = best;
     // What a simple form leaves over must not be given a name of its own before the richer form was tried.
-    let reformed = reform(ctx, fit.clone(), mask, effort);
+    let reformed = reform(ctx, fit.clone(), mask, effort, much_left(&fit));
     if reformed.parts != fit.parts {
         fit = reformed;
         steps.push((ids(&fit), fit.chi2));
@@ -363,9 +369,19 @@ pub(crate) fn search(
         if priced(ctx, &top) >= priced(ctx, &fit) {
             break;
         }
+        // A richer form of what is there may explain as well what the next name would stand for.
+        if top.parts.len() > fit.parts.len() {
+            let reformed = reform(ctx, fit.clone(), mask, effort, true);
+            if reformed.parts != fit.parts && priced(ctx, &reformed) < priced(ctx, &top) {
+                fit = reformed;
+                steps.push((ids(&fit), fit.chi2));
+                continue;
+            }
+        }
         let (top, _) = replace(ctx, top, mask, effort);
         let forms: Vec<usize> = top.parts.iter().map(|p| p.variant).collect();
-        fit = reform(ctx, top, mask, effort);
+        let rich = much_left(&top);
+        fit = reform(ctx, top, mask, effort, rich);
         if fit
             .parts
             .iter()

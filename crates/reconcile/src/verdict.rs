@@ -9,6 +9,7 @@ use crate::floor;
 use crate::frames;
 use crate::guard;
 use crate::held_out;
+use crate::locking;
 use crate::noise::Noise;
 use crate::predict::{Base, Block, Zpk};
 use crate::problem::Problem;
@@ -126,6 +127,9 @@ pub fn reconcile(
         found.fit = ctx.fit(parts, &problem.all(), 12);
         held = held_out::check(&ctx, &found.fit, options.threads);
     }
+    found.fit.locking = (0..found.fit.parts.len())
+        .map(|i| locking::refine(&ctx, &found.fit, i, options.threads))
+        .collect();
     progress("map and verdict");
     Ok(assemble::assemble(
         model, &records, &ctx, found, held, &frames,

@@ -1,15 +1,17 @@
 //! A rig that hides effects, written apart from the catalogue of `cellpos-plant`.
 //!
-//! Another integrator (fixed-step Runge-Kutta on Eq. (6) in controllable form, 64 steps a millisecond, where the
-//! catalogue is exact), other equations where the literature offers them (Preisach relays for hysteresis, one
+//! Another integrator (fixed-step Runge-Kutta on Eq. (6) in controllable form, 64 steps a millisecond, the jumps of its
+//! direct path apart from the flow, where the catalogue is exact), other equations where the literature offers them (Preisach relays for hysteresis, one
 //! Kelvin-Voigt element per decade for creep, an internal variable for the standard linear solid), and effects that the
 //! catalogue does not have. Nuisances (diffusion, localisation noise, phases) are drawn at random.
 
 pub mod cases;
+mod relays;
 pub mod table;
 pub mod threshold;
 
 use cellpos_reconcile::Record;
+use relays::Relays;
 use std::f64::consts::TAU;
 
 /// Steps per millisecond.
@@ -269,96 +271,6 @@ pub fn run(script: &Script, hidden: &[Hidden], nuisance: Nuisance, random: &mut 
     }
 }
 
-/// Classical Preisach model: relays over the half plane up > down, weights falling off from the diagonal and, slowly, from
-/// the middle of the stroke. Evaluated exactly through its Everett function and the stack of extremes that the relays
-/// remember (Mayergoyz, Mathematical Models of Hysteresis, 1991, ch. 1), because a grid of relays moves in steps that no
-/// piezo shows.
-struct Relays {
-    width_um: f64,
-    span: f64,
-    /// Remembered extremes, alternating minimum and maximum, the outermost first.
-    extremes: Vec<f64>,
-    at: f64,
-    scale: f64,
-}
-
-impl Relays {
-    fn new(width_um: f64) -> Self {
-        let span = 6.0 * width_um;
-        let mut relays = Self {
-            width_um,
-            span,
-            extremes: vec![-span],
-            at: 0.0,
-            scale: 1.0,
-        };
-        // Far from the last reversal the displacement goes with the input: the nominal gain is that of the large stroke.
-        relays.scale = 0.5 / width_um;
-        // Demagnetised by an oscillation that dies out.
-        for k in 0..400 {
-            let a = span * (1.0 - f64::from(k) / 400.0);
-            relays.extremes.push(if k % 2 == 0 { a } else { -a });
-        }
-        relays
-    }
-
-    /// Weight of all relays that switch between two extremes: `exp(-half width/width)` integrated over the triangle,
-    /// falling off from the middle over ten widths.
-    fn everett(&self, up: f64, down: f64) -> f64 {
-        let (w, d) = (self.width_um, (up - down).max(0.0));
-        let middle = 0.5 * (up + down) / (10.0 * w);
-        (2.0 * d * w - 4.0 * w * w * (1.0 - (-0.5 * d / w).exp())) * (-middle * middle).exp()
-    }
-
-    /// Displacement after the input has gone straight to `u`.
-    fn follow(&mut self, u: f64) -> f64 {
-        if u != self.at {
-            let rising = u > self.at;
-            let last_is_minimum = self.extremes.len() % 2 == 1;
-            // A reversal is remembered.
-            if rising != last_is_minimum {
-                self.extremes.push(self.at);
-            }
-            // What the input passes is wiped out, pairs of extremes at a time.
-            while self.extremes.len() >= 2 {
-                let before = self.extremes[self.extremes.len() - 2];
-                if (rising && u >= before) || (!rising && u <= before) {
-                    self.extremes.pop();
-                    self.extremes.pop();
-                } else {
-                    break;
-                }
-            }
-            if self.extremes.is_empty() {
-                self.extremes.push(-self.span);
-            }
-            self.at = u;
-        }
-        let mut sum = -0.5 * self.everett(self.span, -self.span);
-        let mut low = self.extremes[0];
-        let mut k = 1;
-        loop {
-            let high = self.extremes.get(k).copied();
-            match high {
-                None => {
-                    sum += self.everett(self.at.max(low), low);
-                    break;
-                }
-                Some(high) => {
-                    let next = self.extremes.get(k + 1).copied().unwrap_or(self.at);
-                    sum += self.everett(high, low) - self.everett(high, next.min(high));
-                    low = next;
-                    if k + 1 >= self.extremes.len() {
-                        break;
-                    }
-                    k += 2;
-                }
-            }
-        }
-        sum * self.scale
-    }
-}
-
 /// Positions that the camera sees at every row, without localisation noise \[um\].
 fn positions(u: &[f64], hidden: &[Hidden], nuisance: Nuisance, random: &mut Random) -> Vec<f64> {
     let h = 1e-3 / FINE as f64;
@@ -382,74 +294,70 @@ fn positions(u: &[f64], hidden: &[Hidden], nuisance: Nuisance, random: &mut Rand
         ([0.0; 2], 0.0, 0.0, 0.0, 0.0, 0.0);
     let mut voigt = [0.0f64; 7];
     let mut ring = [0.0f64; 2];
-    let (mut before, mut bead, mut walk) = (0.0, 0.0, 0.0);
-    let mut pressed: Option<(f64, f64)> = None;
+    let (mut last, mut bead, mut walk) = (0.0, 0.0, 0.0);
     let mut past: Vec<f64> = Vec::with_capacity(n);
-    path.push(0.0);
+    path.push([0.0; 2]);
     for j in 0..n {
         let t = j as f64 * h;
-        let mut x = u[j / FINE];
+        let mut x = Through::held(u[j / FINE]);
         for e in hidden {
             match *e {
-                Hidden::Saturation(low, high) => x = x.clamp(low - 4.0, high - 4.0),
+                Hidden::Saturation(low, high) => x = x.map(|x| x.clamp(low - 4.0, high - 4.0)),
                 Hidden::SlewLimit(rate) => {
                     let old = slew;
-                    slew += (x - slew).clamp(-rate * h, rate * h);
-                    x = 0.5 * (old + slew);
-                }
-                Hidden::DriverLag(hz) => {
-                    // Implicit midpoint rule.
-                    let w = 0.5 * TAU * hz * h;
-                    let old = lag;
-                    lag = (lag * (1.0 - w) + 2.0 * w * x) / (1.0 + w);
-                    x = 0.5 * (old + lag);
-                }
-                Hidden::Preisach(part, _) => {
-                    let p = match pressed {
-                        Some((at, p)) if at == x => p,
-                        _ => relays.first_mut().map_or(0.0, |r| r.follow(x)),
+                    let way = (x.end - slew).clamp(-rate * h, rate * h);
+                    slew += way;
+                    // The ramp takes a part of the step, then rests.
+                    x = Through {
+                        start: old,
+                        mean: slew - 0.5 * way * (way.abs() / (rate * h)),
+                        end: slew,
                     };
-                    pressed = Some((x, p));
+                }
+                Hidden::DriverLag(hz) => x = low_pass(&mut lag, x, h, 1.0 / (TAU * hz)),
+                Hidden::Preisach(part, _) => {
                     // The domains that switch add to the elastic part: the gain rises with the amplitude and the loop
                     // lags, as in every measured piezo.
-                    x = (1.0 - part) * x + part * p;
+                    x = x.map(|x| {
+                        let p = relays.first_mut().map_or(0.0, |r| r.follow(x));
+                        (1.0 - part) * x + part * p
+                    });
                 }
                 Hidden::Creep(g) => {
-                    // One Kelvin-Voigt element per decade from 1 ms to 1000 s.
-                    let mut sum = 0.0;
-                    for (i, q) in voigt.iter_mut().enumerate() {
-                        let tau = 10f64.powi(i as i32 - 3);
-                        let old = *q;
-                        *q += (x - *q) * (1.0 - (-h / tau).exp());
-                        sum += 0.5 * (old + *q);
-                    }
-                    // The displacement 0.1 s after a step counts as 1.
+                    // One Kelvin-Voigt element per decade from 1 ms to 1000 s. The displacement 0.1 s after a step counts
+                    // as 1.
                     let at_tenth: f64 =
                         (0..7).map(|i| 1.0 - (-0.1 / 10f64.powi(i - 3)).exp()).sum();
-                    x = x * (1.0 - at_tenth * g) + g * sum;
+                    let mut y = x.map(|x| x * (1.0 - at_tenth * g));
+                    for (i, q) in voigt.iter_mut().enumerate() {
+                        let crept = low_pass(q, x, h, 10f64.powi(i as i32 - 3));
+                        y = y.plus(g, crept);
+                    }
+                    x = y;
                 }
                 Hidden::Resonance(hz, zeta) => {
                     let w = TAU * hz;
-                    let f = |r: [f64; 2]| [r[1], w * w * (x - r[0]) - 2.0 * zeta * w * r[1]];
-                    let old = ring[0];
+                    let f = |r: [f64; 2]| [r[1], w * w * (x.mean - r[0]) - 2.0 * zeta * w * r[1]];
+                    let old = ring;
                     ring = rk4(ring, h, f);
-                    x = 0.5 * (old + ring[0]);
+                    x = Through {
+                        start: old[0],
+                        // Two slopes and two ends make a cubic.
+                        mean: 0.5 * (old[0] + ring[0]) + h / 12.0 * (old[1] - ring[1]),
+                        end: ring[0],
+                    };
                 }
                 Hidden::Backlash(width) => {
-                    play = f64::clamp(play, x - 0.5 * width, x + 0.5 * width);
-                    x = play;
+                    x = x.map(|x| {
+                        play = f64::clamp(play, x - 0.5 * width, x + 0.5 * width);
+                        play
+                    });
                 }
                 Hidden::Relaxation(tau, strength) => {
-                    let old = solid;
-                    solid += (x - solid) * (1.0 - (-h / tau).exp());
-                    x += strength * (x - 0.5 * (old + solid));
+                    let flow = low_pass(&mut solid, x, h, tau);
+                    x = x.plus(strength, x).plus(-strength, flow);
                 }
-                Hidden::Bubble(tau) => {
-                    let w = 0.5 * h / tau;
-                    let old = gas;
-                    gas = (gas * (1.0 - w) + 2.0 * w * x) / (1.0 + w);
-                    x = 0.5 * (old + gas);
-                }
+                Hidden::Bubble(tau) => x = low_pass(&mut gas, x, h, tau),
                 Hidden::Echo(c, late) => {
                     let k = (late / h) as usize;
                     let old = if j >= k && k > 0 {
@@ -457,39 +365,117 @@ fn positions(u: &[f64], hidden: &[Hidden], nuisance: Nuisance, random: &mut Rand
                     } else {
                         0.0
                     };
-                    past.push(x);
-                    x += c * old;
+                    past.push(x.mean);
+                    x = x.plus(c, Through::held(old));
                 }
                 _ => {}
             }
         }
-        s = rk4(s, h, |s| derivative(s, x));
-        let now = output(s, x);
-        let mut v = (now - before) / h;
-        before = now;
+        // What the direct path does at once is a jump of the bead, apart from the flow that follows.
+        let start = output(s, x.start);
+        s = rk4(s, h, |s| derivative(s, x.mean));
+        let end = output(s, x.end);
+        let mut jump = start - last;
+        let mut v = (end - start) / h;
+        last = end;
         let mut lost = 0.0;
         for e in hidden {
             match *e {
-                Hidden::Gain(f) => v *= f,
-                Hidden::GainDrift(r) => v *= 1.0 + r * t,
+                Hidden::Gain(f) => {
+                    v *= f;
+                    jump *= f;
+                }
+                Hidden::GainDrift(r) => {
+                    v *= 1.0 + r * (t + 0.5 * h);
+                    jump *= 1.0 + r * t;
+                }
                 Hidden::FlowDrift(d) => v += d,
                 Hidden::Adhesion(limit) => v = v.signum() * (v.abs() - limit).max(0.0),
-                Hidden::Leak(w) => lost += w * (bead + 0.5 * v * h),
-                Hidden::Square(c) => v += c * x * x,
-                Hidden::Cube(c) => v += c * x * x * x,
-                Hidden::Profile(c) => v *= 1.0 + c * (TAU * bead / 20.0).sin(),
+                Hidden::Leak(w) => lost += w * (bead + jump + 0.5 * v * h),
+                Hidden::Square(c) => v += c * x.mean * x.mean,
+                Hidden::Cube(c) => v += c * x.mean * x.mean * x.mean,
+                Hidden::Profile(c) => {
+                    let faster = 1.0 + c * (TAU * bead / 20.0).sin();
+                    v *= faster;
+                    jump *= faster;
+                }
                 Hidden::Spring(c) => lost += c * bead * bead * bead,
-                Hidden::Breathing(c) => v *= 1.0 + c * (TAU * 0.7 * t).sin(),
-                Hidden::Valve(c) => v *= if v > 0.0 { 1.0 + c } else { 1.0 - c },
-                Hidden::Jumps(c) if j % (FINE * 997) == FINE * 500 => v += c / h,
+                Hidden::Breathing(c) => {
+                    let swing = 1.0 + c * (TAU * 0.7 * t).sin();
+                    v *= swing;
+                    jump *= swing;
+                }
+                Hidden::Valve(c) => {
+                    let way = |x: f64| if x > 0.0 { 1.0 + c } else { 1.0 - c };
+                    v *= way(v);
+                    jump *= way(jump);
+                }
+                Hidden::Jumps(c) if j % (FINE * 997) == FINE * 500 => jump += c,
                 _ => {}
             }
         }
+        bead += jump;
+        path[j][1] = bead + walk;
         bead += (v - lost) * h;
         walk += (2.0 * nuisance.diffusion_um2_per_s * h).sqrt() * random.normal();
-        path.push(bead + walk);
+        path.push([bead + walk; 2]);
     }
     camera(&path, u.len(), h, hidden, random)
+}
+
+/// A signal in one step of the integrator: its value right after the step's start, its mean, its value at the end.
+#[derive(Debug, Clone, Copy)]
+struct Through {
+    start: f64,
+    mean: f64,
+    end: f64,
+}
+
+impl Through {
+    fn held(x: f64) -> Self {
+        Self {
+            start: x,
+            mean: x,
+            end: x,
+        }
+    }
+
+    /// Through something without dynamics, which may remember the way it went.
+    fn map(self, mut f: impl FnMut(f64) -> f64) -> Self {
+        if self.start == self.end {
+            return Self::held(f(self.end));
+        }
+        let start = f(self.start);
+        let mean = f(self.mean);
+        let end = f(self.end);
+        Self { start, mean, end }
+    }
+
+    fn plus(self, factor: f64, other: Self) -> Self {
+        Self {
+            start: self.start + factor * other.start,
+            mean: self.mean + factor * other.mean,
+            end: self.end + factor * other.end,
+        }
+    }
+}
+
+/// A first-order lag by the implicit midpoint rule, in parts of a step that are short against its time.
+fn low_pass(z: &mut f64, x: Through, h: f64, tau: f64) -> Through {
+    let start = *z;
+    let parts = (20.0 * h / tau).ceil().clamp(1.0, 64.0);
+    let w = 0.5 * h / (tau * parts);
+    let mut sum = 0.0;
+    for _ in 0..parts as usize {
+        let old = *z;
+        *z = (old * (1.0 - w) + 2.0 * w * x.mean) / (1.0 + w);
+        sum += 0.5 * (old + *z);
+    }
+    Through {
+        start,
+        mean: sum / parts,
+        end: *z,
+    }
 }
 
 fn rk4(s: [f64; 2], h: f64, f: impl Fn([f64; 2]) -> [f64; 2]) -> [f64; 2] {
@@ -505,7 +491,15 @@ fn rk4(s: [f64; 2], h: f64, f: impl Fn([f64; 2]) -> [f64; 2]) -> [f64; 2] {
 }
 
 /// What the frames show of a fine path.
-fn camera(path: &[f64], rows: usize, h: f64, hidden: &[Hidden], random: &mut Random) -> Vec<f64> {
+///
+/// `path[i]` holds the position right before and right after time i h.
+fn camera(
+    path: &[[f64; 2]],
+    rows: usize,
+    h: f64,
+    hidden: &[Hidden],
+    random: &mut Random,
+) -> Vec<f64> {
     let (mut delay, mut exposure, mut skew) = (0.0, 0.0, 0.0);
     let phase = TAU * random.uniform();
     for e in hidden {
@@ -517,9 +511,15 @@ fn camera(path: &[f64], rows: usize, h: f64, hidden: &[Hidden], random: &mut Ran
         }
     }
     let at = |t: f64| {
+        // Limits from the left: a command that acts at the very instant is not seen yet.
         let x = (t / h).max(0.0);
-        let i = (x as usize).min(path.len() - 2);
-        path[i] + (path[i + 1] - path[i]) * (x - i as f64)
+        let i = ((x - 1e-6).ceil() - 1.0)
+            .max(0.0)
+            .min(path.len() as f64 - 2.0) as usize;
+        if x <= 1e-6 {
+            return path[0][0];
+        }
+        path[i][1] + (path[i + 1][0] - path[i][1]) * (x - i as f64)
     };
     (0..rows)
         .map(|k| {

@@ -21,6 +21,9 @@ pub(crate) enum Block {
         weights: [f64; PLAY_LEVELS.len()],
         quadratic: f64,
     },
+    /// Play operators whose density falls off exponentially with the threshold, `fraction/width exp(-r/width)`, beside
+    /// `1 - fraction` of the input itself: large strokes keep their gain.
+    Domains { fraction: f64, width_um: f64 },
     /// Per decade.
     Creep { g: f64 },
     /// rad/s and damping ratio.
@@ -56,6 +59,46 @@ pub(crate) enum Block {
 /// Thresholds of the play operators in parts of the stroke.
 pub(crate) const PLAY_LEVELS: [f64; 8] = [0.0, 0.03, 0.08, 0.15, 0.25, 0.4, 0.6, 0.8];
 
+/// Classes of thresholds of [`Block::Domains`], by their edges in widths.
+const DOMAIN_EDGES: [f64; DOMAINS + 1] = [
+    0.0,
+    0.04,
+    0.1,
+    0.18,
+    0.28,
+    0.4,
+    0.55,
+    0.75,
+    1.0,
+    1.3,
+    1.7,
+    2.2,
+    3.0,
+    4.5,
+    f64::INFINITY,
+];
+
+/// Number of play operators that stand for an exponential density.
+pub(crate) const DOMAINS: usize = 14;
+
+/// Thresholds in widths and shares of an exponential density of play operators, each class at its mean.
+pub(crate) fn domains() -> ([f64; DOMAINS], [f64; DOMAINS]) {
+    let (mut radii, mut shares) = ([0.0; DOMAINS], [0.0; DOMAINS]);
+    let moment = |r: f64| {
+        if r.is_finite() {
+            (r + 1.0) * (-r).exp()
+        } else {
+            0.0
+        }
+    };
+    for i in 0..DOMAINS {
+        let (a, b) = (DOMAIN_EDGES[i], DOMAIN_EDGES[i + 1]);
+        shares[i] = (-a).exp() - (-b).exp();
+        radii[i] = (moment(a) - moment(b)) / shares[i];
+    }
+    (radii, shares)
+}
+
 impl Block {
     /// Rank in the chain.
     pub fn rank(&self) -> u8 {
@@ -63,7 +106,7 @@ impl Block {
             Self::Saturation { .. } => 0,
             Self::SlewLimit { .. } => 1,
             Self::DriverLag { .. } => 2,
-            Self::BoucWen { .. } | Self::Play { .. } => 3,
+            Self::BoucWen { .. } | Self::Play { .. } | Self::Domains { .. } => 3,
             Self::Creep { .. } => 4,
             Self::Resonance { .. } => 5,
             Self::Backlash { .. } => 6,

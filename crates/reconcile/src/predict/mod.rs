@@ -11,7 +11,7 @@ mod camera;
 mod modal;
 mod piezo;
 
-pub(crate) use block::{Block, PLAY_LEVELS};
+pub(crate) use block::{Block, PLAY_LEVELS, domains};
 pub(crate) use modal::Zpk;
 use modal::{Modal, Trace};
 
@@ -75,7 +75,10 @@ impl<'a> Chain<'a> {
                     dynamic_before = true;
                     piezo::append_linear(b, &mut zpk);
                 }
-                Block::BoucWen { .. } | Block::Play { .. } | Block::Backlash { .. } => {
+                Block::BoucWen { .. }
+                | Block::Play { .. }
+                | Block::Domains { .. }
+                | Block::Backlash { .. } => {
                     if dynamic_before {
                         fine = fine.max(10);
                     }
@@ -134,6 +137,10 @@ impl<'a> Chain<'a> {
                 } => {
                     flush(&mut pending, &mut x, h);
                     piezo::play(&mut x, stroke_um, weights, quadratic);
+                }
+                Block::Domains { fraction, width_um } => {
+                    flush(&mut pending, &mut x, h);
+                    piezo::domains(&mut x, fraction, width_um);
                 }
                 Block::Backlash { width_um } => {
                     flush(&mut pending, &mut x, h);

@@ -1,25 +1,12 @@
 //! Driver, piezo and chip blocks on a grid.
 
-use super::block::{Block, PLAY_LEVELS};
+use super::block::{self, Block, DOMAINS, PLAY_LEVELS};
 use super::modal::Zpk;
 use nalgebra::Complex;
 
-/// Fastest and slowest lag of the creep bank, as powers of ten of a second; two per decade.
-const CREEP_TAUS_S: [f64; 13] = [
-    1e-3,
-    3.162_277_66e-3,
-    1e-2,
-    3.162_277_66e-2,
-    0.1,
-    0.316_227_766,
-    1.0,
-    3.162_277_66,
-    10.0,
-    31.622_776_6,
-    100.0,
-    316.227_766,
-    1000.0,
-];
+/// The creep bank, as in `cellpos-plant`: so many lags, two per decade, the first a quarter of a decade above 0.1 ms.
+const CREEP_LAGS: usize = 18;
+const CREEP_FASTEST_S: f64 = 1.778_279_41e-4;
 
 /// Appends a linear block to a chain; anything else is left out.
 pub(crate) fn append_linear(b: &Block, zpk: &mut Zpk) {
@@ -52,22 +39,16 @@ pub(crate) fn append_linear(b: &Block, zpk: &mut Zpk) {
 
 /// Logarithmic creep as a bank of lags: `1 + g/2 (sum 1/(1 + tau s) - n0)`, where n0 makes the step response 1 at 0.1 s.
 fn creep(g: f64, zpk: &mut Zpk) {
-    let n0: f64 = CREEP_TAUS_S.iter().map(|t| 1.0 - (-0.1 / t).exp()).sum();
+    let taus_s: [f64; CREEP_LAGS] =
+        std::array::from_fn(|i| CREEP_FASTEST_S * 10f64.powf(0.5 * i as f64));
+    let n0: f64 = taus_s.iter().map(|t| 1.0 - (-0.1 / t).exp()).sum();
     let direct = 1.0 - 0.5 * g * n0;
     // Zeros interlace with the poles: one between each pair, one beyond the fastest. Bisection on w = -s.
-    let value = |w: f64| {
-        direct
-            + 0.5
-                * g
-                * CREEP_TAUS_S
-                    .iter()
-                    .map(|t| 1.0 / (1.0 - t * w))
-                    .sum::<f64>()
-    };
+    let value = |w: f64| direct + 0.5 * g * taus_s.iter().map(|t| 1.0 / (1.0 - t * w)).sum::<f64>();
     if g <= 0.0 || direct <= 0.0 {
         return;
     }
-    let mut poles: Vec<f64> = CREEP_TAUS_S.iter().map(|t| 1.0 / t).collect();
+    let mut poles: Vec<f64> = taus_s.iter().map(|t| 1.0 / t).collect();
     poles.sort_by(f64::total_cmp);
     let mut gain = direct;
     for i in 0..poles.len() {
@@ -133,6 +114,21 @@ pub(crate) fn play(
             sum += weights[i] * p[i];
         }
         *v = sum + quadratic * sum * sum;
+    }
+}
+
+/// Play operators of an exponential density, beside the input itself.
+pub(crate) fn domains(x: &mut [f64], fraction: f64, width_um: f64) {
+    let (radii, shares) = block::domains();
+    let radii = radii.map(|r| r * width_um);
+    let mut p = [0.0f64; DOMAINS];
+    for v in x.iter_mut() {
+        let mut sum = 0.0;
+        for i in 0..DOMAINS {
+            p[i] = p[i].min(*v + radii[i]).max(*v - radii[i]);
+            sum += shares[i] * p[i];
+        }
+        *v += fraction * (sum - *v);
     }
 }
 
