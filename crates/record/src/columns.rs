@@ -39,7 +39,7 @@ impl Kind {
 }
 
 /// The columns before the controller's state, in the order of [`visit`].
-const FIXED: [(&str, Kind); 31] = [
+const FIXED: [(&str, Kind); 32] = [
     ("seq", Kind::U64),
     ("time_ns", Kind::I64),
     ("frame_id", Kind::U64),
@@ -71,6 +71,7 @@ const FIXED: [(&str, Kind); 31] = [
     ("plan_ns", Kind::I64),
     ("stage", Kind::U8),
     ("length_um", Kind::F64),
+    ("area_um2", Kind::F64),
 ];
 
 /// Name and type of every column.
@@ -133,6 +134,7 @@ fn visit(row: &TickRecord, to: &mut impl Take) {
     to.i64(row.plan_ns);
     to.u8(row.stage);
     to.f64(row.length_um);
+    to.f64(row.area_um2);
     for value in row.controller_state {
         to.f64(value);
     }
@@ -172,6 +174,7 @@ pub(crate) fn unknown() -> TickRecord {
         plan_ns: -1,
         stage: 0,
         length_um: f64::NAN,
+        area_um2: f64::NAN,
         controller_state: [f64::NAN; CONTROLLER_STATE_LEN],
     }
 }
@@ -211,6 +214,7 @@ pub(crate) fn set(row: &mut TickRecord, column: usize, bits: u64) {
         28 => row.plan_ns = bits.cast_signed(),
         29 => row.stage = bits as u8,
         30 => row.length_um = float,
+        31 => row.area_um2 = float,
         _ => {
             if let Some(state) = column
                 .checked_sub(FIXED.len())

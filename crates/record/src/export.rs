@@ -15,7 +15,7 @@ use std::path::Path;
 pub const CSV_HEAD: &str = "time_s,pzt_um,bead_um,seq,frame_id,mid_exposure_s,sigma_um,target_um,estimate_um,\
                             neutral_um,requested_um,applied_um,true_um,verdict,life,request,board,\
                             board_fault,flags,drained,wake_us,compute_us,track,decision,plan_s,stage,\
-                            length_um";
+                            length_um,area_um2";
 
 /// Formats of [`export`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -79,7 +79,7 @@ fn csv_row(row: &TickRecord, out: &mut impl Write) -> io::Result<()> {
     };
     writeln!(
         out,
-        "{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{}",
+        "{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{}",
         seconds(row.time_ns),
         Maybe(row.command_um),
         Maybe(bead_um),
@@ -111,6 +111,7 @@ fn csv_row(row: &TickRecord, out: &mut impl Write) -> io::Result<()> {
         }),
         row.stage,
         Maybe(row.length_um),
+        Maybe(row.area_um2),
     )
 }
 

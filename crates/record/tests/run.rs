@@ -35,6 +35,7 @@ fn row(seq: u64) -> TickRecord {
         plan_ns: -1,
         stage: 2,
         length_um: 9.5,
+        area_um2: 61.0 + x,
         flags,
         drained: 1,
         wake_ns: 1234,
@@ -78,6 +79,8 @@ fn bits(row: &TickRecord) -> Vec<u64> {
         row.command_um,
         row.applied_um,
         row.true_um,
+        row.length_um,
+        row.area_um2,
     ];
     bits.extend(
         floats
@@ -237,6 +240,10 @@ fn exports_carry_units_in_their_names_and_follow_the_row_convention() {
         third[11], "",
         "a number that does not exist is an empty field"
     );
+    let head: Vec<&str> = CSV_HEAD.split(',').collect();
+    assert_eq!(head.len(), third.len());
+    let area = head.iter().position(|name| *name == "area_um2").unwrap();
+    assert_eq!(third[area].parse::<f64>().unwrap(), 64.0);
     let record = run.to_record().unwrap();
     assert!((record.rate_hz() - 1000.0).abs() < 1e-9);
 
@@ -259,7 +266,7 @@ fn exports_carry_units_in_their_names_and_follow_the_row_convention() {
             assert_eq!(value.to_bits(), (20.0 + rows as f64 / 7.0).to_bits());
             rows += 1;
         }
-        assert_eq!(batch.num_columns(), 31 + CONTROLLER_STATE_LEN);
+        assert_eq!(batch.num_columns(), 32 + CONTROLLER_STATE_LEN);
     }
     assert_eq!(rows, 100);
     let names: Vec<_> = std::fs::read_dir(root.path().join("out"))
@@ -281,6 +288,55 @@ fn arrow_itself_reads_the_stream() {
         .map(|batch| batch.unwrap().num_rows())
         .sum();
     assert_eq!(rows, 50);
+}
+
+#[test]
+fn a_recording_from_before_a_column_existed_reads_with_nothing_known_of_it() {
+    let root = tempfile::tempdir().unwrap();
+    let mut writer =
+        RunWriter::create_with(root.path(), RunMeta::new("t", "virtual"), policy(16)).unwrap();
+    (0..50).for_each(|seq| writer.tick(&row(seq)));
+    let folder = writer.finish(RunEnd::new("done")).folder;
+    let path = folder.join("ticks.arrow");
+    // The same rows as they were written before the loop measured areas.
+    let file = std::fs::File::open(&path).unwrap();
+    let mut batches: Vec<arrow_array::RecordBatch> =
+        arrow_ipc::reader::StreamReader::try_new(file, None)
+            .unwrap()
+            .map(Result::unwrap)
+            .collect();
+    for batch in &mut batches {
+        let area = batch.schema().index_of("area_um2").unwrap();
+        batch.remove_column(area);
+    }
+    let file = std::fs::File::create(&path).unwrap();
+    let mut old = arrow_ipc::writer::StreamWriter::try_new(file, &batches[0].schema()).unwrap();
+    for batch in &batches {
+        old.write(batch).unwrap();
+    }
+    old.finish().unwrap();
+    drop(old);
+
+    let (ticks, lost) = RunReader::open(&folder).unwrap().ticks().unwrap();
+    assert_eq!(
+        (ticks.len(), lost.damaged_bytes, lost.finished),
+        (50, 0, true)
+    );
+    for (tick, seq) in ticks.iter().zip(0..) {
+        assert!(tick.area_um2.is_nan());
+        let expected = TickRecord {
+            area_um2: tick.area_um2,
+            ..row(seq)
+        };
+        assert_eq!(bits(tick), bits(&expected));
+    }
+    let mut csv = Vec::new();
+    cellpos_record::write_csv(&RunReader::open(&folder).unwrap(), &mut csv).unwrap();
+    let csv = String::from_utf8(csv).unwrap();
+    assert!(
+        csv.lines().skip(1).all(|line| line.ends_with(",9.5,")),
+        "{csv}"
+    );
 }
 
 #[test]

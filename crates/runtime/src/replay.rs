@@ -134,7 +134,7 @@ fn input(record: &TickRecord, previous: Option<&TickRecord>) -> TickInput {
         track: TrackState::from_number(record.track).zip(Decision::from_number(record.decision)),
         snr: f64::NAN,
         length_um: record.length_um,
-        area_um2: f64::NAN,
+        area_um2: record.area_um2,
         true_um: record.true_um,
         true_pzt_um: f64::NAN,
     });

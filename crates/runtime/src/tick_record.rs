@@ -84,6 +84,8 @@ pub struct TickRecord {
     pub stage: u8,
     /// Measured length of the cell, um.
     pub length_um: f64,
+    /// Measured projected area of the cell, um^2.
+    pub area_um2: f64,
     /// Estimated bead position at the tick, um.
     pub estimate_um: f64,
     /// Estimated PZT displacement at which the bead is at rest, um.

@@ -22,7 +22,8 @@ mod script;
 pub use check::{Check, CheckError, CheckLimits, Violation, WaveCheck, check};
 pub use cursor::{Cursor, Output, Seen, Status, StopReason};
 pub use cycles::{
-    Alarm, AmplitudeWatch, CycleFlags, CycleRow, CycleTable, Trend, read_cycles, trend,
+    Alarm, AmplitudeWatch, CycleColumns, CycleFlags, CycleRow, CycleTable, HeadError, ReadCycles,
+    Trend, read_cycles, trend,
 };
 pub use error::ScriptError;
 pub use follow::Follower;

@@ -7,7 +7,7 @@ use cellpos_runtime::Timing;
 use cellpos_script::{ArmKind, CycleRow, trend};
 
 #[test]
-fn the_trends_of_stretch_and_recovery_are_found_and_the_static_arm_has_none() {
+fn the_trends_of_stretch_area_and_recovery_are_found_and_the_static_arm_has_none() {
     let path = concat!(
         env!("CARGO_MANIFEST_DIR"),
         "/../../examples/scripts/fatigue.toml"
@@ -30,9 +30,20 @@ fn the_trends_of_stretch_and_recovery_are_found_and_the_static_arm_has_none() {
     };
     let stretch = |row: &CycleRow| row.length_peak_um / rest_um;
     let recovery = |row: &CycleRow| row.recovery_s;
+    let rest_um2 = table.rows[0].area_start_um2;
+    let disc_um2 = std::f64::consts::FRAC_PI_4 * cell.rest_um.powi(2);
+    assert!((rest_um2 / disc_um2 - 1.0).abs() < 0.05);
+    let area = |row: &CycleRow| row.area_peak_um2 / rest_um2;
     for (name, found, first, last) in [
         ("stretch", of(ArmKind::Cyclic, &stretch), 3.80, 2.86),
         ("recovery", of(ArmKind::Cyclic, &recovery), 0.16, 0.37),
+        // The volume is kept: the projected area goes with the root of the length.
+        (
+            "area",
+            of(ArmKind::Cyclic, &area),
+            3.80f64.sqrt(),
+            2.86f64.sqrt(),
+        ),
     ] {
         let found = found.unwrap();
         eprintln!("{name}: {found:?}");
@@ -44,9 +55,17 @@ fn the_trends_of_stretch_and_recovery_are_found_and_the_static_arm_has_none() {
         assert!((found.last / last - 1.0).abs() < 0.05, "{name}: {found:?}");
         assert!(found.is_significant(), "{name}: {found:?}");
     }
-    let still = of(ArmKind::Static, &stretch).unwrap();
-    eprintln!("static: {still:?}");
-    assert!(still.cycles == 180 && !still.is_significant(), "{still:?}");
+    for (name, still) in [
+        ("stretch", of(ArmKind::Static, &stretch)),
+        ("area", of(ArmKind::Static, &area)),
+    ] {
+        let still = still.unwrap();
+        eprintln!("{name}, static: {still:?}");
+        assert!(
+            still.cycles == 180 && !still.is_significant(),
+            "{name}: {still:?}"
+        );
+    }
     let recovering = of(ArmKind::Static, &recovery);
     assert!(
         recovering.is_none_or(|trend| !trend.is_significant()),

@@ -77,11 +77,11 @@ pub fn run(args: Args) -> CommandResult {
     }
     head(&mut page, &sessions, &ticks);
     let text = std::fs::read_to_string(args.run.join(CYCLES_CSV)).unwrap_or_default();
-    let (rows, unreadable) = read_cycles(&text);
+    let cycles = read_cycles(&text);
     traces(&mut page, &ticks);
     let bound = spectrum::Bound::of(meta, &ticks);
     errors(&mut page, &ticks, bound.as_ref());
-    let trends = cycles::section(&mut page, &rows, unreadable);
+    let trends = cycles::section(&mut page, &cycles);
     learned(&mut page, &args.run)?;
     timing(&mut page, &sessions, &ticks);
     events(&mut page, &sessions);
@@ -93,7 +93,7 @@ pub fn run(args: Args) -> CommandResult {
             "out": out,
             "sessions": sessions.len(),
             "ticks": ticks.rows,
-            "cycles": rows.len(),
+            "cycles": cycles.rows.len(),
             "rms_nm": ticks.rms_um().map(|um| um * 1e3),
             "bound_rms_nm": bound.as_ref().map(|bound| bound.rms_um * 1e3),
             "trends": trends,

@@ -113,6 +113,7 @@ impl<R: Guide> Core<R> {
             plan_ns: guided.plan_ns,
             stage: guided.stage as u8,
             length_um: m.map_or(f64::NAN, |m| m.length_um),
+            area_um2: m.map_or(f64::NAN, |m| m.area_um2),
             estimate_um: output.estimate_um,
             neutral_um: output.neutral_um,
             requested_um: output.requested_um,

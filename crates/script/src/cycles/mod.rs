@@ -8,9 +8,12 @@ mod fit;
 mod open;
 mod outlier;
 mod row;
+mod shape;
+mod table;
 mod trend;
 
-pub use row::{CycleFlags, CycleRow, read_cycles};
+pub use row::{CycleFlags, CycleRow};
+pub use table::{CycleColumns, HeadError, ReadCycles, read_cycles};
 pub use trend::{Alarm, AmplitudeWatch, Trend, trend};
 
 use crate::plan::{Cycle, Plan};

@@ -1,6 +1,7 @@
 //! A cycle that is going on.
 
-use super::fit::{self, SineFit};
+use super::fit::SineFit;
+use super::shape::Series;
 use super::{CycleFlags, CycleRow, Place, bounds_ns};
 use crate::plan::{Cycle, Plan};
 use cellpos_control::{Reference, SolverStatus};
@@ -20,15 +21,8 @@ pub(super) struct Open {
     /// n, sums of u, v, u u, u v, of the speed v against the displacement u away from neutral.
     gain: [f64; 5],
     far_um: f64,
-    lengths: Vec<Length>,
-}
-
-/// A measured length of the cell.
-#[derive(Debug, Clone, Copy)]
-struct Length {
-    time_s: f64,
-    um: f64,
-    phase: f64,
+    lengths_um: Series,
+    areas_um2: Series,
 }
 
 impl Open {
@@ -63,7 +57,8 @@ impl Open {
             } else {
                 low
             },
-            lengths: Vec::new(),
+            lengths_um: Series::default(),
+            areas_um2: Series::default(),
         }
     }
 
@@ -164,13 +159,9 @@ impl Open {
             }
         }
         self.last_seen = Some((place.exposed_ns, at_um));
-        if record.length_um.is_finite() {
-            self.lengths.push(Length {
-                time_s: place.exposed_ns as f64 * 1e-9,
-                um: record.length_um,
-                phase,
-            });
-        }
+        let exposed_s = place.exposed_ns as f64 * 1e-9;
+        self.lengths_um.add(exposed_s, phase, record.length_um);
+        self.areas_um2.add(exposed_s, phase, record.area_um2);
     }
 
     /// The row of the finished cycle.
@@ -201,77 +192,22 @@ impl Open {
         if n >= 10.0 && spread / n > 4e-4 {
             row.gain_per_s = (uv - u * v / n) / spread;
         }
-        lengths(&mut row, &self.lengths);
+        let length_um = self.lengths_um.at_phases();
+        row.length_start_um = length_um.start;
+        row.length_quarter_um = length_um.quarter;
+        row.length_half_um = length_um.half;
+        row.length_three_quarters_um = length_um.three_quarters;
+        row.length_peak_um = length_um.peak;
+        row.length_end_um = length_um.end;
+        // Of the length: the area follows it, but with a power below one, so that its relaxation is no single exponential.
+        row.recovery_s = self.lengths_um.recovery_s();
+        let area_um2 = self.areas_um2.at_phases();
+        row.area_start_um2 = area_um2.start;
+        row.area_quarter_um2 = area_um2.quarter;
+        row.area_half_um2 = area_um2.half;
+        row.area_three_quarters_um2 = area_um2.three_quarters;
+        row.area_peak_um2 = area_um2.peak;
+        row.area_end_um2 = area_um2.end;
         row
-    }
-}
-
-/// What the cell's length did over the cycle.
-fn lengths(row: &mut CycleRow, lengths: &[Length]) {
-    let (Some(first), Some(last)) = (lengths.first(), lengths.last()) else {
-        return;
-    };
-    row.length_start_um = first.um;
-    row.length_quarter_um = length_at(lengths, 0.25);
-    row.length_half_um = length_at(lengths, 0.5);
-    row.length_three_quarters_um = length_at(lengths, 0.75);
-    row.length_end_um = last.um;
-    let longest = (0..).zip(lengths).max_by(|a, b| a.1.um.total_cmp(&b.1.um));
-    let Some((index, peak)) = longest else {
-        return;
-    };
-    row.length_peak_um = peak.um;
-    // Noise alone must not be taken for a recovery.
-    if peak.um - last.um < 0.05 * peak.um {
-        return;
-    }
-    let after = lengths.get(index..).unwrap_or(&[]);
-    // From nine tenths of the way down on: the way out of the constriction itself is no relaxation.
-    let level_um = last.um + 0.9 * (peak.um - last.um);
-    let falling: Vec<(f64, f64)> = after
-        .iter()
-        .skip_while(|length| length.um >= level_um)
-        .map(|length| (length.time_s, length.um))
-        .collect();
-    row.recovery_s = fit::recovery_s(&falling).unwrap_or(f64::NAN);
-}
-
-/// The length at a phase, on the line between its neighbours; NaN where the cell was not seen for a tenth of the cycle.
-fn length_at(lengths: &[Length], phase: f64) -> f64 {
-    let after = lengths.partition_point(|length| length.phase < phase);
-    let before = after.checked_sub(1).and_then(|index| lengths.get(index));
-    match (before, lengths.get(after)) {
-        (Some(a), Some(b)) if b.phase - a.phase < 0.1 => {
-            let share = (phase - a.phase) / (b.phase - a.phase).max(f64::MIN_POSITIVE);
-            a.um + (b.um - a.um) * share
-        }
-        _ => f64::NAN,
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::plan::ArmKind;
-
-    #[test]
-    fn lengths_are_taken_at_fixed_phases_and_not_across_a_gap() {
-        let all: Vec<Length> = (0..200)
-            .map(|k| f64::from(k) / 200.0)
-            // Not seen from 0.4 to 0.6.
-            .filter(|phase| !(0.4..0.6).contains(phase))
-            .map(|phase| Length {
-                time_s: phase,
-                um: 10.0 + 8.0 * phase,
-                phase,
-            })
-            .collect();
-        let mut row = CycleRow::empty(0, 1, ArmKind::Cyclic);
-        lengths(&mut row, &all);
-        assert!((row.length_quarter_um - 12.0).abs() < 1e-9);
-        assert!((row.length_three_quarters_um - 16.0).abs() < 1e-9);
-        assert!(row.length_half_um.is_nan());
-        assert!((row.length_start_um - 10.0).abs() < 1e-9 && row.length_end_um > 17.9);
-        assert!(row.recovery_s.is_nan(), "nothing recovers");
     }
 }

@@ -178,8 +178,20 @@ pub struct CycleRow {
     pub length_peak_um: f64,
     /// Length of the cell at the end, um.
     pub length_end_um: f64,
-    /// Time constant of the cell's recovery after its largest length, s.
+    /// Time constant of the recovery of the cell's length after its largest, s.
     pub recovery_s: f64,
+    /// Projected area of the cell at the start, um^2.
+    pub area_start_um2: f64,
+    /// Projected area of the cell after a quarter of the cycle, um^2.
+    pub area_quarter_um2: f64,
+    /// Projected area of the cell after half of the cycle, um^2.
+    pub area_half_um2: f64,
+    /// Projected area of the cell after three quarters of the cycle, um^2.
+    pub area_three_quarters_um2: f64,
+    /// Largest projected area of the cell, um^2.
+    pub area_peak_um2: f64,
+    /// Projected area of the cell at the end, um^2.
+    pub area_end_um2: f64,
     /// What disturbed it.
     pub flags: CycleFlags,
 }
@@ -187,14 +199,14 @@ pub struct CycleRow {
 /// Columns of the table that hold numbers with a fraction, with access to them.
 macro_rules! floats {
     ($($name:ident),*) => {
-        const FLOATS: &[(&str, fn(&CycleRow) -> f64, fn(&mut CycleRow, f64))] =
+        pub(super) const FLOATS: &[(&str, fn(&CycleRow) -> f64, fn(&mut CycleRow, f64))] =
             &[$((stringify!($name), |row| row.$name, |row, value| row.$name = value)),*];
     };
 }
 /// Columns that hold whole numbers.
 macro_rules! wholes {
     ($($name:ident),*) => {
-        const WHOLES: &[(&str, fn(&CycleRow) -> u64, fn(&mut CycleRow, u64))] =
+        pub(super) const WHOLES: &[(&str, fn(&CycleRow) -> u64, fn(&mut CycleRow, u64))] =
             &[$((stringify!($name), |row| row.$name, |row, value| row.$name = value)),*];
     };
 }
@@ -230,7 +242,13 @@ floats!(
     length_three_quarters_um,
     length_peak_um,
     length_end_um,
-    recovery_s
+    recovery_s,
+    area_start_um2,
+    area_quarter_um2,
+    area_half_um2,
+    area_three_quarters_um2,
+    area_peak_um2,
+    area_end_um2
 );
 
 impl CycleRow {
@@ -268,6 +286,12 @@ impl CycleRow {
             length_peak_um: 0.0,
             length_end_um: 0.0,
             recovery_s: 0.0,
+            area_start_um2: 0.0,
+            area_quarter_um2: 0.0,
+            area_half_um2: 0.0,
+            area_three_quarters_um2: 0.0,
+            area_peak_um2: 0.0,
+            area_end_um2: 0.0,
             flags: CycleFlags::default(),
         };
         for (_, _, set) in FLOATS {
@@ -317,33 +341,6 @@ impl CycleRow {
         cells.push(self.flags.to_string());
         cells.join(",")
     }
-
-    /// A line of the table; None if it is none.
-    pub fn parse_csv(line: &str) -> Option<Self> {
-        let mut cells = line.split(',');
-        let mut row = Self::empty(0, 0, ArmKind::Cyclic);
-        for (index, (_, _, set)) in WHOLES.iter().enumerate() {
-            if index == 2 {
-                row.arm = match cells.next()? {
-                    "cyclic" => ArmKind::Cyclic,
-                    "static" => ArmKind::Static,
-                    _ => return None,
-                };
-            }
-            set(&mut row, cells.next()?.parse().ok()?);
-        }
-        for (_, _, set) in FLOATS {
-            let cell = cells.next()?;
-            let value = if cell.is_empty() {
-                f64::NAN
-            } else {
-                cell.parse().ok()?
-            };
-            set(&mut row, value);
-        }
-        row.flags = cells.next()?.parse().ok()?;
-        cells.next().is_none().then_some(row)
-    }
 }
 
 /// To a thousandth of a nanometre or a nanosecond: more digits would be noise in the file.
@@ -351,58 +348,14 @@ fn round(value: f64) -> f64 {
     (value * 1e6).round() / 1e6
 }
 
-/// The rows of a table, and how many lines behind its head are none.
-pub fn read_cycles(text: &str) -> (Vec<CycleRow>, usize) {
-    let mut rows = Vec::new();
-    let mut unreadable = 0;
-    // A last line without its end was cut off: it may read as a row and still not be the one that was meant.
-    let whole = text.rfind('\n').map_or(0, |end| end + 1);
-    unreadable += usize::from(whole < text.len());
-    for line in text.get(..whole).unwrap_or("").lines().skip(1) {
-        match CycleRow::parse_csv(line) {
-            Some(row) => rows.push(row),
-            None => unreadable += 1,
-        }
-    }
-    (rows, unreadable)
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
 
     #[test]
-    fn a_row_reads_back_as_it_was_written_and_a_torn_one_not_at_all() {
-        let mut row = CycleRow::empty(41, 3, ArmKind::Static);
-        row.ticks = 100;
-        row.seen = 97;
-        row.reached_um = 1.25;
-        row.lag_deg = -0.5;
-        row.flags
-            .set(CycleFlags::LOST | CycleFlags::RECORDS_LOST, true);
-        let line = row.to_csv();
-        assert_eq!(
-            line.split(',').count(),
-            CycleRow::csv_head().split(',').count()
-        );
-        let back = CycleRow::parse_csv(&line).unwrap();
-        assert_eq!(back.to_csv(), line);
-        assert_eq!((back.cycle, back.session, back.flags), (41, 3, row.flags));
-        assert!(back.reached_um == 1.25 && back.gain_per_s.is_nan());
-        let text = format!("{}\n{line}\n{line}", CycleRow::csv_head());
-        let (rows, unreadable) = read_cycles(&text);
-        assert_eq!((rows.len(), unreadable), (1, 1));
-        for end in 0..line.len() {
-            if let Some(part) = CycleRow::parse_csv(&line[..end]) {
-                assert!(line[..end].ends_with(['t', ',']), "{part:?}");
-            }
-        }
-    }
-
-    #[test]
     fn names_of_quantities_carry_their_unit() {
         for (name, ..) in FLOATS {
-            let unit = ["_um", "_s", "_deg"]
+            let unit = ["_um", "_um2", "_s", "_deg"]
                 .iter()
                 .any(|unit| name.ends_with(unit));
             assert!(unit, "{name}");

@@ -55,6 +55,7 @@ fn records(
             plan_ns: output.plan_ns,
             stage: output.stage as u8,
             length_um: f64::NAN,
+            area_um2: f64::NAN,
             estimate_um: measured_um,
             neutral_um: 20.0,
             requested_um: 20.0,
@@ -202,4 +203,47 @@ fn the_gain_of_the_bead_against_the_pzt_is_measured_in_each_cycle() {
         assert!((row.gain_per_s - 400.0).abs() < 0.5, "{row:?}");
     }
     assert!(plan.at_um(0.0) == 1.0);
+}
+
+#[test]
+fn length_and_area_of_a_cell_are_each_taken_at_the_phases_of_the_cycle() {
+    let plan = plan(TEXT);
+    // Length and area follow the bead; the area is not measured at all in the tenth cycle.
+    let (start_ns, end_ns) = bounds_ns(&plan.cycle(10).unwrap());
+    let all = records(
+        &plan,
+        |r, _| r,
+        |record| {
+            record.length_um = 10.0 + record.measured_um;
+            let exposed_ns = record.plan_ns - 2_000_000;
+            record.area_um2 = if (start_ns..end_ns).contains(&exposed_ns) {
+                f64::NAN
+            } else {
+                60.0 + 4.0 * record.measured_um
+            };
+            true
+        },
+    );
+    for row in &table(&plan, &all)[..20] {
+        let close = |value: f64, expected: f64| (value - expected).abs() < 0.05;
+        // 1 um and an amplitude of 2 um: 11, 13, 11, 9, 11 um.
+        assert!(close(row.length_start_um, 11.0) && close(row.length_end_um, 11.0 - 0.13));
+        assert!(close(row.length_quarter_um, 13.0) && close(row.length_peak_um, 13.0));
+        assert!(close(row.length_half_um, 11.0) && close(row.length_three_quarters_um, 9.0));
+        let areas = [
+            (row.area_start_um2, 64.0),
+            (row.area_quarter_um2, 72.0),
+            (row.area_half_um2, 64.0),
+            (row.area_three_quarters_um2, 56.0),
+            (row.area_peak_um2, 72.0),
+            (row.area_end_um2, 64.0 - 0.5),
+        ];
+        for (value, expected) in areas {
+            if row.cycle == 10 {
+                assert!(value.is_nan(), "{row:?}");
+            } else {
+                assert!((value - expected).abs() < 0.2, "{row:?}");
+            }
+        }
+    }
 }

@@ -1,7 +1,7 @@
 //! The cycles of a run: their trends, with the static arm beside.
 
 use cellpos_report::{Axis, Column, Figure, Panel, Report, Series, Status, Table};
-use cellpos_script::{ArmKind, CycleRow, Trend, trend};
+use cellpos_script::{ArmKind, CycleRow, ReadCycles, Trend, trend};
 use std::collections::BTreeMap;
 
 /// A quantity of the cycles.
@@ -10,11 +10,29 @@ struct Quantity {
     of_what: &'static str,
     name: &'static str,
     unit: &'static str,
-    of: fn(&CycleRow, f64) -> f64,
+    of: fn(&CycleRow, &Rest) -> f64,
 }
 
-/// The second argument is the length of the cell before the first cycle, um.
-const QUANTITIES: [Quantity; 9] = [
+/// The cell before the first cycle; NaN where it was not measured.
+struct Rest {
+    length_um: f64,
+    area_um2: f64,
+}
+
+impl Rest {
+    fn of(rows: &[CycleRow]) -> Self {
+        let first = |of: fn(&CycleRow) -> f64| {
+            let mut values = rows.iter().map(of);
+            values.find(|value| value.is_finite()).unwrap_or(f64::NAN)
+        };
+        Self {
+            length_um: first(|row| row.length_start_um),
+            area_um2: first(|row| row.area_start_um2),
+        }
+    }
+}
+
+const QUANTITIES: [Quantity; 12] = [
     Quantity {
         of_what: "rig",
         name: "reached over commanded amplitude",
@@ -61,7 +79,25 @@ const QUANTITIES: [Quantity; 9] = [
         of_what: "cell",
         name: "stretch",
         unit: "",
-        of: |row, rest_um| row.length_peak_um / rest_um,
+        of: |row, rest| row.length_peak_um / rest.length_um,
+    },
+    Quantity {
+        of_what: "cell",
+        name: "area when stretched over area at rest",
+        unit: "",
+        of: |row, rest| row.area_peak_um2 / rest.area_um2,
+    },
+    Quantity {
+        of_what: "cell",
+        name: "length at rest",
+        unit: "um",
+        of: |row, _| row.length_start_um,
+    },
+    Quantity {
+        of_what: "cell",
+        name: "area at rest",
+        unit: "um^2",
+        of: |row, _| row.area_start_um2,
     },
     Quantity {
         of_what: "cell",
@@ -72,15 +108,23 @@ const QUANTITIES: [Quantity; 9] = [
 ];
 
 /// Adds the section; gives the trends as they go into the JSON.
-pub fn section(page: &mut Report, rows: &[CycleRow], unreadable: usize) -> serde_json::Value {
-    if rows.is_empty() && unreadable == 0 {
+pub fn section(page: &mut Report, read: &ReadCycles) -> serde_json::Value {
+    let (rows, unreadable) = (read.rows.as_slice(), read.unreadable);
+    if rows.is_empty() && unreadable == 0 && read.head.is_none() {
         return serde_json::Value::Null;
     }
     page.section("Cycles");
-    if unreadable > 0 {
+    if let Some(error) = &read.head {
         page.note(
             Status::Warning,
-            &format!("{unreadable} lines of cycles.csv are no rows, or of another version."),
+            &format!(
+                "cycles.csv is not read: {error}. Was it changed, or written by a newer version?"
+            ),
+        );
+    } else if unreadable > 0 {
+        page.note(
+            Status::Warning,
+            &format!("{unreadable} lines of cycles.csv are no rows."),
         );
     }
     if rows.is_empty() {
@@ -91,11 +135,7 @@ pub fn section(page: &mut Report, rows: &[CycleRow], unreadable: usize) -> serde
         "{} cycles, {disturbed} of them disturbed.",
         rows.len()
     ));
-    let rest_um = rows
-        .iter()
-        .map(|row| row.length_start_um)
-        .find(|um| um.is_finite())
-        .unwrap_or(f64::NAN);
+    let rest = Rest::of(rows);
     let mut table = Table::new([
         Column::left("of"),
         Column::left("quantity"),
@@ -123,7 +163,7 @@ pub fn section(page: &mut Report, rows: &[CycleRow], unreadable: usize) -> serde
             let values: Vec<(u64, f64)> = rows
                 .iter()
                 .filter(|row| row.arm == arm)
-                .map(|row| (row.cycle, (quantity.of)(row, rest_um)))
+                .map(|row| (row.cycle, (quantity.of)(row, &rest)))
                 .filter(|(_, value)| value.is_finite())
                 .collect();
             if values.is_empty() {

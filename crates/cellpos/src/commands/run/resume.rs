@@ -6,7 +6,8 @@ use crate::outcome::Failure;
 use crate::rig_file::{ClockKind, RigFile};
 use crate::setup::{Prepared, ReferenceSpec};
 use cellpos_record::{
-    CYCLES_CSV, CYCLES_PARQUET, RecordError, RunReader, SESSIONS, TableColumn, write_table_parquet,
+    CYCLES_CSV, CYCLES_PARQUET, LineFile, RecordError, RunReader, SESSIONS, TableColumn,
+    write_table_parquet,
 };
 use cellpos_script::{ArmKind, CycleRow, read_cycles};
 use std::path::{Path, PathBuf};
@@ -25,15 +26,39 @@ pub fn cycles(folder: &Path) -> Result<Vec<CycleRow>, Failure> {
         }
     };
     let whole = cellpos_record::whole_text(&text);
-    let (rows, unreadable) = read_cycles(whole);
-    if unreadable > 0 {
-        // Going on from fewer rows than there are would do cycles twice.
-        return Err(Failure::bad_input(
-            format!("{}: {unreadable} lines are no rows", path.display()),
-            "was it changed, or written by another version? put it right, or begin a new run",
-        ));
+    let read = read_cycles(whole);
+    // Going on from fewer rows than there are would do cycles twice.
+    let problem = match (&read.head, read.unreadable) {
+        (Some(error), _) => error.to_string(),
+        (None, 0) => return Ok(read.rows),
+        (None, lines) => format!("{lines} lines are no rows"),
+    };
+    Err(Failure::bad_input(
+        format!("{}: {problem}", path.display()),
+        "was it changed, or written by a newer version? put it right, go on with that version, or begin a new run",
+    ))
+}
+
+/// Gives the table of a run that an older version began the columns of this one, in one step: new rows go below the
+/// same head, and what the older version did not measure stays empty.
+fn renew(folder: &Path) -> Result<(), Failure> {
+    let path = folder.join(CYCLES_CSV);
+    let Ok(text) = std::fs::read_to_string(&path) else {
+        return Ok(());
+    };
+    if !read_cycles(cellpos_record::whole_text(&text)).older {
+        return Ok(());
     }
-    Ok(rows)
+    // Held while it is replaced: nobody else may be writing it.
+    let held = LineFile::open(&path, &CycleRow::csv_head(), true).map_err(Failure::input)?;
+    let mut text = CycleRow::csv_head() + "\n";
+    for row in cycles(folder)? {
+        text.push_str(&row.to_csv());
+        text.push('\n');
+    }
+    cellpos_table::write_atomically(&path, text.as_bytes()).map_err(Failure::failed)?;
+    drop(held);
+    Ok(())
 }
 
 /// The per-cycle table for other programs.
@@ -143,6 +168,7 @@ pub fn ready(folder: &Path, best_effort: bool) -> Result<Option<Ready>, Failure>
     else {
         return Err(not_a_run("is no run of a script".to_string()));
     };
+    renew(folder)?;
     let number = sessions.len() as u64 + 1;
     // Where the bead rested last is a better first belief than the rig file's.
     let rested = done.iter().rev().map(|row| row.neutral_um);
