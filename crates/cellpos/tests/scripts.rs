@@ -87,6 +87,8 @@ fn every_example_passes_the_check_and_a_rehearsal_with_a_row_for_each_cycle() {
     );
 }
 
+const AREA: &str = "area when stretched over area at rest";
+
 /// What is hidden in the emulated cell is what the report finds, within 5 %, and nothing in the static arm.
 fn trends_of_the_cell(report: &Value) {
     let of = |quantity: &str, arm: &str| {
@@ -96,7 +98,12 @@ fn trends_of_the_cell(report: &Value) {
             .find(|trend| trend["quantity"] == quantity && trend["arm"] == arm);
         found.cloned()
     };
-    for (quantity, first, last) in [("stretch", 3.80, 2.86), ("recovery time", 0.16, 0.37)] {
+    for (quantity, first, last) in [
+        ("stretch", 3.80, 2.86),
+        ("recovery time", 0.16, 0.37),
+        // The cell keeps its volume: its area goes with the root of its length.
+        (AREA, 3.80f64.sqrt(), 2.86f64.sqrt()),
+    ] {
         let found = of(quantity, "cyclic").unwrap();
         assert_eq!(
             (&found["cycles"], &found["significant"]),
@@ -112,7 +119,16 @@ fn trends_of_the_cell(report: &Value) {
             "{quantity}"
         );
     }
-    assert_eq!(of("stretch", "static").unwrap()["cycles"], 180);
+    for quantity in ["stretch", AREA] {
+        assert_eq!(of(quantity, "static").unwrap()["cycles"], 180);
+    }
+    let disc_um2 = std::f64::consts::FRAC_PI_4 * 64.0;
+    for (quantity, hidden) in [("length at rest", 8.0), ("area at rest", disc_um2)] {
+        for arm in ["cyclic", "static"] {
+            let value = of(quantity, arm).unwrap()["first"].as_f64().unwrap();
+            assert!((value / hidden - 1.0).abs() < 0.05, "{quantity}: {value}");
+        }
+    }
 }
 
 #[test]
@@ -386,6 +402,69 @@ fn a_run_whose_table_is_damaged_is_not_gone_on_with_and_a_torn_last_line_is_no_d
     );
     let page = std::fs::read_to_string(run.join("report.html")).unwrap();
     assert!(page.contains("The last of 2 sessions came to its end"));
+}
+
+#[test]
+fn a_run_that_an_older_version_began_is_gone_on_with_and_its_table_takes_on_the_new_columns() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    std::fs::write(at.join("cell.toml"), "[emulator.cell]\n").unwrap();
+    script(at, 40);
+    json(
+        at,
+        &["run", "quick.toml", "--dry", "--rig", "cell.toml", "--json"],
+    );
+    let run = only_run(at);
+    let name = run.to_str().unwrap();
+    let meta = std::fs::read_to_string(run.join("run.toml")).unwrap();
+    std::fs::write(run.join("run.toml"), &meta[..meta.find("[end]").unwrap()]).unwrap();
+    // Half of the table, as it was before areas were measured.
+    let table = std::fs::read_to_string(run.join("cycles.csv")).unwrap();
+    let head = table.lines().next().unwrap();
+    let known: Vec<bool> = head
+        .split(',')
+        .map(|name| !name.starts_with("area_"))
+        .collect();
+    let old = |line: &str| {
+        let cells = line.split(',').zip(&known).filter(|(_, known)| **known);
+        cells.map(|(cell, _)| cell).collect::<Vec<_>>().join(",") + "\n"
+    };
+    let older: String = table.lines().take(21).map(old).collect();
+    std::fs::write(run.join("cycles.csv"), &older).unwrap();
+    assert_eq!(json(at, &["report", name, "--json"])["cycles"], 20);
+
+    json(at, &["run", "--resume", name, "--json"]);
+    let renewed = std::fs::read_to_string(run.join("cycles.csv")).unwrap();
+    assert_eq!(renewed.lines().next(), Some(head));
+    let kept: String = renewed.lines().take(21).map(old).collect();
+    assert_eq!(kept, older, "what was there stays as it was");
+    assert_eq!(numbers(&run, "cycle"), (0..40).collect::<Vec<u64>>());
+    let areas = column(&run, "area_half_um2");
+    assert!(areas[..20].iter().all(String::is_empty), "{areas:?}");
+    // A sphere of 8 um that is never pressed into the constriction.
+    let disc_um2 = std::f64::consts::FRAC_PI_4 * 64.0;
+    for area in &areas[20..] {
+        let um2: f64 = area.parse().unwrap();
+        assert!((um2 / disc_um2 - 1.0).abs() < 0.02, "{um2}");
+    }
+
+    // A newer one's column is not dropped: the run is not gone on with.
+    std::fs::write(run.join("run.toml"), &meta[..meta.find("[end]").unwrap()]).unwrap();
+    let newer = renewed.replacen("flags", "odour,flags", 1);
+    std::fs::write(run.join("cycles.csv"), &newer).unwrap();
+    let (code, _, err) = cellpos(at, &["run", "--resume", name]);
+    assert_eq!(code, Some(2), "{err}");
+    assert!(
+        err.contains("cycles.csv: column `odour` is not known") && err.contains("newer version"),
+        "{err}"
+    );
+    assert_eq!(
+        std::fs::read_to_string(run.join("cycles.csv")).unwrap(),
+        newer
+    );
+    json(at, &["report", name, "--json"]);
+    let page = std::fs::read_to_string(run.join("report.html")).unwrap();
+    assert!(page.contains("column `odour` is not known"));
 }
 
 #[test]

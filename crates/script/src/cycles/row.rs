@@ -353,6 +353,18 @@ mod tests {
     use super::*;
 
     #[test]
+    fn every_column_of_the_table_with_a_number_is_among_the_numbers() {
+        let row = CycleRow::empty(0, 1, ArmKind::Cyclic);
+        let numbers: Vec<&str> = row.numbers().iter().map(|(name, _)| *name).collect();
+        let head = CycleRow::csv_head();
+        let columns: Vec<&str> = head
+            .split(',')
+            .filter(|name| !["arm", "flags"].contains(name))
+            .collect();
+        assert_eq!(numbers, columns);
+    }
+
+    #[test]
     fn names_of_quantities_carry_their_unit() {
         for (name, ..) in FLOATS {
             let unit = ["_um", "_um2", "_s", "_deg"]
