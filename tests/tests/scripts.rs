@@ -66,6 +66,8 @@ fn killed(kills: u32, cycles: u32) {
     let folder = tempfile::tempdir().unwrap();
     let folder = folder.path();
     write_files(folder, cycles);
+    let elsewhere = folder.join("elsewhere");
+    std::fs::create_dir(&elsewhere).unwrap();
     let rig = RigInABox::start(
         folder,
         &["--duration", "1000s", "--new-bead-after", "100ms"],
@@ -78,15 +80,20 @@ fn killed(kills: u32, cycles: u32) {
     loop {
         in_vain += 1;
         assert!(in_vain < 20, "sessions end before they do anything");
-        let line = match run_folder(folder) {
-            Some(run) => format!("run --resume {} --best-effort --json", run.display()),
+        let (from, line) = match run_folder(folder) {
+            // Board and camera are found from any folder, though rig.toml names them by relative paths.
+            Some(run) => (
+                elsewhere.as_path(),
+                format!("run --resume {} --best-effort --json", run.display()),
+            ),
             None => {
                 // Killed before there was a table: nothing was acknowledged, nothing is lost.
                 let _ = std::fs::remove_dir_all(folder.join("runs"));
-                "run script.toml --rig rig.toml --best-effort --json".to_string()
+                let line = "run script.toml --rig rig.toml --best-effort --json";
+                (folder, line.to_string())
             }
         };
-        let mut child = cellpos(folder, &line)
+        let mut child = cellpos(from, &line)
             .stdout(std::process::Stdio::null())
             .stderr(std::process::Stdio::null())
             .spawn()

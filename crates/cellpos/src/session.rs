@@ -1,7 +1,7 @@
 //! What every command that closes the loop does: connect and arm a rig, run, stop on signals, write the run's metadata.
 
 use crate::outcome::Failure;
-use crate::rig_file::{CameraConfig, ClockKind, Frames, Rig, RigFile};
+use crate::rig_file::{ActuatorConfig, CameraConfig, ClockKind, Frames, Rig, RigFile};
 use crate::setup::{self, ReferenceSpec, Setup, SetupConfig};
 use cellpos_control::ControllerKind;
 use cellpos_control::design::bound_rms_um;
@@ -158,6 +158,9 @@ pub fn meta(
     };
     let mut meta = RunMeta::new(name, clock);
     meta.command_line = std::env::args().collect();
+    // A folder that is gone is no reason not to run.
+    meta.started_in =
+        std::env::current_dir().map_or_else(|_| String::new(), |path| path.display().to_string());
     meta.seed = file.is_emulated().then_some(file.emulator.seed);
     meta.versions
         .insert("cellpos".to_string(), env!("CARGO_PKG_VERSION").to_string());
@@ -166,8 +169,9 @@ pub fn meta(
             .push(InputFile::of(path).map_err(Failure::input)?);
     }
     meta.config = table(&setup.config)?;
+    let rig = table(&anchored(file)?)?;
     meta.config
-        .insert("rig".to_string(), toml::Value::Table(table(file)?));
+        .insert("rig".to_string(), toml::Value::Table(rig));
     meta.model = setup
         .model
         .to_toml_string()
@@ -175,6 +179,38 @@ pub fn meta(
         .map_err(Failure::failed)?;
     meta.controller = table(&setup.controller)?;
     Ok(meta)
+}
+
+/// The rig with absolute paths, as it is kept with a run: whoever goes on with the run need not start the program from the
+/// same folder.
+fn anchored(file: &RigFile) -> Result<RigFile, Failure> {
+    let absolute = |path: &Path| {
+        std::path::absolute(path).map_err(|error| {
+            Failure::Failed(miette::miette!(
+                "no absolute path of {}: {error}",
+                path.display()
+            ))
+        })
+    };
+    let mut file = file.clone();
+    if let Some(calibration) = &mut file.calibration_file {
+        *calibration = absolute(calibration)?;
+    }
+    if let CameraConfig::Socket { socket, .. } = &mut file.camera {
+        *socket = absolute(socket)?;
+    }
+    if let ActuatorConfig::Serial { port, .. } = &mut file.actuator
+        // Else it is a name of the system's own (COM5).
+        && Path::new(port).exists()
+    {
+        *port = absolute(Path::new(port))?.display().to_string();
+    }
+    if file.emulator.model != "eq6" {
+        file.emulator.model = absolute(Path::new(&file.emulator.model))?
+            .display()
+            .to_string();
+    }
+    Ok(file)
 }
 
 /// The files behind the options `--rig`, `--model` and `--controller`.

@@ -45,6 +45,9 @@ pub enum ReferenceSpec {
         text: String,
         /// Time of the plan at which the session begins, s.
         from_s: f64,
+        /// Time that the script ran in the sessions before, s; left out: as long as the plan says.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        ran_s: Option<f64>,
         /// Length of the cell when the run began, um, for a session that goes on with it.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         first_length_um: Option<f64>,
@@ -131,13 +134,16 @@ impl ReferenceSpec {
             }),
             Self::Script {
                 from_s,
+                ran_s,
                 first_length_um,
                 ..
             } => {
                 let plan = self.script()?.map(|(_, plan)| Arc::new(plan));
                 let plan = plan.unwrap_or_else(|| unreachable!("a script has a plan"));
-                let follower = Follower::new(plan, *from_s, delay_ticks);
-                AnyGuide::Script(Box::new(follower.with_first_length(*first_length_um)))
+                let follower = Follower::new(plan, *from_s, delay_ticks)
+                    .with_elapsed(*ran_s)
+                    .with_first_length(*first_length_um);
+                AnyGuide::Script(Box::new(follower))
             }
         })
     }

@@ -92,6 +92,9 @@ pub struct RunMeta {
     /// The command line, word by word.
     #[serde(default)]
     pub command_line: Vec<String>,
+    /// The folder that it was started from: what relative paths of `command_line` and `inputs` are meant from.
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    pub started_in: String,
     /// Seed of every random number of the run (as text above 2^63).
     #[serde(default, with = "seed", skip_serializing_if = "Option::is_none")]
     pub seed: Option<u64>,
@@ -129,6 +132,7 @@ impl RunMeta {
             name: name.to_owned(),
             started_utc: String::new(),
             command_line: Vec::new(),
+            started_in: String::new(),
             seed: None,
             clock: clock.to_owned(),
             versions: BTreeMap::new(),

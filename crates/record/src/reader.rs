@@ -107,6 +107,20 @@ impl RunReader {
         })
     }
 
+    /// The last row that a condition holds for, without reading those before it.
+    ///
+    /// # Errors
+    /// [`RecordError::Io`] when the file cannot be opened, or the disk refuses to read on.
+    pub fn last_where(
+        &self,
+        is: impl Fn(&TickRecord) -> bool,
+    ) -> Result<Option<TickRecord>, RecordError> {
+        let path = self.folder.join(TICKS_ARROW);
+        File::open(&path)
+            .and_then(|file| Stream::new(BufReader::new(file))?.last_where(is))
+            .map_err(RecordError::io("cannot read", path))
+    }
+
     /// All rows, and what is missing.
     ///
     /// # Errors

@@ -18,6 +18,16 @@ const MAX_BODY: u64 = 1 << 30;
 /// Bytes looked through at a time when searching for the next message after damage.
 const SEARCH: usize = 1 << 16;
 
+/// What stands before the rows of a message.
+struct Head {
+    kind: MessageHeader,
+    /// The description; empty for the end mark.
+    meta: Vec<u8>,
+    /// Where the body begins.
+    body: u64,
+    end: u64,
+}
+
 /// What a message turned out to be.
 enum Message {
     /// The schema, or something without rows.
@@ -97,21 +107,27 @@ impl<R: Read + Seek> Stream<R> {
         self.from.read_exact(out)
     }
 
-    /// The message at a position and its end; None if there is none.
-    fn message(&mut self, position: u64) -> io::Result<Option<(Message, u64)>> {
+    /// The head of the message at a position; None if there is none, or none of the kinds that a recording has.
+    fn head(&mut self, position: u64) -> io::Result<Option<Head>> {
         let left = self.length.saturating_sub(position);
         if left < 8 {
             return Ok(None);
         }
-        let mut head = [0u8; 8];
-        self.read_at(position, &mut head)?;
-        let [a, b, c, d, e, f, g, h] = head;
+        let mut mark = [0u8; 8];
+        self.read_at(position, &mut mark)?;
+        let [a, b, c, d, e, f, g, h] = mark;
         if [a, b, c, d] != CONTINUATION {
             return Ok(None);
         }
         let meta_length = u64::from(u32::from_le_bytes([e, f, g, h]));
+        let body = position + 8 + meta_length;
         if meta_length == 0 {
-            return Ok(Some((Message::End, position + 8)));
+            return Ok(Some(Head {
+                kind: MessageHeader::NONE,
+                meta: Vec::new(),
+                body,
+                end: body,
+            }));
         }
         if meta_length > MAX_META || meta_length > left - 8 {
             return Ok(None);
@@ -121,27 +137,87 @@ impl<R: Read + Seek> Stream<R> {
         let Ok(message) = root_as_message(&meta) else {
             return Ok(None);
         };
+        let kind = message.header_type();
+        if ![MessageHeader::Schema, MessageHeader::RecordBatch].contains(&kind) {
+            return Ok(None);
+        }
         let Ok(body_length) = u64::try_from(message.bodyLength()) else {
             return Ok(None);
         };
         if body_length > MAX_BODY || body_length > left - 8 - meta_length {
             return Ok(None);
         }
-        let end = position + 8 + meta_length + body_length;
-        let kind = message.header_type();
-        if kind == MessageHeader::Schema {
+        Ok(Some(Head {
+            kind,
+            meta,
+            body,
+            end: body + body_length,
+        }))
+    }
+
+    /// The message at a position and its end; None if there is none.
+    fn message(&mut self, position: u64) -> io::Result<Option<(Message, u64)>> {
+        let Some(head) = self.head(position)? else {
+            return Ok(None);
+        };
+        if head.meta.is_empty() {
+            return Ok(Some((Message::End, head.end)));
+        }
+        let Ok(message) = root_as_message(&head.meta) else {
+            return Ok(None);
+        };
+        if head.kind == MessageHeader::Schema {
             if let Some(layout) = layout(&message) {
                 self.layout = layout;
-                return Ok(Some((Message::NoRows, end)));
+                return Ok(Some((Message::NoRows, head.end)));
             }
             return Ok(None);
         }
-        if kind != MessageHeader::RecordBatch {
-            return Ok(None);
+        let mut body = vec![0u8; (head.end - head.body) as usize];
+        self.read_at(head.body, &mut body)?;
+        Ok(decode(&message, &body, &self.layout).map(|rows| (Message::Rows(rows), head.end)))
+    }
+
+    /// The last row that a condition holds for. The batches before it are passed over by their lengths and not read, so
+    /// that the end of a night's recording is found in no time.
+    ///
+    /// # Errors
+    /// Only when the file system refuses to read.
+    pub(crate) fn last_where(
+        &mut self,
+        is: impl Fn(&TickRecord) -> bool,
+    ) -> io::Result<Option<TickRecord>> {
+        let mut batches = Vec::new();
+        let mut position = 0;
+        while position < self.length {
+            let head = self.head(position)?;
+            if head
+                .as_ref()
+                .is_some_and(|h| h.kind == MessageHeader::Schema)
+            {
+                self.message(position)?;
+            }
+            position = match head {
+                Some(head) => {
+                    if head.kind == MessageHeader::RecordBatch {
+                        batches.push(position);
+                    }
+                    head.end
+                }
+                None => match self.search(position + 8)? {
+                    Some(found) => found,
+                    None => break,
+                },
+            };
         }
-        let mut body = vec![0u8; body_length as usize];
-        self.read_at(position + 8 + meta_length, &mut body)?;
-        Ok(decode(&message, &body, &self.layout).map(|rows| (Message::Rows(rows), end)))
+        for position in batches.into_iter().rev() {
+            if let Some((Message::Rows(rows), _)) = self.message(position)?
+                && let Some(row) = rows.iter().rfind(|row| is(row))
+            {
+                return Ok(Some(*row));
+            }
+        }
+        Ok(None)
     }
 
     /// The first position at or after `from` at which a message stands. Messages start at multiples of eight.

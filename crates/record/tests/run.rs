@@ -192,6 +192,28 @@ fn rows_behind_damage_are_found_again_and_the_gap_shows() {
 }
 
 #[test]
+fn the_last_row_of_a_kind_is_found_from_the_end_over_damage_and_a_torn_batch() {
+    let root = tempfile::tempdir().unwrap();
+    let folder = cut_off(root.path(), 100, 10);
+    let last = |is: &dyn Fn(&TickRecord) -> bool| {
+        let run = RunReader::open(&folder).unwrap();
+        run.last_where(is).unwrap().map(|row| row.seq)
+    };
+    assert_eq!(last(&|_| true), Some(99));
+    assert_eq!(last(&|row| row.seq.is_multiple_of(37)), Some(74));
+    assert_eq!(last(&|row| row.stage == 7), None);
+    // Damage in the middle, and the last batch torn.
+    let path = folder.join("ticks.arrow");
+    let mut bytes = std::fs::read(&path).unwrap();
+    let middle = bytes.len() / 2;
+    bytes[middle..middle + 3000].fill(0x5a);
+    bytes.truncate(bytes.len() - 100);
+    std::fs::write(&path, &bytes).unwrap();
+    assert_eq!(last(&|_| true), Some(89));
+    assert_eq!(last(&|row| row.seq < 20), Some(19));
+}
+
+#[test]
 fn rows_lost_before_the_recorder_show_as_a_gap() {
     let root = tempfile::tempdir().unwrap();
     let mut writer =

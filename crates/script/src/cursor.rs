@@ -66,7 +66,7 @@ pub struct Cursor {
     plan_s: f64,
     from_s: f64,
     ticks: u64,
-    /// Running time, waits included, s.
+    /// Running time, waits and pauses included, of all sessions, s.
     elapsed_s: f64,
     segment: usize,
     waited_s: f64,
@@ -83,7 +83,7 @@ impl Plan {
     }
 
     /// A cursor at a time of the plan, to resume at a whole cycle. Waits before it count as done, and as having taken no
-    /// time.
+    /// time; [`Cursor::expect_elapsed`] says what they did take.
     pub fn start_at(&self, plan_s: f64) -> Cursor {
         let segment = self.segments().partition_point(|s| s.start_s < plan_s);
         let segment = match self.segments().get(segment.saturating_sub(1)) {
@@ -290,6 +290,16 @@ impl Cursor {
         self.first_length_um = length_um;
     }
 
+    /// Counts the running time on from here, s: what the sessions before took.
+    pub fn expect_elapsed(&mut self, elapsed_s: f64) {
+        self.elapsed_s = elapsed_s;
+    }
+
+    /// Time of the script in which nothing of the plan is followed: on the way to where it goes on.
+    pub(crate) fn pass(&mut self, sample_s: f64) {
+        self.elapsed_s += sample_s;
+    }
+
     /// Goes on to the next segment.
     fn leave(&mut self) {
         self.segment += 1;
@@ -316,7 +326,7 @@ impl Cursor {
         self.plan_s
     }
 
-    /// Running time, waits included, s.
+    /// Running time, waits and pauses included, of all sessions, s.
     pub fn elapsed_s(&self) -> f64 {
         self.elapsed_s
     }

@@ -26,6 +26,8 @@ pub struct Follower {
     reference_um: f64,
     stage: Stage,
     swing: Option<(u16, f64)>,
+    /// Whether the script's time runs: not before its first tick.
+    begun: bool,
     tail: u32,
 }
 
@@ -61,6 +63,7 @@ impl Follower {
             reference_um,
             stage: Stage::None,
             swing: None,
+            begun: false,
             tail: 0,
         }
     }
@@ -69,6 +72,15 @@ impl Follower {
     #[must_use]
     pub fn with_first_length(mut self, length_um: Option<f64>) -> Self {
         self.cursor.expect_length(length_um);
+        self
+    }
+
+    /// The same, with the time that the script has run in the sessions before, s; None: as long as the plan says.
+    #[must_use]
+    pub fn with_elapsed(mut self, elapsed_s: Option<f64>) -> Self {
+        if let Some(elapsed_s) = elapsed_s {
+            self.cursor.expect_elapsed(elapsed_s);
+        }
         self
     }
 
@@ -152,6 +164,9 @@ impl Follower {
         if self.approach != Approach::Over && !input.frozen {
             match self.approach(input) {
                 Some(reference_um) => {
+                    if self.begun {
+                        self.cursor.pass(input.sample_s);
+                    }
                     self.reference_um = reference_um;
                     self.stage = Stage::Approach;
                     preview_um.fill(reference_um);
@@ -165,6 +180,7 @@ impl Follower {
                 None => {}
             }
         }
+        self.begun = true;
         if input.frozen {
             let output = self.plan.stand(&mut self.cursor, input.sample_s, &seen);
             self.stage = match stage(output.status) {
@@ -323,6 +339,33 @@ mod tests {
         assert!(paused.iter().all(|o| o.plan_ns == paused[0].plan_ns));
         let running = all.iter().filter(|o| o.stage == Stage::Running).count();
         assert_eq!(running, 400, "no tick of the plan is lost to the pause");
+    }
+
+    #[test]
+    fn the_time_of_a_script_is_that_of_all_its_sessions_with_pauses_and_ways_and_without_the_approach()
+     {
+        let text = "[stop]\nafter = \"2s\"\n[[step]]\ndo = \"hold\"\nduration = \"1s\"\n\
+                    [[step]]\ndo = \"hold\"\nduration = \"10s\"\n";
+        let ticks = |follower: &mut Follower, change: &dyn Fn(usize, &mut GuideInput)| {
+            let all = walk(follower, change);
+            assert!(all.iter().any(|output| output.stage == Stage::StoppedTime));
+            let first = all.iter().position(|o| o.stage == Stage::Running).unwrap();
+            let over = all.iter().position(|o| o.stage.is_over()).unwrap();
+            over - first
+        };
+        let about = |found: usize, expected: usize| found.abs_diff(expected) <= 1;
+        assert!(about(ticks(&mut follower(text), &|_, _| {}), 2000));
+        let change = |tick: usize, told: &mut GuideInput| {
+            told.frozen = (300..450).contains(&tick);
+            told.skip = tick == 600;
+        };
+        let found = ticks(&mut follower(text), &change);
+        assert!(about(found, 2000), "{found}");
+        // The session before ran for 1.4 s, and the plan goes on from 1 s.
+        let plan = Arc::new(Plan::new(&Script::parse(text, "t.toml").unwrap()).unwrap());
+        let resumed = |elapsed_s| Follower::new(Arc::clone(&plan), 1.0, 2).with_elapsed(elapsed_s);
+        assert!(about(ticks(&mut resumed(Some(1.4)), &|_, _| {}), 600));
+        assert!(about(ticks(&mut resumed(None), &|_, _| {}), 1000));
     }
 
     #[test]

@@ -103,9 +103,11 @@ fn pack(run: &Path, out: Option<&Path>, json: bool) -> CommandResult {
         copy(&run.join(&path), &part.join(&path))?;
     }
     let mut missing = Vec::new();
-    let inputs = reader.meta().map(|meta| meta.inputs.clone());
-    for (number, input) in inputs.unwrap_or_default().iter().enumerate() {
-        let path = Path::new(&input.path);
+    let meta = reader.meta().ok();
+    let inputs = meta.map_or(&[][..], |meta| &meta.inputs);
+    let from = meta.map_or(Path::new(""), |meta| Path::new(&meta.started_in));
+    for (number, input) in inputs.iter().enumerate() {
+        let path = &from.join(&input.path);
         let same = InputFile::of(path).is_ok_and(|now| now.sha256 == input.sha256);
         if same && let Some(name) = path.file_name() {
             let name = format!("{number:02}-{}", name.to_string_lossy());

@@ -232,6 +232,7 @@ fn read(path: &Path) -> Result<(ReferenceSpec, Script, Vec<InputFile>), Failure>
         file,
         text,
         from_s: 0.0,
+        ran_s: None,
         first_length_um: None,
         waveforms,
     };

@@ -83,19 +83,19 @@ const QUANTITIES: [Quantity; 12] = [
     },
     Quantity {
         of_what: "cell",
-        name: "area when stretched over area at rest",
+        name: "areal stretch",
         unit: "",
         of: |row, rest| row.area_peak_um2 / rest.area_um2,
     },
     Quantity {
         of_what: "cell",
-        name: "length at rest",
+        name: "length at cycle start",
         unit: "um",
         of: |row, _| row.length_start_um,
     },
     Quantity {
         of_what: "cell",
-        name: "area at rest",
+        name: "area at cycle start",
         unit: "um^2",
         of: |row, _| row.area_start_um2,
     },
@@ -148,7 +148,8 @@ pub fn section(page: &mut Report, read: &ReadCycles) -> serde_json::Value {
         Column::left("trend"),
     ]);
     table.caption(
-        "Straight lines through all cycles of an arm. A trend is one when it is beyond three times its 95 % interval.",
+        "Straight lines through all cycles of an arm. A trend is one when it is beyond three times its 95 % interval. Stretch and \
+         areal stretch: largest length and area over those at the start of the first cycle.",
     );
     let mut figure = Figure::new("cycles", "The cycles of the run, cyclic and static arm.");
     let mut json = Vec::new();

@@ -9,6 +9,7 @@ use cellpos_record::{
     CYCLES_CSV, CYCLES_PARQUET, LineFile, RecordError, RunReader, SESSIONS, TableColumn,
     write_table_parquet,
 };
+use cellpos_runtime::{Stage, TickRecord};
 use cellpos_script::{ArmKind, CycleRow, read_cycles};
 use std::path::{Path, PathBuf};
 
@@ -170,6 +171,7 @@ pub fn ready(folder: &Path, best_effort: bool) -> Result<Option<Ready>, Failure>
     };
     renew(folder)?;
     let number = sessions.len() as u64 + 1;
+    let ran_s = ran_s(&sessions, file.timing.period_us * 1e-6)?;
     // Where the bead rested last is a better first belief than the rig file's.
     let rested = done.iter().rev().map(|row| row.neutral_um);
     let within = |um: &f64| (file.limits.low_um..=file.limits.high_um).contains(um);
@@ -193,6 +195,7 @@ pub fn ready(folder: &Path, best_effort: bool) -> Result<Option<Ready>, Failure>
             file: script,
             text,
             from_s,
+            ran_s: Some(ran_s),
             first_length_um: done
                 .iter()
                 .map(|row| row.length_start_um)
@@ -223,4 +226,24 @@ fn gap_s(session: &Path) -> Option<f64> {
         .and_then(|meta| meta.modified())
         .ok()?;
     written.elapsed().ok().map(|gap| gap.as_secs_f64())
+}
+
+/// How long the script has run in some sessions, s: in each from its first tick to its last on the disk, with waits and
+/// pauses, without the approach. What lies between the sessions does not count.
+fn ran_s(sessions: &[PathBuf], period_s: f64) -> Result<f64, Failure> {
+    let in_script = |row: &TickRecord| {
+        [Stage::Running, Stage::Waiting, Stage::Paused].contains(&Stage::from_number(row.stage))
+    };
+    let mut ticks = 0;
+    for session in sessions {
+        let reader = RunReader::open(session).map_err(Failure::input)?;
+        let Some(last) = reader.last_where(in_script).map_err(Failure::input)? else {
+            continue;
+        };
+        let rows = reader.batches().map_err(Failure::input)?;
+        if let Some(first) = rows.flatten().find(in_script) {
+            ticks += (last.seq + 1).saturating_sub(first.seq);
+        }
+    }
+    Ok(ticks as f64 * period_s)
 }
