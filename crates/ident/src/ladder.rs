@@ -140,6 +140,8 @@ pub struct LadderProblem<'a> {
     sampling: Sampling,
     prior: Option<DelayPrior>,
     weights: Vec<f64>,
+    /// By how much the two weak bounds (share, lead) are moved, in their standard deviations.
+    bounds_moved: [f64; 2],
 }
 
 /// The model that a parameter vector stands for.
@@ -206,6 +208,7 @@ impl<'a> LadderProblem<'a> {
             sampling,
             prior,
             weights,
+            bounds_moved: [0.0; 2],
         })
     }
 
@@ -227,10 +230,14 @@ impl<'a> LadderProblem<'a> {
         // Behind a hold the lead trades exactly with the delay, and the share with the lead: without these two weak
         // bounds the directions would be open.
         let (middle, sd) = SHARE_MIDDLE_SD;
-        out[last + 1] = model
-            .feedthrough_share
-            .map_or(0.0, |share| (share - middle) / sd);
-        out[last + 2] = model.far_lead_s / (LEAD_SD_PERIODS * self.sampling.period_s);
+        let [share_moved, lead_moved] = self.bounds_moved;
+        (out[last + 1], out[last + 2]) = match model.feedthrough_share {
+            Some(share) => (
+                (share - middle) / sd - share_moved,
+                model.far_lead_s / (LEAD_SD_PERIODS * self.sampling.period_s) - lead_moved,
+            ),
+            None => (0.0, 0.0),
+        };
     }
 
     /// Weighted sum of squares of `data` about `model`, without the delay prior.
@@ -243,6 +250,13 @@ impl<'a> LadderProblem<'a> {
     /// The same problem with another delay prior.
     pub fn with_prior(mut self, prior: Option<DelayPrior>) -> Self {
         self.prior = prior;
+        self
+    }
+
+    /// The same problem with the weak bounds on the feedthrough's share and on the far zero's lead moved, in their
+    /// standard deviations: what is known beforehand is uncertain too, and a replicate of the fit draws it anew.
+    pub fn with_bounds_moved(mut self, share_and_lead: [f64; 2]) -> Self {
+        self.bounds_moved = share_and_lead;
         self
     }
 

@@ -170,7 +170,7 @@ fn judge_width(value: f64, interval: [f64; 2], why_not: &str) -> Verdict {
 
 /// Judges a ladder that was fitted without a delay prior; `prior` is then brought in for the model to go on with.
 ///
-/// `replicates` bootstrap fits (0: none) resample the blocks of every line with replacement.
+/// `replicates` bootstrap fits (0: none) resample the blocks of every line with replacement; see [`bootstrap`].
 pub fn judge(
     problem: &LadderProblem<'_>,
     fit: &LadderFit,
@@ -190,7 +190,12 @@ pub fn judge(
         (draws.len() >= 40).then(|| {
             let values: Vec<f64> = draws.iter().map(|x| f(x)).collect();
             let value = f(&best.parameters);
-            [0.025, 0.975].map(|share| value + wider * (quantile(&values, share) - value))
+            // A new draw lies below the k-th of n in k of n + 1 cases.
+            let n = values.len() as f64;
+            [0.025, 0.975].map(|share| {
+                let place = ((n + 1.0) * share - 1.0) / (n - 1.0);
+                value + wider * (quantile(&values, place) - value)
+            })
         })
     };
     let sd = |i: usize| best.covariance[(i, i)].sqrt();
@@ -455,7 +460,12 @@ fn slow_pole_parameter(value: f64, half: f64, chosen: Rung) -> Parameter {
     }
 }
 
-/// Parameter vectors of the chosen rung fitted to resampled blocks.
+/// Parameter vectors of the chosen rung fitted to resampled blocks, each with the weak bounds on the feedthrough drawn anew.
+///
+/// A fit held by a bound that is right on average errs by less than its covariance says where the bound acts, and by how
+/// much less depends on where it landed: replicates about that place alone would repeat its luck. With the bound drawn
+/// as a datum beside the lines their spread is that of the covariance (randomise, then optimise), and the shape that of the
+/// fit as it is, not of its linear part.
 pub fn bootstrap(
     problem: &LadderProblem<'_>,
     fit: &LadderFit,
@@ -484,7 +494,13 @@ pub fn bootstrap(
                     p.response + sum / n as f64 * size
                 })
                 .collect();
-            let found = problem.fit_from(&data, best.rung, &best.parameters, None);
+            let moved = [(); 2].map(|()| fit.scale.sqrt() * random.normal());
+            let found = problem.clone().with_bounds_moved(moved).fit_from(
+                &data,
+                best.rung,
+                &best.parameters,
+                None,
+            );
             found.chi2.is_finite().then_some(found.parameters)
         })
         .collect()
