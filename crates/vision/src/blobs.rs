@@ -16,14 +16,12 @@ pub struct Blob {
     pub contrast_sum: f64,
     /// Largest contrast, grey levels.
     pub peak: f64,
-    /// Full length along the long axis of the ellipse with the region's second moments, px.
-    pub length_px: f64,
-    /// Full width along its short axis, px.
-    pub width_px: f64,
-    /// Angle of the long axis from the x axis towards y, rad, -pi/2 to pi/2.
-    pub angle_rad: f64,
+    /// Mean contrast, each pixel weighted with its own: that of the body, whatever the share of the soft edge.
+    pub body: f64,
     /// Whether the region touches the frame's border.
     pub at_border: bool,
+    /// Root label of its runs.
+    label: u32,
 }
 
 /// Sums over a region.
@@ -33,10 +31,8 @@ struct Label {
     n: f64,
     sx: f64,
     sy: f64,
-    sxx: f64,
-    sxy: f64,
-    syy: f64,
     w: f64,
+    ww: f64,
     wx: f64,
     wy: f64,
     peak: f64,
@@ -50,6 +46,17 @@ struct Run {
     label: u32,
 }
 
+/// Where a row crosses a region: the first column in it, and the first behind its last.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Span {
+    /// Row.
+    pub y: u32,
+    /// First column.
+    pub start: u32,
+    /// First column behind.
+    pub end: u32,
+}
+
 /// Buffers for the labelling.
 #[derive(Debug, Clone)]
 pub struct Blobs {
@@ -57,9 +64,12 @@ pub struct Blobs {
     before: Vec<Run>,
     now: Vec<Run>,
     found: Vec<Blob>,
+    /// All runs of the frame, row by row, where they are wanted.
+    runs: Vec<(u32, Run)>,
     dropped_runs: u64,
     max_runs: usize,
     max_labels: usize,
+    max_kept_runs: usize,
 }
 
 impl Blobs {
@@ -71,9 +81,20 @@ impl Blobs {
             before: Vec::with_capacity(max_runs),
             now: Vec::with_capacity(max_runs),
             found: Vec::with_capacity(max_labels),
+            runs: Vec::new(),
             dropped_runs: 0,
             max_runs,
             max_labels,
+            max_kept_runs: 0,
+        }
+    }
+
+    /// The same, with room to keep `max_kept_runs` runs of a frame for [`Blobs::spans`].
+    pub fn with_spans(max_runs: usize, max_labels: usize, max_kept_runs: usize) -> Self {
+        Blobs {
+            runs: Vec::with_capacity(max_kept_runs),
+            max_kept_runs,
+            ..Blobs::new(max_runs, max_labels)
         }
     }
 
@@ -102,6 +123,7 @@ impl Blobs {
         self.now.clear();
         self.found.clear();
         self.dropped_runs = 0;
+        self.runs.clear();
         for y in 0..height {
             let edge_row = y == 0 || y + 1 == height;
             let mut x = 0;
@@ -125,17 +147,44 @@ impl Blobs {
                 sums.at_border = edge_row || start == 0 || x == width;
                 self.join(start as u32, x as u32, sums);
             }
+            if self.max_kept_runs > 0 {
+                let room = self.max_kept_runs - self.runs.len();
+                self.dropped_runs += self.now.len().saturating_sub(room) as u64;
+                self.runs
+                    .extend(self.now.iter().take(room).map(|run| (y as u32, *run)));
+            }
             std::mem::swap(&mut self.before, &mut self.now);
             self.now.clear();
         }
-        for (i, label) in self.labels.iter().enumerate() {
-            if label.parent as usize == i && label.n >= min_area_px {
-                self.found.push(label.blob());
+        for (label, i) in self.labels.iter().zip(0_u32..) {
+            if label.parent == i && label.n >= min_area_px {
+                self.found.push(Blob {
+                    label: i,
+                    ..label.blob()
+                });
             }
         }
         self.found
             .sort_unstable_by(|a, b| b.contrast_sum.total_cmp(&a.contrast_sum));
         &self.found
+    }
+
+    /// The rows that cross a region of the last frame, from the first to the last, each with its outermost columns: a hole
+    /// in the region counts as part of it. Empty without [`Blobs::with_spans`].
+    pub fn spans(&self, blob: &Blob) -> impl Iterator<Item = Span> {
+        let label = blob.label;
+        let mut runs = self
+            .runs
+            .iter()
+            .filter(move |(_, run)| self.root(run.label) == label)
+            .peekable();
+        std::iter::from_fn(move || {
+            let &(y, Run { start, mut end, .. }) = runs.next()?;
+            while let Some((_, run)) = runs.next_if(|(row, _)| *row == y) {
+                end = run.end;
+            }
+            Some(Span { y, start, end })
+        })
     }
 
     /// Gives a run the label of the runs of the row above that touch it, or a new one.
@@ -213,10 +262,8 @@ impl Label {
             n: 1.0,
             sx: x,
             sy: y,
-            sxx: x * x,
-            sxy: x * y,
-            syy: y * y,
             w: v,
+            ww: v * v,
             wx: v * x,
             wy: v * y,
             peak: v,
@@ -228,10 +275,8 @@ impl Label {
         self.n += other.n;
         self.sx += other.sx;
         self.sy += other.sy;
-        self.sxx += other.sxx;
-        self.sxy += other.sxy;
-        self.syy += other.syy;
         self.w += other.w;
+        self.ww += other.ww;
         self.wx += other.wx;
         self.wy += other.wy;
         self.peak = self.peak.max(other.peak);
@@ -240,11 +285,6 @@ impl Label {
 
     fn blob(&self) -> Blob {
         let (mx, my) = (self.sx / self.n, self.sy / self.n);
-        // The second moment of a pixel about its own centre is 1/12.
-        let vxx = (self.sxx / self.n - mx * mx).max(0.0) + 1.0 / 12.0;
-        let vyy = (self.syy / self.n - my * my).max(0.0) + 1.0 / 12.0;
-        let vxy = self.sxy / self.n - mx * my;
-        let (mean, half) = (0.5 * (vxx + vyy), 0.5 * f64::hypot(vxx - vyy, 2.0 * vxy));
         let weighted = self.w > 0.0;
         Blob {
             area_px: self.n,
@@ -252,11 +292,9 @@ impl Label {
             y_px: if weighted { self.wy / self.w } else { my },
             contrast_sum: self.w,
             peak: self.peak,
-            // A uniform ellipse of full axis L has the second moment L^2 / 16 along it.
-            length_px: 4.0 * (mean + half).sqrt(),
-            width_px: 4.0 * (mean - half).max(0.0).sqrt(),
-            angle_rad: 0.5 * (2.0 * vxy).atan2(vxx - vyy),
+            body: if weighted { self.ww / self.w } else { 0.0 },
             at_border: self.at_border,
+            label: 0,
         }
     }
 }
@@ -313,35 +351,26 @@ mod tests {
     }
 
     #[test]
-    fn an_ellipse_gets_its_axes_area_and_angle_back() {
-        let mut blobs = Blobs::new(64, 64);
-        let (length, width, angle) = (40.0_f64, 16.0_f64, 0.5_f64);
-        let inside = |x: usize, y: usize| {
-            let (dx, dy) = (x as f64 - 40.3, y as f64 - 31.8);
-            let (u, v) = (
-                dx * angle.cos() + dy * angle.sin(),
-                -dx * angle.sin() + dy * angle.cos(),
-            );
-            if (2.0 * u / length).powi(2) + (2.0 * v / width).powi(2) < 1.0 {
-                1.0
-            } else {
-                0.0
-            }
+    fn the_rows_of_a_region_come_one_by_one_over_its_holes_and_without_its_neighbours() {
+        let mut blobs = Blobs::with_spans(16, 16, 64);
+        let found = label(
+            &mut blobs,
+            &["333..1", "3.3...", "333...", "...1..", "......"],
+            1.0,
+        );
+        let spans = |blob: &Blob| -> Vec<(u32, u32, u32)> {
+            blobs.spans(blob).map(|s| (s.y, s.start, s.end)).collect()
         };
-        let b = blobs.label((80, 64), 0.5, 4.0, inside)[0];
-        assert!(
-            (b.length_px - length).abs() < 0.3 && (b.width_px - width).abs() < 0.3,
-            "{b:?}"
+        assert_eq!(
+            spans(&found[0]),
+            [(0, 0, 3), (1, 0, 3), (2, 0, 3), (3, 3, 4)]
         );
-        assert!(
-            (b.area_px / (std::f64::consts::PI / 4.0 * length * width) - 1.0).abs() < 0.02,
-            "{b:?}"
-        );
-        assert!((b.angle_rad - angle).abs() < 0.01, "{b:?}");
-        assert!(
-            (b.x_px - 40.3).abs() < 0.1 && (b.y_px - 31.8).abs() < 0.1,
-            "{b:?}"
-        );
+        assert_eq!(spans(&found[1]), [(0, 5, 6)]);
+        assert_eq!(blobs.dropped_runs(), 0);
+        assert!((found[0].body - (8.0 * 9.0 + 1.0) / 25.0).abs() < 1e-12);
+        let mut cramped = Blobs::with_spans(16, 16, 2);
+        label(&mut cramped, &["1.1.1.1"], 1.0);
+        assert_eq!(cramped.dropped_runs(), 2);
     }
 
     #[test]

@@ -18,12 +18,13 @@ pub mod many;
 pub mod profile;
 mod seed;
 mod streak;
+mod surface;
 pub mod symmetry;
 pub mod track;
 
 pub use account::{FrameAccount, FrameCounts, FrameKind, IdKind};
 pub use blobs::{Blob, Blobs};
-pub use cells::{CellConfig, CellError, CellFinder};
+pub use cells::{Cell, CellConfig, CellError, CellFinder};
 pub use config::{ConfigError, Learning, LocaliserConfig, Noise, Polarity};
 pub use fix::{Fix, Verdict};
 pub use frame::{Frame, Pixels};
@@ -35,4 +36,6 @@ pub use profile::{
 };
 pub use seed::Detector;
 pub use symmetry::RadialSymmetry;
-pub use track::{Commanded, Decision, TrackState, TrackStep, Tracker, TrackerConfig};
+pub use track::{
+    CellStep, CellTracker, Commanded, Decision, TrackState, TrackStep, Tracker, TrackerConfig,
+};

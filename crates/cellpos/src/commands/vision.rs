@@ -285,17 +285,16 @@ fn find_cells(
         let cells = finder.find(&frame).map_err(Failure::input)?;
         tally.time_us.push(start.elapsed().as_secs_f64() * 1e6);
         for (k, c) in cells.iter().enumerate() {
+            let (length_px, width_px) = c.axes_px();
             let _ = write!(
                 csv,
-                "{n},{k},{:.3},{:.3},{},{:.2},{:.2},{:.1},{:.2},{:.2},{}",
+                "{n},{k},{:.3},{:.3},{:.1},{length_px:.2},{width_px:.2},{:.1},{:.2},{:.2},{}",
                 c.x_px,
                 c.y_px,
                 c.area_px,
-                c.length_px,
-                c.width_px,
-                c.angle_rad.to_degrees(),
-                c.contrast_sum / c.area_px,
-                c.peak,
+                c.angle_rad().to_degrees(),
+                c.mean_grey,
+                c.peak_grey,
                 c.at_border
             );
             end_row(&mut csv, calibration, c.x_px, c.y_px);
@@ -305,7 +304,7 @@ fn find_cells(
         let marks = cells
             .iter()
             .zip(0..)
-            .map(|(c, k)| (k, c.x_px, c.y_px, 0.5 * c.length_px, !c.at_border));
+            .map(|(c, k)| (k, c.x_px, c.y_px, 0.5 * c.axes_px().0, !c.at_border));
         sheet.add(n, &frame, marks);
     }
     Ok(csv)

@@ -2,7 +2,7 @@
 
 use cellpos_rig::CalibrationFile;
 use cellpos_rig::sources::RecordingInfo;
-use cellpos_vision::{Blob, Fix, Verdict};
+use cellpos_vision::{Cell, Fix, Verdict};
 use serde::Serialize;
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -21,7 +21,7 @@ pub struct Tally {
     residual: Vec<f64>,
     sd_px: Vec<f64>,
     subpixel: [u64; BINS],
-    cells: Vec<Blob>,
+    cells: Vec<Cell>,
     most_cells: usize,
     frames_without: u64,
 }
@@ -132,7 +132,7 @@ impl Tally {
     }
 
     /// A cell.
-    pub fn cell(&mut self, cell: &Blob) {
+    pub fn cell(&mut self, cell: &Cell) {
         self.cells.push(*cell);
     }
 
@@ -161,11 +161,11 @@ impl Tally {
             subpixel_chi2: uniformity(&self.subpixel),
         });
         let of =
-            |get: fn(&Blob) -> f64| quantile(&self.cells.iter().map(get).collect::<Vec<_>>(), 0.5);
+            |get: fn(&Cell) -> f64| quantile(&self.cells.iter().map(get).collect::<Vec<_>>(), 0.5);
         let cells = (!self.cells.is_empty()).then(|| CellFigures {
             area_median_px: of(|c| c.area_px),
-            length_median_px: of(|c| c.length_px),
-            width_median_px: of(|c| c.width_px),
+            length_median_px: of(|c| c.axes_px().0),
+            width_median_px: of(|c| c.axes_px().1),
         });
         Summary {
             source: info.path.display().to_string(),

@@ -6,20 +6,24 @@
 //! which it belongs to the other is less likely by a set margin. Otherwise the tracker coasts and, after its limit, is
 //! lost: being lost is an answer, following another bead is not.
 
+mod cell;
 mod config;
 mod identity;
 mod motion;
 mod neighbours;
+mod standing;
 
 use crate::config::ConfigError;
 use crate::fix::{Fix, Verdict};
 use crate::frame::Frame;
 use crate::localiser::Localiser;
 use crate::seed::Detector;
+pub use cell::{CellStep, CellTracker};
 pub use config::{Commanded, Decision, TrackState, TrackStep, TrackerConfig};
 use identity::Identity;
 use motion::{Motion, Randomness};
 use neighbours::{Claim, MAX_BEADS, Neighbours};
+use standing::{Chosen as Sighted, Standing};
 
 /// Frames between measurements of the size while tracking.
 const SIZE_STRIDE: u32 = 8;
@@ -55,10 +59,9 @@ pub struct Tracker {
     localiser: Localiser,
     detector: Detector,
     neighbours: Neighbours,
-    state: TrackState,
+    standing: Standing,
     chosen: Option<Chosen>,
     aim: Option<(f64, f64)>,
-    time_s: Option<f64>,
     frames: u32,
     candidates: [Option<Candidate>; MAX_BEADS],
 }
@@ -71,21 +74,15 @@ impl Tracker {
     pub fn new(localiser: Localiser, config: TrackerConfig) -> Result<Self, ConfigError> {
         config.check()?;
         let detector = Detector::new(&localiser, 4 * MAX_BEADS);
-        let randomness = Randomness {
-            diffusion_px2_per_s: config.diffusion_px2_per_s,
-            velocity_walk: config.velocity_walk_px_per_s15,
-            flow_error: config.flow_error,
-        };
         Ok(Tracker {
             config,
-            randomness,
+            randomness: Randomness::of(&config),
             localiser,
             detector,
             neighbours: Neighbours::default(),
-            state: TrackState::Searching,
+            standing: Standing::default(),
             chosen: None,
             aim: None,
-            time_s: None,
             frames: 0,
             candidates: [None; MAX_BEADS],
         })
@@ -93,7 +90,7 @@ impl Tracker {
 
     /// Where the tracker stands.
     pub fn state(&self) -> TrackState {
-        self.state
+        self.standing.state
     }
 
     /// The localiser in use.
@@ -107,7 +104,7 @@ impl Tracker {
         self.aim = aim;
         self.chosen = None;
         self.neighbours = Neighbours::default();
-        self.state = TrackState::Searching;
+        self.standing.state = TrackState::Searching;
     }
 
     /// Takes in the frame exposed about `time_s`, with what was commanded: a flow velocity since the frame before (px/s), or
@@ -123,13 +120,7 @@ impl Tracker {
             streak_px,
         } = commanded.into();
         self.localiser.expect_streak(streak_px);
-        let dt_s = self.time_s.map_or(0.0, |before| (time_s - before).max(0.0));
-        let dt_s = if dt_s.is_finite() { dt_s } else { 0.0 };
-        let time_s = self
-            .time_s
-            .unwrap_or(if time_s.is_finite() { time_s } else { 0.0 })
-            + dt_s;
-        self.time_s = Some(time_s);
+        let (dt_s, time_s) = self.standing.elapse(time_s);
         self.frames = self.frames.wrapping_add(1);
         if let Some(chosen) = &mut self.chosen {
             chosen.motion.predict(dt_s, flow_px_per_s, &self.randomness);
@@ -145,8 +136,18 @@ impl Tracker {
             }
             (Some(frame), Some(chosen)) => self.follow(frame, chosen, time_s),
         };
-        self.settle(decision, time_s);
-        self.describe(decision, fix, before, time_s)
+        let sighted = |chosen: Chosen| Sighted {
+            motion: chosen.motion,
+            confirmed: chosen.confirmed >= self.config.confirm_frames,
+            last_fix_s: chosen.last_fix_s,
+        };
+        let (before, now) = (before.map(sighted), self.chosen.map(sighted));
+        let limit_s = self.config.coast_limit_s;
+        let step = self.standing.settle(decision, fix, before, now, limit_s);
+        TrackStep {
+            neighbours: self.neighbours.count() as u8,
+            ..step
+        }
     }
 
     fn search(&mut self, frame: &Frame, time_s: f64) -> (Decision, Option<Fix>) {
@@ -212,7 +213,7 @@ impl Tracker {
     }
 
     fn follow(&mut self, frame: &Frame, chosen: Chosen, time_s: f64) -> (Decision, Option<Fix>) {
-        let tracking = self.state == TrackState::Tracking;
+        let tracking = self.standing.state == TrackState::Tracking;
         let look =
             self.frames.is_multiple_of(self.config.neighbour_stride) || self.neighbours.count() > 0;
         if tracking && !look {
@@ -264,7 +265,8 @@ impl Tracker {
             let mut ok = c.fix.verdict == Verdict::Good
                 && chosen.identity.agrees(&self.config, &c.fix, c.size);
             // A lost bead may come back anywhere; a coasting one only near its prediction.
-            ok &= self.state == TrackState::Lost || self.within_gate(&chosen.motion, &c.fix);
+            ok &=
+                self.standing.state == TrackState::Lost || self.within_gate(&chosen.motion, &c.fix);
             let surprise = |i: usize| {
                 let other = self.candidates.get(i).copied().flatten();
                 other.map_or(f64::INFINITY, |o| chosen.motion.surprise(&o.fix))
@@ -301,7 +303,7 @@ impl Tracker {
             claim,
         ) {
             (Some(c), _) => {
-                let decision = match self.state {
+                let decision = match self.standing.state {
                     TrackState::Tracking | TrackState::Searching => Decision::Accepted,
                     TrackState::Coasting => Decision::Regained,
                     TrackState::Lost => Decision::Reacquired,
@@ -435,43 +437,6 @@ impl Tracker {
             }
         } else if let Some(free) = self.candidates.iter_mut().find(|s| s.is_none()) {
             *free = Some(c);
-        }
-    }
-
-    fn settle(&mut self, decision: Decision, time_s: f64) {
-        self.state = match self.chosen {
-            None => TrackState::Searching,
-            Some(c) if c.confirmed < self.config.confirm_frames => TrackState::Searching,
-            Some(_) if decision.is_accepted() => TrackState::Tracking,
-            Some(_) if self.state == TrackState::Lost => TrackState::Lost,
-            Some(c) if time_s - c.last_fix_s > self.config.coast_limit_s => TrackState::Lost,
-            Some(_) => TrackState::Coasting,
-        };
-    }
-
-    fn describe(
-        &self,
-        decision: Decision,
-        fix: Option<Fix>,
-        before: Option<Chosen>,
-        time_s: f64,
-    ) -> TrackStep {
-        let motion = self.chosen.map(|c| c.motion);
-        let (x_px, y_px) = motion.map_or((f64::NAN, f64::NAN), |m| m.position());
-        let innovation = match (before, fix) {
-            (Some(b), Some(f)) => b.motion.distance2(&f).sqrt(),
-            _ => f64::NAN,
-        };
-        TrackStep {
-            state: self.state,
-            decision,
-            fix: fix.unwrap_or(Fix::none(x_px, y_px, Verdict::NoSignal)),
-            x_px,
-            y_px,
-            sd_px: motion.map_or(f64::INFINITY, |m| m.sd_px()),
-            innovation_sigma: innovation,
-            coasted_s: self.chosen.map_or(0.0, |c| time_s - c.last_fix_s),
-            neighbours: self.neighbours.count() as u8,
         }
     }
 }

@@ -1,5 +1,6 @@
 //! Predicted motion of one object: commanded flow plus an unexplained velocity, with Brownian motion.
 
+use super::config::TrackerConfig;
 use crate::fix::Fix;
 
 /// The least standard deviation granted to a fix, px: a template is never exact.
@@ -18,6 +19,16 @@ pub(crate) struct Randomness {
     pub velocity_walk: f64,
     /// Share of the commanded displacement that may be wrong.
     pub flow_error: f64,
+}
+
+impl Randomness {
+    pub fn of(config: &TrackerConfig) -> Self {
+        Randomness {
+            diffusion_px2_per_s: config.diffusion_px2_per_s,
+            velocity_walk: config.velocity_walk_px_per_s15,
+            flow_error: config.flow_error,
+        }
+    }
 }
 
 /// Position and unexplained velocity along one axis, with covariance (Kalman filter).
