@@ -3,8 +3,7 @@
 //! The shape is a Kelvin-Voigt body: its length follows the load with a first-order lag, short while it is pressed into
 //! the constriction, longer while it recovers outside. With every passage it stretches less and recovers more slowly,
 //! linearly up to the last passage of [`CellConfig::fatigue_passages`]. In the constriction the same PZT displacement
-//! moves it faster. Not here: friction at the wall, adhesion, and pictures of a cell: frames still show a bead, so that
-//! a length is delivered only with positions without pictures.
+//! moves it faster. Not here: friction at the wall and adhesion.
 
 use crate::config::WorldError;
 use crate::random::Gaussian;
@@ -35,7 +34,7 @@ pub struct CellConfig {
     pub recovery_last_s: f64,
     /// Passages over which it tires; more change nothing.
     pub fatigue_passages: u32,
-    /// Noise of the measured length, um RMS; the measured area is that of the measured length.
+    /// Noise of the length delivered without pictures, um RMS; the area is that of the measured length.
     pub noise_um: f64,
 }
 
@@ -111,7 +110,7 @@ impl CellConfig {
     }
 
     /// How far a position is inside: 0 outside, 1 inside, smooth in between.
-    fn inside(&self, x_um: f64) -> f64 {
+    pub(crate) fn inside(&self, x_um: f64) -> f64 {
         let share = ((x_um - self.entry_um) / self.mouth_um + 0.5).clamp(0.0, 1.0);
         share * share * (3.0 - 2.0 * share)
     }

@@ -34,9 +34,9 @@ pub struct WorldConfig {
     pub exposure_ms: f64,
     /// From the middle of an exposure to the delivery of its frame, ms.
     pub latency_ms: f64,
-    /// Radius of the bead, um: where its profile first crosses the background.
+    /// Radius of the bead, um: where its profile first crosses the background; of no effect with a cell.
     pub bead_radius_um: f64,
-    /// Contrast of the bead's middle against the background, grey levels of 8 bits.
+    /// Contrast of the middle of bead or cell against the background, grey levels of 8 bits.
     pub contrast_grey: f64,
     /// Background, grey levels.
     pub background_grey: f64,
@@ -250,7 +250,35 @@ impl WorldConfig {
         }
         if let Some(cell) = &self.cell {
             cell.validate()?;
+            let across_um = f64::from(self.height_px) * self.pixel_um;
+            let along_um = f64::from(self.width_px) * self.pixel_um;
+            let room_um = across_um - 2.0 * self.lateral_um - 2.0 * self.pixel_um;
+            within(
+                "cell.rest_um",
+                cell.rest_um,
+                0.1,
+                room_um,
+                "less than the frame's height: height_px * pixel_um, less lateral_um and a pixel on either side",
+            )?;
+            let most_um = cell.rest_um * cell.stretch_first.max(cell.stretch_last);
+            within(
+                "cell: rest_um times the larger stretch",
+                most_um,
+                0.1,
+                along_um,
+                "less than the frame's width: width_px * pixel_um",
+            )?;
         }
         self.faults.validate()
+    }
+
+    /// Half of the frame's width, um.
+    pub(crate) fn half_frame_um(&self) -> f64 {
+        0.5 * f64::from(self.width_px) * self.pixel_um
+    }
+
+    /// Half of the length along the channel of what is in view, um.
+    pub(crate) fn half_length_um(&self, length_um: Option<f64>) -> f64 {
+        length_um.map_or(self.bead_radius_um, |um| 0.5 * um)
     }
 }

@@ -1,8 +1,8 @@
 //! The physical world behind the emulated rig: PZT, chip, bead and rendered camera frames.
 //!
 //! [`World`] is driven by the displacement that stands at the board's output and by time, and yields what a camera
-//! would deliver, when it would deliver it: frames of 8 bits with a ring-profile bead blurred along its true path during the
-//! exposure, with shot and read noise; or positions with the equivalent noise, for runs that need no pictures. Beside
+//! would deliver, when it would deliver it: frames of 8 bits with a ring-profile bead, or a cell in its channel, blurred
+//! along the true path during the exposure, with shot and read noise; or positions with the equivalent noise, for runs that need no pictures. Beside
 //! them it knows the truth. Faults are injected from a schedule ([`Faults`]).
 //!
 //! A seed fixes every bit of what comes out. Not for the PZT board, which is firmware of its own, and not for real time:
@@ -11,6 +11,7 @@
 
 mod camera;
 mod cell;
+mod cell_picture;
 mod config;
 mod faults;
 mod random;

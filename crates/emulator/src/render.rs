@@ -1,9 +1,10 @@
-//! From bead positions to grey values.
+//! From positions of beads and cells to grey values.
 //!
-//! Only the neighbourhood of a bead is computed; everything else is background, whose noise is drawn beforehand into a
+//! Only the neighbourhood of an object is computed; everything else is background, whose noise is drawn beforehand into a
 //! long strip of grey values from which each row takes a piece at a random place. A piece comes again after a hundred
 //! thousand pixels, at another place of another frame.
 
+use crate::cell_picture::{CellPicture, HalfAxes, walls};
 use crate::config::WorldConfig;
 use crate::random::{Gaussian, stream_of};
 use cellpos_vision::{PixelResponse, RadialProfile, RingProfile, Template};
@@ -27,8 +28,13 @@ pub(crate) struct Blur {
 }
 
 impl Blur {
-    /// Reduces a path, sampled at equal times with the weights of the trapezoidal rule, to as few points as the spacing allows.
+    /// Reduces a bead's path, sampled at equal times with the weights of the trapezoidal rule, to as few points as the
+    /// spacing allows.
     pub(crate) fn along(path: &[(f64, f64)]) -> Self {
+        Self::spaced(path, POINT_SPACING_PX)
+    }
+
+    fn spaced(path: &[(f64, f64)], spacing_px: f64) -> Self {
         let mut blur = Self {
             points: [(0.0, 0.0); MAX_POINTS],
             count: 1,
@@ -37,7 +43,7 @@ impl Blur {
             .windows(2)
             .map(|w| (w[1].0 - w[0].0).hypot(w[1].1 - w[0].1))
             .sum::<f64>();
-        let wanted = (length_px / POINT_SPACING_PX).ceil().max(1.0);
+        let wanted = (length_px / spacing_px).ceil().max(1.0);
         blur.count = (wanted as usize).min(MAX_POINTS);
         let last = path.len().saturating_sub(1);
         for (k, point) in blur.points.iter_mut().enumerate().take(blur.count) {
@@ -83,21 +89,38 @@ pub(crate) fn mean_between(path: &[(f64, f64)], from: f64, to: f64) -> (f64, f64
     (x / (to - from), y / (to - from))
 }
 
+/// Something to be drawn.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Body {
+    blur: Blur,
+    form: Form,
+}
+
+#[derive(Debug, Clone, Copy)]
+enum Form {
+    Bead,
+    Cell(HalfAxes),
+}
+
 /// Draws frames.
 #[derive(Debug, Clone)]
 pub(crate) struct Renderer {
     width: usize,
     height: usize,
+    pixel_um: f64,
     background: f32,
     contrast: f32,
     read_variance: f32,
     grey_per_electron: f32,
     template: Template,
     support_px: f32,
+    cell: CellPicture,
+    /// Grey levels that each pixel loses to the channel's walls; empty without a cell.
+    walls: Vec<f32>,
     /// Grey values of background with noise.
     strip: Vec<u8>,
     gaussian: Vec<f32>,
-    /// Room for the beads' light in a piece of one row.
+    /// Room for the objects' light in a piece of one row.
     values: Vec<f32>,
     rng: Xoshiro256PlusPlus,
 }
@@ -121,12 +144,15 @@ impl Renderer {
         Some(Self {
             width: usize::from(config.width_px),
             height: usize::from(config.height_px),
+            pixel_um: config.pixel_um,
             background,
             contrast: config.contrast_grey as f32,
             read_variance,
             grey_per_electron,
             support_px: profile.support_px() as f32,
             template,
+            cell: CellPicture::new(config.pixel_um),
+            walls: config.cell.map_or(Vec::new(), |cell| walls(config, &cell)),
             strip,
             gaussian,
             values: vec![0.0; usize::from(config.width_px)],
@@ -134,10 +160,31 @@ impl Renderer {
         })
     }
 
-    /// Draws the beads (none, one or two) into `pixels`, which is brought to the frame's size. `lit` is the part of the
+    /// A bead that went along a path, px.
+    pub(crate) fn bead(&self, path: &[(f64, f64)]) -> Body {
+        Body {
+            blur: Blur::along(path),
+            form: Form::Bead,
+        }
+    }
+
+    /// A cell that went along a path, px.
+    pub(crate) fn cell(&self, path: &[(f64, f64)], length_um: f64, width_um: f64) -> Body {
+        let half_px = |um: f64| (0.5 * um / self.pixel_um) as f32;
+        Body {
+            // The soft edge hides steps of half its width.
+            blur: Blur::spaced(path, f64::from(0.5 * self.cell.blur_px())),
+            form: Form::Cell(HalfAxes {
+                along_px: half_px(length_um),
+                across_px: half_px(width_um),
+            }),
+        }
+    }
+
+    /// Draws the objects (none, one or two) into `pixels`, which is brought to the frame's size. `lit` is the part of the
     /// exposure for which the LED added its light.
-    pub(crate) fn draw(&mut self, beads: &[Blur], lit: f64, pixels: &mut Vec<u8>) {
-        self.draw_beads(beads, pixels);
+    pub(crate) fn draw(&mut self, bodies: &[Body], lit: f64, pixels: &mut Vec<u8>) {
+        self.draw_bodies(bodies, pixels);
         let light = grey((lit * LED_GREY) as f32);
         if light > 0 {
             for pixel in pixels {
@@ -146,7 +193,7 @@ impl Renderer {
         }
     }
 
-    fn draw_beads(&mut self, beads: &[Blur], pixels: &mut Vec<u8>) {
+    fn draw_bodies(&mut self, bodies: &[Body], pixels: &mut Vec<u8>) {
         pixels.resize(self.width * self.height, 0);
         for row in pixels.chunks_exact_mut(self.width) {
             let from = (self.rng.next_u64() >> 40) as usize % STRIP_LEN;
@@ -154,10 +201,14 @@ impl Renderer {
                 row.copy_from_slice(piece);
             }
         }
-        let Some((columns, rows)) = self.neighbourhood(beads) else {
+        for (pixel, wall) in pixels.iter_mut().zip(&self.walls) {
+            if *wall > 0.5 {
+                *pixel = grey(f32::from(*pixel) - wall);
+            }
+        }
+        let Some((columns, rows)) = self.neighbourhood(bodies) else {
             return;
         };
-        let reach2 = self.support_px * self.support_px;
         for (y, row) in pixels
             .chunks_exact_mut(self.width)
             .enumerate()
@@ -171,25 +222,28 @@ impl Renderer {
                 continue;
             };
             values.fill(0.0);
-            for bead in beads {
-                let weight = self.contrast / bead.points().len() as f32;
-                for &(bx, by) in bead.points() {
+            for body in bodies {
+                let weight = self.contrast / body.blur.points().len() as f32;
+                for &(bx, by) in body.blur.points() {
                     let (x, dy) = (bx - columns.0 as f32, y as f32 - by);
-                    let room2 = reach2 - dy * dy;
-                    if room2 <= 0.0 {
-                        continue;
-                    }
-                    let half = room2.sqrt();
-                    // `as` takes what is below 0 to 0.
-                    let from = (x - half).ceil() as usize;
-                    let to = ((x + half).floor() + 1.0) as usize;
-                    let to = to.min(values.len());
-                    let Some(chord) = values.get_mut(from.min(to)..to) else {
-                        continue;
-                    };
-                    for (i, value) in chord.iter_mut().enumerate() {
-                        let dx = (from + i) as f32 - x;
-                        *value += weight * self.template.value_at_squared(dx * dx + dy * dy);
+                    match body.form {
+                        Form::Bead => {
+                            let room2 = self.support_px * self.support_px - dy * dy;
+                            if room2 > 0.0 {
+                                add_chord(values, x, room2.sqrt(), |dx| {
+                                    weight * self.template.value_at_squared(dx * dx + dy * dy)
+                                });
+                            }
+                        }
+                        Form::Cell(axes) => {
+                            let (along, across) = self.cell.reach_px(axes);
+                            let room2 = 1.0 - (dy / across) * (dy / across);
+                            if room2 > 0.0 {
+                                add_chord(values, x, along * room2.sqrt(), |dx| {
+                                    weight * self.cell.value(axes, dx, dy)
+                                });
+                            }
+                        }
                     }
                 }
             }
@@ -197,36 +251,63 @@ impl Renderer {
             let Some(noise) = self.gaussian.get(at..at + row.len()) else {
                 continue;
             };
-            for ((pixel, value), noise) in row.iter_mut().zip(&*values).zip(noise) {
-                let level = (self.background + value).max(0.0);
+            let first = y * self.width + columns.0;
+            let walls = self.walls.get(first..first + row.len()).unwrap_or(&[]);
+            let walls = walls.iter().chain(std::iter::repeat(&0.0));
+            for (((pixel, value), noise), wall) in
+                row.iter_mut().zip(&*values).zip(noise).zip(walls)
+            {
+                let level = (self.background - wall + value).max(0.0);
                 let sd = (level * self.grey_per_electron + self.read_variance).sqrt();
                 *pixel = grey(level + sd * noise);
             }
         }
     }
 
-    /// Columns and rows (from, to) that hold all beads' neighbourhoods; `None` when none is in the frame.
-    fn neighbourhood(&self, beads: &[Blur]) -> Option<((usize, usize), (usize, usize))> {
+    /// Columns and rows (from, to) that hold all objects' neighbourhoods; `None` when none is in the frame.
+    fn neighbourhood(&self, bodies: &[Body]) -> Option<((usize, usize), (usize, usize))> {
+        let reach = |body: &Body| match body.form {
+            Form::Bead => (self.support_px, self.support_px),
+            Form::Cell(axes) => self.cell.reach_px(axes),
+        };
+        let (mut low, mut high) = (
+            (f32::INFINITY, f32::INFINITY),
+            (f32::NEG_INFINITY, f32::NEG_INFINITY),
+        );
+        for body in bodies {
+            let (rx, ry) = reach(body);
+            for &(x, y) in body.blur.points() {
+                low = (low.0.min(x - rx), low.1.min(y - ry));
+                high = (high.0.max(x + rx), high.1.max(y + ry));
+            }
+        }
         let span = |low: f32, high: f32, length: usize| {
             // `as` takes what is below 0 to 0.
-            let from = ((low - self.support_px).floor().max(0.0) as usize).min(length);
-            let to = ((high + self.support_px).ceil() + 1.0).max(0.0) as usize;
+            let from = (low.floor().max(0.0) as usize).min(length);
+            let to = (high.ceil() + 1.0).max(0.0) as usize;
             (from, to.min(length))
         };
-        let points = || beads.iter().flat_map(|bead| bead.points());
-        let bounds = |pick: fn(&(f32, f32)) -> f32| {
-            points()
-                .map(pick)
-                .fold((f32::INFINITY, f32::NEG_INFINITY), |(a, b), v| {
-                    (a.min(v), b.max(v))
-                })
-        };
-        let (x, y) = (bounds(|p| p.0), bounds(|p| p.1));
-        if x.0 > x.1 {
+        if low.0 > high.0 {
             return None;
         }
-        let (columns, rows) = (span(x.0, x.1, self.width), span(y.0, y.1, self.height));
+        let (columns, rows) = (
+            span(low.0, high.0, self.width),
+            span(low.1, high.1, self.height),
+        );
         (columns.0 < columns.1 && rows.0 < rows.1).then_some((columns, rows))
+    }
+}
+
+/// Adds `value` of the distance from `x` to the pixels of a row within `half` of it.
+fn add_chord(values: &mut [f32], x: f32, half: f32, value: impl Fn(f32) -> f32) {
+    // `as` takes what is below 0 to 0.
+    let from = (x - half).ceil() as usize;
+    let to = (((x + half).floor() + 1.0) as usize).min(values.len());
+    let Some(chord) = values.get_mut(from.min(to)..to) else {
+        return;
+    };
+    for (i, place) in chord.iter_mut().enumerate() {
+        *place += value((from + i) as f32 - x);
     }
 }
 
@@ -235,31 +316,47 @@ fn grey(level: f32) -> u8 {
     (level + 0.5) as u8
 }
 
-/// Smallest standard deviation of x that any unbiased localiser can reach on the rendered frames of a bead in mid-frame,
-/// um: the Cramer-Rao bound for position, contrast and background unknown.
+/// Smallest standard deviation of x that any unbiased localiser can reach on the rendered frames of a bead (or a cell at
+/// rest) in mid-frame, um: the Cramer-Rao bound for position, contrast and background unknown.
 ///
 /// By symmetry x is uncorrelated with y, contrast and background, so the information of x alone decides.
 pub(crate) fn localisation_bound_um(config: &WorldConfig) -> Option<f64> {
     let profile = RingProfile::new(config.bead_radius_px())?;
+    let picture = CellPicture::new(config.pixel_um);
+    let value = |dx: f64, dy: f64| match config.cell {
+        None => profile.value(dx.hypot(dy)),
+        Some(cell) => {
+            let half_px = (0.5 * cell.rest_um / config.pixel_um) as f32;
+            let axes = HalfAxes {
+                along_px: half_px,
+                across_px: half_px,
+            };
+            f64::from(picture.value(axes, dx as f32, dy as f32))
+        }
+    };
+    let slope = |dx: f64, dy: f64| match config.cell {
+        None => {
+            let r = dx.hypot(dy);
+            if r > 0.0 && r <= profile.support_px() {
+                profile.slope(r) * dx / r
+            } else {
+                0.0
+            }
+        }
+        // Half a pixel on either side: wider than the steps of the edge's table.
+        Some(_) => value(dx + 0.5, dy) - value(dx - 0.5, dy),
+    };
     let (x0, y0) = (config.origin_x_px(), config.origin_y_px());
     let mut information = 0.0;
     for y in 0..config.height_px {
         for x in 0..config.width_px {
             let (dx, dy) = (f64::from(x) - x0, f64::from(y) - y0);
-            let r = dx.hypot(dy);
-            if r > profile.support_px() {
-                continue;
-            }
-            let level = (config.background_grey + config.contrast_grey * profile.value(r)).max(0.0);
+            let slope = config.contrast_grey * slope(dx, dy);
+            let level = (config.background_grey + config.contrast_grey * value(dx, dy)).max(0.0);
             // Rounding to whole grey levels adds a twelfth.
             let variance = level / config.electrons_per_grey
                 + config.read_noise_grey * config.read_noise_grey
                 + 1.0 / 12.0;
-            let slope = if r > 0.0 {
-                config.contrast_grey * profile.slope(r) * dx / r
-            } else {
-                0.0
-            };
             information += slope * slope / variance;
         }
     }
@@ -311,7 +408,7 @@ mod tests {
     fn pixels_on_the_bead_have_the_shot_noise_of_their_own_level() {
         let config = WorldConfig::default();
         let mut renderer = Renderer::new(&config).unwrap();
-        let bead = Blur::along(&[(128.0, 16.0)]);
+        let bead = renderer.bead(&[(128.0, 16.0)]);
         let centre = 16 * 256 + 128;
         let mut pixels = Vec::new();
         let values: Vec<f64> = (0..4000)
@@ -336,10 +433,12 @@ mod tests {
         let mut renderer = Renderer::new(&config).unwrap();
         let mut pixels = Vec::new();
         for x in [-1e6, -40.0, 300.0, 1e9] {
-            renderer.draw(&[Blur::along(&[(x, 16.0)])], 0.0, &mut pixels);
+            let bead = renderer.bead(&[(x, 16.0)]);
+            renderer.draw(&[bead], 0.0, &mut pixels);
             assert!(pixels.iter().all(|&p| p < 130), "bead at {x}");
         }
-        renderer.draw(&[Blur::along(&[(0.0, 16.0)])], 0.0, &mut pixels);
+        let bead = renderer.bead(&[(0.0, 16.0)]);
+        renderer.draw(&[bead], 0.0, &mut pixels);
         assert!(pixels[16 * 256] > 150);
     }
 }

@@ -5,10 +5,13 @@ use crate::cell::Cell;
 use crate::config::{WorldConfig, WorldError};
 use crate::faults::FaultKind;
 use crate::random::Gaussian;
-use crate::render::{Blur, Renderer, localisation_bound_um, mean_between};
+use crate::render::{Renderer, localisation_bound_um, mean_between};
 use cellpos_plant::{Chain, Effect, Model, Noise};
 use cellpos_vision::Verdict;
 use std::f64::consts::TAU;
+
+/// Turns a seed into that of frames of the empty channel.
+const EMPTY_SEED: u64 = 0x5eed_0f0e_3a97_7c41;
 
 /// The emulated world. Times are nanoseconds of whatever clock the caller keeps, starting at `start_ns`.
 ///
@@ -70,12 +73,7 @@ impl World {
         };
         let chain = Chain::with_brownian_motion(&running, config.seed)
             .map_err(|error| WorldError::Model(error.to_string()))?;
-        let radius = WorldError::Value {
-            key: "bead_radius_um",
-            value: config.bead_radius_um,
-            must: "above 0 um",
-        };
-        let renderer = Renderer::new(config).ok_or(radius)?;
+        let renderer = renderer(config)?;
         let localisation_um = match config.localisation_um {
             Some(um) => um,
             None => localisation_bound_um(config).ok_or(WorldError::Value {
@@ -151,14 +149,33 @@ impl World {
         self.localisation_um
     }
 
-    /// Whether any part of the bead's disc is within the frame.
+    /// Whether any part of the bead (or the cell) is within the frame.
     pub fn bead_in_frame(&self) -> bool {
-        self.is_in_frame(self.bead_um())
+        self.is_in_frame(self.bead_um(), self.length_um())
     }
 
-    fn is_in_frame(&self, x_um: f64) -> bool {
-        let half_um = 0.5 * f64::from(self.config.width_px) * self.config.pixel_um;
-        x_um.abs() < half_um + self.config.bead_radius_um
+    fn is_in_frame(&self, x_um: f64, length_um: Option<f64>) -> bool {
+        x_um.abs() < self.config.half_frame_um() + self.config.half_length_um(length_um)
+    }
+
+    /// Frames of the same rig without bead or cell, rows contiguous, one byte per pixel: what a camera sees of the empty
+    /// channel. They have a noise of their own, so that taking them changes nothing in a world with the same seed.
+    ///
+    /// # Errors
+    /// [`WorldError`] names the value that cannot be.
+    pub fn empty_frames(config: &WorldConfig, count: usize) -> Result<Vec<Vec<u8>>, WorldError> {
+        config.validate()?;
+        let other = WorldConfig {
+            seed: config.seed ^ EMPTY_SEED,
+            ..config.clone()
+        };
+        let mut renderer = renderer(&other)?;
+        let draw = |_| {
+            let mut pixels = Vec::new();
+            renderer.draw(&[], 0.0, &mut pixels);
+            pixels
+        };
+        Ok((0..count).map(draw).collect())
     }
 
     /// Advances to `t_ns` while the board's output stands at `applied_um`; does nothing for a time that is past.
@@ -278,7 +295,7 @@ impl World {
         let Some(after_ms) = self.config.new_bead_after_ms else {
             return;
         };
-        if self.is_in_frame(bead_um) {
+        if self.is_in_frame(bead_um, self.length_um()) {
             self.out_since_ns = None;
             return;
         }
@@ -313,8 +330,19 @@ impl World {
                 self.config.origin_y_px() + um.1 / self.config.pixel_um,
             )
         };
-        let first = Blur::along(&exposure.samples.map(|s| px((s.seen_um, s.lateral_um))));
-        let second = second_path(&exposure).map(|path| Blur::along(&path.map(px)));
+        let path = exposure.samples.map(|s| px((s.seen_um, s.lateral_um)));
+        let first = match (self.config.cell, mid_length_um(&exposure)) {
+            (Some(cell), Some(um)) => self.renderer.cell(&path, um, cell.width_um(um)),
+            _ => self.renderer.bead(&path),
+        };
+        let second = second_path(&exposure).map(|path| match self.config.cell {
+            // Another cell, at rest.
+            Some(cell) => {
+                let path = path.map(px);
+                self.renderer.cell(&path, cell.rest_um, cell.rest_um)
+            }
+            None => self.renderer.bead(&path.map(px)),
+        });
         match (is_visible(&exposure), second) {
             (true, None) => self.renderer.draw(&[first], info.lit, pixels),
             (true, Some(second)) => self.renderer.draw(&[first, second], info.lit, pixels),
@@ -336,14 +364,8 @@ impl World {
         let verdict = self.verdict(&exposure, mean_um);
         let good = verdict == Verdict::Good;
         let or_nan = |value| if good { value } else { f64::NAN };
-        let (length_um, area_um2) = match &mut self.cell {
-            // As it was in the middle of the exposure.
-            Some(cell) if good => exposure
-                .samples
-                .get(EXPOSURE_STEPS / 2)
-                .map_or((f64::NAN, f64::NAN), |sample| {
-                    cell.measured(sample.length_um)
-                }),
+        let (length_um, area_um2) = match (&mut self.cell, mid_length_um(&exposure)) {
+            (Some(cell), Some(length_um)) if good => cell.measured(length_um),
             _ => (f64::NAN, f64::NAN),
         };
         Some(PositionFix {
@@ -359,21 +381,37 @@ impl World {
 
     fn verdict(&self, exposure: &Exposure, mean_um: f64) -> Verdict {
         let config = &self.config;
-        let half_um = 0.5 * f64::from(config.width_px) * config.pixel_um;
-        if !is_visible(exposure) || !self.is_in_frame(mean_um) {
+        let length_um = mid_length_um(exposure);
+        if !is_visible(exposure) || !self.is_in_frame(mean_um, length_um) {
             return Verdict::NoSignal;
         }
-        if mean_um.abs() > half_um - config.bead_radius_um {
+        let half_um = config.half_length_um(length_um);
+        if mean_um.abs() > config.half_frame_um() - half_um {
             return Verdict::AtBorder;
         }
+        let other_um = config.half_length_um(config.cell.map(|cell| cell.rest_um));
         let merged = second_path(exposure)
-            .is_some_and(|path| (path[0].0 - mean_um).abs() < 2.0 * config.bead_radius_um);
+            .is_some_and(|path| (path[0].0 - mean_um).abs() < half_um + other_um);
         if merged {
             Verdict::BadFit
         } else {
             Verdict::Good
         }
     }
+}
+
+/// Length of the cell in the middle of the exposure, um; `None` for a bead.
+fn mid_length_um(exposure: &Exposure) -> Option<f64> {
+    let middle = exposure.samples.get(EXPOSURE_STEPS / 2)?;
+    Some(middle.length_um).filter(|um| um.is_finite())
+}
+
+fn renderer(config: &WorldConfig) -> Result<Renderer, WorldError> {
+    Renderer::new(config).ok_or(WorldError::Value {
+        key: "bead_radius_um",
+        value: config.bead_radius_um,
+        must: "above 0 um",
+    })
 }
 
 fn is_visible(exposure: &Exposure) -> bool {

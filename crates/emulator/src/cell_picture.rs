@@ -1,0 +1,141 @@
+//! What a cell and its channel look like: an ellipse with a soft edge and a brighter rim, between two walls.
+
+use crate::cell::CellConfig;
+use crate::config::WorldConfig;
+
+/// Standard deviation of the soft edge that the microscope gives to everything, um.
+const BLUR_UM: f64 = 0.2;
+/// Contrast of the rim on top of the body's, as a share of it, and its distance from the edge in edge widths.
+const RIM: (f64, f64) = (0.3, 3.0);
+/// Edge widths beyond which nothing is drawn.
+const REACH: f64 = 5.0;
+/// Steps of the edge's table per edge width.
+const STEPS: f64 = 32.0;
+/// Light lost at a wall, grey levels, and the room between the cell and a wall, um.
+const WALL_GREY: f64 = 35.0;
+const WALL_ROOM_UM: f64 = 0.8;
+
+/// Half axes of a cell, along and across the channel, px.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct HalfAxes {
+    pub along_px: f32,
+    pub across_px: f32,
+}
+
+/// Draws cells, in units of the body's contrast.
+#[derive(Debug, Clone)]
+pub(crate) struct CellPicture {
+    blur_px: f32,
+    /// Values over the distance from the edge, from `-REACH` to `REACH` edge widths.
+    edge: Vec<f32>,
+}
+
+impl CellPicture {
+    pub(crate) fn new(pixel_um: f64) -> Self {
+        let steps = (2.0 * REACH * STEPS) as usize;
+        let edge = (0..=steps)
+            .map(|k| {
+                let widths = k as f64 / STEPS - REACH;
+                let rim = (-0.5 * (widths + RIM.1).powi(2)).exp();
+                // The logistic function with the slope of a Gaussian's integral.
+                let body = 1.0 / (1.0 + (1.702 * widths).exp());
+                (body + RIM.0 * rim) as f32
+            })
+            .collect();
+        Self {
+            blur_px: (BLUR_UM / pixel_um) as f32,
+            edge,
+        }
+    }
+
+    /// Standard deviation of the soft edge, px.
+    pub(crate) fn blur_px(&self) -> f32 {
+        self.blur_px
+    }
+
+    /// Distance from the middle beyond which a cell draws nothing, along and across, px.
+    pub(crate) fn reach_px(&self, axes: HalfAxes) -> (f32, f32) {
+        let edge = REACH as f32 * self.blur_px;
+        (axes.along_px + edge, axes.across_px + edge)
+    }
+
+    /// Share of the body's contrast at a distance from the middle, along and across, px.
+    pub(crate) fn value(&self, axes: HalfAxes, dx: f32, dy: f32) -> f32 {
+        let (u, v) = (dx / axes.along_px, dy / axes.across_px);
+        let r2 = u * u + v * v;
+        let (gx, gy) = (u / axes.along_px, v / axes.across_px);
+        let slope2 = gx * gx + gy * gy;
+        // Distance from the ellipse to first order: (r^2 - 1) / |grad r^2|, exact on it.
+        let widths = if slope2 > 0.0 {
+            0.5 * (r2 - 1.0) / (slope2.sqrt() * self.blur_px)
+        } else {
+            -(REACH as f32)
+        };
+        let place = (widths + REACH as f32) * STEPS as f32;
+        if place <= 0.0 {
+            return 1.0;
+        }
+        self.edge.get(place as usize).copied().unwrap_or(0.0)
+    }
+}
+
+/// Grey levels that the channel's walls take from each pixel, row by row: outside as far apart as the cell is wide at
+/// rest, in the constriction as when it is stretched least.
+pub(crate) fn walls(config: &WorldConfig, cell: &CellConfig) -> Vec<f32> {
+    let blur_um = BLUR_UM.max(config.pixel_um);
+    let inside_um = cell.width_um(cell.rest_um * cell.stretch_first.min(cell.stretch_last));
+    let (wide_um, narrow_um) = (0.5 * cell.rest_um, 0.5 * inside_um);
+    let mut grey = Vec::with_capacity(usize::from(config.width_px) * usize::from(config.height_px));
+    for row in 0..config.height_px {
+        for column in 0..config.width_px {
+            let inside = cell.inside(config.um_from_px(f64::from(column)));
+            let y_um = (f64::from(row) - config.origin_y_px()).abs() * config.pixel_um;
+            let wall_um = wide_um + (narrow_um - wide_um) * inside + WALL_ROOM_UM;
+            grey.push((WALL_GREY * (-0.5 * ((y_um - wall_um) / blur_um).powi(2)).exp()) as f32);
+        }
+    }
+    grey
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn half_of_the_contrast_lies_on_the_ellipse_and_all_of_it_well_inside() {
+        let picture = CellPicture::new(0.2);
+        let axes = HalfAxes {
+            along_px: 60.0,
+            across_px: 12.0,
+        };
+        for degrees in 0..90 {
+            let (sin, cos) = f32::to_radians(degrees as f32).sin_cos();
+            let on = picture.value(axes, 60.0 * cos, 12.0 * sin);
+            assert!((on - 0.5).abs() < 0.03, "{degrees}: {on}");
+            assert!((picture.value(axes, 20.0 * cos, 4.0 * sin) - 1.0).abs() < 0.01);
+        }
+        let (x, y) = picture.reach_px(axes);
+        assert!(picture.value(axes, x, 0.0) < 1e-3 && picture.value(axes, 0.0, y) < 1e-3);
+        assert_eq!(picture.value(axes, 0.0, 0.0), 1.0);
+    }
+
+    #[test]
+    fn the_walls_leave_room_for_the_cell_and_come_closer_in_the_constriction() {
+        let config = WorldConfig {
+            pixel_um: 0.2,
+            height_px: 64,
+            ..WorldConfig::default()
+        };
+        let cell = CellConfig::default();
+        let grey = walls(&config, &cell);
+        let darkest = |x_um: f64| {
+            let column = config.px_from_um(x_um).round() as usize;
+            let rows = (0..32).map(|row| grey[row * 256 + column]);
+            let (row, _) = (0..).zip(rows).max_by(|a, b| a.1.total_cmp(&b.1)).unwrap();
+            (config.origin_y_px() - f64::from(row)) * 0.2
+        };
+        assert!((darkest(-10.0) - 4.8).abs() < 0.15, "{}", darkest(-10.0));
+        let narrow = 0.5 * cell.width_um(8.0 * 2.86) + 0.8;
+        assert!((darkest(12.0) - narrow).abs() < 0.15, "{}", darkest(12.0));
+    }
+}
