@@ -3,7 +3,7 @@
 use crate::outcome::Failure;
 use crate::toml_file;
 use cellpos_control::Limits;
-use cellpos_emulator::WorldConfig;
+use cellpos_emulator::{World, WorldConfig};
 use cellpos_firmware_sim::BoardConfig;
 use cellpos_plant::Model;
 use cellpos_rig::serial::SerialLine;
@@ -11,11 +11,14 @@ use cellpos_rig::socket::SocketCamera;
 use cellpos_rig::sources::Region;
 use cellpos_rig::{
     Actuator, BoardHost, Calibration, CalibrationFile, Camera, Clock, CommandedFlow, EmulatedRig,
-    FlowTap, PositionSource, VisionSource,
+    FlowTap, Followed, FrameBuffer, PositionSource, VisionSource, background,
 };
 use cellpos_runtime::{ArmingConfig, Timing};
 use cellpos_units::Hertz;
-use cellpos_vision::{Localiser, LocaliserConfig, ProfileSpec, Tracker, TrackerConfig};
+use cellpos_vision::{
+    CellConfig, CellFinder, CellTracker, Localiser, LocaliserConfig, ProfileSpec, Tracker,
+    TrackerConfig,
+};
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -39,6 +42,9 @@ pub struct RigFile {
     /// Localisation; left out: a ring profile for the bead of `[emulator]`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub vision: Option<LocaliserConfig>,
+    /// A cell is followed instead of a bead; an emulated rig with `[emulator.cell]` needs no such table.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub cell: Option<CellInView>,
     /// Tracking; left out: for a 1 um bead in water.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub tracking: Option<TrackerConfig>,
@@ -52,6 +58,18 @@ pub struct RigFile {
     pub board: BoardConfig,
     /// The emulated world.
     pub emulator: WorldConfig,
+}
+
+/// How a cell is seen, the table `[cell]`.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct CellInView {
+    /// Recording of the empty channel, as `cellpos background` writes it; from the folder of rig.toml. The emulated camera
+    /// brings its own.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub background: Option<PathBuf>,
+    /// What counts as a cell.
+    pub finder: CellConfig,
 }
 
 /// The PZT board.
@@ -127,6 +145,7 @@ impl Default for RigFile {
             calibration: None,
             calibration_file: None,
             vision: None,
+            cell: None,
             tracking: None,
             limits: Limits {
                 low_um: 0.0,
@@ -209,6 +228,9 @@ impl RigFile {
             let read = CalibrationFile::read(calibration).map_err(Failure::input)?;
             file.calibration = Some(read.calibration());
         }
+        if let Some(background) = file.cell.as_mut().and_then(|cell| cell.background.as_mut()) {
+            *background = folder.join(&*background);
+        }
         if let CameraConfig::Socket { socket, .. } = &mut file.camera {
             *socket = folder.join(&*socket);
         }
@@ -236,6 +258,15 @@ impl RigFile {
         self.timing.validate().map_err(|error| say(&error))?;
         self.board.validate().map_err(|error| say(&error))?;
         self.emulator.validate().map_err(|error| say(&error))?;
+        if let Some(cell) = &self.cell {
+            CellFinder::new(1, 1, cell.finder)
+                .map_err(|error| say(&format!("[cell.finder] {error}")))?;
+            if matches!(self.camera, CameraConfig::Emulated {}) && self.emulator.cell.is_none() {
+                return Err(say(
+                    &"[cell]: the emulated rig has a bead; give it a cell with a table [emulator.cell]",
+                ));
+            }
+        }
         if !(self.limits.low_um..=self.limits.high_um).contains(&self.first_neutral_um) {
             return Err(say(&format!(
                 "first_neutral_um = {}: must be within the limits, {} to {} um",
@@ -264,6 +295,57 @@ impl RigFile {
         )
     }
 
+    /// Whether a cell is followed, so that its length and area are measured.
+    pub fn follows_a_cell(&self) -> bool {
+        match self.camera {
+            CameraConfig::Emulated {} => self.emulator.cell.is_some(),
+            _ => self.cell.is_some(),
+        }
+    }
+
+    /// The file with the empty channel, if cells are seen against one.
+    pub fn background(&self) -> Option<&Path> {
+        match self.camera {
+            CameraConfig::Emulated {} => None,
+            _ => self.cell.as_ref()?.background.as_deref(),
+        }
+    }
+
+    /// What finds cells against the empty channel.
+    fn finder(&self) -> Result<CellFinder, Failure> {
+        /// Frames of the empty channel that the emulated camera takes beforehand.
+        const EMPTY_FRAMES: usize = 100;
+        let cell = self.cell.clone().unwrap_or_default();
+        match (&self.camera, &cell.background) {
+            (CameraConfig::Emulated {}, _) => {
+                let frames = World::empty_frames(&self.emulator, EMPTY_FRAMES);
+                let buffer = |mono8| FrameBuffer {
+                    width: usize::from(self.emulator.width_px),
+                    height: usize::from(self.emulator.height_px),
+                    bits: 8,
+                    mono8,
+                    mono16: Vec::new(),
+                };
+                let frames: Vec<FrameBuffer> = frames
+                    .map_err(Failure::input)?
+                    .into_iter()
+                    .map(buffer)
+                    .collect();
+                background::finder(&frames, "emulated camera", cell.finder)
+            }
+            (_, Some(path)) => background::load(path, cell.finder),
+            (_, None) => {
+                return Err(Failure::bad_input(
+                    "[cell] background: a camera needs frames of the empty channel to see a cell",
+                    "record them with cellpos background --rig RIG.toml --out empty.tif, then name that file here",
+                ));
+            }
+        }
+        .map_err(|error| {
+            Failure::bad_input(error, "record the empty channel again: cellpos background")
+        })
+    }
+
     fn localiser(&self) -> Result<Localiser, Failure> {
         let config = self.vision.clone().unwrap_or_else(|| {
             LocaliserConfig::new(ProfileSpec::Ring {
@@ -286,8 +368,16 @@ impl RigFile {
         let config = self
             .tracking
             .unwrap_or_else(|| TrackerConfig::for_pixel_um(calibration.pixel_um));
-        let tracker = Tracker::new(self.localiser()?, config).map_err(Failure::input)?;
-        let source = VisionSource::new(camera, tracker, calibration, clock.clone());
+        let followed: Followed = if self.follows_a_cell() {
+            CellTracker::new(self.finder()?, config)
+                .map_err(Failure::input)?
+                .into()
+        } else {
+            Tracker::new(self.localiser()?, config)
+                .map_err(Failure::input)?
+                .into()
+        };
+        let source = VisionSource::new(camera, followed, calibration, clock.clone());
         Ok(Box::new(source.with_flow(flow.clone())))
     }
 
@@ -344,7 +434,7 @@ impl RigFile {
     }
 
     /// The camera of a real rig, running.
-    fn open_camera(&self) -> Result<Box<dyn Camera>, Failure> {
+    pub fn open_camera(&self) -> Result<Box<dyn Camera>, Failure> {
         match &self.camera {
             CameraConfig::Emulated {} => Err(Failure::bad_input(
                 "the emulated camera sees the emulated bead only",

@@ -196,6 +196,9 @@ fn anchored(file: &RigFile) -> Result<RigFile, Failure> {
     if let Some(calibration) = &mut file.calibration_file {
         *calibration = absolute(calibration)?;
     }
+    if let Some(background) = file.cell.as_mut().and_then(|cell| cell.background.as_mut()) {
+        *background = absolute(background)?;
+    }
     if let CameraConfig::Socket { socket, .. } = &mut file.camera {
         *socket = absolute(socket)?;
     }
@@ -213,9 +216,15 @@ fn anchored(file: &RigFile) -> Result<RigFile, Failure> {
     Ok(file)
 }
 
-/// The files behind the options `--rig`, `--model` and `--controller`.
-pub fn inputs<'a>(rig: Option<&'a Path>, model: &'a str, controller: &'a str) -> Vec<&'a Path> {
+/// The files behind the options `--rig`, `--model` and `--controller`, and those that the rig file names.
+pub fn inputs<'a>(
+    rig: Option<&'a Path>,
+    file: &'a RigFile,
+    model: &'a str,
+    controller: &'a str,
+) -> Vec<&'a Path> {
     let mut inputs: Vec<&Path> = rig.into_iter().collect();
+    inputs.extend(file.background());
     if model != "eq6" {
         inputs.push(Path::new(model));
     }

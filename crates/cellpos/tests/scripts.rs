@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 #[test]
 fn every_example_passes_the_check_and_a_rehearsal_with_a_row_for_each_cycle() {
     let folder = tempfile::tempdir().unwrap();
-    std::fs::write(folder.path().join("cell.toml"), "[emulator.cell]\n").unwrap();
+    std::fs::write(folder.path().join("cell.toml"), cell_rig()).unwrap();
     for path in examples() {
         let name = path.file_stem().unwrap().to_str().unwrap().to_string();
         let path = path.to_str().unwrap();
@@ -212,7 +212,7 @@ fn a_report_shows_the_run_and_a_bundle_is_what_its_manifest_says() {
     let folder = tempfile::tempdir().unwrap();
     let at = folder.path();
     script(at, 100);
-    std::fs::write(at.join("cell.toml"), "[emulator.cell]\n").unwrap();
+    std::fs::write(at.join("cell.toml"), cell_rig()).unwrap();
     json(
         at,
         &["run", "quick.toml", "--dry", "--rig", "cell.toml", "--json"],
@@ -564,7 +564,10 @@ fn a_run_is_gone_on_with_from_any_folder() {
 fn a_script_that_looks_at_a_length_is_refused_where_nobody_measures_one() {
     let folder = tempfile::tempdir().unwrap();
     let at = folder.path();
-    std::fs::write(at.join("cell.toml"), "[emulator.cell]\n").unwrap();
+    std::fs::write(at.join("cell.toml"), cell_rig()).unwrap();
+    let real = "[actuator]\nkind = \"serial\"\nport = \"pzt\"\n[camera]\nkind = \"socket\"\nsocket = \"camera.sock\"\n\
+                [cell]\nbackground = \"empty.tif\"\n";
+    std::fs::write(at.join("real.toml"), real).unwrap();
     let hold = "[[step]]\ndo = \"hold\"\nduration = \"200ms\"\n";
     let stop = format!("name = \"stop\"\n[stop]\nlength_change_above = \"50um\"\n{hold}");
     let wait = format!(
@@ -572,16 +575,14 @@ fn a_script_that_looks_at_a_length_is_refused_where_nobody_measures_one() {
     );
     for (name, text) in [("stop.toml", stop), ("wait.toml", wait)] {
         std::fs::write(at.join(name), text).unwrap();
-        for more in [
-            &["--dry"][..],
-            &["--dry", "--rig", "cell.toml", "--frames", "on"],
-        ] {
-            let (code, _, err) = cellpos(at, &[&["run", name], more].concat());
-            assert_eq!(code, Some(2), "{err}");
-            assert!(err.contains("emulator.cell"), "{err}");
+        let (code, _, err) = cellpos(at, &["run", name, "--dry"]);
+        assert_eq!(code, Some(2), "{err}");
+        assert!(err.contains("[emulator.cell]"), "{err}");
+        // A rig with a camera and a cell is rehearsed with an emulated one.
+        for file in ["cell.toml", "real.toml"] {
+            let run = json(at, &["run", name, "--dry", "--rig", file, "--json"]);
+            assert_eq!(run["outcome"], "done", "{name}");
         }
-        let run = json(at, &["run", name, "--dry", "--rig", "cell.toml", "--json"]);
-        assert_eq!(run["outcome"], "done", "{name}");
     }
-    assert_eq!(std::fs::read_dir(at.join("runs")).unwrap().count(), 2);
+    assert_eq!(std::fs::read_dir(at.join("runs")).unwrap().count(), 4);
 }

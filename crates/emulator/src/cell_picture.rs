@@ -18,8 +18,10 @@ const WALL_ROOM_UM: f64 = 0.8;
 /// Half axes of a cell, along and across the channel, px.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct HalfAxes {
-    pub along_px: f32,
-    pub across_px: f32,
+    along_px: f32,
+    across_px: f32,
+    /// Square of the share of both axes within which there is neither edge nor rim.
+    deep2: f32,
 }
 
 /// Draws cells, in units of the body's contrast.
@@ -48,6 +50,17 @@ impl CellPicture {
         }
     }
 
+    /// The half axes of a cell of a length and a width, px.
+    pub(crate) fn half_axes(&self, length_px: f64, width_px: f64) -> HalfAxes {
+        let (along_px, across_px) = (0.5 * length_px as f32, 0.5 * width_px as f32);
+        let deep = 1.0 - REACH as f32 * self.blur_px / along_px.min(across_px);
+        HalfAxes {
+            along_px,
+            across_px,
+            deep2: deep.max(0.0) * deep.max(0.0),
+        }
+    }
+
     /// Standard deviation of the soft edge, px.
     pub(crate) fn blur_px(&self) -> f32 {
         self.blur_px
@@ -63,6 +76,9 @@ impl CellPicture {
     pub(crate) fn value(&self, axes: HalfAxes, dx: f32, dy: f32) -> f32 {
         let (u, v) = (dx / axes.along_px, dy / axes.across_px);
         let r2 = u * u + v * v;
+        if r2 < axes.deep2 {
+            return 1.0;
+        }
         let (gx, gy) = (u / axes.along_px, v / axes.across_px);
         let slope2 = gx * gx + gy * gy;
         // Distance from the ellipse to first order: (r^2 - 1) / |grad r^2|, exact on it.
@@ -79,22 +95,26 @@ impl CellPicture {
     }
 }
 
-/// Grey levels that the channel's walls take from each pixel, row by row: outside as far apart as the cell is wide at
+/// Grey levels that the channel's walls take from a pixel, by its number, where it is more than nothing: outside as far apart as the cell is wide at
 /// rest, in the constriction as when it is stretched least.
-pub(crate) fn walls(config: &WorldConfig, cell: &CellConfig) -> Vec<f32> {
+pub(crate) fn walls(config: &WorldConfig, cell: &CellConfig) -> Vec<(usize, f32)> {
     let blur_um = BLUR_UM.max(config.pixel_um);
     let inside_um = cell.width_um(cell.rest_um * cell.stretch_first.min(cell.stretch_last));
     let (wide_um, narrow_um) = (0.5 * cell.rest_um, 0.5 * inside_um);
-    let mut grey = Vec::with_capacity(usize::from(config.width_px) * usize::from(config.height_px));
+    let mut walls = Vec::new();
     for row in 0..config.height_px {
         for column in 0..config.width_px {
             let inside = cell.inside(config.um_from_px(f64::from(column)));
             let y_um = (f64::from(row) - config.origin_y_px()).abs() * config.pixel_um;
             let wall_um = wide_um + (narrow_um - wide_um) * inside + WALL_ROOM_UM;
-            grey.push((WALL_GREY * (-0.5 * ((y_um - wall_um) / blur_um).powi(2)).exp()) as f32);
+            let grey = WALL_GREY * (-0.5 * ((y_um - wall_um) / blur_um).powi(2)).exp();
+            if grey > 0.2 {
+                let number = usize::from(row) * usize::from(config.width_px) + usize::from(column);
+                walls.push((number, grey as f32));
+            }
         }
     }
-    grey
+    walls
 }
 
 #[cfg(test)]
@@ -104,10 +124,7 @@ mod tests {
     #[test]
     fn half_of_the_contrast_lies_on_the_ellipse_and_all_of_it_well_inside() {
         let picture = CellPicture::new(0.2);
-        let axes = HalfAxes {
-            along_px: 60.0,
-            across_px: 12.0,
-        };
+        let axes = picture.half_axes(120.0, 24.0);
         for degrees in 0..90 {
             let (sin, cos) = f32::to_radians(degrees as f32).sin_cos();
             let on = picture.value(axes, 60.0 * cos, 12.0 * sin);
@@ -127,12 +144,14 @@ mod tests {
             ..WorldConfig::default()
         };
         let cell = CellConfig::default();
-        let grey = walls(&config, &cell);
+        let walls = walls(&config, &cell);
         let darkest = |x_um: f64| {
             let column = config.px_from_um(x_um).round() as usize;
-            let rows = (0..32).map(|row| grey[row * 256 + column]);
-            let (row, _) = (0..).zip(rows).max_by(|a, b| a.1.total_cmp(&b.1)).unwrap();
-            (config.origin_y_px() - f64::from(row)) * 0.2
+            let upper = walls
+                .iter()
+                .filter(|(number, _)| number % 256 == column && number / 256 < 32);
+            let (number, _) = upper.max_by(|a, b| a.1.total_cmp(&b.1)).unwrap();
+            (config.origin_y_px() - (number / 256) as f64) * 0.2
         };
         assert!((darkest(-10.0) - 4.8).abs() < 0.15, "{}", darkest(-10.0));
         let narrow = 0.5 * cell.width_um(8.0 * 2.86) + 0.8;

@@ -115,8 +115,8 @@ pub(crate) struct Renderer {
     template: Template,
     support_px: f32,
     cell: CellPicture,
-    /// Grey levels that each pixel loses to the channel's walls; empty without a cell.
-    walls: Vec<f32>,
+    /// Pixels on the channel's walls, by number, and the grey levels that they lose; empty without a cell.
+    walls: Vec<(usize, f32)>,
     /// Grey values of background with noise.
     strip: Vec<u8>,
     gaussian: Vec<f32>,
@@ -170,14 +170,11 @@ impl Renderer {
 
     /// A cell that went along a path, px.
     pub(crate) fn cell(&self, path: &[(f64, f64)], length_um: f64, width_um: f64) -> Body {
-        let half_px = |um: f64| (0.5 * um / self.pixel_um) as f32;
+        let px = |um: f64| um / self.pixel_um;
         Body {
             // The soft edge hides steps of half its width.
             blur: Blur::spaced(path, f64::from(0.5 * self.cell.blur_px())),
-            form: Form::Cell(HalfAxes {
-                along_px: half_px(length_um),
-                across_px: half_px(width_um),
-            }),
+            form: Form::Cell(self.cell.half_axes(px(length_um), px(width_um))),
         }
     }
 
@@ -201,8 +198,8 @@ impl Renderer {
                 row.copy_from_slice(piece);
             }
         }
-        for (pixel, wall) in pixels.iter_mut().zip(&self.walls) {
-            if *wall > 0.5 {
+        for (number, wall) in &self.walls {
+            if let Some(pixel) = pixels.get_mut(*number) {
                 *pixel = grey(f32::from(*pixel) - wall);
             }
         }
@@ -252,12 +249,15 @@ impl Renderer {
                 continue;
             };
             let first = y * self.width + columns.0;
-            let walls = self.walls.get(first..first + row.len()).unwrap_or(&[]);
-            let walls = walls.iter().chain(std::iter::repeat(&0.0));
-            for (((pixel, value), noise), wall) in
-                row.iter_mut().zip(&*values).zip(noise).zip(walls)
-            {
-                let level = (self.background - wall + value).max(0.0);
+            let from = self.walls.partition_point(|(number, _)| *number < first);
+            for (number, wall) in self.walls.iter().skip(from) {
+                match values.get_mut(number - first) {
+                    Some(value) => *value -= wall,
+                    None => break,
+                }
+            }
+            for ((pixel, value), noise) in row.iter_mut().zip(&*values).zip(noise) {
+                let level = (self.background + value).max(0.0);
                 let sd = (level * self.grey_per_electron + self.read_variance).sqrt();
                 *pixel = grey(level + sd * noise);
             }
@@ -326,11 +326,8 @@ pub(crate) fn localisation_bound_um(config: &WorldConfig) -> Option<f64> {
     let value = |dx: f64, dy: f64| match config.cell {
         None => profile.value(dx.hypot(dy)),
         Some(cell) => {
-            let half_px = (0.5 * cell.rest_um / config.pixel_um) as f32;
-            let axes = HalfAxes {
-                along_px: half_px,
-                across_px: half_px,
-            };
+            let rest_px = cell.rest_um / config.pixel_um;
+            let axes = picture.half_axes(rest_px, rest_px);
             f64::from(picture.value(axes, dx as f32, dy as f32))
         }
     };

@@ -1,5 +1,6 @@
 //! From pixels to micrometres along the channel.
 
+use cellpos_vision::Cell;
 use serde::{Deserialize, Serialize};
 
 /// An axis of the picture.
@@ -113,6 +114,16 @@ impl Calibration {
         let (ux, uy) = self.direction();
         let var_px2 = ux * ux * var_x_px2 + 2.0 * ux * uy * cov_xy_px2 + uy * uy * var_y_px2;
         var_px2 * self.pixel_um * self.pixel_um
+    }
+
+    /// Length of a cell along the channel, um.
+    pub fn length_um(&self, cell: &Cell) -> f64 {
+        self.pixel_um * cell.extent_px(self.direction())
+    }
+
+    /// Area of a cell, um^2.
+    pub fn area_um2(&self, cell: &Cell) -> f64 {
+        self.pixel_um * self.pixel_um * cell.area_px
     }
 
     /// A speed along the channel (um/s) as it shows in the picture, px/s.

@@ -7,6 +7,7 @@
 #![forbid(unsafe_code)]
 
 pub mod actuator;
+pub mod background;
 pub mod board;
 pub mod calibration;
 pub mod calibration_file;
@@ -29,4 +30,4 @@ pub use emulated::EmulatedRig;
 pub use flow::{CommandedFlow, FlowTap};
 pub use measurement::Measurement;
 pub use source::{Camera, CameraError, FrameBuffer, FrameStamp, PositionSource, SourceInfo};
-pub use vision_source::VisionSource;
+pub use vision_source::{Followed, VisionSource};

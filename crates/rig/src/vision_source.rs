@@ -1,21 +1,68 @@
-//! A camera with a tracker: frames in, positions of one and the same bead out.
+//! A camera with a tracker: frames in, positions of one and the same bead, or cell, out.
 //!
 //! The tracker predicts the bead from the commanded flow, takes a fix only when place, intensity, size and residual
 //! agree, and says of every frame where it stands and why. A fix that it does not take gives no position, so that the
-//! loop coasts rather than follows another bead.
+//! loop coasts rather than follows another bead. Of a cell, length and area come with the position.
 
 use crate::calibration::Calibration;
 use crate::clock::Clock;
 use crate::flow::CommandedFlow;
 use crate::measurement::Measurement;
 use crate::source::{Camera, CameraError, FrameBuffer, FrameStamp, PositionSource, SourceInfo};
-use cellpos_vision::{Commanded, Decision, TrackStep, Tracker, Verdict};
+use cellpos_vision::{
+    Cell, CellTracker, Commanded, Decision, Frame, TrackState, TrackStep, Tracker, Verdict,
+};
+
+/// What is followed.
+#[derive(Debug)]
+pub enum Followed {
+    /// A bead.
+    Bead(Box<Tracker>),
+    /// A cell.
+    Cell(Box<CellTracker>),
+}
+
+impl From<Tracker> for Followed {
+    fn from(tracker: Tracker) -> Self {
+        Self::Bead(Box::new(tracker))
+    }
+}
+
+impl From<CellTracker> for Followed {
+    fn from(tracker: CellTracker) -> Self {
+        Self::Cell(Box::new(tracker))
+    }
+}
+
+impl Followed {
+    fn state(&self) -> TrackState {
+        match self {
+            Self::Bead(tracker) => tracker.state(),
+            Self::Cell(tracker) => tracker.state(),
+        }
+    }
+
+    fn step(
+        &mut self,
+        frame: &Frame,
+        time_s: f64,
+        commanded: Commanded,
+    ) -> Result<(TrackStep, Option<Cell>), cellpos_vision::CellError> {
+        match self {
+            Self::Bead(tracker) => Ok((tracker.step(Some(frame), time_s, commanded), None)),
+            Self::Cell(tracker) => {
+                let step = tracker.step(Some(frame), time_s, commanded)?;
+                Ok((step.track, step.cell))
+            }
+        }
+    }
+}
 
 /// A camera with a tracker. Allocates nothing per frame once it runs.
 #[derive(Debug)]
 pub struct VisionSource<C> {
     camera: C,
-    tracker: Tracker,
+    followed: Followed,
     calibration: Calibration,
     clock: Clock,
     flow: Option<CommandedFlow>,
@@ -28,10 +75,15 @@ pub struct VisionSource<C> {
 
 impl<C: Camera> VisionSource<C> {
     /// Joins a camera and a tracker. Without [`VisionSource::with_flow`] the prediction knows no commands.
-    pub fn new(camera: C, tracker: Tracker, calibration: Calibration, clock: Clock) -> Self {
+    pub fn new(
+        camera: C,
+        tracker: impl Into<Followed>,
+        calibration: Calibration,
+        clock: Clock,
+    ) -> Self {
         Self {
             camera,
-            tracker,
+            followed: tracker.into(),
             calibration,
             clock,
             flow: None,
@@ -47,17 +99,15 @@ impl<C: Camera> VisionSource<C> {
         self
     }
 
-    /// The tracker.
-    pub fn tracker(&self) -> &Tracker {
-        &self.tracker
-    }
-
     /// Looks at the frame in the buffer; `None` for one that came twice, late, or with an old time stamp.
-    fn look(&mut self, stamp: &FrameStamp) -> Option<TrackStep> {
+    fn look(
+        &mut self,
+        stamp: &FrameStamp,
+    ) -> Result<Option<(TrackStep, Option<Cell>)>, CameraError> {
         let at_ns = stamp.mid_exposure_ns;
         let before = self.newest;
         if before.is_some_and(|(id, ns)| stamp.id <= id || at_ns <= ns) {
-            return None;
+            return Ok(None);
         }
         self.newest = Some((stamp.id, at_ns));
         let first_ns = *self.first_ns.get_or_insert(at_ns);
@@ -77,10 +127,16 @@ impl<C: Camera> VisionSource<C> {
             streak_px: (x * exposed_s, y * exposed_s),
         };
         let time_s = (at_ns - first_ns) as f64 * 1e-9;
-        Some(
-            self.tracker
-                .step(Some(&self.buffer.frame()), time_s, commanded),
-        )
+        self.followed
+            .step(&self.buffer.frame(), time_s, commanded)
+            .map(Some)
+            .map_err(|error| CameraError::Broken {
+                camera: self.camera.info().name,
+                problem: error.to_string(),
+                remedy:
+                    "record the background again, as this camera is set now: cellpos background"
+                        .to_string(),
+            })
     }
 }
 
@@ -89,7 +145,10 @@ impl<C: Camera> PositionSource for VisionSource<C> {
         let Some(stamp) = self.camera.next_frame(&mut self.buffer, deadline_ns)? else {
             return Ok(None);
         };
-        let step = self.look(&stamp);
+        let (step, cell) = match self.look(&stamp)? {
+            Some((step, cell)) => (Some(step), cell),
+            None => (None, None),
+        };
         let fix = step.map(|s| s.fix);
         let taken = step.filter(|s| s.decision.is_accepted()).map(|s| s.fix);
         let c = &self.calibration;
@@ -102,11 +161,11 @@ impl<C: Camera> PositionSource for VisionSource<C> {
                 c.variance_um2(f.var_x_px2, f.var_y_px2, f.cov_xy_px2)
             }),
             verdict: fix.map_or(Verdict::NoSignal, |f| f.verdict),
-            track: Some(step.map_or((self.tracker.state(), Decision::Stale), |s| {
+            track: Some(step.map_or((self.followed.state(), Decision::Stale), |s| {
                 (s.state, s.decision)
             })),
-            length_um: f64::NAN,
-            area_um2: f64::NAN,
+            length_um: cell.map_or(f64::NAN, |cell| c.length_um(&cell)),
+            area_um2: cell.map_or(f64::NAN, |cell| c.area_um2(&cell)),
             snr: fix.map_or(f64::NAN, |f| f.snr),
             true_um: stamp.true_um,
             true_pzt_um: stamp.true_pzt_um,

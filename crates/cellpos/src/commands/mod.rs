@@ -1,5 +1,6 @@
 //! One module a command: `Args` (read by clap), `run(args)` (calls the libraries, prints the result).
 
+pub mod background;
 pub mod bundle;
 pub mod camera;
 pub mod check;
@@ -54,6 +55,8 @@ pub enum Command {
     Vision(Box<vision::Args>),
     /// Which cameras there are; delivered rate, intervals, age and losses of one.
     Camera(camera::Args),
+    /// Frames of the empty channel, against which a cell is seen.
+    Background(background::Args),
     /// Reproduce the figures and numbers of Mizoue et al. 2017 from the emulated rig, and say where the paper errs.
     Paper(paper::Args),
 }
@@ -77,6 +80,7 @@ impl Command {
             Self::Circle(args) => circle::run(*args),
             Self::Vision(args) => vision::run(*args),
             Self::Camera(args) => camera::run(args),
+            Self::Background(args) => background::run(args),
             Self::Paper(args) => paper::run(args),
         }
     }

@@ -10,7 +10,7 @@ use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
 use crate::rig_file::{ActuatorConfig, CameraConfig, ClockKind, Frames, Rig, RigFile};
 use crate::session;
 use crate::setup::{Prepared, ReferenceSpec, Setup};
-use cellpos_emulator::FaultKind;
+use cellpos_emulator::{CellConfig, FaultKind};
 use cellpos_record::{InputFile, LineFile, RunWriter};
 use cellpos_runtime::live::Operator;
 use cellpos_runtime::{EndRule, Finished, Life};
@@ -161,7 +161,7 @@ fn fresh(args: &Args) -> Result<Ready, Failure> {
     if args.dry {
         rehearse(&mut file, &args.model);
     }
-    for path in session::inputs(args.rig.as_deref(), &args.model, &args.controller) {
+    for path in session::inputs(args.rig.as_deref(), &file, &args.model, &args.controller) {
         inputs.push(InputFile::of(path).map_err(Failure::input)?);
     }
     let (clock, frames) = if args.dry {
@@ -202,6 +202,14 @@ fn rehearse(file: &mut RigFile, model: &str) {
     file.emulator.model = model.to_string();
     file.emulator.rate_hz = 1e6 / file.timing.period_us;
     file.emulator.latency_ms = file.timing.camera_delay_ms;
+    if file.cell.is_some() && file.emulator.cell.is_none() {
+        file.emulator.cell = Some(CellConfig::default());
+        if file.emulator.validate().is_err() {
+            // A field that holds the cell at rest and stretched.
+            (file.emulator.width_px, file.emulator.height_px) = (256, 64);
+            file.emulator.pixel_um = 0.2;
+        }
+    }
 }
 
 /// A script with everything that it names, in a form that is kept with the run.
@@ -291,15 +299,14 @@ fn start(args: &Args, ready: Ready) -> CommandResult {
     let (script, plan) = reference.script()?.ok_or_else(|| {
         Failure::bad_input("the run has no script", "resume a run of cellpos run")
     })?;
-    if plan.needs_length() && (config.frames || !file.is_emulated() || file.emulator.cell.is_none())
-    {
+    if plan.needs_length() && !file.follows_a_cell() {
         return Err(Failure::bad_input(
             format!(
                 "{}: a wait for cell-length or a stop on length_change_above, and nobody measures a length here: the loop follows \
-                 a bead, or the middle of a cell",
+                 a bead",
                 script.file
             ),
-            "an emulated rig with a table [emulator.cell] and --frames off (the default of --dry) delivers one",
+            "follow a cell: a table [cell] in rig.toml, or [emulator.cell] for the emulated rig",
         ));
     }
     let plan = Arc::new(plan);

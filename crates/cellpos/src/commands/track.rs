@@ -147,7 +147,7 @@ pub fn run(args: Args) -> CommandResult {
     let writer = if args.no_record {
         None
     } else {
-        let mut inputs = session::inputs(args.rig.as_deref(), &args.model, &args.controller);
+        let mut inputs = session::inputs(args.rig.as_deref(), &file, &args.model, &args.controller);
         inputs.extend(args.learned.as_deref());
         let meta = session::meta(&args.name, args.clock, &inputs, &file, &setup)?;
         Some(RunWriter::create(&args.runs, meta).map_err(Failure::failed)?)

@@ -39,6 +39,12 @@ pub fn examples() -> Vec<PathBuf> {
     files
 }
 
+/// The example rig with a cell.
+pub fn cell_rig() -> String {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples/cell.toml");
+    std::fs::read_to_string(path).unwrap()
+}
+
 /// Cell `column` of every row of a run's per-cycle table.
 pub fn column(run: &Path, column: &str) -> Vec<String> {
     let text = std::fs::read_to_string(run.join("cycles.csv")).unwrap();
