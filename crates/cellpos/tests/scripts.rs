@@ -409,7 +409,7 @@ fn a_run_whose_table_is_damaged_is_not_gone_on_with_and_a_torn_last_line_is_no_d
 fn a_run_that_an_older_version_began_is_gone_on_with_and_its_table_takes_on_the_new_columns() {
     let folder = tempfile::tempdir().unwrap();
     let at = folder.path();
-    std::fs::write(at.join("cell.toml"), "[emulator.cell]\n").unwrap();
+    std::fs::write(at.join("cell.toml"), cell_rig()).unwrap();
     script(at, 40);
     json(
         at,

@@ -16,6 +16,8 @@ fn the_trends_of_stretch_area_and_recovery_are_found_and_the_static_arm_has_none
     let cell = CellConfig::default();
     let world = WorldConfig {
         seed: 5,
+        pixel_um: 0.2,
+        height_px: 64,
         cell: Some(cell),
         ..WorldConfig::default()
     };

@@ -112,7 +112,7 @@ impl Outliner {
             let lower_y = f64::from(y) - origin.1;
             let range = (left.saturating_sub(1), right);
             self.add_squares(&mut sums, range, level, origin.0, lower_y);
-            sums.take_pulls(&self.pull_above, left, origin.0, lower_y - 1.0);
+            sums.take_pulls(&self.pull_above, range, origin.0, lower_y - 1.0);
             std::mem::swap(&mut self.above, &mut self.below);
             std::mem::swap(&mut self.pull_above, &mut self.pull_below);
         }
@@ -334,8 +334,8 @@ impl Sums {
         }
     }
 
-    fn take_pulls(&mut self, row: &[f64], left: usize, x0: f64, y: f64) {
-        for (k, pull) in row.iter().enumerate().skip(left.saturating_sub(1)) {
+    fn take_pulls(&mut self, row: &[f64], (from, to): (usize, usize), x0: f64, y: f64) {
+        for (k, pull) in row.iter().enumerate().take(to + 1).skip(from) {
             if *pull != 0.0 {
                 let (x, square) = (k as f64 - x0, pull * pull);
                 let terms = [1.0, x, y, x * x, x * y, y * y];
