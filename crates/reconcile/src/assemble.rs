@@ -20,6 +20,9 @@ use std::collections::BTreeMap;
 /// Rivals closer than this (twice the log-likelihood) cannot be told from the winner.
 const TIE: f64 = 10.0;
 
+/// A valley no deeper than this below the best belongs to the 95 % interval (chi-square, one number).
+const VALLEY: f64 = 3.84;
+
 /// Pairs of names that no record of command and bead position can tell apart.
 fn inseparable(a: &str, b: &str) -> bool {
     matches!((a, b), ("driver-lag", "bubble") | ("bubble", "driver-lag"))
@@ -95,10 +98,21 @@ pub(crate) fn assemble(
         alternatives.sort();
         let needs_text = !alternatives.is_empty() || id == "gain-error";
         let freedom = crate::fit::freedom_of(part.variant(), ctx.problem.records.len());
+        let mut parameters = parameters(ctx, &fit, i, left / n);
+        // Other valleys of the same equation that fit as well.
+        for r in rivals.get(i).map_or(&[][..], Vec::as_slice) {
+            if r.part.variant == part.variant && r.chi2 - fit.chi2 < VALLEY {
+                for (p, value) in part.variant().params.iter().zip(r.part.natural()) {
+                    if let Some(found) = parameters.get_mut(p.name) {
+                        found.reach(value);
+                    }
+                }
+            }
+        }
         effects.push(NamedEffect {
             id: id.to_owned(),
             place: place_of(id),
-            parameters: parameters(ctx, &fit, i, left / n),
+            parameters,
             p_value: significance::p_value(gain, freedom),
             explained: if excess > 0.0 {
                 (gain / excess).clamp(0.0, 1.0)

@@ -161,6 +161,18 @@ fn unit_of(name: &str) -> &'static str {
     }
 }
 
+/// Play operators that stand for an exponential density of thresholds, as a model file holds them.
+pub(crate) fn exponential_play(fraction: f64, width_um: f64) -> Hysteresis {
+    let (radii, shares) = domains();
+    let thresholds = std::iter::once(0.0).chain(radii.map(|r| r * width_um));
+    let weights = std::iter::once(1.0 - fraction).chain(shares.map(|s| s * fraction));
+    Hysteresis::Play {
+        thresholds_um: thresholds.collect(),
+        weights: weights.collect(),
+        quadratic_per_um: 0.0,
+    }
+}
+
 /// The effect of a model file for part `index`.
 fn effect_of(ctx: &Context<'_>, fit: &Fit, index: usize) -> Option<Effect> {
     let part = &fit.parts[index];
@@ -196,14 +208,7 @@ fn effect_of(ctx: &Context<'_>, fit: &Fit, index: usize) -> Option<Effect> {
             quadratic_per_um: quadratic,
         }),
         Block::Domains { fraction, width_um } => {
-            let (radii, shares) = domains();
-            let thresholds = std::iter::once(0.0).chain(radii.map(|r| r * width_um));
-            let weights = std::iter::once(1.0 - fraction).chain(shares.map(|s| s * fraction));
-            Effect::PztHysteresis(Hysteresis::Play {
-                thresholds_um: thresholds.collect(),
-                weights: weights.collect(),
-                quadratic_per_um: 0.0,
-            })
+            Effect::PztHysteresis(exponential_play(fraction, width_um))
         }
         Block::Creep { g } => Effect::PztCreep { per_decade: g },
         Block::Resonance { zeta, .. } => Effect::PztResonance {

@@ -1,7 +1,7 @@
 //! The candidates: every effect of the vocabulary with its parameters, where to start looking, and what tells it apart.
 
 use crate::fit::Part;
-use crate::predict::{Block, PLAY_LEVELS};
+use crate::predict::{Block, PLAY_LEVELS, domains};
 use cellpos_plant::{Effect, Hysteresis};
 use std::f64::consts::TAU;
 
@@ -450,31 +450,60 @@ pub(crate) static VARIANTS: &[Variant] = &[
 ];
 
 /// The forms that delay a slow motion by `lag_s`: those with one number, and a lightly damped resonance where that is at
-/// a frequency which a piezo can have.
-pub(crate) fn of_lag(lag_s: f64) -> Vec<Part> {
+/// a frequency which a piezo can have. Faster than the frames its ringing shows by its phase from one frame to the next
+/// only: such a resonance starts from each quarter of a cycle, because the sum of squares has a valley in each.
+pub(crate) fn of_lag(lag_s: f64, sample_s: f64) -> Vec<Part> {
     const DAMPING: f64 = 0.1;
     let resonance_hz = 2.0 * DAMPING / (TAU * lag_s);
+    let quarters: &[f64] = if resonance_hz * sample_s > 1.0 {
+        &[0.0, -0.5, -0.25, 0.25, 0.5]
+    } else {
+        &[0.0]
+    };
     VARIANTS
         .iter()
         .enumerate()
-        .filter_map(|(i, v)| {
+        .flat_map(|(i, v)| {
             if v.id == "pzt-resonance" {
-                return (v.typical.0..v.typical.1)
-                    .contains(&resonance_hz)
-                    .then(|| Part::new(i, &[resonance_hz, DAMPING]));
+                return quarters
+                    .iter()
+                    .map(|q| resonance_hz + q / sample_s)
+                    .filter(|hz| (v.typical.0..v.typical.1).contains(hz))
+                    .map(|hz| Part::new(i, &[hz, 0.5 * TAU * hz * lag_s]))
+                    .collect();
             }
             if v.params.len() != 1 {
-                return None;
+                return Vec::new();
             }
             let value = match v.id {
                 "time-delay" | "bubble" => lag_s,
                 "driver-lag" => 1.0 / (TAU * lag_s),
                 "exposure-averaging" => 2.0 * lag_s,
-                _ => return None,
+                _ => return Vec::new(),
             };
-            Some(Part::new(i, &[value]))
+            vec![Part::new(i, &[value])]
         })
         .collect()
+}
+
+/// Fraction and width of play operators that stand for an exponential density, as [`crate::augment`] writes them.
+fn domains_of(thresholds_um: &[f64], weights: &[f64]) -> Option<(f64, f64)> {
+    let (radii, shares) = domains();
+    let ([zero, thresholds_um @ ..], [rest, weights @ ..]) = (thresholds_um, weights) else {
+        return None;
+    };
+    if *zero != 0.0 || thresholds_um.len() != radii.len() || weights.len() != shares.len() {
+        return None;
+    }
+    let (fraction, width_um) = (1.0 - rest, thresholds_um[0] / radii[0]);
+    let alike = |given: &[f64], own: &[f64], unit: f64| {
+        given
+            .iter()
+            .zip(own)
+            .all(|(g, o)| (g - unit * o).abs() < 1e-6 * unit.abs())
+    };
+    (alike(thresholds_um, &radii, width_um) && alike(weights, &shares, fraction))
+        .then_some((fraction, width_um))
 }
 
 /// The flat form of an effect of a model file; `None` for those that are no part of the response.
@@ -509,6 +538,11 @@ pub(crate) fn block_of(effect: &Effect, scope: &Scope) -> Option<Block> {
             quadratic_per_um,
         }) => {
             // Only thresholds in this crate's own proportions can be held as a flat block.
+            if let Some((fraction, width_um)) = domains_of(thresholds_um, weights)
+                && quadratic_per_um == 0.0
+            {
+                return Some(Block::Domains { fraction, width_um });
+            }
             let stroke_um = thresholds_um.last().copied().unwrap_or(scope.stroke_um)
                 / PLAY_LEVELS[PLAY_LEVELS.len() - 1];
             let mut w = [0.0; PLAY_LEVELS.len()];

@@ -56,7 +56,7 @@ impl Part {
             "pdms-relaxation" => -v[0] * v[1],
             _ => return None,
         };
-        (1e-5..0.1).contains(&lag_s).then_some(lag_s)
+        (1e-6..0.1).contains(&lag_s).then_some(lag_s)
     }
 
     fn block(&self, scope: &Scope) -> Block {

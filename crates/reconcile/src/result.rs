@@ -46,6 +46,17 @@ pub struct Interval {
     pub unit: String,
 }
 
+impl Interval {
+    /// Widens the interval to another value that explains the records as well, as uncertain as the best.
+    pub(crate) fn reach(&mut self, value: f64) {
+        let [low, high] = self.ci95;
+        self.ci95 = [
+            low.min(value - (self.value - low)),
+            high.max(value + (high - self.value)),
+        ];
+    }
+}
+
 /// One named effect.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Effect {

@@ -230,15 +230,24 @@ fn replace(ctx: &Context<'_>, mut fit: Fit, mask: &Mask, effort: Effort) -> (Fit
             let twins: Vec<Part> = fit.parts[i]
                 .lag_s()
                 .map(|lag_s| {
-                    catalogue::of_lag(lag_s)
+                    let starts = catalogue::of_lag(lag_s, ctx.problem.base.sample_s);
+                    let valleys = |id: &str| starts.iter().filter(|p| p.variant().id == id).count();
+                    let several: Vec<bool> =
+                        starts.iter().map(|p| valleys(p.variant().id) > 1).collect();
+                    starts
                         .into_iter()
-                        .filter(|p| {
+                        .zip(several)
+                        .filter(|(p, several)| {
                             let other = p.variant().id;
-                            other != id
-                                && !ctx.excludes(other)
-                                && !fit.has(other)
-                                && !list.iter().any(|r| r.id == other)
+                            !ctx.excludes(other)
+                                && (*several || !list.iter().any(|r| r.id == other))
+                                && if other == id {
+                                    *several
+                                } else {
+                                    !fit.has(other)
+                                }
                         })
+                        .map(|(p, _)| p)
                         .collect()
                 })
                 .unwrap_or_default();
@@ -332,6 +341,8 @@ pub(crate) fn search(
         fit = reformed;
         steps.push((ids(&fit), fit.chi2));
     }
+    // The last set whose effects were weighed against their rivals.
+    let mut weighed: Option<(Fit, Vec<Vec<Rival>>)> = None;
     let mut beam: Vec<Fit> = singles.into_iter().skip(1).take(2).collect();
     while fit.parts.len() < effort.max_effects {
         progress(&format!("looking further beside {}", ids(&fit).join(" + ")));
@@ -378,7 +389,8 @@ pub(crate) fn search(
                 continue;
             }
         }
-        let (top, _) = replace(ctx, top, mask, effort);
+        let (top, rivals) = replace(ctx, top, mask, effort);
+        weighed = Some((top.clone(), rivals));
         let forms: Vec<usize> = top.parts.iter().map(|p| p.variant).collect();
         let rich = much_left(&top);
         fit = reform(ctx, top, mask, effort, rich);
@@ -399,7 +411,22 @@ pub(crate) fn search(
     if refined.chi2 <= fit.chi2 {
         fit = refined;
     }
-    let (fit, rivals) = replace(ctx, fit, mask, effort);
+    let (fit, rivals) = match weighed {
+        // The very same, up to the last digits of the fit.
+        Some((before, rivals))
+            if rivals.len() == fit.parts.len()
+                && rivals.iter().any(|r| !r.is_empty())
+                && before
+                    .parts
+                    .iter()
+                    .map(|p| p.variant)
+                    .eq(fit.parts.iter().map(|p| p.variant))
+                && (before.chi2 - fit.chi2).abs() < 0.1 =>
+        {
+            (fit, rivals)
+        }
+        _ => replace(ctx, fit, mask, effort),
+    };
     Found {
         fit,
         null,

@@ -8,7 +8,7 @@
 use cellpos_reconcile::Verdict;
 use cellpos_tests::truth::cases::{Case, nulls, outside, pairs, singles};
 use cellpos_tests::truth::table::{Row, evaluate};
-use cellpos_tests::truth::threshold::above_threshold;
+use cellpos_tests::truth::threshold::{above_threshold, weak};
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -26,8 +26,13 @@ fn main() {
         ("nulls", nulls(40)),
         ("outside", outside()),
     ] {
-        for case in group {
-            if which == "all" || which == name {
+        for mut case in group {
+            if which == "all" || which == name || (which == "levels" && name == "singles") {
+                if case.level == "weak" {
+                    for h in &mut case.hidden {
+                        *h = weak(*h, seed * 1000 + number);
+                    }
+                }
                 cases.push((case, seed * 1000 + number));
             }
             number += 1;
@@ -35,8 +40,8 @@ fn main() {
     }
     if which == "levels" {
         // How far each single lies above the threshold of detection, without running the search.
-        for (i, case) in singles().iter().enumerate() {
-            let times = above_threshold(&case.hidden, seed * 1000 + i as u64);
+        for (case, seed) in cases {
+            let times = above_threshold(&case.hidden, seed);
             println!(
                 "{:7} {:40} {times:6.1}",
                 case.level,

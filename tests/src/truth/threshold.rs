@@ -43,6 +43,25 @@ fn whitened(residual: &[f64]) -> Vec<f64> {
         .collect()
 }
 
+/// A weak saturation with its levels moved to twice the threshold: what is clipped are the few highest peaks of the
+/// excitation, whose height goes with its random phases. Everything else is weak enough by its number alone.
+pub fn weak(hidden: Hidden, seed: u64) -> Hidden {
+    let Hidden::Saturation(..) = hidden else {
+        return hidden;
+    };
+    let at = |width_um: f64| Hidden::Saturation(4.0 - width_um, 4.0 + width_um);
+    let (mut near, mut far) = (1.0, 6.0);
+    for _ in 0..12 {
+        let middle = 0.5 * (near + far);
+        if above_threshold(&[at(middle)], seed) > 2.0 {
+            near = middle;
+        } else {
+            far = middle;
+        }
+    }
+    at(((near + far) * 500.0).round() * 1e-3)
+}
+
 /// Amplitude of a hidden effect over the amplitude that just reaches the threshold; for effects of single frames, their
 /// rate over the least rate that is named.
 pub fn above_threshold(hidden: &[Hidden], seed: u64) -> f64 {

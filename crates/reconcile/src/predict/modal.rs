@@ -129,6 +129,12 @@ impl Trace {
     }
 }
 
+/// Decay, drive and weight of four modes.
+fn columns(four: &[[f64; 4]]) -> ([f64; 4], [f64; 4], [f64; 4]) {
+    let column = |j: usize| std::array::from_fn(|i| four[i][j]);
+    (column(0), column(1), column(2))
+}
+
 impl Modal {
     /// Partial fractions of a proper transfer function, held-input recursion of step `h`.
     pub fn new(zpk: &Zpk, h: f64) -> Self {
@@ -191,17 +197,21 @@ impl Modal {
                 y[k] = self.direct * u[k - 1];
             }
         }
-        let mut pairs = self.real.chunks_exact(2);
-        for pair in &mut pairs {
-            let ([a0, b0, w0, _], [a1, b1, w1, _]) = (pair[0], pair[1]);
-            let (mut z0, mut z1) = (0.0, 0.0);
+        // Four at a time: each waits for its own last value only.
+        let mut fours = self.real.chunks_exact(4);
+        for four in &mut fours {
+            let (a, b, w) = columns(four);
+            let mut z = [0.0; 4];
             for (y, &u) in y.iter_mut().zip(u) {
-                *y += w0 * z0 + w1 * z1;
-                z0 = a0 * z0 + b0 * u;
-                z1 = a1 * z1 + b1 * u;
+                let mut sum = 0.0;
+                for i in 0..4 {
+                    sum += w[i] * z[i];
+                    z[i] = a[i] * z[i] + b[i] * u;
+                }
+                *y += sum;
             }
         }
-        for &[a, b, w, _] in pairs.remainder() {
+        for &[a, b, w, _] in fours.remainder() {
             let mut z = 0.0;
             for (y, &u) in y.iter_mut().zip(u) {
                 *y += w * z;
@@ -220,35 +230,58 @@ impl Modal {
     /// Positions with jumps and slopes, for what acts on the motion inside a step (adhesion, delay, exposure).
     pub fn trace(&self, u: &[f64], t: &mut Trace) {
         let n = u.len();
-        self.run(u, &mut t.pos);
+        t.pos.clear();
+        t.pos.resize(n, 0.0);
         t.jump.clear();
         t.jump.reserve(n);
         let mut before = 0.0;
-        for &u in u {
+        for (k, &u) in u.iter().enumerate() {
+            t.pos[k] = self.direct * before;
             t.jump.push(self.direct * (u - before));
             before = u;
         }
-        t.start_slope.clear();
-        t.start_slope
-            .extend(u.iter().map(|u| self.slope_direct * u));
-        t.end_slope.clear();
-        t.end_slope.extend_from_slice(&t.start_slope);
-        for &[a, b, _, s] in &self.real {
-            let mut z = 0.0;
-            for ((u, v0), v1) in u.iter().zip(&mut t.start_slope).zip(&mut t.end_slope) {
-                *v0 += s * z;
-                z = a * z + b * u;
-                *v1 += s * z;
+        // Slope of the modes at the start of each step, and of what would be the next.
+        let mut slope = vec![0.0; n + 1];
+        let mut fours = self.real.chunks_exact(4);
+        for four in &mut fours {
+            let (a, b, w) = columns(four);
+            let s: [f64; 4] = std::array::from_fn(|i| four[i][3]);
+            let mut z = [0.0; 4];
+            for ((&u, y), v) in u.iter().zip(&mut t.pos).zip(&mut slope) {
+                let (mut sum, mut rise) = (0.0, 0.0);
+                for i in 0..4 {
+                    sum += w[i] * z[i];
+                    rise += s[i] * z[i];
+                    z[i] = a[i] * z[i] + b[i] * u;
+                }
+                *y += sum;
+                *v += rise;
             }
+            slope[n] += (0..4).map(|i| s[i] * z[i]).sum::<f64>();
+        }
+        for &[a, b, w, s] in fours.remainder() {
+            let mut z = 0.0;
+            for ((&u, y), v) in u.iter().zip(&mut t.pos).zip(&mut slope) {
+                *y += w * z;
+                *v += s * z;
+                z = a * z + b * u;
+            }
+            slope[n] += s * z;
         }
         for m in &self.complex {
             let mut z = C::new(0.0, 0.0);
-            for ((u, v0), v1) in u.iter().zip(&mut t.start_slope).zip(&mut t.end_slope) {
-                *v0 += m.slope.re * z.re - m.slope.im * z.im;
+            for ((&u, y), v) in u.iter().zip(&mut t.pos).zip(&mut slope) {
+                *y += m.weight.re * z.re - m.weight.im * z.im;
+                *v += m.slope.re * z.re - m.slope.im * z.im;
                 z = m.a * z + m.b * u;
-                *v1 += m.slope.re * z.re - m.slope.im * z.im;
             }
+            slope[n] += m.slope.re * z.re - m.slope.im * z.im;
         }
+        let straight = |(u, v): (&f64, &f64)| self.slope_direct * u + v;
+        t.start_slope.clear();
+        t.start_slope.extend(u.iter().zip(&slope).map(straight));
+        t.end_slope.clear();
+        t.end_slope.extend(u.iter().zip(&slope[1..]).map(straight));
     }
 
     /// The mean of the output over each step, for a smooth signal that goes into a nonlinear block next.
