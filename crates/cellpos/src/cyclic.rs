@@ -5,7 +5,8 @@ use crate::rig_file::RigFile;
 use crate::setup::Prepared;
 use cellpos_control::design::{DesignPlant, Uncertainty, harmonic_responses};
 use cellpos_control::{
-    CycleLearning, HarmonicResponse, LearnConfig, LearnedTable, Learner, Profile, Reference, Shape,
+    CycleLearning, HarmonicResponse, LearnConfig, LearnError, LearnedTable, Learner, Profile,
+    Reference, Shape,
 };
 use cellpos_units::{Hertz, Micrometers};
 use serde::{Deserialize, Serialize};
@@ -53,6 +54,9 @@ pub struct LearnSpec {
     pub config: LearnConfig,
     /// Responses of the closed loop to the addition, with their uncertainty.
     pub responses: Vec<HarmonicResponse>,
+    /// Margins of gain and delay that the uncertainty was computed with; none in runs from before this was kept.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub margins: Option<Uncertainty>,
     /// What was known before.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub table: Option<LearnedTable>,
@@ -117,6 +121,7 @@ impl LearnSpec {
         )
         .map_err(Failure::input)?;
         plant.neutral_um = file.first_neutral_um;
+        let margins = Uncertainty::of_model(&setup.model, plant.delay_s);
         let responses = harmonic_responses(
             &plant,
             &loop_config,
@@ -124,7 +129,7 @@ impl LearnSpec {
             wanted.from_s,
             wanted.frequency_hz,
             wanted.harmonics,
-            Uncertainty::default(),
+            margins,
         )
         .map_err(Failure::input)?;
         let spec = Self {
@@ -134,16 +139,27 @@ impl LearnSpec {
                 ..LearnConfig::default()
             },
             responses,
+            margins: Some(margins),
             table,
         };
         spec.learning(sample_s)?;
         Ok(spec)
     }
 
+    /// The learner alone.
+    pub fn learner(&self, sample_s: f64) -> Result<Learner, LearnError> {
+        Learner::new(self.config, self.frequency_hz, sample_s, &self.responses)
+            .map(|learner| learner.with_margins(self.margins))
+    }
+
     /// The learner beside the loop.
     pub fn learning(&self, sample_s: f64) -> Result<CycleLearning, Failure> {
-        let learner = Learner::new(self.config, self.frequency_hz, sample_s, &self.responses)
-            .map_err(Failure::input)?;
+        let learner = self.learner(sample_s).map_err(|error| match self.margins {
+            Some(margins) if matches!(error, LearnError::NotConvergent { .. }) => {
+                Failure::bad_input(format!("{error}"), format!("reckoned with: {margins}"))
+            }
+            _ => Failure::input(error),
+        })?;
         let state = match &self.table {
             Some(table) => learner.resume(table).map_err(Failure::input)?,
             None => learner.start(),
@@ -180,14 +196,17 @@ pub fn learned_text(table: &LearnedTable) -> String {
     let nm =
         |um: Option<f64>| um.map_or_else(|| "-".to_string(), |um| format!("{:.1} nm", um * 1e3));
     format!(
-        "{:.0} cycles, measured error {} RMS at first, {} at the end{}",
+        "{:.0} cycles, measured error {} RMS at first, {} at the end{}{}",
         table.cycles,
         nm(table.error_before_um),
         nm(table.error_after_um),
         match table.retreats {
             0 => String::new(),
             n => format!("; {n} retreats"),
-        }
+        },
+        table
+            .margins
+            .map_or_else(String::new, |margins| format!("; reckoned with: {margins}"))
     )
 }
 

@@ -2,6 +2,7 @@
 
 mod common;
 
+use cellpos_plant::Model;
 use common::{cellpos, number, succeed};
 use std::path::Path;
 
@@ -379,7 +380,26 @@ fn a_sine_is_learned_kept_with_the_run_replayed_and_gone_on_from() {
     assert!(number(&with, "rms_true_nm") < 100.0, "{with}");
     assert!(number(&without, "rms_true_nm") > 3.0 * number(&with, "rms_true_nm"));
     let run = with["run"].as_str().unwrap();
-    assert!(folder.path().join(run).join("learned.toml").is_file());
+    let kept = std::fs::read_to_string(folder.path().join(run).join("learned.toml")).unwrap();
+    assert!(kept.contains("gain_source = \"assumed\""), "{kept}");
+    // With a model whose gain and delay are known, by their intervals.
+    let known = Model {
+        intervals: [
+            ("gain_per_s".to_owned(), [426.0, 430.0]),
+            ("delay_ms".to_owned(), [1.9, 2.1]),
+        ]
+        .into(),
+        ..Model::eq6()
+    };
+    std::fs::write(folder.path().join("known.toml"), known.to_toml_string()).unwrap();
+    let by_model = succeed(
+        folder.path(),
+        &format!("{} --learn --model known.toml", line.replace("2.6s", "1s")),
+    )
+    .json();
+    let margins = &by_model["learned"]["margins"];
+    assert_eq!(margins["gain_source"], "floor", "{by_model}");
+    assert_eq!(margins["delay_source"], "identified", "{by_model}");
     succeed(folder.path(), &format!("replay {run}"));
     let again = succeed(
         folder.path(),

@@ -12,9 +12,14 @@
 //! back, nothing is learned; the addition goes on. Retreat: when the error grows past that of the start, the best table
 //! so far comes back and the rate is halved; the third retreat ends the learning.
 
+mod table;
+
+use crate::design::Uncertainty;
 use crate::error::{BuildError, check};
 use serde::{Deserialize, Serialize};
 use std::f64::consts::TAU;
+
+pub use table::{LearnedHarmonic, LearnedTable};
 
 /// Harmonics that a learner holds.
 pub const HARMONICS: usize = 8;
@@ -121,36 +126,6 @@ pub enum LearnError {
     },
 }
 
-/// One harmonic of a learned addition: `cos_um cos(2 pi h phase) + sin_um sin(2 pi h phase)`.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct LearnedHarmonic {
-    /// Which harmonic.
-    pub harmonic: u32,
-    /// Cosine part, um of PZT.
-    pub cos_um: f64,
-    /// Sine part, um of PZT.
-    pub sin_um: f64,
-}
-
-/// What a learner has learned, in the form of a file.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct LearnedTable {
-    /// Frequency of the reference, Hz.
-    pub frequency_hz: f64,
-    /// Cycles learned.
-    pub cycles: f64,
-    /// Times that the learner retreated; 3: the learning was given up.
-    pub retreats: u32,
-    /// RMS of the measured error over the first cycles, um.
-    pub error_before_um: Option<f64>,
-    /// RMS of the measured error over the last cycles, um.
-    pub error_after_um: Option<f64>,
-    /// The harmonics.
-    pub harmonics: Vec<LearnedHarmonic>,
-}
-
 /// A learner for one periodic reference. Immutable; the state is apart and `Copy`.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Learner {
@@ -162,6 +137,7 @@ pub struct Learner {
     window_ticks: u32,
     responses: Vec<HarmonicResponse>,
     refused: Vec<HarmonicResponse>,
+    margins: Option<Uncertainty>,
 }
 
 /// State of a [`Learner`].
@@ -271,7 +247,14 @@ impl Learner {
             window_ticks: ((WINDOW_TICKS * advance).ceil().max(2.0) / advance).round() as u32,
             responses: kept,
             refused,
+            margins: None,
         })
+    }
+
+    /// The same learner, whose tables say by which margins its responses' uncertainty was computed.
+    pub fn with_margins(mut self, margins: Option<Uncertainty>) -> Self {
+        self.margins = margins;
+        self
     }
 
     /// Harmonics that are not learned because the response is not known well enough.
@@ -361,6 +344,7 @@ impl Learner {
             retreats: state.retreats,
             error_before_um: rms(state.first_um2),
             error_after_um: rms(state.last_um2),
+            margins: self.margins,
             harmonics: (1u32..)
                 .zip(&state.theta)
                 .filter(|(_, t)| t[0] != 0.0 || t[1] != 0.0)

@@ -1,7 +1,8 @@
 //! Learning over cycles on a rig whose gain is 20 % and whose delay is 0.25 ms off the model.
 
-use cellpos_control::design::{DesignPlant, Uncertainty, harmonic_responses};
+use cellpos_control::design::{DesignPlant, MarginSource, Uncertainty, harmonic_responses};
 use cellpos_control::*;
+use cellpos_plant::Model;
 
 const FADE_S: f64 = 0.2;
 
@@ -300,6 +301,7 @@ fn a_harmonic_whose_response_is_too_uncertain_is_refused() {
     let vague = Uncertainty {
         gain_factor: 2.0,
         delay_s: 1e-3,
+        ..Uncertainty::default()
     };
     let at_300_hz = harmonic_responses(
         &plant,
@@ -315,4 +317,74 @@ fn a_harmonic_whose_response_is_too_uncertain_is_refused() {
         at_300_hz[0].relative_uncertainty > 1.0,
         "1 ms is 108 deg at 300 Hz: {at_300_hz:?}"
     );
+}
+
+fn identified(gain_per_s: [f64; 2], delay_ms: [f64; 2]) -> Model {
+    let mut model = Model::eq6();
+    for (name, interval) in [("gain_per_s", gain_per_s), ("delay_ms", delay_ms)] {
+        model.intervals.insert(name.to_owned(), interval);
+    }
+    model
+}
+
+#[test]
+fn margins_are_three_standard_deviations_of_the_identified_model_and_never_less_than_the_least() {
+    assert_eq!(
+        Uncertainty::of_model(&Model::eq6(), 2e-3),
+        Uncertainty::default()
+    );
+    // 1.96 standard deviations of 6 % of the gain, and of 0.1 ms.
+    let spread = (1.96 * 0.06_f64).exp();
+    let vague = identified([428.0 / spread, 428.0 * spread], [2.0 - 0.196, 2.0 + 0.196]);
+    let margins = Uncertainty::of_model(&vague, 2e-3);
+    assert!((margins.gain_factor.ln() - 0.18).abs() < 1e-9, "{margins}");
+    assert!((margins.delay_s - 0.3e-3).abs() < 1e-9, "{margins}");
+    assert_eq!(margins.gain_source, MarginSource::Identified);
+    assert_eq!(margins.delay_source, MarginSource::Identified);
+    // A loop that reckons with another delay than the identified one is off by as much.
+    let off = Uncertainty::of_model(&vague, 1.8e-3);
+    assert!((off.delay_s - 0.5e-3).abs() < 1e-9, "{off}");
+    // Whatever the sign of the gain.
+    let reversed = identified([-428.0 * spread, -428.0 / spread], [1.804, 2.196]);
+    assert!(
+        (Uncertainty::of_model(&reversed, 2e-3).gain_factor - margins.gain_factor).abs() < 1e-9
+    );
+    let sharp = Uncertainty::of_model(&identified([426.4, 429.1], [1.9995, 2.0005]), 2e-3);
+    assert_eq!((sharp.gain_factor, sharp.delay_s), (1.1, 0.05e-3));
+    assert_eq!(sharp.gain_source, MarginSource::Floor);
+    assert_eq!(sharp.delay_source, MarginSource::Floor);
+    // An interval across nought, and one without end, say nothing.
+    let useless = identified([-1.0, 800.0], [0.0, f64::INFINITY]);
+    assert_eq!(
+        Uncertainty::of_model(&useless, 2e-3),
+        Uncertainty::default()
+    );
+}
+
+#[test]
+fn a_model_known_well_lets_more_be_learned_and_one_known_badly_less() {
+    let at_300_hz = |margins| {
+        let responses = harmonic_responses(
+            &DesignPlant::eq6(2.5e-3),
+            &config(ControllerConfig::Lqg(Lqg::default())),
+            &sine(0.5, 300.0),
+            FADE_S,
+            300.0,
+            1,
+            margins,
+        )
+        .unwrap();
+        let learner = Learner::new(LearnConfig::default(), 300.0, 1e-3, &responses);
+        (responses[0].relative_uncertainty, learner.is_ok())
+    };
+    let well = Uncertainty::of_model(&identified([426.4, 429.1], [1.9995, 2.0005]), 2e-3);
+    let badly = Uncertainty::of_model(&identified([300.0, 600.0], [1.6, 2.4]), 2e-3);
+    let ((sharp, learned), (fixed, learned_too), (vague, refused)) = (
+        at_300_hz(well),
+        at_300_hz(Uncertainty::default()),
+        at_300_hz(badly),
+    );
+    println!("uncertainty of the response at 300 Hz: {sharp:.3}, {fixed:.3}, {vague:.3}");
+    assert!(learned && learned_too && !refused);
+    assert!(sharp < 0.4 * fixed && vague > 1.0);
 }

@@ -293,6 +293,7 @@ fn learned(page: &mut Report, run: &Path) -> Result<(), Failure> {
         Column::right("error at first (nm RMS)"),
         Column::right("error at the end (nm RMS)"),
         Column::right("retreats"),
+        Column::left("the plant was taken to be known to"),
     ]);
     for motion in &motions {
         let learned = &motion.table;
@@ -302,6 +303,9 @@ fn learned(page: &mut Report, run: &Path) -> Result<(), Failure> {
             &nm(learned.error_before_um),
             &nm(learned.error_after_um),
             &learned.retreats.to_string(),
+            &learned
+                .margins
+                .map_or_else(|| "-".to_owned(), |margins| margins.to_string()),
         ]);
     }
     table.caption("Measured errors over the first and the last cycles in full swing, localisation noise included.");

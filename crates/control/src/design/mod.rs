@@ -15,7 +15,7 @@ mod spread;
 mod step;
 
 pub use bound::{bound_rms_um, kalman_posterior_um2};
-pub use learning::{Uncertainty, harmonic_responses};
+pub use learning::{MarginSource, Uncertainty, harmonic_responses};
 pub use margins::{Margins, margins};
 pub use noise::{NoiseFigures, noise_figures};
 pub use plant::{DesignPlant, DesignWarning};

@@ -141,9 +141,7 @@ impl Keeper {
         let mut tables = vec![None; count];
         for spec in specs {
             let learn = &spec.learn;
-            let learner =
-                Learner::new(learn.config, learn.frequency_hz, sample_s, &learn.responses);
-            learners[usize::from(spec.motion)] = learner.ok();
+            learners[usize::from(spec.motion)] = learn.learner(sample_s).ok();
             tables[usize::from(spec.motion)] = learn.table.clone();
         }
         Some(Self {
