@@ -20,6 +20,8 @@ pub struct Blob {
     pub body: f64,
     /// Whether the region touches the frame's border.
     pub at_border: bool,
+    /// First column and first row of the region, and the first column and row behind it.
+    pub bounds: [u32; 4],
     /// Root label of its runs.
     label: u32,
 }
@@ -37,6 +39,7 @@ struct Label {
     wy: f64,
     peak: f64,
     at_border: bool,
+    bounds: [u32; 4],
 }
 
 #[derive(Debug, Clone, Copy)]
@@ -145,6 +148,7 @@ impl Blobs {
                     x += 1;
                 }
                 sums.at_border = edge_row || start == 0 || x == width;
+                sums.bounds = [start as u32, y as u32, x as u32, y as u32 + 1];
                 self.join(start as u32, x as u32, sums);
             }
             if self.max_kept_runs > 0 {
@@ -268,6 +272,7 @@ impl Label {
             wy: v * y,
             peak: v,
             at_border: false,
+            bounds: [u32::MAX, u32::MAX, 0, 0],
         }
     }
 
@@ -281,6 +286,8 @@ impl Label {
         self.wy += other.wy;
         self.peak = self.peak.max(other.peak);
         self.at_border |= other.at_border;
+        let ([a, b, c, d], [e, f, g, h]) = (self.bounds, other.bounds);
+        self.bounds = [a.min(e), b.min(f), c.max(g), d.max(h)];
     }
 
     fn blob(&self) -> Blob {
@@ -294,6 +301,7 @@ impl Label {
             peak: self.peak,
             body: if weighted { self.ww / self.w } else { 0.0 },
             at_border: self.at_border,
+            bounds: self.bounds,
             label: 0,
         }
     }
@@ -366,6 +374,7 @@ mod tests {
             [(0, 0, 3), (1, 0, 3), (2, 0, 3), (3, 3, 4)]
         );
         assert_eq!(spans(&found[1]), [(0, 5, 6)]);
+        assert_eq!(found[0].bounds, [0, 0, 4, 4]);
         assert_eq!(blobs.dropped_runs(), 0);
         assert!((found[0].body - (8.0 * 9.0 + 1.0) / 25.0).abs() < 1e-12);
         let mut cramped = Blobs::with_spans(16, 16, 2);

@@ -4,7 +4,7 @@
 //! the pixels; place, area, length and width are those of the surface inside. The noise of the outline is known from the
 //! slope there, so that the place comes with its covariance. Allocates only when made.
 
-use crate::blobs::Blobs;
+use crate::blobs::{Blob, Blobs};
 use crate::config::ConfigError;
 use crate::frame::{Frame, Pixels};
 use crate::surface::Outliner;
@@ -12,6 +12,12 @@ use serde::{Deserialize, Serialize};
 
 /// Runs kept per row.
 const RUNS_PER_ROW: usize = 32;
+/// Distance from a region within which the background is left alone, px.
+const CLEAR_PX: usize = 6;
+/// Pixels beside that, whose change stands for that behind the region.
+const BESIDE_PX: usize = 12;
+/// Each row of the background is refreshed once in so many frames.
+const REFRESHED_EVERY: usize = 16;
 
 /// Settings of a [`CellFinder`].
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -23,6 +29,9 @@ pub struct CellConfig {
     pub min_area_px: f64,
     /// Most regions told apart in a frame.
     pub max_regions: u32,
+    /// Frames over which the background follows slow changes of light and focus where no cell is; 0: it stays as it was
+    /// recorded.
+    pub refresh_frames: u32,
 }
 
 impl Default for CellConfig {
@@ -31,6 +40,8 @@ impl Default for CellConfig {
             threshold_sigma: 5.0,
             min_area_px: 30.0,
             max_regions: 64,
+            // Twenty seconds at 1000 frames a second.
+            refresh_frames: 20_000,
         }
     }
 }
@@ -134,6 +145,11 @@ pub struct CellFinder {
     blobs: Blobs,
     outliner: Outliner,
     cells: Vec<Cell>,
+    /// Light of the last frame relative to the background's.
+    light: f32,
+    refreshed: usize,
+    /// Changes of the row being refreshed.
+    change: Vec<f32>,
 }
 
 impl CellFinder {
@@ -170,6 +186,13 @@ impl CellFinder {
             65_536.0,
             "1 to 65536",
         )?;
+        range(
+            "refresh_frames",
+            f64::from(config.refresh_frames),
+            0.0,
+            1e9,
+            "0 (never) to 1e9 frames",
+        )?;
         // A region shaped like a comb takes a label for each tooth.
         let room = 16 * config.max_regions as usize;
         Ok(CellFinder {
@@ -182,6 +205,9 @@ impl CellFinder {
             blobs: Blobs::with_spans(room.max(width / 2 + 1), room, RUNS_PER_ROW * height),
             outliner: Outliner::new(width, height),
             cells: Vec::with_capacity(room),
+            light: 1.0,
+            refreshed: 0,
+            change: vec![0.0; width],
         })
     }
 
@@ -236,6 +262,69 @@ impl CellFinder {
         self.blobs.dropped_runs() > 0
     }
 
+    /// Lets the background follow the frame last given to [`CellFinder::find`]: a sixteenth of the rows at a time, each by a
+    /// little. Near a region it changes as it does beside it, so that a cell is never taken in, however long it stays; dust
+    /// too small for a cell is.
+    pub fn refresh(&mut self, frame: &Frame) {
+        // In quite another light it is not the background that has changed.
+        if self.config.refresh_frames == 0
+            || self.is_cluttered()
+            || !(0.8..1.25).contains(&self.light)
+        {
+            return;
+        }
+        match frame.pixels {
+            Pixels::Mono8(p) => self.refresh_rows(p),
+            Pixels::Mono16(p) => self.refresh_rows(p),
+        }
+    }
+
+    fn refresh_rows<T: Copy>(&mut self, pixels: &[T])
+    where
+        f32: From<T>,
+    {
+        self.refreshed = (self.refreshed + 1) % REFRESHED_EVERY;
+        let share = (REFRESHED_EVERY as f32 / self.config.refresh_frames as f32).min(1.0);
+        let unlit = 1.0 / self.light;
+        let (width, found) = (self.width, self.blobs.found());
+        let rows = self
+            .mean
+            .chunks_exact_mut(width)
+            .zip(pixels.chunks_exact(width))
+            .enumerate();
+        for (y, (mean, row)) in rows.skip(self.refreshed).step_by(REFRESHED_EVERY) {
+            for ((change, m), p) in self.change.iter_mut().zip(&*mean).zip(row) {
+                *change = share * (f32::from(*p) * unlit - m);
+            }
+            let mut x = 0;
+            while let Some((from, to)) = next_near(found, x, y, width) {
+                let open = |from: usize, to: usize| {
+                    let shown = self.change.get(from..to).unwrap_or(&[]);
+                    let sum: f32 = shown.iter().sum();
+                    (!shown.is_empty()).then(|| sum / shown.len() as f32)
+                };
+                let left = open(from.saturating_sub(BESIDE_PX).max(x), from);
+                let behind = next_near(found, to, y, width).map_or(width, |next| next.0);
+                let right = open(to, (to + BESIDE_PX).min(behind));
+                let (left, right) = match (left, right) {
+                    (Some(left), Some(right)) => (left, right),
+                    (Some(one), None) | (None, Some(one)) => (one, one),
+                    (None, None) => (0.0, 0.0),
+                };
+                let steps = (to - from) as f32;
+                if let Some(hidden) = self.change.get_mut(from..to) {
+                    for (k, change) in hidden.iter_mut().enumerate() {
+                        *change = left + (right - left) * (k as f32 + 0.5) / steps;
+                    }
+                }
+                x = to;
+            }
+            for (m, change) in mean.iter_mut().zip(&self.change) {
+                *m += change;
+            }
+        }
+    }
+
     fn checked<'p, T>(&self, frame: &Frame, pixels: &'p [T]) -> Result<&'p [T], CellError> {
         if (frame.width, frame.height) != (self.width, self.height) {
             return Err(CellError::Size {
@@ -270,7 +359,8 @@ impl CellFinder {
     where
         f32: From<T>,
     {
-        let light = self.light(pixels);
+        let light = self.light_of(pixels);
+        self.light = light;
         let noise = self.noise_grey();
         let threshold = (self.config.threshold_sigma * noise) as f32;
         let (mean, width) = (&self.mean, self.width);
@@ -309,7 +399,7 @@ impl CellFinder {
     }
 
     /// Light of the frame relative to the background's: mean ratio over pixels that differ little from it.
-    fn light<T: Copy>(&self, pixels: &[T]) -> f32
+    fn light_of<T: Copy>(&self, pixels: &[T]) -> f32
     where
         f32: From<T>,
     {
@@ -335,6 +425,23 @@ impl CellFinder {
         }
         light as f32
     }
+}
+
+/// The first stretch of a row (from, to), at or behind column `x`, that is near a region; stretches that overlap are one.
+fn next_near(found: &[Blob], x: usize, y: usize, width: usize) -> Option<(usize, usize)> {
+    let near = || {
+        found.iter().filter_map(|blob| {
+            let [left, top, right, bottom] = blob.bounds.map(|b| b as usize);
+            let rows = y + CLEAR_PX >= top && y < bottom + CLEAR_PX;
+            let (from, to) = (left.saturating_sub(CLEAR_PX), right + CLEAR_PX);
+            (rows && to > x).then_some((from.max(x), to.min(width)))
+        })
+    };
+    let (from, mut to) = near().min().filter(|(from, to)| from < to)?;
+    while let Some((_, further)) = near().find(|next| next.0 <= to && next.1 > to) {
+        to = further;
+    }
+    Some((from, to))
 }
 
 #[cfg(test)]

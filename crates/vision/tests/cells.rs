@@ -86,7 +86,11 @@ fn frame(pixels: &[u8]) -> Frame<'_> {
 }
 
 fn finder(noise: f64, random: &mut Random) -> CellFinder {
-    let mut finder = CellFinder::new(WIDTH, HEIGHT, CellConfig::default()).unwrap();
+    finder_with(noise, random, CellConfig::default())
+}
+
+fn finder_with(noise: f64, random: &mut Random, config: CellConfig) -> CellFinder {
+    let mut finder = CellFinder::new(WIDTH, HEIGHT, config).unwrap();
     for _ in 0..40 {
         let empty = picture(&[], noise, random);
         finder.take_background(&frame(&empty)).unwrap();
@@ -100,7 +104,7 @@ fn length_area_and_place_are_true_to_a_fraction_of_a_pixel_and_the_variance_is_w
     for (noise, stretch) in [(1.5, 1.0), (1.5, 2.0), (1.5, 3.8), (4.0, 1.0), (4.0, 3.8)] {
         let mut finder = finder(noise, &mut random);
         let [mut z2x, mut z2y, mut bias, mut length, mut area] = [0.0; 5];
-        const N: usize = 200;
+        const N: usize = 120;
         for _ in 0..N {
             let place = 120.0 + random.uniform();
             let cell = Drawn::at(place).stretched(stretch);
@@ -279,6 +283,51 @@ fn of_two_cells_alike_a_lost_one_is_not_guessed() {
     }
     let step = run.see(&[Drawn::at(70.0), Drawn::at(170.0)]);
     assert!((step.cell.unwrap().x_px - 170.0).abs() < 0.2);
+}
+
+#[test]
+fn a_background_that_changes_slowly_is_followed_and_a_cell_that_stays_is_not_taken_in() {
+    for refresh_frames in [120, 0] {
+        let mut random = Random(10);
+        let config = CellConfig {
+            refresh_frames,
+            ..CellConfig::default()
+        };
+        let finder = finder_with(1.5, &mut random, config);
+        let mut tracker = CellTracker::new(finder, TrackerConfig::default()).unwrap();
+        let cell = Drawn::at(190.0);
+        let mut last = None;
+        for n in 0..900 {
+            let t = f64::from(n) / 900.0;
+            // One side of the frame grows brighter and the other darker, three times the threshold in all.
+            let pixels: Vec<u8> = picture(&[cell], 1.5, &mut random)
+                .into_iter()
+                .enumerate()
+                .map(|(k, p)| {
+                    let side = (k % WIDTH) as f64 / (WIDTH as f64 - 1.0) - 0.5;
+                    (f64::from(p) + 48.0 * side * t).round() as u8
+                })
+                .collect();
+            let step = tracker
+                .step(Some(&frame(&pixels)), f64::from(n) * 1e-3, (0.0, 0.0))
+                .unwrap();
+            last = step.cell;
+        }
+        if refresh_frames == 0 {
+            assert_eq!(
+                last, None,
+                "without following the change there is no cell left"
+            );
+            continue;
+        }
+        let seen = last.unwrap();
+        assert!((seen.x_px - cell.x).abs() < 0.3, "{seen:?}");
+        assert!(
+            (seen.extent_px((1.0, 0.0)) / 24.0 - 1.0).abs() < 0.02,
+            "{seen:?}"
+        );
+        assert_eq!(tracker.state(), TrackState::Tracking);
+    }
 }
 
 #[test]

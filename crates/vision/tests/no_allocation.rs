@@ -3,8 +3,8 @@
 
 use cellpos_counting_alloc::{CountingAllocator, allocations};
 use cellpos_vision::{
-    CellConfig, CellFinder, Commanded, Frame, Learning, Localiser, LocaliserConfig, Noise,
-    PixelResponse, Pixels, ProfileSpec, Tracker, TrackerConfig, Verdict,
+    CellConfig, CellFinder, CellTracker, Commanded, Frame, Learning, Localiser, LocaliserConfig,
+    Noise, PixelResponse, Pixels, ProfileSpec, Tracker, TrackerConfig, Verdict,
 };
 
 #[global_allocator]
@@ -130,7 +130,7 @@ fn tracking_through_an_encounter_and_a_loss_allocates_nothing() {
 }
 
 #[test]
-fn finding_cells_allocates_nothing() {
+fn finding_and_following_a_cell_allocates_nothing() {
     let mut finder = CellFinder::new(64, 48, CellConfig::default()).unwrap();
     let empty = vec![100_u8; 64 * 48];
     let mut cell = empty.clone();
@@ -148,4 +148,19 @@ fn finding_cells_allocates_nothing() {
     let found = finder.find(&frame(&cell)).unwrap().len();
     assert_eq!(allocations(), before);
     assert_eq!(found, 1);
+    let mut tracker = CellTracker::new(finder, TrackerConfig::default()).unwrap();
+    let before = allocations();
+    let mut taken = 0;
+    for n in 0..200 {
+        // Seen, gone, and seen again: found, followed, lost and taken anew.
+        let shown = if (50..150).contains(&n) {
+            &empty
+        } else {
+            &cell
+        };
+        let step = tracker.step(Some(&frame(shown)), f64::from(n) * 1e-3, (0.0, 0.0));
+        taken += u32::from(step.is_ok_and(|step| step.cell.is_some()));
+    }
+    assert_eq!(allocations(), before);
+    assert_eq!(taken, 98);
 }

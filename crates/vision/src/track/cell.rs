@@ -96,6 +96,7 @@ impl CellTracker {
         let flow_px_per_s = commanded.into().flow_px_per_s;
         if let Some(frame) = frame {
             self.finder.find(frame)?;
+            self.finder.refresh(frame);
         }
         let (dt_s, time_s) = self.standing.elapse(time_s);
         if let Some(chosen) = &mut self.chosen {
