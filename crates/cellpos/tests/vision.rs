@@ -200,6 +200,29 @@ fn cells_are_measured_against_the_background() {
         assert!((row[column("length_px")] / row[column("width_px")] - 2.0).abs() < 0.15);
         assert!((row[column("mean_contrast_grey")] - 40.0).abs() < 3.0);
     }
+    // The same against the empty channel recorded by itself.
+    let empty = folder.path().join("empty");
+    std::fs::create_dir(&empty).unwrap();
+    for n in 0..8 {
+        let name = format!("{n}.png");
+        std::fs::rename(cells.join(&name), empty.join(&name)).unwrap();
+    }
+    let apart = succeed(
+        folder.path(),
+        "vision cells --cells --background empty --out apart --json",
+    )
+    .json();
+    assert_eq!(apart["cells"], r["cells"]);
+    let refused = cellpos(
+        folder.path(),
+        "vision cells --cells --background cells --out third",
+    );
+    assert_eq!(refused.code, Some(2));
+    assert!(
+        message(&refused).contains("the channel was not empty"),
+        "{}",
+        refused.err
+    );
 }
 
 /// An uncompressed grey TIFF of one picture, as little-endian bytes.

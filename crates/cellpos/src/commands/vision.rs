@@ -4,7 +4,7 @@ use super::vision_sheet::Sheet;
 use super::vision_summary::{Summary, Tally};
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
 use cellpos_rig::sources::{self, Region, SourceError};
-use cellpos_rig::{CalibrationFile, FrameBuffer};
+use cellpos_rig::{CalibrationFile, FrameBuffer, background};
 use cellpos_vision::{
     CellConfig, CellFinder, Learning, LinkConfig, Localiser, LocaliserConfig, ManyTracker,
     Polarity, ProfileSpec, RingProfile, Verdict,
@@ -57,8 +57,11 @@ pub struct Args {
     #[arg(long)]
     cells: bool,
     /// Frames at the start that show no cell, averaged into the background.
-    #[arg(long, default_value_t = 20)]
+    #[arg(long, default_value_t = 20, conflicts_with = "background")]
     background_frames: usize,
+    /// Recording of the empty channel, as `cellpos background` writes it, instead of frames at the start.
+    #[arg(long, requires = "cells")]
+    background: Option<PathBuf>,
     /// Stop after this many frames.
     #[arg(long)]
     frames: Option<usize>,
@@ -254,18 +257,28 @@ fn find_cells(
     sheet: &mut Sheet,
     tally: &mut Tally,
 ) -> Result<String, Failure> {
-    let background = args.background_frames;
-    if background < 2 || background >= frames {
-        let error = format!("--background-frames {background}: not possible with {frames} frames");
-        return Err(Failure::bad_input(
-            error,
-            "give 2 or more frames without a cell, and leave some to look at",
-        ));
-    }
     let mut buffer = FrameBuffer::default();
-    read(0, &mut buffer).map_err(Failure::input)?;
-    let mut finder = CellFinder::new(buffer.width, buffer.height, CellConfig::default())
-        .map_err(Failure::input)?;
+    let (mut finder, background) = match &args.background {
+        Some(path) => {
+            let finder = background::load(path, CellConfig::default()).map_err(|error| {
+                Failure::bad_input(error, "record the empty channel again: cellpos background")
+            })?;
+            (finder, 0)
+        }
+        None => {
+            let background = args.background_frames;
+            if background < 2 || background >= frames {
+                return Err(Failure::bad_input(
+                    format!("--background-frames {background}: not possible with {frames} frames"),
+                    "give 2 or more frames without a cell, and leave some to look at",
+                ));
+            }
+            read(0, &mut buffer).map_err(Failure::input)?;
+            let finder = CellFinder::new(buffer.width, buffer.height, CellConfig::default())
+                .map_err(Failure::input)?;
+            (finder, background)
+        }
+    };
     let mut csv = String::from(
         "frame,cell,x_px,y_px,area_px,length_px,width_px,angle_deg,mean_contrast_grey,peak_contrast_grey,at_border",
     );
