@@ -74,6 +74,10 @@ pub struct EstimatorConfig {
     pub neutral_initial_um: f64,
     /// Localisation noise assumed where a fix states none, um (standard deviation).
     pub fix_noise_um: f64,
+    /// By how much smaller than it is the variance of a fix is taken when the estimate is corrected by it: 1 is the Kalman
+    /// filter, the best for the model as it is; more brings the loop nearer to its state feedback, whose margins a filter
+    /// that trusts the model takes away (loop transfer recovery, Doyle and Stein 1979). The gate has the variance as it is.
+    pub recovery: f64,
     /// Exposure of a frame, ms; at most a tick. A fix is the mean over it of a path that bends where a command takes effect.
     pub exposure_ms: f64,
     /// An innovation larger than this many standard deviations is refused.
@@ -96,6 +100,7 @@ impl Default for EstimatorConfig {
             gain_uncertainty: 0.2,
             neutral_initial_um: 2.0,
             fix_noise_um: 0.020,
+            recovery: 10.0,
             exposure_ms: 0.0,
             gate_sigma: 6.0,
             gate_floor_um: 0.5,
@@ -221,6 +226,13 @@ impl Estimator {
             c.fix_noise_um,
             c.fix_noise_um > 0.0,
             "positive",
+        )?;
+        check(
+            "recovery",
+            "",
+            c.recovery,
+            (1.0..=1e6).contains(&c.recovery),
+            "1 (Kalman filter) to 1000000",
         )?;
         check(
             "exposure_ms",
@@ -534,7 +546,8 @@ impl Estimator {
             state.covariance_um2[2] = p22.max(RELEASED_NEUTRAL_UM.powi(2));
             return (true, innovation);
         }
-        let (k1, k2) = (ph1 / spread, ph2 / spread);
+        let trusted = spread - fix.variance_um2 + fix.variance_um2 / self.config.recovery;
+        let (k1, k2) = (ph1 / trusted, ph2 / trusted);
         state.integrator_um += k1 * innovation;
         state.neutral_um += k2 * innovation;
         state.covariance_um2 = [p11 - k1 * ph1, p12 - k1 * ph2, p22 - k2 * ph2];

@@ -21,13 +21,13 @@ pub(crate) const DEVIATION: usize = MODES + 2;
 #[serde(deny_unknown_fields, default)]
 pub struct Lqg {
     /// Weight of the motion that a command causes in a tick, relative to the position error: 0.05 is close to minimum
-    /// variance, 3 is cautious; 1.4 is stable for twice the gain with one more sample of delay.
+    /// variance, 8 is cautious; 3 is stable for twice the gain with one more sample of delay, however exact the fixes.
     pub effort: f64,
 }
 
 impl Default for Lqg {
     fn default() -> Self {
-        Self { effort: 1.4 }
+        Self { effort: 3.0 }
     }
 }
 
@@ -189,5 +189,5 @@ fn steady_gain(
         2.0 * config.diffusion_um2_per_s * ts,
         walk * ts,
     ]));
-    kalman_gain(&a, &h, &q, config.fix_noise_um.powi(2))
+    kalman_gain(&a, &h, &q, config.fix_noise_um.powi(2) / config.recovery)
 }

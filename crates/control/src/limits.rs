@@ -147,10 +147,12 @@ impl Limits {
                 command_um = previous_um;
             }
         }
+        // A request that misses a limit by less than the grid resolves keeps to it but for rounding.
+        let step_um = (self.high_um - self.low_um) / GRID_STEPS;
         Limited {
             command_um,
-            range: in_range != wanted,
-            slew: limited != in_range,
+            range: (in_range - wanted).abs() > step_um,
+            slew: (limited - in_range).abs() > step_um,
             not_finite,
         }
     }

@@ -59,7 +59,7 @@ pub struct Mpc {
 impl Default for Mpc {
     fn default() -> Self {
         Self {
-            effort: 1.4,
+            effort: 3.0,
             move_effort: 0.1,
             solver: SolverKind::default(),
             view_low_um: None,

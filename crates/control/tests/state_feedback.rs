@@ -111,6 +111,50 @@ fn the_linear_equivalent_predicts_the_hold_error_and_is_stable_over_the_spread()
     }
 }
 
+/// The more exact the fixes, the more of the state feedback and the less of the filter is in the loop: the default weights
+/// must hold for the one as for the other.
+#[test]
+fn the_margins_over_the_spread_do_not_hang_on_how_exact_the_fixes_are() {
+    let plant = DesignPlant::eq6(2.5e-3);
+    println!("fix nm  recovery  hold nm  Ms  at twice the gain and one more sample");
+    for fix_noise_um in [0.0006, 0.02, 0.06] {
+        for controller in [
+            ControllerConfig::Lqg(Lqg::default()),
+            mpc(SolverKind::ActiveSet),
+        ] {
+            let figures = |recovery| {
+                let estimator = EstimatorConfig {
+                    fix_noise_um,
+                    recovery,
+                    ..EstimatorConfig::default()
+                };
+                let plant = DesignPlant {
+                    fix_noise_um,
+                    ..plant.clone()
+                };
+                let law = controller
+                    .linear(&estimator, &LoopModel::eq6(2e-3))
+                    .unwrap();
+                let rows = spread(&plant, &law).unwrap();
+                assert!(rows.iter().all(|row| row.margins.stable), "{rows:?}");
+                let hold = noise_figures(&plant, &law).unwrap().unwrap().rms_um;
+                let (own, worst) = (margins(&plant, &law).unwrap().ms, rows[9].margins.ms);
+                println!(
+                    "{:.1}  {recovery}  {:.2}  {own:.2}  {worst:.1}",
+                    fix_noise_um * 1e3,
+                    hold * 1e3
+                );
+                (hold, own, worst)
+            };
+            let (kalman, (hold, own, worst)) =
+                (figures(1.0), figures(EstimatorConfig::default().recovery));
+            assert!(own < 1.6 && worst < 16.0, "{own} {worst}");
+            // What the recovery costs in hold error, at any noise, is less than the effort costs.
+            assert!(hold < 1.01 * kalman.0, "{hold} against {}", kalman.0);
+        }
+    }
+}
+
 #[test]
 fn previewed_sines_of_5_um_are_followed_within_1_5_times_the_hold_error() {
     for controller in [
