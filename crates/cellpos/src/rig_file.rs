@@ -29,6 +29,10 @@ use std::time::Duration;
 pub struct RigFile {
     /// First belief of the PZT displacement at which the bead is at rest, um; the loop finds the rest.
     pub first_neutral_um: f64,
+    /// Of several beads in view, the one nearest to this position at the start is followed, um; left out: the most
+    /// prominent. The option `--near` of `track` and `run` goes before.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub near_um: Option<f64>,
     /// The PZT board.
     pub actuator: ActuatorConfig,
     /// The camera.
@@ -140,6 +144,7 @@ impl Default for RigFile {
     fn default() -> Self {
         Self {
             first_neutral_um: 20.0,
+            near_um: None,
             actuator: ActuatorConfig::Emulated {},
             camera: CameraConfig::Emulated {},
             calibration: None,
@@ -273,6 +278,11 @@ impl RigFile {
                 self.first_neutral_um, self.limits.low_um, self.limits.high_um
             )));
         }
+        if let Some(near_um) = self.near_um.filter(|um| !um.is_finite()) {
+            return Err(say(&format!(
+                "near_um = {near_um}: must be a position in view, um"
+            )));
+        }
         let problem = self.calibration.as_ref().and_then(Calibration::problem);
         if let Some((key, value, must_be)) = problem {
             return Err(say(&format!(
@@ -378,7 +388,11 @@ impl RigFile {
                 .into()
         };
         let source = VisionSource::new(camera, followed, calibration, clock.clone());
-        Ok(Box::new(source.with_flow(flow.clone())))
+        let source = source.with_flow(flow.clone());
+        Ok(Box::new(match self.near_um {
+            Some(position_um) => source.near(position_um),
+            None => source,
+        }))
     }
 
     /// Connects camera and board.

@@ -214,3 +214,47 @@ fn beside_a_second_bead_the_loop_never_changes_over_without_saying_so() {
     // Never to take a frame would be safe and useless.
     assert!(accepted > 8 * 1200, "{accepted} {refused}");
 }
+
+#[test]
+fn of_two_beads_in_view_the_one_that_was_asked_for_is_followed() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    let rig = |more: &str| {
+        format!(
+            "{more}[emulator.faults]\nsecond_bead_um = 6.0\nevent = [{{ kind = \"second-bead\", at_s = 0.0 }}]\n"
+        )
+    };
+    std::fs::write(at.join("rig.toml"), rig("")).unwrap();
+    std::fs::write(at.join("near.toml"), rig("near_um = 7.0\n")).unwrap();
+    for (options, distance_um) in [
+        ("--rig rig.toml --near -1um", 0.0),
+        ("--rig rig.toml --near 5um", 6.0),
+        ("--rig near.toml", 6.0),
+        // The option goes before the file.
+        ("--rig near.toml --near -1um", 0.0),
+    ] {
+        let line = format!(
+            "track --target 0um --duration 1s --clock virtual --frames on --json {options}"
+        );
+        let json = succeed(at, &line).json();
+        let run = at.join(json["run"].as_str().unwrap());
+        let (ticks, _) = RunReader::open(&run).unwrap().ticks().unwrap();
+        let seen = || ticks.iter().filter(|tick| tick.measured_um.is_finite());
+        assert!(seen().count() > 900, "{options}");
+        let last = seen().next_back().unwrap();
+        // Both diffuse: a micrometre in a second.
+        let apart_um = last.measured_um - last.true_um;
+        assert!(
+            (apart_um - distance_um).abs() < 3.0,
+            "{options}: {apart_um}"
+        );
+        assert!(
+            last.measured_um.abs() < 1.0,
+            "{options}: the one followed is led to the target"
+        );
+    }
+    std::fs::write(at.join("nan.toml"), rig("near_um = nan\n")).unwrap();
+    let refused = cellpos(at, "track --target 0um --duration 1s --rig nan.toml");
+    assert_eq!(refused.code, Some(2));
+    assert!(refused.err.contains("near_um"), "{}", refused.err);
+}

@@ -109,6 +109,17 @@ impl Calibration {
         self.pixel_um * ((x_px - ox) * ux + (y_px - oy) * uy)
     }
 
+    /// The point of the picture at a position along the channel, with the coordinate across the axis given, px.
+    pub fn point_px(&self, position_um: f64, across_px: f64) -> (f64, f64) {
+        let (sin, cos) = self.tilt_deg.to_radians().sin_cos();
+        let way_px = self.sign * position_um / self.pixel_um;
+        let along_px = self.origin_px + (way_px - (across_px - self.origin_across_px) * sin) / cos;
+        match self.axis {
+            Axis::X => (along_px, across_px),
+            Axis::Y => (across_px, along_px),
+        }
+    }
+
     /// Variance of a position from the covariance of the point, um^2.
     pub fn variance_um2(&self, var_x_px2: f64, var_y_px2: f64, cov_xy_px2: f64) -> f64 {
         let (ux, uy) = self.direction();
@@ -162,6 +173,24 @@ mod tests {
         tilt_deg: 0.0,
         origin_across_px: 20.0,
     };
+
+    #[test]
+    fn a_position_becomes_the_point_that_gives_it_back() {
+        for axis in [Axis::X, Axis::Y] {
+            for (sign, tilt_deg) in [(1.0, 0.0), (-1.0, 12.0), (1.0, -30.0)] {
+                let calibration = Calibration {
+                    axis,
+                    sign,
+                    tilt_deg,
+                    origin_across_px: 7.0,
+                    ..STRAIGHT
+                };
+                let (x, y) = calibration.point_px(-3.5, 20.0);
+                assert_eq!(if axis == Axis::X { y } else { x }, 20.0);
+                assert!((calibration.position_um(x, y) + 3.5).abs() < 1e-12);
+            }
+        }
+    }
 
     #[test]
     fn axis_and_sign_choose_which_way_the_bead_moves() {

@@ -4,7 +4,7 @@
 //! agree, and says of every frame where it stands and why. A fix that it does not take gives no position, so that the
 //! loop coasts rather than follows another bead. Of a cell, length and area come with the position.
 
-use crate::calibration::Calibration;
+use crate::calibration::{Axis, Calibration};
 use crate::clock::Clock;
 use crate::flow::CommandedFlow;
 use crate::measurement::Measurement;
@@ -35,6 +35,13 @@ impl From<CellTracker> for Followed {
 }
 
 impl Followed {
+    fn choose(&mut self, aim_px: (f64, f64)) {
+        match self {
+            Self::Bead(tracker) => tracker.choose(Some(aim_px)),
+            Self::Cell(tracker) => tracker.choose(Some(aim_px)),
+        }
+    }
+
     fn state(&self) -> TrackState {
         match self {
             Self::Bead(tracker) => tracker.state(),
@@ -96,6 +103,18 @@ impl<C: Camera> VisionSource<C> {
     /// Lets the tracker predict from what is commanded.
     pub fn with_flow(mut self, flow: CommandedFlow) -> Self {
         self.flow = Some(flow);
+        self
+    }
+
+    /// Of several beads or cells, the one nearest to this position at the start is followed; without it the most prominent.
+    pub fn near(mut self, position_um: f64) -> Self {
+        let info = self.camera.info();
+        let across_px = match self.calibration.axis {
+            Axis::X => 0.5 * info.height_px.saturating_sub(1) as f64,
+            Axis::Y => 0.5 * info.width_px.saturating_sub(1) as f64,
+        };
+        self.followed
+            .choose(self.calibration.point_px(position_um, across_px));
         self
     }
 

@@ -17,6 +17,7 @@ use cellpos_runtime::{EndRule, Finished, Life};
 use cellpos_script::{
     AmplitudeWatch, Check, CheckLimits, CycleRow, CycleTable, Plan, Script, check,
 };
+use cellpos_units::Micrometers;
 use learning::Keeper;
 use serde::{Deserialize, Serialize};
 use sink::{ScriptSink, Stalls};
@@ -58,6 +59,10 @@ pub struct Args {
     /// Learn the feed-forward of periodic motions over their cycles, as `learn = true` in the script does.
     #[arg(long, conflicts_with = "resume")]
     learn: bool,
+    /// Of several beads or cells in view, follow the one nearest to this position at the start; left out: `near_um` of
+    /// `--rig`, or the most prominent.
+    #[arg(long, allow_hyphen_values = true)]
+    near: Option<Micrometers>,
     /// Seed of the emulated rig; left out: that of rig.toml.
     #[arg(long)]
     seed: Option<u64>,
@@ -131,7 +136,7 @@ pub(super) struct Ready {
 
 /// Runs a script, or goes on with one.
 pub fn run(args: Args) -> CommandResult {
-    let ready = match &args.resume {
+    let mut ready = match &args.resume {
         Some(folder) => match resume::ready(folder, args.best_effort)? {
             Some(ready) => ready,
             None => {
@@ -141,6 +146,9 @@ pub fn run(args: Args) -> CommandResult {
         },
         None => fresh(&args)?,
     };
+    if let Some(near) = args.near {
+        ready.file.near_um = Some(near.value());
+    }
     start(&args, ready)
 }
 

@@ -54,6 +54,10 @@ pub struct Args {
     /// The plant that the controller is made for: a model.toml, or eq6.
     #[arg(long, default_value = "eq6")]
     model: String,
+    /// Of several beads or cells in view, follow the one nearest to this position at the start; left out: `near_um` of
+    /// `--rig`, or the most prominent.
+    #[arg(long, allow_hyphen_values = true)]
+    near: Option<Micrometers>,
     /// Seed of the emulated rig; left out: that of rig.toml.
     #[arg(long)]
     seed: Option<u64>,
@@ -108,6 +112,9 @@ pub fn run(args: Args) -> CommandResult {
     let mut file = RigFile::load(args.rig.as_deref())?;
     if let Some(seed) = args.seed {
         file.emulator.seed = seed;
+    }
+    if let Some(near) = args.near {
+        file.near_um = Some(near.value());
     }
     let ticks = ticks(args.duration, file.timing.period_us)?;
     let mut prepared = session::prepare(&args.model, &args.controller, &file)?;

@@ -178,6 +178,14 @@ pub fn ready(folder: &Path, best_effort: bool) -> Result<Option<Ready>, Failure>
     if let Some(neutral_um) = rested.into_iter().find(within) {
         file.first_neutral_um = neutral_um;
     }
+    // Of several beads in view the one that was followed.
+    let seen = RunReader::open(last).ok().and_then(|reader| {
+        reader
+            .last_where(|tick| tick.measured_um.is_finite())
+            .ok()
+            .flatten()
+    });
+    file.near_um = seen.map(|tick| tick.measured_um).or(file.near_um);
     // Another session sees other noise, and the same each time that it is repeated.
     file.emulator.seed = file.emulator.seed.wrapping_add(number - 1);
     let clock = if meta.clock == "virtual" {
