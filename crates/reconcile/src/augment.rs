@@ -3,7 +3,7 @@
 use crate::catalogue::{Kind, VARIANTS};
 use crate::fit::{Context, Fit};
 use crate::frames::FrameCounts;
-use crate::predict::{Block, PLAY_LEVELS, domains};
+use crate::predict::{Block, PLAY_LEVELS, domains, near_whole};
 use crate::result::{Effect as NamedEffect, Interval, Verdict};
 use cellpos_plant::{Effect, Hysteresis, Model};
 use std::collections::BTreeMap;
@@ -173,6 +173,22 @@ pub(crate) fn exponential_play(fraction: f64, width_um: f64) -> Hysteresis {
     }
 }
 
+/// A delay a hair short of whole frames, whose frames do not show the edges of the command: whole frames for a simulator,
+/// which would show them.
+fn without_edge(ctx: &Context<'_>, fit: &Fit, delay_s: f64) -> f64 {
+    const HAIR: f64 = 0.005;
+    let sample_s = ctx.problem.base.sample_s;
+    let short = |frames: usize| frames as f64 - delay_s / sample_s;
+    match near_whole(delay_s / sample_s) {
+        Some(frames)
+            if (0.0..HAIR).contains(&short(frames)) && fit.soft < 0.35 * ctx.problem.soft.1 =>
+        {
+            frames as f64 * sample_s
+        }
+        _ => delay_s,
+    }
+}
+
 /// The effect of a model file for part `index`.
 fn effect_of(ctx: &Context<'_>, fit: &Fit, index: usize) -> Option<Effect> {
     let part = &fit.parts[index];
@@ -231,7 +247,9 @@ fn effect_of(ctx: &Context<'_>, fit: &Fit, index: usize) -> Option<Effect> {
             speed_um_per_s: um_per_s,
         },
         Block::ClockSkew { .. } => Effect::ClockSkew { ppm: v[0] },
-        Block::Delay { s } => Effect::TimeDelay { delay_s: s },
+        Block::Delay { s } => Effect::TimeDelay {
+            delay_s: without_edge(ctx, fit, s),
+        },
         Block::Exposure { s } => Effect::ExposureAveraging { exposure_s: s },
         Block::Hum { hz } => {
             let line = &fit.lines[before(Kind::Line)];

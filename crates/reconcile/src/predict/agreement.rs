@@ -148,3 +148,17 @@ fn the_predictor_and_the_simulator_of_the_program_agree_on_every_effect_of_the_r
     }
     assert!(bad.is_empty(), "{}", bad.join("; "));
 }
+
+#[test]
+fn a_delay_goes_through_whole_frames_without_a_cliff() {
+    let u = command_um();
+    let at = |delay_s: f64| predicted(&Model::eq6().with_effect(Effect::TimeDelay { delay_s }), &u);
+    let whole = at(0.002);
+    for off_s in [1e-12, 1e-10, 1e-8, 1e-6] {
+        for delay_s in [0.002 - off_s, 0.002 + off_s] {
+            // The bead moves at up to some 400 um/s per um of displacement.
+            let apart = apart_um(&at(delay_s), &whole);
+            assert!(apart < 1000.0 * off_s + 1e-9, "{delay_s} s: {apart} um");
+        }
+    }
+}

@@ -117,14 +117,29 @@ pub(crate) fn sample(
     }
     let path = Path::new(t, h, exposure > 0.0);
     let sample_s = h * fine as f64;
+    // A frame so close behind an edge shows what the share of the edge says, as one close before it does: else a delay of
+    // whole frames would be a cliff, and a fit that stands on it takes no step.
+    let whole = near_whole(delay / sample_s);
+    let edge = whole.filter(|w| skew == 0.0 && exposure == 0.0 && delay / sample_s < *w as f64);
     for k in 0..rows {
         let at = k as f64 * sample_s * (1.0 + skew) - delay;
         y.push(if exposure > 0.0 {
             (path.integral(at) - path.integral(at - exposure)) / exposure
         } else {
-            path.position(at)
+            let shown = edge
+                .and_then(|w| k.checked_sub(w))
+                .filter(|edge| path.step_of(at).0 == edge * fine)
+                .map_or(0.0, |edge| t.jump[edge * fine]);
+            path.position(at) - shown
         });
     }
+}
+
+/// The whole number of frames that a delay (in frames) is so close to that the frames lie at the edges of the command.
+pub(crate) fn near_whole(frames: f64) -> Option<usize> {
+    const NEAR: f64 = 0.06;
+    let whole = frames.round();
+    ((frames - whole).abs() <= NEAR).then_some(whole as usize)
 }
 
 /// The position as a function of time: a cubic in every step, jumps between them.

@@ -12,6 +12,7 @@ mod modal;
 mod piezo;
 
 pub(crate) use block::{Block, PLAY_LEVELS, domains};
+pub(crate) use camera::near_whole;
 pub(crate) use modal::Zpk;
 use modal::{Modal, Trace};
 
@@ -198,11 +199,10 @@ impl Chain<'_> {
             }
         }
         // Edges lie on the grid of the samples: a delay between samples puts the frames between the edges.
-        let whole = delay.round();
-        if (delay - whole).abs() > 0.06 {
+        let Some(shift) = camera::near_whole(delay) else {
             return;
-        }
-        let (shift, share) = (whole as usize, direct / base);
+        };
+        let share = direct / base;
         for (k, edge) in edge.iter_mut().enumerate().skip(shift) {
             let j = (k - shift) * self.fine;
             let before = if j == 0 { x[0] } else { x[j - 1] };
