@@ -76,8 +76,7 @@ impl Outliner {
         contrast: impl Fn(usize, usize) -> f32,
     ) -> Option<Surface> {
         self.rows.clear();
-        self.rows
-            .extend(spans.take(self.height.saturating_sub(self.rows.len())));
+        self.rows.extend(spans.take(self.height));
         let body = self.body(&contrast).unwrap_or(blob.body);
         let level = 0.5 * body;
         let (first, last) = (self.rows.first()?.y, self.rows.last()?.y);
@@ -149,13 +148,12 @@ impl Outliner {
     /// Columns (from, to) of a row that are near the region: in this row or one within the margin.
     fn around(&self, y: u32) -> (usize, usize) {
         let first = self.rows.first().map_or(0, |r| r.y);
-        let at = y.saturating_sub(first + MARGIN_PX) as usize;
-        // Rows without a run are rare; each counts one back.
+        // A region's rows follow each other without a gap.
+        let before = y.saturating_sub(first + MARGIN_PX) as usize;
         let near = self
             .rows
             .iter()
-            .skip(at.saturating_sub(self.gaps()))
-            .skip_while(|r| r.y + MARGIN_PX < y)
+            .skip(before)
             .take_while(|r| r.y <= y + MARGIN_PX);
         let (from, to) = near.fold((u32::MAX, 0), |(from, to), r| {
             (from.min(r.start), to.max(r.end))
@@ -164,13 +162,6 @@ impl Outliner {
             from.saturating_sub(MARGIN_PX) as usize,
             ((to + MARGIN_PX) as usize).min(self.width),
         )
-    }
-
-    fn gaps(&self) -> usize {
-        match (self.rows.first(), self.rows.last()) {
-            (Some(first), Some(last)) => (last.y - first.y + 1) as usize - self.rows.len(),
-            _ => 0,
-        }
     }
 
     /// Reads a row into `below`; a pixel with the surface on all four sides is no hole.
