@@ -72,8 +72,8 @@ fn killed_and_resumed(folder: &Path, cycles: u32, most: u32, extra: &[&str]) -> 
             acknowledged = now;
         }
         if ended {
-            let err = String::from_utf8_lossy(&out.stderr).into_owned();
-            assert_eq!(out.status.code(), Some(0), "{err}");
+            let said = String::from_utf8_lossy(&[out.stdout, out.stderr].concat()).into_owned();
+            assert_eq!(out.status.code(), Some(0), "{said}");
             let run = run.unwrap();
             assert_eq!(acknowledged, (0..u64::from(cycles)).collect::<Vec<u64>>());
             return (run, kills);
