@@ -51,20 +51,24 @@ pub fn narrow(setup: &mut setup::Prepared, file: &RigFile, rig: &Rig) {
     }
 }
 
-/// How long a frame is exposed, s: as the rig file says, else as the model does; 0 where nobody does.
-fn exposure_s(file: &RigFile, model: &Model) -> f64 {
-    let of_camera = match &file.camera {
+/// How long a frame is exposed, s, where the rig file says so.
+pub fn stated_exposure_s(file: &RigFile) -> Option<f64> {
+    match &file.camera {
         CameraConfig::Emulated {} => Some(file.emulator.exposure_ms * 1e-3),
         CameraConfig::Industrial { exposure_us, .. } => exposure_us.map(|us| us * 1e-6),
         CameraConfig::Socket { .. } => None,
-    };
+    }
+}
+
+/// How long a frame is exposed, s: as the rig file says, else as the model does; 0 where nobody does.
+fn exposure_s(file: &RigFile, model: &Model) -> f64 {
     let of_model = || {
         model.effects.iter().find_map(|effect| match effect {
             Effect::ExposureAveraging { exposure_s } => Some(*exposure_s),
             _ => None,
         })
     };
-    of_camera.or_else(of_model).unwrap_or(0.0)
+    stated_exposure_s(file).or_else(of_model).unwrap_or(0.0)
 }
 
 /// Arms the board and completes the set-up with where it stands.

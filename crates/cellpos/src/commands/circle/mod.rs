@@ -222,6 +222,13 @@ fn close(
     } else {
         given.clone()
     };
+    // What the rig file states needs no finding. Left out, the way that the bead goes in a part of an exposure is taken for
+    // delay: 14 us of it at 0.5 ms.
+    if let Some(exposure_s) = crate::session::stated_exposure_s(file).filter(|s| *s > 0.0)
+        && start.effect("exposure-averaging").is_none()
+    {
+        start = start.with_effect(Effect::ExposureAveraging { exposure_s });
+    }
     let mut records = vec![first.record.clone()];
     let options = Options {
         max_effects: args.max_effects,
@@ -259,8 +266,13 @@ fn close(
         ..stage::with_delay(model, first.age_s)
     });
     let configured_s = file.timing.camera_delay_ms * 1e-3;
+    let averaged_s = match reconciled.augmented.effect("exposure-averaging") {
+        Some(Effect::ExposureAveraging { exposure_s }) => *exposure_s,
+        _ => 0.0,
+    };
+    // The model's delay ends with the exposure, the loop's in its middle.
     let found_s = match reconciled.augmented.effect("time-delay") {
-        Some(Effect::TimeDelay { delay_s }) => *delay_s,
+        Some(Effect::TimeDelay { delay_s }) => *delay_s + 0.5 * averaged_s,
         _ => configured_s,
     };
     let motion = Motion {
