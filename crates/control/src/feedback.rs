@@ -37,13 +37,7 @@ impl Lqg {
     /// # Errors
     /// [`BuildError::OutOfRange`].
     pub fn validate(&self) -> Result<(), BuildError> {
-        check(
-            "effort",
-            "",
-            self.effort,
-            (1e-4..=1e4).contains(&self.effort),
-            "0.0001 to 10000",
-        )
+        check_effort(self.effort)
     }
 
     /// The feedback for a plant.
@@ -59,6 +53,12 @@ impl Lqg {
             gains: std::array::from_fn(|i| f[i]),
         })
     }
+}
+
+/// Refuses a weight of commands that no problem has.
+pub(crate) fn check_effort(effort: f64) -> Result<(), BuildError> {
+    let usable = (1e-4..=1e4).contains(&effort);
+    check("effort", "", effort, usable, "0.0001 to 10000")
 }
 
 /// Plant of the deviation state over one tick: `s' = A s + B (u - n)`, `y - r = C s`.

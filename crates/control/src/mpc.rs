@@ -10,7 +10,7 @@ mod clarabel_qp;
 use crate::active_set::{ABSENT, QpEnd, QpMatrices, QpVectors, ROWS, VARS, WorkingSet};
 use crate::control_loop::{ControlLoop, Prepared};
 use crate::error::{BuildError, check};
-use crate::feedback::{DEVIATION, Deviation, Feedback};
+use crate::feedback::{DEVIATION, Deviation, Feedback, check_effort};
 use crate::limits::Limits;
 use crate::loop_io::{LoopInput, SolverReport, SolverStatus, SolverTerms};
 use crate::loop_model::LoopModel;
@@ -86,13 +86,7 @@ impl Mpc {
     /// # Errors
     /// [`BuildError::OutOfRange`] naming the key.
     pub fn validate(&self) -> Result<(), BuildError> {
-        check(
-            "effort",
-            "",
-            self.effort,
-            (1e-4..=1e4).contains(&self.effort),
-            "0.0001 to 10000",
-        )?;
+        check_effort(self.effort)?;
         check(
             "move_effort",
             "",

@@ -144,6 +144,26 @@ pub struct ConfigError {
     pub must_be: &'static str,
 }
 
+impl ConfigError {
+    /// Refuses a setting unless `ok`.
+    pub(crate) fn unless(
+        ok: bool,
+        key: &'static str,
+        value: f64,
+        must_be: &'static str,
+    ) -> Result<(), Self> {
+        if ok {
+            Ok(())
+        } else {
+            Err(Self {
+                key,
+                value,
+                must_be,
+            })
+        }
+    }
+}
+
 impl LocaliserConfig {
     /// Default settings for a profile: the smallest odd window that holds the bead and its ring, at least 15 px.
     pub fn new(profile: ProfileSpec) -> Self {
@@ -172,17 +192,7 @@ impl LocaliserConfig {
     /// # Errors
     /// Names the first setting that cannot be used.
     pub fn template(&self) -> Result<Template, ConfigError> {
-        let check = |ok: bool, key, value, must_be| {
-            if ok {
-                Ok(())
-            } else {
-                Err(ConfigError {
-                    key,
-                    value,
-                    must_be,
-                })
-            }
-        };
+        let check = ConfigError::unless;
         let (key, size_px) = match self.profile {
             ProfileSpec::Ring { edge_px } => ("profile.edge_px", edge_px),
             ProfileSpec::Gaussian { sigma_px } => ("profile.sigma_px", sigma_px),

@@ -305,20 +305,14 @@ pub(crate) fn compile(model: &Model) -> Compiled {
 }
 
 fn hysteresis_block(hysteresis: &Hysteresis) -> HysteresisBlock {
+    let explicit = matches!(hysteresis, Hysteresis::BoucWenExplicit { .. });
     match hysteresis {
         Hysteresis::BoucWen {
             fraction,
             beta_per_um,
             gamma_per_um,
-        } => HysteresisBlock::BoucWen {
-            fraction: *fraction,
-            beta: *beta_per_um,
-            gamma: *gamma_per_um,
-            explicit: false,
-            h: 0.0,
-            input: 0.0,
-        },
-        Hysteresis::BoucWenExplicit {
+        }
+        | Hysteresis::BoucWenExplicit {
             fraction,
             beta_per_um,
             gamma_per_um,
@@ -326,7 +320,7 @@ fn hysteresis_block(hysteresis: &Hysteresis) -> HysteresisBlock {
             fraction: *fraction,
             beta: *beta_per_um,
             gamma: *gamma_per_um,
-            explicit: true,
+            explicit,
             h: 0.0,
             input: 0.0,
         },

@@ -93,15 +93,7 @@ impl TrackerConfig {
     /// Names the first that cannot be used.
     pub fn check(&self) -> Result<(), ConfigError> {
         let range = |key, value: f64, low: f64, high: f64, must_be| {
-            if value >= low && value <= high {
-                Ok(())
-            } else {
-                Err(ConfigError {
-                    key,
-                    value,
-                    must_be,
-                })
-            }
+            ConfigError::unless(value >= low && value <= high, key, value, must_be)
         };
         range(
             "diffusion_px2_per_s",

@@ -124,27 +124,26 @@ pub fn rows(done: &Done, drifting: &Drifting, recorded: &Recorded) -> Result<Vec
             .find(|p| p.frequency_hz == hz)
             .ok_or_else(|| missing("line"))
     };
-    let mut rows = Vec::new();
-    let mut add =
-        |key, quantity: &str, paper: &str, ours: f64, unit, holds: bool, remark: String| {
-            rows.push(Row {
-                key,
-                quantity: quantity.to_owned(),
-                paper: paper.to_owned(),
-                ours,
-                unit,
-                holds,
-                paper_is_wrong: false,
-                identifiable: true,
-                remark,
-            });
+    let row =
+        |key, quantity: &str, paper: &str, ours: f64, unit, holds: bool, remark: String| Row {
+            key,
+            quantity: quantity.to_owned(),
+            paper: paper.to_owned(),
+            ours,
+            unit,
+            holds,
+            paper_is_wrong: false,
+            identifiable: true,
+            remark,
         };
+    let mut rows = Vec::new();
+    let mut add = |row| rows.push(row);
     for p in points {
         let (g, a) = (
             eq6.gain_db(Hertz(p.frequency_hz)).0,
             eq6.phase_deg(Hertz(p.frequency_hz)).0,
         );
-        add(
+        add(row(
             "gain",
             &format!("Fig. 7: gain at {} Hz", p.frequency_hz),
             &format!("{g:.2}"),
@@ -152,8 +151,8 @@ pub fn rows(done: &Done, drifting: &Drifting, recorded: &Recorded) -> Result<Vec
             "dB",
             within(p.gain_db, g, 0.2),
             "paper: Eq. (6) evaluated".to_owned(),
-        );
-        add(
+        ));
+        add(row(
             "phase",
             &format!("Fig. 7: phase at {} Hz, compensated", p.frequency_hz),
             &format!("{a:.2}"),
@@ -161,9 +160,9 @@ pub fn rows(done: &Done, drifting: &Drifting, recorded: &Recorded) -> Result<Vec
             "deg",
             within(p.phase_deg, a, 1.0),
             "paper: Eq. (6) evaluated; the text says about -90".to_owned(),
-        );
+        ));
     }
-    add(
+    add(row(
         "delay",
         "Fig. 6: recording delay",
         "2",
@@ -171,8 +170,8 @@ pub fn rows(done: &Done, drifting: &Drifting, recorded: &Recorded) -> Result<Vec
         "ms",
         within(delay.value, 2.0, 0.05),
         "one edge between two 1 ms clocks reads 2 for anything from 1 to 3 ms; 300 dithered edges here".to_owned(),
-    );
-    add(
+    ));
+    add(row(
         "delay_phase_300hz",
         "phase of that delay at 300 Hz",
         "-216",
@@ -180,7 +179,7 @@ pub fn rows(done: &Done, drifting: &Drifting, recorded: &Recorded) -> Result<Vec
         "deg",
         within(-0.36 * 300.0 * delay.value, -216.0, 6.0),
         "0.1 ms of error is 10.8 deg".to_owned(),
-    );
+    ));
     let slope = {
         let x: Vec<f64> = f.iter().map(|f| f.log10()).collect();
         let n = x.len() as f64;
@@ -190,7 +189,7 @@ pub fn rows(done: &Done, drifting: &Drifting, recorded: &Recorded) -> Result<Vec
         });
         sxy / sxx
     };
-    add(
+    add(row(
         "slope",
         "slope of the gain",
         "-20",
@@ -198,8 +197,8 @@ pub fn rows(done: &Done, drifting: &Drifting, recorded: &Recorded) -> Result<Vec
         "dB/decade",
         within(slope, -20.4, 0.3),
         "Eq. (6) itself: -20.5 over these lines".to_owned(),
-    );
-    add(
+    ));
+    add(row(
         "gain_per_s",
         "integrator gain K of Eq. (6)",
         "428",
@@ -207,8 +206,8 @@ pub fn rows(done: &Done, drifting: &Drifting, recorded: &Recorded) -> Result<Vec
         "1/s",
         within(k.value / 428.1, 1.0, 0.01) && k.verdict.is_identified(),
         interval(k.ci95),
-    );
-    add(
+    ));
+    add(row(
         "pair_pole",
         "76.3 of Eq. (6): pole of the pair",
         "76.3",
@@ -216,8 +215,8 @@ pub fn rows(done: &Done, drifting: &Drifting, recorded: &Recorded) -> Result<Vec
         "rad/s",
         covers(pole.ci95, 76.3),
         interval(pole.ci95),
-    );
-    add(
+    ));
+    add(row(
         "pair_zero",
         "zero of the pair",
         "86.5",
@@ -225,9 +224,9 @@ pub fn rows(done: &Done, drifting: &Drifting, recorded: &Recorded) -> Result<Vec
         "rad/s",
         covers(zero.ci95, 86.5),
         interval(zero.ci95),
-    );
+    ));
     let held = recorded.averaged.last().copied().unwrap_or(f64::NAN);
-    add(
+    add(row(
         "recorded_amplitude_averaged",
         "Fig. 5b: recorded amplitude at 300 Hz, 1 ms hold or average",
         "0.856",
@@ -235,9 +234,9 @@ pub fn rows(done: &Done, drifting: &Drifting, recorded: &Recorded) -> Result<Vec
         "",
         within(held, 0.858, 0.003),
         "one cause of two: sinc(0.3) = 0.858, to be divided out".to_owned(),
-    );
+    ));
     let peaks = recorded.peaks.last().copied().unwrap_or(f64::NAN);
-    add(
+    add(row(
         "recorded_amplitude_peaks",
         "Fig. 5b: recorded amplitude at 300 Hz, peaks of perfect samples",
         "0.856",
@@ -245,9 +244,9 @@ pub fn rows(done: &Done, drifting: &Drifting, recorded: &Recorded) -> Result<Vec
         "",
         (0.80..=0.90).contains(&peaks),
         "the other cause: nothing is wrong with the samples, only with the reading".to_owned(),
-    );
+    ));
     let dft = recorded.dft.last().copied().unwrap_or(f64::NAN);
-    add(
+    add(row(
         "recorded_amplitude_dft",
         "the same samples by DFT",
         "not given",
@@ -255,8 +254,8 @@ pub fn rows(done: &Done, drifting: &Drifting, recorded: &Recorded) -> Result<Vec
         "",
         within(dft, 1.0, 1e-6),
         "no correction needed".to_owned(),
-    );
-    add(
+    ));
+    add(row(
         "fit_10hz",
         "Fig. A1: phase at 10 Hz, sine fit with drift",
         "-93.30",
@@ -264,24 +263,16 @@ pub fn rows(done: &Done, drifting: &Drifting, recorded: &Recorded) -> Result<Vec
         "deg",
         within(drifting.fit_deg, -93.30, 1.5),
         "paper: Eq. (6) evaluated; half a second of record".to_owned(),
-    );
+    ));
 
-    let mut wrong =
-        |key, quantity: &str, paper: &str, ours: f64, unit, holds: bool, remark: String| {
-            rows.push(Row {
-                key,
-                quantity: quantity.to_owned(),
-                paper: paper.to_owned(),
-                ours,
-                unit,
-                holds,
-                paper_is_wrong: true,
-                identifiable: true,
-                remark,
-            });
-        };
+    let mut wrong = |row| {
+        rows.push(Row {
+            paper_is_wrong: true,
+            ..row
+        });
+    };
     let ratio = literal_per_hertz(model.gain_per_s, EQ5_LITERAL_PER_S);
-    wrong(
+    wrong(row(
         "eq5",
         "Eq. (5): G(s) = 63/s",
         "63",
@@ -292,10 +283,10 @@ pub fn rows(done: &Done, drifting: &Drifting, recorded: &Recorded) -> Result<Vec
             "63 is the gain at 1 Hz: 2 pi 63 = {EQ5_VELOCITY_GAIN_PER_S:.0}/s. Literally it is {:.2} times too small (a factor of 2 pi, 16 dB); a loop designed on it is unstable",
             ratio.unwrap_or(f64::NAN)
         ),
-    );
+    ));
     let five = at(5.0)?;
     let lag_ms = -five.delayed_phase_deg / 360.0 / 5.0 * 1e3;
-    wrong(
+    wrong(row(
         "lag_5hz",
         "Fig. 4c: lag of the peaks at 5 Hz, recording delay included",
         "47",
@@ -304,9 +295,9 @@ pub fn rows(done: &Done, drifting: &Drifting, recorded: &Recorded) -> Result<Vec
         within(lag_ms, 53.3, 1.0),
         "read off the peaks by eye; its own phase at 5 Hz and 2 ms of delay make 53.3 ms"
             .to_owned(),
-    );
+    ));
     let a10 = a10_error_db(10.0);
-    wrong(
+    wrong(row(
         "a10",
         "Eq. (A10) as printed against (A9), 10 Hz",
         "0",
@@ -314,8 +305,8 @@ pub fn rows(done: &Done, drifting: &Drifting, recorded: &Recorded) -> Result<Vec
         "dB",
         within(a10, -24.8, 0.2),
         "(2 z^2 w)^2 must read (2 z w)^2".to_owned(),
-    );
-    wrong(
+    ));
+    wrong(row(
         "rounding_numerator",
         "2 z1 w1 of the listed values against Eq. (6)",
         "20261.5",
@@ -323,8 +314,8 @@ pub fn rows(done: &Done, drifting: &Drifting, recorded: &Recorded) -> Result<Vec
         "rad/s",
         !within(2.0 * 7.7 * 1321.0, 20261.5, 20.0),
         "rounded: 20343; take Eq. (6)'s coefficients".to_owned(),
-    );
-    wrong(
+    ));
+    wrong(row(
         "rounding_denominator",
         "2 z2 w2 of the listed values against Eq. (6)",
         "76.3",
@@ -332,9 +323,9 @@ pub fn rows(done: &Done, drifting: &Drifting, recorded: &Recorded) -> Result<Vec
         "rad/s",
         !within(2.0 * 104.8 * 0.36, 76.3, 0.5),
         "rounded: 75.46".to_owned(),
-    );
+    ));
     let r2 = integrator_r2(&f, &gain);
-    wrong(
+    wrong(row(
         "r2",
         "R^2 of the fit (five parameters, ten gains)",
         "0.9993",
@@ -342,8 +333,8 @@ pub fn rows(done: &Done, drifting: &Drifting, recorded: &Recorded) -> Result<Vec
         "",
         r2 > 0.999,
         "here: a ONE-parameter integrator on our gains; R^2 shows little, intervals do".to_owned(),
-    );
-    wrong(
+    ));
+    wrong(row(
         "fft_10hz",
         "App. B: phase at 10 Hz by bare FFT, delay left in",
         "-103.96",
@@ -354,8 +345,8 @@ pub fn rows(done: &Done, drifting: &Drifting, recorded: &Recorded) -> Result<Vec
             "{} um/s of drift leak v/(pi f) into every bin",
             drifting.drift_um_per_s
         ),
-    );
-    wrong(
+    ));
+    wrong(row(
         "fft_10hz_compensated",
         "App. B: the same with 2 ms taken off",
         "-96.76",
@@ -363,9 +354,9 @@ pub fn rows(done: &Done, drifting: &Drifting, recorded: &Recorded) -> Result<Vec
         "deg",
         within(drifting.fft_compensated_deg, -96.76, 2.0),
         "Eq. (6) says -93.30: fit sine and drift".to_owned(),
-    );
+    ));
     let clash = check_grid(&PAPER_FREQUENCIES_HZ, 1000.0, 7, 0.25);
-    wrong(
+    wrong(row(
         "aliases",
         "drive lines onto which harmonics fold at 1 kHz",
         "ten lines",
@@ -385,7 +376,7 @@ pub fn rows(done: &Done, drifting: &Drifting, recorded: &Recorded) -> Result<Vec
         "lines",
         clash.is_err(),
         "harmonics of 100, 200 and 300 Hz fold onto each other: prefer 197, 293 Hz".to_owned(),
-    );
+    ));
     for (key, quantity, paper, parameter) in [
         (
             "far_zero",
