@@ -2,7 +2,8 @@
 //!
 //! The PZT makes a small doublet (up, down, back) about the displacement at which it stood; the bead's frame-to-frame
 //! increments are fitted with `drift + ratio * increments predicted by the model`. Increments, because Brownian motion
-//! makes positions a random walk; a doublet, because it leaves the bead where it was.
+//! makes positions a random walk; a doublet, because it leaves the bead where it was. A refusal counts only for a pulse that went
+//! as planned: where ticks were skipped or frames came late the answer is that of another pulse, and it is made again.
 
 use crate::life::Refusal;
 use cellpos_plant::{DiscretePlant, PlantError, TransferFunction};
@@ -83,8 +84,14 @@ pub struct ArmingState {
     sum_xx: f64,
     sum_xy: f64,
     sum_yy: f64,
+    /// Whether the pulse did not go as planned.
+    disturbed: bool,
+    /// Pulses made that counted for nothing.
+    repeated: u32,
 }
 
+/// Pulses made again at most: a rig that is disturbed every time is not fit to be closed.
+const MOST_REPEATED: u32 = 3;
 /// Ticks without any position after which the PZT goes to where the bead is believed to rest.
 const UNSEEN_TICKS: u32 = 50;
 /// How far it goes in a tick, um: 100 um/s at 1 kHz.
@@ -95,6 +102,8 @@ const SEARCH_UM: f64 = 0.1;
 pub enum Step {
     /// Hold this displacement, um.
     Command(f64),
+    /// The pulse was disturbed and counts for nothing; hold this displacement, um, until the bead is steady again.
+    Again(f64, Verdict),
     /// The check is over.
     Done(Verdict),
 }
@@ -140,7 +149,8 @@ impl Arming {
     }
 
     /// One tick: the position, if there is a good one, the displacement commanded so far, and the one at which the bead is
-    /// believed to rest.
+    /// believed to rest; `disturbed` when ticks were skipped before this one, its frame is late, missing or old, or the last
+    /// command was late.
     ///
     /// The PZT is held where it stands, which may be where a person has brought the bead to rest. Where no bead is to be
     /// seen (a board that has parked flings it away, and the next one too) it goes to the believed rest, so that one can
@@ -151,6 +161,7 @@ impl Arming {
         position_um: Option<f64>,
         command_um: f64,
         neutral_um: f64,
+        disturbed: bool,
     ) -> Step {
         state.ticks += 1;
         state.seen |= position_um.is_some();
@@ -188,6 +199,7 @@ impl Arming {
         };
         let tick = pulse + 1;
         state.pulse = Some(tick);
+        state.disturbed |= disturbed;
         if let (Some(now), Some(before), Some(&x)) = (
             position_um,
             state.last_um,
@@ -204,7 +216,20 @@ impl Arming {
         state.last_um = position_um;
         match self.program_um.get(tick as usize) {
             Some(offset_um) => Step::Command(state.base_um + offset_um),
-            None => Step::Done(self.judge(state)),
+            None => {
+                let verdict = self.judge(state);
+                let void = verdict.refusal.is_some() && state.disturbed;
+                if !void || state.repeated >= MOST_REPEATED {
+                    return Step::Done(verdict);
+                }
+                let base_um = state.base_um;
+                *state = ArmingState {
+                    repeated: state.repeated + 1,
+                    seen: true,
+                    ..ArmingState::default()
+                };
+                Step::Again(base_um, verdict)
+            }
         }
     }
 
@@ -250,6 +275,17 @@ mod tests {
 
     /// A plant of `factor` times Eq. (6) with drift and a reproducible jitter of the position.
     fn run(config: ArmingConfig, factor: f64, blind: impl Fn(u32) -> bool) -> (Verdict, f64) {
+        let (verdict, largest, _) = run_disturbed(config, factor, blind, |_| 0);
+        (verdict, largest)
+    }
+
+    /// The same where before a tick others are skipped; gives the pulses made again, too.
+    fn run_disturbed(
+        config: ArmingConfig,
+        factor: f64,
+        blind: impl Fn(u32) -> bool,
+        skipped: impl Fn(u32) -> u32,
+    ) -> (Verdict, f64, u32) {
         let arming =
             Arming::new(config, &TransferFunction::eq6(), SAMPLE, DELAY).expect("eq6 is a plant");
         let plant =
@@ -258,14 +294,23 @@ mod tests {
         let mut state = ArmingState::default();
         let mut command = 20.0;
         let mut largest: f64 = 0.0;
+        let mut again = 0;
         for tick in 0..10_000u32 {
+            // The last command stands while the loop does not run.
+            for _ in 0..skipped(tick) {
+                plant.step(&mut truth, command - 20.0);
+            }
             let jitter =
                 0.02 * (f64::from(tick.wrapping_mul(2_654_435_761)) / f64::from(u32::MAX) - 0.5);
             let position = factor * plant.output_um(&truth) + 0.01 * f64::from(tick) + jitter;
             let seen = (!blind(tick)).then_some(position);
-            match arming.step(&mut state, seen, command, 20.0) {
+            match arming.step(&mut state, seen, command, 20.0, skipped(tick) > 0) {
                 Step::Command(next) => command = next,
-                Step::Done(verdict) => return (verdict, largest),
+                Step::Again(next, _) => {
+                    command = next;
+                    again += 1;
+                }
+                Step::Done(verdict) => return (verdict, largest, again),
             }
             largest = largest.max((command - 20.0).abs());
             plant.step(&mut truth, command - 20.0);
@@ -288,7 +333,8 @@ mod tests {
             for tick in 0..1000 {
                 // Seen once, and lost again: a person may have brought it to rest here.
                 let position = (seen && tick == 10).then_some(0.0);
-                let Step::Command(next) = arming.step(&mut state, position, command, 20.0) else {
+                let step = arming.step(&mut state, position, command, 20.0, false);
+                let Step::Command(next) = step else {
                     panic!("given up too soon");
                 };
                 assert!((next - command).abs() <= 0.1 + 1e-12);
@@ -343,6 +389,26 @@ mod tests {
     fn a_bead_lost_during_the_pulse_is_no_bead() {
         let (verdict, _) = run(ArmingConfig::default(), 1.0, |tick| tick > 22);
         assert_eq!(verdict.refusal, Some(Refusal::NoBead));
+    }
+
+    #[test]
+    fn a_pulse_in_which_the_loop_stalled_is_made_again_and_not_held_against_the_plant() {
+        // Stalls in the upward half: the bead goes on for as long and comes back for the rest only.
+        let stalls = |tick| match tick {
+            24 | 26 | 28 => 60,
+            _ => 0,
+        };
+        let config = ArmingConfig::default();
+        let (verdict, _, again) = run_disturbed(config, 1.0, |_| false, stalls);
+        assert_eq!((verdict.refusal, again), (None, 1), "{verdict:?}");
+        assert!((verdict.gain_ratio - 1.0).abs() < 0.05, "{verdict:?}");
+        // A plant that is wrong is refused however the first pulse went, and nothing is tried for ever.
+        let (verdict, _, again) = run_disturbed(config, -1.0, |_| false, stalls);
+        assert_eq!((verdict.refusal, again), (Some(Refusal::WrongSign), 1));
+        let always = |tick| if tick % 3 == 0 { 40 } else { 0 };
+        let (verdict, _, again) = run_disturbed(config, -1.0, |_| false, always);
+        assert!(verdict.refusal.is_some());
+        assert_eq!(again, MOST_REPEATED);
     }
 
     #[test]

@@ -210,6 +210,7 @@ impl<R: Guide> Core<R> {
             time_ns: input.time_ns,
             flags: TickFlags::default(),
             events: Events::default(),
+            disturbed: false,
         };
         if tick.seq == 0 {
             tick.event(EventKind::Armed);
@@ -256,8 +257,22 @@ impl<R: Guide> Core<R> {
             let held = self.state.control.previous_command_um();
             let neutral_um = self.state.control.estimator.neutral_um;
             let arming = &mut self.state.arming;
-            match self.arming.step(arming, position_um, held, neutral_um) {
+            let disturbed = tick.disturbed;
+            match self
+                .arming
+                .step(arming, position_um, held, neutral_um, disturbed)
+            {
                 Step::Command(command_um) => return Mode::Direct(command_um),
+                Step::Again(command_um, verdict) => {
+                    if let Some(refusal) = verdict.refusal {
+                        tick.event(EventKind::ArmingRepeated {
+                            refusal,
+                            gain_ratio: verdict.gain_ratio,
+                            ci95: verdict.ci95,
+                        });
+                    }
+                    return Mode::Direct(command_um);
+                }
                 Step::Done(verdict) => match verdict.refusal {
                     Some(refusal) => {
                         tick.event(EventKind::ArmingRefused {

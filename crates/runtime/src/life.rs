@@ -143,6 +143,16 @@ pub enum EventKind {
         /// Half width of its 95 % interval.
         ci95: f64,
     },
+    /// Ticks were skipped or frames came late during the pulse, and its answer is not that of the model: it counts for
+    /// nothing and is made again.
+    ArmingRepeated {
+        /// What the answer would have meant.
+        refusal: Refusal,
+        /// Measured gain over the model's; NaN when none was measured.
+        gain_ratio: f64,
+        /// Half width of its 95 % interval.
+        ci95: f64,
+    },
     /// The plant did not answer the pulse as the model says.
     ArmingRefused {
         /// Why.

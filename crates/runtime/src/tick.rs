@@ -99,6 +99,8 @@ pub(crate) struct Tick {
     pub(crate) time_ns: i64,
     pub(crate) flags: TickFlags,
     pub(crate) events: Events,
+    /// Whether time did not pass as planned up to this tick: ticks skipped, its frame late, missing or old, a late command.
+    pub(crate) disturbed: bool,
 }
 
 impl Tick {

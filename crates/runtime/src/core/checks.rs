@@ -20,6 +20,7 @@ impl<R: Guide> Core<R> {
         if skipped <= 0 {
             return;
         }
+        tick.disturbed = true;
         tick.event(EventKind::TicksSkipped {
             count: skipped as u64,
         });
@@ -85,6 +86,11 @@ impl<R: Guide> Core<R> {
             });
             stale = true;
         }
+        let period = self.timing.period_ns();
+        let beyond_ns = age_ns - Timing::ms_to_ns(self.timing.camera_delay_ms);
+        tick.disturbed |= stale
+            || tick.flags.0 & (TickFlags::DROPPED_FRAME | TickFlags::DOUBLED_FRAME) != 0
+            || beyond_ns > period / 2;
         if stale {
             tick.flags.set(TickFlags::STALE);
             self.state.stale_in_a_row += 1;
@@ -105,8 +111,6 @@ impl<R: Guide> Core<R> {
             });
             self.state.counts.reacquired += 1;
         }
-        let beyond_ns = age_ns - Timing::ms_to_ns(self.timing.camera_delay_ms);
-        let period = self.timing.period_ns();
         let age_samples =
             ((beyond_ns + period / 2).max(0) / period).min(i64::from(u16::MAX)) as u16;
         Some(LoopMeasurement {
@@ -121,6 +125,7 @@ impl<R: Guide> Core<R> {
     pub(super) fn check_driver(&mut self, input: &TickInput, tick: &mut Tick) {
         match input.previous_late_ns {
             Some(compute_ns) => {
+                tick.disturbed = true;
                 tick.event(EventKind::LateTick {
                     compute_us: f64::from(compute_ns) * 1e-3,
                 });
@@ -132,6 +137,7 @@ impl<R: Guide> Core<R> {
             None => self.state.late_in_a_row = 0,
         }
         if input.previous_refused {
+            tick.disturbed = true;
             self.state.refused_in_a_row += 1;
             if self.state.refused_in_a_row >= self.timing.faults_in_a_row {
                 self.latch(SafeReason::ActuatorRingFull, tick);
