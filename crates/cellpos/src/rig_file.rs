@@ -329,13 +329,8 @@ impl RigFile {
         match (&self.camera, &cell.background) {
             (CameraConfig::Emulated {}, _) => {
                 let frames = World::empty_frames(&self.emulator, EMPTY_FRAMES);
-                let buffer = |mono8| FrameBuffer {
-                    width: usize::from(self.emulator.width_px),
-                    height: usize::from(self.emulator.height_px),
-                    bits: 8,
-                    mono8,
-                    mono16: Vec::new(),
-                };
+                let (width, height) = (self.emulator.width_px, self.emulator.height_px);
+                let buffer = |mono8| FrameBuffer::of_mono8(width.into(), height.into(), mono8);
                 let frames: Vec<FrameBuffer> = frames
                     .map_err(Failure::input)?
                     .into_iter()

@@ -95,8 +95,8 @@ impl CellPicture {
     }
 }
 
-/// Grey levels that the channel's walls take from a pixel, by its number, where it is more than nothing: outside as far apart as the cell is wide at
-/// rest, in the constriction as when it is stretched least.
+/// Grey levels that the channel's walls take from a pixel, by its number, where it is more than nothing: outside as far
+/// apart as the cell is wide at rest, in the constriction as when it is stretched least.
 pub(crate) fn walls(config: &WorldConfig, cell: &CellConfig) -> Vec<(usize, f32)> {
     let blur_um = BLUR_UM.max(config.pixel_um);
     let inside_um = cell.width_um(cell.rest_um * cell.stretch_first.min(cell.stretch_last));

@@ -164,13 +164,7 @@ mod tests {
             cell: Some(EmulatedCell::default()),
             ..WorldConfig::default()
         };
-        let buffer = |mono8| FrameBuffer {
-            width: 256,
-            height: 64,
-            bits: 8,
-            mono8,
-            mono16: Vec::new(),
-        };
+        let buffer = |mono8| FrameBuffer::of_mono8(256, 64, mono8);
         let frames = World::empty_frames(&world, count).unwrap();
         frames.into_iter().map(buffer).collect()
     }

@@ -37,6 +37,17 @@ pub struct FrameBuffer {
 }
 
 impl FrameBuffer {
+    /// A frame of 8 bits per pixel, rows contiguous.
+    pub fn of_mono8(width: usize, height: usize, mono8: Vec<u8>) -> Self {
+        Self {
+            width,
+            height,
+            bits: 8,
+            mono8,
+            mono16: Vec::new(),
+        }
+    }
+
     /// The frame as vision takes it.
     pub fn frame(&self) -> Frame<'_> {
         Frame {

@@ -82,7 +82,9 @@ impl Outliner {
         let (first, last) = (self.rows.first()?.y, self.rows.last()?.y);
         let top = first.saturating_sub(MARGIN_PX);
         let bottom = (last + MARGIN_PX).min(self.height.saturating_sub(1) as u32);
-        let (left, right) = self.reach();
+        let [left, _, right, _] = blob.bounds;
+        let left = left.saturating_sub(MARGIN_PX) as usize;
+        let right = ((right + MARGIN_PX) as usize).min(self.width);
         if let Some(columns) = self.columns.get_mut(left..right) {
             columns.fill((u32::MAX, 0));
         }
@@ -133,16 +135,6 @@ impl Outliner {
             }
         }
         (n > 0.0 && sum > 0.0).then(|| sum / n)
-    }
-
-    /// Columns (from, to) that hold the region with its margin.
-    fn reach(&self) -> (usize, usize) {
-        let from = self.rows.iter().map(|r| r.start).min().unwrap_or(0);
-        let to = self.rows.iter().map(|r| r.end).max().unwrap_or(0);
-        (
-            from.saturating_sub(MARGIN_PX) as usize,
-            ((to + MARGIN_PX) as usize).min(self.width),
-        )
     }
 
     /// Columns (from, to) of a row that are near the region: in this row or one within the margin.
