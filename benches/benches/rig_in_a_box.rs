@@ -4,7 +4,7 @@
 //! The competitor is the same run without any command, which leaves the world alone.
 
 use cellpos_emulator::WorldConfig;
-use cellpos_firmware_sim::{BoardConfig, RigInABox};
+use cellpos_emulator::{BoardConfig, RigInABox};
 use cellpos_link::{Arm, Command, Decoder, MAX_FRAME, PROTOCOL_VERSION, ToBoard, ToHost, encode};
 use cellpos_plant::Model;
 use std::hint::black_box;

@@ -4,10 +4,12 @@
 pub mod simulated;
 
 use cellpos_control::{ControllerFile, ControllerKind, Pi, Profile};
+use cellpos_drivers::{CommandedFlow, FlowTap, VisionSource};
+use cellpos_emulator::BoardConfig;
+use cellpos_emulator::EmulatedRig;
 use cellpos_emulator::WorldConfig;
-use cellpos_firmware_sim::BoardConfig;
 use cellpos_plant::{Hertz, Model, TransferFunction};
-use cellpos_rig::{Clock, CommandedFlow, EmulatedRig, FlowTap, PositionSource, VisionSource};
+use cellpos_rig::{Clock, PositionSource};
 use cellpos_runtime::live::{self, Operator, Threads};
 use cellpos_runtime::realtime::Conditions;
 use cellpos_runtime::{
@@ -43,8 +45,8 @@ pub fn track(clock: Clock, frames: bool, ticks: u64) -> (Summary, Conditions) {
     file.controller = ControllerKind::Pi;
     let armed = cellpos_rig::Actuator::arm(
         &mut actuator,
-        &cellpos_rig::actuator::Session {
-            id: 1,
+        &cellpos_rig::ArmRequest {
+            session: 1,
             park_um: 20.0,
             limits: [
                 file.limits.low_um,
@@ -52,6 +54,7 @@ pub fn track(clock: Clock, frames: bool, ticks: u64) -> (Summary, Conditions) {
                 file.limits.slew_um_per_s,
             ],
             watchdog_ms: None,
+            hold_watchdog_ms: None,
         },
     )
     .expect("the board arms");

@@ -83,7 +83,7 @@ pub fn run(
     let age_ticks = rig.delay_s / ts;
     let mut rig = SimulatedRig::new(rig).expect("a sound rig");
     let mut controller = Controller::new(config).expect("a sound controller");
-    let mut state = controller.start(20.0, 20.0);
+    controller.start(20.0, 20.0);
     let mut preview = vec![0.0; controller.preview_len()];
     let mut learning = learner.map(|learner| CycleLearning::new(learner.clone(), learner.start()));
     for tick in 0..ticks {
@@ -104,7 +104,7 @@ pub fn run(
             }),
             ..LoopInput::default()
         };
-        let output = controller.step(&mut state, &input);
+        let output = controller.step(&input);
         if let Some(learning) = &mut learning {
             learning.learn(Some((fix.position_um, age_ticks)));
         }

@@ -154,6 +154,7 @@ impl Host {
         self.wait_for(|m| matches!(m, ToHost::Identity(_)));
         self.say(&ToBoard::Arm(Arm {
             watchdog_ms: Some(400),
+            hold_watchdog_ms: Some(300),
             ..Arm::session(session)
         }));
         self.wait_for(|m| matches!(m, ToHost::Status(s) if s.state == BoardState::Armed && s.session == session));
@@ -173,7 +174,7 @@ impl Host {
 }
 
 #[test]
-fn a_host_that_falls_silent_leaves_a_slew_limited_ramp_to_park() {
+fn a_host_that_falls_silent_leaves_a_bead_at_rest_and_then_a_slew_limited_ramp_to_park() {
     let sim = Sim::start(&[]);
     let mut host = sim.host();
     host.arm(7);
@@ -183,7 +184,7 @@ fn a_host_that_falls_silent_leaves_a_slew_limited_ramp_to_park() {
     }
     let seq = host.seq;
     host.wait_for(|m| matches!(m, ToHost::Status(s) if s.last_seq == Some(seq)));
-    // Silence. The board says that it has parked, with its own words and numbers.
+    // Silence. The board says that it holds, and then that it has parked, with its own words and numbers.
     let fault = host.wait_for(|m| matches!(m, ToHost::Fault { .. }));
     assert!(matches!(
         fault,
@@ -195,9 +196,11 @@ fn a_host_that_falls_silent_leaves_a_slew_limited_ramp_to_park() {
     host.wait_for(
         |m| matches!(m, ToHost::Status(s) if s.state == BoardState::Safe && s.applied_pm == 0),
     );
+    std::thread::sleep(Duration::from_millis(50));
     let rows = sim.finish();
     let running: Vec<&Row> = rows.iter().filter(|row| row.state == "Running").collect();
     let safe: Vec<&Row> = rows.iter().filter(|row| row.state == "Safe").collect();
+    let holding: Vec<&Row> = rows.iter().filter(|row| row.state == "Holding").collect();
     let step_um = 40.0 / 65535.0;
     assert!((running[running.len() - 1].applied_um - 20.5).abs() <= step_um);
     let held_s = running[running.len() - 1].time_s - running[0].time_s;
@@ -206,6 +209,12 @@ fn a_host_that_falls_silent_leaves_a_slew_limited_ramp_to_park() {
         "no ramp before the watchdog time is over: {held_s} s"
     );
     assert!(safe.iter().all(|row| row.fault == "CommandTimeout"));
+    let at_rest = &holding[holding.len() / 2..];
+    assert!(
+        at_rest
+            .iter()
+            .all(|row| (row.applied_um - 20.0).abs() <= step_um)
+    );
     for pair in safe.windows(2) {
         // The ramp is a staircase: one update period of 0.1 ms more may fall between two rows.
         let reach_um = 1000.0 * (pair[1].time_s - pair[0].time_s + 100e-6) + 2.0 * step_um;
@@ -230,7 +239,8 @@ fn a_second_host_finds_the_line_open_after_the_first_was_cut_off() {
     first.arm(1);
     first.command(1, 21.0);
     drop(first);
-    std::thread::sleep(Duration::from_millis(100));
+    // A session whose commands are fresh is not taken over: the board has to miss the first host.
+    std::thread::sleep(Duration::from_millis(500));
     let mut second = sim.host();
     second.arm(2);
     second.command(2, 20.0);

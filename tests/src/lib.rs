@@ -1,5 +1,7 @@
 //! Whole-system tests: what they share.
 #![forbid(unsafe_code)]
 
+pub mod attack;
+pub mod browser;
 pub mod programs;
 pub mod truth;

@@ -14,11 +14,13 @@ pub const PATIENCE: Duration = Duration::from_secs(30);
 /// They are not there: a run of this package's tests alone does not build them.
 pub fn folder() -> PathBuf {
     let exe = std::env::current_exe().expect("a test knows its own path");
-    let folder = exe
-        .parent()
-        .and_then(Path::parent)
-        .expect("target/<profile>/deps")
-        .to_path_buf();
+    // A test is in target/<profile>/deps, a program of this package beside the others.
+    let beside = exe.parent().expect("target/<profile>");
+    let folder = if beside.ends_with("deps") {
+        beside.parent().expect("target/<profile>").to_path_buf()
+    } else {
+        beside.to_path_buf()
+    };
     for name in ["cellpos", "firmware-sim"] {
         assert!(
             folder.join(name).is_file(),

@@ -1,41 +1,92 @@
 //! The `cellpos` program: arguments in, calls, results out.
 //!
 //! Exit codes: 0 done, 1 failed or limits broken, 2 bad input. With `--json` standard output carries one JSON object
-//! and nothing else; progress, warnings and errors go to standard error.
+//! and nothing else (an error is one too); progress, warnings and errors for people go to standard error.
 #![forbid(unsafe_code)]
 
+mod arguments;
 mod commands;
-mod cyclic;
 mod outcome;
-mod recording;
-mod rig_file;
-mod session;
-mod setup;
-mod toml_file;
+mod output;
+mod view_args;
 
-use clap::Parser;
+use cellpos_session::{cyclic, provenance, recording, rig_file, setup, signals, toml_file};
+use clap::{CommandFactory, FromArgMatches, Parser};
 use std::process::ExitCode;
+use tracing_subscriber::EnvFilter;
 
 /// Closed-loop positioning of a cell or bead in a PDMS microchannel at 1 kHz.
 #[derive(Debug, Parser)]
-#[command(name = "cellpos", version, arg_required_else_help = true)]
+#[command(
+    name = "cellpos",
+    version = provenance::VERSION_AND_COMMIT,
+    arg_required_else_help = true,
+    after_help = "RUST_LOG (else CELLPOS_LOG) sets what is logged, for example RUST_LOG=cellpos_rig=debug."
+)]
 struct Cli {
+    /// Log more on standard error; twice: more still.
+    #[arg(long, global = true, action = clap::ArgAction::Count, conflicts_with = "quiet")]
+    verbose: u8,
+    /// Log errors alone, and show no progress.
+    #[arg(long, global = true)]
+    quiet: bool,
+    /// Write over files that are there already.
+    #[arg(long, global = true)]
+    force: bool,
     #[command(subcommand)]
     command: commands::Command,
 }
 
+/// What is logged: as the environment says, else as the options do.
+fn log_filter(verbose: u8, quiet: bool) -> EnvFilter {
+    let said = ["RUST_LOG", "CELLPOS_LOG"]
+        .into_iter()
+        .find_map(|name| EnvFilter::try_from_env(name).ok());
+    let level = match (quiet, verbose) {
+        (true, _) => "error",
+        (false, 0) => "warn",
+        (false, 1) => "info",
+        (false, _) => "debug",
+    };
+    said.unwrap_or_else(|| EnvFilter::new(level))
+}
+
+/// The program's arguments, for completions and manual pages too.
+fn command_line() -> clap::Command {
+    Cli::command()
+}
+
 fn main() -> ExitCode {
+    cellpos_terminal::panics_do_not_wait();
+    if let Err(error) = signals::listen() {
+        eprintln!(
+            "signals cannot be caught ({error}): Ctrl-C ends the program, and the board parks by its own watchdog"
+        );
+    }
+    let words = arguments::joined(std::env::args_os());
+    let json = words
+        .iter()
+        .take_while(|word| *word != "--")
+        .any(|word| word == "--json");
+    let matches = match command_line().try_get_matches_from(words) {
+        Ok(matches) => matches,
+        Err(error) => return outcome::exit_arguments(&error, json),
+    };
+    let cli = match Cli::from_arg_matches(&matches) {
+        Ok(cli) => cli,
+        Err(error) => return outcome::exit_arguments(&error, json),
+    };
     tracing_subscriber::fmt()
-        .with_writer(std::io::stderr)
+        .with_writer(|| cellpos_terminal::Log)
         .with_ansi(std::io::IsTerminal::is_terminal(&std::io::stderr()))
         .without_time()
-        .with_env_filter(
-            tracing_subscriber::EnvFilter::try_from_env("CELLPOS_LOG")
-                .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new("warn")),
-        )
+        .with_env_filter(log_filter(cli.verbose, cli.quiet))
         .with_target(false)
         .init();
-    // clap itself leaves with exit code 2 on arguments that it cannot read.
-    let cli = Cli::parse();
-    outcome::exit(cli.command.run())
+    output::configure(output::Settings {
+        command: matches.subcommand_name().unwrap_or("cellpos").to_owned(),
+        force: cli.force,
+        quiet: cli.quiet,
+    });
+    outcome::exit(cli.command.run(), json)
 }

@@ -1,7 +1,10 @@
 //! How a command ends: exit codes, JSON on standard output, errors on standard error.
 
+pub use cellpos_session::Failure;
+use cellpos_terminal::{Colours, clean};
 use serde::Serialize;
 use std::process::ExitCode;
+use std::time::Duration;
 
 /// What a command that ran to its end has to say.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -12,69 +15,129 @@ pub enum Outcome {
     Broken,
 }
 
-/// Why a command could not do its work.
-#[derive(Debug)]
-pub enum Failure {
-    /// The user can put it right: a file, key, value or argument. Exit code 2.
-    BadInput(miette::Report),
-    /// Something failed on the way: a device, a full disk, the loop. Exit code 1.
-    Failed(miette::Report),
-}
-
 /// The result of every command.
 pub type CommandResult = Result<Outcome, Failure>;
 
-impl Failure {
-    /// Bad input, with a help line that says what would be right.
-    pub fn bad_input(error: impl std::fmt::Display, help: impl std::fmt::Display) -> Self {
-        Self::BadInput(miette::miette!(help = help.to_string(), "{error}"))
-    }
+/// Version of the JSON objects: it rises when a key changes its meaning or goes.
+pub const JSON_VERSION: u32 = 1;
 
-    /// A failure on the way, in the words of its error and of the errors behind it.
-    pub fn failed(error: impl std::error::Error + Send + Sync + 'static) -> Self {
-        Self::Failed(miette::Report::from_err(error))
-    }
-
-    /// In a line.
-    pub fn text(&self) -> String {
-        match self {
-            Self::BadInput(report) | Self::Failed(report) => report.to_string(),
-        }
-    }
-
-    /// Bad input, in the words of a library's error.
-    pub fn input(error: impl std::error::Error + Send + Sync + 'static) -> Self {
-        Self::BadInput(miette::Report::from_err(error))
-    }
+/// A JSON object with the name of its schema (docs/schemas) and its version in front.
+#[derive(Serialize)]
+struct Object<'a, T: Serialize> {
+    schema: String,
+    version: u32,
+    #[serde(flatten)]
+    value: &'a T,
 }
 
 /// Prints `value` as the one JSON object on standard output.
 pub fn print_json(value: &impl Serialize) -> Result<(), Failure> {
-    let text = serde_json::to_string_pretty(value).map_err(Failure::failed)?;
+    print_object(&crate::output::settings().command, value)
+}
+
+fn print_object(name: &str, value: &impl Serialize) -> Result<(), Failure> {
+    let object = Object {
+        schema: format!("cellpos.{name}"),
+        version: JSON_VERSION,
+        value,
+    };
+    let text = serde_json::to_string_pretty(&object).map_err(Failure::failed)?;
     print_text(&format!("{text}\n"))
 }
 
 /// Prints text on standard output; a closed pipe (`| head`) is no error.
 pub fn print_text(text: &str) -> Result<(), Failure> {
     use std::io::Write;
-    match std::io::stdout().write_all(text.as_bytes()) {
+    // What a run was told to say is shown below what it said while it ran.
+    cellpos_terminal::stderr().flush(PATIENCE);
+    match std::io::stdout().write_all(clean(text, Colours::Kept).as_bytes()) {
         Err(error) if error.kind() != std::io::ErrorKind::BrokenPipe => Err(Failure::failed(error)),
         _ => Ok(()),
     }
 }
 
-/// Prints the error, if any, and gives the exit code.
-pub fn exit(result: CommandResult) -> ExitCode {
-    match result {
-        Ok(Outcome::Done) => ExitCode::SUCCESS,
-        Ok(Outcome::Broken) => ExitCode::from(1),
-        Err(Failure::Failed(report)) => {
-            eprintln!("{report:?}");
-            ExitCode::from(1)
-        }
-        Err(Failure::BadInput(report)) => {
-            eprintln!("{report:?}");
-            ExitCode::from(2)
-        }
+/// How long the last words of a run may take to reach the terminal.
+const PATIENCE: Duration = Duration::from_millis(300);
+
+/// What `--json` prints in place of a result.
+#[derive(Debug, Serialize)]
+struct ErrorObject {
+    error: ErrorText,
+}
+
+#[derive(Debug, Serialize)]
+struct ErrorText {
+    /// `bad-input` (exit code 2) or `failed` (exit code 1).
+    kind: &'static str,
+    message: String,
+    /// What is behind it, outermost first.
+    causes: Vec<String>,
+    help: Option<String>,
+}
+
+fn error_object(kind: &'static str, report: &miette::Report) -> ErrorObject {
+    ErrorObject {
+        error: ErrorText {
+            kind,
+            message: report.to_string(),
+            causes: report.chain().skip(1).map(ToString::to_string).collect(),
+            help: report.help().map(|help| help.to_string()),
+        },
     }
+}
+
+/// Prints the error, if any, and gives the exit code.
+pub fn exit(result: CommandResult, json: bool) -> ExitCode {
+    let (code, kind, report) = match result {
+        Ok(Outcome::Done) => return ExitCode::SUCCESS,
+        Ok(Outcome::Broken) => return ExitCode::from(1),
+        Err(Failure::Failed(report)) => (1, "failed", report),
+        Err(Failure::BadInput(report)) => (2, "bad-input", report),
+    };
+    cellpos_terminal::stderr().flush(PATIENCE);
+    // Files are quoted in it: nothing in them gives orders to the terminal.
+    eprintln!("{}", clean(&format!("{report:?}"), Colours::Kept));
+    if json {
+        // Nobody is left to be told of a standard output that is gone.
+        let _ = print_object("error", &error_object(kind, &report));
+    }
+    ExitCode::from(code)
+}
+
+/// Says what is wrong with the arguments, or shows the help or version that they ask for.
+pub fn exit_arguments(error: &clap::Error, json: bool) -> ExitCode {
+    let _ = error.print();
+    let surplus = error
+        .get(clap::error::ContextKind::InvalidArg)
+        .map(ToString::to_string)
+        .filter(|word| {
+            std::path::Path::new(word)
+                .join(cellpos_record::RUN_TOML)
+                .exists()
+        });
+    if let Some(run) = surplus {
+        eprintln!(
+            "\n  help: {run} is one more run, and this command takes one (did a glob match two?): name it, or write latest-NAME \
+             for the newest of a name"
+        );
+    }
+    let code = u8::try_from(error.exit_code()).unwrap_or(2);
+    if json && error.use_stderr() {
+        let text = error.to_string();
+        let mut lines = text.lines().map(str::trim).filter(|line| !line.is_empty());
+        let object = ErrorObject {
+            error: ErrorText {
+                kind: "bad-input",
+                message: lines
+                    .next()
+                    .unwrap_or("")
+                    .trim_start_matches("error: ")
+                    .to_owned(),
+                causes: Vec::new(),
+                help: Some(lines.collect::<Vec<_>>().join("\n")).filter(|help| !help.is_empty()),
+            },
+        };
+        let _ = print_object("error", &object);
+    }
+    ExitCode::from(code)
 }

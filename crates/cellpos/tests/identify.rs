@@ -112,12 +112,8 @@ fn a_model_with_a_literal_63_per_s_is_flagged_as_a_factor_of_two_pi() {
 #[test]
 fn a_hysteretic_piezo_is_told_of_and_never_becomes_an_unstable_plant() {
     let folder = tempfile::tempdir().unwrap();
-    let law = cellpos_plant::Hysteresis::BoucWen {
-        fraction: 0.3,
-        beta_per_um: 0.9,
-        gamma_per_um: 0.2,
-    };
-    let model = cellpos_plant::Model::eq6().with_effect(cellpos_plant::Effect::PztHysteresis(law));
+    let law = cellpos_plant::effects::bouc_wen(0.3, 0.9, 0.2);
+    let model = cellpos_plant::Model::eq6().with_effect(law);
     std::fs::write(folder.path().join("piezo.toml"), model.to_toml_string()).unwrap();
     let line = "identify --model piezo.toml --seed 5 --frames off --bootstrap 0 --json --out m.toml --report r.html";
     let args: Vec<&str> = line.split(' ').collect();
@@ -141,6 +137,7 @@ fn the_same_seed_gives_the_same_result_to_the_bit() {
         "off",
         "--bootstrap",
         "50",
+        "--force",
         "--json",
         "--out",
         "m.toml",

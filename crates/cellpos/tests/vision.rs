@@ -103,7 +103,10 @@ fn a_recording_gives_positions_micrometres_a_sheet_and_a_summary() {
     let beads = &r["beads"];
     // 80 grey levels over 1.5, at the window's own estimate of the noise.
     assert!((number(beads, "snr_median") - 53.0).abs() < 8.0, "{beads}");
-    assert!((number(beads, "residual_median") - 1.0).abs() < 0.2);
+    assert!(
+        (number(beads, "residual_median") - 1.0).abs() < 0.3,
+        "{beads}"
+    );
     let counts = beads["subpixel_counts"].as_array().unwrap();
     let counted: f64 = counts.iter().map(|c| c.as_f64().unwrap()).sum();
     assert_eq!(counted, 120.0);
@@ -172,6 +175,55 @@ fn the_measured_beads_are_found_in_every_frame() {
 }
 
 #[test]
+fn settings_come_out_of_the_recording_and_go_into_a_rig_whose_loop_sees_the_same() {
+    let folder = tempfile::tempdir().unwrap();
+    let root = folder.path();
+    let beads = recording(root, 30);
+    // A frame that was lost.
+    std::fs::remove_file(beads.join("frame_012.png")).unwrap();
+    let text = succeed(root, "vision beads --out found").out;
+    assert!(text.contains("frames lost        1"), "{text}");
+    assert!(
+        text.contains(" of 28 objects are beads of radius 5.0"),
+        "{text}"
+    );
+    let at = text.find("[vision]").expect("a table to paste");
+    let mut rig = text[at..].to_string();
+    rig.push_str("\n[calibration]\npixel_um = 0.2\norigin_px = 48.0\nsign = 1.0\n[camera]\nkind = \"socket\"\n");
+    rig.push_str("socket = \"camera.sock\"\n[actuator]\nkind = \"serial\"\nport = \"pzt\"\n");
+    std::fs::write(root.join("rig.toml"), &rig).unwrap();
+    let r = succeed(
+        root,
+        "vision beads --as-loop rig.toml --rate-hz 200 --out loop --json",
+    )
+    .json();
+    assert_eq!(
+        (number(&r, "frames"), number(&r, "lost_frames")),
+        (29.0, 1.0)
+    );
+    // All but the two frames that confirm the bead.
+    assert_eq!(number(&r, "positions"), 27.0, "{r}");
+    let (names, rows) = rows(&root.join("loop/as-loop.csv"));
+    let column = |name: &str| names.iter().position(|n| n == name).unwrap();
+    let last = rows.last().unwrap();
+    assert_eq!(last[column("frame")], 29.0);
+    let um = places(29).map(|(x, _)| 0.2 * (x - 48.0));
+    assert!(
+        um.iter()
+            .any(|um| (um - last[column("bead_um")]).abs() < 0.02),
+        "{last:?}"
+    );
+    // The same settings for all beads, and a rig that does not know what its beads look like.
+    let r = succeed(root, "vision beads --rig rig.toml --out again --json").json();
+    assert_eq!(number(&r, "fixes"), 58.0, "{r}");
+    let (_, rest) = rig.split_once("[calibration]").unwrap();
+    std::fs::write(root.join("bare.toml"), format!("[calibration]{rest}")).unwrap();
+    let ran = cellpos(root, "vision beads --as-loop bare.toml --out none");
+    assert_eq!(ran.code, Some(2));
+    assert!(message(&ran).contains("cellpos vision"), "{}", ran.err);
+}
+
+#[test]
 fn cells_are_measured_against_the_background() {
     let folder = tempfile::tempdir().unwrap();
     let cells = folder.path().join("cells");
@@ -198,7 +250,9 @@ fn cells_are_measured_against_the_background() {
         assert!((row[column("y_px")] - 25.5).abs() < 0.2);
         assert!((row[column("area_px")] - 288.0).abs() < 15.0);
         assert!((row[column("length_px")] / row[column("width_px")] - 2.0).abs() < 0.15);
-        assert!((row[column("mean_contrast_grey")] - 40.0).abs() < 3.0);
+        assert!((row[column("rim_grey")] - 40.0).abs() < 4.0, "{row:?}");
+        assert!(row[column("sd_area_px")] > 0.0 && row[column("sd_length_px")] < 0.2);
+        assert_eq!(row[column("cell")], 0.0, "the number stays with the cell");
     }
     // The same against the empty channel recorded by itself.
     let empty = folder.path().join("empty");
@@ -272,9 +326,9 @@ fn every_recording_that_cannot_be_used_is_refused_with_what_would_be_right() {
     std::fs::write(root.join("headless.tif"), &whole[..200]).unwrap();
     std::fs::write(root.join("deep.tif"), tiff(64, 48, 32)).unwrap();
     std::fs::write(root.join("empty.tif"), tiff(0, 48, 8)).unwrap();
-    image::RgbImage::new(64, 48)
-        .save(root.join("colour.png"))
-        .unwrap();
+    let mut colour = image::RgbImage::new(64, 48);
+    colour.put_pixel(3, 2, image::Rgb([9, 9, 8]));
+    colour.save(root.join("colour.png")).unwrap();
     std::fs::write(root.join("notes.txt"), "no picture").unwrap();
     std::fs::create_dir(root.join("nothing")).unwrap();
     std::fs::write(
@@ -288,7 +342,10 @@ fn every_recording_that_cannot_be_used_is_refused_with_what_would_be_right() {
     )
     .unwrap();
 
-    let whole = cellpos(root, "vision whole.tif --out whole --json");
+    let whole = cellpos(
+        root,
+        "vision whole.tif --edge-px 5 --no-learning --out whole --json",
+    );
     assert_eq!(number(&whole.json(), "frames"), 1.0, "{}", whole.err);
     for (line, says) in [
         (
@@ -379,7 +436,7 @@ fn cameras_that_are_not_there_are_clear_errors() {
             "region 0x8+0+0",
         ),
         ("camera --recording beads --rate-hz 0", 2, "--rate-hz 0"),
-        ("camera --recording beads --duration 0s", 2, "--duration 0s"),
+        ("camera --recording beads --duration 0s", 2, "above zero"),
     ] {
         let ran = cellpos(folder.path(), line);
         assert_eq!(ran.code, Some(code), "{line}\n{}\n{}", ran.out, ran.err);

@@ -8,6 +8,7 @@
 #![allow(clippy::needless_range_loop)]
 
 use nalgebra::{DMatrix, DVector};
+use std::time::Instant;
 
 /// Variables: move blocks.
 pub const VARS: usize = 12;
@@ -102,8 +103,26 @@ pub enum QpEnd {
     Solved([f64; VARS]),
     /// No point keeps the bounds.
     Infeasible,
-    /// Too many iterations.
+    /// Stopped before the end: where the solver was. The point need not keep the bounds.
+    Stopped([f64; VARS]),
+    /// Nothing usable.
     GaveUp,
+}
+
+/// When a solver has to stop.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Stop {
+    /// At this time.
+    pub deadline: Option<Instant>,
+    /// After so many iterations: a recorded end again.
+    pub iterations: Option<u16>,
+}
+
+impl Stop {
+    fn is_met(&self, iterations: u16) -> bool {
+        self.iterations.is_some_and(|most| iterations >= most)
+            || self.deadline.is_some_and(|at| Instant::now() >= at)
+    }
 }
 
 impl QpMatrices {
@@ -248,22 +267,18 @@ impl QpMatrices {
 
     /// Solves, starting from a working set (that of the previous tick, or empty) and leaving the final one in it.
     /// Gives the end and the number of iterations.
-    pub fn solve(&self, v: &QpVectors, set: &mut WorkingSet) -> (QpEnd, u16) {
+    pub fn solve(&self, v: &QpVectors, set: &mut WorkingSet, stop: Stop) -> (QpEnd, u16) {
         const MOST: u16 = 200;
-        let mut z0 = [0.0; VARS];
-        for (z, row) in z0.iter_mut().zip(&self.inverse_factor) {
-            *z = -row.iter().zip(&v.linear).map(|(l, f)| l * f).sum::<f64>();
-        }
-        let mut z = self.warm(v, set, &z0);
+        let mut z = self.warm(v, set, &self.unconstrained_point(v));
         let mut iterations = 0;
         while let Some((row, side, _)) = self.most_violated(v, &z) {
             let mut multiplier = 0.0;
             loop {
-                iterations += 1;
-                if iterations > MOST {
+                if iterations >= MOST || stop.is_met(iterations) {
                     *set = WorkingSet::default();
-                    return (QpEnd::GaveUp, iterations);
+                    return (QpEnd::Stopped(self.variables(&z)), iterations);
                 }
+                iterations += 1;
                 let bound = if side > 0.0 { v.low[row] } else { v.high[row] };
                 let by = side * (bound - self.along(row, &z));
                 let mut r = [0.0; VARS];
@@ -319,12 +334,31 @@ impl QpMatrices {
                 }
             }
         }
+        (QpEnd::Solved(self.variables(&z)), iterations)
+    }
+
+    /// `z_0 = -L^-1 f`: the optimum without rows, in the transformed coordinates.
+    fn unconstrained_point(&self, v: &QpVectors) -> [f64; VARS] {
+        std::array::from_fn(|i| {
+            let row = &self.inverse_factor[i];
+            -row.iter().zip(&v.linear).map(|(l, f)| l * f).sum::<f64>()
+        })
+    }
+
+    /// `w = L'^-1 z`.
+    fn variables(&self, z: &[f64; VARS]) -> [f64; VARS] {
         let mut w = [0.0; VARS];
-        for (i, row) in self.inverse_factor.iter().enumerate() {
+        for (row, z) in self.inverse_factor.iter().zip(z) {
             for (w, l) in w.iter_mut().zip(row) {
-                *w += l * z[i];
+                *w += l * z;
             }
         }
-        (QpEnd::Solved(w), iterations)
+        w
+    }
+
+    /// The optimum without rows, and whether it keeps them all: then it is the solution, and there is nothing to solve.
+    pub fn without_rows(&self, v: &QpVectors) -> ([f64; VARS], bool) {
+        let z = self.unconstrained_point(v);
+        (self.variables(&z), self.most_violated(v, &z).is_none())
     }
 }

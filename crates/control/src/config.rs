@@ -3,12 +3,12 @@
 //! Unknown keys are refused with a suggestion; every number has its unit in the key. The plant is not part of this
 //! file: it is the model.toml beside it.
 
+use crate::controller::{Controller, ControllerConfig, LoopConfig};
 use crate::design::DesignPlant;
 use crate::error::BuildError;
 use crate::estimator::EstimatorConfig;
-use crate::feedback::Lqg;
 use crate::limits::Limits;
-use crate::loop_io::{ControllerConfig, LoopConfig};
+use crate::lqg::Lqg;
 use crate::mpc::Mpc;
 use crate::pi::{Lead, Pi};
 use crate::toml_file::{self, ConfigError, TomlFile};
@@ -210,7 +210,7 @@ impl ControllerFile {
             controller: self.controller_config(),
             limits: self.limits,
         };
-        crate::control_loop::ControlLoop::new(config).map_err(ConfigError::build("controller"))?;
+        Controller::new(config).map_err(ConfigError::build("controller"))?;
         Ok(config)
     }
 }

@@ -67,6 +67,22 @@ pub enum BuildError {
         /// Imaginary part, rad/s.
         im: f64,
     },
+    /// A law has more columns of its own than a record holds.
+    #[error("the control law names {given} columns: a record holds {most}")]
+    TooManyColumns {
+        /// Columns named.
+        given: usize,
+        /// Columns that can be held.
+        most: usize,
+    },
+    /// A column that cannot be one.
+    #[error(
+        "the control law's column `{name}`: a name is lower-case letters, digits and `_`, and stands once"
+    )]
+    Column {
+        /// Its name.
+        name: &'static str,
+    },
     /// An iteration that must converge for a well-posed problem did not.
     #[error("{what} did not converge: check the model and the weights")]
     NoConvergence {

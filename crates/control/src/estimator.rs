@@ -8,21 +8,26 @@
 //! Brownian motion drives `q` with variance `2 D Ts` per tick, neutral is a random walk, and a relative uncertainty of
 //! the gain widens the covariance in proportion to the motion it predicts.
 
+mod config;
 mod exposure;
 mod stuck;
 mod transition;
 
-use crate::error::{BuildError, check};
+use crate::error::BuildError;
 use crate::loop_model::{LoopModel, MODES};
-use serde::{Deserialize, Serialize};
-use stuck::RELEASED_TICKS;
 use transition::Transition;
 
-pub(crate) use stuck::EVIDENCE_GRID;
-pub(crate) use transition::Moment;
+pub use config::EstimatorConfig;
+pub use transition::PredictedState;
 
-/// Past commands held.
-pub const HISTORY: usize = 6;
+/// Past commands held: a delay of up to 15 samples, which is 3 ms at 5 kHz.
+pub const HISTORY: usize = 16;
+
+/// Ticks by which a frame may be late and still be used at its own time.
+const LONGEST_LAG: usize = 3;
+
+/// Ticks over which the fastest motion is looked for.
+const FASTEST_TICKS: usize = 6;
 
 /// Uncertainty of neutral once the filter has been wrong for many fixes, um: half the range of the PZT.
 const LOST_NEUTRAL_UM: f64 = 20.0;
@@ -31,6 +36,9 @@ const LOST_NEUTRAL_UM: f64 = 20.0;
 /// the same bead.
 const GATE_LAG_TICKS: f64 = 1.0;
 
+/// Ticks after a bead came free for which its speed stays bounded.
+const RELEASED_TICKS: u8 = 50;
+
 /// Weight of a fix in the average position of a stuck bead.
 const STUCK_AVERAGE: f64 = 0.05;
 
@@ -38,77 +46,11 @@ const STUCK_AVERAGE: f64 = 0.05;
 /// wrong because neutral was.
 const RELEASED_NEUTRAL_UM: f64 = 0.5;
 
-/// Variance of spread level 0, um^2.
+/// What the variance per tick that a wrong gain may cause keeps of itself from tick to tick: it halves in 8 ticks.
+const SPREAD_KEPT: f64 = 0.917_004_043_204_671_2;
+
+/// Variance that a wrong gain may cause below which it is none, um^2.
 const LEAST_SPREAD_UM2: f64 = 1e-6;
-
-fn spread_um2(level: u8) -> f64 {
-    if level == 0 {
-        0.0
-    } else {
-        LEAST_SPREAD_UM2 * (f64::from(level) / 8.0).exp2()
-    }
-}
-
-/// The level after one more tick. It follows the crests: a filter whose gain rose and fell within each cycle of a motion
-/// would rectify the innovations of that cycle into a false neutral.
-fn raised(level: u8, variance_um2: f64) -> u8 {
-    let wanted = if variance_um2 > LEAST_SPREAD_UM2 {
-        (8.0 * (variance_um2 / LEAST_SPREAD_UM2).log2()).min(255.0) as u8
-    } else {
-        0
-    };
-    wanted.max(level.saturating_sub(1))
-}
-
-/// Noise and gate of the estimator.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct EstimatorConfig {
-    /// Diffusion coefficient D of the bead, um^2/s.
-    pub diffusion_um2_per_s: f64,
-    /// Random walk of neutral, um/sqrt(s).
-    pub neutral_walk_um_per_sqrt_s: f64,
-    /// Relative standard uncertainty of the plant's gain.
-    pub gain_uncertainty: f64,
-    /// Standard uncertainty of neutral at the start, um.
-    pub neutral_initial_um: f64,
-    /// Localisation noise assumed where a fix states none, um (standard deviation).
-    pub fix_noise_um: f64,
-    /// By how much smaller than it is the variance of a fix is taken when the estimate is corrected by it: 1 is the Kalman
-    /// filter, the best for the model as it is; more brings the loop nearer to its state feedback, whose margins a filter
-    /// that trusts the model takes away (loop transfer recovery, Doyle and Stein 1979). The gate has the variance as it is.
-    pub recovery: f64,
-    /// Exposure of a frame, ms; at most a tick. A fix is the mean over it of a path that bends where a command takes effect.
-    pub exposure_ms: f64,
-    /// An innovation larger than this many standard deviations is refused.
-    pub gate_sigma: f64,
-    /// ... unless it is smaller than this and the fastest motion of the last ticks, um.
-    pub gate_floor_um: f64,
-    /// After this many refused measurements in a row the next one is believed.
-    pub gate_most: u8,
-    /// Bead speed granted while the bead is taken for stuck, um per tick: bounds the jump when it comes free. Twice that
-    /// is granted for 50 ticks afterwards, so that it goes to a far reference without a jerk.
-    pub stuck_speed_um_per_tick: f64,
-}
-
-impl Default for EstimatorConfig {
-    /// A 1 um bead mid-slit (D = 0.33 um^2/s) with 20 nm fixes.
-    fn default() -> Self {
-        Self {
-            diffusion_um2_per_s: 0.33,
-            neutral_walk_um_per_sqrt_s: 0.015,
-            gain_uncertainty: 0.2,
-            neutral_initial_um: 2.0,
-            fix_noise_um: 0.020,
-            recovery: 10.0,
-            exposure_ms: 0.0,
-            gate_sigma: 6.0,
-            gate_floor_um: 0.5,
-            gate_most: 10,
-            stuck_speed_um_per_tick: 0.5,
-        }
-    }
-}
 
 /// State of the estimator.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -125,9 +67,8 @@ pub struct EstimatorState {
     pub history_um: [f64; HISTORY],
     /// Evidence that the bead is stuck, natural logarithm of the odds, 0 or more.
     pub stuck_evidence: f64,
-    /// Level of the variance per tick that a wrong gain may cause: eight to a factor of two, 0 for none. It rises at
-    /// once and falls by one a tick.
-    pub spread_level: u8,
+    /// Variance per tick that a wrong gain may cause, um^2.
+    pub spread_um2: f64,
     /// Ticks by which the filter's time lies behind the nominal delay.
     pub lag: u8,
     /// Refused measurements in a row.
@@ -142,22 +83,29 @@ pub struct EstimatorState {
 
 /// What the estimator knows after a measurement (or its absence).
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) struct Estimate {
+pub struct Estimate {
+    /// Bead position now, just before the command takes effect, um.
     pub position_um: f64,
+    /// Neutral: the PZT displacement at which the bead rests, um.
     pub neutral_um: f64,
+    /// What this tick's measurement shows by the model, um.
     pub predicted_measurement_um: f64,
+    /// Measurement less its prediction, um.
     pub innovation_um: f64,
     /// The measurement was used, at its nominal time.
     pub fresh: bool,
     /// No measurement was used.
     pub coasting: bool,
+    /// The measurement was refused by the innovation gate.
     pub gated: bool,
+    /// A measurement has been used at some time.
     pub seen: bool,
+    /// The bead is taken for stuck.
     pub stuck: bool,
     /// Largest distance of the command from neutral, um; infinite unless the bead is stuck or has just come free.
     pub authority_um: f64,
     /// The present as a state, for state feedback.
-    pub now: Moment,
+    pub now: PredictedState,
 }
 
 /// A fix as the estimator takes it: finite and within reason.
@@ -190,79 +138,7 @@ impl Estimator {
     /// A value out of range, or a delay that needs more than [`HISTORY`] past commands.
     pub fn new(config: EstimatorConfig, model: LoopModel) -> Result<Self, BuildError> {
         model.validate()?;
-        let c = &config;
-        check(
-            "diffusion_um2_per_s",
-            "um^2/s",
-            c.diffusion_um2_per_s,
-            c.diffusion_um2_per_s > 0.0,
-            "positive",
-        )?;
-        let walk = c.neutral_walk_um_per_sqrt_s;
-        check(
-            "neutral_walk_um_per_sqrt_s",
-            "um/sqrt(s)",
-            walk,
-            walk >= 0.0,
-            "0 or more",
-        )?;
-        check(
-            "gain_uncertainty",
-            "",
-            c.gain_uncertainty,
-            (0.0..=10.0).contains(&c.gain_uncertainty),
-            "0 to 10",
-        )?;
-        check(
-            "neutral_initial_um",
-            "um",
-            c.neutral_initial_um,
-            c.neutral_initial_um > 0.0,
-            "positive",
-        )?;
-        check(
-            "fix_noise_um",
-            "um",
-            c.fix_noise_um,
-            c.fix_noise_um > 0.0,
-            "positive",
-        )?;
-        check(
-            "recovery",
-            "",
-            c.recovery,
-            (1.0..=1e6).contains(&c.recovery),
-            "1 (Kalman filter) to 1000000",
-        )?;
-        check(
-            "exposure_ms",
-            "ms",
-            c.exposure_ms,
-            (0.0..=1e3 * model.sample_time_s).contains(&c.exposure_ms),
-            "0 to a tick",
-        )?;
-        check(
-            "gate_sigma",
-            "",
-            c.gate_sigma,
-            c.gate_sigma > 0.0,
-            "positive",
-        )?;
-        check(
-            "gate_floor_um",
-            "um",
-            c.gate_floor_um,
-            c.gate_floor_um >= 0.0,
-            "0 or more",
-        )?;
-        let speed = c.stuck_speed_um_per_tick;
-        check(
-            "stuck_speed_um_per_tick",
-            "um",
-            speed,
-            speed > 0.0,
-            "positive",
-        )?;
+        config.validate(model.sample_time_s)?;
         let samples = model.delay_samples();
         let delay_ticks = (samples - 1e-9).ceil().max(0.0) as usize;
         if delay_ticks + 1 > HISTORY {
@@ -278,7 +154,7 @@ impl Estimator {
             tick: Transition::new(&model, 1.0),
             part: Transition::new(&model, if part < 1e-9 { 0.0 } else { part }),
             delay_ticks,
-            longest_lag: HISTORY - 1 - delay_ticks,
+            longest_lag: LONGEST_LAG.min(HISTORY - 1 - delay_ticks),
         })
     }
 
@@ -306,7 +182,7 @@ impl Estimator {
             modes: [0.0; MODES],
             history_um: [command_um; HISTORY],
             stuck_evidence: 0.0,
-            spread_level: 0,
+            spread_um2: 0.0,
             lag: 0,
             gated: 0,
             seen: false,
@@ -316,7 +192,7 @@ impl Estimator {
     }
 
     /// Position from the state at one time, um.
-    pub(crate) fn position(&self, m: &Moment) -> f64 {
+    pub(crate) fn position(&self, m: &PredictedState) -> f64 {
         let modes: f64 = m
             .modes
             .iter()
@@ -336,9 +212,9 @@ impl Estimator {
             .unwrap_or(last)
     }
 
-    fn filter_moment(&self, state: &EstimatorState) -> Moment {
+    fn filter_state(&self, state: &EstimatorState) -> PredictedState {
         let back = self.delay_ticks + usize::from(state.lag);
-        Moment {
+        PredictedState {
             q: state.integrator_um,
             n: state.neutral_um,
             modes: state.modes,
@@ -355,7 +231,7 @@ impl Estimator {
     fn advance_filter(&self, state: &mut EstimatorState) -> f64 {
         let back = self.delay_ticks + usize::from(state.lag);
         let command = Self::command(state, back.max(1));
-        let m = self.filter_moment(state);
+        let m = self.filter_state(state);
         let motion = self.tick.gain * (command - m.n);
         let ts = self.model.sample_time_s;
         let [p11, p12, p22] = state.covariance_um2;
@@ -371,11 +247,14 @@ impl Estimator {
         state.modes = next.modes;
         let g = self.tick.gain;
         let spread = self.config.gain_uncertainty * self.net_motion(state, back, m.n);
-        state.spread_level = raised(state.spread_level, spread * spread);
+        // It rises at once and falls slowly, so that it follows the crests: a filter whose gain rose and fell within each
+        // cycle of a motion would rectify the innovations of that cycle into a false neutral.
+        let crest = (SPREAD_KEPT * state.spread_um2).max(spread * spread);
+        state.spread_um2 = if crest > LEAST_SPREAD_UM2 { crest } else { 0.0 };
         let p11n = p11 - 2.0 * g * p12
             + g * g * p22
             + 2.0 * self.config.diffusion_um2_per_s * ts
-            + spread_um2(state.spread_level);
+            + state.spread_um2;
         state.covariance_um2 = if p11n < 1e6 {
             [p11n, p12 - g * p22, p22n]
         } else {
@@ -400,11 +279,12 @@ impl Estimator {
     /// The furthest that the model says the bead has gone in one of the last ticks, um.
     fn fastest_motion(&self, state: &EstimatorState) -> f64 {
         let motion_um = |command: &f64| (self.tick.gain * (command - state.neutral_um)).abs();
-        state.history_um.iter().map(motion_um).fold(0.0, f64::max)
+        let newest = state.history_um.iter().take(FASTEST_TICKS);
+        newest.map(motion_um).fold(0.0, f64::max)
     }
 
     /// From the filter's time to that of its measurement.
-    fn at_measurement(&self, m: &Moment, command_um: f64, stuck: bool) -> Moment {
+    fn at_measurement(&self, m: &PredictedState, command_um: f64, stuck: bool) -> PredictedState {
         if self.part.fraction == 0.0 || stuck {
             *m
         } else {
@@ -449,7 +329,7 @@ impl Estimator {
         if was_stuck && !state.stuck {
             state.released_ticks = RELEASED_TICKS;
         }
-        let mut m = self.filter_moment(state);
+        let mut m = self.filter_state(state);
         let mut predicted = m;
         let back = self.delay_ticks + usize::from(state.lag);
         for ticks_ago in (1..=back).rev() {
@@ -486,7 +366,7 @@ impl Estimator {
 
     /// Uses a fix at the filter's time. Returns whether it was accepted, and the innovation.
     fn update(&self, state: &mut EstimatorState, fix: &Fix, motion_um: f64) -> (bool, f64) {
-        let from = self.filter_moment(state);
+        let from = self.filter_state(state);
         let part = self.part_of(fix);
         // An exposure before the filter's time lies in the tick of the command before.
         let back = self.delay_ticks + usize::from(state.lag);
@@ -510,7 +390,10 @@ impl Estimator {
         let [p11, p12, p22] = state.covariance_um2;
         let h = -part.gain;
         let (ph1, ph2) = (p11 + h * p12, p12 + h * p22);
-        let spread = ph1 + h * ph2 + fix.variance_um2;
+        // Between the filter's time and that of the exposure the bead went its Brownian way, which no command tells.
+        let apart_s = fix.offset.abs() * self.model.sample_time_s;
+        let walk_um2 = 2.0 * self.config.diffusion_um2_per_s * apart_s;
+        let spread = ph1 + h * ph2 + walk_um2 + fix.variance_um2;
         // A stuck bead that comes free may move far in a frame.
         let widest = if state.stuck { 10.0 } else { 1.0 };
         let floor_um = self.config.gate_floor_um + GATE_LAG_TICKS * self.fastest_motion(state);
@@ -546,7 +429,7 @@ impl Estimator {
             state.covariance_um2[2] = p22.max(RELEASED_NEUTRAL_UM.powi(2));
             return (true, innovation);
         }
-        let trusted = spread - fix.variance_um2 + fix.variance_um2 / self.config.recovery;
+        let trusted = spread - fix.variance_um2 + fix.variance_um2 / self.config.ltr_noise_scaling;
         let (k1, k2) = (ph1 / trusted, ph2 / trusted);
         state.integrator_um += k1 * innovation;
         state.neutral_um += k2 * innovation;
@@ -568,13 +451,13 @@ impl Estimator {
         self.delay_ticks
     }
 
-    /// The moment one tick later.
-    pub(crate) fn tick_moment(&self, m: &Moment, command_um: f64) -> Moment {
+    /// The state one tick later.
+    pub(crate) fn tick_state(&self, m: &PredictedState, command_um: f64) -> PredictedState {
         self.tick.advance(m, command_um)
     }
 
     /// The position that a measurement made at the filter's time `m` shows, um; `command_um` is in force after `m`.
-    pub(crate) fn measured_moment(&self, m: &Moment, command_um: f64) -> f64 {
+    pub(crate) fn position_measured(&self, m: &PredictedState, command_um: f64) -> f64 {
         self.position(&self.at_measurement(m, command_um, false))
     }
 

@@ -3,7 +3,7 @@
 //! The sampled plant `y_(k+1) = C A s_k + C B u_k` has all its zeros inside the unit circle, so `u_k` follows from the
 //! next reference. (The biproper form of Eq. (6) has a zero at z = -19.3 and must never be inverted.)
 
-use crate::feedback::{DEVIATION, Deviation};
+use crate::deviation::{DEVIATION, Deviation};
 use crate::loop_model::{LoopModel, MODES};
 
 /// State of the inverse: the model's state on the reference.
@@ -19,7 +19,7 @@ pub struct FeedForwardState {
 
 impl FeedForwardState {
     /// Every number is one that a bead and a PZT can have.
-    pub(crate) fn is_sound(&self) -> bool {
+    fn is_sound(&self) -> bool {
         self.integrator_um.abs() < 1e7
             && self.last_um.abs() < 1e7
             && self.modes.iter().all(|x| x.abs() < 1e7)
@@ -89,9 +89,13 @@ impl FeedForward {
         state.integrator_um + modes + self.feedthrough * state.last_um
     }
 
-    /// Puts the state on the reference of this tick: a jump that no preview announced moves the integrator part.
+    /// Puts the state on the reference of this tick: a jump that no preview announced moves the integrator part. A state
+    /// that nothing can have is put at rest.
     pub(crate) fn meet(&self, state: &mut FeedForwardState, reference_um: f64) {
         state.integrator_um += reference_um - self.position(state);
+        if !state.is_sound() {
+            *state = Self::rest(reference_um);
+        }
     }
 }
 

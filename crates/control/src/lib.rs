@@ -1,6 +1,6 @@
 //! Controllers, estimators, references, output limits and loop design.
 //!
-//! Everything here is a pure step function: configuration is immutable and kept apart from a `Copy` state, no device
+//! Everything here is a pure step function: configuration is immutable and kept apart from the state, no device
 //! and no clock is known, and a step neither allocates nor can panic. The same [`ControlLoop`] runs on the real clock,
 //! on the virtual one, in a replay and in [`design`]'s simulations.
 //!
@@ -13,46 +13,51 @@
 pub mod active_set;
 mod config;
 mod control_loop;
+mod controller;
 pub mod design;
+mod deviation;
 mod error;
 mod estimator;
-mod feedback;
 mod feedforward;
+pub mod law;
 pub mod learning;
 mod limits;
 mod linear;
 mod loop_io;
 mod loop_model;
+mod lqg;
 mod monitor;
 mod mpc;
 mod pi;
 mod reference;
 pub mod riccati;
 mod simulation;
-mod state;
 mod toml_file;
+mod uncertainty;
 
 pub use config::{ControllerFile, ControllerKind, PiFile};
-pub use control_loop::{ControlLoop, Controller};
+pub use control_loop::{ControlLoop, LoopState};
+pub use controller::{Controller, ControllerConfig, LoopConfig};
 pub use error::{BuildError, Parameter};
-pub use estimator::{Estimator, EstimatorConfig, EstimatorState, HISTORY};
-pub use feedback::{Feedback, Lqg};
+pub use estimator::{
+    Estimate, Estimator, EstimatorConfig, EstimatorState, HISTORY, PredictedState,
+};
 pub use feedforward::FeedForwardState;
+pub use law::{
+    ControlLaw, LAW_COLUMNS, LawInput, LawOutput, SolverReport, SolverStatus, SolverTerms,
+};
 pub use learning::{
     CycleLearning, HarmonicResponse, LearnConfig, LearnError, LearnedHarmonic, LearnedTable,
     Learner, LearnerState,
 };
 pub use limits::{Limited, Limits};
 pub use linear::LinearLaw;
-pub use loop_io::{
-    ControllerConfig, LoopConfig, LoopFlags, LoopInput, LoopOutput, Measurement, Mode,
-    SolverReport, SolverStatus, SolverTerms,
-};
+pub use loop_io::{LoopFlags, LoopInput, LoopOutput, LoopParts, Measurement, Mode};
 pub use loop_model::{LoopMode, LoopModel, MODES};
+pub use lqg::{Feedback, Lqg, LqgLaw};
 pub use monitor::{PlantEstimate, PlantMonitor, PlantMonitorState, PlantVerdict};
-pub use mpc::{HORIZON, Mpc, SolverKind};
-pub use pi::{Lead, Pi, PiState};
+pub use mpc::{HORIZON, Mpc, MpcLaw, MpcState, SolverKind};
+pub use pi::{Lead, Pi, PiLaw, PiState};
 pub use reference::{Points, Profile, Reference, Shape, fill_preview};
 pub use simulation::{RigConfig, SimulatedRig};
-pub use state::{LoopState, STATE_LEN};
 pub use toml_file::ConfigError;

@@ -42,9 +42,8 @@ pub struct Limited {
     pub not_finite: bool,
 }
 
-/// Commands lie on a grid of this many steps over the range (2.4 pm for 40 um), so that two pack exactly into the
-/// integer part of one `f64` of the recorded state.
-pub(crate) const GRID_STEPS: f64 = 16_777_215.0;
+/// Part of the range by which a request may pass a limit before that counts: 2.4 pm of 40 um, far below any DAC's step.
+const ROUNDING: f64 = 6e-8;
 
 impl Limits {
     /// Checks that the range is a range, the slew positive and the park displacement within the range.
@@ -78,46 +77,17 @@ impl Limits {
         )
     }
 
-    /// Grid index of a displacement within the range.
-    pub(crate) fn index(&self, command_um: f64) -> f64 {
-        let steps = (command_um - self.low_um) / (self.high_um - self.low_um) * GRID_STEPS;
-        if steps.is_finite() {
-            steps.round().clamp(0.0, GRID_STEPS)
-        } else {
-            0.0
-        }
-    }
-
-    /// Displacement of a grid index, um.
-    pub(crate) fn at_index(&self, index: f64) -> f64 {
-        (self.low_um + index * (self.high_um - self.low_um) / GRID_STEPS)
-            .clamp(self.low_um, self.high_um)
-    }
-
-    /// The nearest whole number of steps of the command grid, um; 0 for a number that is not finite. A command less such
-    /// an amount is still on the grid.
-    pub(crate) fn to_steps(self, amount_um: f64) -> f64 {
-        let step_um = (self.high_um - self.low_um) / GRID_STEPS;
-        if amount_um.is_finite() {
-            (amount_um / step_um).round() * step_um
-        } else {
-            0.0
-        }
-    }
-
-    /// The nearest displacement within the range and on the command grid, um; park for a number that is not finite.
-    pub fn to_grid(&self, displacement_um: f64) -> f64 {
+    /// The nearest displacement within the range, um; park for a number that is not finite.
+    pub fn nearest(&self, displacement_um: f64) -> f64 {
         let wanted = if displacement_um.is_finite() {
             displacement_um
         } else {
             self.park_um
         };
-        self.at_index(self.index(wanted.clamp(self.low_um, self.high_um)))
+        wanted.clamp(self.low_um, self.high_um)
     }
 
     /// Limits a request, given the previous command (already within the range) and the sample time.
-    ///
-    /// The result is on the command grid, rounded towards the previous command, so that rounding breaks no limit.
     pub fn apply(&self, requested_um: f64, previous_um: f64, sample_time_s: f64) -> Limited {
         let not_finite = !requested_um.is_finite();
         let wanted = if not_finite {
@@ -127,32 +97,13 @@ impl Limits {
         };
         let in_range = wanted.clamp(self.low_um, self.high_um);
         let most = self.slew_um_per_s * sample_time_s;
-        let limited = in_range.clamp(previous_um - most, previous_um + most);
-        let mut index = self.index(limited);
-        let mut command_um = self.at_index(index);
-        let overshoots = if limited >= previous_um {
-            command_um > limited
-        } else {
-            command_um < limited
-        };
-        if overshoots {
-            index += if limited >= previous_um { -1.0 } else { 1.0 };
-            command_um = self.at_index(index.clamp(0.0, GRID_STEPS));
-            let passed = if limited >= previous_um {
-                command_um < previous_um
-            } else {
-                command_um > previous_um
-            };
-            if passed {
-                command_um = previous_um;
-            }
-        }
-        // A request that misses a limit by less than the grid resolves keeps to it but for rounding.
-        let step_um = (self.high_um - self.low_um) / GRID_STEPS;
+        let command_um = in_range.clamp(previous_um - most, previous_um + most);
+        // A plan within the limits may miss them by the rounding of its arithmetic.
+        let least_um = ROUNDING * (self.high_um - self.low_um);
         Limited {
             command_um,
-            range: (in_range - wanted).abs() > step_um,
-            slew: (limited - in_range).abs() > step_um,
+            range: (in_range - wanted).abs() > least_um,
+            slew: (command_um - in_range).abs() > least_um,
             not_finite,
         }
     }

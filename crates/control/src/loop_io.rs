@@ -1,13 +1,9 @@
 //! What a loop is built from, what a tick of it is given, and what it gives.
 
-use crate::error::BuildError;
 use crate::estimator::EstimatorConfig;
-use crate::feedback::Lqg;
+use crate::law::{SolverReport, SolverTerms};
 use crate::limits::Limits;
-use crate::linear::LinearLaw;
 use crate::loop_model::LoopModel;
-use crate::mpc::Mpc;
-use crate::pi::Pi;
 
 /// A bead position from vision.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -52,20 +48,10 @@ pub struct LoopInput<'a> {
     /// A learned correction of the feed-forward, added in [`Mode::Run`], um of PZT. The estimator is not told of it:
     /// it is what the plant needs beyond what the model says, so that with it the model is right along the reference.
     pub learned_um: f64,
+    /// Time since the previous command, s, where it is shorter than a tick: the slew limit holds by the clock.
+    pub slew_time_s: Option<f64>,
     /// How long an optimising controller may take.
     pub solver: SolverTerms,
-}
-
-/// How long an optimising controller may take in a tick.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub enum SolverTerms {
-    /// As long as it needs: the virtual clock.
-    #[default]
-    Unlimited,
-    /// Until then; the time that it took is reported.
-    Until(std::time::Instant),
-    /// A recorded tick again: it ends as it ended then. Without this a deadline would not replay to the bit.
-    Recorded(SolverStatus),
 }
 
 /// What happened in a tick.
@@ -83,46 +69,6 @@ pub struct LoopFlags {
     pub gated: bool,
     /// The bead does not follow the PZT and is taken for stuck.
     pub stuck: bool,
-}
-
-/// How the optimiser of a tick ended.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-#[repr(u8)]
-pub enum SolverStatus {
-    /// The controller does not optimise.
-    #[default]
-    NotUsed = 0,
-    /// Solved.
-    Solved = 1,
-    /// Out of time or iterations: the shifted previous plan was used.
-    PreviousPlan = 2,
-    /// No plan was left: PI was used.
-    FallbackPi = 3,
-}
-
-impl SolverStatus {
-    /// The status of a number in a record; anything unknown counts as not used.
-    pub fn from_number(number: u8) -> Self {
-        match number {
-            1 => Self::Solved,
-            2 => Self::PreviousPlan,
-            3 => Self::FallbackPi,
-            _ => Self::NotUsed,
-        }
-    }
-}
-
-/// Account of the optimiser of a tick.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub struct SolverReport {
-    /// How it ended.
-    pub status: SolverStatus,
-    /// Iterations.
-    pub iterations: u16,
-    /// Constraints active at the solution.
-    pub active: u16,
-    /// Time it took, ns; 0 where no deadline was set.
-    pub solve_ns: u32,
 }
 
 /// What a tick gives.
@@ -146,54 +92,27 @@ pub struct LoopOutput {
     pub solver: SolverReport,
 }
 
-/// Which control law.
+/// Everything that a loop with the law `L` is built from.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub enum ControllerConfig {
-    /// PI, with or without lead.
-    Pi(Pi),
-    /// State feedback on the estimate, with feed-forward of the previewed reference.
-    Lqg(Lqg),
-    /// Model predictive control under the limits, with preview; PI as the last fallback.
-    Mpc(Mpc, Pi),
-}
-
-impl ControllerConfig {
-    pub(crate) fn pi(&self) -> Pi {
-        match self {
-            Self::Pi(pi) | Self::Mpc(_, pi) => *pi,
-            Self::Lqg(_) => Pi::new(0.0, 0.0),
-        }
-    }
-
-    /// The feedback part without limits.
-    ///
-    /// # Errors
-    /// [`BuildError`] naming the parameter, or a Riccati equation without solution.
-    pub fn linear(
-        &self,
-        estimator: &EstimatorConfig,
-        model: &LoopModel,
-    ) -> Result<LinearLaw, BuildError> {
-        match self {
-            Self::Pi(pi) => Ok(LinearLaw::Pi {
-                pi: *pi,
-                sample_time_s: model.sample_time_s,
-            }),
-            Self::Lqg(lqg) => lqg.feedback(model)?.linear(estimator, model),
-            Self::Mpc(mpc, _) => mpc.feedback(model)?.linear(estimator, model),
-        }
-    }
-}
-
-/// Everything that a loop is built from.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct LoopConfig {
+pub struct LoopParts<L> {
     /// The plant.
     pub model: LoopModel,
     /// Estimator.
     pub estimator: EstimatorConfig,
-    /// Control law.
-    pub controller: ControllerConfig,
+    /// Control law: one of this crate by its configuration, or any [`crate::ControlLaw`].
+    pub controller: L,
     /// Limits of the command.
     pub limits: Limits,
+}
+
+impl<L> LoopParts<L> {
+    /// The same with another law.
+    pub fn with<M>(self, controller: M) -> LoopParts<M> {
+        LoopParts {
+            model: self.model,
+            estimator: self.estimator,
+            controller,
+            limits: self.limits,
+        }
+    }
 }

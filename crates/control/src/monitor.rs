@@ -10,7 +10,7 @@
 //! start is no alarm. It only watches: no command depends on it.
 
 use crate::error::BuildError;
-use crate::estimator::{Estimator, EstimatorConfig, HISTORY, Moment};
+use crate::estimator::{Estimator, EstimatorConfig, HISTORY, PredictedState};
 use crate::loop_model::LoopModel;
 use serde::Serialize;
 
@@ -151,7 +151,7 @@ pub struct PlantMonitor {
 /// State of a [`PlantMonitor`].
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PlantMonitorState {
-    moment: Moment,
+    model: PredictedState,
     commands_um: [f64; HISTORY + 2],
     fast: Sums,
     slow: Sums,
@@ -201,7 +201,7 @@ impl PlantMonitor {
     /// A plant at rest at a command.
     pub fn start(&self, command_um: f64) -> PlantMonitorState {
         PlantMonitorState {
-            moment: Moment::default(),
+            model: PredictedState::default(),
             commands_um: [command_um; HISTORY + 2],
             fast: NOTHING,
             slow: NOTHING,
@@ -243,19 +243,19 @@ impl PlantMonitor {
         };
         // The model at the time of this tick's frame, driven by what was in force before it. Its position starts anew
         // each tick, so that nothing grows over hours: only the increment counts.
-        let mut from = state.moment;
+        let mut from = state.model;
         from.q = 0.0;
         from.n = neutral_um;
         from.last_um = command(delay + 2);
-        let before = self.estimator.measured_moment(&from, command(delay + 1));
-        let to = self.estimator.tick_moment(&from, command(delay + 1));
+        let before = self.estimator.position_measured(&from, command(delay + 1));
+        let to = self.estimator.tick_state(&from, command(delay + 1));
         let part = if delay > 0 {
             command(delay)
         } else {
             command_um
         };
-        let increment_um = self.estimator.measured_moment(&to, part) - before;
-        state.moment = to;
+        let increment_um = self.estimator.position_measured(&to, part) - before;
+        state.model = to;
         state.commands_um.rotate_right(1);
         state.commands_um[0] = command_um;
         if let (Some(now), Some(last), Some(predicted)) =

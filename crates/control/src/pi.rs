@@ -5,6 +5,7 @@
 //! Gains: `kp` in um of PZT per um of bead, `ki` in 1/s (um of PZT per um of bead and second).
 
 use crate::error::{BuildError, check};
+use crate::law::{ControlLaw, FAR_UM, LawInput, LawOutput};
 use serde::{Deserialize, Serialize};
 
 /// A lead `(1 + s/wz) / (1 + s/wp)` with `wz < wp`, discretised by Tustin's rule.
@@ -117,29 +118,36 @@ pub struct PiState {
     pub integral_um: f64,
     /// Memory of the lead, um of bead.
     pub lead_um: f64,
+    /// Proportional part of this tick, um of PZT.
+    pub proportional_um: f64,
 }
 
-/// A PI controller ready to step: coefficients for one sample time.
+/// The PI law: coefficients for one sample time.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) struct PiStep {
+pub struct PiLaw {
     config: Pi,
     lead: Option<(f64, f64, f64)>,
     integral_per_tick: f64,
     tracking_per_tick: f64,
 }
 
-impl PiStep {
-    pub(crate) fn new(config: Pi, sample_time_s: f64) -> Self {
-        Self {
+impl PiLaw {
+    /// The law of a configuration.
+    ///
+    /// # Errors
+    /// As [`Pi::validate`].
+    pub fn new(config: Pi, sample_time_s: f64) -> Result<Self, BuildError> {
+        config.validate()?;
+        Ok(Self {
             config,
             lead: config.lead.map(|l| l.coefficients(sample_time_s)),
             integral_per_tick: config.ki_per_s * sample_time_s,
             tracking_per_tick: (sample_time_s / config.tracking_time_s).min(1.0),
-        }
+        })
     }
 
     /// The proportional part, um of PZT; advances the lead's memory.
-    pub(crate) fn proportional(&self, state: &mut PiState, reference_um: f64, bead_um: f64) -> f64 {
+    fn proportional(&self, state: &mut PiState, reference_um: f64, bead_um: f64) {
         let error = self.config.setpoint_weight * reference_um - bead_um;
         let shaped = match self.lead {
             Some((b0, b1, a1)) => {
@@ -149,38 +157,75 @@ impl PiStep {
             }
             None => error,
         };
-        self.config.kp * shaped
-    }
-
-    /// The integral part of this tick's output, um of PZT. `hold` stops the integration (bead lost or stuck).
-    pub(crate) fn integral(&self, state: &PiState, error_um: f64, hold: bool) -> f64 {
-        state.integral_um
-            + if hold {
-                0.0
-            } else {
-                0.5 * self.integral_per_tick * error_um
-            }
-    }
-
-    /// Integrates and back-calculates, after the limits have acted.
-    pub(crate) fn integrate(
-        &self,
-        state: &mut PiState,
-        error_um: f64,
-        requested_um: f64,
-        command_um: f64,
-        hold: bool,
-    ) {
-        let growth = if hold {
-            0.0
-        } else {
-            self.integral_per_tick * error_um
-        };
-        state.integral_um += growth + (command_um - requested_um) * self.tracking_per_tick;
+        state.proportional_um = self.config.kp * shaped;
     }
 
     /// Makes the next proportional + integral output equal to `command_um` (bumpless return to control).
-    pub(crate) fn track(&self, state: &mut PiState, proportional_um: f64, command_um: f64) {
-        state.integral_um = command_um - proportional_um;
+    pub(crate) fn track(&self, state: &mut PiState, command_um: f64) {
+        state.integral_um = command_um - state.proportional_um;
+        Self::sound(state, command_um);
+    }
+
+    /// A state that nothing can have is put at rest at the command in force.
+    fn sound(state: &mut PiState, command_um: f64) {
+        if !(state.integral_um.abs() < FAR_UM && state.lead_um.abs() < FAR_UM) {
+            *state = PiState {
+                integral_um: command_um,
+                ..PiState::default()
+            };
+        }
+    }
+}
+
+impl ControlLaw for PiLaw {
+    type State = PiState;
+
+    fn start(&self, command_um: f64) -> PiState {
+        PiState {
+            integral_um: command_um,
+            ..PiState::default()
+        }
+    }
+
+    fn step(&self, state: &mut PiState, input: &LawInput) -> LawOutput {
+        self.proportional(state, input.reference_um, input.bead_um);
+        let growth_um = if input.hold() {
+            0.0
+        } else {
+            0.5 * self.integral_per_tick * (input.reference_um - input.bead_um)
+        };
+        LawOutput::wish(state.proportional_um + (state.integral_um + growth_um))
+    }
+
+    /// Integrates and back-calculates.
+    fn applied(&self, state: &mut PiState, input: &LawInput, wish_um: f64, applied_um: f64) {
+        let growth = if input.hold() {
+            0.0
+        } else {
+            self.integral_per_tick * (input.reference_um - input.bead_um)
+        };
+        state.integral_um += growth + (applied_um - wish_um) * self.tracking_per_tick;
+        Self::sound(state, applied_um);
+    }
+
+    /// While something else decides, PI follows as if the reference were where the bead is: the way from there to the
+    /// reference is then a step like any other once PI takes over, not an offset for the integrator alone.
+    fn follow(&self, state: &mut PiState, input: &LawInput, command_um: f64) {
+        self.proportional(state, input.bead_um, input.bead_um);
+        self.track(state, command_um);
+    }
+
+    fn columns(&self) -> &'static [&'static str] {
+        if self.lead.is_some() {
+            &["pi_integral_um", "pi_lead_um"]
+        } else {
+            &["pi_integral_um"]
+        }
+    }
+
+    fn record(&self, state: &PiState, out: &mut [f32]) {
+        for (out, value) in out.iter_mut().zip([state.integral_um, state.lead_um]) {
+            *out = value as f32;
+        }
     }
 }

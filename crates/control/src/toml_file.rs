@@ -76,7 +76,9 @@ pub(crate) trait TomlFile: DeserializeOwned {
 /// Reads a file and checks its values.
 pub(crate) fn load<T: TomlFile>(path: &Path) -> Result<T, ConfigError> {
     let file = path.display().to_string();
-    match std::fs::read_to_string(path) {
+    /// No controller comes near it.
+    const MOST_BYTES: u64 = 1 << 24;
+    match cellpos_table::read_text(path, MOST_BYTES) {
         Ok(text) => parse(&text, &file),
         Err(error) => Err(ConfigError::Unreadable {
             file,
@@ -94,8 +96,8 @@ pub(crate) fn parse<T: TomlFile>(text: &str, file: &str) -> Result<T, ConfigErro
 
 fn text_error(text: &str, file: &str, error: &toml::de::Error) -> ConfigError {
     let Position { line, column, .. } = Position::of(text, error.span().unwrap_or(0..0));
-    let message = error.message().to_owned();
-    // "unknown field `a`" and "missing field `a`" name the key; "invalid type: string "a", expected f64" does not.
+    let message = cellpos_plant::in_words(error.message());
+    // "unknown field `a`" and "missing field `a`" name the key; "is the text "a", must be a number" does not.
     let written = if message.contains('`') {
         None
     } else {
@@ -140,7 +142,7 @@ mod tests {
             ),
             (
                 "speed_um_per_s = \"fast\"",
-                "s.toml:1:18: `speed_um_per_s = \"fast\"`: invalid type: string \"fast\", expected f64",
+                "s.toml:1:18: `speed_um_per_s = \"fast\"`: is the text \"fast\", must be a number",
             ),
             ("", "s.toml:1:1: missing field `speed_um_per_s`"),
             (

@@ -35,7 +35,7 @@ fn allocations_by_step(controller: ControllerConfig) -> Vec<u64> {
     let monitor = PlantMonitor::new(config.estimator, config.model).unwrap();
     let mut watching = monitor.start(20.0);
     let mut controller = Controller::new(config).unwrap();
-    let mut state = controller.start(20.0, 20.0);
+    controller.start(20.0, 20.0);
     let mut preview = vec![0.0; controller.preview_len()];
     let learner = Learner::new(
         LearnConfig::default(),
@@ -79,7 +79,7 @@ fn allocations_by_step(controller: ControllerConfig) -> Vec<u64> {
                 learned_um: learning.addition_um(Some(k as f64 * 5e-3), reference(k)),
                 ..LoopInput::default()
             };
-            let out = controller.step(&mut state, &input);
+            let out = controller.step(&input);
             learning.learn(Some((fix.position_um, 2.0)));
             monitor.step(
                 &mut watching,

@@ -71,7 +71,7 @@ fn run(
     let delay_s = rig.delay_s;
     let mut rig = SimulatedRig::new(rig).unwrap();
     let mut controller = Controller::new(config(controller)).unwrap();
-    let mut state = controller.start(20.0, 20.0);
+    controller.start(20.0, 20.0);
     let mut preview = vec![0.0; controller.preview_len()];
     let mut learning = learning.map(|(l, state)| CycleLearning::new(l.clone(), state));
     for k in 0..ticks {
@@ -96,7 +96,7 @@ fn run(
         if let Some(learning) = &mut learning {
             input.learned_um = learning.addition_um(profile.phase(time_s), reference_um);
         }
-        let out = controller.step(&mut state, &input);
+        let out = controller.step(&input);
         if let Some(learning) = &mut learning {
             learning.learn(fix.map(|fix| (fix.position_um, delay_s / 1e-3)));
         }

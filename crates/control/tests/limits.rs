@@ -82,13 +82,13 @@ proptest! {
         ticks in proptest::collection::vec((any_measurement(), any_number(), any_mode()), 1..200),
     ) {
         let mut controller = Controller::new(config).unwrap();
-        let mut state = controller.start(start, start);
+        controller.start(start, start);
         let Limits { low_um, high_um, slew_um_per_s, .. } = config.limits;
-        let mut last = state.previous_command_um();
+        let mut last = controller.previous_command_um();
         prop_assert!((low_um..=high_um).contains(&last));
         for (measurement, reference_um, mode) in ticks {
             let input = LoopInput { measurement, reference_um, mode, ..LoopInput::default() };
-            let out = controller.step(&mut state, &input);
+            let out = controller.step(&input);
             prop_assert!(out.command_um.is_finite());
             prop_assert!((low_um..=high_um).contains(&out.command_um));
             let rounding = 1e-12 * (1.0 + last.abs());
@@ -110,15 +110,15 @@ proptest! {
             limits: Limits::default(),
         };
         let mut controller = Controller::new(config).unwrap();
-        let mut state = controller.start(20.0, 20.0);
+        controller.start(20.0, 20.0);
         for (measurement, reference_um, mode) in garbage {
-            controller.step(&mut state, &LoopInput { measurement, reference_um, mode, ..LoopInput::default() });
+            controller.step(&LoopInput { measurement, reference_um, mode, ..LoopInput::default() });
         }
         let mut rig = SimulatedRig::new(RigConfig::eq6(seed)).unwrap();
         let mut worst: f64 = 0.0;
         for k in 0..8000 {
             let input = LoopInput { measurement: Some(rig.measure()), ..LoopInput::default() };
-            let out = controller.step(&mut state, &input);
+            let out = controller.step(&input);
             rig.advance(out.command_um);
             if k > 7500 {
                 worst = worst.max(rig.true_um().abs());

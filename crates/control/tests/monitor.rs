@@ -76,7 +76,7 @@ fn verdicts(
     let monitor = PlantMonitor::new(config.estimator, config.model).unwrap();
     let mut watching = monitor.start(20.0);
     let mut controller = Controller::new(config).unwrap();
-    let mut state = controller.start(20.0, 20.0);
+    controller.start(20.0, 20.0);
     let mut preview = vec![0.0; controller.preview_len()];
     let mut offset_um = 0.0;
     let verdicts = (0..2 * HALF)
@@ -102,7 +102,7 @@ fn verdicts(
                 preview_um: &preview,
                 ..LoopInput::default()
             };
-            let out = controller.step(&mut state, &input);
+            let out = controller.step(&input);
             rig.advance(out.command_um);
             changed.advance(out.command_um);
             monitor.step(

@@ -55,7 +55,7 @@ fn release(controller: ControllerConfig, case: Case, gain: f64, seed: u64) -> (f
         limits: Limits::default(),
     })
     .unwrap();
-    let mut state = controller.start(20.0, 20.0);
+    controller.start(20.0, 20.0);
     let (mut last_um, mut fastest_um, mut flagged, mut away_um) = (0.0, 0.0_f64, false, 0.0);
     for k in 0..free_from + 1300 {
         rig.stuck = (STUCK_FROM..free_from).contains(&k);
@@ -70,7 +70,7 @@ fn release(controller: ControllerConfig, case: Case, gain: f64, seed: u64) -> (f
             reference_um,
             ..LoopInput::default()
         };
-        let out = controller.step(&mut state, &input);
+        let out = controller.step(&input);
         let now_um = rig.true_um();
         if k >= free_from {
             fastest_um = fastest_um.max((now_um - last_um).abs());

@@ -3,7 +3,8 @@
 use crate::config::WorldConfig;
 use crate::faults::{FaultKind, Faults};
 use crate::random::{stream_of, uniform};
-use cellpos_plant::{Effect, Model};
+use cellpos_plant::Model;
+use cellpos_plant::effects::Action;
 use cellpos_vision::Verdict;
 use rand_xoshiro::Xoshiro256PlusPlus;
 use std::collections::VecDeque;
@@ -41,6 +42,10 @@ pub struct PositionFix {
     pub length_um: f64,
     /// Projected area of the cell, um^2; NaN for a bead, or when it is not measured.
     pub area_um2: f64,
+    /// Standard deviation of the length, um; NaN without one.
+    pub length_sd_um: f64,
+    /// Standard deviation of the area, um^2; NaN without one.
+    pub area_sd_um2: f64,
     /// As of the frame that would have been delivered.
     pub info: FrameInfo,
     /// Measured position along the channel, um; NaN unless the verdict is good.
@@ -119,14 +124,14 @@ impl Camera {
     fn take_over(&mut self, model: &Model) {
         let mut delay_ns = None;
         for effect in &model.effects {
-            match *effect {
-                Effect::ExposureAveraging { exposure_s } => {
+            match effect.act() {
+                Action::Exposure(exposure_s) => {
                     self.exposure_ns = ((exposure_s * 1e9) as i64).min(self.period_ns as i64);
                 }
-                Effect::TimeDelay { delay_s } => delay_ns = Some((delay_s * 1e9).round() as i64),
-                Effect::FrameDrops { rate } => self.faults.drop_rate = rate,
-                Effect::FrameRepeats { rate } => self.faults.double_rate = rate,
-                Effect::ClockSkew { ppm } => self.period_ns *= 1.0 + 1e-6 * ppm,
+                Action::Delay(delay_s) => delay_ns = Some((delay_s * 1e9).round() as i64),
+                Action::Drop(rate) => self.faults.drop_rate = rate,
+                Action::Repeat(rate) => self.faults.double_rate = rate,
+                Action::Skew(skew) => self.period_ns *= 1.0 + skew,
                 _ => {}
             }
         }

@@ -34,6 +34,13 @@ pub struct CellConfig {
     pub recovery_last_s: f64,
     /// Passages over which it tires; more change nothing.
     pub fatigue_passages: u32,
+    /// Contrast of the body, as a share of `contrast_grey`; negative: darker than the background.
+    pub body: f64,
+    /// Contrast of rim and halo at 1 um out of focus, as a share of `contrast_grey`.
+    pub halo: f64,
+    /// Distance of the cell's middle from the focus, um: positive with a rim of the sign of the contrast and a halo of the
+    /// other, negative the other way round.
+    pub focus_um: f64,
     /// Noise of the length delivered without pictures, um RMS; the area is that of the measured length.
     pub noise_um: f64,
 }
@@ -52,6 +59,9 @@ impl Default for CellConfig {
             recovery_first_s: 0.16,
             recovery_last_s: 0.37,
             fatigue_passages: 180,
+            body: 1.0,
+            halo: 0.5,
+            focus_um: 0.5,
             noise_um: 0.05,
         }
     }
@@ -77,6 +87,9 @@ impl CellConfig {
         within("cell.gain", self.gain, 0.1, 10.0, "0.1..10")?;
         within("cell.rest_um", self.rest_um, 0.1, 100.0, "0.1..100 um")?;
         within("cell.noise_um", self.noise_um, 0.0, 10.0, "0..10 um")?;
+        within("cell.body", self.body, -2.0, 2.0, "-2..2 of the contrast")?;
+        within("cell.halo", self.halo, 0.0, 2.0, "0..2 of the contrast")?;
+        within("cell.focus_um", self.focus_um, -20.0, 20.0, "-20..20 um")?;
         let passages = f64::from(self.fatigue_passages);
         within("cell.fatigue_passages", passages, 2.0, 1e9, "2 or more")?;
         for (key, value) in [
@@ -173,6 +186,14 @@ impl Cell {
     /// True length, um.
     pub(crate) fn length_um(&self) -> f64 {
         self.length_um
+    }
+
+    /// Standard deviations that [`Cell::measured`] has of a length: of the length (um) and of the area (um^2).
+    pub(crate) fn noise(&self, length_um: f64) -> (f64, f64) {
+        let noise_um = self.config.noise_um;
+        // The area goes with the root of the length.
+        let area_um2 = 0.5 * self.config.area_um2(length_um) / length_um * noise_um;
+        (noise_um, area_um2)
     }
 
     /// Length (um) and projected area (um^2) as measured of a cell of a true length.

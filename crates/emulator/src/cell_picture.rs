@@ -1,10 +1,20 @@
-//! What a cell and its channel look like: an ellipse with a soft edge and a brighter rim, between two walls.
+//! What a cell and its channel look like: an ellipse with a soft edge, a rim and a halo, between two walls.
+//!
+//! Body: a step blurred by the microscope, the more the further the cell is out of focus. Out of focus the edge's phase
+//! shows as well, as the second derivative of that step (transport of intensity): a rim just inside the edge and a halo of
+//! the other sign just outside, which change places on the other side of the focus.
 
 use crate::cell::CellConfig;
 use crate::config::WorldConfig;
 
-/// Standard deviation of the soft edge that the microscope gives to everything, um.
+/// Standard deviation of the soft edge that the microscope gives to everything in focus, um.
 const BLUR_UM: f64 = 0.2;
+/// Standard deviation of the blur that a distance from the focus adds, per um of it (numerical aperture 0.5 or so).
+const BLUR_PER_FOCUS: f64 = 0.15;
+/// Distance from the focus at which the edge's phase shows with the contrast of [`CellConfig::halo`], um.
+const HALO_FOCUS_UM: f64 = 1.0;
+/// Largest contrast of the phase, in multiples of that.
+const MOST_PHASE: f64 = 2.0;
 /// Contrast of the rim on top of the body's, as a share of it, and its distance from the edge in edge widths.
 const RIM: (f64, f64) = (0.3, 3.0);
 /// Edge widths beyond which nothing is drawn.
@@ -28,12 +38,17 @@ pub(crate) struct HalfAxes {
 #[derive(Debug, Clone)]
 pub(crate) struct CellPicture {
     blur_px: f32,
+    /// Contrast well inside.
+    body: f32,
     /// Values over the distance from the edge, from `-REACH` to `REACH` edge widths.
     edge: Vec<f32>,
 }
 
 impl CellPicture {
-    pub(crate) fn new(pixel_um: f64) -> Self {
+    pub(crate) fn new(pixel_um: f64, cell: &CellConfig) -> Self {
+        let blur_um = BLUR_UM.hypot(BLUR_PER_FOCUS * cell.focus_um);
+        let out_of_focus = (cell.focus_um / HALO_FOCUS_UM).clamp(-MOST_PHASE, MOST_PHASE);
+        let phase = cell.halo * out_of_focus;
         let steps = (2.0 * REACH * STEPS) as usize;
         let edge = (0..=steps)
             .map(|k| {
@@ -41,11 +56,14 @@ impl CellPicture {
                 let rim = (-0.5 * (widths + RIM.1).powi(2)).exp();
                 // The logistic function with the slope of a Gaussian's integral.
                 let body = 1.0 / (1.0 + (1.702 * widths).exp());
-                (body + RIM.0 * rim) as f32
+                // Extremes of 1 and -1, one width on either side of the edge.
+                let lobes = -widths * (0.5 - 0.5 * widths * widths).exp();
+                (cell.body * (body + RIM.0 * rim) + phase * lobes) as f32
             })
             .collect();
         Self {
-            blur_px: (BLUR_UM / pixel_um) as f32,
+            blur_px: (blur_um / pixel_um) as f32,
+            body: cell.body as f32,
             edge,
         }
     }
@@ -77,7 +95,7 @@ impl CellPicture {
         let (u, v) = (dx / axes.along_px, dy / axes.across_px);
         let r2 = u * u + v * v;
         if r2 < axes.deep2 {
-            return 1.0;
+            return self.body;
         }
         let (gx, gy) = (u / axes.along_px, v / axes.across_px);
         let slope2 = gx * gx + gy * gy;
@@ -89,7 +107,7 @@ impl CellPicture {
         };
         let place = (widths + REACH as f32) * STEPS as f32;
         if place <= 0.0 {
-            return 1.0;
+            return self.body;
         }
         self.edge.get(place as usize).copied().unwrap_or(0.0)
     }
@@ -123,7 +141,11 @@ mod tests {
 
     #[test]
     fn half_of_the_contrast_lies_on_the_ellipse_and_all_of_it_well_inside() {
-        let picture = CellPicture::new(0.2);
+        let in_focus = CellConfig {
+            focus_um: 0.0,
+            ..CellConfig::default()
+        };
+        let picture = CellPicture::new(0.2, &in_focus);
         let axes = picture.half_axes(120.0, 24.0);
         for degrees in 0..90 {
             let (sin, cos) = f32::to_radians(degrees as f32).sin_cos();

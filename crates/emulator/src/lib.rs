@@ -1,26 +1,35 @@
-//! The physical world behind the emulated rig: PZT, chip, bead and rendered camera frames.
+//! The emulated rig: the board's own state machine, the physical world behind it and a rendered camera.
 //!
 //! [`World`] is driven by the displacement that stands at the board's output and by time, and yields what a camera
 //! would deliver, when it would deliver it: frames of 8 bits with a ring-profile bead, or a cell in its channel, blurred
-//! along the true path during the exposure, with shot and read noise; or positions with the equivalent noise, for runs that need no pictures. Beside
-//! them it knows the truth. Faults are injected from a schedule ([`Faults`]).
+//! along the true path during the exposure, with shot and read noise; or positions with the equivalent noise, for runs
+//! that need no pictures. Beside them it knows the truth. Faults are injected from a schedule ([`Faults`]). The world has
+//! no clock but the times it is given.
 //!
-//! A seed fixes every bit of what comes out. Not for the PZT board, which is firmware of its own, and not for real time:
-//! the world has no clock but the times it is given.
+//! [`RigInABox`] joins the world to a [`Board`] on one clock; [`EmulatedRig`] puts both behind the traits of
+//! `cellpos-rig`, on the real clock or a virtual one. A seed fixes every bit of what comes out.
 #![forbid(unsafe_code)]
 
+mod board_config;
 mod camera;
 mod cell;
 mod cell_picture;
 mod config;
+mod emulated_rig;
 mod faults;
 mod random;
 mod render;
+mod rig_in_a_box;
+pub mod scene;
 mod world;
 
+pub use board_config::{BoardConfig, BoardConfigError};
 pub use camera::{FrameInfo, PositionFix};
 pub use cell::CellConfig;
+pub use cellpos_board::Board;
 pub use config::{WorldConfig, WorldError};
+pub use emulated_rig::{EmulatedCamera, EmulatedPort, EmulatedPositions, EmulatedRig};
 pub use faults::{FaultEvent, FaultKind, Faults};
 pub use random::Gaussian;
+pub use rig_in_a_box::{BoxError, RigInABox};
 pub use world::World;

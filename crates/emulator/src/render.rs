@@ -151,7 +151,7 @@ impl Renderer {
             grey_per_electron,
             support_px: profile.support_px() as f32,
             template,
-            cell: CellPicture::new(config.pixel_um),
+            cell: CellPicture::new(config.pixel_um, &config.cell.unwrap_or_default()),
             walls: config.cell.map_or(Vec::new(), |cell| walls(config, &cell)),
             strip,
             gaussian,
@@ -322,7 +322,7 @@ fn grey(level: f32) -> u8 {
 /// By symmetry x is uncorrelated with y, contrast and background, so the information of x alone decides.
 pub(crate) fn localisation_bound_um(config: &WorldConfig) -> Option<f64> {
     let profile = RingProfile::new(config.bead_radius_px())?;
-    let picture = CellPicture::new(config.pixel_um);
+    let picture = CellPicture::new(config.pixel_um, &config.cell.unwrap_or_default());
     let value = |dx: f64, dy: f64| match config.cell {
         None => profile.value(dx.hypot(dy)),
         Some(cell) => {

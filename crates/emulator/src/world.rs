@@ -6,9 +6,9 @@ use crate::config::{WorldConfig, WorldError};
 use crate::faults::FaultKind;
 use crate::random::Gaussian;
 use crate::render::{Renderer, localisation_bound_um, mean_between};
-use cellpos_plant::{Chain, Effect, Model, Noise};
+use cellpos_plant::effects::{Action, Shown};
+use cellpos_plant::{Chain, Model, Noise};
 use cellpos_vision::Verdict;
-use std::f64::consts::TAU;
 
 /// Turns a seed into that of frames of the empty channel.
 const EMPTY_SEED: u64 = 0x5eed_0f0e_3a97_7c41;
@@ -49,7 +49,7 @@ pub struct World {
     /// Exposure since which the bead has been out of the frame.
     out_since_ns: Option<i64>,
     /// Effects of the model on light and table.
-    image_effects: Vec<Effect>,
+    shown: Vec<Box<dyn Shown>>,
     led: bool,
     has_events: bool,
     cell: Option<Cell>,
@@ -100,11 +100,16 @@ impl World {
             localisation_um,
             snr: config.contrast_grey.abs() / pixel_variance.sqrt(),
             out_since_ns: None,
-            image_effects: model
-                .effects
-                .iter()
-                .filter(|e| matches!(e, Effect::PixelLocking { .. } | Effect::MainsHum { .. }))
-                .cloned()
+            shown: model
+                .ordered_effects()
+                .into_iter()
+                .filter_map(|e| match e.act() {
+                    Action::Show(mut shown) => {
+                        shown.seed(config.seed ^ 0xd1b5_4a32_d192_ed03);
+                        Some(shown)
+                    }
+                    _ => None,
+                })
                 .collect(),
             led: false,
             has_events: !config.faults.event.is_empty(),
@@ -251,41 +256,29 @@ impl World {
         }
     }
 
-    fn look(&self) -> Sample {
+    fn look(&mut self) -> Sample {
         let true_um = self.bead_um();
+        let seen_um = self.apparent_um(true_um);
+        let second_um = self
+            .second_um
+            .map(|(along, across)| (self.apparent_um(true_um + along), across));
         Sample {
             length_um: self.length_um().unwrap_or(f64::NAN),
             true_um,
             lateral_um: self.lateral_um,
-            seen_um: self.apparent_um(true_um),
-            second_um: self
-                .second_um
-                .map(|(along, across)| (self.apparent_um(true_um + along), across)),
+            seen_um,
+            second_um,
             visible: !self.active(FaultKind::LoseBead),
             lit: self.led,
         }
     }
 
     /// Where the camera sees what is at `x_um`: the model's effects on light and table.
-    fn apparent_um(&self, x_um: f64) -> f64 {
+    fn apparent_um(&mut self, x_um: f64) -> f64 {
+        let t_s = (self.now_ns - self.start_ns) as f64 * 1e-9;
         let mut seen_um = x_um;
-        for effect in &self.image_effects {
-            match *effect {
-                Effect::PixelLocking {
-                    pixel_um,
-                    amplitude,
-                    phase_deg,
-                } => {
-                    seen_um += amplitude
-                        * pixel_um
-                        * (TAU * x_um / pixel_um + phase_deg.to_radians()).sin();
-                }
-                Effect::MainsHum { hz, um, phase_deg } => {
-                    let t_s = (self.now_ns - self.start_ns) as f64 * 1e-9;
-                    seen_um += um * (TAU * hz * t_s + phase_deg.to_radians()).sin();
-                }
-                _ => {}
-            }
+        for shown in &mut self.shown {
+            seen_um = shown.show(seen_um, t_s);
         }
         seen_um
     }
@@ -368,9 +361,15 @@ impl World {
             (Some(cell), Some(length_um)) if good => cell.measured(length_um),
             _ => (f64::NAN, f64::NAN),
         };
+        let (length_sd_um, area_sd_um2) = match &self.cell {
+            Some(cell) if length_um.is_finite() => cell.noise(length_um),
+            _ => (f64::NAN, f64::NAN),
+        };
         Some(PositionFix {
             length_um,
             area_um2,
+            length_sd_um,
+            area_sd_um2,
             info,
             x_um: or_nan(mean_um + noise_um),
             variance_um2: or_nan(self.localisation_um * self.localisation_um),

@@ -1,7 +1,7 @@
 //! The emulated world against closed forms: diffusion, gain, drift, delay, blur, noise, faults.
 
 use cellpos_emulator::{FaultKind, Faults, FrameInfo, PositionFix, World, WorldConfig};
-use cellpos_plant::{Effect, Model};
+use cellpos_plant::{Model, effects};
 use cellpos_vision::{Frame, Localiser, LocaliserConfig, Pixels, ProfileSpec, Verdict};
 
 const MS: i64 = 1_000_000;
@@ -418,9 +418,9 @@ fn a_stalled_camera_delivers_nothing_and_then_all_at_once() {
 #[test]
 fn effects_of_the_model_at_the_cameras_place_are_taken_over() {
     let model = Model::eq6()
-        .with_effect(Effect::TimeDelay { delay_s: 0.003 })
-        .with_effect(Effect::ExposureAveraging { exposure_s: 0.001 })
-        .with_effect(Effect::FrameDrops { rate: 0.5 });
+        .with_effect(effects::time_delay(0.003))
+        .with_effect(effects::exposure_averaging(0.001))
+        .with_effect(effects::frame_drops(0.5));
     let mut world = World::new(&quiet(), &model, 0).unwrap();
     let fixes = positions(&mut world, 1000, 20.0);
     assert!(fixes.len() > 400 && fixes.len() < 600);

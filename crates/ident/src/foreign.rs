@@ -5,12 +5,14 @@
 //! Not for naming what makes the harmonics: that is reconciliation.
 
 use crate::error::IdentError;
+use crate::feedback::{by_reference, feedback};
 use crate::frequency_response::{DetectionLine, FrequencyPoint, Segment, Settings, measure};
 use crate::rational::{RationalFit, fit_orders};
 use crate::sampled::{Hold, Sampling};
 use crate::spectral::{find_lines, residual_of, welch};
 use crate::stats::student_t_quantile;
 use crate::tone_fit::{ToneFit, Whitening};
+use nalgebra::Complex;
 
 /// What to do with a foreign record.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -68,9 +70,25 @@ pub struct Harmonic {
     pub unexplained: bool,
 }
 
+/// What the response rests on.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Basis {
+    /// The input went its own way: output over input.
+    Input,
+    /// The record is of a loop: both were projected on its reference, which the noise is not in (joint input-output).
+    Reference,
+    /// The record is of a loop, and nothing from outside moved it: the response cannot be told from the controller.
+    Nothing {
+        /// Part of the input's change that the output's past predicts; None where it was not tested.
+        share: Option<f64>,
+    },
+}
+
 /// What a foreign record says.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ForeignResult {
+    /// What the response rests on.
+    pub basis: Basis,
     /// How it was excited.
     pub excitation: Excitation,
     /// Driven lines, strongest first (empty for broadband).
@@ -170,6 +188,186 @@ pub fn identify(
     }
 }
 
+/// Identifies a record of a loop by way of its reference.
+///
+/// # Errors
+/// As [`identify`].
+pub fn identify_in_loop(
+    reference: &[f64],
+    input: &[f64],
+    output: &[f64],
+    settings: &ForeignSettings,
+) -> Result<ForeignResult, IdentError> {
+    let n = reference.len();
+    if n != input.len() || n != output.len() {
+        return Err(IdentError::Lengths {
+            input: input.len().min(n),
+            output: output.len(),
+        });
+    }
+    if n < 512 {
+        return Err(IdentError::TooShort {
+            what: "an identification in a loop",
+            rows: n,
+            needed: 512,
+        });
+    }
+    let period_s = 1.0 / settings.rate_hz;
+    let sampling = Sampling {
+        period_s,
+        exposure_s: 0.0,
+        hold: settings.hold,
+    };
+    let output_rms = rms(&residual_of(&bridged(output), period_s, &[]));
+    let nothing = |share| ForeignResult {
+        basis: Basis::Nothing { share },
+        excitation: Excitation::Broadband,
+        lines: Vec::new(),
+        points: Vec::new(),
+        harmonics: Vec::new(),
+        models: Vec::new(),
+        output_rms,
+        linear_residual_rms: None,
+        sampling,
+    };
+    let moved = rms(&residual_of(reference, period_s, &[]));
+    if moved.is_nan() || moved < 1e-6 {
+        return Ok(nothing(feedback(input, output).map(|found| found.share)));
+    }
+    let found = find_lines(reference, period_s, 24);
+    let lowest = found
+        .frequency_hz
+        .iter()
+        .copied()
+        .fold(f64::INFINITY, f64::min);
+    let mut result = if found.explained > 0.97 && n as f64 * period_s * lowest >= 3.0 {
+        from_lines(
+            input,
+            &bridged(output),
+            sampling,
+            &found.frequency_hz,
+            settings,
+            output_rms,
+        )?
+    } else {
+        const LEAST_COHERENCE: f64 = 0.5;
+        let stretch = (n / 10).clamp(256, 4096);
+        let mut points = by_reference(
+            reference,
+            input,
+            &bridged(output),
+            period_s,
+            stretch,
+            LEAST_COHERENCE,
+        );
+        if points.len() < 3 {
+            return Ok(nothing(feedback(input, output).map(|found| found.share)));
+        }
+        for p in &mut points {
+            p.variance = p.variance.max(p.response.norm_sqr() * 1e-8);
+        }
+        let models = stable(fit_orders(&points, sampling, settings.most_order)?, &points);
+        ForeignResult {
+            points,
+            models,
+            ..nothing(None)
+        }
+    };
+    result.basis = Basis::Reference;
+    Ok(result)
+}
+
+/// What a record says whose input answers its output, and that has no reference.
+pub fn nothing_to_tell(
+    output: &[f64],
+    settings: &ForeignSettings,
+    share: Option<f64>,
+) -> ForeignResult {
+    let period_s = 1.0 / settings.rate_hz;
+    ForeignResult {
+        basis: Basis::Nothing { share },
+        excitation: Excitation::Broadband,
+        lines: Vec::new(),
+        points: Vec::new(),
+        harmonics: Vec::new(),
+        models: Vec::new(),
+        output_rms: rms(&residual_of(&bridged(output), period_s, &[])),
+        linear_residual_rms: None,
+        sampling: Sampling {
+            period_s,
+            exposure_s: 0.0,
+            hold: settings.hold,
+        },
+    }
+}
+
+/// A series with its gaps bridged by straight lines: a frame that was lost now and then must not take a whole stretch of
+/// thousands with it.
+pub fn bridged(series: &[f64]) -> Vec<f64> {
+    let known: Vec<usize> = (0..series.len())
+        .filter(|&k| series[k].is_finite())
+        .collect();
+    let mut bridged = series.to_vec();
+    for (k, value) in bridged.iter_mut().enumerate() {
+        if value.is_finite() {
+            continue;
+        }
+        let after = known.partition_point(|&i| i < k);
+        let before = after.checked_sub(1).and_then(|i| known.get(i)).copied();
+        *value = match (before, known.get(after).copied()) {
+            (Some(a), Some(b)) => {
+                series[a] + (series[b] - series[a]) * (k - a) as f64 / (b - a) as f64
+            }
+            (Some(only), None) | (None, Some(only)) => series[only],
+            (None, None) => 0.0,
+        };
+    }
+    bridged
+}
+
+/// The models without those that the plant cannot be: a channel with a cell in it is passive, and an unstable pole is the
+/// noise's, or the controller's. An integrator whose pole the fit puts a hair to the right of zero is one.
+fn stable(models: Vec<RationalFit>, points: &[FrequencyPoint]) -> Vec<RationalFit> {
+    // One or two lines tell gain and lag there, and no model.
+    if points.len() < 3 {
+        return Vec::new();
+    }
+    let lowest_hz = points
+        .iter()
+        .map(|p| p.frequency_hz)
+        .fold(f64::INFINITY, f64::min);
+    let hair = 0.02 * std::f64::consts::TAU * lowest_hz;
+    models
+        .into_iter()
+        .filter_map(|mut model| {
+            if model.poles.iter().all(|pole| pole.re <= 0.0) {
+                return Some(model);
+            }
+            if model
+                .poles
+                .iter()
+                .any(|pole| pole.re > 0.0 && (pole.im != 0.0 || pole.re > hair))
+            {
+                return None;
+            }
+            for pole in &mut model.poles {
+                pole.re = pole.re.min(0.0);
+            }
+            let mut denominator = vec![Complex::from(1.0)];
+            for pole in &model.poles {
+                let mut next = vec![Complex::from(0.0); denominator.len() + 1];
+                for (k, c) in denominator.iter().enumerate() {
+                    next[k] += c;
+                    next[k + 1] -= c * pole;
+                }
+                denominator = next;
+            }
+            model.denominator = denominator.iter().map(|c| c.re).collect();
+            Some(model)
+        })
+        .collect()
+}
+
 fn from_lines(
     input: &[f64],
     output: &[f64],
@@ -239,9 +437,10 @@ fn from_lines(
     for p in &mut points {
         p.variance = p.variance.max(floor(p));
     }
-    let models = fit_orders(&points, sampling, settings.most_order)?;
+    let models = stable(fit_orders(&points, sampling, settings.most_order)?, &points);
     let linear_residual_rms = Some(rms(&residual_of(output, period_s, lines_hz)));
     Ok(ForeignResult {
+        basis: Basis::Input,
         excitation: Excitation::Lines,
         lines,
         points,
@@ -286,8 +485,9 @@ fn from_spectra(
     for p in &mut points {
         p.variance = p.variance.max(p.response.norm_sqr() * 1e-8);
     }
-    let models = fit_orders(&points, sampling, settings.most_order)?;
+    let models = stable(fit_orders(&points, sampling, settings.most_order)?, &points);
     Ok(ForeignResult {
+        basis: Basis::Input,
         excitation: Excitation::Broadband,
         lines: Vec::new(),
         points,

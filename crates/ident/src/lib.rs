@@ -4,13 +4,27 @@
 //! verdict. Pure computation: no device, no clock, no file. Frequencies are in Hz, angles in degrees at boundaries;
 //! angular frequency only inside. A record follows the project's convention: row k holds the command applied from
 //! `t_k` on and the position just before it takes effect.
+//!
+//! ```
+//! use cellpos_ident::tone_fit::{ToneFit, fit_block};
+//! // A sine of 2 um at 10 Hz on a drift of 5 um/s, as a record at 1 kHz.
+//! let row = |k: usize| {
+//!     let t = k as f64 * 1e-3;
+//!     2.0 * (std::f64::consts::TAU * 10.0 * t).cos() + 5.0 * t
+//! };
+//! let signal: Vec<f64> = (0..1000).map(row).collect();
+//! let block = fit_block(&signal, 0, 1000, 1e-3, &[10.0], ToneFit::default()).expect("enough rows");
+//! assert!((block.phasors[0].norm() - 2.0).abs() < 1e-9, "the drift is no part of it");
+//! ```
 #![forbid(unsafe_code)]
 
 pub mod bare_fft;
+mod bootstrap;
 pub mod delay;
 mod error;
 pub mod excitation;
 pub mod experiment;
+pub mod feedback;
 pub mod foreign;
 pub mod frequency_response;
 pub mod ladder;
@@ -19,6 +33,7 @@ pub mod least_squares;
 pub mod noise;
 pub mod random;
 pub mod rational;
+mod rung;
 pub mod sampled;
 pub mod spectral;
 pub mod stats;

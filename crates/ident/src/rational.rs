@@ -118,25 +118,7 @@ pub fn fit_rational(
     order: usize,
     zeros: usize,
 ) -> Result<RationalFit, IdentError> {
-    let parameters = order + zeros + 2;
-    if 2 * points.len() < parameters || points.is_empty() {
-        return Err(IdentError::TooFewPoints {
-            points: points.len(),
-            parameters,
-            needed: parameters.div_ceil(2),
-        });
-    }
-    if let Some(p) = points
-        .iter()
-        .find(|p| !(p.variance.is_finite() && p.variance > 0.0))
-    {
-        return Err(IdentError::OutOfRange {
-            key: "variance",
-            value: p.variance,
-            unit: "1",
-            expected: "a positive variance per point",
-        });
-    }
+    let parameters = checked(points, order + zeros + 2)?;
     let zeros = zeros.min(order);
     let two_pi = 2.0 * std::f64::consts::PI;
     let log_mean = points.iter().map(|p| p.frequency_hz.ln()).sum::<f64>() / points.len() as f64;
@@ -234,6 +216,29 @@ pub fn fit_rational(
         dof,
         aicc: found.chi2 + 2.0 * k + correction,
     })
+}
+
+/// Refuses points that cannot determine so many parameters; gives their number back.
+fn checked(points: &[FrequencyPoint], parameters: usize) -> Result<usize, IdentError> {
+    if 2 * points.len() < parameters || points.is_empty() {
+        return Err(IdentError::TooFewPoints {
+            points: points.len(),
+            parameters,
+            needed: parameters.div_ceil(2),
+        });
+    }
+    if let Some(p) = points
+        .iter()
+        .find(|p| !(p.variance.is_finite() && p.variance > 0.0))
+    {
+        return Err(IdentError::OutOfRange {
+            key: "variance",
+            value: p.variance,
+            unit: "1",
+            expected: "a positive variance per point",
+        });
+    }
+    Ok(parameters)
 }
 
 /// Coefficients (scaled time) of a rational function by iterated linear least squares; the hold and delay are first

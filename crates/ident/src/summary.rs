@@ -53,6 +53,8 @@ pub struct Identification {
     pub disagreement_s: Option<f64>,
     /// The response with hold, exposure and delay taken off.
     pub compensated: Vec<CompensatedPoint>,
+    /// Localisation noise as vision stated it while the plant was measured, um RMS, where it did.
+    pub stated_noise_um: Option<f64>,
     /// What a user must know before using the model.
     pub warnings: Vec<String>,
 }
@@ -117,6 +119,7 @@ pub fn summarise(
         led,
         disagreement_s: disagreement,
         compensated,
+        stated_noise_um: None,
         warnings: Vec::new(),
     };
     result.warnings = warnings(&result, stated_per_s);
@@ -207,8 +210,18 @@ fn warnings(result: &Identification, stated_per_s: Option<f64>) -> Vec<String> {
 }
 
 impl Identification {
+    /// Localisation noise for a model, um RMS: what the scatter of the lines says, or what vision stated where Brownian motion
+    /// drowns it in the scatter; 0 where neither tells.
+    fn localisation_um(&self) -> f64 {
+        let measured_um = self.measured.noise.map_or(0.0, |n| n.localisation_um);
+        match self.stated_noise_um {
+            Some(stated_um) if measured_um < 0.5 * stated_um => stated_um,
+            _ => measured_um,
+        }
+    }
+
     /// The identified plant as a model file: transfer function without the delay, noise, intervals, covariance of the
-    /// coefficients, and the delay among the provenance (it belongs to the rig's camera path, not to the plant).
+    /// coefficients, and the delay of the camera path beside them.
     ///
     /// # Errors
     /// [`PlantError`] when the coefficients make no plant.
@@ -238,7 +251,7 @@ impl Identification {
         }
         let noise = self.measured.noise.map_or(Noise::NONE, |n| Noise {
             diffusion_um2_per_s: n.diffusion_um2_per_s,
-            localisation_um: n.localisation_um,
+            localisation_um: self.localisation_um(),
         });
         Ok(Model {
             name: name.to_owned(),
@@ -251,6 +264,7 @@ impl Identification {
             working_point_um,
             effects: Vec::new(),
             noise,
+            camera_delay_s: Some(best.delay_s),
             covariance: Some(self.coefficient_covariance()),
             intervals,
             provenance,

@@ -6,9 +6,9 @@
 
 use nalgebra::Complex;
 
+pub use crate::bootstrap::bootstrap;
 use crate::ladder::{DelayPrior, LadderFit, LadderProblem, Rung, index, model_of};
 use crate::ladder_model::LadderModel;
-use crate::random::Random;
 use crate::stats::{quantile, student_t_quantile};
 
 /// Whether the data determine a parameter.
@@ -168,6 +168,9 @@ fn judge_width(value: f64, interval: [f64; 2], why_not: &str) -> Verdict {
     }
 }
 
+/// The bootstrap's interval of a function of the parameters, where enough replicates were fitted.
+type Drawn<'a> = dyn Fn(&dyn Fn(&[f64]) -> f64) -> Option<[f64; 2]> + 'a;
+
 /// Judges a ladder that was fitted without a delay prior; `prior` is then brought in for the model to go on with.
 ///
 /// `replicates` bootstrap fits (0: none) resample the blocks of every line with replacement; see [`bootstrap`].
@@ -216,47 +219,7 @@ pub fn judge(
             "the gain's interval is wider than half its value: excite more strongly or longer",
         ),
     });
-    for (name, meaning, i) in [
-        (
-            "pair_zero_rad_per_s",
-            "zero of the pole-zero pair",
-            index::LN_ZERO,
-        ),
-        (
-            "pair_pole_rad_per_s",
-            "pole of the pole-zero pair",
-            index::LN_POLE,
-        ),
-    ] {
-        let source = if best.rung >= Rung::PoleZeroPair {
-            Some(best)
-        } else {
-            fit.rungs.iter().find(|r| r.rung == Rung::PoleZeroPair)
-        };
-        let Some(source) = source else { continue };
-        let value = source.parameters[i].exp();
-        let ci95 = log_interval(value, source.covariance[(i, i)].sqrt(), t);
-        let chosen = best.rung >= Rung::PoleZeroPair;
-        parameters.push(Parameter {
-            name,
-            meaning,
-            unit: "rad/s",
-            value,
-            ci95,
-            bootstrap95: if chosen { drawn(&|x| x[i].exp()) } else { None },
-            verdict: if chosen {
-                judge_width(
-                    value,
-                    ci95,
-                    "the pair is seen, but not where it lies: excite more lines about it",
-                )
-            } else {
-                Verdict::NotIdentifiable {
-                    reason: "the data do not need a pole-zero pair".to_owned(),
-                }
-            },
-        });
-    }
+    parameters.extend(pair_parameters(fit, t, &drawn));
 
     let effective = best.parameters[index::EFFECTIVE_DELAY_MS];
     let half = t * sd(index::EFFECTIVE_DELAY_MS);
@@ -297,6 +260,54 @@ pub fn judge(
         phase_delay95_s: [phase_low * 1e-3, phase_high * 1e-3],
         phase_delay_s: (effective + lead[0]) * 1e-3,
     }
+}
+
+/// Zero and pole of the pair, where a fit has them.
+fn pair_parameters(fit: &LadderFit, t: f64, drawn: &Drawn) -> Vec<Parameter> {
+    let best = fit.best();
+    let mut found = Vec::new();
+    for (name, meaning, i) in [
+        (
+            "pair_zero_rad_per_s",
+            "zero of the pole-zero pair",
+            index::LN_ZERO,
+        ),
+        (
+            "pair_pole_rad_per_s",
+            "pole of the pole-zero pair",
+            index::LN_POLE,
+        ),
+    ] {
+        let source = if best.rung >= Rung::PoleZeroPair {
+            Some(best)
+        } else {
+            fit.rungs.iter().find(|r| r.rung == Rung::PoleZeroPair)
+        };
+        let Some(source) = source else { continue };
+        let value = source.parameters[i].exp();
+        let ci95 = log_interval(value, source.covariance[(i, i)].sqrt(), t);
+        let chosen = best.rung >= Rung::PoleZeroPair;
+        found.push(Parameter {
+            name,
+            meaning,
+            unit: "rad/s",
+            value,
+            ci95,
+            bootstrap95: if chosen { drawn(&|x| x[i].exp()) } else { None },
+            verdict: if chosen {
+                judge_width(
+                    value,
+                    ci95,
+                    "the pair is seen, but not where it lies: excite more lines about it",
+                )
+            } else {
+                Verdict::NotIdentifiable {
+                    reason: "the data do not need a pole-zero pair".to_owned(),
+                }
+            },
+        });
+    }
+    found
 }
 
 /// The chosen rung fitted again with the delay measured otherwise, and the far zero free to make up the difference.
@@ -458,50 +469,4 @@ fn slow_pole_parameter(value: f64, half: f64, chosen: Rung) -> Parameter {
             }
         },
     }
-}
-
-/// Parameter vectors of the chosen rung fitted to resampled blocks, each with the weak bounds on the feedthrough drawn anew.
-///
-/// A fit held by a bound that is right on average errs by less than its covariance says where the bound acts, and by how
-/// much less depends on where it landed: replicates about that place alone would repeat its luck. With the bound drawn
-/// as a datum beside the lines their spread is that of the covariance (randomise, then optimise), and the shape that of the
-/// fit as it is, not of its linear part.
-pub fn bootstrap(
-    problem: &LadderProblem<'_>,
-    fit: &LadderFit,
-    replicates: usize,
-    seed: u64,
-) -> Vec<Vec<f64>> {
-    let mut random = Random::new(seed);
-    let best = fit.best();
-    (0..replicates)
-        .filter_map(|_| {
-            let data: Vec<Complex<f64>> = problem
-                .points()
-                .iter()
-                .map(|p| {
-                    let n = p.block_errors.len();
-                    if n < 2 {
-                        return p.response;
-                    }
-                    let sum: Complex<f64> = (0..n).map(|_| p.block_errors[random.below(n)]).sum();
-                    // Resampled means are narrower than the truth by (n-1)/n; the noise model sets the size, and what the
-                    // rung leaves over widens it as it widens the covariance.
-                    let size = (p.variance / p.scatter_variance.max(f64::MIN_POSITIVE) * n as f64
-                        / (n as f64 - 1.0)
-                        * fit.scale)
-                        .sqrt();
-                    p.response + sum / n as f64 * size
-                })
-                .collect();
-            let moved = [(); 2].map(|()| fit.scale.sqrt() * random.normal());
-            let found = problem.clone().with_bounds_moved(moved).fit_from(
-                &data,
-                best.rung,
-                &best.parameters,
-                None,
-            );
-            found.chi2.is_finite().then_some(found.parameters)
-        })
-        .collect()
 }

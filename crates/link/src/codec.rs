@@ -1,12 +1,12 @@
 //! Framing: messages to bytes and back.
 
 use core::marker::PhantomData;
-use crc::{CRC_32_ISO_HDLC, Crc, Table};
+use crc::{CRC_32_ISO_HDLC, Crc};
 use serde::{Serialize, de::DeserializeOwned};
 
 use crate::{ToBoard, ToHost};
 
-/// Most bytes of a message between direction byte and check sum (the longest has 72).
+/// Most bytes of a message between direction byte and check sum (the longest has 75).
 pub const MAX_PAYLOAD: usize = 96;
 const CRC_LEN: usize = 4;
 const MAX_BODY: usize = 1 + MAX_PAYLOAD + CRC_LEN;
@@ -15,7 +15,8 @@ const MAX_ENCODED: usize = cobs::max_encoding_length(MAX_BODY);
 pub const MAX_FRAME: usize = MAX_ENCODED + 2;
 
 const DELIMITER: u8 = 0;
-static CRC: Crc<u32, Table<16>> = Crc::<u32, Table<16>>::new(&CRC_32_ISO_HDLC);
+/// One table of 256 entries: a kilobyte is what a board has to spare, and its look-up needs no bounds check.
+static CRC: Crc<u32> = Crc::<u32>::new(&CRC_32_ISO_HDLC);
 
 mod sealed {
     pub trait Sealed {}
@@ -67,18 +68,27 @@ impl core::error::Error for EncodeError {}
 /// # Errors
 /// [`EncodeError::OutputTooShort`]; nothing of `out` may be sent then.
 pub fn encode<M: Message>(message: &M, out: &mut [u8]) -> Result<usize, EncodeError> {
+    // No index that can fail: the firmware that links this has no panic path.
     let mut body = [0_u8; MAX_BODY];
-    body[0] = M::DIRECTION;
-    let payload = postcard::to_slice(message, &mut body[1..1 + MAX_PAYLOAD])
-        .map_err(|_| EncodeError::MessageTooLong)?
+    let (direction, payload) = body.split_first_mut().ok_or(EncodeError::MessageTooLong)?;
+    *direction = M::DIRECTION;
+    let payload = payload
+        .first_chunk_mut::<MAX_PAYLOAD>()
+        .and_then(|room| postcard::to_slice(message, room).ok())
+        .ok_or(EncodeError::MessageTooLong)?
         .len();
-    let checked = 1 + payload;
-    let crc = CRC.checksum(&body[..checked]);
-    body[checked..checked + CRC_LEN].copy_from_slice(&crc.to_le_bytes());
+    let (checked, check) = body
+        .split_at_mut_checked(1 + payload)
+        .ok_or(EncodeError::MessageTooLong)?;
+    *check
+        .first_chunk_mut::<CRC_LEN>()
+        .ok_or(EncodeError::MessageTooLong)? = CRC.checksum(checked).to_le_bytes();
+    let body = body
+        .get(..1 + payload + CRC_LEN)
+        .ok_or(EncodeError::MessageTooLong)?;
     let (first, rest) = out.split_first_mut().ok_or(EncodeError::OutputTooShort)?;
     *first = DELIMITER;
-    let encoded = cobs::try_encode(&body[..checked + CRC_LEN], rest)
-        .map_err(|_| EncodeError::OutputTooShort)?;
+    let encoded = cobs::try_encode(body, rest).map_err(|_| EncodeError::OutputTooShort)?;
     *rest.get_mut(encoded).ok_or(EncodeError::OutputTooShort)? = DELIMITER;
     Ok(encoded + 2)
 }

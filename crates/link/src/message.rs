@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 
 /// Version of the protocol, exchanged in [`ToBoard::Hello`] and [`Identity`]. A board refuses to be armed by a host of
 /// another version.
-pub const PROTOCOL_VERSION: u16 = 1;
+pub const PROTOCOL_VERSION: u16 = 2;
 
 /// What the host says to the board.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -20,7 +20,7 @@ pub enum ToBoard {
     Arm(Arm),
     /// Where the PZT has to be from now on.
     Command(Command),
-    /// Slew to the last neutral estimate and hold it there: the bead all but stops.
+    /// Slew to the last zero-flow estimate and hold it there: the bead all but stops.
     Freeze,
     /// Slew-limited ramp to the park displacement; latched until the next [`ToBoard::Arm`].
     Park,
@@ -43,11 +43,14 @@ pub enum ToBoard {
 /// How a session is to be run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Arm {
-    /// Number of the session, chosen by the host; a command of another session is ignored and counted.
+    /// Number of the session, drawn at random by the host, so that two hosts are told apart; a command of another
+    /// session is ignored and counted.
     pub session: u16,
-    /// Without a fresh command for this long while running, the board ramps to park. `None`: the board's default.
+    /// Without a fresh command for this long while running, the board goes to the last zero-flow estimate and holds it.
+    /// `None`: the board's default.
     pub watchdog_ms: Option<u16>,
-    /// The same while frozen, or armed without a first command. `None`: the board's default.
+    /// Held for this long (by itself, frozen, or armed without a first command), the board ramps to park. `None`: the
+    /// board's default.
     pub hold_watchdog_ms: Option<u16>,
     /// Where a ramp to park ends. `None`: the board's default.
     pub park_pm: Option<i32>,
@@ -96,7 +99,8 @@ pub struct Command {
     pub time_us: u64,
     /// Commanded PZT displacement, pm.
     pub displacement_pm: i32,
-    /// The host's running estimate of the displacement at which the bead is at rest, pm: where a freeze goes.
+    /// The host's running estimate of the zero-flow displacement, at which the bead is at rest, pm: where a freeze and a
+    /// board that hears no more commands go.
     pub neutral_pm: i32,
 }
 
@@ -119,7 +123,7 @@ pub enum ToHost {
     },
     /// How things stand.
     Status(Status),
-    /// Sent once, at the moment a fault is latched; also part of every status from then on.
+    /// Sent once, at the moment the board stops following by itself; also part of every status from then on.
     Fault {
         /// Which.
         fault: Fault,
@@ -154,7 +158,7 @@ pub struct Identity {
     pub dac_bits: u8,
     /// Default watchdog while running, ms.
     pub watchdog_ms: u16,
-    /// Default watchdog while frozen or armed, ms.
+    /// Default watchdog while holding, frozen or armed, ms.
     pub hold_watchdog_ms: u16,
 }
 
@@ -190,6 +194,8 @@ pub enum Refusal {
     Watchdog,
     /// Not possible in the present state.
     State,
+    /// Another session is running, and its commands are fresh.
+    Busy,
 }
 
 /// State of the board.
@@ -202,19 +208,21 @@ pub enum BoardState {
     Armed = 1,
     /// Following commands.
     Running = 2,
-    /// Holding the neutral estimate; only arm, park and disarm leave this state.
+    /// Holding the zero-flow estimate because the host said so; only arm, park and disarm leave this state.
     Frozen = 3,
     /// Ramping to park or there; latched: only arm and disarm leave this state.
     Safe = 4,
+    /// Holding the zero-flow estimate because commands stopped; a fresh command takes up again.
+    Holding = 5,
 }
 
-/// Why the board went safe by itself.
+/// Why the board stopped following by itself.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[repr(u8)]
 pub enum Fault {
     /// No fault.
     None = 0,
-    /// No fresh command within the watchdog time while running.
+    /// No fresh command within the watchdog time while running; ends with the next fresh command, or with the next arming.
     CommandTimeout = 1,
     /// Nothing came to end a freeze within the hold watchdog time.
     FreezeTimeout = 2,
@@ -235,11 +243,11 @@ pub struct Status {
     pub state: BoardState,
     /// Displacement that stands at the converter's output, pm.
     pub applied_pm: i32,
-    /// Last neutral estimate, pm.
+    /// Last zero-flow estimate, pm.
     pub neutral_pm: i32,
     /// Board time, us since its start.
     pub board_time_us: u64,
-    /// Latched fault.
+    /// Fault in force.
     pub fault: Fault,
     /// Whether the LED is lit.
     pub led: bool,
@@ -253,4 +261,6 @@ pub struct Status {
     pub clipped: u32,
     /// Messages to the host dropped because they were not collected.
     pub unsent: u32,
+    /// How often in this session the board held by itself because commands stopped.
+    pub holds: u16,
 }

@@ -62,7 +62,7 @@ fn longest_status() -> Status {
         session: u16::MAX,
         last_seq: Some(u32::MAX),
         last_time_us: u64::MAX,
-        state: BoardState::Safe,
+        state: BoardState::Holding,
         applied_pm: i32::MIN,
         neutral_pm: i32::MIN,
         board_time_us: u64::MAX,
@@ -73,6 +73,7 @@ fn longest_status() -> Status {
         late: u32::MAX,
         clipped: u32::MAX,
         unsent: u32::MAX,
+        holds: u16::MAX,
     }
 }
 

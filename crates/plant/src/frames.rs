@@ -1,6 +1,6 @@
 //! Frames that are lost or delivered twice: what happens to whole rows of a record.
 
-use crate::effect::Effect;
+use crate::effects::Action;
 use crate::model::Model;
 use crate::random::Gaussian;
 
@@ -19,20 +19,16 @@ pub enum FrameFate {
 ///
 /// The first frame is always kept. The fate of a frame does not depend on the number of frames after it.
 pub fn frame_fates(model: &Model, frames: usize, seed: u64) -> Vec<FrameFate> {
-    let rate = |wanted: &str| -> f64 {
-        // Independent causes: the chance to escape all of them is the product.
-        let kept: f64 = model
-            .effects
-            .iter()
-            .filter(|e| e.id() == wanted)
-            .map(|e| match e {
-                Effect::FrameDrops { rate } | Effect::FrameRepeats { rate } => 1.0 - rate,
-                _ => 1.0,
-            })
-            .product();
-        1.0 - kept
-    };
-    let (drops, repeats) = (rate("frame-drops"), rate("frame-repeats"));
+    // Independent causes: the chance to escape all of them is the product.
+    let (mut not_dropped, mut not_repeated) = (1.0, 1.0);
+    for effect in &model.effects {
+        match effect.act() {
+            Action::Drop(rate) => not_dropped *= 1.0 - rate,
+            Action::Repeat(rate) => not_repeated *= 1.0 - rate,
+            _ => {}
+        }
+    }
+    let (drops, repeats) = (1.0 - not_dropped, 1.0 - not_repeated);
     let mut random = Gaussian::new(seed ^ 0x5851_f42d_4c95_7f2d);
     (0..frames)
         .map(|k| {
@@ -71,12 +67,13 @@ pub fn apply_frame_fates(bead_um: &[f64], fates: &[FrameFate]) -> Vec<Option<f64
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::effects::{frame_drops, frame_repeats};
 
     #[test]
     fn frames_are_lost_and_repeated_at_their_rates() {
         let model = Model::eq6()
-            .with_effect(Effect::FrameDrops { rate: 0.02 })
-            .with_effect(Effect::FrameRepeats { rate: 0.05 });
+            .with_effect(frame_drops(0.02))
+            .with_effect(frame_repeats(0.05));
         let n = 50_000;
         let fates = frame_fates(&model, n, 1);
         let count = |f| fates.iter().filter(|x| **x == f).count() as f64 / n as f64;

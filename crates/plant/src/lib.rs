@@ -15,7 +15,7 @@
 
 mod chain;
 mod discrete;
-mod effect;
+pub mod effects;
 mod error;
 mod frames;
 mod modal;
@@ -28,13 +28,15 @@ mod roots;
 mod simulate;
 mod state_space;
 mod transfer;
+mod words;
 
 pub use cellpos_units::{Decibels, Degrees, Hertz, Micrometers, Seconds};
 pub use chain::{Chain, ChainError};
 pub use discrete::{DiscretePlant, DiscreteState};
-pub use effect::{EFFECT_IDS, Effect, EffectError, Hysteresis, Parameter, ParameterSpec, Place};
+pub use effects::{Effect, EffectError, Parameter, Place};
 pub use error::{ModelError, ModelProblem, PlantError, Position};
 pub use frames::{FrameFate, apply_frame_fates, frame_fates};
+pub use modal::Zpk;
 pub use model::{Covariance, Model, Noise};
 pub use nalgebra::Complex;
 pub use physical::{NotIdentifiable, PhysicalParameters, SecondOrder};
@@ -45,3 +47,4 @@ pub use transfer::{
     EQ5_LITERAL_PER_S, EQ5_VELOCITY_GAIN_PER_S, MAX_ORDER, ProbablyPerHertz, TransferFunction,
     probably_per_hertz,
 };
+pub use words::in_words;

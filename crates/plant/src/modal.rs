@@ -3,16 +3,24 @@
 use crate::transfer::TransferFunction;
 use nalgebra::Complex;
 
-/// Zeros, poles and gain: `gain prod(s - z) / prod(s - p)`. Complex roots are present with their conjugates.
+/// Zeros, poles \[rad/s\] and gain: `gain prod(s - z) / prod(s - p)`. Complex roots are present with their conjugates.
 #[derive(Debug, Clone, PartialEq)]
-pub(crate) struct Zpk {
+pub struct Zpk {
+    /// Zeros, rad/s.
     pub zeros: Vec<Complex<f64>>,
+    /// Poles, rad/s.
     pub poles: Vec<Complex<f64>>,
+    /// Leading coefficient.
     pub gain: f64,
 }
 
+fn real(x: f64) -> Complex<f64> {
+    Complex::new(x, 0.0)
+}
+
 impl Zpk {
-    pub(crate) fn one() -> Self {
+    /// The factor 1.
+    pub fn one() -> Self {
         Self {
             zeros: Vec::new(),
             poles: Vec::new(),
@@ -20,7 +28,8 @@ impl Zpk {
         }
     }
 
-    pub(crate) fn of(g: &TransferFunction) -> Self {
+    /// Of a transfer function.
+    pub fn of(g: &TransferFunction) -> Self {
         Self {
             zeros: g.zeros(),
             poles: g.poles(),
@@ -28,14 +37,63 @@ impl Zpk {
         }
     }
 
-    pub(crate) fn series(mut self, other: &Self) -> Self {
+    /// First-order low-pass `w / (s + w)`.
+    pub fn low_pass(w: f64) -> Self {
+        Self {
+            zeros: Vec::new(),
+            poles: vec![real(-w)],
+            gain: w,
+        }
+    }
+
+    /// First-order high-pass `s / (s + w)`.
+    pub fn high_pass(w: f64) -> Self {
+        Self {
+            zeros: vec![real(0.0)],
+            poles: vec![real(-w)],
+            gain: 1.0,
+        }
+    }
+
+    /// Second-order low-pass `w^2 / (s^2 + 2 zeta w s + w^2)` of a frequency in Hz and a damping ratio.
+    pub fn resonance(frequency_hz: f64, damping: f64) -> Self {
+        let w = std::f64::consts::TAU * frequency_hz;
+        let poles = if damping < 1.0 {
+            let im = w * (1.0 - damping * damping).sqrt();
+            vec![
+                Complex::new(-damping * w, im),
+                Complex::new(-damping * w, -im),
+            ]
+        } else {
+            let fast = -w * (damping + (damping * damping - 1.0).sqrt());
+            vec![real(fast), real(w * w / fast)]
+        };
+        Self {
+            zeros: Vec::new(),
+            poles,
+            gain: w * w,
+        }
+    }
+
+    /// `(1 + (1 + strength) time s) / (1 + time s)`.
+    pub fn relaxation(time_s: f64, strength: f64) -> Self {
+        Self {
+            zeros: vec![real(-1.0 / (time_s * (1.0 + strength)))],
+            poles: vec![real(-1.0 / time_s)],
+            gain: 1.0 + strength,
+        }
+    }
+
+    /// The product of two.
+    pub fn series(mut self, other: &Self) -> Self {
         self.zeros.extend_from_slice(&other.zeros);
         self.poles.extend_from_slice(&other.poles);
         self.gain *= other.gain;
         self
     }
 
-    pub(crate) fn at(&self, s: Complex<f64>) -> Complex<f64> {
+    /// Value at a complex frequency, rad/s.
+    pub fn at(&self, s: Complex<f64>) -> Complex<f64> {
         // Factors are taken alternately so that neither product overflows.
         let mut value = Complex::new(self.gain, 0.0);
         let n = self.zeros.len().max(self.poles.len());

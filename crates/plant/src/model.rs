@@ -1,8 +1,7 @@
 //! [`Model`]: the plant with its working point, effects and noise; the one artifact that identify writes, the
 //! emulator runs, design reads, reconcile extends and track carries.
 
-use crate::chain::linear_part;
-use crate::effect::Effect;
+use crate::effects::{Action, Effect, Place};
 use crate::error::{ModelError, ModelProblem};
 use crate::model_file;
 use crate::transfer::TransferFunction;
@@ -53,6 +52,10 @@ pub struct Model {
     pub effects: Vec<Effect>,
     /// Brownian motion and localisation noise.
     pub noise: Noise,
+    /// Delay of the camera path that was measured with the plant, s: from the middle of an exposure to the tick that uses it.
+    /// It is not in [`Self::plant`], belongs to the rig and is what `camera_delay_ms` of rig.toml says; a loop's delay is
+    /// this and half a period of hold.
+    pub camera_delay_s: Option<f64>,
     /// Covariance of the fitted parameters, if they were fitted.
     pub covariance: Option<Covariance>,
     /// 95 % confidence intervals \[low, high\] by parameter name.
@@ -75,6 +78,7 @@ impl Model {
                 diffusion_um2_per_s: 0.33,
                 localisation_um: 0.03,
             },
+            camera_delay_s: None,
             covariance: None,
             intervals: BTreeMap::new(),
             provenance: BTreeMap::new(),
@@ -99,7 +103,9 @@ impl Model {
     /// A file that cannot be read, and all that [`Self::from_toml_str`] refuses.
     pub fn load_file(path: &Path) -> Result<Self, ModelError> {
         let file = path.display().to_string();
-        let text = std::fs::read_to_string(path).map_err(|error| ModelError {
+        /// No model comes near it.
+        const MOST_BYTES: u64 = 1 << 24;
+        let text = cellpos_table::read_text(path, MOST_BYTES).map_err(|error| ModelError {
             file: file.clone(),
             at: None,
             problem: Box::new(ModelProblem::Unreadable {
@@ -134,27 +140,37 @@ impl Model {
     pub fn linear_response(&self, frequency: Hertz) -> Complex<f64> {
         let w = TAU * frequency.value();
         let s = Complex::new(0.0, w);
-        let mut value = self.plant.at(s);
+        let one = Complex::new(1.0, 0.0);
+        let (mut value, mut before, mut camera) = (self.plant.at(s), one, one);
+        let mut beside = Vec::new();
         for effect in &self.effects {
-            value *= match *effect {
-                Effect::TimeDelay { delay_s } => Complex::from_polar(1.0, -w * delay_s),
-                Effect::ExposureAveraging { exposure_s } => {
+            match effect.act() {
+                Action::Linear(zpk) => {
+                    let factor = zpk.at(s);
+                    value *= factor;
+                    if effect.place() < Place::Chip {
+                        before *= factor;
+                    }
+                }
+                Action::Delay(delay_s) => camera *= Complex::from_polar(1.0, -w * delay_s),
+                Action::Exposure(exposure_s) => {
                     let half = 0.5 * w * exposure_s;
                     let sinc = if half.abs() < 1e-9 {
                         1.0
                     } else {
                         half.sin() / half
                     };
-                    Complex::from_polar(sinc, -half)
+                    camera *= Complex::from_polar(sinc, -half);
                 }
-                Effect::Bubble { lag_s, .. } => (s * lag_s + 1.0).inv(),
-                ref other => match linear_part(other) {
-                    Some(part) => part.at(s),
-                    None => continue,
-                },
-            };
+                Action::Bypass(zpk) => beside.push(zpk.at(s)),
+                // A block counts as what it is at the start, where that is linear: see the documentation above.
+                Action::Block(_) => {
+                    value *= effect.kind().at_start(effect).map_or(one, |zpk| zpk.at(s));
+                }
+                _ => {}
+            }
         }
-        value
+        (value + before * beside.into_iter().sum::<Complex<f64>>()) * camera
     }
 
     /// The first effect with this id.

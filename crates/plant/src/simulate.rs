@@ -4,10 +4,9 @@
 //! integral of the position in closed form. Nothing is interpolated.
 
 use crate::chain::{Chain, ChainError, in_range};
-use crate::effect::Effect;
+use crate::effects::{Action, Shown};
 use crate::model::Model;
 use crate::random::Gaussian;
-use std::f64::consts::TAU;
 
 /// On which side of the command a row's position is taken, where the two coincide.
 ///
@@ -71,10 +70,8 @@ struct Camera {
     exposure_s: f64,
     /// `t' = (1 + skew) t`.
     skew: f64,
-    /// (rad/s, um, rad).
-    hum: Vec<(f64, f64, f64)>,
-    /// (1/um, um, rad).
-    locking: Vec<(f64, f64, f64)>,
+    /// What light, table and sensor make of a position.
+    shown: Vec<Box<dyn Shown>>,
     localisation_um: f64,
     noise: Option<Gaussian>,
 }
@@ -92,33 +89,26 @@ impl Camera {
             delay_s: 0.0,
             exposure_s: 0.0,
             skew: 0.0,
-            hum: Vec::new(),
-            locking: Vec::new(),
+            shown: Vec::new(),
             localisation_um: model.noise.localisation_um,
             // A stream of its own, so that the Brownian path does not depend on the camera.
             noise: seed.map(|s| Gaussian::new(s ^ 0x9e37_79b9_7f4a_7c15)),
         };
         let mut exposures = 0;
         for effect in model.ordered_effects() {
-            match *effect {
-                Effect::TimeDelay { delay_s } => camera.delay_s += delay_s,
-                Effect::ExposureAveraging { exposure_s } => {
-                    camera.exposure_s = exposure_s;
+            match effect.act() {
+                Action::Delay(s) => camera.delay_s += s,
+                Action::Exposure(s) => {
+                    camera.exposure_s = s;
                     exposures += 1;
                 }
-                Effect::ClockSkew { ppm } => camera.skew += 1e-6 * ppm,
-                Effect::MainsHum { hz, um, phase_deg } => {
-                    camera.hum.push((TAU * hz, um, phase_deg.to_radians()));
+                Action::Skew(e) => camera.skew += e,
+                Action::Show(mut shown) => {
+                    if let Some(seed) = seed {
+                        shown.seed(seed ^ 0xd1b5_4a32_d192_ed03);
+                    }
+                    camera.shown.push(shown);
                 }
-                Effect::PixelLocking {
-                    pixel_um,
-                    amplitude,
-                    phase_deg,
-                } => camera.locking.push((
-                    TAU / pixel_um,
-                    amplitude * pixel_um,
-                    phase_deg.to_radians(),
-                )),
                 _ => {}
             }
         }
@@ -133,11 +123,8 @@ impl Camera {
     /// From the position that the frame saw to the recorded one.
     fn record(&mut self, seen_um: f64, time_s: f64) -> f64 {
         let mut y = seen_um;
-        for &(w, um, phase) in &self.hum {
-            y += um * (w * time_s + phase).sin();
-        }
-        for &(k, um, phase) in &self.locking {
-            y += um * (k * y + phase).sin();
+        for shown in &mut self.shown {
+            y = shown.show(y, time_s);
         }
         if let Some(noise) = &mut self.noise {
             y += self.localisation_um * noise.next_normal();

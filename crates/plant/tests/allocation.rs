@@ -2,9 +2,7 @@
 #![forbid(unsafe_code)]
 
 use cellpos_counting_alloc::{CountingAllocator, allocations_of};
-use cellpos_plant::{
-    Chain, DiscretePlant, Effect, Hysteresis, Model, Seconds, Simulator, TransferFunction,
-};
+use cellpos_plant::{Chain, DiscretePlant, Model, Seconds, Simulator, TransferFunction, effects};
 
 #[global_allocator]
 static ALLOCATOR: CountingAllocator = CountingAllocator;
@@ -16,29 +14,13 @@ fn everything() -> Model {
     ))
     .unwrap();
     for effect in [
-        Effect::PztHysteresis(Hysteresis::Play {
-            thresholds_um: vec![0.0, 0.1],
-            weights: vec![0.9, 0.1],
-            quadratic_per_um: 0.0,
-        }),
-        Effect::PztResonance {
-            frequency_hz: 900.0,
-            damping: 0.05,
-        },
-        Effect::Backlash { width_um: 0.05 },
-        Effect::Bubble {
-            lag_s: 1e-3,
-            dissolution_per_s: 0.01,
-        },
-        Effect::GainDrift { per_s: 1e-3 },
-        Effect::WallAdhesion {
-            speed_um_per_s: 20.0,
-        },
-        Effect::MainsHum {
-            hz: 50.0,
-            um: 0.1,
-            phase_deg: 0.0,
-        },
+        effects::play(&[0.0, 0.1], &[0.9, 0.1], 0.0),
+        effects::pzt_resonance(900.0, 0.05),
+        effects::backlash(0.05),
+        effects::bubble(1e-3, 0.01),
+        effects::gain_drift(1e-3),
+        effects::wall_adhesion(20.0),
+        effects::mains_hum(50.0, 0.1, 0.0),
     ] {
         model = model.with_effect(effect);
     }

@@ -1,8 +1,8 @@
 //! The exact discretisation and the chain against fine numerical integration and against each other.
 
 use cellpos_plant::{
-    Chain, Complex, DiscretePlant, Effect, Gaussian, Hertz, Model, Seconds, StateSpace,
-    TransferFunction,
+    Chain, Complex, DiscretePlant, Gaussian, Hertz, Model, Seconds, StateSpace, TransferFunction,
+    effects,
 };
 use std::f64::consts::TAU;
 
@@ -125,19 +125,12 @@ fn a_sample_time_or_delay_out_of_range_is_refused() {
 #[test]
 fn the_chain_takes_any_steps_to_the_same_place() {
     let mut model = Model::eq6()
-        .with_effect(Effect::DriverLag {
-            bandwidth_hz: 300.0,
-        })
-        .with_effect(Effect::PztCreep { per_decade: 0.02 })
-        .with_effect(Effect::PztResonance {
-            frequency_hz: 900.0,
-            damping: 0.05,
-        })
-        .with_effect(Effect::Leak {
-            corner_rad_per_s: 1.5,
-        })
-        .with_effect(Effect::FlowDrift { um_per_s: 5.0 });
-    model.effects.push(Effect::GainDrift { per_s: 0.05 });
+        .with_effect(effects::driver_lag(300.0))
+        .with_effect(effects::pzt_creep(0.02))
+        .with_effect(effects::pzt_resonance(900.0, 0.05))
+        .with_effect(effects::leak(1.5))
+        .with_effect(effects::flow_drift(5.0));
+    model.effects.push(effects::gain_drift(0.05));
     let mut whole = Chain::new(&model).unwrap();
     let mut parts = Chain::new(&model).unwrap();
     for (k, u) in noise(200, 8).into_iter().enumerate() {

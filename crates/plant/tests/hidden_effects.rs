@@ -3,7 +3,8 @@
 //! Eq. (6) with the effects and parameters named in the data's README must leave nothing but Brownian motion and
 //! localisation noise in the increments of the residual, in every record.
 
-use cellpos_plant::{Effect, Hysteresis, Model, Sampled, SimulateOptions, simulate};
+use cellpos_plant::effects::{self, Action};
+use cellpos_plant::{Effect, Model, Sampled, SimulateOptions, simulate};
 use std::path::PathBuf;
 
 const RECORDS: [&str; 6] = [
@@ -74,8 +75,8 @@ fn reproduces(case: &str, effects: Vec<Effect>, tolerance: f64) {
     let mut model = Model::eq6();
     let exposure = effects
         .iter()
-        .find_map(|e| match e {
-            Effect::ExposureAveraging { exposure_s } => Some(*exposure_s),
+        .find_map(|e| match e.act() {
+            Action::Exposure(exposure_s) => Some(exposure_s),
             _ => None,
         })
         .unwrap_or(0.0);
@@ -101,59 +102,35 @@ fn eq_6_alone_explains_the_records_in_which_nothing_is_hidden() {
 
 #[test]
 fn the_documented_delay_explains_the_delay_records() {
-    reproduces(
-        "time-delay",
-        vec![Effect::TimeDelay { delay_s: 2e-3 }],
-        0.02,
-    );
+    reproduces("time-delay", vec![effects::time_delay(2e-3)], 0.02);
 }
 
 #[test]
 fn the_documented_drift_explains_the_drift_records() {
-    reproduces(
-        "flow-drift",
-        vec![Effect::FlowDrift { um_per_s: 8.0 }],
-        0.02,
-    );
+    reproduces("flow-drift", vec![effects::flow_drift(8.0)], 0.02);
 }
 
 #[test]
 fn the_documented_driver_lag_explains_its_records() {
-    reproduces(
-        "driver-lag",
-        vec![Effect::DriverLag {
-            bandwidth_hz: 180.0,
-        }],
-        0.02,
-    );
+    reproduces("driver-lag", vec![effects::driver_lag(180.0)], 0.02);
 }
 
 #[test]
 fn the_documented_exposure_explains_its_records() {
     reproduces(
         "exposure-averaging",
-        vec![Effect::ExposureAveraging { exposure_s: 0.9e-3 }],
+        vec![effects::exposure_averaging(0.9e-3)],
         0.02,
     );
 }
 
 #[test]
 fn the_documented_adhesion_explains_its_records() {
-    reproduces(
-        "wall-adhesion",
-        vec![Effect::WallAdhesion {
-            speed_um_per_s: 35.0,
-        }],
-        0.03,
-    );
+    reproduces("wall-adhesion", vec![effects::wall_adhesion(35.0)], 0.03);
 }
 
 fn hysteresis(fraction: f64, beta_per_um: f64, gamma_per_um: f64) -> Effect {
-    Effect::PztHysteresis(Hysteresis::BoucWenExplicit {
-        fraction,
-        beta_per_um,
-        gamma_per_um,
-    })
+    effects::bouc_wen_explicit(fraction, beta_per_um, gamma_per_um)
 }
 
 #[test]
@@ -161,10 +138,7 @@ fn the_documented_hysteresis_explains_its_records() {
     reproduces("pzt-hysteresis", vec![hysteresis(0.3, 0.9, 0.2)], 0.02);
     reproduces(
         "time-delay+pzt-hysteresis",
-        vec![
-            hysteresis(0.25, 0.7, 0.3),
-            Effect::TimeDelay { delay_s: 1.5e-3 },
-        ],
+        vec![hysteresis(0.25, 0.7, 0.3), effects::time_delay(1.5e-3)],
         0.02,
     );
 }
@@ -173,9 +147,7 @@ fn the_documented_hysteresis_explains_its_records() {
 fn the_documented_leak_and_hum_explain_their_records() {
     // The hum's phase is not documented and differs from record to record: it is fitted.
     for record in RECORDS {
-        let leak = Effect::Leak {
-            corner_rad_per_s: 1.5,
-        };
+        let leak = effects::leak(1.5);
         let model = Model::eq6().with_effect(leak.clone());
         let Some(d) = increments(&model, "leak+mains-hum", record, Sampled::AfterCommand) else {
             return;
@@ -192,11 +164,7 @@ fn the_documented_leak_and_hum_explain_their_records() {
         let amplitude = c.hypot(s) * scale;
         let phase_deg = (-s).atan2(c).to_degrees();
         assert!((amplitude - 0.15).abs() < 0.006, "{record}: {amplitude} um");
-        let whole = model.with_effect(Effect::MainsHum {
-            hz: 50.0,
-            um: 0.15,
-            phase_deg,
-        });
+        let whole = model.with_effect(effects::mains_hum(50.0, 0.15, phase_deg));
         let d = increments(&whole, "leak+mains-hum", record, Sampled::AfterCommand).unwrap();
         let ratio = rms(&d) / floor_um(0.0);
         println!("leak+mains-hum {record}: {ratio:.4}, {amplitude:.4} um");

@@ -1,6 +1,6 @@
 //! Brownian motion, localisation noise, and that a seed fixes every bit.
 
-use cellpos_plant::{Chain, Effect, Model, SimulateOptions, Simulator, simulate};
+use cellpos_plant::{Chain, Model, SimulateOptions, Simulator, effects, simulate};
 
 fn noisy(model: &Model, n: usize, seed: u64) -> Vec<f64> {
     let options = SimulateOptions {
@@ -67,7 +67,7 @@ fn localisation_noise_is_white_and_of_its_size() {
 
 #[test]
 fn an_exposure_takes_a_third_of_itself_from_the_brownian_increments() {
-    let mut model = Model::eq6().with_effect(Effect::ExposureAveraging { exposure_s: 0.9e-3 });
+    let mut model = Model::eq6().with_effect(effects::exposure_averaging(0.9e-3));
     model.noise.localisation_um = 0.0;
     let y = noisy(&model, 40_000, 7);
     let expected = 2.0 * 0.33 * (1e-3 - 0.9e-3 / 3.0);
@@ -96,8 +96,8 @@ fn a_seed_fixes_every_bit_and_no_seed_means_no_noise() {
 #[test]
 fn row_by_row_and_whole_records_are_the_same_to_the_bit() {
     let model = Model::eq6()
-        .with_effect(Effect::TimeDelay { delay_s: 2.4e-3 })
-        .with_effect(Effect::ExposureAveraging { exposure_s: 0.7e-3 });
+        .with_effect(effects::time_delay(2.4e-3))
+        .with_effect(effects::exposure_averaging(0.7e-3));
     let u: Vec<f64> = (0..200).map(|k| 4.0 + f64::from(k % 17) * 0.05).collect();
     let options = SimulateOptions {
         seed: Some(3),

@@ -1,24 +1,14 @@
 //! What was found, as parameters with intervals and as a model file.
 
-use crate::catalogue::{Kind, VARIANTS};
+use crate::catalogue::Part;
 use crate::fit::{Context, Fit};
+use crate::floor::Floor;
 use crate::frames::FrameCounts;
-use crate::predict::{Block, PLAY_LEVELS, domains, near_whole};
+use crate::predict::near_whole;
 use crate::result::{Effect as NamedEffect, Interval, Verdict};
-use cellpos_plant::{Effect, Hysteresis, Model};
+use cellpos_plant::effects::{self, Role};
+use cellpos_plant::{Effect, Model};
 use std::collections::BTreeMap;
-
-/// Place of an effect in the chain.
-pub(crate) fn place_of(id: &str) -> &'static str {
-    match id {
-        "driver-lag" | "slew-limit" | "saturation" => "driver",
-        "pzt-hysteresis" | "pzt-creep" | "pzt-resonance" | "backlash" => "pzt",
-        "pdms-relaxation" | "bubble" | "leak" => "chip",
-        "gain-error" => "bead/camera",
-        "gain-drift" | "wall-adhesion" | "flow-drift" => "bead",
-        _ => "camera",
-    }
-}
 
 /// Relative error of a parameter that no length of record takes away: two integrators of the same equations, a commanded edge
 /// in one and in the other, agree to about a thousandth (two of these).
@@ -54,15 +44,15 @@ pub(crate) fn parameters(
             Interval {
                 value: p.natural(x),
                 ci95: [low, high],
-                unit: unit_of(p.name).to_owned(),
+                unit: unit_of(part, p.name).to_owned(),
             },
         );
     }
-    match part.variant().kind {
-        Kind::Line => {
+    match part.variant().role {
+        Role::Line => {
             let line = fit.parts[..index]
                 .iter()
-                .filter(|p| p.variant().kind == Kind::Line)
+                .filter(|p| p.variant().role == Role::Line)
                 .count();
             let amplitudes: Vec<f64> = fit.lines[line].iter().map(|[a, b]| a.hypot(*b)).collect();
             let rows: f64 = ctx.problem.records.iter().map(|r| r.u.len() as f64).sum();
@@ -92,10 +82,10 @@ pub(crate) fn parameters(
                 },
             );
         }
-        Kind::Position => {
+        Role::Position => {
             let at = fit.parts[..index]
                 .iter()
-                .filter(|p| p.variant().kind == Kind::Position)
+                .filter(|p| p.variant().role == Role::Position)
                 .count();
             if let Some(Some(exact)) = fit.locking.get(index) {
                 let (amplitude, sd) = exact.amplitude_px();
@@ -142,35 +132,17 @@ pub(crate) fn parameters(
                 },
             );
         }
-        Kind::Chain => {}
+        Role::Chain => {}
     }
     out
 }
 
-fn unit_of(name: &str) -> &'static str {
-    match name {
-        "bandwidth_hz" | "frequency_hz" | "hz" => "Hz",
-        "rate_um_per_s" | "speed_um_per_s" | "um_per_s" => "um/s",
-        "low_um" | "high_um" | "width_um" | "pixel_um" | "um" => "um",
-        "beta_per_um" | "gamma_per_um" | "quadratic_per_um" => "1/um",
-        "time_s" | "lag_s" | "delay_s" | "exposure_s" => "s",
-        "corner_rad_per_s" => "rad/s",
-        "dissolution_per_s" | "per_s" => "1/s",
-        "ppm" => "ppm",
-        _ => "",
+/// Unit of a parameter; a width of operators is that of their thresholds.
+fn unit_of(part: &Part, name: &str) -> &'static str {
+    if name == "width_um" {
+        return "um";
     }
-}
-
-/// Play operators that stand for an exponential density of thresholds, as a model file holds them.
-pub(crate) fn exponential_play(fraction: f64, width_um: f64) -> Hysteresis {
-    let (radii, shares) = domains();
-    let thresholds = std::iter::once(0.0).chain(radii.map(|r| r * width_um));
-    let weights = std::iter::once(1.0 - fraction).chain(shares.map(|s| s * fraction));
-    Hysteresis::Play {
-        thresholds_um: thresholds.collect(),
-        weights: weights.collect(),
-        quadratic_per_um: 0.0,
-    }
+    effects::find(part.id()).map_or("", |k| k.spec().unit(name))
 }
 
 /// A delay a hair short of whole frames, whose frames do not show the edges of the command: whole frames for a simulator,
@@ -193,66 +165,19 @@ fn without_edge(ctx: &Context<'_>, fit: &Fit, delay_s: f64) -> f64 {
 fn effect_of(ctx: &Context<'_>, fit: &Fit, index: usize) -> Option<Effect> {
     let part = &fit.parts[index];
     let v = part.natural();
-    let before = |kind| {
+    let before = |role| {
         fit.parts[..index]
             .iter()
-            .filter(|p| p.variant().kind == kind)
+            .filter(|p| p.variant().role == role)
             .count()
     };
-    Some(match (part.variant().build)(&v, &ctx.scope) {
-        Block::Saturation { low_um, high_um } => Effect::Saturation { low_um, high_um },
-        Block::SlewLimit { rate } => Effect::SlewLimit {
-            rate_um_per_s: rate,
-        },
-        Block::DriverLag { .. } => Effect::DriverLag { bandwidth_hz: v[0] },
-        Block::BoucWen {
-            fraction,
-            beta,
-            gamma,
-        } => Effect::PztHysteresis(Hysteresis::BoucWenExplicit {
-            fraction,
-            beta_per_um: beta,
-            gamma_per_um: gamma,
-        }),
-        Block::Play {
-            stroke_um,
-            weights,
-            quadratic,
-        } => Effect::PztHysteresis(Hysteresis::Play {
-            thresholds_um: PLAY_LEVELS.iter().map(|l| l * stroke_um).collect(),
-            weights: weights.to_vec(),
-            quadratic_per_um: quadratic,
-        }),
-        Block::Domains { fraction, width_um } => {
-            Effect::PztHysteresis(exponential_play(fraction, width_um))
+    match part.variant().role {
+        Role::Chain if part.id() == "time-delay" => {
+            Some(effects::time_delay(without_edge(ctx, fit, v[0])))
         }
-        Block::Creep { g } => Effect::PztCreep { per_decade: g },
-        Block::Resonance { zeta, .. } => Effect::PztResonance {
-            frequency_hz: v[0],
-            damping: zeta,
-        },
-        Block::Backlash { width_um } => Effect::Backlash { width_um },
-        Block::Relaxation { time_s, strength } => Effect::PdmsRelaxation { time_s, strength },
-        Block::Bubble { lag_s, dissolution } => Effect::Bubble {
-            lag_s,
-            dissolution_per_s: dissolution,
-        },
-        Block::Leak { corner } => Effect::Leak {
-            corner_rad_per_s: corner,
-        },
-        Block::Gain { factor } => Effect::GainError { factor },
-        Block::GainDrift { per_s } => Effect::GainDrift { per_s },
-        Block::FlowDrift { um_per_s } => Effect::FlowDrift { um_per_s },
-        Block::Adhesion { um_per_s } => Effect::WallAdhesion {
-            speed_um_per_s: um_per_s,
-        },
-        Block::ClockSkew { .. } => Effect::ClockSkew { ppm: v[0] },
-        Block::Delay { s } => Effect::TimeDelay {
-            delay_s: without_edge(ctx, fit, s),
-        },
-        Block::Exposure { s } => Effect::ExposureAveraging { exposure_s: s },
-        Block::Hum { hz } => {
-            let line = &fit.lines[before(Kind::Line)];
+        Role::Chain => Some(part.effect(&ctx.scope)),
+        Role::Line => {
+            let line = &fit.lines[before(Role::Line)];
             let [a, b] = line.first().copied()?;
             let rows: f64 = ctx.problem.records.iter().map(|r| r.u.len() as f64).sum();
             let um = ctx
@@ -263,30 +188,26 @@ fn effect_of(ctx: &Context<'_>, fit: &Fit, index: usize) -> Option<Effect> {
                 .map(|(r, [a, b])| a.hypot(*b) * r.u.len() as f64)
                 .sum::<f64>()
                 / rows;
-            Effect::MainsHum {
-                hz,
-                um,
-                phase_deg: b.atan2(a).to_degrees(),
-            }
+            // Amplitude and phase are no parameters of the fit: the form of the effect has them beside the frequency.
+            part.effect(&ctx.scope)
+                .with_parameter("um", um)
+                .and_then(|e| e.with_parameter("phase_deg", b.atan2(a).to_degrees()))
+                .ok()
         }
-        Block::PixelLocking { .. } if matches!(fit.locking.get(index), Some(Some(_))) => {
-            let exact = fit.locking.get(index).copied().flatten()?;
-            let [a, b] = exact.wave_um;
-            Effect::PixelLocking {
-                pixel_um: exact.pixel_um,
-                amplitude: exact.amplitude_px().0,
-                phase_deg: b.atan2(a).to_degrees(),
-            }
+        Role::Position => {
+            let exact = fit.locking.get(index).copied().flatten();
+            let ([a, b], pixel_um, amplitude) = match exact {
+                Some(l) => (l.wave_um, l.pixel_um, l.amplitude_px().0),
+                None => {
+                    let [a, b] = fit.positions[before(Role::Position)];
+                    let sharp = ctx.problem.noise.sharpness(v[0]);
+                    ([a, b], v[0], a.hypot(b) / (v[0] * sharp))
+                }
+            };
+            let phase_deg = b.atan2(a).to_degrees();
+            Some(effects::pixel_locking(pixel_um, amplitude, phase_deg))
         }
-        Block::PixelLocking { pixel_um } => {
-            let [a, b] = fit.positions[before(Kind::Position)];
-            Effect::PixelLocking {
-                pixel_um,
-                amplitude: a.hypot(b) / (pixel_um * ctx.problem.noise.sharpness(pixel_um)),
-                phase_deg: b.atan2(a).to_degrees(),
-            }
-        }
-    })
+    }
 }
 
 /// The model with what was found, its intervals and where they come from.
@@ -297,6 +218,7 @@ pub(crate) fn augment(
     frames: &FrameCounts,
     named: &[NamedEffect],
     verdict: Verdict,
+    floor: &Floor,
 ) -> Model {
     let mut out = model.clone();
     out.name = if named.is_empty() {
@@ -308,31 +230,39 @@ pub(crate) fn augment(
     if let Ok(plant) = model.plant.scaled(fit.gain) {
         out.plant = plant;
     }
-    out.noise.diffusion_um2_per_s = ctx
-        .problem
-        .noise
-        .diffusion_um2_per_s(ctx.problem.base.sample_s);
-    out.noise.localisation_um = ctx.problem.noise.localisation_um();
+    // Without a floor there is no noise to write, and numbers beyond what a model may hold are none.
+    let noise = cellpos_plant::Noise {
+        diffusion_um2_per_s: ctx
+            .problem
+            .noise
+            .diffusion_um2_per_s(ctx.problem.base.sample_s),
+        localisation_um: ctx.problem.noise.localisation_um(),
+    };
+    if floor.source.is_known() && noise.diffusion_um2_per_s < 1e4 && noise.localisation_um < 100.0 {
+        out.noise = noise;
+    }
+    out.provenance
+        .insert("noise".to_owned(), floor.source.words().to_owned());
     if verdict != Verdict::Unknown {
         for i in 0..fit.parts.len() {
             if let Some(e) = effect_of(ctx, fit, i) {
-                out.effects
-                    .retain(|old| old.id() != e.id() || !VARIANTS.iter().any(|v| v.id == old.id()));
+                out.effects.retain(|old| old.id() != e.id());
                 out.effects.push(e);
             }
         }
         if frames.drops_named() {
-            out.effects.push(Effect::FrameDrops {
-                rate: frames.drop_rate(),
-            });
+            out.effects.push(effects::frame_drops(frames.drop_rate()));
         }
         if frames.repeats_named() {
-            out.effects.push(Effect::FrameRepeats {
-                rate: frames.repeat_rate(),
-            });
+            out.effects
+                .push(effects::frame_repeats(frames.repeat_rate()));
         }
         for e in named {
-            for (name, p) in &e.parameters {
+            for (name, p) in e
+                .parameters
+                .iter()
+                .filter(|(_, p)| p.ci95.iter().all(|v| v.is_finite()))
+            {
                 out.intervals.insert(format!("{}.{name}", e.id), p.ci95);
             }
         }

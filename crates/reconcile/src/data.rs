@@ -1,6 +1,8 @@
 //! Records as the workflow sees them: an even time grid, the command in micrometres, the bead where there was one.
 
 use crate::error::ReconcileError;
+use crate::thresholds::THRESHOLDS;
+use realfft::RealFftPlanner;
 
 /// One record on an even grid.
 #[derive(Debug, Clone, PartialEq)]
@@ -145,7 +147,45 @@ impl Record {
     /// Whether the command never changes.
     pub fn is_rest(&self) -> bool {
         let (low, high) = self.pzt_range_um();
-        high - low < 1e-9
+        self.rests_within(1e-12 * low.abs().max(high.abs()))
+    }
+
+    /// Whether the command stays within a range: a measured one is never quite still.
+    pub(crate) fn rests_within(&self, range_um: f64) -> bool {
+        let (low, high) = self.pzt_range_um();
+        high - low <= range_um
+    }
+
+    /// Whether another record has the same command, within the noise of a measured one.
+    pub(crate) fn same_command(&self, other: &Self) -> bool {
+        let n = self.rows().min(other.rows());
+        if n < 50 || self.rows().abs_diff(other.rows()) > n / 50 {
+            return false;
+        }
+        let d: f64 = self.pzt_um[..n]
+            .iter()
+            .zip(&other.pzt_um[..n])
+            .map(|(a, b)| (a - b).powi(2))
+            .sum();
+        let share = THRESHOLDS.repeat_share;
+        let power = variance(&self.pzt_um[..n]);
+        power > 0.0 && d / n as f64 <= share * share * power
+    }
+
+    /// Whether the positions come in steps that are not small beside their increments: a sensor that counts.
+    pub fn is_quantised(&self) -> bool {
+        let mut sizes: Vec<f64> = self
+            .bead_um
+            .windows(2)
+            .map(|w| (w[1] - w[0]).abs())
+            .filter(|d| d.is_finite() && *d > 0.0)
+            .collect();
+        if sizes.len() < 20 {
+            return false;
+        }
+        let middle = sizes.len() / 2;
+        let (_, median, _) = sizes.select_nth_unstable_by(middle, f64::total_cmp);
+        *median < 8.0 * self.resolution_um
     }
 
     /// Smallest and largest command \[um\].
@@ -157,25 +197,50 @@ impl Record {
             })
     }
 
-    /// The smallest period, in rows, at which the whole command repeats itself; `None` without one (or at rest).
+    /// Largest excursion of the position from its start \[um\].
+    pub fn travel_um(&self) -> f64 {
+        let mut seen = self.bead_um.iter().filter(|b| b.is_finite());
+        let start = seen.next().copied().unwrap_or(0.0);
+        seen.map(|b| (b - start).abs()).fold(0.0, f64::max)
+    }
+
+    /// The smallest period, in rows, at which the whole command repeats itself within the noise of a measured one; `None`
+    /// without one (or at rest).
+    ///
+    /// A multisine may need one period of run-in: the later part alone may repeat.
     pub fn period_rows(&self) -> Option<usize> {
         let n = self.rows();
-        let (low, high) = self.pzt_range_um();
-        let tolerance = 1e-4 * (high - low) + 1.1e-5;
-        if high - low < 1e-9 {
+        let u = &self.pzt_um;
+        let power = variance(u);
+        if n < 60 || power <= 0.0 || self.is_rest() {
             return None;
         }
-        let u = &self.pzt_um;
-        // A multisine may need one period of run-in; compare the later part only.
-        (20..=n / 2).find(|&p| {
-            (n - p..n)
-                .rev()
-                .step_by(7)
-                .all(|k| (u[k] - u[k - p]).abs() <= tolerance)
-                && (p..n)
-                    .step_by(3)
-                    .all(|k| (u[k] - u[k - p]).abs() <= tolerance)
-        })
+        let limit = THRESHOLDS.repeat_share.powi(2) * power;
+        let apart = differences(u)?;
+        let mut away = false;
+        for p in 1..=n / 2 {
+            // The command must have gone somewhere before it can be said to have come back.
+            away |= apart[p] > 0.25 * power;
+            let least =
+                apart[p] <= apart[p - 1] && apart.get(p + 1).is_none_or(|next| apart[p] <= *next);
+            if !away || p < 20 || !least {
+                continue;
+            }
+            let from = |shift: usize, first: usize| {
+                let d: f64 = (first..n).map(|k| (u[k] - u[k - shift]).powi(2)).sum();
+                d / (n - first).max(1) as f64
+            };
+            // The run-in counts for one period in all.
+            let start = if n >= 4 * p { 2 * p } else { p };
+            if apart[p] > limit && (start == p || from(p, start) > limit) {
+                continue;
+            }
+            let once = from(p, start);
+            // Noise is the same whatever lies between; a sine that swells is off by twice as much after twice the time.
+            let steady = n < 4 * p || once < 1e-6 * power || from(2 * p, start) < 2.5 * once;
+            return steady.then_some(p);
+        }
+        None
     }
 
     /// The part of a record between two rows, as a record of its own.
@@ -191,6 +256,57 @@ impl Record {
             unseen: self.unseen[from..to].to_vec(),
         }
     }
+}
+
+/// Range of the command over all records \[um\].
+pub(crate) fn command_range_um(records: &[Record]) -> f64 {
+    let (low, high) = records
+        .iter()
+        .map(Record::pzt_range_um)
+        .fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), (c, d)| {
+            (a.min(c), b.max(d))
+        });
+    (high - low).max(0.0)
+}
+
+/// Variance about the mean.
+fn variance(x: &[f64]) -> f64 {
+    let n = x.len().max(1) as f64;
+    let mean = x.iter().sum::<f64>() / n;
+    x.iter().map(|v| (v - mean).powi(2)).sum::<f64>() / n
+}
+
+/// Mean square of `x_k - x_(k-p)` for every shift p up to half the length, through the autocorrelation.
+fn differences(x: &[f64]) -> Option<Vec<f64>> {
+    let n = x.len();
+    let mean = x.iter().sum::<f64>() / n as f64;
+    let size = (2 * n).next_power_of_two();
+    let mut padded = vec![0.0; size];
+    for (p, v) in padded.iter_mut().zip(x) {
+        *p = v - mean;
+    }
+    let mut planner = RealFftPlanner::<f64>::new();
+    let forward = planner.plan_fft_forward(size);
+    let mut spectrum = forward.make_output_vec();
+    let squares: Vec<f64> = padded[..n].iter().map(|v| v * v).collect();
+    forward.process(&mut padded, &mut spectrum).ok()?;
+    for s in &mut spectrum {
+        *s = (s.norm_sqr()).into();
+    }
+    let inverse = planner.plan_fft_inverse(size);
+    let mut correlation = inverse.make_output_vec();
+    inverse.process(&mut spectrum, &mut correlation).ok()?;
+    let (mut head, mut tail) = (squares.iter().sum::<f64>(), squares.iter().sum::<f64>());
+    let mut out = Vec::with_capacity(n / 2 + 1);
+    for p in 0..=n / 2 {
+        if p > 0 {
+            head -= squares[n - p];
+            tail -= squares[p - 1];
+        }
+        let r = correlation[p] / size as f64;
+        out.push(((head + tail - 2.0 * r) / (n - p) as f64).max(0.0));
+    }
+    Some(out)
 }
 
 /// Puts records into an order that does not depend on that of the files, and joins parts of one record: a part that
@@ -333,10 +449,14 @@ fn resolution(values: &[f64]) -> f64 {
 
 /// The smallest increment that is not zero: the step of a converter whose numbers were scaled.
 fn least_increment(values: &[f64]) -> f64 {
+    let size = values
+        .iter()
+        .filter(|v| v.is_finite())
+        .fold(0.0f64, |a, v| a.max(v.abs()));
     values
         .windows(2)
         .map(|w| (w[1] - w[0]).abs())
-        .filter(|d| *d > 1e-9)
+        .filter(|d| *d > 1e-12 * size)
         .fold(f64::INFINITY, f64::min)
         .min(1e9)
 }

@@ -35,15 +35,15 @@ pub enum ReconcileError {
     ConstantInput,
     /// Too little data.
     #[error(
-        "only {seconds:.1} s of record ({rows} frames with a bead): at least {needed_s:.0} s with a changing command are needed to tell effects apart"
+        "only {seconds:.1} s of record with a changing command, {rows} rows with a position in all: at least {needed} are needed to tell effects apart"
     )]
     TooShort {
         /// Length of all records with a changing command \[s\].
         seconds: f64,
-        /// Frames.
+        /// Rows with a position.
         rows: usize,
-        /// What is needed \[s\].
-        needed_s: f64,
+        /// The limit that is not met.
+        needed: String,
     },
     /// Looks like other units.
     #[error("{what}: the measured motion is {ratio:.3} times the model's; {hint}")]
@@ -69,9 +69,17 @@ pub enum ReconcileError {
         /// What to do.
         hint: &'static str,
     },
+    /// The output comes before the input.
+    #[error(
+        "the output leads the input by about {lead_s:.4} s: swapped columns, or two clocks; nothing that is driven moves before its drive"
+    )]
+    Leads {
+        /// By how much \[s\].
+        lead_s: f64,
+    },
     /// Does not follow the model at all.
     #[error(
-        "these records do not follow this model: only {explained_percent:.0} % of the measured motion goes with the command as the model says (at any gain and delay up to 20 ms){detail}; a record of another rig, swapped columns, or the wrong model file"
+        "these records do not follow this model: only {explained_percent:.0} % of the measured motion goes with the command as the model says (at any gain, at delays up to 20 samples){detail}; a record of another rig, swapped columns, or the wrong model file"
     )]
     AnotherRig {
         /// Part of the motion explained by the best gain and delay, percent.

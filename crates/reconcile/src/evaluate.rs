@@ -1,10 +1,11 @@
 //! One evaluation of a set of parts: innovations, and their derivatives by every free number.
 
-use crate::catalogue::{Kind, Param};
-use crate::fit::{Context, Fit, Part};
+use crate::catalogue::Part;
+use crate::fit::{Context, Fit};
 use crate::linear::{Columns, sum_squares};
 use crate::predict::simulate;
 use crate::problem::Mask;
+use cellpos_plant::effects::{FitParameter, Role};
 use std::f64::consts::TAU;
 
 /// One evaluation of the model.
@@ -20,32 +21,43 @@ pub(crate) struct State {
 
 impl Context<'_> {
     pub fn state(&self, fit: &Fit, mask: &Mask) -> State {
-        let blocks = self.blocks(&fit.parts);
+        let effects = self.effects(&fit.parts);
         let mut edge = Vec::new();
         let (mut sim, mut soft) = (Vec::new(), Vec::new());
-        for r in &self.problem.records {
+        for (r, ranges) in self.problem.records.iter().zip(mask) {
             let mut y = Vec::new();
-            simulate(&self.problem.base, &r.u, &blocks, &mut y, Some(&mut edge));
+            // A record that does not count costs nothing.
+            if ranges.is_empty() {
+                sim.push(Vec::new());
+                soft.push(Vec::new());
+                continue;
+            }
+            simulate(&self.problem.base, &r.u, &effects, &mut y, Some(&mut edge));
             if fit.gain != 1.0 {
                 y.iter_mut().for_each(|y| *y *= fit.gain);
             }
             sim.push(y);
             let mut w = vec![0.0; edge.len()];
             if edge.iter().any(|e| *e != 0.0) {
-                r.whitener.apply(&edge, &mut w);
+                r.whiten(&edge, &mut w);
             }
             soft.push(w);
         }
         let mut residual = Vec::with_capacity(sim.len());
         let mut innovations = Vec::with_capacity(sim.len());
         for (i, (r, s)) in self.problem.records.iter().zip(&sim).enumerate() {
+            if s.is_empty() {
+                residual.push(Vec::new());
+                innovations.push(Vec::new());
+                continue;
+            }
             let mut e: Vec<f64> = r.y.iter().zip(s).map(|(y, s)| y - s).collect();
             let mut line = 0;
             let mut position = 0;
             for p in &fit.parts {
-                match p.variant().kind {
-                    Kind::Chain => {}
-                    Kind::Line => {
+                match p.variant().role {
+                    Role::Chain => {}
+                    Role::Line => {
                         let [a, b] = fit.lines[line][i];
                         if a != 0.0 || b != 0.0 {
                             self.rotate(p.natural()[0], e.len(), |k, sin, cos| {
@@ -54,7 +66,7 @@ impl Context<'_> {
                         }
                         line += 1;
                     }
-                    Kind::Position => {
+                    Role::Position => {
                         let [a, b] = fit.positions[position];
                         if a != 0.0 || b != 0.0 {
                             let pixel = p.natural()[0];
@@ -74,7 +86,7 @@ impl Context<'_> {
                 }
             }
             let mut w = vec![0.0; e.len()];
-            r.whitener.apply(&e, &mut w);
+            r.whiten(&e, &mut w);
             for (w, s) in w.iter_mut().zip(&soft[i]) {
                 *w -= fit.soft * s;
             }
@@ -100,33 +112,34 @@ impl Context<'_> {
     }
 
     /// Whitened derivative columns of the innovations at a state.
-    pub fn columns(&self, fit: &Fit, state: &State) -> (usize, Vec<Columns>) {
+    pub fn columns(&self, fit: &Fit, state: &State, mask: &Mask) -> (usize, Vec<Columns>) {
         let records = &self.problem.records;
+        let counted = |i: usize| !mask[i].is_empty();
         let mut columns: Vec<Columns> = records.iter().map(|_| Vec::new()).collect();
         let mut next = 0;
         let (mut line, mut position) = (0, 0);
         for (index, part) in fit.parts.iter().enumerate() {
-            match part.variant().kind {
-                Kind::Chain => {
+            match part.variant().role {
+                Role::Chain => {
                     for (j, p) in part.variant().params.iter().enumerate() {
                         let (parts, step) = self.nudged(&fit.parts, index, j, p);
-                        let moved = self.simulated(&parts);
-                        for (i, r) in records.iter().enumerate() {
+                        let moved = self.simulated(&parts, mask);
+                        for (i, r) in records.iter().enumerate().filter(|(i, _)| counted(*i)) {
                             let d: Vec<f64> = moved[i]
                                 .iter()
                                 .zip(&state.sim[i])
                                 .map(|(a, b)| (b - fit.gain * a) / step)
                                 .collect();
                             let mut c = vec![0.0; d.len()];
-                            r.whitener.apply(&d, &mut c);
+                            r.whiten(&d, &mut c);
                             columns[i].push((next, c));
                         }
                         next += 1;
                     }
                 }
-                Kind::Line => {
+                Role::Line => {
                     let hz = part.natural()[0];
-                    for (i, r) in records.iter().enumerate() {
+                    for (i, r) in records.iter().enumerate().filter(|(i, _)| counted(*i)) {
                         let n = r.u.len();
                         let [a, b] = fit.lines[line][i];
                         let mut d = [vec![0.0; n], vec![0.0; n], vec![0.0; n]];
@@ -138,7 +151,7 @@ impl Context<'_> {
                         });
                         for (j, d) in d.iter().enumerate() {
                             let mut w = vec![0.0; n];
-                            r.whitener.apply(d, &mut w);
+                            r.whiten(d, &mut w);
                             // Frequency is common; sine and cosine are this record's own.
                             let at = if j == 0 { next } else { next + 2 * i + j };
                             if j > 0 || a != 0.0 || b != 0.0 {
@@ -149,10 +162,10 @@ impl Context<'_> {
                     next += 1 + 2 * records.len();
                     line += 1;
                 }
-                Kind::Position => {
+                Role::Position => {
                     let pixel = part.natural()[0];
                     let [a, b] = fit.positions[position];
-                    for (i, r) in records.iter().enumerate() {
+                    for (i, r) in records.iter().enumerate().filter(|(i, _)| counted(*i)) {
                         let n = r.u.len();
                         let walk = r.whitener.around(&state.residual[i]);
                         let mut d = [vec![0.0; n], vec![0.0; n], vec![0.0; n]];
@@ -165,7 +178,7 @@ impl Context<'_> {
                         }
                         for (j, d) in d.iter().enumerate() {
                             let mut w = vec![0.0; n];
-                            r.whitener.apply(d, &mut w);
+                            r.whiten(d, &mut w);
                             if j > 0 || a != 0.0 || b != 0.0 {
                                 columns[i].push((next + j, w));
                             }
@@ -184,9 +197,12 @@ impl Context<'_> {
             // The weights of the play operators hold a gain of their own.
             if !fit.parts.iter().any(|p| p.variant().holds_gain()) {
                 for ((columns, sim), r) in columns.iter_mut().zip(&state.sim).zip(records) {
+                    if sim.is_empty() {
+                        continue;
+                    }
                     let d: Vec<f64> = sim.iter().map(|s| -s / fit.gain).collect();
                     let mut c = vec![0.0; d.len()];
-                    r.whitener.apply(&d, &mut c);
+                    r.whiten(&d, &mut c);
                     columns.push((next, c));
                 }
             }
@@ -196,7 +212,7 @@ impl Context<'_> {
     }
 
     /// The parts with one parameter moved by its step, towards the inside of its bounds.
-    fn nudged(&self, parts: &[Part], index: usize, j: usize, p: &Param) -> (Vec<Part>, f64) {
+    fn nudged(&self, parts: &[Part], index: usize, j: usize, p: &FitParameter) -> (Vec<Part>, f64) {
         let mut parts = parts.to_vec();
         let x = parts[index].theta[j];
         let mut step = p.step

@@ -3,76 +3,27 @@
 //! Every fit, that of the null included, also has the linear nuisances: the share of the newest command in a frame,
 //! and (inside the whitening filter) each record's start.
 
-use crate::augment::place_of;
-use crate::catalogue::{Kind, Scope, VARIANTS, Variant};
+use crate::catalogue::{Part, Variant};
 use crate::linear::{Tangents, normal_equations};
 use crate::locking::Locking;
-use crate::predict::{Block, simulate};
+use crate::predict::{Effect, Place, simulate};
 use crate::problem::{Mask, Problem};
+use cellpos_plant::effects::{Candidate, Role, Scope, find};
 use nalgebra::{DMatrix, DVector};
-use std::f64::consts::TAU;
-
-/// One candidate with its parameters, in the fit's coordinates.
-#[derive(Debug, Clone, PartialEq)]
-pub(crate) struct Part {
-    pub variant: usize,
-    pub theta: Vec<f64>,
-}
-
-impl Part {
-    /// From natural values.
-    pub fn new(variant: usize, natural: &[f64]) -> Self {
-        let theta = VARIANTS[variant]
-            .params
-            .iter()
-            .zip(natural)
-            .map(|(p, v)| p.coordinate(*v))
-            .collect();
-        Self { variant, theta }
-    }
-
-    pub fn variant(&self) -> &'static Variant {
-        &VARIANTS[self.variant]
-    }
-
-    /// Parameter values in their units.
-    pub fn natural(&self) -> Vec<f64> {
-        self.variant()
-            .params
-            .iter()
-            .zip(&self.theta)
-            .map(|(p, x)| p.natural(*x))
-            .collect()
-    }
-
-    /// By how much it delays a slow motion, if that is what it does \[s\].
-    pub fn lag_s(&self) -> Option<f64> {
-        let v = self.natural();
-        let lag_s = match self.variant().id {
-            "time-delay" | "bubble" => v[0],
-            "driver-lag" => 1.0 / (TAU * v[0]),
-            "exposure-averaging" => 0.5 * v[0],
-            "pzt-resonance" => 2.0 * v[1] / (TAU * v[0]),
-            "pdms-relaxation" => -v[0] * v[1],
-            _ => return None,
-        };
-        (1e-6..0.1).contains(&lag_s).then_some(lag_s)
-    }
-
-    fn block(&self, scope: &Scope) -> Block {
-        (self.variant().build)(&self.natural(), scope)
-    }
-}
 
 /// What the fit needs to know apart from the data: ranges, and the effects that the model already has.
 #[derive(Debug, Clone)]
 pub(crate) struct Context<'a> {
     pub problem: &'a Problem,
     pub scope: Scope,
-    pub fixed: Vec<Block>,
+    pub fixed: Vec<Effect>,
+    /// Everything that may be tried.
+    pub variants: Vec<Variant>,
     /// The base model's gain is free in every fit, the null included: a base fitted to these very records.
     pub free_gain: bool,
     pub white: Option<WhiteEvidence>,
+    /// The positions come in steps that are not small beside their increments.
+    pub quantised: bool,
 }
 
 /// What the size of the white noise says about averaging in the camera.
@@ -97,7 +48,7 @@ impl WhiteEvidence {
     pub fn distance(&self, parts: &[Part], sample_s: f64) -> f64 {
         let exposure_s: f64 = parts
             .iter()
-            .filter(|p| p.variant().id == "exposure-averaging")
+            .filter(|p| p.id() == "exposure-averaging")
             .map(|p| p.natural()[0])
             .sum();
         let expected = self.model_um2 - self.walk_um2 * (exposure_s / sample_s).min(2.0) / 6.0;
@@ -125,7 +76,7 @@ pub(crate) struct Fit {
     pub chi2: f64,
     /// Innovations that count under the mask.
     pub count: usize,
-    /// Innovations of all rows, masked or not.
+    /// Innovations of all rows, masked or not, of all records.
     pub innovations: Vec<Vec<f64>>,
     /// Covariance of the parameters of the parts, in the fit's coordinates, in order.
     pub covariance: DMatrix<f64>,
@@ -141,7 +92,7 @@ impl Fit {
     }
 
     pub fn has(&self, id: &str) -> bool {
-        self.parts.iter().any(|p| p.variant().id == id)
+        self.parts.iter().any(|p| p.id() == id)
     }
 
     /// Sum of squares of the innovations under another mask.
@@ -160,12 +111,12 @@ impl Fit {
 }
 
 /// Number of free numbers that a variant brings.
-pub(crate) fn freedom_of(v: &Variant, records: usize) -> usize {
+pub(crate) fn freedom_of(v: &Candidate, records: usize) -> usize {
     v.params.len()
-        + match v.kind {
-            Kind::Chain => 0,
-            Kind::Line => 2 * records,
-            Kind::Position => 2,
+        + match v.role {
+            Role::Chain => 0,
+            Role::Line => 2 * records,
+            Role::Position => 2,
         }
 }
 
@@ -175,27 +126,34 @@ const WEIGHT_PRECISION: f64 = 100.0;
 
 impl Context<'_> {
     /// Whether an effect is no candidate: behind a bare actuator there is neither a chip nor a bead, and a free gain
-    /// is no error.
+    /// is no error; a sensor that counts in steps has no pixels.
     pub fn excludes(&self, id: &str) -> bool {
-        self.free_gain && matches!(place_of(id), "chip" | "bead" | "bead/camera")
+        if self.quantised && id == "pixel-locking" {
+            return true;
+        }
+        self.free_gain
+            && find(id).is_some_and(|k| matches!(k.spec().place, Place::Chip | Place::Bead))
     }
 
-    pub fn blocks(&self, parts: &[Part]) -> Vec<Block> {
-        let mut blocks = self.fixed.clone();
-        blocks.extend(parts.iter().map(|p| p.block(&self.scope)));
-        blocks.sort_by_key(Block::rank);
-        blocks
+    /// The effects of the model and of a set, as they are simulated.
+    pub fn effects(&self, parts: &[Part]) -> Vec<Effect> {
+        let mut effects = self.fixed.clone();
+        effects.extend(parts.iter().map(|p| p.effect(&self.scope)));
+        effects
     }
 
-    /// Simulated positions of all records.
-    pub fn simulated(&self, parts: &[Part]) -> Vec<Vec<f64>> {
-        let blocks = self.blocks(parts);
+    /// Simulated positions of the records that count under a mask; empty for the others.
+    pub fn simulated(&self, parts: &[Part], mask: &Mask) -> Vec<Vec<f64>> {
+        let effects = self.effects(parts);
         self.problem
             .records
             .iter()
-            .map(|r| {
+            .zip(mask)
+            .map(|(r, ranges)| {
                 let mut y = Vec::new();
-                simulate(&self.problem.base, &r.u, &blocks, &mut y, None);
+                if !ranges.is_empty() {
+                    simulate(&self.problem.base, &r.u, &effects, &mut y, None);
+                }
                 y
             })
             .collect()
@@ -222,11 +180,11 @@ impl Context<'_> {
         let records = self.problem.records.len();
         let lines = parts
             .iter()
-            .filter(|p| p.variant().kind == Kind::Line)
+            .filter(|p| p.variant().role == Role::Line)
             .count();
         let positions = parts
             .iter()
-            .filter(|p| p.variant().kind == Kind::Position)
+            .filter(|p| p.variant().role == Role::Position)
             .count();
         let fit = Fit {
             parts,
@@ -252,7 +210,7 @@ impl Context<'_> {
         let mut normal;
         let mut round = 0;
         loop {
-            let (n, columns) = self.columns(&fit, &state);
+            let (n, columns) = self.columns(&fit, &state, mask);
             size = n;
             let (a, g) = normal_equations(n, &columns, &state.innovations, mask);
             normal = a;
@@ -302,7 +260,11 @@ impl Context<'_> {
             }
         }
         fit.chi2 = state.chi2;
-        fit.innovations = state.innovations;
+        fit.innovations = if mask.iter().any(Vec::is_empty) {
+            self.state(&fit, &self.problem.all()).innovations
+        } else {
+            state.innovations
+        };
         let mut regular = normal.clone();
         for i in 0..size {
             regular[(i, i)] +=
@@ -334,8 +296,8 @@ impl Context<'_> {
         let (mut line, mut position) = (0, 0);
         for part in &mut t.parts {
             let v = part.variant();
-            match v.kind {
-                Kind::Chain => {
+            match v.role {
+                Role::Chain => {
                     for (x, p) in part.theta.iter_mut().zip(v.params) {
                         // A logarithm that wants to move more than a factor of four is not in its linear range.
                         let d = if p.log {
@@ -347,7 +309,7 @@ impl Context<'_> {
                         next += 1;
                     }
                 }
-                Kind::Line => {
+                Role::Line => {
                     let p = &v.params[0];
                     part.theta[0] =
                         p.coordinate(p.natural(part.theta[0] + step[next].clamp(-0.05, 0.05)));
@@ -358,7 +320,7 @@ impl Context<'_> {
                     next += 1 + 2 * records;
                     line += 1;
                 }
-                Kind::Position => {
+                Role::Position => {
                     let p = &v.params[0];
                     part.theta[0] =
                         p.coordinate(p.natural(part.theta[0] + step[next].clamp(-0.02, 0.02)));
@@ -393,7 +355,7 @@ impl Context<'_> {
     /// Tangents at a fit, for screening further candidates.
     pub fn tangents(&self, fit: &Fit, mask: &Mask) -> Tangents {
         let state = self.state(fit, mask);
-        let (n, columns) = self.columns(fit, &state);
+        let (n, columns) = self.columns(fit, &state, mask);
         let (normal, gradient) = normal_equations(n, &columns, &state.innovations, mask);
         let mut regular = normal.clone();
         for i in 0..n {
@@ -414,6 +376,11 @@ impl Context<'_> {
     pub fn innovations(&self, fit: &Fit, mask: &Mask) -> (Vec<Vec<f64>>, f64) {
         let s = self.state(fit, mask);
         (s.innovations, s.chi2)
+    }
+
+    /// Raw residual of a fit in the records that count under a mask; empty for the others.
+    pub fn residual_under(&self, fit: &Fit, mask: &Mask) -> Vec<Vec<f64>> {
+        self.state(fit, mask).residual
     }
 
     /// Raw residual and simulated position of a fit.

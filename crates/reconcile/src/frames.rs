@@ -11,6 +11,10 @@ pub(crate) struct FrameCounts {
     pub repeats: usize,
     /// Exact zero increments that the resolution of the file gives by chance.
     pub by_chance: f64,
+    /// Repeats of a row that is a repeat itself.
+    pub in_a_row: usize,
+    /// The positions come in steps that are not small beside their increments.
+    pub quantised: bool,
     /// Rows that repeat the one before, per record.
     pub repeated: Vec<Vec<bool>>,
 }
@@ -36,6 +40,17 @@ impl FrameCounts {
             && excess > 5.0 * (self.by_chance + 1.0).sqrt()
             && excess > 0.5 * self.by_chance
             && self.repeat_rate() > 2e-4
+            && self.looks_like_a_camera()
+    }
+
+    /// A sensor that counts, a row that was held or interpolated, and a plant that stands still give equal rows as well: those
+    /// come in runs or in a rhythm, camera faults one by one and seldom.
+    fn looks_like_a_camera(&self) -> bool {
+        let rate = self.repeats as f64 / self.pairs.max(1) as f64;
+        let expected = rate * self.repeats as f64;
+        !self.quantised
+            && rate < 0.25
+            && self.in_a_row as f64 <= 2.0 * expected + 5.0 * expected.sqrt() + 3.0
     }
 }
 
@@ -47,6 +62,8 @@ pub(crate) fn count(records: &[Record]) -> FrameCounts {
         pairs: 0,
         repeats: 0,
         by_chance: 0.0,
+        in_a_row: 0,
+        quantised: records.iter().any(Record::is_quantised),
         repeated: Vec::new(),
     };
     for r in records {
@@ -82,6 +99,7 @@ pub(crate) fn count(records: &[Record]) -> FrameCounts {
         }
         // Twenty neighbouring values of the increment, each as likely as zero by chance.
         c.by_chance += near as f64 / 20.0;
+        c.in_a_row += repeated.windows(2).filter(|w| w[0] && w[1]).count();
         c.repeated.push(repeated);
     }
     c

@@ -1,15 +1,21 @@
 //! Records that must get a message instead of a name: nothing moves, too little, other units, another rig.
 
 use crate::data::Record;
+use crate::dot::dot;
 use crate::error::ReconcileError;
 use crate::fit::Context;
-use crate::linear::dot;
 
-/// Shortest total length of records with a changing command \[s\].
-pub(crate) const NEEDED_S: f64 = 5.0;
+/// Shortest total length of records with a changing command, of a rig whose noise is a walk \[s\].
+const NEEDED_S: f64 = 5.0;
+
+/// Fewest rows from which effects can be told apart.
+const NEEDED_ROWS: usize = 400;
+
+/// Samples by which an output may be delayed, or seem to lead.
+const MOST_SAMPLES: usize = 20;
 
 /// What can be seen without a model.
-pub(crate) fn records(records: &[Record]) -> Result<(), ReconcileError> {
+pub(crate) fn records(records: &[Record], bead: bool) -> Result<(), ReconcileError> {
     let Some(first) = records.first() else {
         return Err(ReconcileError::NoRecords);
     };
@@ -28,15 +34,18 @@ pub(crate) fn records(records: &[Record]) -> Result<(), ReconcileError> {
     }
     let seconds: f64 = moving.iter().map(|r| r.frames() as f64 * r.sample_s).sum();
     let rows: usize = records.iter().map(Record::frames).sum();
-    let needed_s = NEEDED_S * (first.sample_s / 1e-3).clamp(1.0, 4.0);
-    if seconds < needed_s || rows < 2000 {
-        return Err(ReconcileError::TooShort {
-            seconds,
-            rows,
-            needed_s,
-        });
-    }
-    Ok(())
+    let needed = if bead && seconds < NEEDED_S {
+        format!("{NEEDED_S} s")
+    } else if rows < NEEDED_ROWS {
+        format!("{NEEDED_ROWS} rows")
+    } else {
+        return Ok(());
+    };
+    Err(ReconcileError::TooShort {
+        seconds,
+        rows,
+        needed,
+    })
 }
 
 /// What the working point says about the command's unit.
@@ -69,11 +78,12 @@ pub(crate) fn working_point(
     Ok(())
 }
 
-/// Whether the motion goes with the command as the model says, at any gain and any delay up to 20 ms.
+/// Whether the motion goes with the command as the model says, at any gain and any delay up to 20 samples; judged by the
+/// innovations of a bead, and by the positions themselves, which a strong nonlinearity leaves more alike.
 pub(crate) fn motion(ctx: &Context<'_>) -> Result<(), ReconcileError> {
     let problem = ctx.problem;
-    let sim = ctx.simulated(&[]);
-    let most = (0.02 / problem.base.sample_s).round() as usize;
+    let sim = ctx.simulated(&[], &problem.all());
+    let most = MOST_SAMPLES;
     let (mut yy, mut count) = (0.0, 0.0);
     let mut white: Vec<(Vec<f64>, Vec<f64>)> = Vec::new();
     for (r, s) in problem.records.iter().zip(&sim) {
@@ -82,8 +92,8 @@ pub(crate) fn motion(ctx: &Context<'_>) -> Result<(), ReconcileError> {
         }
         let (mut y, mut w) = (vec![0.0; s.len()], vec![0.0; s.len()]);
         // A command that is off its working point would drown everything in a ramp; take the ramp off both.
-        r.whitener.apply(&without_ramp(&r.y, &r.present), &mut y);
-        r.whitener.apply(&without_ramp(s, &r.present), &mut w);
+        r.whiten(&without_ramp(&r.y, &r.present), &mut y);
+        r.whiten(&without_ramp(s, &r.present), &mut w);
         yy += dot(&y, &y);
         count += r.whitener.count() as f64;
         white.push((y, w));
@@ -99,6 +109,11 @@ pub(crate) fn motion(ctx: &Context<'_>) -> Result<(), ReconcileError> {
             best = ys * ys / ss;
             gain = ys / ss;
         }
+    }
+    if let Some(lead) = leads(&white) {
+        return Err(ReconcileError::Leads {
+            lead_s: lead as f64 * problem.base.sample_s,
+        });
     }
     let excess = yy - count;
     if excess < 0.02 * count && ss > 0.5 * count {
@@ -151,10 +166,64 @@ pub(crate) fn motion(ctx: &Context<'_>) -> Result<(), ReconcileError> {
         }
         return Ok(());
     }
+    let alike = level_likeness(problem, &sim);
+    if explained.max(alike) > LEAST_ALIKE {
+        return Ok(());
+    }
     Err(ReconcileError::AnotherRig {
-        explained_percent: 100.0 * explained.clamp(0.0, 1.0),
+        explained_percent: 100.0 * explained.max(alike).clamp(0.0, 1.0),
         detail: String::new(),
     })
+}
+
+/// Below this part of the motion a record does not go with the model in any sense.
+const LEAST_ALIKE: f64 = 0.08;
+
+/// Part of the variance of the positions that the model's own positions explain at the best gain and delay.
+fn level_likeness(problem: &crate::problem::Problem, sim: &[Vec<f64>]) -> f64 {
+    let (mut best, mut yy, mut ss) = (0.0f64, 0.0, 0.0);
+    let pairs: Vec<(Vec<f64>, Vec<f64>)> = problem
+        .records
+        .iter()
+        .zip(sim)
+        .filter(|(r, _)| !r.rest)
+        .map(|(r, s)| (r.without_start(&r.y, true), r.without_start(s, true)))
+        .collect();
+    for (y, s) in &pairs {
+        yy += dot(y, y);
+        ss += dot(s, s);
+    }
+    for d in 0..=MOST_SAMPLES {
+        let ys: f64 = pairs
+            .iter()
+            .map(|(y, s)| dot(&y[d.min(y.len())..], &s[..s.len().saturating_sub(d)]))
+            .sum();
+        if ss > 0.0 && yy > 0.0 {
+            best = best.max(ys * ys / (ss * yy));
+        }
+    }
+    best
+}
+
+/// By how many samples the output leads, where it fits clearly better so than with any delay.
+fn leads(white: &[(Vec<f64>, Vec<f64>)]) -> Option<usize> {
+    let at = |d: isize| -> f64 {
+        let k = d.unsigned_abs();
+        let ys: f64 = white
+            .iter()
+            .map(|(y, s)| {
+                let (a, b) = if d >= 0 { (y, s) } else { (s, y) };
+                dot(&a[k.min(a.len())..], &b[..b.len().saturating_sub(k)])
+            })
+            .sum();
+        ys * ys
+    };
+    let most = MOST_SAMPLES as isize;
+    let late = (0..=most).map(at).fold(0.0, f64::max);
+    let (lead, early) = (2..=most)
+        .map(|d| (d, at(-d)))
+        .max_by(|a, b| a.1.total_cmp(&b.1))?;
+    (early > 4.0 * late && early > 0.0).then_some(lead as usize)
 }
 
 fn without_ramp(y: &[f64], present: &[bool]) -> Vec<f64> {

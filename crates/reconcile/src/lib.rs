@@ -11,8 +11,10 @@
 mod actuator;
 mod assemble;
 mod augment;
+mod battery;
 mod catalogue;
 mod data;
+mod dot;
 mod error;
 mod evaluate;
 mod fit;
@@ -20,10 +22,12 @@ mod floor;
 mod frames;
 mod guard;
 mod held_out;
-mod hypothesis;
+mod judge;
 mod linear;
+mod lines;
 mod locking;
 mod map;
+mod names;
 mod noise;
 mod parallel;
 mod pixel;
@@ -33,18 +37,23 @@ mod report;
 mod result;
 mod screen;
 mod search;
-mod separate;
 mod significance;
+mod split;
+mod thresholds;
 mod verdict;
 
 pub use actuator::constant_gain;
+pub use battery::{Hypothesis, Term};
 pub use data::Record;
 pub use error::ReconcileError;
-pub use hypothesis::{Hypothesis, Term};
+pub use floor::FloorSource;
+pub use judge::figure;
 pub use map::{BAND_EDGES_HZ, BandRatio, Cell, DiscrepancyMap, MapRow, band_labels};
 pub use noise::Noise;
 pub use report::report;
 pub use result::{
-    BandGap, Effect, Gap, GapStep, Interval, Reconciliation, RecordGap, Trace, Traces, Verdict,
+    BandGap, Effect, Gap, GapStep, Interval, Reconciliation, RecordGap, Remainder, Trace, Traces,
+    Verdict,
 };
+pub use thresholds::{THRESHOLDS, Thresholds};
 pub use verdict::{Options, reconcile};

@@ -7,11 +7,11 @@
 //! likelihood `y - a sin(2 pi x/p) - b cos(2 pi x/p)` of the row. The normalising factors are the likelihood of the
 //! record, whose derivatives row by row give the scoring steps and the covariance.
 
-use crate::catalogue::Kind;
 use crate::fit::{Context, Fit};
 use crate::noise::Noise;
 use crate::parallel;
 use crate::predict::simulate;
+use cellpos_plant::effects::Role;
 use nalgebra::{Matrix5, Vector5};
 use std::f64::consts::TAU;
 
@@ -164,12 +164,12 @@ pub(crate) fn refine(
     threads: usize,
 ) -> Option<Locking> {
     let part = fit.parts.get(index)?;
-    if part.variant().kind != Kind::Position {
+    if part.variant().role != Role::Position {
         return None;
     }
     let at = fit.parts[..index]
         .iter()
-        .filter(|p| p.variant().kind == Kind::Position)
+        .filter(|p| p.variant().role == Role::Position)
         .count();
     let tracks = tracks(ctx, fit, at);
     let noise = &ctx.problem.noise;
@@ -262,14 +262,14 @@ fn tracks(ctx: &Context<'_>, fit: &Fit, at: usize) -> Vec<Track> {
         }
     }
     let (residual, sim) = ctx.residual(&bare);
-    let blocks = ctx.blocks(&fit.parts);
+    let effects = ctx.effects(&fit.parts);
     ctx.problem
         .records
         .iter()
         .zip(residual.into_iter().zip(sim))
         .map(|(r, (mut seen_um, path_um))| {
             let (mut edge, mut y) = (Vec::new(), Vec::new());
-            simulate(&ctx.problem.base, &r.u, &blocks, &mut y, Some(&mut edge));
+            simulate(&ctx.problem.base, &r.u, &effects, &mut y, Some(&mut edge));
             for (seen, edge) in seen_um.iter_mut().zip(&edge) {
                 *seen -= fit.soft * edge;
             }

@@ -25,11 +25,19 @@ impl Noise {
 
     /// From variance and lag-1 covariance of increments, `q + 2 R` and `-R`, kept physical.
     pub fn from_increments(variance: f64, lag1: f64) -> Self {
-        let variance = variance.max(1e-14);
+        let variance = variance.max(1e-40);
         let white = (-lag1).clamp(0.005 * variance, 0.4995 * variance);
         Self {
             walk_um2: variance - 2.0 * white,
             white_um2: white,
+        }
+    }
+
+    /// The same with at least so much white noise \[um^2\].
+    pub fn at_least(self, white_um2: f64) -> Self {
+        Self {
+            white_um2: self.white_um2.max(white_um2),
+            ..self
         }
     }
 
@@ -105,6 +113,20 @@ impl Whitener {
             *e = d * s;
             m += k * d;
         }
+    }
+
+    /// The walk at every row from the rows before it alone: what a regressor may know without being correlated with the
+    /// row's own innovation.
+    pub fn ahead(&self, r: &[f64]) -> Vec<f64> {
+        let mut m = r.first().copied().unwrap_or(0.0);
+        r.iter()
+            .zip(&self.gain)
+            .map(|(r, k)| {
+                let before = m;
+                m += k * (r - m);
+                before
+            })
+            .collect()
     }
 
     /// The walk at every row from the rows before and after it, but not from the row itself: independent of its noise.

@@ -3,7 +3,8 @@
 //! What a sine of the position gains against the innovations is an inner product, and by the transpose of the whitening
 //! filter it becomes a Fourier transform over the positions: all pixel sizes at once, all records in phase.
 
-use crate::fit::{Context, Fit, Part};
+use crate::catalogue::{Part, Variant};
+use crate::fit::{Context, Fit};
 use crate::parallel;
 use crate::problem::Mask;
 use crate::screen::{Lead, pair_score};
@@ -29,7 +30,7 @@ const NEEDED: f64 = 36.0;
 pub(crate) fn pixel_scan(
     ctx: &Context<'_>,
     fit: &Fit,
-    variant: usize,
+    variant: Variant,
     mask: &Mask,
     threads: usize,
 ) -> Option<Lead> {
@@ -81,8 +82,8 @@ pub(crate) fn pixel_scan(
             let (sin, cos): (Vec<f64>, Vec<f64>) =
                 positions[i].iter().map(|p| (TAU * q * p).sin_cos()).unzip();
             let (mut ws, mut wc) = (vec![0.0; sin.len()], vec![0.0; sin.len()]);
-            r.whitener.apply(&sin, &mut ws);
-            r.whitener.apply(&cos, &mut wc);
+            r.whiten(&sin, &mut ws);
+            r.whiten(&cos, &mut wc);
             for range in &mask[i] {
                 s.extend_from_slice(&ws[range.clone()]);
                 c.extend_from_slice(&wc[range.clone()]);

@@ -1,8 +1,10 @@
 //! Records made ready for fitting: commands from the working point, whitening filters, masks.
 
-use crate::data::Record;
+use crate::data::{Record, command_range_um};
+use crate::dot::dot;
 use crate::noise::{Noise, Whitener};
 use crate::predict::Base;
+use crate::thresholds::THRESHOLDS;
 use std::ops::Range;
 
 /// Start of a record with an analogue input that is not scored \[s\].
@@ -32,6 +34,107 @@ pub(crate) struct Prepared {
     pub whitener: Whitener,
     extra_walk: Option<Vec<f64>>,
     pub rest: bool,
+    /// Motions by which the plant may come to rest from where it was before the record, as they are.
+    transients: Vec<Vec<f64>>,
+    /// The same in the space of innovations, orthonormal.
+    free: Vec<Vec<f64>>,
+}
+
+impl Prepared {
+    /// Innovations of a residual, in standard deviations, without what an unknown state at the record's start makes.
+    pub fn whiten(&self, r: &[f64], e: &mut [f64]) {
+        self.whitener.apply(r, e);
+        for q in &self.free {
+            let share = dot(q, e);
+            for (e, q) in e.iter_mut().zip(q) {
+                *e -= share * q;
+            }
+        }
+    }
+
+    /// Orthonormal innovations of the transients under the present whitener.
+    fn free_transients(&mut self) {
+        let mut free: Vec<Vec<f64>> = Vec::new();
+        for t in &self.transients {
+            let mut w = vec![0.0; t.len()];
+            self.whitener.apply(t, &mut w);
+            let size = dot(&w, &w);
+            for q in &free {
+                let share = dot(q, &w);
+                w.iter_mut().zip(q).for_each(|(w, q)| *w -= share * q);
+            }
+            let left = dot(&w, &w);
+            if left > 1e-9 * size && left > 0.0 {
+                let scale = 1.0 / left.sqrt();
+                w.iter_mut().for_each(|w| *w *= scale);
+                free.push(w);
+            }
+        }
+        self.free = free;
+    }
+
+    /// What the transients and a level (and, where asked for, a ramp) leave of a residual.
+    pub fn without_start(&self, residual: &[f64], ramp: bool) -> Vec<f64> {
+        let n = residual.len();
+        let mut columns: Vec<Vec<f64>> = vec![vec![1.0; n]];
+        if ramp {
+            columns.push((0..n).map(|k| k as f64 / n as f64 - 0.5).collect());
+        }
+        columns.extend(self.transients.iter().cloned());
+        let mut basis: Vec<Vec<f64>> = Vec::new();
+        let mut left = residual.to_vec();
+        let blank = |v: &mut Vec<f64>| {
+            v.iter_mut()
+                .zip(&self.present)
+                .for_each(|(v, p)| *v = if *p { *v } else { 0.0 });
+        };
+        blank(&mut left);
+        for mut c in columns {
+            blank(&mut c);
+            let size = dot(&c, &c);
+            for q in &basis {
+                let share = dot(q, &c);
+                c.iter_mut().zip(q).for_each(|(c, q)| *c -= share * q);
+            }
+            let rest = dot(&c, &c);
+            if rest > 1e-9 * size && rest > 0.0 {
+                let scale = 1.0 / rest.sqrt();
+                c.iter_mut().for_each(|c| *c *= scale);
+                let share = dot(&c, &left);
+                left.iter_mut().zip(&c).for_each(|(l, q)| *l -= share * q);
+                basis.push(c);
+            }
+        }
+        left
+    }
+}
+
+/// Decays of the poles of a plant that did not rest before the record, from its first row.
+fn transients(base: &Base, rows: usize) -> Vec<Vec<f64>> {
+    if !base.free_start {
+        return Vec::new();
+    }
+    let (dt, length_s) = (base.sample_s, rows as f64 * base.sample_s);
+    let mut all = Vec::new();
+    for p in &base.zpk.poles {
+        // Slower is a level, faster is over at once.
+        if p.im < 0.0 || p.norm() * length_s < 0.05 || -p.re * dt > 5.0 {
+            continue;
+        }
+        let decay = |f: fn(f64) -> f64| -> Vec<f64> {
+            (0..rows)
+                .map(|k| {
+                    let t = k as f64 * dt;
+                    (p.re * t).exp() * f(p.im * t)
+                })
+                .collect()
+        };
+        all.push(decay(f64::cos));
+        if p.im > 0.0 {
+            all.push(decay(f64::sin));
+        }
+    }
+    all
 }
 
 /// Everything that fits share.
@@ -45,6 +148,8 @@ pub(crate) struct Problem {
     /// The direct path of Eq. (6) acts at once; a frame whose exposure straddles the command's edge shows a part of it.
     /// It is a nuisance of every fit, the null included: worth at most 19 nm per um of command step.
     pub soft: (f64, f64),
+    /// The positions come in steps that are not small beside their increments.
+    pub quantised: bool,
 }
 
 impl Problem {
@@ -57,6 +162,7 @@ impl Problem {
         };
         let velocity = base.zpk.at(nalgebra::Complex::new(0.0, 125.0)).norm() * 125.0;
         let kick = if base.interpolated_input { 0.0 } else { direct };
+        let range_um = command_range_um(records);
         let prepared = records
             .iter()
             .zip(repeated)
@@ -84,15 +190,19 @@ impl Problem {
                     .collect();
                 let extra_walk = uncertain_command(r, velocity * base.sample_s);
                 let whitener = Whitener::new(&noise, &present, extra_walk.as_deref());
-                Prepared {
+                let mut prepared = Prepared {
+                    transients: transients(&base, r.rows()),
+                    free: Vec::new(),
                     name: r.name.clone(),
                     u,
                     y,
                     present,
                     whitener,
                     extra_walk,
-                    rest: r.is_rest(),
-                }
+                    rest: r.rests_within(THRESHOLDS.rest_share * range_um),
+                };
+                prepared.free_transients();
+                prepared
             })
             .collect();
         Self {
@@ -100,6 +210,7 @@ impl Problem {
             records: prepared,
             noise,
             soft: (-0.4 * kick, 1.3 * kick),
+            quantised: records.iter().any(Record::is_quantised),
         }
     }
 
@@ -108,6 +219,7 @@ impl Problem {
         self.noise = noise;
         for r in &mut self.records {
             r.whitener = Whitener::new(&noise, &r.present, r.extra_walk.as_deref());
+            r.free_transients();
         }
         self
     }

@@ -53,6 +53,10 @@ fn verdict(r: &mut Report, result: &Reconciliation) {
         .join(" + ");
     match result.verdict {
         Verdict::Named => r.note(Status::Good, &format!("named: {names}")),
+        Verdict::NamedWithRemainder => r.note(
+            Status::Warning,
+            &format!("named: {names}; and something remains"),
+        ),
         Verdict::Ambiguous => r.note(
             Status::Warning,
             &format!("ambiguous: {names}, or what stands beside it below"),
@@ -79,12 +83,7 @@ fn verdict(r: &mut Report, result: &Reconciliation) {
             let p = e
                 .parameters
                 .iter()
-                .map(|(n, v)| {
-                    format!(
-                        "{n} = {:.5} {} [{:.5}, {:.5}]",
-                        v.value, v.unit, v.ci95[0], v.ci95[1]
-                    )
-                })
+                .map(|(n, v)| format!("{n} = {} {}", interval(v.value, v.ci95), v.unit))
                 .collect::<Vec<_>>()
                 .join("; ");
             t.row([
@@ -103,6 +102,17 @@ fn verdict(r: &mut Report, result: &Reconciliation) {
             }
         }
     }
+    if let Some(rest) = &result.remainder {
+        r.note(
+            Status::Warning,
+            &format!(
+                "Remainder, {:.1} % of the excess: {}; {}",
+                100.0 * rest.share,
+                rest.how,
+                rest.places.join("; ")
+            ),
+        );
+    }
     if let Some(h) = &result.hypothesis {
         r.note(
             Status::Warning,
@@ -120,46 +130,116 @@ fn heat(r: &mut Report, name: &str, caption: &str, map: &DiscrepancyMap) {
     let rows: Vec<&crate::map::MapRow> =
         map.rows.iter().filter(|row| row.cells.len() == n).collect();
     let names: Vec<&str> = rows.iter().map(|row| row.name.as_str()).collect();
+    let bands: Vec<String> = band_labels()
+        .iter()
+        .map(|label| label.trim_end_matches(" Hz").replace("..", "\u{2013}"))
+        .collect();
+    let caption = &format!("{caption}; by record and band (Hz)");
     let values: Vec<f64> = rows
         .iter()
-        .flat_map(|row| row.cells.iter().map(|c| c.z.clamp(-5.0, 50.0)))
+        .flat_map(|row| row.cells.iter().map(|c| c.z))
         .collect();
     r.figure(Figure::heat_map(
         name,
         caption,
-        HeatMap::new(
-            "excess, standard deviations",
-            &names,
-            &band_labels(),
-            &values,
-        ),
+        HeatMap::new("excess, standard deviations", &names, &bands, &values),
     ));
+}
+
+/// A value with its 95 % interval, to the digits that the interval leaves it.
+fn interval(value: f64, [low, high]: [f64; 2]) -> String {
+    let width = (high - low).abs();
+    // Two digits of the width; a value without a width, to six digits.
+    let smallest = if width > 0.0 && width.is_finite() {
+        0.1 * width
+    } else {
+        1e-5 * value.abs().max(f64::MIN_POSITIVE)
+    };
+    let digits = (-smallest.log10().floor()).clamp(0.0, 12.0) as usize;
+    format!("{value:.digits$} [{low:.digits$}, {high:.digits$}]")
+}
+
+/// Gain and phase with their 95 % bands, in runs of neighbouring bands: what was not excited is a gap.
+struct Supported {
+    hz: Vec<f64>,
+    gain_db: [Vec<f64>; 3],
+    phase_deg: [Vec<f64>; 3],
+    left_out: usize,
+}
+
+impl Supported {
+    fn of(map: &DiscrepancyMap) -> Self {
+        let mut found = Self {
+            hz: Vec::new(),
+            gain_db: Default::default(),
+            phase_deg: Default::default(),
+            left_out: 0,
+        };
+        for band in &map.ratios {
+            found.hz.push(band.hz);
+            let half = 1.96 * band.error;
+            let gain = |factor: f64| band.gain_db + 20.0 * factor.max(1e-6).log10();
+            let (gains, phases) = if band.is_supported() {
+                (
+                    [gain(1.0 - half), band.gain_db, gain(1.0 + half)],
+                    [-half, 0.0, half].map(|angle| band.phase_deg + angle.to_degrees()),
+                )
+            } else {
+                found.left_out += 1;
+                ([f64::NAN; 3], [f64::NAN; 3])
+            };
+            for (column, value) in found.gain_db.iter_mut().zip(gains) {
+                column.push(value);
+            }
+            for (column, value) in found.phase_deg.iter_mut().zip(phases) {
+                column.push(value);
+            }
+        }
+        found
+    }
 }
 
 fn response(r: &mut Report, result: &Reconciliation) {
     r.section("Response: measured over simulated");
-    r.paragraph("0 dB and 0 deg mean that the model is right at that frequency.");
-    let split = |m: &DiscrepancyMap| {
-        let hz: Vec<f64> = m.ratios.iter().map(|b| b.hz).collect();
-        let gain: Vec<f64> = m.ratios.iter().map(|b| b.gain_db).collect();
-        let phase: Vec<f64> = m.ratios.iter().map(|b| b.phase_deg).collect();
-        (hz, gain, phase)
-    };
-    let (h0, g0, p0) = split(&result.before);
-    let (h1, g1, p1) = split(&result.after);
-    if h0.is_empty() {
+    let (before, after) = (Supported::of(&result.before), Supported::of(&result.after));
+    let any = before.gain_db[1].iter().any(|db| db.is_finite());
+    r.paragraph(&format!(
+        "0 dB and 0 deg mean that the model is right at that frequency. Thin: 95 % of the noise. Bands in which less than \
+         {:.0} % of the motion was driven are left out ({} of {}): there the record shows noise, and in a loop the answer to it.",
+        100.0 * crate::map::BandRatio::SUPPORTED,
+        before.left_out,
+        before.hz.len()
+    ));
+    if !any {
+        r.note(
+            Status::Plain,
+            "no band was driven enough to draw a response: nothing is drawn",
+        );
         return;
     }
+    let mut gain = Panel::new(Axis::log("frequency", "Hz"), Axis::linear("gain", "dB"));
+    let mut phase = Panel::new(Axis::log("frequency", "Hz"), Axis::linear("phase", "deg"));
+    for (name, color, of) in [("before", 0, &before), ("after", 1, &after)] {
+        gain = gain.series(Series::line(name, &of.hz, &of.gain_db[1]).color(color));
+        phase = phase.series(Series::line(name, &of.hz, &of.phase_deg[1]).color(color));
+        for end in [0, 2] {
+            gain = gain.series(
+                Series::line("", &of.hz, &of.gain_db[end])
+                    .thin()
+                    .color(color),
+            );
+            phase = phase.series(
+                Series::line("", &of.hz, &of.phase_deg[end])
+                    .thin()
+                    .color(color),
+            );
+        }
+    }
     r.figure(
-        Figure::bode("response", "Measured over simulated, before and after")
-            .bode_series(
-                Series::line("before", &h0, &g0),
-                Series::line("before", &h0, &p0),
-            )
-            .bode_series(
-                Series::line("after", &h1, &g1),
-                Series::line("after", &h1, &p1),
-            ),
+        Figure::new("response", "Measured over simulated, before and after")
+            .panel(gain)
+            .panel(phase)
+            .share_x(),
     );
 }
 
@@ -254,6 +334,21 @@ fn traces(r: &mut Report, result: &Reconciliation) {
                     ),
             )
             .share_x(),
+        );
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_interval_has_the_digits_that_it_leaves_the_value() {
+        assert_eq!(interval(2.0, [1.998_1, 2.002_9]), "2.0000 [1.9981, 2.0029]");
+        assert_eq!(interval(123.456, [113.4, 133.5]), "123 [113, 134]");
+        assert_eq!(
+            interval(0.25, [0.25, 0.25]),
+            "0.250000 [0.250000, 0.250000]"
         );
     }
 }

@@ -1,19 +1,22 @@
 //! What the workflow hands back: verdict, effects, where, gap, and what a report needs.
 
+use crate::battery::Hypothesis;
 use crate::fit::{Context, Fit};
-use crate::hypothesis::Hypothesis;
+use crate::floor::FloorSource;
 use crate::map::DiscrepancyMap;
 use crate::noise::Noise;
 use cellpos_plant::Model;
 use serde::Serialize;
 use std::collections::BTreeMap;
 
-/// The four answers.
+/// The five answers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Verdict {
     /// Effects are named; alternatives that no record of command and position can tell apart are listed with them.
     Named,
+    /// Effects are named and hold on their own, and something remains beside them: see [`Reconciliation::remainder`].
+    NamedWithRemainder,
     /// The data cannot separate the named effect from its alternatives; `separate_by` says what would.
     Ambiguous,
     /// Beyond the floor, and nothing in the catalogue closes enough of it.
@@ -27,6 +30,7 @@ impl Verdict {
     pub fn word(self) -> &'static str {
         match self {
             Self::Named => "named",
+            Self::NamedWithRemainder => "named-with-remainder",
             Self::Ambiguous => "ambiguous",
             Self::Unknown => "unknown",
             Self::NothingMissing => "nothing-missing",
@@ -76,6 +80,20 @@ pub struct Effect {
     pub separate_by: Option<String>,
 }
 
+/// What is left beside the named effects.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Remainder {
+    /// Where it shows.
+    #[serde(rename = "where")]
+    pub places: Vec<String>,
+    /// What it is like, in words.
+    pub how: String,
+    /// Part of the excess over the floor that is left, 0..1.
+    pub share: f64,
+    /// A formula for it, where one helps on data that it has not seen.
+    pub formula: Option<Hypothesis>,
+}
+
 /// A step of the search.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct GapStep {
@@ -97,6 +115,10 @@ pub struct RecordGap {
     pub before: f64,
     /// RMS innovation of the augmented model fitted to all other records \[um\].
     pub after: f64,
+    /// RMS error of the free run of the null model.
+    pub free_run_before: f64,
+    /// The same of the augmented model fitted to all other records.
+    pub free_run_after: f64,
 }
 
 /// The gap of one band.
@@ -121,10 +143,16 @@ pub struct Gap {
     pub before: f64,
     /// Augmented model, on held-out records.
     pub after: f64,
-    /// Noise alone.
+    /// Noise alone; where [`Reconciliation::floor`] is unknown, what the fit leaves.
     pub floor: f64,
+    /// RMS error of the free run of the null model on held-out records, without its start.
+    pub free_run_before: f64,
+    /// The same of the augmented model.
+    pub free_run_after: f64,
+    /// What noise alone is expected to make of it.
+    pub free_run_floor: f64,
     /// Unit of all figures of the gap.
-    pub unit: &'static str,
+    pub unit: String,
     /// What they are.
     pub quantity: &'static str,
     /// The search, step by step, on all records.
@@ -225,6 +253,10 @@ pub struct Reconciliation {
     pub base_shift: BTreeMap<String, Interval>,
     /// A formula for what no effect explains.
     pub hypothesis: Option<Hypothesis>,
+    /// What is left beside the named effects.
+    pub remainder: Option<Remainder>,
+    /// Where the noise floor comes from.
+    pub floor: FloorSource,
     /// Noise of these records.
     pub noise: Noise,
     /// Sample time \[s\].
@@ -251,6 +283,8 @@ impl Reconciliation {
             "gap": self.gap,
             "base_shift": self.base_shift,
             "hypothesis": self.hypothesis,
+            "remainder": self.remainder,
+            "floor": { "source": self.floor, "known": self.floor.is_known(), "words": self.floor.words() },
             "noise": {
                 "diffusion_um2_per_s": self.noise.diffusion_um2_per_s(self.sample_s),
                 "localisation_um": self.noise.localisation_um(),

@@ -3,12 +3,14 @@
 //! One simulation per starting value gives a direction in the space of innovations; projected against the tangents of
 //! the present fit it says how much the sum of squares falls when the candidate is scaled best and all else refitted.
 
-use crate::catalogue::{Kind, VARIANTS};
-use crate::fit::{Context, Fit, Part};
-use crate::linear::{Tangents, dot};
+use crate::catalogue::{Part, Variant};
+use crate::dot::dot;
+use crate::fit::{Context, Fit};
+use crate::linear::Tangents;
 use crate::parallel;
 use crate::pixel::pixel_scan;
 use crate::problem::Mask;
+use cellpos_plant::effects::Role;
 use std::f64::consts::TAU;
 
 /// One candidate that may be worth a fit.
@@ -26,21 +28,21 @@ pub(crate) fn screen(
     tangents: &Tangents,
     mask: &Mask,
     threads: usize,
-    allowed: impl Fn(usize) -> bool,
+    allowed: impl Fn(Variant) -> bool,
 ) -> Vec<Lead> {
     let mut jobs: Vec<Part> = Vec::new();
-    for (i, v) in VARIANTS.iter().enumerate() {
-        if allowed(i) && v.kind != Kind::Position {
-            jobs.extend((v.starts)(&ctx.scope).iter().map(|s| Part::new(i, s)));
+    for v in &ctx.variants {
+        if allowed(*v) && v.candidate().role != Role::Position {
+            jobs.extend(v.starts(&ctx.scope));
         }
     }
-    let sim = ctx.simulated(&fit.parts);
-    let scores = parallel::map(&jobs, threads, |part| match part.variant().kind {
-        Kind::Line => line_score(ctx, fit, part.natural()[0], mask),
+    let sim = ctx.simulated(&fit.parts, mask);
+    let scores = parallel::map(&jobs, threads, |part| match part.variant().role {
+        Role::Line => line_score(ctx, fit, part.natural()[0], mask),
         _ => {
             let mut parts = fit.parts.clone();
             parts.push(part.clone());
-            let moved = ctx.simulated(&parts);
+            let moved = ctx.simulated(&parts, mask);
             let d: Vec<Vec<f64>> = ctx
                 .problem
                 .records
@@ -49,7 +51,7 @@ pub(crate) fn screen(
                 .map(|(r, (m, s))| {
                     let d: Vec<f64> = m.iter().zip(s).map(|(m, s)| fit.gain * (s - m)).collect();
                     let mut w = vec![0.0; d.len()];
-                    r.whitener.apply(&d, &mut w);
+                    r.whiten(&d, &mut w);
                     w
                 })
                 .collect();
@@ -57,26 +59,26 @@ pub(crate) fn screen(
             if g.scale > 0.02 { g.score } else { 0.0 }
         }
     });
-    let mut best: Vec<Option<Lead>> = VARIANTS.iter().map(|_| None).collect();
+    let mut best: Vec<Lead> = Vec::new();
     for (part, score) in jobs.into_iter().zip(scores) {
-        let slot = &mut best[part.variant];
-        if slot.as_ref().is_none_or(|l| l.score < score) {
-            *slot = Some(Lead { part, score });
+        match best.iter_mut().find(|l| l.part.variant == part.variant) {
+            Some(lead) if lead.score < score => *lead = Lead { part, score },
+            Some(_) => {}
+            None => best.push(Lead { part, score }),
         }
     }
-    if let Some(v) = VARIANTS.iter().position(|v| v.kind == Kind::Position)
-        && allowed(v)
-        && let Some(lead) = pixel_scan(ctx, fit, v, mask, threads)
+    if let Some(v) = ctx
+        .variants
+        .iter()
+        .find(|v| v.candidate().role == Role::Position)
+        && allowed(*v)
+        && let Some(lead) = pixel_scan(ctx, fit, *v, mask, threads)
     {
-        best[v] = Some(lead);
+        best.push(lead);
     }
-    let mut leads: Vec<Lead> = best.into_iter().flatten().collect();
-    leads.sort_by(|a, b| {
-        b.score
-            .total_cmp(&a.score)
-            .then(a.part.variant.cmp(&b.part.variant))
-    });
-    leads
+    // A stable sort: what gains the same comes in the order of the table.
+    best.sort_by(|a, b| b.score.total_cmp(&a.score));
+    best
 }
 
 /// Gain of two columns together.
@@ -103,8 +105,8 @@ pub(crate) fn line_score(ctx: &Context<'_>, fit: &Fit, hz: f64, mask: &Mask) -> 
                 (s[k], c[k]) = (TAU * hz * k as f64 * ctx.problem.base.sample_s).sin_cos();
             }
             let (mut ws, mut wc) = (vec![0.0; n], vec![0.0; n]);
-            r.whitener.apply(&s, &mut ws);
-            r.whitener.apply(&c, &mut wc);
+            r.whiten(&s, &mut ws);
+            r.whiten(&c, &mut wc);
             mask[i]
                 .iter()
                 .map(|m| {

@@ -1,10 +1,12 @@
 //! The sequential search: add the best candidate, look again, take back what is no longer needed, try replacements.
 
-use crate::catalogue::{self, VARIANTS, Variant};
-use crate::fit::{Context, Fit, Part, freedom_of};
+use crate::catalogue::{self, Part};
+use crate::fit::{Context, Fit, freedom_of};
 use crate::parallel;
 use crate::problem::Mask;
 use crate::screen::screen;
+use crate::thresholds::THRESHOLDS;
+use cellpos_plant::effects::Candidate;
 
 /// How hard to search.
 #[derive(Debug, Clone, Copy)]
@@ -41,11 +43,11 @@ pub(crate) fn chi2_quantile(k: f64, z: f64) -> f64 {
 /// What an addition must gain to count: family-wise 5 % over all variants, their starts and the scan of pixel sizes
 /// (about 2000 trials, 4.1 standard deviations), times 1.3 for the error of the noise estimate.
 pub(crate) fn threshold(freedom: usize) -> f64 {
-    1.3 * chi2_quantile(freedom as f64, 4.1)
+    THRESHOLDS.addition_noise * chi2_quantile(freedom as f64, THRESHOLDS.addition_sd)
 }
 
 /// The same for a variant in a problem of so many records.
-fn bar(v: &Variant, records: usize) -> f64 {
+fn bar(v: &Candidate, records: usize) -> f64 {
     threshold(freedom_of(v, records))
 }
 
@@ -77,16 +79,6 @@ pub(crate) fn implausibility(part: &Part, left: f64) -> f64 {
     }
 }
 
-/// Whether two variants say the same thing.
-fn same_id(a: usize, id: &str) -> bool {
-    VARIANTS[a].id == id
-}
-
-/// Forms with many numbers are tried only once their effect has been found in its simple form: see [`reform`].
-fn late(v: &Variant) -> bool {
-    v.params.len() > 3 || (v.id == "bubble" && v.params.len() == 2)
-}
-
 /// Fits the best leads next to a set and returns the fits, best first.
 fn extensions(
     ctx: &Context<'_>,
@@ -99,10 +91,10 @@ fn extensions(
 ) -> Vec<Fit> {
     let tangents = ctx.tangents(fit, mask);
     let leads = screen(ctx, fit, &tangents, mask, effort.threads, |v| {
-        !late(&VARIANTS[v])
-            && !ctx.excludes(VARIANTS[v].id)
-            && !fit.parts.iter().any(|p| same_id(v, p.variant().id))
-            && !forbidden.contains(&VARIANTS[v].id)
+        !v.candidate().late
+            && !ctx.excludes(v.id())
+            && !fit.has(v.id())
+            && !forbidden.contains(&v.id())
     });
     let records = ctx.problem.records.len();
     let worth: Vec<Part> = leads
@@ -120,7 +112,7 @@ fn extensions(
     // The best form of each effect, and the second of those with forms that are no limits of each other.
     let mut seen: Vec<&str> = Vec::new();
     let worth = worth.into_iter().filter(|part| {
-        let id = part.variant().id;
+        let id = part.id();
         let before = seen.iter().filter(|s| **s == id).count();
         let new = before == 0 || (before == 1 && id == "pzt-hysteresis");
         if new {
@@ -146,22 +138,18 @@ fn extensions(
     fits
 }
 
-/// What a response to the command must gain, in parts of what is explained already: the equations of the first effect
-/// are not those of nature to the last digit, and what they leave over must not be given a name of its own.
-const RELATIVE: f64 = 0.0015;
-
 /// Whether the part of `bigger` that `smaller` lacks is worth having, where `null` is the sum of squares without effects.
 fn worth_it(smaller: &Fit, bigger: &Fit, null: f64) -> bool {
     let added = bigger.freedom().saturating_sub(smaller.freedom()).max(1);
     let off_response = bigger
         .parts
         .iter()
-        .filter(|p| !smaller.has(p.variant().id))
+        .filter(|p| !smaller.has(p.id()))
         .all(|p| p.variant().off_response);
     let least = if off_response {
         0.0
     } else {
-        RELATIVE * (null - smaller.chi2).max(0.0)
+        THRESHOLDS.addition_share * (null - smaller.chi2).max(0.0)
     };
     smaller.chi2 - bigger.chi2 > threshold(added).max(least)
 }
@@ -194,7 +182,7 @@ fn replace(ctx: &Context<'_>, mut fit: Fit, mask: &Mask, effort: Effort) -> (Fit
         let mut better: Option<Fit> = None;
         let mut consider = |other: Fit, part: Part, list: &mut Vec<Rival>| {
             list.push(Rival {
-                id: part.variant().id,
+                id: part.id(),
                 chi2: other.chi2,
                 part,
             });
@@ -208,7 +196,7 @@ fn replace(ctx: &Context<'_>, mut fit: Fit, mask: &Mask, effort: Effort) -> (Fit
         };
         for i in 0..fit.parts.len() {
             let mut parts = fit.parts.clone();
-            let id = parts.remove(i).variant().id;
+            let id = parts.remove(i).id();
             let without = ctx.fit_from(parts, Some(fit.soft), mask, 10);
             let mut list: Vec<Rival> = Vec::new();
             for other in extensions(
@@ -230,15 +218,14 @@ fn replace(ctx: &Context<'_>, mut fit: Fit, mask: &Mask, effort: Effort) -> (Fit
             let twins: Vec<Part> = fit.parts[i]
                 .lag_s()
                 .map(|lag_s| {
-                    let starts = catalogue::of_lag(lag_s, ctx.problem.base.sample_s);
-                    let valleys = |id: &str| starts.iter().filter(|p| p.variant().id == id).count();
-                    let several: Vec<bool> =
-                        starts.iter().map(|p| valleys(p.variant().id) > 1).collect();
+                    let starts = catalogue::of_lag(lag_s, &ctx.scope);
+                    let valleys = |id: &str| starts.iter().filter(|p| p.id() == id).count();
+                    let several: Vec<bool> = starts.iter().map(|p| valleys(p.id()) > 1).collect();
                     starts
                         .into_iter()
                         .zip(several)
                         .filter(|(p, several)| {
-                            let other = p.variant().id;
+                            let other = p.id();
                             !ctx.excludes(other)
                                 && (*several || !list.iter().any(|r| r.id == other))
                                 && if other == id {
@@ -273,24 +260,21 @@ fn replace(ctx: &Context<'_>, mut fit: Fit, mask: &Mask, effort: Effort) -> (Fit
 /// Tries the other forms of the same effects (play operators for Bouc-Wen, a dissolving bubble, two-sided clipping).
 fn reform(ctx: &Context<'_>, mut fit: Fit, mask: &Mask, effort: Effort, rich: bool) -> Fit {
     for i in 0..fit.parts.len() {
-        let id = fit.parts[i].variant().id;
-        let others: Vec<Part> = VARIANTS
+        let id = fit.parts[i].id();
+        let others: Vec<Part> = ctx
+            .variants
             .iter()
-            .enumerate()
-            .filter(|(v, variant)| {
-                let form = variant.id == id && *v != fit.parts[i].variant;
-                // A lag that dissolves is a bubble.
-                if ctx.excludes(variant.id) {
+            .filter(|v| {
+                if ctx.excludes(v.id()) {
                     return false;
                 }
-                let dissolving = id == "driver-lag" && variant.id == "bubble" && late(variant);
-                (form || dissolving) && (rich || !late(variant))
+                let form = v.id() == id && **v != fit.parts[i].variant;
+                // A lag that dissolves is a bubble.
+                let late = v.candidate().late;
+                let dissolving = id == "driver-lag" && v.id() == "bubble" && late;
+                (form || dissolving) && (rich || !late)
             })
-            .flat_map(|(v, variant)| {
-                (variant.starts)(&ctx.scope)
-                    .into_iter()
-                    .map(move |s| Part::new(v, &s))
-            })
+            .flat_map(|v| v.starts(&ctx.scope))
             .collect();
         let fits = parallel::map(&others, effort.threads, |part| {
             let mut parts = fit.parts.clone();
@@ -345,6 +329,9 @@ pub(crate) fn search(
     let mut weighed: Option<(Fit, Vec<Vec<Rival>>)> = None;
     let mut beam: Vec<Fit> = singles.into_iter().skip(1).take(2).collect();
     while fit.parts.len() < effort.max_effects {
+        if fit.parts.len() >= 2 && left_over(&fit) > THRESHOLDS.hopeless * left_over(&null) {
+            break;
+        }
         progress(&format!("looking further beside {}", ids(&fit).join(" + ")));
         let mut next: Vec<Fit> = extensions(
             ctx,
@@ -353,7 +340,7 @@ pub(crate) fn search(
             effort,
             6,
             &[],
-            RELATIVE * (null.chi2 - fit.chi2),
+            THRESHOLDS.addition_share * (null.chi2 - fit.chi2),
         );
         next.retain(|f| worth_it(&fit, f, null.chi2));
         if next.is_empty() {
@@ -391,7 +378,7 @@ pub(crate) fn search(
         }
         let (top, rivals) = replace(ctx, top, mask, effort);
         weighed = Some((top.clone(), rivals));
-        let forms: Vec<usize> = top.parts.iter().map(|p| p.variant).collect();
+        let forms: Vec<catalogue::Variant> = top.parts.iter().map(|p| p.variant).collect();
         let rich = much_left(&top);
         fit = reform(ctx, top, mask, effort, rich);
         if fit
@@ -437,5 +424,5 @@ pub(crate) fn search(
 
 /// Ids of a set in the order in which they were found.
 pub(crate) fn ids(fit: &Fit) -> Vec<&'static str> {
-    fit.parts.iter().map(|p| p.variant().id).collect()
+    fit.parts.iter().map(|p| p.id()).collect()
 }

@@ -1,21 +1,23 @@
 //! The workflow: guards, null model, search, held-out check.
 
 use crate::assemble;
-use crate::catalogue::{self, Scope};
+use crate::catalogue;
 use crate::data::{self, Record};
 use crate::error::ReconcileError;
-use crate::fit::{Context, WhiteEvidence};
-use crate::floor;
+use crate::fit::{Context, Fit, WhiteEvidence};
+use crate::floor::{self, FloorSource};
 use crate::frames;
 use crate::guard;
 use crate::held_out;
 use crate::locking;
 use crate::noise::Noise;
-use crate::predict::{Base, Block, Zpk};
+use crate::predict::{Base, Zpk};
 use crate::problem::Problem;
 use crate::result::Reconciliation;
 use crate::search::{self, Effort, ids};
-use cellpos_plant::Model;
+use crate::thresholds::THRESHOLDS;
+use cellpos_plant::effects::Scope;
+use cellpos_plant::{Effect, Model};
 
 /// By how much a walk may differ from that of the model for the model's localisation noise to be believed of this rig: the
 /// radius of a bead and the viscosity of a warm room make so much.
@@ -33,6 +35,8 @@ pub struct Options {
     /// The base model is a constant gain fitted to these very records, those of a bare actuator and its displacement
     /// sensor: the gain is free in every fit, the null included, and effects of the chip and of the bead are not looked for.
     pub free_gain: bool,
+    /// The plant need not have rested at its working point before a record: its transients are free in every record.
+    pub free_start: bool,
 }
 
 impl Default for Options {
@@ -42,6 +46,7 @@ impl Default for Options {
             max_effects: 4,
             interpolated_input: false,
             free_gain: false,
+            free_start: false,
         }
     }
 }
@@ -60,8 +65,10 @@ pub fn reconcile(
     progress: &mut dyn FnMut(&str),
 ) -> Result<Reconciliation, ReconcileError> {
     let records = data::canonical(records.to_vec());
-    guard::records(&records)?;
-    guard::working_point(&records, model.working_point_um)?;
+    guard::records(&records, !options.free_start && !options.free_gain)?;
+    if !options.free_start {
+        guard::working_point(&records, model.working_point_um)?;
+    }
     let frames = frames::count(&records);
     let none: Vec<Vec<bool>> = records.iter().map(|r| vec![false; r.rows()]).collect();
     let repeated = if frames.repeats_named() {
@@ -71,25 +78,28 @@ pub fn reconcile(
     };
     let base = base_of(model, &records, options)?;
     let scope = scope_of(model, &records, &base);
-    let fixed = fixed_blocks(model, &scope);
-    let start = Noise::new(
-        model.noise.diffusion_um2_per_s.max(1e-4),
-        base.sample_s,
-        model.noise.localisation_um.max(1e-3),
-    );
+    let fixed = model.effects.clone();
+    let stated = stated_noise(model, base.sample_s);
+    let start = stated.unwrap_or_else(|| Noise::new(0.33, base.sample_s, 0.03));
     let problem = Problem::new(base, &records, repeated, start);
     let present: Vec<Vec<bool>> = problem.records.iter().map(|r| r.present.clone()).collect();
 
     progress("null model and noise floor");
     let first = context(&problem, scope, &fixed, options).fit(Vec::new(), &problem.all(), 4);
-    let (residual, _) = context(&problem, scope, &fixed, options).residual(&first);
-    let (noise, trusted) = floor::estimate(&records, &present, &residual);
+    let residual = free_of_start(&context(&problem, scope, &fixed, options), &first);
+    let floor = floor::estimate(&records, &present, &residual, stated);
+    let (noise, trusted) = (floor.noise, floor.rows);
     let problem = problem.with_noise(noise);
     guard::motion(&context(&problem, scope, &fixed, options))?;
 
     let effort = Effort {
         threads: options.threads,
-        max_effects: options.max_effects,
+        // Without a floor no set is a name: one effect is enough to say what the rest looks like.
+        max_effects: if floor.source.is_known() {
+            options.max_effects
+        } else {
+            options.max_effects.min(1)
+        },
     };
     let mut noise = noise;
     let mut problem = problem;
@@ -105,7 +115,11 @@ pub fn reconcile(
         let (residual, _) = ctx.residual(&found.fit);
         let refined = floor::from_residuals(&present, &residual);
         round += 1;
-        if round >= 2 || refined.innovation_um() > 0.97 * noise.innovation_um() {
+        // A floor that was measured is not talked down by a fit that has numbers to spare.
+        if round >= 2
+            || !floor.source.is_known()
+            || refined.innovation_um() > 0.97 * noise.innovation_um()
+        {
             break;
         }
         noise = refined;
@@ -116,6 +130,7 @@ pub fn reconcile(
         ..context(&problem, scope, &fixed, options)
     };
     progress("held-out check");
+    drop_small(&ctx, &mut found);
     let mut held = held_out::check(&ctx, &found.fit, options.threads);
     // What does not help where it was not fitted is not named.
     while let Some(i) = held.unconfirmed.first().copied() {
@@ -135,38 +150,85 @@ pub fn reconcile(
         .map(|i| locking::refine(&ctx, &found.fit, i, options.threads))
         .collect();
     progress("map and verdict");
-    Ok(assemble::assemble(
-        model, &records, &ctx, found, held, &frames,
-    ))
+    let given = assemble::Given {
+        model,
+        records: &records,
+        frames: &frames,
+        floor: &floor,
+        threads: options.threads,
+    };
+    Ok(assemble::assemble(&given, &ctx, found, held))
+}
+
+/// The noise that a model states, unless it says that its figures are a fit's own residual.
+fn stated_noise(model: &Model, sample_s: f64) -> Option<Noise> {
+    let noise = &model.noise;
+    let guessed = model
+        .provenance
+        .get("noise")
+        .is_some_and(|w| w == FloorSource::Unknown.words());
+    let some = noise.diffusion_um2_per_s > 0.0 || noise.localisation_um > 0.0;
+    (some && !guessed)
+        .then(|| Noise::new(noise.diffusion_um2_per_s, sample_s, noise.localisation_um))
+}
+
+/// Raw residuals without what an unknown state at the start makes.
+fn free_of_start(ctx: &Context<'_>, fit: &Fit) -> Vec<Vec<f64>> {
+    let (residual, _) = ctx.residual(fit);
+    if !ctx.problem.base.free_start {
+        return residual;
+    }
+    ctx.problem
+        .records
+        .iter()
+        .zip(residual)
+        .map(|(r, e)| r.without_start(&e, false))
+        .collect()
+}
+
+/// Takes back what is smaller than anything that matters beside effects that explain the rest.
+fn drop_small(ctx: &Context<'_>, found: &mut search::Found) {
+    let all = ctx.problem.all();
+    let mut i = 0;
+    while i < found.fit.parts.len() {
+        if found.fit.parts[i].matters() {
+            i += 1;
+            continue;
+        }
+        let mut parts = found.fit.parts.clone();
+        parts.remove(i);
+        let without = ctx.fit_from(parts, Some(found.fit.soft), &all, 8);
+        let gained = (found.null.chi2 - found.fit.chi2).max(1e-12);
+        if (without.chi2 - found.fit.chi2) / gained > THRESHOLDS.small_share {
+            i += 1;
+            continue;
+        }
+        if i < found.rivals.len() {
+            found.rivals.remove(i);
+        }
+        found.fit = without;
+    }
 }
 
 fn context<'a>(
     problem: &'a Problem,
     scope: Scope,
-    fixed: &[Block],
+    fixed: &[Effect],
     options: &Options,
 ) -> Context<'a> {
     Context {
         problem,
         scope,
         fixed: fixed.to_vec(),
+        variants: catalogue::variants(),
         free_gain: options.free_gain,
         white: None,
+        quantised: problem.quantised,
     }
 }
 
 fn base_of(model: &Model, records: &[Record], options: &Options) -> Result<Base, ReconcileError> {
-    let (num, den) = (model.plant.num(), model.plant.den());
-    let (Some(n), Some(d)) = (num.first(), den.first()) else {
-        return Err(ReconcileError::Model(
-            "the plant has no coefficients".to_owned(),
-        ));
-    };
-    let zpk = Zpk {
-        zeros: model.plant.zeros(),
-        poles: model.plant.poles(),
-        gain: n / d,
-    };
+    let zpk = Zpk::of(&model.plant);
     if zpk.poles.iter().any(|p| p.re > 1e-6) {
         return Err(ReconcileError::Model(
             "the plant is unstable: a free run of it cannot be compared with a record".to_owned(),
@@ -177,6 +239,7 @@ fn base_of(model: &Model, records: &[Record], options: &Options) -> Result<Base,
         working_point_um: model.working_point_um,
         sample_s: records[0].sample_s,
         interpolated_input: options.interpolated_input,
+        free_start: options.free_start,
     })
 }
 
@@ -198,16 +261,11 @@ fn scope_of(model: &Model, records: &[Record], base: &Base) -> Scope {
         } else {
             (high - w).abs().max((w - low).abs()).max(1e-6)
         },
+        travel_um: records.iter().map(Record::travel_um).fold(1e-6, f64::max),
         sample_s: base.sample_s,
+        length_s: records.iter().map(Record::duration_s).fold(0.0, f64::max),
+        sampled_input: base.interpolated_input,
     }
-}
-
-fn fixed_blocks(model: &Model, scope: &Scope) -> Vec<Block> {
-    model
-        .ordered_effects()
-        .into_iter()
-        .filter_map(|e| catalogue::block_of(e, scope))
-        .collect()
 }
 
 fn evidence(

@@ -25,9 +25,47 @@ pub enum RecordError {
         /// The folder.
         path: PathBuf,
     },
+    /// Not enough room for the run.
+    #[error(
+        "{}: the run needs up to {} and the disk has {} left: make room, or write elsewhere with --runs",
+        path.display(),
+        size(*needed),
+        size(*free)
+    )]
+    NoSpace {
+        /// Where it was to be written.
+        path: PathBuf,
+        /// Bytes that it may take.
+        needed: u64,
+        /// Bytes that are left.
+        free: u64,
+    },
+    /// A column that an export does not have.
+    #[error("there is no column `{name}`; the columns are {}", crate::export::csv_head().replace(',', ", "))]
+    Column {
+        /// The name asked for.
+        name: String,
+    },
+    /// A run of a later version.
+    #[error(
+        "{} is of format {found}; this version of cellpos reads formats up to {}: use the version that wrote it, or a later one",
+        path.display(),
+        crate::FORMAT
+    )]
+    Newer {
+        /// The metadata file.
+        path: PathBuf,
+        /// Its format.
+        found: u32,
+    },
     /// A name that cannot be part of a folder's name.
     #[error("run name `{0}`: use letters, digits, `-` and `_`, at most 64 of them")]
     Name(String),
+    /// A column of a control law that a run cannot have.
+    #[error(
+        "the control law's column `{0}`: its name is one that every run has, or it is one more than a row holds"
+    )]
+    LawColumn(String),
     /// The metadata cannot be written as TOML.
     #[error("run.toml: {0}")]
     Meta(String),
@@ -52,4 +90,14 @@ impl RecordError {
         let path = path.into();
         move |source| Self::Io { what, path, source }
     }
+}
+
+/// A number of bytes as people read it.
+fn size(bytes: u64) -> String {
+    let (number, unit) = match bytes {
+        0..1_000_000 => (bytes as f64 / 1e3, "kB"),
+        1_000_000..1_000_000_000 => (bytes as f64 / 1e6, "MB"),
+        _ => (bytes as f64 / 1e9, "GB"),
+    };
+    format!("{number:.1} {unit}")
 }

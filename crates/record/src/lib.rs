@@ -6,7 +6,7 @@
 //! |---|---|---|
 //! | `run.toml` | command line, configuration, model, controller, versions, conditions, seed, SHA-256 of inputs; the outcome | at the start, replaced in one step at the end |
 //! | `ticks.arrow` | one row a tick ([`cellpos_runtime::TickRecord`]), an Arrow IPC stream | appended, synced at least each second |
-//! | `events.jsonl` | one JSON object a line | each at once |
+//! | `events.jsonl` | one JSON object a line | with the ticks, after them |
 //! | `ticks.parquet` | the same rows for other programs | at the end |
 //! | `cycles.csv` | of a script: one row a cycle ([`LineFile`]) | appended, synced at least each second |
 //! | `cycles.parquet` | the same | at the end |
@@ -14,8 +14,8 @@
 //! | `sessions/` | of a run that was resumed: a run folder for each further session | |
 //!
 //! **While running** a [`RunWriter`] belongs to the recorder thread. It may allocate and block on the disk, so nothing
-//! of it is ever called in a tick. A full disk or a failing one never stops the loop: what could not be written is
-//! counted ([`Faults`]), said once, and the run ends readable, because a batch that was cut is taken back.
+//! of it is ever called in a tick. What a full disk or a failing one refuses waits in memory and is tried again; what never
+//! got there is counted ([`Faults`]), and the run ends readable, because a batch that was cut is taken back.
 //!
 //! **Afterwards** a [`RunReader`] reads what is there: a run cut off anywhere up to its last complete batch, a damaged
 //! one around the damage. It never panics on a damaged file, and says what is missing ([`Lost`]).
@@ -26,25 +26,35 @@
 //! Not for data that a tick waits for, and no locking: one writer a folder.
 #![forbid(unsafe_code)]
 
+mod blocks;
 mod columns;
 mod error;
 mod events;
-mod export;
+pub mod export;
 mod lines;
 mod meta;
 mod reader;
+mod sessions;
+pub mod space;
 mod stream;
 mod writer;
 
+pub use columns::Group;
 pub use error::RecordError;
 pub use events::{Event, Events, read_events};
 pub use export::{
-    CSV_HEAD, Format, TableColumn, export, write_csv, write_parquet, write_table_parquet,
+    Exported, Format, Part, Selection, Source, TableColumn, csv_head, export, write_csv,
+    write_parquet, write_table_parquet,
 };
 pub use lines::{LineFile, whole_text};
 pub use meta::{InputFile, RunEnd, RunMeta};
 pub use reader::{Batches, Gap, Lost, RunReader};
+pub use sessions::Sessions;
 pub use writer::{Faults, Finished, FlushPolicy, RunWriter};
+
+/// Version of the layout of a run folder. 1: rows without a check. 2: rows with a check, only the columns that the run
+/// needs, no state of the controller.
+pub const FORMAT: u32 = 2;
 
 /// Name of the metadata file in a run folder.
 pub const RUN_TOML: &str = "run.toml";

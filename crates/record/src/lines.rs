@@ -1,13 +1,11 @@
 //! A text file that only ever grows by whole lines.
 
+use crate::blocks::{Blocks, open_here};
 use crate::error::RecordError;
-use crate::writer::{Blocks, Faults, whole_lines};
+use crate::writer::{Faults, whole_lines};
 use std::fs::{File, OpenOptions};
-use std::io::{Seek, SeekFrom};
+use std::io::{Read, Seek, SeekFrom};
 use std::path::Path;
-
-/// Lines that wait for a disk that refuses them, at most, bytes.
-const MOST_WAITING: usize = 1 << 24;
 
 /// A text file with a head line, appended to line by line: a line that was acknowledged is in the file, whole, whatever
 /// happens to this process afterwards.
@@ -17,10 +15,10 @@ const MOST_WAITING: usize = 1 << 24;
 /// recorder thread; may block.
 pub struct LineFile {
     blocks: Blocks<File>,
-    waiting: String,
-    waiting_lines: u64,
     sync: bool,
-    faults: Faults,
+    io_errors: u64,
+    first: Option<String>,
+    failing: bool,
 }
 
 /// The whole lines of a text: without a last one that was cut off.
@@ -37,12 +35,9 @@ impl LineFile {
     /// [`RecordError::Io`] when it cannot be opened, or another process has it open.
     pub fn open(path: &Path, head: &str, sync: bool) -> Result<Self, RecordError> {
         let attempt = || -> std::io::Result<Self> {
-            let mut file = OpenOptions::new()
-                .read(true)
-                .write(true)
-                .create(true)
-                .truncate(false)
-                .open(path)?;
+            let mut options = OpenOptions::new();
+            options.read(true).write(true).create(true).truncate(false);
+            let mut file = open_here(&mut options, path)?;
             file.try_lock().map_err(|error| match error {
                 std::fs::TryLockError::Error(error) => error,
                 std::fs::TryLockError::WouldBlock => std::io::Error::new(
@@ -50,18 +45,19 @@ impl LineFile {
                     "another process is writing it: is the run still going on?",
                 ),
             })?;
-            let whole = whole_lines(&std::fs::read(path)?);
+            let whole = whole_length(&mut file)?;
             file.set_len(whole)?;
             file.seek(SeekFrom::Start(whole))?;
             let mut lines = Self {
                 blocks: Blocks::new(file, whole),
-                waiting: String::new(),
-                waiting_lines: 0,
                 sync,
-                faults: Faults::default(),
+                io_errors: 0,
+                first: None,
+                failing: false,
             };
             if whole == 0 {
-                lines.blocks.append(format!("{head}\n").as_bytes(), sync)?;
+                lines.blocks.push(format!("{head}\n").as_bytes(), 0);
+                lines.write()?;
             }
             Ok(lines)
         };
@@ -70,44 +66,65 @@ impl LineFile {
 
     /// Takes a line (without its end); it goes to the disk with the next [`LineFile::flush`].
     pub fn push(&mut self, line: &str) {
-        if self.waiting.len() + line.len() >= MOST_WAITING {
-            self.faults.rows_lost += 1;
-            return;
+        self.blocks.push(format!("{line}\n").as_bytes(), 1);
+    }
+
+    fn write(&mut self) -> std::io::Result<()> {
+        self.blocks.write()?;
+        if self.sync {
+            self.blocks.sync()
+        } else {
+            Ok(())
         }
-        self.waiting.push_str(line);
-        self.waiting.push('\n');
-        self.waiting_lines += 1;
     }
 
     /// Writes what waits; says whether nothing waits any more.
     pub fn flush(&mut self) -> bool {
-        if self.waiting.is_empty() {
-            return true;
-        }
-        match self.blocks.append(self.waiting.as_bytes(), self.sync) {
-            Ok(()) => {
-                self.waiting.clear();
-                self.waiting_lines = 0;
-                true
-            }
-            Err(error) => {
-                self.faults.io_errors += 1;
-                if self.faults.first.is_none() {
-                    tracing::error!("the table is incomplete: {error}; control goes on");
-                    self.faults.first = Some(error.to_string());
-                }
-                false
+        let written = self.write();
+        self.failing = written.is_err();
+        if let Err(error) = written {
+            self.io_errors += 1;
+            if self.first.is_none() {
+                tracing::error!("the table is incomplete: {error}");
+                self.first = Some(error.to_string());
             }
         }
+        self.blocks.waiting_bytes() == 0
+    }
+
+    /// Whether the last attempt to write failed.
+    pub fn is_failing(&self) -> bool {
+        self.failing
     }
 
     /// What could not be written: lines dropped, and those that still wait.
     pub fn faults(&self) -> Faults {
         Faults {
-            rows_lost: self.faults.rows_lost + self.waiting_lines,
-            ..self.faults.clone()
+            rows_lost: self.blocks.lost(),
+            events_lost: 0,
+            io_errors: self.io_errors,
+            first: self.first.clone(),
         }
     }
+}
+
+/// Length of a file without a last line that was cut off.
+fn whole_length(file: &mut File) -> std::io::Result<u64> {
+    const BLOCK: usize = 1 << 16;
+    let mut block = vec![0; BLOCK];
+    let mut end = file.seek(SeekFrom::End(0))?;
+    while end > 0 {
+        let start = end.saturating_sub(BLOCK as u64);
+        let part = &mut block[..(end - start) as usize];
+        file.seek(SeekFrom::Start(start))?;
+        file.read_exact(part)?;
+        let whole = whole_lines(part);
+        if whole > 0 {
+            return Ok(start + whole);
+        }
+        end = start;
+    }
+    Ok(0)
 }
 
 #[cfg(test)]
@@ -157,10 +174,10 @@ mod tests {
         };
         let mut lines = LineFile {
             blocks: Blocks::new(file, 0),
-            waiting: String::new(),
-            waiting_lines: 0,
             sync: false,
-            faults: Faults::default(),
+            io_errors: 0,
+            first: None,
+            failing: false,
         };
         for _ in 0..3 {
             lines.push("1,2");

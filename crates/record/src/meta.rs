@@ -1,10 +1,12 @@
 //! `run.toml`: how a run came about, and how it ended.
 
+use crate::columns::{GROUPS, Group};
 use crate::error::RecordError;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use std::collections::BTreeMap;
 use std::fmt::Write;
+use std::io::Read;
 use std::path::Path;
 
 /// A file that went into a run, with its fingerprint.
@@ -24,23 +26,47 @@ impl InputFile {
     /// # Errors
     /// [`RecordError::Io`] when it cannot be read.
     pub fn of(path: &Path) -> Result<Self, RecordError> {
-        let bytes = std::fs::read(path).map_err(RecordError::io("cannot read", path))?;
-        Ok(Self::of_bytes(&path.display().to_string(), &bytes))
+        let attempt = || -> std::io::Result<(u64, String)> {
+            let mut file = std::fs::File::open(path)?;
+            if !file.metadata()?.is_file() {
+                return Err(std::io::Error::other("is not a plain file"));
+            }
+            let mut block = vec![0; 1 << 16];
+            let (mut bytes, mut digest) = (0, Sha256::new());
+            loop {
+                let read = file.read(&mut block)?;
+                if read == 0 {
+                    return Ok((bytes, hexadecimal(&digest.finalize())));
+                }
+                bytes += read as u64;
+                digest.update(block.get(..read).unwrap_or_default());
+            }
+        };
+        let (bytes, sha256) = attempt().map_err(RecordError::io("cannot read", path))?;
+        Ok(Self {
+            path: path.display().to_string(),
+            bytes,
+            sha256,
+        })
     }
 
     /// Fingerprint of bytes already read.
     pub fn of_bytes(path: &str, bytes: &[u8]) -> Self {
-        let mut sha256 = String::with_capacity(64);
-        for byte in Sha256::digest(bytes) {
-            // Writing to a String cannot fail.
-            let _ = write!(sha256, "{byte:02x}");
-        }
         Self {
             path: path.to_owned(),
             bytes: bytes.len() as u64,
-            sha256,
+            sha256: hexadecimal(&Sha256::digest(bytes)),
         }
     }
+}
+
+fn hexadecimal(bytes: &[u8]) -> String {
+    let mut text = String::with_capacity(2 * bytes.len());
+    for byte in bytes {
+        // Writing to a String cannot fail.
+        let _ = write!(text, "{byte:02x}");
+    }
+    text
 }
 
 /// How a run ended; absent from `run.toml` while it runs, and for ever if it was killed.
@@ -51,10 +77,11 @@ pub struct RunEnd {
     pub ended_utc: String,
     /// In a word or two: `done`, `interrupted`, `safe`.
     pub outcome: String,
-    /// Rows written. Set by [`crate::RunWriter::finish`].
+    /// Rows on the disk. Set by [`crate::RunWriter::finish`].
     #[serde(default)]
     pub rows: u64,
-    /// Rows that could not be written. Set by [`crate::RunWriter::finish`].
+    /// Rows that are not on the disk: those lost on the way to the writer, to which [`crate::RunWriter::finish`] adds those
+    /// that could not be written or do not read back.
     #[serde(default)]
     pub rows_lost: u64,
     /// Events that could not be written. Set by [`crate::RunWriter::finish`].
@@ -104,6 +131,12 @@ pub struct RunMeta {
     /// Versions of the program and of what it ran on.
     #[serde(default)]
     pub versions: BTreeMap<String, String>,
+    /// The groups of columns that the run has beside [`Group::Loop`]; all of them unless it is said.
+    #[serde(default = "all_groups")]
+    pub columns: Vec<Group>,
+    /// Names of the control law's own columns, in the order of [`cellpos_runtime::TickRecord::law`].
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub law_columns: Vec<String>,
     /// Files that went in.
     #[serde(default)]
     pub inputs: Vec<InputFile>,
@@ -124,11 +157,15 @@ pub struct RunMeta {
     pub end: Option<RunEnd>,
 }
 
+fn all_groups() -> Vec<Group> {
+    GROUPS.to_vec()
+}
+
 impl RunMeta {
     /// Metadata with a name and a clock (`real` or `virtual`), and nothing else yet.
     pub fn new(name: &str, clock: &str) -> Self {
         Self {
-            format: 1,
+            format: crate::FORMAT,
             name: name.to_owned(),
             started_utc: String::new(),
             command_line: Vec::new(),
@@ -136,6 +173,8 @@ impl RunMeta {
             seed: None,
             clock: clock.to_owned(),
             versions: BTreeMap::new(),
+            columns: all_groups(),
+            law_columns: Vec::new(),
             inputs: Vec::new(),
             conditions: toml::Table::new(),
             config: toml::Table::new(),

@@ -2,14 +2,19 @@
 
 use crate::error::RecordError;
 use crate::events::{Events, read_events};
+use crate::export::columns::Row;
+use crate::export::seconds;
 use crate::meta::RunMeta;
 use crate::stream::Stream;
-use crate::{EVENTS_JSONL, RUN_TOML, TICKS_ARROW};
+use crate::{EVENTS_JSONL, FORMAT, RUN_TOML, TICKS_ARROW};
 use cellpos_runtime::TickRecord;
-use cellpos_table::Record;
+use cellpos_table::{Record, read_text};
 use std::fs::File;
 use std::io::BufReader;
 use std::path::{Path, PathBuf};
+
+/// Largest metadata that are believed, bytes.
+const MOST_META: u64 = 1 << 26;
 
 /// Rows missing between two that are there.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -36,6 +41,8 @@ pub struct Lost {
     pub gaps: Vec<Gap>,
     /// Rows missing in all breaks.
     pub rows: u64,
+    /// Rows that are not what was written: their check is wrong.
+    pub damaged_rows: u64,
     /// Rows whose number is not larger than the one before: never in a sound run.
     pub disordered_rows: u64,
     /// Bytes passed over because they made no sense.
@@ -59,7 +66,7 @@ impl RunReader {
     /// Opens a run folder. Damaged or missing metadata are no error ([`RunReader::meta`] says so): the rows still read.
     ///
     /// # Errors
-    /// [`RecordError::NotARun`] without `ticks.arrow`.
+    /// [`RecordError::NotARun`] without `ticks.arrow`, [`RecordError::Newer`] for a format that this version does not know.
     pub fn open(folder: &Path) -> Result<Self, RecordError> {
         if !folder.join(TICKS_ARROW).is_file() {
             return Err(RecordError::NotARun {
@@ -67,11 +74,19 @@ impl RunReader {
             });
         }
         let path = folder.join(RUN_TOML);
-        let meta = std::fs::read_to_string(&path)
-            .map_err(|error| format!("cannot read {}: {error}", path.display()))
+        let meta: Result<RunMeta, String> = read_text(&path, MOST_META)
+            .map_err(|error| error.to_string())
             .and_then(|text| {
                 toml::from_str(&text).map_err(|error| format!("{}: {error}", path.display()))
             });
+        if let Ok(meta) = &meta
+            && meta.format > FORMAT
+        {
+            return Err(RecordError::Newer {
+                path,
+                found: meta.format,
+            });
+        }
         Ok(Self {
             folder: folder.to_owned(),
             meta,
@@ -91,6 +106,11 @@ impl RunReader {
         self.meta.as_ref().map_err(String::as_str)
     }
 
+    /// Names of the control law's own columns: [`TickRecord::law`] in this order. Empty if the metadata is damaged.
+    pub fn law_columns(&self) -> &[String] {
+        self.meta.as_ref().map_or(&[], |meta| &meta.law_columns)
+    }
+
     /// The rows, batch by batch, so that a night's run needs no night's memory.
     ///
     /// # Errors
@@ -98,7 +118,7 @@ impl RunReader {
     pub fn batches(&self) -> Result<Batches, RecordError> {
         let path = self.folder.join(TICKS_ARROW);
         let stream = File::open(&path)
-            .and_then(|file| Stream::new(BufReader::new(file)))
+            .and_then(|file| Stream::new(BufReader::new(file), self.law_columns().len()))
             .map_err(RecordError::io("cannot read", path))?;
         Ok(Batches {
             stream,
@@ -117,7 +137,9 @@ impl RunReader {
     ) -> Result<Option<TickRecord>, RecordError> {
         let path = self.folder.join(TICKS_ARROW);
         File::open(&path)
-            .and_then(|file| Stream::new(BufReader::new(file))?.last_where(is))
+            .and_then(|file| {
+                Stream::new(BufReader::new(file), self.law_columns().len())?.last_where(is)
+            })
             .map_err(RecordError::io("cannot read", path))
     }
 
@@ -149,22 +171,36 @@ impl RunReader {
     /// # Errors
     /// [`RecordError`] when the rows cannot be read, [`cellpos_table::Problem::TooShort`] with fewer than two of them.
     pub fn to_record(&self) -> Result<Record, RecordError> {
-        let mut out = Vec::new();
-        crate::write_csv(self, &mut out).map_err(RecordError::io(
-            "cannot read",
-            self.folder.join(TICKS_ARROW),
-        ))?;
-        let text = String::from_utf8(out).map_err(|_| RecordError::Encode {
-            what: "a record",
-            message: "not text".to_owned(),
-        })?;
-        let mapping = cellpos_table::Mapping {
-            gaps: cellpos_table::Gaps::Hold,
-            // Rows have numbers: jitter of the real clock is no reason to refuse a run.
-            jitter: 0.49,
-            ..cellpos_table::Mapping::default()
-        };
-        Ok(Record::parse(&self.folder, &text, &mapping)?)
+        let mut batches = self.batches()?;
+        let columns = crate::export::numbers();
+        let mut time_s = Vec::new();
+        let (mut pzt_um, mut bead_um) = (Vec::new(), Vec::new());
+        let mut more: Vec<(String, Vec<f64>)> = columns
+            .iter()
+            .map(|column| (column.name.to_owned(), Vec::new()))
+            .collect();
+        for tick in batches.by_ref().flatten() {
+            time_s.push(seconds(tick.time_ns));
+            pzt_um.push(tick.command_um);
+            bead_um.push(crate::export::bead_um(&tick));
+            let row = Row {
+                tick,
+                session: 1,
+                offset_ns: 0,
+            };
+            for (column, (_, values)) in columns.iter().zip(&mut more) {
+                values.push(column.number(&row));
+            }
+        }
+        // Rows have numbers: jitter of the real clock is no reason to refuse a run.
+        const JITTER: f64 = 0.49;
+        Ok(Record::from_rows(
+            &self.folder,
+            &time_s,
+            [pzt_um, bead_um],
+            more,
+            JITTER,
+        )?)
     }
 }
 
@@ -179,6 +215,7 @@ impl Batches {
     /// What was missing in the batches taken so far; complete once the iterator has ended.
     pub fn lost(&self) -> Lost {
         Lost {
+            damaged_rows: self.stream.damaged_rows,
             damaged_bytes: self.stream.damaged_bytes,
             torn_bytes: self.stream.torn_bytes,
             finished: self.stream.ended,

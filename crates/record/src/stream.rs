@@ -4,7 +4,7 @@
 //! apart itself, because a file cut off in the middle of a message, or damaged, must give every row around the damage
 //! and must never panic or ask for absurd memory: every length is checked against the file before it is believed.
 
-use crate::columns::{self, Kind};
+use crate::columns::{CHECK, COLUMNS, Column, Kind};
 use arrow_ipc::{MessageHeader, Type, root_as_message};
 use cellpos_runtime::TickRecord;
 use std::io::{self, Read, Seek, SeekFrom};
@@ -28,12 +28,38 @@ struct Head {
     end: u64,
 }
 
+/// The rows of a batch, and how many of it were not what was written.
+struct Rows {
+    rows: Vec<TickRecord>,
+    damaged: u64,
+}
+
+/// A column of the file.
+#[derive(Clone, Copy)]
+struct Place {
+    kind: Kind,
+    meaning: Meaning,
+}
+
+/// What a column of the file holds.
+#[derive(Clone, Copy)]
+enum Meaning {
+    /// A value of the row.
+    Value(&'static Column),
+    /// The control law's own value of this number.
+    Law(usize),
+    /// The check of the row.
+    Check,
+    /// Something that this version does not know.
+    Unknown,
+}
+
 /// What a message turned out to be.
 enum Message {
     /// The schema, or something without rows.
     NoRows,
     /// Rows.
-    Rows(Vec<TickRecord>),
+    Rows(Rows),
     /// The end mark of a finished stream.
     End,
 }
@@ -43,8 +69,9 @@ pub(crate) struct Stream<R> {
     from: R,
     length: u64,
     position: u64,
-    /// For each column of the file: its place in [`columns::columns`] (None: unknown to this version) and its type.
-    layout: Vec<(Option<usize>, Kind)>,
+    layout: Vec<Place>,
+    /// Rows whose check is wrong: never written, or damaged.
+    pub(crate) damaged_rows: u64,
     /// Bytes passed over because they made no sense, before a message that did.
     pub(crate) damaged_bytes: u64,
     /// Bytes after the last message that made sense: a batch cut off.
@@ -54,18 +81,31 @@ pub(crate) struct Stream<R> {
 }
 
 impl<R: Read + Seek> Stream<R> {
-    pub(crate) fn new(mut from: R) -> io::Result<Self> {
+    /// A stream from its beginning. `law` is how many columns of its own the control law has, in case the schema itself is
+    /// damaged.
+    pub(crate) fn new(mut from: R, law: usize) -> io::Result<Self> {
         let length = from.seek(SeekFrom::End(0))?;
         Ok(Self {
             from,
             length,
             position: 0,
             // The layout of this version, in case the schema itself is damaged.
-            layout: columns::columns()
-                .into_iter()
-                .enumerate()
-                .map(|(place, (_, kind))| (Some(place), kind))
+            layout: COLUMNS
+                .iter()
+                .map(|column| Place {
+                    kind: column.kind,
+                    meaning: Meaning::Value(column),
+                })
+                .chain((0..law).map(|index| Place {
+                    kind: Kind::F32,
+                    meaning: Meaning::Law(index),
+                }))
+                .chain([Place {
+                    kind: Kind::U32,
+                    meaning: Meaning::Check,
+                }])
                 .collect(),
+            damaged_rows: 0,
             damaged_bytes: 0,
             torn_bytes: 0,
             ended: false,
@@ -82,8 +122,9 @@ impl<R: Read + Seek> Stream<R> {
                 Some((message, end)) => {
                     self.position = end;
                     self.ended = matches!(message, Message::End);
-                    if let Message::Rows(rows) = message {
-                        return Ok(Some(rows));
+                    if let Message::Rows(batch) = message {
+                        self.damaged_rows += batch.damaged;
+                        return Ok(Some(batch.rows));
                     }
                 }
                 None => match self.search(self.position + 8)? {
@@ -211,8 +252,8 @@ impl<R: Read + Seek> Stream<R> {
             };
         }
         for position in batches.into_iter().rev() {
-            if let Some((Message::Rows(rows), _)) = self.message(position)?
-                && let Some(row) = rows.iter().rfind(|row| is(row))
+            if let Some((Message::Rows(batch), _)) = self.message(position)?
+                && let Some(row) = batch.rows.iter().rfind(|row| is(row))
             {
                 return Ok(Some(*row));
             }
@@ -250,9 +291,9 @@ impl<R: Read + Seek> Stream<R> {
 }
 
 /// Places and types of the columns that a schema message names; None if one has a type that this reader does not know.
-fn layout(message: &arrow_ipc::Message) -> Option<Vec<(Option<usize>, Kind)>> {
-    let known = columns::columns();
+fn layout(message: &arrow_ipc::Message) -> Option<Vec<Place>> {
     let fields = message.header_as_schema()?.fields()?;
+    let mut law = 0;
     fields
         .iter()
         .map(|field| {
@@ -267,27 +308,32 @@ fn layout(message: &arrow_ipc::Message) -> Option<Vec<(Option<usize>, Kind)>> {
                         _ => return None,
                     }
                 }
-                Type::FloatingPoint => {
-                    let float = field.type_as_floating_point()?;
-                    (float.precision() == arrow_ipc::Precision::DOUBLE).then_some(Kind::F64)?
-                }
+                Type::FloatingPoint => match field.type_as_floating_point()?.precision() {
+                    arrow_ipc::Precision::DOUBLE => Kind::F64,
+                    arrow_ipc::Precision::SINGLE => Kind::F32,
+                    _ => return None,
+                },
                 _ => return None,
             };
             let name = field.name().unwrap_or("");
-            let place = known
-                .iter()
-                .position(|(other, other_kind)| other == name && *other_kind == kind);
-            Some((place, kind))
+            let known = COLUMNS.iter().find(|c| c.name == name && c.kind == kind);
+            let meaning = match known {
+                Some(column) => Meaning::Value(column),
+                None if name == CHECK && kind == Kind::U32 => Meaning::Check,
+                // Whatever its name: the law named it.
+                None if kind == Kind::F32 => {
+                    law += 1;
+                    Meaning::Law(law - 1)
+                }
+                None => Meaning::Unknown,
+            };
+            Some(Place { kind, meaning })
         })
         .collect()
 }
 
-/// Rows of a batch; None unless every column is whole.
-fn decode(
-    message: &arrow_ipc::Message,
-    body: &[u8],
-    layout: &[(Option<usize>, Kind)],
-) -> Option<Vec<TickRecord>> {
+/// Rows of a batch; None unless every column is whole. Rows whose check is wrong are left out and counted.
+fn decode(message: &arrow_ipc::Message, body: &[u8], layout: &[Place]) -> Option<Rows> {
     let batch = message.header_as_record_batch()?;
     if batch.compression().is_some() {
         return None;
@@ -302,25 +348,61 @@ fn decode(
     if nodes.len() != layout.len() || buffers.len() != 2 * layout.len() {
         return None;
     }
-    let mut out = vec![columns::unknown(); rows];
-    for (index, (place, kind)) in layout.iter().enumerate() {
+    let mut out = vec![TickRecord::unknown(); rows];
+    let mut checks = None;
+    let mut sums = vec![crc32fast::Hasher::new(); rows];
+    for (index, place) in layout.iter().enumerate() {
         let node = nodes.get(index);
         if usize::try_from(node.length()) != Ok(rows) || node.null_count() != 0 {
             return None;
         }
         let buffer = buffers.get(2 * index + 1);
         let start = usize::try_from(buffer.offset()).ok()?;
-        let bytes = rows.checked_mul(kind.width())?;
+        let width = place.kind.width();
+        let bytes = rows.checked_mul(width)?;
         if usize::try_from(buffer.length()).ok()? < bytes {
             return None;
         }
         let data = body.get(start..start.checked_add(bytes)?)?;
-        let Some(place) = place else { continue };
-        for (row, value) in out.iter_mut().zip(data.chunks_exact(kind.width())) {
+        if matches!(place.meaning, Meaning::Check) {
+            checks = Some(data);
+            continue;
+        }
+        for ((row, sum), value) in out.iter_mut().zip(&mut sums).zip(data.chunks_exact(width)) {
+            sum.update(value);
             let mut bits = [0u8; 8];
-            bits.get_mut(..value.len())?.copy_from_slice(value);
-            columns::set(row, *place, u64::from_le_bytes(bits));
+            bits.get_mut(..width)?.copy_from_slice(value);
+            let bits = u64::from_le_bytes(bits);
+            match place.meaning {
+                Meaning::Value(column) => (column.set)(row, bits),
+                Meaning::Law(index) => {
+                    if let Some(own) = row.law.get_mut(index) {
+                        *own = f32::from_bits(bits as u32);
+                    }
+                }
+                Meaning::Check | Meaning::Unknown => {}
+            }
         }
     }
-    Some(out)
+    let Some(checks) = checks else {
+        // A file from before rows were checked.
+        return Some(Rows {
+            rows: out,
+            damaged: 0,
+        });
+    };
+    let sound = checks
+        .chunks_exact(Kind::U32.width())
+        .zip(sums)
+        .map(|(check, sum)| sum.finalize().to_le_bytes() == check);
+    let kept: Vec<TickRecord> = out
+        .into_iter()
+        .zip(sound)
+        .filter_map(|(row, sound)| sound.then_some(row))
+        .collect();
+    let damaged = (rows - kept.len()) as u64;
+    Some(Rows {
+        rows: kept,
+        damaged,
+    })
 }

@@ -1,8 +1,10 @@
 //! Writing a run while it runs.
 
-use crate::columns::Builder;
+use crate::blocks::{Blocks, Sink, open_here};
+use crate::columns::{self, Builder, Group};
 use crate::error::RecordError;
 use crate::events::Event;
+use crate::export::{Selection, Source};
 use crate::meta::{RunEnd, RunMeta};
 use crate::reader::RunReader;
 use crate::{EVENTS_JSONL, RUN_TOML, TICKS_ARROW, TICKS_PARQUET};
@@ -10,7 +12,7 @@ use arrow_ipc::writer::StreamWriter;
 use cellpos_runtime::TickRecord;
 use cellpos_table::write_atomically;
 use std::fs::{File, OpenOptions};
-use std::io::{self, Seek, SeekFrom, Write};
+use std::io;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
@@ -62,70 +64,10 @@ pub struct Finished {
     pub rows: u64,
     /// What could not be written.
     pub faults: Faults,
+    /// Whether `run.toml` has the end of the run.
+    pub closed: bool,
     /// Why there is no `ticks.parquet`, if there is none.
     pub parquet: Result<(), RecordError>,
-}
-
-/// A file to append to, as far as the writer needs it.
-pub(crate) trait Sink {
-    /// Appends all bytes, or fails, perhaps after some of them.
-    fn append(&mut self, bytes: &[u8]) -> io::Result<()>;
-    /// Cuts the file to a length.
-    fn cut(&mut self, length: u64) -> io::Result<()>;
-    /// Waits until the disk has everything.
-    fn sync(&mut self) -> io::Result<()>;
-}
-
-impl Sink for File {
-    fn append(&mut self, bytes: &[u8]) -> io::Result<()> {
-        self.write_all(bytes)
-    }
-
-    fn cut(&mut self, length: u64) -> io::Result<()> {
-        self.set_len(length)?;
-        self.seek(SeekFrom::Start(length)).map(|_| ())
-    }
-
-    fn sync(&mut self) -> io::Result<()> {
-        self.sync_data()
-    }
-}
-
-/// A file of which only whole blocks are kept: a block that fails is taken back.
-pub(crate) struct Blocks<S> {
-    sink: S,
-    /// Length up to which the file is whole.
-    good: u64,
-    /// Whether bytes of a failed block may still stand behind `good`.
-    torn: bool,
-}
-
-impl<S: Sink> Blocks<S> {
-    pub(crate) fn new(sink: S, good: u64) -> Self {
-        Self {
-            sink,
-            good,
-            torn: false,
-        }
-    }
-
-    pub(crate) fn append(&mut self, bytes: &[u8], sync: bool) -> io::Result<()> {
-        if self.torn {
-            self.sink.cut(self.good)?;
-            self.torn = false;
-        }
-        match self.sink.append(bytes) {
-            Ok(()) => {
-                self.good += bytes.len() as u64;
-                if sync { self.sink.sync() } else { Ok(()) }
-            }
-            Err(error) => {
-                // Cutting frees nothing and so works on a full disk; if not, it is tried again before the next block.
-                self.torn = self.sink.cut(self.good).is_err();
-                Err(error)
-            }
-        }
-    }
 }
 
 /// Writes a run folder. See the crate's documentation; belongs to the recorder thread.
@@ -143,8 +85,13 @@ pub(crate) struct Log<S: Sink> {
     events: Blocks<S>,
     policy: FlushPolicy,
     last_flush: Instant,
+    /// Rows that could not be encoded.
+    rows_refused: u64,
     rows: u64,
-    faults: Faults,
+    io_errors: u64,
+    first: Option<String>,
+    /// The last attempt to write failed.
+    failing: bool,
 }
 
 impl<S: Sink> Log<S> {
@@ -152,9 +99,10 @@ impl<S: Sink> Log<S> {
         ticks: Blocks<S>,
         events: Blocks<S>,
         policy: FlushPolicy,
-        write_schema: bool,
+        groups: &[Group],
+        law: &[String],
     ) -> Result<Self, RecordError> {
-        let builder = Builder::new(policy.rows);
+        let builder = Builder::new(policy.rows, groups, law);
         let mut encoder = StreamWriter::try_new(Vec::new(), builder.schema()).map_err(|error| {
             RecordError::Encode {
                 what: "the columns of a run",
@@ -169,95 +117,113 @@ impl<S: Sink> Log<S> {
             events,
             policy,
             last_flush: Instant::now(),
+            rows_refused: 0,
             rows: 0,
-            faults: Faults::default(),
+            io_errors: 0,
+            first: None,
+            failing: false,
         };
-        if write_schema && let Err(error) = log.ticks.append(&schema, policy.sync) {
-            log.fault(&error);
-        }
+        log.ticks.push(&schema, 0);
+        log.write(policy.sync);
         Ok(log)
     }
 
     fn fault(&mut self, error: &dyn std::fmt::Display) {
-        self.faults.io_errors += 1;
-        if self.faults.first.is_none() {
+        self.io_errors += 1;
+        if self.first.is_none() {
             // Said once: a full disk would otherwise fill the log too.
-            tracing::error!(
-                "the record is incomplete: {error}; control goes on, losses are counted"
-            );
-            self.faults.first = Some(error.to_string());
+            tracing::error!("the record is incomplete: {error}; losses are counted");
+            self.first = Some(error.to_string());
+        }
+    }
+
+    pub(crate) fn faults(&self) -> Faults {
+        Faults {
+            rows_lost: self.ticks.lost() + self.rows_refused,
+            events_lost: self.events.lost(),
+            io_errors: self.io_errors,
+            first: self.first.clone(),
         }
     }
 
     pub(crate) fn tick(&mut self, row: &TickRecord) {
-        self.builder.push(row);
+        if let Some(name) = self.builder.push(row) {
+            self.fault(&format!("the run has no column for the value of {name}"));
+        }
+        self.rows += 1;
         if self.builder.rows() >= self.policy.rows {
             self.flush();
-        } else if self.builder.rows() == 1 {
-            // The wait counts from the oldest row.
-            self.last_flush = Instant::now();
         } else {
             self.poll();
         }
     }
 
     pub(crate) fn poll(&mut self) {
-        if self.builder.rows() > 0
-            && self
-                .policy
-                .interval
-                .is_some_and(|longest| self.last_flush.elapsed() >= longest)
+        if self
+            .policy
+            .interval
+            .is_some_and(|longest| self.last_flush.elapsed() >= longest)
         {
             self.flush();
         }
     }
 
+    /// Hands the rows gathered so far to the file, then the events that came with them.
     pub(crate) fn flush(&mut self) {
         let rows = self.builder.rows() as u64;
-        if rows == 0 {
-            return;
-        }
-        let written = self
-            .builder
-            .take()
-            .and_then(|batch| self.encoder.write(&batch))
-            .map_err(|error| error.to_string())
-            .and_then(|()| {
-                let bytes = std::mem::take(self.encoder.get_mut());
-                self.ticks
-                    .append(&bytes, self.policy.sync)
-                    .map_err(|error| error.to_string())
-            });
-        match written {
-            Ok(()) => self.rows += rows,
-            Err(error) => {
-                self.encoder.get_mut().clear();
-                self.faults.rows_lost += rows;
-                self.fault(&error);
+        if rows > 0 {
+            let encoded = self
+                .builder
+                .take()
+                .and_then(|batch| self.encoder.write(&batch));
+            let bytes = std::mem::take(self.encoder.get_mut());
+            match encoded {
+                Ok(()) => self.ticks.push(&bytes, rows),
+                Err(error) => {
+                    self.rows_refused += rows;
+                    self.fault(&error);
+                }
             }
+        }
+        self.write(self.policy.sync);
+    }
+
+    /// Rows first: an event in the log is never without the ticks that it came with.
+    fn write(&mut self, sync: bool) {
+        self.last_flush = Instant::now();
+        let mut attempt = || {
+            self.ticks.is_there()?;
+            self.ticks.write()?;
+            if sync {
+                self.ticks.sync()?;
+            }
+            self.events.write()?;
+            if sync {
+                self.events.sync()?;
+            }
+            io::Result::Ok(())
+        };
+        let written = attempt();
+        self.failing = written.is_err();
+        if let Err(error) = written {
+            self.fault(&error);
         }
     }
 
     pub(crate) fn event(&mut self, event: &Event) {
-        let written = event
-            .line()
-            .map_err(io::Error::from)
-            .and_then(|line| self.events.append(line.as_bytes(), self.policy.sync));
-        if let Err(error) = written {
-            self.faults.events_lost += 1;
-            self.fault(&error);
+        match event.line() {
+            Ok(line) => self.events.push(line.as_bytes(), 1),
+            Err(error) => self.fault(&error),
         }
     }
 
     /// Writes what waits and the end mark, and syncs.
     pub(crate) fn close(&mut self) {
         self.flush();
-        let end = [0xff, 0xff, 0xff, 0xff, 0, 0, 0, 0];
-        if let Err(error) = self.ticks.append(&end, true) {
-            self.fault(&error);
-        }
-        if let Err(error) = self.events.sink.sync() {
-            self.fault(&error);
+        if !self.failing {
+            let end = [0xff, 0xff, 0xff, 0xff, 0, 0, 0, 0];
+            self.ticks.push(&end, 0);
+            self.write(true);
         }
     }
 }
@@ -271,6 +237,7 @@ impl RunWriter {
     /// [`RecordError`] when the folder cannot be made or the name cannot be one. A run that cannot be recorded at its
     /// start should not begin.
     pub fn create(root: &Path, meta: RunMeta) -> Result<Self, RecordError> {
+        crate::space::check(root, None, &meta.columns)?;
         let policy = if meta.clock == "virtual" {
             FlushPolicy::VIRTUAL
         } else {
@@ -292,6 +259,9 @@ impl RunWriter {
         if meta.name.is_empty() || meta.name.len() > 64 || !meta.name.chars().all(fits) {
             return Err(RecordError::Name(meta.name));
         }
+        if let Some(name) = columns::impossible(&meta.law_columns) {
+            return Err(RecordError::LawColumn(name.to_owned()));
+        }
         std::fs::create_dir_all(root).map_err(RecordError::io("cannot create", root))?;
         let now = jiff::Timestamp::now();
         meta.started_utc = now.strftime("%Y-%m-%dT%H:%M:%S%.3fZ").to_string();
@@ -300,16 +270,19 @@ impl RunWriter {
         write_atomically(&folder.join(RUN_TOML), meta.to_toml()?.as_bytes())?;
         let create = |name: &str| {
             let path = folder.join(name);
-            OpenOptions::new()
-                .write(true)
-                .create_new(true)
-                .open(&path)
+            open_here(OpenOptions::new().write(true).create_new(true), &path)
                 .map_err(RecordError::io("cannot create", path))
         };
         let ticks = Blocks::new(create(TICKS_ARROW)?, 0);
         let events = Blocks::new(create(EVENTS_JSONL)?, 0);
         Ok(Self {
-            log: Log::new(ticks, events, policy.sane(), true)?,
+            log: Log::new(
+                ticks,
+                events,
+                policy.sane(),
+                &meta.columns,
+                &meta.law_columns,
+            )?,
             folder,
             meta,
         })
@@ -325,12 +298,17 @@ impl RunWriter {
         &self.meta
     }
 
+    /// Adds what is known of the conditions only once the run goes; it is written with the end.
+    pub fn add_conditions(&mut self, conditions: toml::Table) {
+        self.meta.conditions.extend(conditions);
+    }
+
     /// Takes a row; it goes to the disk with its batch.
     pub fn tick(&mut self, row: &TickRecord) {
         self.log.tick(row);
     }
 
-    /// Writes an event at once.
+    /// Takes an event; it goes to the disk with the next batch, after its ticks.
     pub fn event(&mut self, event: &Event) {
         self.log.event(event);
     }
@@ -346,40 +324,70 @@ impl RunWriter {
     }
 
     /// What could not be written so far.
-    pub fn faults(&self) -> &Faults {
-        &self.log.faults
+    pub fn faults(&self) -> Faults {
+        self.log.faults()
+    }
+
+    /// Whether the last attempt to write failed: what waits is tried again with the next batch.
+    pub fn is_failing(&self) -> bool {
+        self.log.failing
     }
 
     /// Writes what waits, the end of `run.toml` (`ended_utc` and the counts are set here), and `ticks.parquet`.
     ///
-    /// A failing disk is no error here either: what could be written is there, and [`Finished`] says the rest.
+    /// The rows are read back: every row taken that does not come back is counted as lost, on top of what `end.rows_lost`
+    /// says was lost on the way here, and the figure `records_lost` of the summary is set to the sum. A failing disk is no
+    /// error here either: what could be written is there, and [`Finished`] says the rest.
     pub fn finish(mut self, mut end: RunEnd) -> Finished {
         self.log.close();
         end.ended_utc = jiff::Timestamp::now()
             .strftime("%Y-%m-%dT%H:%M:%S%.3fZ")
             .to_string();
-        end.rows = self.log.rows;
-        end.rows_lost = self.log.faults.rows_lost;
-        end.events_lost = self.log.faults.events_lost;
+        let parquet = RunReader::open(&self.folder).and_then(|run| {
+            let path = self.folder.join(TICKS_PARQUET);
+            crate::write_parquet(&Source::single(run), &Selection::default(), &path).map(|_| ())
+        });
+        let mut faults = self.log.faults();
+        let rows = match self.rows_on_disk() {
+            Ok(rows) => rows,
+            Err(error) => {
+                faults.first.get_or_insert(error.to_string());
+                0
+            }
+        };
+        faults.rows_lost = faults.rows_lost.max(self.log.rows.saturating_sub(rows));
+        if let Err(error) = &parquet {
+            faults.io_errors += 1;
+            faults.first.get_or_insert(error.to_string());
+        }
+        end.rows = rows;
+        end.rows_lost += faults.rows_lost;
+        end.events_lost += faults.events_lost;
+        if let Some(lost) = end.summary.get_mut("records_lost") {
+            *lost = toml::Value::Integer(i64::try_from(end.rows_lost).unwrap_or(i64::MAX));
+        }
         self.meta.end = Some(end);
         let written = self.meta.to_toml().and_then(|text| {
             write_atomically(&self.folder.join(RUN_TOML), text.as_bytes())?;
             Ok(())
         });
-        if let Err(error) = written {
-            self.log.fault(&error);
-        }
-        let parquet = RunReader::open(&self.folder)
-            .and_then(|run| crate::write_parquet(&run, &self.folder.join(TICKS_PARQUET)));
-        if let Err(error) = &parquet {
-            self.log.fault(error);
+        if let Err(error) = &written {
+            faults.io_errors += 1;
+            faults.first.get_or_insert(error.to_string());
         }
         Finished {
             folder: self.folder.clone(),
-            rows: self.log.rows,
-            faults: self.log.faults.clone(),
+            rows,
+            faults,
+            closed: written.is_ok(),
             parquet,
         }
+    }
+
+    /// Rows that come back from the disk.
+    fn rows_on_disk(&self) -> Result<u64, RecordError> {
+        let mut batches = RunReader::open(&self.folder)?.batches()?;
+        Ok(batches.by_ref().map(|batch| batch.len() as u64).sum())
     }
 }
 

@@ -1,5 +1,5 @@
 use super::*;
-use crate::columns;
+use crate::columns::GROUPS;
 use crate::stream::Stream;
 use std::cell::RefCell;
 use std::io::Cursor;
@@ -12,6 +12,10 @@ struct Disk {
     room: Rc<RefCell<usize>>,
     /// Whether cutting fails as well.
     stuck: Rc<RefCell<bool>>,
+    removed: Rc<RefCell<bool>>,
+    /// Whether a sync fails, as after an error of the medium.
+    forgets: Rc<RefCell<bool>>,
+    syncs: Rc<RefCell<u64>>,
 }
 
 impl Disk {
@@ -20,6 +24,9 @@ impl Disk {
             bytes: Rc::default(),
             room: Rc::new(RefCell::new(room)),
             stuck: Rc::default(),
+            removed: Rc::default(),
+            forgets: Rc::default(),
+            syncs: Rc::default(),
         }
     }
 }
@@ -48,12 +55,23 @@ impl Sink for Disk {
     }
 
     fn sync(&mut self) -> io::Result<()> {
+        *self.syncs.borrow_mut() += 1;
+        if *self.forgets.borrow() {
+            return Err(io::Error::other("input/output error"));
+        }
+        Ok(())
+    }
+
+    fn is_there(&self) -> io::Result<()> {
+        if *self.removed.borrow() {
+            return Err(io::Error::other("removed"));
+        }
         Ok(())
     }
 }
 
 fn row(seq: u64) -> TickRecord {
-    let mut row = columns::unknown();
+    let mut row = TickRecord::unknown();
     row.seq = seq;
     row.command_um = seq as f64;
     row
@@ -68,7 +86,7 @@ fn policy(rows: usize) -> FlushPolicy {
 }
 
 fn read(bytes: &[u8]) -> (Vec<u64>, u64, u64) {
-    let mut stream = Stream::new(Cursor::new(bytes)).unwrap();
+    let mut stream = Stream::new(Cursor::new(bytes), 0).unwrap();
     let mut seqs = Vec::new();
     while let Some(batch) = stream.next_batch().unwrap() {
         seqs.extend(batch.iter().map(|row| row.seq));
@@ -76,17 +94,16 @@ fn read(bytes: &[u8]) -> (Vec<u64>, u64, u64) {
     (seqs, stream.damaged_bytes, stream.torn_bytes)
 }
 
+fn log(ticks: &Disk, events: &Disk, rows: usize) -> Log<Disk> {
+    let blocks = |disk: &Disk| Blocks::new(disk.clone(), 0);
+    Log::new(blocks(ticks), blocks(events), policy(rows), &GROUPS, &[]).unwrap()
+}
+
 #[test]
-fn a_full_disk_is_counted_and_the_run_goes_on_when_there_is_room_again() {
+fn what_a_full_disk_refuses_waits_and_is_there_when_there_is_room_again() {
     for stuck in [false, true] {
-        let (ticks, events) = (Disk::new(60_000), Disk::new(200));
-        let mut log = Log::new(
-            Blocks::new(ticks.clone(), 0),
-            Blocks::new(events.clone(), 0),
-            policy(10),
-            true,
-        )
-        .unwrap();
+        let (ticks, events) = (Disk::new(30_000), Disk::new(200));
+        let mut log = log(&ticks, &events, 10);
         *ticks.stuck.borrow_mut() = stuck;
         for seq in 0..500 {
             log.tick(&row(seq));
@@ -94,61 +111,86 @@ fn a_full_disk_is_counted_and_the_run_goes_on_when_there_is_room_again() {
                 log.event(&Event::new(seq as f64, "mark"));
             }
         }
-        let lost = log.faults.rows_lost;
-        assert!(lost > 0 && log.faults.events_lost > 0);
-        assert_eq!(
-            lost + log.rows,
-            500,
-            "every row is either written or counted"
-        );
-        assert!(log.faults.first.is_some());
-        // Somebody deletes files: the record goes on behind its last whole batch.
+        assert!(log.failing);
+        let faults = log.faults();
+        assert!(faults.rows_lost > 0 && faults.events_lost > 0 && faults.first.is_some());
+        // Somebody deletes files.
         *ticks.room.borrow_mut() = usize::MAX;
+        *events.room.borrow_mut() = usize::MAX;
         *ticks.stuck.borrow_mut() = false;
         for seq in 500..600 {
             log.tick(&row(seq));
         }
+        assert!(!log.failing);
         log.close();
-        assert_eq!(log.faults.rows_lost, lost);
+        assert_eq!((log.faults().rows_lost, log.faults().events_lost), (0, 0));
         let (seqs, damaged, torn) = read(&ticks.bytes.borrow());
-        assert_eq!(seqs.len() as u64, 600 - lost);
-        assert_eq!(seqs.last(), Some(&599));
+        assert_eq!(seqs, (0..600).collect::<Vec<u64>>());
         assert_eq!((damaged, torn), (0, 0), "no half batch stays behind");
         let log = events.bytes.borrow();
+        assert_eq!(log.iter().filter(|byte| **byte == b'\n').count(), 10);
         assert!(log.ends_with(b"\n"), "no half line stays behind");
     }
 }
 
 #[test]
-fn a_disk_that_is_full_from_the_start_stops_nothing() {
-    let mut log = Log::new(
-        Blocks::new(Disk::new(0), 0),
-        Blocks::new(Disk::new(0), 0),
-        policy(4),
-        true,
-    )
-    .unwrap();
+fn a_disk_that_is_full_from_the_start_loses_everything_by_number() {
+    let mut log = log(&Disk::new(0), &Disk::new(0), 4);
     for seq in 0..10 {
         log.tick(&row(seq));
     }
     log.event(&Event::new(0.0, "x"));
     log.close();
-    assert_eq!(log.faults.rows_lost, 10);
-    assert_eq!(log.faults.events_lost, 1);
-    assert_eq!(log.rows, 0);
+    assert!(log.failing);
+    assert_eq!(log.faults().rows_lost, 10);
+    assert_eq!(log.faults().events_lost, 1);
+}
+
+#[test]
+fn a_file_that_was_removed_is_noticed_with_the_next_batch() {
+    let (ticks, events) = (Disk::new(usize::MAX), Disk::new(usize::MAX));
+    let mut log = log(&ticks, &events, 10);
+    (0..10).for_each(|seq| log.tick(&row(seq)));
+    assert!(!log.failing);
+    *ticks.removed.borrow_mut() = true;
+    (10..20).for_each(|seq| log.tick(&row(seq)));
+    assert!(log.failing);
+    assert_eq!(log.faults().rows_lost, 10);
+}
+
+#[test]
+fn events_go_to_the_disk_with_their_ticks_and_cost_no_wait_of_their_own() {
+    let (ticks, events) = (Disk::new(usize::MAX), Disk::new(usize::MAX));
+    let mut log = log(&ticks, &events, 100);
+    let before = *ticks.syncs.borrow() + *events.syncs.borrow();
+    for seq in 0..1000 {
+        log.tick(&row(seq));
+        log.event(&Event::new(seq as f64, "frame-repeated"));
+    }
+    let syncs = *ticks.syncs.borrow() + *events.syncs.borrow() - before;
+    assert!(syncs <= 20, "{syncs} waits for ten batches");
+    log.close();
+    let written = events.bytes.borrow();
+    assert_eq!(written.iter().filter(|byte| **byte == b'\n').count(), 1000);
+}
+
+#[test]
+fn rows_that_the_disk_says_it_does_not_have_are_counted() {
+    let (ticks, events) = (Disk::new(usize::MAX), Disk::new(usize::MAX));
+    let mut log = log(&ticks, &events, 10);
+    *ticks.forgets.borrow_mut() = true;
+    (0..10).for_each(|seq| log.tick(&row(seq)));
+    *ticks.forgets.borrow_mut() = false;
+    (10..20).for_each(|seq| log.tick(&row(seq)));
+    assert!(!log.failing);
+    assert_eq!(log.faults().rows_lost, 10);
 }
 
 #[test]
 fn a_run_cut_off_at_any_byte_reads_back_to_its_last_whole_batch() {
     let disk = Disk::new(usize::MAX);
     let mut ends = Vec::new();
-    let mut log = Log::new(
-        Blocks::new(disk.clone(), 0),
-        Blocks::new(Disk::new(usize::MAX), 0),
-        policy(8),
-        true,
-    )
-    .unwrap();
+    let mut log = log(&disk, &Disk::new(usize::MAX), 8);
     for seq in 0..40 {
         log.tick(&row(seq));
         if seq % 8 == 7 {

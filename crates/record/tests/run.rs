@@ -1,9 +1,10 @@
 //! Behaviour of run folders: whole, cut off, damaged, resumed.
 
 use cellpos_record::{
-    CSV_HEAD, Event, FlushPolicy, Format, InputFile, RunEnd, RunMeta, RunReader, RunWriter, export,
+    Event, FlushPolicy, Format, InputFile, RunEnd, RunMeta, RunReader, RunWriter, Selection,
+    Source, csv_head, export, write_csv,
 };
-use cellpos_runtime::{CONTROLLER_STATE_LEN, TickFlags, TickRecord};
+use cellpos_runtime::{TickFlags, TickRecord};
 use proptest::prelude::*;
 use std::path::{Path, PathBuf};
 
@@ -36,6 +37,8 @@ fn row(seq: u64) -> TickRecord {
         stage: 2,
         length_um: 9.5,
         area_um2: 61.0 + x,
+        length_sd_um: 0.02,
+        area_sd_um2: 0.3,
         flags,
         drained: 1,
         wake_ns: 1234,
@@ -44,7 +47,7 @@ fn row(seq: u64) -> TickRecord {
         solver_iterations: 9,
         solver_active: 3,
         solver_ns: 95_000,
-        controller_state: std::array::from_fn(|index| index as f64 + x),
+        ..TickRecord::unknown()
     }
 }
 
@@ -81,13 +84,10 @@ fn bits(row: &TickRecord) -> Vec<u64> {
         row.true_um,
         row.length_um,
         row.area_um2,
+        row.length_sd_um,
+        row.area_sd_um2,
     ];
-    bits.extend(
-        floats
-            .iter()
-            .chain(&row.controller_state)
-            .map(|v| v.to_bits()),
-    );
+    bits.extend(floats.iter().map(|v| v.to_bits()));
     bits
 }
 
@@ -186,7 +186,6 @@ fn rows_behind_damage_are_found_again_and_the_gap_shows() {
     let (ticks, lost) = RunReader::open(&folder).unwrap().ticks().unwrap();
     assert!((70..100).contains(&ticks.len()), "{}", ticks.len());
     assert_eq!(ticks.last().unwrap().seq, 99);
-    // Damage inside numbers cannot be seen; damage to the structure is passed over.
     assert!(lost.rows > 0 && lost.damaged_bytes > 0);
     assert_eq!(lost.rows as usize, 100 - ticks.len());
 }
@@ -248,11 +247,14 @@ fn exports_carry_units_in_their_names_and_follow_the_row_convention() {
     let root = tempfile::tempdir().unwrap();
     let folder = cut_off(root.path(), 100, 8);
     let run = RunReader::open(&folder).unwrap();
+    let source = Source::single(RunReader::open(&folder).unwrap());
+    let all = Selection::default();
     let csv = root.path().join("out/run.csv");
-    export(&run, Format::Csv, &csv).unwrap();
+    let done = export(&source, &all, Format::Csv, &csv).unwrap();
+    assert_eq!(done.rows, 100);
     let text = std::fs::read_to_string(&csv).unwrap();
-    assert_eq!(text.lines().next(), Some(CSV_HEAD));
-    assert!(CSV_HEAD.starts_with("time_s,pzt_um,bead_um,"));
+    assert_eq!(text.lines().next(), Some(csv_head().as_str()));
+    assert!(csv_head().starts_with("time_s,pzt_um,bead_um,"));
     assert_eq!(text.lines().count(), 1 + 100);
     let third: Vec<&str> = text.lines().nth(4).unwrap().split(',').collect();
     assert_eq!(third[0], "0.003");
@@ -262,7 +264,8 @@ fn exports_carry_units_in_their_names_and_follow_the_row_convention() {
         third[11], "",
         "a number that does not exist is an empty field"
     );
-    let head: Vec<&str> = CSV_HEAD.split(',').collect();
+    let head = csv_head();
+    let head: Vec<&str> = head.split(',').collect();
     assert_eq!(head.len(), third.len());
     let area = head.iter().position(|name| *name == "area_um2").unwrap();
     assert_eq!(third[area].parse::<f64>().unwrap(), 64.0);
@@ -270,7 +273,7 @@ fn exports_carry_units_in_their_names_and_follow_the_row_convention() {
     assert!((record.rate_hz() - 1000.0).abs() < 1e-9);
 
     let parquet = root.path().join("out/run.parquet");
-    export(&run, Format::Parquet, &parquet).unwrap();
+    export(&source, &all, Format::Parquet, &parquet).unwrap();
     let file = std::fs::File::open(&parquet).unwrap();
     let reader = parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder::try_new(file)
         .unwrap()
@@ -279,7 +282,7 @@ fn exports_carry_units_in_their_names_and_follow_the_row_convention() {
     let mut rows = 0;
     for batch in reader {
         let batch = batch.unwrap();
-        let column = batch.column_by_name("command_um").unwrap();
+        let column = batch.column_by_name("pzt_um").unwrap();
         let column = column
             .as_any()
             .downcast_ref::<arrow_array::Float64Array>()
@@ -288,7 +291,9 @@ fn exports_carry_units_in_their_names_and_follow_the_row_convention() {
             assert_eq!(value.to_bits(), (20.0 + rows as f64 / 7.0).to_bits());
             rows += 1;
         }
-        assert_eq!(batch.num_columns(), 32 + CONTROLLER_STATE_LEN);
+        assert_eq!(batch.num_columns(), head.len());
+        let applied = batch.column_by_name("applied_um").unwrap();
+        assert_eq!(arrow_array::Array::null_count(applied), batch.num_rows());
     }
     assert_eq!(rows, 100);
     let names: Vec<_> = std::fs::read_dir(root.path().join("out"))
@@ -328,8 +333,10 @@ fn a_recording_from_before_a_column_existed_reads_with_nothing_known_of_it() {
             .map(Result::unwrap)
             .collect();
     for batch in &mut batches {
-        let area = batch.schema().index_of("area_um2").unwrap();
-        batch.remove_column(area);
+        for name in ["area_um2", "check"] {
+            let place = batch.schema().index_of(name).unwrap();
+            batch.remove_column(place);
+        }
     }
     let file = std::fs::File::create(&path).unwrap();
     let mut old = arrow_ipc::writer::StreamWriter::try_new(file, &batches[0].schema()).unwrap();
@@ -353,11 +360,112 @@ fn a_recording_from_before_a_column_existed_reads_with_nothing_known_of_it() {
         assert_eq!(bits(tick), bits(&expected));
     }
     let mut csv = Vec::new();
-    cellpos_record::write_csv(&RunReader::open(&folder).unwrap(), &mut csv).unwrap();
+    let source = Source::single(RunReader::open(&folder).unwrap());
+    write_csv(&source, &Selection::default(), &mut csv).unwrap();
     let csv = String::from_utf8(csv).unwrap();
     assert!(
-        csv.lines().skip(1).all(|line| line.ends_with(",9.5,")),
+        csv.lines().skip(1).all(|line| line.contains(",9.5,,")),
         "{csv}"
+    );
+}
+
+#[test]
+fn a_block_of_zeros_is_no_row() {
+    let root = tempfile::tempdir().unwrap();
+    let folder = cut_off(root.path(), 100, 10);
+    let path = folder.join("ticks.arrow");
+    let mut bytes = std::fs::read(&path).unwrap();
+    // What a file system leaves after a crash: the length is right, the last blocks were never written.
+    let length = bytes.len();
+    bytes[length - 1500..].fill(0);
+    std::fs::write(&path, &bytes).unwrap();
+    let (ticks, lost) = RunReader::open(&folder).unwrap().ticks().unwrap();
+    for tick in &ticks {
+        assert_eq!(bits(tick), bits(&row(tick.seq)), "row {}", tick.seq);
+    }
+    assert!(ticks.len() < 100);
+    assert_eq!(ticks.len() as u64 + lost.damaged_rows, 100);
+}
+
+#[test]
+fn a_run_of_a_later_format_is_refused_by_name() {
+    let root = tempfile::tempdir().unwrap();
+    let folder = cut_off(root.path(), 5, 10);
+    let path = folder.join("run.toml");
+    let text = std::fs::read_to_string(&path).unwrap();
+    assert!(text.contains("format = 2"));
+    std::fs::write(&path, text.replace("format = 2", "format = 3")).unwrap();
+    let error = RunReader::open(&folder).unwrap_err().to_string();
+    assert!(
+        error.contains("format 3") && error.contains("up to 2"),
+        "{error}"
+    );
+}
+
+#[test]
+fn rows_that_do_not_read_back_are_counted_as_lost() {
+    let root = tempfile::tempdir().unwrap();
+    let mut writer =
+        RunWriter::create_with(root.path(), RunMeta::new("t", "real"), policy(10)).unwrap();
+    (0..50).for_each(|seq| writer.tick(&row(seq)));
+    assert!(!writer.is_failing());
+    std::fs::remove_dir_all(writer.folder()).unwrap();
+    (50..100).for_each(|seq| writer.tick(&row(seq)));
+    assert!(writer.is_failing());
+    let mut end = RunEnd::new("done");
+    end.rows_lost = 3;
+    let done = writer.finish(end);
+    assert_eq!((done.rows, done.faults.rows_lost), (0, 100));
+    assert!(done.faults.first.unwrap().contains("removed"));
+}
+
+#[cfg(unix)]
+#[test]
+fn a_symbolic_link_in_a_run_folder_is_not_written_through() {
+    let root = tempfile::tempdir().unwrap();
+    let victim = root.path().join("victim");
+    std::fs::write(&victim, "whole\n").unwrap();
+    let link = root.path().join("cycles.csv");
+    std::os::unix::fs::symlink(&victim, &link).unwrap();
+    let error = cellpos_record::LineFile::open(&link, "a,b", false)
+        .err()
+        .unwrap();
+    assert!(error.to_string().contains("symbolic link"), "{error}");
+    assert_eq!(std::fs::read_to_string(&victim).unwrap(), "whole\n");
+}
+
+#[test]
+fn a_part_of_a_run_is_exported_as_asked_over_its_sessions() {
+    let root = tempfile::tempdir().unwrap();
+    let parts = [1, 2].map(|number| cellpos_record::Part {
+        reader: RunReader::open(&cut_off(root.path(), 100, 8)).unwrap(),
+        number,
+        offset_ns: (number as i64 - 1) * 1_000_000_000,
+    });
+    let source = Source::new(parts.into());
+    let selection = Selection {
+        from_s: 0.090,
+        to_s: 1.009,
+        every: 4.try_into().unwrap(),
+        columns: Some(vec!["session".into(), "time_s".into(), "verdict".into()]),
+    };
+    let mut csv = Vec::new();
+    let done = write_csv(&source, &selection, &mut csv).unwrap();
+    assert_eq!(
+        String::from_utf8(csv).unwrap(),
+        "session,time_s,verdict\n1,0.09,good\n1,0.094,good\n1,0.098,good\n2,1.002,good\n2,1.006,good\n"
+    );
+    assert_eq!((done.rows, done.lost.len()), (5, 2));
+    let wrong = Selection {
+        columns: Some(vec!["pzt".into()]),
+        ..Selection::default()
+    };
+    let error = write_csv(&source, &wrong, &mut Vec::new())
+        .unwrap_err()
+        .to_string();
+    assert!(
+        error.contains("`pzt`") && error.contains("pzt_um"),
+        "{error}"
     );
 }
 
@@ -407,4 +515,45 @@ proptest! {
         let _ = run.events().unwrap();
         let _ = run.to_record();
     }
+}
+
+#[test]
+fn a_control_law_has_its_own_columns_under_its_own_names() {
+    let root = tempfile::tempdir().unwrap();
+    let mut meta = RunMeta::new("law", "real");
+    meta.law_columns = vec!["pi_integral_um".into(), "pi_lead_um".into()];
+    let mut writer = RunWriter::create_with(root.path(), meta.clone(), policy(16)).unwrap();
+    let own = |seq: u64| {
+        let mut row = row(seq);
+        row.law = std::array::from_fn(|i| {
+            if i < 2 {
+                (seq + i as u64) as f32 / 3.0
+            } else {
+                f32::NAN
+            }
+        });
+        row
+    };
+    (0..40).for_each(|seq| writer.tick(&own(seq)));
+    let folder = writer.folder().to_owned();
+    drop(writer);
+    let reader = RunReader::open(&folder).unwrap();
+    assert_eq!(reader.law_columns(), ["pi_integral_um", "pi_lead_um"]);
+    let (ticks, lost) = reader.ticks().unwrap();
+    assert_eq!((ticks.len(), lost.damaged_rows), (40, 0));
+    for (tick, seq) in ticks.iter().zip(0..) {
+        assert_eq!(tick.law.map(f32::to_bits), own(seq).law.map(f32::to_bits));
+    }
+    let file = std::fs::File::open(folder.join("ticks.arrow")).unwrap();
+    let stream = arrow_ipc::reader::StreamReader::try_new(file, None).unwrap();
+    assert!(
+        stream.schema().index_of("pi_lead_um").is_ok(),
+        "any Arrow library sees them"
+    );
+    meta.law_columns.push("command_um".into());
+    let error = RunWriter::create(root.path(), meta)
+        .err()
+        .unwrap()
+        .to_string();
+    assert!(error.contains("`command_um`"), "{error}");
 }

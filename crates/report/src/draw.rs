@@ -59,6 +59,12 @@ fn panels_grid(svg: &mut Svg, figure: &Figure, panels: &[Panel]) -> f64 {
                 width: width - LEFT_PX - RIGHT_PX,
                 x_range: shared.unwrap_or_else(|| data_range(panel, true)),
                 show_x: !(figure.share_x && columns == 1) || last_row,
+                // Panels below each other that show the same series need one legend, above the first.
+                show_legend: columns > 1
+                    || row_index == 0
+                    || panels
+                        .get(row_index - 1)
+                        .is_none_or(|above| entries(above) != entries(panel)),
             };
             tallest = tallest.max(draw_panel(svg, panel, &frame));
         }
@@ -75,6 +81,19 @@ struct Frame {
     x_range: Option<(f64, f64)>,
     /// Whether the x axis has its numbers and title (only the lowest of panels that share it).
     show_x: bool,
+    /// Whether its legend is drawn.
+    show_legend: bool,
+}
+
+/// What a panel's legend says: names, colours and strokes.
+fn entries(panel: &Panel) -> Vec<(&str, usize, bool)> {
+    panel
+        .series
+        .iter()
+        .zip(colors(panel))
+        .filter(|(series, _)| !series.label.is_empty())
+        .map(|(series, color)| (series.label.as_str(), color, series.dashed))
+        .collect()
 }
 
 /// Range of a panel's data along one axis, marker lines included.
@@ -129,7 +148,10 @@ fn draw_panel(svg: &mut Svg, panel: &Panel, frame: &Frame) -> f64 {
         );
         top += LINE_PX;
     }
-    top += legend(svg, panel, frame.left, top, frame.width) + 4.0;
+    if frame.show_legend {
+        top += legend(svg, panel, frame.left, top, frame.width);
+    }
+    top += 4.0;
 
     let (mut width, mut height) = (frame.width, panel.height_px);
     let y_range = data_range(panel, false);

@@ -143,9 +143,6 @@ impl Table {
 
     fn html(&self, out: &mut String) {
         out.push_str("<div class=\"scroll\"><table>");
-        if !self.caption.is_empty() {
-            let _ = write!(out, "<caption>{}</caption>", escape(&self.caption));
-        }
         let side = |column: &Column| if column.right { " class=\"num\"" } else { "" };
         if self.columns.iter().any(|column| !column.head.is_empty()) {
             out.push_str("<thead><tr>");
@@ -165,6 +162,10 @@ impl Table {
             out.push_str("</tr>\n");
         }
         out.push_str("</tbody></table></div>\n");
+        // Outside of what scrolls: on a narrow screen it is read whole.
+        if !self.caption.is_empty() {
+            let _ = writeln!(out, "<p class=\"caption\">{}</p>", escape(&self.caption));
+        }
     }
 }
 
@@ -396,7 +397,7 @@ nav ul{columns:2;list-style:none;padding:10px 14px;background:#f5f7f9;border-rad
 a{color:#0063a0}figure{margin:18px 0}figure svg{max-width:100%;height:auto;display:block}\
 figcaption{color:#5c6470;font-size:13px;margin-top:4px}\
 .scroll{overflow-x:auto;margin:12px 0}table{border-collapse:collapse;font-size:13.5px}\
-caption{caption-side:bottom;text-align:left;color:#5c6470;font-size:13px;padding-top:4px}\
+p.caption{color:#5c6470;font-size:13px;margin-top:4px}\
 th{text-align:left;font-weight:600;border-bottom:2px solid #c3cad2;padding:4px 14px 4px 6px;vertical-align:bottom}\
 td{border-bottom:1px solid #e8ebef;padding:4px 14px 4px 6px;vertical-align:top}\
 .num{text-align:right;font-variant-numeric:tabular-nums;padding:4px 8px}\
@@ -405,7 +406,7 @@ tr.good td:first-child{color:#00724f}tr.warning td:first-child{color:#8a5a00}tr.
 .note.good{border-color:#009e73;background:#eaf6f1}.note.warning{border-color:#d99a00;background:#fdf6e3}.note.bad{border-color:#c8372d;background:#fcecea}\
 pre{background:#f5f7f9;padding:10px 14px;border-radius:6px;overflow-x:auto;font-size:13px;line-height:1.4}\
 @media (prefers-color-scheme:dark){\
-body{background:#14171b;color:#e4e7eb}h2{border-color:#2f353d}a{color:#6cb8ee}figcaption,caption{color:#a3acb8}\
+body{background:#14171b;color:#e4e7eb}h2{border-color:#2f353d}a{color:#6cb8ee}figcaption,p.caption{color:#a3acb8}\
 nav ul,.note,pre{background:#1e2329}th{border-color:#4a525d}td{border-color:#2a2f37}\
 tr.good td:first-child{color:#3ccf9f}tr.warning td:first-child{color:#f0b429}tr.bad td:first-child{color:#ff8078}\
 .note.good{background:#10281f}.note.warning{background:#2c2410}.note.bad{background:#301614}}\

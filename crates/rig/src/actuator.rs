@@ -1,43 +1,131 @@
 //! The PZT actuator as the loop's I/O thread sees it.
+//!
+//! The words are the loop's, not those of one board: an analogue output card, a network controller and the project's own
+//! board all report themselves as an [`ActuatorState`] and an [`ActuatorFault`].
 
-use cellpos_link::{BoardState, Fault, Refusal, Request};
 use serde::Serialize;
 use std::time::Duration;
 
+/// What an actuator does at present. The numbers are those of a run's record.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[repr(u8)]
+pub enum ActuatorState {
+    /// At park or on the way there; takes no commands.
+    Disarmed = 0,
+    /// Holds its displacement and waits for the first command.
+    Armed = 1,
+    /// Follows commands.
+    Running = 2,
+    /// Holds the zero-flow displacement because it was told to ([`Actuator::freeze`]); only a new session leaves this.
+    Frozen = 3,
+    /// Parks or is parked; latched: only a new session leaves this.
+    Safe = 4,
+    /// Holds the zero-flow displacement by itself because commands stopped; a fresh command takes up again.
+    Holding = 5,
+}
+
+impl ActuatorState {
+    /// All, in the order of their numbers.
+    pub const ALL: [Self; 6] = [
+        Self::Disarmed,
+        Self::Armed,
+        Self::Running,
+        Self::Frozen,
+        Self::Safe,
+        Self::Holding,
+    ];
+
+    /// The state of a number in a record; anything unknown is [`ActuatorState::Safe`].
+    pub fn from_number(number: u8) -> Self {
+        Self::ALL
+            .into_iter()
+            .find(|state| *state as u8 == number)
+            .unwrap_or(Self::Safe)
+    }
+
+    /// Whether commands are taken.
+    pub fn takes_commands(self) -> bool {
+        matches!(self, Self::Armed | Self::Running | Self::Holding)
+    }
+}
+
+/// Why an actuator stopped following by itself. The numbers are those of a run's record.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[repr(u8)]
+pub enum ActuatorFault {
+    /// No fault.
+    None = 0,
+    /// No fresh command within the watchdog time.
+    CommandTimeout = 1,
+    /// Nothing came to end a freeze within the hold watchdog time.
+    FreezeTimeout = 2,
+    /// Armed, but no first command within the hold watchdog time.
+    ArmTimeout = 3,
+    /// A fault of the device: temperature, current, supply, converter.
+    Device = 4,
+}
+
+impl ActuatorFault {
+    /// All, in the order of their numbers.
+    pub const ALL: [Self; 5] = [
+        Self::None,
+        Self::CommandTimeout,
+        Self::FreezeTimeout,
+        Self::ArmTimeout,
+        Self::Device,
+    ];
+
+    /// The fault of a number in a record; anything unknown is [`ActuatorFault::Device`].
+    pub fn from_number(number: u8) -> Self {
+        Self::ALL
+            .into_iter()
+            .find(|fault| *fault as u8 == number)
+            .unwrap_or(Self::Device)
+    }
+}
+
 /// What an actuator can do, as it says itself.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct ActuatorInfo {
+    /// What it is: kind, serial number, version of its firmware.
+    pub name: String,
     /// Smallest displacement, um.
     pub low_um: f64,
     /// Largest displacement, um.
     pub high_um: f64,
     /// Largest rate of displacement, um/s.
     pub slew_um_per_s: f64,
-    /// One step of the converter, um.
+    /// One step of the converter, um; 0 where that is not known.
     pub step_um: f64,
-    /// Watchdog on missing commands, ms.
+    /// Default time without a fresh command after which it stops following, ms.
     pub watchdog_ms: u16,
-    /// Serial number.
-    pub serial: u32,
-    /// Firmware version.
-    pub firmware: [u8; 3],
+    /// Default time that it then holds before it parks, ms.
+    pub hold_watchdog_ms: u16,
 }
 
-/// The newest that the actuator has said.
+/// The newest that an actuator has said.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct BoardReport {
+pub struct ActuatorReport {
+    /// Session that it is in, [`ArmRequest::session`]: another number than one's own means that another host armed it.
+    pub session: u16,
     /// State.
-    pub state: BoardState,
+    pub state: ActuatorState,
     /// Latched fault.
-    pub fault: Fault,
-    /// Displacement at the converter's output, um.
+    pub fault: ActuatorFault,
+    /// Displacement that stands at the output, um.
     pub applied_um: f64,
-    /// Sequence number of the last command obeyed.
+    /// Sequence number of the last command obeyed, counted from 0 at arming; `None` before the first.
     pub last_seq: Option<u32>,
     /// Host time of that command, us since arming.
     pub last_time_us: u64,
-    /// Frames that the board could not read.
+    /// The actuator's own clock, us since its start: spacing of commands as it saw them.
+    pub device_time_us: u64,
+    /// Frames that it could not read.
     pub bad_frames: u32,
+    /// Commands that it ignored: old, doubled, of another session, or in a state that takes none.
+    pub ignored: u32,
+    /// How often in this session it held by itself because commands stopped: a report in between may have been missed.
+    pub holds: u16,
     /// When the report was read, ns of the run's clock.
     pub read_ns: i64,
 }
@@ -46,10 +134,10 @@ pub struct BoardReport {
 #[derive(Debug, thiserror::Error)]
 pub enum ActuatorError {
     /// The line is gone or broken.
-    #[error("PZT board on {port}: {stage}")]
+    #[error("{actuator}: {stage}: {source}")]
     Line {
-        /// Name of the port.
-        port: String,
+        /// Which actuator.
+        actuator: String,
         /// What was being done.
         stage: &'static str,
         /// What the operating system said.
@@ -57,72 +145,76 @@ pub enum ActuatorError {
         source: std::io::Error,
     },
     /// No answer.
-    #[error(
-        "PZT board on {port}: no answer to {request:?} within {after:?}: is it powered, is it this port?"
-    )]
+    #[error("{actuator}: no answer to {request} within {after:?}: is it powered, is it this port?")]
     Timeout {
-        /// Name of the port.
-        port: String,
+        /// Which actuator.
+        actuator: String,
         /// What was asked.
-        request: Request,
+        request: &'static str,
         /// How long was waited.
         after: Duration,
     },
     /// A refusal.
-    #[error("PZT board on {port} refused {request:?}: {refusal:?}")]
+    #[error("{actuator} refused {request}: {reason}")]
     Refused {
-        /// Name of the port.
-        port: String,
+        /// Which actuator.
+        actuator: String,
         /// What was asked.
-        request: Request,
-        /// Why not.
-        refusal: Refusal,
+        request: &'static str,
+        /// Why not, and what would be right.
+        reason: String,
     },
     /// A command that is not a number; nothing was sent.
-    #[error("a command must be a number: displacement {command_um} um, neutral {neutral_um} um")]
+    #[error("a command must be a number: displacement {command_um} um, zero flow {neutral_um} um")]
     NotANumber {
         /// Displacement asked for, um.
         command_um: f64,
-        /// Estimate of neutral, um.
+        /// Estimate of the zero-flow displacement, um.
         neutral_um: f64,
     },
-    /// Another protocol version.
+    /// Another version of the protocol, or another kind of device.
     #[error(
-        "PZT board on {port} speaks protocol {received}, this program {expected}: update the firmware or the program"
+        "{actuator} speaks {received}, this program {expected}: update the firmware or the program"
     )]
-    Protocol {
-        /// Name of the port.
-        port: String,
-        /// This program's version.
-        expected: u16,
-        /// The board's.
-        received: u16,
+    Incompatible {
+        /// Which actuator.
+        actuator: String,
+        /// What this program speaks.
+        expected: String,
+        /// What the device speaks.
+        received: String,
     },
 }
 
 /// How a session is to be run.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Session {
-    /// Number of the session.
-    pub id: u16,
+pub struct ArmRequest {
+    /// Number of the session, drawn at random so that two hosts at one actuator are told apart.
+    pub session: u16,
     /// Where a ramp to park ends, um.
     pub park_um: f64,
-    /// Limits tighter than the board's own: smallest, largest displacement (um) and slew (um/s).
+    /// Smallest and largest displacement (um) and slew (um/s) of this session, at most the actuator's own.
     pub limits: [f64; 3],
-    /// Watchdog on missing commands, ms; `None` leaves the board's.
+    /// Without a fresh command for this long it stops following and holds the zero-flow displacement, ms; `None` leaves
+    /// the actuator's own.
     pub watchdog_ms: Option<u16>,
+    /// When it has held for this long it parks, ms; `None` leaves the actuator's own.
+    pub hold_watchdog_ms: Option<u16>,
 }
 
 /// A PZT actuator. Called from the actuator thread only; may block.
+///
+/// An actuator enforces range and slew of its session itself, at its output, and acts on silence by itself: a killed
+/// host must end in park.
 pub trait Actuator: Send {
     /// What it can do.
     fn info(&self) -> ActuatorInfo;
-    /// Starts a session: the board holds its displacement and waits for commands.
+    /// Starts a session: the actuator holds its displacement and waits for commands.
     ///
     /// # Errors
     /// No answer, or a refusal.
-    fn arm(&mut self, session: &Session) -> Result<BoardReport, ActuatorError>;
-    /// Hands over a displacement and the estimate of neutral, both um.
+    fn arm(&mut self, request: &ArmRequest) -> Result<ActuatorReport, ActuatorError>;
+    /// Hands over a displacement and the estimate of the zero-flow displacement, both um.
     ///
     /// # Errors
     /// The line is broken.
@@ -132,7 +224,7 @@ pub trait Actuator: Send {
         neutral_um: f64,
         time_us: u64,
     ) -> Result<(), ActuatorError>;
-    /// Slew to the last estimate of neutral and hold there.
+    /// Slew to the last estimate of the zero-flow displacement and hold there.
     ///
     /// # Errors
     /// The line is broken.
@@ -151,5 +243,22 @@ pub trait Actuator: Send {
     ///
     /// # Errors
     /// The line is broken.
-    fn poll(&mut self) -> Result<Option<BoardReport>, ActuatorError>;
+    fn poll(&mut self) -> Result<Option<ActuatorReport>, ActuatorError>;
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn numbers_of_a_record_read_back_as_what_they_were_and_unknown_ones_as_the_worst() {
+        for state in ActuatorState::ALL {
+            assert_eq!(ActuatorState::from_number(state as u8), state);
+        }
+        for fault in ActuatorFault::ALL {
+            assert_eq!(ActuatorFault::from_number(fault as u8), fault);
+        }
+        assert_eq!(ActuatorState::from_number(200), ActuatorState::Safe);
+        assert_eq!(ActuatorFault::from_number(200), ActuatorFault::Device);
+    }
 }

@@ -26,6 +26,10 @@ pub struct Measurement {
     pub length_um: f64,
     /// Projected area of the cell, um^2; NaN for a bead, or when it is not measured.
     pub area_um2: f64,
+    /// Standard deviation of `length_um`, um; NaN without one.
+    pub length_sd_um: f64,
+    /// Standard deviation of `area_um2`, um^2; NaN without one.
+    pub area_sd_um2: f64,
     /// True bead position at `ready_ns`, um (emulated rig only, else NaN).
     pub true_um: f64,
     /// True PZT displacement at `ready_ns`, um (emulated rig only, else NaN).

@@ -132,6 +132,45 @@ impl<C: Camera + ?Sized> Camera for Box<C> {
     }
 }
 
+/// A frame with what vision made of it.
+#[derive(Debug, Clone, Copy)]
+pub struct SeenFrame<'a> {
+    /// The frame.
+    pub frame: Frame<'a>,
+    /// Bits per pixel of the frame.
+    pub bits: u16,
+    /// When it was exposed.
+    pub stamp: FrameStamp,
+    /// Centre of the bead or cell that was taken, px; `None`: nothing was.
+    pub centre_px: Option<(f64, f64)>,
+    /// Half its width along the columns and the rows, px.
+    pub half_px: (f64, f64),
+    /// Where it was expected, px.
+    pub expected_px: (f64, f64),
+    /// Standard deviation of that place, px; infinite while it is looked for everywhere.
+    pub expected_sd_px: f64,
+    /// From pixels to the channel.
+    pub scale: PictureScale,
+}
+
+/// Where the channel lies in a picture, to first order: what a scale bar and a click need.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PictureScale {
+    /// Position along the channel at the centre of the first pixel, um.
+    pub first_um: f64,
+    /// Change of position with each pixel along the channel's axis, um; negative where the channel runs against it.
+    pub um_per_px: f64,
+    /// Whether the channel follows the columns of the picture rather than its rows.
+    pub upright: bool,
+}
+
+/// Looks at each new frame beside the loop: a live picture, a ring of the last seconds. Called on the camera's thread between
+/// a frame and its position: it must not wait, lock or allocate.
+pub trait FrameWatch: Send {
+    /// A new frame has been looked at.
+    fn frame(&mut self, seen: &SeenFrame<'_>);
+}
+
 /// A stream of bead positions.
 pub trait PositionSource: Send {
     /// Waits for the next position until `deadline_ns`; `None` when none came in time.
@@ -142,4 +181,10 @@ pub trait PositionSource: Send {
 
     /// What the source says of itself.
     fn info(&self) -> SourceInfo;
+
+    /// Shows each new frame to `watch` from now on; `false` where the source has no frames.
+    fn watch(&mut self, watch: Box<dyn FrameWatch>) -> bool {
+        drop(watch);
+        false
+    }
 }

@@ -63,8 +63,8 @@ pub struct Arming {
     config: ArmingConfig,
     /// Displacement at each tick of the pulse less the one before the pulse, um.
     program_um: Vec<f64>,
-    /// Increment of the measured position at each tick, um, as the model says.
-    increments_um: Vec<f64>,
+    /// Measured position at each tick, um, as the model says.
+    positions_um: Vec<f64>,
 }
 
 /// How far the check has come.
@@ -77,7 +77,10 @@ pub struct ArmingState {
     /// Tick of the pulse; `None` before it.
     pulse: Option<u32>,
     base_um: f64,
-    last_um: Option<f64>,
+    /// The last position, um, and the tick of the pulse at which it came.
+    last: Option<(u32, f64)>,
+    /// Ticks in a row without a frame.
+    silent: u32,
     n: f64,
     sum_x: f64,
     sum_y: f64,
@@ -90,12 +93,31 @@ pub struct ArmingState {
     repeated: u32,
 }
 
+/// Ticks in a row without a frame that a steady bead may have.
+const MOST_SILENT: u32 = 3;
 /// Pulses made again at most: a rig that is disturbed every time is not fit to be closed.
 const MOST_REPEATED: u32 = 3;
 /// Ticks without any position after which the PZT goes to where the bead is believed to rest.
 const UNSEEN_TICKS: u32 = 50;
 /// How far it goes in a tick, um: 100 um/s at 1 kHz.
 const SEARCH_UM: f64 = 0.1;
+
+/// What a tick of arming is given.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct ArmingInput {
+    /// The position, um, if there is a good one.
+    pub position_um: Option<f64>,
+    /// Whether a new frame came: a camera slower than the loop has none for some ticks.
+    pub framed: bool,
+    /// Displacement commanded so far, um.
+    pub command_um: f64,
+    /// Displacement at which the bead is believed to rest, um.
+    pub neutral_um: f64,
+    /// Whether time did not pass as planned: ticks were skipped, the frame is late, missing or old, the last command was late.
+    pub disturbed: bool,
+    /// Periods since the tick before.
+    pub steps: u64,
+}
 
 /// What to do in this tick of arming.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -130,48 +152,43 @@ impl Arming {
             })
             .collect();
         let mut state = discrete.state(0.0);
-        let mut last = discrete.output_um(&state);
-        let increments_um = program_um
+        let positions_um = program_um
             .iter()
             .map(|&command_um| {
-                let now = discrete.output_um(&state);
-                let increment = now - last;
-                last = now;
+                let now_um = discrete.output_um(&state);
                 discrete.step(&mut state, command_um);
-                increment
+                now_um
             })
             .collect();
         Ok(Self {
             config,
             program_um,
-            increments_um,
+            positions_um,
         })
     }
 
-    /// One tick: the position, if there is a good one, the displacement commanded so far, and the one at which the bead is
-    /// believed to rest; `disturbed` when ticks were skipped before this one, its frame is late, missing or old, or the last
-    /// command was late.
+    /// One tick.
     ///
     /// The PZT is held where it stands, which may be where a person has brought the bead to rest. Where no bead is to be
     /// seen (a board that has parked flings it away, and the next one too) it goes to the believed rest, so that one can
     /// come.
-    pub fn step(
-        &self,
-        state: &mut ArmingState,
-        position_um: Option<f64>,
-        command_um: f64,
-        neutral_um: f64,
-        disturbed: bool,
-    ) -> Step {
-        state.ticks += 1;
+    pub fn step(&self, state: &mut ArmingState, input: &ArmingInput) -> Step {
+        let ArmingInput {
+            position_um,
+            command_um,
+            neutral_um,
+            ..
+        } = *input;
+        let steps = u32::try_from(input.steps).unwrap_or(u32::MAX);
+        state.ticks = state.ticks.saturating_add(steps);
         state.seen |= position_um.is_some();
+        state.silent = if input.framed { 0 } else { state.silent + 1 };
         let Some(pulse) = state.pulse else {
-            state.steady = if position_um.is_some() {
-                state.steady + 1
-            } else {
-                0
-            };
-            state.last_um = position_um;
+            if position_um.is_some() {
+                state.steady += 1;
+            } else if input.framed || state.silent > MOST_SILENT {
+                state.steady = 0;
+            }
             if state.steady >= self.config.steady_ticks {
                 if !self.config.check {
                     return Step::Done(Verdict {
@@ -181,6 +198,7 @@ impl Arming {
                     });
                 }
                 state.pulse = Some(0);
+                state.last = position_um.map(|um| (0, um));
                 state.base_um = command_um;
                 return Step::Command(command_um + self.program_um.first().copied().unwrap_or(0.0));
             }
@@ -199,21 +217,25 @@ impl Arming {
         };
         let tick = pulse + 1;
         state.pulse = Some(tick);
-        state.disturbed |= disturbed;
-        if let (Some(now), Some(before), Some(&x)) = (
-            position_um,
-            state.last_um,
-            self.increments_um.get(tick as usize),
-        ) {
-            let y = now - before;
-            state.n += 1.0;
-            state.sum_x += x;
-            state.sum_y += y;
-            state.sum_xx += x * x;
-            state.sum_xy += x * y;
-            state.sum_yy += y * y;
+        state.disturbed |= input.disturbed;
+        if let Some(now_um) = position_um {
+            let expected_um = |tick: u32| self.positions_um.get(tick as usize);
+            if let Some((at, before_um)) = state.last
+                && let (Some(from_um), Some(to_um)) = (expected_um(at), expected_um(tick))
+            {
+                let (x, y) = (to_um - from_um, now_um - before_um);
+                state.n += 1.0;
+                state.sum_x += x;
+                state.sum_y += y;
+                state.sum_xx += x * x;
+                state.sum_xy += x * y;
+                state.sum_yy += y * y;
+            }
+            state.last = Some((tick, now_um));
+        } else if input.framed {
+            // What comes next may be another bead.
+            state.last = None;
         }
-        state.last_um = position_um;
         match self.program_um.get(tick as usize) {
             Some(offset_um) => Step::Command(state.base_um + offset_um),
             None => {
@@ -304,7 +326,16 @@ mod tests {
                 0.02 * (f64::from(tick.wrapping_mul(2_654_435_761)) / f64::from(u32::MAX) - 0.5);
             let position = factor * plant.output_um(&truth) + 0.01 * f64::from(tick) + jitter;
             let seen = (!blind(tick)).then_some(position);
-            match arming.step(&mut state, seen, command, 20.0, skipped(tick) > 0) {
+            let steps = u64::from(skipped(tick)) + 1;
+            let input = ArmingInput {
+                position_um: seen,
+                framed: true,
+                command_um: command,
+                neutral_um: 20.0,
+                disturbed: steps > 1,
+                steps,
+            };
+            match arming.step(&mut state, &input) {
                 Step::Command(next) => command = next,
                 Step::Again(next, _) => {
                     command = next;
@@ -333,7 +364,15 @@ mod tests {
             for tick in 0..1000 {
                 // Seen once, and lost again: a person may have brought it to rest here.
                 let position = (seen && tick == 10).then_some(0.0);
-                let step = arming.step(&mut state, position, command, 20.0, false);
+                let input = ArmingInput {
+                    position_um: position,
+                    framed: true,
+                    command_um: command,
+                    neutral_um: 20.0,
+                    disturbed: false,
+                    steps: 1,
+                };
+                let step = arming.step(&mut state, &input);
                 let Step::Command(next) = step else {
                     panic!("given up too soon");
                 };

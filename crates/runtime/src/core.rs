@@ -1,14 +1,16 @@
 //! One tick of the loop as a pure function of what came in: life cycle, freshness, arming, control, limits, account.
 //!
 //! # The loop contract
-//! 1. A tick starts on the arrival of a frame; a timer stands in when frames stop.
+//! 0. Time is the clock's: each tick has its number on a [`Grid`] of the period, and advances plan, controller, estimator
+//!    and learner by the steps that have passed since the tick before: one, or more where ticks were skipped, never none.
+//! 1. A tick starts on the arrival of a new frame; a timer stands in when frames stop. A frame that is not new starts none.
 //! 2. The measurement ring is drained: the newest is kept, the rest counted.
-//! 3. The age of the newest is checked by frame id AND mid-exposure time stamp.
+//! 3. The newest is checked by frame id AND mid-exposure time stamp, see [`cellpos_rig::freshness`].
 //! 4. Estimate. 5. Controller. 6. Finite, range, slew.
 //! 7. The command goes into the actuator ring.
 //! 8. The tick's record goes into the recorder ring (full: dropped, counted, the sequence number runs on).
 //!
-//! Steps 3 to 6 are [`Core::step`]; the drivers ([`crate::live`], [`crate::virtual_run`]) do the rest around it. The
+//! Steps 4 to 6 are [`Core::step`]; the drivers ([`crate::live`], [`crate::virtual_run`]) do the rest around it. The
 //! core knows no clock and no device: its input is [`TickInput`], so that the same code runs in real time, on a
 //! virtual clock, and in a replay of a recorded run, to the bit. A step allocates nothing, takes no lock, makes no
 //! system call, formats nothing and logs nothing.
@@ -20,50 +22,56 @@
 mod account;
 mod checks;
 
-use crate::arming::{Arming, ArmingConfig, ArmingState, Step};
-use crate::guide::{Guide, GuideInput, GuideOutput, Stage};
+use crate::arming::{Arming, ArmingConfig, ArmingInput, ArmingState, Step};
+use crate::grid::Grid;
 use crate::learners::Learners;
 use crate::life::{EventKind, Events, FreezeReason, Life, Request, SafeReason};
+use crate::reference::{ReferenceGenerator, ReferenceInput, ReferenceOutput, Stage};
 use crate::tick::Tick;
 pub use crate::tick::{Action, Counts, TickInput, TickOutput};
 use crate::tick_record::TickFlags;
 pub use crate::timing::{CoreError, Timing};
 use cellpos_control::{
-    Controller, CycleLearning, LoopConfig, LoopInput, LoopOutput, LoopState,
-    Measurement as LoopMeasurement, Mode, PlantMonitor, PlantMonitorState, SolverStatus,
-    SolverTerms,
+    Controller, CycleLearning, LoopConfig, LoopInput, LoopOutput, Measurement as LoopMeasurement,
+    Mode, PlantMonitor, PlantMonitorState, SolverStatus, SolverTerms,
 };
-use cellpos_link::BoardState;
 use cellpos_plant::TransferFunction;
-use cellpos_rig::BoardReport;
+use cellpos_rig::ActuatorReport;
+use cellpos_rig::ActuatorState;
 use cellpos_units::Seconds;
 use std::ops::Range;
 
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct State {
     seq: u64,
+    grid: Option<Grid>,
+    /// Number of the last tick on the grid.
+    index: u64,
     counts: Counts,
     life: Life,
     safe_reason: Option<SafeReason>,
     last_time_ns: i64,
-    control: LoopState,
     arming: ArmingState,
-    /// Tick at which the loop was closed.
+    /// Tick on the grid at which the loop was closed.
     running_since: u64,
     last_frame: Option<(u64, i64)>,
     stale_in_a_row: u32,
     late_in_a_row: u32,
     refused_in_a_row: u32,
-    /// Ticks in a row without a position that was used.
+    /// Steps of the grid in a row without a position that was used.
     missing: u32,
     frames_silent: bool,
-    coasting_since: Option<u64>,
-    frozen: Option<(FreezeReason, u64)>,
-    stuck_since: Option<u64>,
-    saturated_since: Option<u64>,
-    board: Option<BoardReport>,
+    early_since_ns: Option<i64>,
+    vision_slow_since_ns: Option<i64>,
+    coasting_since_ns: Option<i64>,
+    /// Why and since when, ns.
+    frozen: Option<(FreezeReason, i64)>,
+    stuck_since_ns: Option<i64>,
+    saturated_since_ns: Option<i64>,
+    board: Option<ActuatorReport>,
     board_heard_ns: i64,
     parked_at: Option<u64>,
+    unrecorded_since_ns: Option<i64>,
     plant: PlantMonitorState,
     stage: Stage,
 }
@@ -72,7 +80,7 @@ struct State {
 #[derive(Debug)]
 pub struct Core<R> {
     controller: Controller,
-    guide: R,
+    reference: R,
     timing: Timing,
     arming: Arming,
     sample_s: f64,
@@ -83,7 +91,7 @@ pub struct Core<R> {
     state: State,
 }
 
-impl<R: Guide> Core<R> {
+impl<R: ReferenceGenerator> Core<R> {
     /// Builds the loop for a board that is armed and stands at `displacement_um`, with `neutral_um` as the first belief
     /// of the displacement at which the bead rests.
     ///
@@ -91,15 +99,33 @@ impl<R: Guide> Core<R> {
     /// A value that cannot be, named.
     pub fn new(
         config: LoopConfig,
-        guide: R,
+        reference: R,
         timing: Timing,
         arming: ArmingConfig,
         plant: &TransferFunction,
         displacement_um: f64,
         neutral_um: f64,
     ) -> Result<Self, CoreError> {
-        timing.validate()?;
         let controller = Controller::new(config)?;
+        let at = [displacement_um, neutral_um];
+        Self::with_controller(controller, reference, timing, arming, plant, at)
+    }
+
+    /// The same with any controller, so with a control law of another crate ([`Controller::with_law`]); `at_um` is the
+    /// board's displacement and the first belief of that at which the bead rests.
+    ///
+    /// # Errors
+    /// A value that cannot be, named.
+    pub fn with_controller(
+        mut controller: Controller,
+        reference: R,
+        timing: Timing,
+        arming: ArmingConfig,
+        plant: &TransferFunction,
+        at_um: [f64; 2],
+    ) -> Result<Self, CoreError> {
+        timing.validate()?;
+        let [displacement_um, neutral_um] = at_um;
         let sample_s = timing.period_us * 1e-6;
         let arming = Arming::new(
             arming,
@@ -107,12 +133,13 @@ impl<R: Guide> Core<R> {
             Seconds(sample_s),
             Seconds(timing.camera_delay_ms * 1e-3),
         )?;
-        let monitor = PlantMonitor::new(config.estimator, config.model)?;
-        let control = controller.start(displacement_um, neutral_um);
+        let settings = controller.settings();
+        let monitor = PlantMonitor::new(settings.estimator, settings.model)?;
+        controller.start(displacement_um, neutral_um);
         Ok(Self {
             preview_um: vec![0.0; controller.preview_len()],
             controller,
-            guide,
+            reference,
             timing,
             arming,
             sample_s,
@@ -122,11 +149,12 @@ impl<R: Guide> Core<R> {
             state: State {
                 plant: monitor.start(displacement_um),
                 seq: 0,
+                grid: None,
+                index: 0,
                 counts: Counts::default(),
                 life: Life::Armed,
                 safe_reason: None,
                 last_time_ns: 0,
-                control,
                 arming: ArmingState::default(),
                 running_since: 0,
                 last_frame: None,
@@ -135,25 +163,28 @@ impl<R: Guide> Core<R> {
                 refused_in_a_row: 0,
                 missing: 0,
                 frames_silent: false,
-                coasting_since: None,
+                early_since_ns: None,
+                vision_slow_since_ns: None,
+                coasting_since_ns: None,
                 frozen: None,
-                stuck_since: None,
-                saturated_since: None,
+                stuck_since_ns: None,
+                saturated_since_ns: None,
                 board: None,
                 board_heard_ns: 0,
                 parked_at: None,
+                unrecorded_since_ns: None,
                 stage: Stage::None,
             },
         })
     }
 
-    /// The same loop with learning over the cycles of its guide's only periodic motion.
+    /// The same loop with learning over the cycles of its reference generator's only periodic motion.
     #[must_use]
     pub fn with_learning(self, learning: CycleLearning) -> Self {
         self.with_learners(Learners::new(vec![Some(learning)]))
     }
 
-    /// The same loop with learning over the cycles of its guide's periodic motions.
+    /// The same loop with learning over the cycles of its reference generator's periodic motions.
     #[must_use]
     pub fn with_learners(mut self, learners: Learners) -> Self {
         self.learners = learners;
@@ -165,6 +196,11 @@ impl<R: Guide> Core<R> {
     pub fn with_late_solver(mut self, spans_ns: Vec<Range<i64>>) -> Self {
         self.late_solver_ns = spans_ns;
         self
+    }
+
+    /// The controller, for the names of its columns in the record.
+    pub fn controller(&self) -> &Controller {
+        &self.controller
     }
 
     /// What is being learned over cycles.
@@ -195,29 +231,57 @@ impl<R: Guide> Core<R> {
     /// Time since the loop was closed, s; `None` when it is not.
     pub fn running_for_s(&self) -> Option<f64> {
         (self.state.life == Life::Running)
-            .then(|| self.state.seq.saturating_sub(self.state.running_since) as f64 * self.sample_s)
+            .then(|| (self.state.index - self.state.running_since) as f64 * self.sample_s)
     }
 
     /// Who says where the bead is to be.
-    pub fn guide(&self) -> &R {
-        &self.guide
+    pub fn reference(&self) -> &R {
+        &self.reference
     }
 
-    /// One tick.
-    pub fn step(&mut self, input: &TickInput) -> TickOutput {
+    /// Number of the last tick on the clock's grid: the periods since the first one.
+    pub fn index(&self) -> u64 {
+        self.state.index
+    }
+
+    /// From when on the next tick may be made, ns since the start of the run; `None`: at any time, it is the first.
+    pub fn opens_ns(&self) -> Option<i64> {
+        let next =
+            i64::try_from(self.state.index).map_or(i64::MAX, |index| index.saturating_add(1));
+        self.state.grid.map(|grid| grid.opens_ns(next))
+    }
+
+    /// One tick. `None`, and nothing done: its time has not come ([`Core::opens_ns`]).
+    pub fn step(&mut self, input: &TickInput) -> Option<TickOutput> {
+        let period_ns = self.timing.period_ns();
+        let first = self.state.grid.is_none();
+        let grid = *self
+            .state
+            .grid
+            .get_or_insert_with(|| Grid::new(input.time_ns, period_ns));
+        let index = u64::try_from(grid.index(input.time_ns)).unwrap_or(0);
+        if !first && index <= self.state.index {
+            return None;
+        }
         let mut tick = Tick {
             seq: self.state.seq,
             time_ns: input.time_ns,
+            index,
+            steps: (index - self.state.index).max(1),
             flags: TickFlags::default(),
             events: Events::default(),
             disturbed: false,
         };
-        if tick.seq == 0 {
+        let slew_time_s = if first {
             tick.event(EventKind::Armed);
             self.state.board_heard_ns = input.time_ns;
+            None
         } else {
-            self.catch_up(input.time_ns, &mut tick);
-        }
+            self.catch_up(&mut tick);
+            let since_ns = input.time_ns - self.state.last_time_ns;
+            (since_ns < period_ns).then_some(since_ns as f64 * 1e-9)
+        };
+        self.state.index = index;
         self.state.last_time_ns = input.time_ns;
         let fix = self.check_frame(input, &mut tick);
         self.check_driver(input, &mut tick);
@@ -225,6 +289,7 @@ impl<R: Guide> Core<R> {
         match input.request {
             Request::Park => self.latch(SafeReason::Operator, &mut tick),
             Request::Freeze | Request::Pause => self.freeze(FreezeReason::Operator, &mut tick),
+            Request::Unrecorded => self.unrecorded(&mut tick),
             Request::None | Request::Skip => {
                 if input.request == Request::Skip {
                     tick.event(EventKind::StepSkipped);
@@ -235,33 +300,36 @@ impl<R: Guide> Core<R> {
             }
         }
         let mode = self.advance_life(fix.map(|fix| fix.position_um), &mut tick);
-        let (output, guided) = self.control(fix, input, mode, &mut tick);
+        let (output, generated) = self.control(fix, input, mode, slew_time_s, &mut tick);
         if output.requested_um.is_nan() {
             self.latch(SafeReason::NotFinite, &mut tick);
         }
         self.account(&output, &mut tick);
-        let action = self.action(&output, tick.seq);
+        let action = self.action(&output, tick.index);
         self.count(input, &output, tick.flags);
-        let record = self.record(input, &output, &guided, tick.flags);
+        let record = self.record(input, &output, &generated, tick.flags);
         self.state.seq += 1;
-        TickOutput {
+        Some(TickOutput {
             action,
             record,
             events: tick.events,
-        }
+        })
     }
 
     /// Life cycle; gives what the controller is to do.
     fn advance_life(&mut self, position_um: Option<f64>, tick: &mut Tick) -> Mode {
         if self.state.life == Life::Armed {
-            let held = self.state.control.previous_command_um();
-            let neutral_um = self.state.control.estimator.neutral_um;
-            let arming = &mut self.state.arming;
-            let disturbed = tick.disturbed;
-            match self
-                .arming
-                .step(arming, position_um, held, neutral_um, disturbed)
-            {
+            let held = self.controller.previous_command_um();
+            let neutral_um = self.controller.estimator().neutral_um;
+            let told = ArmingInput {
+                position_um,
+                framed: !tick.flags.has(TickFlags::TIMER),
+                command_um: held,
+                neutral_um,
+                disturbed: tick.disturbed,
+                steps: tick.steps,
+            };
+            match self.arming.step(&mut self.state.arming, &told) {
                 Step::Command(command_um) => return Mode::Direct(command_um),
                 Step::Again(command_um, verdict) => {
                     if let Some(refusal) = verdict.refusal {
@@ -291,7 +359,7 @@ impl<R: Guide> Core<R> {
                         }
                         tick.event(EventKind::Running);
                         self.state.life = Life::Running;
-                        self.state.running_since = tick.seq;
+                        self.state.running_since = tick.index;
                         self.state.missing = 0;
                     }
                 },
@@ -328,16 +396,17 @@ impl<R: Guide> Core<R> {
         fix: Option<LoopMeasurement>,
         input: &TickInput,
         mode: Mode,
+        slew_time_s: Option<f64>,
         tick: &mut Tick,
-    ) -> (LoopOutput, GuideOutput) {
+    ) -> (LoopOutput, ReferenceOutput) {
         let running = self.state.life == Life::Running;
         let since = if running {
-            self.state.seq - self.state.running_since
+            tick.index - self.state.running_since
         } else {
             0
         };
         let length_um = input.measurement.map(|m| m.length_um);
-        let told = GuideInput {
+        let told = ReferenceInput {
             running,
             frozen: mode == Mode::Freeze,
             skip: running && input.request == Request::Skip,
@@ -346,30 +415,32 @@ impl<R: Guide> Core<R> {
             position_um: fix.map(|fix| fix.position_um),
             age_ticks: fix.map_or(0, |fix| fix.age_samples),
             length_um: length_um.filter(|um| fix.is_some() && um.is_finite()),
+            target_um: input.target_um,
         };
-        let guided = self.guide.step(&told, &mut self.preview_um);
-        if guided.stage != self.state.stage {
-            self.state.stage = guided.stage;
-            if guided.stage != Stage::None {
+        let generated = self.reference.step(&told, &mut self.preview_um);
+        if generated.stage != self.state.stage {
+            self.state.stage = generated.stage;
+            if generated.stage != Stage::None {
                 tick.event(EventKind::Script {
-                    stage: guided.stage,
+                    stage: generated.stage,
                 });
             }
         }
         let given = LoopInput {
             measurement: fix,
-            reference_um: guided.reference_um,
+            reference_um: generated.reference_um,
             preview_um: &self.preview_um,
             mode,
+            slew_time_s,
             solver: self.solver_terms(input),
             learned_um: self.learners.addition_um(
-                guided.motion,
-                guided.phase.filter(|_| mode == Mode::Run),
-                guided.reference_um,
+                generated.motion,
+                generated.phase.filter(|_| mode == Mode::Run),
+                generated.reference_um,
             ),
-            excitation_um: self.guide.excitation_um(),
+            excitation_um: self.reference.excitation_um(),
         };
-        let output = self.controller.step(&mut self.state.control, &given);
+        let output = self.controller.step(&given);
         let nominal = self.timing.camera_delay_ms * 1e-3 / self.sample_s;
         let used = fix.filter(|_| !output.flags.coasting && !output.flags.stuck);
         self.learners.learn(used.map(|fix| {
@@ -377,13 +448,13 @@ impl<R: Guide> Core<R> {
             (fix.position_um, age)
         }));
         self.watch_plant(fix, &output, tick);
-        (output, guided)
+        (output, generated)
     }
 
     fn solver_terms(&self, input: &TickInput) -> SolverTerms {
         let late = |span: &Range<i64>| span.contains(&input.time_ns);
         if self.late_solver_ns.iter().any(late) {
-            SolverTerms::Recorded(SolverStatus::PreviousPlan)
+            SolverTerms::Recorded(SolverStatus::PreviousPlan, 0)
         } else {
             input.solver
         }
@@ -410,8 +481,8 @@ impl<R: Guide> Core<R> {
         }
     }
 
-    fn action(&mut self, output: &LoopOutput, seq: u64) -> Action {
-        /// Ticks after which an order to park that the board has not confirmed is given again.
+    fn action(&mut self, output: &LoopOutput, index: u64) -> Action {
+        /// Periods after which an order to park that the board has not confirmed is given again.
         const REPEAT: u64 = 10;
         if self.state.life != Life::Safe {
             return Action::Command {
@@ -422,11 +493,11 @@ impl<R: Guide> Core<R> {
         let confirmed = self
             .state
             .board
-            .is_some_and(|b| matches!(b.state, BoardState::Safe | BoardState::Disarmed));
+            .is_some_and(|b| matches!(b.state, ActuatorState::Safe | ActuatorState::Disarmed));
         match self.state.parked_at {
-            Some(at) if confirmed || seq < at + REPEAT => Action::None,
+            Some(at) if confirmed || index < at + REPEAT => Action::None,
             _ => {
-                self.state.parked_at = Some(seq);
+                self.state.parked_at = Some(index);
                 Action::Park
             }
         }
@@ -443,15 +514,15 @@ impl<R: Guide> Core<R> {
 
     fn freeze(&mut self, reason: FreezeReason, tick: &mut Tick) {
         if self.state.life == Life::Running && self.state.frozen.is_none() {
-            self.state.frozen = Some((reason, tick.seq));
+            self.state.frozen = Some((reason, tick.time_ns));
             tick.event(EventKind::FreezeStarted { reason });
         }
     }
 
     fn thaw(&mut self, tick: &mut Tick) {
-        if let Some((_, since)) = self.state.frozen.take() {
+        if let Some((_, since_ns)) = self.state.frozen.take() {
             tick.event(EventKind::FreezeEnded {
-                lasted_ms: (tick.seq - since) as f64 * self.timing.period_us * 1e-3,
+                lasted_ms: (tick.time_ns - since_ns) as f64 * 1e-6,
             });
         }
     }

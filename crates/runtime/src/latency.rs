@@ -10,6 +10,7 @@ use serde::Serialize;
 pub struct Latency {
     histogram: Histogram<u64>,
     max_ns: u64,
+    max_tick: u64,
 }
 
 /// Quantiles of a [`Latency`] in microseconds.
@@ -23,6 +24,8 @@ pub struct Quantiles {
     pub p999: f64,
     /// Exact maximum, us.
     pub max: f64,
+    /// Number of the tick in which it came.
+    pub max_tick: u64,
 }
 
 impl Default for Latency {
@@ -44,12 +47,15 @@ impl Latency {
         Self {
             histogram,
             max_ns: 0,
+            max_tick: 0,
         }
     }
 
-    /// Counts one duration.
-    pub fn record(&mut self, ns: u64) {
-        self.max_ns = self.max_ns.max(ns);
+    /// Counts one duration, of the tick `seq`.
+    pub fn record(&mut self, ns: u64, seq: u64) {
+        if ns > self.max_ns {
+            (self.max_ns, self.max_tick) = (ns, seq);
+        }
         self.histogram.saturating_record(ns.min(Self::HIGHEST_NS));
     }
 
@@ -70,6 +76,7 @@ impl Latency {
             p99: at(0.99),
             p999: at(0.999),
             max: self.max_ns as f64 / 1e3,
+            max_tick: self.max_tick,
         }
     }
 }
@@ -82,13 +89,13 @@ mod tests {
     fn quantiles_of_a_known_ramp_are_within_three_digits_and_the_maximum_is_exact() {
         let mut latency = Latency::new();
         for us in 1..=10_000u64 {
-            latency.record(us * 1000);
+            latency.record(us * 1000, us);
         }
-        latency.record(12_345_678_901);
+        latency.record(12_345_678_901, 77);
         let q = latency.quantiles_us();
         assert!((q.p50 - 5000.0).abs() < 5.0, "{q:?}");
         assert!((q.p99 - 9900.0).abs() < 11.0, "{q:?}");
-        assert_eq!(q.max, 12_345_678.901);
+        assert_eq!((q.max, q.max_tick), (12_345_678.901, 77));
         assert_eq!(latency.count(), 10_001);
     }
 

@@ -1,4 +1,4 @@
-//! Learning over cycles beside a loop: one learner for each periodic motion of its guide.
+//! Learning over cycles beside a loop: one learner for each periodic motion of its reference generator.
 //!
 //! Not here: how is learned, see [`cellpos_control::learning`].
 
@@ -13,7 +13,7 @@ pub struct Learners {
 }
 
 impl Learners {
-    /// One learner for each motion by its number ([`crate::GuideOutput::motion`]).
+    /// One learner for each motion by its number ([`crate::ReferenceOutput::motion`]).
     pub fn new(all: Vec<Option<CycleLearning>>) -> Self {
         Self { all, motion: 0 }
     }

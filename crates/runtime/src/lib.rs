@@ -2,16 +2,22 @@
 #![forbid(unsafe_code)]
 
 pub mod arming;
+mod board_watch;
 pub mod core;
-pub mod guide;
+mod frames;
+mod grid;
 pub mod latency;
 mod learners;
 pub mod life;
 pub mod live;
+mod pacer;
 pub mod realtime;
+pub mod recorder;
+pub mod reference;
 pub mod replay;
 pub mod run;
 pub mod summary;
+mod threads;
 mod tick;
 mod tick_record;
 pub mod ticker;
@@ -20,9 +26,14 @@ pub mod virtual_run;
 
 pub use crate::core::{Action, Core, CoreError, TickInput, TickOutput, Timing};
 pub use arming::ArmingConfig;
-pub use guide::{Guide, GuideInput, GuideOutput, Stage};
+pub use board_watch::BoardTrouble;
+pub use cellpos_control::LAW_COLUMNS;
+pub use frames::FrameTally;
+pub use grid::Grid;
 pub use learners::Learners;
 pub use life::{Event, EventKind, Life, Request, SafeReason};
+pub use recorder::{RecorderFault, RecorderReport};
+pub use reference::{ReferenceGenerator, ReferenceInput, ReferenceOutput, Stage, Steered};
 pub use run::{EndRule, Finished, NoSink, RunError, RunSink};
 pub use summary::{End, Statistics, Summary};
-pub use tick_record::{CONTROLLER_STATE_LEN, TickFlags, TickRecord};
+pub use tick_record::{TickFlags, TickRecord};

@@ -4,9 +4,9 @@
 //! Freezing (slew to the estimate of neutral, so that the bead all but stops) is a mode within Running and is left
 //! when its cause goes away; safe (ramp to park: the bead is lost, the hardware is not) is not.
 
-use crate::guide::Stage;
+use crate::reference::Stage;
 use cellpos_control::PlantVerdict;
-use cellpos_link::{BoardState, Fault};
+use cellpos_rig::{ActuatorFault, ActuatorState};
 use serde::Serialize;
 
 /// Where a run stands.
@@ -59,6 +59,8 @@ pub enum Request {
     Skip = 3,
     /// Stop the bead where it is until something else is asked for; does not end the run.
     Pause = 4,
+    /// The run is no longer being recorded: stop the bead where it is, then ramp to park.
+    Unrecorded = 5,
 }
 
 impl Request {
@@ -69,6 +71,7 @@ impl Request {
             1 => Self::Freeze,
             3 => Self::Skip,
             4 => Self::Pause,
+            5 => Self::Unrecorded,
             _ => Self::Park,
         }
     }
@@ -86,6 +89,8 @@ pub enum SafeReason {
     CameraLost,
     /// Frames that were old or repeated, too many in a row.
     StaleFrames,
+    /// Frames grew old because vision takes longer for one than the camera.
+    VisionSlow,
     /// Commands handed over late, too many in a row.
     LateTicks,
     /// The controller's output was not a finite number.
@@ -96,8 +101,18 @@ pub enum SafeReason {
     LinkLost,
     /// Commands could not be handed over, too many in a row.
     ActuatorRingFull,
+    /// The board was armed by another host.
+    BoardForeign,
+    /// The board obeyed no command any more, though it talked.
+    BoardNotObeying,
+    /// The board's output did not stand where the commands were.
+    BoardNotFollowing,
+    /// The loop stood still for so long that where the bead is cannot be told from what was commanded.
+    Stalled,
     /// The plant did not answer the arming pulse as the model says.
     ArmingRefused,
+    /// The run could no longer be recorded: the recorder died, its disk refused, or it fell behind.
+    Unrecorded,
 }
 
 /// Why the bead is frozen.
@@ -110,6 +125,8 @@ pub enum FreezeReason {
     BeadLost,
     /// No frames.
     CameraStalled,
+    /// The run is no longer being recorded.
+    Unrecorded,
 }
 
 /// Why arming was refused.
@@ -186,21 +203,52 @@ pub enum EventKind {
         /// Why.
         reason: SafeReason,
     },
-    /// Frame ids are missing.
+    /// Frames are missing; one that comes late after all is taken off the count again.
     FramesDropped {
         /// How many.
         count: u64,
     },
     /// A frame came twice, or after a newer one.
     FrameRepeated {
-        /// Its id; where it came together with newer ones, the newest's.
+        /// Its id; of several in a tick, the last one's.
         frame_id: u64,
     },
     /// A frame with a new id is older than allowed, or its time stamp does not advance.
     FrameStale {
-        /// Age of its exposure.
+        /// Age of the exposure; of several, the oldest.
         age_ms: f64,
     },
+    /// Frames are stamped with a time that has not come.
+    FrameFromFuture {
+        /// By how much the worst of them.
+        ahead_ms: f64,
+    },
+    /// Frames come earlier than expected by more than half a tick: the camera path is shorter than `camera_delay_ms` says.
+    FramesEarlyStarted {
+        /// Age of the exposure.
+        age_ms: f64,
+        /// Age expected.
+        expected_ms: f64,
+    },
+    /// Frames come when they are expected again.
+    FramesEarlyEnded {
+        /// How long they came early.
+        lasted_ms: f64,
+    },
+    /// Vision takes longer for a frame than the camera: frames pile up and grow old.
+    VisionSlowStarted {
+        /// Mean time for a frame.
+        vision_ms: f64,
+        /// Time from frame to frame.
+        period_ms: f64,
+    },
+    /// Vision keeps up again.
+    VisionSlowEnded {
+        /// How long it did not.
+        lasted_ms: f64,
+    },
+    /// The camera began to count its frames anew: it was restarted. Frames lost meanwhile are not known by number.
+    CameraRestarted,
     /// Vision took a bead after the one followed had been lost: like it in size and brightness, but it may be another.
     BeadReacquired {
         /// Where.
@@ -243,10 +291,16 @@ pub enum EventKind {
     BoardChanged {
         /// State.
         #[serde(serialize_with = "as_debug")]
-        state: BoardState,
+        state: ActuatorState,
         /// Latched fault.
         #[serde(serialize_with = "as_debug")]
-        fault: Fault,
+        fault: ActuatorFault,
+    },
+    /// Commands had stopped for the board's watchdog: it went to the zero-flow displacement and held it. The loop has
+    /// taken up again, or will with the next command.
+    BoardHeld {
+        /// Times since the last such event.
+        count: u16,
     },
     /// Frames on the link were damaged.
     LinkGarbage {
@@ -331,8 +385,8 @@ mod tests {
             r#"{"seq":7,"time_ns":8000000,"event":"safe-latched","reason":"stale-frames"}"#
         );
         let board = EventKind::BoardChanged {
-            state: BoardState::Safe,
-            fault: Fault::CommandTimeout,
+            state: ActuatorState::Safe,
+            fault: ActuatorFault::CommandTimeout,
         };
         assert_eq!(
             serde_json::to_string(&board).expect("plain data"),

@@ -12,42 +12,72 @@
 //! the process dies the board's watchdog does.
 
 use crate::core::Core;
-use crate::guide::Guide;
-use crate::life::{Event, Life, Request};
-use crate::realtime::{self, Conditions};
-use crate::run::{EndRule, EndWatch, Finished, RunError, RunSink, close_session, serve_actuator};
-use crate::summary::{End, Statistics, Summary};
-use crate::tick_record::TickRecord;
-use crate::ticker::{Ends, Order, RingSizes, Ticker};
-use cellpos_control::{LearnedTable, LearnerState};
-use cellpos_rig::clock::{monotonic_ns, sleep_until_ns};
-use cellpos_rig::{Actuator, BoardReport, Clock, Measurement, PositionSource};
-use rtrb::{Consumer, Producer};
-use std::sync::atomic::{AtomicBool, AtomicU8, Ordering};
+use crate::life::{Life, Request};
+use crate::realtime;
+use crate::recorder::{self, Feed, RecorderFault};
+use crate::reference::ReferenceGenerator;
+use crate::run::{EndRule, Finished, RunError, RunSink, close_session};
+use crate::summary::{Statistics, Summary};
+use crate::threads::{Acting, ControlEnd, Controlling, Next, Seeing, Shared};
+use crate::ticker::{Ends, RingSizes, Ticker};
+use cellpos_rig::clock::monotonic_ns;
+use cellpos_rig::{Actuator, Clock, PositionSource};
+use std::sync::atomic::{AtomicU8, AtomicU64, Ordering};
 use std::thread::{self, Thread};
 use std::time::Duration;
 
 /// What the operator asks for, shared with a signal handler or a keyboard.
 #[derive(Debug, Default)]
-pub struct Operator(AtomicU8);
+pub struct Operator {
+    asked: AtomicU8,
+    recorder: AtomicU8,
+    /// Complement of the bits of the target, um: 0, the complement of a number that is none, while nothing was said.
+    target: AtomicU64,
+}
 
 impl Operator {
     /// Asks.
     pub fn ask(&self, request: Request) {
-        self.0.store(request as u8, Ordering::Release);
+        self.asked.store(request as u8, Ordering::Release);
+    }
+
+    /// Says where the bead is to be from now on, um; a reference that cannot be steered does not listen.
+    pub fn steer(&self, target_um: f64) {
+        self.target.store(!target_um.to_bits(), Ordering::Release);
+    }
+
+    /// Where the bead is to be, um, if that was said.
+    pub fn target_um(&self) -> Option<f64> {
+        Some(f64::from_bits(!self.target.load(Ordering::Acquire))).filter(|um| um.is_finite())
     }
 
     /// What was last asked.
     pub fn asked(&self) -> Request {
-        Request::from_number(self.0.load(Ordering::Acquire))
+        Request::from_number(self.asked.load(Ordering::Acquire))
     }
 
-    /// What was last asked, to be acted on: asking to skip holds for one tick.
+    /// Says that the run is no longer recorded: from now on the loop freezes the bead, then parks. The first cause stays.
+    pub fn unrecorded(&self, fault: RecorderFault) {
+        let _ = self
+            .recorder
+            .compare_exchange(0, fault as u8, Ordering::AcqRel, Ordering::Acquire);
+    }
+
+    /// Why the run is no longer recorded, if so.
+    pub fn recorder_fault(&self) -> Option<RecorderFault> {
+        RecorderFault::from_number(self.recorder.load(Ordering::Acquire))
+    }
+
+    /// What was last asked, to be acted on: asking to skip holds for one tick; a run that nobody records is stopped unless
+    /// it is parked anyway.
     pub fn take(&self) -> Request {
         let asked = self.asked();
+        if asked != Request::Park && self.recorder_fault().is_some() {
+            return Request::Unrecorded;
+        }
         if asked == Request::Skip {
             // Something asked meanwhile stays.
-            let _ = self.0.compare_exchange(
+            let _ = self.asked.compare_exchange(
                 Request::Skip as u8,
                 Request::None as u8,
                 Ordering::AcqRel,
@@ -59,7 +89,7 @@ impl Operator {
 
     /// Replaces one request by another, unless something else was asked meanwhile; says whether it did.
     pub fn change(&self, from: Request, to: Request) -> bool {
-        self.0
+        self.asked
             .compare_exchange(from as u8, to as u8, Ordering::AcqRel, Ordering::Acquire)
             .is_ok()
     }
@@ -68,7 +98,7 @@ impl Operator {
     pub fn stop(&self) -> Request {
         let next = match self.asked() {
             Request::None | Request::Skip | Request::Pause => Request::Freeze,
-            Request::Freeze | Request::Park => Request::Park,
+            Request::Freeze | Request::Park | Request::Unrecorded => Request::Park,
         };
         self.ask(next);
         next
@@ -106,17 +136,6 @@ impl Threads {
     }
 }
 
-struct ControlEnd {
-    end: End,
-    conditions: Conditions,
-    life: Life,
-    safe_reason: Option<crate::life::SafeReason>,
-    counts: crate::core::Counts,
-    account: crate::ticker::Account,
-    learned: Vec<Option<LearnedTable>>,
-    period_us: f64,
-}
-
 /// Runs until `end` says so or the operator asks for it.
 ///
 /// # Errors
@@ -126,7 +145,7 @@ struct ControlEnd {
     clippy::too_many_arguments,
     reason = "each is one part of the rig or one rule of the run"
 )]
-pub fn run<R: Guide + Send, S: RunSink>(
+pub fn run<R: ReferenceGenerator + Send, S: RunSink>(
     core: Core<R>,
     source: &mut dyn PositionSource,
     actuator: &mut dyn Actuator,
@@ -137,21 +156,28 @@ pub fn run<R: Guide + Send, S: RunSink>(
     operator: &Operator,
 ) -> Result<Finished<S>, RunError> {
     let (ticker, ends) = Ticker::new(core, Clock::Real, monotonic_ns(), RingSizes::default());
+    let period_ns = ticker.core().timing().period_ns();
     let Ends {
         measurements,
-        mut orders,
-        mut reports,
+        orders,
+        reports,
         records,
         events,
         learned,
     } = ends;
-    let stop = AtomicBool::new(false);
+    let feed = Feed {
+        records,
+        events,
+        learned,
+    };
+    let shared = Shared::default();
+    let shared = &shared;
     let start = |thread: &'static str| move |source| RunError::Thread { thread, source };
     thread::scope(|scope| {
         let recorder = thread::Builder::new()
             .name("cellpos-record".to_string())
             .spawn_scoped(scope, || {
-                record(records, events, learned, &mut sink, &mut statistics);
+                recorder::serve(feed, &mut sink, &mut statistics, operator)
             })
             .map_err(start("recorder"))?;
         // The actuator thread is this one, so that `actuator` needs no owner of its own; control is told whom to wake.
@@ -160,18 +186,17 @@ pub fn run<R: Guide + Send, S: RunSink>(
             .name("cellpos-control".to_string())
             .spawn_scoped(scope, move || {
                 let conditions = realtime::apply(&threads.control);
-                control(ticker, end, operator, &actuator_thread, conditions)
+                let controlling = Controlling::new(ticker, Clock::Real, end, operator, shared);
+                (control(controlling, &actuator_thread), conditions)
             })
             .map_err(start("control"))?;
         let control_thread = control.thread().clone();
         let camera = thread::Builder::new()
             .name("cellpos-camera".to_string())
-            .spawn_scoped(scope, {
-                let stop = &stop;
-                move || {
-                    realtime::apply(&threads.camera);
-                    see(source, measurements, &control_thread, stop)
-                }
+            .spawn_scoped(scope, move || {
+                realtime::apply(&threads.camera);
+                let seeing = Seeing::new(source, measurements, Clock::Real, period_ns, shared);
+                see(seeing, &control_thread)
             });
         let camera = match camera {
             Ok(camera) => camera,
@@ -184,11 +209,11 @@ pub fn run<R: Guide + Send, S: RunSink>(
             }
         };
         realtime::apply(&threads.actuator);
-        let mut io_error = actuate(actuator, &mut orders, &mut reports).err();
+        let mut io_error = actuate(Acting::new(actuator, orders, reports));
         let control_end = control.join();
-        stop.store(true, Ordering::Release);
+        shared.stop.store(true, Ordering::Release);
         let life = match &control_end {
-            Ok(end) => end.life,
+            Ok((end, _)) => end.life,
             Err(_) => Life::Safe,
         };
         let closed = close_session(actuator, life, thread::sleep);
@@ -204,10 +229,11 @@ pub fn run<R: Guide + Send, S: RunSink>(
         }
         let recorded = recorder.join();
         let control_end = control_end.map_err(|_| RunError::Panicked { thread: "control" })?;
-        recorded.map_err(|_| RunError::Panicked { thread: "recorder" })?;
-        Ok((control_end, io_error))
+        let mut recorded = recorded.map_err(|_| RunError::Panicked { thread: "recorder" })?;
+        recorded.fault = recorded.fault.or(operator.recorder_fault());
+        Ok((control_end, io_error, recorded))
     })
-    .map(|(control_end, io_error)| Finished {
+    .map(|((control_end, conditions), io_error, recorder)| Finished {
         summary: Summary::new(
             control_end.life,
             control_end.safe_reason,
@@ -216,147 +242,49 @@ pub fn run<R: Guide + Send, S: RunSink>(
             &control_end.account,
             &statistics,
             control_end.period_us,
-        ),
-        conditions: control_end.conditions,
+        )
+        .with_unkept(&recorder),
+        recorder,
+        conditions,
         learned: control_end.learned,
         sink,
         io_error,
     })
 }
 
-fn see(
-    source: &mut dyn PositionSource,
-    mut measurements: Producer<Measurement>,
-    control: &Thread,
-    stop: &AtomicBool,
-) -> Result<(), RunError> {
-    const LOOK_UP_NS: i64 = 20_000_000;
-    /// A deadline that is past: only what has arrived already.
-    const NOW_NS: i64 = 0;
-    // Frames that piled up before the run are of no use to it.
-    while source.next(NOW_NS)?.is_some() {}
-    while !stop.load(Ordering::Acquire) && !measurements.is_abandoned() {
-        if let Some(measurement) = source.next(monotonic_ns() + LOOK_UP_NS)? {
-            // A full ring means that control has not run for a second; the gap in the frame ids tells the rest.
-            let _ = measurements.push(measurement);
-            // After a stall frames come in a burst: control is woken for the newest, not for each of the past.
-            while let Some(measurement) = source.next(NOW_NS)? {
-                let _ = measurements.push(measurement);
-            }
+fn see(mut seeing: Seeing, control: &Thread) -> Result<(), RunError> {
+    seeing.clear()?;
+    while !seeing.is_over() {
+        if seeing.round()? {
             control.unpark();
         }
     }
     Ok(())
 }
 
-fn control<R: Guide>(
-    mut ticker: Ticker<R>,
-    end: EndRule,
-    operator: &Operator,
+fn control<R: ReferenceGenerator>(
+    mut controlling: Controlling<R>,
     actuator: &Thread,
-    conditions: Conditions,
 ) -> ControlEnd {
-    let period_ns = ticker.core().timing().period_ns();
-    // A frame may be this late before the timer stands in for it.
-    let grace_ns = period_ns * 3 / 10;
-    let mut watch = EndWatch::new(end);
-    let mut last_ns = monotonic_ns();
-    let mut last_tick_ns = last_ns;
-    let end = loop {
-        let due_ns = last_ns + period_ns + grace_ns;
-        let timer = loop {
-            if ticker.has_measurement() {
-                break false;
+    loop {
+        match controlling.round() {
+            Next::Wait(until_ns) => {
+                let wait_ns = until_ns.saturating_sub(monotonic_ns());
+                thread::park_timeout(Duration::from_nanos(wait_ns.max(0).unsigned_abs()));
             }
-            let now_ns = monotonic_ns();
-            if now_ns >= due_ns {
-                break true;
+            Next::Ticked => actuator.unpark(),
+            Next::Over(end) => {
+                let ended = controlling.finish(end);
+                actuator.unpark();
+                return ended;
             }
-            thread::park_timeout(Duration::from_nanos((due_ns - now_ns) as u64));
-        };
-        // However the frames come, two ticks are never closer than half a period.
-        sleep_until_ns(last_tick_ns + period_ns / 2);
-        last_tick_ns = monotonic_ns();
-        // After a timer tick the next one is due a period later; after a stall the past is not made up for.
-        let now_ns = monotonic_ns();
-        last_ns = if timer && now_ns - due_ns < period_ns {
-            due_ns - grace_ns
-        } else {
-            now_ns
-        };
-        let request = operator.take();
-        let life = ticker.tick(due_ns, request);
-        actuator.unpark();
-        if let Some(end) = watch.after_tick(life, request, ticker.core().guide().finished()) {
-            break end;
         }
-    };
-    ControlEnd {
-        end,
-        conditions,
-        life: ticker.core().life(),
-        safe_reason: ticker.core().safe_reason(),
-        counts: *ticker.core().counts(),
-        learned: ticker.core().learners().tables(),
-        account: ticker.account().clone(),
-        period_us: ticker.core().timing().period_us,
     }
-    // Dropping the ticker closes the rings: the recorder drains them and ends, the actuator thread leaves its loop.
 }
 
-fn actuate(
-    actuator: &mut dyn Actuator,
-    orders: &mut Consumer<Order>,
-    reports: &mut Producer<BoardReport>,
-) -> Result<(), RunError> {
-    loop {
-        let control_is_gone = orders.is_abandoned();
-        if let Err(error) = serve_actuator(actuator, orders, reports) {
-            // Control hears nothing more of the board and latches Safe; wait for it to end, without eating a CPU.
-            while !orders.is_abandoned() {
-                while orders.pop().is_ok() {}
-                thread::park_timeout(Duration::from_millis(10));
-            }
-            return Err(error.into());
-        }
-        if control_is_gone {
-            return Ok(());
-        }
+fn actuate(mut acting: Acting) -> Option<RunError> {
+    while !acting.round() {
         thread::park_timeout(Duration::from_millis(1));
     }
-}
-
-fn record(
-    mut records: Consumer<TickRecord>,
-    mut events: Consumer<Event>,
-    mut learned: Consumer<(u16, LearnerState)>,
-    sink: &mut impl RunSink,
-    statistics: &mut Statistics,
-) {
-    const LOOK_EVERY: Duration = Duration::from_millis(5);
-    const PROGRESS_EVERY: u32 = 20;
-    let mut round = 0_u32;
-    loop {
-        // Asked first: whatever was pushed before the ring was closed is still drained below.
-        let over = records.is_abandoned() && events.is_abandoned();
-        while let Ok(record) = records.pop() {
-            statistics.add(&record);
-            sink.tick(&record);
-        }
-        while let Ok(event) = events.pop() {
-            sink.event(&event);
-        }
-        while let Ok((motion, state)) = learned.pop() {
-            sink.learned(motion, &state);
-        }
-        if over {
-            sink.progress(statistics);
-            return;
-        }
-        if round.is_multiple_of(PROGRESS_EVERY) {
-            sink.progress(statistics);
-        }
-        round = round.wrapping_add(1);
-        thread::sleep(LOOK_EVERY);
-    }
+    acting.finish()
 }

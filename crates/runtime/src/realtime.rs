@@ -97,6 +97,8 @@ fn first_line(path: &str) -> Option<String> {
 /// Applies a request to the calling thread and says what was obtained.
 pub fn apply(request: &Request) -> Conditions {
     let mut degraded = Vec::new();
+    // Counted before this thread is pinned to one of them.
+    let cpus = allowed_cpus().len().max(1);
     if let Some(priority) = request.fifo_priority {
         let fifo = ThreadSchedulePolicy::Realtime(RealtimeThreadSchedulePolicy::Fifo);
         let granted = ThreadPriorityValue::try_from(priority)
@@ -150,9 +152,7 @@ pub fn apply(request: &Request) -> Conditions {
             "the CPU frequency governor is `{governor}`: set `performance` (cpupower frequency-set -g performance)"
         ));
     }
-    let cpus = allowed_cpus().len().max(1);
-    let processors = std::thread::available_parallelism().map_or(cpus, usize::from);
-    if pinned.is_none() && processors < 2 {
+    if cpus < 2 {
         degraded.push("one CPU only: camera, control and recording share it".to_string());
     }
     Conditions {
@@ -160,7 +160,7 @@ pub fn apply(request: &Request) -> Conditions {
         priority,
         cpu: pinned,
         memory_locked,
-        cpus: processors.max(cpus),
+        cpus,
         kernel: kernel(),
         governor,
         isolated: first_line("/sys/devices/system/cpu/isolated").unwrap_or_default(),
@@ -262,7 +262,7 @@ pub fn bare_loop(duration: Duration) -> (Latency, u64) {
         let due = start + tick * PERIOD_NS;
         sleep_until_ns(due);
         let late = (monotonic_ns() - due).max(0);
-        latency.record(late as u64);
+        latency.record(late as u64, tick as u64);
         let skipped = late / PERIOD_NS;
         missed += skipped as u64;
         tick += 1 + skipped;

@@ -1,16 +1,17 @@
 //! A recorded run through its loop again.
 //!
-//! A record holds everything that a tick was given, so the tick can be repeated and its command compared to the bit.
-//! Behind a gap (records lost because the recorder ring was full, or a file cut off) the loop's own state is not
-//! known; the rest of such a run is counted as not replayed rather than compared with something else.
+//! A record holds everything that a tick was given, so a run can be repeated from its first tick on and every command
+//! compared to the bit. The loop's own state is not recorded: a gap (records lost because the recorder ring was full, or a
+//! damaged file) is the end of a replay, and [`Outcome::gap`] says where. What stands behind it is counted, not compared.
 
-use crate::core::{Core, TickInput};
-use crate::guide::Guide;
+use crate::board_watch::BoardTrouble;
+use crate::core::{Core, TickInput, TickOutput};
+use crate::frames::FrameTally;
 use crate::life::Request;
+use crate::reference::ReferenceGenerator;
 use crate::tick_record::{TickFlags, TickRecord};
 use cellpos_control::{SolverStatus, SolverTerms};
-use cellpos_link::{BoardState, Fault};
-use cellpos_rig::{BoardReport, Measurement};
+use cellpos_rig::{ActuatorFault, ActuatorReport, ActuatorState, Measurement};
 use cellpos_vision::{Decision, TrackState, Verdict};
 use serde::Serialize;
 
@@ -27,13 +28,26 @@ pub struct Mismatch {
     pub replayed: f64,
 }
 
+/// Records missing between two that are there; a record that does not begin with tick 0 has one before its first.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+pub struct Gap {
+    /// First tick that is missing.
+    pub from_seq: u64,
+    /// Number of the record found in its place.
+    pub found_seq: u64,
+}
+
 /// How a replay went.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Outcome {
     /// Records given.
     pub ticks: u64,
-    /// Records whose command, estimate, neutral and state came out the same to the bit.
+    /// Records that were replayed: those before the first gap.
+    pub replayed: u64,
+    /// Records whose command, estimate, neutral and own columns of the law came out the same to the bit.
     pub identical: u64,
+    /// The gap at which the replay ended.
+    pub gap: Option<Gap>,
     /// The first that did not.
     pub first_mismatch: Option<Mismatch>,
 }
@@ -43,20 +57,20 @@ pub struct Outcome {
 pub struct Replay<R> {
     core: Core<R>,
     previous: Option<TickRecord>,
-    broken: bool,
     outcome: Outcome,
 }
 
-impl<R: Guide> Replay<R> {
+impl<R: ReferenceGenerator> Replay<R> {
     /// A replay through a loop built as the recorded one was.
     pub fn new(core: Core<R>) -> Self {
         Self {
             core,
             previous: None,
-            broken: false,
             outcome: Outcome {
                 ticks: 0,
+                replayed: 0,
                 identical: 0,
+                gap: None,
                 first_mismatch: None,
             },
         }
@@ -71,15 +85,31 @@ impl<R: Guide> Replay<R> {
     pub fn add(&mut self, record: &TickRecord) {
         self.outcome.ticks += 1;
         let expected = self.previous.map_or(0, |previous| previous.seq + 1);
-        if record.seq != expected {
-            self.broken = true;
+        if self.outcome.gap.is_none() && record.seq != expected {
+            self.outcome.gap = Some(Gap {
+                from_seq: expected,
+                found_seq: record.seq,
+            });
         }
-        if self.broken {
+        if self.outcome.gap.is_some() {
             return;
         }
+        self.outcome.replayed += 1;
         let output = self.core.step(&input(record, self.previous.as_ref()));
         self.previous = Some(*record);
-        let replayed = output.record;
+        let Some(TickOutput {
+            record: replayed, ..
+        }) = output
+        else {
+            // Two ticks in one period of the clock: this loop makes one.
+            self.outcome.first_mismatch.get_or_insert(Mismatch {
+                seq: record.seq,
+                column: "time_ns",
+                recorded: record.time_ns as f64,
+                replayed: f64::NAN,
+            });
+            return;
+        };
         let columns = [
             ("command_um", record.command_um, replayed.command_um),
             ("requested_um", record.requested_um, replayed.requested_um),
@@ -90,14 +120,17 @@ impl<R: Guide> Replay<R> {
             ("stage", f64::from(record.stage), f64::from(replayed.stage)),
             ("life", f64::from(record.life), f64::from(replayed.life)),
         ];
-        let states = record
-            .controller_state
-            .iter()
-            .zip(&replayed.controller_state);
+        let names = self.core.controller().columns();
+        let own = names.iter().zip(record.law.iter().zip(&replayed.law));
         let differing = columns
             .into_iter()
-            .chain(states.map(|(a, b)| ("controller_state", *a, *b)))
-            .find(|(_, a, b)| a.to_bits() != b.to_bits());
+            .find(|(_, a, b)| a.to_bits() != b.to_bits())
+            .or_else(|| {
+                // A record that was written without these columns has nothing to compare.
+                own.map(|(name, (a, b))| (*name, *a, *b))
+                    .find(|(_, a, b)| !a.is_nan() && a.to_bits() != b.to_bits())
+                    .map(|(name, a, b)| (name, f64::from(a), f64::from(b)))
+            });
         match differing {
             None => self.outcome.identical += 1,
             Some((column, recorded, replayed)) => {
@@ -135,54 +168,58 @@ fn input(record: &TickRecord, previous: Option<&TickRecord>) -> TickInput {
         snr: f64::NAN,
         length_um: record.length_um,
         area_um2: record.area_um2,
+        length_sd_um: record.length_sd_um,
+        area_sd_um2: record.area_sd_um2,
         true_um: record.true_um,
         true_pzt_um: f64::NAN,
     });
     let board = record
         .flags
         .has(TickFlags::BOARD_HEARD)
-        .then_some(BoardReport {
-            state: board_state(record.board),
-            fault: board_fault(record.board_fault),
+        .then_some(ActuatorReport {
+            state: ActuatorState::from_number(record.board),
+            fault: ActuatorFault::from_number(record.board_fault),
             applied_um: record.applied_um,
+            session: 0,
             last_seq: None,
             last_time_us: 0,
+            device_time_us: 0,
             bad_frames: 0,
+            ignored: 0,
+            holds: 0,
             read_ns: record.time_ns,
         });
     TickInput {
         time_ns: record.time_ns,
         measurement,
-        drained: u32::from(record.drained),
+        frames: frames(record),
         previous_late_ns: previous
             .filter(|p| p.flags.has(TickFlags::LATE))
             .map(|p| p.compute_ns),
+        slow_vision_ns: None,
+        board_trouble: record
+            .flags
+            .has(TickFlags::BOARD_TROUBLE)
+            .then_some(BoardTrouble::Foreign),
         previous_refused: previous.is_some_and(|p| p.flags.has(TickFlags::ACTUATOR_RING_FULL)),
         board,
         request: Request::from_number(record.request),
-        solver: SolverTerms::Recorded(SolverStatus::from_number(record.solver_status)),
+        // A reference that can be steered was told just this; the others do not listen.
+        target_um: Some(record.target_um).filter(|um| um.is_finite()),
+        solver: SolverTerms::Recorded(
+            SolverStatus::from_number(record.solver_status),
+            record.solver_iterations,
+        ),
     }
 }
-
-fn board_state(number: u8) -> BoardState {
-    [
-        BoardState::Disarmed,
-        BoardState::Armed,
-        BoardState::Running,
-        BoardState::Frozen,
-    ]
-    .into_iter()
-    .find(|state| *state as u8 == number)
-    .unwrap_or(BoardState::Safe)
-}
-
-fn board_fault(number: u8) -> Fault {
-    [
-        Fault::CommandTimeout,
-        Fault::FreezeTimeout,
-        Fault::ArmTimeout,
-    ]
-    .into_iter()
-    .find(|fault| *fault as u8 == number)
-    .unwrap_or(Fault::None)
+/// What is known of the frames of a record: whether there were some of a kind, which is all that the loop acts on.
+fn frames(record: &TickRecord) -> FrameTally {
+    let has = |mask| u32::from(record.flags.has(mask));
+    FrameTally {
+        arrived: u32::from(record.drained),
+        missed: has(TickFlags::DROPPED_FRAME),
+        // Of frames that were not new the loop acts on [`TickFlags::STALE`] alone.
+        stale: has(TickFlags::STALE),
+        ..FrameTally::default()
+    }
 }

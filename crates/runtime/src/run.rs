@@ -3,25 +3,41 @@
 use crate::core::{Action, CoreError};
 use crate::life::{Event, Life, Request};
 use crate::realtime::Conditions;
+use crate::recorder::RecorderReport;
 use crate::summary::{End, Statistics, Summary};
 use crate::tick_record::TickRecord;
 use crate::ticker::Order;
 use cellpos_control::{LearnedTable, LearnerState};
-use cellpos_rig::{Actuator, ActuatorError, BoardReport, CameraError};
+use cellpos_rig::{Actuator, ActuatorError, ActuatorReport, CameraError};
 use rtrb::{Consumer, Producer};
 use std::time::Duration;
 
 /// Where records and events go. Called on the recorder thread; may block, allocate and fail in its own way: a sink that
-/// cannot write counts what it loses, reports it in the end, and never stops a run.
+/// cannot write counts what it loses and says so ([`RunSink::is_refused`]), and the run is frozen and parked. A sink never
+/// waits for a terminal.
 pub trait RunSink: Send {
     /// One tick.
     fn tick(&mut self, record: &TickRecord);
     /// One event.
     fn event(&mut self, event: &Event);
-    /// Whether it takes a record now. Asked on the virtual clock only, where a sink that waits for its disk cannot block;
-    /// records left in the ring until it is full are lost.
+    /// Events of one kind that came too often to be told one by one: the last of them, and how many there were.
+    fn repeated(&mut self, last: &Event, count: u64) {
+        let _ = count;
+        self.event(last);
+    }
+    /// What the operator wrote into the run while it went on.
+    fn note(&mut self, time_ns: i64, text: &str) {
+        let _ = (time_ns, text);
+    }
+    /// Whether it takes a record now: an emulated disk that hangs does not. Records left in the ring until it is full are
+    /// lost.
     fn is_ready(&self) -> bool {
         true
+    }
+    /// Whether what it was given last could not be kept: a full disk, a folder that is gone. Asked some hundred times a
+    /// second.
+    fn is_refused(&self) -> bool {
+        false
     }
     /// What is being learned over the cycles of a periodic motion, as it stands: about four times a second while learning.
     fn learned(&mut self, motion: u16, state: &LearnerState) {
@@ -70,14 +86,14 @@ pub enum RunError {
     },
 }
 
-/// When a run ends.
+/// When a run ends, in periods of the loop by the clock.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct EndRule {
-    /// Ticks of the run; `None`: until the operator or a fault ends it.
+    /// Periods of the run; `None`: until the operator or a fault ends it.
     pub ticks: Option<u64>,
-    /// Ticks frozen by the operator before the run ends.
+    /// Periods frozen by the operator before the run ends.
     pub freeze_ticks: u64,
-    /// Ticks recorded after Safe was latched: long enough to see the board park.
+    /// Periods recorded after Safe was latched: long enough to see the board park.
     pub safe_ticks: u64,
 }
 
@@ -95,7 +111,8 @@ impl Default for EndRule {
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct EndWatch {
     rule: EndRule,
-    ticks: u64,
+    /// Periods that have passed.
+    passed: u64,
     frozen: u64,
     safe: u64,
 }
@@ -104,27 +121,29 @@ impl EndWatch {
     pub(crate) fn new(rule: EndRule) -> Self {
         Self {
             rule,
-            ticks: 0,
+            passed: 0,
             frozen: 0,
             safe: 0,
         }
     }
 
-    /// To be asked once after each tick.
+    /// To be asked once after each tick, with its number on the clock's grid.
     pub(crate) fn after_tick(
         &mut self,
+        index: u64,
         life: Life,
         request: Request,
-        guide_finished: bool,
+        reference_finished: bool,
     ) -> Option<End> {
-        self.ticks += 1;
+        let steps = (index + 1).saturating_sub(self.passed);
+        self.passed = index + 1;
         self.frozen = if request == Request::Freeze {
-            self.frozen + 1
+            self.frozen + steps
         } else {
             0
         };
         if life == Life::Safe {
-            self.safe += 1;
+            self.safe += steps;
             let by_operator = request == Request::Park;
             return (self.safe > self.rule.safe_ticks).then_some(if by_operator {
                 End::Operator
@@ -135,11 +154,11 @@ impl EndWatch {
         if self.frozen > self.rule.freeze_ticks {
             return Some(End::Operator);
         }
-        if guide_finished {
+        if reference_finished {
             return Some(End::Script);
         }
         match self.rule.ticks {
-            Some(ticks) if self.ticks >= ticks => Some(End::Duration),
+            Some(ticks) if self.passed >= ticks => Some(End::Duration),
             _ => None,
         }
     }
@@ -150,7 +169,7 @@ impl EndWatch {
 pub(crate) fn serve_actuator(
     actuator: &mut dyn Actuator,
     orders: &mut Consumer<Order>,
-    reports: &mut Producer<BoardReport>,
+    reports: &mut Producer<ActuatorReport>,
 ) -> Result<(), ActuatorError> {
     let mut newest = None;
     let mut park = false;
@@ -199,8 +218,10 @@ pub struct Finished<S> {
     pub conditions: Conditions,
     /// The sink, with all that it was given.
     pub sink: S,
-    /// What was learned over cycles, for each periodic motion of the guide; `None`: without a learner.
+    /// What was learned over cycles, for each periodic motion of the reference generator; `None`: without a learner.
     pub learned: Vec<Option<LearnedTable>>,
+    /// How the recording went.
+    pub recorder: RecorderReport,
     /// What went wrong on an I/O thread, if anything did; the loop has seen it as silence and acted on it.
     pub io_error: Option<RunError>,
 }

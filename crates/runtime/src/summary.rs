@@ -3,7 +3,8 @@
 use crate::core::Counts;
 use crate::latency::Quantiles;
 use crate::life::{Life, SafeReason};
-use crate::tick_record::TickRecord;
+use crate::recorder::RecorderReport;
+use crate::tick_record::{TickFlags, TickRecord};
 use crate::ticker::Account;
 use serde::Serialize;
 
@@ -43,6 +44,7 @@ pub const SETTLED_AFTER_S: f64 = 2.0;
 pub struct Statistics {
     settled_after_ns: i64,
     running_since_ns: Option<i64>,
+    frozen: bool,
     measured: Moments,
     truth: Moments,
     variance: Moments,
@@ -105,6 +107,7 @@ impl Statistics {
         Self {
             settled_after_ns: (settled_after_s * 1e9) as i64,
             running_since_ns: None,
+            frozen: false,
             measured: Moments::default(),
             truth: Moments::default(),
             variance: Moments::default(),
@@ -118,7 +121,14 @@ impl Statistics {
     pub fn add(&mut self, record: &TickRecord) {
         self.targets.copy_within(0..TARGETS - 1, 1);
         self.targets[0] = (record.time_ns, record.target_um);
-        if record.life == Life::Running as u8 {
+        // A bead that is frozen is not being held on its reference: what it wanders is no error of the loop. The same way
+        // back as after closing the loop when it goes on.
+        if record.flags.has(TickFlags::FREEZE) {
+            self.frozen = true;
+        } else if record.life == Life::Running as u8 {
+            if std::mem::take(&mut self.frozen) && self.running_since_ns.is_some() {
+                self.running_since_ns = Some(record.time_ns);
+            }
             let seen_um = if record.true_um.is_finite() {
                 record.true_um
             } else {
@@ -138,7 +148,9 @@ impl Statistics {
             if let Some(step) = &mut self.step {
                 step.add(seen_um, record.time_ns - since);
             }
-            if record.time_ns - since >= self.settled_after_ns {
+            // A bead that is frozen is not tracked: its distance from the reference is no error.
+            let tracked = !record.flags.has(TickFlags::FREEZE);
+            if tracked && record.time_ns - since >= self.settled_after_ns {
                 self.measured
                     .add(record.measured_um - self.target_at(record.mid_exposure_ns));
                 self.truth.add(record.true_um - record.target_um);
@@ -185,6 +197,32 @@ impl Statistics {
     pub fn rms_measured_nm(&self) -> Option<f64> {
         self.measured.rms_nm()
     }
+
+    /// Positions that the errors are of.
+    pub fn positions(&self) -> u64 {
+        self.measured.n
+    }
+
+    /// Mean of measured position less reference so far, nm.
+    pub fn mean_error_nm(&self) -> Option<f64> {
+        self.measured.mean_nm()
+    }
+
+    /// Largest distance of a measured position from its reference so far, nm.
+    pub fn peak_error_nm(&self) -> Option<f64> {
+        (self.measured.n > 0).then_some(self.measured.peak * 1e3)
+    }
+
+    /// Whether the errors of this tick are among those counted: the loop closed and settled, the bead not frozen.
+    pub fn counts_now(&self) -> bool {
+        let running = self
+            .last
+            .as_ref()
+            .filter(|r| r.life == Life::Running as u8 && !self.frozen);
+        running
+            .zip(self.running_since_ns)
+            .is_some_and(|(r, since)| r.time_ns - since >= self.settled_after_ns)
+    }
 }
 
 /// How a run ended.
@@ -201,7 +239,8 @@ pub enum End {
     Safe,
 }
 
-/// The figures of a run. Errors count from two seconds after the loop was closed; `None` where there is nothing to say.
+/// The figures of a run. Errors count from two seconds after the loop was closed (or went on after a freeze) until the bead is
+/// frozen or the PZT parks; `None` where there is nothing to say.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Summary {
     /// Life-cycle state in which the run ended: `running` unless something went wrong.
@@ -215,7 +254,7 @@ pub struct Summary {
     /// Losses and limits by kind.
     #[serde(flatten)]
     pub counts: Counts,
-    /// Records that found the recorder ring full.
+    /// Records that are not on disk: the recorder's ring was full, the recorder failed, or the disk refused.
     pub records_lost: u64,
     /// Events that found their ring full.
     pub events_lost: u64,
@@ -237,9 +276,21 @@ pub struct Summary {
     pub tick_us: Quantiles,
     /// From the arrival of a position to the start of its tick, us.
     pub wake_us: Quantiles,
+    /// From the middle of the exposure to the hand-over of the command computed from it, us.
+    pub exposure_to_command_us: Quantiles,
+    /// How far the spacing of commands that the board saw is off that at which they were handed over, us.
+    pub board_spacing_us: Quantiles,
 }
 
 impl Summary {
+    /// The same figures with the records counted as lost that the recorder could not hand over.
+    #[must_use]
+    pub fn with_unkept(mut self, recorder: &RecorderReport) -> Self {
+        self.records_lost += recorder.records_unkept;
+        self.events_lost += recorder.events_unkept;
+        self
+    }
+
     /// Joins what the control thread and the records say.
     pub fn new(
         life: Life,
@@ -269,6 +320,8 @@ impl Summary {
                 + 0.5e-3 * period_us,
             tick_us: account.tick.quantiles_us(),
             wake_us: account.wake.quantiles_us(),
+            exposure_to_command_us: account.exposure_to_command.quantiles_us(),
+            board_spacing_us: account.board_spacing.quantiles_us(),
         }
     }
 }

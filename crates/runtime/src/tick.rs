@@ -1,9 +1,11 @@
 //! What a tick is given and gives, and its account.
 
+use crate::board_watch::BoardTrouble;
+use crate::frames::FrameTally;
 use crate::life::{Event, EventKind, Events, Request};
 use crate::tick_record::{TickFlags, TickRecord};
 use cellpos_control::SolverTerms;
-use cellpos_rig::{BoardReport, Measurement};
+use cellpos_rig::{ActuatorReport, Measurement};
 use serde::Serialize;
 
 /// What a tick is given by its driver.
@@ -11,18 +13,24 @@ use serde::Serialize;
 pub struct TickInput {
     /// Start of the tick since the start of the run, ns.
     pub time_ns: i64,
-    /// The newest measurement in the ring; `None` on a timer tick. Its times, too, count from the start of the run.
+    /// The newest new measurement; `None` on a timer tick. Its times, too, count from the start of the run.
     pub measurement: Option<Measurement>,
-    /// Measurements found in the ring.
-    pub drained: u32,
+    /// All frames that came since the previous tick.
+    pub frames: FrameTally,
     /// How long the previous tick took, ns, if it was late.
     pub previous_late_ns: Option<u32>,
     /// The previous tick's command found the actuator ring full.
     pub previous_refused: bool,
     /// The newest report of the board, if one came since the previous tick.
-    pub board: Option<BoardReport>,
+    pub board: Option<ActuatorReport>,
+    /// What is wrong with a board that talks, if anything is.
+    pub board_trouble: Option<BoardTrouble>,
     /// What the operator asks for.
     pub request: Request,
+    /// Where the operator wants the bead, um, for a reference that can be steered; a number, or `None`.
+    pub target_um: Option<f64>,
+    /// How long vision takes for a frame, ns, while it is slower than the camera.
+    pub slow_vision_ns: Option<u32>,
     /// How long an optimising controller may take, or how it ended when this tick was recorded.
     pub solver: SolverTerms,
 }
@@ -59,15 +67,25 @@ pub struct TickOutput {
 pub struct Counts {
     /// Ticks.
     pub ticks: u64,
-    /// Ticks started by the timer: no frame came.
+    /// Ticks started by the timer: no new frame came.
     pub timer: u64,
     /// Commands handed over late.
     pub late: u64,
     /// Ticks that never came.
     pub skipped: u64,
-    /// Frames that were repeated, out of order, or older than allowed.
+    /// Frames that were repeated, out of order, older than allowed, or stamped with a time that had not come.
     pub stale: u64,
-    /// Frame ids missing.
+    /// Of these: frames that came twice.
+    pub doubled: u64,
+    /// Of these: frames that came after their successor.
+    pub reordered: u64,
+    /// Of these: frames stamped with a time that had not come.
+    pub future: u64,
+    /// Frames that came earlier than expected by more than half a tick.
+    pub early: u64,
+    /// Times that the camera began to count its frames anew.
+    pub camera_restarts: u64,
+    /// Frames that never came, each counted once.
     pub frames_lost: u64,
     /// Frames that arrived behind a newer one and were not used.
     pub superseded: u64,
@@ -87,7 +105,9 @@ pub struct Counts {
     pub slew_limited: u64,
     /// Commands that found the actuator ring full.
     pub refused: u64,
-    /// Ticks in which the optimiser ran out of time or found nothing, and its previous plan went on.
+    /// Ticks in which the optimiser ran out of time, and its best feasible point was followed.
+    pub plans_stopped: u64,
+    /// Ticks in which the optimiser found nothing, and its previous plan went on.
     pub plans_reused: u64,
     /// Ticks in which no plan was left, and PI stood in.
     pub solver_fallbacks: u64,
@@ -97,6 +117,9 @@ pub struct Counts {
 pub(crate) struct Tick {
     pub(crate) seq: u64,
     pub(crate) time_ns: i64,
+    /// Its number on the clock's grid, and how many steps of the grid have passed since the tick before.
+    pub(crate) index: u64,
+    pub(crate) steps: u64,
     pub(crate) flags: TickFlags,
     pub(crate) events: Events,
     /// Whether time did not pass as planned up to this tick: ticks skipped, its frame late, missing or old, a late command.
@@ -115,20 +138,19 @@ impl Tick {
     /// Start and end of a condition as a pair of events.
     pub(crate) fn span(
         &mut self,
-        since: &mut Option<u64>,
+        since_ns: &mut Option<i64>,
         holds: bool,
-        period_us: f64,
         started: EventKind,
         ended: impl Fn(f64) -> EventKind,
     ) {
-        match (*since, holds) {
+        match (*since_ns, holds) {
             (None, true) => {
-                *since = Some(self.seq);
+                *since_ns = Some(self.time_ns);
                 self.event(started);
             }
-            (Some(from), false) => {
-                *since = None;
-                self.event(ended((self.seq - from) as f64 * period_us * 1e-3));
+            (Some(from_ns), false) => {
+                *since_ns = None;
+                self.event(ended((self.time_ns - from_ns) as f64 * 1e-6));
             }
             _ => {}
         }

@@ -1,18 +1,17 @@
 //! The plain record that each tick of the loop hands to the recorder ring.
 
-/// Numbers of controller and estimator state kept in each record, so that a replay can resume after a gap.
-pub const CONTROLLER_STATE_LEN: usize = 16;
+use cellpos_control::LAW_COLUMNS;
 
 /// What happened in a tick, as bits.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct TickFlags(pub u32);
 
 impl TickFlags {
-    /// The tick was started by the timer: no frame arrived.
+    /// The tick was started by the timer: no new frame arrived.
     pub const TIMER: u32 = 1 << 0;
     /// The command was handed over later than the tick's budget.
     pub const LATE: u32 = 1 << 1;
-    /// The newest measurement was older than allowed, or repeated a frame already seen.
+    /// Frames came, and none of them was new: repeated, older than allowed, or stamped with a time that had not come.
     pub const STALE: u32 = 1 << 2;
     /// At least one frame id is missing before this one.
     pub const DROPPED_FRAME: u32 = 1 << 3;
@@ -40,6 +39,11 @@ impl TickFlags {
     pub const BOARD_HEARD: u32 = 1 << 14;
     /// The bead does not follow the flow: it sticks to a wall.
     pub const STUCK: u32 = 1 << 15;
+
+    /// The frame came earlier than expected by more than half a tick: the model behind the loop has another delay.
+    pub const EARLY: u32 = 1 << 16;
+    /// The board talks, and does not do what it is told.
+    pub const BOARD_TROUBLE: u32 = 1 << 17;
 
     /// Whether all bits of `mask` are set.
     pub fn has(self, mask: u32) -> bool {
@@ -86,6 +90,10 @@ pub struct TickRecord {
     pub length_um: f64,
     /// Measured projected area of the cell, um^2.
     pub area_um2: f64,
+    /// Standard deviation of `length_um`, um.
+    pub length_sd_um: f64,
+    /// Standard deviation of `area_um2`, um^2.
+    pub area_sd_um2: f64,
     /// Estimated bead position at the tick, um.
     pub estimate_um: f64,
     /// Estimated PZT displacement at which the bead is at rest, um.
@@ -108,7 +116,7 @@ pub struct TickRecord {
     pub board_fault: u8,
     /// What happened.
     pub flags: TickFlags,
-    /// Measurements found in the ring at this tick (one is used, the rest counted).
+    /// Frames that came since the previous tick, at most 255 (one is used, the rest counted).
     pub drained: u8,
     /// From the due time to the start of the tick, ns; 0 on the virtual clock.
     pub wake_ns: u32,
@@ -122,6 +130,50 @@ pub struct TickRecord {
     pub solver_active: u8,
     /// Time it took, ns; 0 on the virtual clock.
     pub solver_ns: u32,
-    /// State of estimator and controller after the tick.
-    pub controller_state: [f64; CONTROLLER_STATE_LEN],
+    /// The control law's own columns after the tick, named by [`cellpos_control::Controller::columns`]; NaN where there is
+    /// none.
+    pub law: [f32; LAW_COLUMNS],
+}
+
+impl TickRecord {
+    /// A record in which nothing is known: what a missing column reads as.
+    pub fn unknown() -> Self {
+        Self {
+            seq: 0,
+            time_ns: 0,
+            frame_id: 0,
+            mid_exposure_ns: 0,
+            measured_um: f64::NAN,
+            variance_um2: f64::NAN,
+            verdict: 255,
+            track: 255,
+            decision: 255,
+            target_um: f64::NAN,
+            estimate_um: f64::NAN,
+            neutral_um: f64::NAN,
+            requested_um: f64::NAN,
+            command_um: f64::NAN,
+            applied_um: f64::NAN,
+            true_um: f64::NAN,
+            life: 0,
+            request: 0,
+            board: 255,
+            board_fault: 0,
+            flags: TickFlags(0),
+            drained: 0,
+            wake_ns: 0,
+            compute_ns: 0,
+            solver_status: 0,
+            solver_iterations: 0,
+            solver_active: 0,
+            solver_ns: 0,
+            plan_ns: -1,
+            stage: 0,
+            length_um: f64::NAN,
+            area_um2: f64::NAN,
+            length_sd_um: f64::NAN,
+            area_sd_um2: f64::NAN,
+            law: [f32::NAN; LAW_COLUMNS],
+        }
+    }
 }

@@ -1,13 +1,15 @@
 //! The tick around the core: rings in, rings out, the deadline account. The same on both clocks.
 
+use crate::board_watch::BoardWatch;
 use crate::core::{Action, Core, TickInput};
-use crate::guide::Guide;
+use crate::frames::FrameWatch;
 use crate::latency::Latency;
 use crate::life::{Event, Life, Request};
+use crate::reference::ReferenceGenerator;
 use crate::tick_record::{TickFlags, TickRecord};
 use cellpos_control::{LearnerState, SolverTerms};
 use cellpos_rig::clock::monotonic_ns;
-use cellpos_rig::{BoardReport, Clock, Measurement};
+use cellpos_rig::{ActuatorReport, Clock, Measurement};
 use rtrb::{Consumer, Producer, RingBuffer};
 use std::time::{Duration, Instant};
 
@@ -31,7 +33,7 @@ pub struct Ends {
     /// For the actuator thread.
     pub orders: Consumer<Order>,
     /// For the actuator thread.
-    pub reports: Producer<BoardReport>,
+    pub reports: Producer<ActuatorReport>,
     /// For the recorder thread.
     pub records: Consumer<TickRecord>,
     /// For the recorder thread.
@@ -70,10 +72,12 @@ impl Default for RingSizes {
 pub struct Account {
     /// From the start of a tick to the hand-over of its command.
     pub tick: Latency,
-    /// From the arrival of a position (or the timer's due time) to the start of its tick.
+    /// From when a tick was due to its start: by the arrival of its position, the clock's grid, or the timer.
     pub wake: Latency,
     /// From the middle of the exposure to the hand-over of the command computed from it.
     pub exposure_to_command: Latency,
+    /// Distance between the spacing of commands as the board saw it and as they were handed over.
+    pub board_spacing: Latency,
     /// Records that found the recorder ring full.
     pub records_lost: u64,
     /// Events that found their ring, or their tick, full.
@@ -89,19 +93,25 @@ pub struct Ticker<R> {
     budget_ns: i64,
     solver_time: Duration,
     measurements: Consumer<Measurement>,
+    frames: FrameWatch,
     orders: Producer<Order>,
-    reports: Consumer<BoardReport>,
+    reports: Consumer<ActuatorReport>,
     records: Producer<TickRecord>,
     events: Producer<Event>,
     learned: Producer<(u16, LearnerState)>,
     ticks: u64,
     previous_late_ns: Option<u32>,
+    steered_um: Option<f64>,
     previous_refused: bool,
+    slow_vision_ns: Option<u32>,
+    board_watch: BoardWatch,
+    /// Sequence number, host's and board's time (us) of the last command that the board has reported.
+    obeyed: Option<(u32, u64, u64)>,
     records_lost_before: bool,
     account: Account,
 }
 
-impl<R: Guide> Ticker<R> {
+impl<R: ReferenceGenerator> Ticker<R> {
     /// Puts rings around a core. `start_ns` is the start of the run on `clock`.
     pub fn new(core: Core<R>, clock: Clock, start_ns: i64, sizes: RingSizes) -> (Self, Ends) {
         let (measurements_in, measurements) = RingBuffer::new(sizes.measurements.max(1));
@@ -113,6 +123,7 @@ impl<R: Guide> Ticker<R> {
         let ticker = Self {
             budget_ns: core.timing().budget_ns(),
             solver_time: Duration::from_secs_f64(core.timing().solver_us * 1e-6),
+            frames: FrameWatch::new(core.timing().period_ns(), core.timing().oldest_ns()),
             core,
             clock,
             start_ns,
@@ -124,12 +135,17 @@ impl<R: Guide> Ticker<R> {
             learned,
             ticks: 0,
             previous_late_ns: None,
+            steered_um: None,
             previous_refused: false,
+            slow_vision_ns: None,
+            board_watch: BoardWatch::new(),
+            obeyed: None,
             records_lost_before: false,
             account: Account {
                 tick: Latency::new(),
                 wake: Latency::new(),
                 exposure_to_command: Latency::new(),
+                board_spacing: Latency::new(),
                 records_lost: 0,
                 events_lost: 0,
             },
@@ -155,9 +171,29 @@ impl<R: Guide> Ticker<R> {
         &self.account
     }
 
-    /// Whether a measurement waits.
-    pub fn has_measurement(&self) -> bool {
-        !self.measurements.is_empty()
+    /// Looks at what has come from the camera; when the newest new frame that may be used was ready, ns, if there is one.
+    pub fn look(&mut self) -> Option<i64> {
+        let now_ns = self.clock.now_ns();
+        // A ring's worth at most: a camera that delivers faster than this looks must not hold it here.
+        for _ in 0..self.measurements.slots() {
+            let Ok(measurement) = self.measurements.pop() else {
+                break;
+            };
+            self.frames.add(&measurement, now_ns);
+        }
+        self.frames.newest(now_ns).map(|newest| newest.ready_ns)
+    }
+
+    /// From when on the next tick may be made, ns on the clock; `None`: at any time.
+    pub fn opens_ns(&self) -> Option<i64> {
+        self.core
+            .opens_ns()
+            .map(|opens_ns| opens_ns.saturating_add(self.start_ns))
+    }
+
+    /// How long vision takes for a frame, ns, while it is slower than the camera: told to the next ticks.
+    pub fn vision_is_slow(&mut self, ns: Option<u32>) {
+        self.slow_vision_ns = ns;
     }
 
     /// Whether the camera's end of the ring is gone.
@@ -165,26 +201,35 @@ impl<R: Guide> Ticker<R> {
         self.measurements.is_abandoned()
     }
 
-    /// One tick. `due_ns`: when a timer tick was due; a frame's tick is due when its position was ready.
+    /// Whether the recorder no longer keeps up: half of its ring is full, or nobody is at its other end.
+    pub fn recorder_is_behind(&self) -> bool {
+        self.records.is_abandoned() || self.records.slots() < self.records.buffer().capacity() / 2
+    }
+
+    /// Says where the operator wants the bead, um, from the next tick on.
+    pub(crate) fn steer(&mut self, target_um: Option<f64>) {
+        self.steered_um = target_um;
+    }
+
+    /// One tick, due at `due_ns`. Before its time has come ([`Ticker::opens_ns`]) nothing is done.
     pub fn tick(&mut self, due_ns: i64, request: Request) -> Life {
         let start_ns = self.clock.now_ns();
         let tick_from = Instant::now();
         let compute_from_ns = monotonic_ns();
-        let mut newest: Option<Measurement> = None;
-        let mut drained = 0;
-        while let Ok(measurement) = self.measurements.pop() {
-            // The newest by id: a camera may deliver a frame after its successor.
-            if newest.is_none_or(|newest| measurement.frame_id > newest.frame_id) {
-                newest = Some(measurement);
-            }
-            drained += 1;
+        if self.opens_ns().is_some_and(|opens_ns| start_ns < opens_ns) {
+            return self.core.life();
         }
+        self.look();
+        let (newest, frames) = self.frames.take(start_ns);
         let mut board = None;
+        let mut board_trouble = None;
         while let Ok(report) = self.reports.pop() {
+            self.spacing(&report);
+            board_trouble = board_trouble.or(self.board_watch.heard(start_ns, &report));
             board = Some(report);
         }
         let since_start = |ns: i64| ns - self.start_ns;
-        let ready_ns = newest.map_or(due_ns, |m| m.ready_ns);
+        let ready_ns = newest.map_or(due_ns, |m| m.ready_ns.max(due_ns));
         let input = TickInput {
             time_ns: since_start(start_ns),
             measurement: newest.map(|m| Measurement {
@@ -192,11 +237,14 @@ impl<R: Guide> Ticker<R> {
                 ready_ns: since_start(m.ready_ns),
                 ..m
             }),
-            drained,
+            frames,
             previous_late_ns: self.previous_late_ns,
             previous_refused: self.previous_refused,
+            slow_vision_ns: self.slow_vision_ns,
             board,
+            board_trouble,
             request,
+            target_um: self.steered_um,
             solver: if self.clock.is_virtual() {
                 // The virtual clock stands still while the solver works.
                 SolverTerms::Unlimited
@@ -204,7 +252,9 @@ impl<R: Guide> Ticker<R> {
                 SolverTerms::Until(tick_from + self.solver_time)
             },
         };
-        let output = self.core.step(&input);
+        let Some(output) = self.core.step(&input) else {
+            return self.core.life();
+        };
         let mut record = output.record;
         self.previous_refused = false;
         if output.action != Action::None {
@@ -215,20 +265,21 @@ impl<R: Guide> Ticker<R> {
             if self.orders.push(order).is_err() {
                 self.previous_refused = true;
                 record.flags.set(TickFlags::ACTUATOR_RING_FULL);
+            } else if let Action::Command { command_um, .. } = output.action {
+                self.board_watch.commanded(start_ns, command_um);
             }
         }
         // Hand-over: from here on the command is on its way.
         let handed_ns = self.clock.now_ns();
         let wake_ns = (start_ns - ready_ns).max(0);
         let compute_ns = handed_ns - start_ns;
-        self.account
-            .tick
-            .record((monotonic_ns() - compute_from_ns).max(0) as u64);
-        self.account.wake.record(wake_ns as u64);
+        let seq = record.seq;
+        let took_ns = (monotonic_ns() - compute_from_ns).max(0) as u64;
+        self.account.tick.record(took_ns, seq);
+        self.account.wake.record(wake_ns as u64, seq);
         if let Some(m) = newest {
-            self.account
-                .exposure_to_command
-                .record((handed_ns - m.mid_exposure_ns).max(0) as u64);
+            let ns = (handed_ns - m.mid_exposure_ns).max(0) as u64;
+            self.account.exposure_to_command.record(ns, seq);
         }
         self.previous_late_ns = None;
         if compute_ns > self.budget_ns {
@@ -251,6 +302,23 @@ impl<R: Guide> Ticker<R> {
             let _ = self.learned.push(learned);
         }
         self.core.life()
+    }
+
+    /// How far the spacing of commands that the board saw is off that at which they were handed over.
+    fn spacing(&mut self, report: &ActuatorReport) {
+        let Some(seq) = report.last_seq else { return };
+        let (host_us, board_us) = (report.last_time_us, report.device_time_us);
+        let before = self.obeyed;
+        if before.is_some_and(|(last, ..)| last == seq) {
+            return;
+        }
+        self.obeyed = Some((seq, host_us, board_us));
+        if let Some((_, host_before, board_before)) = before {
+            let host = host_us.saturating_sub(host_before);
+            let board = board_us.saturating_sub(board_before);
+            let off_ns = host.abs_diff(board).saturating_mul(1000);
+            self.account.board_spacing.record(off_ns, self.ticks);
+        }
     }
 
     fn hand_over_record(&mut self, mut record: TickRecord) {

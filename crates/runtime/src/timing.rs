@@ -12,7 +12,7 @@ pub struct Timing {
     pub period_us: f64,
     /// From the start of a tick to the latest hand-over of its command, us.
     pub budget_us: f64,
-    /// Of the budget, what an optimising controller may use, us; past it the previous plan goes on.
+    /// Of the budget, what an optimising controller may use, us; past it the best feasible point so far is followed.
     pub solver_us: f64,
     /// From the middle of an exposure to the tick that uses it, ms: the camera path.
     pub camera_delay_ms: f64,
@@ -33,7 +33,7 @@ impl Default for Timing {
         Self {
             period_us: 1000.0,
             budget_us: 500.0,
-            solver_us: 250.0,
+            solver_us: 170.0,
             camera_delay_ms: 2.0,
             oldest_ms: 5.0,
             faults_in_a_row: 5,
@@ -53,6 +53,11 @@ impl Timing {
     /// Budget of a tick, ns.
     pub fn budget_ns(&self) -> i64 {
         (self.budget_us * 1e3).round() as i64
+    }
+
+    /// Oldest exposure that may still be controlled on, ns.
+    pub fn oldest_ns(&self) -> i64 {
+        Self::ms_to_ns(self.oldest_ms)
     }
 
     pub(crate) fn ms_to_ns(ms: f64) -> i64 {

@@ -4,12 +4,13 @@
 //! rig fixes every bit of the records; wake-up and compute times in them are zero.
 
 use crate::core::Core;
-use crate::guide::Guide;
 use crate::life::Request;
 use crate::realtime::Conditions;
+use crate::recorder::{Feed, Recorder};
+use crate::reference::ReferenceGenerator;
 use crate::run::{EndRule, EndWatch, Finished, RunError, RunSink, close_session, serve_actuator};
 use crate::summary::{Statistics, Summary};
-use crate::ticker::{RingSizes, Ticker};
+use crate::ticker::{Ends, RingSizes, Ticker};
 use cellpos_rig::{Actuator, Clock, PositionSource};
 
 /// Runs until `end` says so. `request` is asked at each tick with its sequence number.
@@ -20,7 +21,7 @@ use cellpos_rig::{Actuator, Clock, PositionSource};
     clippy::too_many_arguments,
     reason = "each is one part of the rig or one rule of the run"
 )]
-pub fn run<R: Guide, S: RunSink>(
+pub fn run<R: ReferenceGenerator, S: RunSink>(
     core: Core<R>,
     clock: &Clock,
     source: &mut dyn PositionSource,
@@ -33,7 +34,21 @@ pub fn run<R: Guide, S: RunSink>(
     const PROGRESS_TICKS: u64 = 100;
     let period_ns = core.timing().period_ns();
     let start_ns = clock.now_ns();
-    let (mut ticker, mut ends) = Ticker::new(core, clock.clone(), start_ns, RingSizes::default());
+    let (mut ticker, ends) = Ticker::new(core, clock.clone(), start_ns, RingSizes::default());
+    let Ends {
+        mut measurements,
+        mut orders,
+        mut reports,
+        records,
+        events,
+        learned,
+    } = ends;
+    let feed = Feed {
+        records,
+        events,
+        learned,
+    };
+    let mut recorder = Recorder::new(feed, &mut sink, &mut statistics);
     let mut watch = EndWatch::new(end);
     let mut io_error = None;
     let mut tick = 0_u64;
@@ -44,44 +59,33 @@ pub fn run<R: Guide, S: RunSink>(
             match source.next(now_ns) {
                 Ok(Some(measurement)) => {
                     // A refused measurement shows as a gap in the frame ids.
-                    let _ = ends.measurements.push(measurement);
+                    let _ = measurements.push(measurement);
                 }
                 Ok(None) => break,
                 Err(error) => io_error = Some(error.into()),
             }
         }
-        let asked = request(tick);
+        let mut asked = request(tick);
+        if recorder.fault().is_some() && asked != Request::Park {
+            asked = Request::Unrecorded;
+        }
         let life = ticker.tick(now_ns, asked);
-        serve_actuator(actuator, &mut ends.orders, &mut ends.reports)?;
+        serve_actuator(actuator, &mut orders, &mut reports)?;
         // A recorder that waits for its disk leaves records in the ring; a full ring refuses, and the refusal is counted.
-        while sink.is_ready() {
-            let Ok(record) = ends.records.pop() else {
-                break;
-            };
-            statistics.add(&record);
-            sink.tick(&record);
-        }
-        while let Ok(event) = ends.events.pop() {
-            sink.event(&event);
-        }
-        while let Ok((motion, state)) = ends.learned.pop() {
-            sink.learned(motion, &state);
-        }
+        recorder.round(now_ns);
         if tick.is_multiple_of(PROGRESS_TICKS) {
-            sink.progress(&statistics);
+            recorder.progress();
         }
         tick += 1;
-        if let Some(end) = watch.after_tick(life, asked, ticker.core().guide().finished()) {
+        let core = ticker.core();
+        if let Some(end) = watch.after_tick(core.index(), life, asked, core.reference().finished())
+        {
             break end;
         }
     };
     let life = ticker.core().life();
     close_session(actuator, life, |span| clock.sleep(span))?;
-    while let Ok(record) = ends.records.pop() {
-        statistics.add(&record);
-        sink.tick(&record);
-    }
-    sink.progress(&statistics);
+    let recorded = recorder.finish();
     let summary = Summary::new(
         life,
         ticker.core().safe_reason(),
@@ -90,7 +94,8 @@ pub fn run<R: Guide, S: RunSink>(
         ticker.account(),
         &statistics,
         ticker.core().timing().period_us,
-    );
+    )
+    .with_unkept(&recorded);
     let conditions = Conditions {
         policy: "virtual clock".to_string(),
         ..Conditions::default()
@@ -98,6 +103,7 @@ pub fn run<R: Guide, S: RunSink>(
     Ok(Finished {
         summary,
         conditions,
+        recorder: recorded,
         sink,
         learned: ticker.core().learners().tables(),
         io_error,

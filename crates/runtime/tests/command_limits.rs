@@ -1,9 +1,9 @@
-//! Whatever the measurements and the operator do, no command leaves the range or the slew limit.
+//! Whatever the measurements, the operator and the clock do, no command leaves the range or the slew limit by the clock.
 
 mod common;
 
 use cellpos_control::ControllerKind;
-use cellpos_runtime::{Action, Life, Request, TickInput};
+use cellpos_runtime::{Action, FrameTally, Life, Request, TickInput};
 use cellpos_vision::Verdict;
 use common::{START_UM, controller, core, measurement, report};
 use proptest::prelude::*;
@@ -35,7 +35,7 @@ fn tick() -> impl Strategy<Value = Tick> {
         prop_oneof![8 => 1e-6..1e-2_f64, 1 => prop::num::f64::ANY],
         prop_oneof![12 => Just(1_i64), 1 => -3..5_i64],
         prop_oneof![12 => Just(2_000_000_i64), 1 => -10_000_000..20_000_000_i64],
-        prop_oneof![12 => Just(1_000_000_i64), 1 => 0..30_000_000_i64],
+        prop_oneof![12 => Just(1_000_000_i64), 3 => 0..1_000_000_i64, 1 => 0..30_000_000_i64],
         prop_oneof![12 => Just(Verdict::Good), 1 => Just(Verdict::NoSignal)],
         0..4_u32,
         prop_oneof![60 => Just(Request::None), 1 => Just(Request::Freeze)],
@@ -80,7 +80,8 @@ proptest! {
     fn no_command_leaves_range_or_slew(kind in kind(), ticks in prop::collection::vec(tick(), 100..300)) {
         let file = controller(kind);
         let mut core = core(&file, false);
-        let slew_um = file.limits.slew_um_per_s * 1e-3 * (1.0 + 1e-9);
+        let slew_um_per_s = file.limits.slew_um_per_s;
+        let mut last_ns = -1_000_000;
         let (mut time_ns, mut id, mut last_um) = (0_i64, 0_u64, START_UM);
         for (k, tick) in ticks.iter().enumerate() {
             // The loop is closed on good frames first, so that there is something to disturb.
@@ -101,20 +102,26 @@ proptest! {
                 m.verdict = tick.verdict;
             }
             let drained = if calm { 1 } else { tick.drained };
-            let output = core.step(&TickInput {
+            let stepped = core.step(&TickInput {
                 time_ns,
                 measurement: (drained > 0).then_some(m),
-                drained,
+                frames: FrameTally { arrived: drained, ..FrameTally::default() },
+                slow_vision_ns: None,
+board_trouble: None,
                 previous_late_ns: None,
                 previous_refused: false,
                 board: Some(report(k as u64)),
                 request: if calm { Request::None } else { tick.request },
+                target_um: None,
                 solver: Default::default(),
             });
+            let Some(output) = stepped else { continue };
+            let most_um = slew_um_per_s * 1e-9 * (time_ns - last_ns).min(1_000_000) as f64 * (1.0 + 1e-9);
+            last_ns = time_ns;
             if let Action::Command { command_um, neutral_um } = output.action {
                 prop_assert!(command_um.is_finite() && neutral_um.is_finite());
                 prop_assert!((file.limits.low_um..=file.limits.high_um).contains(&command_um), "{command_um}");
-                prop_assert!((command_um - last_um).abs() <= slew_um, "{last_um} -> {command_um}");
+                prop_assert!((command_um - last_um).abs() <= most_um + 1e-9, "{last_um} -> {command_um}");
                 last_um = command_um;
             }
         }

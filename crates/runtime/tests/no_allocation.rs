@@ -7,9 +7,9 @@ use cellpos_control::ControllerKind;
 use cellpos_counting_alloc::{CountingAllocator, allocations, allocations_of};
 use cellpos_rig::Clock;
 use cellpos_runtime::ticker::{RingSizes, Ticker};
-use cellpos_runtime::{Life, Request};
+use cellpos_runtime::{Action, Life, Request};
 use cellpos_vision::Verdict;
-use common::{controller, core, measurement, report};
+use common::{START_UM, controller, core, measurement, report};
 
 #[global_allocator]
 static ALLOCATOR: CountingAllocator = CountingAllocator;
@@ -24,7 +24,7 @@ fn allocations_per_run(kind: ControllerKind) -> (u64, usize) {
         RingSizes::default(),
     );
     let before = allocations();
-    let mut ran = 0;
+    let (mut ran, mut applied_um) = (0, START_UM);
     for k in 0..3000_u64 {
         let due_ns = k as i64 * 1_000_000;
         clock.sleep_until_ns(due_ns);
@@ -46,10 +46,16 @@ fn allocations_per_run(kind: ControllerKind) -> (u64, usize) {
             2500.. => Request::Park,
             _ => Request::None,
         };
-        ends.reports.push(report(k)).unwrap();
+        let mut said = report(k);
+        said.applied_um = applied_um;
+        ends.reports.push(said).unwrap();
         ran += usize::from(ticker.tick(due_ns, request) == Life::Running);
         // The other ends of the rings, which live on threads that may allocate, do not here.
-        while ends.orders.pop().is_ok() {}
+        while let Ok(order) = ends.orders.pop() {
+            if let Action::Command { command_um, .. } = order.action {
+                applied_um = command_um;
+            }
+        }
         while ends.records.pop().is_ok() {}
         while ends.events.pop().is_ok() {}
     }

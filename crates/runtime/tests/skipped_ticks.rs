@@ -3,7 +3,7 @@
 mod common;
 
 use cellpos_control::ControllerKind;
-use cellpos_runtime::{Action, Life, Request, TickInput};
+use cellpos_runtime::{Action, FrameTally, Life, Request, TickInput};
 use common::{controller, core, measurement, report};
 
 /// Commands of the ticks `0..ticks`, less those of `skipped`, with the bead where `position_um` has it.
@@ -16,20 +16,29 @@ fn commands(
     let mut core = core(&controller(kind), false);
     let mut commands = Vec::new();
     for k in (0..ticks).filter(|k| !skipped.contains(k)) {
-        let output = core.step(&TickInput {
+        let arrived = if k == skipped.end {
+            skipped.clone().count() as u32 + 1
+        } else {
+            1
+        };
+        let stepped = core.step(&TickInput {
             time_ns: k as i64 * 1_000_000,
             measurement: Some(measurement(k, position_um(k))),
-            drained: if k == skipped.end {
-                skipped.clone().count() as u32 + 1
-            } else {
-                1
+            frames: FrameTally {
+                arrived,
+                superseded: arrived - 1,
+                ..FrameTally::default()
             },
+            slow_vision_ns: None,
+            board_trouble: None,
             previous_late_ns: None,
             previous_refused: false,
             board: Some(report(k)),
             request: Request::None,
+            target_um: None,
             solver: Default::default(),
         });
+        let output = stepped.expect("each in a period of its own");
         if let (Life::Running, Action::Command { command_um, .. }) = (core.life(), output.action) {
             commands.push((k, command_um));
         }

@@ -1,8 +1,8 @@
-//! A script as the guide of a loop.
+//! A script as the reference generator of a loop.
 
 use crate::cursor::{Cursor, Seen, Status, StopReason};
 use crate::plan::Plan;
-use cellpos_runtime::{Guide, GuideInput, GuideOutput, Stage};
+use cellpos_runtime::{ReferenceGenerator, ReferenceInput, ReferenceOutput, Stage};
 use std::sync::Arc;
 
 /// References kept, to compare a position with the reference of the time at which it was measured.
@@ -94,7 +94,7 @@ impl Follower {
         self.stage
     }
 
-    fn seen(&self, input: &GuideInput) -> Seen {
+    fn seen(&self, input: &ReferenceInput) -> Seen {
         let back = (self.delay_ticks + usize::from(input.age_ticks)).clamp(1, PAST);
         let then_um = self
             .past_um
@@ -109,7 +109,7 @@ impl Follower {
     }
 
     /// One tick of the way to the plan's position; None: it is over.
-    fn approach(&mut self, input: &GuideInput) -> Option<f64> {
+    fn approach(&mut self, input: &ReferenceInput) -> Option<f64> {
         let to_um = self.plan.reference_um(&self.cursor);
         if self.approach == Approach::Due {
             let from_um = input.position_um?;
@@ -148,7 +148,7 @@ impl Follower {
     }
 
     /// Reference and stage of a tick of the closed loop.
-    fn follow(&mut self, input: &GuideInput, preview_um: &mut [f64]) {
+    fn follow(&mut self, input: &ReferenceInput, preview_um: &mut [f64]) {
         if input.skip && !self.stage.is_over() {
             self.cursor.skip(&self.plan);
             self.approach = Approach::Going {
@@ -217,8 +217,8 @@ fn stage(status: Status) -> Stage {
     }
 }
 
-impl Guide for Follower {
-    fn step(&mut self, input: &GuideInput, preview_um: &mut [f64]) -> GuideOutput {
+impl ReferenceGenerator for Follower {
+    fn step(&mut self, input: &ReferenceInput, preview_um: &mut [f64]) -> ReferenceOutput {
         // The plan's time of this tick: the cursor itself is a sample ahead after its step.
         let plan_s = self.cursor.plan_s();
         self.swing = None;
@@ -236,7 +236,7 @@ impl Guide for Follower {
         } else {
             plan_s
         };
-        GuideOutput {
+        ReferenceOutput {
             phase: self.swing.map(|(_, phase)| phase),
             motion: self.swing.map_or(0, |(motion, _)| motion),
             reference_um: self.reference_um,
@@ -268,8 +268,8 @@ mod tests {
         Follower::new(Arc::new(plan), 0.0, 2)
     }
 
-    fn input(position_um: f64) -> GuideInput {
-        GuideInput {
+    fn input(position_um: f64) -> ReferenceInput {
+        ReferenceInput {
             running: true,
             frozen: false,
             skip: false,
@@ -278,13 +278,17 @@ mod tests {
             position_um: Some(position_um),
             age_ticks: 0,
             length_um: None,
+            target_um: None,
         }
     }
 
     /// Runs to the end with a bead that is always where it should be; gives (reference, stage, plan) of each tick.
-    fn walk(follower: &mut Follower, change: impl Fn(usize, &mut GuideInput)) -> Vec<GuideOutput> {
+    fn walk(
+        follower: &mut Follower,
+        change: impl Fn(usize, &mut ReferenceInput),
+    ) -> Vec<ReferenceOutput> {
         let mut preview = [0.0; 40];
-        let mut all: Vec<GuideOutput> = Vec::new();
+        let mut all: Vec<ReferenceOutput> = Vec::new();
         while !follower.finished() {
             let at = all.last().map_or(0.0, |output| output.reference_um);
             let mut told = input(at);
@@ -334,7 +338,8 @@ mod tests {
         let all = walk(&mut follower, |tick, told| {
             told.frozen = (300..450).contains(&tick);
         });
-        let paused: Vec<&GuideOutput> = all.iter().filter(|o| o.stage == Stage::Paused).collect();
+        let paused: Vec<&ReferenceOutput> =
+            all.iter().filter(|o| o.stage == Stage::Paused).collect();
         assert_eq!(paused.len(), 150);
         assert!(paused.iter().all(|o| o.plan_ns == paused[0].plan_ns));
         let running = all.iter().filter(|o| o.stage == Stage::Running).count();
@@ -346,7 +351,7 @@ mod tests {
      {
         let text = "[stop]\nafter = \"2s\"\n[[step]]\ndo = \"hold\"\nduration = \"1s\"\n\
                     [[step]]\ndo = \"hold\"\nduration = \"10s\"\n";
-        let ticks = |follower: &mut Follower, change: &dyn Fn(usize, &mut GuideInput)| {
+        let ticks = |follower: &mut Follower, change: &dyn Fn(usize, &mut ReferenceInput)| {
             let all = walk(follower, change);
             assert!(all.iter().any(|output| output.stage == Stage::StoppedTime));
             let first = all.iter().position(|o| o.stage == Stage::Running).unwrap();
@@ -355,7 +360,7 @@ mod tests {
         };
         let about = |found: usize, expected: usize| found.abs_diff(expected) <= 1;
         assert!(about(ticks(&mut follower(text), &|_, _| {}), 2000));
-        let change = |tick: usize, told: &mut GuideInput| {
+        let change = |tick: usize, told: &mut ReferenceInput| {
             told.frozen = (300..450).contains(&tick);
             told.skip = tick == 600;
         };

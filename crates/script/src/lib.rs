@@ -5,8 +5,19 @@
 //! waits for conditions and ends on stop conditions. [`check()`] compares a plan with a model and limits before
 //! anything moves: peak position, speed and PZT demand, and the largest amplitude that the rig could do.
 //!
-//! The format is described in `docs/scripts.md`. [`Follower`] makes it the guide of a loop, [`CycleTable`]
+//! The format is described in `docs/scripts.md`. [`Follower`] makes it the reference generator of a loop, [`CycleTable`]
 //! makes a row for each of its cycles from the loop's records. Not here: the loop, devices, files of a run.
+//!
+//! ```
+//! use cellpos_script::{Plan, Script};
+//! let text = "name = \"step\"\nstart = \"0um\"\n\n[[step]]\ndo = \"hold\"\nduration = \"1s\"\n";
+//! let script = Script::parse(text, "step.toml")?;
+//! let plan = Plan::new(&script)?;
+//! assert_eq!(plan.total_s(), 1.0);
+//! let wrong = Script::parse(&text.replace("1s", "1"), "step.toml").unwrap_err().to_string();
+//! assert!(wrong.contains("step.toml:6"), "file and line: {wrong}");
+//! # Ok::<(), cellpos_script::ScriptError>(())
+//! ```
 #![forbid(unsafe_code)]
 
 mod check;
@@ -17,17 +28,22 @@ mod follow;
 mod node;
 mod plan;
 mod read;
+mod sample;
 mod script;
+mod shuffle;
+mod table;
 
 pub use check::{Check, CheckError, CheckLimits, Violation, WaveCheck, check};
 pub use cursor::{Cursor, Output, Seen, Status, StopReason};
 pub use cycles::{
-    Alarm, AmplitudeWatch, CycleColumns, CycleFlags, CycleRow, CycleTable, HeadError, ReadCycles,
-    Trend, read_cycles, trend,
+    Alarm, AmplitudeWatch, CycleColumns, CycleFlags, CycleRow, CycleTable, FatigueStop,
+    FatigueWatch, HeadError, Mean, ReadCycles, Saturating, Trend, read_cycles, trend,
 };
 pub use error::ScriptError;
 pub use follow::Follower;
 pub use plan::{ArmKind, Cycle, Mark, Motion, Periodic, PeriodicReference, Plan, Segment};
+pub use read::MOST_BYTES;
+pub use sample::Sample;
 pub use script::{
     Condition, Load, MoveShape, OnTimeout, Order, Script, Step, StepKind, Stop, WaveShape,
 };

@@ -12,9 +12,21 @@ use toml::de::{DeTable, DeValue};
 pub(crate) struct Source<'a> {
     pub(crate) file: &'a str,
     pub(crate) text: &'a str,
+    /// Where each line begins but the first.
+    pub(crate) lines: &'a [usize],
+}
+
+/// Where each line of a text begins but the first.
+pub(crate) fn line_starts(text: &str) -> Vec<usize> {
+    text.match_indices('\n').map(|(at, _)| at + 1).collect()
 }
 
 impl Source<'_> {
+    /// Line of a place, from 1.
+    pub(crate) fn line(&self, at: usize) -> usize {
+        self.lines.partition_point(|start| *start <= at) + 1
+    }
+
     pub(crate) fn fail(
         &self,
         span: Range<usize>,

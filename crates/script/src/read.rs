@@ -1,15 +1,18 @@
 //! Reading a script file.
 
 use crate::error::ScriptError;
-use crate::node::{Node, Source, cut};
+use crate::node::{Node, Source, cut, line_starts};
 use crate::script::{
-    Condition, Load, MoveShape, OnTimeout, Order, Script, Step, StepKind, Stop, WaveShape,
+    Condition, Load, MoveShape, OnTimeout, Order, Script, Step, StepKind, WaveShape,
 };
-use cellpos_table::{ColumnRef, Table};
+use crate::shuffle::shuffle;
+use cellpos_table::{ColumnRef, Table, read_text};
 use cellpos_units::{Hertz, Micrometers, MicrometersPerSecond, Seconds};
 use std::path::Path;
 use toml::de::DeTable;
 
+/// Largest script or waveform, bytes: a hundred times that of any experiment.
+pub const MOST_BYTES: u64 = 1 << 26;
 /// Most steps that a script may have after its sweeps are written out.
 const MAX_STEPS: usize = 100_000;
 /// Longest duration of one step, s: thirty days.
@@ -24,13 +27,13 @@ impl Script {
     /// [`ScriptError`] with the place; a file that cannot be read is an error at line 1.
     pub fn read(path: &Path) -> Result<Self, ScriptError> {
         let file = path.display().to_string();
-        let text = std::fs::read_to_string(path).map_err(|error| {
+        let text = read_text(path, MOST_BYTES).map_err(|error| {
             let help = Some("give the path of a script file".to_owned());
             ScriptError::new(&file, "", 0..0, format!("cannot be read: {error}"), help)
         })?;
         let folder = path.parent().unwrap_or(Path::new("")).to_owned();
         Self::parse_with(&text, &file, &|name| {
-            std::fs::read_to_string(folder.join(name)).map_err(|error| error.to_string())
+            read_text(&folder.join(name), MOST_BYTES).map_err(|error| error.to_string())
         })
     }
 
@@ -53,7 +56,12 @@ impl Script {
         file: &str,
         load: &dyn Fn(&str) -> Result<String, String>,
     ) -> Result<Self, ScriptError> {
-        let source = Source { file, text };
+        let lines = line_starts(text);
+        let source = Source {
+            file,
+            text,
+            lines: &lines,
+        };
         let table = DeTable::parse(text)
             .map_err(|error| source.fail(error.span().unwrap_or(0..0), error.message(), None))?;
         let root = Node {
@@ -62,7 +70,9 @@ impl Script {
             span: (0, 0),
             variables: &[],
         };
-        root.only(&["name", "notes", "start", "seed", "learn", "stop", "step"])?;
+        root.only(&[
+            "name", "notes", "sample", "start", "seed", "learn", "stop", "step",
+        ])?;
         let name = root.text("name")?.map_or("script", |text| text.value);
         let fits = |c: char| c.is_ascii_alphanumeric() || c == '-' || c == '_';
         if name.is_empty() || name.len() > 64 || !name.chars().all(fits) {
@@ -90,42 +100,21 @@ impl Script {
             text: text.to_owned(),
             name: name.to_owned(),
             notes: root.text("notes")?.map_or("", |text| text.value).to_owned(),
+            sample: crate::table::sample(&root)?,
             start_um: length(&root, "start", -MAX_UM)?.unwrap_or(0.0),
             learn: root.flag("learn")?.unwrap_or(false),
-            stop: stop(&root)?,
+            stop: crate::table::stop(&root)?,
             steps,
         })
     }
 }
 
-fn length(node: &Node, key: &str, low_um: f64) -> Result<Option<f64>, ScriptError> {
+pub(crate) fn length(node: &Node, key: &str, low_um: f64) -> Result<Option<f64>, ScriptError> {
     node.quantity::<Micrometers>(key, Micrometers::value, (low_um, MAX_UM))
 }
 
-fn time(node: &Node, key: &str) -> Result<Option<f64>, ScriptError> {
+pub(crate) fn time(node: &Node, key: &str) -> Result<Option<f64>, ScriptError> {
     node.quantity::<Seconds>(key, Seconds::value, (1e-3, MAX_S))
-}
-
-fn stop(root: &Node) -> Result<Stop, ScriptError> {
-    let Some(node) = root.table("stop")? else {
-        return Ok(Stop::default());
-    };
-    node.only(&[
-        "lost_longer_than",
-        "error_above",
-        "amplitude_error_above",
-        "length_change_above",
-        "after",
-        "after_cycles",
-    ])?;
-    Ok(Stop {
-        lost_longer_than_s: time(&node, "lost_longer_than")?,
-        error_above_um: length(&node, "error_above", 1e-3)?,
-        amplitude_error_above: node.percent("amplitude_error_above", (0.1, 1000.0))?,
-        length_change_above_um: length(&node, "length_change_above", 1e-3)?,
-        after_s: time(&node, "after")?,
-        after_cycles: node.whole("after_cycles", (1, u64::MAX))?,
-    })
 }
 
 /// What reading a file carries along.
@@ -218,7 +207,7 @@ impl Reader<'_> {
                     steps: self.filled(node, steps)?,
                 }
             }
-            "sweep" => StepKind::Group(self.sweep(node, variables)?),
+            "sweep" => StepKind::Sweep(self.sweep(node, variables)?),
             "wait" => wait(node)?,
             "mark" => StepKind::Mark {
                 text: node
@@ -236,7 +225,7 @@ impl Reader<'_> {
                     .unwrap_or_default(),
             },
         };
-        let line = node.source.fail(node.span(), "", None).line;
+        let line = node.source.line(node.span().start);
         Ok(Step {
             kind,
             label: node.text("label")?.map(|text| text.value.to_owned()),
@@ -260,7 +249,7 @@ impl Reader<'_> {
         &mut self,
         node: &Node,
         variables: &[(String, String)],
-    ) -> Result<Vec<Step>, ScriptError> {
+    ) -> Result<Vec<Vec<Step>>, ScriptError> {
         let name = node.need_text("name", "steps inside write \"$name\" for the value")?;
         let mut values = node.texts("values")?;
         if values.is_empty() {
@@ -288,7 +277,7 @@ impl Reader<'_> {
             let mut inner = variables.to_vec();
             inner.push((name.value.to_owned(), value));
             let steps = self.steps(node, &inner)?;
-            all.extend(self.filled(node, steps)?);
+            all.push(self.filled(node, steps)?);
         }
         Ok(all)
     }
@@ -482,19 +471,4 @@ fn wait(node: &Node) -> Result<StepKind, ScriptError> {
         })?,
         on_timeout: node.word("on_timeout", &timeouts)?.unwrap_or_default(),
     })
-}
-
-/// Fisher and Yates' shuffle with SplitMix64: the same seed gives the same order on every machine.
-fn shuffle(values: &mut [String], seed: u64) {
-    let mut state = seed;
-    let mut next = || {
-        state = state.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let mut z = state;
-        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        z ^ (z >> 31)
-    };
-    for last in (1..values.len()).rev() {
-        values.swap(last, (next() % (last as u64 + 1)) as usize);
-    }
 }

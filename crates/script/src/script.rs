@@ -1,5 +1,6 @@
 //! What a script says. Reading it from a file: `read.rs`.
 
+use crate::sample::Sample;
 use std::ops::Range;
 
 /// How a move gets from one position to the other.
@@ -105,6 +106,13 @@ pub struct Stop {
     pub amplitude_error_above: Option<f64>,
     /// Length of the cell changed by more than this since the first frame, um.
     pub length_change_above_um: Option<f64>,
+    /// Mean stretch of ten cycles below that of the first ten by this share of it. This and the next two are judged on the
+    /// rows of the per-cycle table, see [`crate::FatigueWatch`].
+    pub stretch_down: Option<f64>,
+    /// Mean length of the cell at the start of ten cycles away from that of the first ten by this share of it, up or down.
+    pub rest_length_change: Option<f64>,
+    /// Mean recovery time of ten cycles above this, s.
+    pub recovery_above_s: Option<f64>,
     /// Running time, waits included, s.
     pub after_s: Option<f64>,
     /// Cycles completed.
@@ -171,8 +179,8 @@ pub enum StepKind {
         /// What.
         steps: Vec<Step>,
     },
-    /// Steps one after the other: a sweep written out.
-    Group(Vec<Step>),
+    /// Steps one after the other, a pass for each value: a sweep written out.
+    Sweep(Vec<Vec<Step>>),
     /// Hold until a condition is met.
     Wait {
         /// The condition.
@@ -207,6 +215,8 @@ pub struct Script {
     pub name: String,
     /// Free text, kept with the run.
     pub notes: String,
+    /// What was in the channel; what it leaves out is the rig file's.
+    pub sample: Sample,
     /// Position at which the script starts, um.
     pub start_um: f64,
     /// Whether the feed-forward of its periodic motions is learned over their cycles.

@@ -70,7 +70,7 @@ fn night(cycles: u32) -> (f64, common::Table) {
         assert!(having(mask) > 0, "{}", CycleFlags(mask));
     }
     // A cycle that is not flagged is one that went well.
-    let well = table.rows.iter().filter(|row| !row.flags.is_disturbed());
+    let well = table.rows.iter().filter(|row| !row.flags.is_touched());
     let mut undisturbed = 0;
     for row in well {
         undisturbed += 1;

@@ -407,3 +407,19 @@ proptest! {
         }
     }
 }
+
+#[test]
+fn a_script_of_twenty_thousand_steps_is_read_and_every_step_knows_its_line() {
+    let step = "[[step]]\ndo = \"hold\"\nduration = \"10ms\"\n\n";
+    let text = "name = \"long\"\n".to_owned() + &step.repeat(20_000);
+    let script = Script::parse(&text, "t.toml").unwrap();
+    assert_eq!(script.steps.len(), 20_000);
+    for (k, step) in script.steps.iter().enumerate() {
+        assert_eq!(step.line, 2 + 4 * k);
+    }
+    let wrong = text
+        .replacen("10ms", "10", 20_000)
+        .replacen("\"10\"", "\"10ms\"", 19_999);
+    let error = Script::parse(&wrong, "t.toml").unwrap_err();
+    assert_eq!(error.line, 2 + 4 * 19_999 + 2);
+}

@@ -26,6 +26,9 @@ pub enum Problem {
     /// Not text in UTF-8.
     #[error("is not text (UTF-8); a record is a CSV file with the columns time_s,pzt_um,bead_um")]
     NotText,
+    /// More text than can be taken apart.
+    #[error("is larger than 4 GB; cut it into parts, or give the run's folder")]
+    TooLarge,
     /// No rows at all.
     #[error("has no rows")]
     Empty,

@@ -1,7 +1,7 @@
 //! Whole files written in one step.
 
 use crate::error::{Problem, TableError};
-use std::io::Write;
+use std::io::{self, Read, Write};
 use std::path::Path;
 
 /// Writes a whole file so that no reader, and no crash, ever sees a part of it: into a temporary file beside it, synced
@@ -21,7 +21,13 @@ pub fn write_atomically(path: &Path, bytes: &[u8]) -> Result<(), TableError> {
         name.push(path.file_name().unwrap_or_default());
         name.push(format!(".{}.part", std::process::id()));
         let part = path.with_file_name(name);
-        let written = std::fs::File::create(&part).and_then(|mut file| {
+        // A new file: a symbolic link of this name would lead elsewhere. One left by a process of this number that died goes.
+        let _ = std::fs::remove_file(&part);
+        let created = std::fs::OpenOptions::new()
+            .write(true)
+            .create_new(true)
+            .open(&part);
+        let written = created.and_then(|mut file| {
             file.write_all(bytes)?;
             file.sync_data()
         });
@@ -36,4 +42,69 @@ pub fn write_atomically(path: &Path, bytes: &[u8]) -> Result<(), TableError> {
         line: None,
         problem: Problem::Write(source),
     })
+}
+
+/// Reads a text file that a person or a program has written, and nothing else: a device that never ends is refused, and so
+/// is more than `most` bytes. A pipe is read up to its end.
+///
+/// # Errors
+/// [`io::Error`] with a sentence for what is no such file; [`io::ErrorKind::NotFound`] and the like as they come.
+pub fn read_text(path: &Path, most: u64) -> io::Result<String> {
+    let file = std::fs::File::open(path)?;
+    let meta = file.metadata()?;
+    if meta.is_dir() {
+        return Err(io::Error::other("is a folder, not a file"));
+    }
+    #[cfg(unix)]
+    {
+        use std::os::unix::fs::FileTypeExt;
+        let kind = meta.file_type();
+        if kind.is_char_device() || kind.is_block_device() {
+            return Err(io::Error::other("is a device, not a file"));
+        }
+    }
+    let mut bytes = Vec::new();
+    file.take(most.saturating_add(1)).read_to_end(&mut bytes)?;
+    if bytes.len() as u64 > most {
+        let text = format!("is larger than {} MB: not a file of this kind", most >> 20);
+        return Err(io::Error::other(text));
+    }
+    String::from_utf8(bytes).map_err(|_| io::Error::other("is not text in UTF-8"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_no_text_file_is_refused_with_a_sentence() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.toml");
+        std::fs::write(&path, "a = 1").unwrap();
+        assert_eq!(read_text(&path, 5).unwrap(), "a = 1");
+        let long = read_text(&path, 4).unwrap_err();
+        assert!(long.to_string().contains("larger"), "{long}");
+        std::fs::write(&path, [0xff, 0xfe]).unwrap();
+        assert!(read_text(&path, 5).is_err());
+        assert!(read_text(folder.path(), 5).is_err());
+        if Path::new("/dev/zero").exists() {
+            let device = read_text("/dev/zero".as_ref(), 5).unwrap_err();
+            assert!(device.to_string().contains("device"), "{device}");
+        }
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn a_symbolic_link_where_a_file_is_written_leads_nowhere() {
+        let folder = tempfile::tempdir().unwrap();
+        let victim = folder.path().join("victim");
+        std::fs::write(&victim, "whole").unwrap();
+        let path = folder.path().join("a.toml");
+        let part = format!(".a.toml.{}.part", std::process::id());
+        std::os::unix::fs::symlink(&victim, folder.path().join(part)).unwrap();
+        std::os::unix::fs::symlink(&victim, &path).unwrap();
+        write_atomically(&path, b"new").unwrap();
+        assert_eq!(std::fs::read_to_string(&victim).unwrap(), "whole");
+        assert_eq!(std::fs::read_to_string(&path).unwrap(), "new");
+    }
 }

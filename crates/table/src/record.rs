@@ -162,23 +162,63 @@ impl Record {
             })
             .collect::<Vec<_>>();
 
+        Ok(Self::laid_out(path, start_s, grid, [pzt_um, bead_um], more))
+    }
+
+    /// A record of rows that a program has read, with the times at which they were taken: as from a table whose missing rows
+    /// are filled ([`Gaps::Hold`]) and whose steps may differ from the usual one by a share `jitter`.
+    ///
+    /// # Errors
+    /// [`TableError`] with the file's name, as for a table.
+    pub fn from_rows(
+        path: &Path,
+        time_s: &[f64],
+        [pzt_um, bead_um]: [Vec<f64>; 2],
+        more: Vec<(String, Vec<f64>)>,
+        jitter: f64,
+    ) -> Result<Self, TableError> {
+        let fail = |problem| TableError {
+            path: path.to_owned(),
+            line: None,
+            problem,
+        };
+        if let Some(value) = pzt_um.iter().find(|value| !value.is_finite()) {
+            return Err(fail(Problem::Cell {
+                column: "pzt_um".to_owned(),
+                text: value.to_string(),
+                help: "a command is a number",
+            }));
+        }
+        let grid = sampling::grid(time_s, jitter, true).map_err(|(_, problem)| fail(problem))?;
+        let start_s = time_s.first().copied().unwrap_or(0.0);
+        Ok(Self::laid_out(path, start_s, grid, [pzt_um, bead_um], more))
+    }
+
+    fn laid_out(
+        path: &Path,
+        start_s: f64,
+        grid: sampling::Grid,
+        [pzt_um, bead_um]: [Vec<f64>; 2],
+        more: Vec<(String, Vec<f64>)>,
+    ) -> Self {
+        let rows = pzt_um.len();
         let total = grid.places.last().map_or(0, |place| place + 1);
         let places = &grid.places;
-        Ok(Self {
+        Self {
             name: path
                 .file_name()
                 .map_or_else(String::new, |name| name.to_string_lossy().into_owned()),
             start_s,
             step_s: grid.step_s,
-            pzt_um: spread(&pzt_um, places, total, true),
-            bead_um: spread(&bead_um, places, total, false),
+            pzt_um: spread(pzt_um, places, total, true),
+            bead_um: spread(bead_um, places, total, false),
             more: more
                 .into_iter()
-                .map(|(name, values)| (name, spread(&values, places, total, false)))
+                .map(|(name, values)| (name, spread(values, places, total, false)))
                 .collect(),
             filled_rows: total - rows,
             jitter_s: grid.jitter_s,
-        })
+        }
     }
 
     /// The record as CSV: `time_s,pzt_um,bead_um` and the further columns. Numbers read back to the same bits.
@@ -216,19 +256,19 @@ impl Record {
 }
 
 /// Puts rows at their places on the grid; rows between take the value before (`hold`) or NaN.
-fn spread(values: &[f64], places: &[usize], total: usize, hold: bool) -> Vec<f64> {
+fn spread(values: Vec<f64>, places: &[usize], total: usize, hold: bool) -> Vec<f64> {
     if values.len() == total {
-        return values.to_vec();
+        return values;
     }
     let mut out = Vec::with_capacity(total);
-    for (value, place) in values.iter().zip(places) {
+    for (value, place) in values.into_iter().zip(places) {
         let fill = if hold {
-            out.last().copied().unwrap_or(*value)
+            out.last().copied().unwrap_or(value)
         } else {
             f64::NAN
         };
         out.resize(*place, fill);
-        out.push(*value);
+        out.push(value);
     }
     out
 }

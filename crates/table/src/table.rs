@@ -11,10 +11,18 @@ pub struct Table<'a> {
     path: PathBuf,
     /// Names of the columns; `1`, `2`, ... without a header.
     pub names: Vec<String>,
-    /// Fields of each row.
-    rows: Vec<Vec<&'a str>>,
+    /// Fields of all rows, one row after the other: places in the text, which take less room than the fields themselves.
+    text: &'a str,
+    fields: Vec<Span>,
     /// Line of each row in the file, counted from 1.
-    lines: Vec<usize>,
+    lines: Vec<u32>,
+}
+
+/// A field's place in the text. A text is at most 4 GB long.
+#[derive(Debug, Clone, Copy)]
+struct Span {
+    start: u32,
+    length: u32,
 }
 
 /// How fields are told apart.
@@ -32,10 +40,10 @@ impl Separator {
             .map_or(Self::White, Self::Char)
     }
 
-    fn split(self, line: &str) -> Vec<&str> {
+    fn split(self, line: &str, mut take: impl FnMut(&str)) {
         match self {
-            Self::White => line.split_whitespace().collect(),
-            Self::Char(separator) => line.split(separator).map(unquote).collect(),
+            Self::White => line.split_whitespace().for_each(&mut take),
+            Self::Char(separator) => line.split(separator).map(unquote).for_each(&mut take),
         }
     }
 }
@@ -59,13 +67,16 @@ impl<'a> Table<'a> {
     /// A first line without any number is the header.
     ///
     /// # Errors
-    /// [`Problem::Empty`], [`Problem::Fields`], [`Problem::DuplicateColumn`].
+    /// [`Problem::Empty`], [`Problem::Fields`], [`Problem::DuplicateColumn`], [`Problem::TooLarge`].
     pub fn parse(path: &Path, text: &'a str) -> Result<Self, TableError> {
         let fail = |line, problem| TableError {
             path: path.to_owned(),
             line,
             problem,
         };
+        if u32::try_from(text.len()).is_err() {
+            return Err(fail(None, Problem::TooLarge));
+        }
         let text = text.strip_prefix('\u{feff}').unwrap_or(text);
         let mut lines = text
             .lines()
@@ -76,10 +87,11 @@ impl<'a> Table<'a> {
             return Err(fail(None, Problem::Empty));
         };
         let separator = Separator::of(first);
-        let fields = separator.split(first);
+        let mut fields = Vec::new();
+        separator.split(first, |field| fields.push(field.to_owned()));
         let is_header = fields.iter().all(|field| number(field).is_none());
         let names: Vec<String> = if is_header {
-            fields.iter().map(|&name| name.to_owned()).collect()
+            fields
         } else {
             (1..=fields.len()).map(|place| place.to_string()).collect()
         };
@@ -94,26 +106,32 @@ impl<'a> Table<'a> {
         let mut table = Self {
             path: path.to_owned(),
             names,
-            rows: Vec::new(),
+            text,
+            fields: Vec::new(),
             lines: Vec::new(),
         };
-        if !is_header {
-            table.rows.push(fields);
-            table.lines.push(first_line);
-        }
-        for (line, text) in lines {
-            let fields = separator.split(text);
-            if fields.len() != table.names.len() {
+        let header = (!is_header).then_some((first_line, first));
+        for (line, row) in header.into_iter().chain(lines) {
+            let before = table.fields.len();
+            separator.split(row, |field| {
+                // A field is a part of the text, whose length fits.
+                let start = field.as_ptr() as usize - text.as_ptr() as usize;
+                table.fields.push(Span {
+                    start: start as u32,
+                    length: field.len() as u32,
+                });
+            });
+            let found = table.fields.len() - before;
+            if found != table.names.len() {
                 let problem = Problem::Fields {
                     expected: table.names.len(),
-                    found: fields.len(),
+                    found,
                 };
                 return Err(fail(Some(line), problem));
             }
-            table.rows.push(fields);
-            table.lines.push(line);
+            table.lines.push(line as u32);
         }
-        if table.rows.is_empty() {
+        if table.lines.is_empty() {
             return Err(fail(None, Problem::Empty));
         }
         Ok(table)
@@ -126,24 +144,30 @@ impl<'a> Table<'a> {
 
     /// Number of rows.
     pub fn len(&self) -> usize {
-        self.rows.len()
+        self.lines.len()
     }
 
     /// Whether there are no rows (never after [`Table::parse`]).
     pub fn is_empty(&self) -> bool {
-        self.rows.is_empty()
+        self.lines.is_empty()
     }
 
     /// Line in the file of a row, counted from 1.
     pub fn line(&self, row: usize) -> Option<usize> {
-        self.lines.get(row).copied()
+        self.lines.get(row).map(|line| *line as usize)
     }
 
     /// The fields of a column, by its place counted from 0.
     pub fn fields(&self, place: usize) -> impl Iterator<Item = &'a str> {
-        self.rows
+        let text = self.text;
+        self.fields
             .iter()
-            .map(move |row| row.get(place).copied().unwrap_or(""))
+            .skip(place)
+            .step_by(self.names.len().max(1))
+            .map(move |span| {
+                let start = span.start as usize;
+                text.get(start..start + span.length as usize).unwrap_or("")
+            })
     }
 
     /// Place of a column, counted from 0, if it exists.

@@ -4,7 +4,7 @@ use crate::profile::{PixelResponse, ProfileSpec, Template};
 use serde::{Deserialize, Serialize};
 
 /// Largest side of the fitted window, px. The buffers are of fixed size.
-pub const MAX_WINDOW_PX: usize = 63;
+pub const MAX_WINDOW_PX: usize = 191;
 
 /// Noise of one pixel, grey levels.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
@@ -80,7 +80,7 @@ impl Default for Learning {
 pub struct LocaliserConfig {
     /// Profile of the bead.
     pub profile: ProfileSpec,
-    /// Side of the square window fitted, px: odd, 7 to 63, wide enough for the whole ring.
+    /// Side of the square window fitted, px: odd, 7 to 191, wide enough for the whole ring.
     pub window_px: usize,
     /// Core brighter or darker than the background.
     #[serde(default)]
@@ -171,6 +171,7 @@ impl LocaliserConfig {
         let reach_px = match profile {
             ProfileSpec::Ring { edge_px } => 1.85 * edge_px,
             ProfileSpec::Gaussian { sigma_px } => 4.0 * sigma_px,
+            ProfileSpec::Table { radius_px, .. } => 1.85 * radius_px,
         };
         let window_px = (2 * reach_px.ceil() as usize + 1).clamp(15, MAX_WINDOW_PX);
         LocaliserConfig {
@@ -196,6 +197,7 @@ impl LocaliserConfig {
         let (key, size_px) = match self.profile {
             ProfileSpec::Ring { edge_px } => ("profile.edge_px", edge_px),
             ProfileSpec::Gaussian { sigma_px } => ("profile.sigma_px", sigma_px),
+            ProfileSpec::Table { radius_px, .. } => ("profile.radius_px", radius_px),
         };
         check(
             (0.5..=1000.0).contains(&size_px),
@@ -208,7 +210,7 @@ impl LocaliserConfig {
             side_ok,
             "window_px",
             self.window_px as f64,
-            "an odd number of pixels from 7 to 63",
+            "an odd number of pixels from 7 to 191",
         )?;
         let wide_enough = self.window_px as f64 >= 2.0 * size_px;
         check(
@@ -349,7 +351,7 @@ mod tests {
             ),
             (
                 LocaliserConfig {
-                    window_px: 65,
+                    window_px: 193,
                     ..good.clone()
                 },
                 "window_px",

@@ -4,7 +4,6 @@
 //! uses buffers made beforehand and allocates nothing. Not for devices or files: frames come in as slices.
 #![forbid(unsafe_code)]
 
-pub mod account;
 pub mod blobs;
 pub mod cells;
 pub mod config;
@@ -15,14 +14,14 @@ mod frame;
 mod learn;
 mod localiser;
 pub mod many;
+mod outline;
 pub mod profile;
 mod seed;
 mod streak;
-mod surface;
+pub mod suggest;
 pub mod symmetry;
 pub mod track;
 
-pub use account::{FrameAccount, FrameCounts, FrameKind, IdKind};
 pub use blobs::{Blob, Blobs};
 pub use cells::{Cell, CellConfig, CellError, CellFinder};
 pub use config::{ConfigError, Learning, LocaliserConfig, Noise, Polarity};
@@ -32,9 +31,10 @@ pub use learn::LearningReport;
 pub use localiser::Localiser;
 pub use many::{LinkConfig, ManyTracker, Sight};
 pub use profile::{
-    GaussianProfile, PixelResponse, ProfileSpec, RadialProfile, RingProfile, Template,
+    GaussianProfile, PixelResponse, ProfileSpec, RadialProfile, RingProfile, TABLE_KNOTS, Template,
 };
 pub use seed::Detector;
+pub use suggest::{NothingToSuggest, Refused, Suggestion};
 pub use symmetry::RadialSymmetry;
 pub use track::{
     CellStep, CellTracker, Commanded, Decision, TrackState, TrackStep, Tracker, TrackerConfig,

@@ -1,7 +1,7 @@
 //! Position of one bead in a frame: seed, template fit, covariance, verdict.
 
-use crate::config::{ConfigError, LocaliserConfig, Noise};
-use crate::crop::Crop;
+use crate::config::{ConfigError, LocaliserConfig, MAX_WINDOW_PX, Noise};
+use crate::crop::{Crop, Row, STRIDE};
 use crate::fit::{self, Pass, Weights};
 use crate::fix::{Fix, Verdict};
 use crate::frame::Frame;
@@ -30,13 +30,18 @@ const SECANT: f64 = 0.1;
 const MAX_OTHERS: usize = 8;
 /// Share of a new frame in the running noise estimate.
 const NOISE_FORGETTING: f64 = 1.0 / 64.0;
+/// Residual ratio from which the variance is judged by the residual: noise alone does not reach it.
+const WIDENED_RATIO: f64 = 1.3;
+/// Share of a new fix in the running widening.
+const WIDENING_FORGETTING: f64 = 1.0 / 16.0;
 /// Variance of rounding to whole grey levels, grey^2: the least that a pixel's noise can be.
 const ROUNDING_VARIANCE: f64 = 1.0 / 12.0;
 
 /// Localises one bead per call. Buffers are made in [`Localiser::new`]; [`Localiser::locate`] allocates nothing.
 ///
 /// The position is the weighted least-squares fit of the template over the whole window in four parameters (x, y,
-/// amplitude, background), which reaches the Cramer-Rao bound; the covariance is that bound.
+/// amplitude, background), which reaches the Cramer-Rao bound; the covariance is that bound, widened by what the template
+/// leaves of the window where that is more than noise.
 #[derive(Debug, Clone)]
 pub struct Localiser {
     config: LocaliserConfig,
@@ -49,6 +54,10 @@ pub struct Localiser {
     /// Way of the bead during the exposure, expected and in use (px).
     streak_px: (f64, f64),
     comb: Comb,
+    /// Running ratio of the position's variance to that from even noise; 0 before the first fix.
+    widening: f64,
+    /// Room for what the template leaves of a window.
+    left: Box<[Row; MAX_WINDOW_PX]>,
     /// Beads taken off the window: x, y, amplitude.
     others: [(f64, f64, f64); MAX_OTHERS],
 }
@@ -81,6 +90,8 @@ impl Localiser {
             learner,
             streak_px: (0.0, 0.0),
             comb: Comb::STILL,
+            widening: 0.0,
+            left: Box::new([[0.0; STRIDE]; MAX_WINDOW_PX]),
             others: [(0.0, 0.0, 0.0); MAX_OTHERS],
         })
     }
@@ -227,12 +238,43 @@ impl Localiser {
         if self.noise_variance.is_none() {
             self.update_noise();
         }
-        let fix = self.judge(frame, fitted, (x_px, y_px));
+        let mut fix = self.judge(frame, fitted, (x_px, y_px));
+        self.widen(&mut fix);
         let whole = side_px == self.config.window_px && self.comb.is_still();
         if fix.verdict == Verdict::Good && whole {
             self.update_noise();
         }
         fix
+    }
+
+    /// Widens a good fix's covariance by what the template leaves of the window.
+    fn widen(&mut self, fix: &mut Fix) {
+        if fix.verdict != Verdict::Good || fix.residual_ratio <= WIDENED_RATIO {
+            return;
+        }
+        let now = fit::widening(
+            &self.crop,
+            &self.template,
+            &self.comb,
+            (fix.x_px, fix.y_px),
+            (
+                fix.amplitude,
+                fix.background - f64::from(self.crop.pedestal),
+            ),
+            self.weight_unit(),
+            self.left.as_mut_slice(),
+        )
+        .unwrap_or(fix.residual_ratio);
+        // One window has few patches: the mean over the last fixes is surer. The first is taken as it is.
+        self.widening = if self.widening > 0.0 {
+            self.widening + WIDENING_FORGETTING * (now - self.widening)
+        } else {
+            now
+        };
+        let widening = self.widening.max(1.0);
+        fix.var_x_px2 *= widening;
+        fix.var_y_px2 *= widening;
+        fix.cov_xy_px2 *= widening;
     }
 
     /// Refines the length of a streak beside the position. By symmetry the two do not depend on each other, so that they

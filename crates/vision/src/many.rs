@@ -47,6 +47,7 @@ pub struct ManyTracker {
     tracks: Vec<Track>,
     next: u32,
     sights: Vec<Sight>,
+    refused: Vec<Fix>,
 }
 
 impl ManyTracker {
@@ -60,6 +61,7 @@ impl ManyTracker {
             tracks: Vec::new(),
             next: 0,
             sights: Vec::new(),
+            refused: Vec::new(),
         }
     }
 
@@ -68,9 +70,20 @@ impl ManyTracker {
         &self.localiser
     }
 
+    /// Beads of the last frame, by number.
+    pub fn sights(&self) -> &[Sight] {
+        &self.sights
+    }
+
+    /// What stood out in the last frame and got no number: fits that are not good, and of no bead known.
+    pub fn refused(&self) -> &[Fix] {
+        &self.refused
+    }
+
     /// Beads of the frame, by number.
     pub fn step(&mut self, frame: &Frame) -> &[Sight] {
         self.sights.clear();
+        self.refused.clear();
         self.detector.detect(frame);
         let mut fixes: Vec<Fix> = Vec::new();
         for blob in self.detector.found().iter().take(self.config.max_beads) {
@@ -79,7 +92,7 @@ impl ManyTracker {
             let doubled = fixes
                 .iter()
                 .any(|f| f64::hypot(f.x_px - fix.x_px, f.y_px - fix.y_px) < apart_px);
-            if fix.verdict != Verdict::NoSignal && !doubled {
+            if !doubled {
                 fixes.push(fix);
             }
         }
@@ -120,7 +133,10 @@ impl ManyTracker {
                     });
                     bead
                 }
-                None => continue,
+                None => {
+                    self.refused.push(fix);
+                    continue;
+                }
             };
             self.sights.push(Sight { bead, fix });
         }

@@ -226,10 +226,26 @@ impl RadialProfile for GaussianProfile {
     }
 }
 
+/// Values of a learnt profile.
+pub const TABLE_KNOTS: usize = 32;
+
 /// Which profile a bead has, as written in a configuration file.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "kind", rename_all = "kebab-case", deny_unknown_fields)]
+#[expect(
+    clippy::large_enum_variant,
+    reason = "read once; a table on the heap would make the settings of a whole rig not Copy"
+)]
 pub enum ProfileSpec {
+    /// Learnt from a recording: a spline through values at equal distances, 1 at the extreme, 0 from the last on.
+    Table {
+        /// Radius of the bead: where the profile is steepest, px.
+        radius_px: f64,
+        /// Distance of the values, px.
+        knot_px: f64,
+        /// Values from the centre outwards.
+        values: [f64; TABLE_KNOTS],
+    },
     /// [`RingProfile`].
     Ring {
         /// Radius at which the profile first crosses the background, px.
@@ -246,6 +262,13 @@ impl ProfileSpec {
     /// The table of this profile; `None` for a size that is not finite and above zero.
     pub fn template(&self, response: PixelResponse) -> Option<Template> {
         match *self {
+            ProfileSpec::Table {
+                radius_px,
+                knot_px,
+                values,
+            } => {
+                SplineProfile::new(&values, knot_px, radius_px).map(|p| Template::new(&p, response))
+            }
             ProfileSpec::Ring { edge_px } => {
                 RingProfile::new(edge_px).map(|p| Template::new(&p, response))
             }

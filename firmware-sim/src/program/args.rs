@@ -1,8 +1,8 @@
 //! Command line of `firmware-sim`, and the configuration it leads to.
 
 use super::ProgramError;
+use cellpos_emulator::BoardConfig;
 use cellpos_emulator::{FaultKind, Faults, WorldConfig};
-use cellpos_firmware_sim::BoardConfig;
 use cellpos_plant::Model;
 use cellpos_units::{Hertz, Micrometers, Seconds};
 use clap::Parser;
@@ -26,6 +26,10 @@ pub struct Args {
     /// Make a symbolic link to the pseudo-terminal here, so that its name is always the same
     #[arg(long, value_name = "PATH")]
     pub pty_link: Option<PathBuf>,
+    /// Provide plant and camera only, around a board that runs elsewhere: the terminal on which it says the codes of its
+    /// converter (three bytes each, see firmware/README.md); the host talks to that board directly
+    #[arg(long, value_name = "TTY", conflicts_with_all = ["pty_link", "link_garbage", "link_loss"])]
+    pub board: Option<PathBuf>,
     /// Unix socket for the camera's frames [default: firmware-sim-PID.sock in the directory for temporary files]
     #[arg(long, value_name = "PATH")]
     pub socket: Option<PathBuf>,

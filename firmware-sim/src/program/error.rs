@@ -1,6 +1,6 @@
 //! What stops the program.
 
-use cellpos_firmware_sim::BoxError;
+use cellpos_emulator::BoxError;
 use std::io;
 use std::path::PathBuf;
 

@@ -1,7 +1,6 @@
 //! The box's own log: what really happened, for proofs that do not rest on what the host says.
 
 use super::ProgramError;
-use cellpos_firmware_sim::RigInABox;
 use std::fs::File;
 use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
@@ -18,7 +17,24 @@ pub struct Log {
     start_ns: i64,
     next_ns: i64,
     flush_ns: i64,
-    last_state: u8,
+    last_state: String,
+}
+
+/// What the log says of one instant.
+#[derive(Debug, Clone, Copy)]
+pub struct Instant<'a> {
+    /// Time, ns.
+    pub now_ns: i64,
+    /// Displacement at the converter, um.
+    pub applied_um: f64,
+    /// True displacement of the PZT, um.
+    pub pzt_um: f64,
+    /// True bead position, um.
+    pub bead_um: f64,
+    /// State of the board, where it is known.
+    pub state: &'a str,
+    /// Its fault, where it is known.
+    pub fault: &'a str,
 }
 
 impl Log {
@@ -38,7 +54,7 @@ impl Log {
             start_ns,
             next_ns: start_ns,
             flush_ns: start_ns + FLUSH_NS,
-            last_state: u8::MAX,
+            last_state: String::new(),
         };
         log.write(format_args!(
             "time_s,monotonic_ns,applied_um,pzt_um,bead_um,state,fault\n"
@@ -60,10 +76,9 @@ impl Log {
     ///
     /// # Errors
     /// What the operating system refuses, a full disk for example.
-    pub fn note(&mut self, rig: &RigInABox) -> Result<(), ProgramError> {
-        let now_ns = rig.now_ns();
-        let state = rig.board().state();
-        let changed = state as u8 != self.last_state;
+    pub fn note(&mut self, instant: &Instant<'_>) -> Result<(), ProgramError> {
+        let now_ns = instant.now_ns;
+        let changed = instant.state != self.last_state;
         if now_ns < self.next_ns && !changed {
             return Ok(());
         }
@@ -71,16 +86,18 @@ impl Log {
         if now_ns >= self.next_ns {
             self.next_ns = (self.next_ns + PERIOD_NS).max(now_ns - PERIOD_NS);
         }
-        self.last_state = state as u8;
+        if changed {
+            self.last_state = instant.state.to_owned();
+        }
         self.write(format_args!(
-            "{:.6},{},{:.6},{:.6},{:.6},{:?},{:?}\n",
+            "{:.6},{},{:.6},{:.6},{:.6},{},{}\n",
             (now_ns - self.start_ns) as f64 * 1e-9,
             now_ns,
-            rig.applied_um(),
-            rig.world().pzt_um(),
-            rig.world().bead_um(),
-            state,
-            rig.board().fault()
+            instant.applied_um,
+            instant.pzt_um,
+            instant.bead_um,
+            instant.state,
+            instant.fault
         ))?;
         if now_ns >= self.flush_ns {
             self.flush_ns = now_ns + FLUSH_NS;

@@ -1,6 +1,7 @@
 //! The program around the box: arguments, pseudo-terminal, socket, log, pacing.
 
 mod args;
+mod around;
 mod error;
 mod frame_server;
 mod line;

@@ -1,16 +1,19 @@
 //! Pacing: the box follows `CLOCK_MONOTONIC`.
 
 use super::args::Args;
+use super::around::Around;
 use super::error::ProgramError;
 use super::frame_server::FrameServer;
 use super::line::Line;
-use super::log::Log;
-use cellpos_firmware_sim::RigInABox;
+use super::log::{Instant, Log};
+use cellpos_emulator::{RigInABox, World};
 use cellpos_link::frames::FrameHeader;
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::io::Errno;
 use rustix::time::{ClockId, clock_gettime};
 use std::io::Write;
+use std::os::fd::BorrowedFd;
+use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use thread_priority::{
@@ -19,13 +22,13 @@ use thread_priority::{
 };
 
 /// Without anything to do the box still wakes up this often: exposures are not announced.
-const LONGEST_SLEEP_NS: i64 = 500_000;
+pub const LONGEST_SLEEP_NS: i64 = 500_000;
 /// How often the line is unlocked and new clients are let in.
-const HOUSEKEEPING_NS: i64 = 20_000_000;
+pub const HOUSEKEEPING_NS: i64 = 20_000_000;
 /// Above the host's threads: a camera and a board do not wait for a busy host either.
 const PRIORITY: u8 = 60;
 
-fn monotonic_ns() -> i64 {
+pub fn monotonic_ns() -> i64 {
     let now = clock_gettime(ClockId::Monotonic);
     now.tv_sec * 1_000_000_000 + now.tv_nsec
 }
@@ -45,8 +48,6 @@ pub fn run(args: &Args) -> Result<(), ProgramError> {
         }
     })?;
     let start_ns = monotonic_ns();
-    let mut rig = RigInABox::new(setup.board, &setup.world, &setup.model, start_ns)?;
-    let line = Line::open(args.pty_link.as_deref())?;
     let socket = args.socket.clone().unwrap_or_else(|| {
         std::env::temp_dir().join(format!("firmware-sim-{}.sock", std::process::id()))
     });
@@ -55,13 +56,33 @@ pub fn run(args: &Args) -> Result<(), ProgramError> {
         Some(path) => Some(Log::create(path, start_ns)?),
         None => None,
     };
-    announce(args, &line, &server)?;
-    if !args.best_effort {
-        ask_for_real_time();
-    }
     let end_ns = args.duration.map_or(i64::MAX, |duration| {
         start_ns.saturating_add((duration.value() * 1e9) as i64)
     });
+    if let Some(path) = &args.board {
+        let mut around = Around::open(path, &setup, start_ns)?;
+        announce(path, None, &server)?;
+        if !args.best_effort {
+            ask_for_real_time();
+        }
+        let frames = around.pace(&mut server, log.as_mut(), end_ns, &stop)?;
+        if let Some(log) = &mut log {
+            log.flush()?;
+        }
+        eprintln!(
+            "firmware-sim: {frames} frames sent ({} skipped for slow readers); {} codes heard, applied {:.3} um",
+            server.skipped,
+            around.heard(),
+            around.applied_um(),
+        );
+        return Ok(());
+    }
+    let mut rig = RigInABox::new(setup.board, &setup.world, &setup.model, start_ns)?;
+    let line = Line::open(args.pty_link.as_deref())?;
+    announce(line.path(), args.pty_link.as_deref(), &server)?;
+    if !args.best_effort {
+        ask_for_real_time();
+    }
     let frames = pace(&mut rig, &line, &mut server, log.as_mut(), end_ns, &stop)?;
     if let Some(log) = &mut log {
         log.flush()?;
@@ -84,11 +105,11 @@ pub fn run(args: &Args) -> Result<(), ProgramError> {
 }
 
 /// Says where the box can be found.
-fn announce(args: &Args, line: &Line, server: &FrameServer) -> Result<(), ProgramError> {
+fn announce(board: &Path, link: Option<&Path>, server: &FrameServer) -> Result<(), ProgramError> {
     let mut out = std::io::stdout().lock();
     let mut say = || -> std::io::Result<()> {
-        writeln!(out, "board  {}", line.path().display())?;
-        if let Some(link) = &args.pty_link {
+        writeln!(out, "board  {}", board.display())?;
+        if let Some(link) = link {
             writeln!(out, "link   {}", link.display())?;
         }
         writeln!(out, "camera {}", server.path().display())?;
@@ -129,10 +150,6 @@ fn pace(
     let mut buffer = [0; 4096];
     let mut pixels = Vec::new();
     let (mut frames, mut watched, mut next_housekeeping_ns) = (0, false, 0);
-    let (width, height) = (
-        rig.world().config().width_px,
-        rig.world().config().height_px,
-    );
     loop {
         let now_ns = monotonic_ns();
         let heard = line.read(&mut buffer)?;
@@ -154,41 +171,58 @@ fn pace(
             watched = server.accept();
         }
         if watched {
-            while let Some(info) = rig.world_mut().take_frame(&mut pixels) {
-                let header = FrameHeader {
-                    frame_id: info.id,
-                    mid_exposure_ns: u64::try_from(info.mid_exposure_ns).unwrap_or(0),
-                    sent_ns: u64::try_from(monotonic_ns()).unwrap_or(0),
-                    exposure_ns: u32::try_from(info.exposure_ns).unwrap_or(u32::MAX),
-                    width,
-                    height,
-                    bits: 8,
-                };
-                server.send(&header, &pixels);
-                frames += 1;
-            }
+            frames += send_frames(rig.world_mut(), server, &mut pixels);
         } else {
             while rig.world_mut().take_position().is_some() {}
         }
         if let Some(log) = log.as_deref_mut() {
-            log.note(rig)?;
+            log.note(&Instant {
+                now_ns: rig.now_ns(),
+                applied_um: rig.applied_um(),
+                pzt_um: rig.world().pzt_um(),
+                bead_um: rig.world().bead_um(),
+                state: &format!("{:?}", rig.board().state()),
+                fault: &format!("{:?}", rig.board().fault()),
+            })?;
         }
         if stop.load(Ordering::Relaxed) || now_ns >= end_ns {
             return Ok(frames);
         }
-        wait(line, rig.next_event_ns().min(now_ns + LONGEST_SLEEP_NS))?;
+        wait(
+            line.readiness(),
+            rig.next_event_ns().min(now_ns + LONGEST_SLEEP_NS),
+        )?;
     }
+}
+
+/// Hands the frames that have been delivered by now to the clients; returns how many.
+pub fn send_frames(world: &mut World, server: &mut FrameServer, pixels: &mut Vec<u8>) -> u64 {
+    let (width, height) = (world.config().width_px, world.config().height_px);
+    let mut frames = 0;
+    while let Some(info) = world.take_frame(pixels) {
+        let header = FrameHeader {
+            frame_id: info.id,
+            mid_exposure_ns: u64::try_from(info.mid_exposure_ns).unwrap_or(0),
+            sent_ns: u64::try_from(monotonic_ns()).unwrap_or(0),
+            exposure_ns: u32::try_from(info.exposure_ns).unwrap_or(u32::MAX),
+            width,
+            height,
+            bits: 8,
+        };
+        server.send(&header, pixels);
+        frames += 1;
+    }
+    frames
 }
 
 /// Sleeps until `deadline_ns` or until the host has written. The time left is taken from the absolute deadline at the last
 /// moment, so that delays do not add up.
-fn wait(line: &Line, deadline_ns: i64) -> Result<(), ProgramError> {
+pub fn wait(readiness: BorrowedFd<'_>, deadline_ns: i64) -> Result<(), ProgramError> {
     let left_ns = (deadline_ns - monotonic_ns()).max(0);
     let timeout = Timespec {
         tv_sec: 0,
         tv_nsec: left_ns.min(LONGEST_SLEEP_NS),
     };
-    let readiness = line.readiness();
     match poll(
         &mut [PollFd::new(&readiness, PollFlags::IN)],
         Some(&timeout),

@@ -1,12 +1,12 @@
 //! Prints how well `reconcile` names effects that a simulator of another make hides: table, confusions, rates.
 //!
-//! `cargo run --release -p cellpos-tests --bin reconcile-table [all|singles|pairs|nulls|outside|levels] [seed] [text]`, the
+//! `cargo run --release -p cellpos-tests --bin reconcile-table [all|singles|pairs|nulls|outside|further|levels] [seed] [text]`, the
 //! last to run only cases whose hidden effects, as printed, contain the text
 
 #![forbid(unsafe_code)]
 
 use cellpos_reconcile::Verdict;
-use cellpos_tests::truth::cases::{Case, nulls, outside, pairs, singles};
+use cellpos_tests::truth::cases::{Case, further, nulls, outside, pairs, singles};
 use cellpos_tests::truth::table::{Row, evaluate};
 use cellpos_tests::truth::threshold::{above_threshold, weak};
 use std::collections::{BTreeMap, BTreeSet};
@@ -25,6 +25,7 @@ fn main() {
         ("pairs", pairs()),
         ("nulls", nulls(40)),
         ("outside", outside()),
+        ("further", further()),
     ] {
         for mut case in group {
             if which == "all" || which == name || (which == "levels" && name == "singles") {
@@ -101,6 +102,10 @@ fn main() {
     println!(
         "nulls with a false name    {:?}",
         rate("null", &|r| !r.named.is_empty())
+    );
+    println!(
+        "further, exact names       {:?}",
+        rate("further", &|r| r.named == r.hidden)
     );
     println!(
         "outside, called unknown    {:?}",

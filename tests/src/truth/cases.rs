@@ -108,26 +108,36 @@ pub fn nulls(count: usize) -> Vec<Case> {
         .collect()
 }
 
-/// Ten effects that are not in the catalogue.
+/// Effects that entered the catalogue later, at one level each.
+pub fn further() -> Vec<Case> {
+    use Hidden::*;
+    cases("further", &[Cube(20.0), Breathing(0.2), Valve(0.1)])
+}
+
+/// Effects that are not in the catalogue, or that it does not look for.
 pub fn outside() -> Vec<Case> {
     use Hidden::*;
-    [
-        Square(60.0),
-        Cube(20.0),
-        Line(37.0, 0.15),
-        Profile(0.3),
-        Spring(0.0005),
-        Echo(0.3, 0.02),
-        Breathing(0.2),
-        Valve(0.1),
-        Distortion(0.003),
-        Jumps(1.5),
-    ]
-    .into_iter()
-    .map(|h| Case {
-        group: "outside",
-        level: "",
-        hidden: vec![h],
-    })
-    .collect()
+    cases(
+        "outside",
+        &[
+            Square(60.0),
+            Line(37.0, 0.15),
+            Profile(0.3),
+            Spring(0.0005),
+            Echo(0.3, 0.02),
+            Distortion(0.003),
+            Jumps(1.5),
+        ],
+    )
+}
+
+fn cases(group: &'static str, hidden: &[Hidden]) -> Vec<Case> {
+    hidden
+        .iter()
+        .map(|h| Case {
+            group,
+            level: "",
+            hidden: vec![*h],
+        })
+        .collect()
 }

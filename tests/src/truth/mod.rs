@@ -141,6 +141,9 @@ impl Hidden {
             Self::Repeats(_) => "frame-repeats",
             Self::PixelLocking(..) => "pixel-locking",
             Self::Hum(..) => "mains-hum",
+            Self::Cube(_) => "stiffening",
+            Self::Breathing(_) => "gain-swing",
+            Self::Valve(_) => "valve-asymmetry",
             _ => "outside",
         }
     }

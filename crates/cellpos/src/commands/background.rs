@@ -2,7 +2,8 @@
 
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
 use crate::rig_file::{CameraConfig, RigFile};
-use cellpos_rig::{Camera, Clock, FrameBuffer, background};
+use cellpos_drivers::background;
+use cellpos_rig::{Camera, Clock, FrameBuffer};
 use serde::Serialize;
 use std::path::PathBuf;
 

@@ -1,8 +1,11 @@
 //! `cellpos bundle`: a run, packed for archiving, with a manifest that any SHA-256 tool checks.
 
+use super::beside;
+use crate::arguments::run_folder;
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
 use cellpos_record::{InputFile, RunReader};
-use std::path::{Path, PathBuf};
+use cellpos_table::read_text;
+use std::path::{Component, Path, PathBuf};
 
 /// Name of the manifest.
 const MANIFEST: &str = "MANIFEST.sha256";
@@ -19,7 +22,7 @@ A bundle is a plain folder: the run with all its sessions, the files that went i
 were, and MANIFEST.sha256, which sha256sum -c reads too. Exit code 1: a bundle is not what its manifest says.")]
 pub struct Args {
     /// The run's folder.
-    #[arg(required_unless_present = "verify", conflicts_with = "verify")]
+    #[arg(required_unless_present = "verify", conflicts_with = "verify", value_parser = run_folder())]
     run: Option<PathBuf>,
     /// The folder to make; left out: the run's with -bundle behind its name.
     #[arg(long)]
@@ -46,8 +49,20 @@ fn io(what: &str, path: &Path) -> impl FnOnce(std::io::Error) -> Failure {
     move |error| Failure::Failed(miette::miette!("{message}: {error}"))
 }
 
+/// How deep folders may lie in a run: a link that leads back up would never end.
+const DEEPEST: usize = 16;
+
+/// What is done about symbolic links.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Links {
+    /// What they lead to is taken.
+    Followed,
+    /// They are refused.
+    Refused,
+}
+
 /// Files below a folder, in order, as paths from it.
-fn files(folder: &Path) -> Result<Vec<PathBuf>, Failure> {
+fn files(folder: &Path, links: Links) -> Result<Vec<PathBuf>, Failure> {
     let mut found = Vec::new();
     let mut open = vec![PathBuf::new()];
     while let Some(below) = open.pop() {
@@ -55,11 +70,31 @@ fn files(folder: &Path) -> Result<Vec<PathBuf>, Failure> {
         for entry in std::fs::read_dir(&here).map_err(io("cannot read", &here))? {
             let entry = entry.map_err(io("cannot read", &here))?;
             let path = below.join(entry.file_name());
-            let kind = entry.file_type().map_err(io("cannot read", &here))?;
-            if kind.is_dir() {
-                open.push(path);
-            } else if kind.is_file() {
+            let full = folder.join(&path);
+            let mut kind = entry.file_type().map_err(io("cannot read", &full))?;
+            if kind.is_symlink() && links == Links::Followed {
+                kind = std::fs::metadata(&full)
+                    .map_err(io("cannot follow the symbolic link", &full))?
+                    .file_type();
+            }
+            let plain = path
+                .to_str()
+                .is_some_and(|name| !name.contains(char::is_control));
+            if !plain {
+                return Err(Failure::bad_input(
+                    format!("{full:?}: a name that a manifest cannot hold"),
+                    "rename the file: letters, digits and the usual signs",
+                ));
+            }
+            if kind.is_file() {
                 found.push(path);
+            } else if kind.is_dir() && path.components().count() <= DEEPEST {
+                open.push(path);
+            } else {
+                return Err(Failure::bad_input(
+                    format!("{}: neither a file nor a folder", full.display()),
+                    "a bundle holds files; move it elsewhere",
+                ));
             }
         }
     }
@@ -67,6 +102,7 @@ fn files(folder: &Path) -> Result<Vec<PathBuf>, Failure> {
     Ok(found)
 }
 
+/// Copies a file into a bundle, block by block.
 fn copy(from: &Path, to: &Path) -> Result<(), Failure> {
     if let Some(folder) = to.parent() {
         std::fs::create_dir_all(folder).map_err(io("cannot create", folder))?;
@@ -78,28 +114,59 @@ fn copy(from: &Path, to: &Path) -> Result<(), Failure> {
 
 fn pack(run: &Path, out: Option<&Path>, json: bool) -> CommandResult {
     let reader = RunReader::open(run).map_err(Failure::input)?;
-    let out = out.map_or_else(
-        || {
-            let mut name = run.file_name().unwrap_or("run".as_ref()).to_owned();
-            name.push("-bundle");
-            run.with_file_name(name)
-        },
-        Path::to_owned,
-    );
+    let out = out.map_or_else(|| beside(run, "-bundle"), Path::to_owned);
     if out.exists() {
         return Err(Failure::bad_input(
             format!("{} is there already", out.display()),
             "a bundle is never overwritten: give another --out",
         ));
     }
-    // Made under another name first: a folder of the wanted name is a whole bundle.
-    let mut part = out.clone().into_os_string();
-    part.push(".part");
-    let part = PathBuf::from(part);
-    if part.exists() {
-        std::fs::remove_dir_all(&part).map_err(io("cannot remove", &part))?;
+    // Made under a name of its own first: a folder of the wanted name is a whole bundle.
+    let mut name = std::ffi::OsString::from(".");
+    name.push(out.file_name().unwrap_or_default());
+    name.push(format!(".{}.part", std::process::id()));
+    let part = out.with_file_name(name);
+    if let Some(folder) = out.parent().filter(|folder| !folder.as_os_str().is_empty()) {
+        std::fs::create_dir_all(folder).map_err(io("cannot create", folder))?;
     }
-    for path in files(run)? {
+    std::fs::create_dir(&part).map_err(io("cannot create", &part))?;
+    let packed = fill(run, &reader, &part).and_then(|packed| {
+        std::fs::rename(&part, &out).map_err(io("cannot make", &out))?;
+        Ok(packed)
+    });
+    let packed = packed.inspect_err(|_| {
+        let _ = std::fs::remove_dir_all(&part);
+    })?;
+    if json {
+        print_json(&serde_json::json!({
+            "bundle": out, "files": packed.files, "bytes": packed.bytes, "inputs_missing": packed.missing,
+        }))?;
+    } else {
+        print_text(&format!(
+            "{}: {} files, {} bytes\n",
+            out.display(),
+            packed.files,
+            packed.bytes
+        ))?;
+        for path in packed.missing {
+            print_text(&format!(
+                "not packed, gone or changed since the run: {path}\n"
+            ))?;
+        }
+    }
+    Ok(Outcome::Done)
+}
+
+/// What a bundle holds.
+struct Packed {
+    files: usize,
+    bytes: u64,
+    /// Inputs that are gone or changed.
+    missing: Vec<String>,
+}
+
+fn fill(run: &Path, reader: &RunReader, part: &Path) -> Result<Packed, Failure> {
+    for path in files(run, Links::Followed)? {
         copy(&run.join(&path), &part.join(&path))?;
     }
     let mut missing = Vec::new();
@@ -118,7 +185,7 @@ fn pack(run: &Path, out: Option<&Path>, json: bool) -> CommandResult {
     }
     let mut manifest = String::new();
     let mut bytes = 0;
-    let packed = files(&part)?;
+    let packed = files(part, Links::Refused)?;
     for path in &packed {
         let file = InputFile::of(&part.join(path)).map_err(Failure::failed)?;
         bytes += file.bytes;
@@ -126,29 +193,23 @@ fn pack(run: &Path, out: Option<&Path>, json: bool) -> CommandResult {
     }
     let path = part.join(MANIFEST);
     std::fs::write(&path, manifest).map_err(io("cannot write", &path))?;
-    std::fs::rename(&part, &out).map_err(io("cannot make", &out))?;
-    if json {
-        print_json(&serde_json::json!({
-            "bundle": out, "files": packed.len(), "bytes": bytes, "inputs_missing": missing,
-        }))?;
-    } else {
-        print_text(&format!(
-            "{}: {} files, {bytes} bytes\n",
-            out.display(),
-            packed.len()
-        ))?;
-        for path in missing {
-            print_text(&format!(
-                "not packed, gone or changed since the run: {path}\n"
-            ))?;
-        }
-    }
-    Ok(Outcome::Done)
+    Ok(Packed {
+        files: packed.len(),
+        bytes,
+        missing,
+    })
+}
+
+/// Whether a name in a manifest stays in the bundle.
+fn stays_inside(name: &Path) -> bool {
+    let mut parts = name.components();
+    parts.clone().next().is_some() && parts.all(|part| matches!(part, Component::Normal(_)))
 }
 
 fn verify(bundle: &Path, json: bool) -> CommandResult {
     let path = bundle.join(MANIFEST);
-    let manifest = std::fs::read_to_string(&path).map_err(|error| {
+    const MOST_MANIFEST: u64 = 1 << 26;
+    let manifest = read_text(&path, MOST_MANIFEST).map_err(|error| {
         Failure::bad_input(
             format!("{}: {error}", path.display()),
             "give the folder of a bundle",
@@ -161,14 +222,31 @@ fn verify(bundle: &Path, json: bool) -> CommandResult {
             wrong.push(format!("manifest: {line}"));
             continue;
         };
-        match InputFile::of(&bundle.join(name)) {
+        let full = bundle.join(name);
+        if !stays_inside(Path::new(name)) {
+            wrong.push(format!("{name}: leads out of the bundle"));
+            continue;
+        }
+        if full.is_symlink() {
+            wrong.push(format!("{name}: a symbolic link, not a file"));
+            listed.push(PathBuf::from(name));
+            continue;
+        }
+        match InputFile::of(&full) {
             Ok(file) if file.sha256 == sha256 => {}
             Ok(_) => wrong.push(format!("{name}: changed")),
             Err(_) => wrong.push(format!("{name}: missing")),
         }
         listed.push(PathBuf::from(name));
     }
-    for path in files(bundle)? {
+    let present = match files(bundle, Links::Refused) {
+        Ok(present) => present,
+        Err(failure) => {
+            wrong.push(failure.text());
+            Vec::new()
+        }
+    };
+    for path in present {
         if path != Path::new(MANIFEST) && !listed.contains(&path) {
             wrong.push(format!("{}: not in the manifest", path.display()));
         }

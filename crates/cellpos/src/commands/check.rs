@@ -1,6 +1,7 @@
 //! `cellpos check`: a setpoint script against a model and the rig's limits, before anything moves.
 
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
+use crate::output;
 use crate::rig_file::RigFile;
 use crate::setup;
 use cellpos_plant::Model;
@@ -49,6 +50,7 @@ pub struct Args {
 
 /// Checks, prints, and gives 1 if the rig cannot do it.
 pub fn run(args: Args) -> CommandResult {
+    output::ready(&args.report)?;
     let script = Script::read(&args.script).map_err(Failure::input)?;
     let model = Model::load(&args.model).map_err(Failure::input)?;
     let limits = limits(&args)?;

@@ -3,6 +3,8 @@
 mod print;
 
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
+use crate::output;
+use crate::setup;
 use cellpos_control::design::{
     DesignLimits, DesignPlant, DesignReport, DesignRequest, DesignWarning, PiSearch, Requested,
     default_lead, design,
@@ -34,16 +36,21 @@ enum Kind {
   cellpos design --model eq6 --delay 2.5ms --kp 0.46 --ki 19.5 --json
   cellpos design --model model.toml --max-ms 1.6 --min-pm 40 --out controller.toml
 
-The loop delay contains half a sample of hold: a 2 ms camera path at 1 kHz is 2.5ms. Without gains the PI controller of
+The loop delay is the camera path (from the middle of an exposure to the tick that uses it) and half a sample of hold: a 2 ms
+camera path at 1 kHz is 2.5ms. A model.toml of cellpos identify carries its camera path, and the sum is done here. Without gains the PI controller of
 largest integral gain (fastest rejection of drift) under --max-ms and --max-mt is searched. Exit code 1 when the loop is
 unstable or a limit is broken, 2 on bad input.")]
 pub struct Args {
     /// Model file, or `eq6` for the built-in nominal plant.
     #[arg(long, default_value = "eq6")]
     model: String,
-    /// Loop delay with half a sample of hold; left out: that of the model's effects (2.5ms where it has none).
-    #[arg(long)]
+    /// Loop delay: camera path (camera_delay_ms of rig.toml) and half a sample of hold; left out: of --rig, else as the model
+    /// was measured with, else 2.5ms.
+    #[arg(long, value_parser = crate::arguments::positive::<Seconds>)]
     delay: Option<Seconds>,
+    /// The rig whose camera_delay_ms and period make the loop delay.
+    #[arg(long, conflicts_with_all = ["delay", "sample"])]
+    rig: Option<PathBuf>,
     /// Sample time.
     #[arg(long, default_value = "1ms")]
     sample: Seconds,
@@ -60,10 +67,10 @@ pub struct Args {
     #[arg(long)]
     setpoint_weight: Option<f64>,
     /// Zero of the lead.
-    #[arg(long, requires = "lead_pole")]
+    #[arg(long, requires = "lead_pole", value_parser = crate::arguments::positive::<Hertz>)]
     lead_zero: Option<Hertz>,
     /// Pole of the lead.
-    #[arg(long, requires = "lead_zero")]
+    #[arg(long, requires = "lead_zero", value_parser = crate::arguments::positive::<Hertz>)]
     lead_pole: Option<Hertz>,
     /// TOML file with limits: max_ms, max_mt, min_pm_deg, min_gm_db, min_delay_margin_ms, max_rms_nm,
     /// max_overshoot_percent, max_settling_ms, stable_over_spread.
@@ -103,17 +110,43 @@ pub struct Args {
 
 /// Designs or checks a controller, prints its figures.
 pub fn run(args: Args) -> CommandResult {
+    output::ready(&args.out)?;
     let model = Model::load(&args.model).map_err(Failure::input)?;
-    let sample_time_s = args.sample.value();
+    let timing = args
+        .rig
+        .as_deref()
+        .map(|path| crate::rig_file::RigFile::load(Some(path)))
+        .transpose()?
+        .map(|file| file.timing);
+    let sample_time_s = timing
+        .as_ref()
+        .map_or(args.sample.value(), |timing| timing.period_us * 1e-6);
     if !(1e-5..=1.0).contains(&sample_time_s) {
         return Err(Failure::bad_input(
             format!("--sample {}: must be 0.01ms to 1s", args.sample),
             "the rig runs at 1ms",
         ));
     }
-    let mut plant = DesignPlant::from_model(&model, args.delay.map(Seconds::value), sample_time_s)
-        .map_err(Failure::input)?;
-    if args.delay.is_none() && plant.delay_s == 0.0 {
+    let of_rig = timing.as_ref().map(setup::loop_delay_s);
+    let given_s = args.delay.map(Seconds::value).or(of_rig);
+    if given_s.is_some_and(|delay_s| delay_s < 0.5 * sample_time_s) {
+        return Err(Failure::bad_input(
+            format!(
+                "--delay {}ms is less than half a sample of hold",
+                given_s.unwrap_or(0.0) * 1e3
+            ),
+            "the loop delay is the camera path and half a sample: 2.5ms for a camera path of 2ms at 1 kHz",
+        ));
+    }
+    let mut plant =
+        DesignPlant::from_model(&model, given_s, sample_time_s).map_err(Failure::input)?;
+    let disagrees = timing
+        .as_ref()
+        .and_then(|timing| setup::model_delay_warning(&model, timing));
+    if let Some(warning) = disagrees {
+        eprintln!("WARNING: {warning}");
+    }
+    if given_s.is_none() && model.camera_delay_s.is_none() && plant.delay_s == 0.0 {
         plant.delay_s = 2e-3;
         plant.warnings.push(DesignWarning::DelayAssumed {
             assumed_ms: plant.loop_delay_s() * 1e3,
@@ -161,7 +194,7 @@ pub fn run(args: Args) -> CommandResult {
     let report = design(&request).map_err(Failure::input)?;
     if let Some(path) = &args.out {
         let file = controller_file(&request, &report);
-        std::fs::write(path, file.to_toml_string()).map_err(Failure::failed)?;
+        output::write(path, &file.to_toml_string())?;
     }
     for warning in &report.warnings {
         eprintln!("WARNING: {warning}");

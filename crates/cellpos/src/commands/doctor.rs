@@ -1,36 +1,228 @@
 //! `cellpos doctor`: is this machine, with these devices, fit for 1 kHz.
 
-use crate::outcome::{CommandResult, Outcome, print_json, print_text};
-use cellpos_runtime::realtime::{self, Request};
+mod findings;
+mod soak;
+
+use crate::arguments::positive;
+use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
+use cellpos_runtime::realtime::{Request, allowed_cpus};
 use cellpos_units::Seconds;
+use findings::{Finding, Machine, Weight};
+use serde::Serialize;
+use soak::Soak;
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 /// Arguments of `cellpos doctor`.
 #[derive(Debug, clap::Args)]
-#[command(after_help = "Example:\n  cellpos doctor --duration 5s")]
+#[command(after_help = "Examples:
+  cellpos doctor
+  cellpos doctor --for 10h --why
+
+Exit code 0: fit; 1: not fit, or measured for too short a time to say so.")]
 pub struct Args {
     /// How long to measure the timer latency.
-    #[arg(long, default_value = "2s")]
+    #[arg(long, visible_alias = "for", default_value = "5s", value_parser = positive::<Seconds>)]
     duration: Seconds,
+    /// Name what ran when a wake-up was late.
+    #[arg(long)]
+    why: bool,
+    /// Length of the run that is planned: is there room for its record?
+    #[arg(long, default_value = "1h", value_parser = positive::<Seconds>)]
+    run: Seconds,
+    /// Where run folders will go.
+    #[arg(long, default_value = "runs")]
+    runs: PathBuf,
     /// Print one JSON object on standard output.
     #[arg(long)]
     json: bool,
 }
 
-/// Asks for everything that the control thread asks for, measures the timer, gives a verdict.
+/// The examination.
+#[derive(Debug, Serialize)]
+struct Report {
+    fit: bool,
+    verdict: String,
+    #[serde(flatten)]
+    soak: Soak,
+    findings: Vec<Finding>,
+    /// How far naming who was late went; none unless asked for.
+    why: Option<String>,
+}
+
+/// Shortest measurement that is called fit, s: a stall that comes once a second must have had its chance.
+const SHORTEST_S: f64 = 2.0;
+
+/// Asks for everything that the control thread asks for, measures the timer, looks at the machine, gives a verdict.
 pub fn run(args: Args) -> CommandResult {
-    let report = realtime::examine(
-        &Request::control_thread(),
-        Duration::from_secs_f64(args.duration.value().clamp(0.1, 3600.0)),
-    );
+    let request = Request::control_thread();
+    let cpus = allowed_cpus().len();
+    let machine = Machine {
+        root: Path::new("/"),
+        cpu: request.cpu.unwrap_or(0),
+        cpus,
+    };
+    let mut findings = machine.findings();
+    findings.extend(machine.serial_ports());
+    findings.extend(findings::disk(&args.runs, args.run.value()));
+    let soak = soak::soak(
+        request,
+        Duration::from_secs_f64(args.duration.value()),
+        args.why,
+    )
+    .map_err(Failure::failed)?;
+    let (fit, verdict) = verdict(&soak, &findings);
+    let report = Report {
+        fit,
+        verdict,
+        soak,
+        findings,
+        why: args.why.then(soak::tracing),
+    };
     if args.json {
         print_json(&report)?;
     } else {
-        print_text(&report.to_string())?;
+        print_text(&text(&report))?;
     }
-    Ok(if report.fit {
-        Outcome::Done
-    } else {
-        Outcome::Broken
-    })
+    Ok(if fit { Outcome::Done } else { Outcome::Broken })
+}
+
+fn verdict(soak: &Soak, findings: &[Finding]) -> (bool, String) {
+    let bad: Vec<&str> = findings
+        .iter()
+        .filter(|finding| finding.weight == Weight::Bad)
+        .map(|finding| finding.what)
+        .collect();
+    let quiet = soak.wake_us.p999 < 200.0 && soak.missed * 1000 <= soak.wakeups;
+    if !quiet {
+        return (
+            false,
+            format!(
+                "not fit for a 1 kHz loop: p99.9 of the wake-up latency is {:.0} us (200 us allowed), {} of {} wake-ups came a \
+                 whole period late",
+                soak.wake_us.p999, soak.missed, soak.wakeups
+            ),
+        );
+    }
+    if soak.seconds < SHORTEST_S {
+        return (
+            false,
+            format!(
+                "timing was good for {:.1} s, which is too short to call it fit: measure for {SHORTEST_S} s or more, and \
+                 overnight before a night's run (--for 10h)",
+                soak.seconds
+            ),
+        );
+    }
+    if !soak.conditions.degraded.is_empty() {
+        return (
+            false,
+            "timing is good now, but not everything asked for was granted: a busy machine will stall the loop".to_string(),
+        );
+    }
+    if !bad.is_empty() {
+        return (
+            false,
+            format!(
+                "timing is good now, but not to be relied on: {}",
+                bad.join(", ")
+            ),
+        );
+    }
+    (
+        true,
+        format!(
+            "fit for a 1 kHz loop, as far as {} can tell",
+            if soak.seconds < 120.0 {
+                format!("{:.0} s", soak.seconds)
+            } else {
+                format!("{:.0} min", soak.seconds / 60.0)
+            }
+        ),
+    )
+}
+
+fn text(report: &Report) -> String {
+    let soak = &report.soak;
+    let q = &soak.wake_us;
+    let mut out = format!("{}\n{}", report.verdict, soak.conditions);
+    out.push_str(&format!(
+        "  wake-up       p50 {:.1} us, p99 {:.1} us, p99.9 {:.1} us, max {:.1} us over {} wake-ups; {} later than {} us, {} \
+         missed\n",
+        q.p50,
+        q.p99,
+        q.p999,
+        q.max,
+        soak.wakeups,
+        soak.late,
+        soak::LATE_NS / 1000,
+        soak.missed
+    ));
+    for finding in &report.findings {
+        let sign = match finding.weight {
+            Weight::Good => "ok  ",
+            Weight::Note => "note",
+            Weight::Bad => "BAD ",
+        };
+        out.push_str(&format!("  {sign}  {}: {}\n", finding.what, finding.found));
+        if let Some(change) = &finding.change {
+            out.push_str(&format!("        change: {change}\n"));
+        }
+    }
+    if let Some(how) = &report.why {
+        if soak.suspects.is_empty() {
+            out.push_str(&format!(
+                "  why           no wake-up was late, or nothing else ran; {how}\n"
+            ));
+        }
+        for suspect in &soak.suspects {
+            out.push_str(&format!(
+                "  why           {} ran in {} late tenths of a second ({:.0} {})\n",
+                suspect.name, suspect.times, suspect.amount, suspect.unit
+            ));
+        }
+        if !soak.suspects.is_empty() {
+            out.push_str(&format!("                {how}\n"));
+        }
+    }
+    out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use cellpos_runtime::latency::Quantiles;
+    use cellpos_runtime::realtime::Conditions;
+
+    fn quiet(seconds: f64) -> Soak {
+        Soak {
+            conditions: Conditions::default(),
+            seconds,
+            wakeups: (seconds * 1e3) as u64,
+            wake_us: Quantiles {
+                p999: 50.0,
+                ..Quantiles::default()
+            },
+            late: 0,
+            missed: 0,
+            suspects: Vec::new(),
+        }
+    }
+
+    #[test]
+    fn nothing_is_called_fit_on_a_tenth_of_a_second_or_beside_a_bad_finding() {
+        assert!(!verdict(&quiet(0.1), &[]).0);
+        assert!(verdict(&quiet(10.0), &[]).0);
+        let bad = Finding {
+            what: "virtual machine",
+            found: String::new(),
+            weight: Weight::Bad,
+            change: None,
+        };
+        let (fit, said) = verdict(&quiet(10.0), &[bad]);
+        assert!(!fit && said.contains("virtual machine"), "{said}");
+        let mut late = quiet(36_000.0);
+        late.missed = 1_000_000;
+        assert!(!verdict(&late, &[]).0);
+    }
 }

@@ -1,74 +1,207 @@
-//! `cellpos export`: a run as CSV or Parquet.
+//! `cellpos export`: a run for other programs.
 
+use super::beside;
+use crate::arguments::run_folder;
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
-use cellpos_record::{Format, RunReader, export};
-use std::path::PathBuf;
+use crate::output;
+use cellpos_record::{Exported, Format, Selection, Sessions, export};
+use cellpos_units::Seconds;
+use std::num::NonZeroU64;
+use std::path::{Path, PathBuf};
 
 /// Arguments of `cellpos export`.
 #[derive(Debug, clap::Args)]
-#[command(
-    after_help = "Example:\n  cellpos export runs/20261121T093000Z-track --format csv --out track.csv\n\n\
-                  Row k of the CSV: the displacement commanded from time_s on, held until the next row; bead_um is \
-                  the position that the camera had delivered just before, empty without a bead."
-)]
+#[command(after_help = "Examples:
+  cellpos export runs/20261121T093000Z-track
+  cellpos export runs/20261121T093000Z-track --out track.parquet
+  cellpos export runs/20261121T190000Z-fatigue --from 60s --to 120s --every 10 --columns time_s,target_um,bead_um
+
+All sessions of a run that was resumed, one behind the other; the column session tells them apart. The columns, their units
+and words are in docs/data.md. Row k: the displacement commanded from time_s on, held until the next row; bead_um is the
+position that the camera had delivered just before. Exit code 1: rows of the run are missing.")]
 pub struct Args {
     /// The run's folder.
+    #[arg(value_parser = run_folder())]
     run: PathBuf,
-    /// What to write.
-    #[arg(long, value_enum, default_value = "csv")]
-    format: ExportFormat,
-    /// The file to write; without it `<run>.csv` or `<run>.parquet` beside the folder.
+    /// What to write; left out: what the name of --out ends in, else CSV.
+    #[arg(long, value_enum)]
+    format: Option<ExportFormat>,
+    /// The file to write; left out: the run's name beside its folder.
     #[arg(long)]
     out: Option<PathBuf>,
+    /// From this time of the run on.
+    #[arg(long)]
+    from: Option<Seconds>,
+    /// Up to this time of the run.
+    #[arg(long)]
+    to: Option<Seconds>,
+    /// These columns, in this order.
+    #[arg(long, value_delimiter = ',')]
+    columns: Option<Vec<String>>,
+    /// Every so many rows one.
+    #[arg(long, default_value = "1")]
+    every: NonZeroU64,
+    /// Only this session.
+    #[arg(long)]
+    session: Option<u64>,
     /// Print one JSON object on standard output.
     #[arg(long)]
     json: bool,
 }
 
-#[derive(Debug, Clone, Copy, clap::ValueEnum)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
 enum ExportFormat {
     Csv,
     Parquet,
+    Hdf5,
+    Mat,
+    Rtdc,
+}
+
+impl ExportFormat {
+    const ALL: [Self; 5] = [Self::Csv, Self::Parquet, Self::Hdf5, Self::Mat, Self::Rtdc];
+
+    fn extension(self) -> &'static str {
+        match self {
+            Self::Csv => "csv",
+            Self::Parquet => "parquet",
+            Self::Hdf5 => "h5",
+            Self::Mat => "mat",
+            Self::Rtdc => "rtdc",
+        }
+    }
+
+    fn format(self) -> Format {
+        match self {
+            Self::Csv => Format::Csv,
+            Self::Parquet => Format::Parquet,
+            Self::Hdf5 => Format::Hdf5,
+            Self::Mat => Format::Mat,
+            Self::Rtdc => Format::Rtdc,
+        }
+    }
+
+    /// The format that a file's name asks for.
+    fn of(path: &Path) -> Option<Self> {
+        let extension = match path.extension()?.to_str()? {
+            "hdf5" => "h5",
+            extension => extension,
+        };
+        Self::ALL
+            .into_iter()
+            .find(|format| format.extension().eq_ignore_ascii_case(extension))
+    }
+}
+
+/// The format, by option or by name; the two must not contradict each other.
+fn chosen(args: &Args) -> Result<ExportFormat, Failure> {
+    let named = args.out.as_deref().and_then(ExportFormat::of);
+    match (args.format, named) {
+        (Some(asked), Some(named)) if asked != named => Err(Failure::bad_input(
+            format!(
+                "--format {} and --out ….{}: which of the two?",
+                asked.extension(),
+                named.extension()
+            ),
+            "leave --format out, or give the file the name of the format",
+        )),
+        (Some(format), _) | (None, Some(format)) => Ok(format),
+        (None, None) => Ok(ExportFormat::Csv),
+    }
+}
+
+fn selection(args: &Args) -> Result<Selection, Failure> {
+    let from_s = args.from.map_or(f64::NEG_INFINITY, |s| s.value());
+    let to_s = args.to.map_or(f64::INFINITY, |s| s.value());
+    if from_s > to_s {
+        return Err(Failure::bad_input(
+            format!("--from {from_s}s is after --to {to_s}s"),
+            "times count from the start of the run",
+        ));
+    }
+    let selection = Selection {
+        from_s,
+        to_s,
+        every: args.every,
+        columns: args.columns.clone(),
+    };
+    selection.columns().map_err(Failure::input)?;
+    Ok(selection)
 }
 
 /// Writes the file and says what of the run is missing.
 pub fn run(args: Args) -> CommandResult {
-    let reader = RunReader::open(&args.run).map_err(Failure::input)?;
-    let (format, extension) = match args.format {
-        ExportFormat::Csv => (Format::Csv, "csv"),
-        ExportFormat::Parquet => (Format::Parquet, "parquet"),
-    };
-    let output = args.out.unwrap_or_else(|| {
-        let mut name = args.run.file_name().unwrap_or("run".as_ref()).to_owned();
-        name.push(format!(".{extension}"));
-        args.run.with_file_name(name)
-    });
-    let mut batches = reader.batches().map_err(Failure::failed)?;
-    let rows: usize = batches.by_ref().map(|batch| batch.len()).sum();
-    let lost = batches.lost();
-    export(&reader, format, &output).map_err(Failure::failed)?;
-    if args.json {
+    let format = chosen(&args)?;
+    let selection = selection(&args)?;
+    let mut sessions = Sessions::of(&args.run).map_err(Failure::input)?;
+    if let Some(wanted) = args.session {
+        sessions.readers.retain(|(number, _)| *number == wanted);
+        if sessions.readers.is_empty() {
+            return Err(Failure::bad_input(
+                format!("{}: has no session {wanted}", args.run.display()),
+                "leave --session out for all sessions",
+            ));
+        }
+    }
+    let output = args
+        .out
+        .unwrap_or_else(|| beside(&args.run, &format!(".{}", format.extension())));
+    output::ready([&output])?;
+    let unreadable = std::mem::take(&mut sessions.unreadable);
+    let count = sessions.readers.len();
+    let source = sessions.into_source().map_err(Failure::failed)?;
+    let done = export(&source, &selection, format.format(), &output).map_err(Failure::failed)?;
+    tell(&output, &done, count, &unreadable, args.json)
+}
+
+fn tell(
+    output: &Path,
+    done: &Exported,
+    sessions: usize,
+    unreadable: &[String],
+    json: bool,
+) -> CommandResult {
+    let sum = |of: fn(&cellpos_record::Lost) -> u64| done.lost.iter().map(of).sum::<u64>();
+    let missing = sum(|lost| lost.rows);
+    let damaged = sum(|lost| lost.damaged_rows);
+    let damaged_bytes = sum(|lost| lost.damaged_bytes);
+    let cut_off = done.lost.iter().filter(|lost| !lost.finished).count();
+    if json {
         print_json(&serde_json::json!({
             "output": output,
-            "rows": rows,
-            "rows_missing": lost.rows,
-            "damaged_bytes": lost.damaged_bytes,
-            "torn_bytes": lost.torn_bytes,
-            "finished": lost.finished,
+            "rows": done.rows,
+            "sessions": sessions,
+            "rows_missing": missing,
+            "rows_damaged": damaged,
+            "damaged_bytes": damaged_bytes,
+            "torn_bytes": sum(|lost| lost.torn_bytes),
+            "finished": cut_off == 0,
+            "unreadable": unreadable,
         }))?;
     } else {
-        print_text(&format!("{}: {rows} rows\n", output.display()))?;
-        if lost.rows > 0 || lost.damaged_bytes > 0 {
+        let of = if sessions > 1 {
+            format!(" of {sessions} sessions")
+        } else {
+            String::new()
+        };
+        print_text(&format!("{}: {} rows{of}\n", output.display(), done.rows))?;
+        if missing + damaged + damaged_bytes > 0 {
             print_text(&format!(
-                "{} rows are missing in {} gaps ({} damaged bytes)\n",
-                lost.rows,
-                lost.gaps.len(),
-                lost.damaged_bytes
+                "{missing} rows are missing between others; {damaged} rows are damaged or were never written to the disk; \
+                 {damaged_bytes} bytes make no sense\n",
             ))?;
         }
-        if !lost.finished {
+        for folder in unreadable {
+            print_text(&format!("left out: {folder}\n"))?;
+        }
+        if cut_off > 0 {
             print_text("the run was cut off: it reads up to its last flush\n")?;
         }
     }
-    Ok(Outcome::Done)
+    let whole = missing + damaged + damaged_bytes == 0 && unreadable.is_empty();
+    Ok(if whole {
+        Outcome::Done
+    } else {
+        Outcome::Broken
+    })
 }

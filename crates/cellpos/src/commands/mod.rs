@@ -1,18 +1,23 @@
 //! One module a command: `Args` (read by clap), `run(args)` (calls the libraries, prints the result).
 
 pub mod background;
+pub mod board;
 pub mod bundle;
+pub mod calibrate;
 pub mod camera;
 pub mod check;
 pub mod circle;
 pub mod design;
 pub mod doctor;
 pub mod export;
+pub mod generate;
 pub mod identify;
+pub mod jog;
 pub mod paper;
 pub mod reconcile;
 pub mod replay;
 pub mod report;
+pub mod rig;
 pub mod run;
 pub mod simulate;
 pub mod track;
@@ -53,12 +58,22 @@ pub enum Command {
     Circle(Box<circle::Args>),
     /// Positions and their quality from a recording: CSV, contact sheet, summary.
     Vision(Box<vision::Args>),
+    /// A rig file: a new one, or what is wrong with one.
+    Rig(rig::Args),
+    /// What the PZT board is, its counters, and how good the line to it is.
+    Board(board::Args),
+    /// Move the PZT by hand.
+    Jog(jog::Args),
+    /// Axis, sign and pixel size of the camera's picture: calibration.toml.
+    Calibrate(calibrate::Args),
     /// Which cameras there are; delivered rate, intervals, age and losses of one.
     Camera(camera::Args),
     /// Frames of the empty channel, against which a cell is seen.
     Background(background::Args),
     /// Reproduce the figures and numbers of Mizoue et al. 2017 from the emulated rig, and say where the paper errs.
     Paper(paper::Args),
+    /// Completions and manual pages, for packages and for a home of one's own.
+    Generate(generate::Args),
 }
 
 impl Command {
@@ -79,9 +94,25 @@ impl Command {
             Self::Reconcile(args) => reconcile::run(*args),
             Self::Circle(args) => circle::run(*args),
             Self::Vision(args) => vision::run(*args),
+            Self::Rig(args) => rig::run(args),
+            Self::Board(args) => board::run(args),
+            Self::Jog(args) => jog::run(args),
+            Self::Calibrate(args) => calibrate::run(args),
             Self::Camera(args) => camera::run(args),
             Self::Background(args) => background::run(args),
             Self::Paper(args) => paper::run(args),
+            Self::Generate(args) => generate::run(args),
         }
     }
+}
+
+/// The path beside a run's folder that has its name and something behind it. A folder given as `.` has a name too.
+fn beside(run: &std::path::Path, behind: &str) -> std::path::PathBuf {
+    let folder = match run.file_name() {
+        Some(_) => run.to_owned(),
+        None => std::fs::canonicalize(run).unwrap_or_else(|_| run.to_owned()),
+    };
+    let mut name = folder.file_name().unwrap_or("run".as_ref()).to_owned();
+    name.push(behind);
+    folder.with_file_name(name)
 }

@@ -1,17 +1,16 @@
 //! `cellpos reconcile`: where simulation and measurement disagree, what is missing, added and shown.
 
-pub mod collect;
-pub mod experiment;
-
-use crate::commands::identify::on_rig::{OnRig, is_unseen};
+use crate::commands::identify::HoldKind;
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
+use crate::output;
 use crate::rig_file::{ClockKind, Frames, RigFile};
+use cellpos_experiment::collect::{self, Collected, Collecting, refused};
+use cellpos_experiment::on_rig::{OnRig, is_unseen};
 use cellpos_plant::{Model, Noise, TransferFunction};
-use cellpos_reconcile::{Options, ReconcileError, Reconciliation, Record, Verdict, reconcile};
+use cellpos_reconcile::{Options, Reconciliation, Record, reconcile};
 use cellpos_record::RunReader;
 use cellpos_runtime::{Life, TickFlags, TickRecord};
 use cellpos_table::{ColumnRef, Table};
-use collect::{Collected, Collecting};
 use std::path::{Path, PathBuf};
 
 /// Find where simulation and measurement disagree, name what is missing, add it to the model.
@@ -22,7 +21,7 @@ Examples:
   cellpos reconcile --model eq6 --collect more --rig rig.toml --out augmented.toml
   cellpos reconcile --model fit --data Model_Vi_Do.dat --rows 0:8027 --input-column 1 --output-column 5 --rate 200Hz
 
-Verdicts: named, ambiguous (the data cannot separate, and what would), unknown (nothing in the catalogue closes enough),
+Verdicts: named, named-with-remainder (and something is left beside), ambiguous (the data cannot separate, and what would), unknown (nothing in the catalogue closes enough),
 nothing-missing. Exit code 0 whenever a verdict was reached, 2 for bad input.")]
 pub struct Args {
     /// Model: eq6, the path of a model.toml, or `fit` for a constant gain fitted to the records.
@@ -83,6 +82,10 @@ pub struct Args {
     /// Factor from the position's column to um (0.001 for nanometres).
     #[arg(long, default_value_t = 1.0)]
     output_um_per_unit: f64,
+    /// How the command acts between rows: zero-order (held) or none (sampled with the output) [default: as the model was
+    /// identified, else zero-order].
+    #[arg(long, value_enum)]
+    hold: Option<HoldKind>,
     /// Rows FROM:TO of every file, counted from 0, TO not included.
     #[arg(long, value_name = "FROM:TO")]
     rows: Option<String>,
@@ -97,6 +100,8 @@ pub struct Args {
 /// Runs the command.
 pub fn run(args: Args) -> CommandResult {
     collectable(&args)?;
+    let json = args.json.iter().filter(|path| path.as_os_str() != "-");
+    output::ready(args.out.iter().chain(&args.report).chain(json))?;
     let files = files(&args.data)?;
     let mut records = Vec::new();
     let mut rests_um = Vec::new();
@@ -124,10 +129,17 @@ pub fn run(args: Args) -> CommandResult {
         fitted(&records)?
     } else {
         let mut model = Model::load(&args.model).map_err(Failure::input)?;
+        // A model of other data says how its input was sampled; such a plant need not have rested before a record.
+        let stated = model.provenance.get("hold").cloned();
+        options.free_start = stated.is_some();
+        options.interpolated_input = match args.hold {
+            Some(hold) => hold == HoldKind::None,
+            None => stated.as_deref() == Some("none"),
+        };
         at_rest_of_runs(&mut model, &records, &rests_um);
         model
     };
-    let bar = indicatif::ProgressBar::new_spinner();
+    let bar = output::progress_bar(None);
     let mut progress = |text: &str| {
         bar.set_message(text.to_owned());
         bar.tick();
@@ -195,22 +207,9 @@ fn rig(args: &Args, model: &Model) -> Result<OnRig, Failure> {
     )
 }
 
-fn refused(error: ReconcileError) -> Failure {
-    Failure::bad_input(
-        error,
-        "no verdict: see docs/reconcile.md for what records are needed",
-    )
-}
-
 fn write(args: &Args, result: &Reconciliation, collected: &[Collected]) -> Result<(), Failure> {
-    let io = |path: &Path, e: std::io::Error| {
-        Failure::bad_input(
-            format!("cannot write {}: {e}", path.display()),
-            "check the folder and its permissions",
-        )
-    };
     if let Some(path) = &args.out {
-        std::fs::write(path, result.augmented.to_toml_string()).map_err(|e| io(path, e))?;
+        output::write(path, &result.augmented.to_toml_string())?;
     }
     if let Some(path) = &args.report {
         let title = args
@@ -220,8 +219,7 @@ fn write(args: &Args, result: &Reconciliation, collected: &[Collected]) -> Resul
             .chain(collected.iter().map(|c| c.file.display().to_string()))
             .collect::<Vec<_>>()
             .join(", ");
-        std::fs::write(path, cellpos_reconcile::report(result, &title).to_html())
-            .map_err(|e| io(path, e))?;
+        output::write(path, &cellpos_reconcile::report(result, &title).to_html())?;
     }
     let mut json = result.to_json();
     if args.collect.is_some() {
@@ -231,7 +229,7 @@ fn write(args: &Args, result: &Reconciliation, collected: &[Collected]) -> Resul
         Some(path) if path.as_os_str() == "-" => return print_json(&json),
         Some(path) => {
             let text = serde_json::to_string_pretty(&json).map_err(Failure::failed)?;
-            std::fs::write(path, text + "\n").map_err(|e| io(path, e))?;
+            output::write(path, &(text + "\n"))?;
         }
         None => {}
     }
@@ -286,23 +284,32 @@ fn summary(result: &Reconciliation) -> String {
             h.formula
         );
     }
-    let g = &result.gap;
-    if result.verdict == Verdict::NothingMissing {
+    if let Some(rest) = &result.remainder {
         let _ = writeln!(
             s,
-            "gap: {:.1} nm, at the floor of {:.1} nm RMS of innovation",
-            1e3 * g.before,
-            1e3 * g.floor
-        );
-    } else {
-        let _ = writeln!(
-            s,
-            "gap on held-out records: {:.1} nm before, {:.1} nm after, floor {:.1} nm RMS of innovation",
-            1e3 * g.before,
-            1e3 * g.after,
-            1e3 * g.floor
+            "remainder: {:.1} % of the excess: {}; {}",
+            100.0 * rest.share,
+            rest.how,
+            rest.places.join("; ")
         );
     }
+    let g = &result.gap;
+    let (f, unit) = (cellpos_reconcile::figure, &g.unit);
+    let _ = writeln!(
+        s,
+        "gap on held-out records, RMS of innovation: {} {unit} before, {} {unit} after, floor {} {unit} ({})",
+        f(g.before),
+        f(g.after),
+        f(g.floor),
+        result.floor.words()
+    );
+    let _ = writeln!(
+        s,
+        "gap on held-out records, RMS of free run:   {} {unit} before, {} {unit} after, noise alone about {} {unit}",
+        f(g.free_run_before),
+        f(g.free_run_after),
+        f(g.free_run_floor)
+    );
     s
 }
 

@@ -2,15 +2,19 @@
 
 mod cycles;
 mod envelope;
+mod fatigue;
 mod spectrum;
 mod ticks;
 
 use super::replay;
 use super::run::{learning, resume};
+use crate::arguments::run_folder;
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
+use crate::output;
 use cellpos_record::{CYCLES_CSV, Lost, RunEnd, RunMeta, RunReader};
 use cellpos_report::{Axis, Column, Figure, Panel, Report, Series, Status, Table};
 use cellpos_script::read_cycles;
+pub use cycles::with_interval;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use ticks::Ticks;
@@ -23,7 +27,8 @@ use ticks::Ticks;
 Writes report.html into the run folder, and beside it report-figures/ with every figure as SVG and its data as CSV. The
 sessions of a run that was resumed are joined; the gaps show.")]
 pub struct Args {
-    /// The run's folder.
+    /// The run's folder; `latest`, or `latest-NAME`: the newest below runs/.
+    #[arg(value_parser = run_folder())]
     run: PathBuf,
     /// The page to write; left out: report.html in the run folder.
     #[arg(long)]
@@ -45,8 +50,11 @@ struct Session {
 
 /// Writes the page.
 pub fn run(args: Args) -> CommandResult {
+    output::ready(&args.out)?;
     let first = RunReader::open(&args.run).map_err(Failure::input)?;
-    let mut ticks = Ticks::default();
+    let text = std::fs::read_to_string(args.run.join(CYCLES_CSV)).unwrap_or_default();
+    let cycles = read_cycles(&text);
+    let mut ticks = Ticks::with_courses(fatigue::courses(&cycles.rows));
     let mut sessions = Vec::new();
     for folder in resume::sessions(&args.run) {
         let reader = RunReader::open(&folder).map_err(Failure::input)?;
@@ -75,13 +83,13 @@ pub fn run(args: Args) -> CommandResult {
     if let Some(notes) = notes(&first) {
         page.paragraph(&notes);
     }
+    what_it_was(&mut page, &sessions);
     head(&mut page, &sessions, &ticks);
-    let text = std::fs::read_to_string(args.run.join(CYCLES_CSV)).unwrap_or_default();
-    let cycles = read_cycles(&text);
     traces(&mut page, &ticks);
     let bound = spectrum::Bound::of(meta, &ticks);
     errors(&mut page, &ticks, bound.as_ref());
     let trends = cycles::section(&mut page, &cycles);
+    fatigue::section(&mut page, &cycles.rows, &ticks);
     learned(&mut page, &args.run)?;
     timing(&mut page, &sessions, &ticks);
     events(&mut page, &sessions);
@@ -128,6 +136,93 @@ fn ending(session: &Session) -> (Status, String) {
     }
 }
 
+/// Sample, date, machine, devices, controller and gains: what a reader asks first.
+fn what_it_was(page: &mut Report, sessions: &[Session]) {
+    let Some(meta) = sessions.iter().find_map(|session| session.meta.as_ref()) else {
+        return;
+    };
+    let at = |table: &toml::Table, path: &[&str]| -> Option<toml::Value> {
+        let (first, rest) = path.split_first()?;
+        let mut value = table.get(*first)?;
+        for key in rest {
+            value = value.get(key)?;
+        }
+        Some(value.clone())
+    };
+    let text = |table: &toml::Table, path: &[&str]| {
+        at(table, path).map(|value| match value {
+            toml::Value::String(text) => text,
+            other => other.to_string(),
+        })
+    };
+    let mut rows: Vec<(String, String)> = Vec::new();
+    let sample = at(&meta.config, &["rig", "sample"])
+        .and_then(|value| value.try_into::<cellpos_script::Sample>().ok())
+        .unwrap_or_default();
+    for (name, value) in sample.rows() {
+        rows.push((name.to_owned(), value));
+    }
+    let mut add = |name: &str, value: Option<String>| {
+        if let Some(value) = value.filter(|value| !value.is_empty()) {
+            rows.push((name.to_owned(), value));
+        }
+    };
+    add("started (UTC)", Some(meta.started_utc.clone()));
+    add("host", text(&meta.conditions, &["host"]));
+    add("clock", Some(meta.clock.clone()));
+    let device = |kind: &str| {
+        let of_rig = text(&meta.config, &["rig", kind, "kind"]);
+        let name = text(&meta.conditions, &[kind, "name"]);
+        match (of_rig, name) {
+            (Some(kind), Some(name)) if name != kind => Some(format!("{kind}: {name}")),
+            (one, other) => one.or(other),
+        }
+    };
+    add("actuator", device("actuator"));
+    add("camera", device("camera"));
+    let law = text(&meta.controller, &["controller"]);
+    let gains = meta
+        .controller
+        .get("pi")
+        .and_then(toml::Value::as_table)
+        .map(|gains| {
+            let gains: Vec<String> = gains
+                .iter()
+                .map(|(key, value)| match value.as_float() {
+                    Some(number) => format!("{key} = {number:.4}"),
+                    None => format!("{key} = {value}"),
+                })
+                .collect();
+            gains.join(", ")
+        });
+    add(
+        "controller",
+        law.map(|law| match (law.as_str(), gains) {
+            ("pi", Some(gains)) => format!("pi: {gains}"),
+            (_, Some(gains)) => format!("{law} (its fallback PI: {gains})"),
+            (_, None) => law,
+        }),
+    );
+    add(
+        "loop delay designed for",
+        text(&meta.controller, &["delay_ms"]).map(|ms| format!("{ms} ms")),
+    );
+    let version = |name: &str| meta.versions.get(name).cloned();
+    add(
+        "cellpos",
+        version("cellpos").map(|cellpos| match version("commit") {
+            Some(commit) => format!("{cellpos} ({commit})"),
+            None => cellpos,
+        }),
+    );
+    add("command", Some(meta.command_line.join(" ")));
+    let rows: Vec<(&str, String)> = rows
+        .iter()
+        .map(|(name, value)| (name.as_str(), value.clone()))
+        .collect();
+    page.table(Table::key_values(&rows));
+}
+
 fn head(page: &mut Report, sessions: &[Session], ticks: &Ticks) {
     if let Some(last) = sessions.last() {
         let (status, text) = ending(last);
@@ -167,12 +262,16 @@ fn head(page: &mut Report, sessions: &[Session], ticks: &Ticks) {
         ("error, largest (nm)", nm(ticks.peak_um())),
     ];
     let mut table = Table::key_values(&rows);
-    table.caption("Errors: measured position less the reference of the time of its exposure.");
+    table.caption(
+        "Errors: measured position less the reference of the time of its exposure, from two seconds after the loop was closed (or \
+         went on after a freeze) until the bead was frozen or the PZT parked; the same as the terminal and run.toml have.",
+    );
     page.table(table);
     if sessions.len() > 1 {
         let mut table = Table::new([
             Column::right("session"),
             Column::right("start (s)"),
+            Column::right("error, RMS (nm)"),
             Column::right("rows missing"),
             Column::left("how it ended"),
         ]);
@@ -180,6 +279,11 @@ fn head(page: &mut Report, sessions: &[Session], ticks: &Ticks) {
             table.row([
                 number.to_string().as_str(),
                 &format!("{:.3}", session.start_s),
+                &nm(ticks
+                    .statistics
+                    .get(number as usize - 1)
+                    .and_then(|statistics| statistics.rms_measured_nm())
+                    .map(|nm| nm * 1e-3)),
                 &session.lost.rows.to_string(),
                 &ending(session).1,
             ]);
@@ -282,7 +386,7 @@ fn errors(page: &mut Report, ticks: &Ticks, bound: Option<&spectrum::Bound>) {
 }
 
 fn learned(page: &mut Report, run: &Path) -> Result<(), Failure> {
-    let motions = learning::load(run)?;
+    let motions = learning::load(run);
     if motions.is_empty() {
         return Ok(());
     }

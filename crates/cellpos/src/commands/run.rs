@@ -7,16 +7,15 @@ mod sink;
 mod text;
 
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
-use crate::rig_file::{ActuatorConfig, CameraConfig, ClockKind, Frames, Rig, RigFile};
-use crate::session;
-use crate::setup::{Prepared, ReferenceSpec, Setup};
 use cellpos_emulator::{CellConfig, FaultKind};
 use cellpos_record::{InputFile, LineFile, RunWriter};
-use cellpos_runtime::live::Operator;
-use cellpos_runtime::{EndRule, Finished, Life};
+use cellpos_runtime::EndRule;
 use cellpos_script::{
     AmplitudeWatch, Check, CheckLimits, CycleRow, CycleTable, Plan, Script, check,
 };
+use cellpos_session::rig_file::{ActuatorConfig, CameraConfig, ClockKind, Frames, RigFile};
+use cellpos_session::setup::{Prepared, ReferenceSpec, Setup};
+use cellpos_session::{Finished, Options, Rig, connect};
 use cellpos_units::Micrometers;
 use learning::Keeper;
 use serde::{Deserialize, Serialize};
@@ -42,7 +41,7 @@ pub struct Args {
     #[arg(required_unless_present = "resume", conflicts_with = "resume")]
     script: Option<PathBuf>,
     /// Go on with a run that was cut off or stopped, as it was set up.
-    #[arg(long, value_name = "RUN")]
+    #[arg(long, value_name = "RUN", value_parser = crate::arguments::run_folder())]
     resume: Option<PathBuf>,
     /// Rehearse: on the virtual clock, with an emulated rig that behaves as --model says.
     #[arg(long)]
@@ -169,7 +168,7 @@ fn fresh(args: &Args) -> Result<Ready, Failure> {
     if args.dry {
         rehearse(&mut file, &args.model);
     }
-    for path in session::inputs(args.rig.as_deref(), &file, &args.model, &args.controller) {
+    for path in connect::inputs(args.rig.as_deref(), &file, &args.model, &args.controller) {
         inputs.push(InputFile::of(path).map_err(Failure::input)?);
     }
     let (clock, frames) = if args.dry {
@@ -182,7 +181,7 @@ fn fresh(args: &Args) -> Result<Ready, Failure> {
         format!("{}{dry}", script.name)
     });
     Ok(Ready {
-        prepared: session::prepare(&args.model, &args.controller, &file)?,
+        prepared: connect::prepare(&args.model, &args.controller, &file)?,
         file,
         reference,
         clock: args.clock.unwrap_or(clock),
@@ -223,7 +222,7 @@ fn rehearse(file: &mut RigFile, model: &str) {
 /// A script with everything that it names, in a form that is kept with the run.
 fn read(path: &Path) -> Result<(ReferenceSpec, Script, Vec<InputFile>), Failure> {
     let file = path.display().to_string();
-    let text = std::fs::read_to_string(path).map_err(|error| {
+    let text = cellpos_table::read_text(path, cellpos_script::MOST_BYTES).map_err(|error| {
         Failure::bad_input(
             format!("{file}: {error}"),
             "give the path of a script file; see examples/scripts/",
@@ -232,7 +231,8 @@ fn read(path: &Path) -> Result<(ReferenceSpec, Script, Vec<InputFile>), Failure>
     let folder = path.parent().unwrap_or(Path::new(""));
     let waveforms = RefCell::new(BTreeMap::new());
     let script = Script::parse_with(&text, &file, &|name| {
-        let text = std::fs::read_to_string(folder.join(name)).map_err(|error| error.to_string())?;
+        let text = cellpos_table::read_text(&folder.join(name), cellpos_script::MOST_BYTES)
+            .map_err(|error| error.to_string())?;
         waveforms
             .borrow_mut()
             .insert(name.to_string(), text.clone());
@@ -256,9 +256,9 @@ fn read(path: &Path) -> Result<(ReferenceSpec, Script, Vec<InputFile>), Failure>
 }
 
 /// The check of `cellpos check`, with the limits that are in force.
-fn allowed(script: &Script, setup: &Prepared, file: &RigFile, rig: &Rig) -> Result<Check, Failure> {
-    let limits = setup.controller.limits;
-    let [low_um, high_um] = rig.source.info().field_um;
+fn allowed(script: &Script, setup: &Prepared, rig: &Rig) -> Result<Check, Failure> {
+    let (limits, file) = (setup.controller.limits, rig.file());
+    let [low_um, high_um] = rig.source().field_um;
     let result = check(
         script,
         &setup.model,
@@ -307,136 +307,162 @@ fn start(args: &Args, ready: Ready) -> CommandResult {
     let (script, plan) = reference.script()?.ok_or_else(|| {
         Failure::bad_input("the run has no script", "resume a run of cellpos run")
     })?;
-    if plan.needs_length() && !file.follows_a_cell() {
-        return Err(Failure::bad_input(
-            format!(
-                "{}: a wait for cell-length or a stop on length_change_above, and nobody measures a length here: the loop follows \
-                 a bead",
-                script.file
-            ),
-            "follow a cell: a table [cell] in rig.toml, or [emulator.cell] for the emulated rig",
-        ));
-    }
+    measurable(&script, &plan, &file)?;
     let plan = Arc::new(plan);
-    let frames = if config.frames {
-        Frames::On
-    } else {
-        Frames::Off
+    let options = Options {
+        clock,
+        frames: if config.frames {
+            Frames::On
+        } else {
+            Frames::Off
+        },
+        best_effort: config.best_effort,
     };
-    let mut rig = session::connect(&file, clock, frames, &prepared.model)?;
-    session::narrow(&mut prepared, &file, &rig);
-    allowed(&script, &prepared, &file, &rig)?;
-    // Before the board is armed: its watchdog does not wait for simulations.
+    let mut rig = Rig::open(file, options)?;
+    rig.fit(&mut prepared);
+    allowed(&script, &prepared, &rig)?;
+    let mut warnings = Vec::new();
     let mut motions = Vec::new();
     if config.learn {
         let known = match &home {
-            Some((folder, _)) => learning::load(folder)?,
+            Some((folder, _)) => learning::load(folder),
             None => Vec::new(),
         };
-        motions = learning::motions(&plan, &prepared, &file, &known, &mut rig.warnings);
+        motions = learning::motions(&plan, &prepared, rig.file(), &known, &mut warnings);
     }
-    let number = u16::try_from(config.number).unwrap_or(u16::MAX);
-    let mut setup = session::arm(prepared, &file, &mut rig, number, reference)?;
+    let mut setup = rig.set_up(prepared, reference)?;
     setup.config.motions = motions;
 
-    let mut meta = session::meta(&name, clock, &[], &file, &setup)?;
+    let mut meta = connect::meta(&name, clock, &[], &setup, &rig)?;
     meta.inputs = inputs;
-    let table = session::table(&config)?;
+    let table = connect::table(&config)?;
     meta.config
         .insert("session".to_string(), toml::Value::Table(table));
     let root = home.as_ref().map_or(args.runs.as_path(), |(_, root)| root);
+    let ticks = plan.total_s() * 1e6 / rig.file().timing.period_us;
+    connect::room(root, Some(ticks as u64), &meta)?;
     let writer = RunWriter::create(root, meta).map_err(Failure::failed)?;
     let folder = home.map_or_else(|| writer.folder().to_owned(), |(folder, _)| folder);
+    let sink = sink(writer, &folder, &config, &plan, &setup, &rig)?;
+    let mut core = setup.core()?;
+    if rig.file().is_emulated() {
+        let faults = &rig.file().emulator.faults;
+        core = core.with_late_solver(faults.spans_ns(FaultKind::SlowSolver));
+    }
+    let keys = keys::listen(rig.operator());
+    let armed = match rig.arm(&setup, core, sink, EndRule::default()) {
+        Ok(armed) => armed,
+        Err(not_armed) => {
+            connect::not_armed(not_armed.sink.close().0, &not_armed.failure);
+            return Err(not_armed.failure);
+        }
+    };
+    let finished = armed.start()?.wait()?;
+    drop(keys);
+    conclude(args, &setup, &plan, &folder, warnings, finished)
+}
+
+/// A length can only be waited for where it is measured.
+fn measurable(script: &Script, plan: &Plan, file: &RigFile) -> Result<(), Failure> {
+    if !plan.needs_length() || file.follows_a_cell() {
+        return Ok(());
+    }
+    Err(Failure::bad_input(
+        format!(
+            "{}: a wait for cell-length or a stop on length_change_above, and nobody measures a length here: the loop follows \
+             a bead",
+            script.file
+        ),
+        "follow a cell: a table [cell] in rig.toml, or [emulator.cell] for the emulated rig",
+    ))
+}
+
+/// Where the records go.
+fn sink(
+    writer: RunWriter,
+    folder: &Path,
+    config: &SessionConfig,
+    plan: &Arc<Plan>,
+    setup: &Setup,
+    rig: &Rig,
+) -> Result<ScriptSink, Failure> {
+    let timing = &rig.file().timing;
+    let live = !rig.clock().is_virtual();
     let lines = LineFile::open(
         &folder.join(cellpos_record::CYCLES_CSV),
         &CycleRow::csv_head(),
-        !rig.clock.is_virtual(),
+        live,
     )
     .map_err(Failure::failed)?;
-
     let cycles = CycleTable::new(
-        Arc::clone(&plan),
+        Arc::clone(plan),
         config.number,
         config.first_cycle,
-        file.timing.camera_delay_ms,
-        file.timing.period_us,
+        timing.camera_delay_ms,
+        timing.period_us,
     );
-    let watch = AmplitudeWatch::new(config.alarm_percent * 1e-2, AmplitudeWatch::WINDOW);
-    let operator = Arc::new(Operator::default());
     let mut sink = ScriptSink::new(
         writer,
         lines,
         cycles,
-        watch,
-        Arc::clone(&plan),
-        Arc::clone(&operator),
-        &config,
+        AmplitudeWatch::new(config.alarm_percent * 1e-2, AmplitudeWatch::WINDOW),
+        Arc::clone(plan),
+        Arc::clone(rig.operator()),
+        config,
     );
-    if let Some(keeper) = Keeper::new(&folder, &setup.config.motions, file.timing.period_us * 1e-6)
-    {
-        sink = sink.with_keeper(keeper, !rig.clock.is_virtual());
+    if config.number > 1 {
+        sink = sink.with_cycles_done(&resume::cycles(folder)?);
     }
-    let mut core = setup.core()?;
-    if file.is_emulated() {
-        let faults = &file.emulator.faults;
-        core = core.with_late_solver(faults.spans_ns(FaultKind::SlowSolver));
+    if let Some(keeper) = Keeper::new(folder, &setup.config.motions, timing.period_us * 1e-6) {
+        sink = sink.with_keeper(keeper, live);
+    }
+    if rig.file().is_emulated() {
         sink = sink.with_stalls(Stalls {
-            spans_ns: faults.spans_ns(FaultKind::StallRecorder),
-            clock: rig.clock.clone(),
+            spans_ns: rig
+                .file()
+                .emulator
+                .faults
+                .spans_ns(FaultKind::StallRecorder),
+            clock: rig.clock().clone(),
         });
     }
-    session::stop_on_signals(&operator)?;
-    let nudges = keys::listen_to_signals(&operator).map_err(Failure::failed)?;
-    let keys = keys::listen(&operator);
-    let finished = session::drive(
-        core,
-        &mut rig,
-        sink,
-        EndRule::default(),
-        config.best_effort,
-        &operator,
-    )?;
-    drop((keys, nudges));
-    conclude(args, &file, &setup, &rig, &plan, &folder, finished)
+    Ok(sink)
 }
 
 fn conclude(
     args: &Args,
-    file: &RigFile,
     setup: &Setup,
-    rig: &Rig,
     plan: &Plan,
     folder: &Path,
+    mut warnings: Vec<String>,
     finished: Finished<ScriptSink>,
 ) -> CommandResult {
+    warnings.extend(connect::warnings(&finished));
     let Finished {
-        summary,
+        ended,
+        rig,
+        mut summary,
         conditions,
-        sink,
-        io_error,
         learned,
+        sink,
+        ..
     } = finished;
-    let mut warnings = rig.warnings.clone();
-    if let Some(error) = &io_error {
-        warnings.push(session::describe(error));
-    }
-    let safe = summary.state != Life::Running || io_error.is_some();
-    let ended = sink.end();
-    let outcome = match (safe, ended.complete()) {
-        (true, _) => summary.state.name(),
-        (false, true) => "done",
-        (false, false) if ended.is_stop() => "stopped",
-        (false, false) => "aborted",
+    let script = sink.end();
+    let outcome = match (ended.as_asked(), script.complete()) {
+        (false, _) => summary.state.name(),
+        (true, true) => "done",
+        (true, false) if script.is_stop() => "stopped",
+        (true, false) => "aborted",
     };
     let (writer, cycle_faults) = sink.close();
     if cycle_faults.rows_lost > 0 {
         warnings.push(format!(
             "{} rows of cycles.csv could not be written: {}",
             cycle_faults.rows_lost,
-            cycle_faults.first.unwrap_or_default()
+            cycle_faults.first.clone().unwrap_or_default()
         ));
     }
-    let run = session::finish(writer, outcome, &summary, &mut warnings);
+    let kept = connect::finish(writer, outcome, &mut summary, &conditions, &mut warnings);
     let learned = learning::named(&setup.config.motions, &learned);
     if !learned.is_empty()
         && let Err(error) = learning::save(folder, learned.clone())
@@ -452,16 +478,17 @@ fn conclude(
             outcome,
             stage: match outcome {
                 "aborted" => "by the operator",
-                _ => ended.name(),
+                _ => script.name(),
             },
-            alarms: ended.alarms,
-            run,
+            ended: &ended,
+            alarms: script.alarms,
+            run: kept.run,
             folder: folder.display().to_string(),
         },
         &summary,
         &cycles,
         plan.cycle_count(),
-        session::bound_rms_nm(file, setup, &summary),
+        connect::bound_rms_nm(rig.file(), setup, &summary),
         &conditions,
         &warnings,
         &learned,
@@ -471,7 +498,8 @@ fn conclude(
     } else {
         print_text(&report.text())?;
     }
-    Ok(if outcome == "done" {
+    let whole = kept.whole && cycle_faults.rows_lost == 0;
+    Ok(if outcome == "done" && whole {
         Outcome::Done
     } else {
         Outcome::Broken

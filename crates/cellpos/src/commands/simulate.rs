@@ -1,6 +1,7 @@
 //! `cellpos simulate`: the noise-free response of a model to the commands of a record.
 
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
+use crate::output;
 use cellpos_plant::{Model, SimulateOptions, simulate};
 use cellpos_record::RunReader;
 use cellpos_table::{Mapping, Record};
@@ -33,6 +34,7 @@ pub struct Args {
 
 /// Reads, simulates, writes.
 pub fn run(args: Args) -> CommandResult {
+    output::ready([&args.out])?;
     let model = Model::load(&args.model).map_err(Failure::input)?;
     let input = if args.input.is_dir() {
         RunReader::open(&args.input)

@@ -1,20 +1,21 @@
 //! `cellpos track`: hold a bead, or go to a position, in closed loop.
 
-use crate::cyclic::{self, LearnSpec, Sine};
+use crate::arguments::positive;
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
-use crate::recording::{LiveLine, Recording};
-use crate::rig_file::{ClockKind, Frames, Rig, RigFile};
-use crate::session;
-use crate::setup::{ReferenceSpec, Setup};
+use crate::view_args::ViewArgs;
 use cellpos_control::{ControllerFile, ControllerKind, LearnedTable, SolverKind};
 use cellpos_record::RunWriter;
-use cellpos_runtime::live::Operator;
 use cellpos_runtime::realtime::Conditions;
-use cellpos_runtime::{EndRule, Finished, Life, Summary};
+use cellpos_runtime::{EndRule, Summary};
+use cellpos_session::cyclic::{self, LearnSpec, Sine};
+use cellpos_session::recording::{LiveLine, Recording};
+use cellpos_session::rig_file::{ClockKind, Frames, RigFile};
+use cellpos_session::setup::{Prepared, ReferenceSpec, Setup};
+use cellpos_session::view::{Page, Viewed};
+use cellpos_session::{Ended, Finished, Options, Rig, connect};
 use cellpos_units::{Micrometers, Seconds};
 use serde::Serialize;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 
 /// Arguments of `cellpos track`.
 #[derive(Debug, clap::Args)]
@@ -31,7 +32,7 @@ pub struct Args {
     #[arg(long, allow_hyphen_values = true)]
     target: Micrometers,
     /// How long; left out: until Ctrl-C.
-    #[arg(long)]
+    #[arg(long, value_parser = positive::<Seconds>)]
     duration: Option<Seconds>,
     /// pi, lead, lqg, mpc, or the path of a controller.toml.
     #[arg(long, default_value = "pi")]
@@ -79,6 +80,8 @@ pub struct Args {
     /// Leave no run folder.
     #[arg(long)]
     no_record: bool,
+    #[command(flatten)]
+    view: ViewArgs,
     /// Print one JSON object on standard output.
     #[arg(long)]
     json: bool,
@@ -96,6 +99,7 @@ enum Solver {
 /// What `--json` prints.
 #[derive(Debug, Serialize)]
 struct Report<'a> {
+    ended: &'a Ended,
     #[serde(flatten)]
     summary: &'a Summary,
     target_um: f64,
@@ -117,17 +121,68 @@ pub fn run(args: Args) -> CommandResult {
         file.near_um = Some(near.value());
     }
     let ticks = ticks(args.duration, file.timing.period_us)?;
-    let mut prepared = session::prepare(&args.model, &args.controller, &file)?;
-    let mut rig = session::connect(&file, args.clock, args.frames, &prepared.model)?;
+    let options = Options {
+        clock: args.clock,
+        frames: args.frames,
+        best_effort: args.best_effort,
+    };
+    let mut prepared = connect::prepare(&args.model, &args.controller, &file)?;
     choose_solver(args.solver, &mut prepared.controller)?;
+    let mut rig = Rig::open(file, options)?;
+    rig.fit(&mut prepared);
     let reach = args.sine.map_or(0.0, |sine| sine.amplitude.value());
     for end in [-reach, reach] {
         check_target(Micrometers(args.target.value() + end), &rig)?;
     }
-    session::narrow(&mut prepared, &file, &rig);
     let limits = prepared.controller.limits;
+    let learn = learn(&args, &prepared, rig.file())?;
+    let mut setup = rig.set_up(prepared, reference(&args))?;
+    setup.config.learn = learn;
+    let recording = Recording::new(
+        writer(&args, &rig, &setup)?,
+        (!args.json && !crate::output::settings().quiet).then_some(LiveLine {
+            low_um: limits.low_um,
+            high_um: limits.high_um,
+        }),
+    );
+    let end = EndRule {
+        ticks,
+        ..EndRule::default()
+    };
+    let core = setup.core()?;
+    let mut view = args.view.open(&mut rig, &setup, &page(&args))?;
+    let sink = Viewed::new(recording, view.as_mut());
+    match rig.arm(&setup, core, sink, end) {
+        Ok(armed) => conclude(&args, &setup, armed.start()?.wait()?),
+        Err(not_armed) => {
+            if let Some(writer) = not_armed.sink.into_sink().into_writer() {
+                connect::not_armed(writer, &not_armed.failure);
+            }
+            Err(not_armed.failure)
+        }
+    }
+}
+
+fn page(args: &Args) -> Page {
+    let motion = args.sine.map_or_else(
+        || "hold".to_string(),
+        |sine| format!("sine of {} at {}", sine.amplitude, sine.frequency),
+    );
+    let rig = args.rig.as_ref().map_or_else(
+        || "emulated rig".to_string(),
+        |path| path.display().to_string(),
+    );
+    Page {
+        name: args.name.clone(),
+        subtitle: format!("track: {motion}, {}, {rig}", args.controller),
+        steered: args.sine.is_none(),
+        script: false,
+    }
+}
+
+fn reference(args: &Args) -> ReferenceSpec {
     let centre_um = args.target.value();
-    let reference = match args.sine {
+    match args.sine {
         Some(sine) => ReferenceSpec::Sine {
             centre_um,
             amplitude_um: sine.amplitude.value(),
@@ -137,44 +192,34 @@ pub fn run(args: Args) -> CommandResult {
         None => ReferenceSpec::Hold {
             position_um: centre_um,
         },
-    };
-    // Before the board is armed: its watchdog does not wait for simulations.
+    }
+}
+
+fn learn(args: &Args, prepared: &Prepared, file: &RigFile) -> Result<Option<LearnSpec>, Failure> {
     let table = args
         .learned
         .as_deref()
         .map(cyclic::load_table)
         .transpose()?;
-    let learn = args
-        .sine
+    args.sine
         .filter(|_| args.learn)
-        .map(|sine| LearnSpec::for_sine(&prepared, &file, sine, table))
-        .transpose()?;
-    let mut setup = session::arm(prepared, &file, &mut rig, 1, reference)?;
-    setup.config.learn = learn;
-    let writer = if args.no_record {
-        None
-    } else {
-        let mut inputs = session::inputs(args.rig.as_deref(), &file, &args.model, &args.controller);
-        inputs.extend(args.learned.as_deref());
-        let meta = session::meta(&args.name, args.clock, &inputs, &file, &setup)?;
-        Some(RunWriter::create(&args.runs, meta).map_err(Failure::failed)?)
-    };
-    let recording = Recording::new(
-        writer,
-        (!args.json).then_some(LiveLine {
-            low_um: limits.low_um,
-            high_um: limits.high_um,
-        }),
-    );
-    let operator = Arc::new(Operator::default());
-    session::stop_on_signals(&operator)?;
-    let end = EndRule {
-        ticks,
-        ..EndRule::default()
-    };
-    let core = setup.core()?;
-    let finished = session::drive(core, &mut rig, recording, end, args.best_effort, &operator)?;
-    conclude(&args, &file, &setup, &rig, finished)
+        .map(|sine| LearnSpec::for_sine(prepared, file, sine, table))
+        .transpose()
+}
+
+/// The run folder, unless none is wanted.
+fn writer(args: &Args, rig: &Rig, setup: &Setup) -> Result<Option<RunWriter>, Failure> {
+    if args.no_record {
+        return Ok(None);
+    }
+    let file = rig.file();
+    let mut inputs = connect::inputs(args.rig.as_deref(), file, &args.model, &args.controller);
+    inputs.extend(args.learned.as_deref());
+    let meta = connect::meta(&args.name, args.clock, &inputs, setup, rig)?;
+    let ticks = ticks(args.duration, file.timing.period_us)?;
+    connect::room(&args.runs, ticks, &meta)?;
+    let writer = RunWriter::create(&args.runs, meta).map_err(Failure::failed)?;
+    Ok(Some(writer))
 }
 
 fn ticks(duration: Option<Seconds>, period_us: f64) -> Result<Option<u64>, Failure> {
@@ -209,7 +254,7 @@ fn choose_solver(solver: Option<Solver>, controller: &mut ControllerFile) -> Res
 }
 
 fn check_target(target: Micrometers, rig: &Rig) -> Result<(), Failure> {
-    let [low_um, high_um] = rig.source.info().field_um;
+    let [low_um, high_um] = rig.source().field_um;
     if (low_um..=high_um).contains(&target.value()) {
         return Ok(());
     }
@@ -219,46 +264,39 @@ fn check_target(target: Micrometers, rig: &Rig) -> Result<(), Failure> {
     ))
 }
 
-fn conclude(
-    args: &Args,
-    file: &RigFile,
-    setup: &Setup,
-    rig: &Rig,
-    finished: Finished<Recording>,
-) -> CommandResult {
+fn conclude(args: &Args, setup: &Setup, finished: Finished<Viewed<Recording>>) -> CommandResult {
+    let mut warnings = connect::warnings(&finished);
     let Finished {
-        summary,
+        ended,
+        rig,
+        mut summary,
         conditions,
-        sink,
-        io_error,
         learned,
+        sink,
+        ..
     } = finished;
     // A sine is one motion.
     let learned = learned.into_iter().flatten().next();
-    let mut warnings = rig.warnings.clone();
-    if let Some(error) = &io_error {
-        warnings.push(session::describe(error));
-    }
-    warnings.extend(session::delay_warning(file, &summary));
-    // Parked by the operator is ended as asked.
-    let as_asked = summary.state == Life::Running
-        || summary.safe_reason == Some(cellpos_runtime::SafeReason::Operator);
-    let healthy = as_asked && io_error.is_none();
+    let healthy = ended.as_asked();
     let outcome = if healthy {
         "done"
     } else {
         summary.state.name()
     };
-    let run = sink
+    let kept = sink
+        .into_inner(&summary, &ended.seen)
         .into_writer()
-        .map(|writer| session::finish(writer, outcome, &summary, &mut warnings));
+        .map(|writer| connect::finish(writer, outcome, &mut summary, &conditions, &mut warnings));
+    let whole = kept.as_ref().is_none_or(|kept| kept.whole);
+    let run = kept.map(|kept| kept.run);
     if let (Some(run), Some(table)) = (&run, &learned)
         && let Err(error) = cyclic::save_table(Path::new(run), table)
     {
         warnings.push(format!("no learned.toml: {error}"));
     }
-    let bound_rms_nm = session::bound_rms_nm(file, setup, &summary);
+    let bound_rms_nm = connect::bound_rms_nm(rig.file(), setup, &summary);
     let report = Report {
+        ended: &ended,
         summary: &summary,
         target_um: args.target.value(),
         controller: &args.controller,
@@ -273,7 +311,7 @@ fn conclude(
     } else {
         print_text(&text(&report))?;
     }
-    Ok(if healthy {
+    Ok(if healthy && whole {
         Outcome::Done
     } else {
         Outcome::Broken
@@ -287,23 +325,27 @@ fn text(report: &Report) -> String {
     let mut line = |name: &str, value: String| out.push_str(&format!("{name:<18}{value}\n"));
     line(
         "state",
-        match s.safe_reason {
-            Some(reason) => format!("{} ({reason:?})", s.state.name()),
-            None => s.state.name().to_string(),
-        },
+        format!("{}: {}", s.state.name(), report.ended.seen),
     );
+    if !report.ended.as_asked() {
+        line("expected", report.ended.expected.clone());
+        line("to do", report.ended.to_do.clone());
+    }
     line(
         "duration",
         format!("{:.3} s, {} ticks", s.duration_s, s.counts.ticks),
     );
     line(
         "error, measured",
-        format!("{} RMS after 2 s", nm(s.rms_measured_nm)),
+        format!(
+            "{} RMS from 2 s after the loop was closed until the freeze",
+            nm(s.rms_measured_nm)
+        ),
     );
     if s.rms_true_nm.is_some() {
         line(
             "error, true",
-            format!("{} RMS after 2 s", nm(s.rms_true_nm)),
+            format!("{} RMS, likewise", nm(s.rms_true_nm)),
         );
     }
     line(
@@ -325,13 +367,19 @@ fn text(report: &Report) -> String {
     if let Some(learned) = report.learned {
         line("learning", cyclic::learned_text(learned));
     }
-    if s.counts.plans_reused + s.counts.solver_fallbacks > 0 {
+    if s.counts.plans_stopped + s.counts.plans_reused + s.counts.solver_fallbacks > 0 {
         line(
             "solver",
             format!(
-                "{} ticks on the previous plan, {} on PI",
-                s.counts.plans_reused, s.counts.solver_fallbacks
+                "{} ticks out of time (best feasible point), {} on the previous plan, {} on PI",
+                s.counts.plans_stopped, s.counts.plans_reused, s.counts.solver_fallbacks
             ),
+        );
+    }
+    if s.records_lost > 0 {
+        line(
+            "LOST",
+            format!("{} rows are not on the disk", s.records_lost),
         );
     }
     line("loop delay", format!("{:.2} ms", s.loop_delay_ms));

@@ -1,6 +1,6 @@
 //! Contact sheet: frames of the recording with what was found drawn in.
 
-use cellpos_vision::{Frame, Pixels};
+use cellpos_vision::{Cell, Frame, Pixels};
 use image::{Rgb, RgbImage};
 use std::path::Path;
 
@@ -28,6 +28,16 @@ const DIGITS: [u16; 10] = [
     0b111_101_111_001_111,
 ];
 
+/// A cell on the sheet.
+#[derive(Debug)]
+pub struct CellMark<'a> {
+    pub number: u32,
+    pub cell: Cell,
+    /// Its outline, px.
+    pub outline: &'a [(f64, f64)],
+    pub good: bool,
+}
+
 /// Gathers tiles.
 #[derive(Debug)]
 pub struct Sheet {
@@ -47,12 +57,13 @@ impl Sheet {
         }
     }
 
-    /// Takes the frame `n` if it is one of the sheet's; marks are (number, x, y, radius, good), px.
+    /// Takes the frame `n` if it is one of the sheet's; marks are (number, x, y, radius, good), px; what was refused and
+    /// never numbered has none.
     pub fn add(
         &mut self,
         n: usize,
         frame: &Frame,
-        marks: impl Iterator<Item = (u32, f64, f64, f64, bool)>,
+        marks: impl Iterator<Item = (Option<u32>, f64, f64, f64, bool)>,
     ) {
         if !self.wanted.contains(&n) {
             return;
@@ -65,6 +76,20 @@ impl Sheet {
                 radius_px,
                 if good { GOOD } else { REFUSED },
             );
+        }
+        tile.number(n as u32, (3.0, 3.0), Rgb([255, 220, 60]));
+        self.tiles.push(tile.picture);
+    }
+
+    /// Takes the frame `n` with its cells, if it is one of the sheet's: green or red.
+    pub fn add_cells(&mut self, n: usize, frame: &Frame, cells: &[CellMark<'_>]) {
+        if !self.wanted.contains(&n) {
+            return;
+        }
+        let mut tile = Tile::new(frame);
+        for mark in cells {
+            let colour = if mark.good { GOOD } else { REFUSED };
+            tile.outline(mark.number, &mark.cell, mark.outline, colour);
         }
         tile.number(n as u32, (3.0, 3.0), Rgb([255, 220, 60]));
         self.tiles.push(tile.picture);
@@ -134,7 +159,13 @@ impl Tile {
     }
 
     /// A circle, a small cross and the number; the place is in pixels of the frame.
-    fn mark(&mut self, number: u32, (x_px, y_px): (f64, f64), radius_px: f64, colour: Rgb<u8>) {
+    fn mark(
+        &mut self,
+        number: Option<u32>,
+        (x_px, y_px): (f64, f64),
+        radius_px: f64,
+        colour: Rgb<u8>,
+    ) {
         // A pixel's centre lies half a pixel from its corner.
         let (x, y) = ((x_px + 0.5) * self.scale, (y_px + 0.5) * self.scale);
         let radius = (1.5 * radius_px * self.scale).clamp(3.0, 300.0);
@@ -147,7 +178,29 @@ impl Tile {
             self.dot(x + f64::from(d), y, colour);
             self.dot(x, y + f64::from(d), colour);
         }
-        self.number(number, (x + radius + 2.0, y - 4.0), colour);
+        if let Some(number) = number {
+            self.number(number, (x + radius + 2.0, y - 4.0), colour);
+        }
+    }
+
+    /// A cell's outline and its number.
+    fn outline(&mut self, number: u32, cell: &Cell, outline: &[(f64, f64)], colour: Rgb<u8>) {
+        for (k, a) in outline.iter().enumerate() {
+            let Some(b) = outline.get((k + 1) % outline.len()) else {
+                continue;
+            };
+            let steps = (f64::hypot(b.0 - a.0, b.1 - a.1) * self.scale)
+                .ceil()
+                .max(1.0) as u32;
+            for t in 0..steps {
+                let t = f64::from(t) / f64::from(steps);
+                let at = |a: f64, b: f64| (a + t * (b - a) + 0.5) * self.scale;
+                self.dot(at(a.0, b.0), at(a.1, b.1), colour);
+            }
+        }
+        let beside_px = 0.5 * cell.extent_px((1.0, 0.0)) + 2.0;
+        let (x, y) = (cell.x_px + beside_px + 0.5, cell.y_px + 0.5);
+        self.number(number, (x * self.scale, y * self.scale - 4.0), colour);
     }
 
     fn number(&mut self, number: u32, (x, y): (f64, f64), colour: Rgb<u8>) {

@@ -1,7 +1,8 @@
 //! What `cellpos vision` counts, and the figures it draws from them.
 
-use cellpos_rig::CalibrationFile;
-use cellpos_rig::sources::RecordingInfo;
+use super::vision::Advice;
+use cellpos_drivers::CalibrationFile;
+use cellpos_drivers::sources::RecordingInfo;
 use cellpos_vision::{Cell, Fix, Verdict};
 use serde::Serialize;
 use std::collections::BTreeMap;
@@ -41,6 +42,13 @@ pub struct Summary {
     pub bits: u16,
     /// Frames looked at.
     pub frames: usize,
+    /// Frames of which the numbers are missing.
+    pub lost_frames: u64,
+    /// What is to be said of how the recording was read.
+    pub note: Option<&'static str>,
+    /// Settings found in the recording.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub settings: Option<Advice>,
     /// Beads numbered, or the most cells in a frame.
     pub objects: usize,
     /// Good fixes.
@@ -108,13 +116,7 @@ impl Tally {
     /// A bead's fix in a frame.
     pub fn fix(&mut self, frame: usize, bead: u32, fix: &Fix) {
         if fix.verdict != Verdict::Good {
-            let name = match fix.verdict {
-                Verdict::NoSignal => "no-signal",
-                Verdict::BadFit => "bad-fit",
-                Verdict::AtBorder => "at-border",
-                Verdict::NotConverged | Verdict::Good => "not-converged",
-            };
-            *self.refused.entry(name).or_default() += 1;
+            self.refuse(verdict_name(fix.verdict));
             return;
         }
         self.tracks
@@ -129,6 +131,11 @@ impl Tally {
             let bin = ((c - c.floor()) * BINS as f64) as usize;
             self.subpixel[bin.min(BINS - 1)] += 1;
         }
+    }
+
+    /// Something that was looked at and not taken.
+    pub fn refuse(&mut self, reason: &'static str) {
+        *self.refused.entry(reason).or_default() += 1;
     }
 
     /// A cell.
@@ -174,6 +181,9 @@ impl Tally {
             height_px: info.height_px,
             bits: info.bits,
             frames,
+            lost_frames: info.lost,
+            note: info.note,
+            settings: None,
             objects: if cells.is_some() {
                 self.most_cells
             } else {
@@ -227,6 +237,17 @@ impl Tally {
         }
         // Large steps hide small errors: what lies within two standard errors of nought shows nothing.
         (-sum > 2.0 * f64::sqrt(squares)).then(|| (-sum / n).sqrt())
+    }
+}
+
+/// The word for a verdict.
+pub fn verdict_name(verdict: Verdict) -> &'static str {
+    match verdict {
+        Verdict::Good => "good",
+        Verdict::NoSignal => "no-signal",
+        Verdict::BadFit => "bad-fit",
+        Verdict::AtBorder => "at-border",
+        Verdict::NotConverged => "not-converged",
     }
 }
 

@@ -5,127 +5,17 @@
 //! estimator's gains and the constraints that it has there. The same at the corners of the plant's uncertainty gives the
 //! bound that the convergence test needs.
 
-use crate::control_loop::Controller;
+use crate::controller::{Controller, ControllerConfig, LoopConfig};
 use crate::design::plant::DesignPlant;
 use crate::design::step::SetUpError;
 use crate::learning::{HARMONICS, HIGHEST_PART, HarmonicResponse};
-use crate::loop_io::{ControllerConfig, LoopConfig, LoopInput};
+use crate::loop_io::LoopInput;
 use crate::mpc::SolverKind;
 use crate::reference::{Reference, fill_preview};
 use crate::simulation::{RigConfig, SimulatedRig};
-use cellpos_plant::Model;
+use crate::uncertainty::Uncertainty;
 use nalgebra::{Complex, DMatrix, DVector};
-use serde::{Deserialize, Serialize};
 use std::f64::consts::TAU;
-use std::fmt;
-
-/// Where a margin comes from.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum MarginSource {
-    /// Nothing is known: the fixed margin.
-    Assumed,
-    /// The model's 95 % interval, widened to three standard deviations.
-    Identified,
-    /// The model's interval is narrower than what changes between an identification and a run.
-    Floor,
-}
-
-impl MarginSource {
-    /// The source in words.
-    pub fn text(self) -> &'static str {
-        match self {
-            Self::Assumed => "assumed: the model has no interval for it",
-            Self::Identified => "three standard deviations of the identified model",
-            Self::Floor => "the least, the model being known better",
-        }
-    }
-}
-
-/// How well the plant is known.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Uncertainty {
-    /// The true gain lies between the model's divided and multiplied by this.
-    pub gain_factor: f64,
-    /// Why so much.
-    pub gain_source: MarginSource,
-    /// The true delay lies within this of the loop's, s.
-    pub delay_s: f64,
-    /// Why so much.
-    pub delay_source: MarginSource,
-}
-
-impl Default for Uncertainty {
-    /// For a model without intervals: a third of the gain either way, a third of a tick.
-    fn default() -> Self {
-        Self {
-            gain_factor: 1.3,
-            gain_source: MarginSource::Assumed,
-            delay_s: 0.3e-3,
-            delay_source: MarginSource::Assumed,
-        }
-    }
-}
-
-impl fmt::Display for Uncertainty {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(
-            f,
-            "gain within a factor of {:.2} ({}), delay within {:.2} ms ({})",
-            self.gain_factor,
-            self.gain_source.text(),
-            self.delay_s * 1e3,
-            self.delay_source.text()
-        )
-    }
-}
-
-/// Least factor on the gain: a bead half a micrometre off the middle of a slit of 3 um, where the flow is a tenth slower
-/// (Poiseuille's parabola), is not where it was when the gain was measured.
-const LEAST_GAIN_FACTOR: f64 = 1.1;
-/// Least uncertainty of the delay, s: by so much the wait from a frame's arrival to its command varies with the load of the
-/// machine.
-const LEAST_DELAY_S: f64 = 0.05e-3;
-/// Three standard deviations over the half-width of a 95 % interval.
-const THREE_SD: f64 = 3.0 / 1.96;
-
-impl Uncertainty {
-    /// Margins from the intervals of a model, as `cellpos identify` and `cellpos reconcile` write them: three standard
-    /// deviations of gain and delay, for the delay together with its distance from the delay `loop_delay_s` that the loop
-    /// reckons with (s, without the hold). A quantity without an interval keeps the margin of [`Uncertainty::default`].
-    pub fn of_model(model: &Model, loop_delay_s: f64) -> Self {
-        let mut out = Self::default();
-        let margin = |value: f64, least: f64| {
-            if value > least {
-                (value, MarginSource::Identified)
-            } else {
-                (least, MarginSource::Floor)
-            }
-        };
-        let usable = |[low, high]: &[f64; 2]| low.is_finite() && high.is_finite() && low <= high;
-        let gain = model.intervals.get("gain_per_s").filter(|i| usable(i));
-        // Both ends of one sign; a gain below nought has its ends the other way round.
-        if let Some(&[low, high]) = gain
-            && low * high > 0.0
-        {
-            let half = 0.5 * (high / low).ln().abs();
-            (out.gain_factor, out.gain_source) = margin((THREE_SD * half).exp(), LEAST_GAIN_FACTOR);
-        }
-        let delay = [("time-delay.delay_s", 1.0), ("delay_ms", 1e-3)]
-            .into_iter()
-            .find_map(|(name, unit_s)| {
-                let interval = model.intervals.get(name).filter(|i| usable(i))?;
-                Some(interval.map(|end| end * unit_s))
-            });
-        if let Some([low, high]) = delay {
-            let off = (0.5 * (low + high) - loop_delay_s).abs();
-            (out.delay_s, out.delay_source) =
-                margin(THREE_SD * 0.5 * (high - low) + off, LEAST_DELAY_S);
-        }
-        out
-    }
-}
 
 const SETTLE_TICKS: u64 = 400;
 /// Shortest and longest time over which a response is fitted, ticks: a period, where that lies between.
@@ -166,7 +56,7 @@ impl<R: Reference + ?Sized> Bench<'_, R> {
             seed: 0,
         })?;
         let mut controller = Controller::new(*self.config)?;
-        let mut state = controller.start(plant.neutral_um, plant.neutral_um);
+        controller.start(plant.neutral_um, plant.neutral_um);
         let mut preview = vec![0.0; controller.preview_len()];
         let mut path = Vec::with_capacity(self.fit_ticks as usize);
         for k in 0..self.fit_from() + self.fit_ticks {
@@ -189,7 +79,7 @@ impl<R: Reference + ?Sized> Bench<'_, R> {
                 },
                 ..LoopInput::default()
             };
-            let out = controller.step(&mut state, &input);
+            let out = controller.step(&input);
             rig.advance(out.command_um);
         }
         Ok(path)

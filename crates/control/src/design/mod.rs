@@ -14,8 +14,9 @@ mod search;
 mod spread;
 mod step;
 
+pub use crate::uncertainty::{MarginSource, Uncertainty};
 pub use bound::{bound_rms_um, kalman_posterior_um2};
-pub use learning::{MarginSource, Uncertainty, harmonic_responses};
+pub use learning::harmonic_responses;
 pub use margins::{Margins, margins};
 pub use noise::{NoiseFigures, noise_figures};
 pub use plant::{DesignPlant, DesignWarning};

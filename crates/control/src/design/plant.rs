@@ -2,11 +2,11 @@
 
 use crate::error::BuildError;
 use crate::loop_model::LoopModel;
+use cellpos_plant::effects::Action;
 use cellpos_plant::{
-    DiscretePlant, Effect, Hertz, Model, PlantError, ProbablyPerHertz, Seconds, TransferFunction,
+    DiscretePlant, Hertz, Model, PlantError, ProbablyPerHertz, Seconds, TransferFunction,
     probably_per_hertz,
 };
-use std::f64::consts::TAU;
 use thiserror::Error;
 
 /// Something that the user must know about a design.
@@ -85,7 +85,7 @@ pub struct DesignPlant {
 
 impl DesignPlant {
     /// The linear part of a model, for a loop delay that includes the half sample of hold; `None` takes the delay of
-    /// the model's own effects.
+    /// the model's own effects and of the camera path that it was measured with.
     ///
     /// # Errors
     /// Lags that make the plant's order too high.
@@ -98,20 +98,24 @@ impl DesignPlant {
         let mut warnings = Vec::new();
         let mut dead_s = 0.0;
         for effect in model.ordered_effects() {
-            match effect {
-                Effect::DriverLag { bandwidth_hz } => {
+            match effect.act() {
+                Action::Linear(zpk) if zpk.poles.is_empty() && zpk.zeros.is_empty() => {
+                    plant = plant.scaled(zpk.gain)?;
+                }
+                // One pole is one pole, wherever it sits.
+                Action::Linear(zpk) if zpk.zeros.is_empty() && zpk.poles.len() == 1 => {
+                    let w = -zpk.poles[0].re;
                     plant = plant.series(&TransferFunction::new(
-                        vec![1.0],
-                        vec![1.0 / (TAU * bandwidth_hz), 1.0],
+                        vec![zpk.gain / w],
+                        vec![1.0 / w, 1.0],
                     )?)?;
                 }
-                Effect::GainError { factor } => plant = plant.scaled(*factor)?,
-                Effect::TimeDelay { delay_s } => dead_s += delay_s,
+                Action::Delay(delay_s) => dead_s += delay_s,
                 // Positions are those of mid-exposure: the average adds no delay to the nominal path.
-                Effect::ExposureAveraging { .. } => {}
+                Action::Exposure(_) => {}
                 // Constant drift and range do not change the linear loop; the step figures contain the range.
-                Effect::FlowDrift { .. } => {}
-                other => warnings.push(DesignWarning::EffectLeftOut { id: other.id() }),
+                Action::Block(_) if effect.id() == "flow-drift" => {}
+                _ => warnings.push(DesignWarning::EffectLeftOut { id: effect.id() }),
             }
         }
         let hold_s = 0.5 * sample_time_s;
@@ -126,7 +130,7 @@ impl DesignPlant {
                 }
                 t - hold_s
             }
-            None => dead_s,
+            None => dead_s + model.camera_delay_s.unwrap_or(0.0),
         };
         if let Some(hint) = [1.0, 10.0]
             .iter()

@@ -1,5 +1,6 @@
 //! The whole design in one call: what `cellpos design` prints.
 
+use crate::controller::{Controller, ControllerConfig, LoopConfig};
 use crate::design::bound::bound_rms_um;
 use crate::design::margins::{Margins, margins};
 use crate::design::noise::{NoiseFigures, noise_figures};
@@ -13,7 +14,6 @@ use crate::error::{BuildError, check};
 use crate::estimator::EstimatorConfig;
 use crate::limits::Limits;
 use crate::linear::LinearLaw;
-use crate::loop_io::{ControllerConfig, LoopConfig};
 use crate::pi::{Lead, Pi};
 use crate::toml_file::{self, ConfigError, TomlFile};
 use cellpos_plant::PlantError;
@@ -287,7 +287,7 @@ fn loop_config(
             controller,
             limits,
         };
-        crate::control_loop::ControlLoop::new(config).map(|_| config)
+        Controller::new(config).map(|_| config)
     });
     built
         .map_err(|error| warnings.push(DesignWarning::NoLoop(error)))

@@ -1,9 +1,9 @@
 //! Step and disturbance figures, from the running loop itself (estimator, controller, limits) without noise.
 
-use crate::control_loop::Controller;
+use crate::controller::{Controller, LoopConfig};
 use crate::design::plant::DesignPlant;
 use crate::error::BuildError;
-use crate::loop_io::{LoopConfig, LoopInput};
+use crate::loop_io::LoopInput;
 use crate::simulation::{RigConfig, SimulatedRig};
 use cellpos_plant::PlantError;
 use thiserror::Error;
@@ -73,9 +73,9 @@ fn run(
 ) -> Result<(Vec<f64>, f64), SetUpError> {
     let mut controller = Controller::new(*config)?;
     let mut rig = rig(plant)?;
-    let mut state = controller.start(plant.neutral_um, plant.neutral_um);
+    controller.start(plant.neutral_um, plant.neutral_um);
     let mut preview = vec![0.0; controller.preview_len()];
-    let mut last = state.previous_command_um();
+    let mut last = controller.previous_command_um();
     let mut largest: f64 = 0.0;
     let mut positions = Vec::with_capacity(ticks);
     for k in 0..SETTLE_TICKS + ticks {
@@ -97,7 +97,7 @@ fn run(
             preview_um: &preview,
             ..LoopInput::default()
         };
-        let out = controller.step(&mut state, &input);
+        let out = controller.step(&input);
         if active {
             largest = largest.max((out.command_um - last).abs());
         }

@@ -2,12 +2,6 @@
 
 use super::{Estimator, EstimatorState};
 
-/// Evidence lies on a grid of this many steps per unit, so that it packs into the recorded state beside the flags.
-pub(crate) const EVIDENCE_GRID: f64 = 65_536.0;
-
-/// Ticks after a bead came free for which its speed stays bounded; at most 63, they share a number of the packed state.
-pub(super) const RELEASED_TICKS: u8 = 50;
-
 /// Speed granted in these ticks, over that of a stuck bead.
 const RELEASED_SPEED: f64 = 2.0;
 
@@ -51,8 +45,7 @@ impl Estimator {
             let odds = motion_um * (0.25 * motion_um - still_um) / (2.0 * noise_um2);
             odds.clamp(-MOST, MOST)
         };
-        let evidence = (state.stuck_evidence + odds).clamp(0.0, 25.0);
-        state.stuck_evidence = (evidence * EVIDENCE_GRID).round() / EVIDENCE_GRID;
+        state.stuck_evidence = (state.stuck_evidence + odds).clamp(0.0, 25.0);
         state.stuck = state.stuck_evidence > if state.stuck { 3.0 } else { 12.0 };
     }
 

@@ -4,11 +4,14 @@ use crate::loop_model::{LoopModel, MODES};
 
 /// Deterministic part of the state at one time.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub(crate) struct Moment {
+pub struct PredictedState {
+    /// Integrator part of the position, um.
     pub q: f64,
+    /// Neutral, um.
     pub n: f64,
+    /// Fast modes, um s.
     pub modes: [f64; MODES],
-    /// Command in force just before this time.
+    /// Command in force just before this time, um.
     pub last_um: f64,
 }
 
@@ -39,9 +42,9 @@ impl Transition {
         this
     }
 
-    pub(super) fn advance(&self, m: &Moment, command_um: f64) -> Moment {
+    pub(super) fn advance(&self, m: &PredictedState, command_um: f64) -> PredictedState {
         let drive = command_um - m.n;
-        let mut next = Moment {
+        let mut next = PredictedState {
             q: m.q + self.gain * drive,
             n: m.n,
             modes: m.modes,

@@ -1,6 +1,6 @@
 //! What a learner has learned, as it is kept in files: `learned.toml`.
 
-use crate::design::Uncertainty;
+use crate::uncertainty::Uncertainty;
 use serde::{Deserialize, Serialize};
 
 /// One harmonic of a learned addition: `cos_um cos(2 pi h phase) + sin_um sin(2 pi h phase)`.

@@ -1,28 +1,60 @@
 //! The condensed QP by clarabel, set up once: a tick updates the vectors in place.
+//!
+//! Rows that no problem of this loop can reach are left out, the cost is scaled to one by its largest curvature, and
+//! equilibration and iterative refinement are off: on a problem of this size and scale they cost time and change nothing.
 
-use crate::active_set::{QpEnd, QpMatrices, QpVectors, ROWS, VARS};
+use crate::active_set::{QpEnd, QpMatrices, QpVectors, Stop, VARS};
 use crate::error::BuildError;
 use clarabel::algebra::CscMatrix;
 use clarabel::solver::{
-    DefaultSettingsBuilder, DefaultSolver, IPSolver, SolverStatus, SupportedConeT,
+    DefaultInfo, DefaultSettingsBuilder, DefaultSolver, IPSolver, SolverStatus, SupportedConeT,
 };
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::{AtomicU32, AtomicU64, Ordering};
 use std::time::Instant;
 
 const FAILED: BuildError = BuildError::NoConvergence {
     what: "the set-up of clarabel",
 };
 
+/// Tolerance of gap and residuals, relative to a problem of size one: 1 nm of a plan of some um and better.
+const TOLERANCE: f64 = 1e-7;
+
+/// One side of a row.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Side {
+    pub row: usize,
+    /// The upper bound; otherwise the lower.
+    pub upper: bool,
+}
+
+/// Where a solve has to end; read by the solver after each iteration.
+#[derive(Debug)]
+struct Limit {
+    /// Nanoseconds after `epoch`; `u64::MAX`: none. clarabel's own time limit counts the time of all solves together
+    /// when a solver is reused.
+    deadline_ns: AtomicU64,
+    /// Iterations; `u32::MAX`: none.
+    iterations: AtomicU32,
+    epoch: Instant,
+}
+
+impl Limit {
+    fn is_met(&self, iterations: u32) -> bool {
+        let deadline = self.deadline_ns.load(Ordering::Relaxed);
+        iterations >= self.iterations.load(Ordering::Relaxed)
+            || (deadline != u64::MAX && self.epoch.elapsed().as_nanos() >= u128::from(deadline))
+    }
+}
+
 /// A solver for one pair of matrices.
-pub(crate) struct ClarabelQp {
+pub(super) struct ClarabelQp {
     solver: DefaultSolver<f64>,
+    sides: Vec<Side>,
+    scale: f64,
     linear: Vec<f64>,
     bounds: Vec<f64>,
-    /// Deadline in nanoseconds after `epoch`; `u64::MAX`: none. clarabel's own time limit counts the time of all
-    /// solves together when a solver is reused.
-    deadline_ns: Arc<AtomicU64>,
-    epoch: Instant,
+    limit: Arc<Limit>,
 }
 
 impl std::fmt::Debug for ClarabelQp {
@@ -32,67 +64,82 @@ impl std::fmt::Debug for ClarabelQp {
 }
 
 impl ClarabelQp {
-    pub(crate) fn new(matrices: &QpMatrices) -> Result<Self, BuildError> {
+    /// A solver for the rows of `sides`.
+    pub(super) fn new(matrices: &QpMatrices, sides: Vec<Side>) -> Result<Self, BuildError> {
         let columns =
             |rows: usize, keep: &dyn Fn(usize, usize) -> bool, at: &dyn Fn(usize, usize) -> f64| {
                 let (mut starts, mut indices, mut values) = (vec![0], Vec::new(), Vec::new());
                 for j in 0..VARS {
-                    for i in 0..rows {
-                        if keep(i, j) {
-                            indices.push(i);
-                            values.push(at(i, j));
-                        }
+                    for i in (0..rows).filter(|&i| keep(i, j)) {
+                        indices.push(i);
+                        values.push(at(i, j));
                     }
                     starts.push(indices.len());
                 }
                 CscMatrix::new(rows, VARS, starts, indices, values)
             };
-        let p = columns(VARS, &|i, j| i <= j, &|i, j| matrices.hessian[(i, j)]);
-        let row = |i: usize, j: usize| {
-            let (sign, i) = if i < ROWS { (1.0, i) } else { (-1.0, i - ROWS) };
-            sign * matrices.rows[(i, j)]
+        let scale = 1.0 / matrices.hessian.diagonal().max().max(f64::MIN_POSITIVE);
+        let p = columns(VARS, &|i, j| i <= j, &|i, j| {
+            scale * matrices.hessian[(i, j)]
+        });
+        let count = sides.len();
+        let signed = |i: usize, j: usize| {
+            let Side { row, upper } = sides[i];
+            let value = matrices.rows[(row, j)];
+            if upper { value } else { -value }
         };
-        let a = columns(2 * ROWS, &|i, j| row(i, j) != 0.0, &row);
+        let a = columns(count, &|i, j| signed(i, j) != 0.0, &signed);
         let settings = DefaultSettingsBuilder::default()
             .verbose(false)
             .presolve_enable(false)
+            .equilibrate_enable(false)
+            .iterative_refinement_enable(false)
+            .tol_gap_abs(TOLERANCE)
+            .tol_gap_rel(TOLERANCE)
+            .tol_feas(TOLERANCE)
             .max_iter(60)
             .build()
             .map_err(|_| FAILED)?;
-        let cones = [SupportedConeT::NonnegativeConeT(2 * ROWS)];
-        let (linear, bounds) = (vec![0.0; VARS], vec![1.0; 2 * ROWS]);
+        let cones = [SupportedConeT::NonnegativeConeT(count)];
+        let (linear, bounds) = (vec![0.0; VARS], vec![1.0; count]);
         let mut solver =
             DefaultSolver::new(&p, &linear, &a, &bounds, &cones, settings).map_err(|_| FAILED)?;
         if !solver.is_data_update_allowed() {
             return Err(FAILED);
         }
-        let deadline_ns = Arc::new(AtomicU64::new(u64::MAX));
-        let epoch = Instant::now();
-        let limit = Arc::clone(&deadline_ns);
-        solver.set_termination_callback(move |_: &clarabel::solver::DefaultInfo<f64>| {
-            let limit = limit.load(Ordering::Relaxed);
-            limit != u64::MAX && epoch.elapsed().as_nanos() >= u128::from(limit)
+        let limit = Arc::new(Limit {
+            deadline_ns: AtomicU64::new(u64::MAX),
+            iterations: AtomicU32::new(u32::MAX),
+            epoch: Instant::now(),
         });
+        let told = Arc::clone(&limit);
+        solver
+            .set_termination_callback(move |info: &DefaultInfo<f64>| told.is_met(info.iterations));
         Ok(Self {
             solver,
+            sides,
+            scale,
             linear,
             bounds,
-            deadline_ns,
-            epoch,
+            limit,
         })
     }
 
     /// Solves; gives the end, the iterations and the number of active rows.
-    pub(crate) fn solve(&mut self, v: &QpVectors, deadline: Option<Instant>) -> (QpEnd, u16, u16) {
-        self.linear.copy_from_slice(&v.linear);
-        for row in 0..ROWS {
-            self.bounds[row] = v.high[row];
-            self.bounds[ROWS + row] = -v.low[row];
+    pub(super) fn solve(&mut self, v: &QpVectors, stop: Stop) -> (QpEnd, u16, u16) {
+        for (slot, value) in self.linear.iter_mut().zip(&v.linear) {
+            *slot = self.scale * value;
         }
-        let limit = deadline.map_or(u64::MAX, |at| {
-            u64::try_from(at.saturating_duration_since(self.epoch).as_nanos()).unwrap_or(u64::MAX)
+        for (slot, Side { row, upper }) in self.bounds.iter_mut().zip(&self.sides) {
+            *slot = if *upper { v.high[*row] } else { -v.low[*row] };
+        }
+        let deadline = stop.deadline.map_or(u64::MAX, |at| {
+            let after = at.saturating_duration_since(self.limit.epoch);
+            u64::try_from(after.as_nanos()).unwrap_or(u64::MAX)
         });
-        self.deadline_ns.store(limit, Ordering::Relaxed);
+        self.limit.deadline_ns.store(deadline, Ordering::Relaxed);
+        let iterations = stop.iterations.map_or(u32::MAX, u32::from);
+        self.limit.iterations.store(iterations, Ordering::Relaxed);
         if self.solver.update_q(&self.linear).is_err()
             || self.solver.update_b(&self.bounds).is_err()
         {
@@ -101,20 +148,17 @@ impl ClarabelQp {
         self.solver.solve();
         let solution = &self.solver.solution;
         let iterations = u16::try_from(solution.iterations).unwrap_or(u16::MAX);
+        let mut w = [0.0; VARS];
+        for (w, x) in w.iter_mut().zip(&solution.x) {
+            *w = *x;
+        }
         let end = match solution.status {
-            SolverStatus::Solved | SolverStatus::AlmostSolved
-                if solution.x.iter().all(|x| x.is_finite()) =>
-            {
-                let mut w = [0.0; VARS];
-                for (w, x) in w.iter_mut().zip(&solution.x) {
-                    *w = *x;
-                }
-                QpEnd::Solved(w)
-            }
             SolverStatus::PrimalInfeasible | SolverStatus::AlmostPrimalInfeasible => {
                 QpEnd::Infeasible
             }
-            _ => QpEnd::GaveUp,
+            _ if w.iter().any(|w| !w.is_finite()) => QpEnd::GaveUp,
+            SolverStatus::Solved | SolverStatus::AlmostSolved => QpEnd::Solved(w),
+            _ => QpEnd::Stopped(w),
         };
         // A row counts as active where its multiplier outweighs its slack.
         let active = solution

@@ -1,37 +1,9 @@
 //! A group of adjoining linear blocks, advanced exactly for inputs that are straight lines.
 
+use crate::effects::Segment;
 use crate::modal::{Zpk, residues, separate};
 use crate::phi::phi;
 use nalgebra::Complex;
-
-/// A signal over one piece of time: a straight line, or close enough to one, from `start` to `end`.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub(crate) struct Segment {
-    /// Just after the piece's beginning, um.
-    pub start: f64,
-    /// Just before its end, um.
-    pub end: f64,
-    /// Integral over the piece, um s.
-    pub integral: f64,
-    /// Slope just after the beginning, um/s.
-    pub speed_start: f64,
-    /// Slope just before the end, um/s.
-    pub speed_end: f64,
-}
-
-impl Segment {
-    /// A straight line over `h_s`.
-    pub(crate) fn line(start: f64, end: f64, h_s: f64) -> Self {
-        let speed = if h_s > 0.0 { (end - start) / h_s } else { 0.0 };
-        Self {
-            start,
-            end,
-            integral: 0.5 * (start + end) * h_s,
-            speed_start: speed,
-            speed_end: speed,
-        }
-    }
-}
 
 /// What one mode does over a piece of one length.
 #[derive(Debug, Clone, Copy)]

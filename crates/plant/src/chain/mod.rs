@@ -7,18 +7,13 @@
 //!
 //! Not here: what the camera makes of the position (see [`crate::Simulator`]).
 
-mod blocks;
 mod compile;
 mod linear;
 
-pub(crate) use compile::linear_part;
-
-use crate::effect::EffectError;
+use crate::effects::{EffectError, Segment};
 use crate::model::Model;
 use crate::random::Gaussian;
-use blocks::Block;
 use compile::{Compiled, Stage};
-use linear::Segment;
 
 /// A model that cannot be run.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
@@ -140,6 +135,11 @@ impl Chain {
     /// As [`Self::new`].
     pub fn with_brownian_motion(model: &Model, seed: u64) -> Result<Self, ChainError> {
         let mut chain = Self::new(model)?;
+        for (i, stage) in chain.compiled.stages.iter_mut().enumerate() {
+            if let Stage::Block(block) = stage {
+                block.seed(seed.wrapping_add(0x632b_e59b_d9b4_e019_u64.wrapping_mul(i as u64 + 1)));
+            }
+        }
         chain.brownian = Some(Brownian {
             diffusion_um2_per_s: model.noise.diffusion_um2_per_s,
             gaussian: Gaussian::new(seed),
@@ -167,6 +167,9 @@ impl Chain {
                 Stage::Linear(group) => group.reset(),
                 Stage::Block(block) => block.reset(),
             }
+        }
+        for group in &mut self.compiled.bypass {
+            group.reset();
         }
         self.time_s = 0.0;
         self.command_um = 0.0;
@@ -234,12 +237,25 @@ impl Chain {
     fn piece(&mut self, h_s: f64, start: f64, end: f64) {
         let want = self.compiled.needs_slopes || self.wants_area;
         let mut signal = Segment::line(start, end, h_s);
-        for stage in &mut self.compiled.stages {
+        let mut beside = Segment::default();
+        for (i, stage) in self.compiled.stages.iter_mut().enumerate() {
+            if i == self.compiled.plant {
+                for group in &mut self.compiled.bypass {
+                    let way = group.advance(h_s, signal, want);
+                    beside.start += way.start;
+                    beside.end += way.end;
+                    beside.integral += way.integral;
+                    beside.speed_start += way.speed_start;
+                    beside.speed_end += way.speed_end;
+                }
+            }
             signal = match stage {
                 Stage::Linear(group) => group.advance(h_s, signal, want),
                 Stage::Block(block) => block.advance(self.time_s, h_s, signal),
             };
         }
+        signal.end += beside.end;
+        signal.integral += beside.integral;
         self.output = signal;
         if self.wants_area {
             self.area_um_s += signal.integral + h_s * self.offset_um;
@@ -296,12 +312,7 @@ impl Chain {
         for stage in &self.compiled.stages {
             match stage {
                 Stage::Linear(group) => speed = group.speed(),
-                Stage::Block(Block::GainDrift { per_s, .. }) => {
-                    speed *= 1.0 + per_s * self.time_s;
-                }
-                Stage::Block(Block::FlowDrift { speed: drift }) => speed += drift,
-                Stage::Block(Block::Dissolving { speed: own, .. }) => speed = *own,
-                Stage::Block(_) => {}
+                Stage::Block(block) => speed = block.speed(self.time_s, speed),
             }
         }
         speed

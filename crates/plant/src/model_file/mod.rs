@@ -8,8 +8,7 @@ mod tests;
 
 pub(crate) use write::write;
 
-use crate::effect::{EFFECT_IDS, Effect, EffectError, Hysteresis, ParameterSpec};
-use crate::effect::{play_lists, specs};
+use crate::effects::{self, Effect, EffectError, ParameterSpec};
 use crate::error::{ModelError, ModelProblem, Position};
 use crate::model::{Covariance, Model, Noise};
 use crate::transfer::TransferFunction;
@@ -18,15 +17,7 @@ use table::{Table, Value, nearest};
 use toml::de::DeTable;
 
 const fn range(unit: &'static str, lower: f64, upper: f64) -> ParameterSpec {
-    ParameterSpec {
-        name: "",
-        unit,
-        lower,
-        upper,
-        log_scaled: false,
-        fixed: false,
-        default: None,
-    }
+    ParameterSpec::new("", unit, lower, upper)
 }
 
 /// Any finite number.
@@ -35,19 +26,20 @@ const WORKING_POINT: ParameterSpec = range("um", -1e4, 1e4);
 const DIFFUSION: ParameterSpec = range("um^2/s", 0.0, 1e4);
 const LOCALISATION: ParameterSpec = range("um", 0.0, 100.0);
 
-const TOP: [&str; 9] = [
+const CAMERA_DELAY: ParameterSpec = range("ms", 0.0, 1000.0);
+
+const TOP: [&str; 10] = [
     "name",
     "description",
     "working_point_um",
     "plant",
     "effects",
     "noise",
+    "camera",
     "covariance",
     "intervals",
     "provenance",
 ];
-
-const HYSTERESIS_FORMS: [&str; 3] = ["bouc-wen", "bouc-wen-explicit", "play"];
 
 pub(crate) fn read(text: &str, file: &str) -> Result<Model, ModelError> {
     let document = DeTable::parse(text).map_err(|error| ModelError {
@@ -96,6 +88,15 @@ pub(crate) fn read(text: &str, file: &str) -> Result<Model, ModelError> {
         None => Noise::NONE,
         Some(v) => read_noise(&top.table("noise", v)?)?,
     };
+    let camera_delay_s = match top.get("camera") {
+        None => None,
+        Some(v) => {
+            let table = top.table("camera", v)?;
+            table.only(&["delay_ms"])?;
+            let delay = table.need("delay_ms", "the delay of the camera path, for example 2.0")?;
+            Some(1e-3 * table.number("delay_ms", delay, &CAMERA_DELAY)?)
+        }
+    };
     let covariance = top
         .get("covariance")
         .map(|v| read_covariance(&top.table("covariance", v)?))
@@ -125,6 +126,7 @@ pub(crate) fn read(text: &str, file: &str) -> Result<Model, ModelError> {
         working_point_um,
         effects,
         noise,
+        camera_delay_s,
         covariance,
         intervals,
         provenance,
@@ -230,40 +232,34 @@ fn read_effect(table: &Table<'_, '_>) -> Result<Effect, ModelError> {
             },
         )
     };
+    let ids = effects::ids();
     let id_value = table.need(
         "id",
-        format!("the name of the effect, one of {}", EFFECT_IDS.join(", ")),
+        format!("the name of the effect, one of {}", ids.join(", ")),
     )?;
     let id = table.text_of("id", id_value)?;
+    let Some(kind) = effects::find(&id) else {
+        return Err(unknown("id", id_value, id, &ids));
+    };
+    let forms = kind.spec().forms;
     let mut known = vec!["id"];
-    let form = if id == "pzt-hysteresis" {
+    let mut form = 0;
+    if forms.len() > 1 {
         known.push("form");
-        match table.get("form") {
-            None => Some("bouc-wen".to_owned()),
-            Some(v) => {
-                let form = table.text_of("form", v)?;
-                if !HYSTERESIS_FORMS.contains(&form.as_str()) {
-                    return Err(unknown("form", v, form, &HYSTERESIS_FORMS));
-                }
-                Some(form)
-            }
+        if let Some(v) = table.get("form") {
+            let name = table.text_of("form", v)?;
+            let names: Vec<&str> = forms.iter().map(|f| f.name).collect();
+            let Some(found) = names.iter().position(|n| *n == name) else {
+                return Err(unknown("form", v, name, &names));
+            };
+            form = found;
         }
-    } else {
-        None
-    };
-    let Some(specs) = specs(&id, form.as_deref()) else {
-        return Err(unknown("id", id_value, id, &EFFECT_IDS));
-    };
-    known.extend(specs.iter().map(|s| s.name));
-    let lists = if form.as_deref() == Some("play") {
-        play_lists()
-    } else {
-        &[]
-    };
-    known.extend(lists.iter().map(|s| s.name));
+    }
+    let specs = &forms[form];
+    known.extend(specs.scalars.iter().chain(specs.lists).map(|s| s.name));
     table.only(&known)?;
-    let mut scalars = Vec::with_capacity(specs.len());
-    for spec in specs {
+    let mut scalars = Vec::with_capacity(specs.scalars.len());
+    for spec in specs.scalars {
         scalars.push(match (table.get(spec.name), spec.default) {
             (Some(v), _) => table.number(spec.name, v, spec)?,
             (None, Some(default)) => default,
@@ -277,28 +273,22 @@ fn read_effect(table: &Table<'_, '_>) -> Result<Effect, ModelError> {
                     "effect {id} needs it, a number in {}..{} ({unit})",
                     spec.lower, spec.upper
                 );
-                return Err(table
-                    .need(spec.name, what)
-                    .err()
-                    .unwrap_or_else(|| unknown("id", id_value, id.clone(), &EFFECT_IDS)));
+                let value = table.need(spec.name, what)?;
+                table.number(spec.name, value, spec)?
             }
         });
     }
-    let mut effect = Effect::from_scalars(&id, form.as_deref(), &scalars)
-        .ok_or_else(|| unknown("id", id_value, id.clone(), &EFFECT_IDS))?;
-    if let Effect::PztHysteresis(Hysteresis::Play {
-        thresholds_um,
-        weights,
-        ..
-    }) = &mut effect
-    {
-        for (spec, values) in lists.iter().zip([thresholds_um, weights]) {
-            let value = table.need(spec.name, "a list of numbers, one per play operator")?;
-            *values = table.list(spec.name, value, "a list of numbers", |name, v| {
+    let mut lists = Vec::with_capacity(specs.lists.len());
+    for spec in specs.lists {
+        let value = table.need(spec.name, "a list of numbers, one per play operator")?;
+        lists.push(
+            table.list(spec.name, value, "a list of numbers", |name, v| {
                 table.number(name, v, spec)
-            })?;
-        }
+            })?,
+        );
     }
+    let lists: Vec<&[f64]> = lists.iter().map(Vec::as_slice).collect();
+    let effect = Effect::new(kind, form, &scalars, &lists);
     effect.validate().map_err(|error| {
         let message = match error {
             EffectError::Inconsistent { message, .. } => {

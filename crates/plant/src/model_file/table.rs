@@ -1,6 +1,6 @@
 //! A table of a TOML file, with what is needed to say where in the file something is wrong.
 
-use crate::effect::ParameterSpec;
+use crate::effects::ParameterSpec;
 use crate::error::{ModelError, ModelProblem, Position};
 use std::ops::Range;
 use toml::Spanned;

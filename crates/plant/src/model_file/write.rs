@@ -1,6 +1,5 @@
 //! A model as the text of a TOML file.
 
-use crate::effect::{Effect, Hysteresis};
 use crate::model::Model;
 use std::fmt::Write as _;
 
@@ -75,6 +74,10 @@ pub(crate) fn write(model: &Model) -> String {
         "localisation_um = {}",
         float(model.noise.localisation_um)
     ));
+    if let Some(delay_s) = model.camera_delay_s {
+        line("\n# from the middle of an exposure to the tick that uses it: camera_delay_ms of rig.toml; no part of the plant\n[camera]".to_owned());
+        line(format!("delay_ms = {}", float(delay_s * 1e3)));
+    }
     for effect in &model.effects {
         line(format!(
             "\n[[effects]] # {}\nid = \"{}\"",
@@ -89,14 +92,12 @@ pub(crate) fn write(model: &Model) -> String {
                 line(format!("{} = {}", p.name, float(p.value)));
             }
         }
-        if let Effect::PztHysteresis(Hysteresis::Play {
-            thresholds_um,
-            weights,
-            ..
-        }) = effect
+        for (i, list) in effect.kind().spec().forms[effect.form_index()]
+            .lists
+            .iter()
+            .enumerate()
         {
-            line(format!("thresholds_um = {}", floats(thresholds_um)));
-            line(format!("weights = {}", floats(weights)));
+            line(format!("{} = {}", list.name, floats(effect.list(i))));
         }
     }
     if let Some(covariance) = &model.covariance {

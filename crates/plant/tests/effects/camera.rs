@@ -5,7 +5,7 @@ use super::*;
 #[test]
 fn a_delay_shifts_the_phase_by_360_f_d_and_leaves_the_gain() {
     for delay_s in [2e-3, 1.5e-3, 0.37e-3] {
-        let model = Model::eq6().with_effect(Effect::TimeDelay { delay_s });
+        let model = Model::eq6().with_effect(effects::time_delay(delay_s));
         // The held command has images; on a fine grid the delay must be exact to the sample.
         let u: Vec<f64> = sine(20.0, 1.0, 1e-3, 400).iter().map(|u| u + 4.0).collect();
         let fine: Vec<f64> = u.iter().flat_map(|u| [*u; 100]).collect();
@@ -19,7 +19,7 @@ fn a_delay_shifts_the_phase_by_360_f_d_and_leaves_the_gain() {
     }
     // Whole samples: the phase, to rounding.
     for f in [5.0, 50.0, 300.0] {
-        let model = Model::eq6().with_effect(Effect::TimeDelay { delay_s: 2e-3 });
+        let model = Model::eq6().with_effect(effects::time_delay(2e-3));
         let phase = -TAU * f * 2e-3;
         let ratio = relative_response(&model, f, 0.5) * Complex::from_polar(1.0, -phase);
         assert!((ratio - 1.0).norm() < 2e-3, "{f} {ratio}");
@@ -32,8 +32,8 @@ fn an_exposure_is_the_exact_mean_of_the_position_over_the_exposure() {
     let u: Vec<f64> = sine(37.0, 1.0, 1e-3, 100).iter().map(|u| u + 4.0).collect();
     for delay_s in [0.0, 0.25e-3, 2e-3] {
         let model = Model::eq6()
-            .with_effect(Effect::ExposureAveraging { exposure_s })
-            .with_effect(Effect::TimeDelay { delay_s });
+            .with_effect(effects::exposure_averaging(exposure_s))
+            .with_effect(effects::time_delay(delay_s));
         let got = run(&model, &u, 1e-3);
         let mut chain = Chain::new(&Model::eq6()).unwrap();
         let mut fine = vec![0.0];
@@ -65,7 +65,7 @@ fn an_exposure_has_the_gain_of_a_sinc_and_half_the_exposure_as_delay() {
             .iter()
             .map(|u| u + 4.0)
             .collect();
-        let with = Model::eq6().with_effect(Effect::ExposureAveraging { exposure_s });
+        let with = Model::eq6().with_effect(effects::exposure_averaging(exposure_s));
         let ratio = harmonic(&run(&with, &u, sample_s), f, sample_s, n)
             / harmonic(&run(&Model::eq6(), &u, sample_s), f, sample_s, n);
         let x = PI * f * exposure_s;
@@ -80,7 +80,7 @@ fn an_exposure_has_the_gain_of_a_sinc_and_half_the_exposure_as_delay() {
 #[test]
 fn a_skewed_clock_errs_in_proportion_to_time_and_frequency() {
     let ppm = 400.0;
-    let model = Model::eq6().with_effect(Effect::ClockSkew { ppm });
+    let model = Model::eq6().with_effect(effects::clock_skew(ppm));
     let u: Vec<f64> = sine(10.0, 1.0, 1e-3, 4000)
         .iter()
         .map(|u| u + 4.0)
@@ -103,18 +103,14 @@ fn a_skewed_clock_errs_in_proportion_to_time_and_frequency() {
     }
     // The last rows lie beyond the record: the last command is held for them.
     assert!(k > 3990);
-    let other = Model::eq6().with_effect(Effect::ClockSkew { ppm: -400.0 });
+    let other = Model::eq6().with_effect(effects::clock_skew(-400.0));
     let y = run(&other, &u, 1e-3);
     assert!((y[3999] - skewed[3999]).abs() > 1e-3);
 }
 
 #[test]
 fn pixel_locking_is_periodic_in_position() {
-    let model = unity().with_effect(Effect::PixelLocking {
-        pixel_um: 0.2,
-        amplitude: 0.05,
-        phase_deg: 30.0,
-    });
+    let model = unity().with_effect(effects::pixel_locking(0.2, 0.05, 30.0));
     let u: Vec<f64> = (0..200).map(|k| 0.013 * k as f64).collect();
     for (y, x) in run(&model, &u, 1e-3).iter().skip(1).zip(&u) {
         let expected = x + 0.05 * 0.2 * (TAU * x / 0.2 + PI / 6.0).sin();
@@ -124,11 +120,7 @@ fn pixel_locking_is_periodic_in_position() {
 
 #[test]
 fn hum_is_a_line_that_does_not_know_the_input() {
-    let hum = Effect::MainsHum {
-        hz: 50.0,
-        um: 0.15,
-        phase_deg: 90.0,
-    };
+    let hum = effects::mains_hum(50.0, 0.15, 90.0);
     let model = Model::eq6().with_effect(hum);
     let moved: Vec<f64> = sine(7.0, 1.0, 1e-3, 300).iter().map(|u| u + 4.0).collect();
     for u in [vec![4.0; 300], moved] {

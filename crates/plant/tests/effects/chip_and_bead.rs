@@ -5,7 +5,7 @@ use super::*;
 #[test]
 fn relaxation_is_a_step_in_gain_with_a_bump_in_phase_at_its_frequency() {
     let (time_s, strength) = (0.2, 0.3);
-    let model = Model::eq6().with_effect(Effect::PdmsRelaxation { time_s, strength });
+    let model = Model::eq6().with_effect(effects::pdms_relaxation(time_s, strength));
     let ratio = |f: f64| model.linear_response(Hertz(f)) / Model::eq6().linear_response(Hertz(f));
     let corner = 1.0 / (TAU * time_s);
     assert!((ratio(corner / 100.0).norm() - 1.0).abs() < 1e-3);
@@ -16,7 +16,7 @@ fn relaxation_is_a_step_in_gain_with_a_bump_in_phase_at_its_frequency() {
     assert!(bump > ratio(3.0 * corner).arg() && bump > ratio(corner / 3.0).arg());
     // In time: a step in displacement gives 1 + strength exp(-t/time) of it.
     let y = run(
-        &unity().with_effect(Effect::PdmsRelaxation { time_s, strength }),
+        &unity().with_effect(effects::pdms_relaxation(time_s, strength)),
         &[1.0; 300],
         1e-3,
     );
@@ -29,23 +29,12 @@ fn relaxation_is_a_step_in_gain_with_a_bump_in_phase_at_its_frequency() {
 #[test]
 fn a_bubble_is_an_extra_pole_and_fades_when_it_dissolves() {
     let lag_s = 3e-3;
-    let lasting = unity().with_effect(Effect::Bubble {
-        lag_s,
-        dissolution_per_s: 0.0,
-    });
+    let lasting = unity().with_effect(effects::bubble(lag_s, 0.0));
     for (k, y) in run(&lasting, &[1.0; 20], 1e-3).iter().enumerate() {
         assert!((y - (1.0 - (-(k as f64) * 1e-3 / lag_s).exp())).abs() < 1e-11);
     }
-    let dissolving = Model::eq6().with_effect(Effect::Bubble {
-        lag_s,
-        dissolution_per_s: 0.5,
-    });
-    let constant = |lag: f64| {
-        Model::eq6().with_effect(Effect::Bubble {
-            lag_s: lag,
-            dissolution_per_s: 0.0,
-        })
-    };
+    let dissolving = Model::eq6().with_effect(effects::bubble(lag_s, 0.5));
+    let constant = |lag: f64| Model::eq6().with_effect(effects::bubble(lag, 0.0));
     let n = 8000;
     let u: Vec<f64> = sine(50.0, 1.0, 1e-3, n).iter().map(|u| u + 4.0).collect();
     let y = run(&dissolving, &u, 1e-3);
@@ -63,9 +52,7 @@ fn a_bubble_is_an_extra_pole_and_fades_when_it_dissolves() {
 
 #[test]
 fn a_leak_lets_a_step_sag_exponentially_to_zero() {
-    let model = unity().with_effect(Effect::Leak {
-        corner_rad_per_s: 2.0,
-    });
+    let model = unity().with_effect(effects::leak(2.0));
     for (k, y) in run(&model, &[1.0; 500], 1e-3).iter().enumerate().skip(1) {
         assert!((y - (-2.0 * k as f64 * 1e-3).exp()).abs() < 1e-12);
     }
@@ -75,7 +62,7 @@ fn a_leak_lets_a_step_sag_exponentially_to_zero() {
 
 #[test]
 fn a_gain_error_is_the_same_at_all_frequencies_amplitudes_and_times() {
-    let model = Model::eq6().with_effect(Effect::GainError { factor: 1.7 });
+    let model = Model::eq6().with_effect(effects::gain_error(1.7));
     let u: Vec<f64> = sine(13.0, 1.0, 1e-3, 500).iter().map(|u| u + 4.0).collect();
     for (a, b) in run(&model, &u, 1e-3)
         .iter()
@@ -90,11 +77,7 @@ fn a_gain_drift_multiplies_the_velocity_by_one_plus_r_t() {
     let r = 0.05;
     let u: Vec<f64> = sine(3.0, 1.0, 1e-3, 2000).iter().map(|u| u + 4.0).collect();
     let plain = run(&Model::eq6(), &u, 1e-3);
-    let drifting = run(
-        &Model::eq6().with_effect(Effect::GainDrift { per_s: r }),
-        &u,
-        1e-3,
-    );
+    let drifting = run(&Model::eq6().with_effect(effects::gain_drift(r)), &u, 1e-3);
     // Increment by increment: the mean of 1 + r t over the row weights the increment, but for its slope.
     for k in 1..2000 {
         let factor = 1.0 + r * (k as f64 - 0.5) * 1e-3;
@@ -110,9 +93,7 @@ fn a_gain_drift_multiplies_the_velocity_by_one_plus_r_t() {
 fn adhesion_holds_the_bead_below_its_speed_and_lets_it_lag_above() {
     let mut model = Model::eq6();
     model.plant = TransferFunction::integrator(400.0).unwrap();
-    let stuck = model.clone().with_effect(Effect::WallAdhesion {
-        speed_um_per_s: 35.0,
-    });
+    let stuck = model.clone().with_effect(effects::wall_adhesion(35.0));
     // 0.08 um gives 32 um/s: stuck. 0.5 um gives 200 um/s: 165 are left.
     let y = run(&stuck, &[4.08; 50], 1e-3);
     assert!(y.iter().all(|y| *y == 0.0));
@@ -138,10 +119,8 @@ fn adhesion_within_a_step_is_exact_when_the_flow_reverses_in_it() {
     let mut model = Model::eq6();
     model.plant = TransferFunction::integrator(400.0).unwrap();
     let stuck = model
-        .with_effect(Effect::DriverLag { bandwidth_hz: 20.0 })
-        .with_effect(Effect::WallAdhesion {
-            speed_um_per_s: 35.0,
-        });
+        .with_effect(effects::driver_lag(20.0))
+        .with_effect(effects::wall_adhesion(35.0));
     let mut chain = Chain::new(&stuck).unwrap();
     chain.advance(5.0, 0.05);
     let up = chain.bead_um();
@@ -160,12 +139,10 @@ fn adhesion_within_a_step_is_exact_when_the_flow_reverses_in_it() {
 
 #[test]
 fn drift_is_a_ramp_at_rest_too_and_does_not_unstick_a_held_bead() {
-    let model = Model::eq6().with_effect(Effect::FlowDrift { um_per_s: 8.0 });
+    let model = Model::eq6().with_effect(effects::flow_drift(8.0));
     let y = run(&model, &[4.0; 1000], 1e-3);
     assert!((y[999] - 8.0 * 0.999).abs() < 1e-9);
     // The flow that adhesion sees includes the drift.
-    let held = model.with_effect(Effect::WallAdhesion {
-        speed_um_per_s: 10.0,
-    });
+    let held = model.with_effect(effects::wall_adhesion(10.0));
     assert!(run(&held, &[4.0; 100], 1e-3).iter().all(|y| *y == 0.0));
 }

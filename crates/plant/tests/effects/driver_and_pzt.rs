@@ -4,9 +4,7 @@ use super::*;
 
 #[test]
 fn a_driver_lag_is_an_exponential_with_its_time_constant() {
-    let model = unity().with_effect(Effect::DriverLag {
-        bandwidth_hz: 100.0,
-    });
+    let model = unity().with_effect(effects::driver_lag(100.0));
     let y = run(&model, &[1.0; 20], 1e-3);
     for (k, y) in y.iter().enumerate() {
         let expected = 1.0 - (-TAU * 100.0 * k as f64 * 1e-3).exp();
@@ -16,9 +14,7 @@ fn a_driver_lag_is_an_exponential_with_its_time_constant() {
 
 #[test]
 fn a_slew_limit_makes_straight_ramps_and_passes_slower_inputs_untouched() {
-    let model = unity().with_effect(Effect::SlewLimit {
-        rate_um_per_s: 250.0,
-    });
+    let model = unity().with_effect(effects::slew_limit(250.0));
     let y = run(&model, &[1.0; 8], 1e-3);
     for (y, expected) in y.iter().zip([0.0, 0.25, 0.5, 0.75, 1.0, 1.0]) {
         assert!((y - expected).abs() < 1e-12);
@@ -51,9 +47,7 @@ fn a_slew_limit_makes_straight_ramps_and_passes_slower_inputs_untouched() {
 #[test]
 fn a_slew_ramp_drives_the_plant_exactly() {
     // The corner falls within a sample; a 1 us grid with the ramp as commands is the reference.
-    let model = Model::eq6().with_effect(Effect::SlewLimit {
-        rate_um_per_s: 700.0,
-    });
+    let model = Model::eq6().with_effect(effects::slew_limit(700.0));
     let mut chain = Chain::new(&model).unwrap();
     let mut reference = Chain::new(&Model::eq6()).unwrap();
     for _ in 0..4 {
@@ -69,10 +63,7 @@ fn a_slew_ramp_drives_the_plant_exactly() {
 
 #[test]
 fn saturation_clips_to_absolute_levels_and_the_camera_sees_flat_tops() {
-    let mut model = unity().with_effect(Effect::Saturation {
-        low_um: 3.5,
-        high_um: 5.0,
-    });
+    let mut model = unity().with_effect(effects::saturation(3.5, 5.0));
     model.working_point_um = 4.0;
     let u: Vec<f64> = sine(10.0, 2.0, 1e-3, 200).iter().map(|u| u + 4.0).collect();
     let y = run(&model, &u, 1e-3);
@@ -180,7 +171,7 @@ fn many_play_operators_show_rayleighs_third_harmonic_one_fifth_of_the_quadrature
 #[test]
 fn creep_gains_its_share_per_decade_and_lags_by_39_degrees_times_it() {
     let g = 0.02;
-    let model = unity().with_effect(Effect::PztCreep { per_decade: g });
+    let model = unity().with_effect(effects::pzt_creep(g));
     let mut chain = Chain::new(&model).unwrap();
     let mut now = 0.0;
     for t in [1e-3, 1e-2, 0.1, 1.0, 10.0, 100.0, 300.0] {
@@ -204,7 +195,7 @@ fn creep_gains_its_share_per_decade_and_lags_by_39_degrees_times_it() {
 
 #[test]
 fn negative_creep_is_the_same_law_with_the_sign_reversed() {
-    let model = unity().with_effect(Effect::PztCreep { per_decade: -0.05 });
+    let model = unity().with_effect(effects::pzt_creep(-0.05));
     let mut chain = Chain::new(&model).unwrap();
     chain.advance(1.0, 10.0);
     assert!((chain.bead_um() - 0.9).abs() < 0.002, "{}", chain.bead_um());
@@ -213,10 +204,7 @@ fn negative_creep_is_the_same_law_with_the_sign_reversed() {
 #[test]
 fn a_resonance_rings_at_its_frequency_with_its_damping() {
     let (f, zeta) = (200.0, 0.05);
-    let model = unity().with_effect(Effect::PztResonance {
-        frequency_hz: f,
-        damping: zeta,
-    });
+    let model = unity().with_effect(effects::pzt_resonance(f, zeta));
     let y = run(&model, &[1.0; 50], 1e-3);
     let (w, wd) = (TAU * f, TAU * f * (1.0 - zeta * zeta).sqrt());
     for (k, y) in y.iter().enumerate() {
@@ -229,10 +217,7 @@ fn a_resonance_rings_at_its_frequency_with_its_damping() {
     assert!((peak.norm() - 1.0 / (2.0 * zeta)).abs() < 1e-9);
     assert!((peak.arg().to_degrees() + 90.0).abs() < 1e-9);
     // Critically damped: a double pole.
-    let model = unity().with_effect(Effect::PztResonance {
-        frequency_hz: f,
-        damping: 1.0,
-    });
+    let model = unity().with_effect(effects::pzt_resonance(f, 1.0));
     for (k, y) in run(&model, &[1.0; 20], 1e-3).iter().enumerate() {
         let wt = w * k as f64 * 1e-3;
         assert!((y - (1.0 - (1.0 + wt) * (-wt).exp())).abs() < 1e-8);
@@ -241,7 +226,7 @@ fn a_resonance_rings_at_its_frequency_with_its_damping() {
 
 #[test]
 fn backlash_is_flat_after_reversals_and_matters_less_for_larger_strokes() {
-    let model = unity().with_effect(Effect::Backlash { width_um: 0.4 });
+    let model = unity().with_effect(effects::backlash(0.4));
     let y = run(&model, &[1.0, 0.9, 0.7, 0.5, -1.0, -0.9, 0.0], 1e-3);
     for (y, expected) in y.iter().zip([0.0, 0.8, 0.8, 0.8, 0.7, -0.8, -0.8]) {
         assert!((y - expected).abs() < 1e-12);

@@ -3,10 +3,11 @@
 mod camera;
 mod chip_and_bead;
 mod driver_and_pzt;
+mod further;
 mod model;
 
 use cellpos_plant::{
-    Chain, Complex, Effect, Hertz, Hysteresis, Model, SimulateOptions, TransferFunction, simulate,
+    Chain, Complex, Effect, Hertz, Model, SimulateOptions, TransferFunction, effects, simulate,
     simulate_at,
 };
 use std::f64::consts::{PI, TAU};
@@ -56,26 +57,13 @@ fn relative_response(model: &Model, f: f64, amplitude: f64) -> Complex<f64> {
 }
 
 fn play(thresholds_um: Vec<f64>, weights: Vec<f64>, quadratic_per_um: f64) -> Effect {
-    Effect::PztHysteresis(Hysteresis::Play {
-        thresholds_um,
-        weights,
-        quadratic_per_um,
-    })
+    effects::play(&thresholds_um, &weights, quadratic_per_um)
 }
 
 fn bouc_wen(explicit: bool) -> Effect {
-    let (fraction, beta_per_um, gamma_per_um) = (0.3, 0.9, 0.2);
-    Effect::PztHysteresis(if explicit {
-        Hysteresis::BoucWenExplicit {
-            fraction,
-            beta_per_um,
-            gamma_per_um,
-        }
+    if explicit {
+        effects::bouc_wen_explicit(0.3, 0.9, 0.2)
     } else {
-        Hysteresis::BoucWen {
-            fraction,
-            beta_per_um,
-            gamma_per_um,
-        }
-    })
+        effects::bouc_wen(0.3, 0.9, 0.2)
+    }
 }

@@ -4,13 +4,9 @@ use super::*;
 
 #[test]
 fn a_model_means_the_same_in_whatever_order_its_effects_are_written() {
-    let a = Effect::DriverLag {
-        bandwidth_hz: 150.0,
-    };
+    let a = effects::driver_lag(150.0);
     let b = bouc_wen(false);
-    let c = Effect::WallAdhesion {
-        speed_um_per_s: 20.0,
-    };
+    let c = effects::wall_adhesion(20.0);
     let u: Vec<f64> = sine(9.0, 1.0, 1e-3, 300).iter().map(|u| u + 4.0).collect();
     let one = Model::eq6()
         .with_effect(a.clone())
@@ -23,14 +19,10 @@ fn a_model_means_the_same_in_whatever_order_its_effects_are_written() {
 #[test]
 fn sub_steps_are_fine_enough_for_hysteresis_behind_a_lag_and_adhesion_behind_the_plant() {
     let model = Model::eq6()
-        .with_effect(Effect::DriverLag {
-            bandwidth_hz: 300.0,
-        })
+        .with_effect(effects::driver_lag(300.0))
         .with_effect(bouc_wen(false))
-        .with_effect(Effect::Backlash { width_um: 0.05 })
-        .with_effect(Effect::WallAdhesion {
-            speed_um_per_s: 35.0,
-        });
+        .with_effect(effects::backlash(0.05))
+        .with_effect(effects::wall_adhesion(35.0));
     let u: Vec<f64> = sine(43.0, 1.0, 1e-3, 500).iter().map(|u| u + 4.0).collect();
     let mut coarse = Chain::new(&model).unwrap();
     let mut fine = Chain::new(&model).unwrap();
@@ -48,8 +40,8 @@ fn sub_steps_are_fine_enough_for_hysteresis_behind_a_lag_and_adhesion_behind_the
 #[test]
 fn rows_at_irregular_times_see_the_same_positions_as_a_regular_record() {
     let model = Model::eq6()
-        .with_effect(Effect::TimeDelay { delay_s: 1.3e-3 })
-        .with_effect(Effect::ExposureAveraging { exposure_s: 0.4e-3 });
+        .with_effect(effects::time_delay(1.3e-3))
+        .with_effect(effects::exposure_averaging(0.4e-3));
     let u: Vec<f64> = sine(21.0, 1.0, 1e-3, 400).iter().map(|u| u + 4.0).collect();
     let regular = run(&model, &u, 1e-3);
     let times: Vec<f64> = (0..400).map(|k| 17.0 + k as f64 * 1e-3).collect();
@@ -74,16 +66,9 @@ fn rows_at_irregular_times_see_the_same_positions_as_a_regular_record() {
 
 #[test]
 fn a_parameter_is_changed_by_name_within_its_bounds_only() {
-    let lag = Effect::DriverLag {
-        bandwidth_hz: 100.0,
-    };
+    let lag = effects::driver_lag(100.0);
     let changed = lag.with_parameter("bandwidth_hz", 200.0).unwrap();
-    assert_eq!(
-        changed,
-        Effect::DriverLag {
-            bandwidth_hz: 200.0
-        }
-    );
+    assert_eq!(changed, effects::driver_lag(200.0));
     let error = lag.with_parameter("bandwidth_hz", -1.0).unwrap_err();
     assert_eq!(
         error.to_string(),

@@ -1,114 +1,51 @@
 //! Bead and camera blocks: what acts on the motion, and how the frames sample it.
 
-use super::block::Block;
+use super::Frames;
 use super::modal::Trace;
+use cellpos_plant::effects::{Block, Segment};
 
-/// Gain drift and flow drift when nothing later needs the motion inside a step.
-pub(crate) fn bead_without_motion(pos: &mut [f64], blocks: &[Block], h: f64) {
-    for b in blocks {
-        match *b {
-            Block::GainDrift { per_s } => {
-                let (mut before, mut sum) = (0.0, 0.0);
-                for (j, p) in pos.iter_mut().enumerate() {
-                    sum += (*p - before) * (1.0 + per_s * (j as f64 - 0.5) * h);
-                    before = *p;
-                    *p = sum;
-                }
-            }
-            Block::FlowDrift { um_per_s } => {
-                for (j, p) in pos.iter_mut().enumerate() {
-                    *p += um_per_s * h * j as f64;
-                }
-            }
-            _ => {}
-        }
-    }
-}
-
-/// Integral over a step of the dead zone of a speed that changes linearly from `a` to `b`.
-fn dead_zone_mean(a: f64, b: f64, limit: f64) -> f64 {
-    // Antiderivative of the dead zone.
-    let f = |v: f64| 0.5 * (v.abs() - limit).max(0.0).powi(2);
-    let d = b - a;
-    if d.abs() < 1e-9 * limit.max(1.0) {
-        return dead(0.5 * (a + b), limit);
-    }
-    (f(b) - f(a)) / d
-}
-
-fn dead(v: f64, limit: f64) -> f64 {
-    v.signum() * (v.abs() - limit).max(0.0)
-}
-
-/// Bead blocks on a trace: gain drift, flow drift, adhesion.
-pub(crate) fn bead(t: &mut Trace, blocks: &[Block], h: f64) {
+/// A block on a trace, step by step.
+pub(crate) fn advance(t: &mut Trace, block: &mut dyn Block, h: f64) {
     let n = t.pos.len();
-    for b in blocks {
-        match *b {
-            Block::GainDrift { per_s } => {
-                let mut sum = 0.0;
-                for j in 0..n {
-                    let at = j as f64 * h;
-                    let flow = if j + 1 < n {
-                        t.pos[j + 1] - t.pos[j] - t.jump[j]
-                    } else {
-                        0.0
-                    };
-                    t.pos[j] = sum;
-                    t.jump[j] *= 1.0 + per_s * at;
-                    t.start_slope[j] *= 1.0 + per_s * at;
-                    t.end_slope[j] *= 1.0 + per_s * (at + h);
-                    sum += t.jump[j] + flow * (1.0 + per_s * (at + 0.5 * h));
-                }
-            }
-            Block::FlowDrift { um_per_s } => {
-                for j in 0..n {
-                    t.pos[j] += um_per_s * h * j as f64;
-                    t.start_slope[j] += um_per_s;
-                    t.end_slope[j] += um_per_s;
-                }
-            }
-            Block::Adhesion { um_per_s } => {
-                let mut sum = 0.0;
-                for j in 0..n {
-                    let flow = if j + 1 < n {
-                        t.pos[j + 1] - t.pos[j] - t.jump[j]
-                    } else {
-                        0.0
-                    };
-                    let (a, b) = (t.start_slope[j], t.end_slope[j]);
-                    // The mean of a linear speed differs from the true flow by the curvature: keep that part.
-                    let bend = flow / h - 0.5 * (a + b);
-                    let moved = dead_zone_mean(a + bend, b + bend, um_per_s) * h;
-                    t.pos[j] = sum;
-                    t.start_slope[j] = dead(a, um_per_s);
-                    t.end_slope[j] = dead(b, um_per_s);
-                    sum += t.jump[j] + moved;
-                }
-            }
-            _ => {}
-        }
+    let mut before = t.pos.first().copied().unwrap_or(0.0);
+    for j in 0..n {
+        let start = t.pos[j] + t.jump[j];
+        let (a, b) = (t.start_slope[j], t.end_slope[j]);
+        let end = t
+            .pos
+            .get(j + 1)
+            .copied()
+            .unwrap_or(start + 0.5 * (a + b) * h);
+        let input = Segment {
+            start,
+            end,
+            integral: h * (0.5 * (start + end) + h / 12.0 * (a - b)),
+            speed_start: a,
+            speed_end: b,
+        };
+        let out = block.advance(j as f64 * h, h, input);
+        t.pos[j] = before;
+        t.jump[j] = out.start - before;
+        t.start_slope[j] = out.speed_start;
+        t.end_slope[j] = out.speed_end;
+        before = out.end;
     }
 }
 
 /// Positions at the frames: clock skew, delay and exposure on a trace with `fine` steps per sample.
 pub(crate) fn sample(
     t: &Trace,
-    blocks: &[Block],
+    frames: Frames,
     h: f64,
     fine: usize,
     rows: usize,
     y: &mut Vec<f64>,
 ) {
-    let (mut skew, mut delay, mut exposure) = (0.0, 0.0, 0.0);
-    for b in blocks {
-        match *b {
-            Block::ClockSkew { e } => skew = e,
-            Block::Delay { s } => delay = s,
-            Block::Exposure { s } => exposure = s,
-            _ => {}
-        }
-    }
+    let Frames {
+        skew,
+        delay_s: delay,
+        exposure_s: exposure,
+    } = frames;
     y.clear();
     y.reserve(rows);
     if skew == 0.0 && delay == 0.0 && exposure == 0.0 {

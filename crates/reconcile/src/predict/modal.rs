@@ -4,60 +4,14 @@
 //! and a gain; the product is split into partial fractions once per parameter set, after which a sample costs one
 //! multiply-add per mode. That is what makes thousands of simulations of a minute of record affordable.
 
+use cellpos_plant::Zpk;
 use nalgebra::Complex;
 
 type C = Complex<f64>;
 
-/// Zeros, poles \[rad/s\] and leading coefficient of a rational transfer function.
-#[derive(Debug, Clone, PartialEq)]
-pub(crate) struct Zpk {
-    pub zeros: Vec<C>,
-    pub poles: Vec<C>,
-    pub gain: f64,
-}
-
-impl Zpk {
-    /// The factor 1.
-    pub fn unity() -> Self {
-        Self {
-            zeros: Vec::new(),
-            poles: Vec::new(),
-            gain: 1.0,
-        }
-    }
-
-    /// Appends `(1 + s/w_zero) / (1 + s/w_pole)`; `None` leaves a side out.
-    pub fn lag_lead(&mut self, zero: Option<f64>, pole: Option<f64>) {
-        if let Some(z) = zero {
-            self.zeros.push(C::new(-z, 0.0));
-            self.gain /= z;
-        }
-        if let Some(p) = pole {
-            self.poles.push(C::new(-p, 0.0));
-            self.gain *= p;
-        }
-    }
-
-    /// Appends all of another factor.
-    pub fn times(&mut self, other: &Self) {
-        self.zeros.extend_from_slice(&other.zeros);
-        self.poles.extend_from_slice(&other.poles);
-        self.gain *= other.gain;
-    }
-
-    /// Value at a complex frequency.
-    pub fn at(&self, s: C) -> C {
-        let n = self
-            .zeros
-            .iter()
-            .fold(C::new(self.gain, 0.0), |a, z| a * (s - z));
-        self.poles.iter().fold(n, |a, p| a / (s - p))
-    }
-
-    /// Whether any pole is too fast for a step for the slope to be smooth inside it.
-    pub fn has_fast_pole(&self, step_s: f64) -> bool {
-        self.poles.iter().any(|p| p.norm() * step_s > 0.8)
-    }
+/// Whether any pole is too fast for a step for the slope to be smooth inside it.
+pub(crate) fn has_fast_pole(zpk: &Zpk, step_s: f64) -> bool {
+    zpk.poles.iter().any(|p| p.norm() * step_s > 0.8)
 }
 
 /// Moves poles that (nearly) coincide apart by a relative 1e-4, so that partial fractions exist.
@@ -114,6 +68,15 @@ pub(crate) struct Trace {
 }
 
 impl Trace {
+    /// Adds another motion.
+    pub fn add(&mut self, other: &Self) {
+        let add = |a: &mut [f64], b: &[f64]| a.iter_mut().zip(b).for_each(|(a, b)| *a += b);
+        add(&mut self.pos, &other.pos);
+        add(&mut self.jump, &other.jump);
+        add(&mut self.start_slope, &other.start_slope);
+        add(&mut self.end_slope, &other.end_slope);
+    }
+
     /// Takes the jumps of a grid of steps for the straight line that they stand for.
     pub fn straighten(&mut self, h: f64) {
         let n = self.pos.len();

@@ -1,14 +1,14 @@
 //! What is kept of a tick: flags, events, counts, the record.
 
 use super::Core;
-use crate::guide::{Guide, GuideOutput};
 use crate::life::{EventKind, Life};
+use crate::reference::{ReferenceGenerator, ReferenceOutput};
 use crate::tick::{Tick, TickInput};
 use crate::tick_record::{TickFlags, TickRecord};
 use cellpos_control::{LoopOutput, SolverStatus};
-use cellpos_link::Fault;
+use cellpos_rig::ActuatorFault;
 
-impl<R: Guide> Core<R> {
+impl<R: ReferenceGenerator> Core<R> {
     /// Flags and events that follow from the controller's output.
     pub(super) fn account(&mut self, output: &LoopOutput, tick: &mut Tick) {
         let flags = output.flags;
@@ -25,7 +25,8 @@ impl<R: Guide> Core<R> {
             }
         }
         self.state.missing = if flags.coasting {
-            self.state.missing.saturating_add(1)
+            let steps = u32::try_from(tick.steps).unwrap_or(u32::MAX);
+            self.state.missing.saturating_add(steps)
         } else {
             0
         };
@@ -35,25 +36,22 @@ impl<R: Guide> Core<R> {
         /// A gap shorter than this is the daily bread of a camera and no event of its own.
         const WORTH_AN_EVENT: u32 = 3;
         let coasts = self.state.missing >= WORTH_AN_EVENT
-            || (self.state.coasting_since.is_some() && self.state.missing > 0);
+            || (self.state.coasting_since_ns.is_some() && self.state.missing > 0);
         tick.span(
-            &mut self.state.coasting_since,
+            &mut self.state.coasting_since_ns,
             coasts,
-            self.timing.period_us,
             EventKind::CoastingStarted,
             |lasted_ms| EventKind::CoastingEnded { lasted_ms },
         );
         tick.span(
-            &mut self.state.stuck_since,
+            &mut self.state.stuck_since_ns,
             flags.stuck,
-            self.timing.period_us,
             EventKind::StuckStarted,
             |lasted_ms| EventKind::StuckEnded { lasted_ms },
         );
         tick.span(
-            &mut self.state.saturated_since,
+            &mut self.state.saturated_since_ns,
             flags.range_limited,
-            self.timing.period_us,
             EventKind::SaturationStarted,
             |lasted_ms| EventKind::SaturationEnded { lasted_ms },
         );
@@ -63,17 +61,35 @@ impl<R: Guide> Core<R> {
     pub(super) fn count(&mut self, input: &TickInput, output: &LoopOutput, flags: TickFlags) {
         let counts = &mut self.state.counts;
         counts.ticks += 1;
-        counts.superseded += u64::from(input.drained.saturating_sub(1));
+        let frames = &input.frames;
+        for (counter, more) in [
+            (&mut counts.superseded, frames.superseded),
+            (
+                &mut counts.stale,
+                frames
+                    .refused()
+                    .saturating_add(frames.late + frames.backlog),
+            ),
+            (&mut counts.doubled, frames.doubled),
+            (&mut counts.reordered, frames.late),
+            (&mut counts.future, frames.future),
+            (&mut counts.camera_restarts, frames.restarts),
+            (&mut counts.frames_lost, frames.missed),
+        ] {
+            *counter += u64::from(more);
+        }
+        counts.frames_lost = counts.frames_lost.saturating_sub(u64::from(frames.late));
         counts.late += u64::from(input.previous_late_ns.is_some());
         counts.refused += u64::from(input.previous_refused);
         match output.solver.status {
             SolverStatus::PreviousPlan => counts.plans_reused += 1,
             SolverStatus::FallbackPi => counts.solver_fallbacks += 1,
+            SolverStatus::Feasible => counts.plans_stopped += 1,
             SolverStatus::NotUsed | SolverStatus::Solved => {}
         }
         for (mask, counter) in [
             (TickFlags::TIMER, &mut counts.timer),
-            (TickFlags::STALE, &mut counts.stale),
+            (TickFlags::EARLY, &mut counts.early),
             (TickFlags::LOST, &mut counts.fixes_lost),
             (TickFlags::GATED, &mut counts.gated),
             (TickFlags::COASTING, &mut counts.coasted),
@@ -90,7 +106,7 @@ impl<R: Guide> Core<R> {
         &self,
         input: &TickInput,
         output: &LoopOutput,
-        guided: &GuideOutput,
+        generated: &ReferenceOutput,
         flags: TickFlags,
     ) -> TickRecord {
         let m = input.measurement;
@@ -109,11 +125,13 @@ impl<R: Guide> Core<R> {
             decision: m
                 .and_then(|m| m.track)
                 .map_or(255, |(_, decision)| decision as u8),
-            target_um: guided.reference_um,
-            plan_ns: guided.plan_ns,
-            stage: guided.stage as u8,
+            target_um: generated.reference_um,
+            plan_ns: generated.plan_ns,
+            stage: generated.stage as u8,
             length_um: m.map_or(f64::NAN, |m| m.length_um),
             area_um2: m.map_or(f64::NAN, |m| m.area_um2),
+            length_sd_um: m.map_or(f64::NAN, |m| m.length_sd_um),
+            area_sd_um2: m.map_or(f64::NAN, |m| m.area_sd_um2),
             estimate_um: output.estimate_um,
             neutral_um: output.neutral_um,
             requested_um: output.requested_um,
@@ -126,16 +144,16 @@ impl<R: Guide> Core<R> {
             board_fault: self
                 .state
                 .board
-                .map_or(Fault::None as u8, |b| b.fault as u8),
+                .map_or(ActuatorFault::None as u8, |b| b.fault as u8),
             flags,
-            drained: input.drained.min(255) as u8,
+            drained: input.frames.arrived.min(255) as u8,
             wake_ns: 0,
             compute_ns: 0,
             solver_status: output.solver.status as u8,
             solver_iterations: output.solver.iterations.min(255) as u8,
             solver_active: output.solver.active.min(255) as u8,
             solver_ns: output.solver.solve_ns,
-            controller_state: self.controller.control_loop().pack(&self.state.control),
+            law: self.controller.record(),
         }
     }
 }

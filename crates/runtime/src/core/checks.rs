@@ -1,106 +1,121 @@
 //! What is checked before anything is decided: ticks that never came, the frame, the driver's account, the board.
 
 use super::Core;
-use crate::guide::Guide;
-use crate::life::{EventKind, SafeReason};
+use crate::board_watch::BoardTrouble;
+use crate::frames::FrameTally;
+use crate::life::{EventKind, FreezeReason, Life, SafeReason};
+use crate::reference::{ReferenceGenerator, ReferenceInput};
 use crate::tick::{Tick, TickInput};
 use crate::tick_record::TickFlags;
 use crate::timing::Timing;
 use cellpos_control::Measurement as LoopMeasurement;
-use cellpos_link::BoardState;
-use cellpos_rig::BoardReport;
+use cellpos_rig::ActuatorReport;
 use cellpos_vision::Decision;
 
-impl<R: Guide> Core<R> {
-    /// Accounts for ticks that never came: the last command was held, the bead moved on.
-    pub(super) fn catch_up(&mut self, time_ns: i64, tick: &mut Tick) {
-        const MOST: i64 = 100;
-        let period = self.timing.period_ns();
-        let skipped = (time_ns - self.state.last_time_ns + period / 2) / period - 1;
-        if skipped <= 0 {
+impl<R: ReferenceGenerator> Core<R> {
+    /// Accounts for ticks that never came: the last command was held, the bead moved on, and so did the plan.
+    pub(super) fn catch_up(&mut self, tick: &mut Tick) {
+        /// A loop that stood still for longer has lost sight of the bead; its board has parked by itself.
+        const LONGEST_NS: i64 = 1_000_000_000;
+        let skipped = tick.steps - 1;
+        if skipped == 0 {
             return;
         }
         tick.disturbed = true;
-        tick.event(EventKind::TicksSkipped {
-            count: skipped as u64,
-        });
-        self.state.counts.skipped += skipped as u64;
-        for _ in 0..skipped.min(MOST) {
-            self.controller.skip(&mut self.state.control);
-            let control = &self.state.control;
-            let (neutral_um, held_um) =
-                (control.estimator.neutral_um, control.previous_command_um());
+        tick.event(EventKind::TicksSkipped { count: skipped });
+        self.state.counts.skipped += skipped;
+        let most = (LONGEST_NS / self.timing.period_ns()).max(1).unsigned_abs();
+        if skipped > most {
+            self.latch(SafeReason::Stalled, tick);
+        }
+        let running = self.state.life == Life::Running;
+        for index in tick.index.saturating_sub(skipped.min(most))..tick.index {
+            self.controller.skip();
+            let neutral_um = self.controller.estimator().neutral_um;
+            let held_um = self.controller.previous_command_um();
             self.monitor
                 .step(&mut self.state.plant, None, neutral_um, held_um);
+            let told = ReferenceInput {
+                running,
+                frozen: self.state.frozen.is_some(),
+                skip: false,
+                tick: if running {
+                    index - self.state.running_since
+                } else {
+                    0
+                },
+                sample_s: self.sample_s,
+                position_um: None,
+                age_ticks: 0,
+                length_um: None,
+                target_um: None,
+            };
+            let passed = self.reference.step(&told, &mut []);
+            let phase = passed
+                .phase
+                .filter(|_| running && self.state.frozen.is_none());
+            self.learners
+                .addition_um(passed.motion, phase, passed.reference_um);
+            self.learners.learn(None);
         }
     }
 
-    /// Freshness by id and by time stamp; gives the measurement that may be controlled on.
+    /// What came from the camera; gives the measurement that may be controlled on.
     pub(super) fn check_frame(
         &mut self,
         input: &TickInput,
         tick: &mut Tick,
     ) -> Option<LoopMeasurement> {
+        self.tell_frames(&input.frames, tick);
+        let slow = EventKind::VisionSlowStarted {
+            vision_ms: f64::from(input.slow_vision_ns.unwrap_or(0)) * 1e-6,
+            period_ms: self.timing.period_us * 1e-3,
+        };
+        tick.span(
+            &mut self.state.vision_slow_since_ns,
+            input.slow_vision_ns.is_some(),
+            slow,
+            |lasted_ms| EventKind::VisionSlowEnded { lasted_ms },
+        );
+        self.state.frames_silent = input.frames.arrived == 0;
         let Some(m) = &input.measurement else {
             tick.flags.set(TickFlags::TIMER);
-            self.state.frames_silent = true;
+            if input.frames.refused() > 0 && input.frames.backlog == 0 {
+                tick.flags.set(TickFlags::STALE);
+                tick.disturbed = true;
+                self.state.stale_in_a_row = self.state.stale_in_a_row.saturating_add(1);
+                if self.state.stale_in_a_row >= self.timing.faults_in_a_row {
+                    let slow = self.state.vision_slow_since_ns.is_some();
+                    let reason = if slow {
+                        SafeReason::VisionSlow
+                    } else {
+                        SafeReason::StaleFrames
+                    };
+                    self.latch(reason, tick);
+                }
+            }
             return None;
         };
-        self.state.frames_silent = false;
-        let age_ns = input.time_ns - m.mid_exposure_ns;
-        let mut stale = false;
-        if let Some((last_id, last_exposure_ns)) = self.state.last_frame {
-            if m.frame_id <= last_id {
-                tick.flags.set(TickFlags::DOUBLED_FRAME);
-                tick.event(EventKind::FrameRepeated {
-                    frame_id: m.frame_id,
-                });
-                stale = true;
-            } else {
-                let expected = m.frame_id - last_id;
-                let arrived = u64::from(input.drained.max(1));
-                if arrived > expected {
-                    // More frames than ids: some came twice, or one of them is older than the last tick's.
-                    tick.flags.set(TickFlags::DOUBLED_FRAME);
-                    tick.event(EventKind::FrameRepeated {
-                        frame_id: m.frame_id,
-                    });
-                }
-                let missing = expected.saturating_sub(arrived);
-                if missing > 0 {
-                    tick.flags.set(TickFlags::DROPPED_FRAME);
-                    tick.event(EventKind::FramesDropped { count: missing });
-                    self.state.counts.frames_lost += missing;
-                }
-                if m.mid_exposure_ns <= last_exposure_ns {
-                    tick.event(EventKind::FrameStale {
-                        age_ms: age_ns as f64 * 1e-6,
-                    });
-                    stale = true;
-                }
-            }
-        }
-        if !stale && age_ns > Timing::ms_to_ns(self.timing.oldest_ms) {
-            tick.event(EventKind::FrameStale {
-                age_ms: age_ns as f64 * 1e-6,
-            });
-            stale = true;
-        }
-        let period = self.timing.period_ns();
-        let beyond_ns = age_ns - Timing::ms_to_ns(self.timing.camera_delay_ms);
-        tick.disturbed |= stale
-            || tick.flags.0 & (TickFlags::DROPPED_FRAME | TickFlags::DOUBLED_FRAME) != 0
-            || beyond_ns > period / 2;
-        if stale {
-            tick.flags.set(TickFlags::STALE);
-            self.state.stale_in_a_row += 1;
-            if self.state.stale_in_a_row >= self.timing.faults_in_a_row {
-                self.latch(SafeReason::StaleFrames, tick);
-            }
-            return None;
-        }
         self.state.stale_in_a_row = 0;
         self.state.last_frame = Some((m.frame_id, m.mid_exposure_ns));
+        let period = self.timing.period_ns();
+        let age_ns = input.time_ns - m.mid_exposure_ns;
+        let beyond_ns = age_ns - Timing::ms_to_ns(self.timing.camera_delay_ms);
+        tick.disturbed |= beyond_ns > period / 2;
+        let early = beyond_ns < -period / 2;
+        if early {
+            tick.flags.set(TickFlags::EARLY);
+        }
+        let started = EventKind::FramesEarlyStarted {
+            age_ms: age_ns as f64 * 1e-6,
+            expected_ms: self.timing.camera_delay_ms,
+        };
+        tick.span(
+            &mut self.state.early_since_ns,
+            early,
+            started,
+            |lasted_ms| EventKind::FramesEarlyEnded { lasted_ms },
+        );
         if !m.is_usable() {
             tick.flags.set(TickFlags::LOST);
             return None;
@@ -113,12 +128,44 @@ impl<R: Guide> Core<R> {
         }
         let age_samples =
             ((beyond_ns + period / 2).max(0) / period).min(i64::from(u16::MAX)) as u16;
+        let offset = (beyond_ns - i64::from(age_samples) * period) as f64 / period as f64;
         Some(LoopMeasurement {
             position_um: m.position_um,
             variance_um2: m.variance_um2,
             age_samples,
-            offset_samples: (beyond_ns - i64::from(age_samples) * period) as f64 / period as f64,
+            // The estimator knows the bead's way up to half a tick from where its frames are expected.
+            offset_samples: offset.max(-0.5),
         })
+    }
+
+    /// Flags and events of the frames that came.
+    fn tell_frames(&self, frames: &FrameTally, tick: &mut Tick) {
+        if frames.doubled + frames.late > 0 {
+            tick.flags.set(TickFlags::DOUBLED_FRAME);
+            tick.event(EventKind::FrameRepeated {
+                frame_id: frames.repeated_id,
+            });
+        }
+        if frames.missed > 0 {
+            tick.disturbed = true;
+            tick.flags.set(TickFlags::DROPPED_FRAME);
+            tick.event(EventKind::FramesDropped {
+                count: u64::from(frames.missed),
+            });
+        }
+        if frames.stale + frames.backlog > 0 {
+            tick.event(EventKind::FrameStale {
+                age_ms: frames.oldest_ns as f64 * 1e-6,
+            });
+        }
+        if frames.future > 0 {
+            tick.event(EventKind::FrameFromFuture {
+                ahead_ms: frames.ahead_ns as f64 * 1e-6,
+            });
+        }
+        if frames.restarts > 0 {
+            tick.event(EventKind::CameraRestarted);
+        }
     }
 
     /// What the driver says of the previous tick.
@@ -129,7 +176,7 @@ impl<R: Guide> Core<R> {
                 tick.event(EventKind::LateTick {
                     compute_us: f64::from(compute_ns) * 1e-3,
                 });
-                self.state.late_in_a_row += 1;
+                self.state.late_in_a_row = self.state.late_in_a_row.saturating_add(1);
                 if self.state.late_in_a_row >= self.timing.faults_in_a_row {
                     self.latch(SafeReason::LateTicks, tick);
                 }
@@ -138,7 +185,7 @@ impl<R: Guide> Core<R> {
         }
         if input.previous_refused {
             tick.disturbed = true;
-            self.state.refused_in_a_row += 1;
+            self.state.refused_in_a_row = self.state.refused_in_a_row.saturating_add(1);
             if self.state.refused_in_a_row >= self.timing.faults_in_a_row {
                 self.latch(SafeReason::ActuatorRingFull, tick);
             }
@@ -147,13 +194,32 @@ impl<R: Guide> Core<R> {
         }
     }
 
+    /// Nobody keeps what happens: the bead is given time to stop, then the PZT goes to park.
+    pub(super) fn unrecorded(&mut self, tick: &mut Tick) {
+        const FREEZE_NS: i64 = 300_000_000;
+        self.freeze(FreezeReason::Unrecorded, tick);
+        let since_ns = *self.state.unrecorded_since_ns.get_or_insert(tick.time_ns);
+        if self.state.life != Life::Running || tick.time_ns - since_ns >= FREEZE_NS {
+            self.latch(SafeReason::Unrecorded, tick);
+        }
+    }
+
     /// What the board says, or its silence.
     pub(super) fn check_board(&mut self, input: &TickInput, tick: &mut Tick) {
+        if let Some(trouble) = input.board_trouble {
+            tick.flags.set(TickFlags::BOARD_TROUBLE);
+            let reason = match trouble {
+                BoardTrouble::Foreign => SafeReason::BoardForeign,
+                BoardTrouble::NotObeying => SafeReason::BoardNotObeying,
+                BoardTrouble::NotFollowing => SafeReason::BoardNotFollowing,
+            };
+            self.latch(reason, tick);
+        }
         if let Some(report) = input.board {
             tick.flags.set(TickFlags::BOARD_HEARD);
             self.state.board_heard_ns = input.time_ns;
             let before = self.state.board.replace(report);
-            let unchanged = |b: BoardReport| b.state == report.state && b.fault == report.fault;
+            let unchanged = |b: ActuatorReport| b.state == report.state && b.fault == report.fault;
             if !before.is_some_and(unchanged) {
                 tick.event(EventKind::BoardChanged {
                     state: report.state,
@@ -166,7 +232,13 @@ impl<R: Guide> Core<R> {
             if damaged > 0 {
                 tick.event(EventKind::LinkGarbage { count: damaged });
             }
-            if !matches!(report.state, BoardState::Armed | BoardState::Running) {
+            let holds = before.map_or(0, |b| b.holds);
+            if report.holds > holds {
+                tick.event(EventKind::BoardHeld {
+                    count: report.holds - holds,
+                });
+            }
+            if !report.state.takes_commands() {
                 self.latch(SafeReason::Board, tick);
             }
         } else if input.time_ns - self.state.board_heard_ns

@@ -2,9 +2,9 @@
 #![allow(dead_code, reason = "each test file uses what it needs")]
 
 use cellpos_control::{ControllerFile, ControllerKind, Lead, Pi, Profile, SolverKind};
-use cellpos_link::{BoardState, Fault};
 use cellpos_plant::{Model, TransferFunction};
-use cellpos_rig::{BoardReport, Measurement};
+use cellpos_rig::{ActuatorFault, ActuatorState};
+use cellpos_rig::{ActuatorReport, Measurement};
 use cellpos_runtime::{ArmingConfig, Core, Timing};
 use cellpos_vision::Verdict;
 
@@ -57,6 +57,8 @@ pub fn measurement(k: u64, position_um: f64) -> Measurement {
         track: None,
         length_um: f64::NAN,
         area_um2: f64::NAN,
+        length_sd_um: f64::NAN,
+        area_sd_um2: f64::NAN,
         snr: 40.0,
         true_um: f64::NAN,
         true_pzt_um: f64::NAN,
@@ -64,14 +66,18 @@ pub fn measurement(k: u64, position_um: f64) -> Measurement {
 }
 
 /// What a board that follows says at tick `k`.
-pub fn report(k: u64) -> BoardReport {
-    BoardReport {
-        state: BoardState::Running,
-        fault: Fault::None,
+pub fn report(k: u64) -> ActuatorReport {
+    ActuatorReport {
+        state: ActuatorState::Running,
+        fault: ActuatorFault::None,
         applied_um: START_UM,
         last_seq: u32::try_from(k).ok(),
+        session: 1,
         last_time_us: k * 1000,
+        device_time_us: k * 1000,
         bad_frames: 0,
+        ignored: 0,
+        holds: 0,
         read_ns: k as i64 * 1_000_000,
     }
 }

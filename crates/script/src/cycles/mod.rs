@@ -4,17 +4,21 @@
 //! recorder lost every record; such a row says so and has no figures. A cycle that was not brought to its end has no
 //! row, so that a run that is resumed does it again.
 
+mod fatigue;
 mod fit;
 mod open;
 mod outlier;
 mod row;
+mod saturating;
 mod shape;
 mod table;
 mod trend;
 
+pub use fatigue::{FatigueStop, FatigueWatch};
 pub use row::{CycleFlags, CycleRow};
+pub use saturating::Saturating;
 pub use table::{CycleColumns, HeadError, ReadCycles, read_cycles};
-pub use trend::{Alarm, AmplitudeWatch, Trend, trend};
+pub use trend::{Alarm, AmplitudeWatch, Mean, Trend, trend};
 
 use crate::plan::{Cycle, Plan};
 use cellpos_runtime::{Life, Request, Stage, TickFlags, TickRecord};
@@ -40,7 +44,8 @@ pub struct CycleTable {
     pending: CycleFlags,
     ready: VecDeque<CycleRow>,
     last_seq: Option<u64>,
-    skipped_to_ns: i64,
+    /// Spans of the plan that the operator skipped, ns.
+    skips_ns: Vec<(i64, i64)>,
     outliers: Outliers,
 }
 
@@ -93,7 +98,7 @@ impl CycleTable {
             pending: CycleFlags::default(),
             ready: VecDeque::new(),
             last_seq: None,
-            skipped_to_ns: i64::MIN,
+            skips_ns: Vec::new(),
             outliers: Outliers::default(),
         }
     }
@@ -122,7 +127,13 @@ impl CycleTable {
             return;
         }
         if record.request == Request::Skip as u8 {
-            self.skipped_to_ns = record.plan_ns;
+            let ran_ns = |past: &Past| match past.stage {
+                Stage::Running => past.plan_ns + self.period_ns,
+                _ => past.plan_ns,
+            };
+            let from_ns = self.past.back().map_or(record.plan_ns, ran_ns);
+            self.skips_ns
+                .push((from_ns.min(record.plan_ns), record.plan_ns));
         }
         let apart_ns = self
             .past
@@ -190,25 +201,34 @@ impl CycleTable {
     /// Finishes every cycle that ends at or before a time of the plan.
     fn close_until(&mut self, plan_ns: i64) {
         while let Some(cycle) = self.plan.cycle(self.next) {
-            let (_, end_ns) = bounds_ns(&cycle);
+            let (start_ns, end_ns) = bounds_ns(&cycle);
             if end_ns > plan_ns {
                 return;
             }
-            let skipped = end_ns <= self.skipped_to_ns;
-            let mut row = match self.open.take() {
-                Some(open) => open.finish(),
+            // Also of a cycle that went on behind the step that was skipped: it is not what the script says.
+            let skipped = self
+                .skips_ns
+                .iter()
+                .any(|(from_ns, to_ns)| *from_ns < end_ns && *to_ns > start_ns);
+            self.skips_ns.retain(|(_, to_ns)| *to_ns > end_ns);
+            let expected = (end_ns - start_ns) as f64 / self.period_ns.max(1) as f64;
+            let (mut row, worst) = match self.open.take() {
+                Some(open) => open.finish(expected),
                 None => {
                     let mut row = CycleRow::empty(cycle.number, self.session, cycle.arm);
                     row.plan_s = cycle.start_s;
                     row.duration_s = cycle.duration_s;
                     row.flags.set(CycleFlags::RECORDS_LOST, !skipped);
-                    row
+                    (row, 1.0)
                 }
             };
             row.flags.set(CycleFlags::SKIPPED, skipped);
             row.flags.set(self.pending.0, true);
+            row.flags.set(CycleFlags::RAMP, cycle.ramp);
+            row.flags.judge(worst);
             let outlier = self.outliers.is_one(&row);
             row.flags.set(CycleFlags::OUTLIER, outlier);
+            row.flags.judge(worst);
             self.ready.push_back(row);
             self.next += 1;
             // A gap disturbs every cycle that it touches, the one that it ends in included.

@@ -23,6 +23,9 @@ pub(super) struct Open {
     far_um: f64,
     lengths_um: Series,
     areas_um2: Series,
+    /// Ticks whose command was late or was not the controller's own, and ticks whose position was refused.
+    late: u64,
+    gated: u64,
 }
 
 impl Open {
@@ -59,6 +62,8 @@ impl Open {
             },
             lengths_um: Series::default(),
             areas_um2: Series::default(),
+            late: 0,
+            gated: 0,
         }
     }
 
@@ -95,6 +100,9 @@ impl Open {
         let has = |mask| record.flags.has(mask);
         let lost = has(TickFlags::LOST) || !place.fresh;
         let limited = has(TickFlags::RANGE_LIMITED) || has(TickFlags::SLEW_LIMITED);
+        let late = has(TickFlags::LATE) || has(TickFlags::ACTUATOR_RING_FULL);
+        self.late += u64::from(late);
+        self.gated += u64::from(has(TickFlags::GATED));
         let unsolved = record.solver_status >= SolverStatus::PreviousPlan as u8;
         row.ticks += 1;
         row.lost += u64::from(lost);
@@ -112,10 +120,7 @@ impl Open {
             (CycleFlags::COASTED, has(TickFlags::COASTING)),
             (CycleFlags::FROZEN, has(TickFlags::FREEZE)),
             (CycleFlags::SATURATED, limited),
-            (
-                CycleFlags::LATE,
-                has(TickFlags::LATE) || has(TickFlags::ACTUATOR_RING_FULL),
-            ),
+            (CycleFlags::LATE, late),
             (CycleFlags::RECORDS_LOST, has(TickFlags::RECORDS_LOST)),
             (CycleFlags::SOLVER_FALLBACK, unsolved),
             (CycleFlags::GATED, has(TickFlags::GATED)),
@@ -164,9 +169,22 @@ impl Open {
         self.areas_um2.add(exposed_s, phase, record.area_um2);
     }
 
-    /// The row of the finished cycle.
-    pub(super) fn finish(self) -> CycleRow {
+    /// The row of the finished cycle, and the largest share of its `expected` ticks that one kind of trouble touched.
+    pub(super) fn finish(self, expected: f64) -> (CycleRow, f64) {
         let mut row = self.row;
+        let missing = expected - row.ticks as f64;
+        let worst = [
+            row.lost,
+            row.coasted,
+            row.saturated,
+            row.solver_fallbacks,
+            self.late,
+            self.gated,
+        ]
+        .into_iter()
+        .map(|ticks| ticks as f64)
+        .fold(missing, f64::max)
+            / expected.max(1.0);
         if row.seen > 0 {
             let n = row.seen as f64;
             row.bias_um = self.error_um / n;
@@ -208,6 +226,6 @@ impl Open {
         row.area_three_quarters_um2 = area_um2.three_quarters;
         row.area_peak_um2 = area_um2.peak;
         row.area_end_um2 = area_um2.end;
-        row
+        (row, worst)
     }
 }

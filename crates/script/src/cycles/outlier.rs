@@ -22,9 +22,8 @@ const SMALL_UM: f64 = 0.15;
 impl Outliers {
     /// Whether a finished cycle is one; an undisturbed cycle that is none is remembered.
     pub(super) fn is_one(&mut self, row: &CycleRow) -> bool {
-        let motion = Some((row.stroke_um, row.duration_s));
-        if self.motion != motion {
-            self.motion = motion;
+        if !self.motion.is_some_and(|motion| row.moves_as(motion)) {
+            self.motion = Some((row.stroke_um, row.duration_s));
             self.rms_um.clear();
         }
         if !row.rms_um.is_finite() {
@@ -74,6 +73,10 @@ mod tests {
         assert!(!outliers.is_one(&row(0.14, 2.0)), "small");
         assert!(outliers.is_one(&row(0.4, 2.0)));
         assert!(outliers.is_one(&row(0.4, 2.0)), "is not learned from");
+        assert!(
+            outliers.is_one(&row(0.4, 2.0 + 1e-12)),
+            "the same motion, elsewhere in the plan"
+        );
         assert!(!outliers.is_one(&row(0.4, 4.0)), "another motion");
         assert!(!outliers.is_one(&row(f64::NAN, 4.0)));
     }

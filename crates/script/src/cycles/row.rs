@@ -7,7 +7,7 @@ use crate::plan::ArmKind;
 pub struct CycleFlags(pub u32);
 
 /// Names of the bits, in order.
-const NAMES: [&str; 17] = [
+const NAMES: [&str; 19] = [
     "lost",
     "stale",
     "dropped",
@@ -25,6 +25,8 @@ const NAMES: [&str; 17] = [
     "paused",
     "stuck",
     "outlier",
+    "ramp",
+    "disturbed",
 ];
 
 impl CycleFlags {
@@ -65,6 +67,19 @@ impl CycleFlags {
     /// that nobody reported.
     pub const OUTLIER: u32 = 1 << 16;
 
+    /// The amplitude of the script's own wave grew or fell over it (no disturbance, but another motion than full swing).
+    pub const RAMP: u32 = 1 << 17;
+    /// What happened changed the cycle: see [`CycleFlags::is_disturbed`].
+    pub const DISTURBED: u32 = 1 << 18;
+
+    /// What changes a cycle however short it lasts: it was not the motion of the script, or not that of the bead.
+    const GRAVE: u32 =
+        Self::FROZEN | Self::SKIPPED | Self::SAFE | Self::PAUSED | Self::STUCK | Self::OUTLIER;
+
+    /// Share of a cycle's ticks from which on trouble of one kind counts as having changed the cycle: a frame that is lost
+    /// now and then is bridged by the prediction, and moves the figures of a cycle by less than the bead's own wandering.
+    pub const WORTH_COUNTING: f64 = 0.02;
+
     /// Whether all bits of `mask` are set.
     pub fn has(self, mask: u32) -> bool {
         self.0 & mask == mask
@@ -76,9 +91,23 @@ impl CycleFlags {
         }
     }
 
-    /// Whether anything went wrong in the cycle.
+    /// Whether what happened changed the cycle: it was frozen, paused, skipped, in Safe, stuck or an outlier, or one kind of
+    /// trouble touched a fiftieth of its ticks ([`Self::WORTH_COUNTING`]).
     pub fn is_disturbed(self) -> bool {
-        self.0 & !Self::WAITED != 0
+        self.0 & (Self::DISTURBED | Self::GRAVE) != 0
+    }
+
+    /// Whether anything at all happened in the cycle that should not have.
+    pub fn is_touched(self) -> bool {
+        self.0 & !(Self::WAITED | Self::RAMP) != 0
+    }
+
+    /// Says whether the cycle is disturbed. `worst`: the largest share of its ticks that one kind of trouble touched.
+    pub(super) fn judge(&mut self, worst: f64) {
+        self.set(
+            Self::DISTURBED,
+            self.is_disturbed() || worst >= Self::WORTH_COUNTING,
+        );
     }
 }
 
@@ -298,6 +327,13 @@ impl CycleRow {
             set(&mut row, f64::NAN);
         }
         row
+    }
+
+    /// Whether stroke (um) and duration (s) are those of another cycle's motion, to a hundredth: they are computed from places
+    /// in the plan, and differ by rounding from cycle to cycle.
+    pub fn moves_as(&self, (stroke_um, duration_s): (f64, f64)) -> bool {
+        let same = |a: f64, b: f64| (a - b).abs() <= 1e-2 * a.abs().max(b.abs()).max(1e-6);
+        same(self.stroke_um, stroke_um) && same(self.duration_s, duration_s)
     }
 
     /// The head of the table.

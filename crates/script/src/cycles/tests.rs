@@ -2,7 +2,7 @@ use super::*;
 use crate::follow::Follower;
 use crate::script::Script;
 use cellpos_control::Reference;
-use cellpos_runtime::{CONTROLLER_STATE_LEN, Guide, GuideInput};
+use cellpos_runtime::{ReferenceGenerator, ReferenceInput};
 
 const TEXT: &str = "start = \"1um\"\n[[step]]\ndo = \"sine\"\namplitude = \"2um\"\nfrequency = \"10Hz\"\ncycles = 20\n\
                     [[step]]\ndo = \"hold\"\nduration = \"100ms\"\n[[step]]\ndo = \"triangle\"\namplitude = \"1um\"\n\
@@ -17,7 +17,17 @@ fn plan(text: &str) -> Arc<Plan> {
 fn records(
     plan: &Arc<Plan>,
     bead: impl Fn(f64, f64) -> f64,
+    change: impl FnMut(&mut TickRecord) -> bool,
+) -> Vec<TickRecord> {
+    records_skipping(plan, bead, change, None)
+}
+
+/// The same, where the operator skips to the next step in a tick.
+fn records_skipping(
+    plan: &Arc<Plan>,
+    bead: impl Fn(f64, f64) -> f64,
     mut change: impl FnMut(&mut TickRecord) -> bool,
+    skip_at: Option<u64>,
 ) -> Vec<TickRecord> {
     let mut follower = Follower::new(Arc::clone(plan), 0.0, 2);
     let mut past: Vec<f64> = Vec::new();
@@ -31,15 +41,16 @@ fn records(
             .map_or(plan.start_um(), |i| past[i]);
         let time_s = seq as f64 * 1e-3;
         let measured_um = bead(exposed_um, time_s);
-        let told = GuideInput {
+        let told = ReferenceInput {
             running: true,
             frozen: false,
-            skip: false,
+            skip: skip_at == Some(seq),
             tick: seq,
             sample_s: 1e-3,
             position_um: Some(measured_um),
             age_ticks: 0,
             length_um: None,
+            target_um: None,
         };
         let output = follower.step(&told, &mut preview);
         past.push(output.reference_um);
@@ -56,6 +67,8 @@ fn records(
             stage: output.stage as u8,
             length_um: f64::NAN,
             area_um2: f64::NAN,
+            length_sd_um: f64::NAN,
+            area_sd_um2: f64::NAN,
             estimate_um: measured_um,
             neutral_um: 20.0,
             requested_um: 20.0,
@@ -63,7 +76,11 @@ fn records(
             applied_um: 20.0,
             true_um: f64::NAN,
             life: Life::Running as u8,
-            request: 0,
+            request: if skip_at == Some(seq) {
+                Request::Skip as u8
+            } else {
+                0
+            },
             board: 2,
             board_fault: 0,
             flags: TickFlags(0),
@@ -76,7 +93,7 @@ fn records(
             solver_ns: 0,
             track: 255,
             decision: 255,
-            controller_state: [0.0; CONTROLLER_STATE_LEN],
+            law: [f32::NAN; cellpos_control::LAW_COLUMNS],
         };
         seq += 1;
         if change(&mut record) {
@@ -168,8 +185,8 @@ fn what_disturbs_a_cycle_is_in_its_row_and_in_no_other() {
     assert_eq!(numbers(&rows), (0..25).collect::<Vec<u64>>());
     for row in &rows {
         let expected = match row.cycle {
-            3 => "lost",
-            7..=9 => "records-lost",
+            3 => "lost+disturbed",
+            7..=9 => "records-lost+disturbed",
             _ => "",
         };
         assert_eq!(row.flags.to_string(), expected, "cycle {}", row.cycle);
@@ -245,5 +262,85 @@ fn length_and_area_of_a_cell_are_each_taken_at_the_phases_of_the_cycle() {
                 assert!((value - expected).abs() < 0.2, "{row:?}");
             }
         }
+    }
+}
+
+#[test]
+fn one_lost_frame_touches_a_cycle_and_does_not_disturb_it() {
+    let plan = plan(TEXT);
+    let first = 2 + records(&plan, |r, _| r, |_| true)
+        .iter()
+        .position(|r| r.stage == Stage::Running as u8)
+        .unwrap() as u64;
+    let all = records(
+        &plan,
+        |r, _| r,
+        |record| {
+            // One frame in cycle 4, three (a fiftieth and more) in cycle 6; one frozen tick in cycle 8.
+            let lost = [first + 440, first + 610, first + 640, first + 670];
+            if lost.contains(&record.seq) {
+                record.flags.set(TickFlags::LOST);
+                record.verdict = 1;
+            }
+            if record.seq == first + 850 {
+                record.flags.set(TickFlags::FREEZE);
+            }
+            true
+        },
+    );
+    let rows = table(&plan, &all);
+    assert_eq!(rows[4].flags.to_string(), "lost");
+    assert!(!rows[4].flags.is_disturbed() && rows[4].flags.is_touched());
+    assert!(rows[6].flags.is_disturbed() && rows[8].flags.is_disturbed());
+    let disturbed = rows.iter().filter(|row| row.flags.is_disturbed()).count();
+    assert_eq!(disturbed, 2);
+}
+
+#[test]
+fn a_cycle_of_which_the_operator_skipped_a_part_says_so() {
+    // Cycles of a repeat: out, stay, back, rest; the operator skips a stay.
+    let plan = plan(
+        "[[step]]\ndo = \"repeat\"\ntimes = 4\n[[step.step]]\ndo = \"move\"\nto = \"2um\"\nduration = \"50ms\"\n\
+         [[step.step]]\ndo = \"hold\"\nduration = \"100ms\"\n[[step.step]]\ndo = \"move\"\nto = \"0um\"\n\
+         duration = \"50ms\"\n[[step.step]]\ndo = \"hold\"\nduration = \"100ms\"\n",
+    );
+    let first = records(&plan, |r, _| r, |_| true)
+        .iter()
+        .position(|r| r.stage == Stage::Running as u8)
+        .unwrap() as u64;
+    // 80 ms into the second cycle.
+    let all = records_skipping(&plan, |r, _| r, |_| true, Some(first + 380));
+    let rows = table(&plan, &all);
+    assert_eq!(numbers(&rows), vec![0, 1, 2, 3]);
+    for row in &rows {
+        assert_eq!(
+            row.flags.has(CycleFlags::SKIPPED),
+            row.cycle == 1,
+            "{row:?}"
+        );
+        assert_eq!(row.flags.is_disturbed(), row.cycle == 1, "{row:?}");
+    }
+}
+
+#[test]
+fn cycles_of_ramps_say_so_and_the_passes_of_a_sweep_have_rows() {
+    let plan = plan(
+        "[[step]]\ndo = \"sine\"\namplitude = \"2um\"\nfrequency = \"10Hz\"\ncycles = 8\nramp_in = 2\nramp_out = 1\n\
+         [[step]]\ndo = \"sweep\"\nname = \"to\"\nvalues = [\"1um\", \"2um\", \"3um\"]\n[[step.step]]\ndo = \"move\"\n\
+         to = \"$to\"\nduration = \"100ms\"\n[[step.step]]\ndo = \"move\"\nto = \"0um\"\nduration = \"100ms\"\n",
+    );
+    let rows = table(&plan, &records(&plan, |r, _| r, |_| true));
+    assert_eq!(numbers(&rows), (0..11).collect::<Vec<u64>>());
+    for row in &rows {
+        let ramp = [0, 1, 7].contains(&row.cycle);
+        assert_eq!(
+            row.flags.to_string(),
+            if ramp { "ramp" } else { "" },
+            "{row:?}"
+        );
+    }
+    let strokes: Vec<f64> = rows[8..].iter().map(|row| row.stroke_um).collect();
+    for (stroke, expected) in strokes.iter().zip([0.5, 1.0, 1.5]) {
+        assert!((stroke - expected).abs() < 1e-3, "{strokes:?}");
     }
 }

@@ -1,46 +1,78 @@
 //! Trends over cycles, and the live watch on the amplitude.
 
+use super::saturating::{self, Saturating};
 use super::{CycleFlags, CycleRow};
 use std::collections::VecDeque;
 
-/// A straight line through a quantity of the cycles.
+/// A mean over some cycles.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Mean {
+    /// Cycles that it is of.
+    pub cycles: u64,
+    /// The mean.
+    pub mean: f64,
+    /// Half width of its 95 % interval, from their scatter (Student's t).
+    pub ci95: f64,
+}
+
+/// What a quantity does over the cycles.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Trend {
     /// Cycles with a value.
     pub cycles: u64,
-    /// Value of the line at the first of them.
-    pub first: f64,
-    /// Value of the line at the last of them.
-    pub last: f64,
-    /// Change per cycle.
+    /// Mean of the first ten of them (of the first half, where there are fewer than twenty).
+    pub first: Mean,
+    /// Mean of the last ten of them, likewise.
+    pub last: Mean,
+    /// Change per cycle, of a straight line through all.
     pub per_cycle: f64,
     /// Half width of its 95 % interval, the residuals taken for white.
     pub ci95_per_cycle: f64,
+    /// RMS of what the straight line leaves.
+    pub residual: f64,
+    /// The law that saturates, where the cycles say at what.
+    pub saturating: Option<Saturating>,
 }
 
 impl Trend {
-    /// Whether the change is beyond chance: outside of three times its 95 % interval, so that residuals that are a little
-    /// correlated raise hardly a false alarm in a thousand static arms.
+    /// Whether the change is beyond chance: the line's outside of three times its 95 % interval, so that residuals that are
+    /// a little correlated raise hardly a false alarm in a thousand static arms.
     pub fn is_significant(&self) -> bool {
         self.per_cycle.abs() > 3.0 * self.ci95_per_cycle
     }
 }
 
-/// The trend of `(cycle, value)` pairs; values that are not finite are left out. None with fewer than five.
-pub fn trend(values: impl IntoIterator<Item = (u64, f64)>) -> Option<Trend> {
-    let points: Vec<(f64, f64)> = values
-        .into_iter()
-        .filter(|(_, value)| value.is_finite())
-        .map(|(cycle, value)| (cycle as f64, value))
-        .collect();
+/// Student's t for a two-sided 95 % interval.
+fn student95(freedom: usize) -> f64 {
+    const TABLE: [f64; 10] = [
+        12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262, 2.228,
+    ];
+    let wide = || 1.96 + 2.5 / freedom.max(1) as f64;
+    let index = freedom.checked_sub(1);
+    index
+        .and_then(|index| TABLE.get(index).copied())
+        .unwrap_or_else(wide)
+}
+
+fn mean_of(points: &[(f64, f64)]) -> Mean {
     let n = points.len() as f64;
-    if points.len() < 5 {
-        return None;
+    let mean = points.iter().map(|p| p.1).sum::<f64>() / n;
+    let squares: f64 = points.iter().map(|p| (p.1 - mean).powi(2)).sum();
+    let freedom = points.len().saturating_sub(1);
+    Mean {
+        cycles: points.len() as u64,
+        mean,
+        ci95: student95(freedom) * (squares / freedom.max(1) as f64 / n).sqrt(),
     }
+}
+
+/// The line of `(cycle, value)` points: change per cycle, half width of its 95 % interval, sum of squared residuals.
+fn line(points: &[(f64, f64)]) -> Option<(f64, f64, f64)> {
+    let n = points.len() as f64;
     let mean = |of: fn(&(f64, f64)) -> f64| points.iter().map(of).sum::<f64>() / n;
     let (mx, my) = (mean(|p| p.0), mean(|p| p.1));
     let (mut sxx, mut sxy) = (0.0, 0.0);
-    for (x, y) in &points {
+    for (x, y) in points {
         sxx += (x - mx) * (x - mx);
         sxy += (x - mx) * (y - my);
     }
@@ -49,13 +81,32 @@ pub fn trend(values: impl IntoIterator<Item = (u64, f64)>) -> Option<Trend> {
     }
     let per_cycle = sxy / sxx;
     let at = |x: f64| my + per_cycle * (x - mx);
-    let residual: f64 = points.iter().map(|(x, y)| (y - at(*x)).powi(2)).sum();
+    let sum: f64 = points.iter().map(|(x, y)| (y - at(*x)).powi(2)).sum();
+    Some((per_cycle, 1.96 * (sum / (n - 2.0) / sxx).sqrt(), sum))
+}
+
+/// The trend of `(cycle, value)` pairs in their order; values that are not finite are left out. None with fewer than five.
+pub fn trend(values: impl IntoIterator<Item = (u64, f64)>) -> Option<Trend> {
+    /// Cycles at each end of which the mean is told.
+    const ENDS: usize = 10;
+    let points: Vec<(f64, f64)> = values
+        .into_iter()
+        .filter(|(_, value)| value.is_finite())
+        .map(|(cycle, value)| (cycle as f64, value))
+        .collect();
+    if points.len() < 5 {
+        return None;
+    }
+    let (per_cycle, ci95_per_cycle, sum) = line(&points)?;
+    let ends = ENDS.min(points.len() / 2);
     Some(Trend {
         cycles: points.len() as u64,
-        first: at(points.first()?.0),
-        last: at(points.last()?.0),
+        first: mean_of(&points[..ends]),
+        last: mean_of(&points[points.len() - ends..]),
         per_cycle,
-        ci95_per_cycle: 1.96 * (residual / (n - 2.0) / sxx).sqrt(),
+        ci95_per_cycle,
+        residual: (sum / points.len() as f64).sqrt(),
+        saturating: saturating::fit(&points, sum),
     })
 }
 
@@ -82,8 +133,10 @@ pub struct AmplitudeWatch {
     limit: f64,
     window: usize,
     errors: VecDeque<(u64, f64)>,
-    /// Errors of the last [`LONG`] cycles, for the trend.
+    /// Errors of the last [`LONG`] cycles of one motion, for the trend.
     long: VecDeque<(u64, f64)>,
+    /// Stroke (um) and duration (s) of that motion.
+    motion: (f64, f64),
     raised: bool,
 }
 
@@ -101,6 +154,7 @@ impl AmplitudeWatch {
             window: window.max(2),
             errors: VecDeque::new(),
             long: VecDeque::new(),
+            motion: (f64::NAN, f64::NAN),
             raised: false,
         }
     }
@@ -118,6 +172,11 @@ impl AmplitudeWatch {
         }
         let error = row.reached_um / row.commanded_um - 1.0;
         self.errors.push_back((row.cycle, error));
+        // What another motion reaches is no trend of this one.
+        if !row.moves_as(self.motion) {
+            self.motion = (row.stroke_um, row.duration_s);
+            self.long.clear();
+        }
         if self.long.len() >= LONG {
             self.long.pop_front();
         }
@@ -125,7 +184,11 @@ impl AmplitudeWatch {
         let mean = self.error().filter(|_| self.errors.len() >= self.window)?;
         if !self.raised && mean.abs() > self.limit {
             self.raised = true;
-            let per_cycle = trend(self.errors.iter().copied()).map_or(0.0, |t| t.per_cycle);
+            let per_cycle = {
+                let points: Vec<(f64, f64)> =
+                    self.errors.iter().map(|p| (p.0 as f64, p.1)).collect();
+                line(&points).map_or(0.0, |line| line.0)
+            };
             return Some(Alarm::Raised {
                 error: mean,
                 per_cycle,
@@ -138,9 +201,12 @@ impl AmplitudeWatch {
         None
     }
 
-    /// Trend of the amplitude error over the last two hundred cycles, as shares.
-    pub fn trend(&self) -> Option<Trend> {
-        trend(self.long.iter().copied())
+    /// Trend of the amplitude error over the last two hundred cycles of the same motion, as shares: the number of cycles, and
+    /// the change per cycle.
+    pub fn trend(&self) -> Option<(u64, f64)> {
+        let points: Vec<(f64, f64)> = self.long.iter().map(|p| (p.0 as f64, p.1)).collect();
+        let (per_cycle, ..) = line(&points).filter(|_| points.len() >= 5)?;
+        Some((points.len() as u64, per_cycle))
     }
 
     /// Mean amplitude error of the last cycles, as a share.
@@ -164,11 +230,63 @@ mod tests {
     fn a_trend_is_found_with_its_ends_and_none_where_there_is_none() {
         let line = |k: u64| 3.8 - 0.94 * k as f64 / 179.0;
         let falling = trend((0..180).map(|k| (k, line(k) + 0.2 * noise(k)))).unwrap();
-        assert!((falling.first - 3.8).abs() < 0.05 && (falling.last - 2.86).abs() < 0.05);
+        assert!(
+            (falling.first.mean - 3.776).abs() < 0.05 && (falling.last.mean - 2.884).abs() < 0.05
+        );
         assert!(falling.is_significant());
+        assert!(
+            falling.saturating.is_none_or(|law| !law.better_than_line),
+            "{falling:?}"
+        );
         let flat = trend((0..180).map(|k| (k, 3.8 + 0.2 * noise(k)))).unwrap();
         assert!(!flat.is_significant(), "{flat:?}");
         assert_eq!(trend((0..4).map(|k| (k, 1.0))), None);
+    }
+
+    #[test]
+    fn what_saturates_has_the_ends_that_the_figure_shows_and_a_law_beside_the_line() {
+        // A stretch of 3.6 that falls to 2.7 within 30 cycles: the ends of a straight line would be 3.0 and 2.6.
+        let truth = |k: u64| 2.7 + 0.9 * (-(k as f64) / 30.0).exp();
+        let found = trend((0..180).map(|k| (k, truth(k) + 0.1 * noise(k)))).unwrap();
+        let ten = (0..10).map(truth).sum::<f64>() / 10.0;
+        assert_eq!((found.first.cycles, found.last.cycles), (10, 10));
+        assert!(
+            (found.first.mean - ten).abs() < 2.0 * found.first.ci95,
+            "{found:?}"
+        );
+        assert!((found.last.mean - 2.7).abs() < 0.02, "{found:?}");
+        assert!(found.first.ci95 > 0.0 && found.first.ci95 < 0.1);
+        let law = found.saturating.unwrap();
+        assert!(law.better_than_line);
+        for (value, ci95, expected) in [
+            (law.start, law.start_ci95, 3.6),
+            (law.end, law.end_ci95, 2.7),
+            (law.cycles, law.cycles_ci95, 30.0),
+        ] {
+            assert!((value - expected).abs() < 2.0 * ci95, "{law:?}");
+            assert!(ci95 < 0.2 * expected, "{law:?}");
+        }
+        assert!(law.residual < 0.5 * found.residual);
+        let flat = trend((0..180).map(|k| (k, 3.8 + 0.2 * noise(k)))).unwrap();
+        assert!(
+            flat.saturating.is_none_or(|law| !law.better_than_line),
+            "{flat:?}"
+        );
+    }
+
+    #[test]
+    fn the_live_trend_is_that_of_one_motion() {
+        let mut watch = AmplitudeWatch::new(0.5, 5);
+        for cycle in 0..60 {
+            let mut row = CycleRow::empty(cycle, 1, ArmKind::Cyclic);
+            let small = cycle < 30;
+            (row.stroke_um, row.duration_s) = (if small { 1.0 } else { 4.0 }, 0.1);
+            row.commanded_um = row.stroke_um;
+            row.reached_um = row.commanded_um * if small { 0.99 } else { 0.80 };
+            watch.add(&row);
+        }
+        let (cycles, per_cycle) = watch.trend().unwrap();
+        assert!(cycles == 30 && per_cycle.abs() < 1e-12, "{per_cycle}");
     }
 
     #[test]
@@ -177,6 +295,7 @@ mod tests {
         let mut alarms = Vec::new();
         for cycle in 0..60 {
             let mut row = CycleRow::empty(cycle, 1, ArmKind::Cyclic);
+            (row.stroke_um, row.duration_s) = (2.0, 0.1);
             row.commanded_um = 2.0;
             let error = if (20..40).contains(&cycle) {
                 -0.2
@@ -188,8 +307,8 @@ mod tests {
                 alarms.push((cycle, alarm));
             }
             if cycle == 19 {
-                let trend = watch.trend().unwrap();
-                assert!(trend.cycles == 20 && !trend.is_significant(), "{trend:?}");
+                let (cycles, per_cycle) = watch.trend().unwrap();
+                assert!(cycles == 20 && per_cycle.abs() < 2e-3, "{per_cycle}");
             }
         }
         assert!(

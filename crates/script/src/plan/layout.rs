@@ -33,6 +33,8 @@ pub(super) struct Layout<'s> {
     /// Positions reached since the innermost label began.
     range: Range<f64>,
     next_cycle: u64,
+    /// Repeats that are being laid out: a pass of one is a cycle, and the values of a sweep in it are parts of that.
+    repeats: usize,
     labels: BTreeMap<String, Arm>,
     plan: Plan,
 }
@@ -48,6 +50,7 @@ impl Layout<'_> {
             integral: 0.0,
             range: script.start_um..script.start_um,
             next_cycle: 0,
+            repeats: 0,
             labels: BTreeMap::new(),
             plan,
         };
@@ -101,12 +104,16 @@ impl Layout<'_> {
     }
 
     fn cycles(&mut self, start_s: f64, period_s: f64, count: u64) {
-        self.arm_cycles(start_s, period_s, count, ArmKind::Cyclic);
+        self.arm_cycles(start_s, period_s, count, ArmKind::Cyclic, false);
     }
 
-    fn arm_cycles(&mut self, start_s: f64, period_s: f64, count: u64, arm: ArmKind) {
+    fn arm_cycles(&mut self, start_s: f64, period_s: f64, count: u64, arm: ArmKind, ramp: bool) {
+        if count == 0 {
+            return;
+        }
         self.plan.cycles.push(Cycles {
             arm,
+            ramp,
             first: self.next_cycle,
             count,
             start_s,
@@ -193,16 +200,17 @@ impl Layout<'_> {
             StepKind::Repeat { times, steps } => {
                 let times = if self.short { (*times).min(3) } else { *times };
                 for _ in 0..times {
-                    let (start_s, cycles) = (self.time_s, self.next_cycle);
-                    self.steps(steps)?;
-                    // A pass without a wave inside, and without passes that were counted already, is a cycle.
-                    if self.next_cycle == cycles && self.time_s > start_s {
-                        self.cycles(start_s, self.time_s - start_s, 1);
-                    }
+                    self.repeats += 1;
+                    let laid = self.pass(steps);
+                    self.repeats -= 1;
+                    laid?;
                 }
                 Ok(())
             }
-            StepKind::Group(steps) => self.steps(steps),
+            StepKind::Sweep(passes) if self.repeats == 0 => {
+                passes.iter().try_for_each(|steps| self.pass(steps))
+            }
+            StepKind::Sweep(passes) => passes.iter().try_for_each(|steps| self.steps(steps)),
             StepKind::Wait {
                 condition,
                 timeout_s,
@@ -229,6 +237,16 @@ impl Layout<'_> {
             }
             StepKind::Static { like, load } => self.static_arm(step, like, *load),
         }
+    }
+
+    /// A pass of a repeat or a sweep: a cycle, if there is no wave in it and no passes that were counted already.
+    fn pass(&mut self, steps: &[Step]) -> Result<(), ScriptError> {
+        let (start_s, cycles) = (self.time_s, self.next_cycle);
+        self.steps(steps)?;
+        if self.next_cycle == cycles && self.time_s > start_s {
+            self.cycles(start_s, self.time_s - start_s, 1);
+        }
+        Ok(())
     }
 
     fn wave(&mut self, step: &Step) -> Result<(), ScriptError> {
@@ -260,7 +278,19 @@ impl Layout<'_> {
         self.push(step, motion, cycles as f64 / frequency_hz, at, reach)?;
         let full = cycles.saturating_sub(ramp_in + ramp_out);
         self.repeats(Periodic::wave(shape, amplitude_um, frequency_hz), full);
-        self.cycles(start_s, 1.0 / frequency_hz, cycles);
+        let period_s = 1.0 / frequency_hz;
+        let ramp_in = ramp_in.min(cycles);
+        let ramp_out = ramp_out.min(cycles - ramp_in);
+        let mut before = 0;
+        for (count, ramp) in [
+            (ramp_in, true),
+            (cycles - ramp_in - ramp_out, false),
+            (ramp_out, true),
+        ] {
+            let from_s = start_s + before as f64 * period_s;
+            self.arm_cycles(from_s, period_s, count, ArmKind::Cyclic, ramp);
+            before += count;
+        }
         Ok(())
     }
 
@@ -356,7 +386,7 @@ impl Layout<'_> {
         self.go(step, home_um, travel_s, MoveShape::MinimumJerk)?;
         if cycles > 0 && arm.duration_s > 0.0 {
             let period_s = arm.duration_s / cycles as f64;
-            self.arm_cycles(start_s, period_s, cycles, ArmKind::Static);
+            self.arm_cycles(start_s, period_s, cycles, ArmKind::Static, false);
         }
         Ok(())
     }

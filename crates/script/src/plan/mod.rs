@@ -93,7 +93,8 @@ pub enum ArmKind {
     Static,
 }
 
-/// One cycle: a period of a wave, or a pass of a repeat that holds no wave; in a static arm, as much time as a cycle of
+/// One cycle: a period of a wave, or a pass of a repeat or of a sweep that holds no wave (of a sweep within a repeat: the
+/// repeat's pass); in a static arm, as much time as a cycle of
 /// the arm that it stands beside takes in the mean.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Cycle {
@@ -105,6 +106,8 @@ pub struct Cycle {
     pub start_s: f64,
     /// Duration, s.
     pub duration_s: f64,
+    /// Whether the amplitude of its wave grows or falls over it (`ramp_in`, `ramp_out`).
+    pub ramp: bool,
 }
 
 /// Equal cycles one after the other.
@@ -115,6 +118,7 @@ struct Cycles {
     start_s: f64,
     period_s: f64,
     arm: ArmKind,
+    ramp: bool,
 }
 
 /// A script laid out in time. Waits take no time in it: a [`crate::Cursor`] stops its clock at them.
@@ -196,7 +200,12 @@ impl Plan {
             };
             matches!(condition, Some(Condition::CellLength { .. }))
         });
-        waits || self.stop.length_change_above_um.is_some()
+        let stop = &self.stop;
+        waits
+            || stop.length_change_above_um.is_some()
+            || stop.stretch_down.is_some()
+            || stop.rest_length_change.is_some()
+            || stop.recovery_above_s.is_some()
     }
 
     /// When the plan's clock next stands still for a wait, from a segment on, s; infinity: never.
@@ -222,6 +231,7 @@ impl Plan {
             arm: run.arm,
             start_s: run.start_s + within as f64 * run.period_s,
             duration_s: run.period_s,
+            ramp: run.ramp,
         })
     }
 

@@ -2,11 +2,12 @@
 
 use cellpos_control::design::DesignPlant;
 use cellpos_control::{ControllerFile, Pi};
+use cellpos_emulator::BoardConfig;
+use cellpos_emulator::EmulatedRig;
 use cellpos_emulator::WorldConfig;
-use cellpos_firmware_sim::BoardConfig;
 use cellpos_plant::Model;
-use cellpos_rig::actuator::Session;
-use cellpos_rig::{Actuator, Clock, EmulatedRig};
+use cellpos_rig::ArmRequest;
+use cellpos_rig::{Actuator, Clock};
 use cellpos_runtime::live::Operator;
 use cellpos_runtime::{
     ArmingConfig, Core, EndRule, Event, RunSink, Statistics, Summary, TickRecord, Timing,
@@ -74,11 +75,12 @@ pub fn run_script(
     let rig = EmulatedRig::new(BoardConfig::default(), world, &model, clock.clone()).unwrap();
     let mut actuator = rig.actuator().unwrap();
     let armed = actuator
-        .arm(&Session {
-            id: 1,
+        .arm(&ArmRequest {
+            session: 1,
             park_um: 20.0,
             limits: [0.0, 40.0, 20_000.0],
             watchdog_ms: None,
+            hold_watchdog_ms: None,
         })
         .unwrap();
     let gains = Pi::new(0.46, 19.5);

@@ -1,6 +1,8 @@
 //! Frames and bounds straight from the profiles' formulas, not from the tables that the fit reads.
 #![allow(dead_code)]
 
+pub mod stack;
+
 use cellpos_vision::{Frame, Pixels, RadialProfile};
 use nalgebra::{Matrix4, Vector4};
 

@@ -3,23 +3,18 @@
 //! The loop is shown a model and a rig; what the rig hides stays in the rig. On the emulated rig the truth is known, so that
 //! the margins that each model predicts can be set beside those that the loop has.
 
-mod margins;
 mod report;
-mod stage;
 
-use crate::commands::identify::on_rig::OnRig;
-use crate::commands::identify::{Excitation, new_run_folder, run as identification};
-use crate::commands::reconcile::collect::{self, Collected, Collecting};
-use crate::commands::reconcile::experiment::Experiment;
+use crate::commands::identify::new_run_folder;
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
+use crate::output;
 use crate::rig_file::{ClockKind, Frames, RigFile};
-use cellpos_ident::excitation::PAPER_FREQUENCIES_HZ;
-use cellpos_plant::{Effect, Model};
-use cellpos_reconcile::{Options, Reconciliation};
+use cellpos_experiment::circle::stage::{Motion, Stage};
+use cellpos_experiment::circle::{Circle, Job, close};
+use cellpos_experiment::on_rig::OnRig;
+use cellpos_plant::Model;
 use cellpos_units::{Hertz, Micrometers, Seconds};
 use serde_json::json;
-use stage::{Motion, Stage};
-use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 /// Arguments of `cellpos circle`.
@@ -86,28 +81,10 @@ pub struct Args {
     json: bool,
 }
 
-/// Everything that came of it.
-pub(crate) struct Circle {
-    /// The measured response and what it was fitted by.
-    identified: identification::Done,
-    /// Whether the model that reconcile extended is the identified one (else the one given), and why.
-    base: (&'static str, String),
-    /// The verdict.
-    reconciled: Reconciliation,
-    /// What was recorded for it.
-    collected: Vec<Collected>,
-    /// As given, as identified, as reconciled.
-    stages: Vec<Stage>,
-    /// The rig's own model with the delay that its frames had; emulated rigs only.
-    truth: Option<Model>,
-    motion: Motion,
-    /// Sample time of the loop, s.
-    sample_s: f64,
-}
-
 /// Runs the command.
 pub fn run(args: Args) -> CommandResult {
     checked(&args)?;
+    output::ready(args.out.iter().chain(&args.report))?;
     let given = Model::load(&args.model).map_err(Failure::input)?;
     let mut file = RigFile::load(args.rig.as_deref())?;
     if let Some(seed) = args.seed {
@@ -127,12 +104,33 @@ pub fn run(args: Args) -> CommandResult {
         .then(|| Model::load(&file.emulator.model).map_err(Failure::input))
         .transpose()?;
     let folder = new_run_folder("circle")?;
-    let bar = indicatif::ProgressBar::new_spinner();
+    let bar = output::progress_bar(None);
     let mut progress = |text: &str| {
         bar.set_message(text.to_owned());
         bar.tick();
     };
-    let circle = close(&args, given, &file, truth, &folder, &mut progress)?;
+    let job = Job {
+        rig: OnRig::new(
+            file,
+            given.clone(),
+            args.clock,
+            args.frames,
+            args.best_effort,
+        )?,
+        given,
+        truth,
+        controller: &args.controller,
+        motion: Motion {
+            amplitude_um: args.amplitude.value(),
+            frequency_hz: args.frequency.value(),
+            duration_s: args.duration.value(),
+        },
+        effort: args.effort,
+        max_effects: args.max_effects,
+        rounds: usize::from(args.rounds),
+        folder: &folder,
+    };
+    let circle = close(job, &mut progress)?;
     bar.finish_and_clear();
     write(&args, &circle, &folder)
 }
@@ -154,162 +152,6 @@ fn checked(args: &Args) -> Result<(), Failure> {
     within("effort", args.effort, 0.2, 10.0, "")
 }
 
-fn close(
-    args: &Args,
-    mut given: Model,
-    file: &RigFile,
-    truth: Option<Model>,
-    folder: &Path,
-    progress: &mut (dyn FnMut(&str) + Send),
-) -> Result<Circle, Failure> {
-    progress("identifying");
-    let rig = OnRig::new(
-        file.clone(),
-        given.clone(),
-        args.clock,
-        args.frames,
-        args.best_effort,
-    )?;
-    let seed = file.emulator.seed;
-    let job = identification::Job {
-        limits: rig.limits(8.0, 400.0, 10.0),
-        setup: rig.bench_setup(),
-        lines_hz: PAPER_FREQUENCIES_HZ.to_vec(),
-        excitation: Excitation::Stepped,
-        seconds_at_1_hz: 40.0,
-        led_edges: if file.is_emulated() { 100 } else { 0 },
-        bootstrap: 0,
-        seed,
-        rig: Some(rig.clone()),
-        resume: None,
-        keep_in: Some(folder.join("partial.json")),
-    };
-    let done = identification::run(&job, |ticks, total| {
-        progress(&format!("identifying: {ticks} of {total} ticks"));
-    })?;
-
-    progress("recording for reconcile");
-    let first = collect::run_experiment(&rig, Experiment::Survey, args.effort, seed, progress)?;
-    let survey = folder.join("survey.csv");
-    collect::write_record(&first.record, &survey)?;
-    given.working_point_um = first.neutral_um;
-    let identified = done
-        .result
-        .model("identified", first.neutral_um, BTreeMap::new())
-        .map_err(Failure::failed)?;
-    let identified = Model {
-        noise: given.noise,
-        ..identified
-    };
-    let fits = done.result.ladder.scale <= 2.0;
-    let base = if fits {
-        (
-            "identified",
-            "Eq. (4) describes the measured response".to_owned(),
-        )
-    } else {
-        (
-            "given",
-            format!(
-                "the measured response is {:.1} standard deviations from the best of Eq. (4): its coefficients have taken up a \
-                 part of what is missing, so the model given is extended instead",
-                done.result.ladder.scale.sqrt()
-            ),
-        )
-    };
-    let mut start = if fits {
-        identified.clone()
-    } else {
-        given.clone()
-    };
-    // What the rig file states needs no finding. Left out, the way that the bead goes in a part of an exposure is taken for
-    // delay: 14 us of it at 0.5 ms.
-    if let Some(exposure_s) = crate::session::stated_exposure_s(file).filter(|s| *s > 0.0)
-        && start.effect("exposure-averaging").is_none()
-    {
-        start = start.with_effect(Effect::ExposureAveraging { exposure_s });
-    }
-    let mut records = vec![first.record.clone()];
-    let options = Options {
-        max_effects: args.max_effects,
-        ..Options::default()
-    };
-    let collecting = Collecting {
-        rig: &rig,
-        folder,
-        rounds: usize::from(args.rounds),
-        share: args.effort,
-        seed: seed + 1,
-    };
-    let (reconciled, mut collected) =
-        collect::look(&mut start, &mut records, &options, &collecting, progress)?;
-    collected.insert(
-        0,
-        Collected {
-            experiment: Experiment::Survey.name(),
-            what: Experiment::Survey.what(),
-            why: "nothing is recorded yet".to_owned(),
-            file: survey,
-            rows: first.record.rows(),
-            rows_without_bead: first.record.rows() - first.record.frames(),
-            verdict: if collected.is_empty() {
-                reconciled.verdict.word().to_owned()
-            } else {
-                "ambiguous".to_owned()
-            },
-        },
-    );
-
-    // The truth as the loop meets it: the delay is from the middle of an exposure to the tick that uses its frame.
-    let truth = truth.map(|model| Model {
-        working_point_um: file.emulator.neutral_um,
-        ..stage::with_delay(model, first.age_s)
-    });
-    let configured_s = file.timing.camera_delay_ms * 1e-3;
-    let averaged_s = match reconciled.augmented.effect("exposure-averaging") {
-        Some(Effect::ExposureAveraging { exposure_s }) => *exposure_s,
-        _ => 0.0,
-    };
-    // The model's delay ends with the exposure, the loop's in its middle.
-    let found_s = match reconciled.augmented.effect("time-delay") {
-        Some(Effect::TimeDelay { delay_s }) => *delay_s + 0.5 * averaged_s,
-        _ => configured_s,
-    };
-    let motion = Motion {
-        amplitude_um: args.amplitude.value(),
-        frequency_hz: args.frequency.value(),
-        duration_s: args.duration.value(),
-    };
-    let delay_s = done.result.judged.model.delay_s;
-    let mut stages = Vec::new();
-    for (name, model, delay_s) in [
-        ("as given", given, configured_s),
-        ("as identified", identified, delay_s),
-        ("as reconciled", reconciled.augmented.clone(), found_s),
-    ] {
-        progress(&format!("designing and tracking: {name}"));
-        let model = stage::with_delay(model, delay_s);
-        stages.push(stage::run(
-            name,
-            model,
-            &args.controller,
-            &rig,
-            truth.as_ref(),
-            motion,
-        )?);
-    }
-    Ok(Circle {
-        identified: done,
-        base,
-        reconciled,
-        collected,
-        stages,
-        truth,
-        motion,
-        sample_s: file.timing.period_us * 1e-6,
-    })
-}
-
 fn write(args: &Args, circle: &Circle, folder: &Path) -> CommandResult {
     let place =
         |given: &Option<PathBuf>, name: &str| given.clone().unwrap_or_else(|| folder.join(name));
@@ -317,7 +159,7 @@ fn write(args: &Args, circle: &Circle, folder: &Path) -> CommandResult {
         place(&args.out, "augmented.toml"),
         place(&args.report, "report.html"),
     );
-    std::fs::write(&out, circle.reconciled.augmented.to_toml_string()).map_err(Failure::failed)?;
+    output::write(&out, &circle.reconciled.augmented.to_toml_string())?;
     let gap = folder.join("gap.html");
     cellpos_reconcile::report(&circle.reconciled, "circle")
         .write(&gap)

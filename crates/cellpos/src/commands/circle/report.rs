@@ -1,8 +1,8 @@
 //! The circle on one page: what was found, margins predicted and true, tracking errors, before and after.
 
-use super::Circle;
-use super::margins::{AMPLITUDES_UM, LoopMargins, Response};
-use super::stage::{Stage, Tracked};
+use cellpos_experiment::circle::Circle;
+use cellpos_experiment::circle::margins::{AMPLITUDES_UM, LoopMargins, Response};
+use cellpos_experiment::circle::stage::{Stage, Tracked};
 use cellpos_reconcile::Reconciliation;
 use cellpos_report::{Axis, Column, Figure, Panel, Report, Series, Status, Table};
 use std::path::Path;
@@ -168,6 +168,13 @@ pub fn report(circle: &Circle, gap: &Path) -> Report {
         r.list(&circle.identified.result.warnings);
     }
 
+    reconciled(&mut r, circle, gap);
+    margins(&mut r, circle);
+    tracking(&mut r, circle);
+    r
+}
+
+fn reconciled(r: &mut Report, circle: &Circle, gap: &Path) {
     r.section("Reconciled");
     let mut t = Table::new([
         Column::left("effect"),
@@ -217,7 +224,9 @@ pub fn report(circle: &Circle, gap: &Path) -> Report {
         ]);
     }
     r.table(t);
+}
 
+fn margins(r: &mut Report, circle: &Circle) {
     r.section("Margins, predicted and true");
     r.paragraph(
         "A controller is designed on each model. Predicted: on that model. True: the same controller on the rig's own model, \
@@ -245,7 +254,9 @@ pub fn report(circle: &Circle, gap: &Path) -> Report {
         }
     }
     r.figure(bode(circle));
+}
 
+fn tracking(r: &mut Report, circle: &Circle) {
     r.section("Tracking, before and after");
     let mut t = Table::new([
         Column::left("controller designed on the model"),
@@ -274,7 +285,6 @@ pub fn report(circle: &Circle, gap: &Path) -> Report {
     ));
     r.table(t);
     r.figure(traces(circle));
-    r
 }
 
 fn margins_table(circle: &Circle) -> Table {

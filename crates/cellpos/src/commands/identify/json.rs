@@ -1,7 +1,7 @@
 //! What `cellpos identify` prints.
 
 use super::report::number;
-use super::run::{Done, Job};
+use cellpos_experiment::identify::{Done, Job};
 use cellpos_ident::verdict::Verdict;
 use cellpos_plant::{Hertz, TransferFunction};
 use serde_json::{Map, Value, json};

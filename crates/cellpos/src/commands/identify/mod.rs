@@ -1,21 +1,22 @@
 //! `cellpos identify`: excite, measure the frequency response, fit, write model.toml and a report.
 
-pub mod bench;
 mod columns;
 mod foreign;
 pub mod json;
-pub mod on_rig;
-mod partial;
 pub mod report;
-pub mod run;
+mod sources;
 
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
+use crate::output;
 use crate::rig_file::{ClockKind, Frames, RigFile};
-use bench::Setup;
 use cellpos_emulator::WorldConfig;
+use cellpos_experiment::identify::held_bead::Setup;
+use cellpos_experiment::identify::{self as identification, Excitation};
+use cellpos_experiment::on_rig::OnRig;
 use cellpos_ident::excitation::{Limits, PAPER_FREQUENCIES_HZ};
 use cellpos_plant::Model;
 use cellpos_rig::Clock;
+use cellpos_session::provenance;
 use cellpos_units::{Hertz, Micrometers, MicrometersPerSecond, Seconds};
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -29,36 +30,26 @@ pub enum Switch {
     Off,
 }
 
-/// How to excite.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
-pub enum Excitation {
-    /// One sine after the other.
-    Stepped,
-    /// All lines at once, random phases, odd lines with detection lines between.
-    Multisine,
-    /// A logarithmic sweep through all lines, repeated.
-    Sweep,
-}
-
 /// Arguments of `cellpos identify`.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:\n  \
     cellpos identify --seed 3 --out model.toml --report identify.html\n  \
     cellpos identify --rig rig.toml --out model.toml\n  \
+    cellpos identify --data runs/20261121T190000Z-sine\n  \
     cellpos identify --data record.csv --input pzt_um --output bead_um --rate 1kHz\n  \
     cellpos identify --data Model_Vi_Do.dat --input 1 --output 5 --rate 200Hz --hold none")]
 pub struct Args {
-    /// Records of any rig instead of the emulated one; several files are identified one after the other.
-    #[arg(long, num_args = 1.., requires_all = ["input", "output", "rate"])]
+    /// Run folders, records of cellpos, or records of any rig with --input, --output and --rate; one after the other.
+    #[arg(long, num_args = 1.., value_parser = crate::arguments::run_folder())]
     data: Vec<PathBuf>,
     /// Input column: a name of the header, or a number from 1.
-    #[arg(long)]
+    #[arg(long, requires_all = ["data", "output", "rate"])]
     input: Option<String>,
     /// Output column: a name of the header, or a number from 1.
     #[arg(long)]
     output: Option<String>,
     /// Rows per second of the records.
-    #[arg(long)]
+    #[arg(long, value_parser = crate::arguments::positive::<Hertz>)]
     rate: Option<Hertz>,
     /// What the records' input does between rows: a command is held (zero-order), a measured signal is not (none).
     #[arg(long, value_enum, default_value_t = HoldKind::ZeroOrder)]
@@ -73,7 +64,7 @@ pub struct Args {
     #[arg(long, conflicts_with = "data")]
     resume: Option<PathBuf>,
     /// Exposure of the camera of `--rig`; left out: that of its `[emulator]`.
-    #[arg(long, requires = "rig")]
+    #[arg(long, requires = "rig", value_parser = crate::arguments::positive::<Seconds>)]
     exposure: Option<Seconds>,
     /// Do not ask the operating system for real time.
     #[arg(long, requires = "rig")]
@@ -136,9 +127,10 @@ pub enum HoldKind {
 
 /// The command line as typed.
 pub fn command_line() -> String {
-    std::env::args()
+    provenance::command_line()
+        .iter()
         .skip(1)
-        .fold("cellpos".to_owned(), |line, a| line + " " + &a)
+        .fold("cellpos".to_owned(), |line, a| line + " " + a)
 }
 
 /// A new folder below runs/, named by the time and `name`.
@@ -198,7 +190,7 @@ fn checked(args: &Args) -> Result<(), Failure> {
 }
 
 /// The rig of `--rig`, with a PI for its delay.
-fn on_rig(args: &Args, model: &Model) -> Result<Option<on_rig::OnRig>, Failure> {
+fn on_rig(args: &Args, model: &Model) -> Result<Option<OnRig>, Failure> {
     let Some(path) = &args.rig else {
         return Ok(None);
     };
@@ -210,10 +202,10 @@ fn on_rig(args: &Args, model: &Model) -> Result<Option<on_rig::OnRig>, Failure> 
         Switch::On => Frames::On,
         Switch::Off => Frames::Off,
     };
-    on_rig::OnRig::new(file, model.clone(), args.clock, frames, args.best_effort).map(Some)
+    OnRig::new(file, model.clone(), args.clock, frames, args.best_effort).map(Some)
 }
 
-fn job(args: &Args) -> Result<run::Job, Failure> {
+fn job(args: &Args) -> Result<identification::Job, Failure> {
     let model = Model::load(&args.model).map_err(Failure::input)?;
     let mut lines_hz: Vec<f64> = if args.frequency.is_empty() {
         PAPER_FREQUENCIES_HZ.to_vec()
@@ -263,7 +255,7 @@ fn job(args: &Args) -> Result<run::Job, Failure> {
             slew_um_per_s: 3200.0,
         },
     };
-    Ok(run::Job {
+    Ok(identification::Job {
         limits,
         setup,
         lines_hz,
@@ -280,6 +272,7 @@ fn job(args: &Args) -> Result<run::Job, Failure> {
 
 /// Runs `cellpos identify`.
 pub fn run(args: Args) -> CommandResult {
+    output::ready(args.out.iter().chain(&args.report))?;
     if !args.data.is_empty() {
         return foreign::run(&args);
     }
@@ -296,12 +289,12 @@ pub fn run(args: Args) -> CommandResult {
         .as_ref()
         .map(|out| out.with_extension("partial.json"));
     job.keep_in = beside.or(folder.as_ref().map(|f| f.join("partial.json")));
-    let bar = indicatif::ProgressBar::new(0);
+    let bar = output::progress_bar(Some(0));
     bar.set_style(
         indicatif::ProgressStyle::with_template("{bar:40} {pos}/{len} ticks, {eta} left")
             .unwrap_or_else(|_| indicatif::ProgressStyle::default_bar()),
     );
-    let done = run::run(&job, |ticks, total| {
+    let done = identification::run(&job, |ticks, total| {
         bar.set_length(total as u64);
         bar.set_position(ticks as u64);
     })?;
@@ -318,7 +311,10 @@ pub fn run(args: Args) -> CommandResult {
     );
     let provenance = BTreeMap::from([
         ("command".to_owned(), command_line()),
-        ("version".to_owned(), env!("CARGO_PKG_VERSION").to_owned()),
+        (
+            "version".to_owned(),
+            provenance::VERSION_AND_COMMIT.to_owned(),
+        ),
         (
             "lines_hz".to_owned(),
             job.lines_hz
@@ -339,10 +335,7 @@ pub fn run(args: Args) -> CommandResult {
         .result
         .model("identified", done.neutral_um, provenance)
         .map_err(Failure::failed)?;
-    if let Some(parent) = model_path.parent().filter(|p| !p.as_os_str().is_empty()) {
-        std::fs::create_dir_all(parent).map_err(Failure::failed)?;
-    }
-    std::fs::write(&model_path, model.to_toml_string()).map_err(Failure::failed)?;
+    output::write(&model_path, &model.to_toml_string())?;
     report::report(&done, &command_line())
         .write_with_figures(&report_path)
         .map_err(Failure::failed)?;

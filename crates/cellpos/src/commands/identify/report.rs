@@ -1,6 +1,6 @@
 //! The report of an identification: Bode with bands, Nyquist, residuals, traces, delay test, parameters.
 
-use super::run::Done;
+use cellpos_experiment::identify::Done;
 use cellpos_ident::ladder_model::LadderModel;
 use cellpos_ident::summary::Identification;
 use cellpos_ident::verdict::{Parameter, Verdict};
@@ -188,7 +188,11 @@ pub fn traces(done: &Done) -> Figure {
 }
 
 /// The delay test: light sent and seen, and the intervals that the edges leave for the delay.
-pub fn delay_test(name: &str, caption: &str, led: &super::bench::DelayTest) -> Figure {
+pub fn delay_test(
+    name: &str,
+    caption: &str,
+    led: &cellpos_experiment::identify::held_bead::DelayTest,
+) -> Figure {
     let first = led.switched_s.first().copied().unwrap_or(0.0);
     let until = led.switched_s.get(4).copied().unwrap_or(first) + 0.006;
     let (mut t, mut grey) = (Vec::new(), Vec::new());

@@ -1,7 +1,7 @@
 //! The paper's figures that `cellpos identify` does not have: 4, 5 and A1.
 
 use super::Drifting;
-use crate::commands::identify::run::Done;
+use cellpos_experiment::identify::Done;
 use cellpos_ident::bare_fft;
 use cellpos_ident::excitation::PAPER_FREQUENCIES_HZ;
 use cellpos_ident::random::Random;

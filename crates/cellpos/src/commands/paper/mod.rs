@@ -4,13 +4,14 @@
 //! in open loop the paper's 1.6 um peak to peak at 2 Hz would move it 54 um; only Fig. A1 is an open-loop record.
 
 mod figures;
+mod row;
 mod table;
 
-use super::identify::bench::{HeldBead, Setup};
-use super::identify::run::{Done, Job, run as identify};
-use super::identify::{Excitation, command_line, new_run_folder};
+use super::identify::{command_line, new_run_folder};
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
 use cellpos_emulator::WorldConfig;
+use cellpos_experiment::identify::held_bead::{HeldBead, Setup};
+use cellpos_experiment::identify::{Done, Excitation, Job, run as identify};
 use cellpos_ident::bare_fft;
 use cellpos_ident::excitation::{Limits, PAPER_FREQUENCIES_HZ, Signal, Tone};
 use cellpos_ident::experiment::{Cause, Plan, PlannedSegment, RecordedSegment};
@@ -154,6 +155,7 @@ fn job(seed: u64) -> Job {
 
 /// Runs `cellpos paper`.
 pub fn run(args: Args) -> CommandResult {
+    crate::output::ready(&args.report)?;
     let done = identify(&job(args.seed), |_, _| {})?;
     let delay_s = done.result.judged.model.delay_s;
     let drifting = drifting(args.seed, delay_s)?;
@@ -168,9 +170,9 @@ pub fn run(args: Args) -> CommandResult {
         .map_err(Failure::failed)?;
     let broken = rows.iter().filter(|r| !r.holds).count();
     if args.json {
-        print_json(&table::json(&rows, &path, args.seed))?;
+        print_json(&row::json(&rows, &path, args.seed))?;
     } else {
-        print_text(&table::text(&rows, &path))?;
+        print_text(&row::text(&rows, &path))?;
     }
     Ok(if broken == 0 {
         Outcome::Done
@@ -183,7 +185,7 @@ fn report(
     done: &Done,
     drifting: &Drifting,
     recorded: &figures::Recorded,
-    rows: &[table::Row],
+    rows: &[row::Row],
 ) -> Report {
     use super::identify::report as plots;
     let mut report =

@@ -2,54 +2,14 @@
 
 use super::Drifting;
 use super::figures::Recorded;
+use super::row::{Row, row, wrong};
 use crate::commands::identify::report::number;
-use crate::commands::identify::run::Done;
 use crate::outcome::Failure;
+use cellpos_experiment::identify::Done;
 use cellpos_ident::excitation::{PAPER_FREQUENCIES_HZ, check_grid};
 use cellpos_ident::summary::literal_per_hertz;
+use cellpos_ident::verdict::Parameter;
 use cellpos_plant::{EQ5_LITERAL_PER_S, EQ5_VELOCITY_GAIN_PER_S, Hertz, TransferFunction};
-use serde_json::{Value, json};
-use std::fmt::Write;
-use std::path::Path;
-
-/// One row.
-pub struct Row {
-    /// Key for machines.
-    pub key: &'static str,
-    /// What it is.
-    pub quantity: String,
-    /// The paper's value as printed.
-    pub paper: String,
-    /// Our value.
-    pub ours: f64,
-    /// Unit.
-    pub unit: &'static str,
-    /// Whether our value is where it should be (by the corrected reading where the paper is wrong).
-    pub holds: bool,
-    /// Whether the paper contradicts itself here.
-    pub paper_is_wrong: bool,
-    /// Whether the data determine the value at all.
-    pub identifiable: bool,
-    /// Why.
-    pub remark: String,
-}
-
-impl Row {
-    /// Our value for reading.
-    pub fn ours_text(&self) -> String {
-        number(self.ours)
-    }
-
-    /// The verdict in words.
-    pub fn verdict(&self) -> &'static str {
-        match (self.holds, self.paper_is_wrong, self.identifiable) {
-            (false, _, _) => "differs",
-            (true, true, _) => "the paper is inconsistent",
-            (true, false, false) => "not identifiable from 2-300 Hz",
-            (true, false, true) => "agrees",
-        }
-    }
-}
 
 fn within(value: f64, target: f64, tolerance: f64) -> bool {
     (value - target).abs() <= tolerance
@@ -97,53 +57,50 @@ fn a10_error_db(frequency_hz: f64) -> f64 {
     20.0 * (printed / right).log10()
 }
 
+/// A parameter of the identification.
+fn parameter<'a>(done: &'a Done, name: &str) -> Result<&'a Parameter, Failure> {
+    done.result
+        .judged
+        .parameter(name)
+        .ok_or_else(|| missing(name))
+}
+
+fn missing(what: &str) -> Failure {
+    Failure::Failed(miette::miette!("the identification gave no {what}"))
+}
+
 /// All rows.
 pub fn rows(done: &Done, drifting: &Drifting, recorded: &Recorded) -> Result<Vec<Row>, Failure> {
-    let result = &done.result;
-    let points = &result.compensated;
-    let model = result.judged.model;
+    let mut rows = spectrum(done);
+    rows.extend(delay_and_slope(done)?);
+    rows.extend(coefficients(done)?);
+    rows.extend(amplitudes(recorded));
+    rows.push(row(
+        "fit_10hz",
+        "Fig. A1: phase at 10 Hz, sine fit with drift",
+        "-93.30",
+        drifting.fit_deg,
+        "deg",
+        within(drifting.fit_deg, -93.30, 1.5),
+        "paper: Eq. (6) evaluated; half a second of record".to_owned(),
+    ));
+
+    rows.extend(inconsistent(done)?);
+    rows.extend(misread(done, drifting));
+    rows.extend(not_identifiable(done)?);
+    Ok(rows)
+}
+
+/// Fig. 7: gain and phase line by line.
+fn spectrum(done: &Done) -> Vec<Row> {
     let eq6 = TransferFunction::eq6();
-    let f: Vec<f64> = points.iter().map(|p| p.frequency_hz).collect();
-    let gain: Vec<f64> = points.iter().map(|p| p.gain_db).collect();
-    let missing =
-        |what: &str| Failure::Failed(miette::miette!("the identification gave no {what}"));
-    let parameter = |name: &str| result.judged.parameter(name).ok_or_else(|| missing(name));
-    let (k, zero, pole) = (
-        parameter("gain_per_s")?,
-        parameter("pair_zero_rad_per_s")?,
-        parameter("pair_pole_rad_per_s")?,
-    );
-    let (far, slow, delay) = (
-        parameter("far_zero_rad_per_s")?,
-        parameter("slow_pole_rad_per_s")?,
-        parameter("delay_ms")?,
-    );
-    let at = |hz: f64| {
-        points
-            .iter()
-            .find(|p| p.frequency_hz == hz)
-            .ok_or_else(|| missing("line"))
-    };
-    let row =
-        |key, quantity: &str, paper: &str, ours: f64, unit, holds: bool, remark: String| Row {
-            key,
-            quantity: quantity.to_owned(),
-            paper: paper.to_owned(),
-            ours,
-            unit,
-            holds,
-            paper_is_wrong: false,
-            identifiable: true,
-            remark,
-        };
     let mut rows = Vec::new();
-    let mut add = |row| rows.push(row);
-    for p in points {
+    for p in &done.result.compensated {
         let (g, a) = (
             eq6.gain_db(Hertz(p.frequency_hz)).0,
             eq6.phase_deg(Hertz(p.frequency_hz)).0,
         );
-        add(row(
+        rows.push(row(
             "gain",
             &format!("Fig. 7: gain at {} Hz", p.frequency_hz),
             &format!("{g:.2}"),
@@ -152,7 +109,7 @@ pub fn rows(done: &Done, drifting: &Drifting, recorded: &Recorded) -> Result<Vec
             within(p.gain_db, g, 0.2),
             "paper: Eq. (6) evaluated".to_owned(),
         ));
-        add(row(
+        rows.push(row(
             "phase",
             &format!("Fig. 7: phase at {} Hz, compensated", p.frequency_hz),
             &format!("{a:.2}"),
@@ -162,6 +119,21 @@ pub fn rows(done: &Done, drifting: &Drifting, recorded: &Recorded) -> Result<Vec
             "paper: Eq. (6) evaluated; the text says about -90".to_owned(),
         ));
     }
+    rows
+}
+
+/// Frequencies, Hz, and gains, dB, of the lines.
+fn gains(done: &Done) -> (Vec<f64>, Vec<f64>) {
+    let points = &done.result.compensated;
+    points.iter().map(|p| (p.frequency_hz, p.gain_db)).unzip()
+}
+
+/// The recording delay, and the slope of the gain.
+fn delay_and_slope(done: &Done) -> Result<Vec<Row>, Failure> {
+    let (f, gain) = gains(done);
+    let delay = parameter(done, "delay_ms")?;
+    let mut rows = Vec::new();
+    let mut add = |row| rows.push(row);
     add(row(
         "delay",
         "Fig. 6: recording delay",
@@ -198,6 +170,16 @@ pub fn rows(done: &Done, drifting: &Drifting, recorded: &Recorded) -> Result<Vec
         within(slope, -20.4, 0.3),
         "Eq. (6) itself: -20.5 over these lines".to_owned(),
     ));
+    Ok(rows)
+}
+
+/// What Eq. (6) says of gain and pole-zero pair.
+fn coefficients(done: &Done) -> Result<Vec<Row>, Failure> {
+    let k = parameter(done, "gain_per_s")?;
+    let zero = parameter(done, "pair_zero_rad_per_s")?;
+    let pole = parameter(done, "pair_pole_rad_per_s")?;
+    let mut rows = Vec::new();
+    let mut add = |row| rows.push(row);
     add(row(
         "gain_per_s",
         "integrator gain K of Eq. (6)",
@@ -225,6 +207,13 @@ pub fn rows(done: &Done, drifting: &Drifting, recorded: &Recorded) -> Result<Vec
         covers(zero.ci95, 86.5),
         interval(zero.ci95),
     ));
+    Ok(rows)
+}
+
+/// Fig. 5b: what is recorded of 300 Hz, in three readings.
+fn amplitudes(recorded: &Recorded) -> Vec<Row> {
+    let mut rows = Vec::new();
+    let mut add = |row| rows.push(row);
     let held = recorded.averaged.last().copied().unwrap_or(f64::NAN);
     add(row(
         "recorded_amplitude_averaged",
@@ -255,24 +244,23 @@ pub fn rows(done: &Done, drifting: &Drifting, recorded: &Recorded) -> Result<Vec
         within(dft, 1.0, 1e-6),
         "no correction needed".to_owned(),
     ));
-    add(row(
-        "fit_10hz",
-        "Fig. A1: phase at 10 Hz, sine fit with drift",
-        "-93.30",
-        drifting.fit_deg,
-        "deg",
-        within(drifting.fit_deg, -93.30, 1.5),
-        "paper: Eq. (6) evaluated; half a second of record".to_owned(),
-    ));
+    rows
+}
 
-    let mut wrong = |row| {
-        rows.push(Row {
-            paper_is_wrong: true,
-            ..row
-        });
+/// Where the paper contradicts its own numbers.
+fn inconsistent(done: &Done) -> Result<Vec<Row>, Failure> {
+    let result = &done.result;
+    let (points, model) = (&result.compensated, result.judged.model);
+    let at = |hz: f64| {
+        points
+            .iter()
+            .find(|p| p.frequency_hz == hz)
+            .ok_or_else(|| missing("line"))
     };
+    let mut rows = Vec::new();
+    let mut add = |row| rows.push(wrong(row));
     let ratio = literal_per_hertz(model.gain_per_s, EQ5_LITERAL_PER_S);
-    wrong(row(
+    add(row(
         "eq5",
         "Eq. (5): G(s) = 63/s",
         "63",
@@ -286,7 +274,7 @@ pub fn rows(done: &Done, drifting: &Drifting, recorded: &Recorded) -> Result<Vec
     ));
     let five = at(5.0)?;
     let lag_ms = -five.delayed_phase_deg / 360.0 / 5.0 * 1e3;
-    wrong(row(
+    add(row(
         "lag_5hz",
         "Fig. 4c: lag of the peaks at 5 Hz, recording delay included",
         "47",
@@ -297,7 +285,7 @@ pub fn rows(done: &Done, drifting: &Drifting, recorded: &Recorded) -> Result<Vec
             .to_owned(),
     ));
     let a10 = a10_error_db(10.0);
-    wrong(row(
+    add(row(
         "a10",
         "Eq. (A10) as printed against (A9), 10 Hz",
         "0",
@@ -306,7 +294,7 @@ pub fn rows(done: &Done, drifting: &Drifting, recorded: &Recorded) -> Result<Vec
         within(a10, -24.8, 0.2),
         "(2 z^2 w)^2 must read (2 z w)^2".to_owned(),
     ));
-    wrong(row(
+    add(row(
         "rounding_numerator",
         "2 z1 w1 of the listed values against Eq. (6)",
         "20261.5",
@@ -315,7 +303,7 @@ pub fn rows(done: &Done, drifting: &Drifting, recorded: &Recorded) -> Result<Vec
         !within(2.0 * 7.7 * 1321.0, 20261.5, 20.0),
         "rounded: 20343; take Eq. (6)'s coefficients".to_owned(),
     ));
-    wrong(row(
+    add(row(
         "rounding_denominator",
         "2 z2 w2 of the listed values against Eq. (6)",
         "76.3",
@@ -324,8 +312,16 @@ pub fn rows(done: &Done, drifting: &Drifting, recorded: &Recorded) -> Result<Vec
         !within(2.0 * 104.8 * 0.36, 76.3, 0.5),
         "rounded: 75.46".to_owned(),
     ));
+    Ok(rows)
+}
+
+/// Where a reading of the data misleads.
+fn misread(done: &Done, drifting: &Drifting) -> Vec<Row> {
+    let (f, gain) = gains(done);
+    let mut rows = Vec::new();
+    let mut add = |row| rows.push(wrong(row));
     let r2 = integrator_r2(&f, &gain);
-    wrong(row(
+    add(row(
         "r2",
         "R^2 of the fit (five parameters, ten gains)",
         "0.9993",
@@ -334,7 +330,7 @@ pub fn rows(done: &Done, drifting: &Drifting, recorded: &Recorded) -> Result<Vec
         r2 > 0.999,
         "here: a ONE-parameter integrator on our gains; R^2 shows little, intervals do".to_owned(),
     ));
-    wrong(row(
+    add(row(
         "fft_10hz",
         "App. B: phase at 10 Hz by bare FFT, delay left in",
         "-103.96",
@@ -346,7 +342,7 @@ pub fn rows(done: &Done, drifting: &Drifting, recorded: &Recorded) -> Result<Vec
             drifting.drift_um_per_s
         ),
     ));
-    wrong(row(
+    add(row(
         "fft_10hz_compensated",
         "App. B: the same with 2 ms taken off",
         "-96.76",
@@ -356,7 +352,7 @@ pub fn rows(done: &Done, drifting: &Drifting, recorded: &Recorded) -> Result<Vec
         "Eq. (6) says -93.30: fit sine and drift".to_owned(),
     ));
     let clash = check_grid(&PAPER_FREQUENCIES_HZ, 1000.0, 7, 0.25);
-    wrong(row(
+    add(row(
         "aliases",
         "drive lines onto which harmonics fold at 1 kHz",
         "ten lines",
@@ -377,6 +373,14 @@ pub fn rows(done: &Done, drifting: &Drifting, recorded: &Recorded) -> Result<Vec
         clash.is_err(),
         "harmonics of 100, 200 and 300 Hz fold onto each other: prefer 197, 293 Hz".to_owned(),
     ));
+    rows
+}
+
+/// What ten lines from 2 to 300 Hz cannot say.
+fn not_identifiable(done: &Done) -> Result<Vec<Row>, Failure> {
+    let far = parameter(done, "far_zero_rad_per_s")?;
+    let slow = parameter(done, "slow_pole_rad_per_s")?;
+    let mut rows = Vec::new();
     for (key, quantity, paper, parameter) in [
         (
             "far_zero",
@@ -411,42 +415,4 @@ pub fn rows(done: &Done, drifting: &Drifting, recorded: &Recorded) -> Result<Vec
 
 fn interval(ends: [f64; 2]) -> String {
     format!("95 %: {} .. {}", number(ends[0]), number(ends[1]))
-}
-
-/// The JSON object.
-pub fn json(rows: &[Row], report: &Path, seed: u64) -> Value {
-    let table: Vec<Value> = rows
-        .iter()
-        .map(|r| {
-            json!({
-                "key": r.key, "quantity": r.quantity, "paper": r.paper,
-                "ours": if r.ours.is_finite() { json!(r.ours) } else { Value::Null },
-                "unit": r.unit, "holds": r.holds, "verdict": r.verdict(), "remark": r.remark,
-            })
-        })
-        .collect();
-    json!({
-        "seed": seed,
-        "table": table,
-        "all_hold": rows.iter().all(|r| r.holds),
-        "report": report.display().to_string(),
-    })
-}
-
-/// The same for reading.
-pub fn text(rows: &[Row], report: &Path) -> String {
-    let mut out = String::new();
-    for r in rows {
-        let _ = writeln!(
-            out,
-            "{:<62} paper {:>10}  here {:>10} {:<9} {}",
-            r.quantity,
-            r.paper,
-            r.ours_text(),
-            r.unit,
-            r.verdict()
-        );
-    }
-    let _ = writeln!(out, "wrote {}", report.display());
-    out
 }

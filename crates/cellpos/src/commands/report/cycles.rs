@@ -1,7 +1,7 @@
-//! The cycles of a run: their trends, with the static arm beside.
+//! The cycles of a run: their trends, each motion by itself, with the static arm beside.
 
 use cellpos_report::{Axis, Column, Figure, Panel, Report, Series, Status, Table};
-use cellpos_script::{ArmKind, CycleRow, ReadCycles, Trend, trend};
+use cellpos_script::{ArmKind, CycleFlags, CycleRow, ReadCycles, Trend, trend};
 use std::collections::BTreeMap;
 
 /// A quantity of the cycles.
@@ -130,40 +130,53 @@ pub fn section(page: &mut Report, read: &ReadCycles) -> serde_json::Value {
     if rows.is_empty() {
         return serde_json::Value::Null;
     }
-    let disturbed = rows.iter().filter(|row| row.flags.is_disturbed()).count();
+    let count = |is: fn(&CycleRow) -> bool| rows.iter().filter(|row| is(row)).count();
+    let disturbed = count(|row| row.flags.is_disturbed());
+    let touched = count(|row| row.flags.is_touched() && !row.flags.is_disturbed());
     page.paragraph(&format!(
-        "{} cycles, {disturbed} of them disturbed.",
+        "{} cycles, {disturbed} of them disturbed; in {touched} more something happened that touched less than a fiftieth of \
+         their ticks.",
         rows.len()
     ));
+    let ramps = count(|row| row.flags.has(CycleFlags::RAMP));
+    if ramps > 0 {
+        page.paragraph(&format!(
+            "{ramps} cycles in which a wave comes in or goes out are in cycles.csv, and in no trend."
+        ));
+    }
     let rest = Rest::of(rows);
+    let groups = groups(rows);
     let mut table = Table::new([
         Column::left("of"),
         Column::left("quantity"),
-        Column::left("arm"),
+        Column::left("motion"),
         Column::right("cycles"),
-        Column::right("first"),
-        Column::right("last"),
-        Column::right("per cycle"),
-        Column::right("95 %"),
+        Column::right("first ten"),
+        Column::right("last ten"),
+        Column::right("change per cycle"),
         Column::left("trend"),
+        Column::left("saturating law"),
     ]);
     table.caption(
-        "Straight lines through all cycles of an arm. A trend is one when it is beyond three times its 95 % interval. Stretch and \
-         areal stretch: largest length and area over those at the start of the first cycle.",
+        "Means of the first and the last ten cycles (of each half, where there are fewer than twenty) with their 95 % intervals; \
+         change per cycle: of a straight line. A trend is one when it is beyond three times the line's 95 % interval. The law: \
+         end + (start - end) exp(-cycle/constant), told where the cycles say at what it saturates; * where it describes them \
+         better than the line. Each motion by itself, skipped cycles and the static arm's way to its load and back left out. Stretch and areal stretch: largest length and \
+         area over those at the start of the first cycle.",
     );
-    let mut figure = Figure::new("cycles", "The cycles of the run, cyclic and static arm.");
+    let mut figure = Figure::new("cycles", "The cycles of the run, each motion by itself.");
     let mut json = Vec::new();
     for quantity in &QUANTITIES {
         let mut panel = Panel::new(
             Axis::linear("cycle", ""),
-            Axis::linear(quantity.name, quantity.unit),
+            Axis::linear(axis_name(quantity.name), quantity.unit),
         )
         .height_px(160.0);
         let mut any = false;
-        for (arm, name) in [(ArmKind::Cyclic, "cyclic"), (ArmKind::Static, "static")] {
-            let values: Vec<(u64, f64)> = rows
+        for group in &groups {
+            let values: Vec<(u64, f64)> = group
+                .rows
                 .iter()
-                .filter(|row| row.arm == arm)
                 .map(|row| (row.cycle, (quantity.of)(row, &rest)))
                 .filter(|(_, value)| value.is_finite())
                 .collect();
@@ -173,21 +186,10 @@ pub fn section(page: &mut Report, read: &ReadCycles) -> serde_json::Value {
             any = true;
             let x: Vec<f64> = values.iter().map(|(cycle, _)| *cycle as f64).collect();
             let y: Vec<f64> = values.iter().map(|(_, value)| *value).collect();
-            panel = panel.series(Series::points(name, &x, &y));
+            panel = panel.series(Series::points(&group.name, &x, &y));
             if let Some(found) = trend(values) {
-                row(&mut table, quantity, name, &found);
-                json.push(serde_json::json!({
-                    "of": quantity.of_what,
-                    "quantity": quantity.name,
-                    "unit": quantity.unit,
-                    "arm": name,
-                    "cycles": found.cycles,
-                    "first": found.first,
-                    "last": found.last,
-                    "per_cycle": found.per_cycle,
-                    "ci95_per_cycle": found.ci95_per_cycle,
-                    "significant": found.is_significant(),
-                }));
+                row(&mut table, quantity, &group.name, &found);
+                json.push(trend_json(quantity, group, &found));
             }
         }
         if any {
@@ -200,23 +202,166 @@ pub fn section(page: &mut Report, read: &ReadCycles) -> serde_json::Value {
     serde_json::Value::Array(json)
 }
 
-fn row(table: &mut Table, quantity: &Quantity, arm: &str, found: &Trend) {
-    let significant = found.is_significant();
+/// Cycles of one motion in one arm.
+struct Group<'r> {
+    arm: ArmKind,
+    name: String,
+    stroke_um: f64,
+    duration_s: f64,
+    rows: Vec<&'r CycleRow>,
+}
+
+/// Whether a cycle of the static arm is one in which the bead goes to its load or back.
+pub fn on_the_way(row: &CycleRow) -> bool {
+    const STILL_UM: f64 = 0.01;
+    row.arm == ArmKind::Static && row.stroke_um > STILL_UM
+}
+
+/// The name of a quantity beside its axis: a long one would be cut there.
+fn axis_name(name: &str) -> &str {
+    match name {
+        "reached over commanded amplitude" => "reached / commanded",
+        other => other,
+    }
+}
+
+/// Motions that are told apart: of a sweep over more, the first.
+const MOST_GROUPS: usize = 8;
+
+/// The cycles by arm, stroke and duration: across amplitudes there is no trend.
+fn groups(rows: &[CycleRow]) -> Vec<Group<'_>> {
+    let mut groups: Vec<Group> = Vec::new();
+    for row in rows {
+        if row.flags.has(CycleFlags::RAMP) || row.flags.has(CycleFlags::SKIPPED) || on_the_way(row)
+        {
+            continue;
+        }
+        let full = groups.len() == MOST_GROUPS;
+        let known = groups.iter_mut().find(|group| {
+            let stroke_um = match row.arm {
+                ArmKind::Cyclic => group.stroke_um,
+                // It goes to its load in the first cycle and comes back in the last.
+                ArmKind::Static => row.stroke_um,
+            };
+            group.arm == row.arm && row.moves_as((stroke_um, group.duration_s))
+        });
+        match known {
+            Some(group) => group.rows.push(row),
+            // A row without records has no stroke of its own.
+            None if !full && row.stroke_um.is_finite() => groups.push(Group {
+                arm: row.arm,
+                name: String::new(),
+                stroke_um: row.stroke_um,
+                duration_s: row.duration_s,
+                rows: vec![row],
+            }),
+            None => {}
+        }
+    }
+    let cyclic = groups.iter().filter(|group| group.arm == ArmKind::Cyclic);
+    let many = cyclic.count() > 1;
+    for group in &mut groups {
+        group.name = match (group.arm, many) {
+            (ArmKind::Static, _) => "static".to_string(),
+            (ArmKind::Cyclic, false) => "cyclic".to_string(),
+            (ArmKind::Cyclic, true) => format!(
+                "{} um, {} s",
+                short(group.stroke_um),
+                short(group.duration_s)
+            ),
+        };
+    }
+    groups
+}
+
+/// A number to three digits, without zeros behind it.
+fn short(value: f64) -> String {
+    let text = format!("{value:.3}");
+    text.trim_end_matches('0').trim_end_matches('.').to_string()
+}
+
+/// A value with an interval, to the digits that the interval leaves it.
+pub fn with_interval(value: f64, ci95: f64) -> String {
+    let digits = if ci95 > 0.0 && ci95.is_finite() {
+        (1.0 - ci95.log10().floor()).clamp(0.0, 9.0) as usize
+    } else {
+        4
+    };
+    if !ci95.is_finite() {
+        return format!("{value:.digits$} (no interval)");
+    }
+    // One value, one line.
+    format!("{value:.digits$}\u{a0}±\u{a0}{ci95:.digits$}")
+}
+
+fn trend_json(quantity: &Quantity, group: &Group, found: &Trend) -> serde_json::Value {
+    serde_json::json!({
+        "of": quantity.of_what,
+        "quantity": quantity.name,
+        "unit": quantity.unit,
+        "arm": match group.arm {
+            ArmKind::Cyclic => "cyclic",
+            ArmKind::Static => "static",
+        },
+        "motion": group.name,
+        "stroke_um": group.stroke_um,
+        "duration_s": group.duration_s,
+        "cycles": found.cycles,
+        "first": found.first.mean,
+        "first_ci95": found.first.ci95,
+        "first_cycles": found.first.cycles,
+        "last": found.last.mean,
+        "last_ci95": found.last.ci95,
+        "last_cycles": found.last.cycles,
+        "per_cycle": found.per_cycle,
+        "ci95_per_cycle": found.ci95_per_cycle,
+        "line_residual": found.residual,
+        "significant": found.is_significant(),
+        "saturating": found.saturating.map(|law| serde_json::json!({
+            "start": law.start,
+            "start_ci95": law.start_ci95,
+            "end": law.end,
+            "end_ci95": law.end_ci95,
+            "cycles": law.cycles,
+            "cycles_ci95": law.cycles_ci95,
+            "residual": law.residual,
+            "better_than_line": law.better_than_line,
+        })),
+    })
+}
+
+fn row(table: &mut Table, quantity: &Quantity, motion: &str, found: &Trend) {
     let name = if quantity.unit.is_empty() {
         quantity.name.to_string()
     } else {
         format!("{} ({})", quantity.name, quantity.unit)
     };
+    let law = found.saturating.map_or_else(String::new, |law| {
+        format!(
+            "{} to {}, {} cycles{}",
+            with_interval(law.start, law.start_ci95),
+            with_interval(law.end, law.end_ci95),
+            with_interval(law.cycles, law.cycles_ci95),
+            if law.better_than_line { " *" } else { "" }
+        )
+    });
     table.row([
         quantity.of_what,
         name.as_str(),
-        arm,
+        motion,
         &found.cycles.to_string(),
-        &format!("{:.4}", found.first),
-        &format!("{:.4}", found.last),
-        &format!("{:.3e}", found.per_cycle),
-        &format!("{:.1e}", found.ci95_per_cycle),
-        if significant { "yes" } else { "none" },
+        &with_interval(found.first.mean, found.first.ci95),
+        &with_interval(found.last.mean, found.last.ci95),
+        &format!(
+            "{:.1e}\u{a0}±\u{a0}{:.0e}",
+            found.per_cycle, found.ci95_per_cycle
+        ),
+        if found.is_significant() {
+            "yes"
+        } else {
+            "none"
+        },
+        &law,
     ]);
 }
 

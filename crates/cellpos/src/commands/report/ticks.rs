@@ -1,7 +1,7 @@
 //! What a report needs of the ticks, gathered as they go by.
 
 use super::envelope::Envelope;
-use cellpos_runtime::{Life, TickRecord};
+use cellpos_runtime::{Life, Statistics, TickRecord};
 use std::collections::VecDeque;
 
 /// Ticks remembered to find the reference of the time of an exposure.
@@ -16,6 +16,19 @@ pub struct Excerpt {
     pub command_um: Vec<f64>,
 }
 
+/// The length of the cell over one cycle.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Course {
+    /// Number of the cycle, from 1 as people count.
+    pub number: u64,
+    /// Session it is in, and where in it, ns.
+    pub session: u64,
+    pub from_ns: i64,
+    pub to_ns: i64,
+    pub time_s: Vec<f64>,
+    pub length_um: Vec<f64>,
+}
+
 /// Columns of a run.
 #[derive(Debug, Default)]
 pub struct Ticks {
@@ -24,8 +37,16 @@ pub struct Ticks {
     /// Reference, position, command and neutral over the whole run, um.
     pub traces: Envelope<4>,
     pub excerpt: Excerpt,
-    /// Of every tick of the closed loop; NaN without a position.
+    /// Of every tick whose error counts (see [`Statistics`]); NaN without a position.
     pub error_um: Vec<f64>,
+    /// The figures of each session, as the terminal and run.toml have them.
+    pub statistics: Vec<Statistics>,
+    /// Length of the cell over the whole run, um; empty where none was measured.
+    pub length: Envelope<1>,
+    pub has_length: bool,
+    /// Cycles whose course is drawn.
+    pub courses: Vec<Course>,
+    session: u64,
     pub wake_us: Vec<f64>,
     pub compute_us: Vec<f64>,
     /// Sum and number of the stated variances of positions.
@@ -38,11 +59,22 @@ pub struct Ticks {
 }
 
 impl Ticks {
+    /// Nothing yet; the cycles whose course is wanted are known.
+    pub fn with_courses(courses: Vec<Course>) -> Self {
+        Self {
+            courses,
+            ..Self::default()
+        }
+    }
+
     /// A session begins at a time of the run.
     pub fn begin(&mut self, start_s: f64) {
         self.start_s = start_s;
         self.past.clear();
         self.traces.gap();
+        self.length.gap();
+        self.session += 1;
+        self.statistics.push(Statistics::default());
     }
 
     /// The next tick.
@@ -62,6 +94,28 @@ impl Ticks {
         self.past.push_back((r.time_ns, r.target_um));
         self.wake_us.push(f64::from(r.wake_ns) * 1e-3);
         self.compute_us.push(f64::from(r.compute_ns) * 1e-3);
+        self.length.add(time_s, [r.length_um]);
+        if r.length_um.is_finite() {
+            self.has_length = true;
+            // Lengths are of the exposure, not of the tick.
+            let at = |course: &&mut Course| {
+                course.session == self.session
+                    && (course.from_ns..course.to_ns).contains(&r.mid_exposure_ns)
+            };
+            if let Some(course) = self.courses.iter_mut().find(at) {
+                course
+                    .time_s
+                    .push((r.mid_exposure_ns - course.from_ns) as f64 * 1e-9);
+                course.length_um.push(r.length_um);
+            }
+        }
+        let counts = match self.statistics.last_mut() {
+            Some(statistics) => {
+                statistics.add(r);
+                statistics.counts_now()
+            }
+            None => false,
+        };
         if r.life != Life::Running as u8 {
             return;
         }
@@ -71,6 +125,9 @@ impl Ticks {
             self.excerpt.target_um.push(r.target_um);
             self.excerpt.measured_um.push(r.measured_um);
             self.excerpt.command_um.push(r.command_um);
+        }
+        if !counts {
+            return;
         }
         let then_um = self.target_at(r.mid_exposure_ns);
         self.error_um.push(match then_um {
@@ -115,24 +172,29 @@ impl Ticks {
         (self.variance_um2.0 / self.variance_um2.1.max(1) as f64).sqrt()
     }
 
-    fn errors(&self) -> impl Iterator<Item = f64> {
-        self.error_um.iter().copied().filter(|um| um.is_finite())
-    }
-
-    /// RMS error, um.
+    /// RMS error of all sessions together, um: of the very positions that the terminal's and run.toml's figures are of.
     pub fn rms_um(&self) -> Option<f64> {
-        let n = self.errors().count();
-        (n > 0).then(|| (self.errors().map(|um| um * um).sum::<f64>() / n as f64).sqrt())
+        let (n, sum) = self.sums(|statistics| statistics.rms_measured_nm().map(|nm| nm * nm));
+        (n > 0.0).then(|| (sum / n).sqrt() * 1e-3)
     }
 
     /// Mean error, um.
     pub fn mean_um(&self) -> Option<f64> {
-        let n = self.errors().count();
-        (n > 0).then(|| self.errors().sum::<f64>() / n as f64)
+        let (n, sum) = self.sums(Statistics::mean_error_nm);
+        (n > 0.0).then(|| sum / n * 1e-3)
+    }
+
+    /// Number of positions, and sum over them of what their sessions have in the mean.
+    fn sums(&self, of: impl Fn(&Statistics) -> Option<f64>) -> (f64, f64) {
+        self.statistics
+            .iter()
+            .filter_map(|statistics| Some((statistics.positions() as f64, of(statistics)?)))
+            .fold((0.0, 0.0), |(n, sum), (m, mean)| (n + m, sum + m * mean))
     }
 
     /// Largest error, um.
     pub fn peak_um(&self) -> Option<f64> {
-        self.errors().map(f64::abs).reduce(f64::max)
+        let peaks = self.statistics.iter().filter_map(Statistics::peak_error_nm);
+        peaks.reduce(f64::max).map(|nm| nm * 1e-3)
     }
 }

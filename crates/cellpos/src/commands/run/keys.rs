@@ -1,11 +1,9 @@
-//! Keys while a script runs: p pauses and goes on, s skips, q stops; and the signals that do the same where there is no
-//! keyboard.
+//! Keys while a script runs: p pauses and goes on, s skips, q stops. The signals that do the same where there is no keyboard
+//! are those of every session.
 
-use cellpos_runtime::Request;
 use cellpos_runtime::live::Operator;
+use cellpos_session::signals::press;
 use rustix::termios::{self, LocalModes, OptionalActions, SpecialCodeIndex, Termios};
-use signal_hook::consts::{SIGUSR1, SIGUSR2};
-use signal_hook::iterator::{Handle, Signals};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
@@ -17,10 +15,14 @@ pub struct Keys {
     thread: Option<JoinHandle<()>>,
 }
 
-/// Listens, if standard input is a terminal.
+/// Listens, if standard input is a terminal and this program is in its foreground: one in the background is stopped by the
+/// system when it touches the terminal, and a stopped program cannot hold a bead.
 pub fn listen(operator: &Arc<Operator>) -> Option<Keys> {
     let stdin = rustix::stdio::stdin();
     if !termios::isatty(stdin) {
+        return None;
+    }
+    if termios::tcgetpgrp(stdin).ok() != Some(rustix::process::getpgrp()) {
         return None;
     }
     let before = termios::tcgetattr(stdin).ok()?;
@@ -55,55 +57,6 @@ pub fn listen(operator: &Arc<Operator>) -> Option<Keys> {
     })
 }
 
-/// The signals while they are listened to.
-pub struct Nudges {
-    handle: Handle,
-    thread: Option<JoinHandle<()>>,
-}
-
-/// Listens to signals: USR1 does what p does, USR2 what s does.
-pub fn listen_to_signals(operator: &Arc<Operator>) -> std::io::Result<Nudges> {
-    let mut signals = Signals::new([SIGUSR1, SIGUSR2])?;
-    let handle = signals.handle();
-    let operator = Arc::clone(operator);
-    let thread = std::thread::Builder::new()
-        .name("cellpos-signals".to_string())
-        .spawn(move || {
-            for signal in signals.forever() {
-                press(if signal == SIGUSR1 { b'p' } else { b's' }, &operator);
-            }
-        })?;
-    Ok(Nudges {
-        handle,
-        thread: Some(thread),
-    })
-}
-
-impl Drop for Nudges {
-    fn drop(&mut self) {
-        self.handle.close();
-        if let Some(thread) = self.thread.take() {
-            let _ = thread.join();
-        }
-    }
-}
-
-/// What a key does.
-fn press(key: u8, operator: &Operator) {
-    // Whichever of two requests holds; neither once a stop has been asked for.
-    let toggle = |from, to, back| {
-        let _ = operator.change(Request::None, to) || operator.change(from, back);
-    };
-    match key {
-        b'p' | b' ' => toggle(Request::Pause, Request::Pause, Request::None),
-        b's' => toggle(Request::Pause, Request::Skip, Request::Skip),
-        b'q' => {
-            operator.stop();
-        }
-        _ => {}
-    }
-}
-
 impl Drop for Keys {
     fn drop(&mut self) {
         self.stop.store(true, Ordering::Release);
@@ -111,29 +64,5 @@ impl Drop for Keys {
             let _ = thread.join();
         }
         let _ = termios::tcsetattr(rustix::stdio::stdin(), OptionalActions::Now, &self.before);
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn p_pauses_and_goes_on_s_skips_once_and_neither_undoes_a_stop() {
-        let operator = Operator::default();
-        press(b'p', &operator);
-        assert_eq!(operator.take(), Request::Pause);
-        assert_eq!(operator.take(), Request::Pause);
-        press(b'p', &operator);
-        assert_eq!(operator.take(), Request::None);
-        press(b's', &operator);
-        assert_eq!(operator.take(), Request::Skip);
-        assert_eq!(operator.take(), Request::None);
-        press(b'q', &operator);
-        press(b'p', &operator);
-        press(b's', &operator);
-        assert_eq!(operator.take(), Request::Freeze);
-        press(b'q', &operator);
-        assert_eq!(operator.take(), Request::Park);
     }
 }

@@ -1,59 +1,18 @@
 //! Learning on the periodic motions of a script, and what was learned as a file of the run.
 
 use crate::cyclic::{LearnSpec, Wanted};
-use crate::outcome::Failure;
 use crate::rig_file::RigFile;
 use crate::setup::{MotionSpec, Prepared};
 use cellpos_control::{LearnedTable, Learner, LearnerState};
 use cellpos_script::{PeriodicReference, Plan};
-use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 
-/// Name of the file in the run folder.
-pub const LEARNED_TOML: &str = "learned.toml";
+pub use crate::cyclic::{LEARNED_TOML, NamedTable, load_learned as load, save_learned as save};
+
 /// Fewest cycles in full swing of a motion that is learned: two are watched, and some must be left to learn from.
 const FEWEST_CYCLES: u64 = 5;
 /// Most motions that are learned: the responses of each take a simulation.
 const MOST_MOTIONS: usize = 16;
-
-/// What was learned on a motion.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct NamedTable {
-    /// The motion in words.
-    pub name: String,
-    /// What was learned.
-    pub table: LearnedTable,
-}
-
-/// The file.
-#[derive(Debug, Default, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-struct LearnedFile {
-    #[serde(default)]
-    motion: Vec<NamedTable>,
-}
-
-/// What an earlier session learned; nothing when it left no file.
-pub fn load(folder: &Path) -> Result<Vec<NamedTable>, Failure> {
-    let path = folder.join(LEARNED_TOML);
-    match std::fs::read_to_string(&path) {
-        Ok(text) => {
-            let file: LearnedFile = crate::toml_file::parse(&text, &path.display().to_string())?;
-            Ok(file.motion)
-        }
-        Err(_) => Ok(Vec::new()),
-    }
-}
-
-/// Writes what was learned: whole or not at all.
-pub fn save(folder: &Path, motion: Vec<NamedTable>) -> std::io::Result<()> {
-    let file = LearnedFile { motion };
-    let text = toml::to_string_pretty(&file).map_err(std::io::Error::other)?;
-    let part = folder.join("learned.toml.part");
-    std::fs::write(&part, text)?;
-    std::fs::rename(part, folder.join(LEARNED_TOML))
-}
 
 /// How the motions of a plan are learned, going on from `known`; what cannot be learned is a warning.
 pub fn motions(

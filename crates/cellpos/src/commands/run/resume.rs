@@ -10,15 +10,21 @@ use cellpos_record::{
     write_table_parquet,
 };
 use cellpos_runtime::{Stage, TickRecord};
-use cellpos_script::{ArmKind, CycleRow, read_cycles};
+use cellpos_script::{ArmKind, CycleRow, CycleTable, read_cycles};
+use cellpos_table::read_text;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
-/// The acknowledged cycles of a run; none where it was cut off before it had a table.
+/// Larger than the table of any run, bytes.
+const MOST_TABLE: u64 = 1 << 30;
+
+/// The acknowledged cycles of a run. Where the table is gone they are counted again from the ticks: beginning at cycle 0
+/// would do all of them a second time.
 pub fn cycles(folder: &Path) -> Result<Vec<CycleRow>, Failure> {
     let path = folder.join(CYCLES_CSV);
-    let text = match std::fs::read_to_string(&path) {
+    let text = match read_text(&path, MOST_TABLE) {
         Ok(text) => text,
-        Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(Vec::new()),
+        Err(error) if error.kind() == std::io::ErrorKind::NotFound => return counted(folder),
         Err(error) => {
             return Err(Failure::bad_input(
                 format!("{}: {error}", path.display()),
@@ -40,24 +46,62 @@ pub fn cycles(folder: &Path) -> Result<Vec<CycleRow>, Failure> {
     ))
 }
 
+/// The cycles that the ticks of all sessions hold whole.
+fn counted(folder: &Path) -> Result<Vec<CycleRow>, Failure> {
+    let mut rows = Vec::new();
+    for session in sessions(folder) {
+        let reader = RunReader::open(&session).map_err(Failure::input)?;
+        let Some(config) = session_config(&reader) else {
+            continue;
+        };
+        let setup = replay::setup(&reader)?;
+        let Some((_, plan)) = setup.config.reference.script()? else {
+            continue;
+        };
+        let timing = &setup.config.timing;
+        let mut table = CycleTable::new(
+            Arc::new(plan),
+            config.number,
+            config.first_cycle,
+            timing.camera_delay_ms,
+            timing.period_us,
+        );
+        for tick in reader.batches().map_err(Failure::input)?.flatten() {
+            table.add(&tick);
+            rows.extend(std::iter::from_fn(|| table.pop()));
+        }
+    }
+    Ok(rows)
+}
+
+/// Writes a run's table of cycles anew, whole or not at all.
+fn write_cycles(path: &Path, rows: &[CycleRow]) -> Result<(), Failure> {
+    let mut text = CycleRow::csv_head() + "\n";
+    for row in rows {
+        text.push_str(&row.to_csv());
+        text.push('\n');
+    }
+    cellpos_table::write_atomically(path, text.as_bytes()).map_err(Failure::failed)
+}
+
 /// Gives the table of a run that an older version began the columns of this one, in one step: new rows go below the
 /// same head, and what the older version did not measure stays empty.
 fn renew(folder: &Path) -> Result<(), Failure> {
     let path = folder.join(CYCLES_CSV);
-    let Ok(text) = std::fs::read_to_string(&path) else {
-        return Ok(());
+    let Ok(text) = read_text(&path, MOST_TABLE) else {
+        // The table is gone: the cycles that the ticks hold are its first rows.
+        let rows = cycles(folder)?;
+        return match rows.is_empty() {
+            true => Ok(()),
+            false => write_cycles(&path, &rows),
+        };
     };
     if !read_cycles(cellpos_record::whole_text(&text)).older {
         return Ok(());
     }
     // Held while it is replaced: nobody else may be writing it.
     let held = LineFile::open(&path, &CycleRow::csv_head(), true).map_err(Failure::input)?;
-    let mut text = CycleRow::csv_head() + "\n";
-    for row in cycles(folder)? {
-        text.push_str(&row.to_csv());
-        text.push('\n');
-    }
-    cellpos_table::write_atomically(&path, text.as_bytes()).map_err(Failure::failed)?;
+    write_cycles(&path, &cycles(folder)?)?;
     drop(held);
     Ok(())
 }

@@ -8,7 +8,8 @@ use cellpos_record::{Event as LogEvent, Faults, LineFile, RunWriter};
 use cellpos_rig::Clock;
 use cellpos_runtime::live::Operator;
 use cellpos_runtime::{Event, Request, RunSink, Stage, Statistics, TickRecord};
-use cellpos_script::{Alarm, AmplitudeWatch, CycleRow, CycleTable, Plan};
+use cellpos_script::{Alarm, AmplitudeWatch, CycleRow, CycleTable, FatigueWatch, Plan};
+use cellpos_session::say::say;
 use indicatif::{ProgressBar, ProgressStyle};
 use std::ops::Range;
 use std::sync::Arc;
@@ -21,6 +22,8 @@ pub struct ScriptSink {
     watch: AmplitudeWatch,
     /// Ends the run when the amplitude error is too large.
     limit: Option<AmplitudeWatch>,
+    /// Ends the run when the cell has changed as much as the script says.
+    fatigue: Option<FatigueWatch>,
     operator: Arc<Operator>,
     plan: Arc<Plan>,
     bar: ProgressBar,
@@ -31,7 +34,8 @@ pub struct ScriptSink {
     last: Option<TickRecord>,
     stage: Stage,
     alarms: u64,
-    amplitude_stop: bool,
+    /// Why the rows of the table stopped it.
+    row_stop: Option<&'static str>,
     /// Length of the cell at the start of the first cycle, um.
     rest_um: Option<f64>,
     stretch: Option<f64>,
@@ -54,8 +58,8 @@ pub struct Stalls {
 pub struct End {
     /// What it was doing last.
     pub stage: Stage,
-    /// Stopped because the amplitude error was too large.
-    pub amplitude_stop: bool,
+    /// Why the rows of the per-cycle table stopped it, if they did.
+    pub row_stop: Option<&'static str>,
     /// Alarms given.
     pub alarms: u64,
 }
@@ -63,22 +67,18 @@ pub struct End {
 impl End {
     /// In words.
     pub fn name(&self) -> &'static str {
-        if self.amplitude_stop {
-            "stopped: amplitude error too large"
-        } else {
-            self.stage.name()
-        }
+        self.row_stop.unwrap_or_else(|| self.stage.name())
     }
 
     /// Whether a condition of the script stopped it.
     pub fn is_stop(&self) -> bool {
-        self.amplitude_stop || self.stage.is_over()
+        self.row_stop.is_some() || self.stage.is_over()
     }
 
     /// Whether the script did what it was to do.
     pub fn complete(&self) -> bool {
         let over = [Stage::Done, Stage::StoppedCycles, Stage::StoppedTime];
-        !self.amplitude_stop && over.contains(&self.stage)
+        self.row_stop.is_none() && over.contains(&self.stage)
     }
 }
 
@@ -101,7 +101,7 @@ impl ScriptSink {
         }
         writer.event(&begun);
         // Hidden by itself where standard error is no terminal.
-        let bar = ProgressBar::new((plan.total_s() * 1e3) as u64);
+        let bar = crate::output::progress_bar(Some((plan.total_s() * 1e3) as u64));
         if let Ok(style) = ProgressStyle::with_template("{bar:30} {percent:>3}% {wide_msg}") {
             bar.set_style(style);
         }
@@ -118,6 +118,7 @@ impl ScriptSink {
                 .stop()
                 .amplitude_error_above
                 .map(|limit| AmplitudeWatch::new(limit, AmplitudeWatch::WINDOW)),
+            fatigue: FatigueWatch::new(plan.stop()),
             writer,
             lines,
             cycles,
@@ -131,7 +132,7 @@ impl ScriptSink {
             last: None,
             stage: Stage::None,
             alarms: 0,
-            amplitude_stop: false,
+            row_stop: None,
             rest_um: None,
             stretch: None,
             stalls: None,
@@ -161,7 +162,7 @@ impl ScriptSink {
     pub fn end(&self) -> End {
         End {
             stage: self.stage,
-            amplitude_stop: self.amplitude_stop,
+            row_stop: self.row_stop,
             alarms: self.alarms,
         }
     }
@@ -210,15 +211,14 @@ impl ScriptSink {
                     .with("cycle", row.cycle)
                     .with("error_percent", error * 100.0),
             );
-            self.bar.suspend(|| {
-                eprintln!(
-                    "{name}: cycle {}: mean amplitude error {:+.1} %",
-                    row.cycle,
-                    error * 100.0
-                );
-            });
+            say(format!(
+                "{name}: cycle {}: mean amplitude error {:+.1} %",
+                row.cycle,
+                error * 100.0
+            ));
         }
         self.judge(&row, time_s);
+        self.judge_cell(&row, time_s);
         if row.length_start_um.is_finite() {
             let rest_um = *self.rest_um.get_or_insert(row.length_start_um);
             self.stretch = Some(row.length_peak_um / rest_um);
@@ -237,10 +237,45 @@ impl ScriptSink {
             .with("cycle", row.cycle)
             .with("error_percent", error * 100.0);
         self.writer.event(&event);
+        self.stop("stopped: amplitude error too large");
+    }
+
+    /// The script's own limits of what the cell does.
+    fn judge_cell(&mut self, row: &CycleRow, time_s: f64) {
+        let Some(passed) = self.fatigue.as_mut().and_then(|watch| watch.add(row)) else {
+            return;
+        };
+        let event = LogEvent::new(time_s, "fatigue-stop")
+            .with("cycle", row.cycle)
+            .with("quantity", passed.quantity)
+            .with("first", passed.first)
+            .with("value", passed.value)
+            .with("allowed", passed.allowed);
+        self.writer.event(&event);
+        // Said once: the rows behind it are of a bead that is frozen.
+        self.fatigue = None;
+        self.stop(match passed.quantity {
+            "stretch_down" => "stopped: the cell stretches less",
+            "rest_length_change" => "stopped: the cell at rest has another length",
+            _ => "stopped: the cell recovers more slowly",
+        });
+    }
+
+    fn stop(&mut self, why: &'static str) {
         if !matches!(self.operator.asked(), Request::Freeze | Request::Park) {
-            self.amplitude_stop = true;
+            self.row_stop = Some(why);
             self.operator.ask(Request::Freeze);
         }
+    }
+
+    /// The same sink, that knows the cycles of the sessions before.
+    pub fn with_cycles_done(mut self, rows: &[CycleRow]) -> Self {
+        if let Some(watch) = &mut self.fatigue {
+            for row in rows {
+                watch.add(row);
+            }
+        }
+        self
     }
 
     fn message(&self, r: &TickRecord) -> String {
@@ -262,8 +297,8 @@ impl ScriptSink {
             format!("  amplitude {:+.1} %", error * 100.0)
         });
         // Fewer cycles give a slope that is chance.
-        if let Some(trend) = self.watch.trend().filter(|trend| trend.cycles >= 20) {
-            amplitude.push_str(&format!(" ({:+.2} %/100 cycles)", trend.per_cycle * 1e4));
+        if let Some((_, per_cycle)) = self.watch.trend().filter(|(cycles, _)| *cycles >= 20) {
+            amplitude.push_str(&format!(" ({:+.2} %/100 cycles)", per_cycle * 1e4));
         }
         if let Some(stretch) = self.stretch.filter(|stretch| stretch.is_finite()) {
             amplitude.push_str(&format!("  stretch {stretch:.2}"));
@@ -320,6 +355,14 @@ impl RunSink for ScriptSink {
 
     fn event(&mut self, event: &Event) {
         self.writer.event(&log_event(event));
+    }
+
+    fn repeated(&mut self, last: &Event, count: u64) {
+        self.writer.event(&log_event(last).with("times", count));
+    }
+
+    fn is_refused(&self) -> bool {
+        self.writer.is_failing() || self.lines.is_failing()
     }
 
     fn learned(&mut self, motion: u16, state: &LearnerState) {

@@ -5,15 +5,18 @@ use crate::cyclic;
 use cellpos_runtime::Summary;
 use cellpos_runtime::realtime::Conditions;
 use cellpos_script::CycleRow;
+use cellpos_session::Ended;
 use serde::Serialize;
 
 /// How the session ended.
 #[derive(Debug, Serialize)]
-pub struct Ending {
+pub struct Ending<'a> {
     /// `done`, `stopped`, `aborted`, or the state of the life cycle.
     pub outcome: &'static str,
     /// What the script was doing last.
     pub stage: &'static str,
+    /// How the loop ended, in sentences.
+    pub ended: &'a Ended,
     /// Amplitude alarms.
     pub alarms: u64,
     /// The session's folder.
@@ -26,13 +29,15 @@ pub struct Ending {
 #[derive(Debug, Serialize)]
 pub struct Report<'a> {
     #[serde(flatten)]
-    ending: Ending,
+    ending: Ending<'a>,
     /// Cycles of the script.
     cycles: u64,
     /// Cycles in the table, those of earlier sessions included.
     cycles_done: u64,
-    /// Of these: disturbed.
+    /// Of these: changed by what happened in them.
     cycles_disturbed: u64,
+    /// Of the others: those in which anything at all happened.
+    cycles_touched: u64,
     /// Mean of reached over commanded amplitude, less 1, percent.
     amplitude_error_percent: Option<f64>,
     /// RMS of the tracking error over the cycles at the time of exposure, nm.
@@ -55,7 +60,7 @@ impl<'a> Report<'a> {
     /// Joins what there is to say.
     #[allow(clippy::too_many_arguments, reason = "each is one part of the report")]
     pub fn new(
-        ending: Ending,
+        ending: Ending<'a>,
         summary: &'a Summary,
         rows: &[CycleRow],
         cycles: u64,
@@ -69,6 +74,10 @@ impl<'a> Report<'a> {
             cycles,
             cycles_done: rows.len() as u64,
             cycles_disturbed: rows.iter().filter(|r| r.flags.is_disturbed()).count() as u64,
+            cycles_touched: rows
+                .iter()
+                .filter(|r| r.flags.is_touched() && !r.flags.is_disturbed())
+                .count() as u64,
             amplitude_error_percent: mean(
                 rows.iter()
                     .map(|r| 100.0 * (r.reached_um / r.commanded_um - 1.0)),
@@ -92,16 +101,20 @@ impl<'a> Report<'a> {
         };
         line(
             "outcome",
-            match self.summary.safe_reason {
-                Some(reason) => format!("{} ({reason:?})", self.ending.outcome),
-                None => format!("{} ({})", self.ending.outcome, self.ending.stage),
+            match self.ending.ended.as_asked() {
+                false => format!("{}: {}", self.ending.outcome, self.ending.ended.seen),
+                true => format!("{} ({})", self.ending.outcome, self.ending.stage),
             },
         );
+        if !self.ending.ended.as_asked() {
+            line("expected", self.ending.ended.expected.clone());
+            line("to do", self.ending.ended.to_do.clone());
+        }
         line(
             "cycles",
             format!(
-                "{} of {} done, {} disturbed",
-                self.cycles_done, self.cycles, self.cycles_disturbed
+                "{} of {} done, {} disturbed, {} more with a lost frame or the like",
+                self.cycles_done, self.cycles, self.cycles_disturbed, self.cycles_touched
             ),
         );
         line(
@@ -115,6 +128,13 @@ impl<'a> Report<'a> {
         line(
             "error",
             format!("{} RMS over the cycles", or_dash(self.cycle_rms_nm, "nm")),
+        );
+        line(
+            "error, all",
+            format!(
+                "{} RMS from 2 s after the loop was closed until the freeze",
+                or_dash(self.summary.rms_measured_nm, "nm")
+            ),
         );
         line("lowest possible", or_dash(self.bound_rms_nm, "nm RMS"));
         let c = &self.summary.counts;

@@ -1,0 +1,165 @@
+//! Arguments that need more than their type: run folders (a path, or `latest`), quantities above zero, values that begin with
+//! a minus.
+
+use clap::builder::{OsStringValueParser, TypedValueParser};
+use std::ffi::OsString;
+use std::path::{Path, PathBuf};
+use std::str::FromStr;
+
+/// Where runs lie unless an option says otherwise.
+const RUNS: &str = "runs";
+
+/// Reads a run folder: a path, `latest` for the newest run below runs/, `latest-NAME` for the newest of that name.
+pub fn run_folder() -> impl TypedValueParser<Value = PathBuf> {
+    OsStringValueParser::new().try_map(|text| {
+        let path = PathBuf::from(text);
+        match path.to_str() {
+            Some(word) if !path.exists() && (word == "latest" || word.starts_with("latest-")) => {
+                latest(Path::new(RUNS), word.strip_prefix("latest-"))
+            }
+            _ => Ok(path),
+        }
+    })
+}
+
+/// The newest run folder, of a name if one is given.
+fn latest(runs: &Path, name: Option<&str>) -> Result<PathBuf, String> {
+    let wanted = |folder: &Path| {
+        let text = folder.file_name().and_then(|text| text.to_str())?;
+        // <UTC time>-<name>, with -2, -3 ... behind it where a second had more than one.
+        let (time, rest) = text.split_once('-')?;
+        let (of, number) = match rest.rsplit_once('-') {
+            Some((of, tail)) if name.is_none_or(|name| name == of) => {
+                (of, tail.parse::<u64>().ok())
+            }
+            _ => (rest, None),
+        };
+        let is_run = time.len() == 16
+            && time.ends_with('Z')
+            && folder.join(cellpos_record::RUN_TOML).exists();
+        let named = name.is_none_or(|name| name == rest || (name == of && number.is_some()));
+        (is_run && named).then(|| (time.to_owned(), number.unwrap_or(1)))
+    };
+    let entries = std::fs::read_dir(runs)
+        .map_err(|error| format!("there is no folder {} here: {error}", runs.display()))?;
+    entries
+        .flatten()
+        .map(|entry| entry.path())
+        .filter_map(|folder| Some((wanted(&folder)?, folder)))
+        .max()
+        .map(|(_, folder)| folder)
+        .ok_or_else(|| match name {
+            Some(name) => format!("{} holds no run named {name}", runs.display()),
+            None => format!("{} holds no run", runs.display()),
+        })
+}
+
+/// Reads a quantity that must be above zero, such as a duration.
+///
+/// # Errors
+/// Says what would be right.
+pub fn positive<Q>(text: &str) -> Result<Q, String>
+where
+    Q: FromStr + PartialOrd + Default,
+    Q::Err: std::fmt::Display,
+{
+    let quantity: Q = text.parse().map_err(|error: Q::Err| error.to_string())?;
+    if quantity > Q::default() {
+        Ok(quantity)
+    } else {
+        Err("it must be above zero, for example 10s for a time".to_owned())
+    }
+}
+
+/// The words of a command line, with each value that begins with a minus and a digit joined to the option before it
+/// (`--duration -3s`): else it would be taken for an option of its own, and the message would not be about the value.
+pub fn joined(words: impl IntoIterator<Item = OsString>) -> Vec<OsString> {
+    let mut joined: Vec<OsString> = Vec::new();
+    for word in words {
+        let negative = word.to_str().is_some_and(|text| {
+            let rest = text.strip_prefix('-').unwrap_or("");
+            rest.starts_with(|c: char| c.is_ascii_digit() || c == '.')
+        });
+        let option = joined.last_mut().filter(|before| {
+            before
+                .to_str()
+                .is_some_and(|text| text.len() > 2 && text.starts_with("--") && !text.contains('='))
+        });
+        match option {
+            Some(option) if negative => {
+                option.push("=");
+                option.push(word);
+            }
+            _ => joined.push(word),
+        }
+    }
+    joined
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_negative_value_belongs_to_the_option_before_it() {
+        let words = [
+            "cellpos",
+            "track",
+            "--duration",
+            "-3s",
+            "--json",
+            "-v",
+            "--near=1um",
+            "-5",
+        ];
+        let joined = joined(words.map(OsString::from));
+        let expected = [
+            "cellpos",
+            "track",
+            "--duration=-3s",
+            "--json",
+            "-v",
+            "--near=1um",
+            "-5",
+        ];
+        assert_eq!(joined, expected.map(OsString::from));
+        assert!(positive::<cellpos_units::Seconds>("-3s").is_err());
+        assert!(
+            positive::<cellpos_units::Seconds>("3")
+                .unwrap_err()
+                .contains("unit")
+        );
+        assert_eq!(positive("3s"), Ok(cellpos_units::Seconds(3.0)));
+    }
+
+    #[test]
+    fn the_newest_run_is_found_by_its_time_its_number_and_its_name() {
+        let runs = tempfile::tempdir().unwrap();
+        for name in [
+            "20261121T100000Z-hold",
+            "20261121T110000Z-hold",
+            "20261121T110000Z-hold-2",
+            "20261121T110000Z-hold-10",
+            "20261121T120000Z-sine-fast",
+            "20261121T130000Z-identify-without-a-run",
+        ] {
+            let folder = runs.path().join(name);
+            std::fs::create_dir(&folder).unwrap();
+            if !name.contains("without") {
+                std::fs::write(folder.join("run.toml"), "").unwrap();
+            }
+        }
+        let found = |name| {
+            let folder = latest(runs.path(), name)?;
+            Ok::<_, String>(folder.file_name().unwrap().to_string_lossy().into_owned())
+        };
+        assert_eq!(found(None).unwrap(), "20261121T120000Z-sine-fast");
+        assert_eq!(found(Some("hold")).unwrap(), "20261121T110000Z-hold-10");
+        assert_eq!(
+            found(Some("sine-fast")).unwrap(),
+            "20261121T120000Z-sine-fast"
+        );
+        assert!(found(Some("night")).unwrap_err().contains("night"));
+        assert!(latest(Path::new("/nowhere"), None).is_err());
+    }
+}

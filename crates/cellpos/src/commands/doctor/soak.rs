@@ -1,0 +1,230 @@
+//! A bare loop at 1 kHz for as long as wanted, and what ran beside it when it was late.
+
+use cellpos_rig::clock::{monotonic_ns, sleep_until_ns};
+use cellpos_runtime::latency::{Latency, Quantiles};
+use cellpos_runtime::realtime::{self, Conditions, Request};
+use serde::Serialize;
+use std::collections::BTreeMap;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::time::Duration;
+
+/// A wake-up later than this is one to be explained, ns: a fifth of the period.
+pub const LATE_NS: u64 = 200_000;
+
+/// What the loop measured.
+#[derive(Debug, Clone, Serialize)]
+pub struct Soak {
+    /// What was obtained.
+    pub conditions: Conditions,
+    /// How long it ran, s.
+    pub seconds: f64,
+    /// Wake-ups measured.
+    pub wakeups: u64,
+    /// From the due time to the wake-up, us.
+    pub wake_us: Quantiles,
+    /// Wake-ups later than [`LATE_NS`].
+    pub late: u64,
+    /// Periods that were missed altogether.
+    pub missed: u64,
+    /// What ran on the machine in the tenths of a second with a late wake-up; empty unless asked for.
+    pub suspects: Vec<Suspect>,
+}
+
+/// Something that ran while the loop was late.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Suspect {
+    /// A process with its number, or an interrupt with its device.
+    pub name: String,
+    /// In how many of the late tenths of a second it ran.
+    pub times: u64,
+    /// Its processor time in them, ms; for an interrupt how often it came.
+    pub amount: f64,
+    /// `ms` or `interrupts`.
+    pub unit: &'static str,
+}
+
+/// Runs the loop. `why`: whether to look at what else runs (ten looks a second, at low priority).
+pub fn soak(request: Request, duration: Duration, why: bool) -> std::io::Result<Soak> {
+    let late = AtomicU64::new(0);
+    let done = AtomicBool::new(false);
+    std::thread::scope(|scope| {
+        let watcher = why.then(|| scope.spawn(|| watch(&late, &done, request.cpu)));
+        let measured = std::thread::Builder::new()
+            .name("cellpos-doctor".to_string())
+            .spawn_scoped(scope, || {
+                let conditions = realtime::apply(&request);
+                let (latency, missed, seconds) = bare_loop(duration, &late);
+                (conditions, latency, missed, seconds)
+            });
+        let measured = measured.map(|thread| thread.join());
+        done.store(true, Ordering::Relaxed);
+        let suspects = watcher.and_then(|thread| thread.join().ok());
+        let Ok((conditions, latency, missed, seconds)) = measured? else {
+            return Err(std::io::Error::other("the measuring thread broke off"));
+        };
+        Ok(Soak {
+            conditions,
+            seconds,
+            wakeups: latency.count(),
+            wake_us: latency.quantiles_us(),
+            late: late.load(Ordering::Relaxed),
+            missed,
+            suspects: suspects.unwrap_or_default(),
+        })
+    })
+}
+
+fn bare_loop(duration: Duration, late: &AtomicU64) -> (Latency, u64, f64) {
+    const PERIOD_NS: i64 = 1_000_000;
+    let mut latency = Latency::new();
+    let mut missed = 0;
+    let start = monotonic_ns() + PERIOD_NS;
+    let ticks = i64::try_from(duration.as_nanos() / PERIOD_NS as u128).unwrap_or(i64::MAX);
+    let mut tick = 0;
+    while tick < ticks {
+        let due = start + tick * PERIOD_NS;
+        sleep_until_ns(due);
+        let after = (monotonic_ns() - due).max(0);
+        latency.record(after as u64, tick as u64);
+        if after as u64 > LATE_NS {
+            late.fetch_add(1, Ordering::Relaxed);
+        }
+        let skipped = after / PERIOD_NS;
+        missed += skipped as u64;
+        tick += 1 + skipped;
+    }
+    (latency, missed, (monotonic_ns() - start) as f64 * 1e-9)
+}
+
+/// Processor time of every process (ms) and number of every interrupt so far, by name.
+fn snapshot(cpu: Option<usize>) -> BTreeMap<String, (f64, &'static str)> {
+    let mut all = BTreeMap::new();
+    let own = std::process::id().to_string();
+    for entry in std::fs::read_dir("/proc").into_iter().flatten().flatten() {
+        let pid = entry.file_name().to_string_lossy().into_owned();
+        if !pid.starts_with(|c: char| c.is_ascii_digit()) || pid == own {
+            continue;
+        }
+        let Ok(stat) = std::fs::read_to_string(entry.path().join("stat")) else {
+            continue;
+        };
+        // The name may hold blanks and brackets: the fields go on behind its last bracket.
+        if let (Some(open), Some(close)) = (stat.find('('), stat.rfind(')')) {
+            let name = stat.get(open + 1..close).unwrap_or("?");
+            let fields: Vec<&str> = stat
+                .get(close + 1..)
+                .unwrap_or("")
+                .split_whitespace()
+                .collect();
+            let ticks = |index: usize| -> f64 {
+                fields
+                    .get(index)
+                    .and_then(|field| field.parse().ok())
+                    .unwrap_or(0.0)
+            };
+            // User and system time, in hundredths of a second.
+            all.insert(
+                format!("{name} ({pid})"),
+                (10.0 * (ticks(11) + ticks(12)), "ms"),
+            );
+        }
+    }
+    let interrupts = std::fs::read_to_string("/proc/interrupts").unwrap_or_default();
+    for line in interrupts.lines().skip(1) {
+        let mut fields = line.split_whitespace();
+        let Some(number) = fields.next() else {
+            continue;
+        };
+        let rest: Vec<&str> = fields.collect();
+        let counts: Vec<f64> = rest
+            .iter()
+            .map_while(|field| field.parse::<f64>().ok())
+            .collect();
+        let count = match cpu {
+            Some(cpu) => counts.get(cpu).copied().unwrap_or(0.0),
+            None => counts.iter().sum(),
+        };
+        let device = rest.get(counts.len()..).unwrap_or(&[]).join(" ");
+        // The timer that wakes the loop comes a thousand times a second and is no suspect.
+        if !device.contains("timer") {
+            all.insert(
+                format!("interrupt {number} {device}"),
+                (count, "interrupts"),
+            );
+        }
+    }
+    all
+}
+
+fn watch(late: &AtomicU64, done: &AtomicBool, cpu: Option<usize>) -> Vec<Suspect> {
+    const LOOK: Duration = Duration::from_millis(100);
+    /// A tenth of a second holds ten hundredths: what ran in one of them ran.
+    const MOST: usize = 8;
+    let mut found: BTreeMap<String, Suspect> = BTreeMap::new();
+    let mut before = snapshot(cpu);
+    let mut seen = late.load(Ordering::Relaxed);
+    while !done.load(Ordering::Relaxed) {
+        std::thread::sleep(LOOK);
+        let after = snapshot(cpu);
+        let now = late.load(Ordering::Relaxed);
+        if now > seen {
+            for (name, (amount, unit)) in &after {
+                let grown = amount - before.get(name).map_or(0.0, |before| before.0);
+                if grown > 0.0 {
+                    let suspect = found.entry(name.clone()).or_insert_with(|| Suspect {
+                        name: name.clone(),
+                        times: 0,
+                        amount: 0.0,
+                        unit,
+                    });
+                    suspect.times += 1;
+                    suspect.amount += grown;
+                }
+            }
+        }
+        seen = now;
+        before = after;
+    }
+    let mut suspects: Vec<Suspect> = found.into_values().collect();
+    suspects.sort_by(|a, b| {
+        (b.times, b.amount)
+            .partial_cmp(&(a.times, a.amount))
+            .unwrap_or(std::cmp::Ordering::Equal)
+    });
+    suspects.truncate(MOST);
+    suspects
+}
+
+/// Whether the kernel could name who was late itself, in a sentence.
+pub fn tracing() -> String {
+    let tracers = ["/sys/kernel/tracing", "/sys/kernel/debug/tracing"]
+        .iter()
+        .find_map(|folder| std::fs::read_to_string(format!("{folder}/available_tracers")).ok());
+    match tracers {
+        Some(tracers) if tracers.contains("timerlat") => {
+            "this kernel traces it to the function: sudo rtla timerlat top (package rtla)".to_string()
+        }
+        Some(_) => {
+            "this kernel has no timerlat tracer: what is named is what ran beside the loop, a tenth of a second at a time"
+                .to_string()
+        }
+        None => {
+            "kernel tracing may not be read (it needs root): what is named is what ran beside the loop, a tenth of a second \
+             at a time"
+                .to_string()
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_else_runs_is_seen_by_name() {
+        let all = snapshot(None);
+        assert!(!all.is_empty());
+        assert!(all.values().all(|(amount, _)| *amount >= 0.0));
+        assert!(!all.keys().any(|name| name.contains("timer")));
+    }
+}

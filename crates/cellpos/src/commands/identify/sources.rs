@@ -1,0 +1,158 @@
+//! What `cellpos identify --data` reads: run folders and records of cellpos, as they are; any other file by its columns.
+
+use super::{Args, columns};
+use crate::commands::run::resume;
+use crate::outcome::Failure;
+use cellpos_record::RunReader;
+use cellpos_runtime::{Life, TickFlags};
+use cellpos_table::{ColumnRef, Table};
+use std::path::Path;
+
+/// A record with what is known of it.
+pub struct Source {
+    /// File or folder, and session where a run has several.
+    pub name: String,
+    /// Rows per second.
+    pub rate_hz: f64,
+    /// The input, row by row.
+    pub input: Vec<f64>,
+    /// The output; NaN where none was seen.
+    pub output: Vec<f64>,
+    /// What the input was to bring about, where the record has it.
+    pub reference: Option<Vec<f64>>,
+    /// Whether the record says itself that a loop was closed.
+    pub closed: bool,
+}
+
+/// Reads a file or a run folder.
+pub fn read(path: &Path, args: &Args) -> Result<Vec<Source>, Failure> {
+    if path.is_dir() {
+        return runs(path);
+    }
+    if let (Some(input), Some(output), Some(rate)) = (&args.input, &args.output, args.rate) {
+        let (input, output) = columns::read(path, input, output).map_err(Failure::input)?;
+        return Ok(vec![Source {
+            name: path.display().to_string(),
+            rate_hz: rate.0,
+            input,
+            output,
+            reference: None,
+            closed: false,
+        }]);
+    }
+    own_record(path).map(|source| vec![source])
+}
+
+/// A CSV of cellpos: time_s, pzt_um, bead_um, and target_um where it has one.
+fn own_record(path: &Path) -> Result<Source, Failure> {
+    let name = path.display().to_string();
+    let text = std::fs::read_to_string(path).map_err(|error| {
+        Failure::bad_input(
+            format!("{name}: cannot be read ({error})"),
+            "name a record or a run folder",
+        )
+    })?;
+    let foreign = |error: String| {
+        Failure::bad_input(
+            format!("{name}: is no record of cellpos: {error}"),
+            "say which columns it has, and how many rows a second: --input pzt_um --output bead_um --rate 1kHz",
+        )
+    };
+    let table = Table::parse(path, &text).map_err(|error| foreign(error.to_string()))?;
+    let column = |name: &str, gaps: bool| {
+        table
+            .numbers(&ColumnRef::Name(name.to_owned()), gaps)
+            .map_err(|error| foreign(error.to_string()))
+    };
+    let (time_s, input, output) = (
+        column("time_s", false)?,
+        column("pzt_um", false)?,
+        column("bead_um", true)?,
+    );
+    let mut steps: Vec<f64> = time_s.windows(2).map(|pair| pair[1] - pair[0]).collect();
+    steps.sort_by(f64::total_cmp);
+    let step_s = steps.get(steps.len() / 2).copied().unwrap_or(0.0);
+    if step_s <= 0.0 {
+        return Err(foreign("time_s does not rise".to_owned()));
+    }
+    Ok(Source {
+        rate_hz: 1.0 / step_s,
+        input,
+        output,
+        reference: column("target_um", true).ok(),
+        closed: false,
+        name,
+    })
+}
+
+/// The sessions of a run, each from where its loop was closed and had settled to where the operator or the script ended it.
+fn runs(path: &Path) -> Result<Vec<Source>, Failure> {
+    const SETTLED_NS: i64 = 2_000_000_000;
+    let folders = resume::sessions(path);
+    let many = folders.len() > 1;
+    let mut sources = Vec::new();
+    for (number, folder) in (1u64..).zip(&folders) {
+        let reader = RunReader::open(folder).map_err(Failure::input)?;
+        let (ticks, _) = reader.ticks().map_err(Failure::input)?;
+        let running = |tick: &cellpos_runtime::TickRecord| {
+            tick.life == Life::Running as u8 && !tick.flags.has(TickFlags::FREEZE)
+        };
+        let Some(first) = ticks.iter().find(|tick| running(tick)) else {
+            continue;
+        };
+        let from_ns = first.time_ns + SETTLED_NS;
+        let mut steps: Vec<i64> = ticks
+            .windows(2)
+            .map(|pair| pair[1].time_ns - pair[0].time_ns)
+            .collect();
+        steps.sort_unstable();
+        let step_ns = steps
+            .get(steps.len() / 2)
+            .copied()
+            .unwrap_or(1_000_000)
+            .max(1);
+        let (mut input, mut output, mut reference) = (Vec::new(), Vec::new(), Vec::new());
+        let mut last_seq = None;
+        for tick in ticks.iter().filter(|tick| tick.time_ns >= from_ns) {
+            if !running(tick) {
+                break;
+            }
+            // A tick whose record is lost leaves a row with the command before it, and no position.
+            let lost =
+                last_seq.map_or(0, |last: u64| tick.seq.saturating_sub(last + 1).min(10_000));
+            for _ in 0..lost {
+                input.push(input.last().copied().unwrap_or(tick.command_um));
+                output.push(f64::NAN);
+                reference.push(tick.target_um);
+            }
+            last_seq = Some(tick.seq);
+            let fresh = !tick.flags.has(TickFlags::TIMER) && !tick.flags.has(TickFlags::STALE);
+            input.push(tick.command_um);
+            output.push(if fresh && tick.verdict == 0 {
+                tick.measured_um
+            } else {
+                f64::NAN
+            });
+            reference.push(tick.target_um);
+        }
+        sources.push(Source {
+            name: if many {
+                format!("{}, session {number}", path.display())
+            } else {
+                path.display().to_string()
+            },
+            rate_hz: 1e9 / step_ns as f64,
+            input,
+            output,
+            reference: Some(reference),
+            closed: true,
+        });
+    }
+    if sources.is_empty() {
+        return Err(Failure::bad_input(
+            format!("{}: the loop was never closed in it", path.display()),
+            "name a run in which the bead was held or moved",
+        ));
+    }
+    Ok(sources)
+}

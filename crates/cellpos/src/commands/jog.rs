@@ -1,0 +1,225 @@
+//! `cellpos jog`: the PZT moved by hand, within the board's limits, parked at the end.
+
+use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
+use crate::rig_file::RigFile;
+use cellpos_rig::FrameBuffer;
+use cellpos_session::signals;
+use cellpos_units::{Micrometers, MicrometersPerSecond};
+use cellpos_workbench::Bench;
+use cellpos_workbench::mover::Mover;
+use cellpos_workbench::snapshot::{self, Eye};
+use serde::Serialize;
+use std::io::BufRead;
+use std::path::PathBuf;
+use std::sync::mpsc::{Receiver, channel};
+
+/// Arguments of `cellpos jog`.
+#[derive(Debug, clap::Args)]
+#[command(
+    after_help = "Without --to, lines are read from standard input: `5um` goes there, `+` and `-` go a step, `+2um` and `-2um` go \
+    that far, `q` ends. The PZT is parked at the end, on Ctrl-C too.\n\n\
+    Examples:\n  cellpos jog --rig rig.toml --to 15um --to 20um\n  cellpos jog --rig rig.toml --step 0.5um"
+)]
+pub struct Args {
+    /// Rig.
+    #[arg(long)]
+    rig: PathBuf,
+    /// Go there, then to the next, then park.
+    #[arg(long, value_name = "LENGTH", allow_hyphen_values = true)]
+    to: Vec<Micrometers>,
+    /// How far `+` and `-` go.
+    #[arg(long, default_value = "1um", value_parser = crate::arguments::positive::<Micrometers>)]
+    step: Micrometers,
+    /// How fast.
+    #[arg(long, default_value = "100um/s", value_parser = crate::arguments::positive::<MicrometersPerSecond>)]
+    speed: MicrometersPerSecond,
+    /// Do not look for a bead.
+    #[arg(long)]
+    blind: bool,
+    /// Print one JSON object on standard output.
+    #[arg(long)]
+    json: bool,
+}
+
+/// Where the PZT went, and what was seen there.
+#[derive(Debug, Serialize)]
+struct Stop {
+    commanded_um: f64,
+    applied_um: f64,
+    /// Position of the bead along the channel, um, or in pixels where nothing is calibrated.
+    bead_um: Option<f64>,
+    bead_px: Option<[f64; 2]>,
+}
+
+#[derive(Debug, Serialize)]
+struct Jogged {
+    stops: Vec<Stop>,
+    park_um: f64,
+}
+
+/// Ticks to rest at a stop before it is looked at.
+const SETTLE: u32 = 30;
+
+/// Moves, shows, parks.
+pub fn run(args: Args) -> CommandResult {
+    let bench = Bench::of(RigFile::load(Some(&args.rig))?)?;
+    let mut mover = Mover::arm(bench.board()?, bench.file())?;
+    let mut stops = Vec::new();
+    let lines = args.to.is_empty().then(read_lines);
+    let mut given = args.to.iter();
+    let mut at_um = mover.at_um();
+    loop {
+        let to_um = match &lines {
+            None => match given.next() {
+                Some(to) => to.0,
+                None => break,
+            },
+            Some(lines) => match next_line(lines, &mut mover, at_um, &args)? {
+                Some(to_um) => to_um,
+                None => break,
+            },
+        };
+        if !go(&mut mover, to_um, args.speed.0)? {
+            break;
+        }
+        at_um = to_um;
+        let stop = look(&bench, &mut mover, to_um, args.blind)?;
+        if !args.json {
+            print_text(&line(&stop))?;
+        }
+        stops.push(stop);
+    }
+    let park_um = mover.limits().park_um;
+    drop(mover);
+    let jogged = Jogged { stops, park_um };
+    if args.json {
+        print_json(&jogged)?;
+    } else {
+        print_text(&format!("parking at {park_um} um\n"))?;
+    }
+    Ok(Outcome::Done)
+}
+
+/// Goes there; false when it was asked to stop.
+fn go(mover: &mut Mover, to_um: f64, speed_um_per_s: f64) -> Result<bool, Failure> {
+    let mut rest = SETTLE;
+    while rest > 0 {
+        if signals::stopped_by().is_some() {
+            return Ok(false);
+        }
+        if mover.step(to_um, speed_um_per_s)? {
+            rest -= 1;
+        }
+    }
+    Ok(true)
+}
+
+/// The next displacement to go to; the present one is held meanwhile.
+fn next_line(
+    lines: &Receiver<String>,
+    mover: &mut Mover,
+    at_um: f64,
+    args: &Args,
+) -> Result<Option<f64>, Failure> {
+    use std::sync::mpsc::TryRecvError;
+    loop {
+        if signals::stopped_by().is_some() {
+            return Ok(None);
+        }
+        mover.step(at_um, args.speed.0)?;
+        let text = match lines.try_recv() {
+            Ok(text) => text,
+            Err(TryRecvError::Empty) => continue,
+            Err(TryRecvError::Disconnected) => return Ok(None),
+        };
+        match (text.trim(), relative(text.trim(), args.step.0)) {
+            ("q", _) => return Ok(None),
+            ("", _) => {}
+            (_, Some(by_um)) => return Ok(Some(at_um + by_um)),
+            (text, None) => match text.parse::<Micrometers>() {
+                Ok(um) => return Ok(Some(um.0)),
+                Err(error) => eprintln!("{text}: {error}; or +, -, +2um, -2um, q"),
+            },
+        }
+    }
+}
+
+/// How far to go for `+`, `-`, `+2um`, `-2um`.
+fn relative(text: &str, step_um: f64) -> Option<f64> {
+    let (sign, rest) = match text.strip_prefix('+') {
+        Some(rest) => (1.0, rest),
+        None => (-1.0, text.strip_prefix('-')?),
+    };
+    if rest.is_empty() {
+        return Some(sign * step_um);
+    }
+    rest.trim()
+        .parse::<Micrometers>()
+        .ok()
+        .map(|um| sign * um.0)
+}
+
+fn read_lines() -> Receiver<String> {
+    let (sender, receiver) = channel();
+    std::thread::spawn(move || {
+        for line in std::io::stdin().lock().lines() {
+            let Ok(line) = line else { return };
+            if sender.send(line).is_err() {
+                return;
+            }
+        }
+    });
+    receiver
+}
+
+/// What is seen at a stop. The PZT is held meanwhile.
+fn look(bench: &Bench, mover: &mut Mover, to_um: f64, blind: bool) -> Result<Stop, Failure> {
+    /// Frames in which a bead is looked for.
+    const LOOKS: u32 = 50;
+    let mut seen = None;
+    if !blind && let (Ok(mut camera), Ok(mut eye)) = (bench.camera(), Eye::of(bench)) {
+        let mut buffer = FrameBuffer::default();
+        let first_ns = snapshot::next_frame(camera.as_mut(), &mut buffer)?;
+        for _ in 0..LOOKS {
+            mover.step(to_um, f64::INFINITY)?;
+            let at_ns = snapshot::next_frame(camera.as_mut(), &mut buffer)?;
+            seen = eye.look(&buffer, (at_ns - first_ns) as f64 * 1e-9)?;
+            if seen.is_some() {
+                break;
+            }
+        }
+    }
+    Ok(Stop {
+        commanded_um: mover.at_um(),
+        applied_um: mover.newest().applied_um,
+        bead_um: seen.and_then(|seen| seen.position_um),
+        bead_px: seen.map(|seen| [seen.x_px, seen.y_px]),
+    })
+}
+
+fn line(stop: &Stop) -> String {
+    let bead = match (stop.bead_um, stop.bead_px) {
+        (Some(um), _) => format!("bead at {um:.2} um"),
+        (None, Some([x, y])) => format!("bead at column {x:.1}, row {y:.1}"),
+        (None, None) => "no bead seen".to_string(),
+    };
+    format!(
+        "PZT at {:.3} um (commanded {:.3} um), {bead}\n",
+        stop.applied_um, stop.commanded_um
+    )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn steps_and_ways_are_read_and_places_are_not_taken_for_them() {
+        assert_eq!(relative("+", 0.5), Some(0.5));
+        assert_eq!(relative("-", 0.5), Some(-0.5));
+        assert_eq!(relative("+2um", 0.5), Some(2.0));
+        assert_eq!(relative("-250nm", 0.5), Some(-0.25));
+        assert_eq!(relative("5um", 0.5), None);
+        assert_eq!(relative("+2", 0.5), None);
+    }
+}

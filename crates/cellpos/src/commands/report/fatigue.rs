@@ -1,0 +1,189 @@
+//! The fatigue figure: what the cycles did to the cell.
+
+use super::cycles::on_the_way;
+use super::ticks::{Course, Ticks};
+use cellpos_report::{Axis, Figure, Panel, Report, Series};
+use cellpos_script::{ArmKind, CycleFlags, CycleRow};
+
+/// The cycles whose course is drawn over each other: the first, the tenth, the hundredth, ... of those that have records.
+pub fn courses(rows: &[CycleRow]) -> Vec<Course> {
+    let cyclic: Vec<&CycleRow> = rows.iter().filter(is_whole).collect();
+    let mut wanted = Vec::new();
+    let mut number = 1;
+    while number <= cyclic.len() {
+        wanted.push(number);
+        number *= 10;
+    }
+    wanted
+        .into_iter()
+        .filter_map(|number| {
+            let row = cyclic.get(number - 1)?;
+            let from_ns = (row.start_s * 1e9) as i64;
+            Some(Course {
+                number: row.cycle + 1,
+                session: row.session,
+                from_ns,
+                to_ns: from_ns + (row.duration_s * 1e9) as i64,
+                time_s: Vec::new(),
+                length_um: Vec::new(),
+            })
+        })
+        .collect()
+}
+
+fn is_whole(row: &&CycleRow) -> bool {
+    row.arm == ArmKind::Cyclic
+        && row.start_s.is_finite()
+        && !row.flags.has(CycleFlags::SKIPPED)
+        && !row.flags.has(CycleFlags::RAMP)
+}
+
+/// Means of ten cycles each with their 95 % intervals: cycle, mean, low, high.
+fn tens(values: &[(f64, f64)]) -> [Vec<f64>; 4] {
+    const TEN: usize = 10;
+    // Student's t for nine degrees of freedom.
+    const T95: f64 = 2.262;
+    let mut columns: [Vec<f64>; 4] = Default::default();
+    for ten in values.chunks(TEN).filter(|ten| ten.len() == TEN) {
+        let n = TEN as f64;
+        let mean = |of: fn(&(f64, f64)) -> f64| ten.iter().map(of).sum::<f64>() / n;
+        let (cycle, value) = (mean(|p| p.0), mean(|p| p.1));
+        let squares: f64 = ten.iter().map(|p| (p.1 - value).powi(2)).sum();
+        let half = T95 * (squares / (n - 1.0) / n).sqrt();
+        for (column, value) in columns
+            .iter_mut()
+            .zip([cycle, value, value - half, value + half])
+        {
+            column.push(value);
+        }
+    }
+    columns
+}
+
+/// Adds the section, where the run has cycles of a cell.
+pub fn section(page: &mut Report, rows: &[CycleRow], ticks: &Ticks) {
+    let rest_um = rows
+        .iter()
+        .map(|row| row.length_start_um)
+        .find(|um| um.is_finite());
+    let Some(rest_um) = rest_um.filter(|_| ticks.has_length) else {
+        return;
+    };
+    page.section("The cell over its cycles");
+    page.figure(
+        Figure::new(
+            "length",
+            "Length of the cell over the whole run: the smallest and the largest of every few ticks.",
+        )
+        .panel(
+            Panel::new(Axis::linear("time", "s"), Axis::linear("length", "um")).series(
+                Series::line("length", &ticks.length.times_s(), &ticks.length.column(0)).thin(),
+            ),
+        ),
+    );
+    let mut panel = Panel::new(
+        Axis::linear("time since the cycle began", "s"),
+        Axis::linear("length", "um"),
+    );
+    let drawn: Vec<&Course> = ticks
+        .courses
+        .iter()
+        .filter(|course| !course.time_s.is_empty())
+        .collect();
+    for course in &drawn {
+        panel = panel.series(
+            Series::line(
+                &format!("cycle {}", course.number),
+                &course.time_s,
+                &course.length_um,
+            )
+            .thin(),
+        );
+    }
+    if !drawn.is_empty() {
+        page.figure(
+            Figure::new(
+                "cycles-over-each-other",
+                "Length over single cycles, laid over each other.",
+            )
+            .panel(panel),
+        );
+    }
+    let of = |arm: ArmKind, value: &dyn Fn(&CycleRow) -> f64| -> Vec<(f64, f64)> {
+        rows.iter()
+            .filter(|row| row.arm == arm && !on_the_way(row))
+            .filter(|row| !row.flags.has(CycleFlags::SKIPPED) && !row.flags.has(CycleFlags::RAMP))
+            .map(|row| (row.cycle as f64 + 1.0, value(row)))
+            .filter(|(_, value)| value.is_finite())
+            .collect()
+    };
+    let mut figure = Figure::new(
+        "fatigue",
+        "Stretch, length at the start and recovery time of every cycle (points), and of ten cycles in the mean with the 95 % \
+         interval of that mean. The static arm stands beside.",
+    );
+    type Value<'v> = &'v dyn Fn(&CycleRow) -> f64;
+    let quantities: [(&str, &str, Value); 3] = [
+        ("stretch", "", &|row| row.length_peak_um / rest_um),
+        ("length at start", "um", &|row| row.length_start_um),
+        ("recovery time", "s", &|row| row.recovery_s),
+    ];
+    for (name, unit, value) in quantities {
+        let mut panel =
+            Panel::new(Axis::linear("cycle", ""), Axis::linear(name, unit)).height_px(200.0);
+        for (color, arm, label) in [
+            (0, ArmKind::Cyclic, "cyclic"),
+            (1, ArmKind::Static, "static"),
+        ] {
+            let points = of(arm, value);
+            if points.is_empty() {
+                continue;
+            }
+            let (x, y): (Vec<f64>, Vec<f64>) = points.iter().copied().unzip();
+            let [cycle, mean, low, high] = tens(&points);
+            if cycle.is_empty() {
+                panel = panel.series(Series::points(label, &x, &y).color(color));
+            } else {
+                panel = panel
+                    .series(Series::points("", &x, &y).color(color).thin())
+                    .series(Series::intervals(label, &cycle, &mean, &low, &high).color(color));
+            }
+        }
+        figure = figure.panel(panel);
+    }
+    page.figure(figure.share_x());
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_first_tenth_and_hundredth_whole_cycle_are_drawn_over_each_other() {
+        let rows: Vec<CycleRow> = (0..150)
+            .map(|cycle| {
+                let mut row = CycleRow::empty(cycle, 1 + cycle / 100, ArmKind::Cyclic);
+                (row.start_s, row.duration_s) = (cycle as f64 % 100.0, 1.0);
+                row
+            })
+            .collect();
+        let found: Vec<(u64, u64)> = courses(&rows)
+            .iter()
+            .map(|course| (course.number, course.session))
+            .collect();
+        assert_eq!(found, vec![(1, 1), (10, 1), (100, 1)]);
+        assert!(courses(&[]).is_empty());
+    }
+
+    #[test]
+    fn means_of_ten_have_the_interval_of_a_mean() {
+        let values: Vec<(f64, f64)> = (0..25)
+            .map(|k| (f64::from(k), if k % 2 == 0 { 1.0 } else { 3.0 }))
+            .collect();
+        let [cycle, mean, low, high] = tens(&values);
+        assert_eq!((cycle.len(), cycle[0], mean[1]), (2, 4.5, 2.0));
+        // Scatter of sqrt(10 / 9) over sqrt(10), times t.
+        let half = 2.262 / 3.0;
+        assert!((high[0] - 2.0 - half).abs() < 1e-9 && (2.0 - low[0] - half).abs() < 1e-9);
+    }
+}

@@ -1,0 +1,189 @@
+//! `cellpos rig`: a rig file to begin with, and what is wrong with one.
+
+use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
+use crate::rig_file::RigFile;
+use cellpos_workbench::Bench;
+use cellpos_workbench::check::{self, Connected, Finding, Weight};
+use cellpos_workbench::template::{self, Kind};
+use serde::Serialize;
+use std::path::PathBuf;
+
+/// Arguments of `cellpos rig`.
+#[derive(Debug, clap::Args)]
+pub struct Args {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Debug, clap::Subcommand)]
+enum Command {
+    /// Print a commented rig file, with what this machine offers.
+    #[command(after_help = "Examples:\n  cellpos rig new --emulated > rig.toml\n  \
+        cellpos rig new --serial /dev/ttyACM0 --camera 192.168.1.20 > rig.toml\n  \
+        cellpos rig new --serial pzt --camera camera.sock > rig.toml")]
+    New(New),
+    /// Read a rig file and say what is wrong with it and what does not fit together.
+    #[command(
+        after_help = "Examples:\n  cellpos rig check rig.toml\n  cellpos rig check rig.toml --connect"
+    )]
+    Check(Check),
+}
+
+#[derive(Debug, clap::Args)]
+struct New {
+    /// Board and camera in this process.
+    #[arg(long, conflicts_with_all = ["serial", "camera"])]
+    emulated: bool,
+    /// Serial port of the board; left out: the first one found.
+    #[arg(long, value_name = "PORT")]
+    serial: Option<String>,
+    /// Socket of a camera server, or address of a GigE or USB3 Vision camera.
+    #[arg(long, value_name = "CAMERA")]
+    camera: Option<String>,
+}
+
+#[derive(Debug, clap::Args)]
+struct Check {
+    /// The file.
+    rig: PathBuf,
+    /// Open board and camera, too, and say what they are. Nothing moves.
+    #[arg(long)]
+    connect: bool,
+    /// Print one JSON object on standard output.
+    #[arg(long)]
+    json: bool,
+}
+
+/// What a check found.
+#[derive(Debug, Serialize)]
+struct Checked {
+    rig: PathBuf,
+    findings: Vec<Finding>,
+    connected: Option<Connected>,
+}
+
+/// Prints a template, or checks a file.
+pub fn run(args: Args) -> CommandResult {
+    match args.command {
+        Command::New(args) => new(args),
+        Command::Check(args) => check(args),
+    }
+}
+
+fn new(args: New) -> CommandResult {
+    let found = template::ports();
+    let port = args.serial.or_else(|| found.first().cloned());
+    let kind = match (args.emulated, port, args.camera) {
+        (false, Some(port), camera) => Kind::Real {
+            port,
+            camera: template::camera(camera.as_deref().unwrap_or("camera.sock")),
+        },
+        (false, None, Some(_)) => {
+            return Err(Failure::bad_input(
+                "no serial port was found for the board",
+                "plug it in, or name the port: --serial PORT; docs/rig.md, Permissions",
+            ));
+        }
+        (true, ..) | (false, None, None) => Kind::Emulated,
+    };
+    eprintln!(
+        "serial ports of this machine: {}",
+        if found.is_empty() {
+            "none".to_string()
+        } else {
+            found.join(", ")
+        }
+    );
+    print_text(&template::text(&kind))?;
+    Ok(Outcome::Done)
+}
+
+fn check(args: Check) -> CommandResult {
+    let file = RigFile::load(Some(&args.rig))?;
+    let findings = check::findings(&file, &args.rig);
+    let broken = findings
+        .iter()
+        .any(|finding| finding.weight == Weight::Error);
+    let connected = if args.connect && !broken {
+        Some(check::connect(&Bench::of(file)?)?)
+    } else {
+        None
+    };
+    let checked = Checked {
+        rig: args.rig,
+        findings,
+        connected,
+    };
+    if args.json {
+        print_json(&checked)?;
+    } else {
+        print_text(&checked.to_string())?;
+    }
+    Ok(if broken {
+        Outcome::Broken
+    } else {
+        Outcome::Done
+    })
+}
+
+impl Checked {
+    fn write(&self, f: &mut std::fmt::Formatter<'_>, finding: &Finding) -> std::fmt::Result {
+        let weight = match finding.weight {
+            Weight::Error => "error",
+            Weight::Warning => "warning",
+        };
+        let line = finding
+            .line
+            .map_or(String::new(), |line| format!(":{line}"));
+        let file = self.rig.display();
+        writeln!(f, "{file}{line}: {weight}: {}", finding.what)?;
+        writeln!(f, "  {}", finding.remedy)
+    }
+}
+
+impl std::fmt::Display for Checked {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        for finding in &self.findings {
+            self.write(f, finding)?;
+        }
+        if let Some(connected) = &self.connected {
+            for finding in &connected.findings {
+                self.write(f, finding)?;
+            }
+            let board = &connected.board;
+            writeln!(f, "board   {}", board.info.name)?;
+            writeln!(
+                f,
+                "        {} to {} um, {} um/s, watchdogs {} and {} ms; {} at {:.3} um",
+                board.info.low_um,
+                board.info.high_um,
+                board.info.slew_um_per_s,
+                board.info.watchdog_ms,
+                board.info.hold_watchdog_ms,
+                board.state,
+                board.applied_um
+            )?;
+            let trip = &board.round_trip_ms;
+            writeln!(
+                f,
+                "        round trip {:.2} ms (median), {:.2} (p99), {:.2} (largest); {} of {} lost",
+                trip.p50, trip.p99, trip.max, board.lost, board.sent
+            )?;
+            writeln!(
+                f,
+                "camera  {}: {} x {} px, {:.1} Hz, {:.2} ms from mid-exposure to arrival (median)",
+                connected.camera,
+                connected.size_px[0],
+                connected.size_px[1],
+                connected.rate_hz,
+                connected.age_ms.p50
+            )?;
+        }
+        let count = self.findings.len() + self.connected.as_ref().map_or(0, |c| c.findings.len());
+        match count {
+            0 => writeln!(f, "{}: nothing to say against it", self.rig.display()),
+            1 => writeln!(f, "{}: 1 finding", self.rig.display()),
+            n => writeln!(f, "{}: {n} findings", self.rig.display()),
+        }
+    }
+}

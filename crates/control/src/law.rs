@@ -1,0 +1,225 @@
+//! What a control law is: configuration that does not change, a state beside it, and a step from one tick to the next.
+//!
+//! A law decides where the PZT is to be. Everything around it is the loop's ([`crate::ControlLoop`]): it estimates, and
+//! after the law it adds excitation and what was learned over cycles, keeps the command finite, within range and within
+//! slew, and tells the law what came of it. So a law of another crate is a configuration, a state and one method:
+//!
+//! ```
+//! use cellpos_control::*;
+//! /// Proportional control about the zero-flow displacement that the estimator gives.
+//! #[derive(Debug, Clone)]
+//! struct Proportional {
+//!     kp_um_per_um: f64,
+//! }
+//!
+//! impl ControlLaw for Proportional {
+//!     type State = f64;
+//!     fn start(&self, _command_um: f64) -> f64 {
+//!         0.0
+//!     }
+//!     fn step(&self, last_error_um: &mut f64, input: &LawInput) -> LawOutput {
+//!         *last_error_um = input.reference_um - input.estimate.position_um;
+//!         LawOutput::wish(input.estimate.neutral_um + self.kp_um_per_um * *last_error_um)
+//!     }
+//!     fn columns(&self) -> &'static [&'static str] {
+//!         &["proportional_error_um"]
+//!     }
+//!     fn record(&self, last_error_um: &f64, out: &mut [f32]) {
+//!         out[0] = *last_error_um as f32;
+//!     }
+//! }
+//!
+//! let mut controller = Controller::with_law(LoopParts {
+//!     model: LoopModel::eq6(2e-3),
+//!     estimator: EstimatorConfig::default(),
+//!     controller: Proportional { kp_um_per_um: 0.3 },
+//!     limits: Limits::default(),
+//! })?;
+//! controller.start(20.0, 20.0);
+//! let fix = Measurement { position_um: 1.0, variance_um2: 4e-4, age_samples: 0, offset_samples: 0.0 };
+//! let out = controller.step(&LoopInput { measurement: Some(fix), ..LoopInput::default() });
+//! assert!(out.command_um < 20.0, "the bead is beyond the reference: pull");
+//! # Ok::<(), BuildError>(())
+//! ```
+
+use crate::estimator::Estimate;
+use std::fmt::Debug;
+
+/// Columns of its own that a law may have in the record.
+pub const LAW_COLUMNS: usize = 8;
+
+/// What a law is given in a tick.
+#[derive(Debug, Clone, Copy)]
+pub struct LawInput<'a> {
+    /// Reference of this tick, um of bead; finite.
+    pub reference_um: f64,
+    /// References of the coming ticks, the next one first; see [`LawInput::preview`].
+    pub preview_um: &'a [f64],
+    /// Position that this tick's measurement shows: the fix itself where it was used, else what the model says that it
+    /// would be, um. It is of the time of the frame, so older than the tick by the delay.
+    pub bead_um: f64,
+    /// What the estimator knows.
+    pub estimate: Estimate,
+    /// Command in force before this tick, less what was learned and the model does not know, um.
+    pub previous_um: f64,
+    /// How long an optimiser may take.
+    pub solver: SolverTerms,
+}
+
+/// Largest position that counts as one, um.
+pub(crate) const FAR_UM: f64 = 1e6;
+
+impl LawInput<'_> {
+    /// The reference `ahead + 1` ticks from now; the last one known is held.
+    pub fn preview(&self, ahead: usize) -> f64 {
+        let known = self
+            .preview_um
+            .get(ahead)
+            .or_else(|| self.preview_um.last())
+            .copied()
+            .unwrap_or(self.reference_um);
+        if known.abs() < FAR_UM {
+            known
+        } else {
+            self.reference_um
+        }
+    }
+
+    /// Nothing is learned of the bead in this tick (no fix was used, or something holds it): an integrator waits.
+    pub fn hold(&self) -> bool {
+        self.estimate.coasting || self.estimate.stuck
+    }
+}
+
+/// What a law answers.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct LawOutput {
+    /// Where the PZT is to be, um; the loop keeps it within the limits.
+    pub wish_um: f64,
+    /// Account of an optimiser.
+    pub solver: SolverReport,
+}
+
+impl LawOutput {
+    /// A wish without an optimiser's account.
+    pub fn wish(wish_um: f64) -> Self {
+        Self {
+            wish_um,
+            solver: SolverReport::default(),
+        }
+    }
+}
+
+/// A control law: immutable configuration, a state apart from it.
+///
+/// `start` and the making of the law may allocate; `step`, `applied`, `follow`, `skip` and `record` run in a tick, so they must
+/// neither allocate, block nor panic. What they compute may rest on their arguments alone: then a recorded run replays
+/// to the bit.
+pub trait ControlLaw: Debug + Send + 'static {
+    /// What it remembers from tick to tick; workspaces too.
+    type State: Debug + Send + 'static;
+
+    /// A state at rest at a command, um.
+    fn start(&self, command_um: f64) -> Self::State;
+
+    /// A tick that the law decides.
+    fn step(&self, state: &mut Self::State, input: &LawInput) -> LawOutput;
+
+    /// What came of the wish of this tick's [`ControlLaw::step`]: `applied_um` is the command after the limits, less
+    /// excitation and what was learned. For anti-windup.
+    fn applied(
+        &self,
+        _state: &mut Self::State,
+        _input: &LawInput,
+        _wish_um: f64,
+        _applied_um: f64,
+    ) {
+    }
+
+    /// A tick that something else decides (freeze, park, arming, no bead seen yet): `command_um` is what it commanded. A
+    /// law with memory follows, so that it takes over without a bump.
+    fn follow(&self, _state: &mut Self::State, _input: &LawInput, _command_um: f64) {}
+
+    /// A tick that never came: the command was held.
+    fn skip(&self, _state: &mut Self::State) {}
+
+    /// References of the coming ticks that a step can use.
+    fn preview_len(&self) -> usize {
+        0
+    }
+
+    /// The law moves its model along the reference by itself. What is learned over cycles is then what the plant needs
+    /// beyond the model, and the estimator is not told of it.
+    fn feeds_forward(&self) -> bool {
+        false
+    }
+
+    /// The law optimises: the record keeps the account of its solver.
+    fn optimises(&self) -> bool {
+        false
+    }
+
+    /// Names of its columns in the record, at most [`LAW_COLUMNS`], with the unit in the name and the law's name before it.
+    fn columns(&self) -> &'static [&'static str] {
+        &[]
+    }
+
+    /// Writes their values after a tick; `out` is as long as [`ControlLaw::columns`].
+    fn record(&self, _state: &Self::State, _out: &mut [f32]) {}
+}
+
+/// How long an optimising controller may take in a tick.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum SolverTerms {
+    /// As long as it needs: the virtual clock.
+    #[default]
+    Unlimited,
+    /// Until then; the time that it took is reported.
+    Until(std::time::Instant),
+    /// A recorded tick again: it ends as it ended then, after as many iterations. Without this a deadline would not
+    /// replay to the bit.
+    Recorded(SolverStatus, u8),
+}
+
+/// How the optimiser of a tick ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[repr(u8)]
+pub enum SolverStatus {
+    /// The controller does not optimise.
+    #[default]
+    NotUsed = 0,
+    /// Solved.
+    Solved = 1,
+    /// No plan of this tick (infeasible, or nothing usable): the shifted previous plan was used.
+    PreviousPlan = 2,
+    /// No plan was left: PI was used.
+    FallbackPi = 3,
+    /// Out of time or iterations: the best point within the limits that was at hand was used.
+    Feasible = 4,
+}
+
+impl SolverStatus {
+    /// The status of a number in a record; anything unknown counts as not used.
+    pub fn from_number(number: u8) -> Self {
+        match number {
+            1 => Self::Solved,
+            2 => Self::PreviousPlan,
+            3 => Self::FallbackPi,
+            4 => Self::Feasible,
+            _ => Self::NotUsed,
+        }
+    }
+}
+
+/// Account of the optimiser of a tick.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct SolverReport {
+    /// How it ended.
+    pub status: SolverStatus,
+    /// Iterations.
+    pub iterations: u16,
+    /// Constraints active at the solution.
+    pub active: u16,
+    /// Time it took, ns; 0 where no deadline was set.
+    pub solve_ns: u32,
+}

@@ -1,0 +1,25 @@
+//! Drivers: what implements the traits of `cellpos-rig` for real devices.
+//!
+//! Behind [`Camera`](cellpos_rig::Camera) stand a camera server's socket ([`socket`]), GigE and USB3 Vision cameras
+//! (`sources::industrial`, feature `aravis`) and recordings on disk ([`sources`]); [`VisionSource`] joins any of them, or
+//! a camera of your own, with a tracker and a calibration to a stream of positions. Behind
+//! [`Actuator`](cellpos_rig::Actuator) stands the PZT board at the end of any byte [`Port`].
+//!
+//! Drivers know no simulator. They may block, allocate and take locks: they run on the I/O threads, never in a tick.
+#![forbid(unsafe_code)]
+
+pub mod background;
+pub mod board;
+pub mod calibration;
+pub mod calibration_file;
+pub mod flow;
+pub mod serial;
+pub mod socket;
+pub mod sources;
+pub mod vision_source;
+
+pub use board::{BoardHost, Port};
+pub use calibration::{Axis, Calibration};
+pub use calibration_file::{CalibrationError, CalibrationFile};
+pub use flow::{CommandedFlow, FlowTap};
+pub use vision_source::{Followed, VisionSource};

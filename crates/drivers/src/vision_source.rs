@@ -1,0 +1,270 @@
+//! A camera with a tracker: frames in, positions of one and the same bead, or cell, out.
+//!
+//! The tracker predicts the bead from the commanded flow, takes a fix only when place, intensity, size and residual
+//! agree, and says of every frame where it stands and why. A fix that it does not take gives no position, so that the
+//! loop coasts rather than follows another bead. Of a cell, length and area come with the position.
+
+use crate::calibration::{Axis, Calibration};
+use crate::flow::CommandedFlow;
+use cellpos_rig::clock::Clock;
+use cellpos_rig::freshness::{FrameAccount, IdKind};
+use cellpos_rig::measurement::Measurement;
+use cellpos_rig::source::{
+    Camera, CameraError, FrameBuffer, FrameStamp, FrameWatch, PositionSource, SeenFrame, SourceInfo,
+};
+use cellpos_vision::{
+    Cell, CellTracker, Commanded, Decision, Frame, TrackState, TrackStep, Tracker, Verdict,
+};
+
+/// What is followed.
+#[derive(Debug)]
+pub enum Followed {
+    /// A bead.
+    Bead(Box<Tracker>),
+    /// A cell.
+    Cell(Box<CellTracker>),
+}
+
+impl From<Tracker> for Followed {
+    fn from(tracker: Tracker) -> Self {
+        Self::Bead(Box::new(tracker))
+    }
+}
+
+impl From<CellTracker> for Followed {
+    fn from(tracker: CellTracker) -> Self {
+        Self::Cell(Box::new(tracker))
+    }
+}
+
+impl Followed {
+    fn choose(&mut self, aim_px: (f64, f64)) {
+        match self {
+            Self::Bead(tracker) => tracker.choose(Some(aim_px)),
+            Self::Cell(tracker) => tracker.choose(Some(aim_px)),
+        }
+    }
+
+    fn state(&self) -> TrackState {
+        match self {
+            Self::Bead(tracker) => tracker.state(),
+            Self::Cell(tracker) => tracker.state(),
+        }
+    }
+
+    /// Half the width of what is drawn around it, px.
+    fn half_px(&self, cell: Option<&Cell>) -> (f64, f64) {
+        match self {
+            Self::Bead(tracker) => {
+                let radius_px = tracker.localiser().template().radius_px();
+                (radius_px, radius_px)
+            }
+            Self::Cell(_) => cell.map_or((f64::NAN, f64::NAN), |cell| {
+                let along = |direction| 0.5 * cell.extent_px(direction);
+                (along((1.0, 0.0)), along((0.0, 1.0)))
+            }),
+        }
+    }
+
+    fn step(
+        &mut self,
+        frame: &Frame,
+        time_s: f64,
+        commanded: Commanded,
+    ) -> Result<(TrackStep, Option<Cell>), cellpos_vision::CellError> {
+        match self {
+            Self::Bead(tracker) => Ok((tracker.step(Some(frame), time_s, commanded), None)),
+            Self::Cell(tracker) => {
+                let step = tracker.step(Some(frame), time_s, commanded)?;
+                Ok((step.track, step.cell))
+            }
+        }
+    }
+}
+
+/// A camera with a tracker. Allocates nothing per frame once it runs.
+pub struct VisionSource<C> {
+    camera: C,
+    followed: Followed,
+    calibration: Calibration,
+    clock: Clock,
+    flow: Option<CommandedFlow>,
+    buffer: FrameBuffer,
+    /// Time stamp of the first frame: the tracker's times count from it.
+    first_ns: Option<i64>,
+    account: FrameAccount,
+    /// Time stamp of the newest frame looked at.
+    newest_ns: Option<i64>,
+    watches: Vec<Box<dyn FrameWatch>>,
+}
+
+impl<C: std::fmt::Debug> std::fmt::Debug for VisionSource<C> {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("VisionSource")
+            .field("camera", &self.camera)
+            .field("followed", &self.followed)
+            .field("calibration", &self.calibration)
+            .field("watches", &self.watches.len())
+            .finish_non_exhaustive()
+    }
+}
+
+impl<C: Camera> VisionSource<C> {
+    /// Joins a camera and a tracker. Without [`VisionSource::with_flow`] the prediction knows no commands.
+    pub fn new(
+        camera: C,
+        tracker: impl Into<Followed>,
+        calibration: Calibration,
+        clock: Clock,
+    ) -> Self {
+        // A source without a rate of its own is looked at as if it gave a frame in a millisecond.
+        let rate_hz = camera.info().rate_hz;
+        let period_ns = if rate_hz > 0.0 {
+            (1e9 / rate_hz) as i64
+        } else {
+            1_000_000
+        };
+        Self {
+            // A frame that has grown old on its way still tells the tracker where the bead went.
+            account: FrameAccount::new(IdKind::Wide, period_ns, i64::MAX),
+            camera,
+            followed: tracker.into(),
+            calibration,
+            clock,
+            flow: None,
+            buffer: FrameBuffer::default(),
+            first_ns: None,
+            newest_ns: None,
+            watches: Vec::new(),
+        }
+    }
+
+    /// Lets the tracker predict from what is commanded.
+    pub fn with_flow(mut self, flow: CommandedFlow) -> Self {
+        self.flow = Some(flow);
+        self
+    }
+
+    /// Of several beads or cells, the one nearest to this position at the start is followed; without it the most prominent.
+    pub fn near(mut self, position_um: f64) -> Self {
+        let info = self.camera.info();
+        let across_px = match self.calibration.axis {
+            Axis::X => 0.5 * info.height_px.saturating_sub(1) as f64,
+            Axis::Y => 0.5 * info.width_px.saturating_sub(1) as f64,
+        };
+        self.followed
+            .choose(self.calibration.point_px(position_um, across_px));
+        self
+    }
+
+    /// Looks at the frame in the buffer; `None` for one that is not new ([`FrameAccount`]).
+    fn look(
+        &mut self,
+        stamp: &FrameStamp,
+    ) -> Result<Option<(TrackStep, Option<Cell>)>, CameraError> {
+        let at_ns = stamp.mid_exposure_ns;
+        let judged = self.account.step(stamp.id, at_ns, stamp.arrival_ns);
+        if !judged.kind.is_new() {
+            return Ok(None);
+        }
+        let before_ns = self.newest_ns.replace(at_ns);
+        let first_ns = *self.first_ns.get_or_insert(at_ns);
+        let mean_px_per_s = |from_ns, to_ns| {
+            let um_per_s = self
+                .flow
+                .as_ref()
+                .map_or(0.0, |flow| flow.mean_um_per_s(from_ns, to_ns));
+            self.calibration.flow_px_per_s(um_per_s)
+        };
+        let exposed_s = stamp.exposure_ns as f64 * 1e-9;
+        let half_ns = stamp.exposure_ns / 2;
+        let (x, y) = mean_px_per_s(at_ns - half_ns, at_ns + half_ns);
+        let commanded = Commanded {
+            flow_px_per_s: before_ns
+                .map_or((0.0, 0.0), |before_ns| mean_px_per_s(before_ns, at_ns)),
+            streak_px: (x * exposed_s, y * exposed_s),
+        };
+        let time_s = (at_ns - first_ns) as f64 * 1e-9;
+        self.followed
+            .step(&self.buffer.frame(), time_s, commanded)
+            .map(Some)
+            .map_err(|error| CameraError::Broken {
+                camera: self.camera.info().name,
+                problem: error.to_string(),
+                remedy:
+                    "record the background again, as this camera is set now: cellpos background"
+                        .to_string(),
+            })
+    }
+}
+
+impl<C: Camera> VisionSource<C> {
+    fn show(&mut self, stamp: &FrameStamp, step: &TrackStep, cell: Option<&Cell>) {
+        if self.watches.is_empty() {
+            return;
+        }
+        let taken = step.decision.is_accepted();
+        let seen = SeenFrame {
+            frame: self.buffer.frame(),
+            bits: self.buffer.bits,
+            stamp: *stamp,
+            centre_px: taken.then_some((step.fix.x_px, step.fix.y_px)),
+            half_px: self.followed.half_px(cell),
+            expected_px: (step.x_px, step.y_px),
+            expected_sd_px: step.sd_px,
+            scale: self.calibration.picture_scale(),
+        };
+        for watch in &mut self.watches {
+            watch.frame(&seen);
+        }
+    }
+}
+
+impl<C: Camera> PositionSource for VisionSource<C> {
+    fn next(&mut self, deadline_ns: i64) -> Result<Option<Measurement>, CameraError> {
+        let Some(stamp) = self.camera.next_frame(&mut self.buffer, deadline_ns)? else {
+            return Ok(None);
+        };
+        let (step, cell) = match self.look(&stamp)? {
+            Some((step, cell)) => (Some(step), cell),
+            None => (None, None),
+        };
+        if let Some(step) = &step {
+            self.show(&stamp, step, cell.as_ref());
+        }
+        let fix = step.map(|s| s.fix);
+        let taken = step.filter(|s| s.decision.is_accepted()).map(|s| s.fix);
+        let c = &self.calibration;
+        Ok(Some(Measurement {
+            frame_id: stamp.id,
+            mid_exposure_ns: stamp.mid_exposure_ns,
+            ready_ns: self.clock.now_ns(),
+            position_um: taken.map_or(f64::NAN, |f| c.position_um(f.x_px, f.y_px)),
+            variance_um2: taken.map_or(f64::NAN, |f| {
+                c.variance_um2(f.var_x_px2, f.var_y_px2, f.cov_xy_px2)
+            }),
+            verdict: fix.map_or(Verdict::NoSignal, |f| f.verdict),
+            track: Some(step.map_or((self.followed.state(), Decision::Stale), |s| {
+                (s.state, s.decision)
+            })),
+            length_um: cell.map_or(f64::NAN, |cell| c.length_um(&cell)),
+            area_um2: cell.map_or(f64::NAN, |cell| c.area_um2(&cell)),
+            length_sd_um: cell.map_or(f64::NAN, |cell| c.length_sd_um(&cell)),
+            area_sd_um2: cell.map_or(f64::NAN, |cell| c.area_sd_um2(&cell)),
+            snr: fix.map_or(f64::NAN, |f| f.snr),
+            true_um: stamp.true_um,
+            true_pzt_um: stamp.true_pzt_um,
+        }))
+    }
+
+    fn info(&self) -> SourceInfo {
+        let mut info = self.camera.info();
+        info.field_um = self.calibration.field_um(info.width_px, info.height_px);
+        info
+    }
+
+    fn watch(&mut self, watch: Box<dyn FrameWatch>) -> bool {
+        self.watches.push(watch);
+        true
+    }
+}

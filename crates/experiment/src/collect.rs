@@ -1,0 +1,262 @@
+//! `cellpos reconcile --collect`: runs the experiment that would decide, on the rig, through the loop of `cellpos track`,
+//! adds its record to the data, and looks again.
+
+use crate::excitation::Experiment;
+use crate::on_rig::{Acquired, Listener, OnRig, Trouble};
+use cellpos_plant::{Hertz, Model};
+use cellpos_reconcile::{Options, ReconcileError, Reconciliation, Record, Verdict, reconcile};
+use cellpos_session::Failure;
+use serde::Serialize;
+use std::path::{Path, PathBuf};
+
+/// A verdict that could not be reached, as a failure.
+pub fn refused(error: ReconcileError) -> Failure {
+    Failure::bad_input(
+        error,
+        "no verdict: see docs/reconcile.md for what records are needed",
+    )
+}
+
+/// One experiment that was run.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Collected {
+    /// Its name.
+    pub experiment: &'static str,
+    /// What was driven.
+    pub what: &'static str,
+    /// Why it was run.
+    pub why: String,
+    /// Where its record lies, ready for `--data`.
+    pub file: PathBuf,
+    /// Rows of the record.
+    pub rows: usize,
+    /// Of these, rows without a bead: not seen, or its frame came too late for its row.
+    pub rows_without_bead: usize,
+    /// Verdict with it.
+    pub verdict: String,
+}
+
+/// How to collect.
+pub struct Collecting<'a> {
+    /// The rig.
+    pub rig: &'a OnRig,
+    /// Folder for the records.
+    pub folder: &'a Path,
+    /// Most experiments.
+    pub rounds: usize,
+    /// Factor on the duration of every experiment.
+    pub share: f64,
+    /// Seed of the excitations.
+    pub seed: u64,
+}
+
+/// What was run on a rig, as a record.
+#[derive(Debug, Clone)]
+pub struct Ran {
+    /// The record.
+    pub record: Record,
+    /// Displacement at which the bead rests, um: where a bead is held, the mean of what was commanded.
+    pub neutral_um: f64,
+    /// From the middle of an exposure to the tick that used it, s.
+    pub age_s: f64,
+}
+
+/// Runs one experiment, all its times multiplied by `share`. What there is of its record is written to `file` as each part
+/// ends, so that it is there whatever ends the process.
+///
+/// # Errors
+/// The rig failed, or the run ended before its time; what was recorded lies in `file`.
+pub fn run_experiment(
+    rig: &OnRig,
+    experiment: Experiment,
+    share: f64,
+    seed: u64,
+    file: &Path,
+    progress: &mut (dyn FnMut(&str) + Send),
+) -> Result<Ran, Failure> {
+    let plan = experiment.plan(rig, share, seed)?;
+    let all: Vec<usize> = (0..plan.segments.len()).collect();
+    let total = plan.ticks();
+    let name = file
+        .file_stem()
+        .map_or_else(String::new, |stem| stem.to_string_lossy().into_owned());
+    let mut heard = |ticks: usize| {
+        progress(&format!(
+            "on the rig: {}, {:.0} %",
+            experiment.what(),
+            100.0 * ticks.min(total) as f64 / total.max(1) as f64
+        ));
+    };
+    let mut segment = |so_far: &Acquired| {
+        let kept = record(&name, so_far, plan.period_s).and_then(|r| write_record(&r, file));
+        if let Err(failure) = kept {
+            tracing::warn!("{}: {}", file.display(), failure.text());
+        }
+    };
+    let mut listener = Listener {
+        progress: &mut heard,
+        segment: &mut segment,
+    };
+    let acquired = rig.acquire(&plan, &all, &mut listener)?;
+    if let Some(Trouble::Ended(ended)) = &acquired.trouble {
+        let kept = record(&name, &acquired, plan.period_s).and_then(|r| write_record(&r, file));
+        return Err(ended.failure(&match kept {
+            Ok(()) => format!(
+                "what was recorded lies in {}: give it to --data, or run the command again",
+                file.display()
+            ),
+            Err(_) => "run the command again; records already collected are kept".to_string(),
+        }));
+    }
+    let record = record(&name, &acquired, plan.period_s)?;
+    write_record(&record, file)?;
+    let missing = record.rows() - record.frames();
+    if 50 * missing > record.rows() {
+        tracing::warn!(
+            "{missing} of {} rows have no bead, or their frame came too late: this machine did not keep the loop's time, or the bead \
+             was hard to see, and the verdict may suffer from it (cellpos doctor)",
+            record.rows()
+        );
+    }
+    Ok(Ran {
+        neutral_um: neutral_um(&record, rig.model.plant.velocity_gain_at(Hertz(2.0))),
+        record,
+        age_s: acquired.path_s + acquired.wait_s,
+    })
+}
+
+/// A run as a record.
+fn record(name: &str, acquired: &Acquired, period_s: f64) -> Result<Record, Failure> {
+    let (pzt_um, bead_um) = &acquired.rows;
+    let time_s: Vec<f64> = (0..pzt_um.len()).map(|k| k as f64 * period_s).collect();
+    let mut record = Record::from_rows(name, &time_s, pzt_um, bead_um).map_err(refused)?;
+    record.unseen.clone_from(&acquired.unseen);
+    Ok(record)
+}
+
+/// Mean command of a held bead, less what moved the bead from where it was to where it came. The loop's own estimate follows
+/// Brownian motion, and an error of 4 nm would look like a drift of 1.7 um/s.
+fn neutral_um(record: &Record, gain_per_s: f64) -> f64 {
+    let mean_um = record.pzt_um.iter().sum::<f64>() / record.rows().max(1) as f64;
+    let mut seen = record.bead_um.iter().filter(|b| b.is_finite());
+    match (seen.next(), seen.next_back()) {
+        (Some(first), Some(last)) if gain_per_s != 0.0 && record.duration_s() > 0.0 => {
+            mean_um - (last - first) / (gain_per_s * record.duration_s())
+        }
+        _ => mean_um,
+    }
+}
+
+/// Writes a record as the CSV that every command reads.
+pub fn write_record(record: &Record, path: &Path) -> Result<(), Failure> {
+    let table = cellpos_table::Record {
+        start_s: record.start_s,
+        ..cellpos_table::Record::new(
+            &record.name,
+            record.sample_s,
+            record.pzt_um.clone(),
+            record.bead_um.clone(),
+        )
+    };
+    table.write(path).map_err(Failure::failed)
+}
+
+/// What to run next, and why; `None` when nothing would help.
+fn next(result: &Result<Reconciliation, ReconcileError>) -> Option<(Experiment, String)> {
+    match result {
+        Ok(r) if r.verdict == Verdict::Ambiguous => r.effects.iter().find_map(|e| {
+            let experiment = Experiment::separating(&e.id, &e.alternatives)?;
+            let why = format!(
+                "{} or {}: {}",
+                e.id,
+                e.alternatives.join(" or "),
+                e.separate_by.as_deref().unwrap_or("more data")
+            );
+            Some((experiment, why))
+        }),
+        Ok(_) => None,
+        Err(
+            error @ (ReconcileError::NoRecords
+            | ReconcileError::ConstantInput
+            | ReconcileError::TooShort { .. }),
+        ) => Some((Experiment::Survey, error.to_string())),
+        Err(_) => None,
+    }
+}
+
+/// Looks, and collects and looks again while that would help. `model.working_point_um` becomes the neutral that the loop
+/// found where no record comes near it.
+pub fn look(
+    model: &mut Model,
+    records: &mut Vec<Record>,
+    options: &Options,
+    collecting: &Collecting<'_>,
+    progress: &mut (dyn FnMut(&str) + Send),
+) -> Result<(Reconciliation, Vec<Collected>), Failure> {
+    let mut collected: Vec<Collected> = Vec::new();
+    let mut done: Vec<Experiment> = Vec::new();
+    loop {
+        let result = reconcile(model, records, options, &mut |text| progress(text));
+        if let Some(last) = collected.last_mut() {
+            last.verdict = match &result {
+                Ok(r) => r.verdict.word().to_owned(),
+                Err(error) => error.to_string(),
+            };
+        }
+        let wanted = next(&result)
+            .filter(|_| collected.len() < collecting.rounds)
+            // What was run and did not decide will not decide now: a longer record may.
+            .map(|(e, why)| {
+                if done.contains(&e) {
+                    (Experiment::Long, why)
+                } else {
+                    (e, why)
+                }
+            })
+            .filter(|(e, _)| !done.contains(e));
+        let Some((experiment, why)) = wanted else {
+            return Ok((result.map_err(refused)?, collected));
+        };
+        done.push(experiment);
+        let seed = collecting.seed + collected.len() as u64;
+        std::fs::create_dir_all(collecting.folder).map_err(Failure::failed)?;
+        let file = free_name(collecting.folder, experiment);
+        let Ran {
+            record, neutral_um, ..
+        } = run_experiment(
+            collecting.rig,
+            experiment,
+            collecting.share,
+            seed,
+            &file,
+            progress,
+        )?;
+        at_rest(model, &record, neutral_um);
+        collected.push(Collected {
+            experiment: experiment.name(),
+            what: experiment.what(),
+            why,
+            file,
+            rows: record.rows(),
+            rows_without_bead: record.rows() - record.frames(),
+            verdict: String::new(),
+        });
+        records.push(record);
+    }
+}
+
+/// The bead rests where the loop found it to rest, if the model was made at another place.
+pub fn at_rest(model: &mut Model, record: &Record, neutral_um: f64) {
+    let (low, high) = record.pzt_range_um();
+    if !(low..=high).contains(&model.working_point_um) {
+        model.working_point_um = neutral_um;
+    }
+}
+
+/// A file that is not there yet: nothing is overwritten.
+fn free_name(folder: &Path, experiment: Experiment) -> PathBuf {
+    (1..)
+        .map(|n| folder.join(format!("{}-{n}.csv", experiment.name())))
+        .find(|path| !path.exists())
+        .unwrap_or_else(|| folder.join(experiment.name()))
+}

@@ -1,0 +1,344 @@
+//! From arguments to a finished identification: plan, run, delay test, summary.
+
+pub mod held_bead;
+mod partial;
+
+use crate::on_rig::{Acquired, Listener, OnRig, Trouble};
+use cellpos_ident::excitation::Limits;
+use cellpos_ident::experiment::{Cause, Measured, Plan, RecordedSegment};
+use cellpos_ident::frequency_response::Settings;
+use cellpos_ident::summary::{Identification, summarise};
+use cellpos_plant::Hertz;
+use cellpos_session::Failure;
+use held_bead::{DelayTest, HeldBead, Setup};
+use std::path::PathBuf;
+
+/// How to excite.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(feature = "clap", derive(clap::ValueEnum))]
+pub enum Excitation {
+    /// One sine after the other.
+    Stepped,
+    /// All lines at once, random phases, odd lines with detection lines between.
+    Multisine,
+    /// A logarithmic sweep through all lines, repeated.
+    Sweep,
+}
+
+/// What to measure.
+#[derive(Debug, Clone)]
+pub struct Job {
+    /// The rig.
+    pub setup: Setup,
+    /// Lines, Hz.
+    pub lines_hz: Vec<f64>,
+    /// How to excite.
+    pub excitation: Excitation,
+    /// Largest amplitudes.
+    pub limits: Limits,
+    /// Measuring time per line is this over the frequency, s at 1 Hz.
+    pub seconds_at_1_hz: f64,
+    /// Edges of the LED test; 0: none.
+    pub led_edges: usize,
+    /// Bootstrap replicates.
+    pub bootstrap: usize,
+    /// Seed of excitation, dither and bootstrap.
+    pub seed: u64,
+    /// The rig of a rig.toml; left out: an emulated one in this process, without the loop's threads.
+    pub rig: Option<OnRig>,
+    /// Segments of a stopped identification to go on from.
+    pub resume: Option<PathBuf>,
+    /// Where finished segments go when the identification is stopped.
+    pub keep_in: Option<PathBuf>,
+}
+
+/// What came of it.
+pub struct Done {
+    /// The plan that was run.
+    pub plan: Plan,
+    /// The records.
+    pub records: Vec<RecordedSegment>,
+    /// The result.
+    pub result: Identification,
+    /// The LED test.
+    pub led: Option<DelayTest>,
+    /// PZT displacement at rest, um.
+    pub neutral_um: f64,
+    /// Mean time from the arrival of a frame to its tick, s; contained in the delay.
+    pub wait_s: f64,
+}
+
+/// Runs a job; `progress` hears ticks done and ticks in all.
+pub fn run(job: &Job, mut progress: impl FnMut(usize, usize) + Send) -> Result<Done, Failure> {
+    let plan = plan(job)?;
+    let total = plan.ticks() + job.led_edges * 11;
+    let records = match &job.resume {
+        Some(path) => partial::load(path, &plan)?,
+        None => Vec::new(),
+    };
+    let mut heard = |ticks: usize| progress(ticks.min(total), total);
+    let Raw {
+        records,
+        mut led,
+        neutral_um,
+        wait_s,
+        path_s,
+        fix_noise_um,
+    } = match &job.rig {
+        Some(rig) => on_rig(job, rig, &plan, records, &mut heard)?,
+        None => held_bead(job, &plan, records, &mut heard)?,
+    };
+    let measured = plan
+        .analyse(&records, &Settings::default())
+        .map_err(Failure::failed)?;
+    progress(total, total);
+    // The LED test ends at the frame's arrival, a row of the record at its tick.
+    if let Some(test) = &mut led {
+        test.estimate.delay_s += wait_s;
+        test.estimate.ci95_s = test.estimate.ci95_s.map(|end| end + wait_s);
+    }
+    let mut result = conclude(job, measured, led.as_ref())?;
+    result.stated_noise_um = fix_noise_um;
+    if let (Some(rig), Some(path_s)) = (&job.rig, path_s) {
+        let (found_ms, configured_ms) = (path_s * 1e3, rig.file.timing.camera_delay_ms);
+        if (found_ms - configured_ms).abs() > 1e-6 {
+            result.warnings.push(format!(
+                "frames come {found_ms:.2} ms after the middle of their exposure, rig.toml says {configured_ms} ms: write \
+                 [timing] camera_delay_ms = {found_ms:.2} and design the controller again"
+            ));
+        }
+    }
+    Ok(Done {
+        plan,
+        records,
+        result,
+        led,
+        neutral_um,
+        wait_s,
+    })
+}
+
+fn plan(job: &Job) -> Result<Plan, Failure> {
+    let expected = job.setup.expected()?;
+    let period_s = job.setup.sampling().period_s;
+    let (lines_hz, seconds) = (&job.lines_hz, job.seconds_at_1_hz);
+    Ok(match job.excitation {
+        Excitation::Multisine => {
+            Plan::multisine(lines_hz, &expected, job.limits, period_s, seconds, job.seed)
+        }
+        Excitation::Stepped => {
+            Plan::stepped_sines(lines_hz, &expected, job.limits, period_s, seconds)
+        }
+        Excitation::Sweep => Plan::log_sweep(lines_hz, &expected, job.limits, period_s, seconds),
+    })
+}
+
+/// What was acquired.
+struct Raw {
+    records: Vec<RecordedSegment>,
+    led: Option<DelayTest>,
+    neutral_um: f64,
+    wait_s: f64,
+    path_s: Option<f64>,
+    fix_noise_um: Option<f64>,
+}
+
+fn held_bead(
+    job: &Job,
+    plan: &Plan,
+    mut records: Vec<RecordedSegment>,
+    progress: &mut dyn FnMut(usize),
+) -> Result<Raw, Failure> {
+    // Segments run in order here: what was measured behind a gap is measured again.
+    let whole = records.iter().zip(0..).take_while(|(r, i)| r.index == *i);
+    records.truncate(whole.count());
+    let mut bead = HeldBead::open(job.setup.clone())?;
+    let records = acquire(job, plan, &mut bead, records, progress)?;
+    let led = if job.led_edges > 0 {
+        Some(bead.delay_test(job.led_edges, job.seed)?)
+    } else {
+        None
+    };
+    let neutral_um = bead.neutral_um();
+    let fix_noise_um = bead.fix_noise_um();
+    bead.close()?;
+    Ok(Raw {
+        records,
+        led,
+        neutral_um,
+        // Ticks fall on the arrivals of frames here.
+        wait_s: 0.0,
+        path_s: None,
+        fix_noise_um,
+    })
+}
+
+/// Runs on the rig of a rig.toml until no segment is missing, at most four times.
+fn on_rig(
+    job: &Job,
+    rig: &OnRig,
+    plan: &Plan,
+    mut records: Vec<RecordedSegment>,
+    progress: &mut (dyn FnMut(usize) + Send),
+) -> Result<Raw, Failure> {
+    const ATTEMPTS: usize = 4;
+    let (mut neutral_um, mut wait_s, mut path_s) = (rig.file.first_neutral_um, 0.0, None);
+    let mut fix_noise_um = None;
+    for attempt in 1..=ATTEMPTS {
+        let missing = |index: &usize| records.iter().all(|r| r.index != *index);
+        let todo: Vec<usize> = (0..plan.segments.len()).filter(missing).collect();
+        if todo.is_empty() {
+            break;
+        }
+        // What is finished is on the disk as it ends, whatever ends the process.
+        let before = records.clone();
+        let mut segment = |so_far: &Acquired| {
+            if let Err(failure) = kept(job, plan, &joined(&before, &so_far.records)) {
+                tracing::warn!("{}", failure.text());
+            }
+        };
+        let mut listener = Listener {
+            progress: &mut *progress,
+            segment: &mut segment,
+        };
+        let acquired = rig.acquire(plan, &todo, &mut listener)?;
+        records = joined(&records, &acquired.records);
+        (neutral_um, wait_s) = (acquired.neutral_um, acquired.wait_s);
+        path_s = Some(acquired.path_s);
+        fix_noise_um = acquired.fix_noise_um.or(fix_noise_um);
+        match acquired.trouble {
+            None => {}
+            Some(Trouble::Spoilt { .. }) if attempt < ATTEMPTS => {
+                tracing::warn!("a lost bead spoilt segments; measuring again what is missing");
+            }
+            Some(trouble) => return Err(stopped(job, plan, &records, &trouble)?),
+        }
+    }
+    let led = match (job.led_edges, rig.file.is_emulated()) {
+        (0, _) => None,
+        (edges, true) => {
+            let mut world = rig.file.emulator.clone();
+            world.faults = Default::default();
+            let model = cellpos_plant::Model::load(&world.model).map_err(Failure::input)?;
+            let clock = job.setup.clock.clone();
+            let setup = Setup {
+                world,
+                model,
+                clock,
+                frames: true,
+                closed_loop: true,
+                pi: None,
+            };
+            Some(HeldBead::open(setup)?.delay_test(edges, job.seed)?)
+        }
+        (edges, false) => Some(rig.delay_test(edges, job.seed)?),
+    };
+    Ok(Raw {
+        records,
+        led,
+        neutral_um,
+        wait_s,
+        path_s,
+        fix_noise_um,
+    })
+}
+
+/// Segments of earlier runs and of this one, in order.
+fn joined(before: &[RecordedSegment], now: &[RecordedSegment]) -> Vec<RecordedSegment> {
+    let mut all = [before, now].concat();
+    all.sort_by_key(|r| r.index);
+    all
+}
+
+/// Keeps what is finished; where, if anything is.
+fn kept(job: &Job, plan: &Plan, records: &[RecordedSegment]) -> Result<Option<PathBuf>, Failure> {
+    let Some(path) = job.keep_in.as_ref().filter(|_| !records.is_empty()) else {
+        return Ok(None);
+    };
+    partial::save(path, plan, records)?;
+    Ok(Some(path.clone()))
+}
+
+/// The failure of an identification that was stopped: what is finished is kept, and the message says how to go on.
+fn stopped(
+    job: &Job,
+    plan: &Plan,
+    records: &[RecordedSegment],
+    why: &Trouble,
+) -> Result<Failure, Failure> {
+    let kept = kept(job, plan, records)?;
+    let go_on = match &kept {
+        Some(path) => format!(
+            "go on with the same arguments and --resume {}: {} of {} segments are kept",
+            path.display(),
+            records.len(),
+            plan.segments.len()
+        ),
+        None => "start again: no segment was finished".to_string(),
+    };
+    Ok(match why {
+        Trouble::Ended(ended) => ended.failure(&go_on),
+        spoilt => Failure::Failed(miette::miette!(
+            help = format!("bring a bead into view and {go_on}"),
+            "{spoilt}"
+        )),
+    })
+}
+
+fn conclude(
+    job: &Job,
+    measured: Measured,
+    led: Option<&DelayTest>,
+) -> Result<Identification, Failure> {
+    summarise(
+        measured,
+        job.setup.sampling(),
+        led.map(|l| l.estimate),
+        job.bootstrap,
+        job.seed,
+        Some(job.setup.model.plant.velocity_gain_at(Hertz(2.0))),
+    )
+    .map_err(Failure::failed)
+}
+
+/// Runs a plan. A bead that is lost once is given up and a new one waited for: the experiment resumes at the segment
+/// that failed, at most three times.
+fn acquire(
+    job: &Job,
+    plan: &Plan,
+    bead: &mut HeldBead,
+    mut records: Vec<RecordedSegment>,
+    mut progress: &mut dyn FnMut(usize),
+) -> Result<Vec<RecordedSegment>, Failure> {
+    for attempt in 0..4 {
+        match plan.run(bead, records.len(), &mut progress) {
+            Ok(more) => {
+                records.extend(more);
+                return Ok(records);
+            }
+            Err(ended) => {
+                records.extend(ended.done);
+                match ended.cause {
+                    Cause::Rig(failure) => {
+                        kept(job, plan, &records)?;
+                        return Err(failure);
+                    }
+                    Cause::BeadLost(error)
+                        if attempt == 3 || bead.setup().world.new_bead_after_ms.is_none() =>
+                    {
+                        tracing::warn!("{error}");
+                        let (done, of) = (records.len(), plan.segments.len());
+                        let missing = of - done;
+                        let why = Trouble::Spoilt { missing, of };
+                        return Err(stopped(job, plan, &records, &why)?);
+                    }
+                    Cause::BeadLost(error) => {
+                        tracing::warn!("{error}; waiting for another bead");
+                        bead.wait_for_bead()?;
+                    }
+                }
+            }
+        }
+    }
+    Ok(records)
+}

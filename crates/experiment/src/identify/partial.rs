@@ -1,0 +1,94 @@
+//! The finished segments of an identification that was stopped, kept so that it can go on where it was.
+
+use cellpos_ident::experiment::{Plan, RecordedSegment};
+use cellpos_session::Failure;
+use serde::{Deserialize, Serialize};
+use std::path::Path;
+
+/// What is kept.
+#[derive(Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Partial {
+    /// One description per planned segment: a plan that differs in any of them is another experiment.
+    plan: Vec<String>,
+    segments: Vec<Kept>,
+}
+
+#[derive(Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Kept {
+    index: usize,
+    from: usize,
+    input_um: Vec<f64>,
+    /// `null` where no frame showed the bead.
+    output_um: Vec<Option<f64>>,
+}
+
+fn describe(plan: &Plan) -> Vec<String> {
+    let segments = plan.segments.iter();
+    segments
+        .map(|s| format!("{} s, {s:?}", plan.period_s))
+        .collect()
+}
+
+/// Writes the segments that are finished.
+pub fn save(path: &Path, plan: &Plan, records: &[RecordedSegment]) -> Result<(), Failure> {
+    let partial = Partial {
+        plan: describe(plan),
+        segments: records
+            .iter()
+            .map(|r| Kept {
+                index: r.index,
+                from: r.from,
+                input_um: r.input.clone(),
+                output_um: r
+                    .output
+                    .iter()
+                    .map(|y| y.is_finite().then_some(*y))
+                    .collect(),
+            })
+            .collect(),
+    };
+    let text = serde_json::to_string(&partial).map_err(Failure::failed)?;
+    cellpos_table::write_atomically(path, text.as_bytes()).map_err(Failure::failed)
+}
+
+/// Reads them back.
+pub fn load(path: &Path, plan: &Plan) -> Result<Vec<RecordedSegment>, Failure> {
+    let refuse = |problem: String, help: &str| {
+        Failure::bad_input(format!("{}: {problem}", path.display()), help)
+    };
+    let help = "give the file that the stopped identification named";
+    let text =
+        std::fs::read_to_string(path).map_err(|e| refuse(format!("cannot read: {e}"), help))?;
+    let partial: Partial = serde_json::from_str(&text).map_err(|e| refuse(e.to_string(), help))?;
+    if partial.plan != describe(plan) {
+        return Err(refuse(
+            "was made with other lines, amplitudes, times or another model".to_owned(),
+            "repeat the arguments of the stopped identification, or start anew without --resume",
+        ));
+    }
+    let sound = |k: &Kept| {
+        k.index < plan.segments.len()
+            && k.input_um.len() == k.output_um.len()
+            && k.from < k.input_um.len()
+            && k.input_um.iter().all(|u| u.is_finite())
+    };
+    if !partial.segments.iter().all(sound) {
+        return Err(refuse("damaged".to_owned(), help));
+    }
+    Ok(partial
+        .segments
+        .into_iter()
+        .map(|k| RecordedSegment {
+            index: k.index,
+            from: k.from,
+            input: k.input_um,
+            output: k
+                .output_um
+                .into_iter()
+                .map(|y| y.unwrap_or(f64::NAN))
+                .collect(),
+        })
+        .collect())
+}

@@ -1,0 +1,25 @@
+//! Experiments on a rig: an identification, records for reconcile, and the whole circle of identify, reconcile, design and
+//! track.
+//!
+//! A segment of an experiment, on the emulated rig (another: `RigFile::load` with a path):
+//!
+//! ```
+//! use cellpos_experiment::excitation::Experiment;
+//! use cellpos_experiment::on_rig::{Listener, OnRig};
+//! use cellpos_session::{RigFile, rig_file::Frames};
+//! # fn main() -> Result<(), cellpos_session::Failure> {
+//! let rig = OnRig::new(RigFile::load(None)?, cellpos_plant::Model::eq6(), None, Frames::Off, true)?;
+//! let plan = Experiment::Amplitudes.plan(&rig, 0.2, 1)?;
+//! let mut listener = Listener { progress: &mut |_| {}, segment: &mut |_| {} };
+//! let acquired = rig.acquire(&plan, &[0], &mut listener)?;
+//! assert!(acquired.trouble.is_none() && acquired.records.len() == 1);
+//! # Ok(())
+//! # }
+//! ```
+#![forbid(unsafe_code)]
+
+pub mod circle;
+pub mod collect;
+pub mod excitation;
+pub mod identify;
+pub mod on_rig;

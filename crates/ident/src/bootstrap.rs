@@ -1,0 +1,51 @@
+//! Replicates of a fit: what its parameters would be on other draws of the same noise.
+
+use crate::ladder::{LadderFit, LadderProblem};
+use crate::random::Random;
+use nalgebra::Complex;
+
+/// Parameter vectors of the chosen rung fitted to resampled blocks, each with the weak bounds on the feedthrough drawn anew.
+///
+/// A fit held by a bound that is right on average errs by less than its covariance says where the bound acts, and by how
+/// much less depends on where it landed: replicates about that place alone would repeat its luck. With the bound drawn
+/// as a datum beside the lines their spread is that of the covariance (randomise, then optimise), and the shape that of the
+/// fit as it is, not of its linear part.
+pub fn bootstrap(
+    problem: &LadderProblem<'_>,
+    fit: &LadderFit,
+    replicates: usize,
+    seed: u64,
+) -> Vec<Vec<f64>> {
+    let mut random = Random::new(seed);
+    let best = fit.best();
+    (0..replicates)
+        .filter_map(|_| {
+            let data: Vec<Complex<f64>> = problem
+                .points()
+                .iter()
+                .map(|p| {
+                    let n = p.block_errors.len();
+                    if n < 2 {
+                        return p.response;
+                    }
+                    let sum: Complex<f64> = (0..n).map(|_| p.block_errors[random.below(n)]).sum();
+                    // Resampled means are narrower than the truth by (n-1)/n; the noise model sets the size, and what the
+                    // rung leaves over widens it as it widens the covariance.
+                    let size = (p.variance / p.scatter_variance.max(f64::MIN_POSITIVE) * n as f64
+                        / (n as f64 - 1.0)
+                        * fit.scale)
+                        .sqrt();
+                    p.response + sum / n as f64 * size
+                })
+                .collect();
+            let moved = [(); 2].map(|()| fit.scale.sqrt() * random.normal());
+            let found = problem.clone().with_bounds_moved(moved).fit_from(
+                &data,
+                best.rung,
+                &best.parameters,
+                None,
+            );
+            found.chi2.is_finite().then_some(found.parameters)
+        })
+        .collect()
+}

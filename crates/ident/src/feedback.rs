@@ -1,0 +1,182 @@
+//! Records of a loop: whether the input answers the output, and the response that is right when it does.
+//!
+//! With feedback the input holds the output's noise. Cross-spectrum over input spectrum then tends to minus the inverse of
+//! the controller where the noise outweighs the excitation, and no averaging helps. A signal that the noise is not in, the
+//! reference or an added excitation, tells the plant from the controller: both input and output are projected on it, and
+//! their ratio is the plant's response (joint input-output, or instrument).
+
+use crate::frequency_response::FrequencyPoint;
+use crate::spectral::welch;
+use nalgebra::{DMatrix, DVector};
+
+/// Whether the input of a record answers its output.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Feedback {
+    /// Part of the input's change, beyond what its own past tells, that the output's past predicts.
+    pub share: f64,
+    /// The test's F statistic.
+    pub f: f64,
+}
+
+impl Feedback {
+    /// Whether that is beyond chance and large enough to bend an estimate.
+    pub fn is_there(self) -> bool {
+        self.share > 0.05 && self.f > 10.0
+    }
+}
+
+/// Looks for feedback: does the past of the output help to predict the input, beyond the input's own past (Granger)? Rows
+/// without an output are left out. None in a record too short or too still to tell.
+pub fn feedback(input: &[f64], output: &[f64]) -> Option<Feedback> {
+    const LAGS: usize = 8;
+    const MOST_ROWS: usize = 40_000;
+    let n = input.len().min(output.len());
+    let mut rows = Vec::new();
+    for k in LAGS + 2..n {
+        // The row's own output is known before its command takes effect.
+        if output[k - LAGS - 1..=k].iter().all(|y| y.is_finite()) {
+            rows.push(k);
+        }
+        if rows.len() >= MOST_ROWS {
+            break;
+        }
+    }
+    if rows.len() < 20 * LAGS {
+        return None;
+    }
+    let du = |k: usize| input[k] - input[k - 1];
+    let dy = |k: usize| output[k] - output[k - 1];
+    let target = DVector::from_iterator(rows.len(), rows.iter().map(|&k| du(k)));
+    let full = DMatrix::from_fn(rows.len(), 2 * LAGS + 1, |i, j| match j {
+        0 => 1.0,
+        j if j <= LAGS => du(rows[i] - j),
+        j => dy(rows[i] - (j - LAGS - 1)),
+    });
+    let own = full.columns(0, LAGS + 1).into_owned();
+    let left = |x: &DMatrix<f64>| -> Option<f64> {
+        let mut normal = x.transpose() * x;
+        // A pure sine makes its own past linearly dependent: what it predicts is not changed by so little.
+        let scale = normal.diagonal().max().max(f64::MIN_POSITIVE);
+        for i in 0..normal.nrows() {
+            normal[(i, i)] += 1e-12 * scale;
+        }
+        let solution = normal.cholesky()?.solve(&(x.transpose() * &target));
+        Some((&target - x * solution).norm_squared())
+    };
+    let (own, both) = (left(&own)?, left(&full)?);
+    let moved = target.norm_squared();
+    if own <= 1e-9 * moved || own <= 0.0 {
+        // The input is told by its own past alone: nothing is left for an output to explain.
+        return Some(Feedback { share: 0.0, f: 0.0 });
+    }
+    let freedom = (rows.len() - 2 * LAGS - 1) as f64;
+    Some(Feedback {
+        share: 1.0 - both / own,
+        f: (own - both) / LAGS as f64 / (both.max(1e-12 * own) / freedom),
+    })
+}
+
+/// The response from input to output by way of a reference that the noise is not in; stretches of `stretch` rows. Points
+/// where either is not coherent with the reference are left out.
+pub fn by_reference(
+    reference: &[f64],
+    input: &[f64],
+    output: &[f64],
+    period_s: f64,
+    stretch: usize,
+    least_coherence: f64,
+) -> Vec<FrequencyPoint> {
+    let to_input = welch(reference, input, period_s, stretch, least_coherence, false);
+    let to_output = welch(reference, output, period_s, stretch, least_coherence, false);
+    to_output
+        .into_iter()
+        .filter_map(|y| {
+            let same = |u: &&FrequencyPoint| (u.frequency_hz - y.frequency_hz).abs() < 1e-9;
+            let u = to_input.iter().find(same)?;
+            let response = y.response / u.response;
+            // The noise of both is the same noise, and adds in the ratio: the sum of both is on the safe side.
+            let relative = y.variance / y.response.norm_sqr() + u.variance / u.response.norm_sqr();
+            let variance = response.norm_sqr() * relative;
+            Some(FrequencyPoint {
+                response,
+                scatter_variance: variance,
+                variance,
+                coherence: y.coherence.min(u.coherence),
+                input: u.output,
+                ..y
+            })
+        })
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::random::Random;
+    use nalgebra::Complex;
+    use std::f64::consts::TAU;
+
+    /// A bead with drift-free Brownian motion under a PI, the reference white within some hertz; gain 400/s at 1 kHz, one row
+    /// of delay.
+    fn closed_loop(reference_um: f64, rows: usize) -> [Vec<f64>; 3] {
+        let mut random = Random::new(4);
+        let (mut r, mut u, mut y) = (Vec::new(), Vec::new(), Vec::new());
+        let (mut x, mut integral, mut slow, mut command) = (0.0, 0.0, 0.0, 0.0);
+        for _ in 0..rows {
+            slow += 0.1 * (reference_um * random.normal() - slow);
+            let seen = x + 0.01 * random.normal();
+            x += 0.4 * command + 0.025 * random.normal();
+            let e = slow - seen;
+            integral += 0.005 * e;
+            command = 0.4 * e + integral;
+            r.push(slow);
+            y.push(seen);
+            u.push(command);
+        }
+        [r, u, y]
+    }
+
+    #[test]
+    fn feedback_is_found_where_it_is_and_not_where_the_input_goes_its_own_way() {
+        let [_, u, y] = closed_loop(0.0, 8000);
+        let found = feedback(&u, &y).unwrap();
+        assert!(found.is_there() && found.share > 0.5, "{found:?}");
+        let mut random = Random::new(9);
+        let mut x = 0.0;
+        let (mut u, mut y) = (Vec::new(), Vec::new());
+        for k in 0..8000 {
+            let noise = 0.3 * random.normal();
+            u.push((TAU * 7.0 * f64::from(k) * 1e-3).sin() + noise);
+            y.push(x + 0.01 * random.normal());
+            x += 0.4 * (u[u.len() - 1] - 0.001 * x) + 0.025 * random.normal();
+        }
+        let none = feedback(&u, &y).unwrap();
+        assert!(!none.is_there(), "{none:?}");
+        assert_eq!(feedback(&u[..50], &y[..50]), None);
+    }
+
+    #[test]
+    fn by_way_of_the_reference_the_response_is_the_plants_and_by_the_input_it_is_not() {
+        let [r, u, y] = closed_loop(0.5, 60_000);
+        let exact = |hz: f64| {
+            let z = Complex::from_polar(1.0, TAU * hz * 1e-3);
+            0.4 / (z - 1.0)
+        };
+        let off = |points: &[FrequencyPoint], low: f64, high: f64| {
+            let of = points
+                .iter()
+                .filter(|p| (low..high).contains(&p.frequency_hz));
+            let (sum, n) = of.fold((0.0, 0.0), |(sum, n), p| {
+                let ratio = p.response / exact(p.frequency_hz) - 1.0;
+                (sum + ratio.norm(), n + 1.0)
+            });
+            (sum / n, n)
+        };
+        let right = by_reference(&r, &u, &y, 1e-3, 2048, 0.3);
+        let (error, n) = off(&right, 2.0, 30.0);
+        assert!(n > 30.0 && error < 0.15, "{error} of {n} points");
+        let wrong = welch(&u, &y, 1e-3, 2048, 0.0, false);
+        let (bias, _) = off(&wrong, 100.0, 300.0);
+        assert!(bias > 0.3, "{bias}: the input alone tells the controller");
+    }
+}

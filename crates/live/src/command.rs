@@ -1,0 +1,125 @@
+//! What the operator's page may ask for.
+
+use serde::Deserialize;
+
+/// Longest note, characters.
+const NOTE_CHARACTERS: usize = 500;
+
+/// A request of the operator.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(tag = "do", rename_all = "kebab-case")]
+pub enum Command {
+    /// Stop the bead where it is.
+    Freeze,
+    /// Go on after a freeze or a pause.
+    Resume,
+    /// Ramp to park: the run ends.
+    Park,
+    /// Stop the script's clock, and the bead where it is.
+    Pause,
+    /// Go on with the script's next step.
+    Skip,
+    /// A new target.
+    Target {
+        /// Position along the channel, um.
+        um: f64,
+    },
+    /// A note into the run's events.
+    Note {
+        /// What it says; control characters are taken out.
+        text: String,
+    },
+}
+
+/// A request that cannot be carried out.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum CommandError {
+    /// Not a request.
+    #[error("not a request: {0}")]
+    Unreadable(String),
+    /// A target that is no position in view.
+    #[error("target {0} is outside the field of view ({1} um to {2} um)")]
+    OutOfView(String, String, String),
+    /// A note without text, or too long.
+    #[error("a note has 1 to 500 characters")]
+    Note,
+    /// A viewer asked.
+    #[error("this link may look only; the operator's link may act")]
+    ViewerOnly,
+}
+
+impl Command {
+    /// Reads a request. `view_um` bounds targets where it is known.
+    ///
+    /// # Errors
+    /// [`CommandError`], to be told to whoever asked.
+    pub fn read(text: &str, view_um: [f64; 2]) -> Result<Self, CommandError> {
+        let command: Self =
+            serde_json::from_str(text).map_err(|e| CommandError::Unreadable(e.to_string()))?;
+        match command {
+            Self::Target { um } => {
+                let [low, high] = view_um;
+                // Comparisons with an unknown end (NaN) are false: then any finite target may be tried.
+                if !um.is_finite() || um < low || um > high || um.abs() > 1e6 {
+                    return Err(CommandError::OutOfView(
+                        um.to_string(),
+                        low.to_string(),
+                        high.to_string(),
+                    ));
+                }
+                Ok(Self::Target { um })
+            }
+            Self::Note { text } => {
+                let text: String = text.chars().filter(|c| !c.is_control()).collect();
+                let length = text.chars().count();
+                if text.trim().is_empty() || length > NOTE_CHARACTERS {
+                    return Err(CommandError::Note);
+                }
+                Ok(Self::Note { text })
+            }
+            other => Ok(other),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const VIEW: [f64; 2] = [-12.8, 12.8];
+
+    #[test]
+    fn requests_are_read_and_bounded() {
+        let read = |text| Command::read(text, VIEW);
+        assert_eq!(read(r#"{"do":"freeze"}"#), Ok(Command::Freeze));
+        assert_eq!(
+            read(r#"{"do":"target","um":-3.5}"#),
+            Ok(Command::Target { um: -3.5 })
+        );
+        assert!(matches!(
+            read(r#"{"do":"target","um":13}"#),
+            Err(CommandError::OutOfView(..))
+        ));
+        assert!(matches!(
+            read(r#"{"do":"target","um":1e999}"#),
+            Err(CommandError::Unreadable(_) | CommandError::OutOfView(..))
+        ));
+        assert!(read(r#"{"do":"arm"}"#).is_err());
+        // A stop is a stop, whatever stands beside it.
+        assert_eq!(read(r#"{"do":"park","now":true}"#), Ok(Command::Park));
+        assert!(Command::read(r#"{"do":"target","um":13}"#, [f64::NAN; 2]).is_ok());
+    }
+
+    #[test]
+    fn a_note_loses_control_characters_and_has_an_end() {
+        let note = Command::read("{\"do\":\"note\",\"text\":\"a\\u001b[31mb\"}", VIEW);
+        assert_eq!(
+            note,
+            Ok(Command::Note {
+                text: "a[31mb".to_string()
+            })
+        );
+        let long = format!("{{\"do\":\"note\",\"text\":\"{}\"}}", "x".repeat(501));
+        assert_eq!(Command::read(&long, VIEW), Err(CommandError::Note));
+    }
+}

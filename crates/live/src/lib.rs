@@ -1,0 +1,48 @@
+//! The live page of a run: picture, traces, events and the stop key in a browser.
+//!
+//! A [`Feed`] takes what happens - rows, pictures, events, the state - from the threads of a run; none of its calls waits, and what
+//! finds its ring full is counted and lost. [`Server::start`] serves one page, baked into the program, on threads of its own:
+//!
+//! | thread | does | waits for |
+//! |---|---|---|
+//! | live-hub | rings -> messages, 25 times a second, into each client's queue | 40 ms |
+//! | live-accept | new connections, at most [`MOST_CLIENTS`] | a connection |
+//! | live-client | one client: its queue out, its requests in | 10 ms |
+//!
+//! A client's queue holds two seconds; when the client does not take it, the oldest message goes and is counted, and after
+//! five seconds without progress the connection is closed. A client can only slow itself down.
+//!
+//! There are two links: the operator's may freeze, park and move, the viewer's may look. Both carry a random word; the
+//! host and origin of each request are checked, so that a page from elsewhere cannot reach the server through the browser.
+//!
+//! The crate knows no camera, board or loop: whoever runs them fills a [`Feed`] and acts on [`Command`]s.
+//!
+//! ```
+//! use cellpos_live::{Feed, Hello, Row, Server, ServerConfig};
+//!
+//! let (mut feed, hub) = Feed::new(Hello { name: "hold".into(), period_us: 1000.0, ..Hello::default() });
+//! let server = Server::start(&ServerConfig::default(), hub, |command| println!("{command:?}"))?;
+//! println!("operator: {}", server.operator_url());
+//! feed.row(&Row { time_s: 0.001, measured_um: 0.05, ..Row::default() });
+//! drop(server); // ends its threads
+//! # Ok::<(), cellpos_live::LiveError>(())
+//! ```
+#![forbid(unsafe_code)]
+
+mod access;
+mod client;
+mod command;
+mod feed;
+mod http;
+mod hub;
+mod page;
+mod row;
+mod server;
+mod state;
+
+pub use access::{Role, Secrets};
+pub use command::{Command, CommandError};
+pub use feed::{Feed, FeedHub, Lost, PictureFeed};
+pub use row::{PICTURE_MARGIN, Picture, Row};
+pub use server::{LiveError, MOST_CLIENTS, Server, ServerConfig};
+pub use state::{Banner, CycleRow, EventLine, Hello, State};

@@ -1,0 +1,158 @@
+// Traces over time: panels on one canvas, each pixel column drawn from the least to the greatest of its rows, so that no
+// excursion of a single tick is lost whatever the time base.
+
+export function sharp(canvas) {
+  const ratio = window.devicePixelRatio || 1;
+  const width = Math.round(canvas.clientWidth * ratio), height = Math.round(canvas.clientHeight * ratio);
+  if (canvas.width !== width || canvas.height !== height) { canvas.width = width; canvas.height = height; }
+  const context = canvas.getContext("2d");
+  context.setTransform(ratio, 0, 0, ratio, 0, 0);
+  context.clearRect(0, 0, canvas.clientWidth, canvas.clientHeight);
+  return context;
+}
+
+export function colour(name) { return getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim(); }
+
+// Round steps of an axis: about `most` of them between low and high.
+export function steps(low, high, most) {
+  const raw = (high - low) / most;
+  if (!(raw > 0) || !isFinite(raw)) return [];
+  const power = Math.pow(10, Math.floor(Math.log10(raw)));
+  const step = [1, 2, 5, 10].map(n => n * power).find(s => s >= raw) ?? 10 * power;
+  const found = [];
+  for (let n = Math.ceil(low / step - 1e-9); n * step <= high + 1e-9 * step; n++) found.push(n * step);
+  return found;
+}
+
+// Powers of ten of a logarithmic axis, short enough for a phone.
+export function short(value) {
+  if (value >= 1e6) return `${+(value / 1e6).toPrecision(1)}M`;
+  if (value >= 1e4) return `${+(value / 1e3).toPrecision(1)}k`;
+  return String(+value.toPrecision(1));
+}
+
+export function number(value, span) {
+  if (!isFinite(value)) return "-";
+  const digits = Math.max(0, Math.min(6, 2 - Math.floor(Math.log10(Math.max(span, 1e-9)))));
+  return (Math.abs(value) < 1e-12 ? 0 : value).toFixed(digits);
+}
+
+const LEFT = 62, RIGHT = 10, TOP = 8, BOTTOM = 24, GAP = 12;
+export const PANELS = [
+  { share: 0.42, unit: "um", series: [["measured", "position", "position"], ["target", "target", "target"]] },
+  { share: 0.29, unit: "nm", series: [["error", "error", "position"]], zero: true },
+  { share: 0.29, unit: "um", series: [["command", "PZT", "pzt"], ["zeroFlow", "zero flow", "zero-flow"]] },
+];
+
+export class Traces {
+  constructor(canvas, rows) { this.canvas = canvas; this.rows = rows; this.cursor = null; }
+  // Seconds of the run at a place of the canvas.
+  timeAt(x) {
+    const width = this.canvas.clientWidth - LEFT - RIGHT;
+    return this.from + (x - LEFT) / width * (this.to - this.from);
+  }
+  draw(from, to, mark) {
+    const { rows } = this;
+    const context = sharp(this.canvas);
+    const width = this.canvas.clientWidth, height = this.canvas.clientHeight;
+    this.from = from; this.to = to;
+    const plotWidth = width - LEFT - RIGHT;
+    const columns = Math.max(1, Math.floor(plotWidth));
+    const first = rows.after(from), last = rows.after(to);
+    const x = time => LEFT + (time - from) / (to - from) * plotWidth;
+    context.font = "12px system-ui, sans-serif";
+    const room = height - TOP - BOTTOM - GAP * (PANELS.length - 1);
+    let top = TOP;
+    for (const panel of PANELS) {
+      const tall = room * panel.share;
+      const found = panel.series.map(([key]) => reduce(rows, rows[key], first, last, from, to, columns));
+      let low = Math.min(...found.map(f => f.low)), high = Math.max(...found.map(f => f.high));
+      if (!(low <= high)) { low = -1; high = 1; }
+      if (panel.zero) { high = Math.max(high, -low, 1e-3); low = -high; }
+      const margin = Math.max(0.06 * (high - low), panel.unit === "nm" ? 5 : 0.01);
+      low -= margin; high += margin;
+      const y = value => top + tall - (value - low) / (high - low) * tall;
+      context.strokeStyle = colour("line"); context.fillStyle = colour("quiet"); context.lineWidth = 1;
+      context.textAlign = "right"; context.textBaseline = "middle";
+      for (const value of steps(low, high, Math.max(2, tall / 42))) {
+        context.beginPath(); context.moveTo(LEFT, y(value)); context.lineTo(width - RIGHT, y(value)); context.stroke();
+        context.fillText(number(value, high - low), LEFT - 6, y(value));
+      }
+      context.save();
+      context.translate(13, top + tall / 2); context.rotate(-Math.PI / 2); context.textAlign = "center";
+      context.fillText(panel.unit, 0, 0); context.restore();
+      context.save();
+      context.beginPath(); context.rect(LEFT, top, plotWidth, tall); context.clip();
+      panel.series.forEach(([, , paint], n) => stroke(context, found[n], colour(paint), y));
+      context.restore();
+      context.textAlign = "left"; context.textBaseline = "top";
+      let at = LEFT + 6;
+      for (const [, label, paint] of panel.series) {
+        context.fillStyle = colour("card"); context.fillRect(at - 2, top + 1, context.measureText(label).width + 4, 15);
+        context.fillStyle = colour(paint); context.fillText(label, at, top + 2);
+        at += context.measureText(label).width + 14;
+      }
+      top += tall + GAP;
+    }
+    context.fillStyle = colour("quiet"); context.textAlign = "center"; context.textBaseline = "top";
+    for (const time of steps(from, to, Math.max(2, plotWidth / 90))) {
+      context.fillText(`${number(time, to - from)} s`, Math.min(width - 24, Math.max(LEFT + 10, x(time))), height - BOTTOM + 7);
+    }
+    for (const [time, paint] of [[mark, "alarm"], [this.cursor, "ink"]]) {
+      if (time === null || time === undefined || time < from || time > to) continue;
+      context.strokeStyle = colour(paint); context.lineWidth = 1;
+      context.beginPath(); context.moveTo(x(time), TOP); context.lineTo(x(time), height - BOTTOM); context.stroke();
+    }
+  }
+  // The row at the cursor, in words.
+  read() {
+    const { rows } = this;
+    if (this.cursor === null || !rows.count) return null;
+    const i = Math.min(rows.count - 1, rows.after(this.cursor));
+    const k = rows.at(i);
+    const say = (value, digits) => isFinite(value) ? value.toFixed(digits) : "-";
+    return `${rows.time[k].toFixed(3)} s: position ${say(rows.measured[k], 3)} um, target ${say(rows.target[k], 3)} um, `
+      + `error ${say(rows.error[k], 0)} nm, PZT ${say(rows.command[k], 3)} um, zero flow ${say(rows.zeroFlow[k], 3)} um`
+      + (isFinite(rows.length[k]) ? `, length ${say(rows.length[k], 3)} um` : "")
+      + `, wake-up ${say(rows.wake[k], 0)} us, computing ${say(rows.compute[k], 0)} us`;
+  }
+}
+
+// Least and greatest of each pixel column; where columns outnumber rows, the rows themselves.
+function reduce(rows, values, first, last, from, to, columns) {
+  const found = { points: [], low: Infinity, high: -Infinity };
+  const scale = columns / (to - from);
+  let column = -1, low = Infinity, high = -Infinity, firstValue = NaN, lastValue = NaN, broken = true;
+  const close = () => {
+    if (column >= 0 && low <= high) found.points.push([column, firstValue, low, high, lastValue, broken]);
+    broken = !(low <= high); low = Infinity; high = -Infinity; firstValue = NaN;
+  };
+  for (let i = first; i < last; i++) {
+    const k = rows.at(i), value = values[k];
+    const here = Math.floor((rows.time[k] - from) * scale);
+    if (here !== column) { close(); column = here; }
+    if (value !== value) continue; // no bead in that frame
+    if (firstValue !== firstValue) firstValue = value;
+    lastValue = value;
+    if (value < low) low = value;
+    if (value > high) high = value;
+  }
+  close();
+  for (const [, , least, greatest] of found.points) {
+    if (least < found.low) found.low = least;
+    if (greatest > found.high) found.high = greatest;
+  }
+  return found;
+}
+
+function stroke(context, found, paint, y) {
+  context.strokeStyle = paint; context.lineWidth = 1.4; context.lineJoin = "round";
+  context.beginPath();
+  for (const [column, first, low, high, last, broken] of found.points) {
+    const x = LEFT + column + 0.5;
+    if (broken) context.moveTo(x, y(first)); else context.lineTo(x, y(first));
+    if (high > low) { context.lineTo(x, y(high)); context.lineTo(x, y(low)); }
+    context.lineTo(x, y(last));
+  }
+  context.stroke();
+}

@@ -1,0 +1,345 @@
+//! The server: accepts, checks, answers.
+
+use crate::access::{Role, Secrets, is_our_host, is_our_origin};
+use crate::client::{self, Queue};
+use crate::command::Command;
+use crate::feed::FeedHub;
+use crate::http::{self, RequestError};
+use crate::hub::{Clients, Hub};
+use crate::page;
+use crate::state::Hello;
+use serde::Serialize;
+use std::fmt;
+use std::net::{SocketAddr, TcpListener, TcpStream};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::thread::{self, JoinHandle};
+use std::time::Duration;
+use tungstenite::Message;
+
+/// Most connections at a time.
+pub const MOST_CLIENTS: usize = 32;
+/// How often the hub sends.
+const ROUND_EVERY: Duration = Duration::from_millis(40);
+/// How often new connections are looked for.
+const ACCEPT_EVERY: Duration = Duration::from_millis(20);
+/// Stack of a client's thread, bytes.
+const STACK: usize = 256 * 1024;
+
+/// Where the server listens.
+#[derive(Clone)]
+pub struct ServerConfig {
+    /// Address and port; port 0: any that is free.
+    pub address: SocketAddr,
+    /// Whether an address other than this machine's own (loopback) was asked for by name.
+    pub beyond_this_machine: bool,
+    /// Called by each thread of the server as its first act: its place among the processors.
+    pub on_thread: Option<Arc<dyn Fn() + Send + Sync>>,
+}
+
+impl fmt::Debug for ServerConfig {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("ServerConfig")
+            .field("address", &self.address)
+            .field("beyond_this_machine", &self.beyond_this_machine)
+            .finish_non_exhaustive()
+    }
+}
+
+impl Default for ServerConfig {
+    /// Loopback, any free port.
+    fn default() -> Self {
+        Self {
+            address: SocketAddr::from(([127, 0, 0, 1], 0)),
+            beyond_this_machine: false,
+            on_thread: None,
+        }
+    }
+}
+
+/// Why there is no page.
+#[derive(Debug, thiserror::Error)]
+pub enum LiveError {
+    /// An address that others can reach was not asked for by its own option.
+    #[error(
+        "{0} can be reached from other machines: whoever has the link can move the PZT, and nothing is encrypted. Use an SSH tunnel to 127.0.0.1, or ask for it with --view-unsafe-address"
+    )]
+    Reachable(SocketAddr),
+    /// The address cannot be listened on.
+    #[error("no page at {address}: is another program, or another run, listening there?")]
+    Listen {
+        /// Address asked for.
+        address: SocketAddr,
+        /// What the operating system said.
+        #[source]
+        source: std::io::Error,
+    },
+    /// No random numbers, or no thread.
+    #[error("the page cannot be served")]
+    System(#[from] std::io::Error),
+}
+
+/// What the server's threads share.
+pub(crate) struct Shared {
+    secrets: Secrets,
+    address: SocketAddr,
+    hello: Hello,
+    /// The hub sends what has come and ends; clients go on until `over`.
+    ending: AtomicBool,
+    over: AtomicBool,
+    clients: Clients,
+    connections: AtomicUsize,
+    command: Box<dyn Fn(Command) + Send + Sync>,
+    on_thread: Option<Arc<dyn Fn() + Send + Sync>>,
+}
+
+#[derive(Serialize)]
+struct Greeting<'a> {
+    hello: &'a Hello,
+    operator: bool,
+}
+
+impl Shared {
+    pub(crate) fn is_over(&self) -> bool {
+        self.over.load(Ordering::Acquire)
+    }
+
+    pub(crate) fn view_um(&self) -> [f64; 2] {
+        self.hello.view_um
+    }
+
+    pub(crate) fn ask(&self, command: Command) {
+        (self.command)(command);
+    }
+
+    /// The first message of a client.
+    pub(crate) fn hello(&self, role: Role) -> Message {
+        let greeting = Greeting {
+            hello: &self.hello,
+            operator: role == Role::Operator,
+        };
+        Message::text(serde_json::to_string(&greeting).unwrap_or_default())
+    }
+
+    fn enter_thread(&self) {
+        if let Some(on_thread) = &self.on_thread {
+            on_thread();
+        }
+    }
+}
+
+/// A page that is being served; dropping it ends its threads.
+pub struct Server {
+    shared: Arc<Shared>,
+    threads: Vec<JoinHandle<()>>,
+}
+
+impl fmt::Debug for Server {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "Server({})", self.shared.address)
+    }
+}
+
+impl Server {
+    /// Listens and serves. `command` is called on a client's thread for each request of the operator: it must not wait.
+    ///
+    /// # Errors
+    /// An address that cannot be listened on, or that others can reach without having been asked for by name.
+    pub fn start(
+        config: &ServerConfig,
+        feed: FeedHub,
+        command: impl Fn(Command) + Send + Sync + 'static,
+    ) -> Result<Self, LiveError> {
+        if !config.address.ip().is_loopback() && !config.beyond_this_machine {
+            return Err(LiveError::Reachable(config.address));
+        }
+        let listen = |source| LiveError::Listen {
+            address: config.address,
+            source,
+        };
+        let listener = TcpListener::bind(config.address).map_err(listen)?;
+        listener.set_nonblocking(true).map_err(listen)?;
+        let shared = Arc::new(Shared {
+            secrets: Secrets::random()?,
+            address: listener.local_addr().map_err(listen)?,
+            hello: feed.hello.clone(),
+            ending: AtomicBool::new(false),
+            over: AtomicBool::new(false),
+            clients: Clients::default(),
+            connections: AtomicUsize::new(0),
+            command: Box::new(command),
+            on_thread: config.on_thread.clone(),
+        });
+        // From here on a failure drops the server, which ends what has started.
+        let mut server = Self {
+            shared: Arc::clone(&shared),
+            threads: vec![],
+        };
+        let hub = Hub::new(feed, shared.clients.clone());
+        server.spawn("live-hub", move |shared| serve_hub(hub, shared))?;
+        server.spawn("live-accept", move |shared| accept(&listener, shared))?;
+        Ok(server)
+    }
+
+    fn spawn(
+        &mut self,
+        name: &str,
+        work: impl FnOnce(&Arc<Shared>) + Send + 'static,
+    ) -> Result<(), LiveError> {
+        let shared = Arc::clone(&self.shared);
+        let thread = thread::Builder::new()
+            .name(name.to_string())
+            .spawn(move || {
+                shared.enter_thread();
+                work(&shared);
+            })?;
+        self.threads.push(thread);
+        Ok(())
+    }
+
+    /// Where it listens.
+    pub fn address(&self) -> SocketAddr {
+        self.shared.address
+    }
+
+    /// The operator's link.
+    pub fn operator_url(&self) -> String {
+        self.url(Role::Operator)
+    }
+
+    /// The viewer's link.
+    pub fn viewer_url(&self) -> String {
+        self.url(Role::Viewer)
+    }
+
+    fn url(&self, role: Role) -> String {
+        let word = self.shared.secrets.word(role);
+        format!("http://{}/?word={word}", self.shared.address)
+    }
+
+    /// Clients that look on.
+    pub fn clients(&self) -> usize {
+        self.shared.clients.count()
+    }
+}
+
+impl Drop for Server {
+    fn drop(&mut self) {
+        // The hub first, so that how the run ended is in the clients' queues when they are told to go.
+        for end in [&self.shared.ending, &self.shared.over] {
+            end.store(true, Ordering::Release);
+            if !self.threads.is_empty() {
+                // A thread that panicked has nothing to hand over.
+                let _ = self.threads.remove(0).join();
+            }
+        }
+    }
+}
+
+fn serve_hub(mut hub: Hub, shared: &Shared) {
+    while !shared.ending.load(Ordering::Acquire) {
+        hub.round();
+        thread::sleep(ROUND_EVERY);
+    }
+    // What came last, for whoever still reads.
+    hub.round();
+}
+
+fn accept(listener: &TcpListener, shared: &Arc<Shared>) {
+    let mut clients: Vec<JoinHandle<()>> = vec![];
+    while !shared.is_over() {
+        clients.retain(|client| !client.is_finished());
+        match listener.accept() {
+            Ok((stream, _)) => clients.extend(greet(stream, shared)),
+            Err(_) => thread::sleep(ACCEPT_EVERY),
+        }
+    }
+    for client in clients {
+        let _ = client.join();
+    }
+}
+
+/// Gives a connection a thread, or sends it away.
+fn greet(mut stream: TcpStream, shared: &Arc<Shared>) -> Option<JoinHandle<()>> {
+    // The listener does not wait; its connections do.
+    stream.set_nonblocking(false).ok()?;
+    if shared.connections.fetch_add(1, Ordering::AcqRel) >= MOST_CLIENTS {
+        shared.connections.fetch_sub(1, Ordering::AcqRel);
+        let _ = stream.set_write_timeout(Some(Duration::from_millis(100)));
+        http::say(
+            &mut stream,
+            "503 Service Unavailable",
+            "too many pages are open",
+        );
+        return None;
+    }
+    let held = Arc::clone(shared);
+    let thread = thread::Builder::new()
+        .name("live-client".to_string())
+        .stack_size(STACK)
+        .spawn(move || {
+            held.enter_thread();
+            converse(stream, &held);
+            held.connections.fetch_sub(1, Ordering::AcqRel);
+        });
+    if thread.is_err() {
+        shared.connections.fetch_sub(1, Ordering::AcqRel);
+    }
+    thread.ok()
+}
+
+/// One connection: a file, a request, or the live line.
+fn converse(mut stream: TcpStream, shared: &Shared) {
+    let request = match http::read_request(&mut stream) {
+        Ok(request) => request,
+        Err(RequestError::Gone) => return,
+        Err(RequestError::Bad) => {
+            return http::say(&mut stream, "400 Bad Request", "not a request");
+        }
+    };
+    if !is_our_host(&request.host, shared.address) {
+        let text = "this is not the host that you asked for";
+        return http::say(&mut stream, "421 Misdirected Request", text);
+    }
+    let foreign = |origin: &String| !is_our_origin(origin, &request.host);
+    if request.origin.as_ref().is_some_and(foreign) {
+        return http::say(&mut stream, "403 Forbidden", "asked for by a foreign page");
+    }
+    if let ("GET", Some((kind, text))) = (request.method.as_str(), page::asset(&request.path)) {
+        return http::answer(&mut stream, "200 OK", kind, text.as_bytes());
+    }
+    let Some(role) = shared.secrets.role(&request.word) else {
+        let text = "open the link that cellpos printed: it carries a word that this one lacks";
+        return http::say(&mut stream, "403 Forbidden", text);
+    };
+    match (
+        request.method.as_str(),
+        request.path.as_str(),
+        &request.websocket_key,
+    ) {
+        ("GET", "/", None) => {
+            http::answer(
+                &mut stream,
+                "200 OK",
+                "text/html; charset=utf-8",
+                page::INDEX.as_bytes(),
+            );
+        }
+        // A browser always says where a script comes from: without an origin it is not our page.
+        ("GET", "/live", Some(_)) if request.origin.is_none() => {
+            http::say(&mut stream, "403 Forbidden", "no origin");
+        }
+        ("GET", "/live", Some(key)) => {
+            if http::switch_to_websocket(&mut stream, key).is_ok() {
+                let queue = Arc::new(Queue::default());
+                shared.clients.add(Arc::clone(&queue));
+                client::serve(stream, role, &queue, shared);
+            }
+        }
+        ("POST", "/do", None) => match client::act(&request.body, role, shared) {
+            Ok(()) => http::say(&mut stream, "200 OK", "done"),
+            Err(error) => http::say(&mut stream, "400 Bad Request", &error.to_string()),
+        },
+        _ => http::say(&mut stream, "404 Not Found", "there is no such page"),
+    }
+}

@@ -1,0 +1,127 @@
+//! What the page is told in words: what the run is, how it stands, what happened.
+
+use serde::Serialize;
+
+/// What does not change during a run.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Hello {
+    /// Name of the run.
+    pub name: String,
+    /// What runs: command, controller, rig.
+    pub subtitle: String,
+    /// Period of the loop, us.
+    pub period_us: f64,
+    /// Ends of the PZT's range, um.
+    pub range_um: [f64; 2],
+    /// Slew limit, um/s.
+    pub slew_um_per_s: f64,
+    /// Ends of the field of view along the channel, um; NaN where it is not known.
+    pub view_um: [f64; 2],
+    /// Budget of a tick, us.
+    pub budget_us: f64,
+    /// Lowest possible RMS error of holding, nm, where the model tells.
+    pub bound_nm: Option<f64>,
+    /// Spectral density of the lowest possible error: pairs of frequency in Hz and amplitude in nm/sqrt(Hz).
+    pub bound_spectrum: Vec<[f64; 2]>,
+    /// Whether the operator may set the target.
+    pub steered: bool,
+    /// Whether a script says where the bead is to be: it can be paused, and its steps skipped.
+    pub script: bool,
+    /// Whether the run has pictures.
+    pub pictures: bool,
+    /// Whether the run is over and read from its folder.
+    pub recorded: bool,
+}
+
+impl Default for Hello {
+    fn default() -> Self {
+        Self {
+            name: String::new(),
+            subtitle: String::new(),
+            period_us: 1000.0,
+            range_um: [0.0, 40.0],
+            slew_um_per_s: f64::NAN,
+            view_um: [f64::NAN; 2],
+            budget_us: f64::NAN,
+            bound_nm: None,
+            bound_spectrum: vec![],
+            steered: false,
+            script: false,
+            pictures: false,
+            recorded: false,
+        }
+    }
+}
+
+/// The banner: one word and one sentence.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct Banner {
+    /// `armed`, `running`, `frozen`, `paused`, `safe`, `over`: the banner's colour goes with it.
+    pub state: &'static str,
+    /// Why, in a sentence.
+    pub reason: String,
+}
+
+impl Default for Banner {
+    fn default() -> Self {
+        Self {
+            state: "armed",
+            reason: "The rig is being made ready.".to_string(),
+        }
+    }
+}
+
+/// How the run stands, a few times a second. The same numbers as in the run's summary.
+#[derive(Debug, Clone, PartialEq, Serialize, Default)]
+pub struct State {
+    /// The banner.
+    pub banner: Banner,
+    /// Time since the start of the run, s.
+    pub time_s: f64,
+    /// Ticks.
+    pub ticks: u64,
+    /// RMS of the measured error since the loop settled, nm.
+    pub rms_nm: Option<f64>,
+    /// Ticks handed over late.
+    pub late: u64,
+    /// Ticks that never came.
+    pub skipped: u64,
+    /// Frames lost on the way.
+    pub frames_lost: u64,
+    /// Stale frames.
+    pub stale: u64,
+    /// Ticks on prediction alone.
+    pub coasted: u64,
+    /// Records that are not on disk.
+    pub records_lost: u64,
+    /// Cycle that runs, from 1, and how many there are, where a script has cycles.
+    pub cycle: Option<[u64; 2]>,
+    /// What comes next in the script.
+    pub next: Option<String>,
+    /// Time left, s, where it is known.
+    pub left_s: Option<f64>,
+}
+
+/// One event as a sentence.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct EventLine {
+    /// Time since the start of the run, s.
+    pub time_s: f64,
+    /// `info`, `warning` or `fault`.
+    pub level: &'static str,
+    /// What happened.
+    pub text: String,
+}
+
+/// One finished cycle of a script.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct CycleRow {
+    /// Number, from 1.
+    pub cycle: u64,
+    /// Amplitude reached, um.
+    pub amplitude_um: Option<f64>,
+    /// Stretch ratio.
+    pub stretch: Option<f64>,
+    /// Recovery time, s.
+    pub recovery_s: Option<f64>,
+}

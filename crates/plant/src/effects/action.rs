@@ -1,0 +1,126 @@
+//! What an effect does, in the few ways in which anything can act on a signal of the chain.
+
+use crate::modal::Zpk;
+use std::fmt;
+
+/// What an effect does at its place.
+#[derive(Debug)]
+pub enum Action {
+    /// A linear, time-invariant factor.
+    Linear(Zpk),
+    /// Limits of the driver's output \[um, absolute\].
+    Clip {
+        /// Smallest displacement, um.
+        low_um: f64,
+        /// Largest displacement, um.
+        high_um: f64,
+    },
+    /// Limit of the speed of the driver's output \[um/s\].
+    Slew(f64),
+    /// Anything else between command and bead.
+    Block(Box<dyn Block>),
+    /// Another way from the PZT's displacement to the record, beside the plant.
+    Bypass(Zpk),
+    /// `y(t - delay)`, s.
+    Delay(f64),
+    /// The mean over an exposure that ends with the frame, s.
+    Exposure(f64),
+    /// Frame k is taken at `(1 + skew) t_k`.
+    Skew(f64),
+    /// Probability of a missing frame.
+    Drop(f64),
+    /// Probability of a frame that is delivered twice.
+    Repeat(f64),
+    /// What the camera shows of a position.
+    Show(Box<dyn Shown>),
+}
+
+/// A signal over one piece of time: a straight line, or close enough to one, from `start` to `end`.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Segment {
+    /// Just after the piece's beginning, um.
+    pub start: f64,
+    /// Just before its end, um.
+    pub end: f64,
+    /// Integral over the piece, um s.
+    pub integral: f64,
+    /// Slope just after the beginning, um/s.
+    pub speed_start: f64,
+    /// Slope just before the end, um/s.
+    pub speed_end: f64,
+}
+
+impl Segment {
+    /// A straight line over `h_s`.
+    pub fn line(start: f64, end: f64, h_s: f64) -> Self {
+        let speed = if h_s > 0.0 { (end - start) / h_s } else { 0.0 };
+        Self {
+            start,
+            end,
+            integral: 0.5 * (start + end) * h_s,
+            speed_start: speed,
+            speed_end: speed,
+        }
+    }
+}
+
+/// A block of the chain that is not linear, or not constant in time, with its state.
+///
+/// In the loop of an emulated rig: no allocation, no panic.
+pub trait Block: fmt::Debug + Send + Sync {
+    /// Advances over a piece of `h_s` (zero: the input jumps, no time passes) that begins at `time_s`.
+    fn advance(&mut self, time_s: f64, h_s: f64, input: Segment) -> Segment;
+
+    /// Back to rest.
+    fn reset(&mut self);
+
+    /// A copy with its state.
+    fn duplicate(&self) -> Box<dyn Block>;
+
+    /// Whether slopes and integrals of the input are used, not its ends alone.
+    fn needs_slopes(&self) -> bool {
+        false
+    }
+
+    /// Whether the output bends where the input is straight, so that a moving input is taken in short pieces.
+    fn bends(&self) -> bool {
+        true
+    }
+
+    /// The slope of the output for a slope of the input \[um/s\]; for blocks that stop nothing.
+    fn speed(&self, time_s: f64, input_um_per_s: f64) -> f64 {
+        let _ = time_s;
+        input_um_per_s
+    }
+
+    /// Starts the random numbers of a block that has any; without a seed it does nothing at random.
+    fn seed(&mut self, seed: u64) {
+        let _ = seed;
+    }
+}
+
+impl Clone for Box<dyn Block> {
+    fn clone(&self) -> Self {
+        self.duplicate()
+    }
+}
+
+/// What camera, light and table make of a position.
+pub trait Shown: fmt::Debug + Send + Sync {
+    /// The position shown for one seen at `time_s` \[um\].
+    fn show(&mut self, seen_um: f64, time_s: f64) -> f64;
+
+    /// A copy with its state.
+    fn duplicate(&self) -> Box<dyn Shown>;
+
+    /// Starts the random numbers of a block that has any; without a seed it does nothing at random.
+    fn seed(&mut self, seed: u64) {
+        let _ = seed;
+    }
+}
+
+impl Clone for Box<dyn Shown> {
+    fn clone(&self) -> Self {
+        self.duplicate()
+    }
+}

@@ -1,0 +1,142 @@
+//! `bubble`: a gas bubble in the chip.
+
+use super::candidate::{grid, one};
+use super::{
+    Action, Block, Candidate, Effect, EffectKind, Experiment, FitParameter, Form, ParameterSpec,
+    Place, Scope, Segment, Spec, lin, log,
+};
+use crate::modal::Zpk;
+use crate::phi::phi;
+use nalgebra::Complex;
+
+/// A gas bubble, compliance `C = V/(n P)` behind the flow resistance R: `1 / (1 + lag s)`, `lag = R C`.
+///
+/// It dissolves: `lag(t) = lag exp(-dissolution t)`; zero for a lasting bubble.
+pub fn bubble(lag_s: f64, dissolution_per_s: f64) -> Effect {
+    Effect::new(&KIND, 0, &[lag_s, dissolution_per_s], &[])
+}
+
+#[derive(Debug)]
+pub(super) struct Bubble;
+
+pub(super) static KIND: Bubble = Bubble;
+
+static SPEC: Spec = Spec {
+    id: "bubble",
+    place: Place::Chip,
+    shown_at: "",
+    equation: "1/(1 + lag s), lag(t) = lag exp(-dissolution t)",
+    signature: "an extra pole that drifts as the bubble dissolves",
+    ahead_of_plant: false,
+    forms: &[Form::only(&[
+        ParameterSpec::new("lag_s", "s", 1e-6, 100.0),
+        ParameterSpec::new("dissolution_per_s", "1/s", -10.0, 10.0).or(0.0),
+    ])],
+    confused_with: &["driver-lag", "time-delay", "exposure-averaging"],
+    inseparable_from: &["driver-lag"],
+    experiment: Experiment::Band,
+    separate_by: "excite to 300 Hz and beyond: a pole rolls off, an exposure follows a sinc, a resonance peaks, a delay changes the phase only",
+};
+
+impl EffectKind for Bubble {
+    fn spec(&self) -> &'static Spec {
+        &SPEC
+    }
+
+    fn act(&self, effect: &Effect) -> Action {
+        let (lag, dissolution) = (effect.scalar(0), effect.scalar(1));
+        if dissolution == 0.0 {
+            return Action::Linear(Zpk::low_pass(1.0 / lag));
+        }
+        Action::Block(Box::new(Dissolving {
+            lag,
+            dissolution,
+            y: 0.0,
+            speed: 0.0,
+        }))
+    }
+
+    fn at_start(&self, effect: &Effect) -> Option<Zpk> {
+        Some(Zpk::low_pass(1.0 / effect.scalar(0)))
+    }
+
+    fn candidates(&self) -> &'static [Candidate] {
+        const ALL: &[Candidate] = &[
+            Candidate::chain(&[LAG]).typical(0.0032, 0.15),
+            Candidate {
+                name: "dissolving",
+                late: true,
+                ..Candidate::chain(&[LAG, lin("dissolution_per_s", -1.0, 1.0, 1e-4)])
+            },
+        ];
+        ALL
+    }
+
+    fn starts(&self, index: usize, _: &Scope) -> Vec<Vec<f64>> {
+        if index == 0 {
+            one([1e-4, 5e-4, 2e-3, 6e-3, 0.02, 0.06])
+        } else {
+            grid(&[1e-3, 8e-3, 0.05], &[0.03])
+        }
+    }
+
+    fn build(&'static self, _: usize, values: &[f64], _: &Scope) -> Effect {
+        Effect::new(self, 0, values, &[])
+    }
+
+    fn lag_s(&self, _: usize, values: &[f64]) -> Option<f64> {
+        values.first().copied()
+    }
+
+    fn of_lag(&self, lag_s: f64, _: &Scope) -> Vec<(usize, Vec<f64>)> {
+        vec![(0, vec![lag_s])]
+    }
+}
+
+const LAG: FitParameter = log("lag_s", 1e-6, 1.0);
+
+/// First-order lag `lag exp(-dissolution t)`.
+#[derive(Debug, Clone)]
+struct Dissolving {
+    lag: f64,
+    dissolution: f64,
+    y: f64,
+    /// Slope at the end of the last piece, um/s.
+    speed: f64,
+}
+
+impl Block for Dissolving {
+    fn advance(&mut self, time_s: f64, h_s: f64, input: Segment) -> Segment {
+        let start = self.y;
+        if h_s <= 0.0 {
+            return Segment::line(start, start, 0.0);
+        }
+        // The lag changes over seconds, a piece lasts less than a millisecond: its mean is enough.
+        let now = (self.lag * (-self.dissolution * (time_s + 0.5 * h_s)).exp()).max(1e-9);
+        let f = phi(Complex::new(-h_s / now, 0.0));
+        let rise = input.end - input.start;
+        let gain = h_s / now;
+        self.y = f.exp.re * start + gain * (f.one.re * input.start + f.two.re * rise);
+        self.speed = (input.end - self.y) / now;
+        Segment {
+            start,
+            end: self.y,
+            integral: input.integral - now * (self.y - start),
+            speed_start: (input.start - start) / now,
+            speed_end: self.speed,
+        }
+    }
+
+    fn reset(&mut self) {
+        self.y = 0.0;
+        self.speed = 0.0;
+    }
+
+    fn duplicate(&self) -> Box<dyn Block> {
+        Box::new(self.clone())
+    }
+
+    fn speed(&self, _: f64, _: f64) -> f64 {
+        self.speed
+    }
+}

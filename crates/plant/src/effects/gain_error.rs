@@ -1,0 +1,67 @@
+//! `gain-error`: another gain of actuator, pixel scale or bead height.
+
+use super::candidate::one;
+use super::{
+    Action, Candidate, Effect, EffectKind, Experiment, Form, ParameterSpec, Place, Scope, Spec, lin,
+};
+use crate::modal::Zpk;
+
+/// The bead's displacement is `factor` times the plant's (bead height in the slit, pixel scale, actuator gain).
+pub fn gain_error(factor: f64) -> Effect {
+    Effect::new(&KIND, 0, &[factor], &[])
+}
+
+#[derive(Debug)]
+pub(super) struct GainError;
+
+pub(super) static KIND: GainError = GainError;
+
+static SPEC: Spec = Spec {
+    id: "gain-error",
+    place: Place::Bead,
+    shown_at: "bead/camera",
+    equation: "x = factor x0",
+    signature: "the same at all frequencies, amplitudes and times",
+    ahead_of_plant: false,
+    forms: &[Form::only(&[ParameterSpec::new(
+        "factor", "", -100.0, 100.0,
+    )])],
+    confused_with: &["pdms-relaxation", "gain-drift"],
+    inseparable_from: &[],
+    experiment: Experiment::Elsewhere,
+    separate_by: "actuator gain, pixel scale and bead height give the same factor: image a stage micrometer for the pixel scale, measure the displacement of the piezo, and refocus on a bead at another height",
+};
+
+impl EffectKind for GainError {
+    fn spec(&self) -> &'static Spec {
+        &SPEC
+    }
+
+    fn act(&self, effect: &Effect) -> Action {
+        Action::Linear(Zpk {
+            gain: effect.scalar(0),
+            ..Zpk::one()
+        })
+    }
+
+    fn check(&self, effect: &Effect) -> Result<(), &'static str> {
+        if effect.scalar(0) == 0.0 {
+            return Err("factor must not be zero: the bead would never move");
+        }
+        Ok(())
+    }
+
+    fn candidates(&self) -> &'static [Candidate] {
+        const ALL: &[Candidate] =
+            &[Candidate::chain(&[lin("factor", 0.05, 20.0, 1e-3)]).typical(0.4, 2.5)];
+        ALL
+    }
+
+    fn starts(&self, _: usize, _: &Scope) -> Vec<Vec<f64>> {
+        one([0.9, 1.1])
+    }
+
+    fn build(&'static self, _: usize, values: &[f64], _: &Scope) -> Effect {
+        Effect::new(self, 0, values, &[])
+    }
+}

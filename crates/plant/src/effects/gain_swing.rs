@@ -1,0 +1,132 @@
+//! `gain-swing`: a gain that goes up and down.
+
+use super::{
+    Action, Block, Candidate, Effect, EffectKind, Experiment, Form, ParameterSpec, Place, Scope,
+    Segment, Spec, lin, log,
+};
+use std::f64::consts::TAU;
+
+/// The velocity gain swings: `K(t) = K0 (1 + depth sin(2 pi t / period + phase))`.
+pub fn gain_swing(depth: f64, period_s: f64, phase_deg: f64) -> Effect {
+    Effect::new(&KIND, 0, &[depth, period_s, phase_deg], &[])
+}
+
+#[derive(Debug)]
+pub(super) struct GainSwing;
+
+pub(super) static KIND: GainSwing = GainSwing;
+
+static SPEC: Spec = Spec {
+    id: "gain-swing",
+    place: Place::Bead,
+    shown_at: "",
+    equation: "K(t) = K0 (1 + d sin(2 pi t/T + p))",
+    signature: "the gain goes up and down through a record",
+    ahead_of_plant: false,
+    forms: &[Form::only(&[
+        ParameterSpec::new("depth", "", -1.0, 1.0),
+        ParameterSpec::new("period_s", "s", 0.1, 1e4),
+        ParameterSpec::new("phase_deg", "deg", -1e4, 1e4).or(0.0),
+    ])],
+    confused_with: &["gain-drift", "gain-error"],
+    inseparable_from: &[],
+    experiment: Experiment::Long,
+    separate_by: "one long record of the same sine: its amplitude goes up and down with the period",
+};
+
+impl EffectKind for GainSwing {
+    fn spec(&self) -> &'static Spec {
+        &SPEC
+    }
+
+    fn act(&self, effect: &Effect) -> Action {
+        Action::Block(Box::new(Swing {
+            depth: effect.scalar(0),
+            w: TAU / effect.scalar(1),
+            phase: effect.scalar(2).to_radians(),
+            input: 0.0,
+            output: 0.0,
+        }))
+    }
+
+    fn candidates(&self) -> &'static [Candidate] {
+        const ALL: &[Candidate] = &[Candidate::chain(&[
+            lin("depth", -0.9, 0.9, 1e-3),
+            log("period_s", 1.0, 200.0),
+            lin("phase_deg", -720.0, 720.0, 0.5),
+        ])
+        .typical(-0.5, 0.5)
+        .smallest(0, 0.01)];
+        ALL
+    }
+
+    fn starts(&self, _: usize, scope: &Scope) -> Vec<Vec<f64>> {
+        [2.0, 3.0, 4.5, 7.0, 11.0, 18.0, 35.0, 80.0]
+            .iter()
+            .filter(|t| **t < 4.0 * scope.length_s)
+            .flat_map(|t| [0.0, 90.0].map(|p| vec![0.1, *t, p]))
+            .collect()
+    }
+
+    fn build(&'static self, _: usize, values: &[f64], _: &Scope) -> Effect {
+        Effect::new(self, 0, values, &[])
+    }
+}
+
+/// Velocity times a swinging gain.
+#[derive(Debug, Clone)]
+struct Swing {
+    depth: f64,
+    w: f64,
+    phase: f64,
+    input: f64,
+    output: f64,
+}
+
+impl Swing {
+    fn gain(&self, time_s: f64) -> f64 {
+        1.0 + self.depth * (self.w * time_s + self.phase).sin()
+    }
+}
+
+impl Block for Swing {
+    fn advance(&mut self, time_s: f64, h_s: f64, input: Segment) -> Segment {
+        // A piece lasts less than a thousandth of a period: the gain in its middle is that of all of it.
+        let (first, middle, last) = (
+            self.gain(time_s),
+            self.gain(time_s + 0.5 * h_s),
+            self.gain(time_s + h_s),
+        );
+        let start = self.output + first * (input.start - self.input);
+        self.output = start + middle * (input.end - input.start);
+        self.input = input.end;
+        Segment {
+            start,
+            end: self.output,
+            integral: h_s * start + middle * (input.integral - h_s * input.start),
+            speed_start: first * input.speed_start,
+            speed_end: last * input.speed_end,
+        }
+    }
+
+    fn reset(&mut self) {
+        self.input = 0.0;
+        self.output = 0.0;
+    }
+
+    fn duplicate(&self) -> Box<dyn Block> {
+        Box::new(self.clone())
+    }
+
+    fn needs_slopes(&self) -> bool {
+        true
+    }
+
+    fn bends(&self) -> bool {
+        false
+    }
+
+    fn speed(&self, time_s: f64, input_um_per_s: f64) -> f64 {
+        input_um_per_s * self.gain(time_s)
+    }
+}

@@ -1,0 +1,277 @@
+//! What a real rig does that Eq. (6) does not: one file per effect, one table that everything iterates.
+//!
+//! An effect is one type that implements [`EffectKind`]: its specification (id, place, parameters with units and bounds),
+//! its equation as an [`Action`] on the signal at its place, the [`Candidate`] forms that a search may try, and what tells
+//! it from others. The simulator, the emulator, the design, the search for discrepancies, its report and model files ask
+//! the kind; none of them knows an effect by its name.
+//!
+//! To add one to this crate: its file here, and its line in `table.rs`. To add one from another crate: implement
+//! [`EffectKind`] there and hand it to [`register`].
+//!
+//! Chain: command -> driver -> pzt -> chip (with the plant) -> bead -> camera -> record. Within a place effects act in the
+//! order of the table, whatever the order in a file, so that a model means the same however it is written.
+
+mod action;
+mod candidate;
+mod parameter;
+mod table;
+
+mod backlash;
+mod bubble;
+mod camera_shake;
+mod clock_skew;
+mod driver_lag;
+mod exposure_averaging;
+mod flow_drift;
+mod flow_wander;
+mod frame_drops;
+mod frame_jitter;
+mod frame_repeats;
+mod gain_drift;
+mod gain_error;
+mod gain_swing;
+mod jumps;
+mod leak;
+mod lens_distortion;
+mod mains_hum;
+mod pdms_relaxation;
+mod pixel_locking;
+mod pump_pulsation;
+mod pzt_creep;
+mod pzt_hysteresis;
+mod pzt_resonance;
+mod saturation;
+mod slew_limit;
+mod stick_slip;
+mod stiffening;
+mod time_delay;
+mod valve_asymmetry;
+mod wall_adhesion;
+
+pub use action::{Action, Block, Segment, Shown};
+pub use backlash::backlash;
+pub use bubble::bubble;
+pub use camera_shake::camera_shake;
+pub use candidate::{Candidate, Experiment, FitParameter, Role, Scope, lin, log};
+pub use clock_skew::clock_skew;
+pub use driver_lag::driver_lag;
+pub use exposure_averaging::exposure_averaging;
+pub use flow_drift::flow_drift;
+pub use flow_wander::flow_wander;
+pub use frame_drops::frame_drops;
+pub use frame_jitter::frame_jitter;
+pub use frame_repeats::frame_repeats;
+pub use gain_drift::gain_drift;
+pub use gain_error::gain_error;
+pub use gain_swing::gain_swing;
+pub use jumps::jumps;
+pub use leak::leak;
+pub use lens_distortion::lens_distortion;
+pub use mains_hum::mains_hum;
+pub use parameter::{EffectError, Form, Parameter, ParameterSpec, Spec};
+pub use pdms_relaxation::pdms_relaxation;
+pub use pixel_locking::pixel_locking;
+pub use pump_pulsation::pump_pulsation;
+pub use pzt_creep::pzt_creep;
+pub use pzt_hysteresis::{bouc_wen, bouc_wen_explicit, exponential_play, play};
+pub use pzt_resonance::pzt_resonance;
+pub use saturation::saturation;
+pub use slew_limit::slew_limit;
+pub use stick_slip::stick_slip;
+pub use stiffening::stiffening;
+pub use table::{all, find, ids, register};
+pub use time_delay::time_delay;
+pub use valve_asymmetry::valve_asymmetry;
+pub use wall_adhesion::wall_adhesion;
+
+use crate::modal::Zpk;
+use std::fmt;
+
+/// Where in the chain an effect acts.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum Place {
+    /// The amplifier, between command and piezo.
+    Driver,
+    /// The piezo and its coupling to the syringe.
+    Pzt,
+    /// Syringe, tube and channel: in the loop of Eq. (1)-(3).
+    Chip,
+    /// The bead in the flow.
+    Bead,
+    /// Camera, light, table and clock.
+    Camera,
+}
+
+impl Place {
+    /// The word in files and results.
+    pub fn word(self) -> &'static str {
+        match self {
+            Self::Driver => "driver",
+            Self::Pzt => "pzt",
+            Self::Chip => "chip",
+            Self::Bead => "bead",
+            Self::Camera => "camera",
+        }
+    }
+}
+
+impl fmt::Display for Place {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.word())
+    }
+}
+
+/// Everything that is known about one effect, apart from its numbers.
+pub trait EffectKind: fmt::Debug + Send + Sync {
+    /// Id, place, parameters, words.
+    fn spec(&self) -> &'static Spec;
+
+    /// What the effect with these numbers does at its place.
+    fn act(&self, effect: &Effect) -> Action;
+
+    /// The linear part at the start of a record of an effect that changes with time, where it has one.
+    fn at_start(&self, effect: &Effect) -> Option<Zpk> {
+        let _ = effect;
+        None
+    }
+
+    /// Whether numbers that are each within their bounds also fit together.
+    ///
+    /// # Errors
+    /// What is wrong, and what would be right.
+    fn check(&self, effect: &Effect) -> Result<(), &'static str> {
+        let _ = effect;
+        Ok(())
+    }
+
+    /// The forms that a search may try; none for an effect that is not looked for by fitting.
+    fn candidates(&self) -> &'static [Candidate] {
+        &[]
+    }
+
+    /// Values from which to start the fit of candidate `index`, in the order of its parameters.
+    fn starts(&self, index: usize, scope: &Scope) -> Vec<Vec<f64>> {
+        let _ = (index, scope);
+        Vec::new()
+    }
+
+    /// The effect that candidate `index` stands for, with these values of its parameters.
+    fn build(&'static self, index: usize, values: &[f64], scope: &Scope) -> Effect;
+
+    /// By how much candidate `index` delays a slow motion \[s\], if that is what it does.
+    fn lag_s(&self, index: usize, values: &[f64]) -> Option<f64> {
+        let _ = (index, values);
+        None
+    }
+
+    /// Candidates (index and values) that delay a slow motion by `lag_s`.
+    fn of_lag(&self, lag_s: f64, scope: &Scope) -> Vec<(usize, Vec<f64>)> {
+        let _ = (lag_s, scope);
+        Vec::new()
+    }
+}
+
+/// One effect with its numbers.
+#[derive(Clone)]
+pub struct Effect {
+    kind: &'static dyn EffectKind,
+    form: usize,
+    scalars: Vec<f64>,
+    lists: Vec<Vec<f64>>,
+}
+
+impl fmt::Debug for Effect {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let mut s = f.debug_struct(self.id());
+        for p in self.parameters() {
+            s.field(&p.name, &p.value);
+        }
+        s.finish()
+    }
+}
+
+impl PartialEq for Effect {
+    fn eq(&self, other: &Self) -> bool {
+        self.id() == other.id()
+            && self.form == other.form
+            && self.scalars == other.scalars
+            && self.lists == other.lists
+    }
+}
+
+impl Effect {
+    /// An effect from its kind, the index of its form, and its numbers in the order of the form; nothing is checked
+    /// (see [`Self::validate`]). Missing numbers are zero.
+    pub fn new(
+        kind: &'static dyn EffectKind,
+        form: usize,
+        scalars: &[f64],
+        lists: &[&[f64]],
+    ) -> Self {
+        let spec = &kind.spec().forms[form.min(kind.spec().forms.len() - 1)];
+        let mut scalars = scalars.to_vec();
+        scalars.resize(spec.scalars.len(), 0.0);
+        let mut lists: Vec<Vec<f64>> = lists.iter().map(|l| l.to_vec()).collect();
+        lists.resize(spec.lists.len(), Vec::new());
+        Self {
+            kind,
+            form,
+            scalars,
+            lists,
+        }
+    }
+
+    /// What kind of effect this is.
+    pub fn kind(&self) -> &'static dyn EffectKind {
+        self.kind
+    }
+
+    /// The id used in model files and results, for example `"time-delay"`.
+    pub fn id(&self) -> &'static str {
+        self.kind.spec().id
+    }
+
+    /// The place of the effect in the chain.
+    pub fn place(&self) -> Place {
+        self.kind.spec().place
+    }
+
+    /// What the effect does at its place.
+    pub fn act(&self) -> Action {
+        self.kind.act(self)
+    }
+
+    /// The form of an effect that has several, for example `"play"`.
+    pub fn form(&self) -> Option<&'static str> {
+        let forms = self.kind.spec().forms;
+        (forms.len() > 1).then(|| forms[self.form].name)
+    }
+
+    /// Index of the form.
+    pub fn form_index(&self) -> usize {
+        self.form
+    }
+
+    /// Scalar parameter number `i` of the form.
+    pub fn scalar(&self, i: usize) -> f64 {
+        self.scalars.get(i).copied().unwrap_or(0.0)
+    }
+
+    /// List parameter number `i` of the form.
+    pub fn list(&self, i: usize) -> &[f64] {
+        self.lists.get(i).map_or(&[], Vec::as_slice)
+    }
+
+    /// The value of a parameter by name.
+    pub fn get(&self, name: &str) -> Option<f64> {
+        self.parameters()
+            .into_iter()
+            .find(|p| p.name == name)
+            .map(|p| p.value)
+    }
+
+    /// The rank in which effects act, from the command to the record.
+    pub fn order(&self) -> (Place, usize) {
+        (self.place(), table::position(self.id()))
+    }
+}

@@ -1,0 +1,71 @@
+//! `pdms-relaxation`: the wall of the chip as a standard linear solid.
+
+use super::candidate::grid;
+use super::{
+    Action, Candidate, Effect, EffectKind, Experiment, Form, ParameterSpec, Place, Scope, Spec,
+    lin, log,
+};
+use crate::modal::Zpk;
+
+/// The wall as a standard linear solid: its stiffness, and with it the numerator of Eq. (A4), gets the factor
+/// `(1 + (1 + strength) time s) / (1 + time s)`.
+///
+/// Gain far above the relaxation frequency is `1 + strength` times that below. In the denominator of Eq. (A4) the wall enters
+/// with the weight `alpha A2/A1`, about 2e-8: neglected.
+pub fn pdms_relaxation(time_s: f64, strength: f64) -> Effect {
+    Effect::new(&KIND, 0, &[time_s, strength], &[])
+}
+
+#[derive(Debug)]
+pub(super) struct PdmsRelaxation;
+
+pub(super) static KIND: PdmsRelaxation = PdmsRelaxation;
+
+static SPEC: Spec = Spec {
+    id: "pdms-relaxation",
+    place: Place::Chip,
+    shown_at: "",
+    equation: "(1 + (1 + strength) time s)/(1 + time s)",
+    signature: "a step in gain with a phase bump at 1/(2 pi time), in proportion to the amplitude",
+    ahead_of_plant: false,
+    forms: &[Form::only(&[
+        ParameterSpec::new("time_s", "s", 1e-5, 1e4),
+        ParameterSpec::new("strength", "", -0.95, 20.0),
+    ])],
+    confused_with: &["pzt-creep", "leak", "gain-error"],
+    inseparable_from: &[],
+    experiment: Experiment::Slow,
+    separate_by: "steps both ways with holds of a minute: log-time tail (creep), exponential (relaxation), sag to zero (leak)",
+};
+
+impl EffectKind for PdmsRelaxation {
+    fn spec(&self) -> &'static Spec {
+        &SPEC
+    }
+
+    fn act(&self, effect: &Effect) -> Action {
+        Action::Linear(Zpk::relaxation(effect.scalar(0), effect.scalar(1)))
+    }
+
+    fn candidates(&self) -> &'static [Candidate] {
+        const ALL: &[Candidate] = &[Candidate::chain(&[
+            log("time_s", 1e-3, 50.0),
+            lin("strength", -0.8, 5.0, 1e-3),
+        ])
+        .typical(0.03, 2.0)
+        .smallest(1, 0.01)];
+        ALL
+    }
+
+    fn starts(&self, _: usize, _: &Scope) -> Vec<Vec<f64>> {
+        grid(&[0.01, 0.03, 0.1, 0.3, 1.0, 3.0], &[-0.1, 0.1])
+    }
+
+    fn build(&'static self, _: usize, values: &[f64], _: &Scope) -> Effect {
+        Effect::new(self, 0, values, &[])
+    }
+
+    fn lag_s(&self, _: usize, values: &[f64]) -> Option<f64> {
+        Some(-values.first()? * values.get(1)?)
+    }
+}

@@ -1,0 +1,73 @@
+//! `pump-pulsation`: the strokes of a pump.
+
+use super::{
+    Action, Effect, EffectKind, Experiment, Form, ParameterSpec, Place, Scope, Shown, Spec,
+};
+use std::f64::consts::TAU;
+
+/// A line below 20 Hz with its second harmonic: `um (sin(w t + p) + second sin(2 (w t + p)))`.
+pub fn pump_pulsation(hz: f64, um: f64, second: f64, phase_deg: f64) -> Effect {
+    Effect::new(&KIND, 0, &[hz, um, second, phase_deg], &[])
+}
+
+#[derive(Debug)]
+pub(super) struct PumpPulsation;
+
+pub(super) static KIND: PumpPulsation = PumpPulsation;
+
+static SPEC: Spec = Spec {
+    id: "pump-pulsation",
+    place: Place::Camera,
+    shown_at: "bead",
+    equation: "y + um (sin(w t) + second sin(2 w t))",
+    signature: "a line as of the mains, at the strokes of a pump",
+    ahead_of_plant: false,
+    forms: &[Form::only(&[
+        ParameterSpec::new("hz", "Hz", 1e-3, 1e3),
+        ParameterSpec::new("um", "um", -1e3, 1e3),
+        ParameterSpec::new("second", "", -10.0, 10.0).or(0.0),
+        ParameterSpec::new("phase_deg", "deg", -360.0, 360.0).or(0.0),
+    ])],
+    confused_with: &["mains-hum"],
+    inseparable_from: &[],
+    experiment: Experiment::Long,
+    separate_by: "the pump at another speed, and stopped",
+};
+
+impl EffectKind for PumpPulsation {
+    fn spec(&self) -> &'static Spec {
+        &SPEC
+    }
+
+    fn act(&self, effect: &Effect) -> Action {
+        Action::Show(Box::new(Strokes {
+            w: TAU * effect.scalar(0),
+            um: effect.scalar(1),
+            second: effect.scalar(2),
+            phase: effect.scalar(3).to_radians(),
+        }))
+    }
+
+    fn build(&'static self, _: usize, values: &[f64], _: &Scope) -> Effect {
+        Effect::new(self, 0, values, &[])
+    }
+}
+
+#[derive(Debug, Clone)]
+struct Strokes {
+    w: f64,
+    um: f64,
+    second: f64,
+    phase: f64,
+}
+
+impl Shown for Strokes {
+    fn show(&mut self, seen_um: f64, time_s: f64) -> f64 {
+        let angle = self.w * time_s + self.phase;
+        seen_um + self.um * (angle.sin() + self.second * (2.0 * angle).sin())
+    }
+
+    fn duplicate(&self) -> Box<dyn Shown> {
+        Box::new(self.clone())
+    }
+}

@@ -1,0 +1,130 @@
+//! `pzt-creep`: the displacement goes on with the logarithm of time.
+
+use super::candidate::one;
+use super::{
+    Action, Candidate, Effect, EffectKind, Experiment, Form, ParameterSpec, Place, Scope, Spec, lin,
+};
+use crate::modal::Zpk;
+use nalgebra::Complex;
+
+/// Creep: `x = x0 (1 + g log10(t / 0.1 s))` after a step, `g` the part of the step gained per decade of time.
+///
+/// Realised as a bank of first-order lags, two per decade from 0.1 ms to 1000 s, each of weight g/2: linear,
+/// within 0.1 % of g of the logarithm from 1 ms to 300 s (Kuhnen, Janocha 1998, linear creep operators).
+pub fn pzt_creep(per_decade: f64) -> Effect {
+    Effect::new(&KIND, 0, &[per_decade], &[])
+}
+
+#[derive(Debug)]
+pub(super) struct PztCreep;
+
+pub(super) static KIND: PztCreep = PztCreep;
+
+static SPEC: Spec = Spec {
+    id: "pzt-creep",
+    place: Place::Pzt,
+    shown_at: "",
+    equation: "x = x0 (1 + g log10(t/0.1 s)) after a step",
+    signature: "a tail in the logarithm of time that flips with the sign of the step; a constant phase of about -39 g deg",
+    ahead_of_plant: false,
+    forms: &[Form::only(&[ParameterSpec::new(
+        "per_decade",
+        "",
+        -0.2,
+        0.2,
+    )])],
+    confused_with: &["pdms-relaxation", "leak", "pzt-hysteresis"],
+    inseparable_from: &[],
+    experiment: Experiment::Slow,
+    separate_by: "steps both ways with holds of a minute: log-time tail (creep), exponential (relaxation), sag to zero (leak)",
+};
+
+impl EffectKind for PztCreep {
+    fn spec(&self) -> &'static Spec {
+        &SPEC
+    }
+
+    fn act(&self, effect: &Effect) -> Action {
+        Action::Linear(creep(effect.scalar(0)))
+    }
+
+    fn candidates(&self) -> &'static [Candidate] {
+        const ALL: &[Candidate] = &[Candidate::chain(&[lin("per_decade", 1e-5, 0.19, 1e-3)])
+            .typical(0.0, 0.06)
+            .smallest(0, 0.003)];
+        ALL
+    }
+
+    fn starts(&self, _: usize, _: &Scope) -> Vec<Vec<f64>> {
+        one([0.01, 0.05])
+    }
+
+    fn build(&'static self, _: usize, values: &[f64], _: &Scope) -> Effect {
+        Effect::new(self, 0, values, &[])
+    }
+}
+
+/// Slowest and fastest time constants of the creep bank, s, and how many per decade.
+const CREEP_FASTEST_S: f64 = 1e-4;
+const CREEP_DECADES: usize = 9;
+const CREEP_PER_DECADE: usize = 2;
+/// A creeping piezo has its nominal displacement this long after a step, s.
+const CREEP_REFERENCE_S: f64 = 0.1;
+
+/// Time constants of the creep bank, s.
+fn creep_times() -> impl Iterator<Item = f64> {
+    (0..CREEP_DECADES * CREEP_PER_DECADE)
+        .map(|i| CREEP_FASTEST_S * 10f64.powf((i as f64 + 0.5) / CREEP_PER_DECADE as f64))
+}
+
+/// `1 + sum (g/n) (1/(1 + tau s) - (1 - exp(-t0/tau)))`: the step response is `1 + g log10(t/t0)`.
+fn creep(per_decade: f64) -> Zpk {
+    if per_decade == 0.0 {
+        return Zpk::one();
+    }
+    let share = per_decade / CREEP_PER_DECADE as f64;
+    let rates: Vec<f64> = creep_times().map(|tau| 1.0 / tau).collect();
+    let direct = 1.0
+        + share
+            * rates
+                .iter()
+                .map(|r| (-CREEP_REFERENCE_S * r).exp_m1())
+                .sum::<f64>();
+    let value = |s: f64| direct + rates.iter().map(|r| share * r / (s + r)).sum::<f64>();
+    // Poles in falling order -r (r falls). A zero lies between each pair of neighbours; the last one lies beyond the
+    // fastest pole for g > 0 and between the slowest pole and the origin for g < 0.
+    let mut brackets: Vec<(f64, f64)> = rates.windows(2).map(|w| (-w[0], -w[1])).collect();
+    if share > 0.0 {
+        brackets.push((-rates[0] * 1e3, -rates[0]));
+    } else {
+        brackets.push((-rates[rates.len() - 1], 0.0));
+    }
+    let zeros = brackets
+        .into_iter()
+        .map(|(mut low, mut high)| {
+            // Just left of a pole the sum has the sign of -share, just right of it that of share.
+            let left_of_high = if high == 0.0 { 1.0 } else { -share.signum() };
+            for _ in 0..200 {
+                let middle = 0.5 * (low + high);
+                if middle <= low || middle >= high {
+                    break;
+                }
+                if value(middle) * left_of_high > 0.0 {
+                    high = middle;
+                } else {
+                    low = middle;
+                }
+            }
+            real(0.5 * (low + high))
+        })
+        .collect();
+    Zpk {
+        zeros,
+        poles: rates.iter().map(|r| real(-r)).collect(),
+        gain: direct,
+    }
+}
+
+fn real(p: f64) -> Complex<f64> {
+    Complex::new(p, 0.0)
+}

@@ -1,0 +1,125 @@
+//! `stick-slip`: the bead sticks until it breaks free, and then goes on until it is slow.
+
+use super::{
+    Action, Block, Effect, EffectKind, Experiment, Form, ParameterSpec, Place, Scope, Segment, Spec,
+};
+
+/// Stuck until the flow reaches `break_um_per_s`, free until it falls below `stop_um_per_s`.
+pub fn stick_slip(break_um_per_s: f64, stop_um_per_s: f64) -> Effect {
+    Effect::new(&KIND, 0, &[break_um_per_s, stop_um_per_s], &[])
+}
+
+#[derive(Debug)]
+pub(super) struct StickSlip;
+
+pub(super) static KIND: StickSlip = StickSlip;
+
+static SPEC: Spec = Spec {
+    id: "stick-slip",
+    place: Place::Bead,
+    shown_at: "",
+    equation: "stuck until |v| > break, free until |v| < stop",
+    signature: "as adhesion, but full speed once free: memory",
+    ahead_of_plant: false,
+    forms: &[Form::only(&[
+        ParameterSpec::new("break_um_per_s", "um/s", 0.0, 1e6),
+        ParameterSpec::new("stop_um_per_s", "um/s", 0.0, 1e6),
+    ])],
+    confused_with: &["wall-adhesion", "backlash"],
+    inseparable_from: &[],
+    experiment: Experiment::Amplitudes,
+    separate_by: "a slow triangle: adhesion moves slower than the flow, a slip at full speed once free",
+};
+
+impl EffectKind for StickSlip {
+    fn spec(&self) -> &'static Spec {
+        &SPEC
+    }
+
+    fn act(&self, effect: &Effect) -> Action {
+        Action::Block(Box::new(Stick {
+            break_um_per_s: effect.scalar(0),
+            stop_um_per_s: effect.scalar(1),
+            stuck: true,
+            input: 0.0,
+            output: 0.0,
+        }))
+    }
+
+    fn check(&self, effect: &Effect) -> Result<(), &'static str> {
+        if effect.scalar(1) > effect.scalar(0) {
+            return Err("stop_um_per_s must not be above break_um_per_s");
+        }
+        Ok(())
+    }
+
+    fn build(&'static self, _: usize, values: &[f64], _: &Scope) -> Effect {
+        let v = |i: usize| values.get(i).copied().unwrap_or(0.0);
+        Effect::new(self, 0, &[v(0), v(1).min(v(0))], &[])
+    }
+}
+
+/// Stuck or free.
+#[derive(Debug, Clone)]
+struct Stick {
+    break_um_per_s: f64,
+    stop_um_per_s: f64,
+    stuck: bool,
+    input: f64,
+    output: f64,
+}
+
+impl Block for Stick {
+    fn advance(&mut self, _: f64, h_s: f64, input: Segment) -> Segment {
+        // A jump is infinitely fast and is followed in full.
+        let start = self.output + (input.start - self.input);
+        let mut travel = 0.0;
+        if h_s > 0.0 {
+            let mean = (input.end - input.start) / h_s;
+            let half = 0.5 * (input.speed_end - input.speed_start);
+            let (a, b) = (mean - half, mean + half);
+            if self.stuck {
+                // It breaks free within the piece, where the speed passes the threshold.
+                let limit = self.break_um_per_s;
+                if a.abs() >= limit {
+                    self.stuck = false;
+                    travel = mean * h_s;
+                } else if b.abs() > limit {
+                    self.stuck = false;
+                    let f = (limit - a.abs()) / (b.abs() - a.abs());
+                    travel = 0.5 * (limit.copysign(b) + b) * (1.0 - f) * h_s;
+                }
+            } else {
+                travel = mean * h_s;
+                // A speed that passes zero passes the lower threshold as well.
+                if b.abs() < self.stop_um_per_s || a * b < 0.0 {
+                    self.stuck = true;
+                }
+            }
+        }
+        let at = |v: f64| if self.stuck { 0.0 } else { v };
+        self.input = input.end;
+        self.output = start + travel;
+        Segment {
+            start,
+            end: self.output,
+            integral: h_s * (start + 0.5 * travel),
+            speed_start: at(input.speed_start),
+            speed_end: at(input.speed_end),
+        }
+    }
+
+    fn reset(&mut self) {
+        self.stuck = true;
+        self.input = 0.0;
+        self.output = 0.0;
+    }
+
+    fn duplicate(&self) -> Box<dyn Block> {
+        Box::new(self.clone())
+    }
+
+    fn needs_slopes(&self) -> bool {
+        true
+    }
+}

@@ -1,0 +1,155 @@
+//! The table of all effects, in the order of the chain, and those that came from elsewhere.
+
+use super::{EffectError, EffectKind};
+use std::sync::{PoisonError, RwLock};
+
+/// The effects of this crate. Within a place, the order here is the order in which they act.
+static TABLE: [&dyn EffectKind; 31] = [
+    &super::saturation::KIND,
+    &super::slew_limit::KIND,
+    &super::driver_lag::KIND,
+    &super::pzt_hysteresis::KIND,
+    &super::pzt_creep::KIND,
+    &super::pzt_resonance::KIND,
+    &super::backlash::KIND,
+    &super::stiffening::KIND,
+    &super::pdms_relaxation::KIND,
+    &super::bubble::KIND,
+    &super::leak::KIND,
+    &super::gain_error::KIND,
+    &super::gain_drift::KIND,
+    &super::gain_swing::KIND,
+    &super::valve_asymmetry::KIND,
+    &super::flow_drift::KIND,
+    &super::flow_wander::KIND,
+    &super::wall_adhesion::KIND,
+    &super::stick_slip::KIND,
+    &super::clock_skew::KIND,
+    &super::camera_shake::KIND,
+    &super::time_delay::KIND,
+    &super::exposure_averaging::KIND,
+    &super::lens_distortion::KIND,
+    &super::jumps::KIND,
+    &super::frame_jitter::KIND,
+    &super::pump_pulsation::KIND,
+    &super::mains_hum::KIND,
+    &super::pixel_locking::KIND,
+    &super::frame_drops::KIND,
+    &super::frame_repeats::KIND,
+];
+
+/// Effects from elsewhere, in the order in which they came.
+static REGISTERED: RwLock<Vec<&'static dyn EffectKind>> = RwLock::new(Vec::new());
+
+/// All effects that are known: the table, then those registered.
+pub fn all() -> Vec<&'static dyn EffectKind> {
+    let more = REGISTERED.read().unwrap_or_else(PoisonError::into_inner);
+    TABLE.iter().copied().chain(more.iter().copied()).collect()
+}
+
+/// The ids of all known effects.
+pub fn ids() -> Vec<&'static str> {
+    all().iter().map(|k| k.spec().id).collect()
+}
+
+/// The effect of an id.
+pub fn find(id: &str) -> Option<&'static dyn EffectKind> {
+    all().into_iter().find(|k| k.spec().id == id)
+}
+
+/// Where an effect stands among all; one that is not known acts last at its place.
+pub(super) fn position(id: &str) -> usize {
+    if let Some(i) = TABLE.iter().position(|k| k.spec().id == id) {
+        return i;
+    }
+    let more = REGISTERED.read().unwrap_or_else(PoisonError::into_inner);
+    TABLE.len() + more.iter().take_while(|k| k.spec().id != id).count()
+}
+
+/// Makes an effect of another crate known to model files, simulation and search, for the life of the process.
+///
+/// # Errors
+/// [`EffectError::Taken`] where an effect of that id is known; the very same one again is no error.
+pub fn register(kind: &'static dyn EffectKind) -> Result<(), EffectError> {
+    let id = kind.spec().id;
+    let taken = || EffectError::Taken { id };
+    if TABLE.iter().any(|k| k.spec().id == id) {
+        return Err(taken());
+    }
+    let mut more = REGISTERED.write().unwrap_or_else(PoisonError::into_inner);
+    match more.iter().find(|k| k.spec().id == id) {
+        Some(known) if std::ptr::addr_eq(*known, kind) => Ok(()),
+        Some(_) => Err(taken()),
+        None => {
+            more.push(kind);
+            Ok(())
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_table_is_in_the_order_of_the_chain_with_every_field_filled_in() {
+        let mut last = None;
+        for kind in TABLE {
+            let spec = kind.spec();
+            assert!(last <= Some(spec.place), "{} stands too late", spec.id);
+            last = Some(spec.place);
+            assert!(
+                !spec.equation.is_empty() && !spec.signature.is_empty(),
+                "{}: equation or signature missing",
+                spec.id
+            );
+            assert!(!spec.separate_by.is_empty(), "{}: separate_by", spec.id);
+            for other in spec.confused_with.iter().chain(spec.inseparable_from) {
+                assert!(find(other).is_some(), "{}: {other} is no effect", spec.id);
+            }
+            for other in spec.inseparable_from {
+                let back = find(other).map(|k| k.spec().inseparable_from);
+                assert!(
+                    back.is_some_and(|b| b.contains(&spec.id)),
+                    "{} and {other}",
+                    spec.id
+                );
+            }
+            assert_eq!(TABLE.iter().filter(|k| k.spec().id == spec.id).count(), 1);
+            for c in kind.candidates() {
+                for p in c.params {
+                    assert!(p.lower < p.upper, "{}: {}", spec.id, p.name);
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn every_start_of_a_search_is_an_effect_within_its_bounds() {
+        let scope = super::super::Scope {
+            working_point_um: 4.0,
+            low_um: 2.0,
+            high_um: 6.0,
+            stroke_um: 2.0,
+            travel_um: 10.0,
+            sample_s: 1e-3,
+            length_s: 16.0,
+            sampled_input: false,
+        };
+        for kind in TABLE {
+            for (i, c) in kind.candidates().iter().enumerate() {
+                for start in kind.starts(i, &scope) {
+                    assert_eq!(start.len(), c.params.len(), "{}", kind.spec().id);
+                    let natural: Vec<f64> = start
+                        .iter()
+                        .zip(c.params)
+                        .map(|(v, p)| p.natural(p.coordinate(*v)))
+                        .collect();
+                    let effect = kind.build(i, &natural, &scope);
+                    assert!(effect.validate().is_ok(), "{effect:?}");
+                    assert_eq!(effect.id(), kind.spec().id);
+                }
+            }
+        }
+    }
+}

@@ -1,0 +1,63 @@
+//! `time-delay`: the record lags.
+
+use super::candidate::one;
+use super::{
+    Action, Candidate, Effect, EffectKind, Experiment, Form, ParameterSpec, Place, Scope, Spec, lin,
+};
+
+/// `y(t - delay)`.
+pub fn time_delay(delay_s: f64) -> Effect {
+    Effect::new(&KIND, 0, &[delay_s], &[])
+}
+
+#[derive(Debug)]
+pub(super) struct TimeDelay;
+
+pub(super) static KIND: TimeDelay = TimeDelay;
+
+static SPEC: Spec = Spec {
+    id: "time-delay",
+    place: Place::Camera,
+    shown_at: "",
+    equation: "y(t - delay)",
+    signature: "phase in proportion to frequency, flat gain",
+    ahead_of_plant: false,
+    forms: &[Form::only(&[ParameterSpec::new("delay_s", "s", 0.0, 1.0)])],
+    confused_with: &["driver-lag", "exposure-averaging", "bubble"],
+    inseparable_from: &[],
+    experiment: Experiment::Band,
+    separate_by: "excite to 300 Hz: a pole rolls off, an exposure follows a sinc, a delay does neither",
+};
+
+impl EffectKind for TimeDelay {
+    fn spec(&self) -> &'static Spec {
+        &SPEC
+    }
+
+    fn act(&self, effect: &Effect) -> Action {
+        Action::Delay(effect.scalar(0))
+    }
+
+    fn candidates(&self) -> &'static [Candidate] {
+        const ALL: &[Candidate] = &[Candidate::chain(&[lin("delay_s", 0.0, 0.1, 1e-5)])
+            .typical(0.0002, 0.05)
+            .smallest(0, 5e-5)];
+        ALL
+    }
+
+    fn starts(&self, _: usize, scope: &Scope) -> Vec<Vec<f64>> {
+        one([0.1, 0.3, 1.0, 2.0, 4.0, 8.0].map(|k| k * scope.sample_s))
+    }
+
+    fn build(&'static self, _: usize, values: &[f64], _: &Scope) -> Effect {
+        Effect::new(self, 0, values, &[])
+    }
+
+    fn lag_s(&self, _: usize, values: &[f64]) -> Option<f64> {
+        values.first().copied()
+    }
+
+    fn of_lag(&self, lag_s: f64, _: &Scope) -> Vec<(usize, Vec<f64>)> {
+        vec![(0, vec![lag_s])]
+    }
+}

@@ -1,0 +1,163 @@
+//! A file that only ever grows by whole blocks.
+
+use std::fs::{File, OpenOptions};
+use std::io::{self, Seek, SeekFrom, Write};
+use std::path::Path;
+
+/// Most bytes that wait for a disk that refuses them: some minutes of a run.
+const MOST_WAITING: usize = 1 << 26;
+
+/// Opens a file for writing that is really there, not somewhere else by a symbolic link.
+pub(crate) fn open_here(options: &mut OpenOptions, path: &Path) -> io::Result<File> {
+    #[cfg(unix)]
+    {
+        use std::os::unix::fs::OpenOptionsExt;
+        options.custom_flags(rustix::fs::OFlags::NOFOLLOW.bits().cast_signed());
+    }
+    let file = options.open(path).map_err(|error| {
+        if path.is_symlink() {
+            io::Error::other("is a symbolic link; what is written into a run stays in its folder")
+        } else {
+            error
+        }
+    })?;
+    if file.metadata()?.is_file() {
+        Ok(file)
+    } else {
+        Err(io::Error::other("is not a plain file"))
+    }
+}
+
+/// A file to append to, as far as the writer needs it.
+pub(crate) trait Sink {
+    /// Appends all bytes, or fails, perhaps after some of them.
+    fn append(&mut self, bytes: &[u8]) -> io::Result<()>;
+    /// Cuts the file to a length.
+    fn cut(&mut self, length: u64) -> io::Result<()>;
+    /// Waits until the disk has everything.
+    fn sync(&mut self) -> io::Result<()>;
+    /// Fails when nobody will find what is written: the file was removed.
+    fn is_there(&self) -> io::Result<()>;
+}
+
+impl Sink for File {
+    fn append(&mut self, bytes: &[u8]) -> io::Result<()> {
+        self.write_all(bytes)
+    }
+
+    fn cut(&mut self, length: u64) -> io::Result<()> {
+        self.set_len(length)?;
+        self.seek(SeekFrom::Start(length)).map(|_| ())
+    }
+
+    fn sync(&mut self) -> io::Result<()> {
+        self.sync_data()
+    }
+
+    fn is_there(&self) -> io::Result<()> {
+        #[cfg(unix)]
+        {
+            use std::os::unix::fs::MetadataExt;
+            if self.metadata()?.nlink() == 0 {
+                return Err(io::Error::other(
+                    "the file was removed while it was being written",
+                ));
+            }
+        }
+        Ok(())
+    }
+}
+
+/// A file of which only whole blocks are kept: a block that fails is taken back and waits for the next try.
+pub(crate) struct Blocks<S> {
+    sink: S,
+    /// Length up to which the file is whole.
+    good: u64,
+    /// Whether bytes of a failed block may still stand behind `good`.
+    torn: bool,
+    /// Whether something was appended since the last sync.
+    unsynced: bool,
+    waiting: Vec<u8>,
+    /// Rows, lines or events in `waiting`.
+    waiting_units: u64,
+    /// Those that did not find room in `waiting` any more.
+    dropped_units: u64,
+    /// Those appended since the last sync that worked.
+    unsynced_units: u64,
+    /// Those of which the disk said that it does not have them.
+    unkept_units: u64,
+}
+
+impl<S: Sink> Blocks<S> {
+    pub(crate) fn new(sink: S, good: u64) -> Self {
+        Self {
+            sink,
+            good,
+            torn: false,
+            unsynced: false,
+            waiting: Vec::new(),
+            waiting_units: 0,
+            dropped_units: 0,
+            unsynced_units: 0,
+            unkept_units: 0,
+        }
+    }
+
+    /// Takes a block of some rows, lines or events; it goes to the file with [`Blocks::write`].
+    pub(crate) fn push(&mut self, bytes: &[u8], units: u64) {
+        if self.waiting.len() + bytes.len() > MOST_WAITING {
+            self.dropped_units += units;
+        } else {
+            self.waiting.extend_from_slice(bytes);
+            self.waiting_units += units;
+        }
+    }
+
+    /// Appends what waits, whole or not at all.
+    pub(crate) fn write(&mut self) -> io::Result<()> {
+        if self.waiting.is_empty() {
+            return Ok(());
+        }
+        self.sink.is_there()?;
+        if self.torn {
+            self.sink.cut(self.good)?;
+            self.torn = false;
+        }
+        if let Err(error) = self.sink.append(&self.waiting) {
+            // Cutting frees nothing and so works on a full disk; if not, it is tried again before the next block.
+            self.torn = self.sink.cut(self.good).is_err();
+            return Err(error);
+        }
+        self.good += self.waiting.len() as u64;
+        self.waiting.clear();
+        self.unsynced_units += std::mem::take(&mut self.waiting_units);
+        self.unsynced = true;
+        Ok(())
+    }
+
+    /// Waits until the disk has what was appended, if anything was.
+    pub(crate) fn sync(&mut self) -> io::Result<()> {
+        if !self.unsynced {
+            return Ok(());
+        }
+        let units = std::mem::take(&mut self.unsynced_units);
+        // A system that could not write says so once and then forgets what it had.
+        self.unsynced = false;
+        self.sink.sync().inspect_err(|_| self.unkept_units += units)
+    }
+
+    /// Whether the file is still where it was made.
+    pub(crate) fn is_there(&self) -> io::Result<()> {
+        self.sink.is_there()
+    }
+
+    /// Rows, lines or events that were taken and are not in the file, or that the disk said it does not have.
+    pub(crate) fn lost(&self) -> u64 {
+        self.waiting_units + self.dropped_units + self.unkept_units
+    }
+
+    /// Bytes that wait.
+    pub(crate) fn waiting_bytes(&self) -> usize {
+        self.waiting.len()
+    }
+}

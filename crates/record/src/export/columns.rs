@@ -1,0 +1,294 @@
+//! What other programs see of a run: the columns, under the same names in every form, with unit and meaning.
+
+use cellpos_runtime::TickRecord;
+
+/// A row as it is exported: a tick, the session that it belongs to, and when that began.
+#[derive(Debug, Clone, Copy)]
+pub struct Row {
+    /// The tick.
+    pub tick: TickRecord,
+    /// Number of the session, from 1.
+    pub session: u64,
+    /// From the start of the run to the start of the session, ns.
+    pub offset_ns: i64,
+}
+
+/// Words for the numbers of an enumeration.
+pub type Codes = &'static [(u8, &'static str)];
+
+/// What a column holds.
+#[derive(Clone, Copy)]
+pub enum Value {
+    /// Numbers; NaN where there is none.
+    Number(fn(&Row) -> f64),
+    /// Whole numbers.
+    Whole(fn(&Row) -> u64),
+    /// One of some words; a number without a word is none.
+    Code(Codes, fn(&Row) -> u8),
+}
+
+/// A column of an export.
+#[derive(Clone, Copy)]
+pub struct Column {
+    /// Its name, the same in every form; names of quantities end in their unit.
+    pub name: &'static str,
+    /// Unit; empty for counts and words.
+    pub unit: &'static str,
+    /// What it is, in a sentence.
+    pub about: &'static str,
+    /// How it is read off a row.
+    pub value: Value,
+}
+
+impl Column {
+    /// The value of a column that holds numbers; the number of a word otherwise.
+    pub fn number(&self, row: &Row) -> f64 {
+        match self.value {
+            Value::Number(get) => get(row),
+            Value::Whole(get) => get(row) as f64,
+            Value::Code(codes, get) => match word(codes, get(row)) {
+                Some(_) => get(row).into(),
+                None => f64::NAN,
+            },
+        }
+    }
+}
+
+/// The word for a number, if it has one.
+pub fn word(codes: Codes, number: u8) -> Option<&'static str> {
+    codes
+        .iter()
+        .find(|(other, _)| *other == number)
+        .map(|(_, word)| *word)
+}
+
+/// Whole nanoseconds in seconds. Dividing gives the number nearest to the decimal fraction; multiplying by 1e-9 does not.
+pub(crate) fn seconds(ns: i64) -> f64 {
+    ns as f64 / 1e9
+}
+
+/// Position of the bead as far as it is one.
+pub(crate) fn bead_um(tick: &TickRecord) -> f64 {
+    if tick.verdict == 0 {
+        tick.measured_um
+    } else {
+        f64::NAN
+    }
+}
+
+/// Verdicts of vision.
+pub const VERDICT: Codes = &[
+    (0, "good"),
+    (1, "no-signal"),
+    (2, "bad-fit"),
+    (3, "at-border"),
+    (4, "not-converged"),
+];
+/// States of the tracker.
+pub const TRACK: Codes = &[
+    (0, "searching"),
+    (1, "tracking"),
+    (2, "coasting"),
+    (3, "lost"),
+];
+/// Decisions of the tracker.
+pub const DECISION: Codes = &[
+    (0, "accepted"),
+    (1, "nothing-found"),
+    (2, "confirming"),
+    (3, "no-signal"),
+    (4, "merged"),
+    (5, "at-border"),
+    (6, "not-converged"),
+    (7, "outside-gate"),
+    (8, "other-bead"),
+    (9, "ambiguous"),
+    (10, "regained"),
+    (11, "reacquired"),
+    (12, "no-frame"),
+    (13, "stale"),
+];
+/// States of a run.
+pub const LIFE: Codes = &[(0, "disarmed"), (1, "armed"), (2, "running"), (3, "safe")];
+/// Requests of operator and program.
+pub const REQUEST: Codes = &[
+    (0, "none"),
+    (1, "freeze"),
+    (2, "park"),
+    (3, "skip"),
+    (4, "pause"),
+    (5, "unrecorded"),
+];
+/// States of the board.
+pub const BOARD: Codes = &[
+    (0, "disarmed"),
+    (1, "armed"),
+    (2, "running"),
+    (3, "frozen"),
+    (4, "safe"),
+];
+/// Faults that the board latches.
+pub const BOARD_FAULT: Codes = &[
+    (0, "none"),
+    (1, "command-timeout"),
+    (2, "freeze-timeout"),
+    (3, "arm-timeout"),
+];
+/// Stages of a script.
+pub const STAGE: Codes = &[
+    (0, "none"),
+    (1, "approach"),
+    (2, "running"),
+    (3, "waiting"),
+    (4, "paused"),
+    (5, "done"),
+    (10, "stopped-lost"),
+    (11, "stopped-error"),
+    (12, "stopped-length"),
+    (13, "stopped-time"),
+    (14, "stopped-cycles"),
+    (15, "stopped-wait"),
+];
+/// How the optimiser ended.
+pub const SOLVER: Codes = &[
+    (0, "not-used"),
+    (1, "solved"),
+    (2, "previous-plan"),
+    (3, "fallback-pi"),
+];
+
+macro_rules! columns {
+    ($($name:literal $unit:literal $value:expr, $about:literal;)*) => {
+        /// Every column, in order.
+        pub const COLUMNS: &[Column] = &[$(Column {
+            name: $name,
+            unit: $unit,
+            about: $about,
+            value: $value,
+        },)*];
+    };
+}
+
+use Value::{Code, Number, Whole};
+
+columns! {
+    "time_s" "s" Number(|r| seconds(r.offset_ns.saturating_add(r.tick.time_ns))),
+        "Start of the tick since the start of the run; a further session begins where its pause ends.";
+    "pzt_um" "um" Number(|r| r.tick.command_um),
+        "PZT displacement commanded from time_s on, held until the next row.";
+    "bead_um" "um" Number(|r| bead_um(&r.tick)),
+        "Position that the camera had delivered just before, exposed around mid_exposure_s; none without a bead.";
+    "seq" "" Whole(|r| r.tick.seq),
+        "Number of the tick in its session; runs on over rows that were lost.";
+    "frame_id" "" Whole(|r| r.tick.frame_id),
+        "Number of the frame used, unwrapped; of the last one seen on a tick of the timer.";
+    "mid_exposure_s" "s" Number(|r| seconds(r.offset_ns.saturating_add(r.tick.mid_exposure_ns))),
+        "Middle of that frame's exposure, on the clock of time_s.";
+    "sigma_um" "um" Number(|r| r.tick.variance_um2.sqrt()),
+        "Standard deviation of the measured position as vision states it.";
+    "target_um" "um" Number(|r| r.tick.target_um),
+        "Reference at the tick.";
+    "estimate_um" "um" Number(|r| r.tick.estimate_um),
+        "Estimated position of the bead at the tick.";
+    "neutral_um" "um" Number(|r| r.tick.neutral_um),
+        "Estimated zero-flow displacement: the PZT displacement at which the bead rests.";
+    "requested_um" "um" Number(|r| r.tick.requested_um),
+        "Output of the controller before range and slew limits.";
+    "applied_um" "um" Number(|r| r.tick.applied_um),
+        "PZT displacement that the board reported last.";
+    "true_um" "um" Number(|r| r.tick.true_um),
+        "True position of the bead at the tick; emulated rig only.";
+    "verdict" "" Code(VERDICT, |r| r.tick.verdict),
+        "What vision says of the frame; none without a frame.";
+    "life" "" Code(LIFE, |r| r.tick.life),
+        "State of the run's life cycle.";
+    "request" "" Code(REQUEST, |r| r.tick.request),
+        "What operator or program asked for at this tick.";
+    "board" "" Code(BOARD, |r| r.tick.board),
+        "State that the board reported last; none before its first report.";
+    "board_fault" "" Code(BOARD_FAULT, |r| r.tick.board_fault),
+        "Fault that the board reported last.";
+    "flags" "" Whole(|r| r.tick.flags.0.into()),
+        "What happened in the tick, as bits.";
+    "drained" "" Whole(|r| r.tick.drained.into()),
+        "Positions found waiting at this tick: one is used, the others are counted.";
+    "wake_us" "us" Number(|r| f64::from(r.tick.wake_ns) / 1e3),
+        "From the arrival of the position, or the time at which the tick was due, to the start of the tick; 0 on the virtual clock.";
+    "compute_us" "us" Number(|r| f64::from(r.tick.compute_ns) / 1e3),
+        "From the start of the tick to the hand-over of the command; 0 on the virtual clock.";
+    "track" "" Code(TRACK, |r| r.tick.track),
+        "State of the tracker; none without a frame or a tracker.";
+    "decision" "" Code(DECISION, |r| r.tick.decision),
+        "What the tracker decided of the frame; none without a frame or a tracker.";
+    "plan_s" "s" Number(|r| if r.tick.plan_ns < 0 { f64::NAN } else { seconds(r.tick.plan_ns) }),
+        "Time of the script's plan; stands still while the script waits or is paused; none without a script.";
+    "stage" "" Code(STAGE, |r| r.tick.stage),
+        "What the script is doing.";
+    "length_um" "um" Number(|r| r.tick.length_um),
+        "Measured length of the cell along the channel; none when a bead is followed.";
+    "area_um2" "um2" Number(|r| r.tick.area_um2),
+        "Measured projected area of the cell; none when a bead is followed.";
+    "length_sd_um" "um" Number(|r| r.tick.length_sd_um),
+        "Standard deviation of the length: of the picture, not of the pixel size.";
+    "area_sd_um2" "um2" Number(|r| r.tick.area_sd_um2),
+        "Standard deviation of the area: of the picture, not of the pixel size.";
+    "measured_um" "um" Number(|r| r.tick.measured_um),
+        "Position as vision gave it, whatever its verdict.";
+    "solver_status" "" Code(SOLVER, |r| r.tick.solver_status),
+        "How the optimiser ended.";
+    "solver_iterations" "" Whole(|r| r.tick.solver_iterations.into()),
+        "Iterations of the optimiser, at most 255.";
+    "solver_active" "" Whole(|r| r.tick.solver_active.into()),
+        "Constraints active at the optimiser's solution, at most 255.";
+    "solver_us" "us" Number(|r| f64::from(r.tick.solver_ns) / 1e3),
+        "Time that the optimiser took; 0 on the virtual clock.";
+    "session" "" Whole(|r| r.session),
+        "Session of the run: 1, and one more each time that it was resumed.";
+}
+
+/// A column by its name.
+pub fn find(name: &str) -> Option<&'static Column> {
+    COLUMNS.iter().find(|column| column.name == name)
+}
+
+/// The columns that hold numbers, without those that a plain record has by itself.
+pub(crate) fn numbers() -> Vec<&'static Column> {
+    COLUMNS
+        .iter()
+        .filter(|column| !["time_s", "pzt_um", "bead_um"].contains(&column.name))
+        .filter(|column| !matches!(column.value, Code(..)))
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use cellpos_runtime::{Life, Request, Stage};
+
+    #[test]
+    fn the_words_are_those_of_the_program() {
+        for (number, word) in LIFE {
+            assert_eq!(Life::from_number(*number).map(Life::name), Some(*word));
+        }
+        for (number, word) in REQUEST {
+            let json = serde_json::to_string(&Request::from_number(*number)).unwrap();
+            assert_eq!(json, format!("\"{word}\""));
+        }
+        for (number, word) in STAGE {
+            let json = serde_json::to_string(&Stage::from_number(*number)).unwrap();
+            assert_eq!(json, format!("\"{word}\""));
+        }
+    }
+
+    #[test]
+    fn names_are_unique_and_end_in_their_unit() {
+        for column in COLUMNS {
+            let same = COLUMNS.iter().filter(|other| other.name == column.name);
+            assert_eq!(same.count(), 1, "{}", column.name);
+            if !column.unit.is_empty() {
+                assert!(column.name.ends_with(&format!("_{}", column.unit)));
+            }
+            assert!(column.about.ends_with('.'), "{}", column.about);
+        }
+    }
+}

@@ -1,0 +1,220 @@
+//! The cells of a run in the format of real-time deformability cytometry (`.rtdc`), which dclab and Shape-Out read: one event
+//! for each frame in which the cell was measured.
+//!
+//! Deformation is not in it: the loop measures length and area of a cell, not its perimeter.
+
+use super::{CHUNK, LEVEL, encode};
+use crate::error::RecordError;
+use crate::export::columns::Row;
+use crate::export::{Exported, Selection, Source, part_of, seconds};
+use crate::meta::RunMeta;
+use hdf5_pure::{AttrValue, File, FileAccessProperties, FileBuilder, MaxExtent, SyncPolicy};
+use std::path::Path;
+
+/// A feature: its name in the format, and how it is read off a row.
+type Feature = (&'static str, fn(&Row) -> f64);
+
+/// The features, by the names that the format knows.
+const FEATURES: [Feature; 7] = [
+    ("area_um", |r| r.tick.area_um2),
+    ("size_x", |r| r.tick.length_um),
+    ("pos_x", |r| r.tick.measured_um),
+    ("time", |r| {
+        seconds(r.offset_ns.saturating_add(r.tick.mid_exposure_ns))
+    }),
+    ("frame", |r| r.tick.frame_id as f64),
+    ("userdef0", |r| r.tick.target_um),
+    ("userdef1", |r| r.tick.command_um),
+];
+
+/// Writes the cells of a run as `.rtdc`, in one step.
+///
+/// # Errors
+/// [`RecordError`] names the file; a run in which no cell was measured, or of which the format's questions about sample, chip
+/// and imaging have no answer, is refused with what is missing.
+pub fn write_rtdc(
+    source: &Source,
+    selection: &Selection,
+    path: &Path,
+) -> Result<Exported, RecordError> {
+    let is_event = |row: &&Row| row.tick.area_um2.is_finite() && row.tick.length_um.is_finite();
+    let mut count = 0;
+    source.rows(selection, |rows| {
+        count += rows.iter().filter(is_event).count() as u64;
+        Ok(())
+    })?;
+    if count == 0 {
+        return Err(refused(
+            "no cell was measured in this run: it holds no events",
+        ));
+    }
+    let part = part_of(path)?;
+    let attempt = || {
+        empty(source, count, &part)?;
+        let access = FileAccessProperties::new().with_sync_policy(SyncPolicy::OnClose);
+        let file = File::open_rw_with_options(&part, access).map_err(|error| encode(&error))?;
+        let mut waiting: Vec<Vec<f64>> = FEATURES.iter().map(|_| Vec::new()).collect();
+        let done = source.rows(selection, |rows| {
+            for row in rows.iter().filter(is_event) {
+                for ((_, get), values) in FEATURES.iter().zip(&mut waiting) {
+                    values.push(get(row));
+                }
+                if waiting.first().is_some_and(|values| values.len() == CHUNK) {
+                    append(&file, &mut waiting)?;
+                }
+            }
+            Ok(())
+        })?;
+        append(&file, &mut waiting)?;
+        file.close().map_err(|error| encode(&error))?;
+        std::fs::rename(&part, path).map_err(RecordError::io("cannot write", path))?;
+        Ok(Exported {
+            rows: count,
+            lost: done.lost,
+        })
+    };
+    attempt().inspect_err(|_| {
+        let _ = std::fs::remove_file(&part);
+    })
+}
+
+fn refused(message: &str) -> RecordError {
+    RecordError::Encode {
+        what: "RT-DC",
+        message: message.to_owned(),
+    }
+}
+
+fn append(file: &File, waiting: &mut [Vec<f64>]) -> Result<(), RecordError> {
+    for ((name, _), values) in FEATURES.iter().zip(waiting) {
+        let mut dataset = file
+            .dataset(&format!("events/{name}"))
+            .map_err(|error| encode(&error))?;
+        dataset.append(values).map_err(|error| encode(&error))?;
+        values.clear();
+    }
+    Ok(())
+}
+
+fn empty(source: &Source, count: u64, path: &Path) -> Result<(), RecordError> {
+    let meta = source
+        .meta()
+        .ok_or_else(|| refused("run.toml cannot be read, and the format asks for what it says"))?;
+    let mut builder = FileBuilder::new();
+    for (name, value) in attributes(meta, count)? {
+        builder.set_attr(name, value);
+    }
+    let mut events = builder.create_group("events");
+    for (name, _) in FEATURES {
+        events
+            .create_dataset(name)
+            .with_f64_data(&[])
+            .with_shape(&[0])
+            .with_maxshape(&[MaxExtent::Unlimited])
+            .with_chunks(&[CHUNK as u64])
+            .with_shuffle()
+            .with_deflate(LEVEL);
+    }
+    builder.add_group(events.finish());
+    builder.write(path).map_err(|error| encode(&error))
+}
+
+/// A value deep in a table.
+fn at<'a>(table: &'a toml::Table, keys: &[&str]) -> Option<&'a toml::Value> {
+    let (first, rest) = keys.split_first()?;
+    rest.iter()
+        .try_fold(table.get(*first)?, |value, key| value.get(*key))
+}
+
+fn number(table: &toml::Table, keys: &[&str]) -> Option<f64> {
+    let value = at(table, keys)?;
+    value
+        .as_float()
+        .or_else(|| value.as_integer().map(|whole| whole as f64))
+}
+
+/// What the format asks of a measurement.
+fn attributes(meta: &RunMeta, count: u64) -> Result<Vec<(&'static str, AttrValue)>, RecordError> {
+    let config = &meta.config;
+    let text = |key: &str| {
+        at(config, &["rig", "sample", key])
+            .and_then(toml::Value::as_str)
+            .ok_or_else(|| {
+                refused(&format!(
+                    "the format asks for `{key}`: say it in the table [sample] of rig.toml or of the script, and run again"
+                ))
+            })
+    };
+    let string = |text: &str| AttrValue::String(text.to_owned());
+    let whole = |value: f64| AttrValue::I64(value as i64);
+    let width_um = number(config, &["rig", "sample", "channel_width_um"]).ok_or_else(|| {
+        refused("the format asks for `channel_width_um`: say it in the table [sample] of rig.toml")
+    })?;
+    let emulator = |key: &str| number(config, &["rig", "emulator", key]);
+    let camera = |key: &str| number(config, &["rig", "camera", key]);
+    let pixel_um = number(config, &["rig", "calibration", "pixel_um"])
+        .or_else(|| emulator("pixel_um"))
+        .ok_or_else(|| refused("run.toml does not say how large a pixel is"))?;
+    let emulated =
+        at(config, &["rig", "camera", "kind"]).and_then(toml::Value::as_str) == Some("emulated");
+    let region = |place: usize| {
+        at(config, &["rig", "camera", "region"])
+            .and_then(|region| region.get(place))
+            .and_then(toml::Value::as_integer)
+            .map(|px| px as f64)
+    };
+    let (width_px, height_px) = if emulated {
+        (emulator("width_px"), emulator("height_px"))
+    } else {
+        (region(2), region(3))
+    };
+    let exposure_us = if emulated {
+        emulator("exposure_ms").map(|ms| ms * 1e3)
+    } else {
+        camera("exposure_us")
+    };
+    let rate_hz = if emulated {
+        emulator("rate_hz")
+    } else {
+        camera("rate_hz")
+    };
+    let date = meta.started_utc.get(..10).unwrap_or("1970-01-01");
+    let time = meta.started_utc.get(11..19).unwrap_or("00:00:00");
+    let version = meta.versions.get("cellpos").map_or("", String::as_str);
+    Ok(vec![
+        ("experiment:date", string(date)),
+        ("experiment:time", string(time)),
+        ("experiment:event count", AttrValue::I64(count as i64)),
+        ("experiment:run index", AttrValue::I64(1)),
+        ("experiment:sample", string(text("sample")?)),
+        ("setup:channel width", AttrValue::F64(width_um)),
+        (
+            "setup:chip region",
+            string(text("region").unwrap_or("channel")),
+        ),
+        // The PZT moves the medium to and fro: there is no steady flow.
+        ("setup:flow rate", AttrValue::F64(0.0)),
+        ("setup:medium", string(text("medium")?)),
+        (
+            "setup:software version",
+            string(&format!("cellpos {version}")),
+        ),
+        (
+            "imaging:flash device",
+            string(if emulated { "emulated" } else { "unknown" }),
+        ),
+        (
+            "imaging:flash duration",
+            AttrValue::F64(exposure_us.unwrap_or(0.0)),
+        ),
+        (
+            "imaging:frame rate",
+            AttrValue::F64(rate_hz.unwrap_or(1000.0)),
+        ),
+        ("imaging:pixel size", AttrValue::F64(pixel_um)),
+        ("imaging:roi position x", whole(region(0).unwrap_or(0.0))),
+        ("imaging:roi position y", whole(region(1).unwrap_or(0.0))),
+        ("imaging:roi size x", whole(width_px.unwrap_or(0.0))),
+        ("imaging:roi size y", whole(height_px.unwrap_or(0.0))),
+    ])
+}

@@ -1,0 +1,159 @@
+//! A run as Apache Parquet: numbers that do not exist are null, words are dictionaries, unit and meaning are with each column.
+
+use super::columns::{Codes, Column, Row, Value, word};
+use super::{Exported, Selection, Source, whole};
+use crate::error::RecordError;
+use arrow_array::builder::StringDictionaryBuilder;
+use arrow_array::types::Int8Type;
+use arrow_array::{ArrayRef, Float64Array, RecordBatch, StringArray, UInt64Array};
+use arrow_schema::{DataType, Field, Schema, SchemaRef};
+use parquet::arrow::ArrowWriter;
+use parquet::file::properties::WriterProperties;
+use std::collections::HashMap;
+use std::io::BufWriter;
+use std::path::Path;
+use std::sync::Arc;
+
+/// Rows of a row group: what the writer holds in memory at most.
+const ROW_GROUP: usize = 1 << 17;
+
+fn encode(error: &dyn std::fmt::Display) -> RecordError {
+    RecordError::Encode {
+        what: "Parquet",
+        message: error.to_string(),
+    }
+}
+
+/// Writes the rows of a run as Parquet, in one step.
+///
+/// # Errors
+/// [`RecordError`] names the file.
+pub fn write_parquet(
+    source: &Source,
+    selection: &Selection,
+    path: &Path,
+) -> Result<Exported, RecordError> {
+    let columns = selection.columns()?;
+    let schema = schema(&columns, source);
+    whole(path, |file| {
+        let properties = WriterProperties::builder()
+            .set_max_row_group_row_count(Some(ROW_GROUP))
+            .build();
+        let out = BufWriter::new(file);
+        let mut writer = ArrowWriter::try_new(out, Arc::clone(&schema), Some(properties))
+            .map_err(|error| encode(&error))?;
+        let done = source.rows(selection, |rows| {
+            let arrays = columns.iter().map(|column| array(column, rows)).collect();
+            let batch = RecordBatch::try_new(Arc::clone(&schema), arrays);
+            batch
+                .map_err(|error| encode(&error))
+                .and_then(|batch| writer.write(&batch).map_err(|error| encode(&error)))
+        })?;
+        let out = writer.into_inner().map_err(|error| encode(&error))?;
+        out.into_inner().map_err(|error| encode(&error))?;
+        Ok(done)
+    })
+}
+
+/// The columns with unit, meaning and words, and what the run is.
+fn schema(columns: &[&'static Column], source: &Source) -> SchemaRef {
+    let fields: Vec<Field> = columns
+        .iter()
+        .map(|column| {
+            let mut about: HashMap<String, String> = HashMap::new();
+            about.insert("description".to_owned(), column.about.to_owned());
+            if !column.unit.is_empty() {
+                about.insert("unit".to_owned(), column.unit.to_owned());
+            }
+            let (kind, nullable) = match column.value {
+                Value::Number(_) => (DataType::Float64, true),
+                Value::Whole(_) => (DataType::UInt64, false),
+                Value::Code(codes, _) => {
+                    about.insert("codes".to_owned(), listed(codes));
+                    let words = DataType::Utf8.into();
+                    (DataType::Dictionary(DataType::Int8.into(), words), true)
+                }
+            };
+            Field::new(column.name, kind, nullable).with_metadata(about)
+        })
+        .collect();
+    let mut about: HashMap<String, String> = HashMap::new();
+    about.insert("cellpos.format".to_owned(), crate::FORMAT.to_string());
+    if let Some(meta) = source.meta() {
+        about.insert("cellpos.run".to_owned(), meta.name.clone());
+        // On the virtual clock a seed fixes every bit, the time of the day does not belong to it.
+        if meta.clock != "virtual" {
+            about.insert("cellpos.started_utc".to_owned(), meta.started_utc.clone());
+        }
+    }
+    Arc::new(Schema::new_with_metadata(fields, about))
+}
+
+/// Words and their numbers in a line.
+pub(crate) fn listed(codes: Codes) -> String {
+    let each: Vec<String> = codes
+        .iter()
+        .map(|(number, word)| format!("{number} {word}"))
+        .collect();
+    each.join(", ")
+}
+
+fn array(column: &Column, rows: &[Row]) -> ArrayRef {
+    match column.value {
+        Value::Number(get) => {
+            let values = rows
+                .iter()
+                .map(|row| Some(get(row)).filter(|v| !v.is_nan()));
+            Arc::new(values.collect::<Float64Array>())
+        }
+        Value::Whole(get) => Arc::new(rows.iter().map(get).map(Some).collect::<UInt64Array>()),
+        Value::Code(codes, get) => {
+            // All words in every batch, in one order, so that all batches share their dictionary.
+            let words: StringArray = codes.iter().map(|(_, word)| Some(*word)).collect();
+            let builder = StringDictionaryBuilder::<Int8Type>::new_with_dictionary(0, &words);
+            let Ok(mut builder) = builder else {
+                unreachable!("a dozen words fit into a dictionary")
+            };
+            for row in rows {
+                builder.append_option(word(codes, get(row)));
+            }
+            Arc::new(builder.finish())
+        }
+    }
+}
+
+/// A column of a small table.
+#[derive(Debug, Clone, PartialEq)]
+pub enum TableColumn {
+    /// Numbers; NaN where there is none.
+    Numbers(Vec<f64>),
+    /// Text.
+    Texts(Vec<String>),
+}
+
+/// Writes a small table of named columns as Parquet, in one step.
+///
+/// # Errors
+/// [`RecordError`] names the file; columns of different lengths are refused.
+pub fn write_table_parquet(
+    path: &Path,
+    columns: &[(&str, TableColumn)],
+) -> Result<(), RecordError> {
+    let arrays = columns.iter().map(|(name, column)| {
+        let array: ArrayRef = match column {
+            TableColumn::Numbers(values) => Arc::new(Float64Array::from(values.clone())),
+            TableColumn::Texts(values) => Arc::new(StringArray::from(values.clone())),
+        };
+        (*name, array)
+    });
+    let batch = RecordBatch::try_from_iter(arrays).map_err(|error| encode(&error))?;
+    let mut bytes = Vec::new();
+    let mut writer =
+        ArrowWriter::try_new(&mut bytes, batch.schema(), None).map_err(|error| encode(&error))?;
+    writer
+        .write(&batch)
+        .and_then(|()| writer.close().map(|_| ()))
+        .map_err(|error| encode(&error))?;
+    cellpos_table::write_atomically(path, &bytes)?;
+    Ok(())
+}

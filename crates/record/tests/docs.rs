@@ -1,0 +1,60 @@
+//! The reference page of the data says what the data are.
+
+use cellpos_record::export::columns::{COLUMNS, Value};
+use cellpos_runtime::TickFlags;
+
+fn page() -> String {
+    let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../../docs/data.md");
+    std::fs::read_to_string(path).unwrap()
+}
+
+#[test]
+fn every_column_is_on_the_page_with_unit_kind_words_and_meaning() {
+    let page = page();
+    for column in COLUMNS {
+        let kind = match column.value {
+            Value::Number(_) => "number",
+            Value::Whole(_) => "whole",
+            Value::Code(..) => "word",
+        };
+        let line = format!(
+            "| `{}` | {} | {kind} | {} |",
+            column.name, column.unit, column.about
+        );
+        assert!(page.contains(&line), "docs/data.md lacks the line\n{line}");
+        if let Value::Code(codes, _) = column.value {
+            let words: Vec<String> = codes
+                .iter()
+                .map(|(number, word)| format!("{number} `{word}`"))
+                .collect();
+            let line = format!("| `{}` | {} |", column.name, words.join(", "));
+            assert!(page.contains(&line), "docs/data.md lacks the line\n{line}");
+        }
+    }
+    let columns = page
+        .lines()
+        .filter(|line| line.starts_with("| `") && line.matches(" | ").count() == 3);
+    assert_eq!(
+        columns.count(),
+        COLUMNS.len(),
+        "a column that is gone is on the page"
+    );
+}
+
+#[test]
+fn every_bit_of_the_flags_is_on_the_page() {
+    let page = page();
+    for (name, value) in [
+        ("timer", TickFlags::TIMER),
+        ("late", TickFlags::LATE),
+        ("dropped-frame", TickFlags::DROPPED_FRAME),
+        ("records-lost", TickFlags::RECORDS_LOST),
+        ("stuck", TickFlags::STUCK),
+    ] {
+        assert!(page.contains(&format!("| {value} | {name} |")), "{name}");
+    }
+    assert!(page.contains(&format!(
+        "format` in run.toml is {}",
+        cellpos_record::FORMAT
+    )));
+}

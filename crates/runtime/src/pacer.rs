@@ -1,0 +1,212 @@
+//! When a tick starts: on a new frame, or on the timer where none comes; never twice in a step of the clock's grid.
+//!
+//! Camera and loop need not agree in rate or phase. A frame that comes when the tick of its step has been made waits for
+//! the next step; where the wait would be long, the frame after it is waited for instead. So a camera that drifts through
+//! the grid costs one tick without a frame, or one frame that is not used, each time that it is a whole period off, and
+//! no frame waits for longer than [`WAITS`] of a period. Knows no clock and no thread: it is told the time.
+
+/// A frame may come this late, in parts of a period after it was expected, before the timer stands in for it.
+const GRACE: f64 = 0.3;
+/// Longest wait of a frame for its step, in periods. Between this and [`LATEST`] lies the hysteresis that keeps a camera
+/// at the edge of a step from falling to either side of it in turn.
+pub(crate) const WAITS: f64 = 0.3;
+/// The timer's tick comes at the latest at this part of its step.
+const LATEST: f64 = 0.9;
+/// Ticks of two steps are no closer than this part of a period.
+const APART: f64 = 0.25;
+
+/// What to do now.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Pace {
+    /// Make a tick; it was due at this time, ns.
+    Tick(i64),
+    /// Look again at this time, ns, or when a frame has come.
+    Wait(i64),
+}
+
+/// Paces a loop.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Pacer {
+    period_ns: i64,
+    /// When the next frame is expected.
+    expected_ns: i64,
+    last_ns: i64,
+}
+
+impl Pacer {
+    pub(crate) fn new(period_ns: i64, now_ns: i64) -> Self {
+        Self {
+            period_ns,
+            expected_ns: now_ns.saturating_add(period_ns),
+            last_ns: i64::MIN / 2,
+        }
+    }
+
+    fn part(&self, of_a_period: f64) -> i64 {
+        (self.period_ns as f64 * of_a_period) as i64
+    }
+
+    /// `opens_ns`: when the next step of the grid begins, `None` before the first tick; `ready_ns`: when the new frame that
+    /// waits, if any, was ready.
+    pub(crate) fn decide(&self, now_ns: i64, opens_ns: Option<i64>, ready_ns: Option<i64>) -> Pace {
+        let Some(opens_ns) = opens_ns else {
+            return match ready_ns {
+                Some(ready_ns) => Pace::Tick(ready_ns),
+                None => Self::at(now_ns, self.expected_ns + self.part(GRACE)),
+            };
+        };
+        let latest_ns = opens_ns + self.part(LATEST);
+        let opens_ns = opens_ns.max(self.last_ns + self.part(APART));
+        if now_ns < opens_ns {
+            return Pace::Wait(opens_ns);
+        }
+        match ready_ns {
+            Some(ready_ns) if ready_ns >= opens_ns - self.part(WAITS) => {
+                Pace::Tick(ready_ns.max(opens_ns))
+            }
+            Some(ready_ns) => {
+                let next_ns = ready_ns + self.period_ns + self.part(GRACE);
+                Self::at(now_ns, next_ns.clamp(opens_ns, latest_ns))
+            }
+            None => {
+                let due_ns = self.expected_ns + self.part(GRACE);
+                Self::at(now_ns, due_ns.clamp(opens_ns, latest_ns))
+            }
+        }
+    }
+
+    fn at(now_ns: i64, due_ns: i64) -> Pace {
+        if now_ns >= due_ns {
+            Pace::Tick(due_ns)
+        } else {
+            Pace::Wait(due_ns)
+        }
+    }
+
+    /// To be told of each tick: its start, and when its frame was ready.
+    pub(crate) fn ticked(&mut self, start_ns: i64, ready_ns: Option<i64>) {
+        self.last_ns = start_ns;
+        self.expected_ns = ready_ns.unwrap_or(self.expected_ns) + self.period_ns;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::grid::Grid;
+
+    const P: i64 = 1_000_000;
+
+    struct Paced {
+        ticks: u64,
+        without_frame: u64,
+        unused: u64,
+        longest_wait_ns: i64,
+        off_ns: i64,
+        closest_ns: i64,
+    }
+
+    /// Ten minutes of frames at these times; says what became of them.
+    fn pace(frames: impl Iterator<Item = i64>) -> Paced {
+        let mut pacer = Pacer::new(P, 0);
+        let (mut grid, mut index) = (None::<Grid>, 0);
+        let (mut now, mut last) = (0, None::<i64>);
+        let mut ready = None;
+        let mut out = Paced {
+            ticks: 0,
+            without_frame: 0,
+            unused: 0,
+            longest_wait_ns: 0,
+            off_ns: 0,
+            closest_ns: i64::MAX,
+        };
+        let mut frames = frames.peekable();
+        while frames.peek().is_some() {
+            while let Some(at) = frames.next_if(|&at| at <= now) {
+                out.unused += u64::from(ready.is_some());
+                ready = Some(at);
+            }
+            let opens = grid.map(|grid: Grid| grid.opens_ns(index + 1));
+            match pacer.decide(now, opens, ready) {
+                Pace::Wait(until) => {
+                    assert!(until > now);
+                    now = until.min(frames.peek().copied().unwrap_or(until));
+                }
+                Pace::Tick(due) => {
+                    assert!(due <= now);
+                    let grid = grid.get_or_insert(Grid::new(now, P));
+                    let at = grid.index(now);
+                    assert!(out.ticks == 0 || at == index + 1, "{index} -> {at}");
+                    index = at;
+                    out.ticks += 1;
+                    out.without_frame += u64::from(ready.is_none());
+                    if let Some(ready) = ready {
+                        out.longest_wait_ns = out.longest_wait_ns.max(now - ready);
+                    }
+                    if let Some(last) = last {
+                        out.closest_ns = out.closest_ns.min(now - last);
+                    }
+                    last = Some(now);
+                    pacer.ticked(now, ready.take());
+                    out.off_ns = out.off_ns.max((grid.opens_ns(index) + P / 2 - now).abs());
+                }
+            }
+        }
+        out
+    }
+
+    fn camera(rate_hz: f64, seconds: f64) -> impl Iterator<Item = i64> {
+        (1..(rate_hz * seconds) as i64).map(move |k| (k as f64 * 1e9 / rate_hz) as i64)
+    }
+
+    #[test]
+    fn a_camera_of_another_rate_costs_one_tick_or_frame_for_each_period_of_difference() {
+        for rate_hz in [990.0, 999.9, 1000.0, 1000.02, 1010.0] {
+            let seconds = 600.0;
+            let paced = pace(camera(rate_hz, seconds));
+            let slips = ((rate_hz - 1000.0) * seconds).abs().ceil() as u64 + 2;
+            assert!(
+                paced.ticks.abs_diff(600_000) < 3,
+                "{rate_hz}: {}",
+                paced.ticks
+            );
+            assert!(
+                paced.without_frame <= slips,
+                "{rate_hz}: {}",
+                paced.without_frame
+            );
+            assert!(paced.unused <= slips, "{rate_hz}: {}", paced.unused);
+            assert!(paced.longest_wait_ns <= 3 * P / 10 + 1, "{rate_hz}");
+            assert!(
+                paced.closest_ns >= P / 4 && paced.off_ns <= P / 2,
+                "{rate_hz}"
+            );
+        }
+    }
+
+    #[test]
+    fn a_camera_of_half_or_double_the_rate_runs_on_the_loops_time() {
+        let half = pace(camera(500.0, 60.0));
+        assert!(half.ticks.abs_diff(60_000) < 3 && half.without_frame.abs_diff(30_000) < 3);
+        let double = pace(camera(2000.0, 60.0));
+        assert!(double.ticks.abs_diff(60_000) < 3 && double.without_frame == 0);
+        assert!(double.unused.abs_diff(60_000) < 5);
+    }
+
+    #[test]
+    fn jitter_at_the_edge_of_a_step_does_not_make_frames_fall_to_either_side_in_turn() {
+        let mut state = 1_u64;
+        let mut jitter = move || {
+            state ^= state << 13;
+            state ^= state >> 7;
+            state ^= state << 17;
+            (state % 200_000) as i64 - 100_000
+        };
+        // 20 s for a period of drift, with a tenth of a period of jitter: every phase is passed.
+        let frames = (1..600_000).map(|k| (k as f64 * 1e9 / 1000.05) as i64 + jitter());
+        let paced = pace(frames);
+        assert!(paced.ticks.abs_diff(599_970) < 3, "{}", paced.ticks);
+        assert!(paced.without_frame < 70, "{}", paced.without_frame);
+        assert!(paced.unused < 100, "{}", paced.unused);
+    }
+}

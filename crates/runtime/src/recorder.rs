@@ -1,0 +1,332 @@
+//! The recorder's side of the rings: what a run leaves behind, handed to the sink.
+//!
+//! One `Recorder` serves every driver: on a thread of its own in real time, between the ticks on the virtual clock. A
+//! round takes a bounded number of records, then a bounded number of events, so that neither can starve the other.
+//! Events of one kind beyond [`EVENTS_A_SECOND`] in a second of the run are counted and told as one, so that a camera that
+//! doubles every frame does not fill the disk with the news.
+//!
+//! A sink that panics, or that has been refusing for longer than [`REFUSED_NS`], is a fault of the run
+//! ([`RecorderFault`]): the bead is frozen and the PZT parked, because a measurement that nobody keeps is worth nothing. The
+//! rings are drained all the same and every record that found no taker is counted.
+
+use crate::life::{Event, EventKind};
+use crate::live::Operator;
+use crate::run::RunSink;
+use crate::summary::Statistics;
+use crate::tick_record::TickRecord;
+use cellpos_control::LearnerState;
+use cellpos_rig::clock::monotonic_ns;
+use rtrb::Consumer;
+use serde::Serialize;
+use std::mem::{Discriminant, discriminant};
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::thread;
+use std::time::Duration;
+
+/// Events of one kind that are told one by one in a second of the run.
+pub const EVENTS_A_SECOND: u64 = 20;
+/// How long a sink may refuse before the run is taken for unrecorded, ns.
+pub const REFUSED_NS: i64 = 500_000_000;
+
+/// Most records in a round.
+const RECORDS_A_ROUND: usize = 2048;
+/// Most events in a round.
+const EVENTS_A_ROUND: usize = 512;
+
+/// Why a run could no longer be recorded.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "kebab-case")]
+#[repr(u8)]
+pub enum RecorderFault {
+    /// The sink panicked: a defect of this program.
+    Panicked = 1,
+    /// The sink could not write: a full disk, a folder that is gone.
+    Refused = 2,
+    /// The recorder fell behind by half of its ring: a disk that hangs.
+    Behind = 3,
+}
+
+impl RecorderFault {
+    pub(crate) fn from_number(number: u8) -> Option<Self> {
+        [Self::Panicked, Self::Refused, Self::Behind]
+            .into_iter()
+            .find(|fault| *fault as u8 == number)
+    }
+
+    /// In a sentence.
+    pub fn sentence(self) -> &'static str {
+        match self {
+            Self::Panicked => {
+                "the recorder failed by a defect of this program; the bead was frozen and the PZT parked"
+            }
+            Self::Refused => {
+                "the run folder could not be written for half a second; the bead was frozen and the PZT parked"
+            }
+            Self::Behind => {
+                "the disk was so slow that the recorder fell behind by half of its memory; the bead was frozen and the PZT \
+                 parked before records were lost"
+            }
+        }
+    }
+}
+
+/// How the recording of a run went.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
+pub struct RecorderReport {
+    /// What ended it, if anything did.
+    pub fault: Option<RecorderFault>,
+    /// Records taken from the ring that no sink took: it had panicked.
+    pub records_unkept: u64,
+    /// Events likewise.
+    pub events_unkept: u64,
+}
+
+/// The recorder's ends of the rings.
+#[derive(Debug)]
+pub(crate) struct Feed {
+    pub(crate) records: Consumer<TickRecord>,
+    pub(crate) events: Consumer<Event>,
+    pub(crate) learned: Consumer<(u16, LearnerState)>,
+}
+
+/// How often a kind of event came in the second that began last.
+#[derive(Debug)]
+struct Seen {
+    kind: Discriminant<EventKind>,
+    since_ns: i64,
+    count: u64,
+    /// The last one that was not told by itself.
+    held: Option<Event>,
+}
+
+/// Tells equal events one by one up to a rate, and the rest by number.
+#[derive(Debug, Default)]
+struct Limiter {
+    seen: Vec<Seen>,
+}
+
+impl Limiter {
+    const SECOND_NS: i64 = 1_000_000_000;
+
+    /// Tells an event, or holds it back.
+    fn event(&mut self, event: &Event, sink: &mut impl RunSink) {
+        let kind = discriminant(&event.kind);
+        let Some(seen) = self.seen.iter_mut().find(|seen| seen.kind == kind) else {
+            self.seen.push(Seen {
+                kind,
+                since_ns: event.time_ns,
+                count: 1,
+                held: None,
+            });
+            return sink.event(event);
+        };
+        if event.time_ns - seen.since_ns >= Self::SECOND_NS {
+            seen.tell(sink);
+            (seen.since_ns, seen.count) = (event.time_ns, 0);
+        }
+        seen.count += 1;
+        if seen.count <= EVENTS_A_SECOND {
+            sink.event(event);
+        } else {
+            seen.held = Some(*event);
+        }
+    }
+
+    /// Tells by number what is held back since a second, or all of it.
+    fn overdue(&mut self, now_ns: Option<i64>, sink: &mut impl RunSink) {
+        for seen in &mut self.seen {
+            if now_ns.is_none_or(|now_ns| now_ns - seen.since_ns >= Self::SECOND_NS) {
+                seen.tell(sink);
+            }
+        }
+    }
+}
+
+impl Seen {
+    fn tell(&mut self, sink: &mut impl RunSink) {
+        if let Some(last) = self.held.take() {
+            sink.repeated(&last, self.count - EVENTS_A_SECOND);
+            self.count = EVENTS_A_SECOND;
+        }
+    }
+}
+
+/// Hands over what waits in the rings.
+#[derive(Debug)]
+pub(crate) struct Recorder<'a, S> {
+    feed: Feed,
+    sink: &'a mut S,
+    statistics: &'a mut Statistics,
+    limiter: Limiter,
+    refused_since_ns: Option<i64>,
+    report: RecorderReport,
+    /// Time of the newest record, ns since the start of the run.
+    newest_ns: i64,
+    /// A record or event has been handed to the sink and was not yet taken.
+    record_in_hand: bool,
+    event_in_hand: bool,
+}
+
+impl<'a, S: RunSink> Recorder<'a, S> {
+    pub(crate) fn new(feed: Feed, sink: &'a mut S, statistics: &'a mut Statistics) -> Self {
+        Self {
+            feed,
+            sink,
+            statistics,
+            limiter: Limiter::default(),
+            refused_since_ns: None,
+            report: RecorderReport::default(),
+            newest_ns: 0,
+            record_in_hand: false,
+            event_in_hand: false,
+        }
+    }
+
+    /// What ended the recording, if anything did.
+    pub(crate) fn fault(&self) -> Option<RecorderFault> {
+        self.report.fault
+    }
+
+    /// Whether nobody will put anything into the rings any more.
+    fn is_over(&self) -> bool {
+        self.feed.records.is_abandoned() && self.feed.events.is_abandoned()
+    }
+
+    /// One round at a time of any steady clock; says whether more waits than a round takes.
+    pub(crate) fn round(&mut self, now_ns: i64) -> bool {
+        if self.report.fault == Some(RecorderFault::Panicked) {
+            return self.discard();
+        }
+        let Ok(more) = catch_unwind(AssertUnwindSafe(|| self.hand_over())) else {
+            self.panicked();
+            return true;
+        };
+        if self.sink.is_refused() {
+            let since_ns = *self.refused_since_ns.get_or_insert(now_ns);
+            if now_ns - since_ns >= REFUSED_NS {
+                self.report.fault.get_or_insert(RecorderFault::Refused);
+            }
+        } else {
+            self.refused_since_ns = None;
+        }
+        more
+    }
+
+    fn panicked(&mut self) {
+        self.report.fault = Some(RecorderFault::Panicked);
+        self.report.records_unkept += u64::from(self.record_in_hand);
+        self.report.events_unkept += u64::from(self.event_in_hand);
+    }
+
+    fn hand_over(&mut self) -> bool {
+        let mut left = RECORDS_A_ROUND;
+        while left > 0 && self.sink.is_ready() {
+            let Ok(record) = self.feed.records.pop() else {
+                break;
+            };
+            left -= 1;
+            self.newest_ns = record.time_ns;
+            self.statistics.add(&record);
+            self.record_in_hand = true;
+            self.sink.tick(&record);
+            self.record_in_hand = false;
+        }
+        let mut more = left == 0;
+        left = EVENTS_A_ROUND;
+        while left > 0 {
+            let Ok(event) = self.feed.events.pop() else {
+                break;
+            };
+            left -= 1;
+            self.event_in_hand = true;
+            self.limiter.event(&event, self.sink);
+            self.event_in_hand = false;
+        }
+        more |= left == 0;
+        self.limiter.overdue(Some(self.newest_ns), self.sink);
+        while let Ok((motion, state)) = self.feed.learned.pop() {
+            self.sink.learned(motion, &state);
+        }
+        more
+    }
+
+    /// Counts what no sink takes any more.
+    fn discard(&mut self) -> bool {
+        while let Ok(record) = self.feed.records.pop() {
+            self.statistics.add(&record);
+            self.report.records_unkept += 1;
+        }
+        while self.feed.events.pop().is_ok() {
+            self.report.events_unkept += 1;
+        }
+        while self.feed.learned.pop().is_ok() {}
+        false
+    }
+
+    pub(crate) fn progress(&mut self) {
+        if self.report.fault == Some(RecorderFault::Panicked) {
+            return;
+        }
+        let told = catch_unwind(AssertUnwindSafe(|| self.sink.progress(self.statistics)));
+        if told.is_err() {
+            self.report.fault = Some(RecorderFault::Panicked);
+        }
+    }
+
+    /// Takes everything that is left, whether the sink is ready or not, and says how it went.
+    pub(crate) fn finish(mut self) -> RecorderReport {
+        while let Ok(record) = self.feed.records.pop() {
+            self.statistics.add(&record);
+            if self.report.fault == Some(RecorderFault::Panicked) {
+                self.report.records_unkept += 1;
+            } else if catch_unwind(AssertUnwindSafe(|| self.sink.tick(&record))).is_err() {
+                self.record_in_hand = true;
+                self.panicked();
+            }
+        }
+        while self.round(0) {}
+        if self.report.fault != Some(RecorderFault::Panicked)
+            && catch_unwind(AssertUnwindSafe(|| self.limiter.overdue(None, self.sink))).is_err()
+        {
+            self.panicked();
+        }
+        self.progress();
+        self.report
+    }
+}
+
+/// The recorder's thread: until the rings are closed and empty. A fault is told to the operator's end of the loop at once.
+pub(crate) fn serve<S: RunSink>(
+    feed: Feed,
+    sink: &mut S,
+    statistics: &mut Statistics,
+    operator: &Operator,
+) -> RecorderReport {
+    const LOOK_EVERY: Duration = Duration::from_millis(5);
+    const PROGRESS_EVERY_NS: i64 = 100_000_000;
+    let mut recorder = Recorder::new(feed, sink, statistics);
+    let mut told_ns = i64::MIN;
+    loop {
+        // Asked first: whatever was pushed before the rings were closed is still drained below.
+        let over = recorder.is_over();
+        let now_ns = monotonic_ns();
+        let more = recorder.round(now_ns);
+        if let Some(fault) = recorder.fault() {
+            operator.unrecorded(fault);
+        }
+        if over && !more {
+            return recorder.finish();
+        }
+        if now_ns.saturating_sub(told_ns) >= PROGRESS_EVERY_NS {
+            told_ns = now_ns;
+            recorder.progress();
+        }
+        if !more {
+            thread::sleep(LOOK_EVERY);
+        }
+    }
+}
+
+#[cfg(test)]
+#[path = "recorder_tests.rs"]
+mod tests;

@@ -1,0 +1,272 @@
+//! What each thread of a run does, a round at a time: the threads themselves only wait in between ([`crate::live`]), so
+//! that a test can run the same rounds on a clock of its own, in any order.
+
+use crate::core::Counts;
+use crate::life::{Life, SafeReason};
+use crate::live::Operator;
+use crate::pacer::{Pace, Pacer};
+use crate::recorder::RecorderFault;
+use crate::reference::ReferenceGenerator;
+use crate::run::{EndRule, EndWatch, RunError, serve_actuator};
+use crate::summary::End;
+use crate::ticker::{Account, Order, Ticker};
+use cellpos_control::LearnedTable;
+use cellpos_rig::{Actuator, ActuatorReport, Clock, Measurement, PositionSource};
+use rtrb::{Consumer, Producer};
+use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
+
+/// What the threads tell each other besides what is in the rings.
+#[derive(Debug, Default)]
+pub(crate) struct Shared {
+    /// The run is over.
+    pub(crate) stop: AtomicBool,
+    /// Mean time that vision takes for a frame while it is slower than the camera, ns; 0: it keeps up.
+    slow_vision_ns: AtomicU32,
+}
+
+/// The camera thread: frame -> position -> ring.
+pub(crate) struct Seeing<'a> {
+    source: &'a mut dyn PositionSource,
+    measurements: Producer<Measurement>,
+    clock: Clock,
+    period_ns: i64,
+    shared: &'a Shared,
+    /// Frames in a row that had been waiting, and the time that they took.
+    backlog: u32,
+    backlog_ns: i64,
+    /// Whether frames were left waiting.
+    behind: bool,
+}
+
+impl<'a> Seeing<'a> {
+    /// How long to wait for a frame before looking whether the run is over, ns.
+    const LOOK_UP_NS: i64 = 20_000_000;
+    /// A deadline that is past: only what has arrived already.
+    const NOW_NS: i64 = 0;
+    /// Frames that piled up before the run are thrown away for no longer than this, ns.
+    const CLEAR_NS: i64 = 100_000_000;
+    /// Frames in a row that must have been waiting before vision is called slow.
+    const SURE: u32 = 5;
+
+    pub(crate) fn new(
+        source: &'a mut dyn PositionSource,
+        measurements: Producer<Measurement>,
+        clock: Clock,
+        period_ns: i64,
+        shared: &'a Shared,
+    ) -> Self {
+        Self {
+            source,
+            measurements,
+            clock,
+            period_ns,
+            shared,
+            backlog: 0,
+            backlog_ns: 0,
+            behind: false,
+        }
+    }
+
+    /// Whether nobody wants its positions any more.
+    pub(crate) fn is_over(&self) -> bool {
+        self.shared.stop.load(Ordering::Acquire) || self.measurements.is_abandoned()
+    }
+
+    /// Throws away the frames that piled up before the run; vision that is slower than the camera never sees the end of
+    /// them, so not for ever.
+    pub(crate) fn clear(&mut self) -> Result<(), RunError> {
+        let until_ns = self.clock.now_ns().saturating_add(Self::CLEAR_NS);
+        while !self.is_over() && self.clock.now_ns() < until_ns {
+            if self.source.next(Self::NOW_NS)?.is_none() {
+                break;
+            }
+        }
+        Ok(())
+    }
+
+    /// Waits for a frame, for a while; then takes those that wait, for a period at most. Says whether control is to be
+    /// woken.
+    pub(crate) fn round(&mut self) -> Result<bool, RunError> {
+        let from_ns = self.clock.now_ns();
+        let had_waited = self.behind;
+        if !self.push(from_ns.saturating_add(Self::LOOK_UP_NS), had_waited)? {
+            self.caught_up();
+            return Ok(false);
+        }
+        // After a stall frames come in a burst: control is woken for the newest, not for each of the past.
+        let burst_ns = self.clock.now_ns();
+        self.behind = true;
+        while self.clock.now_ns() - burst_ns < self.period_ns && !self.is_over() {
+            if !self.push(Self::NOW_NS, true)? {
+                self.caught_up();
+                break;
+            }
+        }
+        Ok(true)
+    }
+
+    /// Takes the next frame, if one comes in time.
+    fn push(&mut self, deadline_ns: i64, had_waited: bool) -> Result<bool, RunError> {
+        let from_ns = self.clock.now_ns();
+        let Some(measurement) = self.source.next(deadline_ns)? else {
+            return Ok(false);
+        };
+        // A full ring means that control has not run for a second; the gap in the frame ids tells the rest.
+        let _ = self.measurements.push(measurement);
+        if had_waited {
+            self.backlog = self.backlog.saturating_add(1);
+            self.backlog_ns = self
+                .backlog_ns
+                .saturating_add(self.clock.now_ns() - from_ns);
+            let mean_ns = self.backlog_ns / i64::from(self.backlog);
+            if self.backlog >= Self::SURE && mean_ns > self.period_ns {
+                let ns = u32::try_from(mean_ns).unwrap_or(u32::MAX);
+                self.shared.slow_vision_ns.store(ns, Ordering::Release);
+            }
+        }
+        Ok(true)
+    }
+
+    fn caught_up(&mut self) {
+        (self.backlog, self.backlog_ns, self.behind) = (0, 0, false);
+        self.shared.slow_vision_ns.store(0, Ordering::Release);
+    }
+}
+
+/// What the control thread does next.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Next {
+    /// Wait until then, ns, or until a frame has come.
+    Wait(i64),
+    /// A tick was made: the actuator is to be woken.
+    Ticked,
+    /// The run is over; the actuator is to be woken.
+    Over(End),
+}
+
+/// The control thread: the tick.
+pub(crate) struct Controlling<'a, R> {
+    ticker: Ticker<R>,
+    clock: Clock,
+    pacer: Pacer,
+    watch: EndWatch,
+    operator: &'a Operator,
+    shared: &'a Shared,
+}
+
+/// What the control thread leaves behind.
+pub(crate) struct ControlEnd {
+    pub(crate) end: End,
+    pub(crate) life: Life,
+    pub(crate) safe_reason: Option<SafeReason>,
+    pub(crate) counts: Counts,
+    pub(crate) account: Account,
+    pub(crate) learned: Vec<Option<LearnedTable>>,
+    pub(crate) period_us: f64,
+}
+
+impl<'a, R: ReferenceGenerator> Controlling<'a, R> {
+    pub(crate) fn new(
+        ticker: Ticker<R>,
+        clock: Clock,
+        end: EndRule,
+        operator: &'a Operator,
+        shared: &'a Shared,
+    ) -> Self {
+        let period_ns = ticker.core().timing().period_ns();
+        Self {
+            pacer: Pacer::new(period_ns, clock.now_ns()),
+            watch: EndWatch::new(end),
+            ticker,
+            clock,
+            operator,
+            shared,
+        }
+    }
+
+    /// Makes a tick, if one is due.
+    pub(crate) fn round(&mut self) -> Next {
+        let ready_ns = self.ticker.look();
+        let now_ns = self.clock.now_ns();
+        let due_ns = match self.pacer.decide(now_ns, self.ticker.opens_ns(), ready_ns) {
+            Pace::Wait(until_ns) => return Next::Wait(until_ns),
+            Pace::Tick(due_ns) => due_ns,
+        };
+        self.pacer.ticked(now_ns, ready_ns);
+        let slow_ns = self.shared.slow_vision_ns.load(Ordering::Acquire);
+        self.ticker.vision_is_slow((slow_ns > 0).then_some(slow_ns));
+        let request = self.operator.take();
+        self.ticker.steer(self.operator.target_um());
+        let life = self.ticker.tick(due_ns, request);
+        if self.ticker.recorder_is_behind() {
+            self.operator.unrecorded(RecorderFault::Behind);
+        }
+        let core = self.ticker.core();
+        let over = core.reference().finished();
+        match self.watch.after_tick(core.index(), life, request, over) {
+            Some(end) => Next::Over(end),
+            None => Next::Ticked,
+        }
+    }
+
+    /// Closes the rings: the recorder drains them and ends, the actuator thread leaves its loop.
+    pub(crate) fn finish(self, end: End) -> ControlEnd {
+        let core = self.ticker.core();
+        ControlEnd {
+            end,
+            life: core.life(),
+            safe_reason: core.safe_reason(),
+            counts: *core.counts(),
+            learned: core.learners().tables(),
+            account: self.ticker.account().clone(),
+            period_us: core.timing().period_us,
+        }
+    }
+}
+
+/// The actuator thread: orders -> board, board -> reports.
+pub(crate) struct Acting<'a> {
+    actuator: &'a mut dyn Actuator,
+    orders: Consumer<Order>,
+    reports: Producer<ActuatorReport>,
+    failed: Option<RunError>,
+}
+
+impl<'a> Acting<'a> {
+    pub(crate) fn new(
+        actuator: &'a mut dyn Actuator,
+        orders: Consumer<Order>,
+        reports: Producer<ActuatorReport>,
+    ) -> Self {
+        Self {
+            actuator,
+            orders,
+            reports,
+            failed: None,
+        }
+    }
+
+    /// Carries out what waits; says whether the run is over. Once the board has failed nothing more is sent: control hears
+    /// nothing of it and latches Safe.
+    pub(crate) fn round(&mut self) -> bool {
+        // Asked first: what was ordered before control ended is still carried out below.
+        let over = self.orders.is_abandoned();
+        if self.failed.is_some() {
+            while self.orders.pop().is_ok() {}
+        } else if let Err(error) =
+            serve_actuator(self.actuator, &mut self.orders, &mut self.reports)
+        {
+            self.failed = Some(error.into());
+        }
+        over
+    }
+
+    /// What went wrong, if anything did.
+    pub(crate) fn finish(self) -> Option<RunError> {
+        self.failed
+    }
+}
+
+#[cfg(test)]
+#[path = "threads_tests.rs"]
+mod tests;

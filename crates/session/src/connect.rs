@@ -1,0 +1,260 @@
+//! What a run folder says of a run, and what the user should know of one that is over.
+
+use crate::Failure;
+pub use crate::failure::describe;
+pub use crate::fit::{prepare, stated_exposure_s};
+use crate::provenance;
+use crate::rig::{Finished, Rig};
+use crate::rig_file::{ActuatorConfig, CameraConfig, ClockKind, RigFile};
+use crate::setup::{ReferenceSpec, Setup};
+use cellpos_control::ControllerKind;
+use cellpos_control::design::bound_rms_um;
+use cellpos_record::{Group, InputFile, RunEnd, RunMeta, RunWriter, space};
+use cellpos_runtime::Summary;
+use cellpos_runtime::realtime::Conditions;
+use cellpos_script::Sample;
+use serde::Serialize;
+use std::path::Path;
+
+/// The metadata of a run, with the files among `inputs` fingerprinted.
+pub fn meta(
+    name: &str,
+    clock: ClockKind,
+    inputs: &[&Path],
+    setup: &Setup,
+    rig: &Rig,
+) -> Result<RunMeta, Failure> {
+    let file = rig.file();
+    let clock = match clock {
+        ClockKind::Real => "real",
+        ClockKind::Virtual => "virtual",
+    };
+    let mut meta = RunMeta::new(name, clock);
+    meta.columns = columns(setup, file);
+    meta.command_line = provenance::command_line();
+    // A folder that is gone is no reason not to run.
+    meta.started_in =
+        std::env::current_dir().map_or_else(|_| String::new(), |path| path.display().to_string());
+    meta.seed = file.is_emulated().then_some(file.emulator.seed);
+    meta.versions
+        .insert("cellpos".to_string(), provenance::VERSION.to_string());
+    meta.versions
+        .insert("commit".to_string(), provenance::COMMIT.to_string());
+    meta.conditions = provenance::machine(rig);
+    for path in inputs {
+        meta.inputs
+            .push(InputFile::of(path).map_err(Failure::input)?);
+    }
+    meta.config = table(&setup.config)?;
+    let mut anchored = anchored(file)?;
+    // What the script says of the sample goes before what the rig file says.
+    let of_script = setup.config.reference.script()?;
+    let of_script = of_script.map_or_else(Sample::default, |(script, _)| script.sample);
+    let sample = of_script.or(&anchored.sample.unwrap_or_default());
+    anchored.sample = (sample != Sample::default()).then_some(sample);
+    let rig = table(&anchored)?;
+    meta.config
+        .insert("rig".to_string(), toml::Value::Table(rig));
+    meta.model = setup
+        .model
+        .to_toml_string()
+        .parse::<toml::Table>()
+        .map_err(Failure::failed)?;
+    meta.controller = table(&setup.controller)?;
+    meta.law_columns = setup
+        .law()?
+        .columns()
+        .iter()
+        .map(|name| (*name).to_owned())
+        .collect();
+    Ok(meta)
+}
+
+/// The columns that a run needs: what nobody measures or computes takes no room on the disk.
+fn columns(setup: &Setup, file: &RigFile) -> Vec<Group> {
+    let mpc = setup.controller.controller == ControllerKind::Mpc;
+    let script = matches!(setup.config.reference, ReferenceSpec::Script { .. });
+    let real = matches!(file.camera, CameraConfig::Industrial { .. });
+    [
+        (Group::Loop, true),
+        (Group::Cell, file.follows_a_cell()),
+        (Group::Truth, !real),
+        (Group::Solver, mpc),
+        (Group::Script, script),
+    ]
+    .into_iter()
+    .filter_map(|(group, wanted)| wanted.then_some(group))
+    .collect()
+}
+
+/// Refuses a run for which the disk has no room; `ticks`: as many as it will have at most, if it has an end.
+///
+/// # Errors
+/// A failure with what is needed and what is there.
+pub fn room(root: &Path, ticks: Option<u64>, meta: &RunMeta) -> Result<(), Failure> {
+    space::check(root, ticks, &meta.columns).map_err(Failure::input)
+}
+
+/// The rig with absolute paths, as it is kept with a run: whoever goes on with the run need not start the program from the
+/// same folder.
+fn anchored(file: &RigFile) -> Result<RigFile, Failure> {
+    let absolute = |path: &Path| {
+        std::path::absolute(path).map_err(|error| {
+            Failure::Failed(miette::miette!(
+                "no absolute path of {}: {error}",
+                path.display()
+            ))
+        })
+    };
+    let mut file = file.clone();
+    if let Some(calibration) = &mut file.calibration_file {
+        *calibration = absolute(calibration)?;
+    }
+    if let Some(background) = file.cell.as_mut().and_then(|cell| cell.background.as_mut()) {
+        *background = absolute(background)?;
+    }
+    if let CameraConfig::Socket { socket, .. } = &mut file.camera {
+        *socket = absolute(socket)?;
+    }
+    if let ActuatorConfig::Serial { port, .. } = &mut file.actuator
+        // Else it is a name of the system's own (COM5).
+        && Path::new(port).exists()
+    {
+        *port = absolute(Path::new(port))?.display().to_string();
+    }
+    if file.emulator.model != "eq6" {
+        file.emulator.model = absolute(Path::new(&file.emulator.model))?
+            .display()
+            .to_string();
+    }
+    Ok(file)
+}
+
+/// The files behind the options `--rig`, `--model` and `--controller`, and those that the rig file names.
+pub fn inputs<'a>(
+    rig: Option<&'a Path>,
+    file: &'a RigFile,
+    model: &'a str,
+    controller: &'a str,
+) -> Vec<&'a Path> {
+    let mut inputs: Vec<&Path> = rig.into_iter().collect();
+    inputs.extend(file.background());
+    if model != "eq6" {
+        inputs.push(Path::new(model));
+    }
+    if controller.ends_with(".toml") {
+        inputs.push(Path::new(controller));
+    }
+    inputs
+}
+
+/// A value as a TOML table.
+pub fn table(value: &impl Serialize) -> Result<toml::Table, Failure> {
+    toml::Table::try_from(value).map_err(Failure::failed)
+}
+
+/// A run folder that is ended.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Kept {
+    /// Its path.
+    pub run: String,
+    /// Whether everything of the run is in it.
+    pub whole: bool,
+}
+
+/// Ends a run folder; what is not on the disk is counted in the summary and said in the warnings.
+pub fn finish(
+    mut writer: RunWriter,
+    outcome: &str,
+    summary: &mut Summary,
+    conditions: &Conditions,
+    warnings: &mut Vec<String>,
+) -> Kept {
+    let mut end = RunEnd::new(outcome);
+    end.summary = toml::Table::try_from(&*summary).unwrap_or_default();
+    writer.add_conditions(provenance::granted(conditions));
+    // Those that never came to the writer; it adds its own.
+    end.rows_lost = summary.records_lost;
+    end.events_lost = summary.events_lost;
+    let done = writer.finish(end);
+    if summary.records_lost > 0 {
+        warnings.push(format!(
+            "{} rows were lost on the way to the recorder",
+            summary.records_lost
+        ));
+    }
+    summary.records_lost += done.faults.rows_lost;
+    summary.events_lost += done.faults.events_lost;
+    if done.faults.rows_lost + done.faults.events_lost > 0 {
+        warnings.push(format!(
+            "{} rows and {} events could not be written: {}",
+            done.faults.rows_lost,
+            done.faults.events_lost,
+            done.faults.first.clone().unwrap_or_default()
+        ));
+    } else if let Err(error) = &done.parquet {
+        warnings.push(format!("no ticks.parquet: {error}"));
+    }
+    if !done.closed {
+        warnings
+            .push("run.toml does not say how the run ended: it could not be written".to_owned());
+    }
+    Kept {
+        run: done.folder.display().to_string(),
+        whole: done.closed && summary.records_lost == 0,
+    }
+}
+
+/// Ends the folder of a run whose board was not armed.
+pub fn not_armed(writer: RunWriter, failure: &Failure) {
+    let mut end = RunEnd::new("not-armed");
+    end.summary
+        .insert("why".to_string(), toml::Value::String(failure.text()));
+    // The failure itself is what the user hears of.
+    let _ = writer.finish(end);
+}
+
+/// Diffusion of the bead, um^2/s: of the emulated rig, or as the model says.
+pub fn diffusion_um2_per_s(file: &RigFile, model: &cellpos_plant::Model) -> f64 {
+    if file.is_emulated() {
+        file.emulator.diffusion_um2_per_s
+    } else {
+        model.noise.diffusion_um2_per_s
+    }
+}
+
+/// Smallest RMS error that any controller could reach, nm: Brownian motion, delay and noise in force.
+pub fn bound_rms_nm(file: &RigFile, setup: &Setup, summary: &Summary) -> Option<f64> {
+    let diffusion = diffusion_um2_per_s(file, &setup.model);
+    summary.fix_noise_nm.map(|noise_nm| {
+        let timing = &setup.config.timing;
+        1e3 * bound_rms_um(
+            diffusion,
+            noise_nm * 1e-3,
+            timing.camera_delay_ms * 1e-3,
+            timing.period_us * 1e-6,
+        )
+    })
+}
+
+/// What is wrong when the frames of a run were not as old as the rig file says: the loop was made for another delay.
+pub fn delay_warning(file: &RigFile, summary: &Summary) -> Option<String> {
+    /// Part of a period: what time stamps can tell without being a setting.
+    const WORTH_SAYING: f64 = 0.3;
+    let timing = &file.timing;
+    let period_ms = timing.period_us * 1e-3;
+    let found_ms = summary.loop_delay_ms - 0.5 * period_ms;
+    ((found_ms - timing.camera_delay_ms).abs() > WORTH_SAYING * period_ms).then(|| {
+        format!(
+            "the frames were {found_ms:.2} ms old when they were used, camera_delay_ms says {} ms: correct it in rig.toml",
+            timing.camera_delay_ms
+        )
+    })
+}
+
+/// What the user should know of a run that is over.
+pub fn warnings<S>(finished: &Finished<S>) -> Vec<String> {
+    let mut warnings = finished.rig.warnings().to_vec();
+    warnings.extend(delay_warning(finished.rig.file(), &finished.summary));
+    warnings
+}

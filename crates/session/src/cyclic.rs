@@ -1,0 +1,298 @@
+//! Cyclic motion: `--sine 5um@50Hz`, `--learn`, and the learned table of a run.
+
+use crate::Failure;
+use crate::prepared::Prepared;
+use crate::rig_file::RigFile;
+use cellpos_control::design::{DesignPlant, Uncertainty, harmonic_responses};
+use cellpos_control::{
+    CycleLearning, HarmonicResponse, LearnConfig, LearnError, LearnedTable, Learner, Profile,
+    Reference, Shape,
+};
+use cellpos_units::{Hertz, Micrometers};
+use serde::{Deserialize, Serialize};
+use std::path::Path;
+use std::str::FromStr;
+
+/// Amplitude and frequency of a sine, as `5um@50Hz`.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Sine {
+    /// Half of peak to peak.
+    pub amplitude: Micrometers,
+    /// Frequency.
+    pub frequency: Hertz,
+}
+
+/// Time over which a sine comes in, s.
+pub const FADE_S: f64 = 0.2;
+
+impl FromStr for Sine {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let (amplitude, frequency) = text
+            .split_once('@')
+            .ok_or("write amplitude@frequency, for example 5um@50Hz")?;
+        let amplitude: Micrometers = amplitude.parse().map_err(|e| format!("amplitude: {e}"))?;
+        let frequency: Hertz = frequency.parse().map_err(|e| format!("frequency: {e}"))?;
+        if amplitude.value() <= 0.0 || frequency.value() <= 0.0 {
+            return Err("amplitude and frequency must be positive".to_string());
+        }
+        Ok(Self {
+            amplitude,
+            frequency,
+        })
+    }
+}
+
+/// What is learned in a run, from what: enough for a replay.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct LearnSpec {
+    /// Frequency of the reference, Hz.
+    pub frequency_hz: f64,
+    /// How.
+    pub config: LearnConfig,
+    /// Responses of the closed loop to the addition, with their uncertainty.
+    pub responses: Vec<HarmonicResponse>,
+    /// Margins of gain and delay that the uncertainty was computed with; none in runs from before this was kept.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub margins: Option<Uncertainty>,
+    /// What was known before.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub table: Option<LearnedTable>,
+}
+
+/// Harmonics of a sine that are learned: nonlinearities make the third.
+const SINE_HARMONICS: u32 = 3;
+
+/// A periodic motion that is to be learned.
+pub struct Wanted<'a> {
+    /// The motion by itself.
+    pub reference: &'a dyn Reference,
+    /// From when on it is in full swing, s.
+    pub from_s: f64,
+    /// Frequency of its cycles, Hz.
+    pub frequency_hz: f64,
+    /// Harmonics that are learned.
+    pub harmonics: u32,
+}
+
+impl LearnSpec {
+    /// For a sine of `cellpos track`; `table`: a learned table to go on from.
+    pub fn for_sine(
+        setup: &Prepared,
+        file: &RigFile,
+        sine: Sine,
+        table: Option<LearnedTable>,
+    ) -> Result<Self, Failure> {
+        let frequency_hz = sine.frequency.value();
+        let reference = Profile::Wave {
+            shape: Shape::Sine,
+            centre_um: 0.0,
+            amplitude_um: sine.amplitude.value(),
+            frequency_hz,
+            fade_s: FADE_S,
+        };
+        let wanted = Wanted {
+            reference: &reference,
+            from_s: FADE_S,
+            frequency_hz,
+            harmonics: SINE_HARMONICS,
+        };
+        Self::new(setup, file, &wanted, table)
+    }
+
+    /// The responses are those of the loop's own model along the reference.
+    pub fn new(
+        setup: &Prepared,
+        file: &RigFile,
+        wanted: &Wanted,
+        table: Option<LearnedTable>,
+    ) -> Result<Self, Failure> {
+        let loop_config = setup
+            .controller
+            .loop_config(&setup.model)
+            .map_err(Failure::input)?;
+        let sample_s = file.timing.period_us * 1e-6;
+        let mut plant = DesignPlant::from_model(
+            &setup.model,
+            Some(setup.controller.delay_ms * 1e-3),
+            sample_s,
+        )
+        .map_err(Failure::input)?;
+        plant.neutral_um = file.first_neutral_um;
+        let margins = Uncertainty::of_model(&setup.model, plant.delay_s);
+        let responses = harmonic_responses(
+            &plant,
+            &loop_config,
+            wanted.reference,
+            wanted.from_s,
+            wanted.frequency_hz,
+            wanted.harmonics,
+            margins,
+        )
+        .map_err(Failure::input)?;
+        let spec = Self {
+            frequency_hz: wanted.frequency_hz,
+            config: LearnConfig {
+                exposure_s: setup.controller.estimator.exposure_ms * 1e-3,
+                ..LearnConfig::default()
+            },
+            responses,
+            margins: Some(margins),
+            table,
+        };
+        spec.learning(sample_s)?;
+        Ok(spec)
+    }
+
+    /// The learner alone.
+    pub fn learner(&self, sample_s: f64) -> Result<Learner, LearnError> {
+        Learner::new(self.config, self.frequency_hz, sample_s, &self.responses)
+            .map(|learner| learner.with_margins(self.margins))
+    }
+
+    /// The learner beside the loop.
+    pub fn learning(&self, sample_s: f64) -> Result<CycleLearning, Failure> {
+        let learner = self.learner(sample_s).map_err(|error| match self.margins {
+            Some(margins) if matches!(error, LearnError::NotConvergent { .. }) => {
+                Failure::bad_input(format!("{error}"), format!("reckoned with: {margins}"))
+            }
+            _ => Failure::input(error),
+        })?;
+        let state = match &self.table {
+            Some(table) => learner.resume(table).map_err(Failure::input)?,
+            None => learner.start(),
+        };
+        Ok(CycleLearning::new(learner, state))
+    }
+}
+
+/// Name of the file of what was learned, in a run folder.
+pub const LEARNED_TOML: &str = "learned.toml";
+/// Larger than what any run learns, bytes.
+const MOST_BYTES: u64 = 1 << 26;
+
+/// What was learned on a motion.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct NamedTable {
+    /// The motion in words.
+    pub name: String,
+    /// What was learned.
+    pub table: LearnedTable,
+}
+
+/// The file: of a sine and of a script alike.
+#[derive(Debug, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct LearnedFile {
+    #[serde(default)]
+    motion: Vec<NamedTable>,
+}
+
+/// What a run learned; nothing when it left no file. What was learned can be learned again: a file that was cut off is said to
+/// be, and passed over.
+pub fn load_learned(folder: &Path) -> Vec<NamedTable> {
+    let path = folder.join(LEARNED_TOML);
+    let read = match cellpos_table::read_text(&path, MOST_BYTES) {
+        Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Vec::new(),
+        Err(error) => Err(format!("{}: {error}", path.display())),
+        Ok(text) => tables(&text, &path.display().to_string()).map_err(|failure| failure.text()),
+    };
+    read.unwrap_or_else(|problem| {
+        tracing::warn!("what was learned is left out: {problem}");
+        Vec::new()
+    })
+}
+
+/// The tables of a text. Runs of a sine once held the table alone.
+fn tables(text: &str, name: &str) -> Result<Vec<NamedTable>, Failure> {
+    match crate::toml_file::parse::<LearnedFile>(text, name) {
+        Ok(file) => Ok(file.motion),
+        Err(failure) => match toml::from_str(text) {
+            Ok(table) => Ok(vec![NamedTable {
+                name: "sine".to_owned(),
+                table,
+            }]),
+            Err(_) => Err(failure),
+        },
+    }
+}
+
+/// Writes what was learned into a run folder: whole or not at all.
+///
+/// # Errors
+/// A disk that is full, a folder that is gone.
+pub fn save_learned(folder: &Path, motion: Vec<NamedTable>) -> std::io::Result<()> {
+    if !folder.is_dir() {
+        return Err(std::io::Error::other("the run's folder is gone"));
+    }
+    let file = LearnedFile { motion };
+    let text = toml::to_string_pretty(&file).map_err(std::io::Error::other)?;
+    cellpos_table::write_atomically(&folder.join(LEARNED_TOML), text.as_bytes())
+        .map_err(std::io::Error::other)
+}
+
+/// Reads the table of a sine, to begin with what was learned on it.
+pub fn load_table(path: &Path) -> Result<LearnedTable, Failure> {
+    let name = path.display().to_string();
+    let help = "name the learned.toml of a run of track with --learn";
+    let text = cellpos_table::read_text(path, MOST_BYTES)
+        .map_err(|error| Failure::bad_input(format!("{name}: {error}"), help))?;
+    let mut motions = tables(&text, &name)?;
+    match (motions.pop(), motions.len()) {
+        (Some(motion), 0) => Ok(motion.table),
+        (None, _) => Err(Failure::bad_input(format!("{name}: holds no table"), help)),
+        (Some(_), more) => Err(Failure::bad_input(
+            format!("{name}: holds {} motions, of a script", more + 1),
+            help,
+        )),
+    }
+}
+
+/// Writes what was learned on a sine into a run folder.
+///
+/// # Errors
+/// As [`save_learned`].
+pub fn save_table(folder: &Path, table: &LearnedTable) -> std::io::Result<()> {
+    let name = "sine".to_owned();
+    let table = table.clone();
+    save_learned(folder, vec![NamedTable { name, table }])
+}
+
+/// What was learned, in a line.
+pub fn learned_text(table: &LearnedTable) -> String {
+    let nm =
+        |um: Option<f64>| um.map_or_else(|| "-".to_string(), |um| format!("{:.1} nm", um * 1e3));
+    format!(
+        "{:.0} cycles, measured error {} RMS at first, {} at the end{}{}",
+        table.cycles,
+        nm(table.error_before_um),
+        nm(table.error_after_um),
+        match table.retreats {
+            0 => String::new(),
+            n => format!("; {n} retreats"),
+        },
+        table
+            .margins
+            .map_or_else(String::new, |margins| format!("; reckoned with: {margins}"))
+    )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_sine_is_read_as_amplitude_and_frequency_with_their_units() {
+        let sine: Sine = "5um@50Hz".parse().expect("a sine");
+        assert_eq!(
+            (sine.amplitude.value(), sine.frequency.value()),
+            (5.0, 50.0)
+        );
+        for wrong in ["5um", "5@50Hz", "5um@50", "-1um@50Hz", "5um@0Hz"] {
+            assert!(wrong.parse::<Sine>().is_err(), "{wrong}");
+        }
+    }
+}

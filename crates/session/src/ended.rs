@@ -1,0 +1,382 @@
+//! How a run ended, in sentences: what was seen, what was expected, what to do.
+
+use crate::failure::{Failure, describe};
+use cellpos_rig::{ActuatorFault as Fault, ActuatorState as State};
+use cellpos_runtime::life::{EventKind, Refusal, SafeReason};
+use cellpos_runtime::recorder::RecorderFault;
+use cellpos_runtime::{ArmingConfig, End, Event, Life, RunError, Summary, Timing};
+use serde::Serialize;
+use std::fmt;
+
+/// The kinds of end that a program may want to steer by.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum EndKind {
+    /// It ran as long as it was to.
+    Done,
+    /// The reference generator came to its end: a script, an excitation.
+    ReferenceOver,
+    /// The operator ended it; the bead was frozen, then the PZT parked.
+    Operator,
+    /// The loop was never closed: the plant did not answer the arming pulse as the model says, or no bead was seen.
+    ArmingRefused,
+    /// The loop went safe while it ran.
+    Safe,
+    /// The run could no longer be recorded.
+    Unrecorded,
+    /// A device or a thread failed.
+    Failed,
+}
+
+/// How a run ended.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Ended {
+    /// In a word.
+    pub kind: EndKind,
+    /// Why arming was refused, where it was.
+    pub refusal: Option<Refusal>,
+    /// Why Safe was latched, where it was.
+    pub reason: Option<SafeReason>,
+    /// What was seen.
+    pub seen: String,
+    /// What was expected; empty where nothing went wrong.
+    pub expected: String,
+    /// What to do; empty where there is nothing.
+    pub to_do: String,
+}
+
+impl Ended {
+    /// Whether it ended as it was asked to.
+    pub fn as_asked(&self) -> bool {
+        matches!(
+            self.kind,
+            EndKind::Done | EndKind::ReferenceOver | EndKind::Operator
+        )
+    }
+}
+
+impl Ended {
+    /// As the failure of a command that needed another end; `help` says how to go on.
+    pub fn failure(&self, help: &str) -> Failure {
+        let advice = [self.to_do.as_str(), help];
+        let advice = advice.iter().filter(|part| !part.is_empty());
+        let help = advice.copied().collect::<Vec<_>>().join("; ");
+        let expected = match self.expected.is_empty() {
+            true => String::new(),
+            false => format!("; expected {}", self.expected),
+        };
+        Failure::Failed(miette::miette!(help = help, "{}{expected}", self.seen))
+    }
+}
+
+impl fmt::Display for Ended {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&self.seen)?;
+        for (before, part) in [("; expected ", &self.expected), ("; ", &self.to_do)] {
+            if !part.is_empty() {
+                write!(f, "{before}{part}")?;
+            }
+        }
+        Ok(())
+    }
+}
+
+/// The last of what says why a run ended, gathered from its events.
+#[derive(Debug, Clone, Copy, Default)]
+pub(crate) struct Clues {
+    arming: Option<(Refusal, f64, f64)>,
+    /// Tick of the refusal.
+    refused_at: u64,
+    board: Option<(State, Fault)>,
+    late_us: Option<f64>,
+    stale_ms: Option<f64>,
+    vision_ms: Option<[f64; 2]>,
+}
+
+impl Clues {
+    pub(crate) fn note(&mut self, event: &Event) {
+        match event.kind {
+            EventKind::ArmingRefused {
+                refusal,
+                gain_ratio,
+                ci95,
+            } => {
+                self.arming = Some((refusal, gain_ratio, ci95));
+                self.refused_at = event.seq;
+            }
+            EventKind::BoardChanged { state, fault } => self.board = Some((state, fault)),
+            EventKind::LateTick { compute_us } => self.late_us = Some(compute_us),
+            EventKind::FrameStale { age_ms } => self.stale_ms = Some(age_ms),
+            EventKind::VisionSlowStarted {
+                vision_ms,
+                period_ms,
+            } => self.vision_ms = Some([vision_ms, period_ms]),
+            _ => {}
+        }
+    }
+}
+
+/// What the loop was set up to expect.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Expected {
+    pub(crate) timing: Timing,
+    pub(crate) arming: ArmingConfig,
+}
+
+/// Three sentences: seen, expected, what to do.
+type Sentences = (String, String, String);
+
+fn sentences(seen: impl Into<String>, expected: impl Into<String>, to_do: &str) -> Sentences {
+    (seen.into(), expected.into(), to_do.to_string())
+}
+
+impl Clues {
+    /// How a run ended, by its summary, its trouble and these clues.
+    pub(crate) fn ended(
+        &self,
+        summary: &Summary,
+        trouble: Option<&RunError>,
+        recorder: Option<RecorderFault>,
+        expected: &Expected,
+    ) -> Ended {
+        let refusal = self.arming.map(|(refusal, ..)| refusal);
+        let refused = summary.safe_reason == Some(SafeReason::ArmingRefused);
+        let by_operator = summary.end == End::Operator
+            || summary.safe_reason == Some(SafeReason::Operator)
+            || trouble.is_none() && summary.state != Life::Safe && summary.end == End::Safe;
+        let kind = match (trouble, summary.state) {
+            (Some(_), _) => EndKind::Failed,
+            _ if recorder.is_some() => EndKind::Unrecorded,
+            _ if by_operator => EndKind::Operator,
+            (None, Life::Safe) if refused => EndKind::ArmingRefused,
+            (None, Life::Safe) => EndKind::Safe,
+            (None, Life::Armed | Life::Disarmed) => EndKind::ArmingRefused,
+            (None, Life::Running) if summary.end == End::Script => EndKind::ReferenceOver,
+            (None, Life::Running) => EndKind::Done,
+        };
+        let (seen, wanted, to_do) = match kind {
+            EndKind::Done => sentences("the time of the run was over", "", ""),
+            EndKind::ReferenceOver => sentences("the reference came to its end", "", ""),
+            EndKind::Operator => sentences("the operator ended the run", "", ""),
+            EndKind::Unrecorded => sentences(
+                recorder.map_or("the run was not recorded", RecorderFault::sentence),
+                "a disk that takes what is recorded",
+                "make room, or name another folder with --runs; what was written is kept",
+            ),
+            EndKind::Failed => trouble.map_or_else(Default::default, failed),
+            EndKind::ArmingRefused if refused => self.refused(expected),
+            EndKind::ArmingRefused => sentences(
+                "the time of the run was over before the loop was closed",
+                "a bead held steadily in view, and time for the arming pulse",
+                "bring a bead into view, or run longer",
+            ),
+            EndKind::Safe => self.safe(summary.safe_reason, expected),
+        };
+        Ended {
+            kind,
+            refusal: refusal.filter(|_| kind == EndKind::ArmingRefused),
+            reason: summary.safe_reason,
+            seen,
+            expected: wanted,
+            to_do,
+        }
+    }
+
+    fn refused(&self, expected: &Expected) -> Sentences {
+        let arming = &expected.arming;
+        let Some((refusal, ratio, ci95)) = self.arming else {
+            return sentences(
+                "the arming pulse was refused",
+                "an answer as the model says",
+                "see events.jsonl in the run folder",
+            );
+        };
+        let gain = format!("{ratio:+.2} of the model's gain (95 %: +-{ci95:.2})");
+        let range = format!("{} to {}", arming.lowest_ratio, arming.highest_ratio);
+        match refusal {
+            Refusal::NoBead if self.refused_at < u64::from(arming.patience_ticks) => sentences(
+                "the bead was in view, and was lost while the arming pulse moved it",
+                format!(
+                    "positions in half of the {} ticks of the pulse at least",
+                    2 * arming.pulse_ticks
+                ),
+                "is it the bead that is followed, and not dirt? If vision refuses fast motion, see [tracking] in rig.toml; a \
+                 tracker must know what is commanded (CommandedFlow)",
+            ),
+            Refusal::NoBead => sentences(
+                format!(
+                    "no bead was steadily in view for {} ticks",
+                    arming.patience_ticks
+                ),
+                format!("{} good positions in a row", arming.steady_ticks),
+                "bring a bead into view and into focus (cellpos camera and cellpos vision show what is seen), then start again",
+            ),
+            Refusal::NoResponse => sentences(
+                format!(
+                    "the bead did not move with the PZT: {gain} after a pulse of {} um",
+                    arming.pulse_um
+                ),
+                format!("{range} of it"),
+                "is the amplifier on, the syringe connected, the bead free of the wall?",
+            ),
+            Refusal::WrongSign => sentences(
+                format!("the bead moved against the PZT: {gain}"),
+                format!("{range} of it: the same sign"),
+                "turn round `sign` in [calibration] of rig.toml: the camera's axis points the other way",
+            ),
+            Refusal::WrongGain => sentences(
+                format!("the bead moved by {gain}"),
+                format!("{range} of it, for which the controller is stable"),
+                "check pixel_um and um per volt; if both are right measure this rig (cellpos identify) and design for it (cellpos \
+                 design)",
+            ),
+        }
+    }
+
+    fn safe(&self, reason: Option<SafeReason>, expected: &Expected) -> Sentences {
+        let timing = &expected.timing;
+        let in_a_row = timing.faults_in_a_row;
+        let lost_ms = f64::from(timing.lost_ticks) * timing.period_us * 1e-3;
+        let last = |value: Option<f64>, unit: &str| {
+            value.map_or_else(String::new, |v| format!(", the last {v:.1} {unit}"))
+        };
+        match reason {
+            Some(SafeReason::BeadLost) => sentences(
+                format!("frames came, and no bead in them, for {lost_ms:.0} ms"),
+                "the bead in view",
+                "bring a bead into view and start again; a faster flow than the loop can hold shows as drift before the loss",
+            ),
+            Some(SafeReason::CameraLost) => sentences(
+                format!("no frame came for {lost_ms:.0} ms"),
+                format!("one every {} ms", timing.period_us * 1e-3),
+                "check cable, power and trigger of the camera (cellpos camera shows what it delivers)",
+            ),
+            Some(SafeReason::StaleFrames) => sentences(
+                format!(
+                    "more than {in_a_row} frames in a row were old or repeated{}",
+                    last(self.stale_ms, "ms old")
+                ),
+                format!("new frames not older than {} ms", timing.oldest_ms),
+                "check the camera's buffers and [timing] camera_delay_ms (cellpos camera shows ages)",
+            ),
+            Some(SafeReason::LateTicks) => sentences(
+                format!(
+                    "more than {in_a_row} commands in a row were late{}",
+                    last(self.late_us, "us after the tick began")
+                ),
+                format!("within {} us", timing.budget_us),
+                "run cellpos doctor; close other programs, or choose a lighter controller",
+            ),
+            Some(SafeReason::Board) => self.board(),
+            Some(SafeReason::LinkLost) => sentences(
+                format!(
+                    "nothing was heard of the board for {} ms",
+                    timing.board_silence_ms
+                ),
+                "a status every 10 ms",
+                "check cable and power of the board; its own watchdog has parked the PZT",
+            ),
+            Some(SafeReason::NotFinite) => sentences(
+                "the controller's output was not a number",
+                "a displacement, um",
+                "keep the run folder: this is a defect, or a controller.toml that no loop can use",
+            ),
+            Some(SafeReason::VisionSlow) => sentences(
+                match self.vision_ms {
+                    Some([vision_ms, period_ms]) => format!(
+                        "vision takes {vision_ms:.1} ms a frame of {period_ms:.1}: frames piled up and grew old"
+                    ),
+                    None => "vision takes longer for a frame than the camera: frames piled up and grew old".to_string(),
+                },
+                format!("new frames not older than {} ms", timing.oldest_ms),
+                "choose a smaller region (origin_px, width_px), a lower frame rate, or a faster machine",
+            ),
+            Some(SafeReason::Stalled) => sentences(
+                "the loop stood still for more than a second",
+                format!("a tick every {} ms", timing.period_us * 1e-3),
+                "see that nothing suspends this program or this machine; the board has stopped the bead by itself",
+            ),
+            Some(SafeReason::BoardForeign) => sentences(
+                "another host has armed the board during the run",
+                "a board in this run's session alone",
+                "see that one program uses the board, then start again",
+            ),
+            Some(SafeReason::BoardNotObeying) => sentences(
+                "the board talked, and obeyed no command for 100 ms",
+                "a sequence number that moves with the commands",
+                "check the line to the board for damaged frames, and its baud rate",
+            ),
+            Some(SafeReason::BoardNotFollowing) => sentences(
+                "for 100 ms the board's output stood where no command was",
+                "an output within 0.2 um of the commands of the last 30 ms",
+                "check the limits of the board against [limits], and its amplifier",
+            ),
+            Some(SafeReason::ActuatorRingFull) => sentences(
+                format!("more than {in_a_row} commands in a row could not be handed to the board"),
+                "a line that takes a command every tick",
+                "check the baud rate and the line of the board",
+            ),
+            other => sentences(
+                format!("the loop went safe ({})", word(&other)),
+                "a loop that runs",
+                "see events.jsonl in the run folder",
+            ),
+        }
+    }
+
+    fn board(&self) -> Sentences {
+        let why = match self.board {
+            Some((_, Fault::CommandTimeout)) => {
+                "the board parked the PZT by itself: no command came within both its watchdog times; this program was stopped, or the \
+                 line was blocked"
+            }
+            Some((_, Fault::FreezeTimeout)) => {
+                "the board parked the PZT by itself: nothing ended a freeze"
+            }
+            Some((_, Fault::ArmTimeout)) => {
+                "the board parked the PZT by itself: armed, and no command followed"
+            }
+            Some((State::Disarmed, _)) => {
+                "the board is disarmed: another host did it, or it was switched off and on"
+            }
+            Some((State::Safe, _)) => "the board was told to park by another host",
+            Some((_, Fault::Device)) => {
+                "the board reports a fault of its own: temperature, current, supply or converter"
+            }
+            _ => "the board is in another state or session than this run's",
+        };
+        sentences(
+            why,
+            "a board that follows this run's commands alone",
+            "see that one program uses the board, and that this one is not suspended; then start again",
+        )
+    }
+}
+
+fn word(reason: &Option<SafeReason>) -> String {
+    match reason.map(serde_json::to_value) {
+        Some(Ok(serde_json::Value::String(word))) => word,
+        _ => "no reason given".to_string(),
+    }
+}
+
+fn failed(error: &RunError) -> Sentences {
+    let seen = describe(error);
+    match error {
+        RunError::Camera(_) => sentences(
+            seen,
+            "a camera that delivers until the run ends",
+            "check its cable and power, then start again",
+        ),
+        RunError::Actuator(_) => sentences(
+            seen,
+            "a board that answers until the run ends",
+            "check its cable and power; its own watchdog parks the PZT",
+        ),
+        _ => sentences(
+            seen,
+            "a run without trouble in the program itself",
+            "keep the run folder: this is worth a report",
+        ),
+    }
+}

@@ -1,0 +1,62 @@
+//! Why a session could not do its work.
+
+/// Why something could not be done.
+#[derive(Debug)]
+pub enum Failure {
+    /// The user can put it right: a file, key, value or argument. Exit code 2.
+    BadInput(miette::Report),
+    /// Something failed on the way: a device, a full disk, the loop. Exit code 1.
+    Failed(miette::Report),
+}
+
+impl Failure {
+    /// Bad input, with a help line that says what would be right.
+    pub fn bad_input(error: impl std::fmt::Display, help: impl std::fmt::Display) -> Self {
+        Self::BadInput(miette::miette!(help = help.to_string(), "{error}"))
+    }
+
+    /// A failure on the way, in the words of its error and of the errors behind it.
+    pub fn failed(error: impl std::error::Error + Send + Sync + 'static) -> Self {
+        Self::Failed(miette::Report::from_err(error))
+    }
+
+    /// In a line.
+    pub fn text(&self) -> String {
+        match self {
+            Self::BadInput(report) | Self::Failed(report) => report.to_string(),
+        }
+    }
+
+    /// Bad input, in the words of a library's error.
+    pub fn input(error: impl std::error::Error + Send + Sync + 'static) -> Self {
+        Self::BadInput(miette::Report::from_err(error))
+    }
+}
+
+impl std::fmt::Display for Failure {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::BadInput(report) | Self::Failed(report) => report.fmt(f),
+        }
+    }
+}
+
+impl std::error::Error for Failure {
+    fn source(&self) -> Option<&(dyn std::error::Error + 'static)> {
+        match self {
+            Self::BadInput(report) | Self::Failed(report) => report.source(),
+        }
+    }
+}
+
+/// An error with what is behind it, on one line.
+pub fn describe(error: &dyn std::error::Error) -> String {
+    let mut text = error.to_string();
+    let mut source = error.source();
+    while let Some(error) = source {
+        text.push_str(": ");
+        text.push_str(&error.to_string());
+        source = error.source();
+    }
+    text
+}

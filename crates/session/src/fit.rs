@@ -1,0 +1,58 @@
+//! A controller fitted to a rig: its limits, what the camera sees, how long a frame is exposed.
+
+use crate::Failure;
+use crate::prepared::Prepared;
+use crate::rig_file::{CameraConfig, Connected, RigFile};
+use crate::setup;
+use cellpos_control::ControllerKind;
+use cellpos_plant::Model;
+use cellpos_plant::effects::Action;
+
+/// Narrows the controller's limits to what rig file and board allow, and the positions that MPC plans for to what the
+/// camera sees; tells the estimator how long a frame is exposed.
+pub(crate) fn narrow(setup: &mut Prepared, file: &RigFile, rig: &Connected) {
+    let board = rig.actuator.info();
+    let own = setup.controller.limits;
+    let asked = setup::within(file.limits, [own.low_um, own.high_um, own.slew_um_per_s]);
+    setup.controller.limits =
+        setup::within(asked, [board.low_um, board.high_um, board.slew_um_per_s]);
+    let exposure_ms = 1e3 * exposure_s(file, &setup.model);
+    let estimator = &mut setup.controller.estimator;
+    if estimator.exposure_ms == 0.0 && exposure_ms <= file.timing.period_us * 1e-3 {
+        estimator.exposure_ms = exposure_ms;
+    }
+    let [low_um, high_um] = rig.source.info().field_um;
+    if setup.controller.controller == ControllerKind::Mpc && low_um < high_um {
+        let mpc = &mut setup.controller.mpc;
+        let given = |view_um: Option<f64>| view_um.filter(|um| um.is_finite());
+        mpc.view_low_um = given(Some(mpc.view_low_um.map_or(low_um, |um| um.max(low_um))));
+        mpc.view_high_um = given(Some(mpc.view_high_um.map_or(high_um, |um| um.min(high_um))));
+    }
+}
+
+/// How long a frame is exposed, s, where the rig file says so.
+pub fn stated_exposure_s(file: &RigFile) -> Option<f64> {
+    match &file.camera {
+        CameraConfig::Emulated {} => Some(file.emulator.exposure_ms * 1e-3),
+        CameraConfig::Industrial { exposure_us, .. } => exposure_us.map(|us| us * 1e-6),
+        CameraConfig::Socket { .. } => None,
+    }
+}
+
+/// How long a frame is exposed, s: as the rig file says, else as the model does; 0 where nobody does.
+fn exposure_s(file: &RigFile, model: &Model) -> f64 {
+    let of_model = || {
+        model.effects.iter().find_map(|effect| match effect.act() {
+            Action::Exposure(exposure_s) => Some(exposure_s),
+            _ => None,
+        })
+    };
+    stated_exposure_s(file).or_else(of_model).unwrap_or(0.0)
+}
+
+/// Model and controller by their options, before a board is known.
+pub fn prepare(model: &str, controller: &str, file: &RigFile) -> Result<Prepared, Failure> {
+    let model = Model::load(model).map_err(Failure::input)?;
+    let controller = setup::controller(controller, &model, &file.timing)?;
+    Ok(Prepared { model, controller })
+}

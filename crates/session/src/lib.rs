@@ -1,0 +1,57 @@
+//! A rig in hand, from its file to the end of a run.
+//!
+//! [`Rig`] (connected, nothing moves) -> [`Armed`] (the board waits for its first command) -> [`Running`] (the loop runs on
+//! threads of its own) -> [`Finished`] (parked; how it ended, in sentences). The board is armed last, when everything else is
+//! ready, and whatever holds it parks it when it is dropped: on an error, on a panic, at the end. Real-time rights and locked
+//! memory end with the run. A program calls [`signals::listen`] first thing, and Ctrl-C freezes and parks.
+//!
+//! ```
+//! use cellpos_runtime::{EndRule, NoSink};
+//! use cellpos_session::setup::ReferenceSpec;
+//! use cellpos_session::{Failure, Options, Rig, RigFile};
+//!
+//! # fn main() -> Result<(), Failure> {
+//! // Another rig: RigFile::load(Some("rig.toml".as_ref()))? with Options::default().
+//! let mut rig = Rig::open(RigFile::load(None)?, Options::rehearsal())?;
+//! let prepared = rig.prepare("eq6", "pi")?;
+//! let setup = rig.set_up(prepared, ReferenceSpec::Hold { position_um: 2.0 })?;
+//! let end = EndRule { ticks: Some(3000), ..EndRule::default() };
+//! let finished = rig.arm(&setup, setup.core()?, NoSink, end)?.start()?.wait()?;
+//! assert!(finished.ended.as_asked(), "{}", finished.ended);
+//! assert!(finished.summary.rms_true_nm.is_some_and(|nm| nm < 100.0));
+//! # Ok(())
+//! # }
+//! ```
+#![forbid(unsafe_code)]
+
+pub mod connect;
+pub mod cyclic;
+mod devices;
+pub mod ended;
+mod failure;
+mod fit;
+mod prepared;
+pub mod provenance;
+pub mod quantities;
+mod real_time;
+pub mod recording;
+mod rig;
+pub mod rig_file;
+pub mod say;
+pub mod setup;
+pub mod signals;
+pub mod toml_file;
+pub mod view;
+mod witness;
+pub mod words;
+
+pub use devices::Options;
+pub use ended::{EndKind, Ended};
+pub use failure::Failure;
+pub use rig::{Armed, Finished, NotArmed, Rig, Running};
+pub use rig_file::RigFile;
+
+/// The README's Rust is compiled and run.
+#[cfg(doctest)]
+#[doc = include_str!("../../../README.md")]
+struct Readme;

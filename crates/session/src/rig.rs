@@ -1,0 +1,493 @@
+//! A rig in hand, as types: [`Rig`] -> [`Armed`] -> [`Running`] -> [`Finished`].
+
+use crate::devices::{Devices, Options, check_armed, session_number};
+use crate::ended::{Clues, Ended, Expected};
+use crate::failure::Failure;
+use crate::fit;
+use crate::real_time::LockedMemory;
+use crate::rig_file::{ClockKind, Connected, RigFile};
+use crate::setup::{Prepared, ReferenceSpec, Setup, SetupConfig};
+use crate::signals::{self, Place};
+use crate::witness::Witness;
+use cellpos_control::LearnedTable;
+use cellpos_rig::{
+    Actuator, ActuatorInfo, ArmRequest, Clock, FrameWatch, PositionSource, SourceInfo,
+};
+use cellpos_runtime::live::{Operator, Threads};
+use cellpos_runtime::realtime::Conditions;
+use cellpos_runtime::recorder::RecorderReport;
+use cellpos_runtime::{
+    Core, EndRule, ReferenceGenerator, RunError, RunSink, Statistics, Summary, live, virtual_run,
+};
+use std::sync::Arc;
+use std::thread::JoinHandle;
+use std::time::Duration;
+
+/// A rig that is connected and not armed: the PZT is at park or on its way there.
+pub struct Rig {
+    file: RigFile,
+    options: Options,
+    devices: Devices,
+    operator: Arc<Operator>,
+    /// Whether nothing was armed on it yet.
+    fresh: bool,
+}
+
+impl Rig {
+    /// Connects camera and board. Nothing moves.
+    ///
+    /// # Errors
+    /// A value of the rig file that cannot be, or a device that does not answer.
+    pub fn open(file: RigFile, options: Options) -> Result<Self, Failure> {
+        let connected = file.connect(options.clock, options.frames)?;
+        Ok(Self::of(file, options, connected))
+    }
+
+    /// A rig of devices that no rig file knows: any stream of positions, any actuator. Of `file` the loop's part is taken:
+    /// limits, times, arming. `clock` is the one that the stamps of the positions are of; where it is virtual, nothing in the
+    /// devices may wait for the machine's.
+    ///
+    /// # Errors
+    /// Never in practice: the nominal model is built in.
+    pub fn with_devices(
+        file: RigFile,
+        options: Options,
+        source: Box<dyn PositionSource>,
+        actuator: Box<dyn Actuator>,
+        clock: Clock,
+    ) -> Result<Self, Failure> {
+        let connected = Connected::of(source, actuator, clock)?;
+        Ok(Self::of(file, options, connected))
+    }
+
+    fn of(file: RigFile, options: Options, connected: Connected) -> Self {
+        Self {
+            file,
+            options,
+            devices: Devices {
+                connected,
+                armed: false,
+            },
+            operator: Arc::default(),
+            fresh: true,
+        }
+    }
+
+    /// The rig's file.
+    pub fn file(&self) -> &RigFile {
+        &self.file
+    }
+
+    /// How it is used.
+    pub fn options(&self) -> Options {
+        self.options
+    }
+
+    /// Its clock.
+    pub fn clock(&self) -> &Clock {
+        &self.devices.connected.clock
+    }
+
+    /// What the board says of itself.
+    pub fn actuator(&self) -> ActuatorInfo {
+        self.devices.connected.actuator.info()
+    }
+
+    /// What the camera says of itself.
+    pub fn source(&self) -> SourceInfo {
+        self.devices.connected.source.info()
+    }
+
+    /// Shows each new frame to `watch` from now on; `false` where the rig has no frames.
+    pub fn watch(&mut self, watch: Box<dyn FrameWatch>) -> bool {
+        self.devices.connected.source.watch(watch)
+    }
+
+    /// Who may ask the next run on this rig for freeze, park, pause.
+    pub fn operator(&self) -> &Arc<Operator> {
+        &self.operator
+    }
+
+    /// What the user should know of it.
+    pub fn warnings(&self) -> &[String] {
+        &self.devices.connected.warnings
+    }
+
+    /// Model and controller by their options (`eq6` or a path; `pi`, `lead`, `lqg`, `mpc` or a path), fitted to this rig as
+    /// [`Rig::fit`] does.
+    ///
+    /// # Errors
+    /// No such model or controller, or one that is made for another delay.
+    pub fn prepare(&self, model: &str, controller: &str) -> Result<Prepared, Failure> {
+        let mut prepared = fit::prepare(model, controller, &self.file)?;
+        self.fit(&mut prepared);
+        Ok(prepared)
+    }
+
+    /// Narrows a controller's limits to what rig file and board allow, and the positions that it plans for to what the camera
+    /// sees; tells the estimator how long a frame is exposed, and the tracker which plant to expect.
+    pub fn fit(&self, prepared: &mut Prepared) {
+        self.devices.connected.expect(&prepared.model);
+        fit::narrow(prepared, &self.file, &self.devices.connected);
+    }
+
+    /// Completes the set-up with where the PZT stands. A PZT that is still on its way to park is waited for, at most ten
+    /// seconds.
+    ///
+    /// # Errors
+    /// The board cannot be read, or the PZT does not come to rest.
+    pub fn set_up(
+        &mut self,
+        prepared: Prepared,
+        reference: ReferenceSpec,
+    ) -> Result<Setup, Failure> {
+        let disagrees = crate::setup::model_delay_warning(&prepared.model, &self.file.timing);
+        self.devices.connected.warnings.extend(disagrees);
+        Ok(Setup {
+            config: SetupConfig {
+                displacement_um: self
+                    .standing_um()?
+                    .unwrap_or(prepared.controller.limits.park_um),
+                neutral_um: self.file.first_neutral_um,
+                reference,
+                timing: self.file.timing,
+                arming: self.file.arming,
+                learn: None,
+                motions: Vec::new(),
+            },
+            model: prepared.model,
+            controller: prepared.controller,
+        })
+    }
+
+    /// Where the PZT stands, um; `None` where the board says nothing before it is armed (it is at park then).
+    fn standing_um(&mut self) -> Result<Option<f64>, Failure> {
+        const PATIENCE: Duration = Duration::from_secs(10);
+        const SILENCE: Duration = Duration::from_millis(300);
+        const LOOK_EVERY: Duration = Duration::from_millis(15);
+        let connected = &mut self.devices.connected;
+        let mut last: Option<f64> = None;
+        let start_ns = connected.clock.now_ns();
+        loop {
+            let report = connected.actuator.poll().map_err(Failure::failed)?;
+            if let Some(report) = report {
+                // What was just switched on, in this process, has not moved yet.
+                let still = self.fresh && connected.clock.is_virtual();
+                if still || last == Some(report.applied_um) {
+                    return Ok(Some(report.applied_um));
+                }
+                last = Some(report.applied_um);
+            }
+            let waited = Duration::from_nanos((connected.clock.now_ns() - start_ns).max(0) as u64);
+            if last.is_none() && waited > SILENCE {
+                return Ok(None);
+            }
+            if waited > PATIENCE {
+                return Err(Failure::bad_input(
+                    format!(
+                        "the PZT does not come to rest: it is at {:.3} um and still moving after {} s",
+                        last.unwrap_or(f64::NAN),
+                        PATIENCE.as_secs()
+                    ),
+                    "does another program use the board?",
+                ));
+            }
+            connected.clock.sleep(LOOK_EVERY);
+        }
+    }
+
+    /// Arms the board: the last thing before the loop runs, when folder, script, loop and recorder are ready. The sink comes
+    /// back where it fails, so that what is in it is not lost.
+    ///
+    /// # Errors
+    /// A stop was asked for, the board refused, or it is not where or what it has to be. It is disarmed again.
+    pub fn arm<R, S>(
+        mut self,
+        setup: &Setup,
+        core: Core<R>,
+        sink: S,
+        end: EndRule,
+    ) -> Result<Armed<R, S>, Box<NotArmed<S>>> {
+        match self.try_arm(setup) {
+            Ok((place, memory)) => Ok(Armed {
+                rig: self,
+                core,
+                sink,
+                end,
+                expected: Expected {
+                    timing: setup.config.timing,
+                    arming: setup.config.arming,
+                },
+                _memory: memory,
+                _place: place,
+            }),
+            Err(failure) => Err(Box::new(NotArmed {
+                failure,
+                sink,
+                rig: self,
+            })),
+        }
+    }
+
+    fn try_arm(&mut self, setup: &Setup) -> Result<(Place, Option<LockedMemory>), Failure> {
+        let memory = match self.options {
+            Options {
+                best_effort: false,
+                clock: ClockKind::Real,
+                ..
+            } => LockedMemory::lock(),
+            _ => None,
+        };
+        let place = signals::hold(&self.operator).map_err(Failure::failed)?;
+        let limits = setup.controller.limits;
+        let own = self.actuator();
+        let id = if self.clock().is_virtual() {
+            1
+        } else {
+            session_number()
+        };
+        let [watchdog_ms, hold_watchdog_ms] = self.file.watchdogs_ms();
+        let session = ArmRequest {
+            session: id,
+            park_um: limits.park_um,
+            // The rig's own slew limit: a controller may ask for less from tick to tick, but what it asks for is to be reached
+            // as early in the tick as the rig allows.
+            limits: [
+                limits.low_um,
+                limits.high_um,
+                self.file.limits.slew_um_per_s.min(own.slew_um_per_s),
+            ],
+            watchdog_ms,
+            hold_watchdog_ms,
+        };
+        self.fresh = false;
+        let expected_um = setup.config.displacement_um;
+        if let Err(failure) = self.arm_board(&session, expected_um, own.step_um) {
+            // While the place is held: no signal ends the program before the board is parked.
+            self.devices.disarm();
+            return Err(failure);
+        }
+        Ok((place, memory))
+    }
+
+    fn arm_board(
+        &mut self,
+        request: &ArmRequest,
+        expected_um: f64,
+        step_um: f64,
+    ) -> Result<(), Failure> {
+        // From here on the board may be armed, whatever it answers.
+        self.devices.armed = true;
+        let actuator = self.devices.connected.actuator.as_mut();
+        let report = actuator.arm(request).map_err(Failure::failed)?;
+        check_armed(&report, request.session, expected_um, step_um)
+    }
+}
+
+/// Why a rig could not be armed, with everything that was to run on it.
+pub struct NotArmed<S> {
+    /// Why.
+    pub failure: Failure,
+    /// The sink.
+    pub sink: S,
+    /// The rig, disarmed.
+    pub rig: Rig,
+}
+
+impl<S> From<Box<NotArmed<S>>> for Failure {
+    fn from(not_armed: Box<NotArmed<S>>) -> Self {
+        not_armed.failure
+    }
+}
+
+/// A rig whose board is armed and waits for the first command. Dropped, it is parked.
+pub struct Armed<R, S> {
+    // Fields are dropped in this order: the board is parked before the place among those that signals go to is given up.
+    rig: Rig,
+    core: Core<R>,
+    sink: S,
+    end: EndRule,
+    expected: Expected,
+    _memory: Option<LockedMemory>,
+    _place: Place,
+}
+
+impl<R, S> Armed<R, S>
+where
+    R: ReferenceGenerator + Send + 'static,
+    S: RunSink + 'static,
+{
+    /// Who may ask for freeze, park, pause.
+    pub fn operator(&self) -> &Arc<Operator> {
+        &self.rig.operator
+    }
+
+    /// Starts the loop on threads of its own.
+    ///
+    /// # Errors
+    /// No thread could be had; the board is parked.
+    pub fn start(self) -> Result<Running<S>, Failure> {
+        let operator = Arc::clone(&self.rig.operator);
+        let thread = std::thread::Builder::new()
+            .name("cellpos-board".to_string())
+            .spawn(move || self.run())
+            .map_err(Failure::failed)?;
+        Ok(Running {
+            operator,
+            thread: Some(thread),
+        })
+    }
+
+    /// The loop, on the calling thread, which becomes the one that serves the board.
+    fn run(self) -> Result<Finished<S>, Failure> {
+        // Dropped in reverse order where the driver panics: the rig is parked before the place is given up.
+        let Self {
+            _place: place,
+            _memory: memory,
+            mut rig,
+            core,
+            sink,
+            end,
+            expected,
+        } = self;
+        let sink = Witness {
+            sink,
+            clues: Clues::default(),
+        };
+        let operator = std::mem::take(&mut rig.operator);
+        let connected = &mut rig.devices.connected;
+        let (source, actuator) = (connected.source.as_mut(), connected.actuator.as_mut());
+        let statistics = Statistics::default();
+        let finished = if connected.clock.is_virtual() {
+            let asked = |_| operator.take();
+            let clock = &connected.clock;
+            virtual_run::run(core, clock, source, actuator, sink, statistics, end, asked)
+        } else {
+            let threads = if rig.options.best_effort {
+                Threads::best_effort()
+            } else {
+                Threads::real_time()
+            };
+            live::run(
+                core, source, actuator, sink, statistics, end, &threads, &operator,
+            )
+        };
+        // Freezes and parks once more where the driver could not.
+        if finished.as_ref().is_ok_and(|run| run.io_error.is_none()) {
+            rig.devices.armed = false;
+        }
+        rig.devices.disarm();
+        drop((memory, place));
+        let finished = finished.map_err(Failure::failed)?;
+        let Witness { sink, clues } = finished.sink;
+        Ok(Finished {
+            ended: clues.ended(
+                &finished.summary,
+                finished.io_error.as_ref(),
+                finished.recorder.fault,
+                &expected,
+            ),
+            rig,
+            summary: finished.summary,
+            conditions: finished.conditions,
+            learned: finished.learned,
+            recorder: finished.recorder,
+            trouble: finished.io_error,
+            sink,
+        })
+    }
+}
+
+/// A loop that runs. Dropped, it is told to park, and waited for.
+pub struct Running<S> {
+    operator: Arc<Operator>,
+    thread: Option<JoinHandle<Result<Finished<S>, Failure>>>,
+}
+
+impl<S> Running<S> {
+    /// Who may ask for freeze, park, pause.
+    pub fn operator(&self) -> &Arc<Operator> {
+        &self.operator
+    }
+
+    /// Whether it has come to its end.
+    pub fn is_over(&self) -> bool {
+        self.thread.as_ref().is_none_or(JoinHandle::is_finished)
+    }
+
+    /// Waits for its end.
+    ///
+    /// # Errors
+    /// The run could not be carried through; the PZT is parked.
+    pub fn wait(self) -> Result<Finished<S>, Failure> {
+        self.wait_with(Duration::from_secs(3600), || {})
+    }
+
+    /// Waits for its end, and does something now and then meanwhile.
+    ///
+    /// # Errors
+    /// The run could not be carried through; the PZT is parked.
+    pub fn wait_with(
+        mut self,
+        every: Duration,
+        mut meanwhile: impl FnMut(),
+    ) -> Result<Finished<S>, Failure> {
+        const LOOK_EVERY: Duration = Duration::from_millis(5);
+        let Some(thread) = self.thread.take() else {
+            return Err(panicked());
+        };
+        let guard = ParkOnPanic(&self.operator);
+        let mut next = std::time::Instant::now() + every;
+        while !thread.is_finished() {
+            std::thread::sleep(LOOK_EVERY);
+            if std::time::Instant::now() >= next {
+                meanwhile();
+                next = std::time::Instant::now() + every;
+            }
+        }
+        std::mem::forget(guard);
+        thread.join().unwrap_or_else(|_| Err(panicked()))
+    }
+}
+
+/// Parks when whoever waits for a run panics.
+struct ParkOnPanic<'a>(&'a Operator);
+
+impl Drop for ParkOnPanic<'_> {
+    fn drop(&mut self) {
+        self.0.ask(cellpos_runtime::Request::Park);
+    }
+}
+
+fn panicked() -> Failure {
+    Failure::failed(RunError::Panicked { thread: "session" })
+}
+
+impl<S> Drop for Running<S> {
+    fn drop(&mut self) {
+        if let Some(thread) = self.thread.take() {
+            self.operator.ask(cellpos_runtime::Request::Park);
+            let _ = thread.join();
+        }
+    }
+}
+
+/// A run that is over; the PZT is at park or on its way there.
+pub struct Finished<S> {
+    /// How it ended, in sentences.
+    pub ended: Ended,
+    /// The rig, disarmed: it may be armed again.
+    pub rig: Rig,
+    /// Its figures.
+    pub summary: Summary,
+    /// Real-time conditions of the control thread.
+    pub conditions: Conditions,
+    /// What was learned over cycles, for each periodic motion of the reference; `None`: without a learner.
+    pub learned: Vec<Option<LearnedTable>>,
+    /// How the recording went.
+    pub recorder: RecorderReport,
+    /// What went wrong on a thread beside control, if anything did.
+    pub trouble: Option<RunError>,
+    /// The sink, with all that it was given.
+    pub sink: S,
+}

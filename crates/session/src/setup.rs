@@ -1,0 +1,364 @@
+//! Everything that determines the commands of a run, in a form that is written into the run folder and read back by a
+//! replay.
+
+use crate::Failure;
+use crate::cyclic::LearnSpec;
+pub use crate::prepared::Prepared;
+use cellpos_control::design::{
+    DesignPlant, DesignRequest, PiSearch, Requested, default_lead, design,
+};
+use cellpos_control::{
+    Controller, ControllerConfig, ControllerFile, ControllerKind, Limits, Profile, Shape,
+};
+use cellpos_plant::Model;
+use cellpos_runtime::{
+    ArmingConfig, Core, Learners, ReferenceGenerator, ReferenceInput, ReferenceOutput, Steered,
+    Timing,
+};
+use cellpos_script::{Follower, Plan, Script};
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+use std::path::Path;
+use std::sync::Arc;
+
+/// What the bead is to follow.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "kind", rename_all = "kebab-case", deny_unknown_fields)]
+pub enum ReferenceSpec {
+    /// Go to a position and hold it.
+    Hold {
+        /// Position, um.
+        position_um: f64,
+    },
+    /// A sine about a position.
+    Sine {
+        /// Position in the middle, um.
+        centre_um: f64,
+        /// Half of peak to peak, um.
+        amplitude_um: f64,
+        /// Frequency, Hz.
+        frequency_hz: f64,
+        /// Time over which it comes in, s.
+        fade_s: f64,
+    },
+    /// Follow a script.
+    Script {
+        /// Its file, for messages.
+        file: String,
+        /// Its text.
+        text: String,
+        /// Time of the plan at which the session begins, s.
+        from_s: f64,
+        /// Time that the script ran in the sessions before, s; left out: as long as the plan says.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        ran_s: Option<f64>,
+        /// Length of the cell when the run began, um, for a session that goes on with it.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        first_length_um: Option<f64>,
+        /// Texts of the waveforms that it names.
+        #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+        waveforms: BTreeMap<String, String>,
+    },
+}
+
+/// What generates the reference of a loop: a position, or a script.
+#[derive(Debug, Clone)]
+pub enum AnyReference {
+    /// A position that the operator may move.
+    Hold(Steered),
+    /// A function of time.
+    Profile(Profile),
+    /// A script.
+    Script(Box<Follower>),
+}
+
+impl ReferenceGenerator for AnyReference {
+    fn step(&mut self, input: &ReferenceInput, preview_um: &mut [f64]) -> ReferenceOutput {
+        match self {
+            Self::Hold(steered) => steered.step(input, preview_um),
+            Self::Profile(profile) => ReferenceGenerator::step(profile, input, preview_um),
+            Self::Script(follower) => follower.step(input, preview_um),
+        }
+    }
+
+    fn finished(&self) -> bool {
+        match self {
+            Self::Hold(_) | Self::Profile(_) => false,
+            Self::Script(follower) => follower.finished(),
+        }
+    }
+}
+
+impl ReferenceSpec {
+    /// The script, if it is one, read and laid out.
+    pub fn script(&self) -> Result<Option<(Script, Plan)>, Failure> {
+        let Self::Script {
+            file,
+            text,
+            waveforms,
+            ..
+        } = self
+        else {
+            return Ok(None);
+        };
+        let load = |name: &str| {
+            waveforms
+                .get(name)
+                .cloned()
+                .ok_or_else(|| "is not kept with the run".to_string())
+        };
+        let script = Script::parse_with(text, file, &load).map_err(Failure::input)?;
+        let plan = Plan::new(&script).map_err(Failure::input)?;
+        Ok(Some((script, plan)))
+    }
+
+    fn generator(&self, timing: &Timing) -> Result<AnyReference, Failure> {
+        let delay_ticks = (timing.camera_delay_ms * 1e3 / timing.period_us).round() as usize;
+        Ok(match self {
+            Self::Hold { position_um } => AnyReference::Hold(Steered::new(*position_um)),
+            Self::Sine {
+                centre_um,
+                amplitude_um,
+                frequency_hz,
+                fade_s,
+            } => AnyReference::Profile(Profile::Wave {
+                shape: Shape::Sine,
+                centre_um: *centre_um,
+                amplitude_um: *amplitude_um,
+                frequency_hz: *frequency_hz,
+                fade_s: *fade_s,
+            }),
+            Self::Script {
+                from_s,
+                ran_s,
+                first_length_um,
+                ..
+            } => {
+                let plan = self.script()?.map(|(_, plan)| Arc::new(plan));
+                let plan = plan.unwrap_or_else(|| unreachable!("a script has a plan"));
+                let follower = Follower::new(plan, *from_s, delay_ticks)
+                    .with_elapsed(*ran_s)
+                    .with_first_length(*first_length_um);
+                AnyReference::Script(Box::new(follower))
+            }
+        })
+    }
+}
+
+/// A loop before it is built.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Setup {
+    /// The plant that the controller believes in.
+    pub model: Model,
+    /// Controller, estimator and limits.
+    pub controller: ControllerFile,
+    /// The rest.
+    pub config: SetupConfig,
+}
+
+/// The part of a [`Setup`] that has no file of its own.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct SetupConfig {
+    /// PZT displacement at the start, um.
+    pub displacement_um: f64,
+    /// First belief of neutral, um.
+    pub neutral_um: f64,
+    /// What the bead is to follow.
+    pub reference: ReferenceSpec,
+    /// Times and counts of the loop.
+    pub timing: Timing,
+    /// The check before the loop is closed.
+    pub arming: ArmingConfig,
+    /// Learning over cycles, where it is on.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub learn: Option<LearnSpec>,
+    /// Learning on the periodic motions of a script.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub motions: Vec<MotionSpec>,
+}
+
+/// Learning on a periodic motion of a script.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct MotionSpec {
+    /// Number of the motion in the plan.
+    pub motion: u16,
+    /// The motion in words.
+    pub name: String,
+    /// How it is learned.
+    pub learn: LearnSpec,
+}
+
+impl Setup {
+    /// Builds the loop with the reference of the set-up, and the learning on it.
+    ///
+    /// # Errors
+    /// A value that cannot be, named.
+    pub fn core(&self) -> Result<Core<AnyReference>, Failure> {
+        let core = self.core_with(self.law()?)?;
+        let sample_s = self.config.timing.period_us * 1e-6;
+        if let Some(learn) = &self.config.learn {
+            return Ok(core.with_learning(learn.learning(sample_s)?));
+        }
+        let mut learners = Vec::new();
+        for spec in &self.config.motions {
+            let number = usize::from(spec.motion);
+            learners.resize(learners.len().max(number + 1), None);
+            learners[number] = Some(spec.learn.learning(sample_s)?);
+        }
+        Ok(core.with_learners(Learners::new(learners)))
+    }
+
+    /// The control law of the set-up.
+    ///
+    /// # Errors
+    /// A controller that does not fit the model.
+    pub fn law(&self) -> Result<Controller, Failure> {
+        let config = self
+            .controller
+            .loop_config(&self.model)
+            .map_err(Failure::input)?;
+        Controller::new(config).map_err(Failure::input)
+    }
+
+    /// Builds the loop with the reference of the set-up and a control law of one's own ([`Controller::with_law`]), without
+    /// learning.
+    ///
+    /// # Errors
+    /// A value that cannot be, named.
+    pub fn core_with(&self, law: Controller) -> Result<Core<AnyReference>, Failure> {
+        self.joined(law, self.config.reference.generator(&self.config.timing)?)
+    }
+
+    /// Builds the loop with a reference generator of one's own.
+    ///
+    /// # Errors
+    /// A value that cannot be, named.
+    pub fn core_following<R: ReferenceGenerator>(&self, reference: R) -> Result<Core<R>, Failure> {
+        self.joined(self.law()?, reference)
+    }
+
+    fn joined<R: ReferenceGenerator>(
+        &self,
+        law: Controller,
+        reference: R,
+    ) -> Result<Core<R>, Failure> {
+        let sample_s = self.config.timing.period_us * 1e-6;
+        let plant =
+            DesignPlant::from_model(&self.model, Some(self.controller.delay_ms * 1e-3), sample_s)
+                .map_err(Failure::input)?;
+        Core::with_controller(
+            law,
+            reference,
+            self.config.timing,
+            self.config.arming,
+            &plant.plant,
+            [self.config.displacement_um, self.config.neutral_um],
+        )
+        .map_err(Failure::input)
+    }
+}
+
+/// The loop delay of a rig, s: its camera path (`camera_delay_ms`: from the middle of an exposure to the tick that uses it)
+/// and half a period of hold. The one definition: controllers are designed for it, and a run measures it.
+pub fn loop_delay_s(timing: &Timing) -> f64 {
+    timing.camera_delay_ms * 1e-3 + 0.5e-6 * timing.period_us
+}
+
+/// What is wrong when a model was measured with another camera path than the rig has: one of the two is not that of today.
+pub fn model_delay_warning(model: &Model, timing: &Timing) -> Option<String> {
+    /// Part of a period: half of it costs a controller some degrees of its margin.
+    const WORTH_SAYING: f64 = 0.3;
+    let (measured_ms, rig_ms) = (model.camera_delay_s? * 1e3, timing.camera_delay_ms);
+    ((measured_ms - rig_ms).abs() > WORTH_SAYING * timing.period_us * 1e-3).then(|| {
+        format!(
+            "the model was measured with a camera path of {measured_ms:.2} ms, the rig file says camera_delay_ms = {rig_ms}: \
+             correct it, or measure the plant again (cellpos identify)"
+        )
+    })
+}
+
+/// A controller by name (`pi`, `lead`: gains found for the model and the delay; `lqg`, `mpc`: the default weights) or
+/// from a controller.toml.
+pub fn controller(name: &str, model: &Model, timing: &Timing) -> Result<ControllerFile, Failure> {
+    let sample_s = timing.period_us * 1e-6;
+    let loop_delay_s = loop_delay_s(timing);
+    let mut kind = None;
+    let lead = match name {
+        "pi" => None,
+        "lead" => Some(default_lead(loop_delay_s)),
+        // The PI gains found below serve these two as the fallback.
+        "lqg" | "mpc" => {
+            kind = Some(if name == "lqg" {
+                ControllerKind::Lqg
+            } else {
+                ControllerKind::Mpc
+            });
+            None
+        }
+        path if path.ends_with(".toml") => {
+            let file = ControllerFile::load(Path::new(path)).map_err(Failure::input)?;
+            if (file.delay_ms * 1e-3 - loop_delay_s).abs() > 0.05 * sample_s {
+                return Err(Failure::bad_input(
+                    format!(
+                        "{path}: made for a loop delay of {} ms, the rig has {} ms",
+                        file.delay_ms,
+                        loop_delay_s * 1e3
+                    ),
+                    format!(
+                        "design it again: cellpos design --delay {}ms",
+                        loop_delay_s * 1e3
+                    ),
+                ));
+            }
+            return Ok(file);
+        }
+        other => {
+            return Err(Failure::bad_input(
+                format!("--controller {other}: not a controller"),
+                "write pi, lead, lqg, mpc, or the path of a controller.toml",
+            ));
+        }
+    };
+    let plant =
+        DesignPlant::from_model(model, Some(loop_delay_s), sample_s).map_err(Failure::input)?;
+    let request = DesignRequest {
+        plant,
+        controller: Requested::SearchPi(PiSearch {
+            lead,
+            ..PiSearch::default()
+        }),
+        setpoint_weight: None,
+        command_limits: Limits::default(),
+        limits: Default::default(),
+    };
+    let report = design(&request).map_err(Failure::input)?;
+    let ControllerConfig::Pi(pi) = report.controller else {
+        unreachable!("a search for PI gains gives PI gains")
+    };
+    let mut file = ControllerFile::from_pi(pi, loop_delay_s);
+    if let Some(kind) = kind {
+        file.controller = kind;
+    }
+    file.sample_time_ms = sample_s * 1e3;
+    if let Some(config) = &report.config {
+        file.estimator = config.estimator;
+    }
+    Ok(file)
+}
+
+/// The tighter of two sets of limits; park as in the first.
+pub fn within(limits: Limits, other: [f64; 3]) -> Limits {
+    let [low_um, high_um, slew_um_per_s] = other;
+    let low_um = limits.low_um.max(low_um);
+    let high_um = limits.high_um.min(high_um);
+    Limits {
+        low_um,
+        high_um,
+        slew_um_per_s: limits.slew_um_per_s.min(slew_um_per_s),
+        park_um: limits
+            .park_um
+            .clamp(low_um.min(high_um), high_um.max(low_um)),
+    }
+}

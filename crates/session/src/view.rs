@@ -1,0 +1,516 @@
+//! The live page of a run: a sink that feeds it beside the recording, and the operator's requests that come back.
+//!
+//! [`View::open`] starts the server; [`Viewed`] wraps the run's own sink. Everything happens on the recorder's thread and on
+//! the server's own threads; the loop knows nothing of it but the target, which it reads once a tick.
+
+use crate::connect;
+use crate::failure::Failure;
+use crate::rig::Rig;
+use crate::setup::Setup;
+use crate::words::{Level, safe_reason, sentence};
+use cellpos_control::design::bound_rms_um;
+use cellpos_live::{
+    Banner, Command, CycleRow, EventLine, Feed, Hello, Picture, PictureFeed, Row, Server,
+    ServerConfig, State,
+};
+use cellpos_rig::{FrameWatch, SeenFrame};
+use cellpos_runtime::life::{EventKind, Request};
+use cellpos_runtime::live::Operator;
+use cellpos_runtime::{Event, Life, RunSink, Statistics, Summary, TickFlags, TickRecord};
+use cellpos_vision::Pixels;
+use std::f64::consts::PI;
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::sync::mpsc::{Receiver, Sender, channel};
+
+/// Where the page is to be served.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct ViewAddress {
+    /// Address and port; port 0: any that is free.
+    pub address: SocketAddr,
+    /// Whether one that other machines can reach was asked for by name.
+    pub beyond_this_machine: bool,
+}
+
+/// The page of a run.
+pub struct View {
+    server: Server,
+    feed: Option<Feed>,
+    notes: Option<Receiver<String>>,
+}
+
+/// What the page says of the run.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Page {
+    /// Its name.
+    pub name: String,
+    /// What runs, in a few words.
+    pub subtitle: String,
+    /// Whether the operator may set the target.
+    pub steered: bool,
+    /// Whether a script says where the bead is to be.
+    pub script: bool,
+}
+
+/// Serves the page of the next run on a rig: its frames are shown, and its operator takes the page's requests.
+///
+/// # Errors
+/// See [`View::open`].
+pub fn open(at: ViewAddress, rig: &mut Rig, setup: &Setup, page: &Page) -> Result<View, Failure> {
+    let hello = hello(rig, setup, page);
+    let mut view = View::open(at, hello, rig.operator())?;
+    if let Some(pictures) = view.pictures() {
+        rig.watch(pictures);
+    }
+    Ok(view)
+}
+
+fn hello(rig: &Rig, setup: &Setup, page: &Page) -> Hello {
+    let limits = setup.controller.limits;
+    let timing = &setup.config.timing;
+    let source = rig.source();
+    let diffusion = connect::diffusion_um2_per_s(rig.file(), &setup.model);
+    let period_s = timing.period_us * 1e-6;
+    let delay_s = timing.camera_delay_ms * 1e-3;
+    Hello {
+        name: page.name.clone(),
+        subtitle: page.subtitle.clone(),
+        period_us: timing.period_us,
+        range_um: [limits.low_um, limits.high_um],
+        slew_um_per_s: limits.slew_um_per_s,
+        view_um: source.field_um,
+        budget_us: timing.budget_us,
+        bound_nm: (diffusion > 0.0).then(|| 1e3 * bound_rms_um(diffusion, 0.0, delay_s, period_s)),
+        bound_spectrum: lowest_spectrum(diffusion, delay_s + period_s, 0.5 / period_s),
+        steered: page.steered,
+        script: page.script,
+        pictures: source.width_px > 0,
+        recorded: false,
+    }
+}
+
+/// Amplitude spectral density (nm/sqrt(Hz), one-sided) of the lowest possible error: Brownian motion of the last `blind_s`
+/// seconds, which no command could answer yet, up to `end_hz`. Its square integrates to 2 D times `blind_s`.
+fn lowest_spectrum(diffusion_um2_per_s: f64, blind_s: f64, end_hz: f64) -> Vec<[f64; 2]> {
+    const POINTS: usize = 300;
+    if diffusion_um2_per_s.is_nan() || diffusion_um2_per_s <= 0.0 {
+        return vec![];
+    }
+    let low_hz = 0.5_f64.min(0.1 * end_hz);
+    (0..=POINTS)
+        .map(|n| {
+            let hz = low_hz * (end_hz / low_hz).powf(n as f64 / POINTS as f64);
+            let per_s = PI * hz;
+            let density = 4.0 * diffusion_um2_per_s * ((per_s * blind_s).sin() / per_s).powi(2);
+            [hz, 1e3 * density.sqrt()]
+        })
+        .collect()
+}
+
+impl View {
+    /// Serves the page. The operator's requests go to `operator`.
+    ///
+    /// # Errors
+    /// The address cannot be listened on, or others could reach it without having been asked for.
+    pub fn open(at: ViewAddress, hello: Hello, operator: &Arc<Operator>) -> Result<Self, Failure> {
+        let (feed, hub) = Feed::new(hello);
+        let (noted, notes) = channel();
+        let operator = Arc::clone(operator);
+        let config = ServerConfig {
+            address: at.address,
+            beyond_this_machine: at.beyond_this_machine,
+            on_thread: None,
+        };
+        let server = Server::start(&config, hub, move |command| act(command, &operator, &noted))
+            .map_err(|error| Failure::bad_input(error, "--view 127.0.0.1:0 takes any free port"))?;
+        Ok(Self {
+            server,
+            feed: Some(feed),
+            notes: Some(notes),
+        })
+    }
+
+    /// The links, to be printed.
+    pub fn links(&self) -> String {
+        format!(
+            "live page, to act:  {}\nlive page, to look: {}",
+            self.server.operator_url(),
+            self.server.viewer_url()
+        )
+    }
+
+    /// Where it listens.
+    pub fn address(&self) -> SocketAddr {
+        self.server.address()
+    }
+
+    /// What shows it the camera's frames; once.
+    pub fn pictures(&mut self) -> Option<Box<dyn FrameWatch>> {
+        let feed = self.feed.as_mut()?.take_pictures()?;
+        Some(Box::new(Pictures {
+            feed,
+            first_ns: None,
+        }))
+    }
+}
+
+fn act(command: Command, operator: &Operator, noted: &Sender<String>) {
+    match command {
+        // A freeze that does not end the run: whoever looks on may want to go on.
+        Command::Freeze | Command::Pause => operator.ask(Request::Pause),
+        Command::Resume => {
+            let _ = operator.change(Request::Pause, Request::None);
+        }
+        Command::Park => operator.ask(Request::Park),
+        Command::Skip => operator.ask(Request::Skip),
+        Command::Target { um } => operator.steer(um),
+        // The run is over: nobody takes notes any more.
+        Command::Note { text } => drop(noted.send(text)),
+    }
+}
+
+/// Crops frames for the page.
+struct Pictures {
+    feed: PictureFeed,
+    first_ns: Option<i64>,
+}
+
+/// Largest crop, px.
+const CROP: (usize, usize) = (384, 288);
+
+impl FrameWatch for Pictures {
+    fn frame(&mut self, seen: &SeenFrame<'_>) {
+        let at_ns = seen.stamp.mid_exposure_ns;
+        let time_s = (at_ns - *self.first_ns.get_or_insert(at_ns)) as f64 * 1e-9;
+        if self.feed.is_due(time_s) {
+            self.feed.offer(time_s, |picture| crop(seen, picture));
+        }
+    }
+}
+
+/// The part of a frame about what is followed, in 8 bits.
+fn crop(seen: &SeenFrame<'_>, picture: &mut Picture) {
+    let frame = &seen.frame;
+    let about = seen.centre_px.unwrap_or(seen.expected_px);
+    // A step of the crop with the bead would hide its motion: it moves in steps of an eighth.
+    let start = |size: usize, most: usize, place: f64| {
+        let step = (most / 8).max(1);
+        let wanted = if place.is_finite() {
+            place as usize
+        } else {
+            size / 2
+        };
+        let start = wanted.saturating_sub(most / 2) / step * step;
+        (start.min(size.saturating_sub(most)), size.min(most))
+    };
+    let (left, width) = start(frame.width, CROP.0, about.0);
+    let (top, height) = start(frame.height, CROP.1, about.1);
+    let shift = seen.bits.saturating_sub(8);
+    for row in top..top + height {
+        let span = row * frame.width + left..row * frame.width + left + width;
+        match frame.pixels {
+            Pixels::Mono8(pixels) => picture.pixels.extend_from_slice(&pixels[span]),
+            Pixels::Mono16(pixels) => picture
+                .pixels
+                .extend(pixels[span].iter().map(|v| (v >> shift).min(255) as u8)),
+        }
+    }
+    (picture.width, picture.height) = (width as u16, height as u16);
+    let scale = seen.scale;
+    let along = if scale.upright { top } else { left };
+    picture.um_per_px = scale.um_per_px as f32;
+    picture.upright = scale.upright;
+    picture.first_um = (scale.first_um + scale.um_per_px * along as f64) as f32;
+    let place = |(x, y): (f64, f64)| [(x - left as f64) as f32, (y - top as f64) as f32];
+    picture.centre_px = seen.centre_px.map_or([f32::NAN; 2], place);
+    picture.half_px = [seen.half_px.0 as f32, seen.half_px.1 as f32];
+    picture.gate_px = if seen.expected_sd_px.is_finite() {
+        (4.0 * seen.expected_sd_px) as f32
+    } else {
+        f32::NAN
+    };
+}
+
+/// References of the last ticks: the error of a position is counted from where the bead was to be when it was exposed.
+const TARGETS: usize = 16;
+
+/// What feeds the page, from what the recorder is given.
+struct Watcher {
+    feed: Feed,
+    notes: Receiver<String>,
+    targets: [(i64, f64); TARGETS],
+    state: State,
+    freeze: String,
+    safe: String,
+}
+
+/// A sink that shows a page what passes through it.
+pub struct Viewed<S> {
+    sink: S,
+    watcher: Option<Watcher>,
+}
+
+impl<S> Viewed<S> {
+    /// A sink without a page, or with one.
+    pub fn new(sink: S, view: Option<&mut View>) -> Self {
+        let watcher = view.and_then(|view| {
+            Some(Watcher {
+                feed: view.feed.take()?,
+                notes: view.notes.take()?,
+                targets: [(i64::MIN, f64::NAN); TARGETS],
+                state: State::default(),
+                freeze: String::new(),
+                safe: String::new(),
+            })
+        });
+        Self { sink, watcher }
+    }
+
+    /// The sink within. The page shows the summary's own figures from now on.
+    pub fn into_inner(self, summary: &Summary, ended: &str) -> S {
+        if let Some(mut watcher) = self.watcher {
+            watcher.conclude(summary, ended);
+        }
+        self.sink
+    }
+
+    /// The sink within, of a run that did not come to a summary.
+    pub fn into_sink(self) -> S {
+        self.sink
+    }
+
+    /// A cycle is over.
+    pub fn cycle(&mut self, cycle: CycleRow) {
+        if let Some(watcher) = &mut self.watcher {
+            watcher.feed.cycle(cycle);
+        }
+    }
+
+    /// The sink within, as it is.
+    pub fn inner(&mut self) -> &mut S {
+        &mut self.sink
+    }
+}
+
+impl Watcher {
+    fn tick(&mut self, record: &TickRecord) {
+        self.targets.copy_within(0..TARGETS - 1, 1);
+        self.targets[0] = (record.time_ns, record.target_um);
+        let exposed_ns = record.mid_exposure_ns;
+        let then = self.targets.iter().find(|(ns, _)| *ns <= exposed_ns);
+        self.feed.row(&Row {
+            seq: record.seq as u32,
+            time_s: record.time_ns as f64 * 1e-9,
+            measured_um: record.measured_um as f32,
+            target_um: record.target_um as f32,
+            target_then_um: then.map_or(f32::NAN, |(_, um)| *um as f32),
+            command_um: record.command_um as f32,
+            zero_flow_um: record.neutral_um as f32,
+            length_um: record.length_um as f32,
+            wake_us: record.wake_ns as f32 * 1e-3,
+            compute_us: record.compute_ns as f32 * 1e-3,
+            flags: record.flags.0,
+            life: record.life,
+        });
+        let state = &mut self.state;
+        state.time_s = record.time_ns as f64 * 1e-9;
+        state.ticks = record.seq + 1;
+        state.late += u64::from(record.flags.has(TickFlags::LATE));
+        state.stale += u64::from(record.flags.has(TickFlags::STALE));
+        state.coasted += u64::from(record.flags.has(TickFlags::COASTING));
+    }
+
+    fn event(&mut self, event: &Event, times: u64) {
+        match event.kind {
+            EventKind::FramesDropped { count } => self.state.frames_lost += count * times,
+            EventKind::TicksSkipped { count } => self.state.skipped += count * times,
+            EventKind::FreezeStarted { .. } => self.freeze = sentence(&event.kind).1,
+            EventKind::SafeLatched { reason } => self.safe = safe_reason(reason).to_string(),
+            _ => {}
+        }
+        let (level, mut text) = sentence(&event.kind);
+        if times > 1 {
+            text = format!("{text} ({times} times more in this second)");
+        }
+        self.tell(event.time_ns, level, text);
+    }
+
+    fn tell(&mut self, time_ns: i64, level: Level, text: String) {
+        self.feed.event(EventLine {
+            time_s: time_ns as f64 * 1e-9,
+            level: level.name(),
+            text,
+        });
+    }
+
+    fn progress(&mut self, statistics: &Statistics) {
+        let Some(record) = statistics.last() else {
+            return;
+        };
+        self.state.rms_nm = statistics.rms_measured_nm();
+        self.state.banner = self.banner(record);
+        self.feed.state(self.state.clone());
+    }
+
+    fn banner(&self, record: &TickRecord) -> Banner {
+        let (state, reason) = match Life::from_number(record.life) {
+            Some(Life::Running) if record.flags.has(TickFlags::FREEZE) => {
+                ("frozen", self.freeze.clone())
+            }
+            Some(Life::Running) if record.flags.has(TickFlags::COASTING) => (
+                "running",
+                "No position: the loop runs on prediction.".to_string(),
+            ),
+            Some(Life::Running) => ("running", "The loop is closed.".to_string()),
+            Some(Life::Safe) => ("safe", format!("The PZT parks: {}.", self.safe)),
+            _ => (
+                "armed",
+                "The bead is being looked for, and the plant's answer is checked.".to_string(),
+            ),
+        };
+        Banner { state, reason }
+    }
+
+    fn conclude(&mut self, summary: &Summary, ended: &str) {
+        let counts = &summary.counts;
+        self.state.banner = Banner {
+            state: if summary.state == Life::Safe {
+                "safe"
+            } else {
+                "over"
+            },
+            reason: format!("The run is over: {ended}"),
+        };
+        self.state.rms_nm = summary.rms_measured_nm;
+        self.state.late = counts.late;
+        self.state.skipped = counts.skipped;
+        self.state.frames_lost = counts.frames_lost;
+        self.state.stale = counts.stale;
+        self.state.coasted = counts.coasted;
+        self.state.records_lost = summary.records_lost;
+        self.state.left_s = None;
+        self.state.next = None;
+        self.feed.state(self.state.clone());
+    }
+}
+
+impl<S: RunSink> RunSink for Viewed<S> {
+    fn tick(&mut self, record: &TickRecord) {
+        if let Some(watcher) = &mut self.watcher {
+            watcher.tick(record);
+        }
+        self.sink.tick(record);
+    }
+
+    fn event(&mut self, event: &Event) {
+        if let Some(watcher) = &mut self.watcher {
+            watcher.event(event, 1);
+        }
+        self.sink.event(event);
+    }
+
+    fn repeated(&mut self, last: &Event, count: u64) {
+        if let Some(watcher) = &mut self.watcher {
+            watcher.event(last, count);
+        }
+        self.sink.repeated(last, count);
+    }
+
+    fn note(&mut self, time_ns: i64, text: &str) {
+        self.sink.note(time_ns, text);
+    }
+
+    fn is_ready(&self) -> bool {
+        self.sink.is_ready()
+    }
+
+    fn is_refused(&self) -> bool {
+        self.sink.is_refused()
+    }
+
+    fn learned(&mut self, motion: u16, state: &cellpos_control::LearnerState) {
+        self.sink.learned(motion, state);
+    }
+
+    fn progress(&mut self, statistics: &Statistics) {
+        if let Some(watcher) = &mut self.watcher {
+            let time_ns = statistics.last().map_or(0, |record| record.time_ns);
+            while let Ok(text) = watcher.notes.try_recv() {
+                self.sink.note(time_ns, &text);
+                watcher.tell(time_ns, Level::Info, format!("Note: {text}"));
+            }
+            watcher.progress(statistics);
+        }
+        self.sink.progress(statistics);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_lowest_spectrum_integrates_to_the_lowest_error() {
+        let (diffusion, blind_s) = (0.33, 3e-3);
+        let spectrum = lowest_spectrum(diffusion, blind_s, 50_000.0);
+        let below = spectrum[0][0] * spectrum[0][1].powi(2);
+        let squares: f64 = spectrum
+            .windows(2)
+            .map(|pair| 0.5 * (pair[1][0] - pair[0][0]) * (pair[0][1].powi(2) + pair[1][1].powi(2)))
+            .sum();
+        let rms_nm = (squares + below).sqrt();
+        let bound_nm = 1e3 * bound_rms_um(diffusion, 0.0, 2e-3, 1e-3);
+        assert!(
+            (rms_nm / bound_nm - 1.0).abs() < 0.02,
+            "{rms_nm} {bound_nm}"
+        );
+        assert!(lowest_spectrum(0.0, blind_s, 500.0).is_empty());
+    }
+
+    #[test]
+    fn a_crop_holds_the_bead_and_says_where_it_lies() {
+        let (width, height) = (1024, 64);
+        let mut pixels = vec![40_u16; width * height];
+        pixels[32 * width + 900] = 4000;
+        let seen = SeenFrame {
+            frame: cellpos_vision::Frame {
+                width,
+                height,
+                pixels: Pixels::Mono16(&pixels),
+            },
+            bits: 12,
+            stamp: cellpos_rig::FrameStamp {
+                id: 0,
+                mid_exposure_ns: 0,
+                exposure_ns: 0,
+                arrival_ns: 0,
+                true_um: f64::NAN,
+                true_pzt_um: f64::NAN,
+            },
+            centre_px: Some((900.0, 32.0)),
+            half_px: (5.0, 5.0),
+            expected_px: (900.0, 32.0),
+            expected_sd_px: f64::INFINITY,
+            scale: cellpos_rig::PictureScale {
+                first_um: -10.0,
+                um_per_px: 0.1,
+                upright: false,
+            },
+        };
+        let (mut feed, _hub) = Feed::new(Hello {
+            pictures: true,
+            ..Hello::default()
+        });
+        let mut shown = None;
+        feed.take_pictures().unwrap().offer(0.0, |picture| {
+            crop(&seen, picture);
+            shown = Some(picture.clone());
+        });
+        let picture = shown.unwrap();
+        assert_eq!((picture.width, picture.height), (384, 64));
+        let [x, y] = picture.centre_px;
+        assert_eq!(picture.pixels[y as usize * 384 + x as usize], 250);
+        let um = picture.first_um + picture.um_per_px * x;
+        assert!((um - 80.0).abs() < 1e-3, "{um}");
+    }
+}

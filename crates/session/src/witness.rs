@@ -1,0 +1,43 @@
+//! What is noted of a run on its way to the sink.
+
+use crate::ended::Clues;
+use cellpos_control::LearnerState;
+use cellpos_runtime::{Event, RunSink, Statistics, TickRecord};
+
+/// Hands everything on to a sink, and keeps what says why a run ended.
+pub(crate) struct Witness<S> {
+    pub(crate) sink: S,
+    pub(crate) clues: Clues,
+}
+
+impl<S: RunSink> RunSink for Witness<S> {
+    fn tick(&mut self, record: &TickRecord) {
+        self.sink.tick(record);
+    }
+
+    fn event(&mut self, event: &Event) {
+        self.clues.note(event);
+        self.sink.event(event);
+    }
+
+    fn repeated(&mut self, last: &Event, count: u64) {
+        self.clues.note(last);
+        self.sink.repeated(last, count);
+    }
+
+    fn is_ready(&self) -> bool {
+        self.sink.is_ready()
+    }
+
+    fn is_refused(&self) -> bool {
+        self.sink.is_refused()
+    }
+
+    fn learned(&mut self, motion: u16, state: &LearnerState) {
+        self.sink.learned(motion, state);
+    }
+
+    fn progress(&mut self, statistics: &Statistics) {
+        self.sink.progress(statistics);
+    }
+}

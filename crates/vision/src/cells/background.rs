@@ -1,0 +1,154 @@
+//! The empty channel: mean of its frames, noise, and slow changes followed where no cell is.
+
+/// Distance from a region within which the background is left alone, px.
+const CLEAR_PX: usize = 6;
+/// Pixels beside that, whose change stands for that behind the region.
+const BESIDE_PX: usize = 12;
+/// Each row of the background is refreshed once in so many frames.
+const REFRESHED_EVERY: usize = 16;
+
+/// First column and row of a region, and the first behind it, px.
+pub(super) type Bounds = [usize; 4];
+
+/// What a frame is compared with.
+#[derive(Debug, Clone)]
+pub(super) struct Background {
+    width: usize,
+    pub mean: Vec<f32>,
+    /// Sum of squared deviations from the running mean, over all pixels.
+    deviations: f64,
+    pub frames: u32,
+    refreshed: usize,
+    /// Changes of the row being refreshed.
+    change: Vec<f32>,
+}
+
+impl Background {
+    pub fn new(width: usize, height: usize) -> Self {
+        Background {
+            width,
+            mean: vec![0.0; width * height],
+            deviations: 0.0,
+            frames: 0,
+            refreshed: 0,
+            change: vec![0.0; width],
+        }
+    }
+
+    /// Noise of a pixel, grey levels: the scatter of the background frames, at least that of rounding.
+    pub fn noise_grey(&self) -> f64 {
+        let degrees = f64::from(self.frames.saturating_sub(1)) * self.mean.len() as f64;
+        (self.deviations / degrees.max(1.0)).max(1.0 / 12.0).sqrt()
+    }
+
+    /// Takes a frame into the running mean.
+    pub fn average<T: Copy>(&mut self, pixels: &[T])
+    where
+        f32: From<T>,
+    {
+        self.frames = self.frames.saturating_add(1);
+        let share = 1.0 / self.frames as f32;
+        for (mean, p) in self.mean.iter_mut().zip(pixels) {
+            let v = f32::from(*p);
+            let before = v - *mean;
+            *mean += share * before;
+            self.deviations += f64::from(before) * f64::from(v - *mean);
+        }
+    }
+
+    /// Follows a frame: a sixteenth of the rows at a time, by their share over `refresh_frames`.
+    pub fn refresh<T: Copy>(
+        &mut self,
+        pixels: &[T],
+        light: f32,
+        refresh_frames: u32,
+        found: &[Bounds],
+    ) where
+        f32: From<T>,
+    {
+        self.refreshed = (self.refreshed + 1) % REFRESHED_EVERY;
+        let share = (REFRESHED_EVERY as f32 / refresh_frames as f32).min(1.0);
+        let unlit = 1.0 / light;
+        let width = self.width;
+        let rows = self
+            .mean
+            .chunks_exact_mut(width)
+            .zip(pixels.chunks_exact(width))
+            .enumerate();
+        for (y, (mean, row)) in rows.skip(self.refreshed).step_by(REFRESHED_EVERY) {
+            for ((change, m), p) in self.change.iter_mut().zip(&*mean).zip(row) {
+                *change = share * (f32::from(*p) * unlit - m);
+            }
+            let mut x = 0;
+            while let Some((from, to)) = next_near(found, x, y, width) {
+                let open = |from: usize, to: usize| {
+                    let shown = self.change.get(from..to).unwrap_or(&[]);
+                    let sum: f32 = shown.iter().sum();
+                    (!shown.is_empty()).then(|| sum / shown.len() as f32)
+                };
+                let left = open(from.saturating_sub(BESIDE_PX).max(x), from);
+                let behind = next_near(found, to, y, width).map_or(width, |next| next.0);
+                let right = open(to, (to + BESIDE_PX).min(behind));
+                let (left, right) = match (left, right) {
+                    (Some(left), Some(right)) => (left, right),
+                    (Some(one), None) | (None, Some(one)) => (one, one),
+                    (None, None) => (0.0, 0.0),
+                };
+                let steps = (to - from) as f32;
+                if let Some(hidden) = self.change.get_mut(from..to) {
+                    for (k, change) in hidden.iter_mut().enumerate() {
+                        *change = left + (right - left) * (k as f32 + 0.5) / steps;
+                    }
+                }
+                x = to;
+            }
+            for (m, change) in mean.iter_mut().zip(&self.change) {
+                *m += change;
+            }
+        }
+    }
+
+    /// Light of the frame relative to the background's: mean ratio over pixels that differ little from it.
+    pub fn light_of<T: Copy>(&self, pixels: &[T]) -> f32
+    where
+        f32: From<T>,
+    {
+        let step = (pixels.len() / 2048).max(1) | 1;
+        let (mut light, mut limit) = (1.0_f64, f64::INFINITY);
+        for _ in 0..4 {
+            let (mut over, mut under, mut spread, mut n) = (0.0_f64, 0.0_f64, 0.0_f64, 0.0_f64);
+            for (p, m) in pixels.iter().zip(&self.mean).step_by(step) {
+                let (v, m) = (f64::from(f32::from(*p)), f64::from(*m));
+                let off = (v - light * m).abs();
+                if off <= limit {
+                    over += v;
+                    under += m;
+                    spread += off;
+                    n += 1.0;
+                }
+            }
+            if under <= 0.0 {
+                break;
+            }
+            light = over / under;
+            limit = 2.5 * spread / n.max(1.0) + self.noise_grey();
+        }
+        light as f32
+    }
+}
+
+/// The first stretch of a row (from, to), at or behind column `x`, that is near a region; stretches that overlap are one.
+fn next_near(found: &[Bounds], x: usize, y: usize, width: usize) -> Option<(usize, usize)> {
+    let near = || {
+        found.iter().filter_map(|&[left, top, right, bottom]| {
+            let rows = y + CLEAR_PX >= top && y < bottom + CLEAR_PX;
+            let (from, to) = (left.saturating_sub(CLEAR_PX), right + CLEAR_PX);
+            (rows && to > x).then_some((from.max(x), to.min(width)))
+        })
+    };
+    let (from, mut to) = near().min().filter(|(from, to)| from < to)?;
+    while let Some((_, further)) = near().find(|next| next.0 <= to && next.1 > to) {
+        to = further;
+    }
+    Some((from, to))
+}

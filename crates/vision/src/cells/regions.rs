@@ -1,0 +1,350 @@
+//! Where something is: patches of 4 x 4 pixels whose RMS contrast stands out, joined.
+//!
+//! The square of the contrast counts, whatever its sign: a dark rim, a bright halo and a body hardly different from the
+//! background are one region. A gap of one patch is closed. The outermost patches are left out, so that lines along the
+//! border of a frame (a header written into the picture, a wall) do not join what is near them.
+
+use super::background::Bounds;
+use crate::blobs::{Blob, Blobs};
+use crate::outline::Start;
+
+/// Side of a patch, px.
+pub(super) const PATCH: usize = 4;
+/// Share of its RMS contrast that a region's core has at least.
+const CORE: f64 = 0.4;
+/// A region this many times as long as wide may be several objects in a row.
+const LONG: f64 = 1.4;
+/// Share of what is on either side that is left of the body between two objects.
+const GAP: f32 = 0.3;
+/// Most objects in a row that are told apart.
+const MAX_PARTS: usize = 4;
+/// Places along a region at which its body is summed, a patch long each.
+const BINS: usize = 512;
+/// Runs kept per row of patches.
+const RUNS_PER_ROW: usize = 16;
+
+/// Buffers.
+#[derive(Debug, Clone)]
+pub(super) struct Regions {
+    columns: usize,
+    rows: usize,
+    /// Mean square contrast of each patch.
+    patches: Vec<f32>,
+    /// Sums of what is darker and of what is brighter than the background in each patch.
+    signs: Vec<[f32; 2]>,
+    blobs: Blobs,
+    pub bounds: Vec<Bounds>,
+}
+
+impl Regions {
+    pub fn new(width: usize, height: usize, max_regions: usize) -> Self {
+        // The last patch of a row and of a column takes what is left over.
+        let (columns, rows) = ((width / PATCH).max(1), (height / PATCH).max(1));
+        // A region shaped like a comb takes a label for each tooth.
+        let room = 16 * max_regions;
+        Regions {
+            columns,
+            rows,
+            patches: vec![0.0; columns * rows],
+            signs: vec![[0.0; 2]; columns * rows],
+            blobs: Blobs::with_spans(room.max(columns / 2 + 1), room, RUNS_PER_ROW * rows),
+            bounds: Vec::with_capacity(room),
+        }
+    }
+
+    /// Joins the patches of a frame's contrast above `threshold` (grey levels RMS). Those with a mean square of `seed` or
+    /// more are objects: their bounds are kept.
+    pub fn find(&mut self, contrast: &[f32], width: usize, threshold: f32, seed: f64) {
+        let height = contrast.len() / width.max(1);
+        self.patches.fill(0.0);
+        self.signs.fill([0.0; 2]);
+        for (y, row) in contrast.chunks_exact(width).enumerate() {
+            let at = (y / PATCH).min(self.rows - 1) * self.columns;
+            let (Some(patches), Some(signs)) = (
+                self.patches.get_mut(at..at + self.columns),
+                self.signs.get_mut(at..at + self.columns),
+            ) else {
+                continue;
+            };
+            let (fours, left) = row.as_chunks::<PATCH>();
+            for ((sum, [dark, bright]), [a, b, c, d]) in patches.iter_mut().zip(signs).zip(fours) {
+                *sum += a * a + b * b + c * c + d * d;
+                let (plain, absolute) = (a + b + c + d, a.abs() + b.abs() + c.abs() + d.abs());
+                *dark += absolute - plain;
+                *bright += absolute + plain;
+            }
+            if let Some(last) = patches.last_mut() {
+                *last += left.iter().map(|v| v * v).sum::<f32>();
+            }
+        }
+        for (k, sum) in self.patches.iter_mut().enumerate() {
+            let side = |at: usize, count: usize, len: usize| {
+                if at + 1 == count {
+                    len - PATCH * (count - 1)
+                } else {
+                    PATCH
+                }
+            };
+            let pixels = side(k % self.columns, self.columns, width)
+                * side(k / self.columns, self.rows, height);
+            *sum /= pixels as f32;
+        }
+        let (patches, columns, rows) = (&self.patches, self.columns, self.rows);
+        let outermost = |x: usize, y: usize| x == 0 || y == 0 || x + 1 >= columns || y + 1 >= rows;
+        let at = |x: usize, y: usize| match patches.get(y * columns + x) {
+            Some(value) if !outermost(x, y) => *value,
+            _ => 0.0,
+        };
+        let closed = |x: usize, y: usize| {
+            if outermost(x, y) {
+                return 0.0;
+            }
+            let own = at(x, y);
+            let opposite = |a: f32, b: f32| a.min(b);
+            own.max(opposite(at(x - 1, y), at(x + 1, y)))
+                .max(opposite(at(x, y - 1), at(x, y + 1)))
+                .max(opposite(at(x - 1, y - 1), at(x + 1, y + 1)))
+                .max(opposite(at(x + 1, y - 1), at(x - 1, y + 1)))
+        };
+        self.blobs
+            .label((columns, rows), threshold * threshold, 1.0, closed);
+        self.bounds.clear();
+        let strong = self.blobs.found().iter().filter(|blob| blob.peak >= seed);
+        for blob in strong.take(self.bounds.capacity()) {
+            self.bounds.push(blob.bounds.map(|b| b as usize * PATCH));
+        }
+    }
+
+    /// Regions, the largest sum of squared contrast first.
+    pub fn found(&self) -> &[Blob] {
+        self.blobs.found()
+    }
+
+    /// Whether the frame held more than there was room for.
+    pub fn is_cluttered(&self) -> bool {
+        self.blobs.dropped_runs() > 0
+    }
+
+    /// Cuts a long region where, along it, hardly anything of its body is left between two objects whose halos meet.
+    pub fn parts(&self, blob: &Blob) -> Parts {
+        let mut parts = Parts::whole();
+        let Some(start) = self.start(blob, &parts.get(0)) else {
+            return parts;
+        };
+        if start.long_px < LONG * start.short_px {
+            return parts;
+        }
+        let (sin, cos) = start.angle_rad.sin_cos();
+        parts.along = [cos, sin, start.x_px * cos + start.y_px * sin];
+        let mut body = [[0.0_f32; 2]; BINS];
+        let bin = |u: f64| ((u / PATCH as f64 + 0.5 * BINS as f64) as usize).min(BINS - 1);
+        for span in self.blobs.spans(blob) {
+            for x in span.start..span.end {
+                let k = span.y as usize * self.columns + x as usize;
+                let u = parts.place(middle(x), middle(span.y));
+                if let (Some([dark, bright]), Some(sums)) =
+                    (self.signs.get(k), body.get_mut(bin(u)))
+                {
+                    sums[0] += dark;
+                    sums[1] += bright;
+                }
+            }
+        }
+        let total = body
+            .iter()
+            .fold([0.0, 0.0], |t, b| [t[0] + b[0], t[1] + b[1]]);
+        let sign = usize::from(total[1] > total[0]);
+        let smooth = |k: usize| {
+            let at = |k: usize| body.get(k).map_or(0.0, |b| b[sign]);
+            0.25 * at(k.wrapping_sub(1)) + 0.5 * at(k) + 0.25 * at(k + 1)
+        };
+        let (mut before, mut from) = (0.0_f32, 0);
+        for k in 1..BINS - 1 {
+            let here = smooth(k);
+            before = before.max(here);
+            let behind = (k..BINS).map(smooth).fold(0.0, f32::max);
+            let lowest = here <= smooth(k - 1) && here < smooth(k + 1);
+            if lowest && here < GAP * before.min(behind) && k > from {
+                parts.cut((k as f64 + 0.5 - 0.5 * BINS as f64) * PATCH as f64);
+                (before, from) = (0.0, k);
+            }
+        }
+        parts
+    }
+
+    /// The ellipse with the same second moments as the part of a region that stands out at least by a share of its RMS
+    /// contrast, holes filled: faint fringes do not count.
+    pub fn start(&self, blob: &Blob, part: &Part) -> Option<Start> {
+        let (mut n, mut sx, mut sy, mut sxx, mut sxy, mut syy) = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0);
+        let strong = (CORE * CORE * blob.contrast_sum / blob.area_px) as f32;
+        for span in self.blobs.spans(blob) {
+            let at = span.y as usize * self.columns;
+            let counts = |x: &u32| {
+                let value = self.patches.get(at + *x as usize);
+                value.is_some_and(|v| *v >= strong) && part.holds(middle(*x), middle(span.y))
+            };
+            let (Some(first), Some(last)) = (
+                (span.start..span.end).find(counts),
+                (span.start..span.end).rev().find(counts),
+            ) else {
+                continue;
+            };
+            let (a, b, y) = (
+                f64::from(first),
+                f64::from(last) + 1.0,
+                f64::from(span.y) + 0.5,
+            );
+            let (count, mean) = (b - a, 0.5 * (a + b));
+            n += count;
+            sx += count * mean;
+            sy += count * y;
+            // A continuous stretch.
+            sxx += count * (mean * mean + count * count / 12.0);
+            sxy += count * mean * y;
+            syy += count * (y * y + 1.0 / 12.0);
+        }
+        if n <= 0.0 {
+            return None;
+        }
+        let (mx, my) = (sx / n, sy / n);
+        let (xx, xy, yy) = (sxx / n - mx * mx, sxy / n - mx * my, syy / n - my * my);
+        let (mean, half) = (0.5 * (xx + yy), 0.5 * f64::hypot(xx - yy, 2.0 * xy));
+        let patch = PATCH as f64;
+        Some(Start {
+            x_px: patch * mx - 0.5,
+            y_px: patch * my - 0.5,
+            long_px: patch * 2.0 * (mean + half).sqrt(),
+            short_px: patch * 2.0 * (mean - half).max(0.0).sqrt(),
+            angle_rad: 0.5 * (2.0 * xy).atan2(xx - yy),
+        })
+    }
+
+    /// Columns and rows (first and last, px) that may hold the object: those of its region, and the outermost patches
+    /// beside it unless a line of quite another contrast runs there.
+    pub fn room(&self, blob: &Blob, (width, height): (usize, usize)) -> [f32; 4] {
+        let [left, top, right, bottom] = blob.bounds.map(|b| b as usize);
+        let most = 2.0 * blob.peak as f32;
+        let calm = |x: usize, y: usize| {
+            self.patches
+                .get(y * self.columns + x)
+                .is_none_or(|v| *v <= most)
+        };
+        let (last_x, last_y) = (self.columns - 1, self.rows - 1);
+        let px = |patch: usize| (patch * PATCH) as f32;
+        [
+            if left > 1 || (top..bottom).all(|y| calm(0, y)) {
+                px(left.saturating_sub(1))
+            } else {
+                px(left)
+            },
+            if top > 1 || (left..right).all(|x| calm(x, 0)) {
+                px(top.saturating_sub(1))
+            } else {
+                px(top)
+            },
+            if right < last_x || (top..bottom).all(|y| calm(last_x, y)) {
+                if right + 1 > last_x {
+                    width as f32 - 1.0
+                } else {
+                    px(right + 1) - 1.0
+                }
+            } else {
+                px(right) - 1.0
+            },
+            if bottom < last_y || (left..right).all(|x| calm(x, last_y)) {
+                if bottom + 1 > last_y {
+                    height as f32 - 1.0
+                } else {
+                    px(bottom + 1) - 1.0
+                }
+            } else {
+                px(bottom) - 1.0
+            },
+        ]
+    }
+
+    /// Area of the region's strong patches (mean square above `strong`) for which `outside` holds, px.
+    pub fn area_where(&self, blob: &Blob, strong: f32, outside: impl Fn(f64, f64) -> bool) -> f64 {
+        let mut patches = 0.0;
+        for span in self.blobs.spans(blob) {
+            for x in span.start..span.end {
+                let value = self
+                    .patches
+                    .get(span.y as usize * self.columns + x as usize);
+                if value.is_some_and(|v| *v > strong) && outside(middle(x), middle(span.y)) {
+                    patches += 1.0;
+                }
+            }
+        }
+        patches * (PATCH * PATCH) as f64
+    }
+}
+
+/// Middle of a patch, px.
+fn middle(patch: u32) -> f64 {
+    PATCH as f64 * (f64::from(patch) + 0.5) - 0.5
+}
+
+/// A region in pieces along its length.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Parts {
+    /// Direction, and its product with the region's middle.
+    along: [f64; 3],
+    cuts: [f64; MAX_PARTS - 1],
+    count: usize,
+}
+
+/// One piece: from and to, px along the region.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Part {
+    along: [f64; 3],
+    from: f64,
+    to: f64,
+}
+
+impl Parts {
+    fn whole() -> Self {
+        Parts {
+            along: [0.0; 3],
+            cuts: [f64::INFINITY; MAX_PARTS - 1],
+            count: 1,
+        }
+    }
+
+    fn place(&self, x: f64, y: f64) -> f64 {
+        x * self.along[0] + y * self.along[1] - self.along[2]
+    }
+
+    fn cut(&mut self, at: f64) {
+        if let Some(place) = self.cuts.get_mut(self.count - 1) {
+            *place = at;
+            self.count += 1;
+        }
+    }
+
+    /// How many there are.
+    pub fn len(&self) -> usize {
+        self.count
+    }
+
+    pub fn get(&self, part: usize) -> Part {
+        let cut = |k: usize| self.cuts.get(k).copied().unwrap_or(f64::INFINITY);
+        Part {
+            along: self.along,
+            from: if part == 0 {
+                f64::NEG_INFINITY
+            } else {
+                cut(part - 1)
+            },
+            to: cut(part),
+        }
+    }
+}
+
+impl Part {
+    /// Whether a point belongs to it.
+    pub fn holds(&self, x: f64, y: f64) -> bool {
+        let u = x * self.along[0] + y * self.along[1] - self.along[2];
+        u >= self.from && u < self.to
+    }
+}

@@ -1,0 +1,128 @@
+//! What the contour encloses, and how well that is known.
+
+use super::{BORDER_PX, Contrast, Outline, Outliner, Profile};
+
+impl Outliner {
+    /// Radius of the disc with the contour's area, px.
+    pub(super) fn radius_px(&self) -> f64 {
+        let n = self.points.len();
+        let cross = |(i, a): (usize, &(f64, f64))| {
+            let b = self.points[(i + 1) % n];
+            a.0 * b.1 - b.0 * a.1
+        };
+        let area = 0.5 * self.points.iter().enumerate().map(cross).sum::<f64>();
+        (area.abs() / core::f64::consts::PI).sqrt().max(1.0)
+    }
+
+    /// Sums over the polygon; `variance` is that of a pixel about the mean profile, grey^2.
+    pub(super) fn measure(
+        &mut self,
+        contrast: &Contrast,
+        profile: &Profile,
+        variance: f64,
+        (rim_grey, halo_grey): (f64, f64),
+    ) -> Option<Outline> {
+        let n = self.points.len();
+        let &(x0, y0) = self.points.first()?;
+        let (mut area, mut sx, mut sy, mut sxx, mut sxy, mut syy) = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0);
+        // By Green's theorem.
+        for i in 0..n {
+            let (a, b) = (self.points[i], self.points[(i + 1) % n]);
+            let (a, b) = ((a.0 - x0, a.1 - y0), (b.0 - x0, b.1 - y0));
+            let cross = a.0 * b.1 - b.0 * a.1;
+            area += cross / 2.0;
+            sx += cross * (a.0 + b.0) / 6.0;
+            sy += cross * (a.1 + b.1) / 6.0;
+            sxx += cross * (a.0 * a.0 + a.0 * b.0 + b.0 * b.0) / 12.0;
+            syy += cross * (a.1 * a.1 + a.1 * b.1 + b.1 * b.1) / 12.0;
+            sxy += cross * (2.0 * a.0 * a.1 + 2.0 * b.0 * b.1 + a.0 * b.1 + b.0 * a.1) / 24.0;
+        }
+        if area <= 0.0 || !area.is_finite() {
+            return None;
+        }
+        let (mx, my) = (sx / area, sy / area);
+        // A polygon on a smooth curve leaves the bows outside: 2/3 pi^2 / n^2 of the area for a circle.
+        let bows = 1.0 + 2.0 / 3.0 * (core::f64::consts::PI / n as f64).powi(2);
+        let moments = [
+            bows * (sxx / area - mx * mx),
+            bows * (sxy / area - mx * my),
+            bows * (syy / area - my * my),
+        ];
+        let area_px = bows * area;
+        let (x_px, y_px) = (x0 + mx, y0 + my);
+        let information = profile.information();
+        let mut c = [0.0; 6];
+        let (mut place, mut area_variance) = ([0.0; 3], 0.0);
+        for i in 0..n {
+            let (a, b) = (self.points[(i + n - 1) % n], self.points[(i + 1) % n]);
+            let length = 0.5 * f64::hypot(b.0 - a.0, b.1 - a.1);
+            let amplitude = self.amplitudes[i];
+            let each = length * variance / (information * amplitude * amplitude);
+            let (x, y) = (self.points[i].0 - x_px, self.points[i].1 - y_px);
+            area_variance += each;
+            place[0] += each * x * x;
+            place[1] += each * y * y;
+            place[2] += each * x * y;
+            let m = [x * x - moments[0], x * y - moments[1], y * y - moments[2]];
+            let pairs = [(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)];
+            for (sum, (i, j)) in c.iter_mut().zip(pairs) {
+                *sum += each * m[i] * m[j];
+            }
+        }
+        let over = 1.0 / (area_px * area_px);
+        let (width, height) = (contrast.width as f64, contrast.height as f64);
+        let at_border = self.points.iter().any(|&(x, y)| {
+            x < BORDER_PX
+                || y < BORDER_PX
+                || x > width - 1.0 - BORDER_PX
+                || y > height - 1.0 - BORDER_PX
+        });
+        Some(Outline {
+            x_px,
+            y_px,
+            place_variances: place.map(|v| v * over),
+            area_px,
+            area_variance,
+            moments_px2: moments,
+            moment_variances: c.map(|v| v * over),
+            rim_grey,
+            halo_grey,
+            solidity: (area / self.hull_area()).min(1.0),
+            at_border,
+        })
+    }
+
+    /// Area of the contour's convex hull (Andrew's monotone chain).
+    fn hull_area(&mut self) -> f64 {
+        self.sorted.clear();
+        self.sorted.extend(&self.points);
+        self.sorted
+            .sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.1.total_cmp(&b.1)));
+        self.hull.clear();
+        let turn = |a: (f64, f64), b: (f64, f64), c: (f64, f64)| {
+            (b.0 - a.0) * (c.1 - a.1) - (b.1 - a.1) * (c.0 - a.0)
+        };
+        for back in [false, true] {
+            let base = self.hull.len();
+            for k in 0..self.sorted.len() {
+                let at = if back { self.sorted.len() - 1 - k } else { k };
+                let p = self.sorted[at];
+                while let [.., a, b] = self.hull.as_slice()
+                    && self.hull.len() >= base + 2
+                    && turn(*a, *b, p) <= 0.0
+                {
+                    self.hull.pop();
+                }
+                self.hull.push(p);
+            }
+            // The last point is the first of the way back.
+            self.hull.pop();
+        }
+        let mut area = 0.0;
+        for (k, a) in self.hull.iter().enumerate() {
+            let b = self.hull[(k + 1) % self.hull.len()];
+            area += 0.5 * (a.0 * b.1 - b.0 * a.1);
+        }
+        area.abs().max(1e-9)
+    }
+}

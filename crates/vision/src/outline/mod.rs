@@ -1,0 +1,174 @@
+//! The outline of a cell in a picture of signed contrast: a closed contour on the crossing from the rim to the halo.
+//!
+//! Modelled, not thresholded. A contour of rays about a start ellipse is laid along the strongest consistent step from
+//! inside to outside, in either direction, by dynamic programming. Then the profile along the contour's own normals is
+//! averaged: that is what rim and halo of this cell look like in this focus. Each normal's profile is fitted by it (shift,
+//! amplitude, offset), so that the outline uses the whole width of the rim, and the shift comes with its variance. The
+//! outline is where the mean profile passes half of the rim's contrast: with a halo that lies on its flank, without one it
+//! is the usual half-height. Allocates only when made.
+
+mod contour;
+mod measure;
+mod normals;
+
+use normals::Profile;
+
+/// Most rays.
+pub(crate) const MAX_RAYS: usize = 128;
+/// Fewest rays.
+const MIN_RAYS: usize = 48;
+/// Most steps along a ray.
+const MAX_STEPS: usize = 48;
+/// Rays that the dynamic programming goes on past the start, so that the contour closes: a quarter on either side.
+const OVERLAP: usize = 24;
+/// Distance of the steps along a normal, px.
+const FINE_PX: f64 = 0.5;
+/// Most steps along a normal, on one side.
+const MAX_FINE: usize = 16;
+/// Passes of the fit along the normals.
+const PASSES: usize = 3;
+/// Cost of a step of the contour from ray to ray, as a share of a typical edge.
+const BEND: f32 = 0.08;
+/// Cost of what has the body's sign but lies outside, per px and share of its contrast.
+const OUTSIDE: f32 = 0.12;
+/// Depth over which the rim's contrast is taken, px.
+const RIM_PX: f64 = 4.0;
+/// Contour points that lie this near to the border are cut by it, px.
+const BORDER_PX: f64 = 1.5;
+
+/// Contrast of a frame: grey levels above the background.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Contrast<'a> {
+    pub pixels: &'a [f32],
+    pub width: usize,
+    pub height: usize,
+    /// First column and row that belong to the object, and the last: nothing counts beyond.
+    pub within: [f32; 4],
+    /// Largest contrast that counts, grey levels: a granule or a dead pixel is no edge.
+    pub most: f32,
+}
+
+impl Contrast<'_> {
+    /// Between the pixels, linearly; nothing outside.
+    #[inline(always)]
+    fn at(&self, x: f64, y: f64) -> f32 {
+        let (x, y) = (x as f32, y as f32);
+        let [left, top, right, bottom] = self.within;
+        if !(x >= left && y >= top && x <= right && y <= bottom) {
+            return 0.0;
+        }
+        let (i, j) = (x as usize, y as usize);
+        if i + 1 >= self.width || j + 1 >= self.height {
+            return 0.0;
+        }
+        let (u, v) = (x - i as f32, y - j as f32);
+        let k = j * self.width + i;
+        match (
+            self.pixels.get(k..k + 2),
+            self.pixels.get(k + self.width..k + self.width + 2),
+        ) {
+            (Some([a, b]), Some([c, d])) => {
+                let (upper, lower) = (a + u * (b - a), c + u * (d - c));
+                (upper + v * (lower - upper)).clamp(-self.most, self.most)
+            }
+            _ => 0.0,
+        }
+    }
+}
+
+/// Where to look: middle, half axes (px) and the long one's angle (rad) of an ellipse about the object with its halo.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Start {
+    pub x_px: f64,
+    pub y_px: f64,
+    pub long_px: f64,
+    pub short_px: f64,
+    pub angle_rad: f64,
+}
+
+/// What the outline encloses.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Outline {
+    pub x_px: f64,
+    pub y_px: f64,
+    /// Of `x_px`, `y_px`, and their covariance, px^2.
+    pub place_variances: [f64; 3],
+    pub area_px: f64,
+    pub area_variance: f64,
+    /// Central second moments: x x, x y, y y.
+    pub moments_px2: [f64; 3],
+    /// Their covariance: of the first with all three, of the second with the last two, of the last.
+    pub moment_variances: [f64; 6],
+    /// Contrast of the rim, signed.
+    pub rim_grey: f64,
+    /// Contrast of the halo, signed; of the same sign as the rim, or 0, where there is none.
+    pub halo_grey: f64,
+    /// Area over that of the convex hull.
+    pub solidity: f64,
+    pub at_border: bool,
+}
+
+/// Buffers of the outliner.
+#[derive(Debug, Clone)]
+pub(crate) struct Outliner {
+    rays: usize,
+    steps: usize,
+    samples: Vec<[f32; MAX_STEPS]>,
+    scores: Vec<[f32; MAX_STEPS]>,
+    from: Vec<[u8; MAX_STEPS]>,
+    points: Vec<(f64, f64)>,
+    normals: Vec<(f64, f64)>,
+    profiles: Vec<normals::Values>,
+    shifts: Vec<f64>,
+    /// Amplitude of each normal's profile, relative to the mean one.
+    amplitudes: Vec<f64>,
+    hull: Vec<(f64, f64)>,
+    sorted: Vec<(f64, f64)>,
+}
+
+impl Outliner {
+    pub fn new() -> Self {
+        Outliner {
+            rays: 0,
+            steps: 0,
+            samples: vec![[0.0; MAX_STEPS]; MAX_RAYS],
+            scores: vec![[0.0; MAX_STEPS]; MAX_RAYS + OVERLAP],
+            from: vec![[0; MAX_STEPS]; MAX_RAYS + OVERLAP],
+            points: Vec::with_capacity(MAX_RAYS),
+            normals: Vec::with_capacity(MAX_RAYS),
+            profiles: vec![[0.0; 2 * MAX_FINE + 1]; MAX_RAYS],
+            shifts: vec![0.0; MAX_RAYS],
+            amplitudes: vec![1.0; MAX_RAYS],
+            hull: Vec::with_capacity(2 * MAX_RAYS + 2),
+            sorted: Vec::with_capacity(MAX_RAYS),
+        }
+    }
+
+    /// Points of the last outline, px.
+    pub fn points(&self) -> &[(f64, f64)] {
+        &self.points
+    }
+
+    /// Outlines the object within `start`; `noise` is the standard deviation of a pixel, grey levels. `None` where there
+    /// is no closed step.
+    pub fn outline(&mut self, contrast: &Contrast, start: &Start, noise: f64) -> Option<Outline> {
+        let polarity = self.lay(contrast, start, noise)?;
+        let half =
+            ((0.45 * start.short_px).clamp(3.0, MAX_FINE as f64 * FINE_PX) / FINE_PX) as usize;
+        let mut profile = None;
+        for _ in 0..PASSES {
+            self.find_normals();
+            self.sample(contrast, half);
+            profile = Some(self.align(half, polarity)?);
+            self.shift_points();
+        }
+        let profile = profile?;
+        let (level_px, rim, halo) = profile.edge(self.radius_px())?;
+        self.find_normals();
+        for (p, n) in self.points.iter_mut().zip(&self.normals) {
+            *p = (p.0 + level_px * n.0, p.1 + level_px * n.1);
+        }
+        let residual = self.residual(&profile).max(noise * noise);
+        self.measure(contrast, &profile, residual, (rim, halo))
+    }
+}

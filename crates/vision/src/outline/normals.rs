@@ -1,0 +1,253 @@
+//! Profiles along the contour's normals, and the mean one that they are fitted by.
+
+use super::{Contrast, FINE_PX, MAX_FINE, Outliner, RIM_PX};
+use nalgebra::{Matrix3, Vector3};
+
+/// Values along a normal, from inside to outside.
+pub(super) type Values = [f32; 2 * MAX_FINE + 1];
+
+/// Farthest that a normal's profile is shifted in one pass, px.
+const MOST_SHIFT_PX: f64 = 1.0;
+/// An object hardly larger than its edge is wide loses contrast to the blur, so that half of what is left lies outside of
+/// it: from this ratio of width to radius on, share of the rim's contrast per ratio, and at most. Set by instruments' masks.
+const BLURRED: (f64, f64, f64) = (0.25, 2.8, 0.3);
+/// Share of the pixels' noise variance that is left in a shift: values between the pixels are means of them.
+const INTERPOLATED: f64 = 0.75;
+/// Amplitudes of a normal's profile that count as the same rim, relative to the mean one.
+const AMPLITUDES: (f64, f64) = (0.25, 4.0);
+
+/// The mean profile along the normals.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Profile {
+    values: [f64; 2 * MAX_FINE + 1],
+    slopes: [f64; 2 * MAX_FINE + 1],
+    /// Steps on one side.
+    half: usize,
+    /// 1 for a dark rim: outside is brighter.
+    polarity: f64,
+}
+
+impl Outliner {
+    /// Outward normals of the contour, from neighbours two points away on either side.
+    pub(super) fn find_normals(&mut self) {
+        let n = self.points.len();
+        self.normals.clear();
+        for i in 0..n {
+            let (a, b) = (self.points[(i + n - 2) % n], self.points[(i + 2) % n]);
+            let (tx, ty) = (b.0 - a.0, b.1 - a.1);
+            let length = f64::hypot(tx, ty).max(1e-9);
+            // The rays go round in the sense that has the outside on this side.
+            self.normals.push((ty / length, -tx / length));
+        }
+    }
+
+    pub(super) fn sample(&mut self, contrast: &Contrast, half: usize) {
+        let rays = self
+            .points
+            .iter()
+            .zip(&self.normals)
+            .zip(&mut self.profiles);
+        for ((p, n), values) in rays {
+            for (k, value) in values.iter_mut().enumerate().take(2 * half + 1) {
+                let s = (k as f64 - half as f64) * FINE_PX;
+                *value = contrast.at(p.0 + s * n.0, p.1 + s * n.1);
+            }
+        }
+    }
+
+    /// Mean profile, and each normal's shift against it by least squares beside amplitude and offset, into `shifts`.
+    pub(super) fn align(&mut self, half: usize, polarity: f64) -> Option<Profile> {
+        let profile = self.mean(half, polarity);
+        let (low, high) = profile.window();
+        let mut previous = 0.0;
+        for i in 0..self.points.len() {
+            let (Some(values), Some(shift), Some(amplitude)) = (
+                self.profiles.get(i),
+                self.shifts.get_mut(i),
+                self.amplitudes.get_mut(i),
+            ) else {
+                break;
+            };
+            let fitted = profile.fit(values, low, high);
+            let (found, a) = fitted.unwrap_or((previous, 1.0));
+            previous = found;
+            (*shift, *amplitude) = (found, a);
+        }
+        Some(profile)
+    }
+
+    fn mean(&self, half: usize, polarity: f64) -> Profile {
+        let count = 2 * half + 1;
+        let mut values = [0.0; 2 * MAX_FINE + 1];
+        for row in self.profiles.iter().take(self.points.len()) {
+            for (sum, v) in values.iter_mut().zip(row).take(count) {
+                *sum += f64::from(*v);
+            }
+        }
+        values
+            .iter_mut()
+            .for_each(|v| *v /= self.points.len().max(1) as f64);
+        let mut slopes = [0.0; 2 * MAX_FINE + 1];
+        for (k, slope) in slopes.iter_mut().enumerate().take(count) {
+            let (a, b) = (k.saturating_sub(1), (k + 1).min(count - 1));
+            *slope = (values[b] - values[a]) / ((b - a) as f64 * FINE_PX);
+        }
+        Profile {
+            values,
+            slopes,
+            half,
+            polarity,
+        }
+    }
+
+    /// Moves each point by its shift, smoothed with its neighbours'.
+    pub(super) fn shift_points(&mut self) {
+        let n = self.points.len();
+        for i in 0..n {
+            let at = |k: usize| self.shifts.get(k % n).copied().unwrap_or(0.0);
+            let shift = 0.25 * at(i + n - 1) + 0.5 * at(i) + 0.25 * at(i + 1);
+            if let (Some(p), Some(m)) = (self.points.get_mut(i), self.normals.get(i)) {
+                *p = (p.0 + shift * m.0, p.1 + shift * m.1);
+            }
+        }
+    }
+
+    /// Mean square of what the mean profile leaves of the normals' profiles, grey^2.
+    pub(super) fn residual(&self, profile: &Profile) -> f64 {
+        let (low, high) = profile.window();
+        let (mut sum, mut n) = (0.0, 0.0);
+        let rays = self.profiles.iter().zip(&self.shifts).zip(&self.amplitudes);
+        for ((values, shift), a) in rays.take(self.points.len()) {
+            let (mut mean, mut square) = (0.0, 0.0);
+            let means = profile.values.iter().zip(&profile.slopes);
+            let pairs = values.iter().zip(means).take(high + 1).skip(low);
+            for (v, (mean_v, slope)) in pairs {
+                let left = f64::from(*v) - a * (mean_v - shift * slope);
+                mean += left;
+                square += left * left;
+            }
+            // The offset and two more are fitted.
+            let count = (high - low + 1) as f64;
+            sum += square - mean * mean / count;
+            n += count - 3.0;
+        }
+        sum / f64::max(n, 1.0)
+    }
+}
+
+impl Profile {
+    /// Steps between which the edge lies: from the rim to the halo, and a little on either side.
+    pub(super) fn window(&self) -> (usize, usize) {
+        let (rim, halo) = (self.rim(), self.halo());
+        let margin = (1.0 / FINE_PX) as usize;
+        let low = rim.saturating_sub(margin).min(self.half - 2);
+        let high = (halo + margin).min(2 * self.half).max(self.half + 2);
+        (low, high)
+    }
+
+    /// Step of the rim's largest contrast, inside the middle.
+    fn rim(&self) -> usize {
+        self.extreme(0..=self.half, -self.polarity)
+    }
+
+    /// Step of the halo's largest contrast, outside the middle.
+    fn halo(&self) -> usize {
+        self.extreme(self.half..=2 * self.half, self.polarity)
+    }
+
+    /// The extreme nearest to the middle: the first local one that reaches nine tenths of the largest.
+    fn extreme(&self, range: core::ops::RangeInclusive<usize>, sign: f64) -> usize {
+        let value = |k: usize| sign * self.values[k];
+        let most = range.clone().map(value).fold(f64::NEG_INFINITY, f64::max);
+        let middle = sign * self.values[self.half];
+        let enough = middle + 0.9 * (most - middle);
+        range
+            .filter(|k| value(*k) >= enough)
+            .min_by_key(|k| k.abs_diff(self.half))
+            .unwrap_or(self.half)
+    }
+
+    /// Shift of a profile against this one, px outwards, and its amplitude.
+    fn fit(&self, values: &Values, low: usize, high: usize) -> Option<(f64, f64)> {
+        let (mut normal, mut right) = (Matrix3::zeros(), Vector3::zeros());
+        let means = self.values.iter().zip(&self.slopes);
+        for (v, (mean, slope)) in values.iter().zip(means).take(high + 1).skip(low) {
+            // v(s) = a T(s - shift) + b, to first order a T - a shift T' + b.
+            let g = Vector3::new(*mean, -slope, 1.0);
+            normal += g * g.transpose();
+            right += g * f64::from(*v);
+        }
+        // A little towards the mean profile's amplitude, so that a featureless stretch is not followed.
+        let ridge = 0.05 * normal[(0, 0)];
+        normal[(0, 0)] += ridge;
+        right[0] += ridge;
+        let solution = normal.cholesky()?.solve(&right);
+        let amplitude = solution[0].clamp(AMPLITUDES.0, AMPLITUDES.1);
+        let shift = (solution[1] / amplitude).clamp(-MOST_SHIFT_PX, MOST_SHIFT_PX);
+        shift.is_finite().then_some((shift, amplitude))
+    }
+
+    /// Where the mean profile passes half of the rim's contrast (px outside the middle), or near there beside a halo, the
+    /// rim's contrast, and the halo's; `radius_px` is that of the object.
+    pub(super) fn edge(&self, radius_px: f64) -> Option<(f64, f64, f64)> {
+        let body = -self.polarity;
+        let (rim_at, halo_at) = (self.rim(), self.halo());
+        let value = |k: usize| body * self.values[k];
+        let most = (0..=self.half).map(value).fold(0.0, f64::max);
+        let swing = value(rim_at) - value(halo_at);
+        if swing <= 0.0 {
+            return None;
+        }
+        // The rim begins where the soft edge ends.
+        let begin = (rim_at..=halo_at)
+            .rev()
+            .find(|k| value(*k) >= 0.9 * most)
+            .unwrap_or(rim_at);
+        let end = begin.saturating_sub((RIM_PX / FINE_PX) as usize);
+        // Between the mean and that weighted with the values themselves: a rim thinner than this depth counts in part.
+        let (first, second) = (end..=begin)
+            .map(|k| value(k).max(0.0))
+            .fold((0.0, 0.0), |(first, second), v| (first + v, second + v * v));
+        // Out of focus the body's own contrast may hide the rim: then the halo is all that shows of the edge.
+        let rim = if first > 0.0 {
+            0.5 * (second / first + first / (begin - end + 1) as f64)
+        } else {
+            0.0
+        };
+        let halo = (-value(halo_at)).max(0.0);
+        let ratio = halo / rim.max(1e-9);
+        let width_px = (halo_at - rim_at) as f64 * FINE_PX;
+        let blurred = (BLURRED.1 * (width_px / radius_px - BLURRED.0)).clamp(0.0, BLURRED.2);
+        // A halo as strong as the rim is the other lobe of one phase edge, in whose middle half of the body's own contrast is.
+        let depth = (self.half / 4).max(1);
+        let body_grey = (0..depth).map(value).sum::<f64>() / depth as f64;
+        let phase = ratio.min(1.0);
+        let level =
+            0.5 * (rim + phase * (body_grey - rim)) + rim * blurred * (2.0 * ratio).min(1.0);
+        let crossing = (rim_at..halo_at)
+            .filter(|k| value(*k) >= level && value(k + 1) < level)
+            .min_by_key(|k| k.abs_diff(self.half));
+        let at = match crossing {
+            Some(k) => k as f64 + (value(k) - level) / (value(k) - value(k + 1)),
+            None => self.half as f64,
+        };
+        let contrast = rim.max(0.5 * swing);
+        Some((
+            (at - self.half as f64) * FINE_PX,
+            body * contrast,
+            -body * halo,
+        ))
+    }
+
+    /// Information on a shift per px of contour, for pixels with noise of variance 1, amplitude and offset unknown.
+    pub(super) fn information(&self) -> f64 {
+        let (low, high) = self.window();
+        let mut normal = Matrix3::zeros();
+        for k in low..=high {
+            let g = Vector3::new(self.values[k], -self.slopes[k], 1.0);
+            normal += g * g.transpose();
+        }
+        let variance = normal.cholesky().map(|c| c.inverse()[(1, 1)]);
+        variance.map_or(f64::MIN_POSITIVE, |v| FINE_PX / (INTERPOLATED * v))
+    }
+}

@@ -1,0 +1,498 @@
+//! Settings found from a recording: strong objects that come again, their mean radial profile, and what they are told by.
+//!
+//! For a recording whose beads nobody has described. Objects of either polarity are looked for by their contrast against a
+//! smooth background, those of the commonest size and contrast are taken as beads, and the mean profile about their centres
+//! becomes the template: aligned, fitted, aligned again. Offline; allocates.
+
+use crate::blobs::Blobs;
+use crate::config::{LocaliserConfig, MAX_WINDOW_PX, Polarity};
+use crate::fix::Verdict;
+use crate::frame::{Frame, Pixels};
+use crate::localiser::Localiser;
+use crate::profile::{ProfileSpec, TABLE_KNOTS};
+use crate::seed;
+use crate::symmetry::RadialSymmetry;
+
+/// Passes of aligning and averaging.
+const PASSES: usize = 4;
+/// Contrast of an object over the noise of a mean of 5 x 5 pixels.
+const LEAST_SIGMA: f32 = 6.0;
+/// Share of the strongest contrast that an object has.
+const LEAST_SHARE: f32 = 0.15;
+/// Objects are alike within these factors of size and of contrast.
+const ALIKE: (f64, f64) = (1.3, 1.7);
+/// Fewest objects that make a profile.
+const FEWEST: usize = 5;
+/// Farthest that a profile is followed, in radii of the region that stands out.
+const REACH: f64 = 1.6;
+/// Share of the profile's extreme below which there is nothing left of it.
+const FADED: f64 = 0.03;
+/// Margin on the residual that the beads themselves have.
+const TOLERANCE_MARGIN: f64 = 2.0;
+/// Largest tolerance suggested.
+const MOST_TOLERANCE: f64 = 0.5;
+
+/// What was found in a recording.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Suggestion {
+    /// Settings of the localiser, the learnt profile in them.
+    pub config: LocaliserConfig,
+    /// Farthest that a bead went from frame to frame, with a margin, px.
+    pub max_step_px: f64,
+    /// Objects that stood out.
+    pub objects: usize,
+    /// Of these, taken as beads.
+    pub taken: usize,
+    /// Refused: another size or contrast, at the border, or a bad fit to the mean profile.
+    pub refused: Refused,
+    /// Median of the beads' peak contrast over the noise.
+    pub snr: f64,
+}
+
+/// Objects refused, by reason.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Refused {
+    /// Cut by the border.
+    pub at_border: usize,
+    /// Of another size or contrast than most.
+    pub other: usize,
+    /// Not fitted by the mean profile.
+    pub bad_fit: usize,
+}
+
+/// Why there is no suggestion.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+pub enum NothingToSuggest {
+    /// Nothing stands out.
+    #[error("nothing stands out of the noise in any of {frames} frames")]
+    Nothing {
+        /// Frames looked at.
+        frames: usize,
+    },
+    /// Too few objects that are alike.
+    #[error(
+        "of {objects} objects that stand out in {frames} frames no {FEWEST} are alike in size and contrast"
+    )]
+    NoneAlike {
+        /// Objects that stand out.
+        objects: usize,
+        /// Frames looked at.
+        frames: usize,
+    },
+    /// The mean profile does not fit the objects that it was made of.
+    #[error(
+        "the mean profile of {objects} objects does not fit them: they have no common round shape (cells: --cells)"
+    )]
+    NoProfile {
+        /// Objects that were alike.
+        objects: usize,
+    },
+}
+
+/// An object that stands out.
+#[derive(Debug, Clone, Copy)]
+struct Object {
+    frame: usize,
+    x_px: f64,
+    y_px: f64,
+    radius_px: f64,
+    contrast: f64,
+}
+
+/// A frame as grey levels above its smooth background.
+struct Flat {
+    width: usize,
+    height: usize,
+    values: Vec<f32>,
+    noise: f32,
+}
+
+/// Looks at frames of a recording, spread over it, and suggests settings for its beads.
+///
+/// # Errors
+/// Nothing stands out, or what does is not alike, or not round.
+pub fn suggest(frames: &[Frame]) -> Result<Suggestion, NothingToSuggest> {
+    let flats: Vec<Flat> = frames.iter().map(Flat::new).collect();
+    let mut refused = Refused::default();
+    let mut objects = Vec::new();
+    for (n, flat) in flats.iter().enumerate() {
+        flat.objects(n, &mut objects, &mut refused);
+    }
+    let seen = objects.len() + refused.at_border;
+    let count = frames.len();
+    if objects.is_empty() {
+        return Err(NothingToSuggest::Nothing { frames: count });
+    }
+    let alike = commonest(&objects);
+    if alike.len() < FEWEST.min(count.max(2)) {
+        return Err(NothingToSuggest::NoneAlike {
+            objects: seen,
+            frames: count,
+        });
+    }
+    refused.other = objects.len() - alike.len();
+    let suggestion = learn(frames, &flats, alike, refused)?;
+    Ok(Suggestion {
+        objects: seen,
+        ..suggestion
+    })
+}
+
+/// The template learnt from the beads that a detector with rough settings sees, whatever their fits say: a size that is
+/// wrong by a fifth or so is put right.
+///
+/// # Errors
+/// As [`suggest`].
+pub fn refine(frames: &[Frame], rough: &Localiser) -> Result<Suggestion, NothingToSuggest> {
+    let flats: Vec<Flat> = frames.iter().map(Flat::new).collect();
+    let mut detector = crate::Detector::new(rough, 1000);
+    let radius_px = 1.85 * rough.template().radius_px();
+    let mut objects = Vec::new();
+    for (n, frame) in frames.iter().enumerate() {
+        for blob in detector.detect(frame).iter().filter(|b| !b.at_border) {
+            objects.push(Object {
+                frame: n,
+                x_px: blob.x_px,
+                y_px: blob.y_px,
+                radius_px,
+                contrast: blob.peak,
+            });
+        }
+    }
+    if objects.is_empty() {
+        return Err(NothingToSuggest::Nothing {
+            frames: frames.len(),
+        });
+    }
+    let seen = objects.len();
+    let alike = commonest(&objects);
+    let refused = Refused {
+        other: seen - alike.len(),
+        ..Refused::default()
+    };
+    let suggestion = learn(frames, &flats, alike, refused)?;
+    Ok(Suggestion {
+        objects: seen,
+        ..suggestion
+    })
+}
+
+fn learn(
+    frames: &[Frame],
+    flats: &[Flat],
+    mut beads: Vec<Object>,
+    mut refused: Refused,
+) -> Result<Suggestion, NothingToSuggest> {
+    let reach_px = REACH * median(beads.iter().map(|o| o.radius_px));
+    let objects = beads.len();
+    let failed = NothingToSuggest::NoProfile { objects };
+    let mut config = None;
+    let mut fits = Vec::new();
+    for pass in 0..PASSES {
+        let profile = mean_profile(flats, &beads, reach_px).ok_or(failed)?;
+        let mut settings = settings(&profile, reach_px).ok_or(failed)?;
+        settings.template_tolerance = MOST_TOLERANCE;
+        let mut localiser = Localiser::new(settings.clone()).map_err(|_| failed)?;
+        fits.clear();
+        for bead in &mut beads {
+            let Some(frame) = frames.get(bead.frame) else {
+                continue;
+            };
+            let fix = localiser.locate(frame, Some((bead.x_px, bead.y_px)));
+            let near = f64::hypot(fix.x_px - bead.x_px, fix.y_px - bead.y_px);
+            if fix.verdict == Verdict::Good && near < localiser.template().radius_px() {
+                (bead.x_px, bead.y_px) = (fix.x_px, fix.y_px);
+                fits.push((bead.frame, fix));
+            }
+        }
+        if fits.len() * 2 < objects && pass + 1 == PASSES {
+            return Err(failed);
+        }
+        config = Some(settings);
+    }
+    let mut config = config.ok_or(failed)?;
+    refused.bad_fit = objects - fits.len();
+    let snr = median(fits.iter().map(|(_, f)| f.snr));
+    // What the beads' own residuals need, with a margin for those not looked at.
+    let needed = fits.iter().map(|(_, f)| {
+        let excess = (f.residual_ratio - config.max_residual_ratio).max(0.0);
+        excess.sqrt() / f.snr.max(1.0)
+    });
+    let needed = quantile(needed, 0.98);
+    let rough = LocaliserConfig::new(config.profile);
+    config.template_tolerance =
+        (TOLERANCE_MARGIN * needed).clamp(rough.template_tolerance, MOST_TOLERANCE);
+    config.min_snr = (0.2 * snr).clamp(3.0, 20.0).floor();
+    let max_step_px = step_px(&fits, reach_px);
+    Ok(Suggestion {
+        config,
+        max_step_px,
+        objects,
+        taken: fits.len(),
+        refused,
+        snr,
+    })
+}
+
+/// Objects alike to the one that has most, and strongest, like it.
+fn commonest(objects: &[Object]) -> Vec<Object> {
+    let within = |a: f64, b: f64, factor: f64| a < factor * b && b < factor * a;
+    let alike = |a: &Object| {
+        let same = |b: &&Object| {
+            within(a.radius_px, b.radius_px, ALIKE.0) && within(a.contrast, b.contrast, ALIKE.1)
+        };
+        objects.iter().filter(same).copied().collect::<Vec<_>>()
+    };
+    let weight = |a: &Object| alike(a).len() as f64 * a.contrast * a.radius_px;
+    let best = objects
+        .iter()
+        .max_by(|a, b| weight(a).total_cmp(&weight(b)));
+    best.map(alike).unwrap_or_default()
+}
+
+/// Mean contrast over the distance from the objects' centres, at [`TABLE_KNOTS`] distances up to `reach_px`.
+fn mean_profile(flats: &[Flat], beads: &[Object], reach_px: f64) -> Option<[f64; TABLE_KNOTS]> {
+    let knot_px = reach_px / (TABLE_KNOTS - 1) as f64;
+    let (mut sums, mut weights) = ([0.0; TABLE_KNOTS], [0.0; TABLE_KNOTS]);
+    for bead in beads {
+        let Some(flat) = flats.get(bead.frame) else {
+            continue;
+        };
+        let (x0, x1) = crate::profile::span(bead.x_px, reach_px, flat.width);
+        let (y0, y1) = crate::profile::span(bead.y_px, reach_px, flat.height);
+        for y in y0..y1 {
+            for x in x0..x1 {
+                let u = f64::hypot(x as f64 - bead.x_px, y as f64 - bead.y_px) / knot_px;
+                let (k, t) = (u as usize, u.fract());
+                if k + 1 < TABLE_KNOTS {
+                    let v = f64::from(flat.values[y * flat.width + x]);
+                    sums[k] += (1.0 - t) * v;
+                    weights[k] += 1.0 - t;
+                    sums[k + 1] += t * v;
+                    weights[k + 1] += t;
+                }
+            }
+        }
+    }
+    let mut profile = [f64::NAN; TABLE_KNOTS];
+    for ((p, s), w) in profile.iter_mut().zip(&sums).zip(&weights) {
+        if *w > 0.5 {
+            *p = s / w;
+        }
+    }
+    // Few pixels lie at the centre itself.
+    if profile[0].is_nan() {
+        profile[0] = profile[1];
+    }
+    profile.iter().all(|v| v.is_finite()).then_some(profile)
+}
+
+/// Settings for a mean profile, grey levels.
+fn settings(profile: &[f64; TABLE_KNOTS], reach_px: f64) -> Option<LocaliserConfig> {
+    let knot_px = reach_px / (TABLE_KNOTS - 1) as f64;
+    let outer = &profile[TABLE_KNOTS * 5 / 6..];
+    let floor = outer.iter().sum::<f64>() / outer.len() as f64;
+    let extreme = profile.iter().map(|v| v - floor).fold(0.0_f64, |best, v| {
+        if v.abs() > best.abs() { v } else { best }
+    });
+    if extreme == 0.0 {
+        return None;
+    }
+    let mut values = profile.map(|v| (v - floor) / extreme);
+    let last = values
+        .iter()
+        .rposition(|v| v.abs() > FADED)
+        .unwrap_or(TABLE_KNOTS - 1);
+    for (k, v) in values.iter_mut().enumerate() {
+        let fade = ((TABLE_KNOTS - 1 - k) as f64 / 4.0).min(1.0);
+        *v *= fade;
+    }
+    // The edge: where the step is largest, counted with the length of the edge.
+    let step = |k: usize| (values[k + 1] - values[k]).abs() * (k as f64 + 0.5);
+    let edge = (0..TABLE_KNOTS - 1).max_by(|a, b| step(*a).total_cmp(&step(*b)))?;
+    let radius_px = ((edge as f64 + 0.5) * knot_px).max(1.0);
+    let extent_px = ((last + 1) as f64 * knot_px).max(1.3 * radius_px);
+    let spec = ProfileSpec::Table {
+        radius_px: rounded(radius_px, 100.0),
+        knot_px: rounded(knot_px, 1e4),
+        values: values.map(|v| rounded(v, 1e4)),
+    };
+    let mut config = LocaliserConfig::new(spec);
+    config.window_px = (2 * extent_px.ceil() as usize + 1).clamp(15, MAX_WINDOW_PX);
+    config.polarity = if extreme > 0.0 {
+        Polarity::Bright
+    } else {
+        Polarity::Dark
+    };
+    Some(config)
+}
+
+/// Farthest step of a bead between frames next to each other, with a margin; a bead's reach where there are none.
+fn step_px(fits: &[(usize, crate::Fix)], reach_px: f64) -> f64 {
+    let mut steps = Vec::new();
+    for (n, fix) in fits {
+        let next = fits.iter().filter(|(m, _)| *m == n + 1);
+        let away = next.map(|(_, f)| f64::hypot(f.x_px - fix.x_px, f.y_px - fix.y_px));
+        if let Some(step) = away.min_by(f64::total_cmp).filter(|step| *step < reach_px) {
+            steps.push(step);
+        }
+    }
+    if steps.is_empty() {
+        return reach_px;
+    }
+    rounded((2.5 * quantile(steps.into_iter(), 0.99)).max(2.0), 10.0)
+}
+
+impl Flat {
+    fn new(frame: &Frame) -> Self {
+        let (values, noise) = match frame.pixels {
+            Pixels::Mono8(p) => (
+                p.iter().map(|v| f32::from(*v)).collect(),
+                seed::background(p).1,
+            ),
+            Pixels::Mono16(p) => (
+                p.iter().map(|v| f32::from(*v)).collect(),
+                seed::background(p).1,
+            ),
+        };
+        let mut flat = Flat {
+            width: frame.width,
+            height: frame.height,
+            values,
+            noise: noise.max(0.29) as f32,
+        };
+        flat.flatten();
+        flat
+    }
+
+    /// Takes off a parabola fitted to what is not an object.
+    fn flatten(&mut self) {
+        use nalgebra::{SMatrix, SVector};
+        let (width, height) = (self.width.max(1) as f64, self.height.max(1) as f64);
+        let terms = |k: usize| {
+            let u = (k % self.width) as f64 / width - 0.5;
+            let v = (k / self.width) as f64 / height - 0.5;
+            SVector::<f64, 6>::from([1.0, u, v, u * u, u * v, v * v])
+        };
+        let mut limit = f64::INFINITY;
+        let mut fitted = SVector::<f64, 6>::zeros();
+        for _ in 0..6 {
+            let (mut normal, mut right) =
+                (SMatrix::<f64, 6, 6>::zeros(), SVector::<f64, 6>::zeros());
+            let (mut off, mut n) = (0.0, 0.0_f64);
+            for (k, v) in self.values.iter().enumerate().step_by(3) {
+                let g = terms(k);
+                let residual = f64::from(*v) - fitted.dot(&g);
+                if limit.is_infinite() || residual.abs() <= limit {
+                    normal += g * g.transpose();
+                    right += g * f64::from(*v);
+                    off += residual.abs();
+                    n += 1.0;
+                }
+            }
+            let Some(cholesky) = normal.cholesky() else {
+                break;
+            };
+            fitted = cholesky.solve(&right);
+            limit = if limit.is_infinite() {
+                f64::MAX
+            } else {
+                2.5 * 1.25 * off / n.max(1.0)
+            };
+        }
+        let plane: Vec<f32> = (0..self.values.len())
+            .map(|k| fitted.dot(&terms(k)) as f32)
+            .collect();
+        for (v, p) in self.values.iter_mut().zip(plane) {
+            *v -= p;
+        }
+    }
+
+    /// Mean of the contrast's square over 5 x 5 pixels, as a root.
+    fn strength(&self) -> Vec<f32> {
+        let (w, h) = (self.width, self.height);
+        let mut rows = vec![0.0; w * h];
+        for (row, values) in rows.chunks_exact_mut(w).zip(self.values.chunks_exact(w)) {
+            for (x, sum) in row.iter_mut().enumerate() {
+                let near = &values[x.saturating_sub(2)..(x + 3).min(w)];
+                *sum = near.iter().map(|v| v * v).sum::<f32>() / near.len() as f32;
+            }
+        }
+        (0..w * h)
+            .map(|k| {
+                let (x, y) = (k % w, k / w);
+                let near = y.saturating_sub(2)..(y + 3).min(h);
+                let count = near.len() as f32;
+                (near.map(|j| rows[j * w + x]).sum::<f32>() / count).sqrt()
+            })
+            .collect()
+    }
+
+    fn objects(&self, frame: usize, objects: &mut Vec<Object>, refused: &mut Refused) {
+        let strength = self.strength();
+        let strongest = strength.iter().fold(0.0_f32, |a, b| a.max(*b));
+        // The RMS of noise alone is `noise`, and scatters by a seventh of it.
+        let least = self.noise * (1.0 + LEAST_SIGMA / 7.0);
+        let threshold = least.max(LEAST_SHARE * strongest);
+        let mut blobs = Blobs::new(self.width / 2 + 1, 16 * 1024);
+        let at = |x: usize, y: usize| strength[y * self.width + x];
+        let found = blobs.label((self.width, self.height), threshold, 20.0, at);
+        for blob in found {
+            if blob.at_border {
+                refused.at_border += 1;
+                continue;
+            }
+            // The mean over 5 x 5 pixels has made it wider by two pixels all round.
+            let radius_px = ((blob.area_px / core::f64::consts::PI).sqrt() - 2.0).max(1.5);
+            let side = (2.0 * 1.2 * radius_px).ceil() as usize | 1;
+            let [left, top, right, bottom] = blob.bounds;
+            let middle = (
+                0.5 * (f64::from(left) + f64::from(right) - 1.0),
+                0.5 * (f64::from(top) + f64::from(bottom) - 1.0),
+            );
+            let (x_px, y_px) = self
+                .centre(middle, side.clamp(7, MAX_WINDOW_PX))
+                .unwrap_or(middle);
+            objects.push(Object {
+                frame,
+                x_px,
+                y_px,
+                radius_px,
+                contrast: blob.peak,
+            });
+        }
+    }
+
+    /// Centre of symmetry near a place.
+    fn centre(&self, (x, y): (f64, f64), side: usize) -> Option<(f64, f64)> {
+        let scale = 20.0 / self.noise;
+        let grey: Vec<u16> = self
+            .values
+            .iter()
+            .map(|v| (32_768.0 + scale * v).clamp(0.0, 65_535.0) as u16)
+            .collect();
+        let frame = Frame {
+            width: self.width,
+            height: self.height,
+            pixels: Pixels::Mono16(&grey),
+        };
+        let mut symmetry = RadialSymmetry::new(side);
+        let found = symmetry.locate(&frame, x, y)?;
+        (f64::hypot(found.0 - x, found.1 - y) < 0.35 * side as f64).then_some(found)
+    }
+}
+
+fn rounded(v: f64, per_unit: f64) -> f64 {
+    (v * per_unit).round() / per_unit
+}
+
+fn median(values: impl Iterator<Item = f64>) -> f64 {
+    quantile(values, 0.5)
+}
+
+fn quantile(values: impl Iterator<Item = f64>, q: f64) -> f64 {
+    let mut sorted: Vec<f64> = values.collect();
+    sorted.sort_by(f64::total_cmp);
+    let at = (sorted.len().saturating_sub(1) as f64 * q).round() as usize;
+    sorted.get(at).copied().unwrap_or(0.0)
+}

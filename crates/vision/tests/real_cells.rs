@@ -1,0 +1,302 @@
+//! Cells and beads that deformability cytometers recorded, against the instruments' own masks.
+
+mod common;
+
+use cellpos_vision::{Cell, CellConfig, CellFinder, Frame, Pixels};
+use common::Random;
+use common::stack::{Stack, masks};
+
+/// What a mask says: pixels, middle, and 4 standard deviations along the rows.
+struct Mask {
+    area: f64,
+    x: f64,
+    y: f64,
+    length: f64,
+}
+
+fn moments(mask: &[u8], width: usize) -> Mask {
+    let (mut n, mut sx, mut sy, mut sxx) = (0.0, 0.0, 0.0, 0.0);
+    for (k, _) in mask.iter().enumerate().filter(|(_, m)| **m > 0) {
+        let (x, y) = ((k % width) as f64, (k / width) as f64);
+        n += 1.0;
+        sx += x;
+        sy += y;
+        sxx += x * x;
+    }
+    let mean = sx / n;
+    let length = 4.0 * (sxx / n - mean * mean + 1.0 / 12.0).sqrt();
+    Mask {
+        area: n,
+        x: mean,
+        y: sy / n,
+        length,
+    }
+}
+
+fn median(values: &[f64]) -> f64 {
+    let mut sorted = values.to_vec();
+    sorted.sort_by(f64::total_cmp);
+    sorted[sorted.len() / 2]
+}
+
+/// What is done to the pictures before they are looked at, the background's and the cells' alike.
+#[derive(Debug, Clone, Copy)]
+enum Change {
+    None,
+    /// Bright and dark exchanged.
+    Inverted,
+    /// Grey levels times a factor, plus an offset.
+    Scaled(f64, f64),
+    /// Normal noise of this standard deviation on top.
+    Noise(f64),
+    /// Mean of 3 x 3 pixels.
+    Blurred,
+    /// Upside down.
+    Flipped,
+}
+
+impl Change {
+    fn apply(self, pixels: &[u8], width: usize, random: &mut Random) -> Vec<u8> {
+        let height = pixels.len() / width;
+        let at =
+            |x: usize, y: usize| f64::from(pixels[y.min(height - 1) * width + x.min(width - 1)]);
+        let value = |k: usize, random: &mut Random| {
+            let (x, y) = (k % width, k / width);
+            match self {
+                Change::None => at(x, y),
+                Change::Inverted => 255.0 - at(x, y),
+                Change::Scaled(factor, offset) => factor * at(x, y) + offset,
+                Change::Noise(sd) => at(x, y) + sd * random.normal(),
+                Change::Blurred => {
+                    let near = |c: usize| [c.saturating_sub(1), c, c + 1];
+                    let sum: f64 = near(y)
+                        .iter()
+                        .flat_map(|j| near(x).map(|i| at(i, *j)))
+                        .sum();
+                    sum / 9.0
+                }
+                Change::Flipped => at(x, height - 1 - y),
+            }
+        };
+        (0..pixels.len())
+            .map(|k| value(k, random).round().clamp(0.0, 255.0) as u8)
+            .collect()
+    }
+}
+
+/// The cell over each mask, and the mask.
+fn pairs(name: &str, least_mask_px: f64, change: Change) -> Vec<(usize, Option<Cell>, Mask)> {
+    let stack = Stack::open(name, "frames.tif");
+    let empty = Stack::open(name, "background.tif");
+    let masks = masks(name);
+    let (width, height) = (stack.width, stack.height);
+    let mut random = Random(11);
+    let mut finder = CellFinder::new(width, height, CellConfig::default()).unwrap();
+    fn frame(pixels: &[u8], width: usize, height: usize) -> Frame<'_> {
+        Frame {
+            width,
+            height,
+            pixels: Pixels::Mono8(pixels),
+        }
+    }
+    for page in &empty.pages {
+        let page = change.apply(page, width, &mut random);
+        finder
+            .take_background(&frame(&page, width, height))
+            .unwrap();
+    }
+    let mut pairs = Vec::new();
+    for (n, (page, mask)) in stack.pages.iter().zip(&masks).enumerate() {
+        let page = change.apply(page, width, &mut random);
+        let mask = match change {
+            Change::Flipped => change.apply(mask, width, &mut random),
+            _ => mask.clone(),
+        };
+        let mask = moments(&mask, width);
+        let found = finder.find(&frame(&page, width, height)).unwrap();
+        if mask.area < least_mask_px || mask.area.is_nan() {
+            continue;
+        }
+        let own = found
+            .iter()
+            .find(|c| f64::hypot(c.x_px - mask.x, c.y_px - mask.y) < 8.0);
+        if let Some(c) = own {
+            println!(
+                "{name} {n} {change:?}: {} found; area {:.3} +- {:.3} and length {:.3} of the mask's, place {:.2} {:.2} px off, \
+                 sd {:.3} px, rim {:.1}, halo {:.1}{}",
+                found.len(),
+                c.area_px / mask.area,
+                c.var_area_px2.sqrt() / mask.area,
+                c.extent_px((1.0, 0.0)) / mask.length,
+                c.x_px - mask.x,
+                c.y_px - mask.y,
+                c.var_x_px2.sqrt(),
+                c.body_grey,
+                c.halo_grey,
+                if c.in_contact { ", in contact" } else { "" },
+            );
+        }
+        pairs.push((n, own.copied(), mask));
+    }
+    pairs
+}
+
+fn areas(pairs: &[(usize, Option<Cell>, Mask)]) -> Vec<f64> {
+    let ratio = |(_, cell, mask): &(usize, Option<Cell>, Mask)| cell.map(|c| c.area_px / mask.area);
+    pairs.iter().filter_map(ratio).collect()
+}
+
+/// Every mask has its cell, its area within `each` of the mask's and the median within `most`.
+fn check(name: &str, change: Change, most: f64, each: f64) {
+    let pairs = pairs(name, 100.0, change);
+    let ratios = areas(&pairs);
+    assert_eq!(ratios.len(), pairs.len(), "{name} {change:?}");
+    let middle = median(&ratios);
+    println!("{name} {change:?}: median area {middle:.3} of the masks'");
+    assert!((middle - 1.0).abs() <= most, "{name} {change:?}: {middle}");
+    for ratio in ratios {
+        assert!((ratio - 1.0).abs() <= each, "{name} {change:?}: {ratio}");
+    }
+}
+
+#[test]
+#[cfg_attr(no_shared_data, ignore = "needs ../shared/data/cells-in-channels")]
+fn measured_cells_and_beads_have_the_area_length_and_place_of_the_instruments_masks() {
+    for name in ["calibration-beads", "cells-wide-channel"] {
+        check(name, Change::None, 0.05, 0.15);
+        let pairs = pairs(name, 100.0, Change::None);
+        let own = |(_, cell, mask): &(usize, Option<Cell>, Mask)| {
+            let c = cell.unwrap();
+            let away = f64::hypot(c.x_px - mask.x, c.y_px - mask.y);
+            (c.extent_px((1.0, 0.0)) / mask.length, away)
+        };
+        let (lengths, away): (Vec<f64>, Vec<f64>) = pairs.iter().map(own).unzip();
+        let (low, high) = lengths
+            .iter()
+            .fold((9.0_f64, 0.0_f64), |(l, h), v| (l.min(*v), h.max(*v)));
+        println!(
+            "{name}: length {low:.3} .. {high:.3} of the masks', place {:.2} px off",
+            median(&away)
+        );
+        assert!(high - low <= 0.03, "{name}: {low} .. {high}");
+        assert!(median(&away) <= 0.3, "{name}: {away:?}");
+    }
+}
+
+#[test]
+#[cfg_attr(no_shared_data, ignore = "needs ../shared/data/cells-in-channels")]
+fn faint_cells_stay_whole_and_have_the_area_that_the_file_says() {
+    let pairs = pairs("cells-low-contrast", 100.0, Change::None);
+    let areas: Vec<f64> = pairs.iter().map(|(_, c, _)| c.unwrap().area_px).collect();
+    // The file's own areas of these events, px.
+    let file = [218.5, 215.0, 217.0, 220.5, 210.5, 218.0, 204.0, 218.0];
+    let ratio = median(&areas) / median(&file);
+    println!("median area {ratio:.3} of the file's own");
+    assert!((ratio - 1.0).abs() <= 0.1, "{ratio}");
+    for (area, file) in areas.iter().zip(file) {
+        assert!((area / file - 1.0).abs() < 0.25, "{area} {file}");
+    }
+}
+
+#[test]
+#[cfg_attr(no_shared_data, ignore = "needs ../shared/data/cells-in-channels")]
+fn other_polarity_light_noise_focus_and_side_change_the_outlines_little() {
+    for change in [
+        Change::Inverted,
+        Change::Scaled(0.5, 0.0),
+        Change::Scaled(1.0, 40.0),
+        Change::Noise(3.0),
+        Change::Blurred,
+        Change::Flipped,
+    ] {
+        check("calibration-beads", change, 0.08, 0.15);
+        check("cells-wide-channel", change, 0.06, 0.15);
+    }
+    // A third of the rim's contrast is hidden in noise as deep as a quarter of it.
+    let noisy = pairs("cells-low-contrast", 100.0, Change::Noise(2.5));
+    assert!(noisy.iter().all(|(_, cell, _)| cell.is_some()));
+    let middle = median(&areas(&noisy));
+    assert!((middle - 1.0).abs() < 0.15, "{middle}");
+}
+
+/// Frames of one cell each, enlarged, with the outline in green and the mask's edge in red, below each other.
+fn draw(
+    name: &str,
+    from: &[usize],
+    (width, height): (usize, usize),
+    scale: usize,
+) -> image::RgbImage {
+    let stack = Stack::open(name, "frames.tif");
+    let empty = Stack::open(name, "background.tif");
+    let masks = masks(name);
+    let mut finder = CellFinder::new(stack.width, stack.height, CellConfig::default()).unwrap();
+    empty
+        .frames()
+        .for_each(|frame| finder.take_background(&frame).unwrap());
+    let mut sheet =
+        image::RgbImage::new((width * scale) as u32, (from.len() * height * scale) as u32);
+    for (tile, n) in from.iter().enumerate() {
+        let frame = stack.frames().nth(*n).unwrap();
+        let cell = finder.find(&frame).unwrap()[0];
+        let (page, mask) = (&stack.pages[*n], &masks[*n]);
+        let left = (cell.x_px as usize)
+            .saturating_sub(width / 2)
+            .min(stack.width - width);
+        let top = (cell.y_px as usize)
+            .saturating_sub(height / 2)
+            .min(stack.height - height);
+        let inside = |x: usize, y: usize| mask[y * stack.width + x] > 0;
+        let rest = &page[..stack.width * (stack.height - 6)];
+        let (low, high) = (rest.iter().min().unwrap(), rest.iter().max().unwrap());
+        for y in 0..height * scale {
+            for x in 0..width * scale {
+                let (i, j) = (left + x / scale, top + y / scale);
+                let v = f64::from(page[j * stack.width + i]) - f64::from(*low);
+                let grey = (255.0 * v / f64::from(high - low)).clamp(0.0, 255.0) as u8;
+                let edge = (x % scale == 0 && inside(i, j) != inside(i.saturating_sub(1), j))
+                    || (y % scale == 0 && inside(i, j) != inside(i, j.saturating_sub(1)));
+                let colour = if edge { [230, 60, 60] } else { [grey; 3] };
+                sheet.put_pixel(
+                    x as u32,
+                    (tile * height * scale + y) as u32,
+                    image::Rgb(colour),
+                );
+            }
+        }
+        let outline = finder.outline(0);
+        for (k, a) in outline.iter().enumerate() {
+            let b = outline[(k + 1) % outline.len()];
+            for t in 0..20 {
+                let t = f64::from(t) / 20.0;
+                let at = |a: f64, b: f64, from: usize| {
+                    (a + t * (b - a) + 0.5 - from as f64) * scale as f64
+                };
+                let (x, y) = (at(a.0, b.0, left), at(a.1, b.1, top));
+                if x >= 0.0 && y >= 0.0 && x < (width * scale) as f64 && y < (height * scale) as f64
+                {
+                    sheet.put_pixel(
+                        x as u32,
+                        tile as u32 * (height * scale) as u32 + y as u32,
+                        image::Rgb([60, 230, 90]),
+                    );
+                }
+            }
+        }
+    }
+    sheet
+}
+
+#[test]
+#[ignore = "writes docs/images/outlines-*.png: cargo test -p cellpos-vision --test real_cells -- --ignored draw"]
+fn draw_the_outlines_of_the_documentation() {
+    let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../../docs/images");
+    std::fs::create_dir_all(folder).unwrap();
+    for (name, frames, size, scale) in [
+        ("calibration-beads", vec![0, 1, 4], (64, 40), 6),
+        ("cells-wide-channel", vec![0, 3, 7], (128, 90), 4),
+        ("cells-low-contrast", vec![0, 1, 4], (64, 36), 6),
+    ] {
+        let sheet = draw(name, &frames, size, scale);
+        sheet.save(format!("{folder}/outlines-{name}.png")).unwrap();
+    }
+}

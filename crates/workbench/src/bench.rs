@@ -1,0 +1,76 @@
+//! The devices of a rig file, without a tracker.
+
+use cellpos_drivers::serial::SerialLine;
+use cellpos_drivers::{BoardHost, Port};
+use cellpos_emulator::EmulatedRig;
+use cellpos_plant::Model;
+use cellpos_rig::{Camera, Clock};
+use cellpos_session::rig_file::{ActuatorConfig, CameraConfig};
+use cellpos_session::{Failure, RigFile};
+
+/// Board and camera on the machine's clock; each is opened when it is asked for.
+pub struct Bench {
+    file: RigFile,
+    emulated: Option<EmulatedRig>,
+}
+
+/// A board at the end of any port.
+pub type Board = BoardHost<Box<dyn Port>>;
+
+impl Bench {
+    /// A bench with the devices of a rig file; nothing is opened yet.
+    ///
+    /// # Errors
+    /// A value of the emulated rig that cannot be.
+    pub fn of(file: RigFile) -> Result<Self, Failure> {
+        let emulated = if matches!(file.actuator, ActuatorConfig::Emulated {})
+            || matches!(file.camera, CameraConfig::Emulated {})
+        {
+            let model = Model::load(&file.emulator.model).map_err(Failure::input)?;
+            let rig = EmulatedRig::new(file.board, &file.emulator, &model, Clock::Real);
+            Some(rig.map_err(Failure::input)?)
+        } else {
+            None
+        };
+        Ok(Self { file, emulated })
+    }
+
+    /// The rig file.
+    pub fn file(&self) -> &RigFile {
+        &self.file
+    }
+
+    /// Opens the board.
+    ///
+    /// # Errors
+    /// The port cannot be opened, or no board answers.
+    pub fn board(&self) -> Result<Board, Failure> {
+        let port: Box<dyn Port> = match (&self.file.actuator, &self.emulated) {
+            (ActuatorConfig::Serial { port, baud, .. }, _) => {
+                let line = SerialLine::open(port, *baud).map_err(|error| {
+                    Failure::bad_input(
+                        format!("[actuator] port = \"{port}\": {error}"),
+                        "is the board plugged in, and may you read and write the device? See docs/rig.md, Permissions",
+                    )
+                })?;
+                Box::new(line)
+            }
+            (ActuatorConfig::Emulated {}, Some(rig)) => Box::new(rig.port()),
+            (ActuatorConfig::Emulated {}, None) => {
+                return Err(Failure::bad_input("no emulated rig", "name a serial port"));
+            }
+        };
+        BoardHost::connect(port, Clock::Real).map_err(Failure::failed)
+    }
+
+    /// Opens the camera.
+    ///
+    /// # Errors
+    /// The camera is not there, or delivers nothing.
+    pub fn camera(&self) -> Result<Box<dyn Camera>, Failure> {
+        match (&self.file.camera, &self.emulated) {
+            (CameraConfig::Emulated {}, Some(rig)) => Ok(Box::new(rig.camera())),
+            _ => self.file.open_camera(),
+        }
+    }
+}

@@ -1,0 +1,321 @@
+//! Axis, sign and tilt of the channel in the picture, from pulses of the PZT in open loop.
+//!
+//! The PZT sets the bead's velocity, v = K (x1 - neutral): pulses to both sides move it to and fro, and what of its motion goes
+//! with the pulses is a vector in the picture, whatever drift and Brownian motion do besides. Its direction is axis, sign and
+//! tilt. Its length is K in pixels: with a pixel size from elsewhere it is compared with the model, so that a pixel size that is
+//! wrong by a factor is noticed.
+
+use crate::bench::Bench;
+use crate::mover::Mover;
+use crate::snapshot::Eye;
+use cellpos_drivers::{Axis, CalibrationFile};
+use cellpos_rig::{Camera, Clock, FrameBuffer};
+use cellpos_session::Failure;
+use serde::Serialize;
+
+/// Pulses: how far, how long, how many.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Pulses {
+    /// To each side of where the PZT stands, um.
+    pub amplitude_um: f64,
+    /// Of each side, ms.
+    pub length_ms: u32,
+    /// Pairs of them.
+    pub pairs: u32,
+}
+
+impl Default for Pulses {
+    /// 0.2 um for 15 ms: 1.3 um of way at the paper's gain, a tenth of the view.
+    fn default() -> Self {
+        Self {
+            amplitude_um: 0.2,
+            length_ms: 15,
+            pairs: 40,
+        }
+    }
+}
+
+/// What the pulses showed.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Response {
+    /// Bead velocity per displacement of the PZT along columns' and rows' numbers, px/s per um.
+    pub gain_px_per_s: [f64; 2],
+    /// Its standard deviation, per axis.
+    pub sd_px_per_s: f64,
+    /// From a command to the motion that it causes, as frames show it, ms.
+    pub lag_ms: f64,
+    /// Frames used.
+    pub frames: usize,
+    /// Size of the frames, px.
+    pub size_px: [usize; 2],
+}
+
+impl Response {
+    /// Length of the gain vector, px/s per um.
+    pub fn gain(&self) -> f64 {
+        self.gain_px_per_s[0].hypot(self.gain_px_per_s[1])
+    }
+
+    /// Axis, sign, tilt (degrees) and the tilt's standard deviation.
+    pub fn direction(&self) -> (Axis, i8, f64, f64) {
+        let [x, y] = self.gain_px_per_s;
+        let (axis, along, other) = if x.abs() >= y.abs() {
+            (Axis::X, x, y)
+        } else {
+            (Axis::Y, y, x)
+        };
+        let sign = if along < 0.0 { -1 } else { 1 };
+        let tilt_deg = (other / along).atan().to_degrees();
+        let sd_deg = (self.sd_px_per_s / self.gain()).to_degrees();
+        (axis, sign, tilt_deg, sd_deg)
+    }
+
+    /// The calibration, with a pixel size from elsewhere. A tilt within two of its standard deviations counts as none.
+    pub fn calibration(&self, pixel_um: f64, pixel_um_sd: f64, method: String) -> CalibrationFile {
+        let (axis, sign, tilt_deg, sd_deg) = self.direction();
+        let [width, height] = self.size_px.map(|px| px.saturating_sub(1) as f64);
+        let (origin_px, across_px) = match axis {
+            Axis::X => (0.5 * width, 0.5 * height),
+            Axis::Y => (0.5 * height, 0.5 * width),
+        };
+        CalibrationFile {
+            pixel_um,
+            pixel_um_sd,
+            axis,
+            sign,
+            origin_px,
+            tilt_deg: if tilt_deg.abs() > 2.0 * sd_deg {
+                tilt_deg
+            } else {
+                0.0
+            },
+            origin_across_px: across_px,
+            date: jiff::Timestamp::now().strftime("%Y-%m-%d").to_string(),
+            method,
+        }
+    }
+}
+
+/// One frame with a bead: when, and where.
+#[derive(Debug, Clone, Copy)]
+struct Sighting {
+    at_ns: i64,
+    x_px: f64,
+    y_px: f64,
+}
+
+/// Moves the PZT by pulses about where it stands and looks what the bead does. Parked on every way out.
+///
+/// # Errors
+/// No camera, no board, no bead, a bead that does not move with the PZT.
+pub fn measure(
+    bench: &Bench,
+    pulses: Pulses,
+    mut progress: impl FnMut(f64),
+) -> Result<Response, Failure> {
+    let mut camera = bench.camera()?;
+    let mut eye = Eye::of(bench)?;
+    let mut mover = Mover::arm(bench.board()?, bench.file())?;
+    let centre_um = mover.at_um();
+    let a_um = pulses.amplitude_um;
+    let (low_um, high_um) = (mover.limits().low_um, mover.limits().high_um);
+    if !(centre_um - a_um >= low_um && centre_um + a_um <= high_um) {
+        return Err(Failure::bad_input(
+            format!(
+                "the PZT stands at {centre_um:.2} um, limits are {low_um} to {high_um} um: no room for {a_um} um to both sides"
+            ),
+            "move it first: park_um in [limits] of rig.toml near the middle of the range, then cellpos jog --to that",
+        ));
+    }
+    let clock = Clock::Real;
+    let (mut commands, mut sightings) = (Vec::new(), Vec::new());
+    let mut buffer = FrameBuffer::default();
+    let start_ns = clock.now_ns();
+    let steps = 2 * pulses.length_ms * pulses.pairs;
+    // The first tenth of a second finds the bead; nothing moves.
+    const FIND_MS: u32 = 100;
+    for step in 0..FIND_MS + steps {
+        let offset_um = match step.checked_sub(FIND_MS) {
+            // Half a pulse first: to and fro about the same place.
+            Some(at) if ((at + pulses.length_ms / 2) / pulses.length_ms).is_multiple_of(2) => a_um,
+            Some(_) => -a_um,
+            None => 0.0,
+        };
+        mover.step(centre_um + offset_um, f64::INFINITY)?;
+        commands.push((clock.now_ns(), offset_um));
+        progress(f64::from(step) / f64::from(FIND_MS + steps));
+        collect(
+            camera.as_mut(),
+            &mut eye,
+            &mut buffer,
+            start_ns,
+            &mut sightings,
+        )?;
+    }
+    mover.step(centre_um, f64::INFINITY)?;
+    drop(mover);
+    let response = fit(&commands, &sightings, [buffer.width, buffer.height]).ok_or_else(|| {
+        Failure::bad_input(
+            format!("a bead was seen in {} frames: too few", sightings.len()),
+            "look with cellpos camera --rig RIG --snapshot frame.png --overlay; see docs/rig.md, Light and focus",
+        )
+    })?;
+    if response.gain() < 5.0 * response.sd_px_per_s {
+        return Err(Failure::bad_input(
+            format!(
+                "the bead does not move with the PZT: {:.1} px/s per um, standard deviation {:.1}",
+                response.gain(),
+                response.sd_px_per_s
+            ),
+            "is the amplifier on, the syringe filled and coupled, the bead free? More pulses: --pairs; larger ones: --amplitude",
+        ));
+    }
+    Ok(response)
+}
+
+/// Looks at the frames that have arrived.
+fn collect(
+    camera: &mut dyn Camera,
+    eye: &mut Eye,
+    buffer: &mut FrameBuffer,
+    start_ns: i64,
+    sightings: &mut Vec<Sighting>,
+) -> Result<(), Failure> {
+    let now_ns = Clock::Real.now_ns();
+    while let Some(stamp) = camera.next_frame(buffer, now_ns).map_err(Failure::failed)? {
+        let at_ns = stamp.mid_exposure_ns;
+        if let Some(seen) = eye.look(buffer, (at_ns - start_ns) as f64 * 1e-9)? {
+            sightings.push(Sighting {
+                at_ns,
+                x_px: seen.x_px,
+                y_px: seen.y_px,
+            });
+        }
+    }
+    Ok(())
+}
+
+/// Mean of the commanded offset from `from_ns` to `to_ns`.
+fn mean_offset(commands: &[(i64, f64)], from_ns: i64, to_ns: i64) -> f64 {
+    let mut sum = 0.0;
+    for (k, &(since_ns, offset_um)) in commands.iter().enumerate() {
+        let until_ns = commands.get(k + 1).map_or(i64::MAX, |next| next.0);
+        let (a, b) = (since_ns.max(from_ns), until_ns.min(to_ns));
+        if a < b {
+            sum += offset_um * (b - a) as f64;
+        }
+    }
+    sum / (to_ns - from_ns) as f64
+}
+
+/// Velocity against offset, by least squares with a constant for drift and for where zero flow is; the lag that explains most.
+fn fit(commands: &[(i64, f64)], sightings: &[Sighting], size_px: [usize; 2]) -> Option<Response> {
+    const LONGEST_GAP_NS: i64 = 20_000_000;
+    let mut sorted = sightings.to_vec();
+    sorted.sort_by_key(|s| s.at_ns);
+    let pairs: Vec<(Sighting, Sighting)> = (sorted.windows(2))
+        .map(|pair| (pair[0], pair[1]))
+        .filter(|(a, b)| (1..LONGEST_GAP_NS).contains(&(b.at_ns - a.at_ns)))
+        .collect();
+    if pairs.len() < 50 {
+        return None;
+    }
+    (0..=12)
+        .map(|half_ms| regress(commands, &pairs, half_ms * 500_000, size_px))
+        .max_by(|a, b| a.gain().total_cmp(&b.gain()))
+}
+
+fn regress(
+    commands: &[(i64, f64)],
+    pairs: &[(Sighting, Sighting)],
+    lag_ns: i64,
+    size_px: [usize; 2],
+) -> Response {
+    let n = pairs.len() as f64;
+    let rows: Vec<(f64, [f64; 2])> = pairs
+        .iter()
+        .map(|(a, b)| {
+            let s = (b.at_ns - a.at_ns) as f64 * 1e-9;
+            let u = mean_offset(commands, a.at_ns - lag_ns, b.at_ns - lag_ns);
+            (u, [(b.x_px - a.x_px) / s, (b.y_px - a.y_px) / s])
+        })
+        .collect();
+    let mean_u = rows.iter().map(|(u, _)| u).sum::<f64>() / n;
+    let suu = rows.iter().map(|(u, _)| (u - mean_u).powi(2)).sum::<f64>();
+    let mut gain = [0.0; 2];
+    let mut residual = 0.0;
+    for (axis, gain) in gain.iter_mut().enumerate() {
+        let mean_v = rows.iter().map(|(_, v)| v[axis]).sum::<f64>() / n;
+        let suv: f64 = rows
+            .iter()
+            .map(|(u, v)| (u - mean_u) * (v[axis] - mean_v))
+            .sum();
+        *gain = suv / suu.max(f64::MIN_POSITIVE);
+        residual += (rows.iter())
+            .map(|(u, v)| (v[axis] - mean_v - *gain * (u - mean_u)).powi(2))
+            .sum::<f64>();
+    }
+    Response {
+        gain_px_per_s: gain,
+        sd_px_per_s: (residual / (2.0 * n - 4.0) / suu.max(f64::MIN_POSITIVE)).sqrt(),
+        lag_ms: lag_ns as f64 * 1e-6,
+        frames: pairs.len() + 1,
+        size_px,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_bead_that_goes_with_the_pulses_shows_axis_sign_tilt_and_gain_through_drift() {
+        // 500 frames; gain 4000 px/s per um, up and to the left at 10 degrees from the rows; drift 300 px/s.
+        let tilt = 170_f64.to_radians();
+        let (gx, gy) = (4000.0 * tilt.cos(), 4000.0 * tilt.sin());
+        let commands: Vec<(i64, f64)> = (0..500)
+            .map(|k| {
+                (
+                    k * 1_000_000,
+                    if (k + 7) / 15 % 2 == 0 { 0.2 } else { -0.2 },
+                )
+            })
+            .collect();
+        let (mut x, mut y) = (100.0, 30.0);
+        let sightings: Vec<Sighting> = (10..500)
+            .map(|k| {
+                let u = mean_offset(
+                    &commands,
+                    (k - 1) * 1_000_000 - 2_000_000,
+                    k * 1_000_000 - 2_000_000,
+                );
+                x += (gx * u + 300.0) * 1e-3;
+                y += gy * u * 1e-3;
+                Sighting {
+                    at_ns: k * 1_000_000,
+                    x_px: x,
+                    y_px: y,
+                }
+            })
+            .collect();
+        let response = fit(&commands, &sightings, [256, 64]).expect("enough frames");
+        let (axis, sign, tilt_deg, _) = response.direction();
+        assert_eq!((axis, sign), (Axis::X, -1));
+        assert!((tilt_deg + 10.0).abs() < 0.5, "{tilt_deg}");
+        assert!((response.gain() - 4000.0).abs() < 40.0, "{response:?}");
+        // Found in steps of half a frame.
+        assert!((response.lag_ms - 2.0).abs() <= 0.5, "{response:?}");
+        let file = response.calibration(0.1, 0.001, "test".to_string());
+        assert_eq!((file.axis, file.sign, file.origin_px), (Axis::X, -1, 127.5));
+    }
+
+    #[test]
+    fn a_few_frames_are_not_enough() {
+        let sightings = [Sighting {
+            at_ns: 0,
+            x_px: 0.0,
+            y_px: 0.0,
+        }; 10];
+        assert_eq!(fit(&[(0, 0.1)], &sightings, [10, 10]), None);
+    }
+}

@@ -1,0 +1,16 @@
+//! Work at the bench, before the loop is closed: what a rig file says and what is there, the board's line, moves by hand,
+//! pictures, calibration.
+//!
+//! All of it opens the devices of a rig file without a tracker ([`Bench`]) and leaves the board parked. Not for closed loops:
+//! those are `cellpos-session`'s.
+#![forbid(unsafe_code)]
+
+mod bench;
+pub mod calibrate;
+pub mod check;
+pub mod line_test;
+pub mod mover;
+pub mod snapshot;
+pub mod template;
+
+pub use bench::Bench;

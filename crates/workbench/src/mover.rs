@@ -1,0 +1,143 @@
+//! The PZT moved by hand: armed with the rig file's limits, at a speed of one's own, parked on every way out.
+
+use crate::bench::Board;
+use cellpos_control::Limits;
+use cellpos_rig::{Actuator, ActuatorReport, ActuatorState, ArmRequest, Clock};
+use cellpos_runtime::live::Operator;
+use cellpos_session::signals::{self, Place};
+use cellpos_session::{Failure, RigFile};
+use std::hash::{BuildHasher, Hasher};
+use std::sync::Arc;
+
+/// Between two commands, ns.
+const PERIOD_NS: i64 = 1_000_000;
+
+/// A board that is armed and follows; parked when dropped.
+pub struct Mover {
+    board: Board,
+    limits: Limits,
+    clock: Clock,
+    start_ns: i64,
+    due_ns: i64,
+    /// Displacement commanded last, um.
+    at_um: f64,
+    session: u16,
+    newest: ActuatorReport,
+    /// While it is held, a signal does not end the program before the board is parked.
+    _place: Place,
+}
+
+impl Mover {
+    /// Arms a board with the limits of a rig file. Nothing moves: it goes on from where it stands.
+    ///
+    /// # Errors
+    /// No answer, a refusal, or limits that do not meet the board's.
+    pub fn arm(mut board: Board, file: &RigFile) -> Result<Self, Failure> {
+        let place = signals::hold(&Arc::new(Operator::default())).map_err(Failure::failed)?;
+        let info = board.info();
+        let limits = Limits {
+            low_um: file.limits.low_um.max(info.low_um),
+            high_um: file.limits.high_um.min(info.high_um),
+            slew_um_per_s: file.limits.slew_um_per_s.min(info.slew_um_per_s),
+            park_um: file.limits.park_um,
+        };
+        let [watchdog_ms, hold_watchdog_ms] = file.watchdogs_ms();
+        let session = std::hash::RandomState::new().build_hasher().finish() as u16;
+        let newest = board
+            .arm(&ArmRequest {
+                session,
+                park_um: limits.park_um,
+                limits: [limits.low_um, limits.high_um, limits.slew_um_per_s],
+                watchdog_ms,
+                hold_watchdog_ms,
+            })
+            .map_err(Failure::failed)?;
+        let clock = Clock::Real;
+        let now_ns = clock.now_ns();
+        Ok(Self {
+            board,
+            limits,
+            clock,
+            start_ns: now_ns,
+            due_ns: now_ns,
+            at_um: newest.applied_um,
+            session,
+            newest,
+            _place: place,
+        })
+    }
+
+    /// Limits in force.
+    pub fn limits(&self) -> &Limits {
+        &self.limits
+    }
+
+    /// Displacement commanded last, um.
+    pub fn at_um(&self) -> f64 {
+        self.at_um
+    }
+
+    /// The newest that the board has said.
+    pub fn newest(&self) -> &ActuatorReport {
+        &self.newest
+    }
+
+    /// A millisecond: waits for its beginning, steps towards `to_um` by at most `speed_um_per_s`, and reads what the board
+    /// says. Whether it is there.
+    ///
+    /// # Errors
+    /// A displacement outside the limits; a signal asked for the end; the line breaks; the board went safe or belongs to another host.
+    pub fn step(&mut self, to_um: f64, speed_um_per_s: f64) -> Result<bool, Failure> {
+        if !(self.limits.low_um..=self.limits.high_um).contains(&to_um) {
+            return Err(Failure::bad_input(
+                format!("{to_um} um: outside the limits"),
+                format!(
+                    "[limits] of rig.toml and the board allow {} to {} um",
+                    self.limits.low_um, self.limits.high_um
+                ),
+            ));
+        }
+        if let Some(signal) = signals::stopped_by() {
+            let stopped = format!("stopped by {signal}: the PZT is parked");
+            return Err(Failure::failed(std::io::Error::other(stopped)));
+        }
+        self.clock.sleep_until_ns(self.due_ns);
+        let now_ns = self.clock.now_ns();
+        // Steps that a stall has cost are not made up for.
+        self.due_ns = (self.due_ns + PERIOD_NS).max(now_ns);
+        let reach_um = speed_um_per_s.min(self.limits.slew_um_per_s) * PERIOD_NS as f64 * 1e-9;
+        self.at_um += (to_um - self.at_um).clamp(-reach_um, reach_um);
+        let time_us = u64::try_from((now_ns - self.start_ns) / 1000).unwrap_or(0);
+        // No bead is followed: where the PZT stands is the best that can be held.
+        self.board
+            .command(self.at_um, self.at_um, time_us)
+            .map_err(Failure::failed)?;
+        if let Some(report) = self.board.poll().map_err(Failure::failed)? {
+            self.newest = report;
+        }
+        let report = &self.newest;
+        if report.session != self.session {
+            return Err(Failure::bad_input(
+                "another program has armed the board meanwhile",
+                "end it, and begin again",
+            ));
+        }
+        if matches!(report.state, ActuatorState::Safe | ActuatorState::Disarmed) {
+            return Err(Failure::bad_input(
+                format!(
+                    "the board went to park by itself ({:?}, {:?})",
+                    report.state, report.fault
+                ),
+                "no command came within both its watchdog times: is the machine overloaded?",
+            ));
+        }
+        Ok(self.at_um == to_um)
+    }
+}
+
+impl Drop for Mover {
+    fn drop(&mut self) {
+        // What fails here, the board's own watchdog does.
+        let _ = self.board.disarm();
+    }
+}

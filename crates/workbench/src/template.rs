@@ -1,0 +1,157 @@
+//! A rig file to begin with: commented, and with what this machine offers.
+
+use std::path::Path;
+
+/// What the new file is to be for.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Kind {
+    /// Everything in this process.
+    Emulated,
+    /// A board behind a serial port and a camera.
+    Real {
+        /// Device of the board.
+        port: String,
+        /// Camera.
+        camera: Camera,
+    },
+}
+
+/// Where the frames come from.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Camera {
+    /// A camera process behind a Unix socket.
+    Socket(String),
+    /// A GigE or USB3 Vision camera.
+    Industrial(String),
+}
+
+/// Serial ports of this machine, by names that stay the same where there are such.
+pub fn ports() -> Vec<String> {
+    let list = |folder: &str, wanted: &dyn Fn(&str) -> bool| -> Vec<String> {
+        let mut found: Vec<String> = std::fs::read_dir(folder)
+            .into_iter()
+            .flatten()
+            .flatten()
+            .filter(|entry| entry.file_name().to_str().is_some_and(wanted))
+            .map(|entry| entry.path().display().to_string())
+            .collect();
+        found.sort();
+        found
+    };
+    let lasting = list("/dev/serial/by-id", &|_| true);
+    if lasting.is_empty() {
+        let usb = |name: &str| name.starts_with("ttyACM") || name.starts_with("ttyUSB");
+        list("/dev", &usb)
+    } else {
+        lasting
+    }
+}
+
+/// The text of a rig file.
+pub fn text(kind: &Kind) -> String {
+    let devices = match kind {
+        Kind::Emulated => "\
+[actuator]
+kind = \"emulated\"        # the board's own state machine in this process; a real one: cellpos rig new --serial PORT
+
+[camera]
+kind = \"emulated\"        # frames are drawn; a real one: --camera PATH_OF_A_SOCKET or --camera ADDRESS
+
+# [calibration]          # the emulated camera brings its own; one of yours, right or wrong, takes its place
+# pixel = \"0.1um\"
+# origin_px = 127.5
+# sign = 1.0
+"
+        .to_string(),
+        Kind::Real { port, camera } => {
+            let camera = match camera {
+                Camera::Socket(path) => format!(
+                    "kind = \"socket\"          # a camera server such as firmware-sim's\nsocket = {path:?}\nrate = \"1kHz\"\n"
+                ),
+                Camera::Industrial(address) => format!(
+                    "kind = \"industrial\"      # program built with --features aravis\naddress = {address:?}\nrate = \"1kHz\"\n\
+                     exposure = \"200us\"       # short: a bead at 400 um/s moves 80 nm meanwhile\n\
+                     # region = {{ x_px = 0, y_px = 0, width_px = 256, height_px = 64 }}\n"
+                ),
+            };
+            format!(
+                "\
+[actuator]
+kind = \"serial\"
+port = {port:?}
+baud = 3000000           # of no effect on USB CDC and pseudo-terminals
+watchdog = \"20ms\"        # without a command for this long the board holds the zero-flow displacement
+hold_watchdog = \"2s\"     # when it has held for this long it parks
+
+[camera]
+{camera}
+[calibration]            # cellpos calibrate measures axis and sign and writes a file: calibration_file = \"calibration.toml\"
+pixel = \"0.1um\"          # of a stage micrometre; a guess until then
+origin_px = 127.5        # the column that is called 0 um
+sign = 1.0               # +1: the coordinate rises when the PZT extends
+
+[vision]                 # what a bead looks like: this is firmware-sim's; cellpos vision RECORDING prints the table for yours
+window_px = 21
+profile = {{ kind = \"ring\", edge_px = 5.0 }}
+"
+            )
+        }
+    };
+    format!(
+        "# A rig for cellpos: see docs/rig.md for every key. Read it with: cellpos rig check FILE [--connect]
+# Quantities are written with a unit (park = \"20um\"), or bare with the unit in the key (park_um = 20.0).
+
+first_neutral = \"20um\"   # first belief of the displacement at which the bead is at rest; the loop finds the rest
+
+{devices}
+[limits]                 # of the command; the board has its own, and the narrower ones hold
+low = \"0um\"
+high = \"40um\"
+slew = \"20um/ms\"
+park = \"20um\"            # where the PZT is left
+
+[timing]
+period = \"1ms\"           # of the camera
+camera_delay = \"2ms\"     # from the middle of an exposure to its tick: cellpos identify measures it
+oldest = \"5ms\"           # an older exposure is stale
+"
+    )
+}
+
+/// What `--camera` names: an existing socket or a path, else an address.
+pub fn camera(text: &str) -> Camera {
+    if Path::new(text).exists() || text.contains('/') || text.ends_with(".sock") {
+        Camera::Socket(text.to_string())
+    } else {
+        Camera::Industrial(text.to_string())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use cellpos_session::RigFile;
+
+    #[test]
+    fn every_template_is_read_as_it_is_written() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let real = |camera| Kind::Real {
+            port: "/dev/serial/by-id/usb-board".to_string(),
+            camera,
+        };
+        for kind in [
+            Kind::Emulated,
+            real(camera("camera.sock")),
+            real(camera("192.168.1.20")),
+        ] {
+            let path = folder.path().join("rig.toml");
+            std::fs::write(&path, text(&kind)).expect("written");
+            let file = RigFile::load(Some(&path)).unwrap_or_else(|error| panic!("{error:?}"));
+            assert_eq!((file.limits.park_um, file.timing.period_us), (20.0, 1000.0));
+            assert_eq!(file.is_emulated(), kind == Kind::Emulated);
+            if kind != Kind::Emulated {
+                assert_eq!(file.watchdogs_ms(), [Some(20), Some(2000)]);
+            }
+        }
+    }
+}

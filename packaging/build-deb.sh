@@ -1,0 +1,11 @@
+#!/usr/bin/env bash
+# Builds the Debian package: program, firmware-sim, completions, manual pages, rules. Needs cargo-deb
+# (cargo install cargo-deb). The file is named on the last line.
+set -euo pipefail
+cd "$(dirname "$0")/.."
+cargo build --profile dist --locked -p cellpos -p cellpos-firmware-sim
+made=target/packaging
+rm -rf "$made"
+target/dist/cellpos generate --out "$made"
+gzip -9n "$made"/man/*.1
+cargo deb --no-build --no-strip --profile dist -p cellpos

@@ -1,0 +1,481 @@
+//! The program under attack: killed, fed with damaged files, with boards and cameras that misbehave, stopped and signalled.
+//!
+//! Each attack says how many tries it made, how they ended, and what broke. A try breaks when the program panics, does not
+//! end, ends with an exit code that it does not have, moves the PZT out of its range, leaves a run that does not read, or
+//! does a cycle twice or not at all. `attack --help` runs them in the numbers of a night; the tests of this package run a few
+//! of each.
+
+use crate::programs::{PATIENCE, RigInABox, cellpos};
+use rustix::process::{Pid, Signal, kill_process};
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::time::{Duration, Instant};
+
+/// How an attack went.
+#[derive(Debug, Clone, Default)]
+pub struct Attacked {
+    /// Tries made.
+    pub tries: u64,
+    /// How they ended, in a word, and how often.
+    pub ends: BTreeMap<String, u64>,
+    /// What broke, in a sentence each.
+    pub broken: Vec<String>,
+}
+
+impl Attacked {
+    fn end(&mut self, how: impl Into<String>) {
+        self.tries += 1;
+        *self.ends.entry(how.into()).or_default() += 1;
+    }
+
+    /// A line of the table.
+    pub fn line(&self, name: &str) -> String {
+        let ends: Vec<String> = self
+            .ends
+            .iter()
+            .map(|(how, count)| format!("{count} {how}"))
+            .collect();
+        format!(
+            "| {name} | {} | {} | {} |",
+            self.tries,
+            self.broken.len(),
+            ends.join(", ")
+        )
+    }
+}
+
+/// Numbers that look like chance and are the same each time.
+#[derive(Debug, Clone, Copy)]
+pub struct Chance(u64);
+
+impl Chance {
+    /// From a seed.
+    pub fn new(seed: u64) -> Self {
+        Self(seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) | 1)
+    }
+
+    fn next(&mut self) -> u64 {
+        self.0 ^= self.0 << 13;
+        self.0 ^= self.0 >> 7;
+        self.0 ^= self.0 << 17;
+        self.0
+    }
+
+    /// Below a bound.
+    fn below(&mut self, bound: u64) -> u64 {
+        self.next() % bound.max(1)
+    }
+}
+
+/// What is left of a command.
+struct Ended {
+    code: Option<i32>,
+    out: String,
+    err: String,
+}
+
+/// Waits for a child, at most for [`PATIENCE`]; a child that does not end is killed and said to be broken.
+fn wait(mut child: Child, what: &str, attacked: &mut Attacked) -> Option<Ended> {
+    let deadline = Instant::now() + 4 * PATIENCE;
+    while child.try_wait().ok()?.is_none() {
+        if Instant::now() > deadline {
+            let _ = child.kill();
+            attacked.broken.push(format!("{what}: does not end"));
+        }
+        std::thread::sleep(Duration::from_millis(10));
+    }
+    let output = child.wait_with_output().ok()?;
+    let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
+    let ended = Ended {
+        code: output.status.code(),
+        out: text(&output.stdout),
+        err: text(&output.stderr),
+    };
+    if ended.err.contains("panicked at") || ended.code == Some(101) {
+        let why = ended.err.lines().find(|line| line.contains("panicked"));
+        let why = why.unwrap_or("exit code 101");
+        attacked.broken.push(format!("{what}: {why}"));
+    }
+    Some(ended)
+}
+
+fn start(command: &mut Command) -> Child {
+    command
+        .stdin(Stdio::null())
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .expect("cellpos starts")
+}
+
+/// Runs a command that must end with one of its own exit codes.
+fn run(folder: &Path, line: &str, what: &str, attacked: &mut Attacked) -> Option<Ended> {
+    let ended = wait(start(&mut cellpos(folder, line)), what, attacked)?;
+    if !matches!(ended.code, Some(0..=2)) {
+        attacked
+            .broken
+            .push(format!("{what}: {line}: exit code {:?}", ended.code));
+    }
+    Some(ended)
+}
+
+fn only_run(folder: &Path) -> Option<PathBuf> {
+    let mut entries = std::fs::read_dir(folder.join("runs")).ok()?.flatten();
+    entries.next().map(|entry| entry.path())
+}
+
+fn quick_script(folder: &Path, cycles: u64) {
+    let text = format!(
+        "name = \"quick\"\n[[step]]\ndo = \"sine\"\namplitude = \"1um\"\nfrequency = \"20Hz\"\ncycles = {cycles}\n"
+    );
+    std::fs::write(folder.join("quick.toml"), text).expect("a script is written");
+}
+
+/// Numbers of the cycles in a run's table.
+fn cycles(run: &Path) -> Vec<u64> {
+    let text = std::fs::read_to_string(run.join("cycles.csv")).unwrap_or_default();
+    let whole = text.rfind('\n').map_or(0, |end| end + 1);
+    text[..whole]
+        .lines()
+        .skip(1)
+        .filter_map(|line| line.split(',').next()?.parse().ok())
+        .collect()
+}
+
+/// `kill -9` of the program in the middle of a script, and on again, until it has been killed so often; then to its end.
+pub fn kill_the_program(folder: &Path, kills: u64, chance: &mut Chance) -> Attacked {
+    let mut attacked = Attacked::default();
+    let count = 20 + 20 * kills;
+    quick_script(folder, count);
+    let options = "--best-effort --frames off --json";
+    let mut done = 0;
+    loop {
+        let begun = only_run(folder);
+        if let Some(run) = begun
+            .as_ref()
+            .filter(|run| !run.join("cycles.csv").exists())
+        {
+            // Killed before it had begun: there is nothing to go on with.
+            let _ = std::fs::remove_dir_all(run);
+        }
+        let line = match only_run(folder) {
+            Some(run) => format!("run --resume {} {options}", run.display()),
+            None => format!("run quick.toml {options}"),
+        };
+        let child = start(&mut cellpos(folder, &line));
+        if done == kills {
+            let what = "the last session";
+            if let Some(ended) = wait(child, what, &mut attacked)
+                && ended.code != Some(0)
+            {
+                attacked
+                    .broken
+                    .push(format!("{what}: {:?} {}", ended.code, ended.err));
+            }
+            break;
+        }
+        std::thread::sleep(Duration::from_millis(300 + chance.below(2000)));
+        let _ = kill_process(Pid::from_child(&child), Signal::KILL);
+        if wait(child, "a killed session", &mut attacked).is_some_and(|ended| ended.code == Some(0))
+        {
+            attacked.end("was over before");
+            break;
+        }
+        done += 1;
+        attacked.end("killed");
+    }
+    if let Some(run) = only_run(folder) {
+        if cycles(&run) != (0..count).collect::<Vec<u64>>() {
+            attacked.broken.push(format!("cycles: {:?}", cycles(&run)));
+        }
+        let line = format!("export {} --out all.csv --force --json", run.display());
+        let ended = self::run(folder, &line, "export", &mut attacked);
+        if ended.is_none_or(|ended| ended.code != Some(0)) {
+            attacked
+                .broken
+                .push("the sessions do not read whole".to_owned());
+        }
+    }
+    attacked
+}
+
+/// rig.toml for a rig in a box.
+fn box_rig(folder: &Path) {
+    let text = "[actuator]\nkind = \"serial\"\nport = \"pzt\"\nwatchdog_ms = 500.0\n\
+         [camera]\nkind = \"socket\"\nsocket = \"camera.sock\"\n\
+         [calibration]\npixel_um = 0.1\norigin_px = 127.5\nsign = 1.0\n\
+         [limits]\nlow_um = 0.0\nhigh_um = 40.0\nslew_um_per_s = 20000.0\npark_um = 12.0\n\
+         [timing]\noldest_ms = 60.0\nfaults_in_a_row = 200\nbudget_us = 1000.0\n";
+    std::fs::write(folder.join("rig.toml"), text).expect("rig.toml is written");
+}
+
+fn emptied(folder: &Path) {
+    let _ = std::fs::remove_dir_all(folder.join("runs"));
+    for name in ["pzt", "camera.sock", "box.csv"] {
+        let _ = std::fs::remove_file(folder.join(name));
+    }
+}
+
+/// The run that a try left reads back; a try that never came to a run leaves none.
+fn reads(folder: &Path, what: &str, attacked: &mut Attacked) {
+    let Some(run) = only_run(folder) else { return };
+    let line = format!("export {} --out all.csv --force --json", run.display());
+    if let Some(ended) = self::run(folder, &line, what, attacked)
+        && ended.code == Some(2)
+    {
+        attacked
+            .broken
+            .push(format!("{what}: the run does not read: {}", ended.err));
+    }
+}
+
+/// `kill -9` of the rig while a bead is held.
+pub fn kill_the_rig(folder: &Path, kills: u64, chance: &mut Chance) -> Attacked {
+    let mut attacked = Attacked::default();
+    box_rig(folder);
+    for number in 0..kills {
+        emptied(folder);
+        let what = format!("rig killed, {number}");
+        let rig = RigInABox::start(folder, &[]);
+        let line = "track --target 0um --rig rig.toml --duration 60s --best-effort --json";
+        let child = start(&mut cellpos(folder, line));
+        std::thread::sleep(Duration::from_millis(500 + chance.below(2500)));
+        drop(rig);
+        let Some(ended) = wait(child, &what, &mut attacked) else {
+            continue;
+        };
+        if ended.code == Some(0) {
+            attacked
+                .broken
+                .push(format!("{what}: said that all went well"));
+        }
+        attacked.end(format!("exit {:?}", ended.code.unwrap_or(-1)));
+        reads(folder, &what, &mut attacked);
+    }
+    attacked
+}
+
+/// A copy of some bytes with a few of them changed, cut out, doubled or cut off.
+fn mutated(bytes: &[u8], chance: &mut Chance) -> Vec<u8> {
+    let mut out = bytes.to_vec();
+    for _ in 0..=chance.below(4) {
+        let length = out.len() as u64;
+        if length == 0 {
+            break;
+        }
+        let at = chance.below(length) as usize;
+        let span = (1 + chance.below(64) as usize).min(out.len() - at);
+        match chance.below(6) {
+            0 => out[at] = chance.next() as u8,
+            1 => out[at] ^= 1 << chance.below(8),
+            2 => drop(out.drain(at..at + span)),
+            3 => {
+                let again: Vec<u8> = out[at..at + span].to_vec();
+                out.splice(at..at, again);
+            }
+            4 => out.truncate(at),
+            _ => out[at..at + span].fill(0),
+        }
+    }
+    out
+}
+
+/// Damaged scripts, rig files, models, records and run folders, each read by the command that reads it.
+pub fn damaged_inputs(folder: &Path, tries: u64, chance: &mut Chance) -> Attacked {
+    let mut attacked = Attacked::default();
+    quick_script(folder, 20);
+    let mut needed = |line: &str| {
+        run(folder, line, "before the attack", &mut attacked);
+    };
+    needed("run quick.toml --clock virtual --frames off --json");
+    needed("track --target 0um --duration 500ms --clock virtual --frames off --name held --json");
+    let mut runs: Vec<PathBuf> = std::fs::read_dir(folder.join("runs"))
+        .map(|entries| entries.flatten().map(|entry| entry.path()).collect())
+        .unwrap_or_default();
+    runs.sort();
+    let (Some(held), Some(scripted)) = (
+        runs.iter()
+            .find(|run| run.to_string_lossy().contains("held")),
+        runs.iter()
+            .find(|run| run.to_string_lossy().contains("quick")),
+    ) else {
+        attacked.broken.push("no runs to attack".to_owned());
+        return attacked;
+    };
+    let line = format!("export {} --out held.csv --json", held.display());
+    run(folder, &line, "before the attack", &mut attacked);
+    std::fs::write(
+        folder.join("rig.toml"),
+        "[timing]\nperiod_us = 1000.0\ncamera_delay_ms = 2.0\n[emulator]\nseed = 3\n[limits]\nlow_um = 0.0\nhigh_um = 40.0\n",
+    )
+    .expect("rig.toml is written");
+    let read = |path: PathBuf| std::fs::read(path).unwrap_or_default();
+    let inputs = [
+        (folder.join("quick.toml"), "check quick.toml".to_owned()),
+        (
+            folder.join("rig.toml"),
+            "track --target 0um --duration 5ms --rig rig.toml --clock virtual --frames off --no-record".to_owned(),
+        ),
+        (
+            folder.join("held.csv"),
+            "simulate --model eq6 --input held.csv --out sim.csv --force".to_owned(),
+        ),
+        (held.join("ticks.arrow"), format!("export {} --out all.csv --force", held.display())),
+        (held.join("run.toml"), format!("replay {}", held.display())),
+        (scripted.join("cycles.csv"), format!("report {} --out page.html --force", scripted.display())),
+        (scripted.join("events.jsonl"), format!("report {} --out page.html --force", scripted.display())),
+    ];
+    let inputs = inputs.map(|(path, line)| (read(path.clone()), path, line));
+    for number in 0..tries {
+        let (bytes, path, line) = &inputs[number as usize % inputs.len()];
+        let damaged = mutated(bytes, chance);
+        std::fs::write(path, &damaged).expect("an input is written");
+        let what = format!("damaged {} ({number})", path.display());
+        let before = attacked.broken.len();
+        if let Some(ended) = run(folder, line, &what, &mut attacked) {
+            attacked.end(format!("exit {}", ended.code.unwrap_or(-1)));
+            if ended.out.contains('\u{7}') || ended.err.contains("\u{1b}]") {
+                attacked
+                    .broken
+                    .push(format!("{what}: orders to the terminal"));
+            }
+        }
+        if attacked.broken.len() > before {
+            // To be looked at: the input that did it.
+            let _ = std::fs::write(folder.join(format!("broken-{number}")), &damaged);
+        }
+        std::fs::write(path, bytes).expect("an input is written back");
+    }
+    attacked
+}
+
+/// Boards whose link garbles and dies, behind a real line.
+pub fn hostile_boards(folder: &Path, tries: u64, chance: &mut Chance) -> Attacked {
+    let mut attacked = Attacked::default();
+    box_rig(folder);
+    for number in 0..tries {
+        emptied(folder);
+        let what = format!("board {number}");
+        let mut options = vec![format!("--link-garbage={}Hz", 1 + chance.below(400))];
+        if chance.below(2) == 0 {
+            let at = 200 + chance.below(1500);
+            options.push(format!("--link-loss={at}ms,{}ms", 1 + chance.below(800)));
+        }
+        let options: Vec<&str> = options.iter().map(String::as_str).collect();
+        let rig = RigInABox::start(folder, &options);
+        let line = "track --target 0um --rig rig.toml --duration 2s --best-effort --json";
+        if let Some(ended) = run(folder, line, &what, &mut attacked) {
+            attacked.end(format!("exit {}", ended.code.unwrap_or(-1)));
+        }
+        let outside = |um: f64| !(-1e-6..=40.0 + 1e-6).contains(&um);
+        if let Some(row) = rig.finish().iter().find(|row| outside(row.applied_um)) {
+            attacked
+                .broken
+                .push(format!("{what}: the PZT at {} um", row.applied_um));
+        }
+        reads(folder, &what, &mut attacked);
+    }
+    attacked
+}
+
+/// Cameras that lose, double, reorder and stall, on the virtual clock: every tick is on the disk or counted.
+pub fn hostile_cameras(folder: &Path, tries: u64, chance: &mut Chance) -> Attacked {
+    let mut attacked = Attacked::default();
+    for number in 0..tries {
+        emptied(folder);
+        let what = format!("camera {number}");
+        let mut share = |most: u64| chance.below(most) as f64 / 1000.0;
+        let mut text = format!(
+            "[emulator]\nseed = {number}\n[emulator.faults]\ndrop_rate = {}\nstale_rate = {}\ndouble_rate = {}\nreorder_rate = {}\n",
+            share(300),
+            share(50),
+            share(500),
+            share(100),
+        );
+        for kind in ["stall-camera", "lose-bead", "double-frames"] {
+            if chance.below(3) == 0 {
+                text.push_str(&format!(
+                    "[[emulator.faults.event]]\nkind = \"{kind}\"\nat_s = {}.5\nfor_s = 0.{}\n",
+                    1 + chance.below(3),
+                    1 + chance.below(9)
+                ));
+            }
+        }
+        std::fs::write(folder.join("hostile.toml"), text).expect("hostile.toml is written");
+        let line = "track --target 1um --rig hostile.toml --duration 5s --clock virtual --frames off --json";
+        let Some(ended) = run(folder, line, &what, &mut attacked) else {
+            continue;
+        };
+        attacked.end(format!("exit {}", ended.code.unwrap_or(-1)));
+        let result: serde_json::Value = serde_json::from_str(&ended.out).unwrap_or_default();
+        let ticks = result["ticks"]
+            .as_u64()
+            .or(result["summary"]["ticks"].as_u64());
+        let lost = result["records_lost"]
+            .as_u64()
+            .or(result["summary"]["records_lost"].as_u64());
+        let Some(run) = only_run(folder) else {
+            if ended.code == Some(0) {
+                attacked.broken.push(format!("{what}: left no run"));
+            }
+            continue;
+        };
+        let line = format!("export {} --out all.csv --force --json", run.display());
+        let rows = self::run(folder, &line, &what, &mut attacked)
+            .and_then(|ended| serde_json::from_str::<serde_json::Value>(&ended.out).ok())
+            .and_then(|export| export["rows"].as_u64());
+        if let (Some(ticks), Some(lost), Some(rows)) = (ticks, lost, rows) {
+            if rows + lost != ticks {
+                attacked.broken.push(format!(
+                    "{what}: {rows} rows and {lost} lost of {ticks} ticks"
+                ));
+            }
+        } else {
+            attacked
+                .broken
+                .push(format!("{what}: no account of ticks: {}", ended.out));
+        }
+    }
+    attacked
+}
+
+/// Stopped, continued, interrupted, hung up on, poked: the program ends when it is told to, and what it did reads.
+pub fn stalls_and_signals(folder: &Path, tries: u64, chance: &mut Chance) -> Attacked {
+    let mut attacked = Attacked::default();
+    let signals = [
+        ("STOP", Signal::STOP),
+        ("INT", Signal::INT),
+        ("TERM", Signal::TERM),
+        ("HUP", Signal::HUP),
+        ("TSTP", Signal::TSTP),
+        ("USR1", Signal::USR1),
+        ("USR2", Signal::USR2),
+    ];
+    for number in 0..tries {
+        emptied(folder);
+        let (name, signal) = signals[number as usize % signals.len()];
+        let what = format!("signal {name}, {number}");
+        let line = "track --target 0um --duration 60s --best-effort --frames off --json";
+        let child = start(&mut cellpos(folder, line));
+        let pid = Pid::from_child(&child);
+        std::thread::sleep(Duration::from_millis(20 + chance.below(3000)));
+        let _ = kill_process(pid, signal);
+        std::thread::sleep(Duration::from_millis(chance.below(500)));
+        let _ = kill_process(pid, Signal::CONT);
+        std::thread::sleep(Duration::from_millis(300));
+        // Whatever came before: this ends it, and a second one at once.
+        let _ = kill_process(pid, Signal::INT);
+        std::thread::sleep(Duration::from_millis(300));
+        let _ = kill_process(pid, Signal::INT);
+        if let Some(ended) = wait(child, &what, &mut attacked) {
+            let how = match ended.code {
+                Some(code) => format!("exit {code}"),
+                None => format!("killed by {name}"),
+            };
+            attacked.end(how);
+        }
+        reads(folder, &what, &mut attacked);
+    }
+    attacked
+}

@@ -1,0 +1,503 @@
+//! The rules of the house that the compiler does not check: no circle between the files of a crate, and layers that do not know
+//! what stands above them.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::{Path, PathBuf};
+
+fn root() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("..")
+}
+
+/// Folders of the workspace's packages, relative to its root.
+fn packages() -> Vec<PathBuf> {
+    let mut found: Vec<PathBuf> = std::fs::read_dir(root().join("crates"))
+        .unwrap()
+        .flatten()
+        .map(|entry| Path::new("crates").join(entry.file_name()))
+        .filter(|path| root().join(path).join("Cargo.toml").is_file())
+        .collect();
+    found.extend(["firmware-sim", "tests", "benches"].map(PathBuf::from));
+    found.sort();
+    found
+}
+
+fn sources(folder: &Path, found: &mut Vec<PathBuf>) {
+    let Ok(entries) = std::fs::read_dir(folder) else {
+        return;
+    };
+    for path in entries.flatten().map(|entry| entry.path()) {
+        if path.is_dir() {
+            sources(&path, found);
+        } else if path.extension().is_some_and(|ending| ending == "rs") {
+            found.push(path);
+        }
+    }
+    found.sort();
+}
+
+/// A source file without comments, text and characters, and without its `#[cfg(test)]` items.
+fn code(text: &str) -> String {
+    without_tests(&without_literals(text))
+}
+
+fn without_literals(text: &str) -> String {
+    let bytes: Vec<char> = text.chars().collect();
+    let mut out = String::with_capacity(text.len());
+    let at = |i: usize| bytes.get(i).copied().unwrap_or('\0');
+    let mut i = 0;
+    while i < bytes.len() {
+        match (at(i), at(i + 1)) {
+            ('/', '/') => {
+                while i < bytes.len() && at(i) != '\n' {
+                    i += 1;
+                }
+            }
+            ('/', '*') => {
+                while i < bytes.len() && !(at(i) == '*' && at(i + 1) == '/') {
+                    i += 1;
+                }
+                i += 2;
+            }
+            ('r', '"' | '#') if !out.ends_with(|c: char| c.is_alphanumeric() || c == '_') => {
+                let hashes = (i + 1..).take_while(|&k| at(k) == '#').count();
+                if at(i + 1 + hashes) == '"' {
+                    i += 2 + hashes;
+                    let closes = |i: usize| at(i) == '"' && (1..=hashes).all(|k| at(i + k) == '#');
+                    while i < bytes.len() && !closes(i) {
+                        i += 1;
+                    }
+                    i += 1 + hashes;
+                } else {
+                    out.push('r');
+                    i += 1;
+                }
+            }
+            ('"', _) => {
+                i += 1;
+                while i < bytes.len() && at(i) != '"' {
+                    i += if at(i) == '\\' { 2 } else { 1 };
+                }
+                i += 1;
+            }
+            ('\'', '\\') => {
+                i += 2;
+                while i < bytes.len() && at(i) != '\'' {
+                    i += 1;
+                }
+                i += 1;
+            }
+            ('\'', _) if at(i + 2) == '\'' => i += 3,
+            (c, _) => {
+                out.push(c);
+                i += 1;
+            }
+        }
+    }
+    out
+}
+
+fn without_tests(text: &str) -> String {
+    const MARK: &str = "#[cfg(test)]";
+    let mut out = String::new();
+    let mut rest = text;
+    while let Some(at) = rest.find(MARK) {
+        out.push_str(&rest[..at]);
+        rest = &rest[at + MARK.len()..];
+        // The item ends with its first `;` outside braces, or with the brace that closes its first one.
+        let mut depth = 0;
+        let mut end = rest.len();
+        for (i, c) in rest.char_indices() {
+            match c {
+                '{' => depth += 1,
+                '}' => {
+                    depth -= 1;
+                    if depth == 0 {
+                        end = i + 1;
+                        break;
+                    }
+                }
+                ';' if depth == 0 => {
+                    end = i + 1;
+                    break;
+                }
+                _ => {}
+            }
+        }
+        rest = &rest[end..];
+    }
+    out.push_str(rest);
+    out
+}
+
+/// One module: a file, its path in the crate, what it defines and what it names of its crate.
+struct Module {
+    file: PathBuf,
+    defines: BTreeSet<String>,
+    /// `pub use`: the name given, the path it stands for.
+    passed_on: Vec<(String, Vec<String>)>,
+    names: Vec<Vec<String>>,
+}
+
+fn module_path(source: &Path, file: &Path) -> Vec<String> {
+    let inner = file.strip_prefix(source).unwrap().with_extension("");
+    let mut parts: Vec<String> = inner
+        .iter()
+        .map(|part| part.to_string_lossy().into_owned())
+        .collect();
+    if matches!(
+        parts.last().map(String::as_str),
+        Some("mod" | "lib" | "main")
+    ) {
+        parts.pop();
+    }
+    parts
+}
+
+fn words(text: &str) -> Vec<String> {
+    let mut found = vec![];
+    let mut word = String::new();
+    let mut characters = text.chars().peekable();
+    while let Some(c) = characters.next() {
+        if c.is_alphanumeric() || c == '_' {
+            word.push(c);
+            continue;
+        }
+        if !word.is_empty() {
+            found.push(std::mem::take(&mut word));
+        }
+        if c == ':' && characters.peek() == Some(&':') {
+            characters.next();
+            found.push("::".to_string());
+        } else if !c.is_whitespace() {
+            found.push(c.to_string());
+        }
+    }
+    if !word.is_empty() {
+        found.push(word);
+    }
+    found
+}
+
+/// The paths of a use tree, each with the name it is given.
+fn use_tree(words: &[String], prefix: &[String], found: &mut Vec<(String, Vec<String>)>) {
+    let mut path = prefix.to_vec();
+    let mut i = 0;
+    while i < words.len() {
+        match words[i].as_str() {
+            "::" => i += 1,
+            "{" => {
+                let mut depth = 0;
+                let mut start = i + 1;
+                for (k, word) in words.iter().enumerate().skip(i) {
+                    match word.as_str() {
+                        "{" => depth += 1,
+                        "}" => depth -= 1,
+                        _ => {}
+                    }
+                    if (word == "," && depth == 1) || depth == 0 {
+                        if start < k {
+                            use_tree(&words[start..k], &path, found);
+                        }
+                        start = k + 1;
+                    }
+                    if depth == 0 {
+                        return;
+                    }
+                }
+                return;
+            }
+            "as" => {
+                let name = words.get(i + 1).cloned().unwrap_or_default();
+                found.push((name, path));
+                return;
+            }
+            "self" if !path.is_empty() && i + 1 == words.len() => i += 1,
+            word => {
+                path.push(word.to_string());
+                i += 1;
+            }
+        }
+    }
+    let name = path.last().cloned().unwrap_or_default();
+    found.push((name, path));
+}
+
+fn read_module(file: &Path) -> Module {
+    const ITEMS: [&str; 9] = [
+        "fn",
+        "struct",
+        "enum",
+        "trait",
+        "const",
+        "static",
+        "type",
+        "union",
+        "macro_rules",
+    ];
+    let words = words(&code(&std::fs::read_to_string(file).unwrap()));
+    let mut module = Module {
+        file: file.to_path_buf(),
+        defines: BTreeSet::new(),
+        passed_on: vec![],
+        names: vec![],
+    };
+    let mut i = 0;
+    let mut public = false;
+    while i < words.len() {
+        let word = words[i].as_str();
+        if word == "use" && words.get(i + 1).is_some_and(|next| next != "<") {
+            let end = (i..words.len())
+                .find(|&k| words[k] == ";")
+                .unwrap_or(words.len());
+            let mut tree = vec![];
+            use_tree(&words[i + 1..end], &[], &mut tree);
+            module
+                .names
+                .extend(tree.iter().map(|(_, path)| path.clone()));
+            if public {
+                module.passed_on.extend(tree);
+            }
+            i = end;
+        } else if ITEMS.contains(&word) {
+            let name = words[i + 1..]
+                .iter()
+                .find(|w| !matches!(w.as_str(), "!" | "mut" | "fn"));
+            module.defines.extend(name.cloned());
+        } else if matches!(word, "crate" | "super") && words.get(i + 1).is_some_and(|w| w == "::") {
+            let mut path = vec![word.to_string()];
+            while words.get(i + 1).is_some_and(|w| w == "::")
+                && words
+                    .get(i + 2)
+                    .is_some_and(|w| w.starts_with(|c: char| c.is_alphabetic() || c == '_'))
+            {
+                path.push(words[i + 2].clone());
+                i += 2;
+            }
+            module.names.push(path);
+        }
+        // `pub`, `pub(crate)`, `pub(super)` stand before what they make public.
+        public = word == "pub" || (public && matches!(word, "(" | "crate" | "super" | ")"));
+        i += 1;
+    }
+    module
+}
+
+type Crate = BTreeMap<Vec<String>, Module>;
+
+/// The module whose file defines what a path names; none outside the crate.
+fn defined_in(
+    house: &Crate,
+    from: &[String],
+    path: &[String],
+    depth: usize,
+) -> Option<Vec<String>> {
+    let mut at: Vec<String>;
+    let mut rest = path;
+    match path.first()?.as_str() {
+        "crate" => {
+            at = vec![];
+            rest = &rest[1..];
+        }
+        "self" => {
+            at = from.to_vec();
+            rest = &rest[1..];
+        }
+        "super" => {
+            at = from.to_vec();
+            while rest.first().is_some_and(|word| word == "super") {
+                at.pop();
+                rest = &rest[1..];
+            }
+        }
+        first => {
+            at = from.to_vec();
+            at.push(first.to_string());
+            if !house.contains_key(&at) {
+                return None;
+            }
+            rest = &rest[1..];
+        }
+    }
+    while let Some(word) = rest.first() {
+        let mut next = at.clone();
+        next.push(word.clone());
+        if !house.contains_key(&next) {
+            break;
+        }
+        at = next;
+        rest = &rest[1..];
+    }
+    let module = house.get(&at)?;
+    let Some(name) = rest.first() else {
+        return Some(at);
+    };
+    if depth < 8 && !module.defines.contains(name) {
+        for (given, path) in &module.passed_on {
+            if given == name {
+                return defined_in(house, &at, path, depth + 1).or(Some(at));
+            }
+        }
+        for (given, path) in &module.passed_on {
+            if given == "*" {
+                let mut through = path[..path.len() - 1].to_vec();
+                through.push(name.clone());
+                let found = defined_in(house, &at, &through, depth + 1);
+                if let Some(found) = found.filter(|found| house[found].defines.contains(name)) {
+                    return Some(found);
+                }
+            }
+        }
+    }
+    Some(at)
+}
+
+/// Who reaches whom, by arrows of any length.
+fn reaches(
+    arrows: &BTreeMap<Vec<String>, BTreeSet<Vec<String>>>,
+    from: &[String],
+) -> BTreeSet<Vec<String>> {
+    let mut seen = BTreeSet::new();
+    let mut ahead: Vec<&Vec<String>> = arrows.get(from).into_iter().flatten().collect();
+    while let Some(next) = ahead.pop() {
+        if seen.insert(next.clone()) {
+            ahead.extend(arrows.get(next).into_iter().flatten());
+        }
+    }
+    seen
+}
+
+fn circles(source: &Path) -> Vec<String> {
+    let mut files = vec![];
+    sources(source, &mut files);
+    files.retain(|file| {
+        !file.ends_with("tests.rs") && !file.iter().any(|part| part == "tests" || part == "bin")
+    });
+    let house: Crate = files
+        .iter()
+        .map(|file| (module_path(source, file), read_module(file)))
+        .collect();
+    let mut arrows: BTreeMap<Vec<String>, BTreeSet<Vec<String>>> = BTreeMap::new();
+    for (from, module) in &house {
+        // What a module only passes on is no use of it.
+        let passed: BTreeSet<&Vec<String>> =
+            module.passed_on.iter().map(|(_, path)| path).collect();
+        for path in module.names.iter().filter(|path| !passed.contains(path)) {
+            if let Some(to) = defined_in(&house, from, path, 0)
+                && to != *from
+            {
+                arrows.entry(from.clone()).or_default().insert(to);
+            }
+        }
+    }
+    let mut found = BTreeSet::new();
+    for from in house.keys() {
+        let mut circle: BTreeSet<Vec<String>> = reaches(&arrows, from);
+        if circle.contains(from) {
+            circle.retain(|other| reaches(&arrows, other).contains(from));
+            let names: Vec<String> = circle
+                .iter()
+                .map(|path| house[path].file.display().to_string())
+                .collect();
+            found.insert(names.join("\n    "));
+        }
+    }
+    found.into_iter().collect()
+}
+
+#[test]
+fn no_files_of_a_crate_stand_in_a_circle() {
+    let mut found = vec![];
+    for package in packages() {
+        found.extend(circles(&root().join(package).join("src")));
+    }
+    assert!(
+        found.is_empty(),
+        "circles of files:\n    {}",
+        found.join("\n\n    ")
+    );
+}
+
+#[test]
+fn a_circle_is_found_where_there_is_one() {
+    let folder = tempfile::tempdir().unwrap();
+    let write = |name: &str, text: &str| std::fs::write(folder.path().join(name), text).unwrap();
+    write("lib.rs", "mod a;\nmod b;\npub use a::First;\n");
+    write("a.rs", "use crate::b::second;\npub struct First;\n");
+    write("b.rs", "// use crate::a::First;\npub fn second() {}\n");
+    assert_eq!(circles(folder.path()), Vec::<String>::new());
+    // Through the crate's front page, beside another name.
+    write("b.rs", "use crate::{First, x};\npub fn second() {}\n");
+    assert_eq!(circles(folder.path()).len(), 1);
+    // Named without `use`; in tests it does not count.
+    write(
+        "b.rs",
+        "pub fn second() -> super::a::First { super::a::First }\n",
+    );
+    assert_eq!(circles(folder.path()).len(), 1);
+    write(
+        "b.rs",
+        "pub fn second() {}\n#[cfg(test)]\nmod tests { use crate::a::First; }\n",
+    );
+    assert_eq!(circles(folder.path()), Vec::<String>::new());
+}
+
+/// Names of the workspace's own packages that a package depends on outside its tests.
+fn own_dependencies(package: &str) -> Vec<String> {
+    let path = root().join("crates").join(package).join("Cargo.toml");
+    let text = std::fs::read_to_string(&path).unwrap_or_else(|e| panic!("{}: {e}", path.display()));
+    let mut inside = false;
+    let mut found = vec![];
+    for line in text.lines() {
+        if line.starts_with('[') {
+            inside = line.trim() == "[dependencies]";
+        } else if inside && let Some(name) = line.strip_prefix("cellpos-") {
+            found.push(name.split([' ', '=', '.']).next().unwrap_or("").to_string());
+        }
+    }
+    found
+}
+
+#[test]
+fn a_layer_knows_only_what_stands_below_it() {
+    // What each may know of the house, all below it.
+    let ground = ["units", "table", "terminal"];
+    let layers: &[(&str, &[&str])] = &[
+        ("units", &[]),
+        ("link", &[]),
+        ("board", &["link"]),
+        ("plant", &["units"]),
+        ("vision", &["units"]),
+        ("report", &[]),
+        ("table", &["units"]),
+        ("control", &["units", "plant"]),
+        ("rig", &["units", "vision", "plant"]),
+        ("runtime", &["units", "plant", "control", "vision", "rig"]),
+        (
+            "script",
+            &["units", "plant", "control", "rig", "runtime", "table"],
+        ),
+        ("record", &["units", "rig", "control", "runtime", "table"]),
+        ("drivers", &["units", "plant", "vision", "link", "rig"]),
+        (
+            "emulator",
+            &[
+                "units", "plant", "vision", "link", "board", "rig", "drivers",
+            ],
+        ),
+        ("ident", &["units", "plant", "table"]),
+        ("reconcile", &["units", "plant", "ident", "report", "table"]),
+    ];
+    let mut wrong = vec![];
+    for (package, may_know) in layers {
+        for known in own_dependencies(package) {
+            if !may_know.contains(&known.as_str()) && !ground.contains(&known.as_str()) {
+                wrong.push(format!("crates/{package} depends on cellpos-{known}"));
+            }
+        }
+    }
+    assert!(
+        wrong.is_empty(),
+        "arrows that run up:\n{}",
+        wrong.join("\n")
+    );
+}

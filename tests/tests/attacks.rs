@@ -1,0 +1,31 @@
+//! A few of each attack; the command `attack` runs them in the numbers of a night.
+
+use cellpos_tests::attack::{self, Attacked, Chance};
+use std::path::Path;
+
+fn stands(attack: impl Fn(&Path, u64, &mut Chance) -> Attacked, tries: u64) {
+    let folder = tempfile::tempdir().unwrap();
+    let attacked = attack(folder.path(), tries, &mut Chance::new(7));
+    assert!(attacked.tries >= 1, "{attacked:?}");
+    assert!(attacked.broken.is_empty(), "{:#?}", attacked.broken);
+}
+
+#[test]
+fn a_killed_program_goes_on_and_does_every_cycle_once() {
+    stands(attack::kill_the_program, 2);
+}
+
+#[test]
+fn damaged_inputs_get_an_answer() {
+    stands(attack::damaged_inputs, 70);
+}
+
+#[test]
+fn a_hostile_camera_costs_no_tick_its_record() {
+    stands(attack::hostile_cameras, 5);
+}
+
+#[test]
+fn a_signalled_program_ends_and_leaves_a_run_that_reads() {
+    stands(attack::stalls_and_signals, 3);
+}
