@@ -219,7 +219,9 @@ fn an_interrupt_freezes_the_bead_and_then_parks() {
     let rows = rig.finish();
     let r: Value = serde_json::from_str(&stdout(&output)).unwrap();
     assert_eq!(r["end"], "operator", "{r}");
-    assert!(r["frozen"].as_f64().unwrap() >= 500.0, "{r}");
+    // Half a second of freezing; a period in which the machine stalled has no tick of its own.
+    let frozen = r["frozen"].as_f64().unwrap() + r["skipped"].as_f64().unwrap();
+    assert!(frozen >= 499.0, "{r}");
     assert!((rows.last().unwrap().applied_um - PARK_UM).abs() < 0.01);
     let run = RunReader::open(&run_folder(folder.path()).unwrap()).unwrap();
     assert!(run.ticks().unwrap().1.finished);

@@ -1,4 +1,4 @@
-//! An effect: a coupling that gets softer the further it is pushed, `x = u - c u^3`.
+//! An effect: a coupling that gives way when it is pulled and not when it is pushed, `x = u - c min(u, 0)`.
 
 use cellpos_plant::effects::{
     Action, Block, Candidate, Effect, EffectKind, Experiment, Form, ParameterSpec, Place, Scope,
@@ -8,9 +8,9 @@ use cellpos_plant::effects::{
 /// Where it is known under its id: hand it to [`cellpos_plant::effects::register`].
 pub static KIND: SoftCoupling = SoftCoupling;
 
-/// The coupling with `c` per um^2.
-pub fn soft_coupling(softening_per_um2: f64) -> Effect {
-    Effect::new(&KIND, 0, &[softening_per_um2], &[])
+/// The coupling that loses the share `give` of what it is pulled.
+pub fn soft_coupling(give: f64) -> Effect {
+    Effect::new(&KIND, 0, &[give], &[])
 }
 
 /// `soft-coupling`.
@@ -21,19 +21,14 @@ static SPEC: Spec = Spec {
     id: "soft-coupling",
     place: Place::Pzt,
     shown_at: "",
-    equation: "x = u - softening u^3",
-    signature: "the gain falls with the square of the amplitude, at all frequencies, without a lag",
+    equation: "x = u - give min(u, 0)",
+    signature: "even harmonics in proportion to the amplitude, at all frequencies, without a lag",
     ahead_of_plant: false,
-    forms: &[Form::only(&[ParameterSpec::new(
-        "softening_per_um2",
-        "1/um^2",
-        0.0,
-        10.0,
-    )])],
-    confused_with: &["saturation"],
+    forms: &[Form::only(&[ParameterSpec::new("give", "1", 0.0, 1.0)])],
+    confused_with: &["valve-asymmetry"],
     inseparable_from: &[],
     experiment: Experiment::Amplitudes,
-    separate_by: "an amplitude sweep: a clip has a knee, a soft coupling bends from the start",
+    separate_by: "the same sine about another working point: the knee stays where the coupling is at rest",
 };
 
 impl EffectKind for SoftCoupling {
@@ -42,18 +37,18 @@ impl EffectKind for SoftCoupling {
     }
 
     fn act(&self, effect: &Effect) -> Action {
-        Action::Block(Box::new(Cubic {
-            softening: effect.scalar(0),
+        Action::Block(Box::new(OneSided {
+            give: effect.scalar(0),
         }))
     }
 
     fn candidates(&self) -> &'static [Candidate] {
-        const ALL: &[Candidate] = &[Candidate::chain(&[log("softening_per_um2", 1e-5, 1.0)])];
+        const ALL: &[Candidate] = &[Candidate::chain(&[log("give", 1e-4, 1.0)])];
         ALL
     }
 
     fn starts(&self, _: usize, _: &Scope) -> Vec<Vec<f64>> {
-        [0.002, 0.01, 0.04].into_iter().map(|c| vec![c]).collect()
+        [0.02, 0.1, 0.4].into_iter().map(|c| vec![c]).collect()
     }
 
     fn build(&'static self, _: usize, values: &[f64], _: &Scope) -> Effect {
@@ -62,29 +57,39 @@ impl EffectKind for SoftCoupling {
 }
 
 #[derive(Debug, Clone)]
-struct Cubic {
-    softening: f64,
+struct OneSided {
+    give: f64,
 }
 
-impl Cubic {
+impl OneSided {
     fn at(&self, u: f64) -> f64 {
-        u - self.softening * u.powi(3)
+        u - self.give * u.min(0.0)
     }
 
     fn slope(&self, u: f64) -> f64 {
-        1.0 - 3.0 * self.softening * u * u
+        if u < 0.0 { 1.0 - self.give } else { 1.0 }
+    }
+
+    /// What is lost of the area under a straight line from `a` to `b` um within `h_s`: that of the part below zero.
+    fn lost(&self, a: f64, b: f64, h_s: f64) -> f64 {
+        let below = if a < 0.0 && b < 0.0 {
+            0.5 * (a + b)
+        } else if a * b < 0.0 {
+            let least = a.min(b);
+            -0.5 * least * least / (b - a).abs()
+        } else {
+            0.5 * a.min(b).min(0.0)
+        };
+        self.give * below * h_s
     }
 }
 
-impl Block for Cubic {
+impl Block for OneSided {
     fn advance(&mut self, _: f64, h_s: f64, input: Segment) -> Segment {
-        let middle = 0.5 * (input.start + input.end);
-        let [start, mid, end] = [input.start, middle, input.end].map(|u| self.at(u));
         Segment {
-            start,
-            end,
-            // Simpson's rule: exact for a cubic of a straight line.
-            integral: h_s / 6.0 * (start + 4.0 * mid + end),
+            start: self.at(input.start),
+            end: self.at(input.end),
+            integral: input.integral - self.lost(input.start, input.end, h_s),
             speed_start: self.slope(input.start) * input.speed_start,
             speed_end: self.slope(input.end) * input.speed_end,
         }

@@ -80,7 +80,7 @@ fn an_effect_from_outside_is_simulated_and_the_search_names_it() {
         working_point_um: 4.0,
         ..Model::eq6()
     };
-    let hidden = given.clone().with_effect(soft_coupling(0.02));
+    let hidden = given.clone().with_effect(soft_coupling(0.2));
     let text = hidden.to_toml_string();
     let read = Model::from_toml_str(&text, "hidden.toml").expect("it is known by its id");
     assert_eq!(read, hidden);
@@ -111,7 +111,7 @@ fn an_effect_from_outside_is_simulated_and_the_search_names_it() {
         (result.verdict, names),
         (Verdict::Named, vec!["soft-coupling"])
     );
-    let found = &result.effects[0].parameters["softening_per_um2"];
+    let found = &result.effects[0].parameters["give"];
     println!("{} ({:?})", found.value, found.ci95);
-    assert!((found.value / 0.02 - 1.0).abs() < 0.1, "{found:?}");
+    assert!((found.value / 0.2 - 1.0).abs() < 0.1, "{found:?}");
 }
