@@ -268,5 +268,5 @@ impl<'a> Acting<'a> {
 }
 
 #[cfg(test)]
-#[path = "threads_tests.rs"]
+#[path = "threads_tests/mod.rs"]
 mod tests;

@@ -3,6 +3,8 @@
 //! [`View::open`] starts the server; [`Viewed`] wraps the run's own sink. Everything happens on the recorder's thread and on
 //! the server's own threads; the loop knows nothing of it but the target, which it reads once a tick.
 
+mod pictures;
+
 use crate::connect;
 use crate::failure::Failure;
 use crate::rig::Rig;
@@ -10,14 +12,13 @@ use crate::setup::Setup;
 use crate::words::{Level, safe_reason, sentence};
 use cellpos_control::design::bound_rms_um;
 use cellpos_live::{
-    Banner, Command, CycleRow, EventLine, Feed, Hello, Picture, PictureFeed, Row, Server,
-    ServerConfig, State,
+    Banner, Command, CycleRow, EventLine, Feed, Hello, Row, Server, ServerConfig, State,
 };
-use cellpos_rig::{FrameWatch, SeenFrame};
+use cellpos_rig::FrameWatch;
 use cellpos_runtime::life::{EventKind, Request};
 use cellpos_runtime::live::Operator;
 use cellpos_runtime::{Event, Life, RunSink, Statistics, Summary, TickFlags, TickRecord};
-use cellpos_vision::Pixels;
+use pictures::Pictures;
 use std::f64::consts::PI;
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -147,10 +148,7 @@ impl View {
     /// What shows it the camera's frames; once.
     pub fn pictures(&mut self) -> Option<Box<dyn FrameWatch>> {
         let feed = self.feed.as_mut()?.take_pictures()?;
-        Some(Box::new(Pictures {
-            feed,
-            first_ns: None,
-        }))
+        Some(Box::new(Pictures::new(feed)))
     }
 }
 
@@ -167,68 +165,6 @@ fn act(command: Command, operator: &Operator, noted: &Sender<String>) {
         // The run is over: nobody takes notes any more.
         Command::Note { text } => drop(noted.send(text)),
     }
-}
-
-/// Crops frames for the page.
-struct Pictures {
-    feed: PictureFeed,
-    first_ns: Option<i64>,
-}
-
-/// Largest crop, px.
-const CROP: (usize, usize) = (384, 288);
-
-impl FrameWatch for Pictures {
-    fn frame(&mut self, seen: &SeenFrame<'_>) {
-        let at_ns = seen.stamp.mid_exposure_ns;
-        let time_s = (at_ns - *self.first_ns.get_or_insert(at_ns)) as f64 * 1e-9;
-        if self.feed.is_due(time_s) {
-            self.feed.offer(time_s, |picture| crop(seen, picture));
-        }
-    }
-}
-
-/// The part of a frame about what is followed, in 8 bits.
-fn crop(seen: &SeenFrame<'_>, picture: &mut Picture) {
-    let frame = &seen.frame;
-    let about = seen.centre_px.unwrap_or(seen.expected_px);
-    // A step of the crop with the bead would hide its motion: it moves in steps of an eighth.
-    let start = |size: usize, most: usize, place: f64| {
-        let step = (most / 8).max(1);
-        let wanted = if place.is_finite() {
-            place as usize
-        } else {
-            size / 2
-        };
-        let start = wanted.saturating_sub(most / 2) / step * step;
-        (start.min(size.saturating_sub(most)), size.min(most))
-    };
-    let (left, width) = start(frame.width, CROP.0, about.0);
-    let (top, height) = start(frame.height, CROP.1, about.1);
-    let shift = seen.bits.saturating_sub(8);
-    for row in top..top + height {
-        let span = row * frame.width + left..row * frame.width + left + width;
-        match frame.pixels {
-            Pixels::Mono8(pixels) => picture.pixels.extend_from_slice(&pixels[span]),
-            Pixels::Mono16(pixels) => picture
-                .pixels
-                .extend(pixels[span].iter().map(|v| (v >> shift).min(255) as u8)),
-        }
-    }
-    (picture.width, picture.height) = (width as u16, height as u16);
-    let scale = seen.scale;
-    let along = if scale.upright { top } else { left };
-    picture.um_per_px = scale.um_per_px as f32;
-    picture.upright = scale.upright;
-    picture.first_um = (scale.first_um + scale.um_per_px * along as f64) as f32;
-    let place = |(x, y): (f64, f64)| [(x - left as f64) as f32, (y - top as f64) as f32];
-    picture.centre_px = seen.centre_px.map_or([f32::NAN; 2], place);
-    picture.half_px = [seen.half_px.0 as f32, seen.half_px.1 as f32];
-    picture.gate_px = if seen.expected_sd_px.is_finite() {
-        (4.0 * seen.expected_sd_px) as f32
-    } else {
-        f32::NAN
-    };
 }
 
 /// References of the last ticks: the error of a position is counted from where the bead was to be when it was exposed.
@@ -465,52 +401,5 @@ mod tests {
             "{rms_nm} {bound_nm}"
         );
         assert!(lowest_spectrum(0.0, blind_s, 500.0).is_empty());
-    }
-
-    #[test]
-    fn a_crop_holds_the_bead_and_says_where_it_lies() {
-        let (width, height) = (1024, 64);
-        let mut pixels = vec![40_u16; width * height];
-        pixels[32 * width + 900] = 4000;
-        let seen = SeenFrame {
-            frame: cellpos_vision::Frame {
-                width,
-                height,
-                pixels: Pixels::Mono16(&pixels),
-            },
-            bits: 12,
-            stamp: cellpos_rig::FrameStamp {
-                id: 0,
-                mid_exposure_ns: 0,
-                exposure_ns: 0,
-                arrival_ns: 0,
-                true_um: f64::NAN,
-                true_pzt_um: f64::NAN,
-            },
-            centre_px: Some((900.0, 32.0)),
-            half_px: (5.0, 5.0),
-            expected_px: (900.0, 32.0),
-            expected_sd_px: f64::INFINITY,
-            scale: cellpos_rig::PictureScale {
-                first_um: -10.0,
-                um_per_px: 0.1,
-                upright: false,
-            },
-        };
-        let (mut feed, _hub) = Feed::new(Hello {
-            pictures: true,
-            ..Hello::default()
-        });
-        let mut shown = None;
-        feed.take_pictures().unwrap().offer(0.0, |picture| {
-            crop(&seen, picture);
-            shown = Some(picture.clone());
-        });
-        let picture = shown.unwrap();
-        assert_eq!((picture.width, picture.height), (384, 64));
-        let [x, y] = picture.centre_px;
-        assert_eq!(picture.pixels[y as usize * 384 + x as usize], 250);
-        let um = picture.first_um + picture.um_per_px * x;
-        assert!((um - 80.0).abs() < 1e-3, "{um}");
     }
 }

@@ -1,0 +1,110 @@
+//! The life cycle: armed, running, frozen, safe.
+
+use super::Core;
+use crate::arming::{ArmingInput, Step};
+use crate::life::{EventKind, FreezeReason, Life, SafeReason};
+use crate::reference::ReferenceGenerator;
+use crate::tick::Tick;
+use crate::tick_record::TickFlags;
+use cellpos_control::Mode;
+
+impl<R: ReferenceGenerator> Core<R> {
+    /// Life cycle; gives what the controller is to do.
+    pub(super) fn advance_life(&mut self, position_um: Option<f64>, tick: &mut Tick) -> Mode {
+        if self.state.life == Life::Armed {
+            let held = self.controller.previous_command_um();
+            let neutral_um = self.controller.estimator().neutral_um;
+            let told = ArmingInput {
+                position_um,
+                framed: !tick.flags.has(TickFlags::TIMER),
+                command_um: held,
+                neutral_um,
+                disturbed: tick.disturbed,
+                steps: tick.steps,
+            };
+            match self.arming.step(&mut self.state.arming, &told) {
+                Step::Command(command_um) => return Mode::Direct(command_um),
+                Step::Again(command_um, verdict) => {
+                    if let Some(refusal) = verdict.refusal {
+                        tick.event(EventKind::ArmingRepeated {
+                            refusal,
+                            gain_ratio: verdict.gain_ratio,
+                            ci95: verdict.ci95,
+                        });
+                    }
+                    return Mode::Direct(command_um);
+                }
+                Step::Done(verdict) => match verdict.refusal {
+                    Some(refusal) => {
+                        tick.event(EventKind::ArmingRefused {
+                            refusal,
+                            gain_ratio: verdict.gain_ratio,
+                            ci95: verdict.ci95,
+                        });
+                        self.latch(SafeReason::ArmingRefused, tick);
+                    }
+                    None => {
+                        if verdict.gain_ratio.is_finite() {
+                            tick.event(EventKind::ArmingPassed {
+                                gain_ratio: verdict.gain_ratio,
+                                ci95: verdict.ci95,
+                            });
+                        }
+                        tick.event(EventKind::Running);
+                        self.state.life = Life::Running;
+                        self.state.running_since = tick.index;
+                        self.state.missing = 0;
+                    }
+                },
+            }
+        }
+        if self.state.life == Life::Running {
+            let cause = if self.state.frames_silent {
+                (FreezeReason::CameraStalled, SafeReason::CameraLost)
+            } else {
+                (FreezeReason::BeadLost, SafeReason::BeadLost)
+            };
+            if self.state.missing >= self.timing.lost_ticks {
+                self.latch(cause.1, tick);
+            } else if self.state.missing >= self.timing.coast_ticks {
+                self.freeze(cause.0, tick);
+            } else if self.state.missing == 0
+                && matches!(self.state.frozen, Some((reason, _)) if reason != FreezeReason::Operator)
+            {
+                self.thaw(tick);
+            }
+        }
+        match (self.state.life, self.state.frozen) {
+            (Life::Running, None) => Mode::Run,
+            (Life::Running, Some(_)) => {
+                tick.flags.set(TickFlags::FREEZE);
+                Mode::Freeze
+            }
+            _ => Mode::Park,
+        }
+    }
+
+    pub(super) fn latch(&mut self, reason: SafeReason, tick: &mut Tick) {
+        if self.state.life != Life::Safe {
+            self.state.life = Life::Safe;
+            self.state.safe_reason = Some(reason);
+            self.state.frozen = None;
+            tick.event(EventKind::SafeLatched { reason });
+        }
+    }
+
+    pub(super) fn freeze(&mut self, reason: FreezeReason, tick: &mut Tick) {
+        if self.state.life == Life::Running && self.state.frozen.is_none() {
+            self.state.frozen = Some((reason, tick.time_ns));
+            tick.event(EventKind::FreezeStarted { reason });
+        }
+    }
+
+    pub(super) fn thaw(&mut self, tick: &mut Tick) {
+        if let Some((_, since_ns)) = self.state.frozen.take() {
+            tick.event(EventKind::FreezeEnded {
+                lasted_ms: (tick.time_ns - since_ns) as f64 * 1e-6,
+            });
+        }
+    }
+}

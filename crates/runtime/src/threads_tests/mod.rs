@@ -1,0 +1,330 @@
+//! The threads' rounds on clocks that bend: a scheduler that runs them in any order, with stalls, bursts, early, late, lost,
+//! doubled and false frames, slow vision, a slow disk and threads that die. The board is the firmware's own, and every step of
+//! its output is looked at.
+
+use super::*;
+use crate::arming::ArmingConfig;
+use crate::core::Core;
+use crate::life::{Event, Request};
+use crate::recorder::{Feed, Recorder, RecorderReport};
+use crate::reference::{ReferenceInput, ReferenceOutput, Stage};
+use crate::replay::Replay;
+use crate::run::{RunSink, close_session};
+use crate::summary::Statistics;
+use crate::tick_record::{TickFlags, TickRecord};
+use crate::ticker::RingSizes;
+use crate::timing::Timing;
+
+use cellpos_control::{ControllerFile, Limits, Pi};
+use cellpos_drivers::{BoardHost, Port};
+use cellpos_emulator::{BoardConfig, RigInABox, WorldConfig};
+use cellpos_plant::{Model, TransferFunction};
+use cellpos_rig::{ArmRequest, CameraError, SourceInfo};
+use rtrb::RingBuffer;
+use std::collections::VecDeque;
+use std::sync::{Arc, Mutex, MutexGuard};
+
+mod rig;
+mod scheduler;
+
+use rig::*;
+use scheduler::*;
+
+const MS: i64 = 1_000_000;
+
+const SLEW_UM_PER_S: f64 = 600.0;
+
+fn file() -> ControllerFile {
+    let mut file = ControllerFile::from_pi(Pi::new(0.46, 19.5), 2.5e-3);
+    file.limits = Limits {
+        low_um: 2.0,
+        high_um: 38.0,
+        slew_um_per_s: SLEW_UM_PER_S,
+        park_um: 2.0,
+    };
+    file
+}
+
+fn core<R: ReferenceGenerator>(reference: R, first_um: f64) -> Core<R> {
+    Core::new(
+        file().loop_config(&Model::eq6()).expect("a controller"),
+        reference,
+        Timing::default(),
+        ArmingConfig {
+            check: true,
+            ..ArmingConfig::default()
+        },
+        &TransferFunction::eq6(),
+        first_um,
+        20.0,
+    )
+    .expect("a loop")
+}
+
+/// Nothing of what a run must keep to, whatever happens, is broken.
+fn check(ran: &Ran, faults: &Faults) {
+    let limits = file().limits;
+    // The board's converter rounds to steps of 0.6 nm.
+    let step_um = 40.0 / 65_535.0;
+    for (_, um) in &ran.outputs {
+        let range = limits.low_um.min(ran.stood_um) - step_um..=limits.high_um + step_um;
+        assert!(range.contains(um), "{um} um");
+    }
+    for window in [1, 2, 5, 10, 50, 200] {
+        for (from, to) in ran.outputs.iter().zip(ran.outputs.iter().skip(window)) {
+            // The board's clock counts microseconds.
+            let apart_s = (to.0 - from.0 + 1000) as f64 * 1e-9;
+            let most_um = SLEW_UM_PER_S * apart_s + step_um * 1.001;
+            assert!(
+                (to.1 - from.1).abs() <= most_um,
+                "{from:?} -> {to:?} in {window} steps"
+            );
+        }
+    }
+    assert!(
+        (ran.applied_um - limits.park_um).abs() < 2.0 * step_um,
+        "parked at {} um",
+        ran.applied_um
+    );
+    let Some(end) = &ran.end else {
+        assert_eq!(faults.dies.map(|(thread, _)| thread), Some(Thread::Control));
+        return;
+    };
+    let kept = ran.records.len() as u64 + ran.report.records_unkept + end.account.records_lost;
+    assert_eq!(
+        kept, end.counts.ticks,
+        "every tick is recorded or counted as lost"
+    );
+    // The board of these runs does what it is told.
+    let blamed = [
+        SafeReason::BoardForeign,
+        SafeReason::BoardNotObeying,
+        SafeReason::BoardNotFollowing,
+    ];
+    assert!(
+        end.safe_reason
+            .is_none_or(|reason| !blamed.contains(&reason))
+    );
+    assert_eq!(end.life == Life::Safe, end.safe_reason.is_some());
+    assert!(end.end != End::Duration || end.safe_reason.is_none());
+    if end.safe_reason != Some(SafeReason::Stalled) {
+        check_plan(&ran.records);
+    }
+}
+
+/// At every tick the plan is where the clock is, whatever the frames did.
+fn check_plan(records: &[TickRecord]) {
+    let closed = records.iter().find(|r| r.life == Life::Running as u8);
+    let Some(closed) = closed else { return };
+    for record in records.iter().filter(|r| r.life == Life::Running as u8) {
+        let clock_ns = record.time_ns - closed.time_ns;
+        assert!(
+            (record.plan_ns - closed.plan_ns - clock_ns).abs() <= MS,
+            "plan {} ns, clock {clock_ns} ns",
+            record.plan_ns
+        );
+    }
+}
+
+fn replays(ran: &Ran) {
+    let reference = Counting {
+        steps: 0,
+        clock: Clock::virtual_at(0),
+        dice: Dice::new(0),
+        slow_tick: 0.0,
+        slow_tick_ns: 0,
+    };
+    let mut replay = Replay::new(core(reference, ran.stood_um));
+    for record in &ran.records {
+        replay.add(record);
+    }
+    let outcome = replay.outcome();
+    assert_eq!(outcome.first_mismatch, None);
+    assert_eq!(outcome.identical, ran.records.len() as u64);
+}
+
+#[test]
+fn plan_and_clock_agree_within_a_thousandth_whatever_the_frames_do() {
+    let doubled = Faults {
+        doubled: 1.0,
+        ..Faults::default()
+    };
+    let jitter = Faults {
+        jitter_ns: (MS / 2, 2 * MS),
+        calm_ns: 500 * MS,
+        ..Faults::default()
+    };
+    let lost = Faults {
+        lost: 0.05,
+        ..Faults::default()
+    };
+    let rate = |camera_hz| Faults {
+        camera_hz,
+        ..Faults::default()
+    };
+    let cases = [doubled, jitter, lost]
+        .into_iter()
+        .chain([500.0, 990.0, 1010.0, 2000.0].map(rate));
+    for (seed, faults) in (1..).zip(cases) {
+        let ran = run(seed, 6000, &faults, &[]);
+        check(&ran, &faults);
+        let end = ran.end.as_ref().expect("control lives");
+        assert_eq!(
+            (end.end, end.safe_reason),
+            (End::Duration, None),
+            "{faults:?}"
+        );
+        let closed = |r: &&TickRecord| r.life == Life::Running as u8;
+        let first = ran.records.iter().find(closed).expect("closed");
+        let last = ran.records.last().expect("records");
+        let clock_s = (last.time_ns - first.time_ns) as f64;
+        let plan_s = (last.plan_ns - first.plan_ns) as f64;
+        assert!((plan_s / clock_s - 1.0).abs() < 1e-3, "{faults:?}");
+        assert!(clock_s > 5.5e9, "{faults:?}");
+        replays(&ran);
+    }
+}
+
+#[test]
+fn a_camera_that_restarts_does_not_end_the_run() {
+    let faults = Faults {
+        restarts_at: Some(1000),
+        ..Faults::default()
+    };
+    let ran = run(7, 3000, &faults, &[]);
+    let end = ran.end.expect("control lives");
+    assert_eq!((end.end, end.safe_reason), (End::Duration, None));
+    assert_eq!((end.counts.camera_restarts, end.counts.frames_lost), (1, 0));
+}
+
+#[test]
+fn frames_lost_are_counted_once_though_others_are_old() {
+    let faults = Faults {
+        lost: 0.05,
+        stale: 0.1,
+        ..Faults::default()
+    };
+    let ran = run(3, 6000, &faults, &[]);
+    let end = ran.end.expect("control lives");
+    let lost = end.counts.frames_lost as f64;
+    assert!((lost / 6000.0 - 0.05).abs() < 0.01, "{lost}");
+}
+
+#[test]
+fn frames_from_the_future_are_not_used_and_end_the_run_when_there_are_no_others() {
+    let faults = Faults {
+        future: 1.0,
+        ..Faults::default()
+    };
+    let ran = run(3, 6000, &faults, &[]);
+    check(&ran, &faults);
+    let end = ran.end.expect("control lives");
+    assert_eq!(end.safe_reason, Some(SafeReason::StaleFrames));
+    assert!(end.counts.future >= 5);
+}
+
+#[test]
+fn vision_slower_than_the_camera_ends_the_run_by_its_name() {
+    let faults = Faults {
+        vision_ns: (1_200_000, 1_200_000),
+        ..Faults::default()
+    };
+    let ran = run(5, 20_000, &faults, &[]);
+    check(&ran, &faults);
+    let end = ran.end.as_ref().expect("control lives");
+    assert_eq!(end.safe_reason, Some(SafeReason::VisionSlow));
+    let told = ran.events.iter().find_map(|event| match event.kind {
+        crate::life::EventKind::VisionSlowStarted {
+            vision_ms,
+            period_ms,
+        } => Some((vision_ms, period_ms)),
+        _ => None,
+    });
+    assert_eq!(told, Some((1.2, 1.0)));
+}
+
+#[test]
+fn each_thread_that_dies_ends_the_run_by_its_name() {
+    for thread in [
+        Thread::Camera,
+        Thread::Control,
+        Thread::Line,
+        Thread::Recorder,
+    ] {
+        let faults = Faults {
+            dies: Some((thread, 500 * MS)),
+            ..Faults::default()
+        };
+        let ran = run(11, 20_000, &faults, &[]);
+        check(&ran, &faults);
+        let reason = ran.end.as_ref().map(|end| end.safe_reason);
+        let expected = match thread {
+            Thread::Camera => Some(Some(SafeReason::CameraLost)),
+            Thread::Control => None,
+            Thread::Line => Some(Some(SafeReason::LinkLost)),
+            Thread::Recorder => Some(Some(SafeReason::Unrecorded)),
+        };
+        assert_eq!(reason, expected, "{thread:?}");
+        assert_eq!(ran.io_error.is_some(), thread == Thread::Line, "{thread:?}");
+    }
+}
+
+#[test]
+fn freeze_and_park_take_the_clocks_time_with_doubled_frames() {
+    let faults = Faults {
+        doubled: 1.0,
+        ..Faults::default()
+    };
+    let ran = run(2, 20_000, &faults, &[(2000 * MS, Request::Freeze)]);
+    check(&ran, &faults);
+    assert_eq!(ran.end.as_ref().map(|end| end.end), Some(End::Operator));
+    let frozen = |r: &&TickRecord| r.flags.has(TickFlags::FREEZE);
+    let first = ran.records.iter().find(frozen).expect("frozen");
+    let last = ran.records.last().expect("records");
+    let frozen_ms = (last.time_ns - first.time_ns) / MS;
+    assert!((frozen_ms - 500).abs() <= 2, "{frozen_ms} ms");
+}
+
+fn any_orders(seeds: std::ops::Range<u64>) {
+    let periods = 1500;
+    for seed in seeds {
+        let mut dice = Dice::new(seed ^ 0x5EED);
+        let faults = Faults::any(&mut dice, periods as i64 * MS);
+        let asks: Vec<_> = (0..dice.next() % 3)
+            .map(|_| {
+                let asked = [
+                    Request::Freeze,
+                    Request::Pause,
+                    Request::None,
+                    Request::Park,
+                ];
+                let at_ns = dice.within(0, periods as i64 * MS);
+                (at_ns, asked[(dice.next() % 4) as usize])
+            })
+            .collect();
+        let outcome = std::panic::catch_unwind(|| {
+            let ran = run(seed, periods, &faults, &asks);
+            check(&ran, &faults);
+            if ran.report.records_unkept == 0
+                && ran
+                    .end
+                    .as_ref()
+                    .is_some_and(|e| e.account.records_lost == 0)
+            {
+                replays(&ran);
+            }
+        });
+        assert!(outcome.is_ok(), "seed {seed}: {faults:?}, {asks:?}");
+    }
+}
+
+#[test]
+fn sixty_random_orders_of_faults_break_nothing() {
+    any_orders(0..60);
+}
+
+#[test]
+#[ignore = "five minutes: cargo test -p cellpos-runtime --lib five_thousand -- --ignored"]
+fn five_thousand_random_orders_of_faults_break_nothing() {
+    any_orders(60..5060);
+}

@@ -1,0 +1,366 @@
+//! The rig of these tests, and what goes wrong with it.
+
+use super::*;
+
+/// Numbers for the scheduler and the faults.
+#[derive(Debug, Clone)]
+pub(super) struct Dice(u64);
+
+impl Dice {
+    pub(super) fn new(seed: u64) -> Self {
+        Self(seed.wrapping_mul(0x9E37_79B9_7F4A_7C15) | 1)
+    }
+
+    pub(super) fn next(&mut self) -> u64 {
+        self.0 ^= self.0 << 13;
+        self.0 ^= self.0 >> 7;
+        self.0 ^= self.0 << 17;
+        self.0.wrapping_mul(0x2545_F491_4F6C_DD1D) >> 11
+    }
+
+    pub(super) fn part(&mut self) -> f64 {
+        self.next() as f64 / (1_u64 << 53) as f64
+    }
+
+    pub(super) fn hits(&mut self, probability: f64) -> bool {
+        self.part() < probability
+    }
+
+    pub(super) fn within(&mut self, least_ns: i64, most_ns: i64) -> i64 {
+        least_ns + (self.part() * (most_ns - least_ns) as f64) as i64
+    }
+}
+
+/// What goes wrong, and how often.
+#[derive(Debug, Clone)]
+pub(super) struct Faults {
+    pub(super) lost: f64,
+    pub(super) doubled: f64,
+    /// Delays of frames, from and up to, ns.
+    pub(super) jitter_ns: (i64, i64),
+    pub(super) stale: f64,
+    pub(super) future: f64,
+    /// The camera counts anew at this frame.
+    pub(super) restarts_at: Option<u64>,
+    pub(super) vision_ns: (i64, i64),
+    /// Probability that a thread is not run for a while, and how long, ns.
+    pub(super) stall: f64,
+    pub(super) stall_ns: i64,
+    /// A tick that takes long.
+    pub(super) slow_tick: f64,
+    pub(super) slow_tick_ns: i64,
+    /// The disk takes nothing for so long, from a time on, ns.
+    pub(super) disk: Option<(i64, i64)>,
+    pub(super) dies: Option<(Thread, i64)>,
+    pub(super) camera_hz: f64,
+    /// Frames are sound until then, ns.
+    pub(super) calm_ns: i64,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Thread {
+    Camera,
+    Control,
+    Line,
+    Recorder,
+}
+
+impl Default for Faults {
+    fn default() -> Self {
+        Self {
+            lost: 0.0,
+            doubled: 0.0,
+            jitter_ns: (0, 0),
+            stale: 0.0,
+            future: 0.0,
+            restarts_at: None,
+            vision_ns: (100_000, 150_000),
+            stall: 0.0,
+            stall_ns: 0,
+            slow_tick: 0.0,
+            slow_tick_ns: 0,
+            disk: None,
+            dies: None,
+            camera_hz: 1000.0,
+            calm_ns: 0,
+        }
+    }
+}
+
+impl Faults {
+    /// Some of everything, as the seed has it.
+    pub(super) fn any(dice: &mut Dice, duration_ns: i64) -> Self {
+        let maybe = |dice: &mut Dice, probability: f64, most: f64| {
+            if dice.hits(probability) {
+                most * dice.part()
+            } else {
+                0.0
+            }
+        };
+        let mut faults = Self {
+            lost: maybe(dice, 0.5, 0.1),
+            doubled: maybe(dice, 0.5, 1.0),
+            stale: maybe(dice, 0.3, 0.1),
+            future: maybe(dice, 0.3, 0.1),
+            stall: maybe(dice, 0.5, 0.002),
+            stall_ns: dice.within(1, 40 * MS),
+            slow_tick: maybe(dice, 0.3, 0.01),
+            slow_tick_ns: dice.within(1, 3 * MS),
+            ..Self::default()
+        };
+        if dice.hits(0.5) {
+            faults.jitter_ns = (0, dice.within(1, 2 * MS));
+        }
+        if dice.hits(0.5) {
+            faults.calm_ns = 300 * MS;
+        }
+        if dice.hits(0.2) {
+            faults.vision_ns = (100_000, dice.within(200_000, 2 * MS));
+        }
+        if dice.hits(0.2) {
+            faults.restarts_at = Some(dice.next() % 1000);
+        }
+        if dice.hits(0.2) {
+            let from_ns = dice.within(0, duration_ns);
+            faults.disk = Some((from_ns, from_ns + dice.within(1, 20_000 * MS)));
+        }
+        if dice.hits(0.3) {
+            let threads = [
+                Thread::Camera,
+                Thread::Control,
+                Thread::Line,
+                Thread::Recorder,
+            ];
+            let thread = threads[(dice.next() % 4) as usize];
+            faults.dies = Some((thread, dice.within(0, duration_ns)));
+        }
+        let rates = [500.0, 990.0, 999.95, 1000.0, 1000.0, 1000.0, 1010.0, 2000.0];
+        faults.camera_hz = rates[(dice.next() % 8) as usize];
+        faults
+    }
+}
+
+/// The emulated rig, and the output of its board at each step.
+pub(super) struct Rig {
+    pub(super) emulated: RigInABox,
+    /// Each step of the output: when, ns, and to where, um.
+    pub(super) outputs: Vec<(i64, f64)>,
+    pub(super) line_is_dead: bool,
+}
+
+impl Rig {
+    pub(super) fn advance(&mut self, now_ns: i64) {
+        // The box began at time 0, so that the board's clock is everybody's.
+        loop {
+            let step_ns = self.emulated.board().next_event_us().saturating_mul(1000);
+            let step_ns = i64::try_from(step_ns).unwrap_or(i64::MAX);
+            if step_ns > now_ns {
+                break;
+            }
+            self.emulated.advance_to(step_ns);
+            self.look();
+        }
+        self.emulated.advance_to(now_ns);
+        self.look();
+    }
+
+    pub(super) fn look(&mut self) {
+        let um = self.emulated.applied_um();
+        if self
+            .outputs
+            .last()
+            .is_none_or(|(_, last_um)| *last_um != um)
+        {
+            self.outputs.push((self.emulated.now_ns(), um));
+        }
+    }
+}
+
+pub(super) type Shelf = Arc<Mutex<Rig>>;
+
+pub(super) fn at(rig: &Shelf, now_ns: i64) -> MutexGuard<'_, Rig> {
+    let mut rig = rig.lock().expect("no thread of a test panics with it");
+    rig.advance(now_ns);
+    rig
+}
+
+#[derive(Clone)]
+pub(super) struct Line {
+    pub(super) rig: Shelf,
+    pub(super) clock: Clock,
+}
+
+impl Port for Line {
+    fn name(&self) -> &str {
+        "line"
+    }
+
+    fn write_all(&mut self, bytes: &[u8]) -> std::io::Result<()> {
+        let now_ns = self.clock.now_ns();
+        let mut rig = at(&self.rig, now_ns);
+        if rig.line_is_dead {
+            return Err(std::io::ErrorKind::BrokenPipe.into());
+        }
+        let now_ns = now_ns.max(rig.emulated.now_ns());
+        rig.emulated.receive(bytes, now_ns);
+        rig.look();
+        Ok(())
+    }
+
+    fn read_available(&mut self, buffer: &mut [u8]) -> std::io::Result<usize> {
+        let mut rig = at(&self.rig, self.clock.now_ns());
+        Ok(rig.emulated.transmit(buffer))
+    }
+}
+
+/// A camera with vision behind it that takes its time, and what goes wrong in both.
+pub(super) struct Source {
+    pub(super) rig: Shelf,
+    pub(super) clock: Clock,
+    pub(super) faults: Faults,
+    pub(super) dice: Dice,
+    pub(super) frames: u64,
+    /// When each frame arrives, in order.
+    pub(super) queue: VecDeque<(i64, Measurement)>,
+}
+
+impl Source {
+    pub(super) fn arrive(&mut self, at_ns: i64, measurement: Measurement) {
+        let place = self.queue.partition_point(|(ns, _)| *ns <= at_ns);
+        self.queue.insert(place, (at_ns, measurement));
+    }
+
+    pub(super) fn pump(&mut self) {
+        let now_ns = self.clock.now_ns();
+        loop {
+            let mut rig = at(&self.rig, now_ns);
+            let Some(fix) = rig.emulated.world_mut().take_position() else {
+                break;
+            };
+            drop(rig);
+            let n = self.frames;
+            self.frames += 1;
+            let mut m = Measurement {
+                frame_id: match self.faults.restarts_at {
+                    Some(first) if n >= first => n - first,
+                    _ => 70_000 + n,
+                },
+                mid_exposure_ns: fix.info.mid_exposure_ns,
+                ready_ns: 0,
+                position_um: fix.x_um,
+                variance_um2: fix.variance_um2,
+                verdict: fix.verdict,
+                track: None,
+                snr: fix.snr,
+                length_um: f64::NAN,
+                length_sd_um: f64::NAN,
+                area_sd_um2: f64::NAN,
+                area_um2: f64::NAN,
+                true_um: f64::NAN,
+                true_pzt_um: f64::NAN,
+            };
+            if fix.info.delivery_ns < self.faults.calm_ns {
+                self.arrive(fix.info.delivery_ns, m);
+                continue;
+            }
+            if self.dice.hits(self.faults.lost) {
+                continue;
+            }
+            if self.dice.hits(self.faults.stale) {
+                m.mid_exposure_ns -= 6 * MS;
+            }
+            if self.dice.hits(self.faults.future) {
+                m.mid_exposure_ns += self.dice.within(3 * MS, 3_600_000 * MS);
+            }
+            let (least, most) = self.faults.jitter_ns;
+            let arrives_ns = fix.info.delivery_ns + self.dice.within(least, most);
+            self.arrive(arrives_ns, m);
+            if self.dice.hits(self.faults.doubled) {
+                self.arrive(arrives_ns + MS / 2, m);
+            }
+        }
+    }
+}
+
+impl PositionSource for Source {
+    fn next(&mut self, _: i64) -> Result<Option<Measurement>, CameraError> {
+        self.pump();
+        let now_ns = self.clock.now_ns();
+        if self.queue.front().is_none_or(|(ns, _)| *ns > now_ns) {
+            return Ok(None);
+        }
+        let (_, mut m) = self.queue.pop_front().expect("asked above");
+        let (least, most) = self.faults.vision_ns;
+        let ready_ns = now_ns + self.dice.within(least, most);
+        self.clock.sleep_until_ns(ready_ns);
+        m.ready_ns = ready_ns;
+        Ok(Some(m))
+    }
+
+    fn info(&self) -> SourceInfo {
+        SourceInfo {
+            name: "bent".to_string(),
+            width_px: 0,
+            height_px: 0,
+            rate_hz: self.faults.camera_hz,
+            latency_ms: 2.0,
+            field_um: [-50.0, 50.0],
+        }
+    }
+}
+
+/// Counts the steps that it is led through, and follows them with a slow sine: its plan is right only where every period of
+/// the clock reaches it.
+pub(super) struct Counting {
+    pub(super) steps: u64,
+    pub(super) clock: Clock,
+    pub(super) dice: Dice,
+    pub(super) slow_tick: f64,
+    pub(super) slow_tick_ns: i64,
+}
+
+impl ReferenceGenerator for Counting {
+    fn step(&mut self, input: &ReferenceInput, preview_um: &mut [f64]) -> ReferenceOutput {
+        let plan_s = self.steps as f64 * input.sample_s;
+        self.steps += u64::from(input.running);
+        let reference_um = 2.0 * (std::f64::consts::TAU * 3.0 * plan_s).sin();
+        preview_um.fill(reference_um);
+        if self.dice.hits(self.slow_tick) {
+            self.clock
+                .sleep_until_ns(self.clock.now_ns() + self.slow_tick_ns);
+        }
+        ReferenceOutput {
+            reference_um,
+            plan_ns: (plan_s * 1e9).round() as i64,
+            stage: Stage::Running,
+            phase: None,
+            motion: 0,
+        }
+    }
+}
+
+pub(super) struct Sink {
+    pub(super) records: Vec<TickRecord>,
+    pub(super) events: Vec<Event>,
+    pub(super) clock: Clock,
+    pub(super) disk: Option<(i64, i64)>,
+    pub(super) dies_at_ns: Option<i64>,
+}
+
+impl RunSink for Sink {
+    fn tick(&mut self, record: &TickRecord) {
+        if self.dies_at_ns.is_some_and(|ns| self.clock.now_ns() >= ns) {
+            std::panic::resume_unwind(Box::new("the sink dies"));
+        }
+        self.records.push(*record);
+    }
+    fn event(&mut self, event: &Event) {
+        self.events.push(*event);
+    }
+    fn progress(&mut self, _: &Statistics) {}
+    fn is_ready(&self) -> bool {
+        let now_ns = self.clock.now_ns();
+        self.disk
+            .is_none_or(|(from, until)| !(from..until).contains(&now_ns))
+    }
+}
