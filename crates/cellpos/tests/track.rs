@@ -253,6 +253,9 @@ fn each_fault_ends_as_it_should_and_is_named() {
         for event in events {
             assert!(log.contains(event), "{fault}: no {event} in\n{log}");
         }
+        // Only a bead that is held sticks: one that is not told where to go does not.
+        let sticks = fault.contains("stick-bead");
+        assert_eq!(log.contains("\"stuck-started\""), sticks, "{fault}\n{log}");
     }
 }
 

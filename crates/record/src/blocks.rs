@@ -1,7 +1,7 @@
 //! A file that only ever grows by whole blocks.
 
 use std::fs::{File, OpenOptions};
-use std::io::{self, Seek, SeekFrom, Write};
+use std::io;
 use std::path::Path;
 
 /// Most bytes that wait for a disk that refuses them: some minutes of a run.
@@ -34,38 +34,19 @@ pub(crate) trait Sink {
     fn append(&mut self, bytes: &[u8]) -> io::Result<()>;
     /// Cuts the file to a length.
     fn cut(&mut self, length: u64) -> io::Result<()>;
-    /// Waits until the disk has everything.
+    /// Sees to it that the disk has everything: now, or soon ([`Sink::is_pending`]); then the next sync says whether it came
+    /// to that.
     fn sync(&mut self) -> io::Result<()>;
-    /// Fails when nobody will find what is written: the file was removed.
-    fn is_there(&self) -> io::Result<()>;
-}
-
-impl Sink for File {
-    fn append(&mut self, bytes: &[u8]) -> io::Result<()> {
-        self.write_all(bytes)
-    }
-
-    fn cut(&mut self, length: u64) -> io::Result<()> {
-        self.set_len(length)?;
-        self.seek(SeekFrom::Start(length)).map(|_| ())
-    }
-
-    fn sync(&mut self) -> io::Result<()> {
-        self.sync_data()
-    }
-
-    fn is_there(&self) -> io::Result<()> {
-        #[cfg(unix)]
-        {
-            use std::os::unix::fs::MetadataExt;
-            if self.metadata()?.nlink() == 0 {
-                return Err(io::Error::other(
-                    "the file was removed while it was being written",
-                ));
-            }
-        }
+    /// Waits for a sync that is still to come.
+    fn settle(&mut self) -> io::Result<()> {
         Ok(())
     }
+    /// Whether a sync is still to come.
+    fn is_pending(&self) -> bool {
+        false
+    }
+    /// Fails when nobody will find what is written: the file was removed.
+    fn is_there(&self) -> io::Result<()>;
 }
 
 /// A file of which only whole blocks are kept: a block that fails is taken back and waits for the next try.
@@ -82,8 +63,10 @@ pub(crate) struct Blocks<S> {
     waiting_units: u64,
     /// Those that did not find room in `waiting` any more.
     dropped_units: u64,
-    /// Those appended since the last sync that worked.
+    /// Those appended since the last sync.
     unsynced_units: u64,
+    /// Those of the syncs that are still to come.
+    pending_units: u64,
     /// Those of which the disk said that it does not have them.
     unkept_units: u64,
 }
@@ -99,6 +82,7 @@ impl<S: Sink> Blocks<S> {
             waiting_units: 0,
             dropped_units: 0,
             unsynced_units: 0,
+            pending_units: 0,
             unkept_units: 0,
         }
     }
@@ -135,15 +119,38 @@ impl<S: Sink> Blocks<S> {
         Ok(())
     }
 
-    /// Waits until the disk has what was appended, if anything was.
+    /// Sees to it that the disk has what was appended, if anything was.
     pub(crate) fn sync(&mut self) -> io::Result<()> {
         if !self.unsynced {
             return Ok(());
         }
-        let units = std::mem::take(&mut self.unsynced_units);
-        // A system that could not write says so once and then forgets what it had.
         self.unsynced = false;
-        self.sink.sync().inspect_err(|_| self.unkept_units += units)
+        self.pending_units += std::mem::take(&mut self.unsynced_units);
+        let synced = self.sink.sync();
+        self.account(synced)
+    }
+
+    /// Waits until the disk has what was synced.
+    pub(crate) fn settle(&mut self) -> io::Result<()> {
+        let settled = self.sink.settle();
+        self.account(settled)
+    }
+
+    fn account(&mut self, synced: io::Result<()>) -> io::Result<()> {
+        match &synced {
+            Ok(()) if self.sink.is_pending() => {}
+            Ok(()) => self.pending_units = 0,
+            // It may have it yet.
+            Err(error) if error.kind() == io::ErrorKind::TimedOut => self.unsynced = true,
+            // A system that could not write says so once and then forgets what it had.
+            Err(_) => self.unkept_units += std::mem::take(&mut self.pending_units),
+        }
+        synced
+    }
+
+    /// What it is appended to.
+    pub(crate) fn sink(&self) -> &S {
+        &self.sink
     }
 
     /// Whether the file is still where it was made.

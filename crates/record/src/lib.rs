@@ -37,6 +37,7 @@ mod reader;
 mod sessions;
 pub mod space;
 mod stream;
+mod synced;
 mod writer;
 
 pub use columns::Group;

@@ -2,6 +2,7 @@
 
 use crate::blocks::{Blocks, open_here};
 use crate::error::RecordError;
+use crate::synced::SyncedFile;
 use crate::writer::{Faults, whole_lines};
 use std::fs::{File, OpenOptions};
 use std::io::{Read, Seek, SeekFrom};
@@ -14,7 +15,7 @@ use std::path::Path;
 /// wait and are tried again with the next ones; when too much waits, the newest are dropped and counted. Belongs to the
 /// recorder thread; may block.
 pub struct LineFile {
-    blocks: Blocks<File>,
+    blocks: Blocks<SyncedFile>,
     sync: bool,
     io_errors: u64,
     first: Option<String>,
@@ -49,7 +50,7 @@ impl LineFile {
             file.set_len(whole)?;
             file.seek(SeekFrom::Start(whole))?;
             let mut lines = Self {
-                blocks: Blocks::new(file, whole),
+                blocks: Blocks::new(SyncedFile::new(file), whole),
                 sync,
                 io_errors: 0,
                 first: None,
@@ -173,7 +174,7 @@ mod tests {
             return;
         };
         let mut lines = LineFile {
-            blocks: Blocks::new(file, 0),
+            blocks: Blocks::new(SyncedFile::new(file), 0),
             sync: false,
             io_errors: 0,
             first: None,

@@ -7,11 +7,12 @@ use crate::events::Event;
 use crate::export::{Selection, Source};
 use crate::meta::{RunEnd, RunMeta};
 use crate::reader::RunReader;
+use crate::synced::SyncedFile;
 use crate::{EVENTS_JSONL, RUN_TOML, TICKS_ARROW, TICKS_PARQUET};
 use arrow_ipc::writer::StreamWriter;
 use cellpos_runtime::TickRecord;
 use cellpos_table::write_atomically;
-use std::fs::{File, OpenOptions};
+use std::fs::OpenOptions;
 use std::io;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
@@ -74,7 +75,7 @@ pub struct Finished {
 pub struct RunWriter {
     folder: PathBuf,
     meta: RunMeta,
-    log: Log<File>,
+    log: Log<SyncedFile>,
 }
 
 /// Columns and events, with the account of what was lost.
@@ -225,6 +226,11 @@ impl<S: Sink> Log<S> {
             self.ticks.push(&end, 0);
             self.write(true);
         }
+        for settled in [self.ticks.settle(), self.events.settle()] {
+            if let Err(error) = settled {
+                self.fault(&error);
+            }
+        }
     }
 }
 
@@ -271,6 +277,7 @@ impl RunWriter {
         let create = |name: &str| {
             let path = folder.join(name);
             open_here(OpenOptions::new().write(true).create_new(true), &path)
+                .map(SyncedFile::new)
                 .map_err(RecordError::io("cannot create", path))
         };
         let ticks = Blocks::new(create(TICKS_ARROW)?, 0);
@@ -363,6 +370,13 @@ impl RunWriter {
         end.rows = rows;
         end.rows_lost += faults.rows_lost;
         end.events_lost += faults.events_lost;
+        if self.log.policy.sync {
+            let slowest = self.log.ticks.sink().slowest();
+            end.summary.insert(
+                "slowest_sync_ms".to_owned(),
+                toml::Value::Float(slowest.as_secs_f64() * 1e3),
+            );
+        }
         if let Some(lost) = end.summary.get_mut("records_lost") {
             *lost = toml::Value::Integer(i64::try_from(end.rows_lost).unwrap_or(i64::MAX));
         }

@@ -68,6 +68,7 @@ struct State {
     /// Why and since when, ns.
     frozen: Option<(FreezeReason, i64)>,
     stuck_since_ns: Option<i64>,
+    stuck_told: bool,
     saturated_since_ns: Option<i64>,
     board: Option<ActuatorReport>,
     board_heard_ns: i64,
@@ -169,6 +170,7 @@ impl<R: ReferenceGenerator> Core<R> {
                 coasting_since_ns: None,
                 frozen: None,
                 stuck_since_ns: None,
+                stuck_told: false,
                 saturated_since_ns: None,
                 board: None,
                 board_heard_ns: 0,

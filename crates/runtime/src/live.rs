@@ -177,7 +177,7 @@ pub fn run<R: ReferenceGenerator + Send, S: RunSink>(
         let recorder = thread::Builder::new()
             .name("cellpos-record".to_string())
             .spawn_scoped(scope, || {
-                recorder::serve(feed, &mut sink, &mut statistics, operator)
+                recorder::serve(feed, &mut sink, &mut statistics, operator, &shared.pulse)
             })
             .map_err(start("recorder"))?;
         // The actuator thread is this one, so that `actuator` needs no owner of its own; control is told whom to wake.

@@ -5,8 +5,8 @@
 //! Events of one kind beyond [`EVENTS_A_SECOND`] in a second of the run are counted and told as one, so that a camera that
 //! doubles every frame does not fill the disk with the news.
 //!
-//! A sink that panics, or that has been refusing for longer than [`REFUSED_NS`], is a fault of the run
-//! ([`RecorderFault`]): the bead is frozen and the PZT parked, because a measurement that nobody keeps is worth nothing. The
+//! A sink that panics, that has been refusing for longer than [`REFUSED_NS`], or that does not come back from a call
+//! ([`Pulse`]) is a fault of the run ([`RecorderFault`]): the bead is frozen and the PZT parked, because a measurement that nobody keeps is worth nothing. The
 //! rings are drained all the same and every record that found no taker is counted.
 
 use crate::life::{Event, EventKind};
@@ -20,6 +20,7 @@ use rtrb::Consumer;
 use serde::Serialize;
 use std::mem::{Discriminant, discriminant};
 use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::thread;
 use std::time::Duration;
 
@@ -42,13 +43,15 @@ pub enum RecorderFault {
     Panicked = 1,
     /// The sink could not write: a full disk, a folder that is gone.
     Refused = 2,
-    /// The recorder fell behind by half of its ring: a disk that hangs.
+    /// The recorder fell behind by half of its ring: a disk that is too slow.
     Behind = 3,
+    /// The sink did not come back from a call: a disk that hangs.
+    Stuck = 4,
 }
 
 impl RecorderFault {
     pub(crate) fn from_number(number: u8) -> Option<Self> {
-        [Self::Panicked, Self::Refused, Self::Behind]
+        [Self::Panicked, Self::Refused, Self::Behind, Self::Stuck]
             .into_iter()
             .find(|fault| *fault as u8 == number)
     }
@@ -61,6 +64,9 @@ impl RecorderFault {
             }
             Self::Refused => {
                 "the run folder could not be written for half a second; the bead was frozen and the PZT parked"
+            }
+            Self::Stuck => {
+                "the recorder stood for 0.9 s in a write that did not come back; the bead was frozen and the PZT parked"
             }
             Self::Behind => {
                 "the disk was so slow that the recorder fell behind by half of its memory; the bead was frozen and the PZT \
@@ -79,6 +85,44 @@ pub struct RecorderReport {
     pub records_unkept: u64,
     /// Events likewise.
     pub events_unkept: u64,
+}
+
+/// Beats while the recorder comes back from what it calls.
+#[derive(Debug, Default)]
+pub(crate) struct Pulse(AtomicU64);
+
+impl Pulse {
+    fn beat(&self) {
+        self.0.fetch_add(1, Ordering::Release);
+    }
+}
+
+/// Watches the recorder's pulse from the control thread.
+#[derive(Debug, Clone, Copy, Default)]
+pub(crate) struct PulseWatch {
+    seen: u64,
+    looked_ns: Option<i64>,
+    still_ns: i64,
+}
+
+impl PulseWatch {
+    /// No beat for so long is a recorder that is stuck, ns.
+    pub(crate) const STUCK_NS: i64 = 900_000_000;
+    /// A look that comes later than this after the one before it says nothing of the time between: the whole program, or the
+    /// machine, may have stood still. ns.
+    const LOOK_NS: i64 = 10_000_000;
+
+    /// Whether the recorder is stuck; to be asked in each tick.
+    pub(crate) fn stuck(&mut self, pulse: &Pulse, now_ns: i64) -> bool {
+        let beats = pulse.0.load(Ordering::Acquire);
+        let since_ns = now_ns - self.looked_ns.replace(now_ns).unwrap_or(now_ns);
+        if beats == self.seen {
+            self.still_ns = self.still_ns.saturating_add(since_ns.min(Self::LOOK_NS));
+        } else {
+            (self.seen, self.still_ns) = (beats, 0);
+        }
+        self.still_ns >= Self::STUCK_NS
+    }
 }
 
 /// The recorder's ends of the rings.
@@ -157,6 +201,7 @@ pub(crate) struct Recorder<'a, S> {
     feed: Feed,
     sink: &'a mut S,
     statistics: &'a mut Statistics,
+    pulse: &'a Pulse,
     limiter: Limiter,
     refused_since_ns: Option<i64>,
     report: RecorderReport,
@@ -168,11 +213,17 @@ pub(crate) struct Recorder<'a, S> {
 }
 
 impl<'a, S: RunSink> Recorder<'a, S> {
-    pub(crate) fn new(feed: Feed, sink: &'a mut S, statistics: &'a mut Statistics) -> Self {
+    pub(crate) fn new(
+        feed: Feed,
+        sink: &'a mut S,
+        statistics: &'a mut Statistics,
+        pulse: &'a Pulse,
+    ) -> Self {
         Self {
             feed,
             sink,
             statistics,
+            pulse,
             limiter: Limiter::default(),
             refused_since_ns: None,
             report: RecorderReport::default(),
@@ -194,6 +245,7 @@ impl<'a, S: RunSink> Recorder<'a, S> {
 
     /// One round at a time of any steady clock; says whether more waits than a round takes.
     pub(crate) fn round(&mut self, now_ns: i64) -> bool {
+        self.pulse.beat();
         if self.report.fault == Some(RecorderFault::Panicked) {
             return self.discard();
         }
@@ -230,6 +282,7 @@ impl<'a, S: RunSink> Recorder<'a, S> {
             self.record_in_hand = true;
             self.sink.tick(&record);
             self.record_in_hand = false;
+            self.pulse.beat();
         }
         let mut more = left == 0;
         left = EVENTS_A_ROUND;
@@ -241,6 +294,7 @@ impl<'a, S: RunSink> Recorder<'a, S> {
             self.event_in_hand = true;
             self.limiter.event(&event, self.sink);
             self.event_in_hand = false;
+            self.pulse.beat();
         }
         more |= left == 0;
         self.limiter.overdue(Some(self.newest_ns), self.sink);
@@ -301,10 +355,11 @@ pub(crate) fn serve<S: RunSink>(
     sink: &mut S,
     statistics: &mut Statistics,
     operator: &Operator,
+    pulse: &Pulse,
 ) -> RecorderReport {
     const LOOK_EVERY: Duration = Duration::from_millis(5);
     const PROGRESS_EVERY_NS: i64 = 100_000_000;
-    let mut recorder = Recorder::new(feed, sink, statistics);
+    let mut recorder = Recorder::new(feed, sink, statistics, pulse);
     let mut told_ns = i64::MIN;
     loop {
         // Asked first: whatever was pushed before the rings were closed is still drained below.

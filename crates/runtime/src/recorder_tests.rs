@@ -91,7 +91,8 @@ fn a_round_is_bounded_and_takes_records_before_events() {
         from.event(seq, EventKind::FrameRepeated { frame_id: seq });
     }
     let (mut sink, mut statistics) = (Sink::default(), Statistics::default());
-    let mut recorder = Recorder::new(feed, &mut sink, &mut statistics);
+    let pulse = Pulse::default();
+    let mut recorder = Recorder::new(feed, &mut sink, &mut statistics, &pulse);
     assert!(recorder.round(0));
     assert_eq!(recorder.sink.told[0], Told::Tick(0));
     let ticks = |sink: &Sink| {
@@ -113,7 +114,7 @@ fn equal_events_are_told_by_number_and_none_is_forgotten() {
     }
     from.event(3000, EventKind::Running);
     let (mut sink, mut statistics) = (Sink::default(), Statistics::default());
-    Recorder::new(feed, &mut sink, &mut statistics).finish();
+    Recorder::new(feed, &mut sink, &mut statistics, &Pulse::default()).finish();
     let mut told = 0;
     let mut lines = 0;
     for line in &sink.told {
@@ -144,7 +145,8 @@ fn a_sink_that_panics_is_a_fault_and_every_record_after_it_is_counted() {
         ..Sink::default()
     };
     let mut statistics = Statistics::default();
-    let mut recorder = Recorder::new(feed, &mut sink, &mut statistics);
+    let pulse = Pulse::default();
+    let mut recorder = Recorder::new(feed, &mut sink, &mut statistics, &pulse);
     let mut rounds = 0;
     while recorder.round(rounds) {
         rounds += 1;
@@ -162,7 +164,8 @@ fn a_sink_that_panics_is_a_fault_and_every_record_after_it_is_counted() {
 fn a_sink_that_refuses_for_half_a_second_is_a_fault_and_a_short_refusal_is_none() {
     let (_from, feed) = rings(RingSizes::default());
     let (mut sink, mut statistics) = (Sink::default(), Statistics::default());
-    let mut recorder = Recorder::new(feed, &mut sink, &mut statistics);
+    let pulse = Pulse::default();
+    let mut recorder = Recorder::new(feed, &mut sink, &mut statistics, &pulse);
     recorder.sink.refuses = true;
     recorder.round(0);
     recorder.round(REFUSED_NS - 1);
@@ -187,7 +190,13 @@ fn the_thread_ends_with_its_rings_and_tells_the_loop_what_it_died_of() {
         ..Sink::default()
     };
     let operator = Operator::default();
-    let report = serve(feed, &mut sink, &mut Statistics::default(), &operator);
+    let report = serve(
+        feed,
+        &mut sink,
+        &mut Statistics::default(),
+        &operator,
+        &Pulse::default(),
+    );
     assert_eq!(report.records_unkept, 7);
     assert_eq!(operator.take(), Request::Unrecorded);
     operator.ask(Request::Park);

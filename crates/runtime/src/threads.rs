@@ -5,7 +5,7 @@ use crate::core::Counts;
 use crate::life::{Life, SafeReason};
 use crate::live::Operator;
 use crate::pacer::{Pace, Pacer};
-use crate::recorder::RecorderFault;
+use crate::recorder::{Pulse, PulseWatch, RecorderFault};
 use crate::reference::ReferenceGenerator;
 use crate::run::{EndRule, EndWatch, RunError, serve_actuator};
 use crate::summary::End;
@@ -22,6 +22,8 @@ pub(crate) struct Shared {
     pub(crate) stop: AtomicBool,
     /// Mean time that vision takes for a frame while it is slower than the camera, ns; 0: it keeps up.
     slow_vision_ns: AtomicU32,
+    /// The recorder's.
+    pub(crate) pulse: Pulse,
 }
 
 /// The camera thread: frame -> position -> ring.
@@ -150,6 +152,7 @@ pub(crate) struct Controlling<'a, R> {
     clock: Clock,
     pacer: Pacer,
     watch: EndWatch,
+    recorder: PulseWatch,
     operator: &'a Operator,
     shared: &'a Shared,
 }
@@ -177,6 +180,7 @@ impl<'a, R: ReferenceGenerator> Controlling<'a, R> {
         Self {
             pacer: Pacer::new(period_ns, clock.now_ns()),
             watch: EndWatch::new(end),
+            recorder: PulseWatch::default(),
             ticker,
             clock,
             operator,
@@ -198,7 +202,9 @@ impl<'a, R: ReferenceGenerator> Controlling<'a, R> {
         let request = self.operator.take();
         self.ticker.steer(self.operator.target_um());
         let life = self.ticker.tick(due_ns, request);
-        if self.ticker.recorder_is_behind() {
+        if self.recorder.stuck(&self.shared.pulse, now_ns) {
+            self.operator.unrecorded(RecorderFault::Stuck);
+        } else if self.ticker.recorder_is_behind() {
             self.operator.unrecorded(RecorderFault::Behind);
         }
         let core = self.ticker.core();

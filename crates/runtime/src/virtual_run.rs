@@ -6,7 +6,7 @@
 use crate::core::Core;
 use crate::life::Request;
 use crate::realtime::Conditions;
-use crate::recorder::{Feed, Recorder};
+use crate::recorder::{Feed, Pulse, Recorder};
 use crate::reference::ReferenceGenerator;
 use crate::run::{EndRule, EndWatch, Finished, RunError, RunSink, close_session, serve_actuator};
 use crate::summary::{Statistics, Summary};
@@ -48,7 +48,8 @@ pub fn run<R: ReferenceGenerator, S: RunSink>(
         events,
         learned,
     };
-    let mut recorder = Recorder::new(feed, &mut sink, &mut statistics);
+    let pulse = Pulse::default();
+    let mut recorder = Recorder::new(feed, &mut sink, &mut statistics, &pulse);
     let mut watch = EndWatch::new(end);
     let mut io_error = None;
     let mut tick = 0_u64;

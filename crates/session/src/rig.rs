@@ -438,8 +438,14 @@ impl<S> Running<S> {
         };
         let guard = ParkOnPanic(&self.operator);
         let mut next = std::time::Instant::now() + every;
+        let mut told = false;
         while !thread.is_finished() {
             std::thread::sleep(LOOK_EVERY);
+            // A recorder that hangs holds the end of the run: it is named now.
+            if let Some(fault) = self.operator.recorder_fault().filter(|_| !told) {
+                tracing::error!("{}", fault.sentence());
+                told = true;
+            }
             if std::time::Instant::now() >= next {
                 meanwhile();
                 next = std::time::Instant::now() + every;

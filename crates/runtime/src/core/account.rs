@@ -43,18 +43,40 @@ impl<R: ReferenceGenerator> Core<R> {
             EventKind::CoastingStarted,
             |lasted_ms| EventKind::CoastingEnded { lasted_ms },
         );
-        tick.span(
-            &mut self.state.stuck_since_ns,
-            flags.stuck,
-            EventKind::StuckStarted,
-            |lasted_ms| EventKind::StuckEnded { lasted_ms },
-        );
+        self.tell_stuck(flags.stuck, tick);
         tick.span(
             &mut self.state.saturated_since_ns,
             flags.range_limited,
             EventKind::SaturationStarted,
             |lasted_ms| EventKind::SaturationEnded { lasted_ms },
         );
+    }
+
+    /// A bead that does not follow is held by something only if its board obeyed meanwhile: while the line is silent the
+    /// commands are the loop's alone.
+    fn tell_stuck(&mut self, stuck: bool, tick: &mut Tick) {
+        /// The board must have obeyed a command given so long after the bead was first taken for stuck.
+        const OBEYED_NS: i64 = 10_000_000;
+        let state = &mut self.state;
+        let told = state.stuck_told;
+        if !stuck {
+            if let (true, Some(since_ns)) = (told, state.stuck_since_ns) {
+                let lasted_ms = (tick.time_ns - since_ns) as f64 * 1e-6;
+                tick.event(EventKind::StuckEnded { lasted_ms });
+            }
+            (state.stuck_since_ns, state.stuck_told) = (None, false);
+            return;
+        }
+        let sure_ns = *state.stuck_since_ns.get_or_insert(tick.time_ns) + OBEYED_NS;
+        let obeyed_ns = match state.board {
+            Some(board) if board.last_seq.is_some() => board.last_time_us.saturating_mul(1000),
+            // A board that does not say what it obeys.
+            _ => tick.time_ns.unsigned_abs(),
+        };
+        if !told && i64::try_from(obeyed_ns).is_ok_and(|ns| ns >= sure_ns) {
+            state.stuck_told = true;
+            tick.event(EventKind::StuckStarted);
+        }
     }
 
     /// Adds the tick to the counts.

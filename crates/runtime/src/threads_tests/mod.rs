@@ -95,6 +95,11 @@ fn check(ran: &Ran, faults: &Faults) {
         kept, end.counts.ticks,
         "every tick is recorded or counted as lost"
     );
+    if let Some((from_ns, until_ns)) = faults.hangs
+        && until_ns - from_ns < 800 * MS
+    {
+        assert_ne!(ran.fault, Some(RecorderFault::Stuck));
+    }
     // The board of these runs does what it is told.
     let blamed = [
         SafeReason::BoardForeign,
@@ -267,6 +272,47 @@ fn each_thread_that_dies_ends_the_run_by_its_name() {
         assert_eq!(reason, expected, "{thread:?}");
         assert_eq!(ran.io_error.is_some(), thread == Thread::Line, "{thread:?}");
     }
+}
+
+#[test]
+fn a_recorder_that_does_not_come_back_from_a_write_is_noticed_within_a_second() {
+    use crate::life::EventKind;
+    for (hangs_ms, noticed) in [(700, false), (1500, true), (20_000, true)] {
+        let faults = Faults {
+            hangs: Some((2000 * MS, (2000 + hangs_ms) * MS)),
+            ..Faults::default()
+        };
+        let ran = run(13, 6000, &faults, &[]);
+        check(&ran, &faults);
+        let end = ran.end.as_ref().expect("control lives");
+        let reason = noticed.then_some(SafeReason::Unrecorded);
+        assert_eq!(end.safe_reason, reason, "{hangs_ms} ms");
+        let frozen_ms = ran.events.iter().find_map(|event| {
+            let frozen = matches!(event.kind, EventKind::FreezeStarted { .. });
+            frozen.then_some(event.time_ns / MS - 2000)
+        });
+        let in_time = frozen_ms.is_some_and(|ms| (800..1000).contains(&ms));
+        assert_eq!(in_time, noticed, "{hangs_ms} ms: {frozen_ms:?}");
+        assert_eq!(end.account.records_lost, 0, "{hangs_ms} ms");
+    }
+}
+
+#[test]
+fn a_program_that_stood_still_as_a_whole_does_not_blame_its_recorder() {
+    let (pulse, mut watch) = (Pulse::default(), PulseWatch::default());
+    let mut now_ns = 0;
+    for late_ms in [1, 1, 3000, 1, 800, 1, 1] {
+        now_ns += late_ms * MS;
+        assert!(!watch.stuck(&pulse, now_ns));
+    }
+    let stuck = (0..2000).position(|_| {
+        now_ns += MS;
+        watch.stuck(&pulse, now_ns)
+    });
+    assert!(
+        stuck.is_some_and(|ms| (800..901).contains(&ms)),
+        "{stuck:?}"
+    );
 }
 
 #[test]

@@ -51,6 +51,8 @@ pub(super) struct Faults {
     pub(super) slow_tick_ns: i64,
     /// The disk takes nothing for so long, from a time on, ns.
     pub(super) disk: Option<(i64, i64)>,
+    /// The recorder's thread does not come back from a write for so long, from a time on, ns.
+    pub(super) hangs: Option<(i64, i64)>,
     pub(super) dies: Option<(Thread, i64)>,
     pub(super) camera_hz: f64,
     /// Frames are sound until then, ns.
@@ -80,6 +82,7 @@ impl Default for Faults {
             slow_tick: 0.0,
             slow_tick_ns: 0,
             disk: None,
+            hangs: None,
             dies: None,
             camera_hz: 1000.0,
             calm_ns: 0,
@@ -123,6 +126,10 @@ impl Faults {
         if dice.hits(0.2) {
             let from_ns = dice.within(0, duration_ns);
             faults.disk = Some((from_ns, from_ns + dice.within(1, 20_000 * MS)));
+        }
+        if dice.hits(0.1) {
+            let from_ns = dice.within(0, duration_ns);
+            faults.hangs = Some((from_ns, from_ns + dice.within(1, 5000 * MS)));
         }
         if dice.hits(0.3) {
             let threads = [

@@ -8,6 +8,8 @@ pub(super) struct Ran {
     pub(super) end: Option<ControlEnd>,
     pub(super) io_error: Option<RunError>,
     pub(super) report: RecorderReport,
+    /// What the operator's end of the loop was told of the recorder.
+    pub(super) fault: Option<RecorderFault>,
     pub(super) records: Vec<TickRecord>,
     pub(super) events: Vec<Event>,
     pub(super) outputs: Vec<(i64, f64)>,
@@ -145,6 +147,12 @@ impl Scheduler<'_> {
 
     pub(super) fn recorder(&mut self, clock: &Clock) {
         let now_ns = clock.now_ns();
+        if let Some((from_ns, until_ns)) = self.faults.hangs
+            && (from_ns..until_ns).contains(&(now_ns - self.start_ns))
+        {
+            self.next_ns[3] = self.start_ns + until_ns;
+            return;
+        }
         let over = self.controlling.is_none();
         let more = self.recorder.round(now_ns);
         if let Some(fault) = self.recorder.fault() {
@@ -274,7 +282,7 @@ pub(super) fn run(seed: u64, periods: u64, faults: &Faults, asks: &[(i64, Reques
         end: None,
         acting: Some(Acting::new(&mut board, ends.orders, ends.reports)),
         io_error: None,
-        recorder: Recorder::new(feed, &mut sink, &mut statistics),
+        recorder: Recorder::new(feed, &mut sink, &mut statistics, &shared.pulse),
         recorded: false,
     };
     let longest_ns = start_ns + (periods as i64 + 30_000) * MS;
@@ -299,6 +307,7 @@ pub(super) fn run(seed: u64, periods: u64, faults: &Faults, asks: &[(i64, Reques
         end,
         io_error,
         report,
+        fault: operator.recorder_fault(),
         records: sink.records,
         events: sink.events,
         stood_um: stands_um,
