@@ -91,7 +91,7 @@ fn run(controller: ControllerConfig, constrained: bool, seconds: u64) -> Outcome
 }
 
 fn bare(seconds: u64) {
-    let (latency, missed) = bare_loop(Duration::from_secs(seconds));
+    let (latency, missed) = bare_loop(Duration::from_secs(seconds), |_| {});
     let q = latency.quantiles_us();
     println!(
         "{:<28} wake-up p50 {:>6.1}  p99 {:>6.1}  p99.9 {:>6.1}  max {:>7.1} us, {missed} periods missed",

@@ -58,7 +58,7 @@ fn real_time(seconds: u64) {
 fn bare() {
     let handle = std::thread::spawn(|| {
         realtime::apply(&realtime::Request::control_thread());
-        bare_loop(Duration::from_secs(10))
+        bare_loop(Duration::from_secs(10), |_| {})
     });
     let (latency, missed) = handle.join().expect("a loop that only sleeps");
     line("bare, wake-up", &latency.quantiles_us());

@@ -202,7 +202,7 @@ pub fn kill_the_program(folder: &Path, kills: u64, chance: &mut Chance) -> Attac
 
 /// rig.toml for a rig in a box.
 fn box_rig(folder: &Path) {
-    let text = "[actuator]\nkind = \"serial\"\nport = \"pzt\"\nwatchdog_ms = 500.0\n\
+    let text = "[actuator]\nkind = \"serial\"\nport = \"pzt\"\nwatchdog_ms = 500\n\
          [camera]\nkind = \"socket\"\nsocket = \"camera.sock\"\n\
          [calibration]\npixel_um = 0.1\norigin_px = 127.5\nsign = 1.0\n\
          [limits]\nlow_um = 0.0\nhigh_um = 40.0\nslew_um_per_s = 20000.0\npark_um = 12.0\n\
@@ -214,6 +214,34 @@ fn emptied(folder: &Path) {
     let _ = std::fs::remove_dir_all(folder.join("runs"));
     for name in ["pzt", "camera.sock", "box.csv"] {
         let _ = std::fs::remove_file(folder.join(name));
+    }
+}
+
+const OVER_THE_LINE: &str = "track --target 0um --rig rig.toml --duration 2s --best-effort --json";
+
+/// A rig in a box that does nothing wrong holds a bead: what is attacked afterwards is a run, and no refusal.
+fn holds_before(folder: &Path, attacked: &mut Attacked) -> bool {
+    box_rig(folder);
+    emptied(folder);
+    let rig = RigInABox::start(folder, &[]);
+    let ended = run(folder, OVER_THE_LINE, "before the attack", attacked);
+    drop(rig);
+    let held = ended.as_ref().is_some_and(|ended| ended.code == Some(0));
+    if !held {
+        let why = ended.map_or_else(String::new, |ended| ended.out + &ended.err);
+        attacked
+            .broken
+            .push(format!("before the attack: no bead is held: {why}"));
+    }
+    held
+}
+
+/// How a try ended: by its exit code, and whether it came to a run.
+fn how(folder: &Path, code: Option<i32>) -> String {
+    let code = code.unwrap_or(-1);
+    match only_run(folder) {
+        Some(_) => format!("exit {code}"),
+        None => format!("exit {code} before a run"),
     }
 }
 
@@ -233,7 +261,9 @@ fn reads(folder: &Path, what: &str, attacked: &mut Attacked) {
 /// `kill -9` of the rig while a bead is held.
 pub fn kill_the_rig(folder: &Path, kills: u64, chance: &mut Chance) -> Attacked {
     let mut attacked = Attacked::default();
-    box_rig(folder);
+    if !holds_before(folder, &mut attacked) {
+        return attacked;
+    }
     for number in 0..kills {
         emptied(folder);
         let what = format!("rig killed, {number}");
@@ -250,7 +280,7 @@ pub fn kill_the_rig(folder: &Path, kills: u64, chance: &mut Chance) -> Attacked 
                 .broken
                 .push(format!("{what}: said that all went well"));
         }
-        attacked.end(format!("exit {:?}", ended.code.unwrap_or(-1)));
+        attacked.end(how(folder, ended.code));
         reads(folder, &what, &mut attacked);
     }
     attacked
@@ -353,7 +383,9 @@ pub fn damaged_inputs(folder: &Path, tries: u64, chance: &mut Chance) -> Attacke
 /// Boards whose link garbles and dies, behind a real line.
 pub fn hostile_boards(folder: &Path, tries: u64, chance: &mut Chance) -> Attacked {
     let mut attacked = Attacked::default();
-    box_rig(folder);
+    if !holds_before(folder, &mut attacked) {
+        return attacked;
+    }
     for number in 0..tries {
         emptied(folder);
         let what = format!("board {number}");
@@ -364,9 +396,8 @@ pub fn hostile_boards(folder: &Path, tries: u64, chance: &mut Chance) -> Attacke
         }
         let options: Vec<&str> = options.iter().map(String::as_str).collect();
         let rig = RigInABox::start(folder, &options);
-        let line = "track --target 0um --rig rig.toml --duration 2s --best-effort --json";
-        if let Some(ended) = run(folder, line, &what, &mut attacked) {
-            attacked.end(format!("exit {}", ended.code.unwrap_or(-1)));
+        if let Some(ended) = run(folder, OVER_THE_LINE, &what, &mut attacked) {
+            attacked.end(how(folder, ended.code));
         }
         let outside = |um: f64| !(-1e-6..=40.0 + 1e-6).contains(&um);
         if let Some(row) = rig.finish().iter().find(|row| outside(row.applied_um)) {

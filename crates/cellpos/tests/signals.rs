@@ -144,6 +144,74 @@ fn a_signal_in_the_first_moments_leaves_no_run_half_way() {
     }
 }
 
+#[test]
+fn a_circle_and_a_collection_that_are_interrupted_keep_what_is_recorded_and_say_how_to_go_on() {
+    let on_the_rig = "--rig rig.toml --frames off --seed 3 --effort 0.3 --max-effects 1 --json";
+    let lines = [
+        format!(
+            "circle {on_the_rig} --clock real --best-effort --rounds 0 --out a.toml --report a.html"
+        ),
+        format!(
+            "reconcile --model eq6 --collect more {on_the_rig} --clock real --best-effort --rounds 1 --out a.toml"
+        ),
+    ];
+    for line in lines {
+        let folder = tempfile::tempdir().unwrap();
+        std::fs::write(folder.path().join("rig.toml"), "[emulator]\nseed = 3\n").unwrap();
+        let child = start(folder.path(), &line);
+        let record = until("finished segment", || csv_below(folder.path()));
+        tell(&child, Signal::INT);
+        let (out, _) = end(child);
+        let text = String::from_utf8_lossy(&out.stderr).into_owned()
+            + &String::from_utf8_lossy(&out.stdout);
+        assert_eq!(out.status.code(), Some(1), "{line}\n{text}");
+        assert!(
+            text.contains("the operator ended the run"),
+            "{line}\n{text}"
+        );
+        let rows = std::fs::read_to_string(&record).unwrap();
+        assert!(rows.starts_with("time_s,pzt_um,bead_um"), "{line}");
+        assert!(
+            rows.lines().count() > 500,
+            "{line}: {}",
+            rows.lines().count()
+        );
+    }
+}
+
+/// A record with rows below a folder.
+fn csv_below(folder: &Path) -> Option<PathBuf> {
+    std::fs::read_dir(folder).ok()?.flatten().find_map(|entry| {
+        let path = entry.path();
+        if path.is_dir() {
+            return csv_below(&path);
+        }
+        let is_record = path.extension().is_some_and(|end| end == "csv");
+        (is_record && path.metadata().is_ok_and(|m| m.len() > 1000)).then_some(path)
+    })
+}
+
+#[test]
+fn a_script_of_sixteen_thousand_steps_starts_on_the_clock_of_the_machine() {
+    let folder = tempfile::tempdir().unwrap();
+    let step = "[[step]]\ndo = \"hold\"\nduration = \"10ms\"\n";
+    let text = format!("name = \"long\"\n{}", step.repeat(16_000));
+    std::fs::write(folder.path().join("long.toml"), text).unwrap();
+    let child = start(
+        folder.path(),
+        "run long.toml --clock real --frames off --best-effort --json",
+    );
+    until("closed loop", || {
+        let text = std::fs::read_to_string(in_runs(folder.path(), "events.jsonl")?).ok()?;
+        text.contains("\"stage\":\"running\"").then_some(())
+    });
+    tell(&child, Signal::INT);
+    let (out, json) = end(child);
+    assert_eq!(out.status.code(), Some(1), "{json}");
+    assert_eq!(json["stage"], "by the operator", "{json}");
+    assert_eq!(json["summary"]["safe_reason"], Value::Null, "{json}");
+}
+
 const IDENTIFY: &str = "identify --rig rig.toml --clock real --frames off --best-effort \
      --frequency 10Hz,20Hz,40Hz,80Hz --led-edges 0 --bootstrap 0 --json";
 

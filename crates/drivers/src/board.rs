@@ -108,6 +108,7 @@ pub struct BoardHost<P> {
     identity: Identity,
     session: u16,
     seq: u32,
+    first_seq: u32,
     newest: Option<ActuatorReport>,
 }
 
@@ -138,6 +139,7 @@ impl<P: Port> BoardHost<P> {
             },
             session: 0,
             seq: 0,
+            first_seq: 0,
             newest: None,
         };
         let hello = ToBoard::Hello {
@@ -156,6 +158,12 @@ impl<P: Port> BoardHost<P> {
         }
         host.identity = identity;
         Ok(host)
+    }
+
+    /// Numbers the commands of each session from `seq` on (0 unless said), to see what happens at the end of the numbers: they
+    /// wrap after seven weeks at 1 kHz.
+    pub fn count_from(&mut self, seq: u32) {
+        self.first_seq = seq;
     }
 
     /// What the board says of itself.
@@ -373,7 +381,7 @@ impl<P: Port> Actuator for BoardHost<P> {
             ..Arm::session(request.session)
         };
         self.session = request.session;
-        self.seq = 0;
+        self.seq = self.first_seq;
         self.ask(&ToBoard::Arm(arm), Request::Arm, |answer| match answer {
             ToHost::Ack {
                 request: Request::Arm,

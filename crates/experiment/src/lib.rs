@@ -18,6 +18,7 @@
 //! ```
 #![forbid(unsafe_code)]
 
+mod camera_rate;
 pub mod circle;
 pub mod collect;
 pub mod excitation;

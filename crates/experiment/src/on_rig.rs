@@ -3,6 +3,7 @@
 //!
 //! The loop freezes and thaws by its own rules when the bead is lost; a segment in which it did is measured again.
 
+use crate::camera_rate::{foreign_rate_hz, other_rate};
 use crate::identify::held_bead::{DelayTest, Setup, mean_grey};
 use cellpos_control::{ControllerFile, Pi};
 use cellpos_emulator::WorldConfig;
@@ -13,12 +14,13 @@ use cellpos_plant::Model;
 use cellpos_rig::clock::monotonic_ns;
 use cellpos_rig::{Camera, Clock, FrameBuffer};
 use cellpos_runtime::{
-    EndRule, Event, Grid, Life, ReferenceGenerator, ReferenceInput, ReferenceOutput, RunSink,
-    Stage, Statistics, TickFlags, TickRecord,
+    EndRule, Event, Grid, Life, ReferenceGenerator, ReferenceInput, ReferenceOutput, Request,
+    RunSink, Stage, Statistics, TickFlags, TickRecord,
 };
 use cellpos_session::rig_file::{ClockKind, Frames, RigFile};
 use cellpos_session::setup::{self, Prepared, ReferenceSpec};
 use cellpos_session::{EndKind, Ended, Failure, Options, Rig};
+use std::sync::Arc;
 use std::sync::mpsc::Sender;
 use std::time::Duration;
 
@@ -240,14 +242,21 @@ impl OnRig {
             now: None,
         })?;
         let (sender, received) = std::sync::mpsc::channel();
+        let period_ns = self.file.timing.period_ns();
         let running = rig
             .arm(&setup, core, Handing(sender), EndRule::default())?
             .start()?;
+        let operator = Arc::clone(running.operator());
         let mut ticks: Vec<TickRecord> = Vec::new();
         let mut ended = 0;
         let finished = running.wait_with(LOOK_EVERY, || {
             ticks.extend(received.try_iter());
             (listener.progress)(ticks.len());
+            if foreign_rate_hz(&ticks, period_ns).is_some() {
+                // Known after a second; nothing of it can be used.
+                operator.ask(Request::Park);
+                return;
+            }
             let now = ended_spans(&ticks, &schedule.spans);
             if now > ended {
                 ended = now;
@@ -255,6 +264,9 @@ impl OnRig {
             }
         })?;
         ticks.extend(received.try_iter());
+        if let Some(rate_hz) = foreign_rate_hz(&ticks, period_ns) {
+            return Err(other_rate(rate_hz, period_ns));
+        }
         let mut acquired = self.acquired(&ticks, plan, &schedule.spans);
         let (done, of) = (acquired.records.len(), schedule.spans.len());
         acquired.trouble = if done == of {

@@ -237,6 +237,11 @@ impl<R: ReferenceGenerator> Core<R> {
             .then(|| (self.state.index - self.state.running_since) as f64 * self.sample_s)
     }
 
+    /// Sequence number of the next tick.
+    pub(crate) fn next_seq(&self) -> u64 {
+        self.state.seq
+    }
+
     /// Who says where the bead is to be.
     pub fn reference(&self) -> &R {
         &self.reference
@@ -252,6 +257,14 @@ impl<R: ReferenceGenerator> Core<R> {
         let next =
             i64::try_from(self.state.index).map_or(i64::MAX, |index| index.saturating_add(1));
         self.state.grid.map(|grid| grid.opens_ns(next))
+    }
+
+    /// The same loop as after so many ticks.
+    #[cfg(test)]
+    pub(crate) fn counted_from(mut self, seq: u64) -> Self {
+        self.state.seq = seq;
+        self.state.counts.ticks = seq;
+        self
     }
 
     /// One tick. `None`, and nothing done: its time has not come ([`Core::opens_ns`]).
@@ -311,7 +324,8 @@ impl<R: ReferenceGenerator> Core<R> {
         let action = self.action(&output, tick.index);
         self.count(input, &output, tick.flags);
         let record = self.record(input, &output, &generated, tick.flags);
-        self.state.seq += 1;
+        // Wraps after half a thousand million years, and does not panic then.
+        self.state.seq = self.state.seq.wrapping_add(1);
         Some(TickOutput {
             action,
             record,

@@ -3,7 +3,7 @@
 //! Each grant (policy and priority, CPU, locked memory) is asked for, then read back. What was refused becomes a line
 //! of [`Conditions::degraded`], which is printed beside every timing figure.
 
-use crate::latency::{Latency, Quantiles};
+use crate::latency::Latency;
 use cellpos_rig::clock::{monotonic_ns, sleep_until_ns};
 use rustix::mm::{MlockAllFlags, mlockall};
 use rustix::thread::{CpuSet, sched_getaffinity, sched_setaffinity};
@@ -183,86 +183,23 @@ fn kernel() -> String {
     format!("{} {}", read("osrelease"), read("version"))
 }
 
-/// The verdict of `cellpos doctor`.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct Examination {
-    /// Whether the machine can be trusted with a 1 kHz loop.
-    pub fit: bool,
-    /// The verdict in a sentence.
-    pub verdict: String,
-    /// What was obtained.
-    pub conditions: Conditions,
-    /// Wake-ups measured at 1 kHz.
-    pub wakeups: u64,
-    /// From the due time to the wake-up, us.
-    pub wake_us: Quantiles,
-    /// Wake-ups later than one period: ticks that a loop would have missed.
-    pub missed: u64,
-}
-
-/// Runs a bare 1 kHz absolute-sleep loop for `duration` on a thread of its own under `request`.
-///
-/// Fit means that nothing asked for was refused, the 99.9th percentile of the wake-up latency is under 200 us (a fifth
-/// of the period, so that frame, fit and solve still find their place) and fewer than 1 wake-up in 1000 was missed.
-pub fn examine(request: &Request, duration: Duration) -> Examination {
-    let request = *request;
-    let measured = std::thread::Builder::new()
-        .name("cellpos-doctor".to_string())
-        .spawn(move || {
-            let conditions = apply(&request);
-            let (latency, missed) = bare_loop(duration);
-            (conditions, latency, missed)
-        })
-        .map(std::thread::JoinHandle::join);
-    let Ok(Ok((conditions, latency, missed))) = measured else {
-        return Examination {
-            fit: false,
-            verdict: "the measuring thread could not be run".to_string(),
-            conditions: Conditions::default(),
-            wakeups: 0,
-            wake_us: Quantiles::default(),
-            missed: 0,
-        };
-    };
-    let wake_us = latency.quantiles_us();
-    let quiet = wake_us.p999 < 200.0 && missed * 1000 <= latency.count();
-    let fit = conditions.degraded.is_empty() && quiet;
-    let verdict = match (conditions.degraded.is_empty(), quiet) {
-        (true, true) => "fit for a 1 kHz loop".to_string(),
-        (false, true) => "timing is good now, but not everything asked for was granted: a busy machine will stall the loop"
-            .to_string(),
-        (_, false) => format!(
-            "not fit for a 1 kHz loop: p99.9 of the wake-up latency is {:.0} us (200 us allowed), {missed} of {} wake-ups \
-             came a whole period late",
-            wake_us.p999,
-            latency.count()
-        ),
-    };
-    Examination {
-        fit,
-        verdict,
-        conditions,
-        wakeups: latency.count(),
-        wake_us,
-        missed,
-    }
-}
-
-/// A bare absolute-sleep loop at 1 kHz on the calling thread: its wake-up latencies and the periods it missed.
+/// A bare absolute-sleep loop at 1 kHz on the calling thread: its wake-up latencies and the periods it missed. `woken` hears
+/// how late each wake-up was, ns.
 ///
 /// It is the yardstick beside every timing of the real loop: stalls seen here are the machine's own.
-pub fn bare_loop(duration: Duration) -> (Latency, u64) {
+pub fn bare_loop(duration: Duration, mut woken: impl FnMut(u64)) -> (Latency, u64) {
     const PERIOD_NS: i64 = 1_000_000;
     let mut latency = Latency::new();
     let mut missed = 0;
     let start = monotonic_ns() + PERIOD_NS;
-    let ticks = (duration.as_nanos() / PERIOD_NS as u128) as i64;
+    let ticks = i64::try_from(duration.as_nanos() / PERIOD_NS as u128).unwrap_or(i64::MAX);
     let mut tick = 0;
     while tick < ticks {
         let due = start + tick * PERIOD_NS;
         sleep_until_ns(due);
         let late = (monotonic_ns() - due).max(0);
         latency.record(late as u64, tick as u64);
+        woken(late as u64);
         let skipped = late / PERIOD_NS;
         missed += skipped as u64;
         tick += 1 + skipped;
@@ -305,19 +242,6 @@ impl fmt::Display for Conditions {
     }
 }
 
-impl fmt::Display for Examination {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let q = &self.wake_us;
-        writeln!(f, "{}", self.verdict)?;
-        write!(f, "{}", self.conditions)?;
-        writeln!(
-            f,
-            "  wake-up       p50 {:.1} us, p99 {:.1} us, p99.9 {:.1} us, max {:.1} us over {} wake-ups, {} missed",
-            q.p50, q.p99, q.p999, q.max, self.wakeups, self.missed
-        )
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -345,13 +269,17 @@ mod tests {
 
     #[test]
     fn best_effort_is_always_shown_as_degraded() {
-        let examination = examine(&Request::best_effort(), Duration::from_millis(50));
-        assert!(!examination.fit);
-        assert!(
-            examination
-                .to_string()
-                .contains("DEGRADED      best effort")
-        );
-        assert!(examination.wakeups > 0);
+        let conditions = apply(&Request::best_effort());
+        let text = conditions.to_string();
+        assert!(text.contains("DEGRADED      best effort"), "{text}");
+    }
+
+    #[test]
+    fn the_bare_loop_wakes_once_a_period_or_counts_it_as_missed() {
+        let mut heard = 0;
+        let (latency, missed) = bare_loop(Duration::from_millis(50), |_| heard += 1);
+        assert_eq!(latency.count(), heard);
+        // The last wake-up may be late by more periods than were left.
+        assert!(heard > 0 && heard + missed >= 50, "{heard} {missed}");
     }
 }

@@ -84,7 +84,10 @@ impl<R: ReferenceGenerator> Replay<R> {
     /// Replays the next record.
     pub fn add(&mut self, record: &TickRecord) {
         self.outcome.ticks += 1;
-        let expected = self.previous.map_or(0, |previous| previous.seq + 1);
+        let expected = match self.previous {
+            Some(previous) => previous.seq.wrapping_add(1),
+            None => self.core.next_seq(),
+        };
         if self.outcome.gap.is_none() && record.seq != expected {
             self.outcome.gap = Some(Gap {
                 from_seq: expected,

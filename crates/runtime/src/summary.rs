@@ -4,6 +4,7 @@ use crate::core::Counts;
 use crate::latency::Quantiles;
 use crate::life::{Life, SafeReason};
 use crate::recorder::RecorderReport;
+use crate::reference::Stage;
 use crate::tick_record::{TickFlags, TickRecord};
 use crate::ticker::Account;
 use serde::Serialize;
@@ -36,6 +37,37 @@ impl Moments {
     }
 }
 
+/// How far a reference's own time went while the clock went on.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+struct PlanWatch {
+    plan_ns: i64,
+    clock_ns: i64,
+}
+
+impl PlanWatch {
+    /// What is shorter says nothing: plan and clock may be a period apart at any time, ns.
+    const SHORTEST_NS: i64 = 1_000_000_000;
+    /// Between two records the operator may have skipped a step, which leaves out its time, ns.
+    const SKIPPED_NS: i64 = 50_000_000;
+
+    fn add(&mut self, before: &TickRecord, now: &TickRecord) {
+        let by_the_plan = |r: &TickRecord| {
+            r.plan_ns >= 0 && r.stage == Stage::Running as u8 && !r.flags.has(TickFlags::FREEZE)
+        };
+        let (plan_ns, clock_ns) = (now.plan_ns - before.plan_ns, now.time_ns - before.time_ns);
+        if by_the_plan(before) && by_the_plan(now) && (plan_ns - clock_ns).abs() < Self::SKIPPED_NS
+        {
+            self.plan_ns = self.plan_ns.saturating_add(plan_ns);
+            self.clock_ns = self.clock_ns.saturating_add(clock_ns);
+        }
+    }
+
+    fn off_percent(&self) -> Option<f64> {
+        (self.clock_ns >= Self::SHORTEST_NS)
+            .then(|| 100.0 * (self.plan_ns as f64 / self.clock_ns as f64 - 1.0))
+    }
+}
+
 /// How long after closing the loop errors are counted from, s, unless the run says otherwise.
 pub const SETTLED_AFTER_S: f64 = 2.0;
 
@@ -49,6 +81,7 @@ pub struct Statistics {
     truth: Moments,
     variance: Moments,
     step: Option<StepWatch>,
+    plan: PlanWatch,
     last: Option<TickRecord>,
     /// Time (ns) and reference (um) of the last ticks, newest first.
     targets: [(i64, f64); TARGETS],
@@ -112,6 +145,7 @@ impl Statistics {
             truth: Moments::default(),
             variance: Moments::default(),
             step: None,
+            plan: PlanWatch::default(),
             last: None,
             targets: [(i64::MIN, f64::NAN); TARGETS],
         }
@@ -119,6 +153,9 @@ impl Statistics {
 
     /// Takes one record.
     pub fn add(&mut self, record: &TickRecord) {
+        if let Some(before) = &self.last {
+            self.plan.add(before, record);
+        }
         self.targets.copy_within(0..TARGETS - 1, 1);
         self.targets[0] = (record.time_ns, record.target_um);
         // A bead that is frozen is not being held on its reference: what it wanders is no error of the loop. The same way
@@ -180,6 +217,11 @@ impl Statistics {
         self.last.as_ref()
     }
 
+    /// How far the plan's time is off the clock's so far, percent; `None` before a second by a plan.
+    pub fn plan_off_percent(&self) -> Option<f64> {
+        self.plan.off_percent()
+    }
+
     /// Localisation noise as vision states it, um RMS; `None` before the first position.
     pub fn fix_noise_um(&self) -> Option<f64> {
         (self.variance.n > 0).then(|| (self.variance.sum / self.variance.n as f64).max(0.0).sqrt())
@@ -225,6 +267,13 @@ impl Statistics {
     }
 }
 
+/// The sentence of a plan that is off the clock by so much.
+pub fn plan_warning(percent: f64) -> String {
+    format!(
+        "the plan's time is {percent:+.1} % off the clock's: frequencies and durations of this run are not those of its script"
+    )
+}
+
 /// How a run ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "kebab-case")]
@@ -251,6 +300,8 @@ pub struct Summary {
     pub safe_reason: Option<SafeReason>,
     /// From the first tick to the last, s.
     pub duration_s: f64,
+    /// How far the time of the plan (script) is off the clock's, percent; `None` without a plan, or less than a second of it.
+    pub plan_off_percent: Option<f64>,
     /// Losses and limits by kind.
     #[serde(flatten)]
     pub counts: Counts,
@@ -283,6 +334,16 @@ pub struct Summary {
 }
 
 impl Summary {
+    /// Plan and clock may differ by so much before every output says so, percent.
+    pub const PLAN_OFF_PERCENT: f64 = 1.0;
+
+    /// Says so in a sentence where plan and clock differ by more than they may.
+    pub fn plan_warning(&self) -> Option<String> {
+        self.plan_off_percent
+            .filter(|percent| percent.is_nan() || percent.abs() > Self::PLAN_OFF_PERCENT)
+            .map(plan_warning)
+    }
+
     /// The same figures with the records counted as lost that the recorder could not hand over.
     #[must_use]
     pub fn with_unkept(mut self, recorder: &RecorderReport) -> Self {
@@ -307,6 +368,7 @@ impl Summary {
             end,
             safe_reason,
             duration_s: (last_ns as f64 + period_us * 1e3) * 1e-9,
+            plan_off_percent: statistics.plan_off_percent(),
             counts,
             records_lost: account.records_lost,
             events_lost: account.events_lost,
@@ -323,5 +385,35 @@ impl Summary {
             exposure_to_command_us: account.exposure_to_command.quantiles_us(),
             board_spacing_us: account.board_spacing.quantiles_us(),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Ten seconds in ticks of `tick_ns` of which each takes the plan a millisecond on, with a second's skip in between.
+    fn off_percent(tick_ns: i64) -> Option<f64> {
+        let mut statistics = Statistics::default();
+        for k in 0..10_000 {
+            let mut record = TickRecord::unknown();
+            record.life = Life::Running as u8;
+            record.stage = Stage::Running as u8;
+            record.time_ns = k * tick_ns;
+            record.plan_ns = (k + if k > 5000 { 1000 } else { 0 }) * 1_000_000;
+            statistics.add(&record);
+        }
+        statistics.plan_off_percent()
+    }
+
+    #[test]
+    fn a_plan_that_runs_by_the_number_of_ticks_is_off_the_clock_and_said_to_be() {
+        assert!(off_percent(1_000_000).is_some_and(|percent| percent.abs() < 1e-9));
+        let doubled = off_percent(500_000).expect("seconds of plan");
+        assert!((doubled - 100.0).abs() < 1e-6, "{doubled}");
+        let slow = off_percent(1_020_000).expect("seconds of plan");
+        assert!((slow + 1.96).abs() < 0.01, "{slow}");
+        assert!(plan_warning(slow).contains("-2.0 %"));
+        assert_eq!(Statistics::default().plan_off_percent(), None);
     }
 }

@@ -177,6 +177,7 @@ pub fn finish(
     end.rows_lost = summary.records_lost;
     end.events_lost = summary.events_lost;
     let done = writer.finish(end);
+    warnings.extend(summary.plan_warning());
     if summary.records_lost > 0 {
         warnings.push(format!(
             "{} rows were lost on the way to the recorder",

@@ -323,3 +323,38 @@ fn the_operator_of_a_rig_stops_the_next_run_on_it_and_not_the_one_after() {
     }
     assert_eq!(kinds, [EndKind::Operator, EndKind::Done]);
 }
+
+/// A sink that stands for half a second in each five hundredth record, as a disk does that takes so long for a sync.
+struct SlowDisk {
+    records: u64,
+}
+
+impl RunSink for SlowDisk {
+    fn tick(&mut self, _: &TickRecord) {
+        if self.records.is_multiple_of(500) {
+            std::thread::sleep(Duration::from_millis(500));
+        }
+        self.records += 1;
+    }
+    fn event(&mut self, _: &Event) {}
+    fn progress(&mut self, _: &Statistics) {}
+}
+
+#[test]
+fn a_disk_of_half_a_second_a_write_starts_and_ends_as_asked() {
+    let (mut rig, log) = rig(ClockKind::Real, |_| {}, |_| {});
+    let setup = set_up(&mut rig);
+    let core = setup.core().expect("a loop");
+    let sink = SlowDisk { records: 0 };
+    let armed = rig.arm(&setup, core, sink, ticks(2000));
+    let armed = armed.unwrap_or_else(|not| panic!("{}", not.failure.text()));
+    let finished = armed
+        .start()
+        .and_then(cellpos_session::Running::wait)
+        .unwrap_or_else(|failure| panic!("{}", failure.text()));
+    assert_eq!(finished.ended.kind, EndKind::Done, "{}", finished.ended);
+    let summary = &finished.summary;
+    assert_eq!(summary.records_lost, 0, "{summary:?}");
+    assert_eq!(finished.sink.records, summary.counts.ticks, "{summary:?}");
+    assert_eq!(told(&log).last(), Some(&"disarm"));
+}

@@ -13,6 +13,8 @@ use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
 use crate::output;
 use cellpos_record::{CYCLES_CSV, Lost, RunEnd, RunMeta, RunReader};
 use cellpos_report::{Axis, Column, Figure, Panel, Report, Series, Status, Table};
+use cellpos_runtime::Summary;
+use cellpos_runtime::summary::plan_warning;
 use cellpos_script::read_cycles;
 pub use cycles::with_interval;
 use std::collections::BTreeMap;
@@ -253,6 +255,17 @@ fn head(page: &mut Report, sessions: &[Session], ticks: &Ticks) {
     if rows + events > 0 {
         let text = format!("{rows} rows and {events} events could not be written.");
         page.note(Status::Warning, &text);
+    }
+    for end in sessions.iter().filter_map(end) {
+        let percent = end
+            .summary
+            .get("plan_off_percent")
+            .and_then(toml::Value::as_float);
+        let most = Summary::PLAN_OFF_PERCENT;
+        if let Some(percent) = percent.filter(|percent| percent.is_nan() || percent.abs() > most) {
+            let text = format!("In this run {}.", plan_warning(percent));
+            page.note(Status::Warning, &text);
+        }
     }
     let rows = [
         ("ticks", ticks.rows.to_string()),

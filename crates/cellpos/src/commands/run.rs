@@ -293,6 +293,9 @@ fn allowed(script: &Script, setup: &Prepared, rig: &Rig) -> Result<Check, Failur
     Ok(result)
 }
 
+/// What a run takes besides its plan, at most: arming, and the way to where the plan begins, s.
+const BEFORE_S: f64 = 30.0;
+
 fn start(args: &Args, ready: Ready) -> CommandResult {
     let Ready {
         file,
@@ -339,7 +342,7 @@ fn start(args: &Args, ready: Ready) -> CommandResult {
     meta.config
         .insert("session".to_string(), toml::Value::Table(table));
     let root = home.as_ref().map_or(args.runs.as_path(), |(_, root)| root);
-    let ticks = plan.total_s() * 1e6 / rig.file().timing.period_us;
+    let ticks = (plan.longest_s() + BEFORE_S) * 1e6 / rig.file().timing.period_us;
     connect::room(root, Some(ticks as u64), &meta)?;
     let writer = RunWriter::create(root, meta).map_err(Failure::failed)?;
     let folder = home.map_or_else(|| writer.folder().to_owned(), |(folder, _)| folder);

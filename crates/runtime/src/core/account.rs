@@ -82,7 +82,7 @@ impl<R: ReferenceGenerator> Core<R> {
     /// Adds the tick to the counts.
     pub(super) fn count(&mut self, input: &TickInput, output: &LoopOutput, flags: TickFlags) {
         let counts = &mut self.state.counts;
-        counts.ticks += 1;
+        counts.ticks = counts.ticks.wrapping_add(1);
         let frames = &input.frames;
         for (counter, more) in [
             (&mut counts.superseded, frames.superseded),

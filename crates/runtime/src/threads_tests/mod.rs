@@ -92,7 +92,8 @@ fn check(ran: &Ran, faults: &Faults) {
     };
     let kept = ran.records.len() as u64 + ran.report.records_unkept + end.account.records_lost;
     assert_eq!(
-        kept, end.counts.ticks,
+        kept,
+        end.counts.ticks.wrapping_sub(faults.first.0),
         "every tick is recorded or counted as lost"
     );
     if let Some((from_ns, until_ns)) = faults.hangs
@@ -139,7 +140,8 @@ fn replays(ran: &Ran) {
         slow_tick: 0.0,
         slow_tick_ns: 0,
     };
-    let mut replay = Replay::new(core(reference, ran.stood_um));
+    let first = ran.records.first().map_or(0, |record| record.seq);
+    let mut replay = Replay::new(core(reference, ran.stood_um).counted_from(first));
     for record in &ran.records {
         replay.add(record);
     }
@@ -271,6 +273,29 @@ fn each_thread_that_dies_ends_the_run_by_its_name() {
         };
         assert_eq!(reason, expected, "{thread:?}");
         assert_eq!(ran.io_error.is_some(), thread == Thread::Line, "{thread:?}");
+    }
+}
+
+#[test]
+fn numbers_that_run_past_their_ends_disturb_nothing_and_replay_to_the_bit() {
+    // Ticks past 32 and 64 bits, commands past the 32 bits of the wire, frames past 32 bits.
+    let frames = u64::from(u32::MAX) - 1500;
+    for seq in [u64::from(u32::MAX) - 1500, u64::MAX - 1500] {
+        let faults = Faults {
+            first: (seq, frames, u32::MAX - 1500),
+            lost: 0.01,
+            doubled: 0.1,
+            ..Faults::default()
+        };
+        let ran = run(17, 4000, &faults, &[]);
+        check(&ran, &faults);
+        let end = ran.end.as_ref().expect("control lives");
+        assert_eq!((end.end, end.safe_reason), (End::Duration, None));
+        let (first, last) = (ran.records.first(), ran.records.last());
+        let passed = last.map(|r| r.seq.wrapping_sub(first.map_or(0, |r| r.seq)));
+        assert_eq!(passed, Some(ran.records.len() as u64 - 1));
+        assert!(ran.records.len() > 3900 && end.counts.frames_lost < 100);
+        replays(&ran);
     }
 }
 

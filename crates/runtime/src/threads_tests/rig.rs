@@ -41,6 +41,8 @@ pub(super) struct Faults {
     pub(super) stale: f64,
     pub(super) future: f64,
     /// The camera counts anew at this frame.
+    /// Number of the first tick, of the first frame and of the first command.
+    pub(super) first: (u64, u64, u32),
     pub(super) restarts_at: Option<u64>,
     pub(super) vision_ns: (i64, i64),
     /// Probability that a thread is not run for a while, and how long, ns.
@@ -75,6 +77,7 @@ impl Default for Faults {
             jitter_ns: (0, 0),
             stale: 0.0,
             future: 0.0,
+            first: (0, 70_000, 0),
             restarts_at: None,
             vision_ns: (100_000, 150_000),
             stall: 0.0,
@@ -250,7 +253,7 @@ impl Source {
             let mut m = Measurement {
                 frame_id: match self.faults.restarts_at {
                     Some(first) if n >= first => n - first,
-                    _ => 70_000 + n,
+                    _ => self.faults.first.1.wrapping_add(n),
                 },
                 mid_exposure_ns: fix.info.mid_exposure_ns,
                 ready_ns: 0,

@@ -188,6 +188,7 @@ pub(super) fn armed(seed: u64, faults: &Faults, clock: &Clock) -> (Shelf, HostBo
         clock: clock.clone(),
     };
     let mut board = BoardHost::connect(line, clock.clone()).expect("a board");
+    board.count_from(faults.first.2);
     let limits = file().limits;
     let armed = board
         .arm(&ArmRequest {
@@ -221,7 +222,7 @@ pub(super) fn run(seed: u64, periods: u64, faults: &Faults, asks: &[(i64, Reques
         records: 4096,
         ..RingSizes::default()
     };
-    let core = core(reference, stands_um);
+    let core = core(reference, stands_um).counted_from(faults.first.0);
     let (ticker, ends) = Ticker::new(core, control_clock.clone(), start_ns, sizes);
     let (seen_in, seen) = RingBuffer::new(1024);
     let mut sink = Sink {

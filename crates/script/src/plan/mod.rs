@@ -171,6 +171,15 @@ impl Plan {
         self.duration_s
     }
 
+    /// Longest duration: each wait takes as long as it may, s.
+    pub fn longest_s(&self) -> f64 {
+        let waits = self.segments.iter().map(|segment| match segment.motion {
+            Motion::Wait { timeout_s, .. } => timeout_s,
+            _ => 0.0,
+        });
+        self.duration_s + waits.sum::<f64>()
+    }
+
     /// Position at the start, um.
     pub fn start_um(&self) -> f64 {
         self.start_um

@@ -1,12 +1,11 @@
 //! A bare loop at 1 kHz for as long as wanted, and what ran beside it when it was late.
 
-use cellpos_rig::clock::{monotonic_ns, sleep_until_ns};
-use cellpos_runtime::latency::{Latency, Quantiles};
-use cellpos_runtime::realtime::{self, Conditions, Request};
+use cellpos_runtime::latency::Quantiles;
+use cellpos_runtime::realtime::{self, Conditions, Request, bare_loop};
 use serde::Serialize;
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 /// A wake-up later than this is one to be explained, ns: a fifth of the period.
 pub const LATE_NS: u64 = 200_000;
@@ -53,8 +52,13 @@ pub fn soak(request: Request, duration: Duration, why: bool) -> std::io::Result<
             .name("cellpos-doctor".to_string())
             .spawn_scoped(scope, || {
                 let conditions = realtime::apply(&request);
-                let (latency, missed, seconds) = bare_loop(duration, &late);
-                (conditions, latency, missed, seconds)
+                let start = Instant::now();
+                let (latency, missed) = bare_loop(duration, |late_ns| {
+                    if late_ns > LATE_NS {
+                        late.fetch_add(1, Ordering::Relaxed);
+                    }
+                });
+                (conditions, latency, missed, start.elapsed().as_secs_f64())
             });
         let measured = measured.map(|thread| thread.join());
         done.store(true, Ordering::Relaxed);
@@ -72,28 +76,6 @@ pub fn soak(request: Request, duration: Duration, why: bool) -> std::io::Result<
             suspects: suspects.unwrap_or_default(),
         })
     })
-}
-
-fn bare_loop(duration: Duration, late: &AtomicU64) -> (Latency, u64, f64) {
-    const PERIOD_NS: i64 = 1_000_000;
-    let mut latency = Latency::new();
-    let mut missed = 0;
-    let start = monotonic_ns() + PERIOD_NS;
-    let ticks = i64::try_from(duration.as_nanos() / PERIOD_NS as u128).unwrap_or(i64::MAX);
-    let mut tick = 0;
-    while tick < ticks {
-        let due = start + tick * PERIOD_NS;
-        sleep_until_ns(due);
-        let after = (monotonic_ns() - due).max(0);
-        latency.record(after as u64, tick as u64);
-        if after as u64 > LATE_NS {
-            late.fetch_add(1, Ordering::Relaxed);
-        }
-        let skipped = after / PERIOD_NS;
-        missed += skipped as u64;
-        tick += 1 + skipped;
-    }
-    (latency, missed, (monotonic_ns() - start) as f64 * 1e-9)
 }
 
 /// Processor time of every process (ms) and number of every interrupt so far, by name.

@@ -1,0 +1,95 @@
+//! Whether the camera gives a frame in each period of the loop.
+//!
+//! A record has a row for each frame, and its excitation is played by the loop's clock: with a camera of another rate every
+//! frequency of it would be wrong.
+
+use cellpos_runtime::{Life, TickFlags, TickRecord};
+use cellpos_session::Failure;
+
+/// Frames in a window: the stamps of two frames may be off by a tenth of a period each.
+const WINDOW: u64 = 500;
+/// Windows that tell: in one of them the camera may have restarted, and not have counted what it lost.
+const WINDOWS: usize = 3;
+/// What is agreed to: a crystal is off by 0.01 %.
+const AGREES: f64 = 1e-3;
+
+/// Frames per second by the stamps of the camera, where that is not one in each period of the loop; `None` where it is, and
+/// while that is not known.
+pub(crate) fn foreign_rate_hz(ticks: &[TickRecord], period_ns: i64) -> Option<f64> {
+    let mut from: Option<(u64, i64)> = None;
+    let mut spacings_ns = Vec::new();
+    let seen = |t: &&TickRecord| {
+        t.life == Life::Running as u8
+            && !t.flags.has(TickFlags::TIMER)
+            && !t.flags.has(TickFlags::STALE)
+    };
+    for tick in ticks.iter().filter(seen) {
+        let (id, ns) = *from.get_or_insert((tick.frame_id, tick.mid_exposure_ns));
+        let frames = tick.frame_id.saturating_sub(id);
+        if frames >= WINDOW {
+            spacings_ns.push((tick.mid_exposure_ns - ns) as f64 / frames as f64);
+            from = Some((tick.frame_id, tick.mid_exposure_ns));
+        }
+    }
+    if spacings_ns.len() < WINDOWS {
+        return None;
+    }
+    spacings_ns.sort_unstable_by(f64::total_cmp);
+    let spacing_ns = spacings_ns[spacings_ns.len() / 2];
+    let off = spacing_ns / period_ns as f64 - 1.0;
+    (off.abs() > AGREES).then(|| 1e9 / spacing_ns)
+}
+
+/// That in a sentence, and what to do.
+pub(crate) fn other_rate(rate_hz: f64, period_ns: i64) -> Failure {
+    Failure::bad_input(
+        format!(
+            "the camera gives {rate_hz:.1} frames/s and the loop runs at {:.1} /s: every frequency of the record would be wrong",
+            1e9 / period_ns as f64
+        ),
+        "set the camera's rate, or period_us in [timing] of rig.toml, so that both are the same",
+    )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn ticks(rate_hz: f64, restarts: bool) -> Vec<TickRecord> {
+        (0..4000)
+            .map(|k| {
+                let frame = (k as f64 * rate_hz * 1e-3).floor();
+                let mut tick = TickRecord::unknown();
+                tick.life = Life::Running as u8;
+                tick.time_ns = k * 1_000_000;
+                tick.frame_id = frame as u64;
+                tick.mid_exposure_ns = (frame / rate_hz * 1e9) as i64 - 2_000_000;
+                if restarts && k > 900 {
+                    // Lost, and not counted.
+                    tick.mid_exposure_ns += 300_000_000;
+                }
+                tick
+            })
+            .collect()
+    }
+
+    #[test]
+    fn a_camera_of_another_rate_is_told_from_one_that_drifts_or_restarts() {
+        let rate_hz = |rate_hz, restarts| foreign_rate_hz(&ticks(rate_hz, restarts), 1_000_000);
+        for same_hz in [999.9, 1000.0, 1000.1] {
+            assert_eq!(rate_hz(same_hz, false), None, "{same_hz}");
+        }
+        assert_eq!(rate_hz(1000.0, true), None);
+        for other_hz in [500.0, 990.0, 1010.0, 2000.0] {
+            let found = rate_hz(other_hz, false);
+            assert!(
+                found.is_some_and(|hz| (hz / other_hz - 1.0).abs() < 1e-3),
+                "{other_hz}: {found:?}"
+            );
+        }
+        assert_eq!(
+            foreign_rate_hz(&ticks(500.0, false)[..1000], 1_000_000),
+            None
+        );
+    }
+}
