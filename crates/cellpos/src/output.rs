@@ -1,7 +1,7 @@
 //! Files that a command writes: looked at before the work begins, never written over unasked; and what holds for the whole
 //! command line.
 
-use crate::outcome::Failure;
+use cellpos_session::Failure;
 use indicatif::{ProgressDrawTarget, TermLike};
 use std::io::IsTerminal;
 use std::path::{Path, PathBuf};

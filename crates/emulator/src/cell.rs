@@ -5,7 +5,7 @@
 //! linearly up to the last passage of [`CellConfig::fatigue_passages`]. In the constriction the same PZT displacement
 //! moves it faster. Not here: friction at the wall and adhesion.
 
-use crate::config::WorldError;
+use crate::error::{WorldError, within};
 use crate::random::Gaussian;
 use serde::{Deserialize, Serialize};
 use std::f64::consts::FRAC_PI_4;
@@ -69,13 +69,6 @@ impl Default for CellConfig {
 
 impl CellConfig {
     pub(crate) fn validate(&self) -> Result<(), WorldError> {
-        let within = |key, value: f64, low: f64, high: f64, must| {
-            if (low..=high).contains(&value) {
-                Ok(())
-            } else {
-                Err(WorldError::Value { key, value, must })
-            }
-        };
         within(
             "cell.entry_um",
             self.entry_um,

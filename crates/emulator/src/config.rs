@@ -1,6 +1,7 @@
 //! How the emulated world is set up.
 
 use crate::cell::CellConfig;
+use crate::error::{WorldError, within};
 use crate::faults::Faults;
 use serde::{Deserialize, Serialize};
 
@@ -84,24 +85,6 @@ impl Default for WorldConfig {
     }
 }
 
-/// Why there is no such world.
-#[derive(Debug, Clone, PartialEq, thiserror::Error)]
-pub enum WorldError {
-    /// A value that cannot be.
-    #[error("[emulator] `{key}` is {value}, must be {must}")]
-    Value {
-        /// Key.
-        key: &'static str,
-        /// Value found.
-        value: f64,
-        /// What would be right, with the unit.
-        must: &'static str,
-    },
-    /// The model cannot be run.
-    #[error("[emulator] `model`: {0}")]
-    Model(String),
-}
-
 impl WorldConfig {
     /// Column of position 0: the middle of the frame, px (pixel centres at whole numbers).
     pub fn origin_x_px(&self) -> f64 {
@@ -138,13 +121,16 @@ impl WorldConfig {
     /// # Errors
     /// [`WorldError::Value`] for the first value that cannot be.
     pub fn validate(&self) -> Result<(), WorldError> {
-        let within = |key, value: f64, low: f64, high: f64, must| {
-            if (low..=high).contains(&value) {
-                Ok(())
-            } else {
-                Err(WorldError::Value { key, value, must })
-            }
-        };
+        self.validate_motion()?;
+        self.validate_frame()?;
+        self.validate_picture()?;
+        if let Some(cell) = &self.cell {
+            self.validate_cell(cell)?;
+        }
+        self.faults.validate()
+    }
+
+    fn validate_motion(&self) -> Result<(), WorldError> {
         within(
             "neutral_um",
             self.neutral_um,
@@ -167,6 +153,10 @@ impl WorldConfig {
             "-10000..10000 um/s",
         )?;
         within("start_um", self.start_um, -1e4, 1e4, "-10000..10000 um")?;
+        Ok(())
+    }
+
+    fn validate_frame(&self) -> Result<(), WorldError> {
         within(
             "width_px",
             f64::from(self.width_px),
@@ -207,6 +197,10 @@ impl WorldConfig {
             100.0 * period_ms,
             "half the exposure to 100 frame periods, in ms",
         )?;
+        Ok(())
+    }
+
+    fn validate_picture(&self) -> Result<(), WorldError> {
         within(
             "bead_radius_um",
             self.bead_radius_um,
@@ -248,28 +242,30 @@ impl WorldConfig {
         if let Some(ms) = self.new_bead_after_ms {
             within("new_bead_after_ms", ms, 0.0, 1e9, "0 or more ms")?;
         }
-        if let Some(cell) = &self.cell {
-            cell.validate()?;
-            let across_um = f64::from(self.height_px) * self.pixel_um;
-            let along_um = f64::from(self.width_px) * self.pixel_um;
-            let room_um = across_um - 2.0 * self.lateral_um - 2.0 * self.pixel_um;
-            within(
-                "cell.rest_um",
-                cell.rest_um,
-                0.1,
-                room_um,
-                "less than the frame's height: height_px * pixel_um, less lateral_um and a pixel on either side",
-            )?;
-            let most_um = cell.rest_um * cell.stretch_first.max(cell.stretch_last);
-            within(
-                "cell: rest_um times the larger stretch",
-                most_um,
-                0.1,
-                along_um,
-                "less than the frame's width: width_px * pixel_um",
-            )?;
-        }
-        self.faults.validate()
+        Ok(())
+    }
+
+    fn validate_cell(&self, cell: &CellConfig) -> Result<(), WorldError> {
+        cell.validate()?;
+        let across_um = f64::from(self.height_px) * self.pixel_um;
+        let along_um = f64::from(self.width_px) * self.pixel_um;
+        let room_um = across_um - 2.0 * self.lateral_um - 2.0 * self.pixel_um;
+        within(
+            "cell.rest_um",
+            cell.rest_um,
+            0.1,
+            room_um,
+            "less than the frame's height: height_px * pixel_um, less lateral_um and a pixel on either side",
+        )?;
+        let most_um = cell.rest_um * cell.stretch_first.max(cell.stretch_last);
+        within(
+            "cell: rest_um times the larger stretch",
+            most_um,
+            0.1,
+            along_um,
+            "less than the frame's width: width_px * pixel_um",
+        )?;
+        Ok(())
     }
 
     /// Half of the frame's width, um.

@@ -1,6 +1,6 @@
 //! What goes wrong, at random or at a given time.
 
-use crate::config::WorldError;
+use crate::error::WorldError;
 use serde::{Deserialize, Serialize};
 use std::ops::Range;
 

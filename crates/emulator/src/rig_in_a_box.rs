@@ -5,7 +5,8 @@
 //! is deterministic to the bit, and the real one. Not a driver: ports, sockets and sleeping are the caller's.
 
 use crate::board_config::{BoardConfig, BoardConfigError};
-use crate::config::{WorldConfig, WorldError};
+use crate::config::WorldConfig;
+use crate::error::WorldError;
 use crate::faults::FaultKind;
 use crate::random::Gaussian;
 use crate::world::World;

@@ -2,7 +2,8 @@
 
 use crate::camera::{Camera, EXPOSURE_STEPS, Exposure, FrameInfo, PositionFix, Sample};
 use crate::cell::Cell;
-use crate::config::{WorldConfig, WorldError};
+use crate::config::WorldConfig;
+use crate::error::WorldError;
 use crate::faults::FaultKind;
 use crate::random::Gaussian;
 use crate::render::{Renderer, localisation_bound_um, mean_between};

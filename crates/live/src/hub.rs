@@ -1,7 +1,7 @@
 //! From the rings to every client, and what a new client gets first.
 
-use crate::client::Queue;
 use crate::feed::{FeedHub, Line};
+use crate::queue::Queue;
 use crate::row::{PICTURE_HEAD, ROW_BYTES, Row};
 use crate::state::{CycleRow, EventLine, State};
 use serde::Serialize;

@@ -36,8 +36,10 @@ mod feed;
 mod http;
 mod hub;
 mod page;
+mod queue;
 mod row;
 mod server;
+mod shared;
 mod state;
 
 pub use access::{Role, Secrets};

@@ -1,21 +1,20 @@
 //! The server: accepts, checks, answers.
 
 use crate::access::{Role, Secrets, is_our_host, is_our_origin};
-use crate::client::{self, Queue};
+use crate::client;
 use crate::command::Command;
 use crate::feed::FeedHub;
 use crate::http::{self, RequestError};
 use crate::hub::{Clients, Hub};
 use crate::page;
-use crate::state::Hello;
-use serde::Serialize;
+use crate::queue::Queue;
+use crate::shared::Shared;
 use std::fmt;
 use std::net::{SocketAddr, TcpListener, TcpStream};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
-use tungstenite::Message;
 
 /// Most connections at a time.
 pub const MOST_CLIENTS: usize = 32;
@@ -77,55 +76,6 @@ pub enum LiveError {
     /// No random numbers, or no thread.
     #[error("the page cannot be served")]
     System(#[from] std::io::Error),
-}
-
-/// What the server's threads share.
-pub(crate) struct Shared {
-    secrets: Secrets,
-    address: SocketAddr,
-    hello: Hello,
-    /// The hub sends what has come and ends; clients go on until `over`.
-    ending: AtomicBool,
-    over: AtomicBool,
-    clients: Clients,
-    connections: AtomicUsize,
-    command: Box<dyn Fn(Command) + Send + Sync>,
-    on_thread: Option<Arc<dyn Fn() + Send + Sync>>,
-}
-
-#[derive(Serialize)]
-struct Greeting<'a> {
-    hello: &'a Hello,
-    operator: bool,
-}
-
-impl Shared {
-    pub(crate) fn is_over(&self) -> bool {
-        self.over.load(Ordering::Acquire)
-    }
-
-    pub(crate) fn view_um(&self) -> [f64; 2] {
-        self.hello.view_um
-    }
-
-    pub(crate) fn ask(&self, command: Command) {
-        (self.command)(command);
-    }
-
-    /// The first message of a client.
-    pub(crate) fn hello(&self, role: Role) -> Message {
-        let greeting = Greeting {
-            hello: &self.hello,
-            operator: role == Role::Operator,
-        };
-        Message::text(serde_json::to_string(&greeting).unwrap_or_default())
-    }
-
-    fn enter_thread(&self) {
-        if let Some(on_thread) = &self.on_thread {
-            on_thread();
-        }
-    }
 }
 
 /// A page that is being served; dropping it ends its threads.

@@ -3,7 +3,6 @@
 
 use crate::effects::{Action, Effect, Place};
 use crate::error::{ModelError, ModelProblem};
-use crate::model_file;
 use crate::transfer::TransferFunction;
 use cellpos_units::Hertz;
 use nalgebra::Complex;
@@ -117,20 +116,6 @@ impl Model {
             }),
         })?;
         Self::from_toml_str(&text, &file)
-    }
-
-    /// Reads a model from the text of a TOML file; `file_name` is for the messages only.
-    ///
-    /// # Errors
-    /// Text that is not TOML, unknown keys, missing keys, wrong types, numbers that are not finite or out of range,
-    /// coefficients that make no plant: each with line, column and what would be right.
-    pub fn from_toml_str(text: &str, file_name: &str) -> Result<Self, ModelError> {
-        model_file::read(text, file_name)
-    }
-
-    /// The model as the text of a TOML file. Reading it back gives the same model to the bit.
-    pub fn to_toml_string(&self) -> String {
-        model_file::write(self)
     }
 
     /// The frequency response of all that is linear: plant, linear effects, delay and exposure, from command to record.

@@ -8,52 +8,30 @@
 //! Not for identifying a plant from nothing (that is `cellpos-ident`), and not for files: records come as columns.
 #![forbid(unsafe_code)]
 
-mod actuator;
-mod assemble;
-mod augment;
-mod battery;
-mod catalogue;
 mod data;
 mod dot;
 mod error;
-mod evaluate;
 mod fit;
-mod floor;
-mod frames;
-mod guard;
-mod held_out;
-mod judge;
-mod linear;
-mod lines;
-mod locking;
-mod map;
-mod names;
-mod noise;
 mod parallel;
-mod pixel;
-mod predict;
 mod problem;
 mod report;
-mod result;
-mod screen;
 mod search;
-mod significance;
-mod split;
+mod simulate;
 mod thresholds;
 mod verdict;
 
-pub use actuator::constant_gain;
-pub use battery::{Hypothesis, Term};
-pub use data::Record;
+pub use data::actuator::constant_gain;
+pub use data::floor::FloorSource;
+pub use data::noise::Noise;
+pub use data::record::Record;
 pub use error::ReconcileError;
-pub use floor::FloorSource;
-pub use judge::figure;
-pub use map::{BAND_EDGES_HZ, BandRatio, Cell, DiscrepancyMap, MapRow, band_labels};
-pub use noise::Noise;
 pub use report::report;
-pub use result::{
+pub use thresholds::{THRESHOLDS, Thresholds};
+pub use verdict::battery::{Hypothesis, Term};
+pub use verdict::judge::figure;
+pub use verdict::map::{BAND_EDGES_HZ, BandRatio, Cell, DiscrepancyMap, MapRow, band_labels};
+pub use verdict::result::{
     BandGap, Effect, Gap, GapStep, Interval, Reconciliation, RecordGap, Remainder, Trace, Traces,
     Verdict,
 };
-pub use thresholds::{THRESHOLDS, Thresholds};
-pub use verdict::{Options, reconcile};
+pub use verdict::workflow::{Options, reconcile};

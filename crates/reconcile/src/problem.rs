@@ -1,9 +1,9 @@
 //! Records made ready for fitting: commands from the working point, whitening filters, masks.
 
-use crate::data::{Record, command_range_um};
+use crate::data::noise::{Noise, Whitener};
+use crate::data::record::{Record, command_range_um};
 use crate::dot::dot;
-use crate::noise::{Noise, Whitener};
-use crate::predict::Base;
+use crate::simulate::Base;
 use crate::thresholds::THRESHOLDS;
 use std::ops::Range;
 

@@ -1,7 +1,7 @@
 //! The HTML report: verdict, map, response before and after, traces, and the shrinking gap.
 
-use crate::map::{BAND_EDGES_HZ, DiscrepancyMap, band_labels};
-use crate::result::{Reconciliation, Verdict};
+use crate::verdict::map::{BAND_EDGES_HZ, DiscrepancyMap, band_labels};
+use crate::verdict::result::{Reconciliation, Verdict};
 use cellpos_report::{Axis, Column, Figure, HeatMap, Panel, Report, Series, Status, Table};
 
 /// Makes the report of a result; `title` names the data.
@@ -127,7 +127,7 @@ fn verdict(r: &mut Report, result: &Reconciliation) {
 
 fn heat(r: &mut Report, name: &str, caption: &str, map: &DiscrepancyMap) {
     let n = BAND_EDGES_HZ.len();
-    let rows: Vec<&crate::map::MapRow> =
+    let rows: Vec<&crate::verdict::map::MapRow> =
         map.rows.iter().filter(|row| row.cells.len() == n).collect();
     let names: Vec<&str> = rows.iter().map(|row| row.name.as_str()).collect();
     let bands: Vec<String> = band_labels()
@@ -206,7 +206,7 @@ fn response(r: &mut Report, result: &Reconciliation) {
     r.paragraph(&format!(
         "0 dB and 0 deg mean that the model is right at that frequency. Thin: 95 % of the noise. Bands in which less than \
          {:.0} % of the motion was driven are left out ({} of {}): there the record shows noise, and in a loop the answer to it.",
-        100.0 * crate::map::BandRatio::SUPPORTED,
+        100.0 * crate::verdict::map::BandRatio::SUPPORTED,
         before.left_out,
         before.hz.len()
     ));
@@ -287,7 +287,7 @@ fn gap(r: &mut Report, result: &Reconciliation) {
         .iter()
         .map(|b| (b.low_hz.max(0.3) * b.high_hz).sqrt())
         .collect();
-    let pick = |f: fn(&crate::result::BandGap) -> f64| {
+    let pick = |f: fn(&crate::verdict::result::BandGap) -> f64| {
         g.bands.iter().map(|b| 1e3 * f(b)).collect::<Vec<f64>>()
     };
     r.figure(

@@ -30,6 +30,14 @@ fn main() -> Result<(), cellpos_report::ReportError> {
     table.caption("Parameters of the fit.");
     report.table(table);
 
+    bode(&mut report);
+    traces(&mut report);
+    histogram(&mut report);
+    map(&mut report);
+    report.write_with_figures(&folder.join("report.html"))
+}
+
+fn bode(report: &mut Report) {
     report.section("Bode");
     let f: Vec<f64> = (0..200).map(|k| 10f64.powf(f64::from(k) / 80.0)).collect();
     let gain: Vec<f64> = f.iter().map(|f| 20.0 * (63.0 / f).log10()).collect();
@@ -71,15 +79,22 @@ fn main() -> Result<(), cellpos_report::ReportError> {
         Figure::nyquist("nyquist", "Open loop in the complex plane.")
             .series(Series::line("L(jw)", &re, &im)),
     );
+}
 
-    report.section("Traces");
+/// Even noise within half a unit, the same every time.
+fn noise() -> impl FnMut() -> f64 {
     let mut state = 1u64;
-    let mut noise = || {
+    move || {
         state = state
             .wrapping_mul(6_364_136_223_846_793_005)
             .wrapping_add(1);
         ((state >> 40) as f64) / (1u64 << 24) as f64 - 0.5
-    };
+    }
+}
+
+fn traces(report: &mut Report) {
+    report.section("Traces");
+    let mut noise = noise();
     let t: Vec<f64> = (0..60_000).map(|k| f64::from(k) / 1000.0).collect();
     let target: Vec<f64> = t
         .iter()
@@ -89,11 +104,6 @@ fn main() -> Result<(), cellpos_report::ReportError> {
     let pzt: Vec<f64> = t
         .iter()
         .map(|t| 20.0 + 3.0 * (t * 0.7).sin() + 0.4 * noise())
-        .collect();
-    let error: Vec<f64> = bead
-        .iter()
-        .zip(&target)
-        .map(|(a, b)| 1000.0 * (a - b))
         .collect();
     report.figure(
         Figure::new("traces", "A minute at 1 kHz, thinned to the screen.")
@@ -112,6 +122,11 @@ fn main() -> Result<(), cellpos_report::ReportError> {
             )
             .share_x(),
     );
+}
+
+fn histogram(report: &mut Report) {
+    let mut noise = noise();
+    let error: Vec<f64> = (0..60_000).map(|_| 600.0 * noise()).collect();
     report.figure(
         Figure::new("histogram", "Errors, and their tail.")
             .columns(2)
@@ -132,6 +147,9 @@ fn main() -> Result<(), cellpos_report::ReportError> {
                 )),
             ),
     );
+}
+
+fn map(report: &mut Report) {
     report.section("Map");
     let values: Vec<f64> = (0..24).map(|k| f64::from(k % 7) * 1.4 - 4.0).collect();
     report.figure(Figure::heat_map(
@@ -144,5 +162,4 @@ fn main() -> Result<(), cellpos_report::ReportError> {
             &values,
         ),
     ));
-    report.write_with_figures(&folder.join("report.html"))
 }

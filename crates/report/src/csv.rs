@@ -3,6 +3,15 @@
 use crate::figure::{Content, Figure};
 use std::fmt::Write;
 
+impl Figure {
+    /// The data of the figure, undecimated, one line per point:
+    /// `panel,series,x,x_axis,y,low,high,y_axis` with label and unit of the axes in `x_axis` and `y_axis`. A heat map
+    /// has its rows as series and its columns as x.
+    pub fn to_csv(&self) -> String {
+        figure(self)
+    }
+}
+
 /// A field, in quotes where CSV needs them.
 fn field(text: &str) -> String {
     if text.contains([',', '"', '\n', '\r']) {

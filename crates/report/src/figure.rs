@@ -279,18 +279,6 @@ impl Figure {
     pub fn name(&self) -> &str {
         &self.name
     }
-
-    /// The figure as an SVG document that stands alone (no script, no external font).
-    pub fn to_svg(&self) -> String {
-        crate::draw::figure(self, true)
-    }
-
-    /// The data of the figure, undecimated, one line per point:
-    /// `panel,series,x,x_axis,y,low,high,y_axis` with label and unit of the axes in `x_axis` and `y_axis`. A heat map
-    /// has its rows as series and its columns as x.
-    pub fn to_csv(&self) -> String {
-        crate::csv::figure(self)
-    }
 }
 
 /// A name that is safe as a file name on every system.

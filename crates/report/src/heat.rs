@@ -1,8 +1,7 @@
 //! Heat maps to SVG.
 
-use crate::draw::WIDTH_PX;
 use crate::figure::HeatMap;
-use crate::svg::{self, Anchor, Svg, px};
+use crate::svg::{self, Anchor, Svg, WIDTH_PX, px};
 use std::fmt::Write;
 
 /// Draws a heat map with its colour bar and returns the height.

@@ -31,6 +31,8 @@ mod draw;
 mod figure;
 mod heat;
 mod html;
+mod marks;
+mod panel;
 mod series;
 mod svg;
 mod thin;

@@ -26,6 +26,8 @@ pub(crate) const STYLE: &str = "\
 .fg text.cell{fill:#1b1e23}.fg text.cellw{fill:#fff}}\
 .fg text.cell{fill:#1b1e23}.fg text.cellw{fill:#fff}.fg .nil{fill:#8a929c;fill-opacity:.25}";
 
+/// Width of every figure, px.
+pub(crate) const WIDTH_PX: f64 = 820.0;
 /// Number of colours of the palette (Okabe and Ito's, darkened where white paper asks for it).
 pub(crate) const COLORS: usize = 8;
 

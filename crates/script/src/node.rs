@@ -1,11 +1,16 @@
 //! Typed access to a TOML table, with the place of every value for errors.
 
 use crate::error::{ScriptError, nearest};
-use cellpos_units::UnitError;
+use cellpos_units::{Micrometers, Seconds, UnitError};
 use std::ops::Range;
 use std::str::FromStr;
 use toml::Spanned;
 use toml::de::{DeTable, DeValue};
+
+/// Longest duration of one step, s: thirty days.
+pub(crate) const MAX_S: f64 = 30.0 * 86_400.0;
+/// Largest position, um.
+pub(crate) const MAX_UM: f64 = 1e4;
 
 /// The text being read, for errors.
 #[derive(Clone, Copy)]
@@ -348,4 +353,14 @@ impl<'a> Node<'a> {
 /// A text short enough for a message.
 pub(crate) fn cut(text: &str) -> String {
     text.chars().take(40).collect()
+}
+
+/// A length of at least `low_um`, um.
+pub(crate) fn length(node: &Node, key: &str, low_um: f64) -> Result<Option<f64>, ScriptError> {
+    node.quantity::<Micrometers>(key, Micrometers::value, (low_um, MAX_UM))
+}
+
+/// A time, s.
+pub(crate) fn time(node: &Node, key: &str) -> Result<Option<f64>, ScriptError> {
+    node.quantity::<Seconds>(key, Seconds::value, (1e-3, MAX_S))
 }

@@ -1,13 +1,13 @@
 //! Reading a script file.
 
 use crate::error::ScriptError;
-use crate::node::{Node, Source, cut, line_starts};
+use crate::node::{MAX_S, MAX_UM, Node, Source, cut, length, line_starts, time};
 use crate::script::{
     Condition, Load, MoveShape, OnTimeout, Order, Script, Step, StepKind, WaveShape,
 };
 use crate::shuffle::shuffle;
 use cellpos_table::{ColumnRef, Table, read_text};
-use cellpos_units::{Hertz, Micrometers, MicrometersPerSecond, Seconds};
+use cellpos_units::{Hertz, MicrometersPerSecond};
 use std::path::Path;
 use toml::de::DeTable;
 
@@ -15,11 +15,6 @@ use toml::de::DeTable;
 pub const MOST_BYTES: u64 = 1 << 26;
 /// Most steps that a script may have after its sweeps are written out.
 const MAX_STEPS: usize = 100_000;
-/// Longest duration of one step, s: thirty days.
-const MAX_S: f64 = 30.0 * 86_400.0;
-/// Largest position, um.
-const MAX_UM: f64 = 1e4;
-
 impl Script {
     /// Reads a script; files that it names are looked for beside it.
     ///
@@ -107,14 +102,6 @@ impl Script {
             steps,
         })
     }
-}
-
-pub(crate) fn length(node: &Node, key: &str, low_um: f64) -> Result<Option<f64>, ScriptError> {
-    node.quantity::<Micrometers>(key, Micrometers::value, (low_um, MAX_UM))
-}
-
-pub(crate) fn time(node: &Node, key: &str) -> Result<Option<f64>, ScriptError> {
-    node.quantity::<Seconds>(key, Seconds::value, (1e-3, MAX_S))
 }
 
 /// What reading a file carries along.

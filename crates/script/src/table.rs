@@ -1,8 +1,7 @@
 //! Tables of a script beside its steps: `[stop]` and `[sample]`.
 
 use crate::error::ScriptError;
-use crate::node::Node;
-use crate::read::{length, time};
+use crate::node::{Node, length, time};
 use crate::sample::Sample;
 use crate::script::Stop;
 use cellpos_units::Micrometers;

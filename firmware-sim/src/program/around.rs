@@ -7,7 +7,7 @@ use super::ProgramError;
 use super::args::Setup;
 use super::frame_server::FrameServer;
 use super::log::{Instant, Log};
-use super::run::{HOUSEKEEPING_NS, LONGEST_SLEEP_NS, monotonic_ns, send_frames, wait};
+use super::pace::{HOUSEKEEPING_NS, LONGEST_SLEEP_NS, monotonic_ns, send_frames, wait};
 use cellpos_emulator::World;
 use rustix::fs::{Mode, OFlags};
 use rustix::io::Errno;

@@ -6,6 +6,7 @@ mod error;
 mod frame_server;
 mod line;
 mod log;
+mod pace;
 mod run;
 
 pub use args::Args;

@@ -6,13 +6,9 @@ use super::error::ProgramError;
 use super::frame_server::FrameServer;
 use super::line::Line;
 use super::log::{Instant, Log};
-use cellpos_emulator::{RigInABox, World};
-use cellpos_link::frames::FrameHeader;
-use rustix::event::{PollFd, PollFlags, Timespec, poll};
-use rustix::io::Errno;
-use rustix::time::{ClockId, clock_gettime};
+use super::pace::{HOUSEKEEPING_NS, LONGEST_SLEEP_NS, monotonic_ns, send_frames, wait};
+use cellpos_emulator::RigInABox;
 use std::io::Write;
-use std::os::fd::BorrowedFd;
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -21,17 +17,8 @@ use thread_priority::{
     set_thread_priority_and_policy, thread_native_id,
 };
 
-/// Without anything to do the box still wakes up this often: exposures are not announced.
-pub const LONGEST_SLEEP_NS: i64 = 500_000;
-/// How often the line is unlocked and new clients are let in.
-pub const HOUSEKEEPING_NS: i64 = 20_000_000;
 /// Above the host's threads: a camera and a board do not wait for a busy host either.
 const PRIORITY: u8 = 60;
-
-pub fn monotonic_ns() -> i64 {
-    let now = clock_gettime(ClockId::Monotonic);
-    now.tv_sec * 1_000_000_000 + now.tv_nsec
-}
 
 /// Runs the box until the duration is over or a signal comes.
 ///
@@ -192,42 +179,5 @@ fn pace(
             line.readiness(),
             rig.next_event_ns().min(now_ns + LONGEST_SLEEP_NS),
         )?;
-    }
-}
-
-/// Hands the frames that have been delivered by now to the clients; returns how many.
-pub fn send_frames(world: &mut World, server: &mut FrameServer, pixels: &mut Vec<u8>) -> u64 {
-    let (width, height) = (world.config().width_px, world.config().height_px);
-    let mut frames = 0;
-    while let Some(info) = world.take_frame(pixels) {
-        let header = FrameHeader {
-            frame_id: info.id,
-            mid_exposure_ns: u64::try_from(info.mid_exposure_ns).unwrap_or(0),
-            sent_ns: u64::try_from(monotonic_ns()).unwrap_or(0),
-            exposure_ns: u32::try_from(info.exposure_ns).unwrap_or(u32::MAX),
-            width,
-            height,
-            bits: 8,
-        };
-        server.send(&header, pixels);
-        frames += 1;
-    }
-    frames
-}
-
-/// Sleeps until `deadline_ns` or until the host has written. The time left is taken from the absolute deadline at the last
-/// moment, so that delays do not add up.
-pub fn wait(readiness: BorrowedFd<'_>, deadline_ns: i64) -> Result<(), ProgramError> {
-    let left_ns = (deadline_ns - monotonic_ns()).max(0);
-    let timeout = Timespec {
-        tv_sec: 0,
-        tv_nsec: left_ns.min(LONGEST_SLEEP_NS),
-    };
-    match poll(
-        &mut [PollFd::new(&readiness, PollFlags::IN)],
-        Some(&timeout),
-    ) {
-        Ok(_) | Err(Errno::INTR) => Ok(()),
-        Err(error) => Err(ProgramError::system("waiting")(error)),
     }
 }

@@ -17,6 +17,33 @@ fn main() {
     let args: Vec<String> = std::env::args().skip(1).collect();
     let which = args.first().map_or("all", String::as_str);
     let seed: u64 = args.get(1).and_then(|s| s.parse().ok()).unwrap_or(1);
+    let mut cases = selected(which, seed);
+    if which == "levels" {
+        // How far each single lies above the threshold of detection, without running the search.
+        for (case, seed) in cases {
+            let times = above_threshold(&case.hidden, seed);
+            println!(
+                "{:7} {:40} {times:6.1}",
+                case.level,
+                format!("{:?}", case.hidden)
+            );
+        }
+        return;
+    }
+    if let Some(text) = args.get(2) {
+        cases.retain(|(c, _)| format!("{:?}", c.hidden).contains(text.as_str()));
+    }
+    let rows = evaluated(&cases);
+    let done: Vec<(&Case, &Row)> = rows
+        .iter()
+        .filter_map(|(i, r)| Some((&cases[*i].0, r.as_ref().ok()?)))
+        .collect();
+    summary(&cases, &done);
+    confusions(&done);
+}
+
+/// The cases of a group, each with the seed of its random numbers.
+fn selected(which: &str, seed: u64) -> Vec<(Case, u64)> {
     // A case keeps its random numbers whatever else is run beside it.
     let mut cases: Vec<(Case, u64)> = Vec::new();
     let mut number = 0;
@@ -39,21 +66,11 @@ fn main() {
             number += 1;
         }
     }
-    if which == "levels" {
-        // How far each single lies above the threshold of detection, without running the search.
-        for (case, seed) in cases {
-            let times = above_threshold(&case.hidden, seed);
-            println!(
-                "{:7} {:40} {times:6.1}",
-                case.level,
-                format!("{:?}", case.hidden)
-            );
-        }
-        return;
-    }
-    if let Some(text) = args.get(2) {
-        cases.retain(|(c, _)| format!("{:?}", c.hidden).contains(text.as_str()));
-    }
+    cases
+}
+
+/// Runs all cases on all cores and prints a line for each as it ends.
+fn evaluated(cases: &[(Case, u64)]) -> BTreeMap<usize, Result<Row, String>> {
     let threads = std::thread::available_parallelism().map_or(2, usize::from);
     let next = AtomicUsize::new(0);
     let rows: Mutex<BTreeMap<usize, Result<Row, String>>> = Mutex::new(BTreeMap::new());
@@ -74,11 +91,10 @@ fn main() {
             });
         }
     });
-    let rows = rows.into_inner().unwrap_or_default();
-    let done: Vec<(&Case, &Row)> = rows
-        .iter()
-        .filter_map(|(i, r)| Some((&cases[*i].0, r.as_ref().ok()?)))
-        .collect();
+    rows.into_inner().unwrap_or_default()
+}
+
+fn summary(cases: &[(Case, u64)], done: &[(&Case, &Row)]) {
     let rate = |group: &str, good: &dyn Fn(&Row) -> bool| {
         let n = done
             .iter()
@@ -137,6 +153,9 @@ fn main() {
     println!("95 % intervals that hold the truth: {covered:?}");
     let slowest = done.iter().map(|(_, r)| r.seconds).fold(0.0, f64::max);
     println!("slowest case, one thread: {slowest:.1} s");
+}
+
+fn confusions(done: &[(&Case, &Row)]) {
     println!("\nconfusions (hidden -> verdict and names)");
     let mut confusions: BTreeMap<(String, String), usize> = BTreeMap::new();
     for (_, r) in done

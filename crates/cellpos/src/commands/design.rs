@@ -112,49 +112,7 @@ pub struct Args {
 pub fn run(args: Args) -> CommandResult {
     output::ready(&args.out)?;
     let model = Model::load(&args.model).map_err(Failure::input)?;
-    let timing = args
-        .rig
-        .as_deref()
-        .map(|path| crate::rig_file::RigFile::load(Some(path)))
-        .transpose()?
-        .map(|file| file.timing);
-    let sample_time_s = timing
-        .as_ref()
-        .map_or(args.sample.value(), |timing| timing.period_us * 1e-6);
-    if !(1e-5..=1.0).contains(&sample_time_s) {
-        return Err(Failure::bad_input(
-            format!("--sample {}: must be 0.01ms to 1s", args.sample),
-            "the rig runs at 1ms",
-        ));
-    }
-    let of_rig = timing.as_ref().map(setup::loop_delay_s);
-    let given_s = args.delay.map(Seconds::value).or(of_rig);
-    if given_s.is_some_and(|delay_s| delay_s < 0.5 * sample_time_s) {
-        return Err(Failure::bad_input(
-            format!(
-                "--delay {}ms is less than half a sample of hold",
-                given_s.unwrap_or(0.0) * 1e3
-            ),
-            "the loop delay is the camera path and half a sample: 2.5ms for a camera path of 2ms at 1 kHz",
-        ));
-    }
-    let mut plant =
-        DesignPlant::from_model(&model, given_s, sample_time_s).map_err(Failure::input)?;
-    let disagrees = timing
-        .as_ref()
-        .and_then(|timing| setup::model_delay_warning(&model, timing));
-    if let Some(warning) = disagrees {
-        eprintln!("WARNING: {warning}");
-    }
-    if given_s.is_none() && model.camera_delay_s.is_none() && plant.delay_s == 0.0 {
-        plant.delay_s = 2e-3;
-        plant.warnings.push(DesignWarning::DelayAssumed {
-            assumed_ms: plant.loop_delay_s() * 1e3,
-        });
-    }
-    if let Some(noise) = args.fix_noise {
-        plant.fix_noise_um = noise.value();
-    }
+    let plant = plant(&args, &model)?;
     let limits = limits(&args)?;
     let gains = args.kp.is_some() || args.setpoint_weight.is_some();
     if gains && matches!(args.controller, Kind::Lqg | Kind::Mpc) {
@@ -164,26 +122,7 @@ pub fn run(args: Args) -> CommandResult {
         ));
     }
     let lead = lead(&args, plant.loop_delay_s())?;
-    let controller = match (args.kp, args.ki) {
-        _ if args.controller == Kind::Lqg => {
-            Requested::Given(ControllerConfig::Lqg(Lqg::default()))
-        }
-        _ if args.controller == Kind::Mpc => {
-            Requested::Given(ControllerConfig::Mpc(Mpc::default(), Pi::new(0.33, 9.6)))
-        }
-        (Some(kp), Some(ki)) => Requested::Pi(Pi {
-            lead,
-            ..Pi::new(kp, ki)
-        }),
-        _ => {
-            let nominal = PiSearch::default();
-            Requested::SearchPi(PiSearch {
-                max_ms: limits.max_ms.unwrap_or(nominal.max_ms),
-                max_mt: limits.max_mt.unwrap_or(nominal.max_mt),
-                lead,
-            })
-        }
-    };
+    let controller = requested(&args, &limits, lead);
     let request = DesignRequest {
         plant,
         controller,
@@ -212,6 +151,78 @@ pub fn run(args: Args) -> CommandResult {
     } else {
         Outcome::Broken
     })
+}
+
+/// The plant as the loop sees it: the model with the delay and the sample time of the rig, or those given.
+fn plant(args: &Args, model: &Model) -> Result<DesignPlant, Failure> {
+    let timing = args
+        .rig
+        .as_deref()
+        .map(|path| crate::rig_file::RigFile::load(Some(path)))
+        .transpose()?
+        .map(|file| file.timing);
+    let sample_time_s = timing
+        .as_ref()
+        .map_or(args.sample.value(), |timing| timing.period_us * 1e-6);
+    if !(1e-5..=1.0).contains(&sample_time_s) {
+        return Err(Failure::bad_input(
+            format!("--sample {}: must be 0.01ms to 1s", args.sample),
+            "the rig runs at 1ms",
+        ));
+    }
+    let of_rig = timing.as_ref().map(setup::loop_delay_s);
+    let given_s = args.delay.map(Seconds::value).or(of_rig);
+    if given_s.is_some_and(|delay_s| delay_s < 0.5 * sample_time_s) {
+        return Err(Failure::bad_input(
+            format!(
+                "--delay {}ms is less than half a sample of hold",
+                given_s.unwrap_or(0.0) * 1e3
+            ),
+            "the loop delay is the camera path and half a sample: 2.5ms for a camera path of 2ms at 1 kHz",
+        ));
+    }
+    let mut plant =
+        DesignPlant::from_model(model, given_s, sample_time_s).map_err(Failure::input)?;
+    let disagrees = timing
+        .as_ref()
+        .and_then(|timing| setup::model_delay_warning(model, timing));
+    if let Some(warning) = disagrees {
+        eprintln!("WARNING: {warning}");
+    }
+    if given_s.is_none() && model.camera_delay_s.is_none() && plant.delay_s == 0.0 {
+        plant.delay_s = 2e-3;
+        plant.warnings.push(DesignWarning::DelayAssumed {
+            assumed_ms: plant.loop_delay_s() * 1e3,
+        });
+    }
+    if let Some(noise) = args.fix_noise {
+        plant.fix_noise_um = noise.value();
+    }
+    Ok(plant)
+}
+
+/// The controller that is asked for.
+fn requested(args: &Args, limits: &DesignLimits, lead: Option<Lead>) -> Requested {
+    match (args.kp, args.ki) {
+        _ if args.controller == Kind::Lqg => {
+            Requested::Given(ControllerConfig::Lqg(Lqg::default()))
+        }
+        _ if args.controller == Kind::Mpc => {
+            Requested::Given(ControllerConfig::Mpc(Mpc::default(), Pi::new(0.33, 9.6)))
+        }
+        (Some(kp), Some(ki)) => Requested::Pi(Pi {
+            lead,
+            ..Pi::new(kp, ki)
+        }),
+        _ => {
+            let nominal = PiSearch::default();
+            Requested::SearchPi(PiSearch {
+                max_ms: limits.max_ms.unwrap_or(nominal.max_ms),
+                max_mt: limits.max_mt.unwrap_or(nominal.max_mt),
+                lead,
+            })
+        }
+    }
 }
 
 fn limits(args: &Args) -> Result<DesignLimits, Failure> {

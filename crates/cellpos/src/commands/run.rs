@@ -3,6 +3,7 @@
 mod keys;
 pub(super) mod learning;
 pub(super) mod resume;
+mod session_config;
 mod sink;
 mod text;
 
@@ -18,7 +19,7 @@ use cellpos_session::setup::{Prepared, ReferenceSpec, Setup};
 use cellpos_session::{Finished, Options, Rig, connect};
 use cellpos_units::Micrometers;
 use learning::Keeper;
-use serde::{Deserialize, Serialize};
+use session_config::SessionConfig;
 use sink::{ScriptSink, Stalls};
 use std::cell::RefCell;
 use std::collections::BTreeMap;
@@ -86,38 +87,6 @@ pub struct Args {
     /// Print one JSON object on standard output.
     #[arg(long)]
     json: bool,
-}
-
-/// What a session needs to know beside the loop's set-up: the table `config.session` of run.toml.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct SessionConfig {
-    /// 1 for the first, one more each time that the run was resumed.
-    number: u64,
-    /// The cycle that it begins with.
-    first_cycle: u64,
-    /// Whether frames are rendered.
-    frames: bool,
-    /// Whether the operating system was not asked for real time.
-    best_effort: bool,
-    /// Amplitude error that raises an alarm, percent.
-    alarm_percent: f64,
-    /// Whether periodic motions are learned.
-    #[serde(default)]
-    learn: bool,
-    /// Seconds from the end of the last record of the session before to the start of this one, s.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    gap_s: Option<f64>,
-    /// Folder of the session before, from the run's folder.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    after: Option<String>,
-}
-
-impl SessionConfig {
-    /// From the last write of the session before to the start of this one, s.
-    pub fn gap_s(&self) -> Option<f64> {
-        self.gap_s
-    }
 }
 
 /// A session before the board is armed.

@@ -1,6 +1,6 @@
 //! Names, units, bounds and values of the parameters of effects.
 
-use super::{Effect, EffectKind, Experiment, Place, table};
+use super::{Effect, EffectKind, Experiment, Place};
 
 /// What is fixed about an effect apart from its equation.
 #[derive(Debug, Clone, Copy)]
@@ -75,10 +75,12 @@ impl Form {
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum EffectError {
     /// No effect of that name.
-    #[error("there is no effect `{id}`: the known ones are {}", table::ids().join(", "))]
+    #[error("there is no effect `{id}`: the known ones are {}", known.join(", "))]
     UnknownEffect {
         /// The id asked for.
         id: String,
+        /// The ids that are known.
+        known: Vec<&'static str>,
     },
     /// An effect of that name is known already.
     #[error("an effect with the id `{id}` is known already: give another id")]
@@ -176,16 +178,6 @@ pub struct Parameter {
 }
 
 impl Effect {
-    /// An effect of a known id, in its first form, from parameters by name; those left out have their defaults.
-    ///
-    /// # Errors
-    /// An unknown id or parameter, a value out of range, a parameter that is needed and missing.
-    pub fn of(id: &str, parameters: &[(&str, f64)]) -> Result<Self, EffectError> {
-        let kind =
-            table::find(id).ok_or_else(|| EffectError::UnknownEffect { id: id.to_owned() })?;
-        Self::of_kind(kind, parameters)
-    }
-
     /// As [`Self::of`] for a kind that need not be in the table.
     ///
     /// # Errors

@@ -1,6 +1,6 @@
 //! The table of all effects, in the order of the chain, and those that came from elsewhere.
 
-use super::{EffectError, EffectKind};
+use super::{Effect, EffectError, EffectKind};
 use std::sync::{PoisonError, RwLock};
 
 /// The effects of this crate. Within a place, the order here is the order in which they act.
@@ -55,6 +55,20 @@ pub fn ids() -> Vec<&'static str> {
 /// The effect of an id.
 pub fn find(id: &str) -> Option<&'static dyn EffectKind> {
     all().into_iter().find(|k| k.spec().id == id)
+}
+
+impl Effect {
+    /// An effect of a known id, in its first form, from parameters by name; those left out have their defaults.
+    ///
+    /// # Errors
+    /// An unknown id or parameter, a value out of range, a parameter that is needed and missing.
+    pub fn of(id: &str, parameters: &[(&str, f64)]) -> Result<Self, EffectError> {
+        let kind = find(id).ok_or_else(|| EffectError::UnknownEffect {
+            id: id.to_owned(),
+            known: ids(),
+        })?;
+        Self::of_kind(kind, parameters)
+    }
 }
 
 /// Where an effect stands among all; one that is not known acts last at its place.

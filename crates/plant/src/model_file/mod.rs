@@ -6,8 +6,6 @@ mod write;
 #[cfg(test)]
 mod tests;
 
-pub(crate) use write::write;
-
 use crate::effects::{self, Effect, EffectError, ParameterSpec};
 use crate::error::{ModelError, ModelProblem, Position};
 use crate::model::{Covariance, Model, Noise};
@@ -15,6 +13,7 @@ use crate::transfer::TransferFunction;
 use std::collections::BTreeMap;
 use table::{Table, Value, nearest};
 use toml::de::DeTable;
+use write::write;
 
 const fn range(unit: &'static str, lower: f64, upper: f64) -> ParameterSpec {
     ParameterSpec::new("", unit, lower, upper)
@@ -41,7 +40,23 @@ const TOP: [&str; 10] = [
     "provenance",
 ];
 
-pub(crate) fn read(text: &str, file: &str) -> Result<Model, ModelError> {
+impl Model {
+    /// Reads a model from the text of a TOML file; `file_name` is for the messages only.
+    ///
+    /// # Errors
+    /// Text that is not TOML, unknown keys, missing keys, wrong types, numbers that are not finite or out of range,
+    /// coefficients that make no plant: each with line, column and what would be right.
+    pub fn from_toml_str(text: &str, file_name: &str) -> Result<Self, ModelError> {
+        read(text, file_name)
+    }
+
+    /// The model as the text of a TOML file. Reading it back gives the same model to the bit.
+    pub fn to_toml_string(&self) -> String {
+        write(self)
+    }
+}
+
+fn read(text: &str, file: &str) -> Result<Model, ModelError> {
     let document = DeTable::parse(text).map_err(|error| ModelError {
         file: file.to_owned(),
         at: Some(Position::of(text, error.span().unwrap_or(0..0))),

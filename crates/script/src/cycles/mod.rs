@@ -8,6 +8,7 @@ mod fatigue;
 mod fit;
 mod open;
 mod outlier;
+mod place;
 mod row;
 mod saturating;
 mod shape;
@@ -20,10 +21,11 @@ pub use saturating::Saturating;
 pub use table::{CycleColumns, HeadError, ReadCycles, read_cycles};
 pub use trend::{Alarm, AmplitudeWatch, Mean, Trend, trend};
 
-use crate::plan::{Cycle, Plan};
+use crate::plan::Plan;
 use cellpos_runtime::{Life, Request, Stage, TickFlags, TickRecord};
 use open::Open;
 use outlier::Outliers;
+use place::{Place, bounds_ns};
 use std::collections::VecDeque;
 use std::sync::Arc;
 
@@ -58,23 +60,6 @@ struct Past {
     command_um: f64,
     neutral_um: f64,
     stage: Stage,
-}
-
-/// A place in the plan at which a position was exposed.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Place {
-    plan_ns: i64,
-    target_um: f64,
-    stage: Stage,
-    exposed_ns: i64,
-    /// Whether the tick has a frame of its own.
-    fresh: bool,
-}
-
-/// Start and end of a cycle by the plan, ns.
-fn bounds_ns(cycle: &Cycle) -> (i64, i64) {
-    let ns = |s: f64| (s * 1e9).round() as i64;
-    (ns(cycle.start_s), ns(cycle.start_s + cycle.duration_s))
 }
 
 impl CycleTable {

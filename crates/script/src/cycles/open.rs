@@ -1,8 +1,9 @@
 //! A cycle that is going on.
 
 use super::fit::SineFit;
+use super::place::{Place, bounds_ns};
+use super::row::{CycleFlags, CycleRow};
 use super::shape::Series;
-use super::{CycleFlags, CycleRow, Place, bounds_ns};
 use crate::plan::{Cycle, Plan};
 use cellpos_control::{Reference, SolverStatus};
 use cellpos_runtime::{Request, Stage, TickFlags, TickRecord};

@@ -1,6 +1,7 @@
 //! Laying a script out in time.
 
-use super::{ArmKind, Cycles, Mark, Motion, Periodic, Plan, Segment};
+use super::course::Periodic;
+use super::parts::{ArmKind, Cycles, Mark, Motion, Plan, Segment};
 use crate::error::ScriptError;
 use crate::script::{Load, MoveShape, Script, Step, StepKind};
 use std::collections::BTreeMap;

@@ -121,6 +121,39 @@ pub fn table(model: &str, request: &DesignRequest, report: &DesignReport) -> Str
         request.plant.loop_delay_s() * 1e3,
         request.plant.delay_s / ts
     );
+    controller_lines(&mut out, report);
+    if let Some(criterion) = criterion(request) {
+        let _ = writeln!(out, "found as: {criterion}");
+    }
+    let _ = writeln!(out, "{}", if m.stable { "stable" } else { "UNSTABLE" });
+    line(&mut out, "phase margin", m.pm_deg, 1, "deg");
+    line(&mut out, "gain margin", m.gm_db, 1, "dB");
+    line(&mut out, "delay margin", m.delay_margin_s * 1e3, 2, "ms");
+    line(&mut out, "", m.delay_margin_s / ts, 2, "samples");
+    line(&mut out, "Ms", m.ms, 3, "");
+    line(&mut out, "Mt", m.mt, 3, "");
+    line(&mut out, "|S| < 1 below", m.s_below_1_hz, 1, "Hz");
+    line(&mut out, "-3 dB of T", m.bandwidth_3db_hz, 1, "Hz");
+    response_lines(&mut out, report);
+    line(
+        &mut out,
+        "predicted hold error (true, RMS)",
+        report.noise.map_or(f64::NAN, |n| n.rms_um * 1e3),
+        1,
+        "nm",
+    );
+    line(
+        &mut out,
+        "minimum-variance bound on it",
+        report.bound_rms_um * 1e3,
+        1,
+        "nm",
+    );
+    spread_lines(&mut out, report);
+    out
+}
+
+fn controller_lines(out: &mut String, report: &DesignReport) {
     match &report.controller {
         ControllerConfig::Pi(pi) => {
             let _ = writeln!(
@@ -150,35 +183,21 @@ pub fn table(model: &str, request: &DesignRequest, report: &DesignReport) -> Str
             );
         }
     }
-    if let Some(criterion) = criterion(request) {
-        let _ = writeln!(out, "found as: {criterion}");
-    }
-    let _ = writeln!(out, "{}", if m.stable { "stable" } else { "UNSTABLE" });
-    line(&mut out, "phase margin", m.pm_deg, 1, "deg");
-    line(&mut out, "gain margin", m.gm_db, 1, "dB");
-    line(&mut out, "delay margin", m.delay_margin_s * 1e3, 2, "ms");
-    line(&mut out, "", m.delay_margin_s / ts, 2, "samples");
-    line(&mut out, "Ms", m.ms, 3, "");
-    line(&mut out, "Mt", m.mt, 3, "");
-    line(&mut out, "|S| < 1 below", m.s_below_1_hz, 1, "Hz");
-    line(&mut out, "-3 dB of T", m.bandwidth_3db_hz, 1, "Hz");
+}
+
+/// Set-point step and disturbance.
+fn response_lines(out: &mut String, report: &DesignReport) {
     if let Some(s) = &report.step {
+        line(out, "10 um step: overshoot", s.overshoot_percent, 1, "%");
         line(
-            &mut out,
-            "10 um step: overshoot",
-            s.overshoot_percent,
-            1,
-            "%",
-        );
-        line(
-            &mut out,
+            out,
             "10 um step: settling to 5 %",
             s.settling_5_percent_s * 1e3,
             0,
             "ms",
         );
         line(
-            &mut out,
+            out,
             "10 um step: settling to 2 %",
             s.settling_2_percent_s * 1e3,
             0,
@@ -186,42 +205,26 @@ pub fn table(model: &str, request: &DesignRequest, report: &DesignReport) -> Str
         );
     }
     if let Some(d) = &report.disturbance {
+        line(out, "10 um/s drift: peak error", d.peak_um * 1e3, 1, "nm");
         line(
-            &mut out,
-            "10 um/s drift: peak error",
-            d.peak_um * 1e3,
-            1,
-            "nm",
-        );
-        line(
-            &mut out,
+            out,
             "10 um/s drift: recovery to 10 %",
             d.recovery_s * 1e3,
             0,
             "ms",
         );
         line(
-            &mut out,
+            out,
             "10 um/s drift: steady error",
             d.steady_error_um * 1e3,
             3,
             "nm",
         );
     }
-    line(
-        &mut out,
-        "predicted hold error (true, RMS)",
-        report.noise.map_or(f64::NAN, |n| n.rms_um * 1e3),
-        1,
-        "nm",
-    );
-    line(
-        &mut out,
-        "minimum-variance bound on it",
-        report.bound_rms_um * 1e3,
-        1,
-        "nm",
-    );
+}
+
+/// Margins at other gains and delays.
+fn spread_lines(out: &mut String, report: &DesignReport) {
     let _ = writeln!(
         out,
         "spread:   gain  delay      PM deg   GM dB      Ms      Mt"
@@ -242,5 +245,4 @@ pub fn table(model: &str, request: &DesignRequest, report: &DesignReport) -> Str
             )
         };
     }
-    out
 }

@@ -1,6 +1,7 @@
 //! A run that is gone on with: everything comes from its folder.
 
-use super::{Ready, SessionConfig};
+use super::Ready;
+use super::session_config::SessionConfig;
 use crate::commands::replay;
 use crate::outcome::Failure;
 use crate::rig_file::{ClockKind, RigFile};
@@ -196,10 +197,7 @@ pub fn ready(folder: &Path, best_effort: bool) -> Result<Option<Ready>, Failure>
     let over = meta.end.as_ref().is_some_and(|end| end.outcome == "done");
     let sessions = sessions(folder);
     let last = sessions.last().map_or(folder, PathBuf::as_path);
-    let last_done = RunReader::open(last).ok().is_some_and(|reader| {
-        let end = reader.meta().ok().and_then(|meta| meta.end.as_ref());
-        end.is_some_and(|end| end.outcome == "done")
-    });
+    let last_done = is_done(last);
     // Without an end of its own a script whose last cycle is done may still have a step to go.
     if over || last_done {
         return Ok(None);
@@ -216,20 +214,7 @@ pub fn ready(folder: &Path, best_effort: bool) -> Result<Option<Ready>, Failure>
     renew(folder)?;
     let number = sessions.len() as u64 + 1;
     let ran_s = ran_s(&sessions, file.timing.period_us * 1e-6)?;
-    // Where the bead rested last is a better first belief than the rig file's.
-    let rested = done.iter().rev().map(|row| row.neutral_um);
-    let within = |um: &f64| (file.limits.low_um..=file.limits.high_um).contains(um);
-    if let Some(neutral_um) = rested.into_iter().find(within) {
-        file.first_neutral_um = neutral_um;
-    }
-    // Of several beads in view the one that was followed.
-    let seen = RunReader::open(last).ok().and_then(|reader| {
-        reader
-            .last_where(|tick| tick.measured_um.is_finite())
-            .ok()
-            .flatten()
-    });
-    file.near_um = seen.map(|tick| tick.measured_um).or(file.near_um);
+    seek_where_it_was(&mut file, &done, last);
     // Another session sees other noise, and the same each time that it is repeated.
     file.emulator.seed = file.emulator.seed.wrapping_add(number - 1);
     let clock = if meta.clock == "virtual" {
@@ -270,6 +255,32 @@ pub fn ready(folder: &Path, best_effort: bool) -> Result<Option<Ready>, Failure>
         inputs: meta.inputs.clone(),
         home: Some((folder.to_owned(), folder.join(SESSIONS))),
     }))
+}
+
+/// Whether a session's script came to its end.
+fn is_done(session: &Path) -> bool {
+    RunReader::open(session).ok().is_some_and(|reader| {
+        let end = reader.meta().ok().and_then(|meta| meta.end.as_ref());
+        end.is_some_and(|end| end.outcome == "done")
+    })
+}
+
+/// Has the next session look for the bead where it was.
+fn seek_where_it_was(file: &mut RigFile, done: &[CycleRow], last: &Path) {
+    // Where the bead rested last is a better first belief than the rig file's.
+    let rested = done.iter().rev().map(|row| row.neutral_um);
+    let within = |um: &f64| (file.limits.low_um..=file.limits.high_um).contains(um);
+    if let Some(neutral_um) = rested.into_iter().find(within) {
+        file.first_neutral_um = neutral_um;
+    }
+    // Of several beads in view the one that was followed.
+    let seen = RunReader::open(last).ok().and_then(|reader| {
+        reader
+            .last_where(|tick| tick.measured_um.is_finite())
+            .ok()
+            .flatten()
+    });
+    file.near_um = seen.map(|tick| tick.measured_um).or(file.near_um);
 }
 
 /// From the last write of a session's records to now, s.

@@ -1,7 +1,7 @@
 //! Where the records of a script go: the run folder, the per-cycle table, the progress bar.
 
-use super::SessionConfig;
 use super::learning::Keeper;
+use super::session_config::SessionConfig;
 use crate::recording::log_event;
 use cellpos_control::LearnerState;
 use cellpos_record::{Event as LogEvent, Faults, LineFile, RunWriter};

@@ -1,11 +1,12 @@
 //! `cellpos vision`: positions and their quality from a recording, and the settings that it needs.
 
+mod advice;
 mod as_loop;
 mod beads;
 mod cells;
 mod settings;
 
-pub use settings::Advice;
+pub use advice::Advice;
 
 use super::vision_sheet::Sheet;
 use super::vision_summary::{Summary, Tally};

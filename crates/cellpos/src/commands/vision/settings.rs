@@ -1,14 +1,12 @@
 //! Settings for beads: given, of a rig, or found in the recording.
 
+use super::advice::Advice;
 use super::{Args, Reader};
 use crate::outcome::Failure;
 use cellpos_rig::FrameBuffer;
 use cellpos_session::rig_file::RigFile;
 use cellpos_vision::suggest::{refine, suggest};
-use cellpos_vision::{
-    Frame, Learning, Localiser, LocaliserConfig, Polarity, ProfileSpec, Suggestion,
-};
-use serde::Serialize;
+use cellpos_vision::{Frame, Learning, Localiser, LocaliserConfig, Polarity, ProfileSpec};
 
 /// Frames that settings are found in, spread over the recording.
 const LOOKED_AT: usize = 20;
@@ -22,68 +20,6 @@ pub(super) struct BeadSettings {
     pub max_step_px: f64,
     /// What is to be said of settings that were found.
     pub advice: Option<Advice>,
-}
-
-/// Settings found in the recording.
-#[derive(Debug, Clone, Serialize)]
-pub struct Advice {
-    /// The table `[vision]` for rig.toml.
-    pub vision: LocaliserConfig,
-    /// Objects that stood out in the frames looked at.
-    pub objects: usize,
-    /// Taken as beads.
-    pub taken: usize,
-    /// Cut by the border.
-    pub at_border: usize,
-    /// Of another size or contrast than most.
-    pub other: usize,
-    /// Not fitted by the mean profile.
-    pub bad_fit: usize,
-    /// Radius of the beads, px.
-    pub radius_px: f64,
-    /// Radius that was given, px.
-    pub given_px: Option<f64>,
-}
-
-impl Advice {
-    fn of(found: &Suggestion, given_px: Option<f64>) -> Self {
-        let radius_px = match found.config.profile {
-            ProfileSpec::Table { radius_px, .. } => radius_px,
-            ProfileSpec::Ring { edge_px } => edge_px,
-            ProfileSpec::Gaussian { sigma_px } => 2.0 * sigma_px,
-        };
-        Advice {
-            vision: found.config.clone(),
-            objects: found.objects,
-            taken: found.taken,
-            at_border: found.refused.at_border,
-            other: found.refused.other,
-            bad_fit: found.refused.bad_fit,
-            radius_px,
-            given_px,
-        }
-    }
-
-    /// The settings as a table to paste, with what they rest on.
-    pub fn text(&self) -> String {
-        let given = self
-            .given_px
-            .map_or(String::new(), |px| format!(" (given: {px:.2} px)"));
-        let mut text = format!(
-            "settings found: {} of {} objects are beads of radius {:.2} px{given}; {} of another size or contrast, {} at the border, \
-             {} not round like these\npaste into rig.toml:\n\n",
-            self.taken, self.objects, self.radius_px, self.other, self.at_border, self.bad_fit
-        );
-        // Settings that come out of a file go back into one.
-        match toml::to_string(&toml::Table::from_iter([(
-            "vision".to_string(),
-            toml::Value::try_from(&self.vision).unwrap_or(toml::Value::Boolean(false)),
-        )])) {
-            Ok(table) => text.push_str(&table),
-            Err(error) => text.push_str(&format!("# {error}\n")),
-        }
-        text
-    }
 }
 
 /// The settings for the beads of this recording.

@@ -1,0 +1,66 @@
+//! What is said of settings that were found in a recording.
+
+use cellpos_vision::{LocaliserConfig, ProfileSpec, Suggestion};
+use serde::Serialize;
+
+/// Settings found in the recording.
+#[derive(Debug, Clone, Serialize)]
+pub struct Advice {
+    /// The table `[vision]` for rig.toml.
+    pub vision: LocaliserConfig,
+    /// Objects that stood out in the frames looked at.
+    pub objects: usize,
+    /// Taken as beads.
+    pub taken: usize,
+    /// Cut by the border.
+    pub at_border: usize,
+    /// Of another size or contrast than most.
+    pub other: usize,
+    /// Not fitted by the mean profile.
+    pub bad_fit: usize,
+    /// Radius of the beads, px.
+    pub radius_px: f64,
+    /// Radius that was given, px.
+    pub given_px: Option<f64>,
+}
+
+impl Advice {
+    pub(super) fn of(found: &Suggestion, given_px: Option<f64>) -> Self {
+        let radius_px = match found.config.profile {
+            ProfileSpec::Table { radius_px, .. } => radius_px,
+            ProfileSpec::Ring { edge_px } => edge_px,
+            ProfileSpec::Gaussian { sigma_px } => 2.0 * sigma_px,
+        };
+        Advice {
+            vision: found.config.clone(),
+            objects: found.objects,
+            taken: found.taken,
+            at_border: found.refused.at_border,
+            other: found.refused.other,
+            bad_fit: found.refused.bad_fit,
+            radius_px,
+            given_px,
+        }
+    }
+
+    /// The settings as a table to paste, with what they rest on.
+    pub fn text(&self) -> String {
+        let given = self
+            .given_px
+            .map_or(String::new(), |px| format!(" (given: {px:.2} px)"));
+        let mut text = format!(
+            "settings found: {} of {} objects are beads of radius {:.2} px{given}; {} of another size or contrast, {} at the border, \
+             {} not round like these\npaste into rig.toml:\n\n",
+            self.taken, self.objects, self.radius_px, self.other, self.at_border, self.bad_fit
+        );
+        // Settings that come out of a file go back into one.
+        match toml::to_string(&toml::Table::from_iter([(
+            "vision".to_string(),
+            toml::Value::try_from(&self.vision).unwrap_or(toml::Value::Boolean(false)),
+        )])) {
+            Ok(table) => text.push_str(&table),
+            Err(error) => text.push_str(&format!("# {error}\n")),
+        }
+        text
+    }
+}

@@ -1,0 +1,61 @@
+//! What the server's threads share.
+
+use crate::access::{Role, Secrets};
+use crate::command::Command;
+use crate::hub::Clients;
+use crate::state::Hello;
+use serde::Serialize;
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use tungstenite::Message;
+
+/// What the server's threads share.
+pub(crate) struct Shared {
+    pub(crate) secrets: Secrets,
+    pub(crate) address: SocketAddr,
+    pub(crate) hello: Hello,
+    /// The hub sends what has come and ends; clients go on until `over`.
+    pub(crate) ending: AtomicBool,
+    pub(crate) over: AtomicBool,
+    pub(crate) clients: Clients,
+    pub(crate) connections: AtomicUsize,
+    pub(crate) command: Box<dyn Fn(Command) + Send + Sync>,
+    pub(crate) on_thread: Option<Arc<dyn Fn() + Send + Sync>>,
+}
+
+#[derive(Serialize)]
+struct Greeting<'a> {
+    pub(crate) hello: &'a Hello,
+    operator: bool,
+}
+
+impl Shared {
+    pub(crate) fn is_over(&self) -> bool {
+        self.over.load(Ordering::Acquire)
+    }
+
+    pub(crate) fn view_um(&self) -> [f64; 2] {
+        self.hello.view_um
+    }
+
+    pub(crate) fn ask(&self, command: Command) {
+        (self.command)(command);
+    }
+
+    /// The first message of a client.
+    pub(crate) fn hello(&self, role: Role) -> Message {
+        let greeting = Greeting {
+            hello: &self.hello,
+            operator: role == Role::Operator,
+        };
+        Message::text(serde_json::to_string(&greeting).unwrap_or_default())
+    }
+
+    /// The first act of a thread of the server.
+    pub(crate) fn enter_thread(&self) {
+        if let Some(on_thread) = &self.on_thread {
+            on_thread();
+        }
+    }
+}

@@ -1,0 +1,260 @@
+//! The noise floor, from the records or from what is stated, before any model is believed; or the statement that it is not
+//! known.
+
+use crate::data::noise::{Noise, increment_moments};
+use crate::data::record::Record;
+use crate::thresholds::THRESHOLDS;
+use serde::Serialize;
+use std::f64::consts::TAU;
+
+/// Where the noise floor comes from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum FloorSource {
+    /// Records whose command rests.
+    Rest,
+    /// Differences of successive periods of a command that repeats.
+    Periods,
+    /// Differences of records with the same command.
+    EqualRecords,
+    /// The noise that the model states.
+    Stated,
+    /// Nowhere: nothing rests or repeats, and nothing is stated. The figures are then the fit's own residual.
+    Unknown,
+}
+
+impl FloorSource {
+    /// In words, for results.
+    pub fn words(self) -> &'static str {
+        match self {
+            Self::Rest => "measured at rest",
+            Self::Periods => "measured between periods of the command",
+            Self::EqualRecords => "measured between records of the same command",
+            Self::Stated => "stated in the model, not measured",
+            Self::Unknown => "not known: no rest, no repeated command, no stated noise",
+        }
+    }
+
+    /// Whether there is a floor at all.
+    pub fn is_known(self) -> bool {
+        self != Self::Unknown
+    }
+}
+
+/// The noise floor of a set of records.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Floor {
+    pub noise: Noise,
+    pub source: FloorSource,
+    /// Increments that it was measured from; 0 where it was not.
+    pub rows: usize,
+}
+
+/// Variance and lag-1 covariance of increments, how many, and where from.
+#[derive(Debug, Clone, Copy)]
+struct Estimate {
+    c0: f64,
+    c1: f64,
+    rows: usize,
+    source: FloorSource,
+}
+
+impl Estimate {
+    fn sigma(&self) -> f64 {
+        Noise::from_increments(self.c0, self.c1).innovation_um()
+    }
+}
+
+/// Estimates both noises from residuals of the null model.
+///
+/// A rest record shows the noise itself (lines at the mains frequency and a drift taken off); of a record whose command
+/// repeats, the difference of successive periods cancels every response that repeats, and so does the difference of two
+/// records of the same command. The smallest of these rules: a misfit can only add. Without any, what the model states is
+/// taken, as long as the records do not lie below it; and without that, the floor is not known, and the increments of the
+/// residuals stand in for the figures alone.
+pub(crate) fn estimate(
+    records: &[Record],
+    present: &[Vec<bool>],
+    residuals: &[Vec<f64>],
+    stated: Option<Noise>,
+) -> Floor {
+    let whole = crate::data::record::command_range_um(records);
+    let mut found: Vec<Estimate> = Vec::new();
+    let mut own: Vec<Estimate> = Vec::new();
+    let of = |e: &[f64], ok: &[bool], sample_s: f64, source, share: f64| {
+        let clean = without_lines(e, ok, sample_s);
+        let (c0, c1, rows) = increment_moments(&clean, &without_jumps(&clean, ok));
+        Estimate {
+            c0: share * c0,
+            c1: share * c1,
+            rows,
+            source,
+        }
+    };
+    for (i, r) in records.iter().enumerate() {
+        let (e, present_i) = (&residuals[i], &present[i]);
+        if r.rests_within(THRESHOLDS.rest_share * whole) {
+            found.push(of(e, present_i, r.sample_s, FloorSource::Rest, 1.0));
+        } else if let Some(p) = r.period_rows() {
+            let from = if r.rows() >= 4 * p { 2 * p } else { p };
+            let rows = from..r.rows();
+            let ok: Vec<bool> = rows
+                .clone()
+                .map(|k| present_i[k] && present_i[k - p])
+                .collect();
+            // The noise of a measured input goes through the model into the residuals, and not into the positions.
+            let y = &r.bead_um;
+            for d in [
+                rows.clone().map(|k| e[k] - e[k - p]).collect::<Vec<f64>>(),
+                rows.map(|k| y[k] - y[k - p])
+                    .map(|d| if d.is_finite() { d } else { 0.0 })
+                    .collect(),
+            ] {
+                found.push(of(&d, &ok, r.sample_s, FloorSource::Periods, 0.5));
+            }
+        }
+        for j in 0..i {
+            if r.same_command(&records[j]) {
+                let n = e.len().min(residuals[j].len());
+                let ok: Vec<bool> = (0..n).map(|k| present_i[k] && present[j][k]).collect();
+                let d: Vec<f64> = (0..n).map(|k| e[k] - residuals[j][k]).collect();
+                found.push(of(&d, &ok, r.sample_s, FloorSource::EqualRecords, 0.5));
+            }
+        }
+        let (c0, c1, rows) = increment_moments(e, present_i);
+        own.push(Estimate {
+            c0,
+            c1,
+            rows,
+            source: FloorSource::Unknown,
+        });
+    }
+    let quantum_um2 = quantisation_um2(records);
+    found.retain(|f| f.rows >= THRESHOLDS.floor_rows && f.c0 > 0.0);
+    if let Some(least) = found.iter().min_by(|a, b| a.sigma().total_cmp(&b.sigma())) {
+        let pooled = pooled(&found, least.sigma());
+        return Floor {
+            noise: Noise::from_increments(pooled.c0, pooled.c1).at_least(quantum_um2),
+            source: least.source,
+            rows: pooled.rows,
+        };
+    }
+    own.retain(|f| f.rows >= 20 && f.c0 > 0.0);
+    let residual = own
+        .iter()
+        .min_by(|a, b| a.sigma().total_cmp(&b.sigma()))
+        .map(|least| {
+            let all = pooled(&own, least.sigma());
+            Noise::from_increments(all.c0, all.c1).at_least(quantum_um2)
+        });
+    let sample_s = records.first().map_or(1e-3, |r| r.sample_s);
+    match (stated, residual) {
+        (Some(noise), Some(least))
+            if noise.innovation_um() < (1.0 + THRESHOLDS.stated_excess) * least.innovation_um() =>
+        {
+            Floor {
+                noise: noise.at_least(quantum_um2),
+                source: FloorSource::Stated,
+                rows: 0,
+            }
+        }
+        (_, least) => Floor {
+            noise: least.unwrap_or_else(|| Noise::new(0.33, sample_s, 0.03)),
+            source: FloorSource::Unknown,
+            rows: 0,
+        },
+    }
+}
+
+/// Those within 3 % of the least together.
+fn pooled(of: &[Estimate], least: f64) -> Estimate {
+    let near: Vec<&Estimate> = of.iter().filter(|f| f.sigma() <= 1.03 * least).collect();
+    let n: f64 = near.iter().map(|f| f.rows as f64).sum::<f64>().max(1.0);
+    let mean =
+        |get: fn(&Estimate) -> f64| near.iter().map(|f| get(f) * f.rows as f64).sum::<f64>() / n;
+    Estimate {
+        c0: mean(|f| f.c0),
+        c1: mean(|f| f.c1),
+        rows: n as usize,
+        source: FloorSource::Unknown,
+    }
+}
+
+/// Variance that the finest step of the position column adds: a sensor that counts is never better than that.
+fn quantisation_um2(records: &[Record]) -> f64 {
+    records
+        .iter()
+        .filter(|r| r.is_quantised())
+        .map(|r| r.resolution_um * r.resolution_um / 12.0)
+        .fold(0.0, f64::max)
+}
+
+/// From the innovations' own model: increments of the raw residuals of a fit that is believed.
+pub(crate) fn from_residuals(present: &[Vec<bool>], residuals: &[Vec<f64>]) -> Noise {
+    let (mut c0, mut c1, mut n) = (0.0, 0.0, 0.0);
+    for (p, e) in present.iter().zip(residuals) {
+        let (a, b, m) = increment_moments(e, p);
+        c0 += a * m as f64;
+        c1 += b * m as f64;
+        n += m as f64;
+    }
+    if n == 0.0 {
+        Noise::new(0.33, 1e-3, 0.03)
+    } else {
+        Noise::from_increments(c0 / n, c1 / n)
+    }
+}
+/// Rows that count, without those after an increment of more than six standard deviations (by the median of their sizes):
+/// a bead that jumps is no noise, and must not raise the floor under which its jumps would then hide.
+fn without_jumps(e: &[f64], present: &[bool]) -> Vec<bool> {
+    let mut sizes: Vec<f64> = (1..e.len())
+        .filter(|&k| present[k] && present[k - 1])
+        .map(|k| (e[k] - e[k - 1]).abs())
+        .collect();
+    if sizes.is_empty() {
+        return present.to_vec();
+    }
+    let middle = sizes.len() / 2;
+    let (_, median, _) = sizes.select_nth_unstable_by(middle, f64::total_cmp);
+    let limit = 6.0 * 1.4826 * *median;
+    (0..e.len())
+        .map(|k| {
+            let jumps = k > 0 && limit > 0.0 && (e[k] - e[k - 1]).abs() > limit;
+            present[k] && !jumps
+        })
+        .collect()
+}
+
+/// Takes lines at 50 and 60 Hz and their second harmonics off.
+fn without_lines(e: &[f64], present: &[bool], sample_s: f64) -> Vec<f64> {
+    let mut clean = e.to_vec();
+    for hz in [50.0, 60.0, 100.0, 120.0] {
+        if hz * sample_s > 0.45 {
+            continue;
+        }
+        // On increments, where the walk does not leak into the line.
+        let (mut ss, mut cc, mut sc, mut se, mut ce) = (0.0, 0.0, 0.0, 0.0, 0.0);
+        for k in 1..clean.len() {
+            if present[k] && present[k - 1] {
+                let w = TAU * hz * sample_s;
+                let (s1, c1) = (w * k as f64).sin_cos();
+                let (s0, c0) = (w * (k - 1) as f64).sin_cos();
+                let (s, c, d) = (s1 - s0, c1 - c0, clean[k] - clean[k - 1]);
+                ss += s * s;
+                cc += c * c;
+                sc += s * c;
+                se += s * d;
+                ce += c * d;
+            }
+        }
+        let det = ss * cc - sc * sc;
+        if det > 1e-12 {
+            let (a, b) = ((cc * se - sc * ce) / det, (ss * ce - sc * se) / det);
+            for (k, v) in clean.iter_mut().enumerate() {
+                let (s, c) = (TAU * hz * sample_s * k as f64).sin_cos();
+                *v -= a * s + b * c;
+            }
+        }
+    }
+    clean
+}

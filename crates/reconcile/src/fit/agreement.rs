@@ -1,0 +1,109 @@
+//! The predictor and the program's simulator take the same equations in another order: one property over the whole table
+//! of effects holds them together.
+
+use super::catalogue::variants;
+use crate::simulate::{Base, simulate};
+use cellpos_plant::effects::{self, Action, Scope};
+use cellpos_plant::{Model, SimulateOptions, Zpk};
+
+const ROWS: usize = 6000;
+
+/// A command with slow and fast parts about 4 um.
+fn command_um() -> Vec<f64> {
+    (0..ROWS)
+        .map(|k| {
+            let t = k as f64 * 1e-3;
+            let sine = |hz: f64| (std::f64::consts::TAU * hz * t).sin();
+            let wave =
+                4.0 + 0.8 * sine(1.7) + 0.5 * sine(11.0) + 0.3 * sine(43.0) + 0.2 * sine(131.0);
+            if k < 20 {
+                4.0
+            } else {
+                (wave * 1e4).round() / 1e4
+            }
+        })
+        .collect()
+}
+
+const SCOPE: Scope = Scope {
+    working_point_um: 4.0,
+    low_um: 2.0,
+    high_um: 6.0,
+    stroke_um: 2.0,
+    travel_um: 20.0,
+    sample_s: 1e-3,
+    length_s: 6.0,
+    sampled_input: false,
+};
+
+fn predicted(model: &Model, pzt_um: &[f64]) -> Vec<f64> {
+    let base = Base {
+        zpk: Zpk::of(&model.plant),
+        working_point_um: 4.0,
+        sample_s: 1e-3,
+        interpolated_input: false,
+        free_start: false,
+    };
+    let u: Vec<f64> = pzt_um.iter().map(|v| v - 4.0).collect();
+    let mut y = Vec::new();
+    simulate(&base, &u, &model.effects, &mut y, None);
+    y
+}
+
+fn simulated(model: &Model, pzt_um: &[f64]) -> Vec<f64> {
+    match cellpos_plant::simulate(model, pzt_um, 1e-3, &SimulateOptions::default()) {
+        Ok(y) => y,
+        Err(e) => panic!("{}: {e}", model.name),
+    }
+}
+
+/// RMS of the difference, each from its own start \[um\].
+fn apart_um(a: &[f64], b: &[f64]) -> f64 {
+    let sum: f64 = a
+        .iter()
+        .zip(b)
+        .map(|(x, y)| ((x - a[0]) - (y - b[0])).powi(2))
+        .sum();
+    (sum / a.len() as f64).sqrt()
+}
+
+#[test]
+fn the_predictor_and_the_simulator_of_the_program_agree_on_every_effect_that_is_looked_for() {
+    let u = command_um();
+    let bare = simulated(&Model::eq6(), &u);
+    let own = apart_um(&predicted(&Model::eq6(), &u), &bare);
+    assert!(own < 1e-6, "Eq. (6) alone: {own} um apart");
+    let mut bad = Vec::new();
+    for variant in variants() {
+        for start in variant.starts(&SCOPE) {
+            let effect = start.effect(&SCOPE);
+            if matches!(effect.act(), Action::Show(_)) {
+                continue;
+            }
+            let model = Model::eq6().with_effect(effect.clone());
+            let truth = simulated(&model, &u);
+            let size = apart_um(&truth, &bare);
+            let error = apart_um(&predicted(&model, &u), &truth);
+            if error > 1e-3 * size.max(0.01) {
+                bad.push(format!(
+                    "{effect:?}: {error:.2e} um of an effect of {size:.2e} um"
+                ));
+            }
+        }
+    }
+    assert!(bad.is_empty(), "{}", bad.join("\n"));
+}
+
+#[test]
+fn a_delay_goes_through_whole_frames_without_a_cliff() {
+    let u = command_um();
+    let at = |delay_s: f64| predicted(&Model::eq6().with_effect(effects::time_delay(delay_s)), &u);
+    let whole = at(0.002);
+    for off_s in [1e-12, 1e-10, 1e-8, 1e-6] {
+        for delay_s in [0.002 - off_s, 0.002 + off_s] {
+            // The bead moves at up to some 400 um/s per um of displacement.
+            let apart = apart_um(&at(delay_s), &whole);
+            assert!(apart < 1000.0 * off_s + 1e-9, "{delay_s} s: {apart} um");
+        }
+    }
+}

@@ -1,0 +1,153 @@
+//! What a fit is given and what it hands back.
+
+use crate::fit::catalogue::{Part, Variant};
+use crate::fit::position_error::Locking;
+use crate::problem::{Mask, Problem};
+use crate::simulate::{Effect, Place, simulate};
+use cellpos_plant::effects::{Candidate, Role, Scope, find};
+use nalgebra::DMatrix;
+
+/// What the fit needs to know apart from the data: ranges, and the effects that the model already has.
+#[derive(Debug, Clone)]
+pub(crate) struct Context<'a> {
+    pub problem: &'a Problem,
+    pub scope: Scope,
+    pub fixed: Vec<Effect>,
+    /// Everything that may be tried.
+    pub variants: Vec<Variant>,
+    /// The base model's gain is free in every fit, the null included: a base fitted to these very records.
+    pub free_gain: bool,
+    pub white: Option<WhiteEvidence>,
+    /// The positions come in steps that are not small beside their increments.
+    pub quantised: bool,
+}
+
+/// What the size of the white noise says about averaging in the camera.
+///
+/// With a held command and a bead that follows at once, the path between two commands is straight, and the mean over an
+/// exposure inside that time IS the position in its middle: an exposure Te and a delay Te/2 give the same response. The
+/// Brownian motion tells them apart: averaged over Te it lowers the white part of the noise by `2 D dt Te/(6 dt)`.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct WhiteEvidence {
+    /// Estimated from the records \[um^2\].
+    pub estimate_um2: f64,
+    /// Standard error of that.
+    pub error_um2: f64,
+    /// What the model's localisation noise gives \[um^2\].
+    pub model_um2: f64,
+    /// `2 D dt` \[um^2\].
+    pub walk_um2: f64,
+}
+
+impl WhiteEvidence {
+    /// Squared distance, in standard deviations, between the estimate and what a set of parts leads one to expect.
+    pub fn distance(&self, parts: &[Part], sample_s: f64) -> f64 {
+        let exposure_s: f64 = parts
+            .iter()
+            .filter(|p| p.id() == "exposure-averaging")
+            .map(|p| p.natural()[0])
+            .sum();
+        let expected = self.model_um2 - self.walk_um2 * (exposure_s / sample_s).min(2.0) / 6.0;
+        ((self.estimate_um2 - expected) / self.error_um2).powi(2)
+    }
+}
+
+/// A fitted set of candidates.
+#[derive(Debug, Clone)]
+pub(crate) struct Fit {
+    pub parts: Vec<Part>,
+    /// Share of the newest command \[um per um\].
+    pub soft: f64,
+    /// Factor on the base model's gain; 1 unless it is free.
+    pub gain: f64,
+    /// Standard errors of `soft` and `gain`.
+    pub errors: [f64; 2],
+    /// Sine and cosine of each line in each record \[um\].
+    pub lines: Vec<Vec<[f64; 2]>>,
+    /// Sine and cosine of each position-periodic error \[um\].
+    pub positions: Vec<[f64; 2]>,
+    /// Those errors by the exact filter, once they are looked at so closely: by part.
+    pub locking: Vec<Option<Locking>>,
+    /// Sum of squares over the mask.
+    pub chi2: f64,
+    /// Innovations that count under the mask.
+    pub count: usize,
+    /// Innovations of all rows, masked or not, of all records.
+    pub innovations: Vec<Vec<f64>>,
+    /// Covariance of the parameters of the parts, in the fit's coordinates, in order.
+    pub covariance: DMatrix<f64>,
+}
+
+impl Fit {
+    /// Free parameters that describe effects: of the parts, and the amplitudes of lines.
+    pub fn freedom(&self) -> usize {
+        self.parts
+            .iter()
+            .map(|p| freedom_of(p.variant(), self.innovations.len()))
+            .sum()
+    }
+
+    pub fn has(&self, id: &str) -> bool {
+        self.parts.iter().any(|p| p.id() == id)
+    }
+
+    /// Sum of squares of the innovations under another mask.
+    pub fn chi2_on(&self, mask: &Mask) -> f64 {
+        self.innovations
+            .iter()
+            .zip(mask)
+            .map(|(e, ranges)| {
+                ranges
+                    .iter()
+                    .map(|r| e[r.clone()].iter().map(|x| x * x).sum::<f64>())
+                    .sum::<f64>()
+            })
+            .sum()
+    }
+}
+
+/// Number of free numbers that a variant brings.
+pub(crate) fn freedom_of(v: &Candidate, records: usize) -> usize {
+    v.params.len()
+        + match v.role {
+            Role::Chain => 0,
+            Role::Line => 2 * records,
+            Role::Position => 2,
+        }
+}
+
+impl Context<'_> {
+    /// Whether an effect is no candidate: behind a bare actuator there is neither a chip nor a bead, and a free gain
+    /// is no error; a sensor that counts in steps has no pixels.
+    pub fn excludes(&self, id: &str) -> bool {
+        if self.quantised && id == "pixel-locking" {
+            return true;
+        }
+        self.free_gain
+            && find(id).is_some_and(|k| matches!(k.spec().place, Place::Chip | Place::Bead))
+    }
+
+    /// The effects of the model and of a set, as they are simulated.
+    pub fn effects(&self, parts: &[Part]) -> Vec<Effect> {
+        let mut effects = self.fixed.clone();
+        effects.extend(parts.iter().map(|p| p.effect(&self.scope)));
+        effects
+    }
+
+    /// Simulated positions of the records that count under a mask; empty for the others.
+    pub fn simulated(&self, parts: &[Part], mask: &Mask) -> Vec<Vec<f64>> {
+        let effects = self.effects(parts);
+        self.problem
+            .records
+            .iter()
+            .zip(mask)
+            .map(|(r, ranges)| {
+                let mut y = Vec::new();
+                if !ranges.is_empty() {
+                    simulate(&self.problem.base, &r.u, &effects, &mut y, None);
+                }
+                y
+            })
+            .collect()
+    }
+}

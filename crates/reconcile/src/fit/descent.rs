@@ -1,0 +1,247 @@
+//! Joint fit of any set of candidates by Levenberg-Marquardt on the innovations.
+//!
+//! Every fit, that of the null included, also has the linear nuisances: the share of the newest command in a frame,
+//! and (inside the whitening filter) each record's start.
+
+use crate::fit::catalogue::Part;
+use crate::fit::context::{Context, Fit, freedom_of};
+use crate::fit::linear::{Tangents, normal_equations};
+use crate::problem::Mask;
+use cellpos_plant::effects::Role;
+use nalgebra::{DMatrix, DVector};
+
+/// Precision with which a weight of a play operator keeps its value in one step of a fit: nothing beside what a record
+/// in which the operator moves has to say.
+const WEIGHT_PRECISION: f64 = 100.0;
+
+impl Context<'_> {
+    /// Fits a set of candidates from starting values.
+    pub fn fit(&self, parts: Vec<Part>, mask: &Mask, iterations: usize) -> Fit {
+        self.fit_from(parts, None, mask, iterations)
+    }
+
+    /// Carries a fit on.
+    pub fn refit(&self, fit: &Fit, mask: &Mask, iterations: usize) -> Fit {
+        self.run(fit.clone(), mask, iterations)
+    }
+
+    /// As [`Self::fit`], with the nuisances of an earlier fit as starting values where they apply.
+    pub fn fit_from(
+        &self,
+        parts: Vec<Part>,
+        soft: Option<f64>,
+        mask: &Mask,
+        iterations: usize,
+    ) -> Fit {
+        let records = self.problem.records.len();
+        let lines = parts
+            .iter()
+            .filter(|p| p.variant().role == Role::Line)
+            .count();
+        let positions = parts
+            .iter()
+            .filter(|p| p.variant().role == Role::Position)
+            .count();
+        let fit = Fit {
+            parts,
+            soft: soft.unwrap_or(0.0),
+            gain: 1.0,
+            errors: [0.0; 2],
+            lines: vec![vec![[0.0; 2]; records]; lines],
+            positions: vec![[0.0; 2]; positions],
+            locking: Vec::new(),
+            chi2: 0.0,
+            count: self.problem.count(mask),
+            innovations: Vec::new(),
+            covariance: DMatrix::zeros(0, 0),
+        };
+        self.run(fit, mask, iterations)
+    }
+
+    fn run(&self, mut fit: Fit, mask: &Mask, iterations: usize) -> Fit {
+        fit.count = self.problem.count(mask);
+        let mut state = self.state(&fit, mask);
+        let mut lambda = 1e-3;
+        let mut size;
+        let mut normal;
+        let mut round = 0;
+        loop {
+            let (n, columns) = self.columns(&fit, &state, mask);
+            size = n;
+            let (a, g) = normal_equations(n, &columns, &state.innovations, mask);
+            normal = a;
+            // Operators wider than any swing of the records never move: their weights stay where they are.
+            let mut at = 0;
+            for p in &fit.parts {
+                for (j, q) in p.variant().params.iter().enumerate() {
+                    if q.name == "weights" {
+                        normal[(at + j, at + j)] += WEIGHT_PRECISION;
+                    }
+                }
+                at += freedom_of(p.variant(), self.problem.records.len());
+            }
+            if round >= iterations {
+                break;
+            }
+            round += 1;
+            let mut improved = 0.0;
+            for _ in 0..8 {
+                let mut damped = normal.clone();
+                for i in 0..n {
+                    damped[(i, i)] += lambda * normal[(i, i)]
+                        + 1e-12
+                        + if normal[(i, i)] == 0.0 { 1.0 } else { 0.0 };
+                }
+                let Some(step) = damped.cholesky().map(|c| c.solve(&(-&g))) else {
+                    lambda *= 10.0;
+                    continue;
+                };
+                let trial = self.stepped(&fit, &step);
+                let trial_state = self.state(&trial, mask);
+                if trial_state.chi2 < state.chi2 {
+                    improved = state.chi2 - trial_state.chi2;
+                    fit = trial;
+                    state = trial_state;
+                    lambda = (lambda * 0.2).max(1e-9);
+                    break;
+                }
+                // A step that changes next to nothing: converged.
+                if trial_state.chi2 - state.chi2 < 1e-3 {
+                    break;
+                }
+                lambda = (lambda * 8.0).max(1e-6);
+            }
+            if improved < 0.02 {
+                break;
+            }
+        }
+        fit.chi2 = state.chi2;
+        fit.innovations = if mask.iter().any(Vec::is_empty) {
+            self.state(&fit, &self.problem.all()).innovations
+        } else {
+            state.innovations
+        };
+        let mut regular = normal.clone();
+        for i in 0..size {
+            regular[(i, i)] +=
+                1e-9 * normal[(i, i)] + if normal[(i, i)] == 0.0 { 1e9 } else { 0.0 };
+        }
+        let inverse = regular
+            .try_inverse()
+            .unwrap_or_else(|| DMatrix::identity(size, size));
+        let sd = |i: usize| {
+            if normal[(i, i)] > 0.0 {
+                inverse[(i, i)].max(0.0).sqrt()
+            } else {
+                0.0
+            }
+        };
+        fit.errors = if self.free_gain {
+            [sd(size - 2), sd(size - 1)]
+        } else {
+            [sd(size - 1), 0.0]
+        };
+        fit.covariance = self.effect_covariance(&fit, &inverse);
+        fit
+    }
+
+    fn stepped(&self, fit: &Fit, step: &DVector<f64>) -> Fit {
+        let mut t = fit.clone();
+        let records = self.problem.records.len();
+        let mut next = 0;
+        let (mut line, mut position) = (0, 0);
+        for part in &mut t.parts {
+            let v = part.variant();
+            match v.role {
+                Role::Chain => {
+                    for (x, p) in part.theta.iter_mut().zip(v.params) {
+                        // A logarithm that wants to move more than a factor of four is not in its linear range.
+                        let d = if p.log {
+                            step[next].clamp(-1.4, 1.4)
+                        } else {
+                            step[next]
+                        };
+                        *x = p.coordinate(p.natural(*x + d));
+                        next += 1;
+                    }
+                }
+                Role::Line => {
+                    let p = &v.params[0];
+                    part.theta[0] =
+                        p.coordinate(p.natural(part.theta[0] + step[next].clamp(-0.05, 0.05)));
+                    for i in 0..records {
+                        t.lines[line][i][0] += step[next + 1 + 2 * i];
+                        t.lines[line][i][1] += step[next + 2 + 2 * i];
+                    }
+                    next += 1 + 2 * records;
+                    line += 1;
+                }
+                Role::Position => {
+                    let p = &v.params[0];
+                    part.theta[0] =
+                        p.coordinate(p.natural(part.theta[0] + step[next].clamp(-0.02, 0.02)));
+                    t.positions[position][0] += step[next + 1];
+                    t.positions[position][1] += step[next + 2];
+                    next += 3;
+                    position += 1;
+                }
+            }
+        }
+        t.soft = (t.soft + step[next]).clamp(self.problem.soft.0, self.problem.soft.1);
+        if self.free_gain {
+            t.gain = (t.gain + step[next + 1]).clamp(0.05, 20.0);
+        }
+        t
+    }
+
+    /// The rows and columns of the parts' own parameters.
+    fn effect_covariance(&self, fit: &Fit, inverse: &DMatrix<f64>) -> DMatrix<f64> {
+        let mut indices = Vec::new();
+        let mut next = 0;
+        for part in &fit.parts {
+            let n = part.variant().params.len();
+            indices.extend(next..next + n);
+            next += freedom_of(part.variant(), self.problem.records.len());
+        }
+        DMatrix::from_fn(indices.len(), indices.len(), |i, j| {
+            inverse[(indices[i], indices[j])]
+        })
+    }
+
+    /// Tangents at a fit, for screening further candidates.
+    pub fn tangents(&self, fit: &Fit, mask: &Mask) -> Tangents {
+        let state = self.state(fit, mask);
+        let (n, columns) = self.columns(fit, &state, mask);
+        let (normal, gradient) = normal_equations(n, &columns, &state.innovations, mask);
+        let mut regular = normal.clone();
+        for i in 0..n {
+            regular[(i, i)] +=
+                1e-9 * normal[(i, i)] + if normal[(i, i)] == 0.0 { 1.0 } else { 0.0 };
+        }
+        let inverse = regular
+            .try_inverse()
+            .unwrap_or_else(|| DMatrix::identity(n, n));
+        Tangents {
+            columns,
+            inverse,
+            gradient,
+        }
+    }
+
+    /// Innovations of a set with given nuisances, without fitting.
+    pub fn innovations(&self, fit: &Fit, mask: &Mask) -> (Vec<Vec<f64>>, f64) {
+        let s = self.state(fit, mask);
+        (s.innovations, s.chi2)
+    }
+
+    /// Raw residual of a fit in the records that count under a mask; empty for the others.
+    pub fn residual_under(&self, fit: &Fit, mask: &Mask) -> Vec<Vec<f64>> {
+        self.state(fit, mask).residual
+    }
+
+    /// Raw residual and simulated position of a fit.
+    pub fn residual(&self, fit: &Fit) -> (Vec<Vec<f64>>, Vec<Vec<f64>>) {
+        let s = self.state(fit, &self.problem.all());
+        (s.residual, s.sim)
+    }
+}

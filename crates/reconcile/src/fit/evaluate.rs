@@ -1,0 +1,230 @@
+//! One evaluation of a set of parts: innovations, and their derivatives by every free number.
+
+use crate::fit::catalogue::Part;
+use crate::fit::context::{Context, Fit};
+use crate::fit::linear::{Columns, sum_squares};
+use crate::problem::Mask;
+use crate::simulate::simulate;
+use cellpos_plant::effects::{FitParameter, Role};
+use std::f64::consts::TAU;
+
+/// One evaluation of the model.
+pub(crate) struct State {
+    pub sim: Vec<Vec<f64>>,
+    /// Raw residual.
+    pub residual: Vec<Vec<f64>>,
+    pub innovations: Vec<Vec<f64>>,
+    /// Whitened edges.
+    pub soft: Vec<Vec<f64>>,
+    pub chi2: f64,
+}
+
+impl Context<'_> {
+    pub fn state(&self, fit: &Fit, mask: &Mask) -> State {
+        let effects = self.effects(&fit.parts);
+        let mut edge = Vec::new();
+        let (mut sim, mut soft) = (Vec::new(), Vec::new());
+        for (r, ranges) in self.problem.records.iter().zip(mask) {
+            let mut y = Vec::new();
+            // A record that does not count costs nothing.
+            if ranges.is_empty() {
+                sim.push(Vec::new());
+                soft.push(Vec::new());
+                continue;
+            }
+            simulate(&self.problem.base, &r.u, &effects, &mut y, Some(&mut edge));
+            if fit.gain != 1.0 {
+                y.iter_mut().for_each(|y| *y *= fit.gain);
+            }
+            sim.push(y);
+            let mut w = vec![0.0; edge.len()];
+            if edge.iter().any(|e| *e != 0.0) {
+                r.whiten(&edge, &mut w);
+            }
+            soft.push(w);
+        }
+        let mut residual = Vec::with_capacity(sim.len());
+        let mut innovations = Vec::with_capacity(sim.len());
+        for (i, (r, s)) in self.problem.records.iter().zip(&sim).enumerate() {
+            if s.is_empty() {
+                residual.push(Vec::new());
+                innovations.push(Vec::new());
+                continue;
+            }
+            let mut e: Vec<f64> = r.y.iter().zip(s).map(|(y, s)| y - s).collect();
+            let mut line = 0;
+            let mut position = 0;
+            for p in &fit.parts {
+                match p.variant().role {
+                    Role::Chain => {}
+                    Role::Line => {
+                        let [a, b] = fit.lines[line][i];
+                        if a != 0.0 || b != 0.0 {
+                            self.rotate(p.natural()[0], e.len(), |k, sin, cos| {
+                                e[k] -= a * sin + b * cos
+                            });
+                        }
+                        line += 1;
+                    }
+                    Role::Position => {
+                        let [a, b] = fit.positions[position];
+                        if a != 0.0 || b != 0.0 {
+                            let pixel = p.natural()[0];
+                            // Once to take the error off the neighbours that tell the position, once in earnest.
+                            let mut straight = e.clone();
+                            for _ in 0..2 {
+                                let walk = r.whitener.around(&straight);
+                                for k in 0..e.len() {
+                                    let (sin, cos) = (TAU * (s[k] + walk[k]) / pixel).sin_cos();
+                                    straight[k] = e[k] - a * sin - b * cos;
+                                }
+                            }
+                            e = straight;
+                        }
+                        position += 1;
+                    }
+                }
+            }
+            let mut w = vec![0.0; e.len()];
+            r.whiten(&e, &mut w);
+            for (w, s) in w.iter_mut().zip(&soft[i]) {
+                *w -= fit.soft * s;
+            }
+            residual.push(e);
+            innovations.push(w);
+        }
+        let chi2 = sum_squares(&innovations, mask);
+        State {
+            sim,
+            residual,
+            innovations,
+            soft,
+            chi2,
+        }
+    }
+
+    /// Calls `f(k, sin, cos)` of a line at every row.
+    fn rotate(&self, hz: f64, rows: usize, mut f: impl FnMut(usize, f64, f64)) {
+        for k in 0..rows {
+            let (s, c) = (TAU * hz * k as f64 * self.problem.base.sample_s).sin_cos();
+            f(k, s, c);
+        }
+    }
+
+    /// Whitened derivative columns of the innovations at a state.
+    pub fn columns(&self, fit: &Fit, state: &State, mask: &Mask) -> (usize, Vec<Columns>) {
+        let records = &self.problem.records;
+        let counted = |i: usize| !mask[i].is_empty();
+        let mut columns: Vec<Columns> = records.iter().map(|_| Vec::new()).collect();
+        let mut next = 0;
+        let (mut line, mut position) = (0, 0);
+        for (index, part) in fit.parts.iter().enumerate() {
+            match part.variant().role {
+                Role::Chain => {
+                    for (j, p) in part.variant().params.iter().enumerate() {
+                        let (parts, step) = self.nudged(&fit.parts, index, j, p);
+                        let moved = self.simulated(&parts, mask);
+                        for (i, r) in records.iter().enumerate().filter(|(i, _)| counted(*i)) {
+                            let d: Vec<f64> = moved[i]
+                                .iter()
+                                .zip(&state.sim[i])
+                                .map(|(a, b)| (b - fit.gain * a) / step)
+                                .collect();
+                            let mut c = vec![0.0; d.len()];
+                            r.whiten(&d, &mut c);
+                            columns[i].push((next, c));
+                        }
+                        next += 1;
+                    }
+                }
+                Role::Line => {
+                    let hz = part.natural()[0];
+                    for (i, r) in records.iter().enumerate().filter(|(i, _)| counted(*i)) {
+                        let n = r.u.len();
+                        let [a, b] = fit.lines[line][i];
+                        let mut d = [vec![0.0; n], vec![0.0; n], vec![0.0; n]];
+                        self.rotate(hz, n, |k, s, c| {
+                            d[0][k] =
+                                -TAU * k as f64 * self.problem.base.sample_s * (a * c - b * s);
+                            d[1][k] = -s;
+                            d[2][k] = -c;
+                        });
+                        for (j, d) in d.iter().enumerate() {
+                            let mut w = vec![0.0; n];
+                            r.whiten(d, &mut w);
+                            // Frequency is common; sine and cosine are this record's own.
+                            let at = if j == 0 { next } else { next + 2 * i + j };
+                            if j > 0 || a != 0.0 || b != 0.0 {
+                                columns[i].push((at, w));
+                            }
+                        }
+                    }
+                    next += 1 + 2 * records.len();
+                    line += 1;
+                }
+                Role::Position => {
+                    let pixel = part.natural()[0];
+                    let [a, b] = fit.positions[position];
+                    for (i, r) in records.iter().enumerate().filter(|(i, _)| counted(*i)) {
+                        let n = r.u.len();
+                        let walk = r.whitener.around(&state.residual[i]);
+                        let mut d = [vec![0.0; n], vec![0.0; n], vec![0.0; n]];
+                        for k in 0..n {
+                            let angle = TAU * (state.sim[i][k] + walk[k]) / pixel;
+                            let (s, c) = angle.sin_cos();
+                            d[0][k] = angle * (a * c - b * s);
+                            d[1][k] = -s;
+                            d[2][k] = -c;
+                        }
+                        for (j, d) in d.iter().enumerate() {
+                            let mut w = vec![0.0; n];
+                            r.whiten(d, &mut w);
+                            if j > 0 || a != 0.0 || b != 0.0 {
+                                columns[i].push((next + j, w));
+                            }
+                        }
+                    }
+                    next += 3;
+                    position += 1;
+                }
+            }
+        }
+        for (columns, soft) in columns.iter_mut().zip(&state.soft) {
+            columns.push((next, soft.iter().map(|s| -s).collect()));
+        }
+        next += 1;
+        if self.free_gain {
+            // The weights of the play operators hold a gain of their own.
+            if !fit.parts.iter().any(|p| p.variant().holds_gain()) {
+                for ((columns, sim), r) in columns.iter_mut().zip(&state.sim).zip(records) {
+                    if sim.is_empty() {
+                        continue;
+                    }
+                    let d: Vec<f64> = sim.iter().map(|s| -s / fit.gain).collect();
+                    let mut c = vec![0.0; d.len()];
+                    r.whiten(&d, &mut c);
+                    columns.push((next, c));
+                }
+            }
+            next += 1;
+        }
+        (next, columns)
+    }
+
+    /// The parts with one parameter moved by its step, towards the inside of its bounds.
+    fn nudged(&self, parts: &[Part], index: usize, j: usize, p: &FitParameter) -> (Vec<Part>, f64) {
+        let mut parts = parts.to_vec();
+        let x = parts[index].theta[j];
+        let mut step = p.step
+            * if p.log {
+                1.0
+            } else {
+                (x.abs() / (50.0 * p.step)).clamp(1.0, 10.0)
+            };
+        if (if p.log { (x + step).exp() } else { x + step }) > p.upper {
+            step = -step;
+        }
+        parts[index].theta[j] = x + step;
+        (parts, step)
+    }
+}

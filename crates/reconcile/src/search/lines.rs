@@ -1,0 +1,84 @@
+//! A line in what is left of a fit, with an amplitude and a phase of its own in every record.
+
+use crate::dot::dot;
+use crate::fit::context::{Context, Fit};
+use crate::problem::Mask;
+use crate::search::lead::line_score;
+use std::f64::consts::TAU;
+
+/// What a line leaves over.
+pub(crate) struct Line {
+    pub hz: f64,
+    /// Mean over the records \[um\].
+    pub amplitude_um: f64,
+    pub left: Vec<Vec<f64>>,
+}
+
+/// Takes a line off, amplitude and phase of every record from the rows of a mask.
+pub(crate) fn without_line(ctx: &Context<'_>, fit: &Fit, hz: f64, train: &Mask) -> Option<Line> {
+    let mut left = fit.innovations.clone();
+    let mut sum = 0.0;
+    for ((r, e), mask) in ctx.problem.records.iter().zip(&mut left).zip(train) {
+        let n = e.len();
+        let (s, c): (Vec<f64>, Vec<f64>) = (0..n)
+            .map(|k| (TAU * hz * k as f64 * ctx.problem.base.sample_s).sin_cos())
+            .unzip();
+        let (mut ws, mut wc) = (vec![0.0; n], vec![0.0; n]);
+        r.whiten(&s, &mut ws);
+        r.whiten(&c, &mut wc);
+        let rows = mask.first()?.clone();
+        let (ws_in, wc_in, e_in) = (&ws[rows.clone()], &wc[rows.clone()], &e[rows]);
+        let (ss, cc, sc) = (dot(ws_in, ws_in), dot(wc_in, wc_in), dot(ws_in, wc_in));
+        let (se, ce) = (dot(ws_in, e_in), dot(wc_in, e_in));
+        let det = ss * cc - sc * sc;
+        if det <= 1e-9 * ss * cc {
+            continue;
+        }
+        let (a, b) = ((cc * se - sc * ce) / det, (ss * ce - sc * se) / det);
+        sum += a.hypot(b);
+        for (e, (s, c)) in e.iter_mut().zip(ws.iter().zip(&wc)) {
+            *e -= a * s + b * c;
+        }
+    }
+    Some(Line {
+        hz,
+        amplitude_um: sum / ctx.problem.records.len() as f64,
+        left,
+    })
+}
+
+/// The frequency of the strongest line in the innovations that is on no line of the command, if any stands out.
+pub(crate) fn strongest_line(ctx: &Context<'_>, fit: &Fit) -> Option<f64> {
+    let mask = ctx.problem.all();
+    let coarse: Vec<f64> = (0..480)
+        .map(|i| 3.05 + f64::from(i))
+        .filter(|f| f * ctx.problem.base.sample_s < 0.48)
+        .collect();
+    // The longest record decides; a line is everywhere.
+    let longest = (0..ctx.problem.records.len()).max_by_key(|i| ctx.problem.records[*i].u.len())?;
+    let e = &fit.innovations[longest];
+    let n = e.len().min(4000);
+    let mut best = (0.0, 0.0);
+    for f in coarse {
+        for part in 0..8 {
+            let hz = f + f64::from(part) / 8.0;
+            let (mut s, mut c) = (0.0, 0.0);
+            for (k, e) in e[..n].iter().enumerate() {
+                let (a, b) = (TAU * hz * k as f64 * ctx.problem.base.sample_s).sin_cos();
+                s += a * e;
+                c += b * e;
+            }
+            let p = 2.0 * (s * s + c * c) / n as f64;
+            if p > best.1 {
+                best = (hz, p);
+            }
+        }
+    }
+    if best.1 < 40.0 {
+        return None;
+    }
+    let fine = (0..41).map(|i| best.0 - 0.1 + f64::from(i) * 0.005);
+    fine.map(|hz| (hz, line_score(ctx, fit, hz, &mask)))
+        .max_by(|a, b| a.1.total_cmp(&b.1))
+        .map(|b| b.0)
+}

@@ -1,0 +1,7 @@
+//! Which candidates to fit: screening, additions one after another, replacements.
+
+pub(crate) mod lead;
+pub(crate) mod lines;
+mod pixel;
+mod screen;
+pub(crate) mod sequential;

@@ -1,0 +1,73 @@
+//! Screening: what would each candidate gain at each of its starting values, without a full fit.
+//!
+//! One simulation per starting value gives a direction in the space of innovations; projected against the tangents of
+//! the present fit it says how much the sum of squares falls when the candidate is scaled best and all else refitted.
+
+use crate::fit::catalogue::{Part, Variant};
+use crate::fit::context::{Context, Fit};
+use crate::fit::linear::Tangents;
+use crate::parallel;
+use crate::problem::Mask;
+use crate::search::lead::{Lead, line_score};
+use crate::search::pixel::pixel_scan;
+use cellpos_plant::effects::Role;
+
+/// The best start of every variant not excluded, best first.
+pub(crate) fn screen(
+    ctx: &Context<'_>,
+    fit: &Fit,
+    tangents: &Tangents,
+    mask: &Mask,
+    threads: usize,
+    allowed: impl Fn(Variant) -> bool,
+) -> Vec<Lead> {
+    let mut jobs: Vec<Part> = Vec::new();
+    for v in &ctx.variants {
+        if allowed(*v) && v.candidate().role != Role::Position {
+            jobs.extend(v.starts(&ctx.scope));
+        }
+    }
+    let sim = ctx.simulated(&fit.parts, mask);
+    let scores = parallel::map(&jobs, threads, |part| match part.variant().role {
+        Role::Line => line_score(ctx, fit, part.natural()[0], mask),
+        _ => {
+            let mut parts = fit.parts.clone();
+            parts.push(part.clone());
+            let moved = ctx.simulated(&parts, mask);
+            let d: Vec<Vec<f64>> = ctx
+                .problem
+                .records
+                .iter()
+                .zip(moved.iter().zip(&sim))
+                .map(|(r, (m, s))| {
+                    let d: Vec<f64> = m.iter().zip(s).map(|(m, s)| fit.gain * (s - m)).collect();
+                    let mut w = vec![0.0; d.len()];
+                    r.whiten(&d, &mut w);
+                    w
+                })
+                .collect();
+            let g = tangents.gain(&d, &fit.innovations, mask);
+            if g.scale > 0.02 { g.score } else { 0.0 }
+        }
+    });
+    let mut best: Vec<Lead> = Vec::new();
+    for (part, score) in jobs.into_iter().zip(scores) {
+        match best.iter_mut().find(|l| l.part.variant == part.variant) {
+            Some(lead) if lead.score < score => *lead = Lead { part, score },
+            Some(_) => {}
+            None => best.push(Lead { part, score }),
+        }
+    }
+    if let Some(v) = ctx
+        .variants
+        .iter()
+        .find(|v| v.candidate().role == Role::Position)
+        && allowed(*v)
+        && let Some(lead) = pixel_scan(ctx, fit, *v, mask, threads)
+    {
+        best.push(lead);
+    }
+    // A stable sort: what gains the same comes in the order of the table.
+    best.sort_by(|a, b| b.score.total_cmp(&a.score));
+    best
+}

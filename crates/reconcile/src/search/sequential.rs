@@ -1,0 +1,422 @@
+//! The sequential search: add the best candidate, look again, take back what is no longer needed, try replacements.
+
+use crate::fit::catalogue::{self, Part};
+use crate::fit::context::{Context, Fit, freedom_of};
+use crate::parallel;
+use crate::problem::Mask;
+use crate::search::screen::screen;
+use crate::thresholds::THRESHOLDS;
+use cellpos_plant::effects::Candidate;
+
+/// How hard to search.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Effort {
+    pub threads: usize,
+    pub max_effects: usize,
+}
+
+/// A set with the rivals met on the way.
+#[derive(Debug, Clone)]
+pub(crate) struct Found {
+    pub fit: Fit,
+    pub null: Fit,
+    /// Sum of squares after each step, with the set of that step.
+    pub steps: Vec<(Vec<&'static str>, f64)>,
+    /// For each effect of the set: rivals in its stead, id and sum of squares of the joint refit.
+    pub rivals: Vec<Vec<Rival>>,
+}
+
+/// Another candidate in the stead of a named one.
+#[derive(Debug, Clone)]
+pub(crate) struct Rival {
+    pub id: &'static str,
+    pub chi2: f64,
+    pub part: Part,
+}
+
+/// Upper quantile of chi-square with `k` degrees of freedom at `z` standard normal deviations (Wilson-Hilferty).
+pub(crate) fn chi2_quantile(k: f64, z: f64) -> f64 {
+    let a = 2.0 / (9.0 * k);
+    k * (1.0 - a + z * a.sqrt()).powi(3)
+}
+
+/// What an addition must gain to count: family-wise 5 % over all variants, their starts and the scan of pixel sizes
+/// (about 2000 trials, 4.1 standard deviations), times 1.3 for the error of the noise estimate.
+pub(crate) fn threshold(freedom: usize) -> f64 {
+    THRESHOLDS.addition_noise * chi2_quantile(freedom as f64, THRESHOLDS.addition_sd)
+}
+
+/// The same for a variant in a problem of so many records.
+fn threshold_of(v: &Candidate, records: usize) -> f64 {
+    threshold(freedom_of(v, records))
+}
+
+/// Sum of squares with a price per parameter, so that a form with many numbers wins only if it is worth them.
+fn penalised_cost(ctx: &Context<'_>, fit: &Fit) -> f64 {
+    let left = left_over(fit);
+    let typical: f64 = fit.parts.iter().map(|p| prior_penalty(p, left)).sum();
+    // Decides ties only: the localisation noise of a rig need not be that of its model.
+    let white = ctx.white.map_or(0.0, |w| {
+        w.distance(&fit.parts, ctx.problem.base.sample_s).min(40.0)
+    });
+    fit.chi2 + 8.0 * fit.freedom() as f64 + typical + white
+}
+
+/// Sum of squares beyond the noise.
+pub(crate) fn left_over(fit: &Fit) -> f64 {
+    (fit.chi2 - fit.count as f64).max(0.0)
+}
+
+/// A price for a main parameter outside the range that real rigs show: decides ties between names. A fit that leaves
+/// something over (`left`) is wrong somewhere else, and by how much tells how little its last percent decides.
+pub(crate) fn prior_penalty(part: &Part, left: f64) -> f64 {
+    let v = part.variant();
+    let x = part.natural()[0];
+    if x < v.typical.0 || x > v.typical.1 {
+        12.0 + 0.2 * left
+    } else {
+        0.0
+    }
+}
+
+/// Fits the best leads next to a set and returns the fits, best first.
+fn extensions(
+    ctx: &Context<'_>,
+    fit: &Fit,
+    mask: &Mask,
+    effort: Effort,
+    wide: usize,
+    forbidden: &[&str],
+    least: f64,
+) -> Vec<Fit> {
+    let tangents = ctx.tangents(fit, mask);
+    let leads = screen(ctx, fit, &tangents, mask, effort.threads, |v| {
+        !v.candidate().late
+            && !ctx.excludes(v.id())
+            && !fit.has(v.id())
+            && !forbidden.contains(&v.id())
+    });
+    let records = ctx.problem.records.len();
+    let worth: Vec<Part> = leads
+        .into_iter()
+        .filter(|l| {
+            let least = if l.part.variant().off_response {
+                0.0
+            } else {
+                least
+            };
+            l.score > 0.5 * threshold_of(l.part.variant(), records).max(least)
+        })
+        .map(|l| l.part)
+        .collect();
+    // The best form of each effect, and the second of those with forms that are no limits of each other.
+    let mut seen: Vec<&str> = Vec::new();
+    let worth = worth.into_iter().filter(|part| {
+        let id = part.id();
+        let before = seen.iter().filter(|s| **s == id).count();
+        let new = before == 0 || (before == 1 && id == "pzt-hysteresis");
+        if new {
+            seen.push(id);
+        }
+        new
+    });
+    let worth: Vec<Part> = worth.take(wide).collect();
+    // A short fit of all, then the best few to the end.
+    let mut fits = parallel::map(&worth, effort.threads, |part| {
+        let mut parts = fit.parts.clone();
+        parts.push(part.clone());
+        ctx.fit_from(parts, Some(fit.soft), mask, 4)
+    });
+    fits.sort_by(|a, b| penalised_cost(ctx, a).total_cmp(&penalised_cost(ctx, b)));
+    let close = fits
+        .first()
+        .map_or(0.0, |best| best.chi2 + 0.5 * (fit.chi2 - best.chi2));
+    let rest = fits.split_off(fits.iter().take(4).filter(|f| f.chi2 <= close).count());
+    let mut fits = parallel::map(&fits, effort.threads, |f| ctx.refit(f, mask, 14));
+    fits.extend(rest);
+    fits.sort_by(|a, b| penalised_cost(ctx, a).total_cmp(&penalised_cost(ctx, b)));
+    fits
+}
+
+/// Whether the part of `bigger` that `smaller` lacks is worth having, where `null` is the sum of squares without effects.
+fn worth_it(smaller: &Fit, bigger: &Fit, null: f64) -> bool {
+    let added = bigger.freedom().saturating_sub(smaller.freedom()).max(1);
+    let off_response = bigger
+        .parts
+        .iter()
+        .filter(|p| !smaller.has(p.id()))
+        .all(|p| p.variant().off_response);
+    let least = if off_response {
+        0.0
+    } else {
+        THRESHOLDS.addition_share * (null - smaller.chi2).max(0.0)
+    };
+    smaller.chi2 - bigger.chi2 > threshold(added).max(least)
+}
+
+/// Takes back effects that are no longer needed.
+fn eliminate(ctx: &Context<'_>, mut fit: Fit, null: f64, mask: &Mask, effort: Effort) -> Fit {
+    while fit.parts.len() > 1 {
+        let indices: Vec<usize> = (0..fit.parts.len()).collect();
+        let without = parallel::map(&indices, effort.threads, |&i| {
+            let mut parts = fit.parts.clone();
+            parts.remove(i);
+            ctx.fit_from(parts, Some(fit.soft), mask, 8)
+        });
+        let Some(best) = without
+            .into_iter()
+            .filter(|w| !worth_it(w, &fit, null))
+            .min_by(|a, b| penalised_cost(ctx, a).total_cmp(&penalised_cost(ctx, b)))
+        else {
+            break;
+        };
+        fit = best;
+    }
+    fit
+}
+
+/// Replaces single effects by others while that helps; also gathers the rivals of each effect.
+fn replace(ctx: &Context<'_>, mut fit: Fit, mask: &Mask, effort: Effort) -> (Fit, Vec<Vec<Rival>>) {
+    for _ in 0..3 {
+        let mut rivals: Vec<Vec<Rival>> = Vec::new();
+        let mut better: Option<Fit> = None;
+        let mut consider = |other: Fit, part: Part, list: &mut Vec<Rival>| {
+            list.push(Rival {
+                id: part.id(),
+                chi2: other.chi2,
+                part,
+            });
+            if penalised_cost(ctx, &other) < penalised_cost(ctx, &fit) - 1.0
+                && better
+                    .as_ref()
+                    .is_none_or(|b| penalised_cost(ctx, &other) < penalised_cost(ctx, b))
+            {
+                better = Some(other);
+            }
+        };
+        for i in 0..fit.parts.len() {
+            let mut parts = fit.parts.clone();
+            let id = parts.remove(i).id();
+            let without = ctx.fit_from(parts, Some(fit.soft), mask, 10);
+            let mut list: Vec<Rival> = Vec::new();
+            for other in extensions(
+                ctx,
+                &without,
+                mask,
+                effort,
+                4,
+                &[id],
+                0.25 * (without.chi2 - fit.chi2),
+            ) {
+                let Some(part) = other.parts.last().cloned() else {
+                    continue;
+                };
+                consider(other, part, &mut list);
+            }
+            // Screening is linear; a lag of another shape need not look promising from afar. Those of the same length
+            // are fitted for certain.
+            let twins: Vec<Part> = fit.parts[i]
+                .lag_s()
+                .map(|lag_s| {
+                    let starts = catalogue::of_lag(lag_s, &ctx.scope);
+                    let valleys = |id: &str| starts.iter().filter(|p| p.id() == id).count();
+                    let several: Vec<bool> = starts.iter().map(|p| valleys(p.id()) > 1).collect();
+                    starts
+                        .into_iter()
+                        .zip(several)
+                        .filter(|(p, several)| {
+                            let other = p.id();
+                            !ctx.excludes(other)
+                                && (*several || !list.iter().any(|r| r.id == other))
+                                && if other == id {
+                                    *several
+                                } else {
+                                    !fit.has(other)
+                                }
+                        })
+                        .map(|(p, _)| p)
+                        .collect()
+                })
+                .unwrap_or_default();
+            for other in parallel::map(&twins, effort.threads, |part| {
+                let mut parts = fit.parts.clone();
+                parts[i] = part.clone();
+                ctx.fit_from(parts, Some(fit.soft), mask, 12)
+            }) {
+                let part = other.parts[i].clone();
+                consider(other, part, &mut list);
+            }
+            rivals.push(list);
+        }
+        match better {
+            Some(b) => fit = b,
+            None => return (fit, rivals),
+        }
+    }
+    let none = vec![Vec::new(); fit.parts.len()];
+    (fit, none)
+}
+
+/// Tries the other forms of the same effects (play operators for Bouc-Wen, a dissolving bubble, two-sided clipping).
+fn reparametrise(ctx: &Context<'_>, mut fit: Fit, mask: &Mask, effort: Effort, rich: bool) -> Fit {
+    for i in 0..fit.parts.len() {
+        let id = fit.parts[i].id();
+        let others: Vec<Part> = ctx
+            .variants
+            .iter()
+            .filter(|v| {
+                if ctx.excludes(v.id()) {
+                    return false;
+                }
+                let form = v.id() == id && **v != fit.parts[i].variant;
+                // A lag that dissolves is a bubble.
+                let late = v.candidate().late;
+                let dissolving = id == "driver-lag" && v.id() == "bubble" && late;
+                (form || dissolving) && (rich || !late)
+            })
+            .flat_map(|v| v.starts(&ctx.scope))
+            .collect();
+        let fits = parallel::map(&others, effort.threads, |part| {
+            let mut parts = fit.parts.clone();
+            parts[i] = part.clone();
+            ctx.fit_from(parts, Some(fit.soft), mask, 10)
+        });
+        if let Some(best) = fits
+            .into_iter()
+            .min_by(|a, b| penalised_cost(ctx, a).total_cmp(&penalised_cost(ctx, b)))
+            && penalised_cost(ctx, &best) < penalised_cost(ctx, &fit) - 20.0
+        {
+            fit = best;
+        }
+    }
+    fit
+}
+
+/// Whether so much is left beyond the noise that a richer form is worth its time, whatever else may explain it.
+fn much_left(fit: &Fit) -> bool {
+    left_over(fit) > 0.01 * fit.count as f64
+}
+
+/// The whole search on the rows of a mask.
+pub(crate) fn search(
+    ctx: &Context<'_>,
+    mask: &Mask,
+    effort: Effort,
+    mut progress: impl FnMut(&str),
+) -> Found {
+    let null = ctx.fit(Vec::new(), mask, 6);
+    let mut steps = vec![(Vec::new(), null.chi2)];
+    progress("screening single effects");
+    let mut singles = extensions(ctx, &null, mask, effort, 8, &[], 0.0);
+    singles.retain(|f| worth_it(&null, f, null.chi2));
+    let Some(best) = singles.first().cloned() else {
+        return Found {
+            fit: null.clone(),
+            null,
+            steps,
+            rivals: Vec::new(),
+        };
+    };
+    steps.push((ids(&best), best.chi2));
+    let mut fit = best;
+    // What a simple form leaves over must not be given a name of its own before the richer form was tried.
+    let reparametrised = reparametrise(ctx, fit.clone(), mask, effort, much_left(&fit));
+    if reparametrised.parts != fit.parts {
+        fit = reparametrised;
+        steps.push((ids(&fit), fit.chi2));
+    }
+    // The last set whose effects were weighed against their rivals.
+    let mut weighed: Option<(Fit, Vec<Vec<Rival>>)> = None;
+    let mut beam: Vec<Fit> = singles.into_iter().skip(1).take(2).collect();
+    while fit.parts.len() < effort.max_effects {
+        if fit.parts.len() >= 2 && left_over(&fit) > THRESHOLDS.hopeless * left_over(&null) {
+            break;
+        }
+        progress(&format!("looking further beside {}", ids(&fit).join(" + ")));
+        let least = THRESHOLDS.addition_share * (null.chi2 - fit.chi2);
+        let mut next: Vec<Fit> = extensions(ctx, &fit, mask, effort, 6, &[], least);
+        next.retain(|f| worth_it(&fit, f, null.chi2));
+        if next.is_empty() {
+            break;
+        }
+        // Something is left: the first choice may have been a compromise between two. Extend its rivals as well.
+        let top_chi2 = next[0].chi2;
+        for other in std::mem::take(&mut beam) {
+            let least = 0.5 * (other.chi2 - top_chi2);
+            next.extend(extensions(ctx, &other, mask, effort, 4, &[], least));
+        }
+        next.sort_by(|a, b| penalised_cost(ctx, a).total_cmp(&penalised_cost(ctx, b)));
+        let Some(top) = next.first().cloned() else {
+            break;
+        };
+        let top = eliminate(ctx, top, null.chi2, mask, effort);
+        if penalised_cost(ctx, &top) >= penalised_cost(ctx, &fit) {
+            break;
+        }
+        // A richer form of what is there may explain as well what the next name would stand for.
+        if top.parts.len() > fit.parts.len() {
+            let reparametrised = reparametrise(ctx, fit.clone(), mask, effort, true);
+            if reparametrised.parts != fit.parts
+                && penalised_cost(ctx, &reparametrised) < penalised_cost(ctx, &top)
+            {
+                fit = reparametrised;
+                steps.push((ids(&fit), fit.chi2));
+                continue;
+            }
+        }
+        let (top, rivals) = replace(ctx, top, mask, effort);
+        weighed = Some((top.clone(), rivals));
+        let forms = top.parts.clone();
+        let rich = much_left(&top);
+        fit = reparametrise(ctx, top, mask, effort, rich);
+        if !alike(&fit.parts, &forms) {
+            fit = eliminate(ctx, fit, null.chi2, mask, effort);
+        }
+        steps.push((ids(&fit), fit.chi2));
+        beam = Vec::new();
+    }
+    progress("refitting all together");
+    let (fit, rivals) = settle(ctx, fit, weighed, mask, effort);
+    Found {
+        fit,
+        null,
+        steps,
+        rivals,
+    }
+}
+
+/// Refits all together; the rivals are weighed again unless that was done for this very set.
+fn settle(
+    ctx: &Context<'_>,
+    mut fit: Fit,
+    weighed: Option<(Fit, Vec<Vec<Rival>>)>,
+    mask: &Mask,
+    effort: Effort,
+) -> (Fit, Vec<Vec<Rival>>) {
+    let refined = ctx.fit_from(fit.parts.clone(), Some(fit.soft), mask, 12);
+    if refined.chi2 <= fit.chi2 {
+        fit = refined;
+    }
+    match weighed {
+        // The very same, up to the last digits of the fit.
+        Some((before, rivals))
+            if rivals.len() == fit.parts.len()
+                && rivals.iter().any(|r| !r.is_empty())
+                && alike(&before.parts, &fit.parts)
+                && (before.chi2 - fit.chi2).abs() < 0.1 =>
+        {
+            (fit, rivals)
+        }
+        _ => replace(ctx, fit, mask, effort),
+    }
+}
+
+/// Whether two sets have the same forms in the same order.
+fn alike(a: &[Part], b: &[Part]) -> bool {
+    a.iter().map(|p| p.variant).eq(b.iter().map(|p| p.variant))
+}
+
+/// Ids of a set in the order in which they were found.
+pub(crate) fn ids(fit: &Fit) -> Vec<&'static str> {
+    fit.parts.iter().map(|p| p.id()).collect()
+}

@@ -1,0 +1,260 @@
+//! Fast simulation of the plant with any of the effects at its place, for fitting.
+//!
+//! The equations of the effects are those of `cellpos_plant::effects`, the very same blocks; what differs from
+//! `cellpos_plant::Chain` is the order of the work: a whole record goes through one block after another on an even grid,
+//! one step per sample where that is exact and a finer grid only where a block needs it, so that a minute of record takes
+//! about a millisecond.
+
+mod camera;
+mod modal;
+
+pub(crate) use camera::near_whole;
+use cellpos_plant::effects::{Action, Block, Segment};
+pub(crate) use cellpos_plant::{Effect, Place, Zpk};
+use modal::{Modal, Trace, has_fast_pole};
+
+/// The plant and the sampling that all records of a problem share.
+#[derive(Debug, Clone)]
+pub(crate) struct Base {
+    pub zpk: Zpk,
+    /// Displacement about which the plant acts \[um\].
+    pub working_point_um: f64,
+    pub sample_s: f64,
+    /// The input is an analogue signal sampled with the output, not a held command: interpolate it.
+    pub interpolated_input: bool,
+    /// The plant need not have rested before a record: its transients are free in every record.
+    pub free_start: bool,
+}
+
+/// Simulates a record: displacement from the working point \[um\] in, bead position \[um\] out.
+///
+/// What the camera shows of a position (lines, pixel locking) is fitted elsewhere: left out here.
+///
+/// `edge`, where asked for, receives the step of the plant's input that acts at the instant of each frame, in parts of
+/// the plant's direct path: what a frame that straddles the edge may already show.
+pub(crate) fn simulate(
+    base: &Base,
+    u: &[f64],
+    effects: &[Effect],
+    y: &mut Vec<f64>,
+    edge: Option<&mut Vec<f64>>,
+) {
+    Chain::new(base, effects).run(u, y, edge);
+}
+
+/// What happens to the signal before the plant, in order.
+enum Stage {
+    Linear(Zpk),
+    Clip(f64, f64),
+    Slew(f64),
+    Block(Box<dyn Block>),
+}
+
+/// What the frames are like.
+#[derive(Debug, Clone, Copy, Default)]
+struct Frames {
+    skew: f64,
+    delay_s: f64,
+    exposure_s: f64,
+}
+
+struct Chain<'a> {
+    base: &'a Base,
+    before: Vec<Stage>,
+    /// Plant and linear blocks behind it.
+    plant: Zpk,
+    /// Blocks on the motion of the bead.
+    motion: Vec<Box<dyn Block>>,
+    bypass: Vec<Zpk>,
+    frames: Frames,
+    /// Steps of the grid per sample.
+    fine: usize,
+}
+
+impl<'a> Chain<'a> {
+    fn new(base: &'a Base, effects: &[Effect]) -> Self {
+        let mut chain = Self {
+            base,
+            before: Vec::new(),
+            plant: base.zpk.clone(),
+            motion: Vec::new(),
+            bypass: Vec::new(),
+            frames: Frames::default(),
+            fine: 1,
+        };
+        let mut sorted: Vec<&Effect> = effects.iter().collect();
+        sorted.sort_by_key(|e| e.order());
+        let mut dynamic_before = false;
+        let mut all = base.zpk.clone();
+        for e in sorted {
+            let spec = e.kind().spec();
+            let early = spec.place < Place::Chip || spec.ahead_of_plant;
+            match e.act() {
+                Action::Linear(zpk) => {
+                    all = all.series(&zpk);
+                    if early {
+                        dynamic_before |= !zpk.poles.is_empty();
+                        chain.before.push(Stage::Linear(zpk));
+                    } else {
+                        chain.plant = std::mem::replace(&mut chain.plant, Zpk::one()).series(&zpk);
+                    }
+                }
+                Action::Clip { low_um, high_um } => {
+                    let w = base.working_point_um;
+                    chain.before.push(Stage::Clip(low_um - w, high_um - w));
+                }
+                Action::Slew(rate) => {
+                    chain.fine = chain.fine.max(10);
+                    dynamic_before = true;
+                    chain.before.push(Stage::Slew(rate));
+                }
+                Action::Block(block) if early => {
+                    if dynamic_before && block.bends() {
+                        chain.fine = chain.fine.max(10);
+                    }
+                    chain.before.push(Stage::Block(block));
+                }
+                Action::Block(block) => {
+                    if spec.place == Place::Chip {
+                        chain.fine = chain.fine.max(4);
+                    }
+                    chain.motion.push(block);
+                }
+                Action::Bypass(zpk) => chain.bypass.push(zpk),
+                Action::Delay(s) => chain.frames.delay_s += s,
+                Action::Exposure(s) => chain.frames.exposure_s = s,
+                Action::Skew(e) => chain.frames.skew += e,
+                Action::Drop(_) | Action::Repeat(_) | Action::Show(_) => {}
+            }
+        }
+        if base.interpolated_input {
+            chain.fine = chain.fine.max(4);
+        }
+        let f = chain.frames;
+        let within = f.skew != 0.0 || f.delay_s != 0.0 || f.exposure_s != 0.0;
+        let slopes = chain.motion.iter().any(|b| b.needs_slopes() && b.bends());
+        if (within || slopes) && has_fast_pole(&all, base.sample_s / chain.fine as f64) {
+            chain.fine = chain.fine.max(4);
+            if has_fast_pole(&all, base.sample_s / chain.fine as f64) {
+                chain.fine = chain.fine.max(10);
+            }
+        }
+        chain
+    }
+
+    fn run(mut self, u: &[f64], y: &mut Vec<f64>, edge: Option<&mut Vec<f64>>) {
+        let n = u.len();
+        let h = self.base.sample_s / self.fine as f64;
+        let mut x: Vec<f64> = if self.base.interpolated_input {
+            interpolate(u, self.fine)
+        } else if self.fine == 1 {
+            u.to_vec()
+        } else {
+            u.iter()
+                .flat_map(|&v| std::iter::repeat_n(v, self.fine))
+                .collect()
+        };
+        let mut pending = Zpk::one();
+        for stage in std::mem::take(&mut self.before) {
+            match stage {
+                Stage::Linear(zpk) => pending = pending.series(&zpk),
+                Stage::Clip(low, high) => x.iter_mut().for_each(|v| *v = v.min(high).max(low)),
+                Stage::Slew(rate) => slew(&mut x, rate, h),
+                Stage::Block(mut block) => {
+                    if !pending.poles.is_empty() || !pending.zeros.is_empty() {
+                        x = Modal::new(&pending, h).means(&x);
+                    } else if pending.gain != 1.0 {
+                        x.iter_mut().for_each(|v| *v *= pending.gain);
+                    }
+                    pending = Zpk::one();
+                    for (j, v) in x.iter_mut().enumerate() {
+                        let held = Segment::line(*v, *v, h);
+                        *v = block.advance(j as f64 * h, h, held).integral / h;
+                    }
+                }
+            }
+        }
+        let modal = Modal::new(&pending.clone().series(&self.plant), h);
+        if let Some(edge) = edge {
+            self.edges(&x, modal.direct, n, edge);
+        }
+        let f = self.frames;
+        let plain = f.skew == 0.0 && f.delay_s == 0.0 && f.exposure_s == 0.0;
+        if plain && self.motion.is_empty() && self.bypass.is_empty() {
+            let mut pos = Vec::new();
+            modal.run(&x, &mut pos);
+            y.clear();
+            y.extend(pos.into_iter().step_by(self.fine));
+            return;
+        }
+        let mut t = Trace::default();
+        modal.trace(&x, &mut t);
+        if self.base.interpolated_input {
+            t.straighten(h);
+        }
+        for block in &mut self.motion {
+            camera::advance(&mut t, block.as_mut(), h);
+        }
+        for zpk in &self.bypass {
+            let mut beside = Trace::default();
+            Modal::new(&pending.clone().series(zpk), h).trace(&x, &mut beside);
+            if self.base.interpolated_input {
+                beside.straighten(h);
+            }
+            t.add(&beside);
+        }
+        camera::sample(&t, f, h, self.fine, n, y);
+    }
+
+    /// Steps of the direct path at the instants of the frames.
+    fn edges(&self, x: &[f64], direct: f64, n: usize, edge: &mut Vec<f64>) {
+        edge.clear();
+        edge.resize(n, 0.0);
+        let base = if self.base.zpk.zeros.len() == self.base.zpk.poles.len() {
+            self.base.zpk.gain
+        } else {
+            0.0
+        };
+        // The window of an exposure ends with the frame: its edge is already averaged.
+        if base == 0.0 || direct == 0.0 || self.frames.exposure_s != 0.0 {
+            return;
+        }
+        // Edges lie on the grid of the samples: a delay between samples puts the frames between the edges.
+        let Some(shift) = camera::near_whole(self.frames.delay_s / self.base.sample_s) else {
+            return;
+        };
+        let share = direct / base;
+        for (k, edge) in edge.iter_mut().enumerate().skip(shift) {
+            let j = (k - shift) * self.fine;
+            let before = if j == 0 { x[0] } else { x[j - 1] };
+            *edge = share * (x[j] - before);
+        }
+    }
+}
+
+/// Rate limit; each step holds the mean of the ramp over the step, so that its integral is exact.
+fn slew(x: &mut [f64], rate: f64, h: f64) {
+    let most = rate * h;
+    let mut at = 0.0f64;
+    for v in x.iter_mut() {
+        let d = (*v - at).clamp(-most, most);
+        let share = if most > 0.0 { d.abs() / most } else { 0.0 };
+        // The ramp takes `share` of the step, then rests at its end.
+        *v = at + d * (1.0 - 0.5 * share);
+        at += d;
+    }
+}
+
+/// Straight lines between the samples; each step of the grid holds the value at its end, so that a plant without dynamics
+/// is exact at the samples.
+fn interpolate(u: &[f64], fine: usize) -> Vec<f64> {
+    let mut x = Vec::with_capacity(u.len() * fine);
+    for k in 0..u.len() {
+        let next = u.get(k + 1).copied().unwrap_or(u[k]);
+        for i in 0..fine {
+            let f = (i as f64 + 1.0) / fine as f64;
+            x.push(u[k] + f * (next - u[k]));
+        }
+    }
+    x
+}

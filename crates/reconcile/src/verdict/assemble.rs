@@ -1,0 +1,171 @@
+//! From the search to the answer: names, verdict, the gap, and the augmented model.
+
+use crate::data::floor::Floor;
+use crate::data::frames::FrameCounts;
+use crate::data::record::Record;
+use crate::fit::catalogue::{Part, Variant};
+use crate::fit::context::{Context, Fit};
+use crate::search::sequential::Found;
+use crate::verdict::augment::augment;
+use crate::verdict::held_out::{self, HeldOut};
+use crate::verdict::judge::{Evidence, judge};
+use crate::verdict::map;
+use crate::verdict::names::{names, of_frames};
+use crate::verdict::result::{Gap, GapStep, Interval, Reconciliation, Traces, Verdict};
+use crate::verdict::sentences::sentences;
+use cellpos_plant::Model;
+use std::collections::BTreeMap;
+
+/// What a run was given.
+pub(crate) struct Given<'a> {
+    pub model: &'a Model,
+    pub records: &'a [Record],
+    pub frames: &'a FrameCounts,
+    pub floor: &'a Floor,
+    pub threads: usize,
+}
+
+pub(crate) fn assemble(
+    given: &Given<'_>,
+    ctx: &Context<'_>,
+    found: Found,
+    held: HeldOut,
+) -> Reconciliation {
+    let Given {
+        model,
+        records,
+        frames,
+        floor,
+        threads,
+    } = *given;
+    let Found {
+        fit,
+        null,
+        steps,
+        rivals,
+    } = found;
+    let sigma = ctx.problem.noise.innovation_um();
+    let n = null.count as f64;
+    let null_map = map::map(ctx, &null);
+    let after_map = map::map(ctx, &fit);
+    let mut places = sentences(ctx, &null, &null_map);
+    let names = names(ctx, &null, &fit, &rivals);
+    let (counted, counted_places) = of_frames(frames);
+    let judgement = judge(
+        ctx,
+        &Evidence {
+            null: &null,
+            fit: &fit,
+            names: &names,
+            held: &held,
+            floor,
+            null_flagged: null_map.any_flagged(),
+            after: &after_map,
+            counted: !counted.is_empty(),
+        },
+        threads,
+    );
+    let verdict = judgement.verdict;
+    places.extend(counted_places);
+    places.extend(judgement.reasons);
+    let named = if verdict == Verdict::Unknown {
+        Vec::new()
+    } else {
+        let mut effects = names.effects;
+        effects.extend(counted);
+        effects.sort_by(|a, b| {
+            b.explained
+                .total_cmp(&a.explained)
+                .then_with(|| a.id.cmp(&b.id))
+        });
+        effects
+    };
+    let rms = |chi2: f64| sigma * (chi2 / n).max(0.0).sqrt();
+    // The noise of these very rows: what the full fit leaves, where that is the floor within its own error.
+    let in_sample = rms(fit.chi2);
+    let gap = Gap {
+        before: held.before_um,
+        after: held.after_um,
+        floor: if in_sample <= 1.01 * sigma {
+            in_sample
+        } else {
+            sigma
+        },
+        free_run_before: held.free_before_um,
+        free_run_after: held.free_after_um,
+        free_run_floor: held.free_floor_um,
+        unit: "um".to_owned(),
+        quantity: "RMS innovation on held-out records",
+        steps: gap_steps(ctx, &null, &steps, rms),
+        per_record: held.per_record.clone(),
+        bands: held_out::bands(&null_map, &after_map),
+    };
+    let augmented = augment(model, ctx, &fit, frames, &named, verdict, floor);
+    let traces = Traces::new(ctx, &null, &fit);
+    Reconciliation {
+        verdict,
+        effects: named,
+        places,
+        gap,
+        base_shift: base_shift(&fit, &held),
+        hypothesis: judgement.hypothesis,
+        remainder: judgement.remainder,
+        floor: floor.source,
+        noise: ctx.problem.noise,
+        sample_s: ctx.problem.base.sample_s,
+        augmented,
+        before: null_map,
+        after: after_map,
+        traces,
+        records: records
+            .iter()
+            .map(|r| (r.name.clone(), r.rows(), r.frames()))
+            .collect(),
+    }
+}
+
+/// What every fit moves beside the effects, with its interval.
+fn base_shift(fit: &Fit, held: &HeldOut) -> BTreeMap<String, Interval> {
+    let edge = 1.96 * fit.errors[0];
+    let share = Interval {
+        value: fit.soft,
+        ci95: [fit.soft - edge, fit.soft + edge],
+        unit: "um/um".to_owned(),
+    };
+    BTreeMap::from([
+        ("frame_edge_share".to_owned(), share),
+        ("gain".to_owned(), held.gain_shift.clone()),
+    ])
+}
+
+/// The search step by step; after the null model, by itself, what a free base gain alone would do.
+fn gap_steps(
+    ctx: &Context<'_>,
+    null: &Fit,
+    steps: &[(Vec<&'static str>, f64)],
+    rms: impl Fn(f64) -> f64,
+) -> Vec<GapStep> {
+    let mut out: Vec<GapStep> = steps
+        .iter()
+        .map(|(names, chi2)| GapStep {
+            effects: names.iter().map(|s| (*s).to_owned()).collect(),
+            rms: rms(*chi2),
+            base_gain: None,
+        })
+        .collect();
+    if ctx.free_gain {
+        if let Some(first) = out.first_mut() {
+            first.base_gain = Some(null.gain);
+        }
+    } else if let Some(v) = Variant::named("gain-error", "") {
+        let parts = vec![Part::new(v, &[1.0])];
+        let free = ctx.fit_from(parts, Some(null.soft), &ctx.problem.all(), 6);
+        let step = GapStep {
+            effects: Vec::new(),
+            rms: rms(free.chi2),
+            base_gain: free.parts.first().map(|p| p.natural()[0]),
+        };
+        out.insert(1.min(out.len()), step);
+    }
+    out
+}

@@ -1,0 +1,148 @@
+//! What was found, as a model.
+
+use crate::data::floor::Floor;
+use crate::data::frames::FrameCounts;
+use crate::fit::context::{Context, Fit};
+use crate::simulate::near_whole;
+use crate::verdict::result::{Effect as NamedEffect, Verdict};
+use cellpos_plant::effects::{self, Role};
+use cellpos_plant::{Effect, Model};
+
+/// A delay a hair short of whole frames, whose frames do not show the edges of the command: whole frames for a simulator,
+/// which would show them.
+fn without_edge(ctx: &Context<'_>, fit: &Fit, delay_s: f64) -> f64 {
+    const HAIR: f64 = 0.005;
+    let sample_s = ctx.problem.base.sample_s;
+    let short = |frames: usize| frames as f64 - delay_s / sample_s;
+    match near_whole(delay_s / sample_s) {
+        Some(frames)
+            if (0.0..HAIR).contains(&short(frames)) && fit.soft < 0.35 * ctx.problem.soft.1 =>
+        {
+            frames as f64 * sample_s
+        }
+        _ => delay_s,
+    }
+}
+
+/// The effect of a model file for part `index`.
+fn effect_of(ctx: &Context<'_>, fit: &Fit, index: usize) -> Option<Effect> {
+    let part = &fit.parts[index];
+    let v = part.natural();
+    let before = |role| {
+        fit.parts[..index]
+            .iter()
+            .filter(|p| p.variant().role == role)
+            .count()
+    };
+    match part.variant().role {
+        Role::Chain if part.id() == "time-delay" => {
+            Some(effects::time_delay(without_edge(ctx, fit, v[0])))
+        }
+        Role::Chain => Some(part.effect(&ctx.scope)),
+        Role::Line => {
+            let line = &fit.lines[before(Role::Line)];
+            let [a, b] = line.first().copied()?;
+            let rows: f64 = ctx.problem.records.iter().map(|r| r.u.len() as f64).sum();
+            let um = ctx
+                .problem
+                .records
+                .iter()
+                .zip(line)
+                .map(|(r, [a, b])| a.hypot(*b) * r.u.len() as f64)
+                .sum::<f64>()
+                / rows;
+            // Amplitude and phase are no parameters of the fit: the form of the effect has them beside the frequency.
+            part.effect(&ctx.scope)
+                .with_parameter("um", um)
+                .and_then(|e| e.with_parameter("phase_deg", b.atan2(a).to_degrees()))
+                .ok()
+        }
+        Role::Position => {
+            let exact = fit.locking.get(index).copied().flatten();
+            let ([a, b], pixel_um, amplitude) = match exact {
+                Some(l) => (l.wave_um, l.pixel_um, l.amplitude_px().0),
+                None => {
+                    let [a, b] = fit.positions[before(Role::Position)];
+                    let sharp = ctx.problem.noise.sharpness(v[0]);
+                    ([a, b], v[0], a.hypot(b) / (v[0] * sharp))
+                }
+            };
+            let phase_deg = b.atan2(a).to_degrees();
+            Some(effects::pixel_locking(pixel_um, amplitude, phase_deg))
+        }
+    }
+}
+
+/// The model with what was found, its intervals and where they come from.
+pub(crate) fn augment(
+    model: &Model,
+    ctx: &Context<'_>,
+    fit: &Fit,
+    frames: &FrameCounts,
+    named: &[NamedEffect],
+    verdict: Verdict,
+    floor: &Floor,
+) -> Model {
+    let mut out = model.clone();
+    out.name = if named.is_empty() {
+        model.name.clone()
+    } else {
+        format!("{}-augmented", model.name)
+    };
+    out.covariance = None;
+    if let Ok(plant) = model.plant.scaled(fit.gain) {
+        out.plant = plant;
+    }
+    // Without a floor there is no noise to write, and numbers beyond what a model may hold are none.
+    let noise = cellpos_plant::Noise {
+        diffusion_um2_per_s: ctx
+            .problem
+            .noise
+            .diffusion_um2_per_s(ctx.problem.base.sample_s),
+        localisation_um: ctx.problem.noise.localisation_um(),
+    };
+    if floor.source.is_known() && noise.diffusion_um2_per_s < 1e4 && noise.localisation_um < 100.0 {
+        out.noise = noise;
+    }
+    out.provenance
+        .insert("noise".to_owned(), floor.source.words().to_owned());
+    if verdict != Verdict::Unknown {
+        for i in 0..fit.parts.len() {
+            if let Some(e) = effect_of(ctx, fit, i) {
+                out.effects.retain(|old| old.id() != e.id());
+                out.effects.push(e);
+            }
+        }
+        if frames.drops_named() {
+            out.effects.push(effects::frame_drops(frames.drop_rate()));
+        }
+        if frames.repeats_named() {
+            out.effects
+                .push(effects::frame_repeats(frames.repeat_rate()));
+        }
+        for e in named {
+            for (name, p) in e
+                .parameters
+                .iter()
+                .filter(|(_, p)| p.ci95.iter().all(|v| v.is_finite()))
+            {
+                out.intervals.insert(format!("{}.{name}", e.id), p.ci95);
+            }
+        }
+    }
+    out.provenance
+        .insert("reconcile.verdict".to_owned(), verdict.word().to_owned());
+    out.provenance
+        .insert("reconcile.base".to_owned(), model.name.clone());
+    for e in named {
+        out.provenance.insert(
+            format!("reconcile.{}", e.id),
+            format!(
+                "p = {:.1e}, explains {:.1} % of the excess over the noise floor",
+                e.p_value,
+                100.0 * e.explained
+            ),
+        );
+    }
+    out
+}

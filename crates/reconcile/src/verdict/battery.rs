@@ -1,0 +1,351 @@
+//! What is left after a fit: regressed on a library of terms of command, position, speed and time, each at the two places
+//! at which it may act, to say where and how, and as a formula with its worth on data that it has not seen.
+
+use crate::dot::dot;
+use crate::fit::context::{Context, Fit};
+use crate::fit::linear::Tangents;
+use crate::problem::{Mask, split_in_time};
+use crate::search::lines::{strongest_line, without_line};
+use crate::simulate::simulate;
+use nalgebra::{DMatrix, DVector};
+
+/// A formula for the unexplained part.
+#[derive(Debug, Clone, PartialEq, serde::Serialize)]
+pub struct Hypothesis {
+    /// For example `plant input += -0.031 y^3`, y the position and d the command from the working point.
+    pub formula: String,
+    /// Part of the excess over the floor that it removes on the held-out last 40 % of every record, 0..1.
+    pub held_out_worth: f64,
+    /// Terms with coefficients and units.
+    pub terms: Vec<Term>,
+}
+
+/// One term of a formula.
+#[derive(Debug, Clone, PartialEq, serde::Serialize)]
+pub struct Term {
+    /// The term: `d` command from the working point, `y` position, `v` its speed, `t` time.
+    pub term: String,
+    /// Where it acts: `input` (into the plant) or `output` (onto the position).
+    pub place: &'static str,
+    /// Its coefficient.
+    pub coefficient: f64,
+    /// Unit of the coefficient.
+    pub unit: String,
+}
+
+/// One term in every record, as innovations.
+pub(crate) struct Column {
+    pub name: &'static str,
+    pub place: &'static str,
+    pub unit: &'static str,
+    /// What it would mean, in words.
+    pub says: &'static str,
+    pub innovations: Vec<Vec<f64>>,
+}
+
+/// What a term of the library is made of, row by row.
+struct Row {
+    d: f64,
+    rate: f64,
+    y: f64,
+    v: f64,
+    t: f64,
+}
+
+type Formula = fn(&Row) -> f64;
+
+/// Name, unit beside um per power, words, formula.
+const TERMS: &[(&str, &str, &str, Formula)] = &[
+    (
+        "d^2",
+        "1/um",
+        "the response is not the same up and down: it goes with the square of the command",
+        |r| r.d * r.d,
+    ),
+    (
+        "d^3",
+        "1/um^2",
+        "the response changes with amplitude",
+        |r| r.d.powi(3),
+    ),
+    (
+        "|d|",
+        "1",
+        "the response is not the same on both sides of the working point",
+        |r| r.d.abs(),
+    ),
+    (
+        "d |d|",
+        "1/um",
+        "the response changes with amplitude",
+        |r| r.d * r.d.abs(),
+    ),
+    (
+        "sign(dd/dt)",
+        "um",
+        "the response depends on the direction of the command: friction or hysteresis",
+        |r| sign(r.rate),
+    ),
+    (
+        "|dd/dt|",
+        "s",
+        "the response depends on the speed of the command, not on its direction",
+        |r| r.rate.abs(),
+    ),
+    ("t d", "1/s", "the gain changes with time", |r| r.t * r.d),
+    (
+        "y",
+        "1",
+        "a force that goes with the position: another stiffness or outflow",
+        |r| r.y,
+    ),
+    (
+        "y^2",
+        "1/um",
+        "a force or an image that bends with the position",
+        |r| r.y * r.y,
+    ),
+    (
+        "y^3",
+        "1/um^2",
+        "a stiffness that grows with the position",
+        |r| r.y.powi(3),
+    ),
+    ("|y|", "1", "the two sides of the position differ", |r| {
+        r.y.abs()
+    }),
+    ("y d", "1/um", "the gain depends on the position", |r| {
+        r.y * r.d
+    }),
+    ("y^2 d", "1/um^2", "the gain depends on the position", |r| {
+        r.y * r.y * r.d
+    }),
+    ("v", "s", "another damping", |r| r.v),
+    ("v |v|", "s^2/um", "a damping that grows with speed", |r| {
+        r.v * r.v.abs()
+    }),
+    ("v^3", "s^3/um^2", "a damping that grows with speed", |r| {
+        r.v.powi(3)
+    }),
+    ("|v|", "s", "motion differs by its direction", |r| r.v.abs()),
+    ("sign(v)", "um", "dry friction", |r| sign(r.v)),
+    (
+        "y v",
+        "s/um",
+        "damping or scale depends on the position",
+        |r| r.y * r.v,
+    ),
+    (
+        "y^2 v",
+        "s/um^2",
+        "damping or scale depends on the position",
+        |r| r.y * r.y * r.v,
+    ),
+    ("t", "um/s", "a drift that grows with time", |r| r.t),
+];
+
+fn sign(x: f64) -> f64 {
+    if x == 0.0 { 0.0 } else { x.signum() }
+}
+
+/// Rows of a record with everything that terms are made of. The position is the model's with what the rows before tell of the
+/// walk: with the row itself, or later ones, in it, its own noise would look like an effect.
+fn rows(ctx: &Context<'_>, i: usize, sim: &[f64], residual: &[f64]) -> Vec<Row> {
+    let dt = ctx.problem.base.sample_s;
+    let r = &ctx.problem.records[i];
+    let walk = r.whitener.ahead(residual);
+    let first = if ctx.problem.base.free_start {
+        0.0
+    } else {
+        (0..r.y.len())
+            .find(|&k| r.present[k])
+            .map_or(0.0, |k| r.y[k])
+    };
+    let y: Vec<f64> = sim.iter().zip(&walk).map(|(s, w)| s + w - first).collect();
+    (0..r.u.len())
+        .map(|k| {
+            let a = k.saturating_sub(1);
+            Row {
+                d: r.u[k],
+                rate: (r.u[k] - r.u[a]) / dt,
+                y: y[k],
+                v: (y[k] - y[a]) / dt,
+                t: k as f64 * dt,
+            }
+        })
+        .collect()
+}
+
+/// The library about a fit.
+pub(crate) fn library(ctx: &Context<'_>, fit: &Fit) -> Vec<Column> {
+    let (residual, sim) = ctx.residual(fit);
+    let records = &ctx.problem.records;
+    let rows: Vec<Vec<Row>> = (0..records.len())
+        .map(|i| rows(ctx, i, &sim[i], &residual[i]))
+        .collect();
+    let mut all = Vec::new();
+    for &(name, unit, says, formula) in TERMS {
+        for place in ["input", "output"] {
+            let innovations = records
+                .iter()
+                .zip(&rows)
+                .map(|(r, rows)| {
+                    let raw: Vec<f64> = rows.iter().map(formula).collect();
+                    let moved = if place == "input" {
+                        let mut y = Vec::new();
+                        simulate(&ctx.problem.base, &raw, &[], &mut y, None);
+                        y
+                    } else {
+                        raw
+                    };
+                    let mut w = vec![0.0; moved.len()];
+                    r.whiten(&moved, &mut w);
+                    w
+                })
+                .collect();
+            all.push(Column {
+                name,
+                place,
+                unit,
+                says,
+                innovations,
+            });
+        }
+    }
+    all.retain(|c| c.innovations.iter().flatten().all(|x| x.is_finite()));
+    all
+}
+
+/// The term of the library that would gain most beside a fit, everything else refitted: its place in the library, and what
+/// twice the log-likelihood would gain.
+pub(crate) fn strongest(
+    library: &[Column],
+    tangents: &Tangents,
+    fit: &Fit,
+    mask: &Mask,
+) -> Option<(usize, f64)> {
+    library
+        .iter()
+        .enumerate()
+        .map(|(i, c)| {
+            (
+                i,
+                tangents.gain(&c.innovations, &fit.innovations, mask).score,
+            )
+        })
+        .filter(|(_, s)| s.is_finite())
+        .max_by(|a, b| a.1.total_cmp(&b.1))
+}
+
+fn inner(a: &[Vec<f64>], b: &[Vec<f64>], mask: &Mask) -> f64 {
+    a.iter()
+        .zip(b)
+        .zip(mask)
+        .map(|((a, b), m)| {
+            m.iter()
+                .map(|r| dot(&a[r.clone()], &b[r.clone()]))
+                .sum::<f64>()
+        })
+        .sum()
+}
+
+/// Most terms of a formula.
+const MOST_TERMS: usize = 4;
+
+/// What a term must gain to be taken into a formula.
+const WORTH: f64 = 40.0;
+
+/// Forward selection on the first part of every record; each term must also help in the rest.
+pub(crate) fn hypothesis(ctx: &Context<'_>, fit: &Fit, library: &[Column]) -> Option<Hypothesis> {
+    let (train, test) = split_in_time(&ctx.problem.records);
+    let all = &fit.innovations;
+    // A line first, with an amplitude and a phase of its own in every record.
+    let line = strongest_line(ctx, fit)
+        .and_then(|hz| without_line(ctx, fit, hz, &train))
+        .filter(|l| inner(&l.left, &l.left, &test) < inner(all, all, &test) - 10.0);
+    let e = line.as_ref().map_or(all, |l| &l.left);
+    let mut chosen: Vec<usize> = Vec::new();
+    let mut coefficients = DVector::zeros(0);
+    let mut left = e.clone();
+    while chosen.len() < MOST_TERMS {
+        let (best, gain) = (0..library.len())
+            .filter(|i| !chosen.contains(i))
+            .map(|i| {
+                let c = &library[i].innovations;
+                let (cc, ce) = (inner(c, c, &train), inner(c, &left, &train));
+                (i, if cc > 0.0 { ce * ce / cc } else { 0.0 })
+            })
+            .max_by(|a, b| a.1.total_cmp(&b.1))?;
+        if gain < WORTH {
+            break;
+        }
+        let mut trial = chosen.clone();
+        trial.push(best);
+        let n = trial.len();
+        let column = |i: usize| &library[trial[i]].innovations;
+        // Terms of very different units: each in parts of its own size.
+        let size: Vec<f64> = (0..n)
+            .map(|i| {
+                inner(column(i), column(i), &train)
+                    .sqrt()
+                    .max(f64::MIN_POSITIVE)
+            })
+            .collect();
+        let a = DMatrix::from_fn(n, n, |i, j| {
+            inner(column(i), column(j), &train) / (size[i] * size[j])
+        });
+        let b = DVector::from_fn(n, |i, _| inner(column(i), e, &train) / size[i]);
+        let Some(x) = a.cholesky().map(|c| c.solve(&b)) else {
+            break;
+        };
+        let x = DVector::from_fn(n, |i, _| x[i] / size[i]);
+        let mut next = e.clone();
+        for (i, x) in trial.iter().zip(x.iter()) {
+            for (next, c) in next.iter_mut().zip(&library[*i].innovations) {
+                next.iter_mut().zip(c).for_each(|(n, c)| *n -= x * c);
+            }
+        }
+        if inner(&next, &next, &test) > inner(&left, &left, &test) - 10.0 {
+            break;
+        }
+        (chosen, coefficients, left) = (trial, x, next);
+    }
+    if chosen.is_empty() && line.is_none() {
+        return None;
+    }
+    let count = ctx.problem.count(&test) as f64;
+    let before = inner(all, all, &test) - count;
+    let after = inner(&left, &left, &test) - count;
+    let line = line.map(|l| Term {
+        term: format!("sin(2 pi {:.2} Hz t + phase of the record)", l.hz),
+        place: "output",
+        coefficient: l.amplitude_um,
+        unit: "um".to_owned(),
+    });
+    let of_library = chosen.iter().zip(coefficients.iter()).map(|(i, x)| Term {
+        term: library[*i].name.to_owned(),
+        place: library[*i].place,
+        coefficient: *x,
+        unit: library[*i].unit.to_owned(),
+    });
+    let terms: Vec<Term> = line.into_iter().chain(of_library).collect();
+    let formula = terms
+        .iter()
+        .map(|t| {
+            format!(
+                "{} += {:.4e} [{}] {}",
+                t.place, t.coefficient, t.unit, t.term
+            )
+        })
+        .collect::<Vec<_>>()
+        .join(", ");
+    Some(Hypothesis {
+        formula,
+        held_out_worth: if before > 0.0 {
+            (1.0 - after / before).clamp(-1.0, 1.0)
+        } else {
+            0.0
+        },
+        terms,
+    })
+}

@@ -1,0 +1,257 @@
+//! Records that must get a message instead of a name: nothing moves, too little, other units, another rig.
+
+use crate::data::record::Record;
+use crate::dot::dot;
+use crate::error::ReconcileError;
+use crate::fit::context::Context;
+
+/// Shortest total length of records with a changing command, of a rig whose noise is a walk \[s\].
+const NEEDED_S: f64 = 5.0;
+
+/// Fewest rows from which effects can be told apart.
+const NEEDED_ROWS: usize = 400;
+
+/// Samples by which an output may be delayed, or seem to lead.
+const MOST_SAMPLES: usize = 20;
+
+/// What can be seen without a model.
+pub(crate) fn records(records: &[Record], bead: bool) -> Result<(), ReconcileError> {
+    let Some(first) = records.first() else {
+        return Err(ReconcileError::NoRecords);
+    };
+    for r in records {
+        if (r.sample_s / first.sample_s - 1.0).abs() > 1e-3 {
+            return Err(ReconcileError::SampleTime {
+                record: r.name.clone(),
+                found_s: r.sample_s,
+                expected_s: first.sample_s,
+            });
+        }
+    }
+    let moving: Vec<&Record> = records.iter().filter(|r| !r.is_rest()).collect();
+    if moving.is_empty() {
+        return Err(ReconcileError::ConstantInput);
+    }
+    let seconds: f64 = moving.iter().map(|r| r.frames() as f64 * r.sample_s).sum();
+    let rows: usize = records.iter().map(Record::frames).sum();
+    let needed = if bead && seconds < NEEDED_S {
+        format!("{NEEDED_S} s")
+    } else if rows < NEEDED_ROWS {
+        format!("{NEEDED_ROWS} rows")
+    } else {
+        return Ok(());
+    };
+    Err(ReconcileError::TooShort {
+        seconds,
+        rows,
+        needed,
+    })
+}
+
+/// What the working point says about the command's unit.
+pub(crate) fn working_point(
+    records: &[Record],
+    working_point_um: f64,
+) -> Result<(), ReconcileError> {
+    let (low, high) = records
+        .iter()
+        .map(Record::pzt_range_um)
+        .fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), (c, d)| {
+            (a.min(c), b.max(d))
+        });
+    let span = (high - low).max(1e-9);
+    if working_point_um < low - 0.5 * span || working_point_um > high + 0.5 * span {
+        let volts = low >= -0.5
+            && high <= 10.5
+            && (0.5 * (low + high) * 4.0 / working_point_um - 1.0).abs() < 0.5;
+        return Err(ReconcileError::WorkingPoint {
+            low_um: low,
+            high_um: high,
+            working_point_um,
+            hint: if volts {
+                "the column looks like volts: convert at 4 um per volt, or name the column with --input-column and its scale with --input-um-per-unit"
+            } else {
+                "check the unit of the column and working_point_um of the model"
+            },
+        });
+    }
+    Ok(())
+}
+
+/// Whether the motion goes with the command as the model says, at any gain and any delay up to 20 samples; judged by the
+/// innovations of a bead, and by the positions themselves, which a strong nonlinearity leaves more alike.
+pub(crate) fn motion(ctx: &Context<'_>) -> Result<(), ReconcileError> {
+    let problem = ctx.problem;
+    let sim = ctx.simulated(&[], &problem.all());
+    let most = MOST_SAMPLES;
+    let (mut yy, mut count) = (0.0, 0.0);
+    let mut white: Vec<(Vec<f64>, Vec<f64>)> = Vec::new();
+    for (r, s) in problem.records.iter().zip(&sim) {
+        if r.rest {
+            continue;
+        }
+        let (mut y, mut w) = (vec![0.0; s.len()], vec![0.0; s.len()]);
+        // A command that is off its working point would drown everything in a ramp; take the ramp off both.
+        r.whiten(&without_ramp(&r.y, &r.present), &mut y);
+        r.whiten(&without_ramp(s, &r.present), &mut w);
+        yy += dot(&y, &y);
+        count += r.whitener.count() as f64;
+        white.push((y, w));
+    }
+    let (mut best, mut gain) = (0.0f64, 0.0f64);
+    let ss: f64 = white.iter().map(|(_, s)| dot(s, s)).sum();
+    for d in 0..=most {
+        let ys: f64 = white
+            .iter()
+            .map(|(y, s)| dot(&y[d.min(y.len())..], &s[..s.len().saturating_sub(d)]))
+            .sum();
+        if ss > 0.0 && ys * ys / ss > best {
+            best = ys * ys / ss;
+            gain = ys / ss;
+        }
+    }
+    if let Some(lead) = leads(&white) {
+        return Err(ReconcileError::Leads {
+            lead_s: lead as f64 * problem.base.sample_s,
+        });
+    }
+    let excess = yy - count;
+    if excess < 0.02 * count && ss > 0.5 * count {
+        return Err(ReconcileError::AnotherRig {
+            explained_percent: 0.0,
+            detail: "; the bead hardly moves although the command does".to_owned(),
+        });
+    }
+    if excess < 0.02 * count {
+        return Ok(());
+    }
+    let explained = best / excess;
+    let units = |what, hint| {
+        Err(ReconcileError::Units {
+            what,
+            ratio: gain,
+            hint,
+        })
+    };
+    if explained > 0.25 {
+        if gain < 0.0 {
+            return units(
+                "sign",
+                "the bead moves against the model: swap the sign of the bead or of the command",
+            );
+        }
+        if gain > 100.0 {
+            return units(
+                "bead_um looks like nanometres",
+                "divide the column by 1000, or pass its scale with --output-um-per-unit 0.001",
+            );
+        }
+        if gain < 0.01 {
+            return units(
+                "bead_um looks like millimetres",
+                "multiply the column by 1000, or pass its scale with --output-um-per-unit 1000",
+            );
+        }
+        if (3.0..5.5).contains(&gain) {
+            return units(
+                "pzt_um looks like volts",
+                "convert at 4 um per volt, or pass its scale with --input-um-per-unit 4",
+            );
+        }
+        if !(0.3..=3.0).contains(&gain) {
+            return units(
+                "the gain of command or position",
+                "check the units of both columns and the model file",
+            );
+        }
+        return Ok(());
+    }
+    let alike = level_likeness(problem, &sim);
+    if explained.max(alike) > LEAST_ALIKE {
+        return Ok(());
+    }
+    Err(ReconcileError::AnotherRig {
+        explained_percent: 100.0 * explained.max(alike).clamp(0.0, 1.0),
+        detail: String::new(),
+    })
+}
+
+/// Below this part of the motion a record does not go with the model in any sense.
+const LEAST_ALIKE: f64 = 0.08;
+
+/// Part of the variance of the positions that the model's own positions explain at the best gain and delay.
+fn level_likeness(problem: &crate::problem::Problem, sim: &[Vec<f64>]) -> f64 {
+    let (mut best, mut yy, mut ss) = (0.0f64, 0.0, 0.0);
+    let pairs: Vec<(Vec<f64>, Vec<f64>)> = problem
+        .records
+        .iter()
+        .zip(sim)
+        .filter(|(r, _)| !r.rest)
+        .map(|(r, s)| (r.without_start(&r.y, true), r.without_start(s, true)))
+        .collect();
+    for (y, s) in &pairs {
+        yy += dot(y, y);
+        ss += dot(s, s);
+    }
+    for d in 0..=MOST_SAMPLES {
+        let ys: f64 = pairs
+            .iter()
+            .map(|(y, s)| dot(&y[d.min(y.len())..], &s[..s.len().saturating_sub(d)]))
+            .sum();
+        if ss > 0.0 && yy > 0.0 {
+            best = best.max(ys * ys / (ss * yy));
+        }
+    }
+    best
+}
+
+/// By how many samples the output leads, where it fits clearly better so than with any delay.
+fn leads(white: &[(Vec<f64>, Vec<f64>)]) -> Option<usize> {
+    let at = |d: isize| -> f64 {
+        let k = d.unsigned_abs();
+        let ys: f64 = white
+            .iter()
+            .map(|(y, s)| {
+                let (a, b) = if d >= 0 { (y, s) } else { (s, y) };
+                dot(&a[k.min(a.len())..], &b[..b.len().saturating_sub(k)])
+            })
+            .sum();
+        ys * ys
+    };
+    let most = MOST_SAMPLES as isize;
+    let late = (0..=most).map(at).fold(0.0, f64::max);
+    let (lead, early) = (2..=most)
+        .map(|d| (d, at(-d)))
+        .max_by(|a, b| a.1.total_cmp(&b.1))?;
+    (early > 4.0 * late && early > 0.0).then_some(lead as usize)
+}
+
+fn without_ramp(y: &[f64], present: &[bool]) -> Vec<f64> {
+    let (mut n, mut t1, mut t2, mut y1, mut ty) = (0.0, 0.0, 0.0, 0.0, 0.0);
+    for (k, (v, p)) in y.iter().zip(present).enumerate() {
+        if *p {
+            let t = k as f64;
+            n += 1.0;
+            t1 += t;
+            t2 += t * t;
+            y1 += v;
+            ty += t * v;
+        }
+    }
+    let det = n * t2 - t1 * t1;
+    if det <= 0.0 {
+        return y.to_vec();
+    }
+    let (slope, offset) = ((n * ty - t1 * y1) / det, (t2 * y1 - t1 * ty) / det);
+    y.iter()
+        .zip(present)
+        .enumerate()
+        .map(|(k, (v, p))| {
+            if *p {
+                v - offset - slope * k as f64
+            } else {
+                0.0
+            }
+        })
+        .collect()
+}

@@ -1,0 +1,260 @@
+//! The check on data not used in fitting: whole records (frequencies, amplitudes, wave forms) and the last part of the
+//! time.
+
+use crate::fit::context::{Context, Fit};
+use crate::parallel;
+use crate::problem::{Mask, Prepared, split_in_time};
+use crate::verdict::map::{BAND_EDGES_HZ, DiscrepancyMap};
+use crate::verdict::result::{BandGap, Interval, RecordGap};
+
+/// What the held-out check found.
+#[derive(Debug, Clone)]
+pub(crate) struct HeldOut {
+    /// RMS innovation of the null on held-out records \[um\].
+    pub before_um: f64,
+    /// RMS innovation of the set, fitted without the record \[um\].
+    pub after_um: f64,
+    /// RMS of the free run's error, likewise: without level, transients, and, for a plant that integrates, a ramp \[um\].
+    pub free_before_um: f64,
+    /// The same of the set \[um\].
+    pub free_after_um: f64,
+    /// What the walk and the white noise alone are expected to make of it \[um\].
+    pub free_floor_um: f64,
+    pub per_record: Vec<RecordGap>,
+    /// Parts that do not help in the last 40 % of the time when fitted on the first 60 %.
+    pub unconfirmed: Vec<usize>,
+    /// How far a free base gain moves when it is refitted together with the set.
+    pub gain_shift: Interval,
+}
+
+/// Sums over the held-out rows of one fold.
+#[derive(Debug, Clone, Copy, Default)]
+struct Sums {
+    before: f64,
+    after: f64,
+    count: usize,
+    free_before: f64,
+    free_after: f64,
+    free_floor: f64,
+    rows: f64,
+}
+
+impl Sums {
+    fn plus(self, o: &Self) -> Self {
+        Self {
+            before: self.before + o.before,
+            after: self.after + o.after,
+            count: self.count + o.count,
+            free_before: self.free_before + o.free_before,
+            free_after: self.free_after + o.free_after,
+            free_floor: self.free_floor + o.free_floor,
+            rows: self.rows + o.rows,
+        }
+    }
+}
+
+/// Whether the plant integrates slowly enough for a nanometre of displacement to become a ramp.
+fn integrates(ctx: &Context<'_>) -> bool {
+    let longest = ctx.scope.length_s;
+    ctx.problem
+        .base
+        .zpk
+        .poles
+        .iter()
+        .any(|p| p.norm() * longest < 1.0)
+}
+
+/// Free-run error on the rows of a mask: energies before and after, what the noise is expected to make, and rows.
+fn free_run(ctx: &Context<'_>, null: &Fit, set: &Fit, test: &Mask) -> Sums {
+    let ramp = integrates(ctx);
+    let noise = &ctx.problem.noise;
+    let mut sums = Sums::default();
+    let (before, after) = (
+        ctx.residual_under(null, test),
+        ctx.residual_under(set, test),
+    );
+    for (i, (r, ranges)) in ctx.problem.records.iter().zip(test).enumerate() {
+        if ranges.is_empty() {
+            continue;
+        }
+        let energy = |e: &[f64]| -> f64 {
+            let left = r.without_start(e, ramp);
+            ranges
+                .iter()
+                .map(|m| left[m.clone()].iter().map(|x| x * x).sum::<f64>())
+                .sum()
+        };
+        let rows: f64 = ranges
+            .iter()
+            .flat_map(Clone::clone)
+            .filter(|&k| r.present[k])
+            .count() as f64;
+        sums.free_before += energy(&before[i]);
+        sums.free_after += energy(&after[i]);
+        // A walk of n rows about its mean has the variance q n/6, about its regression line q n/15.
+        let share = if ramp { 1.0 / 15.0 } else { 1.0 / 6.0 };
+        sums.free_floor += rows * (noise.walk_um2 * r.u.len() as f64 * share + noise.white_um2);
+        sums.rows += rows;
+    }
+    sums
+}
+
+/// Runs the check.
+pub(crate) fn check(ctx: &Context<'_>, fit: &Fit, threads: usize) -> HeldOut {
+    let records = &ctx.problem.records;
+    let sigma = ctx.problem.noise.innovation_um();
+    let (train, test) = split_in_time(records);
+    // Records: each predicted by a fit to all others, where those are enough; else the end of each by its beginning.
+    // Amplitudes and phases of lines are each record's own: kept.
+    let folds: Vec<usize> = (0..records.len()).collect();
+    let results = parallel::map(&folds, threads, |&i| {
+        let mut others = ctx.problem.all();
+        let mut own: Mask = vec![Vec::new(); records.len()];
+        std::mem::swap(&mut others[i], &mut own[i]);
+        // A record at rest says nothing of a response.
+        let moving = |mask: &Mask| -> usize {
+            let moves = |(m, r): (&Vec<std::ops::Range<usize>>, &Prepared)| {
+                if r.rest { Vec::new() } else { m.clone() }
+            };
+            ctx.problem
+                .count(&mask.iter().zip(records).map(moves).collect())
+        };
+        let enough = records[i].rest || 4 * moving(&others) > moving(&others) + moving(&own);
+        let (others, own) = if enough {
+            (others, own)
+        } else {
+            let mut end: Mask = vec![Vec::new(); records.len()];
+            end[i].clone_from(&test[i]);
+            (train.clone(), end)
+        };
+        let null = ctx.fit(Vec::new(), &others, 3);
+        let set = if fit.parts.is_empty() {
+            null.clone()
+        } else {
+            let mut f = ctx.refit(fit, &others, 4);
+            f.lines.clone_from(&fit.lines);
+            f.innovations = ctx.innovations(&f, &ctx.problem.all()).0;
+            f
+        };
+        Sums {
+            before: null.chi2_on(&own),
+            after: set.chi2_on(&own),
+            count: ctx.problem.count(&own),
+            ..free_run(ctx, &null, &set, &own)
+        }
+    });
+    let innovation = |c: f64, n: usize| sigma * (c / n.max(1) as f64).sqrt();
+    let per_record: Vec<RecordGap> = records
+        .iter()
+        .zip(&results)
+        .map(|(r, s)| {
+            let free = |e: f64| (e / s.rows.max(1.0)).sqrt();
+            RecordGap {
+                record: r.name.clone(),
+                before: innovation(s.before, s.count),
+                after: innovation(s.after, s.count),
+                free_run_before: free(s.free_before),
+                free_run_after: free(s.free_after),
+            }
+        })
+        .collect();
+    let total = results.iter().fold(Sums::default(), |a, s| a.plus(s));
+    // Time: the first 60 % of every record predict the rest.
+    let indices: Vec<usize> = (0..fit.parts.len()).collect();
+    let whole = (!fit.parts.is_empty()).then(|| ctx.refit(fit, &train, 4).chi2_on(&test));
+    let unconfirmed = parallel::map(&indices, threads, |&i| {
+        let mut parts = fit.parts.clone();
+        parts.remove(i);
+        let without = ctx
+            .fit_from(parts, Some(fit.soft), &train, 6)
+            .chi2_on(&test);
+        whole.is_some_and(|w| without - w < 2.0)
+    });
+    let unconfirmed = indices
+        .into_iter()
+        .zip(unconfirmed)
+        .filter(|(_, u)| *u)
+        .map(|(i, _)| i)
+        .collect();
+    let free = |e: f64| (e / total.rows.max(1.0)).sqrt();
+    HeldOut {
+        before_um: innovation(total.before, total.count),
+        after_um: innovation(total.after, total.count),
+        free_before_um: free(total.free_before),
+        free_after_um: free(total.free_after),
+        free_floor_um: free(total.free_floor),
+        per_record,
+        unconfirmed,
+        gain_shift: gain_shift(ctx, fit),
+    }
+}
+
+/// Refits with a free gain beside the set (or alone) and says how far it moves from 1.
+fn gain_shift(ctx: &Context<'_>, fit: &Fit) -> Interval {
+    let unit = String::new();
+    if ctx.free_gain {
+        return Interval {
+            value: fit.gain,
+            ci95: [
+                fit.gain - 1.96 * fit.errors[1],
+                fit.gain + 1.96 * fit.errors[1],
+            ],
+            unit,
+        };
+    }
+    if fit.has("gain-error") {
+        return Interval {
+            value: 1.0,
+            ci95: [1.0, 1.0],
+            unit,
+        };
+    }
+    let Some(v) = crate::fit::catalogue::Variant::named("gain-error", "") else {
+        return Interval {
+            value: 1.0,
+            ci95: [1.0, 1.0],
+            unit,
+        };
+    };
+    let mut parts = fit.parts.clone();
+    parts.push(crate::fit::catalogue::Part::new(v, &[1.0]));
+    let free = ctx.fit_from(parts, Some(fit.soft), &ctx.problem.all(), 3);
+    let value = free.parts.last().map_or(1.0, |p| p.natural()[0]);
+    let n = free.covariance.nrows();
+    let sd = if n > 0 {
+        free.covariance[(n - 1, n - 1)].max(0.0).sqrt()
+    } else {
+        0.0
+    };
+    Interval {
+        value,
+        ci95: [value - 1.96 * sd, value + 1.96 * sd],
+        unit,
+    }
+}
+
+/// RMS innovation per band before and after, all records together.
+pub(crate) fn bands(before: &DiscrepancyMap, after: &DiscrepancyMap) -> Vec<BandGap> {
+    let n = BAND_EDGES_HZ.len() - 1;
+    (0..n)
+        .map(|b| {
+            let rms = |m: &DiscrepancyMap| {
+                let cells: Vec<f64> = m
+                    .rows
+                    .iter()
+                    .filter(|r| r.cells.len() > n)
+                    .map(|r| r.cells[b].rms_um.powi(2))
+                    .collect();
+                (cells.iter().sum::<f64>() / cells.len().max(1) as f64).sqrt()
+            };
+            let floor = before.rows.first().map_or(0.0, |r| r.cells[b].floor_um);
+            BandGap {
+                low_hz: BAND_EDGES_HZ[b],
+                high_hz: BAND_EDGES_HZ[b + 1],
+                before: rms(before),
+                after: rms(after),
+                floor,
+            }
+        })
+        .collect()
+}

@@ -1,0 +1,295 @@
+//! The verdict: what a set of effects must show before its names are given, and what is said where it does not.
+
+use crate::data::floor::Floor;
+use crate::fit::context::{Context, Fit};
+use crate::search::sequential::{ids, left_over};
+use crate::thresholds::THRESHOLDS;
+use crate::verdict::battery::{self, Column, Hypothesis};
+use crate::verdict::held_out::HeldOut;
+use crate::verdict::map::DiscrepancyMap;
+use crate::verdict::names::Names;
+use crate::verdict::result::{Remainder, Verdict};
+use crate::verdict::sentences::sentences;
+use crate::verdict::split;
+
+/// Everything that a verdict rests on.
+pub(crate) struct Evidence<'a> {
+    pub null: &'a Fit,
+    pub fit: &'a Fit,
+    pub names: &'a Names,
+    pub held: &'a HeldOut,
+    pub floor: &'a Floor,
+    /// Whether the map of the null shows anything beyond the floor.
+    pub null_flagged: bool,
+    pub after: &'a DiscrepancyMap,
+    /// Whether missing or repeated frames were counted.
+    pub counted: bool,
+}
+
+/// The verdict with its reasons.
+pub(crate) struct Judgement {
+    pub verdict: Verdict,
+    /// Sentences for `where`.
+    pub reasons: Vec<String>,
+    pub hypothesis: Option<Hypothesis>,
+    pub remainder: Option<Remainder>,
+}
+
+/// A figure with digits for whatever unit it is in.
+pub fn figure(x: f64) -> String {
+    if x == 0.0 || !x.is_finite() {
+        return format!("{x}");
+    }
+    let digits = (2 - x.abs().log10().floor() as i32).clamp(0, 12) as usize;
+    if x.abs() < 1e-9 {
+        format!("{x:.2e}")
+    } else {
+        format!("{x:.digits$}")
+    }
+}
+
+pub(crate) fn judge(ctx: &Context<'_>, e: &Evidence<'_>, threads: usize) -> Judgement {
+    let n = e.null.count as f64;
+    let scatter = (2.0 * n + (0.012 * n).powi(2)).sqrt();
+    let excess = e.null.chi2 - n;
+    let left = e.fit.chi2 - n;
+    let closed = if excess > 0.0 {
+        1.0 - left.max(0.0) / excess
+    } else {
+        1.0
+    };
+    let all = ctx.problem.all();
+    let library = battery::library(ctx, e.fit);
+    let strongest = battery::strongest(&library, &ctx.tangents(e.fit, &all), e.fit, &all);
+    // A term counts where it is beyond chance and beyond what equations that differ in their last digits leave.
+    let gained = (e.null.chi2 - e.fit.chi2).max(0.0);
+    let term = strongest.filter(|(_, gain)| *gain > TERM_LEAST.max(TERM_SHARE * gained));
+    let much = left > THRESHOLDS.left_sd * scatter && closed < whole(e.fit);
+    let remains = much || term.is_some();
+    let mut out = Judgement {
+        verdict: Verdict::NothingMissing,
+        reasons: Vec::new(),
+        hypothesis: None,
+        remainder: None,
+    };
+    if e.fit.parts.is_empty() {
+        let beyond = excess > 4.0 * scatter || e.null_flagged || term.is_some();
+        if !e.floor.source.is_known() {
+            out.verdict = Verdict::Unknown;
+            out.reasons
+                .push(no_floor(e, "nothing of the catalogue helps"));
+        } else if beyond {
+            out.verdict = Verdict::Unknown;
+            out.reasons
+                .push("no effect of the catalogue explains it".to_owned());
+        } else if e.counted {
+            out.verdict = Verdict::Named;
+        }
+        if out.verdict == Verdict::Unknown {
+            describe(ctx, e.fit, &library, term, &mut out);
+        }
+        return out;
+    }
+    if let Some(reason) = refusal(ctx, e, closed, left > THRESHOLDS.left_sd * scatter, threads) {
+        out.verdict = Verdict::Unknown;
+        out.reasons.push(reason);
+        describe(ctx, e.null, &battery::library(ctx, e.null), None, &mut out);
+        return out;
+    }
+    if remains && (e.names.ambiguous || closed < REMAINDER_CLOSED) {
+        out.verdict = Verdict::Unknown;
+        out.reasons.push(format!(
+            "the best of the catalogue, {}, closes {:.1} % of it, and more than chance is left: no name",
+            ids(e.fit).join(" + "),
+            100.0 * closed
+        ));
+        describe(ctx, e.null, &battery::library(ctx, e.null), None, &mut out);
+        return out;
+    }
+    out.verdict = if e.names.ambiguous {
+        Verdict::Ambiguous
+    } else if remains {
+        Verdict::NamedWithRemainder
+    } else {
+        Verdict::Named
+    };
+    if remains {
+        out.remainder = Some(remainder(ctx, e, &library, term, 1.0 - closed));
+    }
+    out
+}
+
+/// What a term of the library must gain in twice the log-likelihood to count as left over: some forty terms, each at chi-square
+/// with one number, are beyond chance at 25; the rest is for a noise whose shape is not quite a walk and white noise.
+const TERM_LEAST: f64 = 80.0;
+
+/// And in parts of what the set gains.
+const TERM_SHARE: f64 = 0.01;
+
+/// With a remainder a set must close so much at least for its names to stand.
+const REMAINDER_CLOSED: f64 = 0.9;
+
+/// What a set must close to count as whole. Positions are known only within the noise where a pixel's error is steep: an error
+/// periodic in position never closes altogether.
+fn whole(fit: &Fit) -> f64 {
+    if fit.has("pixel-locking") {
+        THRESHOLDS.closed_least
+    } else {
+        THRESHOLDS.closed_whole
+    }
+}
+
+/// Why a set is no name, if it is none.
+fn refusal(
+    ctx: &Context<'_>,
+    e: &Evidence<'_>,
+    closed: f64,
+    open: bool,
+    threads: usize,
+) -> Option<String> {
+    let best = ids(e.fit).join(" + ");
+    if !e.floor.source.is_known() {
+        return Some(no_floor(e, &format!("the best of the catalogue is {best}")));
+    }
+    if e.names.curvature {
+        return Some(format!(
+            "the best of the catalogue, {best}, needs a static curvature more than the memory of a hysteresis: no name"
+        ));
+    }
+    if open && closed < THRESHOLDS.closed_least {
+        return Some(format!(
+            "the best of the catalogue, {best}, closes {:.0} % of it: not enough for a name",
+            100.0 * closed
+        ));
+    }
+    if let Some(words) = at_bound(ctx, e.fit) {
+        return Some(format!(
+            "the best of the catalogue, {best}, is no name: {words}"
+        ));
+    }
+    if let Some(words) = not_earned(e) {
+        return Some(format!(
+            "the best of the catalogue, {best}, is no name: {words}"
+        ));
+    }
+    split::disagreement(ctx, e.null, e.fit, threads)
+        .map(|words| format!("the best of the catalogue, {best}, is no name: {words}"))
+}
+
+/// What is said where there is no floor.
+fn no_floor(e: &Evidence<'_>, best: &str) -> String {
+    format!(
+        "without a noise floor no name is given (no rest, no repeated command, no stated noise); {best}: innovations {} before, {} after, free run {} before, {} after, on held-out records; record a rest of 10 s or the command twice, and look again",
+        figure(e.held.before_um),
+        figure(e.held.after_um),
+        figure(e.held.free_before_um),
+        figure(e.held.free_after_um)
+    )
+}
+
+/// A number that stopped at its bound was looking for another equation.
+fn at_bound(ctx: &Context<'_>, fit: &Fit) -> Option<String> {
+    let mut at = 0;
+    for part in &fit.parts {
+        for (j, (p, v)) in part.variant().params.iter().zip(part.natural()).enumerate() {
+            let (low, high) = (p.coordinate(p.lower), p.coordinate(p.upper));
+            let x = part.theta[j];
+            let near = 1e-4 * (high - low);
+            let sd = fit.covariance[(at + j, at + j)].max(0.0).sqrt();
+            if x > high - near || (x < low + near && p.lower != 0.0) {
+                return Some(format!(
+                    "{} of {} stands at its bound, {}",
+                    p.name,
+                    part.id(),
+                    figure(v)
+                ));
+            }
+            if j == 0 && p.log && 1.96 * sd > 0.5 * (high - low) {
+                return Some(format!("{} of {} may be anything", p.name, part.id()));
+            }
+            let nyquist_hz = 0.5 / ctx.scope.sample_s;
+            if ctx.scope.sampled_input && p.name.ends_with("_hz") && v > nyquist_hz {
+                return Some(format!(
+                    "{} of {} is {} Hz, above half the sampling rate of {} Hz",
+                    p.name,
+                    part.id(),
+                    figure(v),
+                    figure(2.0 * nyquist_hz)
+                ));
+            }
+        }
+        at += part.theta.len();
+    }
+    None
+}
+
+/// A name must help on data that was not fitted, in innovations and, where its effect is beyond what the walk makes, in free run.
+fn not_earned(e: &Evidence<'_>) -> Option<String> {
+    let (before, after) = (e.held.free_before_um, e.held.free_after_um);
+    // The walk's own scatter is as large as itself.
+    let floor = 2.0 * e.held.free_floor_um;
+    if before > floor && after > floor && after > (1.0 - THRESHOLDS.free_run_fall) * before {
+        return Some(format!(
+            "the free run on held-out records is off by {} with it and by {} without",
+            figure(after),
+            figure(before)
+        ));
+    }
+    if e.held.after_um > e.held.before_um {
+        return Some(format!(
+            "the innovations on held-out records are {} with it and {} without",
+            figure(e.held.after_um),
+            figure(e.held.before_um)
+        ));
+    }
+    None
+}
+
+/// Says what is left, with a formula.
+fn describe(
+    ctx: &Context<'_>,
+    fit: &Fit,
+    library: &[Column],
+    term: Option<(usize, f64)>,
+    out: &mut Judgement,
+) {
+    let all = ctx.problem.all();
+    let term = term.or_else(|| {
+        battery::strongest(library, &ctx.tangents(fit, &all), fit, &all)
+            .filter(|(_, gain)| *gain > TERM_LEAST.max(0.1 * left_over(fit)))
+    });
+    if let Some((i, gain)) = term {
+        out.reasons.push(format!(
+            "what it is like: {} ({} at the {}, {:.0} % of what is left)",
+            library[i].says,
+            library[i].name,
+            library[i].place,
+            100.0 * (gain / left_over(fit).max(gain)).min(1.0)
+        ));
+    }
+    out.hypothesis = battery::hypothesis(ctx, fit, library);
+}
+
+/// What is left beside names that stand.
+fn remainder(
+    ctx: &Context<'_>,
+    e: &Evidence<'_>,
+    library: &[Column],
+    term: Option<(usize, f64)>,
+    share: f64,
+) -> Remainder {
+    Remainder {
+        places: sentences(ctx, e.fit, e.after),
+        how: term.map_or_else(
+            || "nothing of the library of terms stands out".to_owned(),
+            |(i, _)| {
+                format!(
+                    "{} ({} at the {})",
+                    library[i].says, library[i].name, library[i].place
+                )
+            },
+        ),
+        share: share.clamp(0.0, 1.0),
+        formula: battery::hypothesis(ctx, e.fit, library),
+    }
+}

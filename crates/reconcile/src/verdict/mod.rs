@@ -1,0 +1,16 @@
+//! What may be said of the set that was found: held-out check, names, verdict, the augmented model.
+
+mod assemble;
+mod augment;
+pub(crate) mod battery;
+mod guard;
+mod held_out;
+pub(crate) mod judge;
+pub(crate) mod map;
+mod names;
+mod parameters;
+pub(crate) mod result;
+mod sentences;
+mod significance;
+mod split;
+pub(crate) mod workflow;

@@ -1,0 +1,201 @@
+//! The effects of a set as results: numbers with intervals, rivals, and what would tell them apart.
+
+use crate::data::frames::{self, FrameCounts};
+use crate::fit::catalogue::{Part, Variant};
+use crate::fit::context::{Context, Fit, freedom_of};
+use crate::search::sequential::{Rival, left_over, prior_penalty};
+use crate::thresholds::THRESHOLDS;
+use crate::verdict::parameters::parameters;
+use crate::verdict::result::{Effect as NamedEffect, Interval};
+use crate::verdict::significance;
+use cellpos_plant::effects;
+use std::collections::BTreeMap;
+
+/// Whether no record of command and bead position can tell two effects apart.
+fn inseparable(a: &str, b: &str) -> bool {
+    effects::find(a).is_some_and(|k| k.spec().inseparable_from.contains(&b))
+}
+
+/// What would tell an effect from its rivals, in words for the result.
+fn separate_by(id: &str, alternatives: &[String]) -> String {
+    let lag = |a: &str| matches!(a, "driver-lag" | "bubble");
+    if lag(id) && alternatives.iter().any(|a| lag(a)) {
+        return "a lag of the driver and a bubble in the chip give the same response from command to bead: measure the piezo itself (strain gauge or capacitive sensor) with the fluid disconnected, or repeat after an hour: a bubble's lag drifts as it dissolves".to_owned();
+    }
+    effects::find(id)
+        .map_or("", |k| k.spec().separate_by)
+        .to_owned()
+}
+
+/// The effects of a set.
+pub(crate) struct Names {
+    pub effects: Vec<NamedEffect>,
+    /// Whether other names explain the records as well.
+    pub ambiguous: bool,
+    /// Whether play operators explain by their static curvature more than by their memory.
+    pub curvature: bool,
+}
+
+/// Ids that explain the records as well in the stead of part `index`, and whether a record could tell them from it.
+fn alternatives(
+    ctx: &Context<'_>,
+    fit: &Fit,
+    index: usize,
+    rivals: &[Rival],
+) -> (Vec<String>, bool) {
+    let part = &fit.parts[index];
+    let id = part.id();
+    let over = left_over(fit);
+    let (mut found, mut open): (Vec<String>, bool) = (Vec::new(), false);
+    for r in rivals {
+        if r.id == id || found.iter().any(|a| a == r.id) {
+            continue;
+        }
+        let decided = ctx.white.is_some_and(|w| {
+            let mut other = fit.parts.clone();
+            other[index] = r.part.clone();
+            let s = ctx.problem.base.sample_s;
+            w.distance(&other, s) - w.distance(&fit.parts, s) > 16.0
+        });
+        // A richer form that only holds the winner as a limit of its numbers is no rival; one as simple is, however
+        // unusual its size, unless what is left over says that the last percent decides nothing.
+        let rough = over > 0.02 * fit.count as f64;
+        let price = if rough || r.part.theta.len() > part.theta.len() {
+            prior_penalty(&r.part, over) - prior_penalty(part, over)
+        } else {
+            0.0
+        };
+        if r.chi2 + price - fit.chi2 < THRESHOLDS.tie && !decided {
+            open |= !inseparable(id, r.id);
+            found.push(r.id.to_owned());
+        }
+    }
+    // What nothing tells apart is both, as long as the form is the plain one of both.
+    let same = effects::find(id).map_or(&[][..], |k| k.spec().inseparable_from);
+    for other in same {
+        if part.variant().params.len() == 1 && !found.iter().any(|x| x == other) {
+            found.push((*other).to_owned());
+        }
+    }
+    found.sort();
+    (found, open)
+}
+
+/// The effects of a fit, with the rivals of each.
+pub(crate) fn names(ctx: &Context<'_>, null: &Fit, fit: &Fit, rivals: &[Vec<Rival>]) -> Names {
+    let all = ctx.problem.all();
+    let n = null.count as f64;
+    let excess = null.chi2 - n;
+    let mut out = Names {
+        effects: Vec::new(),
+        ambiguous: false,
+        curvature: false,
+    };
+    for (i, part) in fit.parts.iter().enumerate() {
+        let id = part.id();
+        let mut parts = fit.parts.clone();
+        parts.remove(i);
+        let without = ctx.fit_from(parts, Some(fit.soft), &all, 8);
+        let gain = (without.chi2 - fit.chi2).max(0.0);
+        out.curvature |= mostly_curvature(ctx, fit, i, gain);
+        let rivals = rivals.get(i).map_or(&[][..], Vec::as_slice);
+        let (alternatives, open) = alternatives(ctx, fit, i, rivals);
+        out.ambiguous |= open;
+        let mut parameters = parameters(ctx, fit, i, (fit.chi2 - n) / n);
+        // Other valleys of the same equation that fit as well.
+        for r in rivals {
+            if r.part.variant == part.variant && r.chi2 - fit.chi2 < THRESHOLDS.valley {
+                for (p, value) in part.variant().params.iter().zip(r.part.natural()) {
+                    if let Some(found) = parameters.get_mut(p.name) {
+                        found.reach(value);
+                    }
+                }
+            }
+        }
+        let needs_text = !alternatives.is_empty() || id == "gain-error";
+        let freedom = freedom_of(part.variant(), ctx.problem.records.len());
+        out.effects.push(NamedEffect {
+            id: id.to_owned(),
+            place: effects::find(id).map_or("camera", |k| k.spec().shown_place()),
+            parameters,
+            p_value: significance::p_value(gain, freedom),
+            explained: if excess > 0.0 {
+                (gain / excess).clamp(0.0, 1.0)
+            } else {
+                0.0
+            },
+            separate_by: needs_text.then(|| separate_by(id, &alternatives)),
+            alternatives,
+        });
+    }
+    out
+}
+
+/// Missing and repeated frames, counted, and where.
+pub(crate) fn of_frames(frames: &FrameCounts) -> (Vec<NamedEffect>, Vec<String>) {
+    let (mut named, mut places) = (Vec::new(), Vec::new());
+    let rows = [
+        (
+            "frame-drops",
+            frames.drops_named(),
+            frames.missing,
+            frames.rows,
+            frames.drop_rate(),
+            0.0,
+        ),
+        (
+            "frame-repeats",
+            frames.repeats_named(),
+            frames.repeats,
+            frames.pairs,
+            frames.repeat_rate(),
+            frames.by_chance,
+        ),
+    ];
+    for (id, is_named, count, total, rate, chance) in rows {
+        if !is_named {
+            continue;
+        }
+        let wide = frames::wilson(count as f64, total.max(1) as f64);
+        let off = chance / total.max(1) as f64;
+        named.push(NamedEffect {
+            id: id.to_owned(),
+            place: "camera",
+            parameters: BTreeMap::from([(
+                "rate".to_owned(),
+                Interval {
+                    value: rate,
+                    ci95: [(wide[0] - off).max(0.0), (wide[1] - off).max(0.0)],
+                    unit: String::new(),
+                },
+            )]),
+            p_value: significance::p_value(2.0 * (count as f64 - chance), 1),
+            explained: 0.0,
+            alternatives: Vec::new(),
+            separate_by: None,
+        });
+        places.push(format!("{id}: {count} of {total} frames"));
+    }
+    (named, places)
+}
+
+/// Whether most of what play operators gain is their static quadratic term, which is no hysteresis.
+fn mostly_curvature(ctx: &Context<'_>, fit: &Fit, index: usize, gain: f64) -> bool {
+    let part = &fit.parts[index];
+    let Some(quadratic) = part
+        .variant()
+        .params
+        .iter()
+        .position(|p| p.name == "quadratic_per_um")
+    else {
+        return false;
+    };
+    let Some(v) = Variant::named("pzt-hysteresis", "curvature") else {
+        return false;
+    };
+    let mut parts = fit.parts.clone();
+    parts[index] = Part::new(v, &[part.natural()[quadratic]]);
+    let forgetful = ctx.fit_from(parts, Some(fit.soft), &ctx.problem.all(), 12);
+    // What memory adds must be at least a half of the whole.
+    forgetful.chi2 - fit.chi2 < 0.5 * gain
+}

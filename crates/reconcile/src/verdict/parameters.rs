@@ -1,0 +1,137 @@
+//! The numbers of what was found, with their intervals.
+
+use crate::fit::catalogue::Part;
+use crate::fit::context::{Context, Fit};
+use crate::verdict::result::Interval;
+use cellpos_plant::effects::{self, Role};
+use std::collections::BTreeMap;
+
+/// Relative error of a parameter that no length of record takes away: two integrators of the same equations, a commanded edge
+/// in one and in the other, agree to about a thousandth (two of these).
+const NUMERIC: f64 = 5e-4;
+
+/// Parameters of part `index` with 95 % intervals in their units.
+pub(crate) fn parameters(
+    ctx: &Context<'_>,
+    fit: &Fit,
+    index: usize,
+    left_per_row: f64,
+) -> BTreeMap<String, Interval> {
+    let offset: usize = fit.parts[..index]
+        .iter()
+        .map(|p| p.variant().params.len())
+        .sum();
+    let part = &fit.parts[index];
+    // A fit that leaves something over is less sure than its own curvature says.
+    let wide = (1.0 + left_per_row.max(0.0)).sqrt();
+    let mut out = BTreeMap::new();
+    for (j, p) in part.variant().params.iter().enumerate() {
+        let x = part.theta[j];
+        let scatter = fit.covariance[(offset + j, offset + j)].max(0.0).sqrt() * wide;
+        let sd = scatter.hypot(NUMERIC * if p.log { 1.0 } else { x.abs() });
+        let (low, high) = (p.natural(x - 1.96 * sd), p.natural(x + 1.96 * sd));
+        let name = if p.name == "weights" {
+            format!("weights[{j}]")
+        } else {
+            p.name.to_owned()
+        };
+        out.insert(
+            name,
+            Interval {
+                value: p.natural(x),
+                ci95: [low, high],
+                unit: unit_of(part, p.name).to_owned(),
+            },
+        );
+    }
+    let nth = |role| {
+        fit.parts[..index]
+            .iter()
+            .filter(|p| p.variant().role == role)
+            .count()
+    };
+    match part.variant().role {
+        Role::Line => {
+            let um = line_um(ctx, part, &fit.lines[nth(Role::Line)]);
+            out.insert("um".to_owned(), um);
+        }
+        Role::Position => {
+            out.extend(wave_of_position(ctx, fit, index, nth(Role::Position)));
+        }
+        Role::Chain => {}
+    }
+    out
+}
+
+/// A value with so many standard deviations about it as make 95 %.
+fn about(value: f64, sd: f64, unit: &str) -> Interval {
+    Interval {
+        value,
+        ci95: [value - 1.96 * sd, value + 1.96 * sd],
+        unit: unit.to_owned(),
+    }
+}
+
+/// Amplitude of a line: the mean over the records, by their rows.
+fn line_um(ctx: &Context<'_>, part: &Part, line: &[[f64; 2]]) -> Interval {
+    let records = &ctx.problem.records;
+    let rows: f64 = records.iter().map(|r| r.u.len() as f64).sum();
+    let mean = records
+        .iter()
+        .zip(line)
+        .map(|(r, [a, b])| a.hypot(*b) * r.u.len() as f64)
+        .sum::<f64>()
+        / rows;
+    // One record's amplitude has the error sigma sqrt(2/n) over the filter's gain at the line.
+    let w = std::f64::consts::TAU * part.natural()[0] * ctx.problem.base.sample_s;
+    let theta = ctx.problem.noise.white_um2 / ctx.problem.noise.innovation_um().powi(2);
+    let gain = (2.0 * (w / 2.0).sin()) / (1.0 + theta * theta - 2.0 * theta * w.cos()).sqrt();
+    let sd = ctx.problem.noise.innovation_um() * (2.0 / rows).sqrt() / gain.max(1e-6);
+    // A sine and a cosine of noise have a length themselves: sd_i^2/(2 A) in the mean of each record's.
+    let mean = (mean - 0.5 * sd * sd * line.len() as f64 / mean.max(1e-12)).max(0.0);
+    about(mean, sd, "um")
+}
+
+/// Amplitude of an error periodic in position, in pixels; by the exact filter, where it was run, the pixel as well.
+fn wave_of_position(
+    ctx: &Context<'_>,
+    fit: &Fit,
+    index: usize,
+    nth: usize,
+) -> Vec<(String, Interval)> {
+    if let Some(Some(exact)) = fit.locking.get(index) {
+        let (amplitude, sd) = exact.amplitude_px();
+        let factor = (1.96 * exact.log_pixel_error().hypot(NUMERIC)).exp();
+        let pixel = Interval {
+            value: exact.pixel_um,
+            ci95: [exact.pixel_um / factor, exact.pixel_um * factor],
+            unit: "um".to_owned(),
+        };
+        let amplitude = about(amplitude, sd.hypot(NUMERIC * amplitude), "px");
+        return vec![
+            ("pixel_um".to_owned(), pixel),
+            ("amplitude".to_owned(), amplitude),
+        ];
+    }
+    let [a, b] = fit.positions[nth];
+    let pixel = fit.parts[index].natural()[0];
+    let rows: f64 = ctx.problem.count(&ctx.problem.all()) as f64;
+    // The fit sees the error at an uncertain position: less sharp than it is.
+    let scale = pixel * ctx.problem.noise.sharpness(pixel);
+    let sd = ctx.problem.noise.innovation_um() * (2.0 / rows).sqrt() / scale;
+    let amplitude = a.hypot(b) / scale;
+    // Positions carry the error themselves: the second order of its slope, as an error of the method.
+    let bent = amplitude * (std::f64::consts::TAU * amplitude).powi(2) / 16.0;
+    vec![(
+        "amplitude".to_owned(),
+        about(amplitude, sd.hypot(bent), "px"),
+    )]
+}
+
+/// Unit of a parameter; a width of operators is that of their thresholds.
+fn unit_of(part: &Part, name: &str) -> &'static str {
+    if name == "width_um" {
+        return "um";
+    }
+    effects::find(part.id()).map_or("", |k| k.spec().unit(name))
+}

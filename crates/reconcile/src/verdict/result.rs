@@ -1,0 +1,295 @@
+//! What the workflow hands back: verdict, effects, where, gap, and what a report needs.
+
+use crate::data::floor::FloorSource;
+use crate::data::noise::Noise;
+use crate::fit::context::{Context, Fit};
+use crate::verdict::battery::Hypothesis;
+use crate::verdict::map::DiscrepancyMap;
+use cellpos_plant::Model;
+use serde::Serialize;
+use std::collections::BTreeMap;
+
+/// The five answers.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Verdict {
+    /// Effects are named; alternatives that no record of command and position can tell apart are listed with them.
+    Named,
+    /// Effects are named and hold on their own, and something remains beside them: see [`Reconciliation::remainder`].
+    NamedWithRemainder,
+    /// The data cannot separate the named effect from its alternatives; `separate_by` says what would.
+    Ambiguous,
+    /// Beyond the floor, and nothing in the catalogue closes enough of it.
+    Unknown,
+    /// At the floor.
+    NothingMissing,
+}
+
+impl Verdict {
+    /// The word used in JSON.
+    pub fn word(self) -> &'static str {
+        match self {
+            Self::Named => "named",
+            Self::NamedWithRemainder => "named-with-remainder",
+            Self::Ambiguous => "ambiguous",
+            Self::Unknown => "unknown",
+            Self::NothingMissing => "nothing-missing",
+        }
+    }
+}
+
+/// A value with its 95 % interval.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Interval {
+    /// Best value.
+    pub value: f64,
+    /// Low and high end of the 95 % confidence interval.
+    pub ci95: [f64; 2],
+    /// Unit; empty for a pure number.
+    #[serde(skip_serializing_if = "String::is_empty")]
+    pub unit: String,
+}
+
+impl Interval {
+    /// Widens the interval to another value that explains the records as well, as uncertain as the best.
+    pub(crate) fn reach(&mut self, value: f64) {
+        let [low, high] = self.ci95;
+        self.ci95 = [
+            low.min(value - (self.value - low)),
+            high.max(value + (high - self.value)),
+        ];
+    }
+}
+
+/// One named effect.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Effect {
+    /// Id of the vocabulary.
+    pub id: String,
+    /// Place in the chain.
+    pub place: &'static str,
+    /// Parameters by name.
+    pub parameters: BTreeMap<String, Interval>,
+    /// Probability of such a gain by chance in the whole search.
+    pub p_value: f64,
+    /// Part of the excess over the floor that goes away with this effect and comes back without it, 0..1.
+    pub explained: f64,
+    /// Ids that explain these records as well in its stead.
+    pub alternatives: Vec<String>,
+    /// The experiment that would tell them apart.
+    pub separate_by: Option<String>,
+}
+
+/// What is left beside the named effects.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Remainder {
+    /// Where it shows.
+    #[serde(rename = "where")]
+    pub places: Vec<String>,
+    /// What it is like, in words.
+    pub how: String,
+    /// Part of the excess over the floor that is left, 0..1.
+    pub share: f64,
+    /// A formula for it, where one helps on data that it has not seen.
+    pub formula: Option<Hypothesis>,
+}
+
+/// A step of the search.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct GapStep {
+    /// The set at that step.
+    pub effects: Vec<String>,
+    /// RMS innovation with that set.
+    pub rms: f64,
+    /// The base model's gain, where it was free in that step: a factor, 1 as in the model.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub base_gain: Option<f64>,
+}
+
+/// The gap of one held-out record.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct RecordGap {
+    /// Record.
+    pub record: String,
+    /// RMS innovation of the null model \[um\].
+    pub before: f64,
+    /// RMS innovation of the augmented model fitted to all other records \[um\].
+    pub after: f64,
+    /// RMS error of the free run of the null model.
+    pub free_run_before: f64,
+    /// The same of the augmented model fitted to all other records.
+    pub free_run_after: f64,
+}
+
+/// The gap of one band.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct BandGap {
+    /// Lower edge \[Hz\].
+    pub low_hz: f64,
+    /// Upper edge \[Hz\].
+    pub high_hz: f64,
+    /// RMS innovation density before, as the full-band RMS that it would give \[um\].
+    pub before: f64,
+    /// The same after.
+    pub after: f64,
+    /// The same of noise alone.
+    pub floor: f64,
+}
+
+/// How far simulation and measurement are apart.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Gap {
+    /// Null model, on held-out records.
+    pub before: f64,
+    /// Augmented model, on held-out records.
+    pub after: f64,
+    /// Noise alone; where [`Reconciliation::floor`] is unknown, what the fit leaves.
+    pub floor: f64,
+    /// RMS error of the free run of the null model on held-out records, without its start.
+    pub free_run_before: f64,
+    /// The same of the augmented model.
+    pub free_run_after: f64,
+    /// What noise alone is expected to make of it.
+    pub free_run_floor: f64,
+    /// Unit of all figures of the gap.
+    pub unit: String,
+    /// What they are.
+    pub quantity: &'static str,
+    /// The search, step by step, on all records.
+    pub steps: Vec<GapStep>,
+    /// Record by record.
+    pub per_record: Vec<RecordGap>,
+    /// Band by band, on all records.
+    pub bands: Vec<BandGap>,
+}
+
+impl Gap {
+    /// `1 - (after - floor)/(before - floor)`; 1 when there was no gap.
+    pub fn closure(&self) -> f64 {
+        let d = self.before - self.floor;
+        if d <= 0.0 {
+            1.0
+        } else {
+            1.0 - (self.after - self.floor) / d
+        }
+    }
+}
+
+/// Stretches of records for plotting.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Trace {
+    /// Record.
+    pub record: String,
+    /// Times \[s\].
+    pub time_s: Vec<f64>,
+    /// Measured position, NaN where missing \[um\].
+    pub measured_um: Vec<f64>,
+    /// Null model, carried along with the measured position by its own filter \[um\].
+    pub before_um: Vec<f64>,
+    /// Augmented model, likewise \[um\].
+    pub after_um: Vec<f64>,
+    /// Free-run residual of the null model \[um\].
+    pub residual_before_um: Vec<f64>,
+    /// Free-run residual of the augmented model \[um\].
+    pub residual_after_um: Vec<f64>,
+}
+
+/// All traces.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Traces(pub Vec<Trace>);
+
+impl Traces {
+    pub(crate) fn new(ctx: &Context<'_>, null: &Fit, fit: &Fit) -> Self {
+        let sample_s = ctx.problem.base.sample_s;
+        let (before, sim_before) = ctx.residual(null);
+        let (after, sim_after) = ctx.residual(fit);
+        Self(
+            ctx.problem
+                .records
+                .iter()
+                .enumerate()
+                .map(|(i, r)| {
+                    let n = r.u.len().min((4.0 / sample_s) as usize);
+                    let measured: Vec<f64> = (0..n)
+                        .map(|k| if r.present[k] { r.y[k] } else { f64::NAN })
+                        .collect();
+                    let start = |s: &[Vec<f64>]| {
+                        (0..n)
+                            .find(|&k| r.present[k])
+                            .map_or(0.0, |k| r.y[k] - s[i][k])
+                    };
+                    let (b0, a0) = (start(&sim_before), start(&sim_after));
+                    Trace {
+                        record: r.name.clone(),
+                        time_s: (0..n).map(|k| k as f64 * sample_s).collect(),
+                        measured_um: measured,
+                        before_um: sim_before[i][..n].iter().map(|s| s + b0).collect(),
+                        after_um: sim_after[i][..n].iter().map(|s| s + a0).collect(),
+                        residual_before_um: before[i][..n]
+                            .iter()
+                            .map(|e| e - before[i][0])
+                            .collect(),
+                        residual_after_um: after[i][..n].iter().map(|e| e - after[i][0]).collect(),
+                    }
+                })
+                .collect(),
+        )
+    }
+}
+
+/// Everything that the workflow found.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Reconciliation {
+    /// The answer.
+    pub verdict: Verdict,
+    /// Named effects, the one that explains most first.
+    pub effects: Vec<Effect>,
+    /// Where the null model fails, in sentences.
+    pub places: Vec<String>,
+    /// How far apart before and after.
+    pub gap: Gap,
+    /// How far base parameters move beside the effects: a free gain (1 = not at all), and the share of a command's
+    /// direct path that the frame at its edge already shows.
+    pub base_shift: BTreeMap<String, Interval>,
+    /// A formula for what no effect explains.
+    pub hypothesis: Option<Hypothesis>,
+    /// What is left beside the named effects.
+    pub remainder: Option<Remainder>,
+    /// Where the noise floor comes from.
+    pub floor: FloorSource,
+    /// Noise of these records.
+    pub noise: Noise,
+    /// Sample time \[s\].
+    pub sample_s: f64,
+    /// The model with the effects added.
+    pub augmented: Model,
+    /// Map of the null model.
+    pub before: DiscrepancyMap,
+    /// Map of the augmented model.
+    pub after: DiscrepancyMap,
+    /// Stretches for plotting.
+    pub traces: Traces,
+    /// Name, rows and frames of every record.
+    pub records: Vec<(String, usize, usize)>,
+}
+
+impl Reconciliation {
+    /// The JSON object for machines.
+    pub fn to_json(&self) -> serde_json::Value {
+        serde_json::json!({
+            "verdict": self.verdict,
+            "effects": self.effects,
+            "where": self.places,
+            "gap": self.gap,
+            "base_shift": self.base_shift,
+            "hypothesis": self.hypothesis,
+            "remainder": self.remainder,
+            "floor": { "source": self.floor, "known": self.floor.is_known(), "words": self.floor.words() },
+            "noise": {
+                "diffusion_um2_per_s": self.noise.diffusion_um2_per_s(self.sample_s),
+                "localisation_um": self.noise.localisation_um(),
+                "innovation_um": self.noise.innovation_um(),
+            },
+        })
+    }
+}

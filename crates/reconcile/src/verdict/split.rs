@@ -1,0 +1,114 @@
+//! Whether the numbers of a set are those of one equation: fitted to parts of the records, they must agree.
+
+use crate::fit::context::{Context, Fit};
+use crate::parallel;
+use crate::problem::Mask;
+use crate::search::sequential::threshold;
+use crate::thresholds::THRESHOLDS;
+use cellpos_plant::effects::Role;
+
+/// A set of rows, with its name for messages.
+type Group = (String, Mask);
+
+/// Records one by one, and halves of the time.
+fn groupings(ctx: &Context<'_>) -> Vec<Vec<Group>> {
+    let records = &ctx.problem.records;
+    let none = || vec![Vec::new(); records.len()];
+    let halves: Vec<Group> = [
+        ("the first half of the time", 0),
+        ("the second half of the time", 1),
+    ]
+    .iter()
+    .map(|(name, half)| {
+        let mask = records
+            .iter()
+            .map(|r| {
+                let n = r.u.len();
+                std::iter::once(half * n / 2..(half + 1) * n / 2).collect()
+            })
+            .collect();
+        ((*name).to_owned(), mask)
+    })
+    .collect();
+    let moving: Vec<usize> = (0..records.len()).filter(|&i| !records[i].rest).collect();
+    let mut all = vec![halves];
+    if moving.len() > 1 {
+        all.push(
+            moving
+                .iter()
+                .map(|&i| {
+                    let mut mask = none();
+                    mask[i] = std::iter::once(0..records[i].u.len()).collect();
+                    (records[i].name.clone(), mask)
+                })
+                .collect(),
+        );
+    }
+    all
+}
+
+/// What does not agree between parts of the records, in words; `None` where everything does.
+pub(crate) fn disagreement(
+    ctx: &Context<'_>,
+    null: &Fit,
+    fit: &Fit,
+    threads: usize,
+) -> Option<String> {
+    let numbers: usize = fit.parts.iter().map(|p| p.theta.len()).sum();
+    if numbers == 0 || fit.parts.iter().all(|p| p.variant().role != Role::Chain) {
+        return None;
+    }
+    let gained = (null.chi2 - fit.chi2).max(0.0);
+    for groups in groupings(ctx) {
+        let fits = parallel::map(&groups, threads, |(_, mask)| {
+            (fit.chi2_on(mask), ctx.refit(fit, mask, 6))
+        });
+        let freedom = (numbers + 1) * (groups.len() - 1);
+        let better: f64 = fits
+            .iter()
+            .map(|(joint, own)| (joint - own.chi2).max(0.0))
+            .sum();
+        let enough = threshold(freedom.max(1)).max(THRESHOLDS.split_gain * gained);
+        if better < enough {
+            continue;
+        }
+        // The number that moves most beyond its own uncertainty, in the group that asks for it.
+        let mut worst: Option<(f64, String)> = None;
+        for ((name, _), (joint, own)) in groups.iter().zip(&fits) {
+            if joint - own.chi2 < 0.5 * better / groups.len() as f64 {
+                continue;
+            }
+            let mut at = 0;
+            for (a, b) in fit.parts.iter().zip(&own.parts) {
+                let (va, vb) = (a.natural(), b.natural());
+                for (j, p) in a.variant().params.iter().enumerate() {
+                    let sd = own.covariance[(at + j, at + j)].max(0.0).sqrt();
+                    let moved = (b.theta[j] - a.theta[j]).abs();
+                    let size = (va[j].abs().max(vb[j].abs())).max(1e-300);
+                    let share = (va[j] - vb[j]).abs() / size;
+                    if a.variant().role == Role::Chain
+                        && moved > 4.0 * sd
+                        && share > THRESHOLDS.split_share
+                        && worst.as_ref().is_none_or(|w| share > w.0)
+                    {
+                        worst = Some((
+                            share,
+                            format!(
+                                "{} of {} is {:.4} in {name} and {:.4} over all: another equation",
+                                p.name,
+                                a.id(),
+                                vb[j],
+                                va[j]
+                            ),
+                        ));
+                    }
+                }
+                at += a.theta.len();
+            }
+        }
+        if let Some((_, words)) = worst {
+            return Some(words);
+        }
+    }
+    None
+}

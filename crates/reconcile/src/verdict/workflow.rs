@@ -1,0 +1,293 @@
+//! The workflow: guards, null model, search, held-out check.
+
+use crate::data::floor::{self, FloorSource};
+use crate::data::frames;
+use crate::data::noise::Noise;
+use crate::data::record::{Record, canonical};
+use crate::error::ReconcileError;
+use crate::fit::catalogue;
+use crate::fit::context::{Context, Fit, WhiteEvidence};
+use crate::fit::locking;
+use crate::problem::Problem;
+use crate::search::sequential::{Effort, Found, ids, search};
+use crate::simulate::{Base, Zpk};
+use crate::thresholds::THRESHOLDS;
+use crate::verdict::assemble;
+use crate::verdict::guard;
+use crate::verdict::held_out;
+use crate::verdict::result::Reconciliation;
+use cellpos_plant::effects::Scope;
+use cellpos_plant::{Effect, Model};
+
+/// By how much a walk may differ from that of the model for the model's localisation noise to be believed of this rig: the
+/// radius of a bead and the viscosity of a warm room make so much.
+const WALK_ALIKE: f64 = 0.3;
+
+/// How to run.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Options {
+    /// Threads for candidates; the result does not depend on it.
+    pub threads: usize,
+    /// Most effects to add.
+    pub max_effects: usize,
+    /// The command is an analogue signal sampled together with the output, not held between rows.
+    pub interpolated_input: bool,
+    /// The base model is a constant gain fitted to these very records, those of a bare actuator and its displacement
+    /// sensor: the gain is free in every fit, the null included, and effects of the chip and of the bead are not looked for.
+    pub free_gain: bool,
+    /// The plant need not have rested at its working point before a record: its transients are free in every record.
+    pub free_start: bool,
+}
+
+impl Default for Options {
+    fn default() -> Self {
+        Self {
+            threads: 2,
+            max_effects: 4,
+            interpolated_input: false,
+            free_gain: false,
+            free_start: false,
+        }
+    }
+}
+
+/// Finds, names and adds what a model lacks.
+///
+/// `progress` is told in words what goes on. The result depends on nothing but the model, the records and the options:
+/// neither on the order of the records nor on the number of threads, and a record cut in two is put together again.
+///
+/// # Errors
+/// Records or a model about which no verdict is possible: see [`ReconcileError`].
+pub fn reconcile(
+    model: &Model,
+    records: &[Record],
+    options: &Options,
+    progress: &mut dyn FnMut(&str),
+) -> Result<Reconciliation, ReconcileError> {
+    let records = canonical(records.to_vec());
+    guard::records(&records, !options.free_start && !options.free_gain)?;
+    if !options.free_start {
+        guard::working_point(&records, model.working_point_um)?;
+    }
+    let frames = frames::count(&records);
+    let none: Vec<Vec<bool>> = records.iter().map(|r| vec![false; r.rows()]).collect();
+    let repeated = if frames.repeats_named() {
+        &frames.repeated
+    } else {
+        &none
+    };
+    let base = base_of(model, &records, options)?;
+    let scope = scope_of(model, &records, &base);
+    let fixed = model.effects.clone();
+    let stated = stated_noise(model, base.sample_s);
+    let start = stated.unwrap_or_else(|| Noise::new(0.33, base.sample_s, 0.03));
+    let problem = Problem::new(base, &records, repeated, start);
+    let present: Vec<Vec<bool>> = problem.records.iter().map(|r| r.present.clone()).collect();
+
+    progress("null model and noise floor");
+    let first = context(&problem, scope, &fixed, options).fit(Vec::new(), &problem.all(), 4);
+    let residual = free_of_start(&context(&problem, scope, &fixed, options), &first);
+    let floor = floor::estimate(&records, &present, &residual, stated);
+    let (noise, trusted) = (floor.noise, floor.rows);
+    let problem = problem.with_noise(noise);
+    guard::motion(&context(&problem, scope, &fixed, options))?;
+
+    let effort = Effort {
+        threads: options.threads,
+        // Without a floor no set is a name: one effect is enough to say what the rest looks like.
+        max_effects: if floor.source.is_known() {
+            options.max_effects
+        } else {
+            options.max_effects.min(1)
+        },
+    };
+    let mut noise = noise;
+    let mut problem = problem;
+    let mut found;
+    let mut round = 0;
+    loop {
+        let ctx = Context {
+            white: evidence(model, &noise, trusted, &problem),
+            ..context(&problem, scope, &fixed, options)
+        };
+        found = search(&ctx, &problem.all(), effort, &mut *progress);
+        // What the final residual shows is at least as good an estimate of the noise, if the fit is good.
+        let (residual, _) = ctx.residual(&found.fit);
+        let refined = floor::from_residuals(&present, &residual);
+        round += 1;
+        // A floor that was measured is not talked down by a fit that has numbers to spare.
+        if round >= 2
+            || !floor.source.is_known()
+            || refined.innovation_um() > 0.97 * noise.innovation_um()
+        {
+            break;
+        }
+        noise = refined;
+        problem = problem.with_noise(noise);
+    }
+    let ctx = Context {
+        white: evidence(model, &noise, trusted, &problem),
+        ..context(&problem, scope, &fixed, options)
+    };
+    progress("held-out check");
+    drop_small(&ctx, &mut found);
+    let mut held = held_out::check(&ctx, &found.fit, options.threads);
+    // What does not help where it was not fitted is not named.
+    while let Some(i) = held.unconfirmed.first().copied() {
+        progress(&format!(
+            "{} does not hold on held-out data: taken back",
+            ids(&found.fit)[i]
+        ));
+        let mut parts = found.fit.parts.clone();
+        parts.remove(i);
+        if i < found.rivals.len() {
+            found.rivals.remove(i);
+        }
+        found.fit = ctx.fit(parts, &problem.all(), 12);
+        held = held_out::check(&ctx, &found.fit, options.threads);
+    }
+    found.fit.locking = (0..found.fit.parts.len())
+        .map(|i| locking::refine(&ctx, &found.fit, i, options.threads))
+        .collect();
+    progress("map and verdict");
+    let given = assemble::Given {
+        model,
+        records: &records,
+        frames: &frames,
+        floor: &floor,
+        threads: options.threads,
+    };
+    Ok(assemble::assemble(&given, &ctx, found, held))
+}
+
+/// The noise that a model states, unless it says that its figures are a fit's own residual.
+fn stated_noise(model: &Model, sample_s: f64) -> Option<Noise> {
+    let noise = &model.noise;
+    let guessed = model
+        .provenance
+        .get("noise")
+        .is_some_and(|w| w == FloorSource::Unknown.words());
+    let some = noise.diffusion_um2_per_s > 0.0 || noise.localisation_um > 0.0;
+    (some && !guessed)
+        .then(|| Noise::new(noise.diffusion_um2_per_s, sample_s, noise.localisation_um))
+}
+
+/// Raw residuals without what an unknown state at the start makes.
+fn free_of_start(ctx: &Context<'_>, fit: &Fit) -> Vec<Vec<f64>> {
+    let (residual, _) = ctx.residual(fit);
+    if !ctx.problem.base.free_start {
+        return residual;
+    }
+    ctx.problem
+        .records
+        .iter()
+        .zip(residual)
+        .map(|(r, e)| r.without_start(&e, false))
+        .collect()
+}
+
+/// Takes back what is smaller than anything that matters beside effects that explain the rest.
+fn drop_small(ctx: &Context<'_>, found: &mut Found) {
+    let all = ctx.problem.all();
+    let mut i = 0;
+    while i < found.fit.parts.len() {
+        if found.fit.parts[i].matters() {
+            i += 1;
+            continue;
+        }
+        let mut parts = found.fit.parts.clone();
+        parts.remove(i);
+        let without = ctx.fit_from(parts, Some(found.fit.soft), &all, 8);
+        let gained = (found.null.chi2 - found.fit.chi2).max(1e-12);
+        if (without.chi2 - found.fit.chi2) / gained > THRESHOLDS.small_share {
+            i += 1;
+            continue;
+        }
+        if i < found.rivals.len() {
+            found.rivals.remove(i);
+        }
+        found.fit = without;
+    }
+}
+
+fn context<'a>(
+    problem: &'a Problem,
+    scope: Scope,
+    fixed: &[Effect],
+    options: &Options,
+) -> Context<'a> {
+    Context {
+        problem,
+        scope,
+        fixed: fixed.to_vec(),
+        variants: catalogue::variants(),
+        free_gain: options.free_gain,
+        white: None,
+        quantised: problem.quantised,
+    }
+}
+
+fn base_of(model: &Model, records: &[Record], options: &Options) -> Result<Base, ReconcileError> {
+    let zpk = Zpk::of(&model.plant);
+    if zpk.poles.iter().any(|p| p.re > 1e-6) {
+        return Err(ReconcileError::Model(
+            "the plant is unstable: a free run of it cannot be compared with a record".to_owned(),
+        ));
+    }
+    Ok(Base {
+        zpk,
+        working_point_um: model.working_point_um,
+        sample_s: records[0].sample_s,
+        interpolated_input: options.interpolated_input,
+        free_start: options.free_start,
+    })
+}
+
+fn scope_of(model: &Model, records: &[Record], base: &Base) -> Scope {
+    let (low, high) = records
+        .iter()
+        .map(Record::pzt_range_um)
+        .fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), (c, d)| {
+            (a.min(c), b.max(d))
+        });
+    let w = model.working_point_um;
+    Scope {
+        working_point_um: w,
+        low_um: low,
+        high_um: high,
+        // A sampled analogue input starts anywhere; what counts are the swings.
+        stroke_um: if base.interpolated_input {
+            (0.5 * (high - low)).max(1e-6)
+        } else {
+            (high - w).abs().max((w - low).abs()).max(1e-6)
+        },
+        travel_um: records.iter().map(Record::travel_um).fold(1e-6, f64::max),
+        sample_s: base.sample_s,
+        length_s: records.iter().map(Record::duration_s).fold(0.0, f64::max),
+        sampled_input: base.interpolated_input,
+    }
+}
+
+fn evidence(
+    model: &Model,
+    noise: &Noise,
+    trusted: usize,
+    problem: &Problem,
+) -> Option<WhiteEvidence> {
+    let model_um2 = model.noise.localisation_um.powi(2);
+    if trusted < 5000 || model_um2 <= 0.0 {
+        return None;
+    }
+    let variance = noise.walk_um2 + 2.0 * noise.white_um2;
+    // Only where the walk is that of the model: else the model's noise says nothing about this rig.
+    let walk = 2.0 * model.noise.diffusion_um2_per_s * problem.base.sample_s;
+    if walk <= 0.0 || (noise.walk_um2 / walk - 1.0).abs() > WALK_ALIKE {
+        return None;
+    }
+    Some(WhiteEvidence {
+        estimate_um2: noise.white_um2,
+        error_um2: 1.5 * variance / (trusted as f64).sqrt(),
+        model_um2,
+        walk_um2: noise.walk_um2,
+    })
+}

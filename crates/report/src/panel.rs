@@ -1,0 +1,336 @@
+//! One panel to SVG: title, legend, axes, data, markers.
+
+use crate::axis::{Placed, Scale};
+use crate::figure::Panel;
+use crate::marks::{dot, draw_series};
+use crate::series::{Kind, Series};
+use crate::svg::{self, Anchor, COLORS, Svg, px};
+use std::fmt::Write;
+
+/// Room for the numbers and the title of the y axis, px.
+pub(crate) const LEFT_PX: f64 = 74.0;
+/// Room beside the axes on the right, px.
+pub(crate) const RIGHT_PX: f64 = 16.0;
+const LINE_PX: f64 = 18.0;
+
+/// Where a panel goes.
+pub(crate) struct Frame {
+    pub(crate) left: f64,
+    pub(crate) top: f64,
+    pub(crate) width: f64,
+    pub(crate) x_range: Option<(f64, f64)>,
+    /// Whether the x axis has its numbers and title (only the lowest of panels that share it).
+    pub(crate) show_x: bool,
+    /// Whether its legend is drawn.
+    pub(crate) show_legend: bool,
+}
+
+/// What a panel's legend says: names, colours and strokes.
+pub(crate) fn entries(panel: &Panel) -> Vec<(&str, usize, bool)> {
+    panel
+        .series
+        .iter()
+        .zip(colors(panel))
+        .filter(|(series, _)| !series.label.is_empty())
+        .map(|(series, color)| (series.label.as_str(), color, series.dashed))
+        .collect()
+}
+
+/// Range of a panel's data along one axis, marker lines included.
+pub(crate) fn data_range(panel: &Panel, along_x: bool) -> Option<(f64, f64)> {
+    let axis = if along_x { &panel.x } else { &panel.y };
+    let mut range: Option<(f64, f64)> = None;
+    let mut take = |value: f64| {
+        if axis.places(value) {
+            let (low, high) = range.unwrap_or((value, value));
+            range = Some((low.min(value), high.max(value)));
+        }
+    };
+    for series in &panel.series {
+        for index in 0..series.len() {
+            let x = series.x.get(index).copied().unwrap_or(f64::NAN);
+            if along_x {
+                match &series.kind {
+                    Kind::Bars { width, .. } => {
+                        take(x - width / 2.0);
+                        take(x + width / 2.0);
+                    }
+                    _ => take(x),
+                }
+                continue;
+            }
+            // What lies outside a fixed range of x must not stretch y.
+            if panel.x.range.is_some_and(|(a, b)| x < a || x > b) {
+                continue;
+            }
+            let (y, low, high) = series.values(index);
+            [y, low, high].into_iter().flatten().for_each(&mut take);
+        }
+        if !along_x && matches!(series.kind, Kind::Bars { .. }) && !series.is_empty() {
+            take(0.0);
+        }
+    }
+    for marker in panel.markers.iter().filter(|m| m.vertical == along_x) {
+        take(marker.value);
+    }
+    range
+}
+
+/// Draws one panel and returns its height with title, legend and axis texts.
+pub(crate) fn draw_panel(svg: &mut Svg, panel: &Panel, frame: &Frame) -> f64 {
+    let mut top = frame.top;
+    if !panel.title.is_empty() {
+        svg.text(
+            "ttl",
+            (frame.left, top + 13.0),
+            Anchor::Start,
+            &svg::fit(&panel.title, frame.width),
+        );
+        top += LINE_PX;
+    }
+    if frame.show_legend {
+        top += legend(svg, panel, frame.left, top, frame.width);
+    }
+    top += 4.0;
+
+    let (mut width, mut height) = (frame.width, panel.height_px);
+    let y_range = data_range(panel, false);
+    let pad_x = if panel
+        .series
+        .iter()
+        .all(|s| matches!(s.kind, Kind::Points { .. }))
+    {
+        0.04
+    } else {
+        0.0
+    };
+    let mut x = Placed::new(&panel.x, frame.x_range, pad_x, width);
+    let mut y = Placed::new(&panel.y, y_range, 0.06, height);
+    let bars_up = panel
+        .series
+        .iter()
+        .any(|s| matches!(s.kind, Kind::Bars { .. }));
+    if bars_up && panel.y.range.is_none() && y_range.is_some_and(|(low, _)| low >= 0.0) {
+        y.low = if panel.y.scale == Scale::Log {
+            y.low
+        } else {
+            0.0
+        };
+    }
+    if panel.equal && panel.x.scale == Scale::Linear && panel.y.scale == Scale::Linear {
+        (width, height) = equalise(&mut x, &mut y, frame.width, height);
+    }
+    let (left, bottom) = (frame.left, top + height);
+    let area = Area {
+        left,
+        top,
+        width,
+        height,
+    };
+    grid(svg, panel, frame, &area, &x, &y);
+
+    // A nested svg clips what is drawn in it and needs no identifier, which would have to be unique in a page.
+    let _ = write!(
+        svg.out,
+        "<svg x=\"{}\" y=\"{}\" width=\"{w}\" height=\"{h}\" viewBox=\"0 0 {w} {h}\">",
+        px(left),
+        px(top),
+        w = px(width),
+        h = px(height)
+    );
+    let empty = panel.series.iter().all(Series::is_empty);
+    if empty {
+        svg.text(
+            "mut",
+            (width / 2.0, height / 2.0),
+            Anchor::Middle,
+            "no data",
+        );
+    }
+    let colors = colors(panel);
+    for below in [true, false] {
+        for (series, color) in panel.series.iter().zip(&colors) {
+            if below == matches!(series.kind, Kind::Band { .. } | Kind::Bars { .. }) {
+                draw_series(svg, series, *color, &x, &y);
+            }
+        }
+    }
+    draw_markers(svg, panel, (width, height), &x, &y);
+    svg.out.push_str("</svg>");
+    svg.rect("frm", (left, top), (width, height));
+
+    let mut end = bottom + 10.0;
+    if frame.show_x {
+        svg.text(
+            "",
+            (left + width / 2.0, bottom + 33.0),
+            Anchor::Middle,
+            &panel.x.title(),
+        );
+        end = bottom + 44.0;
+    }
+    svg.upright(
+        "",
+        (left - LEFT_PX + 16.0, top + height / 2.0),
+        &svg::fit(&panel.y.title(), height + 20.0),
+    );
+    end - frame.top
+}
+
+/// Where the axes of a panel enclose its data, px.
+struct Area {
+    left: f64,
+    top: f64,
+    width: f64,
+    height: f64,
+}
+
+/// Grid lines and the numbers at them.
+fn grid(svg: &mut Svg, panel: &Panel, frame: &Frame, area: &Area, x: &Placed, y: &Placed) {
+    let Area {
+        left,
+        top,
+        width,
+        height,
+    } = *area;
+    let bottom = top + height;
+    for tick in x.ticks(if frame.width < 320.0 { 52.0 } else { 72.0 }) {
+        let Some(at) = x.at(tick.value) else { continue };
+        let class = if tick.label.is_some() { "grd" } else { "grm" };
+        if panel.x.scale == Scale::Linear || panel.x.scale == Scale::Log {
+            svg.line(class, (left + at, top), (left + at, bottom));
+        }
+        if let (true, Some(label)) = (frame.show_x, &tick.label) {
+            let room = match &panel.x.scale {
+                Scale::Categories(names) => width / names.len().max(1) as f64,
+                _ => f64::INFINITY,
+            };
+            svg.text(
+                "mut",
+                (left + at, bottom + 15.0),
+                Anchor::Middle,
+                &svg::fit(label, room),
+            );
+        }
+    }
+    for tick in y.ticks(34.0) {
+        let Some(at) = y.at(tick.value) else { continue };
+        let class = if tick.label.is_some() { "grd" } else { "grm" };
+        svg.line(class, (left, bottom - at), (left + width, bottom - at));
+        if let Some(label) = &tick.label {
+            svg.text("mut", (left - 7.0, bottom - at + 4.0), Anchor::End, label);
+        }
+    }
+}
+
+/// Marker lines across the data, in its own coordinates.
+fn draw_markers(svg: &mut Svg, panel: &Panel, (width, height): (f64, f64), x: &Placed, y: &Placed) {
+    for marker in &panel.markers {
+        let axis = if marker.vertical { x } else { y };
+        let Some(at) = axis.at(marker.value) else {
+            continue;
+        };
+        if marker.vertical {
+            svg.line("mrk", (at, 0.0), (at, height));
+            let wide = svg::text_width_px(&marker.label);
+            if at + wide + 8.0 > width {
+                svg.text("mut", (at - 4.0, 13.0), Anchor::End, &marker.label);
+            } else {
+                svg.text("mut", (at + 4.0, 13.0), Anchor::Start, &marker.label);
+            }
+        } else {
+            svg.line("mrk", (0.0, height - at), (width, height - at));
+            let y_text = if height - at < 16.0 {
+                height - at + 13.0
+            } else {
+                height - at - 4.0
+            };
+            svg.text("mut", (width - 5.0, y_text), Anchor::End, &marker.label);
+        }
+    }
+}
+
+/// Widens one range so that both axes have the same number of pixels per unit; returns width and height.
+fn equalise<'a>(
+    x: &mut Placed<'a>,
+    y: &mut Placed<'a>,
+    width_px: f64,
+    height_px: f64,
+) -> (f64, f64) {
+    let width = width_px.min(height_px * 1.25);
+    x.length_px = width;
+    let pad = (x.high - x.low) * 0.06;
+    if x.axis.range.is_none() {
+        (x.low, x.high) = (x.low - pad, x.high + pad);
+    }
+    let per_px = ((x.high - x.low) / width).max((y.high - y.low) / height_px);
+    for (axis, length) in [(x, width), (y, height_px)] {
+        let middle = (axis.low + axis.high) / 2.0;
+        axis.low = middle - per_px * length / 2.0;
+        axis.high = middle + per_px * length / 2.0;
+    }
+    (width, height_px)
+}
+
+/// Palette number of each series.
+fn colors(panel: &Panel) -> Vec<usize> {
+    let mut next = 0;
+    panel
+        .series
+        .iter()
+        .map(|series| {
+            let color = series.color.unwrap_or(next);
+            if series.color.is_none() {
+                next += 1;
+            }
+            color % COLORS
+        })
+        .collect()
+}
+
+/// Draws the legend in lines above the panel and returns its height.
+fn legend(svg: &mut Svg, panel: &Panel, left: f64, top: f64, width: f64) -> f64 {
+    let named: Vec<_> = panel
+        .series
+        .iter()
+        .zip(colors(panel))
+        .filter(|(series, _)| !series.label.is_empty())
+        .collect();
+    if named.is_empty() {
+        return 0.0;
+    }
+    let (mut x, mut y) = (left, top);
+    for (series, color) in named {
+        let label = svg::fit(&series.label, width - 30.0);
+        let wide = svg::text_width_px(&label) + 42.0;
+        if x > left && x + wide - 16.0 > left + width {
+            x = left;
+            y += LINE_PX;
+        }
+        let middle = y + 9.0;
+        match &series.kind {
+            Kind::Line { .. } | Kind::Step { .. } => {
+                let dash = if series.dashed { " dsh" } else { "" };
+                svg.line(
+                    &format!("ln s{color}{dash}"),
+                    (x, middle),
+                    (x + 20.0, middle),
+                );
+            }
+            Kind::Points { .. } => dot(svg, color, (x + 10.0, middle), 3.2),
+            Kind::Band { .. } => {
+                svg.rect(&format!("bnd f{color}"), (x, middle - 5.0), (20.0, 10.0));
+            }
+            Kind::Bars { .. } => {
+                svg.rect(
+                    &format!("bar f{color}"),
+                    (x + 4.0, middle - 5.0),
+                    (12.0, 10.0),
+                );
+            }
+        }
+        svg.text("", (x + 25.0, middle + 4.0), Anchor::Start, &label);
+        x += wide;
+    }
+    y - top + LINE_PX
+}
