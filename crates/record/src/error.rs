@@ -41,10 +41,12 @@ pub enum RecordError {
         free: u64,
     },
     /// A column that an export does not have.
-    #[error("there is no column `{name}`; the columns are {}", crate::export::csv_head().replace(',', ", "))]
+    #[error("there is no column `{name}`; the columns are {}", known.join(", "))]
     Column {
         /// The name asked for.
         name: String,
+        /// The columns that there are.
+        known: Vec<&'static str>,
     },
     /// A run of a later version.
     #[error(

@@ -31,6 +31,7 @@ mod columns;
 mod error;
 mod events;
 pub mod export;
+mod faults;
 mod lines;
 mod meta;
 mod reader;
@@ -47,11 +48,12 @@ pub use export::{
     Exported, Format, Part, Selection, Source, TableColumn, csv_head, export, write_csv,
     write_parquet, write_table_parquet,
 };
+pub use faults::Faults;
 pub use lines::{LineFile, whole_text};
 pub use meta::{InputFile, RunEnd, RunMeta};
 pub use reader::{Batches, Gap, Lost, RunReader};
 pub use sessions::Sessions;
-pub use writer::{Faults, Finished, FlushPolicy, RunWriter};
+pub use writer::{Finished, FlushPolicy, RunWriter};
 
 /// Version of the layout of a run folder. 1: rows without a check. 2: rows with a check, only the columns that the run
 /// needs, no state of the controller.

@@ -2,8 +2,8 @@
 
 use crate::blocks::{Blocks, open_here};
 use crate::error::RecordError;
+use crate::faults::Faults;
 use crate::synced::SyncedFile;
-use crate::writer::{Faults, whole_lines};
 use std::fs::{File, OpenOptions};
 use std::io::{Read, Seek, SeekFrom};
 use std::path::Path;
@@ -126,6 +126,14 @@ fn whole_length(file: &mut File) -> std::io::Result<u64> {
         end = start;
     }
     Ok(0)
+}
+
+/// Length of the lines that end with a line end.
+pub(crate) fn whole_lines(bytes: &[u8]) -> u64 {
+    bytes
+        .iter()
+        .rposition(|byte| *byte == b'\n')
+        .map_or(0, |last| last as u64 + 1)
 }
 
 #[cfg(test)]

@@ -5,6 +5,7 @@ use crate::columns::{self, Builder, Group};
 use crate::error::RecordError;
 use crate::events::Event;
 use crate::export::{Selection, Source};
+use crate::faults::Faults;
 use crate::meta::{RunEnd, RunMeta};
 use crate::reader::RunReader;
 use crate::synced::SyncedFile;
@@ -41,19 +42,6 @@ impl FlushPolicy {
         interval: None,
         sync: false,
     };
-}
-
-/// What could not be written so far.
-#[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub struct Faults {
-    /// Rows not written.
-    pub rows_lost: u64,
-    /// Events not written.
-    pub events_lost: u64,
-    /// Refusals of the disk.
-    pub io_errors: u64,
-    /// The first refusal, in the system's words.
-    pub first: Option<String>,
 }
 
 /// What [`RunWriter::finish`] leaves behind.
@@ -420,14 +408,6 @@ impl FlushPolicy {
             ..self
         }
     }
-}
-
-/// Length of the lines that end with a line end.
-pub(crate) fn whole_lines(bytes: &[u8]) -> u64 {
-    bytes
-        .iter()
-        .rposition(|byte| *byte == b'\n')
-        .map_or(0, |last| last as u64 + 1)
 }
 
 /// Makes a folder that did not exist.

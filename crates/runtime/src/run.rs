@@ -3,7 +3,7 @@
 use crate::core::{Action, CoreError};
 use crate::life::{Event, Life, Request};
 use crate::realtime::Conditions;
-use crate::recorder::RecorderReport;
+use crate::recording::RecorderReport;
 use crate::summary::{End, Statistics, Summary};
 use crate::tick_record::TickRecord;
 use crate::ticker::Order;

@@ -3,7 +3,7 @@
 use crate::core::Counts;
 use crate::latency::Quantiles;
 use crate::life::{Life, SafeReason};
-use crate::recorder::RecorderReport;
+use crate::recording::RecorderReport;
 use crate::reference::Stage;
 use crate::tick_record::{TickFlags, TickRecord};
 use crate::ticker::Account;

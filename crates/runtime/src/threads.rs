@@ -3,9 +3,10 @@
 
 use crate::core::Counts;
 use crate::life::{Life, SafeReason};
-use crate::live::Operator;
+use crate::operator::Operator;
 use crate::pacer::{Pace, Pacer};
-use crate::recorder::{Pulse, PulseWatch, RecorderFault};
+use crate::recorder::{Pulse, PulseWatch};
+use crate::recording::RecorderFault;
 use crate::reference::ReferenceGenerator;
 use crate::run::{EndRule, EndWatch, RunError, serve_actuator};
 use crate::summary::End;

@@ -8,6 +8,7 @@ pub mod blobs;
 pub mod cells;
 pub mod config;
 mod crop;
+mod detector;
 mod fit;
 mod fix;
 mod frame;

@@ -146,14 +146,14 @@ const WEAKEST_SHARE: f32 = 0.3;
 const LEAST_AREA_SHARE: f64 = 0.15;
 
 impl Detector {
-    /// A detector for beads like the localiser's, with room for `max_beads` of them in a frame.
-    pub fn new(localiser: &crate::Localiser, max_beads: usize) -> Self {
+    /// A detector for beads of a sign of contrast, a radius and a signal to noise ratio, with room for `max_beads` of them.
+    pub(crate) fn of(sign: f64, radius_px: f64, min_snr: f64, max_beads: usize) -> Self {
         let room = 16 * max_beads.clamp(1, 1000);
         Detector {
             blobs: Blobs::new(room, room),
-            sign: localiser.sign(),
-            radius_px: localiser.template().radius_px(),
-            min_snr: localiser.config().min_snr,
+            sign,
+            radius_px,
+            min_snr,
         }
     }
 

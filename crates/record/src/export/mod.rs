@@ -95,7 +95,10 @@ impl Selection {
         names
             .iter()
             .map(|name| {
-                columns::find(name).ok_or_else(|| RecordError::Column { name: name.clone() })
+                columns::find(name).ok_or_else(|| RecordError::Column {
+                    name: name.clone(),
+                    known: COLUMNS.iter().map(|column| column.name).collect(),
+                })
             })
             .collect()
     }

@@ -22,7 +22,7 @@ pub use cell::{CellStep, CellTracker};
 pub use config::{Commanded, Decision, TrackState, TrackStep, TrackerConfig};
 use identity::Identity;
 use motion::{Motion, Randomness};
-use neighbours::{Claim, MAX_BEADS, Neighbours};
+use neighbours::{Candidate, Claim, MAX_BEADS, Neighbours};
 use standing::{Chosen as Sighted, Standing};
 
 /// Frames between measurements of the size while tracking.
@@ -42,13 +42,6 @@ struct Chosen {
     identity: Identity,
     confirmed: u32,
     last_fix_s: f64,
-}
-
-/// A bead seen in the frame, fitted.
-#[derive(Debug, Clone, Copy)]
-pub(crate) struct Candidate {
-    pub fix: Fix,
-    pub size: Option<(f64, f64)>,
 }
 
 /// Tracks one bead. Allocates only when made.

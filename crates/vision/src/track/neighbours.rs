@@ -1,9 +1,8 @@
 //! Other beads in the frame, followed so that the chosen one is not taken for one of them.
 
-use super::Candidate;
 use super::config::TrackerConfig;
 use super::motion::{Motion, Randomness};
-use crate::fix::Verdict;
+use crate::fix::{Fix, Verdict};
 
 /// Beads looked at in a frame.
 pub(crate) const MAX_BEADS: usize = 8;
@@ -13,6 +12,13 @@ const MEMORY_S: f64 = 2.0;
 const AMPLITUDE_SHARE: f64 = 0.05;
 /// Cost of not seeing a bead that should be there, on the scale of minus twice the log likelihood.
 const MISS: f64 = 30.0;
+
+/// A bead seen in the frame, fitted.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Candidate {
+    pub fix: Fix,
+    pub size: Option<(f64, f64)>,
+}
 
 /// Whose a fix is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
