@@ -2,7 +2,7 @@
 
 mod common;
 
-use cellpos_plant::{Effect, Model, effects};
+use cellpos_plant::{Effect, Model, Noise, effects};
 use common::{number, succeed};
 use serde_json::Value;
 use std::path::Path;
@@ -229,11 +229,28 @@ fn frames_that_came_without_a_fix_are_no_dropped_frames() {
         "track --target 0um --sine 3um@10Hz --duration 8s --clock virtual --rig rig.toml --json";
     let run = succeed(folder.path(), track).json();
     assert!(number(&run, "fixes_lost") > 200.0, "{run}");
-    let line = format!(
-        "reconcile --model eq6 --data {} --max-effects 1 --json --out a.toml",
-        run["run"].as_str().unwrap()
-    );
-    let r = succeed(folder.path(), &line).json();
-    let effects = r["effects"].as_array().unwrap();
-    assert!(effects.iter().all(|e| e["id"] == "time-delay"), "{r}");
+    let data = run["run"].as_str().unwrap();
+    let line = |model: &str| {
+        format!(
+            "reconcile --model {model} --data {data} --max-effects 1 --json --out a.toml --force"
+        )
+    };
+    // Neither rest nor repeat, and less noise than Eq. (6) states: no floor, and without one there is no name.
+    let r = succeed(folder.path(), &line("eq6")).json();
+    assert_eq!(r["effects"].as_array().unwrap().len(), 0, "{r}");
+    let words = r["where"].to_string();
+    assert!(words.contains("best of the catalogue is time-delay"), "{r}");
+    // The noise of this rig stated, the delay is named, and nothing beside it.
+    let quiet = Model {
+        working_point_um: 20.0,
+        noise: Noise {
+            diffusion_um2_per_s: 0.33,
+            localisation_um: 0.0025,
+        },
+        ..Model::eq6()
+    };
+    std::fs::write(folder.path().join("quiet.toml"), quiet.to_toml_string()).unwrap();
+    let r = succeed(folder.path(), &line("quiet.toml")).json();
+    named(&r, "time-delay");
+    assert_eq!(r["effects"].as_array().unwrap().len(), 1, "{r}");
 }

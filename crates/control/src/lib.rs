@@ -8,6 +8,17 @@
 //!
 //! Sampling convention: at tick `k` a command `u_k` takes effect and is held until tick `k + 1`; the position `p_k` is
 //! that just before `u_k` takes effect. The measurement that arrives at tick `k` is of the position `delay` earlier.
+//!
+//! ```
+//! use cellpos_control::{Controller, ControllerFile, LoopInput, Pi};
+//! use cellpos_plant::Model;
+//! // PI for Eq. (6) behind a loop delay of 2.5 ms, from rest at 20 um; a tick without a measurement.
+//! let file = ControllerFile::from_pi(Pi::new(0.46, 19.5), 2.5e-3);
+//! let mut controller = Controller::new(file.loop_config(&Model::eq6()).unwrap()).unwrap();
+//! controller.start(20.0, 20.0);
+//! let out = controller.step(&LoopInput::default());
+//! assert_eq!(out.command_um, 20.0);
+//! ```
 #![forbid(unsafe_code)]
 
 pub mod active_set;

@@ -6,6 +6,15 @@
 //! [`Actuator`](cellpos_rig::Actuator) stands the PZT board at the end of any byte [`Port`].
 //!
 //! Drivers know no simulator. They may block, allocate and take locks: they run on the I/O threads, never in a tick.
+//!
+//! ```
+//! use cellpos_drivers::Calibration;
+//! // 0.1 um a pixel along the rows, position 0 at column 128.
+//! let calibration = Calibration::along_rows(0.1, 128.0, 1.0);
+//! assert!((calibration.position_um(138.0, 16.0) - 1.0).abs() < 1e-12);
+//! // The variance in pixels becomes one in um^2: 0.2 px are 20 nm.
+//! assert!((calibration.variance_um2(0.04, 0.04, 0.0).sqrt() - 0.02).abs() < 1e-12);
+//! ```
 #![forbid(unsafe_code)]
 
 pub mod background;

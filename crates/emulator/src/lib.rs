@@ -8,6 +8,22 @@
 //!
 //! [`RigInABox`] joins the world to a [`Board`] on one clock; [`EmulatedRig`] puts both behind the traits of
 //! `cellpos-rig`, on the real clock or a virtual one. A seed fixes every bit of what comes out.
+//!
+//! ```
+//! use cellpos_emulator::{World, WorldConfig};
+//! use cellpos_plant::Model;
+//! // The PZT stands at the displacement of zero flow: the bead drifts at 3 um/s and diffuses.
+//! let mut world = World::new(&WorldConfig::default(), &Model::eq6(), 0).unwrap();
+//! let mut seen = 0;
+//! for k in 1..=100 {
+//!     world.advance_to(k * 1_000_000, 20.0);
+//!     while let Some(fix) = world.take_position() {
+//!         assert!(fix.position_um.abs() < 3.0);
+//!         seen += 1;
+//!     }
+//! }
+//! assert!(seen > 90);
+//! ```
 #![forbid(unsafe_code)]
 
 mod board_config;

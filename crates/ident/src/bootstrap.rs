@@ -1,18 +1,18 @@
 //! Replicates of a fit: what its parameters would be on other draws of the same noise.
 
-use crate::ladder::{LadderFit, LadderProblem};
+use crate::order_selection::{CandidateFits, OrderSelection};
 use crate::random::Random;
 use nalgebra::Complex;
 
-/// Parameter vectors of the chosen rung fitted to resampled blocks, each with the weak bounds on the feedthrough drawn anew.
+/// Parameter vectors of the chosen order fitted to resampled blocks, each with the weak bounds on the feedthrough drawn anew.
 ///
 /// A fit held by a bound that is right on average errs by less than its covariance says where the bound acts, and by how
 /// much less depends on where it landed: replicates about that place alone would repeat its luck. With the bound drawn
 /// as a datum beside the lines their spread is that of the covariance (randomise, then optimise), and the shape that of the
 /// fit as it is, not of its linear part.
 pub fn bootstrap(
-    problem: &LadderProblem<'_>,
-    fit: &LadderFit,
+    problem: &OrderSelection<'_>,
+    fit: &CandidateFits,
     replicates: usize,
     seed: u64,
 ) -> Vec<Vec<f64>> {
@@ -30,7 +30,7 @@ pub fn bootstrap(
                     }
                     let sum: Complex<f64> = (0..n).map(|_| p.block_errors[random.below(n)]).sum();
                     // Resampled means are narrower than the truth by (n-1)/n; the noise model sets the size, and what the
-                    // rung leaves over widens it as it widens the covariance.
+                    // order leaves over widens it as it widens the covariance.
                     let size = (p.variance / p.scatter_variance.max(f64::MIN_POSITIVE) * n as f64
                         / (n as f64 - 1.0)
                         * fit.scale)
@@ -41,7 +41,7 @@ pub fn bootstrap(
             let moved = [(); 2].map(|()| fit.scale.sqrt() * random.normal());
             let found = problem.clone().with_bounds_moved(moved).fit_from(
                 &data,
-                best.rung,
+                best.order,
                 &best.parameters,
                 None,
             );

@@ -20,6 +20,8 @@
 
 pub mod bare_fft;
 mod bootstrap;
+pub mod candidate_model;
+mod candidate_order;
 pub mod delay;
 mod error;
 pub mod excitation;
@@ -27,13 +29,11 @@ pub mod experiment;
 pub mod feedback;
 pub mod foreign;
 pub mod frequency_response;
-pub mod ladder;
-pub mod ladder_model;
 pub mod least_squares;
 pub mod noise;
+pub mod order_selection;
 pub mod random;
 pub mod rational;
-mod rung;
 pub mod sampled;
 pub mod spectral;
 pub mod stats;

@@ -3,7 +3,7 @@
 //! For records of other rigs, whose plant is not Eq. (4): `G(s) = B(s)/A(s) e^(-sL)`, orders from a static gain up,
 //! chosen by AICc. Started by Sanathanan-Koerner iterations, finished by Levenberg-Marquardt on the exact sampled
 //! response. Time is scaled by the band's middle, so that coefficients are of order one. Not for Eq. (4) itself:
-//! [`crate::ladder`] knows its parameters.
+//! [`crate::order_selection`] knows its parameters.
 
 use nalgebra::{Complex, DMatrix, DVector};
 

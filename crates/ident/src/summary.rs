@@ -7,11 +7,13 @@ use std::collections::BTreeMap;
 use cellpos_plant::{Covariance, Model, Noise, PlantError, TransferFunction, probably_per_hertz};
 use nalgebra::{Complex, DMatrix};
 
+use crate::candidate_model::CandidateModel;
 use crate::delay::{DelayEstimate, disagreement_s};
 use crate::error::IdentError;
 use crate::experiment::Measured;
-use crate::ladder::{DelayPrior, LadderFit, LadderProblem, Rung, index, model_of};
-use crate::ladder_model::LadderModel;
+use crate::order_selection::{
+    CandidateFits, CandidateOrder, DelayPrior, OrderSelection, index, model_of,
+};
 use crate::sampled::Sampling;
 use crate::verdict::{Judged, judge};
 
@@ -43,8 +45,8 @@ pub struct Identification {
     pub measured: Measured,
     /// How the record was sampled.
     pub sampling: Sampling,
-    /// The ladder.
-    pub ladder: LadderFit,
+    /// The candidate orders, fitted.
+    pub selection: CandidateFits,
     /// Parameters with verdicts, and the model to go on with.
     pub judged: Judged,
     /// The delay test, where one was run.
@@ -65,7 +67,7 @@ pub struct Identification {
 pub fn compensated(
     measured: Complex<f64>,
     frequency_hz: f64,
-    model: &LadderModel,
+    model: &CandidateModel,
     sampling: Sampling,
 ) -> Complex<f64> {
     measured * model.response(frequency_hz) / model.sampled_response(frequency_hz, sampling)
@@ -75,7 +77,7 @@ pub fn compensated(
 /// gain that somebody believed in before, for a warning where it is the measured one less a factor of 2 pi.
 ///
 /// # Errors
-/// Those of [`LadderProblem::new`] and [`LadderProblem::fit`].
+/// Those of [`OrderSelection::new`] and [`OrderSelection::fit`].
 pub fn summarise(
     measured: Measured,
     sampling: Sampling,
@@ -84,14 +86,14 @@ pub fn summarise(
     seed: u64,
     stated_per_s: Option<f64>,
 ) -> Result<Identification, IdentError> {
-    let problem = LadderProblem::new(&measured.points, sampling, None)?;
-    let ladder = problem.fit()?;
+    let problem = OrderSelection::new(&measured.points, sampling, None)?;
+    let selection = problem.fit()?;
     let prior = led.map(|l| DelayPrior {
         delay_s: l.delay_s,
         sd_s: l.sd_s.max(1e-7),
         half95_s: (0.5 * (l.ci95_s[1] - l.ci95_s[0])).max(1e-7),
     });
-    let judged = judge(&problem, &ladder, prior, bootstrap, seed);
+    let judged = judge(&problem, &selection, prior, bootstrap, seed);
     let disagreement = led.and_then(|l| disagreement_s(&l, judged.phase_delay95_s, 2e-5));
     let compensated = measured
         .points
@@ -114,7 +116,7 @@ pub fn summarise(
     let mut result = Identification {
         measured,
         sampling,
-        ladder,
+        selection,
         judged,
         led,
         disagreement_s: disagreement,
@@ -151,11 +153,11 @@ fn warnings(result: &Identification, stated_per_s: Option<f64>) -> Vec<String> {
             gap * 1e3
         ));
     }
-    if result.ladder.scale > 2.0 {
+    if result.selection.scale > 2.0 {
         out.push(format!(
-            "the residuals of the best rung are {:.1} times the noise (as standard deviations): the plant holds something that \
+            "the residuals of the best order are {:.1} times the noise (as standard deviations): the plant holds something that \
              Eq. (4) does not; the intervals were widened by that factor",
-            result.ladder.scale.sqrt()
+            result.selection.scale.sqrt()
         ));
     }
     let gain = result.judged.model.gain_per_s;
@@ -243,8 +245,8 @@ impl Identification {
         let mut provenance = provenance;
         provenance.insert("delay_ms".to_owned(), format!("{:.4}", best.delay_s * 1e3));
         provenance.insert(
-            "rung".to_owned(),
-            self.ladder.best().rung.formula().to_owned(),
+            "model-order".to_owned(),
+            self.selection.best().order.formula().to_owned(),
         );
         for p in &self.judged.parameters {
             provenance.insert(format!("verdict.{}", p.name), p.verdict.label().to_owned());
@@ -258,7 +260,7 @@ impl Identification {
             description: format!(
                 "identified from {} lines, {}",
                 self.measured.points.len(),
-                self.ladder.best().rung.formula()
+                self.selection.best().order.formula()
             ),
             plant,
             working_point_um,
@@ -274,22 +276,22 @@ impl Identification {
     /// Covariance of the transfer function's coefficients, carried over from that of the fitted parameters.
     fn coefficient_covariance(&self) -> Covariance {
         let best = self.judged.model;
-        let rung = if best.slow_pole_rad_per_s != 0.0 {
-            Rung::Eq4
+        let order = if best.slow_pole_rad_per_s != 0.0 {
+            CandidateOrder::Eq4
         } else if best.far_lead_s != 0.0 {
-            Rung::FarZero
+            CandidateOrder::FarZero
         } else if best.zero_rad_per_s != best.pole_rad_per_s {
-            Rung::PoleZeroPair
+            CandidateOrder::PoleZeroPair
         } else {
-            Rung::Integrator
+            CandidateOrder::Integrator
         };
         let source = self
-            .ladder
-            .rungs
+            .selection
+            .candidates
             .iter()
-            .find(|r| r.rung == rung)
-            .unwrap_or(self.ladder.best());
-        let mut x = vec![0.0; source.rung.parameters()];
+            .find(|r| r.order == order)
+            .unwrap_or(self.selection.best());
+        let mut x = vec![0.0; source.order.parameters()];
         let values = [
             (index::LN_GAIN, best.gain_per_s.ln()),
             (index::EFFECTIVE_DELAY_MS, best.effective_delay_s() * 1e3),
@@ -308,7 +310,7 @@ impl Identification {
             }
         }
         let coefficients = |x: &[f64]| -> Vec<f64> {
-            let (num, den) = model_of(x, source.rung).polynomials();
+            let (num, den) = model_of(x, source.order).polynomials();
             num.into_iter().chain(den.into_iter().skip(1)).collect()
         };
         let here = coefficients(&x);
@@ -325,7 +327,7 @@ impl Identification {
             .covariance
             .map(|v| if v.is_finite() { v } else { 0.0 });
         let matrix = &jacobian * spread * jacobian.transpose();
-        let (num, _) = model_of(&x, source.rung).polynomials();
+        let (num, _) = model_of(&x, source.order).polynomials();
         let names = (0..num.len())
             .map(|i| format!("plant.num[{i}]"))
             .chain((1..=here.len() - num.len()).map(|i| format!("plant.den[{i}]")))
@@ -339,9 +341,9 @@ impl Identification {
     }
 
     /// Band of the fitted plant at `frequency_hz`: gain (dB) and phase (deg), each low and high at 95 %, delay
-    /// excluded. From the covariance of the chosen rung.
+    /// excluded. From the covariance of the chosen order.
     pub fn band(&self, frequency_hz: f64) -> ([f64; 2], [f64; 2]) {
-        let best = self.ladder.best();
+        let best = self.selection.best();
         let here = best.model.response(frequency_hz);
         let (mut gain_variance, mut phase_variance) = (0.0, 0.0);
         let n = best.parameters.len();
@@ -350,7 +352,7 @@ impl Identification {
                 let step = 1e-5 * best.parameters[j].abs().max(0.1);
                 let mut moved = best.parameters.clone();
                 moved[j] += step;
-                let ratio = model_of(&moved, best.rung).response(frequency_hz) / here;
+                let ratio = model_of(&moved, best.order).response(frequency_hz) / here;
                 (
                     20.0 * ratio.norm().log10() / step,
                     ratio.arg().to_degrees() / step,

@@ -1,14 +1,16 @@
 //! What each parameter is worth: intervals by covariance and by bootstrap, and a verdict for every one.
 //!
-//! No parameter leaves without an interval and a verdict. A parameter is identified when the chosen rung holds it and
+//! No parameter leaves without an interval and a verdict. A parameter is identified when the chosen order holds it and
 //! its 95 % interval is narrower than half the value on either side; the slow pole and the far zero are judged on the
-//! profile of the fit, where a delay may trade against the far zero. Not for choosing a model: [`crate::ladder`].
+//! profile of the fit, where a delay may trade against the far zero. Not for choosing a model: [`crate::order_selection`].
 
 use nalgebra::Complex;
 
 pub use crate::bootstrap::bootstrap;
-use crate::ladder::{DelayPrior, LadderFit, LadderProblem, Rung, index, model_of};
-use crate::ladder_model::LadderModel;
+use crate::candidate_model::CandidateModel;
+use crate::order_selection::{
+    CandidateFits, CandidateOrder, DelayPrior, OrderSelection, index, model_of,
+};
 use crate::stats::{quantile, student_t_quantile};
 
 /// Whether the data determine a parameter.
@@ -57,13 +59,13 @@ pub struct Parameter {
     pub verdict: Verdict,
 }
 
-/// The parameters of a ladder fit with verdicts, and the model to go on with.
+/// The parameters of a fit of candidate orders with verdicts, and the model to go on with.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Judged {
     /// One entry per parameter of Eq. (4) with delay.
     pub parameters: Vec<Parameter>,
     /// The chosen model, with the delay of the prior where there is one.
-    pub model: LadderModel,
+    pub model: CandidateModel,
     /// Interval of the delay from the phase slope alone, far zero included (upper end infinite where unbounded), s.
     pub phase_delay95_s: [f64; 2],
     /// Best delay from the phase slope alone, s: the smallest far-zero lead that the data allow.
@@ -85,12 +87,15 @@ const PROFILE_RISE: f64 = 3.841;
 
 /// Profile interval of the far zero's lead, ms, searched in 0..`LEAD_MOST_MS` sampling periods.
 fn lead_interval_ms(
-    problem: &LadderProblem<'_>,
-    fit: &LadderFit,
+    problem: &OrderSelection<'_>,
+    fit: &CandidateFits,
     data: &[Complex<f64>],
     period_ms: f64,
 ) -> Option<[f64; 2]> {
-    let far = fit.rungs.iter().find(|r| r.rung == Rung::FarZero)?;
+    let far = fit
+        .candidates
+        .iter()
+        .find(|r| r.order == CandidateOrder::FarZero)?;
     // The weak bound on the lead itself must not decide how far the data let it go.
     let bound = |lead_ms: f64| (lead_ms / (0.3 * period_ms)).powi(2);
     let chi2_at = |lead_ms: f64| -> f64 {
@@ -102,7 +107,7 @@ fn lead_interval_ms(
                 problem
                     .fit_from(
                         data,
-                        Rung::FarZero,
+                        CandidateOrder::FarZero,
                         &start,
                         Some((index::FAR_LEAD_MS, lead_ms)),
                     )
@@ -171,12 +176,12 @@ fn judge_width(value: f64, interval: [f64; 2], why_not: &str) -> Verdict {
 /// The bootstrap's interval of a function of the parameters, where enough replicates were fitted.
 type Drawn<'a> = dyn Fn(&dyn Fn(&[f64]) -> f64) -> Option<[f64; 2]> + 'a;
 
-/// Judges a ladder that was fitted without a delay prior; `prior` is then brought in for the model to go on with.
+/// Judges candidates that were fitted without a delay prior; `prior` is then brought in for the model to go on with.
 ///
 /// `replicates` bootstrap fits (0: none) resample the blocks of every line with replacement; see [`bootstrap`].
 pub fn judge(
-    problem: &LadderProblem<'_>,
-    fit: &LadderFit,
+    problem: &OrderSelection<'_>,
+    fit: &CandidateFits,
     prior: Option<DelayPrior>,
     replicates: usize,
     seed: u64,
@@ -247,11 +252,15 @@ pub fn judge(
     let delay = delay_parameter(&model, prior, effective, half, lead, period_ms);
     parameters.push(delay);
     parameters.push(far_zero_parameter(fit, &model, prior, lead, period_ms));
-    if let Some(full) = fit.rungs.iter().find(|r| r.rung == Rung::Eq4) {
+    if let Some(full) = fit
+        .candidates
+        .iter()
+        .find(|r| r.order == CandidateOrder::Eq4)
+    {
         parameters.push(slow_pole_parameter(
             full.parameters[index::SLOW_POLE],
             full.covariance[(index::SLOW_POLE, index::SLOW_POLE)].sqrt() * t,
-            best.rung,
+            best.order,
         ));
     }
     Judged {
@@ -263,7 +272,7 @@ pub fn judge(
 }
 
 /// Zero and pole of the pair, where a fit has them.
-fn pair_parameters(fit: &LadderFit, t: f64, drawn: &Drawn) -> Vec<Parameter> {
+fn pair_parameters(fit: &CandidateFits, t: f64, drawn: &Drawn) -> Vec<Parameter> {
     let best = fit.best();
     let mut found = Vec::new();
     for (name, meaning, i) in [
@@ -278,15 +287,17 @@ fn pair_parameters(fit: &LadderFit, t: f64, drawn: &Drawn) -> Vec<Parameter> {
             index::LN_POLE,
         ),
     ] {
-        let source = if best.rung >= Rung::PoleZeroPair {
+        let source = if best.order >= CandidateOrder::PoleZeroPair {
             Some(best)
         } else {
-            fit.rungs.iter().find(|r| r.rung == Rung::PoleZeroPair)
+            fit.candidates
+                .iter()
+                .find(|r| r.order == CandidateOrder::PoleZeroPair)
         };
         let Some(source) = source else { continue };
         let value = source.parameters[i].exp();
         let ci95 = log_interval(value, source.covariance[(i, i)].sqrt(), t);
-        let chosen = best.rung >= Rung::PoleZeroPair;
+        let chosen = best.order >= CandidateOrder::PoleZeroPair;
         found.push(Parameter {
             name,
             meaning,
@@ -310,39 +321,46 @@ fn pair_parameters(fit: &LadderFit, t: f64, drawn: &Drawn) -> Vec<Parameter> {
     found
 }
 
-/// The chosen rung fitted again with the delay measured otherwise, and the far zero free to make up the difference.
+/// The chosen order fitted again with the delay measured otherwise, and the far zero free to make up the difference.
 fn with_prior(
-    problem: &LadderProblem<'_>,
-    fit: &LadderFit,
+    problem: &OrderSelection<'_>,
+    fit: &CandidateFits,
     prior: Option<DelayPrior>,
-) -> LadderModel {
+) -> CandidateModel {
     let best = fit.best();
     let Some(prior) = prior else {
         return best.model;
     };
     let with = problem.clone().with_prior(Some(prior));
     let data = problem.data();
-    let far = fit.rungs.iter().find(|r| r.rung == Rung::FarZero);
+    let far = fit
+        .candidates
+        .iter()
+        .find(|r| r.order == CandidateOrder::FarZero);
     let Some(far) = far else {
-        let found = with.fit_from(&data, best.rung, &best.parameters, None);
-        return model_of(&found.parameters, best.rung);
+        let found = with.fit_from(&data, best.order, &best.parameters, None);
+        return model_of(&found.parameters, best.order);
     };
-    let rung = best.rung.max(Rung::FarZero);
-    let source = if rung == Rung::Eq4 { best } else { far };
+    let order = best.order.max(CandidateOrder::FarZero);
+    let source = if order == CandidateOrder::Eq4 {
+        best
+    } else {
+        far
+    };
     let found = [0.0, 0.05, 0.2]
         .iter()
         .map(|extra| {
             let mut start = source.parameters.clone();
             start[index::FAR_LEAD_MS] =
                 prior.delay_s * 1e3 - start[index::EFFECTIVE_DELAY_MS] + extra;
-            with.fit_from(&data, rung, &start, None)
+            with.fit_from(&data, order, &start, None)
         })
         .min_by(|a, b| a.chi2.total_cmp(&b.chi2));
-    found.map_or(best.model, |f| model_of(&f.parameters, rung))
+    found.map_or(best.model, |f| model_of(&f.parameters, order))
 }
 
 fn delay_parameter(
-    model: &LadderModel,
+    model: &CandidateModel,
     prior: Option<DelayPrior>,
     effective_ms: f64,
     half_ms: f64,
@@ -390,8 +408,8 @@ fn delay_parameter(
 }
 
 fn far_zero_parameter(
-    fit: &LadderFit,
-    model: &LadderModel,
+    fit: &CandidateFits,
+    model: &CandidateModel,
     prior: Option<DelayPrior>,
     lead_ms: [f64; 2],
     period_ms: f64,
@@ -412,7 +430,7 @@ fn far_zero_parameter(
     };
     let width = 0.5 * (lead_ms[1] - lead_ms[0]);
     // A lead that may reach half a sampling period is told from a delay only by which rows show it.
-    let identified = fit.best().rung >= Rung::FarZero
+    let identified = fit.best().order >= CandidateOrder::FarZero
         && lead_ms[1] < 0.5 * period_ms
         && width < WIDEST_RELATIVE * middle;
     let value = if prior.is_some() && model.far_lead_s > 0.0 {
@@ -448,8 +466,8 @@ fn far_zero_parameter(
     }
 }
 
-fn slow_pole_parameter(value: f64, half: f64, chosen: Rung) -> Parameter {
-    let identified = chosen == Rung::Eq4 && half < WIDEST_RELATIVE * value;
+fn slow_pole_parameter(value: f64, half: f64, chosen: CandidateOrder) -> Parameter {
+    let identified = chosen == CandidateOrder::Eq4 && half < WIDEST_RELATIVE * value;
     let high = value + half;
     Parameter {
         name: "slow_pole_rad_per_s",

@@ -2,12 +2,12 @@
 
 mod common;
 
+use cellpos_ident::candidate_model::CandidateModel;
 use cellpos_ident::delay::{SeenEdge, delay_from_edges, dithered_edges};
 use cellpos_ident::excitation::{Limits, PAPER_FREQUENCIES_HZ};
 use cellpos_ident::experiment::{Measured, Plan};
 use cellpos_ident::frequency_response::Settings;
-use cellpos_ident::ladder::{DelayPrior, LadderFit, LadderProblem};
-use cellpos_ident::ladder_model::LadderModel;
+use cellpos_ident::order_selection::{CandidateFits, DelayPrior, OrderSelection};
 use cellpos_ident::sampled::Sampling;
 use cellpos_ident::verdict::{Judged, judge};
 use cellpos_plant::TransferFunction;
@@ -36,8 +36,8 @@ fn measured(rig: &mut PositionRig) -> Measured {
     plan.analyse(&records, &Settings::default()).unwrap()
 }
 
-fn fitted(m: &Measured, prior: Option<DelayPrior>, replicates: usize) -> (LadderFit, Judged) {
-    let problem = LadderProblem::new(&m.points, Sampling::held(1.0 / PERIOD_S), None).unwrap();
+fn fitted(m: &Measured, prior: Option<DelayPrior>, replicates: usize) -> (CandidateFits, Judged) {
+    let problem = OrderSelection::new(&m.points, Sampling::held(1.0 / PERIOD_S), None).unwrap();
     let fit = problem.fit().unwrap();
     let judged = judge(&problem, &fit, prior, replicates, 1);
     (fit, judged)
@@ -55,7 +55,7 @@ fn a_held_bead_gives_gain_and_delay_and_says_what_it_cannot_tell() {
     let start = std::time::Instant::now();
     for p in &m.points {
         let e = p.response
-            / LadderModel::eq6(0.002).sampled_response(p.frequency_hz, Sampling::held(1000.0))
+            / CandidateModel::eq6(0.002).sampled_response(p.frequency_hz, Sampling::held(1000.0))
             - 1.0;
         println!(
             "{} Hz: {:.6} rel err {e:.6}, rel sd {:.6} blocks {} u {:.3} y {:.3} rows {}",
@@ -70,10 +70,10 @@ fn a_held_bead_gives_gain_and_delay_and_says_what_it_cannot_tell() {
     }
     let (fit, judged) = fitted(&m, Some(prior), 200);
     println!("{:?} fit {:?}", m.noise, start.elapsed());
-    for r in &fit.rungs {
+    for r in &fit.candidates {
         println!(
             "{:?} chi2 {:.1} dof {} aicc {:.1} held out {:.3} p {:.2e} {:?}",
-            r.rung, r.chi2, r.dof, r.aicc, r.held_out, r.step_p_value, r.parameters
+            r.order, r.chi2, r.dof, r.aicc, r.held_out, r.step_p_value, r.parameters
         );
     }
     for p in &judged.parameters {
@@ -82,7 +82,7 @@ fn a_held_bead_gives_gain_and_delay_and_says_what_it_cannot_tell() {
             p.name, p.value, p.unit, p.ci95, p.bootstrap95, p.verdict
         );
     }
-    let truth = LadderModel::eq6(0.002);
+    let truth = CandidateModel::eq6(0.002);
     let gain = judged.parameter("gain_per_s").unwrap();
     assert!((gain.value / truth.gain_per_s - 1.0).abs() < 0.01);
     assert!(gain.ci95[0] < truth.gain_per_s && truth.gain_per_s < gain.ci95[1]);
@@ -174,7 +174,7 @@ fn counted(seeds: std::ops::Range<u64>) -> (Counts, f64, f64) {
 }
 
 fn true_values() -> [(&'static str, f64); 5] {
-    let truth = LadderModel::eq6(0.002);
+    let truth = CandidateModel::eq6(0.002);
     [
         ("gain_per_s", truth.gain_per_s),
         ("pair_zero_rad_per_s", truth.zero_rad_per_s),

@@ -4,11 +4,11 @@ mod common;
 
 use cellpos_ident::IdentError;
 use cellpos_ident::bare_fft;
+use cellpos_ident::candidate_model::CandidateModel;
 use cellpos_ident::excitation::{Limits, PAPER_FREQUENCIES_HZ, Signal, Tone};
 use cellpos_ident::experiment::{Cause, Plan, PlannedSegment};
 use cellpos_ident::frequency_response::{Estimator, Segment, Settings, measure};
-use cellpos_ident::ladder::LadderProblem;
-use cellpos_ident::ladder_model::LadderModel;
+use cellpos_ident::order_selection::OrderSelection;
 use cellpos_ident::random::Random;
 use cellpos_ident::sampled::Sampling;
 use cellpos_ident::summary::{literal_per_hertz, summarise};
@@ -38,7 +38,7 @@ fn drifting(frequency_hz: f64, rows: usize, drift_um_per_s: f64) -> (Vec<f64>, V
 #[test]
 fn a_drift_of_10_um_per_s_biases_the_sine_fit_by_less_than_a_fifth_of_a_percent_and_the_bare_fft_by_several_percent()
  {
-    let model = LadderModel::eq6(0.0);
+    let model = CandidateModel::eq6(0.0);
     for f in PAPER_FREQUENCIES_HZ {
         let (input, output) = drifting(f, 2000, 10.0);
         let truth = model.sampled_response(f, Sampling::held(1.0 / PERIOD_S));
@@ -82,7 +82,7 @@ fn the_papers_phase_at_10_hz_is_explained_by_its_drift() {
 #[test]
 fn feedback_at_low_coherence_biases_the_direct_estimate_and_not_the_joint_one() {
     let f = 20.0;
-    let truth = LadderModel::eq6(0.002).sampled_response(f, Sampling::held(1.0 / PERIOD_S));
+    let truth = CandidateModel::eq6(0.002).sampled_response(f, Sampling::held(1.0 / PERIOD_S));
     let mut sums = [Complex::new(0.0, 0.0); 2];
     let runs = 40;
     let mut coherence = 0.0;
@@ -175,7 +175,7 @@ fn one_lost_frame_in_ten_costs_precision_and_no_accuracy() {
     let records = plan.run(&mut rig, 0, |_| {}).unwrap();
     let measured = plan.analyse(&records, &Settings::default()).unwrap();
     for p in &measured.points {
-        let truth = LadderModel::eq6(0.002)
+        let truth = CandidateModel::eq6(0.002)
             .sampled_response(p.frequency_hz, Sampling::held(1.0 / PERIOD_S));
         assert!(
             (p.response - truth).norm_sqr() < 9.0 * p.scatter_variance,
@@ -210,11 +210,11 @@ fn a_multisine_gives_the_same_plant_in_one_go_and_its_detection_lines_stay_silen
         "{silent}"
     );
     let problem =
-        LadderProblem::new(&measured.points, Sampling::held(1.0 / PERIOD_S), None).unwrap();
+        OrderSelection::new(&measured.points, Sampling::held(1.0 / PERIOD_S), None).unwrap();
     let fit = problem.fit().unwrap();
     let gain = fit.best().model.gain_per_s;
     assert!(
-        (gain / LadderModel::eq6(0.0).gain_per_s - 1.0).abs() < 0.03,
+        (gain / CandidateModel::eq6(0.0).gain_per_s - 1.0).abs() < 0.03,
         "{gain}"
     );
 }

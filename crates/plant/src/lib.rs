@@ -11,6 +11,18 @@
 //! just before that command takes effect.
 //!
 //! Not here: controllers, estimation, fitting, images.
+//!
+//! ```
+//! use cellpos_plant::{Model, SimulateOptions, effects, simulate};
+//! // A step of 1 um about the working point of 4 um, a row a millisecond, with and without a driver of 80 Hz.
+//! let step: Vec<f64> = (0..200).map(|k| if k < 10 { 4.0 } else { 5.0 }).collect();
+//! let eq6 = Model::eq6();
+//! let slow = eq6.clone().with_effect(effects::driver_lag(80.0));
+//! let fast_um = simulate(&eq6, &step, 1e-3, &SimulateOptions::default()).unwrap();
+//! let slow_um = simulate(&slow, &step, 1e-3, &SimulateOptions::default()).unwrap();
+//! assert!(fast_um[9].abs() < 1e-9);
+//! assert!(0.0 < slow_um[15] && slow_um[15] < fast_um[15]);
+//! ```
 #![forbid(unsafe_code)]
 
 mod chain;

@@ -1,11 +1,23 @@
 //! Finds where simulation and measurement disagree, names what is missing, adds it to the model and shows the gap shrink.
 //!
-//! [`reconcile`] takes a model and records and answers with one of four verdicts: effects are *named*, the records leave
-//! it *ambiguous* between several, it is *unknown* to the catalogue, or *nothing is missing*. All scores are sums of
+//! [`reconcile`] takes a model and records and answers with one of five verdicts: effects are *named*, alone or with a
+//! *remainder* beside them, the records leave it *ambiguous* between several, it is *unknown* to the catalogue, or *nothing is
+//! missing*. All scores are sums of
 //! squared innovations of the model's own Kalman filter ([`Noise`]), because the free-run residual of a perfect model of
 //! this rig is a random walk.
 //!
 //! Not for identifying a plant from nothing (that is `cellpos-ident`), and not for files: records come as columns.
+//!
+//! ```
+//! use cellpos_plant::Model;
+//! use cellpos_reconcile::{Options, ReconcileError, Record, reconcile};
+//! let time_s: Vec<f64> = (0..3000).map(|k| f64::from(k) * 1e-3).collect();
+//! let (pzt_um, bead_um) = (vec![4.0; 3000], vec![0.0; 3000]);
+//! let rest = Record::from_rows("rest", &time_s, &pzt_um, &bead_um).unwrap();
+//! // A command that never changes tells no effect from another, and is refused with what to record instead.
+//! let answer = reconcile(&Model::eq6(), &[rest], &Options::default(), &mut |_| {});
+//! assert!(matches!(answer, Err(ReconcileError::ConstantInput)));
+//! ```
 #![forbid(unsafe_code)]
 
 mod data;

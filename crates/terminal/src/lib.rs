@@ -7,6 +7,14 @@
 //!
 //! What is shown is cleaned ([`clean`]): text that came from a file cannot move the cursor, rename the window or hide what
 //! follows. Not for the result of a command, which goes to standard output when nothing waits any more.
+//!
+//! ```
+//! use cellpos_terminal::{Colours, clean};
+//! // A note from a file that would clear the screen and rename the window.
+//! let note = "cell 7\u{1b}[2J\u{1b}]0;mine\u{7} lost";
+//! let shown = clean(note, Colours::Removed);
+//! assert!(!shown.contains('\u{1b}') && shown.contains("cell 7"));
+//! ```
 #![forbid(unsafe_code)]
 
 use std::borrow::Cow;

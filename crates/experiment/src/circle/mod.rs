@@ -152,7 +152,7 @@ fn measure(job: &Job<'_>, progress: &mut (dyn FnMut(&str) + Send)) -> Result<Don
 fn base(done: &Done, given: &Model, identified: &Model) -> (Model, (&'static str, String)) {
     /// Penalised misfit, in variances, up to which the fit counts as a description.
     const DESCRIBES: f64 = 2.0;
-    let scale = done.result.ladder.scale;
+    let scale = done.result.selection.scale;
     if scale <= DESCRIBES {
         let why = "Eq. (4) describes the measured response".to_owned();
         return (identified.clone(), ("identified", why));

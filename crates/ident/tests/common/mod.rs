@@ -1,7 +1,7 @@
 //! A rig of positions: the discretised plant of cellpos-plant, Brownian motion, drift, localisation noise, and a PI loop.
 
+use cellpos_ident::candidate_model::CandidateModel;
 use cellpos_ident::experiment::{Bench, Row};
-use cellpos_ident::ladder_model::LadderModel;
 use cellpos_ident::random::Random;
 use cellpos_plant::{Complex, DiscretePlant, DiscreteState, Seconds, TransferFunction};
 
@@ -78,7 +78,7 @@ impl Bench for PositionRig {
 
 /// Expected plant and loop gain of the nominal rig with the PI gains above.
 pub fn expected(delay_s: f64) -> impl Fn(f64) -> (Complex<f64>, Complex<f64>) {
-    let model = LadderModel::eq6(delay_s);
+    let model = CandidateModel::eq6(delay_s);
     move |f| {
         let sampling = cellpos_ident::sampled::Sampling::held(1.0 / PERIOD_S);
         let h = model.sampled_response(f, sampling);

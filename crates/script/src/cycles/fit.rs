@@ -1,5 +1,6 @@
 //! Least squares over one cycle: a sine at the cycle's frequency with offset and slope, and an exponential recovery.
 
+use super::minimum::minimum;
 use nalgebra::{Matrix3, Matrix4, Vector3, Vector4};
 use std::f64::consts::TAU;
 
@@ -102,24 +103,7 @@ pub(super) fn recovery_s(points: &[(f64, f64)]) -> Option<f64> {
         }
     };
     let (low, high) = ((span_s * 1e-3).ln(), (span_s * 3.0).ln());
-    // The cost has one minimum, but flat ends: a coarse look first, then golden sections.
-    const LOOKS: u32 = 24;
-    let at = |k: u32| low + (high - low) * f64::from(k) / f64::from(LOOKS);
-    let best = (0..=LOOKS).min_by(|a, b| cost(at(*a)).total_cmp(&cost(at(*b))))?;
-    if best == 0 || best == LOOKS {
-        return None;
-    }
-    let golden = (5f64.sqrt() - 1.0) / 2.0;
-    let (mut a, mut b) = (at(best - 1), at(best + 1));
-    for _ in 0..40 {
-        let (c, d) = (b - golden * (b - a), a + golden * (b - a));
-        if cost(c) < cost(d) {
-            b = d;
-        } else {
-            a = c;
-        }
-    }
-    Some((0.5 * (a + b)).exp())
+    minimum(low, high, 24, 40, cost).map(f64::exp)
 }
 
 #[cfg(test)]

@@ -6,6 +6,7 @@
 
 mod fatigue;
 mod fit;
+mod minimum;
 mod open;
 mod outlier;
 mod place;

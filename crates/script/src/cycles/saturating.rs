@@ -1,5 +1,6 @@
 //! A law that saturates, beside the straight line: most of what tires in a cell does so in its first cycles.
 
+use super::minimum::minimum;
 use nalgebra::{Matrix3, Vector3};
 
 /// `end + (start - end) exp(-(cycle - first) / cycles)` through a quantity of the cycles.
@@ -28,7 +29,6 @@ pub struct Saturating {
 pub(super) fn fit(points: &[(f64, f64)], line: f64) -> Option<Saturating> {
     /// Fewest points of a law with three parameters that is not chance.
     const FEWEST: usize = 12;
-    const LOOKS: u32 = 40;
     let (first, last) = (points.first()?.0, points.last()?.0);
     let span = last - first;
     if points.len() < FEWEST || span <= 0.0 {
@@ -36,22 +36,7 @@ pub(super) fn fit(points: &[(f64, f64)], line: f64) -> Option<Saturating> {
     }
     let cost = |log: f64| solve(points, first, log.exp()).map_or(f64::INFINITY, |(_, _, sum)| sum);
     let (low, high) = ((0.5f64).ln(), span.ln());
-    let at = |k: u32| low + (high - low) * f64::from(k) / f64::from(LOOKS);
-    let best = (0..=LOOKS).min_by(|a, b| cost(at(*a)).total_cmp(&cost(at(*b))))?;
-    if best == 0 || best == LOOKS {
-        return None;
-    }
-    let golden = (5f64.sqrt() - 1.0) / 2.0;
-    let (mut a, mut b) = (at(best - 1), at(best + 1));
-    for _ in 0..50 {
-        let (c, d) = (b - golden * (b - a), a + golden * (b - a));
-        if cost(c) < cost(d) {
-            b = d;
-        } else {
-            a = c;
-        }
-    }
-    let cycles = (0.5 * (a + b)).exp();
+    let cycles = minimum(low, high, 40, 50, cost)?.exp();
     let (start, end, sum) = solve(points, first, cycles)?;
     let n = points.len() as f64;
     let variance = sum / (n - 3.0);

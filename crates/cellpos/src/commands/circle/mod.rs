@@ -171,7 +171,7 @@ fn write(args: &Args, circle: &Circle, folder: &Path) -> CommandResult {
         "identify": {
             "gain_per_s": circle.identified.result.judged.model.gain_per_s,
             "delay_ms": circle.identified.result.judged.model.delay_s * 1e3,
-            "misfit": circle.identified.result.ladder.scale.sqrt(),
+            "misfit": circle.identified.result.selection.scale.sqrt(),
             "warnings": circle.identified.result.warnings,
         },
         "base": { "model": circle.base.0, "why": circle.base.1 },

@@ -64,13 +64,13 @@ pub fn identification(done: &Done, job: &Job, model: &Path, report: &Path) -> Va
         })
         .collect();
     let phase = result.judged.phase_delay95_s;
-    let rungs: Vec<Value> = result
-        .ladder
-        .rungs
+    let orders: Vec<Value> = result
+        .selection
+        .candidates
         .iter()
         .map(|r| {
             json!({
-                "model": r.rung.formula(), "chi2": finite(r.chi2), "dof": r.dof, "aicc": finite(r.aicc),
+                "model": r.order.formula(), "chi2": finite(r.chi2), "dof": r.dof, "aicc": finite(r.aicc),
                 "held_out": finite(r.held_out), "step_p_value": r.step_p_value,
             })
         })
@@ -80,7 +80,7 @@ pub fn identification(done: &Done, job: &Job, model: &Path, report: &Path) -> Va
         "rows": done.records.iter().map(|r| r.input.len()).sum::<usize>(),
         "frames": job.setup.frames,
         "closed_loop": job.setup.closed_loop,
-        "model_formula": result.ladder.best().rung.formula(),
+        "model_formula": result.selection.best().order.formula(),
         "parameters": parameters,
         "frequencies": frequencies,
         "delay": {
@@ -99,7 +99,7 @@ pub fn identification(done: &Done, job: &Job, model: &Path, report: &Path) -> Va
             "p_value": n.p_value,
             "used_for_weights": n.used,
         })),
-        "ladder": rungs,
+        "ladder": orders,
         "neutral_um": done.neutral_um,
         "warnings": result.warnings,
         "model": model.display().to_string(),
@@ -110,7 +110,7 @@ pub fn identification(done: &Done, job: &Job, model: &Path, report: &Path) -> Va
 /// The same for reading.
 pub fn text(done: &Done, model: &Path, report: &Path) -> String {
     let result = &done.result;
-    let mut out = format!("model  {}\n", result.ladder.best().rung.formula());
+    let mut out = format!("model  {}\n", result.selection.best().order.formula());
     for p in &result.judged.parameters {
         let _ = writeln!(
             out,

@@ -1,7 +1,7 @@
 //! The report of an identification: Bode with bands, Nyquist, residuals, traces, delay test, parameters.
 
 use cellpos_experiment::identify::Done;
-use cellpos_ident::ladder_model::LadderModel;
+use cellpos_ident::candidate_model::CandidateModel;
 use cellpos_ident::summary::Identification;
 use cellpos_ident::verdict::{Parameter, Verdict};
 use cellpos_plant::{EQ5_VELOCITY_GAIN_PER_S, Hertz, TransferFunction};
@@ -56,7 +56,7 @@ pub fn bode(name: &str, caption: &str, result: &Identification, high_hz: f64) ->
     let (model_gain, model_phase) = curve(&|f| model.response(f));
     let eq6 = TransferFunction::eq6();
     let (eq6_gain, eq6_phase) = curve(&|f| eq6.response(Hertz(f)));
-    let integrator = LadderModel::integrator(EQ5_VELOCITY_GAIN_PER_S, 0.0);
+    let integrator = CandidateModel::integrator(EQ5_VELOCITY_GAIN_PER_S, 0.0);
     let (eq5_gain, eq5_phase) = curve(&|f| integrator.response(f));
     let delayed: Vec<f64> = points.iter().map(|p| p.delayed_phase_deg).collect();
     Figure::bode(name, caption)
@@ -125,7 +125,7 @@ pub fn residuals(result: &Identification) -> Figure {
     let (mut re, mut im) = (Vec::new(), Vec::new());
     for p in &result.measured.points {
         let model = result
-            .ladder
+            .selection
             .best()
             .model
             .sampled_response(p.frequency_hz, result.sampling);
@@ -135,7 +135,7 @@ pub fn residuals(result: &Identification) -> Figure {
         re.push(e.re);
         im.push(e.im);
     }
-    Figure::new("residuals", "Residuals of the chosen rung over their standard deviations; 95 % of them belong between the lines.").panel(
+    Figure::new("residuals", "Residuals of the chosen order over their standard deviations; 95 % of them belong between the lines.").panel(
         Panel::new(Axis::log("frequency", "Hz"), Axis::linear("residual", "standard deviations"))
             .series(Series::points("gain", &f, &re))
             .series(Series::points("phase", &f, &im))
@@ -353,8 +353,8 @@ pub fn lines(result: &Identification) -> Table {
     table
 }
 
-/// The table of rungs.
-pub fn ladder(result: &Identification) -> Table {
+/// The table of candidate orders.
+pub fn candidates(result: &Identification) -> Table {
     let mut table = Table::new([
         Column::left("model"),
         Column::right("chi2"),
@@ -363,15 +363,15 @@ pub fn ladder(result: &Identification) -> Table {
         Column::right("held out, per datum"),
         Column::right("p of this step"),
     ]);
-    for (i, r) in result.ladder.rungs.iter().enumerate() {
+    for (i, r) in result.selection.candidates.iter().enumerate() {
         table.row_with(
-            if i == result.ladder.chosen {
+            if i == result.selection.chosen {
                 Status::Good
             } else {
                 Status::Plain
             },
             [
-                r.rung.formula().to_owned(),
+                r.order.formula().to_owned(),
                 format!("{:.1}", r.chi2),
                 format!("{:.0}", r.dof),
                 format!("{:.1}", r.aicc),
@@ -417,7 +417,9 @@ pub fn report(done: &Done, command_line: &str) -> Report {
         .table(lines(result))
         .figure(nyquist(result))
         .figure(residuals(result));
-    report.section("Choice of the model").table(ladder(result));
+    report
+        .section("Choice of the model")
+        .table(candidates(result));
     report.section("Delay");
     let phase = result.judged.phase_delay95_s;
     report.paragraph(&format!(

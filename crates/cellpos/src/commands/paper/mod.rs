@@ -250,7 +250,7 @@ fn report(
         &done.result,
         1000.0,
     ));
-    report.table(plots::ladder(&done.result));
+    report.table(plots::candidates(&done.result));
     report
         .section("Fig. A1: the complex plane at 10 Hz, with drift")
         .figure(figures::fig_a1(drifting));

@@ -1,23 +1,25 @@
-//! Fit of the model ladder to a frequency response, and the choice of the rung that the data support.
+//! Fit of candidate models of rising order to a frequency response, and the choice of the order that the data support.
 //!
 //! Complex, weighted least squares on what the record shows (hold, delay and exposure inside the model, not taken off
-//! the data). Rungs: integrator with delay; with a pole-zero pair; with the far zero; full Eq. (4). A higher rung is
+//! the data). Candidates: integrator with delay; with a pole-zero pair; with the far zero; full Eq. (4). A higher order is
 //! taken only when an F-test rejects the lower one (1 %), AICc falls, and the fit to one half of the blocks predicts
 //! the other half better. What a parameter is worth is told by [`crate::verdict`].
 
-pub use crate::rung::{DelayPrior, LadderFit, Rung, RungFit, index, model_of};
+pub use crate::candidate_order::{
+    CandidateFit, CandidateFits, CandidateOrder, DelayPrior, index, model_of,
+};
 use nalgebra::Complex;
 
+use crate::candidate_model::CandidateModel;
 use crate::error::IdentError;
 use crate::frequency_response::FrequencyPoint;
-use crate::ladder_model::LadderModel;
 use crate::least_squares::{Minimum, covariance, minimise};
 use crate::sampled::Sampling;
 use crate::stats::f_exceeds;
 
-/// What the ladder is fitted to.
+/// What the candidates are fitted to.
 #[derive(Debug, Clone)]
-pub struct LadderProblem<'a> {
+pub struct OrderSelection<'a> {
     points: &'a [FrequencyPoint],
     sampling: Sampling,
     prior: Option<DelayPrior>,
@@ -36,7 +38,7 @@ const LEAD_SD_PERIODS: f64 = 0.3;
 /// What is known of the feedthrough's share one row later: between 0 and 1.
 const SHARE_MIDDLE_SD: (f64, f64) = (0.5, 0.5);
 
-impl<'a> LadderProblem<'a> {
+impl<'a> OrderSelection<'a> {
     /// A problem from points with variances.
     ///
     /// # Errors
@@ -79,7 +81,7 @@ impl<'a> LadderProblem<'a> {
         2 * self.points.len() + 3
     }
 
-    fn residuals(&self, data: &[Complex<f64>], model: &LadderModel, out: &mut [f64]) {
+    fn residuals(&self, data: &[Complex<f64>], model: &CandidateModel, out: &mut [f64]) {
         let sampler = model.sampler(self.sampling);
         for (i, (p, y)) in self.points.iter().zip(data).enumerate() {
             let e = (y - sampler.response(p.frequency_hz)) * self.weights[i];
@@ -104,7 +106,7 @@ impl<'a> LadderProblem<'a> {
     }
 
     /// Weighted sum of squares of `data` about `model`, without the delay prior.
-    pub fn chi2(&self, data: &[Complex<f64>], model: &LadderModel) -> f64 {
+    pub fn chi2(&self, data: &[Complex<f64>], model: &CandidateModel) -> f64 {
         let mut out = vec![0.0; self.rows()];
         self.residuals(data, model, &mut out);
         out[..2 * self.points.len()].iter().map(|r| r * r).sum()
@@ -138,15 +140,15 @@ impl<'a> LadderProblem<'a> {
         self.points.iter().map(|p| p.response).collect()
     }
 
-    /// Fits `data` on `rung` from one start; parameters in `fixed` keep their value.
+    /// Fits `data` on `order` from one start; parameters in `fixed` keep their value.
     pub fn fit_from(
         &self,
         data: &[Complex<f64>],
-        rung: Rung,
+        order: CandidateOrder,
         start: &[f64],
         fixed: Option<(usize, f64)>,
     ) -> Minimum {
-        let n = rung.parameters();
+        let n = order.parameters();
         let free: Vec<usize> = (0..n)
             .filter(|&i| fixed.is_none_or(|(f, _)| f != i))
             .collect();
@@ -164,7 +166,7 @@ impl<'a> LadderProblem<'a> {
         let x0: Vec<f64> = free.iter().map(|&i| base[i]).collect();
         let steps: Vec<f64> = free.iter().map(|&i| STEPS[i]).collect();
         let mut found = minimise(&x0, &steps, self.rows(), |x, out| {
-            self.residuals(data, &model_of(&expand(x), rung), out);
+            self.residuals(data, &model_of(&expand(x), order), out);
         });
         found.parameters = expand(&found.parameters);
         found
@@ -182,7 +184,7 @@ impl<'a> LadderProblem<'a> {
         let step = (100.0 / fastest.max(1e-9)).min(period_ms);
         let mut delay_ms = -2.0 * period_ms;
         while delay_ms <= 20.0 * period_ms {
-            let unit = LadderModel::integrator(1.0, delay_ms * 1e-3).partial_fractions();
+            let unit = CandidateModel::integrator(1.0, delay_ms * 1e-3).partial_fractions();
             let (mut cross, mut power) = (0.0, 0.0);
             for ((p, y), w) in self.points.iter().zip(data).zip(&self.weights) {
                 let h = unit.sampled_response(p.frequency_hz, delay_ms * 1e-3, self.sampling);
@@ -200,11 +202,11 @@ impl<'a> LadderProblem<'a> {
         best.1
     }
 
-    /// The best fit of `rung` over several starts, the rung below included.
+    /// The best fit of `order` over several starts, the order below included.
     fn fit_rung(
         &self,
         data: &[Complex<f64>],
-        rung: Rung,
+        order: CandidateOrder,
         below: Option<&[f64]>,
     ) -> Option<Minimum> {
         let [ln_gain, delay_ms] = self.first_guess(data);
@@ -214,11 +216,11 @@ impl<'a> LadderProblem<'a> {
             x.extend_from_slice(tail);
             starts.push(x);
         };
-        match (rung, below) {
-            (Rung::Integrator, _) | (_, None) => {
-                extend(&[ln_gain, delay_ms], &[0.0; 5][..rung.parameters() - 2])
+        match (order, below) {
+            (CandidateOrder::Integrator, _) | (_, None) => {
+                extend(&[ln_gain, delay_ms], &[0.0; 5][..order.parameters() - 2])
             }
-            (Rung::PoleZeroPair, Some(x)) => {
+            (CandidateOrder::PoleZeroPair, Some(x)) => {
                 let (low, high) = self.band_rad_per_s();
                 for share in [0.2, 0.4, 0.6, 0.8] {
                     let centre = low.ln() + share * (high / low).ln();
@@ -227,7 +229,7 @@ impl<'a> LadderProblem<'a> {
                     }
                 }
             }
-            (Rung::FarZero, Some(x)) => {
+            (CandidateOrder::FarZero, Some(x)) => {
                 // First with the lead held: where the delay crosses half a sample the feedthrough moves to another
                 // row at once, and a long first step would cross into the wrong one.
                 for share in [0.03, 0.1, 0.3] {
@@ -235,13 +237,13 @@ impl<'a> LadderProblem<'a> {
                     let mut start = x.to_vec();
                     start.extend([lead_ms, 0.5]);
                     let held =
-                        self.fit_from(data, rung, &start, Some((index::FAR_LEAD_MS, lead_ms)));
+                        self.fit_from(data, order, &start, Some((index::FAR_LEAD_MS, lead_ms)));
                     if held.parameters.iter().all(|v| v.is_finite()) {
                         extend(&held.parameters, &[]);
                     }
                 }
             }
-            (Rung::Eq4, Some(x)) => {
+            (CandidateOrder::Eq4, Some(x)) => {
                 for slow in [0.0, 0.5] {
                     extend(x, &[slow]);
                 }
@@ -256,7 +258,7 @@ impl<'a> LadderProblem<'a> {
         };
         let fits = starts
             .iter()
-            .map(|s| self.fit_from(data, rung, s, None))
+            .map(|s| self.fit_from(data, order, s, None))
             .filter(sane);
         fits.min_by(|a, b| a.chi2.total_cmp(&b.chi2))
     }
@@ -270,24 +272,24 @@ impl<'a> LadderProblem<'a> {
         )
     }
 
-    /// Fits every rung that the points allow, lowest first.
-    fn fit_rungs(&self, data: &[Complex<f64>]) -> Vec<(Rung, Minimum)> {
-        let mut out: Vec<(Rung, Minimum)> = Vec::new();
-        for rung in Rung::ALL {
-            if 2 * self.points.len() <= rung.parameters() {
+    /// Fits every order that the points allow, lowest first.
+    fn fit_rungs(&self, data: &[Complex<f64>]) -> Vec<(CandidateOrder, Minimum)> {
+        let mut out: Vec<(CandidateOrder, Minimum)> = Vec::new();
+        for order in CandidateOrder::ALL {
+            if 2 * self.points.len() <= order.parameters() {
                 break;
             }
             let below = out.last().map(|(_, m)| m.parameters.clone());
-            let Some(found) = self.fit_rung(data, rung, below.as_deref()) else {
+            let Some(found) = self.fit_rung(data, order, below.as_deref()) else {
                 break;
             };
-            out.push((rung, found));
+            out.push((order, found));
         }
         out
     }
 
-    /// Weighted squares per datum of each rung on the half of the blocks that it has not seen (both ways, averaged).
-    fn held_out(&self, full: &[(Rung, Minimum)]) -> Vec<f64> {
+    /// Weighted squares per datum of each order on the half of the blocks that it has not seen (both ways, averaged).
+    fn held_out(&self, full: &[(CandidateOrder, Minimum)]) -> Vec<f64> {
         let half = |parity: usize| -> Vec<Complex<f64>> {
             self.points
                 .iter()
@@ -301,24 +303,24 @@ impl<'a> LadderProblem<'a> {
         let (even, odd) = (half(0), half(1));
         let n = 2.0 * self.points.len() as f64;
         full.iter()
-            .map(|(rung, m)| {
+            .map(|(order, m)| {
                 [(&even, &odd), (&odd, &even)]
                     .iter()
                     .map(|(fit, test)| {
-                        let found = self.fit_from(fit, *rung, &m.parameters, None);
+                        let found = self.fit_from(fit, *order, &m.parameters, None);
                         // Half the blocks: twice the variance.
-                        0.25 * self.chi2(test, &model_of(&found.parameters, *rung)) / n
+                        0.25 * self.chi2(test, &model_of(&found.parameters, *order)) / n
                     })
                     .sum()
             })
             .collect()
     }
 
-    /// Fits the ladder and chooses a rung.
+    /// Fits the candidates and chooses an order.
     ///
     /// # Errors
     /// [`IdentError::NoFit`] when not even the integrator converges.
-    pub fn fit(&self) -> Result<LadderFit, IdentError> {
+    pub fn fit(&self) -> Result<CandidateFits, IdentError> {
         let data = self.data();
         let fits = self.fit_rungs(&data);
         let held_out = self.held_out(&fits);
@@ -348,15 +350,15 @@ impl<'a> LadderProblem<'a> {
             .map(|(r, m)| m.chi2 / (n - r.parameters() as f64))
             .fold(f64::INFINITY, f64::min);
         let scale = best_reduced.max(1.0) * weight_noise;
-        let mut rungs: Vec<RungFit> = Vec::new();
-        for ((rung, m), held_out) in fits.into_iter().zip(held_out) {
-            let k = rung.parameters() as f64;
-            let step_p_value = rungs.last().map_or(1.0, |below| {
+        let mut orders: Vec<CandidateFit> = Vec::new();
+        for ((order, m), held_out) in fits.into_iter().zip(held_out) {
+            let k = order.parameters() as f64;
+            let step_p_value = orders.last().map_or(1.0, |below| {
                 let gained =
-                    (below.chi2 - m.chi2).max(0.0) / (k - below.rung.parameters() as f64) / scale;
+                    (below.chi2 - m.chi2).max(0.0) / (k - below.order.parameters() as f64) / scale;
                 f_exceeds(
                     gained,
-                    k - below.rung.parameters() as f64,
+                    k - below.order.parameters() as f64,
                     interval_dof.min(1e4),
                 )
             });
@@ -365,9 +367,9 @@ impl<'a> LadderProblem<'a> {
             } else {
                 f64::INFINITY
             };
-            rungs.push(RungFit {
-                rung,
-                model: model_of(&m.parameters, rung),
+            orders.push(CandidateFit {
+                order,
+                model: model_of(&m.parameters, order),
                 covariance: covariance(&m.jacobian) * scale,
                 chi2: m.chi2,
                 dof: n - k,
@@ -378,26 +380,26 @@ impl<'a> LadderProblem<'a> {
                 parameters: m.parameters,
             });
         }
-        if !rungs.first().is_some_and(|r| r.converged) {
+        if !orders.first().is_some_and(|r| r.converged) {
             return Err(IdentError::NoFit {
                 what: "an integrator with delay",
                 reason: "no start led to a minimum",
             });
         }
         let mut chosen = 0;
-        for i in 1..rungs.len() {
-            let (low, high) = (&rungs[chosen], &rungs[i]);
-            let more = (high.rung.parameters() - low.rung.parameters()) as f64;
+        for i in 1..orders.len() {
+            let (low, high) = (&orders[chosen], &orders[i]);
+            let more = (high.order.parameters() - low.order.parameters()) as f64;
             let gained = (low.chi2 - high.chi2).max(0.0) / more / scale;
             let p_value = f_exceeds(gained, more, interval_dof.min(1e4));
-            // Eq. (1)-(3) are passive: a rung that explains more with an unstable pole has found something else.
+            // Eq. (1)-(3) are passive: an order that explains more with an unstable pole has found something else.
             let passive = high.model.slow_pole_rad_per_s >= 0.0;
             if p_value < 0.01 && high.aicc < low.aicc && high.held_out < low.held_out && passive {
                 chosen = i;
             }
         }
-        Ok(LadderFit {
-            rungs,
+        Ok(CandidateFits {
+            candidates: orders,
             chosen,
             scale,
             interval_dof,

@@ -1,11 +1,11 @@
-//! The models of the ladder, their parameter vectors, and what a fit of them gives.
+//! The candidate models, their parameter vectors, and what a fit of them gives.
 
-use crate::ladder_model::LadderModel;
+use crate::candidate_model::CandidateModel;
 use nalgebra::DMatrix;
 
-/// A model of the ladder.
+/// A candidate model.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub enum Rung {
+pub enum CandidateOrder {
     /// `K e^(-sL)/s`: gain and delay.
     Integrator,
     /// With a pole-zero pair.
@@ -16,32 +16,32 @@ pub enum Rung {
     Eq4,
 }
 
-impl Rung {
-    /// All rungs, lowest first.
-    pub const ALL: [Rung; 4] = [
-        Rung::Integrator,
-        Rung::PoleZeroPair,
-        Rung::FarZero,
-        Rung::Eq4,
+impl CandidateOrder {
+    /// All orders, lowest first.
+    pub const ALL: [CandidateOrder; 4] = [
+        CandidateOrder::Integrator,
+        CandidateOrder::PoleZeroPair,
+        CandidateOrder::FarZero,
+        CandidateOrder::Eq4,
     ];
 
     /// Real parameters.
     pub fn parameters(self) -> usize {
         match self {
-            Rung::Integrator => 2,
-            Rung::PoleZeroPair => 4,
-            Rung::FarZero => 6,
-            Rung::Eq4 => 7,
+            CandidateOrder::Integrator => 2,
+            CandidateOrder::PoleZeroPair => 4,
+            CandidateOrder::FarZero => 6,
+            CandidateOrder::Eq4 => 7,
         }
     }
 
     /// The model as a formula.
     pub fn formula(self) -> &'static str {
         match self {
-            Rung::Integrator => "K e^(-sL)/s",
-            Rung::PoleZeroPair => "K (1 + s/z)/(s (1 + s/p)) e^(-sL)",
-            Rung::FarZero => "K (1 + s/z)(1 + s/f)/(s (1 + s/p)) e^(-sL)",
-            Rung::Eq4 => "K (1 + s/z)(1 + s/f)/((s + q)(1 + s/p)) e^(-sL), Eq. (4)",
+            CandidateOrder::Integrator => "K e^(-sL)/s",
+            CandidateOrder::PoleZeroPair => "K (1 + s/z)/(s (1 + s/p)) e^(-sL)",
+            CandidateOrder::FarZero => "K (1 + s/z)(1 + s/f)/(s (1 + s/p)) e^(-sL)",
+            CandidateOrder::Eq4 => "K (1 + s/z)(1 + s/f)/((s + q)(1 + s/p)) e^(-sL), Eq. (4)",
         }
     }
 }
@@ -76,13 +76,13 @@ pub struct DelayPrior {
     pub half95_s: f64,
 }
 
-/// One rung fitted.
+/// One order fitted.
 #[derive(Debug, Clone, PartialEq)]
-pub struct RungFit {
+pub struct CandidateFit {
     /// Which model.
-    pub rung: Rung,
+    pub order: CandidateOrder,
     /// The fitted model.
-    pub model: LadderModel,
+    pub model: CandidateModel,
     /// The parameter vector, see [`index`].
     pub parameters: Vec<f64>,
     /// Covariance of the parameter vector, already multiplied by `scale`.
@@ -96,18 +96,18 @@ pub struct RungFit {
     /// Weighted sum of squares per real datum on blocks that the fit has not seen; about 1 plus the fit's own share
     /// for a right model.
     pub held_out: f64,
-    /// Probability that the step from the rung below is by chance (1 for the lowest).
+    /// Probability that the step from the order below is by chance (1 for the lowest).
     pub step_p_value: f64,
     /// Whether the iteration converged.
     pub converged: bool,
 }
 
-/// The ladder fitted and a rung chosen.
+/// The candidates fitted, and the order that was chosen.
 #[derive(Debug, Clone, PartialEq)]
-pub struct LadderFit {
-    /// Every rung that the number of points allows, lowest first.
-    pub rungs: Vec<RungFit>,
-    /// Index of the chosen rung in `rungs`.
+pub struct CandidateFits {
+    /// Every order that the number of points allows, lowest first.
+    pub candidates: Vec<CandidateFit>,
+    /// Index of the chosen order in `orders`.
     pub chosen: usize,
     /// Factor on variances because residuals exceed the noise (1 where they do not).
     pub scale: f64,
@@ -115,27 +115,27 @@ pub struct LadderFit {
     pub interval_dof: f64,
 }
 
-impl LadderFit {
-    /// The chosen rung.
-    pub fn best(&self) -> &RungFit {
-        &self.rungs[self.chosen]
+impl CandidateFits {
+    /// The chosen order.
+    pub fn best(&self) -> &CandidateFit {
+        &self.candidates[self.chosen]
     }
 }
 
 /// The model that a parameter vector stands for.
-pub fn model_of(x: &[f64], rung: Rung) -> LadderModel {
+pub fn model_of(x: &[f64], order: CandidateOrder) -> CandidateModel {
     let mut model =
-        LadderModel::integrator(x[index::LN_GAIN].exp(), x[index::EFFECTIVE_DELAY_MS] * 1e-3);
-    if rung >= Rung::PoleZeroPair {
+        CandidateModel::integrator(x[index::LN_GAIN].exp(), x[index::EFFECTIVE_DELAY_MS] * 1e-3);
+    if order >= CandidateOrder::PoleZeroPair {
         model.zero_rad_per_s = x[index::LN_ZERO].exp();
         model.pole_rad_per_s = x[index::LN_POLE].exp();
     }
-    if rung >= Rung::FarZero {
+    if order >= CandidateOrder::FarZero {
         model.far_lead_s = x[index::FAR_LEAD_MS] * 1e-3;
         model.delay_s += model.far_lead_s;
         model.feedthrough_share = Some(x[index::FEEDTHROUGH_SHARE]);
     }
-    if rung >= Rung::Eq4 {
+    if order >= CandidateOrder::Eq4 {
         model.slow_pole_rad_per_s = x[index::SLOW_POLE];
     }
     model

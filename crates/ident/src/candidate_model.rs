@@ -1,4 +1,4 @@
-//! The models of the ladder as functions of physical parameters, from a bare integrator to Eq. (4).
+//! The candidate models as functions of physical parameters, from a bare integrator to Eq. (4).
 //!
 //! `G(s) = K (1 + s/z) (1 + s tau) / ((s + q) (1 + s/p)) e^(-s L)`: integrator gain `K`, pole-zero pair `z`, `p`, far
 //! zero at `-1/tau`, slow pole at `-q`, delay `L`. With all of them this is Eq. (4) with real poles and zeros
@@ -11,7 +11,7 @@ use crate::sampled::{Hold, PartialFractions, Sampling};
 
 /// Parameters of Eq. (4) with real poles and zeros, and a delay.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct LadderModel {
+pub struct CandidateModel {
     /// Integrator gain `K`, bead speed per PZT displacement, 1/s.
     pub gain_per_s: f64,
     /// Zero of the pair, rad/s (a zero at `-zero_rad_per_s`).
@@ -30,7 +30,7 @@ pub struct LadderModel {
     pub feedthrough_share: Option<f64>,
 }
 
-impl LadderModel {
+impl CandidateModel {
     /// A bare integrator behind a delay: Eq. (5) with its unit put right.
     pub fn integrator(gain_per_s: f64, delay_s: f64) -> Self {
         Self {
@@ -154,7 +154,7 @@ impl LadderModel {
     }
 }
 
-/// A [`LadderModel`] prepared for evaluation at many frequencies.
+/// A [`CandidateModel`] prepared for evaluation at many frequencies.
 #[derive(Debug, Clone)]
 pub struct Sampler {
     fractions: PartialFractions,
@@ -187,7 +187,7 @@ mod tests {
 
     #[test]
     fn eq6_in_these_parameters_has_the_gain_and_phase_of_the_papers_frequencies() {
-        let model = LadderModel::eq6(0.0);
+        let model = CandidateModel::eq6(0.0);
         let table = [
             (2.0, 30.62, -91.04),
             (5.0, 22.55, -92.33),
@@ -211,9 +211,9 @@ mod tests {
 
     #[test]
     fn polynomials_and_partial_fractions_are_the_same_plant() {
-        let model = LadderModel {
+        let model = CandidateModel {
             slow_pole_rad_per_s: 0.7,
-            ..LadderModel::eq6(0.0)
+            ..CandidateModel::eq6(0.0)
         };
         let (numerator, denominator) = model.polynomials();
         let horner =
@@ -229,8 +229,8 @@ mod tests {
     #[test]
     fn behind_a_hold_the_far_zero_and_the_delay_of_an_integrator_cannot_be_told_apart() {
         let sampling = Sampling::held(1000.0);
-        let plain = LadderModel::integrator(400.0, 0.0021);
-        let traded = LadderModel {
+        let plain = CandidateModel::integrator(400.0, 0.0021);
+        let traded = CandidateModel {
             far_lead_s: 0.0005,
             delay_s: 0.0026,
             ..plain
