@@ -1,5 +1,7 @@
 //! The firmware on an emulated Cortex-M4F closes the loop: QEMU runs the ARM code, `firmware-sim --board` is plant and
 //! camera around it, `cellpos track` the host. What is asserted is logic, never latency: emulated time is not board time.
+//! QEMU's UART hands over a byte at a time, some ten thousand a second on a busy machine: at 100 Hz the commands take a third of
+//! that.
 //!
 //! `scripts/firmware-qemu.sh` builds the firmware and runs these tests with `CELLPOS_FIRMWARE` naming it.
 
@@ -40,8 +42,12 @@ impl Rig {
     fn start(watchdog_ms: u32, hold_watchdog_ms: u32) -> Self {
         let firmware = std::env::var("CELLPOS_FIRMWARE")
             .expect("CELLPOS_FIRMWARE names the firmware: run scripts/firmware-qemu.sh");
-        let mut qemu = Command::new("qemu-system-arm")
+        // Before all else on a busy machine, where that is allowed: a board does not wait for its host's other programs.
+        let mut qemu = Command::new("nice")
             .args([
+                "-n",
+                "-20",
+                "qemu-system-arm",
                 "-machine",
                 "mps2-an386",
                 "-display",
@@ -68,14 +74,15 @@ impl Rig {
         let text = format!(
             "[actuator]\nkind = \"serial\"\nport = \"{}\"\nwatchdog_ms = {watchdog_ms}\n\
              hold_watchdog_ms = {hold_watchdog_ms}\n\
-             [camera]\nkind = \"socket\"\nsocket = \"camera.sock\"\nrate_hz = 250.0\n\
+             [camera]\nkind = \"socket\"\nsocket = \"camera.sock\"\nrate_hz = 100.0\n\
              [calibration]\npixel_um = 0.1\norigin_px = 127.5\nsign = 1.0\n\
              [vision]\nwindow_px = 21\n[vision.profile]\nkind = \"ring\"\nedge_px = 5.0\n\
              [limits]\nlow_um = {LOW_UM}\nhigh_um = {HIGH_UM}\nslew_um_per_s = {SLEW_UM_PER_S}\npark_um = {PARK_UM}\n\
              [timing]\noldest_ms = 400.0\nfaults_in_a_row = 1000\nbudget_us = 3000.0\nlost_ticks = 20000\n\
-             period_us = 4000.0\ncamera_delay_ms = 16.0\n\
+             period_us = 10000.0\ncamera_delay_ms = 20.0\n\
              board_silence_ms = 1000.0\n\
-             [arming]\ncheck = false\n[emulator]\nrate_hz = 250.0\n",
+             [arming]\ncheck = false\n\
+             [emulator]\nrate_hz = 100.0\nexposure_ms = 0.5\n",
             terminals[0].display()
         );
         std::fs::write(folder.path().join("rig.toml"), text).unwrap();
@@ -83,6 +90,8 @@ impl Rig {
             .arg("--board")
             .arg(&terminals[1])
             .args([
+                "--rig",
+                "rig.toml",
                 "--socket",
                 "camera.sock",
                 "--log",
@@ -224,21 +233,24 @@ fn a_killed_host_leaves_the_board_holding_and_then_parked() {
     child.kill().unwrap();
     child.wait().unwrap();
     std::thread::sleep(Duration::from_millis(1_000));
-    let holding = rig.settled_rows();
-    std::thread::sleep(Duration::from_millis(1_500));
+    std::thread::sleep(Duration::from_millis(3_000));
     let after = rig.settled_rows();
     // Held for a while on one code near the zero-flow displacement of 20 um, then at park.
-    let still = holding
+    let (mut longest, mut now) = ((0, f64::NAN), (0, f64::NAN));
+    for row in after
         .iter()
-        .rev()
-        .find(|row| (row.applied_um - PARK_UM).abs() > 0.1);
-    assert!(
-        (still.expect("held").applied_um - 20.0).abs() < 2.0,
-        "{still:?}"
-    );
-    let held_um = still.unwrap().applied_um;
-    let at_rest = after.iter().filter(|row| row.applied_um == held_um).count();
-    assert!(at_rest > 500, "held for {at_rest} rows");
+        .filter(|row| (row.applied_um - PARK_UM).abs() > 0.1)
+    {
+        now = if row.applied_um == now.1 {
+            (now.0 + 1, now.1)
+        } else {
+            (1, row.applied_um)
+        };
+        longest = if now.0 > longest.0 { now } else { longest };
+    }
+    let (rows_held, held_um) = longest;
+    assert!(rows_held > 500, "held for {rows_held} rows");
+    assert!((held_um - 20.0).abs() < 2.0, "held at {held_um} um");
     assert!((after.last().unwrap().applied_um - PARK_UM).abs() < 0.01);
 }
 
@@ -284,7 +296,7 @@ fn garbage_on_the_line_costs_frames_and_not_the_bead() {
 #[ignore = "needs qemu-system-arm and a cross build: scripts/firmware-qemu.sh"]
 fn a_host_that_stalls_is_held_for_and_takes_up_again_and_one_that_stays_away_is_parked() {
     let _alone = ONE_AT_A_TIME.lock().unwrap_or_else(|p| p.into_inner());
-    let rig = Rig::start(20, 2_000);
+    let rig = Rig::start(40, 2_000);
     let mut child = rig.track("--duration 8s");
     rig.wait_for_the_loop(&mut child);
     std::thread::sleep(Duration::from_secs(1));
@@ -299,7 +311,7 @@ fn a_host_that_stalls_is_held_for_and_takes_up_again_and_one_that_stays_away_is_
     assert!(rig.events().contains("board-held"), "{}", rig.events());
     drop(rig);
 
-    let rig = Rig::start(20, 300);
+    let rig = Rig::start(40, 300);
     let mut child = rig.track("--duration 20s");
     rig.wait_for_the_loop(&mut child);
     std::thread::sleep(Duration::from_secs(1));

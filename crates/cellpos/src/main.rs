@@ -6,6 +6,7 @@
 
 mod arguments;
 mod commands;
+mod keyboard;
 mod outcome;
 mod output;
 mod view_args;

@@ -43,6 +43,9 @@ impl<P: Port + ?Sized> Port for Box<P> {
 
 /// How long an answer to a request may take.
 const ANSWER_WITHIN: Duration = Duration::from_millis(500);
+/// How long the answer to the first hello may take: a board that the opening of its port resets, or a line that wakes up
+/// when it is opened (a pseudo-terminal of QEMU looks once a second), is silent at first.
+const HELLO_WITHIN: Duration = Duration::from_secs(3);
 /// How often a request is sent again within that time.
 const REPEAT_EVERY: Duration = Duration::from_millis(50);
 
@@ -71,7 +74,7 @@ fn name_of(request: Request) -> &'static str {
     match request {
         Request::Hello => "to say what it is (hello)",
         Request::Arm => "to be armed",
-        Request::Command => "a command",
+        Request::Command => "to take a command",
         Request::Freeze => "to freeze",
         Request::Park => "to park",
         Request::Disarm => "to be disarmed",
@@ -222,6 +225,7 @@ impl<P: Port> BoardHost<P> {
     /// # Errors
     /// The line is broken, or no status came.
     pub fn status(&mut self) -> Result<Status, ActuatorError> {
+        // No refusal answers a status request, so the request only names what is waited for.
         self.ask(
             &ToBoard::StatusRequest,
             Request::Hello,
@@ -307,7 +311,11 @@ impl<P: Port> BoardHost<P> {
         request: Request,
         mut answer: impl FnMut(ToHost) -> Option<T>,
     ) -> Result<T, ActuatorError> {
-        let give_up_ns = self.clock.now_ns() + ANSWER_WITHIN.as_nanos() as i64;
+        let within = match request {
+            Request::Hello => HELLO_WITHIN,
+            _ => ANSWER_WITHIN,
+        };
+        let give_up_ns = self.clock.now_ns() + within.as_nanos() as i64;
         let actuator = self.name();
         while self.clock.now_ns() < give_up_ns {
             self.send(message)?;
@@ -336,7 +344,7 @@ impl<P: Port> BoardHost<P> {
         Err(ActuatorError::Timeout {
             actuator,
             request: name_of(request),
-            after: ANSWER_WITHIN,
+            after: within,
         })
     }
 }

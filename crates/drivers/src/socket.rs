@@ -123,6 +123,14 @@ impl SocketCamera {
     }
 }
 
+/// Reads what is there, without waiting.
+fn at_hand(stream: &mut UnixStream, chunk: &mut [u8]) -> std::io::Result<usize> {
+    stream.set_nonblocking(true)?;
+    let read = stream.read(chunk);
+    stream.set_nonblocking(false)?;
+    read
+}
+
 impl Camera for SocketCamera {
     fn next_frame(
         &mut self,
@@ -134,23 +142,30 @@ impl Camera for SocketCamera {
                 return Ok(Some(stamp));
             }
             let left_ns = deadline_ns - monotonic_ns();
-            if left_ns <= 0 {
-                return Ok(None);
-            }
+            // What has arrived is taken even when there is no time to wait for more.
+            let overdue = left_ns <= 0;
             let Some(stream) = &mut self.stream else {
+                if overdue {
+                    return Ok(None);
+                }
                 if !self.reconnect() {
                     Clock::Real.sleep(RECONNECT_EVERY.min(Duration::from_nanos(left_ns as u64)));
                 }
                 continue;
             };
-            let left = Duration::from_nanos(left_ns as u64).max(Duration::from_micros(1));
-            let read = stream
-                .set_read_timeout(Some(left))
-                .and_then(|()| stream.read(&mut self.chunk));
+            let read = if overdue {
+                at_hand(stream, &mut self.chunk)
+            } else {
+                let left = Duration::from_nanos(left_ns as u64).max(Duration::from_micros(1));
+                stream
+                    .set_read_timeout(Some(left))
+                    .and_then(|()| stream.read(&mut self.chunk))
+            };
             match read {
                 Ok(0) => self.stream = None,
                 Ok(length) => self.pending = 0..length,
                 Err(error) => match error.kind() {
+                    ErrorKind::WouldBlock if overdue => return Ok(None),
                     ErrorKind::WouldBlock | ErrorKind::TimedOut | ErrorKind::Interrupted => {}
                     _ => self.stream = None,
                 },
@@ -222,6 +237,29 @@ mod tests {
             .expect("a frame");
         assert_eq!((stamp.id, buffer.mono8.as_slice()), (9, &[5; 8][..]));
         server.join().expect("the server ends");
+    }
+
+    #[test]
+    fn a_frame_that_has_arrived_is_taken_without_time_to_wait() {
+        let directory = tempfile::tempdir().expect("a temporary directory");
+        let path = directory.path().join("camera.sock");
+        let listener = UnixListener::bind(&path).expect("a socket");
+        let server = std::thread::spawn(move || {
+            let (mut client, _) = listener.accept().expect("a client");
+            for id in 1..=3 {
+                let mut bytes = header(id, 8).to_bytes().to_vec();
+                bytes.extend([id as u8; 8]);
+                client.write_all(&bytes).expect("the client reads");
+            }
+            client
+        });
+        let mut camera = SocketCamera::connect(&path, 1000.0, 2.0, Duration::from_secs(5))
+            .expect("the first frame comes");
+        let _client = server.join().expect("all is sent");
+        let mut buffer = FrameBuffer::default();
+        let mut next = || camera.next_frame(&mut buffer, 0).expect("a stream");
+        let ids = [next(), next(), next()].map(|stamp| stamp.map(|stamp| stamp.id));
+        assert_eq!(ids, [Some(2), Some(3), None]);
     }
 
     #[test]

@@ -145,7 +145,9 @@ pub enum ActuatorError {
         source: std::io::Error,
     },
     /// No answer.
-    #[error("{actuator}: no answer to {request} within {after:?}: is it powered, is it this port?")]
+    #[error(
+        "{actuator} was asked {request} and did not answer within {after:?}: is it powered, is it this port?"
+    )]
     Timeout {
         /// Which actuator.
         actuator: String,

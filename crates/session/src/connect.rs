@@ -9,6 +9,7 @@ use crate::rig_file::{ActuatorConfig, CameraConfig, ClockKind, RigFile};
 use crate::setup::{ReferenceSpec, Setup};
 use cellpos_control::ControllerKind;
 use cellpos_control::design::bound_rms_um;
+use cellpos_drivers::Calibration;
 use cellpos_record::{Group, InputFile, RunEnd, RunMeta, RunWriter, space};
 use cellpos_runtime::Summary;
 use cellpos_runtime::realtime::Conditions;
@@ -257,5 +258,24 @@ pub fn delay_warning(file: &RigFile, summary: &Summary) -> Option<String> {
 pub fn warnings<S>(finished: &Finished<S>) -> Vec<String> {
     let mut warnings = finished.rig.warnings().to_vec();
     warnings.extend(delay_warning(finished.rig.file(), &finished.summary));
+    let calibration = finished.rig.file().calibration;
+    warnings.extend((finished.odd_gain).map(|ratio| gain_warning(ratio, calibration.as_ref())));
     warnings
+}
+
+/// What a gain that is not the model's may come from. Positions in pixels times a wrong pixel size are a gain wrong by the
+/// same factor.
+fn gain_warning(ratio: f64, calibration: Option<&Calibration>) -> String {
+    let pixel = calibration.map_or_else(String::new, |c| {
+        format!(
+            " (pixel_um = {}; {:.4} would make it the model's)",
+            c.pixel_um,
+            c.pixel_um / ratio
+        )
+    });
+    format!(
+        "the bead answered the arming pulse with {ratio:.2} of the model's gain: a pixel size wrong by that factor looks like this\
+         {pixel}, and so do a wrong um per volt and the model of another chip: calibrate with a stage micrometre (cellpos \
+         calibrate); if pixel and drive are right measure this rig (cellpos identify)"
+    )
 }

@@ -85,6 +85,8 @@ impl fmt::Display for Ended {
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct Clues {
     arming: Option<(Refusal, f64, f64)>,
+    /// Gain over the model's, and half its 95 % interval, of a pulse that was accepted.
+    passed: Option<(f64, f64)>,
     /// Tick of the refusal.
     refused_at: u64,
     board: Option<(State, Fault)>,
@@ -104,6 +106,7 @@ impl Clues {
                 self.arming = Some((refusal, gain_ratio, ci95));
                 self.refused_at = event.seq;
             }
+            EventKind::ArmingPassed { gain_ratio, ci95 } => self.passed = Some((gain_ratio, ci95)),
             EventKind::BoardChanged { state, fault } => self.board = Some((state, fault)),
             EventKind::LateTick { compute_us } => self.late_us = Some(compute_us),
             EventKind::FrameStale { age_ms } => self.stale_ms = Some(age_ms),
@@ -114,6 +117,12 @@ impl Clues {
             _ => {}
         }
     }
+}
+
+/// Whether a gain over the model's differs from 1 by more than a rig does from day to day, beyond its 95 % interval.
+pub(crate) fn is_odd(ratio: f64, ci95: f64) -> bool {
+    const USUAL: f64 = 1.25;
+    ratio - ci95 > USUAL || ratio + ci95 < 1.0 / USUAL
 }
 
 /// What the loop was set up to expect.
@@ -131,6 +140,13 @@ fn sentences(seen: impl Into<String>, expected: impl Into<String>, to_do: &str) 
 }
 
 impl Clues {
+    /// Gain over the model's, where the arming pulse was accepted and the gain is nevertheless not the model's.
+    pub(crate) fn odd_gain(&self) -> Option<f64> {
+        (self.passed)
+            .filter(|(ratio, ci95)| is_odd(*ratio, *ci95))
+            .map(|(ratio, _)| ratio)
+    }
+
     /// How a run ended, by its summary, its trouble and these clues.
     pub(crate) fn ended(
         &self,

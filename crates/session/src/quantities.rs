@@ -10,7 +10,7 @@ use std::path::Path;
 use toml::de::{DeTable, DeValue};
 
 /// The quantities that may be written with a unit: table (empty: none), key, and the key with its unit.
-pub const QUANTITIES: [(&str, &str, &str); 18] = [
+pub const QUANTITIES: [(&str, &str, &str); 20] = [
     ("", "first_neutral", "first_neutral_um"),
     ("", "near", "near_um"),
     ("actuator", "watchdog", "watchdog_ms"),
@@ -29,6 +29,8 @@ pub const QUANTITIES: [(&str, &str, &str); 18] = [
     ("timing", "oldest", "oldest_ms"),
     ("timing", "board_silence", "board_silence_ms"),
     ("tracking", "coast_limit", "coast_limit_s"),
+    ("arming", "pulse", "pulse_um"),
+    ("sample", "channel_width", "channel_width_um"),
 ];
 
 /// Reads a file in which quantities may have units.
@@ -44,6 +46,41 @@ pub fn read<T: DeserializeOwned>(path: &Path) -> Result<T, Failure> {
     })?;
     let name = path.display().to_string();
     toml_file::parse(&bare(&text, &name)?, &name)
+}
+
+/// The line of a key in a file, counted from 1: of a table (empty: none), or wherever it stands first (`None`). A key with its
+/// unit is found where the quantity is written without, too.
+pub fn line_of(text: &str, table: Option<&str>, key: &str) -> Option<usize> {
+    let plain = (QUANTITIES.iter())
+        .find(|(of, _, with_unit)| *with_unit == key && table.is_none_or(|table| table == *of))
+        .map(|(_, plain, _)| *plain);
+    let mut inside = "";
+    for (at, line) in text.lines().enumerate() {
+        let line = line.trim();
+        if let Some(header) = line.strip_prefix('[') {
+            inside = header.split(']').next().unwrap_or("").trim();
+            // A table that is a key of another one, or of none.
+            let (of, name) = inside.rsplit_once('.').unwrap_or(("", inside));
+            if name == key && table.is_none_or(|table| table == of) {
+                return Some(at + 1);
+            }
+            continue;
+        }
+        let name = line.split(['=', '#']).next().unwrap_or("").trim();
+        let (of, name) = name.rsplit_once('.').unwrap_or((inside, name));
+        if (name == key || Some(name) == plain) && table.is_none_or(|table| table == of) {
+            return Some(at + 1);
+        }
+    }
+    None
+}
+
+/// The line of the first key of a table that a message names.
+pub(crate) fn line_named(text: &str, table: &str, message: &str) -> Option<usize> {
+    let is_of_a_word = |c: char| c.is_ascii_alphanumeric() || c == '_';
+    let words = message.split(|c| !is_of_a_word(c));
+    let mut keys = words.filter(|word| word.len() > 2);
+    keys.find_map(|key| line_of(text, Some(table), key))
 }
 
 /// The text with bare numbers.
@@ -127,6 +164,26 @@ mod tests {
         let expected = "near_um = -1.5 # here\n[actuator]\nkind = \"serial\"\nwatchdog_ms = 20\n[camera]\nrate_hz = 1000.0\n\
                         [calibration]\npixel_um = 0.1\n[timing]\nperiod_us = 1000.0\ncamera_delay_ms = 2.0\nbudget_us = 500.0\n";
         assert_eq!(bare, expected);
+    }
+
+    #[test]
+    fn a_key_is_found_in_its_own_table_with_or_without_its_unit() {
+        let text = "near = \"1um\"\n[emulator]\nrate_hz = 1.0\n[camera] # one\nkind = \"socket\"\n  rate = \"1kHz\" # of it\n\
+                    [vision.profile]\nkind = \"ring\"\n";
+        for (table, key, line) in [
+            (Some(""), "near_um", Some(1)),
+            (Some("emulator"), "rate_hz", Some(3)),
+            (Some("camera"), "rate_hz", Some(6)),
+            (Some(""), "camera", Some(4)),
+            (Some("vision"), "profile", Some(7)),
+            (Some("vision.profile"), "kind", Some(8)),
+            (Some("limits"), "low_um", None),
+            (None, "kind", Some(5)),
+        ] {
+            assert_eq!(line_of(text, table, key), line, "{table:?} {key}");
+        }
+        let message = "rig.toml: near_um = 99: must be in view";
+        assert_eq!(line_named(text, "", message), Some(1));
     }
 
     #[test]

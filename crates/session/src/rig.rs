@@ -381,6 +381,7 @@ where
         let finished = finished.map_err(Failure::failed)?;
         let Witness { sink, clues } = finished.sink;
         Ok(Finished {
+            odd_gain: clues.odd_gain(),
             ended: clues.ended(
                 &finished.summary,
                 finished.io_error.as_ref(),
@@ -492,6 +493,8 @@ pub struct Finished<S> {
     pub learned: Vec<Option<LearnedTable>>,
     /// How the recording went.
     pub recorder: RecorderReport,
+    /// Gain over the model's as the arming pulse showed it, where it was accepted and is nevertheless not the model's.
+    pub odd_gain: Option<f64>,
     /// What went wrong on a thread beside control, if anything did.
     pub trouble: Option<RunError>,
     /// The sink, with all that it was given.

@@ -1,7 +1,9 @@
 //! What is noted of a run on its way to the sink.
 
-use crate::ended::Clues;
+use crate::ended::{Clues, is_odd};
+use crate::{say, words};
 use cellpos_control::LearnerState;
+use cellpos_runtime::life::EventKind;
 use cellpos_runtime::{Event, RunSink, Statistics, TickRecord};
 
 /// Hands everything on to a sink, and keeps what says why a run ended.
@@ -17,6 +19,12 @@ impl<S: RunSink> RunSink for Witness<S> {
 
     fn event(&mut self, event: &Event) {
         self.clues.note(event);
+        // Worth knowing while the bead is still held, and not only when the run is over.
+        if let EventKind::ArmingPassed { gain_ratio, ci95 } = event.kind
+            && is_odd(gain_ratio, ci95)
+        {
+            say::say(format!("WARNING: {}", words::sentence(&event.kind).1));
+        }
         self.sink.event(event);
     }
 

@@ -1,5 +1,6 @@
 //! Events of a run as sentences: for the terminal, the page and the report.
 
+use crate::ended::is_odd;
 use cellpos_runtime::life::{EventKind, FreezeReason, Refusal, SafeReason};
 
 /// How much an event matters to whoever looks on.
@@ -78,6 +79,13 @@ pub fn sentence(kind: &EventKind) -> (Level, String) {
         EventKind::Armed => (
             Info,
             text("The board is armed; the bead is being looked for."),
+        ),
+        EventKind::ArmingPassed { gain_ratio, ci95 } if is_odd(gain_ratio, ci95) => (
+            Warning,
+            format!(
+                "The plant answered the arming pulse with {gain_ratio:.2} +- {ci95:.2} of the model's gain: is the pixel size wrong \
+                 by this factor, or the um per volt?"
+            ),
         ),
         EventKind::ArmingPassed { gain_ratio, ci95 } => (
             Info,

@@ -1,10 +1,9 @@
-//! What does not fit together in a rig file that reads well, and what is found when its devices are opened.
+//! What does not fit together in a rig file that reads well.
 
-use crate::bench::Bench;
-use crate::line_test::{self, LineTest, Quantiles};
-use cellpos_rig::{Actuator, Clock, FrameBuffer};
+pub use crate::connected::{Connected, connect};
+use cellpos_session::RigFile;
+use cellpos_session::quantities::line_of;
 use cellpos_session::rig_file::{ActuatorConfig, CameraConfig};
-use cellpos_session::{Failure, RigFile};
 use serde::Serialize;
 use std::path::Path;
 
@@ -25,153 +24,247 @@ pub struct Finding {
     pub weight: Weight,
     /// Line of the key in the file; none for what is not there.
     pub line: Option<usize>,
-    /// Key and value, and why it does not fit.
+    /// The key with its table, as `camera.rate_hz`; empty where it is about no key.
+    pub key: String,
+    /// Its value, with the unit of the key; empty where it is not there.
+    pub value: String,
+    /// Why it does not fit, with key and value.
     pub what: String,
     /// What would be right.
     pub remedy: String,
 }
 
-/// What does not fit together in a file that was read from `path`.
-pub fn findings(file: &RigFile, path: &Path) -> Vec<Finding> {
-    let text = std::fs::read_to_string(path).unwrap_or_default();
-    let mut found = Vec::new();
-    let mut say = |weight, key: &str, what: String, remedy: &str| {
-        found.push(Finding {
+/// Findings in the making.
+struct Findings<'a> {
+    file: &'a RigFile,
+    text: String,
+    found: Vec<Finding>,
+}
+
+use Weight::{Error, Warning};
+
+impl Findings<'_> {
+    fn say(
+        &mut self,
+        weight: Weight,
+        (table, key): (&str, &str),
+        value: &dyn std::fmt::Display,
+        what: String,
+        remedy: &str,
+    ) {
+        let whole = [table, key]
+            .iter()
+            .filter(|part| !part.is_empty())
+            .copied()
+            .collect::<Vec<_>>()
+            .join(".");
+        self.found.push(Finding {
             weight,
-            line: line_of(&text, key),
+            line: line_of(&self.text, Some(table), key),
+            key: whole,
+            value: value.to_string(),
             what,
             remedy: remedy.to_string(),
         });
-    };
-    use Weight::{Error, Warning};
-    let timing = &file.timing;
-    let period_ms = timing.period_us * 1e-3;
-    let (rate_hz, exposure_us) = match &file.camera {
-        CameraConfig::Emulated {} => (file.emulator.rate_hz, Some(file.emulator.exposure_ms * 1e3)),
-        CameraConfig::Socket { rate_hz, .. } => (*rate_hz, None),
-        CameraConfig::Industrial {
-            rate_hz,
-            exposure_us,
-            ..
-        } => (*rate_hz, *exposure_us),
-    };
-    if (rate_hz * timing.period_us * 1e-6 - 1.0).abs() > 0.01 {
-        say(
-            Error,
-            "rate",
-            format!(
-                "the camera's {rate_hz} Hz is a frame each {} us, [timing] period_us is {}",
-                (1e6 / rate_hz).round(),
-                timing.period_us
-            ),
-            "make period_us one million divided by the rate: the loop makes one tick a frame",
-        );
     }
-    if let Some(us) = exposure_us.filter(|us| *us > 1e6 / rate_hz) {
-        say(
-            Error,
-            "exposure",
-            format!("an exposure of {us} us does not fit into a frame of {rate_hz} Hz"),
-            "shorten the exposure, or lower the rate",
-        );
+
+    /// Rate, exposure, age.
+    fn times(&mut self) {
+        let timing = self.file.timing;
+        let (table, rate_hz, exposure) = match &self.file.camera {
+            CameraConfig::Emulated {} => {
+                let world = &self.file.emulator;
+                let exposure = Some(("exposure_ms", world.exposure_ms, 1e3));
+                ("emulator", world.rate_hz, exposure)
+            }
+            CameraConfig::Socket { rate_hz, .. } => ("camera", *rate_hz, None),
+            CameraConfig::Industrial {
+                rate_hz,
+                exposure_us,
+                ..
+            } => {
+                let exposure = exposure_us.map(|us| ("exposure_us", us, 1.0));
+                ("camera", *rate_hz, exposure)
+            }
+        };
+        if (rate_hz * timing.period_us * 1e-6 - 1.0).abs() > 0.01 {
+            self.say(
+                Error,
+                (table, "rate_hz"),
+                &rate_hz,
+                format!(
+                    "rate_hz = {rate_hz}: a frame each {} us, [timing] period_us is {}",
+                    (1e6 / rate_hz).round(),
+                    timing.period_us
+                ),
+                "make period_us one million divided by the rate: the loop makes one tick a frame",
+            );
+        }
+        if let Some((key, exposure, us)) = exposure
+            && exposure * us > 1e6 / rate_hz
+        {
+            self.say(
+                Error,
+                (table, key),
+                &exposure,
+                format!("{key} = {exposure}: does not fit into a frame of {rate_hz} Hz"),
+                "shorten the exposure, or lower the rate",
+            );
+        }
+        if timing.oldest_ms <= timing.camera_delay_ms {
+            self.say(
+                Error,
+                ("timing", "oldest_ms"),
+                &timing.oldest_ms,
+                format!(
+                    "oldest_ms = {}: not above camera_delay_ms = {}, every frame would be stale",
+                    timing.oldest_ms, timing.camera_delay_ms
+                ),
+                "make oldest_ms the delay plus two periods or more",
+            );
+        }
     }
-    if timing.oldest_ms <= timing.camera_delay_ms {
-        say(
-            Error,
-            "oldest",
-            format!(
-                "oldest_ms = {} is not above camera_delay_ms = {}: every frame would be stale",
-                timing.oldest_ms, timing.camera_delay_ms
-            ),
-            "make oldest_ms the delay plus two periods or more",
-        );
+
+    /// Watchdogs against the period and against each other.
+    fn watchdogs(&mut self) {
+        let period_ms = self.file.timing.period_us * 1e-3;
+        let (table, board) = if let ActuatorConfig::Emulated {} = self.file.actuator {
+            let board = &self.file.board;
+            (
+                "board",
+                [board.watchdog_ms, board.hold_watchdog_ms].map(Some),
+            )
+        } else {
+            ("actuator", self.file.watchdogs_ms())
+        };
+        if let Some(ms) = board[0].filter(|ms| f64::from(*ms) < 5.0 * period_ms) {
+            self.say(
+                Warning,
+                (table, "watchdog_ms"),
+                &ms,
+                format!("watchdog_ms = {ms}: less than five periods of {period_ms} ms"),
+                "20 ms lets a stall of the machine pass; the board holds the bead meanwhile",
+            );
+        }
+        if let [Some(watchdog), Some(hold)] = board
+            && hold < watchdog
+        {
+            self.say(
+                Warning,
+                (table, "hold_watchdog_ms"),
+                &hold,
+                format!("hold_watchdog_ms = {hold}: shorter than watchdog_ms = {watchdog}"),
+                "two seconds leave a stalled host time to take up again",
+            );
+        }
     }
-    let board = if let ActuatorConfig::Emulated {} = file.actuator {
-        [file.board.watchdog_ms, file.board.hold_watchdog_ms].map(Some)
-    } else {
-        file.watchdogs_ms()
-    };
-    if let Some(ms) = board[0].filter(|ms| f64::from(*ms) < 5.0 * period_ms) {
-        say(
-            Warning,
-            "watchdog",
-            format!("watchdog_ms = {ms} is less than five periods of {period_ms} ms"),
-            "20 ms lets a stall of the machine pass; the board holds the bead meanwhile",
-        );
-    }
-    if let [Some(watchdog), Some(hold)] = board
-        && hold < watchdog
-    {
-        say(
-            Warning,
-            "hold_watchdog",
-            format!("hold_watchdog_ms = {hold} is shorter than watchdog_ms = {watchdog}"),
-            "two seconds leave a stalled host time to take up again",
-        );
-    }
-    let step_um = 40.0 / 65_535.0;
-    let reach_um = file.limits.slew_um_per_s * period_ms * 1e-3;
-    if reach_um < 10.0 * step_um {
-        say(
-            Warning,
-            "slew",
-            format!(
-                "slew_um_per_s = {} is {:.1} nm a tick, a few steps of a 16-bit converter",
-                file.limits.slew_um_per_s,
-                reach_um * 1e3
-            ),
-            "the loop needs some um/ms to catch a bead: 20000 is usual",
-        );
-    }
-    if let ActuatorConfig::Serial { baud, port, .. } = &file.actuator {
+
+    /// Slew against the converter's step, the line against the rate, port and pairing of board and camera.
+    fn board(&mut self) {
+        let file = self.file;
+        let period_ms = file.timing.period_us * 1e-3;
+        let step_um = 40.0 / 65_535.0;
+        let reach_um = file.limits.slew_um_per_s * period_ms * 1e-3;
+        if reach_um < 10.0 * step_um {
+            self.say(
+                Warning,
+                ("limits", "slew_um_per_s"),
+                &file.limits.slew_um_per_s,
+                format!(
+                    "slew_um_per_s = {}: {:.1} nm a tick, a few steps of a 16-bit converter",
+                    file.limits.slew_um_per_s,
+                    reach_um * 1e3
+                ),
+                "the loop needs some um/ms to catch a bead: 20000 is usual",
+            );
+        }
+        let emulated_camera = matches!(file.camera, CameraConfig::Emulated {});
+        if emulated_camera != matches!(file.actuator, ActuatorConfig::Emulated {}) {
+            self.say(
+                Error,
+                ("camera", "kind"),
+                &(if emulated_camera { "emulated" } else { "real" }),
+                "kind: board and camera must both be emulated, or neither: the emulated board moves the emulated bead only"
+                    .to_string(),
+                "run firmware-sim to have both behind a serial port and a socket",
+            );
+        }
+        let ActuatorConfig::Serial { baud, port, .. } = &file.actuator else {
+            return;
+        };
         /// Longest command on the wire, in bits.
         const COMMAND_BITS: f64 = 360.0;
         if f64::from(*baud) < COMMAND_BITS * 1e3 / period_ms {
-            say(
+            self.say(
                 Error,
-                "baud",
-                format!("{baud} Bd carries no command each {period_ms} ms (360 bits)"),
+                ("actuator", "baud"),
+                baud,
+                format!("baud = {baud}: carries no command each {period_ms} ms (360 bits)"),
                 "921600 at least, 3000000 where the adapter can: the time on the wire is delay in the loop",
             );
         }
         if port.is_empty() {
-            say(
+            self.say(
                 Error,
-                "port",
-                "port is empty".to_string(),
+                ("actuator", "port"),
+                port,
+                "port = \"\": names no device".to_string(),
                 "cellpos rig new lists the ports",
             );
         }
     }
-    if !matches!(file.camera, CameraConfig::Emulated {}) {
-        if file.calibration.is_none() {
-            say(
-                Error,
-                "calibration",
-                "no [calibration]: a real camera needs to know how large a pixel is".to_string(),
-                "cellpos calibrate writes a file; name it with calibration_file",
-            );
+
+    /// What a real camera needs beside a rate.
+    fn camera(&mut self, path: &Path) {
+        let file = self.file;
+        if !matches!(file.camera, CameraConfig::Emulated {}) {
+            if file.calibration.is_none() {
+                self.say(
+                    Error,
+                    ("", "calibration"),
+                    &"",
+                    "[calibration] is missing: a real camera needs to know how large a pixel is"
+                        .to_string(),
+                    "cellpos calibrate writes a file; name it with calibration_file",
+                );
+            }
+            if file.vision.is_none() && file.cell.is_none() {
+                self.say(
+                    Error,
+                    ("", "vision"),
+                    &"",
+                    "[vision] is missing: what a bead looks like to this camera is not known"
+                        .to_string(),
+                    "record some frames with a bead in view; cellpos vision RECORDING prints the table",
+                );
+            }
         }
-        if file.vision.is_none() && file.cell.is_none() {
-            say(
-                Error,
-                "vision",
-                "no [vision]: what a bead looks like to this camera is not known".to_string(),
-                "record some frames with a bead in view; cellpos vision RECORDING prints the table",
+        if let Some(calibration) = &file.calibration_file
+            && let Some(what) = older_than(calibration, path)
+        {
+            self.say(
+                Warning,
+                ("", "calibration_file"),
+                &calibration.display(),
+                what,
+                "calibrate again if camera, objective or axis were changed since",
             );
         }
     }
-    if let Some(calibration) = &file.calibration_file
-        && let Some(what) = older_than(calibration, path)
-    {
-        say(
-            Warning,
-            "calibration_file",
-            what,
-            "calibrate again if camera, objective or axis were changed since",
-        );
-    }
-    found
+}
+
+/// What does not fit together in a file that was read from `path`.
+pub fn findings(file: &RigFile, path: &Path) -> Vec<Finding> {
+    let mut findings = Findings {
+        file,
+        text: std::fs::read_to_string(path).unwrap_or_default(),
+        found: Vec::new(),
+    };
+    findings.times();
+    findings.watchdogs();
+    findings.board();
+    findings.camera(path);
+    findings.found
 }
 
 /// A sentence when the rig file was changed on a later day than that of its calibration.
@@ -189,129 +282,6 @@ fn older_than(calibration: &Path, rig: &Path) -> Option<String> {
             "{} is of {dated}, the rig file was changed on {changed}",
             calibration.display()
         )
-    })
-}
-
-/// The line of a key, with or without a unit behind it.
-fn line_of(text: &str, key: &str) -> Option<usize> {
-    let is_key = |line: &str| {
-        let line = line.trim_start();
-        let name = line
-            .split(['=', ']', '#'])
-            .next()
-            .unwrap_or("")
-            .trim()
-            .trim_start_matches('[');
-        name == key
-            || name
-                .strip_prefix(key)
-                .is_some_and(|rest| rest.starts_with('_'))
-    };
-    text.lines().position(is_key).map(|at| at + 1)
-}
-
-/// What was found behind the file.
-#[derive(Debug, Clone, Serialize)]
-pub struct Connected {
-    /// The board and its line.
-    pub board: LineTest,
-    /// The camera's name.
-    pub camera: String,
-    /// Its frames, px.
-    pub size_px: [usize; 2],
-    /// Frames a second over a second.
-    pub rate_hz: f64,
-    /// From mid-exposure to arrival, ms.
-    pub age_ms: Quantiles,
-    /// What does not fit to the file.
-    pub findings: Vec<Finding>,
-}
-
-/// Opens board and camera. Nothing moves.
-///
-/// # Errors
-/// One of them is not there, or does not answer.
-pub fn connect(bench: &Bench) -> Result<Connected, Failure> {
-    const PINGS: u32 = 200;
-    const WATCH_NS: i64 = 1_000_000_000;
-    let file = bench.file();
-    let mut board = bench.board()?;
-    let line = line_test::run(&mut board, PINGS)?;
-    let info = board.info();
-    let mut camera = bench.camera()?;
-    let mut buffer = FrameBuffer::default();
-    let clock = Clock::Real;
-    // What had piled up while the board was asked is old.
-    while camera
-        .next_frame(&mut buffer, clock.now_ns())
-        .map_err(Failure::failed)?
-        .is_some()
-    {}
-    let start_ns = clock.now_ns();
-    let mut ages_ms = Vec::new();
-    while clock.now_ns() < start_ns + WATCH_NS {
-        if let Some(stamp) = camera
-            .next_frame(&mut buffer, start_ns + WATCH_NS)
-            .map_err(Failure::failed)?
-        {
-            ages_ms.push((stamp.arrival_ns - stamp.mid_exposure_ns) as f64 * 1e-6);
-        }
-    }
-    let rate_hz = ages_ms.len() as f64 / ((clock.now_ns() - start_ns) as f64 * 1e-9);
-    let age_ms = Quantiles::of(ages_ms);
-    let mut findings = Vec::new();
-    let mut say = |what: String, remedy: &str| {
-        findings.push(Finding {
-            weight: Weight::Warning,
-            line: None,
-            what,
-            remedy: remedy.to_string(),
-        });
-    };
-    let promised_hz = 1e6 / file.timing.period_us;
-    if rate_hz < 0.9 * promised_hz {
-        say(
-            format!(
-                "the camera delivers {rate_hz:.0} Hz, [timing] period_us promises {promised_hz:.0} Hz"
-            ),
-            "smaller region, shorter exposure, faster link: cellpos camera shows which frames are missing",
-        );
-    }
-    if (age_ms.p50 - file.timing.camera_delay_ms).abs() > 0.5 * file.timing.period_us * 1e-3 {
-        say(
-            format!(
-                "frames are {:.2} ms old on arrival (median), camera_delay_ms says {}",
-                age_ms.p50, file.timing.camera_delay_ms
-            ),
-            "cellpos identify measures the delay with the LED",
-        );
-    }
-    if line.lost > 0 {
-        say(
-            format!("{} of {} pings were lost", line.lost, line.sent),
-            "cable, baud rate, another program on the port?",
-        );
-    }
-    let own = &file.limits;
-    if own.low_um < info.low_um
-        || own.high_um > info.high_um
-        || own.slew_um_per_s > info.slew_um_per_s
-    {
-        say(
-            format!(
-                "[limits] are wider than the board's {} to {} um at {} um/s",
-                info.low_um, info.high_um, info.slew_um_per_s
-            ),
-            "the board's hold; write them into the file so that it says what is so",
-        );
-    }
-    Ok(Connected {
-        board: line,
-        camera: camera.info().name,
-        size_px: [buffer.width, buffer.height],
-        rate_hz,
-        age_ms,
-        findings,
     })
 }
 
@@ -345,6 +315,9 @@ mod tests {
         );
         for finding in &found {
             assert!(!finding.what.is_empty() && !finding.remedy.is_empty());
+            let (_, key) = finding.key.rsplit_once('.').unwrap_or(("", &finding.key));
+            assert!(finding.what.contains(key), "{finding:?}");
+            assert!(finding.what.contains(&finding.value), "{finding:?}");
         }
     }
 

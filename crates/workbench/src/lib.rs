@@ -8,6 +8,7 @@
 mod bench;
 pub mod calibrate;
 pub mod check;
+mod connected;
 pub mod line_test;
 pub mod mover;
 pub mod snapshot;

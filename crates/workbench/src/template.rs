@@ -47,8 +47,42 @@ pub fn ports() -> Vec<String> {
     }
 }
 
+/// Sockets in a folder, as camera servers make them.
+pub fn sockets(folder: &Path) -> Vec<String> {
+    use std::os::unix::fs::FileTypeExt;
+    let mut found: Vec<String> = std::fs::read_dir(folder)
+        .into_iter()
+        .flatten()
+        .flatten()
+        .filter(|entry| entry.file_type().is_ok_and(|kind| kind.is_socket()))
+        .filter_map(|entry| entry.file_name().into_string().ok())
+        .collect();
+    found.sort();
+    found
+}
+
+/// What a machine offers.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Found {
+    /// Serial ports.
+    pub ports: Vec<String>,
+    /// Cameras: sockets, addresses of industrial ones.
+    pub cameras: Vec<String>,
+}
+
+/// What was found, as comments.
+fn list(what: &str, found: &[String]) -> String {
+    if found.is_empty() {
+        return format!("# {what} found on this machine: none\n");
+    }
+    let lines: String = (found.iter())
+        .map(|name| format!("#   {}\n", name.escape_debug()))
+        .collect();
+    format!("# {what} found on this machine:\n{lines}")
+}
+
 /// The text of a rig file.
-pub fn text(kind: &Kind) -> String {
+pub fn text(kind: &Kind, found: &Found) -> String {
     let devices = match kind {
         Kind::Emulated => "\
 [actuator]
@@ -97,10 +131,11 @@ profile = {{ kind = \"ring\", edge_px = 5.0 }}
             )
         }
     };
+    let (ports, cameras) = (list("Serial ports", &found.ports), list("Cameras", &found.cameras));
     format!(
         "# A rig for cellpos: see docs/rig.md for every key. Read it with: cellpos rig check FILE [--connect]
 # Quantities are written with a unit (park = \"20um\"), or bare with the unit in the key (park_um = 20.0).
-
+{ports}{cameras}
 first_neutral = \"20um\"   # first belief of the displacement at which the bead is at rest; the loop finds the rest
 
 {devices}
@@ -135,6 +170,10 @@ mod tests {
     #[test]
     fn every_template_is_read_as_it_is_written() {
         let folder = tempfile::tempdir().expect("a folder");
+        let found = Found {
+            ports: vec!["/dev/ttyACM0".to_string(), "odd\nname".to_string()],
+            cameras: Vec::new(),
+        };
         let real = |camera| Kind::Real {
             port: "/dev/serial/by-id/usb-board".to_string(),
             camera,
@@ -145,7 +184,9 @@ mod tests {
             real(camera("192.168.1.20")),
         ] {
             let path = folder.path().join("rig.toml");
-            std::fs::write(&path, text(&kind)).expect("written");
+            let text = text(&kind, &found);
+            assert!(text.contains("#   /dev/ttyACM0\n") && text.contains("machine: none"));
+            std::fs::write(&path, text).expect("written");
             let file = RigFile::load(Some(&path)).unwrap_or_else(|error| panic!("{error:?}"));
             assert_eq!((file.limits.park_um, file.timing.period_us), (20.0, 1000.0));
             assert_eq!(file.is_emulated(), kind == Kind::Emulated);

@@ -80,6 +80,15 @@ impl Counter {
     }
 }
 
+/// Some microseconds without an access to a device. QEMU serves accesses one at a time, under the lock that its own side of the
+/// serial ports needs, too: a firmware that polls without a pause starves the line that it polls.
+pub fn pause() {
+    for _ in 0..500 {
+        // SAFETY: does nothing.
+        unsafe { core::arch::asm!("nop", options(nomem, nostack, preserves_flags)) }
+    }
+}
+
 /// The LED in front of the camera: LED 0 of the FPGA's own registers.
 pub struct Led(usize);
 

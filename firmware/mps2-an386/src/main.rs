@@ -1,8 +1,8 @@
 //! The PZT board on ARM's MPS2 AN386 (Cortex-M4F, 25 MHz), as QEMU runs it.
 //!
 //! UART 0 is the line to the host. UART 1 stands for the converter's SPI: each new code, and every 10 ms the
-//! code that stands, goes out as three bytes `1000 0Lcc`, `0ccc cccc`, `0ccc cccc` (L: LED, c: code, highest bit first), so that a listener finds its place anywhere
-//! in the stream. A free-running counter is the clock; the output is updated every 100 us; a hardware watchdog resets a
+//! code that stands, goes out as three bytes `1000 0Lcc`, `0ccc cccc`, `0ccc cccc` (L: LED, c: code, highest bit first), so
+//! that a listener finds its place anywhere in the stream. A free-running counter is the clock; the output is updated every 100 us; a hardware watchdog resets a
 //! firmware that hangs, and the reset puts the output to its power-up code.
 //!
 //! No interrupt, no allocation, no floating point. The panic handler calls a function that exists nowhere: were there a
@@ -36,8 +36,10 @@ fn run(line: &Uart, converter: &Uart, counter: &Counter, led: &Led, watchdog: &W
         let passed_us = cycles.wrapping_sub(counter.cycles()) / Counter::CYCLES_PER_US;
         cycles = cycles.wrapping_sub(passed_us * Counter::CYCLES_PER_US);
         now_us += u64::from(passed_us);
+        let mut heard = false;
         while let Some(byte) = line.take() {
             board.receive(&[byte], now_us);
+            heard = true;
         }
         if now_us >= tick_us {
             tick_us = now_us + u64::from(CONFIG.update_us);
@@ -55,6 +57,9 @@ fn run(line: &Uart, converter: &Uart, counter: &Counter, led: &Led, watchdog: &W
                 Some(byte) => line.give(byte),
                 None => break,
             }
+        }
+        if !heard {
+            hardware::pause();
         }
     }
 }

@@ -108,9 +108,11 @@ struct Listing {
 
 /// One of them.
 #[derive(Debug, Serialize)]
-struct Listed {
-    address: String,
-    id: String,
+pub(super) struct Listed {
+    /// IP address; empty for a USB3 camera.
+    pub(super) address: String,
+    /// Identifier.
+    pub(super) id: String,
     vendor: String,
     model: String,
     protocol: String,
@@ -247,7 +249,7 @@ fn industrial(address: &str, args: &Args) -> CommandResult {
 const WITHOUT_ARAVIS: &str = "install libaravis-dev and libusb-1.0-0-dev, then build with: cargo build --release --features aravis";
 
 #[cfg(feature = "aravis")]
-fn cameras() -> (bool, Vec<Listed>, String) {
+pub(super) fn cameras() -> (bool, Vec<Listed>, String) {
     let found = sources::industrial::list().unwrap_or_default();
     let listed = found.into_iter().map(|c| Listed {
         address: c.address,
@@ -266,7 +268,7 @@ fn cameras() -> (bool, Vec<Listed>, String) {
 }
 
 #[cfg(not(feature = "aravis"))]
-fn cameras() -> (bool, Vec<Listed>, String) {
+pub(super) fn cameras() -> (bool, Vec<Listed>, String) {
     (
         false,
         Vec::new(),

@@ -4,9 +4,9 @@ use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
 use crate::rig_file::RigFile;
 use cellpos_workbench::Bench;
 use cellpos_workbench::check::{self, Connected, Finding, Weight};
-use cellpos_workbench::template::{self, Kind};
+use cellpos_workbench::template::{self, Found, Kind};
 use serde::Serialize;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 /// Arguments of `cellpos rig`.
 #[derive(Debug, clap::Args)]
@@ -71,31 +71,54 @@ pub fn run(args: Args) -> CommandResult {
 }
 
 fn new(args: New) -> CommandResult {
-    let found = template::ports();
-    let port = args.serial.or_else(|| found.first().cloned());
-    let kind = match (args.emulated, port, args.camera) {
+    let found = Found {
+        ports: template::ports(),
+        cameras: cameras(),
+    };
+    let camera_asked_for = args.camera.is_some();
+    let port = args.serial.or_else(|| found.ports.first().cloned());
+    let camera = args.camera.or_else(|| found.cameras.first().cloned());
+    let kind = match (args.emulated, port, camera) {
+        (true, ..) => Kind::Emulated,
         (false, Some(port), camera) => Kind::Real {
             port,
             camera: template::camera(camera.as_deref().unwrap_or("camera.sock")),
         },
-        (false, None, Some(_)) => {
+        (false, None, _) if camera_asked_for => {
             return Err(Failure::bad_input(
                 "no serial port was found for the board",
                 "plug it in, or name the port: --serial PORT; docs/rig.md, Permissions",
             ));
         }
-        (true, ..) | (false, None, None) => Kind::Emulated,
+        // A camera alone is no rig.
+        (false, None, _) => Kind::Emulated,
     };
-    eprintln!(
-        "serial ports of this machine: {}",
-        if found.is_empty() {
+    for (what, found) in [("serial ports", &found.ports), ("cameras", &found.cameras)] {
+        let names = if found.is_empty() {
             "none".to_string()
         } else {
             found.join(", ")
-        }
-    );
-    print_text(&template::text(&kind))?;
+        };
+        eprintln!("{what} of this machine: {names}");
+    }
+    print_text(&template::text(&kind, &found))?;
     Ok(Outcome::Done)
+}
+
+/// Cameras that answer: servers with a socket in this folder, industrial ones by address or identifier.
+fn cameras() -> Vec<String> {
+    let (_, industrial, _) = super::camera::cameras();
+    let industrial = industrial.into_iter().map(|camera| {
+        if camera.address.is_empty() {
+            camera.id
+        } else {
+            camera.address
+        }
+    });
+    template::sockets(Path::new("."))
+        .into_iter()
+        .chain(industrial)
+        .collect()
 }
 
 fn check(args: Check) -> CommandResult {

@@ -1,68 +1,13 @@
 //! Keys while a script runs: p pauses and goes on, s skips, q stops. The signals that do the same where there is no keyboard
 //! are those of every session.
 
+use crate::keyboard::{self, Keyboard};
 use cellpos_runtime::live::Operator;
 use cellpos_session::signals::press;
-use rustix::termios::{self, LocalModes, OptionalActions, SpecialCodeIndex, Termios};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
-use std::thread::JoinHandle;
 
-/// The keyboard while it is listened to; dropping it gives the terminal back as it was.
-pub struct Keys {
-    before: Termios,
-    stop: Arc<AtomicBool>,
-    thread: Option<JoinHandle<()>>,
-}
-
-/// Listens, if standard input is a terminal and this program is in its foreground: one in the background is stopped by the
-/// system when it touches the terminal, and a stopped program cannot hold a bead.
-pub fn listen(operator: &Arc<Operator>) -> Option<Keys> {
-    let stdin = rustix::stdio::stdin();
-    if !termios::isatty(stdin) {
-        return None;
-    }
-    if termios::tcgetpgrp(stdin).ok() != Some(rustix::process::getpgrp()) {
-        return None;
-    }
-    let before = termios::tcgetattr(stdin).ok()?;
-    let mut raw = before.clone();
-    // Single keys without echo; Ctrl-C stays a signal. A read gives up after a tenth of a second.
-    raw.local_modes
-        .remove(LocalModes::ICANON | LocalModes::ECHO);
-    raw.special_codes[SpecialCodeIndex::VMIN] = 0;
-    raw.special_codes[SpecialCodeIndex::VTIME] = 1;
-    termios::tcsetattr(stdin, OptionalActions::Now, &raw).ok()?;
-    let stop = Arc::new(AtomicBool::new(false));
-    let thread = std::thread::Builder::new()
-        .name("cellpos-keys".to_string())
-        .spawn({
-            let (operator, stop) = (Arc::clone(operator), Arc::clone(&stop));
-            move || {
-                let mut key = [0u8; 1];
-                while !stop.load(Ordering::Acquire) {
-                    match rustix::io::read(rustix::stdio::stdin(), &mut key) {
-                        Ok(1) => press(key[0], &operator),
-                        Ok(_) => {}
-                        Err(_) => std::thread::sleep(std::time::Duration::from_millis(100)),
-                    }
-                }
-            }
-        })
-        .ok();
-    Some(Keys {
-        before,
-        stop,
-        thread,
-    })
-}
-
-impl Drop for Keys {
-    fn drop(&mut self) {
-        self.stop.store(true, Ordering::Release);
-        if let Some(thread) = self.thread.take() {
-            let _ = thread.join();
-        }
-        let _ = termios::tcsetattr(rustix::stdio::stdin(), OptionalActions::Now, &self.before);
-    }
+/// Listens, if there is a keyboard to listen to.
+pub fn listen(operator: &Arc<Operator>) -> Option<Keyboard> {
+    let operator = Arc::clone(operator);
+    keyboard::listen(move |key| press(key, &operator))
 }

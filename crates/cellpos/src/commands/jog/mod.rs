@@ -1,5 +1,7 @@
 //! `cellpos jog`: the PZT moved by hand, within the board's limits, parked at the end.
 
+mod typed;
+
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
 use crate::rig_file::RigFile;
 use cellpos_rig::FrameBuffer;
@@ -9,15 +11,17 @@ use cellpos_workbench::Bench;
 use cellpos_workbench::mover::Mover;
 use cellpos_workbench::snapshot::{self, Eye};
 use serde::Serialize;
-use std::io::BufRead;
 use std::path::PathBuf;
-use std::sync::mpsc::{Receiver, channel};
+use std::sync::mpsc::Receiver;
+use typed::Typed;
 
 /// Arguments of `cellpos jog`.
 #[derive(Debug, clap::Args)]
 #[command(
-    after_help = "Without --to, lines are read from standard input: `5um` goes there, `+` and `-` go a step, `+2um` and `-2um` go \
-    that far, `q` ends. The PZT is parked at the end, on Ctrl-C too.\n\n\
+    after_help = "Without --to, on a terminal, single keys move: + and up a step, - and down a step back, g goes to a displacement \
+    (g, 5um, Enter), q ends. Where standard input is no terminal its lines are read: `5um` goes there, `+` and `-` go a step, \
+    `+2um` and `-2um` go that far, `q` ends. The PZT is parked at the end, on Ctrl-C too. In open loop the bead flows at some \
+    400 um/s for each um away from zero flow: small steps keep it in view.\n\n\
     Examples:\n  cellpos jog --rig rig.toml --to 15um --to 20um\n  cellpos jog --rig rig.toml --step 0.5um"
 )]
 pub struct Args {
@@ -65,16 +69,19 @@ pub fn run(args: Args) -> CommandResult {
     let bench = Bench::of(RigFile::load(Some(&args.rig))?)?;
     let mut mover = Mover::arm(bench.board()?, bench.file())?;
     let mut stops = Vec::new();
-    let lines = args.to.is_empty().then(read_lines);
+    let typed = args.to.is_empty().then(Typed::listen);
+    if typed.as_ref().is_some_and(|typed| typed.keyboard.is_some()) {
+        eprintln!("{}", typed::HELP);
+    }
     let mut given = args.to.iter();
     let mut at_um = mover.at_um();
     loop {
-        let to_um = match &lines {
+        let to_um = match &typed {
             None => match given.next() {
                 Some(to) => to.0,
                 None => break,
             },
-            Some(lines) => match next_line(lines, &mut mover, at_um, &args)? {
+            Some(typed) => match next_line(&typed.lines, &mut mover, at_um, &args)? {
                 Some(to_um) => to_um,
                 None => break,
             },
@@ -157,19 +164,6 @@ fn relative(text: &str, step_um: f64) -> Option<f64> {
         .parse::<Micrometers>()
         .ok()
         .map(|um| sign * um.0)
-}
-
-fn read_lines() -> Receiver<String> {
-    let (sender, receiver) = channel();
-    std::thread::spawn(move || {
-        for line in std::io::stdin().lock().lines() {
-            let Ok(line) = line else { return };
-            if sender.send(line).is_err() {
-                return;
-            }
-        }
-    });
-    receiver
 }
 
 /// What is seen at a stop. The PZT is held meanwhile.

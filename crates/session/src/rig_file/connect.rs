@@ -1,0 +1,260 @@
+//! The devices that a rig file names, opened.
+
+use super::{ActuatorConfig, CameraConfig, ClockKind, Frames, RigFile};
+use crate::Failure;
+use cellpos_drivers::serial::SerialLine;
+use cellpos_drivers::socket::SocketCamera;
+use cellpos_drivers::{BoardHost, Calibration, CommandedFlow, FlowTap, Followed, VisionSource};
+use cellpos_emulator::EmulatedRig;
+use cellpos_plant::Model;
+use cellpos_rig::{Actuator, Camera, Clock, PositionSource};
+use cellpos_units::Hertz;
+use cellpos_vision::{CellTracker, Tracker, TrackerConfig};
+use std::time::Duration;
+
+/// The devices of a rig.
+pub struct Connected {
+    /// Positions.
+    pub source: Box<dyn PositionSource>,
+    /// The PZT.
+    pub actuator: Box<dyn Actuator>,
+    /// Its clock.
+    pub clock: Clock,
+    /// What the user should know.
+    pub warnings: Vec<String>,
+    flow: CommandedFlow,
+}
+
+/// Where a plant's gain from PZT displacement to bead velocity is read for the tracker's prediction.
+const FLOW_GAIN_AT: Hertz = Hertz(20.0);
+
+impl Connected {
+    /// Devices that were connected by somebody else.
+    pub(crate) fn of(
+        source: Box<dyn PositionSource>,
+        actuator: Box<dyn Actuator>,
+        clock: Clock,
+    ) -> Result<Self, Failure> {
+        Ok(Self {
+            source,
+            actuator,
+            clock,
+            warnings: Vec::new(),
+            flow: nominal_flow()?,
+        })
+    }
+
+    /// Lets the tracker predict the bead with this plant's gain; until then it takes that of Eq. (6). The prediction
+    /// allows for a gain that is wrong by half.
+    pub fn expect(&self, model: &Model) {
+        self.flow
+            .set_gain_per_s(model.plant.velocity_gain_at(FLOW_GAIN_AT));
+    }
+}
+
+impl RigFile {
+    /// A camera behind the tracker of this rig, with no command that it could know of.
+    ///
+    /// # Errors
+    /// Settings that cannot be used, or no calibration.
+    pub fn watch<C: Camera + 'static>(
+        &self,
+        camera: C,
+        clock: &Clock,
+    ) -> Result<Box<dyn PositionSource>, Failure> {
+        let emulated = || {
+            let middle_px = 0.5 * f64::from(self.emulator.width_px.saturating_sub(1));
+            Calibration::along_rows(self.emulator.pixel_um, middle_px, 1.0)
+        };
+        let calibration = match self.camera {
+            CameraConfig::Emulated {} => self.calibration.unwrap_or_else(emulated),
+            _ => self.real_calibration()?,
+        };
+        self.tracked(camera, calibration, clock, &nominal_flow()?)
+    }
+
+    /// A camera with its tracker.
+    fn tracked<C: Camera + 'static>(
+        &self,
+        camera: C,
+        calibration: Calibration,
+        clock: &Clock,
+        flow: &CommandedFlow,
+    ) -> Result<Box<dyn PositionSource>, Failure> {
+        let config = self
+            .tracking
+            .unwrap_or_else(|| TrackerConfig::for_pixel_um(calibration.pixel_um));
+        let followed: Followed = if self.follows_a_cell() {
+            CellTracker::new(self.finder()?, config)
+                .map_err(Failure::input)?
+                .into()
+        } else {
+            Tracker::new(self.localiser()?, config)
+                .map_err(Failure::input)?
+                .into()
+        };
+        let source = VisionSource::new(camera, followed, calibration, clock.clone());
+        let source = source.with_flow(flow.clone());
+        Ok(Box::new(match self.near_um {
+            Some(position_um) => source.near(position_um),
+            None => source,
+        }))
+    }
+
+    /// Connects camera and board.
+    pub fn connect(&self, clock: ClockKind, frames: Frames) -> Result<Connected, Failure> {
+        match (&self.actuator, &self.camera) {
+            (ActuatorConfig::Emulated {}, CameraConfig::Emulated {}) => self.emulate(clock, frames),
+            (ActuatorConfig::Serial { port, baud, .. }, camera)
+                if *camera != (CameraConfig::Emulated {}) =>
+            {
+                if clock == ClockKind::Virtual || frames == Frames::Off {
+                    return Err(Failure::bad_input(
+                        "--clock virtual and --frames off are for the emulated rig",
+                        "leave them out, or leave out --rig",
+                    ));
+                }
+                self.open(port, *baud)
+            }
+            _ => Err(Failure::bad_input(
+                "the emulated board moves the emulated bead only: [actuator] and [camera] must both be emulated, or neither",
+                "run firmware-sim to have both behind a serial port and a socket",
+            )),
+        }
+    }
+
+    fn emulate(&self, clock: ClockKind, frames: Frames) -> Result<Connected, Failure> {
+        let clock = match clock {
+            ClockKind::Real => Clock::Real,
+            ClockKind::Virtual => Clock::virtual_at(0),
+        };
+        let model = Model::load(&self.emulator.model).map_err(Failure::input)?;
+        let emulated = EmulatedRig::new(self.board, &self.emulator, &model, clock.clone())
+            .map_err(Failure::input)?;
+        let flow = nominal_flow()?;
+        let source: Box<dyn PositionSource> = match frames {
+            Frames::Off => Box::new(emulated.positions()),
+            Frames::On => {
+                // A calibration of one's own, right or wrong, rehearses one of a real rig.
+                let calibration = self.calibration.unwrap_or(emulated.calibration());
+                self.tracked(emulated.camera(), calibration, &clock, &flow)?
+            }
+        };
+        let board = emulated.actuator().map_err(Failure::failed)?;
+        let mut warnings = Vec::new();
+        if (self.emulator.latency_ms - self.timing.camera_delay_ms).abs() > 1e-9 {
+            warnings.push(format!(
+                "the emulated camera is {} ms late, the loop is set up for {} ms",
+                self.emulator.latency_ms, self.timing.camera_delay_ms
+            ));
+        }
+        Ok(Connected {
+            source,
+            actuator: Box::new(FlowTap::new(board, flow.clone(), clock.clone())),
+            clock,
+            warnings,
+            flow,
+        })
+    }
+
+    /// The camera of a real rig, running.
+    pub fn open_camera(&self) -> Result<Box<dyn Camera>, Failure> {
+        match &self.camera {
+            CameraConfig::Emulated {} => Err(Failure::bad_input(
+                "the emulated camera sees the emulated bead only",
+                "write [camera] kind = \"socket\" or \"industrial\"",
+            )),
+            CameraConfig::Socket { socket, rate_hz } => {
+                let (delay_ms, patience) = (self.timing.camera_delay_ms, Duration::from_secs(2));
+                let camera = SocketCamera::connect(socket, *rate_hz, delay_ms, patience)
+                    .map_err(Failure::failed)?;
+                Ok(Box::new(camera))
+            }
+            #[cfg(feature = "aravis")]
+            CameraConfig::Industrial {
+                address,
+                rate_hz,
+                region,
+                exposure_us,
+                bits,
+            } => {
+                use cellpos_drivers::sources::industrial::{IndustrialCamera, IndustrialSettings};
+                let settings = IndustrialSettings {
+                    address: address.clone(),
+                    region: *region,
+                    rate_hz: *rate_hz,
+                    exposure_us: *exposure_us,
+                    bits: *bits,
+                    latency_ms: self.timing.camera_delay_ms,
+                    buffers: 50,
+                };
+                Ok(Box::new(
+                    IndustrialCamera::open(settings).map_err(Failure::failed)?,
+                ))
+            }
+            #[cfg(not(feature = "aravis"))]
+            CameraConfig::Industrial { address, .. } => Err(Failure::bad_input(
+                format!(
+                    "[camera] address = \"{address}\": this program was built without industrial cameras"
+                ),
+                "install libaravis-dev and libusb-1.0-0-dev, then build with: cargo build --release --features aravis",
+            )),
+        }
+    }
+
+    fn real_calibration(&self) -> Result<Calibration, Failure> {
+        self.calibration.ok_or_else(|| {
+            Failure::bad_input(
+                "a real camera needs a [calibration] with pixel_um, origin_px and sign",
+                "measure pixel_um with a stage micrometer; see examples/rig.toml",
+            )
+        })
+    }
+
+    fn open(&self, port: &str, baud: u32) -> Result<Connected, Failure> {
+        let calibration = self.real_calibration()?;
+        let line = SerialLine::open(port, baud).map_err(|error| {
+            Failure::bad_input(
+                format!("[actuator] port = \"{port}\": {error}"),
+                "is the board plugged in (or firmware-sim running), and may you read and write the device?",
+            )
+        })?;
+        let mut warnings = Vec::new();
+        if let Some(ms) = SerialLine::latency_timer_ms(port).filter(|&ms| ms > 1) {
+            warnings.push(format!(
+                "the USB adapter of {port} holds answers back for {ms} ms: write 1 to its latency_timer"
+            ));
+        }
+        let board = BoardHost::connect(line, Clock::Real).map_err(Failure::failed)?;
+        let flow = nominal_flow()?;
+        let camera = self.open_camera()?;
+        Ok(Connected {
+            source: self.tracked(camera, calibration, &Clock::Real, &flow)?,
+            actuator: Box::new(FlowTap::new(board, flow.clone(), Clock::Real)),
+            clock: Clock::Real,
+            warnings,
+            flow,
+        })
+    }
+
+    /// Camera and board without a tracker, for the LED test.
+    pub fn open_for_led(&self) -> Result<(Box<dyn Camera>, BoardHost<SerialLine>), Failure> {
+        let ActuatorConfig::Serial { port, baud, .. } = &self.actuator else {
+            return Err(Failure::bad_input(
+                "the LED test of a rig needs its board and its camera",
+                "leave the test out with --led-edges 0",
+            ));
+        };
+        let line = SerialLine::open(port, *baud).map_err(Failure::failed)?;
+        let board = BoardHost::connect(line, Clock::Real).map_err(Failure::failed)?;
+        Ok((self.open_camera()?, board))
+    }
+}
+
+/// The flow of Eq. (6)'s plant, nothing commanded yet.
+fn nominal_flow() -> Result<CommandedFlow, Failure> {
+    let nominal = Model::load("eq6").map_err(Failure::input)?;
+    Ok(CommandedFlow::new(
+        nominal.plant.velocity_gain_at(FLOW_GAIN_AT),
+    ))
+}

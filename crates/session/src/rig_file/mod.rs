@@ -1,0 +1,326 @@
+//! rig.toml: which camera, which board, their calibration and limits, and the times of the loop.
+
+mod connect;
+mod sight;
+
+pub use connect::Connected;
+
+use crate::{Failure, quantities};
+use cellpos_control::Limits;
+use cellpos_drivers::sources::Region;
+use cellpos_drivers::{Calibration, CalibrationFile};
+use cellpos_emulator::{BoardConfig, WorldConfig};
+use cellpos_runtime::{ArmingConfig, Timing};
+use cellpos_script::Sample;
+use cellpos_vision::{CellConfig, CellFinder, LocaliserConfig, TrackerConfig};
+use serde::{Deserialize, Serialize};
+use std::path::{Path, PathBuf};
+
+/// A rig.toml. Every table and key may be left out: what is left is the emulated rig of the paper.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct RigFile {
+    /// First belief of the PZT displacement at which the bead is at rest, um; the loop finds the rest.
+    pub first_neutral_um: f64,
+    /// Of several beads in view, the one nearest to this position at the start is followed, um; left out: the most
+    /// prominent. The option `--near` of `track` and `run` goes before.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub near_um: Option<f64>,
+    /// What is in the channel; a script's own goes before.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub sample: Option<Sample>,
+    /// The PZT board.
+    pub actuator: ActuatorConfig,
+    /// The camera.
+    pub camera: CameraConfig,
+    /// From pixels to micrometres; left out for the emulated camera: its own.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub calibration: Option<Calibration>,
+    /// A calibration file instead of `[calibration]`, with date and uncertainty; from the folder of rig.toml.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub calibration_file: Option<PathBuf>,
+    /// Localisation; left out: a ring profile for the bead of `[emulator]`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub vision: Option<LocaliserConfig>,
+    /// A cell is followed instead of a bead; an emulated rig with `[emulator.cell]` needs no such table.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub cell: Option<CellInView>,
+    /// Tracking; left out: for a 1 um bead in water.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub tracking: Option<TrackerConfig>,
+    /// Limits of the command, within those of the board.
+    pub limits: Limits,
+    /// Times and counts of the loop.
+    pub timing: Timing,
+    /// The check before the loop is closed.
+    pub arming: ArmingConfig,
+    /// The emulated board.
+    pub board: BoardConfig,
+    /// The emulated world.
+    pub emulator: WorldConfig,
+}
+
+/// How a cell is seen, the table `[cell]`.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct CellInView {
+    /// Recording of the empty channel, as `cellpos background` writes it; from the folder of rig.toml. The emulated camera
+    /// brings its own.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub background: Option<PathBuf>,
+    /// What counts as a cell.
+    pub finder: CellConfig,
+}
+
+/// The PZT board.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "kind", rename_all = "kebab-case", deny_unknown_fields)]
+pub enum ActuatorConfig {
+    /// The firmware library in this process.
+    Emulated {},
+    /// A board behind a serial port.
+    Serial {
+        /// Device, for example /dev/ttyUSB0; a relative path is meant from the folder of the file.
+        port: String,
+        /// Baud rate; a pseudo-terminal takes any.
+        #[serde(default = "baud")]
+        baud: u32,
+        /// Without a fresh command for this long the board goes to the zero-flow displacement and holds it, ms; left
+        /// out: the board's own.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        watchdog_ms: Option<u16>,
+        /// When it has held for this long it parks, ms; left out: the board's own.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        hold_watchdog_ms: Option<u16>,
+    },
+}
+
+fn baud() -> u32 {
+    3_000_000
+}
+
+/// The camera.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "kind", rename_all = "kebab-case", deny_unknown_fields)]
+pub enum CameraConfig {
+    /// Rendered in this process.
+    Emulated {},
+    /// A camera process behind a Unix socket.
+    Socket {
+        /// Path of the socket.
+        socket: PathBuf,
+        /// Frame rate, Hz.
+        #[serde(default = "rate_hz")]
+        rate_hz: f64,
+    },
+    /// A GigE or USB3 Vision camera; needs a program built with the feature `aravis`.
+    Industrial {
+        /// IP address of a GigE camera, or the identifier of another (`cellpos camera` lists both).
+        address: String,
+        /// Frame rate, Hz.
+        #[serde(default = "rate_hz")]
+        rate_hz: f64,
+        /// Part of the sensor read out; left out: as the camera is set.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        region: Option<Region>,
+        /// Exposure, us; left out: as the camera is set.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        exposure_us: Option<f64>,
+        /// 8 or 16 bits per pixel.
+        #[serde(default = "bits")]
+        bits: u16,
+    },
+}
+
+fn bits() -> u16 {
+    8
+}
+
+fn rate_hz() -> f64 {
+    1000.0
+}
+
+impl Default for RigFile {
+    fn default() -> Self {
+        Self {
+            first_neutral_um: 20.0,
+            near_um: None,
+            sample: None,
+            actuator: ActuatorConfig::Emulated {},
+            camera: CameraConfig::Emulated {},
+            calibration: None,
+            calibration_file: None,
+            vision: None,
+            cell: None,
+            tracking: None,
+            limits: Limits {
+                low_um: 0.0,
+                high_um: 40.0,
+                slew_um_per_s: 40_000.0,
+                park_um: 20.0,
+            },
+            timing: Timing::default(),
+            arming: ArmingConfig::default(),
+            board: BoardConfig::default(),
+            emulator: WorldConfig::default(),
+        }
+    }
+}
+
+/// Whether positions come from rendered frames or are drawn with the noise that frames would give.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(feature = "clap", derive(clap::ValueEnum))]
+pub enum Frames {
+    /// Render and localise.
+    On,
+    /// Positions with equivalent noise.
+    Off,
+}
+
+/// Which clock.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(feature = "clap", derive(clap::ValueEnum))]
+pub enum ClockKind {
+    /// The machine's.
+    Real,
+    /// As fast as the machine can; deterministic.
+    Virtual,
+}
+
+impl RigFile {
+    /// Reads a rig.toml, or the defaults where there is none.
+    pub fn load(path: Option<&Path>) -> Result<Self, Failure> {
+        let Some(path) = path else {
+            return Ok(Self::default());
+        };
+        let mut file: Self = quantities::read(path)?;
+        file.validate(path)?;
+        // Paths in the file are meant from the file's own folder.
+        let folder = path.parent().unwrap_or(Path::new(""));
+        if let Some(calibration) = &mut file.calibration_file {
+            *calibration = folder.join(&*calibration);
+            if file.calibration.is_some() {
+                return Err(Failure::bad_input(
+                    format!(
+                        "{}: both calibration_file and [calibration]",
+                        path.display()
+                    ),
+                    "keep the one that holds for this camera",
+                ));
+            }
+            let read = CalibrationFile::read(calibration).map_err(Failure::input)?;
+            file.calibration = Some(read.calibration());
+        }
+        if let Some(background) = file.cell.as_mut().and_then(|cell| cell.background.as_mut()) {
+            *background = folder.join(&*background);
+        }
+        if let CameraConfig::Socket { socket, .. } = &mut file.camera {
+            *socket = folder.join(&*socket);
+        }
+        if let ActuatorConfig::Serial { port, .. } = &mut file.actuator {
+            // A relative path is a link beside the file if there is one, else a name of the system's own (COM5).
+            let beside = folder.join(&*port);
+            if beside.exists() {
+                *port = beside.display().to_string();
+            }
+        }
+        if file.emulator.model != "eq6" {
+            file.emulator.model = folder.join(&file.emulator.model).display().to_string();
+        }
+        Ok(file)
+    }
+
+    fn validate(&self, path: &Path) -> Result<(), Failure> {
+        let say = |table: &str, error: &dyn std::fmt::Display| {
+            let message = error.to_string();
+            let text = std::fs::read_to_string(path).unwrap_or_default();
+            let line = quantities::line_named(&text, table, &message)
+                .map_or_else(String::new, |line| format!(":{line}"));
+            Failure::bad_input(
+                format!("{}{line}: {message}", path.display()),
+                "docs/rig.md has every key; see the commented files under examples/, too",
+            )
+        };
+        self.limits
+            .validate()
+            .map_err(|error| say("limits", &error))?;
+        self.timing
+            .validate()
+            .map_err(|error| say("timing", &error))?;
+        self.board
+            .validate()
+            .map_err(|error| say("board", &error))?;
+        self.emulator
+            .validate()
+            .map_err(|error| say("emulator", &error))?;
+        if let Some(cell) = &self.cell {
+            CellFinder::new(1, 1, cell.finder)
+                .map_err(|error| say("cell.finder", &format!("[cell.finder] {error}")))?;
+            if matches!(self.camera, CameraConfig::Emulated {}) && self.emulator.cell.is_none() {
+                return Err(say(
+                    "",
+                    &"[cell]: the emulated rig has a bead; give it a cell with a table [emulator.cell]",
+                ));
+            }
+        }
+        if !(self.limits.low_um..=self.limits.high_um).contains(&self.first_neutral_um) {
+            return Err(say("", &format!(
+                "first_neutral_um = {}: must be within the limits, {} to {} um",
+                self.first_neutral_um, self.limits.low_um, self.limits.high_um
+            )));
+        }
+        if let Some(near_um) = self.near_um.filter(|um| !um.is_finite()) {
+            return Err(say("", &format!(
+                "near_um = {near_um}: must be a position in view, um"
+            )));
+        }
+        let problem = self.calibration.as_ref().and_then(Calibration::problem);
+        if let Some((key, value, must_be)) = problem {
+            return Err(say("calibration", &format!(
+                "[calibration] {key} = {value}: must be {must_be}"
+            )));
+        }
+        if let Some(tracking) = &self.tracking {
+            tracking
+                .check()
+                .map_err(|error| say("tracking", &format!("[tracking] {error}")))?;
+        }
+        Ok(())
+    }
+
+    /// Whether all of it is emulated in this process.
+    pub fn is_emulated(&self) -> bool {
+        matches!(
+            (&self.actuator, &self.camera),
+            (ActuatorConfig::Emulated {}, CameraConfig::Emulated {})
+        )
+    }
+
+    /// Whether a cell is followed, so that its length and area are measured.
+    pub fn follows_a_cell(&self) -> bool {
+        match self.camera {
+            CameraConfig::Emulated {} => self.emulator.cell.is_some(),
+            _ => self.cell.is_some(),
+        }
+    }
+
+    /// The file with the empty channel, if cells are seen against one.
+    pub fn background(&self) -> Option<&Path> {
+        match self.camera {
+            CameraConfig::Emulated {} => None,
+            _ => self.cell.as_ref()?.background.as_deref(),
+        }
+    }
+
+    /// Command watchdog and hold watchdog asked of the board, ms; `None` leaves the board's own.
+    pub fn watchdogs_ms(&self) -> [Option<u16>; 2] {
+        match self.actuator {
+            ActuatorConfig::Serial {
+                watchdog_ms,
+                hold_watchdog_ms,
+                ..
+            } => [watchdog_ms, hold_watchdog_ms],
+            ActuatorConfig::Emulated {} => [None, None],
+        }
+    }
+}

@@ -1,0 +1,179 @@
+//! Every key that the types of rig.toml take is in docs/rig.md, and the page names none that they do not take.
+//!
+//! What the types take they say themselves: an unknown key is refused with the list of the known ones, for each table and each
+//! `kind` of one.
+
+use cellpos_session::RigFile;
+use cellpos_session::quantities::QUANTITIES;
+use std::collections::BTreeSet;
+use std::path::Path;
+
+const UNKNOWN: &str = "no_such_key";
+
+/// Keys or variants in backquotes behind the word `expected`.
+fn expected(message: &str) -> Vec<String> {
+    let list = message.split("expected").nth(1).unwrap_or("");
+    list.split('`')
+        .skip(1)
+        .step_by(2)
+        .map(ToString::to_string)
+        .collect()
+}
+
+fn refusal(text: &str) -> String {
+    match toml::from_str::<RigFile>(text) {
+        Ok(_) => String::new(),
+        Err(error) => error.message().to_string(),
+    }
+}
+
+/// What a table needs before it looks at its keys.
+fn needs(table: &str) -> &'static str {
+    match table {
+        "camera.region" => "[camera]\nkind = \"industrial\"\naddress = \"a\"\n",
+        "vision.noise" | "vision.learning" => {
+            "[vision]\nprofile = { kind = \"ring\", edge_px = 5.0 }\nwindow_px = 21\n"
+        }
+        _ => "",
+    }
+}
+
+/// The keys of a table (empty: of none) and of all its kinds; `None` where it is no table.
+fn keys_of(table: &str) -> Option<BTreeSet<String>> {
+    let header = |kind: &str| {
+        let kind = match kind {
+            "" => String::new(),
+            kind => format!("kind = \"{kind}\"\n"),
+        };
+        match table {
+            "" => format!("{UNKNOWN} = 1\n"),
+            table => format!("{}[{table}]\n{kind}{UNKNOWN} = 1\n", needs(table)),
+        }
+    };
+    let said = refusal(&header(""));
+    if said.contains("missing field `kind`") {
+        let kinds = expected(&refusal(&header(UNKNOWN)));
+        assert!(!kinds.is_empty(), "[{table}]: no kinds");
+        let mut keys = BTreeSet::from(["kind".to_string()]);
+        for kind in kinds {
+            let said = refusal(&header(&kind));
+            keys.extend(expected(&said));
+        }
+        return Some(keys);
+    }
+    said.contains(&format!("unknown field `{UNKNOWN}`"))
+        .then(|| expected(&said).into_iter().collect())
+}
+
+/// All keys of a table and below, with their tables.
+fn all_below(table: &str, all: &mut BTreeSet<String>) {
+    for key in keys_of(table).unwrap_or_default() {
+        let whole = match table {
+            "" => key,
+            table => format!("{table}.{key}"),
+        };
+        let is_table = keys_of(&whole).is_some();
+        if is_table {
+            all_below(&whole, all);
+        }
+        // A table as such is told where it stands for a choice; its keys say the rest.
+        if !is_table || whole.contains('.') {
+            all.insert(whole);
+        }
+    }
+}
+
+fn page() -> String {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../docs/rig.md");
+    std::fs::read_to_string(path).expect("docs/rig.md")
+}
+
+/// The keys of the page's tables, from their first column, and the forms with a unit from the second.
+fn documented() -> (BTreeSet<String>, BTreeSet<(String, String)>) {
+    let page = page();
+    let (_, tables) = page
+        .split_once("## rig.toml, every key")
+        .expect("the heading");
+    let (mut keys, mut with_unit) = (BTreeSet::new(), BTreeSet::new());
+    for line in tables.lines().filter(|line| line.starts_with("| `")) {
+        let cells: Vec<&str> = line.trim_matches('|').split('|').collect();
+        let quoted = |cell: &str| -> Vec<String> {
+            cell.split('`')
+                .skip(1)
+                .step_by(2)
+                .map(ToString::to_string)
+                .collect()
+        };
+        let names = quoted(cells[0]);
+        // Tables of two columns have no form with a unit.
+        if let (3, [key], [plain]) = (cells.len(), names.as_slice(), quoted(cells[1]).as_slice()) {
+            with_unit.insert((key.clone(), plain.clone()));
+        }
+        keys.extend(names);
+    }
+    (keys, with_unit)
+}
+
+#[test]
+fn every_key_of_the_types_is_in_the_page_and_the_page_names_no_other() {
+    let mut all = BTreeSet::new();
+    all_below("", &mut all);
+    // Told in one line with its four coordinates.
+    all.retain(|key| !key.starts_with("camera.region."));
+    // The walk must have come to tables within tables and to choices.
+    for key in [
+        "emulator.faults.drop_rate",
+        "vision.profile.edge_px",
+        "camera.address",
+        "tracking.certainty",
+    ] {
+        assert!(all.contains(key), "{key} was not found among {all:#?}");
+    }
+    // The kinds of choices are told with the choice.
+    all.retain(|key| !matches!(key.as_str(), "vision.profile.kind" | "vision.noise.kind"));
+    let (documented, _) = documented();
+    let missing: Vec<_> = all.difference(&documented).collect();
+    let unknown: Vec<_> = documented.difference(&all).collect();
+    assert!(
+        missing.is_empty() && unknown.is_empty(),
+        "missing {missing:#?}, unknown {unknown:#?}"
+    );
+}
+
+#[test]
+fn every_quantity_with_a_unit_is_in_the_page() {
+    let of_code: BTreeSet<(String, String)> = (QUANTITIES.iter())
+        .map(|(table, plain, with_unit)| {
+            let whole = match *table {
+                "" => with_unit.to_string(),
+                table => format!("{table}.{with_unit}"),
+            };
+            (whole, plain.to_string())
+        })
+        .collect();
+    assert_eq!(of_code, documented().1);
+}
+
+#[test]
+fn a_value_that_cannot_be_is_named_with_its_line() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("rig.toml");
+    for (text, words) in [
+        (
+            "\n[limits]\nlow = \"0um\"\nhigh = \"40um\"\nslew_um_per_s = 1.0\npark = \"50um\"\n",
+            ["rig.toml:6", "park_um"],
+        ),
+        (
+            "[timing]\nperiod_us = 1000.0\noldest_ms = -1.0\n",
+            ["rig.toml:3", "oldest_ms"],
+        ),
+        (
+            "[emulator]\nseed = 1\n[calibration]\npixel = \"0um\"\norigin_px = 1.0\nsign = 1.0\n",
+            ["rig.toml:4", "pixel_um"],
+        ),
+    ] {
+        std::fs::write(&path, text).expect("written");
+        let error = RigFile::load(Some(&path)).expect_err("refused").text();
+        assert!(words.iter().all(|word| error.contains(word)), "{error}");
+    }
+}
