@@ -1,9 +1,11 @@
 #!/usr/bin/env bash
 # The firmware for a Cortex-M4F: installs what it takes from Debian, builds, reports its size, checks what is linked, and
-# closes the loop through it on QEMU. Nothing is installed where it is there already.
+# closes the loop through it on QEMU. The same for the RP2350 up to its size: no QEMU runs that. Nothing is installed where it
+# is there already.
 #
 #   scripts/firmware-qemu.sh          all of it
-#   scripts/firmware-qemu.sh build    the firmware only
+#   scripts/firmware-qemu.sh build    the firmware for QEMU only
+#   scripts/firmware-qemu.sh rp2350   the firmware for the RP2350 only
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
@@ -20,29 +22,49 @@ versions=$(dpkg-query -W -f '${Version}\n' rustc-web cargo-web rust-web-src | so
 [ "$(wc -l <<<"$versions")" = 1 ] || { echo "rustc-web, cargo-web and rust-web-src differ:" $versions >&2; exit 2; }
 
 # Debian's own tools, whatever else is installed. Nightly features only for -Zbuild-std.
-export CARGO_TARGET_DIR="$PWD/target/firmware"
-(
-  cd firmware/mps2-an386
-  PATH="/usr/bin:$PATH" RUSTC=/usr/bin/rustc RUSTC_BOOTSTRAP=1 \
-    RUSTFLAGS="-C linker-flavor=ld.lld -C linker=/usr/bin/ld.lld -C link-arg=-Tmemory.x -C link-arg=--gc-sections" \
-    /usr/bin/cargo build --release --locked --target thumbv7em-none-eabihf -Zbuild-std=core
-)
-firmware="$CARGO_TARGET_DIR/thumbv7em-none-eabihf/release/cellpos-firmware-mps2-an386"
-unset CARGO_TARGET_DIR
+target="$PWD/target/firmware"
+build() { # folder, triple, linker script and further arguments of the linker
+  local folder=$1 triple=$2 flags="-C linker-flavor=ld.lld -C linker=/usr/bin/ld.lld -C link-arg=--gc-sections"
+  shift 2
+  for argument in "$@"; do flags="$flags -C link-arg=$argument"; done
+  (
+    cd "firmware/$folder"
+    PATH="/usr/bin:$PATH" RUSTC=/usr/bin/rustc RUSTC_BOOTSTRAP=1 RUSTFLAGS="$flags" CARGO_TARGET_DIR="$target" \
+      /usr/bin/cargo build --release --locked --target "$triple" -Zbuild-std=core
+  )
+}
+section() { readelf -SW "$1" | awk -v name="$2" '{ sub(/^ *\[ *[0-9]+\]/, "") } $1 == name { print $5 }'; }
+sum() { # file, sections: bytes of them together
+  local file=$1 bytes=0 size
+  shift
+  for name in "$@"; do size=$(section "$file" "$name"); bytes=$((bytes + 16#${size:-0})); done
+  echo "$bytes"
+}
 
-section() { readelf -SW "$firmware" | awk -v name="$1" '{ sub(/^ *\[ *[0-9]+\]/, "") } $1 == name { print $5 }'; }
-code=0
-for name in .vectors .text .rodata .data; do size=$(section $name); code=$((code + 16#${size:-0})); done
-data=$(section .data) bss=$(section .bss)
-ram=$((16#${data:-0} + 16#${bss:-0}))
-echo "firmware: $code bytes of code and constants (at most 65536), $ram bytes of static RAM; stack and static RAM together 8192 bytes"
-[ "$code" -le 65536 ]
-# A panic path would not have linked (see src/main.rs); f64 on this core is calls to these.
-if readelf -sW "$firmware" | grep -E 'panic|__aeabi_[di]2?d|__aeabi_d(add|sub|mul|div|cmp)|(add|sub|mul|div)df3'; then
-  echo "firmware: a panic path or double precision is linked" >&2; exit 1
+rp2350() {
+  build rp2350 thumbv8m.main-none-eabihf -Tlink.x --nmagic
+  local elf="$target/thumbv8m.main-none-eabihf/release/cellpos-firmware-rp2350"
+  echo "firmware rp2350: $(sum "$elf" .vector_table .start_block .text .rodata .data) bytes of code and constants," \
+    "$(sum "$elf" .data .bss .uninit) bytes of static RAM"
+  # The boot ROM starts nothing without this block within the first 4 kB.
+  [ "$(sum "$elf" .start_block)" -gt 0 ]
+}
+[ "${1:-all}" = rp2350 ] && { rp2350; exit 0; }
+
+build mps2-an386 thumbv7em-none-eabihf -Tmemory.x
+firmware="$target/thumbv7em-none-eabihf/release/cellpos-firmware-mps2-an386"
+code=$(sum "$firmware" .vectors .text .rodata .data)
+ram=$(sum "$firmware" .data .bss)
+echo "firmware mps2-an386: $code bytes of code and constants (at most 65536), $ram bytes of static RAM (at most 8192, which" \
+  "memory.x gives to stack and data together)"
+[ "$code" -le 65536 ] && [ "$ram" -le 8192 ] || { echo "firmware: too large" >&2; exit 1; }
+# A panic path would not have linked (see src/main.rs); f64 on this core is calls to these; nor is there an allocator.
+if readelf -sW "$firmware" | grep -E 'panic|__aeabi_[di]2?d|__aeabi_d(add|sub|mul|div|cmp)|(add|sub|mul|div)df3|__rust_alloc'; then
+  echo "firmware: a panic path, double precision or an allocator is linked" >&2; exit 1
 fi
-echo "firmware: no panic path, no double precision"
+echo "firmware mps2-an386: no panic path, no double precision, no allocator"
 [ "${1:-all}" = build ] && exit 0
 
+rp2350
 cargo build --workspace --bins --locked
 CELLPOS_FIRMWARE="$firmware" cargo test -p cellpos-tests --locked --test firmware_qemu -- --ignored --nocapture --test-threads 1

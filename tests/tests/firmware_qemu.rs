@@ -42,12 +42,20 @@ impl Rig {
     fn start(watchdog_ms: u32, hold_watchdog_ms: u32) -> Self {
         let firmware = std::env::var("CELLPOS_FIRMWARE")
             .expect("CELLPOS_FIRMWARE names the firmware: run scripts/firmware-qemu.sh");
-        // Before all else on a busy machine, where that is allowed: a board does not wait for its host's other programs.
-        let mut qemu = Command::new("nice")
+        // With a priority above other programs where that is allowed (below the loop's): a board waits for nobody's builds.
+        let allowed = Command::new("chrt")
+            .args(["-r", "20", "true"])
+            .stderr(Stdio::null())
+            .status()
+            .is_ok_and(|status| status.success());
+        let before: &[&str] = if allowed {
+            &["chrt", "-r", "20", "qemu-system-arm"]
+        } else {
+            &["qemu-system-arm"]
+        };
+        let mut qemu = Command::new(before[0])
+            .args(&before[1..])
             .args([
-                "-n",
-                "-20",
-                "qemu-system-arm",
                 "-machine",
                 "mps2-an386",
                 "-display",
