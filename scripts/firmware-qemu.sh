@@ -27,10 +27,11 @@ build() { # folder, triple, linker script and further arguments of the linker
   local folder=$1 triple=$2 flags="-C linker-flavor=ld.lld -C linker=/usr/bin/ld.lld -C link-arg=--gc-sections"
   shift 2
   for argument in "$@"; do flags="$flags -C link-arg=$argument"; done
+  # The flags are the linker's alone: they go to the program, and what it is built of is built once for all.
   (
     cd "firmware/$folder"
-    PATH="/usr/bin:$PATH" RUSTC=/usr/bin/rustc RUSTC_BOOTSTRAP=1 RUSTFLAGS="$flags" CARGO_TARGET_DIR="$target" \
-      /usr/bin/cargo build --release --locked --target "$triple" -Zbuild-std=core
+    PATH="/usr/bin:$PATH" RUSTC=/usr/bin/rustc RUSTC_BOOTSTRAP=1 RUSTFLAGS="" CARGO_TARGET_DIR="$target" \
+      /usr/bin/cargo rustc --release --locked --target "$triple" -Zbuild-std=core -- $flags
   )
 }
 section() { readelf -SW "$1" | awk -v name="$2" '{ sub(/^ *\[ *[0-9]+\]/, "") } $1 == name { print $5 }'; }

@@ -38,8 +38,15 @@ fn needs(table: &str) -> &'static str {
     }
 }
 
+/// Tables that look at nothing else before they know their `kind`; below them there is one table, with needs of its own.
+const OF_A_KIND: [&str; 4] = ["actuator", "camera", "vision.profile", "vision.noise"];
+
 /// The keys of a table (empty: of none) and of all its kinds; `None` where it is no table.
 fn keys_of(table: &str) -> Option<BTreeSet<String>> {
+    let below = |of: &str| (table.strip_prefix(of)).is_some_and(|rest| rest.starts_with('.'));
+    if OF_A_KIND.iter().any(|of| below(of)) && needs(table).is_empty() {
+        return None;
+    }
     let header = |kind: &str| {
         let kind = match kind {
             "" => String::new(),
