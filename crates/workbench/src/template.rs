@@ -131,7 +131,10 @@ profile = {{ kind = \"ring\", edge_px = 5.0 }}
             )
         }
     };
-    let (ports, cameras) = (list("Serial ports", &found.ports), list("Cameras", &found.cameras));
+    let (ports, cameras) = (
+        list("Serial ports", &found.ports),
+        list("Cameras", &found.cameras),
+    );
     format!(
         "# A rig for cellpos: see docs/rig.md for every key. Read it with: cellpos rig check FILE [--connect]
 # Quantities are written with a unit (park = \"20um\"), or bare with the unit in the key (park_um = 20.0).

@@ -100,7 +100,10 @@ impl Converter {
         if !LOOKED_AT {
             return None;
         }
-        self.adc.blocking_read(&mut self.channel).ok().map(i32::from)
+        self.adc
+            .blocking_read(&mut self.channel)
+            .ok()
+            .map(i32::from)
     }
 
     /// The code that the output shows by the ADC, good to some percent of the range.
@@ -114,7 +117,9 @@ impl Converter {
         let Some(counts) = self.counts() else {
             return false;
         };
-        let expected = self.written.map(|code| i32::from(code) * COUNTS_AT_TOP / 65_535);
+        let expected = self
+            .written
+            .map(|code| i32::from(code) * COUNTS_AT_TOP / 65_535);
         let low = expected[0].min(expected[1]) - TOLERANCE;
         let high = expected[0].max(expected[1]) + TOLERANCE;
         self.wrong = if (low..=high).contains(&counts) {

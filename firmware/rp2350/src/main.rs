@@ -62,7 +62,10 @@ fn now_us() -> u64 {
 
 /// Displacement of a code, pm.
 fn displacement_pm(code: u16) -> i32 {
-    let (low, high) = (i64::from(CONFIG.limits.low_pm), i64::from(CONFIG.limits.high_pm));
+    let (low, high) = (
+        i64::from(CONFIG.limits.low_pm),
+        i64::from(CONFIG.limits.high_pm),
+    );
     (low + i64::from(code) * (high - low) / i64::from(CONFIG.highest_code())) as i32
 }
 
@@ -129,7 +132,11 @@ async fn talk(mut line: Sender<'static, Driver>) {
                 Timer::after_micros(100).await;
                 continue;
             }
-            if line.write_packet(packet.get(..length).unwrap_or(&[])).await.is_err() {
+            if line
+                .write_packet(packet.get(..length).unwrap_or(&[]))
+                .await
+                .is_err()
+            {
                 break;
             }
             // A full packet is taken for a part of a longer transfer: an empty one ends it.

@@ -264,21 +264,26 @@ impl RigFile {
             }
         }
         if !(self.limits.low_um..=self.limits.high_um).contains(&self.first_neutral_um) {
-            return Err(say("", &format!(
-                "first_neutral_um = {}: must be within the limits, {} to {} um",
-                self.first_neutral_um, self.limits.low_um, self.limits.high_um
-            )));
+            return Err(say(
+                "",
+                &format!(
+                    "first_neutral_um = {}: must be within the limits, {} to {} um",
+                    self.first_neutral_um, self.limits.low_um, self.limits.high_um
+                ),
+            ));
         }
         if let Some(near_um) = self.near_um.filter(|um| !um.is_finite()) {
-            return Err(say("", &format!(
-                "near_um = {near_um}: must be a position in view, um"
-            )));
+            return Err(say(
+                "",
+                &format!("near_um = {near_um}: must be a position in view, um"),
+            ));
         }
         let problem = self.calibration.as_ref().and_then(Calibration::problem);
         if let Some((key, value, must_be)) = problem {
-            return Err(say("calibration", &format!(
-                "[calibration] {key} = {value}: must be {must_be}"
-            )));
+            return Err(say(
+                "calibration",
+                &format!("[calibration] {key} = {value}: must be {must_be}"),
+            ));
         }
         if let Some(tracking) = &self.tracking {
             tracking

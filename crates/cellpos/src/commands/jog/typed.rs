@@ -5,8 +5,7 @@ use std::io::BufRead;
 use std::sync::mpsc::{Receiver, channel};
 
 /// What single keys do, for the person at the terminal.
-pub const HELP: &str =
-    "keys: + or up a step, - or down a step back, g goes to a displacement (5um, Enter), q parks and ends";
+pub const HELP: &str = "keys: + or up a step, - or down a step back, g goes to a displacement (5um, Enter), q parks and ends";
 
 /// Makes commands of single keys.
 #[derive(Debug, Default)]
@@ -88,9 +87,6 @@ mod tests {
         let mut keys = Keys::default();
         let typed = b"+-x\x1b[A\x1b[Bg5x\x7fum\ng1\x1b+=q\x04";
         let commands: Vec<String> = typed.iter().filter_map(|key| keys.push(*key)).collect();
-        assert_eq!(
-            commands,
-            ["+", "-", "+", "-", "5um", "+", "+", "q", "q"]
-        );
+        assert_eq!(commands, ["+", "-", "+", "-", "5um", "+", "+", "q", "q"]);
     }
 }
