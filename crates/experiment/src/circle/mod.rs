@@ -38,6 +38,8 @@ pub struct Job<'a> {
     pub rounds: usize,
     /// Folder for the records.
     pub folder: &'a Path,
+    /// Finished segments of an identification that was stopped on the way round.
+    pub resume: Option<&'a Path>,
 }
 
 /// Everything that came of it.
@@ -140,7 +142,7 @@ fn measure(job: &Job<'_>, progress: &mut (dyn FnMut(&str) + Send)) -> Result<Don
         bootstrap: 0,
         seed: rig.file.emulator.seed,
         rig: Some(rig.clone()),
-        resume: None,
+        resume: job.resume.map(Path::to_owned),
         keep_in: Some(job.folder.join("partial.json")),
     };
     identify::run(&identification, |ticks, total| {

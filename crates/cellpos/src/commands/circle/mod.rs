@@ -70,6 +70,9 @@ pub struct Args {
     /// Do not ask the operating system for real time.
     #[arg(long)]
     best_effort: bool,
+    /// Go on from the finished segments of a circle that was stopped in its identification.
+    #[arg(long, value_name = "PARTIAL")]
+    resume: Option<PathBuf>,
     /// Write the augmented model here [default: augmented.toml in a new folder of runs/].
     #[arg(long)]
     out: Option<PathBuf>,
@@ -129,6 +132,7 @@ pub fn run(args: Args) -> CommandResult {
         max_effects: args.max_effects,
         rounds: usize::from(args.rounds),
         folder: &folder,
+        resume: args.resume.as_deref(),
     };
     let circle = close(job, &mut progress)?;
     bar.finish_and_clear();
