@@ -83,7 +83,7 @@ fn wait(mut child: Child, what: &str, attacked: &mut Attacked) -> Option<Ended> 
             let _ = child.kill();
             attacked.broken.push(format!("{what}: does not end"));
         }
-        std::thread::sleep(Duration::from_millis(10));
+        std::thread::sleep(Duration::from_millis(2));
     }
     let output = child.wait_with_output().ok()?;
     let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
