@@ -93,16 +93,26 @@ fn vision_finds_place_length_and_area_of_the_cell_that_was_drawn_at_rest_and_str
 #[test]
 fn a_cell_with_rim_and_halo_keeps_its_length_and_area_through_the_focus() {
     // A dark body of 9 um, as weak as a cell's in bright field, with rim and halo of either order.
+    // A body and a halo alike in strength and sign, and one that absorbs more than its edge bends.
+    let kinds = [
+        (9.0, -0.35, 0.6),
+        (9.0, 0.35, 0.6),
+        (14.0, 0.35, 0.3),
+        (14.0, -0.35, 0.3),
+        (8.0, 1.0, 0.5),
+    ];
     for focus_um in [-2.0, -1.0, 0.0, 1.0, 2.0] {
-        for body in [-0.35, 0.35] {
+        for (rest_um, body, halo) in kinds {
             let config = WorldConfig {
                 height_px: 96,
                 start_um: -12.0,
                 cell: Some(CellConfig {
                     body,
                     focus_um,
-                    rest_um: 9.0,
-                    halo: 0.6,
+                    rest_um,
+                    halo,
+                    stretch_first: 2.0,
+                    stretch_last: 2.0,
                     ..CellConfig::default()
                 }),
                 ..config()
@@ -110,7 +120,7 @@ fn a_cell_with_rim_and_halo_keeps_its_length_and_area_through_the_focus() {
             let cell = config.cell.unwrap();
             let mut finder = finder(&config);
             let [mut n, mut length, mut area, mut z2, mut length2] = [0.0; 5];
-            watch(&config, 0.2, config.neutral_um, |_, info, pixels| {
+            watch(&config, 0.1, config.neutral_um, |_, info, pixels| {
                 let found = finder.find(&frame(&config, pixels)).unwrap();
                 assert_eq!(found.len(), 1, "{focus_um} {body}: {found:?}");
                 let c = found[0];
@@ -118,19 +128,23 @@ fn a_cell_with_rim_and_halo_keeps_its_length_and_area_through_the_focus() {
                 let own = config.pixel_um * c.extent_px((1.0, 0.0)) / cell.rest_um;
                 length += own;
                 length2 += own * own;
-                area += config.pixel_um.powi(2) * c.area_px / (0.25 * std::f64::consts::PI * 81.0);
+                area += config.pixel_um.powi(2) * c.area_px
+                    / (0.25 * std::f64::consts::PI * rest_um * rest_um);
                 let sd_um = config.pixel_um * c.var_x_px2.sqrt();
                 z2 += ((config.um_from_px(c.x_px) - info.true_um) / sd_um).powi(2);
             });
             let (length, area, z) = (length / n, area / n, (z2 / n).sqrt());
             println!(
-                "focus {focus_um} um, body {body}: length {length:.4}, area {area:.4}, error/sd {z:.2}"
+                "focus {focus_um} um, body {body}, halo {halo}, {rest_um} um: length {length:.4}, area {area:.4}, error/sd {z:.2}"
             );
             assert!(
                 (length - 1.0).abs() < 0.01,
-                "{focus_um} {body}: length {length}"
+                "{focus_um} {body} {halo}: length {length}"
             );
-            assert!((area - 1.0).abs() < 0.02, "{focus_um} {body}: area {area}");
+            assert!(
+                (area - 1.0).abs() < 0.02,
+                "{focus_um} {body} {halo}: area {area}"
+            );
             assert!((0.6..1.5).contains(&z), "{focus_um} {body}: {z}");
         }
     }

@@ -4,6 +4,7 @@ mod common;
 
 use cellpos_vision::{Cell, CellConfig, CellFinder, Frame, Pixels};
 use common::Random;
+use common::change::{Change, Picture};
 use common::stack::{Stack, masks};
 
 /// What a mask says: pixels, middle, and 4 standard deviations along the rows.
@@ -39,84 +40,51 @@ fn median(values: &[f64]) -> f64 {
     sorted[sorted.len() / 2]
 }
 
-/// What is done to the pictures before they are looked at, the background's and the cells' alike.
-#[derive(Debug, Clone, Copy)]
-enum Change {
-    None,
-    /// Bright and dark exchanged.
-    Inverted,
-    /// Grey levels times a factor, plus an offset.
-    Scaled(f64, f64),
-    /// Normal noise of this standard deviation on top.
-    Noise(f64),
-    /// Mean of 3 x 3 pixels.
-    Blurred,
-    /// Upside down.
-    Flipped,
-}
-
-impl Change {
-    fn apply(self, pixels: &[u8], width: usize, random: &mut Random) -> Vec<u8> {
-        let height = pixels.len() / width;
-        let at =
-            |x: usize, y: usize| f64::from(pixels[y.min(height - 1) * width + x.min(width - 1)]);
-        let value = |k: usize, random: &mut Random| {
-            let (x, y) = (k % width, k / width);
-            match self {
-                Change::None => at(x, y),
-                Change::Inverted => 255.0 - at(x, y),
-                Change::Scaled(factor, offset) => factor * at(x, y) + offset,
-                Change::Noise(sd) => at(x, y) + sd * random.normal(),
-                Change::Blurred => {
-                    let near = |c: usize| [c.saturating_sub(1), c, c + 1];
-                    let sum: f64 = near(y)
-                        .iter()
-                        .flat_map(|j| near(x).map(|i| at(i, *j)))
-                        .sum();
-                    sum / 9.0
-                }
-                Change::Flipped => at(x, height - 1 - y),
-            }
-        };
-        (0..pixels.len())
-            .map(|k| value(k, random).round().clamp(0.0, 255.0) as u8)
-            .collect()
-    }
-}
-
-/// The cell over each mask, and the mask.
+/// The cell over each mask, and the mask as the change leaves it.
 fn pairs(name: &str, least_mask_px: f64, change: Change) -> Vec<(usize, Option<Cell>, Mask)> {
     let stack = Stack::open(name, "frames.tif");
     let empty = Stack::open(name, "background.tif");
     let masks = masks(name);
-    let (width, height) = (stack.width, stack.height);
     let mut random = Random(11);
-    let mut finder = CellFinder::new(width, height, CellConfig::default()).unwrap();
-    fn frame(pixels: &[u8], width: usize, height: usize) -> Frame<'_> {
+    // The rows that a header is written into: no microscope blurs it.
+    let header = match (name, change) {
+        (_, Change::None) => 0,
+        ("cells-low-contrast", _) => 6 * stack.width,
+        _ => 0,
+    };
+    let mut changed = |page: &[u8], empty: bool| {
+        let page = &page[..page.len() - header];
+        let picture = change.apply(&Picture::of(page, stack.width), empty, &mut random);
+        (picture.pixels(), picture.width, picture.height)
+    };
+    let frame = |(pixels, width, height): &(Vec<u8>, usize, usize)| -> Frame<'static> {
+        // Leaked: a few pictures of a test.
+        let pixels = Pixels::Mono8(pixels.clone().leak());
         Frame {
-            width,
-            height,
-            pixels: Pixels::Mono8(pixels),
+            width: *width,
+            height: *height,
+            pixels,
         }
+    };
+    let mut finder: Option<CellFinder> = None;
+    for page in empty.pages.iter().take(16) {
+        let frame = frame(&changed(page, true));
+        let finder = finder.get_or_insert_with(|| {
+            CellFinder::new(frame.width, frame.height, CellConfig::default()).unwrap()
+        });
+        finder.take_background(&frame).unwrap();
     }
-    for page in &empty.pages {
-        let page = change.apply(page, width, &mut random);
-        finder
-            .take_background(&frame(&page, width, height))
-            .unwrap();
-    }
+    let mut finder = finder.unwrap();
     let mut pairs = Vec::new();
     for (n, (page, mask)) in stack.pages.iter().zip(&masks).enumerate() {
-        let page = change.apply(page, width, &mut random);
-        let mask = match change {
-            Change::Flipped => change.apply(mask, width, &mut random),
-            _ => mask.clone(),
-        };
-        let mask = moments(&mask, width);
-        let found = finder.find(&frame(&page, width, height)).unwrap();
+        let found = finder.find(&frame(&changed(page, false))).unwrap();
+        let mut mask = moments(mask, stack.width);
         if mask.area < least_mask_px || mask.area.is_nan() {
             continue;
         }
+        (mask.x, mask.y) = change.place((mask.x, mask.y), stack.height - header / stack.width);
+        mask.area *= change.size().powi(2);
+        mask.length *= change.size();
         let own = found
             .iter()
             .find(|c| f64::hypot(c.x_px - mask.x, c.y_px - mask.y) < 8.0);
@@ -206,7 +174,7 @@ fn other_polarity_light_noise_focus_and_side_change_the_outlines_little() {
         Change::Scaled(0.5, 0.0),
         Change::Scaled(1.0, 40.0),
         Change::Noise(3.0),
-        Change::Blurred,
+        Change::Blurred(0.8),
         Change::Flipped,
     ] {
         check("calibration-beads", change, 0.08, 0.15);
@@ -298,5 +266,72 @@ fn draw_the_outlines_of_the_documentation() {
     ] {
         let sheet = draw(name, &frames, size, scale);
         sheet.save(format!("{folder}/outlines-{name}.png")).unwrap();
+    }
+}
+
+/// What a change does to the cells of a set: shares found, median area and its extremes over the masks'.
+fn effect(name: &str, change: Change) -> (usize, usize, [f64; 3]) {
+    let pairs = pairs(name, 100.0, change);
+    let mut ratios = areas(&pairs);
+    ratios.sort_by(f64::total_cmp);
+    let of = |at: usize| ratios.get(at).copied().unwrap_or(f64::NAN);
+    let last = ratios.len().saturating_sub(1);
+    let spread = [of(ratios.len() / 2), of(0), of(last)];
+    println!(
+        "{name} {change:?}: {} of {}, {spread:.3?}",
+        ratios.len(),
+        pairs.len()
+    );
+    (ratios.len(), pairs.len(), spread)
+}
+
+#[test]
+#[cfg_attr(no_shared_data, ignore = "needs ../shared/data/cells-in-channels")]
+fn another_contrast_curve_focus_pixel_or_place_of_the_chip_changes_the_outlines_little() {
+    for change in [
+        Change::Scaled(0.5, 60.0),
+        Change::Gamma(0.5),
+        Change::Gamma(2.0),
+        Change::Noise(4.0),
+        Change::Blurred(1.6),
+        Change::Defocused(-1.0),
+        Change::Defocused(0.5),
+        Change::Resized(0.5),
+        Change::Resized(1.5),
+        Change::Drifted(0.3),
+        Change::Drifted(1.0),
+        Change::Lamp(0.9),
+        Change::Lamp(1.1),
+    ] {
+        for name in ["calibration-beads", "cells-wide-channel"] {
+            let (found, count, [middle, least, most]) = effect(name, change);
+            assert_eq!(found, count, "{name} {change:?}");
+            assert!((middle - 1.0).abs() <= 0.05, "{name} {change:?}: {middle}");
+            assert!(
+                least > 0.85 && most < 1.15,
+                "{name} {change:?}: {least} {most}"
+            );
+        }
+    }
+    // Cells of 17 px at three times the noise.
+    for change in [
+        Change::Inverted,
+        Change::Scaled(0.5, 60.0),
+        Change::Gamma(0.5),
+        Change::Gamma(2.0),
+        Change::Noise(2.0),
+        Change::Blurred(0.8),
+        Change::Defocused(-0.5),
+        Change::Defocused(0.25),
+        Change::Resized(0.7),
+        Change::Resized(1.5),
+        Change::Drifted(0.3),
+        Change::Drifted(1.0),
+        Change::Lamp(0.9),
+    ] {
+        let (found, count, [middle, least, most]) = effect("cells-low-contrast", change);
+        assert_eq!(found, count, "{change:?}");
+        assert!((middle - 1.0).abs() <= 0.1, "{change:?}: {middle}");
+        assert!(least > 0.85 && most < 1.15, "{change:?}: {least} {most}");
     }
 }

@@ -1,5 +1,7 @@
 //! The empty channel: mean of its frames, noise, and slow changes followed where no cell is.
 
+use super::drift::SAMPLES;
+
 /// Distance from a region within which the background is left alone, px.
 const CLEAR_PX: usize = 6;
 /// Pixels beside that, whose change stands for that behind the region.
@@ -13,7 +15,7 @@ pub(super) type Bounds = [usize; 4];
 /// What a frame is compared with.
 #[derive(Debug, Clone)]
 pub(super) struct Background {
-    width: usize,
+    pub width: usize,
     pub mean: Vec<f32>,
     /// Sum of squared deviations from the running mean, over all pixels.
     deviations: f64,
@@ -21,6 +23,9 @@ pub(super) struct Background {
     refreshed: usize,
     /// Changes of the row being refreshed.
     change: Vec<f32>,
+    /// Pixels at which it is steep, and frames since they were chosen first.
+    pub steep: Vec<u32>,
+    pub steep_age: u32,
 }
 
 impl Background {
@@ -32,6 +37,8 @@ impl Background {
             frames: 0,
             refreshed: 0,
             change: vec![0.0; width],
+            steep: Vec::with_capacity(SAMPLES),
+            steep_age: 0,
         }
     }
 
@@ -47,6 +54,7 @@ impl Background {
         f32: From<T>,
     {
         self.frames = self.frames.saturating_add(1);
+        self.steep_age = 0;
         let share = 1.0 / self.frames as f32;
         for (mean, p) in self.mean.iter_mut().zip(pixels) {
             let v = f32::from(*p);

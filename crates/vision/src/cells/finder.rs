@@ -10,14 +10,20 @@ use crate::outline::{Contrast, MAX_RAYS, Outline, Outliner};
 
 /// An object needs a patch of this many times the threshold.
 const SEED: f64 = 2.0;
+/// A region of this many patches is an object from this share of that on: dust is small.
+const FAINT: (f64, f64) = (6.0, 0.7);
 /// An outline less convex than this is that of two cells: two discs that touch have 0.88.
 const LEAST_SOLIDITY: f64 = 0.93;
 /// Width of a halo that belongs to the cell, px and share of the short half axis.
 const HALO: (f64, f64) = (6.0, 0.35);
+/// Largest shift of a frame that the background follows, px.
+const MOST_REFRESHED_PX: f64 = 0.5;
 /// Cells of a frame whose outlines are kept.
 const KEPT_OUTLINES: usize = 8;
 /// Contrast that counts at most, in RMS contrasts of the region.
 const MOST_CONTRAST: f32 = 3.0;
+/// Share of the region's RMS contrast that another cell beside has: fringes are weaker.
+const BESIDE: f64 = 0.6;
 /// Share of the cell's area that may lie beyond its halo.
 const MOST_BESIDE: f64 = 0.2;
 
@@ -39,6 +45,10 @@ pub struct CellFinder {
     dust: u32,
     /// Light of the last frame relative to the background's.
     light: f32,
+    /// Shift of the last frame against the background, px.
+    drift_px: (f64, f64),
+    /// A row of the shifted background.
+    row: Vec<f32>,
 }
 
 impl CellFinder {
@@ -97,6 +107,8 @@ impl CellFinder {
                 .collect(),
             dust: 0,
             light: 1.0,
+            drift_px: (0.0, 0.0),
+            row: vec![0.0; width],
         })
     }
 
@@ -155,6 +167,12 @@ impl CellFinder {
         &self.cells
     }
 
+    /// Shift of the last frame against the background, px to the right and down, for which it was made good; noughts where
+    /// there was none to speak of.
+    pub fn drift_px(&self) -> (f64, f64) {
+        self.drift_px
+    }
+
     /// Regions of the last frame that stood out but have no outline, or one smaller than a cell.
     pub fn dust(&self) -> u32 {
         self.dust
@@ -180,7 +198,8 @@ impl CellFinder {
     pub fn refresh(&mut self, frame: &Frame) {
         // In quite another light it is not the background that has changed.
         let frames = self.config.refresh_frames;
-        if frames == 0 || self.is_cluttered() || !(0.8..1.25).contains(&self.light) {
+        let moved = f64::hypot(self.drift_px.0, self.drift_px.1) > MOST_REFRESHED_PX;
+        if frames == 0 || moved || self.is_cluttered() || !(0.8..1.25).contains(&self.light) {
             return;
         }
         let bounds = &self.regions.bounds;
@@ -212,13 +231,17 @@ impl CellFinder {
     {
         let light = self.background.light_of(pixels);
         self.light = light;
-        for ((c, p), m) in self
-            .contrast
-            .iter_mut()
-            .zip(pixels)
-            .zip(&self.background.mean)
-        {
-            *c = f32::from(*p) - light * m;
+        self.background.choose_steep();
+        self.drift_px = self.background.drift_of(pixels, light);
+        if self.drift_px == (0.0, 0.0) {
+            let means = pixels.iter().zip(&self.background.mean);
+            for (c, (p, m)) in self.contrast.iter_mut().zip(means) {
+                *c = f32::from(*p) - light * m;
+            }
+        } else {
+            let buffers = (self.contrast.as_mut_slice(), self.row.as_mut_slice());
+            self.background
+                .contrast_shifted(pixels, light, self.drift_px, buffers);
         }
         let noise = self.noise_grey();
         let threshold = self.config.threshold_sigma * noise;
@@ -229,7 +252,7 @@ impl CellFinder {
         self.dust = 0;
         let size = (self.width, self.height);
         for blob in self.regions.found() {
-            if blob.peak < strong {
+            if !is_object(blob, strong) {
                 self.dust = self.dust.saturating_add(1);
                 continue;
             }
@@ -251,7 +274,8 @@ impl CellFinder {
                         if outline.area_px >= self.config.min_area_px
                             && self.cells.len() < self.cells.capacity() =>
                     {
-                        let beside = beside(&self.regions, blob, &part, &outline, strong as f32);
+                        let strong = strong.max(BESIDE * BESIDE * mean_square) as f32;
+                        let beside = beside(&self.regions, blob, &part, &outline, strong);
                         if let Some(kept) = self.outlines.get_mut(self.cells.len()) {
                             kept.clear();
                             kept.extend(self.outliner.points().iter().take(MAX_RAYS));
@@ -263,6 +287,11 @@ impl CellFinder {
             }
         }
     }
+}
+
+/// Whether a region is more than a fluctuation; `strong` is the mean square contrast that a patch of an object has.
+pub(super) fn is_object(blob: &Blob, strong: f64) -> bool {
+    blob.peak >= strong || blob.area_px >= FAINT.0 && blob.peak >= FAINT.1 * FAINT.1 * strong
 }
 
 /// Area of what stands out strongly beyond the outline and its halo, px.

@@ -5,6 +5,7 @@
 //! outline, each with its variance. Allocates only when made.
 
 mod background;
+mod drift;
 mod finder;
 mod regions;
 

@@ -5,6 +5,7 @@
 //! border of a frame (a header written into the picture, a wall) do not join what is near them.
 
 use super::background::Bounds;
+use super::finder::is_object;
 use crate::blobs::{Blob, Blobs};
 use crate::outline::Start;
 
@@ -52,8 +53,8 @@ impl Regions {
         }
     }
 
-    /// Joins the patches of a frame's contrast above `threshold` (grey levels RMS). Those with a mean square of `seed` or
-    /// more are objects: their bounds are kept.
+    /// Joins the patches of a frame's contrast above `threshold` (grey levels RMS). Bounds are kept of those that
+    /// are objects with the mean square `seed`.
     pub fn find(&mut self, contrast: &[f32], width: usize, threshold: f32, seed: f64) {
         let height = contrast.len() / width.max(1);
         self.patches.fill(0.0);
@@ -109,7 +110,11 @@ impl Regions {
         self.blobs
             .label((columns, rows), threshold * threshold, 1.0, closed);
         self.bounds.clear();
-        let strong = self.blobs.found().iter().filter(|blob| blob.peak >= seed);
+        let strong = self
+            .blobs
+            .found()
+            .iter()
+            .filter(|blob| is_object(blob, seed));
         for blob in strong.take(self.bounds.capacity()) {
             self.bounds.push(blob.bounds.map(|b| b as usize * PATCH));
         }

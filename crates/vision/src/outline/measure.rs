@@ -2,6 +2,9 @@
 
 use super::{BORDER_PX, Contrast, Outline, Outliner, Profile};
 
+/// Share of a disc's second moments that an outline's have at least.
+const LEAST_MOMENT: f64 = 0.05;
+
 impl Outliner {
     /// Radius of the disc with the contour's area, px.
     pub(super) fn radius_px(&self) -> f64 {
@@ -48,6 +51,13 @@ impl Outliner {
             bows * (sxy / area - mx * my),
             bows * (syy / area - my * my),
         ];
+        // The contour of something hardly larger than a pixel may cross itself.
+        let least = LEAST_MOMENT * area / (4.0 * core::f64::consts::PI);
+        if moments[0].min(moments[2]) < least
+            || moments[0] * moments[2] - moments[1] * moments[1] < least * least
+        {
+            return None;
+        }
         let area_px = bows * area;
         let (x_px, y_px) = (x0 + mx, y0 + my);
         let information = profile.information();

@@ -8,6 +8,7 @@
 //! is the usual half-height. Allocates only when made.
 
 mod contour;
+mod edge;
 mod measure;
 mod normals;
 
@@ -33,6 +34,8 @@ const BEND: f32 = 0.08;
 const OUTSIDE: f32 = 0.12;
 /// Depth over which the rim's contrast is taken, px.
 const RIM_PX: f64 = 4.0;
+/// Distance of the edge from the contour from which on the profiles are taken again, px.
+const FAR_PX: f64 = 1.0;
 /// Contour points that lie this near to the border are cut by it, px.
 const BORDER_PX: f64 = 1.5;
 
@@ -124,6 +127,7 @@ pub(crate) struct Outliner {
     amplitudes: Vec<f64>,
     hull: Vec<(f64, f64)>,
     sorted: Vec<(f64, f64)>,
+    shapes: edge::Shapes,
 }
 
 impl Outliner {
@@ -141,6 +145,7 @@ impl Outliner {
             amplitudes: vec![1.0; MAX_RAYS],
             hull: Vec::with_capacity(2 * MAX_RAYS + 2),
             sorted: Vec::with_capacity(MAX_RAYS),
+            shapes: edge::Shapes::new(),
         }
     }
 
@@ -162,13 +167,26 @@ impl Outliner {
             profile = Some(self.align(half, polarity)?);
             self.shift_points();
         }
-        let profile = profile?;
-        let (level_px, rim, halo) = profile.edge(self.radius_px())?;
-        self.find_normals();
-        for (p, n) in self.points.iter_mut().zip(&self.normals) {
-            *p = (p.0 + level_px * n.0, p.1 + level_px * n.1);
+        let mut profile = profile?;
+        let mut edge = profile.edge(self.radius_px(), &self.shapes)?;
+        if edge.at_px.abs() > FAR_PX {
+            // Laid on a lobe beside the edge: from near the edge it is seen sharper.
+            self.find_normals();
+            self.shift_outwards(edge.at_px);
+            self.find_normals();
+            self.sample(contrast, half);
+            profile = self.align(half, polarity)?;
+            self.shift_points();
+            edge = profile.edge(self.radius_px(), &self.shapes)?;
         }
+        self.find_normals();
+        self.shift_outwards(edge.at_px);
         let residual = self.residual(&profile).max(noise * noise);
-        self.measure(contrast, &profile, residual, (rim, halo))
+        self.measure(
+            contrast,
+            &profile,
+            residual,
+            (edge.rim_grey, edge.halo_grey),
+        )
     }
 }

@@ -1,6 +1,6 @@
 //! Profiles along the contour's normals, and the mean one that they are fitted by.
 
-use super::{Contrast, FINE_PX, MAX_FINE, Outliner, RIM_PX};
+use super::{Contrast, FINE_PX, MAX_FINE, Outliner};
 use nalgebra::{Matrix3, Vector3};
 
 /// Values along a normal, from inside to outside.
@@ -8,9 +8,6 @@ pub(super) type Values = [f32; 2 * MAX_FINE + 1];
 
 /// Farthest that a normal's profile is shifted in one pass, px.
 const MOST_SHIFT_PX: f64 = 1.0;
-/// An object hardly larger than its edge is wide loses contrast to the blur, so that half of what is left lies outside of
-/// it: from this ratio of width to radius on, share of the rim's contrast per ratio, and at most. Set by instruments' masks.
-const BLURRED: (f64, f64, f64) = (0.25, 2.8, 0.3);
 /// Share of the pixels' noise variance that is left in a shift: values between the pixels are means of them.
 const INTERPOLATED: f64 = 0.75;
 /// Amplitudes of a normal's profile that count as the same rim, relative to the mean one.
@@ -19,12 +16,12 @@ const AMPLITUDES: (f64, f64) = (0.25, 4.0);
 /// The mean profile along the normals.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Profile {
-    values: [f64; 2 * MAX_FINE + 1],
+    pub(super) values: [f64; 2 * MAX_FINE + 1],
     slopes: [f64; 2 * MAX_FINE + 1],
     /// Steps on one side.
-    half: usize,
+    pub(super) half: usize,
     /// 1 for a dark rim: outside is brighter.
-    polarity: f64,
+    pub(super) polarity: f64,
 }
 
 impl Outliner {
@@ -112,6 +109,13 @@ impl Outliner {
         }
     }
 
+    /// Moves all points along their normals.
+    pub(super) fn shift_outwards(&mut self, shift_px: f64) {
+        for (p, n) in self.points.iter_mut().zip(&self.normals) {
+            *p = (p.0 + shift_px * n.0, p.1 + shift_px * n.1);
+        }
+    }
+
     /// Mean square of what the mean profile leaves of the normals' profiles, grey^2.
     pub(super) fn residual(&self, profile: &Profile) -> f64 {
         let (low, high) = profile.window();
@@ -146,12 +150,12 @@ impl Profile {
     }
 
     /// Step of the rim's largest contrast, inside the middle.
-    fn rim(&self) -> usize {
+    pub(super) fn rim(&self) -> usize {
         self.extreme(0..=self.half, -self.polarity)
     }
 
     /// Step of the halo's largest contrast, outside the middle.
-    fn halo(&self) -> usize {
+    pub(super) fn halo(&self) -> usize {
         self.extreme(self.half..=2 * self.half, self.polarity)
     }
 
@@ -185,58 +189,6 @@ impl Profile {
         let amplitude = solution[0].clamp(AMPLITUDES.0, AMPLITUDES.1);
         let shift = (solution[1] / amplitude).clamp(-MOST_SHIFT_PX, MOST_SHIFT_PX);
         shift.is_finite().then_some((shift, amplitude))
-    }
-
-    /// Where the mean profile passes half of the rim's contrast (px outside the middle), or near there beside a halo, the
-    /// rim's contrast, and the halo's; `radius_px` is that of the object.
-    pub(super) fn edge(&self, radius_px: f64) -> Option<(f64, f64, f64)> {
-        let body = -self.polarity;
-        let (rim_at, halo_at) = (self.rim(), self.halo());
-        let value = |k: usize| body * self.values[k];
-        let most = (0..=self.half).map(value).fold(0.0, f64::max);
-        let swing = value(rim_at) - value(halo_at);
-        if swing <= 0.0 {
-            return None;
-        }
-        // The rim begins where the soft edge ends.
-        let begin = (rim_at..=halo_at)
-            .rev()
-            .find(|k| value(*k) >= 0.9 * most)
-            .unwrap_or(rim_at);
-        let end = begin.saturating_sub((RIM_PX / FINE_PX) as usize);
-        // Between the mean and that weighted with the values themselves: a rim thinner than this depth counts in part.
-        let (first, second) = (end..=begin)
-            .map(|k| value(k).max(0.0))
-            .fold((0.0, 0.0), |(first, second), v| (first + v, second + v * v));
-        // Out of focus the body's own contrast may hide the rim: then the halo is all that shows of the edge.
-        let rim = if first > 0.0 {
-            0.5 * (second / first + first / (begin - end + 1) as f64)
-        } else {
-            0.0
-        };
-        let halo = (-value(halo_at)).max(0.0);
-        let ratio = halo / rim.max(1e-9);
-        let width_px = (halo_at - rim_at) as f64 * FINE_PX;
-        let blurred = (BLURRED.1 * (width_px / radius_px - BLURRED.0)).clamp(0.0, BLURRED.2);
-        // A halo as strong as the rim is the other lobe of one phase edge, in whose middle half of the body's own contrast is.
-        let depth = (self.half / 4).max(1);
-        let body_grey = (0..depth).map(value).sum::<f64>() / depth as f64;
-        let phase = ratio.min(1.0);
-        let level =
-            0.5 * (rim + phase * (body_grey - rim)) + rim * blurred * (2.0 * ratio).min(1.0);
-        let crossing = (rim_at..halo_at)
-            .filter(|k| value(*k) >= level && value(k + 1) < level)
-            .min_by_key(|k| k.abs_diff(self.half));
-        let at = match crossing {
-            Some(k) => k as f64 + (value(k) - level) / (value(k) - value(k + 1)),
-            None => self.half as f64,
-        };
-        let contrast = rim.max(0.5 * swing);
-        Some((
-            (at - self.half as f64) * FINE_PX,
-            body * contrast,
-            -body * halo,
-        ))
     }
 
     /// Information on a shift per px of contour, for pixels with noise of variance 1, amplitude and offset unknown.

@@ -1,6 +1,7 @@
 //! Frames and bounds straight from the profiles' formulas, not from the tables that the fit reads.
 #![allow(dead_code)]
 
+pub mod change;
 pub mod stack;
 
 use cellpos_vision::{Frame, Pixels, RadialProfile};

@@ -1,0 +1,230 @@
+//! A frame that is shifted against the background: a chip or a stage that has crept or shakes.
+//!
+//! Walls are the strongest edges in a channel; a third of a pixel makes lines of them that join what is near. The shift is
+//! found by least squares at the background's own slopes, objects left out, and the background is moved by it.
+
+use super::background::Background;
+
+/// Largest shift that is made good, px.
+const MOST_PX: f64 = 3.0;
+/// Shifts below this are none, px; and below so many standard deviations.
+const LEAST: (f64, f64) = (0.03, 4.0);
+/// At most this many pixels serve for the estimate.
+pub(super) const SAMPLES: usize = 384;
+/// Frames after which these are chosen anew.
+const CHOSEN_EVERY: u32 = 4096;
+const PASSES: usize = 5;
+/// A shift is believed when it leaves at most this share of the squares, each counted up to so many standard deviations.
+const BETTER: f64 = 0.9;
+const MOST_OFF: f64 = 20.0;
+
+/// Sums of the least squares.
+#[derive(Debug, Clone, Copy, Default)]
+struct Sums {
+    xx: f64,
+    xy: f64,
+    yy: f64,
+    rx: f64,
+    ry: f64,
+    /// Sum of what pixels differ by, and their number.
+    off: f64,
+    n: f64,
+    /// Sum of squares, large ones clipped.
+    clipped: f64,
+}
+
+/// Weights of four pixels in a row for a place between the middle two, by a cubic through them (Catmull-Rom).
+fn cubic(t: f32) -> [f32; 4] {
+    let (t2, t3) = (t * t, t * t * t);
+    [
+        0.5 * (-t3 + 2.0 * t2 - t),
+        0.5 * (3.0 * t3 - 5.0 * t2 + 2.0),
+        0.5 * (-3.0 * t3 + 4.0 * t2 + t),
+        0.5 * (t3 - t2),
+    ]
+}
+
+impl Background {
+    fn height(&self) -> usize {
+        self.mean.len() / self.width.max(1)
+    }
+
+    /// Between the pixels, linearly; `None` near the border.
+    fn between(&self, x: f64, y: f64) -> Option<f64> {
+        let (x, y) = (x as f32, y as f32);
+        if !(x >= 0.0 && y >= 0.0) {
+            return None;
+        }
+        let (i, j) = (x as usize, y as usize);
+        let (u, v) = (x - i as f32, y - j as f32);
+        let k = j * self.width + i;
+        let [a, b] = *self.mean.get(k..k + 2)? else {
+            return None;
+        };
+        let [c, d] = *self.mean.get(k + self.width..k + self.width + 2)? else {
+            return None;
+        };
+        let (upper, lower) = (a + u * (b - a), c + u * (d - c));
+        Some(f64::from(upper + v * (lower - upper)))
+    }
+
+    /// Chooses the pixels at which the background is steep, now and then.
+    pub fn choose_steep(&mut self) {
+        self.steep_age = self.steep_age.wrapping_add(1);
+        if self.steep_age % CHOSEN_EVERY != 1 {
+            return;
+        }
+        let (width, height) = (self.width, self.height());
+        let least = 2.0 * self.noise_grey() as f32;
+        self.steep.clear();
+        if width < 16 || height < 16 {
+            return;
+        }
+        let steep = |k: &usize| {
+            let at = |k: usize| self.mean.get(k).copied().unwrap_or(0.0);
+            let (x, y) = (k % width, k / width);
+            let within = (4..width - 5).contains(&x) && (4..height - 5).contains(&y);
+            let across = (at(k + 1) - at(k.saturating_sub(1))).abs();
+            within && across.max((at(k + width) - at(k.saturating_sub(width))).abs()) > least
+        };
+        let count = (0..self.mean.len()).filter(steep).count();
+        let every = count.div_ceil(SAMPLES).max(1);
+        let chosen = (0..self.mean.len()).filter(steep).step_by(every);
+        self.steep.extend(chosen.take(SAMPLES).map(|k| k as u32));
+    }
+
+    /// Shift of the frame against the background, px to the right and down; noughts where there is none to speak of.
+    pub fn drift_of<T: Copy>(&self, pixels: &[T], light: f32) -> (f64, f64)
+    where
+        f32: From<T>,
+    {
+        let noise = self.noise_grey();
+        let (mut at, mut sd, mut limit) = ((0.0_f64, 0.0_f64), (0.0, 0.0), f64::INFINITY);
+        let mut unmoved = None;
+        for _ in 0..PASSES {
+            let sums = self.slopes(pixels, f64::from(light), at, limit);
+            // A shift by a pixel is not expected: without slopes along a direction there is none.
+            let least = noise * noise;
+            let (xx, xy, yy) = (sums.xx + least, sums.xy, sums.yy + least);
+            let (rx, ry) = (sums.rx - at.0 * least, sums.ry - at.1 * least);
+            let determinant = xx * yy - xy * xy;
+            if determinant <= 0.0 || sums.n < 1.0 {
+                return (0.0, 0.0);
+            }
+            let most = |v: f64| v.clamp(-1.0, 1.0);
+            let step = (
+                most((rx * yy - ry * xy) / determinant),
+                most((ry * xx - rx * xy) / determinant),
+            );
+            if unmoved.is_none() && f64::hypot(step.0, step.1) < 0.5 * LEAST.0 {
+                return (0.0, 0.0);
+            }
+            at = (at.0 + step.0, at.1 + step.1);
+            if !(at.0.abs() <= MOST_PX && at.1.abs() <= MOST_PX) {
+                return (0.0, 0.0);
+            }
+            let spread = 1.25 * sums.off / sums.n;
+            let variance = spread.max(noise).powi(2);
+            sd = (
+                (variance * yy / determinant).sqrt(),
+                (variance * xx / determinant).sqrt(),
+            );
+            limit = (8.0 * spread).max(4.0 * noise);
+            unmoved.get_or_insert(sums.clipped);
+        }
+        let moved = self.slopes(pixels, f64::from(light), at, limit).clipped;
+        if unmoved.is_none_or(|unmoved| moved > BETTER * unmoved) {
+            return (0.0, 0.0);
+        }
+        let told = |d: f64, sd: f64| {
+            if d.abs() > LEAST.0.max(LEAST.1 * sd) {
+                d
+            } else {
+                0.0
+            }
+        };
+        (told(at.0, sd.0), told(at.1, sd.1))
+    }
+
+    /// Sums over pixels where the background is steep, it being moved by `at` px; those that differ by more than `limit`
+    /// are left out.
+    fn slopes<T: Copy>(&self, pixels: &[T], light: f64, at: (f64, f64), limit: f64) -> Sums
+    where
+        f32: From<T>,
+    {
+        let noise = self.noise_grey();
+        let mut sums = Sums::default();
+        for k in self.steep.iter().map(|k| *k as usize) {
+            let (i, j) = (k % self.width, k / self.width);
+            let Some(p) = pixels.get(k) else { continue };
+            let (x, y) = (i as f64 - at.0, j as f64 - at.1);
+            let (Some(own), Some(left), Some(right), Some(above), Some(below)) = (
+                self.between(x, y),
+                self.between(x - 0.5, y),
+                self.between(x + 0.5, y),
+                self.between(x, y - 0.5),
+                self.between(x, y + 0.5),
+            ) else {
+                continue;
+            };
+            // A smooth slope cannot tell a shift from light that has changed.
+            let steep = |slope: f64| if slope.abs() > noise { slope } else { 0.0 };
+            let (gx, gy) = (light * steep(right - left), light * steep(below - above));
+            if gx == 0.0 && gy == 0.0 {
+                continue;
+            }
+            let off = f64::from(f32::from(*p)) - light * own;
+            sums.clipped += off.abs().min(MOST_OFF * noise).powi(2);
+            if off.abs() > limit {
+                continue;
+            }
+            sums.xx += gx * gx;
+            sums.xy += gx * gy;
+            sums.yy += gy * gy;
+            sums.rx -= gx * off;
+            sums.ry -= gy * off;
+            sums.off += off.abs();
+            sums.n += 1.0;
+        }
+        sums
+    }
+
+    /// What a frame shifted by `shift` px differs by from the background at `light`, into `contrast`.
+    pub fn contrast_shifted<T: Copy>(
+        &self,
+        pixels: &[T],
+        light: f32,
+        shift: (f64, f64),
+        (contrast, row): (&mut [f32], &mut [f32]),
+    ) where
+        f32: From<T>,
+    {
+        let (width, height) = (self.width, self.height());
+        let split = |d: f64| {
+            let whole = (-d).floor();
+            (whole as isize, cubic((-d - whole) as f32))
+        };
+        let ((ox, wx), (oy, wy)) = (split(shift.0), split(shift.1));
+        let inside = |k: isize, len: usize| k.clamp(0, len as isize - 1) as usize;
+        let rows = contrast
+            .chunks_exact_mut(width)
+            .zip(pixels.chunks_exact(width));
+        for (y, (out, frame)) in rows.enumerate() {
+            row.fill(0.0);
+            for (n, w) in (-1..).zip(wy) {
+                let from = inside(y as isize + oy + n, height) * width;
+                let means = self.mean.get(from..from + width).unwrap_or(&[]);
+                for (sum, m) in row.iter_mut().zip(means) {
+                    *sum += w * m;
+                }
+            }
+            for (x, (c, p)) in out.iter_mut().zip(frame).enumerate() {
+                let mut m = 0.0;
+                for (n, w) in (-1..).zip(wx) {
+                    m += w * row[inside(x as isize + ox + n, width)];
+                }
+                *c = f32::from(*p) - light * m;
+            }
+        }
+    }
+}

@@ -1,0 +1,267 @@
+//! Where in the mean profile the edge is.
+//!
+//! Beside a halo it is told by the rim: half of the rim's contrast, or, the more the halo is like the rim (both lobes of one
+//! phase edge), half of the body's. Without a halo of the other sign the profile may still have two lobes, with the outer one
+//! of the body's own sign (a body that absorbs, on the other side of the focus): then a blurred step with the two lobes of a
+//! phase edge is fitted, and the edge is that step's middle.
+
+use super::normals::Profile;
+use super::{FINE_PX, RIM_PX};
+use nalgebra::{Matrix3, Vector3};
+
+/// An object hardly larger than its edge is wide loses contrast to the blur, so that half of what is left lies outside of
+/// it: from this ratio of the edge's width to the radius on, share of the rim's contrast per ratio, and at most.
+const BLURRED: (f64, f64, f64) = (0.15, 1.8, 0.25);
+/// The edge's width is taken between these shares of the swing from halo to rim, and counted so many times.
+const WIDTH: (f64, f64, f64) = (0.15, 0.85, 1.4);
+/// A halo weaker than this share of the rim is none.
+const NO_HALO: f64 = 0.06;
+/// Share of the profile (RMS) that a fitted phase edge may leave.
+const MOST_LEFT: f64 = 0.12;
+/// Lobes, as a share of the step, from which on the fitted edge counts, and from which on it alone counts.
+const LOBES: (f64, f64) = (0.1, 0.18);
+/// Share of what a step without lobes leaves that one with lobes may leave.
+const LESS_LEFT: f64 = 0.3;
+/// Farthest that the middle of a phase edge is looked for, px.
+const REACH_PX: f64 = 4.5;
+/// Widths of the blur that are tried, px.
+const BLURS_PX: [f64; 5] = [0.7, 1.0, 1.4, 2.0, 2.8];
+/// Rounds in which the best of them is refined.
+const ROUNDS: usize = 4;
+
+/// The edge of a mean profile.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Edge {
+    /// Distance outside the profile's middle, px.
+    pub at_px: f64,
+    /// Contrast of the rim, signed.
+    pub rim_grey: f64,
+    /// Contrast of the halo, signed; 0 without one.
+    pub halo_grey: f64,
+}
+
+/// Blurred step, phase lobes and rim over the distance from the edge in widths of the blur.
+#[derive(Debug, Clone)]
+pub(super) struct Shapes {
+    values: Vec<[f64; 3]>,
+}
+
+impl Shapes {
+    const PER_WIDTH: f64 = 32.0;
+    const REACH: f64 = 6.0;
+    /// Distance of a rim from the edge.
+    const RIM: f64 = 3.0;
+
+    pub(super) fn new() -> Self {
+        let value = |k: usize| {
+            let u = k as f64 / Self::PER_WIDTH - Self::REACH;
+            // The logistic function with the slope of a Gaussian's integral; the Gaussian's slope, extremes of 1 and -1.
+            let step = 1.0 / (1.0 + (1.702 * u).exp());
+            let rim = (-0.5 * (u + Self::RIM).powi(2)).exp();
+            [step, -u * (0.5 - 0.5 * u * u).exp(), rim]
+        };
+        let count = (2.0 * Self::REACH * Self::PER_WIDTH) as usize + 1;
+        Shapes {
+            values: (0..count).map(value).collect(),
+        }
+    }
+
+    #[inline(always)]
+    fn at(&self, widths: f64) -> [f64; 3] {
+        let last = self.values.len() - 1;
+        let k = (widths + Self::REACH) * Self::PER_WIDTH + 0.5;
+        let k = (k.max(0.0) as usize).min(last);
+        self.values.get(k).copied().unwrap_or([0.0; 3])
+    }
+}
+
+impl Profile {
+    /// The edge of an object of the radius `radius_px`; `None` where inside and outside are alike.
+    pub(super) fn edge(&self, radius_px: f64, shapes: &Shapes) -> Option<Edge> {
+        let body = -self.polarity;
+        let (rim_at, halo_at) = (self.rim(), self.halo());
+        let value = |k: usize| body * self.values[k];
+        let most = (0..=self.half).map(value).fold(0.0, f64::max);
+        let swing = value(rim_at) - value(halo_at);
+        if swing <= 0.0 {
+            return None;
+        }
+        // The rim begins where the soft edge ends.
+        let begin = (rim_at..=halo_at)
+            .rev()
+            .find(|k| value(*k) >= 0.9 * most)
+            .unwrap_or(rim_at);
+        let end = begin.saturating_sub((RIM_PX / FINE_PX) as usize);
+        // Between the mean and that weighted with the values themselves: a rim thinner than this depth counts in part.
+        let (first, second) = (end..=begin)
+            .map(|k| value(k).max(0.0))
+            .fold((0.0, 0.0), |(first, second), v| (first + v, second + v * v));
+        // Out of focus the body's own contrast may hide the rim: then the halo is all that shows of the edge.
+        let rim = if first > 0.0 {
+            0.5 * (second / first + first / (begin - end + 1) as f64)
+        } else {
+            0.0
+        };
+        let halo = (-value(halo_at)).max(0.0);
+        let ratio = halo / rim.max(1e-9);
+        let found = |at_px| Edge {
+            at_px,
+            rim_grey: body * rim.max(0.5 * swing),
+            halo_grey: -body * halo,
+        };
+        let fitted = (ratio < NO_HALO).then(|| self.phase_edge(shapes)).flatten();
+        let crossing = |level: f64| {
+            let passes = |k: &usize| value(*k) >= level && value(k + 1) < level;
+            let k = (rim_at..halo_at)
+                .filter(passes)
+                .min_by_key(|k| k.abs_diff(self.half))?;
+            Some(k as f64 + (value(k) - level) / (value(k) - value(k + 1)))
+        };
+        let (low, high, times) = WIDTH;
+        let share = |s: f64| value(halo_at) + s * swing;
+        let width_px = match (crossing(share(high)), crossing(share(low))) {
+            (Some(inner), Some(outer)) => times * (outer - inner) * FINE_PX,
+            _ => (halo_at - rim_at) as f64 * FINE_PX,
+        };
+        let blurred = (BLURRED.1 * (width_px / radius_px - BLURRED.0)).clamp(0.0, BLURRED.2);
+        // A halo as strong as the rim is the other lobe of one phase edge, in whose middle half of the body's own contrast is.
+        let depth = (self.half / 4).max(1);
+        let body_grey = (0..depth).map(value).sum::<f64>() / depth as f64;
+        let phase = ratio.min(1.0);
+        let level =
+            0.5 * (rim + phase * (body_grey - rim)) + rim * blurred * (2.0 * ratio).min(1.0);
+        let at = crossing(level).unwrap_or(self.half as f64);
+        let at_px = (at - self.half as f64) * FINE_PX;
+        let (fitted_px, weight) = fitted.unwrap_or((at_px, 0.0));
+        Some(found(at_px + weight * (fitted_px - at_px)))
+    }
+
+    /// Middle of the blurred step that fits the profile with an outer lobe of the step's own sign, px outside the profile's
+    /// middle, and how far that is to be believed, 0 to 1; `None` where none does.
+    fn phase_edge(&self, shapes: &Shapes) -> Option<(f64, f64)> {
+        let values = self.values.iter().take(2 * self.half + 1);
+        let power: f64 = values.map(|v| v * v).sum();
+        let best = self.fitted(shapes, With::Lobes);
+        if best.left > MOST_LEFT * MOST_LEFT * power {
+            return None;
+        }
+        let weight = ((-best.lobes / best.step - LOBES.0) / (LOBES.1 - LOBES.0)).clamp(0.0, 1.0);
+        if weight <= 0.0 || weight.is_nan() {
+            return None;
+        }
+        // A rim inside would be taken for a part of the inner lobe.
+        let best = self.refined(shapes, best, With::LobesAndRim);
+        let plain = self.fitted(shapes, With::Rim);
+        (best.left < LESS_LEFT * plain.left).then_some((best.at_px, weight))
+    }
+
+    /// The best fit of a blurred step with what is said, wherever it lies.
+    fn fitted(&self, shapes: &Shapes, with: With) -> PhaseEdge {
+        let reach_px = REACH_PX.min(0.5 * self.half as f64 * FINE_PX + 1.0);
+        let places = (reach_px / FINE_PX) as i32;
+        let mut best = PhaseEdge::NONE;
+        for blur_px in BLURS_PX {
+            for place in -places..=places {
+                let at_px = f64::from(place) * FINE_PX;
+                best = best.or(self.phase_edge_at(shapes, (at_px, blur_px), 2, with));
+            }
+        }
+        self.refined(shapes, best, with)
+    }
+
+    /// The best within a step of the coarse search, by ever smaller steps.
+    fn refined(&self, shapes: &Shapes, start: PhaseEdge, with: With) -> PhaseEdge {
+        let mut best = self.phase_edge_at(shapes, (start.at_px, start.blur_px), 1, with);
+        let (mut step_px, mut factor) = (0.5 * FINE_PX, 1.19_f64);
+        for _ in 0..ROUNDS {
+            let (at_px, blur_px) = (best.at_px, best.blur_px);
+            for i in -1..=1 {
+                for blur_px in [blur_px / factor, blur_px, blur_px * factor] {
+                    let at = (at_px + f64::from(i) * step_px, blur_px);
+                    best = best.or(self.phase_edge_at(shapes, at, 1, with));
+                }
+            }
+            (step_px, factor) = (0.5 * step_px, factor.sqrt());
+        }
+        best
+    }
+
+    /// A step at a place with lobes or a rim or both, fitted to every `stride`th value.
+    fn phase_edge_at(
+        &self,
+        shapes: &Shapes,
+        (at_px, blur_px): (f64, f64),
+        stride: usize,
+        with: With,
+    ) -> PhaseEdge {
+        let (mut normal, mut right, mut power) = (Matrix3::zeros(), Vector3::zeros(), 0.0);
+        let scale = 1.0 / blur_px;
+        let first = (-(self.half as f64) * FINE_PX - at_px) * scale;
+        let values = self.values.iter().take(2 * self.half + 1);
+        for (k, v) in values.enumerate().step_by(stride) {
+            let g = Vector3::from(shapes.at(first + k as f64 * FINE_PX * scale));
+            normal += g * g.transpose();
+            right += g * *v;
+            power += v * v;
+        }
+        let left_out = match with {
+            With::Lobes => Some((2, Vector3::z())),
+            With::Rim => Some((1, Vector3::y())),
+            With::LobesAndRim => None,
+        };
+        if let Some((k, unit)) = left_out {
+            normal.set_row(k, &unit.transpose());
+            normal.set_column(k, &unit);
+            right[k] = 0.0;
+        }
+        let Some(cholesky) = normal.cholesky() else {
+            return PhaseEdge::NONE;
+        };
+        let mut fitted = cholesky.solve(&right);
+        if matches!(with, With::Rim) && fitted[2] * fitted[0] < 0.0 {
+            // A rim is stronger than the body, not weaker.
+            fitted = Vector3::new(right[0] / normal[(0, 0)], 0.0, 0.0);
+        }
+        PhaseEdge {
+            left: stride as f64 * (power - fitted.dot(&right)),
+            at_px,
+            blur_px,
+            step: fitted[0],
+            lobes: fitted[1],
+        }
+    }
+}
+
+/// What is fitted beside the step.
+#[derive(Debug, Clone, Copy)]
+enum With {
+    Lobes,
+    Rim,
+    LobesAndRim,
+}
+
+/// A blurred step with phase lobes.
+#[derive(Debug, Clone, Copy)]
+struct PhaseEdge {
+    /// What it leaves of the profile, grey^2.
+    left: f64,
+    at_px: f64,
+    blur_px: f64,
+    /// Contrast of the body and of the lobes, grey levels.
+    step: f64,
+    lobes: f64,
+}
+
+impl PhaseEdge {
+    const NONE: PhaseEdge = PhaseEdge {
+        left: f64::INFINITY,
+        at_px: 0.0,
+        blur_px: 1.0,
+        step: 0.0,
+        lobes: 0.0,
+    };
+
+    fn or(self, other: PhaseEdge) -> PhaseEdge {
+        if other.left < self.left { other } else { self }
+    }
+}

@@ -1,0 +1,179 @@
+//! Recorded pictures as another microscope, camera or focus would have given them.
+
+use super::Random;
+
+/// A picture of real grey levels.
+#[derive(Debug, Clone)]
+pub struct Picture {
+    pub width: usize,
+    pub height: usize,
+    pub grey: Vec<f64>,
+}
+
+/// What is done to the pictures before they are looked at, the background's and the cells' alike.
+#[derive(Debug, Clone, Copy)]
+pub enum Change {
+    None,
+    /// Bright and dark exchanged.
+    Inverted,
+    /// Grey levels times a factor, plus an offset.
+    Scaled(f64, f64),
+    /// Grey levels over the middle of the range, to a power.
+    Gamma(f64),
+    /// Normal noise of this standard deviation on top.
+    Noise(f64),
+    /// Gaussian of this standard deviation, px.
+    Blurred(f64),
+    /// Another focus: so many times the Laplacian of the slightly blurred picture on top (transport of intensity).
+    Defocused(f64),
+    /// Upside down.
+    Flipped,
+    /// Other pixels: this many times as large a picture.
+    Resized(f64),
+    /// The frames, not the background, moved by so many px to the right and half as many down.
+    Drifted(f64),
+    /// The frames, not the background, brighter by this factor.
+    Lamp(f64),
+}
+
+impl Change {
+    /// Factor of lengths.
+    pub fn size(self) -> f64 {
+        match self {
+            Change::Resized(factor) => factor,
+            _ => 1.0,
+        }
+    }
+
+    /// The changed picture; `empty` for one of the background.
+    pub fn apply(self, picture: &Picture, empty: bool, random: &mut Random) -> Picture {
+        let p = picture;
+        let each = |f: &mut dyn FnMut(f64) -> f64| Picture {
+            grey: p.grey.iter().map(|v| f(*v)).collect(),
+            ..p.clone()
+        };
+        match self {
+            Change::None => p.clone(),
+            Change::Inverted => each(&mut |v| 255.0 - v),
+            Change::Scaled(factor, offset) => each(&mut |v| factor * v + offset),
+            Change::Gamma(power) => each(&mut |v| 128.0 * (v.max(0.0) / 128.0).powf(power)),
+            Change::Noise(sd) => each(&mut |v| v + sd * random.normal()),
+            Change::Blurred(sd) => p.blurred(sd),
+            Change::Defocused(factor) => {
+                let soft = p.blurred(0.7);
+                let at = |x: usize, y: usize| soft.at(x as f64, y as f64);
+                let laplacian = |k: usize| {
+                    let (x, y) = (k % p.width, k / p.width);
+                    let (r, d) = ((x + 1).min(p.width - 1), (y + 1).min(p.height - 1));
+                    at(x.saturating_sub(1), y) + at(r, y) + at(x, y.saturating_sub(1)) + at(x, d)
+                        - 4.0 * at(x, y)
+                };
+                let grey = (0..p.grey.len()).map(|k| p.grey[k] + factor * laplacian(k));
+                Picture {
+                    grey: grey.collect(),
+                    ..p.clone()
+                }
+            }
+            Change::Flipped => p.sampled(p.width, p.height, |x, y| (x, p.height as f64 - 1.0 - y)),
+            Change::Resized(factor) => {
+                // What is made smaller is blurred by its larger pixels first.
+                let soft = if factor < 1.0 {
+                    p.blurred(0.3 / factor)
+                } else {
+                    p.clone()
+                };
+                let side = |n: usize| (n as f64 * factor) as usize;
+                soft.sampled(side(p.width), side(p.height), |x, y| {
+                    ((x + 0.5) / factor - 0.5, (y + 0.5) / factor - 0.5)
+                })
+            }
+            Change::Drifted(_) if empty => p.clone(),
+            Change::Drifted(px) => p.sampled(p.width, p.height, |x, y| (x - px, y - 0.5 * px)),
+            Change::Lamp(_) if empty => p.clone(),
+            Change::Lamp(factor) => each(&mut |v| factor * v),
+        }
+    }
+
+    /// Where a place of the picture comes to lie.
+    pub fn place(self, (x, y): (f64, f64), height: usize) -> (f64, f64) {
+        match self {
+            Change::Flipped => (x, height as f64 - 1.0 - y),
+            Change::Resized(f) => ((x + 0.5) * f - 0.5, (y + 0.5) * f - 0.5),
+            Change::Drifted(px) => (x + px, y + 0.5 * px),
+            _ => (x, y),
+        }
+    }
+}
+
+impl Picture {
+    pub fn of(pixels: &[u8], width: usize) -> Self {
+        Picture {
+            width,
+            height: pixels.len() / width,
+            grey: pixels.iter().map(|v| f64::from(*v)).collect(),
+        }
+    }
+
+    /// As a camera of 8 bits gives it.
+    pub fn pixels(&self) -> Vec<u8> {
+        let grey = self.grey.iter();
+        grey.map(|v| v.round().clamp(0.0, 255.0) as u8).collect()
+    }
+
+    /// Between the pixels, linearly; the border goes on beyond it.
+    fn at(&self, x: f64, y: f64) -> f64 {
+        let (x, y) = (
+            x.clamp(0.0, self.width as f64 - 1.0),
+            y.clamp(0.0, self.height as f64 - 1.0),
+        );
+        let (i, j) = (x as usize, y as usize);
+        let (r, d) = ((i + 1).min(self.width - 1), (j + 1).min(self.height - 1));
+        let (u, v) = (x.fract(), y.fract());
+        let get = |i: usize, j: usize| self.grey[j * self.width + i];
+        let (upper, lower) = (
+            get(i, j) + u * (get(r, j) - get(i, j)),
+            get(i, d) + u * (get(r, d) - get(i, d)),
+        );
+        upper + v * (lower - upper)
+    }
+
+    fn sampled(
+        &self,
+        width: usize,
+        height: usize,
+        from: impl Fn(f64, f64) -> (f64, f64),
+    ) -> Picture {
+        let value = |k: usize| {
+            let (x, y) = from((k % width) as f64, (k / width) as f64);
+            self.at(x, y)
+        };
+        Picture {
+            width,
+            height,
+            grey: (0..width * height).map(value).collect(),
+        }
+    }
+
+    fn blurred(&self, sd: f64) -> Picture {
+        let reach = (4.0 * sd).ceil() as i32;
+        let kernel: Vec<f64> = (-reach..=reach)
+            .map(|k| (-0.5 * (f64::from(k) / sd).powi(2)).exp())
+            .collect();
+        let sum: f64 = kernel.iter().sum();
+        let along = |p: &Picture, (dx, dy): (f64, f64)| {
+            let value = |k: usize| {
+                let (x, y) = ((k % p.width) as f64, (k / p.width) as f64);
+                let near = kernel.iter().zip(-reach..).map(|(w, j)| {
+                    let j = f64::from(j);
+                    w * p.at(x + j * dx, y + j * dy)
+                });
+                near.sum::<f64>() / sum
+            };
+            Picture {
+                grey: (0..p.grey.len()).map(value).collect(),
+                ..p.clone()
+            }
+        };
+        along(&along(self, (1.0, 0.0)), (0.0, 1.0))
+    }
+}
