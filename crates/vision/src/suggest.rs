@@ -27,6 +27,8 @@ const FEWEST: usize = 5;
 const REACH: f64 = 1.6;
 /// Share of the profile's extreme below which there is nothing left of it.
 const FADED: f64 = 0.03;
+/// Weight of a level profile at the centre, pixels.
+const LEVEL: f64 = 0.5;
 /// Margin on the residual that the beads themselves have.
 const TOLERANCE_MARGIN: f64 = 2.0;
 /// Largest tolerance suggested.
@@ -253,7 +255,9 @@ fn commonest(objects: &[Object]) -> Vec<Object> {
 /// Mean contrast over the distance from the objects' centres, at [`TABLE_KNOTS`] distances up to `reach_px`.
 fn mean_profile(flats: &[Flat], beads: &[Object], reach_px: f64) -> Option<[f64; TABLE_KNOTS]> {
     let knot_px = reach_px / (TABLE_KNOTS - 1) as f64;
-    let (mut sums, mut weights) = ([0.0; TABLE_KNOTS], [0.0; TABLE_KNOTS]);
+    // Least squares of straight lines between the knots: a mean of what is near a knot would blunt the profile.
+    let (mut own, mut next, mut right) =
+        ([0.0; TABLE_KNOTS], [0.0; TABLE_KNOTS], [0.0; TABLE_KNOTS]);
     for bead in beads {
         let Some(flat) = flats.get(bead.frame) else {
             continue;
@@ -266,23 +270,45 @@ fn mean_profile(flats: &[Flat], beads: &[Object], reach_px: f64) -> Option<[f64;
                 let (k, t) = (u as usize, u.fract());
                 if k + 1 < TABLE_KNOTS {
                     let v = f64::from(flat.values[y * flat.width + x]);
-                    sums[k] += (1.0 - t) * v;
-                    weights[k] += 1.0 - t;
-                    sums[k + 1] += t * v;
-                    weights[k + 1] += t;
+                    own[k] += (1.0 - t) * (1.0 - t);
+                    own[k + 1] += t * t;
+                    next[k] += t * (1.0 - t);
+                    right[k] += (1.0 - t) * v;
+                    right[k + 1] += t * v;
                 }
             }
         }
     }
-    let mut profile = [f64::NAN; TABLE_KNOTS];
-    for ((p, s), w) in profile.iter_mut().zip(&sums).zip(&weights) {
-        if *w > 0.5 {
-            *p = s / w;
+    lines(own, next, right)
+}
+
+/// Solves the symmetric system with `own` on the diagonal and `next` beside it; `None` where nothing is known of a knot.
+fn lines(
+    mut own: [f64; TABLE_KNOTS],
+    next: [f64; TABLE_KNOTS],
+    mut right: [f64; TABLE_KNOTS],
+) -> Option<[f64; TABLE_KNOTS]> {
+    // Few pixels lie at the centre itself: there the profile is level.
+    own[0] += LEVEL;
+    own[1] += LEVEL;
+    let mut beside = next;
+    beside[0] -= LEVEL;
+    for k in 1..TABLE_KNOTS {
+        if own[k - 1] <= 0.0 {
+            return None;
         }
+        let factor = beside[k - 1] / own[k - 1];
+        own[k] -= factor * beside[k - 1];
+        right[k] -= factor * right[k - 1];
     }
-    // Few pixels lie at the centre itself.
-    if profile[0].is_nan() {
-        profile[0] = profile[1];
+    let mut profile = [0.0; TABLE_KNOTS];
+    for k in (0..TABLE_KNOTS).rev() {
+        let after = if k + 1 < TABLE_KNOTS {
+            beside[k] * profile[k + 1]
+        } else {
+            0.0
+        };
+        profile[k] = (right[k] - after) / own[k];
     }
     profile.iter().all(|v| v.is_finite()).then_some(profile)
 }

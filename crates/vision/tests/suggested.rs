@@ -3,8 +3,8 @@
 mod common;
 
 use cellpos_vision::{
-    Decision, Detector, Frame, LinkConfig, Localiser, LocaliserConfig, ManyTracker, ProfileSpec,
-    RingProfile, Suggestion, Tracker, TrackerConfig, Verdict,
+    Decision, Detector, Frame, LinkConfig, Localiser, LocaliserConfig, ManyTracker, Pixels,
+    ProfileSpec, RingProfile, Suggestion, Tracker, TrackerConfig, Verdict,
     suggest::{refine, suggest},
 };
 use common::stack::Stack;
@@ -86,6 +86,52 @@ fn five_measured_beads_are_all_seen_in_the_loops_tracker_with_suggested_settings
     assert_eq!(seen, 250);
 }
 
+/// Middle of a circle through the steepest places along rays, those far off it left out (a bacterium sticks to the rim).
+fn rim_circle(frame: &Frame, (mut x, mut y): (f64, f64)) -> (f64, f64) {
+    let Pixels::Mono8(pixels) = frame.pixels else {
+        panic!("8 bits");
+    };
+    let at = |x: f64, y: f64| {
+        let (i, j) = (x as usize, y as usize);
+        let (u, v) = (x.fract(), y.fract());
+        let get = |i: usize, j: usize| {
+            f64::from(pixels[(j.min(frame.height - 1)) * frame.width + i.min(frame.width - 1)])
+        };
+        (1.0 - v) * ((1.0 - u) * get(i, j) + u * get(i + 1, j))
+            + v * ((1.0 - u) * get(i, j + 1) + u * get(i + 1, j + 1))
+    };
+    for _ in 0..5 {
+        let mut rims: Vec<(f64, f64, f64)> = (0..180)
+            .map(|k| {
+                let (sin, cos) = (f64::from(k) * std::f64::consts::TAU / 180.0).sin_cos();
+                let value = |r: f64| at(x + r * cos, y + r * sin);
+                let slope = |r: f64| (value(r + 1.5) - value(r - 1.5)).abs();
+                let radii = (0..120).map(|n| 15.0 + 0.25 * f64::from(n));
+                let r = radii
+                    .max_by(|a, b| slope(*a).total_cmp(&slope(*b)))
+                    .unwrap();
+                // Between the steps, by a parabola.
+                let (a, b, c) = (slope(r - 0.25), slope(r), slope(r + 0.25));
+                let bend = a - 2.0 * b + c;
+                let r = if bend < 0.0 {
+                    r + 0.125 * (a - c) / bend
+                } else {
+                    r
+                };
+                (r, cos, sin)
+            })
+            .collect();
+        let mut radii: Vec<f64> = rims.iter().map(|r| r.0).collect();
+        radii.sort_by(f64::total_cmp);
+        let middle = radii[90];
+        rims.retain(|(r, _, _)| (r - middle).abs() < 3.0);
+        let n = rims.len() as f64;
+        x += 2.0 / n * rims.iter().map(|(r, c, _)| (r - middle) * c).sum::<f64>();
+        y += 2.0 / n * rims.iter().map(|(r, _, s)| (r - middle) * s).sum::<f64>();
+    }
+    (x, y)
+}
+
 #[test]
 #[cfg_attr(no_shared_data, ignore = "needs ../shared/data/trapped-bead")]
 fn a_trapped_bead_is_seen_in_every_frame_and_its_error_is_what_the_covariance_says() {
@@ -122,6 +168,29 @@ fn a_trapped_bead_is_seen_in_every_frame_and_its_error_is_what_the_covariance_sa
     let sd = fixes.iter().map(|f| f.var_x_px2.sqrt()).sum::<f64>() / 100.0;
     println!("RMS from the authors' track: {x:.3} {y:.3} px; stated standard deviation {sd:.4} px");
     assert!(x < 0.32 && y < 0.32, "{x} {y}");
+    // Three tracks whose errors do not depend on each other: each one's variance out of the three differences.
+    let rims: Vec<(f64, f64)> = stack
+        .frames()
+        .zip(&fixes)
+        .map(|(frame, fix)| rim_circle(&frame, (fix.x_px, fix.y_px)))
+        .collect();
+    let split =
+        |own: &dyn Fn(usize) -> f64, two: &dyn Fn(usize) -> f64, three: &dyn Fn(usize) -> f64| {
+            let a = off(&|k| own(k) - two(k)).powi(2);
+            let b = off(&|k| own(k) - three(k)).powi(2);
+            let c = off(&|k| two(k) - three(k)).powi(2);
+            (0.5 * (a + b - c), 0.5 * (a + c - b), 0.5 * (b + c - a))
+        };
+    let along = split(&|k| fixes[k].x_px, &|k| rims[k].0, &|k| authors[k].0);
+    let down = split(&|k| fixes[k].y_px, &|k| rims[k].1, &|k| authors[k].1);
+    let stated2 = fixes.iter().map(|f| f.var_x_px2 + f.var_y_px2).sum::<f64>() / 100.0;
+    let ratio = ((along.0 + down.0).max(0.0) / stated2).sqrt();
+    println!(
+        "variances of template, circle and authors, px^2: {along:.4?} {down:.4?}; error over stated {ratio:.2}"
+    );
+    // The other two must be told apart from nothing, or the split says nothing.
+    assert!(along.2 > 0.0 && down.2 > 0.0, "{along:?} {down:?}");
+    assert!(ratio <= 2.0, "{ratio}");
 }
 
 #[test]

@@ -127,7 +127,9 @@ fn ratio(spoilt: Spoilt) -> (f64, f64) {
     config.template_tolerance = 0.3;
     let mut localiser = Localiser::new(config).unwrap();
     let (mut error2, mut stated2) = (0.0, 0.0);
-    let count = 250;
+    // So many frames show the ratio to 3 %; where it is near a bound, to 1 %, so that chance does not decide.
+    let near_bound = matches!(spoilt, Spoilt::Blurred(1.5) | Spoilt::Saturated(160.0));
+    let count = if near_bound { 2500 } else { 300 };
     for _ in 0..count {
         let at = (31.0 + random.uniform(), 31.0 + random.uniform());
         let pixels = picture(spoilt, at, &mut random);
@@ -169,7 +171,7 @@ fn the_error_is_what_the_covariance_says_on_pictures_that_the_template_does_not_
         println!("{case:?}: error over stated {ratio:.2}, RMS {rms:.4} px");
     }
     for (case, (ratio, _)) in found {
-        assert!((0.78..1.5).contains(&ratio), "{case:?}: {ratio}");
+        assert!((0.8..1.5).contains(&ratio), "{case:?}: {ratio}");
     }
 }
 
