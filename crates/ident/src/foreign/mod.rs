@@ -4,115 +4,19 @@
 //! hold are listed, because no linear model of any order makes them. Broadband inputs go through averaged spectra.
 //! Not for naming what makes the harmonics: that is reconciliation.
 
+mod result;
+
+pub use result::{Basis, Excitation, ForeignResult, ForeignSettings, Harmonic, LineResult};
+
 use crate::error::IdentError;
 use crate::feedback::{by_reference, feedback};
 use crate::frequency_response::{DetectionLine, FrequencyPoint, Segment, Settings, measure};
 use crate::rational::{RationalFit, fit_orders};
-use crate::sampled::{Hold, Sampling};
+use crate::sampled::Sampling;
 use crate::spectral::{find_lines, residual_of, welch};
 use crate::stats::student_t_quantile;
 use crate::tone_fit::{ToneFit, Whitening};
 use nalgebra::Complex;
-
-/// What to do with a foreign record.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct ForeignSettings {
-    /// Rows per second.
-    pub rate_hz: f64,
-    /// Highest order of a linear model tried.
-    pub most_order: usize,
-    /// What the input does between rows.
-    pub hold: Hold,
-}
-
-/// How the record was excited.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Excitation {
-    /// By a few sines.
-    Lines,
-    /// By something broadband: averaged spectra.
-    Broadband,
-}
-
-/// Gain and lag at one driven line.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct LineResult {
-    /// Frequency, Hz.
-    pub frequency_hz: f64,
-    /// Coherent gain, output unit per input unit.
-    pub gain: f64,
-    /// Half-width of its 95 % interval.
-    pub gain_ci95: f64,
-    /// Phase, deg (negative: the output lags).
-    pub phase_deg: f64,
-    /// Half-width of its 95 % interval, deg.
-    pub phase_ci95_deg: f64,
-    /// The phase as a time by which the output lags, ms.
-    pub lag_ms: f64,
-    /// Coherence.
-    pub coherence: f64,
-}
-
-/// A harmonic in the output.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Harmonic {
-    /// The driven line, Hz.
-    pub fundamental_hz: f64,
-    /// Which harmonic.
-    pub number: usize,
-    /// Amplitude over that of the fundamental, in the output.
-    pub output_ratio: f64,
-    /// The same in the input.
-    pub input_ratio: f64,
-    /// Probability that noise alone shows this much.
-    pub p_value: f64,
-    /// Whether it is beyond both noise and anything that the input holds.
-    pub unexplained: bool,
-}
-
-/// What the response rests on.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Basis {
-    /// The input went its own way: output over input.
-    Input,
-    /// The record is of a loop: both were projected on its reference, which the noise is not in (joint input-output).
-    Reference,
-    /// The record is of a loop, and nothing from outside moved it: the response cannot be told from the controller.
-    Nothing {
-        /// Part of the input's change that the output's past predicts; None where it was not tested.
-        share: Option<f64>,
-    },
-}
-
-/// What a foreign record says.
-#[derive(Debug, Clone, PartialEq)]
-pub struct ForeignResult {
-    /// What the response rests on.
-    pub basis: Basis,
-    /// How it was excited.
-    pub excitation: Excitation,
-    /// Driven lines, strongest first (empty for broadband).
-    pub lines: Vec<LineResult>,
-    /// The response, in order of frequency.
-    pub points: Vec<FrequencyPoint>,
-    /// Harmonics looked for.
-    pub harmonics: Vec<Harmonic>,
-    /// Linear models fitted, best AICc first.
-    pub models: Vec<RationalFit>,
-    /// RMS of the output about its own offset and ramp, output unit.
-    pub output_rms: f64,
-    /// RMS of what the coherent linear response at the lines leaves (lines only), output unit.
-    pub linear_residual_rms: Option<f64>,
-    /// How the record was sampled.
-    pub sampling: Sampling,
-}
-
-impl ForeignResult {
-    /// Whether harmonics remain that no linear model explains.
-    pub fn harmonics_remain(&self) -> bool {
-        self.harmonics.iter().any(|h| h.unexplained)
-    }
-}
 
 fn rms(x: &[f64]) -> f64 {
     (x.iter().map(|v| v * v).sum::<f64>() / x.len().max(1) as f64).sqrt()
@@ -150,12 +54,8 @@ pub fn identify(
             needed: 64,
         });
     }
-    let period_s = 1.0 / settings.rate_hz;
-    let sampling = Sampling {
-        period_s,
-        exposure_s: 0.0,
-        hold: settings.hold,
-    };
+    let sampling = settings.sampling();
+    let period_s = sampling.period_s;
     let input_rms = rms(&residual_of(input, period_s, &[]));
     let size = input.iter().fold(0.0f64, |a, v| a.max(v.abs()));
     if input_rms.is_nan() || input_rms <= 1e-9 * size.max(f64::MIN_POSITIVE) {
@@ -212,24 +112,10 @@ pub fn identify_in_loop(
             needed: 512,
         });
     }
-    let period_s = 1.0 / settings.rate_hz;
-    let sampling = Sampling {
-        period_s,
-        exposure_s: 0.0,
-        hold: settings.hold,
-    };
+    let sampling = settings.sampling();
+    let period_s = sampling.period_s;
     let output_rms = rms(&residual_of(&bridged(output), period_s, &[]));
-    let nothing = |share| ForeignResult {
-        basis: Basis::Nothing { share },
-        excitation: Excitation::Broadband,
-        lines: Vec::new(),
-        points: Vec::new(),
-        harmonics: Vec::new(),
-        models: Vec::new(),
-        output_rms,
-        linear_residual_rms: None,
-        sampling,
-    };
+    let nothing = |share| ForeignResult::nothing(sampling, output_rms, share);
     let moved = rms(&residual_of(reference, period_s, &[]));
     if moved.is_nan() || moved < 1e-6 {
         return Ok(nothing(feedback(input, output).map(|found| found.share)));
@@ -283,22 +169,9 @@ pub fn nothing_to_tell(
     settings: &ForeignSettings,
     share: Option<f64>,
 ) -> ForeignResult {
-    let period_s = 1.0 / settings.rate_hz;
-    ForeignResult {
-        basis: Basis::Nothing { share },
-        excitation: Excitation::Broadband,
-        lines: Vec::new(),
-        points: Vec::new(),
-        harmonics: Vec::new(),
-        models: Vec::new(),
-        output_rms: rms(&residual_of(&bridged(output), period_s, &[])),
-        linear_residual_rms: None,
-        sampling: Sampling {
-            period_s,
-            exposure_s: 0.0,
-            hold: settings.hold,
-        },
-    }
+    let sampling = settings.sampling();
+    let output_rms = rms(&residual_of(&bridged(output), sampling.period_s, &[]));
+    ForeignResult::nothing(sampling, output_rms, share)
 }
 
 /// A series with its gaps bridged by straight lines: a frame that was lost now and then must not take a whole stretch of
