@@ -204,6 +204,7 @@ pub fn kill_the_program(folder: &Path, kills: u64, chance: &mut Chance) -> Attac
 fn box_rig(folder: &Path) {
     let text = "[actuator]\nkind = \"serial\"\nport = \"pzt\"\nwatchdog_ms = 500\n\
          [camera]\nkind = \"socket\"\nsocket = \"camera.sock\"\n\
+         [vision]\nwindow_px = 21\n[vision.profile]\nkind = \"ring\"\nedge_px = 5.0\n\
          [calibration]\npixel_um = 0.1\norigin_px = 127.5\nsign = 1.0\n\
          [limits]\nlow_um = 0.0\nhigh_um = 40.0\nslew_um_per_s = 20000.0\npark_um = 12.0\n\
          [timing]\noldest_ms = 60.0\nfaults_in_a_row = 200\nbudget_us = 1000.0\n";

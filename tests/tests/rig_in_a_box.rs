@@ -54,6 +54,14 @@ fn seconds(rows: &[BoxRow], state: &str) -> f64 {
     (last - first) as f64 * 1e-9
 }
 
+/// Longest time without a row from a moment on, ms: the box itself stood still.
+fn longest_gap_ms(rows: &[BoxRow], from_ns: i64) -> f64 {
+    rows.windows(2)
+        .filter(|pair| pair[1].monotonic_ns > from_ns)
+        .map(|pair| (pair[1].monotonic_ns - pair[0].monotonic_ns) as f64 * 1e-6)
+        .fold(0.0, f64::max)
+}
+
 /// Largest speed of the PZT between two rows, um/s; rows closer than the log's own period are left out.
 fn fastest_um_per_s(rows: &[BoxRow]) -> f64 {
     rows.windows(2)
@@ -78,7 +86,7 @@ fn a_bead_is_held_over_a_pseudo_terminal_and_a_socket_and_the_pzt_is_parked_afte
     .output()
     .unwrap();
     // The board is told to park when the run is over; give it the time of the ramp.
-    std::thread::sleep(Duration::from_millis(100));
+    std::thread::sleep(Duration::from_millis(500));
     let rows = rig.finish();
     let text = stdout(&output);
     assert!(
@@ -90,7 +98,10 @@ fn a_bead_is_held_over_a_pseudo_terminal_and_a_socket_and_the_pzt_is_parked_afte
     assert_eq!(r["state"], "running", "{r}");
     // Five seconds of the clock: a tick for each period, made or skipped.
     let periods = r["ticks"].as_u64().unwrap() + r["skipped"].as_u64().unwrap();
-    assert!(periods.abs_diff(5000) <= 1, "{r}");
+    let by_the_clock = (r["duration_s"].as_f64().unwrap() * 1e3).round() as u64;
+    assert!(periods.abs_diff(by_the_clock) <= 1, "{r}");
+    // The tick that ends the run may itself be late.
+    assert!((5000..6000).contains(&periods), "{r}");
     let rms = r["rms_measured_nm"].as_f64().unwrap();
     println!(
         "{rms:.1} nm RMS against a bound of {} nm",
@@ -139,8 +150,8 @@ fn kill_and_look() -> bool {
     let rows = rig.finish();
 
     // First the zero-flow displacement is held, where the bead all but stops; within both watchdog times plus the ramp
-    // the PZT stands at park. A stall of the machine may come on top.
-    let stall_ms = 100.0;
+    // the PZT stands at park. A stall of the box, which its log shows as a gap, may come on top.
+    let stall_ms = 20.0 + longest_gap_ms(&rows, killed_ns);
     let before = rows
         .iter()
         .rfind(|row| row.monotonic_ns < killed_ns)
@@ -185,7 +196,8 @@ fn kill_and_look() -> bool {
     let recorded_s = ticks.last().unwrap().time_ns as f64 * 1e-9;
     let lived_s = seconds(&rows, "Running");
     println!("{recorded_s:.2} s of {lived_s:.2} s read back");
-    assert!(lived_s - recorded_s < 1.0 + stall_ms * 1e-3);
+    // A batch of half a second waits for the disk, and one behind it.
+    assert!(lived_s - recorded_s < 1.5 + stall_ms * 1e-3);
     assert!(
         run.events()
             .unwrap()
@@ -215,7 +227,7 @@ fn an_interrupt_freezes_the_bead_and_then_parks() {
     let pid = rustix::process::Pid::from_child(&child);
     rustix::process::kill_process(pid, rustix::process::Signal::INT).unwrap();
     let output = child.wait_with_output().unwrap();
-    std::thread::sleep(Duration::from_millis(100));
+    std::thread::sleep(Duration::from_millis(500));
     let rows = rig.finish();
     let r: Value = serde_json::from_str(&stdout(&output)).unwrap();
     assert_eq!(r["end"], "operator", "{r}");

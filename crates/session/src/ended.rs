@@ -1,6 +1,7 @@
 //! How a run ended, in sentences: what was seen, what was expected, what to do.
 
 use crate::failure::{Failure, describe};
+use crate::words::safe_reason;
 use cellpos_rig::{ActuatorFault as Fault, ActuatorState as State};
 use cellpos_runtime::life::{EventKind, Refusal, SafeReason};
 use cellpos_runtime::recorder::RecorderFault;
@@ -256,88 +257,86 @@ impl Clues {
         let last = |value: Option<f64>, unit: &str| {
             value.map_or_else(String::new, |v| format!(", the last {v:.1} {unit}"))
         };
-        match reason {
-            Some(SafeReason::BeadLost) => sentences(
-                format!("frames came, and no bead in them, for {lost_ms:.0} ms"),
+        let Some(reason) = reason else {
+            return sentences(
+                "the loop went safe, and gave no reason",
+                "a loop that runs",
+                "see events.jsonl in the run folder",
+            );
+        };
+        let (figures, wanted, to_do) = match reason {
+            SafeReason::Board => return self.board(),
+            SafeReason::BeadLost => sentences(
+                format!(" ({lost_ms:.0} ms)"),
                 "the bead in view",
                 "bring a bead into view and start again; a faster flow than the loop can hold shows as drift before the loss",
             ),
-            Some(SafeReason::CameraLost) => sentences(
-                format!("no frame came for {lost_ms:.0} ms"),
+            SafeReason::CameraLost => sentences(
+                format!(" ({lost_ms:.0} ms)"),
                 format!("one every {} ms", timing.period_us * 1e-3),
                 "check cable, power and trigger of the camera (cellpos camera shows what it delivers)",
             ),
-            Some(SafeReason::StaleFrames) => sentences(
-                format!(
-                    "more than {in_a_row} frames in a row were old or repeated{}",
-                    last(self.stale_ms, "ms old")
-                ),
+            SafeReason::StaleFrames => sentences(
+                format!(" (more than {in_a_row}{})", last(self.stale_ms, "ms old")),
                 format!("new frames not older than {} ms", timing.oldest_ms),
                 "check the camera's buffers and [timing] camera_delay_ms (cellpos camera shows ages)",
             ),
-            Some(SafeReason::LateTicks) => sentences(
+            SafeReason::LateTicks => sentences(
                 format!(
-                    "more than {in_a_row} commands in a row were late{}",
+                    " (more than {in_a_row}{})",
                     last(self.late_us, "us after the tick began")
                 ),
                 format!("within {} us", timing.budget_us),
                 "run cellpos doctor; close other programs, or choose a lighter controller",
             ),
-            Some(SafeReason::Board) => self.board(),
-            Some(SafeReason::LinkLost) => sentences(
-                format!(
-                    "nothing was heard of the board for {} ms",
-                    timing.board_silence_ms
-                ),
+            SafeReason::LinkLost => sentences(
+                format!(" ({} ms)", timing.board_silence_ms),
                 "a status every 10 ms",
                 "check cable and power of the board; its own watchdog has parked the PZT",
             ),
-            Some(SafeReason::NotFinite) => sentences(
-                "the controller's output was not a number",
+            SafeReason::NotFinite => sentences(
+                "",
                 "a displacement, um",
                 "keep the run folder: this is a defect, or a controller.toml that no loop can use",
             ),
-            Some(SafeReason::VisionSlow) => sentences(
-                match self.vision_ms {
-                    Some([vision_ms, period_ms]) => format!(
-                        "vision takes {vision_ms:.1} ms a frame of {period_ms:.1}: frames piled up and grew old"
-                    ),
-                    None => "vision takes longer for a frame than the camera: frames piled up and grew old".to_string(),
-                },
+            SafeReason::VisionSlow => sentences(
+                self.vision_ms
+                    .map_or_else(String::new, |[vision_ms, period_ms]| {
+                        format!(" (it takes {vision_ms:.1} ms a frame of {period_ms:.1})")
+                    }),
                 format!("new frames not older than {} ms", timing.oldest_ms),
                 "choose a smaller region (origin_px, width_px), a lower frame rate, or a faster machine",
             ),
-            Some(SafeReason::Stalled) => sentences(
-                "the loop stood still for more than a second",
+            SafeReason::Stalled => sentences(
+                " (more than a second)",
                 format!("a tick every {} ms", timing.period_us * 1e-3),
                 "see that nothing suspends this program or this machine; the board has stopped the bead by itself",
             ),
-            Some(SafeReason::BoardForeign) => sentences(
-                "another host has armed the board during the run",
+            SafeReason::BoardForeign => sentences(
+                "",
                 "a board in this run's session alone",
                 "see that one program uses the board, then start again",
             ),
-            Some(SafeReason::BoardNotObeying) => sentences(
-                "the board talked, and obeyed no command for 100 ms",
+            SafeReason::BoardNotObeying => sentences(
+                " (for 100 ms)",
                 "a sequence number that moves with the commands",
                 "check the line to the board for damaged frames, and its baud rate",
             ),
-            Some(SafeReason::BoardNotFollowing) => sentences(
-                "for 100 ms the board's output stood where no command was",
+            SafeReason::BoardNotFollowing => sentences(
+                " (for 100 ms)",
                 "an output within 0.2 um of the commands of the last 30 ms",
                 "check the limits of the board against [limits], and its amplifier",
             ),
-            Some(SafeReason::ActuatorRingFull) => sentences(
-                format!("more than {in_a_row} commands in a row could not be handed to the board"),
+            SafeReason::ActuatorRingFull => sentences(
+                format!(" (more than {in_a_row} in a row)"),
                 "a line that takes a command every tick",
                 "check the baud rate and the line of the board",
             ),
-            other => sentences(
-                format!("the loop went safe ({})", word(&other)),
-                "a loop that runs",
-                "see events.jsonl in the run folder",
-            ),
-        }
+            SafeReason::Operator | SafeReason::ArmingRefused | SafeReason::Unrecorded => {
+                sentences("", "a loop that runs", "see events.jsonl in the run folder")
+            }
+        };
+        (format!("{}{figures}", safe_reason(reason)), wanted, to_do)
     }
 
     fn board(&self) -> Sentences {
@@ -366,13 +365,6 @@ impl Clues {
             "a board that follows this run's commands alone",
             "see that one program uses the board, and that this one is not suspended; then start again",
         )
-    }
-}
-
-fn word(reason: &Option<SafeReason>) -> String {
-    match reason.map(serde_json::to_value) {
-        Some(Ok(serde_json::Value::String(word))) => word,
-        _ => "no reason given".to_string(),
     }
 }
 
