@@ -12,10 +12,10 @@ pub struct Keyboard {
     thread: Option<JoinHandle<()>>,
 }
 
-/// Hands each byte that is typed to `on_key`, on a thread of its own, if standard input is a terminal and this program is in its
+/// Hands what was typed to `on_keys`, as much as came at once (the key of an arrow is several bytes), on a thread of its own, if standard input is a terminal and this program is in its
 /// foreground: one in the background is stopped by the system when it touches the terminal, and a stopped program cannot hold a
 /// bead.
-pub fn listen(mut on_key: impl FnMut(u8) + Send + 'static) -> Option<Keyboard> {
+pub fn listen(mut on_keys: impl FnMut(&[u8]) + Send + 'static) -> Option<Keyboard> {
     let stdin = rustix::stdio::stdin();
     if !termios::isatty(stdin) {
         return None;
@@ -36,11 +36,10 @@ pub fn listen(mut on_key: impl FnMut(u8) + Send + 'static) -> Option<Keyboard> {
     let thread = std::thread::Builder::new()
         .name("cellpos-keys".to_string())
         .spawn(move || {
-            let mut key = [0u8; 1];
+            let mut keys = [0u8; 32];
             while !asked.load(Ordering::Acquire) {
-                match rustix::io::read(rustix::stdio::stdin(), &mut key) {
-                    Ok(1) => on_key(key[0]),
-                    Ok(_) => {}
+                match rustix::io::read(rustix::stdio::stdin(), &mut keys) {
+                    Ok(count) => on_keys(keys.get(..count).unwrap_or(&[])),
                     Err(_) => std::thread::sleep(std::time::Duration::from_millis(100)),
                 }
             }

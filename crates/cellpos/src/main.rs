@@ -7,6 +7,7 @@
 mod arguments;
 mod commands;
 mod keyboard;
+mod keys;
 mod outcome;
 mod output;
 mod view_args;

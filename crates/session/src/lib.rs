@@ -30,6 +30,7 @@ mod devices;
 pub mod ended;
 mod failure;
 mod fit;
+pub mod live_line;
 mod prepared;
 pub mod provenance;
 pub mod quantities;

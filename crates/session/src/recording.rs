@@ -1,7 +1,9 @@
 //! Where the recorder thread's rows go: the run folder, and the live line on the terminal.
 
+use crate::live_line::LiveLine;
+use crate::view::Shown;
 use cellpos_record::{Event as LogEvent, RunWriter};
-use cellpos_runtime::{Event, Life, RunSink, Statistics, TickRecord};
+use cellpos_runtime::{Event, RunSink, Statistics, TickRecord};
 use std::io::IsTerminal;
 
 /// Writes a run folder (if there is one) and a live line (if standard error is a terminal).
@@ -9,14 +11,6 @@ pub struct Recording {
     writer: Option<RunWriter>,
     line: Option<LiveLine>,
     late: u64,
-}
-
-/// What the live line needs to know.
-pub struct LiveLine {
-    /// Smallest displacement, um.
-    pub low_um: f64,
-    /// Largest displacement, um.
-    pub high_um: f64,
 }
 
 impl Recording {
@@ -54,6 +48,8 @@ pub fn log_event(event: &Event) -> LogEvent {
     logged
 }
 
+impl Shown for Recording {}
+
 impl RunSink for Recording {
     fn tick(&mut self, record: &TickRecord) {
         if record.flags.has(cellpos_runtime::TickFlags::LATE) {
@@ -90,22 +86,9 @@ impl RunSink for Recording {
         if let Some(writer) = &mut self.writer {
             writer.poll();
         }
-        let (Some(line), Some(r)) = (&self.line, statistics.last()) else {
-            return;
-        };
-        let state = Life::from_number(r.life).map_or("?", Life::name);
-        let rms = statistics
-            .rms_measured_nm()
-            .map_or_else(|| "-".to_string(), |rms| format!("{rms:.1}nm"));
-        cellpos_terminal::stderr().show(&format!(
-            "{:8.2}s  target {:+.3}um  bead {:+.3}um  error {:+6.0}nm  rms {rms}  PZT {:.3}um ({:.1}um to limit)  {state}  late {}",
-            r.time_ns as f64 * 1e-9,
-            r.target_um,
-            r.measured_um,
-            (r.measured_um - r.target_um) * 1e3,
-            r.command_um,
-            (r.command_um - line.low_um).min(line.high_um - r.command_um),
-            self.late,
-        ));
+        if let (Some(line), Some(record)) = (&self.line, statistics.last()) {
+            let text = line.text(record, statistics, self.late, cellpos_terminal::columns());
+            cellpos_terminal::stderr().show(&text);
+        }
     }
 }

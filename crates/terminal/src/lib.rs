@@ -99,6 +99,15 @@ pub fn stderr() -> &'static Terminal {
     TERMINAL.get_or_init(|| Terminal::new(io::stderr()))
 }
 
+/// Columns of the terminal behind standard error; 80 where it does not say.
+pub fn columns() -> usize {
+    rustix::termios::tcgetwinsize(io::stderr())
+        .ok()
+        .map(|size| usize::from(size.ws_col))
+        .filter(|columns| *columns > 0)
+        .unwrap_or(80)
+}
+
 /// Sends the words of a panic to [`stderr`], so that a thread that fails does not wait for a screen before it is noticed.
 pub fn panics_do_not_wait() {
     let plain = std::panic::take_hook();

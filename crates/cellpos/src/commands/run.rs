@@ -1,13 +1,15 @@
 //! `cellpos run`: a setpoint script in closed loop, with a row for each cycle; resumed after whatever ended it.
 
-mod keys;
 pub(super) mod learning;
 pub(super) mod resume;
 mod session_config;
+mod shown;
 mod sink;
 mod text;
 
+use crate::keys;
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
+use crate::view_args::ViewArgs;
 use cellpos_emulator::{CellConfig, FaultKind};
 use cellpos_record::{InputFile, LineFile, RunWriter};
 use cellpos_runtime::EndRule;
@@ -16,6 +18,7 @@ use cellpos_script::{
 };
 use cellpos_session::rig_file::{ActuatorConfig, CameraConfig, ClockKind, Frames, RigFile};
 use cellpos_session::setup::{Prepared, ReferenceSpec, Setup};
+use cellpos_session::view::{Page, Viewed};
 use cellpos_session::{Finished, Options, Rig, connect};
 use cellpos_units::Micrometers;
 use learning::Keeper;
@@ -84,6 +87,8 @@ pub struct Args {
     /// Name of the run; left out: that of the script.
     #[arg(long)]
     name: Option<String>,
+    #[command(flatten)]
+    view: ViewArgs,
     /// Print one JSON object on standard output.
     #[arg(long)]
     json: bool,
@@ -321,17 +326,28 @@ fn start(args: &Args, ready: Ready) -> CommandResult {
         let faults = &rig.file().emulator.faults;
         core = core.with_late_solver(faults.spans_ns(FaultKind::SlowSolver));
     }
-    let keys = keys::listen(rig.operator());
+    let mut view = args.view.open(&mut rig, &setup, &page(&name, &script))?;
+    let sink = Viewed::new(sink.with_page(view.is_some()), view.as_mut());
+    let keys = keys::of_a_script(rig.operator());
     let armed = match rig.arm(&setup, core, sink, EndRule::default()) {
         Ok(armed) => armed,
         Err(not_armed) => {
-            connect::not_armed(not_armed.sink.close().0, &not_armed.failure);
+            connect::not_armed(not_armed.sink.into_sink().close().0, &not_armed.failure);
             return Err(not_armed.failure);
         }
     };
     let finished = armed.start()?.wait()?;
     drop(keys);
     conclude(args, &setup, &plan, &folder, warnings, finished)
+}
+
+fn page(name: &str, script: &Script) -> Page {
+    Page {
+        name: name.to_string(),
+        subtitle: format!("run: {}", script.file),
+        steered: false,
+        script: true,
+    }
 }
 
 /// A length can only be waited for where it is measured.
@@ -407,7 +423,7 @@ fn conclude(
     plan: &Plan,
     folder: &Path,
     mut warnings: Vec<String>,
-    finished: Finished<ScriptSink>,
+    finished: Finished<Viewed<ScriptSink>>,
 ) -> CommandResult {
     warnings.extend(connect::warnings(&finished));
     let Finished {
@@ -419,6 +435,7 @@ fn conclude(
         sink,
         ..
     } = finished;
+    let sink = sink.into_inner(&summary, &ended.seen);
     let script = sink.end();
     let outcome = match (ended.as_asked(), script.complete()) {
         (false, _) => summary.state.name(),

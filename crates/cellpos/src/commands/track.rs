@@ -1,6 +1,7 @@
 //! `cellpos track`: hold a bead, or go to a position, in closed loop.
 
 use crate::arguments::positive;
+use crate::keys::{self, Steering};
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
 use crate::view_args::ViewArgs;
 use cellpos_control::{ControllerFile, ControllerKind, LearnedTable, SolverKind};
@@ -8,7 +9,8 @@ use cellpos_record::RunWriter;
 use cellpos_runtime::realtime::Conditions;
 use cellpos_runtime::{EndRule, Summary};
 use cellpos_session::cyclic::{self, LearnSpec, Sine};
-use cellpos_session::recording::{LiveLine, Recording};
+use cellpos_session::live_line::{LiveLine, Typed};
+use cellpos_session::recording::Recording;
 use cellpos_session::rig_file::{ClockKind, Frames, RigFile};
 use cellpos_session::setup::{Prepared, ReferenceSpec, Setup};
 use cellpos_session::view::{Page, Viewed};
@@ -26,7 +28,8 @@ use std::path::{Path, PathBuf};
   cellpos track --target 0um --sine 5um@50Hz --controller lqg --learn --duration 5s
 
 Without --rig the rig is emulated: frames are rendered, the board is the firmware library. Ctrl-C freezes the bead, then
-parks the PZT; a second Ctrl-C parks at once. Exit code 0: the run ended as asked; 1: it ended in Safe; 2: bad input.")]
+parks the PZT; a second Ctrl-C parks at once. Keys, where standard input is a terminal: f freezes and goes on, q does what
+Ctrl-C does; the arrows move the target (left, right: 0.1 um; down, up: 1 um), a number and Enter sets it. Exit code 0: the run ended as asked; 1: it ended in Safe; 2: bad input.")]
 pub struct Args {
     /// Where the bead is to be.
     #[arg(long, allow_hyphen_values = true)]
@@ -138,12 +141,20 @@ pub fn run(args: Args) -> CommandResult {
     let learn = learn(&args, &prepared, rig.file())?;
     let mut setup = rig.set_up(prepared, reference(&args))?;
     setup.config.learn = learn;
+    let (typed, steered) = (Typed::default(), args.sine.is_none());
+    let line = LiveLine {
+        low_um: limits.low_um,
+        high_um: limits.high_um,
+        keys: if steered {
+            keys::OF_A_HOLD
+        } else {
+            keys::OF_A_MOTION
+        },
+        typed: typed.clone(),
+    };
     let recording = Recording::new(
         writer(&args, &rig, &setup)?,
-        (!args.json && !crate::output::settings().quiet).then_some(LiveLine {
-            low_um: limits.low_um,
-            high_um: limits.high_um,
-        }),
+        (!args.json && !crate::output::settings().quiet).then_some(line),
     );
     let end = EndRule {
         ticks,
@@ -152,6 +163,16 @@ pub fn run(args: Args) -> CommandResult {
     let core = setup.core()?;
     let mut view = args.view.open(&mut rig, &setup, &page(&args))?;
     let sink = Viewed::new(recording, view.as_mut());
+    let view_um = rig.source().field_um;
+    let _keys = (args.clock == ClockKind::Real).then(|| {
+        keys::of_a_track(Steering::new(
+            rig.operator(),
+            typed,
+            args.target.value(),
+            view_um,
+            steered,
+        ))
+    });
     match rig.arm(&setup, core, sink, end) {
         Ok(armed) => conclude(&args, &setup, armed.start()?.wait()?),
         Err(not_armed) => {

@@ -58,8 +58,8 @@ impl Typed {
         let (sender, lines) = channel();
         let of_keys = sender.clone();
         let mut keys = Keys::default();
-        let keyboard = keyboard::listen(move |key| {
-            if let Some(command) = keys.push(key) {
+        let keyboard = keyboard::listen(move |typed| {
+            for command in typed.iter().filter_map(|key| keys.push(*key)) {
                 // Nobody listens any more: the program is ending.
                 let _ = of_keys.send(command);
             }

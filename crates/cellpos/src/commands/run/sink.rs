@@ -2,6 +2,7 @@
 
 use super::learning::Keeper;
 use super::session_config::SessionConfig;
+use super::shown::Unshown;
 use crate::recording::log_event;
 use cellpos_control::LearnerState;
 use cellpos_record::{Event as LogEvent, Faults, LineFile, RunWriter};
@@ -25,13 +26,14 @@ pub struct ScriptSink {
     /// Ends the run when the cell has changed as much as the script says.
     fatigue: Option<FatigueWatch>,
     operator: Arc<Operator>,
-    plan: Arc<Plan>,
+    pub(super) plan: Arc<Plan>,
+    pub(super) unshown: Unshown,
     bar: ProgressBar,
     /// Rows that are not yet acknowledged: their ticks go to the disk first.
     waiting: Vec<CycleRow>,
     acknowledged_ns: i64,
     next_mark: usize,
-    last: Option<TickRecord>,
+    pub(super) last: Option<TickRecord>,
     stage: Stage,
     alarms: u64,
     /// Why the rows of the table stopped it.
@@ -126,6 +128,7 @@ impl ScriptSink {
             operator,
             plan,
             bar,
+            unshown: Unshown::default(),
             waiting: Vec::new(),
             acknowledged_ns: 0,
             next_mark,
@@ -146,6 +149,14 @@ impl ScriptSink {
         Self {
             keeper: Some(keeper),
             keep_live: live,
+            ..self
+        }
+    }
+
+    /// The same sink, that keeps for a live page what only it knows.
+    pub fn with_page(self, page: bool) -> Self {
+        Self {
+            unshown: Unshown::new(page),
             ..self
         }
     }
@@ -211,12 +222,19 @@ impl ScriptSink {
                     .with("cycle", row.cycle)
                     .with("error_percent", error * 100.0),
             );
-            say(format!(
+            let text = format!(
                 "{name}: cycle {}: mean amplitude error {:+.1} %",
                 row.cycle,
                 error * 100.0
-            ));
+            );
+            let level = match alarm {
+                Alarm::Raised { .. } => "warning",
+                Alarm::Cleared { .. } => "info",
+            };
+            self.unshown.line(time_s, level, text.clone());
+            say(text);
         }
+        self.unshown.cycle(&row);
         self.judge(&row, time_s);
         self.judge_cell(&row, time_s);
         if row.length_start_um.is_finite() {
@@ -264,6 +282,9 @@ impl ScriptSink {
     fn stop(&mut self, why: &'static str) {
         if !matches!(self.operator.asked(), Request::Freeze | Request::Park) {
             self.row_stop = Some(why);
+            let time_s = self.last.map_or(0.0, |r| r.time_ns as f64 * 1e-9);
+            self.unshown
+                .line(time_s, "fault", format!("The script is {why}."));
             self.operator.ask(Request::Freeze);
         }
     }
@@ -339,6 +360,8 @@ impl RunSink for ScriptSink {
                     .with("text", mark.text.clone())
                     .with("plan_s", mark.time_s);
                 self.writer.event(&event);
+                self.unshown
+                    .line(time_s, "info", format!("Mark: {}", mark.text));
                 self.next_mark += 1;
             }
         }
@@ -359,6 +382,11 @@ impl RunSink for ScriptSink {
 
     fn repeated(&mut self, last: &Event, count: u64) {
         self.writer.event(&log_event(last).with("times", count));
+    }
+
+    fn note(&mut self, time_ns: i64, text: &str) {
+        let event = LogEvent::new(time_ns as f64 * 1e-9, "note").with("text", text);
+        self.writer.event(&event);
     }
 
     fn is_refused(&self) -> bool {

@@ -1,0 +1,144 @@
+//! The line of a run on the terminal: what matters most comes first, and what does not fit is left out.
+
+use cellpos_runtime::{Life, Statistics, TickRecord};
+use std::sync::{Arc, Mutex, PoisonError};
+
+/// What the live line needs to know.
+#[derive(Debug, Clone, Default)]
+pub struct LiveLine {
+    /// Smallest displacement, um.
+    pub low_um: f64,
+    /// Largest displacement, um.
+    pub high_um: f64,
+    /// Which keys do what; empty: none are listened to.
+    pub keys: &'static str,
+    /// What the operator is typing.
+    pub typed: Typed,
+}
+
+/// What the operator is typing, shared by the thread of the keys and the one of the line; neither has real-time rights.
+#[derive(Debug, Clone, Default)]
+pub struct Typed(Arc<Mutex<String>>);
+
+impl Typed {
+    /// Puts a text in place of the one before.
+    pub fn set(&self, text: &str) {
+        *self.0.lock().unwrap_or_else(PoisonError::into_inner) = text.to_string();
+    }
+
+    /// What there is.
+    pub fn text(&self) -> String {
+        self.0
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
+            .clone()
+    }
+}
+
+/// A part of a line: how soon it is left out when there is no room (the largest first), and its text.
+type Part = (u8, String);
+
+impl LiveLine {
+    /// The line for a terminal of so many columns.
+    pub fn text(
+        &self,
+        record: &TickRecord,
+        statistics: &Statistics,
+        late: u64,
+        columns: usize,
+    ) -> String {
+        let state = Life::from_number(record.life).map_or("?", Life::name);
+        let error_nm = (record.measured_um - record.target_um) * 1e3;
+        let to_limit_um = (record.command_um - self.low_um).min(self.high_um - record.command_um);
+        let mut parts: Vec<Part> = vec![
+            (4, format!("{:.2}s", record.time_ns as f64 * 1e-9)),
+            (0, state.to_string()),
+            (0, format!("error {error_nm:+.0}nm")),
+        ];
+        if let Some(rms_nm) = statistics.rms_measured_nm() {
+            parts.push((3, format!("rms {rms_nm:.1}nm")));
+        }
+        parts.push((5, format!("target {:+.3}um", record.target_um)));
+        parts.push((6, format!("bead {:+.3}um", record.measured_um)));
+        parts.push((1, format!("PZT {:.2}um", record.command_um)));
+        parts.push((7, format!("({to_limit_um:.1}um to limit)")));
+        parts.push((if late > 0 { 2 } else { 8 }, format!("late {late}")));
+        let typed = self.typed.text();
+        if !typed.is_empty() {
+            parts.push((0, format!("target: {typed}_")));
+        } else if !self.keys.is_empty() {
+            parts.push((9, self.keys.to_string()));
+        }
+        fit(parts, columns)
+    }
+}
+
+/// The parts side by side, without those that have no room.
+fn fit(mut parts: Vec<Part>, columns: usize) -> String {
+    loop {
+        let line = parts
+            .iter()
+            .map(|(_, text)| text.as_str())
+            .collect::<Vec<_>>()
+            .join("  ");
+        if line.chars().count() < columns {
+            return line;
+        }
+        let least = (0..parts.len()).max_by_key(|&n| parts[n].0);
+        match least {
+            Some(n) if parts[n].0 > 0 => drop(parts.remove(n)),
+            // The cursor stands behind the line: it needs a column.
+            _ => return line.chars().take(columns.saturating_sub(1)).collect(),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn line(columns: usize, typed: &str) -> String {
+        let line = LiveLine {
+            low_um: 0.0,
+            high_um: 40.0,
+            keys: "f freeze, q stop",
+            typed: Typed::default(),
+        };
+        line.typed.set(typed);
+        let record = TickRecord {
+            time_ns: 12_345_600_000_000,
+            measured_um: -12.3456,
+            target_um: -12.0,
+            command_um: 31.234,
+            life: Life::Running as u8,
+            ..TickRecord::default()
+        };
+        line.text(&record, &Statistics::default(), 0, columns)
+    }
+
+    #[test]
+    fn the_line_fits_any_width_and_what_matters_stays() {
+        for columns in 1..250 {
+            assert!(line(columns, "").chars().count() < columns.max(1) + usize::from(columns == 0));
+        }
+        let narrow = line(40, "");
+        assert!(
+            narrow.contains("running") && narrow.contains("error -346nm"),
+            "{narrow}"
+        );
+        assert!(narrow.contains("PZT 31.23um"), "{narrow}");
+        let wide = line(200, "");
+        for part in ["(8.8um to limit)", "late 0", "f freeze", "bead -12.346um"] {
+            assert!(wide.contains(part), "{wide}");
+        }
+    }
+
+    #[test]
+    fn what_is_typed_stands_in_place_of_the_keys() {
+        let typed = line(60, "-2.5");
+        assert!(
+            typed.contains("target: -2.5_") && !typed.contains("freeze"),
+            "{typed}"
+        );
+    }
+}
