@@ -1,7 +1,7 @@
 //! A real browser, driven by the WebDriver protocol: Debian's `chromium` and `chromium-driver`.
 
 use serde_json::{Value, json};
-use std::io::{BufRead, BufReader, Read, Write};
+use std::io::{BufRead, BufReader, Write};
 use std::net::TcpStream;
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
@@ -30,7 +30,8 @@ impl Browser {
         let port = lines
             .find_map(|line| {
                 let line = line.ok()?;
-                let (_, rest) = line.split_once("on port ")?;
+                // Its first line repeats the 0 that it was given.
+                let (_, rest) = line.split_once("successfully on port ")?;
                 rest.trim_end_matches('.').parse().ok()
             })
             .expect("chromedriver says its port");
@@ -81,13 +82,9 @@ impl Browser {
             body.len()
         )
         .expect("chromedriver reads");
-        let mut bytes = vec![];
-        stream
-            .read_to_end(&mut bytes)
-            .expect("chromedriver answers");
-        let answer = String::from_utf8_lossy(&bytes);
-        let (_, body) = answer.split_once("\r\n\r\n").expect("an answer");
-        let value: Value = serde_json::from_str(body).unwrap_or_else(|e| panic!("{e}: {answer}"));
+        let answer = read_answer(BufReader::new(stream)).expect("chromedriver answers");
+        let value: Value =
+            serde_json::from_str(&answer).unwrap_or_else(|e| panic!("{e}: {answer}"));
         assert!(
             value["value"]["error"].is_null(),
             "{path}: {}",
@@ -116,6 +113,24 @@ impl Browser {
         text(&self.run(&format!(
             "return document.getElementById('{id}').textContent"
         )))
+    }
+
+    /// Clicks a button and waits until the page is in one of some states; says how long that took by the page's own clock, ms.
+    ///
+    /// # Panics
+    /// After three seconds.
+    pub fn click_until(&self, id: &str, states: &[&str]) -> f64 {
+        self.run(&format!(
+            "const start = performance.now(), wanted = {};
+             window.took = null;
+             new MutationObserver(() => {{
+               if (wanted.includes(document.body.dataset.state)) window.took ??= performance.now() - start;
+             }}).observe(document.body, {{ attributes: true }});
+             document.getElementById('{id}').click();",
+            json!(states)
+        ));
+        self.wait_for("return window.took !== null", Duration::from_secs(3));
+        self.run("return window.took").as_f64().expect("a time")
     }
 
     /// Clicks an element as a person does: it has to be seen.
@@ -165,6 +180,22 @@ impl Browser {
         let taken = self.on_session("GET", "/screenshot", &Value::Null);
         std::fs::write(path, base64(&text(&taken))).expect("a screenshot is written");
     }
+}
+
+/// The body of an answer; the driver leaves the line open behind it.
+fn read_answer(mut from: impl BufRead) -> std::io::Result<String> {
+    let (mut line, mut length) = (String::new(), 0);
+    while from.read_line(&mut line)? > 2 {
+        if let Some((name, value)) = line.split_once(':')
+            && name.eq_ignore_ascii_case("content-length")
+        {
+            length = value.trim().parse().map_err(std::io::Error::other)?;
+        }
+        line.clear();
+    }
+    let mut body = vec![0; length];
+    from.read_exact(&mut body)?;
+    String::from_utf8(body).map_err(std::io::Error::other)
 }
 
 impl Drop for Browser {

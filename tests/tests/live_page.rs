@@ -41,6 +41,25 @@ impl Watched {
         }
     }
 
+    /// `cellpos watch`: a page that may look only.
+    fn looking(folder: &Path, line: &str) -> Self {
+        let mut child = programs::cellpos(folder, line)
+            .stderr(Stdio::piped())
+            .stdout(Stdio::null())
+            .spawn()
+            .expect("cellpos starts");
+        let mut lines = BufReader::new(child.stderr.take().expect("piped")).lines();
+        let viewer = lines
+            .find_map(|line| Some(line.ok()?.split_once("to look:")?.1.trim().to_string()))
+            .expect("cellpos prints its link");
+        std::thread::spawn(move || lines.for_each(drop));
+        Self {
+            child,
+            operator: String::new(),
+            viewer,
+        }
+    }
+
     fn ended(mut self) -> ExitStatus {
         let deadline = Instant::now() + programs::PATIENCE;
         loop {
@@ -67,6 +86,21 @@ fn pictures() -> std::path::PathBuf {
     folder
 }
 
+const SCRIPT: &str = r#"
+name = "shown"
+[[step]]
+do = "hold"
+duration = "1s"
+[[step]]
+do = "mark"
+text = "<b>waves</b>"
+[[step]]
+do = "sine"
+amplitude = "2um"
+frequency = "4Hz"
+cycles = 40
+"#;
+
 const RUNNING: &str = "return document.body.dataset.state === 'running'";
 
 #[test]
@@ -75,7 +109,7 @@ fn the_operator_sees_a_moving_bead_and_freezes_steers_and_parks_it() {
     let folder = tempfile::tempdir().unwrap();
     let run = Watched::start(
         folder.path(),
-        "track --target 0um --view --best-effort --name watched --duration 120s",
+        "track --target 0um --view --name watched --duration 120s",
     );
     let page = Browser::start(1400, 1500);
     page.open(&run.operator);
@@ -93,12 +127,10 @@ fn the_operator_sees_a_moving_bead_and_freezes_steers_and_parks_it() {
     std::thread::sleep(Duration::from_secs(3));
     page.screenshot(&pictures().join("hold.png"));
 
-    page.click("freeze");
-    let frozen = page.wait_for(
-        "return document.body.dataset.state === 'frozen'",
-        Duration::from_secs(3),
+    println!(
+        "frozen on the page {} ms after the click",
+        page.click_until("freeze", &["frozen"])
     );
-    println!("frozen on the page {frozen:?} after the click");
     page.click("resume");
     page.wait_for(RUNNING, Duration::from_secs(3));
 
@@ -122,10 +154,9 @@ fn the_operator_sees_a_moving_bead_and_freezes_steers_and_parks_it() {
     page.screenshot(&pictures().join("steered.png"));
     assert_eq!(page.console(), Vec::<String>::new());
 
-    page.click("park");
-    page.wait_for(
-        "return ['safe', 'over'].includes(document.body.dataset.state)",
-        Duration::from_secs(3),
+    println!(
+        "parked on the page {} ms after the click",
+        page.click_until("park", &["safe", "over"])
     );
     page.screenshot(&pictures().join("parked.png"));
     let status = run.ended();
@@ -157,7 +188,7 @@ fn a_viewer_looks_on_and_a_page_from_elsewhere_gets_nothing() {
     let folder = tempfile::tempdir().unwrap();
     let run = Watched::start(
         folder.path(),
-        "track --target 0um --view --best-effort --no-record --duration 60s",
+        "track --target 0um --view --no-record --duration 60s",
     );
     let page = Browser::start(500, 1800);
     page.open(&run.viewer);
@@ -183,6 +214,72 @@ fn a_viewer_looks_on_and_a_page_from_elsewhere_gets_nothing() {
         "return document.body.innerText.includes('it carries a word')",
         Duration::from_secs(5),
     );
+}
+
+#[test]
+#[ignore = "needs chromium and chromium-driver: .ci/run installs them and runs this"]
+fn a_script_and_its_folder_show_the_same_run() {
+    let folder = tempfile::tempdir().unwrap();
+    std::fs::write(folder.path().join("script.toml"), SCRIPT).unwrap();
+    let run = Watched::start(folder.path(), "run script.toml --view --name shown");
+    let page = Browser::start(1400, 1500);
+    page.open(&run.operator);
+    page.wait_for(
+        "return /Cycle [0-9]+ of 40[.]/.test(document.getElementById('script-text').textContent)",
+        programs::PATIENCE,
+    );
+    page.wait_for(
+        "return /[0-9]+ cycles done/.test(document.getElementById('cycles-text').textContent)",
+        programs::PATIENCE,
+    );
+    page.wait_for(
+        "return document.getElementById('events').textContent.includes('Mark: <b>waves</b>')",
+        programs::PATIENCE,
+    );
+    // The same run, from its folder, in another program.
+    let watch = Watched::looking(folder.path(), "watch latest-shown --for 300s");
+    let other = Browser::start(1400, 1500);
+    other.open(&watch.viewer);
+    other.wait_for(RUNNING, programs::PATIENCE);
+    page.click_until("pause", &["paused"]);
+    other.wait_for(
+        "return ['frozen', 'disconnected'].includes(document.body.dataset.state)",
+        Duration::from_secs(20),
+    );
+    page.screenshot(&pictures().join("script.png"));
+    page.click_until("resume", &["running"]);
+    let status = run.ended();
+    assert!(status.success(), "{status}");
+    other.wait_for(
+        "return document.body.dataset.state === 'over'",
+        Duration::from_secs(20),
+    );
+    other.screenshot(&pictures().join("watch.png"));
+    assert_eq!(other.console(), Vec::<String>::new());
+    // What the page says at the end is what the run's summary says.
+    let found = std::fs::read_dir(folder.path().join("runs"))
+        .unwrap()
+        .flatten()
+        .next()
+        .expect("one run");
+    let meta: toml::Table = std::fs::read_to_string(found.path().join("run.toml"))
+        .unwrap()
+        .parse()
+        .unwrap();
+    let summary = &meta["end"]["summary"];
+    for (id, key) in [
+        ("f-late", "late"),
+        ("f-skipped", "skipped"),
+        ("f-lost", "frames_lost"),
+    ] {
+        assert_eq!(
+            other.text_of(id),
+            summary[key].as_integer().unwrap().to_string(),
+            "{key}"
+        );
+    }
+    let rms = summary["rms_measured_nm"].as_float().unwrap();
+    assert_eq!(other.text_of("f-rms"), format!("{rms:.1} nm"));
 }
 
 #[test]

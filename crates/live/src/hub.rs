@@ -13,8 +13,12 @@ use tungstenite::{Bytes, Message};
 const ROWS: u8 = 1;
 /// First byte of a picture.
 const PICTURE: u8 = 2;
-/// Rows that a new client gets of the past.
+/// Rows that a new client gets of the past of a run that goes on; of one that is over, all that the page can hold.
 const PAST_ROWS: usize = 10_000;
+/// What the page can hold of a run, s, and rows at most.
+const HELD: (f64, usize) = (600.0, 1_200_000);
+/// Messages in which a new client gets the past, at most: they have to find room in its queue.
+const PAST_MESSAGES: usize = 50;
 /// Events kept for new clients.
 const PAST_EVENTS: usize = 300;
 /// Cycles kept for new clients.
@@ -37,6 +41,7 @@ pub(crate) struct Hub {
     feed: FeedHub,
     clients: Clients,
     past: Past,
+    past_rows: usize,
 }
 
 /// The clients, shared with the thread that accepts them. Locked by the server's own threads only.
@@ -87,10 +92,16 @@ fn rows_message<'a>(rows: impl ExactSizeIterator<Item = &'a Row>) -> Message {
 
 impl Hub {
     pub(crate) fn new(feed: FeedHub, clients: Clients) -> Self {
+        let past_rows = if feed.hello.recorded {
+            ((HELD.0 * 1e6 / feed.hello.period_us) as usize).min(HELD.1)
+        } else {
+            PAST_ROWS
+        };
         Self {
             feed,
             clients,
             past: Past::default(),
+            past_rows,
         }
     }
 
@@ -110,7 +121,7 @@ impl Hub {
             clients.iter().for_each(|queue| queue.push(&message));
         }
         self.past.rows.extend(fresh);
-        let excess = self.past.rows.len().saturating_sub(PAST_ROWS);
+        let excess = self.past.rows.len().saturating_sub(self.past_rows);
         self.past.rows.drain(..excess);
         while let Ok(line) = self.feed.lines.pop() {
             let message = self.past.take(line);
@@ -165,8 +176,10 @@ impl Past {
         if !self.cycles.is_empty() {
             queue.push(&text(&Told::Cycles(self.cycles.iter().collect())));
         }
-        if !self.rows.is_empty() {
-            queue.push(&rows_message(self.rows.iter()));
+        let mut rows = self.rows.iter();
+        let size = rows.len().div_ceil(PAST_MESSAGES).max(ROWS_OF_A_MESSAGE);
+        while rows.len() > 0 {
+            queue.push(&rows_message(rows.by_ref().take(size)));
         }
     }
 }

@@ -32,6 +32,7 @@ mod error;
 mod events;
 pub mod export;
 mod faults;
+mod follow;
 mod lines;
 mod meta;
 mod reader;
@@ -49,6 +50,7 @@ pub use export::{
     write_parquet, write_table_parquet,
 };
 pub use faults::Faults;
+pub use follow::Follow;
 pub use lines::{LineFile, whole_text};
 pub use meta::{InputFile, RunEnd, RunMeta};
 pub use reader::{Batches, Gap, Lost, RunReader};

@@ -78,6 +78,8 @@ pub(crate) struct Stream<R> {
     pub(crate) torn_bytes: u64,
     /// Whether the end mark was seen last.
     pub(crate) ended: bool,
+    /// Whether bytes at the end that make no message yet are waited for.
+    follows: bool,
 }
 
 impl<R: Read + Seek> Stream<R> {
@@ -109,7 +111,15 @@ impl<R: Read + Seek> Stream<R> {
             damaged_bytes: 0,
             torn_bytes: 0,
             ended: false,
+            follows: false,
         })
+    }
+
+    /// Takes the file as long as it is now; what is at its end and no message yet is left for the next time.
+    pub(crate) fn follow(&mut self) -> io::Result<()> {
+        self.length = self.from.seek(SeekFrom::End(0))?;
+        self.follows = true;
+        Ok(())
     }
 
     /// The rows of the next batch; None at the end.
@@ -132,6 +142,7 @@ impl<R: Read + Seek> Stream<R> {
                         self.damaged_bytes += found - self.position;
                         self.position = found;
                     }
+                    None if self.follows => break,
                     None => {
                         self.torn_bytes = self.length - self.position;
                         self.position = self.length;

@@ -35,6 +35,7 @@ mod prepared;
 pub mod provenance;
 pub mod quantities;
 mod real_time;
+pub mod recorded;
 pub mod recording;
 mod rig;
 pub mod rig_file;

@@ -2,6 +2,7 @@
 
 use crate::live_line::LiveLine;
 use crate::view::Shown;
+use crate::words::sentence;
 use cellpos_record::{Event as LogEvent, RunWriter};
 use cellpos_runtime::{Event, RunSink, Statistics, TickRecord};
 use std::io::IsTerminal;
@@ -43,7 +44,11 @@ pub fn log_event(event: &Event) -> LogEvent {
         Some(serde_json::Value::String(name)) => name,
         _ => "event".to_string(),
     };
-    let mut logged = LogEvent::new(event.time_ns as f64 * 1e-9, &name).with("tick", event.seq);
+    let (level, text) = sentence(&event.kind);
+    let mut logged = LogEvent::new(event.time_ns as f64 * 1e-9, &name)
+        .with("tick", event.seq)
+        .with("level", level.name())
+        .with("text", text);
     logged.data.extend(data);
     logged
 }

@@ -24,6 +24,7 @@ pub mod track;
 pub mod vision;
 mod vision_sheet;
 mod vision_summary;
+pub mod watch;
 
 use crate::outcome::CommandResult;
 
@@ -42,6 +43,8 @@ pub enum Command {
     Simulate(simulate::Args),
     /// Run a recorded run through its controller again and compare to the bit.
     Replay(replay::Args),
+    /// A run that goes on or is over, on the live page, from its folder.
+    Watch(watch::Args),
     /// What a run did, on one page: traces, errors, cycles, timing, events, provenance.
     Report(report::Args),
     /// A run packed for archiving, with a manifest.
@@ -83,6 +86,7 @@ impl Command {
             Self::Track(args) => track::run(args),
             Self::Run(args) => run::run(*args),
             Self::Replay(args) => replay::run(args),
+            Self::Watch(args) => watch::run(args),
             Self::Design(args) => design::run(args),
             Self::Check(args) => check::run(args),
             Self::Simulate(args) => simulate::run(args),

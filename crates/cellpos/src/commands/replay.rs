@@ -2,11 +2,9 @@
 
 use crate::arguments::run_folder;
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
-use crate::setup::{Setup, SetupConfig};
-use cellpos_control::ControllerFile;
-use cellpos_plant::Model;
 use cellpos_record::{RunReader, Sessions};
 use cellpos_runtime::replay::{Gap, Mismatch, Replay};
+use cellpos_session::recorded;
 use serde::Serialize;
 use std::path::PathBuf;
 
@@ -82,7 +80,7 @@ pub fn run(args: Args) -> CommandResult {
 }
 
 fn session(number: u64, reader: &RunReader) -> Result<SessionReport, Failure> {
-    let mut replay = Replay::new(setup(reader)?.core()?);
+    let mut replay = Replay::new(recorded::setup(reader)?.core()?);
     let mut batches = reader.batches().map_err(Failure::input)?;
     for record in batches.by_ref().flatten() {
         replay.add(&record);
@@ -131,28 +129,4 @@ fn text(report: &Report) -> String {
         out.push_str(&format!("not replayed: {folder}\n"));
     }
     out
-}
-
-/// The loop as the run folder describes it.
-pub fn setup(reader: &RunReader) -> Result<Setup, Failure> {
-    let meta = reader.meta().map_err(|problem| {
-        Failure::bad_input(
-            format!(
-                "{}: run.toml cannot be used: {problem}",
-                reader.folder().display()
-            ),
-            "a replay needs the configuration in run.toml",
-        )
-    })?;
-    let mut config = meta.config.clone();
-    config.remove("rig");
-    config.remove("session");
-    let name = reader.folder().join("run.toml").display().to_string();
-    let text = |table: &toml::Table| toml::to_string(table).map_err(Failure::failed);
-    Ok(Setup {
-        model: Model::from_toml_str(&text(&meta.model)?, &name).map_err(Failure::input)?,
-        controller: ControllerFile::from_toml_str(&text(&meta.controller)?, &name)
-            .map_err(Failure::input)?,
-        config: crate::toml_file::parse::<SetupConfig>(&text(&config)?, &name)?,
-    })
 }

@@ -6,7 +6,6 @@ mod fatigue;
 mod spectrum;
 mod ticks;
 
-use super::replay;
 use super::run::{learning, resume};
 use crate::arguments::run_folder;
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
@@ -117,7 +116,7 @@ pub fn run(args: Args) -> CommandResult {
 /// The notes of the script, if the run is one of a script with notes.
 fn notes(reader: &RunReader) -> Option<String> {
     // A run that cannot be set up again is still worth a report.
-    let setup = replay::setup(reader).ok()?;
+    let setup = cellpos_session::recorded::setup(reader).ok()?;
     let (script, _) = setup.config.reference.script().ok()??;
     Some(script.notes).filter(|notes| !notes.is_empty())
 }

@@ -4,9 +4,11 @@
 //! the server's own threads; the loop knows nothing of it but the target, which it reads once a tick.
 
 mod pictures;
+mod watch;
 mod watcher;
 
 pub use cellpos_live::{CycleRow, EventLine, State};
+pub use watch::Watch;
 pub use watcher::{Shown, Viewed};
 
 use crate::connect;
@@ -67,10 +69,19 @@ pub fn open(at: ViewAddress, rig: &mut Rig, setup: &Setup, page: &Page) -> Resul
 }
 
 fn hello(rig: &Rig, setup: &Setup, page: &Page) -> Hello {
-    let limits = setup.controller.limits;
-    let timing = &setup.config.timing;
     let source = rig.source();
     let diffusion = connect::diffusion_um2_per_s(rig.file(), &setup.model);
+    Hello {
+        view_um: source.field_um,
+        pictures: source.width_px > 0,
+        ..hello_of(setup, diffusion, page)
+    }
+}
+
+/// What set-up and diffusion coefficient (um^2/s) say of a run.
+fn hello_of(setup: &Setup, diffusion: f64, page: &Page) -> Hello {
+    let limits = setup.controller.limits;
+    let timing = &setup.config.timing;
     let period_s = timing.period_us * 1e-6;
     let delay_s = timing.camera_delay_ms * 1e-3;
     Hello {
@@ -79,14 +90,12 @@ fn hello(rig: &Rig, setup: &Setup, page: &Page) -> Hello {
         period_us: timing.period_us,
         range_um: [limits.low_um, limits.high_um],
         slew_um_per_s: limits.slew_um_per_s,
-        view_um: source.field_um,
         budget_us: timing.budget_us,
         bound_nm: (diffusion > 0.0).then(|| 1e3 * bound_rms_um(diffusion, 0.0, delay_s, period_s)),
         bound_spectrum: lowest_spectrum(diffusion, delay_s + period_s, 0.5 / period_s),
         steered: page.steered,
         script: page.script,
-        pictures: source.width_px > 0,
-        recorded: false,
+        ..Hello::default()
     }
 }
 

@@ -26,41 +26,32 @@ pub trait Shown {
 /// References of the last ticks: the error of a position is counted from where the bead was to be when it was exposed.
 const TARGETS: usize = 16;
 
-/// What feeds the page, from what the recorder is given.
-struct Watcher {
-    feed: Feed,
-    notes: Receiver<String>,
+/// What feeds the page, from what the recorder is given, or from what is read in its folder.
+pub(super) struct Watcher {
+    pub(super) feed: Feed,
     targets: [(i64, f64); TARGETS],
-    state: State,
+    pub(super) state: State,
     freeze: String,
-    safe: String,
+    pub(super) safe: String,
 }
 
 /// A sink that shows a page what passes through it.
 pub struct Viewed<S> {
     sink: S,
-    watcher: Option<Watcher>,
+    page: Option<(Watcher, Receiver<String>)>,
 }
 
 impl<S> Viewed<S> {
     /// A sink without a page, or with one.
     pub fn new(sink: S, view: Option<&mut View>) -> Self {
-        let watcher = view.and_then(|view| {
-            Some(Watcher {
-                feed: view.feed.take()?,
-                notes: view.notes.take()?,
-                targets: [(i64::MIN, f64::NAN); TARGETS],
-                state: State::default(),
-                freeze: String::new(),
-                safe: String::new(),
-            })
-        });
-        Self { sink, watcher }
+        let page =
+            view.and_then(|view| Some((Watcher::new(view.feed.take()?), view.notes.take()?)));
+        Self { sink, page }
     }
 
     /// The sink within. The page shows the summary's own figures from now on.
     pub fn into_inner(self, summary: &Summary, ended: &str) -> S {
-        if let Some(mut watcher) = self.watcher {
+        if let Some((mut watcher, _)) = self.page {
             watcher.conclude(summary, ended);
         }
         self.sink
@@ -73,7 +64,18 @@ impl<S> Viewed<S> {
 }
 
 impl Watcher {
-    fn tick(&mut self, record: &TickRecord) {
+    pub(super) fn new(feed: Feed) -> Self {
+        Self {
+            feed,
+            targets: [(i64::MIN, f64::NAN); TARGETS],
+            state: State::default(),
+            freeze: String::new(),
+            safe: String::new(),
+        }
+    }
+
+    /// Shows a tick.
+    pub(super) fn show(&mut self, record: &TickRecord) {
         self.targets.copy_within(0..TARGETS - 1, 1);
         self.targets[0] = (record.time_ns, record.target_um);
         let exposed_ns = record.mid_exposure_ns;
@@ -92,6 +94,10 @@ impl Watcher {
             flags: record.flags.0,
             life: record.life,
         });
+    }
+
+    /// Counts a tick.
+    pub(super) fn count(&mut self, record: &TickRecord) {
         let state = &mut self.state;
         state.time_s = record.time_ns as f64 * 1e-9;
         state.ticks = record.seq + 1;
@@ -133,7 +139,7 @@ impl Watcher {
         self.feed.state(self.state.clone());
     }
 
-    fn banner(&self, record: &TickRecord) -> Banner {
+    pub(super) fn banner(&self, record: &TickRecord) -> Banner {
         let (state, reason) = match Life::from_number(record.life) {
             Some(Life::Running) if record.flags.has(TickFlags::FREEZE) => {
                 ("frozen", self.freeze.clone())
@@ -177,21 +183,22 @@ impl Watcher {
 
 impl<S: RunSink + Shown> RunSink for Viewed<S> {
     fn tick(&mut self, record: &TickRecord) {
-        if let Some(watcher) = &mut self.watcher {
-            watcher.tick(record);
+        if let Some((watcher, _)) = &mut self.page {
+            watcher.show(record);
+            watcher.count(record);
         }
         self.sink.tick(record);
     }
 
     fn event(&mut self, event: &Event) {
-        if let Some(watcher) = &mut self.watcher {
+        if let Some((watcher, _)) = &mut self.page {
             watcher.event(event, 1);
         }
         self.sink.event(event);
     }
 
     fn repeated(&mut self, last: &Event, count: u64) {
-        if let Some(watcher) = &mut self.watcher {
+        if let Some((watcher, _)) = &mut self.page {
             watcher.event(last, count);
         }
         self.sink.repeated(last, count);
@@ -214,9 +221,9 @@ impl<S: RunSink + Shown> RunSink for Viewed<S> {
     }
 
     fn progress(&mut self, statistics: &Statistics) {
-        if let Some(watcher) = &mut self.watcher {
+        if let Some((watcher, notes)) = &mut self.page {
             let time_ns = statistics.last().map_or(0, |record| record.time_ns);
-            while let Ok(text) = watcher.notes.try_recv() {
+            while let Ok(text) = notes.try_recv() {
                 self.sink.note(time_ns, &text);
                 watcher.tell(time_ns, Level::Info, format!("Note: {text}"));
             }

@@ -90,19 +90,7 @@ impl Bound {
             }
             value.as_float()
         };
-        let kind = |device: &str| {
-            let rig = meta.config.get("rig")?.get(device)?;
-            rig.get("kind")?.as_str()
-        };
-        let emulated = kind("camera") == Some("emulated");
-        let diffusion_um2_per_s = if emulated {
-            at(&["rig", "emulator", "diffusion_um2_per_s"])?
-        } else {
-            meta.model
-                .get("noise")?
-                .get("diffusion_um2_per_s")?
-                .as_float()?
-        };
+        let diffusion_um2_per_s = cellpos_session::recorded::diffusion_um2_per_s(meta)?;
         let delay_s = at(&["timing", "camera_delay_ms"])? * 1e-3;
         let period_s = at(&["timing", "period_us"])? * 1e-6;
         Some(Self {

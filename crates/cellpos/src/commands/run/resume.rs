@@ -2,7 +2,6 @@
 
 use super::Ready;
 use super::session_config::SessionConfig;
-use crate::commands::replay;
 use crate::outcome::Failure;
 use crate::rig_file::{ClockKind, RigFile};
 use crate::setup::{Prepared, ReferenceSpec};
@@ -55,7 +54,7 @@ fn counted(folder: &Path) -> Result<Vec<CycleRow>, Failure> {
         let Some(config) = session_config(&reader) else {
             continue;
         };
-        let setup = replay::setup(&reader)?;
+        let setup = cellpos_session::recorded::setup(&reader)?;
         let Some((_, plan)) = setup.config.reference.script()? else {
             continue;
         };
@@ -168,7 +167,7 @@ pub fn ready(folder: &Path, best_effort: bool) -> Result<Option<Ready>, Failure>
         )
     };
     let reader = RunReader::open(folder).map_err(Failure::input)?;
-    let setup = replay::setup(&reader)?;
+    let setup = cellpos_session::recorded::setup(&reader)?;
     let first =
         session_config(&reader).ok_or_else(|| not_a_run("is no run of a script".to_string()))?;
     if first.number != 1 {
