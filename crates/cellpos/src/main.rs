@@ -8,6 +8,7 @@ mod arguments;
 mod commands;
 mod keyboard;
 mod keys;
+mod notify;
 mod outcome;
 mod output;
 mod view_args;

@@ -8,6 +8,7 @@ mod sink;
 mod text;
 
 use crate::keys;
+use crate::notify::{NotifyArgs, What};
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
 use crate::view_args::ViewArgs;
 use cellpos_emulator::{CellConfig, FaultKind};
@@ -89,6 +90,8 @@ pub struct Args {
     name: Option<String>,
     #[command(flatten)]
     view: ViewArgs,
+    #[command(flatten)]
+    notify: NotifyArgs,
     /// Print one JSON object on standard output.
     #[arg(long)]
     json: bool,
@@ -341,6 +344,13 @@ fn start(args: &Args, ready: Ready) -> CommandResult {
     conclude(args, &setup, &plan, &folder, warnings, finished)
 }
 
+/// Name of a run by its folder.
+fn run_name(folder: &Path) -> String {
+    folder
+        .file_name()
+        .map_or_else(String::new, |name| name.to_string_lossy().into_owned())
+}
+
 fn page(name: &str, script: &Script) -> Page {
     Page {
         name: name.to_string(),
@@ -462,6 +472,13 @@ fn conclude(
     if let Err(error) = resume::cycles_parquet(folder, &cycles) {
         warnings.push(format!("no cycles.parquet: {error}"));
     }
+    let what = match outcome {
+        "done" => What::End,
+        "stopped" | "aborted" => What::Stop,
+        _ => What::Safe,
+    };
+    let said = format!("{outcome}: {}; {ended}", script.name());
+    warnings.extend((args.notify).tell(what, &run_name(folder), &said, folder.to_str()));
     let report = text::Report::new(
         text::Ending {
             outcome,

@@ -2,6 +2,7 @@
 
 use crate::arguments::positive;
 use crate::keys::{self, Steering};
+use crate::notify::{NotifyArgs, What};
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
 use crate::view_args::ViewArgs;
 use cellpos_control::{ControllerFile, ControllerKind, LearnedTable, SolverKind};
@@ -14,7 +15,7 @@ use cellpos_session::recording::Recording;
 use cellpos_session::rig_file::{ClockKind, Frames, RigFile};
 use cellpos_session::setup::{Prepared, ReferenceSpec, Setup};
 use cellpos_session::view::{Page, Viewed};
-use cellpos_session::{Ended, Finished, Options, Rig, connect};
+use cellpos_session::{EndKind, Ended, Finished, Options, Rig, connect};
 use cellpos_units::{Micrometers, Seconds};
 use serde::Serialize;
 use std::path::{Path, PathBuf};
@@ -85,6 +86,8 @@ pub struct Args {
     no_record: bool,
     #[command(flatten)]
     view: ViewArgs,
+    #[command(flatten)]
+    notify: NotifyArgs,
     /// Print one JSON object on standard output.
     #[arg(long)]
     json: bool,
@@ -179,6 +182,8 @@ pub fn run(args: Args) -> CommandResult {
             if let Some(writer) = not_armed.sink.into_sink().into_writer() {
                 connect::not_armed(writer, &not_armed.failure);
             }
+            let reason = not_armed.failure.to_string();
+            args.notify.tell(What::Failed, &args.name, &reason, None);
             Err(not_armed.failure)
         }
     }
@@ -315,6 +320,13 @@ fn conclude(args: &Args, setup: &Setup, finished: Finished<Viewed<Recording>>) -
     {
         warnings.push(format!("no learned.toml: {error}"));
     }
+    let what = match ended.kind {
+        EndKind::Operator => What::Stop,
+        _ if healthy => What::End,
+        _ => What::Safe,
+    };
+    let told = (args.notify).tell(what, &args.name, &ended.to_string(), run.as_deref());
+    warnings.extend(told);
     let bound_rms_nm = connect::bound_rms_nm(rig.file(), setup, &summary);
     let report = Report {
         ended: &ended,

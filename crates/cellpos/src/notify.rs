@@ -1,0 +1,78 @@
+//! `--notify`: a command of the user's when a run ends, stops or goes safe.
+
+use std::process::{Child, Command, Stdio};
+use std::time::{Duration, Instant};
+
+/// How long the user's command is waited for; then it is left to itself.
+const PATIENCE: Duration = Duration::from_secs(10);
+
+/// Options of commands that can take a night.
+#[derive(Debug, clap::Args)]
+pub struct NotifyArgs {
+    /// A command for the shell when the run is over: CELLPOS_EVENT is end, stop, safe or failed, CELLPOS_REASON a sentence,
+    /// CELLPOS_RUN the run folder, CELLPOS_NAME the run's name. It is started when the PZT is parked.
+    #[arg(long, value_name = "COMMAND")]
+    notify: Option<String>,
+}
+
+/// What is told.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum What {
+    /// The run came to its end.
+    End,
+    /// The operator, or a condition of the script, stopped it.
+    Stop,
+    /// It went safe.
+    Safe,
+    /// It was never begun, or could not be carried through.
+    Failed,
+}
+
+impl What {
+    fn name(self) -> &'static str {
+        match self {
+            Self::End => "end",
+            Self::Stop => "stop",
+            Self::Safe => "safe",
+            Self::Failed => "failed",
+        }
+    }
+}
+
+impl NotifyArgs {
+    /// Runs the user's command, if there is one; what went wrong with it comes back as a sentence.
+    pub fn tell(&self, what: What, name: &str, reason: &str, run: Option<&str>) -> Option<String> {
+        let line = self.notify.as_deref()?;
+        let child = Command::new("sh")
+            .arg("-c")
+            .arg(line)
+            .env("CELLPOS_EVENT", what.name())
+            .env("CELLPOS_NAME", name)
+            .env("CELLPOS_REASON", reason)
+            .env("CELLPOS_RUN", run.unwrap_or(""))
+            // What it prints goes where messages go: standard output is the result's.
+            .stdin(Stdio::null())
+            .stdout(Stdio::null())
+            .spawn();
+        match child {
+            Ok(child) => wait(child).map(|problem| format!("--notify: {problem}")),
+            Err(error) => Some(format!("--notify: sh could not be started: {error}")),
+        }
+    }
+}
+
+fn wait(mut child: Child) -> Option<String> {
+    let start = Instant::now();
+    while start.elapsed() < PATIENCE {
+        match child.try_wait() {
+            Ok(Some(status)) if status.success() => return None,
+            Ok(Some(status)) => return Some(format!("the command ended with {status}")),
+            Ok(None) => std::thread::sleep(Duration::from_millis(20)),
+            Err(error) => return Some(error.to_string()),
+        }
+    }
+    Some(format!(
+        "the command still runs after {} s; it is left to itself",
+        PATIENCE.as_secs()
+    ))
+}
