@@ -3,6 +3,7 @@
 use serde_json::{Value, json};
 use std::io::{BufRead, BufReader, Write};
 use std::net::TcpStream;
+use std::os::unix::process::CommandExt;
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
@@ -24,6 +25,7 @@ impl Browser {
             .arg("--port=0")
             .stdout(Stdio::piped())
             .stderr(Stdio::null())
+            .process_group(0)
             .spawn()
             .expect("chromedriver: apt-get install chromium chromium-driver");
         let mut lines = BufReader::new(driver.stdout.take().expect("piped")).lines();
@@ -200,11 +202,13 @@ fn read_answer(mut from: impl BufRead) -> std::io::Result<String> {
 
 impl Drop for Browser {
     fn drop(&mut self) {
-        // Closing the session ends the browser; the driver goes by itself.
+        // Closing the session ends the browser in good order. Where that fails, and where the test did, driver and browser are
+        // one group of processes: none of them outlives the test.
         if !self.session.is_empty() && !std::thread::panicking() {
             self.on_session("DELETE", "", &Value::Null);
         }
-        let _ = self.driver.kill();
+        let group = rustix::process::Pid::from_child(&self.driver);
+        let _ = rustix::process::kill_process_group(group, rustix::process::Signal::KILL);
         let _ = self.driver.wait();
     }
 }

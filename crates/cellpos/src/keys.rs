@@ -119,7 +119,7 @@ impl Steering {
                 "{um} um: outside what the camera sees, {low_um:.1} um to {high_um:.1} um"
             ));
         } else if matches!(self.operator.asked(), Request::Freeze | Request::Park) {
-            say("the run is being stopped: no new target".to_string());
+            say("the run is being stopped: no new target");
         } else {
             self.operator.steer(um);
         }

@@ -5,6 +5,7 @@
 #![forbid(unsafe_code)]
 
 mod arguments;
+mod clips;
 mod commands;
 mod keyboard;
 mod keys;

@@ -45,5 +45,6 @@ pub use plan::{ArmKind, Cycle, Mark, Motion, Periodic, PeriodicReference, Plan, 
 pub use read::MOST_BYTES;
 pub use sample::Sample;
 pub use script::{
-    Condition, Load, MoveShape, OnTimeout, Order, Script, Step, StepKind, Stop, WaveShape,
+    ClipWishes, Condition, Load, MoveShape, OnTimeout, Order, Script, Step, StepKind, Stop,
+    WaveShape,
 };

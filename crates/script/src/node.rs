@@ -326,6 +326,33 @@ impl<'a> Node<'a> {
             .collect()
     }
 
+    /// A list of numbers of a kind.
+    pub(crate) fn numbers(
+        &self,
+        key: &str,
+        help: &str,
+        fits: fn(f64) -> bool,
+    ) -> Result<Vec<f64>, ScriptError> {
+        let Some(raw) = self.raw(key) else {
+            return Ok(Vec::new());
+        };
+        let fail = |span, message: String| self.source.fail(span, message, Some(help));
+        let list = raw
+            .get_ref()
+            .as_array()
+            .ok_or_else(|| fail(raw.span(), format!("`{key}` must be a list of numbers")))?;
+        list.iter()
+            .map(|item| {
+                let text = self.source.text.get(item.span()).unwrap_or("");
+                let number = text.replace('_', "").parse().ok();
+                number.filter(|n| fits(*n)).ok_or_else(|| {
+                    let message = format!("`{key}`: {} cannot be one of them", cut(text));
+                    fail(item.span(), message)
+                })
+            })
+            .collect()
+    }
+
     /// A list of texts.
     pub(crate) fn texts(&self, key: &str) -> Result<Vec<String>, ScriptError> {
         let Some(raw) = self.raw(key) else {

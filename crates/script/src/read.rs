@@ -66,7 +66,7 @@ impl Script {
             variables: &[],
         };
         root.only(&[
-            "name", "notes", "sample", "start", "seed", "learn", "stop", "step",
+            "name", "notes", "sample", "start", "seed", "learn", "stop", "clips", "step",
         ])?;
         let name = root.text("name")?.map_or("script", |text| text.value);
         let fits = |c: char| c.is_ascii_alphanumeric() || c == '-' || c == '_';
@@ -99,6 +99,7 @@ impl Script {
             start_um: length(&root, "start", -MAX_UM)?.unwrap_or(0.0),
             learn: root.flag("learn")?.unwrap_or(false),
             stop: crate::table::stop(&root)?,
+            clips: crate::table::clips(&root)?,
             steps,
         })
     }

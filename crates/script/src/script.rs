@@ -119,6 +119,36 @@ pub struct Stop {
     pub after_cycles: Option<u64>,
 }
 
+/// Which clips of the camera's picture are to be kept.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ClipWishes {
+    /// Cycles, from 1.
+    pub cycles: Vec<u64>,
+    /// Phases of them, as shares of a cycle.
+    pub phases: Vec<f64>,
+    /// Time before the moment, s.
+    pub before_s: f64,
+    /// Time behind it, s.
+    pub after_s: f64,
+    /// All of them together, MB at most.
+    pub most_mb: u64,
+    /// Whether what happens (the bead lost, a freeze, Safe) is kept too.
+    pub events: bool,
+}
+
+impl Default for ClipWishes {
+    fn default() -> Self {
+        Self {
+            cycles: vec![],
+            phases: vec![0.5],
+            before_s: 0.25,
+            after_s: 0.25,
+            most_mb: 200,
+            events: true,
+        }
+    }
+}
+
 /// One step of a script, with its place in the file.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Step {
@@ -223,6 +253,8 @@ pub struct Script {
     pub learn: bool,
     /// Stop conditions.
     pub stop: Stop,
+    /// Clips to keep, if any are wanted beside those of what happens.
+    pub clips: Option<ClipWishes>,
     /// The steps.
     pub steps: Vec<Step>,
 }

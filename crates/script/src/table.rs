@@ -1,9 +1,9 @@
-//! Tables of a script beside its steps: `[stop]` and `[sample]`.
+//! Tables of a script beside its steps: `[stop]`, `[sample]` and `[clips]`.
 
 use crate::error::ScriptError;
 use crate::node::{Node, length, time};
 use crate::sample::Sample;
-use crate::script::Stop;
+use crate::script::{ClipWishes, Stop};
 use cellpos_units::Micrometers;
 
 /// The table `[stop]`.
@@ -84,11 +84,61 @@ pub(crate) fn sample(root: &Node) -> Result<Sample, ScriptError> {
     })
 }
 
+/// The table `[clips]`.
+pub(crate) fn clips(root: &Node) -> Result<Option<ClipWishes>, ScriptError> {
+    let Some(node) = root.table("clips")? else {
+        return Ok(None);
+    };
+    node.only(&["cycles", "phases", "before", "after", "most_mb", "events"])?;
+    let whole = |n: f64| n >= 1.0 && n.fract() == 0.0 && n < 1e15;
+    let cycles = node.numbers("cycles", "for example cycles = [1, 10, 100]", whole)?;
+    let share = |n: f64| (0.0..1.0).contains(&n);
+    let help = "shares of a cycle, for example [0.0, 0.5]";
+    let phases = node.numbers("phases", help, share)?;
+    let usual = ClipWishes::default();
+    Ok(Some(ClipWishes {
+        cycles: cycles.into_iter().map(|n| n as u64).collect(),
+        phases: if phases.is_empty() {
+            usual.phases
+        } else {
+            phases
+        },
+        before_s: time(&node, "before")?.unwrap_or(usual.before_s).min(10.0),
+        after_s: time(&node, "after")?.unwrap_or(usual.after_s).min(10.0),
+        most_mb: node
+            .whole("most_mb", (1, 1_000_000))?
+            .unwrap_or(usual.most_mb),
+        events: node.flag("events")?.unwrap_or(usual.events),
+    }))
+}
+
 #[cfg(test)]
 mod tests {
     use crate::Script;
 
     const STEP: &str = "[[step]]\ndo = \"hold\"\nduration = \"1s\"\n";
+
+    #[test]
+    fn clips_are_wished_for_by_cycle_and_phase() {
+        let text = format!(
+            "[clips]\ncycles = [1, 100]\nphases = [0.25]\nbefore = \"100ms\"\nmost_mb = 50\n{STEP}"
+        );
+        let clips = Script::parse(&text, "t.toml").unwrap().clips.unwrap();
+        assert_eq!((clips.cycles, clips.phases), (vec![1, 100], vec![0.25]));
+        assert_eq!((clips.before_s, clips.after_s), (0.1, 0.25));
+        assert_eq!((clips.most_mb, clips.events), (50, true));
+        assert!(Script::parse(STEP, "t.toml").unwrap().clips.is_none());
+        for (wrong, said) in [
+            ("cycles = [0]", "cycles"),
+            ("cycles = [1.5]", "cycles"),
+            ("phases = [1]", "phases"),
+            ("cycle = [1]", "did you mean `cycles`"),
+        ] {
+            let error = Script::parse(&format!("[clips]\n{wrong}\n{STEP}"), "t.toml").unwrap_err();
+            let text = format!("{error} {error:?}");
+            assert!(text.contains(said), "{wrong}: {text}");
+        }
+    }
 
     #[test]
     fn the_sample_and_the_stops_on_what_the_cell_does_are_read_with_their_units() {

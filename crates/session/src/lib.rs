@@ -24,6 +24,7 @@
 //! ```
 #![forbid(unsafe_code)]
 
+pub mod clips;
 pub mod connect;
 pub mod cyclic;
 mod devices;

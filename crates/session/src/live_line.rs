@@ -111,7 +111,7 @@ mod tests {
             target_um: -12.0,
             command_um: 31.234,
             life: Life::Running as u8,
-            ..TickRecord::default()
+            ..TickRecord::unknown()
         };
         line.text(&record, &Statistics::default(), 0, columns)
     }

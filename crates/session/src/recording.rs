@@ -24,6 +24,13 @@ impl Recording {
         }
     }
 
+    /// The run folder, if there is one.
+    pub fn folder(&self) -> Option<std::path::PathBuf> {
+        self.writer
+            .as_ref()
+            .map(|writer| writer.folder().to_owned())
+    }
+
     /// The run folder's writer, to be finished.
     pub fn into_writer(self) -> Option<RunWriter> {
         if self.line.is_some() {

@@ -3,6 +3,7 @@
 mod cycles;
 mod envelope;
 mod fatigue;
+mod fault;
 mod spectrum;
 mod ticks;
 
@@ -93,6 +94,7 @@ pub fn run(args: Args) -> CommandResult {
     fatigue::section(&mut page, &cycles.rows, &ticks);
     learned(&mut page, &args.run)?;
     timing(&mut page, &sessions, &ticks);
+    fault::section(&mut page, &sessions)?;
     events(&mut page, &sessions);
     provenance(&mut page, &sessions);
     let out = args.out.unwrap_or_else(|| args.run.join("report.html"));
@@ -472,7 +474,7 @@ fn events(page: &mut Report, sessions: &[Session]) {
     let mut table = Table::new([
         Column::right("time (s)"),
         Column::left("event"),
-        Column::left("particulars"),
+        Column::left("what happened"),
     ]);
     let mut left_out = 0;
     let mut shown = 0;
@@ -483,7 +485,11 @@ fn events(page: &mut Report, sessions: &[Session]) {
                 continue;
             }
             shown += 1;
-            let data = serde_json::to_string(&event.data).unwrap_or_default();
+            // Runs of older versions have no sentences.
+            let data = match event.data.get("text").and_then(|text| text.as_str()) {
+                Some(text) => text.to_owned(),
+                None => serde_json::to_string(&event.data).unwrap_or_default(),
+            };
             let time = format!("{:.3}", session.start_s + event.time_s);
             table.row([time.as_str(), &event.event, &data]);
         }

@@ -7,6 +7,7 @@ mod shown;
 mod sink;
 mod text;
 
+use crate::clips;
 use crate::keys;
 use crate::notify::{NotifyArgs, What};
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
@@ -17,6 +18,7 @@ use cellpos_runtime::EndRule;
 use cellpos_script::{
     AmplitudeWatch, Check, CheckLimits, CycleRow, CycleTable, Plan, Script, check,
 };
+use cellpos_session::clips::Clipped;
 use cellpos_session::rig_file::{ActuatorConfig, CameraConfig, ClockKind, Frames, RigFile};
 use cellpos_session::setup::{Prepared, ReferenceSpec, Setup};
 use cellpos_session::view::{Page, Viewed};
@@ -322,6 +324,7 @@ fn start(args: &Args, ready: Ready) -> CommandResult {
     let ticks = (plan.longest_s() + BEFORE_S) * 1e6 / rig.file().timing.period_us;
     connect::room(root, Some(ticks as u64), &meta)?;
     let writer = RunWriter::create(root, meta).map_err(Failure::failed)?;
+    let session = writer.folder().to_owned();
     let folder = home.map_or_else(|| writer.folder().to_owned(), |(folder, _)| folder);
     let sink = sink(writer, &folder, &config, &plan, &setup, &rig)?;
     let mut core = setup.core()?;
@@ -330,12 +333,20 @@ fn start(args: &Args, ready: Ready) -> CommandResult {
         core = core.with_late_solver(faults.spans_ns(FaultKind::SlowSolver));
     }
     let mut view = args.view.open(&mut rig, &setup, &page(&name, &script))?;
-    let sink = Viewed::new(sink.with_page(view.is_some()), view.as_mut());
+    let wishes = script.clips.clone().unwrap_or_default();
+    let clips = clips::of(&mut rig, &session, &wishes)?;
+    let schedule = clips::schedule(&plan, &wishes);
+    let sink = sink.with_page(view.is_some());
+    let sink = Clipped::new(sink, clips, schedule, wishes.events);
+    let sink = Viewed::new(sink, view.as_mut());
     let keys = keys::of_a_script(rig.operator());
     let armed = match rig.arm(&setup, core, sink, EndRule::default()) {
         Ok(armed) => armed,
         Err(not_armed) => {
-            connect::not_armed(not_armed.sink.into_sink().close().0, &not_armed.failure);
+            connect::not_armed(
+                not_armed.sink.into_sink().into_parts().0.close().0,
+                &not_armed.failure,
+            );
             return Err(not_armed.failure);
         }
     };
@@ -433,7 +444,7 @@ fn conclude(
     plan: &Plan,
     folder: &Path,
     mut warnings: Vec<String>,
-    finished: Finished<Viewed<ScriptSink>>,
+    finished: Finished<Viewed<Clipped<ScriptSink>>>,
 ) -> CommandResult {
     warnings.extend(connect::warnings(&finished));
     let Finished {
@@ -445,7 +456,8 @@ fn conclude(
         sink,
         ..
     } = finished;
-    let sink = sink.into_inner(&summary, &ended.seen);
+    let (sink, kept_clips) = sink.into_inner(&summary, &ended.seen).into_parts();
+    warnings.extend(clips::warnings(kept_clips));
     let script = sink.end();
     let outcome = match (ended.as_asked(), script.complete()) {
         (false, _) => summary.state.name(),

@@ -1,6 +1,7 @@
 //! `cellpos track`: hold a bead, or go to a position, in closed loop.
 
 use crate::arguments::positive;
+use crate::clips;
 use crate::keys::{self, Steering};
 use crate::notify::{NotifyArgs, What};
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
@@ -9,6 +10,8 @@ use cellpos_control::{ControllerFile, ControllerKind, LearnedTable, SolverKind};
 use cellpos_record::RunWriter;
 use cellpos_runtime::realtime::Conditions;
 use cellpos_runtime::{EndRule, Summary};
+use cellpos_script::ClipWishes;
+use cellpos_session::clips::Clipped;
 use cellpos_session::cyclic::{self, LearnSpec, Sine};
 use cellpos_session::live_line::{LiveLine, Typed};
 use cellpos_session::recording::Recording;
@@ -165,7 +168,12 @@ pub fn run(args: Args) -> CommandResult {
     };
     let core = setup.core()?;
     let mut view = args.view.open(&mut rig, &setup, &page(&args))?;
-    let sink = Viewed::new(recording, view.as_mut());
+    let clips = match recording.folder() {
+        Some(folder) => clips::of(&mut rig, &folder, &ClipWishes::default())?,
+        None => None,
+    };
+    let sink = Clipped::new(recording, clips, vec![], true);
+    let sink = Viewed::new(sink, view.as_mut());
     let view_um = rig.source().field_um;
     let _keys = (args.clock == ClockKind::Real).then(|| {
         keys::of_a_track(Steering::new(
@@ -179,7 +187,7 @@ pub fn run(args: Args) -> CommandResult {
     match rig.arm(&setup, core, sink, end) {
         Ok(armed) => conclude(&args, &setup, armed.start()?.wait()?),
         Err(not_armed) => {
-            if let Some(writer) = not_armed.sink.into_sink().into_writer() {
+            if let Some(writer) = not_armed.sink.into_sink().into_parts().0.into_writer() {
                 connect::not_armed(writer, &not_armed.failure);
             }
             let reason = not_armed.failure.to_string();
@@ -290,7 +298,11 @@ fn check_target(target: Micrometers, rig: &Rig) -> Result<(), Failure> {
     ))
 }
 
-fn conclude(args: &Args, setup: &Setup, finished: Finished<Viewed<Recording>>) -> CommandResult {
+fn conclude(
+    args: &Args,
+    setup: &Setup,
+    finished: Finished<Viewed<Clipped<Recording>>>,
+) -> CommandResult {
     let mut warnings = connect::warnings(&finished);
     let Finished {
         ended,
@@ -309,8 +321,9 @@ fn conclude(args: &Args, setup: &Setup, finished: Finished<Viewed<Recording>>) -
     } else {
         summary.state.name()
     };
+    let (sink, kept_clips) = sink.into_inner(&summary, &ended.seen).into_parts();
+    warnings.extend(clips::warnings(kept_clips));
     let kept = sink
-        .into_inner(&summary, &ended.seen)
         .into_writer()
         .map(|writer| connect::finish(writer, outcome, &mut summary, &conditions, &mut warnings));
     let whole = kept.as_ref().is_none_or(|kept| kept.whole);

@@ -37,6 +37,18 @@ function begin(told) {
   $("picture-card").hidden = !hello.pictures;
 }
 
+// What led to Safe is held on the screen by itself: the last half second before the PZT began to park.
+let faulted = false;
+function holdFault(time) {
+  if (faulted || hello?.recorded) return;
+  faulted = true;
+  setTimeout(() => {
+    hold(true);
+    mark = time; held = { from: time - 0.5, to: time + 0.1 };
+    answer("Held: the last half second before the PZT began to park. Hold (space) goes on.");
+  }, 400);
+}
+
 function show(told) {
   state = told;
   document.body.dataset.state = state.banner.state;
@@ -67,6 +79,7 @@ function happened(events) {
     item.className = event.level; time.textContent = `${event.time_s.toFixed(3)} s`;
     item.append(time, event.text); // text, never markup
     list.prepend(item);
+    if (event.level === "fault" && event.text.startsWith("The PZT parks")) holdFault(event.time_s);
     if ($("trigger").value === "event" && event.level !== "info" && !hello?.recorded) fire(event.time_s);
   }
   while (list.childElementCount > MOST_EVENTS) list.lastElementChild.remove();

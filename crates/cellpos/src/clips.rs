@@ -1,0 +1,84 @@
+//! Clips of the camera's picture, kept with a run.
+
+use cellpos_script::{ClipWishes, Plan};
+use cellpos_session::clips::{ClipConfig, Clips, Schedule};
+use cellpos_session::{Failure, Rig};
+use std::path::Path;
+
+/// The clips of the next run on a rig, into its folder; none where there are no frames, or where the run is not of the real
+/// clock: there nobody looks on, and the run is over before a picture is written.
+pub fn of(rig: &mut Rig, folder: &Path, wishes: &ClipWishes) -> Result<Option<Clips>, Failure> {
+    let source = rig.source();
+    if source.width_px == 0 || rig.clock().is_virtual() {
+        return Ok(None);
+    }
+    let config = ClipConfig {
+        before_s: wishes.before_s,
+        after_s: wishes.after_s,
+        most_bytes: wishes.most_mb * 1_000_000,
+    };
+    let size = (source.width_px as usize, source.height_px as usize);
+    let rate_hz = 1e6 / rig.file().timing.period_us;
+    let (clips, taker) = Clips::open(folder, config, size, rate_hz)?;
+    rig.watch(taker);
+    Ok(Some(clips))
+}
+
+/// When a script wants clips, by its plan.
+pub fn schedule(plan: &Plan, wishes: &ClipWishes) -> Schedule {
+    let mut schedule = Schedule::new();
+    for number in &wishes.cycles {
+        let Some(cycle) = plan.cycle(number.saturating_sub(1)) else {
+            continue;
+        };
+        for phase in &wishes.phases {
+            let at_s = cycle.start_s + phase * cycle.duration_s;
+            schedule.push((at_s, format!("cycle-{number:06}-phase-{phase:.2}")));
+        }
+    }
+    schedule.sort_by(|a, b| a.0.total_cmp(&b.0));
+    schedule
+}
+
+/// What the user should know of the clips of a run that is over.
+pub fn warnings(clips: Option<Clips>) -> Vec<String> {
+    let Some(clips) = clips else {
+        return Vec::new();
+    };
+    let report = clips.finish();
+    let mut said = Vec::new();
+    if report.no_room > 0 {
+        said.push(format!(
+            "{} clips were not kept: those before them took all that most_mb in [clips] allows",
+            report.no_room
+        ));
+    }
+    if let Some(error) = report.first_error {
+        said.push(format!("a clip could not be written: {error}"));
+    }
+    if report.frames_left_out > 0 && !report.written.is_empty() {
+        said.push(format!(
+            "{} frames are in no clip: they came while clips were written",
+            report.frames_left_out
+        ));
+    }
+    said
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use cellpos_script::Script;
+
+    #[test]
+    fn clips_stand_where_the_cycles_of_the_plan_are() {
+        let text = "[clips]\ncycles = [10, 1, 99]\nphases = [0.0, 0.5]\n[[step]]\ndo = \"hold\"\nduration = \"1s\"\n\
+                    [[step]]\ndo = \"sine\"\namplitude = \"1um\"\nfrequency = \"2Hz\"\ncycles = 20\n";
+        let script = Script::parse(text, "t.toml").unwrap();
+        let plan = Plan::new(&script).unwrap();
+        let schedule = schedule(&plan, &script.clips.unwrap());
+        let times: Vec<f64> = schedule.iter().map(|moment| moment.0).collect();
+        assert_eq!(times, [1.0, 1.25, 5.5, 5.75], "cycle 99 does not exist");
+        assert_eq!(schedule[3].1, "cycle-000010-phase-0.50");
+    }
+}

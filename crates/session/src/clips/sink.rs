@@ -1,0 +1,131 @@
+//! When a clip is kept: around what happened, and where the schedule says.
+
+use super::{Clips, Moment};
+use crate::view::{CycleRow, EventLine, Shown, State};
+use cellpos_control::LearnerState;
+use cellpos_runtime::life::EventKind;
+use cellpos_runtime::{Event, RunSink, Statistics, TickRecord};
+
+/// Moments of a script's plan, in their order: time in the plan, s, and name.
+pub type Schedule = Vec<(f64, String)>;
+
+/// Least time between two clips of what happened, s: a fault that comes and goes is seen in the first.
+const APART_S: f64 = 10.0;
+
+/// A sink that keeps clips of what passes through it.
+pub struct Clipped<S> {
+    sink: S,
+    clips: Option<Clips>,
+    schedule: Schedule,
+    next: usize,
+    events: bool,
+    last: Option<TickRecord>,
+    last_event_s: f64,
+}
+
+impl<S> Clipped<S> {
+    /// A sink that keeps clips, or with none of them what it was. `events`: whether what happens is kept.
+    pub fn new(sink: S, clips: Option<Clips>, schedule: Schedule, events: bool) -> Self {
+        Self {
+            sink,
+            clips,
+            schedule,
+            next: 0,
+            events,
+            last: None,
+            last_event_s: f64::NEG_INFINITY,
+        }
+    }
+
+    /// The sink within, and the clips.
+    pub fn into_parts(self) -> (S, Option<Clips>) {
+        (self.sink, self.clips)
+    }
+
+    fn keep(&self, record: &TickRecord, name: String) {
+        if let Some(moments) = self.clips.as_ref().and_then(|clips| clips.moments.as_ref()) {
+            // The thread is gone only when it failed, which it says at the end.
+            let _ = moments.send(Moment {
+                frame: (record.frame_id, record.mid_exposure_ns),
+                at_ns: record.time_ns,
+                name,
+            });
+        }
+    }
+
+    fn happened(&mut self, event: &Event) {
+        let name = match event.kind {
+            EventKind::FreezeStarted { .. } => "frozen",
+            EventKind::SafeLatched { .. } => "safe",
+            EventKind::BeadReacquired { .. } => "reacquired",
+            EventKind::StuckStarted => "stuck",
+            _ => return,
+        };
+        let time_s = event.time_ns as f64 * 1e-9;
+        // What ends the run is kept in any case.
+        if name != "safe" && time_s - self.last_event_s < APART_S {
+            return;
+        }
+        if let Some(record) = self.last.filter(|_| self.events) {
+            self.last_event_s = time_s;
+            self.keep(&record, format!("{time_s:011.3}s-{name}"));
+        }
+    }
+}
+
+impl<S: RunSink> RunSink for Clipped<S> {
+    fn tick(&mut self, record: &TickRecord) {
+        while let Some((at_s, name)) = self.schedule.get(self.next) {
+            if (record.plan_ns as f64) < at_s * 1e9 {
+                break;
+            }
+            self.keep(record, name.clone());
+            self.next += 1;
+        }
+        self.last = Some(*record);
+        self.sink.tick(record);
+    }
+
+    fn event(&mut self, event: &Event) {
+        self.happened(event);
+        self.sink.event(event);
+    }
+
+    fn repeated(&mut self, last: &Event, count: u64) {
+        self.sink.repeated(last, count);
+    }
+
+    fn note(&mut self, time_ns: i64, text: &str) {
+        self.sink.note(time_ns, text);
+    }
+
+    fn is_ready(&self) -> bool {
+        self.sink.is_ready()
+    }
+
+    fn is_refused(&self) -> bool {
+        self.sink.is_refused()
+    }
+
+    fn learned(&mut self, motion: u16, state: &LearnerState) {
+        self.sink.learned(motion, state);
+    }
+
+    fn progress(&mut self, statistics: &Statistics) {
+        self.sink.progress(statistics);
+    }
+}
+
+impl<S: Shown> Shown for Clipped<S> {
+    fn complete(&self, state: &mut State) {
+        self.sink.complete(state);
+    }
+
+    fn next_cycle(&mut self) -> Option<CycleRow> {
+        self.sink.next_cycle()
+    }
+
+    fn next_line(&mut self) -> Option<EventLine> {
+        self.sink.next_line()
+    }
+}
