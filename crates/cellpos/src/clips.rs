@@ -17,7 +17,7 @@ pub fn of(rig: &mut Rig, folder: &Path, wishes: &ClipWishes) -> Result<Option<Cl
         after_s: wishes.after_s,
         most_bytes: wishes.most_mb * 1_000_000,
     };
-    let size = (source.width_px as usize, source.height_px as usize);
+    let size = (source.width_px, source.height_px);
     let rate_hz = 1e6 / rig.file().timing.period_us;
     let (clips, taker) = Clips::open(folder, config, size, rate_hz)?;
     rig.watch(taker);
