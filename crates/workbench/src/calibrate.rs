@@ -173,7 +173,7 @@ pub fn measure(
     Ok(response)
 }
 
-/// Looks at the frames that have arrived.
+/// Looks at frames that have arrived.
 fn collect(
     camera: &mut dyn Camera,
     eye: &mut Eye,
@@ -181,8 +181,13 @@ fn collect(
     start_ns: i64,
     sightings: &mut Vec<Sighting>,
 ) -> Result<(), Failure> {
+    /// In a step, so that commands go out while a slow machine has more frames than it can look at.
+    const FRAMES: usize = 2;
     let now_ns = Clock::Real.now_ns();
-    while let Some(stamp) = camera.next_frame(buffer, now_ns).map_err(Failure::failed)? {
+    for _ in 0..FRAMES {
+        let Some(stamp) = camera.next_frame(buffer, now_ns).map_err(Failure::failed)? else {
+            break;
+        };
         let at_ns = stamp.mid_exposure_ns;
         if let Some(seen) = eye.look(buffer, (at_ns - start_ns) as f64 * 1e-9)? {
             sightings.push(Sighting {
