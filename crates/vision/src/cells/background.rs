@@ -1,13 +1,14 @@
 //! The empty channel: mean of its frames, noise, and slow changes followed where no cell is.
 
-use super::drift::SAMPLES;
-
 /// Distance from a region within which the background is left alone, px.
 const CLEAR_PX: usize = 6;
 /// Pixels beside that, whose change stands for that behind the region.
 const BESIDE_PX: usize = 12;
 /// Each row of the background is refreshed once in so many frames.
 const REFRESHED_EVERY: usize = 16;
+
+/// At most this many pixels serve for the estimate of a shift.
+pub(super) const SAMPLES: usize = 384;
 
 /// First column and row of a region, and the first behind it, px.
 pub(super) type Bounds = [usize; 4];

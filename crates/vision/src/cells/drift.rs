@@ -3,14 +3,12 @@
 //! Walls are the strongest edges in a channel; a third of a pixel makes lines of them that join what is near. The shift is
 //! found by least squares at the background's own slopes, objects left out, and the background is moved by it.
 
-use super::background::Background;
+use super::background::{Background, SAMPLES};
 
 /// Largest shift that is made good, px.
 const MOST_PX: f64 = 3.0;
 /// Shifts below this are none, px; and below so many standard deviations.
 const LEAST: (f64, f64) = (0.03, 4.0);
-/// At most this many pixels serve for the estimate.
-pub(super) const SAMPLES: usize = 384;
 /// Frames after which these are chosen anew.
 const CHOSEN_EVERY: u32 = 4096;
 const PASSES: usize = 5;

@@ -1,7 +1,7 @@
 //! The finder: background, regions, outlines.
 
 use super::background::Background;
-use super::regions::{Part, Regions};
+use super::regions::{Part, Regions, is_object};
 use super::{Cell, CellConfig, CellError};
 use crate::blobs::Blob;
 use crate::config::ConfigError;
@@ -10,8 +10,6 @@ use crate::outline::{Contrast, MAX_RAYS, Outline, Outliner};
 
 /// An object needs a patch of this many times the threshold.
 const SEED: f64 = 2.0;
-/// A region of this many patches is an object from this share of that on: dust is small.
-const FAINT: (f64, f64) = (6.0, 0.7);
 /// An outline less convex than this is that of two cells: two discs that touch have 0.88.
 const LEAST_SOLIDITY: f64 = 0.93;
 /// Width of a halo that belongs to the cell, px and share of the short half axis.
@@ -287,11 +285,6 @@ impl CellFinder {
             }
         }
     }
-}
-
-/// Whether a region is more than a fluctuation; `strong` is the mean square contrast that a patch of an object has.
-pub(super) fn is_object(blob: &Blob, strong: f64) -> bool {
-    blob.peak >= strong || blob.area_px >= FAINT.0 && blob.peak >= FAINT.1 * FAINT.1 * strong
 }
 
 /// Area of what stands out strongly beyond the outline and its halo, px.

@@ -5,10 +5,11 @@
 //! border of a frame (a header written into the picture, a wall) do not join what is near them.
 
 use super::background::Bounds;
-use super::finder::is_object;
 use crate::blobs::{Blob, Blobs};
 use crate::outline::Start;
 
+/// A region of this many patches is an object from this share of that on: dust is small.
+const FAINT: (f64, f64) = (6.0, 0.7);
 /// Side of a patch, px.
 pub(super) const PATCH: usize = 4;
 /// Share of its RMS contrast that a region's core has at least.
@@ -352,4 +353,9 @@ impl Part {
         let u = x * self.along[0] + y * self.along[1] - self.along[2];
         u >= self.from && u < self.to
     }
+}
+
+/// Whether a region is more than a fluctuation; `strong` is the mean square contrast that a patch of an object has.
+pub(super) fn is_object(blob: &Blob, strong: f64) -> bool {
+    blob.peak >= strong || blob.area_px >= FAINT.0 && blob.peak >= FAINT.1 * FAINT.1 * strong
 }
