@@ -108,7 +108,7 @@ impl Steering {
         if self.steered {
             let from_um = self.operator.target_um().unwrap_or(self.first_um);
             // Steps of a tenth stay round numbers.
-            self.steer(((from_um + by_um) * 1e6).round() * 1e-6);
+            self.steer(((from_um + by_um) * 1e6).round() / 1e6);
         }
     }
 

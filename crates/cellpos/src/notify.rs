@@ -1,5 +1,6 @@
 //! `--notify`: a command of the user's when a run ends, stops or goes safe.
 
+use std::path::Path;
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
@@ -58,6 +59,17 @@ impl NotifyArgs {
             Ok(child) => wait(child).map(|problem| format!("--notify: {problem}")),
             Err(error) => Some(format!("--notify: sh could not be started: {error}")),
         }
+    }
+
+    /// The same at the end of a script, by the word for its outcome.
+    pub fn of_a_script(&self, outcome: &str, reason: &str, folder: &Path) -> Option<String> {
+        let what = match outcome {
+            "done" => What::End,
+            "stopped" | "aborted" => What::Stop,
+            _ => What::Safe,
+        };
+        let name = folder.file_name().unwrap_or(folder.as_os_str());
+        self.tell(what, &name.to_string_lossy(), reason, folder.to_str())
     }
 }
 

@@ -1,7 +1,7 @@
 //! How a run ended, in sentences: what was seen, what was expected, what to do.
 
 use crate::failure::{Failure, describe};
-use crate::words::safe_reason;
+use crate::words::{is_odd, safe_reason};
 use cellpos_rig::{ActuatorFault as Fault, ActuatorState as State};
 use cellpos_runtime::life::{EventKind, Refusal, SafeReason};
 use cellpos_runtime::recorder::RecorderFault;
@@ -118,12 +118,6 @@ impl Clues {
             _ => {}
         }
     }
-}
-
-/// Whether a gain over the model's differs from 1 by more than a rig does from day to day, beyond its 95 % interval.
-pub(crate) fn is_odd(ratio: f64, ci95: f64) -> bool {
-    const USUAL: f64 = 1.25;
-    ratio - ci95 > USUAL || ratio + ci95 < 1.0 / USUAL
 }
 
 /// What the loop was set up to expect.

@@ -1,6 +1,7 @@
 //! What is noted of a run on its way to the sink.
 
-use crate::ended::{Clues, is_odd};
+use crate::ended::Clues;
+use crate::words::is_odd;
 use crate::{say, words};
 use cellpos_control::LearnerState;
 use cellpos_runtime::life::EventKind;

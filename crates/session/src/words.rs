@@ -1,6 +1,5 @@
 //! Events of a run as sentences: for the terminal, the page and the report.
 
-use crate::ended::is_odd;
 use cellpos_runtime::life::{EventKind, FreezeReason, Refusal, SafeReason};
 
 /// How much an event matters to whoever looks on.
@@ -69,6 +68,12 @@ fn refusal(reason: Refusal) -> &'static str {
         Refusal::WrongSign => "the bead moved the other way: is the sign in [calibration] right?",
         Refusal::WrongGain => "the gain is outside what the controller is safe for",
     }
+}
+
+/// Whether a gain over the model's differs from 1 by more than a rig does from day to day, beyond its 95 % interval.
+pub(crate) fn is_odd(ratio: f64, ci95: f64) -> bool {
+    const USUAL: f64 = 1.25;
+    ratio - ci95 > USUAL || ratio + ci95 < 1.0 / USUAL
 }
 
 /// An event in a sentence, and how much it matters.

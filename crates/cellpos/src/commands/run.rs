@@ -1,15 +1,17 @@
 //! `cellpos run`: a setpoint script in closed loop, with a row for each cycle; resumed after whatever ended it.
 
 pub(super) mod learning;
+mod load;
 pub(super) mod resume;
 mod session_config;
 mod shown;
 mod sink;
 mod text;
+mod unshown;
 
 use crate::clips;
 use crate::keys;
-use crate::notify::{NotifyArgs, What};
+use crate::notify::NotifyArgs;
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
 use crate::view_args::ViewArgs;
 use cellpos_emulator::{CellConfig, FaultKind};
@@ -27,8 +29,6 @@ use cellpos_units::Micrometers;
 use learning::Keeper;
 use session_config::SessionConfig;
 use sink::{ScriptSink, Stalls};
-use std::cell::RefCell;
-use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -139,7 +139,7 @@ fn fresh(args: &Args) -> Result<Ready, Failure> {
         ));
     }
     let path = args.script.as_deref().unwrap_or(Path::new(""));
-    let (reference, script, mut inputs) = read(path)?;
+    let (reference, script, mut inputs) = load::script(path)?;
     let mut file = RigFile::load(args.rig.as_deref())?;
     if let Some(seed) = args.seed {
         file.emulator.seed = seed;
@@ -196,42 +196,6 @@ fn rehearse(file: &mut RigFile, model: &str) {
             file.emulator.pixel_um = 0.2;
         }
     }
-}
-
-/// A script with everything that it names, in a form that is kept with the run.
-fn read(path: &Path) -> Result<(ReferenceSpec, Script, Vec<InputFile>), Failure> {
-    let file = path.display().to_string();
-    let text = cellpos_table::read_text(path, cellpos_script::MOST_BYTES).map_err(|error| {
-        Failure::bad_input(
-            format!("{file}: {error}"),
-            "give the path of a script file; see examples/scripts/",
-        )
-    })?;
-    let folder = path.parent().unwrap_or(Path::new(""));
-    let waveforms = RefCell::new(BTreeMap::new());
-    let script = Script::parse_with(&text, &file, &|name| {
-        let text = cellpos_table::read_text(&folder.join(name), cellpos_script::MOST_BYTES)
-            .map_err(|error| error.to_string())?;
-        waveforms
-            .borrow_mut()
-            .insert(name.to_string(), text.clone());
-        Ok(text)
-    })
-    .map_err(Failure::input)?;
-    let waveforms = waveforms.into_inner();
-    let mut inputs = vec![InputFile::of_bytes(&file, text.as_bytes())];
-    inputs.extend(waveforms.iter().map(|(name, text)| {
-        InputFile::of_bytes(&folder.join(name).display().to_string(), text.as_bytes())
-    }));
-    let reference = ReferenceSpec::Script {
-        file,
-        text,
-        from_s: 0.0,
-        ran_s: None,
-        first_length_um: None,
-        waveforms,
-    };
-    Ok((reference, script, inputs))
 }
 
 /// The check of `cellpos check`, with the limits that are in force.
@@ -353,13 +317,6 @@ fn start(args: &Args, ready: Ready) -> CommandResult {
     let finished = armed.start()?.wait()?;
     drop(keys);
     conclude(args, &setup, &plan, &folder, warnings, finished)
-}
-
-/// Name of a run by its folder.
-fn run_name(folder: &Path) -> String {
-    folder
-        .file_name()
-        .map_or_else(String::new, |name| name.to_string_lossy().into_owned())
 }
 
 fn page(name: &str, script: &Script) -> Page {
@@ -484,13 +441,8 @@ fn conclude(
     if let Err(error) = resume::cycles_parquet(folder, &cycles) {
         warnings.push(format!("no cycles.parquet: {error}"));
     }
-    let what = match outcome {
-        "done" => What::End,
-        "stopped" | "aborted" => What::Stop,
-        _ => What::Safe,
-    };
     let said = format!("{outcome}: {}; {ended}", script.name());
-    warnings.extend((args.notify).tell(what, &run_name(folder), &said, folder.to_str()));
+    warnings.extend(args.notify.of_a_script(outcome, &said, folder));
     let report = text::Report::new(
         text::Ending {
             outcome,

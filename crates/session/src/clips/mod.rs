@@ -8,6 +8,7 @@
 //! The camera thread copies each frame into a buffer that exists already; where none is empty the frame is left out and counted.
 //! Everything slow happens on the clip thread.
 
+mod moment;
 mod ring;
 mod sink;
 mod tiff_stack;
@@ -17,6 +18,7 @@ pub use sink::{Clipped, Schedule};
 use crate::failure::Failure;
 use cellpos_rig::{FrameWatch, SeenFrame};
 use cellpos_vision::Pixels;
+use moment::Moment;
 use ring::{Ring, Shot};
 use rtrb::{Consumer, Producer, RingBuffer};
 use std::path::{Path, PathBuf};
@@ -54,17 +56,6 @@ impl Default for ClipConfig {
             most_bytes: 200_000_000,
         }
     }
-}
-
-/// A moment to keep.
-#[derive(Debug, Clone, PartialEq)]
-struct Moment {
-    /// Number of the frame that the loop used then, and its time in the run, ns.
-    frame: (u64, i64),
-    /// When, in the run, ns.
-    at_ns: i64,
-    /// Name of its file, without an ending.
-    name: String,
 }
 
 /// What became of the clips of a run.

@@ -1,6 +1,6 @@
 //! The frames of the last seconds, and the moments that wait for theirs.
 
-use super::Moment;
+use super::moment::Moment;
 use std::collections::VecDeque;
 
 /// A part of a frame.

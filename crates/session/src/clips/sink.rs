@@ -1,6 +1,7 @@
 //! When a clip is kept: around what happened, and where the schedule says.
 
-use super::{Clips, Moment};
+use super::Clips;
+use super::moment::Moment;
 use crate::view::{CycleRow, EventLine, Shown, State};
 use cellpos_control::LearnerState;
 use cellpos_runtime::life::EventKind;

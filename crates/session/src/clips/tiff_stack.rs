@@ -1,6 +1,6 @@
 //! A clip on disk: a TIFF of one page a frame, and a table of their times beside it.
 
-use super::Moment;
+use super::moment::Moment;
 use super::ring::Shot;
 use std::fmt::Write;
 use std::fs::File;

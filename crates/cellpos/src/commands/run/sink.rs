@@ -2,7 +2,7 @@
 
 use super::learning::Keeper;
 use super::session_config::SessionConfig;
-use super::shown::Unshown;
+use super::unshown::Unshown;
 use crate::recording::log_event;
 use cellpos_control::LearnerState;
 use cellpos_record::{Event as LogEvent, Faults, LineFile, RunWriter};
