@@ -18,7 +18,7 @@
 //! for k in 1..=100 {
 //!     world.advance_to(k * 1_000_000, 20.0);
 //!     while let Some(fix) = world.take_position() {
-//!         assert!(fix.position_um.abs() < 3.0);
+//!         assert!(fix.x_um.abs() < 3.0);
 //!         seen += 1;
 //!     }
 //! }

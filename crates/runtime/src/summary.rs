@@ -298,7 +298,7 @@ pub struct Summary {
     pub end: End,
     /// Why Safe was latched, if it was.
     pub safe_reason: Option<SafeReason>,
-    /// From the first tick to the last, s.
+    /// From the start of the run, before the first frame, to the end of the last tick, s.
     pub duration_s: f64,
     /// How far the time of the plan (script) is off the clock's, percent; `None` without a plan, or less than a second of it.
     pub plan_off_percent: Option<f64>,
