@@ -138,7 +138,8 @@ fn an_identification_stopped_by_a_lost_bead_keeps_its_segments_and_goes_on_from_
     assert_eq!(ran.code, Some(1), "{}\n{}", ran.out, ran.err);
     let text = message(&ran);
     assert!(
-        text.contains("the bead was not seen for longer") && text.contains("3 of 5 segments are kept"),
+        text.contains("the bead was not seen for longer")
+            && text.contains("3 of 5 segments are kept"),
         "{text}"
     );
     assert!(text.contains("--resume m.partial.json"), "{text}");
