@@ -37,7 +37,7 @@ export function number(value, span) {
   return (Math.abs(value) < 1e-12 ? 0 : value).toFixed(digits);
 }
 
-const LEFT = 62, RIGHT = 10, TOP = 8, BOTTOM = 24, GAP = 12;
+const LEFT = 74, RIGHT = 10, TOP = 8, BOTTOM = 24, GAP = 12;
 export const PANELS = [
   { share: 0.42, unit: "um", series: [["measured", "position", "position"], ["target", "target", "target"]] },
   { share: 0.29, unit: "nm", series: [["error", "error", "position"]], zero: true },
