@@ -6,7 +6,7 @@
 //! doubles every frame does not fill the disk with the news.
 //!
 //! A sink that panics, that has been refusing for longer than [`REFUSED_NS`], or that does not come back from a call
-//! ([`Pulse`]) is a fault of the run ([`RecorderFault`]): the bead is frozen and the PZT parked, because a measurement that nobody keeps is worth nothing. The
+//! (`Pulse`) is a fault of the run ([`RecorderFault`]): the bead is frozen and the PZT parked, because a measurement that nobody keeps is worth nothing. The
 //! rings are drained all the same and every record that found no taker is counted.
 
 use crate::life::{Event, EventKind};
