@@ -353,7 +353,7 @@ fn margins_are_three_standard_deviations_of_the_identified_model_and_never_less_
     assert_eq!((sharp.gain_factor, sharp.delay_s), (1.1, 0.05e-3));
     assert_eq!(sharp.gain_source, MarginSource::Floor);
     assert_eq!(sharp.delay_source, MarginSource::Floor);
-    // An interval across nought, and one without end, say nothing.
+    // An interval across zero, and one without end, say nothing.
     let useless = identified([-1.0, 800.0], [0.0, f64::INFINITY]);
     assert_eq!(
         Uncertainty::of_model(&useless, 2e-3),

@@ -10,7 +10,7 @@
 //! assert_eq!(allocations_of(|| drop(std::hint::black_box(vec![1_u8; 64]))), 1);
 //! assert_eq!(allocations_of(|| assert_eq!(std::hint::black_box(2) + 2, 4)), 0);
 //! ```
-//! Where it is not installed the count stays nought, so a test that asserts a count of nought also shows that its counter
+//! Where it is not installed the count stays zero, so a test that asserts a count of zero also shows that its counter
 //! counts. What is freed is not counted: what is freed was allocated before. Nor is it meant for finding out where an
 //! allocation comes from; a debugger stopped in [`CountingAllocator`]'s `alloc` tells that.
 #![allow(unsafe_code)]

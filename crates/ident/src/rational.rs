@@ -9,7 +9,7 @@ use nalgebra::{Complex, DMatrix, DVector};
 
 use crate::error::IdentError;
 use crate::frequency_response::FrequencyPoint;
-use crate::least_squares::{covariance, minimise};
+use crate::least_squares::{Minimum, covariance, minimise};
 use crate::sampled::{Hold, PartialFractions, Sampling};
 
 /// A fitted rational model.
@@ -150,34 +150,16 @@ pub fn fit_rational(
             out[2 * i + 1] = e.im;
         }
     };
-    let steps = vec![1e-6; parameters];
-    let delays = 10;
-    let mut best: Option<crate::least_squares::Minimum> = None;
-    for i in 0..delays {
+    let starts = (0..10).filter_map(|i| {
         let delay_s = i as f64 * 0.5 * sampling.period_s;
-        let Some(start) =
-            sanathanan_koerner(points, &weights, sampling, order, zeros, scale, delay_s)
-        else {
-            continue;
-        };
-        let mut x = start;
+        let mut x = sanathanan_koerner(points, &weights, sampling, order, zeros, scale, delay_s)?;
         x.push(delay_s * scale);
-        let mut r = vec![0.0; 2 * points.len()];
-        fill(&x, &mut r);
-        if !r.iter().all(|v| v.is_finite()) {
-            continue;
-        }
-        let found = minimise(&x, &steps, 2 * points.len(), fill);
-        if found.chi2.is_finite() && best.as_ref().is_none_or(|b| found.chi2 < b.chi2) {
-            best = Some(found);
-        }
-    }
-    let Some(found) = best else {
-        return Err(IdentError::NoFit {
-            what: "a rational model",
-            reason: "no start led to a finite residual",
-        });
-    };
+        Some(x)
+    });
+    let found = best_minimum(starts, 2 * points.len(), &fill).ok_or(IdentError::NoFit {
+        what: "a rational model",
+        reason: "no start led to a finite residual",
+    })?;
     let (numerator, denominator, delay_s) = unscale(&found.parameters);
     let dof = 2.0 * points.len() as f64 - parameters as f64;
     let spread = if dof > 0.0 {
@@ -216,6 +198,27 @@ pub fn fit_rational(
         dof,
         aicc: found.chi2 + 2.0 * k + correction,
     })
+}
+
+/// The lowest of the minima that the starts lead to, of residuals that are finite at the start.
+fn best_minimum(
+    starts: impl Iterator<Item = Vec<f64>>,
+    residuals: usize,
+    fill: &impl Fn(&[f64], &mut [f64]),
+) -> Option<Minimum> {
+    let mut best: Option<Minimum> = None;
+    for x in starts {
+        let mut r = vec![0.0; residuals];
+        fill(&x, &mut r);
+        if !r.iter().all(|v| v.is_finite()) {
+            continue;
+        }
+        let found = minimise(&x, &vec![1e-6; x.len()], residuals, fill);
+        if found.chi2.is_finite() && best.as_ref().is_none_or(|b| found.chi2 < b.chi2) {
+            best = Some(found);
+        }
+    }
+    best
 }
 
 /// Refuses points that cannot determine so many parameters; gives their number back.

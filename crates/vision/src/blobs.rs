@@ -101,7 +101,7 @@ impl Blobs {
         }
     }
 
-    /// Runs of pixels left out of the last frame for want of room: when not nought, the frame is not a picture of a
+    /// Runs of pixels left out of the last frame for want of room: when not zero, the frame is not a picture of a
     /// few objects.
     pub fn dropped_runs(&self) -> u64 {
         self.dropped_runs

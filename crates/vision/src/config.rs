@@ -193,6 +193,20 @@ impl LocaliserConfig {
     /// # Errors
     /// Names the first setting that cannot be used.
     pub fn template(&self) -> Result<Template, ConfigError> {
+        let (key, size_px) = self.check_size()?;
+        self.check_limits()?;
+        self.learning.as_ref().map_or(Ok(()), Learning::check)?;
+        self.noise.check()?;
+        let refused = ConfigError {
+            key,
+            value: size_px,
+            must_be: "a finite size above 0 px",
+        };
+        self.profile.template(self.pixel_response).ok_or(refused)
+    }
+
+    /// The profile's key and size, where size and window go together.
+    fn check_size(&self) -> Result<(&'static str, f64), ConfigError> {
         let check = ConfigError::unless;
         let (key, size_px) = match self.profile {
             ProfileSpec::Ring { edge_px } => ("profile.edge_px", edge_px),
@@ -219,7 +233,11 @@ impl LocaliserConfig {
             self.window_px as f64,
             "at least as wide as the bead, in px",
         )?;
-        let at_least = |v: f64, low: f64| v.is_finite() && v >= low;
+        Ok((key, size_px))
+    }
+
+    fn check_limits(&self) -> Result<(), ConfigError> {
+        let check = ConfigError::unless;
         check(
             at_least(self.min_snr, 1.0),
             "min_snr",
@@ -245,61 +263,64 @@ impl LocaliserConfig {
             "max_passes",
             f64::from(passes),
             "between 3 and 50 passes",
-        )?;
-        if let Some(Learning {
-            first_fixes,
-            max_change,
-            ..
-        }) = self.learning
-        {
-            check(
-                first_fixes >= 5,
-                "learning.first_fixes",
-                f64::from(first_fixes),
-                "5 fixes or more",
-            )?;
-            let allowed = max_change > 0.0 && max_change <= 0.5;
-            check(
-                allowed,
-                "learning.max_change",
-                max_change,
-                "a fraction above 0, at most 0.5",
-            )?;
-        }
-        if let Noise::Known {
-            read_sd_grey,
-            shot_grey_per_electron,
-            black_level_grey,
-        } = self.noise
-        {
-            let positive = read_sd_grey.is_finite() && read_sd_grey > 0.0;
-            check(
-                positive,
-                "noise.read_sd_grey",
-                read_sd_grey,
-                "above 0 grey levels",
-            )?;
-            let gain = shot_grey_per_electron;
-            check(
-                at_least(gain, 0.0),
-                "noise.shot_grey_per_electron",
-                gain,
-                "0 grey levels per electron or more",
-            )?;
-            check(
-                black_level_grey.is_finite(),
-                "noise.black_level_grey",
-                black_level_grey,
-                "a finite grey level",
-            )?;
-        }
-        let refused = ConfigError {
-            key,
-            value: size_px,
-            must_be: "a finite size above 0 px",
-        };
-        self.profile.template(self.pixel_response).ok_or(refused)
+        )
     }
+}
+
+impl Learning {
+    fn check(&self) -> Result<(), ConfigError> {
+        let check = ConfigError::unless;
+        check(
+            self.first_fixes >= 5,
+            "learning.first_fixes",
+            f64::from(self.first_fixes),
+            "5 fixes or more",
+        )?;
+        let allowed = self.max_change > 0.0 && self.max_change <= 0.5;
+        check(
+            allowed,
+            "learning.max_change",
+            self.max_change,
+            "a fraction above 0, at most 0.5",
+        )
+    }
+}
+
+impl Noise {
+    fn check(&self) -> Result<(), ConfigError> {
+        let check = ConfigError::unless;
+        let Noise::Known {
+            read_sd_grey,
+            shot_grey_per_electron: gain,
+            black_level_grey,
+        } = *self
+        else {
+            return Ok(());
+        };
+        let positive = read_sd_grey.is_finite() && read_sd_grey > 0.0;
+        check(
+            positive,
+            "noise.read_sd_grey",
+            read_sd_grey,
+            "above 0 grey levels",
+        )?;
+        check(
+            at_least(gain, 0.0),
+            "noise.shot_grey_per_electron",
+            gain,
+            "0 grey levels per electron or more",
+        )?;
+        check(
+            black_level_grey.is_finite(),
+            "noise.black_level_grey",
+            black_level_grey,
+            "a finite grey level",
+        )
+    }
+}
+
+fn at_least(value: f64, low: f64) -> bool {
+    value.is_finite() && value >= low
 }
 
 #[cfg(test)]

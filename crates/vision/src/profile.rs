@@ -16,7 +16,7 @@ const RING_KNOTS: [f64; 27] = [
 /// Knots per edge radius of [`RING_KNOTS`].
 const RING_KNOTS_PER_EDGE: f64 = 10.0;
 
-/// The radius, in standard deviations, beyond which the Gaussian is taken as nought (4e-6 of the peak).
+/// The radius, in standard deviations, beyond which the Gaussian is taken as zero (4e-6 of the peak).
 const GAUSSIAN_SUPPORT_SIGMA: f64 = 5.0;
 
 /// Normalised radial profile of a bead: 1 at the centre, 0 beyond [`RadialProfile::support_px`].
@@ -27,7 +27,7 @@ pub trait RadialProfile {
     fn slope(&self, r_px: f64) -> f64;
     /// Radius of the bead, px: the edge of a ring profile, twice the standard deviation of a Gaussian.
     fn radius_px(&self) -> f64;
-    /// Radius beyond which the profile is nought, px.
+    /// Radius beyond which the profile is zero, px.
     fn support_px(&self) -> f64;
 
     /// Value averaged over the area of a pixel whose centre is at `r_px`: `f + (f'' + f'/r) / 24`, the first term of
@@ -67,7 +67,7 @@ pub struct SplineProfile {
 }
 
 impl SplineProfile {
-    /// A profile through `values` at the radii 0, `knot_px`, 2 `knot_px` ..., nought beyond the last; `radius_px` is the
+    /// A profile through `values` at the radii 0, `knot_px`, 2 `knot_px` ..., zero beyond the last; `radius_px` is the
     /// bead's radius. `None` for fewer than three values, a value that is not finite, or a distance not above zero.
     pub fn new(values: &[f64], knot_px: f64, radius_px: f64) -> Option<Self> {
         let positive = |v: f64| v.is_finite() && v > 0.0;
@@ -125,7 +125,7 @@ impl RadialProfile for SplineProfile {
     }
 }
 
-/// Value of the spline at `u` knot distances from the centre, nought beyond the last knot.
+/// Value of the spline at `u` knot distances from the centre, zero beyond the last knot.
 pub(crate) fn spline_value(values: &[f64], curvatures: &[f64], u: f64) -> f64 {
     let i = u as usize;
     let (Some([v0, v1]), Some([c0, c1])) = (values.get(i..i + 2), curvatures.get(i..i + 2)) else {
@@ -391,7 +391,7 @@ impl Template {
         self.radius_px
     }
 
-    /// Radius beyond which the profile is nought, px.
+    /// Radius beyond which the profile is zero, px.
     pub fn support_px(&self) -> f64 {
         self.support_px
     }

@@ -235,7 +235,7 @@ impl Tally {
                 }
             }
         }
-        // Large steps hide small errors: what lies within two standard errors of nought shows nothing.
+        // Large steps hide small errors: what lies within two standard errors of zero shows nothing.
         (-sum > 2.0 * f64::sqrt(squares)).then(|| (-sum / n).sqrt())
     }
 }

@@ -140,17 +140,11 @@ impl IndustrialCamera {
             .map_err(refused("this pixel format", "set bits to 8, or to 16"))?;
         if let Some(r) = settings.region {
             let pixels = |n: usize| i32::try_from(n).unwrap_or(i32::MAX);
-            camera
-                .set_region(
-                    pixels(r.x_px),
-                    pixels(r.y_px),
-                    pixels(r.width_px),
-                    pixels(r.height_px),
-                )
-                .map_err(refused(
-                    &format!("the region {r}"),
-                    "give one that its sensor and its steps allow",
-                ))?;
+            let [x, y, width, height] = [r.x_px, r.y_px, r.width_px, r.height_px].map(pixels);
+            camera.set_region(x, y, width, height).map_err(refused(
+                &format!("the region {r}"),
+                "give one that its sensor and its steps allow",
+            ))?;
         }
         if let Some(exposure_us) = settings.exposure_us {
             let remedy = "give an exposure shorter than the frame interval";

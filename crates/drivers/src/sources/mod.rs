@@ -99,7 +99,7 @@ pub enum SourceError {
         /// Its name.
         name: &'static str,
     },
-    /// A frame of nought pixels, or of more than can be.
+    /// A frame without pixels, or of more than can be.
     #[error("{}: frames of {width} x {height} px: from 1 x 1 to 2^26 pixels are possible", path.display())]
     Size {
         /// Which file.
