@@ -206,12 +206,12 @@ const MOST_LINES: usize = 500;
 /// Files that are longer and wait to be taken apart: none may join them.
 const LONG: [&str; 12] = [
     "crates/cellpos/src/commands/report.rs",
-    "crates/cellpos/tests/scripts.rs",
-    "crates/drivers/tests/recordings.rs",
-    "crates/emulator/tests/world.rs",
-    "crates/link/tests/vectors.rs",
+    "crates/cellpos/tests/all/scripts.rs",
+    "crates/drivers/tests/all/recordings.rs",
+    "crates/emulator/tests/all/world.rs",
+    "crates/link/tests/all/vectors.rs",
     "crates/plant/src/simulate.rs",
-    "crates/record/tests/run.rs",
+    "crates/record/tests/all/run.rs",
     "crates/session/src/rig.rs",
     "crates/session/src/rig_file.rs",
     "crates/vision/src/profile.rs",

@@ -1,0 +1,177 @@
+//! `cellpos identify` with a sweep, on the rig of a rig.toml, and when the bead is lost on the way.
+
+use crate::common::{Ran, cellpos, number, succeed};
+use serde_json::Value;
+use std::path::Path;
+
+const TRUE_GAIN_PER_S: f64 = 428.13;
+
+fn rig(folder: &Path, name: &str, text: &str) {
+    std::fs::write(folder.join(name), text).unwrap();
+}
+
+fn gain(result: &Value) -> f64 {
+    number(&result["parameters"]["gain_per_s"], "value")
+}
+
+fn message(ran: &Ran) -> String {
+    let text = ran.err.replace(['│', '\n'], " ");
+    text.split_whitespace().collect::<Vec<_>>().join(" ")
+}
+
+#[test]
+fn a_log_sweep_finds_gain_and_delay_too() {
+    let folder = tempfile::tempdir().unwrap();
+    let r = succeed(
+        folder.path(),
+        "identify --excitation sweep --seed 3 --json --out m.toml --report r.html",
+    )
+    .json();
+    let k = &r["parameters"]["gain_per_s"];
+    println!("sweep: {k}, delay {}", r["parameters"]["delay_ms"]["value"]);
+    assert!((gain(&r) / TRUE_GAIN_PER_S - 1.0).abs() < 0.03, "{k}");
+    let ends = |i: usize| k["ci95"][i].as_f64().unwrap();
+    assert!(
+        ends(0) < TRUE_GAIN_PER_S && TRUE_GAIN_PER_S < ends(1),
+        "{k}"
+    );
+    assert!((number(&r["parameters"]["delay_ms"], "value") - 2.0).abs() < 0.05);
+    for line in r["frequencies"].as_array().unwrap() {
+        let miss = |a: &str, b: &str| (number(line, a) - number(line, b)).abs();
+        assert!(
+            miss("gain_db", "eq6_gain_db") < 0.2 + 4.0 * number(line, "gain_sd_db"),
+            "{line}"
+        );
+        assert!(
+            miss("phase_deg", "eq6_phase_deg") < 1.0 + 4.0 * number(line, "phase_sd_deg"),
+            "{line}"
+        );
+    }
+}
+
+#[test]
+fn on_the_rig_of_a_rig_toml_the_same_plant_comes_out_through_the_loop_of_track() {
+    let folder = tempfile::tempdir().unwrap();
+    rig(folder.path(), "rig.toml", "[emulator]\nseed = 3\n");
+    let line = "identify --rig rig.toml --json --out m.toml --report r.html";
+    let r = succeed(folder.path(), line).json();
+    println!("through the loop: K {}", r["parameters"]["gain_per_s"]);
+    assert_eq!(number(&r, "seed"), 3.0);
+    assert!((gain(&r) / TRUE_GAIN_PER_S - 1.0).abs() < 0.01, "{r}");
+    // A record's delay ends at the tick, the camera's at the arrival of the frame.
+    let wait_ms = number(&r["delay"], "arrival_to_tick_ms");
+    assert!((0.0..0.1).contains(&wait_ms), "{wait_ms}");
+    assert!((number(&r["delay"], "led_ms") - wait_ms - 2.0).abs() < 0.05);
+    let lines = r["frequencies"].as_array().unwrap();
+    assert_eq!(lines.len(), 10);
+    for line in lines {
+        let miss = |a: &str, b: &str| (number(line, a) - number(line, b)).abs();
+        assert!(miss("gain_db", "eq6_gain_db") < 0.2, "{line}");
+        assert!(miss("phase_deg", "eq6_phase_deg") < 1.0, "{line}");
+    }
+}
+
+#[test]
+fn a_camera_later_than_the_rig_file_says_is_measured_and_the_file_is_said_to_be_wrong() {
+    let folder = tempfile::tempdir().unwrap();
+    // Half the exposure comes on top: 4 ms from its middle to the tick, the file says 2.
+    let mut late = cellpos_plant::Model::eq6();
+    late.effects
+        .push(cellpos_plant::effects::time_delay(0.003_75));
+    std::fs::write(folder.path().join("late.toml"), late.to_toml_string()).unwrap();
+    rig(
+        folder.path(),
+        "rig.toml",
+        "[emulator]\nseed = 4\nmodel = \"late.toml\"\n",
+    );
+    let line =
+        "identify --rig rig.toml --frames off --bootstrap 0 --json --out m.toml --report r.html";
+    let r = succeed(folder.path(), line).json();
+    assert!((gain(&r) / TRUE_GAIN_PER_S - 1.0).abs() < 0.01, "{r}");
+    let delay_ms = number(&r["parameters"]["delay_ms"], "value");
+    assert!((delay_ms - 4.0).abs() < 0.05, "{delay_ms}");
+    let warnings = r["warnings"].as_array().unwrap();
+    let told = |w: &Value| w.as_str().unwrap().contains("camera_delay_ms = 4.00");
+    assert_eq!(warnings.iter().filter(|w| told(w)).count(), 1, "{r}");
+    for line in r["frequencies"].as_array().unwrap() {
+        let miss = |a: &str, b: &str| (number(line, a) - number(line, b)).abs();
+        assert!(miss("phase_deg", "eq6_phase_deg") < 1.0, "{line}");
+    }
+}
+
+const FEW: &str = "--frequency 5Hz,10Hz,20Hz,50Hz,120Hz --bootstrap 0 --led-edges 0 --json --out m.toml --report r.html";
+
+#[test]
+fn a_segment_in_which_the_bead_was_lost_is_measured_again() {
+    let folder = tempfile::tempdir().unwrap();
+    rig(
+        folder.path(),
+        "rig.toml",
+        "[emulator.faults]\nevent = [{ kind = \"lose-bead\", at_s = 12.0, for_s = 0.3 }]\n",
+    );
+    let ran = succeed(folder.path(), &format!("identify --rig rig.toml {FEW}"));
+    let r = ran.json();
+    assert!((gain(&r) / TRUE_GAIN_PER_S - 1.0).abs() < 0.02, "{r}");
+    assert_eq!(r["frequencies"].as_array().unwrap().len(), 5);
+    assert!(
+        message(&ran).contains("measuring again what is missing"),
+        "{}",
+        ran.err
+    );
+}
+
+#[test]
+fn an_identification_stopped_by_a_lost_bead_keeps_its_segments_and_goes_on_from_them() {
+    let folder = tempfile::tempdir().unwrap();
+    rig(
+        folder.path(),
+        "bad.toml",
+        "[emulator.faults]\nevent = [{ kind = \"lose-bead\", at_s = 17.0 }]\n",
+    );
+    rig(folder.path(), "good.toml", "[emulator]\nseed = 2\n");
+    let ran = cellpos(
+        folder.path(),
+        &format!("identify --rig bad.toml --seed 2 {FEW}"),
+    );
+    assert_eq!(ran.code, Some(1), "{}\n{}", ran.out, ran.err);
+    let text = message(&ran);
+    assert!(
+        text.contains("the bead was not seen for longer")
+            && text.contains("3 of 5 segments are kept"),
+        "{text}"
+    );
+    assert!(text.contains("--resume m.partial.json"), "{text}");
+    assert!(!folder.path().join("m.toml").exists());
+
+    let kept: Value = serde_json::from_str(
+        &std::fs::read_to_string(folder.path().join("m.partial.json")).unwrap(),
+    )
+    .unwrap();
+    let done = kept["segments"].as_array().unwrap().len();
+    assert!((1..5).contains(&done), "{done}");
+    let r = succeed(
+        folder.path(),
+        &format!("identify --rig good.toml --resume m.partial.json {FEW}"),
+    )
+    .json();
+    assert!((gain(&r) / TRUE_GAIN_PER_S - 1.0).abs() < 0.02, "{r}");
+    assert_eq!(r["frequencies"].as_array().unwrap().len(), 5);
+
+    // Another experiment, a damaged file, no file.
+    rig(folder.path(), "cut.json", "{\"plan\": [");
+    for (line, says) in [
+        (
+            "identify --rig good.toml --resume m.partial.json --frequency 5Hz,10Hz",
+            "other lines",
+        ),
+        ("identify --rig good.toml --resume cut.json", "cut.json"),
+        ("identify --rig good.toml --resume none.json", "cannot read"),
+    ] {
+        let ran = cellpos(
+            folder.path(),
+            &format!("{line} --led-edges 0 --out x.toml --report x.html"),
+        );
+        assert_eq!(ran.code, Some(2), "{line}\n{}", ran.err);
+        assert!(message(&ran).contains(says), "{line}\n{}", ran.err);
+    }
+}

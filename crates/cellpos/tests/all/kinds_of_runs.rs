@@ -1,0 +1,268 @@
+//! Every kind of run through every command that reads one; what is missing or damaged around a run.
+
+use crate::common::{cellpos, succeed};
+use serde_json::Value;
+use std::path::{Path, PathBuf};
+
+const FAST: &str = "--clock virtual --frames off --json";
+
+/// The one folder below `runs` that a command has made.
+fn made(folder: &Path, line: &str) -> PathBuf {
+    let list = || -> Vec<PathBuf> {
+        let entries = std::fs::read_dir(folder.join("runs")).into_iter().flatten();
+        entries.flatten().map(|entry| entry.path()).collect()
+    };
+    let before = list();
+    succeed(folder, line);
+    let mut new = list();
+    new.retain(|run| !before.contains(run));
+    assert_eq!(new.len(), 1, "{line}");
+    new.remove(0)
+}
+
+fn script(folder: &Path) {
+    let text = "name = \"quick\"\n[[step]]\ndo = \"sine\"\namplitude = \"1um\"\nfrequency = \"20Hz\"\ncycles = 40\n\
+                [[step]]\ndo = \"hold\"\nduration = \"100ms\"\n";
+    std::fs::write(folder.join("quick.toml"), text).unwrap();
+}
+
+/// Makes a run what a kill leaves: no end, and the beginning of its records.
+fn killed(run: &Path, share: f64) {
+    let meta = std::fs::read_to_string(run.join("run.toml")).unwrap();
+    std::fs::write(run.join("run.toml"), &meta[..meta.find("[end]").unwrap()]).unwrap();
+    let _ = std::fs::remove_file(run.join("ticks.parquet"));
+    let ticks = std::fs::OpenOptions::new()
+        .write(true)
+        .open(run.join("ticks.arrow"))
+        .unwrap();
+    let length = ticks.metadata().unwrap().len();
+    ticks.set_len((length as f64 * share) as u64).unwrap();
+}
+
+/// A run of a script that was killed and gone on with.
+fn resumed(folder: &Path) -> PathBuf {
+    let run = made(folder, &format!("run quick.toml --name resumed {FAST}"));
+    killed(&run, 0.6);
+    let table = std::fs::read_to_string(run.join("cycles.csv")).unwrap();
+    let rows: Vec<&str> = table.lines().take(1 + 20).collect();
+    std::fs::write(run.join("cycles.csv"), rows.join("\n") + "\n").unwrap();
+    succeed(folder, &format!("run --resume {} --json", run.display()));
+    run
+}
+
+fn lines(path: &Path) -> u64 {
+    std::fs::read_to_string(path).unwrap().lines().count() as u64
+}
+
+#[test]
+fn every_kind_of_run_goes_through_every_command_that_reads_one() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    script(at);
+    let cell = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples/cell.toml");
+    let learn = "--sine 2um@20Hz --learn --duration 5s --name learned";
+    let cut = made(
+        at,
+        &format!("track --target 1um --duration 20s --name cut {FAST}"),
+    );
+    killed(&cut, 0.8);
+    let bare = made(
+        at,
+        &format!("track --target 1um --duration 3s --name bare {FAST}"),
+    );
+    // Without a summary: as a version that knew none, or a disk that was full at the end, leaves it.
+    let meta = std::fs::read_to_string(bare.join("run.toml")).unwrap();
+    let end = meta.find("[end.summary]").unwrap();
+    std::fs::write(bare.join("run.toml"), &meta[..end]).unwrap();
+    let runs = [
+        (
+            "track",
+            made(at, &format!("track --target 1um --duration 4s {FAST}")),
+        ),
+        (
+            "learned",
+            made(at, &format!("track --target 0um {learn} {FAST}")),
+        ),
+        ("script", made(at, &format!("run quick.toml {FAST}"))),
+        (
+            "script that learns",
+            made(
+                at,
+                &format!("run quick.toml --learn --name learning {FAST}"),
+            ),
+        ),
+        ("resumed", resumed(at)),
+        (
+            "cell",
+            made(
+                at,
+                &format!(
+                    "track --target 0um --duration 3s --name cell --rig {} --clock virtual --json",
+                    cell.display()
+                ),
+            ),
+        ),
+        ("killed", cut),
+        ("without a summary", bare),
+    ];
+    for (kind, run) in &runs {
+        let path = run.display();
+        let exported: Value = succeed(at, &format!("export {path} --json")).json();
+        let rows = exported["rows"].as_u64().unwrap();
+        assert!(rows > 1500, "{kind}: {exported}");
+        let csv = PathBuf::from(format!("{path}.csv"));
+        assert_eq!(lines(&csv), 1 + rows, "{kind}");
+        let parquet: Value = succeed(at, &format!("export {path} --format parquet --json")).json();
+        assert_eq!(parquet["rows"], rows, "{kind}");
+
+        let replay = succeed(at, &format!("replay {path} --json")).json();
+        assert_eq!(replay["ticks"], rows, "{kind}: {replay}");
+        assert_eq!(replay["identical"], rows, "{kind}: {replay}");
+
+        succeed(at, &format!("report {path} --json"));
+        assert!(run.join("report.html").is_file(), "{kind}");
+
+        let bundle = succeed(at, &format!("bundle {path} --json")).json();
+        assert_eq!(
+            bundle["inputs_missing"].as_array().map(Vec::len),
+            Some(0),
+            "{kind}: {bundle}"
+        );
+        succeed(at, &format!("bundle --verify {path}-bundle"));
+
+        let simulated = format!("{path}-simulated.csv");
+        succeed(
+            at,
+            &format!("simulate --model eq6 --input {path} --out {simulated}"),
+        );
+    }
+    let (_, resumed) = &runs[4];
+    let of_sessions = succeed(at, &format!("export {} --force --json", resumed.display())).json();
+    assert_eq!(of_sessions["sessions"], 2);
+    let csv = std::fs::read_to_string(format!("{}.csv", resumed.display())).unwrap();
+    let times: Vec<f64> = csv
+        .lines()
+        .skip(1)
+        .map(|line| line.split(',').next().unwrap().parse().unwrap())
+        .collect();
+    assert!(
+        times.windows(2).all(|pair| pair[1] > pair[0]),
+        "one axis of time"
+    );
+}
+
+#[test]
+fn a_run_whose_table_of_cycles_is_gone_goes_on_where_its_ticks_end() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    script(at);
+    let run = made(at, &format!("run quick.toml {FAST}"));
+    let whole = std::fs::read_to_string(run.join("cycles.csv")).unwrap();
+    killed(&run, 0.6);
+    std::fs::remove_file(run.join("cycles.csv")).unwrap();
+    succeed(at, &format!("run --resume {} --json", run.display()));
+    let cycles: Vec<String> = std::fs::read_to_string(run.join("cycles.csv"))
+        .unwrap()
+        .lines()
+        .map(str::to_owned)
+        .collect();
+    let numbers: Vec<usize> = cycles[1..]
+        .iter()
+        .map(|line| line.split(',').next().unwrap().parse().unwrap())
+        .collect();
+    assert_eq!(numbers, (0..40).collect::<Vec<usize>>());
+    let first: Vec<&str> = whole.lines().take(11).collect();
+    assert_eq!(
+        cycles[..11],
+        first,
+        "the rows that the run had are the rows that the ticks give"
+    );
+}
+
+#[test]
+fn what_was_learned_is_expendable() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    script(at);
+    let run = made(at, &format!("run quick.toml --learn {FAST}"));
+    let learned = run.join("learned.toml");
+    let text = std::fs::read_to_string(&learned).unwrap();
+    std::fs::write(&learned, &text[..text.len() / 2]).unwrap();
+    let ran = succeed(at, &format!("report {} --json", run.display()));
+    assert!(
+        ran.err.contains("learned.toml") && ran.err.contains("left out"),
+        "{}",
+        ran.err
+    );
+    killed(&run, 0.6);
+    let table = std::fs::read_to_string(run.join("cycles.csv")).unwrap();
+    let rows: Vec<&str> = table.lines().take(1 + 20).collect();
+    std::fs::write(run.join("cycles.csv"), rows.join("\n") + "\n").unwrap();
+    succeed(at, &format!("run --resume {} --json", run.display()));
+}
+
+#[cfg(unix)]
+#[test]
+fn a_bundle_follows_links_when_it_is_packed_and_trusts_none_when_it_is_verified() {
+    use std::os::unix::fs::symlink;
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    let run = made(at, &format!("track --target 0um --duration 1s {FAST}"));
+    std::fs::write(at.join("notes.txt"), "notes").unwrap();
+    symlink(at.join("notes.txt"), run.join("notes.txt")).unwrap();
+    // A folder of the name that an earlier version used for its half-made bundles is somebody's.
+    std::fs::create_dir(at.join("packed.part")).unwrap();
+    std::fs::write(at.join("packed.part/mine"), "mine").unwrap();
+    succeed(at, &format!("bundle {} --out packed", run.display()));
+    assert!(at.join("packed.part/mine").is_file());
+    let copy = at.join("packed/notes.txt");
+    assert!(!copy.is_symlink() && std::fs::read_to_string(&copy).unwrap() == "notes");
+    succeed(at, "bundle --verify packed");
+
+    let manifest = at.join("packed/MANIFEST.sha256");
+    let honest = std::fs::read_to_string(&manifest).unwrap();
+    std::fs::remove_file(&copy).unwrap();
+    symlink(at.join("notes.txt"), &copy).unwrap();
+    let ran = cellpos(at, "bundle --verify packed");
+    assert_eq!(ran.code, Some(1), "{}", ran.out);
+    assert!(ran.out.contains("notes.txt"), "{}", ran.out);
+    std::fs::remove_file(&copy).unwrap();
+    std::fs::write(&copy, "notes").unwrap();
+    let line = honest
+        .lines()
+        .find(|line| line.ends_with("notes.txt"))
+        .unwrap();
+    let outside = line.replace("notes.txt", "../notes.txt");
+    std::fs::write(&manifest, format!("{honest}{outside}\n")).unwrap();
+    let ran = cellpos(at, "bundle --verify packed");
+    assert_eq!(ran.code, Some(1), "{}", ran.out);
+    assert!(ran.out.contains("leads out of the bundle"), "{}", ran.out);
+}
+
+#[test]
+fn a_device_is_no_script_and_a_script_gives_the_terminal_no_orders() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    if Path::new("/dev/zero").exists() {
+        let ran = cellpos(at, "check /dev/zero");
+        assert_eq!(ran.code, Some(2));
+        assert!(ran.err.contains("device"), "{}", ran.err);
+    }
+    std::fs::write(
+        at.join("evil.toml"),
+        "name = \"a\\u001b]0;owned\\u0007\"\n# \u{1b}[2J\nwrong = 1\n",
+    )
+    .unwrap();
+    for line in [
+        "check evil.toml",
+        "run evil.toml --dry",
+        "design --model evil.toml",
+    ] {
+        let ran = cellpos(at, line);
+        assert_eq!(ran.code, Some(2), "{line}: {}{}", ran.out, ran.err);
+        let orders = [&ran.out, &ran.err].map(|text| {
+            text.contains('\u{7}') || text.contains("\u{1b}[2J") || text.contains("\u{1b}]")
+        });
+        assert_eq!(orders, [false, false], "{line}");
+    }
+}

@@ -1,0 +1,19 @@
+//! The program, run as a user runs it.
+
+mod bead_loss;
+mod cell;
+mod circle;
+mod common;
+mod design;
+mod identify;
+mod identify_rig;
+mod kinds_of_runs;
+mod newcomer;
+mod script_faults;
+mod script_runs;
+mod scripts;
+mod signals;
+mod terminal;
+mod track;
+mod vision;
+mod wrong_pixel;

@@ -1,0 +1,603 @@
+//! `cellpos check`, `run`, `report` and `bundle` as a user runs them.
+
+use crate::script_runs::*;
+use serde_json::Value;
+use std::path::{Path, PathBuf};
+
+#[test]
+fn every_example_passes_the_check_and_a_rehearsal_with_a_row_for_each_cycle() {
+    let folder = tempfile::tempdir().unwrap();
+    std::fs::write(folder.path().join("cell.toml"), cell_rig()).unwrap();
+    for path in examples() {
+        let name = path.file_stem().unwrap().to_str().unwrap().to_string();
+        let path = path.to_str().unwrap();
+        let report = format!("{name}.html");
+        let check = json(
+            folder.path(),
+            &[
+                "check", path, "--model", "eq6", "--json", "--report", &report,
+            ],
+        );
+        assert_eq!(check["ok"], true);
+        assert!(folder.path().join(&report).exists());
+        // The fatigue example lasts twelve minutes and the heartbeat ten: seconds here, and the same code as the others.
+        let mut args = vec!["run", path, "--dry", "--json"];
+        if name == "fatigue" {
+            args.extend(["--rig", "cell.toml"]);
+        }
+        let run = json(folder.path(), &args);
+        assert_eq!(run["outcome"], "done", "{name}");
+        let done = run["cycles_done"].as_u64().unwrap();
+        let expected = match name.as_str() {
+            // It stops by itself after ten minutes of 0.8 s cycles.
+            "heartbeat" => 750,
+            _ => check["cycles"].as_u64().unwrap(),
+        };
+        assert_eq!(done, expected, "{name}");
+        // While a motion is learned, its first cycles stand out from the later ones.
+        let standing_out = if name == "sine-sweep" { done / 10 } else { 0 };
+        let disturbed = run["cycles_disturbed"].as_u64().unwrap();
+        assert!(disturbed <= standing_out, "{name}: {disturbed}");
+        assert_eq!(run["summary"]["range_limited"], 0, "{name}");
+    }
+    let runs: Vec<_> = std::fs::read_dir(folder.path().join("runs"))
+        .unwrap()
+        .map(|run| run.unwrap().path())
+        .collect();
+    assert_eq!(runs.len(), 5);
+    for run in &runs {
+        let cycles = numbers(run, "cycle");
+        assert_eq!(cycles, (0..cycles.len() as u64).collect::<Vec<u64>>());
+        assert_eq!(
+            run.join("cycles.parquet").exists(),
+            !cycles.is_empty(),
+            "{run:?}"
+        );
+    }
+    let of = |name: &str| {
+        let run = runs.iter().find(|run| run.to_str().unwrap().contains(name));
+        run.unwrap().to_str().unwrap()
+    };
+    trends_of_the_cell(&json(
+        folder.path(),
+        &["report", of("fatigue-dry"), "--json"],
+    ));
+    let step = runs
+        .iter()
+        .find(|run| run.to_str().unwrap().contains("step-dry"))
+        .unwrap();
+    let replay = json(folder.path(), &["replay", step.to_str().unwrap(), "--json"]);
+    assert_eq!(replay["ticks"], replay["identical"]);
+    let (code, _, err) = cellpos(
+        folder.path(),
+        &[
+            "simulate",
+            "--model",
+            "eq6",
+            "--input",
+            step.to_str().unwrap(),
+            "--out",
+            "sim.csv",
+        ],
+    );
+    assert_eq!(code, Some(0), "{err}");
+    let rows = std::fs::read_to_string(folder.path().join("sim.csv")).unwrap();
+    assert_eq!(
+        rows.lines().count() as u64,
+        1 + replay["ticks"].as_u64().unwrap()
+    );
+}
+
+/// What is hidden in the emulated cell is what the report finds, within 5 %, and nothing in the static arm.
+fn trends_of_the_cell(report: &Value) {
+    let of = |quantity: &str, arm: &str| {
+        let trends = report["trends"].as_array().unwrap();
+        let found = trends
+            .iter()
+            .find(|trend| trend["quantity"] == quantity && trend["arm"] == arm);
+        found.cloned()
+    };
+    for (quantity, first, last) in [
+        ("stretch", 3.80, 2.86),
+        ("recovery time", 0.16, 0.37),
+        // The cell keeps its volume: its area goes with the root of its length.
+        ("areal stretch", 3.80f64.sqrt(), 2.86f64.sqrt()),
+    ] {
+        let found = of(quantity, "cyclic").unwrap();
+        assert_eq!(
+            (&found["cycles"], &found["significant"]),
+            (&180.into(), &true.into())
+        );
+        for (key, hidden) in [("first", first), ("last", last)] {
+            let value = found[key].as_f64().unwrap();
+            assert!((value / hidden - 1.0).abs() < 0.05, "{quantity}: {found}");
+        }
+        let still = of(quantity, "static");
+        assert!(
+            still.is_none_or(|trend| trend["significant"] == false),
+            "{quantity}"
+        );
+    }
+    for quantity in ["stretch", "areal stretch"] {
+        // The way to the load and back is no cycle under load.
+        assert_eq!(of(quantity, "static").unwrap()["cycles"], 178);
+    }
+    let disc_um2 = std::f64::consts::FRAC_PI_4 * 64.0;
+    // The cyclic arm begins outside of the constriction; the static one is under load throughout.
+    for (quantity, hidden) in [
+        ("length at cycle start", 8.0),
+        ("area at cycle start", disc_um2),
+    ] {
+        let value = of(quantity, "cyclic").unwrap()["first"].as_f64().unwrap();
+        assert!((value / hidden - 1.0).abs() < 0.05, "{quantity}: {value}");
+        // The way to the load and back is no cycle under load.
+        assert_eq!(of(quantity, "static").unwrap()["cycles"], 178);
+    }
+}
+
+#[test]
+fn what_the_rig_cannot_do_is_refused_before_anything_moves() {
+    let folder = tempfile::tempdir().unwrap();
+    let text = "[[step]]\ndo = \"sine\"\namplitude = \"9um\"\nfrequency = \"200Hz\"\ncycles = 20\nramp_in = 4\nramp_out = 4\n";
+    std::fs::write(folder.path().join("wild.toml"), text).unwrap();
+    std::fs::write(folder.path().join("torn.toml"), "[[step]]\ndo = \"hodl\"\n").unwrap();
+    let (code, out, _) = cellpos(folder.path(), &["check", "wild.toml"]);
+    assert_eq!(code, Some(1));
+    assert!(
+        out.contains("wild.toml:1: PZT range") && out.contains("scale all positions by 0."),
+        "{out}"
+    );
+    // A rig with less room allows less, and what is said on the command line counts more.
+    let narrow = "first_neutral_um = 10.0\n[limits]\nlow_um = 0.0\nhigh_um = 20.0\nslew_um_per_s = 20000.0\npark_um = 10.0\n";
+    std::fs::write(folder.path().join("narrow.toml"), narrow).unwrap();
+    let largest = |extra: &[&str]| {
+        let args = [&["check", "wild.toml", "--json"], extra].concat();
+        let (_, out, _) = cellpos(folder.path(), &args);
+        let check: Value = serde_json::from_str(&out).unwrap();
+        check["waves"][0]["largest_um"].as_f64().unwrap()
+    };
+    let wide = largest(&["--slew", "1000000um/s"]);
+    let narrow = largest(&["--rig", "narrow.toml", "--slew", "1000000um/s"]);
+    assert!((narrow / wide - 0.5).abs() < 1e-6, "{narrow} {wide}");
+    let (code, _, err) = cellpos(folder.path(), &["run", "wild.toml", "--dry"]);
+    assert_eq!(code, Some(2));
+    assert!(err.contains("the rig cannot do it"), "{err}");
+    for args in [
+        ["check", "torn.toml"].as_slice(),
+        &["run", "torn.toml", "--dry"],
+    ] {
+        let (code, _, err) = cellpos(folder.path(), args);
+        assert_eq!(code, Some(2));
+        assert!(
+            err.contains("torn.toml:2:6") && err.contains("hold"),
+            "{err}"
+        );
+    }
+    let (code, _, err) = cellpos(folder.path(), &["run", "absent.toml"]);
+    assert_eq!(code, Some(2), "{err}");
+    assert!(!folder.path().join("runs").exists(), "nothing was started");
+}
+
+#[test]
+fn a_rehearsal_behaves_as_the_model_it_is_given() {
+    let folder = tempfile::tempdir().unwrap();
+    script(folder.path(), 60);
+    // The controller is made for the model too, so a rig of half the gain is a rehearsal like any other.
+    let eq6 = std::fs::read_to_string(
+        Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples/model.toml"),
+    )
+    .unwrap();
+    std::fs::write(folder.path().join("model.toml"), eq6).unwrap();
+    let run = json(
+        folder.path(),
+        &[
+            "run",
+            "quick.toml",
+            "--dry",
+            "--model",
+            "model.toml",
+            "--controller",
+            "mpc",
+            "--json",
+        ],
+    );
+    assert_eq!(
+        (&run["outcome"], &run["cycles_done"]),
+        (&"done".into(), &60.into())
+    );
+    // Preview: the amplitude is there, whatever the frequency.
+    let error = run["amplitude_error_percent"].as_f64().unwrap();
+    assert!(error.abs() < 2.0, "{error}");
+}
+
+#[test]
+fn a_report_shows_the_run_and_a_bundle_is_what_its_manifest_says() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    script(at, 100);
+    std::fs::write(at.join("cell.toml"), cell_rig()).unwrap();
+    json(
+        at,
+        &["run", "quick.toml", "--dry", "--rig", "cell.toml", "--json"],
+    );
+    let run = only_run(at);
+    let name = run.strip_prefix(at).unwrap().to_str().unwrap();
+    let report = json(at, &["report", name, "--json"]);
+    assert_eq!(
+        (&report["cycles"], &report["sessions"]),
+        (&100.into(), &1.into())
+    );
+    // PI on a moving reference is far from what the best controller could do while holding.
+    let (rms, bound) = (&report["rms_nm"], report["bound_rms_nm"].as_f64().unwrap());
+    assert!(
+        (bound - 44.5).abs() < 1.0 && rms.as_f64().unwrap() > bound,
+        "{report}"
+    );
+    let trends = report["trends"].as_array().unwrap();
+    let reached = trends
+        .iter()
+        .find(|trend| trend["quantity"] == "reached over commanded amplitude")
+        .unwrap();
+    assert_eq!(
+        (&reached["arm"], &reached["cycles"]),
+        (&"cyclic".into(), &100.into())
+    );
+    let page = std::fs::read_to_string(run.join("report.html")).unwrap();
+    for part in [
+        "Traces",
+        "Error",
+        "Cycles",
+        "Loop timing",
+        "Events",
+        "provenance",
+        "SHA-256",
+    ] {
+        assert!(page.contains(part), "{part}");
+    }
+    assert!(!page.contains("http-equiv") && !page.contains("src=\"http"));
+    for figure in [
+        "traces",
+        "excerpt",
+        "error-histogram",
+        "error-spectrum",
+        "cycles",
+    ] {
+        assert!(
+            run.join(format!("report-figures/{figure}.csv")).exists(),
+            "{figure}"
+        );
+    }
+
+    let packed = json(at, &["bundle", name, "--json"]);
+    assert_eq!(packed["inputs_missing"], serde_json::json!([]));
+    let bundle = PathBuf::from(format!("{}-bundle", run.display()));
+    assert!(bundle.join("inputs/00-quick.toml").exists());
+    let path = bundle.to_str().unwrap();
+    assert_eq!(
+        json(at, &["bundle", "--verify", path, "--json"])["wrong"],
+        serde_json::json!([])
+    );
+    let (code, _, err) = cellpos(at, &["bundle", name]);
+    assert_eq!(code, Some(2), "never overwritten: {err}");
+    let table = bundle.join("cycles.csv");
+    let text = std::fs::read_to_string(&table).unwrap();
+    std::fs::write(&table, text.replacen("cyclic", "static", 1)).unwrap();
+    std::fs::write(bundle.join("more.txt"), "").unwrap();
+    std::fs::remove_file(bundle.join("run.toml")).unwrap();
+    let (code, out, _) = cellpos(at, &["bundle", "--verify", path]);
+    assert_eq!(code, Some(1));
+    for wrong in [
+        "cycles.csv: changed",
+        "run.toml: missing",
+        "more.txt: not in the manifest",
+    ] {
+        assert!(out.contains(wrong), "{out}");
+    }
+}
+
+#[test]
+fn learning_takes_the_error_of_a_script_down_and_is_gone_on_from_after_a_cut() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    // Two motions that take turns, and one too short to be learned; PI alone lags far behind both.
+    let text = "name = \"turns\"\nlearn = true\n[stop]\nafter_cycles = 104\n[[step]]\ndo = \"repeat\"\ntimes = 4\n\
+                [[step.step]]\ndo = \"sine\"\namplitude = \"2um\"\nfrequency = \"20Hz\"\ncycles = 30\nramp_in = 2\nramp_out = 2\n\
+                [[step.step]]\ndo = \"triangle\"\namplitude = \"1um\"\nfrequency = \"10Hz\"\ncycles = 20\n\
+                [[step]]\ndo = \"sine\"\namplitude = \"1um\"\nfrequency = \"5Hz\"\ncycles = 4\n";
+    std::fs::write(at.join("turns.toml"), text).unwrap();
+    let args = ["run", "turns.toml", "--dry", "--json"];
+    let run = json(at, &args);
+    let learned = run["learned"].as_array().unwrap();
+    assert_eq!(learned.len(), 2, "{run}");
+    for one in learned {
+        let um = |name: &str| one["table"][name].as_f64().unwrap();
+        let (before, after) = (um("error_before_um"), um("error_after_um"));
+        assert!(after < 0.5 * before, "{one}");
+        assert_eq!(one["table"]["retreats"], 0);
+    }
+    // Cycles of the first motion: its error in the first turn and in the last.
+    let folder = only_run(at);
+    let rms: Vec<f64> = column(&folder, "rms_um")
+        .iter()
+        .map(|cell| cell.parse().unwrap())
+        .collect();
+    assert_eq!(rms.len(), 104);
+    let mean =
+        |range: std::ops::Range<usize>| rms[range.clone()].iter().sum::<f64>() / range.len() as f64;
+    // The ramps of a turn are not learned on: from its third cycle to its last but three.
+    assert!(mean(57..75) < 0.5 * mean(2..4), "{rms:?}");
+    let replay = json(at, &["replay", folder.to_str().unwrap(), "--json"]);
+    assert_eq!(replay["ticks"], replay["identical"], "{replay}");
+    let kept = std::fs::read_to_string(folder.join("learned.toml")).unwrap();
+    assert!(kept.contains("sine of 2 um at 20 Hz") && kept.contains("triangle of 1 um at 10 Hz"));
+
+    // The end of the run is cut off: what is left is what a crash leaves.
+    let meta = std::fs::read_to_string(folder.join("run.toml")).unwrap();
+    let end = meta.find("[end]").expect("an end");
+    std::fs::write(folder.join("run.toml"), &meta[..end]).unwrap();
+    let cycles = std::fs::read_to_string(folder.join("cycles.csv")).unwrap();
+    let rows: Vec<&str> = cycles.lines().take(51).collect();
+    std::fs::write(folder.join("cycles.csv"), rows.join("\n") + "\n").unwrap();
+    let resumed = json(at, &["run", "--resume", folder.to_str().unwrap(), "--json"]);
+    assert_eq!(resumed["cycles_done"], 104, "{resumed}");
+    let rms: Vec<f64> = column(&folder, "rms_um")
+        .iter()
+        .map(|cell| cell.parse().unwrap())
+        .collect();
+    // Known from the first cycles on: the addition of the session before is in force.
+    assert!(
+        rms[53..56].iter().sum::<f64>() / 3.0 < 0.5 * rms[2..4].iter().sum::<f64>() / 2.0,
+        "{rms:?}"
+    );
+    let before = &learned[0]["table"]["cycles"].as_f64().unwrap();
+    let after = resumed["learned"][0]["table"]["cycles"].as_f64().unwrap();
+    assert!(after > *before, "{before} {after}");
+}
+
+#[test]
+fn a_script_stops_when_the_amplitude_is_not_reached() {
+    let folder = tempfile::tempdir().unwrap();
+    // At 120 Hz feedback alone does not follow.
+    let text = "name = \"far\"\n[stop]\namplitude_error_above = \"40%\"\n[[step]]\ndo = \"sine\"\namplitude = \"2um\"\n\
+                frequency = \"120Hz\"\ncycles = 2000\n";
+    std::fs::write(folder.path().join("far.toml"), text).unwrap();
+    let (code, out, err) = cellpos(folder.path(), &["run", "far.toml", "--dry", "--json"]);
+    assert_eq!(code, Some(1), "{err}");
+    let run: Value = serde_json::from_str(&out).unwrap();
+    assert_eq!(
+        (&run["outcome"], &run["stage"]),
+        (
+            &"stopped".into(),
+            &"stopped: amplitude error too large".into()
+        )
+    );
+    let done = run["cycles_done"].as_u64().unwrap();
+    assert!((10..30).contains(&done), "{done}");
+    let events = std::fs::read_to_string(only_run(folder.path()).join("events.jsonl")).unwrap();
+    assert!(events.contains("amplitude-stop") && events.contains("freeze-started"));
+}
+
+#[test]
+fn a_run_whose_table_is_damaged_is_not_gone_on_with_and_a_torn_last_line_is_no_damage() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    script(at, 40);
+    json(at, &["run", "quick.toml", "--dry", "--json"]);
+    let run = only_run(at);
+    let meta = std::fs::read_to_string(run.join("run.toml")).unwrap();
+    std::fs::write(run.join("run.toml"), &meta[..meta.find("[end]").unwrap()]).unwrap();
+    let table = std::fs::read_to_string(run.join("cycles.csv")).unwrap();
+    let name = run.to_str().unwrap();
+    std::fs::write(run.join("cycles.csv"), format!("{table}what is this\n")).unwrap();
+    let (code, _, err) = cellpos(at, &["run", "--resume", name]);
+    assert_eq!(code, Some(2), "{err}");
+    assert!(err.contains("was it changed"), "{err}");
+    // Cut off in the middle of its twentieth row.
+    let end = table.match_indices('\n').nth(19).unwrap().0 + 30;
+    std::fs::write(run.join("cycles.csv"), &table[..end]).unwrap();
+    json(at, &["run", "--resume", name, "--json"]);
+    assert_eq!(numbers(&run, "cycle"), (0..40).collect::<Vec<u64>>());
+    let sessions = numbers(&run, "session");
+    assert_eq!((sessions[18], sessions[19]), (1, 2));
+    let report = json(at, &["report", name, "--json"]);
+    assert_eq!(
+        (&report["sessions"], &report["cycles"]),
+        (&2.into(), &40.into())
+    );
+    let page = std::fs::read_to_string(run.join("report.html")).unwrap();
+    assert!(page.contains("The last of 2 sessions came to its end"));
+}
+
+#[test]
+fn a_run_that_an_older_version_began_is_gone_on_with_and_its_table_takes_on_the_new_columns() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    std::fs::write(at.join("cell.toml"), cell_rig()).unwrap();
+    script(at, 40);
+    json(
+        at,
+        &["run", "quick.toml", "--dry", "--rig", "cell.toml", "--json"],
+    );
+    let run = only_run(at);
+    let name = run.to_str().unwrap();
+    let meta = std::fs::read_to_string(run.join("run.toml")).unwrap();
+    std::fs::write(run.join("run.toml"), &meta[..meta.find("[end]").unwrap()]).unwrap();
+    // Half of the table, as it was before areas were measured.
+    let table = std::fs::read_to_string(run.join("cycles.csv")).unwrap();
+    let head = table.lines().next().unwrap();
+    let known: Vec<bool> = head
+        .split(',')
+        .map(|name| !name.starts_with("area_"))
+        .collect();
+    let old = |line: &str| {
+        let cells = line.split(',').zip(&known).filter(|(_, known)| **known);
+        cells.map(|(cell, _)| cell).collect::<Vec<_>>().join(",") + "\n"
+    };
+    let older: String = table.lines().take(21).map(old).collect();
+    std::fs::write(run.join("cycles.csv"), &older).unwrap();
+    assert_eq!(json(at, &["report", name, "--json"])["cycles"], 20);
+
+    json(at, &["run", "--resume", name, "--json"]);
+    let renewed = std::fs::read_to_string(run.join("cycles.csv")).unwrap();
+    assert_eq!(renewed.lines().next(), Some(head));
+    let kept: String = renewed.lines().take(21).map(old).collect();
+    assert_eq!(kept, older, "what was there stays as it was");
+    assert_eq!(numbers(&run, "cycle"), (0..40).collect::<Vec<u64>>());
+    let areas = column(&run, "area_half_um2");
+    assert!(areas[..20].iter().all(String::is_empty), "{areas:?}");
+    // A sphere of 8 um that is never pressed into the constriction.
+    let disc_um2 = std::f64::consts::FRAC_PI_4 * 64.0;
+    for area in &areas[20..] {
+        let um2: f64 = area.parse().unwrap();
+        assert!((um2 / disc_um2 - 1.0).abs() < 0.02, "{um2}");
+    }
+
+    // A newer one's column is not dropped: the run is not gone on with.
+    std::fs::write(run.join("run.toml"), &meta[..meta.find("[end]").unwrap()]).unwrap();
+    let newer = renewed.replacen("flags", "odour,flags", 1);
+    std::fs::write(run.join("cycles.csv"), &newer).unwrap();
+    let (code, _, err) = cellpos(at, &["run", "--resume", name]);
+    assert_eq!(code, Some(2), "{err}");
+    assert!(
+        err.contains("cycles.csv: column `odour`") && err.contains("newer version"),
+        "{err}"
+    );
+    assert_eq!(
+        std::fs::read_to_string(run.join("cycles.csv")).unwrap(),
+        newer
+    );
+    json(at, &["report", name, "--json"]);
+    let page = std::fs::read_to_string(run.join("report.html")).unwrap();
+    assert!(page.contains("column `odour` is not known"));
+}
+
+/// Makes a run what a crash leaves: no end, the first cycles of its table, and the beginning of its records.
+fn crash(run: &Path, cycles: usize, share: f64) {
+    let meta = std::fs::read_to_string(run.join("run.toml")).unwrap();
+    std::fs::write(run.join("run.toml"), &meta[..meta.find("[end]").unwrap()]).unwrap();
+    let table = std::fs::read_to_string(run.join("cycles.csv")).unwrap();
+    let rows: Vec<&str> = table.lines().take(1 + cycles).collect();
+    std::fs::write(run.join("cycles.csv"), rows.join("\n") + "\n").unwrap();
+    let ticks = std::fs::OpenOptions::new()
+        .write(true)
+        .open(run.join("ticks.arrow"))
+        .unwrap();
+    let length = ticks.metadata().unwrap().len();
+    ticks.set_len((length as f64 * share) as u64).unwrap();
+}
+
+#[test]
+fn the_time_of_a_resumed_script_is_that_of_all_its_sessions() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    let text = "name = \"timed\"\n[stop]\nafter = \"5s\"\n[[step]]\ndo = \"wait\"\nfor = \"position\"\nabove = \"9um\"\n\
+                timeout = \"3s\"\non_timeout = \"continue\"\n[[step]]\ndo = \"sine\"\namplitude = \"1um\"\n\
+                frequency = \"10Hz\"\ncycles = 100\n";
+    std::fs::write(at.join("timed.toml"), text).unwrap();
+    // Ticks in which the time of the script ran: running, waiting, paused.
+    let ran = |run: &Path| {
+        let mut args = vec![
+            "export",
+            run.to_str().unwrap(),
+            "--out",
+            "ticks.csv",
+            "--force",
+        ];
+        if run.join("sessions").exists() {
+            args.extend(["--session", "1"]);
+        }
+        let (code, _, err) = cellpos(at, &args);
+        assert_eq!(code, Some(0), "{err}");
+        let ticks = std::fs::read_to_string(at.join("ticks.csv")).unwrap();
+        let mut lines = ticks.lines();
+        let head = lines.next().unwrap();
+        let stage = head.split(',').position(|name| name == "stage").unwrap();
+        lines
+            .filter(|line| {
+                ["running", "waiting", "paused"].contains(&line.split(',').nth(stage).unwrap())
+            })
+            .count()
+    };
+    json(at, &["run", "timed.toml", "--dry", "--json"]);
+    let run = only_run(at);
+    assert!(ran(&run).abs_diff(5000) <= 1, "{}", ran(&run));
+    // Three seconds of waiting and one of ten cycles, and what of the next ones was on the disk.
+    crash(&run, 10, 0.85);
+    let before = ran(&run);
+    assert!((3500..4900).contains(&before), "{before}");
+    let resumed = json(at, &["run", "--resume", run.to_str().unwrap(), "--json"]);
+    assert_eq!(resumed["stage"], "stopped: time is up", "{resumed}");
+    let session = std::fs::read_dir(run.join("sessions"))
+        .unwrap()
+        .next()
+        .unwrap()
+        .unwrap()
+        .path();
+    let all = before + ran(&session);
+    assert!(all.abs_diff(5000) <= 2, "{before} of {all} before");
+    let replay = json(at, &["replay", session.to_str().unwrap(), "--json"]);
+    assert_eq!(replay["ticks"], replay["identical"], "{replay}");
+}
+
+#[test]
+fn a_run_is_gone_on_with_from_any_folder() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    let (lab, elsewhere) = (at.join("lab"), at.join("elsewhere"));
+    std::fs::create_dir(&lab).unwrap();
+    std::fs::create_dir(&elsewhere).unwrap();
+    std::fs::write(
+        lab.join("world.toml"),
+        cellpos_plant::Model::eq6().to_toml_string(),
+    )
+    .unwrap();
+    std::fs::write(lab.join("rig.toml"), "[emulator]\nmodel = \"world.toml\"\n").unwrap();
+    script(at, 40);
+    let rig = "lab/rig.toml";
+    let args = ["run", "quick.toml", "--rig", rig, "--clock", "virtual"];
+    json(at, &[&args[..], &["--frames", "off", "--json"]].concat());
+    let run = only_run(at);
+    crash(&run, 20, 0.6);
+    json(
+        &elsewhere,
+        &["run", "--resume", run.to_str().unwrap(), "--json"],
+    );
+    assert_eq!(numbers(&run, "cycle"), (0..40).collect::<Vec<u64>>());
+    // What went in is packed from any folder too.
+    let bundle = json(
+        &elsewhere,
+        &["bundle", run.to_str().unwrap(), "--out", "packed", "--json"],
+    );
+    assert_eq!(
+        bundle["inputs_missing"],
+        Value::Array(Vec::new()),
+        "{bundle}"
+    );
+}
+
+#[test]
+fn a_script_that_looks_at_a_length_is_refused_where_nobody_measures_one() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    std::fs::write(at.join("cell.toml"), cell_rig()).unwrap();
+    let real = "[actuator]\nkind = \"serial\"\nport = \"pzt\"\n[camera]\nkind = \"socket\"\nsocket = \"camera.sock\"\n\
+                [cell]\nbackground = \"empty.tif\"\n";
+    std::fs::write(at.join("real.toml"), real).unwrap();
+    let hold = "[[step]]\ndo = \"hold\"\nduration = \"200ms\"\n";
+    let stop = format!("name = \"stop\"\n[stop]\nlength_change_above = \"50um\"\n{hold}");
+    let wait = format!(
+        "name = \"wait\"\n{hold}[[step]]\ndo = \"wait\"\nfor = \"cell-length\"\nabove = \"1um\"\ntimeout = \"2s\"\n"
+    );
+    for (name, text) in [("stop.toml", stop), ("wait.toml", wait)] {
+        std::fs::write(at.join(name), text).unwrap();
+        let (code, _, err) = cellpos(at, &["run", name, "--dry"]);
+        assert_eq!(code, Some(2), "{err}");
+        assert!(err.contains("[emulator.cell]"), "{err}");
+        // A rig with a camera and a cell is rehearsed with an emulated one.
+        for file in ["cell.toml", "real.toml"] {
+            let run = json(at, &["run", name, "--dry", "--rig", file, "--json"]);
+            assert_eq!(run["outcome"], "done", "{name}");
+        }
+    }
+    assert_eq!(std::fs::read_dir(at.join("runs")).unwrap().count(), 4);
+}

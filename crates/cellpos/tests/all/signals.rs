@@ -1,0 +1,224 @@
+//! Signals to a program that holds a rig: freeze, keep what is finished, park; and none that ends it half-way.
+
+use rustix::process::{Pid, Signal, kill_process};
+use serde_json::Value;
+use std::os::unix::process::ExitStatusExt;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Output, Stdio};
+use std::time::{Duration, Instant};
+
+const PATIENCE: Duration = Duration::from_secs(60);
+
+fn start(folder: &Path, line: &str) -> Child {
+    Command::new(env!("CARGO_BIN_EXE_cellpos"))
+        .args(line.split_whitespace())
+        .current_dir(folder)
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .unwrap()
+}
+
+fn tell(child: &Child, signal: Signal) {
+    let pid = Pid::from_raw(i32::try_from(child.id()).unwrap()).unwrap();
+    kill_process(pid, signal).unwrap();
+}
+
+fn until<T>(what: &str, mut there: impl FnMut() -> Option<T>) -> T {
+    let start = Instant::now();
+    loop {
+        if let Some(found) = there() {
+            return found;
+        }
+        assert!(start.elapsed() < PATIENCE, "no {what} in time");
+        std::thread::sleep(Duration::from_millis(10));
+    }
+}
+
+/// Files of a name in the folders below runs/.
+fn in_runs(folder: &Path, name: &str) -> Option<PathBuf> {
+    let entries = std::fs::read_dir(folder.join("runs")).ok()?;
+    entries
+        .flatten()
+        .map(|entry| entry.path().join(name))
+        .find(|path| path.exists())
+}
+
+/// Waits until the loop is closed, as the events say.
+fn running(folder: &Path) {
+    until("closed loop", || {
+        let text = std::fs::read_to_string(in_runs(folder, "events.jsonl")?).ok()?;
+        text.contains("\"running\"").then_some(())
+    });
+}
+
+fn end(child: Child) -> (Output, Value) {
+    let out = child.wait_with_output().unwrap();
+    let json = serde_json::from_slice(&out.stdout).unwrap_or(Value::Null);
+    (out, json)
+}
+
+const TRACK: &str =
+    "track --target 0um --duration 60s --frames off --best-effort --json --name held";
+
+#[test]
+fn the_first_signal_freezes_the_second_parks_and_both_are_ends_as_asked() {
+    for (signals, state) in [(1, "running"), (2, "safe")] {
+        let folder = tempfile::tempdir().unwrap();
+        let child = start(folder.path(), TRACK);
+        running(folder.path());
+        for _ in 0..signals {
+            tell(&child, Signal::TERM);
+            std::thread::sleep(Duration::from_millis(50));
+        }
+        let (out, json) = end(child);
+        assert_eq!(out.status.code(), Some(0), "{json}");
+        assert_eq!(json["ended"]["kind"], "operator", "{json}");
+        assert_eq!(json["state"], state, "{json}");
+    }
+}
+
+#[test]
+fn usr1_pauses_and_goes_on_and_ctrl_z_does_not_stop_a_program_that_holds_a_bead() {
+    let folder = tempfile::tempdir().unwrap();
+    let child = start(folder.path(), TRACK);
+    running(folder.path());
+    for signal in [Signal::USR1, Signal::TSTP, Signal::USR1, Signal::USR2] {
+        tell(&child, signal);
+        std::thread::sleep(Duration::from_millis(200));
+    }
+    tell(&child, Signal::INT);
+    let (out, json) = end(child);
+    assert_eq!(out.status.code(), Some(0), "{json}");
+    assert_eq!(json["ended"]["kind"], "operator", "{json}");
+    assert_eq!(json["safe_reason"], Value::Null, "{json}");
+    assert!(json["frozen"].as_f64().unwrap() > 500.0, "{json}");
+}
+
+#[test]
+fn nohup_holds_and_without_it_the_end_of_a_terminal_is_an_orderly_end() {
+    for ignored in [true, false] {
+        let folder = tempfile::tempdir().unwrap();
+        let trap = if ignored { "trap '' HUP; " } else { "" };
+        let line = format!("{trap}exec {} {TRACK}", env!("CARGO_BIN_EXE_cellpos"));
+        let mut child = Command::new("sh")
+            .args(["-c", &line])
+            .current_dir(folder.path())
+            .stdout(Stdio::piped())
+            .stderr(Stdio::piped())
+            .spawn()
+            .unwrap();
+        running(folder.path());
+        tell(&child, Signal::HUP);
+        if ignored {
+            std::thread::sleep(Duration::from_millis(1500));
+            assert!(child.try_wait().unwrap().is_none(), "it ended");
+            tell(&child, Signal::INT);
+        }
+        let (out, json) = end(child);
+        assert_eq!(out.status.code(), Some(0), "{json}");
+        assert_eq!(json["ended"]["kind"], "operator", "{json}");
+    }
+}
+
+#[test]
+fn a_signal_in_the_first_moments_leaves_no_run_half_way() {
+    for delay_ms in [0, 3, 6, 10, 15, 20, 30, 40, 50, 60, 90] {
+        let folder = tempfile::tempdir().unwrap();
+        let child = start(folder.path(), TRACK);
+        std::thread::sleep(Duration::from_millis(delay_ms));
+        tell(&child, Signal::INT);
+        let (out, _) = end(child);
+        let killed = out.status.signal().is_some();
+        let ticks = in_runs(folder.path(), "ticks.arrow");
+        let rows = ticks.and_then(|path| path.metadata().ok()).map(|m| m.len());
+        if killed {
+            // The rig was not held: nothing ran, so nothing can be cut off.
+            assert!(rows.is_none_or(|bytes| bytes < 20_000), "{rows:?} bytes");
+        } else if let Some(toml) = in_runs(folder.path(), "run.toml") {
+            let text = std::fs::read_to_string(toml).unwrap();
+            assert!(text.contains("outcome"), "after {delay_ms} ms: {text}");
+        }
+    }
+}
+
+#[test]
+fn a_circle_and_a_collection_that_are_interrupted_keep_what_is_recorded_and_say_where() {
+    // On the virtual clock, so that a busy machine loses no bead; long enough to be interrupted.
+    let on_the_rig = "--rig rig.toml --frames off --seed 3 --effort 1 --max-effects 1 --json";
+    for line in [
+        format!("circle {on_the_rig} --rounds 0 --out a.toml --report a.html"),
+        format!("reconcile --model eq6 --collect more {on_the_rig} --rounds 1 --out a.toml"),
+    ] {
+        let folder = tempfile::tempdir().unwrap();
+        std::fs::write(folder.path().join("rig.toml"), "[emulator]\nseed = 3\n").unwrap();
+        let child = start(folder.path(), &line);
+        let kept = until("finished segment", || {
+            let partial = in_runs(folder.path(), "partial.json");
+            let record = Some(folder.path().join("more/survey-1.csv"));
+            partial.or(record.filter(|path| path.exists()))
+        });
+        tell(&child, Signal::INT);
+        let (out, json) = end(child);
+        assert_eq!(out.status.code(), Some(1), "{line}\n{json}");
+        let error = &json["error"];
+        assert_eq!(error["message"], "the operator ended the run", "{json}");
+        let name = kept.file_name().unwrap().to_str().unwrap();
+        let help = error["help"].as_str().unwrap();
+        assert!(help.contains(name), "{help}");
+        let text = std::fs::read_to_string(&kept).unwrap();
+        if name == "partial.json" {
+            let kept: Value = serde_json::from_str(&text).unwrap();
+            assert!(!kept["segments"].as_array().unwrap().is_empty());
+        } else {
+            assert!(text.starts_with("time_s,pzt_um,bead_um"));
+            assert!(text.lines().count() > 500);
+        }
+    }
+}
+
+#[test]
+fn a_script_of_sixteen_thousand_steps_starts_on_the_clock_of_the_machine() {
+    let folder = tempfile::tempdir().unwrap();
+    let step = "[[step]]\ndo = \"hold\"\nduration = \"10ms\"\n";
+    let text = format!("name = \"long\"\n{}", step.repeat(16_000));
+    std::fs::write(folder.path().join("long.toml"), text).unwrap();
+    let child = start(
+        folder.path(),
+        "run long.toml --clock real --frames off --best-effort --json",
+    );
+    until("closed loop", || {
+        let text = std::fs::read_to_string(in_runs(folder.path(), "events.jsonl")?).ok()?;
+        text.contains("\"stage\":\"running\"").then_some(())
+    });
+    tell(&child, Signal::INT);
+    let (out, json) = end(child);
+    assert_eq!(out.status.code(), Some(1), "{json}");
+    assert_eq!(json["stage"], "by the operator", "{json}");
+    assert_eq!(json["summary"]["safe_reason"], Value::Null, "{json}");
+}
+
+const IDENTIFY: &str = "identify --rig rig.toml --clock real --frames off --best-effort \
+     --frequency 10Hz,20Hz,40Hz,80Hz --led-edges 0 --bootstrap 0 --json";
+
+#[test]
+fn an_identification_keeps_its_segments_as_they_end_whatever_ends_it() {
+    for signal in [Signal::INT, Signal::KILL] {
+        let folder = tempfile::tempdir().unwrap();
+        std::fs::write(folder.path().join("rig.toml"), "[emulator]\nseed = 3\n").unwrap();
+        let child = start(folder.path(), IDENTIFY);
+        let partial = until("finished segment", || {
+            in_runs(folder.path(), "partial.json")
+        });
+        tell(&child, signal);
+        let (out, _) = end(child);
+        let kept: Value = serde_json::from_slice(&std::fs::read(&partial).unwrap()).unwrap();
+        assert!(!kept["segments"].as_array().unwrap().is_empty());
+        if signal == Signal::INT {
+            let text = String::from_utf8_lossy(&out.stderr).into_owned()
+                + &String::from_utf8_lossy(&out.stdout);
+            assert_eq!(out.status.code(), Some(1), "{text}");
+            assert!(text.contains("--resume"), "{text}");
+        }
+    }
+}

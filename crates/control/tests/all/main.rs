@@ -1,0 +1,16 @@
+//! The laws in closed loop.
+
+mod allocation;
+mod late_ticks;
+mod learning;
+mod limits;
+mod monitor;
+mod pi_loop;
+mod solvers;
+mod state_feedback;
+mod stuck_bead;
+
+/// Counts by thread, so that tests beside each other do not disturb one another.
+#[global_allocator]
+static ALLOCATOR: cellpos_counting_alloc::CountingAllocator =
+    cellpos_counting_alloc::CountingAllocator;

@@ -1,0 +1,10 @@
+//! Cameras and recordings as sources of positions.
+
+mod fake_camera;
+mod recordings;
+mod vision_source;
+
+/// Counts by thread, so that tests beside each other do not disturb one another.
+#[global_allocator]
+static ALLOCATOR: cellpos_counting_alloc::CountingAllocator =
+    cellpos_counting_alloc::CountingAllocator;

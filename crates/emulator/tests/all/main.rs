@@ -1,0 +1,7 @@
+//! The emulated rig.
+
+mod background;
+mod cell;
+mod rig_in_a_box;
+mod scene;
+mod world;

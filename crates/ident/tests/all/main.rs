@@ -1,0 +1,6 @@
+//! Identification from records.
+
+mod closed_loop;
+mod common;
+mod frequency_response;
+mod measured_piezo;

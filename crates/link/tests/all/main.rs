@@ -1,0 +1,4 @@
+//! The wire format.
+
+mod vectors;
+mod wire;

@@ -1,0 +1,13 @@
+//! The chain from command to position.
+
+mod allocation;
+mod discretisation;
+mod effects;
+mod hidden_effects;
+mod noise;
+mod paper;
+
+/// Counts by thread, so that tests beside each other do not disturb one another.
+#[global_allocator]
+static ALLOCATOR: cellpos_counting_alloc::CountingAllocator =
+    cellpos_counting_alloc::CountingAllocator;

@@ -1,0 +1,6 @@
+//! Verdicts on records.
+
+mod labelled;
+mod measured;
+mod measured_piezo;
+mod verdicts;

@@ -1,0 +1,248 @@
+//! What a verdict rests on: a floor, numbers that hold everywhere, and a list of effects that grows from outside.
+
+use cellpos_plant::effects::{
+    self, Action, Block, Candidate, EffectKind, Experiment, Form, ParameterSpec, Place, Scope,
+    Segment, Spec, lin,
+};
+use cellpos_plant::{Effect, Gaussian, Model, Noise, SimulateOptions, TransferFunction, simulate};
+use cellpos_reconcile::{FloorSource, Options, Reconciliation, Record, Verdict, reconcile};
+use std::f64::consts::TAU;
+
+/// A lag of 20 ms about zero, sampled at 1 kHz, with white noise.
+fn plant() -> Model {
+    Model {
+        name: "lag".to_owned(),
+        plant: TransferFunction::new(vec![1.0], vec![0.02, 1.0]).unwrap(),
+        working_point_um: 0.0,
+        noise: Noise {
+            diffusion_um2_per_s: 1e-4,
+            localisation_um: 0.01,
+        },
+        ..Model::eq6()
+    }
+}
+
+/// Held levels at random, 20 rows each.
+fn levels(rows: usize, size: f64, seed: u64) -> Vec<f64> {
+    let mut random = Gaussian::new(seed);
+    let mut u = Vec::with_capacity(rows);
+    while u.len() < rows {
+        let level = size * random.next_normal();
+        u.extend(std::iter::repeat_n(level, 20));
+    }
+    u.truncate(rows);
+    u
+}
+
+fn record(name: &str, model: &Model, u: &[f64], seed: u64) -> Record {
+    let options = SimulateOptions {
+        seed: Some(seed),
+        ..SimulateOptions::default()
+    };
+    let y = simulate(model, u, 1e-3, &options).unwrap();
+    let t: Vec<f64> = (0..u.len()).map(|k| k as f64 * 1e-3).collect();
+    Record::from_rows(name, &t, u, &y).unwrap()
+}
+
+fn run(model: &Model, records: &[Record]) -> Reconciliation {
+    let options = Options {
+        free_start: true,
+        ..Options::default()
+    };
+    reconcile(model, records, &options, &mut |_| {}).unwrap()
+}
+
+fn named(r: &Reconciliation) -> Vec<&str> {
+    r.effects.iter().map(|e| e.id.as_str()).collect()
+}
+
+/// Random records without rest, repeat or stated noise, some with an effect: none may be named.
+fn never_named(count: u64) {
+    let silent = Model {
+        noise: Noise::NONE,
+        ..plant()
+    };
+    for seed in 0..count {
+        let truth = match seed % 4 {
+            0 => plant(),
+            1 => plant().with_effect(effects::time_delay(4e-3)),
+            2 => plant().with_effect(effects::gain_error(1.3)),
+            _ => plant().with_effect(effects::backlash(0.2)),
+        };
+        let r = run(
+            &silent,
+            &[record("only", &truth, &levels(900, 1.0, seed), seed + 1000)],
+        );
+        assert_eq!(r.floor, FloorSource::Unknown, "seed {seed}");
+        assert_eq!(r.verdict, Verdict::Unknown, "seed {seed}: {:?}", named(&r));
+        assert!(r.effects.is_empty());
+        assert!(
+            r.places.iter().any(|p| p.contains("record a rest of 10 s")),
+            "{:?}",
+            r.places
+        );
+    }
+}
+
+#[test]
+fn without_a_floor_nothing_is_named() {
+    never_named(24);
+}
+
+#[test]
+#[ignore = "minutes: cargo test --release -p cellpos-reconcile --test all verdicts -- --include-ignored"]
+fn without_a_floor_nothing_is_named_in_a_thousand_records() {
+    never_named(1000);
+}
+
+#[test]
+fn a_measured_input_rests_and_repeats_within_its_own_noise() {
+    let mut random = Gaussian::new(3);
+    let mut noisy = |u: f64| u + 0.01 * random.next_normal();
+    let t: Vec<f64> = (0..4000).map(|k| k as f64 * 1e-3).collect();
+    let sine: Vec<f64> = (0..4000)
+        .map(|k| noisy((TAU * 2.0 * f64::from(k) * 1e-3).sin()))
+        .collect();
+    let y = vec![0.5; 4000];
+    let of = |u: &[f64]| Record::from_rows("r", &t, u, &y).unwrap();
+    assert_eq!(of(&sine).period_rows(), Some(500));
+    // A sine that swells by a twentieth a period comes back nowhere.
+    let swelling: Vec<f64> = (0..4000)
+        .map(|k| {
+            let t = f64::from(k) * 1e-3;
+            (1.0 + 0.1 * t) * (TAU * 2.0 * t).sin()
+        })
+        .collect();
+    assert_eq!(of(&swelling).period_rows(), None);
+    let wander = levels(4000, 1.0, 9);
+    assert_eq!(of(&wander).period_rows(), None);
+}
+
+/// One moving record and a measured rest: the floor comes from the rest, the held-out check from the end of the record.
+#[test]
+#[ignore = "added last and not yet seen to pass: cargo test -p cellpos-reconcile --test all verdicts -- --include-ignored a_rest"]
+fn a_rest_that_is_measured_gives_the_floor_of_one_moving_record() {
+    let mut random = Gaussian::new(4);
+    let mut noisy = |u: f64| u + 0.01 * random.next_normal();
+    // A rest that is measured: the floor comes from it.
+    let truth = plant().with_effect(effects::gain_error(1.2));
+    let rest: Vec<f64> = (0..2000).map(|_| noisy(0.0) * 0.03).collect();
+    let silent = Model {
+        noise: Noise::NONE,
+        ..plant()
+    };
+    let r = run(
+        &silent,
+        &[
+            record("moving", &truth, &levels(4000, 1.0, 5), 6),
+            record("rest", &truth, &rest, 7),
+        ],
+    );
+    assert_eq!(r.floor, FloorSource::Rest);
+    assert_eq!(r.verdict, Verdict::Named, "{:?}", r.places);
+    assert_eq!(named(&r), ["gain-error"]);
+    let factor = &r.effects[0].parameters["factor"];
+    assert!((factor.value - 1.2).abs() < 0.01, "{factor:?}");
+}
+
+#[test]
+fn numbers_that_change_with_the_part_of_the_data_are_no_name() {
+    let with = |factor: f64| plant().with_effect(effects::gain_error(factor));
+    let r = run(
+        &plant(),
+        &[
+            record("large", &with(0.8), &levels(2000, 1.0, 1), 1),
+            record("small", &with(1.25), &levels(2000, 0.5, 2), 2),
+            record("rest", &plant(), &vec![0.0; 1500], 3),
+        ],
+    );
+    assert_eq!(r.verdict, Verdict::Unknown, "{:?}", named(&r));
+    assert!(r.effects.is_empty());
+}
+
+/// An effect of another crate: the drive's square.
+#[derive(Debug)]
+struct SquareDrive;
+
+static SQUARE_DRIVE: SquareDrive = SquareDrive;
+
+static SPEC: Spec = Spec {
+    id: "square-drive",
+    place: Place::Driver,
+    shown_at: "",
+    equation: "u + c u^2",
+    signature: "even harmonics",
+    ahead_of_plant: false,
+    forms: &[Form::only(&[ParameterSpec::new(
+        "per_um", "1/um", -1.0, 1.0,
+    )])],
+    confused_with: &[],
+    inseparable_from: &[],
+    experiment: Experiment::Amplitudes,
+    separate_by: "the second harmonic at two amplitudes",
+};
+
+#[derive(Debug, Clone)]
+struct Square {
+    per_um: f64,
+}
+
+impl Block for Square {
+    fn advance(&mut self, _: f64, h_s: f64, input: Segment) -> Segment {
+        let at = |u: f64| u + self.per_um * u * u;
+        Segment::line(at(input.start), at(input.end), h_s)
+    }
+
+    fn reset(&mut self) {}
+
+    fn duplicate(&self) -> Box<dyn Block> {
+        Box::new(self.clone())
+    }
+}
+
+impl EffectKind for SquareDrive {
+    fn spec(&self) -> &'static Spec {
+        &SPEC
+    }
+
+    fn act(&self, effect: &Effect) -> Action {
+        Action::Block(Box::new(Square {
+            per_um: effect.scalar(0),
+        }))
+    }
+
+    fn candidates(&self) -> &'static [Candidate] {
+        const ALL: &[Candidate] = &[Candidate::chain(&[lin("per_um", -0.5, 0.5, 1e-4)])];
+        ALL
+    }
+
+    fn starts(&self, _: usize, _: &Scope) -> Vec<Vec<f64>> {
+        vec![vec![-0.05], vec![0.05]]
+    }
+
+    fn build(&'static self, _: usize, values: &[f64], _: &Scope) -> Effect {
+        Effect::new(self, 0, values, &[])
+    }
+}
+
+#[test]
+fn an_effect_from_elsewhere_is_searched_named_written_and_read_like_any_other() {
+    effects::register(&SQUARE_DRIVE).unwrap();
+    effects::register(&SQUARE_DRIVE).unwrap();
+    let truth = plant().with_effect(Effect::of("square-drive", &[("per_um", 0.1)]).unwrap());
+    let r = run(
+        &plant(),
+        &[
+            record("one", &truth, &levels(4000, 1.0, 11), 11),
+            record("two", &truth, &levels(4000, 0.5, 12), 12),
+            record("rest", &truth, &vec![0.0; 3000], 13),
+        ],
+    );
+    assert_eq!(r.verdict, Verdict::Named, "{:?}", r.places);
+    assert_eq!(named(&r), ["square-drive"]);
+    let found = &r.effects[0].parameters["per_um"];
+    assert!((found.value - 0.1).abs() < 0.003, "{found:?}");
+    let text = r.augmented.to_toml_string();
+    let back = Model::from_toml_str(&text, "augmented.toml").unwrap();
+    assert!(back.effect("square-drive").is_some());
+}

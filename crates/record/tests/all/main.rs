@@ -1,0 +1,5 @@
+//! Run folders and their exports.
+
+mod docs;
+mod exports;
+mod run;

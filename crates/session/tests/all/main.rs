@@ -1,0 +1,4 @@
+//! Sessions with a rig.
+
+mod rig_keys;
+mod session;

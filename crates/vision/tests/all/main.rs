@@ -1,0 +1,17 @@
+//! Pictures, rendered and recorded, through localiser and trackers.
+
+mod bound;
+mod cells;
+mod common;
+mod measured_beads;
+mod no_allocation;
+mod real_cells;
+mod streak;
+mod suggested;
+mod tracking;
+mod uncertainty;
+
+/// Counts by thread, so that tests beside each other do not disturb one another.
+#[global_allocator]
+static ALLOCATOR: cellpos_counting_alloc::CountingAllocator =
+    cellpos_counting_alloc::CountingAllocator;

@@ -1,0 +1,187 @@
+//! Beads that move while the shutter is open: their images are streaks, and the fit knows it.
+
+use crate::common::{BACKGROUND, Errors, Random};
+use cellpos_vision::{
+    Frame, Localiser, LocaliserConfig, Noise, Pixels, ProfileSpec, RadialProfile, RingProfile,
+    Verdict,
+};
+use nalgebra::{Matrix4, Vector4};
+
+const WIDTH: usize = 65;
+const HEIGHT: usize = 33;
+const WINDOW: usize = 31;
+const NOISE: f64 = 100.0;
+const EDGE_PX: f64 = 5.0;
+/// Points that stand for the exposure: more than the localiser has.
+const POINTS: usize = 96;
+
+/// Value and derivatives by the centre of a streak along `way`, at a distance from its middle.
+fn streak(p: &RingProfile, (dx, dy): (f64, f64), way: (f64, f64)) -> (f64, f64, f64) {
+    let mut sums = (0.0, 0.0, 0.0);
+    for k in 0..POINTS {
+        let at = (k as f64 + 0.5) / POINTS as f64 - 0.5;
+        let (x, y) = (dx - at * way.0, dy - at * way.1);
+        let r = f64::hypot(x, y).max(1e-9);
+        let slope = -p.slope(r) / r;
+        sums = (sums.0 + p.value(r), sums.1 + slope * x, sums.2 + slope * y);
+    }
+    let n = POINTS as f64;
+    (sums.0 / n, sums.1 / n, sums.2 / n)
+}
+
+/// A frame of streaks, all along `way`.
+fn render(
+    p: &RingProfile,
+    beads: &[(f64, f64)],
+    way: (f64, f64),
+    snr: f64,
+    random: &mut Random,
+) -> Vec<u16> {
+    let pixel = |k: usize| {
+        let (i, j) = ((k % WIDTH) as f64, (k / WIDTH) as f64);
+        let values = beads.iter().map(|(x, y)| streak(p, (i - x, j - y), way).0);
+        let value: f64 = values.sum();
+        (BACKGROUND + snr * NOISE * value + NOISE * random.normal()).round() as u16
+    };
+    (0..WIDTH * HEIGHT).map(pixel).collect()
+}
+
+fn frame(pixels: &[u16]) -> Frame<'_> {
+    Frame {
+        width: WIDTH,
+        height: HEIGHT,
+        pixels: Pixels::Mono16(pixels),
+    }
+}
+
+/// Cramer-Rao bound of x and y in the localiser's window, px.
+fn bound(p: &RingProfile, way: (f64, f64), snr: f64) -> (f64, f64) {
+    let half = (WINDOW / 2) as i64;
+    let mut information = Matrix4::zeros();
+    for j in -half..=half {
+        for i in -half..=half {
+            let (f, fx, fy) = streak(p, (i as f64, j as f64), way);
+            let g = Vector4::new(snr * fx, snr * fy, snr * f, snr);
+            information += g * g.transpose();
+        }
+    }
+    let c = information
+        .try_inverse()
+        .expect("a bead carries information");
+    (c[(0, 0)].sqrt(), c[(1, 1)].sqrt())
+}
+
+fn localiser() -> Localiser {
+    let config = LocaliserConfig {
+        window_px: WINDOW,
+        noise: Noise::Known {
+            read_sd_grey: NOISE,
+            shot_grey_per_electron: 0.0,
+            black_level_grey: 0.0,
+        },
+        ..LocaliserConfig::new(ProfileSpec::Ring { edge_px: EDGE_PX })
+    };
+    Localiser::new(config).unwrap()
+}
+
+#[test]
+fn streaks_are_localised_at_their_bound_though_the_speed_is_half_known() {
+    let profile = RingProfile::new(EDGE_PX).unwrap();
+    println!(
+        "way px  expected  SNR  bound x, y (px)  error / bound  bias x, y (px)  good  residual"
+    );
+    for (way, snr) in [
+        ((4.0, 0.0), 20.0),
+        ((8.0, 0.0), 20.0),
+        ((8.0, 0.0), 60.0),
+        ((7.5, -2.7), 40.0),
+        ((15.0, 0.0), 40.0),
+    ] {
+        for known in [0.6, 1.6] {
+            let mut localiser = localiser();
+            let mut random = Random(11);
+            let limit = bound(&profile, way, snr);
+            let mut errors = Errors::default();
+            let (mut good, mut residual) = (0, 0.0);
+            let n = 40;
+            for _ in 0..n {
+                let at = (31.5 + random.uniform(), 15.5 + random.uniform());
+                let pixels = render(&profile, &[at], way, snr, &mut random);
+                localiser.expect_streak((known * way.0, known * way.1));
+                let guess = (at.0 + random.normal(), at.1 + random.normal());
+                let fix = localiser.locate(&frame(&pixels), Some(guess));
+                good += i32::from(fix.verdict == Verdict::Good);
+                residual += fix.residual_ratio / f64::from(n);
+                errors.add((fix.x_px - at.0, fix.y_px - at.1), limit);
+            }
+            let (ratio, bias) = (errors.ratio(), errors.bias());
+            println!(
+                "{way:?}  {known}  {snr}  {:.4} {:.4}  {ratio:.3}  {:+.4} {:+.4}  {good}/{n}  {residual:.2}",
+                limit.0, limit.1, bias.0, bias.1
+            );
+            assert_eq!(good, n, "{way:?} {known} {snr}");
+            assert!(ratio < 1.25, "{way:?} {known} {snr}: {ratio}");
+            let sigma = (f64::from(n)).sqrt().recip();
+            assert!(bias.0.abs() < 4.0 * limit.0 * sigma + 0.005, "{bias:?}");
+            assert!(bias.1.abs() < 4.0 * limit.1 * sigma + 0.005, "{bias:?}");
+        }
+    }
+}
+
+/// Of two beads that touch, the one in the frame's middle, once the other's image is taken off: its error is that of a bead
+/// alone, whatever was looked at before. The pair looked at as if it were one bead is what a tracker does first; the length
+/// of streak that this comes to is the pair's, not a bead's.
+#[test]
+fn of_two_beads_that_touch_and_move_fast_each_is_localised_at_its_own_bound() {
+    let profile = RingProfile::new(EDGE_PX).unwrap();
+    let way = (8.0, 0.0);
+    let snr = 40.0;
+    println!("apart (px)  expected  error / bound  bias x, y (px)  good");
+    for apart in [(9.0, 4.0), (2.0, 9.0), (11.0, 0.0)] {
+        for known in [0.8, 1.0, 1.2] {
+            let mut random = Random(7);
+            let limit = bound(&profile, way, snr);
+            let mut errors = Errors::default();
+            let (mut good, n) = (0, 40);
+            for _ in 0..n {
+                let at = (31.5 + random.uniform(), 15.5 + random.uniform());
+                let other = (at.0 + apart.0, at.1 + apart.1);
+                let pixels = render(&profile, &[at, other], way, snr, &mut random);
+                let guess = (at.0 + random.normal(), at.1 + random.normal());
+                let beads = [
+                    (guess.0, guess.1, snr * NOISE),
+                    (other.0, other.1, snr * NOISE),
+                ];
+                let [fresh, fix] = [false, true].map(|pair_first| {
+                    let mut localiser = localiser();
+                    localiser.expect_streak((known * way.0, known * way.1));
+                    if pair_first {
+                        let middle = (at.0 + 0.5 * apart.0, at.1 + 0.5 * apart.1);
+                        localiser.locate(&frame(&pixels), Some(middle));
+                    }
+                    localiser.locate_beside(&frame(&pixels), guess, &beads, 0)
+                });
+                assert_eq!(fresh, fix, "what was looked at before must not matter");
+                good += i32::from(fix.verdict == Verdict::Good);
+                errors.add((fix.x_px - at.0, fix.y_px - at.1), limit);
+            }
+            let (ratio, bias) = (errors.ratio(), errors.bias());
+            println!(
+                "{apart:?}  {known}  {ratio:.3}  {:+.4} {:+.4}  {good}/{n}",
+                bias.0, bias.1
+            );
+            assert_eq!(good, n, "{apart:?} {known}");
+            assert!(ratio < 1.25, "{apart:?} {known}: {ratio}");
+        }
+    }
+}
+
+#[test]
+fn a_streak_that_nobody_expects_is_no_fix() {
+    let profile = RingProfile::new(EDGE_PX).unwrap();
+    let mut random = Random(5);
+    let way = (10.0, 0.0);
+    let pixels = render(&profile, &[(32.0, 16.0)], way, 40.0, &mut random);
+    let fix = localiser().locate(&frame(&pixels), Some((32.0, 16.0)));
+    assert_ne!(fix.verdict, Verdict::Good);
+}

@@ -1,0 +1,269 @@
+//! Following one bead past others, through losses and returns.
+
+use crate::common::Random;
+use cellpos_vision::{
+    Decision, Frame, Localiser, LocaliserConfig, PixelResponse, Pixels, ProfileSpec, Template,
+    TrackState, Tracker, TrackerConfig,
+};
+
+const WIDTH: usize = 96;
+const HEIGHT: usize = 64;
+const NOISE: f64 = 2.0;
+const AMPLITUDE: f64 = 80.0;
+const EDGE_PX: f64 = 4.5;
+const DT_S: f64 = 1e-3;
+
+struct Scene {
+    template: Template,
+    image: Vec<f32>,
+    pixels: Vec<u8>,
+    /// Normal numbers, read from a random place on: drawing each one anew would take most of the test's time.
+    noise: Vec<f32>,
+}
+
+impl Scene {
+    fn new() -> Self {
+        let template = ProfileSpec::Ring { edge_px: EDGE_PX }
+            .template(PixelResponse::Point)
+            .unwrap();
+        let mut random = Random(1);
+        let noise = (0..3 * WIDTH * HEIGHT)
+            .map(|_| (NOISE * random.normal()) as f32)
+            .collect();
+        Scene {
+            template,
+            image: vec![0.0; WIDTH * HEIGHT],
+            pixels: vec![0; WIDTH * HEIGHT],
+            noise,
+        }
+    }
+
+    fn draw(&mut self, beads: &[(f64, f64, f64)], random: &mut Random) -> Frame<'_> {
+        self.image.fill(110.0);
+        for (x, y, brightness) in beads {
+            self.template
+                .draw(&mut self.image, WIDTH, *x, *y, AMPLITUDE * brightness);
+        }
+        let start = (random.uniform() * (2 * WIDTH * HEIGHT) as f64) as usize;
+        for ((p, v), n) in self
+            .pixels
+            .iter_mut()
+            .zip(&self.image)
+            .zip(&self.noise[start..])
+        {
+            *p = (v + n).round().clamp(0.0, 255.0) as u8;
+        }
+        Frame {
+            width: WIDTH,
+            height: HEIGHT,
+            pixels: Pixels::Mono8(&self.pixels),
+        }
+    }
+}
+
+fn tracker() -> Tracker {
+    let localiser =
+        Localiser::new(LocaliserConfig::new(ProfileSpec::Ring { edge_px: EDGE_PX })).unwrap();
+    Tracker::new(localiser, TrackerConfig::default()).unwrap()
+}
+
+/// Brownian step of the tracker's assumed diffusion.
+fn step(random: &mut Random) -> f64 {
+    (2.0 * 33.0 * DT_S).sqrt() * random.normal()
+}
+
+#[derive(Debug, Default)]
+struct Encounters {
+    kept: usize,
+    given_up: usize,
+    switched: usize,
+    coasted_frames: usize,
+    worst_px: f64,
+}
+
+/// One encounter: the neighbour passes at `impact_px` with the relative speed `speed`, under a common flow.
+fn encounter(scene: &mut Scene, seed: u64, outcome: &mut Encounters) {
+    let mut random = Random(seed);
+    let mut tracker = tracker();
+    let impact_px = 20.0 * (random.uniform() - 0.5);
+    let speed = 60.0 + 440.0 * random.uniform();
+    let angle = std::f64::consts::TAU * random.uniform();
+    let brightness = 0.9 + 0.2 * random.uniform();
+    let (flow_amplitude, flow_hz) = (300.0 * random.uniform(), 5.0 + 20.0 * random.uniform());
+    let (c, s) = (angle.cos(), angle.sin());
+    let reach_px = 24.0;
+    let (mut ax, mut ay) = (48.0, 32.0);
+    let (mut bx, mut by) = (
+        ax - reach_px * c - impact_px * s,
+        ay - reach_px * s + impact_px * c,
+    );
+    let frames = 60 + (2.0 * reach_px / speed / DT_S) as usize;
+    tracker.choose(Some((ax, ay)));
+    for n in 0..frames {
+        let time_s = n as f64 * DT_S;
+        let flow = flow_amplitude * (std::f64::consts::TAU * flow_hz * time_s).cos();
+        let moving = if n > 20 { speed * DT_S } else { 0.0 };
+        let frame = scene.draw(&[(ax, ay, 1.0), (bx, by, brightness)], &mut random);
+        let t = tracker.step(Some(&frame), time_s, (flow, 0.0));
+        if t.state == TrackState::Tracking {
+            let to_own = f64::hypot(t.x_px - ax, t.y_px - ay);
+            let to_other = f64::hypot(t.x_px - bx, t.y_px - by);
+            if to_own > 2.0 || to_other < to_own {
+                outcome.switched += 1;
+                println!(
+                    "seed {seed} frame {n}: {t:?}; own {ax:.2} {ay:.2}, other {bx:.2} {by:.2}"
+                );
+                return;
+            }
+            outcome.worst_px = outcome.worst_px.max(to_own);
+        } else if t.state == TrackState::Coasting {
+            outcome.coasted_frames += 1;
+        }
+        assert!(n < 20 || t.state != TrackState::Searching, "{t:?}");
+        ax += flow * DT_S + step(&mut random);
+        ay += step(&mut random);
+        bx += flow * DT_S + moving * c + step(&mut random);
+        by += moving * s + step(&mut random);
+    }
+    match tracker.state() {
+        TrackState::Tracking => outcome.kept += 1,
+        _ => outcome.given_up += 1,
+    }
+}
+
+#[test]
+fn two_hundred_encounters_pass_without_a_silent_switch() {
+    let mut outcome = Encounters::default();
+    let mut scene = Scene::new();
+    for seed in 1..=200 {
+        encounter(&mut scene, seed * 7919, &mut outcome);
+    }
+    println!("200 encounters of two like beads: {outcome:?}");
+    assert_eq!(outcome.switched, 0, "{outcome:?}");
+    // Giving up is honest, but a tracker that always gives up is of no use.
+    assert!(outcome.kept >= 150, "{outcome:?}");
+}
+
+#[test]
+fn a_lost_bead_is_reacquired_within_50_ms_of_its_return_and_the_record_says_so() {
+    let mut longest_ms = 0.0_f64;
+    for seed in 1..=20 {
+        let mut random = Random(seed * 104_729);
+        let mut scene = Scene::new();
+        let mut tracker = tracker();
+        let (mut x, mut y) = (40.0, 30.0);
+        let mut back_at = None;
+        let mut decision = None;
+        for n in 0..400 {
+            let time_s = f64::from(n) * DT_S;
+            let hidden = (100..300).contains(&n);
+            let beads: &[(f64, f64, f64)] = if hidden { &[] } else { &[(x, y, 1.0)] };
+            let frame = scene.draw(beads, &mut random);
+            let t = tracker.step(Some(&frame), time_s, (0.0, 0.0));
+            match n {
+                50..100 => assert_eq!(t.state, TrackState::Tracking, "{n} {t:?}"),
+                100..148 => assert_eq!(t.state, TrackState::Coasting, "{n} {t:?}"),
+                155..300 => assert_eq!(t.state, TrackState::Lost, "{n} {t:?}"),
+                _ => {}
+            }
+            if n >= 300 && t.state == TrackState::Tracking && back_at.is_none() {
+                back_at = Some(n);
+                decision = Some(t.decision);
+                assert!(f64::hypot(t.x_px - x, t.y_px - y) < 0.5, "{t:?}");
+            }
+            // It comes back elsewhere.
+            (x, y) = if n == 299 {
+                (
+                    25.0 + 45.0 * random.uniform(),
+                    20.0 + 24.0 * random.uniform(),
+                )
+            } else {
+                (x, y)
+            };
+            x += step(&mut random);
+            y += step(&mut random);
+        }
+        let back_at = back_at.expect("the bead came back");
+        longest_ms = longest_ms.max(f64::from(back_at - 300));
+        assert_eq!(decision, Some(Decision::Reacquired));
+    }
+    println!("re-acquired within {longest_ms} ms of the return");
+    assert!(longest_ms <= 50.0);
+}
+
+#[test]
+fn a_short_gap_is_coasted_through_on_the_commanded_flow() {
+    let mut random = Random(77);
+    let mut scene = Scene::new();
+    let mut tracker = tracker();
+    let (mut x, y) = (20.0, 32.0);
+    for n in 0..120 {
+        let gap = (60..90).contains(&n);
+        let frame = scene.draw(&[(x, y, 1.0)], &mut random);
+        let t = tracker.step(
+            if gap { None } else { Some(&frame) },
+            f64::from(n) * DT_S,
+            (400.0, 0.0),
+        );
+        if gap {
+            assert_eq!(
+                (t.state, t.decision),
+                (TrackState::Coasting, Decision::NoFrame)
+            );
+            assert!((t.x_px - x).abs() < 3.0, "{n}: {t:?}, bead at {x}");
+        }
+        if n == 90 {
+            assert_eq!(t.decision, Decision::Regained, "{t:?}");
+        }
+        x += 400.0 * DT_S;
+    }
+}
+
+#[test]
+fn another_kind_of_bead_in_the_lost_ones_place_is_not_taken() {
+    let mut random = Random(5);
+    let mut scene = Scene::new();
+    let mut tracker = tracker();
+    for n in 0..300 {
+        let brightness = if n < 100 { 1.0 } else { 0.45 };
+        let frame = scene.draw(&[(40.0, 30.0, brightness)], &mut random);
+        let t = tracker.step(Some(&frame), f64::from(n) * DT_S, (0.0, 0.0));
+        if n >= 100 {
+            assert!(!t.decision.is_accepted(), "{n} {t:?}");
+            assert_eq!(t.decision, Decision::OtherBead);
+        }
+    }
+    assert_eq!(tracker.state(), TrackState::Lost);
+}
+
+#[test]
+fn an_empty_picture_keeps_the_tracker_searching() {
+    let mut random = Random(6);
+    let mut scene = Scene::new();
+    let mut tracker = tracker();
+    for n in 0..50 {
+        let frame = scene.draw(&[], &mut random);
+        let t = tracker.step(Some(&frame), f64::from(n) * DT_S, (0.0, 0.0));
+        assert_eq!(
+            (t.state, t.decision),
+            (TrackState::Searching, Decision::NothingFound)
+        );
+    }
+}
+
+#[test]
+fn the_bead_nearest_to_the_aim_is_chosen() {
+    let mut random = Random(6);
+    let mut scene = Scene::new();
+    for aim in [(20.0, 20.0), (70.0, 40.0)] {
+        let mut tracker = tracker();
+        tracker.choose(Some(aim));
+        let beads = [(22.0, 22.0, 1.0), (70.0, 38.0, 1.2)];
+        for n in 0..10 {
+            let frame = scene.draw(&beads, &mut random);
+            let t = tracker.step(Some(&frame), f64::from(n) * DT_S, (0.0, 0.0));
+            assert!(f64::hypot(t.x_px - aim.0, t.y_px - aim.1) < 4.0);
+        }
+        assert_eq!(tracker.state(), TrackState::Tracking);
+    }
+}
