@@ -16,6 +16,7 @@ use cellpos_runtime::{
     ArmingConfig, Core, EndRule, NoSink, Statistics, Summary, Timing, virtual_run,
 };
 use cellpos_vision::{Localiser, LocaliserConfig, ProfileSpec, Tracker, TrackerConfig};
+use std::sync::Arc;
 
 /// A run on the emulated rig, held at 0 um with PI, as `cellpos track --target 0um` does it.
 ///
@@ -92,7 +93,7 @@ pub fn track(clock: Clock, frames: bool, ticks: u64) -> (Summary, Conditions) {
             Statistics::default(),
             end,
             &Threads::real_time(),
-            &Operator::default(),
+            &Arc::new(Operator::default()),
         )
     }
     .expect("the run is carried through");

@@ -1,8 +1,10 @@
 //! A file that only ever grows by whole blocks.
 
 use std::fs::{File, OpenOptions};
+use std::collections::VecDeque;
 use std::io;
 use std::path::Path;
+use std::time::Duration;
 
 /// Most bytes that wait for a disk that refuses them: some minutes of a run.
 const MOST_WAITING: usize = 1 << 26;
@@ -34,16 +36,17 @@ pub(crate) trait Sink {
     fn append(&mut self, bytes: &[u8]) -> io::Result<()>;
     /// Cuts the file to a length.
     fn cut(&mut self, length: u64) -> io::Result<()>;
-    /// Sees to it that the disk has everything: now, or soon ([`Sink::is_pending`]); then the next sync says whether it came
-    /// to that.
+    /// Sees to it that the disk has everything: now, or soon ([`Sink::awaited`]); then the next sync says whether it came to
+    /// that.
     fn sync(&mut self) -> io::Result<()>;
-    /// Waits for a sync that is still to come.
-    fn settle(&mut self) -> io::Result<()> {
+    /// Waits for a sync that is still to come, at most for a time; [`io::ErrorKind::TimedOut`] when it did not.
+    fn settle(&mut self, most: Duration) -> io::Result<()> {
+        let _ = most;
         Ok(())
     }
-    /// Whether a sync is still to come.
-    fn is_pending(&self) -> bool {
-        false
+    /// Of the syncs that were asked for, how many, the newest, are still to come.
+    fn awaited(&self) -> u64 {
+        0
     }
     /// Fails when nobody will find what is written: the file was removed.
     fn is_there(&self) -> io::Result<()>;
@@ -65,8 +68,8 @@ pub(crate) struct Blocks<S> {
     dropped_units: u64,
     /// Those appended since the last sync.
     unsynced_units: u64,
-    /// Those of the syncs that are still to come.
-    pending_units: u64,
+    /// Those of each sync that is still to come, the oldest first.
+    pending: VecDeque<u64>,
     /// Those of which the disk said that it does not have them.
     unkept_units: u64,
 }
@@ -82,7 +85,7 @@ impl<S: Sink> Blocks<S> {
             waiting_units: 0,
             dropped_units: 0,
             unsynced_units: 0,
-            pending_units: 0,
+            pending: VecDeque::new(),
             unkept_units: 0,
         }
     }
@@ -125,26 +128,40 @@ impl<S: Sink> Blocks<S> {
             return Ok(());
         }
         self.unsynced = false;
-        self.pending_units += std::mem::take(&mut self.unsynced_units);
+        self.pending
+            .push_back(std::mem::take(&mut self.unsynced_units));
         let synced = self.sink.sync();
         self.account(synced)
     }
 
-    /// Waits until the disk has what was synced.
-    pub(crate) fn settle(&mut self) -> io::Result<()> {
-        let settled = self.sink.settle();
+    /// Waits until the disk has what was synced, at most for a time. What it has not confirmed by then is not kept.
+    pub(crate) fn settle(&mut self, most: Duration) -> io::Result<()> {
+        let settled = self.sink.settle(most);
+        if let Err(error) = &settled
+            && error.kind() == io::ErrorKind::TimedOut
+        {
+            self.unkept_units += std::mem::take(&mut self.unsynced_units);
+        }
         self.account(settled)
     }
 
+    /// Rows, lines or events that are in the file as far as this program can tell, and of which the disk has not said so.
+    pub(crate) fn unconfirmed_units(&self) -> u64 {
+        let awaited = self.awaited().min(self.pending.len());
+        self.unsynced_units + self.pending.iter().rev().take(awaited).sum::<u64>()
+    }
+
+    fn awaited(&self) -> usize {
+        usize::try_from(self.sink.awaited()).unwrap_or(usize::MAX)
+    }
+
+    /// What the disk has said of the syncs so far. A system that could not write says so once and then forgets what it had.
     fn account(&mut self, synced: io::Result<()>) -> io::Result<()> {
-        match &synced {
-            Ok(()) if self.sink.is_pending() => {}
-            Ok(()) => self.pending_units = 0,
-            // It may have it yet.
-            Err(error) if error.kind() == io::ErrorKind::TimedOut => self.unsynced = true,
-            // A system that could not write says so once and then forgets what it had.
-            Err(_) => self.unkept_units += std::mem::take(&mut self.pending_units),
+        if synced.is_err() {
+            self.unkept_units += self.pending.drain(..).sum::<u64>();
         }
+        let confirmed = self.pending.len().saturating_sub(self.awaited());
+        self.pending.drain(..confirmed);
         synced
     }
 
@@ -161,6 +178,16 @@ impl<S: Sink> Blocks<S> {
     /// Rows, lines or events that were taken and are not in the file, or that the disk said it does not have.
     pub(crate) fn lost(&self) -> u64 {
         self.waiting_units + self.dropped_units + self.unkept_units
+    }
+
+    /// Length up to which the file is whole.
+    pub(crate) fn bytes(&self) -> u64 {
+        self.good
+    }
+
+    /// Rows, lines or events that wait.
+    pub(crate) fn waiting_units(&self) -> u64 {
+        self.waiting_units
     }
 
     /// Bytes that wait.

@@ -28,6 +28,7 @@
 
 mod blocks;
 mod columns;
+mod ending;
 mod error;
 mod events;
 pub mod export;

@@ -3,7 +3,8 @@
 use crate::blocks::{Blocks, open_here};
 use crate::error::RecordError;
 use crate::faults::Faults;
-use crate::synced::SyncedFile;
+use crate::synced::{DISK_ANSWERS, SyncedFile};
+use cellpos_runtime::recorder::Unconfirmed;
 use std::fs::{File, OpenOptions};
 use std::io::{Read, Seek, SeekFrom};
 use std::path::Path;
@@ -84,13 +85,35 @@ impl LineFile {
         let written = self.write();
         self.failing = written.is_err();
         if let Err(error) = written {
-            self.io_errors += 1;
-            if self.first.is_none() {
-                tracing::error!("the table is incomplete: {error}");
-                self.first = Some(error.to_string());
-            }
+            self.fault(&error);
         }
         self.blocks.waiting_bytes() == 0
+    }
+
+    fn fault(&mut self, error: &std::io::Error) {
+        self.io_errors += 1;
+        if self.first.is_none() {
+            tracing::error!("the table is incomplete: {error}");
+            self.first = Some(error.to_string());
+        }
+    }
+
+    /// Writes what waits for the last time, and waits for the disk to confirm it.
+    pub fn close(&mut self) {
+        self.flush();
+        if self.sync
+            && let Err(error) = self.blocks.settle(DISK_ANSWERS)
+        {
+            self.fault(&error);
+        }
+    }
+
+    /// What was written and the disk has not confirmed, in lines.
+    pub fn unconfirmed(&self) -> Unconfirmed {
+        Unconfirmed {
+            since: self.blocks.sink().unconfirmed(),
+            rows: self.blocks.unconfirmed_units(),
+        }
     }
 
     /// Whether the last attempt to write failed.

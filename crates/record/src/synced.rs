@@ -1,4 +1,7 @@
 //! A file whose syncs are waited for by a thread of its own, so that a slow disk never holds the recorder.
+//!
+//! How long the disk leaves what was written unconfirmed is asked for ([`SyncedFile::unconfirmed`]); whether that is too long is
+//! for the run to say ([`cellpos_runtime::recorder::Unconfirmed`]), which also has the argument.
 
 use crate::blocks::Sink;
 use std::fs::File;
@@ -6,12 +9,10 @@ use std::io::{self, Seek, SeekFrom, Write};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-/// A disk that needs longer for a sync is said to be slow.
-const SLOW: Duration = Duration::from_millis(500);
-/// A disk that needs longer for a sync is said to refuse.
-const PATIENCE: Duration = Duration::from_secs(8);
 /// How long the end of a run waits for the disk.
-const LAST_PATIENCE: Duration = Duration::from_secs(30);
+pub(crate) const LAST_PATIENCE: Duration = Duration::from_secs(15);
+/// A disk that works answers so soon when little is left to write. A file that is let go waits no longer for its last sync.
+pub(crate) const DISK_ANSWERS: Duration = Duration::from_secs(2);
 
 #[derive(Default)]
 struct State {
@@ -19,6 +20,9 @@ struct State {
     asked: u64,
     done: u64,
     busy_since: Option<Instant>,
+    /// When the oldest of the syncs that are running, and of those that still wait for their turn, was asked for.
+    running_since: Option<Instant>,
+    waiting_since: Option<Instant>,
     slowest: Duration,
     failed: Option<io::Error>,
     closed: bool,
@@ -53,10 +57,11 @@ impl Shared {
                 let asked = state.asked;
                 let from = Instant::now();
                 state.busy_since = Some(from);
+                state.running_since = state.waiting_since.take();
                 drop(state);
                 let synced = sync();
                 state = self.lock();
-                state.busy_since = None;
+                (state.busy_since, state.running_since) = (None, None);
                 state.slowest = state.slowest.max(from.elapsed());
                 state.done = asked;
                 if let Err(error) = synced {
@@ -82,16 +87,21 @@ pub(crate) struct SyncedFile {
     file: File,
     /// Made with the first sync.
     shared: Option<Arc<Shared>>,
-    slow_was_said: bool,
 }
 
 impl SyncedFile {
     pub(crate) fn new(file: File) -> Self {
-        Self {
-            file,
-            shared: None,
-            slow_was_said: false,
-        }
+        Self { file, shared: None }
+    }
+
+    /// How long the oldest of what was to be synced has been waiting for the disk's answer.
+    pub(crate) fn unconfirmed(&self) -> Duration {
+        let Some(shared) = &self.shared else {
+            return Duration::ZERO;
+        };
+        let state = shared.lock();
+        let since = state.running_since.or(state.waiting_since);
+        since.map_or(Duration::ZERO, |at| at.elapsed())
     }
 
     /// The longest sync so far.
@@ -137,43 +147,31 @@ impl Sink for SyncedFile {
 
     fn sync(&mut self) -> io::Result<()> {
         let shared = self.started()?;
-        let (failed, busy) = {
-            let mut state = shared.lock();
-            state.asked += 1;
-            shared.changed.notify_all();
-            let busy = state.busy_since.map_or(Duration::ZERO, |at| at.elapsed());
-            (state.failed.take(), busy)
-        };
-        if let Some(error) = failed {
-            return Err(error);
-        }
-        if busy > PATIENCE {
-            let text = format!("the disk has not finished a write for {busy:.0?}");
-            return Err(io::Error::new(io::ErrorKind::TimedOut, text));
-        }
-        if busy > SLOW && !std::mem::replace(&mut self.slow_was_said, true) {
-            tracing::warn!(
-                "the disk takes longer than {SLOW:.1?} for a write: a power failure now would cost more than the last second"
-            );
-        }
-        Ok(())
+        let mut state = shared.lock();
+        state.asked += 1;
+        state.waiting_since.get_or_insert_with(Instant::now);
+        shared.changed.notify_all();
+        state.failed.take().map_or(Ok(()), Err)
     }
 
-    fn settle(&mut self) -> io::Result<()> {
-        let Some(shared) = &self.shared else {
-            return self.file.sync_data();
-        };
-        if !shared.wait_until(LAST_PATIENCE, |state| state.done == state.asked) {
-            let text = format!("the disk has not finished a write for {LAST_PATIENCE:.0?}");
+    fn settle(&mut self, most: Duration) -> io::Result<()> {
+        let shared = self.started()?;
+        if shared.lock().asked == 0 {
+            // Nothing was synced so far: a run on the virtual clock.
+            shared.lock().asked = 1;
+            shared.changed.notify_all();
+        }
+        if !shared.wait_until(most, |state| state.done == state.asked) {
+            let text = format!("the disk did not confirm what was written within {most:.0?}");
             return Err(io::Error::new(io::ErrorKind::TimedOut, text));
         }
         shared.lock().failed.take().map_or(Ok(()), Err)
     }
 
-    fn is_pending(&self) -> bool {
-        self.shared.as_ref().is_some_and(|shared| {
+    fn awaited(&self) -> u64 {
+        self.shared.as_ref().map_or(0, |shared| {
             let state = shared.lock();
-            state.done < state.asked
+            state.asked - state.done
         })
     }
 
@@ -197,7 +195,7 @@ impl Drop for SyncedFile {
         if let Some(shared) = &self.shared {
             shared.lock().closed = true;
             shared.changed.notify_all();
-            shared.wait_until(PATIENCE, |state| state.ended);
+            shared.wait_until(DISK_ANSWERS, |state| state.ended);
         }
     }
 }
@@ -230,13 +228,45 @@ mod tests {
             // Comes back although the first one hangs.
             file.append(b"row").unwrap();
             file.sync().unwrap();
-            assert!(file.is_pending());
+            assert!(file.awaited() > 0);
         }
         end.send(Ok(())).unwrap();
         begins.recv().unwrap();
         end.send(Ok(())).unwrap();
-        file.settle().unwrap();
-        assert!(!file.is_pending() && begins.try_recv().is_err());
+        file.settle(LAST_PATIENCE).unwrap();
+        assert!(file.awaited() == 0 && begins.try_recv().is_err());
+    }
+
+    #[test]
+    fn what_is_unconfirmed_is_as_old_as_the_oldest_sync_that_was_asked_for() {
+        let (mut file, end, begins) = held();
+        assert_eq!(file.unconfirmed(), Duration::ZERO);
+        let first = Instant::now();
+        file.sync().unwrap();
+        begins.recv().unwrap();
+        std::thread::sleep(Duration::from_millis(40));
+        let second = Instant::now();
+        file.sync().unwrap();
+        // The first one is older, and still runs.
+        assert!(file.unconfirmed() >= Duration::from_millis(40));
+        assert!(file.unconfirmed() <= first.elapsed());
+        end.send(Ok(())).unwrap();
+        begins.recv().unwrap();
+        // What was asked for meanwhile is being synced now: its age counts from when it was asked for.
+        assert!(file.unconfirmed() <= second.elapsed());
+        end.send(Ok(())).unwrap();
+        file.settle(LAST_PATIENCE).unwrap();
+        assert_eq!(file.unconfirmed(), Duration::ZERO);
+    }
+
+    #[test]
+    fn a_disk_that_never_answers_is_not_waited_for_longer_than_said() {
+        let (mut file, _end, begins) = held();
+        file.sync().unwrap();
+        begins.recv().unwrap();
+        let given_up = file.settle(Duration::from_millis(20)).unwrap_err();
+        assert_eq!(given_up.kind(), io::ErrorKind::TimedOut);
+        assert!(file.unconfirmed() >= Duration::from_millis(20));
     }
 
     #[test]
@@ -253,7 +283,7 @@ mod tests {
                     .wait_until(LAST_PATIENCE, |state| state.done == state.asked)
             );
             let said = if at_the_end {
-                file.settle()
+                file.settle(LAST_PATIENCE)
             } else {
                 file.sync()
             };
@@ -262,7 +292,7 @@ mod tests {
                 begins.recv().unwrap();
                 end.send(Ok(())).unwrap();
             }
-            file.settle().unwrap();
+            file.settle(LAST_PATIENCE).unwrap();
         }
     }
 
@@ -270,8 +300,7 @@ mod tests {
     fn without_a_sync_there_is_no_thread() {
         let mut file = SyncedFile::new(tempfile::tempfile().unwrap());
         file.append(b"row").unwrap();
-        file.settle().unwrap();
-        assert!(file.shared.is_none() && !file.is_pending());
+        assert!(file.shared.is_none() && file.awaited() == 0);
         assert_eq!(file.slowest(), Duration::ZERO);
     }
 }

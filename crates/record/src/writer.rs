@@ -4,14 +4,13 @@ use crate::blocks::{Blocks, Sink, open_here};
 use crate::columns::{self, Builder, Group};
 use crate::error::RecordError;
 use crate::events::Event;
-use crate::export::{Selection, Source};
 use crate::faults::Faults;
-use crate::meta::{RunEnd, RunMeta};
-use crate::reader::RunReader;
-use crate::synced::SyncedFile;
-use crate::{EVENTS_JSONL, RUN_TOML, TICKS_ARROW, TICKS_PARQUET};
+use crate::meta::RunMeta;
+use crate::synced::{DISK_ANSWERS, SyncedFile};
+use crate::{EVENTS_JSONL, RUN_TOML, TICKS_ARROW};
 use arrow_ipc::writer::StreamWriter;
 use cellpos_runtime::TickRecord;
+use cellpos_runtime::recorder::Unconfirmed;
 use cellpos_table::write_atomically;
 use std::fs::OpenOptions;
 use std::io;
@@ -53,6 +52,8 @@ pub struct Finished {
     pub rows: u64,
     /// What could not be written.
     pub faults: Faults,
+    /// The longest that the disk took to confirm what was written, where it was asked to.
+    pub slowest_sync: Option<Duration>,
     /// Whether `run.toml` has the end of the run.
     pub closed: bool,
     /// Why there is no `ticks.parquet`, if there is none.
@@ -61,9 +62,9 @@ pub struct Finished {
 
 /// Writes a run folder. See the crate's documentation; belongs to the recorder thread.
 pub struct RunWriter {
-    folder: PathBuf,
-    meta: RunMeta,
-    log: Log<SyncedFile>,
+    pub(crate) folder: PathBuf,
+    pub(crate) meta: RunMeta,
+    pub(crate) log: Log<SyncedFile>,
 }
 
 /// Columns and events, with the account of what was lost.
@@ -81,6 +82,16 @@ pub(crate) struct Log<S: Sink> {
     first: Option<String>,
     /// The last attempt to write failed.
     failing: bool,
+    closed: bool,
+}
+
+impl<S: Sink> Drop for Log<S> {
+    /// A log dropped on the way out of a failure leaves what it had.
+    fn drop(&mut self) {
+        if !self.closed {
+            self.flush();
+        }
+    }
 }
 
 impl<S: Sink> Log<S> {
@@ -111,6 +122,7 @@ impl<S: Sink> Log<S> {
             io_errors: 0,
             first: None,
             failing: false,
+            closed: false,
         };
         log.ticks.push(&schema, 0);
         log.write(policy.sync);
@@ -206,18 +218,64 @@ impl<S: Sink> Log<S> {
         }
     }
 
-    /// Writes what waits and the end mark, and syncs.
-    pub(crate) fn close(&mut self) {
+    /// Rows that were taken.
+    pub(crate) fn rows(&self) -> u64 {
+        self.rows
+    }
+
+    /// Whether each flush is synced.
+    pub(crate) fn syncs(&self) -> bool {
+        self.policy.sync
+    }
+
+    /// Length of the rows so far.
+    pub(crate) fn bytes(&self) -> u64 {
+        self.ticks.bytes()
+    }
+
+    /// Rows that were taken and are in memory only, as far as the disk has said.
+    pub(crate) fn unconfirmed_rows(&self) -> u64 {
+        self.builder.rows() as u64 + self.ticks.waiting_units() + self.ticks.unconfirmed_units()
+    }
+
+    /// Writes what waits and the end mark, and syncs; says whether the disk confirmed it.
+    pub(crate) fn close(&mut self, most: Duration) -> bool {
+        self.closed = true;
         self.flush();
         if !self.failing {
             let end = [0xff, 0xff, 0xff, 0xff, 0, 0, 0, 0];
             self.ticks.push(&end, 0);
             self.write(true);
         }
-        for settled in [self.ticks.settle(), self.events.settle()] {
+        let until = Instant::now() + most;
+        let mut answers = true;
+        let settled = self.ticks.settle(most);
+        // The two share their time; a disk that has not answered the one is asked for the other all the same.
+        let left = until.saturating_duration_since(Instant::now());
+        for settled in [settled, self.events.settle(left.max(DISK_ANSWERS))] {
             if let Err(error) = settled {
+                answers &= error.kind() != io::ErrorKind::TimedOut;
                 self.fault(&error);
             }
+        }
+        answers
+    }
+}
+
+impl Log<SyncedFile> {
+    /// The longest sync so far.
+    pub(crate) fn slowest_sync(&self) -> Duration {
+        self.ticks
+            .sink()
+            .slowest()
+            .max(self.events.sink().slowest())
+    }
+
+    fn unconfirmed(&self) -> Unconfirmed {
+        let (ticks, events) = (self.ticks.sink(), self.events.sink());
+        Unconfirmed {
+            since: ticks.unconfirmed().max(events.unconfirmed()),
+            rows: self.unconfirmed_rows(),
         }
     }
 }
@@ -323,80 +381,15 @@ impl RunWriter {
         self.log.faults()
     }
 
+    /// What was taken and the disk has not confirmed. Rows that still gather for the next flush are among the rows; the time
+    /// counts from the flush.
+    pub fn unconfirmed(&self) -> Unconfirmed {
+        self.log.unconfirmed()
+    }
+
     /// Whether the last attempt to write failed: what waits is tried again with the next batch.
     pub fn is_failing(&self) -> bool {
         self.log.failing
-    }
-
-    /// Writes what waits, the end of `run.toml` (`ended_utc` and the counts are set here), and `ticks.parquet`.
-    ///
-    /// The rows are read back: every row taken that does not come back is counted as lost, on top of what `end.rows_lost`
-    /// says was lost on the way here, and the figure `records_lost` of the summary is set to the sum. A failing disk is no
-    /// error here either: what could be written is there, and [`Finished`] says the rest.
-    pub fn finish(mut self, mut end: RunEnd) -> Finished {
-        self.log.close();
-        end.ended_utc = jiff::Timestamp::now()
-            .strftime("%Y-%m-%dT%H:%M:%S%.3fZ")
-            .to_string();
-        let parquet = RunReader::open(&self.folder).and_then(|run| {
-            let path = self.folder.join(TICKS_PARQUET);
-            crate::write_parquet(&Source::single(run), &Selection::default(), &path).map(|_| ())
-        });
-        let mut faults = self.log.faults();
-        let rows = match self.rows_on_disk() {
-            Ok(rows) => rows,
-            Err(error) => {
-                faults.first.get_or_insert(error.to_string());
-                0
-            }
-        };
-        faults.rows_lost = faults.rows_lost.max(self.log.rows.saturating_sub(rows));
-        if let Err(error) = &parquet {
-            faults.io_errors += 1;
-            faults.first.get_or_insert(error.to_string());
-        }
-        end.rows = rows;
-        end.rows_lost += faults.rows_lost;
-        end.events_lost += faults.events_lost;
-        if self.log.policy.sync {
-            let slowest = self.log.ticks.sink().slowest();
-            end.summary.insert(
-                "slowest_sync_ms".to_owned(),
-                toml::Value::Float(slowest.as_secs_f64() * 1e3),
-            );
-        }
-        if let Some(lost) = end.summary.get_mut("records_lost") {
-            *lost = toml::Value::Integer(i64::try_from(end.rows_lost).unwrap_or(i64::MAX));
-        }
-        self.meta.end = Some(end);
-        let written = self.meta.to_toml().and_then(|text| {
-            write_atomically(&self.folder.join(RUN_TOML), text.as_bytes())?;
-            Ok(())
-        });
-        if let Err(error) = &written {
-            faults.io_errors += 1;
-            faults.first.get_or_insert(error.to_string());
-        }
-        Finished {
-            folder: self.folder.clone(),
-            rows,
-            faults,
-            closed: written.is_ok(),
-            parquet,
-        }
-    }
-
-    /// Rows that come back from the disk.
-    fn rows_on_disk(&self) -> Result<u64, RecordError> {
-        let mut batches = RunReader::open(&self.folder)?.batches()?;
-        Ok(batches.by_ref().map(|batch| batch.len() as u64).sum())
-    }
-}
-
-impl Drop for RunWriter {
-    /// A writer dropped on the way out of a failure leaves what it had.
-    fn drop(&mut self) {
-        self.log.flush();
     }
 }
 

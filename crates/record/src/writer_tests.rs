@@ -122,7 +122,7 @@ fn what_a_full_disk_refuses_waits_and_is_there_when_there_is_room_again() {
             log.tick(&row(seq));
         }
         assert!(!log.failing);
-        log.close();
+        log.close(Duration::ZERO);
         assert_eq!((log.faults().rows_lost, log.faults().events_lost), (0, 0));
         let (seqs, damaged, torn) = read(&ticks.bytes.borrow());
         assert_eq!(seqs, (0..600).collect::<Vec<u64>>());
@@ -140,7 +140,7 @@ fn a_disk_that_is_full_from_the_start_loses_everything_by_number() {
         log.tick(&row(seq));
     }
     log.event(&Event::new(0.0, "x"));
-    log.close();
+    log.close(Duration::ZERO);
     assert!(log.failing);
     assert_eq!(log.faults().rows_lost, 10);
     assert_eq!(log.faults().events_lost, 1);
@@ -169,7 +169,7 @@ fn events_go_to_the_disk_with_their_ticks_and_cost_no_wait_of_their_own() {
     }
     let syncs = *ticks.syncs.borrow() + *events.syncs.borrow() - before;
     assert!(syncs <= 20, "{syncs} waits for ten batches");
-    log.close();
+    log.close(Duration::ZERO);
     let written = events.bytes.borrow();
     assert_eq!(written.iter().filter(|byte| **byte == b'\n').count(), 1000);
 }

@@ -30,6 +30,7 @@ const OFF_UM: f64 = 0.2;
 #[derive(Debug, Clone)]
 pub(crate) struct BoardWatch {
     session: Option<u16>,
+    state: Option<ActuatorState>,
     last_seq: Option<u32>,
     moved_ns: i64,
     commands: u32,
@@ -43,6 +44,7 @@ impl BoardWatch {
     pub(crate) fn new() -> Self {
         Self {
             session: None,
+            state: None,
             last_seq: None,
             moved_ns: 0,
             commands: 0,
@@ -66,8 +68,13 @@ impl BoardWatch {
         if *self.session.get_or_insert(report.session) != report.session {
             return Some(BoardTrouble::Foreign);
         }
-        if report.state != ActuatorState::Running {
+        // A board that begins to hold had heard nothing for its watchdog time, perhaps because this program stood still: it is
+        // given as long again. Each command that reaches it ends the holding.
+        let heeds = matches!(report.state, ActuatorState::Running | ActuatorState::Holding);
+        if self.state.replace(report.state) != Some(report.state) || !heeds {
             (self.moved_ns, self.commands, self.off_since_ns) = (now_ns, 0, None);
+        }
+        if !heeds {
             return None;
         }
         if report.last_seq != self.last_seq {
@@ -75,7 +82,7 @@ impl BoardWatch {
         } else if self.commands >= COMMANDS && now_ns - self.moved_ns > LASTS_NS {
             return Some(BoardTrouble::NotObeying);
         }
-        if self.explains(now_ns, report.applied_um) {
+        if report.state == ActuatorState::Holding || self.explains(now_ns, report.applied_um) {
             self.off_since_ns = None;
             return None;
         }
@@ -143,14 +150,18 @@ mod tests {
             report.last_seq = u32::try_from(k / 50).ok();
         };
         assert_eq!(watch(late), None);
-        let rests = |k: i64, _: f64, report: &mut ActuatorReport| {
-            if (200..600).contains(&k) {
-                report.state = ActuatorState::Holding;
-                report.applied_um = 20.0;
-                report.last_seq = Some(199);
+        // Commands reach it again within 100 ms, and it holds no more; or nothing of what is commanded ever reaches it.
+        let rests = |until: i64| {
+            move |k: i64, _: f64, report: &mut ActuatorReport| {
+                if (200..until).contains(&k) {
+                    report.state = ActuatorState::Holding;
+                    report.applied_um = 20.0;
+                    report.last_seq = Some(199);
+                }
             }
         };
-        assert_eq!(watch(rests), None);
+        assert_eq!(watch(rests(300)), None);
+        assert_eq!(watch(rests(600)), Some((BoardTrouble::NotObeying, 301)));
     }
 
     #[test]

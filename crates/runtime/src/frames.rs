@@ -49,6 +49,8 @@ pub(crate) struct FrameWatch {
     oldest_ns: i64,
     /// Exposure of the last frame that was too old, while no other has come.
     old_ns: Option<i64>,
+    /// Frames of this tick that were too old, and the last one's exposure.
+    too_old: Option<(u32, i64)>,
     newest: Option<Measurement>,
     tally: FrameTally,
 }
@@ -61,6 +63,7 @@ impl FrameWatch {
             period_ns,
             oldest_ns,
             old_ns: None,
+            too_old: None,
             newest: None,
             tally: FrameTally::default(),
         }
@@ -113,29 +116,40 @@ impl FrameWatch {
 
     /// The newest frame that may be used now.
     pub(crate) fn newest(&mut self, now_ns: i64) -> Option<&Measurement> {
-        /// Periods by which the newest frame of a tick must be ahead of the one before for the backlog to become shorter.
-        const WORKED_OFF: i64 = 2;
         let exposed_ns = self.newest?.mid_exposure_ns;
         let age_ns = now_ns.saturating_sub(exposed_ns);
         if age_ns > self.oldest_ns {
             self.newest = None;
-            let gained = |old_ns: i64| exposed_ns - old_ns >= WORKED_OFF * self.period_ns;
-            let count = if self.old_ns.is_none_or(gained) {
-                &mut self.tally.backlog
-            } else {
-                &mut self.tally.stale
-            };
-            *count = count.saturating_add(1);
-            self.old_ns = Some(exposed_ns);
+            let before = self.too_old.map_or(0, |(count, _)| count);
+            self.too_old = Some((before.saturating_add(1), exposed_ns));
             self.tally.oldest_ns = self.tally.oldest_ns.max(age_ns);
         }
         self.newest.as_ref()
+    }
+
+    /// Whether the frames of a tick that were too old make a backlog shorter. Asked once a tick: in between control may look at
+    /// each frame of a burst as it comes.
+    fn judge_old(&mut self) {
+        /// Periods by which the newest frame of a tick must be ahead of the one before for the backlog to become shorter.
+        const WORKED_OFF: i64 = 2;
+        let Some((number, exposed_ns)) = self.too_old.take() else {
+            return;
+        };
+        let gained = |old_ns: i64| exposed_ns - old_ns >= WORKED_OFF * self.period_ns;
+        let count = if self.old_ns.is_none_or(gained) {
+            &mut self.tally.backlog
+        } else {
+            &mut self.tally.stale
+        };
+        *count = count.saturating_add(number);
+        self.old_ns = Some(exposed_ns);
     }
 
     /// Hands over what has come, and begins anew.
     pub(crate) fn take(&mut self, now_ns: i64) -> (Option<Measurement>, FrameTally) {
         let newest = self.newest(now_ns).copied();
         self.newest = None;
+        self.judge_old();
         if newest.is_some() {
             self.old_ns = None;
         }

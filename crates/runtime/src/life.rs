@@ -307,6 +307,20 @@ pub enum EventKind {
         /// Damaged frames since the last such event.
         count: u32,
     },
+    /// The disk has not confirmed what was written for longer than a working disk takes.
+    DiskSlowStarted {
+        /// For how long.
+        unconfirmed_ms: f64,
+        /// Rows that a power failure now would cost.
+        rows: u64,
+        /// How long it may go on before the run is stopped.
+        limit_ms: f64,
+    },
+    /// The disk has been confirming in time for a while.
+    DiskSlowEnded {
+        /// The longest that it did not.
+        longest_ms: f64,
+    },
     /// The run was ended by its duration.
     Finished,
     /// The script came to another stage.

@@ -15,7 +15,7 @@ use crate::core::Core;
 use crate::life::{Life, Request};
 pub use crate::operator::Operator;
 use crate::realtime;
-use crate::recorder::{self, Feed};
+use crate::recorder::{self, Feed, Pulse, PulseWatch, RecorderReport};
 use crate::reference::ReferenceGenerator;
 use crate::run::{EndRule, Finished, RunError, RunSink, close_session};
 use crate::summary::{Statistics, Summary};
@@ -23,8 +23,9 @@ use crate::threads::{Acting, ControlEnd, Controlling, Next, Seeing, Shared};
 use crate::ticker::{Ends, RingSizes, Ticker};
 use cellpos_rig::clock::monotonic_ns;
 use cellpos_rig::{Actuator, Clock, PositionSource};
+use std::sync::Arc;
 use std::sync::atomic::Ordering;
-use std::thread::{self, Thread};
+use std::thread::{self, JoinHandle, Thread};
 use std::time::Duration;
 
 /// How the threads are to run.
@@ -58,24 +59,28 @@ impl Threads {
     }
 }
 
+/// How long the recorder is waited for after the end of a run without a sign of it.
+const LAST_PATIENCE: Duration = Duration::from_secs(5);
+
 /// Runs until `end` says so or the operator asks for it.
 ///
 /// # Errors
-/// A thread that could not be started or panicked. Trouble with camera or board ends the run in Safe and is in
+/// A thread that could not be started or panicked; [`RunError::RecorderHangs`] when the sink does not come back: it is left
+/// behind with its thread, the PZT is parked. Trouble with camera or board ends the run in Safe and is in
 /// [`Finished::io_error`].
 #[allow(
     clippy::too_many_arguments,
     reason = "each is one part of the rig or one rule of the run"
 )]
-pub fn run<R: ReferenceGenerator + Send, S: RunSink>(
+pub fn run<R: ReferenceGenerator + Send, S: RunSink + 'static>(
     core: Core<R>,
     source: &mut dyn PositionSource,
     actuator: &mut dyn Actuator,
-    mut sink: S,
-    mut statistics: Statistics,
+    sink: S,
+    statistics: Statistics,
     end: EndRule,
     threads: &Threads,
-    operator: &Operator,
+    operator: &Arc<Operator>,
 ) -> Result<Finished<S>, RunError> {
     let (ticker, ends) = Ticker::new(core, Clock::Real, monotonic_ns(), RingSizes::default());
     let period_ns = ticker.core().timing().period_ns();
@@ -95,15 +100,20 @@ pub fn run<R: ReferenceGenerator + Send, S: RunSink>(
     let shared = Shared::default();
     let shared = &shared;
     let start = |thread: &'static str| move |source| RunError::Thread { thread, source };
-    thread::scope(|scope| {
-        let recorder = thread::Builder::new()
-            .name("cellpos-record".to_string())
-            .spawn_scoped(scope, || {
-                recorder::serve(feed, &mut sink, &mut statistics, operator, &shared.pulse)
+    let recorder = Recording::start(feed, sink, statistics, operator, &shared.pulse)
+        .map_err(start("recorder"))?;
+    let ended = thread::scope(|scope| {
+        // No thread that is not made here gets real-time rights: whoever calls keeps those that it has, and so do the programs
+        // and threads that it starts.
+        let serving = thread::Builder::new()
+            .name("cellpos-actuator".to_string())
+            .spawn_scoped(scope, move || {
+                realtime::apply(&threads.actuator);
+                let failed = actuate(Acting::new(&mut *actuator, orders, reports));
+                (actuator, failed)
             })
-            .map_err(start("recorder"))?;
-        // The actuator thread is this one, so that `actuator` needs no owner of its own; control is told whom to wake.
-        let actuator_thread = thread::current();
+            .map_err(start("actuator"))?;
+        let actuator_thread = serving.thread().clone();
         let control = thread::Builder::new()
             .name("cellpos-control".to_string())
             .spawn_scoped(scope, move || {
@@ -125,19 +135,21 @@ pub fn run<R: ReferenceGenerator + Send, S: RunSink>(
             Err(error) => {
                 // The measurement ring is gone: control freezes and parks by itself; park now, all the same.
                 operator.ask(Request::Park);
-                let _ = actuator.park();
                 let _ = control.join();
+                let _ = serving.join();
                 return Err(start("camera")(error));
             }
         };
-        realtime::apply(&threads.actuator);
-        let mut io_error = actuate(Acting::new(actuator, orders, reports));
         let control_end = control.join();
+        let served = serving.join();
         shared.stop.store(true, Ordering::Release);
         let life = match &control_end {
             Ok((end, _)) => end.life,
             Err(_) => Life::Safe,
         };
+        // A thread that panicked has let go of the board: whoever gave it to this run parks it.
+        let (actuator, mut io_error) =
+            served.map_err(|_| RunError::Panicked { thread: "actuator" })?;
         let closed = close_session(actuator, life, thread::sleep);
         if let Err(error) = closed {
             io_error.get_or_insert(error.into());
@@ -149,13 +161,15 @@ pub fn run<R: ReferenceGenerator + Send, S: RunSink>(
             }
             Err(_) => io_error = Some(RunError::Panicked { thread: "camera" }),
         }
-        let recorded = recorder.join();
         let control_end = control_end.map_err(|_| RunError::Panicked { thread: "control" })?;
-        let mut recorded = recorded.map_err(|_| RunError::Panicked { thread: "recorder" })?;
-        recorded.fault = recorded.fault.or(operator.recorder_fault());
-        Ok((control_end, io_error, recorded))
-    })
-    .map(|((control_end, conditions), io_error, recorder)| Finished {
+        Ok((control_end, io_error))
+    });
+    let ticks = ended.as_ref().map_or(0, |((end, _), _)| end.counts.ticks);
+    let recorded = recorder.wait(ticks, LAST_PATIENCE);
+    let ((control_end, conditions), io_error) = ended?;
+    let (sink, statistics, mut recorder) = recorded?;
+    recorder.fault = recorder.fault.or(operator.recorder_fault());
+    Ok(Finished {
         summary: Summary::new(
             control_end.life,
             control_end.safe_reason,
@@ -172,6 +186,57 @@ pub fn run<R: ReferenceGenerator + Send, S: RunSink>(
         sink,
         io_error,
     })
+}
+
+/// What the recorder's thread gives back.
+type Recorded<S> = (S, Statistics, RecorderReport);
+
+/// The recorder's thread. It owns what it writes to, so that it can be left behind when a write never comes back.
+struct Recording<S> {
+    thread: JoinHandle<Recorded<S>>,
+    pulse: Arc<Pulse>,
+}
+
+impl<S: RunSink + 'static> Recording<S> {
+    fn start(
+        feed: Feed,
+        mut sink: S,
+        mut statistics: Statistics,
+        operator: &Arc<Operator>,
+        pulse: &Arc<Pulse>,
+    ) -> std::io::Result<Self> {
+        let (operator, beats) = (Arc::clone(operator), Arc::clone(pulse));
+        let serve = move || {
+            let report = recorder::serve(feed, &mut sink, &mut statistics, &operator, &beats);
+            (sink, statistics, report)
+        };
+        let thread = thread::Builder::new()
+            .name("cellpos-record".to_string())
+            .spawn(serve)?;
+        Ok(Self {
+            thread,
+            pulse: Arc::clone(pulse),
+        })
+    }
+
+    /// Waits for its end as long as it shows signs of life, and for a while without. `ticks`: rows of the run.
+    fn wait(self, ticks: u64, patience: Duration) -> Result<Recorded<S>, RunError> {
+        const LOOK_EVERY: Duration = Duration::from_millis(5);
+        let mut watch = PulseWatch::default();
+        while !self.thread.is_finished() {
+            watch.stuck(&self.pulse, monotonic_ns());
+            if u128::from(watch.still_ns().unsigned_abs()) >= patience.as_nanos() {
+                return Err(RunError::RecorderHangs {
+                    waited_s: patience.as_secs(),
+                    ticks,
+                    unkept: ticks.saturating_sub(self.pulse.kept()),
+                });
+            }
+            thread::sleep(LOOK_EVERY);
+        }
+        let recorded = self.thread.join();
+        recorded.map_err(|_| RunError::Panicked { thread: "recorder" })
+    }
 }
 
 fn see(mut seeing: Seeing, control: &Thread) -> Result<(), RunError> {

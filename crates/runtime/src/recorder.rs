@@ -5,13 +5,15 @@
 //! Events of one kind beyond [`EVENTS_A_SECOND`] in a second of the run are counted and told as one, so that a camera that
 //! doubles every frame does not fill the disk with the news.
 //!
-//! A sink that panics, that has been refusing for longer than [`REFUSED_NS`], or that does not come back from a call
-//! (`Pulse`) is a fault of the run ([`RecorderFault`]): the bead is frozen and the PZT parked, because a measurement that nobody keeps is worth nothing. The
-//! rings are drained all the same and every record that found no taker is counted.
+//! A sink that panics, that has been refusing for longer than [`REFUSED_NS`], that does not come back from a call
+//! (`Pulse`), or whose disk has not confirmed anything for [`Unconfirmed::LIMIT`] is a fault of the run
+//! ([`RecorderFault`]): the bead is frozen and the PZT parked, because a measurement that nobody keeps is worth nothing.
+//! The rings are drained all the same and every record that found no taker is counted. A disk that is merely slow is told
+//! ([`Unconfirmed::SAID`]) and left to its work.
 
 use crate::life::{Event, EventKind};
 use crate::operator::Operator;
-pub use crate::recording::{RecorderFault, RecorderReport};
+pub use crate::recording::{RecorderFault, RecorderReport, Unconfirmed};
 use crate::run::RunSink;
 use crate::summary::Statistics;
 use crate::tick_record::TickRecord;
@@ -36,11 +38,20 @@ const EVENTS_A_ROUND: usize = 512;
 
 /// Beats while the recorder comes back from what it calls.
 #[derive(Debug, Default)]
-pub(crate) struct Pulse(AtomicU64);
+pub(crate) struct Pulse {
+    beats: AtomicU64,
+    /// Rows that were handed over and are not among those that the disk has yet to confirm.
+    kept: AtomicU64,
+}
 
 impl Pulse {
     fn beat(&self) {
-        self.0.fetch_add(1, Ordering::Release);
+        self.beats.fetch_add(1, Ordering::Release);
+    }
+
+    /// Rows that are known to be kept.
+    pub(crate) fn kept(&self) -> u64 {
+        self.kept.load(Ordering::Acquire)
     }
 }
 
@@ -61,7 +72,7 @@ impl PulseWatch {
 
     /// Whether the recorder is stuck; to be asked in each tick.
     pub(crate) fn stuck(&mut self, pulse: &Pulse, now_ns: i64) -> bool {
-        let beats = pulse.0.load(Ordering::Acquire);
+        let beats = pulse.beats.load(Ordering::Acquire);
         let since_ns = now_ns - self.looked_ns.replace(now_ns).unwrap_or(now_ns);
         if beats == self.seen {
             self.still_ns = self.still_ns.saturating_add(since_ns.min(Self::LOOK_NS));
@@ -69,6 +80,51 @@ impl PulseWatch {
             (self.seen, self.still_ns) = (beats, 0);
         }
         self.still_ns >= Self::STUCK_NS
+    }
+
+    /// For how long no beat has been seen, ns.
+    pub(crate) fn still_ns(&self) -> i64 {
+        self.still_ns
+    }
+}
+
+/// Watches what the disk has not confirmed: tells that it is slow, and that it is well again after [`DiskWatch::CALM_NS`], so
+/// that a disk on the edge is no news each second.
+#[derive(Debug, Clone, Copy, Default)]
+struct DiskWatch {
+    /// When it was last slow, and the longest since it was first told, ms.
+    slow: Option<(i64, f64)>,
+    longest: Duration,
+}
+
+impl DiskWatch {
+    const CALM_NS: i64 = 10_000_000_000;
+
+    fn look(&mut self, unconfirmed: Unconfirmed, now_ns: i64) -> Option<EventKind> {
+        self.longest = self.longest.max(unconfirmed.since);
+        let ms = unconfirmed.since.as_secs_f64() * 1e3;
+        let is_slow = unconfirmed.since >= Unconfirmed::SAID;
+        match &mut self.slow {
+            Some((last_ns, longest_ms)) if is_slow => {
+                (*last_ns, *longest_ms) = (now_ns, longest_ms.max(ms));
+                None
+            }
+            Some((last_ns, longest_ms)) => {
+                let longest_ms = *longest_ms;
+                (now_ns - *last_ns >= Self::CALM_NS).then(|| {
+                    self.slow = None;
+                    EventKind::DiskSlowEnded { longest_ms }
+                })
+            }
+            None => is_slow.then(|| {
+                self.slow = Some((now_ns, ms));
+                EventKind::DiskSlowStarted {
+                    unconfirmed_ms: ms,
+                    rows: unconfirmed.rows,
+                    limit_ms: Unconfirmed::LIMIT.as_secs_f64() * 1e3,
+                }
+            }),
+        }
     }
 }
 
@@ -151,9 +207,12 @@ pub(crate) struct Recorder<'a, S> {
     pulse: &'a Pulse,
     limiter: Limiter,
     refused_since_ns: Option<i64>,
+    disk: DiskWatch,
     report: RecorderReport,
-    /// Time of the newest record, ns since the start of the run.
+    /// Number and time of the newest record, ns since the start of the run, and how many were taken.
+    newest_seq: u64,
     newest_ns: i64,
+    taken: u64,
     /// A record or event has been handed to the sink and was not yet taken.
     record_in_hand: bool,
     event_in_hand: bool,
@@ -173,8 +232,11 @@ impl<'a, S: RunSink> Recorder<'a, S> {
             pulse,
             limiter: Limiter::default(),
             refused_since_ns: None,
+            disk: DiskWatch::default(),
             report: RecorderReport::default(),
+            newest_seq: 0,
             newest_ns: 0,
+            taken: 0,
             record_in_hand: false,
             event_in_hand: false,
         }
@@ -196,7 +258,12 @@ impl<'a, S: RunSink> Recorder<'a, S> {
         if self.report.fault == Some(RecorderFault::Panicked) {
             return self.discard();
         }
-        let Ok(more) = catch_unwind(AssertUnwindSafe(|| self.hand_over())) else {
+        let taken = catch_unwind(AssertUnwindSafe(|| {
+            let more = self.hand_over();
+            self.look_at_the_disk(now_ns);
+            more
+        }));
+        let Ok(more) = taken else {
             self.panicked();
             return true;
         };
@@ -209,6 +276,24 @@ impl<'a, S: RunSink> Recorder<'a, S> {
             self.refused_since_ns = None;
         }
         more
+    }
+
+    /// What the disk has not confirmed is told while it may still come to it, and is a fault when it does not.
+    fn look_at_the_disk(&mut self, now_ns: i64) {
+        let unconfirmed = self.sink.unconfirmed();
+        let kept = self.taken.saturating_sub(unconfirmed.rows);
+        self.pulse.kept.store(kept, Ordering::Release);
+        if let Some(kind) = self.disk.look(unconfirmed, now_ns) {
+            let event = Event {
+                seq: self.newest_seq,
+                time_ns: self.newest_ns,
+                kind,
+            };
+            self.limiter.event(&event, self.sink);
+        }
+        if unconfirmed.since >= Unconfirmed::LIMIT {
+            self.report.fault.get_or_insert(RecorderFault::Unconfirmed);
+        }
     }
 
     fn panicked(&mut self) {
@@ -224,7 +309,8 @@ impl<'a, S: RunSink> Recorder<'a, S> {
                 break;
             };
             left -= 1;
-            self.newest_ns = record.time_ns;
+            (self.newest_seq, self.newest_ns) = (record.seq, record.time_ns);
+            self.taken += 1;
             self.statistics.add(&record);
             self.record_in_hand = true;
             self.sink.tick(&record);
@@ -278,6 +364,8 @@ impl<'a, S: RunSink> Recorder<'a, S> {
     pub(crate) fn finish(mut self) -> RecorderReport {
         while let Ok(record) = self.feed.records.pop() {
             self.statistics.add(&record);
+            self.taken += 1;
+            self.pulse.beat();
             if self.report.fault == Some(RecorderFault::Panicked) {
                 self.report.records_unkept += 1;
             } else if catch_unwind(AssertUnwindSafe(|| self.sink.tick(&record))).is_err() {
@@ -292,6 +380,8 @@ impl<'a, S: RunSink> Recorder<'a, S> {
             self.panicked();
         }
         self.progress();
+        let longest_ms = self.disk.longest.as_millis();
+        self.report.unconfirmed_ms = u64::try_from(longest_ms).unwrap_or(u64::MAX);
         self.report
     }
 }

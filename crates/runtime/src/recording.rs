@@ -1,6 +1,7 @@
 //! How the recording of a run went.
 
 use serde::Serialize;
+use std::time::Duration;
 
 /// Why a run could no longer be recorded.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
@@ -15,13 +16,21 @@ pub enum RecorderFault {
     Behind = 3,
     /// The sink did not come back from a call: a disk that hangs.
     Stuck = 4,
+    /// The disk took what was written and has not confirmed it for [`Unconfirmed::LIMIT`].
+    Unconfirmed = 5,
 }
 
 impl RecorderFault {
     pub(crate) fn from_number(number: u8) -> Option<Self> {
-        [Self::Panicked, Self::Refused, Self::Behind, Self::Stuck]
-            .into_iter()
-            .find(|fault| *fault as u8 == number)
+        [
+            Self::Panicked,
+            Self::Refused,
+            Self::Behind,
+            Self::Stuck,
+            Self::Unconfirmed,
+        ]
+        .into_iter()
+        .find(|fault| *fault as u8 == number)
     }
 
     /// In a sentence.
@@ -36,12 +45,34 @@ impl RecorderFault {
             Self::Stuck => {
                 "the recorder stood for 0.9 s in a write that did not come back; the bead was frozen and the PZT parked"
             }
+            Self::Unconfirmed => {
+                "the disk had not confirmed what was written for 5 s: all of it was in memory only; the bead was frozen and the \
+                 PZT parked"
+            }
             Self::Behind => {
                 "the disk was so slow that the recorder fell behind by half of its memory; the bead was frozen and the PZT \
                  parked before records were lost"
             }
         }
     }
+}
+
+/// What a sink has been given and cannot promise to keep: the disk has not said that it has it. A program that dies loses
+/// nothing of what was written, but a power failure would.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Unconfirmed {
+    /// How long the oldest of it has been waiting for the disk's answer; zero where none is waited for.
+    pub since: Duration,
+    /// Rows.
+    pub rows: u64,
+}
+
+impl Unconfirmed {
+    /// A wait that is said: a sync of half a second is a slow disk that does its work.
+    pub const SAID: Duration = Duration::from_millis(900);
+    /// A wait that ends the run: as long as a file system leaves unwritten what no program asks it to sync (the commit
+    /// interval of ext4 is 5 s), and twice what the commit of a journal takes on a busy disk.
+    pub const LIMIT: Duration = Duration::from_secs(5);
 }
 
 /// How the recording of a run went.
@@ -53,4 +84,6 @@ pub struct RecorderReport {
     pub records_unkept: u64,
     /// Events likewise.
     pub events_unkept: u64,
+    /// The longest that the disk left what was written unconfirmed, ms; zero where it was never asked.
+    pub unconfirmed_ms: u64,
 }

@@ -3,7 +3,7 @@
 use crate::core::{Action, CoreError};
 use crate::life::{Event, Life, Request};
 use crate::realtime::Conditions;
-use crate::recording::RecorderReport;
+use crate::recording::{RecorderReport, Unconfirmed};
 use crate::summary::{End, Statistics, Summary};
 use crate::tick_record::TickRecord;
 use crate::ticker::Order;
@@ -38,6 +38,10 @@ pub trait RunSink: Send {
     /// second.
     fn is_refused(&self) -> bool {
         false
+    }
+    /// What it was given and the disk has not confirmed. Asked some hundred times a second.
+    fn unconfirmed(&self) -> Unconfirmed {
+        Unconfirmed::default()
     }
     /// What is being learned over the cycles of a periodic motion, as it stands: about four times a second while learning.
     fn learned(&mut self, motion: u16, state: &LearnerState) {
@@ -83,6 +87,19 @@ pub enum RunError {
     Panicked {
         /// Which.
         thread: &'static str,
+    },
+    /// The recorder did not come back from a write after the end of the run, and was left behind: the PZT is parked.
+    #[error(
+        "the recorder did not come back from a write within {waited_s} s of the end of the run, and was given up: of {ticks} rows \
+         the last {unkept} are lost or were never confirmed by the disk"
+    )]
+    RecorderHangs {
+        /// How long it was waited for without a sign of it, s.
+        waited_s: u64,
+        /// Rows of the run.
+        ticks: u64,
+        /// Rows that the disk has not confirmed.
+        unkept: u64,
     },
 }
 

@@ -14,6 +14,7 @@ use crate::ticker::{Account, Order, Ticker};
 use cellpos_control::LearnedTable;
 use cellpos_rig::{Actuator, ActuatorReport, Clock, Measurement, PositionSource};
 use rtrb::{Consumer, Producer};
+use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 
 /// What the threads tell each other besides what is in the rings.
@@ -24,7 +25,7 @@ pub(crate) struct Shared {
     /// Mean time that vision takes for a frame while it is slower than the camera, ns; 0: it keeps up.
     slow_vision_ns: AtomicU32,
     /// The recorder's.
-    pub(crate) pulse: Pulse,
+    pub(crate) pulse: Arc<Pulse>,
 }
 
 /// The camera thread: frame -> position -> ring.

@@ -13,6 +13,7 @@ use cellpos_drivers::Calibration;
 use cellpos_record::{Group, InputFile, RunEnd, RunMeta, RunWriter, space};
 use cellpos_runtime::Summary;
 use cellpos_runtime::realtime::Conditions;
+use cellpos_runtime::recorder::Unconfirmed;
 use cellpos_script::Sample;
 use serde::Serialize;
 use std::path::Path;
@@ -196,6 +197,12 @@ pub fn finish(
         ));
     } else if let Err(error) = &done.parquet {
         warnings.push(format!("no ticks.parquet: {error}"));
+    }
+    if let Some(slowest) = done.slowest_sync.filter(|took| *took >= Unconfirmed::SAID) {
+        warnings.push(format!(
+            "the disk took up to {:.1} s to confirm what was written: a power failure then would have cost so much of the run",
+            slowest.as_secs_f64()
+        ));
     }
     if !done.closed {
         warnings

@@ -225,13 +225,28 @@ fn tables(text: &str, name: &str) -> Result<Vec<NamedTable>, Failure> {
 /// # Errors
 /// A disk that is full, a folder that is gone.
 pub fn save_learned(folder: &Path, motion: Vec<NamedTable>) -> std::io::Result<()> {
+    put_learned(folder, motion, cellpos_table::write_atomically)
+}
+
+/// As [`save_learned`], without a wait for the disk: for what is learned while the run goes, on the recorder's thread.
+///
+/// # Errors
+/// As [`save_learned`].
+pub fn save_learning(folder: &Path, motion: Vec<NamedTable>) -> std::io::Result<()> {
+    put_learned(folder, motion, cellpos_table::write_unsynced)
+}
+
+fn put_learned(
+    folder: &Path,
+    motion: Vec<NamedTable>,
+    write: impl Fn(&Path, &[u8]) -> Result<(), cellpos_table::TableError>,
+) -> std::io::Result<()> {
     if !folder.is_dir() {
         return Err(std::io::Error::other("the run's folder is gone"));
     }
     let file = LearnedFile { motion };
     let text = toml::to_string_pretty(&file).map_err(std::io::Error::other)?;
-    cellpos_table::write_atomically(&folder.join(LEARNED_TOML), text.as_bytes())
-        .map_err(std::io::Error::other)
+    write(&folder.join(LEARNED_TOML), text.as_bytes()).map_err(std::io::Error::other)
 }
 
 /// Reads the table of a sine, to begin with what was learned on it.

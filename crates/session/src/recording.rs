@@ -4,6 +4,7 @@ use crate::live_line::LiveLine;
 use crate::view::Shown;
 use crate::words::sentence;
 use cellpos_record::{Event as LogEvent, RunWriter};
+use cellpos_runtime::recorder::Unconfirmed;
 use cellpos_runtime::{Event, RunSink, Statistics, TickRecord};
 use std::io::IsTerminal;
 
@@ -86,6 +87,11 @@ impl RunSink for Recording {
 
     fn is_refused(&self) -> bool {
         self.writer.as_ref().is_some_and(RunWriter::is_failing)
+    }
+
+    fn unconfirmed(&self) -> Unconfirmed {
+        let writer = self.writer.as_ref();
+        writer.map_or_else(Unconfirmed::default, RunWriter::unconfirmed)
     }
 
     fn note(&mut self, time_ns: i64, text: &str) {

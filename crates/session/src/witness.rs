@@ -5,6 +5,7 @@ use crate::words::is_odd;
 use crate::{say, words};
 use cellpos_control::LearnerState;
 use cellpos_runtime::life::EventKind;
+use cellpos_runtime::recorder::Unconfirmed;
 use cellpos_runtime::{Event, RunSink, Statistics, TickRecord};
 
 /// Hands everything on to a sink, and keeps what says why a run ended.
@@ -21,9 +22,12 @@ impl<S: RunSink> RunSink for Witness<S> {
     fn event(&mut self, event: &Event) {
         self.clues.note(event);
         // Worth knowing while the bead is still held, and not only when the run is over.
-        if let EventKind::ArmingPassed { gain_ratio, ci95 } = event.kind
-            && is_odd(gain_ratio, ci95)
-        {
+        let told = match event.kind {
+            EventKind::ArmingPassed { gain_ratio, ci95 } => is_odd(gain_ratio, ci95),
+            EventKind::DiskSlowStarted { .. } => true,
+            _ => false,
+        };
+        if told {
             say::say(format!("WARNING: {}", words::sentence(&event.kind).1));
         }
         self.sink.event(event);
@@ -40,6 +44,10 @@ impl<S: RunSink> RunSink for Witness<S> {
 
     fn is_refused(&self) -> bool {
         self.sink.is_refused()
+    }
+
+    fn unconfirmed(&self) -> Unconfirmed {
+        self.sink.unconfirmed()
     }
 
     fn learned(&mut self, motion: u16, state: &LearnerState) {

@@ -247,6 +247,26 @@ pub fn sentence(kind: &EventKind) -> (Level, String) {
                 plural(u64::from(count), "message", "messages")
             ),
         ),
+        EventKind::DiskSlowStarted {
+            unconfirmed_ms,
+            rows,
+            limit_ms,
+        } => (
+            Warning,
+            format!(
+                "The disk has not confirmed what was written for {:.1} s: {rows} rows are in memory only, and a power failure now \
+                 would cost them; the run stops after {:.0} s of it.",
+                unconfirmed_ms * 1e-3,
+                limit_ms * 1e-3
+            ),
+        ),
+        EventKind::DiskSlowEnded { longest_ms } => (
+            Info,
+            format!(
+                "The disk confirms in time again; it took {:.1} s at most.",
+                longest_ms * 1e-3
+            ),
+        ),
         EventKind::Finished => (Info, text("The time is up.")),
         EventKind::Script { stage } => (Info, format!("Script: {}.", stage.name())),
         EventKind::StepSkipped => (Info, text("The operator went on with the next step.")),

@@ -1,6 +1,7 @@
 //! Whole files written in one step.
 
 use crate::error::{Problem, TableError};
+use std::fs::File;
 use std::io::{self, Read, Write};
 use std::path::Path;
 
@@ -10,6 +11,23 @@ use std::path::Path;
 /// # Errors
 /// [`Problem::Write`] with the file's name; the temporary file is removed.
 pub fn write_atomically(path: &Path, bytes: &[u8]) -> Result<(), TableError> {
+    replace(path, bytes, File::sync_data)
+}
+
+/// As [`write_atomically`], without a wait for the disk: no reader ever sees a part of it, but after a crash of the system the
+/// file may be cut off. For what can be had again.
+///
+/// # Errors
+/// As [`write_atomically`].
+pub fn write_unsynced(path: &Path, bytes: &[u8]) -> Result<(), TableError> {
+    replace(path, bytes, |_| Ok(()))
+}
+
+fn replace(
+    path: &Path,
+    bytes: &[u8],
+    sync: impl Fn(&File) -> io::Result<()>,
+) -> Result<(), TableError> {
     let attempt = || {
         if let Some(folder) = path.parent()
             && !folder.as_os_str().is_empty()
@@ -29,7 +47,7 @@ pub fn write_atomically(path: &Path, bytes: &[u8]) -> Result<(), TableError> {
             .open(&part);
         let written = created.and_then(|mut file| {
             file.write_all(bytes)?;
-            file.sync_data()
+            sync(&file)
         });
         written
             .and_then(|()| std::fs::rename(&part, path))
@@ -50,7 +68,7 @@ pub fn write_atomically(path: &Path, bytes: &[u8]) -> Result<(), TableError> {
 /// # Errors
 /// [`io::Error`] with a sentence for what is no such file; [`io::ErrorKind::NotFound`] and the like as they come.
 pub fn read_text(path: &Path, most: u64) -> io::Result<String> {
-    let file = std::fs::File::open(path)?;
+    let file = File::open(path)?;
     let meta = file.metadata()?;
     if meta.is_dir() {
         return Err(io::Error::other("is a folder, not a file"));

@@ -6,7 +6,7 @@ use super::*;
 use crate::arming::ArmingConfig;
 use crate::core::Core;
 use crate::life::{Event, Request};
-use crate::recorder::{Feed, Recorder, RecorderReport};
+use crate::recorder::{Feed, Recorder, RecorderReport, Unconfirmed};
 use crate::reference::{ReferenceInput, ReferenceOutput, Stage};
 use crate::replay::Replay;
 use crate::run::{RunSink, close_session};
@@ -101,15 +101,23 @@ fn check(ran: &Ran, faults: &Faults) {
     {
         assert_ne!(ran.fault, Some(RecorderFault::Stuck));
     }
-    // The board of these runs does what it is told.
+    if faults
+        .unconfirmed
+        .is_none_or(|(from_ns, until_ns)| until_ns - from_ns < 4990 * MS)
+    {
+        assert_ne!(ran.fault, Some(RecorderFault::Unconfirmed));
+    }
+    // The board of these runs does what it is told, unless it is deaf.
     let blamed = [
         SafeReason::BoardForeign,
         SafeReason::BoardNotObeying,
         SafeReason::BoardNotFollowing,
     ];
     assert!(
-        end.safe_reason
-            .is_none_or(|reason| !blamed.contains(&reason))
+        faults.deaf.is_some()
+            || end
+                .safe_reason
+                .is_none_or(|reason| !blamed.contains(&reason))
     );
     assert_eq!(end.life == Life::Safe, end.safe_reason.is_some());
     assert!(end.end != End::Duration || end.safe_reason.is_none());
@@ -319,6 +327,84 @@ fn a_recorder_that_does_not_come_back_from_a_write_is_noticed_within_a_second() 
         let in_time = frozen_ms.is_some_and(|ms| (800..1000).contains(&ms));
         assert_eq!(in_time, noticed, "{hangs_ms} ms: {frozen_ms:?}");
         assert_eq!(end.account.records_lost, 0, "{hangs_ms} ms");
+    }
+}
+
+#[test]
+fn a_disk_that_confirms_nothing_is_told_within_a_second_and_ends_the_run_after_five() {
+    use crate::life::EventKind;
+    for (lasts_ms, told, ends) in [
+        (500, false, false),
+        (3000, true, false),
+        (20_000, true, true),
+    ] {
+        let faults = Faults {
+            unconfirmed: Some((2000 * MS, (2000 + lasts_ms) * MS)),
+            ..Faults::default()
+        };
+        let ran = run(19, 20_000, &faults, &[]);
+        check(&ran, &faults);
+        let ms_of = |is: fn(&EventKind) -> bool| {
+            let event = ran.events.iter().find(|event| is(&event.kind));
+            event.map(|event| event.time_ns / MS - 2000)
+        };
+        let slow_ms = ms_of(|kind| matches!(kind, EventKind::DiskSlowStarted { .. }));
+        assert_eq!(
+            slow_ms.is_some_and(|ms| (850..1000).contains(&ms)),
+            told,
+            "{lasts_ms} ms: {slow_ms:?}"
+        );
+        let well_ms = ms_of(|kind| matches!(kind, EventKind::DiskSlowEnded { .. }));
+        assert_eq!(well_ms.is_some(), told && !ends, "{lasts_ms} ms");
+        let frozen_ms = ms_of(|kind| matches!(kind, EventKind::FreezeStarted { .. }));
+        assert_eq!(
+            frozen_ms.is_some_and(|ms| (4990..5030).contains(&ms)),
+            ends,
+            "{lasts_ms} ms: {frozen_ms:?}"
+        );
+        let end = ran.end.as_ref().expect("control lives");
+        let reason = ends.then_some(SafeReason::Unrecorded);
+        assert_eq!(end.safe_reason, reason, "{lasts_ms} ms");
+        let fault = ends.then_some(RecorderFault::Unconfirmed);
+        assert_eq!(ran.fault, fault, "{lasts_ms} ms");
+        let longest_ms = ran.report.unconfirmed_ms;
+        assert!(longest_ms >= lasts_ms.min(5000).unsigned_abs() - 10 && longest_ms <= 5600);
+    }
+}
+
+#[test]
+fn a_board_that_hears_no_command_any_more_is_named_and_parks_by_itself() {
+    let faults = Faults {
+        deaf: Some(2000 * MS),
+        ..Faults::default()
+    };
+    let ran = run(23, 6000, &faults, &[]);
+    check(&ran, &faults);
+    let end = ran.end.as_ref().expect("control lives");
+    assert_eq!(end.safe_reason, Some(SafeReason::BoardNotObeying));
+}
+
+#[test]
+fn frames_that_come_early_or_in_a_burst_do_not_end_the_run() {
+    for faults in [
+        Faults {
+            early: 0.5,
+            ..Faults::default()
+        },
+        Faults {
+            burst: Some((2000 * MS, 2200 * MS)),
+            ..Faults::default()
+        },
+    ] {
+        let ran = run(29, 5000, &faults, &[]);
+        check(&ran, &faults);
+        let end = ran.end.as_ref().expect("control lives");
+        assert_eq!(
+            (end.end, end.safe_reason),
+            (End::Duration, None),
+            "{faults:?}"
+        );
+        replays(&ran);
     }
 }
 

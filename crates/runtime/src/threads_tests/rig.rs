@@ -40,9 +40,13 @@ pub(super) struct Faults {
     pub(super) jitter_ns: (i64, i64),
     pub(super) stale: f64,
     pub(super) future: f64,
-    /// The camera counts anew at this frame.
+    /// Exposed later than it should have been for when it arrives: the camera path is shorter than the loop was told.
+    pub(super) early: f64,
+    /// The camera keeps its frames from a time on, and delivers them at once at another, ns.
+    pub(super) burst: Option<(i64, i64)>,
     /// Number of the first tick, of the first frame and of the first command.
     pub(super) first: (u64, u64, u32),
+    /// The camera counts anew at this frame.
     pub(super) restarts_at: Option<u64>,
     pub(super) vision_ns: (i64, i64),
     /// Probability that a thread is not run for a while, and how long, ns.
@@ -55,6 +59,10 @@ pub(super) struct Faults {
     pub(super) disk: Option<(i64, i64)>,
     /// The recorder's thread does not come back from a write for so long, from a time on, ns.
     pub(super) hangs: Option<(i64, i64)>,
+    /// The disk takes what is written and confirms nothing from a time on until another, ns.
+    pub(super) unconfirmed: Option<(i64, i64)>,
+    /// The board hears no command any more from a time on, ns; it is heard all the same.
+    pub(super) deaf: Option<i64>,
     pub(super) dies: Option<(Thread, i64)>,
     pub(super) camera_hz: f64,
     /// Frames are sound until then, ns.
@@ -77,6 +85,8 @@ impl Default for Faults {
             jitter_ns: (0, 0),
             stale: 0.0,
             future: 0.0,
+            early: 0.0,
+            burst: None,
             first: (0, 70_000, 0),
             restarts_at: None,
             vision_ns: (100_000, 150_000),
@@ -86,6 +96,8 @@ impl Default for Faults {
             slow_tick_ns: 0,
             disk: None,
             hangs: None,
+            unconfirmed: None,
+            deaf: None,
             dies: None,
             camera_hz: 1000.0,
             calm_ns: 0,
@@ -108,6 +120,7 @@ impl Faults {
             doubled: maybe(dice, 0.5, 1.0),
             stale: maybe(dice, 0.3, 0.1),
             future: maybe(dice, 0.3, 0.1),
+            early: maybe(dice, 0.3, 0.5),
             stall: maybe(dice, 0.5, 0.002),
             stall_ns: dice.within(1, 40 * MS),
             slow_tick: maybe(dice, 0.3, 0.01),
@@ -134,6 +147,17 @@ impl Faults {
             let from_ns = dice.within(0, duration_ns);
             faults.hangs = Some((from_ns, from_ns + dice.within(1, 5000 * MS)));
         }
+        if dice.hits(0.1) {
+            let from_ns = dice.within(0, duration_ns);
+            faults.unconfirmed = Some((from_ns, from_ns + dice.within(1, 10_000 * MS)));
+        }
+        if dice.hits(0.2) {
+            let from_ns = dice.within(0, duration_ns);
+            faults.burst = Some((from_ns, from_ns + dice.within(1, 300 * MS)));
+        }
+        if dice.hits(0.1) {
+            faults.deaf = Some(dice.within(0, duration_ns));
+        }
         if dice.hits(0.3) {
             let threads = [
                 Thread::Camera,
@@ -156,6 +180,7 @@ pub(super) struct Rig {
     /// Each step of the output: when, ns, and to where, um.
     pub(super) outputs: Vec<(i64, f64)>,
     pub(super) line_is_dead: bool,
+    pub(super) is_deaf: bool,
 }
 
 impl Rig {
@@ -210,6 +235,9 @@ impl Port for Line {
         let mut rig = at(&self.rig, now_ns);
         if rig.line_is_dead {
             return Err(std::io::ErrorKind::BrokenPipe.into());
+        }
+        if rig.is_deaf {
+            return Ok(());
         }
         let now_ns = now_ns.max(rig.emulated.now_ns());
         rig.emulated.receive(bytes, now_ns);
@@ -282,8 +310,16 @@ impl Source {
             if self.dice.hits(self.faults.future) {
                 m.mid_exposure_ns += self.dice.within(3 * MS, 3_600_000 * MS);
             }
+            if self.dice.hits(self.faults.early) {
+                m.mid_exposure_ns += self.dice.within(MS / 2, 3 * MS / 2);
+            }
             let (least, most) = self.faults.jitter_ns;
-            let arrives_ns = fix.info.delivery_ns + self.dice.within(least, most);
+            let mut arrives_ns = fix.info.delivery_ns + self.dice.within(least, most);
+            if let Some((from_ns, until_ns)) = self.faults.burst
+                && (from_ns..until_ns).contains(&arrives_ns)
+            {
+                arrives_ns = until_ns;
+            }
             self.arrive(arrives_ns, m);
             if self.dice.hits(self.faults.doubled) {
                 self.arrive(arrives_ns + MS / 2, m);
@@ -354,6 +390,7 @@ pub(super) struct Sink {
     pub(super) events: Vec<Event>,
     pub(super) clock: Clock,
     pub(super) disk: Option<(i64, i64)>,
+    pub(super) unconfirmed: Option<(i64, i64)>,
     pub(super) dies_at_ns: Option<i64>,
 }
 
@@ -368,6 +405,17 @@ impl RunSink for Sink {
         self.events.push(*event);
     }
     fn progress(&mut self, _: &Statistics) {}
+    fn unconfirmed(&self) -> Unconfirmed {
+        let now_ns = self.clock.now_ns();
+        let waits = |(from, until): &(i64, i64)| (*from..*until).contains(&now_ns);
+        let Some((from_ns, _)) = self.unconfirmed.filter(waits) else {
+            return Unconfirmed::default();
+        };
+        Unconfirmed {
+            since: std::time::Duration::from_nanos((now_ns - from_ns).unsigned_abs()),
+            rows: ((now_ns - from_ns) / MS).unsigned_abs(),
+        }
+    }
     fn is_ready(&self) -> bool {
         let now_ns = self.clock.now_ns();
         self.disk

@@ -136,7 +136,12 @@ impl Scheduler<'_> {
     pub(super) fn actuator(&mut self, clock: &Clock) {
         let now_ns = clock.now_ns();
         let dead = self.dies(Thread::Line, now_ns);
-        at(&self.rig, now_ns).line_is_dead |= dead;
+        let deaf = (self.faults.deaf).is_some_and(|ns| now_ns >= self.start_ns + ns);
+        {
+            let mut rig = at(&self.rig, now_ns);
+            rig.line_is_dead |= dead;
+            rig.is_deaf |= deaf;
+        }
         self.next_ns[2] = now_ns + MS;
         if self.acting.as_mut().is_some_and(Acting::round) {
             self.io_error = self.acting.take().and_then(Acting::finish);
@@ -182,6 +187,7 @@ pub(super) fn armed(seed: u64, faults: &Faults, clock: &Clock) -> (Shelf, HostBo
         emulated,
         outputs: Vec::new(),
         line_is_dead: false,
+        is_deaf: false,
     }));
     let line = Line {
         rig: Arc::clone(&rig),
@@ -230,6 +236,7 @@ pub(super) fn run(seed: u64, periods: u64, faults: &Faults, asks: &[(i64, Reques
         events: Vec::new(),
         clock: recorder_clock.clone(),
         disk: faults.disk.map(|(a, b)| (start_ns + a, start_ns + b)),
+        unconfirmed: (faults.unconfirmed).map(|(a, b)| (start_ns + a, start_ns + b)),
         dies_at_ns: match faults.dies {
             Some((Thread::Recorder, ns)) => Some(start_ns + ns),
             _ => None,

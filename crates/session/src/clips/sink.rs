@@ -5,6 +5,7 @@ use super::moment::Moment;
 use crate::view::{CycleRow, EventLine, Shown, State};
 use cellpos_control::LearnerState;
 use cellpos_runtime::life::EventKind;
+use cellpos_runtime::recorder::Unconfirmed;
 use cellpos_runtime::{Event, RunSink, Statistics, TickRecord};
 
 /// Moments of a script's plan, in their order: time in the plan, s, and name.
@@ -106,6 +107,10 @@ impl<S: RunSink> RunSink for Clipped<S> {
 
     fn is_refused(&self) -> bool {
         self.sink.is_refused()
+    }
+
+    fn unconfirmed(&self) -> Unconfirmed {
+        self.sink.unconfirmed()
     }
 
     fn learned(&mut self, motion: u16, state: &LearnerState) {

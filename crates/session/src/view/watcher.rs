@@ -4,6 +4,7 @@ use super::View;
 use crate::words::{Level, safe_reason, sentence};
 use cellpos_live::{Banner, CycleRow, EventLine, Feed, Row, State};
 use cellpos_runtime::life::EventKind;
+use cellpos_runtime::recorder::Unconfirmed;
 use cellpos_runtime::{Event, Life, RunSink, Statistics, Summary, TickFlags, TickRecord};
 use std::sync::mpsc::Receiver;
 
@@ -214,6 +215,10 @@ impl<S: RunSink + Shown> RunSink for Viewed<S> {
 
     fn is_refused(&self) -> bool {
         self.sink.is_refused()
+    }
+
+    fn unconfirmed(&self) -> Unconfirmed {
+        self.sink.unconfirmed()
     }
 
     fn learned(&mut self, motion: u16, state: &cellpos_control::LearnerState) {

@@ -7,6 +7,7 @@ use cellpos_control::{LearnedTable, Learner, LearnerState};
 use cellpos_script::{PeriodicReference, Plan};
 use std::path::{Path, PathBuf};
 
+use crate::cyclic::save_learning;
 pub use crate::cyclic::{LEARNED_TOML, NamedTable, load_learned as load, save_learned as save};
 
 /// Fewest cycles in full swing of a motion that is learned: two are watched, and some must be left to learn from.
@@ -125,7 +126,7 @@ impl Keeper {
 
     /// Writes what has changed. A disk that refuses is asked again with the next change: the run goes on all the same.
     pub fn save(&mut self) {
-        if self.changed && save(&self.folder, named(&self.specs, &self.tables)).is_ok() {
+        if self.changed && save_learning(&self.folder, named(&self.specs, &self.tables)).is_ok() {
             self.changed = false;
         }
     }

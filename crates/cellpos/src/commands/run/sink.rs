@@ -8,6 +8,7 @@ use cellpos_control::LearnerState;
 use cellpos_record::{Event as LogEvent, Faults, LineFile, RunWriter};
 use cellpos_rig::Clock;
 use cellpos_runtime::live::Operator;
+use cellpos_runtime::recorder::Unconfirmed;
 use cellpos_runtime::{Event, Request, RunSink, Stage, Statistics, TickRecord};
 use cellpos_script::{Alarm, AmplitudeWatch, CycleRow, CycleTable, FatigueWatch, Plan};
 use cellpos_session::say::say;
@@ -181,6 +182,7 @@ impl ScriptSink {
     /// Acknowledges what is finished and gives the writer back, with what of the table could not be written.
     pub fn close(mut self) -> (RunWriter, Faults) {
         self.acknowledge();
+        self.lines.close();
         self.bar.finish_and_clear();
         (self.writer, self.lines.faults())
     }
@@ -391,6 +393,14 @@ impl RunSink for ScriptSink {
 
     fn is_refused(&self) -> bool {
         self.writer.is_failing() || self.lines.is_failing()
+    }
+
+    fn unconfirmed(&self) -> Unconfirmed {
+        let (ticks, lines) = (self.writer.unconfirmed(), self.lines.unconfirmed());
+        Unconfirmed {
+            since: ticks.since.max(lines.since),
+            rows: ticks.rows,
+        }
     }
 
     fn learned(&mut self, motion: u16, state: &LearnerState) {

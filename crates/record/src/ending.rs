@@ -1,0 +1,207 @@
+//! The end of a run folder, within a bound: a disk that has stopped to answer must not keep the program.
+//!
+//! Whatever touches the disk here is done on threads that are waited for as long as a slow disk may take, and left behind
+//! after that. A thread that stands in the kernel for good keeps nothing but itself; what the disk has not confirmed is
+//! counted as lost.
+
+use crate::error::RecordError;
+use crate::export::{Selection, Source};
+use crate::faults::Faults;
+use crate::meta::{RunEnd, RunMeta};
+use crate::reader::RunReader;
+use crate::synced::{DISK_ANSWERS, LAST_PATIENCE};
+use crate::writer::{Finished, RunWriter};
+use crate::{RUN_TOML, TICKS_PARQUET};
+use cellpos_table::write_atomically;
+use std::path::{Path, PathBuf};
+use std::sync::mpsc;
+use std::thread;
+use std::time::Duration;
+
+/// How long writing and reading so many bytes may take on a disk that is slow and works: a minute, and a second for each five
+/// megabytes.
+fn patience(bytes: u64) -> Duration {
+    Duration::from_secs(60 + bytes / 5_000_000)
+}
+
+/// What some work on a thread of its own comes to, or nothing where it does not come back in time.
+fn within<T: Send + 'static>(
+    most: Duration,
+    work: impl FnOnce() -> T + Send + 'static,
+) -> Option<T> {
+    let (done, result) = mpsc::channel();
+    let hand_over = move || {
+        // Nobody who listens: it came too late.
+        let _ = done.send(work());
+    };
+    let thread = thread::Builder::new().name("cellpos-finish".to_owned());
+    thread.spawn(hand_over).ok()?;
+    result.recv_timeout(most).ok()
+}
+
+fn no_answer(path: &Path, after: Duration) -> RecordError {
+    let text = format!("the disk did not answer within {} s", after.as_secs());
+    let source = std::io::Error::new(std::io::ErrorKind::TimedOut, text);
+    RecordError::io("cannot write", path)(source)
+}
+
+impl RunWriter {
+    /// Writes what waits, the end of `run.toml` (`ended_utc` and the counts are set here), and `ticks.parquet`.
+    ///
+    /// The rows are read back: every row taken that does not come back is counted as lost, on top of what `end.rows_lost`
+    /// says was lost on the way here, and the figure `records_lost` of the summary is set to the sum. A failing disk is no
+    /// error here either: what could be written is there, and [`Finished`] says the rest. Nor does a disk that does not answer
+    /// keep it for ever: it is given 15 s for what was written last (a run on the virtual clock, which syncs only here, a
+    /// minute and a second for each 5 MB), and a minute and a second for each 5 MB for `ticks.parquet`.
+    pub fn finish(self, end: RunEnd) -> Finished {
+        let Self {
+            folder,
+            meta,
+            mut log,
+        } = self;
+        let (taken, unconfirmed) = (log.rows(), log.unconfirmed_rows());
+        let settling = match log.syncs() {
+            true => LAST_PATIENCE,
+            false => patience(log.bytes()),
+        };
+        let close = move || {
+            let answers = log.close(settling);
+            (log, answers)
+        };
+        let longest = settling + 2 * DISK_ANSWERS;
+        let mut ending = Ending {
+            end,
+            meta,
+            faults: Faults::default(),
+            rows: taken.saturating_sub(unconfirmed),
+            slowest_sync: None,
+            parquet: Err(no_answer(&folder.join(TICKS_PARQUET), longest)),
+            folder,
+        };
+        let Some((log, answers)) = within(longest, close) else {
+            ending.faults.rows_lost = unconfirmed;
+            ending.no_answer(longest);
+            return ending.finished(false);
+        };
+        ending.faults = log.faults();
+        if log.syncs() {
+            let slowest = log.slowest_sync();
+            ending.slowest_sync = Some(slowest);
+            let ms = slowest.as_secs_f64() * 1e3;
+            let summary = &mut ending.end.summary;
+            summary.insert("slowest_sync_ms".to_owned(), toml::Value::Float(ms));
+        }
+        if answers {
+            ending.read_back(taken, patience(log.bytes()));
+        } else {
+            ending.rows = taken.saturating_sub(ending.faults.rows_lost);
+        }
+        ending.close(answers)
+    }
+}
+
+/// What is known of the end so far.
+struct Ending {
+    folder: PathBuf,
+    meta: RunMeta,
+    end: RunEnd,
+    faults: Faults,
+    rows: u64,
+    slowest_sync: Option<Duration>,
+    parquet: Result<(), RecordError>,
+}
+
+impl Ending {
+    fn fault(&mut self, error: &RecordError) {
+        self.faults.io_errors += 1;
+        self.faults.first.get_or_insert(error.to_string());
+    }
+
+    fn no_answer(&mut self, after: Duration) {
+        let error = no_answer(&self.folder, after);
+        self.fault(&error);
+    }
+
+    /// Writes `ticks.parquet`, and counts the rows that come back from the disk.
+    fn read_back(&mut self, taken: u64, most: Duration) {
+        let folder = self.folder.clone();
+        let read = within(most, move || (parquet(&folder), rows_on_disk(&folder)));
+        let Some((parquet, rows)) = read else {
+            self.no_answer(most);
+            return;
+        };
+        self.rows = rows.unwrap_or_else(|error| {
+            self.faults.first.get_or_insert(error.to_string());
+            0
+        });
+        self.faults.rows_lost = self.faults.rows_lost.max(taken.saturating_sub(self.rows));
+        if let Err(error) = &parquet {
+            self.fault(error);
+        }
+        self.parquet = parquet;
+    }
+
+    /// Puts the end into `run.toml`.
+    fn close(mut self, answers: bool) -> Finished {
+        let end = &mut self.end;
+        end.ended_utc = jiff::Timestamp::now()
+            .strftime("%Y-%m-%dT%H:%M:%S%.3fZ")
+            .to_string();
+        end.rows = self.rows;
+        end.rows_lost += self.faults.rows_lost;
+        end.events_lost += self.faults.events_lost;
+        if let Some(lost) = end.summary.get_mut("records_lost") {
+            *lost = toml::Value::Integer(i64::try_from(end.rows_lost).unwrap_or(i64::MAX));
+        }
+        self.meta.end = Some(end.clone());
+        let (path, meta) = (self.folder.join(RUN_TOML), self.meta.clone());
+        let most = if answers { LAST_PATIENCE } else { DISK_ANSWERS };
+        let write = move || {
+            let text = meta.to_toml()?;
+            write_atomically(&path, text.as_bytes()).map_err(RecordError::from)
+        };
+        match within(most, write) {
+            Some(Ok(())) => return self.finished(true),
+            Some(Err(error)) => self.fault(&error),
+            None => self.no_answer(most),
+        }
+        self.finished(false)
+    }
+
+    fn finished(self, closed: bool) -> Finished {
+        Finished {
+            folder: self.folder,
+            rows: self.rows,
+            slowest_sync: self.slowest_sync,
+            faults: self.faults,
+            closed,
+            parquet: self.parquet,
+        }
+    }
+}
+
+fn parquet(folder: &Path) -> Result<(), RecordError> {
+    let run = RunReader::open(folder)?;
+    let path = folder.join(TICKS_PARQUET);
+    crate::write_parquet(&Source::single(run), &Selection::default(), &path).map(|_| ())
+}
+
+/// Rows that come back from the disk.
+fn rows_on_disk(folder: &Path) -> Result<u64, RecordError> {
+    let mut batches = RunReader::open(folder)?.batches()?;
+    Ok(batches.by_ref().map(|batch| batch.len() as u64).sum())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn work_that_does_not_come_back_is_left_behind() {
+        let (release, held) = mpsc::channel::<()>();
+        let hangs = within(Duration::from_millis(20), move || held.recv());
+        assert!(hangs.is_none());
+        drop(release);
+        assert_eq!(within(Duration::from_secs(60), || 7), Some(7));
+    }
+}
