@@ -5,6 +5,8 @@
 //! does a cycle twice or not at all. `attack --help` runs them in the numbers of a night; the tests of this package run a few
 //! of each.
 
+pub mod sockets;
+
 use crate::programs::{PATIENCE, RigInABox, cellpos};
 use rustix::process::{Pid, Signal, kill_process};
 use std::collections::BTreeMap;

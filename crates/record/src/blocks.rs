@@ -1,7 +1,7 @@
 //! A file that only ever grows by whole blocks.
 
-use std::fs::{File, OpenOptions};
 use std::collections::VecDeque;
+use std::fs::{File, OpenOptions};
 use std::io;
 use std::path::Path;
 use std::time::Duration;

@@ -70,7 +70,10 @@ impl BoardWatch {
         }
         // A board that begins to hold had heard nothing for its watchdog time, perhaps because this program stood still: it is
         // given as long again. Each command that reaches it ends the holding.
-        let heeds = matches!(report.state, ActuatorState::Running | ActuatorState::Holding);
+        let heeds = matches!(
+            report.state,
+            ActuatorState::Running | ActuatorState::Holding
+        );
         if self.state.replace(report.state) != Some(report.state) || !heeds {
             (self.moved_ns, self.commands, self.off_since_ns) = (now_ns, 0, None);
         }

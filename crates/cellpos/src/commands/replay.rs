@@ -4,7 +4,7 @@ use crate::arguments::run_folder;
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
 use cellpos_record::{RunReader, Sessions};
 use cellpos_runtime::replay::{Gap, Mismatch, Replay};
-use cellpos_session::recorded;
+use cellpos_session::{provenance, recorded};
 use serde::Serialize;
 use std::path::PathBuf;
 
@@ -12,7 +12,8 @@ use std::path::PathBuf;
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Example:\n  cellpos replay runs/20261121T090000Z-track\n
 Every recorded measurement of every session goes through the recorded controller again; the commands must come out the
-same to the last bit. Exit code 0: all do; 1: one does not, or rows are missing and those behind the gap cannot be replayed.")]
+same to the last bit. Exit code 0: all do; 1: one does not, or rows are missing and those behind the gap cannot be replayed.
+What was not replayed is said: rows that are missing, damaged or lost, those behind a gap, and the end of a run that was killed.")]
 pub struct Args {
     /// The run folder.
     #[arg(value_parser = run_folder())]
@@ -32,6 +33,14 @@ struct SessionReport {
     identical: u64,
     missing_rows: u64,
     damaged_rows: u64,
+    /// Rows of the run that are not in the record, as run.toml says, beside those that are missing or damaged in between.
+    lost_rows: u64,
+    /// Whether the record ends where the run did; it does not where the run was killed, or still goes on.
+    complete: bool,
+    /// Bytes of a batch that is cut off or damaged beyond being rows.
+    unreadable_bytes: u64,
+    /// The version that recorded it, where it is another one.
+    recorded_by: Option<String>,
     ended_at_gap: Option<Gap>,
     first_mismatch: Option<Mismatch>,
 }
@@ -43,6 +52,7 @@ struct Report {
     replayed: u64,
     identical: u64,
     missing_rows: u64,
+    complete: bool,
     first_mismatch: Option<Mismatch>,
     sessions: Vec<SessionReport>,
     unreadable: Vec<String>,
@@ -62,7 +72,8 @@ pub fn run(args: Args) -> CommandResult {
         ticks: sum(|s| s.ticks),
         replayed: sum(|s| s.replayed),
         identical: sum(|s| s.identical),
-        missing_rows: sum(|s| s.missing_rows + s.damaged_rows),
+        missing_rows: sum(|s| s.missing_rows + s.damaged_rows + s.lost_rows),
+        complete: found.unreadable.is_empty() && sessions.iter().all(|s| s.complete),
         first_mismatch: sessions.iter().find_map(|s| s.first_mismatch),
         sessions,
         unreadable: found.unreadable,
@@ -80,13 +91,18 @@ pub fn run(args: Args) -> CommandResult {
 }
 
 fn session(number: u64, reader: &RunReader) -> Result<SessionReport, Failure> {
-    let mut replay = Replay::new(recorded::setup(reader)?.core()?);
+    let core = recorded::setup(reader)?.core()?;
+    same_law(reader, core.controller().columns())?;
+    let mut replay = Replay::new(core);
     let mut batches = reader.batches().map_err(Failure::input)?;
     for record in batches.by_ref().flatten() {
         replay.add(&record);
     }
     let outcome = replay.outcome();
     let lost = batches.lost();
+    let known = lost.rows + lost.damaged_rows;
+    let meta = reader.meta().ok();
+    let end = meta.and_then(|meta| meta.end.as_ref());
     Ok(SessionReport {
         session: number,
         ticks: outcome.ticks,
@@ -94,9 +110,70 @@ fn session(number: u64, reader: &RunReader) -> Result<SessionReport, Failure> {
         identical: outcome.identical,
         missing_rows: lost.rows,
         damaged_rows: lost.damaged_rows,
+        lost_rows: end.map_or(0, |end| end.rows_lost).saturating_sub(known),
+        complete: lost.finished && lost.read_error.is_none(),
+        unreadable_bytes: lost.torn_bytes + lost.damaged_bytes,
+        recorded_by: meta
+            .and_then(|meta| meta.versions.get("cellpos").cloned())
+            .filter(|version| version != provenance::VERSION),
         ended_at_gap: outcome.gap,
         first_mismatch: outcome.first_mismatch,
     })
+}
+
+/// A replay through another control law than the recorded one would say nothing of either.
+fn same_law(reader: &RunReader, columns: &[&'static str]) -> Result<(), Failure> {
+    let recorded = reader.law_columns();
+    // A record without such columns has nothing to compare.
+    if recorded.is_empty() || recorded.iter().eq(columns) {
+        return Ok(());
+    }
+    let named = |names: &[&str]| match names {
+        [] => "none of its own".to_string(),
+        names => names.join(", "),
+    };
+    let recorded: Vec<&str> = recorded.iter().map(String::as_str).collect();
+    Err(Failure::bad_input(
+        format!(
+            "{}: was driven by a control law with other columns ({}) than the one that run.toml describes ({})",
+            reader.folder().display(),
+            named(&recorded),
+            named(columns)
+        ),
+        "a law of another program is replayed by that program (cellpos_runtime::replay)",
+    ))
+}
+
+/// What of a session was not replayed, beside what stands behind a gap.
+fn left_out(s: &SessionReport) -> Vec<String> {
+    let mut lines = Vec::new();
+    if s.lost_rows > 0 {
+        lines.push(format!(
+            "not replayed: {} rows that were lost in the run and are not in the record",
+            s.lost_rows
+        ));
+    }
+    if s.damaged_rows > 0 && s.ended_at_gap.is_none() {
+        lines.push(format!("not replayed: {} damaged rows", s.damaged_rows));
+    }
+    if !s.complete {
+        lines.push(format!(
+            "not replayed: what came after the last row; the record has no end ({} unreadable bytes): the run was killed, or still \
+             goes on",
+            s.unreadable_bytes
+        ));
+    } else if s.unreadable_bytes > 0 {
+        lines.push(format!(
+            "not replayed: {} bytes that make no rows",
+            s.unreadable_bytes
+        ));
+    }
+    if let Some(version) = &s.recorded_by {
+        lines.push(format!(
+            "recorded by cellpos {version}, replayed by another version"
+        ));
+    }
+    lines
 }
 
 fn text(report: &Report) -> String {
@@ -107,7 +184,10 @@ fn text(report: &Report) -> String {
                 "differs first at tick {}: {} recorded {:?}, replayed {:?}",
                 m.seq, m.column, m.recorded, m.replayed
             ),
-            (None, None) => "every command reproduced to the bit".to_string(),
+            (None, None) if s.complete && s.lost_rows + s.damaged_rows == 0 => {
+                "every command reproduced to the bit".to_string()
+            }
+            (None, None) => "every command that the record has reproduced to the bit".to_string(),
             (None, Some(gap)) => format!(
                 "all that were replayed; the replay ended at tick {}, which is missing: {} ticks stand behind that gap ({} \
                  rows missing, {} damaged), where the state of the loop is not known, and were not replayed",
@@ -124,6 +204,7 @@ fn text(report: &Report) -> String {
             "{} of {} ticks identical: {verdict}\n",
             s.identical, s.ticks
         ));
+        out.extend(left_out(s).iter().map(|line| format!("{line}\n")));
     }
     for folder in &report.unreadable {
         out.push_str(&format!("not replayed: {folder}\n"));

@@ -3,7 +3,7 @@
 use crate::design::plant::DesignPlant;
 use crate::linear::LinearLaw;
 use cellpos_plant::{DiscretePlant, PlantError};
-use nalgebra::{Complex, DMatrix};
+use nalgebra::{Complex, DMatrix, Schur};
 use std::f64::consts::{PI, TAU};
 
 /// Margins of a loop. With `stable = false` the other figures describe the open loop's curve only.
@@ -156,7 +156,7 @@ pub fn margins(plant: &DesignPlant, law: &LinearLaw) -> Result<Margins, PlantErr
     Ok(Grid::new(plant, 400)?.margins(law))
 }
 
-/// Whether the loop's poles lie inside the unit circle.
+/// Whether the loop's poles lie inside the unit circle; poles that cannot be computed do not.
 pub(crate) fn is_stable(plant: &DesignPlant, law: &LinearLaw) -> Result<bool, PlantError> {
     Ok(spectral_radius(&closed_loop(&plant.measured()?, law)) < 1.0)
 }
@@ -175,11 +175,19 @@ fn closed_loop(plant: &DiscretePlant, law: &LinearLaw) -> DMatrix<f64> {
     closed
 }
 
+/// Largest magnitude of an eigenvalue; NaN where it cannot be computed: entries that are no numbers, or so badly scaled that
+/// the iteration does not come to an end.
 fn spectral_radius(a: &DMatrix<f64>) -> f64 {
-    a.complex_eigenvalues()
-        .iter()
-        .map(|v| v.norm())
-        .fold(0.0, f64::max)
+    /// Sweeps for each row; a sound matrix needs two or three.
+    const SWEEPS: usize = 60;
+    if !a.iter().all(|entry| entry.is_finite()) {
+        return f64::NAN;
+    }
+    let schur = Schur::try_new(a.clone(), f64::EPSILON, SWEEPS * a.nrows().max(1));
+    schur.map_or(f64::NAN, |schur| {
+        let radius = |most: f64, v: &Complex<f64>| most.max(v.norm());
+        schur.complex_eigenvalues().iter().fold(0.0, radius)
+    })
 }
 
 fn bisect(mut low: f64, mut high: f64, f: impl Fn(f64) -> f64) -> f64 {

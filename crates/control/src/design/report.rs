@@ -20,6 +20,10 @@ use cellpos_plant::PlantError;
 use serde::Deserialize;
 use thiserror::Error;
 
+/// Longest delay that is designed for, samples: twice what the running loop's estimator reaches back. The work grows with its
+/// cube.
+const LONGEST_DELAY: f64 = 2.0 * crate::estimator::HISTORY as f64;
+
 /// Why a design is not possible.
 #[derive(Debug, Clone, PartialEq, Error)]
 pub enum DesignError {
@@ -38,6 +42,19 @@ pub enum DesignError {
         delay_ms: f64,
         /// Half a sample, ms.
         hold_ms: f64,
+    },
+    /// The delay is longer than any loop of this program reaches back.
+    #[error(
+        "delay {delay_ms} ms is more than {most} samples of {sample_ms} ms: no loop reaches back so far; shorten the camera path, or \
+         sample more slowly"
+    )]
+    DelayTooLong {
+        /// Given, ms.
+        delay_ms: f64,
+        /// Sample time, ms.
+        sample_ms: f64,
+        /// Samples that are designed for.
+        most: f64,
     },
     /// No gains keep the limits.
     #[error(
@@ -198,6 +215,13 @@ pub fn design(request: &DesignRequest) -> Result<DesignReport, DesignError> {
         return Err(DesignError::DelayBelowHold {
             delay_ms: plant.loop_delay_s() * 1e3,
             hold_ms,
+        });
+    }
+    if plant.delay_s > LONGEST_DELAY * plant.sample_time_s {
+        return Err(DesignError::DelayTooLong {
+            delay_ms: plant.loop_delay_s() * 1e3,
+            sample_ms: plant.sample_time_s * 1e3,
+            most: LONGEST_DELAY,
         });
     }
     let pi = match request.controller {
