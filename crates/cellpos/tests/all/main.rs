@@ -9,6 +9,7 @@ mod identify;
 mod identify_rig;
 mod kinds_of_runs;
 mod newcomer;
+mod replay;
 mod script_faults;
 mod script_runs;
 mod scripts;

@@ -1,6 +1,7 @@
 //! The laws in closed loop.
 
 mod allocation;
+mod badly_scaled;
 mod late_ticks;
 mod learning;
 mod limits;

@@ -1,8 +1,6 @@
 //! What a replay claims: the rows that it replayed, and no other.
 
-mod common;
-
-use common::{Ran, cellpos, number, succeed};
+use crate::common::{Ran, cellpos, number, succeed};
 use std::path::{Path, PathBuf};
 
 const FAST: &str = "--clock virtual --frames off --json";

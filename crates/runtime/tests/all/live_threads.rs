@@ -1,7 +1,6 @@
 //! The threads of a live run: what they leave behind in the program that made them.
 
-mod common;
-
+use crate::common::{controller, core};
 use cellpos_control::ControllerKind;
 use cellpos_emulator::{BoardConfig, EmulatedRig, WorldConfig};
 use cellpos_plant::Model;
@@ -9,7 +8,6 @@ use cellpos_rig::{Actuator, ArmRequest, Clock};
 use cellpos_runtime::live::{self, Operator, Threads};
 use cellpos_runtime::run::Finished;
 use cellpos_runtime::{EndRule, Event, NoSink, RunError, RunSink, Statistics, TickRecord};
-use common::{controller, core};
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, channel};
 use std::time::{Duration, Instant};
