@@ -1,6 +1,7 @@
 //! Benchmarks with conditions and competitors: what they share.
 #![forbid(unsafe_code)]
 
+pub mod live_page;
 pub mod simulated;
 
 use cellpos_control::{ControllerFile, ControllerKind, Pi, Profile};

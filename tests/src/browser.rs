@@ -174,6 +174,33 @@ impl Browser {
         lines.iter().map(|line| text(&line["message"])).collect()
     }
 
+    /// Memory of driver and browser together, kB: what their processes have in RAM, pages that they share counted once for each
+    /// that has them.
+    pub fn memory_kb(&self) -> u64 {
+        let group = self.driver.id();
+        let Ok(processes) = std::fs::read_dir("/proc") else {
+            return 0;
+        };
+        processes
+            .flatten()
+            .filter_map(|entry| {
+                let stat = std::fs::read_to_string(entry.path().join("stat")).ok()?;
+                // Behind the name, which may hold anything: state, parent, group.
+                let (_, rest) = stat.rsplit_once(')')?;
+                let of: u32 = rest.split_whitespace().nth(2)?.parse().ok()?;
+                (of == group).then(|| resident_kb(&entry.path()))
+            })
+            .sum()
+    }
+
+    /// What the page's own objects take, bytes, collected first.
+    pub fn heap_bytes(&self) -> f64 {
+        let body = json!({ "cmd": "HeapProfiler.collectGarbage", "params": {} });
+        self.on_session("POST", "/goog/cdp/execute", &body);
+        let used = self.run("return performance.memory.usedJSHeapSize");
+        used.as_f64().unwrap_or(f64::NAN)
+    }
+
     /// Keeps a picture of the page.
     ///
     /// # Panics
@@ -182,6 +209,14 @@ impl Browser {
         let taken = self.on_session("GET", "/screenshot", &Value::Null);
         std::fs::write(path, base64(&text(&taken))).expect("a screenshot is written");
     }
+}
+
+/// What a process has in RAM, kB; 0 where it is gone. `process`: its folder in /proc.
+pub fn resident_kb(process: &Path) -> u64 {
+    let status = std::fs::read_to_string(process.join("status")).unwrap_or_default();
+    let line = status.lines().find_map(|line| line.strip_prefix("VmRSS:"));
+    let kb = line.and_then(|rest| rest.split_whitespace().next()?.parse().ok());
+    kb.unwrap_or(0)
 }
 
 /// The body of an answer; the driver leaves the line open behind it.

@@ -13,6 +13,9 @@ pub const OF_A_HOLD: &str = "f freeze, q stop, arrows or 2.5 Enter: target";
 /// Which keys a motion takes that is not steered.
 pub const OF_A_MOTION: &str = "f freeze, q stop";
 
+/// Which keys a script takes.
+pub const OF_A_SCRIPT: &str = "p pause, s next step, q stop";
+
 /// Keys of a script: p pauses and goes on, s skips, q stops.
 pub fn of_a_script(operator: &Arc<Operator>) -> Option<Keyboard> {
     let operator = Arc::clone(operator);

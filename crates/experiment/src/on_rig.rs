@@ -19,6 +19,7 @@ use cellpos_runtime::{
 };
 use cellpos_session::rig_file::{ClockKind, Frames, RigFile};
 use cellpos_session::setup::{self, Prepared, ReferenceSpec};
+use cellpos_session::view::{Pages, Shown, State, Viewed};
 use cellpos_session::{EndKind, Ended, Failure, Options, Rig};
 use std::sync::Arc;
 use std::sync::mpsc::Sender;
@@ -100,15 +101,41 @@ impl ReferenceGenerator for Exciting {
 }
 
 /// Hands every tick on, to whoever waits for the run.
-struct Handing(Sender<TickRecord>);
+struct Handing {
+    ticks: Sender<TickRecord>,
+    /// The segments, by ticks since the first of them.
+    spans: Vec<Span>,
+    /// The tick in which the loop was closed, and the newest.
+    closed: Option<u64>,
+    newest: u64,
+    period_s: f64,
+}
 
 impl RunSink for Handing {
     fn tick(&mut self, record: &TickRecord) {
+        if self.closed.is_none() && record.life == Life::Running as u8 {
+            self.closed = Some(record.seq);
+        }
+        self.newest = record.seq;
         // Nobody who hears it: the run is given up already.
-        let _ = self.0.send(*record);
+        let _ = self.ticks.send(*record);
     }
     fn event(&mut self, _: &Event) {}
     fn progress(&mut self, _: &Statistics) {}
+}
+
+impl Shown for Handing {
+    fn complete(&self, state: &mut State) {
+        let Some(closed) = self.closed else {
+            return;
+        };
+        let since = usize::try_from(self.newest - closed).unwrap_or(usize::MAX);
+        let now = since.saturating_sub(SETTLE_TICKS);
+        let begun = (self.spans.iter()).filter(|span| span.start <= now).count();
+        let end = (self.spans.last()).map_or(0, |span| span.start + span.rows);
+        state.doing = Some(format!("Segment {begun} of {}", self.spans.len()));
+        state.left_s = Some(self.period_s * (SETTLE_TICKS + end).saturating_sub(since) as f64);
+    }
 }
 
 /// Why segments are missing.
@@ -130,7 +157,10 @@ impl std::fmt::Display for Trouble {
         match self {
             Self::Ended(ended) => ended.fmt(f),
             Self::Spoilt { missing, of } => {
-                write!(f, "{missing} of {of} segments were spoilt by a lost bead")
+                write!(
+                    f,
+                    "{missing} of {of} segments were spoilt by a lost bead or a freeze"
+                )
             }
         }
     }
@@ -227,6 +257,20 @@ impl OnRig {
         todo: &[usize],
         listener: &mut Listener<'_>,
     ) -> Result<Acquired, Failure> {
+        self.acquire_shown(plan, todo, listener, None)
+    }
+
+    /// The same, shown on a live page.
+    ///
+    /// # Errors
+    /// As [`OnRig::acquire`]; a page that cannot be served.
+    pub fn acquire_shown(
+        &self,
+        plan: &Plan,
+        todo: &[usize],
+        listener: &mut Listener<'_>,
+        pages: Option<&mut Pages>,
+    ) -> Result<Acquired, Failure> {
         /// How often the ticks are looked at.
         const LOOK_EVERY: Duration = Duration::from_millis(100);
         let schedule = plan.schedule(todo);
@@ -243,9 +287,19 @@ impl OnRig {
         })?;
         let (sender, received) = std::sync::mpsc::channel();
         let period_ns = self.file.timing.period_ns();
-        let running = rig
-            .arm(&setup, core, Handing(sender), EndRule::default())?
-            .start()?;
+        let mut view = match pages {
+            Some(pages) => pages.next(&mut rig, &setup)?,
+            None => None,
+        };
+        let handing = Handing {
+            ticks: sender,
+            spans: schedule.spans.clone(),
+            closed: None,
+            newest: 0,
+            period_s: 1e-9 * period_ns as f64,
+        };
+        let sink = Viewed::new(handing, view.as_deref_mut());
+        let running = rig.arm(&setup, core, sink, EndRule::default())?.start()?;
         let operator = Arc::clone(running.operator());
         let mut ticks: Vec<TickRecord> = Vec::new();
         let mut ended = 0;
@@ -263,6 +317,7 @@ impl OnRig {
                 (listener.segment)(&self.acquired(&ticks, plan, &schedule.spans));
             }
         })?;
+        finished.sink.give_back(view);
         ticks.extend(received.try_iter());
         if let Some(rate_hz) = foreign_rate_hz(&ticks, period_ns) {
             return Err(other_rate(rate_hz, period_ns));

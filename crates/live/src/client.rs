@@ -108,7 +108,7 @@ pub(crate) fn act(text: &str, role: Role, shared: &Shared) -> Result<(), Command
     if role != Role::Operator {
         return Err(CommandError::ViewerOnly);
     }
-    shared.ask(Command::read(text, shared.view_um())?);
+    shared.ask(Command::read(text, shared.targets_um())?);
     Ok(())
 }
 

@@ -38,7 +38,7 @@ pub enum CommandError {
     #[error("not a request: {0}")]
     Unreadable(String),
     /// A target that is no position in view.
-    #[error("target {0} is outside the field of view ({1} um to {2} um)")]
+    #[error("target {0} is outside what can be asked for ({1} um to {2} um)")]
     OutOfView(String, String, String),
     /// A note without text, or too long.
     #[error("a note has 1 to 500 characters")]
@@ -49,16 +49,16 @@ pub enum CommandError {
 }
 
 impl Command {
-    /// Reads a request. `view_um` bounds targets where it is known.
+    /// Reads a request. `targets_um` bounds targets where it is known.
     ///
     /// # Errors
     /// [`CommandError`], to be told to whoever asked.
-    pub fn read(text: &str, view_um: [f64; 2]) -> Result<Self, CommandError> {
+    pub fn read(text: &str, targets_um: [f64; 2]) -> Result<Self, CommandError> {
         let command: Self =
             serde_json::from_str(text).map_err(|e| CommandError::Unreadable(e.to_string()))?;
         match command {
             Self::Target { um } => {
-                let [low, high] = view_um;
+                let [low, high] = targets_um;
                 // Comparisons with an unknown end (NaN) are false: then any finite target may be tried.
                 if !um.is_finite() || um < low || um > high || um.abs() > 1e6 {
                     return Err(CommandError::OutOfView(

@@ -1,7 +1,7 @@
 //! From the threads of a run to the page, without waiting.
 
 use crate::row::{PICTURE_MARGIN, Picture, Row};
-use crate::state::{CycleRow, EventLine, Hello, State};
+use crate::state::{ClipLine, CycleRow, EventLine, Hello, State};
 use rtrb::{Consumer, Producer, RingBuffer};
 
 /// Rows that fit while the hub is not running: eight seconds at 1 kHz.
@@ -26,10 +26,15 @@ pub struct Lost {
 
 /// What goes through the ring of words.
 #[derive(Debug, Clone, PartialEq)]
-pub(crate) enum Line {
+pub enum Line {
+    /// How the run stands.
     State(Box<State>),
+    /// What happened.
     Event(EventLine),
+    /// A cycle is over.
     Cycle(CycleRow),
+    /// A clip is on the disk.
+    Clip(ClipLine),
 }
 
 /// The run's end of the rings. No call waits; what does not fit is counted in [`Feed::lost`].
@@ -128,6 +133,11 @@ impl Feed {
         self.line(Line::Cycle(cycle));
     }
 
+    /// A clip is on the disk.
+    pub fn clip(&mut self, clip: ClipLine) {
+        self.line(Line::Clip(clip));
+    }
+
     fn line(&mut self, line: Line) {
         self.lost.lines += u64::from(self.lines.push(line).is_err());
     }
@@ -135,6 +145,23 @@ impl Feed {
     /// What did not fit.
     pub fn lost(&self) -> Lost {
         self.lost
+    }
+}
+
+impl FeedHub {
+    /// What the run is.
+    pub fn hello(&self) -> &Hello {
+        &self.hello
+    }
+
+    /// The next tick that came, for whoever shows a run without a server.
+    pub fn next_row(&mut self) -> Option<Row> {
+        self.rows.pop().ok()
+    }
+
+    /// The next of what is told in words, likewise.
+    pub fn next_line(&mut self) -> Option<Line> {
+        self.lines.pop().ok()
     }
 }
 

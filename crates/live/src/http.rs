@@ -24,6 +24,8 @@ pub(crate) struct Request {
     pub path: String,
     /// The word in the link.
     pub word: String,
+    /// The name of what is asked for, where the path alone does not say it.
+    pub name: String,
     pub host: String,
     pub origin: Option<String>,
     /// The client's key, where it asks for a WebSocket.
@@ -102,11 +104,11 @@ fn parse_head(bytes: &[u8]) -> Result<Option<(Request, usize, usize)>, RequestEr
     let target = parsed.path.unwrap_or_default();
     let (path, query) = target.split_once('?').unwrap_or((target, ""));
     request.path = path.to_string();
-    request.word = query
-        .split('&')
-        .find_map(|pair| pair.strip_prefix("word="))
-        .unwrap_or_default()
-        .to_string();
+    let of_query = |key: &str| {
+        let value = query.split('&').find_map(|pair| pair.strip_prefix(key));
+        value.unwrap_or_default().to_string()
+    };
+    (request.word, request.name) = (of_query("word="), of_query("name="));
     let mut upgrade = false;
     let mut key = None;
     let mut body_length = 0;

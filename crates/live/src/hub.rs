@@ -3,7 +3,7 @@
 use crate::feed::{FeedHub, Line};
 use crate::queue::Queue;
 use crate::row::{PICTURE_HEAD, ROW_BYTES, Row};
-use crate::state::{CycleRow, EventLine, State};
+use crate::state::{ClipLine, CycleRow, EventLine, State};
 use serde::Serialize;
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -23,6 +23,8 @@ const PAST_MESSAGES: usize = 50;
 const PAST_EVENTS: usize = 300;
 /// Cycles kept for new clients.
 const PAST_CYCLES: usize = 20_000;
+/// Clips kept for new clients.
+const PAST_CLIPS: usize = 1000;
 /// Rows of one message: a client that reads slowly loses little at a time.
 const ROWS_OF_A_MESSAGE: usize = 2000;
 
@@ -33,6 +35,7 @@ enum Told<'a> {
     State(&'a State),
     Events(Vec<&'a EventLine>),
     Cycles(Vec<&'a CycleRow>),
+    Clips(Vec<&'a ClipLine>),
 }
 
 /// The hub's memory, and the queues of its clients.
@@ -53,6 +56,7 @@ struct Past {
     rows: VecDeque<Row>,
     events: VecDeque<EventLine>,
     cycles: VecDeque<CycleRow>,
+    clips: VecDeque<ClipLine>,
     state: Option<State>,
 }
 
@@ -162,6 +166,11 @@ impl Past {
                 keep(&mut self.cycles, cycle, PAST_CYCLES);
                 message
             }
+            Line::Clip(clip) => {
+                let message = text(&Told::Clips(vec![&clip]));
+                keep(&mut self.clips, clip, PAST_CLIPS);
+                message
+            }
         }
     }
 
@@ -175,6 +184,9 @@ impl Past {
         }
         if !self.cycles.is_empty() {
             queue.push(&text(&Told::Cycles(self.cycles.iter().collect())));
+        }
+        if !self.clips.is_empty() {
+            queue.push(&text(&Told::Clips(self.clips.iter().collect())));
         }
         let mut rows = self.rows.iter();
         let size = rows.len().div_ceil(PAST_MESSAGES).max(ROWS_OF_A_MESSAGE);

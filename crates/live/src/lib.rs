@@ -33,6 +33,7 @@ mod access;
 mod client;
 mod command;
 mod feed;
+mod film;
 mod http;
 mod hub;
 mod page;
@@ -44,7 +45,8 @@ mod state;
 
 pub use access::{Role, Secrets};
 pub use command::{Command, CommandError};
-pub use feed::{Feed, FeedHub, Lost, PictureFeed};
+pub use feed::{Feed, FeedHub, Line, Lost, PictureFeed};
+pub use film::{Film, FilmFrame, film_bytes};
 pub use row::{PICTURE_MARGIN, Picture, Row};
 pub use server::{LiveError, MOST_CLIENTS, Server, ServerConfig};
-pub use state::{Banner, CycleRow, EventLine, Hello, State};
+pub use state::{Banner, ClipLine, CycleRow, EventLine, Hello, State};

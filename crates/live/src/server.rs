@@ -4,6 +4,7 @@ use crate::access::{Role, Secrets, is_our_host, is_our_origin};
 use crate::client;
 use crate::command::Command;
 use crate::feed::FeedHub;
+use crate::film::Film;
 use crate::http::{self, RequestError};
 use crate::hub::{Clients, Hub};
 use crate::page;
@@ -34,6 +35,8 @@ pub struct ServerConfig {
     pub beyond_this_machine: bool,
     /// Called by each thread of the server as its first act: its place among the processors.
     pub on_thread: Option<Arc<dyn Fn() + Send + Sync>>,
+    /// Gives a clip by its name, as the page plays it ([`Film`]); called on a client's thread.
+    pub film: Option<Film>,
 }
 
 impl fmt::Debug for ServerConfig {
@@ -52,6 +55,7 @@ impl Default for ServerConfig {
             address: SocketAddr::from(([127, 0, 0, 1], 0)),
             beyond_this_machine: false,
             on_thread: None,
+            film: None,
         }
     }
 }
@@ -119,6 +123,7 @@ impl Server {
             connections: AtomicUsize::new(0),
             command: Box::new(command),
             on_thread: config.on_thread.clone(),
+            film: config.film.clone(),
         });
         // From here on a failure drops the server, which ends what has started.
         let mut server = Self {
@@ -275,6 +280,12 @@ fn converse(mut stream: TcpStream, shared: &Shared) {
                 page::INDEX.as_bytes(),
             );
         }
+        ("GET", "/clip", None) => match shared.film.as_ref().and_then(|film| film(&request.name)) {
+            Some(film) => {
+                http::answer(&mut stream, "200 OK", "application/octet-stream", &film);
+            }
+            None => http::say(&mut stream, "404 Not Found", "there is no such clip"),
+        },
         // A browser always says where a script comes from: without an origin it is not our page.
         ("GET", "/live", Some(_)) if request.origin.is_none() => {
             http::say(&mut stream, "403 Forbidden", "no origin");

@@ -2,6 +2,7 @@
 
 use crate::access::{Role, Secrets};
 use crate::command::Command;
+use crate::film::Film;
 use crate::hub::Clients;
 use crate::state::Hello;
 use serde::Serialize;
@@ -22,6 +23,7 @@ pub(crate) struct Shared {
     pub(crate) connections: AtomicUsize,
     pub(crate) command: Box<dyn Fn(Command) + Send + Sync>,
     pub(crate) on_thread: Option<Arc<dyn Fn() + Send + Sync>>,
+    pub(crate) film: Option<Film>,
 }
 
 #[derive(Serialize)]
@@ -35,8 +37,8 @@ impl Shared {
         self.over.load(Ordering::Acquire)
     }
 
-    pub(crate) fn view_um(&self) -> [f64; 2] {
-        self.hello.view_um
+    pub(crate) fn targets_um(&self) -> [f64; 2] {
+        self.hello.targets_um()
     }
 
     pub(crate) fn ask(&self, command: Command) {

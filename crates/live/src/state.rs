@@ -25,6 +25,10 @@ pub struct Hello {
     pub bound_spectrum: Vec<[f64; 2]>,
     /// Whether the operator may set the target.
     pub steered: bool,
+    /// Whether the target is a displacement of the PZT, moved by hand, rather than a position that a loop holds.
+    pub by_hand: bool,
+    /// Whether notes are kept with the run.
+    pub notes: bool,
     /// Whether a script says where the bead is to be: it can be paused, and its steps skipped.
     pub script: bool,
     /// Whether the run has pictures.
@@ -46,9 +50,22 @@ impl Default for Hello {
             bound_nm: None,
             bound_spectrum: vec![],
             steered: false,
+            by_hand: false,
+            notes: true,
             script: false,
             pictures: false,
             recorded: false,
+        }
+    }
+}
+
+impl Hello {
+    /// Between which ends a target lies, um; NaN where that is not known.
+    pub fn targets_um(&self) -> [f64; 2] {
+        if self.by_hand {
+            self.range_um
+        } else {
+            self.view_um
         }
     }
 }
@@ -82,6 +99,10 @@ pub struct State {
     pub ticks: u64,
     /// RMS of the measured error since the loop settled, nm.
     pub rms_nm: Option<f64>,
+    /// Wake-up of the ticks behind their due time, us: the least time that 99.9 % of them do not exceed.
+    pub wake_us: Option<f64>,
+    /// Computing time of the ticks, us, likewise.
+    pub compute_us: Option<f64>,
     /// Ticks handed over late.
     pub late: u64,
     /// Ticks that never came.
@@ -96,6 +117,8 @@ pub struct State {
     pub records_lost: u64,
     /// Cycle that runs, from 1, and how many there are, where a script has cycles.
     pub cycle: Option<[u64; 2]>,
+    /// What is being done, where no script says it.
+    pub doing: Option<String>,
     /// What comes next in the script.
     pub next: Option<String>,
     /// Time left, s, where it is known.
@@ -111,6 +134,17 @@ pub struct EventLine {
     pub level: &'static str,
     /// What happened.
     pub text: String,
+}
+
+/// A clip of the camera's picture that is on the disk.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct ClipLine {
+    /// Its name.
+    pub name: String,
+    /// What it is kept of: time since the start of the run, s.
+    pub time_s: f64,
+    /// Its frames.
+    pub frames: u64,
 }
 
 /// One finished cycle of a script.

@@ -2,6 +2,7 @@
 
 use crate::draw;
 use crate::figure::Figure;
+use crate::picture::Picture;
 use crate::svg::{STYLE, escape};
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
@@ -179,6 +180,7 @@ enum Block {
     Verbatim(String),
     Table(Table),
     Figure(Figure),
+    Picture(Picture),
 }
 
 /// A report: see the crate's documentation.
@@ -249,6 +251,15 @@ impl Report {
         self.push(Block::Figure(figure))
     }
 
+    /// Adds a picture of pixels, a PNG file, which the page carries within itself. `shows` says in a few words what it shows.
+    pub fn picture(&mut self, shows: &str, caption: &str, png: Vec<u8>) -> &mut Self {
+        self.push(Block::Picture(Picture {
+            shows: shows.to_owned(),
+            caption: caption.to_owned(),
+            png,
+        }))
+    }
+
     /// The figures, in order.
     pub fn figures(&self) -> impl Iterator<Item = &Figure> {
         self.blocks.iter().filter_map(|block| match block {
@@ -316,6 +327,7 @@ impl Report {
                     let _ = writeln!(out, "<pre>{}</pre>", escape(text));
                 }
                 Block::Table(table) => table.html(&mut out),
+                Block::Picture(picture) => picture.html(&mut out, escape),
                 Block::Figure(figure) => {
                     let _ = write!(out, "<figure>\n{}", draw::figure(figure, false));
                     if !figure.caption.is_empty() {
@@ -394,7 +406,7 @@ main{max-width:860px;margin:0 auto;padding:24px 20px 60px}\
 h1{font-size:26px;line-height:1.25;margin:8px 0 16px}h2{font-size:20px;margin:38px 0 10px;padding-top:8px;border-top:1px solid #dfe3e8}\
 h3{font-size:16px;margin:24px 0 6px}p{margin:8px 0}ul{margin:8px 0;padding-left:22px}\
 nav ul{columns:2;list-style:none;padding:10px 14px;background:#f5f7f9;border-radius:6px;font-size:14px}\
-a{color:#0063a0}figure{margin:18px 0}figure svg{max-width:100%;height:auto;display:block}\
+a{color:#0063a0}figure{margin:18px 0}figure svg,img.pixels{max-width:100%;height:auto;display:block}img.pixels{image-rendering:pixelated}\
 figcaption{color:#5c6470;font-size:13px;margin-top:4px}\
 .scroll{overflow-x:auto;margin:12px 0}table{border-collapse:collapse;font-size:13.5px}\
 p.caption{color:#5c6470;font-size:13px;margin-top:4px}\

@@ -33,6 +33,7 @@ mod heat;
 mod html;
 mod marks;
 mod panel;
+mod picture;
 mod series;
 mod svg;
 mod thin;

@@ -24,8 +24,10 @@
 //! ```
 #![forbid(unsafe_code)]
 
+mod beside;
 pub mod clips;
 pub mod connect;
+mod crop;
 pub mod cyclic;
 mod devices;
 pub mod ended;
@@ -41,6 +43,7 @@ pub mod recording;
 mod rig;
 pub mod rig_file;
 pub mod say;
+pub mod screen;
 pub mod setup;
 pub mod signals;
 pub mod toml_file;

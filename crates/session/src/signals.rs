@@ -123,6 +123,7 @@ fn act(signal: i32) {
     let mut desk = desk();
     if desk.sessions.is_empty() {
         if !matches!(signal, SIGUSR1 | SIGUSR2) {
+            cellpos_terminal::give_back();
             // The desk stays closed meanwhile: nobody arms a board while the program ends.
             let _ = emulate_default_handler(signal);
         }

@@ -5,6 +5,9 @@
 //! it; the number is told once the terminal takes output again. So nothing that holds a rig, records or reacts to a signal
 //! ever waits for a screen.
 //!
+//! The whole terminal can be taken for a while ([`Terminal::open_screen`]): what is said meanwhile is kept and told when the
+//! terminal is given back, on whatever way the program ends ([`give_back`]).
+//!
 //! What is shown is cleaned ([`clean`]): text that came from a file cannot move the cursor, rename the window or hide what
 //! follows. Not for the result of a command, which goes to standard output when nothing waits any more.
 //!
@@ -17,11 +20,16 @@
 //! ```
 #![forbid(unsafe_code)]
 
+mod screen;
+
+pub use screen::give_back;
+
+use screen::Screen;
 use std::borrow::Cow;
 use std::io::{self, Write};
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, sync_channel};
-use std::sync::{Arc, OnceLock};
+use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 use std::thread;
 use std::time::Duration;
 
@@ -37,6 +45,12 @@ enum Message {
     Leave,
     /// Says when everything before it has been written.
     Flush(SyncSender<()>),
+    /// The whole terminal is taken.
+    Open,
+    /// A picture on it, as it is.
+    Draw(String),
+    /// It is given back.
+    Close,
 }
 
 /// A terminal, or what takes its place.
@@ -44,20 +58,41 @@ enum Message {
 pub struct Terminal {
     ring: SyncSender<Message>,
     dropped: Arc<AtomicU64>,
+    /// Pictures that are not on the terminal yet.
+    pending: Arc<AtomicU64>,
+    /// What was said last while the whole terminal was taken; known to the threads of terminal and picture alone.
+    heard: Arc<Mutex<String>>,
 }
 
 impl Terminal {
     /// A thread that writes to `out`. It ends when the last handle is gone, and does not keep the program from ending. Where
     /// no thread can be started everything is dropped and counted.
     pub fn new(out: impl Write + Send + 'static) -> Self {
+        Self::with(out, Screen::default())
+    }
+
+    fn with(out: impl Write + Send + 'static, screen: Screen) -> Self {
         let (ring, messages) = sync_channel(RING);
         let dropped = Arc::new(AtomicU64::new(0));
+        let (pending, heard) = (Arc::default(), Arc::default());
+        let mut writer = Writer {
+            out,
+            live: false,
+            screen,
+            pending: Arc::clone(&pending),
+            heard: Arc::clone(&heard),
+        };
         let counted = Arc::clone(&dropped);
         // Without a thread the receiver is gone and each message counts as dropped.
         let _ = thread::Builder::new()
             .name("cellpos-terminal".to_string())
-            .spawn(move || serve(&messages, &counted, out));
-        Self { ring, dropped }
+            .spawn(move || writer.serve(&messages, &counted));
+        Self {
+            ring,
+            dropped,
+            pending,
+            heard,
+        }
     }
 
     fn send(&self, message: Message) {
@@ -81,6 +116,40 @@ impl Terminal {
         self.send(Message::Leave);
     }
 
+    /// Takes the whole terminal: pictures are drawn on it, the live line is not shown, and what is said is kept until
+    /// [`Terminal::close_screen`].
+    pub fn open_screen(&self) {
+        self.send(Message::Open);
+    }
+
+    /// Whether the last picture is on the terminal: another one need not be made before.
+    pub fn can_draw(&self) -> bool {
+        self.pending.load(Ordering::Acquire) == 0
+    }
+
+    /// A picture, as sequences for the terminal; `false`: it was not taken. Never waits.
+    pub fn draw(&self, picture: String) -> bool {
+        self.pending.fetch_add(1, Ordering::AcqRel);
+        let taken = self.ring.try_send(Message::Draw(picture)).is_ok();
+        if !taken {
+            self.pending.fetch_sub(1, Ordering::AcqRel);
+        }
+        taken
+    }
+
+    /// What was said last while the terminal was taken.
+    pub fn heard(&self) -> String {
+        let heard = self.heard.lock().unwrap_or_else(PoisonError::into_inner);
+        heard.clone()
+    }
+
+    /// Gives the terminal back and tells what was said meanwhile. A terminal that takes nothing is waited for no longer than
+    /// `patience`.
+    pub fn close_screen(&self, patience: Duration) {
+        self.send(Message::Close);
+        self.flush(patience);
+    }
+
     /// Messages that found the ring full and have not been told of yet.
     pub fn dropped(&self) -> u64 {
         self.dropped.load(Ordering::Relaxed)
@@ -96,7 +165,11 @@ impl Terminal {
 /// The terminal behind standard error, shared by the whole program.
 pub fn stderr() -> &'static Terminal {
     static TERMINAL: OnceLock<Terminal> = OnceLock::new();
-    TERMINAL.get_or_init(|| Terminal::new(io::stderr()))
+    TERMINAL.get_or_init(|| {
+        let screen = Screen::default();
+        screen.is_that_of_stderr();
+        Terminal::with(io::stderr(), screen)
+    })
 }
 
 /// Columns of the terminal behind standard error; 80 where it does not say.
@@ -108,12 +181,22 @@ pub fn columns() -> usize {
         .unwrap_or(80)
 }
 
+/// Columns and rows of the terminal behind standard error; 80 x 24 where it does not say.
+pub fn size() -> (u16, u16) {
+    rustix::termios::tcgetwinsize(io::stderr())
+        .ok()
+        .map(|size| (size.ws_col, size.ws_row))
+        .filter(|(columns, rows)| *columns > 0 && *rows > 0)
+        .unwrap_or((80, 24))
+}
+
 /// Sends the words of a panic to [`stderr`], so that a thread that fails does not wait for a screen before it is noticed.
 pub fn panics_do_not_wait() {
     let plain = std::panic::take_hook();
     std::panic::set_hook(Box::new(move |info| {
         // The program ends with its main thread: nobody would be left to write.
         if thread::current().name() == Some("main") {
+            give_back();
             plain(info);
         } else {
             stderr().say(&info.to_string());
@@ -121,45 +204,82 @@ pub fn panics_do_not_wait() {
     }));
 }
 
-fn serve(messages: &Receiver<Message>, dropped: &AtomicU64, mut out: impl Write) {
-    let mut live = false;
-    loop {
-        let written = match messages.recv_timeout(Duration::from_secs(1)) {
-            Ok(Message::Flush(done)) => {
-                let flushed = out.flush();
+/// What the terminal's own thread has.
+struct Writer<W> {
+    out: W,
+    live: bool,
+    screen: Screen,
+    pending: Arc<AtomicU64>,
+    heard: Arc<Mutex<String>>,
+}
+
+impl<W: Write> Writer<W> {
+    fn serve(&mut self, messages: &Receiver<Message>, dropped: &AtomicU64) {
+        loop {
+            let written = match messages.recv_timeout(Duration::from_secs(1)) {
+                Ok(message) => self.write(message),
+                Err(RecvTimeoutError::Timeout) => Ok(()),
+                Err(RecvTimeoutError::Disconnected) => return,
+            };
+            // A terminal that is gone for good: what comes is dropped and counted.
+            if written.is_err_and(|error| error.kind() == io::ErrorKind::BrokenPipe) {
+                return;
+            }
+            let lost = dropped.swap(0, Ordering::Relaxed);
+            if lost > 0 {
+                let _ = self.say(&format!(
+                    "({lost} messages found the terminal not taking output)"
+                ));
+            }
+        }
+    }
+
+    fn write(&mut self, message: Message) -> io::Result<()> {
+        match message {
+            Message::Flush(done) => {
+                let flushed = self.out.flush();
                 let _ = done.try_send(());
                 flushed
             }
-            Ok(Message::Say(text)) => {
-                let end = if std::mem::take(&mut live) {
-                    "\r\x1b[K"
-                } else {
-                    ""
-                };
-                let text = text.strip_suffix('\n').unwrap_or(&text);
-                writeln!(out, "{end}{}", clean(text, Colours::Kept)).and_then(|()| out.flush())
+            Message::Say(text) => self.say(&text),
+            Message::Show(_) | Message::Leave if self.screen.is_open() => Ok(()),
+            Message::Show(line) => {
+                self.live = !line.is_empty();
+                let line = clean(&line, Colours::Kept);
+                write!(self.out, "\r\x1b[K{line}").and_then(|()| self.out.flush())
             }
-            Ok(Message::Show(line)) => {
-                live = !line.is_empty();
-                write!(out, "\r\x1b[K{}", clean(&line, Colours::Kept)).and_then(|()| out.flush())
+            Message::Leave if std::mem::take(&mut self.live) => {
+                writeln!(self.out).and_then(|()| self.out.flush())
             }
-            Ok(Message::Leave) if std::mem::take(&mut live) => {
-                writeln!(out).and_then(|()| out.flush())
+            Message::Leave => Ok(()),
+            Message::Open => self.screen.open(&mut self.out),
+            Message::Draw(picture) => {
+                let drawn = self.screen.draw(&mut self.out, &picture);
+                self.pending.fetch_sub(1, Ordering::AcqRel);
+                drawn
             }
-            Ok(Message::Leave) | Err(RecvTimeoutError::Timeout) => Ok(()),
-            Err(RecvTimeoutError::Disconnected) => return,
+            Message::Close => {
+                let kept = self.screen.close(&mut self.out)?;
+                kept.iter().try_for_each(|text| self.say(text))
+            }
+        }
+    }
+
+    fn say(&mut self, text: &str) -> io::Result<()> {
+        let text = text.strip_suffix('\n').unwrap_or(text);
+        if self.screen.is_open() {
+            let mut heard = self.heard.lock().unwrap_or_else(PoisonError::into_inner);
+            *heard = clean(text.trim(), Colours::Removed).replace('\n', " ");
+            self.screen.keep(text);
+            return Ok(());
+        }
+        let end = if std::mem::take(&mut self.live) {
+            "\r\x1b[K"
+        } else {
+            ""
         };
-        // A terminal that is gone for good: what comes is dropped and counted.
-        if written.is_err_and(|error| error.kind() == io::ErrorKind::BrokenPipe) {
-            return;
-        }
-        let lost = dropped.swap(0, Ordering::Relaxed);
-        if lost > 0 {
-            let _ = writeln!(
-                out,
-                "({lost} messages found the terminal not taking output)"
-            );
-        }
+        let text = clean(text, Colours::Kept);
+        writeln!(self.out, "{end}{text}").and_then(|()| self.out.flush())
     }
 }
 
@@ -227,7 +347,7 @@ fn colour_length(text: &str) -> Option<usize> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use std::sync::{Condvar, Mutex};
+    use std::sync::Condvar;
 
     /// A terminal that takes output only while it is let.
     #[derive(Clone, Default)]
@@ -285,6 +405,53 @@ mod tests {
         assert!(text.contains("messages found the terminal not taking output"));
         assert!(text.ends_with("the end\n"), "{text:?}");
         assert_eq!(terminal.dropped(), 0);
+    }
+
+    #[test]
+    fn what_is_said_while_the_whole_terminal_is_taken_is_told_when_it_is_given_back() {
+        let screen = Screen::default();
+        screen.go_on();
+        let terminal = Terminal::new(screen.clone());
+        terminal.say("before");
+        terminal.open_screen();
+        terminal.show("no live line");
+        terminal.say("\x1b[31man event\x1b[0m");
+        assert!(terminal.draw("\x1b[1;1Hpicture".to_string()));
+        assert!(terminal.flush(Duration::from_secs(20)));
+        assert!(terminal.can_draw());
+        assert!(terminal.heard().ends_with("an event\u{fffd}[0m"));
+        let text = screen.text();
+        assert!(
+            text.contains("picture") && !text.contains("an event"),
+            "{text:?}"
+        );
+        terminal.close_screen(Duration::from_secs(20));
+        assert!(!terminal.draw("too late".to_string()) || terminal.flush(Duration::from_secs(20)));
+        let text = screen.text();
+        assert!(
+            !text.contains("live line") && !text.contains("too late"),
+            "{text:?}"
+        );
+        let (taken, given) = (text.find("\x1b[?1049h"), text.find("\x1b[?1049l"));
+        let told = text.find("an event");
+        assert!(taken < given && given < told && told.is_some(), "{text:?}");
+    }
+
+    #[test]
+    fn a_terminal_that_takes_no_output_gets_one_picture_and_is_not_waited_for() {
+        let screen = Screen::default();
+        let terminal = Terminal::new(screen.clone());
+        terminal.open_screen();
+        let drawn = (0..1000).filter(|_| terminal.can_draw() && terminal.draw("p".repeat(5000)));
+        assert_eq!(drawn.count(), 1);
+        terminal.close_screen(Duration::from_millis(1));
+        screen.go_on();
+        while !terminal.flush(Duration::from_secs(1)) {}
+        assert!(
+            screen.text().ends_with("\x1b[?1049l"),
+            "{:?}",
+            screen.text()
+        );
     }
 
     #[test]

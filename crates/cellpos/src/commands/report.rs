@@ -1,5 +1,6 @@
 //! `cellpos report`: what a run did, on one page.
 
+mod clips;
 mod cycles;
 mod envelope;
 mod fatigue;
@@ -95,6 +96,7 @@ pub fn run(args: Args) -> CommandResult {
     learned(&mut page, &args.run)?;
     timing(&mut page, &sessions, &ticks);
     fault::section(&mut page, &sessions)?;
+    clips::section(&mut page, &sessions);
     events(&mut page, &sessions);
     provenance(&mut page, &sessions);
     let out = args.out.unwrap_or_else(|| args.run.join("report.html"));

@@ -21,9 +21,10 @@ use cellpos_script::{
     AmplitudeWatch, Check, CheckLimits, CycleRow, CycleTable, Plan, Script, check,
 };
 use cellpos_session::clips::Clipped;
+use cellpos_session::live_line::Typed;
 use cellpos_session::rig_file::{ActuatorConfig, CameraConfig, ClockKind, Frames, RigFile};
 use cellpos_session::setup::{Prepared, ReferenceSpec, Setup};
-use cellpos_session::view::{Page, Viewed};
+use cellpos_session::view::{Page, View, Viewed};
 use cellpos_session::{Finished, Options, Rig, connect};
 use cellpos_units::Micrometers;
 use learning::Keeper;
@@ -296,7 +297,10 @@ fn start(args: &Args, ready: Ready) -> CommandResult {
         let faults = &rig.file().emulator.faults;
         core = core.with_late_solver(faults.spans_ns(FaultKind::SlowSolver));
     }
-    let mut view = args.view.open(&mut rig, &setup, &page(&name, &script))?;
+    let shown = page(&name, &script);
+    let typed = Typed::default();
+    let mut view = (args.view).open(&mut rig, &setup, &shown, keys::OF_A_SCRIPT, &typed)?;
+    view.iter().for_each(|view| view.recorded_in(&session));
     let wishes = script.clips.clone().unwrap_or_default();
     let clips = clips::of(&mut rig, &session, &wishes)?;
     let schedule = clips::schedule(&plan, &wishes);
@@ -307,6 +311,7 @@ fn start(args: &Args, ready: Ready) -> CommandResult {
     let armed = match rig.arm(&setup, core, sink, EndRule::default()) {
         Ok(armed) => armed,
         Err(not_armed) => {
+            drop(view);
             connect::not_armed(
                 not_armed.sink.into_sink().into_parts().0.close().0,
                 &not_armed.failure,
@@ -316,7 +321,7 @@ fn start(args: &Args, ready: Ready) -> CommandResult {
     };
     let finished = armed.start()?.wait()?;
     drop(keys);
-    conclude(args, &setup, &plan, &folder, warnings, finished)
+    conclude(args, &setup, &plan, &folder, warnings, (finished, view))
 }
 
 fn page(name: &str, script: &Script) -> Page {
@@ -325,6 +330,7 @@ fn page(name: &str, script: &Script) -> Page {
         subtitle: format!("run: {}", script.file),
         steered: false,
         script: true,
+        notes: true,
     }
 }
 
@@ -401,7 +407,7 @@ fn conclude(
     plan: &Plan,
     folder: &Path,
     mut warnings: Vec<String>,
-    finished: Finished<Viewed<Clipped<ScriptSink>>>,
+    (finished, view): (Finished<Viewed<Clipped<ScriptSink>>>, Option<View>),
 ) -> CommandResult {
     warnings.extend(connect::warnings(&finished));
     let Finished {
@@ -414,6 +420,8 @@ fn conclude(
         ..
     } = finished;
     let (sink, kept_clips) = sink.into_inner(&summary, &ended.seen).into_parts();
+    // The terminal is given back, and the page is over, before anything is said.
+    drop(view);
     warnings.extend(clips::warnings(kept_clips));
     let script = sink.end();
     let outcome = match (ended.as_asked(), script.complete()) {

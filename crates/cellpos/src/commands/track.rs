@@ -17,7 +17,7 @@ use cellpos_session::live_line::{LiveLine, Typed};
 use cellpos_session::recording::Recording;
 use cellpos_session::rig_file::{ClockKind, Frames, RigFile};
 use cellpos_session::setup::{Prepared, ReferenceSpec, Setup};
-use cellpos_session::view::{Page, Viewed};
+use cellpos_session::view::{Page, View, Viewed};
 use cellpos_session::{EndKind, Ended, Finished, Options, Rig, connect};
 use cellpos_units::{Micrometers, Seconds};
 use serde::Serialize;
@@ -148,28 +148,33 @@ pub fn run(args: Args) -> CommandResult {
     let mut setup = rig.set_up(prepared, reference(&args))?;
     setup.config.learn = learn;
     let (typed, steered) = (Typed::default(), args.sine.is_none());
+    let help = if steered {
+        keys::OF_A_HOLD
+    } else {
+        keys::OF_A_MOTION
+    };
     let line = LiveLine {
         low_um: limits.low_um,
         high_um: limits.high_um,
-        keys: if steered {
-            keys::OF_A_HOLD
-        } else {
-            keys::OF_A_MOTION
-        },
+        keys: help,
         typed: typed.clone(),
     };
     let recording = Recording::new(
         writer(&args, &rig, &setup)?,
-        (!args.json && !crate::output::settings().quiet).then_some(line),
+        (!args.json && !args.view.tui() && !crate::output::settings().quiet).then_some(line),
     );
     let end = EndRule {
         ticks,
         ..EndRule::default()
     };
     let core = setup.core()?;
-    let mut view = args.view.open(&mut rig, &setup, &page(&args))?;
+    let shown = page(&args);
+    let mut view = (args.view).open(&mut rig, &setup, &shown, help, &typed)?;
     let clips = match recording.folder() {
-        Some(folder) => clips::of(&mut rig, &folder, &ClipWishes::default())?,
+        Some(folder) => {
+            view.iter().for_each(|view| view.recorded_in(&folder));
+            clips::of(&mut rig, &folder, &ClipWishes::default())?
+        }
         None => None,
     };
     let sink = Clipped::new(recording, clips, vec![], true);
@@ -185,8 +190,12 @@ pub fn run(args: Args) -> CommandResult {
         ))
     });
     match rig.arm(&setup, core, sink, end) {
-        Ok(armed) => conclude(&args, &setup, armed.start()?.wait()?),
+        Ok(armed) => {
+            let finished = armed.start()?.wait()?;
+            conclude(&args, &setup, finished, view)
+        }
         Err(not_armed) => {
+            drop(view);
             if let Some(writer) = not_armed.sink.into_sink().into_parts().0.into_writer() {
                 connect::not_armed(writer, &not_armed.failure);
             }
@@ -211,6 +220,7 @@ fn page(args: &Args) -> Page {
         subtitle: format!("track: {motion}, {}, {rig}", args.controller),
         steered: args.sine.is_none(),
         script: false,
+        notes: !args.no_record,
     }
 }
 
@@ -302,6 +312,7 @@ fn conclude(
     args: &Args,
     setup: &Setup,
     finished: Finished<Viewed<Clipped<Recording>>>,
+    view: Option<View>,
 ) -> CommandResult {
     let mut warnings = connect::warnings(&finished);
     let Finished {
@@ -322,6 +333,8 @@ fn conclude(
         summary.state.name()
     };
     let (sink, kept_clips) = sink.into_inner(&summary, &ended.seen).into_parts();
+    // The terminal is given back, and the page is over, before anything is said.
+    drop(view);
     warnings.extend(clips::warnings(kept_clips));
     let kept = sink
         .into_writer()

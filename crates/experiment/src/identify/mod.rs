@@ -10,6 +10,7 @@ use cellpos_ident::frequency_response::Settings;
 use cellpos_ident::summary::{Identification, summarise};
 use cellpos_plant::Hertz;
 use cellpos_session::Failure;
+use cellpos_session::view::Pages;
 use held_bead::{DelayTest, HeldBead, Setup};
 use std::path::PathBuf;
 
@@ -69,7 +70,16 @@ pub struct Done {
 }
 
 /// Runs a job; `progress` hears ticks done and ticks in all.
-pub fn run(job: &Job, mut progress: impl FnMut(usize, usize) + Send) -> Result<Done, Failure> {
+pub fn run(job: &Job, progress: impl FnMut(usize, usize) + Send) -> Result<Done, Failure> {
+    run_shown(job, progress, None)
+}
+
+/// The same; on a rig it is shown on the live page that `pages` wants.
+pub fn run_shown(
+    job: &Job,
+    mut progress: impl FnMut(usize, usize) + Send,
+    pages: Option<&mut Pages>,
+) -> Result<Done, Failure> {
     let plan = plan(job)?;
     let total = plan.ticks() + job.led_edges * 11;
     let records = match &job.resume {
@@ -85,7 +95,7 @@ pub fn run(job: &Job, mut progress: impl FnMut(usize, usize) + Send) -> Result<D
         path_s,
         fix_noise_um,
     } = match &job.rig {
-        Some(rig) => on_rig(job, rig, &plan, records, &mut heard)?,
+        Some(rig) => on_rig(job, rig, &plan, records, &mut heard, pages)?,
         None => held_bead(job, &plan, records, &mut heard)?,
     };
     let measured = plan
@@ -180,6 +190,7 @@ fn on_rig(
     plan: &Plan,
     mut records: Vec<RecordedSegment>,
     progress: &mut (dyn FnMut(usize) + Send),
+    mut pages: Option<&mut Pages>,
 ) -> Result<Raw, Failure> {
     const ATTEMPTS: usize = 4;
     let (mut neutral_um, mut wait_s, mut path_s) = (rig.file.first_neutral_um, 0.0, None);
@@ -201,7 +212,7 @@ fn on_rig(
             progress: &mut *progress,
             segment: &mut segment,
         };
-        let acquired = rig.acquire(plan, &todo, &mut listener)?;
+        let acquired = rig.acquire_shown(plan, &todo, &mut listener, pages.as_deref_mut())?;
         records = joined(&records, &acquired.records);
         (neutral_um, wait_s) = (acquired.neutral_um, acquired.wait_s);
         path_s = Some(acquired.path_s);
@@ -209,10 +220,21 @@ fn on_rig(
         match acquired.trouble {
             None => {}
             Some(Trouble::Spoilt { .. }) if attempt < ATTEMPTS => {
-                tracing::warn!("a lost bead spoilt segments; measuring again what is missing");
+                tracing::warn!(
+                    "a lost bead or a freeze spoilt segments; measuring again what is missing"
+                );
             }
-            Some(trouble) => return Err(stopped(job, plan, &records, &trouble)?),
+            Some(trouble) => {
+                let (done, of) = (records.len(), plan.segments.len());
+                if let Some(pages) = pages {
+                    pages.over(&format!("{trouble}; {done} of {of} segments are measured."));
+                }
+                return Err(stopped(job, plan, &records, &trouble)?);
+            }
         }
+    }
+    if let Some(pages) = pages {
+        pages.over("all segments are measured, and the model is being fitted.");
     }
     let led = match (job.led_edges, rig.file.is_emulated()) {
         (0, _) => None,

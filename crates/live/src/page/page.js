@@ -4,12 +4,13 @@ import { Rows, Wire } from "/wire.js";
 import { Traces } from "/trace.js";
 import { Lateness, drawCycles, drawSpectrum } from "/spectrum.js";
 import { PictureView, drawGauge } from "/picture.js";
+import { Clips } from "/clips.js";
 
 const LONGEST_S = 600, MOST_ROWS = 1_200_000, MOST_EVENTS = 500, MOST_CYCLES = 20_000;
 const $ = id => document.getElementById(id);
 let hello = null, operator = false, rows = new Rows(1024), traces = new Traces($("traces"), rows), lateness = new Lateness();
 let state = null, cycles = [], held = null, mark = null, armedTrigger = null, checked = 0, unheard = null;
-const picture = new PictureView($("picture"));
+const picture = new PictureView($("picture")), clips = new Clips($);
 
 const theme = localStorage.getItem("theme");
 if (theme) document.documentElement.dataset.theme = theme;
@@ -33,7 +34,11 @@ function begin(told) {
   for (const id of ["freeze", "resume", "park"]) $(id).hidden = hello.recorded;
   for (const id of ["freeze", "resume", "park", "pause", "skip"]) $(id).disabled = !operator;
   for (const input of document.querySelectorAll("#target-form *, #note-form *")) input.disabled = !operator || hello.recorded;
-  $("target-card").hidden = !hello.steered; $("script-card").hidden = !hello.script;
+  $("target-card").hidden = !hello.steered; $("script-card").hidden = !hello.script; $("note-card").hidden = !hello.notes;
+  for (const id of ["pause", "skip", "cycles", "cycles-text"]) $(id).hidden = !hello.script || (hello.recorded && !id.startsWith("cycles"));
+  $("script-title").textContent = hello.script ? "Script" : "Measurement";
+  $("target-label").textContent = hello.by_hand ? "displacement of the PZT, um" : "position, um";
+  if (hello.by_hand) document.body.dataset.hand = ""; else delete document.body.dataset.hand;
   $("picture-card").hidden = !hello.pictures;
 }
 
@@ -60,10 +65,13 @@ function show(told) {
     $(`f-${id}`).textContent = value; $(`f-${id}`).parentElement.classList.toggle("bad", wrong && value > 0);
   }
   const parts = [];
+  if (state.doing) { parts.push(`${state.doing}.`); $("script-card").hidden = false; }
   if (state.cycle) parts.push(`Cycle ${state.cycle[0]} of ${state.cycle[1]}.`);
   if (state.next) parts.push(`Next: ${state.next}.`);
   if (state.left_s !== null) parts.push(`${clock(state.left_s)} left.`);
   $("script-text").textContent = parts.join(" ");
+  $("lateness-text").textContent = state.wake_us === null ? ""
+    : `99.9 % of all ticks: wake-up within ${state.wake_us.toFixed(0)} us, computing within ${state.compute_us.toFixed(0)} us.`;
 }
 
 function clock(seconds) {
@@ -94,6 +102,7 @@ const told = message => {
     cycles.push(...message.cycles.filter(c => c.cycle > known));
     cycles.splice(0, Math.max(0, cycles.length - MOST_CYCLES));
   }
+  if (message.clips) clips.add(message.clips);
   if (message.unshown !== undefined) { unheard = message.unshown; }
   if (message.refused !== undefined) answer(message.refused);
   if (message.done) answer("Done.");
@@ -106,7 +115,7 @@ const wire = new Wire({
   rows: view => { rows.take(view); },
   picture: shown => {
     picture.show(shown);
-    $("picture-text").textContent = isFinite(shown.centre[0]) ? (operator && hello?.steered ? "Click to set the target." : "") : "Nothing is followed in this picture.";
+    $("picture-text").textContent = isFinite(shown.centre[0]) ? (operator && hello?.steered && !hello.by_hand ? "Click to set the target." : "") : "Nothing is followed in this picture.";
   },
   closed: () => {
     if (state?.banner.state === "over") return;
@@ -121,9 +130,9 @@ for (const id of ["freeze", "resume", "park", "pause", "skip"]) $(id).onclick = 
 const setTarget = um => { if (isFinite(um)) ask({ do: "target", um }); else answer("A target is a number in um, for example -2.5."); };
 $("target-form").onsubmit = event => { event.preventDefault(); setTarget(parseFloat($("target").value.replace(",", "."))); };
 for (const button of document.querySelectorAll(".step")) {
-  button.onclick = () => { if (rows.count) setTarget(+(rows.target[rows.at(rows.count - 1)] + +button.dataset.um).toFixed(6)); };
+  button.onclick = () => { if (rows.count) setTarget(+((hello.by_hand ? rows.command : rows.target)[rows.at(rows.count - 1)] + +button.dataset.um).toFixed(6)); };
 }
-$("picture").onclick = event => { if (operator && hello?.steered) setTarget(+picture.umAt(event).toFixed(3)); };
+$("picture").onclick = event => { if (operator && hello?.steered && !hello.by_hand) setTarget(+picture.umAt(event).toFixed(3)); };
 $("note-form").onsubmit = event => { event.preventDefault(); ask({ do: "note", text: $("note").value }); $("note").value = ""; };
 
 // What is seen: time base, hold, trigger, cursor, export
@@ -195,7 +204,8 @@ function draw(now) {
     const k = rows.at(rows.count - 1);
     picture.target = rows.target[k];
     drawGauge($("gauge"), hello.range_um, rows.command[k], rows.zeroFlow[k]);
-    $("gauge-text").textContent = `PZT ${rows.command[k].toFixed(3)} um, at rest at ${rows.zeroFlow[k].toFixed(3)} um`;
+    $("gauge-text").textContent = `PZT ${rows.command[k].toFixed(3)} um`
+      + (isFinite(rows.zeroFlow[k]) ? `, at rest at ${rows.zeroFlow[k].toFixed(3)} um` : "");
   }
   lateness.take(rows);
   if (now - slow < 500) return;

@@ -53,6 +53,7 @@ export class PictureView {
     }
     // A scale bar of a round length, about a quarter of the picture.
     const span = Math.abs(umPerPx) * (upright ? height : width);
+    if (!(span > 0)) return; // nothing is calibrated
     const power = 10 ** Math.floor(Math.log10(span / 4));
     const bar = [1, 2, 5, 10].map(n => n * power).filter(n => n <= span / 3).pop() ?? power;
     const length = bar / Math.abs(umPerPx) * scale, x = 8 * (window.devicePixelRatio || 1), y = canvas.height - x;

@@ -3,6 +3,7 @@
 const ROW_BYTES = 56;
 const PICTURE_HEAD = 40;
 const word = new URLSearchParams(location.search).get("word") ?? "";
+export const wordOfLink = word;
 
 // Columns of typed arrays in which the newest rows overwrite the oldest; nothing grows while a run goes on.
 export class Rows {

@@ -8,14 +8,19 @@
 //! The camera thread copies each frame into a buffer that exists already; where none is empty the frame is left out and counted.
 //! Everything slow happens on the clip thread.
 
+mod film;
 mod moment;
 mod ring;
 mod sink;
 mod tiff_stack;
 
+pub use cellpos_live::FilmFrame;
+pub use film::{Film, list, read};
 pub use sink::{Clipped, Schedule};
 
+use crate::crop::{self, Crop};
 use crate::failure::Failure;
+use cellpos_live::ClipLine;
 use cellpos_rig::{FrameWatch, SeenFrame};
 use cellpos_vision::Pixels;
 use moment::Moment;
@@ -28,8 +33,6 @@ use std::sync::mpsc::{Receiver, Sender, channel};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
-/// Largest crop, px.
-const CROP: (usize, usize) = (384, 288);
 /// Memory of the buffers at most, bytes.
 const MOST_MEMORY: usize = 256 << 20;
 /// From a frame until the clip thread hears of what happened in it, s: the recorder looks some ten times a second.
@@ -74,6 +77,7 @@ pub struct ClipReport {
 /// The clips of a run; dropping it ends its thread.
 pub struct Clips {
     moments: Option<Sender<Moment>>,
+    kept: Receiver<ClipLine>,
     left_out: Arc<AtomicU64>,
     stop: Arc<AtomicBool>,
     thread: Option<JoinHandle<ClipReport>>,
@@ -90,7 +94,7 @@ impl Clips {
         (width_px, height_px): (usize, usize),
         rate_hz: f64,
     ) -> Result<(Self, Box<dyn FrameWatch>), Failure> {
-        let crop = (width_px.min(CROP.0), height_px.min(CROP.1));
+        let crop = (width_px.min(crop::MOST.0), height_px.min(crop::MOST.1));
         let pixels = (crop.0 * crop.1).max(1);
         let wanted = (config.before_s + config.after_s + HEARD_AFTER_S) * rate_hz;
         // Two bytes a pixel, whatever the camera sends.
@@ -104,11 +108,13 @@ impl Clips {
         let left_out = Arc::new(AtomicU64::new(0));
         let stop = Arc::new(AtomicBool::new(false));
         let (moments, heard) = channel();
+        let (told, kept) = channel();
         let keeper = Keeper {
             ring: Ring::new(config.before_s, config.after_s, count),
             full: full_out,
             empty,
             heard,
+            told,
             folder: folder.join(CLIPS),
             room: config.most_bytes,
             report: ClipReport::default(),
@@ -128,11 +134,17 @@ impl Clips {
         };
         let clips = Self {
             moments: Some(moments),
+            kept,
             left_out,
             stop,
             thread: Some(thread),
         };
         Ok((clips, Box::new(taker)))
+    }
+
+    /// The next clip that was written since.
+    pub fn next_kept(&self) -> Option<ClipLine> {
+        self.kept.try_recv().ok()
     }
 
     /// Ends the thread when what it has heard of is written, and says what became of the clips.
@@ -177,29 +189,12 @@ impl FrameWatch for Taker {
     }
 }
 
-/// Where a crop of `most` px lies in `size` px so that it holds `place`.
-fn start(size: usize, most: usize, place: f64) -> usize {
-    let wanted = if place.is_finite() {
-        place as usize
-    } else {
-        size / 2
-    };
-    wanted
-        .saturating_sub(most / 2)
-        .min(size.saturating_sub(most))
-}
-
-fn fill(seen: &SeenFrame<'_>, crop: (usize, usize), shot: &mut Shot) {
-    let frame = &seen.frame;
-    let (width, height) = (crop.0.min(frame.width), crop.1.min(frame.height));
-    let about = seen.centre_px.unwrap_or(seen.expected_px);
-    let left = start(frame.width, width, about.0);
-    let top = start(frame.height, height, about.1);
+fn fill(seen: &SeenFrame<'_>, most: (usize, usize), shot: &mut Shot) {
+    let crop = Crop::about(seen, most, usize::MAX);
     shot.pixels.clear();
-    shot.deep = matches!(frame.pixels, Pixels::Mono16(_));
-    for row in top..top + height {
-        let span = row * frame.width + left..row * frame.width + left + width;
-        match frame.pixels {
+    shot.deep = matches!(seen.frame.pixels, Pixels::Mono16(_));
+    for span in crop.rows() {
+        match seen.frame.pixels {
             Pixels::Mono8(pixels) => {
                 let row = pixels.get(span).unwrap_or(&[]);
                 shot.pixels.extend(row.iter().map(|v| u16::from(*v)));
@@ -210,12 +205,11 @@ fn fill(seen: &SeenFrame<'_>, crop: (usize, usize), shot: &mut Shot) {
             }
         }
     }
-    (shot.width, shot.height) = (width, height);
+    (shot.width, shot.height) = crop.size;
     (shot.id, shot.stamp_ns) = (seen.stamp.id, seen.stamp.mid_exposure_ns);
-    shot.origin_px = (left, top);
-    shot.centre_px = seen.centre_px.map_or((f64::NAN, f64::NAN), |(x, y)| {
-        (x - left as f64, y - top as f64)
-    });
+    shot.origin_px = crop.origin;
+    let centre = seen.centre_px.map(|centre| crop.place(centre));
+    shot.centre_px = centre.unwrap_or((f64::NAN, f64::NAN));
 }
 
 /// On the clip thread: keeps the last seconds, and writes.
@@ -224,6 +218,7 @@ struct Keeper {
     full: Consumer<Shot>,
     empty: Producer<Shot>,
     heard: Receiver<Moment>,
+    told: Sender<ClipLine>,
     folder: PathBuf,
     room: u64,
     report: ClipReport,
@@ -262,8 +257,17 @@ impl Keeper {
             self.report.no_room += 1;
             return;
         }
-        match tiff_stack::write(&self.folder, moment, &shots, self.ring.offset_ns(moment)) {
+        let offset_ns = self.ring.offset_ns(moment);
+        match tiff_stack::write(&self.folder, moment, &shots, offset_ns) {
             Ok(()) => {
+                // Nobody who hears of it: no page is open.
+                let _ = self.told.send(ClipLine {
+                    name: moment.name.clone(),
+                    time_s: shots
+                        .first()
+                        .map_or(f64::NAN, |shot| shot.time_s(offset_ns)),
+                    frames: shots.len() as u64,
+                });
                 self.room -= bytes;
                 self.report
                     .written

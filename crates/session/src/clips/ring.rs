@@ -27,6 +27,11 @@ impl Shot {
             ..Self::default()
         }
     }
+
+    /// When it was exposed, s of the run, which began `offset_ns` by the rig's clock.
+    pub(super) fn time_s(&self, offset_ns: i64) -> f64 {
+        (self.stamp_ns - offset_ns) as f64 * 1e-9
+    }
 }
 
 /// Frames in the order of their exposure, and moments that are not over.

@@ -2,7 +2,7 @@
 
 use super::Clips;
 use super::moment::Moment;
-use crate::view::{CycleRow, EventLine, Shown, State};
+use crate::view::{ClipLine, CycleRow, EventLine, Shown, State};
 use cellpos_control::LearnerState;
 use cellpos_runtime::life::EventKind;
 use cellpos_runtime::recorder::Unconfirmed;
@@ -133,5 +133,9 @@ impl<S: Shown> Shown for Clipped<S> {
 
     fn next_line(&mut self) -> Option<EventLine> {
         self.sink.next_line()
+    }
+
+    fn next_clip(&mut self) -> Option<ClipLine> {
+        self.clips.as_ref().and_then(Clips::next_kept)
     }
 }

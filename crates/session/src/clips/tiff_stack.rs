@@ -39,7 +39,7 @@ pub(super) fn write(
         let _ = writeln!(
             times,
             "{number},{:.9},{},{},{},{},{}",
-            (shot.stamp_ns - offset_ns) as f64 * 1e-9,
+            shot.time_s(offset_ns),
             shot.id,
             shot.origin_px.0,
             shot.origin_px.1,
@@ -47,7 +47,10 @@ pub(super) fn write(
             number_or_nothing(shot.centre_px.1),
         );
     }
-    std::fs::write(path("csv"), times)
+    // Whoever finds the table finds both whole.
+    let unfinished = path("csv.part");
+    std::fs::write(&unfinished, times)?;
+    std::fs::rename(unfinished, path("csv"))
 }
 
 fn page(pages: &mut TiffEncoder<BufWriter<File>>, shot: &Shot) -> tiff::TiffResult<()> {

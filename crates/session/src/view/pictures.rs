@@ -1,13 +1,24 @@
 //! What the live page shows of the camera's frames.
 
+use crate::crop::{self, Crop};
 use cellpos_live::{Picture, PictureFeed};
 use cellpos_rig::{FrameWatch, SeenFrame};
 use cellpos_vision::Pixels;
+use std::sync::mpsc::Sender;
+
+/// How a crop moves with the bead: with every pixel it would hide the bead's motion.
+const STEPS: usize = 8;
 
 /// Crops frames for the page.
 pub(super) struct Pictures {
     feed: PictureFeed,
     first_ns: Option<i64>,
+}
+
+/// [`Pictures`] while a run's camera has them; they come back when its watch is dropped.
+struct Lent {
+    pictures: Option<Pictures>,
+    back: Sender<Pictures>,
 }
 
 impl Pictures {
@@ -17,13 +28,16 @@ impl Pictures {
             first_ns: None,
         }
     }
-}
 
-/// Largest crop, px.
-const CROP: (usize, usize) = (384, 288);
+    /// For the camera of a run; `back` gets them when the run is over.
+    pub(super) fn lend(self, back: &Sender<Pictures>) -> Box<dyn FrameWatch> {
+        Box::new(Lent {
+            pictures: Some(self),
+            back: back.clone(),
+        })
+    }
 
-impl FrameWatch for Pictures {
-    fn frame(&mut self, seen: &SeenFrame<'_>) {
+    fn show(&mut self, seen: &SeenFrame<'_>) {
         let at_ns = seen.stamp.mid_exposure_ns;
         let time_s = (at_ns - *self.first_ns.get_or_insert(at_ns)) as f64 * 1e-9;
         if self.feed.is_due(time_s) {
@@ -32,41 +46,49 @@ impl FrameWatch for Pictures {
     }
 }
 
+impl FrameWatch for Lent {
+    fn frame(&mut self, seen: &SeenFrame<'_>) {
+        if let Some(pictures) = &mut self.pictures {
+            pictures.show(seen);
+        }
+    }
+}
+
+impl Drop for Lent {
+    fn drop(&mut self) {
+        if let Some(pictures) = self.pictures.take() {
+            // Without anybody to take them the page is over.
+            let _ = self.back.send(pictures);
+        }
+    }
+}
+
 /// The part of a frame about what is followed, in 8 bits.
 fn crop(seen: &SeenFrame<'_>, picture: &mut Picture) {
-    let frame = &seen.frame;
-    let about = seen.centre_px.unwrap_or(seen.expected_px);
-    // A step of the crop with the bead would hide its motion: it moves in steps of an eighth.
-    let start = |size: usize, most: usize, place: f64| {
-        let step = (most / 8).max(1);
-        let wanted = if place.is_finite() {
-            place as usize
-        } else {
-            size / 2
-        };
-        let start = wanted.saturating_sub(most / 2) / step * step;
-        (start.min(size.saturating_sub(most)), size.min(most))
-    };
-    let (left, width) = start(frame.width, CROP.0, about.0);
-    let (top, height) = start(frame.height, CROP.1, about.1);
+    let crop = Crop::about(seen, crop::MOST, STEPS);
     let shift = seen.bits.saturating_sub(8);
-    for row in top..top + height {
-        let span = row * frame.width + left..row * frame.width + left + width;
-        match frame.pixels {
+    for span in crop.rows() {
+        match seen.frame.pixels {
             Pixels::Mono8(pixels) => picture.pixels.extend_from_slice(&pixels[span]),
             Pixels::Mono16(pixels) => picture
                 .pixels
                 .extend(pixels[span].iter().map(|v| (v >> shift).min(255) as u8)),
         }
     }
-    (picture.width, picture.height) = (width as u16, height as u16);
+    (picture.width, picture.height) = (crop.size.0 as u16, crop.size.1 as u16);
     let scale = seen.scale;
-    let along = if scale.upright { top } else { left };
+    let along = if scale.upright {
+        crop.origin.1
+    } else {
+        crop.origin.0
+    };
     picture.um_per_px = scale.um_per_px as f32;
     picture.upright = scale.upright;
     picture.first_um = (scale.first_um + scale.um_per_px * along as f64) as f32;
-    let place = |(x, y): (f64, f64)| [(x - left as f64) as f32, (y - top as f64) as f32];
-    picture.centre_px = seen.centre_px.map_or([f32::NAN; 2], place);
+    picture.centre_px = seen.centre_px.map_or([f32::NAN; 2], |centre| {
+        let (x, y) = crop.place(centre);
+        [x as f32, y as f32]
+    });
     picture.half_px = [seen.half_px.0 as f32, seen.half_px.1 as f32];
     picture.gate_px = if seen.expected_sd_px.is_finite() {
         (4.0 * seen.expected_sd_px) as f32

@@ -1,15 +1,20 @@
 //! The page of a run that is read in its folder: one that goes on in another process, or one that is over.
 
+use super::cycle::cycle_row;
+use super::hello::{Page, hello_of};
+use super::live_view::{ViewAddress, config, film_of};
 use super::watcher::Watcher;
-use super::{CycleRow, EventLine, Page, ViewAddress, hello_of};
+use crate::clips;
 use crate::failure::Failure;
 use crate::recorded;
-use cellpos_live::{Banner, Feed, Server, ServerConfig};
+use cellpos_live::{Banner, EventLine, Feed, Server};
 use cellpos_record::{CYCLES_CSV, Event, Follow, RunEnd, Sessions};
 use cellpos_runtime::{Statistics, TickRecord};
-use cellpos_script::read_cycles;
-use std::collections::VecDeque;
+use cellpos_script::{CycleRow, read_cycles};
+use std::collections::{BTreeSet, VecDeque};
+use std::io::{Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 /// Rows handed to the page at once: half of what its ring holds.
@@ -18,8 +23,10 @@ const ROWS_AT_ONCE: usize = 4096;
 const HELD_S: f64 = 600.0;
 /// A run without an end to which nothing was added for this long has lost its program, or its disk.
 const SILENT_AFTER: Duration = Duration::from_secs(5);
-/// Longest table of cycles that is read.
-const MOST_TABLE: u64 = 1 << 30;
+/// Most of the table of cycles that is read at once, bytes.
+const MOST_TABLE: u64 = 16 << 20;
+/// How often the folder of clips is looked into.
+const CLIPS_EVERY: Duration = Duration::from_secs(1);
 
 /// A page that shows a run folder. Nothing is asked of the program that writes it, and nothing can be asked through the page.
 pub struct Watch {
@@ -32,7 +39,9 @@ pub struct Watch {
     most_waiting: usize,
     last: Option<TickRecord>,
     changed: Instant,
-    cycles: (u64, usize),
+    cycles: CyclesRead,
+    session: PathBuf,
+    clips: (Option<Instant>, BTreeSet<String>),
     over: bool,
 }
 
@@ -44,6 +53,7 @@ impl Watch {
     pub fn open(folder: &Path, at: ViewAddress) -> Result<Self, Failure> {
         let sessions = Sessions::of(folder).map_err(Failure::input)?;
         let newest = sessions.readers.last().map_or(folder, |(_, r)| r.folder());
+        let session = newest.to_owned();
         let follow = Follow::open(newest).map_err(Failure::input)?;
         let setup = recorded::setup(follow.reader())?;
         let meta = follow.reader().meta().ok();
@@ -55,22 +65,20 @@ impl Watch {
             name: folder_name.to_string_lossy().into_owned(),
             subtitle: meta.map_or_else(String::new, |meta| meta.command_line.join(" ")),
             steered: false,
+            notes: false,
             script: folder.join(CYCLES_CSV).is_file(),
         };
         let mut hello = hello_of(&setup, diffusion, &page);
         hello.recorded = true;
         let most_waiting = (HELD_S * 1e6 / hello.period_us) as usize;
         let (feed, hub) = Feed::new(hello);
-        let config = ServerConfig {
-            address: at.address,
-            beyond_this_machine: at.beyond_this_machine,
-            on_thread: None,
-        };
+        let of = session.clone();
+        let config = config(at, Some(Arc::new(move |name| film_of(&of, name))));
         let server = Server::start(&config, hub, |_| ())
             .map_err(|error| Failure::bad_input(error, "127.0.0.1:0 takes any free port"))?;
         Ok(Self {
             server,
-            watcher: Watcher::new(feed),
+            watcher: Watcher::new(vec![feed]),
             follow,
             folder: folder.to_owned(),
             statistics: Statistics::default(),
@@ -78,7 +86,9 @@ impl Watch {
             most_waiting,
             last: None,
             changed: Instant::now(),
-            cycles: (0, 0),
+            cycles: CyclesRead::default(),
+            session,
+            clips: (None, BTreeSet::new()),
             over: false,
         })
     }
@@ -103,9 +113,12 @@ impl Watch {
         }
         for event in self.follow.events().map_err(Failure::failed)? {
             self.count(&event);
-            self.watcher.feed.event(line(&event));
+            self.watcher.event_line(line(&event));
         }
-        self.read_cycles();
+        for row in self.cycles.more(&self.folder.join(CYCLES_CSV)) {
+            self.watcher.cycle(cycle_row(&row));
+        }
+        self.look_for_clips();
         self.tell();
         Ok(!self.waiting.is_empty())
     }
@@ -148,29 +161,17 @@ impl Watch {
         }
     }
 
-    /// Rows of the per-cycle table that are new. A row never changes once it is written.
-    fn read_cycles(&mut self) {
-        let path = self.folder.join(CYCLES_CSV);
-        let Ok(bytes) = std::fs::metadata(&path).map(|meta| meta.len()) else {
-            return;
-        };
-        if bytes == self.cycles.0 {
+    fn look_for_clips(&mut self) {
+        let (looked, known) = &mut self.clips;
+        if looked.is_some_and(|at| at.elapsed() < CLIPS_EVERY) {
             return;
         }
-        let Ok(text) = cellpos_table::read_text(&path, MOST_TABLE) else {
-            return;
-        };
-        let known = |value: f64| value.is_finite().then_some(value);
-        let rows = read_cycles(cellpos_record::whole_text(&text)).rows;
-        for row in rows.iter().skip(self.cycles.1) {
-            self.watcher.feed.cycle(CycleRow {
-                cycle: row.cycle + 1,
-                amplitude_um: known(row.reached_um),
-                stretch: known(row.length_peak_um / row.length_start_um),
-                recovery_s: known(row.recovery_s),
-            });
+        *looked = Some(Instant::now());
+        for clip in clips::list(&self.session) {
+            if known.insert(clip.name.clone()) {
+                self.watcher.clip(clip);
+            }
         }
-        self.cycles = (bytes, rows.len());
     }
 
     fn tell(&mut self) {
@@ -187,7 +188,9 @@ impl Watch {
         if let Some(end) = end.filter(|_| self.waiting.is_empty()) {
             self.over = true;
             conclude(&mut self.watcher, &end);
-        } else if silent {
+            return;
+        }
+        if silent {
             state.banner = Banner {
                 state: "disconnected",
                 reason: format!(
@@ -199,8 +202,44 @@ impl Watch {
         } else if let Some(last) = &self.last {
             self.watcher.state.banner = self.watcher.banner(last);
         }
-        let state = self.watcher.state.clone();
-        self.watcher.feed.state(state);
+        self.watcher.tails();
+        self.watcher.tell_state();
+    }
+}
+
+/// How much of the per-cycle table was read. A row never changes once it is written.
+#[derive(Debug, Default)]
+struct CyclesRead {
+    head: String,
+    bytes: u64,
+}
+
+impl CyclesRead {
+    /// The rows behind those that were read before; none where the table cannot be read.
+    fn more(&mut self, path: &Path) -> Vec<CycleRow> {
+        let length = std::fs::metadata(path).map_or(0, |meta| meta.len());
+        if length <= self.bytes {
+            return vec![];
+        }
+        let read = || -> std::io::Result<String> {
+            let mut file = std::fs::File::open(path)?;
+            file.seek(SeekFrom::Start(self.bytes))?;
+            let mut text = vec![];
+            file.take(MOST_TABLE).read_to_end(&mut text)?;
+            // What is not whole may end within a character; it is read again.
+            Ok(String::from_utf8_lossy(&text).into_owned())
+        };
+        let Ok(text) = read() else { return vec![] };
+        let whole = cellpos_record::whole_text(&text);
+        self.bytes += whole.len() as u64;
+        let rows = if self.head.is_empty() {
+            let head = whole.lines().next().unwrap_or("");
+            self.head = format!("{head}\n");
+            read_cycles(whole)
+        } else {
+            read_cycles(&format!("{}{whole}", self.head))
+        };
+        rows.rows
     }
 }
 
@@ -211,14 +250,6 @@ fn conclude(watcher: &mut Watcher, end: &RunEnd) {
     };
     let count = |key: &str, counted: u64| number(key).map_or(counted, |n| n as u64);
     let state = &mut watcher.state;
-    state.banner = Banner {
-        state: if end.outcome == "safe" {
-            "safe"
-        } else {
-            "over"
-        },
-        reason: format!("The run is over: {}.", end.outcome),
-    };
     state.rms_nm = number("rms_measured_nm").or(state.rms_nm);
     state.late = count("late", state.late);
     state.skipped = count("skipped", state.skipped);
@@ -226,6 +257,13 @@ fn conclude(watcher: &mut Watcher, end: &RunEnd) {
     state.stale = count("stale", state.stale);
     state.coasted = count("coasted", state.coasted);
     state.records_lost = end.rows_lost;
+    let tail = |name: &str| {
+        let value = end.summary.get(name)?.get("p999")?;
+        value.as_float().or(value.as_integer().map(|n| n as f64))
+    };
+    state.wake_us = tail("wake_us").or(state.wake_us);
+    state.compute_us = tail("tick_us").or(state.compute_us);
+    watcher.over(end.outcome == "safe", &format!("{}.", end.outcome));
 }
 
 fn text<'e>(event: &'e Event, key: &str) -> Option<&'e str> {

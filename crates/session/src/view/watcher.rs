@@ -1,12 +1,10 @@
-//! What the recorder is given, shown on the page as it passes through.
+//! What page and screen are told of a run, from what its recorder is given.
 
-use super::View;
 use crate::words::{Level, safe_reason, sentence};
-use cellpos_live::{Banner, CycleRow, EventLine, Feed, Row, State};
+use cellpos_live::{Banner, ClipLine, CycleRow, EventLine, Feed, Row, State};
+use cellpos_runtime::latency::Latency;
 use cellpos_runtime::life::EventKind;
-use cellpos_runtime::recorder::Unconfirmed;
-use cellpos_runtime::{Event, Life, RunSink, Statistics, Summary, TickFlags, TickRecord};
-use std::sync::mpsc::Receiver;
+use cellpos_runtime::{Event, Life, NoSink, Statistics, Summary, TickFlags, TickRecord};
 
 /// What a sink knows of its run that the page is to show besides what passes through it.
 pub trait Shown {
@@ -22,57 +20,89 @@ pub trait Shown {
     fn next_line(&mut self) -> Option<EventLine> {
         None
     }
+    /// The next clip that was written since.
+    fn next_clip(&mut self) -> Option<ClipLine> {
+        None
+    }
 }
+
+impl Shown for NoSink {}
 
 /// References of the last ticks: the error of a position is counted from where the bead was to be when it was exposed.
 const TARGETS: usize = 16;
 
-/// What feeds the page, from what the recorder is given, or from what is read in its folder.
+/// How often the tails of the ticks' times are told, in states.
+const TAILS_EVERY: u32 = 10;
+
+/// What feeds page and screen, from what the recorder is given, or from what is read in its folder.
 pub(super) struct Watcher {
-    pub(super) feed: Feed,
+    feeds: Vec<Feed>,
     targets: [(i64, f64); TARGETS],
     pub(super) state: State,
     freeze: String,
     pub(super) safe: String,
-}
-
-/// A sink that shows a page what passes through it.
-pub struct Viewed<S> {
-    sink: S,
-    page: Option<(Watcher, Receiver<String>)>,
-}
-
-impl<S> Viewed<S> {
-    /// A sink without a page, or with one.
-    pub fn new(sink: S, view: Option<&mut View>) -> Self {
-        let page =
-            view.and_then(|view| Some((Watcher::new(view.feed.take()?), view.notes.take()?)));
-        Self { sink, page }
-    }
-
-    /// The sink within. The page shows the summary's own figures from now on.
-    pub fn into_inner(self, summary: &Summary, ended: &str) -> S {
-        if let Some((mut watcher, _)) = self.page {
-            watcher.conclude(summary, ended);
-        }
-        self.sink
-    }
-
-    /// The sink within, of a run that did not come to a summary.
-    pub fn into_sink(self) -> S {
-        self.sink
-    }
+    wake: Latency,
+    compute: Latency,
+    told: u32,
+    /// Ticks and time, s, of the runs before this one on the same page.
+    before: (u64, f64),
 }
 
 impl Watcher {
-    pub(super) fn new(feed: Feed) -> Self {
+    pub(super) fn new(feeds: Vec<Feed>) -> Self {
         Self {
-            feed,
+            feeds,
             targets: [(i64::MIN, f64::NAN); TARGETS],
             state: State::default(),
             freeze: String::new(),
             safe: String::new(),
+            wake: Latency::new(),
+            compute: Latency::new(),
+            told: 0,
+            before: (0, 0.0),
         }
+    }
+
+    /// What comes from now on is of another run: it is shown behind what there was.
+    pub(super) fn next_run(&mut self) {
+        self.before = (self.state.ticks, self.state.time_s);
+        self.targets = [(i64::MIN, f64::NAN); TARGETS];
+        self.freeze.clear();
+        self.safe.clear();
+    }
+
+    fn time_s(&self, time_ns: i64) -> f64 {
+        self.before.1 + time_ns as f64 * 1e-9
+    }
+
+    /// A tick as it is drawn.
+    pub(super) fn row(&mut self, row: &Row) {
+        self.feeds.iter_mut().for_each(|feed| feed.row(row));
+    }
+
+    /// What happened.
+    pub(super) fn event_line(&mut self, line: EventLine) {
+        self.feeds
+            .iter_mut()
+            .for_each(|feed| feed.event(line.clone()));
+    }
+
+    /// A cycle is over.
+    pub(super) fn cycle(&mut self, cycle: CycleRow) {
+        self.feeds.iter_mut().for_each(|feed| feed.cycle(cycle));
+    }
+
+    /// A clip is on the disk.
+    pub(super) fn clip(&mut self, clip: ClipLine) {
+        self.feeds
+            .iter_mut()
+            .for_each(|feed| feed.clip(clip.clone()));
+    }
+
+    /// How the run stands.
+    pub(super) fn tell_state(&mut self) {
+        let Self { feeds, state, .. } = self;
+        feeds.iter_mut().for_each(|feed| feed.state(state.clone()));
     }
 
     /// Shows a tick.
@@ -81,9 +111,9 @@ impl Watcher {
         self.targets[0] = (record.time_ns, record.target_um);
         let exposed_ns = record.mid_exposure_ns;
         let then = self.targets.iter().find(|(ns, _)| *ns <= exposed_ns);
-        self.feed.row(&Row {
-            seq: record.seq as u32,
-            time_s: record.time_ns as f64 * 1e-9,
+        self.row(&Row {
+            seq: (self.before.0 + record.seq) as u32,
+            time_s: self.time_s(record.time_ns),
             measured_um: record.measured_um as f32,
             target_um: record.target_um as f32,
             target_then_um: then.map_or(f32::NAN, |(_, um)| *um as f32),
@@ -99,15 +129,19 @@ impl Watcher {
 
     /// Counts a tick.
     pub(super) fn count(&mut self, record: &TickRecord) {
+        self.wake.record(record.wake_ns.into(), record.seq);
+        self.compute.record(record.compute_ns.into(), record.seq);
+        let time_s = self.time_s(record.time_ns);
         let state = &mut self.state;
-        state.time_s = record.time_ns as f64 * 1e-9;
-        state.ticks = record.seq + 1;
+        state.time_s = time_s;
+        state.ticks = self.before.0 + record.seq + 1;
         state.late += u64::from(record.flags.has(TickFlags::LATE));
         state.stale += u64::from(record.flags.has(TickFlags::STALE));
         state.coasted += u64::from(record.flags.has(TickFlags::COASTING));
     }
 
-    fn event(&mut self, event: &Event, times: u64) {
+    /// Tells an event, and counts what it says.
+    pub(super) fn event(&mut self, event: &Event, times: u64) {
         match event.kind {
             EventKind::FramesDropped { count } => self.state.frames_lost += count * times,
             EventKind::TicksSkipped { count } => self.state.skipped += count * times,
@@ -122,22 +156,34 @@ impl Watcher {
         self.tell(event.time_ns, level, text);
     }
 
-    fn tell(&mut self, time_ns: i64, level: Level, text: String) {
-        self.feed.event(EventLine {
-            time_s: time_ns as f64 * 1e-9,
+    /// Tells what happened.
+    pub(super) fn tell(&mut self, time_ns: i64, level: Level, text: String) {
+        self.event_line(EventLine {
+            time_s: self.time_s(time_ns),
             level: level.name(),
             text,
         });
     }
 
-    fn progress(&mut self, statistics: &Statistics, sink: &impl Shown) {
+    /// Tells how the run stands.
+    pub(super) fn progress(&mut self, statistics: &Statistics, sink: &impl Shown) {
         let Some(record) = statistics.last() else {
             return;
         };
         self.state.rms_nm = statistics.rms_measured_nm();
         self.state.banner = self.banner(record);
         sink.complete(&mut self.state);
-        self.feed.state(self.state.clone());
+        self.tails();
+        self.tell_state();
+    }
+
+    /// The tails of the ticks' times, now and then: they are looked for in all that was counted.
+    pub(super) fn tails(&mut self) {
+        if self.told.is_multiple_of(TAILS_EVERY) && self.wake.count() > 0 {
+            self.state.wake_us = Some(self.wake.quantiles_us().p999);
+            self.state.compute_us = Some(self.compute.quantiles_us().p999);
+        }
+        self.told = self.told.wrapping_add(1);
     }
 
     pub(super) fn banner(&self, record: &TickRecord) -> Banner {
@@ -159,87 +205,32 @@ impl Watcher {
         Banner { state, reason }
     }
 
-    fn conclude(&mut self, summary: &Summary, ended: &str) {
+    /// The figures of the run's own summary, and its end.
+    pub(super) fn conclude(&mut self, summary: &Summary, ended: &str) {
         let counts = &summary.counts;
+        self.state = State {
+            rms_nm: summary.rms_measured_nm,
+            wake_us: Some(summary.wake_us.p999),
+            compute_us: Some(summary.tick_us.p999),
+            late: counts.late,
+            skipped: counts.skipped,
+            frames_lost: counts.frames_lost,
+            stale: counts.stale,
+            coasted: counts.coasted,
+            records_lost: summary.records_lost,
+            ..std::mem::take(&mut self.state)
+        };
+        self.over(summary.state == Life::Safe, ended);
+    }
+
+    /// The run is over, for a reason in a sentence.
+    pub(super) fn over(&mut self, safe: bool, ended: &str) {
         self.state.banner = Banner {
-            state: if summary.state == Life::Safe {
-                "safe"
-            } else {
-                "over"
-            },
+            state: if safe { "safe" } else { "over" },
             reason: format!("The run is over: {ended}"),
         };
-        self.state.rms_nm = summary.rms_measured_nm;
-        self.state.late = counts.late;
-        self.state.skipped = counts.skipped;
-        self.state.frames_lost = counts.frames_lost;
-        self.state.stale = counts.stale;
-        self.state.coasted = counts.coasted;
-        self.state.records_lost = summary.records_lost;
         self.state.left_s = None;
         self.state.next = None;
-        self.feed.state(self.state.clone());
-    }
-}
-
-impl<S: RunSink + Shown> RunSink for Viewed<S> {
-    fn tick(&mut self, record: &TickRecord) {
-        if let Some((watcher, _)) = &mut self.page {
-            watcher.show(record);
-            watcher.count(record);
-        }
-        self.sink.tick(record);
-    }
-
-    fn event(&mut self, event: &Event) {
-        if let Some((watcher, _)) = &mut self.page {
-            watcher.event(event, 1);
-        }
-        self.sink.event(event);
-    }
-
-    fn repeated(&mut self, last: &Event, count: u64) {
-        if let Some((watcher, _)) = &mut self.page {
-            watcher.event(last, count);
-        }
-        self.sink.repeated(last, count);
-    }
-
-    fn note(&mut self, time_ns: i64, text: &str) {
-        self.sink.note(time_ns, text);
-    }
-
-    fn is_ready(&self) -> bool {
-        self.sink.is_ready()
-    }
-
-    fn is_refused(&self) -> bool {
-        self.sink.is_refused()
-    }
-
-    fn unconfirmed(&self) -> Unconfirmed {
-        self.sink.unconfirmed()
-    }
-
-    fn learned(&mut self, motion: u16, state: &cellpos_control::LearnerState) {
-        self.sink.learned(motion, state);
-    }
-
-    fn progress(&mut self, statistics: &Statistics) {
-        if let Some((watcher, notes)) = &mut self.page {
-            let time_ns = statistics.last().map_or(0, |record| record.time_ns);
-            while let Ok(text) = notes.try_recv() {
-                self.sink.note(time_ns, &text);
-                watcher.tell(time_ns, Level::Info, format!("Note: {text}"));
-            }
-            while let Some(line) = self.sink.next_line() {
-                watcher.feed.event(line);
-            }
-            while let Some(cycle) = self.sink.next_cycle() {
-                watcher.feed.cycle(cycle);
-            }
-            watcher.progress(statistics, &self.sink);
-        }
-        self.sink.progress(statistics);
+        self.tell_state();
     }
 }

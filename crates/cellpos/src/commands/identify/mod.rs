@@ -9,6 +9,7 @@ mod sources;
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
 use crate::output;
 use crate::rig_file::{ClockKind, Frames, RigFile};
+use crate::view_args::{self, PageArgs};
 use cellpos_emulator::WorldConfig;
 use cellpos_experiment::identify::held_bead::Setup;
 use cellpos_experiment::identify::{self as identification, Excitation};
@@ -17,6 +18,7 @@ use cellpos_ident::excitation::{Limits, PAPER_FREQUENCIES_HZ};
 use cellpos_plant::Model;
 use cellpos_rig::Clock;
 use cellpos_session::provenance;
+use cellpos_session::view::{Page, Pages};
 use cellpos_units::{Hertz, Micrometers, MicrometersPerSecond, Seconds};
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -111,6 +113,8 @@ pub struct Args {
     /// Where to write the report, figures beside it [default: report.html in a new folder of runs/].
     #[arg(long)]
     report: Option<PathBuf>,
+    #[command(flatten)]
+    page: PageArgs,
     /// Print one JSON object on standard output.
     #[arg(long)]
     json: bool,
@@ -270,6 +274,23 @@ fn job(args: &Args) -> Result<identification::Job, Failure> {
     })
 }
 
+/// The live page, if one is wanted.
+fn pages(args: &Args, job: &identification::Job) -> Result<Option<Pages>, Failure> {
+    let clock = job.rig.as_ref().map_or(ClockKind::Virtual, |rig| rig.clock);
+    let wanted = args.page.wanted(clock)?;
+    let of = args.rig.iter().map(|path| path.display().to_string());
+    let page = Page {
+        name: "identify".to_string(),
+        subtitle: format!("identify: {:?}, {}", job.excitation, of.collect::<String>()),
+        steered: false,
+        script: false,
+        notes: false,
+    };
+    Ok(wanted
+        .is_any()
+        .then(|| Pages::new(wanted, page, view_args::said)))
+}
+
 /// Runs `cellpos identify`.
 pub fn run(args: Args) -> CommandResult {
     output::ready(args.out.iter().chain(&args.report))?;
@@ -294,10 +315,12 @@ pub fn run(args: Args) -> CommandResult {
         indicatif::ProgressStyle::with_template("{bar:40} {pos}/{len} ticks, {eta} left")
             .unwrap_or_else(|_| indicatif::ProgressStyle::default_bar()),
     );
-    let done = identification::run(&job, |ticks, total| {
+    let mut pages = pages(&args, &job)?;
+    let progress = |ticks: usize, total: usize| {
         bar.set_length(total as u64);
         bar.set_position(ticks as u64);
-    })?;
+    };
+    let done = identification::run_shown(&job, progress, pages.as_mut())?;
     bar.finish_and_clear();
 
     let place = |given: &Option<PathBuf>, name: &str| {

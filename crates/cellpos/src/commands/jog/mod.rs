@@ -1,16 +1,19 @@
 //! `cellpos jog`: the PZT moved by hand, within the board's limits, parked at the end.
 
+mod shown;
 mod typed;
 
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
-use crate::rig_file::RigFile;
+use crate::rig_file::{ClockKind, RigFile};
+use crate::view_args::PageArgs;
 use cellpos_rig::FrameBuffer;
 use cellpos_session::signals;
 use cellpos_units::{Micrometers, MicrometersPerSecond};
 use cellpos_workbench::Bench;
 use cellpos_workbench::mover::Mover;
-use cellpos_workbench::snapshot::{self, Eye};
+use cellpos_workbench::snapshot::{self, Eye, Seen};
 use serde::Serialize;
+use shown::{Asked, Shown};
 use std::path::PathBuf;
 use std::sync::mpsc::Receiver;
 use typed::Typed;
@@ -40,6 +43,8 @@ pub struct Args {
     /// Do not look for a bead.
     #[arg(long)]
     blind: bool,
+    #[command(flatten)]
+    page: PageArgs,
     /// Print one JSON object on standard output.
     #[arg(long)]
     json: bool,
@@ -55,6 +60,17 @@ struct Stop {
     bead_px: Option<[f64; 2]>,
 }
 
+impl Stop {
+    fn at(mover: &Mover, seen: Option<Seen>) -> Self {
+        Self {
+            commanded_um: mover.at_um(),
+            applied_um: mover.newest().applied_um,
+            bead_um: seen.and_then(|seen| seen.position_um),
+            bead_px: seen.map(|seen| [seen.x_px, seen.y_px]),
+        }
+    }
+}
+
 #[derive(Debug, Serialize)]
 struct Jogged {
     stops: Vec<Stop>,
@@ -67,6 +83,9 @@ const SETTLE: u32 = 30;
 /// Moves, shows, parks.
 pub fn run(args: Args) -> CommandResult {
     let bench = Bench::of(RigFile::load(Some(&args.rig))?)?;
+    let wanted = args.page.wanted(ClockKind::Real)?;
+    // Before the board is armed: it does not wait for a camera.
+    let mut shown = Shown::open(&wanted, &bench, args.blind)?;
     let mut mover = Mover::arm(bench.board()?, bench.file())?;
     let mut stops = Vec::new();
     let typed = args.to.is_empty().then(Typed::listen);
@@ -81,16 +100,19 @@ pub fn run(args: Args) -> CommandResult {
                 Some(to) => to.0,
                 None => break,
             },
-            Some(typed) => match next_line(&typed.lines, &mut mover, at_um, &args)? {
+            Some(typed) => match next_line(&typed.lines, &mut mover, at_um, &args, &mut shown)? {
                 Some(to_um) => to_um,
                 None => break,
             },
         };
-        if !go(&mut mover, to_um, args.speed.0)? {
+        if !go(&mut mover, to_um, args.speed.0, &mut shown)? {
             break;
         }
         at_um = to_um;
-        let stop = look(&bench, &mut mover, to_um, args.blind)?;
+        let stop = match &mut shown {
+            Some(shown) => shown.look(&mut mover, at_um)?,
+            None => look(&bench, &mut mover, at_um, args.blind)?,
+        };
         if !args.json {
             print_text(&line(&stop))?;
         }
@@ -98,6 +120,9 @@ pub fn run(args: Args) -> CommandResult {
     }
     let park_um = mover.limits().park_um;
     drop(mover);
+    if let Some(shown) = shown {
+        shown.over();
+    }
     let jogged = Jogged { stops, park_um };
     if args.json {
         print_json(&jogged)?;
@@ -108,13 +133,28 @@ pub fn run(args: Args) -> CommandResult {
 }
 
 /// Goes there; false when it was asked to stop.
-fn go(mover: &mut Mover, to_um: f64, speed_um_per_s: f64) -> Result<bool, Failure> {
+fn go(
+    mover: &mut Mover,
+    to_um: f64,
+    speed_um_per_s: f64,
+    shown: &mut Option<Shown>,
+) -> Result<bool, Failure> {
     let mut rest = SETTLE;
     while rest > 0 {
         if signals::stopped_by().is_some() {
             return Ok(false);
         }
-        if mover.step(to_um, speed_um_per_s)? {
+        let asked = shown.as_ref().map_or(Asked::Nothing, Shown::asked);
+        let to_um = match asked {
+            Asked::Park => return Ok(false),
+            Asked::Freeze => mover.at_um(),
+            Asked::Nothing | Asked::To(_) => to_um,
+        };
+        let there = mover.step(to_um, speed_um_per_s)?;
+        if let Some(shown) = shown {
+            shown.step(mover);
+        }
+        if there && asked != Asked::Freeze {
             rest -= 1;
         }
     }
@@ -127,6 +167,7 @@ fn next_line(
     mover: &mut Mover,
     at_um: f64,
     args: &Args,
+    shown: &mut Option<Shown>,
 ) -> Result<Option<f64>, Failure> {
     use std::sync::mpsc::TryRecvError;
     loop {
@@ -134,6 +175,17 @@ fn next_line(
             return Ok(None);
         }
         mover.step(at_um, args.speed.0)?;
+        if let Some(shown) = shown {
+            shown.step(mover);
+            match shown.asked() {
+                Asked::Park => return Ok(None),
+                Asked::To(um) => {
+                    let limits = mover.limits();
+                    return Ok(Some(um.clamp(limits.low_um, limits.high_um)));
+                }
+                Asked::Freeze | Asked::Nothing => {}
+            }
+        }
         let text = match lines.try_recv() {
             Ok(text) => text,
             Err(TryRecvError::Empty) => continue,
@@ -183,12 +235,7 @@ fn look(bench: &Bench, mover: &mut Mover, to_um: f64, blind: bool) -> Result<Sto
             }
         }
     }
-    Ok(Stop {
-        commanded_um: mover.at_um(),
-        applied_um: mover.newest().applied_um,
-        bead_um: seen.and_then(|seen| seen.position_um),
-        bead_px: seen.map(|seen| [seen.x_px, seen.y_px]),
-    })
+    Ok(Stop::at(mover, seen))
 }
 
 fn line(stop: &Stop) -> String {

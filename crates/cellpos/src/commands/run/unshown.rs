@@ -24,13 +24,7 @@ impl Unshown {
     /// A finished cycle.
     pub(super) fn cycle(&mut self, row: &CycleRow) {
         if self.on {
-            let known = |value: f64| value.is_finite().then_some(value);
-            self.cycles.push_back(view::CycleRow {
-                cycle: row.cycle + 1,
-                amplitude_um: known(row.reached_um),
-                stretch: known(row.length_peak_um / row.length_start_um),
-                recovery_s: known(row.recovery_s),
-            });
+            self.cycles.push_back(view::cycle_row(row));
         }
     }
 

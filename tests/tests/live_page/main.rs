@@ -1,89 +1,37 @@
 //! The live page in a real browser, on a real run of the emulated rig. Needs Debian's chromium and chromium-driver, which
 //! `.ci/run` installs: `cargo test -p cellpos-tests --test live_page -- --ignored`.
 
+mod other_commands;
+mod watched;
+
 use cellpos_tests::browser::Browser;
 use cellpos_tests::programs;
-use std::io::{BufRead, BufReader};
-use std::path::Path;
-use std::process::{Child, Command, ExitStatus, Stdio};
+use std::process::Command;
 use std::time::{Duration, Instant};
+use watched::{RUNNING, Watched, only_run, pictures, portraits, says_the_summary, shows};
 
-/// A `track` with a live page.
-struct Watched {
-    child: Child,
-    operator: String,
-    viewer: String,
-}
-
-impl Watched {
-    fn start(folder: &Path, line: &str) -> Self {
-        let mut child = programs::cellpos(folder, line)
-            .stderr(Stdio::piped())
-            .stdout(Stdio::null())
-            .spawn()
-            .expect("cellpos starts");
-        let mut lines = BufReader::new(child.stderr.take().expect("piped")).lines();
-        let mut link = |what: &str| {
-            lines
-                .find_map(|line| {
-                    let line = line.ok()?;
-                    let (_, url) = line.split_once(what)?;
-                    Some(url.trim().to_string())
-                })
-                .expect("cellpos prints its links")
-        };
-        let (operator, viewer) = (link("to act:"), link("to look:"));
-        std::thread::spawn(move || lines.for_each(drop));
-        Self {
-            child,
-            operator,
-            viewer,
-        }
-    }
-
-    /// `cellpos watch`: a page that may look only.
-    fn looking(folder: &Path, line: &str) -> Self {
-        let mut child = programs::cellpos(folder, line)
-            .stderr(Stdio::piped())
-            .stdout(Stdio::null())
-            .spawn()
-            .expect("cellpos starts");
-        let mut lines = BufReader::new(child.stderr.take().expect("piped")).lines();
-        let viewer = lines
-            .find_map(|line| Some(line.ok()?.split_once("to look:")?.1.trim().to_string()))
-            .expect("cellpos prints its link");
-        std::thread::spawn(move || lines.for_each(drop));
-        Self {
-            child,
-            operator: String::new(),
-            viewer,
-        }
-    }
-
-    fn ended(mut self) -> ExitStatus {
-        let deadline = Instant::now() + programs::PATIENCE;
-        loop {
-            if let Some(status) = self.child.try_wait().expect("a child") {
-                return status;
-            }
-            assert!(Instant::now() < deadline, "the run did not end");
-            std::thread::sleep(Duration::from_millis(20));
-        }
-    }
-}
-
-impl Drop for Watched {
-    fn drop(&mut self) {
-        let _ = self.child.kill();
-        let _ = self.child.wait();
-    }
-}
-
-/// Where pictures of the page are kept, to be looked at.
-fn pictures() -> std::path::PathBuf {
-    let folder = programs::folder().join("live-page");
-    std::fs::create_dir_all(&folder).expect("a folder for pictures");
-    folder
+/// Whether the bead came to a target of an exported record and stayed there: its mean over some 100 ms is within 0.1 um.
+fn reached(csv: &str, target_um: f64) -> bool {
+    let mut lines = csv.lines();
+    let head: Vec<&str> = lines.next().expect("a head").split(',').collect();
+    let at = |name: &str| head.iter().position(|column| *column == name);
+    let (target, bead) = (
+        at("target_um").expect("a target"),
+        at("measured_um").expect("a position"),
+    );
+    let found: Vec<f64> = lines
+        .filter_map(|line| {
+            let cells: Vec<&str> = line.split(',').collect();
+            let number = |n: usize| cells.get(n)?.parse::<f64>().ok();
+            let on_target = number(target).is_some_and(|um| (um - target_um).abs() < 1e-9);
+            on_target.then(|| number(bead)).flatten()
+        })
+        .filter(|um| um.is_finite())
+        .collect();
+    found.windows(100).any(|some| {
+        let mean = some.iter().sum::<f64>() / some.len() as f64;
+        (mean - target_um).abs() < 0.1
+    })
 }
 
 const SCRIPT: &str = r#"
@@ -101,23 +49,36 @@ frequency = "4Hz"
 cycles = 40
 "#;
 
-const RUNNING: &str = "return document.body.dataset.state === 'running'";
-
 #[test]
 #[ignore = "needs chromium and chromium-driver: .ci/run installs them and runs this"]
 fn the_operator_sees_a_moving_bead_and_freezes_steers_and_parks_it() {
     let folder = tempfile::tempdir().unwrap();
+    // The browser is there when the run begins, as an operator's is.
+    let page = Browser::start(1400, 1500);
+    let begun = Instant::now();
     let run = Watched::start(
         folder.path(),
         "track --target 0um --view --name watched --duration 120s",
     );
-    let page = Browser::start(1400, 1500);
     page.open(&run.operator);
-    let shown = page.wait_for(
-        "return document.getElementById('f-time').textContent !== '-' && document.getElementById('picture').width > 200",
+    page.wait_for(
+        "return document.getElementById('picture').width > 200 && document.getElementById('picture-text').textContent.startsWith('Click')",
         programs::PATIENCE,
     );
-    println!("the bead is on the page {shown:?} after it was opened");
+    println!(
+        "a bead is on the page {:?} after the command was given",
+        begun.elapsed()
+    );
+    let places = "const v = document.getElementById('picture'); return v.getContext('2d').getImageData(0, 0, v.width, v.height).data.reduce((sum, value, n) => (sum * 31 + value * (n % 97)) % 1000003, 0)";
+    let first = page.run(places);
+    page.wait_for(
+        &format!("return (() => {{ {places} }})() !== {first}"),
+        programs::PATIENCE,
+    );
+    println!(
+        "it moves on the page {:?} after the command was given",
+        begun.elapsed()
+    );
     page.wait_for(RUNNING, programs::PATIENCE);
     let first = page.text_of("gauge-text");
     page.wait_for(
@@ -163,19 +124,15 @@ fn the_operator_sees_a_moving_bead_and_freezes_steers_and_parks_it() {
     assert!(status.code().is_some(), "{status}");
     drop(page);
 
-    let found: Vec<_> = std::fs::read_dir(folder.path().join("runs"))
-        .unwrap()
-        .flatten()
-        .collect();
-    let events = std::fs::read_to_string(found[0].path().join("events.jsonl")).unwrap();
+    let (found, _) = only_run(folder.path());
+    let events = std::fs::read_to_string(found.join("events.jsonl")).unwrap();
     assert!(events.contains("\"note\""), "{events}");
     let csv = folder.path().join("ticks.csv");
     let export = programs::cellpos(folder.path(), "export latest-watched --out ticks.csv")
         .output()
         .unwrap();
     assert!(export.status.success(), "{export:?}");
-    let text = std::fs::read_to_string(csv).unwrap();
-    assert!(text.contains("3.5"), "the target was reached in the record");
+    assert!(reached(&std::fs::read_to_string(csv).unwrap(), 3.5));
     let replay = programs::cellpos(folder.path(), "replay latest-watched")
         .output()
         .unwrap();
@@ -224,18 +181,9 @@ fn a_script_and_its_folder_show_the_same_run() {
     let run = Watched::start(folder.path(), "run script.toml --view --name shown");
     let page = Browser::start(1400, 1500);
     page.open(&run.operator);
-    page.wait_for(
-        "return /Cycle [0-9]+ of 40[.]/.test(document.getElementById('script-text').textContent)",
-        programs::PATIENCE,
-    );
-    page.wait_for(
-        "return /[0-9]+ cycles done/.test(document.getElementById('cycles-text').textContent)",
-        programs::PATIENCE,
-    );
-    page.wait_for(
-        "return document.getElementById('events').textContent.includes('Mark: <b>waves</b>')",
-        programs::PATIENCE,
-    );
+    shows(&page, "script-text", "Cycle [0-9]+ of 40[.]");
+    shows(&page, "cycles-text", "[0-9]+ cycles done");
+    shows(&page, "events", "Mark: <b>waves<.b>");
     // The same run, from its folder, in another program.
     let watch = Watched::looking(folder.path(), "watch latest-shown --for 300s");
     let other = Browser::start(1400, 1500);
@@ -257,29 +205,59 @@ fn a_script_and_its_folder_show_the_same_run() {
     other.screenshot(&pictures().join("watch.png"));
     assert_eq!(other.console(), Vec::<String>::new());
     // What the page says at the end is what the run's summary says.
-    let found = std::fs::read_dir(folder.path().join("runs"))
-        .unwrap()
-        .flatten()
-        .next()
-        .expect("one run");
-    let meta: toml::Table = std::fs::read_to_string(found.path().join("run.toml"))
-        .unwrap()
-        .parse()
+    says_the_summary(&other, &only_run(folder.path()).1);
+}
+
+#[test]
+#[ignore = "needs chromium and chromium-driver: .ci/run installs them and runs this"]
+fn clips_are_played_and_a_name_of_evil_intent_is_text() {
+    let folder = tempfile::tempdir().unwrap();
+    let run = Watched::start(
+        folder.path(),
+        "track --target 0um --view --duration 60s --name <img/src=x/onerror=document.title=1>",
+    );
+    let page = Browser::start(1400, 2000);
+    page.open(&run.operator);
+    page.wait_for(RUNNING, programs::PATIENCE);
+    assert!(page.text_of("name").contains("<img/src=x"));
+    assert_eq!(
+        page.run("return document.querySelectorAll('img').length"),
+        0
+    );
+    // A freeze is worth a clip.
+    page.click_until("freeze", &["frozen"]);
+    shows(&page, "clips", "frozen");
+    page.run("document.querySelector('#clips button').click()");
+    shows(&page, "clip-text", "frozen: frame [0-9]+ of [0-9]+, at");
+    page.run("document.getElementById('clip-on').click()");
+    let text = page.text_of("clip-text");
+    page.run("document.getElementById('clip-on').click()");
+    assert_ne!(page.text_of("clip-text"), text, "stepped");
+    page.screenshot(&pictures().join("clip.png"));
+    portraits(&run.operator, "page");
+    assert_eq!(page.console(), Vec::<String>::new());
+    page.click_until("park", &["safe", "over"]);
+    run.ended();
+    // The same clips in the run's folder, and in its report.
+    let (found, _) = only_run(folder.path());
+    let name = found.file_name().unwrap().to_string_lossy().into_owned();
+    let watch = Watched::looking(folder.path(), &format!("watch runs/{name} --for 300s"));
+    page.open(&watch.viewer);
+    shows(&page, "clips", "frozen");
+    page.run("document.querySelector('#clips button').click()");
+    shows(&page, "clip-text", "frozen: frame [0-9]+ of [0-9]+, at");
+    let report = programs::cellpos(folder.path(), &format!("report runs/{name}"))
+        .output()
         .unwrap();
-    let summary = &meta["end"]["summary"];
-    for (id, key) in [
-        ("f-late", "late"),
-        ("f-skipped", "skipped"),
-        ("f-lost", "frames_lost"),
-    ] {
-        assert_eq!(
-            other.text_of(id),
-            summary[key].as_integer().unwrap().to_string(),
-            "{key}"
-        );
-    }
-    let rms = summary["rms_measured_nm"].as_float().unwrap();
-    assert_eq!(other.text_of("f-rms"), format!("{rms:.1} nm"));
+    assert!(report.status.success(), "{report:?}");
+    let text = std::fs::read_to_string(found.join("report.html")).unwrap();
+    assert!(
+        text.contains("data:image/png;base64,"),
+        "the report shows the clip"
+    );
+    page.open(&format!("file://{}", found.join("report.html").display()));
+    page.run("document.querySelector('img.pixels').scrollIntoView()");
+    page.screenshot(&pictures().join("report-clip.png"));
 }
 
 #[test]

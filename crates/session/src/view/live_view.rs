@@ -1,0 +1,289 @@
+//! The page and the screen of a command that holds a rig.
+
+use super::hello::{Page, hello};
+use super::pictures::Pictures;
+use super::watcher::Watcher;
+use crate::beside::beside_the_loop;
+use crate::clips;
+use crate::failure::Failure;
+use crate::rig::Rig;
+use crate::screen::{Screen, ScreenConfig};
+use crate::setup::Setup;
+use cellpos_live::{Command, Feed, Film, Hello, Server, ServerConfig};
+use cellpos_rig::FrameWatch;
+use cellpos_runtime::Request;
+use cellpos_runtime::live::Operator;
+use std::net::SocketAddr;
+use std::path::{Path, PathBuf};
+use std::sync::mpsc::{Receiver, Sender, channel};
+use std::sync::{Arc, Mutex, OnceLock, PoisonError};
+
+/// Frames of a clip that the page gets: half a second of a fast camera.
+const FILM_FRAMES: usize = 250;
+
+/// Where the page is to be served.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct ViewAddress {
+    /// Address and port; port 0: any that is free.
+    pub address: SocketAddr,
+    /// Whether one that other machines can reach was asked for by name.
+    pub beyond_this_machine: bool,
+}
+
+/// How a run is to be shown.
+#[derive(Debug, Clone, Default)]
+pub struct Wanted {
+    /// The page in a browser.
+    pub page: Option<ViewAddress>,
+    /// The whole terminal.
+    pub screen: Option<ScreenConfig>,
+}
+
+impl Wanted {
+    /// Whether it is to be shown at all.
+    pub fn is_any(&self) -> bool {
+        self.page.is_some() || self.screen.is_some()
+    }
+}
+
+/// Whom the operator's requests go to: the run that goes on, or the last one.
+type Addressee = Arc<Mutex<Arc<Operator>>>;
+
+/// What shows a run, or several one after the other.
+pub struct View {
+    // Fields are dropped in this order: the terminal is given back before anything else is said.
+    screen: Option<Screen>,
+    server: Option<Server>,
+    pub(super) watcher: Option<Watcher>,
+    pub(super) notes: Option<Receiver<String>>,
+    pictures: (Sender<Pictures>, Receiver<Pictures>),
+    addressee: Addressee,
+    run: Arc<OnceLock<PathBuf>>,
+}
+
+impl View {
+    /// Shows the next run on a rig: its frames are shown, and its operator takes the requests.
+    ///
+    /// # Errors
+    /// The address cannot be listened on, or others could reach it without having been asked for.
+    pub fn of(wanted: &Wanted, rig: &mut Rig, setup: &Setup, page: &Page) -> Result<Self, Failure> {
+        let mut view = Self::open(wanted, hello(rig, setup, page), rig.operator())?;
+        view.follow(rig);
+        Ok(view)
+    }
+
+    /// Shows what is said of a run by whoever fills it. The operator's requests go to `operator`.
+    ///
+    /// # Errors
+    /// As [`View::of`].
+    pub fn open(wanted: &Wanted, hello: Hello, operator: &Arc<Operator>) -> Result<Self, Failure> {
+        let (noted, notes) = channel();
+        let addressee: Addressee = Arc::new(Mutex::new(Arc::clone(operator)));
+        let run = Arc::new(OnceLock::new());
+        let pictures = channel();
+        let mut feeds = vec![];
+        let mut server = None;
+        if let Some(at) = wanted.page {
+            let (mut feed, hub) = Feed::new(hello.clone());
+            if let Some(feed) = feed.take_pictures() {
+                // The other end is in this very pair.
+                let _ = pictures.0.send(Pictures::new(feed));
+            }
+            let asked = Arc::clone(&addressee);
+            let act = move |command| act(command, &asked, &noted);
+            let config = config(at, Some(film(&run)));
+            server = Some(Server::start(&config, hub, act).map_err(|error| {
+                Failure::bad_input(error, "--view 127.0.0.1:0 takes any free port")
+            })?);
+            feeds.push(feed);
+        }
+        let mut screen = None;
+        if let Some(config) = &wanted.screen {
+            // The screen has no pictures: what it is told of is no bigger than a line.
+            let without = Hello {
+                pictures: false,
+                ..hello
+            };
+            let (feed, hub) = Feed::new(without);
+            screen = Some(Screen::open(config, hub).map_err(Failure::failed)?);
+            feeds.push(feed);
+        }
+        Ok(Self {
+            screen,
+            server,
+            watcher: Some(Watcher::new(feeds)),
+            notes: Some(notes),
+            pictures,
+            addressee,
+            run,
+        })
+    }
+
+    /// Turns to the next run on a rig. A stop that was asked for meanwhile holds for it too.
+    pub fn follow(&mut self, rig: &mut Rig) {
+        let operator = Arc::clone(rig.operator());
+        let mut addressee = lock(&self.addressee);
+        let asked = addressee.asked();
+        if !Arc::ptr_eq(&addressee, &operator) && asked != Request::None {
+            operator.ask(asked);
+        }
+        *addressee = operator;
+        drop(addressee);
+        if let Some(pictures) = self.pictures() {
+            rig.watch(pictures);
+        }
+    }
+
+    /// What shows it the camera's frames, unless another camera has it.
+    pub fn pictures(&mut self) -> Option<Box<dyn FrameWatch>> {
+        let pictures = self.pictures.1.try_recv().ok()?;
+        Some(pictures.lend(&self.pictures.0))
+    }
+
+    /// The folder of the run, whose clips may be asked for.
+    pub fn recorded_in(&self, run: &Path) {
+        let _ = self.run.set(run.to_owned());
+    }
+
+    /// The links, to be printed; none without a page.
+    pub fn links(&self) -> Option<String> {
+        let server = self.server.as_ref()?;
+        Some(format!(
+            "live page, to act:  {}\nlive page, to look: {}",
+            server.operator_url(),
+            server.viewer_url()
+        ))
+    }
+
+    /// The links of operator and viewer; none without a page.
+    pub fn urls(&self) -> Option<[String; 2]> {
+        let server = self.server.as_ref()?;
+        Some([server.operator_url(), server.viewer_url()])
+    }
+
+    /// Whether other machines can reach its page.
+    pub fn is_reachable(&self) -> bool {
+        let server = self.server.as_ref();
+        server.is_some_and(|server| !server.address().ip().is_loopback())
+    }
+
+    /// Whether it has the whole terminal.
+    pub fn has_screen(&self) -> bool {
+        self.screen.is_some()
+    }
+}
+
+/// What shows the runs of a command that has several, one after the other, all on one page.
+pub struct Pages {
+    wanted: Wanted,
+    page: Page,
+    said: fn(&View),
+    view: Option<View>,
+}
+
+impl Pages {
+    /// Nothing is shown before the first run; `said` is called then.
+    pub fn new(wanted: Wanted, page: Page, said: fn(&View)) -> Self {
+        Self {
+            wanted,
+            page,
+            said,
+            view: None,
+        }
+    }
+
+    /// Shows the next run on a rig; `None`: nothing is wanted.
+    ///
+    /// # Errors
+    /// As [`View::of`].
+    pub fn next(&mut self, rig: &mut Rig, setup: &Setup) -> Result<Option<&mut View>, Failure> {
+        if !self.wanted.is_any() {
+            return Ok(None);
+        }
+        if let Some(view) = &mut self.view {
+            view.follow(rig);
+        } else {
+            let view = View::of(&self.wanted, rig, setup, &self.page)?;
+            (self.said)(&view);
+            self.view = Some(view);
+        }
+        Ok(self.view.as_mut())
+    }
+
+    /// Nothing follows any more, for a reason in a sentence.
+    pub fn over(&mut self, reason: &str) {
+        if let Some(watcher) = self.view.as_mut().and_then(|view| view.watcher.as_mut()) {
+            watcher.over(false, reason);
+        }
+    }
+}
+
+/// Where and how a page is served: beside the loop, by the ordinary scheduler.
+pub(super) fn config(at: ViewAddress, film: Option<Film>) -> ServerConfig {
+    ServerConfig {
+        address: at.address,
+        beyond_this_machine: at.beyond_this_machine,
+        on_thread: Some(Arc::new(beside_the_loop)),
+        film,
+    }
+}
+
+/// The clips of a run folder that is not known yet.
+fn film(run: &Arc<OnceLock<PathBuf>>) -> Film {
+    let run = Arc::clone(run);
+    Arc::new(move |name| film_of(run.get()?, name))
+}
+
+/// A clip of a run folder, as the page takes it.
+pub(super) fn film_of(run: &Path, name: &str) -> Option<Vec<u8>> {
+    let film = clips::read(run, name, FILM_FRAMES).ok()?;
+    Some(film.to_bytes())
+}
+
+fn lock(addressee: &Addressee) -> std::sync::MutexGuard<'_, Arc<Operator>> {
+    addressee.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+fn act(command: Command, addressee: &Addressee, noted: &Sender<String>) {
+    let operator = lock(addressee);
+    match command {
+        // A freeze that does not end the run: whoever looks on may want to go on.
+        Command::Freeze | Command::Pause => {
+            let _ = operator.change(Request::None, Request::Pause)
+                || operator.change(Request::Skip, Request::Pause);
+        }
+        Command::Resume => {
+            let _ = operator.change(Request::Pause, Request::None);
+        }
+        Command::Park => operator.ask(Request::Park),
+        Command::Skip => {
+            let _ = operator.change(Request::None, Request::Skip)
+                || operator.change(Request::Pause, Request::Skip);
+        }
+        Command::Target { um } => operator.steer(um),
+        // The run is over: nobody takes notes any more.
+        Command::Note { text } => drop(noted.send(text)),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_freeze_or_a_skip_on_the_page_never_undoes_a_stop() {
+        let operator = Arc::new(Operator::default());
+        let addressee: Addressee = Arc::new(Mutex::new(Arc::clone(&operator)));
+        let (noted, _notes) = channel();
+        let ask = |command| {
+            act(command, &addressee, &noted);
+            operator.asked()
+        };
+        assert_eq!(ask(Command::Freeze), Request::Pause);
+        assert_eq!(ask(Command::Resume), Request::None);
+        assert_eq!(ask(Command::Park), Request::Park);
+        for command in [Command::Freeze, Command::Resume, Command::Skip] {
+            assert_eq!(ask(command), Request::Park);
+        }
+    }
+}

@@ -1,0 +1,166 @@
+//! A command with a live page, and what its tests ask of the page.
+
+use cellpos_tests::browser::Browser;
+use cellpos_tests::programs;
+use std::io::{BufRead, BufReader};
+use std::path::Path;
+use std::process::{Child, Command, ExitStatus, Stdio};
+use std::time::{Duration, Instant};
+
+/// The page says that the loop is closed, or that the PZT is moved.
+pub const RUNNING: &str = "return document.body.dataset.state === 'running'";
+
+/// A command with a live page.
+pub struct Watched {
+    pub child: Child,
+    /// The link to act; none of a page that may look only.
+    pub operator: String,
+    /// The link to look.
+    pub viewer: String,
+}
+
+impl Watched {
+    /// A command that prints both links.
+    pub fn start(folder: &Path, line: &str) -> Self {
+        let mut command = programs::cellpos(folder, line);
+        command.stdin(Stdio::null());
+        Self::printing(command, &["to act:", "to look:"])
+    }
+
+    /// `cellpos watch`: a page that may look only.
+    pub fn looking(folder: &Path, line: &str) -> Self {
+        let mut command = programs::cellpos(folder, line);
+        command.stdin(Stdio::null());
+        Self::printing(command, &["to look:"])
+    }
+
+    /// A command that prints both links and reads standard input, which stays open.
+    pub fn open(folder: &Path, line: &str) -> Self {
+        let mut command = programs::cellpos(folder, line);
+        command.stdin(Stdio::piped());
+        Self::printing(command, &["to act:", "to look:"])
+    }
+
+    fn printing(mut command: Command, links: &[&str]) -> Self {
+        let mut child = command
+            .stderr(Stdio::piped())
+            .stdout(Stdio::null())
+            .spawn()
+            .expect("cellpos starts");
+        let mut lines = BufReader::new(child.stderr.take().expect("piped")).lines();
+        let mut found: Vec<String> = (links.iter())
+            .map(|what| {
+                lines
+                    .find_map(|line| Some(line.ok()?.split_once(what)?.1.trim().to_string()))
+                    .expect("cellpos prints its links")
+            })
+            .collect();
+        // What it prints further must not fill the pipe.
+        std::thread::spawn(move || lines.for_each(drop));
+        Self {
+            child,
+            viewer: found.pop().expect("a link to look"),
+            operator: found.pop().unwrap_or_default(),
+        }
+    }
+
+    pub fn ended(mut self) -> ExitStatus {
+        let deadline = Instant::now() + programs::PATIENCE;
+        loop {
+            if let Some(status) = self.child.try_wait().expect("a child") {
+                return status;
+            }
+            assert!(Instant::now() < deadline, "the run did not end");
+            std::thread::sleep(Duration::from_millis(20));
+        }
+    }
+}
+
+impl Drop for Watched {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+/// Waits until something on the page says so.
+pub fn shows(page: &Browser, id: &str, pattern: &str) {
+    page.wait_for(
+        &format!("return /{pattern}/.test(document.getElementById('{id}').textContent)"),
+        programs::PATIENCE,
+    );
+}
+
+/// Pictures of a page as it is, light and dark, on a wide and a narrow window, to be looked at.
+pub fn portraits(url: &str, name: &str) {
+    for width in [1400, 400] {
+        let page = Browser::start(width, if width > 1000 { 1900 } else { 3600 });
+        page.open(url);
+        page.wait_for(
+            "return document.getElementById('f-time').textContent !== '-'",
+            programs::PATIENCE,
+        );
+        std::thread::sleep(Duration::from_secs(3));
+        for theme in ["light", "dark"] {
+            page.run(&format!(
+                "document.documentElement.dataset.theme = '{theme}'"
+            ));
+            std::thread::sleep(Duration::from_millis(700));
+            page.screenshot(&pictures().join(format!("{name}-{width}-{theme}.png")));
+            let wide = page.run("return document.documentElement.scrollWidth <= innerWidth");
+            assert_eq!(wide, true, "{name}: wider than {width} px");
+        }
+        assert_eq!(page.console(), Vec::<String>::new());
+    }
+}
+
+/// The folder of the only run below `runs`, and the summary in its `run.toml`.
+pub fn only_run(folder: &Path) -> (std::path::PathBuf, toml::Table) {
+    let runs = std::fs::read_dir(folder.join("runs")).unwrap().flatten();
+    let found: Vec<_> = runs.map(|entry| entry.path()).collect();
+    let [run] = found.as_slice() else {
+        panic!("{found:?}");
+    };
+    let text = std::fs::read_to_string(run.join("run.toml")).unwrap();
+    let meta: toml::Table = text.parse().unwrap();
+    let summary = meta["end"]["summary"].as_table().unwrap().clone();
+    (run.clone(), summary)
+}
+
+/// What the page says is what the run's summary says: counts, error, and the tails of the ticks' times.
+pub fn says_the_summary(page: &Browser, summary: &toml::Table) {
+    for (id, key) in [
+        ("f-late", "late"),
+        ("f-skipped", "skipped"),
+        ("f-lost", "frames_lost"),
+        ("f-stale", "stale"),
+        ("f-coasted", "coasted"),
+    ] {
+        let counted = summary[key].as_integer().unwrap().to_string();
+        assert_eq!(page.text_of(id), counted, "{key}");
+    }
+    let rms = summary["rms_measured_nm"].as_float().unwrap();
+    assert_eq!(page.text_of("f-rms"), format!("{rms:.1} nm"));
+    let tail = |key: &str| {
+        let value = &summary[key]["p999"];
+        let us = value.as_float().or(value.as_integer().map(|n| n as f64));
+        us.expect("a time").round()
+    };
+    let text = page.text_of("lateness-text");
+    let told: Vec<f64> = (text.split_whitespace())
+        .filter_map(|word| word.parse().ok())
+        .filter(|number| *number != 99.9)
+        .collect();
+    let expected = [tail("wake_us"), tail("tick_us")];
+    assert!(
+        told.len() == 2 && told.iter().zip(expected).all(|(a, b)| (a - b).abs() <= 1.0),
+        "{text}: {expected:?}"
+    );
+}
+
+/// Where pictures of the page are kept, to be looked at.
+pub fn pictures() -> std::path::PathBuf {
+    let folder = programs::folder().join("live-page");
+    std::fs::create_dir_all(&folder).expect("a folder for pictures");
+    folder
+}
