@@ -41,7 +41,8 @@ impl Watched {
         Self::printing(command, &["to act:", "to look:"])
     }
 
-    fn printing(mut command: Command, links: &[&str]) -> Self {
+    /// A command that prints the links behind these words.
+    pub fn printing(mut command: Command, links: &[&str]) -> Self {
         let mut child = command
             .stderr(Stdio::piped())
             .stdout(Stdio::null())

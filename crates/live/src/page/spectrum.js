@@ -165,7 +165,7 @@ export function drawCycles(canvas, cycles) {
     const top = n * tall + 3;
     const x = c => left + (c - 1) / (end - 1) * (width - left - 8), y = v => top + (high - v) / (high - low) * (tall - 8);
     context.strokeStyle = colour("line"); context.fillStyle = colour("quiet"); context.textAlign = "right"; context.textBaseline = "middle";
-    for (const v of steps(low, high, 2)) {
+    for (const v of steps(low, high, 3)) {
       context.beginPath(); context.moveTo(left, y(v)); context.lineTo(width - 8, y(v)); context.stroke();
       context.fillText(number(v, high - low), left - 5, y(v));
     }

@@ -49,7 +49,9 @@ pub(super) fn screen(
     }
     if !history.cycles.is_empty() && area.width >= COLUMNS_FOR_CYCLES {
         let [left, right] =
-            Layout::horizontal([Constraint::Min(20), Constraint::Length(38)]).areas(log);
+            Layout::horizontal([Constraint::Min(20), Constraint::Length(36)])
+                .spacing(2)
+                .areas(log);
         event_lines(frame, left, history);
         cycle_table(frame, right, history);
     } else {
@@ -250,6 +252,10 @@ fn trace(frame: &mut Frame<'_>, area: Rect, history: &History, panel: &Panel) {
     });
     let quiet = Style::new().fg(Color::Gray);
     let label = |value: f64| Span::raw(format!("{value:>7.2}"));
+    let mut title: Vec<Span<'_>> = (panel.lines.iter())
+        .map(|(name, colour, _)| Span::raw(format!("{name} ")).fg(*colour))
+        .collect();
+    title.push(Span::raw(panel.unit));
     let chart = Chart::new(sets.collect())
         .x_axis(
             Axis::default()
@@ -259,7 +265,7 @@ fn trace(frame: &mut Frame<'_>, area: Rect, history: &History, panel: &Panel) {
         )
         .y_axis(
             Axis::default()
-                .title(panel.unit)
+                .title(Line::from(title))
                 .bounds([low, high])
                 .labels([label(low), label(high)])
                 .style(quiet),
@@ -392,6 +398,7 @@ mod tests {
             "1.987",
             "f freeze, q stop",
             "-10 s",
+            "target position um",
         ] {
             assert!(text.contains(part), "{part}\n{text}");
         }
