@@ -104,6 +104,15 @@ impl Browser {
         self.on_session("POST", "/url", &json!({ "url": url }));
     }
 
+    /// Shows the page as on a screen of this size, px; a window has a least width.
+    pub fn resize(&self, width: u32, height: u32) {
+        let size = json!({
+            "width": width, "height": height, "deviceScaleFactor": 1, "mobile": width < 600,
+        });
+        let body = json!({ "cmd": "Emulation.setDeviceMetricsOverride", "params": size });
+        self.on_session("POST", "/goog/cdp/execute", &body);
+    }
+
     /// What a script returns.
     pub fn run(&self, script: &str) -> Value {
         let body = json!({ "script": script, "args": [] });

@@ -66,6 +66,14 @@ impl Followed {
         }
     }
 
+    /// Outline of the cell that was taken, px; empty for a bead.
+    fn outline(&self, cell: Option<&Cell>) -> &[(f64, f64)] {
+        match (self, cell) {
+            (Self::Cell(tracker), Some(cell)) => tracker.outline(cell),
+            _ => &[],
+        }
+    }
+
     fn step(
         &mut self,
         frame: &Frame,
@@ -210,6 +218,7 @@ impl<C: Camera> VisionSource<C> {
             stamp: *stamp,
             centre_px: taken.then_some((step.fix.x_px, step.fix.y_px)),
             half_px: self.followed.half_px(cell),
+            outline_px: self.followed.outline(cell),
             expected_px: (step.x_px, step.y_px),
             expected_sd_px: step.sd_px,
             scale: self.calibration.picture_scale(),

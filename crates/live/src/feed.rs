@@ -1,6 +1,6 @@
 //! From the threads of a run to the page, without waiting.
 
-use crate::row::{PICTURE_MARGIN, Picture, Row};
+use crate::row::{OUTLINE_POINTS, PICTURE_MARGIN, Picture, Row};
 use crate::state::{ClipLine, CycleRow, EventLine, Hello, State};
 use rtrb::{Consumer, Producer, RingBuffer};
 
@@ -82,6 +82,7 @@ impl Feed {
                 first_um: f32::NAN,
                 centre_px: [f32::NAN; 2],
                 half_px: [f32::NAN; 2],
+                outline_px: Vec::with_capacity(if hello.pictures { OUTLINE_POINTS } else { 0 }),
                 gate_px: f32::NAN,
                 time_s: f32::NAN,
             });
@@ -172,7 +173,7 @@ impl PictureFeed {
     }
 
     /// Fills a picture and sends it. `fill` gets an empty vector with room for [`PICTURE_MARGIN`] pixels within
-    /// [`Picture::pixels`], so that it need not allocate. Without an empty picture, or with one that makes no sense, none is sent.
+    /// [`Picture::pixels`], and for [`OUTLINE_POINTS`] points of an outline, so that it need not allocate. Without an empty picture, or with one that makes no sense, none is sent.
     pub fn offer(&mut self, time_s: f64, fill: impl FnOnce(&mut Picture)) {
         self.next_s = time_s + PICTURE_EVERY_S;
         let Ok(mut picture) = self.empty.pop() else {
@@ -180,6 +181,7 @@ impl PictureFeed {
             return;
         };
         picture.pixels.clear();
+        picture.outline_px.clear();
         fill(&mut picture);
         picture.time_s = time_s as f32;
         // As many pictures exist as the ring has room for.

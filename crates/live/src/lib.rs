@@ -47,6 +47,6 @@ pub use access::{Role, Secrets};
 pub use command::{Command, CommandError};
 pub use feed::{Feed, FeedHub, Line, Lost, PictureFeed};
 pub use film::{Film, FilmFrame, film_bytes};
-pub use row::{PICTURE_MARGIN, Picture, Row};
+pub use row::{OUTLINE_POINTS, PICTURE_MARGIN, Picture, Row};
 pub use server::{LiveError, MOST_CLIENTS, Server, ServerConfig};
 pub use state::{Banner, ClipLine, CycleRow, EventLine, Hello, State};

@@ -7,6 +7,9 @@ pub(crate) const PICTURE_HEAD: usize = 40;
 /// Largest picture, pixels: a crop, not a frame.
 pub const PICTURE_MARGIN: usize = 512 * 512;
 
+/// Most points of an outline.
+pub const OUTLINE_POINTS: usize = 200;
+
 /// One tick as the page draws it. Numbers that do not exist are NaN.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Row {
@@ -96,6 +99,8 @@ pub struct Picture {
     pub centre_px: [f32; 2],
     /// Half width of what is drawn around it, px, along columns and rows.
     pub half_px: [f32; 2],
+    /// Outline of the cell, px; empty for a bead.
+    pub outline_px: Vec<[f32; 2]>,
     /// Half width of the gate in which it is looked for, px; NaN without one.
     pub gate_px: f32,
     /// Time since the start of the run, s.
@@ -107,7 +112,8 @@ impl Picture {
     pub(crate) fn encode(&self, out: &mut Vec<u8>) {
         out.extend(self.width.to_le_bytes());
         out.extend(self.height.to_le_bytes());
-        out.extend([u8::from(self.upright), 0, 0, 0]);
+        let points = self.outline_px.len().min(OUTLINE_POINTS);
+        out.extend([u8::from(self.upright), points as u8, 0, 0]);
         for value in [
             self.um_per_px,
             self.first_um,
@@ -121,6 +127,13 @@ impl Picture {
             out.extend(value.to_le_bytes());
         }
         out.extend(&self.pixels);
+        if points > 0 {
+            // The page reads them as they lie: at a multiple of their size.
+            out.resize(out.len().next_multiple_of(4), 0);
+            for value in self.outline_px.iter().take(points).flatten() {
+                out.extend(value.to_le_bytes());
+            }
+        }
     }
 
     /// Whether size and pixels agree and the crop is small enough to be sent.
@@ -149,11 +162,19 @@ mod tests {
             first_um: -1.0,
             centre_px: [1.0, 0.5],
             half_px: [2.0, 2.0],
+            outline_px: vec![],
             gate_px: f32::NAN,
             time_s: 0.5,
         };
         assert!(picture.is_sound());
         picture.encode(&mut bytes);
         assert_eq!(bytes.len(), PICTURE_HEAD + 6);
+        bytes.clear();
+        let outlined = Picture {
+            outline_px: vec![[0.5, 1.0]; OUTLINE_POINTS + 1],
+            ..picture
+        };
+        outlined.encode(&mut bytes);
+        assert_eq!(bytes.len(), PICTURE_HEAD + 8 + 8 * OUTLINE_POINTS);
     }
 }

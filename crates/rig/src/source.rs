@@ -145,6 +145,8 @@ pub struct SeenFrame<'a> {
     pub centre_px: Option<(f64, f64)>,
     /// Half its width along the columns and the rows, px.
     pub half_px: (f64, f64),
+    /// Outline of the cell, px; empty for a bead, or when none was taken.
+    pub outline_px: &'a [(f64, f64)],
     /// Where it was expected, px.
     pub expected_px: (f64, f64),
     /// Standard deviation of that place, px; infinite while it is looked for everywhere.

@@ -34,7 +34,8 @@ fn reached(csv: &str, target_um: f64) -> bool {
     })
 }
 
-const RUNNING_OR_OVER: &str = "return !['connecting', 'armed'].includes(document.body.dataset.state)";
+const RUNNING_OR_OVER: &str =
+    "return !['connecting', 'armed'].includes(document.body.dataset.state)";
 
 const SCRIPT: &str = r#"
 name = "shown"
@@ -246,12 +247,18 @@ fn clips_are_played_and_a_name_of_evil_intent_is_text() {
     page.open(&watch.viewer);
     page.wait_for(RUNNING_OR_OVER, programs::PATIENCE);
     assert_eq!(page.text_of("name"), evil);
-    assert_eq!(page.run("return document.querySelectorAll('img').length"), 0);
+    assert_eq!(
+        page.run("return document.querySelectorAll('img').length"),
+        0
+    );
     assert_ne!(page.run("return document.title"), "evil");
     shows(&page, "clips", "frozen");
     page.run("document.querySelector('#clips button').click()");
     shows(&page, "clip-text", "frozen: frame [0-9]+ of [0-9]+, at");
-    let report = programs::cellpos(folder.path(), "report").arg(&found).output().unwrap();
+    let report = programs::cellpos(folder.path(), "report")
+        .arg(&found)
+        .output()
+        .unwrap();
     assert!(report.status.success(), "{report:?}");
     let text = std::fs::read_to_string(found.join("report.html")).unwrap();
     assert!(

@@ -24,8 +24,9 @@ fn an_identification_is_seen_freezes_and_parks_and_keeps_what_is_finished() {
     page.screenshot(&pictures().join("identify.png"));
     page.click_until("freeze", &["frozen"]);
     page.click_until("resume", &["running"]);
-    page.click_until("park", &["safe", "over"]);
+    // Before the program is gone, and the page looks for it in vain.
     assert_eq!(page.console(), Vec::<String>::new());
+    page.click_until("park", &["safe", "over"]);
     let status = run.ended();
     assert_eq!(status.code(), Some(1));
     let kept = std::fs::read_to_string(folder.path().join("model.partial.json")).unwrap();
@@ -59,10 +60,11 @@ fn a_pzt_moved_by_hand_is_seen_goes_where_the_page_says_freezes_and_parks() {
     page.click_until("resume", &["running"]);
     shows(&page, "gauge-text", "PZT 30[.]000");
     shows(&page, "events", "PZT at 30");
+    // Before the program is gone, and the page looks for it in vain.
+    assert_eq!(page.console(), Vec::<String>::new());
     page.click_until("park", &["safe", "over"]);
     let stdin = run.child.stdin.take();
     let status = run.ended();
     drop(stdin);
     assert!(status.success(), "{status}");
-    assert_eq!(page.console(), Vec::<String>::new());
 }

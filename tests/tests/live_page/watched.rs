@@ -94,8 +94,9 @@ pub fn shows(page: &Browser, id: &str, pattern: &str) {
 
 /// Pictures of a page as it is, light and dark, on a wide and a narrow window, to be looked at.
 pub fn portraits(url: &str, name: &str) {
-    for width in [1400, 400] {
-        let page = Browser::start(width, if width > 1000 { 1900 } else { 3600 });
+    for (width, height) in [(1400, 1900), (400, 3600)] {
+        let page = Browser::start(1400, 1000);
+        page.resize(width, height);
         page.open(url);
         page.wait_for(
             "return document.getElementById('f-time').textContent !== '-'",

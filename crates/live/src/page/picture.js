@@ -16,7 +16,7 @@ export class PictureView {
   draw() {
     const { picture, canvas } = this;
     if (!picture) return;
-    const { width, height, pixels, upright, umPerPx, firstUm, centre, half, gate } = picture;
+    const { width, height, pixels, upright, umPerPx, firstUm, centre, half, gate, outline } = picture;
     const scale = Math.max(1, Math.round(canvas.clientWidth * (window.devicePixelRatio || 1) / width));
     if (canvas.width !== width * scale || canvas.height !== height * scale) { canvas.width = width * scale; canvas.height = height * scale; }
     const context = canvas.getContext("2d");
@@ -45,7 +45,13 @@ export class PictureView {
     if (isFinite(centre[0])) {
       const cx = (centre[0] + 0.5) * scale, cy = (centre[1] + 0.5) * scale;
       context.strokeStyle = "#5ad1ff"; context.beginPath();
-      context.ellipse(cx, cy, Math.max(2, half[0] * scale), Math.max(2, half[1] * scale), 0, 0, 2 * Math.PI); context.stroke();
+      if (outline.length) {
+        for (let n = 0; n < outline.length; n += 2) context.lineTo((outline[n] + 0.5) * scale, (outline[n + 1] + 0.5) * scale);
+        context.closePath();
+      } else {
+        context.ellipse(cx, cy, Math.max(2, half[0] * scale), Math.max(2, half[1] * scale), 0, 0, 2 * Math.PI);
+      }
+      context.stroke();
       if (isFinite(gate)) {
         context.strokeStyle = "rgba(255,255,255,.55)"; context.setLineDash([2, 4]);
         const along = upright ? cy : cx; across(along - gate * scale); across(along + gate * scale); context.setLineDash([]);

@@ -18,10 +18,15 @@ export function steps(low, high, most) {
   const raw = (high - low) / most;
   if (!(raw > 0) || !isFinite(raw)) return [];
   const power = Math.pow(10, Math.floor(Math.log10(raw)));
-  const step = [1, 2, 5, 10].map(n => n * power).find(s => s >= raw) ?? 10 * power;
-  const found = [];
-  for (let n = Math.ceil(low / step - 1e-9); n * step <= high + 1e-9 * step; n++) found.push(n * step);
-  return found;
+  const sizes = [0.5, 1, 2, 5, 10].map(n => n * power), round = sizes.findIndex(s => s >= raw * (1 - 1e-9));
+  const at = step => {
+    const found = [];
+    for (let n = Math.ceil(low / step - 1e-9); n * step <= high + 1e-9 * step; n++) found.push(n * step);
+    return found;
+  };
+  // One value alone says nothing of the scale.
+  const found = at(sizes[round]);
+  return found.length > 1 || round < 1 ? found : at(sizes[round - 1]);
 }
 
 // Powers of ten of a logarithmic axis, short enough for a phone.

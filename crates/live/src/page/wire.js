@@ -58,10 +58,12 @@ export class Rows {
 
 export function readPicture(view) {
   const f = n => view.getFloat32(12 + 4 * n, true);
-  const width = view.getUint16(4, true), height = view.getUint16(6, true);
+  const width = view.getUint16(4, true), height = view.getUint16(6, true), points = view.getUint8(9);
+  const behind = 4 + PICTURE_HEAD + Math.ceil(width * height / 4) * 4;
   return {
     width, height, upright: view.getUint8(8) !== 0, umPerPx: f(0), firstUm: f(1), centre: [f(2), f(3)], half: [f(4), f(5)],
     gate: f(6), time: f(7), pixels: new Uint8Array(view.buffer, 4 + PICTURE_HEAD, width * height),
+    outline: points ? new Float32Array(view.buffer, behind, 2 * points) : [],
   };
 }
 

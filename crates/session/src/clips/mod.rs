@@ -307,6 +307,7 @@ mod tests {
             },
             centre_px: Some((32.0, 8.0)),
             half_px: (5.0, 5.0),
+            outline_px: &[],
             expected_px: (32.0, 8.0),
             expected_sd_px: 1.0,
             scale: PictureScale {

@@ -48,10 +48,9 @@ pub(super) fn screen(
         trace(frame, traces, history, &POSITION);
     }
     if !history.cycles.is_empty() && area.width >= COLUMNS_FOR_CYCLES {
-        let [left, right] =
-            Layout::horizontal([Constraint::Min(20), Constraint::Length(36)])
-                .spacing(2)
-                .areas(log);
+        let [left, right] = Layout::horizontal([Constraint::Min(20), Constraint::Length(36)])
+            .spacing(2)
+            .areas(log);
         event_lines(frame, left, history);
         cycle_table(frame, right, history);
     } else {

@@ -1,7 +1,7 @@
 //! What the live page shows of the camera's frames.
 
 use crate::crop::{self, Crop};
-use cellpos_live::{Picture, PictureFeed};
+use cellpos_live::{OUTLINE_POINTS, Picture, PictureFeed};
 use cellpos_rig::{FrameWatch, SeenFrame};
 use cellpos_vision::Pixels;
 use std::sync::mpsc::Sender;
@@ -89,6 +89,12 @@ fn crop(seen: &SeenFrame<'_>, picture: &mut Picture) {
         let (x, y) = crop.place(centre);
         [x as f32, y as f32]
     });
+    picture.outline_px.clear();
+    let points = seen.outline_px.iter().take(OUTLINE_POINTS);
+    picture.outline_px.extend(points.map(|point| {
+        let (x, y) = crop.place(*point);
+        [x as f32, y as f32]
+    }));
     picture.half_px = [seen.half_px.0 as f32, seen.half_px.1 as f32];
     picture.gate_px = if seen.expected_sd_px.is_finite() {
         (4.0 * seen.expected_sd_px) as f32
@@ -124,6 +130,7 @@ mod tests {
             },
             centre_px: Some((900.0, 32.0)),
             half_px: (5.0, 5.0),
+            outline_px: &[(899.0, 31.0), (901.0, 31.0), (900.0, 33.0)],
             expected_px: (900.0, 32.0),
             expected_sd_px: f64::INFINITY,
             scale: cellpos_rig::PictureScale {
@@ -145,6 +152,8 @@ mod tests {
         assert_eq!((picture.width, picture.height), (384, 64));
         let [x, y] = picture.centre_px;
         assert_eq!(picture.pixels[y as usize * 384 + x as usize], 250);
+        assert_eq!(picture.outline_px[0], [x - 1.0, y - 1.0]);
+        assert_eq!(picture.outline_px.len(), 3);
         let um = picture.first_um + picture.um_per_px * x;
         assert!((um - 80.0).abs() < 1e-3, "{um}");
     }

@@ -70,6 +70,13 @@ impl CellTracker {
         })
     }
 
+    /// Outline (px) of a cell of the last frame; empty where it is not kept.
+    pub fn outline(&self, cell: &Cell) -> &[(f64, f64)] {
+        let same = |found: &Cell| (found.x_px, found.y_px) == (cell.x_px, cell.y_px);
+        let number = self.finder.found().iter().position(same);
+        number.map_or(&[], |k| self.finder.outline(k))
+    }
+
     /// Where the tracker stands.
     pub fn state(&self) -> TrackState {
         self.standing.state

@@ -247,6 +247,7 @@ impl Eyes {
             stamp,
             centre_px,
             half_px: (half_px, half_px),
+            outline_px: &[],
             expected_px: centre_px.unwrap_or((f64::NAN, f64::NAN)),
             expected_sd_px: f64::INFINITY,
             scale: self.calibration.map_or(
