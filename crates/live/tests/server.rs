@@ -288,3 +288,35 @@ fn dropping_the_server_tells_how_it_ended_and_ends_its_threads_and_connections()
     until(&mut socket, text_with("the last word"));
     while socket.read().is_ok() {}
 }
+
+#[test]
+fn a_clip_is_given_to_whoever_may_look_and_to_nobody_else() {
+    let (_feed, hub) = Feed::new(Hello::default());
+    let film: cellpos_live::Film = Arc::new(|name| (name == "frozen").then(|| vec![7; 100_000]));
+    let config = ServerConfig {
+        film: Some(film),
+        ..ServerConfig::default()
+    };
+    let server = Server::start(&config, hub, |_| ()).unwrap();
+    let get = |path: &str| {
+        let mut stream = TcpStream::connect(server.address()).unwrap();
+        let host = server.address();
+        write!(stream, "GET {path} HTTP/1.1\r\nHost: {host}\r\n\r\n").unwrap();
+        let mut answer = vec![];
+        stream.read_to_end(&mut answer).unwrap();
+        answer
+    };
+    let starts = |answer: &[u8], with: &str| {
+        let head = String::from_utf8_lossy(&answer[..answer.len().min(60)]).into_owned();
+        assert!(head.starts_with(with), "{head}");
+    };
+    let word = word(&server.viewer_url()).to_string();
+    let answer = get(&format!("/clip?word={word}&name=frozen"));
+    starts(&answer, "HTTP/1.1 200");
+    assert!(answer.ends_with(&[7; 100_000]));
+    starts(
+        &get(&format!("/clip?word={word}&name=none")),
+        "HTTP/1.1 404",
+    );
+    starts(&get("/clip?name=frozen"), "HTTP/1.1 403");
+}

@@ -365,6 +365,16 @@ mod tests {
             stack.next_image().unwrap();
         }
         assert_eq!(pages, 51);
+        // As the live page and the report read it back.
+        let found = list(folder.path());
+        assert_eq!((found.len(), found[0].frames), (1, 51));
+        assert_eq!((found[0].name.as_str(), found[0].time_s), ("lost", 0.16));
+        let film = read(folder.path(), "lost", 6).unwrap();
+        let times: Vec<f64> = film.frames.iter().map(|frame| frame.time_s).collect();
+        assert_eq!(times, [0.16, 0.17, 0.18, 0.19, 0.2, 0.21]);
+        assert_eq!((film.width, film.height), (64, 16));
+        assert_eq!(film.frames[5].pixels[0], 210);
+        assert!(read(folder.path(), "../lost", 6).is_err());
     }
 
     #[test]

@@ -107,3 +107,56 @@ impl<S: RunSink + Shown> RunSink for Viewed<S> {
         self.sink.progress(statistics);
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::view::{Hello, Wanted};
+    use cellpos_live::Feed;
+    use cellpos_runtime::NoSink;
+    use cellpos_runtime::live::Operator;
+    use std::sync::Arc;
+
+    #[test]
+    fn a_second_run_on_the_same_page_goes_on_behind_the_first() {
+        let mut view = View::open(
+            &Wanted::default(),
+            Hello::default(),
+            &Arc::new(Operator::default()),
+        )
+        .unwrap();
+        let (feed, mut hub) = Feed::new(Hello::default());
+        view.watcher = Some(Watcher::new(vec![feed]));
+        let run = |view: &mut View| {
+            let mut sink = Viewed::new(NoSink, Some(view));
+            let mut statistics = Statistics::default();
+            for seq in 0..100 {
+                let mut record = TickRecord::unknown();
+                (record.seq, record.time_ns) = (seq, 1_000_000 * seq as i64);
+                (record.wake_ns, record.compute_ns) = (20_000, 7_000);
+                statistics.add(&record);
+                sink.tick(&record);
+            }
+            sink.progress(&statistics);
+            sink.give_back(Some(view));
+        };
+        run(&mut view);
+        run(&mut view);
+        let rows: Vec<_> = std::iter::from_fn(|| hub.next_row()).collect();
+        assert_eq!(rows.len(), 200);
+        assert!(rows.iter().zip(0..).all(|(row, n)| row.seq == n));
+        assert!(rows.windows(2).all(|pair| pair[1].time_s >= pair[0].time_s));
+        let last = std::iter::from_fn(|| hub.next_line()).last();
+        let Some(cellpos_live::Line::State(state)) = last else {
+            panic!("{last:?}");
+        };
+        assert_eq!(state.ticks, 200);
+        // Within the three digits of a histogram.
+        let near =
+            |told: Option<f64>, us: f64| told.is_some_and(|told| (told / us - 1.0).abs() < 0.002);
+        assert!(
+            near(state.wake_us, 20.0) && near(state.compute_us, 7.0),
+            "{state:?}"
+        );
+    }
+}

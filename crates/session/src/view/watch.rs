@@ -302,3 +302,31 @@ fn line(event: &Event) -> EventLine {
         text: words,
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use cellpos_script::ArmKind;
+    use std::io::Write;
+
+    #[test]
+    fn a_table_that_grows_is_read_on_from_where_it_was_left() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join(CYCLES_CSV);
+        let mut read = CyclesRead::default();
+        assert!(read.more(&path).is_empty(), "there is none yet");
+        let mut file = std::fs::File::create(&path).unwrap();
+        let row = |cycle| CycleRow::empty(cycle, 1, ArmKind::Static).to_csv();
+        let numbers = |rows: Vec<CycleRow>| -> Vec<u64> { rows.iter().map(|r| r.cycle).collect() };
+        writeln!(file, "{}\n{}", CycleRow::csv_head(), row(0)).unwrap();
+        assert_eq!(numbers(read.more(&path)), [0]);
+        assert!(read.more(&path).is_empty(), "none twice");
+        // A row that is not whole yet is read when it is.
+        let (second, third) = (row(1), row(2));
+        let (half, rest) = third.split_at(third.len() / 2);
+        write!(file, "{second}\n{half}").unwrap();
+        assert_eq!(numbers(read.more(&path)), [1]);
+        writeln!(file, "{rest}").unwrap();
+        assert_eq!(numbers(read.more(&path)), [2]);
+    }
+}
