@@ -10,6 +10,7 @@ mod identify_rig;
 mod kinds_of_runs;
 mod newcomer;
 mod replay;
+mod screen;
 mod script_faults;
 mod script_runs;
 mod scripts;
