@@ -77,7 +77,7 @@ fn main() {
     let mut turns: Vec<(Condition, Turn)> = vec![];
     for round in 0..rounds as usize {
         let mut order = Condition::ALL;
-        order.rotate_left(round % order.len());
+        order.rotate_left(round % Condition::ALL.len());
         for condition in order {
             let turn = turn(condition, seconds);
             println!(

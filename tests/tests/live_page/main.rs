@@ -254,7 +254,7 @@ fn clips_are_played_and_a_name_of_evil_intent_is_text() {
     assert_ne!(page.run("return document.title"), "evil");
     shows(&page, "clips", "frozen");
     page.run("document.querySelector('#clips button').click()");
-    shows(&page, "clip-text", "frozen: frame [0-9]+ of [0-9]+, at");
+    shows(&page, "clip-text", "frame [0-9]+ of [0-9]+, at");
     let report = programs::cellpos(folder.path(), "report")
         .arg(&found)
         .output()

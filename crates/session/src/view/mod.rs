@@ -9,6 +9,7 @@ mod cycle;
 mod hello;
 mod live_view;
 mod pictures;
+mod tail;
 mod viewed;
 mod watch;
 mod watcher;

@@ -151,9 +151,9 @@ mod tests {
             panic!("{last:?}");
         };
         assert_eq!(state.ticks, 200);
-        // Within the three digits of a histogram.
+        // Within a step of the tail.
         let near =
-            |told: Option<f64>, us: f64| told.is_some_and(|told| (told / us - 1.0).abs() < 0.002);
+            |told: Option<f64>, us: f64| told.is_some_and(|told| (told / us - 1.0).abs() < 0.017);
         assert!(
             near(state.wake_us, 20.0) && near(state.compute_us, 7.0),
             "{state:?}"

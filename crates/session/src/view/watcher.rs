@@ -1,8 +1,8 @@
 //! What page and screen are told of a run, from what its recorder is given.
 
+use super::tail::Tail;
 use crate::words::{Level, safe_reason, sentence};
 use cellpos_live::{Banner, ClipLine, CycleRow, EventLine, Feed, Row, State};
-use cellpos_runtime::latency::Latency;
 use cellpos_runtime::life::EventKind;
 use cellpos_runtime::{Event, Life, NoSink, Statistics, Summary, TickFlags, TickRecord};
 
@@ -41,8 +41,8 @@ pub(super) struct Watcher {
     pub(super) state: State,
     freeze: String,
     pub(super) safe: String,
-    wake: Latency,
-    compute: Latency,
+    wake: Tail,
+    compute: Tail,
     told: u32,
     /// Ticks and time, s, of the runs before this one on the same page.
     before: (u64, f64),
@@ -56,8 +56,8 @@ impl Watcher {
             state: State::default(),
             freeze: String::new(),
             safe: String::new(),
-            wake: Latency::new(),
-            compute: Latency::new(),
+            wake: Tail::new(),
+            compute: Tail::new(),
             told: 0,
             before: (0, 0.0),
         }
@@ -129,8 +129,8 @@ impl Watcher {
 
     /// Counts a tick.
     pub(super) fn count(&mut self, record: &TickRecord) {
-        self.wake.record(record.wake_ns.into(), record.seq);
-        self.compute.record(record.compute_ns.into(), record.seq);
+        self.wake.add(record.wake_ns);
+        self.compute.add(record.compute_ns);
         let time_s = self.time_s(record.time_ns);
         let state = &mut self.state;
         state.time_s = time_s;
@@ -179,9 +179,9 @@ impl Watcher {
 
     /// The tails of the ticks' times, now and then: they are looked for in all that was counted.
     pub(super) fn tails(&mut self) {
-        if self.told.is_multiple_of(TAILS_EVERY) && self.wake.count() > 0 {
-            self.state.wake_us = Some(self.wake.quantiles_us().p999);
-            self.state.compute_us = Some(self.compute.quantiles_us().p999);
+        if self.told.is_multiple_of(TAILS_EVERY) {
+            self.state.wake_us = self.wake.p999_us();
+            self.state.compute_us = self.compute.p999_us();
         }
         self.told = self.told.wrapping_add(1);
     }
