@@ -72,10 +72,9 @@ fn the_operator_sees_a_moving_bead_and_freezes_steers_and_parks_it() {
         "a bead is on the page {:?} after the command was given",
         begun.elapsed()
     );
-    let places = "const v = document.getElementById('picture'); return v.getContext('2d').getImageData(0, 0, v.width, v.height).data.reduce((sum, value, n) => (sum * 31 + value * (n % 97)) % 1000003, 0)";
-    let first = page.run(places);
+    page.run("window.first = document.getElementById('picture').toDataURL()");
     page.wait_for(
-        &format!("return (() => {{ {places} }})() !== {first}"),
+        "return document.getElementById('picture').toDataURL() !== window.first",
         programs::PATIENCE,
     );
     println!(

@@ -45,11 +45,15 @@ impl<S> Viewed<S> {
 
 impl<S: RunSink + Shown> RunSink for Viewed<S> {
     fn tick(&mut self, record: &TickRecord) {
+        self.sink.tick(record);
         if let Some((watcher, _)) = &mut self.page {
             watcher.show(record);
             watcher.count(record);
+            // A freeze is on the page when it is in force, not with the next look.
+            if watcher.turns(record) {
+                watcher.stands(record, &self.sink);
+            }
         }
-        self.sink.tick(record);
     }
 
     fn event(&mut self, event: &Event) {

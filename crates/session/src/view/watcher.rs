@@ -44,6 +44,8 @@ pub(super) struct Watcher {
     wake: Tail,
     compute: Tail,
     told: u32,
+    /// Life and freeze of the newest tick.
+    standing: (u8, bool),
     /// Ticks and time, s, of the runs before this one on the same page.
     before: (u64, f64),
 }
@@ -59,6 +61,7 @@ impl Watcher {
             wake: Tail::new(),
             compute: Tail::new(),
             told: 0,
+            standing: (0, false),
             before: (0, 0.0),
         }
     }
@@ -140,6 +143,19 @@ impl Watcher {
         state.coasted += u64::from(record.flags.has(TickFlags::COASTING));
     }
 
+    /// Whether a tick stands otherwise than the one before: frozen, parked, or going on.
+    pub(super) fn turns(&mut self, record: &TickRecord) -> bool {
+        let standing = (record.life, record.flags.has(TickFlags::FREEZE));
+        std::mem::replace(&mut self.standing, standing) != standing
+    }
+
+    /// Tells how the run stands after a tick.
+    pub(super) fn stands(&mut self, record: &TickRecord, sink: &impl Shown) {
+        self.state.banner = self.banner(record);
+        sink.complete(&mut self.state);
+        self.tell_state();
+    }
+
     /// Tells an event, and counts what it says.
     pub(super) fn event(&mut self, event: &Event, times: u64) {
         match event.kind {
@@ -171,10 +187,8 @@ impl Watcher {
             return;
         };
         self.state.rms_nm = statistics.rms_measured_nm();
-        self.state.banner = self.banner(record);
-        sink.complete(&mut self.state);
         self.tails();
-        self.tell_state();
+        self.stands(record, sink);
     }
 
     /// The tails of the ticks' times, now and then: they are looked for in all that was counted.
