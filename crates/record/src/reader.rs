@@ -2,7 +2,6 @@
 
 use crate::error::RecordError;
 use crate::events::{Events, read_events};
-use crate::export::columns::Row;
 use crate::export::seconds;
 use crate::meta::RunMeta;
 use crate::stream::Stream;
@@ -166,31 +165,18 @@ impl RunReader {
 
     /// The run as a plain record: commanded PZT displacement, and the bead position that the camera had delivered
     /// when the command was given (so the camera's delay is in it, as in any record of two instruments). Missing rows
-    /// are filled: the command is held, the bead not seen.
+    /// are filled: the command is held, the bead not seen. Takes 24 bytes a row; an export has the other columns.
     ///
     /// # Errors
     /// [`RecordError`] when the rows cannot be read, [`cellpos_table::Problem::TooShort`] with fewer than two of them.
     pub fn to_record(&self) -> Result<Record, RecordError> {
         let mut batches = self.batches()?;
-        let columns = crate::export::numbers();
         let mut time_s = Vec::new();
         let (mut pzt_um, mut bead_um) = (Vec::new(), Vec::new());
-        let mut more: Vec<(String, Vec<f64>)> = columns
-            .iter()
-            .map(|column| (column.name.to_owned(), Vec::new()))
-            .collect();
         for tick in batches.by_ref().flatten() {
             time_s.push(seconds(tick.time_ns));
             pzt_um.push(tick.command_um);
             bead_um.push(crate::export::bead_um(&tick));
-            let row = Row {
-                tick,
-                session: 1,
-                offset_ns: 0,
-            };
-            for (column, (_, values)) in columns.iter().zip(&mut more) {
-                values.push(column.number(&row));
-            }
         }
         // Rows have numbers: jitter of the real clock is no reason to refuse a run.
         const JITTER: f64 = 0.49;
@@ -198,7 +184,7 @@ impl RunReader {
             &self.folder,
             &time_s,
             [pzt_um, bead_um],
-            more,
+            vec![],
             JITTER,
         )?)
     }

@@ -20,8 +20,7 @@ struct State {
     asked: u64,
     done: u64,
     busy_since: Option<Instant>,
-    /// When the oldest of the syncs that are running, and of those that still wait for their turn, was asked for.
-    running_since: Option<Instant>,
+    /// When a sync was asked for that waits for its turn.
     waiting_since: Option<Instant>,
     slowest: Duration,
     failed: Option<io::Error>,
@@ -57,11 +56,15 @@ impl Shared {
                 let asked = state.asked;
                 let from = Instant::now();
                 state.busy_since = Some(from);
-                state.running_since = state.waiting_since.take();
+                state.waiting_since = None;
                 drop(state);
                 let synced = sync();
                 state = self.lock();
-                (state.busy_since, state.running_since) = (None, None);
+                state.busy_since = None;
+                // What was asked for meanwhile waits from now on: the disk has just shown that it works.
+                if state.waiting_since.is_some() {
+                    state.waiting_since = Some(Instant::now());
+                }
                 state.slowest = state.slowest.max(from.elapsed());
                 state.done = asked;
                 if let Err(error) = synced {
@@ -94,13 +97,14 @@ impl SyncedFile {
         Self { file, shared: None }
     }
 
-    /// How long the oldest of what was to be synced has been waiting for the disk's answer.
+    /// How long the disk has been at a sync without an answer. What is asked for while a sync runs waits for the next one: the
+    /// rows at stake may be older, by as long as the sync before took.
     pub(crate) fn unconfirmed(&self) -> Duration {
         let Some(shared) = &self.shared else {
             return Duration::ZERO;
         };
         let state = shared.lock();
-        let since = state.running_since.or(state.waiting_since);
+        let since = state.busy_since.or(state.waiting_since);
         since.map_or(Duration::ZERO, |at| at.elapsed())
     }
 
@@ -238,21 +242,21 @@ mod tests {
     }
 
     #[test]
-    fn what_is_unconfirmed_is_as_old_as_the_oldest_sync_that_was_asked_for() {
+    fn a_disk_that_answers_is_none_that_has_stopped_however_much_waits_for_it() {
         let (mut file, end, begins) = held();
         assert_eq!(file.unconfirmed(), Duration::ZERO);
         let first = Instant::now();
         file.sync().unwrap();
         begins.recv().unwrap();
         std::thread::sleep(Duration::from_millis(40));
-        let second = Instant::now();
         file.sync().unwrap();
-        // The first one is older, and still runs.
+        // The first one still runs.
         assert!(file.unconfirmed() >= Duration::from_millis(40));
         assert!(file.unconfirmed() <= first.elapsed());
+        let second = Instant::now();
         end.send(Ok(())).unwrap();
         begins.recv().unwrap();
-        // What was asked for meanwhile is being synced now: its age counts from when it was asked for.
+        // The disk has answered: its time counts anew, though what is being synced now was asked for before.
         assert!(file.unconfirmed() <= second.elapsed());
         end.send(Ok(())).unwrap();
         file.settle(LAST_PATIENCE).unwrap();

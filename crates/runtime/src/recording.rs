@@ -61,7 +61,7 @@ impl RecorderFault {
 /// nothing of what was written, but a power failure would.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Unconfirmed {
-    /// How long the oldest of it has been waiting for the disk's answer; zero where none is waited for.
+    /// How long the disk has been asked to confirm it without an answer to anything; zero where none is waited for.
     pub since: Duration,
     /// Rows.
     pub rows: u64,

@@ -421,27 +421,30 @@ fn read_run(path: &Path) -> Result<(Record, Option<f64>), Failure> {
     let time_s: Vec<f64> = (0..record.len())
         .map(|k| record.start_s + k as f64 * record.step_s)
         .collect();
-    let (ticks, _) = run.ticks().map_err(Failure::input)?;
     let mut read = Record::from_rows(&record_name(path), &time_s, &record.pzt_um, &record.bead_um)
         .map_err(refused)?;
-    let first_seq = ticks.first().map_or(0, |t| t.seq);
-    for tick in ticks.iter().filter(|t| is_unseen(t)) {
-        let row = usize::try_from(tick.seq.saturating_sub(first_seq)).unwrap_or(usize::MAX);
-        if let Some(unseen) = read.unseen.get_mut(row) {
-            *unseen = true;
+    let mut first_seq = None;
+    // Where the bead of a closed loop rested: the mean of what was commanded while the loop ran, um.
+    let (mut sum_um, mut count) = (0.0, 0_usize);
+    for tick in run.batches().map_err(Failure::input)?.flatten() {
+        let first_seq = *first_seq.get_or_insert(tick.seq);
+        if is_unseen(&tick) {
+            let row = usize::try_from(tick.seq.saturating_sub(first_seq)).unwrap_or(usize::MAX);
+            if let Some(unseen) = read.unseen.get_mut(row) {
+                *unseen = true;
+            }
+        }
+        if held(&tick) {
+            (sum_um, count) = (sum_um + tick.command_um, count + 1);
         }
     }
-    Ok((read, rest_um(&ticks)))
+    // Ten seconds of a held bead move it by less than 10 um: 2 nm of PZT.
+    Ok((read, (count >= 1000).then(|| sum_um / count as f64)))
 }
 
-/// Where the bead of a closed loop rested: the mean of what was commanded while the loop ran, um.
-fn rest_um(ticks: &[TickRecord]) -> Option<f64> {
-    let held = ticks.iter().filter(|t| {
-        t.life == Life::Running as u8 && !t.flags.has(TickFlags::FREEZE) && t.command_um.is_finite()
-    });
-    let (sum_um, count) = held.fold((0.0, 0_usize), |(s, n), t| (s + t.command_um, n + 1));
-    // Ten seconds of a held bead move it by less than 10 um: 2 nm of PZT.
-    (count >= 1000).then(|| sum_um / count as f64)
+/// Whether the loop ran in a tick.
+fn held(t: &TickRecord) -> bool {
+    t.life == Life::Running as u8 && !t.flags.has(TickFlags::FREEZE) && t.command_um.is_finite()
 }
 
 /// Runs hold a bead wherever its rest is, and that is another place every day: where no record comes near the model's

@@ -222,3 +222,146 @@ fn an_identification_keeps_its_segments_as_they_end_whatever_ends_it() {
         }
     }
 }
+
+/// A command that holds a rig, what it needs in its folder, and how to see from outside that it holds it.
+struct Holding {
+    line: &'static str,
+    /// A file whose appearing says so, in the folder or in its run.
+    sign: &'static str,
+    /// What stands in that file then.
+    text: &'static str,
+}
+
+/// Every command that holds a rig, on the clock of the machine where it has a choice.
+const HOLDING: [Holding; 7] = [
+    Holding {
+        line: "track --target 0um --rig rig.toml --duration 60s --frames off --best-effort --json",
+        sign: "events.jsonl",
+        text: "\"running\"",
+    },
+    Holding {
+        line: "run sine.toml --rig rig.toml --clock real --frames off --best-effort --json",
+        sign: "events.jsonl",
+        text: "\"stage\":\"running\"",
+    },
+    Holding {
+        line: IDENTIFY,
+        sign: "partial.json",
+        text: "segments",
+    },
+    Holding {
+        line: "circle --rig rig.toml --frames off --seed 3 --effort 1 --max-effects 1 --rounds 0 --out a.toml --report a.html \
+               --json",
+        sign: "partial.json",
+        text: "segments",
+    },
+    Holding {
+        line: "reconcile --model eq6 --collect more --rig rig.toml --frames off --seed 3 --effort 1 --max-effects 1 --rounds 1 \
+               --out a.toml --json",
+        sign: "more/survey-1.csv",
+        text: "time_s",
+    },
+    Holding {
+        line: "jog --rig rig.toml --to 8um --to 12um --to 8um --to 12um --to 8um --to 12um --to 8um --speed 2um/s --blind --json",
+        sign: "",
+        text: "",
+    },
+    Holding {
+        line: "calibrate --rig rig.toml --pixel 0.1um --pairs 4000 --out calibration.toml --json",
+        sign: "",
+        text: "",
+    },
+];
+
+fn prepared() -> tempfile::TempDir {
+    let folder = tempfile::tempdir().unwrap();
+    std::fs::write(folder.path().join("rig.toml"), "[emulator]\nseed = 3\n").unwrap();
+    let script = "name = \"sine\"\n[[step]]\ndo = \"sine\"\namplitude = \"1um\"\nfrequency = \"5Hz\"\ncycles = 300\n";
+    std::fs::write(folder.path().join("sine.toml"), script).unwrap();
+    folder
+}
+
+/// Started as `nohup` starts it.
+fn start_ignoring_hup(folder: &Path, line: &str) -> Child {
+    let line = format!("trap '' HUP; exec {} {line}", env!("CARGO_BIN_EXE_cellpos"));
+    Command::new("sh")
+        .args(["-c", &line])
+        .current_dir(folder)
+        .stdin(Stdio::null())
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .unwrap()
+}
+
+/// State of a process by its letter, as the system has it.
+fn state(child: &Child) -> Option<char> {
+    let stat = std::fs::read_to_string(format!("/proc/{}/stat", child.id())).ok()?;
+    stat.rsplit_once(") ")?.1.chars().next()
+}
+
+#[test]
+fn no_command_that_holds_a_rig_is_ended_or_stopped_by_a_signal_that_is_no_stop() {
+    for Holding { line, sign, text } in HOLDING {
+        let folder = prepared();
+        let mut child = start_ignoring_hup(folder.path(), line);
+        if sign.is_empty() {
+            // Nothing is written until the end: the signal's own answer says whether the rig is held.
+            std::thread::sleep(Duration::from_millis(1000));
+        } else {
+            until(line, || {
+                let path = in_runs(folder.path(), sign).unwrap_or(folder.path().join(sign));
+                let there = std::fs::read_to_string(path).is_ok_and(|all| all.contains(text));
+                there.then_some(())
+            });
+        }
+        for signal in [Signal::TSTP, Signal::USR1, Signal::HUP, Signal::USR1] {
+            tell(&child, signal);
+            std::thread::sleep(Duration::from_millis(60));
+            assert_ne!(state(&child), Some('T'), "{line}: stopped by {signal:?}");
+            let ended = child.try_wait().unwrap();
+            assert!(
+                ended.is_none_or(|status| status.signal().is_none()),
+                "{line}: ended by {signal:?}"
+            );
+        }
+        tell(&child, Signal::INT);
+        let (out, _) = end(child);
+        // An orderly end of its own: by no signal, with a code that it has.
+        assert!(
+            matches!(out.status.code(), Some(0 | 1)),
+            "{line}: {:?}\n{}",
+            out.status,
+            String::from_utf8_lossy(&out.stderr)
+        );
+    }
+}
+
+#[test]
+fn a_stop_in_the_first_moments_of_any_command_that_holds_a_rig_is_an_end() {
+    for Holding { line, .. } in HOLDING {
+        for delay_ms in [5, 25, 60] {
+            let folder = prepared();
+            let child = start(folder.path(), line);
+            std::thread::sleep(Duration::from_millis(delay_ms));
+            tell(&child, Signal::INT);
+            let (out, _) = end(child);
+            // Before a rig is held the signal ends the program as always; afterwards the end is its own.
+            let ended = (out.status.signal(), out.status.code());
+            assert!(
+                matches!(ended, (Some(2), None) | (None, Some(0..=2))),
+                "{line} after {delay_ms} ms: {ended:?}"
+            );
+            if let Some(toml) = in_runs(folder.path(), "run.toml") {
+                let text = std::fs::read_to_string(toml).unwrap();
+                let rows = in_runs(folder.path(), "ticks.arrow")
+                    .and_then(|path| path.metadata().ok())
+                    .map_or(0, |meta| meta.len());
+                assert!(
+                    text.contains("outcome") || rows < 20_000,
+                    "{line} after {delay_ms} ms: cut off with {rows} bytes"
+                );
+            }
+        }
+    }
+}

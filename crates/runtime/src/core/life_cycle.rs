@@ -69,8 +69,10 @@ impl<R: ReferenceGenerator> Core<R> {
             } else if self.state.missing >= self.timing.coast_ticks {
                 self.freeze(cause.0, tick);
             } else if self.state.missing == 0
-                && matches!(self.state.frozen, Some((reason, _)) if reason != FreezeReason::Operator)
+                && let Some((FreezeReason::BeadLost | FreezeReason::CameraStalled, _)) =
+                    self.state.frozen
             {
+                // What was frozen for another reason stays so, however well the bead is seen.
                 self.thaw(tick);
             }
         }

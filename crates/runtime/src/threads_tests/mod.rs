@@ -362,6 +362,18 @@ fn a_disk_that_confirms_nothing_is_told_within_a_second_and_ends_the_run_after_f
             ends,
             "{lasts_ms} ms: {frozen_ms:?}"
         );
+        // Frozen once, and until the PZT parks: the bead is in view all the time.
+        let unrecorded = |event: &&Event| {
+            let reason = crate::life::FreezeReason::Unrecorded;
+            event.kind == EventKind::FreezeStarted { reason }
+        };
+        let freezes = ran.events.iter().filter(unrecorded).count();
+        assert_eq!(freezes, usize::from(ends), "{lasts_ms} ms");
+        let frozen = ran
+            .records
+            .iter()
+            .filter(|r| r.flags.has(TickFlags::FREEZE));
+        assert_eq!(frozen.count() > 400, ends, "{lasts_ms} ms");
         let end = ran.end.as_ref().expect("control lives");
         let reason = ends.then_some(SafeReason::Unrecorded);
         assert_eq!(end.safe_reason, reason, "{lasts_ms} ms");

@@ -93,18 +93,21 @@ fn runs(path: &Path) -> Result<Vec<Source>, Failure> {
     let mut sources = Vec::new();
     for (number, folder) in (1u64..).zip(&folders) {
         let reader = RunReader::open(folder).map_err(Failure::input)?;
-        let (ticks, _) = reader.ticks().map_err(Failure::input)?;
         let running = |tick: &cellpos_runtime::TickRecord| {
             tick.life == Life::Running as u8 && !tick.flags.has(TickFlags::FREEZE)
         };
-        let Some(first) = ticks.iter().find(|tick| running(tick)) else {
+        // Read twice, so that a night's run needs no night's memory.
+        let ticks =
+            || -> Result<_, Failure> { Ok(reader.batches().map_err(Failure::input)?.flatten()) };
+        let (mut steps, mut last_ns, mut first_ns) = (Vec::new(), None, None);
+        for tick in ticks()? {
+            steps.extend(last_ns.replace(tick.time_ns).map(|ns| tick.time_ns - ns));
+            first_ns = first_ns.or(running(&tick).then_some(tick.time_ns));
+        }
+        let Some(first_ns) = first_ns else {
             continue;
         };
-        let from_ns = first.time_ns + SETTLED_NS;
-        let mut steps: Vec<i64> = ticks
-            .windows(2)
-            .map(|pair| pair[1].time_ns - pair[0].time_ns)
-            .collect();
+        let from_ns = first_ns + SETTLED_NS;
         steps.sort_unstable();
         let step_ns = steps
             .get(steps.len() / 2)
@@ -113,8 +116,8 @@ fn runs(path: &Path) -> Result<Vec<Source>, Failure> {
             .max(1);
         let (mut input, mut output, mut reference) = (Vec::new(), Vec::new(), Vec::new());
         let mut last_seq = None;
-        for tick in ticks.iter().filter(|tick| tick.time_ns >= from_ns) {
-            if !running(tick) {
+        for tick in ticks()?.filter(|tick| tick.time_ns >= from_ns) {
+            if !running(&tick) {
                 break;
             }
             // A tick whose record is lost leaves a row with the command before it, and no position.
