@@ -251,15 +251,6 @@ pub fn find(name: &str) -> Option<&'static Column> {
     COLUMNS.iter().find(|column| column.name == name)
 }
 
-/// The columns that hold numbers, without those that a plain record has by itself.
-pub(crate) fn numbers() -> Vec<&'static Column> {
-    COLUMNS
-        .iter()
-        .filter(|column| !["time_s", "pzt_um", "bead_um"].contains(&column.name))
-        .filter(|column| !matches!(column.value, Code(..)))
-        .collect()
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -18,7 +18,7 @@ use crate::events::Event;
 use crate::meta::RunMeta;
 use crate::reader::{Lost, RunReader};
 use columns::{COLUMNS, Column, Row};
-pub(crate) use columns::{bead_um, numbers, seconds};
+pub(crate) use columns::{bead_um, seconds};
 use std::fs::{File, OpenOptions};
 use std::io;
 use std::num::NonZeroU64;

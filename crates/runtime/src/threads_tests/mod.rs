@@ -373,7 +373,7 @@ fn a_disk_that_confirms_nothing_is_told_within_a_second_and_ends_the_run_after_f
             .records
             .iter()
             .filter(|r| r.flags.has(TickFlags::FREEZE));
-        assert_eq!(frozen.count() > 400, ends, "{lasts_ms} ms");
+        assert_eq!(frozen.count() > 290, ends, "{lasts_ms} ms");
         let end = ran.end.as_ref().expect("control lives");
         let reason = ends.then_some(SafeReason::Unrecorded);
         assert_eq!(end.safe_reason, reason, "{lasts_ms} ms");
