@@ -124,9 +124,9 @@ fn another_controller_is_named_by_its_first_difference_and_another_law_is_refuse
     let run = held(folder.path(), "");
     let meta = std::fs::read_to_string(run.join("run.toml")).unwrap();
     edit(&run, |text| {
-        let at = text.find("\nkp = ").unwrap() + 6;
+        let at = text.find("\nkp_um_per_um = ").unwrap() + "\nkp_um_per_um = ".len();
         let end = at + text[at..].find('\n').unwrap();
-        format!("{}0.4{}", &text[..at], &text[end..])
+        format!("{}0.31{}", &text[..at], &text[end..])
     });
     let (text, json) = replay(folder.path(), &run);
     assert_eq!(text.code, Some(1), "{}", text.out);
