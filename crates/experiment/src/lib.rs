@@ -22,5 +22,6 @@ mod camera_rate;
 pub mod circle;
 pub mod collect;
 pub mod excitation;
+mod exciting;
 pub mod identify;
 pub mod on_rig;

@@ -4,6 +4,7 @@
 //! The loop freezes and thaws by its own rules when the bead is lost; a segment in which it did is measured again.
 
 use crate::camera_rate::{foreign_rate_hz, other_rate};
+use crate::exciting::{Exciting, Handing, SETTLE_TICKS};
 use crate::identify::held_bead::{DelayTest, Setup, mean_grey};
 use cellpos_control::{ControllerFile, Pi};
 use cellpos_emulator::WorldConfig;
@@ -13,20 +14,13 @@ use cellpos_ident::experiment::{Plan, RecordedSegment, Span};
 use cellpos_plant::Model;
 use cellpos_rig::clock::monotonic_ns;
 use cellpos_rig::{Camera, Clock, FrameBuffer};
-use cellpos_runtime::{
-    EndRule, Event, Grid, Life, ReferenceGenerator, ReferenceInput, ReferenceOutput, Request,
-    RunSink, Stage, Statistics, TickFlags, TickRecord,
-};
+use cellpos_runtime::{EndRule, Grid, Life, Request, TickFlags, TickRecord};
 use cellpos_session::rig_file::{ClockKind, Frames, RigFile};
 use cellpos_session::setup::{self, Prepared, ReferenceSpec};
-use cellpos_session::view::{Pages, Shown, State, Viewed};
+use cellpos_session::view::{Pages, Viewed};
 use cellpos_session::{EndKind, Ended, Failure, Options, Rig};
 use std::sync::Arc;
-use std::sync::mpsc::Sender;
 use std::time::Duration;
-
-/// Ticks at rest between closing the loop and the first segment.
-const SETTLE_TICKS: usize = 500;
 
 /// A rig and the loop to hold a bead on it with.
 #[derive(Debug, Clone)]
@@ -64,78 +58,6 @@ pub struct Acquired {
     pub unseen: Vec<bool>,
     /// Why segments are missing, if any are.
     pub trouble: Option<Trouble>,
-}
-
-/// Holds the bead at 0 um and plays the excitation, counted from where the loop was closed.
-#[derive(Debug)]
-struct Exciting {
-    excitation_um: Vec<f64>,
-    now: Option<usize>,
-}
-
-impl ReferenceGenerator for Exciting {
-    fn step(&mut self, input: &ReferenceInput, preview_um: &mut [f64]) -> ReferenceOutput {
-        preview_um.fill(0.0);
-        let tick = usize::try_from(input.tick).unwrap_or(usize::MAX);
-        self.now = input.running.then_some(tick);
-        ReferenceOutput {
-            reference_um: 0.0,
-            plan_ns: -1,
-            stage: Stage::None,
-            phase: None,
-            motion: 0,
-        }
-    }
-
-    fn excitation_um(&self) -> f64 {
-        let at = self.now.and_then(|tick| tick.checked_sub(SETTLE_TICKS));
-        at.and_then(|k| self.excitation_um.get(k))
-            .copied()
-            .unwrap_or(0.0)
-    }
-
-    fn finished(&self) -> bool {
-        self.now
-            .is_some_and(|tick| tick >= SETTLE_TICKS + self.excitation_um.len())
-    }
-}
-
-/// Hands every tick on, to whoever waits for the run.
-struct Handing {
-    ticks: Sender<TickRecord>,
-    /// The segments, by ticks since the first of them.
-    spans: Vec<Span>,
-    /// The tick in which the loop was closed, and the newest.
-    closed: Option<u64>,
-    newest: u64,
-    period_s: f64,
-}
-
-impl RunSink for Handing {
-    fn tick(&mut self, record: &TickRecord) {
-        if self.closed.is_none() && record.life == Life::Running as u8 {
-            self.closed = Some(record.seq);
-        }
-        self.newest = record.seq;
-        // Nobody who hears it: the run is given up already.
-        let _ = self.ticks.send(*record);
-    }
-    fn event(&mut self, _: &Event) {}
-    fn progress(&mut self, _: &Statistics) {}
-}
-
-impl Shown for Handing {
-    fn complete(&self, state: &mut State) {
-        let Some(closed) = self.closed else {
-            return;
-        };
-        let since = usize::try_from(self.newest - closed).unwrap_or(usize::MAX);
-        let now = since.saturating_sub(SETTLE_TICKS);
-        let begun = (self.spans.iter()).filter(|span| span.start <= now).count();
-        let end = (self.spans.last()).map_or(0, |span| span.start + span.rows);
-        state.doing = Some(format!("Segment {begun} of {}", self.spans.len()));
-        state.left_s = Some(self.period_s * (SETTLE_TICKS + end).saturating_sub(since) as f64);
-    }
 }
 
 /// Why segments are missing.
@@ -281,23 +203,14 @@ impl OnRig {
         };
         rig.fit(&mut prepared);
         let setup = rig.set_up(prepared, ReferenceSpec::Hold { position_um: 0.0 })?;
-        let core = setup.core_following(Exciting {
-            excitation_um: schedule.excitation_um.clone(),
-            now: None,
-        })?;
+        let core = setup.core_following(Exciting::new(&schedule.excitation_um))?;
         let (sender, received) = std::sync::mpsc::channel();
         let period_ns = self.file.timing.period_ns();
         let mut view = match pages {
             Some(pages) => pages.next(&mut rig, &setup)?,
             None => None,
         };
-        let handing = Handing {
-            ticks: sender,
-            spans: schedule.spans.clone(),
-            closed: None,
-            newest: 0,
-            period_s: 1e-9 * period_ns as f64,
-        };
+        let handing = Handing::new(sender, &schedule.spans, 1e-9 * period_ns as f64);
         let sink = Viewed::new(handing, view.as_deref_mut());
         let running = rig.arm(&setup, core, sink, EndRule::default())?.start()?;
         let operator = Arc::clone(running.operator());
