@@ -49,7 +49,7 @@ text = "<b>waves</b>"
 do = "sine"
 amplitude = "2um"
 frequency = "4Hz"
-cycles = 40
+cycles = 80
 "#;
 
 #[test]
@@ -183,7 +183,7 @@ fn a_script_and_its_folder_show_the_same_run() {
     let run = Watched::start(folder.path(), "run script.toml --view --name shown");
     let page = Browser::start(1400, 1500);
     page.open(&run.operator);
-    shows(&page, "script-text", "Cycle [0-9]+ of 40[.]");
+    shows(&page, "script-text", "Cycle [0-9]+ of 80[.]");
     shows(&page, "cycles-text", "[0-9]+ cycles done");
     shows(&page, "events", "Mark: <b>waves<.b>");
     // The same run, from its folder, in another program.

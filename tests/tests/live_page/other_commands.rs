@@ -17,7 +17,7 @@ fn an_identification_is_seen_freezes_and_parks_and_keeps_what_is_finished() {
     let page = Browser::start(1400, 1500);
     let run = Watched::start(
         folder.path(),
-        "identify --rig rig.toml --clock real --best-effort --frequency 20Hz,50Hz,100Hz,200Hz --led-edges 0 --bootstrap 0 \
+        "identify --rig rig.toml --clock real --frequency 20Hz,50Hz,100Hz,200Hz --led-edges 0 --bootstrap 0 \
          --out model.toml --report identify.html --view",
     );
     page.open(&run.operator);

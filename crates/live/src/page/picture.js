@@ -34,7 +34,7 @@ export class PictureView {
     this.small.getContext("2d").putImageData(grey, 0, 0);
     context.imageSmoothingEnabled = false;
     context.drawImage(this.small, 0, 0, width * scale, height * scale);
-    context.lineWidth = Math.max(1.5, scale / 3);
+    context.lineWidth = Math.max(2.5, scale / 3);
     const toPx = um => ((um - firstUm) / umPerPx + 0.5) * scale;
     const across = at => {
       context.beginPath();

@@ -110,7 +110,12 @@ pub fn run(args: Args) -> CommandResult {
         }
         at_um = to_um;
         let stop = match &mut shown {
-            Some(shown) => shown.look(&mut mover, at_um)?,
+            Some(shown) => {
+                let seen = shown.look(&mut mover, at_um)?;
+                let stop = Stop::at(&mover, seen);
+                shown.tell(line(&stop).trim_end());
+                stop
+            }
             None => look(&bench, &mut mover, at_um, args.blind)?,
         };
         if !args.json {

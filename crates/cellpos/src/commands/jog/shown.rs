@@ -1,6 +1,5 @@
 //! The live page of a PZT that is moved by hand: its displacement, the camera's picture, freeze and park.
 
-use super::Stop;
 use crate::outcome::Failure;
 use crate::view_args;
 use cellpos_drivers::Calibration;
@@ -122,7 +121,7 @@ impl Shown {
     }
 
     /// What is seen at a stop. The PZT is held meanwhile.
-    pub fn look(&mut self, mover: &mut Mover, to_um: f64) -> Result<Stop, Failure> {
+    pub fn look(&mut self, mover: &mut Mover, to_um: f64) -> Result<Option<Seen>, Failure> {
         /// How long a bead is looked for, ms.
         const LOOK_MS: u32 = 100;
         let mut seen = None;
@@ -138,11 +137,13 @@ impl Shown {
                 break;
             }
         }
-        let stop = Stop::at(mover, seen);
+        Ok(seen)
+    }
+
+    /// Tells what was found.
+    pub fn tell(&mut self, text: &str) {
         let time_ns = Clock::Real.now_ns() - self.start_ns;
-        let text = super::line(&stop).trim_end().to_string();
-        self.by_hand.tell(time_ns, text);
-        Ok(stop)
+        self.by_hand.tell(time_ns, text.to_string());
     }
 
     /// It is over: the PZT is at park or on its way there.
