@@ -1,5 +1,7 @@
 //! Why a session could not do its work.
 
+use cellpos_runtime::RunError;
+
 /// Why something could not be done.
 #[derive(Debug)]
 pub enum Failure {
@@ -18,6 +20,18 @@ impl Failure {
     /// A failure on the way, in the words of its error and of the errors behind it.
     pub fn failed(error: impl std::error::Error + Send + Sync + 'static) -> Self {
         Self::Failed(miette::Report::from_err(error))
+    }
+
+    /// A run that could not be carried through, with what was expected and what to do where that is known.
+    pub fn of_run(error: RunError) -> Self {
+        match error {
+            RunError::RecorderHangs { .. } => Self::Failed(miette::miette!(
+                help = "expected a disk that answers; see that the disk with the run folder works (the system's log names a bad one), or name \
+                        another folder with --runs; what was written before is kept, and the PZT is parked",
+                "{error}"
+            )),
+            error => Self::failed(error),
+        }
     }
 
     /// In a line.

@@ -378,7 +378,7 @@ where
         }
         rig.devices.disarm();
         drop((memory, place));
-        let finished = finished.map_err(Failure::failed)?;
+        let finished = finished.map_err(Failure::of_run)?;
         let Witness { sink, clues } = finished.sink;
         Ok(Finished {
             odd_gain: clues.odd_gain(),
