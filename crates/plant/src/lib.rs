@@ -43,7 +43,7 @@ mod transfer;
 mod words;
 
 pub use cellpos_units::{Decibels, Degrees, Hertz, Micrometers, Seconds};
-pub use chain::{Chain, ChainError};
+pub use chain::{Chain, ChainError, TiedPlant};
 pub use discrete::{DiscretePlant, DiscreteState};
 pub use effects::{Effect, EffectError, Parameter, Place};
 pub use error::{ModelError, ModelProblem, PlantError, Position};

@@ -128,7 +128,8 @@ impl Model {
         let one = Complex::new(1.0, 0.0);
         let (mut value, mut before, mut camera) = (self.plant.at(s), one, one);
         let mut beside = Vec::new();
-        for effect in &self.effects {
+        let mut tied = Vec::new();
+        for effect in self.ordered_effects() {
             match effect.act() {
                 Action::Linear(zpk) => {
                     let factor = zpk.at(s);
@@ -150,11 +151,40 @@ impl Model {
                 Action::Bypass(zpk) => beside.push(zpk.at(s)),
                 // A block counts as what it is at the start, where that is linear: see the documentation above.
                 Action::Block(_) => {
-                    value *= effect.kind().at_start(effect).map_or(one, |zpk| zpk.at(s));
+                    value *= match effect.kind().small_motion(effect, s) {
+                        Some([input, position, velocity]) => input + position + velocity * s,
+                        None => effect.kind().at_start(effect).map_or(one, |zpk| zpk.at(s)),
+                    };
+                }
+                Action::Around(tie) => tied.push((tie.replaces_output(), effect)),
+                Action::Show(shown) if shown.is_static() => {
+                    if let Some([input, position, _]) = effect.kind().small_motion(effect, s) {
+                        camera *= input + position;
+                    }
                 }
                 _ => {}
             }
         }
+        if tied.is_empty() {
+            return (value + before * beside.into_iter().sum::<Complex<f64>>()) * camera;
+        }
+        let plant = self.plant.at(s);
+        let (mut drive, mut fed_back) = (one, Complex::new(0.0, 0.0));
+        for (_, effect) in tied.iter().filter(|(replaces, _)| !replaces) {
+            if let Some([input, position, velocity]) = effect.kind().small_motion(effect, s) {
+                drive *= input;
+                fed_back = fed_back * input + position + velocity * s;
+            }
+        }
+        // y = P (drive u + fed_back y), and what stands in for y sees what entered the plant.
+        let mut answer = plant * drive / (one - plant * fed_back);
+        let entered = answer / plant;
+        for (_, effect) in tied.iter().filter(|(replaces, _)| *replaces) {
+            if let Some([input, position, velocity]) = effect.kind().small_motion(effect, s) {
+                answer = input * entered + (position + velocity * s) * answer;
+            }
+        }
+        value *= answer / plant;
         (value + before * beside.into_iter().sum::<Complex<f64>>()) * camera
     }
 

@@ -1,7 +1,8 @@
 //! From a model to the sequence of stages that a [`super::Chain`] advances.
 
 use super::linear::LinearGroup;
-use crate::effects::{Action, Block, Place};
+use super::tied::TiedPlant;
+use crate::effects::{Action, Around, Block, Place};
 use crate::modal::Zpk;
 use crate::model::Model;
 
@@ -10,6 +11,7 @@ use crate::model::Model;
 pub(crate) enum Stage {
     Linear(LinearGroup),
     Block(Box<dyn Block>),
+    Tied(Box<TiedPlant>),
 }
 
 /// The compiled chain without its state of the front (saturation, slew).
@@ -78,6 +80,17 @@ impl Builder {
         self.stages.push(Stage::Block(block));
     }
 
+    /// The plant with what is tied to it, a stage of its own; what leads to it is one as well, and tells the PZT's displacement.
+    fn tied_plant(&mut self, plant: &Zpk, ties: Vec<Box<dyn Around>>) {
+        self.tap = Some(self.pending.clone());
+        self.flush();
+        let tied = TiedPlant::new(plant, ties);
+        self.substep_s = self.substep_s.min(tied.longest_s());
+        self.fastest = self.fastest.max(0.2 / tied.longest_s());
+        self.moving = true;
+        self.stages.push(Stage::Tied(Box::new(tied)));
+    }
+
     /// The plant joins the linear blocks gathered so far; their end is the PZT's displacement.
     fn plant(&mut self, plant: &Zpk) {
         self.tap = Some(self.pending.clone());
@@ -103,6 +116,16 @@ pub(crate) fn compile(model: &Model) -> Compiled {
     let mut beside: Vec<Zpk> = Vec::new();
     let mut before_plant = Zpk::one();
     let effects = model.ordered_effects();
+    let mut ties: Vec<Box<dyn Around>> = Vec::new();
+    for effect in &effects {
+        if let Action::Around(tie) = effect.act() {
+            ties.push(tie);
+        }
+    }
+    let mut put_in = |builder: &mut Builder| match std::mem::take(&mut ties) {
+        none if none.is_empty() => builder.plant(&plant),
+        ties => builder.tied_plant(&plant, ties),
+    };
     let passes_by = |e: &&&crate::effects::Effect| matches!(e.act(), Action::Bypass(_));
     for effect in effects.iter().filter(passes_by) {
         if let Action::Bypass(zpk) = effect.act() {
@@ -113,7 +136,7 @@ pub(crate) fn compile(model: &Model) -> Compiled {
         let spec = effect.kind().spec();
         if spec.place >= Place::Chip && !spec.ahead_of_plant && !plant_is_in {
             before_plant = builder.pending.clone();
-            builder.plant(&plant);
+            put_in(&mut builder);
             plant_is_in = true;
         }
         match effect.act() {
@@ -129,8 +152,9 @@ pub(crate) fn compile(model: &Model) -> Compiled {
                 builder.moving = true;
             }
             Action::Block(block) => builder.push(block),
-            // The camera's part: see the simulator.
-            Action::Bypass(_)
+            // The camera's part: see the simulator. What is tied to the plant went in with it.
+            Action::Around(_)
+            | Action::Bypass(_)
             | Action::Delay(_)
             | Action::Exposure(_)
             | Action::Skew(_)
@@ -141,7 +165,7 @@ pub(crate) fn compile(model: &Model) -> Compiled {
     }
     if !plant_is_in {
         before_plant = builder.pending.clone();
-        builder.plant(&plant);
+        put_in(&mut builder);
     }
     builder.flush();
     Compiled {

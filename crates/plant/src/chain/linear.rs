@@ -167,6 +167,33 @@ impl LinearGroup {
         sum
     }
 
+    /// Position and slope with an input that jumps to this value now.
+    pub(crate) fn at_input(&self, input: f64) -> (f64, f64) {
+        (
+            self.state_output() + self.direct * input,
+            self.state_speed() + self.weight_sum * input,
+        )
+    }
+
+    /// Position and slope `h_s` later, were this input held. Changes no state.
+    pub(crate) fn ahead(&mut self, h_s: f64, input: f64) -> (f64, f64) {
+        let index = self.slot(h_s);
+        let (mut position, mut speed) = (self.direct * input, self.weight_sum * input);
+        if let Some(slot) = self.slots.get(index) {
+            for ((m, s), x) in self.real.iter().zip(&slot.real).zip(&self.x) {
+                let x = s.decay * x + s.hold * input;
+                position += m.weight * x;
+                speed += m.weight * m.pole * x;
+            }
+            for ((m, s), z) in self.complex.iter().zip(&slot.complex).zip(&self.z) {
+                let z = s.decay * z + s.hold * input;
+                position += (m.weight * z).re;
+                speed += (m.weight * m.pole * z).re;
+            }
+        }
+        (position, speed)
+    }
+
     /// The slope of the output now, um/s.
     pub(crate) fn speed(&self) -> f64 {
         self.state_speed() + self.weight_sum * self.last_input + self.direct * self.last_slope

@@ -9,11 +9,13 @@
 
 mod compile;
 mod linear;
+mod tied;
 
 use crate::effects::{EffectError, Segment};
 use crate::model::Model;
 use crate::random::Gaussian;
 use compile::{Compiled, Stage};
+pub use tied::TiedPlant;
 
 /// A model that cannot be run.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
@@ -166,6 +168,7 @@ impl Chain {
             match stage {
                 Stage::Linear(group) => group.reset(),
                 Stage::Block(block) => block.reset(),
+                Stage::Tied(tied) => tied.reset(),
             }
         }
         for group in &mut self.compiled.bypass {
@@ -252,6 +255,7 @@ impl Chain {
             signal = match stage {
                 Stage::Linear(group) => group.advance(h_s, signal, want),
                 Stage::Block(block) => block.advance(self.time_s, h_s, signal),
+                Stage::Tied(tied) => tied.advance(self.time_s, h_s, signal),
             };
         }
         signal.end += beside.end;
@@ -313,6 +317,7 @@ impl Chain {
             match stage {
                 Stage::Linear(group) => speed = group.speed(),
                 Stage::Block(block) => speed = block.speed(self.time_s, speed),
+                Stage::Tied(tied) => speed = tied.velocity(),
             }
         }
         speed

@@ -1,5 +1,6 @@
 //! What an effect does, in the few ways in which anything can act on a signal of the chain.
 
+use super::user::Seen;
 use crate::modal::Zpk;
 use std::fmt;
 
@@ -19,6 +20,8 @@ pub enum Action {
     Slew(f64),
     /// Anything else between command and bead.
     Block(Box<dyn Block>),
+    /// Tied to the plant: changes what enters it, with its position known, or stands in for what it gives.
+    Around(Box<dyn Around>),
     /// Another way from the PZT's displacement to the record, beside the plant.
     Bypass(Zpk),
     /// `y(t - delay)`, s.
@@ -105,6 +108,36 @@ impl Clone for Box<dyn Block> {
     }
 }
 
+/// An effect that is tied to the plant. No allocation, no panic.
+pub trait Around: fmt::Debug + Send + Sync {
+    /// Whether its output is taken for the plant's; else it is what enters the plant.
+    fn replaces_output(&self) -> bool;
+
+    /// Longest step of its equations \[s\], where it needs one other than the plant's poles do.
+    fn longest_s(&self) -> Option<f64>;
+
+    /// Its output now, remembered as the last.
+    fn give(&mut self, seen: &Seen) -> f64;
+
+    /// Its output expected `h_s` later, nothing remembered.
+    fn ahead(&self, h_s: f64, now: &Seen, then: &Seen) -> f64;
+
+    /// Its states go on over a piece.
+    fn advance(&mut self, h_s: f64, now: &Seen, then: &Seen);
+
+    /// Back to rest.
+    fn reset(&mut self);
+
+    /// A copy with its state.
+    fn duplicate(&self) -> Box<dyn Around>;
+}
+
+impl Clone for Box<dyn Around> {
+    fn clone(&self) -> Self {
+        self.duplicate()
+    }
+}
+
 /// What camera, light and table make of a position.
 pub trait Shown: fmt::Debug + Send + Sync {
     /// The position shown for one seen at `time_s` \[um\].
@@ -112,6 +145,11 @@ pub trait Shown: fmt::Debug + Send + Sync {
 
     /// A copy with its state.
     fn duplicate(&self) -> Box<dyn Shown>;
+
+    /// Whether the same position is always shown alike, so that a search can take it for a part of the model.
+    fn is_static(&self) -> bool {
+        false
+    }
 
     /// Starts the random numbers of a block that has any; without a seed it does nothing at random.
     fn seed(&mut self, seed: u64) {

@@ -6,7 +6,7 @@
 //! the kind; none of them knows an effect by its name.
 //!
 //! To add one to this crate: its file here, and its line in `table.rs`. To add one from another crate: implement
-//! [`EffectKind`] there and hand it to [`register`].
+//! [`EffectKind`] there and hand it to [`register`]. To add one without a line of code: a [`Definition`], from a file.
 //!
 //! Chain: command -> driver -> pzt -> chip (with the plant) -> bead -> camera -> record. Within a place effects act in the
 //! order of the table, whatever the order in a file, so that a model means the same however it is written.
@@ -45,10 +45,11 @@ mod slew_limit;
 mod stick_slip;
 mod stiffening;
 mod time_delay;
+mod user;
 mod valve_asymmetry;
 mod wall_adhesion;
 
-pub use action::{Action, Block, Segment, Shown};
+pub use action::{Action, Around, Block, Segment, Shown};
 pub use backlash::backlash;
 pub use bubble::bubble;
 pub use camera_shake::camera_shake;
@@ -81,10 +82,14 @@ pub use stick_slip::stick_slip;
 pub use stiffening::stiffening;
 pub use table::{all, find, ids, register};
 pub use time_delay::time_delay;
+pub use user::{
+    Definition, DefinitionError, FUNCTIONS, Seen, Site, UserParameter, UserState, define,
+};
 pub use valve_asymmetry::valve_asymmetry;
 pub use wall_adhesion::wall_adhesion;
 
 use crate::modal::Zpk;
+use nalgebra::Complex;
 use std::fmt;
 
 /// Where in the chain an effect acts.
@@ -132,6 +137,18 @@ pub trait EffectKind: fmt::Debug + Send + Sync {
     /// The linear part at the start of a record of an effect that changes with time, where it has one.
     fn at_start(&self, effect: &Effect) -> Option<Zpk> {
         let _ = effect;
+        None
+    }
+
+    /// What a user wrote down, of an effect of the user's own.
+    fn definition(&self) -> Option<&Definition> {
+        None
+    }
+
+    /// Factors on input, position and velocity for small motions about rest at a complex frequency \[rad/s\], where the
+    /// effect is neither linear nor without such factors.
+    fn small_motion(&self, effect: &Effect, s: Complex<f64>) -> Option<[Complex<f64>; 3]> {
+        let _ = (effect, s);
         None
     }
 

@@ -1,5 +1,6 @@
 //! model.toml: reading with positions and suggestions, writing so that it reads back to the bit.
 
+mod definitions;
 mod table;
 mod write;
 
@@ -27,7 +28,8 @@ const LOCALISATION: ParameterSpec = range("um", 0.0, 100.0);
 
 const CAMERA_DELAY: ParameterSpec = range("ms", 0.0, 1000.0);
 
-const TOP: [&str; 10] = [
+const TOP: [&str; 11] = [
+    "definitions",
     "name",
     "description",
     "working_point_um",
@@ -56,14 +58,18 @@ impl Model {
     }
 }
 
-fn read(text: &str, file: &str) -> Result<Model, ModelError> {
-    let document = DeTable::parse(text).map_err(|error| ModelError {
+fn parse<'i>(text: &'i str, file: &str) -> Result<toml::Spanned<DeTable<'i>>, ModelError> {
+    DeTable::parse(text).map_err(|error| ModelError {
         file: file.to_owned(),
         at: Some(Position::of(text, error.span().unwrap_or(0..0))),
         problem: Box::new(ModelProblem::Syntax {
             message: error.message().to_owned(),
         }),
-    })?;
+    })
+}
+
+fn read(text: &str, file: &str) -> Result<Model, ModelError> {
+    let document = parse(text, file)?;
     let top = Table {
         file,
         text,
@@ -90,6 +96,10 @@ fn read(text: &str, file: &str) -> Result<Model, ModelError> {
         "a table with the coefficients num and den, highest power of s first",
     )?;
     let plant = read_plant(&top.table("plant", plant)?)?;
+    // Effects of the user's own come first: those below may be of them.
+    if let Some(v) = top.get("definitions") {
+        definitions::read_all("definitions", &top, v)?;
+    }
     let effects = match top.get("effects") {
         None => Vec::new(),
         Some(v) => top.list(

@@ -3,7 +3,7 @@
 use crate::model::Model;
 use std::fmt::Write as _;
 
-fn float(value: f64) -> String {
+pub(super) fn float(value: f64) -> String {
     // `{:?}` is the shortest text that reads back to the same bits; TOML wants a digit on both sides of the point.
     let text = format!("{value:?}");
     match text.split_once('e') {
@@ -12,12 +12,12 @@ fn float(value: f64) -> String {
     }
 }
 
-fn floats(values: &[f64]) -> String {
+pub(super) fn floats(values: &[f64]) -> String {
     let texts: Vec<String> = values.iter().map(|v| float(*v)).collect();
     format!("[{}]", texts.join(", "))
 }
 
-fn quoted(text: &str) -> String {
+pub(super) fn quoted(text: &str) -> String {
     toml::Value::String(text.to_owned()).to_string()
 }
 
@@ -77,6 +77,20 @@ pub(crate) fn write(model: &Model) -> String {
     if let Some(delay_s) = model.camera_delay_s {
         line("\n# from the middle of an exposure to the tick that uses it: camera_delay_ms of rig.toml; no part of the plant\n[camera]".to_owned());
         line(format!("delay_ms = {}", float(delay_s * 1e3)));
+    }
+    let mut written: Vec<&str> = Vec::new();
+    for effect in &model.effects {
+        if let Some(definition) = effect.kind().definition()
+            && !written.contains(&effect.id())
+        {
+            written.push(effect.id());
+            line(
+                definition
+                    .to_toml_string("definitions")
+                    .trim_end()
+                    .to_owned(),
+            );
+        }
     }
     for effect in &model.effects {
         line(format!(

@@ -9,7 +9,8 @@ mod camera;
 mod modal;
 
 pub(crate) use camera::near_whole;
-use cellpos_plant::effects::{Action, Block, Segment};
+use cellpos_plant::TiedPlant;
+use cellpos_plant::effects::{Action, Around, Block, Segment, Shown};
 pub(crate) use cellpos_plant::{Effect, Place, Zpk};
 use modal::{Modal, Trace, has_fast_pole};
 
@@ -28,7 +29,8 @@ pub(crate) struct Base {
 
 /// Simulates a record: displacement from the working point \[um\] in, bead position \[um\] out.
 ///
-/// What the camera shows of a position (lines, pixel locking) is fitted elsewhere: left out here.
+/// What the camera shows of a position (lines, pixel locking) is fitted elsewhere: left out here, unless it shows the same
+/// position always alike.
 ///
 /// `edge`, where asked for, receives the step of the plant's input that acts at the instant of each frame, in parts of
 /// the plant's direct path: what a frame that straddles the edge may already show.
@@ -50,6 +52,9 @@ enum Stage {
     Block(Box<dyn Block>),
 }
 
+/// Most steps of a plant with something tied to it between two rows.
+const MOST_STEPS: f64 = 20.0;
+
 /// What the frames are like.
 #[derive(Debug, Clone, Copy, Default)]
 struct Frames {
@@ -66,6 +71,9 @@ struct Chain<'a> {
     /// Blocks on the motion of the bead.
     motion: Vec<Box<dyn Block>>,
     bypass: Vec<Zpk>,
+    /// What is tied to the plant, which then goes step by step.
+    ties: Vec<Box<dyn Around>>,
+    shown: Vec<Box<dyn Shown>>,
     frames: Frames,
     /// Steps of the grid per sample.
     fine: usize,
@@ -79,6 +87,8 @@ impl<'a> Chain<'a> {
             plant: base.zpk.clone(),
             motion: Vec::new(),
             bypass: Vec::new(),
+            ties: Vec::new(),
+            shown: Vec::new(),
             frames: Frames::default(),
             fine: 1,
         };
@@ -86,6 +96,7 @@ impl<'a> Chain<'a> {
         sorted.sort_by_key(|e| e.order());
         let mut dynamic_before = false;
         let mut all = base.zpk.clone();
+        let mut behind = Zpk::one();
         for e in sorted {
             let spec = e.kind().spec();
             let early = spec.place < Place::Chip || spec.ahead_of_plant;
@@ -96,7 +107,7 @@ impl<'a> Chain<'a> {
                         dynamic_before |= !zpk.poles.is_empty();
                         chain.before.push(Stage::Linear(zpk));
                     } else {
-                        chain.plant = std::mem::replace(&mut chain.plant, Zpk::one()).series(&zpk);
+                        behind = behind.series(&zpk);
                     }
                 }
                 Action::Clip { low_um, high_um } => {
@@ -121,12 +132,20 @@ impl<'a> Chain<'a> {
                     chain.motion.push(block);
                 }
                 Action::Bypass(zpk) => chain.bypass.push(zpk),
+                Action::Around(tie) => chain.ties.push(tie),
+                Action::Show(shown) if shown.is_static() => chain.shown.push(shown),
                 Action::Delay(s) => chain.frames.delay_s += s,
                 Action::Exposure(s) => chain.frames.exposure_s = s,
                 Action::Skew(e) => chain.frames.skew += e,
                 Action::Drop(_) | Action::Repeat(_) | Action::Show(_) => {}
             }
         }
+        // What is tied to the plant takes the plant out of the linear blocks.
+        chain.plant = if chain.ties.is_empty() {
+            base.zpk.clone().series(&behind)
+        } else {
+            behind
+        };
         if base.interpolated_input {
             chain.fine = chain.fine.max(4);
         }
@@ -143,8 +162,54 @@ impl<'a> Chain<'a> {
     }
 
     fn run(mut self, u: &[f64], y: &mut Vec<f64>, edge: Option<&mut Vec<f64>>) {
+        let mut shown = std::mem::take(&mut self.shown);
+        if self.ties.is_empty() {
+            self.run_linear(u, y, edge);
+        } else {
+            if let Some(edge) = edge {
+                edge.clear();
+                edge.resize(u.len(), 0.0);
+            }
+            self.run_tied(u, y);
+        }
+        for block in &mut shown {
+            for (k, y) in y.iter_mut().enumerate() {
+                *y = block.show(*y, k as f64 * self.base.sample_s);
+            }
+        }
+    }
+
+    fn run_linear(&mut self, u: &[f64], y: &mut Vec<f64>, edge: Option<&mut Vec<f64>>) {
         let n = u.len();
         let h = self.base.sample_s / self.fine as f64;
+        let (mut x, pending) = self.ahead_of_plant(u, h);
+        if self.base.interpolated_input && self.base.zpk.zeros.len() < self.base.zpk.poles.len() {
+            middle(&mut x);
+        }
+        let modal = Modal::new(&pending.clone().series(&self.plant), h);
+        if let Some(edge) = edge {
+            self.edges(&x, modal.direct, n, edge);
+        }
+        let f = self.frames;
+        let plain = f.skew == 0.0 && f.delay_s == 0.0 && f.exposure_s == 0.0;
+        if plain && self.motion.is_empty() && self.bypass.is_empty() {
+            let mut pos = Vec::new();
+            modal.run(&x, &mut pos);
+            y.clear();
+            y.extend(pos.into_iter().step_by(self.fine));
+            return;
+        }
+        let mut t = Trace::default();
+        modal.trace(&x, &mut t);
+        if self.base.interpolated_input {
+            t.straighten(h);
+        }
+        self.behind_plant(&mut t, &x, &pending, h);
+        camera::sample(&t, f, h, self.fine, n, y);
+    }
+
+    /// What enters the plant, step by step, without the linear blocks that come last before it.
+    fn ahead_of_plant(&mut self, u: &[f64], h: f64) -> (Vec<f64>, Zpk) {
         let mut x: Vec<f64> = if self.base.interpolated_input {
             interpolate(u, self.fine)
         } else if self.fine == 1 {
@@ -174,36 +239,62 @@ impl<'a> Chain<'a> {
                 }
             }
         }
-        let modal = Modal::new(&pending.clone().series(&self.plant), h);
-        if let Some(edge) = edge {
-            self.edges(&x, modal.direct, n, edge);
-        }
-        let f = self.frames;
-        let plain = f.skew == 0.0 && f.delay_s == 0.0 && f.exposure_s == 0.0;
-        if plain && self.motion.is_empty() && self.bypass.is_empty() {
-            let mut pos = Vec::new();
-            modal.run(&x, &mut pos);
-            y.clear();
-            y.extend(pos.into_iter().step_by(self.fine));
-            return;
+        (x, pending)
+    }
+
+    /// A plant with what is tied to it, step by step.
+    fn run_tied(&mut self, u: &[f64], y: &mut Vec<f64>) {
+        let mut tied = TiedPlant::new(&self.base.zpk, std::mem::take(&mut self.ties));
+        let steps = (self.base.sample_s / tied.longest_s() - 1e-9).ceil();
+        self.fine = self.fine.max(steps.clamp(1.0, MOST_STEPS) as usize);
+        let n = u.len();
+        let h = self.base.sample_s / self.fine as f64;
+        let (mut x, pending) = self.ahead_of_plant(u, h);
+        if !pending.poles.is_empty() {
+            x = Modal::new(&pending, h).means(&x);
+        } else if pending.gain != 1.0 {
+            x.iter_mut().for_each(|v| *v *= pending.gain);
         }
         let mut t = Trace::default();
-        modal.trace(&x, &mut t);
-        if self.base.interpolated_input {
-            t.straighten(h);
+        let mut position = 0.0;
+        for (j, &end) in x.iter().enumerate() {
+            // A sampled input goes in straight lines to the value at the step's end, a held one jumps.
+            let start = match j {
+                _ if !self.base.interpolated_input => end,
+                0 => u[0],
+                _ => x[j - 1],
+            };
+            let out = tied.advance(j as f64 * h, h, Segment::line(start, end, h));
+            t.pos.push(position);
+            t.jump.push(out.start - position);
+            t.start_slope.push(out.speed_start);
+            t.end_slope.push(out.speed_end);
+            position = out.end;
         }
+        if self.plant != Zpk::one() {
+            let mut means: Vec<f64> = t.pos.iter().zip(&t.jump).map(|(p, j)| p + j).collect();
+            for (j, mean) in means.iter_mut().enumerate() {
+                *mean = 0.5 * (*mean + t.pos.get(j + 1).copied().unwrap_or(position));
+            }
+            Modal::new(&self.plant, h).trace(&means, &mut t);
+        }
+        self.behind_plant(&mut t, &x, &Zpk::one(), h);
+        camera::sample(&t, self.frames, h, self.fine, n, y);
+    }
+
+    /// Blocks on the motion, and what goes beside the plant.
+    fn behind_plant(&mut self, t: &mut Trace, x: &[f64], pending: &Zpk, h: f64) {
         for block in &mut self.motion {
-            camera::advance(&mut t, block.as_mut(), h);
+            camera::advance(t, block.as_mut(), h);
         }
         for zpk in &self.bypass {
             let mut beside = Trace::default();
-            Modal::new(&pending.clone().series(zpk), h).trace(&x, &mut beside);
+            Modal::new(&pending.clone().series(zpk), h).trace(x, &mut beside);
             if self.base.interpolated_input {
                 beside.straighten(h);
             }
             t.add(&beside);
         }
-        camera::sample(&t, f, h, self.fine, n, y);
     }
 
     /// Steps of the direct path at the instants of the frames.
@@ -242,6 +333,14 @@ fn slew(x: &mut [f64], rate: f64, h: f64) {
         // The ramp takes `share` of the step, then rests at its end.
         *v = at + d * (1.0 - 0.5 * share);
         at += d;
+    }
+}
+
+/// The mean over each step of a line through the values at the steps' ends: what a plant without a direct path answers to.
+fn middle(x: &mut [f64]) {
+    let mut before = x.first().copied().unwrap_or(0.0);
+    for v in x.iter_mut() {
+        (before, *v) = (*v, 0.5 * (before + *v));
     }
 }
 

@@ -3,7 +3,8 @@
 
 use cellpos_ident::foreign::{ForeignSettings, identify};
 use cellpos_ident::sampled::Hold;
-use cellpos_plant::{Model, Noise, TransferFunction, effects};
+use cellpos_plant::effects::Definition;
+use cellpos_plant::{Model, Noise, SimulateOptions, TransferFunction, effects, simulate};
 use cellpos_reconcile::{Options, ReconcileError, Reconciliation, Record, Verdict, reconcile};
 use std::path::{Path, PathBuf};
 
@@ -252,4 +253,80 @@ fn a_silverbox_has_a_stiffness_that_grows_with_the_position_and_no_name_in_the_c
 fn no_half_of_a_silverbox_has_a_name_in_the_catalogue() {
     let Some(s) = silverbox() else { return };
     s.no_name(&s.base(2));
+}
+
+/// Free run of a model on a record that no fit has seen: RMS error beside a level that is taken from `zero_on`.
+fn free_run(model: &Model, hold: Hold, sample_s: f64, io: (&[f64], &[f64]), zero: f64) -> f64 {
+    let y = free_response(model, hold, sample_s, io.0);
+    let sum: f64 = y
+        .iter()
+        .zip(io.1)
+        .map(|(s, y)| (y - s - zero).powi(2))
+        .sum();
+    (sum / io.1.len() as f64).sqrt()
+}
+
+fn free_response(model: &Model, hold: Hold, sample_s: f64, u: &[f64]) -> Vec<f64> {
+    /// A sampled input goes on in straight lines: so many steps a row come close to them.
+    const STEPS: usize = 20;
+    let options = SimulateOptions::default();
+    if hold != Hold::None {
+        return simulate(model, u, sample_s, &options).unwrap();
+    }
+    let fine: Vec<f64> = u
+        .windows(2)
+        .flat_map(|w| {
+            (0..STEPS).map(move |i| w[0] + (w[1] - w[0]) * (i as f64 + 0.5) / STEPS as f64)
+        })
+        .chain([u[u.len() - 1]])
+        .collect();
+    let y = simulate(model, &fine, sample_s / STEPS as f64, &options).unwrap();
+    y.into_iter().step_by(STEPS).collect()
+}
+
+const CUBIC: &str = r#"
+[[effects]]
+id = "cubic-spring"
+place = "chip"
+says = "a spring that hardens with the position"
+output = "(1 + gain)*input - stiffness*position - damping*velocity - cubic*position^3"
+[effects.parameters]
+gain = { unit = "", lower = -0.5, upper = 0.5, start = 0.0 }
+stiffness = { unit = "1", lower = -1.0, upper = 1.0, start = 0.0 }
+damping = { unit = "s", lower = -0.01, upper = 0.01, start = 0.0 }
+cubic = { unit = "1/V^2", lower = -100.0, upper = 100.0, start = [1.0, 5.0] }
+"#;
+
+#[test]
+fn a_silverbox_is_named_with_a_cubic_spring_from_a_file() {
+    let Some(s) = silverbox() else { return };
+    let arrow = set(
+        "silverbox",
+        &["sb_arrow"],
+        ("V1", "V2"),
+        s.sample_s,
+        2,
+        s.hold,
+    )
+    .unwrap();
+    let (_, u, y) = &arrow.files[0];
+    let model = s.base(2);
+    let before = free_run(&model, s.hold, s.sample_s, (u, y), 0.0);
+    Definition::from_toml_str(CUBIC, "cubic.toml").unwrap();
+    let result = s.run(&model, &s.records(|n| 0..n)).unwrap();
+    let after = free_run(&result.augmented, s.hold, s.sample_s, (u, y), 0.0);
+    println!(
+        "arrow: {:.2} mV before, {:.2} mV after",
+        1e3 * before,
+        1e3 * after
+    );
+    println!("{}", result.augmented.to_toml_string());
+    assert!(
+        matches!(result.verdict, Verdict::Named | Verdict::NamedWithRemainder),
+        "{:?}",
+        result.places
+    );
+    assert_eq!(result.effects.len(), 1);
+    assert_eq!(result.effects[0].id, "cubic-spring");
+    assert!(after < 1e-3, "{after} V");
 }

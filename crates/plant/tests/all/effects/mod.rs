@@ -5,6 +5,7 @@ mod chip_and_bead;
 mod driver_and_pzt;
 mod further;
 mod model;
+mod user;
 
 use cellpos_plant::{
     Chain, Complex, Effect, Hertz, Model, SimulateOptions, TransferFunction, effects, simulate,

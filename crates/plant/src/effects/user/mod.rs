@@ -1,0 +1,217 @@
+//! Effects of the user's own: a place, an expression in the field's notation, parameters with unit, bounds and start.
+//!
+//! A [`Definition`] comes from a file (`cellpos reconcile --effects`) or stands in a model file; [`define`] makes it known,
+//! after which it is simulated, searched, named, written and read like any other. Here are its equations; the file's form is
+//! the model file's business.
+
+mod blocks;
+mod core;
+mod definition;
+mod expression;
+
+pub use core::Seen;
+pub use definition::{Definition, DefinitionError, Site, UserParameter, UserState};
+pub use expression::FUNCTIONS;
+
+use self::core::Core;
+use super::{
+    Action, Candidate, Effect, EffectKind, Experiment, FitParameter, Form, ParameterSpec, Scope,
+    Spec, find, register,
+};
+use definition::{Compiled, MOST_STATES};
+use nalgebra::{Complex, DMatrix, DVector};
+use std::sync::Arc;
+
+/// An effect of the user's own among the kinds of effects.
+#[derive(Debug)]
+struct UserKind {
+    definition: Definition,
+    compiled: Arc<Compiled>,
+    spec: &'static Spec,
+    candidates: &'static [Candidate],
+    starts: Vec<Vec<f64>>,
+}
+
+fn kept(text: &str) -> &'static str {
+    Box::leak(text.to_owned().into_boxed_str())
+}
+
+/// Makes an effect of the user's own known to model files, simulation and search, for the life of the process.
+///
+/// # Errors
+/// A definition that is refused, or another effect of the same id; the very same definition again is no error.
+pub fn define(definition: &Definition) -> Result<&'static dyn EffectKind, DefinitionError> {
+    let compiled = definition.compile()?;
+    let taken = |message: &str| DefinitionError {
+        id: definition.id.clone(),
+        key: "id".to_owned(),
+        message: message.to_owned(),
+    };
+    if let Some(known) = find(&definition.id) {
+        return match known.definition() {
+            Some(other) if same(other, definition) => Ok(known),
+            Some(_) => Err(taken(
+                "another effect of this id is defined already, with another equation or other bounds: give another id",
+            )),
+            None => Err(taken("this is an effect of the catalogue: give another id")),
+        };
+    }
+    let kind: &'static UserKind = Box::leak(Box::new(UserKind::new(definition.clone(), compiled)));
+    register(kind).map_err(|e| taken(&e.to_string()))?;
+    Ok(kind)
+}
+
+/// Whether two definitions mean the same, wherever their searches begin.
+fn same(a: &Definition, b: &Definition) -> bool {
+    let bare = |d: &Definition| {
+        let mut d = d.clone();
+        d.parameters.iter_mut().for_each(|p| p.start.clear());
+        d
+    };
+    bare(a) == bare(b)
+}
+
+/// Every combination of the starts of all numbers, at most so many.
+fn combinations(definition: &Definition) -> Vec<Vec<f64>> {
+    const MOST: usize = 48;
+    let mut all: Vec<Vec<f64>> = vec![Vec::new()];
+    for p in &definition.parameters {
+        let many = all.len() * p.start.len() <= MOST;
+        let starts = if many { &p.start[..] } else { &p.start[..1] };
+        all = all
+            .iter()
+            .flat_map(|head| {
+                starts
+                    .iter()
+                    .map(move |s| [head.as_slice(), &[*s]].concat())
+            })
+            .collect();
+    }
+    all
+}
+
+impl UserKind {
+    fn new(definition: Definition, compiled: Compiled) -> Self {
+        let specs: Vec<ParameterSpec> = definition
+            .parameters
+            .iter()
+            .map(|p| ParameterSpec::new(kept(&p.name), kept(&p.unit), p.lower, p.upper))
+            .collect();
+        let params: Vec<FitParameter> = definition
+            .parameters
+            .iter()
+            .zip(&specs)
+            .map(|(p, spec)| {
+                let log = p.lower > 0.0 && p.upper > 30.0 * p.lower;
+                let size = p.start.iter().fold(0.0, |a: f64, s| a.max(s.abs()));
+                FitParameter {
+                    name: spec.name,
+                    log,
+                    lower: p.lower,
+                    upper: p.upper,
+                    step: if log {
+                        1e-3
+                    } else {
+                        1e-3 * size.max(1e-2 * (p.upper - p.lower))
+                    },
+                }
+            })
+            .collect();
+        let forms: &'static [Form] =
+            Box::leak(Box::new([Form::only(Box::leak(specs.into_boxed_slice()))]));
+        let candidates: &'static [Candidate] = Box::leak(Box::new([Candidate::chain(Box::leak(
+            params.into_boxed_slice(),
+        ))]));
+        let says = kept(&definition.says);
+        Self {
+            spec: Box::leak(Box::new(Spec {
+                id: kept(&definition.id),
+                place: definition.site.place(),
+                shown_at: definition.site.word(),
+                equation: kept(&definition.output),
+                signature: says,
+                ahead_of_plant: definition.site == Site::Chip,
+                forms,
+                confused_with: &[],
+                inseparable_from: &[],
+                experiment: Experiment::Amplitudes,
+                separate_by: "the same motion at several amplitudes and frequencies",
+            })),
+            starts: combinations(&definition),
+            definition,
+            compiled: Arc::new(compiled),
+            candidates,
+        }
+    }
+
+    fn core(&self, effect: &Effect) -> Core {
+        let values: Vec<f64> = (0..self.definition.parameters.len())
+            .map(|i| effect.scalar(i))
+            .collect();
+        Core::new(Arc::clone(&self.compiled), &values)
+    }
+}
+
+impl EffectKind for UserKind {
+    fn spec(&self) -> &'static Spec {
+        self.spec
+    }
+
+    fn act(&self, effect: &Effect) -> Action {
+        let core = self.core(effect);
+        match self.definition.site {
+            site @ (Site::Driver | Site::Pzt | Site::Bead) => {
+                Action::Block(Box::new(blocks::Inline {
+                    core,
+                    of_bead: site == Site::Bead,
+                }))
+            }
+            site @ (Site::Chip | Site::Plant) => Action::Around(Box::new(blocks::Tied {
+                core,
+                replaces: site == Site::Plant,
+                step_s: self.definition.step_s,
+            })),
+            Site::Camera => Action::Show(Box::new(blocks::Pictured { core })),
+        }
+    }
+
+    fn candidates(&self) -> &'static [Candidate] {
+        self.candidates
+    }
+
+    fn starts(&self, _: usize, _: &Scope) -> Vec<Vec<f64>> {
+        self.starts.clone()
+    }
+
+    fn build(&'static self, _: usize, values: &[f64], _: &Scope) -> Effect {
+        Effect::new(self, 0, values, &[])
+    }
+
+    fn definition(&self) -> Option<&Definition> {
+        Some(&self.definition)
+    }
+
+    /// Of motions of a hundredth of a micrometre about rest, by central differences.
+    fn small_motion(&self, effect: &Effect, s: Complex<f64>) -> Option<[Complex<f64>; 3]> {
+        const SIZE: f64 = 0.01;
+        let slopes = self.core(effect).slopes(SIZE);
+        let n = slopes.states.min(MOST_STATES);
+        let resolvent = DMatrix::from_fn(n, n, |i, j| {
+            let own = if i == j { s } else { Complex::new(0.0, 0.0) };
+            own - slopes.rates[i][3 + j]
+        })
+        .lu();
+        let mut out = [Complex::new(0.0, 0.0); 3];
+        for (column, out) in out.iter_mut().enumerate() {
+            *out = Complex::new(slopes.output[column], 0.0);
+            if n > 0 {
+                let drive = DVector::from_fn(n, |i, _| Complex::new(slopes.rates[i][column], 0.0));
+                let states = resolvent.solve(&drive)?;
+                for (j, x) in states.iter().enumerate() {
+                    *out += *x * slopes.output[3 + j];
+                }
+            }
+        }
+        Some(out)
+    }
+}
