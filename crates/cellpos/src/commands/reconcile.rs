@@ -6,8 +6,9 @@ use crate::output;
 use crate::rig_file::{ClockKind, Frames, RigFile};
 use cellpos_experiment::collect::{self, Collected, Collecting, refused};
 use cellpos_experiment::on_rig::{OnRig, is_unseen};
+use cellpos_plant::effects::Definition;
 use cellpos_plant::{Model, Noise, TransferFunction};
-use cellpos_reconcile::{Options, Reconciliation, Record, reconcile};
+use cellpos_reconcile::{Options, Reconciliation, Record, Verdict, reconcile};
 use cellpos_record::RunReader;
 use cellpos_runtime::{Life, TickFlags, TickRecord};
 use cellpos_table::{ColumnRef, Table};
@@ -19,6 +20,7 @@ use std::path::{Path, PathBuf};
 Examples:
   cellpos reconcile --model eq6 --data runs/monday --out augmented.toml --report gap.html --json result.json
   cellpos reconcile --model eq6 --collect more --rig rig.toml --out augmented.toml
+  cellpos reconcile --model base.toml --data d.csv --effects mine.toml --out augmented.toml
   cellpos reconcile --model fit --data Model_Vi_Do.dat --rows 0:8027 --input-column 1 --output-column 5 --rate 200Hz
 
 Verdicts: named, named-with-remainder (and something is left beside), ambiguous (the data cannot separate, and what would), unknown (nothing in the catalogue closes enough),
@@ -55,7 +57,10 @@ pub struct Args {
     /// Do not ask the operating system for real time.
     #[arg(long, requires = "collect")]
     best_effort: bool,
-    /// Write the augmented model here (TOML).
+    /// Effects of your own, searched like those of the catalogue (TOML, see docs/reconcile.md).
+    #[arg(long, value_name = "FILE")]
+    effects: Vec<PathBuf>,
+    /// Write the augmented model here (TOML); where the verdict is unknown, its hypothesis goes beside it as NAME.effects.toml.
     #[arg(long)]
     out: Option<PathBuf>,
     /// Write the report here (HTML).
@@ -101,7 +106,17 @@ pub struct Args {
 pub fn run(args: Args) -> CommandResult {
     collectable(&args)?;
     let json = args.json.iter().filter(|path| path.as_os_str() != "-");
-    output::ready(args.out.iter().chain(&args.report).chain(json))?;
+    let beside: Vec<PathBuf> = args.out.iter().map(|out| proposal_path(out)).collect();
+    output::ready(
+        args.out
+            .iter()
+            .chain(&args.report)
+            .chain(json)
+            .chain(&beside),
+    )?;
+    for file in &args.effects {
+        Definition::load_file(file).map_err(Failure::input)?;
+    }
     let files = files(&args.data)?;
     let mut records = Vec::new();
     let mut rests_um = Vec::new();
@@ -211,6 +226,10 @@ fn write(args: &Args, result: &Reconciliation, collected: &[Collected]) -> Resul
     if let Some(path) = &args.out {
         output::write(path, &result.augmented.to_toml_string())?;
     }
+    let proposed = proposed(args, result);
+    if let Some((path, text)) = &proposed {
+        output::write(path, text)?;
+    }
     if let Some(path) = &args.report {
         let title = args
             .data
@@ -245,7 +264,26 @@ fn write(args: &Args, result: &Reconciliation, collected: &[Collected]) -> Resul
             c.why
         ));
     }
-    print_text(&(text + &summary(result)))
+    text.push_str(&summary(result));
+    if let Some((path, _)) = &proposed {
+        text.push_str(&format!(
+            "the hypothesis as effects of your own: {}; edit it, and run again with --effects\n",
+            path.display()
+        ));
+    }
+    print_text(&text)
+}
+
+/// Where a verdict is unknown and has a formula: the file beside the augmented model, and its text.
+fn proposed(args: &Args, result: &Reconciliation) -> Option<(PathBuf, String)> {
+    let text = result
+        .proposal_toml()
+        .filter(|_| result.verdict == Verdict::Unknown)?;
+    Some((proposal_path(args.out.as_ref()?), text))
+}
+
+fn proposal_path(out: &Path) -> PathBuf {
+    out.with_extension("effects.toml")
 }
 
 fn summary(result: &Reconciliation) -> String {

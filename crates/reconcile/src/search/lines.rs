@@ -58,27 +58,73 @@ pub(crate) fn strongest_line(ctx: &Context<'_>, fit: &Fit) -> Option<f64> {
     let longest = (0..ctx.problem.records.len()).max_by_key(|i| ctx.problem.records[*i].u.len())?;
     let e = &fit.innovations[longest];
     let n = e.len().min(4000);
-    let mut best = (0.0, 0.0);
+    let dt = ctx.problem.base.sample_s;
+    let mut found: Vec<(f64, f64)> = Vec::new();
     for f in coarse {
         for part in 0..8 {
             let hz = f + f64::from(part) / 8.0;
             let (mut s, mut c) = (0.0, 0.0);
             for (k, e) in e[..n].iter().enumerate() {
-                let (a, b) = (TAU * hz * k as f64 * ctx.problem.base.sample_s).sin_cos();
+                let (a, b) = (TAU * hz * k as f64 * dt).sin_cos();
                 s += a * e;
                 c += b * e;
             }
             let p = 2.0 * (s * s + c * c) / n as f64;
-            if p > best.1 {
-                best = (hz, p);
+            if p > LINE_LEAST {
+                found.push((hz, p));
             }
         }
     }
-    if best.1 < 40.0 {
-        return None;
-    }
+    found.sort_by(|a, b| b.1.total_cmp(&a.1));
+    found.truncate(MOST_TRIED);
+    let command = &ctx.problem.records[longest].u[..n];
+    let best = found.into_iter().find(|(hz, _)| {
+        stands_out(&e[..n], *hz, dt)
+            && !(1..=HARMONICS).any(|k| stands_out(command, hz / f64::from(k), dt))
+    })?;
     let fine = (0..41).map(|i| best.0 - 0.1 + f64::from(i) * 0.005);
     fine.map(|hz| (hz, line_score(ctx, fit, hz, &mask)))
         .max_by(|a, b| a.1.total_cmp(&b.1))
         .map(|b| b.0)
+}
+
+/// Least power of a line, in units of the noise's own.
+const LINE_LEAST: f64 = 40.0;
+/// Frequencies that are looked at, strongest first.
+const MOST_TRIED: usize = 100;
+/// A response that bends answers at multiples of the command's lines: up to this one.
+const HARMONICS: u32 = 5;
+/// How far a line must stand above its neighbours, in power.
+const ABOVE_NEIGHBOURS: f64 = 10.0;
+
+/// Power at a frequency under a window that keeps strong neighbours out.
+fn power(x: &[f64], hz: f64, dt: f64) -> f64 {
+    let n = x.len() as f64;
+    let (mut s, mut c) = (0.0, 0.0);
+    for (k, x) in x.iter().enumerate() {
+        let window = 1.0 - (TAU * k as f64 / n).cos();
+        let (a, b) = (TAU * hz * k as f64 * dt).sin_cos();
+        s += a * window * x;
+        c += b * window * x;
+    }
+    s * s + c * c
+}
+
+/// Whether a series has a line at a frequency: more there than at the neighbours that it can be told from.
+fn stands_out(x: &[f64], hz: f64, dt: f64) -> bool {
+    let bin = 1.0 / (x.len() as f64 * dt);
+    let peak = [-1.0, -0.5, 0.0, 0.5, 1.0]
+        .iter()
+        .map(|d| power(x, hz + d * bin, dt))
+        .fold(0.0, f64::max);
+    let mut around: Vec<f64> = (4..12)
+        .flat_map(|i| [-f64::from(i), f64::from(i)])
+        .map(|i| hz + i * bin)
+        .filter(|f| *f > 0.0)
+        .map(|f| power(x, f, dt))
+        .collect();
+    around.sort_by(f64::total_cmp);
+    around
+        .get(around.len() / 2)
+        .is_some_and(|median| peak > ABOVE_NEIGHBOURS * median)
 }

@@ -11,6 +11,7 @@ use crate::verdict::held_out::{self, HeldOut};
 use crate::verdict::judge::{Evidence, judge};
 use crate::verdict::map;
 use crate::verdict::names::{names, of_frames};
+use crate::verdict::proposal;
 use crate::verdict::result::{Gap, GapStep, Interval, Reconciliation, Traces, Verdict};
 use crate::verdict::sentences::sentences;
 use cellpos_plant::Model;
@@ -108,6 +109,11 @@ pub(crate) fn assemble(
         places,
         gap,
         base_shift: base_shift(&fit, &held),
+        proposal: judgement
+            .hypothesis
+            .iter()
+            .flat_map(|h| proposal::of(ctx, h))
+            .collect(),
         hypothesis: judgement.hypothesis,
         remainder: judgement.remainder,
         floor: floor.source,

@@ -9,6 +9,7 @@ pub(crate) mod judge;
 pub(crate) mod map;
 mod names;
 mod parameters;
+mod proposal;
 pub(crate) mod result;
 mod sentences;
 mod significance;

@@ -6,6 +6,7 @@ use crate::fit::context::{Context, Fit};
 use crate::verdict::battery::Hypothesis;
 use crate::verdict::map::DiscrepancyMap;
 use cellpos_plant::Model;
+use cellpos_plant::effects::Definition;
 use serde::Serialize;
 use std::collections::BTreeMap;
 
@@ -253,6 +254,8 @@ pub struct Reconciliation {
     pub base_shift: BTreeMap<String, Interval>,
     /// A formula for what no effect explains.
     pub hypothesis: Option<Hypothesis>,
+    /// The same as effects of the user's own, to be edited and run again; without lines.
+    pub proposal: Vec<Definition>,
     /// What is left beside the named effects.
     pub remainder: Option<Remainder>,
     /// Where the noise floor comes from.
@@ -274,6 +277,18 @@ pub struct Reconciliation {
 }
 
 impl Reconciliation {
+    /// The proposal as the text of an effects file, if there is one.
+    pub fn proposal_toml(&self) -> Option<String> {
+        let effects = self.proposal.iter().map(|d| d.to_toml_string("effects"));
+        (!self.proposal.is_empty()).then(|| {
+            format!(
+                "# What the rest looks like, as effects to edit and to run again with --effects. Take out what makes no sense;\n\
+                 # say what a number means by its name; let bounds be those of the thing itself.\n{}",
+                effects.collect::<String>()
+            )
+        })
+    }
+
     /// The JSON object for machines.
     pub fn to_json(&self) -> serde_json::Value {
         serde_json::json!({
@@ -283,6 +298,7 @@ impl Reconciliation {
             "gap": self.gap,
             "base_shift": self.base_shift,
             "hypothesis": self.hypothesis,
+            "effects_toml": self.proposal_toml(),
             "remainder": self.remainder,
             "floor": { "source": self.floor, "known": self.floor.is_known(), "words": self.floor.words() },
             "noise": {

@@ -330,3 +330,65 @@ fn a_silverbox_is_named_with_a_cubic_spring_from_a_file() {
     assert_eq!(result.effects[0].id, "cubic-spring");
     assert!(after < 1e-3, "{after} V");
 }
+
+/// Two tanks one above the other; what runs over the upper one's rim falls in part into the lower, and the lower runs over at
+/// 10 V. Levels in volts, the pump's voltage from 3 V.
+const TANKS: &str = r#"
+[[effects]]
+id = "tanks-overflow"
+place = "plant"
+says = "tanks that run over"
+output = "min(lower, 10)"
+step_s = 2.0
+[effects.states]
+upper = { rate = "pump*(input + offset) - outlet*upper - 0.25*max(upper - rim, 0)", start = "upper_0" }
+lower = { rate = "outlet*upper + caught*0.25*max(upper - rim, 0) - drain*max(lower, 1e-6)^power - 0.25*max(lower - 10, 0)", start = "lower_0" }
+[effects.parameters]
+pump = { unit = "1/s", lower = 0.005, upper = 0.1, start = 0.03 }
+offset = { unit = "V", lower = 0.0, upper = 10.0, start = 3.0 }
+outlet = { unit = "1/s", lower = 0.002, upper = 0.05, start = 0.02 }
+rim = { unit = "V", lower = 3.0, upper = 80.0, start = 9.0 }
+caught = { unit = "", lower = 0.0, upper = 3.0, start = 1.0 }
+drain = { unit = "V/s", lower = 0.01, upper = 0.5, start = 0.05 }
+power = { unit = "", lower = 0.05, upper = 1.0, start = 0.5 }
+upper_0 = { unit = "V", lower = 0.0, upper = 80.0, start = 5.0 }
+lower_0 = { unit = "V", lower = 3.0, upper = 8.0, start = 5.2 }
+"#;
+
+#[test]
+fn tanks_with_an_overflow_from_a_file_follow_what_they_have_not_seen() {
+    let Some(s) = set(
+        "cascaded-tanks",
+        &["tanks_Est"],
+        ("u_V", "y_V"),
+        4.0,
+        2,
+        Hold::ZeroOrder,
+    ) else {
+        return;
+    };
+    let fresh = set(
+        "cascaded-tanks",
+        &["tanks_Val"],
+        ("u_V", "y_V"),
+        4.0,
+        2,
+        Hold::ZeroOrder,
+    )
+    .unwrap();
+    Definition::from_toml_str(TANKS, "tanks.toml").unwrap();
+    // A sensor of 0.2 V: the best that is known of these tanks.
+    let model = Model {
+        noise: Noise {
+            diffusion_um2_per_s: 0.0,
+            localisation_um: 0.2,
+        },
+        ..rough(3.0, &[3200.0, 120.0, 1.0], 3.0)
+    };
+    let result = s.run(&model, &s.records(|n| 0..n)).unwrap();
+    println!("{}", result.augmented.to_toml_string());
+    let (_, u, y) = &fresh.files[0];
+    let after = free_run(&result.augmented, s.hold, s.sample_s, (u, y), 0.0);
+    println!("fresh record: {after:.3} V");
+    assert!(after < 0.30, "{after} V");
+}
