@@ -114,8 +114,10 @@ pub fn run(args: Args) -> CommandResult {
             .chain(json)
             .chain(&beside),
     )?;
+    let mut own_effects = Vec::new();
     for file in &args.effects {
-        Definition::load_file(file).map_err(Failure::input)?;
+        let kinds = Definition::load_file(file).map_err(Failure::input)?;
+        own_effects.extend(kinds.iter().map(|kind| kind.spec().id));
     }
     let files = files(&args.data)?;
     let mut records = Vec::new();
@@ -136,6 +138,7 @@ pub fn run(args: Args) -> CommandResult {
     let mut options = Options {
         threads,
         max_effects: args.max_effects,
+        own_effects,
         ..Options::default()
     };
     let model = if args.model == "fit" {

@@ -74,7 +74,7 @@ fn the_predictor_and_the_simulator_of_the_program_agree_on_every_effect_that_is_
     let own = apart_um(&predicted(&Model::eq6(), &u), &bare);
     assert!(own < 1e-6, "Eq. (6) alone: {own} um apart");
     let mut bad = Vec::new();
-    for variant in variants() {
+    for variant in variants(&[]) {
         for start in variant.starts(&SCOPE) {
             let effect = start.effect(&SCOPE);
             if matches!(effect.act(), Action::Show(_)) {

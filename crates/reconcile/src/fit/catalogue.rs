@@ -41,10 +41,11 @@ impl Variant {
     }
 }
 
-/// Every form of every known effect.
-pub(crate) fn variants() -> Vec<Variant> {
+/// Every form of every known effect; of the user's own those that are asked for.
+pub(crate) fn variants(own: &[&str]) -> Vec<Variant> {
     effects::all()
         .into_iter()
+        .filter(|kind| kind.definition().is_none() || own.contains(&kind.spec().id))
         .flat_map(|kind| (0..kind.candidates().len()).map(move |form| Variant { kind, form }))
         .collect()
 }

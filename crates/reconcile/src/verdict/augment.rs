@@ -73,6 +73,21 @@ fn effect_of(ctx: &Context<'_>, fit: &Fit, index: usize) -> Option<Effect> {
     }
 }
 
+/// Adds what was fitted beside the effects of the base model: a delay to the delay that is there already, a factor to the
+/// factor; of an exposure there is one.
+fn add(effects: &mut Vec<Effect>, found: Effect) {
+    let Some(old) = effects.iter_mut().find(|e| e.id() == found.id()) else {
+        effects.push(found);
+        return;
+    };
+    match found.id() {
+        "time-delay" => *old = effects::time_delay(old.scalar(0) + found.scalar(0)),
+        "gain-error" => *old = effects::gain_error(old.scalar(0) * found.scalar(0)),
+        "exposure-averaging" => *old = found,
+        _ => effects.push(found),
+    }
+}
+
 /// The model with what was found, its intervals and where they come from.
 pub(crate) fn augment(
     model: &Model,
@@ -109,8 +124,7 @@ pub(crate) fn augment(
     if verdict != Verdict::Unknown {
         for i in 0..fit.parts.len() {
             if let Some(e) = effect_of(ctx, fit, i) {
-                out.effects.retain(|old| old.id() != e.id());
-                out.effects.push(e);
+                add(&mut out.effects, e);
             }
         }
         if frames.drops_named() {
@@ -145,4 +159,22 @@ pub(crate) fn augment(
         );
     }
     out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_delay_found_beside_a_delay_is_added_to_it() {
+        let mut all = vec![effects::time_delay(2e-3), effects::gain_error(0.5)];
+        add(&mut all, effects::time_delay(0.5e-3));
+        add(&mut all, effects::gain_error(1.2));
+        add(&mut all, effects::backlash(0.1));
+        add(&mut all, effects::backlash(0.2));
+        let ids: Vec<&str> = all.iter().map(Effect::id).collect();
+        assert_eq!(ids, ["time-delay", "gain-error", "backlash", "backlash"]);
+        assert!((all[0].scalar(0) - 2.5e-3).abs() < 1e-12);
+        assert!((all[1].scalar(0) - 0.6).abs() < 1e-12);
+    }
 }

@@ -37,6 +37,9 @@ pub struct Options {
     pub free_gain: bool,
     /// The plant need not have rested at its working point before a record: its transients are free in every record.
     pub free_start: bool,
+    /// Ids of effects of the user's own to look for beside the catalogue; others that a model file has defined are
+    /// simulated and not looked for.
+    pub own_effects: Vec<&'static str>,
 }
 
 impl Default for Options {
@@ -47,6 +50,7 @@ impl Default for Options {
             interpolated_input: false,
             free_gain: false,
             free_start: false,
+            own_effects: Vec::new(),
         }
     }
 }
@@ -220,7 +224,7 @@ fn context<'a>(
         problem,
         scope,
         fixed: fixed.to_vec(),
-        variants: catalogue::variants(),
+        variants: catalogue::variants(&options.own_effects),
         free_gain: options.free_gain,
         white: None,
         quantised: problem.quantised,
