@@ -106,7 +106,11 @@ pub struct Args {
 pub fn run(args: Args) -> CommandResult {
     collectable(&args)?;
     let json = args.json.iter().filter(|path| path.as_os_str() != "-");
-    let beside: Vec<PathBuf> = args.out.iter().map(|out| proposal_path(out)).collect();
+    let beside: Vec<PathBuf> = args
+        .out
+        .iter()
+        .flat_map(|out| [proposal_path(out), out.with_extension("best.toml")])
+        .collect();
     output::ready(
         args.out
             .iter()
@@ -229,6 +233,10 @@ fn write(args: &Args, result: &Reconciliation, collected: &[Collected]) -> Resul
     if let Some(path) = &args.out {
         output::write(path, &result.augmented.to_toml_string())?;
     }
+    let unnamed = unnamed(args, result);
+    if let Some(path) = &unnamed {
+        output::write(path, &result.best.to_toml_string())?;
+    }
     let proposed = proposed(args, result);
     if let Some((path, text)) = &proposed {
         output::write(path, text)?;
@@ -274,7 +282,19 @@ fn write(args: &Args, result: &Reconciliation, collected: &[Collected]) -> Resul
             path.display()
         ));
     }
+    if let Some(path) = &unnamed {
+        text.push_str(&format!(
+            "the model with the best set, its names not earned: {}\n",
+            path.display()
+        ));
+    }
     print_text(&text)
+}
+
+/// With effects of one's own and no name: the file of the model with the best set.
+fn unnamed(args: &Args, result: &Reconciliation) -> Option<PathBuf> {
+    let wanted = !args.effects.is_empty() && result.verdict == Verdict::Unknown;
+    wanted.then(|| args.out.as_ref().map(|out| out.with_extension("best.toml")))?
 }
 
 /// Where a verdict is unknown and has a formula: the file beside the augmented model, and its text.

@@ -21,6 +21,11 @@ impl Variant {
         self.kind.spec().id
     }
 
+    /// Whether it is an effect of the user's own.
+    pub fn is_own(self) -> bool {
+        self.kind.definition().is_some()
+    }
+
     pub fn candidate(self) -> &'static Candidate {
         &self.kind.candidates()[self.form]
     }

@@ -92,6 +92,7 @@ fn extensions(
     let tangents = ctx.tangents(fit, mask);
     let leads = screen(ctx, fit, &tangents, mask, effort.threads, |v| {
         !v.candidate().late
+            && !v.is_own()
             && !ctx.excludes(v.id())
             && !fit.has(v.id())
             && !forbidden.contains(&v.id())
@@ -134,8 +135,29 @@ fn extensions(
     let rest = fits.split_off(fits.iter().take(4).filter(|f| f.chi2 <= close).count());
     let mut fits = parallel::map(&fits, effort.threads, |f| ctx.refit(f, mask, 14));
     fits.extend(rest);
+    fits.extend(own(ctx, fit, mask, effort, forbidden));
     fits.sort_by(|a, b| penalised_cost(ctx, a).total_cmp(&penalised_cost(ctx, b)));
     fits
+}
+
+/// Every effect of the user's own beside a set, from its best start. Screening is linear, and equations with many numbers look
+/// like nothing from afar: those that a user asks for are few, and are fitted for certain.
+fn own(ctx: &Context<'_>, fit: &Fit, mask: &Mask, effort: Effort, forbidden: &[&str]) -> Vec<Fit> {
+    const SHORT: usize = 6;
+    const LONG: usize = 60;
+    let mut best: Vec<Fit> = Vec::new();
+    for variant in ctx.variants.iter().filter(|v| {
+        v.is_own() && !ctx.excludes(v.id()) && !fit.has(v.id()) && !forbidden.contains(&v.id())
+    }) {
+        let starts = variant.starts(&ctx.scope);
+        let fits = parallel::map(&starts, effort.threads, |part| {
+            let mut parts = fit.parts.clone();
+            parts.push(part.clone());
+            ctx.fit_from(parts, Some(fit.soft), mask, SHORT)
+        });
+        best.extend(fits.into_iter().min_by(|a, b| a.chi2.total_cmp(&b.chi2)));
+    }
+    parallel::map(&best, effort.threads, |f| ctx.refit(f, mask, LONG))
 }
 
 /// Whether the part of `bigger` that `smaller` lacks is worth having, where `null` is the sum of squares without effects.

@@ -102,6 +102,18 @@ pub(crate) fn assemble(
         bands: held_out::bands(&null_map, &after_map),
     };
     let augmented = augment(model, ctx, &fit, frames, &named, verdict, floor);
+    // The same with the set that was best, whether or not it earned its names.
+    let mut best = augment(
+        model,
+        ctx,
+        &fit,
+        frames,
+        &named,
+        Verdict::NamedWithRemainder,
+        floor,
+    );
+    best.provenance
+        .insert("reconcile.verdict".to_owned(), verdict.word().to_owned());
     let traces = Traces::new(ctx, &null, &fit);
     Reconciliation {
         verdict,
@@ -120,6 +132,7 @@ pub(crate) fn assemble(
         noise: ctx.problem.noise,
         sample_s: ctx.problem.base.sample_s,
         augmented,
+        best,
         before: null_map,
         after: after_map,
         traces,

@@ -266,6 +266,9 @@ pub struct Reconciliation {
     pub sample_s: f64,
     /// The model with the effects added.
     pub augmented: Model,
+    /// The model with the best set that was found, whatever the verdict says of its names: where that is `unknown`, equations
+    /// that predict without being shown to be true.
+    pub best: Model,
     /// Map of the null model.
     pub before: DiscrepancyMap,
     /// Map of the augmented model.
