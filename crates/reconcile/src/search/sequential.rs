@@ -144,7 +144,7 @@ fn extensions(
 /// like nothing from afar: those that a user asks for are few, and are fitted for certain.
 fn own(ctx: &Context<'_>, fit: &Fit, mask: &Mask, effort: Effort, forbidden: &[&str]) -> Vec<Fit> {
     const SHORT: usize = 6;
-    const LONG: usize = 60;
+    const LONG: usize = 200;
     let mut best: Vec<Fit> = Vec::new();
     for variant in ctx.variants.iter().filter(|v| {
         v.is_own() && !ctx.excludes(v.id()) && !fit.has(v.id()) && !forbidden.contains(&v.id())

@@ -211,7 +211,8 @@ impl<'a> Chain<'a> {
     /// What enters the plant, step by step, without the linear blocks that come last before it.
     fn ahead_of_plant(&mut self, u: &[f64], h: f64) -> (Vec<f64>, Zpk) {
         let mut x: Vec<f64> = if self.base.interpolated_input {
-            interpolate(u, self.fine)
+            let smooth = self.base.zpk.zeros.len() < self.base.zpk.poles.len();
+            interpolate(u, self.fine, smooth)
         } else if self.fine == 1 {
             u.to_vec()
         } else {
@@ -344,15 +345,26 @@ fn middle(x: &mut [f64]) {
     }
 }
 
-/// Straight lines between the samples; each step of the grid holds the value at its end, so that a plant without dynamics
+/// Between the samples, straight lines, or (`smooth`) cubics whose slope at a sample is that of its neighbours, which take far
+/// less from the fast part of an analogue input; each step of the grid holds the value at its end, so that a plant without dynamics
 /// is exact at the samples.
-fn interpolate(u: &[f64], fine: usize) -> Vec<f64> {
+fn interpolate(u: &[f64], fine: usize, smooth: bool) -> Vec<f64> {
     let mut x = Vec::with_capacity(u.len() * fine);
     for k in 0..u.len() {
         let next = u.get(k + 1).copied().unwrap_or(u[k]);
         for i in 0..fine {
             let f = (i as f64 + 1.0) / fine as f64;
-            x.push(u[k] + f * (next - u[k]));
+            let line = u[k] + f * (next - u[k]);
+            x.push(if smooth {
+                let before = u[k.saturating_sub(1)];
+                let after = u.get(k + 2).copied().unwrap_or(next);
+                // The cubic through both samples with half the neighbours' difference as slope, less the line.
+                let (a, b) = (0.5 * (next - before), 0.5 * (after - u[k]));
+                let d = next - u[k];
+                line + f * (1.0 - f) * ((1.0 - f) * (a - d) - f * (b - d))
+            } else {
+                line
+            });
         }
     }
     x
