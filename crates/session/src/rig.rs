@@ -338,7 +338,7 @@ where
         })
     }
 
-    /// The loop, on the calling thread, which becomes the one that serves the board.
+    /// The loop, on threads that it makes for itself; the calling one waits for them.
     fn run(self) -> Result<Finished<S>, Failure> {
         // Dropped in reverse order where the driver panics: the rig is parked before the place is given up.
         let Self {
