@@ -80,14 +80,17 @@ fn main() {
         order.rotate_left(round % Condition::ALL.len());
         for condition in order {
             let turn = turn(condition, seconds);
+            let [wake, wake_tail, compute, compute_tail] = turn.figures.map(|us| {
+                if us.is_nan() {
+                    "-".to_string()
+                } else {
+                    format!("{us:.1}")
+                }
+            });
             println!(
-                "  round {}: {:<20} wake-up {:7.1} {:8.1}   computing {:7.1} {:8.1} us, {} skipped",
+                "  round {}: {:<20} wake-up {wake:>7} {wake_tail:>8}   computing {compute:>7} {compute_tail:>8} us, {} skipped",
                 round + 1,
                 condition.name(),
-                turn.figures[0],
-                turn.figures[1],
-                turn.figures[2],
-                turn.figures[3],
                 turn.skipped
             );
             turns.push((condition, turn));
