@@ -307,6 +307,12 @@ static void cw_put_i32(cw_writer *w, int32_t value) {
     cw_put_varint(w, (bits << 1) ^ (value < 0 ? 0xffffffffu : 0u));
 }
 
+/* Whether an optional field follows; gives the same, so that it stands in the condition under which the field is written. */
+static bool cw_put_has(cw_writer *w, bool has) {
+    cw_put(w, has);
+    return has;
+}
+
 static void cw_put_limits(cw_writer *w, const cw_limits *l) {
     cw_put_i32(w, l->low_pm);
     cw_put_i32(w, l->high_pm);
@@ -315,22 +321,17 @@ static void cw_put_limits(cw_writer *w, const cw_limits *l) {
 
 static void cw_put_arm(cw_writer *w, const cw_arm *a) {
     cw_put_varint(w, a->session);
-    cw_put(w, a->has_watchdog);
-    if (a->has_watchdog) cw_put_varint(w, a->watchdog_ms);
-    cw_put(w, a->has_hold_watchdog);
-    if (a->has_hold_watchdog) cw_put_varint(w, a->hold_watchdog_ms);
-    cw_put(w, a->has_park);
-    if (a->has_park) cw_put_i32(w, a->park_pm);
-    cw_put(w, a->has_limits);
-    if (a->has_limits) cw_put_limits(w, &a->limits);
+    if (cw_put_has(w, a->has_watchdog)) cw_put_varint(w, a->watchdog_ms);
+    if (cw_put_has(w, a->has_hold_watchdog)) cw_put_varint(w, a->hold_watchdog_ms);
+    if (cw_put_has(w, a->has_park)) cw_put_i32(w, a->park_pm);
+    if (cw_put_has(w, a->has_limits)) cw_put_limits(w, &a->limits);
     cw_put(w, a->interpolate);
     cw_put_varint(w, a->status_every);
 }
 
 static void cw_put_status(cw_writer *w, const cw_status *s) {
     cw_put_varint(w, s->session);
-    cw_put(w, s->has_last_seq);
-    if (s->has_last_seq) cw_put_varint(w, s->last_seq);
+    if (cw_put_has(w, s->has_last_seq)) cw_put_varint(w, s->last_seq);
     cw_put_varint(w, s->last_time_us);
     cw_put_varint(w, s->state);
     cw_put_i32(w, s->applied_pm);

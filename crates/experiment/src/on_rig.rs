@@ -203,7 +203,7 @@ impl OnRig {
         };
         rig.fit(&mut prepared);
         let setup = rig.set_up(prepared, ReferenceSpec::Hold { position_um: 0.0 })?;
-        let core = setup.core_following(Exciting::new(&schedule.excitation_um))?;
+        let core = setup.core_following(Exciting::new(&schedule))?;
         let (sender, received) = std::sync::mpsc::channel();
         let period_ns = self.file.timing.period_ns();
         let mut view = match pages {

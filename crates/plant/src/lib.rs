@@ -35,6 +35,7 @@ mod model;
 mod model_file;
 mod phi;
 mod physical;
+pub mod quantities;
 mod random;
 mod roots;
 mod simulate;

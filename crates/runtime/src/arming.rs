@@ -2,7 +2,9 @@
 //!
 //! The PZT makes a small doublet (up, down, back) about the displacement at which it stood; the bead's frame-to-frame
 //! increments are fitted with `drift + ratio * increments predicted by the model`. Increments, because Brownian motion
-//! makes positions a random walk; a doublet, because it leaves the bead where it was. A refusal counts only for a pulse that went
+//! makes positions a random walk; a doublet, because it leaves the bead where it was. Of a bead that is
+//! farther from position 0 than the doublet moves it, the first half goes towards 0, so that one at the border of the view stays
+//! in it. A refusal counts only for a pulse that went
 //! as planned: where ticks were skipped or frames came late the answer is that of another pulse, and it is made again.
 
 use crate::life::Refusal;
@@ -77,6 +79,8 @@ pub struct ArmingState {
     /// Tick of the pulse; `None` before it.
     pulse: Option<u32>,
     base_um: f64,
+    /// Whether the doublet goes down first.
+    down_first: bool,
     /// The last position, um, and the tick of the pulse at which it came.
     last: Option<(u32, f64)>,
     /// Ticks in a row without a frame.
@@ -91,6 +95,13 @@ pub struct ArmingState {
     disturbed: bool,
     /// Pulses made that counted for nothing.
     repeated: u32,
+}
+
+impl ArmingState {
+    /// Sign of the doublet.
+    fn way(&self) -> f64 {
+        if self.down_first { -1.0 } else { 1.0 }
+    }
 }
 
 /// Ticks in a row without a frame that a steady bead may have.
@@ -200,7 +211,10 @@ impl Arming {
                 state.pulse = Some(0);
                 state.last = position_um.map(|um| (0, um));
                 state.base_um = command_um;
-                return Step::Command(command_um + self.program_um.first().copied().unwrap_or(0.0));
+                let reach_um = self.positions_um.iter().copied().fold(0.0, f64::max);
+                state.down_first = position_um.is_some_and(|um| um > reach_um);
+                let first_um = self.program_um.first().copied().unwrap_or(0.0);
+                return Step::Command(command_um + state.way() * first_um);
             }
             if state.ticks > self.config.patience_ticks {
                 return Step::Done(Verdict {
@@ -223,7 +237,7 @@ impl Arming {
             if let Some((at, before_um)) = state.last
                 && let (Some(from_um), Some(to_um)) = (expected_um(at), expected_um(tick))
             {
-                let (x, y) = (to_um - from_um, now_um - before_um);
+                let (x, y) = (state.way() * (to_um - from_um), now_um - before_um);
                 state.n += 1.0;
                 state.sum_x += x;
                 state.sum_y += y;
@@ -237,7 +251,7 @@ impl Arming {
             state.last = None;
         }
         match self.program_um.get(tick as usize) {
-            Some(offset_um) => Step::Command(state.base_um + offset_um),
+            Some(offset_um) => Step::Command(state.base_um + state.way() * offset_um),
             None => {
                 let verdict = self.judge(state);
                 let void = verdict.refusal.is_some() && state.disturbed;
@@ -289,172 +303,5 @@ impl Arming {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    const SAMPLE: Seconds = Seconds(1e-3);
-    const DELAY: Seconds = Seconds(2e-3);
-
-    /// A plant of `factor` times Eq. (6) with drift and a reproducible jitter of the position.
-    fn run(config: ArmingConfig, factor: f64, blind: impl Fn(u32) -> bool) -> (Verdict, f64) {
-        let (verdict, largest, _) = run_disturbed(config, factor, blind, |_| 0);
-        (verdict, largest)
-    }
-
-    /// The same where before a tick others are skipped; gives the pulses made again, too.
-    fn run_disturbed(
-        config: ArmingConfig,
-        factor: f64,
-        blind: impl Fn(u32) -> bool,
-        skipped: impl Fn(u32) -> u32,
-    ) -> (Verdict, f64, u32) {
-        let arming =
-            Arming::new(config, &TransferFunction::eq6(), SAMPLE, DELAY).expect("eq6 is a plant");
-        let plant =
-            DiscretePlant::new(&TransferFunction::eq6(), SAMPLE, DELAY).expect("eq6 is a plant");
-        let mut truth = plant.state(0.0);
-        let mut state = ArmingState::default();
-        let mut command = 20.0;
-        let mut largest: f64 = 0.0;
-        let mut again = 0;
-        for tick in 0..10_000u32 {
-            // The last command stands while the loop does not run.
-            for _ in 0..skipped(tick) {
-                plant.step(&mut truth, command - 20.0);
-            }
-            let jitter =
-                0.02 * (f64::from(tick.wrapping_mul(2_654_435_761)) / f64::from(u32::MAX) - 0.5);
-            let position = factor * plant.output_um(&truth) + 0.01 * f64::from(tick) + jitter;
-            let seen = (!blind(tick)).then_some(position);
-            let steps = u64::from(skipped(tick)) + 1;
-            let input = ArmingInput {
-                position_um: seen,
-                framed: true,
-                command_um: command,
-                neutral_um: 20.0,
-                disturbed: steps > 1,
-                steps,
-            };
-            match arming.step(&mut state, &input) {
-                Step::Command(next) => command = next,
-                Step::Again(next, _) => {
-                    command = next;
-                    again += 1;
-                }
-                Step::Done(verdict) => return (verdict, largest, again),
-            }
-            largest = largest.max((command - 20.0).abs());
-            plant.step(&mut truth, command - 20.0);
-        }
-        panic!("arming never ended");
-    }
-
-    #[test]
-    fn the_pzt_goes_to_the_believed_rest_only_where_no_bead_was_ever_seen() {
-        let arming = Arming::new(
-            ArmingConfig::default(),
-            &TransferFunction::eq6(),
-            SAMPLE,
-            DELAY,
-        )
-        .expect("eq6 is a plant");
-        let stands = |seen: bool| {
-            let mut state = ArmingState::default();
-            let mut command = 12.0;
-            for tick in 0..1000 {
-                // Seen once, and lost again: a person may have brought it to rest here.
-                let position = (seen && tick == 10).then_some(0.0);
-                let input = ArmingInput {
-                    position_um: position,
-                    framed: true,
-                    command_um: command,
-                    neutral_um: 20.0,
-                    disturbed: false,
-                    steps: 1,
-                };
-                let step = arming.step(&mut state, &input);
-                let Step::Command(next) = step else {
-                    panic!("given up too soon");
-                };
-                assert!((next - command).abs() <= 0.1 + 1e-12);
-                command = next;
-            }
-            command
-        };
-        assert_eq!(stands(true), 12.0);
-        assert!((stands(false) - 20.0).abs() < 1e-9);
-    }
-
-    #[test]
-    fn the_plant_of_the_model_passes_with_a_ratio_of_one() {
-        let (verdict, largest) = run(ArmingConfig::default(), 1.0, |_| false);
-        assert_eq!(verdict.refusal, None);
-        assert!(
-            (verdict.gain_ratio - 1.0).abs() < verdict.ci95.max(0.02),
-            "{verdict:?}"
-        );
-        assert_eq!(largest, 0.5);
-    }
-
-    #[test]
-    fn a_wrong_sign_a_dead_bead_and_a_factor_of_four_are_told_apart() {
-        for (factor, refusal) in [
-            (-1.0, Refusal::WrongSign),
-            (0.0, Refusal::NoResponse),
-            (4.0, Refusal::WrongGain),
-            (0.2, Refusal::WrongGain),
-        ] {
-            let (verdict, _) = run(ArmingConfig::default(), factor, |_| false);
-            assert_eq!(
-                verdict.refusal,
-                Some(refusal),
-                "factor {factor}: {verdict:?}"
-            );
-        }
-        for factor in [0.5, 2.0] {
-            let (verdict, _) = run(ArmingConfig::default(), factor, |_| false);
-            assert_eq!(verdict.refusal, None, "factor {factor}");
-        }
-    }
-
-    #[test]
-    fn without_a_steady_bead_the_pzt_never_moves() {
-        let (verdict, largest) = run(ArmingConfig::default(), 1.0, |tick| tick % 10 == 0);
-        assert_eq!(verdict.refusal, Some(Refusal::NoBead));
-        assert_eq!(largest, 0.0);
-    }
-
-    #[test]
-    fn a_bead_lost_during_the_pulse_is_no_bead() {
-        let (verdict, _) = run(ArmingConfig::default(), 1.0, |tick| tick > 22);
-        assert_eq!(verdict.refusal, Some(Refusal::NoBead));
-    }
-
-    #[test]
-    fn a_pulse_in_which_the_loop_stalled_is_made_again_and_not_held_against_the_plant() {
-        // Stalls in the upward half: the bead goes on for as long and comes back for the rest only.
-        let stalls = |tick| match tick {
-            24 | 26 | 28 => 60,
-            _ => 0,
-        };
-        let config = ArmingConfig::default();
-        let (verdict, _, again) = run_disturbed(config, 1.0, |_| false, stalls);
-        assert_eq!((verdict.refusal, again), (None, 1), "{verdict:?}");
-        assert!((verdict.gain_ratio - 1.0).abs() < 0.05, "{verdict:?}");
-        // A plant that is wrong is refused however the first pulse went, and nothing is tried for ever.
-        let (verdict, _, again) = run_disturbed(config, -1.0, |_| false, stalls);
-        assert_eq!((verdict.refusal, again), (Some(Refusal::WrongSign), 1));
-        let always = |tick| if tick % 3 == 0 { 40 } else { 0 };
-        let (verdict, _, again) = run_disturbed(config, -1.0, |_| false, always);
-        assert!(verdict.refusal.is_some());
-        assert_eq!(again, MOST_REPEATED);
-    }
-
-    #[test]
-    fn a_few_missing_frames_do_not_matter() {
-        let (verdict, _) = run(ArmingConfig::default(), 1.0, |tick| {
-            tick > 25 && tick % 7 == 0
-        });
-        assert_eq!(verdict.refusal, None);
-    }
-}
+#[path = "arming_tests.rs"]
+mod tests;

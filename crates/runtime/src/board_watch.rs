@@ -1,7 +1,9 @@
 //! Whether the board does what it is told: judged from its reports, beside the loop.
 //!
 //! Three things go wrong without a word from the board: another host has armed it, it takes commands and obeys none, or
-//! its output is not where the commands were. A report that is late by the line is none of these: each must last.
+//! its output is not where the commands were. A report names the command that it was made under, by the host's time of it;
+//! its output is compared with that command and those shortly before it, however late the report comes. Each trouble must
+//! last.
 
 use cellpos_rig::{ActuatorReport, ActuatorState};
 
@@ -16,9 +18,11 @@ pub enum BoardTrouble {
     NotFollowing,
 }
 
-/// Commands that are remembered, and for how long they may explain where the output stands, ns.
-const REMEMBERED: usize = 64;
-const EXPLAINS_NS: i64 = 30_000_000;
+/// Commands that are remembered: a second at 1 kHz. A report under an older one says nothing.
+const REMEMBERED: usize = 1024;
+/// How long before the command that a report names others may explain where the output stands, us: a board that
+/// interpolates, or whose slew is less than the loop's, is still on its way from them.
+const EXPLAINS_US: u64 = 30_000;
 /// Trouble must last for so long, ns.
 const LASTS_NS: i64 = 100_000_000;
 /// Commands handed over meanwhile, at least: a loop that stood still gave none to obey.
@@ -35,8 +39,8 @@ pub(crate) struct BoardWatch {
     moved_ns: i64,
     commands: u32,
     off_since_ns: Option<i64>,
-    /// When and where to, newest last.
-    given: [(i64, f64); REMEMBERED],
+    /// When, by the host's time that goes with the command (us), and where to.
+    given: Box<[(u64, f64); REMEMBERED]>,
     next: usize,
 }
 
@@ -49,16 +53,16 @@ impl BoardWatch {
             moved_ns: 0,
             commands: 0,
             off_since_ns: None,
-            given: [(i64::MIN, f64::NAN); REMEMBERED],
+            given: Box::new([(0, f64::NAN); REMEMBERED]),
             next: 0,
         }
     }
 
-    /// A command was handed over.
-    pub(crate) fn commanded(&mut self, now_ns: i64, command_um: f64) {
+    /// A command was handed over, with the time that goes with it, us.
+    pub(crate) fn commanded(&mut self, time_us: u64, command_um: f64) {
         self.commands = self.commands.saturating_add(1);
         if let Some(slot) = self.given.get_mut(self.next) {
-            *slot = (now_ns, command_um);
+            *slot = (time_us, command_um);
         }
         self.next = (self.next + 1) % REMEMBERED;
     }
@@ -85,7 +89,7 @@ impl BoardWatch {
         } else if self.commands >= COMMANDS && now_ns - self.moved_ns > LASTS_NS {
             return Some(BoardTrouble::NotObeying);
         }
-        if report.state == ActuatorState::Holding || self.explains(now_ns, report.applied_um) {
+        if report.state == ActuatorState::Holding || self.explains(report) {
             self.off_since_ns = None;
             return None;
         }
@@ -93,21 +97,31 @@ impl BoardWatch {
         (now_ns - since_ns > LASTS_NS).then_some(BoardTrouble::NotFollowing)
     }
 
-    /// Whether a displacement lies among the commands of the last moments and the one before them.
-    fn explains(&self, now_ns: i64, applied_um: f64) -> bool {
-        let (mut low_um, mut high_um) = (f64::INFINITY, f64::NEG_INFINITY);
+    /// Whether the output that a report tells lies among the command that it names, those shortly before it and the one
+    /// before those. What cannot be compared is explained: no command obeyed, or one that is no longer remembered.
+    fn explains(&self, report: &ActuatorReport) -> bool {
+        if report.last_seq.is_none() {
+            return true;
+        }
+        let named_us = report.last_time_us;
+        let mut range_um: Option<(f64, f64)> = None;
         for ago in 1..=REMEMBERED {
             let at = (self.next + REMEMBERED - ago) % REMEMBERED;
-            let Some(&(ns, um)) = self.given.get(at).filter(|(_, um)| um.is_finite()) else {
+            let Some(&(us, um)) = self.given.get(at).filter(|(_, um)| um.is_finite()) else {
                 break;
             };
-            (low_um, high_um) = (low_um.min(um), high_um.max(um));
-            if ns < now_ns - EXPLAINS_NS {
+            if range_um.is_none() && us > named_us {
+                continue;
+            }
+            let (low_um, high_um) = range_um.unwrap_or((um, um));
+            range_um = Some((low_um.min(um), high_um.max(um)));
+            if us.saturating_add(EXPLAINS_US) < named_us {
                 break;
             }
         }
-        // Nothing was commanded yet, or a report is not a number that could be compared.
-        low_um > high_um || (low_um - OFF_UM..=high_um + OFF_UM).contains(&applied_um)
+        range_um.is_none_or(|(low_um, high_um)| {
+            (low_um - OFF_UM..=high_um + OFF_UM).contains(&report.applied_um)
+        })
     }
 }
 
@@ -118,18 +132,22 @@ mod tests {
 
     const MS: i64 = 1_000_000;
 
+    /// Displacement commanded in a millisecond, um.
+    fn command_um(k: i64) -> f64 {
+        20.0 + 5.0 * (k.max(0) as f64 * 0.03).sin()
+    }
+
     /// A second of a slow sine at a board that answers with a report each millisecond; the first trouble and when, ms.
-    fn watch(answer: impl Fn(i64, f64, &mut ActuatorReport)) -> Option<(BoardTrouble, i64)> {
+    fn watch(answer: impl Fn(i64, &mut ActuatorReport)) -> Option<(BoardTrouble, i64)> {
         let mut watch = BoardWatch::new();
-        for k in 0..1000 {
-            let command_um = 20.0 + 5.0 * (k as f64 * 0.03).sin();
-            watch.commanded(k * MS, command_um);
+        for k in 0..1000_i64 {
+            watch.commanded(1000 * k.unsigned_abs(), command_um(k));
             let mut report = ActuatorReport {
                 session: 7,
                 state: ActuatorState::Running,
                 fault: ActuatorFault::None,
-                applied_um: command_um,
-                last_seq: u32::try_from(k).ok(),
+                applied_um: 0.0,
+                last_seq: None,
                 last_time_us: 0,
                 device_time_us: 0,
                 bad_frames: 0,
@@ -137,7 +155,8 @@ mod tests {
                 holds: 0,
                 read_ns: k * MS,
             };
-            answer(k, command_um, &mut report);
+            under(k, &mut report);
+            answer(k, &mut report);
             if let Some(trouble) = watch.heard(k * MS, &report) {
                 return Some((trouble, k));
             }
@@ -145,21 +164,40 @@ mod tests {
         None
     }
 
+    /// A report under the command of a millisecond.
+    fn under(k: i64, report: &mut ActuatorReport) {
+        report.applied_um = command_um(k);
+        report.last_seq = u32::try_from(k).ok();
+        report.last_time_us = 1000 * k.max(0).unsigned_abs();
+    }
+
     #[test]
     fn a_board_that_follows_late_or_rests_is_no_trouble() {
-        assert_eq!(watch(|_, _, _| ()), None);
-        let late = |k: i64, _: f64, report: &mut ActuatorReport| {
-            report.applied_um = 20.0 + 5.0 * ((k - 20).max(0) as f64 * 0.03).sin();
-            report.last_seq = u32::try_from(k / 50).ok();
+        assert_eq!(watch(|_, _| ()), None);
+        // Its reports come late by a line's delay, 80 ms and more, and name the commands that they were made under.
+        for late in [20, 80, 300] {
+            let answer = |k: i64, report: &mut ActuatorReport| {
+                under(k - late, report);
+                if k < late {
+                    report.state = ActuatorState::Armed;
+                }
+            };
+            assert_eq!(watch(answer), None, "{late} ms");
+        }
+        // Every fiftieth command gets through, and it goes there with 20 ms of lag.
+        let lags = |k: i64, report: &mut ActuatorReport| {
+            let named = k / 50 * 50;
+            under(named, report);
+            report.applied_um = command_um(named - 20);
         };
-        assert_eq!(watch(late), None);
+        assert_eq!(watch(lags), None);
         // Commands reach it again within 100 ms, and it holds no more; or nothing of what is commanded ever reaches it.
         let rests = |until: i64| {
-            move |k: i64, _: f64, report: &mut ActuatorReport| {
+            move |k: i64, report: &mut ActuatorReport| {
                 if (200..until).contains(&k) {
+                    under(199, report);
                     report.state = ActuatorState::Holding;
                     report.applied_um = 20.0;
-                    report.last_seq = Some(199);
                 }
             }
         };
@@ -169,19 +207,27 @@ mod tests {
 
     #[test]
     fn another_session_a_sequence_that_stands_and_an_output_elsewhere_are_told_apart() {
-        let foreign = |k: i64, _: f64, report: &mut ActuatorReport| {
+        let foreign = |k: i64, report: &mut ActuatorReport| {
             report.session = if k < 300 { 7 } else { 8 };
         };
         assert_eq!(watch(foreign), Some((BoardTrouble::Foreign, 300)));
-        let deaf = |k: i64, _: f64, report: &mut ActuatorReport| {
-            report.last_seq = u32::try_from(k.min(300)).ok();
-        };
+        let deaf = |k: i64, report: &mut ActuatorReport| under(k.min(300), report);
         assert_eq!(watch(deaf), Some((BoardTrouble::NotObeying, 401)));
-        let elsewhere = |k: i64, um: f64, report: &mut ActuatorReport| {
-            report.applied_um = if k < 300 { um } else { 31.0 };
+        let elsewhere = |k: i64, report: &mut ActuatorReport| {
+            if k >= 300 {
+                report.applied_um = 31.0;
+            }
         };
         assert_eq!(watch(elsewhere), Some((BoardTrouble::NotFollowing, 401)));
-        let nowhere = |_: i64, _: f64, report: &mut ActuatorReport| report.applied_um = f64::NAN;
+        // Late or not: an output that is not where the command that it names was.
+        let late = |k: i64, report: &mut ActuatorReport| {
+            under(k - 80, report);
+            if k >= 380 {
+                report.applied_um = 31.0;
+            }
+        };
+        assert_eq!(watch(late), Some((BoardTrouble::NotFollowing, 481)));
+        let nowhere = |_: i64, report: &mut ActuatorReport| report.applied_um = f64::NAN;
         assert_eq!(
             watch(nowhere).map(|t| t.0),
             Some(BoardTrouble::NotFollowing)

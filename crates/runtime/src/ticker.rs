@@ -262,11 +262,12 @@ impl<R: ReferenceGenerator> Ticker<R> {
                 action: output.action,
                 time_us: (input.time_ns / 1000).max(0) as u64,
             };
+            let time_us = order.time_us;
             if self.orders.push(order).is_err() {
                 self.previous_refused = true;
                 record.flags.set(TickFlags::ACTUATOR_RING_FULL);
             } else if let Action::Command { command_um, .. } = output.action {
-                self.board_watch.commanded(start_ns, command_um);
+                self.board_watch.commanded(time_us, command_um);
             }
         }
         // Hand-over: from here on the command is on its way.

@@ -7,11 +7,14 @@
 
 use crate::bench::Bench;
 use crate::mover::Mover;
-use crate::snapshot::Eye;
+use crate::watch::{Sighting, Watch};
 use cellpos_drivers::{Axis, CalibrationFile};
-use cellpos_rig::{Camera, Clock, FrameBuffer};
+use cellpos_rig::Clock;
+use cellpos_runtime::realtime;
 use cellpos_session::Failure;
 use serde::Serialize;
+use std::sync::atomic::{AtomicU32, Ordering};
+use std::time::Duration;
 
 /// Pulses: how far, how long, how many.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -96,14 +99,6 @@ impl Response {
     }
 }
 
-/// One frame with a bead: when, and where.
-#[derive(Debug, Clone, Copy)]
-struct Sighting {
-    at_ns: i64,
-    x_px: f64,
-    y_px: f64,
-}
-
 /// Moves the PZT by pulses about where it stands and looks what the bead does. Parked on every way out.
 ///
 /// # Errors
@@ -113,8 +108,7 @@ pub fn measure(
     pulses: Pulses,
     mut progress: impl FnMut(f64),
 ) -> Result<Response, Failure> {
-    let mut camera = bench.camera()?;
-    let mut eye = Eye::of(bench)?;
+    let mut watch = Watch::of(bench)?;
     let mut mover = Mover::arm(bench.board()?, bench.file())?;
     let centre_um = mover.at_um();
     let a_um = pulses.amplitude_um;
@@ -127,34 +121,11 @@ pub fn measure(
             "move it first: park_um in [limits] of rig.toml near the middle of the range, then cellpos jog --to that",
         ));
     }
-    let clock = Clock::Real;
-    let (mut commands, mut sightings) = (Vec::new(), Vec::new());
-    let mut buffer = FrameBuffer::default();
-    let start_ns = clock.now_ns();
-    let steps = 2 * pulses.length_ms * pulses.pairs;
-    // The first tenth of a second finds the bead; nothing moves.
-    const FIND_MS: u32 = 100;
-    for step in 0..FIND_MS + steps {
-        let offset_um = match step.checked_sub(FIND_MS) {
-            // Half a pulse first: to and fro about the same place.
-            Some(at) if ((at + pulses.length_ms / 2) / pulses.length_ms).is_multiple_of(2) => a_um,
-            Some(_) => -a_um,
-            None => 0.0,
-        };
-        mover.step(centre_um + offset_um, f64::INFINITY)?;
-        commands.push((clock.now_ns(), offset_um));
-        progress(f64::from(step) / f64::from(FIND_MS + steps));
-        collect(
-            camera.as_mut(),
-            &mut eye,
-            &mut buffer,
-            start_ns,
-            &mut sightings,
-        )?;
-    }
-    mover.step(centre_um, f64::INFINITY)?;
+    let (commands, end_ns) = on_a_thread_of_its_own(&mut watch, &mut mover, pulses, &mut progress)?;
     drop(mover);
-    let response = fit(&commands, &sightings, [buffer.width, buffer.height]).ok_or_else(|| {
+    let size_px = watch.size_px();
+    let sightings = watch.finish(end_ns)?;
+    let response = fit(&commands, &sightings, size_px).ok_or_else(|| {
         Failure::bad_input(
             format!("a bead was seen in {} frames: too few", sightings.len()),
             "look with cellpos camera --rig RIG --snapshot frame.png --overlay; see docs/rig.md, Light and focus",
@@ -173,31 +144,92 @@ pub fn measure(
     Ok(response)
 }
 
-/// Looks at frames that have arrived.
-fn collect(
-    camera: &mut dyn Camera,
-    eye: &mut Eye,
-    buffer: &mut FrameBuffer,
-    start_ns: i64,
-    sightings: &mut Vec<Sighting>,
-) -> Result<(), Failure> {
-    /// In a step, so that commands go out while a slow machine has more frames than it can look at.
-    const FRAMES: usize = 2;
-    let now_ns = Clock::Real.now_ns();
-    for _ in 0..FRAMES {
-        let Some(stamp) = camera.next_frame(buffer, now_ns).map_err(Failure::failed)? else {
+/// What was commanded, when (ns) and how far from where the PZT stood (um), and when it was over.
+type Commanded = (Vec<(i64, f64)>, i64);
+
+/// The pulses, on a thread with the rights of the loop's own: a busy machine must neither hold a pulse nor lose frames.
+fn on_a_thread_of_its_own(
+    watch: &mut Watch,
+    mover: &mut Mover,
+    pulses: Pulses,
+    progress: &mut impl FnMut(f64),
+) -> Result<Commanded, Failure> {
+    const LOOK_EVERY: Duration = Duration::from_millis(20);
+    let done = AtomicU32::new(0);
+    std::thread::scope(|scope| {
+        let moving = std::thread::Builder::new()
+            .name("cellpos-pulses".to_string())
+            .spawn_scoped(scope, || {
+                realtime::apply(&realtime::Request::io_thread(70));
+                pulse(watch, mover, pulses, &done)
+            })
+            .map_err(Failure::failed)?;
+        while !moving.is_finished() {
+            let steps = f64::from(2 * pulses.length_ms * pulses.pairs);
+            progress(f64::from(done.load(Ordering::Relaxed)) / steps.max(1.0));
+            std::thread::sleep(LOOK_EVERY);
+        }
+        moving.join().unwrap_or_else(|_| {
+            let what = "the thread of the pulses panicked; the PZT is parked";
+            Err(Failure::failed(std::io::Error::other(what)))
+        })
+    })
+}
+
+/// Waits for a bead that is well in view, then moves the PZT to and fro about where it stands.
+fn pulse(
+    watch: &mut Watch,
+    mover: &mut Mover,
+    pulses: Pulses,
+    done: &AtomicU32,
+) -> Result<Commanded, Failure> {
+    let clock = Clock::Real;
+    let (centre_um, a_um) = (mover.at_um(), pulses.amplitude_um);
+    // Nothing moves until a bead is well in view: one at the border would be out of it with the first pulse.
+    for step in 0..FIND_MS {
+        mover.step(centre_um, f64::INFINITY)?;
+        watch.glance()?;
+        let now_ns = clock.now_ns();
+        if step >= SURE_MS && is_well_in_view(&watch.sightings, watch.size_px(), now_ns) {
             break;
-        };
-        let at_ns = stamp.mid_exposure_ns;
-        if let Some(seen) = eye.look(buffer, (at_ns - start_ns) as f64 * 1e-9)? {
-            sightings.push(Sighting {
-                at_ns,
-                x_px: seen.x_px,
-                y_px: seen.y_px,
-            });
         }
     }
-    Ok(())
+    watch.sightings.clear();
+    let mut commands = Vec::new();
+    for step in 0..2 * pulses.length_ms * pulses.pairs {
+        // Half a pulse first: to and fro about the same place.
+        let is_up = ((step + pulses.length_ms / 2) / pulses.length_ms).is_multiple_of(2);
+        let offset_um = if is_up { a_um } else { -a_um };
+        mover.step(centre_um + offset_um, f64::INFINITY)?;
+        commands.push((clock.now_ns(), offset_um));
+        watch.put_aside()?;
+        done.store(step, Ordering::Relaxed);
+    }
+    mover.step(centre_um, f64::INFINITY)?;
+    Ok((commands, clock.now_ns()))
+}
+
+/// Longest wait for a bead that is well in view, ms: one that drifts out of view, and the next one that comes in. Then what
+/// there is has to do.
+const FIND_MS: u32 = 8_000;
+/// At least so long, ms.
+const SURE_MS: u32 = 100;
+
+/// Whether a bead has just been seen in the middle half of the picture, in some frames in a row.
+fn is_well_in_view(sightings: &[Sighting], size_px: [usize; 2], now_ns: i64) -> bool {
+    const FRAMES: usize = 10;
+    const FRESH_NS: i64 = 100_000_000;
+    let [width, height] = size_px.map(|px| px as f64);
+    let is_inner = |at: f64, size: f64| (0.25 * size..=0.75 * size).contains(&at);
+    let last = sightings.len().checked_sub(FRAMES);
+    last.and_then(|from| sightings.get(from..))
+        .is_some_and(|last| {
+            last.iter().all(|seen| {
+                now_ns - seen.at_ns < FRESH_NS
+                    && is_inner(seen.x_px, width)
+                    && is_inner(seen.y_px, height)
+            })
+        })
 }
 
 /// Mean of the commanded offset from `from_ns` to `to_ns`.
@@ -315,6 +347,29 @@ mod tests {
         assert!((response.lag_ms - 2.0).abs() < 1e-9, "{response:?}");
         let file = response.calibration(0.1, 0.001, "test".to_string());
         assert_eq!((file.axis, file.sign, file.origin_px), (Axis::X, -1, 127.5));
+    }
+
+    #[test]
+    fn only_a_bead_in_the_middle_half_that_is_seen_now_is_well_in_view() {
+        let seen = |x_px: f64, y_px: f64| -> Vec<Sighting> {
+            let at = |k: i64| Sighting {
+                at_ns: k * 1_000_000,
+                x_px,
+                y_px,
+            };
+            (0..20).map(at).collect()
+        };
+        let is_well = |sightings: &[Sighting], now_ms: i64| {
+            is_well_in_view(sightings, [256, 32], now_ms * 1_000_000)
+        };
+        assert!(is_well(&seen(100.0, 15.0), 25));
+        assert!(!is_well(&seen(100.0, 15.0), 500), "long ago");
+        assert!(!is_well(&seen(230.0, 15.0), 25), "at the right border");
+        assert!(!is_well(&seen(100.0, 3.0), 25), "at the upper border");
+        assert!(!is_well(&seen(100.0, 15.0)[..5], 25), "too few");
+        let mut moving = seen(100.0, 15.0);
+        moving.extend(seen(250.0, 15.0));
+        assert!(!is_well(&moving, 25));
     }
 
     #[test]

@@ -1,44 +1,16 @@
 //! What does not fit together in a rig file that reads well.
 
-pub use crate::connected::{Connected, connect};
+pub use crate::connected::{CameraSeen, Connected, connect};
+use crate::finding::Found;
+pub use crate::finding::{Finding, Weight};
 use cellpos_session::RigFile;
-use cellpos_session::quantities::line_of;
 use cellpos_session::rig_file::{ActuatorConfig, CameraConfig};
-use serde::Serialize;
 use std::path::Path;
 
-/// How much a finding matters.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Weight {
-    /// It cannot work.
-    Error,
-    /// It may work, and should be looked at.
-    Warning,
-}
-
-/// Something that does not fit.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct Finding {
-    /// How much it matters.
-    pub weight: Weight,
-    /// Line of the key in the file; none for what is not there.
-    pub line: Option<usize>,
-    /// The key with its table, as `camera.rate_hz`; empty where it is about no key.
-    pub key: String,
-    /// Its value, with the unit of the key; empty where it is not there.
-    pub value: String,
-    /// Why it does not fit, with key and value.
-    pub what: String,
-    /// What would be right.
-    pub remedy: String,
-}
-
-/// Findings in the making.
+/// Findings of what the file says, in the making.
 struct Findings<'a> {
     file: &'a RigFile,
-    text: String,
-    found: Vec<Finding>,
+    found: Found,
 }
 
 use Weight::{Error, Warning};
@@ -47,25 +19,12 @@ impl Findings<'_> {
     fn say(
         &mut self,
         weight: Weight,
-        (table, key): (&str, &str),
+        of: (&str, &str),
         value: &dyn std::fmt::Display,
         what: String,
         remedy: &str,
     ) {
-        let whole = [table, key]
-            .iter()
-            .filter(|part| !part.is_empty())
-            .copied()
-            .collect::<Vec<_>>()
-            .join(".");
-        self.found.push(Finding {
-            weight,
-            line: line_of(&self.text, Some(table), key),
-            key: whole,
-            value: value.to_string(),
-            what,
-            remedy: remedy.to_string(),
-        });
+        self.found.say(weight, of, value, what, remedy);
     }
 
     /// Rate, exposure, age.
@@ -257,14 +216,13 @@ impl Findings<'_> {
 pub fn findings(file: &RigFile, path: &Path) -> Vec<Finding> {
     let mut findings = Findings {
         file,
-        text: std::fs::read_to_string(path).unwrap_or_default(),
-        found: Vec::new(),
+        found: Found::in_file(path),
     };
     findings.times();
     findings.watchdogs();
     findings.board();
     findings.camera(path);
-    findings.found
+    findings.found.findings
 }
 
 /// A sentence when the rig file was changed on a later day than that of its calibration.

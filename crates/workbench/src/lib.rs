@@ -9,9 +9,11 @@ mod bench;
 pub mod calibrate;
 pub mod check;
 mod connected;
+mod finding;
 pub mod line_test;
 pub mod mover;
 pub mod snapshot;
 pub mod template;
+mod watch;
 
 pub use bench::Bench;

@@ -2,8 +2,9 @@
 
 use super::ProgramError;
 use cellpos_emulator::BoardConfig;
-use cellpos_emulator::{FaultKind, Faults, WorldConfig};
+use cellpos_emulator::{FaultKind, Faults, QUANTITIES, WorldConfig};
 use cellpos_plant::Model;
+use cellpos_plant::quantities::bare;
 use cellpos_units::{Hertz, Micrometers, Seconds};
 use clap::Parser;
 use serde::Deserialize;
@@ -285,10 +286,13 @@ fn read_rig_file(path: &Path) -> Result<RigFile, ProgramError> {
         doing: "reading the rig file",
         source,
     })?;
-    toml::from_str(&text).map_err(|error| ProgramError::RigFile {
+    let refused = |problem: String| ProgramError::RigFile {
         path: path.to_owned(),
-        problem: error.to_string(),
-    })
+        problem,
+    };
+    let text = bare(&text, &QUANTITIES)
+        .map_err(|error| refused(format!("line {}: {error}", error.line)))?;
+    toml::from_str(&text).map_err(|error| refused(error.to_string()))
 }
 
 #[cfg(test)]
@@ -317,6 +321,35 @@ mod tests {
         assert!(!faults.active(FaultKind::LoseBead, ns(5.6)));
         assert!(faults.active(FaultKind::LoseBead, ns(1e6)));
         assert!(faults.active(FaultKind::LinkLoss, ns(1.5)));
+    }
+
+    #[test]
+    fn a_rig_file_may_have_quantities_with_units_and_a_wrong_one_is_named() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("rig.toml");
+        let of = |text: &str| {
+            std::fs::write(&path, text).unwrap();
+            parse(&format!("--rig {}", path.display())).unwrap().setup()
+        };
+        let setup = of(
+            "[limits]\npark = \"1um\"\n[board]\npower_up = \"10um\"\nwatchdog = \"0.05s\"\n[emulator]\nneutral = \"0.01mm\"\n\
+             new_bead_after = \"1s\"\n[[emulator.faults.event]]\nkind = \"lose-bead\"\nat = \"2s\"\n",
+        )
+        .unwrap();
+        assert_eq!(
+            (setup.board.power_up_um, setup.board.watchdog_ms),
+            (10.0, 50)
+        );
+        assert_eq!(
+            (setup.world.neutral_um, setup.world.new_bead_after_ms),
+            (10.0, Some(1000.0))
+        );
+        assert_eq!(setup.world.faults.event[0].at_s, 2.0);
+        let error = of("[board]\npark = \"20ms\"\n").unwrap_err().to_string();
+        assert!(
+            error.contains("line 2") && error.contains("park"),
+            "{error}"
+        );
     }
 
     #[test]

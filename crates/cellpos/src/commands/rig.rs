@@ -127,11 +127,15 @@ fn check(args: Check) -> CommandResult {
     let broken = findings
         .iter()
         .any(|finding| finding.weight == Weight::Error);
-    let connected = if args.connect && !broken {
-        Some(check::connect(&Bench::of(file)?)?)
+    let connected = if args.connect {
+        Some(check::connect(&Bench::of(file)?, &args.rig))
     } else {
         None
     };
+    let broken = broken
+        || (connected.iter())
+            .flat_map(|connected| &connected.findings)
+            .any(|finding| finding.weight == Weight::Error);
     let checked = Checked {
         rig: args.rig,
         findings,
@@ -173,34 +177,7 @@ impl std::fmt::Display for Checked {
             for finding in &connected.findings {
                 self.write(f, finding)?;
             }
-            let board = &connected.board;
-            writeln!(f, "board   {}", board.info.name)?;
-            writeln!(
-                f,
-                "        {} to {} um, {} um/s, watchdogs {} and {} ms; {} at {:.3} um",
-                board.info.low_um,
-                board.info.high_um,
-                board.info.slew_um_per_s,
-                board.info.watchdog_ms,
-                board.info.hold_watchdog_ms,
-                board.state,
-                board.applied_um
-            )?;
-            let trip = &board.round_trip_ms;
-            writeln!(
-                f,
-                "        round trip {:.2} ms (median), {:.2} (p99), {:.2} (largest); {} of {} lost",
-                trip.p50, trip.p99, trip.max, board.lost, board.sent
-            )?;
-            writeln!(
-                f,
-                "camera  {}: {} x {} px, {:.1} Hz, {:.2} ms from mid-exposure to arrival (median)",
-                connected.camera,
-                connected.size_px[0],
-                connected.size_px[1],
-                connected.rate_hz,
-                connected.age_ms.p50
-            )?;
+            write_devices(f, connected)?;
         }
         let count = self.findings.len() + self.connected.as_ref().map_or(0, |c| c.findings.len());
         match count {
@@ -209,4 +186,36 @@ impl std::fmt::Display for Checked {
             n => writeln!(f, "{}: {n} findings", self.rig.display()),
         }
     }
+}
+
+/// What the devices say of themselves.
+fn write_devices(f: &mut std::fmt::Formatter<'_>, connected: &Connected) -> std::fmt::Result {
+    if let Some(board) = &connected.board {
+        writeln!(f, "board   {}", board.info.name)?;
+        writeln!(
+            f,
+            "        {} to {} um, {} um/s, watchdogs {} and {} ms; {} at {:.3} um",
+            board.info.low_um,
+            board.info.high_um,
+            board.info.slew_um_per_s,
+            board.info.watchdog_ms,
+            board.info.hold_watchdog_ms,
+            board.state,
+            board.applied_um
+        )?;
+        let trip = &board.round_trip_ms;
+        writeln!(
+            f,
+            "        round trip {:.2} ms (median), {:.2} (p99), {:.2} (largest); {} of {} lost",
+            trip.p50, trip.p99, trip.max, board.lost, board.sent
+        )?;
+    }
+    if let Some(camera) = &connected.camera {
+        writeln!(
+            f,
+            "camera  {}: {} x {} px, {:.1} Hz, {:.2} ms from mid-exposure to arrival (median)",
+            camera.name, camera.size_px[0], camera.size_px[1], camera.rate_hz, camera.age_ms.p50
+        )?;
+    }
+    Ok(())
 }

@@ -4,7 +4,7 @@
 //! `kind` of one.
 
 use cellpos_session::RigFile;
-use cellpos_session::quantities::QUANTITIES;
+use cellpos_session::quantities::quantities;
 use std::collections::BTreeSet;
 use std::path::Path;
 
@@ -112,9 +112,11 @@ fn documented() -> (BTreeSet<String>, BTreeSet<(String, String)>) {
                 .collect()
         };
         let names = quoted(cells[0]);
-        // Tables of two columns have no form with a unit.
-        if let (3, [key], [plain]) = (cells.len(), names.as_slice(), quoted(cells[1]).as_slice()) {
-            with_unit.insert((key.clone(), plain.clone()));
+        let plain = quoted(cells[1]);
+        // One form for each key of the line, in their order, or none at all.
+        if cells.len() == 3 && !plain.is_empty() {
+            assert_eq!(names.len(), plain.len(), "{line}");
+            with_unit.extend(names.iter().cloned().zip(plain));
         }
         keys.extend(names);
     }
@@ -147,18 +149,44 @@ fn every_key_of_the_types_is_in_the_page_and_the_page_names_no_other() {
     );
 }
 
+/// The keys that take a quantity with a unit, with their tables, and the form of it.
+fn of_code() -> BTreeSet<(String, String)> {
+    quantities()
+        .map(|known| {
+            let whole = match known.table {
+                "" => known.with_unit.to_string(),
+                table => format!("{table}.{}", known.with_unit),
+            };
+            (whole, known.plain.to_string())
+        })
+        .collect()
+}
+
 #[test]
 fn every_quantity_with_a_unit_is_in_the_page() {
-    let of_code: BTreeSet<(String, String)> = (QUANTITIES.iter())
-        .map(|(table, plain, with_unit)| {
-            let whole = match *table {
-                "" => with_unit.to_string(),
-                table => format!("{table}.{with_unit}"),
-            };
-            (whole, plain.to_string())
-        })
-        .collect();
+    let mut of_code = of_code();
+    // Told in one line with the list that they stand in.
+    of_code.retain(|(key, _)| !key.starts_with("emulator.faults.event."));
     assert_eq!(of_code, documented().1);
+}
+
+#[test]
+fn every_length_time_speed_and_frequency_may_have_its_unit() {
+    let mut all = BTreeSet::new();
+    all_below("", &mut all);
+    let of_code: BTreeSet<String> = of_code().into_iter().map(|(key, _)| key).collect();
+    let is_quantity = |key: &&String| {
+        let units = ["_um", "_um_per_s", "_ms", "_us", "_s", "_hz", "_deg"];
+        units.iter().any(|unit| key.ends_with(unit)) && !key.ends_with("_per_s")
+            || key.ends_with("_um_per_s")
+    };
+    let without: Vec<&String> = all
+        .iter()
+        .filter(is_quantity)
+        .filter(|key| !of_code.contains(*key))
+        .collect();
+    assert!(without.is_empty(), "{without:#?}");
+    assert!(all.iter().filter(is_quantity).count() > 40);
 }
 
 #[test]
@@ -173,6 +201,14 @@ fn a_value_that_cannot_be_is_named_with_its_line() {
         (
             "[timing]\nperiod_us = 1000.0\noldest_ms = -1.0\n",
             ["rig.toml:3", "oldest_ms"],
+        ),
+        (
+            "[emulator]\nseed = 1\nexposure = \"5ms\"\n",
+            ["rig.toml:3", "exposure_ms"],
+        ),
+        (
+            "[board]\nhigh = \"40um\"\npark = \"41um\"\n",
+            ["rig.toml:3", "park_um"],
         ),
         (
             "[emulator]\nseed = 1\n[calibration]\npixel = \"0um\"\norigin_px = 1.0\nsign = 1.0\n",

@@ -1,19 +1,20 @@
 //! `cellpos jog`: the PZT moved by hand, within the board's limits, parked at the end.
 
 mod shown;
+mod sight;
 mod typed;
 
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
 use crate::rig_file::{ClockKind, RigFile};
 use crate::view_args::PageArgs;
-use cellpos_rig::FrameBuffer;
 use cellpos_session::signals;
 use cellpos_units::{Micrometers, MicrometersPerSecond};
 use cellpos_workbench::Bench;
 use cellpos_workbench::mover::Mover;
-use cellpos_workbench::snapshot::{self, Eye, Seen};
+use cellpos_workbench::snapshot::Seen;
 use serde::Serialize;
 use shown::{Asked, Shown};
+use sight::Sight;
 use std::path::PathBuf;
 use std::sync::mpsc::Receiver;
 use typed::Typed;
@@ -86,6 +87,10 @@ pub fn run(args: Args) -> CommandResult {
     let wanted = args.page.wanted(ClockKind::Real)?;
     // Before the board is armed: it does not wait for a camera.
     let mut shown = Shown::open(&wanted, &bench, args.blind)?;
+    let mut sight = match &shown {
+        None if !args.blind => Sight::of(&bench),
+        _ => None,
+    };
     let mut mover = Mover::arm(bench.board()?, bench.file())?;
     let mut stops = Vec::new();
     let typed = args.to.is_empty().then(Typed::listen);
@@ -116,7 +121,10 @@ pub fn run(args: Args) -> CommandResult {
                 shown.tell(line(&stop).trim_end());
                 stop
             }
-            None => look(&bench, &mut mover, at_um, args.blind)?,
+            None => {
+                let seen = sight.as_mut().map(|sight| sight.look(&mut mover, at_um));
+                Stop::at(&mover, seen.transpose()?.flatten())
+            }
         };
         if !args.json {
             print_text(&line(&stop))?;
@@ -221,26 +229,6 @@ fn relative(text: &str, step_um: f64) -> Option<f64> {
         .parse::<Micrometers>()
         .ok()
         .map(|um| sign * um.0)
-}
-
-/// What is seen at a stop. The PZT is held meanwhile.
-fn look(bench: &Bench, mover: &mut Mover, to_um: f64, blind: bool) -> Result<Stop, Failure> {
-    /// Frames in which a bead is looked for.
-    const LOOKS: u32 = 50;
-    let mut seen = None;
-    if !blind && let (Ok(mut camera), Ok(mut eye)) = (bench.camera(), Eye::of(bench)) {
-        let mut buffer = FrameBuffer::default();
-        let first_ns = snapshot::next_frame(camera.as_mut(), &mut buffer)?;
-        for _ in 0..LOOKS {
-            mover.step(to_um, f64::INFINITY)?;
-            let at_ns = snapshot::next_frame(camera.as_mut(), &mut buffer)?;
-            seen = eye.look(&buffer, (at_ns - first_ns) as f64 * 1e-9)?;
-            if seen.is_some() {
-                break;
-            }
-        }
-    }
-    Ok(Stop::at(mover, seen))
 }
 
 fn line(stop: &Stop) -> String {

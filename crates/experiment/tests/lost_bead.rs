@@ -1,0 +1,85 @@
+//! An experiment in which the bead is lost for a while, on the emulated rig and the virtual clock.
+
+use cellpos_emulator::{FaultEvent, FaultKind};
+use cellpos_experiment::on_rig::{Listener, OnRig, Trouble};
+use cellpos_ident::excitation::{Signal, Tone};
+use cellpos_ident::experiment::{Plan, PlannedSegment};
+use cellpos_plant::Model;
+use cellpos_session::RigFile;
+use cellpos_session::rig_file::Frames;
+
+/// Ticks at rest before the first segment.
+const REST: usize = 500;
+
+fn plan() -> Plan {
+    let tone = Tone {
+        frequency_hz: 60.0,
+        amplitude_um: 0.5,
+        phase_rad: 0.0,
+    };
+    let segment = PlannedSegment {
+        label: "60 Hz".to_string(),
+        signal: Signal::Tones {
+            tones: vec![tone],
+            fade_in_s: 0.1,
+        },
+        lines_hz: vec![60.0],
+        detection_hz: Vec::new(),
+        settle_s: 0.2,
+        measure_s: 2.0,
+    };
+    Plan {
+        period_s: 1e-3,
+        segments: vec![segment.clone(), segment],
+        lost_frames: 50,
+    }
+}
+
+fn rms(values: impl Iterator<Item = f64>) -> f64 {
+    let (sum, count) = values.fold((0.0, 0.0_f64), |(sum, count), x| (sum + x * x, count + 1.0));
+    (sum / count).sqrt()
+}
+
+#[test]
+fn a_bead_found_again_is_caught_at_rest_and_the_next_segment_and_the_end_find_it_in_the_middle() {
+    let mut file = RigFile::default();
+    file.emulator.faults.event.push(FaultEvent {
+        kind: FaultKind::LoseBead,
+        at_s: 1.5,
+        for_s: Some(0.2),
+    });
+    let neutral_um = file.emulator.neutral_um;
+    let rig = OnRig::new(file, Model::eq6(), None, Frames::Off, true).expect("an emulated rig");
+    let plan = plan();
+    let spans = plan.schedule(&[0, 1]).spans;
+    let mut listener = Listener {
+        progress: &mut |_| {},
+        segment: &mut |_| {},
+    };
+    let acquired = rig.acquire(&plan, &[0, 1], &mut listener).expect("a run");
+    let indices: Vec<usize> = acquired.records.iter().map(|record| record.index).collect();
+    assert_eq!(indices, [1], "the first is spoilt, the second is whole");
+    let spoilt = Trouble::Spoilt { missing: 1, of: 2 };
+    assert_eq!(acquired.trouble, Some(spoilt));
+    let (command_um, bead_um) = &acquired.rows;
+    let moved = |from: usize, to: usize| rms(command_um[from..to].iter().map(|um| um - neutral_um));
+    let first = REST + spans[0].start;
+    assert!(
+        moved(first + 300, first + 700) > 0.2,
+        "it was excited before"
+    );
+    // Lost at about 1.4 s and found 0.2 s later; the rest of the segment is at rest, with the noise of the loop.
+    let (again, next) = (1800, REST + spans[1].start);
+    assert!(next > again + 500);
+    let rest_um = moved(again, next);
+    assert!(rest_um < 0.1, "{rest_um} um of command at rest");
+    let held_um = rms(bead_um[next - 100..next].iter().copied());
+    assert!(held_um < 0.2, "{held_um} um before the next segment");
+    assert!(moved(next + 300, next + 700) > 0.2, "and is excited again");
+    // The last rows are at rest, so that the bead is frozen where it was held.
+    let end = bead_um.len();
+    let rest_um = moved(end - 200, end);
+    assert!(rest_um < 0.1, "{rest_um} um of command at the end");
+    let held_um = rms(bead_um[end - 200..].iter().copied());
+    assert!(held_um < 0.2, "{held_um} um at the end");
+}

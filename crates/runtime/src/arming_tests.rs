@@ -1,0 +1,204 @@
+//! The arming pulse against plants that are right, wrong, lost and disturbed.
+
+use super::*;
+
+const SAMPLE: Seconds = Seconds(1e-3);
+const DELAY: Seconds = Seconds(2e-3);
+
+/// A plant of `factor` times Eq. (6) with drift and a reproducible jitter of the position.
+fn run(config: ArmingConfig, factor: f64, blind: impl Fn(u32) -> bool) -> (Verdict, f64) {
+    let (verdict, largest, _) = run_disturbed(config, factor, blind, |_| 0);
+    (verdict, largest)
+}
+
+/// The same where before a tick others are skipped; gives the pulses made again, too.
+fn run_disturbed(
+    config: ArmingConfig,
+    factor: f64,
+    blind: impl Fn(u32) -> bool,
+    skipped: impl Fn(u32) -> u32,
+) -> (Verdict, f64, u32) {
+    let arming =
+        Arming::new(config, &TransferFunction::eq6(), SAMPLE, DELAY).expect("eq6 is a plant");
+    let plant =
+        DiscretePlant::new(&TransferFunction::eq6(), SAMPLE, DELAY).expect("eq6 is a plant");
+    let mut truth = plant.state(0.0);
+    let mut state = ArmingState::default();
+    let mut command = 20.0;
+    let mut largest: f64 = 0.0;
+    let mut again = 0;
+    for tick in 0..10_000u32 {
+        // The last command stands while the loop does not run.
+        for _ in 0..skipped(tick) {
+            plant.step(&mut truth, command - 20.0);
+        }
+        let jitter =
+            0.02 * (f64::from(tick.wrapping_mul(2_654_435_761)) / f64::from(u32::MAX) - 0.5);
+        let position = factor * plant.output_um(&truth) + 0.01 * f64::from(tick) + jitter;
+        let seen = (!blind(tick)).then_some(position);
+        let steps = u64::from(skipped(tick)) + 1;
+        let input = ArmingInput {
+            position_um: seen,
+            framed: true,
+            command_um: command,
+            neutral_um: 20.0,
+            disturbed: steps > 1,
+            steps,
+        };
+        match arming.step(&mut state, &input) {
+            Step::Command(next) => command = next,
+            Step::Again(next, _) => {
+                command = next;
+                again += 1;
+            }
+            Step::Done(verdict) => return (verdict, largest, again),
+        }
+        largest = largest.max((command - 20.0).abs());
+        plant.step(&mut truth, command - 20.0);
+    }
+    panic!("arming never ended");
+}
+
+#[test]
+fn the_pzt_goes_to_the_believed_rest_only_where_no_bead_was_ever_seen() {
+    let arming = Arming::new(
+        ArmingConfig::default(),
+        &TransferFunction::eq6(),
+        SAMPLE,
+        DELAY,
+    )
+    .expect("eq6 is a plant");
+    let stands = |seen: bool| {
+        let mut state = ArmingState::default();
+        let mut command = 12.0;
+        for tick in 0..1000 {
+            // Seen once, and lost again: a person may have brought it to rest here.
+            let position = (seen && tick == 10).then_some(0.0);
+            let input = ArmingInput {
+                position_um: position,
+                framed: true,
+                command_um: command,
+                neutral_um: 20.0,
+                disturbed: false,
+                steps: 1,
+            };
+            let step = arming.step(&mut state, &input);
+            let Step::Command(next) = step else {
+                panic!("given up too soon");
+            };
+            assert!((next - command).abs() <= 0.1 + 1e-12);
+            command = next;
+        }
+        command
+    };
+    assert_eq!(stands(true), 12.0);
+    assert!((stands(false) - 20.0).abs() < 1e-9);
+}
+
+#[test]
+fn the_plant_of_the_model_passes_with_a_ratio_of_one() {
+    let (verdict, largest) = run(ArmingConfig::default(), 1.0, |_| false);
+    assert_eq!(verdict.refusal, None);
+    assert!(
+        (verdict.gain_ratio - 1.0).abs() < verdict.ci95.max(0.02),
+        "{verdict:?}"
+    );
+    assert_eq!(largest, 0.5);
+}
+
+#[test]
+fn a_wrong_sign_a_dead_bead_and_a_factor_of_four_are_told_apart() {
+    for (factor, refusal) in [
+        (-1.0, Refusal::WrongSign),
+        (0.0, Refusal::NoResponse),
+        (4.0, Refusal::WrongGain),
+        (0.2, Refusal::WrongGain),
+    ] {
+        let (verdict, _) = run(ArmingConfig::default(), factor, |_| false);
+        assert_eq!(
+            verdict.refusal,
+            Some(refusal),
+            "factor {factor}: {verdict:?}"
+        );
+    }
+    for factor in [0.5, 2.0] {
+        let (verdict, _) = run(ArmingConfig::default(), factor, |_| false);
+        assert_eq!(verdict.refusal, None, "factor {factor}");
+    }
+}
+
+#[test]
+fn without_a_steady_bead_the_pzt_never_moves() {
+    let (verdict, largest) = run(ArmingConfig::default(), 1.0, |tick| tick % 10 == 0);
+    assert_eq!(verdict.refusal, Some(Refusal::NoBead));
+    assert_eq!(largest, 0.0);
+}
+
+#[test]
+fn a_bead_lost_during_the_pulse_is_no_bead() {
+    let (verdict, _) = run(ArmingConfig::default(), 1.0, |tick| tick > 22);
+    assert_eq!(verdict.refusal, Some(Refusal::NoBead));
+}
+
+#[test]
+fn a_pulse_in_which_the_loop_stalled_is_made_again_and_not_held_against_the_plant() {
+    // Stalls in the upward half: the bead goes on for as long and comes back for the rest only.
+    let stalls = |tick| match tick {
+        24 | 26 | 28 => 60,
+        _ => 0,
+    };
+    let config = ArmingConfig::default();
+    let (verdict, _, again) = run_disturbed(config, 1.0, |_| false, stalls);
+    assert_eq!((verdict.refusal, again), (None, 1), "{verdict:?}");
+    assert!((verdict.gain_ratio - 1.0).abs() < 0.05, "{verdict:?}");
+    // A plant that is wrong is refused however the first pulse went, and nothing is tried for ever.
+    let (verdict, _, again) = run_disturbed(config, -1.0, |_| false, stalls);
+    assert_eq!((verdict.refusal, again), (Some(Refusal::WrongSign), 1));
+    let always = |tick| if tick % 3 == 0 { 40 } else { 0 };
+    let (verdict, _, again) = run_disturbed(config, -1.0, |_| false, always);
+    assert!(verdict.refusal.is_some());
+    assert_eq!(again, MOST_REPEATED);
+}
+
+#[test]
+fn the_pulse_takes_a_bead_at_the_border_towards_the_middle_and_back() {
+    let plant =
+        DiscretePlant::new(&TransferFunction::eq6(), SAMPLE, DELAY).expect("eq6 is a plant");
+    let config = ArmingConfig::default();
+    let arming =
+        Arming::new(config, &TransferFunction::eq6(), SAMPLE, DELAY).expect("eq6 is a plant");
+    for start_um in [11.0, -11.0] {
+        let mut truth = plant.state(0.0);
+        let mut state = ArmingState::default();
+        let mut command = 20.0;
+        let (mut nearest, mut farthest) = (f64::INFINITY, 0.0_f64);
+        let verdict = loop {
+            let position = start_um + plant.output_um(&truth);
+            (nearest, farthest) = (nearest.min(position.abs()), farthest.max(position.abs()));
+            let input = ArmingInput {
+                position_um: Some(position),
+                framed: true,
+                command_um: command,
+                neutral_um: 20.0,
+                disturbed: false,
+                steps: 1,
+            };
+            match arming.step(&mut state, &input) {
+                Step::Command(next) | Step::Again(next, _) => command = next,
+                Step::Done(verdict) => break verdict,
+            }
+            plant.step(&mut truth, command - 20.0);
+        };
+        assert_eq!(verdict.refusal, None, "{verdict:?}");
+        assert!(farthest < 11.05, "{farthest} um from the middle");
+        assert!((8.5..9.5).contains(&nearest), "{nearest} um");
+    }
+}
+
+#[test]
+fn a_few_missing_frames_do_not_matter() {
+    let (verdict, _) = run(ArmingConfig::default(), 1.0, |tick| {
+        tick > 25 && tick % 7 == 0
+    });
+    assert_eq!(verdict.refusal, None);
+}
