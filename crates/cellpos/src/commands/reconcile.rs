@@ -6,7 +6,7 @@ use crate::output;
 use crate::rig_file::{ClockKind, Frames, RigFile};
 use cellpos_experiment::collect::{self, Collected, Collecting, refused};
 use cellpos_experiment::on_rig::{OnRig, is_unseen};
-use cellpos_plant::effects::Definition;
+use cellpos_plant::effects::{self, Definition};
 use cellpos_plant::{Model, Noise, TransferFunction};
 use cellpos_reconcile::{Options, Reconciliation, Record, Verdict, reconcile};
 use cellpos_record::RunReader;
@@ -159,6 +159,9 @@ pub fn run(args: Args) -> CommandResult {
             None => stated.as_deref() == Some("none"),
         };
         at_rest_of_runs(&mut model, &records, &rests_um);
+        if files.iter().all(|file| is_run(file)) {
+            with_camera_delay(&mut model);
+        }
         model
     };
     let bar = output::progress_bar(None);
@@ -525,6 +528,16 @@ fn at_rest_of_runs(model: &mut Model, records: &[Record], rests_um: &[f64]) {
         model.working_point_um
     );
     model.working_point_um = rest_um;
+}
+
+/// A run shows its bead as late as the camera path is: a model that was identified with that delay beside its plant has it as
+/// an effect here, or it would be found a second time and counted twice.
+fn with_camera_delay(model: &mut Model) {
+    if model.effect("time-delay").is_none()
+        && let Some(delay_s) = model.camera_delay_s.take().filter(|d| *d > 0.0)
+    {
+        model.effects.push(effects::time_delay(delay_s));
+    }
 }
 
 /// A base model for data without one: a constant gain about the command before the records began.

@@ -253,3 +253,111 @@ fn frames_that_came_without_a_fix_are_no_dropped_frames() {
     named(&r, "time-delay");
     assert_eq!(r["effects"].as_array().unwrap().len(), 1, "{r}");
 }
+
+#[test]
+fn what_identify_writes_reconcile_reads_and_what_that_writes_the_others_read() {
+    let folder = tempfile::tempdir().unwrap();
+    succeed(
+        folder.path(),
+        "identify --seed 3 --clock virtual --frames off --out model.toml",
+    );
+    let identified = Model::load_file(&folder.path().join("model.toml")).unwrap();
+    let delay_s = identified.camera_delay_s.unwrap();
+    assert!((delay_s - 2e-3).abs() < 0.1e-3, "{delay_s} s");
+    let track = "track --target 0um --sine 3um@10Hz --duration 10s --clock virtual --frames off --seed 2 --json";
+    let run = succeed(folder.path(), track).json();
+    let r = succeed(
+        folder.path(),
+        &format!(
+            "reconcile --model model.toml --data {} --max-effects 1 --json --out a.toml",
+            run["run"].as_str().unwrap()
+        ),
+    )
+    .json();
+    // The delay is in the model already: what is found of it is a correction, and is added, not counted twice.
+    let augmented = Model::load_file(&folder.path().join("a.toml")).unwrap();
+    assert_eq!(augmented.camera_delay_s, None);
+    let delays: Vec<_> = augmented
+        .effects
+        .iter()
+        .filter(|e| e.id() == "time-delay")
+        .collect();
+    assert_eq!(delays.len(), 1, "{r}");
+    let total_s = delays[0].get("delay_s").unwrap();
+    assert!((total_s - 2e-3).abs() < 0.15e-3, "{total_s} s: {r}");
+    assert!(augmented.noise.diffusion_um2_per_s < 10.0);
+    for line in [
+        "design --model a.toml --json",
+        "track --model a.toml --target 0um --duration 1s --clock virtual --frames off --seed 5 --json",
+    ] {
+        succeed(folder.path(), line);
+    }
+}
+
+const OWN: &str = r#"
+[[effects]]
+id = "even-drive"
+place = "driver"
+says = "a drive that is stronger to one side"
+output = "input + even*input^2"
+[effects.parameters]
+even = { unit = "1/um", lower = -0.5, upper = 0.5, start = [-0.05, 0.05] }
+"#;
+
+#[test]
+fn an_effect_of_ones_own_goes_from_its_file_to_a_name_and_into_every_command() {
+    let folder = tempfile::tempdir().unwrap();
+    let write = |name: &str, text: &str| std::fs::write(folder.path().join(name), text).unwrap();
+    write("own.toml", OWN);
+    let wrong = OWN.replace("input^2", "imput^2");
+    write("wrong.toml", &wrong);
+    // A model in which it hides, as a user would write it.
+    let hidden = OWN
+        .replace("[[effects]]", "[[definitions]]")
+        .replace("[effects.", "[definitions.");
+    let base = Model::eq6().to_toml_string();
+    write(
+        "hidden.toml",
+        &format!("{base}{hidden}\n[[effects]]\nid = \"even-drive\"\neven = 0.1\n"),
+    );
+    let tau = std::f64::consts::TAU;
+    let rows: String = (0..8000)
+        .map(|k| {
+            let t = f64::from(k) * 1e-3;
+            let size = if k < 6000 { 1.0 } else { 0.0 };
+            let u = 4.0 + size * (0.6 * (tau * 3.0 * t).sin() + 0.3 * (tau * 17.0 * t).sin());
+            format!("{t:.3},{u:.5}\n")
+        })
+        .collect();
+    write("in.csv", &format!("time_s,pzt_um\n{rows}"));
+    succeed(
+        folder.path(),
+        "simulate --model hidden.toml --input in.csv --out data.csv --seed 4",
+    );
+    let ran = common::cellpos(
+        folder.path(),
+        "reconcile --data data.csv --effects wrong.toml",
+    );
+    assert_eq!(ran.code, Some(2), "{}", ran.err);
+    assert!(
+        ran.err.contains("wrong.toml") && ran.err.contains("imput"),
+        "{}",
+        ran.err
+    );
+    let r = succeed(
+        folder.path(),
+        "reconcile --data data.csv --effects own.toml --max-effects 1 --json --out a.toml",
+    )
+    .json();
+    let even = named(&r, "even-drive")["parameters"]["even"].clone();
+    assert!((number(&even, "value") - 0.1).abs() < 0.01, "{even}");
+    let text = std::fs::read_to_string(folder.path().join("a.toml")).unwrap();
+    assert!(text.contains("[[definitions]]"), "{text}");
+    for line in [
+        "simulate --model a.toml --input in.csv --out again.csv --seed 4",
+        "design --model a.toml --json",
+        "reconcile --model a.toml --data data.csv --max-effects 1 --json",
+    ] {
+        succeed(folder.path(), line);
+    }
+}
