@@ -8,8 +8,10 @@ use super::definition::Problem;
 use fasteval3::compiler::{IC, Instruction, InstructionI};
 use fasteval3::{Compiler, EmptyNamespace, Parser, Slab};
 
+type OfOne = (&'static str, fn(f64) -> f64);
+
 /// Functions of one number, beside those of two or more.
-const OF_ONE: &[(&str, fn(f64) -> f64)] = &[
+const OF_ONE: &[OfOne] = &[
     ("sqrt", f64::sqrt),
     ("exp", f64::exp),
     ("ln", f64::ln),
