@@ -1,17 +1,17 @@
 //! `cellpos reconcile`: where simulation and measurement disagree, what is missing, added and shown.
 
+mod records;
+
 use crate::commands::identify::HoldKind;
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
 use crate::output;
 use crate::rig_file::{ClockKind, Frames, RigFile};
 use cellpos_experiment::collect::{self, Collected, Collecting, refused};
-use cellpos_experiment::on_rig::{OnRig, is_unseen};
-use cellpos_plant::effects::{self, Definition};
-use cellpos_plant::{Model, Noise, TransferFunction};
-use cellpos_reconcile::{Options, Reconciliation, Record, Verdict, reconcile};
-use cellpos_record::RunReader;
-use cellpos_runtime::{Life, TickFlags, TickRecord};
-use cellpos_table::{ColumnRef, Table};
+use cellpos_experiment::on_rig::OnRig;
+use cellpos_plant::Model;
+use cellpos_plant::effects::Definition;
+use cellpos_reconcile::{Options, Reconciliation, Verdict, reconcile};
+use records::{Columns, at_rest_of_runs, files, fitted, is_run, read, read_run, with_camera_delay};
 use std::path::{Path, PathBuf};
 
 /// Find where simulation and measurement disagree, name what is missing, add it to the model.
@@ -69,31 +69,12 @@ pub struct Args {
     /// Print the result as JSON, or write it to FILE.
     #[arg(long, num_args = 0..=1, default_missing_value = "-", value_name = "FILE")]
     json: Option<PathBuf>,
-    /// Column of the command: its name, or its number from 1.
-    #[arg(long, default_value = "pzt_um")]
-    input_column: String,
-    /// Column of the position: its name, or its number from 1.
-    #[arg(long, default_value = "bead_um")]
-    output_column: String,
-    /// Column of the time in seconds: its name, or its number from 1.
-    #[arg(long, default_value = "time_s")]
-    time_column: String,
-    /// Sampling rate of files without a time column, with unit (200Hz).
-    #[arg(long)]
-    rate: Option<cellpos_units::Hertz>,
-    /// Factor from the command's column to um (4 for volts).
-    #[arg(long, default_value_t = 1.0)]
-    input_um_per_unit: f64,
-    /// Factor from the position's column to um (0.001 for nanometres).
-    #[arg(long, default_value_t = 1.0)]
-    output_um_per_unit: f64,
+    #[command(flatten)]
+    columns: Columns,
     /// How the command acts between rows: zero-order (held) or none (sampled with the output) [default: as the model was
     /// identified, else zero-order].
     #[arg(long, value_enum)]
     hold: Option<HoldKind>,
-    /// Rows FROM:TO of every file, counted from 0, TO not included.
-    #[arg(long, value_name = "FROM:TO")]
-    rows: Option<String>,
     /// Most effects to add.
     #[arg(long, default_value_t = 4)]
     max_effects: usize,
@@ -132,7 +113,7 @@ pub fn run(args: Args) -> CommandResult {
             records.push(record);
             rests_um.extend(rest_um);
         } else {
-            records.push(read(file, &args)?);
+            records.push(read(file, &args.columns)?);
         }
     }
     let threads = args
@@ -375,180 +356,4 @@ fn summary(result: &Reconciliation) -> String {
         f(g.free_run_floor)
     );
     s
-}
-
-/// All record files behind the arguments, in a fixed order.
-fn files(data: &[PathBuf]) -> Result<Vec<PathBuf>, Failure> {
-    let mut found = Vec::new();
-    for path in data {
-        if path.is_dir() && !is_run(path) {
-            let entries = std::fs::read_dir(path).map_err(|e| {
-                Failure::bad_input(
-                    format!("cannot read the folder {}: {e}", path.display()),
-                    "check --data",
-                )
-            })?;
-            let mut inside: Vec<PathBuf> = entries
-                .filter_map(Result::ok)
-                .map(|e| e.path())
-                .filter(|p| {
-                    (p.is_dir() && is_run(p))
-                        || p.extension().is_some_and(|e| e == "csv" || e == "dat")
-                })
-                .collect();
-            inside.sort();
-            if inside.is_empty() {
-                return Err(Failure::bad_input(
-                    format!("no CSV file and no run folder in {}", path.display()),
-                    "--data takes CSV files (time_s,pzt_um,bead_um), run folders, or a folder of them",
-                ));
-            }
-            found.extend(inside);
-        } else if path.exists() {
-            found.push(path.clone());
-        } else {
-            return Err(Failure::bad_input(
-                format!("{} does not exist", path.display()),
-                "check --data",
-            ));
-        }
-    }
-    Ok(found)
-}
-
-fn is_run(path: &Path) -> bool {
-    path.join("ticks.arrow").exists()
-}
-
-fn record_name(path: &Path) -> String {
-    path.file_stem().map_or_else(
-        || path.display().to_string(),
-        |s| s.to_string_lossy().into_owned(),
-    )
-}
-
-fn read(path: &Path, args: &Args) -> Result<Record, Failure> {
-    let name = record_name(path);
-    let bytes = std::fs::read(path).map_err(|e| {
-        Failure::bad_input(
-            format!("cannot read {}: {e}", path.display()),
-            "check --data",
-        )
-    })?;
-    let text = String::from_utf8(bytes).map_err(|_| {
-        Failure::bad_input(
-            format!("{} is not a text file", path.display()),
-            "records are CSV: time_s,pzt_um,bead_um",
-        )
-    })?;
-    let table = Table::parse(path, &text).map_err(Failure::input)?;
-    let column = |c: &str, empty| {
-        table
-            .numbers(&ColumnRef::from(c), empty)
-            .map_err(Failure::input)
-    };
-    let mut u = column(&args.input_column, false)?;
-    let mut y = column(&args.output_column, true)?;
-    let mut t = match args.rate {
-        Some(rate) => (0..u.len()).map(|k| k as f64 / rate.value()).collect(),
-        None => column(&args.time_column, false)?,
-    };
-    if let Some(rows) = &args.rows {
-        let wrong = || {
-            Failure::bad_input(
-                format!("--rows {rows}: not FROM:TO within 0..{}", u.len()),
-                "for example --rows 0:6000",
-            )
-        };
-        let (from, to) = rows.split_once(':').ok_or_else(wrong)?;
-        let (from, to): (usize, usize) = (
-            from.parse().map_err(|_| wrong())?,
-            to.parse().map_err(|_| wrong())?,
-        );
-        if from >= to || to > u.len() {
-            return Err(wrong());
-        }
-        u = u[from..to].to_vec();
-        y = y[from..to].to_vec();
-        t = t[from..to].to_vec();
-    }
-    u.iter_mut().for_each(|v| *v *= args.input_um_per_unit);
-    y.iter_mut().for_each(|v| *v *= args.output_um_per_unit);
-    Record::from_rows(&name, &t, &u, &y).map_err(refused)
-}
-
-/// A run folder, of an open or a closed loop: the commands given, and the positions as the camera delivered them; and where
-/// its bead rested.
-fn read_run(path: &Path) -> Result<(Record, Option<f64>), Failure> {
-    let run = RunReader::open(path).map_err(Failure::input)?;
-    let record = run.to_record().map_err(Failure::input)?;
-    let time_s: Vec<f64> = (0..record.len())
-        .map(|k| record.start_s + k as f64 * record.step_s)
-        .collect();
-    let mut read = Record::from_rows(&record_name(path), &time_s, &record.pzt_um, &record.bead_um)
-        .map_err(refused)?;
-    let mut first_seq = None;
-    // Where the bead of a closed loop rested: the mean of what was commanded while the loop ran, um.
-    let (mut sum_um, mut count) = (0.0, 0_usize);
-    for tick in run.batches().map_err(Failure::input)?.flatten() {
-        let first_seq = *first_seq.get_or_insert(tick.seq);
-        if is_unseen(&tick) {
-            let row = usize::try_from(tick.seq.saturating_sub(first_seq)).unwrap_or(usize::MAX);
-            if let Some(unseen) = read.unseen.get_mut(row) {
-                *unseen = true;
-            }
-        }
-        if held(&tick) {
-            (sum_um, count) = (sum_um + tick.command_um, count + 1);
-        }
-    }
-    // Ten seconds of a held bead move it by less than 10 um: 2 nm of PZT.
-    Ok((read, (count >= 1000).then(|| sum_um / count as f64)))
-}
-
-/// Whether the loop ran in a tick.
-fn held(t: &TickRecord) -> bool {
-    t.life == Life::Running as u8 && !t.flags.has(TickFlags::FREEZE) && t.command_um.is_finite()
-}
-
-/// Runs hold a bead wherever its rest is, and that is another place every day: where no record comes near the model's
-/// working point, the runs' own is taken.
-fn at_rest_of_runs(model: &mut Model, records: &[Record], rests_um: &[f64]) {
-    let inside = records.iter().any(|r| {
-        let (low, high) = r.pzt_range_um();
-        (low..=high).contains(&model.working_point_um)
-    });
-    if inside || rests_um.is_empty() {
-        return;
-    }
-    let rest_um = rests_um.iter().sum::<f64>() / rests_um.len() as f64;
-    tracing::warn!(
-        "the model's working point, {} um, lies outside what was commanded: the bead of these runs rested at {rest_um:.3} um, \
-         which is taken instead",
-        model.working_point_um
-    );
-    model.working_point_um = rest_um;
-}
-
-/// A run shows its bead as late as the camera path is: a model that was identified with that delay beside its plant has it as
-/// an effect here, or it would be found a second time and counted twice.
-fn with_camera_delay(model: &mut Model) {
-    if model.effect("time-delay").is_none()
-        && let Some(delay_s) = model.camera_delay_s.take().filter(|d| *d > 0.0)
-    {
-        model.effects.push(effects::time_delay(delay_s));
-    }
-}
-
-/// A base model for data without one: a constant gain about the command before the records began.
-fn fitted(records: &[Record]) -> Result<Model, Failure> {
-    let (gain, working_point_um) = cellpos_reconcile::constant_gain(records).map_err(refused)?;
-    Ok(Model {
-        name: "fit".to_owned(),
-        description: "A constant gain fitted to the records".to_owned(),
-        plant: TransferFunction::new(vec![gain], vec![1.0]).map_err(Failure::input)?,
-        working_point_um,
-        noise: Noise::NONE,
-        ..Model::eq6()
-    })
 }

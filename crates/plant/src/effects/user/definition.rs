@@ -1,11 +1,7 @@
 //! What a user writes down of an effect, and its check.
 
-use super::expression::Program;
+use super::expression::{Problem, Program};
 use crate::effects::Place;
-
-/// What is wrong with a part of a definition, and what would be right.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Problem(pub String);
 
 /// A definition that is refused: which key, and why.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]

@@ -4,9 +4,12 @@
 //! [`FUNCTIONS`]. Parsing and folding of constants are those of the crate `fasteval3`; its own evaluation looks names up by
 //! their letters and allocates for functions, so what it compiled is put into order here, with a place for every name.
 
-use super::definition::Problem;
 use fasteval3::compiler::{IC, Instruction, InstructionI};
 use fasteval3::{Compiler, EmptyNamespace, Parser, Slab};
+
+/// What is wrong with a part of a definition, and what would be right.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Problem(pub String);
 
 type OfOne = (&'static str, fn(f64) -> f64);
 
