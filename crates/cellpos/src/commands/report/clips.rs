@@ -76,10 +76,15 @@ fn strip(film: &Film) -> Result<Vec<u8>, String> {
     } else {
         (count * step.0 - RIM, height)
     };
-    let values = || film.frames.iter().flat_map(|frame| frame.pixels.iter());
-    let low = values().min().copied().unwrap_or(0);
-    let high = values().max().copied().unwrap_or(255);
-    let stretch = 255.0 / f32::from(high.saturating_sub(low).max(1));
+    let shown = |pixels: &[u8], x: u32, y: u32| {
+        let at = (y * every * film.width + x * every) as usize;
+        pixels.get(at).copied().unwrap_or(0)
+    };
+    let places = || (0..height).flat_map(|y| (0..width).map(move |x| (x, y)));
+    let (low, high) = (film.frames.iter())
+        .flat_map(|frame| places().map(|(x, y)| shown(&frame.pixels, x, y)))
+        .fold((255, 0), |(low, high), v| (v.min(low), v.max(high)));
+    let stretch = 255.0 / f32::from((high - low).max(1));
     let mut picture = GrayImage::from_pixel(size.0, size.1, Luma([128]));
     for (n, frame) in (0..).zip(&film.frames) {
         let (left, top) = if upright {
@@ -87,13 +92,9 @@ fn strip(film: &Film) -> Result<Vec<u8>, String> {
         } else {
             (n * step.0, 0)
         };
-        for y in 0..height {
-            for x in 0..width {
-                let at = (y * every * film.width + x * every) as usize;
-                let value = frame.pixels.get(at).copied().unwrap_or(0);
-                let grey = f32::from(value.saturating_sub(low)) * stretch;
-                picture.put_pixel(left + x, top + y, Luma([grey as u8]));
-            }
+        for (x, y) in places() {
+            let grey = f32::from(shown(&frame.pixels, x, y) - low) * stretch;
+            picture.put_pixel(left + x, top + y, Luma([grey.round() as u8]));
         }
     }
     let mut png = Cursor::new(Vec::new());
