@@ -1,29 +1,11 @@
 //! Learning over cycles on a rig whose gain is 20 % and whose delay is 0.25 ms off the model.
 
+use crate::common::{config, mpc};
 use cellpos_control::design::{DesignPlant, MarginSource, Uncertainty, harmonic_responses};
 use cellpos_control::*;
 use cellpos_plant::Model;
 
 const FADE_S: f64 = 0.2;
-
-fn config(controller: ControllerConfig) -> LoopConfig {
-    LoopConfig {
-        model: LoopModel::eq6(2e-3),
-        estimator: EstimatorConfig::default(),
-        controller,
-        limits: Limits::default(),
-    }
-}
-
-fn mpc() -> ControllerConfig {
-    ControllerConfig::Mpc(
-        Mpc {
-            solver: SolverKind::ActiveSet,
-            ..Mpc::default()
-        },
-        Pi::new(0.46, 19.5),
-    )
-}
 
 fn wrong_rig(seed: u64) -> RigConfig {
     let eq6 = RigConfig::eq6(seed);
@@ -132,7 +114,10 @@ fn rms_um(
 #[test]
 fn learning_brings_cyclic_motion_to_twice_the_hold_error_within_20_cycles() {
     let hold = Profile::Hold { position_um: 0.0 };
-    for controller in [ControllerConfig::Lqg(Lqg::default()), mpc()] {
+    for controller in [
+        ControllerConfig::Lqg(Lqg::default()),
+        mpc(SolverKind::ActiveSet),
+    ] {
         let hold_um = rms_um(controller, 1, &hold, None, (1000, 5000));
         for (amplitude_um, frequency_hz) in [
             (5.0, 50.0),

@@ -2,6 +2,7 @@
 
 mod allocation;
 mod badly_scaled;
+mod common;
 mod late_ticks;
 mod learning;
 mod limits;

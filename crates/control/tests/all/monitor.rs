@@ -1,17 +1,9 @@
 //! The plant monitor: silent in normal work, right about a stuck bead, a bubble and a constriction.
 
+use crate::common::config;
 use cellpos_control::*;
 use cellpos_plant::TransferFunction;
 use std::f64::consts::TAU;
-
-fn config(controller: ControllerConfig) -> LoopConfig {
-    LoopConfig {
-        model: LoopModel::eq6(2e-3),
-        estimator: EstimatorConfig::default(),
-        controller,
-        limits: Limits::default(),
-    }
-}
 
 fn pi() -> ControllerConfig {
     ControllerConfig::Pi(Pi::new(0.46, 19.5))

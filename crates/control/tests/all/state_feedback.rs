@@ -1,28 +1,10 @@
 //! LQG and MPC on the simulated rig: hold at the bound, steps, previewed sines, both solvers, the spread.
 
+use crate::common::{config, mpc};
 use cellpos_control::design::{
     DesignPlant, bound_rms_um, margins, noise_figures, spread, step_figures,
 };
 use cellpos_control::*;
-
-fn mpc(solver: SolverKind) -> ControllerConfig {
-    ControllerConfig::Mpc(
-        Mpc {
-            solver,
-            ..Mpc::default()
-        },
-        Pi::new(0.46, 19.5),
-    )
-}
-
-fn config(controller: ControllerConfig) -> LoopConfig {
-    LoopConfig {
-        model: LoopModel::eq6(2e-3),
-        estimator: EstimatorConfig::default(),
-        controller,
-        limits: Limits::default(),
-    }
-}
 
 /// RMS of the true error from tick `from` on.
 fn rms_um(config: LoopConfig, rig: RigConfig, profile: &Profile, ticks: u64, from: u64) -> f64 {
