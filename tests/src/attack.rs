@@ -31,6 +31,15 @@ impl Attacked {
         *self.ends.entry(how.into()).or_default() += 1;
     }
 
+    /// Ends a rig, whose log must show the PZT within its range throughout.
+    fn ends_within_range(&mut self, rig: RigInABox, what: &str) {
+        let outside = |um: f64| !(-1e-6..=40.0 + 1e-6).contains(&um);
+        if let Some(row) = rig.finish().iter().find(|row| outside(row.applied_um)) {
+            self.broken
+                .push(format!("{what}: the PZT at {} um", row.applied_um));
+        }
+    }
+
     /// A line of the table.
     pub fn line(&self, name: &str) -> String {
         let ends: Vec<String> = self
@@ -417,12 +426,7 @@ pub fn hostile_boards(folder: &Path, tries: u64, chance: &mut Chance) -> Attacke
         if let Some(ended) = run(folder, OVER_THE_LINE, &what, &mut attacked) {
             attacked.end(how(folder, ended.code));
         }
-        let outside = |um: f64| !(-1e-6..=40.0 + 1e-6).contains(&um);
-        if let Some(row) = rig.finish().iter().find(|row| outside(row.applied_um)) {
-            attacked
-                .broken
-                .push(format!("{what}: the PZT at {} um", row.applied_um));
-        }
+        attacked.ends_within_range(rig, &what);
         reads(folder, &what, &mut attacked);
     }
     attacked

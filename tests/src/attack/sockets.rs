@@ -231,12 +231,7 @@ pub fn hostile_camera_lines(folder: &Path, tries: u64, chance: &mut Chance) -> A
             );
         }
         drop(relay);
-        let outside = |um: f64| !(-1e-6..=40.0 + 1e-6).contains(&um);
-        if let Some(row) = rig.finish().iter().find(|row| outside(row.applied_um)) {
-            attacked
-                .broken
-                .push(format!("{what}: the PZT at {} um", row.applied_um));
-        }
+        attacked.ends_within_range(rig, &what);
         reads(folder, &what, &mut attacked);
     }
     attacked
