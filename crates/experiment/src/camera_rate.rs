@@ -3,7 +3,7 @@
 //! A record has a row for each frame, and its excitation is played by the loop's clock: with a camera of another rate every
 //! frequency of it would be wrong.
 
-use cellpos_runtime::{Life, TickFlags, TickRecord};
+use cellpos_runtime::{TickFlags, TickRecord};
 use cellpos_session::Failure;
 
 /// Frames in a window: the stamps of two frames may be off by a tenth of a period each.
@@ -19,9 +19,7 @@ pub(crate) fn foreign_rate_hz(ticks: &[TickRecord], period_ns: i64) -> Option<f6
     let mut from: Option<(u64, i64)> = None;
     let mut spacings_ns = Vec::new();
     let seen = |t: &&TickRecord| {
-        t.life == Life::Running as u8
-            && !t.flags.has(TickFlags::TIMER)
-            && !t.flags.has(TickFlags::STALE)
+        t.is_running() && !t.flags.has(TickFlags::TIMER) && !t.flags.has(TickFlags::STALE)
     };
     for tick in ticks.iter().filter(seen) {
         let (id, ns) = *from.get_or_insert((tick.frame_id, tick.mid_exposure_ns));
@@ -54,6 +52,7 @@ pub(crate) fn other_rate(rate_hz: f64, period_ns: i64) -> Failure {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use cellpos_runtime::Life;
 
     fn ticks(rate_hz: f64, restarts: bool) -> Vec<TickRecord> {
         (0..4000)

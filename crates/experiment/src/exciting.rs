@@ -2,7 +2,7 @@
 
 use cellpos_ident::experiment::{Schedule, Span};
 use cellpos_runtime::{
-    Event, Life, ReferenceGenerator, ReferenceInput, ReferenceOutput, RunSink, Stage, Statistics,
+    Event, ReferenceGenerator, ReferenceInput, ReferenceOutput, RunSink, Stage, Statistics,
     TickRecord,
 };
 use cellpos_session::view::{Shown, State};
@@ -102,7 +102,7 @@ impl Handing {
 
 impl RunSink for Handing {
     fn tick(&mut self, record: &TickRecord) {
-        if self.closed.is_none() && record.life == Life::Running as u8 {
+        if self.closed.is_none() && record.is_running() {
             self.closed = Some(record.seq);
         }
         self.newest = record.seq;

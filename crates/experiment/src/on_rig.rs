@@ -14,7 +14,7 @@ use cellpos_ident::experiment::{Plan, RecordedSegment, Span};
 use cellpos_plant::Model;
 use cellpos_rig::clock::monotonic_ns;
 use cellpos_rig::{Camera, Clock, FrameBuffer};
-use cellpos_runtime::{EndRule, Grid, Life, Request, TickFlags, TickRecord};
+use cellpos_runtime::{EndRule, Grid, Request, TickFlags, TickRecord};
 use cellpos_session::rig_file::{ClockKind, Frames, RigFile};
 use cellpos_session::setup::{self, Prepared, ReferenceSpec};
 use cellpos_session::view::{Pages, Viewed};
@@ -332,7 +332,7 @@ pub fn is_unseen(tick: &TickRecord) -> bool {
 
 /// Spans that are over.
 fn ended_spans(ticks: &[TickRecord], spans: &[Span]) -> usize {
-    let is_running = |t: &&TickRecord| t.life == Life::Running as u8;
+    let is_running = |t: &&TickRecord| t.is_running();
     let (Some(first), Some(last)) = (ticks.iter().find(is_running), ticks.last()) else {
         return 0;
     };
@@ -392,7 +392,7 @@ impl Rows {
         };
         let closed = ticks
             .iter()
-            .position(|t| t.life == Life::Running as u8)
+            .position(TickRecord::is_running)
             .unwrap_or(ticks.len());
         rows.path_ns = camera_path_ns(&ticks[closed..], period_ns, camera_delay_ms);
         let mut first_id = None;
@@ -427,7 +427,7 @@ impl Rows {
             rows.input[row] = tick.command_um;
             rows.output[row] = if on_time { tick.measured_um } else { f64::NAN };
             rows.unseen[row] = is_unseen(tick);
-            rows.usable[row] = tick.life == Life::Running as u8 && !has(TickFlags::FREEZE);
+            rows.usable[row] = tick.is_controlled();
             // A tick that was skipped, or whose record was lost, leaves its place to the one behind it.
             let at = usize::try_from(grid.index(tick.time_ns) - first_index).unwrap_or(0);
             rows.of_tick.resize(at.max(rows.of_tick.len()), row);

@@ -162,7 +162,7 @@ impl Statistics {
         // back as after closing the loop when it goes on.
         if record.flags.has(TickFlags::FREEZE) {
             self.frozen = true;
-        } else if record.life == Life::Running as u8 {
+        } else if record.is_running() {
             if std::mem::take(&mut self.frozen) && self.running_since_ns.is_some() {
                 self.running_since_ns = Some(record.time_ns);
             }
@@ -260,7 +260,7 @@ impl Statistics {
         let running = self
             .last
             .as_ref()
-            .filter(|r| r.life == Life::Running as u8 && !self.frozen);
+            .filter(|r| r.is_running() && !self.frozen);
         running
             .zip(self.running_since_ns)
             .is_some_and(|(r, since)| r.time_ns - since >= self.settled_after_ns)

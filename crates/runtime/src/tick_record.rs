@@ -1,5 +1,6 @@
 //! The plain record that each tick of the loop hands to the recorder ring.
 
+use crate::life::Life;
 use cellpos_control::LAW_COLUMNS;
 
 /// What happened in a tick, as bits.
@@ -136,6 +137,16 @@ pub struct TickRecord {
 }
 
 impl TickRecord {
+    /// Whether the loop was closed.
+    pub fn is_running(&self) -> bool {
+        self.life == Life::Running as u8
+    }
+
+    /// Whether the loop was closed and the bead not frozen: its command answers its position.
+    pub fn is_controlled(&self) -> bool {
+        self.is_running() && !self.flags.has(TickFlags::FREEZE)
+    }
+
     /// A record in which nothing is known: what a missing column reads as.
     pub fn unknown() -> Self {
         Self {

@@ -128,9 +128,9 @@ fn check(ran: &Ran, faults: &Faults) {
 
 /// At every tick the plan is where the clock is, whatever the frames did.
 fn check_plan(records: &[TickRecord]) {
-    let closed = records.iter().find(|r| r.life == Life::Running as u8);
+    let closed = records.iter().find(|r| r.is_running());
     let Some(closed) = closed else { return };
-    for record in records.iter().filter(|r| r.life == Life::Running as u8) {
+    for record in records.iter().filter(|r| r.is_running()) {
         let clock_ns = record.time_ns - closed.time_ns;
         assert!(
             (record.plan_ns - closed.plan_ns - clock_ns).abs() <= MS,
@@ -189,7 +189,7 @@ fn plan_and_clock_agree_within_a_thousandth_whatever_the_frames_do() {
             (End::Duration, None),
             "{faults:?}"
         );
-        let closed = |r: &&TickRecord| r.life == Life::Running as u8;
+        let closed = |r: &&TickRecord| r.is_running();
         let first = ran.records.iter().find(closed).expect("closed");
         let last = ran.records.last().expect("records");
         let clock_s = (last.time_ns - first.time_ns) as f64;

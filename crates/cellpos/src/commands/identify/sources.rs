@@ -4,7 +4,7 @@ use super::{Args, columns};
 use crate::commands::run::resume;
 use crate::outcome::Failure;
 use cellpos_record::RunReader;
-use cellpos_runtime::{Life, TickFlags};
+use cellpos_runtime::TickFlags;
 use cellpos_table::{ColumnRef, Table};
 use std::path::Path;
 
@@ -93,16 +93,13 @@ fn runs(path: &Path) -> Result<Vec<Source>, Failure> {
     let mut sources = Vec::new();
     for (number, folder) in (1u64..).zip(&folders) {
         let reader = RunReader::open(folder).map_err(Failure::input)?;
-        let running = |tick: &cellpos_runtime::TickRecord| {
-            tick.life == Life::Running as u8 && !tick.flags.has(TickFlags::FREEZE)
-        };
         // Read twice, so that a night's run needs no night's memory.
         let ticks =
             || -> Result<_, Failure> { Ok(reader.batches().map_err(Failure::input)?.flatten()) };
         let (mut steps, mut last_ns, mut first_ns) = (Vec::new(), None, None);
         for tick in ticks()? {
             steps.extend(last_ns.replace(tick.time_ns).map(|ns| tick.time_ns - ns));
-            first_ns = first_ns.or(running(&tick).then_some(tick.time_ns));
+            first_ns = first_ns.or(tick.is_controlled().then_some(tick.time_ns));
         }
         let Some(first_ns) = first_ns else {
             continue;
@@ -117,7 +114,7 @@ fn runs(path: &Path) -> Result<Vec<Source>, Failure> {
         let (mut input, mut output, mut reference) = (Vec::new(), Vec::new(), Vec::new());
         let mut last_seq = None;
         for tick in ticks()?.filter(|tick| tick.time_ns >= from_ns) {
-            if !running(&tick) {
+            if !tick.is_controlled() {
                 break;
             }
             // A tick whose record is lost leaves a row with the command before it, and no position.

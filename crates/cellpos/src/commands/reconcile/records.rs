@@ -7,7 +7,7 @@ use cellpos_plant::effects;
 use cellpos_plant::{Model, Noise, TransferFunction};
 use cellpos_reconcile::Record;
 use cellpos_record::RunReader;
-use cellpos_runtime::{Life, TickFlags, TickRecord};
+use cellpos_runtime::TickRecord;
 use cellpos_table::{ColumnRef, Table};
 use std::path::{Path, PathBuf};
 
@@ -168,7 +168,7 @@ pub(super) fn read_run(path: &Path) -> Result<(Record, Option<f64>), Failure> {
 
 /// Whether the loop ran in a tick.
 fn held(t: &TickRecord) -> bool {
-    t.life == Life::Running as u8 && !t.flags.has(TickFlags::FREEZE) && t.command_um.is_finite()
+    t.is_controlled() && t.command_um.is_finite()
 }
 
 /// Runs hold a bead wherever its rest is, and that is another place every day: where no record comes near the model's

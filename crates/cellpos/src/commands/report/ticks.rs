@@ -1,7 +1,7 @@
 //! What a report needs of the ticks, gathered as they go by.
 
 use super::envelope::Envelope;
-use cellpos_runtime::{Life, Statistics, TickRecord};
+use cellpos_runtime::{Statistics, TickRecord};
 use std::collections::VecDeque;
 
 /// Ticks remembered to find the reference of the time of an exposure.
@@ -116,7 +116,7 @@ impl Ticks {
             }
             None => false,
         };
-        if r.life != Life::Running as u8 {
+        if !r.is_running() {
             return;
         }
         let since_s = time_s - *self.first_running_s.get_or_insert(time_s);
