@@ -5,8 +5,10 @@
 //! cargo run --release -p cellpos-benches --bin minute-table -- 10    ten seconds of each
 //! ```
 //!
-//! Late: woken, or a command handed over, more than half a period after its time. Skipped: periods without a tick. Exit code
-//! 1: the loop was late or skipped more often than the bare loop and one in ten thousand ticks.
+//! Late: woken, or a command handed over, more than half a period after its time. Skipped: periods without a tick. Lost: the
+//! two together, which is what both loops are compared by. The bare loop makes the tick of a wake-up that is 0.7 periods late
+//! all the same and counts it as late; cellpos makes the tick of the period that is nearest then and counts one skipped.
+//! Exit code 1: the loop lost more than the bare loop and one in ten thousand ticks.
 
 use cellpos_benches::track;
 use cellpos_rig::Clock;
@@ -120,9 +122,17 @@ impl Figures {
     fn line(&self, load: &str, name: &str) {
         let [p999, max] = self.wake_us;
         println!(
-            "| {load} | {name} | {} | {} | {} | {p999:.0} | {max:.0} |",
-            self.ticks, self.late, self.skipped
+            "| {load} | {name} | {} | {} | {} | {} | {p999:.0} | {max:.0} |",
+            self.ticks,
+            self.late,
+            self.skipped,
+            self.lost()
         );
+    }
+
+    /// Ticks that were not made within half a period of their time.
+    fn lost(&self) -> u64 {
+        self.late + self.skipped
     }
 }
 
@@ -174,8 +184,10 @@ fn main() -> ExitCode {
         .first()
         .and_then(|word| word.parse().ok())
         .unwrap_or(60);
-    println!("| load | loop | ticks | late | skipped | wake-up, 99.9 % (us) | largest (us) |");
-    println!("|---|---|---|---|---|---|---|");
+    println!(
+        "| load | loop | ticks | late | skipped | lost | wake-up, 99.9 % (us) | largest (us) |"
+    );
+    println!("|---|---|---|---|---|---|---|---|");
     let mut holds = true;
     for (load, name) in Load::ALL {
         let loading =
@@ -194,7 +206,7 @@ fn main() -> ExitCode {
         yardstick.line(name, "bare");
         ours.line(name, "cellpos");
         let more = (ours.ticks + ours.skipped) / 10_000;
-        holds &= ours.late <= yardstick.late + more && ours.skipped <= yardstick.skipped + more;
+        holds &= ours.lost() <= yardstick.lost() + more;
     }
     if holds {
         ExitCode::SUCCESS

@@ -40,7 +40,7 @@ pub struct Threads {
 }
 
 impl Threads {
-    /// SCHED_FIFO for all three, control on a CPU of its own choice, memory locked.
+    /// SCHED_FIFO for all three on one CPU, control before the others, memory locked.
     pub fn real_time() -> Self {
         Self {
             control: realtime::Request::control_thread(),
