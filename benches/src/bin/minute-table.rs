@@ -3,6 +3,7 @@
 //! ```text
 //! cargo run --release -p cellpos-benches --bin minute-table          a minute of each
 //! cargo run --release -p cellpos-benches --bin minute-table -- 10    ten seconds of each
+//! cargo run --release -p cellpos-benches --bin minute-table -- 60 touched    of the loads with this in their name
 //! ```
 //!
 //! Late: woken, or a command handed over, more than half a period after its time. Skipped: periods without a tick. Lost: the
@@ -189,7 +190,11 @@ fn main() -> ExitCode {
     );
     println!("|---|---|---|---|---|---|---|---|");
     let mut holds = true;
-    for (load, name) in Load::ALL {
+    let wanted = words.get(1).map_or("", String::as_str);
+    for (load, name) in Load::ALL
+        .into_iter()
+        .filter(|(_, name)| name.contains(wanted))
+    {
         let loading =
             (load != Load::Idle).then(|| Loading::start(name).expect("this program starts"));
         // Beside means in turn: half of the bare loop before, half after.

@@ -14,7 +14,7 @@
 use crate::core::Core;
 use crate::life::{Life, Request};
 pub use crate::operator::Operator;
-use crate::realtime;
+use crate::realtime::{self, Conditions};
 use crate::recorder::{self, Feed, Pulse, PulseWatch, RecorderReport};
 use crate::reference::ReferenceGenerator;
 use crate::run::{EndRule, Finished, RunError, RunSink, close_session};
@@ -167,29 +167,45 @@ pub fn run<R: ReferenceGenerator + Send, S: RunSink + 'static>(
     let ticks = ended.as_ref().map_or(0, |((end, _), _)| end.counts.ticks);
     let recorded = recorder.wait(ticks, LAST_PATIENCE);
     let ((control_end, conditions), io_error) = ended?;
-    let (sink, statistics, mut recorder) = recorded?;
-    recorder.fault = recorder.fault.or(operator.recorder_fault());
-    Ok(Finished {
-        summary: Summary::new(
-            control_end.life,
-            control_end.safe_reason,
-            control_end.end,
-            control_end.counts,
-            &control_end.account,
-            &statistics,
-            control_end.period_us,
-        )
-        .with_unkept(&recorder),
-        recorder,
+    Ok(finished(
+        control_end,
         conditions,
-        learned: control_end.learned,
-        sink,
+        recorded?,
         io_error,
-    })
+        operator,
+    ))
 }
 
 /// What the recorder's thread gives back.
 type Recorded<S> = (S, Statistics, RecorderReport);
+
+/// What is left of a run of which every thread has ended.
+fn finished<S>(
+    control: ControlEnd,
+    conditions: Conditions,
+    (sink, statistics, mut recorder): Recorded<S>,
+    io_error: Option<RunError>,
+    operator: &Operator,
+) -> Finished<S> {
+    recorder.fault = recorder.fault.or(operator.recorder_fault());
+    Finished {
+        summary: Summary::new(
+            control.life,
+            control.safe_reason,
+            control.end,
+            control.counts,
+            &control.account,
+            &statistics,
+            control.period_us,
+        )
+        .with_unkept(&recorder),
+        recorder,
+        conditions,
+        learned: control.learned,
+        sink,
+        io_error,
+    }
+}
 
 /// The recorder's thread. It owns what it writes to, so that it can be left behind when a write never comes back.
 struct Recording<S> {

@@ -78,199 +78,179 @@ pub(crate) fn is_odd(ratio: f64, ci95: f64) -> bool {
 
 /// An event in a sentence, and how much it matters.
 pub fn sentence(kind: &EventKind) -> (Level, String) {
-    use Level::{Fault, Info, Warning};
-    let text = |text: &str| text.to_string();
+    (level(kind), text(kind))
+}
+
+fn level(kind: &EventKind) -> Level {
     match *kind {
-        EventKind::Armed => (
-            Info,
-            text("The board is armed; the bead is being looked for."),
-        ),
-        EventKind::ArmingPassed { gain_ratio, ci95 } if is_odd(gain_ratio, ci95) => (
-            Warning,
-            format!(
-                "The plant answered the arming pulse with {gain_ratio:.2} +- {ci95:.2} of the model's gain: is the pixel size wrong \
-                 by this factor, or the um per volt?"
-            ),
-        ),
-        EventKind::ArmingPassed { gain_ratio, ci95 } => (
-            Info,
-            format!(
-                "The plant answered the arming pulse: its gain is {gain_ratio:.2} +- {ci95:.2} of the model's."
-            ),
-        ),
-        EventKind::ArmingRepeated { refusal: why, .. } => (
-            Warning,
-            format!(
-                "The arming pulse was disturbed and is made again ({}).",
-                refusal(why)
-            ),
-        ),
+        EventKind::ArmingPassed { gain_ratio, ci95 } if is_odd(gain_ratio, ci95) => Level::Warning,
+        EventKind::FreezeStarted {
+            reason: FreezeReason::Operator,
+        }
+        | EventKind::SafeLatched {
+            reason: SafeReason::Operator,
+        }
+        | EventKind::Armed
+        | EventKind::ArmingPassed { .. }
+        | EventKind::Running
+        | EventKind::CoastingEnded { .. }
+        | EventKind::FreezeEnded { .. }
+        | EventKind::FramesEarlyEnded { .. }
+        | EventKind::VisionSlowEnded { .. }
+        | EventKind::StuckEnded { .. }
+        | EventKind::SaturationEnded { .. }
+        | EventKind::DiskSlowEnded { .. }
+        | EventKind::Finished
+        | EventKind::Script { .. }
+        | EventKind::StepSkipped => Level::Info,
+        EventKind::ArmingRefused { .. } | EventKind::SafeLatched { .. } => Level::Fault,
+        _ => Level::Warning,
+    }
+}
+
+fn text(kind: &EventKind) -> String {
+    match *kind {
+        EventKind::Armed => "The board is armed; the bead is being looked for.".to_string(),
+        EventKind::ArmingPassed { gain_ratio, ci95 } => arming_passed(gain_ratio, ci95),
+        EventKind::ArmingRepeated { refusal: why, .. } => {
+            let why = refusal(why);
+            format!("The arming pulse was disturbed and is made again ({why}).")
+        }
         EventKind::ArmingRefused {
             refusal: why,
             gain_ratio,
             ..
-        } => (
-            Fault,
-            if gain_ratio.is_finite() {
-                format!(
-                    "Arming was refused: {}; the measured gain is {gain_ratio:.2} of the model's.",
-                    refusal(why)
-                )
-            } else {
-                format!("Arming was refused: {}.", refusal(why))
-            },
-        ),
-        EventKind::Running => (Info, text("The loop is closed.")),
-        EventKind::CoastingStarted => (Warning, text("No position: the loop runs on prediction.")),
+        } => arming_refused(why, gain_ratio),
+        EventKind::Running => "The loop is closed.".to_string(),
+        EventKind::CoastingStarted => "No position: the loop runs on prediction.".to_string(),
         EventKind::CoastingEnded { lasted_ms } => {
-            (Info, format!("Positions are back after {lasted_ms:.1} ms."))
+            format!("Positions are back after {lasted_ms:.1} ms.")
         }
-        EventKind::FreezeStarted { reason } => (
-            if reason == FreezeReason::Operator {
-                Info
-            } else {
-                Warning
-            },
-            format!("The bead is being stopped: {}.", freeze_reason(reason)),
-        ),
-        EventKind::FreezeEnded { lasted_ms } => {
-            (Info, format!("Control goes on after {lasted_ms:.0} ms."))
+        EventKind::FreezeStarted { reason } => {
+            format!("The bead is being stopped: {}.", freeze_reason(reason))
         }
-        EventKind::SafeLatched { reason } => (
-            if reason == SafeReason::Operator {
-                Info
-            } else {
-                Fault
-            },
-            format!("The PZT parks: {}.", safe_reason(reason)),
-        ),
-        EventKind::FramesDropped { count } => (
-            Warning,
-            format!(
-                "{count} {} missing.",
-                plural(count, "frame is", "frames are")
-            ),
-        ),
-        EventKind::FrameRepeated { frame_id } => (Warning, format!("Frame {frame_id} came again.")),
-        EventKind::FrameStale { age_ms } => (
-            Warning,
-            format!("A frame was {age_ms:.1} ms old and was not used."),
-        ),
-        EventKind::FrameFromFuture { ahead_ms } => (
-            Warning,
-            format!("A frame is stamped with a time {ahead_ms:.1} ms ahead and was not used."),
-        ),
+        EventKind::FreezeEnded { lasted_ms } => ended("Control goes on", lasted_ms),
+        EventKind::SafeLatched { reason } => format!("The PZT parks: {}.", safe_reason(reason)),
+        EventKind::FramesDropped { count } => {
+            let frames = plural(count, "frame is", "frames are");
+            format!("{count} {frames} missing.")
+        }
+        EventKind::FrameRepeated { frame_id } => format!("Frame {frame_id} came again."),
+        EventKind::FrameStale { age_ms } => {
+            format!("A frame was {age_ms:.1} ms old and was not used.")
+        }
+        EventKind::FrameFromFuture { ahead_ms } => {
+            format!("A frame is stamped with a time {ahead_ms:.1} ms ahead and was not used.")
+        }
         EventKind::FramesEarlyStarted {
             age_ms,
             expected_ms,
-        } => (
-            Warning,
-            format!(
-                "Frames are {age_ms:.2} ms old where {expected_ms:.2} ms are expected: is camera_delay_ms right?"
-            ),
+        } => format!(
+            "Frames are {age_ms:.2} ms old where {expected_ms:.2} ms are expected: is camera_delay_ms right?"
         ),
-        EventKind::FramesEarlyEnded { lasted_ms } => (
-            Info,
-            format!("Frames come as expected again after {lasted_ms:.0} ms."),
-        ),
+        EventKind::FramesEarlyEnded { lasted_ms } => {
+            ended("Frames come as expected again", lasted_ms)
+        }
         EventKind::VisionSlowStarted {
             vision_ms,
             period_ms,
-        } => (
-            Warning,
-            format!("Vision takes {vision_ms:.2} ms for a frame of {period_ms:.2} ms."),
+        } => format!("Vision takes {vision_ms:.2} ms for a frame of {period_ms:.2} ms."),
+        EventKind::VisionSlowEnded { lasted_ms } => ended("Vision keeps up again", lasted_ms),
+        EventKind::CameraRestarted => "The camera began to count its frames anew.".to_string(),
+        EventKind::BeadReacquired { position_um } => format!(
+            "A bead was taken at {position_um:.3} um after the one followed had been lost: it may be another."
         ),
-        EventKind::VisionSlowEnded { lasted_ms } => (
-            Info,
-            format!("Vision keeps up again after {lasted_ms:.0} ms."),
-        ),
-        EventKind::CameraRestarted => (Warning, text("The camera began to count its frames anew.")),
-        EventKind::BeadReacquired { position_um } => (
-            Warning,
-            format!(
-                "A bead was taken at {position_um:.3} um after the one followed had been lost: it may be another."
-            ),
-        ),
-        EventKind::LateTick { compute_us } => (
-            Warning,
-            format!("A command was handed over {compute_us:.0} us after its tick began: late."),
-        ),
-        EventKind::TicksSkipped { count } => (
-            Warning,
-            format!(
-                "{count} {} skipped: the loop was not woken in time.",
-                plural(count, "tick was", "ticks were")
-            ),
-        ),
+        EventKind::LateTick { compute_us } => {
+            format!("A command was handed over {compute_us:.0} us after its tick began: late.")
+        }
+        EventKind::TicksSkipped { count } => {
+            let ticks = plural(count, "tick was", "ticks were");
+            format!("{count} {ticks} skipped: the loop was not woken in time.")
+        }
         EventKind::PlantChanged {
             verdict,
             gain_ratio,
             lag_ms,
-        } => (
-            Warning,
-            if gain_ratio.is_finite() && lag_ms.is_finite() {
-                format!(
-                    "The plant is {verdict:?}: {gain_ratio:.2} of the model's gain, {lag_ms:.2} ms of lag that it lacks."
-                )
-            } else {
-                format!("The plant is {verdict:?}.")
-            },
-        ),
-        EventKind::StuckStarted => (
-            Warning,
-            text("The bead does not follow the PZT: it sticks."),
-        ),
-        EventKind::StuckEnded { lasted_ms } => (
-            Info,
-            format!("The bead follows again after {lasted_ms:.0} ms."),
-        ),
-        EventKind::SaturationStarted => (Warning, text("The PZT is at an end of its range.")),
-        EventKind::SaturationEnded { lasted_ms } => (
-            Info,
-            format!("The PZT is off the end of its range after {lasted_ms:.0} ms."),
-        ),
-        EventKind::BoardChanged { state, fault } => (
-            Warning,
-            format!("The board reports {state:?}, fault {fault:?}."),
-        ),
-        EventKind::BoardHeld { count } => (
-            Warning,
-            format!(
-                "Commands had stopped for the board's watchdog, {count} {}: it held the bead by itself, and the loop takes up again.",
-                plural(u64::from(count), "time", "times")
-            ),
-        ),
-        EventKind::LinkGarbage { count } => (
-            Warning,
-            format!(
-                "{count} damaged {} on the link.",
-                plural(u64::from(count), "message", "messages")
-            ),
-        ),
+        } => plant_changed(&format!("{verdict:?}"), gain_ratio, lag_ms),
+        EventKind::StuckStarted => "The bead does not follow the PZT: it sticks.".to_string(),
+        EventKind::StuckEnded { lasted_ms } => ended("The bead follows again", lasted_ms),
+        EventKind::SaturationStarted => "The PZT is at an end of its range.".to_string(),
+        EventKind::SaturationEnded { lasted_ms } => {
+            ended("The PZT is off the end of its range", lasted_ms)
+        }
+        EventKind::BoardChanged { state, fault } => {
+            format!("The board reports {state:?}, fault {fault:?}.")
+        }
+        EventKind::BoardHeld { count } => board_held(count),
+        EventKind::LinkGarbage { count } => {
+            let messages = plural(u64::from(count), "message", "messages");
+            format!("{count} damaged {messages} on the link.")
+        }
         EventKind::DiskSlowStarted {
             unconfirmed_ms,
             rows,
             limit_ms,
-        } => (
-            Warning,
-            format!(
-                "The disk has not confirmed what was written for {:.1} s: {rows} rows are in memory only, and a power failure now \
-                 would cost them; the run stops after {:.0} s of it.",
-                unconfirmed_ms * 1e-3,
-                limit_ms * 1e-3
-            ),
+        } => disk_slow(unconfirmed_ms, rows, limit_ms),
+        EventKind::DiskSlowEnded { longest_ms } => format!(
+            "The disk confirms in time again; it took {:.1} s at most.",
+            longest_ms * 1e-3
         ),
-        EventKind::DiskSlowEnded { longest_ms } => (
-            Info,
-            format!(
-                "The disk confirms in time again; it took {:.1} s at most.",
-                longest_ms * 1e-3
-            ),
-        ),
-        EventKind::Finished => (Info, text("The time is up.")),
-        EventKind::Script { stage } => (Info, format!("Script: {}.", stage.name())),
-        EventKind::StepSkipped => (Info, text("The operator went on with the next step.")),
+        EventKind::Finished => "The time is up.".to_string(),
+        EventKind::Script { stage } => format!("Script: {}.", stage.name()),
+        EventKind::StepSkipped => "The operator went on with the next step.".to_string(),
     }
+}
+
+fn ended(what: &str, lasted_ms: f64) -> String {
+    format!("{what} after {lasted_ms:.0} ms.")
+}
+
+fn arming_passed(gain_ratio: f64, ci95: f64) -> String {
+    if is_odd(gain_ratio, ci95) {
+        format!(
+            "The plant answered the arming pulse with {gain_ratio:.2} +- {ci95:.2} of the model's gain: is the pixel size wrong \
+             by this factor, or the um per volt?"
+        )
+    } else {
+        format!(
+            "The plant answered the arming pulse: its gain is {gain_ratio:.2} +- {ci95:.2} of the model's."
+        )
+    }
+}
+
+fn arming_refused(why: Refusal, gain_ratio: f64) -> String {
+    let why = refusal(why);
+    if gain_ratio.is_finite() {
+        format!("Arming was refused: {why}; the measured gain is {gain_ratio:.2} of the model's.")
+    } else {
+        format!("Arming was refused: {why}.")
+    }
+}
+
+fn plant_changed(verdict: &str, gain_ratio: f64, lag_ms: f64) -> String {
+    if gain_ratio.is_finite() && lag_ms.is_finite() {
+        format!(
+            "The plant is {verdict}: {gain_ratio:.2} of the model's gain, {lag_ms:.2} ms of lag that it lacks."
+        )
+    } else {
+        format!("The plant is {verdict}.")
+    }
+}
+
+fn board_held(count: u16) -> String {
+    let times = plural(u64::from(count), "time", "times");
+    format!(
+        "Commands had stopped for the board's watchdog, {count} {times}: it held the bead by itself, and the loop takes up again."
+    )
+}
+
+fn disk_slow(unconfirmed_ms: f64, rows: u64, limit_ms: f64) -> String {
+    format!(
+        "The disk has not confirmed what was written for {:.1} s: {rows} rows are in memory only, and a power failure now \
+         would cost them; the run stops after {:.0} s of it.",
+        unconfirmed_ms * 1e-3,
+        limit_ms * 1e-3
+    )
 }
 
 fn plural(count: u64, one: &'static str, many: &'static str) -> &'static str {

@@ -45,8 +45,6 @@ pub(crate) fn assemble(
         steps,
         rivals,
     } = found;
-    let sigma = ctx.problem.noise.innovation_um();
-    let n = null.count as f64;
     let null_map = map::map(ctx, &null);
     let after_map = map::map(ctx, &fit);
     let mut places = sentences(ctx, &null, &null_map);
@@ -81,26 +79,7 @@ pub(crate) fn assemble(
         });
         effects
     };
-    let rms = |chi2: f64| sigma * (chi2 / n).max(0.0).sqrt();
-    // The noise of these very rows: what the full fit leaves, where that is the floor within its own error.
-    let in_sample = rms(fit.chi2);
-    let gap = Gap {
-        before: held.before_um,
-        after: held.after_um,
-        floor: if in_sample <= 1.01 * sigma {
-            in_sample
-        } else {
-            sigma
-        },
-        free_run_before: held.free_before_um,
-        free_run_after: held.free_after_um,
-        free_run_floor: held.free_floor_um,
-        unit: "um".to_owned(),
-        quantity: "RMS innovation on held-out records",
-        steps: gap_steps(ctx, &null, &steps, rms),
-        per_record: held.per_record.clone(),
-        bands: held_out::bands(&null_map, &after_map),
-    };
+    let gap = gap(ctx, &held, [&null, &fit], &steps, [&null_map, &after_map]);
     let augmented = augment(model, ctx, &fit, frames, &named, verdict, floor);
     // The same with the set that was best, whether or not it earned its names.
     let mut best = augment(
@@ -140,6 +119,38 @@ pub(crate) fn assemble(
             .iter()
             .map(|r| (r.name.clone(), r.rows(), r.frames()))
             .collect(),
+    }
+}
+
+/// How far the gap has shrunk: fits and maps without and with the effects.
+fn gap(
+    ctx: &Context<'_>,
+    held: &HeldOut,
+    [null, fit]: [&Fit; 2],
+    steps: &[(Vec<&'static str>, f64)],
+    [null_map, after_map]: [&map::DiscrepancyMap; 2],
+) -> Gap {
+    let sigma = ctx.problem.noise.innovation_um();
+    let n = null.count as f64;
+    let rms = |chi2: f64| sigma * (chi2 / n).max(0.0).sqrt();
+    // The noise of these very rows: what the full fit leaves, where that is the floor within its own error.
+    let in_sample = rms(fit.chi2);
+    Gap {
+        before: held.before_um,
+        after: held.after_um,
+        floor: if in_sample <= 1.01 * sigma {
+            in_sample
+        } else {
+            sigma
+        },
+        free_run_before: held.free_before_um,
+        free_run_after: held.free_after_um,
+        free_run_floor: held.free_floor_um,
+        unit: "um".to_owned(),
+        quantity: "RMS innovation on held-out records",
+        steps: gap_steps(ctx, null, steps, rms),
+        per_record: held.per_record.clone(),
+        bands: held_out::bands(null_map, after_map),
     }
 }
 

@@ -208,6 +208,34 @@ pub(super) fn armed(seed: u64, faults: &Faults, clock: &Clock) -> (Shelf, HostBo
     (rig, board, armed.applied_um)
 }
 
+/// A sink that keeps everything, on a disk with these faults.
+fn sink(faults: &Faults, start_ns: i64, clock: &Clock) -> Sink {
+    let at = |(from_ns, until_ns): (i64, i64)| (start_ns + from_ns, start_ns + until_ns);
+    Sink {
+        records: Vec::new(),
+        events: Vec::new(),
+        clock: clock.clone(),
+        disk: faults.disk.map(at),
+        unconfirmed: faults.unconfirmed.map(at),
+        dies_at_ns: match faults.dies {
+            Some((Thread::Recorder, ns)) => Some(start_ns + ns),
+            _ => None,
+        },
+    }
+}
+
+/// The positions of the rig's bead, through a camera with these faults.
+fn source(seed: u64, faults: &Faults, rig: &Shelf, clock: &Clock) -> Source {
+    Source {
+        rig: Arc::clone(rig),
+        clock: clock.clone(),
+        faults: faults.clone(),
+        dice: Dice::new(seed ^ 0x1234),
+        frames: 0,
+        queue: VecDeque::new(),
+    }
+}
+
 /// A run of `periods` with these faults.
 pub(super) fn run(seed: u64, periods: u64, faults: &Faults, asks: &[(i64, Request)]) -> Ran {
     let clocks: [Clock; 4] = std::array::from_fn(|_| Clock::virtual_at(0));
@@ -231,17 +259,7 @@ pub(super) fn run(seed: u64, periods: u64, faults: &Faults, asks: &[(i64, Reques
     let core = core(reference, stands_um).counted_from(faults.first.0);
     let (ticker, ends) = Ticker::new(core, control_clock.clone(), start_ns, sizes);
     let (seen_in, seen) = RingBuffer::new(1024);
-    let mut sink = Sink {
-        records: Vec::new(),
-        events: Vec::new(),
-        clock: recorder_clock.clone(),
-        disk: faults.disk.map(|(a, b)| (start_ns + a, start_ns + b)),
-        unconfirmed: (faults.unconfirmed).map(|(a, b)| (start_ns + a, start_ns + b)),
-        dies_at_ns: match faults.dies {
-            Some((Thread::Recorder, ns)) => Some(start_ns + ns),
-            _ => None,
-        },
-    };
+    let mut sink = sink(faults, start_ns, recorder_clock);
     let mut statistics = Statistics::default();
     let feed = Feed {
         records: ends.records,
@@ -249,14 +267,7 @@ pub(super) fn run(seed: u64, periods: u64, faults: &Faults, asks: &[(i64, Reques
         learned: ends.learned,
     };
     let (shared, operator) = (Shared::default(), Operator::default());
-    let mut source = Source {
-        rig: Arc::clone(&rig),
-        clock: camera_clock.clone(),
-        faults: faults.clone(),
-        dice: Dice::new(seed ^ 0x1234),
-        frames: 0,
-        queue: VecDeque::new(),
-    };
+    let mut source = source(seed, faults, &rig, camera_clock);
     let rule = EndRule {
         ticks: Some(periods),
         ..EndRule::default()
