@@ -17,7 +17,7 @@ fn a_killed_program_goes_on_and_does_every_cycle_once() {
 
 #[test]
 fn damaged_inputs_get_an_answer() {
-    stands(attack::damaged_inputs, 70);
+    stands(attack::inputs::damaged_inputs, 70);
 }
 
 #[test]

@@ -42,6 +42,7 @@ pub mod recorded;
 pub mod recording;
 mod rig;
 pub mod rig_file;
+mod running;
 pub mod say;
 pub mod screen;
 pub mod setup;

@@ -6,6 +6,7 @@ use crate::failure::Failure;
 use crate::fit;
 use crate::real_time::LockedMemory;
 use crate::rig_file::{ClockKind, Connected, RigFile};
+use crate::running;
 use crate::setup::{Prepared, ReferenceSpec, Setup, SetupConfig};
 use crate::signals::{self, Place};
 use crate::witness::Witness;
@@ -20,7 +21,6 @@ use cellpos_runtime::{
     Core, EndRule, ReferenceGenerator, RunError, RunSink, Statistics, Summary, live, virtual_run,
 };
 use std::sync::Arc;
-use std::thread::JoinHandle;
 use std::time::Duration;
 
 /// A rig that is connected and not armed: the PZT is at park or on its way there.
@@ -332,10 +332,7 @@ where
             .name("cellpos-board".to_string())
             .spawn(move || self.run())
             .map_err(Failure::failed)?;
-        Ok(Running {
-            operator,
-            thread: Some(thread),
-        })
+        Ok(Running::new(operator, thread))
     }
 
     /// The loop, on threads that it makes for itself; the calling one waits for them.
@@ -399,85 +396,8 @@ where
     }
 }
 
-/// A loop that runs. Dropped, it is told to park, and waited for.
-pub struct Running<S> {
-    operator: Arc<Operator>,
-    thread: Option<JoinHandle<Result<Finished<S>, Failure>>>,
-}
-
-impl<S> Running<S> {
-    /// Who may ask for freeze, park, pause.
-    pub fn operator(&self) -> &Arc<Operator> {
-        &self.operator
-    }
-
-    /// Whether it has come to its end.
-    pub fn is_over(&self) -> bool {
-        self.thread.as_ref().is_none_or(JoinHandle::is_finished)
-    }
-
-    /// Waits for its end.
-    ///
-    /// # Errors
-    /// The run could not be carried through; the PZT is parked.
-    pub fn wait(self) -> Result<Finished<S>, Failure> {
-        self.wait_with(Duration::from_secs(3600), || {})
-    }
-
-    /// Waits for its end, and does something now and then meanwhile.
-    ///
-    /// # Errors
-    /// The run could not be carried through; the PZT is parked.
-    pub fn wait_with(
-        mut self,
-        every: Duration,
-        mut meanwhile: impl FnMut(),
-    ) -> Result<Finished<S>, Failure> {
-        const LOOK_EVERY: Duration = Duration::from_millis(5);
-        let Some(thread) = self.thread.take() else {
-            return Err(panicked());
-        };
-        let guard = ParkOnPanic(&self.operator);
-        let mut next = std::time::Instant::now() + every;
-        let mut told = false;
-        while !thread.is_finished() {
-            std::thread::sleep(LOOK_EVERY);
-            // A recorder that hangs holds the end of the run: it is named now.
-            if let Some(fault) = self.operator.recorder_fault().filter(|_| !told) {
-                tracing::error!("{}", fault.sentence());
-                told = true;
-            }
-            if std::time::Instant::now() >= next {
-                meanwhile();
-                next = std::time::Instant::now() + every;
-            }
-        }
-        std::mem::forget(guard);
-        thread.join().unwrap_or_else(|_| Err(panicked()))
-    }
-}
-
-/// Parks when whoever waits for a run panics.
-struct ParkOnPanic<'a>(&'a Operator);
-
-impl Drop for ParkOnPanic<'_> {
-    fn drop(&mut self) {
-        self.0.ask(cellpos_runtime::Request::Park);
-    }
-}
-
-fn panicked() -> Failure {
-    Failure::failed(RunError::Panicked { thread: "session" })
-}
-
-impl<S> Drop for Running<S> {
-    fn drop(&mut self) {
-        if let Some(thread) = self.thread.take() {
-            self.operator.ask(cellpos_runtime::Request::Park);
-            let _ = thread.join();
-        }
-    }
-}
+/// A loop that runs, and what it ends in.
+pub type Running<S> = running::Running<Finished<S>>;
 
 /// A run that is over; the PZT is at park or on its way there.
 pub struct Finished<S> {

@@ -32,7 +32,7 @@ fn main() -> ExitCode {
             "damaged inputs",
             "--inputs",
             100_000,
-            attack::damaged_inputs,
+            attack::inputs::damaged_inputs,
         ),
         ("hostile boards", "--boards", 100, attack::hostile_boards),
         ("hostile cameras", "--cameras", 60, attack::hostile_cameras),

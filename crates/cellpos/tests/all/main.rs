@@ -14,6 +14,7 @@ mod screen;
 mod script_faults;
 mod script_runs;
 mod scripts;
+mod scripts_resumed;
 mod signals;
 mod terminal;
 mod track;

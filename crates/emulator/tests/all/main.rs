@@ -5,3 +5,4 @@ mod cell;
 mod rig_in_a_box;
 mod scene;
 mod world;
+mod world_faults;

@@ -4,9 +4,9 @@ use cellpos_emulator::{FaultKind, Faults, FrameInfo, PositionFix, World, WorldCo
 use cellpos_plant::{Model, effects};
 use cellpos_vision::{Frame, Localiser, LocaliserConfig, Pixels, ProfileSpec, Verdict};
 
-const MS: i64 = 1_000_000;
+pub(crate) const MS: i64 = 1_000_000;
 
-fn quiet() -> WorldConfig {
+pub(crate) fn quiet() -> WorldConfig {
     WorldConfig {
         diffusion_um2_per_s: 0.0,
         drift_um_per_s: 0.0,
@@ -14,12 +14,12 @@ fn quiet() -> WorldConfig {
     }
 }
 
-fn world(config: &WorldConfig) -> World {
+pub(crate) fn world(config: &WorldConfig) -> World {
     World::new(config, &Model::eq6(), 0).unwrap()
 }
 
 /// Runs for `ms` milliseconds at a constant output; the positions delivered.
-fn positions(world: &mut World, ms: i64, applied_um: f64) -> Vec<PositionFix> {
+pub(crate) fn positions(world: &mut World, ms: i64, applied_um: f64) -> Vec<PositionFix> {
     let mut all = Vec::new();
     let end_ns = world.now_ns() + ms * MS;
     while world.now_ns() < end_ns {
@@ -31,7 +31,7 @@ fn positions(world: &mut World, ms: i64, applied_um: f64) -> Vec<PositionFix> {
     all
 }
 
-fn ids(fixes: &[PositionFix]) -> Vec<u64> {
+pub(crate) fn ids(fixes: &[PositionFix]) -> Vec<u64> {
     fixes.iter().map(|fix| fix.info.id).collect()
 }
 
@@ -149,12 +149,12 @@ fn a_frame_shows_the_mean_of_the_path_over_the_exposure() {
     }
 }
 
-fn localiser() -> Localiser {
+pub(crate) fn localiser() -> Localiser {
     Localiser::new(LocaliserConfig::new(ProfileSpec::Ring { edge_px: 5.0 })).unwrap()
 }
 
 /// Locates the bead in the next frame, if there is one.
-fn locate(
+pub(crate) fn locate(
     world: &mut World,
     localiser: &mut Localiser,
     pixels: &mut Vec<u8>,
@@ -267,155 +267,6 @@ fn the_same_seed_gives_the_same_pixels_and_another_seed_others() {
 }
 
 #[test]
-fn frames_are_dropped_doubled_reordered_and_go_stale_at_their_rates() {
-    let run = |faults: Faults| {
-        let config = WorldConfig { faults, ..quiet() };
-        positions(&mut world(&config), 20_000, 20.0)
-    };
-    let rate = 0.1;
-    let near = |count: usize| {
-        let expected = 20_000.0 * rate;
-        (count as f64 - expected).abs() < 5.0 * (expected * (1.0 - rate)).sqrt() + 5.0
-    };
-    let dropped = run(Faults {
-        drop_rate: rate,
-        ..Faults::default()
-    });
-    assert!(near(20_000 - dropped.len()), "{}", dropped.len());
-    let doubled = run(Faults {
-        double_rate: rate,
-        ..Faults::default()
-    });
-    assert!(near(doubled.len() - 19_998), "{}", doubled.len());
-    let pairs = doubled
-        .windows(2)
-        .filter(|w| w[0].info.id == w[1].info.id && w[0].info.true_um == w[1].info.true_um)
-        .count();
-    assert!(near(pairs));
-    let reordered = run(Faults {
-        reorder_rate: rate,
-        ..Faults::default()
-    });
-    let back = ids(&reordered).windows(2).filter(|w| w[1] < w[0]).count();
-    // A frame that is held back together with its predecessor does not overtake it.
-    assert!(near(back + (20_000.0 * rate * rate) as usize), "{back}");
-    let stale = run(Faults {
-        stale_rate: rate,
-        ..Faults::default()
-    });
-    let old = stale
-        .iter()
-        .filter(|fix| fix.info.delivery_ns - fix.info.mid_exposure_ns > 2 * MS)
-        .count();
-    assert!(near(old), "{old}");
-    assert!(
-        ids(&stale).windows(2).all(|w| w[1] == w[0] + 1),
-        "ids go on as if nothing had happened"
-    );
-    assert!(stale.iter().all(|fix| {
-        let age_ms = (fix.info.delivery_ns - fix.info.mid_exposure_ns) / MS;
-        age_ms == 2 || age_ms == 7
-    }));
-}
-
-#[test]
-fn a_lost_bead_is_gone_from_pictures_and_positions_and_comes_back() {
-    let config = WorldConfig {
-        faults: Faults::default().with(FaultKind::LoseBead, 0.1, Some(0.05)),
-        ..quiet()
-    };
-    let fixes = positions(&mut world(&config), 300, 20.0);
-    let lost: Vec<u64> = fixes
-        .iter()
-        .filter(|fix| fix.verdict != Verdict::Good)
-        .map(|fix| fix.info.id)
-        .collect();
-    // Exposed from 99.75 ms + 1 on: ids 99 (middle 100 ms, half lit) to 149.
-    assert_eq!((lost[0], lost[lost.len() - 1]), (99, 149));
-    assert_eq!(lost.len(), 51);
-    let mut world = world(&config);
-    let (mut localiser, mut pixels) = (localiser(), Vec::new());
-    world.advance_to(130 * MS, 20.0);
-    let mut verdicts = Vec::new();
-    while let Some((info, _, _, verdict)) = locate(&mut world, &mut localiser, &mut pixels) {
-        verdicts.push((info.id, verdict));
-    }
-    assert!(
-        verdicts
-            .iter()
-            .all(|&(id, verdict)| (verdict == Verdict::Good) == (id < 99)),
-        "{verdicts:?}"
-    );
-}
-
-#[test]
-fn a_stuck_bead_stands_still_in_the_flow_and_goes_on_from_there() {
-    let config = WorldConfig {
-        drift_um_per_s: 10.0,
-        faults: Faults::default().with(FaultKind::StickBead, 0.1, Some(0.2)),
-        ..quiet()
-    };
-    let mut world = world(&config);
-    world.advance_to(110 * MS, 20.0);
-    let stuck_um = world.bead_um();
-    assert!((stuck_um - 1.0).abs() < 0.01);
-    world.advance_to(290 * MS, 20.5);
-    assert_eq!(world.bead_um(), stuck_um);
-    world.advance_to(310 * MS, 20.5);
-    let moved_um = world.bead_um() - stuck_um;
-    assert!(
-        moved_um > 1.0 && moved_um < 8.0,
-        "{moved_um} um in 10-20 ms"
-    );
-}
-
-#[test]
-fn a_second_bead_shows_in_the_picture_and_spoils_the_position_when_it_is_close() {
-    let at = |second_bead_um: f64| {
-        let config = WorldConfig {
-            faults: Faults {
-                second_bead_um,
-                ..Faults::default().with(FaultKind::SecondBead, 0.0, None)
-            },
-            ..quiet()
-        };
-        world(&config)
-    };
-    let mut pixels = Vec::new();
-    let mut apart = at(6.0);
-    apart.advance_to(20 * MS, 20.0);
-    assert!(apart.take_frame(&mut pixels).is_some());
-    let column = |um: f64| (127.5 + um / 0.1) as usize;
-    let bright = |pixels: &[u8], x: usize| {
-        pixels[16 * 256 + x - 1..16 * 256 + x + 2]
-            .iter()
-            .all(|&p| p > 150)
-    };
-    assert!(bright(&pixels, column(0.0)) && bright(&pixels, column(6.0)));
-    assert!(!bright(&pixels, column(3.0)));
-    let verdict = |world: &mut World| positions(world, 20, 20.0).pop().unwrap().verdict;
-    assert_eq!(verdict(&mut at(6.0)), Verdict::Good);
-    assert_eq!(verdict(&mut at(0.7)), Verdict::BadFit);
-}
-
-#[test]
-fn a_stalled_camera_delivers_nothing_and_then_all_at_once() {
-    let config = WorldConfig {
-        faults: Faults::default().with(FaultKind::StallCamera, 0.1, Some(0.03)),
-        ..quiet()
-    };
-    let mut world = world(&config);
-    world.advance_to(100 * MS - 1, 20.0);
-    let before = std::iter::from_fn(|| world.take_position()).count();
-    assert_eq!(before, 97);
-    world.advance_to(130 * MS - 1, 20.0);
-    assert!(world.take_position().is_none());
-    world.advance_to(130 * MS, 20.0);
-    let burst: Vec<_> = std::iter::from_fn(|| world.take_position()).collect();
-    assert_eq!(ids(&burst), (97..128).collect::<Vec<_>>());
-}
-
-#[test]
 fn effects_of_the_model_at_the_cameras_place_are_taken_over() {
     let model = Model::eq6()
         .with_effect(effects::time_delay(0.003))
@@ -427,21 +278,6 @@ fn effects_of_the_model_at_the_cameras_place_are_taken_over() {
     let info = fixes[0].info;
     assert_eq!(info.exposure_ns, MS);
     assert_eq!(info.delivery_ns - info.mid_exposure_ns, 3_500_000);
-}
-
-#[test]
-fn a_bead_that_was_carried_off_is_replaced_once_the_flow_is_slow() {
-    let config = WorldConfig {
-        new_bead_after_ms: Some(100.0),
-        ..quiet()
-    };
-    let mut world = world(&config);
-    positions(&mut world, 200, 0.0);
-    assert!(!world.bead_in_frame(), "20 um from neutral: 8.5 mm/s");
-    positions(&mut world, 300, 20.0);
-    assert!(world.bead_in_frame());
-    // At 51 um/s or less, dying away with the pole at 76 rad/s, and the slow pole's 3 um/s for 0.3 s.
-    assert!(world.bead_um().abs() < 2.0, "{}", world.bead_um());
 }
 
 #[test]

@@ -1,19 +1,19 @@
 //! The wire as others see it: `docs/protocol-vectors.json` is what the code says, and the C99 file under `firmware/c`
 //! reads and writes the same bytes.
 
+use crate::wire_in_c::InC;
 use cellpos_link::*;
 use proptest::prelude::*;
 use proptest::strategy::ValueTree;
 use proptest::test_runner::{Config, RngAlgorithm, TestRng, TestRunner};
 use serde_json::{Value, json};
-use std::io::Write;
 use std::path::{Path, PathBuf};
-use std::process::{Command as Program, Stdio};
 
 const TO_BOARD: u8 = 0xb1;
+
 const TO_HOST: u8 = 0x4e;
 
-fn root() -> PathBuf {
+pub(crate) fn root() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../..")
 }
 
@@ -319,63 +319,6 @@ fn good_vectors_are_read_and_damaged_ones_are_counted() {
     }
     for (name, direction, wire) in damaged() {
         assert_eq!(found(direction, &wire), "1", "{name}");
-    }
-}
-
-/// The C99 decoder and encoder, compiled.
-struct InC {
-    folder: PathBuf,
-}
-
-impl InC {
-    fn compile(name: &str) -> Self {
-        let folder =
-            std::env::temp_dir().join(format!("cellpos-wire-{}-{name}", std::process::id()));
-        std::fs::create_dir_all(&folder).expect("a folder for the program");
-        let status = Program::new("cc")
-            .args([
-                "-std=c99",
-                "-Wall",
-                "-Wextra",
-                "-Wpedantic",
-                "-Werror",
-                "-O2",
-                "-o",
-            ])
-            .arg(folder.join("compare"))
-            .arg(root().join("firmware/c/compare.c"))
-            .status()
-            .expect("a C compiler called cc (Debian: gcc)");
-        assert!(status.success(), "firmware/c does not compile");
-        Self { folder }
-    }
-
-    /// What it finds in each byte string.
-    fn found(&self, strings: &[(u8, Vec<u8>)]) -> Vec<String> {
-        let mut child = Program::new(self.folder.join("compare"))
-            .stdin(Stdio::piped())
-            .stdout(Stdio::piped())
-            .spawn()
-            .expect("it was compiled");
-        let mut stdin = child.stdin.take().expect("piped");
-        let mut input = Vec::new();
-        for (direction, bytes) in strings {
-            input.extend(u16::try_from(bytes.len()).expect("short").to_le_bytes());
-            input.push(*direction);
-            input.extend(bytes);
-        }
-        let writer = std::thread::spawn(move || stdin.write_all(&input));
-        let output = child.wait_with_output().expect("it ends");
-        writer.join().expect("no panic").expect("it reads all");
-        assert!(output.status.success());
-        let text = String::from_utf8(output.stdout).expect("text");
-        text.lines().map(str::to_owned).collect()
-    }
-}
-
-impl Drop for InC {
-    fn drop(&mut self) {
-        let _ = std::fs::remove_dir_all(&self.folder);
     }
 }
 
