@@ -2,6 +2,7 @@
 
 use crate::world::{MS, ids, localiser, locate, positions, quiet, world};
 use cellpos_emulator::{FaultKind, Faults, World, WorldConfig};
+use cellpos_vision::Verdict;
 
 #[test]
 fn frames_are_dropped_doubled_reordered_and_go_stale_at_their_rates() {
