@@ -54,6 +54,24 @@ impl Ended {
             EndKind::Done | EndKind::ReferenceOver | EndKind::Operator
         )
     }
+
+    /// Whether what ended it may be over by now, as a stall of this machine or of the line is: another run may go well, and
+    /// nobody need do anything for it. A bead that is lost or a board in the hands of another program is not that.
+    pub fn may_pass(&self) -> bool {
+        matches!(
+            self.reason,
+            Some(
+                SafeReason::ActuatorRingFull
+                    | SafeReason::Board
+                    | SafeReason::BoardNotObeying
+                    | SafeReason::LateTicks
+                    | SafeReason::LinkLost
+                    | SafeReason::StaleFrames
+                    | SafeReason::Stalled
+                    | SafeReason::VisionSlow
+            )
+        )
+    }
 }
 
 impl Ended {

@@ -121,6 +121,25 @@ fn a_segment_in_which_the_bead_was_lost_is_measured_again() {
 }
 
 #[test]
+fn a_run_that_ended_because_the_line_stalled_is_gone_on_with() {
+    let folder = tempfile::tempdir().unwrap();
+    rig(
+        folder.path(),
+        "rig.toml",
+        "[emulator.faults]\nevent = [{ kind = \"link-loss\", at_s = 12.0, for_s = 1.0 }]\n",
+    );
+    let ran = succeed(folder.path(), &format!("identify --rig rig.toml {FEW}"));
+    let r = ran.json();
+    assert!((gain(&r) / TRUE_GAIN_PER_S - 1.0).abs() < 0.02, "{r}");
+    assert_eq!(r["frequencies"].as_array().unwrap().len(), 5);
+    let said = message(&ran);
+    assert!(
+        said.contains("not heard") && said.contains("measuring again what is missing"),
+        "{said}"
+    );
+}
+
+#[test]
 fn an_identification_stopped_by_a_lost_bead_keeps_its_segments_and_goes_on_from_them() {
     let folder = tempfile::tempdir().unwrap();
     rig(

@@ -183,7 +183,8 @@ fn held_bead(
     })
 }
 
-/// Runs on the rig of a rig.toml until no segment is missing, at most four times.
+/// Runs on the rig of a rig.toml until no segment is missing, at most four times: again where a bead was lost for a while,
+/// or the machine or the line stalled; not where somebody has to do something first.
 fn on_rig(
     job: &Job,
     rig: &OnRig,
@@ -223,6 +224,9 @@ fn on_rig(
                 tracing::warn!(
                     "a lost bead or a freeze spoilt segments; measuring again what is missing"
                 );
+            }
+            Some(Trouble::Ended(ended)) if ended.may_pass() && attempt < ATTEMPTS => {
+                tracing::warn!("{}; measuring again what is missing", ended.seen);
             }
             Some(trouble) => {
                 let (done, of) = (records.len(), plan.segments.len());
