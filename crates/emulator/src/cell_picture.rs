@@ -99,9 +99,9 @@ impl CellPicture {
         }
         let (gx, gy) = (u / axes.along_px, v / axes.across_px);
         let slope2 = gx * gx + gy * gy;
-        // Distance from the ellipse to first order: (r^2 - 1) / |grad r^2|, exact on it.
+        // Distance from the ellipse, (r - 1) / |grad r|: to first order, exact for a circle.
         let widths = if slope2 > 0.0 {
-            0.5 * (r2 - 1.0) / (slope2.sqrt() * self.blur_px)
+            (r2 - r2.sqrt()) / (slope2.sqrt() * self.blur_px)
         } else {
             -(REACH as f32)
         };

@@ -100,6 +100,9 @@ fn a_cell_with_rim_and_halo_keeps_its_length_and_area_through_the_focus() {
         (14.0, 0.35, 0.3),
         (14.0, -0.35, 0.3),
         (8.0, 1.0, 0.5),
+        (6.0, -0.35, 0.6),
+        (6.0, 0.35, 0.6),
+        (6.0, 1.0, 0.5),
     ];
     for focus_um in [-2.0, -1.0, 0.0, 1.0, 2.0] {
         for (rest_um, body, halo) in kinds {

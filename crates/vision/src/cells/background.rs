@@ -10,6 +10,13 @@ const REFRESHED_EVERY: usize = 16;
 /// At most this many pixels serve for the estimate of a shift.
 pub(super) const SAMPLES: usize = 384;
 
+/// About so many pixels serve for the estimate of the light.
+const LIGHT_SAMPLES: usize = 2048;
+/// Ratios of a pixel to the background's are counted in so many classes from 0 on, and so many to a ratio of 1.
+const LIGHT_BINS: usize = 1024;
+const LIGHT_BINS_PER_ONE: f32 = 256.0;
+const LIGHT_PASSES: usize = 4;
+
 /// First column and row of a region, and the first behind it, px.
 pub(super) type Bounds = [usize; 4];
 
@@ -117,32 +124,53 @@ impl Background {
         }
     }
 
-    /// Light of the frame relative to the background's: mean ratio over pixels that differ little from it.
+    /// Light of the frame relative to the background's: where most pixels' ratios lie. Its median is a start that no header,
+    /// cell or wall within half of the frame draws away; then the mean of what lies within two standard deviations of it.
     pub fn light_of<T: Copy>(&self, pixels: &[T]) -> f32
     where
         f32: From<T>,
     {
-        let step = (pixels.len() / 2048).max(1) | 1;
-        let (mut light, mut limit) = (1.0_f64, f64::INFINITY);
-        for _ in 0..4 {
-            let (mut over, mut under, mut spread, mut n) = (0.0_f64, 0.0_f64, 0.0_f64, 0.0_f64);
-            for (p, m) in pixels.iter().zip(&self.mean).step_by(step) {
-                let (v, m) = (f64::from(f32::from(*p)), f64::from(*m));
-                let off = (v - light * m).abs();
-                if off <= limit {
+        let step = (pixels.len() / LIGHT_SAMPLES).max(1) | 1;
+        let pairs = || {
+            let pairs = pixels.iter().zip(&self.mean).step_by(step);
+            pairs.map(|(p, m)| (f32::from(*p), *m))
+        };
+        let mut counts = [0.0_f32; LIGHT_BINS];
+        let mut n = 0.0_f32;
+        for (v, m) in pairs().filter(|(_, m)| *m > 0.0) {
+            let bin = (v / m * LIGHT_BINS_PER_ONE) as usize;
+            if let Some(count) = counts.get_mut(bin.min(LIGHT_BINS - 1)) {
+                *count += 1.0;
+                n += 1.0;
+            }
+        }
+        let below = |share: f32| {
+            let (mut left, mut bin) = (share * n, 0);
+            while bin < LIGHT_BINS - 1 && left > counts[bin] {
+                left -= counts[bin];
+                bin += 1;
+            }
+            (bin as f32 + left / counts[bin].max(1.0)) / LIGHT_BINS_PER_ONE
+        };
+        if n == 0.0 {
+            return 1.0;
+        }
+        let mut light = below(0.5);
+        // Half of a normal distribution lies within 0.67 standard deviations of its middle.
+        let sd = 0.74 * (below(0.75) - below(0.25));
+        for _ in 0..LIGHT_PASSES {
+            let (mut over, mut under) = (0.0_f32, 0.0_f32);
+            for (v, m) in pairs() {
+                if (v - light * m).abs() <= 2.0 * sd * m + 1.0 {
                     over += v;
                     under += m;
-                    spread += off;
-                    n += 1.0;
                 }
             }
-            if under <= 0.0 {
-                break;
+            if under > 0.0 {
+                light = over / under;
             }
-            light = over / under;
-            limit = 2.5 * spread / n.max(1.0) + self.noise_grey();
         }
-        light as f32
+        light
     }
 }
 

@@ -1,9 +1,10 @@
 //! Where in the mean profile the edge is.
 //!
-//! Beside a halo it is told by the rim: half of the rim's contrast, or, the more the halo is like the rim (both lobes of one
-//! phase edge), half of the body's. Without a halo of the other sign the profile may still have two lobes, with the outer one
-//! of the body's own sign (a body that absorbs, on the other side of the focus): then a blurred step with the two lobes of a
-//! phase edge is fitted, and the edge is that step's middle.
+//! Where a blurred step with the lobes of a phase edge and a rim describes the profile nearly wholly, the edge is that step's
+//! middle. Real rims and halos are richer, and there the rim tells: the edge is at half of the rim's contrast or, the more the
+//! halo is like the rim (both lobes of one phase edge), of the body's. Without a halo of the other sign the profile may still
+//! have two lobes, the outer one of the body's own sign (a body that absorbs, on the other side of the focus): then the step
+//! with lobes is looked for farther away.
 
 use super::normals::Profile;
 use super::{FINE_PX, RIM_PX};
@@ -26,6 +27,17 @@ const LESS_LEFT: f64 = 0.3;
 const REACH_PX: f64 = 4.5;
 /// Widths of the blur that are tried, px.
 const BLURS_PX: [f64; 5] = [0.7, 1.0, 1.4, 2.0, 2.8];
+/// First step (px), factor of the blur and stride of the values about the best of a search.
+const NEAR: (f64, f64, usize) = (0.5 * FINE_PX, 1.19, 1);
+/// What a blurred step with lobes and rim may leave of the profile (RMS share): up to here its middle alone counts, from
+/// there on it does not.
+const MODEL_LEFT: (f64, f64) = (0.02, 0.04);
+/// How far this middle may lie from where the level is, in widths of the blur: up to here it counts, from there on not.
+const MODEL_AWAY: (f64, f64) = (0.25, 0.4);
+/// How many widths of the blur an edge seems wide, with strong lobes and without any.
+const WIDTHS: [(f64, With); 2] = [(1.9, With::LobesAndRim), (2.9, With::Rim)];
+/// Lobes that leave no less than this share of what a plain step leaves are none.
+const PLAIN: f64 = 1.5;
 /// Rounds in which the best of them is refined.
 const ROUNDS: usize = 4;
 
@@ -76,13 +88,15 @@ impl Shapes {
 }
 
 impl Profile {
-    /// The edge of an object of the radius `radius_px`; `None` where inside and outside are alike.
-    pub(super) fn edge(&self, radius_px: f64, shapes: &Shapes) -> Option<Edge> {
+    /// The edge of an object of the radius `radius_px`, to a pixel or so, or to the last; `None` where inside and outside are
+    /// alike.
+    pub(super) fn edge(&self, radius_px: f64, shapes: &Shapes, fine: bool) -> Option<Edge> {
         let body = -self.polarity;
         let (rim_at, halo_at) = (self.rim(), self.halo());
         let value = |k: usize| body * self.values[k];
         let most = (0..=self.half).map(value).fold(0.0, f64::max);
-        let swing = value(rim_at) - value(halo_at);
+        let least = (self.half..=2 * self.half).map(value).fold(0.0, f64::min);
+        let swing = most - least;
         if swing <= 0.0 {
             return None;
         }
@@ -102,7 +116,7 @@ impl Profile {
         } else {
             0.0
         };
-        let halo = (-value(halo_at)).max(0.0);
+        let halo = -least;
         let ratio = halo / rim.max(1e-9);
         let found = |at_px| Edge {
             at_px,
@@ -118,7 +132,7 @@ impl Profile {
             Some(k as f64 + (value(k) - level) / (value(k) - value(k + 1)))
         };
         let (low, high, times) = WIDTH;
-        let share = |s: f64| value(halo_at) + s * swing;
+        let share = |s: f64| least + s * swing;
         let width_px = match (crossing(share(high)), crossing(share(low))) {
             (Some(inner), Some(outer)) => times * (outer - inner) * FINE_PX,
             _ => (halo_at - rim_at) as f64 * FINE_PX,
@@ -133,7 +147,42 @@ impl Profile {
         let at = crossing(level).unwrap_or(self.half as f64);
         let at_px = (at - self.half as f64) * FINE_PX;
         let (fitted_px, weight) = fitted.unwrap_or((at_px, 0.0));
-        Some(found(at_px + weight * (fitted_px - at_px)))
+        let at_px = at_px + weight * (fitted_px - at_px);
+        if !fine {
+            return Some(found(at_px));
+        }
+        let (model_px, weight) = self.model(shapes, (at_px, width_px));
+        Some(found(at_px + weight * (model_px - at_px)))
+    }
+
+    /// Middle of the blurred step with lobes and rim near a place and of about a width (px), px outside the profile's middle,
+    /// and how far that is to be believed, 0 to 1: where it leaves next to nothing of the profile no level tells more.
+    fn model(&self, shapes: &Shapes, (near_px, width_px): (f64, f64)) -> (f64, f64) {
+        let values = self.values.iter().take(2 * self.half + 1);
+        let power: f64 = values.map(|v| v * v).sum();
+        let tried = WIDTHS.map(|(widths, with)| {
+            let start = PhaseEdge {
+                at_px: near_px,
+                blur_px: width_px / widths,
+                ..PhaseEdge::NONE
+            };
+            let coarse = self.refined(shapes, start, with, (FINE_PX, 1.2, 2));
+            self.refined(shapes, coarse, with, (0.25 * FINE_PX, 1.1, 1))
+        });
+        let [lobes, plain] = tried;
+        let best = if plain.left < PLAIN * lobes.left {
+            plain
+        } else {
+            lobes
+        };
+        let left = (best.left.max(0.0) / power.max(1e-9)).sqrt();
+        let away = (best.at_px - near_px).abs() / best.blur_px;
+        let within =
+            |(from, to): (f64, f64), value: f64| ((to - value) / (to - from)).clamp(0.0, 1.0);
+        (
+            best.at_px,
+            within(MODEL_LEFT, left) * within(MODEL_AWAY, away),
+        )
     }
 
     /// Middle of the blurred step that fits the profile with an outer lobe of the step's own sign, px outside the profile's
@@ -150,7 +199,7 @@ impl Profile {
             return None;
         }
         // A rim inside would be taken for a part of the inner lobe.
-        let best = self.refined(shapes, best, With::LobesAndRim);
+        let best = self.refined(shapes, best, With::LobesAndRim, NEAR);
         let plain = self.fitted(shapes, With::Rim);
         (best.left < LESS_LEFT * plain.left).then_some((best.at_px, weight))
     }
@@ -166,19 +215,24 @@ impl Profile {
                 best = best.or(self.phase_edge_at(shapes, (at_px, blur_px), 2, with));
             }
         }
-        self.refined(shapes, best, with)
+        self.refined(shapes, best, with, NEAR)
     }
 
-    /// The best within a step of the coarse search, by ever smaller steps.
-    fn refined(&self, shapes: &Shapes, start: PhaseEdge, with: With) -> PhaseEdge {
-        let mut best = self.phase_edge_at(shapes, (start.at_px, start.blur_px), 1, with);
-        let (mut step_px, mut factor) = (0.5 * FINE_PX, 1.19_f64);
+    /// The best about a start, by ever smaller steps from `step_px` and `factor` of the blur on, by every `stride`th value.
+    fn refined(
+        &self,
+        shapes: &Shapes,
+        start: PhaseEdge,
+        with: With,
+        (mut step_px, mut factor, stride): (f64, f64, usize),
+    ) -> PhaseEdge {
+        let mut best = self.phase_edge_at(shapes, (start.at_px, start.blur_px), stride, with);
         for _ in 0..ROUNDS {
             let (at_px, blur_px) = (best.at_px, best.blur_px);
             for i in -1..=1 {
                 for blur_px in [blur_px / factor, blur_px, blur_px * factor] {
                     let at = (at_px + f64::from(i) * step_px, blur_px);
-                    best = best.or(self.phase_edge_at(shapes, at, 1, with));
+                    best = best.or(self.phase_edge_at(shapes, at, stride, with));
                 }
             }
             (step_px, factor) = (0.5 * step_px, factor.sqrt());

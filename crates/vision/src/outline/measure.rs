@@ -17,6 +17,25 @@ impl Outliner {
         (area.abs() / core::f64::consts::PI).sqrt().max(1.0)
     }
 
+    /// Short half axis of the ellipse with the second moments of the contour's points, px.
+    pub(super) fn short_px(&self) -> f64 {
+        let n = self.points.len().max(1) as f64;
+        let sum = self
+            .points
+            .iter()
+            .fold((0.0, 0.0), |s, p| (s.0 + p.0, s.1 + p.1));
+        let (mx, my) = (sum.0 / n, sum.1 / n);
+        let (mut xx, mut xy, mut yy) = (0.0, 0.0, 0.0);
+        for (x, y) in self.points.iter().map(|p| (p.0 - mx, p.1 - my)) {
+            xx += x * x / n;
+            xy += x * y / n;
+            yy += y * y / n;
+        }
+        // Points on a circle have half of its squared radius along each axis.
+        let (mean, half) = (0.5 * (xx + yy), 0.5 * f64::hypot(xx - yy, 2.0 * xy));
+        (2.0 * (mean - half).max(0.0)).sqrt()
+    }
+
     /// Sums over the polygon; `variance` is that of a pixel about the mean profile, grey^2.
     pub(super) fn measure(
         &mut self,

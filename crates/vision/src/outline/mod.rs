@@ -4,8 +4,7 @@
 //! inside to outside, in either direction, by dynamic programming. Then the profile along the contour's own normals is
 //! averaged: that is what rim and halo of this cell look like in this focus. Each normal's profile is fitted by it (shift,
 //! amplitude, offset), so that the outline uses the whole width of the rim, and the shift comes with its variance. The
-//! outline is where the mean profile passes half of the rim's contrast: with a halo that lies on its flank, without one it
-//! is the usual half-height. Allocates only when made.
+//! outline is the middle of the step that fits the mean profile, or where that passes half of the rim's contrast. Allocates only when made.
 
 mod contour;
 mod edge;
@@ -26,7 +25,7 @@ const OVERLAP: usize = 24;
 const FINE_PX: f64 = 0.5;
 /// Most steps along a normal, on one side.
 const MAX_FINE: usize = 16;
-/// Passes of the fit along the normals.
+/// Passes of the fit along the normals before the last one about the edge.
 const PASSES: usize = 3;
 /// Cost of a step of the contour from ray to ray, as a share of a typical edge.
 const BEND: f32 = 0.08;
@@ -34,8 +33,8 @@ const BEND: f32 = 0.08;
 const OUTSIDE: f32 = 0.12;
 /// Depth over which the rim's contrast is taken, px.
 const RIM_PX: f64 = 4.0;
-/// Distance of the edge from the contour from which on the profiles are taken again, px.
-const FAR_PX: f64 = 1.0;
+/// How far the profiles reach on either side, as a share of the contour's short half axis.
+const REACH: f64 = 0.6;
 /// Contour points that lie this near to the border are cut by it, px.
 const BORDER_PX: f64 = 1.5;
 
@@ -158,8 +157,8 @@ impl Outliner {
     /// is no closed step.
     pub fn outline(&mut self, contrast: &Contrast, start: &Start, noise: f64) -> Option<Outline> {
         let polarity = self.lay(contrast, start, noise)?;
-        let half =
-            ((0.45 * start.short_px).clamp(3.0, MAX_FINE as f64 * FINE_PX) / FINE_PX) as usize;
+        let reach_px = (REACH * self.short_px()).clamp(3.0, MAX_FINE as f64 * FINE_PX);
+        let half = (reach_px / FINE_PX).round() as usize;
         let mut profile = None;
         for _ in 0..PASSES {
             self.find_normals();
@@ -167,18 +166,15 @@ impl Outliner {
             profile = Some(self.align(half, polarity)?);
             self.shift_points();
         }
-        let mut profile = profile?;
-        let mut edge = profile.edge(self.radius_px(), &self.shapes)?;
-        if edge.at_px.abs() > FAR_PX {
-            // Laid on a lobe beside the edge: from near the edge it is seen sharper.
-            self.find_normals();
-            self.shift_outwards(edge.at_px);
-            self.find_normals();
-            self.sample(contrast, half);
-            profile = self.align(half, polarity)?;
-            self.shift_points();
-            edge = profile.edge(self.radius_px(), &self.shapes)?;
-        }
+        // The contour may lie on a lobe beside the edge: about the edge itself the profile does not depend on the start.
+        let near = profile?.edge(self.radius_px(), &self.shapes, false)?;
+        self.find_normals();
+        self.shift_outwards(near.at_px);
+        self.find_normals();
+        self.sample(contrast, half);
+        let profile = self.align(half, polarity)?;
+        self.shift_points();
+        let edge = profile.edge(self.radius_px(), &self.shapes, true)?;
         self.find_normals();
         self.shift_outwards(edge.at_px);
         let residual = self.residual(&profile).max(noise * noise);

@@ -32,6 +32,32 @@ fn moments(mask: &[u8], width: usize) -> Mask {
     }
 }
 
+/// A mask without its notches: filled to its convex hull.
+fn filled(mask: &[u8], width: usize) -> Vec<u8> {
+    let inside = |k: usize| mask[k] > 0;
+    let points: Vec<(f64, f64)> = (0..mask.len())
+        .filter(|k| inside(*k))
+        .map(|k| ((k % width) as f64, (k / width) as f64))
+        .collect();
+    // Within the hull is what no straight line separates from the mask: tried over directions of half a degree.
+    let directions: Vec<(f64, f64, f64)> = (0..720)
+        .map(|n| {
+            let (sin, cos) = (f64::from(n) * std::f64::consts::PI / 360.0).sin_cos();
+            let along = points.iter().map(|p| p.0 * cos + p.1 * sin);
+            (cos, sin, along.fold(f64::NEG_INFINITY, f64::max))
+        })
+        .collect();
+    let held = |k: usize| {
+        let (x, y) = ((k % width) as f64, (k / width) as f64);
+        directions
+            .iter()
+            .all(|(c, s, most)| x * c + y * s <= most + 1e-9)
+    };
+    (0..mask.len())
+        .map(|k| u8::from(!points.is_empty() && held(k)))
+        .collect()
+}
+
 fn median(values: &[f64]) -> f64 {
     let mut sorted = values.to_vec();
     sorted.sort_by(f64::total_cmp);
@@ -76,7 +102,12 @@ fn pairs(name: &str, least_mask_px: f64, change: Change) -> Vec<(usize, Option<C
     let mut pairs = Vec::new();
     for (n, (page, mask)) in stack.pages.iter().zip(&masks).enumerate() {
         let found = finder.find(&frame(&changed(page, false))).unwrap();
-        let mut mask = moments(mask, stack.width);
+        // The masks of this set have notches where a cell is as bright as the channel.
+        let mut mask = if name == "cells-low-contrast" {
+            moments(&filled(mask, stack.width), stack.width)
+        } else {
+            moments(mask, stack.width)
+        };
         if mask.area < least_mask_px || mask.area.is_nan() {
             continue;
         }
@@ -162,6 +193,14 @@ fn faint_cells_stay_whole_and_have_the_area_that_the_file_says() {
     for (area, file) in areas.iter().zip(file) {
         assert!((area / file - 1.0).abs() < 0.25, "{area} {file}");
     }
+    // Against masks of 17 px, each quantised and some cut at the top: they tell no better than 1 %.
+    let length =
+        |(_, c, mask): &(usize, Option<Cell>, Mask)| c.unwrap().extent_px((1.0, 0.0)) / mask.length;
+    let mut lengths: Vec<f64> = pairs.iter().map(length).collect();
+    lengths.sort_by(f64::total_cmp);
+    let (low, high) = (lengths[0], lengths[lengths.len() - 1]);
+    println!("length {low:.3} .. {high:.3} of the masks'");
+    assert!(high - low < 0.04, "{low} .. {high}");
 }
 
 #[test]
