@@ -1,4 +1,4 @@
-//! Recordings on disk as cameras: folders of PNG or TIFF pictures, TIFF stacks, Photron recordings.
+//! Recordings on disk as cameras: folders of PNG or TIFF pictures, TIFF stacks, Photron recordings, `.rtdc` files.
 //!
 //! [`open`] tells the kind by the name; [`Playback`] plays a recording at its frame rate behind the
 //! [`Camera`](cellpos_rig::Camera) trait. Not for writing.
@@ -10,6 +10,8 @@ pub mod photron;
 pub mod pictures;
 pub mod playback;
 pub mod region;
+#[cfg(feature = "hdf5")]
+pub mod rtdc;
 pub mod tiff;
 
 use cellpos_rig::source::FrameBuffer;
@@ -37,7 +39,7 @@ pub enum SourceError {
     },
     /// No known kind of recording.
     #[error(
-        "{}: not a recording: give a folder of PNG or TIFF pictures, a .tif or .tiff stack, or a Photron .cihx, .cih or .mraw file",
+        "{}: not a recording: give a folder of PNG or TIFF pictures, a .tif or .tiff stack, a Photron .cihx, .cih or .mraw file, or an .rtdc file",
         path.display()
     )]
     UnknownKind {
@@ -196,6 +198,14 @@ pub trait Recording: Send + std::fmt::Debug {
         index as u64
     }
 
+    /// The empty scene, where the recording holds it or enough frames to tell it.
+    ///
+    /// # Errors
+    /// It is there but damaged.
+    fn background(&mut self) -> Result<Option<FrameBuffer>, SourceError> {
+        Ok(None)
+    }
+
     /// Reads the frame `index` (from 0) into `buffer`.
     ///
     /// # Errors
@@ -219,6 +229,8 @@ pub fn open(path: &Path) -> Result<Box<dyn Recording>, SourceError> {
     match extension.as_str() {
         "tif" | "tiff" => Ok(Box::new(TiffStack::open(path)?)),
         "mraw" | "cih" | "cihx" => Ok(Box::new(PhotronRecording::open(path)?)),
+        #[cfg(feature = "hdf5")]
+        "rtdc" => Ok(Box::new(rtdc::RtdcRecording::open(path)?)),
         "png" => Ok(Box::new(PictureFolder::of(path, vec![path.to_path_buf()])?)),
         _ if !path.exists() => Err(SourceError::Unreadable {
             path: path.to_path_buf(),

@@ -2,6 +2,8 @@
 
 mod fake_camera;
 mod recordings;
+#[cfg(feature = "hdf5")]
+mod rtdc;
 mod vision_source;
 
 /// Counts by thread, so that tests beside each other do not disturb one another.

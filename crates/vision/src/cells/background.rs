@@ -27,6 +27,8 @@ pub(super) struct Background {
     pub mean: Vec<f32>,
     /// Sum of squared deviations from the running mean, over all pixels.
     deviations: f64,
+    /// Noise from elsewhere, grey levels; 0 without.
+    known_noise: f64,
     pub frames: u32,
     refreshed: usize,
     /// Changes of the row being refreshed.
@@ -42,6 +44,7 @@ impl Background {
             width,
             mean: vec![0.0; width * height],
             deviations: 0.0,
+            known_noise: 0.0,
             frames: 0,
             refreshed: 0,
             change: vec![0.0; width],
@@ -53,7 +56,40 @@ impl Background {
     /// Noise of a pixel, grey levels: the scatter of the background frames, at least that of rounding.
     pub fn noise_grey(&self) -> f64 {
         let degrees = f64::from(self.frames.saturating_sub(1)) * self.mean.len() as f64;
-        (self.deviations / degrees.max(1.0)).max(1.0 / 12.0).sqrt()
+        let scatter = (self.deviations / degrees.max(1.0)).max(1.0 / 12.0).sqrt();
+        scatter.max(self.known_noise)
+    }
+
+    /// Takes a picture that is a mean already for the background; its noise is that of a frame beside it.
+    pub fn be<T: Copy>(&mut self, pixels: &[T])
+    where
+        f32: From<T>,
+    {
+        (self.frames, self.deviations, self.steep_age) = (2, 0.0, 0);
+        for (mean, p) in self.mean.iter_mut().zip(pixels) {
+            *mean = f32::from(*p);
+        }
+    }
+
+    /// Takes the noise from a frame: half of the differences from the background, about their median, are within 0.67
+    /// standard deviations of it, whatever swims in it. The least of several frames counts.
+    pub fn learn_noise<T: Copy>(&mut self, pixels: &[T])
+    where
+        f32: From<T>,
+    {
+        let light = self.light_of(pixels);
+        let step = (pixels.len() / 4096).max(1) | 1;
+        let pairs = pixels.iter().zip(&self.mean).step_by(step);
+        let mut off: Vec<f32> = pairs.map(|(p, m)| f32::from(*p) - light * m).collect();
+        off.sort_unstable_by(f32::total_cmp);
+        let at = |share: f64| off.get((share * off.len() as f64) as usize);
+        if let (Some(low), Some(high)) = (at(0.25), at(0.75)) {
+            // Of whole grey levels, of which a quartile is no finer than one.
+            let noise = (0.741 * f64::from(high - low)).max(0.5);
+            if self.known_noise == 0.0 || noise < self.known_noise {
+                self.known_noise = noise;
+            }
+        }
     }
 
     /// Takes a frame into the running mean.

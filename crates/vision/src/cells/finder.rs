@@ -133,6 +133,46 @@ impl CellFinder {
         Ok(())
     }
 
+    /// Takes one picture of the empty channel that is a mean of many for the background, in place of frames of it; the noise
+    /// must be learnt from frames then.
+    ///
+    /// # Errors
+    /// A frame of another size.
+    pub fn set_background(&mut self, frame: &Frame) -> Result<(), CellError> {
+        match frame.pixels {
+            Pixels::Mono8(p) => {
+                let p = self.checked(frame, p)?;
+                self.background.be(p);
+            }
+            Pixels::Mono16(p) => {
+                let p = self.checked(frame, p)?;
+                self.background.be(p);
+            }
+        }
+        Ok(())
+    }
+
+    /// Learns the noise from a frame of which less than half shows cells; the least of several counts. Allocates.
+    ///
+    /// # Errors
+    /// A frame of another size, or no background yet.
+    pub fn learn_noise(&mut self, frame: &Frame) -> Result<(), CellError> {
+        if self.background.frames < 2 {
+            return Err(CellError::NoBackground);
+        }
+        match frame.pixels {
+            Pixels::Mono8(p) => {
+                let p = self.checked(frame, p)?;
+                self.background.learn_noise(p);
+            }
+            Pixels::Mono16(p) => {
+                let p = self.checked(frame, p)?;
+                self.background.learn_noise(p);
+            }
+        }
+        Ok(())
+    }
+
     /// Noise of a pixel, grey levels: the scatter of the background frames, at least that of rounding.
     pub fn noise_grey(&self) -> f64 {
         self.background.noise_grey()

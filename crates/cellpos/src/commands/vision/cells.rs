@@ -15,6 +15,8 @@ use std::time::Instant;
 const STAYS: (u32, f64) = (20, 0.1);
 /// Farthest that a cell goes from frame to frame, in its own lengths.
 const MOST_LENGTHS: f64 = 2.0;
+/// Frames of which the noise is learnt where the recording holds its background.
+const NOISE_FRAMES: usize = 20;
 /// Change of the area from frame to frame by which a cell is still the same.
 const MOST_CHANGE: f64 = 1.4;
 
@@ -178,6 +180,9 @@ fn finder(
         return Ok((finder, 0));
     }
     let count = args.background_frames;
+    if let Some(finder) = own_background(config, reader)? {
+        return Ok((finder, 0));
+    }
     if count < 2 || count >= reader.frames {
         return Err(Failure::bad_input(
             format!(
@@ -201,4 +206,26 @@ fn finder(
         )
     })?;
     Ok((finder, count))
+}
+
+/// A finder from the background that the recording itself holds, if it does; the noise is that of its pictures.
+fn own_background(config: CellConfig, reader: &mut Reader) -> Result<Option<CellFinder>, Failure> {
+    let Some(mut empty) = reader.recording.background().map_err(Failure::input)? else {
+        return Ok(None);
+    };
+    if let Some(region) = reader.region {
+        region.cut(&mut empty).map_err(Failure::input)?;
+    }
+    let mut finder = CellFinder::new(empty.width, empty.height, config).map_err(Failure::input)?;
+    finder
+        .set_background(&empty.frame())
+        .map_err(Failure::input)?;
+    let mut buffer = FrameBuffer::default();
+    for n in 0..reader.frames.min(NOISE_FRAMES) {
+        reader.read(n, &mut buffer)?;
+        finder
+            .learn_noise(&buffer.frame())
+            .map_err(Failure::input)?;
+    }
+    Ok(Some(finder))
 }

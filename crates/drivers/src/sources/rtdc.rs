@@ -1,0 +1,231 @@
+//! Recordings of deformability cytometers (`.rtdc`): HDF5 with one picture an event, its background, and what the instrument
+//! says of camera and pixel.
+//!
+//! Read: `events/image`, `events/image_bg`, `events/frame`, and of the root's attributes `imaging:pixel size` and
+//! `imaging:frame rate`. Masks and features of the instrument are not: vision measures by itself.
+
+use super::{Recording, RecordingInfo, SourceError, check_size};
+use cellpos_rig::source::FrameBuffer;
+use hdf5_pure::{AttrValue, Dataset, Error, File};
+use std::path::{Path, PathBuf};
+
+/// Most backgrounds that are averaged, and pictures of which a median is taken where the file holds none.
+const MOST_BACKGROUNDS: usize = 64;
+/// Filters that such files come with and that are not read here.
+const FILTERS: [(u16, &str); 4] = [
+    (307, "bzip2"),
+    (32_001, "Blosc"),
+    (32_004, "LZ4"),
+    (32_015, "Zstandard"),
+];
+
+/// An `.rtdc` file.
+#[derive(Debug)]
+pub struct RtdcRecording {
+    info: RecordingInfo,
+    pictures: Dataset,
+    backgrounds: Option<Dataset>,
+    /// Numbers of the frames, where they grow.
+    numbers: Vec<u64>,
+}
+
+impl RtdcRecording {
+    /// Opens the file and reads its first picture.
+    ///
+    /// # Errors
+    /// No HDF5, no pictures, pixels of another kind than 8 or 16 bits, a compression that is not read.
+    pub fn open(path: &Path) -> Result<Self, SourceError> {
+        std::fs::File::open(path).map_err(|cause| SourceError::Unreadable {
+            path: path.to_path_buf(),
+            cause,
+        })?;
+        let wrong = |error: Error| told(path, 0, &error);
+        let file = File::open_streaming(path).map_err(wrong)?;
+        let events = file.group("events").and_then(|events| events.datasets());
+        let held = |name: &str| {
+            events
+                .as_ref()
+                .is_ok_and(|names| names.iter().any(|n| n == name))
+        };
+        // What is there but damaged is told; what was never saved is done without.
+        let dataset = |name: &str| {
+            let path = format!("events/{name}");
+            let found = held(name).then(|| file.dataset(&path));
+            found.transpose().map_err(wrong)
+        };
+        let Some(pictures) = dataset("image")? else {
+            return Err(SourceError::Empty {
+                path: path.to_path_buf(),
+                expected: "an .rtdc file with events/image is needed, as the instrument saves it with images",
+            });
+        };
+        let shape = pictures.shape().map_err(wrong)?;
+        let [frames, height, width] = shape[..] else {
+            return Err(SourceError::PixelKind {
+                path: path.to_path_buf(),
+                frame: 0,
+                found: format!("events/image of {} dimensions", shape.len()),
+                expected: "event, row, column are needed",
+            });
+        };
+        let (width, height) = (width as usize, height as usize);
+        check_size(path, width, height)?;
+        if frames == 0 {
+            return Err(SourceError::Empty {
+                path: path.to_path_buf(),
+                expected: "events/image holds no event",
+            });
+        }
+        let attributes = file.root().attrs().unwrap_or_default();
+        let number = |key: &str| {
+            let value = attributes.get(key).and_then(number)?;
+            (value.is_finite() && value > 0.0).then_some(value)
+        };
+        let numbers = match dataset("frame")? {
+            Some(frames) => frames.read_f64().map_err(wrong)?,
+            None => Vec::new(),
+        };
+        let backgrounds = dataset("image_bg")?;
+        let alike = |other: &Dataset| other.shape().is_ok_and(|own| own == shape);
+        let mut recording = RtdcRecording {
+            info: RecordingInfo {
+                path: path.to_path_buf(),
+                kind: "deformability cytometer recording (.rtdc)",
+                width_px: width,
+                height_px: height,
+                bits: 8,
+                frames: frames as usize,
+                lost: 0,
+                rate_hz: number("imaging:frame rate"),
+                pixel_um: number("imaging:pixel size"),
+                note: None,
+            },
+            pictures,
+            backgrounds: backgrounds.filter(alike),
+            numbers: growing(&numbers, frames as usize),
+        };
+        let mut first = FrameBuffer::default();
+        recording.read(0, &mut first)?;
+        recording.info.bits = first.bits;
+        Ok(recording)
+    }
+
+    fn take(&self, from: &Dataset, index: usize, to: &mut FrameBuffer) -> Result<(), SourceError> {
+        let wrong = |error: Error| told(&self.info.path, index, &error);
+        let pixels = self.info.width_px * self.info.height_px;
+        (to.width, to.height) = (self.info.width_px, self.info.height_px);
+        let raw = from.read_raw_rows(index as u64, 1).map_err(wrong)?;
+        if raw.len() == pixels {
+            (to.bits, to.mono8) = (8, raw);
+            return Ok(());
+        }
+        if raw.len() != 2 * pixels {
+            return Err(SourceError::PixelKind {
+                path: self.info.path.clone(),
+                frame: index,
+                found: format!("{} bytes for {pixels} pixels", raw.len()),
+                expected: "pixels of 8 or 16 bits are needed",
+            });
+        }
+        to.mono16 = from.read_u16_rows(index as u64, 1).map_err(wrong)?;
+        to.bits = 16;
+        Ok(())
+    }
+}
+
+impl Recording for RtdcRecording {
+    fn info(&self) -> &RecordingInfo {
+        &self.info
+    }
+
+    fn number(&self, index: usize) -> u64 {
+        self.numbers.get(index).copied().unwrap_or(index as u64)
+    }
+
+    fn read(&mut self, index: usize, buffer: &mut FrameBuffer) -> Result<(), SourceError> {
+        if index >= self.info.frames {
+            return Err(SourceError::NoSuchFrame {
+                path: self.info.path.clone(),
+                frame: index,
+                frames: self.info.frames,
+            });
+        }
+        self.take(&self.pictures, index, buffer)
+    }
+
+    fn background(&mut self) -> Result<Option<FrameBuffer>, SourceError> {
+        let count = self.info.frames.min(MOST_BACKGROUNDS);
+        let from = self.backgrounds.as_ref().unwrap_or(&self.pictures);
+        let mut frames = vec![FrameBuffer::default(); count];
+        for (k, frame) in frames.iter_mut().enumerate() {
+            self.take(from, k * self.info.frames / count, frame)?;
+        }
+        Ok(median(&frames))
+    }
+}
+
+/// Median of each pixel: a cell in a few of the frames is not in it.
+fn median(frames: &[FrameBuffer]) -> Option<FrameBuffer> {
+    let first = frames.first()?;
+    let mut values = Vec::with_capacity(frames.len());
+    let mut middle = |k: usize| {
+        values.clear();
+        values.extend(frames.iter().filter_map(|frame| {
+            let eight = frame.mono8.get(k).map(|v| u16::from(*v));
+            eight.or_else(|| frame.mono16.get(k).copied())
+        }));
+        values.sort_unstable();
+        values.get(values.len() / 2).copied().unwrap_or(0)
+    };
+    let mut picture = FrameBuffer {
+        mono8: Vec::new(),
+        mono16: Vec::new(),
+        ..first.clone()
+    };
+    let pixels = first.width * first.height;
+    if first.bits <= 8 {
+        picture.mono8 = (0..pixels).map(|k| middle(k) as u8).collect();
+    } else {
+        picture.mono16 = (0..pixels).map(middle).collect();
+    }
+    Some(picture)
+}
+
+/// Frame numbers from the first on, where there is one for each event and they grow; else none.
+fn growing(numbers: &[f64], events: usize) -> Vec<u64> {
+    let (Some(first), true) = (numbers.first(), numbers.len() == events) else {
+        return Vec::new();
+    };
+    if numbers.windows(2).all(|pair| pair[0] < pair[1]) {
+        numbers.iter().map(|n| (n - first) as u64).collect()
+    } else {
+        Vec::new()
+    }
+}
+
+fn number(value: &AttrValue) -> Option<f64> {
+    match value {
+        AttrValue::String(text) => text.trim().parse().ok(),
+        other => other.as_f64(),
+    }
+}
+
+fn told(path: &Path, frame: usize, error: &Error) -> SourceError {
+    let (path, problem) = (PathBuf::from(path), error.to_string());
+    let named = FILTERS
+        .iter()
+        .find(|(method, _)| problem.contains(&method.to_string()) && problem.contains("filter"));
+    match named {
+        Some(&(method, name)) => SourceError::Compression {
+            path,
+            frame,
+            method,
+            name,
+        },
+        None => SourceError::Damaged {
+            path,
+            frame,
+            problem,
+        },
+    }
+}

@@ -1,0 +1,68 @@
+//! Files of deformability cytometers, written by the HDF5 library itself.
+
+use cellpos_drivers::sources::{self, SourceError};
+use cellpos_rig::FrameBuffer;
+use std::path::{Path, PathBuf};
+
+fn file(name: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR"))
+        .join("tests/data")
+        .join(name)
+}
+
+fn sum(frame: &FrameBuffer) -> u64 {
+    frame.mono8.iter().map(|v| u64::from(*v)).sum()
+}
+
+#[test]
+fn pictures_background_pixel_size_rate_and_frame_numbers_come_out_as_they_were_written() {
+    let mut recording = sources::open(&file("faint-cells.rtdc")).unwrap();
+    let info = recording.info().clone();
+    assert_eq!((info.width_px, info.height_px, info.frames), (100, 45, 3));
+    assert_eq!((info.pixel_um, info.rate_hz), (Some(0.68), Some(2000.0)));
+    assert_eq!([0, 1, 2].map(|n| recording.number(n)), [0, 3, 4]);
+    let mut frame = FrameBuffer::default();
+    for (n, expected) in [291_493, 292_892, 331_428].into_iter().enumerate() {
+        recording.read(n, &mut frame).unwrap();
+        assert_eq!((frame.bits, sum(&frame)), (8, expected), "{n}");
+    }
+    let empty = recording.background().unwrap().unwrap();
+    assert_eq!((empty.width, empty.height, sum(&empty)), (100, 45, 292_832));
+    let beyond = recording.read(3, &mut frame).unwrap_err();
+    assert!(
+        matches!(beyond, SourceError::NoSuchFrame { .. }),
+        "{beyond}"
+    );
+}
+
+#[test]
+fn a_compression_that_is_not_read_is_named_and_what_is_cut_off_or_no_hdf5_is_told() {
+    let error = sources::open(&file("zstandard.rtdc")).unwrap_err();
+    let SourceError::Compression { method, name, .. } = error else {
+        panic!("{error}");
+    };
+    assert_eq!((method, name), (32_015, "Zstandard"));
+    let folder = tempfile::tempdir().unwrap();
+    let whole = std::fs::read(file("faint-cells.rtdc")).unwrap();
+    for (name, bytes) in [
+        ("cut.rtdc", &whole[..whole.len() / 2]),
+        ("text.rtdc", b"text"),
+    ] {
+        let path = folder.path().join(name);
+        std::fs::write(&path, bytes).unwrap();
+        let error = sources::open(&path).unwrap_err();
+        assert!(error.to_string().contains(name), "{error}");
+        assert!(
+            matches!(
+                error,
+                SourceError::Damaged { .. } | SourceError::Empty { .. }
+            ),
+            "{error}"
+        );
+    }
+    let missing = sources::open(&folder.path().join("none.rtdc")).unwrap_err();
+    assert!(
+        matches!(missing, SourceError::Unreadable { .. }),
+        "{missing}"
+    );
+}
