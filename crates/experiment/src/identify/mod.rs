@@ -183,7 +183,7 @@ fn held_bead(
     })
 }
 
-/// Runs on the rig of a rig.toml until no segment is missing, at most four times: again where a bead was lost for a while,
+/// Runs on the rig of a rig.toml until no segment is missing or four runs in a row have measured none: again where a bead was lost for a while,
 /// or the machine or the line stalled; not where somebody has to do something first.
 fn on_rig(
     job: &Job,
@@ -193,10 +193,11 @@ fn on_rig(
     progress: &mut (dyn FnMut(usize) + Send),
     mut pages: Option<&mut Pages>,
 ) -> Result<Raw, Failure> {
-    const ATTEMPTS: usize = 4;
+    const IN_VAIN: usize = 4;
+    let mut in_vain = 0;
     let (mut neutral_um, mut wait_s, mut path_s) = (rig.file.first_neutral_um, 0.0, None);
     let mut fix_noise_um = None;
-    for attempt in 1..=ATTEMPTS {
+    loop {
         let missing = |index: &usize| records.iter().all(|r| r.index != *index);
         let todo: Vec<usize> = (0..plan.segments.len()).filter(missing).collect();
         if todo.is_empty() {
@@ -215,17 +216,22 @@ fn on_rig(
         };
         let acquired = rig.acquire_shown(plan, &todo, &mut listener, pages.as_deref_mut())?;
         records = joined(&records, &acquired.records);
+        in_vain = if acquired.records.is_empty() {
+            in_vain + 1
+        } else {
+            0
+        };
         (neutral_um, wait_s) = (acquired.neutral_um, acquired.wait_s);
         path_s = Some(acquired.path_s);
         fix_noise_um = acquired.fix_noise_um.or(fix_noise_um);
         match acquired.trouble {
             None => {}
-            Some(Trouble::Spoilt { .. }) if attempt < ATTEMPTS => {
+            Some(Trouble::Spoilt { .. }) if in_vain < IN_VAIN => {
                 tracing::warn!(
                     "a lost bead or a freeze spoilt segments; measuring again what is missing"
                 );
             }
-            Some(Trouble::Ended(ended)) if ended.may_pass() && attempt < ATTEMPTS => {
+            Some(Trouble::Ended(ended)) if ended.may_pass() && in_vain < IN_VAIN => {
                 tracing::warn!("{}; measuring again what is missing", ended.seen);
             }
             Some(trouble) => {
