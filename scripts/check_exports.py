@@ -17,8 +17,9 @@ import pandas as pd
 import scipy.io
 
 
-def words(codes: str) -> dict:
-    """`0 good, 1 no-signal` as {0: "good", 1: "no-signal"}."""
+def words(codes) -> dict:
+    """`0 good, 1 no-signal` as {0: "good", 1: "no-signal"}; h5py gives a text of fixed length as bytes."""
+    codes = codes.decode() if isinstance(codes, bytes) else codes
     pairs = (part.split(" ", 1) for part in codes.split(", "))
     return {int(number): word for number, word in pairs}
 

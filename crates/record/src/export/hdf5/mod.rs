@@ -18,8 +18,10 @@ use hdf5_pure::{
 };
 use std::path::Path;
 
-/// Rows of a chunk, and rows held in memory.
-const CHUNK: usize = 1 << 16;
+/// Rows of a chunk, and rows held in memory. The library encodes a chunk's rows in 1, 2, 4 or 8 bytes; HDF5 2.0 refuses a file
+/// in which they are not as few as can be, which is three from 65 536 rows on.
+const CHUNK: usize = 1 << 15;
+const _: () = assert!(CHUNK <= u16::MAX as usize);
 /// The number of a word that is none.
 const NO_WORD: u8 = 255;
 /// How hard to deflate: numbers of a measurement gain little from more.

@@ -38,11 +38,12 @@ pub fn write_rtdc(
     path: &Path,
 ) -> Result<Exported, RecordError> {
     let is_event = |row: &&Row| row.tick.area_um2.is_finite() && row.tick.length_um.is_finite();
-    let mut count = 0;
+    let mut events = Events::default();
     source.rows(selection, |rows| {
-        count += rows.iter().filter(is_event).count() as u64;
+        rows.iter().filter(is_event).for_each(|row| events.add(row));
         Ok(())
     })?;
+    let count = events.count;
     if count == 0 {
         return Err(refused(
             "no cell was measured in this run: it holds no events",
@@ -50,7 +51,7 @@ pub fn write_rtdc(
     }
     let part = part_of(path)?;
     let attempt = || {
-        empty(source, count, &part)?;
+        empty(source, &events, &part)?;
         let access = FileAccessProperties::new().with_sync_policy(SyncPolicy::OnClose);
         let file = File::open_rw_with_options(&part, access).map_err(|error| encode(&error))?;
         let mut waiting: Vec<Vec<f64>> = FEATURES.iter().map(|_| Vec::new()).collect();
@@ -78,6 +79,59 @@ pub fn write_rtdc(
     })
 }
 
+/// What has to be known of all events before the first is written.
+#[derive(Debug, Default)]
+struct Events {
+    count: u64,
+    /// Where the path so far ends: time \[s\], position \[um\].
+    last: Option<(f64, f64)>,
+    path_um: f64,
+    path_s: f64,
+}
+
+impl Events {
+    /// Points of the path are this far apart, s: noise of the position, some 20 nm, makes no more than 2 um/s.
+    const STEP_S: f64 = 0.01;
+    /// A longer pause, of a lost cell or between two sessions, is no part of the path, s.
+    const PAUSE_S: f64 = 0.1;
+
+    fn add(&mut self, row: &Row) {
+        self.count += 1;
+        let now = (
+            seconds(row.offset_ns.saturating_add(row.tick.mid_exposure_ns)),
+            row.tick.measured_um,
+        );
+        let Some((time_s, position_um)) = self.last else {
+            self.last = Some(now);
+            return;
+        };
+        let passed_s = now.0 - time_s;
+        if (Self::STEP_S..=Self::PAUSE_S).contains(&passed_s) && now.1.is_finite() {
+            self.path_um += (now.1 - position_um).abs();
+            self.path_s += passed_s;
+        }
+        if passed_s >= Self::STEP_S {
+            self.last = Some(now);
+        }
+    }
+
+    /// Mean speed of the cell, to and fro, um/s.
+    fn speed_um_per_s(&self) -> f64 {
+        if self.path_s > 0.0 {
+            self.path_um / self.path_s
+        } else {
+            0.0
+        }
+    }
+}
+
+/// Flow through a square channel at a speed, ul/s. The PZT moves the medium to and fro: this is its mean amount. The format
+/// refuses a flow of nothing, so that a cell at rest has the smallest of all.
+fn flow_ul_per_s(speed_um_per_s: f64, width_um: f64) -> f64 {
+    const UL_PER_UM3: f64 = 1e-9;
+    (speed_um_per_s * width_um * width_um * UL_PER_UM3).max(f64::MIN_POSITIVE)
+}
+
 fn refused(message: &str) -> RecordError {
     RecordError::Encode {
         what: "RT-DC",
@@ -96,12 +150,12 @@ fn append(file: &File, waiting: &mut [Vec<f64>]) -> Result<(), RecordError> {
     Ok(())
 }
 
-fn empty(source: &Source, count: u64, path: &Path) -> Result<(), RecordError> {
+fn empty(source: &Source, all: &Events, path: &Path) -> Result<(), RecordError> {
     let meta = source
         .meta()
         .ok_or_else(|| refused("run.toml cannot be read, and the format asks for what it says"))?;
     let mut builder = FileBuilder::new();
-    for (name, value) in attributes(meta, count)? {
+    for (name, value) in attributes(meta, all)? {
         builder.set_attr(name, value);
     }
     let mut events = builder.create_group("events");
@@ -134,7 +188,7 @@ fn number(table: &toml::Table, keys: &[&str]) -> Option<f64> {
 }
 
 /// What the format asks of a measurement.
-fn attributes(meta: &RunMeta, count: u64) -> Result<Vec<(&'static str, AttrValue)>, RecordError> {
+fn attributes(meta: &RunMeta, all: &Events) -> Result<Vec<(&'static str, AttrValue)>, RecordError> {
     let config = &meta.config;
     let text = |key: &str| {
         at(config, &["rig", "sample", key])
@@ -184,7 +238,7 @@ fn attributes(meta: &RunMeta, count: u64) -> Result<Vec<(&'static str, AttrValue
     Ok(vec![
         ("experiment:date", string(date)),
         ("experiment:time", string(time)),
-        ("experiment:event count", AttrValue::I64(count as i64)),
+        ("experiment:event count", AttrValue::I64(all.count as i64)),
         ("experiment:run index", AttrValue::I64(1)),
         ("experiment:sample", string(text("sample")?)),
         ("setup:channel width", AttrValue::F64(width_um)),
@@ -192,8 +246,11 @@ fn attributes(meta: &RunMeta, count: u64) -> Result<Vec<(&'static str, AttrValue
             "setup:chip region",
             string(text("region").unwrap_or("channel")),
         ),
-        // The PZT moves the medium to and fro: there is no steady flow.
-        ("setup:flow rate", AttrValue::F64(0.0)),
+        (
+            "setup:flow rate",
+            AttrValue::F64(flow_ul_per_s(all.speed_um_per_s(), width_um)),
+        ),
+        ("setup:identifier", string(&meta.name)),
         ("setup:medium", string(text("medium")?)),
         (
             "setup:software version",
@@ -217,4 +274,33 @@ fn attributes(meta: &RunMeta, count: u64) -> Result<Vec<(&'static str, AttrValue
         ("imaging:roi size x", whole(width_px.unwrap_or(0.0))),
         ("imaging:roi size y", whole(height_px.unwrap_or(0.0))),
     ])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_flow_is_the_mean_speed_of_the_cell_times_the_section_of_the_channel() {
+        let mut all = Events::default();
+        let row = |ms: u64, position_um: f64| {
+            let mut tick = cellpos_runtime::TickRecord::unknown();
+            (tick.mid_exposure_ns, tick.measured_um) = (ms * 1_000_000, position_um);
+            Row {
+                tick,
+                session: 1,
+                offset_ns: 0,
+            }
+        };
+        // To and fro at 100 um/s for two seconds, with a pause of a second between.
+        for ms in (0..1000).chain(2000..3000) {
+            let phase = (ms % 200) as f64 * 1e-3;
+            all.add(&row(ms, 100.0 * phase.min(0.2 - phase)));
+        }
+        assert_eq!(all.count, 2000);
+        let speed = all.speed_um_per_s();
+        assert!((speed / 100.0 - 1.0).abs() < 0.02, "{speed}");
+        assert!((flow_ul_per_s(speed, 20.0) / 4e-5 - 1.0).abs() < 0.02);
+        assert!(flow_ul_per_s(0.0, 20.0) > 0.0);
+    }
 }

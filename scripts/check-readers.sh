@@ -1,0 +1,13 @@
+#!/usr/bin/env bash
+# Exports read by other programs, in an environment of their own; skipped with the reason where that cannot be installed.
+# usage: scripts/check-readers.sh target/debug/cellpos
+set -euo pipefail
+program=$(realpath "$1")
+cd "$(dirname "$0")/.."
+readers=target/readers
+if ! { [ -x "$readers/bin/python" ] || python3 -m venv "$readers"; } \
+    || ! "$readers/bin/pip" install -q --disable-pip-version-check pandas pyarrow polars h5py scipy dclab; then
+    echo "check-readers: skipped: the readers (pandas, pyarrow, polars, h5py, scipy, dclab) cannot be installed here"
+    exit 0
+fi
+"$readers/bin/python" scripts/check_readers.py "$program"

@@ -1,0 +1,118 @@
+#!/usr/bin/env python3
+"""Runs, exports them, and reads them as others would: the recipes of docs/data.md, all forms compared, dclab's own check.
+
+    scripts/check_readers.py target/debug/cellpos
+
+Needs pandas, pyarrow, polars, h5py, scipy and dclab; R and Octave are used where they are installed. Exit code 1: something
+cannot be read, or is not what another form says.
+"""
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import dclab
+
+ROOT = Path(__file__).resolve().parent.parent
+SCRIPT = """name = "long"
+[[step]]
+do = "sine"
+amplitude = "1um"
+frequency = "20Hz"
+cycles = 2000
+"""
+SAMPLE = """
+[sample]
+sample = "emulated cell"
+medium = "PBS"
+channel_width = "20um"
+"""
+
+
+def newest(folder: Path, name: str) -> Path:
+    return sorted((folder / "runs").glob(f"*-{name}"))[-1]
+
+
+def two_sessions(program: str, folder: Path) -> Path:
+    """A run of 100,000 ticks that was killed on its way and gone on with."""
+    (folder / "long.toml").write_text(SCRIPT)
+    begun = subprocess.Popen(
+        [program, "run", "long.toml", "--clock", "virtual", "--frames", "off"],
+        cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+    )
+    while begun.poll() is None:
+        tables = list((folder / "runs").glob("*-long/cycles.csv"))
+        if tables and tables[0].read_bytes().count(b"\n") > 200:
+            begun.kill()
+            begun.wait()
+            break
+        time.sleep(0.005)
+    run = newest(folder, "long")
+    subprocess.run([program, "run", "--resume", run], cwd=folder, check=False, stdout=subprocess.DEVNULL)
+    return run
+
+
+def exports(program: str, folder: Path, run: Path) -> None:
+    for form in ("csv", "parquet", "h5", "mat"):
+        subprocess.run(
+            [program, "export", run, "--out", f"track.{form}"], cwd=folder, check=True, stdout=subprocess.DEVNULL
+        )
+    subprocess.run([sys.executable, ROOT / "scripts/check_exports.py", "track"], cwd=folder, check=True)
+
+
+def cell(program: str, folder: Path) -> None:
+    rig = (ROOT / "examples/cell.toml").read_text() + SAMPLE
+    (folder / "cell.toml").write_text(rig)
+    track = "track --target 0um --rig cell.toml --duration 2s --clock virtual --name cell".split()
+    subprocess.run([program, *track], cwd=folder, check=True, stdout=subprocess.DEVNULL)
+    subprocess.run(
+        [program, "export", newest(folder, "cell"), "--out", "cell.rtdc"], cwd=folder, check=True, stdout=subprocess.DEVNULL
+    )
+    violations, alerts, _ = dclab.rtdc_dataset.check_dataset(folder / "cell.rtdc")
+    assert not violations, violations
+    with dclab.new_dataset(folder / "cell.rtdc") as data:
+        assert len(data) > 1900 and 10 < data["area_um"].mean() < 200, len(data)
+    print(f"dclab-verify-dataset: no violation, {len(alerts)} alerts: {alerts}")
+
+
+def recipes(folder: Path, run: Path) -> None:
+    text = (ROOT / "docs/data.md").read_text()
+    text = re.sub(r"runs/\d{8}T\d{6}Z-track", str(run), text)
+    blocks = re.findall(r"```python\n(.*?)```", text, re.S)
+    assert len(blocks) >= 5, "are the recipes still marked with python?"
+    for block in blocks:
+        subprocess.run([sys.executable, "-c", block], cwd=folder, check=True, stdout=subprocess.DEVNULL)
+    print(f"{len(blocks)} recipes in Python run")
+    others = {"Rscript": ("r", "-e"), "octave-cli": ("matlab", "--eval"), "julia": ("julia", "-e")}
+    for program, (language, flag) in others.items():
+        blocks = re.findall(rf"```{language}\n(.*?)```", text, re.S)
+        if not blocks:
+            sys.exit(f"docs/data.md has no recipe marked {language}")
+        if not shutil.which(program):
+            print(f"skipped: {program} is not installed")
+            continue
+        # Only what the program has by itself: packages for Parquet are another matter.
+        plain = [block for block in blocks if "arrow::" not in block and "parquet" not in block.lower()]
+        for block in plain:
+            subprocess.run([program, flag, block], cwd=folder, check=True, stdout=subprocess.DEVNULL)
+        print(f"{len(plain)} recipes in {program} run")
+
+
+def main(program: str) -> None:
+    program = os.path.abspath(program)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        run = two_sessions(program, folder)
+        assert len(list((run / "sessions").iterdir())) == 1, "the run was over before it could be killed"
+        exports(program, folder, run)
+        cell(program, folder)
+        recipes(folder, run)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])
