@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # Exports read by other programs, in an environment of their own; skipped with the reason where that cannot be installed.
-# usage: scripts/check-readers.sh target/debug/cellpos
+# usage: scripts/check-readers.sh target/debug/cellpos [CYCLES]; 20000 cycles are a run of a million ticks
 set -euo pipefail
 program=$(realpath "$1")
 cd "$(dirname "$0")/.."
@@ -10,4 +10,4 @@ if ! { [ -x "$readers/bin/python" ] || python3 -m venv "$readers"; } \
     echo "check-readers: skipped: the readers (pandas, pyarrow, polars, h5py, scipy, dclab) cannot be installed here"
     exit 0
 fi
-"$readers/bin/python" scripts/check_readers.py "$program"
+"$readers/bin/python" scripts/check_readers.py "$program" "${@:2}"

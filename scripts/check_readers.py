@@ -1,9 +1,10 @@
 #!/usr/bin/env python3
 """Runs, exports them, and reads them as others would: the recipes of docs/data.md, all forms compared, dclab's own check.
 
-    scripts/check_readers.py target/debug/cellpos
+    scripts/check_readers.py target/debug/cellpos [CYCLES]
 
-Needs pandas, pyarrow, polars, h5py, scipy and dclab; R and Octave are used where they are installed. Exit code 1: something
+CYCLES of 50 ticks each, 2000 if left out; with 20000 it is a run of a million ticks. No export and no report may take more than
+300 MB, nor the report more than 10 s. Needs pandas, pyarrow, polars, h5py, scipy and dclab; R and Octave are used where they are installed. Exit code 1: something
 cannot be read, or is not what another form says.
 """
 
@@ -24,7 +25,7 @@ SCRIPT = """name = "long"
 do = "sine"
 amplitude = "1um"
 frequency = "20Hz"
-cycles = 2000
+cycles = %s
 """
 SAMPLE = """
 [sample]
@@ -38,16 +39,29 @@ def newest(folder: Path, name: str) -> Path:
     return sorted((folder / "runs").glob(f"*-{name}"))[-1]
 
 
-def two_sessions(program: str, folder: Path) -> Path:
-    """A run of 100,000 ticks that was killed on its way and gone on with."""
-    (folder / "long.toml").write_text(SCRIPT)
+def measured(program: str, folder: Path, *words) -> None:
+    """Runs a command, with its time and the most memory that it had."""
+    begun = time.monotonic()
+    child = subprocess.Popen([program, *words], cwd=folder, stdout=subprocess.DEVNULL)
+    _, status, used = os.wait4(child.pid, 0)
+    child.returncode = os.waitstatus_to_exitcode(status)
+    took_s, most_mb = time.monotonic() - begun, used.ru_maxrss / 1000
+    print(f"{words[0]} {words[-1]}: {took_s:.1f} s, {most_mb:.0f} MB")
+    assert child.returncode == 0, words
+    assert most_mb <= 300, f"{words}: {most_mb:.0f} MB"
+    assert words[0] != "report" or took_s < 10, f"report: {took_s:.1f} s"
+
+
+def two_sessions(program: str, folder: Path, cycles: int) -> Path:
+    """A run that was killed on its way and gone on with."""
+    (folder / "long.toml").write_text(SCRIPT % cycles)
     begun = subprocess.Popen(
         [program, "run", "long.toml", "--clock", "virtual", "--frames", "off"],
         cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
     )
     while begun.poll() is None:
         tables = list((folder / "runs").glob("*-long/cycles.csv"))
-        if tables and tables[0].read_bytes().count(b"\n") > 200:
+        if tables and tables[0].read_bytes().count(b"\n") > cycles // 10:
             begun.kill()
             begun.wait()
             break
@@ -59,9 +73,8 @@ def two_sessions(program: str, folder: Path) -> Path:
 
 def exports(program: str, folder: Path, run: Path) -> None:
     for form in ("csv", "parquet", "h5", "mat"):
-        subprocess.run(
-            [program, "export", run, "--out", f"track.{form}"], cwd=folder, check=True, stdout=subprocess.DEVNULL
-        )
+        measured(program, folder, "export", run, "--out", f"track.{form}")
+    measured(program, folder, "report", run, "--json")
     subprocess.run([sys.executable, ROOT / "scripts/check_exports.py", "track"], cwd=folder, check=True)
 
 
@@ -103,11 +116,11 @@ def recipes(folder: Path, run: Path) -> None:
         print(f"{len(plain)} recipes in {program} run")
 
 
-def main(program: str) -> None:
+def main(program: str, cycles: int = 2000) -> None:
     program = os.path.abspath(program)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        run = two_sessions(program, folder)
+        run = two_sessions(program, folder, cycles)
         assert len(list((run / "sessions").iterdir())) == 1, "the run was over before it could be killed"
         exports(program, folder, run)
         cell(program, folder)
@@ -115,4 +128,4 @@ def main(program: str) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1])
+    main(sys.argv[1], *map(int, sys.argv[2:3]))
