@@ -41,7 +41,8 @@ pub use report::report;
 pub use thresholds::{THRESHOLDS, Thresholds};
 pub use verdict::battery::{Hypothesis, Term};
 pub use verdict::judge::figure;
-pub use verdict::map::{BAND_EDGES_HZ, BandRatio, Cell, DiscrepancyMap, MapRow, band_labels};
+pub use verdict::map::{BAND_EDGES_HZ, Cell, DiscrepancyMap, MapRow, band_labels};
+pub use verdict::response::BandRatio;
 pub use verdict::result::{
     BandGap, Effect, Gap, GapStep, Interval, Reconciliation, RecordGap, Remainder, Trace, Traces,
     Verdict,

@@ -206,7 +206,7 @@ fn response(r: &mut Report, result: &Reconciliation) {
     r.paragraph(&format!(
         "0 dB and 0 deg mean that the model is right at that frequency. Thin: 95 % of the noise. Bands in which less than \
          {:.0} % of the motion was driven are left out ({} of {}): there the record shows noise, and in a loop the answer to it.",
-        100.0 * crate::verdict::map::BandRatio::SUPPORTED,
+        100.0 * crate::verdict::response::BandRatio::SUPPORTED,
         before.left_out,
         before.hz.len()
     ));

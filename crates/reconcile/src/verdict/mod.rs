@@ -10,6 +10,7 @@ pub(crate) mod map;
 mod names;
 mod parameters;
 mod proposal;
+pub(crate) mod response;
 pub(crate) mod result;
 mod sentences;
 mod significance;
