@@ -2,4 +2,6 @@
 
 mod between_runs;
 mod rig_keys;
+mod rig_schema;
+mod rig_walk;
 mod session;

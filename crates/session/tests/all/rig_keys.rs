@@ -3,94 +3,13 @@
 //! What the types take they say themselves: an unknown key is refused with the list of the known ones, for each table and each
 //! `kind` of one.
 
+use crate::rig_walk::all_below;
 use cellpos_session::RigFile;
 use cellpos_session::quantities::quantities;
 use std::collections::BTreeSet;
 use std::path::Path;
 
-const UNKNOWN: &str = "no_such_key";
-
-/// Keys or variants in backquotes behind the word `expected`.
-fn expected(message: &str) -> Vec<String> {
-    let list = message.split("expected").nth(1).unwrap_or("");
-    list.split('`')
-        .skip(1)
-        .step_by(2)
-        .map(ToString::to_string)
-        .collect()
-}
-
-fn refusal(text: &str) -> String {
-    match toml::from_str::<RigFile>(text) {
-        Ok(_) => String::new(),
-        Err(error) => error.message().to_string(),
-    }
-}
-
-/// What a table needs before it looks at its keys.
-fn needs(table: &str) -> &'static str {
-    match table {
-        "camera.region" => "[camera]\nkind = \"industrial\"\naddress = \"a\"\n",
-        "vision.noise" | "vision.learning" => {
-            "[vision]\nprofile = { kind = \"ring\", edge_px = 5.0 }\nwindow_px = 21\n"
-        }
-        _ => "",
-    }
-}
-
-/// Tables that look at nothing else before they know their `kind`; below them there is one table, with needs of its own.
-const OF_A_KIND: [&str; 4] = ["actuator", "camera", "vision.profile", "vision.noise"];
-
-/// The keys of a table (empty: of none) and of all its kinds; `None` where it is no table.
-fn keys_of(table: &str) -> Option<BTreeSet<String>> {
-    let below = |of: &str| (table.strip_prefix(of)).is_some_and(|rest| rest.starts_with('.'));
-    if OF_A_KIND.iter().any(|of| below(of)) && needs(table).is_empty() {
-        return None;
-    }
-    let header = |kind: &str| {
-        let kind = match kind {
-            "" => String::new(),
-            kind => format!("kind = \"{kind}\"\n"),
-        };
-        match table {
-            "" => format!("{UNKNOWN} = 1\n"),
-            table => format!("{}[{table}]\n{kind}{UNKNOWN} = 1\n", needs(table)),
-        }
-    };
-    let said = refusal(&header(""));
-    if said.contains("missing field `kind`") {
-        let kinds = expected(&refusal(&header(UNKNOWN)));
-        assert!(!kinds.is_empty(), "[{table}]: no kinds");
-        let mut keys = BTreeSet::from(["kind".to_string()]);
-        for kind in kinds {
-            let said = refusal(&header(&kind));
-            keys.extend(expected(&said));
-        }
-        return Some(keys);
-    }
-    said.contains(&format!("unknown field `{UNKNOWN}`"))
-        .then(|| expected(&said).into_iter().collect())
-}
-
-/// All keys of a table and below, with their tables.
-fn all_below(table: &str, all: &mut BTreeSet<String>) {
-    for key in keys_of(table).unwrap_or_default() {
-        let whole = match table {
-            "" => key,
-            table => format!("{table}.{key}"),
-        };
-        let is_table = keys_of(&whole).is_some();
-        if is_table {
-            all_below(&whole, all);
-        }
-        // A table as such is told where it stands for a choice; its keys say the rest.
-        if !is_table || whole.contains('.') {
-            all.insert(whole);
-        }
-    }
-}
-
-fn page() -> String {
+pub fn page() -> String {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../docs/rig.md");
     std::fs::read_to_string(path).expect("docs/rig.md")
 }
