@@ -6,8 +6,8 @@ program=$(realpath "$1")
 cd "$(dirname "$0")/.."
 readers=target/readers
 if ! { [ -x "$readers/bin/python" ] || python3 -m venv "$readers"; } \
-    || ! "$readers/bin/pip" install -q --disable-pip-version-check pandas pyarrow polars h5py scipy dclab; then
-    echo "check-readers: skipped: the readers (pandas, pyarrow, polars, h5py, scipy, dclab) cannot be installed here"
+    || ! "$readers/bin/pip" install -q --disable-pip-version-check pandas pyarrow polars h5py scipy dclab jsonschema; then
+    echo "check-readers: skipped: the readers (pandas, pyarrow, polars, h5py, scipy, dclab, jsonschema) cannot be installed here"
     exit 0
 fi
 "$readers/bin/python" scripts/check_readers.py "$program" "${@:2}"

@@ -4,10 +4,11 @@
     scripts/check_readers.py target/debug/cellpos [CYCLES]
 
 CYCLES of 50 ticks each, 2000 if left out; with 20000 it is a run of a million ticks. No export and no report may take more than
-300 MB, nor the report more than 10 s. Needs pandas, pyarrow, polars, h5py, scipy and dclab; R and Octave are used where they are installed. Exit code 1: something
+300 MB, nor the report more than 10 s. Needs pandas, pyarrow, polars, h5py, scipy, dclab and jsonschema; R and Octave are used where they are installed. Exit code 1: something
 cannot be read, or is not what another form says.
 """
 
+import json
 import os
 import re
 import shutil
@@ -15,9 +16,11 @@ import subprocess
 import sys
 import tempfile
 import time
+import tomllib
 from pathlib import Path
 
 import dclab
+import jsonschema
 
 ROOT = Path(__file__).resolve().parent.parent
 SCRIPT = """name = "long"
@@ -116,8 +119,31 @@ def recipes(folder: Path, run: Path) -> None:
         print(f"{len(plain)} recipes in {program} run")
 
 
+def schemas() -> None:
+    """The files of examples/ against docs/schemas, by somebody else's reading of JSON Schema."""
+    files = {"script": (ROOT / "examples/scripts").glob("*.toml")}
+    files["rig"] = [ROOT / "examples/rig.toml", ROOT / "examples/cell.toml"]
+    files["model"] = [ROOT / "examples/model.toml", ROOT / "examples/hidden.toml"]
+    checked = 0
+    for name, paths in files.items():
+        schema = json.loads((ROOT / f"docs/schemas/{name}.json").read_text())
+        for path in paths:
+            text = path.read_text()
+            jsonschema.validate(tomllib.loads(text), schema)
+            try:
+                jsonschema.validate(tomllib.loads("no_such_key = 1\n" + text), schema)
+            except jsonschema.ValidationError:
+                checked += 1
+            else:
+                sys.exit(f"{name}.json takes a key that {path.name} may not have")
+    for path in (ROOT / "docs/schemas").glob("*.json"):
+        jsonschema.Draft7Validator.check_schema(json.loads(path.read_text()))
+    print(f"{checked} files fit their schemas")
+
+
 def main(program: str, cycles: int = 2000) -> None:
     program = os.path.abspath(program)
+    schemas()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         run = two_sessions(program, folder, cycles)

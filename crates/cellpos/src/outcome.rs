@@ -35,6 +35,11 @@ pub fn print_json(value: &impl Serialize) -> Result<(), Failure> {
     print_object(&crate::output::settings().command, value)
 }
 
+/// Prints a value as JSON under a schema of its own: a command that has results of two kinds.
+pub fn print_json_of(schema: &str, value: &impl Serialize) -> Result<(), Failure> {
+    print_object(schema, value)
+}
+
 fn print_object(name: &str, value: &impl Serialize) -> Result<(), Failure> {
     let object = Object {
         schema: format!("cellpos.{name}"),

@@ -30,7 +30,7 @@ pub struct Args {
     #[arg(long, default_value = "eq6")]
     model: String,
     /// CSV files, run folders, or folders of both.
-    #[arg(long, required_unless_present = "collect", num_args = 1..)]
+    #[arg(long, required_unless_present = "collect", num_args = 1.., value_parser = crate::arguments::run_folder())]
     data: Vec<PathBuf>,
     /// Where the records leave it open, or there are none, run what would decide on the rig, keep its records in FOLDER
     /// and look again.

@@ -2,6 +2,7 @@
 
 pub(super) mod learning;
 mod load;
+mod queue;
 pub(super) mod resume;
 mod session_config;
 mod shown;
@@ -25,7 +26,7 @@ use cellpos_session::live_line::Typed;
 use cellpos_session::rig_file::{ActuatorConfig, CameraConfig, ClockKind, Frames, RigFile};
 use cellpos_session::setup::{Prepared, ReferenceSpec, Setup};
 use cellpos_session::view::{Page, View, Viewed};
-use cellpos_session::{Finished, Options, Rig, connect};
+use cellpos_session::{Ended, Finished, Options, Rig, connect};
 use cellpos_units::Micrometers;
 use learning::Keeper;
 use session_config::SessionConfig;
@@ -39,6 +40,7 @@ use std::sync::Arc;
   cellpos run examples/scripts/fatigue.toml --dry
   cellpos run examples/scripts/step.toml --rig rig.toml --model model.toml --controller controller.toml
   cellpos run --resume runs/20261121T190000Z-fatigue
+  cellpos run examples/scripts/fatigue.toml --rig rig.toml --cells 20 --between 30s
 
 The script is checked first, as by cellpos check with the limits of the rig. Keys, where standard input is a terminal: p
 pauses and goes on, s skips to the next step, q freezes the bead, then parks the PZT. SIGUSR1 does what p does, SIGUSR2
@@ -92,6 +94,8 @@ pub struct Args {
     #[arg(long)]
     name: Option<String>,
     #[command(flatten)]
+    queue: queue::QueueArgs,
+    #[command(flatten)]
     view: ViewArgs,
     #[command(flatten)]
     notify: NotifyArgs,
@@ -109,12 +113,28 @@ pub(super) struct Ready {
     name: String,
     session: SessionConfig,
     inputs: Vec<InputFile>,
-    /// The run's folder, and where the session's goes; None: a new run below `--runs`.
+    /// Where the folder of a new run goes.
+    runs: PathBuf,
+    /// The run's folder, and where the session's goes; None: a new run below `runs`.
     home: Option<(PathBuf, PathBuf)>,
 }
 
-/// Runs a script, or goes on with one.
+/// A run that is over.
+pub(super) struct Over {
+    outcome: &'static str,
+    ended: Ended,
+    /// The run's folder.
+    folder: PathBuf,
+    cycles: Vec<CycleRow>,
+    /// Whether the script came to its end and everything is on the disk.
+    whole: bool,
+}
+
+/// Runs a script, or goes on with one, or on one cell after another.
 pub fn run(args: Args) -> CommandResult {
+    if let Some(cells) = args.queue.cells {
+        return queue::run(&args, cells);
+    }
     let mut ready = match &args.resume {
         Some(folder) => match resume::ready(folder, args.best_effort)? {
             Some(ready) => ready,
@@ -128,7 +148,12 @@ pub fn run(args: Args) -> CommandResult {
     if let Some(near) = args.near {
         ready.file.near_um = Some(near.value());
     }
-    start(&args, ready)
+    let over = start(&args, ready, true)?;
+    Ok(if over.whole {
+        Outcome::Done
+    } else {
+        Outcome::Broken
+    })
 }
 
 /// A new run from the arguments.
@@ -177,6 +202,7 @@ fn fresh(args: &Args) -> Result<Ready, Failure> {
             after: None,
         },
         inputs,
+        runs: args.runs.clone(),
         home: None,
     })
 }
@@ -240,7 +266,8 @@ fn allowed(script: &Script, setup: &Prepared, rig: &Rig) -> Result<Check, Failur
 /// What a run takes besides its plan, at most: arming, and the way to where the plan begins, s.
 const BEFORE_S: f64 = 30.0;
 
-fn start(args: &Args, ready: Ready) -> CommandResult {
+/// Runs what is ready; `tell`: whether its end is printed.
+fn start(args: &Args, ready: Ready, tell: bool) -> Result<Over, Failure> {
     let Ready {
         file,
         mut prepared,
@@ -249,6 +276,7 @@ fn start(args: &Args, ready: Ready) -> CommandResult {
         name,
         session: config,
         inputs,
+        runs,
         home,
     } = ready;
     let (script, plan) = reference.script()?.ok_or_else(|| {
@@ -285,7 +313,7 @@ fn start(args: &Args, ready: Ready) -> CommandResult {
     let table = connect::table(&config)?;
     meta.config
         .insert("session".to_string(), toml::Value::Table(table));
-    let root = home.as_ref().map_or(args.runs.as_path(), |(_, root)| root);
+    let root = home.as_ref().map_or(runs.as_path(), |(_, root)| root);
     let ticks = (plan.longest_s() + BEFORE_S) * 1e6 / rig.file().timing.period_us;
     connect::room(root, Some(ticks as u64), &meta)?;
     let writer = RunWriter::create(root, meta).map_err(Failure::failed)?;
@@ -321,7 +349,15 @@ fn start(args: &Args, ready: Ready) -> CommandResult {
     };
     let finished = armed.start()?.wait()?;
     drop(keys);
-    conclude(args, &setup, &plan, &folder, warnings, (finished, view))
+    conclude(
+        args,
+        &setup,
+        &plan,
+        folder,
+        warnings,
+        (finished, view),
+        tell,
+    )
 }
 
 fn page(name: &str, script: &Script) -> Page {
@@ -405,10 +441,11 @@ fn conclude(
     args: &Args,
     setup: &Setup,
     plan: &Plan,
-    folder: &Path,
+    folder: PathBuf,
     mut warnings: Vec<String>,
     (finished, view): (Finished<Viewed<Clipped<ScriptSink>>>, Option<View>),
-) -> CommandResult {
+    tell: bool,
+) -> Result<Over, Failure> {
     warnings.extend(connect::warnings(&finished));
     let Finished {
         ended,
@@ -441,16 +478,16 @@ fn conclude(
     let kept = connect::finish(writer, outcome, &mut summary, &conditions, &mut warnings);
     let learned = learning::named(&setup.config.motions, &learned);
     if !learned.is_empty()
-        && let Err(error) = learning::save(folder, learned.clone())
+        && let Err(error) = learning::save(&folder, learned.clone())
     {
         warnings.push(format!("no {}: {error}", learning::LEARNED_TOML));
     }
-    let cycles = resume::cycles(folder)?;
-    if let Err(error) = resume::cycles_parquet(folder, &cycles) {
+    let cycles = resume::cycles(&folder)?;
+    if let Err(error) = resume::cycles_parquet(&folder, &cycles) {
         warnings.push(format!("no cycles.parquet: {error}"));
     }
     let said = format!("{outcome}: {}; {ended}", script.name());
-    warnings.extend(args.notify.of_a_script(outcome, &said, folder));
+    warnings.extend(args.notify.of_a_script(outcome, &said, &folder));
     let report = text::Report::new(
         text::Ending {
             outcome,
@@ -471,15 +508,17 @@ fn conclude(
         &warnings,
         &learned,
     );
-    if args.json {
-        print_json(&report)?;
-    } else {
-        print_text(&report.text())?;
+    match (tell, args.json) {
+        (false, _) => {}
+        (true, true) => print_json(&report)?,
+        (true, false) => print_text(&report.text())?,
     }
-    let whole = kept.whole && cycle_faults.rows_lost == 0;
-    Ok(if outcome == "done" && whole {
-        Outcome::Done
-    } else {
-        Outcome::Broken
+    let whole = outcome == "done" && kept.whole && cycle_faults.rows_lost == 0;
+    Ok(Over {
+        outcome,
+        cycles,
+        folder,
+        whole,
+        ended,
     })
 }

@@ -19,7 +19,7 @@ pub struct Args {
     #[arg(long)]
     model: String,
     /// A record (CSV), or a run folder.
-    #[arg(long)]
+    #[arg(long, value_parser = crate::arguments::run_folder())]
     input: PathBuf,
     /// The record to write.
     #[arg(long)]

@@ -252,6 +252,7 @@ pub fn ready(folder: &Path, best_effort: bool) -> Result<Option<Ready>, Failure>
             ..first
         },
         inputs: meta.inputs.clone(),
+        runs: PathBuf::new(),
         home: Some((folder.to_owned(), folder.join(SESSIONS))),
     }))
 }

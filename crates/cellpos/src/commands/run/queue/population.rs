@@ -1,0 +1,298 @@
+//! What the cells of a queue have in common, and how far they differ: a row a cell, a page over all.
+
+use super::Over;
+use cellpos_report::{Axis, Column, Figure, Panel, Report, Series, Status, Table};
+use cellpos_script::{ArmKind, CycleFlags, CycleRow, trend};
+use serde::Serialize;
+use std::collections::BTreeMap;
+
+/// A cell. What was not measured is None.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub(super) struct CellRow {
+    /// Its number in the queue, from 1.
+    cell: u64,
+    /// `done`, `stopped`, or how the run ended else.
+    outcome: String,
+    /// Cycles in the run's table.
+    cycles: u64,
+    /// Of these: changed by what happened in them.
+    cycles_disturbed: u64,
+    /// Length at the start of the first cycle \[um\].
+    rest_length_um: Option<f64>,
+    /// Longest over length at the start, mean of the first and of the last ten whole cycles of the cyclic arm.
+    stretch_first: Option<f64>,
+    stretch_last: Option<f64>,
+    /// Recovery time, likewise \[s\].
+    recovery_first_s: Option<f64>,
+    recovery_last_s: Option<f64>,
+    /// RMS of the tracking error over the cycles \[nm\].
+    cycle_rms_nm: Option<f64>,
+    /// The run's folder.
+    run: String,
+}
+
+/// The whole, undisturbed cycles of the cyclic arm.
+fn counted(rows: &[CycleRow]) -> impl Iterator<Item = &CycleRow> {
+    rows.iter().filter(|row| {
+        row.arm == ArmKind::Cyclic && !row.flags.is_disturbed() && !row.flags.has(CycleFlags::RAMP)
+    })
+}
+
+fn finite(value: f64) -> Option<f64> {
+    value.is_finite().then_some(value)
+}
+
+fn stretch(row: &CycleRow) -> f64 {
+    row.length_peak_um / row.length_start_um
+}
+
+impl CellRow {
+    pub(super) fn new(cell: u64, over: &Over) -> Self {
+        let rows = &over.cycles;
+        let ends = |of: fn(&CycleRow) -> f64| {
+            let trend = trend(counted(rows).map(|row| (row.cycle, of(row))));
+            (
+                trend.as_ref().map(|t| t.first.mean),
+                trend.as_ref().map(|t| t.last.mean),
+            )
+        };
+        let (stretch_first, stretch_last) = ends(stretch);
+        let (recovery_first_s, recovery_last_s) = ends(|row| row.recovery_s);
+        let squares: Vec<f64> = rows
+            .iter()
+            .map(|row| row.rms_um * row.rms_um)
+            .filter(|square| square.is_finite())
+            .collect();
+        let mean = squares.iter().sum::<f64>() / squares.len() as f64;
+        Self {
+            cell,
+            outcome: over.outcome.to_owned(),
+            cycles: rows.len() as u64,
+            cycles_disturbed: rows.iter().filter(|row| row.flags.is_disturbed()).count() as u64,
+            rest_length_um: rows.iter().find_map(|row| finite(row.length_start_um)),
+            stretch_first,
+            stretch_last,
+            recovery_first_s,
+            recovery_last_s,
+            cycle_rms_nm: finite(mean.sqrt() * 1e3),
+            run: over.folder.display().to_string(),
+        }
+    }
+
+    /// Whether the script came to its end.
+    pub(super) fn is_done(&self) -> bool {
+        self.outcome == "done"
+    }
+
+    fn numbers(&self) -> [(&'static str, Option<f64>, usize); 6] {
+        [
+            ("rest_length_um", self.rest_length_um, 3),
+            ("stretch_first", self.stretch_first, 4),
+            ("stretch_last", self.stretch_last, 4),
+            ("recovery_first_s", self.recovery_first_s, 4),
+            ("recovery_last_s", self.recovery_last_s, 4),
+            ("cycle_rms_nm", self.cycle_rms_nm, 1),
+        ]
+    }
+}
+
+/// The table as CSV; a number that does not exist is an empty field.
+pub(super) fn csv(rows: &[CellRow]) -> String {
+    let mut out = String::from(
+        "cell,outcome,cycles,cycles_disturbed,rest_length_um,stretch_first,stretch_last,recovery_first_s,recovery_last_s,\
+         cycle_rms_nm,run\n",
+    );
+    for row in rows {
+        let numbers = row
+            .numbers()
+            .map(|(_, value, _)| value.map_or(String::new(), |value| value.to_string()));
+        out.push_str(&format!(
+            "{},{},{},{},{},\"{}\"\n",
+            row.cell,
+            row.outcome,
+            row.cycles,
+            row.cycles_disturbed,
+            numbers.join(","),
+            row.run.replace('"', "\"\"")
+        ));
+    }
+    out
+}
+
+fn shown(value: Option<f64>, digits: usize) -> String {
+    value.map_or_else(|| "-".to_owned(), |value| format!("{value:.digits$}"))
+}
+
+/// A line a cell, for the terminal.
+pub(super) fn text(rows: &[CellRow]) -> String {
+    let line = |row: &CellRow| {
+        format!(
+            "cell {:<13}{}: {} cycles, stretch {} -> {}, recovery {} -> {} s, {} nm RMS\n",
+            row.cell,
+            row.outcome,
+            row.cycles,
+            shown(row.stretch_first, 3),
+            shown(row.stretch_last, 3),
+            shown(row.recovery_first_s, 3),
+            shown(row.recovery_last_s, 3),
+            shown(row.cycle_rms_nm, 1)
+        )
+    };
+    rows.iter().map(line).collect()
+}
+
+/// Half the width of the 95 % interval of a mean, by Student's t.
+fn half95(values: &[f64]) -> f64 {
+    const TABLE: [f64; 10] = [
+        12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262, 2.228,
+    ];
+    let n = values.len();
+    if n < 2 {
+        return f64::NAN;
+    }
+    let mean = values.iter().sum::<f64>() / n as f64;
+    let squares: f64 = values.iter().map(|value| (value - mean).powi(2)).sum();
+    let t = TABLE
+        .get(n - 2)
+        .copied()
+        .unwrap_or(1.96 + 2.5 / (n - 1) as f64);
+    t * (squares / (n - 1) as f64 / n as f64).sqrt()
+}
+
+/// Mean over the cells at each cycle that two cells or more have: cycle, mean, low, high.
+fn mean_course(courses: &[Vec<(f64, f64)>]) -> [Vec<f64>; 4] {
+    let mut at: BTreeMap<u64, Vec<f64>> = BTreeMap::new();
+    for (cycle, value) in courses.iter().flatten() {
+        at.entry(*cycle as u64).or_default().push(*value);
+    }
+    let mut columns: [Vec<f64>; 4] = Default::default();
+    for (cycle, values) in at.iter().filter(|(_, values)| values.len() > 1) {
+        let mean = values.iter().sum::<f64>() / values.len() as f64;
+        let half = half95(values);
+        for (column, value) in
+            columns
+                .iter_mut()
+                .zip([*cycle as f64, mean, mean - half, mean + half])
+        {
+            column.push(value);
+        }
+    }
+    columns
+}
+
+/// The page: the figure of the population, and the table.
+pub(super) fn page(name: &str, rows: &[CellRow], cycles: &[Vec<CycleRow>]) -> Report {
+    let mut page = Report::new(&format!("Cells: {name}"));
+    let done = rows.iter().filter(|row| row.is_done()).count();
+    let status = if done == rows.len() {
+        Status::Good
+    } else {
+        Status::Warning
+    };
+    page.note(
+        status,
+        &format!(
+            "{done} of {} cells went through the whole script",
+            rows.len()
+        ),
+    );
+    page.section("The population over its cycles");
+    type Value = fn(&CycleRow) -> f64;
+    let quantities: [(&str, &str, Value); 3] = [
+        ("stretch", "", stretch),
+        ("length at start", "um", |row| row.length_start_um),
+        ("recovery time", "s", |row| row.recovery_s),
+    ];
+    let mut figure = Figure::new(
+        "population",
+        "Thin: each cell. Thick: mean over the cells, with the 95 % interval of that mean as a band, at each cycle that two cells \
+         or more have. Whole, undisturbed cycles of the cyclic arm.",
+    );
+    let mut any = false;
+    for (name, unit, value) in quantities {
+        let courses: Vec<Vec<(f64, f64)>> = (cycles.iter())
+            .map(|rows| {
+                let points = counted(rows).map(|row| (row.cycle as f64 + 1.0, value(row)));
+                points.filter(|(_, value)| value.is_finite()).collect()
+            })
+            .collect();
+        if courses.iter().all(Vec::is_empty) {
+            continue;
+        }
+        any = true;
+        let mut panel =
+            Panel::new(Axis::linear("cycle", ""), Axis::linear(name, unit)).height_px(220.0);
+        for course in courses.iter().filter(|course| !course.is_empty()) {
+            let (x, y): (Vec<f64>, Vec<f64>) = course.iter().copied().unzip();
+            panel = panel.series(Series::line("", &x, &y).thin().color(1));
+        }
+        let [cycle, mean, low, high] = mean_course(&courses);
+        if !cycle.is_empty() {
+            panel = panel
+                .series(Series::band("", &cycle, &low, &high).color(0))
+                .series(Series::line("mean of the cells", &cycle, &mean).color(0));
+        }
+        figure = figure.panel(panel);
+    }
+    if any {
+        page.figure(figure.share_x());
+    } else {
+        page.paragraph(
+            "No length was measured in these runs: the table below is of the tracking alone.",
+        );
+    }
+    page.section("The cells");
+    let mut table = Table::new([
+        Column::right("cell"),
+        Column::left("outcome"),
+        Column::right("cycles"),
+        Column::right("disturbed"),
+        Column::right("length at rest [um]"),
+        Column::right("stretch, first ten"),
+        Column::right("last ten"),
+        Column::right("recovery, first ten [s]"),
+        Column::right("last ten"),
+        Column::right("error RMS [nm]"),
+    ]);
+    for row in rows {
+        let begin = [
+            row.cell.to_string(),
+            row.outcome.clone(),
+            row.cycles.to_string(),
+            row.cycles_disturbed.to_string(),
+        ];
+        let numbers = row.numbers().map(|(_, value, digits)| shown(value, digits));
+        table.row(begin.into_iter().chain(numbers));
+    }
+    page.table(table);
+    page.list(
+        &rows
+            .iter()
+            .map(|row| format!("cell {}: {}", row.cell, row.run))
+            .collect::<Vec<_>>(),
+    );
+    page
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_mean_course_is_of_the_cycles_that_two_cells_have() {
+        let courses = vec![
+            vec![(1.0, 3.0), (2.0, 2.8), (3.0, 2.6)],
+            vec![(1.0, 3.4), (2.0, 3.0)],
+            Vec::new(),
+        ];
+        let [cycle, mean, low, high] = mean_course(&courses);
+        assert_eq!(cycle, [1.0, 2.0]);
+        assert!((mean[0] - 3.2).abs() < 1e-12 && (mean[1] - 2.9).abs() < 1e-12);
+        // Two values d apart: a standard error of d / 2, times t of one degree of freedom.
+        assert!(
+            (high[0] - mean[0] - 12.706 * 0.2).abs() < 1e-9
+                && (mean[0] - low[0] - 12.706 * 0.2).abs() < 1e-9
+        );
+        assert!(half95(&[1.0]).is_nan());
+    }
+}
