@@ -16,8 +16,8 @@ fn one_cell_after_the_other_goes_through_the_script_into_one_table() {
         (Some("cellpos.cells"), 3)
     );
     let mut errors = Vec::new();
-    for (number, cell) in (1..).zip(cells) {
-        assert_eq!(cell["cell"], number);
+    for (place, cell) in (1..).zip(cells) {
+        assert_eq!(cell["cell"], place);
         assert_eq!(
             (cell["outcome"].as_str(), cell["cycles"].as_u64()),
             (Some("done"), Some(30))
