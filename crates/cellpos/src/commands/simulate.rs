@@ -1,9 +1,10 @@
 //! `cellpos simulate`: the noise-free response of a model to the commands of a record.
 
+use crate::commands::run::resume::sessions;
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
 use crate::output;
 use cellpos_plant::{Model, SimulateOptions, simulate};
-use cellpos_record::RunReader;
+use cellpos_record::{RunReader, SESSIONS};
 use cellpos_table::{Mapping, Record};
 use std::path::PathBuf;
 
@@ -37,6 +38,15 @@ pub fn run(args: Args) -> CommandResult {
     output::ready([&args.out])?;
     let model = Model::load(&args.model).map_err(Failure::input)?;
     let input = if args.input.is_dir() {
+        let sessions = sessions(&args.input).len();
+        if sessions > 1 {
+            // Each begins with a bead of its own.
+            tracing::warn!(
+                "{} has {sessions} sessions: the first is simulated; name the folder of another one, below {}",
+                args.input.display(),
+                args.input.join(SESSIONS).display()
+            );
+        }
         RunReader::open(&args.input)
             .and_then(|run| run.to_record())
             .map_err(Failure::input)?

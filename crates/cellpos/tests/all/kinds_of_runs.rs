@@ -21,7 +21,7 @@ fn made(folder: &Path, line: &str) -> PathBuf {
 }
 
 fn script(folder: &Path) {
-    let text = "name = \"quick\"\n[[step]]\ndo = \"sine\"\namplitude = \"1um\"\nfrequency = \"20Hz\"\ncycles = 40\n\
+    let text = "name = \"quick\"\n[[step]]\ndo = \"sine\"\namplitude = \"1um\"\nfrequency = \"20Hz\"\ncycles = 120\n\
                 [[step]]\ndo = \"hold\"\nduration = \"100ms\"\n";
     std::fs::write(folder.join("quick.toml"), text).unwrap();
 }
@@ -54,13 +54,52 @@ fn lines(path: &Path) -> u64 {
     std::fs::read_to_string(path).unwrap().lines().count() as u64
 }
 
+/// A run compared with a model, and a model fitted to it: a result, or a sentence that says what such a record lacks.
+fn compared(at: &Path, kind: &str, run: &Path) {
+    let path = run.display();
+    let ran = cellpos(
+        at,
+        &format!("reconcile --model eq6 --data {path} --report {path}-gap.html --json"),
+    );
+    let said = ran.json();
+    match ran.code {
+        Some(0) => {
+            let page = std::fs::read_to_string(format!("{path}-gap.html")).unwrap();
+            for session in std::fs::read_dir(run.join("sessions"))
+                .into_iter()
+                .flatten()
+            {
+                let name = session.unwrap().file_name();
+                assert!(
+                    page.contains(name.to_str().unwrap()),
+                    "{kind}: {name:?} was left out"
+                );
+            }
+        }
+        code => {
+            let message = said["error"]["message"].as_str().unwrap_or("");
+            assert!(
+                code == Some(2) && message.contains("at least 5 s"),
+                "{kind}: {said}"
+            );
+        }
+    }
+    let ran = cellpos(
+        at,
+        &format!("identify --data {path} --json --out {path}-model.toml"),
+    );
+    let said = ran.json();
+    let fits = matches!(ran.code, Some(0 | 1)) || !said["error"]["message"].is_null();
+    assert!(fits && !ran.err.contains("panicked"), "{kind}: {}", ran.err);
+}
+
 #[test]
 fn every_kind_of_run_goes_through_every_command_that_reads_one() {
     let folder = tempfile::tempdir().unwrap();
     let at = folder.path();
     script(at);
     let cell = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples/cell.toml");
-    let learn = "--sine 2um@20Hz --learn --duration 5s --name learned";
+    let learn = "--sine 2um@20Hz --learn --duration 6s --name learned";
     let cut = made(
         at,
         &format!("track --target 1um --duration 20s --name cut {FAST}"),
@@ -77,7 +116,7 @@ fn every_kind_of_run_goes_through_every_command_that_reads_one() {
     let runs = [
         (
             "track",
-            made(at, &format!("track --target 1um --duration 4s {FAST}")),
+            made(at, &format!("track --target 1um --duration 6s {FAST}")),
         ),
         (
             "learned",
@@ -135,6 +174,7 @@ fn every_kind_of_run_goes_through_every_command_that_reads_one() {
             at,
             &format!("simulate --model eq6 --input {path} --out {simulated}"),
         );
+        compared(at, kind, run);
     }
     let (_, resumed) = &runs[4];
     let of_sessions = succeed(at, &format!("export {} --force --json", resumed.display())).json();
@@ -170,7 +210,7 @@ fn a_run_whose_table_of_cycles_is_gone_goes_on_where_its_ticks_end() {
         .iter()
         .map(|line| line.split(',').next().unwrap().parse().unwrap())
         .collect();
-    assert_eq!(numbers, (0..40).collect::<Vec<usize>>());
+    assert_eq!(numbers, (0..120).collect::<Vec<usize>>());
     let first: Vec<&str> = whole.lines().take(11).collect();
     assert_eq!(
         cycles[..11],

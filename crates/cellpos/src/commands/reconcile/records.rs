@@ -1,5 +1,6 @@
 //! The records that a reconciliation reads: CSV files and run folders, and what they say about the model's working point.
 
+use crate::commands::run::resume::sessions;
 use crate::outcome::Failure;
 use cellpos_experiment::collect::refused;
 use cellpos_experiment::on_rig::is_unseen;
@@ -73,7 +74,13 @@ pub(super) fn files(data: &[PathBuf]) -> Result<Vec<PathBuf>, Failure> {
             ));
         }
     }
-    Ok(found)
+    // A run that was resumed has a record for each of its sessions.
+    Ok((found.iter())
+        .flat_map(|path| match is_run(path) {
+            true => sessions(path),
+            false => vec![path.clone()],
+        })
+        .collect())
 }
 
 pub(super) fn is_run(path: &Path) -> bool {
