@@ -20,32 +20,47 @@ pub trait RunSink: Send {
     fn tick(&mut self, record: &TickRecord);
     /// One event.
     fn event(&mut self, event: &Event);
+    /// The sink that this one hands on to, for one that stands before another: what it does not look at itself goes there.
+    fn inner(&self) -> Option<&dyn RunSink> {
+        None
+    }
+    /// The same, to be told.
+    fn inner_mut(&mut self) -> Option<&mut dyn RunSink> {
+        None
+    }
     /// Events of one kind that came too often to be told one by one: the last of them, and how many there were.
     fn repeated(&mut self, last: &Event, count: u64) {
-        let _ = count;
-        self.event(last);
+        match self.inner_mut() {
+            Some(inner) => inner.repeated(last, count),
+            None => self.event(last),
+        }
     }
     /// What the operator wrote into the run while it went on.
     fn note(&mut self, time_ns: i64, text: &str) {
-        let _ = (time_ns, text);
+        if let Some(inner) = self.inner_mut() {
+            inner.note(time_ns, text);
+        }
     }
     /// Whether it takes a record now: an emulated disk that hangs does not. Records left in the ring until it is full are
     /// lost.
     fn is_ready(&self) -> bool {
-        true
+        self.inner().is_none_or(RunSink::is_ready)
     }
     /// Whether what it was given last could not be kept: a full disk, a folder that is gone. Asked some hundred times a
     /// second.
     fn is_refused(&self) -> bool {
-        false
+        self.inner().is_some_and(RunSink::is_refused)
     }
     /// What it was given and the disk has not confirmed. Asked some hundred times a second.
     fn unconfirmed(&self) -> Unconfirmed {
-        Unconfirmed::default()
+        self.inner()
+            .map_or_else(Unconfirmed::default, RunSink::unconfirmed)
     }
     /// What is being learned over the cycles of a periodic motion, as it stands: about four times a second while learning.
     fn learned(&mut self, motion: u16, state: &LearnerState) {
-        let _ = (motion, state);
+        if let Some(inner) = self.inner_mut() {
+            inner.learned(motion, state);
+        }
     }
     /// Called about ten times a second of the run, and at its end.
     fn progress(&mut self, statistics: &Statistics);
@@ -241,4 +256,70 @@ pub struct Finished<S> {
     pub recorder: RecorderReport,
     /// What went wrong on an I/O thread, if anything did; the loop has seen it as silence and acted on it.
     pub io_error: Option<RunError>,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Counts what it is told, and takes nothing.
+    #[derive(Default)]
+    struct Told {
+        repeated: u64,
+        notes: usize,
+    }
+
+    impl RunSink for Told {
+        fn tick(&mut self, _: &TickRecord) {}
+        fn event(&mut self, _: &Event) {}
+        fn repeated(&mut self, _: &Event, count: u64) {
+            self.repeated += count;
+        }
+        fn note(&mut self, _: i64, _: &str) {
+            self.notes += 1;
+        }
+        fn is_ready(&self) -> bool {
+            false
+        }
+        fn is_refused(&self) -> bool {
+            true
+        }
+        fn unconfirmed(&self) -> Unconfirmed {
+            Unconfirmed {
+                rows: 7,
+                ..Unconfirmed::default()
+            }
+        }
+        fn progress(&mut self, _: &Statistics) {}
+    }
+
+    /// Looks at nothing.
+    struct Before(Told);
+
+    impl RunSink for Before {
+        fn inner(&self) -> Option<&dyn RunSink> {
+            Some(&self.0)
+        }
+        fn inner_mut(&mut self) -> Option<&mut dyn RunSink> {
+            Some(&mut self.0)
+        }
+        fn tick(&mut self, _: &TickRecord) {}
+        fn event(&mut self, _: &Event) {}
+        fn progress(&mut self, _: &Statistics) {}
+    }
+
+    #[test]
+    fn what_a_sink_does_not_look_at_goes_to_the_one_behind_it() {
+        let mut sink = Before(Told::default());
+        assert!(!sink.is_ready() && sink.is_refused());
+        assert_eq!(sink.unconfirmed().rows, 7);
+        sink.note(0, "a note");
+        let event = Event {
+            seq: 0,
+            time_ns: 0,
+            kind: crate::life::EventKind::Running,
+        };
+        sink.repeated(&event, 3);
+        assert_eq!((sink.0.notes, sink.0.repeated), (1, 3));
+    }
 }

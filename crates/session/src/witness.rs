@@ -3,9 +3,7 @@
 use crate::ended::Clues;
 use crate::words::is_odd;
 use crate::{say, words};
-use cellpos_control::LearnerState;
 use cellpos_runtime::life::EventKind;
-use cellpos_runtime::recorder::Unconfirmed;
 use cellpos_runtime::{Event, RunSink, Statistics, TickRecord};
 
 /// Hands everything on to a sink, and keeps what says why a run ended.
@@ -15,6 +13,14 @@ pub(crate) struct Witness<S> {
 }
 
 impl<S: RunSink> RunSink for Witness<S> {
+    fn inner(&self) -> Option<&dyn RunSink> {
+        Some(&self.sink)
+    }
+
+    fn inner_mut(&mut self) -> Option<&mut dyn RunSink> {
+        Some(&mut self.sink)
+    }
+
     fn tick(&mut self, record: &TickRecord) {
         self.sink.tick(record);
     }
@@ -36,22 +42,6 @@ impl<S: RunSink> RunSink for Witness<S> {
     fn repeated(&mut self, last: &Event, count: u64) {
         self.clues.note(last);
         self.sink.repeated(last, count);
-    }
-
-    fn is_ready(&self) -> bool {
-        self.sink.is_ready()
-    }
-
-    fn is_refused(&self) -> bool {
-        self.sink.is_refused()
-    }
-
-    fn unconfirmed(&self) -> Unconfirmed {
-        self.sink.unconfirmed()
-    }
-
-    fn learned(&mut self, motion: u16, state: &LearnerState) {
-        self.sink.learned(motion, state);
     }
 
     fn progress(&mut self, statistics: &Statistics) {

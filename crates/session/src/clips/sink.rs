@@ -3,9 +3,7 @@
 use super::Clips;
 use super::moment::Moment;
 use crate::view::{ClipLine, CycleRow, EventLine, Shown, State};
-use cellpos_control::LearnerState;
 use cellpos_runtime::life::EventKind;
-use cellpos_runtime::recorder::Unconfirmed;
 use cellpos_runtime::{Event, RunSink, Statistics, TickRecord};
 
 /// Moments of a script's plan, in their order: time in the plan, s, and name.
@@ -76,6 +74,14 @@ impl<S> Clipped<S> {
 }
 
 impl<S: RunSink> RunSink for Clipped<S> {
+    fn inner(&self) -> Option<&dyn RunSink> {
+        Some(&self.sink)
+    }
+
+    fn inner_mut(&mut self) -> Option<&mut dyn RunSink> {
+        Some(&mut self.sink)
+    }
+
     fn tick(&mut self, record: &TickRecord) {
         while let Some((at_s, name)) = self.schedule.get(self.next) {
             if (record.plan_ns as f64) < at_s * 1e9 {
@@ -91,30 +97,6 @@ impl<S: RunSink> RunSink for Clipped<S> {
     fn event(&mut self, event: &Event) {
         self.happened(event);
         self.sink.event(event);
-    }
-
-    fn repeated(&mut self, last: &Event, count: u64) {
-        self.sink.repeated(last, count);
-    }
-
-    fn note(&mut self, time_ns: i64, text: &str) {
-        self.sink.note(time_ns, text);
-    }
-
-    fn is_ready(&self) -> bool {
-        self.sink.is_ready()
-    }
-
-    fn is_refused(&self) -> bool {
-        self.sink.is_refused()
-    }
-
-    fn unconfirmed(&self) -> Unconfirmed {
-        self.sink.unconfirmed()
-    }
-
-    fn learned(&mut self, motion: u16, state: &LearnerState) {
-        self.sink.learned(motion, state);
     }
 
     fn progress(&mut self, statistics: &Statistics) {

@@ -3,7 +3,6 @@
 use super::live_view::View;
 use super::watcher::{Shown, Watcher};
 use crate::words::Level;
-use cellpos_runtime::recorder::Unconfirmed;
 use cellpos_runtime::{Event, RunSink, Statistics, Summary, TickRecord};
 use std::sync::mpsc::Receiver;
 
@@ -44,6 +43,14 @@ impl<S> Viewed<S> {
 }
 
 impl<S: RunSink + Shown> RunSink for Viewed<S> {
+    fn inner(&self) -> Option<&dyn RunSink> {
+        Some(&self.sink)
+    }
+
+    fn inner_mut(&mut self) -> Option<&mut dyn RunSink> {
+        Some(&mut self.sink)
+    }
+
     fn tick(&mut self, record: &TickRecord) {
         self.sink.tick(record);
         if let Some((watcher, _)) = &mut self.page {
@@ -68,26 +75,6 @@ impl<S: RunSink + Shown> RunSink for Viewed<S> {
             watcher.event(last, count);
         }
         self.sink.repeated(last, count);
-    }
-
-    fn note(&mut self, time_ns: i64, text: &str) {
-        self.sink.note(time_ns, text);
-    }
-
-    fn is_ready(&self) -> bool {
-        self.sink.is_ready()
-    }
-
-    fn is_refused(&self) -> bool {
-        self.sink.is_refused()
-    }
-
-    fn unconfirmed(&self) -> Unconfirmed {
-        self.sink.unconfirmed()
-    }
-
-    fn learned(&mut self, motion: u16, state: &cellpos_control::LearnerState) {
-        self.sink.learned(motion, state);
     }
 
     fn progress(&mut self, statistics: &Statistics) {
