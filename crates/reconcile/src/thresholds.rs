@@ -48,6 +48,68 @@ pub struct Thresholds {
     pub repeat_share: f64,
     /// A stated noise is believed only where the records do not fall below it by more than this part.
     pub stated_excess: f64,
+    /// Trials of the search by which a probability is multiplied: variants, starts, pixel sizes. Pinned with `addition_sd`.
+    pub trials: f64,
+    /// What the best of all pixel sizes must gain: beyond chance in some ten thousand trials of two degrees of freedom.
+    /// Pinned by `records_that_hide_nothing_get_no_name`.
+    pub pixel_gain: f64,
+    /// Least power of a line in the innovations, in units of the noise's own. Pinned by `leak_and_hum_together_are_both_named`
+    /// and, from the other side, by `records_that_hide_nothing_get_no_name`.
+    pub line_power: f64,
+    /// How far a line must stand above its neighbours, in power. Pinned with it.
+    pub line_above: f64,
+    /// Price, in twice the log-likelihood, of a main parameter outside the range that rigs show: decides ties between names.
+    pub untypical: f64,
+    /// The same, in parts of what a fit leaves over: one that is wrong elsewhere decides little by its last percent.
+    pub untypical_share: f64,
+    /// What another effect in the place of one that was taken must gain for the two to be exchanged.
+    pub swap: f64,
+    /// By so much in twice the log-likelihood the stated localisation noise may decide between rivals that the records
+    /// cannot tell apart. Pinned by `averaging_over_the_exposure_is_told_from_a_delay_by_the_noise`.
+    pub white_decides: f64,
+    /// A walk may differ from the model's by this part for the model's localisation noise to be believed of this rig: the
+    /// radius of a bead and the viscosity of a warm room make so much. Pinned with it.
+    pub walk_alike: f64,
+    /// A fit that leaves more than this per row is rough: what rivals differ by in their last percent decides nothing.
+    pub rough: f64,
+    /// Standard deviations beyond which a band, a third or a record of the discrepancy map is flagged. Records times bands and
+    /// thirds, 5 % together, would be 3.2 for 60 cells; a whole one more, because the floor's shape (a walk plus white noise)
+    /// is not that of nature to the last percent either. Pinned by `records_that_hide_nothing_get_no_name`.
+    pub flag_sd: f64,
+    /// The excess, in standard deviations of its scatter, beyond which records without an effect are not called
+    /// `nothing-missing`. Pinned with it.
+    pub null_sd: f64,
+    /// A single row is a jump beyond so many standard deviations. Pinned by `jumps_of_the_bead_are_unknown_and_it_says_where`.
+    pub jump_sd: f64,
+    /// What a term must gain in twice the log-likelihood to be taken into a formula of what is left.
+    pub term_worth: f64,
+    /// What it must gain to count as left over: some forty terms, each at chi-square with one number, are beyond chance at 25;
+    /// the rest is for a noise whose shape is not quite a walk and white noise.
+    pub term_least: f64,
+    /// And in parts of what the set gains.
+    pub term_share: f64,
+    /// With a remainder a set must close so much at least for its names to stand.
+    pub remainder_closed: f64,
+    /// And, with [`Self::split_share`], by more than so many standard deviations. Pinned with it.
+    pub split_sd: f64,
+    /// Shortest total length of records with a changing command, of a rig whose noise is a walk \[s\].
+    /// Pinned by `wrong_units_constant_inputs_short_and_foreign_records_get_a_message`, as are the next two.
+    pub needed_s: f64,
+    /// Fewest rows from which effects can be told apart.
+    pub needed_rows: usize,
+    /// Below this part of the motion a record does not go with the model in any sense.
+    pub least_alike: f64,
+    /// Fewest missing or repeated frames that are a fault of the camera: fewer are a start-up glitch. Pinned by the counts of
+    /// the labelled cases, as are the others of frames.
+    pub faults_least: usize,
+    /// Smallest rate of missing or repeated frames that is told.
+    pub faults_rate: f64,
+    /// Repeats beyond those by chance, in standard deviations of these.
+    pub repeats_sd: f64,
+    /// And in parts of them.
+    pub repeats_share: f64,
+    /// Rows that repeat more often than this are no camera's: a sensor that counts, or rows that were held.
+    pub repeats_most: f64,
 }
 
 /// The numbers in use.
@@ -69,4 +131,30 @@ pub const THRESHOLDS: Thresholds = Thresholds {
     rest_share: 1e-3,
     repeat_share: 0.14,
     stated_excess: 0.1,
+    trials: 2000.0,
+    pixel_gain: 36.0,
+    line_power: 40.0,
+    line_above: 10.0,
+    untypical: 12.0,
+    untypical_share: 0.2,
+    swap: 20.0,
+    white_decides: 16.0,
+    walk_alike: 0.3,
+    rough: 0.02,
+    flag_sd: 4.2,
+    null_sd: 4.0,
+    jump_sd: 6.0,
+    term_worth: 40.0,
+    term_least: 80.0,
+    term_share: 0.01,
+    remainder_closed: 0.9,
+    split_sd: 4.0,
+    needed_s: 5.0,
+    needed_rows: 400,
+    least_alike: 0.08,
+    faults_least: 5,
+    faults_rate: 2e-4,
+    repeats_sd: 5.0,
+    repeats_share: 0.5,
+    repeats_most: 0.25,
 };

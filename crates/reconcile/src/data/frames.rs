@@ -1,6 +1,7 @@
 //! Frames that are missing or come twice: counted, not simulated.
 
 use crate::data::record::Record;
+use crate::thresholds::THRESHOLDS;
 
 /// What was counted.
 #[derive(Debug, Clone, PartialEq)]
@@ -30,16 +31,16 @@ impl FrameCounts {
 
     /// More missing frames than a start-up glitch.
     pub fn drops_named(&self) -> bool {
-        self.missing >= 5 && self.drop_rate() > 2e-4
+        self.missing >= THRESHOLDS.faults_least && self.drop_rate() > THRESHOLDS.faults_rate
     }
 
     /// Beyond chance by five standard deviations and by a half of what chance gives.
     pub fn repeats_named(&self) -> bool {
         let excess = self.repeats as f64 - self.by_chance;
-        self.repeats >= 5
-            && excess > 5.0 * (self.by_chance + 1.0).sqrt()
-            && excess > 0.5 * self.by_chance
-            && self.repeat_rate() > 2e-4
+        self.repeats >= THRESHOLDS.faults_least
+            && excess > THRESHOLDS.repeats_sd * (self.by_chance + 1.0).sqrt()
+            && excess > THRESHOLDS.repeats_share * self.by_chance
+            && self.repeat_rate() > THRESHOLDS.faults_rate
             && self.looks_like_a_camera()
     }
 
@@ -49,7 +50,7 @@ impl FrameCounts {
         let rate = self.repeats as f64 / self.pairs.max(1) as f64;
         let expected = rate * self.repeats as f64;
         !self.quantised
-            && rate < 0.25
+            && rate < THRESHOLDS.repeats_most
             && self.in_a_row as f64 <= 2.0 * expected + 5.0 * expected.sqrt() + 3.0
     }
 }

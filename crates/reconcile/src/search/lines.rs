@@ -4,6 +4,7 @@ use crate::dot::dot;
 use crate::fit::context::{Context, Fit};
 use crate::problem::Mask;
 use crate::search::lead::line_score;
+use crate::thresholds::THRESHOLDS;
 use std::f64::consts::TAU;
 
 /// What a line leaves over.
@@ -70,7 +71,7 @@ pub(crate) fn strongest_line(ctx: &Context<'_>, fit: &Fit) -> Option<f64> {
                 c += b * e;
             }
             let p = 2.0 * (s * s + c * c) / n as f64;
-            if p > LINE_LEAST {
+            if p > THRESHOLDS.line_power {
                 found.push((hz, p));
             }
         }
@@ -88,14 +89,10 @@ pub(crate) fn strongest_line(ctx: &Context<'_>, fit: &Fit) -> Option<f64> {
         .map(|b| b.0)
 }
 
-/// Least power of a line, in units of the noise's own.
-const LINE_LEAST: f64 = 40.0;
 /// Frequencies that are looked at, strongest first.
 const MOST_TRIED: usize = 100;
 /// A response that bends answers at multiples of the command's lines: up to this one.
 const HARMONICS: u32 = 5;
-/// How far a line must stand above its neighbours, in power.
-const ABOVE_NEIGHBOURS: f64 = 10.0;
 
 /// Power at a frequency under a window that keeps strong neighbours out.
 fn power(x: &[f64], hz: f64, dt: f64) -> f64 {
@@ -126,5 +123,5 @@ fn stands_out(x: &[f64], hz: f64, dt: f64) -> bool {
     around.sort_by(f64::total_cmp);
     around
         .get(around.len() / 2)
-        .is_some_and(|median| peak > ABOVE_NEIGHBOURS * median)
+        .is_some_and(|median| peak > THRESHOLDS.line_above * median)
 }

@@ -8,6 +8,7 @@ use crate::fit::context::{Context, Fit};
 use crate::parallel;
 use crate::problem::{Mask, Prepared};
 use crate::search::lead::{Lead, pair_score};
+use crate::thresholds::THRESHOLDS;
 use realfft::RealFftPlanner;
 use std::f64::consts::TAU;
 
@@ -19,9 +20,6 @@ const WAVES: (f64, f64) = (0.66, 20.0);
 
 /// Most bins: a bead that travels further than 20 mm is not looked at.
 const MOST_BINS: usize = 1 << 21;
-
-/// What the best of all pixel sizes must gain: beyond chance in some ten thousand trials of two degrees of freedom.
-const NEEDED: f64 = 36.0;
 
 /// The best pixel size, if any stands out.
 ///
@@ -89,7 +87,7 @@ pub(crate) fn pixel_scan(
         })
         .collect();
     let (best, top, middle) = peak(&scores, from)?;
-    if top < 0.7 * NEEDED * middle {
+    if top < 0.7 * THRESHOLDS.pixel_gain * middle {
         return None;
     }
     let centre = (best + from) as f64 * step;
@@ -101,7 +99,7 @@ pub(crate) fn pixel_scan(
         pair_score(&s, &c, &e)
     });
     let (best, &score) = gains.iter().enumerate().max_by(|a, b| a.1.total_cmp(b.1))?;
-    if score < NEEDED * middle {
+    if score < THRESHOLDS.pixel_gain * middle {
         return None;
     }
     Some(Lead {

@@ -73,7 +73,7 @@ pub(crate) fn prior_penalty(part: &Part, left: f64) -> f64 {
     let v = part.variant();
     let x = part.natural()[0];
     if x < v.typical.0 || x > v.typical.1 {
-        12.0 + 0.2 * left
+        THRESHOLDS.untypical + THRESHOLDS.untypical_share * left
     } else {
         0.0
     }
@@ -306,7 +306,7 @@ fn reparametrise(ctx: &Context<'_>, mut fit: Fit, mask: &Mask, effort: Effort, r
         if let Some(best) = fits
             .into_iter()
             .min_by(|a, b| penalised_cost(ctx, a).total_cmp(&penalised_cost(ctx, b)))
-            && penalised_cost(ctx, &best) < penalised_cost(ctx, &fit) - 20.0
+            && penalised_cost(ctx, &best) < penalised_cost(ctx, &fit) - THRESHOLDS.swap
         {
             fit = best;
         }

@@ -7,6 +7,7 @@ use crate::fit::linear::Tangents;
 use crate::problem::{Mask, split_in_time};
 use crate::search::lines::{strongest_line, without_line};
 use crate::simulate::simulate;
+use crate::thresholds::THRESHOLDS;
 use nalgebra::{DMatrix, DVector};
 
 /// A formula for the unexplained part.
@@ -252,9 +253,6 @@ fn inner(a: &[Vec<f64>], b: &[Vec<f64>], mask: &Mask) -> f64 {
 /// Most terms of a formula.
 const MOST_TERMS: usize = 4;
 
-/// What a term must gain to be taken into a formula.
-const WORTH: f64 = 40.0;
-
 /// Forward selection on the first part of every record; each term must also help in the rest.
 pub(crate) fn hypothesis(ctx: &Context<'_>, fit: &Fit, library: &[Column]) -> Option<Hypothesis> {
     let (train, test) = split_in_time(&ctx.problem.records);
@@ -276,7 +274,7 @@ pub(crate) fn hypothesis(ctx: &Context<'_>, fit: &Fit, library: &[Column]) -> Op
                 (i, if cc > 0.0 { ce * ce / cc } else { 0.0 })
             })
             .max_by(|a, b| a.1.total_cmp(&b.1))?;
-        if gain < WORTH {
+        if gain < THRESHOLDS.term_worth {
             break;
         }
         let mut trial = chosen.clone();

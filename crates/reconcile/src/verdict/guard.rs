@@ -4,12 +4,7 @@ use crate::data::record::Record;
 use crate::dot::dot;
 use crate::error::ReconcileError;
 use crate::fit::context::Context;
-
-/// Shortest total length of records with a changing command, of a rig whose noise is a walk \[s\].
-const NEEDED_S: f64 = 5.0;
-
-/// Fewest rows from which effects can be told apart.
-const NEEDED_ROWS: usize = 400;
+use crate::thresholds::THRESHOLDS;
 
 /// Samples by which an output may be delayed, or seem to lead.
 const MOST_SAMPLES: usize = 20;
@@ -34,10 +29,10 @@ pub(crate) fn records(records: &[Record], bead: bool) -> Result<(), ReconcileErr
     }
     let seconds: f64 = moving.iter().map(|r| r.frames() as f64 * r.sample_s).sum();
     let rows: usize = records.iter().map(Record::frames).sum();
-    let needed = if bead && seconds < NEEDED_S {
-        format!("{NEEDED_S} s")
-    } else if rows < NEEDED_ROWS {
-        format!("{NEEDED_ROWS} rows")
+    let needed = if bead && seconds < THRESHOLDS.needed_s {
+        format!("{} s", THRESHOLDS.needed_s)
+    } else if rows < THRESHOLDS.needed_rows {
+        format!("{} rows", THRESHOLDS.needed_rows)
     } else {
         return Ok(());
     };
@@ -167,7 +162,7 @@ pub(crate) fn motion(ctx: &Context<'_>) -> Result<(), ReconcileError> {
         return Ok(());
     }
     let alike = level_likeness(problem, &sim);
-    if explained.max(alike) > LEAST_ALIKE {
+    if explained.max(alike) > THRESHOLDS.least_alike {
         return Ok(());
     }
     Err(ReconcileError::AnotherRig {
@@ -175,9 +170,6 @@ pub(crate) fn motion(ctx: &Context<'_>) -> Result<(), ReconcileError> {
         detail: String::new(),
     })
 }
-
-/// Below this part of the motion a record does not go with the model in any sense.
-const LEAST_ALIKE: f64 = 0.08;
 
 /// Part of the variance of the positions that the model's own positions explain at the best gain and delay.
 fn level_likeness(problem: &crate::problem::Problem, sim: &[Vec<f64>]) -> f64 {

@@ -63,7 +63,8 @@ pub(crate) fn judge(ctx: &Context<'_>, e: &Evidence<'_>, threads: usize) -> Judg
     let strongest = battery::strongest(&library, &ctx.tangents(e.fit, &all), e.fit, &all);
     // A term counts where it is beyond chance and beyond what equations that differ in their last digits leave.
     let gained = (e.null.chi2 - e.fit.chi2).max(0.0);
-    let term = strongest.filter(|(_, gain)| *gain > TERM_LEAST.max(TERM_SHARE * gained));
+    let term = strongest
+        .filter(|(_, gain)| *gain > THRESHOLDS.term_least.max(THRESHOLDS.term_share * gained));
     let much = left > THRESHOLDS.left_sd * scatter && closed < whole(e.fit);
     let remains = much || term.is_some();
     let mut out = Judgement {
@@ -73,7 +74,7 @@ pub(crate) fn judge(ctx: &Context<'_>, e: &Evidence<'_>, threads: usize) -> Judg
         remainder: None,
     };
     if e.fit.parts.is_empty() {
-        let beyond = excess > 4.0 * scatter || e.null_flagged || term.is_some();
+        let beyond = excess > THRESHOLDS.null_sd * scatter || e.null_flagged || term.is_some();
         if !e.floor.source.is_known() {
             out.verdict = Verdict::Unknown;
             out.reasons
@@ -96,7 +97,7 @@ pub(crate) fn judge(ctx: &Context<'_>, e: &Evidence<'_>, threads: usize) -> Judg
         describe(ctx, e.null, &battery::library(ctx, e.null), None, &mut out);
         return out;
     }
-    if remains && (e.names.ambiguous || closed < REMAINDER_CLOSED) {
+    if remains && (e.names.ambiguous || closed < THRESHOLDS.remainder_closed) {
         out.verdict = Verdict::Unknown;
         out.reasons.push(format!(
             "the best of the catalogue, {}, closes {:.1} % of it, and more than chance is left: no name",
@@ -118,16 +119,6 @@ pub(crate) fn judge(ctx: &Context<'_>, e: &Evidence<'_>, threads: usize) -> Judg
     }
     out
 }
-
-/// What a term of the library must gain in twice the log-likelihood to count as left over: some forty terms, each at chi-square
-/// with one number, are beyond chance at 25; the rest is for a noise whose shape is not quite a walk and white noise.
-const TERM_LEAST: f64 = 80.0;
-
-/// And in parts of what the set gains.
-const TERM_SHARE: f64 = 0.01;
-
-/// With a remainder a set must close so much at least for its names to stand.
-const REMAINDER_CLOSED: f64 = 0.9;
 
 /// What a set must close to count as whole. Positions are known only within the noise where a pixel's error is steep: an error
 /// periodic in position never closes altogether.
@@ -256,7 +247,7 @@ fn describe(
     let all = ctx.problem.all();
     let term = term.or_else(|| {
         battery::strongest(library, &ctx.tangents(fit, &all), fit, &all)
-            .filter(|(_, gain)| *gain > TERM_LEAST.max(0.1 * left_over(fit)))
+            .filter(|(_, gain)| *gain > THRESHOLDS.term_least.max(0.1 * left_over(fit)))
     });
     if let Some((i, gain)) = term {
         out.reasons.push(format!(

@@ -1,6 +1,7 @@
 //! WHERE the model fails: the innovations by record and band, time and excitation, and a sentence about it.
 
 use crate::fit::context::{Context, Fit};
+use crate::thresholds::THRESHOLDS;
 use crate::verdict::response::{self, BandRatio, transform};
 use realfft::RealFftPlanner;
 
@@ -75,9 +76,7 @@ pub(crate) fn map(ctx: &Context<'_>, fit: &Fit) -> DiscrepancyMap {
     let sample_s = ctx.problem.base.sample_s;
     let sigma = ctx.problem.noise.innovation_um();
     let bands = BAND_EDGES_HZ.len() - 1;
-    // Records x (bands + 1) + 3 thirds, 5 % together, would be 3.2 standard deviations for 60 cells; a whole one more,
-    // because the floor's shape (a walk plus white noise) is not that of nature to the last percent either.
-    let limit = 4.2;
+    let limit = THRESHOLDS.flag_sd;
     let mut planner = RealFftPlanner::<f64>::new();
     let mut rows = Vec::new();
     for (r, e) in ctx.problem.records.iter().zip(&fit.innovations) {

@@ -55,11 +55,11 @@ fn alternatives(
             let mut other = fit.parts.clone();
             other[index] = r.part.clone();
             let s = ctx.problem.base.sample_s;
-            w.distance(&other, s) - w.distance(&fit.parts, s) > 16.0
+            w.distance(&other, s) - w.distance(&fit.parts, s) > THRESHOLDS.white_decides
         });
         // A richer form that only holds the winner as a limit of its numbers is no rival; one as simple is, however
         // unusual its size, unless what is left over says that the last percent decides nothing.
-        let rough = over > 0.02 * fit.count as f64;
+        let rough = over > THRESHOLDS.rough * fit.count as f64;
         let price = if rough || r.part.theta.len() > part.theta.len() {
             prior_penalty(&r.part, over) - prior_penalty(part, over)
         } else {

@@ -2,6 +2,7 @@
 
 use crate::fit::context::{Context, Fit};
 use crate::problem::Prepared;
+use crate::thresholds::THRESHOLDS;
 use crate::verdict::map::{BAND_EDGES_HZ, DiscrepancyMap, MapRow};
 
 /// Sentences about where the null model fails.
@@ -139,7 +140,7 @@ fn jumps(ctx: &Context<'_>, fit: &Fit) -> Option<String> {
     let (mut jumps, mut energy, mut most) = (0usize, 0.0, (0.0f64, 0usize, 0usize));
     for (i, e) in fit.innovations.iter().enumerate() {
         for (k, e) in e.iter().enumerate() {
-            if e.abs() > 6.0 {
+            if e.abs() > THRESHOLDS.jump_sd {
                 jumps += 1;
                 energy += e * e;
                 if e.abs() > most.0 {

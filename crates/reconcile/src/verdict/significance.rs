@@ -1,9 +1,10 @@
 //! How likely a gain of that size is by chance.
 
+use crate::thresholds::THRESHOLDS;
+
 /// Upper tail of chi-square with `freedom` degrees of freedom, times the number of trials of the search, at most 1.
 pub(crate) fn p_value(gain: f64, freedom: usize) -> f64 {
-    const TRIALS: f64 = 2000.0;
-    (TRIALS * upper_tail(gain.max(0.0), freedom as f64)).clamp(1e-300, 1.0)
+    (THRESHOLDS.trials * upper_tail(gain.max(0.0), freedom as f64)).clamp(1e-300, 1.0)
 }
 
 /// `Q(k/2, x/2)`, by the finite series for whole and half degrees.

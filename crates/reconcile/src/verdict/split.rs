@@ -87,7 +87,7 @@ pub(crate) fn disagreement(
                     let size = (va[j].abs().max(vb[j].abs())).max(1e-300);
                     let share = (va[j] - vb[j]).abs() / size;
                     if a.variant().role == Role::Chain
-                        && moved > 4.0 * sd
+                        && moved > THRESHOLDS.split_sd * sd
                         && share > THRESHOLDS.split_share
                         && worst.as_ref().is_none_or(|w| share > w.0)
                     {

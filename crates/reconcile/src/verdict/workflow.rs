@@ -19,10 +19,6 @@ use crate::verdict::result::Reconciliation;
 use cellpos_plant::effects::Scope;
 use cellpos_plant::{Effect, Model};
 
-/// By how much a walk may differ from that of the model for the model's localisation noise to be believed of this rig: the
-/// radius of a bead and the viscosity of a warm room make so much.
-const WALK_ALIKE: f64 = 0.3;
-
 /// How to run.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Options {
@@ -285,7 +281,7 @@ fn evidence(
     let variance = noise.walk_um2 + 2.0 * noise.white_um2;
     // Only where the walk is that of the model: else the model's noise says nothing about this rig.
     let walk = 2.0 * model.noise.diffusion_um2_per_s * problem.base.sample_s;
-    if walk <= 0.0 || (noise.walk_um2 / walk - 1.0).abs() > WALK_ALIKE {
+    if walk <= 0.0 || (noise.walk_um2 / walk - 1.0).abs() > THRESHOLDS.walk_alike {
         return None;
     }
     Some(WhiteEvidence {
