@@ -107,6 +107,7 @@ pub const DECISION: Codes = &[
     (11, "reacquired"),
     (12, "no-frame"),
     (13, "stale"),
+    (14, "stays"),
 ];
 /// States of a run.
 pub const LIFE: Codes = &[(0, "disarmed"), (1, "armed"), (2, "running"), (3, "safe")];

@@ -2,11 +2,13 @@
 //!
 //! A cell has no template: what tells it from another is where it must be, the contrast of its body, and its size. It may
 //! stretch to several times its length, but then its surface stays (a cell flat between two walls) or its volume does (a
-//! body of revolution); one of the two must agree. Two cells that touch are one region of another size: it is not taken.
+//! body of revolution); one of the two must agree. Two cells that touch are one region of another size: it is not taken, nor is
+//! what stays where it is while cells pass.
 
 use super::config::{Commanded, Decision, TrackState, TrackStep, TrackerConfig};
 use super::motion::{Motion, Randomness};
 use super::standing::{Chosen as Sighted, Standing};
+use super::stays::Stays;
 use crate::cells::{Cell, CellError, CellFinder};
 use crate::config::ConfigError;
 use crate::fix::{Fix, Verdict};
@@ -48,6 +50,7 @@ pub struct CellTracker {
     randomness: Randomness,
     finder: CellFinder,
     standing: Standing,
+    stays: Stays,
     chosen: Option<Chosen>,
     aim: Option<(f64, f64)>,
 }
@@ -65,6 +68,7 @@ impl CellTracker {
             randomness: Randomness::of(&config),
             finder,
             standing: Standing::default(),
+            stays: Stays::default(),
             chosen: None,
             aim: None,
         })
@@ -117,6 +121,12 @@ impl CellTracker {
             (Some(_), None) => self.search(time_s),
             (Some(_), Some(chosen)) => self.follow(chosen, time_s),
         };
+        if frame.is_some() {
+            let (flow_x, flow_y) = flow_px_per_s;
+            let followed = seen.as_ref().filter(|_| decision.is_accepted());
+            let carried_px = (flow_x * dt_s, flow_y * dt_s);
+            self.stays.see(self.finder.found(), carried_px, followed);
+        }
         let sighted = |chosen: Chosen| Sighted {
             motion: chosen.motion,
             confirmed: chosen.confirmed >= self.config.confirm_frames,
@@ -140,11 +150,15 @@ impl CellTracker {
         };
         let best = cells
             .iter()
-            .filter(|c| !c.at_border)
+            .filter(|c| !c.at_border && !self.stays.holds(c))
             .min_by(|a, b| distance(a).total_cmp(&distance(b)));
         let Some(cell) = best.copied() else {
             let seen = cells.first().copied();
-            let decision = seen.map_or(Decision::NothingFound, |_| Decision::AtBorder);
+            let decision = match seen {
+                None => Decision::NothingFound,
+                Some(cell) if cell.at_border => Decision::AtBorder,
+                Some(_) => Decision::Stays,
+            };
             return (decision, seen);
         };
         self.chosen = Some(Chosen {
@@ -227,6 +241,9 @@ impl CellTracker {
     ) -> Option<Decision> {
         if cell.at_border {
             return Some(Decision::AtBorder);
+        }
+        if self.stays.holds(cell) {
+            return Some(Decision::Stays);
         }
         let (x, y) = chosen.motion.position();
         let own_px = OWN_WIDTHS * chosen.cell.axes_px().1;

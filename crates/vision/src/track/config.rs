@@ -238,6 +238,8 @@ pub enum Decision {
     NoFrame = 12,
     /// The frame came twice, out of order or with an old time stamp, and was not looked at.
     Stale = 13,
+    /// What there is stays where it is while cells pass: dirt, a wall.
+    Stays = 14,
 }
 
 impl Decision {
@@ -259,6 +261,7 @@ impl Decision {
             Reacquired,
             NoFrame,
             Stale,
+            Stays,
         ]
         .into_iter()
         .find(|decision| *decision as u8 == number)

@@ -12,6 +12,7 @@ mod identity;
 mod motion;
 mod neighbours;
 mod standing;
+mod stays;
 
 use crate::config::ConfigError;
 use crate::fix::{Fix, Verdict};

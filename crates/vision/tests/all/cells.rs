@@ -263,6 +263,55 @@ fn a_cell_that_is_gone_is_lost_and_another_kind_does_not_take_its_place() {
 }
 
 #[test]
+fn dirt_that_stays_while_the_cell_passes_does_not_take_its_place() {
+    let mut run = Run::new(7);
+    // As large and as dark as the cell: told by its staying alone.
+    let dirt = Drawn::at(190.0);
+    run.tracker.choose(Some((60.0, 31.6)));
+    for n in 0..60 {
+        // The cell goes twice its width.
+        run.see(&[Drawn::at(60.0 + f64::from(n)), dirt]);
+    }
+    assert_eq!(run.tracker.state(), TrackState::Tracking);
+    let followed = run.see(&[Drawn::at(120.0), dirt]).cell;
+    assert!((followed.unwrap().x_px - 120.0).abs() < 0.2, "{followed:?}");
+    for _ in 0..100 {
+        let step = run.see(&[dirt]);
+        assert_eq!(step.cell, None);
+    }
+    assert_eq!(run.see(&[dirt]).track.decision, Decision::Stays);
+    assert_eq!(run.tracker.state(), TrackState::Lost);
+    run.tracker.choose(None);
+    assert_eq!(run.see(&[dirt]).track.decision, Decision::Stays);
+    // Beside it a cell is not ambiguous.
+    run.see(&[Drawn::at(80.0), dirt]);
+    for _ in 0..3 {
+        run.see(&[Drawn::at(80.0), dirt]);
+    }
+    let step = run.see(&[Drawn::at(80.0), dirt]);
+    assert!((step.cell.unwrap().x_px - 80.0).abs() < 0.2);
+}
+
+#[test]
+fn a_cell_that_the_loop_holds_still_is_never_taken_for_dirt() {
+    let mut run = Run::new(8);
+    let cell = Drawn::at(100.0);
+    for n in 0..200 {
+        let pixels = picture(&[cell], 1.5, &mut run.random);
+        // The flow that is commanded holds it against another one: carried away it would be by 200 px.
+        let step = run
+            .tracker
+            .step(Some(&frame(&pixels)), f64::from(n) * 1e-3, (1000.0, 0.0));
+        let step = step.unwrap();
+        assert!(
+            n < 3 || step.cell.is_some(),
+            "{n}: {:?}",
+            step.track.decision
+        );
+    }
+}
+
+#[test]
 fn of_two_cells_alike_a_lost_one_is_not_guessed() {
     let mut run = Run::new(6);
     for _ in 0..10 {
