@@ -1,16 +1,156 @@
-//! A detector for the beads that a localiser fits.
+//! Finds every bead of a frame by threshold above the background about it: seeds for [`crate::Localiser::locate`].
 
+use crate::blobs::{Blob, Blobs};
+use crate::frame::{Frame, Pixels};
+use crate::level::Level;
 use crate::localiser::Localiser;
-use crate::seed::Detector;
+use crate::seed::{LEAST_NOISE, background};
+
+/// Share of the strongest contrast in the frame that a bead must reach to be seen beside it, in one look.
+const WEAKEST_SHARE: f32 = 0.3;
+/// Most looks at a frame, each at so much of the one before, for beads beside something much stronger.
+const MOST_LOOKS: usize = 4;
+/// Share of a bead's disc that must stand out.
+const LEAST_AREA_SHARE: f64 = 0.15;
+/// What a weaker look finds within so many radii of what a stronger one found is its ring.
+const OWN_RADII: f64 = 1.5;
+/// Threshold for means of 3 x 3 pixels, as a share of that for one, and the least radius of a bead that leaves them be, px.
+const SMOOTHED: f32 = 0.4;
+const SMOOTH_RADIUS_PX: f64 = 3.0;
+/// Most beads that a detector is made for.
+const MOST_BEADS: usize = 20_000;
+
+/// Finds beads. Allocates only when made.
+#[derive(Debug, Clone)]
+pub struct Detector {
+    blobs: Blobs,
+    level: Level,
+    found: Vec<Blob>,
+    sign: f64,
+    radius_px: f64,
+    min_snr: f64,
+    looks: usize,
+    left_out: u64,
+}
 
 impl Detector {
-    /// A detector for beads like the localiser's, with room for `max_beads` of them in a frame.
+    /// A detector for beads like the localiser's, with room for `max_beads` of them in a frame. One look at a frame: what is
+    /// much weaker than the strongest is not seen.
     pub fn new(localiser: &Localiser, max_beads: usize) -> Self {
-        Self::of(
-            localiser.sign(),
-            localiser.template().radius_px(),
-            localiser.config().min_snr,
-            max_beads,
-        )
+        let max_beads = max_beads.clamp(1, MOST_BEADS);
+        // A region shaped like a comb takes a label for each tooth.
+        let room = (16 * max_beads).min(16_000).max(4 * max_beads);
+        Detector {
+            blobs: Blobs::new(room, room),
+            level: Level::new(),
+            found: Vec::with_capacity(room),
+            sign: localiser.sign(),
+            radius_px: localiser.template().radius_px(),
+            min_snr: localiser.config().min_snr,
+            looks: 1,
+            left_out: 0,
+        }
+    }
+
+    /// The same for recordings: looks again for weaker beads.
+    pub fn thorough(localiser: &Localiser, max_beads: usize) -> Self {
+        Detector {
+            looks: MOST_LOOKS,
+            ..Detector::new(localiser, max_beads)
+        }
+    }
+
+    /// What the last call of [`Detector::detect`] found.
+    pub fn found(&self) -> &[Blob] {
+        &self.found
+    }
+
+    /// Runs of pixels that the last frame held beyond the room made: when not zero, there may be more beads.
+    pub fn left_out(&self) -> u64 {
+        self.left_out
+    }
+
+    /// Bead-like regions of the frame, the largest contrast first. Empty when nothing stands out of the noise.
+    pub fn detect(&mut self, frame: &Frame) -> &[Blob] {
+        self.found.clear();
+        self.left_out = 0;
+        let pixels = frame.width.checked_mul(frame.height).unwrap_or(usize::MAX);
+        match frame.pixels {
+            Pixels::Mono8(p) if p.len() >= pixels => self.detect_in(p, frame),
+            Pixels::Mono16(p) if p.len() >= pixels => self.detect_in(p, frame),
+            _ => {}
+        }
+        &self.found
+    }
+
+    fn detect_in<T: Copy>(&mut self, pixels: &[T], frame: &Frame)
+    where
+        f32: From<T>,
+    {
+        let (width, height) = (frame.width, frame.height);
+        let (mean, noise) = background(pixels);
+        let sign = self.sign as f32;
+        self.level
+            .take(pixels, (width, height), self.radius_px, mean as f32);
+        let step = if self.radius_px >= 3.0 { 2 } else { 1 };
+        let strongest = self.level.strongest(pixels, (width, height), sign, step);
+        let least = (self.min_snr.max(4.0) * noise.max(LEAST_NOISE)) as f32;
+        let smooth = self.looks > 1 && self.radius_px >= SMOOTH_RADIUS_PX;
+        if strongest <= if smooth { SMOOTHED * least } else { least } {
+            return;
+        }
+        let min_area_px =
+            LEAST_AREA_SHARE * core::f64::consts::PI * self.radius_px * self.radius_px;
+        let mut share = WEAKEST_SHARE;
+        for _ in 0..self.looks {
+            let threshold = least.max(share * strongest);
+            let level = &mut self.level;
+            self.blobs
+                .label((width, height), threshold, min_area_px, |x, y| {
+                    let value = pixels.get(y * width + x).map_or(0.0, |v| f32::from(*v));
+                    sign * (value - level.at(x, y))
+                });
+            self.keep_new();
+            if threshold <= least {
+                break;
+            }
+            share *= WEAKEST_SHARE;
+        }
+        if smooth {
+            // Beads as weak as the noise of a pixel: means of 3 x 3 pixels have a third of it.
+            let level = &mut self.level;
+            let inside = (width.saturating_sub(2), height.saturating_sub(2));
+            let threshold = SMOOTHED * least;
+            self.blobs.label(inside, threshold, min_area_px, |x, y| {
+                let row = |j: usize| {
+                    let from = (y + j) * width + x;
+                    let three = pixels.get(from..from + 3).unwrap_or(&[]);
+                    three.iter().map(|v| f32::from(*v)).sum::<f32>()
+                };
+                sign * ((row(0) + row(1) + row(2)) / 9.0 - level.at(x + 1, y + 1))
+            });
+            self.keep_new();
+        }
+        self.found
+            .sort_unstable_by(|a, b| b.contrast_sum.total_cmp(&a.contrast_sum));
+    }
+
+    /// Keeps of the last look what no stronger one has shown.
+    fn keep_new(&mut self) {
+        self.left_out += self.blobs.dropped_runs();
+        let own_px = OWN_RADII * self.radius_px;
+        let known = self.found.len();
+        for blob in self.blobs.found() {
+            let [left, top, right, bottom] = blob.bounds.map(f64::from);
+            // Of a stronger one this look shows more, or the ring about it.
+            let holds = |b: &Blob| {
+                let inside = (left..=right).contains(&b.x_px) && (top..=bottom).contains(&b.y_px);
+                inside || f64::hypot(b.x_px - blob.x_px, b.y_px - blob.y_px) < own_px
+            };
+            let seen = self.found.iter().take(known).any(holds);
+            if !seen && self.found.len() < self.found.capacity() {
+                self.found.push(*blob);
+            }
+        }
     }
 }

@@ -13,6 +13,7 @@ mod fit;
 mod fix;
 mod frame;
 mod learn;
+mod level;
 mod localiser;
 pub mod many;
 mod outline;
@@ -26,6 +27,7 @@ pub mod track;
 pub use blobs::{Blob, Blobs};
 pub use cells::{Cell, CellConfig, CellError, CellFinder};
 pub use config::{ConfigError, Learning, LocaliserConfig, Noise, Polarity};
+pub use detector::Detector;
 pub use fix::{Fix, Verdict};
 pub use frame::{Frame, Pixels};
 pub use learn::LearningReport;
@@ -34,7 +36,6 @@ pub use many::{LinkConfig, ManyTracker, Sight};
 pub use profile::{
     GaussianProfile, PixelResponse, ProfileSpec, RadialProfile, RingProfile, TABLE_KNOTS, Template,
 };
-pub use seed::Detector;
 pub use suggest::{NothingToSuggest, Refused, Suggestion};
 pub use symmetry::RadialSymmetry;
 pub use track::{

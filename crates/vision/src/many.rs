@@ -4,10 +4,10 @@
 //! first. A bead that was not seen for a while and comes back gets a new number: a number never changes its bead
 //! knowingly.
 
+use crate::detector::Detector;
 use crate::fix::{Fix, Verdict};
 use crate::frame::Frame;
 use crate::localiser::Localiser;
-use crate::seed::Detector;
 
 /// How beads are linked from frame to frame.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -53,7 +53,7 @@ pub struct ManyTracker {
 impl ManyTracker {
     /// A tracker without beads.
     pub fn new(localiser: Localiser, config: LinkConfig) -> Self {
-        let detector = Detector::new(&localiser, config.max_beads);
+        let detector = Detector::thorough(&localiser, config.max_beads);
         ManyTracker {
             config,
             localiser,
@@ -78,6 +78,11 @@ impl ManyTracker {
     /// What stood out in the last frame and got no number: fits that are not good, and of no bead known.
     pub fn refused(&self) -> &[Fix] {
         &self.refused
+    }
+
+    /// Whether the last frame held more than there was room for: then beads may have been left out.
+    pub fn is_crowded(&self) -> bool {
+        self.detector.left_out() > 0
     }
 
     /// Beads of the frame, by number.

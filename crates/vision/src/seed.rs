@@ -1,14 +1,13 @@
 //! A first position in a whole frame, by threshold.
 
-use crate::blobs::{Blob, Blobs};
 use crate::frame::{Frame, Pixels};
 
 /// At most this many pixels serve for the statistics of the background.
 const STATISTICS_PIXELS: usize = 1024;
 /// The least noise a pixel can have, grey levels: that of rounding to whole levels.
-const LEAST_NOISE: f64 = 0.29;
+pub(crate) const LEAST_NOISE: f64 = 0.29;
 /// Side of the square whose sum is compared, px: one hot pixel is not a bead.
-const PATCH: usize = 3;
+pub(crate) const PATCH: usize = 3;
 
 /// Centroid of the strongest bead of the frame; `sign` is -1 for dark cores. `None` when nothing stands out of the
 /// background by `min_snr` times its noise.
@@ -129,77 +128,6 @@ where
         }
     }
     Some((best, at))
-}
-
-/// Finds every bead of a frame by threshold: seeds for [`crate::Localiser::locate`]. Allocates only when made.
-#[derive(Debug, Clone)]
-pub struct Detector {
-    blobs: Blobs,
-    sign: f64,
-    radius_px: f64,
-    min_snr: f64,
-}
-
-/// Share of the strongest contrast in the frame that a bead must reach to be seen beside it.
-const WEAKEST_SHARE: f32 = 0.3;
-/// Share of a bead's disc that must stand out.
-const LEAST_AREA_SHARE: f64 = 0.15;
-
-impl Detector {
-    /// A detector for beads of a sign of contrast, a radius and a signal to noise ratio, with room for `max_beads` of them.
-    pub(crate) fn of(sign: f64, radius_px: f64, min_snr: f64, max_beads: usize) -> Self {
-        let room = 16 * max_beads.clamp(1, 1000);
-        Detector {
-            blobs: Blobs::new(room, room),
-            sign,
-            radius_px,
-            min_snr,
-        }
-    }
-
-    /// What the last call of [`Detector::detect`] found.
-    pub fn found(&self) -> &[Blob] {
-        self.blobs.found()
-    }
-
-    /// Bead-like regions of the frame, the largest contrast first. Empty when nothing stands out of the noise.
-    pub fn detect(&mut self, frame: &Frame) -> &[Blob] {
-        match frame.pixels {
-            Pixels::Mono8(p) => self.detect_in(p, frame),
-            Pixels::Mono16(p) => self.detect_in(p, frame),
-        }
-    }
-
-    fn detect_in<T: Copy>(&mut self, pixels: &[T], frame: &Frame) -> &[Blob]
-    where
-        f32: From<T>,
-    {
-        let (mut width, mut height) = (frame.width, frame.height);
-        if width.checked_mul(height).is_none_or(|n| n > pixels.len()) {
-            (width, height) = (0, 0);
-        }
-        let (mean, noise) = background(pixels);
-        let (sign, mean) = (self.sign as f32, mean as f32);
-        let step = if self.radius_px >= 3.0 { 2 } else { 1 };
-        let best = brightest_patch(pixels, width, height, sign, step).map_or(0.0, |(sum, _)| sum);
-        let contrast = best / (PATCH * PATCH) as f32 - sign * mean;
-        let least = (self.min_snr.max(4.0) * noise.max(LEAST_NOISE)) as f32;
-        if contrast <= least {
-            (width, height) = (0, 0);
-        }
-        let min_area_px =
-            LEAST_AREA_SHARE * core::f64::consts::PI * self.radius_px * self.radius_px;
-        self.blobs.label(
-            (width, height),
-            least.max(WEAKEST_SHARE * contrast),
-            min_area_px,
-            |x, y| {
-                pixels
-                    .get(y * width + x)
-                    .map_or(0.0, |v| sign * (f32::from(*v) - mean))
-            },
-        )
-    }
 }
 
 /// Centroid of what exceeds the threshold within a bead's diameter of `at`, the window moved once onto the result.

@@ -147,7 +147,7 @@ pub fn suggest(frames: &[Frame]) -> Result<Suggestion, NothingToSuggest> {
 /// As [`suggest`].
 pub fn refine(frames: &[Frame], rough: &Localiser) -> Result<Suggestion, NothingToSuggest> {
     let flats: Vec<Flat> = frames.iter().map(Flat::new).collect();
-    let mut detector = crate::Detector::new(rough, 1000);
+    let mut detector = crate::Detector::thorough(rough, 1000);
     let radius_px = 1.85 * rough.template().radius_px();
     let mut objects = Vec::new();
     for (n, frame) in frames.iter().enumerate() {

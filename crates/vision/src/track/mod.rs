@@ -15,10 +15,10 @@ mod standing;
 mod stays;
 
 use crate::config::ConfigError;
+use crate::detector::Detector;
 use crate::fix::{Fix, Verdict};
 use crate::frame::Frame;
 use crate::localiser::Localiser;
-use crate::seed::Detector;
 pub use cell::{CellStep, CellTracker};
 pub use config::{Commanded, Decision, TrackState, TrackStep, TrackerConfig};
 use identity::Identity;

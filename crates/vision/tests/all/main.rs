@@ -3,6 +3,7 @@
 mod bound;
 mod cells;
 mod common;
+mod detector;
 mod measured_beads;
 mod no_allocation;
 mod real_cells;

@@ -11,8 +11,8 @@ use cellpos_vision::{LinkConfig, Localiser, ManyTracker, Verdict};
 use std::fmt::Write as _;
 use std::time::Instant;
 
-/// Most beads in a frame.
-const MOST_BEADS: usize = 1000;
+/// Most beads in a frame; a frame with more is counted as `crowded`.
+const MOST_BEADS: usize = 20_000;
 
 /// Follows all beads; gives the table of their positions.
 pub(super) fn find(
@@ -68,6 +68,9 @@ pub(super) fn find(
         }
         for fix in tracker.refused() {
             tally.refuse(verdict_name(fix.verdict));
+        }
+        if tracker.is_crowded() {
+            tally.refuse("crowded");
         }
         let good = sights.iter().filter(|s| s.fix.verdict == Verdict::Good);
         tally.frame(good.count());
