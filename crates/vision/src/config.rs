@@ -1,6 +1,6 @@
 //! Settings of the localiser: made once, checked once, never changed while frames run.
 
-use crate::profile::{PixelResponse, ProfileSpec, Template};
+use crate::template::{PixelResponse, ProfileSpec, Template};
 use serde::{Deserialize, Serialize};
 
 /// Largest side of the fitted window, px. The buffers are of fixed size.

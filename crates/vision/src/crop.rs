@@ -2,8 +2,8 @@
 
 use crate::config::MAX_WINDOW_PX;
 use crate::frame::{Frame, Pixels};
-use crate::profile::Template;
 use crate::streak::Comb;
+use crate::template::Template;
 
 /// Pixels that are computed on together.
 pub(crate) const LANES: usize = 4;

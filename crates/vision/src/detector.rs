@@ -74,7 +74,7 @@ impl Detector {
     pub fn detect(&mut self, frame: &Frame) -> &[Blob] {
         self.found.clear();
         self.left_out = 0;
-        let pixels = frame.width.checked_mul(frame.height).unwrap_or(usize::MAX);
+        let pixels = frame.width.saturating_mul(frame.height);
         match frame.pixels {
             Pixels::Mono8(p) if p.len() >= pixels => self.detect_in(p, frame),
             Pixels::Mono16(p) if p.len() >= pixels => self.detect_in(p, frame),

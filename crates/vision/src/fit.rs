@@ -6,8 +6,8 @@
 //! parameters for normal noise, and its inverse their Cramer-Rao bound.
 
 use crate::crop::{Crop, LANES, Row, STRIDE};
-use crate::profile::Template;
 use crate::streak::Comb;
+use crate::template::Template;
 use nalgebra::{Matrix2, Matrix3, Matrix4, Vector2, Vector3, Vector4};
 use wide::f32x4;
 

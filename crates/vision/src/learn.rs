@@ -2,7 +2,8 @@
 
 use crate::config::Learning;
 use crate::crop::Crop;
-use crate::profile::{Template, clamped_curvatures, spline_value};
+use crate::profile::{clamped_curvatures, spline_value};
+use crate::template::Template;
 
 /// Knots of the learnt profile.
 const KNOTS: usize = 48;

@@ -16,12 +16,14 @@ mod learn;
 mod level;
 mod localiser;
 pub mod many;
+mod objects;
 mod outline;
 pub mod profile;
 mod seed;
 mod streak;
 pub mod suggest;
 pub mod symmetry;
+pub mod template;
 pub mod track;
 
 pub use blobs::{Blob, Blobs};
@@ -33,11 +35,11 @@ pub use frame::{Frame, Pixels};
 pub use learn::LearningReport;
 pub use localiser::Localiser;
 pub use many::{LinkConfig, ManyTracker, Sight};
-pub use profile::{
-    GaussianProfile, PixelResponse, ProfileSpec, RadialProfile, RingProfile, TABLE_KNOTS, Template,
-};
-pub use suggest::{NothingToSuggest, Refused, Suggestion};
+pub use objects::Refused;
+pub use profile::{GaussianProfile, RadialProfile, RingProfile};
+pub use suggest::{NothingToSuggest, Suggestion};
 pub use symmetry::RadialSymmetry;
+pub use template::{PixelResponse, ProfileSpec, TABLE_KNOTS, Template};
 pub use track::{
     CellStep, CellTracker, Commanded, Decision, TrackState, TrackStep, Tracker, TrackerConfig,
 };

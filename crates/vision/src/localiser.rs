@@ -6,9 +6,9 @@ use crate::fit::{self, Pass, Weights};
 use crate::fix::{Fix, Verdict};
 use crate::frame::Frame;
 use crate::learn::{Learner, LearningReport};
-use crate::profile::Template;
 use crate::seed;
 use crate::streak::Comb;
+use crate::template::Template;
 
 /// A step below this ends the fit, px: what is left after it is of second order in it.
 const CONVERGED_PX: f64 = 0.01;

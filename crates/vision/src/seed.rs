@@ -143,8 +143,8 @@ where
 {
     let (mut x, mut y) = (at.0 as f64, at.1 as f64);
     for reach_px in [2.0 * radius_px, 1.3 * radius_px] {
-        let (x0, x1) = crate::profile::span(x, reach_px.max(1.0), frame.width);
-        let (y0, y1) = crate::profile::span(y, reach_px.max(1.0), frame.height);
+        let (x0, x1) = crate::template::span(x, reach_px.max(1.0), frame.width);
+        let (y0, y1) = crate::template::span(y, reach_px.max(1.0), frame.height);
         let (mut s, mut sx, mut sy) = (0.0_f64, 0.0, 0.0);
         for j in y0..y1 {
             let Some(row) = pixels.get(j * frame.width + x0..j * frame.width + x1) else {

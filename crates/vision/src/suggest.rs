@@ -4,21 +4,15 @@
 //! smooth background, those of the commonest size and contrast are taken as beads, and the mean profile about their centres
 //! becomes the template: aligned, fitted, aligned again. Offline; allocates.
 
-use crate::blobs::Blobs;
 use crate::config::{LocaliserConfig, MAX_WINDOW_PX, Polarity};
 use crate::fix::Verdict;
-use crate::frame::{Frame, Pixels};
+use crate::frame::Frame;
 use crate::localiser::Localiser;
-use crate::profile::{ProfileSpec, TABLE_KNOTS};
-use crate::seed;
-use crate::symmetry::RadialSymmetry;
+use crate::objects::{Flat, Object, Refused};
+use crate::template::{ProfileSpec, TABLE_KNOTS};
 
 /// Passes of aligning and averaging.
 const PASSES: usize = 4;
-/// Contrast of an object over the noise of a mean of 5 x 5 pixels.
-const LEAST_SIGMA: f32 = 6.0;
-/// Share of the strongest contrast that an object has.
-const LEAST_SHARE: f32 = 0.15;
 /// Objects are alike within these factors of size and of contrast.
 const ALIKE: (f64, f64) = (1.3, 1.7);
 /// Fewest objects that make a profile.
@@ -51,17 +45,6 @@ pub struct Suggestion {
     pub snr: f64,
 }
 
-/// Objects refused, by reason.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub struct Refused {
-    /// Cut by the border.
-    pub at_border: usize,
-    /// Of another size or contrast than most.
-    pub other: usize,
-    /// Not fitted by the mean profile.
-    pub bad_fit: usize,
-}
-
 /// Why there is no suggestion.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum NothingToSuggest {
@@ -89,24 +72,6 @@ pub enum NothingToSuggest {
         /// Objects that were alike.
         objects: usize,
     },
-}
-
-/// An object that stands out.
-#[derive(Debug, Clone, Copy)]
-struct Object {
-    frame: usize,
-    x_px: f64,
-    y_px: f64,
-    radius_px: f64,
-    contrast: f64,
-}
-
-/// A frame as grey levels above its smooth background.
-struct Flat {
-    width: usize,
-    height: usize,
-    values: Vec<f32>,
-    noise: f32,
 }
 
 /// Looks at frames of a recording, spread over it, and suggests settings for its beads.
@@ -262,8 +227,8 @@ fn mean_profile(flats: &[Flat], beads: &[Object], reach_px: f64) -> Option<[f64;
         let Some(flat) = flats.get(bead.frame) else {
             continue;
         };
-        let (x0, x1) = crate::profile::span(bead.x_px, reach_px, flat.width);
-        let (y0, y1) = crate::profile::span(bead.y_px, reach_px, flat.height);
+        let (x0, x1) = crate::template::span(bead.x_px, reach_px, flat.width);
+        let (y0, y1) = crate::template::span(bead.y_px, reach_px, flat.height);
         for y in y0..y1 {
             for x in x0..x1 {
                 let u = f64::hypot(x as f64 - bead.x_px, y as f64 - bead.y_px) / knot_px;
@@ -367,145 +332,6 @@ fn step_px(fits: &[(usize, crate::Fix)], reach_px: f64) -> f64 {
         return reach_px;
     }
     rounded((2.5 * quantile(steps.into_iter(), 0.99)).max(2.0), 10.0)
-}
-
-impl Flat {
-    fn new(frame: &Frame) -> Self {
-        let (values, noise) = match frame.pixels {
-            Pixels::Mono8(p) => (
-                p.iter().map(|v| f32::from(*v)).collect(),
-                seed::background(p).1,
-            ),
-            Pixels::Mono16(p) => (
-                p.iter().map(|v| f32::from(*v)).collect(),
-                seed::background(p).1,
-            ),
-        };
-        let mut flat = Flat {
-            width: frame.width,
-            height: frame.height,
-            values,
-            noise: noise.max(0.29) as f32,
-        };
-        flat.flatten();
-        flat
-    }
-
-    /// Takes off a parabola fitted to what is not an object.
-    fn flatten(&mut self) {
-        use nalgebra::{SMatrix, SVector};
-        let (width, height) = (self.width.max(1) as f64, self.height.max(1) as f64);
-        let terms = |k: usize| {
-            let u = (k % self.width) as f64 / width - 0.5;
-            let v = (k / self.width) as f64 / height - 0.5;
-            SVector::<f64, 6>::from([1.0, u, v, u * u, u * v, v * v])
-        };
-        let mut limit = f64::INFINITY;
-        let mut fitted = SVector::<f64, 6>::zeros();
-        for _ in 0..6 {
-            let (mut normal, mut right) =
-                (SMatrix::<f64, 6, 6>::zeros(), SVector::<f64, 6>::zeros());
-            let (mut off, mut n) = (0.0, 0.0_f64);
-            for (k, v) in self.values.iter().enumerate().step_by(3) {
-                let g = terms(k);
-                let residual = f64::from(*v) - fitted.dot(&g);
-                if limit.is_infinite() || residual.abs() <= limit {
-                    normal += g * g.transpose();
-                    right += g * f64::from(*v);
-                    off += residual.abs();
-                    n += 1.0;
-                }
-            }
-            let Some(cholesky) = normal.cholesky() else {
-                break;
-            };
-            fitted = cholesky.solve(&right);
-            limit = if limit.is_infinite() {
-                f64::MAX
-            } else {
-                2.5 * 1.25 * off / n.max(1.0)
-            };
-        }
-        let plane: Vec<f32> = (0..self.values.len())
-            .map(|k| fitted.dot(&terms(k)) as f32)
-            .collect();
-        for (v, p) in self.values.iter_mut().zip(plane) {
-            *v -= p;
-        }
-    }
-
-    /// Mean of the contrast's square over 5 x 5 pixels, as a root.
-    fn strength(&self) -> Vec<f32> {
-        let (w, h) = (self.width, self.height);
-        let mut rows = vec![0.0; w * h];
-        for (row, values) in rows.chunks_exact_mut(w).zip(self.values.chunks_exact(w)) {
-            for (x, sum) in row.iter_mut().enumerate() {
-                let near = &values[x.saturating_sub(2)..(x + 3).min(w)];
-                *sum = near.iter().map(|v| v * v).sum::<f32>() / near.len() as f32;
-            }
-        }
-        (0..w * h)
-            .map(|k| {
-                let (x, y) = (k % w, k / w);
-                let near = y.saturating_sub(2)..(y + 3).min(h);
-                let count = near.len() as f32;
-                (near.map(|j| rows[j * w + x]).sum::<f32>() / count).sqrt()
-            })
-            .collect()
-    }
-
-    fn objects(&self, frame: usize, objects: &mut Vec<Object>, refused: &mut Refused) {
-        let strength = self.strength();
-        let strongest = strength.iter().fold(0.0_f32, |a, b| a.max(*b));
-        // The RMS of noise alone is `noise`, and scatters by a seventh of it.
-        let least = self.noise * (1.0 + LEAST_SIGMA / 7.0);
-        let threshold = least.max(LEAST_SHARE * strongest);
-        let mut blobs = Blobs::new(self.width / 2 + 1, 16 * 1024);
-        let at = |x: usize, y: usize| strength[y * self.width + x];
-        let found = blobs.label((self.width, self.height), threshold, 20.0, at);
-        for blob in found {
-            if blob.at_border {
-                refused.at_border += 1;
-                continue;
-            }
-            // The mean over 5 x 5 pixels has made it wider by two pixels all round.
-            let radius_px = ((blob.area_px / core::f64::consts::PI).sqrt() - 2.0).max(1.5);
-            let side = (2.0 * 1.2 * radius_px).ceil() as usize | 1;
-            let [left, top, right, bottom] = blob.bounds;
-            let middle = (
-                0.5 * (f64::from(left) + f64::from(right) - 1.0),
-                0.5 * (f64::from(top) + f64::from(bottom) - 1.0),
-            );
-            let (x_px, y_px) = self
-                .centre(middle, side.clamp(7, MAX_WINDOW_PX))
-                .unwrap_or(middle);
-            objects.push(Object {
-                frame,
-                x_px,
-                y_px,
-                radius_px,
-                contrast: blob.peak,
-            });
-        }
-    }
-
-    /// Centre of symmetry near a place.
-    fn centre(&self, (x, y): (f64, f64), side: usize) -> Option<(f64, f64)> {
-        let scale = 20.0 / self.noise;
-        let grey: Vec<u16> = self
-            .values
-            .iter()
-            .map(|v| (32_768.0 + scale * v).clamp(0.0, 65_535.0) as u16)
-            .collect();
-        let frame = Frame {
-            width: self.width,
-            height: self.height,
-            pixels: Pixels::Mono16(&grey),
-        };
-        let mut symmetry = RadialSymmetry::new(side);
-        let found = symmetry.locate(&frame, x, y)?;
-        (f64::hypot(found.0 - x, found.1 - y) < 0.35 * side as f64).then_some(found)
-    }
 }
 
 fn rounded(v: f64, per_unit: f64) -> f64 {

@@ -204,13 +204,11 @@ fn no_files_of_a_crate_stand_in_a_circle() {
 const MOST_LINES: usize = 500;
 
 /// Files that are longer and wait to be taken apart: none may join them.
-const LONG: [&str; 6] = [
+const LONG: [&str; 4] = [
     "crates/cellpos/src/commands/report.rs",
     "crates/drivers/tests/all/recordings.rs",
     "crates/plant/src/simulate.rs",
     "crates/record/tests/all/run.rs",
-    "crates/vision/src/profile.rs",
-    "crates/vision/src/suggest.rs",
 ];
 
 #[test]
