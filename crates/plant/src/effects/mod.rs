@@ -42,6 +42,7 @@ mod pzt_hysteresis;
 mod pzt_resonance;
 mod saturation;
 mod slew_limit;
+mod speed_law;
 mod stick_slip;
 mod stiffening;
 mod time_delay;

@@ -1,8 +1,7 @@
 //! `stick-slip`: the bead sticks until it breaks free, and then goes on until it is slow.
 
-use super::{
-    Action, Block, Effect, EffectKind, Experiment, Form, ParameterSpec, Place, Scope, Segment, Spec,
-};
+use super::speed_law::{OfSpeed, SpeedLaw};
+use super::{Action, Effect, EffectKind, Experiment, Form, ParameterSpec, Place, Scope, Spec};
 
 /// Stuck until the flow reaches `break_um_per_s`, free until it falls below `stop_um_per_s`.
 pub fn stick_slip(break_um_per_s: f64, stop_um_per_s: f64) -> Effect {
@@ -37,13 +36,11 @@ impl EffectKind for StickSlip {
     }
 
     fn act(&self, effect: &Effect) -> Action {
-        Action::Block(Box::new(Stick {
+        Action::Block(Box::new(OfSpeed::new(Stick {
             break_um_per_s: effect.scalar(0),
             stop_um_per_s: effect.scalar(1),
             stuck: true,
-            input: 0.0,
-            output: 0.0,
-        }))
+        })))
     }
 
     fn check(&self, effect: &Effect) -> Result<(), &'static str> {
@@ -65,61 +62,36 @@ struct Stick {
     break_um_per_s: f64,
     stop_um_per_s: f64,
     stuck: bool,
-    input: f64,
-    output: f64,
 }
 
-impl Block for Stick {
-    fn advance(&mut self, _: f64, h_s: f64, input: Segment) -> Segment {
-        // A jump is infinitely fast and is followed in full.
-        let start = self.output + (input.start - self.input);
-        let mut travel = 0.0;
-        if h_s > 0.0 {
-            let mean = (input.end - input.start) / h_s;
-            let half = 0.5 * (input.speed_end - input.speed_start);
-            let (a, b) = (mean - half, mean + half);
-            if self.stuck {
-                // It breaks free within the piece, where the speed passes the threshold.
-                let limit = self.break_um_per_s;
-                if a.abs() >= limit {
-                    self.stuck = false;
-                    travel = mean * h_s;
-                } else if b.abs() > limit {
-                    self.stuck = false;
-                    let f = (limit - a.abs()) / (b.abs() - a.abs());
-                    travel = 0.5 * (limit.copysign(b) + b) * (1.0 - f) * h_s;
-                }
-            } else {
-                travel = mean * h_s;
-                // A speed that passes zero passes the lower threshold as well.
-                if b.abs() < self.stop_um_per_s || a * b < 0.0 {
-                    self.stuck = true;
-                }
+impl SpeedLaw for Stick {
+    fn travel(&mut self, moved: f64, a: f64, b: f64, h_s: f64) -> f64 {
+        if self.stuck {
+            // It breaks free within the piece, where the speed passes the threshold.
+            let limit = self.break_um_per_s;
+            if a.abs() >= limit {
+                self.stuck = false;
+                return moved;
             }
+            if b.abs() > limit {
+                self.stuck = false;
+                let f = (limit - a.abs()) / (b.abs() - a.abs());
+                return 0.5 * (limit.copysign(b) + b) * (1.0 - f) * h_s;
+            }
+            return 0.0;
         }
-        let at = |v: f64| if self.stuck { 0.0 } else { v };
-        self.input = input.end;
-        self.output = start + travel;
-        Segment {
-            start,
-            end: self.output,
-            integral: h_s * (start + 0.5 * travel),
-            speed_start: at(input.speed_start),
-            speed_end: at(input.speed_end),
+        // A speed that passes zero passes the lower threshold as well.
+        if b.abs() < self.stop_um_per_s || a * b < 0.0 {
+            self.stuck = true;
         }
+        moved
+    }
+
+    fn speed(&self, speed: f64) -> f64 {
+        if self.stuck { 0.0 } else { speed }
     }
 
     fn reset(&mut self) {
         self.stuck = true;
-        self.input = 0.0;
-        self.output = 0.0;
-    }
-
-    fn duplicate(&self) -> Box<dyn Block> {
-        Box::new(self.clone())
-    }
-
-    fn needs_slopes(&self) -> bool {
-        true
     }
 }

@@ -1,9 +1,9 @@
 //! `valve-asymmetry`: the gain differs outward and inward.
 
 use super::candidate::one;
+use super::speed_law::{OfSpeed, SpeedLaw};
 use super::{
-    Action, Block, Candidate, Effect, EffectKind, Experiment, Form, ParameterSpec, Place, Scope,
-    Segment, Spec, lin,
+    Action, Candidate, Effect, EffectKind, Experiment, Form, ParameterSpec, Place, Scope, Spec, lin,
 };
 
 /// The velocity is `1 + asymmetry` times as large outward and `1 - asymmetry` inward.
@@ -41,11 +41,9 @@ impl EffectKind for ValveAsymmetry {
     }
 
     fn act(&self, effect: &Effect) -> Action {
-        Action::Block(Box::new(Valve {
+        Action::Block(Box::new(OfSpeed::new(Valve {
             asymmetry: effect.scalar(0),
-            input: 0.0,
-            output: 0.0,
-        }))
+        })))
     }
 
     fn candidates(&self) -> &'static [Candidate] {
@@ -65,11 +63,9 @@ impl EffectKind for ValveAsymmetry {
 }
 
 /// Outward faster than inward.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Copy)]
 struct Valve {
     asymmetry: f64,
-    input: f64,
-    output: f64,
 }
 
 /// Integral over a piece of the size of a speed that runs straight from `a` to `b`.
@@ -80,45 +76,20 @@ fn way(a: f64, b: f64, h_s: f64) -> f64 {
     0.5 * h_s * (a * a + b * b) / (a.abs() + b.abs())
 }
 
-impl Block for Valve {
-    fn advance(&mut self, _: f64, h_s: f64, input: Segment) -> Segment {
-        let jump = input.start - self.input;
-        let start = self.output + jump + self.asymmetry * jump.abs();
-        let (mean, half) = if h_s > 0.0 {
-            (
-                (input.end - input.start) / h_s,
-                0.5 * (input.speed_end - input.speed_start),
-            )
-        } else {
-            (0.0, 0.0)
-        };
-        let travel = input.end - input.start + self.asymmetry * way(mean - half, mean + half, h_s);
-        self.input = input.end;
-        self.output = start + travel;
-        let gain = |v: f64| v + self.asymmetry * v.abs();
-        Segment {
-            start,
-            end: self.output,
-            integral: h_s * (start + 0.5 * travel),
-            speed_start: gain(input.speed_start),
-            speed_end: gain(input.speed_end),
-        }
+impl SpeedLaw for Valve {
+    fn jump(&self, jump: f64) -> f64 {
+        self.speed(jump)
     }
 
-    fn reset(&mut self) {
-        self.input = 0.0;
-        self.output = 0.0;
+    fn travel(&mut self, moved: f64, a: f64, b: f64, h_s: f64) -> f64 {
+        moved + self.asymmetry * way(a, b, h_s)
     }
 
-    fn duplicate(&self) -> Box<dyn Block> {
-        Box::new(self.clone())
+    fn speed(&self, speed: f64) -> f64 {
+        speed + self.asymmetry * speed.abs()
     }
 
-    fn needs_slopes(&self) -> bool {
-        true
-    }
-
-    fn speed(&self, _: f64, input_um_per_s: f64) -> f64 {
-        input_um_per_s + self.asymmetry * input_um_per_s.abs()
+    fn slope(&self, speed: f64) -> f64 {
+        self.speed(speed)
     }
 }

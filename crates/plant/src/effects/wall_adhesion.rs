@@ -1,9 +1,9 @@
 //! `wall-adhesion`: the bead sticks to the wall.
 
 use super::candidate::one;
+use super::speed_law::{OfSpeed, SpeedLaw};
 use super::{
-    Action, Block, Candidate, Effect, EffectKind, Experiment, Form, ParameterSpec, Place, Scope,
-    Segment, Spec, log,
+    Action, Candidate, Effect, EffectKind, Experiment, Form, ParameterSpec, Place, Scope, Spec, log,
 };
 
 /// Sticks to the wall unless the flow past it is faster than a threshold: a dead zone of the speed.
@@ -41,11 +41,9 @@ impl EffectKind for WallAdhesion {
     }
 
     fn act(&self, effect: &Effect) -> Action {
-        Action::Block(Box::new(Adhesion {
+        Action::Block(Box::new(OfSpeed::new(Adhesion {
             threshold: effect.scalar(0),
-            input: 0.0,
-            output: 0.0,
-        }))
+        })))
     }
 
     fn candidates(&self) -> &'static [Candidate] {
@@ -68,8 +66,6 @@ impl EffectKind for WallAdhesion {
 #[derive(Debug, Clone)]
 struct Adhesion {
     threshold: f64,
-    input: f64,
-    output: f64,
 }
 
 /// Integral over a piece of the dead zone of a speed that runs straight from `a` to `b`.
@@ -88,39 +84,12 @@ fn dead_zone_travel(a: f64, b: f64, threshold: f64, h: f64) -> f64 {
     h * (even(b) - even(a)) / (b - a)
 }
 
-impl Block for Adhesion {
-    fn advance(&mut self, _: f64, h_s: f64, input: Segment) -> Segment {
-        // A jump is infinitely fast and is followed in full.
-        let start = self.output + (input.start - self.input);
-        let travel = if h_s > 0.0 {
-            let mean = (input.end - input.start) / h_s;
-            let half = 0.5 * (input.speed_end - input.speed_start);
-            dead_zone_travel(mean - half, mean + half, self.threshold, h_s)
-        } else {
-            0.0
-        };
-        let zone = |v: f64| (v.abs() - self.threshold).max(0.0) * v.signum();
-        self.input = input.end;
-        self.output = start + travel;
-        Segment {
-            start,
-            end: self.output,
-            integral: h_s * (start + 0.5 * travel),
-            speed_start: zone(input.speed_start),
-            speed_end: zone(input.speed_end),
-        }
+impl SpeedLaw for Adhesion {
+    fn travel(&mut self, _: f64, a: f64, b: f64, h_s: f64) -> f64 {
+        dead_zone_travel(a, b, self.threshold, h_s)
     }
 
-    fn reset(&mut self) {
-        self.input = 0.0;
-        self.output = 0.0;
-    }
-
-    fn duplicate(&self) -> Box<dyn Block> {
-        Box::new(self.clone())
-    }
-
-    fn needs_slopes(&self) -> bool {
-        true
+    fn speed(&self, speed: f64) -> f64 {
+        (speed.abs() - self.threshold).max(0.0) * speed.signum()
     }
 }
