@@ -10,6 +10,16 @@ const REFRESHED_EVERY: usize = 16;
 /// At most this many pixels serve for the estimate of a shift.
 pub(super) const SAMPLES: usize = 384;
 
+/// Side of the patches that are restless or not, px.
+const PATCH: usize = 4;
+/// A patch is restless from so many times the scatter of the median one on, and from so many grey levels on.
+const RESTLESS: (f32, f32) = (4.0, 4.0);
+/// Fewest frames that tell, and the share of them in which a patch must change: what swims past does so in few. Text is
+/// written into the outer quarter of a frame.
+const FEWEST_RESTLESS: u32 = 8;
+const RESTLESS_SHARE: (u32, u32) = (2, 5);
+/// Patches beside a restless one that are taken for restless.
+const BESIDE: usize = 2;
 /// About so many pixels serve for the estimate of the light.
 const LIGHT_SAMPLES: usize = 2048;
 /// Ratios of a pixel to the background's are counted in so many classes from 0 on, and so many to a ratio of 1.
@@ -25,8 +35,15 @@ pub(super) type Bounds = [usize; 4];
 pub(super) struct Background {
     pub width: usize,
     pub mean: Vec<f32>,
-    /// Sum of squared deviations from the running mean, over all pixels.
-    deviations: f64,
+    /// Sum of squared deviations from the running mean, over the pixels of each patch.
+    deviations: Vec<f32>,
+    /// Patches whose grey levels change by themselves: text that counts the frames, a lamp in the picture.
+    restless: Vec<bool>,
+    /// Squares of what the last frame differed by in each patch, and in how many frames that was much.
+    last: Vec<f32>,
+    active: Vec<u32>,
+    sorted: Vec<f32>,
+    scatter: f64,
     /// Noise from elsewhere, grey levels; 0 without.
     known_noise: f64,
     pub frames: u32,
@@ -40,10 +57,16 @@ pub(super) struct Background {
 
 impl Background {
     pub fn new(width: usize, height: usize) -> Self {
+        let patches = width.div_ceil(PATCH) * height.div_ceil(PATCH);
         Background {
             width,
             mean: vec![0.0; width * height],
-            deviations: 0.0,
+            deviations: vec![0.0; patches],
+            restless: vec![false; patches],
+            last: vec![0.0; patches],
+            active: vec![0; patches],
+            sorted: Vec::with_capacity(patches),
+            scatter: 0.0,
             known_noise: 0.0,
             frames: 0,
             refreshed: 0,
@@ -53,11 +76,72 @@ impl Background {
         }
     }
 
-    /// Noise of a pixel, grey levels: the scatter of the background frames, at least that of rounding.
+    /// Noise of a pixel, grey levels: the scatter of the background frames, restless patches left out, at least that of
+    /// rounding.
     pub fn noise_grey(&self) -> f64 {
-        let degrees = f64::from(self.frames.saturating_sub(1)) * self.mean.len() as f64;
-        let scatter = (self.deviations / degrees.max(1.0)).max(1.0 / 12.0).sqrt();
-        scatter.max(self.known_noise)
+        self.scatter
+            .max((1.0_f64 / 12.0).sqrt())
+            .max(self.known_noise)
+    }
+
+    /// Takes noise and restless patches from the deviations and from the last frame's differences.
+    fn settle(&mut self) {
+        if self.frames < 2 || self.last.is_empty() {
+            return;
+        }
+        let pixels = (PATCH * PATCH) as f32;
+        let most = |sorted: &mut Vec<f32>, values: &[f32], degrees: f32| {
+            sorted.clear();
+            sorted.extend(values);
+            let middle = sorted.len() / 2;
+            let (_, median, _) = sorted.select_nth_unstable_by(middle, f32::total_cmp);
+            (RESTLESS.0 * RESTLESS.0 * *median).max(RESTLESS.1 * RESTLESS.1 * degrees)
+        };
+        let active = most(&mut self.sorted, &self.last, pixels);
+        for (count, off) in self.active.iter_mut().zip(&self.last) {
+            *count += u32::from(*off > active);
+        }
+        let degrees = (self.frames - 1) as f32 * pixels;
+        let limit = most(&mut self.sorted, &self.deviations, degrees);
+        let calm = self.deviations.iter().filter(|d| **d <= limit);
+        let (sum, n) = calm.fold((0.0, 0.0), |(sum, n), d| (sum + f64::from(*d), n + 1.0));
+        self.scatter = (sum / f64::max(n, 1.0) / f64::from(degrees)).sqrt();
+        if self.frames < FEWEST_RESTLESS {
+            return;
+        }
+        let columns = self.width.div_ceil(PATCH).max(1);
+        let rows = self.restless.len() / columns;
+        let least = self.frames * RESTLESS_SHARE.0 / RESTLESS_SHARE.1;
+        let outer = |k: usize, count: usize| 4 * k.min(count - 1 - k) < count;
+        for (k, restless) in self.restless.iter_mut().enumerate() {
+            let (x, y) = (k % columns, k / columns);
+            // Beside text that has changed there is text that will.
+            let beside = k - x.min(BESIDE)..=k + BESIDE.min(columns - 1 - x);
+            let near = self.active.get(beside).unwrap_or(&[]);
+            let written = outer(x, columns) || outer(y, rows);
+            *restless = written && near.iter().any(|count| *count >= least);
+        }
+    }
+
+    /// Whether a pixel belongs to a patch that changes by itself.
+    pub fn is_restless(&self, x: usize, y: usize) -> bool {
+        let patch = y / PATCH * self.width.div_ceil(PATCH) + x / PATCH;
+        self.restless.get(patch).copied().unwrap_or(false)
+    }
+
+    /// Takes the restless patches out of a contrast.
+    pub fn calm(&self, contrast: &mut [f32]) {
+        if !self.restless.contains(&true) {
+            return;
+        }
+        let columns = self.width.div_ceil(PATCH);
+        let rows = contrast.chunks_exact_mut(self.width);
+        for (y, row) in rows.enumerate() {
+            let restless = self.restless.iter().skip(y / PATCH * columns);
+            for (patch, _) in row.chunks_mut(PATCH).zip(restless).filter(|(_, r)| **r) {
+                patch.fill(0.0);
+            }
+        }
     }
 
     /// Takes a picture that is a mean already for the background; its noise is that of a frame beside it.
@@ -65,7 +149,9 @@ impl Background {
     where
         f32: From<T>,
     {
-        (self.frames, self.deviations, self.steep_age) = (2, 0.0, 0);
+        (self.frames, self.scatter, self.steep_age) = (2, 0.0, 0);
+        self.deviations.fill(0.0);
+        self.restless.fill(false);
         for (mean, p) in self.mean.iter_mut().zip(pixels) {
             *mean = f32::from(*p);
         }
@@ -100,12 +186,24 @@ impl Background {
         self.frames = self.frames.saturating_add(1);
         self.steep_age = 0;
         let share = 1.0 / self.frames as f32;
-        for (mean, p) in self.mean.iter_mut().zip(pixels) {
-            let v = f32::from(*p);
-            let before = v - *mean;
-            *mean += share * before;
-            self.deviations += f64::from(before) * f64::from(v - *mean);
+        let columns = self.width.div_ceil(PATCH);
+        self.last.fill(0.0);
+        let rows = self.mean.chunks_exact_mut(self.width);
+        for (y, (means, pixels)) in rows.zip(pixels.chunks_exact(self.width)).enumerate() {
+            for (x, (mean, p)) in means.iter_mut().zip(pixels).enumerate() {
+                let v = f32::from(*p);
+                let before = v - *mean;
+                *mean += share * before;
+                let patch = y / PATCH * columns + x / PATCH;
+                if let (Some(sum), Some(last)) =
+                    (self.deviations.get_mut(patch), self.last.get_mut(patch))
+                {
+                    *sum += before * (v - *mean);
+                    *last += before * before;
+                }
+            }
         }
+        self.settle();
     }
 
     /// Follows a frame: a sixteenth of the rows at a time, by their share over `refresh_frames`.

@@ -78,17 +78,22 @@ impl Background {
         if width < 16 || height < 16 {
             return;
         }
+        // Taken out while the rest is looked at: its room stays.
+        let mut kept = std::mem::take(&mut self.steep);
         let steep = |k: &usize| {
             let at = |k: usize| self.mean.get(k).copied().unwrap_or(0.0);
             let (x, y) = (k % width, k / width);
             let within = (4..width - 5).contains(&x) && (4..height - 5).contains(&y);
             let across = (at(k + 1) - at(k.saturating_sub(1))).abs();
-            within && across.max((at(k + width) - at(k.saturating_sub(width))).abs()) > least
+            within
+                && !self.is_restless(x, y)
+                && across.max((at(k + width) - at(k.saturating_sub(width))).abs()) > least
         };
         let count = (0..self.mean.len()).filter(steep).count();
         let every = count.div_ceil(SAMPLES).max(1);
         let chosen = (0..self.mean.len()).filter(steep).step_by(every);
-        self.steep.extend(chosen.take(SAMPLES).map(|k| k as u32));
+        kept.extend(chosen.take(SAMPLES).map(|k| k as u32));
+        self.steep = kept;
     }
 
     /// Shift of the frame against the background, px to the right and down; noughts where there is none to speak of.

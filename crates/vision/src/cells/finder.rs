@@ -281,6 +281,7 @@ impl CellFinder {
             self.background
                 .contrast_shifted(pixels, light, self.drift_px, buffers);
         }
+        self.background.calm(&mut self.contrast);
         let noise = self.noise_grey();
         let threshold = self.config.threshold_sigma * noise;
         let strong = (SEED * threshold).powi(2);

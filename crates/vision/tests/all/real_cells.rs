@@ -372,3 +372,24 @@ fn another_contrast_curve_focus_pixel_or_place_of_the_chip_changes_the_outlines_
         assert!(least > 0.85 && most < 1.15, "{change:?}: {least} {most}");
     }
 }
+
+#[test]
+#[cfg_attr(no_shared_data, ignore = "needs ../shared/data/cells-in-channels")]
+fn text_written_into_the_pictures_is_no_cell_and_changes_none() {
+    for rows in [8, 16, 24] {
+        for name in [
+            "calibration-beads",
+            "cells-wide-channel",
+            "cells-low-contrast",
+        ] {
+            // A header that fills more than a quarter of the picture is not taken for one.
+            if name == "cells-low-contrast" && rows > 16 {
+                continue;
+            }
+            let (found, count, [middle, least, most]) = effect(name, Change::Header(rows));
+            assert_eq!(found, count, "{name} {rows}");
+            assert!((middle - 1.0).abs() <= 0.05, "{name} {rows}: {middle}");
+            assert!(least > 0.85 && most < 1.15, "{name} {rows}: {least} {most}");
+        }
+    }
+}

@@ -34,6 +34,8 @@ pub enum Change {
     Drifted(f64),
     /// The frames, not the background, brighter by this factor.
     Lamp(f64),
+    /// So many rows of text on top, another one in each frame.
+    Header(usize),
 }
 
 impl Change {
@@ -91,6 +93,25 @@ impl Change {
             Change::Drifted(px) => p.sampled(p.width, p.height, |x, y| (x - px, y - 0.5 * px)),
             Change::Lamp(_) if empty => p.clone(),
             Change::Lamp(factor) => each(&mut |v| factor * v),
+            Change::Header(rows) => {
+                // Letters of 6 x 8 px in white on black, a third of their strokes set.
+                let mut grey = vec![0.0; rows * p.width];
+                for letter in 0..p.width / 6 * (rows / 8) {
+                    let (column, line) = (letter % (p.width / 6), letter / (p.width / 6));
+                    for stroke in 0..24 {
+                        if random.uniform() < 0.35 {
+                            let (x, y) = (6 * column + stroke % 4, 8 * line + stroke / 4);
+                            grey[y * p.width + x] = 255.0;
+                        }
+                    }
+                }
+                grey.extend(&p.grey);
+                Picture {
+                    width: p.width,
+                    height: p.height + rows,
+                    grey,
+                }
+            }
         }
     }
 
@@ -100,6 +121,7 @@ impl Change {
             Change::Flipped => (x, height as f64 - 1.0 - y),
             Change::Resized(f) => ((x + 0.5) * f - 0.5, (y + 0.5) * f - 0.5),
             Change::Drifted(px) => (x + px, y + 0.5 * px),
+            Change::Header(rows) => (x, y + rows as f64),
             _ => (x, y),
         }
     }
