@@ -36,8 +36,9 @@ const MODEL_LEFT: (f64, f64) = (0.02, 0.04);
 const MODEL_AWAY: (f64, f64) = (0.25, 0.4);
 /// How many widths of the blur an edge seems wide, with strong lobes and without any.
 const WIDTHS: [(f64, With); 2] = [(1.9, With::LobesAndRim), (2.9, With::Rim)];
-/// Lobes that leave no less than this share of what a plain step leaves are none.
-const PLAIN: f64 = 1.5;
+/// Squares that a plain step leaves, over those that one with lobes leaves: up to here there are no lobes, from there on
+/// there are.
+const PLAIN: (f64, f64) = (4.0, 12.0);
 /// Rounds in which the best of them is refined.
 const ROUNDS: usize = 4;
 
@@ -170,19 +171,18 @@ impl Profile {
             self.refined(shapes, coarse, with, (0.25 * FINE_PX, 1.1, 1))
         });
         let [lobes, plain] = tried;
-        let best = if plain.left < PLAIN * lobes.left {
-            plain
-        } else {
-            lobes
-        };
-        let left = (best.left.max(0.0) / power.max(1e-9)).sqrt();
-        let away = (best.at_px - near_px).abs() / best.blur_px;
         let within =
             |(from, to): (f64, f64), value: f64| ((to - value) / (to - from)).clamp(0.0, 1.0);
-        (
-            best.at_px,
-            within(MODEL_LEFT, left) * within(MODEL_AWAY, away),
-        )
+        let own = within(PLAIN, plain.left / lobes.left.max(1e-9));
+        let mixed = |lobes: f64, plain: f64| lobes + own * (plain - lobes);
+        let (best_px, blur_px) = (
+            mixed(lobes.at_px, plain.at_px),
+            mixed(lobes.blur_px, plain.blur_px),
+        );
+        let left = mixed(lobes.left, plain.left).max(0.0) / power.max(1e-9);
+        let away = (best_px - near_px).abs() / blur_px;
+        let weight = within(MODEL_LEFT, left.sqrt()) * within(MODEL_AWAY, away);
+        (best_px, weight)
     }
 
     /// Middle of the blurred step that fits the profile with an outer lobe of the step's own sign, px outside the profile's
