@@ -89,9 +89,9 @@ impl Shapes {
 }
 
 impl Profile {
-    /// The edge of an object of the radius `radius_px`, to a pixel or so, or to the last; `None` where inside and outside are
-    /// alike.
-    pub(super) fn edge(&self, radius_px: f64, shapes: &Shapes, fine: bool) -> Option<Edge> {
+    /// The edge of an object of the radius `radius_px`; `trust`, 0 to 1, says how far a model of the profile may tell it.
+    /// `None` where inside and outside are alike.
+    pub(super) fn edge(&self, radius_px: f64, shapes: &Shapes, trust: f64) -> Option<Edge> {
         let body = -self.polarity;
         let (rim_at, halo_at) = (self.rim(), self.halo());
         let value = |k: usize| body * self.values[k];
@@ -149,11 +149,11 @@ impl Profile {
         let at_px = (at - self.half as f64) * FINE_PX;
         let (fitted_px, weight) = fitted.unwrap_or((at_px, 0.0));
         let at_px = at_px + weight * (fitted_px - at_px);
-        if !fine {
+        if trust <= 0.0 {
             return Some(found(at_px));
         }
         let (model_px, weight) = self.model(shapes, (at_px, width_px));
-        Some(found(at_px + weight * (model_px - at_px)))
+        Some(found(at_px + trust * weight * (model_px - at_px)))
     }
 
     /// Middle of the blurred step with lobes and rim near a place and of about a width (px), px outside the profile's middle,

@@ -17,8 +17,8 @@ impl Outliner {
         (area.abs() / core::f64::consts::PI).sqrt().max(1.0)
     }
 
-    /// Short half axis of the ellipse with the second moments of the contour's points, px.
-    pub(super) fn short_px(&self) -> f64 {
+    /// Half axes of the ellipse with the second moments of the contour's points, px.
+    pub(super) fn half_axes_px(&self) -> (f64, f64) {
         let n = self.points.len().max(1) as f64;
         let sum = self
             .points
@@ -33,7 +33,8 @@ impl Outliner {
         }
         // Points on a circle have half of its squared radius along each axis.
         let (mean, half) = (0.5 * (xx + yy), 0.5 * f64::hypot(xx - yy, 2.0 * xy));
-        (2.0 * (mean - half).max(0.0)).sqrt()
+        let axis = |moment: f64| (2.0 * moment.max(0.0)).sqrt();
+        (axis(mean + half), axis(mean - half))
     }
 
     /// Sums over the polygon; `variance` is that of a pixel about the mean profile, grey^2.

@@ -33,6 +33,9 @@ const BEND: f32 = 0.08;
 const OUTSIDE: f32 = 0.12;
 /// Depth over which the rim's contrast is taken, px.
 const RIM_PX: f64 = 4.0;
+/// Ratio of the half axes up to which a profile is the same all round, so that a model of it tells the edge, and from which
+/// on it is not: the tips of a cell that is pressed thin are all edge.
+const ROUND: (f64, f64) = (1.6, 2.6);
 /// How far the profiles reach on either side, as a share of the contour's short half axis.
 const REACH: f64 = 0.6;
 /// Contour points that lie this near to the border are cut by it, px.
@@ -157,7 +160,9 @@ impl Outliner {
     /// is no closed step.
     pub fn outline(&mut self, contrast: &Contrast, start: &Start, noise: f64) -> Option<Outline> {
         let polarity = self.lay(contrast, start, noise)?;
-        let reach_px = (REACH * self.short_px()).clamp(3.0, MAX_FINE as f64 * FINE_PX);
+        let (long_px, short_px) = self.half_axes_px();
+        let trust = ((ROUND.1 - long_px / short_px.max(1.0)) / (ROUND.1 - ROUND.0)).clamp(0.0, 1.0);
+        let reach_px = (REACH * short_px).clamp(3.0, MAX_FINE as f64 * FINE_PX);
         let half = (reach_px / FINE_PX).round() as usize;
         let mut profile = None;
         for _ in 0..PASSES {
@@ -167,14 +172,14 @@ impl Outliner {
             self.shift_points();
         }
         // The contour may lie on a lobe beside the edge: about the edge itself the profile does not depend on the start.
-        let near = profile?.edge(self.radius_px(), &self.shapes, false)?;
+        let near = profile?.edge(self.radius_px(), &self.shapes, 0.0)?;
         self.find_normals();
         self.shift_outwards(near.at_px);
         self.find_normals();
         self.sample(contrast, half);
         let profile = self.align(half, polarity)?;
         self.shift_points();
-        let edge = profile.edge(self.radius_px(), &self.shapes, true)?;
+        let edge = profile.edge(self.radius_px(), &self.shapes, trust)?;
         self.find_normals();
         self.shift_outwards(edge.at_px);
         let residual = self.residual(&profile).max(noise * noise);
