@@ -91,7 +91,7 @@ fn verdict(r: &mut Report, result: &Reconciliation) {
                 e.place.to_owned(),
                 p,
                 format!("{:.1} %", 100.0 * e.explained),
-                format!("{:.1e}", e.p_value),
+                p_value(e.p_value),
                 e.alternatives.join(", "),
             ]);
         }
@@ -146,6 +146,16 @@ fn heat(r: &mut Report, name: &str, caption: &str, map: &DiscrepancyMap) {
     ));
 }
 
+/// A probability; below what the search computes it is said to be less.
+fn p_value(p: f64) -> String {
+    const LEAST: f64 = 1e-16;
+    if p < LEAST {
+        format!("< {LEAST:.0e}")
+    } else {
+        format!("{p:.1e}")
+    }
+}
+
 /// A value with its 95 % interval, to the digits that the interval leaves it.
 fn interval(value: f64, [low, high]: [f64; 2]) -> String {
     let width = (high - low).abs();
@@ -159,7 +169,7 @@ fn interval(value: f64, [low, high]: [f64; 2]) -> String {
     format!("{value:.digits$} [{low:.digits$}, {high:.digits$}]")
 }
 
-/// Gain and phase with their 95 % bands, in runs of neighbouring bands: what was not excited is a gap.
+/// Gain and phase with their 95 % intervals: low, middle, high; NaN in a band that was not excited.
 struct Supported {
     hz: Vec<f64>,
     gain_db: [Vec<f64>; 3],
@@ -204,7 +214,7 @@ fn response(r: &mut Report, result: &Reconciliation) {
     let (before, after) = (Supported::of(&result.before), Supported::of(&result.after));
     let any = before.gain_db[1].iter().any(|db| db.is_finite());
     r.paragraph(&format!(
-        "0 dB and 0 deg mean that the model is right at that frequency. Thin: 95 % of the noise. Bands in which less than \
+        "0 dB and 0 deg mean that the model is right at that frequency. Bars: 95 % intervals. Bands in which less than \
          {:.0} % of the motion was driven are left out ({} of {}): there the record shows noise, and in a loop the answer to it.",
         100.0 * crate::verdict::response::BandRatio::SUPPORTED,
         before.left_out,
@@ -220,20 +230,12 @@ fn response(r: &mut Report, result: &Reconciliation) {
     let mut gain = Panel::new(Axis::log("frequency", "Hz"), Axis::linear("gain", "dB"));
     let mut phase = Panel::new(Axis::log("frequency", "Hz"), Axis::linear("phase", "deg"));
     for (name, color, of) in [("before", 0, &before), ("after", 1, &after)] {
-        gain = gain.series(Series::line(name, &of.hz, &of.gain_db[1]).color(color));
-        phase = phase.series(Series::line(name, &of.hz, &of.phase_deg[1]).color(color));
-        for end in [0, 2] {
-            gain = gain.series(
-                Series::line("", &of.hz, &of.gain_db[end])
-                    .thin()
-                    .color(color),
-            );
-            phase = phase.series(
-                Series::line("", &of.hz, &of.phase_deg[end])
-                    .thin()
-                    .color(color),
-            );
-        }
+        // Points: a band that stands alone has no line, and between two bands nothing was measured.
+        let drawn = |label: &str, [low, middle, high]: &[Vec<f64>; 3]| {
+            Series::intervals(label, &of.hz, middle, low, high).color(color)
+        };
+        gain = gain.series(drawn(name, &of.gain_db));
+        phase = phase.series(drawn("", &of.phase_deg));
     }
     r.figure(
         Figure::new("response", "Measured over simulated, before and after")
@@ -323,12 +325,12 @@ fn traces(r: &mut Report, result: &Reconciliation) {
             .panel(
                 Panel::new(Axis::linear("time", "s"), Axis::linear("residual", "um"))
                     .series(
-                        Series::line("before", &t.time_s, &t.residual_before_um)
+                        Series::line("", &t.time_s, &t.residual_before_um)
                             .thin()
                             .color(1),
                     )
                     .series(
-                        Series::line("after", &t.time_s, &t.residual_after_um)
+                        Series::line("", &t.time_s, &t.residual_after_um)
                             .thin()
                             .color(2),
                     ),
@@ -350,5 +352,11 @@ mod tests {
             interval(0.25, [0.25, 0.25]),
             "0.250000 [0.250000, 0.250000]"
         );
+    }
+
+    #[test]
+    fn a_probability_too_small_to_compute_is_no_number() {
+        assert_eq!(p_value(1e-300), "< 1e-16");
+        assert_eq!(p_value(0.0321), "3.2e-2");
     }
 }

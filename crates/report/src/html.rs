@@ -402,7 +402,7 @@ fn write_file(path: &Path, text: &str) -> Result<(), ReportError> {
 const PAGE_STYLE: &str = "\
 :root{color-scheme:light dark}\
 body{margin:0;background:#fff;color:#1d2127;font:15px/1.55 system-ui,'DejaVu Sans','Segoe UI',Helvetica,Arial,sans-serif}\
-main{max-width:860px;margin:0 auto;padding:24px 20px 60px}\
+main{max-width:1000px;margin:0 auto;padding:24px 20px 60px}\
 h1{font-size:26px;line-height:1.25;margin:8px 0 16px}h2{font-size:20px;margin:38px 0 10px;padding-top:8px;border-top:1px solid #dfe3e8}\
 h3{font-size:16px;margin:24px 0 6px}p{margin:8px 0}ul{margin:8px 0;padding-left:22px}\
 nav ul{columns:2;list-style:none;padding:10px 14px;background:#f5f7f9;border-radius:6px;font-size:14px}\
@@ -412,7 +412,7 @@ figcaption{color:#5c6470;font-size:13px;margin-top:4px}\
 p.caption{color:#5c6470;font-size:13px;margin-top:4px}\
 th{text-align:left;font-weight:600;border-bottom:2px solid #c3cad2;padding:4px 14px 4px 6px;vertical-align:bottom}\
 td{border-bottom:1px solid #e8ebef;padding:4px 14px 4px 6px;vertical-align:top}\
-.num{text-align:right;font-variant-numeric:tabular-nums;padding:4px 8px}\
+.num{text-align:right;font-variant-numeric:tabular-nums;padding:4px 8px}td.num{white-space:nowrap}\
 tr.good td:first-child{color:#00724f}tr.warning td:first-child{color:#8a5a00}tr.bad td:first-child{color:#b3261e;font-weight:600}\
 .note{padding:10px 14px;border-left:4px solid #9aa3ae;background:#f5f7f9;border-radius:0 6px 6px 0;margin:12px 0}\
 .note.good{border-color:#009e73;background:#eaf6f1}.note.warning{border-color:#d99a00;background:#fdf6e3}.note.bad{border-color:#c8372d;background:#fcecea}\

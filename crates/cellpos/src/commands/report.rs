@@ -126,7 +126,11 @@ fn notes(reader: &RunReader) -> Option<String> {
 }
 
 fn nm(um: Option<f64>) -> String {
-    um.map_or_else(|| "-".to_string(), |um| format!("{:.1}", um * 1e3))
+    // What rounds to nothing has no sign.
+    um.map_or_else(
+        || "-".to_string(),
+        |um| format!("{:.1}", (um * 1e4).round() / 10.0 + 0.0),
+    )
 }
 
 /// How a session ended.

@@ -117,17 +117,25 @@ fn course(thirds: &[MapRow]) -> Option<String> {
     if let [a, _, c] = excess[..] {
         let most = a.max(c);
         if most > 0.0 {
+            // Less than a thousandth is none: a ratio to it would be one to noise.
+            let next_to_none = |part: f64, of: f64| part < 1e-3 * of;
             return Some(if a > 0.5 * c && c > 0.5 * a {
                 "from the start and evenly in time".to_owned()
+            } else if next_to_none(a, c) {
+                "growing in time: the last third of the records has excess, the first next to none"
+                    .to_owned()
+            } else if next_to_none(c, a) {
+                "fading in time: the first third of the records has excess, the last next to none"
+                    .to_owned()
             } else if c > a {
                 format!(
                     "growing in time: the last third of the records has {:.1} times the excess of the first",
-                    c / a.max(1e-3 * c)
+                    c / a
                 )
             } else {
                 format!(
                     "fading in time: the first third of the records has {:.1} times the excess of the last",
-                    a / c.max(1e-3 * a)
+                    a / c
                 )
             });
         }

@@ -79,7 +79,8 @@ pub fn bode(name: &str, caption: &str, result: &Identification, high_hz: f64) ->
         .bode_series(
             Series::intervals("measured", &f, &gain, &gain_low, &gain_high),
             Series::intervals(
-                "measured, delay taken off",
+                // One legend for both panels: the same words in both.
+                "measured",
                 &f,
                 &phase,
                 &phase_low,
@@ -87,7 +88,7 @@ pub fn bode(name: &str, caption: &str, result: &Identification, high_hz: f64) ->
             ),
         )
         .bode_series(
-            Series::points("measured", &[], &[]),
+            Series::points("measured, delay left in", &[], &[]),
             Series::points("measured, delay left in", &f, &delayed),
         )
 }
@@ -254,9 +255,13 @@ pub fn delay_test(
                 &low_ms,
                 &high_ms,
             ))
-            .horizontal(
-                led.estimate.delay_s * 1e3,
-                &format!("{:.3} ms", led.estimate.delay_s * 1e3),
+            .series(
+                Series::line(
+                    &format!("all together: {:.3} ms", led.estimate.delay_s * 1e3),
+                    &[0.0, number.last().copied().unwrap_or(0.0)],
+                    &[led.estimate.delay_s * 1e3; 2],
+                )
+                .dashed(),
             ),
         )
 }

@@ -352,10 +352,7 @@ fn row(table: &mut Table, quantity: &Quantity, motion: &str, found: &Trend) {
         &found.cycles.to_string(),
         &with_interval(found.first.mean, found.first.ci95),
         &with_interval(found.last.mean, found.last.ci95),
-        &format!(
-            "{:.1e}\u{a0}±\u{a0}{:.0e}",
-            found.per_cycle, found.ci95_per_cycle
-        ),
+        &change(found.per_cycle, found.ci95_per_cycle),
         if found.is_significant() {
             "yes"
         } else {
@@ -380,4 +377,12 @@ fn flags(page: &mut Report, rows: &[CycleRow]) {
         table.row([word.as_str(), &count.to_string()]);
     }
     page.table(table);
+}
+
+/// A change per cycle with half its interval; a quantity that never changes has none.
+fn change(per_cycle: f64, ci95: f64) -> String {
+    if per_cycle == 0.0 && ci95 == 0.0 {
+        return "0".to_owned();
+    }
+    format!("{per_cycle:.1e}\u{a0}±\u{a0}{ci95:.0e}")
 }

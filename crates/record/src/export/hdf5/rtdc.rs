@@ -283,7 +283,7 @@ mod tests {
     #[test]
     fn the_flow_is_the_mean_speed_of_the_cell_times_the_section_of_the_channel() {
         let mut all = Events::default();
-        let row = |ms: u64, position_um: f64| {
+        let row = |ms: i64, position_um: f64| {
             let mut tick = cellpos_runtime::TickRecord::unknown();
             (tick.mid_exposure_ns, tick.measured_um) = (ms * 1_000_000, position_um);
             Row {
@@ -292,10 +292,10 @@ mod tests {
                 offset_ns: 0,
             }
         };
-        // To and fro at 100 um/s for two seconds, with a pause of a second between.
+        // To and fro at 100 um/s for two seconds, with a pause of a second between; a step with a turn in it is too short by half.
         for ms in (0..1000).chain(2000..3000) {
-            let phase = (ms % 200) as f64 * 1e-3;
-            all.add(&row(ms, 100.0 * phase.min(0.2 - phase)));
+            let phase = (ms % 1000) as f64 * 1e-3;
+            all.add(&row(ms, 100.0 * phase.min(1.0 - phase)));
         }
         assert_eq!(all.count, 2000);
         let speed = all.speed_um_per_s();
