@@ -1,7 +1,9 @@
 //! Benchmarks with conditions and competitors: what they share.
 #![forbid(unsafe_code)]
 
+pub mod adaptation;
 pub mod live_page;
+pub mod parallel;
 pub mod simulated;
 
 use cellpos_control::{ControllerFile, ControllerKind, Pi, Profile};

@@ -1,5 +1,6 @@
 //! One tick of the loop: estimate, control law, limits.
 
+use crate::adapt::{AdaptState, Adaptation, Adapter, Told, Tuning};
 use crate::error::BuildError;
 use crate::estimator::{Estimate, Estimator, EstimatorState, Fix};
 use crate::law::{ControlLaw, FAR_UM, LawInput, LawOutput};
@@ -17,6 +18,8 @@ pub struct LoopState<S> {
     pub previous_um: f64,
     /// Part of it that was learned and that the estimator was not told of, um.
     pub hidden_um: f64,
+    /// Estimate of the plant and the tuning in force, where the loop adapts.
+    pub adapt: Option<AdaptState>,
 }
 
 /// Estimator, control law and limits. Immutable; the state is apart.
@@ -40,6 +43,7 @@ pub struct LoopState<S> {
 pub struct ControlLoop<L> {
     parts: LoopParts<L>,
     estimator: Estimator,
+    adapter: Option<Adapter>,
 }
 
 /// A tick between estimate and command.
@@ -47,6 +51,8 @@ struct Tick<'a> {
     law: LawInput<'a>,
     /// The law decides; otherwise the mode does.
     controls: bool,
+    /// The fix that came.
+    fix: Option<Fix>,
     /// The measurement or the reference was not a number that a position can be.
     not_finite: bool,
 }
@@ -58,8 +64,14 @@ impl<L: ControlLaw> ControlLoop<L> {
     /// [`BuildError`] naming the parameter.
     pub fn new(parts: LoopParts<L>) -> Result<Self, BuildError> {
         parts.limits.validate()?;
+        let (config, model) = (parts.estimator, parts.model);
+        let adapter = config
+            .adapt
+            .then(|| Adapter::new(config, model))
+            .transpose()?;
         Ok(Self {
-            estimator: Estimator::new(parts.estimator, parts.model)?,
+            estimator: Estimator::new(config, model)?,
+            adapter,
             parts,
         })
     }
@@ -87,6 +99,59 @@ impl<L: ControlLaw> ControlLoop<L> {
             law: self.parts.controller.start(command),
             previous_um: command,
             hidden_um: 0.0,
+            adapt: self.adapter.map(|adapter| adapter.start(command)),
+        }
+    }
+
+    /// What is known of the plant, and the tuning in force; `None` where the loop does not adapt.
+    pub fn adaptation(&self, state: &LoopState<L::State>) -> Option<Adaptation> {
+        let adapter = self.adapter.as_ref()?;
+        Some(adapter.adaptation(state.adapt.as_ref()?))
+    }
+
+    /// Displacement at which the bead rests, um of PZT.
+    pub fn neutral_um(&self, state: &LoopState<L::State>) -> f64 {
+        state.estimator.neutral_um / self.tuning(state).gain
+    }
+
+    /// The columns of adaptation after a tick.
+    pub(crate) fn record_adaptation(&self, state: &LoopState<L::State>, out: &mut [f32]) {
+        if let (Some(adapter), Some(adapt)) = (&self.adapter, &state.adapt) {
+            adapter.record(adapt, out);
+        }
+    }
+
+    fn tuning(&self, state: &LoopState<L::State>) -> Tuning {
+        match (&self.adapter, &state.adapt) {
+            (Some(adapter), Some(adapt)) => adapter.tuning(adapt),
+            _ => Tuning::default(),
+        }
+    }
+
+    /// The estimator of the delay in force.
+    fn estimator_of(&self, state: &LoopState<L::State>) -> &Estimator {
+        match (&self.adapter, &state.adapt) {
+            (Some(adapter), Some(adapt)) => adapter.estimator(adapt),
+            _ => &self.estimator,
+        }
+    }
+
+    /// After the command of a tick: what it and the fix tell of the plant. A tuning that moved takes the states of estimator
+    /// and law with it, so that the position believed and the command go on where they were.
+    fn adapt(&self, state: &mut LoopState<L::State>, told: &Told) {
+        let (before, from) = (self.tuning(state), *self.estimator_of(state));
+        let (Some(adapter), Some(adapt)) = (&self.adapter, &mut state.adapt) else {
+            return;
+        };
+        adapter.step(adapt, told);
+        let (now, to) = (adapter.tuning(adapt), *adapter.estimator(adapt));
+        if from.model() != to.model() {
+            from.retime(&mut state.estimator, &to);
+        }
+        let ratio = now.gain / before.gain;
+        if ratio != 1.0 {
+            to.rescale(&mut state.estimator, ratio);
+            self.parts.controller.rescale(&mut state.law, ratio);
         }
     }
 
@@ -119,12 +184,13 @@ impl<L: ControlLaw> ControlLoop<L> {
     pub fn step(&self, state: &mut LoopState<L::State>, input: &LoopInput) -> LoopOutput {
         let law = &self.parts.controller;
         let tick = self.estimate(state, input);
+        let gain = tick.law.tuning.gain;
         let decided = if tick.controls {
             law.step(&mut state.law, &tick.law)
         } else {
             LawOutput::wish(match input.mode {
-                Mode::Park => self.parts.limits.park_um,
-                Mode::Direct(displacement_um) => displacement_um,
+                Mode::Park => self.parts.limits.park_um * gain,
+                Mode::Direct(displacement_um) => displacement_um * gain,
                 Mode::Run | Mode::Freeze => tick.law.estimate.neutral_um,
             })
         };
@@ -139,40 +205,56 @@ impl<L: ControlLaw> ControlLoop<L> {
         let output = self.limit(state, input, &tick, &decided, added_um);
         if tick.controls {
             // The excitation is no saturation: an integrator must not be pulled along with it.
-            let applied_um = output.command_um - added_um;
+            let applied_um = (output.command_um - added_um) * gain;
             law.applied(&mut state.law, &tick.law, decided.wish_um, applied_um);
         } else {
-            law.follow(&mut state.law, &tick.law, output.command_um);
+            law.follow(&mut state.law, &tick.law, output.command_um * gain);
         }
         // With a feed-forward of its own the loop asks for what moves the model along the reference; what is learned makes
         // the bead do the same, so the estimator is not told of it. Without one the learned part is what moves the bead,
         // and an estimator that does not know of it refuses fixes and takes the bead for stuck.
         let hidden_um = if law.feeds_forward() { learned_um } else { 0.0 };
         self.estimator
-            .push(&mut state.estimator, output.command_um - hidden_um);
+            .push(&mut state.estimator, (output.command_um - hidden_um) * gain);
         state.previous_um = output.command_um;
         state.hidden_um = hidden_um;
+        if state.adapt.is_some() {
+            let estimate = &tick.law.estimate;
+            let told = Told {
+                fix: tick.fix,
+                command_um: output.command_um,
+                free: tick.controls && !estimate.stuck && !output.flags.not_finite,
+            };
+            self.adapt(state, &told);
+        }
         output
     }
 
     /// A tick that never came: the command was held and the bead moved on. The estimator follows; integrator and
     /// feed-forward stay where they are, so that a step in progress goes on as it was.
     pub fn skip(&self, state: &mut LoopState<L::State>) {
-        self.estimator.step(&mut state.estimator, None);
+        let estimator = *self.estimator_of(state);
+        estimator.step(&mut state.estimator, None);
         // What the estimator was told of the command; a learned part of it is held as well.
         let held_um = state.estimator.history_um[0];
         self.estimator.push(&mut state.estimator, held_um);
         self.parts.controller.skip(&mut state.law);
+        if let (Some(adapter), Some(adapt)) = (&self.adapter, &mut state.adapt) {
+            adapter.skip(adapt, state.previous_um);
+        }
     }
 
     /// Estimate and reference of a tick.
     fn estimate<'a>(&self, state: &mut LoopState<L::State>, input: &LoopInput<'a>) -> Tick<'a> {
         let fix = input.measurement.as_ref().and_then(|m| self.fix(m));
-        let mut estimate: Estimate = self.estimator.step(&mut state.estimator, fix);
+        let tuning = self.tuning(state);
+        let estimator = self.estimator_of(state);
+        let mut estimate: Estimate = estimator.step(&mut state.estimator, fix);
         let Limits {
             low_um, high_um, ..
         } = self.parts.limits;
-        state.estimator.neutral_um = state.estimator.neutral_um.clamp(low_um, high_um);
+        let (low, high) = (low_um * tuning.gain, high_um * tuning.gain);
+        state.estimator.neutral_um = state.estimator.neutral_um.clamp(low, high);
         estimate.neutral_um = state.estimator.neutral_um;
         estimate.now.n = state.estimator.neutral_um;
         // What a PI controller sees: the fix itself where there is one, else what the model says it would be.
@@ -183,6 +265,7 @@ impl<L: ControlLaw> ControlLoop<L> {
         let reference_ok = input.reference_um.abs() < FAR_UM;
         Tick {
             controls: input.mode == Mode::Run && reference_ok && estimate.seen,
+            fix,
             not_finite: !reference_ok || (input.measurement.is_some() && fix.is_none()),
             law: LawInput {
                 reference_um: if reference_ok {
@@ -193,7 +276,8 @@ impl<L: ControlLaw> ControlLoop<L> {
                 preview_um: input.preview_um,
                 bead_um,
                 estimate,
-                previous_um: state.previous_um - state.hidden_um,
+                previous_um: (state.previous_um - state.hidden_um) * tuning.gain,
+                tuning,
                 solver: input.solver,
             },
         }
@@ -209,11 +293,14 @@ impl<L: ControlLaw> ControlLoop<L> {
         added_um: f64,
     ) -> LoopOutput {
         let estimate = &tick.law.estimate;
-        let requested_um = decided.wish_um + added_um;
+        // From the law's units to those of the PZT.
+        let gain = tick.law.tuning.gain;
+        let neutral_um = estimate.neutral_um / gain;
+        let requested_um = decided.wish_um / gain + added_um;
         let mut wanted_um = requested_um;
-        let most = estimate.authority_um;
+        let most = estimate.authority_um / gain;
         if most.is_finite() && input.mode == Mode::Run {
-            wanted_um = wanted_um.clamp(estimate.neutral_um - most, estimate.neutral_um + most);
+            wanted_um = wanted_um.clamp(neutral_um - most, neutral_um + most);
         }
         let sample_s = self.parts.model.sample_time_s;
         let limited = self.parts.limits.apply(
@@ -228,7 +315,7 @@ impl<L: ControlLaw> ControlLoop<L> {
             requested_um,
             estimate_um: estimate.position_um,
             predicted_measurement_um: estimate.predicted_measurement_um,
-            neutral_um: estimate.neutral_um,
+            neutral_um,
             innovation_um: estimate.innovation_um,
             flags: LoopFlags {
                 range_limited: limited.range,

@@ -1,5 +1,6 @@
 //! A loop with any law behind one type, and the laws of this crate by their configuration.
 
+use crate::adapt::{ADAPT_COLUMNS, Adaptation};
 use crate::control_loop::{ControlLoop, LoopState};
 use crate::error::BuildError;
 use crate::estimator::{EstimatorConfig, EstimatorState};
@@ -53,6 +54,8 @@ trait AnyLoop: std::fmt::Debug + Send {
     fn skip(&mut self);
     fn estimator(&self) -> &EstimatorState;
     fn previous_command_um(&self) -> f64;
+    fn neutral_um(&self) -> f64;
+    fn adaptation(&self) -> Option<Adaptation>;
     fn record(&self, out: &mut [f32; LAW_COLUMNS]);
 }
 
@@ -85,10 +88,19 @@ impl<L: ControlLaw> AnyLoop for Running<L> {
         self.state.previous_um
     }
 
+    fn neutral_um(&self) -> f64 {
+        self.control.neutral_um(&self.state)
+    }
+
+    fn adaptation(&self) -> Option<Adaptation> {
+        self.control.adaptation(&self.state)
+    }
+
     fn record(&self, out: &mut [f32; LAW_COLUMNS]) {
-        if let Some(own) = out.get_mut(..self.columns) {
+        if let Some((own, rest)) = out.split_at_mut_checked(self.columns) {
             let law = &self.control.parts().controller;
             law.record(&self.state.law, own);
+            self.control.record_adaptation(&self.state, rest);
         }
     }
 }
@@ -100,7 +112,7 @@ pub struct Controller {
     settings: LoopParts<()>,
     preview_len: usize,
     optimises: bool,
-    columns: &'static [&'static str],
+    columns: Vec<&'static str>,
 }
 
 impl Controller {
@@ -129,8 +141,12 @@ impl Controller {
     /// [`BuildError`] naming the parameter, or a column of the law that no record can have.
     pub fn with_law<L: ControlLaw>(parts: LoopParts<L>) -> Result<Self, BuildError> {
         let law = &parts.controller;
-        let columns = law.columns();
-        check_columns(columns)?;
+        let own = law.columns();
+        let mut columns = own.to_vec();
+        if parts.estimator.adapt {
+            columns.extend(ADAPT_COLUMNS);
+        }
+        check_columns(&columns)?;
         let (preview_len, optimises) = (law.preview_len(), law.optimises());
         let settings = LoopParts {
             model: parts.model,
@@ -145,7 +161,7 @@ impl Controller {
             running: Box::new(Running {
                 control,
                 state,
-                columns: columns.len(),
+                columns: own.len(),
             }),
             settings,
             preview_len,
@@ -164,9 +180,19 @@ impl Controller {
         self.running.start(command_um, neutral_um);
     }
 
-    /// The estimator as it stands.
+    /// The estimator as it stands; its displacements are those of the PZT times the gain in force ([`crate::Tuning::gain`]).
     pub fn estimator(&self) -> &EstimatorState {
         self.running.estimator()
+    }
+
+    /// Displacement at which the bead rests, as far as it is known, um.
+    pub fn neutral_um(&self) -> f64 {
+        self.running.neutral_um()
+    }
+
+    /// What is known of gain and delay of the plant, and the tuning in force; `None` where the loop does not adapt.
+    pub fn adaptation(&self) -> Option<Adaptation> {
+        self.running.adaptation()
     }
 
     /// Command of the previous tick, um.
@@ -185,8 +211,8 @@ impl Controller {
     }
 
     /// Names of the law's own columns in the record.
-    pub fn columns(&self) -> &'static [&'static str] {
-        self.columns
+    pub fn columns(&self) -> &[&'static str] {
+        &self.columns
     }
 
     /// Values of these columns after a tick; NaN where there is no column.

@@ -42,6 +42,7 @@
 //! # Ok::<(), BuildError>(())
 //! ```
 
+use crate::adapt::Tuning;
 use crate::estimator::Estimate;
 use std::fmt::Debug;
 
@@ -62,6 +63,8 @@ pub struct LawInput<'a> {
     pub estimate: Estimate,
     /// Command in force before this tick, less what was learned and the model does not know, um.
     pub previous_um: f64,
+    /// Gain and delay of the plant over those of the design. Without adaptation both are 1.
+    pub tuning: Tuning,
     /// How long an optimiser may take.
     pub solver: SolverTerms,
 }
@@ -139,6 +142,10 @@ pub trait ControlLaw: Debug + Send + 'static {
     /// A tick that something else decides (freeze, park, arming, no bead seen yet): `command_um` is what it commanded. A
     /// law with memory follows, so that it takes over without a bump.
     fn follow(&self, _state: &mut Self::State, _input: &LawInput, _command_um: f64) {}
+
+    /// The gain in force has changed by a factor between two ticks ([`Tuning::gain`]): displacements that the state keeps
+    /// (not positions of the bead) are to be multiplied by it, so that the law goes on without a bump.
+    fn rescale(&self, _state: &mut Self::State, _ratio: f64) {}
 
     /// A tick that never came: the command was held.
     fn skip(&self, _state: &mut Self::State) {}

@@ -22,6 +22,7 @@
 #![forbid(unsafe_code)]
 
 pub mod active_set;
+mod adapt;
 mod config;
 mod control_loop;
 mod controller;
@@ -46,6 +47,7 @@ mod simulation;
 mod toml_file;
 mod uncertainty;
 
+pub use adapt::{ADAPT_COLUMNS, AdaptMode, AdaptNews, AdaptState, Adaptation, Tuning};
 pub use config::{ControllerFile, ControllerKind, PiFile};
 pub use control_loop::{ControlLoop, LoopState};
 pub use controller::{Controller, ControllerConfig, LoopConfig};

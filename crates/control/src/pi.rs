@@ -4,6 +4,7 @@
 //! Tustin's rule, whose phase is that of the continuous one.
 //! Gains: `kp` in um of PZT per um of bead, `ki` in 1/s (um of PZT per um of bead and second).
 
+use crate::adapt::Tuning;
 use crate::error::{BuildError, check};
 use crate::law::{ControlLaw, FAR_UM, LawInput, LawOutput};
 use serde::{Deserialize, Serialize};
@@ -127,6 +128,7 @@ pub struct PiState {
 pub struct PiLaw {
     config: Pi,
     lead: Option<(f64, f64, f64)>,
+    sample_time_s: f64,
     integral_per_tick: f64,
     tracking_per_tick: f64,
 }
@@ -141,15 +143,16 @@ impl PiLaw {
         Ok(Self {
             config,
             lead: config.lead.map(|l| l.coefficients(sample_time_s)),
+            sample_time_s,
             integral_per_tick: config.ki_per_s * sample_time_s,
             tracking_per_tick: (sample_time_s / config.tracking_time_s).min(1.0),
         })
     }
 
     /// The proportional part, um of PZT; advances the lead's memory.
-    fn proportional(&self, state: &mut PiState, reference_um: f64, bead_um: f64) {
+    fn proportional(&self, state: &mut PiState, reference_um: f64, bead_um: f64, tuning: &Tuning) {
         let error = self.config.setpoint_weight * reference_um - bead_um;
-        let shaped = match self.lead {
+        let shaped = match self.lead_of(tuning) {
             Some((b0, b1, a1)) => {
                 let out = b0 * error + state.lead_um;
                 state.lead_um = b1 * error - a1 * out;
@@ -157,7 +160,25 @@ impl PiLaw {
             }
             None => error,
         };
-        state.proportional_um = self.config.kp * shaped;
+        state.proportional_um = self.config.kp / tuning.delay * shaped;
+    }
+
+    /// Coefficients of the lead for the delay in force: all times of the loop go with it.
+    fn lead_of(&self, tuning: &Tuning) -> Option<(f64, f64, f64)> {
+        if tuning.delay == 1.0 {
+            return self.lead;
+        }
+        let lead = self.config.lead?;
+        let slower = Lead {
+            zero_hz: lead.zero_hz / tuning.delay,
+            pole_hz: lead.pole_hz / tuning.delay,
+        };
+        Some(slower.coefficients(self.sample_time_s))
+    }
+
+    /// Integral gain per tick for the delay in force.
+    fn integral_per_tick(&self, tuning: &Tuning) -> f64 {
+        self.integral_per_tick / (tuning.delay * tuning.delay)
     }
 
     /// Makes the next proportional + integral output equal to `command_um` (bumpless return to control).
@@ -188,11 +209,11 @@ impl ControlLaw for PiLaw {
     }
 
     fn step(&self, state: &mut PiState, input: &LawInput) -> LawOutput {
-        self.proportional(state, input.reference_um, input.bead_um);
+        self.proportional(state, input.reference_um, input.bead_um, &input.tuning);
         let growth_um = if input.hold() {
             0.0
         } else {
-            0.5 * self.integral_per_tick * (input.reference_um - input.bead_um)
+            0.5 * self.integral_per_tick(&input.tuning) * (input.reference_um - input.bead_um)
         };
         LawOutput::wish(state.proportional_um + (state.integral_um + growth_um))
     }
@@ -202,17 +223,22 @@ impl ControlLaw for PiLaw {
         let growth = if input.hold() {
             0.0
         } else {
-            self.integral_per_tick * (input.reference_um - input.bead_um)
+            self.integral_per_tick(&input.tuning) * (input.reference_um - input.bead_um)
         };
-        state.integral_um += growth + (applied_um - wish_um) * self.tracking_per_tick;
+        state.integral_um +=
+            growth + (applied_um - wish_um) * self.tracking_per_tick / input.tuning.delay;
         Self::sound(state, applied_um);
     }
 
     /// While something else decides, PI follows as if the reference were where the bead is: the way from there to the
     /// reference is then a step like any other once PI takes over, not an offset for the integrator alone.
     fn follow(&self, state: &mut PiState, input: &LawInput, command_um: f64) {
-        self.proportional(state, input.bead_um, input.bead_um);
+        self.proportional(state, input.bead_um, input.bead_um, &input.tuning);
         self.track(state, command_um);
+    }
+
+    fn rescale(&self, state: &mut PiState, ratio: f64) {
+        state.integral_um *= ratio;
     }
 
     fn columns(&self) -> &'static [&'static str] {

@@ -69,6 +69,12 @@ pub struct SimulatedRig {
     pub drift_um_per_s: f64,
     /// Something holds the bead.
     pub stuck: bool,
+    /// Factor on the gain of the plant from now on; 1 at the start.
+    pub gain: f64,
+    /// Ticks by which fixes are older from now on than they are said to be, at most 7; 0 at the start.
+    pub late_ticks: usize,
+    /// What fixes without noise showed at this tick and those before, newest first, um.
+    shown: [f64; 8],
     held: Option<(f64, VecDeque<f64>)>,
     random: Gaussian,
 }
@@ -94,6 +100,9 @@ impl SimulatedRig {
             fraction: (samples - whole).max(0.0),
             drift_um_per_s: 0.0,
             stuck: false,
+            gain: 1.0,
+            late_ticks: 0,
+            shown: [0.0; 8],
             held: None,
             random: Gaussian::new(config.seed),
             config,
@@ -126,6 +135,8 @@ impl SimulatedRig {
             .as_ref()
             .and_then(|(_, past)| past.get(self.whole).copied())
             .unwrap_or(free);
+        self.shown[0] = position_um;
+        let position_um = *self.shown.get(self.late_ticks).unwrap_or(&position_um);
         let noise = self.config.fix_noise_um;
         Measurement {
             position_um: position_um + noise * self.random.draw(),
@@ -137,7 +148,8 @@ impl SimulatedRig {
 
     /// Holds a command for one tick.
     pub fn advance(&mut self, command_um: f64) {
-        let drive = command_um - self.config.neutral_um;
+        let drive = (command_um - self.config.neutral_um) * self.gain;
+        self.shown.copy_within(0..7, 1);
         let (now, _) = self.walk.front().copied().unwrap_or_default();
         let before = self.free_um();
         self.truth.step(&mut self.truth_state, drive);

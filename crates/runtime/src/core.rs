@@ -390,6 +390,17 @@ impl<R: ReferenceGenerator> Core<R> {
             (fix.position_um, age)
         }));
         self.watch_plant(fix, &output, tick);
+        if let Some(news) = self.controller.adaptation().and_then(|now| now.news) {
+            let ms = |samples: f64| samples * self.sample_s * 1e3;
+            tick.event(EventKind::Adapted {
+                gain_before: news.gain[0],
+                gain: news.gain[1],
+                delay_before_ms: ms(news.delay_samples[0]),
+                delay_ms: ms(news.delay_samples[1]),
+                over_s: news.ticks as f64 * self.sample_s,
+                retreat: news.retreat,
+            });
+        }
         (output, generated)
     }
 

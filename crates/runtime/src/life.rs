@@ -273,6 +273,21 @@ pub enum EventKind {
         /// Lag that the model lacks, ms; NaN where it is not known.
         lag_ms: f64,
     },
+    /// The loop was tuned to another gain or delay of the plant.
+    Adapted {
+        /// Gain that it was tuned to, over the model's.
+        gain_before: f64,
+        /// Gain that it is tuned to.
+        gain: f64,
+        /// Delay beyond the model's that it was tuned to, ms.
+        delay_before_ms: f64,
+        /// Delay that it is tuned to.
+        delay_ms: f64,
+        /// Time that the change took, s.
+        over_s: f64,
+        /// What was found is no plant: the design is in force again.
+        retreat: bool,
+    },
     /// The bead does not follow the PZT.
     StuckStarted,
     /// It follows again.

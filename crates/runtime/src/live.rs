@@ -198,7 +198,8 @@ fn finished<S>(
             &statistics,
             control.period_us,
         )
-        .with_unkept(&recorder),
+        .with_unkept(&recorder)
+        .with_adaptation(control.adaptation),
         recorder,
         conditions,
         learned: control.learned,

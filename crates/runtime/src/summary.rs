@@ -7,6 +7,7 @@ use crate::recording::RecorderReport;
 use crate::reference::Stage;
 use crate::tick_record::{TickFlags, TickRecord};
 use crate::ticker::Account;
+use cellpos_control::Adaptation;
 use serde::Serialize;
 
 /// Running sums of one error.
@@ -321,6 +322,9 @@ pub struct Summary {
     pub fix_noise_nm: Option<f64>,
     /// The move to the first reference; `None` when the bead was there already.
     pub step: Option<StepResult>,
+    /// What was known of gain and delay of the plant at the end, and what the loop was tuned to; `None` where it does not adapt.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub adaptation: Option<Adaptation>,
     /// Median loop delay: exposure to command, and half a period of hold, ms.
     pub loop_delay_ms: f64,
     /// From the start of a tick to the hand-over of its command, us.
@@ -352,6 +356,12 @@ impl Summary {
         self
     }
 
+    /// The same figures with what adaptation came to.
+    #[must_use]
+    pub fn with_adaptation(self, adaptation: Option<Adaptation>) -> Self {
+        Self { adaptation, ..self }
+    }
+
     /// Joins what the control thread and the records say.
     pub fn new(
         life: Life,
@@ -378,6 +388,7 @@ impl Summary {
             peak_error_nm: (statistics.measured.n > 0).then_some(statistics.measured.peak * 1e3),
             fix_noise_nm: statistics.fix_noise_um().map(|um| um * 1e3),
             step: statistics.step_result(),
+            adaptation: None,
             loop_delay_ms: account.exposure_to_command.quantiles_us().p50 * 1e-3
                 + 0.5e-3 * period_us,
             tick_us: account.tick.quantiles_us(),

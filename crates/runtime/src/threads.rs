@@ -11,7 +11,7 @@ use crate::reference::ReferenceGenerator;
 use crate::run::{EndRule, EndWatch, RunError, serve_actuator};
 use crate::summary::End;
 use crate::ticker::{Account, Order, Ticker};
-use cellpos_control::LearnedTable;
+use cellpos_control::{Adaptation, LearnedTable};
 use cellpos_rig::{Actuator, ActuatorReport, Clock, Measurement, PositionSource};
 use rtrb::{Consumer, Producer};
 use std::sync::Arc;
@@ -167,6 +167,7 @@ pub(crate) struct ControlEnd {
     pub(crate) counts: Counts,
     pub(crate) account: Account,
     pub(crate) learned: Vec<Option<LearnedTable>>,
+    pub(crate) adaptation: Option<Adaptation>,
     pub(crate) period_us: f64,
 }
 
@@ -226,6 +227,7 @@ impl<'a, R: ReferenceGenerator> Controlling<'a, R> {
             safe_reason: core.safe_reason(),
             counts: *core.counts(),
             learned: core.learners().tables(),
+            adaptation: core.controller().adaptation(),
             account: self.ticker.account().clone(),
             period_us: core.timing().period_us,
         }

@@ -96,7 +96,8 @@ pub fn run<R: ReferenceGenerator, S: RunSink>(
         &statistics,
         ticker.core().timing().period_us,
     )
-    .with_unkept(&recorded);
+    .with_unkept(&recorded)
+    .with_adaptation(ticker.core().controller().adaptation());
     let conditions = Conditions {
         policy: "virtual clock".to_string(),
         ..Conditions::default()

@@ -24,6 +24,7 @@
 //! ```
 #![forbid(unsafe_code)]
 
+pub mod adapt;
 mod beside;
 pub mod clips;
 pub mod connect;

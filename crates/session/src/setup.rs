@@ -345,6 +345,8 @@ pub fn controller(name: &str, model: &Model, timing: &Timing) -> Result<Controll
     if let Some(config) = &report.config {
         file.estimator = config.estimator;
     }
+    // PI is robust by itself, and robust is what it is chosen for.
+    file.estimator.adapt = kind.is_some();
     Ok(file)
 }
 

@@ -1,5 +1,6 @@
 //! Events of a run as sentences: for the terminal, the page and the report.
 
+use crate::adapt;
 use cellpos_runtime::life::{EventKind, FreezeReason, Refusal, SafeReason};
 
 /// How much an event matters to whoever looks on.
@@ -172,6 +173,19 @@ fn text(kind: &EventKind) -> String {
             gain_ratio,
             lag_ms,
         } => plant_changed(&format!("{verdict:?}"), gain_ratio, lag_ms),
+        EventKind::Adapted {
+            gain_before,
+            gain,
+            delay_before_ms,
+            delay_ms,
+            over_s,
+            retreat,
+        } => adapt::sentence(
+            [gain_before, gain],
+            [delay_before_ms, delay_ms],
+            over_s,
+            retreat,
+        ),
         EventKind::StuckStarted => "The bead does not follow the PZT: it sticks.".to_string(),
         EventKind::StuckEnded { lasted_ms } => ended("The bead follows again", lasted_ms),
         EventKind::SaturationStarted => "The PZT is at an end of its range.".to_string(),

@@ -296,5 +296,7 @@ fn controller_file(request: &DesignRequest, report: &DesignReport) -> Controller
         file.estimator = config.estimator;
         file.limits = config.limits;
     }
+    let kind = file.controller;
+    file.estimator.adapt = matches!(kind, ControllerKind::Lqg | ControllerKind::Mpc);
     file
 }

@@ -21,6 +21,7 @@ use cellpos_runtime::EndRule;
 use cellpos_script::{
     AmplitudeWatch, Check, CheckLimits, CycleRow, CycleTable, Plan, Script, check,
 };
+use cellpos_session::adapt::{self, Adapt};
 use cellpos_session::clips::Clipped;
 use cellpos_session::live_line::Typed;
 use cellpos_session::rig_file::{ActuatorConfig, CameraConfig, ClockKind, Frames, RigFile};
@@ -59,6 +60,10 @@ pub struct Args {
     /// pi, lead, lqg, mpc, or the path of a controller.toml.
     #[arg(long, default_value = "pi")]
     controller: String,
+    /// Whether the law follows the gain and delay of the plant while it runs; left out: lqg and mpc do, pi and lead do not, a
+    /// controller.toml says by itself.
+    #[arg(long, value_enum, conflicts_with = "resume")]
+    adapt: Option<Adapt>,
     /// The rig; left out: emulated.
     #[arg(long)]
     rig: Option<PathBuf>,
@@ -185,8 +190,10 @@ fn fresh(args: &Args) -> Result<Ready, Failure> {
         let dry = if args.dry { "-dry" } else { "" };
         format!("{}{dry}", script.name)
     });
+    let mut prepared = connect::prepare(&args.model, &args.controller, &file)?;
+    adapt::choose(args.adapt, &mut prepared.controller);
     Ok(Ready {
-        prepared: connect::prepare(&args.model, &args.controller, &file)?,
+        prepared,
         file,
         reference,
         clock: args.clock.unwrap_or(clock),

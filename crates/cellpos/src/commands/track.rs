@@ -11,6 +11,7 @@ use cellpos_record::RunWriter;
 use cellpos_runtime::realtime::Conditions;
 use cellpos_runtime::{EndRule, Summary};
 use cellpos_script::ClipWishes;
+use cellpos_session::adapt::{self, Adapt};
 use cellpos_session::clips::Clipped;
 use cellpos_session::cyclic::{self, LearnSpec, Sine};
 use cellpos_session::live_line::{LiveLine, Typed};
@@ -56,6 +57,10 @@ pub struct Args {
     /// Solver of mpc; left out: that of controller.toml, active-set where it names none.
     #[arg(long, value_enum)]
     solver: Option<Solver>,
+    /// Whether the law follows the gain and delay of the plant while it runs; left out: lqg and mpc do, pi and lead do not, a
+    /// controller.toml says by itself.
+    #[arg(long, value_enum)]
+    adapt: Option<Adapt>,
     /// The rig; left out: emulated.
     #[arg(long)]
     rig: Option<PathBuf>,
@@ -137,6 +142,7 @@ pub fn run(args: Args) -> CommandResult {
     };
     let mut prepared = connect::prepare(&args.model, &args.controller, &file)?;
     choose_solver(args.solver, &mut prepared.controller)?;
+    adapt::choose(args.adapt, &mut prepared.controller);
     let mut rig = Rig::open(file, options)?;
     rig.fit(&mut prepared);
     let reach = args.sine.map_or(0.0, |sine| sine.amplitude.value());
@@ -422,6 +428,9 @@ fn text(report: &Report) -> String {
                 step.size_um, step.settling_ms, step.overshoot_percent
             ),
         );
+    }
+    if let Some(now) = &s.adaptation {
+        line("adaptation", adapt::text(now));
     }
     if let Some(learned) = report.learned {
         line("learning", cyclic::learned_text(learned));

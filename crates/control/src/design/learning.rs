@@ -121,6 +121,8 @@ pub fn harmonic_responses(
     let mut config = *config;
     // The simulated rig sees points of the path.
     config.estimator.exposure_ms = 0.0;
+    // The response of the loop as designed, on a plant that may be another.
+    config.estimator.adapt = false;
     if let ControllerConfig::Mpc(mpc, _) = &mut config.controller {
         // Both solvers give the same law; this one takes a tenth of the time.
         mpc.solver = SolverKind::ActiveSet;

@@ -33,6 +33,15 @@ pub struct EstimatorConfig {
     /// Bead speed granted while the bead is taken for stuck, um per tick: bounds the jump when it comes free. Twice that
     /// is granted for 50 ticks afterwards, so that it goes to a far reference without a jerk.
     pub stuck_speed_um_per_tick: f64,
+    /// Gain and delay of the plant are estimated while the loop runs, and the law follows them.
+    #[serde(skip_serializing_if = "is_off")]
+    pub adapt: bool,
+}
+
+/// A file without the key is one that does not adapt.
+#[expect(clippy::trivially_copy_pass_by_ref, reason = "serde calls it so")]
+fn is_off(adapt: &bool) -> bool {
+    !adapt
 }
 
 impl Default for EstimatorConfig {
@@ -50,6 +59,7 @@ impl Default for EstimatorConfig {
             gate_floor_um: 0.5,
             gate_most: 10,
             stuck_speed_um_per_tick: 0.5,
+            adapt: false,
         }
     }
 }

@@ -58,4 +58,19 @@ impl Transition {
         }
         next
     }
+
+    /// The state before a tick that [`Transition::advance`] made, with the command of that tick.
+    pub(super) fn retreat(&self, m: &PredictedState, command_um: f64) -> PredictedState {
+        let drive = command_um - m.n;
+        let mut before = PredictedState {
+            q: m.q - self.gain * drive,
+            ..*m
+        };
+        for ((x, a), b) in before.modes.iter_mut().zip(&self.a).zip(&self.b) {
+            if *a > 0.0 {
+                *x = (*x - b * drive) / a;
+            }
+        }
+        before
+    }
 }

@@ -87,6 +87,17 @@ impl MpcLaw {
         Ok(this)
     }
 
+    /// Range and slew (um per tick) in the units of the gain in force.
+    fn limits_of(&self, input: &LawInput) -> (Limits, f64) {
+        let gain = input.tuning.gain;
+        let limits = Limits {
+            low_um: self.limits.low_um * gain,
+            high_um: self.limits.high_um * gain,
+            ..self.limits
+        };
+        (limits, self.most_move_um * gain)
+    }
+
     /// The sides of rows that a problem of this loop can reach.
     fn sides(&self) -> Vec<Side> {
         let both = |row: usize| [true, false].map(|upper| Side { row, upper });
@@ -205,6 +216,7 @@ impl MpcLaw {
     /// Feed-forward along the preview, kept within range and slew; the model on the reference follows what was kept.
     fn reference_plan(&self, state: &MpcState, input: &LawInput) -> ReferencePlan {
         let neutral = input.estimate.neutral_um;
+        let (limits, most_move_um) = self.limits_of(input);
         let mut on = state.on_reference;
         let mut plan = ReferencePlan {
             command: [0.0; HORIZON],
@@ -217,8 +229,8 @@ impl MpcLaw {
             let last = on.last_um;
             let wanted = self.forward.wanted(&on, next);
             let command = wanted
-                .clamp(last - self.most_move_um, last + self.most_move_um)
-                .clamp(self.limits.low_um - neutral, self.limits.high_um - neutral);
+                .clamp(last - most_move_um, last + most_move_um)
+                .clamp(limits.low_um - neutral, limits.high_um - neutral);
             self.forward.drive(&mut on, command);
             plan.command[i] = command;
             plan.reference[i] = next;
@@ -236,7 +248,7 @@ impl MpcLaw {
         s: &[f64; DEVIATION],
         reference: &ReferencePlan,
     ) -> QpVectors {
-        let limits = &self.limits;
+        let (limits, most_move_um) = self.limits_of(input);
         let neutral = input.estimate.neutral_um;
         let mut v = QpVectors {
             linear: [0.0; VARS],
@@ -269,8 +281,8 @@ impl MpcLaw {
             v.high[b] = limits.high_um - neutral - most;
             // The first block starts from the last command, the others from the reference's last move.
             let jump = commands[0] - before;
-            v.low[VARS + b] = -self.most_move_um - jump;
-            v.high[VARS + b] = self.most_move_um - jump;
+            v.low[VARS + b] = -most_move_um - jump;
+            v.high[VARS + b] = most_move_um - jump;
             start += length;
             before = reference.command[start - 1];
             let at = start - 1;
@@ -332,6 +344,12 @@ impl ControlLaw for MpcLaw {
 
     fn applied(&self, state: &mut MpcState, _input: &LawInput, _wish_um: f64, applied_um: f64) {
         self.pi.track(&mut state.pi, applied_um);
+    }
+
+    fn rescale(&self, state: &mut MpcState, ratio: f64) {
+        state.plan_um.iter_mut().for_each(|um| *um *= ratio);
+        state.corrections.iter_mut().for_each(|um| *um *= ratio);
+        self.pi.rescale(&mut state.pi, ratio);
     }
 
     fn follow(&self, state: &mut MpcState, input: &LawInput, command_um: f64) {

@@ -20,7 +20,10 @@ fn mpc(solver: SolverKind) -> ControllerConfig {
 fn allocations_by_step(controller: ControllerConfig) -> Vec<u64> {
     let config = LoopConfig {
         model: LoopModel::eq6(2e-3),
-        estimator: EstimatorConfig::default(),
+        estimator: EstimatorConfig {
+            adapt: true,
+            ..EstimatorConfig::default()
+        },
         controller,
         limits: Limits {
             slew_um_per_s: 1000.0,

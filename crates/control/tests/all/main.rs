@@ -1,5 +1,6 @@
 //! The laws in closed loop.
 
+mod adaptation;
 mod allocation;
 mod badly_scaled;
 mod common;

@@ -13,7 +13,7 @@ impl<R: ReferenceGenerator> Core<R> {
     pub(super) fn advance_life(&mut self, position_um: Option<f64>, tick: &mut Tick) -> Mode {
         if self.state.life == Life::Armed {
             let held = self.controller.previous_command_um();
-            let neutral_um = self.controller.estimator().neutral_um;
+            let neutral_um = self.controller.neutral_um();
             let told = ArmingInput {
                 position_um,
                 framed: !tick.flags.has(TickFlags::TIMER),

@@ -1,0 +1,114 @@
+//! A loop that holds a bead while the plant changes: its error against the bound of the plant in force, and its margins there.
+
+use cellpos_control::design::{DesignPlant, bound_rms_um, margins};
+use cellpos_control::*;
+
+/// What the plant becomes, over the design's.
+#[derive(Debug, Clone, Copy)]
+pub struct Regime {
+    /// Gain.
+    pub gain: f64,
+    /// Samples by which fixes are older than they are said to be.
+    pub late_ticks: u32,
+    /// Time over which the gain drifts there, s; 0: at once.
+    pub drift_s: f64,
+}
+
+/// How a loop does in a regime.
+#[derive(Debug, Clone, Copy)]
+pub struct Row {
+    /// True hold error from 5 s after the change on, over the lowest possible on that plant.
+    pub over_bound: f64,
+    /// Ms of the law in force on that plant, the largest at a few times from 5 s after the change on.
+    pub ms: f64,
+    /// Largest error from the change on, um.
+    pub peak_um: f64,
+    /// Where adaptation stands at the end.
+    pub adaptation: Option<Adaptation>,
+}
+
+/// Time to adapt and time measured, s.
+const ADAPT_S: f64 = 5.0;
+const MEASURE_S: f64 = 10.0;
+
+/// Ms of the linear equivalent of a law tuned to `gain` and `delay` more samples, on a plant of `regime`; infinite if unstable.
+fn effective_ms(config: &LoopConfig, gain: f64, delay_samples: f64, regime: Regime) -> f64 {
+    let ts = config.model.sample_time_s;
+    let model = LoopModel {
+        delay_s: config.model.delay_s + delay_samples * ts,
+        ..config.model
+    };
+    let law = (config.controller)
+        .linear(&config.estimator, &model)
+        .expect("a law for a delay that was tried");
+    let plant = DesignPlant {
+        sample_time_s: ts,
+        delay_s: config.model.delay_s,
+        ..DesignPlant::eq6(2.5e-3)
+    };
+    let plant = plant
+        .changed(regime.gain / gain, regime.late_ticks)
+        .expect("a gain above 0");
+    let margins = margins(&plant, &law).expect("a plant that can be sampled");
+    if margins.stable {
+        margins.ms
+    } else {
+        f64::INFINITY
+    }
+}
+
+/// Holds a bead through the regimes, one after the other.
+///
+/// # Panics
+/// A loop or a rig that cannot be built: a defect.
+pub fn hold_through(config: LoopConfig, rig: RigConfig, regimes: &[Regime]) -> Vec<Row> {
+    let ts = config.model.sample_time_s;
+    let d_um2_per_s = rig.diffusion_um2_per_s;
+    let mut rig = SimulatedRig::new(rig).expect("a sound rig");
+    let mut controller = Controller::new(config).expect("a sound controller");
+    controller.start(20.0, 20.0);
+    let preview = vec![0.0; controller.preview_len()];
+    let mut gain = 1.0;
+    let ticks = |s: f64| (s / ts).round() as u64;
+    let mut rows = Vec::new();
+    for regime in regimes {
+        let from = gain;
+        let drift = ticks(regime.drift_s);
+        let (settled, end) = (drift + ticks(ADAPT_S), drift + ticks(ADAPT_S + MEASURE_S));
+        let (mut peak_um, mut squares, mut ms) = (0.0_f64, 0.0, 0.0_f64);
+        for tick in 0..end {
+            gain = if tick < drift {
+                from * (regime.gain / from).powf(tick as f64 / drift as f64)
+            } else {
+                regime.gain
+            };
+            rig.gain = gain;
+            rig.late_ticks = regime.late_ticks as usize;
+            let error_um = rig.true_um();
+            peak_um = peak_um.max(error_um.abs());
+            let input = LoopInput {
+                measurement: Some(rig.measure()),
+                preview_um: &preview,
+                ..LoopInput::default()
+            };
+            rig.advance(controller.step(&input).command_um);
+            if tick >= settled {
+                squares += error_um * error_um;
+                if (tick - settled) % ticks(1.0) == 0 {
+                    let now = controller.adaptation();
+                    let (gain, delay) = now.map_or((1.0, 0.0), |a| (a.gain, a.delay_samples));
+                    ms = ms.max(effective_ms(&config, gain, delay, *regime));
+                }
+            }
+        }
+        let delay_s = config.model.delay_s + f64::from(regime.late_ticks) * ts;
+        let rms_um = (squares / (end - settled) as f64).sqrt();
+        rows.push(Row {
+            over_bound: rms_um / bound_rms_um(d_um2_per_s, 0.0, delay_s, ts),
+            ms,
+            peak_um,
+            adaptation: controller.adaptation(),
+        });
+    }
+    rows
+}

@@ -1,0 +1,431 @@
+//! Adaptation: gain and delay of the plant, estimated while the loop runs, and what of them comes into force.
+//!
+//! **Estimate.** The commands drive the model, undisturbed, beside the loop. Its position at the time of each fix, for each of a
+//! few delays ([`window::DELAYS`]), and the fix itself go through one and the same filter: that which makes white noise of
+//! Brownian motion, drift and localisation noise. What is left of the fix is then the gain times what is left of the model's
+//! position, and white noise; gain and delay are a linear regression and a comparison of sums of squares. Nothing has to be
+//! added to the command for that: a loop that holds a bead answers its Brownian motion in every tick, and an answer is
+//! independent of the noise that comes after it. A second of hold at 1 kHz tells the gain to some 5 %.
+//!
+//! **Memory.** Old ticks are forgotten by the excitation of new ones, so that nothing is forgotten at rest. A slow window
+//! holds ten times what a fast one does; where they surely differ the plant has changed, and the slow one begins anew from
+//! the fast.
+//!
+//! **In force.** See [`supervisor`]. The law itself is not made again: a plant of `g` times the gain is the plant of the design
+//! for displacements counted in units of `1/g`, so that estimator, feedback, feed-forward and the plan of MPC stay those of the
+//! design, in other units; the delay changes the estimator, of which there is one for each, and the gains of PI.
+
+mod supervisor;
+mod whiten;
+mod window;
+
+use crate::error::BuildError;
+use crate::estimator::{Estimator, EstimatorConfig, Fix, PredictedState};
+use crate::loop_model::LoopModel;
+use serde::Serialize;
+use supervisor::Force;
+pub use supervisor::{AdaptMode, AdaptNews};
+use whiten::{Track, Whitener};
+use window::{DELAYS, Finding, MEMBERS, NOMINAL, Window};
+
+/// Names of the columns that adaptation adds to a law's own in the record.
+pub const ADAPT_COLUMNS: [&str; 5] = [
+    "adapt_gain",
+    "adapt_delay_samples",
+    "adapt_gain_estimate",
+    "adapt_gain_sd",
+    "adapt_mode",
+];
+
+/// Excitation held by the slow and the fast window.
+const SLOW: f64 = 1500.0;
+const FAST: f64 = 250.0;
+/// Standard uncertainties by which the two must differ for a plant that has changed; noise variances, for its delay.
+const CHANGED: f64 = 4.5;
+const CHANGED_DELAY: f64 = 24.0;
+/// Times the stated wandering of neutral for which the filter makes white noise of it: a real flow wanders more.
+const WANDERS: f64 = 2.0;
+/// Past positions of the model that are kept, ticks.
+const PAST: usize = 24;
+/// A fix so many standard deviations off, over twice what the model moved, is no fix of this bead.
+const OUTLIER: f64 = 6.0;
+/// Outliers in a row after which the series begin anew.
+const OUTLIERS: u8 = 12;
+/// Memory of the check whether what is left is white, ticks.
+const WHITE_TICKS: f64 = 2000.0;
+
+/// Memory of the mean square of what is left now, and of what is usually left, ticks. Where the first is below this part of
+/// the other the bead does not wander: something holds it, whatever else is known.
+const NOW_TICKS: f64 = 100.0;
+const USUAL_TICKS: f64 = 20_000.0;
+const STILL: f64 = 0.65;
+
+/// The tuning in force, as a law is told of it.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Tuning {
+    /// Gain of the plant over the design's. Displacements that a law is given, and those that it answers, are of the PZT
+    /// times this; so are limits of displacement that it keeps by itself.
+    pub gain: f64,
+    /// Loop delay (with the half sample of hold) over the design's.
+    pub delay: f64,
+}
+
+impl Default for Tuning {
+    /// That of the design.
+    fn default() -> Self {
+        Self {
+            gain: 1.0,
+            delay: 1.0,
+        }
+    }
+}
+
+/// Where adaptation stands.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Adaptation {
+    /// Gain in force, over the design's.
+    pub gain: f64,
+    /// Delay in force beyond the design's, samples.
+    pub delay_samples: f64,
+    /// Estimated gain over the model's, and its standard uncertainty; `None` before there was motion enough.
+    pub gain_estimate: Option<[f64; 2]>,
+    /// Estimated delay beyond the design's and its standard uncertainty, samples.
+    pub delay_estimate_samples: Option<[f64; 2]>,
+    /// What the supervisor does.
+    pub mode: AdaptMode,
+    /// A change worth telling of, in this tick.
+    #[serde(skip)]
+    pub news: Option<AdaptNews>,
+}
+
+/// Adaptation for one model. Immutable; the state is apart and `Copy`.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Adapter {
+    estimators: [Option<Estimator>; MEMBERS],
+    nominal: Estimator,
+    whitener: Whitener,
+    /// Whole and fractional samples of the design's delay.
+    delay_samples: f64,
+}
+
+/// State of an [`Adapter`].
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct AdaptState {
+    model: PredictedState,
+    /// Positions of the model at this tick and those before, newest first, um.
+    past_um: [f64; PAST],
+    seen: Option<Track>,
+    moved: [Track; MEMBERS],
+    slow: Window,
+    fast: Window,
+    /// Squares of what is left, and its products with that of the tick before.
+    white: [f64; 2],
+    left_um: f64,
+    /// Mean squares of what is left, now and usually, um^2, and the ticks that they are of.
+    now_um2: f64,
+    usual_um2: f64,
+    ticks: f64,
+    outliers: u8,
+    /// Gain and member of the newest finding.
+    believed: (f64, usize),
+    /// The newest finding.
+    found: Option<Finding>,
+    force: Force,
+    news: Option<AdaptNews>,
+}
+
+/// What the adapter is told of a tick.
+pub(crate) struct Told {
+    /// The fix that came, whether or not it was used.
+    pub fix: Option<Fix>,
+    /// Command that takes effect now, um of PZT.
+    pub command_um: f64,
+    /// The law decides, and nothing holds the bead.
+    pub free: bool,
+}
+
+impl Adapter {
+    /// For a model and the noise of its estimator.
+    ///
+    /// # Errors
+    /// As [`Estimator::new`].
+    pub fn new(config: EstimatorConfig, model: LoopModel) -> Result<Self, BuildError> {
+        let ts = model.sample_time_s;
+        let walk_um2 = 2.0 * config.diffusion_um2_per_s * ts;
+        let wander = WANDERS * config.neutral_walk_um_per_sqrt_s.max(0.01);
+        let drift_um2 = (wander * model.gain_per_s * ts).powi(2) * ts;
+        Ok(Self {
+            estimators: DELAYS.map(|extra| delayed(config, model, extra)),
+            nominal: Estimator::new(config, model)?,
+            whitener: Whitener::new(walk_um2, drift_um2, config.fix_noise_um.powi(2))?,
+            delay_samples: model.delay_samples(),
+        })
+    }
+
+    /// Nothing known, the design in force, everything at rest at a command, um.
+    pub fn start(&self, command_um: f64) -> AdaptState {
+        AdaptState {
+            model: PredictedState {
+                n: command_um,
+                last_um: command_um,
+                ..PredictedState::default()
+            },
+            past_um: [0.0; PAST],
+            seen: None,
+            moved: [Track::default(); MEMBERS],
+            slow: Window::new(FAST, SLOW),
+            fast: Window::new(FAST, FAST),
+            white: [0.0; 2],
+            left_um: 0.0,
+            now_um2: 0.0,
+            usual_um2: 0.0,
+            ticks: 0.0,
+            outliers: 0,
+            believed: (1.0, NOMINAL),
+            found: None,
+            force: Force::default(),
+            news: None,
+        }
+    }
+
+    fn usable(&self) -> [bool; MEMBERS] {
+        self.estimators.map(|one| one.is_some())
+    }
+
+    /// The estimator of the delay in force.
+    pub fn estimator(&self, state: &AdaptState) -> &Estimator {
+        self.estimators
+            .get(state.force.member)
+            .and_then(Option::as_ref)
+            .unwrap_or(&self.nominal)
+    }
+
+    /// The tuning in force.
+    pub fn tuning(&self, state: &AdaptState) -> Tuning {
+        let design = self.delay_samples + 0.5;
+        Tuning {
+            gain: state.force.log_gain.exp(),
+            delay: (design + DELAYS[state.force.member]) / design,
+        }
+    }
+
+    /// Where it stands.
+    pub fn adaptation(&self, state: &AdaptState) -> Adaptation {
+        let found = state.found;
+        Adaptation {
+            gain: state.force.log_gain.exp(),
+            delay_samples: DELAYS[state.force.member],
+            gain_estimate: found.map(|f| [f.gain, f.gain_sd]),
+            delay_estimate_samples: found.map(|f| [f.delay, f.delay_sd]),
+            mode: state.force.mode,
+            news: state.news,
+        }
+    }
+
+    /// Variance of what is left, um^2: at least a quarter of what the noise alone would leave. Of a plant that has just
+    /// changed the slow window fits nothing.
+    fn left_um2(&self, state: &AdaptState) -> f64 {
+        let (expected, usable) = (self.whitener.noise_um2, self.usable());
+        let of = |window: &Window| window.residual_um2(&usable);
+        let least = [of(&state.slow), of(&state.fast)]
+            .into_iter()
+            .flatten()
+            .fold(f64::INFINITY, f64::min);
+        if least.is_finite() {
+            least.max(0.25 * expected)
+        } else {
+            expected
+        }
+    }
+
+    /// The same for an interval: more where it is not white.
+    fn noise_um2(&self, state: &AdaptState) -> f64 {
+        let [rr, rr1] = state.white;
+        let rho = if rr > 0.0 { (rr1 / rr).abs() } else { 0.0 };
+        let coloured = if rho > 0.1 {
+            ((1.0 + rho) / (1.0 - rho).max(0.05)).min(20.0)
+        } else {
+            1.0
+        };
+        coloured * self.left_um2(state)
+    }
+
+    fn finding(&self, window: &Window, state: &AdaptState) -> Option<Finding> {
+        window.finding(&self.usable(), self.noise_um2(state))
+    }
+
+    /// After the command of a tick: learns from the fix, and moves the tuning where it may. The tuning that it leaves is that
+    /// of the next tick.
+    pub fn step(&self, state: &mut AdaptState, told: &Told) {
+        let learned = self.learn(state, told.fix.filter(|_| told.free));
+        self.drive(state, told.command_um);
+        state.news = None;
+        if !told.free {
+            state.force.pause();
+            return;
+        }
+        if learned {
+            self.compare(state);
+            let found = self.finding(&state.slow, state);
+            state.found = found;
+            state.believed = found.map_or(state.believed, |f| (f.gain.max(0.0), f.best));
+            if state.force.follow(found.as_ref(), &self.usable()) {
+                state.found = None;
+                state.slow = Window::new(FAST, SLOW);
+                state.fast = Window::new(FAST, FAST);
+            }
+        }
+        if !learned {
+            state.force.pause();
+        }
+        state.news = state.force.news();
+    }
+
+    /// A tick that never came: the command was held.
+    pub fn skip(&self, state: &mut AdaptState, command_um: f64) {
+        self.learn(state, None);
+        self.drive(state, command_um);
+    }
+
+    /// The model one tick on.
+    fn drive(&self, state: &mut AdaptState, command_um: f64) {
+        state.model = self.nominal.tick_state(&state.model, command_um);
+        state.past_um.copy_within(0..PAST - 1, 1);
+        state.past_um[0] = self.nominal.position(&state.model);
+        if !state.past_um[0].is_finite() {
+            let force = state.force;
+            *state = self.start(command_um);
+            state.force = force;
+        }
+    }
+
+    /// Position of the model so many ticks ago, um: on the line between ticks, as between them the bead moves evenly.
+    fn past(state: &AdaptState, ago: f64) -> Option<f64> {
+        let newer = ago.max(0.0).floor();
+        let (part, newer) = (ago.max(0.0) - newer, newer as usize);
+        let (a, b) = (state.past_um.get(newer)?, state.past_um.get(newer + 1)?);
+        Some(a + part * (b - a))
+    }
+
+    /// One tick of the regression. Whether something was learned.
+    fn learn(&self, state: &mut AdaptState, fix: Option<Fix>) -> bool {
+        let (usable, noise_um2) = (self.usable(), self.left_um2(state));
+        let mut at_um = [0.0; MEMBERS];
+        let mut known = fix.is_some();
+        if let Some(fix) = fix {
+            let ago = self.delay_samples + fix.age as f64 + fix.offset;
+            for ((at, extra), open) in at_um.iter_mut().zip(DELAYS).zip(usable) {
+                match Self::past(state, ago + extra) {
+                    Some(um) => *at = um,
+                    None if open => known = false,
+                    None => {}
+                }
+            }
+        }
+        let Some(fix) = fix.filter(|_| known) else {
+            // What is not seen moves on as it did.
+            if let Some(seen) = &mut state.seen {
+                self.whitener.step(seen, 0.0);
+            }
+            state
+                .moved
+                .iter_mut()
+                .for_each(|m| self.whitener.step(m, 0.0));
+            return false;
+        };
+        let Some(seen) = &mut state.seen else {
+            state.seen = Some(Whitener::begin(fix.position_um));
+            state.moved = at_um.map(Whitener::begin);
+            return false;
+        };
+        let y = Whitener::innovation(seen, fix.position_um);
+        let mut p = [0.0; MEMBERS];
+        for ((p, track), at) in p.iter_mut().zip(&state.moved).zip(at_um) {
+            *p = Whitener::innovation(track, at);
+        }
+        let (gain, member) = state.believed;
+        let left = y - gain * p[member];
+        let sd = noise_um2.sqrt();
+        let outlier = left.abs() > OUTLIER * sd + 2.0 * gain.max(1.0) * p[member].abs();
+        state.outliers = if outlier { state.outliers + 1 } else { 0 };
+        if outlier && state.outliers < OUTLIERS {
+            self.whitener.step(seen, 0.0);
+            state
+                .moved
+                .iter_mut()
+                .for_each(|m| self.whitener.step(m, 0.0));
+            return false;
+        }
+        if outlier {
+            state.seen = None;
+            state.outliers = 0;
+            return false;
+        }
+        let z = seen.drift - gain * state.moved[member].drift;
+        self.whitener.step(seen, y);
+        for (track, p) in state.moved.iter_mut().zip(p) {
+            self.whitener.step(track, p);
+        }
+        if Self::is_still(state, left.clamp(-3.0 * sd, 3.0 * sd)) {
+            return false;
+        }
+        state.slow.add(member, &p, z, y, noise_um2);
+        state.fast.add(member, &p, z, y, noise_um2);
+        let keep = 1.0 - 1.0 / WHITE_TICKS;
+        let left = left.clamp(-3.0 * sd, 3.0 * sd);
+        state.white[0] = keep * state.white[0] + left * left;
+        state.white[1] = keep * state.white[1] + left * state.left_um;
+        state.left_um = left;
+        true
+    }
+
+    /// Whether the bead wanders so much less than it did that something must hold it.
+    fn is_still(state: &mut AdaptState, left_um: f64) -> bool {
+        let square = left_um * left_um;
+        state.ticks += 1.0;
+        state.now_um2 += (square - state.now_um2) / state.ticks.min(NOW_TICKS);
+        state.usual_um2 += (square - state.usual_um2) / state.ticks.min(USUAL_TICKS);
+        state.ticks > 2.0 * NOW_TICKS && state.now_um2 < STILL * state.usual_um2
+    }
+
+    /// Where the two windows surely differ the plant has changed: the slow one begins anew from the fast.
+    fn compare(&self, state: &mut AdaptState) {
+        let pair = self
+            .finding(&state.fast, state)
+            .zip(self.finding(&state.slow, state));
+        let Some((fast, slow)) = pair else {
+            return;
+        };
+        let off = (fast.gain - slow.gain).abs();
+        let gain = off > CHANGED * fast.gain_sd.hypot(slow.gain_sd);
+        let delay = fast.worse[slow.best] > CHANGED_DELAY;
+        if gain || delay {
+            state.slow = state.slow.taken_from(&state.fast);
+        }
+    }
+
+    /// The values of [`ADAPT_COLUMNS`].
+    pub fn record(&self, state: &AdaptState, out: &mut [f32]) {
+        let now = self.adaptation(state);
+        let [gain, sd] = now.gain_estimate.unwrap_or([f64::NAN; 2]);
+        let values = [now.gain, now.delay_samples, gain, sd];
+        for (out, value) in out.iter_mut().zip(values) {
+            *out = value as f32;
+        }
+        if let Some(out) = out.get_mut(values.len()) {
+            *out = f32::from(now.mode as u8);
+        }
+    }
+}
+
+/// The estimator for so many more samples of delay; `None` where there is none.
+fn delayed(config: EstimatorConfig, model: LoopModel, extra: f64) -> Option<Estimator> {
+    let delay_s = model.delay_s + extra * model.sample_time_s;
+    if delay_s < -1e-9 {
+        return None;
+    }
+    Estimator::new(config, LoopModel { delay_s, ..model }).ok()
+}
+
+/// Checks that nominal is where it is said to be.
+const _: () = assert!(DELAYS[NOMINAL] == 0.0);

@@ -1,0 +1,93 @@
+//! Adaptation of the loop to the plant: whether it is asked for, and what came of it in words.
+
+use cellpos_control::{AdaptMode, Adaptation, ControllerFile};
+
+/// Whether the law follows the gain and delay of the plant while the loop runs.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+pub enum Adapt {
+    /// It does.
+    On,
+    /// It stays as it was designed.
+    Off,
+}
+
+/// What the command line asks for goes before what the controller has: `lqg` and `mpc` by name adapt, a controller.toml does as
+/// its key `adapt` in `[estimator]` says.
+pub fn choose(asked: Option<Adapt>, controller: &mut ControllerFile) {
+    if let Some(asked) = asked {
+        controller.estimator.adapt = asked == Adapt::On;
+    }
+}
+
+/// Where adaptation stands, in a line.
+pub fn text(now: &Adaptation) -> String {
+    let mode = match now.mode {
+        AdaptMode::Waiting => "too little motion to say",
+        AdaptMode::Agreeing => "in force",
+        AdaptMode::Moving => "on its way",
+        AdaptMode::Paused => "paused",
+        AdaptMode::Retreating => "back to the design",
+    };
+    let found = now.gain_estimate.map_or_else(String::new, |[gain, sd]| {
+        format!(", estimated {gain:.2} +- {:.2}", 1.96 * sd)
+    });
+    format!(
+        "tuned to {:.2} of the model's gain{found}, {:+.1} samples of delay; {mode}",
+        now.gain, now.delay_samples
+    )
+}
+
+/// The sentence of a change; the gains are over the model's.
+pub(crate) fn sentence(gain: [f64; 2], delay_ms: [f64; 2], over_s: f64, retreat: bool) -> String {
+    if retreat {
+        return format!(
+            "What the motion says is no plant: tuned to the design again, from {:.2} of the gain.",
+            gain[0]
+        );
+    }
+    /// A change of the gain that is worth a word beside one of the delay.
+    const CHANGED: f64 = 1.1;
+    let ratio = gain[1] / gain[0];
+    let gain_changed = !(1.0 / CHANGED..=CHANGED).contains(&ratio);
+    let mut parts = Vec::new();
+    if gain_changed {
+        let way = if ratio < 1.0 { "fell" } else { "rose" };
+        parts.push(format!("gain {way} to {:.2}", gain[1]));
+    }
+    let more_ms = delay_ms[1] - delay_ms[0];
+    if more_ms.abs() > 1e-6 {
+        let way = if more_ms > 0.0 { "grew" } else { "shrank" };
+        parts.push(format!("delay {way} by {:.2} ms", more_ms.abs()));
+    }
+    let hint = match (gain_changed, ratio < 1.0) {
+        (true, true) => "; is the channel clogging?",
+        (true, false) => "; has a constriction opened, or the bead moved to the middle?",
+        (false, _) => "; does the camera or the amplifier take longer than the rig file says?",
+    };
+    let what = parts.join(", ");
+    let mut letters = what.chars();
+    let first = letters.next().map(|c| c.to_uppercase().to_string());
+    format!(
+        "{}{} over {over_s:.1} s: adapted{hint}",
+        first.unwrap_or_default(),
+        letters.as_str()
+    )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_change_reads_as_a_sentence() {
+        assert_eq!(
+            sentence([1.0, 0.7], [0.0, 0.0], 40.0, false),
+            "Gain fell to 0.70 over 40.0 s: adapted; is the channel clogging?"
+        );
+        assert_eq!(
+            sentence([1.0, 1.04], [0.0, 1.0], 0.5, false),
+            "Delay grew by 1.00 ms over 0.5 s: adapted; does the camera or the amplifier take longer than the rig file says?"
+        );
+        assert!(sentence([1.6, 1.0], [0.0, 0.0], 1.0, true).contains("design again"));
+    }
+}
