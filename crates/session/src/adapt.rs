@@ -3,7 +3,8 @@
 use cellpos_control::{AdaptMode, Adaptation, ControllerFile};
 
 /// Whether the law follows the gain and delay of the plant while the loop runs.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(feature = "clap", derive(clap::ValueEnum))]
 pub enum Adapt {
     /// It does.
     On,

@@ -375,7 +375,7 @@ fn a_bead_that_is_drawn_out_over_its_frames_is_seen_in_each_of_them() {
 fn a_sine_is_learned_kept_with_the_run_replayed_and_gone_on_from() {
     let folder = tempfile::tempdir().unwrap();
     model_with_gain(folder.path(), 0.8);
-    let line = "track --target 0um --sine 5um@100Hz --controller mpc --solver active-set --duration 2.6s --clock virtual --frames off --seed 3 --rig rig.toml --json";
+    let line = "track --target 0um --sine 5um@100Hz --controller mpc --solver active-set --duration 2.6s --clock virtual --frames off --seed 3 --rig rig.toml --adapt off --json";
     let without = succeed(folder.path(), line).json();
     let with = succeed(folder.path(), &format!("{line} --learn")).json();
     assert!(number(&with, "rms_true_nm") < 100.0, "{with}");

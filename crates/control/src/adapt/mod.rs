@@ -106,6 +106,7 @@ pub(crate) struct Adapter {
     whitener: Whitener,
     /// Whole and fractional samples of the design's delay.
     delay_samples: f64,
+    exposure_ticks: f64,
 }
 
 /// State of an [`Adapter`].
@@ -159,6 +160,7 @@ impl Adapter {
             nominal: Estimator::new(config, model)?,
             whitener: Whitener::new(walk_um2, drift_um2, config.fix_noise_um.powi(2))?,
             delay_samples: model.delay_samples(),
+            exposure_ticks: config.exposure_ms * 1e-3 / ts,
         })
     }
 
@@ -299,7 +301,25 @@ impl Adapter {
         }
     }
 
-    /// Position of the model so many ticks ago, um: on the line between ticks, as between them the bead moves evenly.
+    /// Mean of the model's position over an exposure whose middle is so many ticks ago, um: on the lines between ticks, as between
+    /// them the bead moves evenly.
+    fn exposed(&self, state: &AdaptState, ago: f64) -> Option<f64> {
+        let half = 0.5 * self.exposure_ticks;
+        let (mut from, until) = ((ago - half).max(0.0), ago + half);
+        let length = until - from;
+        if length < 1e-6 {
+            return Self::past(state, ago);
+        }
+        let mut sum = 0.0;
+        while from < until {
+            let to = (from.floor() + 1.0).min(until);
+            sum += 0.5 * (to - from) * (Self::past(state, from)? + Self::past(state, to)?);
+            from = to;
+        }
+        Some(sum / length)
+    }
+
+    /// Position of the model so many ticks ago, um.
     fn past(state: &AdaptState, ago: f64) -> Option<f64> {
         let newer = ago.max(0.0).floor();
         let (part, newer) = (ago.max(0.0) - newer, newer as usize);
@@ -315,7 +335,7 @@ impl Adapter {
         if let Some(fix) = fix {
             let ago = self.delay_samples + fix.age as f64 + fix.offset;
             for ((at, extra), open) in at_um.iter_mut().zip(DELAYS).zip(usable) {
-                match Self::past(state, ago + extra) {
+                match self.exposed(state, ago + extra) {
                     Some(um) => *at = um,
                     None if open => known = false,
                     None => {}

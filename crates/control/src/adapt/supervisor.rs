@@ -30,8 +30,8 @@ pub(super) const MOST_GAIN: f64 = 2.5;
 /// An estimate surely beyond these is none of a plant.
 const DOUBT: [f64; 2] = [0.3, 4.0];
 /// Difference (of logarithms) at which the tuning sets out, at which it stops, and the same in standard uncertainties.
-const SET_OUT: (f64, f64) = (0.05, 2.5);
-const ARRIVED: (f64, f64) = (0.015, 1.0);
+const SET_OUT: (f64, f64) = (0.01, 2.5);
+const ARRIVED: (f64, f64) = (0.003, 1.0);
 /// Largest change per tick of the logarithm of the gain in force, upwards and downwards.
 const UP_PER_TICK: f64 = 0.15;
 const DOWN_PER_TICK: f64 = 0.003;
@@ -128,8 +128,8 @@ impl Force {
         self.retreat_told = false;
         let aim = found.gain.max(0.05).ln();
         let (off, sd) = (aim - self.log_gain, found.log_sd());
-        let beyond = |(least, sds): (f64, f64)| off.abs() > least.max(sds * sd);
-        self.moving = beyond(if self.moving { ARRIVED } else { SET_OUT });
+        let (least, sds) = if self.moving { ARRIVED } else { SET_OUT };
+        self.moving = off.abs() > least.max(sds * sd);
         if self.moving {
             // Towards boldness to the near end of the interval and no further.
             self.go(if off < 0.0 { (off + sd).min(0.0) } else { off });

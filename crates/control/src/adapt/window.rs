@@ -10,7 +10,7 @@ pub const NOMINAL: usize = 2;
 const APART: f64 = 0.5;
 
 /// Part of the gain that no measurement decides: a real plant is no linear one.
-const MODEL_SD: f64 = 0.01;
+const MODEL_SD: f64 = 0.003;
 
 /// Shortest memory, ticks: a few violent ticks are not all that is known.
 const SHORTEST_TICKS: f64 = 40.0;

@@ -93,7 +93,7 @@ fn long_hold(seed: u64, ticks: u64) -> (f64, u32, [f64; 2]) {
     let mut rig = SimulatedRig::new(RigConfig::eq6(seed)).unwrap();
     let mut controller = Controller::new(adapting(lqg())).unwrap();
     controller.start(20.0, 20.0);
-    let (mut n, mut squares, mut told) = (0.0, 0.0, 0);
+    let (mut n, mut squares, mut told) = (0.0_f64, 0.0_f64, 0);
     let mut force = [f64::INFINITY, 0.0_f64];
     for k in 0..ticks {
         tick(&mut controller, &mut rig);
@@ -106,7 +106,7 @@ fn long_hold(seed: u64, ticks: u64) -> (f64, u32, [f64; 2]) {
             force = [force[0].min(now.gain), force[1].max(now.gain)];
         }
     }
-    ((squares / n as f64).sqrt(), told, force)
+    ((squares / n).sqrt(), told, force)
 }
 
 #[test]
