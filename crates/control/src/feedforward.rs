@@ -26,6 +26,32 @@ impl FeedForwardState {
     }
 }
 
+/// Displacements from neutral that a tick can have.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Reach {
+    /// Ends of the range less neutral, um.
+    pub low_um: f64,
+    pub high_um: f64,
+    /// Largest move of a tick, um.
+    pub move_um: f64,
+}
+
+impl Reach {
+    /// The nearest to `wanted` after `last`.
+    pub(crate) fn clamp(&self, wanted: f64, last: f64) -> f64 {
+        wanted
+            .clamp(last - self.move_um, last + self.move_um)
+            .clamp(self.low_um, self.high_um)
+    }
+}
+
+/// Ticks within which a move must be slowed down.
+const BRAKING_TICKS: usize = 24;
+/// Displacement by which a move may end beyond what is wanted, um: 10 nm of bead in a tick.
+const OVERRUN_UM: f64 = 0.025;
+/// Halvings of the interval in which the largest displacement is looked for: a thousandth of the range.
+const HALVINGS: usize = 12;
+
 /// Inverse of one model.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct FeedForward {
@@ -67,6 +93,69 @@ impl FeedForward {
         (next_um - state.integrator_um - modes) / self.direct
     }
 
+    /// The displacement from neutral within reach that takes the model to the references of the coming ticks, the next one first:
+    /// as fast as range and slew allow, and no faster than it can be slowed down again, so that a jump that asks for more is
+    /// made in a few ticks without going past its end.
+    pub(crate) fn within(
+        &self,
+        state: &FeedForwardState,
+        next_um: impl Fn(usize) -> f64,
+        reach: &Reach,
+    ) -> f64 {
+        let last = state.last_um;
+        let first = reach.clamp(self.wanted(state, next_um(0)), last);
+        // Which way the model travels, against the reference.
+        let own = (next_um(1) - next_um(0)) / self.direct;
+        let way = (first - own).signum();
+        if !self.overruns(state, first, &next_um, reach, way) {
+            return first;
+        }
+        // The fastest from which it can still be slowed down.
+        let mut sure = reach.clamp(last - way * reach.move_um, last);
+        let mut too_much = first;
+        for _ in 0..HALVINGS {
+            let middle = 0.5 * (sure + too_much);
+            if self.overruns(state, middle, &next_um, reach, way) {
+                too_much = middle;
+            } else {
+                sure = middle;
+            }
+        }
+        sure
+    }
+
+    /// Whether the model, slowed down as fast as the slew allows after this displacement, goes past a reference on its
+    /// way (1 or -1).
+    fn overruns(
+        &self,
+        state: &FeedForwardState,
+        displacement_um: f64,
+        next_um: &impl Fn(usize) -> f64,
+        reach: &Reach,
+        way: f64,
+    ) -> bool {
+        let mut on = *state;
+        self.drive(&mut on, displacement_um);
+        for ahead in 1..BRAKING_TICKS {
+            let wanted = self.wanted(&on, next_um(ahead));
+            // Slow enough: no faster than the reference itself.
+            let own = (next_um(ahead) - next_um(ahead - 1)) / self.direct;
+            if (on.last_um - own) * way <= 0.0 {
+                return false;
+            }
+            // A reference that jumps is met when it has jumped, and not before.
+            if own.abs() > on.last_um.abs() + reach.move_um {
+                return false;
+            }
+            let slowest = reach.clamp(on.last_um - way * reach.move_um, on.last_um);
+            if (slowest - wanted) * way > OVERRUN_UM {
+                return true;
+            }
+            self.drive(&mut on, slowest);
+        }
+        false
+    }
+
     /// Drives the model for one tick with a displacement from neutral.
     pub(crate) fn drive(&self, state: &mut FeedForwardState, displacement_um: f64) {
         state.integrator_um += self.gain * displacement_um;
@@ -87,6 +176,23 @@ impl FeedForward {
     pub(crate) fn position(&self, state: &FeedForwardState) -> f64 {
         let modes: f64 = (0..MODES).map(|i| self.c[i] * state.modes[i]).sum();
         state.integrator_um + modes + self.feedthrough * state.last_um
+    }
+
+    /// The same where the reference of this tick was announced by the tick before: the model that range and slew keep back goes
+    /// on towards it.
+    pub(crate) fn meet_announced(
+        &self,
+        state: &mut FeedForwardState,
+        reference_um: f64,
+        announced_um: Option<f64>,
+    ) {
+        /// Below this it is rounding, um.
+        const SAME_UM: f64 = 1e-9;
+        let announced = announced_um.is_some_and(|um| (um - reference_um).abs() < SAME_UM);
+        let behind = (reference_um - self.position(state)).abs() > SAME_UM;
+        if !(announced && behind && state.is_sound()) {
+            self.meet(state, reference_um);
+        }
     }
 
     /// Puts the state on the reference of this tick: a jump that no preview announced moves the integrator part. A state

@@ -67,7 +67,7 @@ pub use limits::{Limited, Limits};
 pub use linear::LinearLaw;
 pub use loop_io::{LoopFlags, LoopInput, LoopOutput, LoopParts, Measurement, Mode};
 pub use loop_model::{LoopMode, LoopModel, MODES};
-pub use lqg::{Feedback, Lqg, LqgLaw};
+pub use lqg::{Feedback, Lqg, LqgLaw, LqgState};
 pub use monitor::{PlantEstimate, PlantMonitor, PlantMonitorState, PlantVerdict};
 pub use mpc::{HORIZON, Mpc, MpcLaw, MpcState, SolverKind};
 pub use pi::{Lead, Pi, PiLaw, PiState};

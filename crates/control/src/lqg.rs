@@ -7,8 +7,9 @@
 use crate::deviation::{DEVIATION, Deviation};
 use crate::error::{BuildError, check};
 use crate::estimator::{Estimator, EstimatorConfig, PredictedState};
-use crate::feedforward::{FeedForward, FeedForwardState};
+use crate::feedforward::{FeedForward, FeedForwardState, Reach};
 use crate::law::{ControlLaw, LawInput, LawOutput};
+use crate::limits::Limits;
 use crate::linear::LinearLaw;
 use crate::loop_model::{LoopModel, MODES};
 use crate::riccati::{kalman_gain, lq_feedback};
@@ -172,43 +173,74 @@ fn steady_gain(
 pub struct LqgLaw {
     feedback: Feedback,
     forward: FeedForward,
+    /// Range of the command and its largest move in a tick, um.
+    reach: Reach,
 }
+
+/// State of [`LqgLaw`].
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct LqgState {
+    on: FeedForwardState,
+    announced_um: Option<f64>,
+}
+
+/// References that the feed-forward looks ahead, to slow down in time.
+const AHEAD: usize = 24;
 
 impl LqgLaw {
     /// The law for a plant.
     ///
     /// # Errors
     /// A weight out of range, or a Riccati equation without solution.
-    pub fn new(config: &Lqg, model: &LoopModel) -> Result<Self, BuildError> {
+    pub fn new(config: &Lqg, model: &LoopModel, limits: &Limits) -> Result<Self, BuildError> {
         Ok(Self {
             feedback: config.feedback(model)?,
             forward: FeedForward::new(model),
+            reach: Reach {
+                low_um: limits.low_um,
+                high_um: limits.high_um,
+                move_um: limits.slew_um_per_s * model.sample_time_s,
+            },
         })
     }
 }
 
 impl ControlLaw for LqgLaw {
     /// The model on the reference.
-    type State = FeedForwardState;
+    type State = LqgState;
 
-    fn start(&self, _command_um: f64) -> FeedForwardState {
-        FeedForwardState::default()
+    fn start(&self, _command_um: f64) -> LqgState {
+        LqgState::default()
     }
 
-    fn step(&self, on: &mut FeedForwardState, input: &LawInput) -> LawOutput {
-        self.forward.meet(on, input.reference_um);
-        let deviation = deviation(&input.estimate.now, on);
-        let feed_forward_um = self.forward.step(on, input.preview(0));
+    fn step(&self, state: &mut LqgState, input: &LawInput) -> LawOutput {
+        let (neutral_um, gain) = (input.estimate.neutral_um, input.tuning.gain);
+        self.forward
+            .meet_announced(&mut state.on, input.reference_um, state.announced_um);
+        let deviation = deviation(&input.estimate.now, &state.on);
+        let reach = Reach {
+            low_um: self.reach.low_um * gain - neutral_um,
+            high_um: self.reach.high_um * gain - neutral_um,
+            move_um: self.reach.move_um * gain,
+        };
+        let feed_forward_um = self
+            .forward
+            .within(&state.on, |ahead| input.preview(ahead), &reach);
+        self.forward.drive(&mut state.on, feed_forward_um);
+        state.announced_um = input.preview_um.first().copied();
         let correction_um = self.feedback.correction(&deviation);
-        LawOutput::wish(input.estimate.neutral_um + feed_forward_um + correction_um)
+        LawOutput::wish(neutral_um + feed_forward_um + correction_um)
     }
 
-    fn follow(&self, on: &mut FeedForwardState, input: &LawInput, _command_um: f64) {
-        *on = FeedForward::rest(input.reference_um);
+    fn follow(&self, state: &mut LqgState, input: &LawInput, _command_um: f64) {
+        *state = LqgState {
+            on: FeedForward::rest(input.reference_um),
+            announced_um: None,
+        };
     }
 
     fn preview_len(&self) -> usize {
-        1
+        AHEAD
     }
 
     fn feeds_forward(&self) -> bool {
@@ -219,9 +251,9 @@ impl ControlLaw for LqgLaw {
         &["lqg_feed_forward_um"]
     }
 
-    fn record(&self, on: &FeedForwardState, out: &mut [f32]) {
+    fn record(&self, state: &LqgState, out: &mut [f32]) {
         if let Some(value) = out.first_mut() {
-            *value = on.last_um as f32;
+            *value = state.on.last_um as f32;
         }
     }
 }

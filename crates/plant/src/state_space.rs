@@ -33,11 +33,12 @@ impl StateSpace {
         let mut c = RowDVector::zeros(n);
         let mut row = 0;
         for (p, r) in zpk.poles.iter().zip(&r) {
-            if p.im < 0.0 {
+            if p.im < 0.0 || row >= n {
                 continue;
             }
             let scale = r.norm().sqrt().max(f64::MIN_POSITIVE);
-            if p.im == 0.0 {
+            // Of a pair that rounding has torn apart one pole is left: it has no room for an imaginary part.
+            if p.im == 0.0 || row + 1 == n {
                 a[(row, row)] = p.re;
                 b[row] = scale;
                 c[row] = r.re / scale;

@@ -61,8 +61,6 @@ pub(super) struct Condensed {
     pub matrices: QpMatrices,
     /// Linear term per deviation state.
     pub from_state: [[f64; DEVIATION]; VARS],
-    /// Linear term per error of the kept-in-limits reference command at each tick.
-    pub from_error: Box<[[f64; HORIZON]; VARS]>,
     /// Free motion of the error at the end of each block, per deviation state.
     pub free: [[f64; DEVIATION]; VARS],
 }
@@ -130,7 +128,6 @@ impl Condensed {
         let mut effect = DMatrix::<f64>::zeros(DEVIATION, VARS);
         let mut hessian = DMatrix::<f64>::zeros(VARS, VARS);
         let mut linear = DMatrix::<f64>::zeros(VARS, DEVIATION);
-        let mut from_error = Box::new([[0.0; HORIZON]; VARS]);
         let mut free = [[0.0; DEVIATION]; VARS];
         let mut rows = DMatrix::<f64>::zeros(ROWS, VARS);
         let mut block = 0;
@@ -147,9 +144,6 @@ impl Condensed {
                 (&d.c * &effect, &d.c * &power);
             hessian += 2.0 * along.transpose() * &along;
             linear += 2.0 * along.transpose() * &still;
-            for (row, value) in from_error.iter_mut().zip(along.iter()) {
-                row[i] = 2.0 * value;
-            }
             hessian[(block, block)] += 2.0 * mpc.effort * scale;
             if i + 1 == ends[block] {
                 free[block] = std::array::from_fn(|k| still[k]);
@@ -179,7 +173,6 @@ impl Condensed {
         Ok(Self {
             matrices,
             from_state: std::array::from_fn(|i| std::array::from_fn(|j| linear[(i, j)])),
-            from_error,
             free,
         })
     }

@@ -6,7 +6,7 @@ use super::feasible;
 use crate::active_set::{ABSENT, QpEnd, QpVectors, ROWS, Stop, VARS, WorkingSet};
 use crate::deviation::DEVIATION;
 use crate::error::BuildError;
-use crate::feedforward::{FeedForward, FeedForwardState};
+use crate::feedforward::{FeedForward, FeedForwardState, Reach};
 use crate::law::{ControlLaw, LawInput, LawOutput, SolverReport, SolverStatus, SolverTerms};
 use crate::limits::Limits;
 use crate::loop_model::LoopModel;
@@ -42,6 +42,7 @@ pub struct MpcLaw {
 #[derive(Debug)]
 pub struct MpcState {
     on_reference: FeedForwardState,
+    announced_um: Option<f64>,
     pi: PiState,
     plan_um: [f64; HORIZON],
     /// Corrections of the newest plan.
@@ -217,6 +218,11 @@ impl MpcLaw {
     fn reference_plan(&self, state: &MpcState, input: &LawInput) -> ReferencePlan {
         let neutral = input.estimate.neutral_um;
         let (limits, most_move_um) = self.limits_of(input);
+        let reach = Reach {
+            low_um: limits.low_um - neutral,
+            high_um: limits.high_um - neutral,
+            move_um: most_move_um,
+        };
         let mut on = state.on_reference;
         let mut plan = ReferencePlan {
             command: [0.0; HORIZON],
@@ -226,11 +232,9 @@ impl MpcLaw {
         };
         for i in 0..HORIZON {
             let next = input.preview(i);
-            let last = on.last_um;
-            let wanted = self.forward.wanted(&on, next);
-            let command = wanted
-                .clamp(last - most_move_um, last + most_move_um)
-                .clamp(limits.low_um - neutral, limits.high_um - neutral);
+            let command = self
+                .forward
+                .within(&on, |ahead| input.preview(i + ahead), &reach);
             self.forward.drive(&mut on, command);
             plan.command[i] = command;
             plan.reference[i] = next;
@@ -261,12 +265,8 @@ impl MpcLaw {
                 .zip(s)
                 .map(|(f, s)| f * s)
                 .sum();
-            let error: f64 = self.condensed.from_error[b]
-                .iter()
-                .zip(&reference.error)
-                .map(|(f, e)| f * e)
-                .sum();
-            *slot = state + error;
+            // The path that range and slew leave of the reference is what is followed: what they forbid is no error.
+            *slot = state;
         }
         let mut start = 0;
         let mut before = input.previous_um - neutral;
@@ -317,6 +317,7 @@ impl ControlLaw for MpcLaw {
         };
         MpcState {
             on_reference: FeedForwardState::default(),
+            announced_um: None,
             pi: self.pi.start(command_um),
             plan_um: [0.0; HORIZON],
             corrections: [0.0; VARS],
@@ -327,8 +328,12 @@ impl ControlLaw for MpcLaw {
     }
 
     fn step(&self, state: &mut MpcState, input: &LawInput) -> LawOutput {
-        self.forward
-            .meet(&mut state.on_reference, input.reference_um);
+        self.forward.meet_announced(
+            &mut state.on_reference,
+            input.reference_um,
+            state.announced_um,
+        );
+        state.announced_um = input.preview_um.first().copied();
         let fallback = self.pi.step(&mut state.pi, input);
         if input.estimate.stuck {
             state.forget();
@@ -355,6 +360,7 @@ impl ControlLaw for MpcLaw {
     fn follow(&self, state: &mut MpcState, input: &LawInput, command_um: f64) {
         state.forget();
         state.on_reference = FeedForward::rest(input.reference_um);
+        state.announced_um = None;
         self.pi.follow(&mut state.pi, input, command_um);
     }
 

@@ -105,6 +105,19 @@ proptest! {
 }
 
 #[test]
+fn poles_that_rounding_tears_apart_end_in_a_design_or_a_sentence() {
+    let plant = DesignPlant {
+        plant: TransferFunction::new(vec![1.0], vec![1e300, 1.0, 1.0, 1.0]).unwrap(),
+        ..DesignPlant::eq6(2.5e-3)
+    };
+    let ended = ends(request(
+        plant,
+        Requested::Given(ControllerConfig::Lqg(Lqg::default())),
+    ));
+    assert!(ended.is_some());
+}
+
+#[test]
 fn a_delay_of_seconds_is_refused_by_its_length() {
     for delay_s in [0.05, 0.9, 10.0, 1e9, f64::INFINITY] {
         let plant = DesignPlant {

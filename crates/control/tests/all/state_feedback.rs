@@ -323,3 +323,78 @@ fn a_solver_that_is_never_in_time_holds_as_well_and_steps_little_worse() {
         );
     }
 }
+
+/// Ticks until an announced step of 10 um stays within 2 %, and how far it goes past its end, um; noise-free, with the range
+/// and slew of the default limits at any rate.
+fn announced_step(
+    controller: ControllerConfig,
+    sample_time_s: f64,
+    seed: Option<u64>,
+) -> (f64, f64) {
+    let at = (0.1 / sample_time_s).round() as u64;
+    let base = config(controller);
+    let config = LoopConfig {
+        model: LoopModel {
+            sample_time_s,
+            ..LoopModel::eq6(2.0 * sample_time_s)
+        },
+        ..base
+    };
+    let eq6 = RigConfig {
+        sample_time_s,
+        delay_s: 2.0 * sample_time_s,
+        ..RigConfig::eq6(seed.unwrap_or(0))
+    };
+    let quiet = seed.is_none();
+    let mut rig = SimulatedRig::new(if quiet { eq6.noise_free() } else { eq6 }).unwrap();
+    let mut controller = Controller::new(config).unwrap();
+    controller.start(20.0, 20.0);
+    let mut preview = vec![0.0; controller.preview_len()];
+    let step = |k: u64| if k >= at { 10.0 } else { 0.0 };
+    let (mut last, mut past_um) = (at, 0.0_f64);
+    for k in 0..at + (0.06 / sample_time_s) as u64 {
+        let off_um = rig.true_um() - step(k);
+        if k >= at {
+            past_um = past_um.max(off_um);
+            if off_um.abs() > 0.2 {
+                last = k + 1;
+            }
+        }
+        for (ahead, slot) in (1..).zip(&mut preview) {
+            *slot = step(k + ahead);
+        }
+        let input = LoopInput {
+            measurement: Some(rig.measure()),
+            reference_um: step(k),
+            preview_um: &preview,
+            ..LoopInput::default()
+        };
+        let before_um = controller.previous_command_um();
+        let output = controller.step(&input);
+        let most_um = config.limits.slew_um_per_s * sample_time_s + 1e-9;
+        assert!((output.command_um - before_um).abs() <= most_um && !output.flags.range_limited);
+        rig.advance(output.command_um);
+    }
+    ((last - at) as f64 * sample_time_s * 1e3, past_um)
+}
+
+#[test]
+fn an_announced_step_is_as_fast_as_range_and_slew_allow_and_does_not_go_past_its_end() {
+    for controller in [
+        ControllerConfig::Lqg(Lqg::default()),
+        mpc(SolverKind::ActiveSet),
+    ] {
+        for (sample_time_s, most_ms) in [(1e-3, 3.0), (0.5e-3, 3.0), (0.2e-3, 3.0)] {
+            let (ms, past_um) = announced_step(controller, sample_time_s, None);
+            assert!(
+                ms <= most_ms && past_um < 0.1,
+                "{controller:?}, {sample_time_s} s: {ms} ms, {past_um} um past"
+            );
+        }
+        for seed in 0..5 {
+            // Brownian motion leaves a band of four standard deviations now and then: only the end is asked for.
+            let (_, past_um) = announced_step(controller, 1e-3, Some(seed));
+            assert!(past_um < 0.4, "{controller:?}: {past_um} um past");
+        }
+    }
+}
