@@ -8,8 +8,6 @@ use crate::seed::{LEAST_NOISE, background};
 
 /// Share of the strongest contrast in the frame that a bead must reach to be seen beside it, in one look.
 const WEAKEST_SHARE: f32 = 0.3;
-/// Most looks at a frame, each at so much of the one before, for beads beside something much stronger.
-const MOST_LOOKS: usize = 4;
 /// Share of a bead's disc that must stand out.
 const LEAST_AREA_SHARE: f64 = 0.15;
 /// What a weaker look finds within so many radii of what a stronger one found is its ring.
@@ -29,7 +27,7 @@ pub struct Detector {
     sign: f64,
     radius_px: f64,
     min_snr: f64,
-    looks: usize,
+    thorough: bool,
     left_out: u64,
 }
 
@@ -47,15 +45,15 @@ impl Detector {
             sign: localiser.sign(),
             radius_px: localiser.template().radius_px(),
             min_snr: localiser.config().min_snr,
-            looks: 1,
+            thorough: false,
             left_out: 0,
         }
     }
 
-    /// The same for recordings: looks again for weaker beads.
+    /// The same for recordings: a second look shows beads that are weak beside the strongest, or in the noise.
     pub fn thorough(localiser: &Localiser, max_beads: usize) -> Self {
         Detector {
-            looks: MOST_LOOKS,
+            thorough: true,
             ..Detector::new(localiser, max_beads)
         }
     }
@@ -95,15 +93,18 @@ impl Detector {
         let step = if self.radius_px >= 3.0 { 2 } else { 1 };
         let strongest = self.level.strongest(pixels, (width, height), sign, step);
         let least = (self.min_snr.max(4.0) * noise.max(LEAST_NOISE)) as f32;
-        let smooth = self.looks > 1 && self.radius_px >= SMOOTH_RADIUS_PX;
+        let smooth = self.thorough && self.radius_px >= SMOOTH_RADIUS_PX;
         if strongest <= if smooth { SMOOTHED * least } else { least } {
             return;
         }
         let min_area_px =
             LEAST_AREA_SHARE * core::f64::consts::PI * self.radius_px * self.radius_px;
-        let mut share = WEAKEST_SHARE;
-        for _ in 0..self.looks {
-            let threshold = least.max(share * strongest);
+        let strong = least.max(WEAKEST_SHARE * strongest);
+        let thresholds = [
+            Some(strong),
+            (self.thorough && !smooth && strong > least).then_some(least),
+        ];
+        for threshold in thresholds.into_iter().flatten() {
             let level = &mut self.level;
             self.blobs
                 .label((width, height), threshold, min_area_px, |x, y| {
@@ -111,10 +112,6 @@ impl Detector {
                     sign * (value - level.at(x, y))
                 });
             self.keep_new();
-            if threshold <= least {
-                break;
-            }
-            share *= WEAKEST_SHARE;
         }
         if smooth {
             // Beads as weak as the noise of a pixel: means of 3 x 3 pixels have a third of it.
