@@ -5,7 +5,7 @@ use crate::mapping::ColumnRef;
 use std::path::{Path, PathBuf};
 
 /// A text file of rows and columns: separated by commas, semicolons, tabs or white space, with or without a header.
-/// Blank lines and lines that start with `#` are skipped; a byte-order mark and Windows line ends do no harm.
+/// Blank lines and lines that start with `#` or `%` are skipped; a byte-order mark and Windows line ends do no harm.
 #[derive(Debug, Clone)]
 pub struct Table<'a> {
     path: PathBuf,
@@ -82,7 +82,10 @@ impl<'a> Table<'a> {
             .lines()
             .enumerate()
             .map(|(index, line)| (index + 1, line))
-            .filter(|(_, line)| !line.trim().is_empty() && !line.trim_start().starts_with('#'));
+            .filter(|(_, line)| {
+                let line = line.trim_start();
+                !line.is_empty() && !line.starts_with(['#', '%'])
+            });
         let Some((first_line, first)) = lines.next() else {
             return Err(fail(None, Problem::Empty));
         };
@@ -185,19 +188,39 @@ impl<'a> Table<'a> {
     /// # Errors
     /// [`Problem::MissingColumn`], [`Problem::WrongUnit`], [`Problem::Cell`].
     pub fn numbers(&self, column: &ColumnRef, allow_empty: bool) -> Result<Vec<f64>, TableError> {
-        let Some(place) = self.find(column) else {
-            return Err(self.missing(column));
-        };
         let help = if allow_empty {
             "leave the field empty where there is no bead"
         } else {
             "write a decimal number with a point"
         };
+        self.column(column, help, |field| field.is_empty() && allow_empty)
+    }
+
+    /// A column of a file that others have written: what is empty or `nan` becomes NaN.
+    ///
+    /// # Errors
+    /// As [`Table::numbers`].
+    pub fn numbers_or_nan(&self, column: &ColumnRef) -> Result<Vec<f64>, TableError> {
+        let help = "leave the field empty, or write nan, where there is no value";
+        self.column(column, help, |field| {
+            field.is_empty() || field.eq_ignore_ascii_case("nan")
+        })
+    }
+
+    fn column(
+        &self,
+        column: &ColumnRef,
+        help: &'static str,
+        is_none: impl Fn(&str) -> bool,
+    ) -> Result<Vec<f64>, TableError> {
+        let Some(place) = self.find(column) else {
+            return Err(self.missing(column));
+        };
         self.fields(place)
             .enumerate()
             .map(|(row, field)| match number(field) {
                 Some(value) if value.is_finite() => Ok(value),
-                None if field.is_empty() && allow_empty => Ok(f64::NAN),
+                _ if is_none(field) => Ok(f64::NAN),
                 _ => Err(self.fail(
                     self.line(row),
                     Problem::Cell {

@@ -1,6 +1,6 @@
 //! Behaviour of reading and writing records.
 
-use cellpos_table::{Gaps, Mapping, Problem, Record, Table, TableError};
+use cellpos_table::{ColumnRef, Gaps, Mapping, Problem, Record, Table, TableError};
 use proptest::prelude::*;
 use std::path::Path;
 
@@ -237,4 +237,20 @@ proptest! {
             prop_assert!(record.step_s > 0.0);
         }
     }
+}
+
+#[test]
+fn a_foreign_column_may_say_nan_where_it_has_no_value_and_comments_of_other_programs_are_skipped() {
+    let text = "% rig 3\nV1;V2\n1.0;NaN\n2.0;\n3.0;0.5\n";
+    let table = Table::parse("in.csv".as_ref(), text).unwrap();
+    let values = table.numbers_or_nan(&ColumnRef::from("V2")).unwrap();
+    assert!(values[0].is_nan() && values[1].is_nan() && values[2] == 0.5);
+    let error = table.numbers(&ColumnRef::from("2"), true).unwrap_err();
+    assert_eq!(error.line, Some(3), "{error}");
+    let word = Table::parse("in.csv".as_ref(), "a,b\n1,2\n3,oops\n").unwrap();
+    let error = word.numbers_or_nan(&ColumnRef::from("b")).unwrap_err();
+    assert!(
+        error.to_string().contains("oops") && error.line == Some(3),
+        "{error}"
+    );
 }

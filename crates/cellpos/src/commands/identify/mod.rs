@@ -1,6 +1,5 @@
 //! `cellpos identify`: excite, measure the frequency response, fit, write model.toml and a report.
 
-mod columns;
 mod foreign;
 pub mod json;
 pub mod report;

@@ -1,6 +1,6 @@
 //! What `cellpos identify --data` reads: run folders and records of cellpos, as they are; any other file by its columns.
 
-use super::{Args, columns};
+use super::Args;
 use crate::commands::run::resume;
 use crate::outcome::Failure;
 use cellpos_record::RunReader;
@@ -30,12 +30,17 @@ pub fn read(path: &Path, args: &Args) -> Result<Vec<Source>, Failure> {
         return runs(path);
     }
     if let (Some(input), Some(output), Some(rate)) = (&args.input, &args.output, args.rate) {
-        let (input, output) = columns::read(path, input, output).map_err(Failure::input)?;
+        let text = text_of(path)?;
+        let table = Table::parse(path, &text).map_err(Failure::input)?;
+        let (input, output) = (
+            ColumnRef::from(input.as_str()),
+            ColumnRef::from(output.as_str()),
+        );
         return Ok(vec![Source {
             name: path.display().to_string(),
             rate_hz: rate.0,
-            input,
-            output,
+            input: table.numbers(&input, false).map_err(Failure::input)?,
+            output: table.numbers_or_nan(&output).map_err(Failure::input)?,
             reference: None,
             closed: false,
         }]);
@@ -43,15 +48,19 @@ pub fn read(path: &Path, args: &Args) -> Result<Vec<Source>, Failure> {
     own_record(path).map(|source| vec![source])
 }
 
+fn text_of(path: &Path) -> Result<String, Failure> {
+    std::fs::read_to_string(path).map_err(|error| {
+        Failure::bad_input(
+            format!("{}: cannot be read ({error})", path.display()),
+            "name a record or a run folder",
+        )
+    })
+}
+
 /// A CSV of cellpos: time_s, pzt_um, bead_um, and target_um where it has one.
 fn own_record(path: &Path) -> Result<Source, Failure> {
     let name = path.display().to_string();
-    let text = std::fs::read_to_string(path).map_err(|error| {
-        Failure::bad_input(
-            format!("{name}: cannot be read ({error})"),
-            "name a record or a run folder",
-        )
-    })?;
+    let text = text_of(path)?;
     let foreign = |error: String| {
         Failure::bad_input(
             format!("{name}: is no record of cellpos: {error}"),
