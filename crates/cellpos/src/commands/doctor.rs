@@ -2,6 +2,7 @@
 
 mod findings;
 mod soak;
+mod traced;
 
 use crate::arguments::positive;
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
@@ -46,8 +47,6 @@ struct Report {
     #[serde(flatten)]
     soak: Soak,
     findings: Vec<Finding>,
-    /// How far naming who was late went; none unless asked for.
-    why: Option<String>,
 }
 
 /// Shortest measurement that is called fit, s: a stall that comes once a second must have had its chance.
@@ -77,7 +76,6 @@ pub fn run(args: Args) -> CommandResult {
         verdict,
         soak,
         findings,
-        why: args.why.then(soak::tracing),
     };
     if args.json {
         print_json(&report)?;
@@ -169,7 +167,7 @@ fn text(report: &Report) -> String {
             out.push_str(&format!("        change: {change}\n"));
         }
     }
-    if let Some(how) = &report.why {
+    if let Some(how) = &soak.why {
         if soak.suspects.is_empty() {
             out.push_str(&format!(
                 "  why           no wake-up was late, or nothing else ran; {how}\n"
@@ -177,7 +175,7 @@ fn text(report: &Report) -> String {
         }
         for suspect in &soak.suspects {
             out.push_str(&format!(
-                "  why           {} ran in {} late tenths of a second ({:.0} {})\n",
+                "  why           {}: {} times, {:.1} {} in all\n",
                 suspect.name, suspect.times, suspect.amount, suspect.unit
             ));
         }
@@ -206,6 +204,7 @@ mod tests {
             late: 0,
             missed: 0,
             suspects: Vec::new(),
+            why: None,
         }
     }
 

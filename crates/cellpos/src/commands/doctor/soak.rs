@@ -1,5 +1,6 @@
 //! A bare loop at 1 kHz for as long as wanted, and what ran beside it when it was late.
 
+use super::traced::{LateWindows, Tracing};
 use cellpos_runtime::latency::Quantiles;
 use cellpos_runtime::realtime::{self, Conditions, Request, bare_loop};
 use serde::Serialize;
@@ -25,8 +26,11 @@ pub struct Soak {
     pub late: u64,
     /// Periods that were missed altogether.
     pub missed: u64,
-    /// What ran on the machine in the tenths of a second with a late wake-up; empty unless asked for.
+    /// What ran while a wake-up was late; empty unless asked for. By the kernel's own record, who had the loop's CPU in that
+    /// very time; without it, what ran on the machine in that tenth of a second.
     pub suspects: Vec<Suspect>,
+    /// How far the naming went, in a sentence; none unless asked for.
+    pub why: Option<String>,
 }
 
 /// Something that ran while the loop was late.
@@ -34,7 +38,7 @@ pub struct Soak {
 pub struct Suspect {
     /// A process with its number, or an interrupt with its device.
     pub name: String,
-    /// In how many of the late tenths of a second it ran.
+    /// In how many of the late wake-ups, or late tenths of a second, it ran.
     pub times: u64,
     /// Its processor time in them, ms; for an interrupt how often it came.
     pub amount: f64,
@@ -46,8 +50,14 @@ pub struct Suspect {
 pub fn soak(request: Request, duration: Duration, why: bool) -> std::io::Result<Soak> {
     let late = AtomicU64::new(0);
     let done = AtomicBool::new(false);
+    let windows = LateWindows::new();
     std::thread::scope(|scope| {
-        let watcher = why.then(|| scope.spawn(|| watch(&late, &done, request.cpu)));
+        let watcher = why.then(|| {
+            scope.spawn(|| match Tracing::start(request.cpu) {
+                Ok(tracing) => watch_traced(tracing, &windows, &done),
+                Err(error) => (watch(&late, &done, request.cpu), tracing(&error)),
+            })
+        });
         let measured = std::thread::Builder::new()
             .name("cellpos-doctor".to_string())
             .spawn_scoped(scope, || {
@@ -56,13 +66,14 @@ pub fn soak(request: Request, duration: Duration, why: bool) -> std::io::Result<
                 let (latency, missed) = bare_loop(duration, |late_ns| {
                     if late_ns > LATE_NS {
                         late.fetch_add(1, Ordering::Relaxed);
+                        windows.add(cellpos_rig::clock::monotonic_ns(), late_ns as i64);
                     }
                 });
                 (conditions, latency, missed, start.elapsed().as_secs_f64())
             });
         let measured = measured.map(|thread| thread.join());
         done.store(true, Ordering::Relaxed);
-        let suspects = watcher.and_then(|thread| thread.join().ok());
+        let found = watcher.and_then(|thread| thread.join().ok());
         let Ok((conditions, latency, missed, seconds)) = measured? else {
             return Err(std::io::Error::other("the measuring thread broke off"));
         };
@@ -73,7 +84,8 @@ pub fn soak(request: Request, duration: Duration, why: bool) -> std::io::Result<
             wake_us: latency.quantiles_us(),
             late: late.load(Ordering::Relaxed),
             missed,
-            suspects: suspects.unwrap_or_default(),
+            why: found.as_ref().map(|(_, how)| how.clone()),
+            suspects: found.map(|(suspects, _)| suspects).unwrap_or_default(),
         })
     })
 }
@@ -138,6 +150,32 @@ fn snapshot(cpu: Option<usize>) -> BTreeMap<String, (f64, &'static str)> {
     all
 }
 
+/// Looks at the kernel's record ten times a second, until the loop is over, and once more.
+fn watch_traced(
+    mut tracing: Tracing,
+    windows: &LateWindows,
+    done: &AtomicBool,
+) -> (Vec<Suspect>, String) {
+    const LOOK: Duration = Duration::from_millis(100);
+    loop {
+        let last = done.load(Ordering::Relaxed);
+        tracing.look(windows);
+        if last {
+            break;
+        }
+        std::thread::sleep(LOOK);
+    }
+    let lost = match tracing.unknown {
+        0 => String::new(),
+        lost => format!(" (of {lost} of them it no longer had the time)"),
+    };
+    let how = format!(
+        "by the kernel's record of switches on the loop's CPU, over {} late wake-ups{lost}",
+        tracing.looked
+    );
+    (tracing.suspects(), how)
+}
+
 fn watch(late: &AtomicU64, done: &AtomicBool, cpu: Option<usize>) -> Vec<Suspect> {
     const LOOK: Duration = Duration::from_millis(100);
     /// A tenth of a second holds ten hundredths: what ran in one of them ran.
@@ -177,25 +215,11 @@ fn watch(late: &AtomicU64, done: &AtomicBool, cpu: Option<usize>) -> Vec<Suspect
     suspects
 }
 
-/// Whether the kernel could name who was late itself, in a sentence.
-pub fn tracing() -> String {
-    let tracers = ["/sys/kernel/tracing", "/sys/kernel/debug/tracing"]
-        .iter()
-        .find_map(|folder| std::fs::read_to_string(format!("{folder}/available_tracers")).ok());
-    match tracers {
-        Some(tracers) if tracers.contains("timerlat") => {
-            "this kernel traces it to the function: sudo rtla timerlat top (package rtla)".to_string()
-        }
-        Some(_) => {
-            "this kernel has no timerlat tracer: what is named is what ran beside the loop, a tenth of a second at a time"
-                .to_string()
-        }
-        None => {
-            "kernel tracing may not be read (it needs root): what is named is what ran beside the loop, a tenth of a second \
-             at a time"
-                .to_string()
-        }
-    }
+/// What is left without the kernel's record, and how to have it.
+fn tracing(error: &str) -> String {
+    format!(
+        "what is named is what ran on the machine, a tenth of a second at a time; for who had the CPU: {error}"
+    )
 }
 
 #[cfg(test)]
