@@ -1,17 +1,17 @@
 //! Cyclic motion with a wrong model: what preview alone leaves, and what learning makes of it.
 //!
-//!     cargo run --release -p cellpos-benches --bin cycle-table
+//!     cargo run --release -p cellpos-benches --bin cycle-table         # -- --adapt 0 --cycles 20 --seeds 5
 //!
 //! Rig at the level of positions: Eq. (6) with the gain 20 % and the delay 0.25 ms off in either direction, D =
 //! 0.33 um^2/s, 20 nm fixes, loop delay 2.5 ms in the model. True positions; the learned error counts from the end of the
-//! 20th cycle at full amplitude for 1 s, the hold error on the same wrong rig for 4 s. Each line is the worst of seeds 0
+//! 20th cycle (`--cycles`) at full amplitude for 1 s, the hold error on the same wrong rig for 4 s. Each line is the worst of seeds 0
 //! to 4 and of the four directions, against the hold error of the same rig.
 
+use cellpos_benches::parallel;
 use cellpos_benches::simulated::{controllers, loop_config, rms, run, sine};
 use cellpos_control::design::{DesignPlant, Uncertainty, harmonic_responses};
 use cellpos_control::*;
 
-const SEEDS: u64 = 5;
 const FADE_S: f64 = 0.2;
 
 fn rig(gain: f64, late_s: f64, seed: u64) -> RigConfig {
@@ -31,8 +31,10 @@ fn error_nm(
     (from, to): (u64, u64),
 ) -> f64 {
     let mut errors = Vec::new();
+    let mut config = loop_config(controller);
+    config.estimator.adapt = parallel::option("--adapt", 0) == 1;
     run(
-        loop_config(controller),
+        config,
         rig,
         profile,
         learner,
@@ -77,12 +79,14 @@ fn main() {
             .expect("the nominal loop");
             let learner = Learner::new(LearnConfig::default(), frequency_hz, 1e-3, &responses)
                 .expect("a learner");
-            let learned_at = (1e3 * (FADE_S + 20.0 / frequency_hz)).ceil() as u64;
+            let learned_at = (1e3
+                * (FADE_S + parallel::option("--cycles", 20) as f64 / frequency_hz))
+                .ceil() as u64;
             let span = (learned_at, learned_at + 1000);
             let mut worst = [0.0_f64; 4];
             for gain in [0.8, 1.2] {
                 for late_s in [-0.25e-3, 0.25e-3] {
-                    for seed in 0..SEEDS {
+                    for seed in 0..parallel::option("--seeds", 5) {
                         let rig = || rig(gain, late_s, seed);
                         let hold = Profile::Hold { position_um: 0.0 };
                         let hold_nm = error_nm(controller, rig(), &hold, None, (1000, 5000));

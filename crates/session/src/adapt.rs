@@ -1,6 +1,7 @@
 //! Adaptation of the loop to the plant: whether it is asked for, and what came of it in words.
 
 use cellpos_control::{AdaptMode, Adaptation, ControllerFile};
+use cellpos_runtime::life::EventKind;
 
 /// Whether the law follows the gain and delay of the plant while the loop runs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -38,8 +39,20 @@ pub fn text(now: &Adaptation) -> String {
     )
 }
 
-/// The sentence of a change; the gains are over the model's.
-pub(crate) fn sentence(gain: [f64; 2], delay_ms: [f64; 2], over_s: f64, retreat: bool) -> String {
+/// The sentence of [`EventKind::Adapted`]; nothing for another event.
+pub(crate) fn sentence(kind: &EventKind) -> String {
+    let EventKind::Adapted {
+        gain_before,
+        gain,
+        delay_before_ms,
+        delay_ms,
+        over_s,
+        retreat,
+    } = *kind
+    else {
+        return String::new();
+    };
+    let (gain, delay_ms) = ([gain_before, gain], [delay_before_ms, delay_ms]);
     if retreat {
         return format!(
             "What the motion says is no plant: tuned to the design again, from {:.2} of the gain.",
@@ -79,16 +92,27 @@ pub(crate) fn sentence(gain: [f64; 2], delay_ms: [f64; 2], over_s: f64, retreat:
 mod tests {
     use super::*;
 
+    fn told(gain: [f64; 2], delay_ms: f64, over_s: f64, retreat: bool) -> String {
+        sentence(&EventKind::Adapted {
+            gain_before: gain[0],
+            gain: gain[1],
+            delay_before_ms: 0.0,
+            delay_ms,
+            over_s,
+            retreat,
+        })
+    }
+
     #[test]
     fn a_change_reads_as_a_sentence() {
         assert_eq!(
-            sentence([1.0, 0.7], [0.0, 0.0], 40.0, false),
+            told([1.0, 0.7], 0.0, 40.0, false),
             "Gain fell to 0.70 over 40.0 s: adapted; is the channel clogging?"
         );
         assert_eq!(
-            sentence([1.0, 1.04], [0.0, 1.0], 0.5, false),
+            told([1.0, 1.04], 1.0, 0.5, false),
             "Delay grew by 1.00 ms over 0.5 s: adapted; does the camera or the amplifier take longer than the rig file says?"
         );
-        assert!(sentence([1.6, 1.0], [0.0, 0.0], 1.0, true).contains("design again"));
+        assert!(told([1.6, 1.0], 0.0, 1.0, true).contains("design again"));
     }
 }
