@@ -6,7 +6,8 @@ use serde_json::{Map, Value, json};
 use std::path::Path;
 
 /// Tables with keys of the user's or of the rig's: versions, configurations, provenance.
-const OPEN: [&str; 6] = [
+const OPEN: [&str; 7] = [
+    "parameters",
     "config",
     "versions",
     "intervals",
@@ -170,9 +171,9 @@ fn the_objects_of_slow_commands_fit_their_schemas() {
         "track --target 0um --duration 6s --clock virtual --frames off --name hold",
     );
     for line in [
-        "identify --clock virtual --seed 3 --frames off --effort 0.3 --out fitted.toml",
+        "identify --clock virtual --seed 3 --frames off --out fitted.toml",
         "reconcile --model eq6 --data latest-sine latest-hold",
-        "circle --frames off --effort 0.3 --duration 2s --out circle",
+        "circle --frames off --effort 0.3 --duration 3s",
         "paper",
         "camera --duration 1s",
     ] {
