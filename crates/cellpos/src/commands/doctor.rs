@@ -2,6 +2,7 @@
 
 mod findings;
 mod soak;
+mod suspect;
 mod traced;
 
 use crate::arguments::positive;

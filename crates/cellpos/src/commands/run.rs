@@ -2,7 +2,9 @@
 
 pub(super) mod learning;
 mod load;
+mod over;
 mod queue;
+mod ready;
 pub(super) mod resume;
 mod session_config;
 mod shown;
@@ -13,7 +15,7 @@ mod unshown;
 use crate::clips;
 use crate::keys;
 use crate::notify::NotifyArgs;
-use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
+use crate::outcome::{CommandResult, Failure, Outcome, print_text};
 use crate::view_args::ViewArgs;
 use cellpos_emulator::{CellConfig, FaultKind};
 use cellpos_record::{InputFile, LineFile, RunWriter};
@@ -25,11 +27,13 @@ use cellpos_session::adapt::{self, Adapt};
 use cellpos_session::clips::Clipped;
 use cellpos_session::live_line::Typed;
 use cellpos_session::rig_file::{ActuatorConfig, CameraConfig, ClockKind, Frames, RigFile};
-use cellpos_session::setup::{Prepared, ReferenceSpec, Setup};
-use cellpos_session::view::{Page, View, Viewed};
-use cellpos_session::{Ended, Finished, Options, Rig, connect};
+use cellpos_session::setup::{Prepared, Setup};
+use cellpos_session::view::{Page, Viewed};
+use cellpos_session::{Options, Rig, connect};
 use cellpos_units::Micrometers;
 use learning::Keeper;
+use over::{Over, Telling};
+use ready::Ready;
 use session_config::SessionConfig;
 use sink::{ScriptSink, Stalls};
 use std::path::{Path, PathBuf};
@@ -107,32 +111,6 @@ pub struct Args {
     /// Print one JSON object on standard output.
     #[arg(long)]
     json: bool,
-}
-
-/// A session before the board is armed.
-pub(super) struct Ready {
-    file: RigFile,
-    prepared: Prepared,
-    reference: ReferenceSpec,
-    clock: ClockKind,
-    name: String,
-    session: SessionConfig,
-    inputs: Vec<InputFile>,
-    /// Where the folder of a new run goes.
-    runs: PathBuf,
-    /// The run's folder, and where the session's goes; None: a new run below `runs`.
-    home: Option<(PathBuf, PathBuf)>,
-}
-
-/// A run that is over.
-pub(super) struct Over {
-    outcome: &'static str,
-    ended: Ended,
-    /// The run's folder.
-    folder: PathBuf,
-    cycles: Vec<CycleRow>,
-    /// Whether the script came to its end and everything is on the disk.
-    whole: bool,
 }
 
 /// Runs a script, or goes on with one, or on one cell after another.
@@ -356,14 +334,17 @@ fn start(args: &Args, ready: Ready, tell: bool) -> Result<Over, Failure> {
     };
     let finished = armed.start()?.wait()?;
     drop(keys);
-    conclude(
-        args,
+    over::conclude(
+        Telling {
+            notify: &args.notify,
+            json: args.json,
+            tell,
+        },
         &setup,
         &plan,
         folder,
         warnings,
         (finished, view),
-        tell,
     )
 }
 
@@ -442,90 +423,4 @@ fn sink(
         });
     }
     Ok(sink)
-}
-
-fn conclude(
-    args: &Args,
-    setup: &Setup,
-    plan: &Plan,
-    folder: PathBuf,
-    mut warnings: Vec<String>,
-    (finished, view): (Finished<Viewed<Clipped<ScriptSink>>>, Option<View>),
-    tell: bool,
-) -> Result<Over, Failure> {
-    warnings.extend(connect::warnings(&finished));
-    let Finished {
-        ended,
-        rig,
-        mut summary,
-        conditions,
-        learned,
-        sink,
-        ..
-    } = finished;
-    let (sink, kept_clips) = sink.into_inner(&summary, &ended.seen).into_parts();
-    // The terminal is given back, and the page is over, before anything is said.
-    drop(view);
-    warnings.extend(clips::warnings(kept_clips));
-    let script = sink.end();
-    let outcome = match (ended.as_asked(), script.complete()) {
-        (false, _) => summary.state.name(),
-        (true, true) => "done",
-        (true, false) if script.is_stop() => "stopped",
-        (true, false) => "aborted",
-    };
-    let (writer, cycle_faults) = sink.close();
-    if cycle_faults.rows_lost > 0 {
-        warnings.push(format!(
-            "{} rows of cycles.csv could not be written: {}",
-            cycle_faults.rows_lost,
-            cycle_faults.first.clone().unwrap_or_default()
-        ));
-    }
-    let kept = connect::finish(writer, outcome, &mut summary, &conditions, &mut warnings);
-    let learned = learning::named(&setup.config.motions, &learned);
-    if !learned.is_empty()
-        && let Err(error) = learning::save(&folder, learned.clone())
-    {
-        warnings.push(format!("no {}: {error}", learning::LEARNED_TOML));
-    }
-    let cycles = resume::cycles(&folder)?;
-    if let Err(error) = resume::cycles_parquet(&folder, &cycles) {
-        warnings.push(format!("no cycles.parquet: {error}"));
-    }
-    let said = format!("{outcome}: {}; {ended}", script.name());
-    warnings.extend(args.notify.of_a_script(outcome, &said, &folder));
-    let report = text::Report::new(
-        text::Ending {
-            outcome,
-            stage: match outcome {
-                "aborted" => "by the operator",
-                _ => script.name(),
-            },
-            ended: &ended,
-            alarms: script.alarms,
-            run: kept.run,
-            folder: folder.display().to_string(),
-        },
-        &summary,
-        &cycles,
-        plan.cycle_count(),
-        connect::bound_rms_nm(rig.file(), setup, &summary),
-        &conditions,
-        &warnings,
-        &learned,
-    );
-    match (tell, args.json) {
-        (false, _) => {}
-        (true, true) => print_json(&report)?,
-        (true, false) => print_text(&report.text())?,
-    }
-    let whole = outcome == "done" && kept.whole && cycle_faults.rows_lost == 0;
-    Ok(Over {
-        outcome,
-        cycles,
-        folder,
-        whole,
-        ended,
-    })
 }

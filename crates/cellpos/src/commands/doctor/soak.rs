@@ -1,5 +1,6 @@
 //! A bare loop at 1 kHz for as long as wanted, and what ran beside it when it was late.
 
+use super::suspect::Suspect;
 use super::traced::{LateWindows, Tracing};
 use cellpos_runtime::latency::Quantiles;
 use cellpos_runtime::realtime::{self, Conditions, Request, bare_loop};
@@ -31,19 +32,6 @@ pub struct Soak {
     pub suspects: Vec<Suspect>,
     /// How far the naming went, in a sentence; none unless asked for.
     pub why: Option<String>,
-}
-
-/// Something that ran while the loop was late.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct Suspect {
-    /// A process with its number, or an interrupt with its device.
-    pub name: String,
-    /// In how many of the late wake-ups, or late tenths of a second, it ran.
-    pub times: u64,
-    /// Its processor time in them, ms; for an interrupt how often it came.
-    pub amount: f64,
-    /// `ms` or `interrupts`.
-    pub unit: &'static str,
 }
 
 /// Runs the loop. `why`: whether to look at what else runs (ten looks a second, at low priority).

@@ -3,7 +3,7 @@
 //! A trace instance of its own (a ring in the kernel's memory) hears `sched_switch` and `irq_handler_entry` while the loop is
 //! measured and goes away with it; nobody else's tracing is touched. It needs root and a mounted tracefs.
 
-use super::soak::Suspect;
+use super::suspect::Suspect;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicI64, Ordering};

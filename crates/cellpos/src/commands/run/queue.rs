@@ -3,7 +3,8 @@
 
 mod population;
 
-use super::{Args, Over, fresh, start};
+use super::over::Over;
+use super::{Args, fresh, start};
 use crate::outcome::{CommandResult, Failure, Outcome, print_json_of, print_text};
 use cellpos_runtime::life::Refusal;
 use cellpos_script::CycleRow;

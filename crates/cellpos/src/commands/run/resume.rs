@@ -1,6 +1,6 @@
 //! A run that is gone on with: everything comes from its folder.
 
-use super::Ready;
+use super::ready::Ready;
 use super::session_config::SessionConfig;
 use crate::outcome::Failure;
 use crate::rig_file::{ClockKind, RigFile};

@@ -1,6 +1,6 @@
 //! What the cells of a queue have in common, and how far they differ: a row a cell, a page over all.
 
-use super::Over;
+use crate::commands::run::over::Over;
 use cellpos_report::{Axis, Column, Figure, Panel, Report, Series, Status, Table};
 use cellpos_script::{ArmKind, CycleFlags, CycleRow, trend};
 use serde::Serialize;

@@ -1,0 +1,22 @@
+//! What stands before a run of a script is armed.
+
+use super::session_config::SessionConfig;
+use cellpos_record::InputFile;
+use cellpos_session::rig_file::{ClockKind, RigFile};
+use cellpos_session::setup::{Prepared, ReferenceSpec};
+use std::path::PathBuf;
+
+/// A session before the board is armed.
+pub struct Ready {
+    pub file: RigFile,
+    pub prepared: Prepared,
+    pub reference: ReferenceSpec,
+    pub clock: ClockKind,
+    pub name: String,
+    pub session: SessionConfig,
+    pub inputs: Vec<InputFile>,
+    /// Where the folder of a new run goes.
+    pub runs: PathBuf,
+    /// The run's folder, and where the session's goes; None: a new run below `runs`.
+    pub home: Option<(PathBuf, PathBuf)>,
+}
