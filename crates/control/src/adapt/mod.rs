@@ -109,7 +109,7 @@ pub(crate) struct Adapter {
     exposure_ticks: f64,
 }
 
-/// State of an [`Adapter`].
+/// State of the adaptation.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct AdaptState {
     model: PredictedState,
