@@ -160,17 +160,20 @@ impl Regions {
             .iter()
             .fold([0.0, 0.0], |t, b| [t[0] + b[0], t[1] + b[1]]);
         let sign = usize::from(total[1] > total[0]);
-        let smooth = |k: usize| {
-            let at = |k: usize| body.get(k).map_or(0.0, |b| b[sign]);
-            0.25 * at(k.wrapping_sub(1)) + 0.5 * at(k) + 0.25 * at(k + 1)
-        };
+        let at = |k: usize| body.get(k).map_or(0.0, |b| b[sign]);
+        let smooth: [f32; BINS] =
+            std::array::from_fn(|k| 0.25 * at(k.wrapping_sub(1)) + 0.5 * at(k) + 0.25 * at(k + 1));
+        // The largest from each place on.
+        let mut behind = smooth;
+        for k in (0..BINS - 1).rev() {
+            behind[k] = behind[k].max(behind[k + 1]);
+        }
         let (mut before, mut from) = (0.0_f32, 0);
         for k in 1..BINS - 1 {
-            let here = smooth(k);
+            let here = smooth[k];
             before = before.max(here);
-            let behind = (k..BINS).map(smooth).fold(0.0, f32::max);
-            let lowest = here <= smooth(k - 1) && here < smooth(k + 1);
-            if lowest && here < GAP * before.min(behind) && k > from {
+            let lowest = here <= smooth[k - 1] && here < smooth[k + 1];
+            if lowest && here < GAP * before.min(behind[k]) && k > from {
                 parts.cut((k as f64 + 0.5 - 0.5 * BINS as f64) * PATCH as f64);
                 (before, from) = (0.0, k);
             }
