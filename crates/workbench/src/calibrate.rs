@@ -108,6 +108,40 @@ pub fn measure(
     pulses: Pulses,
     mut progress: impl FnMut(f64),
 ) -> Result<Response, Failure> {
+    const TRIES: usize = 3;
+    let mut tried = 1;
+    let response = loop {
+        match pulsed(bench, pulses, &mut progress)? {
+            Ok(response) => break response,
+            // The bead left the picture with the pulses: the next one is waited for.
+            Err(_) if tried < TRIES => tried += 1,
+            Err(seen) => {
+                return Err(Failure::bad_input(
+                    format!("a bead was seen in {seen} frames: too few, {TRIES} times in a row"),
+                    "look with cellpos camera --rig RIG --snapshot frame.png --overlay; see docs/rig.md, Light and focus",
+                ));
+            }
+        }
+    };
+    if response.gain() < 5.0 * response.sd_px_per_s {
+        return Err(Failure::bad_input(
+            format!(
+                "the bead does not move with the PZT: {:.1} px/s per um, standard deviation {:.1}",
+                response.gain(),
+                response.sd_px_per_s
+            ),
+            "is the amplifier on, the syringe filled and coupled, the bead free? More pulses: --pairs; larger ones: --amplitude",
+        ));
+    }
+    Ok(response)
+}
+
+/// Once: the response, or in how many frames a bead was seen where these are too few.
+fn pulsed(
+    bench: &Bench,
+    pulses: Pulses,
+    progress: &mut impl FnMut(f64),
+) -> Result<Result<Response, usize>, Failure> {
     let mut watch = Watch::of(bench)?;
     let mut mover = Mover::arm(bench.board()?, bench.file())?;
     let centre_um = mover.at_um();
@@ -121,27 +155,11 @@ pub fn measure(
             "move it first: park_um in [limits] of rig.toml near the middle of the range, then cellpos jog --to that",
         ));
     }
-    let (commands, end_ns) = on_a_thread_of_its_own(&mut watch, &mut mover, pulses, &mut progress)?;
+    let (commands, end_ns) = on_a_thread_of_its_own(&mut watch, &mut mover, pulses, progress)?;
     drop(mover);
     let size_px = watch.size_px();
     let sightings = watch.finish(end_ns)?;
-    let response = fit(&commands, &sightings, size_px).ok_or_else(|| {
-        Failure::bad_input(
-            format!("a bead was seen in {} frames: too few", sightings.len()),
-            "look with cellpos camera --rig RIG --snapshot frame.png --overlay; see docs/rig.md, Light and focus",
-        )
-    })?;
-    if response.gain() < 5.0 * response.sd_px_per_s {
-        return Err(Failure::bad_input(
-            format!(
-                "the bead does not move with the PZT: {:.1} px/s per um, standard deviation {:.1}",
-                response.gain(),
-                response.sd_px_per_s
-            ),
-            "is the amplifier on, the syringe filled and coupled, the bead free? More pulses: --pairs; larger ones: --amplitude",
-        ));
-    }
-    Ok(response)
+    Ok(fit(&commands, &sightings, size_px).ok_or(sightings.len()))
 }
 
 /// What was commanded, when (ns) and how far from where the PZT stood (um), and when it was over.
