@@ -139,14 +139,14 @@ impl<L: ControlLaw> ControlLoop<L> {
     /// After the command of a tick: what it and the fix tell of the plant. A tuning that moved takes the states of estimator
     /// and law with it, so that the position believed and the command go on where they were.
     fn adapt(&self, state: &mut LoopState<L::State>, told: &Told) {
-        let (before, from) = (self.tuning(state), *self.estimator_of(state));
+        let (before, from) = (self.tuning(state), self.estimator_of(state));
         let (Some(adapter), Some(adapt)) = (&self.adapter, &mut state.adapt) else {
             return;
         };
         adapter.step(adapt, told);
-        let (now, to) = (adapter.tuning(adapt), *adapter.estimator(adapt));
+        let (now, to) = (adapter.tuning(adapt), adapter.estimator(adapt));
         if from.model() != to.model() {
-            from.retime(&mut state.estimator, &to);
+            from.retime(&mut state.estimator, to);
         }
         let ratio = now.gain / before.gain;
         if ratio != 1.0 {
@@ -233,8 +233,7 @@ impl<L: ControlLaw> ControlLoop<L> {
     /// A tick that never came: the command was held and the bead moved on. The estimator follows; integrator and
     /// feed-forward stay where they are, so that a step in progress goes on as it was.
     pub fn skip(&self, state: &mut LoopState<L::State>) {
-        let estimator = *self.estimator_of(state);
-        estimator.step(&mut state.estimator, None);
+        self.estimator_of(state).step(&mut state.estimator, None);
         // What the estimator was told of the command; a learned part of it is held as well.
         let held_um = state.estimator.history_um[0];
         self.estimator.push(&mut state.estimator, held_um);

@@ -214,7 +214,11 @@ impl Estimator {
     }
 
     fn filter_state(&self, state: &EstimatorState) -> PredictedState {
-        let back = self.delay_ticks + usize::from(state.lag);
+        self.filter_state_at(state, self.delay_ticks + usize::from(state.lag))
+    }
+
+    /// The filter's state where its newest command is `back` ticks back.
+    fn filter_state_at(&self, state: &EstimatorState, back: usize) -> PredictedState {
         PredictedState {
             q: state.integrator_um,
             n: state.neutral_um,

@@ -45,8 +45,8 @@ impl Reach {
     }
 }
 
-/// Ticks within which a move must be slowed down.
-const BRAKING_TICKS: usize = 24;
+/// Ticks within which a move must be slowed down: references that are looked at ahead.
+pub(crate) const BRAKING_TICKS: usize = 24;
 /// Displacement by which a move may end beyond what is wanted, um: 10 nm of bead in a tick.
 const OVERRUN_UM: f64 = 0.025;
 /// Halvings of the interval in which the largest displacement is looked for: a thousandth of the range.

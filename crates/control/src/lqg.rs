@@ -7,7 +7,7 @@
 use crate::deviation::{DEVIATION, Deviation};
 use crate::error::{BuildError, check};
 use crate::estimator::{Estimator, EstimatorConfig, PredictedState};
-use crate::feedforward::{FeedForward, FeedForwardState, Reach};
+use crate::feedforward::{BRAKING_TICKS, FeedForward, FeedForwardState, Reach};
 use crate::law::{ControlLaw, LawInput, LawOutput};
 use crate::limits::Limits;
 use crate::linear::LinearLaw;
@@ -184,9 +184,6 @@ pub struct LqgState {
     announced_um: Option<f64>,
 }
 
-/// References that the feed-forward looks ahead, to slow down in time.
-const AHEAD: usize = 24;
-
 impl LqgLaw {
     /// The law for a plant.
     ///
@@ -240,7 +237,7 @@ impl ControlLaw for LqgLaw {
     }
 
     fn preview_len(&self) -> usize {
-        AHEAD
+        BRAKING_TICKS
     }
 
     fn feeds_forward(&self) -> bool {

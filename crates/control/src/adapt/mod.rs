@@ -276,8 +276,7 @@ impl Adapter {
                 state.slow = Window::new(FAST, SLOW);
                 state.fast = Window::new(FAST, FAST);
             }
-        }
-        if !learned {
+        } else {
             state.force.pause();
         }
         state.news = state.force.news();
@@ -343,14 +342,7 @@ impl Adapter {
             }
         }
         let Some(fix) = fix.filter(|_| known) else {
-            // What is not seen moves on as it did.
-            if let Some(seen) = &mut state.seen {
-                self.whitener.step(seen, 0.0);
-            }
-            state
-                .moved
-                .iter_mut()
-                .for_each(|m| self.whitener.step(m, 0.0));
+            self.coast(state);
             return false;
         };
         let Some(seen) = &mut state.seen else {
@@ -369,11 +361,7 @@ impl Adapter {
         let outlier = left.abs() > OUTLIER * sd + 2.0 * gain.max(1.0) * p[member].abs();
         state.outliers = if outlier { state.outliers + 1 } else { 0 };
         if outlier && state.outliers < OUTLIERS {
-            self.whitener.step(seen, 0.0);
-            state
-                .moved
-                .iter_mut()
-                .for_each(|m| self.whitener.step(m, 0.0));
+            self.coast(state);
             return false;
         }
         if outlier {
@@ -386,17 +374,24 @@ impl Adapter {
         for (track, p) in state.moved.iter_mut().zip(p) {
             self.whitener.step(track, p);
         }
-        if Self::is_still(state, left.clamp(-3.0 * sd, 3.0 * sd)) {
+        let left = left.clamp(-3.0 * sd, 3.0 * sd);
+        if Self::is_still(state, left) {
             return false;
         }
         state.slow.add(member, &p, z, y, noise_um2);
         state.fast.add(member, &p, z, y, noise_um2);
         let keep = 1.0 - 1.0 / WHITE_TICKS;
-        let left = left.clamp(-3.0 * sd, 3.0 * sd);
         state.white[0] = keep * state.white[0] + left * left;
         state.white[1] = keep * state.white[1] + left * state.left_um;
         state.left_um = left;
         true
+    }
+
+    /// A tick without a fix to learn from: what is not seen moves on as it did.
+    fn coast(&self, state: &mut AdaptState) {
+        for track in state.seen.iter_mut().chain(&mut state.moved) {
+            self.whitener.step(track, 0.0);
+        }
     }
 
     /// Whether the bead wanders so much less than it did that something must hold it.

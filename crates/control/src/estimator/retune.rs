@@ -1,6 +1,6 @@
 //! A state handed over to another delay, or counted in other units, between two ticks.
 
-use super::{Estimator, EstimatorState, PredictedState};
+use super::{Estimator, EstimatorState};
 
 impl Estimator {
     /// Between two ticks: hands a state over to an estimator that differs from this one in the delay. The fixes used so far
@@ -40,19 +40,5 @@ impl Estimator {
         state.covariance_um2[1] *= ratio;
         state.covariance_um2[2] *= ratio * ratio;
         state.integrator_um += before - position(state);
-    }
-
-    /// The filter's state `back` ticks before the next tick.
-    fn filter_state_at(&self, state: &EstimatorState, back: usize) -> PredictedState {
-        PredictedState {
-            q: state.integrator_um,
-            n: state.neutral_um,
-            modes: state.modes,
-            last_um: if state.stuck {
-                state.neutral_um
-            } else {
-                Self::command(state, back + 1)
-            },
-        }
     }
 }
