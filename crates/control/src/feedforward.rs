@@ -4,6 +4,8 @@
 //! next reference. (The biproper form of Eq. (6) has a zero at z = -19.3 and must never be inverted.)
 
 use crate::deviation::{DEVIATION, Deviation};
+use crate::law::LawInput;
+use crate::limits::Limits;
 use crate::loop_model::{LoopModel, MODES};
 
 /// State of the inverse: the model's state on the reference.
@@ -26,10 +28,10 @@ impl FeedForwardState {
     }
 }
 
-/// Displacements from neutral that a tick can have.
+/// Displacements that a tick can have.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Reach {
-    /// Ends of the range less neutral, um.
+    /// Ends of the range, um.
     pub low_um: f64,
     pub high_um: f64,
     /// Largest move of a tick, um.
@@ -37,6 +39,25 @@ pub(crate) struct Reach {
 }
 
 impl Reach {
+    /// Range and slew of a loop, in um of the command.
+    pub(crate) fn of(limits: &Limits, sample_time_s: f64) -> Self {
+        Self {
+            low_um: limits.low_um,
+            high_um: limits.high_um,
+            move_um: limits.slew_um_per_s * sample_time_s,
+        }
+    }
+
+    /// The same from neutral, in the units of the gain in force.
+    pub(crate) fn about_neutral(&self, input: &LawInput) -> Self {
+        let (neutral_um, gain) = (input.estimate.neutral_um, input.tuning.gain);
+        Self {
+            low_um: self.low_um * gain - neutral_um,
+            high_um: self.high_um * gain - neutral_um,
+            move_um: self.move_um * gain,
+        }
+    }
+
     /// The nearest to `wanted` after `last`.
     pub(crate) fn clamp(&self, wanted: f64, last: f64) -> f64 {
         wanted

@@ -193,11 +193,7 @@ impl LqgLaw {
         Ok(Self {
             feedback: config.feedback(model)?,
             forward: FeedForward::new(model),
-            reach: Reach {
-                low_um: limits.low_um,
-                high_um: limits.high_um,
-                move_um: limits.slew_um_per_s * model.sample_time_s,
-            },
+            reach: Reach::of(limits, model.sample_time_s),
         })
     }
 }
@@ -211,22 +207,17 @@ impl ControlLaw for LqgLaw {
     }
 
     fn step(&self, state: &mut LqgState, input: &LawInput) -> LawOutput {
-        let (neutral_um, gain) = (input.estimate.neutral_um, input.tuning.gain);
         self.forward
             .meet_announced(&mut state.on, input.reference_um, state.announced_um);
         let deviation = deviation(&input.estimate.now, &state.on);
-        let reach = Reach {
-            low_um: self.reach.low_um * gain - neutral_um,
-            high_um: self.reach.high_um * gain - neutral_um,
-            move_um: self.reach.move_um * gain,
-        };
+        let reach = self.reach.about_neutral(input);
         let feed_forward_um = self
             .forward
             .within(&state.on, |ahead| input.preview(ahead), &reach);
         self.forward.drive(&mut state.on, feed_forward_um);
         state.announced_um = input.preview_um.first().copied();
         let correction_um = self.feedback.correction(&deviation);
-        LawOutput::wish(neutral_um + feed_forward_um + correction_um)
+        LawOutput::wish(input.estimate.neutral_um + feed_forward_um + correction_um)
     }
 
     fn follow(&self, state: &mut LqgState, input: &LawInput, _command_um: f64) {

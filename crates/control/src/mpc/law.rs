@@ -34,8 +34,7 @@ pub struct MpcLaw {
     condensed: Condensed,
     forward: FeedForward,
     pi: PiLaw,
-    limits: Limits,
-    most_move_um: f64,
+    reach: Reach,
 }
 
 /// State of the law: model on the reference, previous plan, warm start, the fallback's state and the solver's workspace.
@@ -79,8 +78,7 @@ impl MpcLaw {
             condensed,
             forward: FeedForward::new(model),
             pi: PiLaw::new(pi, model.sample_time_s)?,
-            limits: *limits,
-            most_move_um: limits.slew_um_per_s * model.sample_time_s,
+            reach: Reach::of(limits, model.sample_time_s),
         };
         if config.solver == SolverKind::Clarabel {
             ClarabelQp::new(&this.condensed.matrices, this.sides())?;
@@ -88,22 +86,11 @@ impl MpcLaw {
         Ok(this)
     }
 
-    /// Range and slew (um per tick) in the units of the gain in force.
-    fn limits_of(&self, input: &LawInput) -> (Limits, f64) {
-        let gain = input.tuning.gain;
-        let limits = Limits {
-            low_um: self.limits.low_um * gain,
-            high_um: self.limits.high_um * gain,
-            ..self.limits
-        };
-        (limits, self.most_move_um * gain)
-    }
-
     /// The sides of rows that a problem of this loop can reach.
     fn sides(&self) -> Vec<Side> {
         let both = |row: usize| [true, false].map(|upper| Side { row, upper });
         // Commands within the range are never further apart than it is wide.
-        let slew = self.most_move_um < self.limits.high_um - self.limits.low_um;
+        let slew = self.reach.move_um < self.reach.high_um - self.reach.low_um;
         let mut sides: Vec<Side> = (0..VARS).flat_map(both).collect();
         if slew {
             sides.extend((VARS..2 * VARS).flat_map(both));
@@ -216,13 +203,7 @@ impl MpcLaw {
 
     /// Feed-forward along the preview, kept within range and slew; the model on the reference follows what was kept.
     fn reference_plan(&self, state: &MpcState, input: &LawInput) -> ReferencePlan {
-        let neutral = input.estimate.neutral_um;
-        let (limits, most_move_um) = self.limits_of(input);
-        let reach = Reach {
-            low_um: limits.low_um - neutral,
-            high_um: limits.high_um - neutral,
-            move_um: most_move_um,
-        };
+        let reach = self.reach.about_neutral(input);
         let mut on = state.on_reference;
         let mut plan = ReferencePlan {
             command: [0.0; HORIZON],
@@ -252,7 +233,7 @@ impl MpcLaw {
         s: &[f64; DEVIATION],
         reference: &ReferencePlan,
     ) -> QpVectors {
-        let (limits, most_move_um) = self.limits_of(input);
+        let reach = self.reach.about_neutral(input);
         let neutral = input.estimate.neutral_um;
         let mut v = QpVectors {
             linear: [0.0; VARS],
@@ -277,12 +258,12 @@ impl MpcLaw {
                 .fold((f64::INFINITY, f64::NEG_INFINITY), |(l, h), c| {
                     (l.min(*c), h.max(*c))
                 });
-            v.low[b] = limits.low_um - neutral - least;
-            v.high[b] = limits.high_um - neutral - most;
+            v.low[b] = reach.low_um - least;
+            v.high[b] = reach.high_um - most;
             // The first block starts from the last command, the others from the reference's last move.
             let jump = commands[0] - before;
-            v.low[VARS + b] = -most_move_um - jump;
-            v.high[VARS + b] = most_move_um - jump;
+            v.low[VARS + b] = -reach.move_um - jump;
+            v.high[VARS + b] = reach.move_um - jump;
             start += length;
             before = reference.command[start - 1];
             let at = start - 1;
