@@ -4,8 +4,8 @@
 //! increments are fitted with `drift + ratio * increments predicted by the model`. Increments, because Brownian motion
 //! makes positions a random walk; a doublet, because it leaves the bead where it was. Of a bead that is
 //! farther from position 0 than the doublet moves it, the first half goes towards 0, so that one at the border of the view stays
-//! in it. A refusal counts only for a pulse that went
-//! as planned: where ticks were skipped or frames came late the answer is that of another pulse, and it is made again.
+//! in it. Increments near a skipped tick or a late frame are the answer to another pulse and are left
+//! out; where what is left refuses the plant, or cannot tell, the pulse is made again and fitted together with the ones before.
 
 use crate::life::Refusal;
 use cellpos_plant::{DiscretePlant, PlantError, TransferFunction};
@@ -57,6 +57,20 @@ pub struct Verdict {
     pub ci95: f64,
     /// Why the plant is refused, if it is.
     pub refusal: Option<Refusal>,
+    /// Whether the interval leaves no doubt about the refusal.
+    sure: bool,
+}
+
+impl Verdict {
+    /// Refused without a gain.
+    fn unmeasured(refusal: Option<Refusal>) -> Self {
+        Self {
+            gain_ratio: f64::NAN,
+            ci95: f64::NAN,
+            refusal,
+            sure: refusal != Some(Refusal::Disturbed),
+        }
+    }
 }
 
 /// The doublet and what the model says of it; everything is computed before the run.
@@ -67,6 +81,8 @@ pub struct Arming {
     program_um: Vec<f64>,
     /// Measured position at each tick, um, as the model says.
     positions_um: Vec<f64>,
+    /// Ticks until a disturbance is no longer seen in the increments.
+    settling_ticks: u32,
 }
 
 /// How far the check has come.
@@ -85,16 +101,34 @@ pub struct ArmingState {
     last: Option<(u32, f64)>,
     /// Ticks in a row without a frame.
     silent: u32,
-    n: f64,
-    sum_x: f64,
-    sum_y: f64,
-    sum_xx: f64,
-    sum_xy: f64,
-    sum_yy: f64,
-    /// Whether the pulse did not go as planned.
-    disturbed: bool,
-    /// Pulses made that counted for nothing.
+    /// Increments of all pulses.
+    sums: Sums,
+    /// Tick of the pulse at which time last did not pass as planned.
+    disturbed_at: Option<u32>,
+    /// Pulses made again.
     repeated: u32,
+}
+
+/// What a straight line is fitted from.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+struct Sums {
+    n: f64,
+    x: f64,
+    y: f64,
+    xx: f64,
+    xy: f64,
+    yy: f64,
+}
+
+impl Sums {
+    fn add(&mut self, x: f64, y: f64) {
+        self.n += 1.0;
+        self.x += x;
+        self.y += y;
+        self.xx += x * x;
+        self.xy += x * y;
+        self.yy += y * y;
+    }
 }
 
 impl ArmingState {
@@ -107,7 +141,7 @@ impl ArmingState {
 /// Ticks in a row without a frame that a steady bead may have.
 const MOST_SILENT: u32 = 3;
 /// Pulses made again at most: a rig that is disturbed every time is not fit to be closed.
-const MOST_REPEATED: u32 = 3;
+const MOST_REPEATED: u32 = 8;
 /// Ticks without any position after which the PZT goes to where the bead is believed to rest.
 const UNSEEN_TICKS: u32 = 50;
 /// How far it goes in a tick, um: 100 um/s at 1 kHz.
@@ -135,7 +169,7 @@ pub struct ArmingInput {
 pub enum Step {
     /// Hold this displacement, um.
     Command(f64),
-    /// The pulse was disturbed and counts for nothing; hold this displacement, um, until the bead is steady again.
+    /// The pulse was disturbed or leaves a doubt; hold this displacement, um, until the bead is steady again.
     Again(f64, Verdict),
     /// The check is over.
     Done(Verdict),
@@ -175,6 +209,7 @@ impl Arming {
             config,
             program_um,
             positions_um,
+            settling_ticks: rest,
         })
     }
 
@@ -202,11 +237,7 @@ impl Arming {
             }
             if state.steady >= self.config.steady_ticks {
                 if !self.config.check {
-                    return Step::Done(Verdict {
-                        gain_ratio: f64::NAN,
-                        ci95: f64::NAN,
-                        refusal: None,
-                    });
+                    return Step::Done(Verdict::unmeasured(None));
                 }
                 state.pulse = Some(0);
                 state.last = position_um.map(|um| (0, um));
@@ -217,11 +248,7 @@ impl Arming {
                 return Step::Command(command_um + state.way() * first_um);
             }
             if state.ticks > self.config.patience_ticks {
-                return Step::Done(Verdict {
-                    gain_ratio: f64::NAN,
-                    ci95: f64::NAN,
-                    refusal: Some(Refusal::NoBead),
-                });
+                return Step::Done(Verdict::unmeasured(Some(Refusal::NoBead)));
             }
             if state.seen || state.ticks <= UNSEEN_TICKS || !neutral_um.is_finite() {
                 return Step::Command(command_um);
@@ -231,37 +258,23 @@ impl Arming {
         };
         let tick = pulse + 1;
         state.pulse = Some(tick);
-        state.disturbed |= input.disturbed;
-        if let Some(now_um) = position_um {
-            let expected_um = |tick: u32| self.positions_um.get(tick as usize);
-            if let Some((at, before_um)) = state.last
-                && let (Some(from_um), Some(to_um)) = (expected_um(at), expected_um(tick))
-            {
-                let (x, y) = (state.way() * (to_um - from_um), now_um - before_um);
-                state.n += 1.0;
-                state.sum_x += x;
-                state.sum_y += y;
-                state.sum_xx += x * x;
-                state.sum_xy += x * y;
-                state.sum_yy += y * y;
-            }
-            state.last = Some((tick, now_um));
-        } else if input.framed {
-            // What comes next may be another bead.
-            state.last = None;
+        if input.disturbed {
+            state.disturbed_at = Some(tick);
         }
+        self.take(state, input, tick);
         match self.program_um.get(tick as usize) {
             Some(offset_um) => Step::Command(state.base_um + state.way() * offset_um),
             None => {
                 let verdict = self.judge(state);
-                let void = verdict.refusal.is_some() && state.disturbed;
-                if !void || state.repeated >= MOST_REPEATED {
+                let doubtful = !verdict.sure || state.disturbed_at.is_some();
+                if verdict.refusal.is_none() || !doubtful || state.repeated >= MOST_REPEATED {
                     return Step::Done(verdict);
                 }
                 let base_um = state.base_um;
                 *state = ArmingState {
                     repeated: state.repeated + 1,
                     seen: true,
+                    sums: state.sums,
                     ..ArmingState::default()
                 };
                 Step::Again(base_um, verdict)
@@ -269,35 +282,65 @@ impl Arming {
         }
     }
 
+    /// The position of a tick of the pulse.
+    fn take(&self, state: &mut ArmingState, input: &ArmingInput, tick: u32) {
+        let Some(now_um) = input.position_um else {
+            if input.framed {
+                // What comes next may be another bead.
+                state.last = None;
+            }
+            return;
+        };
+        let expected_um = |tick: u32| self.positions_um.get(tick as usize);
+        let last = state.last.replace((tick, now_um));
+        let Some((from, before_um)) = last else {
+            return;
+        };
+        let disturbed = state
+            .disturbed_at
+            .is_some_and(|at| at + self.settling_ticks > from);
+        if let (Some(from_um), Some(to_um)) = (expected_um(from), expected_um(tick))
+            && !disturbed
+        {
+            state
+                .sums
+                .add(state.way() * (to_um - from_um), now_um - before_um);
+        }
+    }
+
     /// Straight-line fit of the increments.
-    fn judge(&self, s: &ArmingState) -> Verdict {
-        let sxx = s.sum_xx - s.sum_x * s.sum_x / s.n.max(1.0);
-        let sxy = s.sum_xy - s.sum_x * s.sum_y / s.n.max(1.0);
-        let syy = s.sum_yy - s.sum_y * s.sum_y / s.n.max(1.0);
-        // Half of the pulse must have been seen, or the ratio means nothing.
+    fn judge(&self, state: &ArmingState) -> Verdict {
+        let s = &state.sums;
+        let sxx = s.xx - s.x * s.x / s.n.max(1.0);
+        let sxy = s.xy - s.x * s.y / s.n.max(1.0);
+        let syy = s.yy - s.y * s.y / s.n.max(1.0);
+        // Half of a pulse must have been seen, or the ratio means nothing.
         if s.n < f64::from(self.config.pulse_ticks) || sxx.is_nan() || sxx <= 0.0 {
-            return Verdict {
-                gain_ratio: f64::NAN,
-                ci95: f64::NAN,
-                refusal: Some(Refusal::NoBead),
-            };
+            return Verdict::unmeasured(Some(match state.disturbed_at {
+                Some(_) => Refusal::Disturbed,
+                None => Refusal::NoBead,
+            }));
         }
         let gain_ratio = sxy / sxx;
         let variance = ((syy - gain_ratio * sxy) / (s.n - 2.0).max(1.0)).max(0.0);
         let ci95 = 1.96 * (variance / sxx).sqrt();
-        let refusal = if gain_ratio.abs() <= 2.0 * ci95 {
-            Some(Refusal::NoResponse)
+        let accepted = self.config.lowest_ratio..=self.config.highest_ratio;
+        let (low, high) = (gain_ratio - ci95, gain_ratio + ci95);
+        let outside = high < *accepted.start() || low > *accepted.end();
+        let (refusal, sure) = if gain_ratio.abs() <= 2.0 * ci95 {
+            (Some(Refusal::NoResponse), outside)
         } else if gain_ratio < 0.0 {
-            Some(Refusal::WrongSign)
-        } else if !(self.config.lowest_ratio..=self.config.highest_ratio).contains(&gain_ratio) {
-            Some(Refusal::WrongGain)
+            (Some(Refusal::WrongSign), true)
+        } else if !accepted.contains(&gain_ratio) {
+            (Some(Refusal::WrongGain), outside)
         } else {
-            None
+            (None, true)
         };
         Verdict {
             gain_ratio,
             ci95,
             refusal,
+            sure,
         }
     }
 }

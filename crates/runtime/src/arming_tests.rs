@@ -149,15 +149,87 @@ fn a_pulse_in_which_the_loop_stalled_is_made_again_and_not_held_against_the_plan
     };
     let config = ArmingConfig::default();
     let (verdict, _, again) = run_disturbed(config, 1.0, |_| false, stalls);
-    assert_eq!((verdict.refusal, again), (None, 1), "{verdict:?}");
+    assert_eq!(verdict.refusal, None, "{verdict:?}");
+    assert!(again <= 1, "{again}");
     assert!((verdict.gain_ratio - 1.0).abs() < 0.05, "{verdict:?}");
-    // A plant that is wrong is refused however the first pulse went, and nothing is tried for ever.
+    // A plant that is wrong is refused however the first pulse went.
     let (verdict, _, again) = run_disturbed(config, -1.0, |_| false, stalls);
     assert_eq!((verdict.refusal, again), (Some(Refusal::WrongSign), 1));
+}
+
+#[test]
+fn what_cannot_be_told_for_stalls_is_said_of_the_stalls_and_not_of_the_plant() {
+    let config = ArmingConfig::default();
     let always = |tick| if tick % 3 == 0 { 40 } else { 0 };
-    let (verdict, _, again) = run_disturbed(config, -1.0, |_| false, always);
-    assert!(verdict.refusal.is_some());
-    assert_eq!(again, MOST_REPEATED);
+    for factor in [1.0, -1.0, 0.0] {
+        let (verdict, _, again) = run_disturbed(config, factor, |_| false, always);
+        assert_eq!(verdict.refusal, Some(Refusal::Disturbed), "{verdict:?}");
+        assert_eq!(again, MOST_REPEATED);
+    }
+    // One stall in every pulse leaves enough of each.
+    let now_and_then = |tick| if tick % 23 == 0 { 30 } else { 0 };
+    for (factor, refusal) in [
+        (1.0, None),
+        (-1.0, Some(Refusal::WrongSign)),
+        (4.0, Some(Refusal::WrongGain)),
+    ] {
+        let (verdict, _, _) = run_disturbed(config, factor, |_| false, now_and_then);
+        assert_eq!(verdict.refusal, refusal, "{verdict:?}");
+    }
+}
+
+#[test]
+fn a_bead_that_jitters_too_much_for_one_pulse_is_told_by_several() {
+    let arming = Arming::new(
+        ArmingConfig::default(),
+        &TransferFunction::eq6(),
+        SAMPLE,
+        DELAY,
+    )
+    .expect("eq6");
+    let plant = DiscretePlant::new(&TransferFunction::eq6(), SAMPLE, DELAY).expect("eq6");
+    // 0.3 um RMS of white noise: 0.42 um an increment beside the 0.2 um that the pulse makes of it.
+    let told = |factor: f64, seed: u32| {
+        let (mut truth, mut state) = (plant.state(0.0), ArmingState::default());
+        let (mut command, mut again, mut random) = (20.0, 0, seed);
+        loop {
+            let noise: f64 = (0..12)
+                .map(|_| {
+                    random = random.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+                    f64::from(random) / f64::from(u32::MAX) - 0.5
+                })
+                .sum();
+            let input = ArmingInput {
+                position_um: Some(factor * plant.output_um(&truth) + 0.3 * noise),
+                framed: true,
+                command_um: command,
+                neutral_um: 20.0,
+                disturbed: false,
+                steps: 1,
+            };
+            match arming.step(&mut state, &input) {
+                Step::Command(next) => command = next,
+                Step::Again(next, _) => {
+                    command = next;
+                    again += 1;
+                }
+                Step::Done(verdict) => return (verdict, again),
+            }
+            plant.step(&mut truth, command - 20.0);
+        }
+    };
+    let mut most = 0;
+    for seed in 0..20 {
+        let (verdict, again) = told(1.0, seed);
+        assert_eq!(verdict.refusal, None, "seed {seed}: {verdict:?}");
+        most = most.max(again);
+        let (verdict, _) = told(0.0, seed);
+        assert_eq!(verdict.refusal, Some(Refusal::NoResponse), "{verdict:?}");
+    }
+    assert!(
+        most > 0,
+        "one pulse was always enough: noise too small to test anything"
+    );
 }
 
 #[test]

@@ -141,6 +141,8 @@ pub enum Refusal {
     WrongSign,
     /// The gain is outside the range that the controller is safe for.
     WrongGain,
+    /// Time went so unevenly in every pulse that nothing can be told from the answers.
+    Disturbed,
 }
 
 /// What happened. Times in milliseconds, positions in micrometres.
@@ -160,8 +162,8 @@ pub enum EventKind {
         /// Half width of its 95 % interval.
         ci95: f64,
     },
-    /// Ticks were skipped or frames came late during the pulse, and its answer is not that of the model: it counts for
-    /// nothing and is made again.
+    /// Ticks were skipped or frames came late during the pulse, or its interval leaves a doubt, and the plant would be
+    /// refused: the pulse is made again and fitted together with this one.
     ArmingRepeated {
         /// What the answer would have meant.
         refusal: Refusal,

@@ -58,19 +58,20 @@ impl Ended {
     /// Whether what ended it may be over by now, as a stall of this machine or of the line is: another run may go well, and
     /// nobody need do anything for it. A bead that is lost or a board in the hands of another program is not that.
     pub fn may_pass(&self) -> bool {
-        matches!(
-            self.reason,
-            Some(
-                SafeReason::ActuatorRingFull
-                    | SafeReason::Board
-                    | SafeReason::BoardNotObeying
-                    | SafeReason::LateTicks
-                    | SafeReason::LinkLost
-                    | SafeReason::StaleFrames
-                    | SafeReason::Stalled
-                    | SafeReason::VisionSlow
+        self.refusal == Some(Refusal::Disturbed)
+            || matches!(
+                self.reason,
+                Some(
+                    SafeReason::ActuatorRingFull
+                        | SafeReason::Board
+                        | SafeReason::BoardNotObeying
+                        | SafeReason::LateTicks
+                        | SafeReason::LinkLost
+                        | SafeReason::StaleFrames
+                        | SafeReason::Stalled
+                        | SafeReason::VisionSlow
+                )
             )
-        )
     }
 }
 
@@ -258,6 +259,14 @@ impl Clues {
                 format!("{range} of it, for which the controller is stable"),
                 "check pixel_um and um per volt; if both are right measure this rig (cellpos identify) and design for it (cellpos \
                  design)",
+            ),
+            Refusal::Disturbed => sentences(
+                "ticks were skipped or frames came late in every arming pulse, so that nothing can be told from how the bead moved",
+                format!(
+                    "half of the {} ticks of a pulse undisturbed",
+                    2 * arming.pulse_ticks
+                ),
+                "does something else keep this machine busy? cellpos doctor tells; start again",
             ),
         }
     }

@@ -68,6 +68,7 @@ fn refusal(reason: Refusal) -> &'static str {
         Refusal::NoResponse => "the bead did not move with the PZT beyond its own noise",
         Refusal::WrongSign => "the bead moved the other way: is the sign in [calibration] right?",
         Refusal::WrongGain => "the gain is outside what the controller is safe for",
+        Refusal::Disturbed => "ticks were skipped or frames came late in every pulse",
     }
 }
 
