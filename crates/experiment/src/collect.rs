@@ -3,6 +3,7 @@
 
 use crate::excitation::Experiment;
 use crate::on_rig::{Acquired, Listener, OnRig, Trouble};
+use cellpos_ident::experiment::Turn;
 use cellpos_plant::{Hertz, Model};
 use cellpos_reconcile::{Options, ReconcileError, Reconciliation, Record, Verdict, reconcile};
 use cellpos_session::Failure;
@@ -75,7 +76,7 @@ pub fn run_experiment(
     progress: &mut (dyn FnMut(&str) + Send),
 ) -> Result<Ran, Failure> {
     let plan = experiment.plan(rig, share, seed)?;
-    let all: Vec<usize> = (0..plan.segments.len()).collect();
+    let all: Vec<Turn> = (0..plan.segments.len()).map(Turn::planned).collect();
     let total = plan.ticks();
     let name = file
         .file_stem()

@@ -6,12 +6,13 @@
 //! ```
 //! use cellpos_experiment::excitation::Experiment;
 //! use cellpos_experiment::on_rig::{Listener, OnRig};
+//! use cellpos_ident::experiment::Turn;
 //! use cellpos_session::{RigFile, rig_file::Frames};
 //! # fn main() -> Result<(), cellpos_session::Failure> {
 //! let rig = OnRig::new(RigFile::load(None)?, cellpos_plant::Model::eq6(), None, Frames::Off, true)?;
 //! let plan = Experiment::Amplitudes.plan(&rig, 0.2, 1)?;
 //! let mut listener = Listener { progress: &mut |_| {}, segment: &mut |_| {} };
-//! let acquired = rig.acquire(&plan, &[0], &mut listener)?;
+//! let acquired = rig.acquire(&plan, &[Turn::planned(0)], &mut listener)?;
 //! assert!(acquired.trouble.is_none() && acquired.records.len() == 1);
 //! # Ok(())
 //! # }
@@ -25,3 +26,4 @@ pub mod excitation;
 mod exciting;
 pub mod identify;
 pub mod on_rig;
+mod rows;

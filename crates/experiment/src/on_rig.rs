@@ -4,17 +4,19 @@
 //! The loop freezes and thaws by its own rules when the bead is lost; a segment in which it did is measured again.
 
 use crate::camera_rate::{foreign_rate_hz, other_rate};
-use crate::exciting::{Exciting, Handing, SETTLE_TICKS};
+use crate::exciting::{Exciting, Handing};
 use crate::identify::held_bead::{DelayTest, Setup, mean_grey};
+pub use crate::rows::is_unseen;
+use crate::rows::{Rows, ended_spans, fix_noise_um};
 use cellpos_control::{ControllerFile, Pi};
 use cellpos_emulator::WorldConfig;
 use cellpos_ident::delay::dithered_edges;
 use cellpos_ident::excitation::Limits as ShapeLimits;
-use cellpos_ident::experiment::{Plan, RecordedSegment, Span};
+use cellpos_ident::experiment::{Plan, RecordedSegment, Span, Turn};
 use cellpos_plant::Model;
 use cellpos_rig::clock::monotonic_ns;
 use cellpos_rig::{Camera, Clock, FrameBuffer};
-use cellpos_runtime::{EndRule, Grid, Request, TickFlags, TickRecord};
+use cellpos_runtime::{EndRule, Request, TickRecord};
 use cellpos_session::rig_file::{ClockKind, Frames, RigFile};
 use cellpos_session::setup::{self, Prepared, ReferenceSpec};
 use cellpos_session::view::{Pages, Viewed};
@@ -71,6 +73,8 @@ pub enum Trouble {
         missing: usize,
         /// Of how many.
         of: usize,
+        /// The first of them, and what spoilt it.
+        first: String,
     },
 }
 
@@ -78,11 +82,8 @@ impl std::fmt::Display for Trouble {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         match self {
             Self::Ended(ended) => ended.fmt(f),
-            Self::Spoilt { missing, of } => {
-                write!(
-                    f,
-                    "{missing} of {of} segments were spoilt by a lost bead or a freeze"
-                )
+            Self::Spoilt { missing, of, first } => {
+                write!(f, "{missing} of {of} segments were spoilt; {first}")
             }
         }
     }
@@ -176,7 +177,7 @@ impl OnRig {
     pub fn acquire(
         &self,
         plan: &Plan,
-        todo: &[usize],
+        todo: &[Turn],
         listener: &mut Listener<'_>,
     ) -> Result<Acquired, Failure> {
         self.acquire_shown(plan, todo, listener, None)
@@ -189,7 +190,7 @@ impl OnRig {
     pub fn acquire_shown(
         &self,
         plan: &Plan,
-        todo: &[usize],
+        todo: &[Turn],
         listener: &mut Listener<'_>,
         pages: Option<&mut Pages>,
     ) -> Result<Acquired, Failure> {
@@ -243,6 +244,7 @@ impl OnRig {
             Some(Trouble::Spoilt {
                 missing: of - done,
                 of,
+                first: self.first_spoilt(&ticks, plan, &schedule.spans),
             })
         } else {
             Some(Trouble::Ended(finished.ended))
@@ -252,11 +254,10 @@ impl OnRig {
 
     /// What the ticks so far hold.
     fn acquired(&self, ticks: &[TickRecord], plan: &Plan, spans: &[Span]) -> Acquired {
-        let timing = &self.file.timing;
-        let rows = Rows::of(ticks, timing.period_ns(), timing.camera_delay_ms);
+        let rows = self.rows(ticks);
         let records = spans
             .iter()
-            .filter_map(|span| rows.segment(span, plan.lost_frames))
+            .filter_map(|span| rows.segment(span, plan.lost_frames).ok())
             .collect();
         Acquired {
             records,
@@ -270,6 +271,23 @@ impl OnRig {
             unseen: rows.unseen,
             trouble: None,
         }
+    }
+
+    fn rows(&self, ticks: &[TickRecord]) -> Rows {
+        let timing = &self.file.timing;
+        Rows::of(ticks, timing.period_ns(), timing.camera_delay_ms)
+    }
+
+    /// The first segment that is spoilt, and what spoilt it.
+    fn first_spoilt(&self, ticks: &[TickRecord], plan: &Plan, spans: &[Span]) -> String {
+        let rows = self.rows(ticks);
+        let first = spans.iter().find_map(|span| {
+            let spoilt = rows.segment(span, plan.lost_frames).err()?;
+            let label = &plan.segments.get(span.index)?.label;
+            let (number, why) = (span.index + 1, spoilt.words(plan.period_s));
+            Some(format!("segment {number} ({label}): {why}"))
+        });
+        first.unwrap_or_default()
     }
 
     /// The LED test on a rig with a real board: its LED is switched at dithered instants before its camera.
@@ -309,159 +327,5 @@ impl OnRig {
         }
         board.led(false).map_err(Failure::failed)?;
         DelayTest::evaluate(switched_s, frame_s, grey)
-    }
-}
-
-/// Localisation noise as vision stated it in some ticks, um RMS.
-fn fix_noise_um(ticks: &[TickRecord]) -> Option<f64> {
-    let (sum, count) = ticks
-        .iter()
-        .map(|tick| tick.variance_um2)
-        .filter(|variance| variance.is_finite())
-        .fold((0.0, 0u64), |(sum, count), variance| {
-            (sum + variance, count + 1)
-        });
-    (count > 0).then(|| (sum / count as f64).max(0.0).sqrt())
-}
-
-/// Whether a frame came at this tick and showed no bead to be trusted.
-pub fn is_unseen(tick: &TickRecord) -> bool {
-    let came = tick.verdict != 255 && !tick.flags.has(TickFlags::TIMER);
-    came && !tick.measured_um.is_finite()
-}
-
-/// Spans that are over.
-fn ended_spans(ticks: &[TickRecord], spans: &[Span]) -> usize {
-    let is_running = |t: &&TickRecord| t.is_running();
-    let (Some(first), Some(last)) = (ticks.iter().find(is_running), ticks.last()) else {
-        return 0;
-    };
-    let since = usize::try_from(last.seq.saturating_sub(first.seq)).unwrap_or(0);
-    let over = |span: &&Span| SETTLE_TICKS + span.start + span.rows < since;
-    spans.iter().filter(over).count()
-}
-
-/// Ticks as rows of an evenly sampled record, by frame id: a tick that never came is a row without a position.
-struct Rows {
-    input: Vec<f64>,
-    output: Vec<f64>,
-    usable: Vec<bool>,
-    /// The frame came, without a bead to be trusted.
-    unseen: Vec<bool>,
-    /// Sum and number of the times from the arrival of a frame to its tick, ns.
-    waited: (i64, i64),
-    /// Row of each tick since the loop was closed.
-    of_tick: Vec<usize>,
-    /// From the middle of an exposure to the arrival of its frame, ns.
-    path_ns: i64,
-}
-
-/// The camera path: as configured, unless the stamps of most frames say that it is another by half a period or more. Then
-/// it is that of the fastest frames, and what is later than those has waited.
-fn camera_path_ns(ticks: &[TickRecord], period_ns: i64, configured_ms: f64) -> i64 {
-    let configured_ns = (configured_ms * 1e6).round() as i64;
-    let mut ages_ns: Vec<i64> = ticks
-        .iter()
-        .filter(|t| !t.flags.has(TickFlags::TIMER) && !t.flags.has(TickFlags::STALE))
-        .map(|t| t.time_ns - t.mid_exposure_ns)
-        .collect();
-    ages_ns.sort_unstable();
-    match (
-        ages_ns.get(ages_ns.len() / 2),
-        ages_ns.get(ages_ns.len() / 100),
-    ) {
-        (Some(median_ns), Some(fastest_ns))
-            if 2 * (median_ns - configured_ns).abs() >= period_ns =>
-        {
-            *fastest_ns
-        }
-        _ => configured_ns,
-    }
-}
-
-impl Rows {
-    fn of(ticks: &[TickRecord], period_ns: i64, camera_delay_ms: f64) -> Self {
-        let mut rows = Self {
-            input: Vec::new(),
-            output: Vec::new(),
-            usable: Vec::new(),
-            unseen: Vec::new(),
-            waited: (0, 0),
-            of_tick: Vec::new(),
-            path_ns: 0,
-        };
-        let closed = ticks
-            .iter()
-            .position(TickRecord::is_running)
-            .unwrap_or(ticks.len());
-        rows.path_ns = camera_path_ns(&ticks[closed..], period_ns, camera_delay_ms);
-        let mut first_id = None;
-        // The excitation is played by the clock: a tick's place in it is its number on the clock's grid.
-        let grid = Grid::new(ticks.first().map_or(0, |t| t.time_ns), period_ns);
-        let first_index = ticks.get(closed).map_or(0, |t| grid.index(t.time_ns));
-        for tick in &ticks[closed..] {
-            let has = |flag| tick.flags.has(flag);
-            let new_frame = !has(TickFlags::TIMER) && !has(TickFlags::STALE);
-            let next = rows.input.len();
-            let row = if new_frame {
-                let first = *first_id.get_or_insert(tick.frame_id.saturating_sub(next as u64));
-                usize::try_from(tick.frame_id.saturating_sub(first)).unwrap_or(next)
-            } else {
-                next
-            };
-            // A row that a timer tick has already taken is overwritten by the frame that came late after all.
-            let row = row.clamp(next.saturating_sub(1), next + 10_000);
-            while rows.input.len() <= row {
-                let held_um = rows.input.last().copied().unwrap_or(tick.command_um);
-                rows.input.push(held_um);
-                rows.output.push(f64::NAN);
-                rows.usable.push(true);
-                rows.unseen.push(false);
-            }
-            let late_ns = tick.time_ns - tick.mid_exposure_ns - rows.path_ns;
-            let on_time = new_frame && !has(TickFlags::LOST) && 2 * late_ns < period_ns;
-            if on_time {
-                rows.waited.0 += late_ns;
-                rows.waited.1 += 1;
-            }
-            rows.input[row] = tick.command_um;
-            rows.output[row] = if on_time { tick.measured_um } else { f64::NAN };
-            rows.unseen[row] = is_unseen(tick);
-            rows.usable[row] = tick.is_controlled();
-            // A tick that was skipped, or whose record was lost, leaves its place to the one behind it.
-            let at = usize::try_from(grid.index(tick.time_ns) - first_index).unwrap_or(0);
-            rows.of_tick.resize(at.max(rows.of_tick.len()), row);
-            rows.of_tick.push(row);
-        }
-        rows
-    }
-
-    fn wait_s(&self) -> f64 {
-        let (sum_ns, count) = self.waited;
-        if count > 0 {
-            1e-9 * sum_ns as f64 / count as f64
-        } else {
-            0.0
-        }
-    }
-
-    /// A segment, unless it is not whole or the bead was lost in it for long.
-    fn segment(&self, span: &Span, lost_frames: usize) -> Option<RecordedSegment> {
-        let row_of = |tick: usize| self.of_tick.get(SETTLE_TICKS + tick).copied();
-        let (start, from) = (row_of(span.start)?, row_of(span.start + span.settle)?);
-        let end = row_of(span.start + span.rows)?;
-        let output = self.output.get(start..end)?;
-        let longest_gap = output
-            .split(|y| y.is_finite())
-            .map(<[f64]>::len)
-            .max()
-            .unwrap_or(0);
-        let sound = self.usable.get(start..end)?.iter().all(|&u| u) && longest_gap < lost_frames;
-        sound.then(|| RecordedSegment {
-            index: span.index,
-            from: from - start,
-            input: self.input[start..end].to_vec(),
-            output: output.to_vec(),
-        })
     }
 }

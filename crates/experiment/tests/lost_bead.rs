@@ -3,7 +3,7 @@
 use cellpos_emulator::{FaultEvent, FaultKind};
 use cellpos_experiment::on_rig::{Listener, OnRig, Trouble};
 use cellpos_ident::excitation::{Signal, Tone};
-use cellpos_ident::experiment::{Plan, PlannedSegment};
+use cellpos_ident::experiment::{Plan, PlannedSegment, Turn};
 use cellpos_plant::Model;
 use cellpos_session::RigFile;
 use cellpos_session::rig_file::Frames;
@@ -51,16 +51,21 @@ fn a_bead_found_again_is_caught_at_rest_and_the_next_segment_and_the_end_find_it
     let neutral_um = file.emulator.neutral_um;
     let rig = OnRig::new(file, Model::eq6(), None, Frames::Off, true).expect("an emulated rig");
     let plan = plan();
-    let spans = plan.schedule(&[0, 1]).spans;
+    let spans = plan.schedule(&[0, 1].map(Turn::planned)).spans;
     let mut listener = Listener {
         progress: &mut |_| {},
         segment: &mut |_| {},
     };
-    let acquired = rig.acquire(&plan, &[0, 1], &mut listener).expect("a run");
+    let acquired = rig
+        .acquire(&plan, &[0, 1].map(Turn::planned), &mut listener)
+        .expect("a run");
     let indices: Vec<usize> = acquired.records.iter().map(|record| record.index).collect();
     assert_eq!(indices, [1], "the first is spoilt, the second is whole");
-    let spoilt = Trouble::Spoilt { missing: 1, of: 2 };
-    assert_eq!(acquired.trouble, Some(spoilt));
+    let told = acquired.trouble.as_ref().map(ToString::to_string);
+    let told = told.unwrap_or_default();
+    let begins = "1 of 2 segments were spoilt; segment 1 (60 Hz): the loop was frozen after 0.";
+    assert!(told.starts_with(begins), "{told}");
+    assert!(matches!(acquired.trouble, Some(Trouble::Spoilt { .. })));
     let (command_um, bead_um) = &acquired.rows;
     let moved = |from: usize, to: usize| rms(command_um[from..to].iter().map(|um| um - neutral_um));
     let first = REST + spans[0].start;

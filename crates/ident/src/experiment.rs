@@ -62,6 +62,22 @@ pub struct Plan {
     pub lost_frames: usize,
 }
 
+/// A segment to be run, and how strongly.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Turn {
+    /// Index of the segment in the plan.
+    pub index: usize,
+    /// Amplitude over the planned one.
+    pub part: f64,
+}
+
+impl Turn {
+    /// A segment as it is planned.
+    pub fn planned(index: usize) -> Self {
+        Self { index, part: 1.0 }
+    }
+}
+
 /// The expected plant and loop that amplitudes are shaped by, at one frequency: `X2/X1`, and plant times controller
 /// (0 in open loop).
 pub type Expected<'a> = &'a dyn Fn(f64) -> (Complex<f64>, Complex<f64>);
@@ -220,13 +236,13 @@ impl Plan {
     }
 
     /// The excitation of the segments `todo` as one table, for a rig that runs without stopping between them: each
-    /// settled, measured and faded out as [`Plan::run`] does it.
-    pub fn schedule(&self, todo: &[usize]) -> Schedule {
+    /// settled, measured and faded out as [`Plan::run`] does it, at the part of its planned amplitude that is asked for.
+    pub fn schedule(&self, todo: &[Turn]) -> Schedule {
         let mut schedule = Schedule {
             excitation_um: Vec::new(),
             spans: Vec::new(),
         };
-        for &index in todo {
+        for &Turn { index, part } in todo {
             let Some(segment) = self.segments.get(index) else {
                 continue;
             };
@@ -239,7 +255,7 @@ impl Plan {
                 rows: total,
             });
             let release = rows(RELEASE_S, self.period_s);
-            let value = |k: usize| segment.signal.value_um(k as f64 * self.period_s);
+            let value = |k: usize| part * segment.signal.value_um(k as f64 * self.period_s);
             schedule.excitation_um.extend((0..total).map(value));
             schedule
                 .excitation_um

@@ -28,7 +28,7 @@ fn a_schedule_is_what_a_run_would_have_added_tick_by_tick() {
     let plan = Plan::stepped_sines(&[5.0, 20.0, 50.0], &integrator, limits, 1e-3, 10.0);
     let mut noted = Noting(Vec::new());
     let records = plan.run(&mut noted, 1, |_| {}).unwrap();
-    let schedule = plan.schedule(&[1, 2]);
+    let schedule = plan.schedule(&[1, 2].map(Turn::planned));
     assert_eq!(schedule.excitation_um, noted.0);
     for (span, record) in schedule.spans.iter().zip(&records) {
         assert_eq!(
@@ -40,4 +40,8 @@ fn a_schedule_is_what_a_run_would_have_added_tick_by_tick() {
             record.input[..]
         );
     }
+    let gentler = plan.schedule(&[1, 2].map(|index| Turn { index, part: 0.5 }));
+    let halved: Vec<f64> = noted.0.iter().map(|um| 0.5 * um).collect();
+    assert_eq!(gentler.excitation_um, halved);
+    assert_eq!(gentler.spans, schedule.spans);
 }

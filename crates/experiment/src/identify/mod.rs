@@ -5,12 +5,13 @@ mod partial;
 
 use crate::on_rig::{Acquired, Listener, OnRig, Trouble};
 use cellpos_ident::excitation::Limits;
-use cellpos_ident::experiment::{Cause, Measured, Plan, RecordedSegment};
+use cellpos_ident::experiment::{Cause, Measured, Plan, RecordedSegment, Turn};
 use cellpos_ident::frequency_response::Settings;
 use cellpos_ident::summary::{Identification, summarise};
 use cellpos_plant::Hertz;
-use cellpos_session::Failure;
+use cellpos_runtime::life::Refusal;
 use cellpos_session::view::Pages;
+use cellpos_session::{Ended, Failure};
 use held_bead::{DelayTest, HeldBead, Setup};
 use std::path::PathBuf;
 
@@ -94,6 +95,7 @@ pub fn run_shown(
         wait_s,
         path_s,
         fix_noise_um,
+        warnings,
     } = match &job.rig {
         Some(rig) => on_rig(job, rig, &plan, records, &mut heard, pages)?,
         None => held_bead(job, &plan, records, &mut heard)?,
@@ -109,6 +111,7 @@ pub fn run_shown(
     }
     let mut result = conclude(job, measured, led.as_ref())?;
     result.stated_noise_um = fix_noise_um;
+    result.warnings.extend(warnings);
     if let (Some(rig), Some(path_s)) = (&job.rig, path_s) {
         let (found_ms, configured_ms) = (path_s * 1e3, rig.file.timing.camera_delay_ms);
         if (found_ms - configured_ms).abs() > 1e-6 {
@@ -151,6 +154,7 @@ struct Raw {
     wait_s: f64,
     path_s: Option<f64>,
     fix_noise_um: Option<f64>,
+    warnings: Vec<String>,
 }
 
 fn held_bead(
@@ -180,6 +184,7 @@ fn held_bead(
         wait_s: 0.0,
         path_s: None,
         fix_noise_um,
+        warnings: Vec::new(),
     })
 }
 
@@ -193,13 +198,15 @@ fn on_rig(
     progress: &mut (dyn FnMut(usize) + Send),
     mut pages: Option<&mut Pages>,
 ) -> Result<Raw, Failure> {
-    const IN_VAIN: usize = 4;
+    const IN_VAIN: usize = 5;
     let mut in_vain = 0;
+    let mut spoilt = vec![0; plan.segments.len()];
+    let mut warnings = Vec::new();
+    let mut had_bead = false;
     let (mut neutral_um, mut wait_s, mut path_s) = (rig.file.first_neutral_um, 0.0, None);
     let mut fix_noise_um = None;
     loop {
-        let missing = |index: &usize| records.iter().all(|r| r.index != *index);
-        let todo: Vec<usize> = (0..plan.segments.len()).filter(missing).collect();
+        let todo = missing(plan, &records, &spoilt);
         if todo.is_empty() {
             break;
         }
@@ -224,14 +231,30 @@ fn on_rig(
         (neutral_um, wait_s) = (acquired.neutral_um, acquired.wait_s);
         path_s = Some(acquired.path_s);
         fix_noise_um = acquired.fix_noise_um.or(fix_noise_um);
+        had_bead |= !acquired.rows.0.is_empty();
+        let run_through = matches!(acquired.trouble, Some(Trouble::Spoilt { .. }));
+        let failed = missing(plan, &records, &spoilt);
+        let done = todo.iter().filter(|turn| turn.part < 1.0);
+        let done = done.filter(|turn| failed.iter().all(|f| f.index != turn.index));
+        warnings.extend(done.map(|turn| {
+            format!(
+                "segment {} ({}) flung the bead out of view as planned and is measured at {} of its amplitude",
+                turn.index + 1,
+                plan.segments[turn.index].label,
+                turn.part
+            )
+        }));
+        // A run that ended early has tried none behind the one in which it did.
+        let tried = if run_through { failed.len() } else { 1 };
+        for turn in failed.iter().take(tried) {
+            spoilt[turn.index] += 1;
+        }
         match acquired.trouble {
             None => {}
-            Some(Trouble::Spoilt { .. }) if in_vain < IN_VAIN => {
-                tracing::warn!(
-                    "a lost bead or a freeze spoilt segments; measuring again what is missing"
-                );
+            Some(trouble @ Trouble::Spoilt { .. }) if in_vain < IN_VAIN => {
+                tracing::warn!("{trouble}; measuring again what is missing");
             }
-            Some(Trouble::Ended(ended)) if ended.may_pass() && in_vain < IN_VAIN => {
+            Some(Trouble::Ended(ended)) if may_go_on(&ended, had_bead) && in_vain < IN_VAIN => {
                 tracing::warn!("{}; measuring again what is missing", ended.seen);
             }
             Some(trouble) => {
@@ -272,7 +295,29 @@ fn on_rig(
         wait_s,
         path_s,
         fix_noise_um,
+        warnings,
     })
+}
+
+/// Whether another run may go well without anybody's doing: a stall may be over, and where a bead was held before, the next
+/// one comes as that one did.
+fn may_go_on(ended: &Ended, had_bead: bool) -> bool {
+    ended.may_pass() || had_bead && ended.refusal == Some(Refusal::NoBead)
+}
+
+/// Segments that are not measured yet. One that was spoilt once may have met with a stall and is run as it is planned; spoilt
+/// more often it flings the bead out of view, by whatever makes this rig livelier than the model: at half the amplitude
+/// then, and at a quarter.
+fn missing(plan: &Plan, records: &[RecordedSegment], spoilt: &[u32]) -> Vec<Turn> {
+    let is_missing = |index: &usize| records.iter().all(|r| r.index != *index);
+    let indices = (0..plan.segments.len()).filter(is_missing);
+    indices
+        .map(|index| {
+            let times = spoilt.get(index).copied().unwrap_or(0);
+            let part = [1.0, 1.0, 0.5].get(times as usize).copied().unwrap_or(0.25);
+            Turn { index, part }
+        })
+        .collect()
 }
 
 /// Segments of earlier runs and of this one, in order.
@@ -361,7 +406,8 @@ fn acquire(
                         tracing::warn!("{error}");
                         let (done, of) = (records.len(), plan.segments.len());
                         let missing = of - done;
-                        let why = Trouble::Spoilt { missing, of };
+                        let first = error.to_string();
+                        let why = Trouble::Spoilt { missing, of, first };
                         return Err(stopped(job, plan, &records, &why)?);
                     }
                     Cause::BeadLost(error) => {
@@ -373,4 +419,35 @@ fn acquire(
         }
     }
     Ok(records)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use cellpos_plant::Complex;
+
+    #[test]
+    fn a_segment_that_fails_again_and_again_is_run_more_gently_and_one_that_failed_once_is_not() {
+        let limits = Limits {
+            bead_um: 8.0,
+            bead_um_per_s: 400.0,
+            pzt_um: 10.0,
+            slew_um_per_s: 3200.0,
+        };
+        let integrator = |f: f64| {
+            let w = 2.0 * std::f64::consts::PI * f;
+            (Complex::new(0.0, -400.0 / w), Complex::new(0.0, 0.0))
+        };
+        let lines_hz = [5.0, 10.0, 20.0, 50.0, 100.0];
+        let plan = Plan::stepped_sines(&lines_hz, &integrator, limits, 1e-3, 10.0);
+        let measured = RecordedSegment {
+            index: 1,
+            from: 0,
+            input: Vec::new(),
+            output: Vec::new(),
+        };
+        let turns = missing(&plan, &[measured], &[0, 3, 1, 2, 7]);
+        let turns: Vec<(usize, f64)> = turns.iter().map(|turn| (turn.index, turn.part)).collect();
+        assert_eq!(turns, [(0, 1.0), (2, 1.0), (3, 0.5), (4, 0.25)]);
+    }
 }

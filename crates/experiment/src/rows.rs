@@ -1,0 +1,208 @@
+//! The ticks of a run as an evenly sampled record, and the segments in it.
+
+use crate::exciting::SETTLE_TICKS;
+use cellpos_ident::experiment::{RecordedSegment, Span};
+use cellpos_runtime::{Grid, TickFlags, TickRecord};
+
+/// Localisation noise as vision stated it in some ticks, um RMS.
+pub(crate) fn fix_noise_um(ticks: &[TickRecord]) -> Option<f64> {
+    let (sum, count) = ticks
+        .iter()
+        .map(|tick| tick.variance_um2)
+        .filter(|variance| variance.is_finite())
+        .fold((0.0, 0u64), |(sum, count), variance| {
+            (sum + variance, count + 1)
+        });
+    (count > 0).then(|| (sum / count as f64).max(0.0).sqrt())
+}
+
+/// Whether a frame came at this tick and showed no bead to be trusted.
+pub fn is_unseen(tick: &TickRecord) -> bool {
+    let came = tick.verdict != 255 && !tick.flags.has(TickFlags::TIMER);
+    came && !tick.measured_um.is_finite()
+}
+
+/// Spans that are over.
+pub(crate) fn ended_spans(ticks: &[TickRecord], spans: &[Span]) -> usize {
+    let is_running = |t: &&TickRecord| t.is_running();
+    let (Some(first), Some(last)) = (ticks.iter().find(is_running), ticks.last()) else {
+        return 0;
+    };
+    let since = usize::try_from(last.seq.saturating_sub(first.seq)).unwrap_or(0);
+    let over = |span: &&Span| SETTLE_TICKS + span.start + span.rows < since;
+    spans.iter().filter(over).count()
+}
+
+/// Ticks as rows of an evenly sampled record, by frame id: a tick that never came is a row without a position.
+pub(crate) struct Rows {
+    pub(crate) input: Vec<f64>,
+    pub(crate) output: Vec<f64>,
+    usable: Vec<bool>,
+    /// The frame came, without a bead to be trusted.
+    pub(crate) unseen: Vec<bool>,
+    /// Sum and number of the times from the arrival of a frame to its tick, ns.
+    waited: (i64, i64),
+    /// Row of each tick since the loop was closed.
+    of_tick: Vec<usize>,
+    /// From the middle of an exposure to the arrival of its frame, ns.
+    pub(crate) path_ns: i64,
+}
+
+/// The camera path: as configured, unless the stamps of most frames say that it is another by half a period or more. Then
+/// it is that of the fastest frames, and what is later than those has waited.
+fn camera_path_ns(ticks: &[TickRecord], period_ns: i64, configured_ms: f64) -> i64 {
+    let configured_ns = (configured_ms * 1e6).round() as i64;
+    let mut ages_ns: Vec<i64> = ticks
+        .iter()
+        .filter(|t| !t.flags.has(TickFlags::TIMER) && !t.flags.has(TickFlags::STALE))
+        .map(|t| t.time_ns - t.mid_exposure_ns)
+        .collect();
+    ages_ns.sort_unstable();
+    match (
+        ages_ns.get(ages_ns.len() / 2),
+        ages_ns.get(ages_ns.len() / 100),
+    ) {
+        (Some(median_ns), Some(fastest_ns))
+            if 2 * (median_ns - configured_ns).abs() >= period_ns =>
+        {
+            *fastest_ns
+        }
+        _ => configured_ns,
+    }
+}
+
+impl Rows {
+    pub(crate) fn of(ticks: &[TickRecord], period_ns: i64, camera_delay_ms: f64) -> Self {
+        let mut rows = Self {
+            input: Vec::new(),
+            output: Vec::new(),
+            usable: Vec::new(),
+            unseen: Vec::new(),
+            waited: (0, 0),
+            of_tick: Vec::new(),
+            path_ns: 0,
+        };
+        let closed = ticks
+            .iter()
+            .position(TickRecord::is_running)
+            .unwrap_or(ticks.len());
+        rows.path_ns = camera_path_ns(&ticks[closed..], period_ns, camera_delay_ms);
+        let mut first_id = None;
+        // The excitation is played by the clock: a tick's place in it is its number on the clock's grid.
+        let grid = Grid::new(ticks.first().map_or(0, |t| t.time_ns), period_ns);
+        let first_index = ticks.get(closed).map_or(0, |t| grid.index(t.time_ns));
+        for tick in &ticks[closed..] {
+            let has = |flag| tick.flags.has(flag);
+            let new_frame = !has(TickFlags::TIMER) && !has(TickFlags::STALE);
+            let next = rows.input.len();
+            let row = if new_frame {
+                let first = *first_id.get_or_insert(tick.frame_id.saturating_sub(next as u64));
+                usize::try_from(tick.frame_id.saturating_sub(first)).unwrap_or(next)
+            } else {
+                next
+            };
+            // A row that a timer tick has already taken is overwritten by the frame that came late after all.
+            let row = row.clamp(next.saturating_sub(1), next + 10_000);
+            while rows.input.len() <= row {
+                let held_um = rows.input.last().copied().unwrap_or(tick.command_um);
+                rows.input.push(held_um);
+                rows.output.push(f64::NAN);
+                rows.usable.push(true);
+                rows.unseen.push(false);
+            }
+            let late_ns = tick.time_ns - tick.mid_exposure_ns - rows.path_ns;
+            let on_time = new_frame && !has(TickFlags::LOST) && 2 * late_ns < period_ns;
+            if on_time {
+                rows.waited.0 += late_ns;
+                rows.waited.1 += 1;
+            }
+            rows.input[row] = tick.command_um;
+            rows.output[row] = if on_time { tick.measured_um } else { f64::NAN };
+            rows.unseen[row] = is_unseen(tick);
+            rows.usable[row] = tick.is_controlled();
+            // A tick that was skipped, or whose record was lost, leaves its place to the one behind it.
+            let at = usize::try_from(grid.index(tick.time_ns) - first_index).unwrap_or(0);
+            rows.of_tick.resize(at.max(rows.of_tick.len()), row);
+            rows.of_tick.push(row);
+        }
+        rows
+    }
+
+    pub(crate) fn wait_s(&self) -> f64 {
+        let (sum_ns, count) = self.waited;
+        if count > 0 {
+            1e-9 * sum_ns as f64 / count as f64
+        } else {
+            0.0
+        }
+    }
+
+    /// A segment, or what keeps it from being one.
+    pub(crate) fn segment(
+        &self,
+        span: &Span,
+        lost_frames: usize,
+    ) -> Result<RecordedSegment, Spoilt> {
+        let row_of = |tick: usize| {
+            let row = self.of_tick.get(SETTLE_TICKS + tick).copied();
+            row.ok_or(Spoilt::NotRun)
+        };
+        let (start, from) = (row_of(span.start)?, row_of(span.start + span.settle)?);
+        let end = row_of(span.start + span.rows)?;
+        let (Some(output), Some(usable)) =
+            (self.output.get(start..end), self.usable.get(start..end))
+        else {
+            return Err(Spoilt::NotRun);
+        };
+        if let Some(at) = usable.iter().position(|usable| !usable) {
+            return Err(Spoilt::Frozen { at });
+        }
+        let mut gap = 0;
+        for (row, um) in output.iter().enumerate() {
+            gap = if um.is_finite() { 0 } else { gap + 1 };
+            if gap >= lost_frames {
+                let at = row + 1 - gap;
+                return Err(Spoilt::Unseen { at, rows: gap });
+            }
+        }
+        Ok(RecordedSegment {
+            index: span.index,
+            from: from - start,
+            input: self.input[start..end].to_vec(),
+            output: output.to_vec(),
+        })
+    }
+}
+
+/// Why a stretch of a run is not a segment; rows are counted from its start.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Spoilt {
+    /// The run ended before it did.
+    NotRun,
+    /// The loop was frozen.
+    Frozen {
+        /// First row of that.
+        at: usize,
+    },
+    /// No position for long.
+    Unseen {
+        /// First row without one.
+        at: usize,
+        /// Rows without one.
+        rows: usize,
+    },
+}
+
+impl Spoilt {
+    /// In words, for a segment of rows `period_s` apart.
+    pub(crate) fn words(self, period_s: f64) -> String {
+        let s = |rows: usize| rows as f64 * period_s;
+        match self {
+            Self::NotRun => "the run ended before it did".to_string(),
+            Self::Frozen { at } => format!("the loop was frozen after {:.2} s", s(at)),
+            Self::Unseen { at, rows } => {
+                format!("no position for {:.2} s after {:.2} s", s(rows), s(at))
+            }
+        }
+    }
+}
