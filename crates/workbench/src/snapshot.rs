@@ -11,8 +11,8 @@ use std::path::Path;
 
 /// How long a frame may let wait, ns.
 const PATIENCE_NS: i64 = 2_000_000_000;
-/// Frames in which a bead or cell is looked for.
-const LOOKS: usize = 200;
+/// How long a bead or cell is looked for, ns: one that was lost is followed by the next.
+const LOOKING_NS: i64 = 5_000_000_000;
 
 /// What was seen in the frame that was kept.
 #[derive(Debug, Clone, Serialize)]
@@ -61,7 +61,7 @@ pub fn next_frame(camera: &mut dyn Camera, buffer: &mut FrameBuffer) -> Result<i
     }
 }
 
-/// Takes a frame; with `overlay` one in which a bead or cell is seen, if there is one among a few.
+/// Takes a frame; with `overlay` the first in which a bead or cell is seen, if one is within five seconds.
 ///
 /// # Errors
 /// No frame comes, or what vision needs is missing.
@@ -72,12 +72,10 @@ pub fn take(bench: &Bench, overlay: bool) -> Result<(Snapshot, RgbImage), Failur
     let mut seen = None;
     if overlay {
         let mut eye = Eye::of(bench)?;
-        for _ in 0..LOOKS {
+        let end_ns = Clock::Real.now_ns() + LOOKING_NS;
+        while seen.is_none() && Clock::Real.now_ns() < end_ns {
             let at_ns = next_frame(camera.as_mut(), &mut buffer)?;
             seen = eye.look(&buffer, (at_ns - start_ns) as f64 * 1e-9)?;
-            if seen.is_some() {
-                break;
-            }
         }
     }
     let grey = grey_levels(&buffer);

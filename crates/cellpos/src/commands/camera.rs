@@ -153,7 +153,7 @@ fn snapshot(rig: &Path, path: &PathBuf, overlay: bool, json: bool) -> CommandRes
             text.push('\n');
         }
         (None, true) => {
-            text += "no bead or cell that vision believes in: see docs/rig.md, Light and focus\n"
+            text += "no bead or cell that vision believes in within 5 s: see docs/rig.md, Light and focus\n"
         }
         (None, false) => {}
     }

@@ -145,12 +145,9 @@ fn a_recording_gives_positions_micrometres_a_sheet_and_a_summary() {
 }
 
 #[test]
+#[cfg_attr(no_shared_data, ignore = "needs ../shared/data/beads-brightfield")]
 fn the_measured_beads_are_found_in_every_frame() {
-    let data = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared/data/beads-brightfield");
-    if !data.exists() {
-        println!("skipped: {} is not there", data.display());
-        return;
-    }
+    let data = Path::new(env!("MEASURED_DATA")).join("beads-brightfield");
     let folder = tempfile::tempdir().unwrap();
     let r = succeed(
         folder.path(),

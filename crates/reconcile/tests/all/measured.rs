@@ -8,13 +8,8 @@ use cellpos_plant::{Model, Noise, SimulateOptions, TransferFunction, effects, si
 use cellpos_reconcile::{Options, ReconcileError, Reconciliation, Record, Verdict, reconcile};
 use std::path::{Path, PathBuf};
 
-fn data() -> Option<PathBuf> {
-    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared/data/measured");
-    if path.is_dir() {
-        return Some(path);
-    }
-    println!("skipped: {} is not beside the repository", path.display());
-    None
+fn data() -> PathBuf {
+    Path::new(env!("MEASURED_DATA")).join("measured")
 }
 
 /// Columns of input and output of a file.
@@ -46,9 +41,9 @@ fn set(
     sample_s: f64,
     order: usize,
     hold: Hold,
-) -> Option<Set> {
-    let folder = data()?.join(name);
-    Some(Set {
+) -> Set {
+    let folder = data().join(name);
+    Set {
         sample_s,
         order,
         hold,
@@ -59,7 +54,7 @@ fn set(
                 ((*f).to_owned(), u, y)
             })
             .collect(),
-    })
+    }
 }
 
 impl Set {
@@ -172,17 +167,16 @@ impl Set {
 }
 
 #[test]
+#[cfg_attr(no_shared_data, ignore = "needs ../shared/data/measured")]
 fn a_hair_dryer_with_its_delay_has_no_name_missing() {
-    let Some(s) = set(
+    let s = set(
         "hair-dryer",
         &["dryer"],
         ("u_V", "y_V"),
         0.08,
         2,
         Hold::ZeroOrder,
-    ) else {
-        return;
-    };
+    );
     s.no_name(&s.base(0));
 }
 
@@ -198,38 +192,36 @@ fn rough(num: f64, den: &[f64], at_rest: f64) -> Model {
 }
 
 #[test]
+#[cfg_attr(no_shared_data, ignore = "needs ../shared/data/measured")]
 fn cascaded_tanks_that_overflow_have_no_name_in_the_catalogue() {
-    let Some(s) = set(
+    let s = set(
         "cascaded-tanks",
         &["tanks_Est", "tanks_Val"],
         ("u_V", "y_V"),
         4.0,
         2,
         Hold::ZeroOrder,
-    ) else {
-        return;
-    };
+    );
     // Two lags of 40 and 80 s.
     s.no_name(&rough(3.0, &[3200.0, 120.0, 1.0], 3.0));
 }
 
 #[test]
+#[cfg_attr(no_shared_data, ignore = "needs ../shared/data/measured")]
 fn drives_with_a_rectifying_sensor_have_no_name_in_the_catalogue() {
-    let Some(s) = set(
+    let s = set(
         "coupled-drives",
         &["drive1", "drive2", "drive3"],
         ("u_V", "z_V"),
         0.02,
         3,
         Hold::ZeroOrder,
-    ) else {
-        return;
-    };
+    );
     // A belt of 1.5 Hz behind a lag of 0.3 s.
     s.no_name(&rough(1.0, &[0.0034, 0.0158, 0.33, 1.0], 0.0));
 }
 
-fn silverbox() -> Option<Set> {
+fn silverbox() -> Set {
     set(
         "silverbox",
         &["sb_sch", "sb_sch2", "sb_ms10"],
@@ -241,17 +233,16 @@ fn silverbox() -> Option<Set> {
 }
 
 #[test]
+#[cfg_attr(no_shared_data, ignore = "needs ../shared/data/measured")]
 fn a_silverbox_has_a_stiffness_that_grows_with_the_position_and_no_name_in_the_catalogue() {
-    let Some(s) = set(
+    let s = set(
         "silverbox",
         &["sb_sch", "sb_sch2", "sb_ms10"],
         ("V1", "V2"),
         1.0 / 610.35,
         2,
         Hold::None,
-    ) else {
-        return;
-    };
+    );
     let model = s.base(2);
     let result = s.run(&model, &s.records(|n| 0..n)).unwrap();
     assert!(result.effects.is_empty(), "{:?}", result.effects);
@@ -263,7 +254,7 @@ fn a_silverbox_has_a_stiffness_that_grows_with_the_position_and_no_name_in_the_c
 #[test]
 #[ignore = "minutes: cargo test --release -p cellpos-reconcile --test all measured -- --include-ignored"]
 fn no_half_of_a_silverbox_has_a_name_in_the_catalogue() {
-    let Some(s) = silverbox() else { return };
+    let s = silverbox();
     s.no_name(&s.base(2));
 }
 
@@ -325,6 +316,7 @@ cubic = { unit = "1/V^2", lower = -100.0, upper = 100.0, start = [1.0, 5.0] }
 "#;
 
 #[test]
+#[cfg_attr(no_shared_data, ignore = "needs ../shared/data/measured")]
 fn a_short_silverbox_is_named_with_a_cubic_spring_from_a_file() {
     cubic_spring(3000);
 }
@@ -337,7 +329,7 @@ fn a_silverbox_is_named_with_a_cubic_spring_from_a_file() {
 
 /// With so many rows of each record at most.
 fn cubic_spring(rows: usize) {
-    let Some(s) = silverbox() else { return };
+    let s = silverbox();
     let arrow = set(
         "silverbox",
         &["sb_arrow"],
@@ -345,8 +337,7 @@ fn cubic_spring(rows: usize) {
         s.sample_s,
         2,
         s.hold,
-    )
-    .unwrap();
+    );
     let (_, u, y) = &arrow.files[0];
     let model = s.base(2);
     let before = free_run(&model, s.hold, s.sample_s, (u, y), 0.0);
@@ -395,17 +386,16 @@ upper_0 = { unit = "V", lower = 0.0, upper = 80.0, start = [5.0, 30.0] }
 "#;
 
 #[test]
+#[cfg_attr(no_shared_data, ignore = "needs ../shared/data/measured")]
 fn tanks_with_an_overflow_from_a_file_follow_what_they_have_not_seen() {
-    let Some(s) = set(
+    let s = set(
         "cascaded-tanks",
         &["tanks_Est"],
         ("u_V", "y_V"),
         4.0,
         2,
         Hold::ZeroOrder,
-    ) else {
-        return;
-    };
+    );
     let fresh = set(
         "cascaded-tanks",
         &["tanks_Val"],
@@ -413,8 +403,7 @@ fn tanks_with_an_overflow_from_a_file_follow_what_they_have_not_seen() {
         4.0,
         2,
         Hold::ZeroOrder,
-    )
-    .unwrap();
+    );
     Definition::from_toml_str(TANKS, "tanks.toml").unwrap();
     // The noise of the level sensor, without a walk: what is scored is the free run.
     let model = Model {

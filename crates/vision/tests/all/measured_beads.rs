@@ -6,10 +6,7 @@ use cellpos_vision::{
 };
 use std::path::Path;
 
-const DATA: &str = concat!(
-    env!("CARGO_MANIFEST_DIR"),
-    "/../../../shared/data/beads-brightfield"
-);
+const DATA: &str = concat!(env!("MEASURED_DATA"), "/beads-brightfield");
 const FRAMES: usize = 50;
 const BEADS: usize = 5;
 
@@ -41,12 +38,9 @@ fn reference(folder: &Path) -> Vec<Vec<(f64, f64)>> {
 }
 
 #[test]
+#[cfg_attr(no_shared_data, ignore = "needs ../shared/data/beads-brightfield")]
 fn all_five_measured_beads_keep_their_numbers_and_move_as_the_reference_says() {
     let folder = Path::new(DATA);
-    if !folder.exists() {
-        println!("skipped: {DATA} is not there");
-        return;
-    }
     let reference = reference(folder);
     let spec = ProfileSpec::Ring {
         edge_px: RingProfile::MEASURED_EDGE_PX,

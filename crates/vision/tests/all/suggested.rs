@@ -8,7 +8,7 @@ use cellpos_vision::{
 };
 use std::path::Path;
 
-const SHARED: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../../../shared/data");
+const SHARED: &str = env!("MEASURED_DATA");
 
 /// The 50 frames with five beads.
 fn beads() -> Stack {

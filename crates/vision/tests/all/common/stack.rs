@@ -5,10 +5,7 @@ use std::path::{Path, PathBuf};
 use tiff::decoder::{Decoder, DecodingResult, Limits};
 
 /// Folder of the cells in channels.
-pub const CELLS: &str = concat!(
-    env!("CARGO_MANIFEST_DIR"),
-    "/../../../shared/data/cells-in-channels"
-);
+pub const CELLS: &str = concat!(env!("MEASURED_DATA"), "/cells-in-channels");
 
 /// Frames of 8 bits.
 pub struct Stack {
