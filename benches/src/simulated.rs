@@ -65,7 +65,7 @@ pub struct Seen {
 }
 
 /// Runs a controller along a profile, with learning if a learner is given; `before` may change the rig at each tick, `each`
-/// sees what happened.
+/// sees what happened. What was learned is given back.
 ///
 /// # Panics
 /// A rig or a controller that cannot be built: a defect.
@@ -77,7 +77,7 @@ pub fn run(
     ticks: u64,
     mut before: impl FnMut(u64, &mut SimulatedRig),
     mut each: impl FnMut(Seen),
-) {
+) -> Option<LearnedTable> {
     let ts = config.model.sample_time_s;
     let late = (rig.delay_s - config.model.delay_s) / ts;
     let age_ticks = rig.delay_s / ts;
@@ -102,11 +102,12 @@ pub fn run(
             learned_um: learning.as_mut().map_or(0.0, |learning| {
                 learning.addition_um(profile.phase(time_s), reference_um)
             }),
+            feed_forward_gain: learning.as_ref().and_then(CycleLearning::feed_forward_gain),
             ..LoopInput::default()
         };
         let output = controller.step(&input);
         if let Some(learning) = &mut learning {
-            learning.learn(Some((fix.position_um, age_ticks)));
+            learning.learn(Some((fix.position_um, age_ticks)), &output.driven);
         }
         rig.advance(output.command_um);
         each(Seen {
@@ -116,6 +117,7 @@ pub fn run(
             output,
         });
     }
+    learning.map(|learning| learning.table())
 }
 
 /// Root of the mean of the squares; NaN of nothing.

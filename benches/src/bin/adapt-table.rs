@@ -56,7 +56,7 @@ fn changes(threads: usize, seeds: u64) {
             let mut config = loop_config(controller);
             config.estimator.adapt = adapt;
             let seeds: Vec<u64> = (0..seeds).collect();
-            let rows: Vec<Row> = parallel::map(threads, &seeds, |&seed| {
+            let rows: Vec<Row> = parallel::map(&seeds, threads, |&seed| {
                 hold_through(config, RigConfig::eq6(seed), &regimes(seed))
             })
             .into_iter()
@@ -91,7 +91,7 @@ fn long_hold(threads: usize, hours: u64) {
         .into_iter()
         .filter(|(name, _)| names.contains(name))
         .collect();
-    let lines = parallel::map(threads, &chosen, |(name, controller)| {
+    let lines = parallel::map(&chosen, threads, |(name, controller)| {
         let mut config = loop_config(*controller);
         config.estimator.adapt = true;
         let mut rig = SimulatedRig::new(RigConfig::eq6(1)).expect("a sound rig");

@@ -1,20 +1,62 @@
 //! Cyclic motion with a wrong model: what preview alone leaves, and what learning makes of it.
 //!
-//!     cargo run --release -p cellpos-benches --bin cycle-table         # -- --adapt 0 --cycles 20 --seeds 5
+//!     cargo run --release -p cellpos-benches --bin cycle-table     # -- --adapt 0 --cycles 10 --seeds 10 --parallel 0
 //!
 //! Rig at the level of positions: Eq. (6) with the gain 20 % and the delay 0.25 ms off in either direction, D =
 //! 0.33 um^2/s, 20 nm fixes, loop delay 2.5 ms in the model. True positions; the learned error counts from the end of the
-//! 20th cycle (`--cycles`) at full amplitude for 1 s, the hold error on the same wrong rig for 4 s. Each line is the worst of seeds 0
-//! to 4 and of the four directions, against the hold error of the same rig.
+//! 10th cycle (`--cycles`) at full amplitude for 1 s, the hold error on the same wrong rig for 4 s. Ten seeds and four
+//! directions each. "worst cycle": error of a cycle over that of the same cycle without learning, mean of squares over all
+//! runs, the largest of the first 40 cycles. "idle": runs that have nothing learned in force at the end.
 
 use cellpos_benches::parallel;
 use cellpos_benches::simulated::{controllers, loop_config, rms, run, sine};
 use cellpos_control::design::{DesignPlant, Uncertainty, harmonic_responses};
 use cellpos_control::*;
+use std::f64::consts::TAU;
 
 const FADE_S: f64 = 0.2;
+/// Cycles that are compared one by one.
+const CYCLES: usize = 40;
+/// Of one sample a tick: 50, 100 and 200 Hz.
+const LINES_TICKS: u32 = 20;
 
-fn rig(gain: f64, late_s: f64, seed: u64) -> RigConfig {
+/// A motion of the table.
+struct Motion {
+    name: &'static str,
+    profile: Profile,
+    frequency_hz: f64,
+    harmonics: u32,
+}
+
+fn motions() -> Vec<Motion> {
+    let one = |name, amplitude_um, frequency_hz| Motion {
+        name,
+        profile: sine(amplitude_um, frequency_hz, FADE_S),
+        frequency_hz,
+        harmonics: 3,
+    };
+    let turn = |i: u32| TAU * f64::from(i) / f64::from(LINES_TICKS);
+    let lines = |x: f64| 2.0 * x.sin() + (2.0 * x + 0.7).sin() + 0.5 * (4.0 * x + 2.0).sin();
+    vec![
+        one("5 um, 50 Hz", 5.0, 50.0),
+        one("5 um, 100 Hz", 5.0, 100.0),
+        one("1 um, 130 Hz", 1.0, 130.0),
+        one("1 um, 200 Hz", 1.0, 200.0),
+        one("0.5 um, 300 Hz", 0.5, 300.0),
+        one("18 um, 50 Hz", 18.0, 50.0),
+        Motion {
+            name: "50, 100, 200 Hz",
+            profile: Profile::Waveform {
+                samples_um: (0..LINES_TICKS).map(|i| lines(turn(i))).collect(),
+                period_s: f64::from(LINES_TICKS) * 1e-3,
+            },
+            frequency_hz: 50.0,
+            harmonics: 6,
+        },
+    ]
+}
+
+fn rig(&(gain, late_s, seed): &(f64, f64, u64)) -> RigConfig {
     let eq6 = RigConfig::eq6(seed);
     RigConfig {
         plant: eq6.plant.scaled(gain).expect("a gain above 0"),
@@ -23,94 +65,127 @@ fn rig(gain: f64, late_s: f64, seed: u64) -> RigConfig {
     }
 }
 
-fn error_nm(
+/// True errors tick by tick, nm, and what was learned.
+fn errors_nm(
     controller: ControllerConfig,
     rig: RigConfig,
     profile: &Profile,
     learner: Option<&Learner>,
-    (from, to): (u64, u64),
-) -> f64 {
+    ticks: u64,
+) -> (Vec<f64>, Option<LearnedTable>) {
     let mut errors = Vec::new();
     let mut config = loop_config(controller);
-    config.estimator.adapt = parallel::option("--adapt", 0) == 1;
-    run(
+    config.estimator.adapt = parallel::option("--adapt", 1) == 1;
+    let learned = run(
         config,
         rig,
         profile,
         learner,
-        to,
+        ticks,
         |_, _| {},
-        |seen| {
-            if seen.tick >= from {
-                errors.push(1e3 * seen.error_um);
-            }
-        },
+        |seen| errors.push(1e3 * seen.error_um),
     );
-    rms(errors.into_iter())
+    (errors, learned)
+}
+
+/// What comes of one rig.
+struct Case {
+    hold_nm: f64,
+    preview_nm: f64,
+    learned_nm: f64,
+    /// Squares of the errors in each cycle, with learning and without, nm^2.
+    cycles: Vec<[f64; 2]>,
+    idle: bool,
+}
+
+fn case(
+    controller: ControllerConfig,
+    motion: &Motion,
+    learner: &Learner,
+    of: &(f64, f64, u64),
+) -> Case {
+    let cycle_ticks = 1e3 / motion.frequency_hz;
+    let start = 1e3 * FADE_S;
+    let learned = (start + parallel::option("--cycles", 10) as f64 * cycle_ticks).ceil() as usize;
+    let ticks = (learned + 1000).max((start + CYCLES as f64 * cycle_ticks).ceil() as usize) as u64;
+    let hold = Profile::Hold { position_um: 0.0 };
+    let (held, _) = errors_nm(controller, rig(of), &hold, None, 5000);
+    let (without, _) = errors_nm(controller, rig(of), &motion.profile, None, ticks);
+    let (with, table) = errors_nm(controller, rig(of), &motion.profile, Some(learner), ticks);
+    let span = |errors: &[f64], from: usize, to: usize| rms(errors[from..to].iter().copied());
+    let cycle = |errors: &[f64], n: usize| {
+        let at = |n: usize| (start + n as f64 * cycle_ticks) as usize;
+        span(errors, at(n), at(n + 1)).powi(2)
+    };
+    Case {
+        hold_nm: span(&held, 1000, 5000),
+        preview_nm: span(&without, learned, learned + 1000),
+        learned_nm: span(&with, learned, learned + 1000),
+        cycles: (0..CYCLES)
+            .map(|n| [cycle(&with, n), cycle(&without, n)])
+            .collect(),
+        idle: table.is_some_and(|table| table.harmonics.is_empty()),
+    }
+}
+
+fn print_row(name: &str, motion: &Motion, cases: &[Case]) {
+    let count = cases.len() as f64;
+    let mean = |of: fn(&Case) -> f64| cases.iter().map(of).sum::<f64>() / count;
+    let worst = cases
+        .iter()
+        .map(|case| case.learned_nm / case.hold_nm)
+        .fold(0.0, f64::max);
+    let cycle = (0..CYCLES)
+        .map(|n| {
+            let sum = |which: usize| cases.iter().map(|case| case.cycles[n][which]).sum::<f64>();
+            (sum(0) / sum(1)).sqrt()
+        })
+        .fold(0.0, f64::max);
+    let idle = cases.iter().filter(|case| case.idle).count();
+    println!(
+        "{name:<16} {:>16} {:>9.1} {:>11.1} {:>11.1} {:>8.2} {worst:>8.2} {cycle:>12.2} {idle:>5} of {count}",
+        motion.name,
+        mean(|case| case.hold_nm),
+        mean(|case| case.preview_nm),
+        mean(|case| case.learned_nm),
+        mean(|case| case.learned_nm / case.hold_nm),
+    );
 }
 
 fn main() {
     let plant = DesignPlant::eq6(2.5e-3);
+    let seeds = parallel::option("--seeds", 10);
+    let rigs: Vec<(f64, f64, u64)> = [0.8, 1.2]
+        .into_iter()
+        .flat_map(|gain| [-0.25e-3, 0.25e-3].map(|late_s| (gain, late_s)))
+        .flat_map(|(gain, late_s)| (0..seeds).map(move |seed| (gain, late_s, seed)))
+        .collect();
     println!(
-        "{:<16} {:>16} {:>14} {:>14} {:>14} {:>10} {:>12}",
-        "", "", "hold nm", "preview nm", "learned nm", "/hold", "uncertainty"
+        "{:<16} {:>16} {:>9} {:>11} {:>11} {:>8} {:>8} {:>12} {:>5}",
+        "", "", "hold nm", "preview nm", "learned nm", "/hold", "worst", "worst cycle", "idle"
     );
     for (name, controller) in controllers() {
         if !matches!(name, "lqg" | "mpc, active set") {
             continue;
         }
-        for (amplitude_um, frequency_hz) in [
-            (5.0, 50.0),
-            (5.0, 100.0),
-            (1.0, 130.0),
-            (1.0, 200.0),
-            (0.5, 300.0),
-        ] {
-            let profile = sine(amplitude_um, frequency_hz, FADE_S);
+        for motion in motions() {
             let responses = harmonic_responses(
                 &plant,
                 &loop_config(controller),
-                &profile,
+                &motion.profile,
                 FADE_S,
-                frequency_hz,
-                3,
+                motion.frequency_hz,
+                motion.harmonics,
                 Uncertainty::default(),
             )
             .expect("the nominal loop");
-            let learner = Learner::new(LearnConfig::default(), frequency_hz, 1e-3, &responses)
-                .expect("a learner");
-            let learned_at = (1e3
-                * (FADE_S + parallel::option("--cycles", 20) as f64 / frequency_hz))
-                .ceil() as u64;
-            let span = (learned_at, learned_at + 1000);
-            let mut worst = [0.0_f64; 4];
-            for gain in [0.8, 1.2] {
-                for late_s in [-0.25e-3, 0.25e-3] {
-                    for seed in 0..parallel::option("--seeds", 5) {
-                        let rig = || rig(gain, late_s, seed);
-                        let hold = Profile::Hold { position_um: 0.0 };
-                        let hold_nm = error_nm(controller, rig(), &hold, None, (1000, 5000));
-                        let preview_nm = error_nm(controller, rig(), &profile, None, span);
-                        let learned_nm =
-                            error_nm(controller, rig(), &profile, Some(&learner), span);
-                        let now = [hold_nm, preview_nm, learned_nm, learned_nm / hold_nm];
-                        for (worst, now) in worst.iter_mut().zip(now) {
-                            *worst = worst.max(now);
-                        }
-                    }
-                }
-            }
-            let uncertainty = responses
-                .first()
-                .map_or(f64::NAN, |response| response.relative_uncertainty);
-            println!(
-                "{name:<16} {:>16} {:>14.1} {:>14.1} {:>14.1} {:>10.2} {uncertainty:>12.2}",
-                format!("{amplitude_um} um, {frequency_hz} Hz"),
-                worst[0],
-                worst[1],
-                worst[2],
-                worst[3]
-            );
+            let config = LearnConfig::default();
+            let learner =
+                Learner::new(config, motion.frequency_hz, 1e-3, &responses).expect("a learner");
+            let cases = parallel::map(&rigs, parallel::threads(), |of| {
+                case(controller, &motion, &learner, of)
+            });
+            print_row(name, &motion, &cases);
         }
     }
 }

@@ -1,12 +1,13 @@
 //! Every controller on one table: hold error against the minimum-variance bound, a 10 um step, previewed sines, spread.
 //!
-//!     cargo run --release -p cellpos-benches --bin hold-table
+//!     cargo run --release -p cellpos-benches --bin hold-table     # -- --parallel 0
 //!
 //! Rig at the level of positions (no camera, no board): Eq. (6), D = 0.33 um^2/s, 20 nm fixes, loop delay 2.5 ms. True
 //! positions at the ticks, seeds 0 to 4. Errors count from 2 s on, for 10 s; a step is settled when the bead stays
 //! within the band until 60 ms after it, Brownian motion included (2 % are 4 standard deviations of the hold error, so
 //! that an excursion later on is no matter of the step).
 
+use cellpos_benches::parallel;
 use cellpos_benches::simulated::{controllers, loop_config, rms, run, sine};
 use cellpos_control::design::{DesignPlant, bound_rms_um, spread};
 use cellpos_control::*;
@@ -42,6 +43,12 @@ fn rms_nm(controller: ControllerConfig, seed: u64, profile: &Profile) -> f64 {
     1e3 * rms(errors.get(2000..).unwrap_or_default().iter().copied())
 }
 
+/// What comes of each seed, on the threads that were asked for.
+fn of_seeds<R: Send>(of: impl Fn(u64) -> R + Sync) -> Vec<R> {
+    let seeds: Vec<u64> = (0..SEEDS).collect();
+    parallel::map(&seeds, parallel::threads(), |seed| of(*seed))
+}
+
 /// Settling to 5 % and 2 % (ms), overshoot (percent), commands at a limit; the worst of the seeds.
 fn step(controller: ControllerConfig) -> (f64, f64, f64, u32) {
     const AT: usize = 300;
@@ -49,8 +56,8 @@ fn step(controller: ControllerConfig) -> (f64, f64, f64, u32) {
         Points::new(vec![(0.0, 0.0), (0.299_999, 0.0), (0.3, 10.0)]).expect("times grow"),
     );
     let mut worst = (0.0_f64, 0.0_f64, 0.0_f64, 0);
-    for seed in 0..SEEDS {
-        let (errors, limited) = errors(controller, seed, &profile, AT as u64 + 60);
+    let of = |seed| errors(controller, seed, &profile, AT as u64 + 60);
+    for (errors, limited) in of_seeds(of) {
         let after = errors.get(AT..).unwrap_or_default();
         let settled = |band: f64| {
             after
@@ -88,14 +95,14 @@ fn main() {
         "100 Hz nm"
     );
     for (name, controller) in controllers() {
-        let hold: Vec<f64> = (0..SEEDS)
-            .map(|seed| rms_nm(controller, seed, &Profile::Hold { position_um: 0.0 }))
-            .collect();
+        let hold = of_seeds(|seed| rms_nm(controller, seed, &Profile::Hold { position_um: 0.0 }));
         let all = rms(hold.iter().copied());
         let worst = hold.iter().copied().fold(0.0, f64::max);
         let (to_5, to_2, overshoot, limited) = step(controller);
-        let followed =
-            |hz: f64| rms((0..SEEDS).map(|seed| rms_nm(controller, seed, &sine(5.0, hz, 0.5))));
+        let followed = |hz: f64| {
+            let profile = sine(5.0, hz, 0.5);
+            rms(of_seeds(|seed| rms_nm(controller, seed, &profile)).into_iter())
+        };
         let (at_50, at_100) = (followed(50.0), followed(100.0));
         let law = controller
             .linear(&EstimatorConfig::default(), &LoopModel::eq6(2e-3))

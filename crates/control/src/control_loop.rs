@@ -4,6 +4,7 @@ use crate::adapt::{AdaptState, Adaptation, Adapter, Told, Tuning};
 use crate::error::BuildError;
 use crate::estimator::{Estimate, Estimator, EstimatorState, Fix};
 use crate::law::{ControlLaw, FAR_UM, LawInput, LawOutput};
+use crate::learning::Driven;
 use crate::limits::Limits;
 use crate::loop_io::{LoopFlags, LoopInput, LoopOutput, LoopParts, Measurement, Mode};
 
@@ -18,6 +19,8 @@ pub struct LoopState<S> {
     pub previous_um: f64,
     /// Part of it that was learned and that the estimator was not told of, um.
     pub hidden_um: f64,
+    /// Feed-forward of the previous tick, um from neutral in the units of the law.
+    pub forward_um: f64,
     /// Estimate of the plant and the tuning in force, where the loop adapts.
     pub adapt: Option<AdaptState>,
 }
@@ -99,6 +102,7 @@ impl<L: ControlLaw> ControlLoop<L> {
             law: self.parts.controller.start(command),
             previous_um: command,
             hidden_um: 0.0,
+            forward_um: 0.0,
             adapt: self.adapter.map(|adapter| adapter.start(command)),
         }
     }
@@ -145,6 +149,8 @@ impl<L: ControlLaw> ControlLoop<L> {
         };
         adapter.step(adapt, told);
         let (now, to) = (adapter.tuning(adapt), adapter.estimator(adapt));
+        let stated = self.parts.estimator.gain_uncertainty;
+        state.estimator.gain_doubt = adapter.gain_doubt(adapt, stated);
         if from.model() != to.model() {
             from.retime(&mut state.estimator, to);
         }
@@ -194,15 +200,25 @@ impl<L: ControlLaw> ControlLoop<L> {
                 Mode::Run | Mode::Freeze => tick.law.estimate.neutral_um,
             })
         };
+        let driven = driven(input, &tick, &decided);
         let (excitation_um, learned_um) = if tick.controls {
-            let learned_um = input.learned_um;
+            // What a feed-forward divided by another gain is more than the law's own.
+            let over = 1.0 / driven.feed_forward_gain - 1.0 / gain;
+            let learned_um = input.learned_um + over * driven.feed_forward_um;
             let usable = learned_um.is_finite();
             (input.excitation_um, if usable { learned_um } else { 0.0 })
         } else {
             (0.0, 0.0)
         };
         let added_um = excitation_um + learned_um;
-        let output = self.limit(state, input, &tick, &decided, added_um);
+        let mut output = self.limit(state, input, &tick, &decided, added_um);
+        let change_um = driven.feed_forward_um - state.forward_um;
+        state.forward_um = driven.feed_forward_um;
+        output.driven = Driven {
+            jump_um: self.parts.model.feedthrough * change_um,
+            limited: output.flags.range_limited || output.flags.slew_limited,
+            ..driven
+        };
         if tick.controls {
             // The excitation is no saturation: an integrator must not be pulled along with it.
             let applied_um = (output.command_um - added_um) * gain;
@@ -316,6 +332,7 @@ impl<L: ControlLaw> ControlLoop<L> {
             predicted_measurement_um: estimate.predicted_measurement_um,
             neutral_um,
             innovation_um: estimate.innovation_um,
+            driven: Driven::default(),
             flags: LoopFlags {
                 range_limited: limited.range,
                 slew_limited: limited.slew,
@@ -326,5 +343,24 @@ impl<L: ControlLaw> ControlLoop<L> {
             },
             solver: decided.solver,
         }
+    }
+}
+
+/// What moves the bead along the reference in a tick.
+fn driven(input: &LoopInput, tick: &Tick, decided: &LawOutput) -> Driven {
+    let gain = tick.law.tuning.gain;
+    let asked = input.feed_forward_gain;
+    Driven {
+        feed_forward_um: if tick.controls {
+            decided.feed_forward_um
+        } else {
+            0.0
+        },
+        jump_um: 0.0,
+        feed_forward_gain: asked
+            .filter(|gain| (0.1..=10.0).contains(gain))
+            .unwrap_or(gain),
+        gain,
+        limited: false,
     }
 }

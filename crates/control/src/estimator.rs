@@ -70,6 +70,8 @@ pub struct EstimatorState {
     pub stuck_evidence: f64,
     /// Variance per tick that a wrong gain may cause, um^2.
     pub spread_um2: f64,
+    /// Part of the stated uncertainty of the gain that is left; 1 where nothing more is known of it.
+    pub gain_doubt: f64,
     /// Ticks by which the filter's time lies behind the nominal delay.
     pub lag: u8,
     /// Refused measurements in a row.
@@ -184,6 +186,7 @@ impl Estimator {
             history_um: [command_um; HISTORY],
             stuck_evidence: 0.0,
             spread_um2: 0.0,
+            gain_doubt: 1.0,
             lag: 0,
             gated: 0,
             seen: false,
@@ -251,7 +254,8 @@ impl Estimator {
         state.integrator_um = next.q;
         state.modes = next.modes;
         let g = self.tick.gain;
-        let spread = self.config.gain_uncertainty * self.net_motion(state, back, m.n);
+        let unsure = self.config.gain_uncertainty * state.gain_doubt;
+        let spread = unsure * self.net_motion(state, back, m.n);
         // It rises at once and falls slowly, so that it follows the crests: a filter whose gain rose and fell within each
         // cycle of a motion would rectify the innovations of that cycle into a false neutral.
         let crest = (SPREAD_KEPT * state.spread_um2).max(spread * spread);

@@ -99,6 +99,8 @@ impl LawInput<'_> {
 pub struct LawOutput {
     /// Where the PZT is to be, um; the loop keeps it within the limits.
     pub wish_um: f64,
+    /// Part of it that moves the model along the reference, um from neutral; 0 for a law that does not.
+    pub feed_forward_um: f64,
     /// Account of an optimiser.
     pub solver: SolverReport,
 }
@@ -108,6 +110,7 @@ impl LawOutput {
     pub fn wish(wish_um: f64) -> Self {
         Self {
             wish_um,
+            feed_forward_um: 0.0,
             solver: SolverReport::default(),
         }
     }

@@ -1,26 +1,41 @@
 //! Learning over cycles: for a periodic reference, the harmonics of the error are driven to zero by a feed-forward.
 //!
-//! Each harmonic `h` of the addition `u_L = sum_h Re(theta_h e^(j 2 pi h phase))` follows
-//! `theta_h -= rate 2 e e^(-j 2 pi h phase) / T_h`, where `e` is the error at the time of the exposure and `T_h` the
-//! response of the bead to the addition in the closed loop (adaptive feed-forward cancellation; in the mean over a cycle
-//! this is iterative learning with the inverse as its filter). It converges where the relative uncertainty of `T_h` is
-//! below 1: a harmonic whose response is not known so well is refused. The error is that at the exposure's own time
-//! stamp, so neither a wrong gain nor a wrong delay of the loop's model remains in the result; a time stamp that is
-//! itself wrong cannot be told from a lag of the bead and does remain.
+//! Each harmonic `h` of the addition `u_L = sum_h Re(theta_h e^(j 2 pi h phase))` is estimated, not descended to. While the
+//! addition is steady the error at the harmonic is `d + T theta` with the response `T` of the closed loop, and noise; a
+//! stretch of ticks gives its phasor `r` with the variance that the noise of the stretch leaves it ([`evidence`]). Then
+//! `theta -= K r / T` with Kalman's `K = P / (P + R)`: nearly 1 while what is there is far above the noise, falling as 1/cycles
+//! after that, `P` growing with each correction by what `T` is uncertain. The error is that at the exposure's own time stamp,
+//! so neither a wrong gain nor a wrong delay of the loop's model remains in the result; a time stamp that is itself wrong cannot
+//! be told from a lag of the bead and does remain. It converges where the relative uncertainty of `T` is below 1: a
+//! harmonic whose response is not known so well is refused.
 //!
-//! Start: two cycles of watching, in which nothing is learned. Freeze: without a fix, and for some ticks after it is
-//! back, nothing is learned; the addition goes on. Retreat: when the error grows past that of the start, the best table
-//! so far comes back and the rate is halved; the third retreat ends the learning.
+//! **Beside adaptation.** What is right for the plant is the sum of feed-forward and addition, and does not change when the
+//! loop's idea of the gain does. From the first correction on the feed-forward is divided by the gain that was then in force
+//! ([`LearnerState::feed_forward_gain`]); before that adaptation has it, and what it moved meanwhile is reckoned with. `T` is in
+//! proportion to the gain in force.
+//!
+//! **Whether it pays.** A harmonic is begun with where its error is surely more than noise, and given up where the error
+//! that it saves is no longer above the variance that it brings.
+//!
+//! **Guard.** Without a fix, for some ticks after, and where the command meets its limits, nothing is learned; the addition
+//! goes on. When the error of a cycle grows past that of the start, the addition is taken back and learning begins anew; the third time
+//! it ends.
 
 mod beside;
+mod config;
+mod evidence;
+mod line;
 mod table;
 
-use crate::error::{BuildError, check};
+use crate::error::check;
 use crate::uncertainty::Uncertainty;
-use serde::{Deserialize, Serialize};
-use std::f64::consts::TAU;
+use evidence::{Evidence, Noise, turn};
+use line::Line;
+use nalgebra::Complex;
 
 pub use beside::CycleLearning;
+pub use config::{HarmonicResponse, LearnConfig, LearnError};
+pub use evidence::Driven;
 pub use table::{LearnedHarmonic, LearnedTable};
 
 /// Harmonics that a learner holds.
@@ -32,102 +47,6 @@ pub const MOST_UNCERTAIN: f64 = 0.95;
 /// Highest frequency learned, as a part of the sampling frequency.
 pub const HIGHEST_PART: f64 = 0.35;
 
-/// Response of the bead to an addition to the command, in the closed loop, at one harmonic.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct HarmonicResponse {
-    /// Which harmonic: 1 is the reference's own frequency.
-    pub harmonic: u32,
-    /// Real part, um of bead per um of PZT.
-    pub re_um_per_um: f64,
-    /// Imaginary part, um of bead per um of PZT.
-    pub im_um_per_um: f64,
-    /// Bound on `|T_true / T - 1|`.
-    pub relative_uncertainty: f64,
-}
-
-/// How a learner learns.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct LearnConfig {
-    /// Part of the error taken off per cycle at first.
-    pub rate_per_cycle: f64,
-    /// The same in the end: it falls as 1/cycles, so that noise is averaged out.
-    pub least_rate_per_cycle: f64,
-    /// Bound on the rate per tick: above it the adaptation would outrun the loop.
-    pub most_rate_per_tick: f64,
-    /// Cycles after which the rate begins to fall.
-    pub fast_cycles: f64,
-    /// Cycles watched before anything is learned.
-    pub watch_cycles: f64,
-    /// Largest addition, um of PZT.
-    pub most_um: f64,
-    /// Growth of the RMS error over that of the start that makes the learner retreat.
-    pub retreat_growth: f64,
-    /// Ticks without learning after the bead was lost.
-    pub settle_ticks: u32,
-    /// Exposure of a frame, s; at most 4 ticks. A fix is the mean over it of a path whose velocity changes with each
-    /// command, and is compared with the mean of the reference's path: at 300 Hz the two differ from the positions at the
-    /// middle by a fifth of the amplitude.
-    pub exposure_s: f64,
-}
-
-impl Default for LearnConfig {
-    fn default() -> Self {
-        Self {
-            rate_per_cycle: 0.5,
-            least_rate_per_cycle: 0.03,
-            most_rate_per_tick: 0.03,
-            fast_cycles: 10.0,
-            watch_cycles: 2.0,
-            most_um: 20.0,
-            retreat_growth: 1.5,
-            settle_ticks: 20,
-            exposure_s: 0.0,
-        }
-    }
-}
-
-/// A learner that cannot be.
-#[derive(Debug, Clone, PartialEq, thiserror::Error)]
-pub enum LearnError {
-    /// A value of the configuration.
-    #[error(transparent)]
-    Value(#[from] BuildError),
-    /// No harmonic passes the convergence test.
-    #[error(
-        "learning at {frequency_hz} Hz would not be sure to converge: the loop's response to an addition is uncertain by {uncertainty:.2} of itself, and must be by less than {most}; identify the plant, or choose a lower frequency or another controller"
-    )]
-    NotConvergent {
-        /// Frequency of the reference, Hz.
-        frequency_hz: f64,
-        /// Smallest relative uncertainty of its harmonics.
-        uncertainty: f64,
-        /// Bound.
-        most: f64,
-    },
-    /// A table of another frequency.
-    #[error(
-        "the learned table is for {table_hz} Hz, the reference has {frequency_hz} Hz: learn again"
-    )]
-    OtherFrequency {
-        /// Of the table, Hz.
-        table_hz: f64,
-        /// Of the reference, Hz.
-        frequency_hz: f64,
-    },
-    /// A table with a harmonic that cannot be.
-    #[error(
-        "the learned table has harmonic {harmonic}: must be 1 to {HARMONICS}, below {highest_hz} Hz"
-    )]
-    Harmonic {
-        /// Found.
-        harmonic: u32,
-        /// Highest frequency, Hz.
-        highest_hz: f64,
-    },
-}
-
 /// A learner for one periodic reference. Immutable; the state is apart and `Copy`.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Learner {
@@ -136,7 +55,10 @@ pub struct Learner {
     /// Cycles per tick.
     advance: f64,
     exposure_ticks: f64,
-    window_ticks: u32,
+    /// Ticks of the guard's cycle.
+    guard_ticks: u32,
+    /// Ticks over which a change of the addition comes in.
+    ramp_ticks: u32,
     responses: Vec<HarmonicResponse>,
     refused: Vec<HarmonicResponse>,
     margins: Option<Uncertainty>,
@@ -145,28 +67,47 @@ pub struct Learner {
 /// State of a [`Learner`].
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct LearnerState {
-    theta: [[f64; 2]; HARMONICS],
-    kept: [[f64; 2]; HARMONICS],
+    lines: [Line; HARMONICS],
+    evidence: Evidence,
+    noise: Noise,
+    /// Gain that the feed-forward is divided by while anything is learned.
+    feed_forward_gain: Option<f64>,
+    /// Ticks since the addition changed, and of the stretch at which it is looked at next.
+    since_change: u32,
+    next_look: u32,
+    /// Length of the stretches, cycles.
+    stretch: f64,
     /// Cycles with learning so far.
     cycles: f64,
-    /// Mean square of the error over the first window, um^2.
+    /// Mean square of the error over the first cycles of the guard and over the last, um^2.
     first_um2: Option<f64>,
-    best_um2: f64,
     last_um2: Option<f64>,
     sum_um2: f64,
     ticks: u32,
-    watched: f64,
     pause: u32,
-    slow: f64,
     retreats: u32,
+    /// Retreats of late, and the cycle of the last.
+    in_row: u32,
+    retreat_cycle: f64,
 }
 
-/// Retreats after which the learning ends.
+impl LearnerState {
+    /// Gain that the feed-forward is to be divided by in the place of that in force; `None` while nothing is learned. See
+    /// [`crate::LoopInput::feed_forward_gain`].
+    pub fn feed_forward_gain(&self) -> Option<f64> {
+        self.feed_forward_gain
+    }
+}
+
+/// Retreats after which the learning ends, if they follow one another within so many cycles.
 const MOST_RETREATS: u32 = 3;
+const FORGIVEN_CYCLES: f64 = 200.0;
 /// Errors below this are noise and no reason to retreat, um.
 const NOISE_UM: f64 = 0.1;
-/// Shortest window over which an error counts, ticks.
-const WINDOW_TICKS: f64 = 60.0;
+/// Shortest time over which the guard looks, ticks.
+const GUARD_TICKS: f64 = 20.0;
+/// Growth of the stretches.
+const LONGER: f64 = 1.5;
 
 impl Learner {
     /// A learner for a reference of `frequency_hz`, with the closed loop's response at each harmonic. Harmonics that do
@@ -180,29 +121,7 @@ impl Learner {
         sample_time_s: f64,
         responses: &[HarmonicResponse],
     ) -> Result<Self, LearnError> {
-        let c = &config;
-        let unit = |key, value: f64| check(key, "", value, value > 0.0 && value <= 1.0, "0 to 1");
-        unit("rate_per_cycle", c.rate_per_cycle)?;
-        unit("least_rate_per_cycle", c.least_rate_per_cycle)?;
-        unit("most_rate_per_tick", c.most_rate_per_tick)?;
-        let positive = |key, unit, value: f64| check(key, unit, value, value > 0.0, "positive");
-        positive("fast_cycles", "cycles", c.fast_cycles)?;
-        positive("watch_cycles", "cycles", c.watch_cycles)?;
-        positive("most_um", "um", c.most_um)?;
-        check(
-            "retreat_growth",
-            "",
-            c.retreat_growth,
-            c.retreat_growth > 1.0,
-            "above 1",
-        )?;
-        check(
-            "exposure_s",
-            "s",
-            c.exposure_s,
-            (0.0..=4.0 * sample_time_s).contains(&c.exposure_s),
-            "0 to 4 ticks",
-        )?;
+        config.validate(sample_time_s)?;
         let highest_hz = HIGHEST_PART / sample_time_s;
         check(
             "frequency_hz",
@@ -246,7 +165,8 @@ impl Learner {
             frequency_hz,
             advance,
             exposure_ticks: config.exposure_s / sample_time_s,
-            window_ticks: ((WINDOW_TICKS * advance).ceil().max(2.0) / advance).round() as u32,
+            guard_ticks: ((GUARD_TICKS * advance).ceil() / advance).round() as u32,
+            ramp_ticks: (1.0 / advance).ceil().clamp(4.0, 20.0) as u32,
             responses: kept,
             refused,
             margins: None,
@@ -272,19 +192,33 @@ impl Learner {
     /// Nothing learned yet.
     pub fn start(&self) -> LearnerState {
         LearnerState {
-            theta: [[0.0; 2]; HARMONICS],
-            kept: [[0.0; 2]; HARMONICS],
+            lines: [Line::default(); HARMONICS],
+            evidence: Evidence::default(),
+            noise: Noise::default(),
+            feed_forward_gain: None,
+            since_change: u32::MAX,
+            next_look: self.ticks_of(self.config.watch_cycles),
+            stretch: self.config.watch_cycles,
             cycles: 0.0,
             first_um2: None,
-            best_um2: f64::INFINITY,
             last_um2: None,
             sum_um2: 0.0,
             ticks: 0,
-            watched: 0.0,
             pause: 0,
-            slow: 1.0,
             retreats: 0,
+            in_row: 0,
+            retreat_cycle: 0.0,
         }
+    }
+
+    /// Ticks of so many cycles; at least those that are watched.
+    fn ticks_of(&self, cycles: f64) -> u32 {
+        let least = f64::from(self.config.watch_ticks) * self.advance;
+        (cycles.max(least.ceil()) / self.advance).round().min(1e9) as u32
+    }
+
+    fn harmonics(&self) -> impl Iterator<Item = u32> + '_ {
+        self.responses.iter().map(|response| response.harmonic)
     }
 
     /// Goes on from a table: at the low rate, its addition in force from the first cycle.
@@ -303,9 +237,9 @@ impl Learner {
         let mut state = self.start();
         let sampling_hz = self.frequency_hz / self.advance;
         for h in &table.harmonics {
-            let slot = (h.harmonic as usize)
+            let line = (h.harmonic as usize)
                 .checked_sub(1)
-                .and_then(|i| state.theta.get_mut(i))
+                .and_then(|i| state.lines.get_mut(i))
                 .filter(|_| f64::from(h.harmonic) * self.frequency_hz <= HIGHEST_PART * sampling_hz)
                 .ok_or(LearnError::Harmonic {
                     harmonic: h.harmonic,
@@ -326,9 +260,14 @@ impl Learner {
                 h.sin_um.abs() <= most,
                 "at most most_um",
             )?;
-            *slot = [h.cos_um, -h.sin_um];
+            let theta = Complex::new(h.cos_um, -h.sin_um);
+            let response = self.responses.iter().find(|r| r.harmonic == h.harmonic);
+            *line = Line::of_another_run(theta, response);
+            let gain = table.feed_forward_gain.unwrap_or(1.0);
+            let usable = (0.1..=10.0).contains(&gain);
+            check("feed_forward_gain", "", gain, usable, "0.1 to 10")?;
+            state.feed_forward_gain = Some(gain);
         }
-        state.kept = state.theta;
         state.cycles = if table.cycles >= 0.0 {
             table.cycles
         } else {
@@ -347,13 +286,14 @@ impl Learner {
             error_before_um: rms(state.first_um2),
             error_after_um: rms(state.last_um2),
             margins: self.margins,
+            feed_forward_gain: state.feed_forward_gain,
             harmonics: (1u32..)
-                .zip(&state.theta)
-                .filter(|(_, t)| t[0] != 0.0 || t[1] != 0.0)
-                .map(|(harmonic, t)| LearnedHarmonic {
+                .zip(&state.lines)
+                .filter(|(_, line)| line.active)
+                .map(|(harmonic, line)| LearnedHarmonic {
                     harmonic,
-                    cos_um: t[0],
-                    sin_um: -t[1],
+                    cos_um: line.theta.re,
+                    sin_um: -line.theta.im,
                 })
                 .collect(),
         }
@@ -363,81 +303,136 @@ impl Learner {
     pub fn addition_um(&self, state: &LearnerState, phase: f64) -> f64 {
         let most = self.config.most_um;
         let sum: f64 = self
-            .responses
-            .iter()
-            .map(|r| {
-                let (sin, cos) = (TAU * (phase * f64::from(r.harmonic)).fract()).sin_cos();
-                state
-                    .theta
-                    .get(r.harmonic as usize - 1)
-                    .map_or(0.0, |t| t[0] * cos - t[1] * sin)
+            .harmonics()
+            .filter_map(|h| Some((h, state.lines.get(h as usize - 1)?)))
+            .map(|(h, line)| {
+                let turn = turn(h, phase);
+                let part = self.part(state);
+                let theta = line.from + (line.theta - line.from) * part;
+                theta.re * turn.re + theta.im * turn.im
             })
             .sum();
         sum.clamp(-most, most)
     }
 
+    /// Part of the last change that has come in.
+    fn part(&self, state: &LearnerState) -> f64 {
+        (f64::from(state.since_change) / f64::from(self.ramp_ticks)).min(1.0)
+    }
+
     /// Learns from the error (bead less reference, um) at the phase (in cycles) at which the frame was exposed; `None`:
-    /// no fix that could be learned from in this tick.
-    pub fn learn(&self, state: &mut LearnerState, error: Option<(f64, f64)>) {
+    /// no fix that could be learned from in this tick. `driven` is what moves the bead now, at the phase `now`.
+    pub fn learn(
+        &self,
+        state: &mut LearnerState,
+        error: Option<(f64, f64)>,
+        (now, driven): (f64, &Driven),
+    ) {
         let c = &self.config;
+        state.since_change = state.since_change.saturating_add(1);
         let Some((phase, error_um)) = error.filter(|(p, e)| p.is_finite() && e.abs() < 1e3) else {
             state.pause = c.settle_ticks;
-            state.sum_um2 = 0.0;
-            state.ticks = 0;
+            (state.sum_um2, state.ticks) = (0.0, 0);
+            state.evidence.interrupt();
             return;
         };
         if state.pause > 0 {
             state.pause -= 1;
             return;
         }
-        state.sum_um2 += error_um * error_um;
-        state.ticks += 1;
-        if state.ticks >= self.window_ticks {
-            let mean_um2 = state.sum_um2 / f64::from(state.ticks);
-            state.sum_um2 = 0.0;
-            state.ticks = 0;
-            self.judge(state, mean_um2);
-        }
-        if state.retreats >= MOST_RETREATS {
+        self.guard(state, error_um);
+        if state.in_row >= MOST_RETREATS {
             return;
         }
-        if state.watched < c.watch_cycles {
-            state.watched += self.advance;
+        if state.since_change <= self.ramp_ticks.saturating_add(c.response_ticks) {
+            state.evidence.pass(error_um);
             return;
         }
         state.cycles += self.advance;
-        let fall = (c.fast_cycles / state.cycles.max(c.fast_cycles)).min(1.0);
-        let per_cycle = (c.rate_per_cycle * fall).max(c.least_rate_per_cycle) * state.slow;
-        let per_tick = (per_cycle * self.advance).min(c.most_rate_per_tick);
-        for r in &self.responses {
-            let (sin, cos) = (TAU * (phase * f64::from(r.harmonic)).fract()).sin_cos();
-            // 2 e exp(-j h phase) / T
-            let (re, im) = (2.0 * error_um * cos, -2.0 * error_um * sin);
-            let size2 = r.re_um_per_um * r.re_um_per_um + r.im_um_per_um * r.im_um_per_um;
-            let rate = per_tick / (1.0 + r.relative_uncertainty) / size2;
-            if let Some(t) = state.theta.get_mut(r.harmonic as usize - 1) {
-                t[0] -= rate * (re * r.re_um_per_um + im * r.im_um_per_um);
-                t[1] -= rate * (im * r.re_um_per_um - re * r.im_um_per_um);
-                for part in t {
-                    *part = part.clamp(-c.most_um, c.most_um);
-                }
-            }
+        state
+            .evidence
+            .add(self.harmonics(), (phase, error_um), (now, driven));
+        if state.evidence.ticks() >= state.next_look {
+            self.look(state, driven);
         }
     }
 
-    /// The end of a window of whole cycles.
-    fn judge(&self, state: &mut LearnerState, mean_um2: f64) {
+    /// Begins a stretch of so many cycles.
+    fn begin(&self, state: &mut LearnerState, cycles: f64) {
+        state.evidence.begin_again();
+        state.stretch = cycles.min(self.config.longest_cycles);
+        state.next_look = self.ticks_of(state.stretch);
+    }
+
+    /// The end of a stretch: what stands out of the noise is corrected.
+    fn look(&self, state: &mut LearnerState, driven: &Driven) {
+        let evidence = state.evidence;
+        let noise = evidence.noise(self.harmonics(), &state.noise);
+        let cycles = f64::from(evidence.ticks()) * self.advance;
+        let floor = 1.0 - (1.0 - 1.0 / self.config.longest_cycles.max(2.0)).powf(cycles);
+        let (mut learning, mut changed) = (false, false);
+        for response in self.responses.iter().filter(|_| !evidence.is_limited()) {
+            let Some(line) = state.lines.get_mut(response.harmonic as usize - 1) else {
+                continue;
+            };
+            let before = line.theta;
+            let how = (self.advance, floor, self.config.most_um);
+            line.correct(response, &evidence, &noise, how, driven);
+            line.from = before;
+            learning |= line.active;
+            changed |= line.theta != before;
+        }
+        if !evidence.is_limited() {
+            state.feed_forward_gain = if learning {
+                state.feed_forward_gain.or(Some(driven.gain))
+            } else {
+                None
+            };
+        }
+        let longest = cycles >= self.config.longest_cycles;
+        if changed {
+            state.since_change = 0;
+        }
+        if changed || learning || longest || evidence.is_limited() {
+            state.noise = noise;
+            self.begin(state, state.stretch * LONGER);
+        } else {
+            // Not yet enough to tell: the stretch goes on.
+            state.next_look = self.ticks_of(cycles * LONGER);
+        }
+    }
+
+    /// A tick of the guard.
+    fn guard(&self, state: &mut LearnerState, error_um: f64) {
+        state.sum_um2 += error_um * error_um;
+        state.ticks += 1;
+        if state.ticks < self.guard_ticks {
+            return;
+        }
+        let mean_um2 = state.sum_um2 / f64::from(state.ticks);
+        (state.sum_um2, state.ticks) = (0.0, 0);
         state.last_um2 = Some(mean_um2);
         let first_um2 = *state.first_um2.get_or_insert(mean_um2);
         let limit = first_um2.max(NOISE_UM * NOISE_UM) * self.config.retreat_growth.powi(2);
-        if mean_um2 > limit && state.retreats < MOST_RETREATS {
-            state.theta = state.kept;
-            state.slow *= 0.5;
-            state.retreats += 1;
-            state.pause = self.window_ticks;
-        } else if mean_um2 < state.best_um2 {
-            state.best_um2 = mean_um2;
-            state.kept = state.theta;
+        let learned = state.lines.iter().any(|line| line.active);
+        if mean_um2 <= limit || !learned || state.in_row >= MOST_RETREATS {
+            return;
         }
+        if state.cycles - state.retreat_cycle > FORGIVEN_CYCLES {
+            state.in_row = 0;
+        }
+        state.retreats += 1;
+        state.in_row += 1;
+        state.retreat_cycle = state.cycles;
+        for line in &mut state.lines {
+            *line = Line {
+                from: line.theta,
+                ..Line::default()
+            };
+        }
+        state.feed_forward_gain = None;
+        state.since_change = 0;
+        self.begin(state, self.config.watch_cycles);
+        state.pause = self.guard_ticks;
     }
 }

@@ -60,8 +60,8 @@ pub use law::{
     ControlLaw, LAW_COLUMNS, LawInput, LawOutput, SolverReport, SolverStatus, SolverTerms,
 };
 pub use learning::{
-    CycleLearning, HarmonicResponse, LearnConfig, LearnError, LearnedHarmonic, LearnedTable,
-    Learner, LearnerState,
+    CycleLearning, Driven, HarmonicResponse, LearnConfig, LearnError, LearnedHarmonic,
+    LearnedTable, Learner, LearnerState,
 };
 pub use limits::{Limited, Limits};
 pub use linear::LinearLaw;

@@ -2,6 +2,7 @@
 
 use crate::estimator::EstimatorConfig;
 use crate::law::{SolverReport, SolverTerms};
+use crate::learning::Driven;
 use crate::limits::Limits;
 use crate::loop_model::LoopModel;
 
@@ -48,6 +49,9 @@ pub struct LoopInput<'a> {
     /// A learned correction of the feed-forward, added in [`Mode::Run`], um of PZT. The estimator is not told of it:
     /// it is what the plant needs beyond what the model says, so that with it the model is right along the reference.
     pub learned_um: f64,
+    /// Gain over the design's that the law's feed-forward is divided by, where it is not to be that in force: what was
+    /// learned is right beside this one.
+    pub feed_forward_gain: Option<f64>,
     /// Time since the previous command, s, where it is shorter than a tick: the slew limit holds by the clock.
     pub slew_time_s: Option<f64>,
     /// How long an optimising controller may take.
@@ -86,6 +90,8 @@ pub struct LoopOutput {
     pub neutral_um: f64,
     /// Measurement less its prediction, um; 0 without measurement.
     pub innovation_um: f64,
+    /// What moves the bead along the reference, for learning.
+    pub driven: Driven,
     /// What happened.
     pub flags: LoopFlags,
     /// The optimiser's account.

@@ -217,7 +217,10 @@ impl ControlLaw for LqgLaw {
         self.forward.drive(&mut state.on, feed_forward_um);
         state.announced_um = input.preview_um.first().copied();
         let correction_um = self.feedback.correction(&deviation);
-        LawOutput::wish(input.estimate.neutral_um + feed_forward_um + correction_um)
+        LawOutput {
+            feed_forward_um,
+            ..LawOutput::wish(input.estimate.neutral_um + feed_forward_um + correction_um)
+        }
     }
 
     fn follow(&self, state: &mut LqgState, input: &LawInput, _command_um: f64) {

@@ -24,7 +24,6 @@ mod data;
 mod dot;
 mod error;
 mod fit;
-mod parallel;
 mod problem;
 mod report;
 mod search;

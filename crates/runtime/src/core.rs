@@ -380,15 +380,17 @@ impl<R: ReferenceGenerator> Core<R> {
                 generated.phase.filter(|_| mode == Mode::Run),
                 generated.reference_um,
             ),
+            feed_forward_gain: self.learners.feed_forward_gain(),
             excitation_um: self.reference.excitation_um(),
         };
         let output = self.controller.step(&given);
         let nominal = self.timing.camera_delay_ms * 1e-3 / self.sample_s;
         let used = fix.filter(|_| !output.flags.coasting && !output.flags.stuck);
-        self.learners.learn(used.map(|fix| {
+        let seen = used.map(|fix| {
             let age = nominal + f64::from(fix.age_samples) + fix.offset_samples;
             (fix.position_um, age)
-        }));
+        });
+        self.learners.learn(seen, &output.driven);
         self.watch_plant(fix, &output, tick);
         if let Some(news) = self.controller.adaptation().and_then(|now| now.news) {
             let ms = |samples: f64| samples * self.sample_s * 1e3;

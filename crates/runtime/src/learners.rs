@@ -2,7 +2,7 @@
 //!
 //! Not here: how is learned, see [`cellpos_control::learning`].
 
-use cellpos_control::{CycleLearning, LearnedTable, LearnerState};
+use cellpos_control::{CycleLearning, Driven, LearnedTable, LearnerState};
 
 /// The learners of a loop. A motion without one is followed without learning.
 #[derive(Debug, Clone, Default)]
@@ -45,7 +45,7 @@ impl Learners {
             // What the one that is left knows of the last ticks is of no use to it when it comes back.
             if let Some(left) = self.active() {
                 left.addition_um(None, reference_um);
-                left.learn(None);
+                left.learn(None, &Driven::default());
             }
             self.motion = motion;
         }
@@ -53,10 +53,18 @@ impl Learners {
             .map_or(0.0, |learning| learning.addition_um(phase, reference_um))
     }
 
-    /// After the controller's step: learns from the fix that was used.
-    pub(crate) fn learn(&mut self, fix: Option<(f64, f64)>) {
+    /// Gain that the feed-forward is to be divided by in this tick; see [`CycleLearning::feed_forward_gain`].
+    pub(crate) fn feed_forward_gain(&self) -> Option<f64> {
+        self.all
+            .get(usize::from(self.motion))?
+            .as_ref()?
+            .feed_forward_gain()
+    }
+
+    /// After the controller's step: learns from the fix that was used, by what moved the bead.
+    pub(crate) fn learn(&mut self, fix: Option<(f64, f64)>, driven: &Driven) {
         if let Some(learning) = self.active() {
-            learning.learn(fix);
+            learning.learn(fix, driven);
         }
     }
 }
@@ -87,7 +95,7 @@ mod tests {
             let phase = f64::from(k) * 1e-3 * frequency_hz;
             let addition = learners.addition_um(motion, Some(phase), 0.0);
             let error: f64 = (TAU * phase).sin() + addition;
-            learners.learn(Some((error, 0.0)));
+            learners.learn(Some((error, 0.0)), &Driven::default());
             if k >= 900 {
                 last += error * error / 100.0;
             }

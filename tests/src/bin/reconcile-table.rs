@@ -10,8 +10,6 @@ use cellpos_tests::truth::cases::{Case, further, nulls, outside, pairs, singles}
 use cellpos_tests::truth::table::{Row, evaluate};
 use cellpos_tests::truth::threshold::{above_threshold, weak};
 use std::collections::{BTreeMap, BTreeSet};
-use std::sync::Mutex;
-use std::sync::atomic::{AtomicUsize, Ordering};
 
 fn main() {
     let args: Vec<String> = std::env::args().skip(1).collect();
@@ -71,27 +69,14 @@ fn selected(which: &str, seed: u64) -> Vec<(Case, u64)> {
 
 /// Runs all cases on all cores and prints a line for each as it ends.
 fn evaluated(cases: &[(Case, u64)]) -> BTreeMap<usize, Result<Row, String>> {
-    let threads = std::thread::available_parallelism().map_or(2, usize::from);
-    let next = AtomicUsize::new(0);
-    let rows: Mutex<BTreeMap<usize, Result<Row, String>>> = Mutex::new(BTreeMap::new());
-    std::thread::scope(|scope| {
-        for _ in 0..threads {
-            scope.spawn(|| {
-                loop {
-                    let i = next.fetch_add(1, Ordering::Relaxed);
-                    let Some((case, seed)) = cases.get(i) else {
-                        break;
-                    };
-                    let row = evaluate(case, *seed);
-                    println!("{}", line(case, &row));
-                    if let Ok(mut rows) = rows.lock() {
-                        rows.insert(i, row);
-                    }
-                }
-            });
-        }
+    let numbered: Vec<usize> = (0..cases.len()).collect();
+    let rows = cellpos_parallel::map(&numbered, cellpos_parallel::threads(0), |&i| {
+        let (case, seed) = &cases[i];
+        let row = evaluate(case, *seed);
+        println!("{}", line(case, &row));
+        row
     });
-    rows.into_inner().unwrap_or_default()
+    rows.into_iter().enumerate().collect()
 }
 
 fn summary(cases: &[(Case, u64)], done: &[(&Case, &Row)]) {

@@ -40,9 +40,14 @@ pub const ADAPT_COLUMNS: [&str; 5] = [
 /// Excitation held by the slow and the fast window.
 const SLOW: f64 = 1500.0;
 const FAST: f64 = 250.0;
+/// Shortest memories of the two, ticks: a large motion would be forgotten in a few, and the gain never known better than that.
+const SLOW_TICKS: f64 = 400.0;
+const FAST_TICKS: f64 = 40.0;
 /// Standard uncertainties by which the two must differ for a plant that has changed; noise variances, for its delay.
 const CHANGED: f64 = 4.5;
 const CHANGED_DELAY: f64 = 24.0;
+/// Part of the stated uncertainty of the gain that stays, whatever is found.
+const LEAST_DOUBT: f64 = 0.1;
 /// Times the stated wandering of neutral for which the filter makes white noise of it: a real flow wanders more.
 const WANDERS: f64 = 2.0;
 /// Past positions of the model that are kept, ticks.
@@ -115,6 +120,8 @@ pub struct AdaptState {
     model: PredictedState,
     /// Positions of the model at this tick and those before, newest first, um.
     past_um: [f64; PAST],
+    /// What the command moved the model at once at the tick before each of these, um.
+    jumps_um: [f64; PAST],
     seen: Option<Track>,
     moved: [Track; MEMBERS],
     slow: Window,
@@ -173,10 +180,11 @@ impl Adapter {
                 ..PredictedState::default()
             },
             past_um: [0.0; PAST],
+            jumps_um: [0.0; PAST],
             seen: None,
             moved: [Track::default(); MEMBERS],
-            slow: Window::new(FAST, SLOW),
-            fast: Window::new(FAST, FAST),
+            slow: Window::new(FAST, SLOW, SLOW_TICKS),
+            fast: Window::new(FAST, FAST, FAST_TICKS),
             white: [0.0; 2],
             left_um: 0.0,
             now_um2: 0.0,
@@ -209,6 +217,17 @@ impl Adapter {
             gain: state.force.log_gain.exp(),
             delay: (design + DELAYS[state.force.member]) / design,
         }
+    }
+
+    /// How uncertain the gain in force is, as a part of `stated`: two standard uncertainties of the estimate and what is in force
+    /// beside it. All of it while nothing is known or anything is in doubt.
+    pub fn gain_doubt(&self, state: &AdaptState, stated: f64) -> f64 {
+        let sure = matches!(state.force.mode, AdaptMode::Agreeing | AdaptMode::Moving);
+        let Some(found) = state.found.filter(|found| sure && found.gain > 0.0) else {
+            return 1.0;
+        };
+        let off = (found.gain.ln() - state.force.log_gain).abs();
+        ((off + 2.0 * found.log_sd()) / stated.max(1e-3)).clamp(LEAST_DOUBT, 1.0)
     }
 
     /// Where it stands.
@@ -273,8 +292,8 @@ impl Adapter {
             state.believed = found.map_or(state.believed, |f| (f.gain.max(0.0), f.best));
             if state.force.follow(found.as_ref(), &self.usable()) {
                 state.found = None;
-                state.slow = Window::new(FAST, SLOW);
-                state.fast = Window::new(FAST, FAST);
+                state.slow = Window::new(FAST, SLOW, SLOW_TICKS);
+                state.fast = Window::new(FAST, FAST, FAST_TICKS);
             }
         } else {
             state.force.pause();
@@ -290,6 +309,9 @@ impl Adapter {
 
     /// The model one tick on.
     fn drive(&self, state: &mut AdaptState, command_um: f64) {
+        state.jumps_um.copy_within(0..PAST - 1, 1);
+        let change_um = command_um - state.model.last_um;
+        state.jumps_um[0] = self.nominal.model().feedthrough * change_um;
         state.model = self.nominal.tick_state(&state.model, command_um);
         state.past_um.copy_within(0..PAST - 1, 1);
         state.past_um[0] = self.nominal.position(&state.model);
@@ -300,8 +322,8 @@ impl Adapter {
         }
     }
 
-    /// Mean of the model's position over an exposure whose middle is so many ticks ago, um: on the lines between ticks, as between
-    /// them the bead moves evenly.
+    /// Mean of the model's position over an exposure whose middle is so many ticks ago, um: between ticks the bead jumps by the direct
+    /// feedthrough and then moves evenly.
     fn exposed(&self, state: &AdaptState, ago: f64) -> Option<f64> {
         let half = 0.5 * self.exposure_ticks;
         let (mut from, until) = ((ago - half).max(0.0), ago + half);
@@ -312,7 +334,7 @@ impl Adapter {
         let mut sum = 0.0;
         while from < until {
             let to = (from.floor() + 1.0).min(until);
-            sum += 0.5 * (to - from) * (Self::past(state, from)? + Self::past(state, to)?);
+            sum += (to - from) * Self::past(state, 0.5 * (from + to))?;
             from = to;
         }
         Some(sum / length)
@@ -323,7 +345,7 @@ impl Adapter {
         let newer = ago.max(0.0).floor();
         let (part, newer) = (ago.max(0.0) - newer, newer as usize);
         let (a, b) = (state.past_um.get(newer)?, state.past_um.get(newer + 1)?);
-        Some(a + part * (b - a))
+        Some(a + part * (b + state.jumps_um.get(newer)? - a))
     }
 
     /// One tick of the regression. Whether something was learned.

@@ -12,9 +12,6 @@ const APART: f64 = 0.5;
 /// Part of the gain that no measurement decides: a real plant is no linear one.
 const MODEL_SD: f64 = 0.003;
 
-/// Shortest memory, ticks: a few violent ticks are not all that is known.
-const SHORTEST_TICKS: f64 = 40.0;
-
 /// Part of the excitation that comes by which a memory grows.
 const GROWTH: f64 = 0.5;
 
@@ -26,6 +23,8 @@ pub(super) struct Window {
     /// with what comes: a memory that begins anew is short at first, so that what came before the change is soon gone.
     most: f64,
     limit: f64,
+    /// Shortest memory, ticks: a few violent ticks are not all that is known.
+    shortest: f64,
     n: f64,
     yy: f64,
     pp: [f64; MEMBERS],
@@ -61,10 +60,11 @@ impl Finding {
 }
 
 impl Window {
-    pub fn new(most: f64, limit: f64) -> Self {
+    pub fn new(most: f64, limit: f64, shortest: f64) -> Self {
         Self {
             most,
             limit,
+            shortest,
             n: 0.0,
             yy: 0.0,
             pp: [0.0; MEMBERS],
@@ -80,6 +80,7 @@ impl Window {
     pub fn taken_from(&self, other: &Self) -> Self {
         Self {
             limit: self.limit,
+            shortest: self.shortest,
             ..*other
         }
     }
@@ -90,7 +91,7 @@ impl Window {
     pub fn add(&mut self, at: usize, p: &[f64; MEMBERS], z: f64, y: f64, noise_um2: f64) {
         let motion = p.get(at).copied().unwrap_or(0.0);
         let excitation = motion * motion / noise_um2;
-        let keep = 1.0 - (excitation / self.most).min(1.0 / SHORTEST_TICKS);
+        let keep = 1.0 - (excitation / self.most).min(1.0 / self.shortest);
         self.most = (self.most + GROWTH * excitation).min(self.limit);
         self.n = self.n * keep + 1.0;
         self.yy = self.yy * keep + y * y;

@@ -1,6 +1,6 @@
 //! A learner beside a loop: each fix is laid on the reference and the phase at the time of its exposure.
 
-use super::{LearnedTable, Learner, LearnerState};
+use super::{Driven, LearnedTable, Learner, LearnerState};
 
 /// References of past ticks that a [`CycleLearning`] keeps: the oldest exposure that it can learn from.
 const PAST: usize = 12;
@@ -12,6 +12,8 @@ pub struct CycleLearning {
     state: LearnerState,
     /// References of the last ticks, newest first, and how many of them count.
     past_um: [f64; PAST],
+    /// Jumps of the path at these ticks but the newest: the first is that of the tick before.
+    jumps_um: [f64; PAST],
     known: usize,
     phase: f64,
 }
@@ -23,6 +25,7 @@ impl CycleLearning {
             learner,
             state,
             past_um: [0.0; PAST],
+            jumps_um: [0.0; PAST],
             known: 0,
             phase: 0.0,
         }
@@ -52,14 +55,23 @@ impl CycleLearning {
         self.learner.addition_um(&self.state, phase)
     }
 
+    /// Gain that the feed-forward is to be divided by in this tick; see [`crate::LoopInput::feed_forward_gain`]. `None` where the
+    /// reference is not periodic now.
+    pub fn feed_forward_gain(&self) -> Option<f64> {
+        self.state.feed_forward_gain().filter(|_| self.known > 0)
+    }
+
     /// After the controller's step: learns from a fix (position um, age of its exposure in ticks) that the controller
-    /// has used; `None`: there was none.
-    pub fn learn(&mut self, fix: Option<(f64, f64)>) {
+    /// has used; `None`: there was none. `driven` is what the loop says of the tick.
+    pub fn learn(&mut self, fix: Option<(f64, f64)>, driven: &Driven) {
         let error = fix.and_then(|(position_um, age_ticks)| {
             let phase = self.phase - age_ticks * self.learner.advance;
             Some((phase, position_um - self.exposed_um(age_ticks)?))
         });
-        self.learner.learn(&mut self.state, error);
+        self.jumps_um.copy_within(0..PAST - 1, 1);
+        self.jumps_um[0] = driven.jump_um;
+        let now = (self.phase, driven);
+        self.learner.learn(&mut self.state, error, now);
     }
 
     /// Mean of the reference's path over an exposure whose middle is so many ticks old, um; `None` if it is not known.
@@ -71,11 +83,10 @@ impl CycleLearning {
             return self.past_reference_um(age_ticks);
         }
         let mut sum = 0.0;
-        // The path is straight between ticks.
+        // Between ticks the path is straight: its mean is that in the middle.
         while from < until {
             let to = (from.floor() + 1.0).min(until);
-            sum +=
-                0.5 * (to - from) * (self.past_reference_um(from)? + self.past_reference_um(to)?);
+            sum += (to - from) * self.past_reference_um(0.5 * (from + to))?;
             from = to;
         }
         Some(sum / length)
@@ -92,7 +103,7 @@ impl CycleLearning {
             return None;
         }
         let (a, b) = (self.past_um.get(newer)?, self.past_um.get(older)?);
-        Some(a + part * (b - a))
+        Some(a + part * (b + self.jumps_um.get(newer)? - a))
     }
 }
 
@@ -137,7 +148,7 @@ mod tests {
                     .map(|x| path(middle + x * exposure_s / 1e-3))
                     .sum::<f64>()
                     / f64::from(points);
-                learning.learn(Some((seen_um, age_ticks)));
+                learning.learn(Some((seen_um, age_ticks)), &Driven::default());
             }
             assert!(largest_um < 1e-4, "{exposure_s} s: {largest_um} um");
         }

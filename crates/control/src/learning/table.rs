@@ -32,6 +32,10 @@ pub struct LearnedTable {
     /// How well the plant was taken to be known in the convergence test; `None` in tables from before this was written.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub margins: Option<Uncertainty>,
+    /// Gain over the model's by which the feed-forward was divided beside the addition; `None` where nothing was learned, and
+    /// in tables of a loop that does not adapt: 1.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub feed_forward_gain: Option<f64>,
     /// The harmonics.
     pub harmonics: Vec<LearnedHarmonic>,
 }

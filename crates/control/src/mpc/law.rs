@@ -324,6 +324,8 @@ impl ControlLaw for MpcLaw {
         let (plan_um, solver) = self.plan(state, input);
         LawOutput {
             wish_um: plan_um.unwrap_or(fallback.wish_um),
+            // A fallback does not feed forward.
+            feed_forward_um: plan_um.map_or(0.0, |_| state.on_reference.last_um),
             solver,
         }
     }

@@ -76,10 +76,11 @@ fn allocations_by_step(controller: ControllerConfig) -> Vec<u64> {
                     Mode::Run
                 },
                 learned_um: learning.addition_um(Some(k as f64 * 5e-3), reference(k)),
+                feed_forward_gain: learning.feed_forward_gain(),
                 ..LoopInput::default()
             };
             let out = controller.step(&input);
-            learning.learn(Some((fix.position_um, 2.0)));
+            learning.learn(Some((fix.position_um, 2.0)), &out.driven);
             monitor.step(
                 &mut watching,
                 Some(fix.position_um),

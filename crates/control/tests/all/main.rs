@@ -6,6 +6,7 @@ mod badly_scaled;
 mod common;
 mod late_ticks;
 mod learning;
+mod learning_beside_adaptation;
 mod limits;
 mod monitor;
 mod pi_loop;

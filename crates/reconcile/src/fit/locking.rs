@@ -10,7 +10,6 @@
 use crate::data::noise::Noise;
 use crate::fit::context::{Context, Fit};
 use crate::fit::position_error::{Locking, Numbers};
-use crate::parallel;
 use crate::simulate::simulate;
 use cellpos_plant::effects::Role;
 use nalgebra::Matrix5;
@@ -161,7 +160,7 @@ pub(crate) fn refine(
             white_um2: x[4].exp(),
         };
         let grid = Grid::new(&noise, wave, pixel)?;
-        Some(parallel::map(&tracks, threads, |t| {
+        Some(cellpos_parallel::map(&tracks, threads, |t| {
             grid.rows(t, wave, pixel)
         }))
     };

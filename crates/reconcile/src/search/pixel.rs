@@ -5,7 +5,6 @@
 
 use crate::fit::catalogue::{Part, Variant};
 use crate::fit::context::{Context, Fit};
-use crate::parallel;
 use crate::problem::{Mask, Prepared};
 use crate::search::lead::{Lead, pair_score};
 use crate::thresholds::THRESHOLDS;
@@ -64,7 +63,7 @@ pub(crate) fn pixel_scan(
     let knots: Vec<f64> = (0..9)
         .map(|i| WAVES.0 * (WAVES.1 / WAVES.0).powf(f64::from(i) / 8.0))
         .collect();
-    let energy = parallel::map(&knots, threads, |&q| {
+    let energy = cellpos_parallel::map(&knots, threads, |&q| {
         let (s, c, _) = columns(q);
         0.5 * (s.iter().chain(&c).map(|x| x * x).sum::<f64>())
     });
@@ -94,7 +93,7 @@ pub(crate) fn pixel_scan(
     let fine: Vec<f64> = (-8..=8)
         .map(|i| centre + step * f64::from(i) / 8.0)
         .collect();
-    let gains = parallel::map(&fine, threads, |&q| {
+    let gains = cellpos_parallel::map(&fine, threads, |&q| {
         let (s, c, e) = columns(q);
         pair_score(&s, &c, &e)
     });

@@ -6,7 +6,6 @@
 use crate::fit::catalogue::{Part, Variant};
 use crate::fit::context::{Context, Fit};
 use crate::fit::linear::Tangents;
-use crate::parallel;
 use crate::problem::Mask;
 use crate::search::lead::{Lead, line_score};
 use crate::search::pixel::pixel_scan;
@@ -28,7 +27,7 @@ pub(crate) fn screen(
         }
     }
     let sim = ctx.simulated(&fit.parts, mask);
-    let scores = parallel::map(&jobs, threads, |part| match part.variant().role {
+    let scores = cellpos_parallel::map(&jobs, threads, |part| match part.variant().role {
         Role::Line => line_score(ctx, fit, part.natural()[0], mask),
         _ => {
             let mut parts = fit.parts.clone();

@@ -2,7 +2,6 @@
 
 use crate::fit::catalogue::{self, Part};
 use crate::fit::context::{Context, Fit, freedom_of};
-use crate::parallel;
 use crate::problem::Mask;
 use crate::search::screen::screen;
 use crate::thresholds::THRESHOLDS;
@@ -123,7 +122,7 @@ fn extensions(
     });
     let worth: Vec<Part> = worth.take(wide).collect();
     // A short fit of all, then the best few to the end.
-    let mut fits = parallel::map(&worth, effort.threads, |part| {
+    let mut fits = cellpos_parallel::map(&worth, effort.threads, |part| {
         let mut parts = fit.parts.clone();
         parts.push(part.clone());
         ctx.fit_from(parts, Some(fit.soft), mask, 4)
@@ -133,7 +132,7 @@ fn extensions(
         .first()
         .map_or(0.0, |best| best.chi2 + 0.5 * (fit.chi2 - best.chi2));
     let rest = fits.split_off(fits.iter().take(4).filter(|f| f.chi2 <= close).count());
-    let mut fits = parallel::map(&fits, effort.threads, |f| ctx.refit(f, mask, 14));
+    let mut fits = cellpos_parallel::map(&fits, effort.threads, |f| ctx.refit(f, mask, 14));
     fits.extend(rest);
     fits.extend(own(ctx, fit, mask, effort, forbidden));
     fits.sort_by(|a, b| penalised_cost(ctx, a).total_cmp(&penalised_cost(ctx, b)));
@@ -150,14 +149,14 @@ fn own(ctx: &Context<'_>, fit: &Fit, mask: &Mask, effort: Effort, forbidden: &[&
         v.is_own() && !ctx.excludes(v.id()) && !fit.has(v.id()) && !forbidden.contains(&v.id())
     }) {
         let starts = variant.starts(&ctx.scope);
-        let fits = parallel::map(&starts, effort.threads, |part| {
+        let fits = cellpos_parallel::map(&starts, effort.threads, |part| {
             let mut parts = fit.parts.clone();
             parts.push(part.clone());
             ctx.fit_from(parts, Some(fit.soft), mask, SHORT)
         });
         best.extend(fits.into_iter().min_by(|a, b| a.chi2.total_cmp(&b.chi2)));
     }
-    parallel::map(&best, effort.threads, |f| ctx.refit(f, mask, LONG))
+    cellpos_parallel::map(&best, effort.threads, |f| ctx.refit(f, mask, LONG))
 }
 
 /// Whether the part of `bigger` that `smaller` lacks is worth having, where `null` is the sum of squares without effects.
@@ -180,7 +179,7 @@ fn worth_it(smaller: &Fit, bigger: &Fit, null: f64) -> bool {
 fn eliminate(ctx: &Context<'_>, mut fit: Fit, null: f64, mask: &Mask, effort: Effort) -> Fit {
     while fit.parts.len() > 1 {
         let indices: Vec<usize> = (0..fit.parts.len()).collect();
-        let without = parallel::map(&indices, effort.threads, |&i| {
+        let without = cellpos_parallel::map(&indices, effort.threads, |&i| {
             let mut parts = fit.parts.clone();
             parts.remove(i);
             ctx.fit_from(parts, Some(fit.soft), mask, 8)
@@ -260,7 +259,7 @@ fn replace(ctx: &Context<'_>, mut fit: Fit, mask: &Mask, effort: Effort) -> (Fit
                         .collect()
                 })
                 .unwrap_or_default();
-            for other in parallel::map(&twins, effort.threads, |part| {
+            for other in cellpos_parallel::map(&twins, effort.threads, |part| {
                 let mut parts = fit.parts.clone();
                 parts[i] = part.clone();
                 ctx.fit_from(parts, Some(fit.soft), mask, 12)
@@ -298,7 +297,7 @@ fn reparametrise(ctx: &Context<'_>, mut fit: Fit, mask: &Mask, effort: Effort, r
             })
             .flat_map(|v| v.starts(&ctx.scope))
             .collect();
-        let fits = parallel::map(&others, effort.threads, |part| {
+        let fits = cellpos_parallel::map(&others, effort.threads, |part| {
             let mut parts = fit.parts.clone();
             parts[i] = part.clone();
             ctx.fit_from(parts, Some(fit.soft), mask, 10)

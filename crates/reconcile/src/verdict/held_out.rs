@@ -2,7 +2,6 @@
 //! time.
 
 use crate::fit::context::{Context, Fit};
-use crate::parallel;
 use crate::problem::{Mask, Prepared, split_in_time};
 use crate::verdict::map::{BAND_EDGES_HZ, DiscrepancyMap};
 use crate::verdict::result::{BandGap, Interval, RecordGap};
@@ -107,7 +106,7 @@ pub(crate) fn check(ctx: &Context<'_>, fit: &Fit, threads: usize) -> HeldOut {
     // Records: each predicted by a fit to all others, where those are enough; else the end of each by its beginning.
     // Amplitudes and phases of lines are each record's own: kept.
     let folds: Vec<usize> = (0..records.len()).collect();
-    let results = parallel::map(&folds, threads, |&i| {
+    let results = cellpos_parallel::map(&folds, threads, |&i| {
         let mut others = ctx.problem.all();
         let mut own: Mask = vec![Vec::new(); records.len()];
         std::mem::swap(&mut others[i], &mut own[i]);
@@ -162,7 +161,7 @@ pub(crate) fn check(ctx: &Context<'_>, fit: &Fit, threads: usize) -> HeldOut {
     // Time: the first 60 % of every record predict the rest.
     let indices: Vec<usize> = (0..fit.parts.len()).collect();
     let whole = (!fit.parts.is_empty()).then(|| ctx.refit(fit, &train, 4).chi2_on(&test));
-    let unconfirmed = parallel::map(&indices, threads, |&i| {
+    let unconfirmed = cellpos_parallel::map(&indices, threads, |&i| {
         let mut parts = fit.parts.clone();
         parts.remove(i);
         let without = ctx

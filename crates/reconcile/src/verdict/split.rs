@@ -1,7 +1,6 @@
 //! Whether the numbers of a set are those of one equation: fitted to parts of the records, they must agree.
 
 use crate::fit::context::{Context, Fit};
-use crate::parallel;
 use crate::problem::Mask;
 use crate::search::sequential::threshold;
 use crate::thresholds::THRESHOLDS;
@@ -60,7 +59,7 @@ pub(crate) fn disagreement(
     }
     let gained = (null.chi2 - fit.chi2).max(0.0);
     for groups in groupings(ctx) {
-        let fits = parallel::map(&groups, threads, |(_, mask)| {
+        let fits = cellpos_parallel::map(&groups, threads, |(_, mask)| {
             (fit.chi2_on(mask), ctx.refit(fit, mask, 6))
         });
         let freedom = (numbers + 1) * (groups.len() - 1);

@@ -8,7 +8,7 @@ use crate::reference::{ReferenceGenerator, ReferenceInput};
 use crate::tick::{Tick, TickInput};
 use crate::tick_record::TickFlags;
 use crate::timing::Timing;
-use cellpos_control::Measurement as LoopMeasurement;
+use cellpos_control::{Driven, Measurement as LoopMeasurement};
 use cellpos_rig::ActuatorReport;
 use cellpos_vision::Decision;
 
@@ -56,7 +56,7 @@ impl<R: ReferenceGenerator> Core<R> {
                 .filter(|_| running && self.state.frozen.is_none());
             self.learners
                 .addition_um(passed.motion, phase, passed.reference_um);
-            self.learners.learn(None);
+            self.learners.learn(None, &Driven::default());
         }
     }
 

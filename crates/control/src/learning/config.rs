@@ -1,0 +1,122 @@
+//! What a learner is told: responses of the loop, how to learn; and why one cannot be.
+
+use super::HARMONICS;
+use crate::error::{BuildError, check};
+use serde::{Deserialize, Serialize};
+
+/// Response of the bead to an addition to the command, in the closed loop, at one harmonic.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct HarmonicResponse {
+    /// Which harmonic: 1 is the reference's own frequency.
+    pub harmonic: u32,
+    /// Real part, um of bead per um of PZT.
+    pub re_um_per_um: f64,
+    /// Imaginary part, um of bead per um of PZT.
+    pub im_um_per_um: f64,
+    /// Bound on `|T_true / T - 1|`.
+    pub relative_uncertainty: f64,
+}
+
+/// How a learner learns.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct LearnConfig {
+    /// Shortest time over which an error counts before anything is made of it, cycles and ticks.
+    pub watch_cycles: f64,
+    /// The same in ticks; both must have passed.
+    pub watch_ticks: u32,
+    /// Memory in the end, cycles: over so many the noise is averaged, and no faster is a plant followed that changes.
+    pub longest_cycles: f64,
+    /// Ticks after a change of the addition until the loop has settled and counts again.
+    pub response_ticks: u32,
+    /// Largest addition, um of PZT.
+    pub most_um: f64,
+    /// Growth of the RMS error over that of the start that makes the learner retreat.
+    pub retreat_growth: f64,
+    /// Ticks without learning after the bead was lost.
+    pub settle_ticks: u32,
+    /// Exposure of a frame, s; at most 4 ticks. A fix is the mean over it of a path whose velocity changes with each
+    /// command, and is compared with the mean of the reference's path: at 300 Hz the two differ from the positions at the
+    /// middle by a fifth of the amplitude.
+    pub exposure_s: f64,
+}
+
+impl Default for LearnConfig {
+    fn default() -> Self {
+        Self {
+            watch_cycles: 2.0,
+            watch_ticks: 10,
+            longest_cycles: 33.0,
+            response_ticks: 8,
+            most_um: 20.0,
+            retreat_growth: 1.5,
+            settle_ticks: 20,
+            exposure_s: 0.0,
+        }
+    }
+}
+
+impl LearnConfig {
+    /// Checks every value.
+    pub(super) fn validate(&self, sample_time_s: f64) -> Result<(), BuildError> {
+        let positive = |key, unit, value: f64| check(key, unit, value, value > 0.0, "positive");
+        positive("watch_cycles", "cycles", self.watch_cycles)?;
+        positive("most_um", "um", self.most_um)?;
+        let ticks = f64::from(self.watch_ticks);
+        check("watch_ticks", "ticks", ticks, ticks >= 8.0, "8 or more")?;
+        let longest = self.longest_cycles;
+        let room = longest >= self.watch_cycles;
+        check(
+            "longest_cycles",
+            "cycles",
+            longest,
+            room,
+            "watch_cycles or more",
+        )?;
+        let growth = self.retreat_growth;
+        check("retreat_growth", "", growth, growth > 1.0, "above 1")?;
+        let open = (0.0..=4.0 * sample_time_s).contains(&self.exposure_s);
+        check("exposure_s", "s", self.exposure_s, open, "0 to 4 ticks")
+    }
+}
+
+/// A learner that cannot be.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum LearnError {
+    /// A value of the configuration.
+    #[error(transparent)]
+    Value(#[from] BuildError),
+    /// No harmonic passes the convergence test.
+    #[error(
+        "learning at {frequency_hz} Hz would not be sure to converge: the loop's response to an addition is uncertain by {uncertainty:.2} of itself, and must be by less than {most}; identify the plant, or choose a lower frequency or another controller"
+    )]
+    NotConvergent {
+        /// Frequency of the reference, Hz.
+        frequency_hz: f64,
+        /// Smallest relative uncertainty of its harmonics.
+        uncertainty: f64,
+        /// Bound.
+        most: f64,
+    },
+    /// A table of another frequency.
+    #[error(
+        "the learned table is for {table_hz} Hz, the reference has {frequency_hz} Hz: learn again"
+    )]
+    OtherFrequency {
+        /// Of the table, Hz.
+        table_hz: f64,
+        /// Of the reference, Hz.
+        frequency_hz: f64,
+    },
+    /// A table with a harmonic that cannot be.
+    #[error(
+        "the learned table has harmonic {harmonic}: must be 1 to {HARMONICS}, below {highest_hz} Hz"
+    )]
+    Harmonic {
+        /// Found.
+        harmonic: u32,
+        /// Highest frequency, Hz.
+        highest_hz: f64,
+    },
+}
