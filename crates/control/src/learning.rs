@@ -34,12 +34,9 @@ use line::Line;
 use nalgebra::Complex;
 
 pub use beside::CycleLearning;
-pub use config::{HarmonicResponse, LearnConfig, LearnError};
+pub use config::{HARMONICS, HarmonicResponse, LearnConfig, LearnError};
 pub use evidence::Driven;
 pub use table::{LearnedHarmonic, LearnedTable};
-
-/// Harmonics that a learner holds.
-pub const HARMONICS: usize = 8;
 
 /// Largest relative uncertainty of a response that is learned on: below 1 by a margin.
 pub const MOST_UNCERTAIN: f64 = 0.95;

@@ -1,8 +1,10 @@
 //! What a learner is told: responses of the loop, how to learn; and why one cannot be.
 
-use super::HARMONICS;
 use crate::error::{BuildError, check};
 use serde::{Deserialize, Serialize};
+
+/// Harmonics that a learner holds.
+pub const HARMONICS: usize = 8;
 
 /// Response of the bead to an addition to the command, in the closed loop, at one harmonic.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -18,9 +20,10 @@ pub struct HarmonicResponse {
     pub relative_uncertainty: f64,
 }
 
-/// How a learner learns.
+/// How a learner learns. Runs of older versions hold keys beside these, of a learner that is no more: they are passed over, so that such a
+/// run can still be read.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
+#[serde(default)]
 pub struct LearnConfig {
     /// Shortest time over which an error counts before anything is made of it, cycles and ticks.
     pub watch_cycles: f64,
@@ -119,4 +122,17 @@ pub enum LearnError {
         /// Highest frequency, Hz.
         highest_hz: f64,
     },
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_configuration_of_an_older_run_is_read() {
+        let old = "rate_per_cycle = 0.5\nfast_cycles = 10.0\nwatch_cycles = 3.0\nmost_um = 5.0";
+        let read: LearnConfig = toml::from_str(old).unwrap();
+        assert_eq!((read.watch_cycles, read.most_um), (3.0, 5.0));
+        assert_eq!(read.longest_cycles, LearnConfig::default().longest_cycles);
+    }
 }

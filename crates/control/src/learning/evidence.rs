@@ -4,7 +4,7 @@
 //! white, so that a stretch of three cycles is not read wrong by a bead that wanders slowly; the phasors are divided by the
 //! difference's own response.
 
-use super::HARMONICS;
+use super::config::HARMONICS;
 use nalgebra::Complex;
 use std::f64::consts::TAU;
 

@@ -1,6 +1,6 @@
 //! What is known of one harmonic of the addition, and how a stretch of ticks corrects it.
 
-use super::HarmonicResponse;
+use super::config::HarmonicResponse;
 use super::evidence::{Driven, Evidence, Noise};
 use nalgebra::Complex;
 
