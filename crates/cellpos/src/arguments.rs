@@ -54,6 +54,32 @@ fn latest(runs: &Path, name: Option<&str>) -> Result<PathBuf, String> {
         })
 }
 
+/// Reads the name of a run.
+///
+/// # Errors
+/// Says what a name may hold.
+pub fn run_name(text: &str) -> Result<String, String> {
+    cellpos_record::check_name(text)
+        .map(|()| text.to_owned())
+        .map_err(|_| "use letters, digits, `-` and `_`, at most 64 of them".to_owned())
+}
+
+/// What is wrong with a whole number, in words for people; None for any other error.
+pub fn about_a_whole_number(
+    error: &(dyn std::error::Error + 'static),
+    text: &str,
+) -> Option<&'static str> {
+    use std::num::IntErrorKind::{NegOverflow, PosOverflow, Zero};
+    let error = error.downcast_ref::<std::num::ParseIntError>()?;
+    Some(match error.kind() {
+        Zero => "it must be above zero",
+        PosOverflow => "it is too large",
+        NegOverflow => "it must not be below zero",
+        _ if text.parse::<f64>().is_ok_and(|number| number < 0.0) => "it must not be below zero",
+        _ => "write a whole number",
+    })
+}
+
 /// Reads a quantity that must be above zero, such as a duration.
 ///
 /// # Errors

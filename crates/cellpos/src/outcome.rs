@@ -1,5 +1,6 @@
 //! How a command ends: exit codes, JSON on standard output, errors on standard error.
 
+use crate::arguments::about_a_whole_number;
 pub use cellpos_session::Failure;
 use cellpos_terminal::{Colours, clean};
 use serde::Serialize;
@@ -109,8 +110,26 @@ pub fn exit(result: CommandResult, json: bool) -> ExitCode {
     ExitCode::from(code)
 }
 
+/// An error about a whole number, without the words of the language that the program is written in.
+fn number_in_words(error: &clap::Error) -> Option<clap::Error> {
+    use clap::error::{ContextKind, ErrorKind};
+    use std::error::Error;
+    let part = |kind| error.get(kind).map(ToString::to_string);
+    let value = part(ContextKind::InvalidValue)?;
+    let wrong = about_a_whole_number(error.source()?, &value)?;
+    let of = part(ContextKind::InvalidArg)?;
+    Some(clap::Error::raw(
+        ErrorKind::ValueValidation,
+        format!(
+            "invalid value '{value}' for '{of}': {wrong}\n\nFor more information, try '--help'.\n"
+        ),
+    ))
+}
+
 /// Says what is wrong with the arguments, or shows the help or version that they ask for.
 pub fn exit_arguments(error: &clap::Error, json: bool) -> ExitCode {
+    let in_words = number_in_words(error);
+    let error = in_words.as_ref().unwrap_or(error);
     let _ = error.print();
     let surplus = error
         .get(clap::error::ContextKind::InvalidArg)

@@ -46,7 +46,20 @@ pub enum RecordError {
         /// The name asked for.
         name: String,
         /// The columns that there are.
-        known: Vec<&'static str>,
+        known: Vec<String>,
+    },
+    /// A column that is asked for twice.
+    #[error("the column `{0}` is asked for twice")]
+    Twice(String),
+    /// An export without a row.
+    #[error(
+        "nothing of the run is in that time: its first row is at {first_s} s, its last at {last_s} s"
+    )]
+    Nothing {
+        /// Time of the run's first row.
+        first_s: f64,
+        /// Time of its last.
+        last_s: f64,
     },
     /// A run of a later version.
     #[error(

@@ -56,7 +56,7 @@ pub use lines::{LineFile, whole_text};
 pub use meta::{InputFile, RunEnd, RunMeta};
 pub use reader::{Batches, Gap, Lost, RunReader};
 pub use sessions::Sessions;
-pub use writer::{Finished, FlushPolicy, RunWriter};
+pub use writer::{Finished, FlushPolicy, RunWriter, check_name};
 
 /// Version of the layout of a run folder. 1: rows without a check. 2: rows with a check, only the columns that the run
 /// needs, no state of the controller.

@@ -280,6 +280,18 @@ impl Log<SyncedFile> {
     }
 }
 
+/// Refuses what cannot be the name of a run.
+///
+/// # Errors
+/// [`RecordError::Name`].
+pub fn check_name(name: &str) -> Result<(), RecordError> {
+    let fits = |c: char| c.is_ascii_alphanumeric() || c == '-' || c == '_';
+    if name.is_empty() || name.len() > 64 || !name.chars().all(fits) {
+        return Err(RecordError::Name(name.to_owned()));
+    }
+    Ok(())
+}
+
 impl RunWriter {
     /// Makes a new folder `<root>/<UTC time>-<name>` (with `-2`, `-3`, ... if it exists) and starts writing.
     ///
@@ -307,10 +319,7 @@ impl RunWriter {
         mut meta: RunMeta,
         policy: FlushPolicy,
     ) -> Result<Self, RecordError> {
-        let fits = |c: char| c.is_ascii_alphanumeric() || c == '-' || c == '_';
-        if meta.name.is_empty() || meta.name.len() > 64 || !meta.name.chars().all(fits) {
-            return Err(RecordError::Name(meta.name));
-        }
+        check_name(&meta.name)?;
         if let Some(name) = columns::impossible(&meta.law_columns) {
             return Err(RecordError::LawColumn(name.to_owned()));
         }

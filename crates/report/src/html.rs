@@ -329,7 +329,7 @@ impl Report {
                 Block::Table(table) => table.html(&mut out),
                 Block::Picture(picture) => picture.html(&mut out, escape),
                 Block::Figure(figure) => {
-                    let _ = write!(out, "<figure>\n{}", draw::figure(figure, false));
+                    let _ = write!(out, "<figure>\n{}", draw::in_page(figure));
                     if !figure.caption.is_empty() {
                         let caption = escape(&figure.caption);
                         let _ = writeln!(out, "<figcaption>{caption}</figcaption>");
@@ -358,6 +358,9 @@ impl Report {
     /// [`ReportError::Write`] names the file.
     pub fn write_with_figures(&self, path: &Path) -> Result<(), ReportError> {
         self.write(path)?;
+        if is_device(path) {
+            return Ok(());
+        }
         let stem = path.file_stem().map_or_else(
             || "report".into(),
             |stem| stem.to_string_lossy().into_owned(),
@@ -377,8 +380,16 @@ impl Report {
     }
 }
 
+/// Whether there is something of this name that is no file: a device or a pipe, which no file may take the place of.
+fn is_device(path: &Path) -> bool {
+    std::fs::metadata(path).is_ok_and(|found| !found.is_file() && !found.is_dir())
+}
+
 fn write_file(path: &Path, text: &str) -> Result<(), ReportError> {
     let attempt = || {
+        if is_device(path) {
+            return std::fs::write(path, text);
+        }
         if let Some(folder) = path.parent()
             && !folder.as_os_str().is_empty()
         {
@@ -408,6 +419,8 @@ h3{font-size:16px;margin:24px 0 6px}p{margin:8px 0}ul{margin:8px 0;padding-left:
 nav ul{columns:2;list-style:none;padding:10px 14px;background:#f5f7f9;border-radius:6px;font-size:14px}\
 a{color:#0063a0}figure{margin:18px 0}figure svg,img.pixels{max-width:100%;height:auto;display:block}img.pixels{image-rendering:pixelated}\
 figcaption{color:#5c6470;font-size:13px;margin-top:4px}\
+.slim{display:none}\
+@media(max-width:760px){.wide{display:none}.slim{display:block}.slim svg{width:100%;max-width:520px}figure .scroll svg{max-width:none}}\
 .scroll{overflow-x:auto;margin:12px 0}table{border-collapse:collapse;font-size:13.5px}\
 p.caption{color:#5c6470;font-size:13px;margin-top:4px}\
 th{text-align:left;font-weight:600;border-bottom:2px solid #c3cad2;padding:4px 14px 4px 6px;vertical-align:bottom}\
@@ -422,4 +435,4 @@ body{background:#14171b;color:#e4e7eb}h2{border-color:#2f353d}a{color:#6cb8ee}fi
 nav ul,.note,pre{background:#1e2329}th{border-color:#4a525d}td{border-color:#2a2f37}\
 tr.good td:first-child{color:#3ccf9f}tr.warning td:first-child{color:#f0b429}tr.bad td:first-child{color:#ff8078}\
 .note.good{background:#10281f}.note.warning{background:#2c2410}.note.bad{background:#301614}}\
-@media print{main{max-width:none}h2{break-after:avoid}figure,table{break-inside:avoid}}";
+@media print{.wide{display:block}.slim{display:none}main{max-width:none}h2{break-after:avoid}figure,table{break-inside:avoid}}";

@@ -14,19 +14,22 @@ pub(crate) const RIGHT_PX: f64 = 16.0;
 const LINE_PX: f64 = 18.0;
 
 /// Where a panel goes.
-pub(crate) struct Frame {
+pub(crate) struct Frame<'a> {
     pub(crate) left: f64,
     pub(crate) top: f64,
     pub(crate) width: f64,
     pub(crate) x_range: Option<(f64, f64)>,
     /// Whether the x axis has its numbers and title (only the lowest of panels that share it).
     pub(crate) show_x: bool,
-    /// Whether its legend is drawn.
-    pub(crate) show_legend: bool,
+    /// What legends above have said.
+    pub(crate) told: &'a [Entry<'a>],
 }
 
+/// A name, a colour and whether the stroke is dashed.
+pub(crate) type Entry<'a> = (&'a str, usize, bool);
+
 /// What a panel's legend says: names, colours and strokes.
-pub(crate) fn entries(panel: &Panel) -> Vec<(&str, usize, bool)> {
+pub(crate) fn entries(panel: &Panel) -> Vec<Entry<'_>> {
     panel
         .series
         .iter()
@@ -55,6 +58,8 @@ pub(crate) fn data_range(panel: &Panel, along_x: bool) -> Option<(f64, f64)> {
                         take(x - width / 2.0);
                         take(x + width / 2.0);
                     }
+                    // A place without a point is no reason for a longer axis.
+                    Kind::Points { .. } if !series.values(index).0.is_some_and(f64::is_finite) => {}
                     _ => take(x),
                 }
                 continue;
@@ -77,7 +82,7 @@ pub(crate) fn data_range(panel: &Panel, along_x: bool) -> Option<(f64, f64)> {
 }
 
 /// Draws one panel and returns its height with title, legend and axis texts.
-pub(crate) fn draw_panel(svg: &mut Svg, panel: &Panel, frame: &Frame) -> f64 {
+pub(crate) fn draw_panel(svg: &mut Svg, panel: &Panel, frame: &Frame<'_>) -> f64 {
     let mut top = frame.top;
     if !panel.title.is_empty() {
         svg.text(
@@ -88,9 +93,7 @@ pub(crate) fn draw_panel(svg: &mut Svg, panel: &Panel, frame: &Frame) -> f64 {
         );
         top += LINE_PX;
     }
-    if frame.show_legend {
-        top += legend(svg, panel, frame.left, top, frame.width);
-    }
+    top += legend(svg, panel, frame.told, (frame.left, top), frame.width);
     top += 4.0;
 
     let (mut width, mut height) = (frame.width, panel.height_px);
@@ -186,7 +189,7 @@ struct Area {
 }
 
 /// Grid lines and the numbers at them.
-fn grid(svg: &mut Svg, panel: &Panel, frame: &Frame, area: &Area, x: &Placed, y: &Placed) {
+fn grid(svg: &mut Svg, panel: &Panel, frame: &Frame<'_>, area: &Area, x: &Placed, y: &Placed) {
     let Area {
         left,
         top,
@@ -233,10 +236,13 @@ fn draw_markers(svg: &mut Svg, panel: &Panel, (width, height): (f64, f64), x: &P
         if marker.vertical {
             svg.line("mrk", (at, 0.0), (at, height));
             let wide = svg::text_width_px(&marker.label);
-            if at + wide + 8.0 > width {
-                svg.text("mut", (at - 4.0, 13.0), Anchor::End, &marker.label);
+            let (before, behind) = (at - 8.0, width - at - 8.0);
+            if wide <= behind || behind >= before {
+                let label = svg::fit(&marker.label, behind);
+                svg.text("mut", (at + 4.0, 13.0), Anchor::Start, &label);
             } else {
-                svg.text("mut", (at + 4.0, 13.0), Anchor::Start, &marker.label);
+                let label = svg::fit(&marker.label, before);
+                svg.text("mut", (at - 4.0, 13.0), Anchor::End, &label);
             }
         } else {
             svg.line("mrk", (0.0, height - at), (width, height - at));
@@ -245,7 +251,8 @@ fn draw_markers(svg: &mut Svg, panel: &Panel, (width, height): (f64, f64), x: &P
             } else {
                 height - at - 4.0
             };
-            svg.text("mut", (width - 5.0, y_text), Anchor::End, &marker.label);
+            let label = svg::fit(&marker.label, width - 10.0);
+            svg.text("mut", (width - 5.0, y_text), Anchor::End, &label);
         }
     }
 }
@@ -288,13 +295,22 @@ fn colors(panel: &Panel) -> Vec<usize> {
         .collect()
 }
 
-/// Draws the legend in lines above the panel and returns its height.
-fn legend(svg: &mut Svg, panel: &Panel, left: f64, top: f64, width: f64) -> f64 {
+/// Draws what the legend has to say beyond what was told before, in lines above the panel, and returns its height.
+pub(crate) fn legend(
+    svg: &mut Svg,
+    panel: &Panel,
+    told: &[Entry<'_>],
+    (left, top): (f64, f64),
+    width: f64,
+) -> f64 {
     let named: Vec<_> = panel
         .series
         .iter()
         .zip(colors(panel))
-        .filter(|(series, _)| !series.label.is_empty())
+        .filter(|(series, color)| {
+            let entry = (series.label.as_str(), *color, series.dashed);
+            !series.label.is_empty() && !told.contains(&entry)
+        })
         .collect();
     if named.is_empty() {
         return 0.0;

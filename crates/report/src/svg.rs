@@ -28,6 +28,8 @@ pub(crate) const STYLE: &str = "\
 
 /// Width of every figure, px.
 pub(crate) const WIDTH_PX: f64 = 820.0;
+/// Width of a figure for a narrow screen, px: shown on one of 400 px its letters keep ten of their twelve.
+pub(crate) const SLIM_PX: f64 = 400.0;
 /// Number of colours of the palette (Okabe and Ito's, darkened where white paper asks for it).
 pub(crate) const COLORS: usize = 8;
 

@@ -6,7 +6,7 @@ use std::io::{self, Read, Write};
 use std::path::Path;
 
 /// Writes a whole file so that no reader, and no crash, ever sees a part of it: into a temporary file beside it, synced
-/// to the disk, then renamed over `path`. Folders are made as needed.
+/// to the disk, then renamed over `path`. Folders are made as needed. A device or a pipe of this name is written to, and stays.
 ///
 /// # Errors
 /// [`Problem::Write`] with the file's name; the temporary file is removed.
@@ -29,6 +29,9 @@ fn replace(
     sync: impl Fn(&File) -> io::Result<()>,
 ) -> Result<(), TableError> {
     let attempt = || {
+        if std::fs::metadata(path).is_ok_and(|found| !found.is_file() && !found.is_dir()) {
+            return File::options().write(true).open(path)?.write_all(bytes);
+        }
         if let Some(folder) = path.parent()
             && !folder.as_os_str().is_empty()
         {
@@ -109,6 +112,23 @@ mod tests {
             let device = read_text("/dev/zero".as_ref(), 5).unwrap_err();
             assert!(device.to_string().contains("device"), "{device}");
         }
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn a_pipe_is_written_to_and_stays() {
+        use std::os::unix::fs::FileTypeExt;
+        let folder = tempfile::tempdir().unwrap();
+        let pipe = folder.path().join("pipe");
+        let made = std::process::Command::new("mkfifo").arg(&pipe).status();
+        assert!(made.unwrap().success());
+        let reader = std::thread::spawn({
+            let pipe = pipe.clone();
+            move || std::fs::read_to_string(pipe).unwrap()
+        });
+        write_atomically(&pipe, b"through").unwrap();
+        assert_eq!(reader.join().unwrap(), "through");
+        assert!(std::fs::metadata(&pipe).unwrap().file_type().is_fifo());
     }
 
     #[cfg(unix)]

@@ -137,3 +137,42 @@ fn take(camera: &mut dyn Camera, count: usize) -> Result<Vec<FrameBuffer>, Failu
     }
     Ok(frames)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use serde_json::Value;
+
+    /// What is printed with `--json` is what its schema says (the other commands are run for theirs; this one needs a camera).
+    #[test]
+    fn the_object_fits_its_schema() {
+        let taken = Taken {
+            camera: "a camera".to_owned(),
+            out: "empty.tif".into(),
+            frames: 100,
+            width_px: 256,
+            height_px: 32,
+            bits: 8,
+            noise_grey: 1.5,
+            threshold_grey: 6.0,
+        };
+        let object = serde_json::to_value(&taken).unwrap();
+        let path = concat!(
+            env!("CARGO_MANIFEST_DIR"),
+            "/../../docs/schemas/cellpos.background.json"
+        );
+        let schema: Value = serde_json::from_str(&std::fs::read_to_string(path).unwrap()).unwrap();
+        let properties = schema["properties"].as_object().unwrap();
+        assert_eq!(properties.len(), 2 + object.as_object().unwrap().len());
+        for (key, value) in object.as_object().unwrap() {
+            let kind = if value.is_number() {
+                "number"
+            } else {
+                "string"
+            };
+            assert_eq!(properties[key]["type"][0], kind, "{key}");
+            let required = schema["required"].as_array().unwrap();
+            assert!(required.iter().any(|name| name == key), "{key}");
+        }
+    }
+}

@@ -127,9 +127,19 @@ fn pack(run: &Path, out: Option<&Path>, json: bool) -> CommandResult {
     name.push(format!(".{}.part", std::process::id()));
     let part = out.with_file_name(name);
     if let Some(folder) = out.parent().filter(|folder| !folder.as_os_str().is_empty()) {
-        std::fs::create_dir_all(folder).map_err(io("cannot create", folder))?;
+        std::fs::create_dir_all(folder).map_err(|error| {
+            Failure::bad_input(
+                format!("{}: cannot be made: {error}", folder.display()),
+                "name a folder in one that you may write to",
+            )
+        })?;
     }
-    std::fs::create_dir(&part).map_err(io("cannot create", &part))?;
+    std::fs::create_dir(&part).map_err(|error| {
+        Failure::bad_input(
+            format!("{}: cannot be made: {error}", out.display()),
+            "name a folder in one that you may write to",
+        )
+    })?;
     let packed = fill(run, &reader, &part).and_then(|packed| {
         std::fs::rename(&part, &out).map_err(io("cannot make", &out))?;
         Ok(packed)

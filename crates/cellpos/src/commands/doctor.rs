@@ -24,7 +24,7 @@ use std::time::Duration;
 Exit code 0: fit; 1: not fit, or measured for too short a time to say so.")]
 pub struct Args {
     /// How long to measure the timer latency.
-    #[arg(long, visible_alias = "for", default_value = "5s", value_parser = positive::<Seconds>)]
+    #[arg(long = "for", alias = "duration", value_name = "DURATION", default_value = "5s", value_parser = positive::<Seconds>)]
     duration: Seconds,
     /// Name what ran when a wake-up was late.
     #[arg(long)]

@@ -4,7 +4,7 @@ use super::beside;
 use crate::arguments::run_folder;
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
 use crate::output;
-use cellpos_record::{Exported, Format, Selection, Sessions, export};
+use cellpos_record::{Exported, Format, RecordError, Selection, Sessions, export};
 use cellpos_units::Seconds;
 use std::num::NonZeroU64;
 use std::path::{Path, PathBuf};
@@ -93,7 +93,7 @@ impl ExportFormat {
     }
 }
 
-/// The format, by option or by name; the two must not contradict each other.
+/// The format, by option or by name; the two must not contradict each other, and an ending that is no format's is not guessed at.
 fn chosen(args: &Args) -> Result<ExportFormat, Failure> {
     let named = args.out.as_deref().and_then(ExportFormat::of);
     match (args.format, named) {
@@ -106,8 +106,19 @@ fn chosen(args: &Args) -> Result<ExportFormat, Failure> {
             "leave --format out, or give the file the name of the format",
         )),
         (Some(format), _) | (None, Some(format)) => Ok(format),
-        (None, None) => Ok(ExportFormat::Csv),
+        (None, None) => match args.out.as_deref().and_then(Path::extension) {
+            Some(ending) if !is_device(args.out.as_deref()) => Err(Failure::bad_input(
+                format!("--out ….{}: there is no such format", ending.display()),
+                "end the name in .csv, .parquet, .h5, .mat or .rtdc, or say which it is with --format",
+            )),
+            _ => Ok(ExportFormat::Csv),
+        },
     }
+}
+
+fn is_device(path: Option<&Path>) -> bool {
+    path.and_then(|path| std::fs::metadata(path).ok())
+        .is_some_and(|found| !found.is_file())
 }
 
 fn selection(args: &Args) -> Result<Selection, Failure> {
@@ -125,7 +136,6 @@ fn selection(args: &Args) -> Result<Selection, Failure> {
         every: args.every,
         columns: args.columns.clone(),
     };
-    selection.columns().map_err(Failure::input)?;
     Ok(selection)
 }
 
@@ -146,11 +156,16 @@ pub fn run(args: Args) -> CommandResult {
     let output = args
         .out
         .unwrap_or_else(|| beside(&args.run, &format!(".{}", format.extension())));
-    output::ready([&output])?;
     let unreadable = std::mem::take(&mut sessions.unreadable);
     let count = sessions.readers.len();
     let source = sessions.into_source().map_err(Failure::failed)?;
-    let done = export(&source, &selection, format.format(), &output).map_err(Failure::failed)?;
+    selection.columns(&source).map_err(Failure::input)?;
+    output::ready([&output])?;
+    let done =
+        export(&source, &selection, format.format(), &output).map_err(|error| match error {
+            RecordError::Nothing { .. } => Failure::input(error),
+            error => Failure::failed(error),
+        })?;
     tell(&output, &done, count, &unreadable, args.json)
 }
 

@@ -12,6 +12,7 @@ mod sink;
 mod text;
 mod unshown;
 
+use crate::arguments::run_name;
 use crate::clips;
 use crate::keys;
 use crate::notify::NotifyArgs;
@@ -100,7 +101,7 @@ pub struct Args {
     #[arg(long, default_value = "runs")]
     runs: PathBuf,
     /// Name of the run; left out: that of the script.
-    #[arg(long)]
+    #[arg(long, value_parser = run_name)]
     name: Option<String>,
     #[command(flatten)]
     queue: queue::QueueArgs,

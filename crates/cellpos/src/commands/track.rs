@@ -1,6 +1,6 @@
 //! `cellpos track`: hold a bead, or go to a position, in closed loop.
 
-use crate::arguments::positive;
+use crate::arguments::{positive, run_name};
 use crate::clips;
 use crate::keys::{self, Steering};
 use crate::notify::{NotifyArgs, What};
@@ -87,7 +87,7 @@ pub struct Args {
     #[arg(long, default_value = "runs")]
     runs: PathBuf,
     /// Name of the run.
-    #[arg(long, default_value = "track")]
+    #[arg(long, default_value = "track", value_parser = run_name)]
     name: String,
     /// Leave no run folder.
     #[arg(long)]

@@ -1,6 +1,7 @@
 //! Every kind of run through every command that reads one; what is missing or damaged around a run.
 
 use crate::common::{cellpos, succeed};
+use cellpos_record::export::columns::OF_LAWS;
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 
@@ -91,6 +92,20 @@ fn compared(at: &Path, kind: &str, run: &Path) {
     let said = ran.json();
     let fits = matches!(ran.code, Some(0 | 1)) || !said["error"]["message"].is_null();
     assert!(fits && !ran.err.contains("panicked"), "{kind}: {}", ran.err);
+    // The CSV of the run says the same: where the loop was closed, and in which session, stands in it.
+    let of_csv = cellpos(at, &format!("identify --data {path}.csv --json"));
+    let without_names = |object: Value| -> Vec<Value> {
+        let mut files = object["files"].as_array().cloned().unwrap_or_default();
+        for file in &mut files {
+            file["file"] = Value::Null;
+        }
+        files
+    };
+    let (of_csv, of_run) = (without_names(of_csv.json()), without_names(said));
+    assert_eq!(of_csv.len(), of_run.len(), "{kind}: {}", ran.err);
+    for (csv, run) in of_csv.iter().zip(&of_run) {
+        assert_eq!(csv, run, "{kind}");
+    }
 }
 
 #[test]
@@ -151,6 +166,18 @@ fn every_kind_of_run_goes_through_every_command_that_reads_one() {
         assert!(rows > 1500, "{kind}: {exported}");
         let csv = PathBuf::from(format!("{path}.csv"));
         assert_eq!(lines(&csv), 1 + rows, "{kind}");
+        let text = std::fs::read_to_string(&csv).unwrap();
+        let head: Vec<&str> = text.lines().next().unwrap().split(',').collect();
+        let meta: toml::Table = std::fs::read_to_string(run.join("run.toml"))
+            .unwrap()
+            .parse()
+            .unwrap();
+        for name in meta["law_columns"].as_array().unwrap() {
+            let name = name.as_str().unwrap();
+            assert!(head.contains(&name), "{kind}: {name}");
+            let known = OF_LAWS.iter().any(|(known, _)| *known == name);
+            assert!(known, "docs/data.md does not say what {name} is");
+        }
         let parquet: Value = succeed(at, &format!("export {path} --format parquet --json")).json();
         assert_eq!(parquet["rows"], rows, "{kind}");
 

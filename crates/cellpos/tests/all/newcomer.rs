@@ -110,7 +110,7 @@ fn the_quick_blocks_of_every_page_run_twice_in_one_folder() {
     let folder = folder();
     // What earlier, slower blocks of the pages leave behind for these.
     let before = "cellpos track --target 0um --duration 2s --clock virtual --frames off --name hold\n\
-                  cellpos run examples/scripts/step.toml --clock virtual --frames off --name fatigue\n\
+                  cellpos run examples/scripts/step.toml --clock virtual --frames off --name fatigue-dry\n\
                   cp examples/model.toml model.toml\n";
     run(folder.path(), before).unwrap();
     let mut ran = 0;

@@ -1,6 +1,7 @@
 //! `cellpos vision` and `cellpos camera` as a user runs them: what they find, what they write, what they refuse.
 
 use crate::common::{Ran, cellpos, number, succeed};
+use crate::schemas::hold;
 use cellpos_vision::{PixelResponse, ProfileSpec, Template};
 use std::path::{Path, PathBuf};
 
@@ -94,6 +95,7 @@ fn a_recording_gives_positions_micrometres_a_sheet_and_a_summary() {
         "vision beads --edge-px 5 --calibration calibration.toml --out result --json",
     )
     .json();
+    hold("vision", &r);
     assert_eq!(number(&r, "frames"), 30.0);
     assert_eq!(number(&r, "objects"), 2.0, "{r}");
     assert_eq!(number(&r, "fixes"), 60.0);
@@ -154,6 +156,7 @@ fn the_measured_beads_are_found_in_every_frame() {
         &format!("vision {} --out result --json", data.display()),
     )
     .json();
+    hold("vision", &r);
     println!(
         "{} objects, {} fixes, noise {} px, bound {} px, sub-pixel chi2/dof {}, {} us per frame",
         r["objects"],
@@ -192,6 +195,7 @@ fn settings_come_out_of_the_recording_and_go_into_a_rig_whose_loop_sees_the_same
         "vision beads --as-loop rig.toml --rate-hz 200 --out loop --json",
     )
     .json();
+    hold("vision", &r);
     assert_eq!(
         (number(&r, "frames"), number(&r, "lost_frames")),
         (29.0, 1.0)
@@ -210,6 +214,7 @@ fn settings_come_out_of_the_recording_and_go_into_a_rig_whose_loop_sees_the_same
     );
     // The same settings for all beads, and a rig that does not know what its beads look like.
     let r = succeed(root, "vision beads --rig rig.toml --out again --json").json();
+    hold("vision", &r);
     assert_eq!(number(&r, "fixes"), 58.0, "{r}");
     let (_, rest) = rig.split_once("[calibration]").unwrap();
     std::fs::write(root.join("bare.toml"), format!("[calibration]{rest}")).unwrap();
@@ -236,6 +241,7 @@ fn cells_are_measured_against_the_background() {
         "vision cells --cells --background-frames 8 --out result --json",
     )
     .json();
+    hold("vision", &r);
     assert_eq!(number(&r, "fixes"), 8.0, "{r}");
     let (names, rows) = rows(&folder.path().join("result/positions.csv"));
     let column = |name: &str| names.iter().position(|n| n == name).unwrap();
@@ -261,6 +267,7 @@ fn cells_are_measured_against_the_background() {
         "vision cells --cells --background empty --out apart --json",
     )
     .json();
+    hold("vision", &apart);
     assert_eq!(apart["cells"], r["cells"]);
     let refused = cellpos(
         folder.path(),
@@ -396,6 +403,7 @@ fn a_recording_plays_as_a_camera_and_what_it_delivered_is_told() {
         "camera --recording beads --rate-hz 200 --duration 3s --json",
     );
     let r = ran.json();
+    hold("vision", &r);
     // Frames that a loaded machine is too late for are skipped, as a camera would, and counted.
     assert_eq!(number(&r, "frames") + number(&r, "dropped"), 40.0, "{r}");
     assert_eq!(number(&r, "doubled_or_stale"), 0.0);

@@ -1,6 +1,6 @@
 //! What other programs see of a run: the columns, under the same names in every form, with unit and meaning.
 
-use cellpos_runtime::TickRecord;
+use cellpos_runtime::{LAW_COLUMNS, TickRecord};
 
 /// A row as it is exported: a tick, the session that it belongs to, and when that began.
 #[derive(Debug, Clone, Copy)]
@@ -29,9 +29,9 @@ pub enum Value {
 
 /// A column of an export.
 #[derive(Clone, Copy)]
-pub struct Column {
+pub struct Column<'a> {
     /// Its name, the same in every form; names of quantities end in their unit.
-    pub name: &'static str,
+    pub name: &'a str,
     /// Unit; empty for counts and words.
     pub unit: &'static str,
     /// What it is, in a sentence.
@@ -40,7 +40,7 @@ pub struct Column {
     pub value: Value,
 }
 
-impl Column {
+impl Column<'_> {
     /// The value of a column that holds numbers; the number of a word otherwise.
     pub fn number(&self, row: &Row) -> f64 {
         match self.value {
@@ -161,7 +161,7 @@ pub const SOLVER: Codes = &[
 macro_rules! columns {
     ($($name:literal $unit:literal $value:expr, $about:literal;)*) => {
         /// Every column, in order.
-        pub const COLUMNS: &[Column] = &[$(Column {
+        pub const COLUMNS: &[Column<'static>] = &[$(Column {
             name: $name,
             unit: $unit,
             about: $about,
@@ -247,8 +247,81 @@ columns! {
         "Session of the run: 1, and one more each time that it was resumed.";
 }
 
+fn law<const INDEX: usize>(row: &Row) -> f64 {
+    row.tick.law.get(INDEX).map_or(f64::NAN, |v| f64::from(*v))
+}
+
+/// The values of a control law's own columns, by their place in a row.
+const LAW: [fn(&Row) -> f64; LAW_COLUMNS] = [
+    law::<0>, law::<1>, law::<2>, law::<3>, law::<4>, law::<5>, law::<6>, law::<7>,
+];
+
+/// What the columns are that the laws of cellpos and their adaptation have; those of a law from elsewhere it knows alone.
+pub const OF_LAWS: &[(&str, &str)] = &[
+    (
+        "pi_integral_um",
+        "Integral part of PI, in displacement of the PZT.",
+    ),
+    (
+        "pi_lead_um",
+        "State of the lead, in displacement of the PZT.",
+    ),
+    (
+        "lqg_feed_forward_um",
+        "Displacement that LQG adds for the motion that it knows beforehand.",
+    ),
+    (
+        "mpc_feed_forward_um",
+        "Displacement that MPC adds for the motion that it knows beforehand.",
+    ),
+    (
+        "mpc_fallback_integral_um",
+        "Integral part of the PI that stands in for MPC.",
+    ),
+    (
+        "adapt_gain",
+        "Gain of the plant that the law is tuned to, over the model's.",
+    ),
+    (
+        "adapt_delay_samples",
+        "Delay that the law is tuned to, less the model's, in samples.",
+    ),
+    (
+        "adapt_gain_estimate",
+        "Estimated gain of the plant, over the model's.",
+    ),
+    ("adapt_gain_sd", "Standard deviation of the estimated gain."),
+    (
+        "adapt_mode",
+        "Adaptation: 0 too little motion, 1 in agreement, 2 moving, 3 paused, 4 back to the design.",
+    ),
+];
+
+/// Columns of the control law's own, in the order of their names in the metadata; at most as many as a row has room for.
+pub fn of_law(names: &[String]) -> Vec<Column<'_>> {
+    let unit = |name: &str| {
+        let units = ["um", "s", "us", "hz", "deg"];
+        let end = name.rsplit('_').next().unwrap_or("");
+        units.into_iter().find(|unit| *unit == end).unwrap_or("")
+    };
+    let about = |name: &str| {
+        let known = OF_LAWS.iter().find(|(known, _)| *known == name);
+        known.map_or("Of the control law's own.", |(_, about)| about)
+    };
+    names
+        .iter()
+        .zip(LAW)
+        .map(|(name, get)| Column {
+            name,
+            unit: unit(name),
+            about: about(name),
+            value: Value::Number(get),
+        })
+        .collect()
+}
+
 /// A column by its name.
-pub fn find(name: &str) -> Option<&'static Column> {
+pub fn find(name: &str) -> Option<&'static Column<'static>> {
     COLUMNS.iter().find(|column| column.name == name)
 }
 

@@ -5,7 +5,7 @@ use super::{Exported, Selection, Source};
 use crate::error::RecordError;
 use std::io::{self, Write};
 
-/// First line of a CSV with all columns.
+/// First line of a CSV with all columns that every run has.
 pub fn csv_head() -> String {
     let names: Vec<&str> = COLUMNS.iter().map(|column| column.name).collect();
     names.join(",")
@@ -21,7 +21,7 @@ pub fn write_csv(
     out: &mut impl Write,
 ) -> Result<Exported, RecordError> {
     let failed = RecordError::io("cannot write", "the CSV");
-    let columns = selection.columns()?;
+    let columns = selection.columns(source)?;
     let names: Vec<&str> = columns.iter().map(|column| column.name).collect();
     if let Err(error) = writeln!(out, "{}", names.join(",")) {
         return Err(failed(error));

@@ -36,7 +36,7 @@ pub fn write_mat(
     selection: &Selection,
     path: &Path,
 ) -> Result<Exported, RecordError> {
-    let columns = selection.columns()?;
+    let columns = selection.columns(source)?;
     let rows = source.rows(selection, |_| Ok(()))?.rows;
     if rows * 8 > MOST_BYTES {
         return Err(RecordError::Encode {
@@ -69,7 +69,7 @@ fn write_at(mut file: &File, place: u64, bytes: &[u8]) -> io::Result<()> {
     file.write_all(bytes)
 }
 
-fn value(column: &Column, row: &Row) -> f64 {
+fn value(column: &Column<'_>, row: &Row) -> f64 {
     match column.value {
         Value::Code(codes, get) => {
             let number = get(row);
@@ -80,7 +80,7 @@ fn value(column: &Column, row: &Row) -> f64 {
 }
 
 /// Writes everything but the values; gives the place of each column's first.
-fn heads(file: &File, columns: &[&'static Column], rows: u64) -> io::Result<Vec<u64>> {
+fn heads(file: &File, columns: &[Column<'_>], rows: u64) -> io::Result<Vec<u64>> {
     let mut out = BufWriter::new(file);
     let mut head = b"MATLAB 5.0 MAT-file, written by cellpos".to_vec();
     head.resize(124, b' ');

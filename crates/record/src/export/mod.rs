@@ -17,6 +17,7 @@ use crate::error::RecordError;
 use crate::events::Event;
 use crate::meta::RunMeta;
 use crate::reader::{Lost, RunReader};
+use cellpos_runtime::LAW_COLUMNS;
 use columns::{COLUMNS, Column, Row};
 pub(crate) use columns::{bead_um, seconds};
 use std::fs::{File, OpenOptions};
@@ -57,6 +58,8 @@ pub struct Part {
 #[derive(Debug)]
 pub struct Source {
     parts: Vec<Part>,
+    /// Names of the control law's own columns, of all sessions.
+    law: Vec<String>,
 }
 
 /// What of a run is wanted.
@@ -87,17 +90,27 @@ impl Selection {
     /// The columns wanted.
     ///
     /// # Errors
-    /// [`RecordError::Column`] for a name that is none.
-    pub fn columns(&self) -> Result<Vec<&'static Column>, RecordError> {
+    /// [`RecordError::Column`] for a name that is none, [`RecordError::Twice`] for one that is asked for twice.
+    pub fn columns<'s>(&self, source: &'s Source) -> Result<Vec<Column<'s>>, RecordError> {
+        let mut all: Vec<Column<'s>> = COLUMNS.to_vec();
+        all.extend(columns::of_law(&source.law));
         let Some(names) = &self.columns else {
-            return Ok(COLUMNS.iter().collect());
+            return Ok(all);
         };
+        let twice = names
+            .iter()
+            .enumerate()
+            .find(|(place, name)| names[..*place].contains(name));
+        if let Some((_, name)) = twice {
+            return Err(RecordError::Twice(name.clone()));
+        }
         names
             .iter()
             .map(|name| {
-                columns::find(name).ok_or_else(|| RecordError::Column {
+                let found = all.iter().find(|column| column.name == name);
+                found.copied().ok_or_else(|| RecordError::Column {
                     name: name.clone(),
-                    known: COLUMNS.iter().map(|column| column.name).collect(),
+                    known: all.iter().map(|column| column.name.to_owned()).collect(),
                 })
             })
             .collect()
@@ -116,7 +129,13 @@ pub struct Exported {
 impl Source {
     /// The sessions of a run.
     pub fn new(parts: Vec<Part>) -> Self {
-        Self { parts }
+        let mut law: Vec<String> = Vec::new();
+        for name in parts.iter().flat_map(|part| part.reader.law_columns()) {
+            if !law.contains(name) {
+                law.push(name.clone());
+            }
+        }
+        Self { parts, law }
     }
 
     /// A run of one session.
@@ -172,7 +191,7 @@ impl Source {
     /// Hands over the rows wanted, some at a time, so that a night's run needs no night's memory.
     ///
     /// # Errors
-    /// [`RecordError`] when a session cannot be read, or what `take` refuses.
+    /// [`RecordError`] when a session cannot be read or has nothing in the time that was asked for, or what `take` refuses.
     pub fn rows(
         &self,
         selection: &Selection,
@@ -183,16 +202,27 @@ impl Source {
         let mut done = Exported::default();
         let mut rows = Vec::with_capacity(ROWS_AT_A_TIME);
         let mut number = 0;
+        let (mut first_ns, mut last_ns) = (None, i64::MIN);
         for part in &self.parts {
+            let places = self.places(part)?;
             let mut batches = part.reader.batches()?;
-            for tick in batches.by_ref().flatten() {
+            for mut tick in batches.by_ref().flatten() {
                 let time_ns = tick.time_ns.saturating_add(part.offset_ns);
+                first_ns = first_ns.or(Some(time_ns));
+                last_ns = last_ns.max(time_ns);
                 if time_ns < from_ns || time_ns > to_ns {
                     continue;
                 }
                 number += 1;
                 if (number - 1) % selection.every != 0 {
                     continue;
+                }
+                if let Some(places) = &places {
+                    let law = tick.law;
+                    tick.law = places.map(|place| {
+                        let value = place.and_then(|place| law.get(place));
+                        value.copied().unwrap_or(f32::NAN)
+                    });
                 }
                 rows.push(Row {
                     tick,
@@ -209,7 +239,29 @@ impl Source {
         }
         take(&rows)?;
         done.rows += rows.len() as u64;
-        Ok(done)
+        match first_ns {
+            Some(first_ns) if done.rows == 0 => Err(RecordError::Nothing {
+                first_s: seconds(first_ns),
+                last_s: seconds(last_ns),
+            }),
+            _ => Ok(done),
+        }
+    }
+
+    /// Where a session has the control law's columns of the whole run; None where all sessions have the same ones.
+    fn places(&self, part: &Part) -> Result<Option<[Option<usize>; LAW_COLUMNS]>, RecordError> {
+        let own = part.reader.law_columns();
+        if own == self.law {
+            return Ok(None);
+        }
+        if let Some(name) = self.law.get(LAW_COLUMNS) {
+            return Err(RecordError::LawColumn(name.clone()));
+        }
+        let mut places = [None; LAW_COLUMNS];
+        for (place, name) in places.iter_mut().zip(&self.law) {
+            *place = own.iter().position(|other| other == name);
+        }
+        Ok(Some(places))
     }
 }
 
@@ -244,6 +296,21 @@ pub fn export(
     }
 }
 
+/// Whether there is something of this name that is no file: a device or a pipe, which nothing may take the place of.
+fn is_device(path: &Path) -> bool {
+    std::fs::metadata(path).is_ok_and(|found| !found.is_file() && !found.is_dir())
+}
+
+/// Gives a file that is written whole its name. A device or a pipe gets the bytes and stays what it is.
+fn settle(part: &Path, path: &Path) -> io::Result<()> {
+    if !is_device(path) {
+        return std::fs::rename(part, path);
+    }
+    let mut device = OpenOptions::new().write(true).open(path)?;
+    io::copy(&mut File::open(part)?, &mut device)?;
+    std::fs::remove_file(part)
+}
+
 /// The temporary name of a file, in a folder that is there.
 fn part_of(path: &Path) -> Result<PathBuf, RecordError> {
     if let Some(folder) = path.parent()
@@ -254,7 +321,11 @@ fn part_of(path: &Path) -> Result<PathBuf, RecordError> {
     let mut name = std::ffi::OsString::from(".");
     name.push(path.file_name().unwrap_or_default());
     name.push(format!(".{}.part", std::process::id()));
-    Ok(path.with_file_name(name))
+    Ok(if is_device(path) {
+        std::env::temp_dir().join(name)
+    } else {
+        path.with_file_name(name)
+    })
 }
 
 /// Writes a file under a temporary name, syncs it, and gives it its name.
@@ -272,7 +343,7 @@ pub(crate) fn whole<T>(
     let attempt = || {
         let done = write(&file)?;
         file.sync_data().map_err(io)?;
-        std::fs::rename(&part, path).map_err(io)?;
+        settle(&part, path).map_err(io)?;
         Ok(done)
     };
     attempt().inspect_err(|_| {

@@ -33,7 +33,7 @@ pub fn write_parquet(
     selection: &Selection,
     path: &Path,
 ) -> Result<Exported, RecordError> {
-    let columns = selection.columns()?;
+    let columns = selection.columns(source)?;
     let schema = schema(&columns, source);
     whole(path, |file| {
         let properties = WriterProperties::builder()
@@ -56,7 +56,7 @@ pub fn write_parquet(
 }
 
 /// The columns with unit, meaning and words, and what the run is.
-fn schema(columns: &[&'static Column], source: &Source) -> SchemaRef {
+fn schema(columns: &[Column<'_>], source: &Source) -> SchemaRef {
     let fields: Vec<Field> = columns
         .iter()
         .map(|column| {
@@ -98,7 +98,7 @@ pub(crate) fn listed(codes: Codes) -> String {
     each.join(", ")
 }
 
-fn array(column: &Column, rows: &[Row]) -> ArrayRef {
+fn array(column: &Column<'_>, rows: &[Row]) -> ArrayRef {
     match column.value {
         Value::Number(get) => {
             let values = rows

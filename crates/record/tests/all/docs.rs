@@ -1,6 +1,6 @@
 //! The reference page of the data says what the data are.
 
-use cellpos_record::export::columns::{COLUMNS, Value};
+use cellpos_record::export::columns::{COLUMNS, OF_LAWS, Value, of_law};
 use cellpos_runtime::TickFlags;
 
 fn page() -> String {
@@ -30,6 +30,12 @@ fn every_column_is_on_the_page_with_unit_kind_words_and_meaning() {
             let line = format!("| `{}` | {} |", column.name, words.join(", "));
             assert!(page.contains(&line), "docs/data.md lacks the line\n{line}");
         }
+    }
+    for (name, about) in OF_LAWS {
+        let name = [(*name).to_owned()];
+        let columns = of_law(&name);
+        let line = format!("| `{}` | {} | {about} |", columns[0].name, columns[0].unit);
+        assert!(page.contains(&line), "docs/data.md lacks the line\n{line}");
     }
     let columns = page
         .lines()

@@ -213,6 +213,92 @@ fn hdf5(path: &Path, expected: &[Vec<f64>]) {
     assert_eq!(events, [1.0, 2.0]);
 }
 
+/// The control law's own columns are exported under the names that the run gives them, session by session.
+#[test]
+fn the_laws_own_columns_are_in_the_export_whatever_their_place_in_a_session() {
+    let root = tempfile::tempdir().unwrap();
+    let session = |root: &Path, number: i64, law: &[&str]| {
+        let mut meta = RunMeta::new("t", "virtual");
+        meta.law_columns = law.iter().map(|name| (*name).to_owned()).collect();
+        let mut table = toml::Table::new();
+        table.insert("number".into(), toml::Value::Integer(number));
+        table.insert("gap_s".into(), toml::Value::Float(2.5));
+        meta.config
+            .insert("session".into(), toml::Value::Table(table));
+        let mut writer = RunWriter::create(root, meta).unwrap();
+        for seq in 0..3 {
+            let mut tick = tick(seq);
+            for (place, value) in tick.law.iter_mut().enumerate() {
+                *value = (10 * number) as f32 + place as f32;
+            }
+            writer.tick(&tick);
+        }
+        writer.finish(RunEnd::new("done")).folder
+    };
+    let run = session(root.path(), 1, &["own_um", "adapt_gain"]);
+    session(
+        &run.join("sessions"),
+        2,
+        &["adapt_gain", "late_s", "own_um"],
+    );
+    let source = source(&run);
+    let selection = |names: &[&str]| Selection {
+        columns: Some(names.iter().map(|name| (*name).to_owned()).collect()),
+        ..Selection::default()
+    };
+    let path = root.path().join("law.csv");
+    let wanted = selection(&["session", "own_um", "adapt_gain", "late_s"]);
+    export(&source, &wanted, Format::Csv, &path).unwrap();
+    let (first, second) = ("1,10,11,\n", "2,22,20,21\n");
+    let text = format!(
+        "session,own_um,adapt_gain,late_s\n{}{}",
+        first.repeat(3),
+        second.repeat(3)
+    );
+    assert_eq!(std::fs::read_to_string(&path).unwrap(), text);
+    let all = Selection::default();
+    let columns = all.columns(&source).unwrap();
+    let units: Vec<(&str, &str)> = columns[COLUMNS.len()..]
+        .iter()
+        .map(|column| (column.name, column.unit))
+        .collect();
+    assert_eq!(
+        units,
+        [("own_um", "um"), ("adapt_gain", ""), ("late_s", "s")]
+    );
+    // What is asked for twice, or is of no time of the run, is refused, and no file is left.
+    let twice = export(&source, &selection(&["seq", "seq"]), Format::Mat, &path).unwrap_err();
+    assert!(twice.to_string().contains("`seq`"), "{twice}");
+    let later = Selection {
+        from_s: 60.0,
+        ..Selection::default()
+    };
+    let none = root.path().join("none.parquet");
+    let said = export(&source, &later, Format::Parquet, &none).unwrap_err();
+    assert!(said.to_string().contains("last at"), "{said}");
+    assert!(!none.exists());
+}
+
+/// A device is written to, and never replaced by a file.
+#[cfg(unix)]
+#[test]
+fn a_pipe_takes_what_is_exported_and_stays_a_pipe() {
+    use std::os::unix::fs::FileTypeExt;
+    let root = tempfile::tempdir().unwrap();
+    let run = run(root.path(), 50);
+    let pipe = root.path().join("pipe");
+    let made = std::process::Command::new("mkfifo").arg(&pipe).status();
+    assert!(made.unwrap().success());
+    let reader = std::thread::spawn({
+        let pipe = pipe.clone();
+        move || std::fs::read_to_string(pipe).unwrap()
+    });
+    export(&source(&run), &Selection::default(), Format::Csv, &pipe).unwrap();
+    assert_eq!(reader.join().unwrap().lines().count(), 1 + 100);
+    let kind = std::fs::metadata(&pipe).unwrap().file_type();
+    assert!(kind.is_fifo());
+}
+
 fn every_form_agrees(rows: u64) {
     let root = tempfile::tempdir().unwrap();
     let run = run(root.path(), rows);

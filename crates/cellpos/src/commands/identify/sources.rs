@@ -4,8 +4,9 @@ use super::Args;
 use crate::commands::run::resume;
 use crate::outcome::Failure;
 use cellpos_record::RunReader;
-use cellpos_runtime::TickFlags;
+use cellpos_runtime::{Life, TickFlags, TickRecord};
 use cellpos_table::{ColumnRef, Table};
+use std::collections::BTreeMap;
 use std::path::Path;
 
 /// A record with what is known of it.
@@ -45,7 +46,7 @@ pub fn read(path: &Path, args: &Args) -> Result<Vec<Source>, Failure> {
             closed: false,
         }]);
     }
-    own_record(path).map(|source| vec![source])
+    own_record(path)
 }
 
 fn text_of(path: &Path) -> Result<String, Failure> {
@@ -57,8 +58,9 @@ fn text_of(path: &Path) -> Result<String, Failure> {
     })
 }
 
-/// A CSV of cellpos: time_s, pzt_um, bead_um, and target_um where it has one.
-fn own_record(path: &Path) -> Result<Source, Failure> {
+/// A CSV of cellpos: time_s, pzt_um, bead_um, and target_um where it has one. Where it says when the loop was closed (`life`), as
+/// exports of runs do, it is taken as the run would be.
+fn own_record(path: &Path) -> Result<Vec<Source>, Failure> {
     let name = path.display().to_string();
     let text = text_of(path)?;
     let foreign = |error: String| {
@@ -78,85 +80,66 @@ fn own_record(path: &Path) -> Result<Source, Failure> {
         column("pzt_um", false)?,
         column("bead_um", true)?,
     );
+    let reference = column("target_um", true).ok();
+    if let Some(life) = table.names.iter().position(|name| *name == "life") {
+        let whole = |name: &str| column(name, true).unwrap_or_default();
+        let (flags, seq, session) = (whole("flags"), whole("seq"), whole("session"));
+        let number = |values: &[f64], row: usize| values.get(row).copied().unwrap_or(f64::NAN);
+        let rows = table.fields(life).enumerate().map(|(row, life)| {
+            let flags = TickFlags(number(&flags, row).max(0.0) as u32);
+            let tick = Tick {
+                time_ns: (number(&time_s, row) * 1e9).round() as i64,
+                seq: number(&seq, row).max(0.0) as u64,
+                controlled: life == Life::Running.name() && !flags.has(TickFlags::FREEZE),
+                input: number(&input, row),
+                output: if is_fresh(flags) {
+                    number(&output, row)
+                } else {
+                    f64::NAN
+                },
+                reference: reference.as_ref().map_or(f64::NAN, |r| number(r, row)),
+            };
+            (number(&session, row).max(1.0) as u64, tick)
+        });
+        let mut sessions: BTreeMap<u64, Vec<Tick>> = BTreeMap::new();
+        for (session, tick) in rows {
+            sessions.entry(session).or_default().push(tick);
+        }
+        let many = sessions.len() > 1;
+        let sources = sessions
+            .iter()
+            .filter_map(|(number, ticks)| {
+                let name = of_session(&name, many.then_some(*number));
+                let all = || Ok(ticks.iter().copied());
+                settled(name, reference.is_some(), all).transpose()
+            })
+            .collect::<Result<Vec<_>, _>>()?;
+        return some(sources, path);
+    }
     let mut steps: Vec<f64> = time_s.windows(2).map(|pair| pair[1] - pair[0]).collect();
     steps.sort_by(f64::total_cmp);
     let step_s = steps.get(steps.len() / 2).copied().unwrap_or(0.0);
     if step_s <= 0.0 {
         return Err(foreign("time_s does not rise".to_owned()));
     }
-    Ok(Source {
+    Ok(vec![Source {
         rate_hz: 1.0 / step_s,
         input,
         output,
-        reference: column("target_um", true).ok(),
+        reference,
         closed: false,
         name,
-    })
+    }])
 }
 
-/// The sessions of a run, each from where its loop was closed and had settled to where the operator or the script ended it.
-fn runs(path: &Path) -> Result<Vec<Source>, Failure> {
-    const SETTLED_NS: i64 = 2_000_000_000;
-    let folders = resume::sessions(path);
-    let many = folders.len() > 1;
-    let mut sources = Vec::new();
-    for (number, folder) in (1u64..).zip(&folders) {
-        let reader = RunReader::open(folder).map_err(Failure::input)?;
-        // Read twice, so that a night's run needs no night's memory.
-        let ticks =
-            || -> Result<_, Failure> { Ok(reader.batches().map_err(Failure::input)?.flatten()) };
-        let (mut steps, mut last_ns, mut first_ns) = (Vec::new(), None, None);
-        for tick in ticks()? {
-            steps.extend(last_ns.replace(tick.time_ns).map(|ns| tick.time_ns - ns));
-            first_ns = first_ns.or(tick.is_controlled().then_some(tick.time_ns));
-        }
-        let Some(first_ns) = first_ns else {
-            continue;
-        };
-        let from_ns = first_ns + SETTLED_NS;
-        steps.sort_unstable();
-        let step_ns = steps
-            .get(steps.len() / 2)
-            .copied()
-            .unwrap_or(1_000_000)
-            .max(1);
-        let (mut input, mut output, mut reference) = (Vec::new(), Vec::new(), Vec::new());
-        let mut last_seq = None;
-        for tick in ticks()?.filter(|tick| tick.time_ns >= from_ns) {
-            if !tick.is_controlled() {
-                break;
-            }
-            // A tick whose record is lost leaves a row with the command before it, and no position.
-            let lost =
-                last_seq.map_or(0, |last: u64| tick.seq.saturating_sub(last + 1).min(10_000));
-            for _ in 0..lost {
-                input.push(input.last().copied().unwrap_or(tick.command_um));
-                output.push(f64::NAN);
-                reference.push(tick.target_um);
-            }
-            last_seq = Some(tick.seq);
-            let fresh = !tick.flags.has(TickFlags::TIMER) && !tick.flags.has(TickFlags::STALE);
-            input.push(tick.command_um);
-            output.push(if fresh && tick.verdict == 0 {
-                tick.measured_um
-            } else {
-                f64::NAN
-            });
-            reference.push(tick.target_um);
-        }
-        sources.push(Source {
-            name: if many {
-                format!("{}, session {number}", path.display())
-            } else {
-                path.display().to_string()
-            },
-            rate_hz: 1e9 / step_ns as f64,
-            input,
-            output,
-            reference: Some(reference),
-            closed: true,
-        });
-    }
+fn of_session(name: &str, number: Option<u64>) -> String {
+    number.map_or_else(
+        || name.to_owned(),
+        |number| format!("{name}, session {number}"),
+    )
+}
+
+fn some(sources: Vec<Source>, path: &Path) -> Result<Vec<Source>, Failure> {
     if sources.is_empty() {
         return Err(Failure::bad_input(
             format!("{}: the loop was never closed in it", path.display()),
@@ -164,4 +147,104 @@ fn runs(path: &Path) -> Result<Vec<Source>, Failure> {
         ));
     }
     Ok(sources)
+}
+
+/// What is wanted of a tick, from a run folder or from a CSV.
+#[derive(Clone, Copy)]
+struct Tick {
+    time_ns: i64,
+    seq: u64,
+    controlled: bool,
+    input: f64,
+    output: f64,
+    reference: f64,
+}
+
+fn is_fresh(flags: TickFlags) -> bool {
+    !flags.has(TickFlags::TIMER) && !flags.has(TickFlags::STALE)
+}
+
+impl From<TickRecord> for Tick {
+    fn from(tick: TickRecord) -> Self {
+        Self {
+            time_ns: tick.time_ns,
+            seq: tick.seq,
+            controlled: tick.is_controlled(),
+            input: tick.command_um,
+            output: if is_fresh(tick.flags) && tick.verdict == 0 {
+                tick.measured_um
+            } else {
+                f64::NAN
+            },
+            reference: tick.target_um,
+        }
+    }
+}
+
+/// The ticks of a session from where its loop was closed and had settled to where the operator or the script ended it; None
+/// where it was never closed. The ticks are asked for twice, so that a night's run needs no night's memory.
+fn settled<T: Iterator<Item = Tick>>(
+    name: String,
+    referenced: bool,
+    ticks: impl Fn() -> Result<T, Failure>,
+) -> Result<Option<Source>, Failure> {
+    const SETTLED_NS: i64 = 2_000_000_000;
+    let (mut steps, mut last_ns, mut first_ns) = (Vec::new(), None, None);
+    for tick in ticks()? {
+        steps.extend(last_ns.replace(tick.time_ns).map(|ns| tick.time_ns - ns));
+        first_ns = first_ns.or(tick.controlled.then_some(tick.time_ns));
+    }
+    let Some(first_ns) = first_ns else {
+        return Ok(None);
+    };
+    let from_ns = first_ns + SETTLED_NS;
+    steps.sort_unstable();
+    let step_ns = steps
+        .get(steps.len() / 2)
+        .copied()
+        .unwrap_or(1_000_000)
+        .max(1);
+    let (mut input, mut output, mut reference) = (Vec::new(), Vec::new(), Vec::new());
+    let mut last_seq = None;
+    for tick in ticks()?.filter(|tick| tick.time_ns >= from_ns) {
+        if !tick.controlled {
+            break;
+        }
+        // A tick whose record is lost leaves a row with the command before it, and no position.
+        let lost = last_seq.map_or(0, |last: u64| tick.seq.saturating_sub(last + 1).min(10_000));
+        for _ in 0..lost {
+            input.push(input.last().copied().unwrap_or(tick.input));
+            output.push(f64::NAN);
+            reference.push(tick.reference);
+        }
+        last_seq = Some(tick.seq);
+        input.push(tick.input);
+        output.push(tick.output);
+        reference.push(tick.reference);
+    }
+    Ok(Some(Source {
+        name,
+        rate_hz: 1e9 / step_ns as f64,
+        input,
+        output,
+        reference: referenced.then_some(reference),
+        closed: true,
+    }))
+}
+
+/// The sessions of a run.
+fn runs(path: &Path) -> Result<Vec<Source>, Failure> {
+    let folders = resume::sessions(path);
+    let many = folders.len() > 1;
+    let mut sources = Vec::new();
+    for (number, folder) in (1u64..).zip(&folders) {
+        let reader = RunReader::open(folder).map_err(Failure::input)?;
+        let ticks = || {
+            let batches = reader.batches().map_err(Failure::input)?;
+            Ok(batches.flatten().map(Tick::from))
+        };
+        let name = of_session(&path.display().to_string(), many.then_some(number));
+        sources.extend(settled(name, true, ticks)?);
+    }
+    some(sources, path)
 }

@@ -4,6 +4,8 @@
 mod files;
 mod objects;
 
+pub use objects::hold;
+
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 

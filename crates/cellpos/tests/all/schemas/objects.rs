@@ -87,7 +87,7 @@ fn merged(a: &Value, b: &Value) -> Value {
 }
 
 /// Holds an object against its schema.
-fn hold(line: &str, object: &Value) {
+pub fn hold(line: &str, object: &Value) {
     let name = object["schema"]
         .as_str()
         .unwrap_or_else(|| panic!("{line}: no schema"));
@@ -117,6 +117,8 @@ fn folder() -> tempfile::TempDir {
     std::fs::write(folder.path().join("wave.toml"), wave).unwrap();
     let wild = "[[step]]\ndo = \"move\"\nto = \"900um\"\nduration = \"2ms\"\n";
     std::fs::write(folder.path().join("wild.toml"), wild).unwrap();
+    let emulated = "[actuator]\nkind = \"emulated\"\n[camera]\nkind = \"emulated\"\n";
+    std::fs::write(folder.path().join("emulated.toml"), emulated).unwrap();
     folder
 }
 
@@ -139,6 +141,11 @@ fn the_objects_of_quick_commands_fit_their_schemas() {
         "design --model eq6",
         "simulate --model eq6 --input latest-hold --out simulated.csv",
         "rig check rig.toml",
+        "board --rig emulated.toml --pings 50",
+        "jog --rig emulated.toml --to 20.2um",
+        "camera",
+        "camera --rig emulated.toml --snapshot seen.png",
+        "generate --out share",
     ] {
         hold(line, &succeed(at, &format!("{line} --json")).json());
     }
@@ -176,6 +183,7 @@ fn the_objects_of_slow_commands_fit_their_schemas() {
         "circle --frames off --effort 0.3 --duration 3s",
         "paper",
         "camera --duration 1s",
+        "calibrate --rig emulated.toml --pixel 0.1um --pairs 20 --out calibration.toml",
     ] {
         let ran = cellpos(at, &format!("{line} --json"));
         assert!(matches!(ran.code, Some(0 | 1)), "{line}: {}", ran.err);

@@ -8,7 +8,7 @@ pub use rtdc::write_rtdc;
 
 use super::columns::{Column, Row, Value, word};
 use super::parquet::listed;
-use super::{Exported, Selection, Source, part_of};
+use super::{Exported, Selection, Source, part_of, settle};
 use crate::error::RecordError;
 use crate::events::Event;
 use cellpos_table::Table;
@@ -42,7 +42,7 @@ enum Values {
 }
 
 impl Values {
-    fn new(column: &Column) -> Self {
+    fn new(column: &Column<'_>) -> Self {
         match column.value {
             Value::Number(_) => Self::Number(Vec::with_capacity(CHUNK)),
             Value::Whole(_) => Self::Whole(Vec::with_capacity(CHUNK)),
@@ -50,7 +50,7 @@ impl Values {
         }
     }
 
-    fn push(&mut self, column: &Column, row: &Row) {
+    fn push(&mut self, column: &Column<'_>, row: &Row) {
         match (self, column.value) {
             (Self::Number(values), Value::Number(get)) => values.push(get(row)),
             (Self::Whole(values), Value::Whole(get)) => values.push(get(row)),
@@ -80,13 +80,13 @@ pub fn write_hdf5(
     selection: &Selection,
     path: &Path,
 ) -> Result<Exported, RecordError> {
-    let columns = selection.columns()?;
+    let columns = selection.columns(source)?;
     let part = part_of(path)?;
     let attempt = || {
         empty(source, &columns, &part)?;
         let access = FileAccessProperties::new().with_sync_policy(SyncPolicy::OnClose);
         let file = File::open_rw_with_options(&part, access).map_err(|error| encode(&error))?;
-        let mut waiting: Vec<Values> = columns.iter().map(|column| Values::new(column)).collect();
+        let mut waiting: Vec<Values> = columns.iter().map(Values::new).collect();
         let done = source.rows(selection, |rows| {
             for row in rows {
                 for (column, values) in columns.iter().zip(&mut waiting) {
@@ -100,7 +100,7 @@ pub fn write_hdf5(
         })?;
         append(&file, &columns, &mut waiting)?;
         file.close().map_err(|error| encode(&error))?;
-        std::fs::rename(&part, path).map_err(RecordError::io("cannot write", path))?;
+        settle(&part, path).map_err(RecordError::io("cannot write", path))?;
         Ok(done)
     };
     attempt().inspect_err(|_| {
@@ -108,11 +108,7 @@ pub fn write_hdf5(
     })
 }
 
-fn append(
-    file: &File,
-    columns: &[&'static Column],
-    waiting: &mut [Values],
-) -> Result<(), RecordError> {
+fn append(file: &File, columns: &[Column<'_>], waiting: &mut [Values]) -> Result<(), RecordError> {
     for (column, values) in columns.iter().zip(waiting) {
         let mut dataset = file
             .dataset(&format!("ticks/{}", column.name))
@@ -136,7 +132,7 @@ fn append(
 }
 
 /// A file with everything but the rows.
-fn empty(source: &Source, columns: &[&'static Column], path: &Path) -> Result<(), RecordError> {
+fn empty(source: &Source, columns: &[Column<'_>], path: &Path) -> Result<(), RecordError> {
     let mut builder = FileBuilder::new();
     builder.set_attr("cellpos_format", AttrValue::U32(crate::FORMAT));
     if let Some(meta) = source.meta() {
@@ -176,7 +172,7 @@ fn empty(source: &Source, columns: &[&'static Column], path: &Path) -> Result<()
     builder.write(path).map_err(|error| encode(&error))
 }
 
-fn described(dataset: &mut DatasetBuilder, column: &Column) {
+fn described(dataset: &mut DatasetBuilder, column: &Column<'_>) {
     dataset.set_attr("description", AttrValue::String(column.about.to_owned()));
     if !column.unit.is_empty() {
         dataset.set_attr("unit", AttrValue::String(column.unit.to_owned()));

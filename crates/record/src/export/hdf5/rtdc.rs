@@ -6,7 +6,7 @@
 use super::{CHUNK, LEVEL, encode};
 use crate::error::RecordError;
 use crate::export::columns::Row;
-use crate::export::{Exported, Selection, Source, part_of, seconds};
+use crate::export::{Exported, Selection, Source, part_of, seconds, settle};
 use crate::meta::RunMeta;
 use hdf5_pure::{AttrValue, File, FileAccessProperties, FileBuilder, MaxExtent, SyncPolicy};
 use std::path::Path;
@@ -68,7 +68,7 @@ pub fn write_rtdc(
         })?;
         append(&file, &mut waiting)?;
         file.close().map_err(|error| encode(&error))?;
-        std::fs::rename(&part, path).map_err(RecordError::io("cannot write", path))?;
+        settle(&part, path).map_err(RecordError::io("cannot write", path))?;
         Ok(Exported {
             rows: count,
             lost: done.lost,
