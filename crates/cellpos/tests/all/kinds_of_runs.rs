@@ -55,6 +55,20 @@ fn lines(path: &Path) -> u64 {
     std::fs::read_to_string(path).unwrap().lines().count() as u64
 }
 
+/// The CSV has the control law's own columns, and docs/data.md says what they are.
+fn has_the_laws_columns(kind: &str, run: &Path, csv: &Path) {
+    let text = std::fs::read_to_string(csv).unwrap();
+    let head: Vec<&str> = text.lines().next().unwrap().split(',').collect();
+    let meta = std::fs::read_to_string(run.join("run.toml")).unwrap();
+    let meta: toml::Table = meta.parse().unwrap();
+    for name in meta["law_columns"].as_array().unwrap() {
+        let name = name.as_str().unwrap();
+        assert!(head.contains(&name), "{kind}: {name}");
+        let known = OF_LAWS.iter().any(|(known, _)| *known == name);
+        assert!(known, "docs/data.md does not say what {name} is");
+    }
+}
+
 /// A run compared with a model, and a model fitted to it: a result, or a sentence that says what such a record lacks.
 fn compared(at: &Path, kind: &str, run: &Path) {
     let path = run.display();
@@ -166,18 +180,7 @@ fn every_kind_of_run_goes_through_every_command_that_reads_one() {
         assert!(rows > 1500, "{kind}: {exported}");
         let csv = PathBuf::from(format!("{path}.csv"));
         assert_eq!(lines(&csv), 1 + rows, "{kind}");
-        let text = std::fs::read_to_string(&csv).unwrap();
-        let head: Vec<&str> = text.lines().next().unwrap().split(',').collect();
-        let meta: toml::Table = std::fs::read_to_string(run.join("run.toml"))
-            .unwrap()
-            .parse()
-            .unwrap();
-        for name in meta["law_columns"].as_array().unwrap() {
-            let name = name.as_str().unwrap();
-            assert!(head.contains(&name), "{kind}: {name}");
-            let known = OF_LAWS.iter().any(|(known, _)| *known == name);
-            assert!(known, "docs/data.md does not say what {name} is");
-        }
+        has_the_laws_columns(kind, run, &csv);
         let parquet: Value = succeed(at, &format!("export {path} --format parquet --json")).json();
         assert_eq!(parquet["rows"], rows, "{kind}");
 

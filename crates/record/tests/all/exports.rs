@@ -337,3 +337,48 @@ fn every_form_has_all_rows_of_both_sessions_with_equal_values() {
 fn a_million_ticks_of_two_sessions_are_equal_in_every_form() {
     every_form_agrees(500_000);
 }
+
+/// Peak of the memory of this process since the last call, MB; None where the system does not say.
+#[cfg(target_os = "linux")]
+fn peak_mb() -> Option<f64> {
+    let status = std::fs::read_to_string("/proc/self/status").ok()?;
+    let line = status.lines().find(|line| line.starts_with("VmHWM:"))?;
+    let kb: f64 = line.split_whitespace().nth(1)?.parse().ok()?;
+    std::fs::write("/proc/self/clear_refs", "5").ok()?;
+    Some(kb / 1024.0)
+}
+
+/// The rows of a night: each form of an export streams them. Needs some 15 GB of disk for a while, and nothing else in this process.
+#[cfg(target_os = "linux")]
+#[test]
+#[ignore = "long: 30 million rows, by itself: cargo test --release -p cellpos-record --features hdf5 --test all a_night -- --ignored --nocapture"]
+fn a_night_of_thirty_million_ticks_is_exported_within_300_mb() {
+    const MOST_MB: f64 = 300.0;
+    let root = tempfile::tempdir().unwrap();
+    let rows = 15_000_000;
+    let run = run(root.path(), rows);
+    println!("written: peak {:.0} MB", peak_mb().unwrap());
+    let forms = [
+        (Format::Csv, "t.csv"),
+        (Format::Parquet, "t.parquet"),
+        #[cfg(feature = "hdf5")]
+        (Format::Hdf5, "t.h5"),
+        (Format::Mat, "t.mat"),
+    ];
+    let mut peaks = Vec::new();
+    for (format, name) in forms {
+        let path = root.path().join(name);
+        let began = std::time::Instant::now();
+        let done = export(&source(&run), &Selection::default(), format, &path).unwrap();
+        assert_eq!(done.rows, 2 * rows, "{name}");
+        let peak = peak_mb().unwrap();
+        let size = std::fs::metadata(&path).unwrap().len() >> 20;
+        println!(
+            "{name}: peak {peak:.0} MB, file {size} MB, {:.0} s",
+            began.elapsed().as_secs_f64()
+        );
+        std::fs::remove_file(path).unwrap();
+        peaks.push((name, peak));
+    }
+    assert!(peaks.iter().all(|(_, peak)| *peak < MOST_MB), "{peaks:?}");
+}
