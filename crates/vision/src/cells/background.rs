@@ -24,6 +24,9 @@ const BESIDE: usize = 2;
 const LIGHT_SAMPLES: usize = 2048;
 /// Ratios of a pixel to the background's are counted in so many classes from 0 on, and so many to a ratio of 1.
 const LIGHT_BINS: usize = 1024;
+/// Every which of them is counted, and a change of the light that is none.
+const LIGHT_COUNTED: usize = 4;
+const LIGHT_SETTLED: f32 = 1e-6;
 const LIGHT_BINS_PER_ONE: f32 = 256.0;
 const LIGHT_PASSES: usize = 4;
 
@@ -43,6 +46,9 @@ pub(super) struct Background {
     last: Vec<f32>,
     active: Vec<u32>,
     sorted: Vec<f32>,
+    /// Pixels that serve for the light, and the background's there.
+    lit: Vec<[f32; 8]>,
+    unlit: Vec<[f32; 8]>,
     scatter: f64,
     /// Noise from elsewhere, grey levels; 0 without.
     known_noise: f64,
@@ -66,6 +72,8 @@ impl Background {
             last: vec![0.0; patches],
             active: vec![0; patches],
             sorted: Vec::with_capacity(patches),
+            lit: Vec::with_capacity(2 * LIGHT_SAMPLES / 8),
+            unlit: Vec::with_capacity(2 * LIGHT_SAMPLES / 8),
             scatter: 0.0,
             known_noise: 0.0,
             frames: 0,
@@ -260,18 +268,19 @@ impl Background {
 
     /// Light of the frame relative to the background's: where most pixels' ratios lie. Its median is a start that no header,
     /// cell or wall within half of the frame draws away; then the mean of what lies within two standard deviations of it.
-    pub fn light_of<T: Copy>(&self, pixels: &[T]) -> f32
+    pub fn light_of<T: Copy>(&mut self, pixels: &[T]) -> f32
     where
         f32: From<T>,
     {
-        let step = (pixels.len() / LIGHT_SAMPLES).max(1) | 1;
-        let pairs = || {
-            let pairs = pixels.iter().zip(&self.mean).step_by(step);
-            pairs.map(|(p, m)| (f32::from(*p), *m))
-        };
+        self.gather(pixels);
         let mut counts = [0.0_f32; LIGHT_BINS];
         let mut n = 0.0_f32;
-        for (v, m) in pairs().filter(|(_, m)| *m > 0.0) {
+        let pairs = self
+            .lit
+            .as_flattened()
+            .iter()
+            .zip(self.unlit.as_flattened());
+        for (v, m) in pairs.step_by(LIGHT_COUNTED).filter(|(_, m)| **m > 0.0) {
             let bin = (v / m * LIGHT_BINS_PER_ONE) as usize;
             if let Some(count) = counts.get_mut(bin.min(LIGHT_BINS - 1)) {
                 *count += 1.0;
@@ -293,18 +302,45 @@ impl Background {
         // Half of a normal distribution lies within 0.67 standard deviations of its middle.
         let sd = 0.74 * (below(0.75) - below(0.25));
         for _ in 0..LIGHT_PASSES {
-            let (mut over, mut under) = (0.0_f32, 0.0_f32);
-            for (v, m) in pairs() {
-                if (v - light * m).abs() <= 2.0 * sd * m + 1.0 {
-                    over += v;
-                    under += m;
+            let (mut over, mut under) = ([0.0_f32; 8], [0.0_f32; 8]);
+            for (lit, unlit) in self.lit.iter().zip(&self.unlit) {
+                for k in 0..8 {
+                    let (v, m) = (lit[k], unlit[k]);
+                    let near = (v - light * m).abs() <= 2.0 * sd * m + 1.0;
+                    over[k] += if near { v } else { 0.0 };
+                    under[k] += if near { m } else { 0.0 };
                 }
             }
+            let (over, under): (f32, f32) = (over.iter().sum(), under.iter().sum());
+            let before = light;
             if under > 0.0 {
                 light = over / under;
             }
+            if (light - before).abs() <= LIGHT_SETTLED * before {
+                break;
+            }
         }
         light
+    }
+
+    /// Gathers every so many pixels beside the background's., in groups of 8; noughts fill the last, and count as nothing.
+    fn gather<T: Copy>(&mut self, pixels: &[T])
+    where
+        f32: From<T>,
+    {
+        let step = (pixels.len() / LIGHT_SAMPLES).max(1) | 1;
+        self.lit.clear();
+        self.unlit.clear();
+        let groups = pixels.chunks(8 * step).zip(self.mean.chunks(8 * step));
+        for (pixels, means) in groups.take(self.lit.capacity()) {
+            let (mut lit, mut unlit) = ([0.0; 8], [0.0; 8]);
+            let pairs = pixels.iter().zip(means).step_by(step);
+            for ((lit, unlit), (p, m)) in lit.iter_mut().zip(&mut unlit).zip(pairs) {
+                (*lit, *unlit) = (f32::from(*p), *m);
+            }
+            self.lit.push(lit);
+            self.unlit.push(unlit);
+        }
     }
 }
 

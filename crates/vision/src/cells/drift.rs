@@ -12,6 +12,8 @@ const LEAST: (f64, f64) = (0.03, 4.0);
 /// Frames after which these are chosen anew.
 const CHOSEN_EVERY: u32 = 4096;
 const PASSES: usize = 5;
+/// A step that changes nothing any more, px.
+const SETTLED_PX: f64 = 0.002;
 /// A shift is believed when it leaves at most this share of the squares, each counted up to so many standard deviations.
 const BETTER: f64 = 0.9;
 const MOST_OFF: f64 = 20.0;
@@ -66,6 +68,23 @@ impl Background {
         Some(f64::from(upper + v * (lower - upper)))
     }
 
+    /// Grey level at a place and its differences over a pixel to the right and down; `None` near the border.
+    fn around(&self, x: f64, y: f64) -> Option<[f64; 3]> {
+        let (left, right) = (self.between(x - 0.5, y)?, self.between(x + 0.5, y)?);
+        let (above, below) = (self.between(x, y - 0.5)?, self.between(x, y + 0.5)?);
+        Some([self.between(x, y)?, right - left, below - above])
+    }
+
+    /// The same at a pixel.
+    fn at_rest(&self, k: usize) -> Option<[f64; 3]> {
+        let &[left, own, right] = self.mean.get(k.checked_sub(1)?..k + 2)? else {
+            return None;
+        };
+        let above = self.mean.get(k.checked_sub(self.width)?)?;
+        let below = self.mean.get(k + self.width)?;
+        Some([own, 0.5 * (right - left), 0.5 * (below - above)].map(f64::from))
+    }
+
     /// Chooses the pixels at which the background is steep, now and then.
     pub fn choose_steep(&mut self) {
         self.steep_age = self.steep_age.wrapping_add(1);
@@ -104,7 +123,7 @@ impl Background {
         let noise = self.noise_grey();
         let (mut at, mut sd, mut limit) = ((0.0_f64, 0.0_f64), (0.0, 0.0), f64::INFINITY);
         let mut unmoved = None;
-        for _ in 0..PASSES {
+        for pass in 0..=PASSES {
             let sums = self.slopes(pixels, f64::from(light), at, limit);
             // A shift by a pixel is not expected: without slopes along a direction there is none.
             let least = noise * noise;
@@ -119,13 +138,6 @@ impl Background {
                 most((rx * yy - ry * xy) / determinant),
                 most((ry * xx - rx * xy) / determinant),
             );
-            if unmoved.is_none() && f64::hypot(step.0, step.1) < 0.5 * LEAST.0 {
-                return (0.0, 0.0);
-            }
-            at = (at.0 + step.0, at.1 + step.1);
-            if !(at.0.abs() <= MOST_PX && at.1.abs() <= MOST_PX) {
-                return (0.0, 0.0);
-            }
             let spread = 1.25 * sums.off / sums.n;
             let variance = spread.max(noise).powi(2);
             sd = (
@@ -133,7 +145,23 @@ impl Background {
                 (variance * xx / determinant).sqrt(),
             );
             limit = (8.0 * spread).max(4.0 * noise);
-            unmoved.get_or_insert(sums.clipped);
+            let small = |step: f64, sd: f64| step.abs() < 0.5 * LEAST.0.max(LEAST.1 * sd);
+            match pass {
+                // Once more with the objects left out.
+                0 if f64::hypot(step.0, step.1) >= 0.5 * LEAST.0 => {
+                    unmoved = Some(sums.clipped);
+                    continue;
+                }
+                0 => return (0.0, 0.0),
+                1 if small(step.0, sd.0) && small(step.1, sd.1) => return (0.0, 0.0),
+                _ => at = (at.0 + step.0, at.1 + step.1),
+            }
+            if !(at.0.abs() <= MOST_PX && at.1.abs() <= MOST_PX) {
+                return (0.0, 0.0);
+            }
+            if f64::hypot(step.0, step.1) < SETTLED_PX {
+                break;
+            }
         }
         let moved = self.slopes(pixels, f64::from(light), at, limit).clipped;
         if unmoved.is_none_or(|unmoved| moved > BETTER * unmoved) {
@@ -160,19 +188,17 @@ impl Background {
         for k in self.steep.iter().map(|k| *k as usize) {
             let (i, j) = (k % self.width, k / self.width);
             let Some(p) = pixels.get(k) else { continue };
-            let (x, y) = (i as f64 - at.0, j as f64 - at.1);
-            let (Some(own), Some(left), Some(right), Some(above), Some(below)) = (
-                self.between(x, y),
-                self.between(x - 0.5, y),
-                self.between(x + 0.5, y),
-                self.between(x, y - 0.5),
-                self.between(x, y + 0.5),
-            ) else {
+            let around = if at == (0.0, 0.0) {
+                self.at_rest(k)
+            } else {
+                self.around(i as f64 - at.0, j as f64 - at.1)
+            };
+            let Some([own, across, down]) = around else {
                 continue;
             };
             // A smooth slope cannot tell a shift from light that has changed.
             let steep = |slope: f64| if slope.abs() > noise { slope } else { 0.0 };
-            let (gx, gy) = (light * steep(right - left), light * steep(below - above));
+            let (gx, gy) = (light * steep(across), light * steep(down));
             if gx == 0.0 && gy == 0.0 {
                 continue;
             }

@@ -34,6 +34,10 @@ pub(super) struct Regions {
     patches: Vec<f32>,
     /// Sums of what is darker and of what is brighter than the background in each patch.
     signs: Vec<[f32; 2]>,
+    /// Sums over the rows of a row of patches: of squares, of values and of their absolutes in each column.
+    sums: [Vec<f32>; 3],
+    /// The patches with gaps closed and without the outermost.
+    closed: Vec<f32>,
     blobs: Blobs,
     pub bounds: Vec<Bounds>,
 }
@@ -49,6 +53,8 @@ impl Regions {
             rows,
             patches: vec![0.0; columns * rows],
             signs: vec![[0.0; 2]; columns * rows],
+            sums: [0; 3].map(|_| vec![0.0; width]),
+            closed: vec![0.0; columns * rows],
             blobs: Blobs::with_spans(room.max(columns / 2 + 1), room, RUNS_PER_ROW * rows),
             bounds: Vec::with_capacity(room),
         }
@@ -57,59 +63,12 @@ impl Regions {
     /// Joins the patches of a frame's contrast above `threshold` (grey levels RMS). Bounds are kept of those that
     /// are objects with the mean square `seed`.
     pub fn find(&mut self, contrast: &[f32], width: usize, threshold: f32, seed: f64) {
-        let height = contrast.len() / width.max(1);
-        self.patches.fill(0.0);
-        self.signs.fill([0.0; 2]);
-        for (y, row) in contrast.chunks_exact(width).enumerate() {
-            let at = (y / PATCH).min(self.rows - 1) * self.columns;
-            let (Some(patches), Some(signs)) = (
-                self.patches.get_mut(at..at + self.columns),
-                self.signs.get_mut(at..at + self.columns),
-            ) else {
-                continue;
-            };
-            let (fours, left) = row.as_chunks::<PATCH>();
-            for ((sum, [dark, bright]), [a, b, c, d]) in patches.iter_mut().zip(signs).zip(fours) {
-                *sum += a * a + b * b + c * c + d * d;
-                let (plain, absolute) = (a + b + c + d, a.abs() + b.abs() + c.abs() + d.abs());
-                *dark += absolute - plain;
-                *bright += absolute + plain;
-            }
-            if let Some(last) = patches.last_mut() {
-                *last += left.iter().map(|v| v * v).sum::<f32>();
-            }
-        }
-        for (k, sum) in self.patches.iter_mut().enumerate() {
-            let side = |at: usize, count: usize, len: usize| {
-                if at + 1 == count {
-                    len - PATCH * (count - 1)
-                } else {
-                    PATCH
-                }
-            };
-            let pixels = side(k % self.columns, self.columns, width)
-                * side(k / self.columns, self.rows, height);
-            *sum /= pixels as f32;
-        }
-        let (patches, columns, rows) = (&self.patches, self.columns, self.rows);
-        let outermost = |x: usize, y: usize| x == 0 || y == 0 || x + 1 >= columns || y + 1 >= rows;
-        let at = |x: usize, y: usize| match patches.get(y * columns + x) {
-            Some(value) if !outermost(x, y) => *value,
-            _ => 0.0,
-        };
-        let closed = |x: usize, y: usize| {
-            if outermost(x, y) {
-                return 0.0;
-            }
-            let own = at(x, y);
-            let opposite = |a: f32, b: f32| a.min(b);
-            own.max(opposite(at(x - 1, y), at(x + 1, y)))
-                .max(opposite(at(x, y - 1), at(x, y + 1)))
-                .max(opposite(at(x - 1, y - 1), at(x + 1, y + 1)))
-                .max(opposite(at(x + 1, y - 1), at(x - 1, y + 1)))
-        };
+        self.sum_patches(contrast, width);
+        self.close();
+        let (closed, columns) = (&self.closed, self.columns);
+        let at = |x: usize, y: usize| closed.get(y * columns + x).copied().unwrap_or(0.0);
         self.blobs
-            .label((columns, rows), threshold * threshold, 1.0, closed);
+            .label((columns, self.rows), threshold * threshold, 1.0, at);
         self.bounds.clear();
         let strong = self
             .blobs
@@ -118,6 +77,110 @@ impl Regions {
             .filter(|blob| is_object(blob, seed));
         for blob in strong.take(self.bounds.capacity()) {
             self.bounds.push(blob.bounds.map(|b| b as usize * PATCH));
+        }
+    }
+
+    /// Mean squares and signs of the patches.
+    fn sum_patches(&mut self, contrast: &[f32], width: usize) {
+        let height = contrast.len() / width.max(1);
+        let last = self.rows - 1;
+        for row in 0..self.rows {
+            let end = if row == last {
+                height
+            } else {
+                (row + 1) * PATCH
+            };
+            let [squares, plain, absolute] = &mut self.sums;
+            for sums in [&mut *squares, plain, absolute] {
+                sums.fill(0.0);
+            }
+            let band = contrast
+                .get(row * PATCH * width..end * width)
+                .unwrap_or(&[]);
+            for values in band.chunks_exact(width) {
+                let sums = squares
+                    .iter_mut()
+                    .zip(plain.iter_mut())
+                    .zip(absolute.iter_mut());
+                for (((square, plain), absolute), v) in sums.zip(values) {
+                    *square += v * v;
+                    *plain += v;
+                    *absolute += v.abs();
+                }
+            }
+            let at = row * self.columns;
+            let (Some(patches), Some(signs)) = (
+                self.patches.get_mut(at..at + self.columns),
+                self.signs.get_mut(at..at + self.columns),
+            ) else {
+                continue;
+            };
+            let rows = end - row * PATCH;
+            let over = 1.0 / (rows * PATCH) as f32;
+            let (fours, left) = squares.as_chunks::<PATCH>();
+            patches.fill(0.0);
+            for (patch, [a, b, c, d]) in patches.iter_mut().zip(fours) {
+                *patch = (a + b + (c + d)) * over;
+            }
+            if !left.is_empty()
+                && let Some(patch) = patches.last_mut()
+            {
+                let all = *patch / over + left.iter().sum::<f32>();
+                *patch = all / (rows * (width - PATCH * (self.columns - 1))) as f32;
+            }
+            let (plain, absolute) = (
+                plain.as_chunks::<PATCH>().0,
+                absolute.as_chunks::<PATCH>().0,
+            );
+            for ((signs, [a, b, c, d]), [e, f, g, h]) in signs.iter_mut().zip(plain).zip(absolute) {
+                let (plain, absolute) = (a + b + (c + d), e + f + (g + h));
+                *signs = [absolute - plain, absolute + plain];
+            }
+        }
+    }
+
+    /// Closes gaps of one patch, and leaves the outermost patches out.
+    fn close(&mut self) {
+        let (columns, rows) = (self.columns, self.rows);
+        self.closed.fill(0.0);
+        if columns < 3 || rows < 3 {
+            return;
+        }
+        let row = |y: usize| {
+            self.patches
+                .get(y * columns..(y + 1) * columns)
+                .unwrap_or(&[])
+        };
+        let most = |a: f32, b: f32| if a > b { a } else { b };
+        let least = |a: f32, b: f32| if a < b { a } else { b };
+        for y in 1..rows - 1 {
+            let (above, own, below) = (row(y - 1), row(y), row(y + 1));
+            let Some(closed) = self.closed.get_mut(y * columns..(y + 1) * columns) else {
+                continue;
+            };
+            for (x, closed) in closed.iter_mut().enumerate().take(columns - 1).skip(1) {
+                let (Some([a, b, c]), Some([d, e, f]), Some([g, h, i])) = (
+                    above.get(x - 1..x + 2),
+                    own.get(x - 1..x + 2),
+                    below.get(x - 1..x + 2),
+                ) else {
+                    continue;
+                };
+                let mut value = *e;
+                // Neighbours among the outermost are none.
+                let (upper, lower) = (y > 1, y + 2 < rows);
+                let (left, right) = (x > 1, x + 2 < columns);
+                if left && right {
+                    value = most(value, least(*d, *f));
+                }
+                if upper && lower {
+                    value = most(value, least(*b, *h));
+                }
+                if left && right && upper && lower {
+                    value = most(value, most(least(*a, *i), least(*c, *g)));
+                }
+                *closed = value;
+            }
         }
     }
 

@@ -33,15 +33,16 @@ impl Outliner {
         let step_px = ((inward_px + outward_px) / (MAX_STEPS - 1) as f64).max(STEP_PX);
         self.steps = (((inward_px + outward_px) / step_px) as usize + 1).min(MAX_STEPS);
         for ray in 0..self.rays {
-            let ((mut x, mut y), (dx, dy)) = self.ray(start, ray, inward_px, step_px);
-            let Some(samples) = self.samples.get_mut(ray) else {
-                continue;
-            };
-            for value in samples.iter_mut().take(self.steps) {
-                *value = contrast.at(x, y);
-                (x, y) = (x + dx, y + dy);
+            let (from, step) = self.ray(start, ray, inward_px, step_px);
+            let samples = self
+                .samples
+                .get_mut(ray)
+                .and_then(|all| all.get_mut(..self.steps));
+            if let Some(samples) = samples {
+                contrast.along(from, step, samples);
             }
         }
+        self.find_steps();
         let ((dark, dark_at), (bright, bright_at)) = (self.potential(1.0), self.potential(-1.0));
         // Of two steps nearly alike it is the outer one: the inner one is that from the rim to the body.
         let outer = if dark_at >= bright_at { 1.0 } else { -1.0 };
@@ -81,26 +82,35 @@ impl Outliner {
         ((start.x_px + x, start.y_px + y), (dx, dy))
     }
 
-    /// Step of the contrast at `k`, going out.
-    #[inline(always)]
-    fn step(samples: &[f32; MAX_STEPS], k: usize, steps: usize) -> f32 {
-        let (mut out, mut inside) = (0.0, 0.0);
-        for j in 0..REACH {
-            inside += samples[k.saturating_sub(j + 1)];
-            out += samples[(k + j).min(steps - 1)];
+    /// Steps of the contrast at each place of each ray, going out, into `scores`.
+    fn find_steps(&mut self) {
+        let steps = self.steps;
+        for (samples, found) in self.samples.iter().zip(&mut self.scores).take(self.rays) {
+            // The ends go on as they are.
+            let mut padded = [samples[steps - 1]; MAX_STEPS + 2 * REACH];
+            padded[..REACH].fill(samples[0]);
+            padded[REACH..REACH + steps].copy_from_slice(&samples[..steps]);
+            for (k, step) in found.iter_mut().enumerate() {
+                let (mut out, mut inside) = (0.0, 0.0);
+                for j in 0..REACH {
+                    inside += padded[k + j];
+                    out += padded[k + REACH + j];
+                }
+                *step = (out - inside) / REACH as f32;
+            }
         }
-        (out - inside) / REACH as f32
     }
 
     /// Means over the rays of the largest step of a sign, and of where it is.
     fn potential(&self, sign: f32) -> (f32, f32) {
         let (mut sum, mut places) = (0.0, 0.0);
-        for samples in self.samples.iter().take(self.rays) {
-            let steps = (1..self.steps).map(|k| (k, sign * Self::step(samples, k, self.steps)));
-            let (at, most) = steps.fold(
-                (0, 0.0),
-                |best, next| if next.1 > best.1 { next } else { best },
-            );
+        for found in self.scores.iter().take(self.rays) {
+            let (mut at, mut most) = (0, 0.0);
+            for (k, step) in found.iter().enumerate().take(self.steps).skip(1) {
+                if sign * step > most {
+                    (at, most) = (k, sign * step);
+                }
+            }
             sum += most;
             places += at as f32;
         }
@@ -108,7 +118,7 @@ impl Outliner {
         (sum / n, places / n)
     }
 
-    /// What speaks for the contour at each step of each ray: the step there, less what of the body's sign lies outside.
+    /// What speaks for the contour at each step of each ray, in the place of the steps: the step there, less what of the body's sign lies outside.
     fn score(&mut self, polarity: f32, noise: f32, step_px: f32) {
         let steps = self.steps;
         for (samples, scores) in self.samples.iter().zip(&mut self.scores).take(self.rays) {
@@ -120,7 +130,7 @@ impl Outliner {
             }
             for (k, score) in scores.iter_mut().enumerate().take(steps) {
                 let beyond = behind[(k + REACH - 1).min(steps - 1)];
-                *score = polarity * Self::step(samples, k, steps) - OUTSIDE * beyond;
+                *score = polarity * *score - OUTSIDE * beyond;
             }
         }
     }
@@ -129,31 +139,34 @@ impl Outliner {
     fn walk(&mut self, typical: f32) {
         let (rays, steps) = (self.rays, self.steps);
         let bend = BEND * typical;
-        let mut best = [0.0_f32; MAX_STEPS];
+        // With room for steps beyond both ends, which nothing comes from.
+        let mut best = [f32::NEG_INFINITY; MAX_STEPS + 2 * MOST_BEND];
+        best[MOST_BEND..MOST_BEND + steps].fill(0.0);
         for n in 0..rays + OVERLAP {
-            let Some(scores) = self.scores.get(n % rays).copied() else {
+            let Some(scores) = self.scores.get(n % rays) else {
                 return;
             };
             let Some(from) = self.from.get_mut(n) else {
                 return;
             };
-            let before = best;
-            for k in 0..steps {
-                let (low, high) = (k.saturating_sub(MOST_BEND), (k + MOST_BEND + 1).min(steps));
-                let (mut top, mut at) = (f32::NEG_INFINITY, k);
-                for (j, value) in before.iter().enumerate().take(high).skip(low) {
-                    let d = j.abs_diff(k) as f32;
-                    let value = value - bend * d * d;
-                    if value > top {
-                        (top, at) = (value, j);
-                    }
+            let (mut top, mut at) = ([f32::NEG_INFINITY; MAX_STEPS], [0_i32; MAX_STEPS]);
+            for d in 0..=2 * MOST_BEND {
+                let off = d.abs_diff(MOST_BEND) as f32;
+                let cost = bend * off * off;
+                for k in 0..MAX_STEPS {
+                    let value = best[k + d] - cost;
+                    let better = value > top[k];
+                    top[k] = if better { value } else { top[k] };
+                    at[k] = if better { d as i32 } else { at[k] };
                 }
-                best[k] = top + scores[k];
-                from[k] = at as u8;
+            }
+            for k in 0..steps {
+                best[k + MOST_BEND] = top[k] + scores[k];
+                from[k] = (k + at[k] as usize).saturating_sub(MOST_BEND) as u8;
             }
         }
         let mut k = (0..steps)
-            .max_by(|a, b| best[*a].total_cmp(&best[*b]))
+            .max_by(|a, b| best[*a + MOST_BEND].total_cmp(&best[*b + MOST_BEND]))
             .unwrap_or(0);
         for n in (0..rays + OVERLAP).rev() {
             // The first and the last of the way round are only there to close it.

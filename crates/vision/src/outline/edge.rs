@@ -6,9 +6,8 @@
 //! have two lobes, the outer one of the body's own sign (a body that absorbs, on the other side of the focus): then the step
 //! with lobes is looked for farther away.
 
-use super::normals::Profile;
-use super::{FINE_PX, RIM_PX};
-use nalgebra::{Matrix3, Vector3};
+use super::normals::{Profile, dot};
+use super::{FINE_PX, MAX_FINE, RIM_PX};
 
 /// An object hardly larger than its edge is wide loses contrast to the blur, so that half of what is left lies outside of
 /// it: from this ratio of the edge's width to the radius on, share of the rim's contrast per ratio, and at most.
@@ -57,6 +56,20 @@ pub(super) struct Edge {
 #[derive(Debug, Clone)]
 pub(super) struct Shapes {
     values: Vec<[f64; 3]>,
+    /// For each blur that is tried, at the places that are.
+    tried: Vec<Tried>,
+}
+
+/// Places along a normal relative to an edge that is tried, in steps.
+const TRIED: usize = 2 * (MAX_FINE + (REACH_PX / FINE_PX) as usize) + 1;
+
+/// The shapes of one blur about an edge in the middle, and sums of their products up to each place: step with itself, with
+/// lobes, with rim, lobes with themselves, rim with itself.
+#[derive(Debug, Clone)]
+struct Tried {
+    blur_px: f64,
+    shapes: [[f32; TRIED]; 3],
+    products: [[f64; 5]; TRIED + 1],
 }
 
 impl Shapes {
@@ -74,8 +87,37 @@ impl Shapes {
             [step, -u * (0.5 - 0.5 * u * u).exp(), rim]
         };
         let count = (2.0 * Self::REACH * Self::PER_WIDTH) as usize + 1;
-        Shapes {
+        let mut shapes = Shapes {
             values: (0..count).map(value).collect(),
+            tried: Vec::new(),
+        };
+        shapes.tried = BLURS_PX.map(|blur_px| shapes.tried(blur_px)).to_vec();
+        shapes
+    }
+
+    fn tried(&self, blur_px: f64) -> Tried {
+        let mut shapes = [[0.0; TRIED]; 3];
+        let mut products = [[0.0; 5]; TRIED + 1];
+        for k in 0..TRIED {
+            let place_px = (k as f64 - (TRIED / 2) as f64) * FINE_PX;
+            let [step, lobes, rim] = self.at(place_px / blur_px);
+            for (row, value) in shapes.iter_mut().zip([step, lobes, rim]) {
+                row[k] = value as f32;
+            }
+            let pairs = [
+                step * step,
+                step * lobes,
+                step * rim,
+                lobes * lobes,
+                rim * rim,
+            ];
+            let before = products[k];
+            products[k + 1] = std::array::from_fn(|n| before[n] + pairs[n]);
+        }
+        Tried {
+            blur_px,
+            shapes,
+            products,
         }
     }
 
@@ -207,12 +249,25 @@ impl Profile {
     /// The best fit of a blurred step with what is said, wherever it lies.
     fn fitted(&self, shapes: &Shapes, with: With) -> PhaseEdge {
         let reach_px = REACH_PX.min(0.5 * self.half as f64 * FINE_PX + 1.0);
-        let places = (reach_px / FINE_PX) as i32;
+        let places = (reach_px / FINE_PX) as usize;
+        let count = 2 * self.half + 1;
+        let mut values = [0.0_f32; 2 * MAX_FINE + 1];
+        for (to, from) in values.iter_mut().zip(&self.values).take(count) {
+            *to = *from as f32;
+        }
+        let values = values.get(..count).unwrap_or(&[]);
+        let power = f64::from(dot(values, values));
         let mut best = PhaseEdge::NONE;
-        for blur_px in BLURS_PX {
-            for place in -places..=places {
-                let at_px = f64::from(place) * FINE_PX;
-                best = best.or(self.phase_edge_at(shapes, (at_px, blur_px), 2, with));
+        for tried in &shapes.tried {
+            for place in 0..=2 * places {
+                // The farther out the edge, the farther in the profile lies.
+                let from = TRIED / 2 + places - self.half - place;
+                let Some(mut sums) = tried.sums(values, from) else {
+                    continue;
+                };
+                sums.power = power;
+                let at_px = (place as f64 - places as f64) * FINE_PX;
+                best = best.or(sums.fitted((at_px, tried.blur_px), 1, with));
             }
         }
         self.refined(shapes, best, with, NEAR)
@@ -230,7 +285,13 @@ impl Profile {
         for _ in 0..ROUNDS {
             let (at_px, blur_px) = (best.at_px, best.blur_px);
             for i in -1..=1 {
-                for blur_px in [blur_px / factor, blur_px, blur_px * factor] {
+                for (n, blur_px) in [blur_px / factor, blur_px, blur_px * factor]
+                    .into_iter()
+                    .enumerate()
+                {
+                    if i == 0 && n == 1 {
+                        continue;
+                    }
                     let at = (at_px + f64::from(i) * step_px, blur_px);
                     best = best.or(self.phase_edge_at(shapes, at, stride, with));
                 }
@@ -248,40 +309,100 @@ impl Profile {
         stride: usize,
         with: With,
     ) -> PhaseEdge {
-        let (mut normal, mut right, mut power) = (Matrix3::zeros(), Vector3::zeros(), 0.0);
         let scale = 1.0 / blur_px;
         let first = (-(self.half as f64) * FINE_PX - at_px) * scale;
         let values = self.values.iter().take(2 * self.half + 1);
+        let mut sums = Sums::default();
         for (k, v) in values.enumerate().step_by(stride) {
-            let g = Vector3::from(shapes.at(first + k as f64 * FINE_PX * scale));
-            normal += g * g.transpose();
-            right += g * *v;
-            power += v * v;
+            let [step, lobes, rim] = shapes.at(first + k as f64 * FINE_PX * scale);
+            let [aa, ab, ac, bb, bc, cc] = &mut sums.normal;
+            *aa += step * step;
+            *ab += step * lobes;
+            *ac += step * rim;
+            *bb += lobes * lobes;
+            *bc += lobes * rim;
+            *cc += rim * rim;
+            sums.right[0] += step * v;
+            sums.right[1] += lobes * v;
+            sums.right[2] += rim * v;
+            sums.power += v * v;
         }
-        let left_out = match with {
-            With::Lobes => Some((2, Vector3::z())),
-            With::Rim => Some((1, Vector3::y())),
-            With::LobesAndRim => None,
+        sums.fitted((at_px, blur_px), stride, with)
+    }
+}
+
+impl Tried {
+    /// Sums for a profile that begins at the place `from`.
+    fn sums(&self, values: &[f32], from: usize) -> Option<Sums> {
+        let to = from + values.len();
+        let [step, lobes, rim] = &self.shapes;
+        let (low, high) = (self.products.get(from)?, self.products.get(to)?);
+        let [aa, ab, ac, bb, cc] = std::array::from_fn(|n| high[n] - low[n]);
+        let product = |shape: &[f32]| shape.get(from..to).map(|s| f64::from(dot(values, s)));
+        Some(Sums {
+            // Lobes and rim are not tried together.
+            normal: [aa, ab, ac, bb, 0.0, cc],
+            right: [product(step)?, product(lobes)?, product(rim)?],
+            power: 0.0,
+        })
+    }
+}
+
+/// Sums of the least squares of step, lobes and rim.
+#[derive(Debug, Clone, Copy, Default)]
+struct Sums {
+    /// The upper triangle, row by row.
+    normal: [f64; 6],
+    right: [f64; 3],
+    /// Of the profile's squares.
+    power: f64,
+}
+
+impl Sums {
+    /// The step at a place and of a blur that fits best.
+    fn fitted(&self, (at_px, blur_px): (f64, f64), stride: usize, with: With) -> PhaseEdge {
+        let [aa, ab, ac, bb, bc, cc] = self.normal;
+        let [a, b, c] = self.right;
+        let two = |other: f64, mixed: f64, right: f64| {
+            let determinant = aa * other - mixed * mixed;
+            let solved = (
+                (a * other - right * mixed) / determinant,
+                (right * aa - a * mixed) / determinant,
+            );
+            (determinant > 1e-12 * aa * other).then_some(solved)
         };
-        if let Some((k, unit)) = left_out {
-            normal.set_row(k, &unit.transpose());
-            normal.set_column(k, &unit);
-            right[k] = 0.0;
-        }
-        let Some(cholesky) = normal.cholesky() else {
+        let fitted = match with {
+            With::Lobes => two(bb, ab, b).map(|(step, lobes)| [step, lobes, 0.0]),
+            With::Rim => two(cc, ac, c).map(|(step, rim)| {
+                // A rim is stronger than the body, not weaker.
+                if rim * step < 0.0 {
+                    [a / aa, 0.0, 0.0]
+                } else {
+                    [step, 0.0, rim]
+                }
+            }),
+            With::LobesAndRim => {
+                // What the step leaves of the others.
+                let (l, r) = (ab / aa, ac / aa);
+                let (bb, bc, cc) = (bb - l * ab, bc - l * ac, cc - r * ac);
+                let (b, c) = (b - l * a, c - r * a);
+                let determinant = bb * cc - bc * bc;
+                (aa > 0.0 && bb > 0.0 && determinant > 1e-12 * bb * cc).then(|| {
+                    let lobes = (b * cc - c * bc) / determinant;
+                    let rim = (c * bb - b * bc) / determinant;
+                    [a / aa - l * lobes - r * rim, lobes, rim]
+                })
+            }
+        };
+        let Some([step, lobes, rim]) = fitted else {
             return PhaseEdge::NONE;
         };
-        let mut fitted = cholesky.solve(&right);
-        if matches!(with, With::Rim) && fitted[2] * fitted[0] < 0.0 {
-            // A rim is stronger than the body, not weaker.
-            fitted = Vector3::new(right[0] / normal[(0, 0)], 0.0, 0.0);
-        }
         PhaseEdge {
-            left: stride as f64 * (power - fitted.dot(&right)),
+            left: stride as f64 * (self.power - step * a - lobes * b - rim * c),
             at_px,
             blur_px,
-            step: fitted[0],
-            lobes: fitted[1],
+            step,
+            lobes,
         }
     }
 }

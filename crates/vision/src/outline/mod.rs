@@ -27,6 +27,8 @@ const FINE_PX: f64 = 0.5;
 const MAX_FINE: usize = 16;
 /// Passes of the fit along the normals before the last one about the edge.
 const PASSES: usize = 3;
+/// One pixel in fixed point.
+const ONE: f64 = (1_u64 << 32) as f64;
 /// Cost of a step of the contour from ray to ray, as a share of a typical edge.
 const BEND: f32 = 0.08;
 /// Cost of what has the body's sign but lies outside, per px and share of its contrast.
@@ -77,6 +79,44 @@ impl Contrast<'_> {
                 (upper + v * (lower - upper)).clamp(-self.most, self.most)
             }
             _ => 0.0,
+        }
+    }
+
+    /// Values at steps of `step` px from `start` on.
+    fn along(&self, start: (f64, f64), step: (f64, f64), values: &mut [f32]) {
+        let place = |k: usize| (start.0 + k as f64 * step.0, start.1 + k as f64 * step.1);
+        let [left, top, right, bottom] = self.within.map(f64::from);
+        let (right, bottom) = (
+            right.min(self.width as f64 - 1.001),
+            bottom.min(self.height as f64 - 1.001),
+        );
+        let inside = |(x, y): (f64, f64)| x >= left && y >= top && x <= right && y <= bottom;
+        if !(inside(place(0)) && inside(place(values.len().saturating_sub(1)))) {
+            for (k, value) in values.iter_mut().enumerate() {
+                let (x, y) = place(k);
+                *value = self.at(x, y);
+            }
+            return;
+        }
+        // Both ends are inside, so all is: in fixed point, without a look at the borders.
+        let fixed = |v: f64| (v * ONE) as i64;
+        let ((mut x, mut y), (dx, dy)) = (
+            (fixed(start.0), fixed(start.1)),
+            (fixed(step.0), fixed(step.1)),
+        );
+        let share = |v: i64| ((v >> 8) & 0xff_ffff) as i32 as f32 * (1.0 / 16_777_216.0);
+        for value in values {
+            let (u, v) = (share(x), share(y));
+            let k = (y >> 32) as usize * self.width + (x >> 32) as usize;
+            let rows = (
+                self.pixels.get(k..k + 2),
+                self.pixels.get(k + self.width..k + self.width + 2),
+            );
+            if let (Some([a, b]), Some([c, d])) = rows {
+                let (upper, lower) = (a + u * (b - a), c + u * (d - c));
+                *value = (upper + v * (lower - upper)).min(self.most).max(-self.most);
+            }
+            (x, y) = (x + dx, y + dy);
         }
     }
 }

@@ -45,17 +45,17 @@ impl Outliner {
             .zip(&self.normals)
             .zip(&mut self.profiles);
         for ((p, n), values) in rays {
-            for (k, value) in values.iter_mut().enumerate().take(2 * half + 1) {
-                let s = (k as f64 - half as f64) * FINE_PX;
-                *value = contrast.at(p.0 + s * n.0, p.1 + s * n.1);
-            }
+            let s = half as f64 * FINE_PX;
+            let start = (p.0 - s * n.0, p.1 - s * n.1);
+            let values = values.get_mut(..2 * half + 1).unwrap_or(&mut []);
+            contrast.along(start, (FINE_PX * n.0, FINE_PX * n.1), values);
         }
     }
 
     /// Mean profile, and each normal's shift against it by least squares beside amplitude and offset, into `shifts`.
     pub(super) fn align(&mut self, half: usize, polarity: f64) -> Option<Profile> {
         let profile = self.mean(half, polarity);
-        let (low, high) = profile.window();
+        let fit = profile.least_squares();
         let mut previous = 0.0;
         for i in 0..self.points.len() {
             let (Some(values), Some(shift), Some(amplitude)) = (
@@ -65,7 +65,7 @@ impl Outliner {
             ) else {
                 break;
             };
-            let fitted = profile.fit(values, low, high);
+            let fitted = fit.as_ref().and_then(|fit| fit.of(values));
             let (found, a) = fitted.unwrap_or((previous, 1.0));
             previous = found;
             (*shift, *amplitude) = (found, a);
@@ -171,24 +171,26 @@ impl Profile {
             .unwrap_or(self.half)
     }
 
-    /// Shift of a profile against this one, px outwards, and its amplitude.
-    fn fit(&self, values: &Values, low: usize, high: usize) -> Option<(f64, f64)> {
-        let (mut normal, mut right) = (Matrix3::zeros(), Vector3::zeros());
-        let means = self.values.iter().zip(&self.slopes);
-        for (v, (mean, slope)) in values.iter().zip(means).take(high + 1).skip(low) {
-            // v(s) = a T(s - shift) + b, to first order a T - a shift T' + b.
-            let g = Vector3::new(*mean, -slope, 1.0);
+    /// The fit of a profile by this one: v(s) = a T(s - shift) + b, to first order a T - a shift T' + b.
+    fn least_squares(&self) -> Option<LeastSquares> {
+        let (low, high) = self.window();
+        let mut shapes = [[0.0_f32; 2 * MAX_FINE + 1]; 2];
+        let mut normal = Matrix3::zeros();
+        for k in low..=high {
+            let g = Vector3::new(self.values[k], -self.slopes[k], 1.0);
             normal += g * g.transpose();
-            right += g * f64::from(*v);
+            (shapes[0][k], shapes[1][k]) = (g[0] as f32, g[1] as f32);
         }
         // A little towards the mean profile's amplitude, so that a featureless stretch is not followed.
         let ridge = 0.05 * normal[(0, 0)];
         normal[(0, 0)] += ridge;
-        right[0] += ridge;
-        let solution = normal.cholesky()?.solve(&right);
-        let amplitude = solution[0].clamp(AMPLITUDES.0, AMPLITUDES.1);
-        let shift = (solution[1] / amplitude).clamp(-MOST_SHIFT_PX, MOST_SHIFT_PX);
-        shift.is_finite().then_some((shift, amplitude))
+        Some(LeastSquares {
+            shapes,
+            inverse: normal.cholesky()?.inverse(),
+            ridge,
+            low,
+            high,
+        })
     }
 
     /// Information on a shift per px of contour, for pixels with noise of variance 1, amplitude and offset unknown.
@@ -202,4 +204,44 @@ impl Profile {
         let variance = normal.cholesky().map(|c| c.inverse()[(1, 1)]);
         variance.map_or(f64::MIN_POSITIVE, |v| FINE_PX / (INTERPOLATED * v))
     }
+}
+
+/// Shapes and inverse of the normal equations, the same for all normals.
+struct LeastSquares {
+    /// Mean profile and its slope, 0 beyond the edge.
+    shapes: [[f32; 2 * MAX_FINE + 1]; 2],
+    inverse: Matrix3<f64>,
+    ridge: f64,
+    low: usize,
+    high: usize,
+}
+
+impl LeastSquares {
+    /// Shift of a profile, px outwards, and its amplitude.
+    fn of(&self, values: &Values) -> Option<(f64, f64)> {
+        let all: f32 = values.iter().take(self.high + 1).skip(self.low).sum();
+        let [mean, slope] = &self.shapes;
+        let right = Vector3::new(
+            f64::from(dot(values, mean)) + self.ridge,
+            f64::from(dot(values, slope)),
+            f64::from(all),
+        );
+        let solution = self.inverse * right;
+        let amplitude = solution[0].clamp(AMPLITUDES.0, AMPLITUDES.1);
+        let shift = (solution[1] / amplitude).clamp(-MOST_SHIFT_PX, MOST_SHIFT_PX);
+        shift.is_finite().then_some((shift, amplitude))
+    }
+}
+
+/// Sum of the products, in four sums side by side.
+pub(super) fn dot(a: &[f32], b: &[f32]) -> f32 {
+    let ((a, a_left), (b, b_left)) = (a.as_chunks::<4>(), b.as_chunks::<4>());
+    let mut sums = [0.0_f32; 4];
+    for (a, b) in a.iter().zip(b) {
+        for ((sum, a), b) in sums.iter_mut().zip(a).zip(b) {
+            *sum += a * b;
+        }
+    }
+    let left: f32 = a_left.iter().zip(b_left).map(|(a, b)| a * b).sum();
+    sums[0] + sums[1] + (sums[2] + sums[3]) + left
 }
