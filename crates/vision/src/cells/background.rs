@@ -26,7 +26,7 @@ const LIGHT_SAMPLES: usize = 2048;
 const LIGHT_BINS: usize = 1024;
 /// Every which of them is counted, and a change of the light that is none.
 const LIGHT_COUNTED: usize = 4;
-const LIGHT_SETTLED: f32 = 1e-6;
+const LIGHT_SETTLED: f32 = 1e-5;
 const LIGHT_BINS_PER_ONE: f32 = 256.0;
 const LIGHT_PASSES: usize = 4;
 

@@ -14,6 +14,10 @@ const LEAST_STEP: f32 = 1.0;
 /// A step is like another from this share of it on.
 const ALIKE: f32 = 0.65;
 
+/// The best that leads to each step of a ray, with room beyond both ends, which nothing comes from.
+pub(super) type Way = [f32; MAX_STEPS + 2 * MOST_BEND];
+pub(super) const NO_WAY: Way = [f32::NEG_INFINITY; MAX_STEPS + 2 * MOST_BEND];
+
 /// A ray: where it begins, and its step (px).
 type Ray = ((f64, f64), (f64, f64));
 
@@ -27,13 +31,18 @@ impl Outliner {
         }
         // Ramanujan's first approximation of the perimeter would be finer than is of use here.
         let perimeter_px = core::f64::consts::PI * (1.5 * (a + b) - (a * b).sqrt());
-        self.rays = (((perimeter_px / 1.5) as usize).next_multiple_of(8)).clamp(MIN_RAYS, MAX_RAYS);
+        self.rays = ((perimeter_px / 1.5) as usize)
+            .next_multiple_of(8)
+            .clamp(MIN_RAYS, MAX_RAYS);
+        // It is laid through every other one where these are many, and refined with the last fit.
+        let every = if self.rays >= 2 * MIN_RAYS { 2 } else { 1 };
+        let rays = self.rays / every;
         let inward_px = (0.65 * b).max(b.min(8.0) - 1.0);
         let outward_px = 0.3 * b + 3.0;
         let step_px = ((inward_px + outward_px) / (MAX_STEPS - 1) as f64).max(STEP_PX);
         self.steps = (((inward_px + outward_px) / step_px) as usize + 1).min(MAX_STEPS);
-        for ray in 0..self.rays {
-            let (from, step) = self.ray(start, ray, inward_px, step_px);
+        for ray in 0..rays {
+            let (from, step) = Self::ray(start, (ray, rays), inward_px, step_px);
             let samples = self
                 .samples
                 .get_mut(ray)
@@ -42,8 +51,9 @@ impl Outliner {
                 contrast.along(from, step, samples);
             }
         }
-        self.find_steps();
-        let ((dark, dark_at), (bright, bright_at)) = (self.potential(1.0), self.potential(-1.0));
+        self.find_steps(rays);
+        let ((dark, dark_at), (bright, bright_at)) =
+            (self.potential(rays, 1.0), self.potential(rays, -1.0));
         // Of two steps nearly alike it is the outer one: the inner one is that from the rim to the body.
         let outer = if dark_at >= bright_at { 1.0 } else { -1.0 };
         let polarity = if dark.min(bright) > ALIKE * dark.max(bright) {
@@ -57,19 +67,21 @@ impl Outliner {
         if typical < LEAST_STEP * noise as f32 {
             return None;
         }
-        self.score(polarity as f32, noise as f32, step_px as f32);
-        self.walk(typical);
+        self.score(rays, polarity as f32, noise as f32, step_px as f32);
+        // Twice as far from ray to ray the contour bends twice as much.
+        self.walk(rays, typical / every as f32);
         self.points.clear();
-        for ray in 0..self.rays {
-            let ((x, y), (dx, dy)) = self.ray(start, ray, inward_px, step_px);
+        for ray in 0..rays {
+            let ((x, y), (dx, dy)) = Self::ray(start, (ray, rays), inward_px, step_px);
             let at = self.shifts.get(ray).copied().unwrap_or(0.0);
             self.points.push((x + at * dx, y + at * dy));
         }
         Some(polarity)
     }
 
-    fn ray(&self, start: &Start, ray: usize, inward_px: f64, step_px: f64) -> Ray {
-        let (sin, cos) = (core::f64::consts::TAU * ray as f64 / self.rays as f64).sin_cos();
+    /// A ray of so many, in steps from inside to outside.
+    fn ray(start: &Start, (ray, rays): (usize, usize), inward_px: f64, step_px: f64) -> Ray {
+        let (sin, cos) = (core::f64::consts::TAU * ray as f64 / rays as f64).sin_cos();
         let (s, c) = start.angle_rad.sin_cos();
         // Both axes grow by the step: the rays never cross.
         let (u, v) = (
@@ -83,9 +95,9 @@ impl Outliner {
     }
 
     /// Steps of the contrast at each place of each ray, going out, into `scores`.
-    fn find_steps(&mut self) {
+    fn find_steps(&mut self, rays: usize) {
         let steps = self.steps;
-        for (samples, found) in self.samples.iter().zip(&mut self.scores).take(self.rays) {
+        for (samples, found) in self.samples.iter().zip(&mut self.scores).take(rays) {
             // The ends go on as they are.
             let mut padded = [samples[steps - 1]; MAX_STEPS + 2 * REACH];
             padded[..REACH].fill(samples[0]);
@@ -102,9 +114,9 @@ impl Outliner {
     }
 
     /// Means over the rays of the largest step of a sign, and of where it is.
-    fn potential(&self, sign: f32) -> (f32, f32) {
+    fn potential(&self, rays: usize, sign: f32) -> (f32, f32) {
         let (mut sum, mut places) = (0.0, 0.0);
-        for found in self.scores.iter().take(self.rays) {
+        for found in self.scores.iter().take(rays) {
             let (mut at, mut most) = (0, 0.0);
             for (k, step) in found.iter().enumerate().take(self.steps).skip(1) {
                 if sign * step > most {
@@ -114,14 +126,14 @@ impl Outliner {
             sum += most;
             places += at as f32;
         }
-        let n = self.rays.max(1) as f32;
+        let n = rays.max(1) as f32;
         (sum / n, places / n)
     }
 
     /// What speaks for the contour at each step of each ray, in the place of the steps: the step there, less what of the body's sign lies outside.
-    fn score(&mut self, polarity: f32, noise: f32, step_px: f32) {
+    fn score(&mut self, rays: usize, polarity: f32, noise: f32, step_px: f32) {
         let steps = self.steps;
-        for (samples, scores) in self.samples.iter().zip(&mut self.scores).take(self.rays) {
+        for (samples, scores) in self.samples.iter().zip(&mut self.scores).take(rays) {
             let mut outside = 0.0;
             let mut behind = [0.0_f32; MAX_STEPS];
             for k in (0..steps).rev() {
@@ -136,33 +148,27 @@ impl Outliner {
     }
 
     /// The best closed contour through the scores, into `shifts`.
-    fn walk(&mut self, typical: f32) {
-        let (rays, steps) = (self.rays, self.steps);
-        let bend = BEND * typical;
-        // With room for steps beyond both ends, which nothing comes from.
-        let mut best = [f32::NEG_INFINITY; MAX_STEPS + 2 * MOST_BEND];
+    fn walk(&mut self, rays: usize, typical: f32) {
+        let steps = self.steps;
+        let costs: [f32; 2 * MOST_BEND + 1] =
+            core::array::from_fn(|d| BEND * typical * (d.abs_diff(MOST_BEND) as f32).powi(2));
+        let mut best = NO_WAY;
         best[MOST_BEND..MOST_BEND + steps].fill(0.0);
         for n in 0..rays + OVERLAP {
-            let Some(scores) = self.scores.get(n % rays) else {
+            let (Some(scores), Some(way)) = (self.scores.get(n % rays), self.ways.get_mut(n))
+            else {
                 return;
             };
-            let Some(from) = self.from.get_mut(n) else {
-                return;
-            };
-            let (mut top, mut at) = ([f32::NEG_INFINITY; MAX_STEPS], [0_i32; MAX_STEPS]);
-            for d in 0..=2 * MOST_BEND {
-                let off = d.abs_diff(MOST_BEND) as f32;
-                let cost = bend * off * off;
-                for k in 0..MAX_STEPS {
-                    let value = best[k + d] - cost;
-                    let better = value > top[k];
-                    top[k] = if better { value } else { top[k] };
-                    at[k] = if better { d as i32 } else { at[k] };
+            *way = best;
+            let mut top = [f32::NEG_INFINITY; MAX_STEPS];
+            for (d, cost) in costs.iter().enumerate() {
+                for (top, before) in top.iter_mut().zip(&way[d..]) {
+                    let value = before - cost;
+                    *top = if value > *top { value } else { *top };
                 }
             }
             for k in 0..steps {
                 best[k + MOST_BEND] = top[k] + scores[k];
-                from[k] = (k + at[k] as usize).saturating_sub(MOST_BEND) as u8;
             }
         }
         let mut k = (0..steps)
@@ -176,9 +182,14 @@ impl Outliner {
             {
                 *shift = k as f64 - 0.5;
             }
-            k = self.from.get(n).map_or(0, |from| usize::from(from[k]));
+            let Some(way) = self.ways.get(n) else { return };
+            let from = |d: &usize| way[k + d] - costs[*d];
+            let d = (0..costs.len()).max_by(|a, b| from(a).total_cmp(&from(b)));
+            k = (k + d.unwrap_or(MOST_BEND))
+                .saturating_sub(MOST_BEND)
+                .min(steps - 1);
         }
     }
 }
 
-const _: () = assert!(MAX_STEPS <= u8::MAX as usize && MIN_RAYS > OVERLAP && MAX_RAYS >= MIN_RAYS);
+const _: () = assert!(MIN_RAYS > OVERLAP && MAX_RAYS >= MIN_RAYS);

@@ -25,8 +25,10 @@ const OVERLAP: usize = 24;
 const FINE_PX: f64 = 0.5;
 /// Most steps along a normal, on one side.
 const MAX_FINE: usize = 16;
-/// Passes of the fit along the normals before the last one about the edge.
+/// Most passes of the fit along the normals before the last one about the edge, and the shift (RMS, px) after which there is no
+/// other.
 const PASSES: usize = 3;
+const SETTLED_PX: f64 = 0.1;
 /// One pixel in fixed point.
 const ONE: f64 = (1_u64 << 32) as f64;
 /// Cost of a step of the contour from ray to ray, as a share of a typical edge.
@@ -160,7 +162,8 @@ pub(crate) struct Outliner {
     steps: usize,
     samples: Vec<[f32; MAX_STEPS]>,
     scores: Vec<[f32; MAX_STEPS]>,
-    from: Vec<[u8; MAX_STEPS]>,
+    /// The best that leads to each step of each ray.
+    ways: Vec<contour::Way>,
     points: Vec<(f64, f64)>,
     normals: Vec<(f64, f64)>,
     profiles: Vec<normals::Values>,
@@ -178,8 +181,8 @@ impl Outliner {
             rays: 0,
             steps: 0,
             samples: vec![[0.0; MAX_STEPS]; MAX_RAYS],
-            scores: vec![[0.0; MAX_STEPS]; MAX_RAYS + OVERLAP],
-            from: vec![[0; MAX_STEPS]; MAX_RAYS + OVERLAP],
+            scores: vec![[0.0; MAX_STEPS]; MAX_RAYS],
+            ways: vec![contour::NO_WAY; MAX_RAYS + OVERLAP],
             points: Vec::with_capacity(MAX_RAYS),
             normals: Vec::with_capacity(MAX_RAYS),
             profiles: vec![[0.0; 2 * MAX_FINE + 1]; MAX_RAYS],
@@ -209,12 +212,15 @@ impl Outliner {
             self.find_normals();
             self.sample(contrast, half);
             profile = Some(self.align(half, polarity)?);
-            self.shift_points();
+            if self.shift_points() < SETTLED_PX {
+                break;
+            }
         }
         // The contour may lie on a lobe beside the edge: about the edge itself the profile does not depend on the start.
         let near = profile?.edge(self.radius_px(), &self.shapes, 0.0)?;
         self.find_normals();
         self.shift_outwards(near.at_px);
+        self.refine();
         self.find_normals();
         self.sample(contrast, half);
         let profile = self.align(half, polarity)?;

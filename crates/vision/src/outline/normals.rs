@@ -25,14 +25,15 @@ pub(super) struct Profile {
 }
 
 impl Outliner {
-    /// Outward normals of the contour, from neighbours two points away on either side.
+    /// Outward normals of the contour, from neighbours two points of the full contour away on either side.
     pub(super) fn find_normals(&mut self) {
         let n = self.points.len();
+        let away = if 2 * n > self.rays { 2 } else { 1 };
         self.normals.clear();
         for i in 0..n {
-            let (a, b) = (self.points[(i + n - 2) % n], self.points[(i + 2) % n]);
+            let (a, b) = (self.points[(i + n - away) % n], self.points[(i + away) % n]);
             let (tx, ty) = (b.0 - a.0, b.1 - a.1);
-            let length = f64::hypot(tx, ty).max(1e-9);
+            let length = (tx * tx + ty * ty).sqrt().max(1e-9);
             // The rays go round in the sense that has the outside on this side.
             self.normals.push((ty / length, -tx / length));
         }
@@ -97,15 +98,38 @@ impl Outliner {
         }
     }
 
-    /// Moves each point by its shift, smoothed with its neighbours'.
-    pub(super) fn shift_points(&mut self) {
+    /// Moves each point by its shift, smoothed with its neighbours', and says how far (RMS, px).
+    pub(super) fn shift_points(&mut self) -> f64 {
         let n = self.points.len();
+        let mut squares = 0.0;
         for i in 0..n {
             let at = |k: usize| self.shifts.get(k % n).copied().unwrap_or(0.0);
             let shift = 0.25 * at(i + n - 1) + 0.5 * at(i) + 0.25 * at(i + 1);
+            squares += shift * shift;
             if let (Some(p), Some(m)) = (self.points.get_mut(i), self.normals.get(i)) {
                 *p = (p.0 + shift * m.0, p.1 + shift * m.1);
             }
+        }
+        (squares / n.max(1) as f64).sqrt()
+    }
+
+    /// Puts a point between each two of a contour that was laid through half of them, on the cubic through four.
+    pub(super) fn refine(&mut self) {
+        let n = self.points.len();
+        if 2 * n > self.rays {
+            return;
+        }
+        self.sorted.clear();
+        self.sorted.extend(&self.points);
+        self.points.clear();
+        let at = |k: usize| self.sorted.get(k % n).copied().unwrap_or_default();
+        for k in 0..n {
+            let ((ax, ay), (bx, by)) = (at(k + n - 1), at(k));
+            let ((cx, cy), (dx, dy)) = (at(k + 1), at(k + 2));
+            let middle = |a: f64, b: f64, c: f64, d: f64| (9.0 * (b + c) - a - d) / 16.0;
+            self.points.push((bx, by));
+            self.points
+                .push((middle(ax, bx, cx, dx), middle(ay, by, cy, dy)));
         }
     }
 
