@@ -24,6 +24,8 @@ const BESIDE: usize = 2;
 const LIGHT_SAMPLES: usize = 2048;
 /// Ratios of a pixel to the background's are counted in so many classes from 0 on, and so many to a ratio of 1.
 const LIGHT_BINS: usize = 1024;
+/// Groups that the place of a group moves on by from stretch to stretch.
+const GATHERED_AT: usize = 7;
 /// Every which of them is counted, and a change of the light that is none.
 const LIGHT_COUNTED: usize = 4;
 const LIGHT_SETTLED: f32 = 1e-5;
@@ -323,18 +325,31 @@ impl Background {
         light
     }
 
-    /// Gathers every so many pixels beside the background's., in groups of 8; noughts fill the last, and count as nothing.
+    /// Gathers groups of 8 pixels beside the background's, here and there.
     fn gather<T: Copy>(&mut self, pixels: &[T])
     where
         f32: From<T>,
     {
-        let step = (pixels.len() / LIGHT_SAMPLES).max(1) | 1;
+        let step = (pixels.len() / LIGHT_SAMPLES).max(1);
         self.lit.clear();
         self.unlit.clear();
-        let groups = pixels.chunks(8 * step).zip(self.mean.chunks(8 * step));
-        for (pixels, means) in groups.take(self.lit.capacity()) {
+        let groups = (0..pixels.len() / (8 * step)).take(self.lit.capacity());
+        for n in groups {
+            // At another place in each stretch, so that no column or row is met again and again.
+            let at = 8 * (n * step + n * GATHERED_AT % step);
+            let (Some(Ok::<&[T; 8], _>(lit)), Some(Ok::<&[f32; 8], _>(unlit))) = (
+                pixels.get(at..at + 8).map(TryInto::try_into),
+                self.mean.get(at..at + 8).map(TryInto::try_into),
+            ) else {
+                continue;
+            };
+            self.lit.push(lit.map(f32::from));
+            self.unlit.push(*unlit);
+        }
+        if self.lit.is_empty() {
+            // Fewer than 8 pixels: noughts count as nothing.
             let (mut lit, mut unlit) = ([0.0; 8], [0.0; 8]);
-            let pairs = pixels.iter().zip(means).step_by(step);
+            let pairs = pixels.iter().zip(&self.mean);
             for ((lit, unlit), (p, m)) in lit.iter_mut().zip(&mut unlit).zip(pairs) {
                 (*lit, *unlit) = (f32::from(*p), *m);
             }

@@ -13,7 +13,9 @@ const LEAST: (f64, f64) = (0.03, 4.0);
 const CHOSEN_EVERY: u32 = 4096;
 const PASSES: usize = 5;
 /// A step that changes nothing any more, px.
-const SETTLED_PX: f64 = 0.002;
+const SETTLED_PX: f64 = 0.005;
+/// Share of the least shift that a first step without the objects must have.
+const STILL: f64 = 0.5;
 /// A shift is believed when it leaves at most this share of the squares, each counted up to so many standard deviations.
 const BETTER: f64 = 0.9;
 const MOST_OFF: f64 = 20.0;
@@ -145,7 +147,9 @@ impl Background {
                 (variance * xx / determinant).sqrt(),
             );
             limit = (8.0 * spread).max(4.0 * noise);
-            let small = |step: f64, sd: f64| step.abs() < 0.5 * LEAST.0.max(LEAST.1 * sd);
+            // By the noise alone: a shift that has not been made good counts as spread.
+            let own = noise.min(spread) / variance.sqrt();
+            let small = |step: f64, sd: f64| step.abs() < STILL * LEAST.0.max(LEAST.1 * own * sd);
             match pass {
                 // Once more with the objects left out.
                 0 if f64::hypot(step.0, step.1) >= 0.5 * LEAST.0 => {

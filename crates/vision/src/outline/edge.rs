@@ -24,6 +24,8 @@ const LOBES: (f64, f64) = (0.1, 0.18);
 const LESS_LEFT: f64 = 0.3;
 /// Farthest that the middle of a phase edge is looked for, px.
 const REACH_PX: f64 = 4.5;
+/// How much more than that the best step that is tried may leave (squares), and the share of the least lobes that it has.
+const ROUGHLY: (f64, f64) = (4.0, 0.5);
 /// Widths of the blur that are tried, px.
 const BLURS_PX: [f64; 5] = [0.7, 1.0, 1.4, 2.0, 2.8];
 /// First step (px), factor of the blur and stride of the values about the best of a search.
@@ -210,6 +212,9 @@ impl Profile {
                 ..PhaseEdge::NONE
             };
             let coarse = self.refined(shapes, start, with, (FINE_PX, 1.2, 2));
+            if coarse.left > ROUGHLY.0 * MODEL_LEFT.1 * MODEL_LEFT.1 * power {
+                return coarse;
+            }
             self.refined(shapes, coarse, with, (0.25 * FINE_PX, 1.1, 1))
         });
         let [lobes, plain] = tried;
@@ -232,7 +237,15 @@ impl Profile {
     fn phase_edge(&self, shapes: &Shapes) -> Option<(f64, f64)> {
         let values = self.values.iter().take(2 * self.half + 1);
         let power: f64 = values.map(|v| v * v).sum();
-        let best = self.fitted(shapes, With::Lobes);
+        let rough = self.tried(shapes, With::Lobes);
+        let lobes = -rough.lobes / rough.step;
+        if rough.left > ROUGHLY.0 * MOST_LEFT * MOST_LEFT * power
+            || lobes < ROUGHLY.1 * LOBES.0
+            || lobes.is_nan()
+        {
+            return None;
+        }
+        let best = self.refined(shapes, rough, With::Lobes, NEAR);
         if best.left > MOST_LEFT * MOST_LEFT * power {
             return None;
         }
@@ -242,12 +255,13 @@ impl Profile {
         }
         // A rim inside would be taken for a part of the inner lobe.
         let best = self.refined(shapes, best, With::LobesAndRim, NEAR);
-        let plain = self.fitted(shapes, With::Rim);
+        let rough = self.tried(shapes, With::Rim);
+        let plain = self.refined(shapes, rough, With::Rim, NEAR);
         (best.left < LESS_LEFT * plain.left).then_some((best.at_px, weight))
     }
 
-    /// The best fit of a blurred step with what is said, wherever it lies.
-    fn fitted(&self, shapes: &Shapes, with: With) -> PhaseEdge {
+    /// The best fit of a blurred step with what is said of those that are tried.
+    fn tried(&self, shapes: &Shapes, with: With) -> PhaseEdge {
         let reach_px = REACH_PX.min(0.5 * self.half as f64 * FINE_PX + 1.0);
         let places = (reach_px / FINE_PX) as usize;
         let count = 2 * self.half + 1;
@@ -270,7 +284,7 @@ impl Profile {
                 best = best.or(sums.fitted((at_px, tried.blur_px), 1, with));
             }
         }
-        self.refined(shapes, best, with, NEAR)
+        best
     }
 
     /// The best about a start, by ever smaller steps from `step_px` and `factor` of the blur on, by every `stride`th value.

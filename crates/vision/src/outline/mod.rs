@@ -28,7 +28,7 @@ const MAX_FINE: usize = 16;
 /// Most passes of the fit along the normals before the last one about the edge, and the shift (RMS, px) after which there is no
 /// other.
 const PASSES: usize = 3;
-const SETTLED_PX: f64 = 0.1;
+const SETTLED_PX: f64 = 0.15;
 /// One pixel in fixed point.
 const ONE: f64 = (1_u64 << 32) as f64;
 /// Cost of a step of the contour from ray to ray, as a share of a typical edge.

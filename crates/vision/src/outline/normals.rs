@@ -198,12 +198,13 @@ impl Profile {
     /// The fit of a profile by this one: v(s) = a T(s - shift) + b, to first order a T - a shift T' + b.
     fn least_squares(&self) -> Option<LeastSquares> {
         let (low, high) = self.window();
+        // From the edge's first step on.
         let mut shapes = [[0.0_f32; 2 * MAX_FINE + 1]; 2];
         let mut normal = Matrix3::zeros();
         for k in low..=high {
             let g = Vector3::new(self.values[k], -self.slopes[k], 1.0);
             normal += g * g.transpose();
-            (shapes[0][k], shapes[1][k]) = (g[0] as f32, g[1] as f32);
+            (shapes[0][k - low], shapes[1][k - low]) = (g[0] as f32, g[1] as f32);
         }
         // A little towards the mean profile's amplitude, so that a featureless stretch is not followed.
         let ridge = 0.05 * normal[(0, 0)];
@@ -232,7 +233,7 @@ impl Profile {
 
 /// Shapes and inverse of the normal equations, the same for all normals.
 struct LeastSquares {
-    /// Mean profile and its slope, 0 beyond the edge.
+    /// Mean profile and its slope from `low` to `high`.
     shapes: [[f32; 2 * MAX_FINE + 1]; 2],
     inverse: Matrix3<f64>,
     ridge: f64,
@@ -243,7 +244,8 @@ struct LeastSquares {
 impl LeastSquares {
     /// Shift of a profile, px outwards, and its amplitude.
     fn of(&self, values: &Values) -> Option<(f64, f64)> {
-        let all: f32 = values.iter().take(self.high + 1).skip(self.low).sum();
+        let values = values.get(self.low..=self.high)?;
+        let all: f32 = values.iter().sum();
         let [mean, slope] = &self.shapes;
         let right = Vector3::new(
             f64::from(dot(values, mean)) + self.ridge,
@@ -257,8 +259,10 @@ impl LeastSquares {
     }
 }
 
-/// Sum of the products, in four sums side by side.
+/// Sum of the products of as many as both have, in four sums side by side.
 pub(super) fn dot(a: &[f32], b: &[f32]) -> f32 {
+    let count = a.len().min(b.len());
+    let (a, b) = (&a[..count], &b[..count]);
     let ((a, a_left), (b, b_left)) = (a.as_chunks::<4>(), b.as_chunks::<4>());
     let mut sums = [0.0_f32; 4];
     for (a, b) in a.iter().zip(b) {
