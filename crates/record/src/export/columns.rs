@@ -108,6 +108,7 @@ pub const DECISION: Codes = &[
     (12, "no-frame"),
     (13, "stale"),
     (14, "stays"),
+    (15, "in-contact"),
 ];
 /// States of a run.
 pub const LIFE: Codes = &[(0, "disarmed"), (1, "armed"), (2, "running"), (3, "safe")];

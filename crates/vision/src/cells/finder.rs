@@ -115,6 +115,12 @@ impl CellFinder {
         &self.config
     }
 
+    /// Whether outlines are laid through all rays and fitted in all passes, instead of through every other one of a large
+    /// cell and until nothing moves: what the fast way is compared with.
+    pub fn set_thorough(&mut self, thorough: bool) {
+        self.outliner.thorough = thorough;
+    }
+
     /// Takes a frame without a cell into the background (running mean over all such frames).
     ///
     /// # Errors

@@ -35,7 +35,8 @@ impl Outliner {
             .next_multiple_of(8)
             .clamp(MIN_RAYS, MAX_RAYS);
         // It is laid through every other one where these are many, and refined with the last fit.
-        let every = if self.rays >= 2 * MIN_RAYS { 2 } else { 1 };
+        let many = self.rays >= 2 * MIN_RAYS && !self.thorough;
+        let every = if many { 2 } else { 1 };
         let rays = self.rays / every;
         let inward_px = (0.65 * b).max(b.min(8.0) - 1.0);
         let outward_px = 0.3 * b + 3.0;

@@ -158,6 +158,8 @@ pub(crate) struct Outline {
 /// Buffers of the outliner.
 #[derive(Debug, Clone)]
 pub(crate) struct Outliner {
+    /// All rays and all passes.
+    pub thorough: bool,
     rays: usize,
     steps: usize,
     samples: Vec<[f32; MAX_STEPS]>,
@@ -178,6 +180,7 @@ pub(crate) struct Outliner {
 impl Outliner {
     pub fn new() -> Self {
         Outliner {
+            thorough: false,
             rays: 0,
             steps: 0,
             samples: vec![[0.0; MAX_STEPS]; MAX_RAYS],
@@ -212,7 +215,7 @@ impl Outliner {
             self.find_normals();
             self.sample(contrast, half);
             profile = Some(self.align(half, polarity)?);
-            if self.shift_points() < SETTLED_PX {
+            if self.shift_points() < SETTLED_PX && !self.thorough {
                 break;
             }
         }

@@ -2,7 +2,7 @@
 //!
 //! A cell has no template: what tells it from another is where it must be, the contrast of its body, and its size. It may
 //! stretch to several times its length, but then its surface stays (a cell flat between two walls) or its volume does (a
-//! body of revolution); one of the two must agree. Two cells that touch are one region of another size: it is not taken, nor is
+//! body of revolution); one of the two must agree. Two cells that touch are one outline of another size: it is not taken, nor is
 //! what stays where it is while cells pass.
 
 use super::config::{Commanded, Decision, TrackState, TrackStep, TrackerConfig};
@@ -150,14 +150,15 @@ impl CellTracker {
         };
         let best = cells
             .iter()
-            .filter(|c| !c.at_border && !self.stays.holds(c))
+            .filter(|c| !c.at_border && !c.in_contact && !self.stays.holds(c))
             .min_by(|a, b| distance(a).total_cmp(&distance(b)));
         let Some(cell) = best.copied() else {
             let seen = cells.first().copied();
             let decision = match seen {
                 None => Decision::NothingFound,
                 Some(cell) if cell.at_border => Decision::AtBorder,
-                Some(_) => Decision::Stays,
+                Some(cell) if self.stays.holds(&cell) => Decision::Stays,
+                Some(_) => Decision::InContact,
             };
             return (decision, seen);
         };
@@ -254,15 +255,25 @@ impl CellTracker {
             // A larger region over the prediction holds the cell and something else.
             let over = f64::abs(cell.x_px - x) < 0.5 * cell.extent_px((1.0, 0.0))
                 && f64::abs(cell.y_px - y) < 0.5 * cell.extent_px((0.0, 1.0));
-            return Some(if over && sizes(cell, &chosen.cell).0 > 0.0 {
-                Decision::Merged
-            } else {
+            return Some(if !over || sizes(cell, &chosen.cell).0 <= 0.0 {
                 Decision::OutsideGate
+            } else if cell.in_contact {
+                Decision::InContact
+            } else {
+                Decision::Merged
             });
         }
+        // As large as before and of another shape it is still the cell: one that is pressed into a constriction.
+        let touched = |other: Decision| {
+            if cell.in_contact {
+                Decision::InContact
+            } else {
+                other
+            }
+        };
         let body = cell.body_grey / chosen.body_grey - 1.0;
         if body.abs() > self.config.max_amplitude_change {
-            return Some(Decision::OtherBead);
+            return Some(touched(Decision::OtherBead));
         }
         let allowed = (f64::from(chosen.missed.max(1)) * (1.0 + self.config.max_size_change).ln())
             .min((1.0 + MOST_SIZE_CHANGE).ln());
@@ -270,9 +281,9 @@ impl CellTracker {
         if surface.abs().min(volume.abs()) <= allowed {
             None
         } else if surface > 0.0 {
-            Some(Decision::Merged)
+            Some(touched(Decision::Merged))
         } else {
-            Some(Decision::OtherBead)
+            Some(touched(Decision::OtherBead))
         }
     }
 }
@@ -299,7 +310,7 @@ fn fix(cell: &Cell, decision: Decision) -> Fix {
         residual_ratio: f64::NAN,
         snr: cell.snr,
         verdict: match decision {
-            Decision::Merged => Verdict::BadFit,
+            Decision::Merged | Decision::InContact => Verdict::BadFit,
             _ if cell.at_border => Verdict::AtBorder,
             _ => Verdict::Good,
         },

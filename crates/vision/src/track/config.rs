@@ -240,6 +240,8 @@ pub enum Decision {
     Stale = 13,
     /// What there is stays where it is while cells pass: dirt, a wall.
     Stays = 14,
+    /// Another cell touches it, so that its size is not its own.
+    InContact = 15,
 }
 
 impl Decision {
@@ -262,6 +264,7 @@ impl Decision {
             NoFrame,
             Stale,
             Stays,
+            InContact,
         ]
         .into_iter()
         .find(|decision| *decision as u8 == number)
@@ -314,7 +317,7 @@ mod tests {
             }
         }
         assert_eq!((0..=255).filter_map(TrackState::from_number).count(), 4);
-        assert_eq!((0..=255).filter_map(Decision::from_number).count(), 15);
+        assert_eq!((0..=255).filter_map(Decision::from_number).count(), 16);
     }
 
     #[test]

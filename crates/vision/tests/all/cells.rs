@@ -129,6 +129,59 @@ fn length_area_and_place_are_true_to_a_fraction_of_a_pixel_and_the_variance_is_w
     }
 }
 
+/// Differences of two measurements of a cell: place, area and length, over half of the first one's standard deviation or a
+/// thousandth of the size, whichever is more (the edge in the mean profile is told to a hundredth of a pixel).
+fn apart(a: &Cell, b: &Cell) -> [f64; 3] {
+    let along = (1.0, 0.0);
+    let (area, length) = (a.area_px, a.extent_px(along));
+    [
+        (a.x_px - b.x_px) / (0.5 * a.var_x_px2.sqrt()),
+        (area - b.area_px) / (0.5 * a.var_area_px2.sqrt()).max(1e-3 * area),
+        (length - b.extent_px(along)) / (0.5 * a.extent_sd_px(along)).max(1e-3 * length),
+    ]
+}
+
+#[test]
+fn an_outline_laid_through_half_of_the_rays_is_that_through_all_to_a_fraction_of_its_standard_deviation()
+ {
+    let mut random = Random(17);
+    for (noise, stretch, size) in [
+        (1.5, 1.0, 24.0),
+        (1.5, 1.0, 44.0),
+        (4.0, 1.0, 44.0),
+        (1.5, 2.0, 40.0),
+        (4.0, 3.8, 40.0),
+    ] {
+        let mut finder = finder(noise, &mut random);
+        let mut squares = [0.0; 3];
+        const N: usize = 40;
+        for _ in 0..N {
+            let drawn = Drawn {
+                length: size,
+                width: size,
+                ..Drawn::at(120.0 + random.uniform())
+            };
+            let drawn = drawn.stretched(stretch);
+            let pixels = picture(&[drawn], noise, &mut random);
+            finder.set_thorough(true);
+            let all = finder.find(&frame(&pixels)).unwrap()[0];
+            finder.set_thorough(false);
+            let fast = finder.find(&frame(&pixels)).unwrap()[0];
+            for (sum, d) in squares.iter_mut().zip(apart(&all, &fast)) {
+                *sum += d * d / N as f64;
+            }
+        }
+        let rms = squares.map(f64::sqrt);
+        eprintln!(
+            "noise {noise}, {size} px, stretch {stretch}: place, area, length {rms:.3?} of what they may be apart"
+        );
+        assert!(
+            rms.iter().all(|r| *r < 1.0),
+            "{noise} {stretch} {size}: {rms:?}"
+        );
+    }
+}
+
 #[test]
 fn length_along_a_tilted_channel_and_the_axes_agree_with_the_ellipse() {
     let mut random = Random(8);
@@ -217,12 +270,13 @@ fn two_cells_that_touch_are_not_taken_and_the_right_one_comes_back() {
     for _ in 0..10 {
         run.see(&[own, Drawn::at(160.0)]);
     }
-    let mut refused = 0;
+    let (mut refused, mut touched) = (0, 0);
     for n in 0..40 {
         // The other comes up, touches for ten frames, and goes away again.
         let gap = 24.0 + 2.0 * f64::from((n - 20_i32).abs() - 5).max(-0.5);
         let step = run.see(&[own, Drawn::at(80.0 + gap)]);
-        if step.track.decision == Decision::Merged {
+        touched += u32::from(step.track.decision == Decision::InContact);
+        if matches!(step.track.decision, Decision::Merged | Decision::InContact) {
             refused += 1;
             assert_eq!(step.track.fix.verdict, Verdict::BadFit);
         }
@@ -233,6 +287,19 @@ fn two_cells_that_touch_are_not_taken_and_the_right_one_comes_back() {
         }
     }
     assert!((5..20).contains(&refused), "{refused}");
+    assert!(touched >= 5, "{touched} of {refused}");
+    // Nor is it chosen as it is, and the reason is named.
+    run.tracker.choose(Some((80.0, 31.6)));
+    for _ in 0..6 {
+        let step = run.see(&[own, Drawn::at(103.0)]);
+        assert_eq!(
+            (step.cell, step.track.decision),
+            (None, Decision::InContact)
+        );
+    }
+    for _ in 0..3 {
+        run.see(&[own]);
+    }
     assert_eq!(run.tracker.state(), TrackState::Tracking);
 }
 

@@ -201,6 +201,73 @@ fn faint_cells_stay_whole_and_have_the_area_that_the_file_says() {
     let (low, high) = (lengths[0], lengths[lengths.len() - 1]);
     println!("length {low:.3} .. {high:.3} of the masks'");
     assert!(high - low < 0.04, "{low} .. {high}");
+    // Whose scatter that is: cells of one kind have one length for the root of their area, to what they differ in shape.
+    let spread = |values: Vec<f64>| {
+        let (low, high) = values
+            .iter()
+            .fold((9.0_f64, 0.0_f64), |(l, h), v| (l.min(*v), h.max(*v)));
+        high / low - 1.0
+    };
+    let shape = |cell: &Cell| cell.extent_px((1.0, 0.0)) / cell.area_px.sqrt();
+    let own = spread(pairs.iter().map(|(_, c, _)| shape(&c.unwrap())).collect());
+    let masks = spread(
+        pairs
+            .iter()
+            .map(|(_, _, m)| m.length / m.area.sqrt())
+            .collect(),
+    );
+    println!("length over the root of the area: within {own:.3}, the masks' within {masks:.3}");
+    assert!(own <= 0.03 && own < masks, "{own} {masks}");
+    // The file's own places along the channel.
+    let file_x = [
+        63.494, 60.957, 56.423, 28.22, 26.859, 55.047, 57.742, 20.255,
+    ];
+    let away: Vec<f64> = pairs
+        .iter()
+        .zip(file_x)
+        .map(|((_, c, _), x)| (c.unwrap().x_px - x).abs())
+        .collect();
+    println!(
+        "along the channel {:.2} px from the file's places",
+        median(&away)
+    );
+    assert!(away.iter().all(|away| *away <= 0.3), "{away:?}");
+}
+
+#[test]
+#[cfg_attr(no_shared_data, ignore = "needs ../shared/data/cells-in-channels")]
+fn the_fast_outlines_of_measured_cells_are_those_through_all_rays() {
+    for name in [
+        "calibration-beads",
+        "cells-wide-channel",
+        "cells-low-contrast",
+    ] {
+        let stack = Stack::open(name, "frames.tif");
+        let mut finder = CellFinder::new(stack.width, stack.height, CellConfig::default()).unwrap();
+        for frame in Stack::open(name, "background.tif").frames() {
+            finder.take_background(&frame).unwrap();
+        }
+        let mut compared = 0;
+        for frame in stack.frames() {
+            finder.set_thorough(true);
+            let all = finder.find(&frame).unwrap().to_vec();
+            finder.set_thorough(false);
+            let fast = finder.find(&frame).unwrap();
+            assert_eq!(all.len(), fast.len(), "{name}");
+            for (all, fast) in all.iter().zip(fast).filter(|(all, _)| !all.at_border) {
+                let area = fast.area_px / all.area_px - 1.0;
+                let length = fast.extent_px((1.0, 0.0)) / all.extent_px((1.0, 0.0)) - 1.0;
+                let place = f64::hypot(fast.x_px - all.x_px, fast.y_px - all.y_px);
+                println!("{name}: area {area:.4}, length {length:.4}, place {place:.3} px apart");
+                compared += 1;
+                assert!(
+                    area.abs() < 0.01 && length.abs() < 0.01 && place < 0.1,
+                    "{name}"
+                );
+            }
+        }
+        assert!(compared >= 7, "{name}: {compared}");
+    }
 }
 
 #[test]
