@@ -40,8 +40,11 @@ const WIDTHS: [(f64, With); 2] = [(1.9, With::LobesAndRim), (2.9, With::Rim)];
 /// Squares that a plain step leaves, over those that one with lobes leaves: up to here there are no lobes, from there on
 /// there are.
 const PLAIN: (f64, f64) = (4.0, 12.0);
-/// Rounds in which the best of them is refined.
-const ROUNDS: usize = 4;
+/// Rounds in which the best of them is refined, how far the lowest point of a parabola may lie, in steps, and by how much the next
+/// round is closer.
+const ROUNDS: usize = 3;
+const FARTHEST: f64 = 1.5;
+const CLOSER: f64 = 0.3;
 
 /// The edge of a mean profile.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -287,30 +290,50 @@ impl Profile {
         best
     }
 
-    /// The best about a start, by ever smaller steps from `step_px` and `factor` of the blur on, by every `stride`th value.
+    /// The best about a start, by parabolas over place and logarithm of the blur: `step_px` and `factor` to either side, by every
+    /// `stride`th value, and closer by once one lies between.
     fn refined(
         &self,
         shapes: &Shapes,
         start: PhaseEdge,
         with: With,
-        (mut step_px, mut factor, stride): (f64, f64, usize),
+        (mut step_px, factor, stride): (f64, f64, usize),
     ) -> PhaseEdge {
+        let mut wider = factor.ln();
+        let at = |from: &PhaseEdge, (i, j): (f64, f64), (step_px, wider): (f64, f64)| {
+            let place = (from.at_px + i * step_px, from.blur_px * (j * wider).exp());
+            self.phase_edge_at(shapes, place, stride, with)
+        };
         let mut best = self.phase_edge_at(shapes, (start.at_px, start.blur_px), stride, with);
         for _ in 0..ROUNDS {
-            let (at_px, blur_px) = (best.at_px, best.blur_px);
-            for i in -1..=1 {
-                for (n, blur_px) in [blur_px / factor, blur_px, blur_px * factor]
-                    .into_iter()
-                    .enumerate()
-                {
-                    if i == 0 && n == 1 {
-                        continue;
-                    }
-                    let at = (at_px + f64::from(i) * step_px, blur_px);
-                    best = best.or(self.phase_edge_at(shapes, at, stride, with));
-                }
+            let (from, steps) = (best, (step_px, wider));
+            let [left, right, narrow, wide, corner] =
+                [(-1.0, 0.0), (1.0, 0.0), (0.0, -1.0), (0.0, 1.0), (1.0, 1.0)]
+                    .map(|way| at(&from, way, steps));
+            let (gx, gy) = (
+                0.5 * (right.left - left.left),
+                0.5 * (wide.left - narrow.left),
+            );
+            let xx = right.left + left.left - 2.0 * from.left;
+            let yy = wide.left + narrow.left - 2.0 * from.left;
+            let xy = corner.left - right.left - wide.left + from.left;
+            for next in [left, right, narrow, wide, corner] {
+                best = best.or(next);
             }
-            (step_px, factor) = (0.5 * step_px, factor.sqrt());
+            let determinant = xx * yy - xy * xy;
+            let mut inside = false;
+            if xx > 0.0 && determinant > 0.0 {
+                let (i, j) = (
+                    (gy * xy - gx * yy) / determinant,
+                    (gx * xy - gy * xx) / determinant,
+                );
+                inside = i.abs() <= 1.0 && j.abs() <= 1.0;
+                let most = |v: f64| v.clamp(-FARTHEST, FARTHEST);
+                best = best.or(at(&from, (most(i), most(j)), steps));
+            }
+            if inside {
+                (step_px, wider) = (CLOSER * step_px, CLOSER * wider);
+            }
         }
         best
     }

@@ -58,56 +58,30 @@ pub(crate) struct Contrast<'a> {
 }
 
 impl Contrast<'_> {
-    /// Between the pixels, linearly; nothing outside.
-    #[inline(always)]
-    fn at(&self, x: f64, y: f64) -> f32 {
-        let (x, y) = (x as f32, y as f32);
-        let [left, top, right, bottom] = self.within;
-        if !(x >= left && y >= top && x <= right && y <= bottom) {
-            return 0.0;
-        }
-        let (i, j) = (x as usize, y as usize);
-        if i + 1 >= self.width || j + 1 >= self.height {
-            return 0.0;
-        }
-        let (u, v) = (x - i as f32, y - j as f32);
-        let k = j * self.width + i;
-        match (
-            self.pixels.get(k..k + 2),
-            self.pixels.get(k + self.width..k + self.width + 2),
-        ) {
-            (Some([a, b]), Some([c, d])) => {
-                let (upper, lower) = (a + u * (b - a), c + u * (d - c));
-                (upper + v * (lower - upper)).clamp(-self.most, self.most)
-            }
-            _ => 0.0,
-        }
-    }
-
-    /// Values at steps of `step` px from `start` on.
+    /// Values at steps of `step` px from `start` on: between the pixels linearly, nothing outside.
     fn along(&self, start: (f64, f64), step: (f64, f64), values: &mut [f32]) {
-        let place = |k: usize| (start.0 + k as f64 * step.0, start.1 + k as f64 * step.1);
         let [left, top, right, bottom] = self.within.map(f64::from);
         let (right, bottom) = (
             right.min(self.width as f64 - 1.001),
             bottom.min(self.height as f64 - 1.001),
         );
-        let inside = |(x, y): (f64, f64)| x >= left && y >= top && x <= right && y <= bottom;
-        if !(inside(place(0)) && inside(place(values.len().saturating_sub(1)))) {
-            for (k, value) in values.iter_mut().enumerate() {
-                let (x, y) = place(k);
-                *value = self.at(x, y);
-            }
-            return;
-        }
-        // Both ends are inside, so all is: in fixed point, without a look at the borders.
+        // The steps that are inside come one after the other.
+        let across = steps_between((start.0, step.0), (left, right));
+        let down = steps_between((start.1, step.1), (top, bottom));
+        let count = values.len();
+        let first = (across.0.max(down.0).ceil() as usize).min(count);
+        let end = ((across.1.min(down.1).floor() + 1.0) as usize).clamp(first, count);
+        let (before, rest) = values.split_at_mut(first);
+        let (inside, behind) = rest.split_at_mut(end - first);
+        before.fill(0.0);
+        behind.fill(0.0);
         let fixed = |v: f64| (v * ONE) as i64;
-        let ((mut x, mut y), (dx, dy)) = (
-            (fixed(start.0), fixed(start.1)),
-            (fixed(step.0), fixed(step.1)),
-        );
+        let from = |start: f64, step: f64| fixed(start + first as f64 * step);
+        let (mut x, mut y) = (from(start.0, step.0), from(start.1, step.1));
+        let (dx, dy) = (fixed(step.0), fixed(step.1));
         let share = |v: i64| ((v >> 8) & 0xff_ffff) as i32 as f32 * (1.0 / 16_777_216.0);
-        for value in values {
+        let (most, least) = (self.most, -self.most);
+        for value in inside {
             let (u, v) = (share(x), share(y));
             let k = (y >> 32) as usize * self.width + (x >> 32) as usize;
             let rows = (
@@ -116,11 +90,29 @@ impl Contrast<'_> {
             );
             if let (Some([a, b]), Some([c, d])) = rows {
                 let (upper, lower) = (a + u * (b - a), c + u * (d - c));
-                *value = (upper + v * (lower - upper)).min(self.most).max(-self.most);
+                let between = upper + v * (lower - upper);
+                let between = if between < most { between } else { most };
+                *value = if between > least { between } else { least };
             }
             (x, y) = (x + dx, y + dy);
         }
     }
+}
+
+/// The first and the last step (numbers that need not be whole, none where the last is before the first) at which `start` and a
+/// multiple of `step` is between two places.
+fn steps_between((start, step): (f64, f64), (low, high): (f64, f64)) -> (f64, f64) {
+    // Rounding in fixed point stays inside.
+    let (low, high) = (low + 1e-6, high - 1e-6);
+    if step.abs() < 1e-9 {
+        return if start >= low && start <= high {
+            (0.0, f64::MAX)
+        } else {
+            (f64::MAX, -1.0)
+        };
+    }
+    let (a, b) = ((low - start) / step, (high - start) / step);
+    (a.min(b).max(0.0), a.max(b).max(-1.0))
 }
 
 /// Where to look: middle, half axes (px) and the long one's angle (rad) of an ellipse about the object with its halo.
