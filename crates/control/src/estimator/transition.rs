@@ -35,7 +35,14 @@ impl Transition {
         };
         for (i, mode) in model.modes.iter().enumerate() {
             if mode.pole_rad_per_s < 0.0 {
-                this.a[i] = (mode.pole_rad_per_s * t).exp();
+                // Backwards over more than that nothing is left of a state but noise: the mode stood where the command had it.
+                const FARTHEST_BACK: f64 = 2.0;
+                let exponent = mode.pole_rad_per_s * t;
+                this.a[i] = if exponent > FARTHEST_BACK {
+                    0.0
+                } else {
+                    exponent.exp()
+                };
                 this.b[i] = (this.a[i] - 1.0) / mode.pole_rad_per_s;
             }
         }
@@ -61,15 +68,19 @@ impl Transition {
 
     /// The state before a tick that [`Transition::advance`] made, with the command of that tick.
     pub(super) fn retreat(&self, m: &PredictedState, command_um: f64) -> PredictedState {
+        /// Part of a mode that a tick must leave, for what it was before to be told from it.
+        const LEAST_LEFT: f64 = 0.1;
         let drive = command_um - m.n;
         let mut before = PredictedState {
             q: m.q - self.gain * drive,
             ..*m
         };
         for ((x, a), b) in before.modes.iter_mut().zip(&self.a).zip(&self.b) {
-            if *a > 0.0 {
-                *x = (*x - b * drive) / a;
-            }
+            *x = if *a > LEAST_LEFT {
+                (*x - b * drive) / a
+            } else {
+                b * drive
+            };
         }
         before
     }

@@ -17,15 +17,41 @@ fn any_number() -> impl Strategy<Value = f64> {
 fn any_measurement() -> impl Strategy<Value = Option<Measurement>> {
     proptest::option::weighted(
         0.8,
-        (any_number(), any_number(), 0u16..9).prop_map(
-            |(position_um, variance_um2, age_samples)| Measurement {
+        (any_number(), any_number(), 0u16..9, any_offset()).prop_map(
+            |(position_um, variance_um2, age_samples, offset_samples)| Measurement {
                 position_um,
                 variance_um2,
                 age_samples,
-                offset_samples: 0.0,
+                offset_samples,
             },
         ),
     )
+}
+
+fn any_offset() -> impl Strategy<Value = f64> {
+    prop_oneof![2 => Just(0.0), 4 => -0.5..=0.5_f64, 1 => any::<f64>()]
+}
+
+fn any_model() -> impl Strategy<Value = LoopModel> {
+    (
+        prop_oneof![-3000.0..-1.0_f64, 1.0..3000.0_f64],
+        0.0..5e-3_f64,
+        0.0..7.0_f64,
+        -1.0..1.0_f64,
+        -1.0..1.0_f64,
+    )
+        .prop_map(|(gain_per_s, delay_s, decade, residue, feedthrough)| {
+            let mut model = LoopModel {
+                gain_per_s,
+                feedthrough,
+                ..LoopModel::eq6(delay_s)
+            };
+            model.modes[0] = LoopMode {
+                pole_rad_per_s: -10f64.powf(decade),
+                residue_per_s: residue * gain_per_s,
+            };
+            model
+        })
 }
 
 fn any_mode() -> impl Strategy<Value = Mode> {
@@ -34,8 +60,9 @@ fn any_mode() -> impl Strategy<Value = Mode> {
 
 prop_compose! {
     fn any_config()(
-        gain in prop_oneof![-3000.0..-1.0_f64, 1.0..3000.0_f64],
-        delay_s in 0.0..5e-3_f64,
+        model in any_model(),
+        adapt in any::<bool>(),
+        noise_decade in -5.0..0.0_f64,
         kp in -5.0..5.0_f64,
         ki in -500.0..500.0_f64,
         weight in 0.0..=1.0_f64,
@@ -59,8 +86,12 @@ prop_compose! {
             _ => ControllerConfig::Mpc(Mpc { effort, solver: SolverKind::ActiveSet, ..Mpc::default() }, pi),
         };
         LoopConfig {
-            model: LoopModel { gain_per_s: gain, ..LoopModel::eq6(delay_s) },
-            estimator: EstimatorConfig::default(),
+            model,
+            estimator: EstimatorConfig {
+                adapt,
+                fix_noise_um: 10f64.powf(noise_decade),
+                ..EstimatorConfig::default()
+            },
             controller,
             limits: Limits {
                 low_um: low,
@@ -79,14 +110,18 @@ proptest! {
     fn no_command_leaves_range_or_slew_whatever_the_measurements(
         config in any_config(),
         start in any_number(),
-        ticks in proptest::collection::vec((any_measurement(), any_number(), any_mode()), 1..200),
+        ticks in proptest::collection::vec((any_measurement(), any_number(), any_mode(), 0u8..8), 1..200),
     ) {
-        let mut controller = Controller::new(config).unwrap();
+        // A model or law that no loop can be built on is refused at once.
+        let Ok(mut controller) = Controller::new(config) else {
+            return Ok(());
+        };
         controller.start(start, start);
         let Limits { low_um, high_um, slew_um_per_s, .. } = config.limits;
         let mut last = controller.previous_command_um();
         prop_assert!((low_um..=high_um).contains(&last));
-        for (measurement, reference_um, mode) in ticks {
+        for (measurement, reference_um, mode, skipped) in ticks {
+            (5..skipped).for_each(|_| controller.skip());
             let input = LoopInput { measurement, reference_um, mode, ..LoopInput::default() };
             let out = controller.step(&input);
             prop_assert!(out.command_um.is_finite());
