@@ -10,11 +10,32 @@ use crate::modal::Zpk;
 /// The wall as a standard linear solid: its stiffness, and with it the numerator of Eq. (A4), gets the factor
 /// `(1 + (1 + strength) time s) / (1 + time s)`.
 ///
-/// Gain far above the relaxation frequency is `1 + strength` times that below. In the denominator of Eq. (A4) the wall enters
-/// with the weight `alpha A2/A1`, about 2e-8: neglected.
+/// Gain far above the relaxation frequency is `1 + strength` times that below: the wall takes away from slow motion. In the
+/// denominator of Eq. (A4) the wall enters with the weight `alpha A2/A1`, about 2e-8: neglected.
 pub fn pdms_relaxation(time_s: f64, strength: f64) -> Effect {
-    Effect::new(&KIND, 0, &[time_s, strength], &[])
+    Effect::new(&KIND, AT_REST, &[time_s, strength], &[])
 }
+
+/// The same wall beside a model whose gain is that of fast motion: the factor of [`pdms_relaxation`] over `1 + strength`.
+pub fn pdms_relaxation_of_fast_gain(time_s: f64, strength: f64) -> Effect {
+    Effect::new(&KIND, AT_SPEED, &[time_s, strength], &[])
+}
+
+/// The model's gain is that of slow motion.
+const AT_REST: usize = 0;
+/// The model's gain is that of fast motion.
+const AT_SPEED: usize = 1;
+
+const NUMBERS: &[ParameterSpec] = &[
+    ParameterSpec::new("time_s", "s", 1e-5, 1e4),
+    ParameterSpec::new("strength", "", -0.95, 20.0),
+];
+
+/// A wall takes away: a fit that wants it to add has found something else.
+const FREE: Candidate =
+    Candidate::chain(&[log("time_s", 1e-3, 50.0), lin("strength", 0.0, 5.0, 1e-3)])
+        .typical(0.03, 2.0)
+        .smallest(1, 0.01);
 
 #[derive(Debug)]
 pub(super) struct PdmsRelaxation;
@@ -25,13 +46,21 @@ static SPEC: Spec = Spec {
     id: "pdms-relaxation",
     place: Place::Chip,
     shown_at: "",
-    equation: "(1 + (1 + strength) time s)/(1 + time s)",
+    equation: "(1 + (1 + strength) time s)/(1 + time s), over 1 + strength where the model's gain is that of fast motion",
     signature: "a step in gain with a phase bump at 1/(2 pi time), in proportion to the amplitude",
     ahead_of_plant: false,
-    forms: &[Form::only(&[
-        ParameterSpec::new("time_s", "s", 1e-5, 1e4),
-        ParameterSpec::new("strength", "", -0.95, 20.0),
-    ])],
+    forms: &[
+        Form {
+            name: "slow-gain",
+            scalars: NUMBERS,
+            lists: &[],
+        },
+        Form {
+            name: "fast-gain",
+            scalars: NUMBERS,
+            lists: &[],
+        },
+    ],
     confused_with: &["pzt-creep", "leak", "gain-error"],
     inseparable_from: &[],
     experiment: Experiment::Slow,
@@ -44,25 +73,34 @@ impl EffectKind for PdmsRelaxation {
     }
 
     fn act(&self, effect: &Effect) -> Action {
-        Action::Linear(Zpk::relaxation(effect.scalar(0), effect.scalar(1)))
+        let (time_s, strength) = (effect.scalar(0), effect.scalar(1));
+        let mut wall = Zpk::relaxation(time_s, strength);
+        if effect.form_index() == AT_SPEED {
+            wall.gain = 1.0;
+        }
+        Action::Linear(wall)
     }
 
     fn candidates(&self) -> &'static [Candidate] {
-        const ALL: &[Candidate] = &[Candidate::chain(&[
-            log("time_s", 1e-3, 50.0),
-            lin("strength", -0.8, 5.0, 1e-3),
-        ])
-        .typical(0.03, 2.0)
-        .smallest(1, 0.01)];
+        const ALL: &[Candidate] = &[
+            Candidate {
+                name: "slow-gain",
+                ..FREE
+            },
+            Candidate {
+                name: "fast-gain",
+                ..FREE
+            },
+        ];
         ALL
     }
 
     fn starts(&self, _: usize, _: &Scope) -> Vec<Vec<f64>> {
-        grid(&[0.01, 0.03, 0.1, 0.3, 1.0, 3.0], &[-0.1, 0.1])
+        grid(&[0.01, 0.03, 0.1, 0.3, 1.0, 3.0], &[0.1])
     }
 
-    fn build(&'static self, _: usize, values: &[f64], _: &Scope) -> Effect {
-        Effect::new(self, 0, values, &[])
+    fn build(&'static self, form: usize, values: &[f64], _: &Scope) -> Effect {
+        Effect::new(self, form, values, &[])
     }
 
     fn lag_s(&self, _: usize, values: &[f64]) -> Option<f64> {

@@ -12,8 +12,24 @@ use nalgebra::Complex;
 /// Realised as a bank of first-order lags, two per decade from 0.1 ms to 1000 s, each of weight g/2: linear,
 /// within 0.1 % of g of the logarithm from 1 ms to 300 s (Kuhnen, Janocha 1998, linear creep operators).
 pub fn pzt_creep(per_decade: f64) -> Effect {
-    Effect::new(&KIND, 0, &[per_decade], &[])
+    Effect::new(&KIND, AT_REST, &[per_decade], &[])
 }
+
+/// The same creep beside a model whose gain is that of fast motion: `x = x0 (1 + g log10(t / 1 ms))`.
+pub fn pzt_creep_of_fast_gain(per_decade: f64) -> Effect {
+    Effect::new(&KIND, AT_SPEED, &[per_decade], &[])
+}
+
+/// The model's gain is that of a step after 0.1 s.
+const AT_REST: usize = 0;
+/// The model's gain is that of a step after 1 ms.
+const AT_SPEED: usize = 1;
+
+const NUMBERS: &[ParameterSpec] = &[ParameterSpec::new("per_decade", "", -0.2, 0.2)];
+
+const FREE: Candidate = Candidate::chain(&[lin("per_decade", 1e-5, 0.19, 1e-3)])
+    .typical(0.0, 0.06)
+    .smallest(0, 0.003);
 
 #[derive(Debug)]
 pub(super) struct PztCreep;
@@ -24,15 +40,21 @@ static SPEC: Spec = Spec {
     id: "pzt-creep",
     place: Place::Pzt,
     shown_at: "",
-    equation: "x = x0 (1 + g log10(t/0.1 s)) after a step",
+    equation: "x = x0 (1 + g log10(t/0.1 s)) after a step; t/1 ms where the model's gain is that of fast motion",
     signature: "a tail in the logarithm of time that flips with the sign of the step; a constant phase of about -39 g deg",
     ahead_of_plant: false,
-    forms: &[Form::only(&[ParameterSpec::new(
-        "per_decade",
-        "",
-        -0.2,
-        0.2,
-    )])],
+    forms: &[
+        Form {
+            name: "slow-gain",
+            scalars: NUMBERS,
+            lists: &[],
+        },
+        Form {
+            name: "fast-gain",
+            scalars: NUMBERS,
+            lists: &[],
+        },
+    ],
     confused_with: &["pdms-relaxation", "leak", "pzt-hysteresis"],
     inseparable_from: &[],
     experiment: Experiment::Slow,
@@ -45,13 +67,24 @@ impl EffectKind for PztCreep {
     }
 
     fn act(&self, effect: &Effect) -> Action {
-        Action::Linear(creep(effect.scalar(0)))
+        let reference_s = match effect.form_index() {
+            AT_SPEED => FAST_REFERENCE_S,
+            _ => CREEP_REFERENCE_S,
+        };
+        Action::Linear(creep(effect.scalar(0), reference_s))
     }
 
     fn candidates(&self) -> &'static [Candidate] {
-        const ALL: &[Candidate] = &[Candidate::chain(&[lin("per_decade", 1e-5, 0.19, 1e-3)])
-            .typical(0.0, 0.06)
-            .smallest(0, 0.003)];
+        const ALL: &[Candidate] = &[
+            Candidate {
+                name: "slow-gain",
+                ..FREE
+            },
+            Candidate {
+                name: "fast-gain",
+                ..FREE
+            },
+        ];
         ALL
     }
 
@@ -59,8 +92,8 @@ impl EffectKind for PztCreep {
         one([0.01, 0.05])
     }
 
-    fn build(&'static self, _: usize, values: &[f64], _: &Scope) -> Effect {
-        Effect::new(self, 0, values, &[])
+    fn build(&'static self, form: usize, values: &[f64], _: &Scope) -> Effect {
+        Effect::new(self, form, values, &[])
     }
 }
 
@@ -70,6 +103,8 @@ const CREEP_DECADES: usize = 9;
 const CREEP_PER_DECADE: usize = 2;
 /// A creeping piezo has its nominal displacement this long after a step, s.
 const CREEP_REFERENCE_S: f64 = 0.1;
+/// The same beside a gain of fast motion.
+const FAST_REFERENCE_S: f64 = 1e-3;
 
 /// Time constants of the creep bank, s.
 fn creep_times() -> impl Iterator<Item = f64> {
@@ -78,7 +113,7 @@ fn creep_times() -> impl Iterator<Item = f64> {
 }
 
 /// `1 + sum (g/n) (1/(1 + tau s) - (1 - exp(-t0/tau)))`: the step response is `1 + g log10(t/t0)`.
-fn creep(per_decade: f64) -> Zpk {
+fn creep(per_decade: f64, reference_s: f64) -> Zpk {
     if per_decade == 0.0 {
         return Zpk::one();
     }
@@ -88,7 +123,7 @@ fn creep(per_decade: f64) -> Zpk {
         + share
             * rates
                 .iter()
-                .map(|r| (-CREEP_REFERENCE_S * r).exp_m1())
+                .map(|r| (-reference_s * r).exp_m1())
                 .sum::<f64>();
     let value = |s: f64| direct + rates.iter().map(|r| share * r / (s + r)).sum::<f64>();
     // Poles in falling order -r (r falls). A zero lies between each pair of neighbours; the last one lies beyond the

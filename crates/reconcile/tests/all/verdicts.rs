@@ -56,6 +56,35 @@ fn named(r: &Reconciliation) -> Vec<&str> {
     r.effects.iter().map(|e| e.id.as_str()).collect()
 }
 
+#[test]
+fn one_effect_in_another_anchoring_is_one_effect() {
+    // The model's gain is that of fast motion: beside it the slow one is off, which is no gain error.
+    let cases = [
+        (effects::pdms_relaxation(0.3, 0.2), 1.0 / 1.2),
+        (effects::pzt_creep(0.05 / 1.1), 1.1),
+    ];
+    for (slow, gain) in cases {
+        let id = slow.id();
+        let hidden = plant()
+            .with_effect(slow)
+            .with_effect(effects::gain_error(gain));
+        let mut records: Vec<Record> = (0..3)
+            .map(|k| {
+                record(
+                    &format!("levels-{k}"),
+                    &hidden,
+                    &levels(6000, 1.0, k),
+                    k + 40,
+                )
+            })
+            .collect();
+        records.push(record("rest", &hidden, &vec![0.0; 6000], 50));
+        let r = run(&plant(), &records);
+        assert_eq!(r.verdict, Verdict::Named, "{id}: {:?}", r.places);
+        assert_eq!(named(&r), [id], "{:?}", r.effects);
+    }
+}
+
 /// Random records without rest, repeat or stated noise, some with an effect: none may be named.
 fn never_named(count: u64) {
     let silent = Model {
