@@ -2,7 +2,9 @@
 """cellpos vision beside trackpy on the same frames: recall, error and time.
 
     pip install trackpy pillow tifffile
-    scripts/vision-beside-trackpy.py [--cellpos target/release/cellpos] [--data ../shared/data]
+    scripts/vision-beside-trackpy.py [--cellpos PROGRAM] [--data ../shared/data]
+
+Without --cellpos the program is built in release first. Times are medians over the frames, of one frame and in one thread.
 
 Rendered frames have a truth: the profile of a bead in bright field, places drawn evenly, normal noise. On the measured
 beads and on the trapped one there is none: there the error is the RMS distance from another track that comes with the
@@ -11,6 +13,7 @@ own noise is 0.27 px).
 """
 import argparse
 import csv
+import json
 import pathlib
 import subprocess
 import tempfile
@@ -65,7 +68,6 @@ def by_cellpos(program, pictures):
             for row in csv.DictReader(file):
                 if row["verdict"] == "good":
                     found[int(row["frame"])].append((float(row["x_px"]), float(row["y_px"])))
-        import json
         return found, json.loads(run.stdout)["time_us"]["p50"] / 1000
 
 
@@ -116,12 +118,27 @@ def template_fits(path):
     return [np.array(track) for track in tracks.values()]
 
 
+def release():
+    """The program, built in release; where cargo put it is what it says."""
+    root = pathlib.Path(__file__).resolve().parent.parent
+    built = subprocess.run(
+        ["cargo", "build", "--release", "-p", "cellpos", "--bin", "cellpos", "--message-format", "json-render-diagnostics"],
+        cwd=root, stdout=subprocess.PIPE, text=True, check=True)
+    for line in built.stdout.splitlines():
+        message = json.loads(line)
+        if message.get("executable") and message["target"]["name"] == "cellpos":
+            return message["executable"]
+    raise SystemExit("cargo names no program")
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--cellpos", default="target/release/cellpos")
+    parser.add_argument("--cellpos", help="program to measure; left out: built in release from this tree")
     parser.add_argument("--data", default="../shared/data")
     args = parser.parse_args()
-    print("| frames | program | recall | error px | others found | ms a frame |\n|---|---|---|---|---|---|")
+    if args.cellpos is None:
+        args.cellpos = release()
+    print("| frames | program | recall | error px | others found | median ms a frame |\n|---|---|---|---|---|---|")
     for snr in (10, 40):
         pictures, truth = rendered(snr)
         for name, (found, ms) in (

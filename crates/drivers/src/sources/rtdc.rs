@@ -114,21 +114,27 @@ impl RtdcRecording {
         let wrong = |error: Error| told(&self.info.path, index, &error);
         let pixels = self.info.width_px * self.info.height_px;
         (to.width, to.height) = (self.info.width_px, self.info.height_px);
-        let raw = from.read_raw_rows(index as u64, 1).map_err(wrong)?;
-        if raw.len() == pixels {
-            (to.bits, to.mono8) = (8, raw);
-            return Ok(());
-        }
-        if raw.len() != 2 * pixels {
+        let bytes = from.element_size().map_err(wrong)?;
+        let row = index as u64;
+        let read = match bytes {
+            1 => {
+                (to.bits, to.mono8) = (8, from.read_raw_rows(row, 1).map_err(wrong)?);
+                to.mono8.len()
+            }
+            2 => {
+                (to.bits, to.mono16) = (16, from.read_u16_rows(row, 1).map_err(wrong)?);
+                to.mono16.len()
+            }
+            _ => 0,
+        };
+        if read != pixels {
             return Err(SourceError::PixelKind {
                 path: self.info.path.clone(),
                 frame: index,
-                found: format!("{} bytes for {pixels} pixels", raw.len()),
+                found: format!("{read} of {pixels} pixels, of {bytes} bytes each"),
                 expected: "pixels of 8 or 16 bits are needed",
             });
         }
-        to.mono16 = from.read_u16_rows(index as u64, 1).map_err(wrong)?;
-        to.bits = 16;
         Ok(())
     }
 }

@@ -36,6 +36,25 @@ fn pictures_background_pixel_size_rate_and_frame_numbers_come_out_as_they_were_w
 }
 
 #[test]
+fn pictures_of_sixteen_bits_come_out_in_either_byte_order_and_numbers_that_are_no_pixels_are_told()
+{
+    let mut recording = sources::open(&file("sixteen-bits.rtdc")).unwrap();
+    let info = recording.info().clone();
+    assert_eq!((info.width_px, info.height_px, info.bits), (10, 8, 16));
+    assert_eq!([0, 1, 2].map(|n| recording.number(n)), [0, 2, 3]);
+    let mut frame = FrameBuffer::default();
+    for n in 0..3 {
+        recording.read(n, &mut frame).unwrap();
+        let expected: Vec<u16> = (0..80).map(|k| (80 * n as u16 + k) * 137 + 300).collect();
+        assert_eq!((frame.bits, &frame.mono16), (16, &expected), "{n}");
+    }
+    let empty = recording.background().unwrap().unwrap();
+    assert_eq!((empty.bits, empty.mono16), (16, vec![4000; 80]));
+    let error = sources::open(&file("of-numbers.rtdc")).unwrap_err();
+    assert!(matches!(error, SourceError::PixelKind { .. }), "{error}");
+}
+
+#[test]
 fn a_compression_that_is_not_read_is_named_and_what_is_cut_off_or_no_hdf5_is_told() {
     let error = sources::open(&file("zstandard.rtdc")).unwrap_err();
     let SourceError::Compression { method, name, .. } = error else {
