@@ -14,8 +14,11 @@ const CHOSEN_EVERY: u32 = 4096;
 const PASSES: usize = 5;
 /// A step that changes nothing any more, px.
 const SETTLED_PX: f64 = 0.005;
-/// Share of the least shift that a first step without the objects must have.
-const STILL: f64 = 0.5;
+/// A shift up to here is told by the slopes at rest, px: it is none where it is below this share of the least one, or leaves more
+/// than this share of the squares.
+const LINEAR_PX: f64 = 0.5;
+const STILL: f64 = 0.8;
+const ALIKE: f64 = 0.96;
 /// A shift is believed when it leaves at most this share of the squares, each counted up to so many standard deviations.
 const BETTER: f64 = 0.9;
 const MOST_OFF: f64 = 20.0;
@@ -33,6 +36,76 @@ struct Sums {
     n: f64,
     /// Sum of squares, large ones clipped.
     clipped: f64,
+}
+
+/// What a pixel differs by, and the background's slopes there, grey levels per px.
+#[derive(Debug, Clone, Copy, Default)]
+struct Slope {
+    off: f64,
+    x: f64,
+    y: f64,
+}
+
+/// A step of the least squares.
+#[derive(Debug, Clone, Copy)]
+struct Step {
+    px: (f64, f64),
+    /// Standard deviations of the shift.
+    sd: (f64, f64),
+    /// What a pixel of the background differs by at most.
+    limit: f64,
+}
+
+impl Sums {
+    /// Sums for a shift that the slopes at rest make good.
+    fn of(slopes: &[Slope], at: (f64, f64), limit: f64, noise: f64) -> Self {
+        let mut sums = Sums::default();
+        for slope in slopes {
+            let off = slope.off + at.0 * slope.x + at.1 * slope.y;
+            sums.take(slope, off, limit, noise);
+        }
+        sums
+    }
+
+    fn take(&mut self, slope: &Slope, off: f64, limit: f64, noise: f64) {
+        self.clipped += off.abs().min(MOST_OFF * noise).powi(2);
+        if off.abs() > limit {
+            return;
+        }
+        self.xx += slope.x * slope.x;
+        self.xy += slope.x * slope.y;
+        self.yy += slope.y * slope.y;
+        self.rx -= slope.x * off;
+        self.ry -= slope.y * off;
+        self.off += off.abs();
+        self.n += 1.0;
+    }
+
+    /// The next step from a shift; `None` where there are no slopes.
+    fn step(&self, at: (f64, f64), noise: f64) -> Option<Step> {
+        // A shift by a pixel is not expected: without slopes along a direction there is none.
+        let least = noise * noise;
+        let (xx, xy, yy) = (self.xx + least, self.xy, self.yy + least);
+        let (rx, ry) = (self.rx - at.0 * least, self.ry - at.1 * least);
+        let determinant = xx * yy - xy * xy;
+        if determinant <= 0.0 || self.n < 1.0 {
+            return None;
+        }
+        let most = |v: f64| v.clamp(-1.0, 1.0);
+        let spread = 1.25 * self.off / self.n;
+        let variance = spread.max(noise).powi(2);
+        Some(Step {
+            px: (
+                most((rx * yy - ry * xy) / determinant),
+                most((ry * xx - rx * xy) / determinant),
+            ),
+            sd: (
+                (variance * yy / determinant).sqrt(),
+                (variance * xx / determinant).sqrt(),
+            ),
+            limit: (8.0 * spread).max(4.0 * noise),
+        })
+    }
 }
 
 /// Weights of four pixels in a row for a place between the middle two, by a cubic through them (Catmull-Rom).
@@ -122,54 +195,63 @@ impl Background {
     where
         f32: From<T>,
     {
-        let noise = self.noise_grey();
-        let (mut at, mut sd, mut limit) = ((0.0_f64, 0.0_f64), (0.0, 0.0), f64::INFINITY);
-        let mut unmoved = None;
-        for pass in 0..=PASSES {
-            let sums = self.slopes(pixels, f64::from(light), at, limit);
-            // A shift by a pixel is not expected: without slopes along a direction there is none.
-            let least = noise * noise;
-            let (xx, xy, yy) = (sums.xx + least, sums.xy, sums.yy + least);
-            let (rx, ry) = (sums.rx - at.0 * least, sums.ry - at.1 * least);
-            let determinant = xx * yy - xy * xy;
-            if determinant <= 0.0 || sums.n < 1.0 {
-                return (0.0, 0.0);
-            }
-            let most = |v: f64| v.clamp(-1.0, 1.0);
-            let step = (
-                most((rx * yy - ry * xy) / determinant),
-                most((ry * xx - rx * xy) / determinant),
-            );
-            let spread = 1.25 * sums.off / sums.n;
-            let variance = spread.max(noise).powi(2);
-            sd = (
-                (variance * yy / determinant).sqrt(),
-                (variance * xx / determinant).sqrt(),
-            );
-            limit = (8.0 * spread).max(4.0 * noise);
-            // By the noise alone: a shift that has not been made good counts as spread.
-            let own = noise.min(spread) / variance.sqrt();
-            let small = |step: f64, sd: f64| step.abs() < STILL * LEAST.0.max(LEAST.1 * own * sd);
-            match pass {
-                // Once more with the objects left out.
-                0 if f64::hypot(step.0, step.1) >= 0.5 * LEAST.0 => {
-                    unmoved = Some(sums.clipped);
-                    continue;
-                }
-                0 => return (0.0, 0.0),
-                1 if small(step.0, sd.0) && small(step.1, sd.1) => return (0.0, 0.0),
-                _ => at = (at.0 + step.0, at.1 + step.1),
-            }
-            if !(at.0.abs() <= MOST_PX && at.1.abs() <= MOST_PX) {
-                return (0.0, 0.0);
-            }
-            if f64::hypot(step.0, step.1) < SETTLED_PX {
+        let (noise, light) = (self.noise_grey(), f64::from(light));
+        let none = (0.0, 0.0);
+        let mut slopes = [Slope::default(); SAMPLES];
+        let mut count = 0;
+        let at_rest = self.steep.iter().filter_map(|k| {
+            let around = self.at_rest(*k as usize)?;
+            self.slope(pixels, *k as usize, light, around)
+        });
+        for (to, slope) in slopes.iter_mut().zip(at_rest) {
+            *to = slope;
+            count += 1;
+        }
+        let slopes = slopes.get(..count).unwrap_or(&[]);
+        let unmoved = Sums::of(slopes, none, f64::INFINITY, noise);
+        let Some(first) = unmoved.step(none, noise) else {
+            return none;
+        };
+        if f64::hypot(first.px.0, first.px.1) < 0.5 * LEAST.0 {
+            return none;
+        }
+        // Without the objects, by the slopes at rest.
+        let (mut at, mut last) = (none, first);
+        for _ in 0..PASSES {
+            let Some(next) = Sums::of(slopes, at, last.limit, noise).step(at, noise) else {
+                return none;
+            };
+            at = (at.0 + next.px.0, at.1 + next.px.1);
+            last = next;
+            if f64::hypot(next.px.0, next.px.1) < SETTLED_PX {
                 break;
             }
         }
-        let moved = self.slopes(pixels, f64::from(light), at, limit).clipped;
-        if unmoved.is_none_or(|unmoved| moved > BETTER * unmoved) {
-            return (0.0, 0.0);
+        let small = |d: f64, sd: f64| d.abs() < STILL * LEAST.0.max(LEAST.1 * sd);
+        if f64::hypot(at.0, at.1) < LINEAR_PX {
+            let left = Sums::of(slopes, at, last.limit, noise).clipped;
+            if small(at.0, last.sd.0) && small(at.1, last.sd.1) || left > ALIKE * unmoved.clipped {
+                return none;
+            }
+        } else {
+            (at, last) = (none, first);
+        }
+        for _ in 0..PASSES {
+            let Some(next) = self.sums_at(pixels, light, at, last.limit).step(at, noise) else {
+                return none;
+            };
+            at = (at.0 + next.px.0, at.1 + next.px.1);
+            last = next;
+            if !(at.0.abs() <= MOST_PX && at.1.abs() <= MOST_PX) {
+                return none;
+            }
+            if f64::hypot(next.px.0, next.px.1) < SETTLED_PX {
+                break;
+            }
+        }
+        let moved = self.sums_at(pixels, light, at, last.limit).clipped;
+        if moved > BETTER * unmoved.clipped {
+            return none;
         }
         let told = |d: f64, sd: f64| {
             if d.abs() > LEAST.0.max(LEAST.1 * sd) {
@@ -178,12 +260,30 @@ impl Background {
                 0.0
             }
         };
-        (told(at.0, sd.0), told(at.1, sd.1))
+        (told(at.0, last.sd.0), told(at.1, last.sd.1))
     }
 
-    /// Sums over pixels where the background is steep, it being moved by `at` px; those that differ by more than `limit`
-    /// are left out.
-    fn slopes<T: Copy>(&self, pixels: &[T], light: f64, at: (f64, f64), limit: f64) -> Sums
+    /// What a pixel differs by, where the background (its grey level there, its differences across and down) is steep.
+    fn slope<T: Copy>(
+        &self,
+        pixels: &[T],
+        k: usize,
+        light: f64,
+        [own, across, down]: [f64; 3],
+    ) -> Option<Slope>
+    where
+        f32: From<T>,
+    {
+        let noise = self.noise_grey();
+        // A smooth slope cannot tell a shift from light that has changed.
+        let steep = |slope: f64| if slope.abs() > noise { slope } else { 0.0 };
+        let (x, y) = (light * steep(across), light * steep(down));
+        let off = f64::from(f32::from(*pixels.get(k)?)) - light * own;
+        (x != 0.0 || y != 0.0).then_some(Slope { off, x, y })
+    }
+
+    /// Sums with the background moved by `at` px; pixels that differ by more than `limit` are left out.
+    fn sums_at<T: Copy>(&self, pixels: &[T], light: f64, at: (f64, f64), limit: f64) -> Sums
     where
         f32: From<T>,
     {
@@ -191,33 +291,10 @@ impl Background {
         let mut sums = Sums::default();
         for k in self.steep.iter().map(|k| *k as usize) {
             let (i, j) = (k % self.width, k / self.width);
-            let Some(p) = pixels.get(k) else { continue };
-            let around = if at == (0.0, 0.0) {
-                self.at_rest(k)
-            } else {
-                self.around(i as f64 - at.0, j as f64 - at.1)
-            };
-            let Some([own, across, down]) = around else {
-                continue;
-            };
-            // A smooth slope cannot tell a shift from light that has changed.
-            let steep = |slope: f64| if slope.abs() > noise { slope } else { 0.0 };
-            let (gx, gy) = (light * steep(across), light * steep(down));
-            if gx == 0.0 && gy == 0.0 {
-                continue;
+            let around = self.around(i as f64 - at.0, j as f64 - at.1);
+            if let Some(slope) = around.and_then(|around| self.slope(pixels, k, light, around)) {
+                sums.take(&slope, slope.off, limit, noise);
             }
-            let off = f64::from(f32::from(*p)) - light * own;
-            sums.clipped += off.abs().min(MOST_OFF * noise).powi(2);
-            if off.abs() > limit {
-                continue;
-            }
-            sums.xx += gx * gx;
-            sums.xy += gx * gy;
-            sums.yy += gy * gy;
-            sums.rx -= gx * off;
-            sums.ry -= gy * off;
-            sums.off += off.abs();
-            sums.n += 1.0;
         }
         sums
     }
