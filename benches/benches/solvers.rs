@@ -2,16 +2,22 @@
 //!
 //!     cargo bench -p cellpos-benches --bench solvers              60 s each
 //!     cargo bench -p cellpos-benches --bench solvers -- 10        10 s each
+//!     cargo bench -p cellpos-benches --bench solvers -- --problems FOLDER
+//!     scripts/solvers-beside.py FOLDER                            the same problems by solvers with a Python interface
+//!
+//! The third solves the problems of 20 s of each loop one after another, without a loop around it, and writes them into the folder.
 //!
 //! Each tick sleeps to its due time, then takes one step of the whole controller (estimator, reference, vectors of the
 //! problem, solver, fallback, limits) on the simulated rig; only the step is timed. `easy` holds a position. `constrained`
 //! allows 1 um/ms and lets the reference leap so that most ticks lie at a bound. The competitor is the same loop with LQG,
 //! which solves nothing, and a bare absolute-sleep loop of the same policy.
 
+use cellpos_benches::problems;
 use cellpos_control::*;
 use cellpos_rig::clock::{monotonic_ns, sleep_until_ns};
 use cellpos_runtime::latency::Latency;
 use cellpos_runtime::realtime::{self, bare_loop};
+use std::path::Path;
 use std::time::{Duration, Instant};
 
 const PERIOD_NS: i64 = 1_000_000;
@@ -30,10 +36,7 @@ struct Outcome {
 }
 
 fn run(controller: ControllerConfig, constrained: bool, seconds: u64) -> Outcome {
-    let limits = Limits {
-        slew_um_per_s: if constrained { 1000.0 } else { 10_000.0 },
-        ..Limits::default()
-    };
+    let (limits, reference) = problems::terms(constrained);
     let config = LoopConfig {
         model: LoopModel::eq6(2e-3),
         estimator: EstimatorConfig::default(),
@@ -44,14 +47,6 @@ fn run(controller: ControllerConfig, constrained: bool, seconds: u64) -> Outcome
     let mut controller = Controller::new(config).expect("a sound controller");
     controller.start(20.0, 20.0);
     let mut preview = vec![0.0; controller.preview_len()];
-    // A leap of 16 um every 14 ms: the slew lets the bead go about as far.
-    let reference = |k: u64| {
-        if !constrained || (k / 14).is_multiple_of(2) {
-            0.0
-        } else {
-            16.0
-        }
-    };
     let mut out = Outcome {
         step: Latency::new(),
         solve: Latency::new(),
@@ -99,7 +94,60 @@ fn bare(seconds: u64) {
     );
 }
 
+/// The problems of both loops by both solvers, one after another, and into files.
+fn stored(folder: &Path) -> std::io::Result<()> {
+    std::fs::create_dir_all(folder)?;
+    for (name, constrained) in [("easy", false), ("constrained", true)] {
+        let all = problems::collect(constrained, 20_000);
+        let (limits, _) = problems::terms(constrained);
+        let solved = [SolverKind::ActiveSet, SolverKind::Clarabel].map(|solver| {
+            let law = problems::law(solver, &limits);
+            let solved = law.solve_timed(&all);
+            let mut latency = Latency::new();
+            let mut iterations = 0;
+            for (k, one) in (0..).zip(&solved) {
+                latency.record(one.took.as_nanos() as u64, k);
+                iterations += u64::from(one.iterations);
+            }
+            let q = latency.quantiles_us();
+            println!(
+                "{:<28} alone   p50 {:>6.1}  p99 {:>6.1}  p99.9 {:>6.1}  max {:>7.1} us, {:.1} iterations",
+                format!("{solver:?}, {name}"),
+                q.p50,
+                q.p99,
+                q.p999,
+                q.max,
+                iterations as f64 / solved.len() as f64
+            );
+            solved
+        });
+        let off = solved[0]
+            .iter()
+            .zip(&solved[1])
+            .filter_map(|(a, b)| Some((a.first_um? - b.first_um?).abs()));
+        println!(
+            "{:<28} largest difference of the first move {:.2e} um",
+            "",
+            off.fold(0.0, f64::max)
+        );
+        let law = problems::law(SolverKind::ActiveSet, &limits);
+        problems::write(
+            &folder.join(format!("{name}.txt")),
+            law.matrices(),
+            &all,
+            &solved[0],
+        )?;
+    }
+    Ok(())
+}
+
 fn main() {
+    let mut arguments = std::env::args().skip_while(|argument| argument != "--problems");
+    if arguments.next().is_some() {
+        let folder = arguments.next().expect("a folder after --problems");
+        stored(Path::new(&folder)).expect("files that can be written");
+        return;
+    }
     let seconds = std::env::args()
         .skip(1)
         .find_map(|argument| argument.parse().ok())

@@ -4,6 +4,7 @@
 pub mod adaptation;
 pub mod live_page;
 pub mod parallel;
+pub mod problems;
 pub mod simulated;
 
 use cellpos_control::{ControllerFile, ControllerKind, Pi, Profile};

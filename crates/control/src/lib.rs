@@ -69,7 +69,7 @@ pub use loop_io::{LoopFlags, LoopInput, LoopOutput, LoopParts, Measurement, Mode
 pub use loop_model::{LoopMode, LoopModel, MODES};
 pub use lqg::{Feedback, Lqg, LqgLaw, LqgState};
 pub use monitor::{PlantEstimate, PlantMonitor, PlantMonitorState, PlantVerdict};
-pub use mpc::{HORIZON, Mpc, MpcLaw, MpcState, SolverKind};
+pub use mpc::{HORIZON, Mpc, MpcLaw, MpcState, SolverKind, TimedSolve};
 pub use pi::{Lead, Pi, PiLaw, PiState};
 pub use reference::{Points, Profile, Reference, Shape, fill_preview};
 pub use simulation::{RigConfig, SimulatedRig};

@@ -10,6 +10,8 @@ mod clarabel_qp;
 mod condensed;
 mod feasible;
 mod law;
+mod problems;
 
 pub use condensed::{HORIZON, Mpc, SolverKind};
 pub use law::{MpcLaw, MpcState};
+pub use problems::TimedSolve;

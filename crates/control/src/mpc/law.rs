@@ -18,7 +18,7 @@ use std::time::Instant;
 const PLAN_MOST: usize = 10;
 
 /// The feed-forward plan of a tick, within range and slew.
-struct ReferencePlan {
+pub(super) struct ReferencePlan {
     command: [f64; HORIZON],
     /// Position of the model on it less the reference, after each tick.
     error: [f64; HORIZON],
@@ -31,8 +31,8 @@ struct ReferencePlan {
 #[derive(Debug, Clone)]
 pub struct MpcLaw {
     config: Mpc,
-    condensed: Condensed,
-    forward: FeedForward,
+    pub(super) condensed: Condensed,
+    pub(super) forward: FeedForward,
     pi: PiLaw,
     reach: Reach,
 }
@@ -40,8 +40,8 @@ pub struct MpcLaw {
 /// State of the law: model on the reference, previous plan, warm start, the fallback's state and the solver's workspace.
 #[derive(Debug)]
 pub struct MpcState {
-    on_reference: FeedForwardState,
-    announced_um: Option<f64>,
+    pub(super) on_reference: FeedForwardState,
+    pub(super) announced_um: Option<f64>,
     pi: PiState,
     plan_um: [f64; HORIZON],
     /// Corrections of the newest plan.
@@ -107,7 +107,12 @@ impl MpcLaw {
     }
 
     /// One solve: its end, iterations and active rows.
-    fn solve(&self, state: &mut MpcState, v: &QpVectors, stop: Stop) -> (QpEnd, u16, u16) {
+    pub(super) fn solve(
+        &self,
+        state: &mut MpcState,
+        v: &QpVectors,
+        stop: Stop,
+    ) -> (QpEnd, u16, u16) {
         let Some(clarabel) = &mut state.clarabel else {
             let (end, iterations) = self.condensed.matrices.solve(v, &mut state.working, stop);
             let active = u16::try_from(state.working.len()).unwrap_or(u16::MAX);
@@ -122,7 +127,7 @@ impl MpcLaw {
     /// The command of this tick, or `None` when there is no plan to follow.
     fn plan(&self, state: &mut MpcState, input: &LawInput) -> (Option<f64>, SolverReport) {
         let neutral = input.estimate.neutral_um;
-        let reference = self.reference_plan(state, input);
+        let reference = self.reference_plan(&state.on_reference, input);
         let deviation = deviation(&input.estimate.now, &state.on_reference);
         state.on_reference = reference.next;
         let vectors = self.vectors(input, &deviation, &reference);
@@ -202,9 +207,9 @@ impl MpcLaw {
     }
 
     /// Feed-forward along the preview, kept within range and slew; the model on the reference follows what was kept.
-    fn reference_plan(&self, state: &MpcState, input: &LawInput) -> ReferencePlan {
+    pub(super) fn reference_plan(&self, on: &FeedForwardState, input: &LawInput) -> ReferencePlan {
         let reach = self.reach.about_neutral(input);
-        let mut on = state.on_reference;
+        let mut on = *on;
         let mut plan = ReferencePlan {
             command: [0.0; HORIZON],
             error: [0.0; HORIZON],
@@ -227,7 +232,7 @@ impl MpcLaw {
         plan
     }
 
-    fn vectors(
+    pub(super) fn vectors(
         &self,
         input: &LawInput,
         s: &[f64; DEVIATION],
