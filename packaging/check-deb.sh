@@ -1,11 +1,13 @@
 #!/usr/bin/env bash
 # Unpacks a package into a folder of its own and looks at what a user would get: programs that run and name their commit,
-# at most 20 MB each, completions and manual pages of every command, a unit that systemd accepts.
+# at most 20 MB each, completions and manual pages of every command, a unit that systemd accepts. As root it is installed, too, in
+# a copy of this system (an overlay that is gone afterwards): dpkg, its scripts, group and user, and removed again.
 # usage: packaging/check-deb.sh target/debian/cellpos_*.deb
 set -euo pipefail
 deb=$1
 root=$(mktemp -d)
-trap 'rm -rf "$root"' EXIT
+copy=$(mktemp -d)
+trap 'rm -rf "$root"; rmdir "$copy"' EXIT
 dpkg-deb --extract "$deb" "$root"
 dpkg-deb --info "$deb" | grep -q 'Package: cellpos'
 fail() { echo "check-deb: $1" >&2; exit 1; }
@@ -30,6 +32,35 @@ done
 if command -v systemd-analyze >/dev/null; then
     sed "s#/usr/bin/cellpos#$root/usr/bin/cellpos#" "$root/lib/systemd/system/cellpos-run@.service" > "$root/cellpos-run@night.service"
     systemd-analyze verify "$root/cellpos-run@night.service" 2>&1 | grep -i 'cellpos-run' && fail "systemd does not accept the unit"
+fi
+# What stands in the copy: run by a shell whose mounts are its own.
+installed() {
+    set -euo pipefail
+    copy=$1 deb=$2
+    mount -t tmpfs tmpfs "$copy"
+    mkdir "$copy/upper" "$copy/work" "$copy/root"
+    mount -t overlay overlay -o "lowerdir=/,upperdir=$copy/upper,workdir=$copy/work" "$copy/root"
+    mount --bind /proc "$copy/root/proc"
+    mount --bind /dev "$copy/root/dev"
+    mount -t tmpfs tmpfs "$copy/root/tmp"
+    cp "$deb" "$copy/root/tmp/cellpos.deb"
+    inside() { chroot "$copy/root" env -i PATH=/usr/sbin:/usr/bin:/sbin:/bin HOME=/root "$@"; }
+    inside dpkg --install /tmp/cellpos.deb >/dev/null
+    inside dpkg --status cellpos | grep -q '^Status: install ok installed'
+    inside cellpos --version
+    inside getent group realtime >/dev/null
+    inside id cellpos | grep -q realtime
+    inside sh -c 'cd /tmp && cellpos track --target 0um --duration 1s --clock virtual --frames off && cellpos report latest' >/dev/null
+    inside dpkg --install /tmp/cellpos.deb >/dev/null
+    inside dpkg --purge cellpos >/dev/null
+    inside sh -c '! command -v cellpos && [ ! -e /etc/security/limits.d/cellpos.conf ]'
+}
+if [ "$(id -u)" != 0 ] || ! unshare -m true 2>/dev/null; then
+    echo "not installed: that needs root"
+elif unshare -m bash -c "$(declare -f installed); installed \"\$1\" \"\$2\"" bash "$copy" "$(realpath "$deb")"; then
+    echo "installed, installed again, purged"
+else
+    fail "dpkg does not install it and purge it as it should"
 fi
 cd "$root"
 "$root/usr/bin/cellpos" track --target 0um --duration 1s --clock virtual --frames off --name package >/dev/null

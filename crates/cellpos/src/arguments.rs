@@ -1,10 +1,12 @@
 //! Arguments that need more than their type: run folders (a path, or `latest`), quantities above zero, values that begin with
 //! a minus.
 
+use cellpos_units::Seconds;
 use clap::builder::{OsStringValueParser, TypedValueParser};
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
+use std::time::Duration;
 
 /// Where runs lie unless an option says otherwise.
 const RUNS: &str = "runs";
@@ -52,6 +54,12 @@ fn latest(runs: &Path, name: Option<&str>) -> Result<PathBuf, String> {
             Some(name) => format!("{} holds no run named {name}", runs.display()),
             None => format!("{} holds no run", runs.display()),
         })
+}
+
+/// A time as a program waits it. Longer than thirty years is thirty years: no clock counts on for ever.
+pub fn span(time: Seconds) -> Duration {
+    const MOST_S: f64 = 1e9;
+    Duration::try_from_secs_f64(time.value().min(MOST_S)).unwrap_or_default()
 }
 
 /// Reads the name of a run.
@@ -156,6 +164,8 @@ mod tests {
                 .contains("unit")
         );
         assert_eq!(positive("3s"), Ok(cellpos_units::Seconds(3.0)));
+        assert_eq!(span(Seconds(0.5)), Duration::from_millis(500));
+        assert_eq!(span(Seconds(1e30)).as_secs(), 1_000_000_000);
     }
 
     #[test]

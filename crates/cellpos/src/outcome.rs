@@ -57,7 +57,9 @@ pub fn print_text(text: &str) -> Result<(), Failure> {
     // What a run was told to say is shown below what it said while it ran.
     cellpos_terminal::stderr().flush(PATIENCE);
     match std::io::stdout().write_all(clean(text, Colours::Kept).as_bytes()) {
-        Err(error) if error.kind() != std::io::ErrorKind::BrokenPipe => Err(Failure::failed(error)),
+        Err(error) if error.kind() != std::io::ErrorKind::BrokenPipe => Err(Failure::Failed(
+            miette::miette!("standard output: cannot be written: {error}"),
+        )),
         _ => Ok(()),
     }
 }

@@ -414,13 +414,13 @@ const PAGE_STYLE: &str = "\
 :root{color-scheme:light dark}\
 body{margin:0;background:#fff;color:#1d2127;font:15px/1.55 system-ui,'DejaVu Sans','Segoe UI',Helvetica,Arial,sans-serif}\
 main{max-width:1000px;margin:0 auto;padding:24px 20px 60px}\
-h1{font-size:26px;line-height:1.25;margin:8px 0 16px}h2{font-size:20px;margin:38px 0 10px;padding-top:8px;border-top:1px solid #dfe3e8}\
+h1{font-size:26px;line-height:1.25;margin:8px 0 16px;overflow-wrap:anywhere}h2{font-size:20px;margin:38px 0 10px;padding-top:8px;border-top:1px solid #dfe3e8}\
 h3{font-size:16px;margin:24px 0 6px}p{margin:8px 0}ul{margin:8px 0;padding-left:22px}\
 nav ul{columns:2;list-style:none;padding:10px 14px;background:#f5f7f9;border-radius:6px;font-size:14px}\
 a{color:#0063a0}figure{margin:18px 0}figure svg,img.pixels{max-width:100%;height:auto;display:block}img.pixels{image-rendering:pixelated}\
 figcaption{color:#5c6470;font-size:13px;margin-top:4px}\
 .slim{display:none}\
-@media(max-width:760px){.wide{display:none}.slim{display:block}.slim svg{width:100%;max-width:520px}figure .scroll svg{max-width:none}}\
+@media(max-width:760px){.wide{display:none}.slim{display:block}.slim svg{width:100%;max-width:520px}figure .scroll svg{max-width:none}td:last-child:not(.num){min-width:15em}}\
 .scroll{overflow-x:auto;margin:12px 0}table{border-collapse:collapse;font-size:13.5px}\
 p.caption{color:#5c6470;font-size:13px;margin-top:4px}\
 th{text-align:left;font-weight:600;border-bottom:2px solid #c3cad2;padding:4px 14px 4px 6px;vertical-align:bottom}\

@@ -8,7 +8,7 @@ use crate::svg::{self, Anchor, COLORS, Svg, px};
 use std::fmt::Write;
 
 /// Room for the numbers and the title of the y axis, px.
-pub(crate) const LEFT_PX: f64 = 74.0;
+pub(crate) const LEFT_PX: f64 = 82.0;
 /// Room beside the axes on the right, px.
 pub(crate) const RIGHT_PX: f64 = 16.0;
 const LINE_PX: f64 = 18.0;

@@ -180,7 +180,7 @@ fn a_file_that_cannot_be_written_is_named_in_the_error() {
 
 #[test]
 fn a_point_stands_where_the_axes_say() {
-    // Frame: left 74, width 820 - 74 - 16 = 730; fixed ranges make the place exact.
+    // Frame: left 82, width 820 - 82 - 16 = 722; fixed ranges make the place exact.
     let svg = Figure::new("p", "")
         .panel(
             Panel::new(
@@ -191,7 +191,7 @@ fn a_point_stands_where_the_axes_say() {
             .series(Series::points("", &[10.0], &[5.0])),
         )
         .to_svg();
-    assert!(svg.contains("cx=\"365\" cy=\"50\""), "{svg}");
+    assert!(svg.contains("cx=\"361\" cy=\"50\""), "{svg}");
 }
 
 proptest! {

@@ -190,6 +190,14 @@ fn kernel() -> String {
 ///
 /// It is the yardstick beside every timing of the real loop: stalls seen here are the machine's own.
 pub fn bare_loop(duration: Duration, mut woken: impl FnMut(u64)) -> (Latency, u64) {
+    bare_loop_while(duration, |late_ns| {
+        woken(late_ns);
+        true
+    })
+}
+
+/// As [`bare_loop`], until `woken` says that it is enough.
+pub fn bare_loop_while(duration: Duration, mut woken: impl FnMut(u64) -> bool) -> (Latency, u64) {
     const PERIOD_NS: i64 = 1_000_000;
     let mut latency = Latency::new();
     let mut missed = 0;
@@ -201,10 +209,13 @@ pub fn bare_loop(duration: Duration, mut woken: impl FnMut(u64)) -> (Latency, u6
         sleep_until_ns(due);
         let late = (monotonic_ns() - due).max(0);
         latency.record(late as u64, tick as u64);
-        woken(late as u64);
+        let goes_on = woken(late as u64);
         let skipped = late / PERIOD_NS;
         missed += skipped as u64;
-        tick += 1 + skipped;
+        tick = tick.saturating_add(1 + skipped);
+        if !goes_on {
+            break;
+        }
     }
     (latency, missed)
 }

@@ -2,7 +2,7 @@
 //!
 //! | signal | a rig is held | no rig is held |
 //! |---|---|---|
-//! | INT, TERM, HUP | freeze the bead, then park; a second one parks at once | ends the program, as always |
+//! | INT, TERM, HUP | freeze the bead, then park; a second one parks at once | ends the program, as always; `doctor` says first what it has |
 //! | QUIT | park at once | ends the program, as always |
 //! | USR1 | pause: freeze until the next USR1 | nothing |
 //! | USR2 | a script goes on with its next step | nothing |
@@ -21,6 +21,7 @@ use signal_hook::consts::{
 };
 use signal_hook::iterator::Signals;
 use signal_hook::low_level::{emulate_default_handler, signal_name};
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 /// Who holds a rig, and whether a stop was asked for.
@@ -29,12 +30,15 @@ struct Desk {
     listening: bool,
     sessions: Vec<Arc<Operator>>,
     stopped_by: Option<i32>,
+    /// A measurement without a rig, which a stop ends early.
+    measuring: Option<Arc<AtomicBool>>,
 }
 
 static DESK: Mutex<Desk> = Mutex::new(Desk {
     listening: false,
     sessions: Vec::new(),
     stopped_by: None,
+    measuring: None,
 });
 
 fn desk() -> MutexGuard<'static, Desk> {
@@ -69,6 +73,14 @@ pub fn hold(operator: &Arc<Operator>) -> Result<Place, Stopped> {
     }
     desk.sessions.push(Arc::clone(operator));
     Ok(Place(Arc::clone(operator)))
+}
+
+/// A flag that the first INT, TERM, HUP or QUIT raises in place of ending the program: a long measurement without a rig comes to
+/// an end and says what it has. The next one ends the program, as always.
+pub fn ends_measuring() -> Arc<AtomicBool> {
+    let flag = Arc::new(AtomicBool::new(false));
+    desk().measuring = Some(Arc::clone(&flag));
+    flag
 }
 
 /// The signal that asked for a stop while a rig was held, by name; `None`: none did.
@@ -122,6 +134,11 @@ pub fn listen() -> std::io::Result<()> {
 fn act(signal: i32) {
     let mut desk = desk();
     if desk.sessions.is_empty() {
+        let stops = matches!(signal, SIGINT | SIGTERM | SIGHUP | SIGQUIT);
+        if let Some(flag) = desk.measuring.take_if(|_| stops) {
+            flag.store(true, Ordering::Relaxed);
+            return;
+        }
         if !matches!(signal, SIGUSR1 | SIGUSR2) {
             cellpos_terminal::give_back();
             // The desk stays closed meanwhile: nobody arms a board while the program ends.

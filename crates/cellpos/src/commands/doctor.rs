@@ -5,21 +5,23 @@ mod soak;
 mod suspect;
 mod traced;
 
-use crate::arguments::positive;
+use crate::arguments::{positive, span};
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
 use cellpos_runtime::realtime::{Request, allowed_cpus};
+use cellpos_session::signals;
 use cellpos_units::Seconds;
 use findings::{Finding, Machine, Weight};
 use serde::Serialize;
 use soak::Soak;
 use std::path::{Path, PathBuf};
-use std::time::Duration;
 
 /// Arguments of `cellpos doctor`.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:
   cellpos doctor
   cellpos doctor --for 10h --why
+
+Ctrl-C ends the measurement, and what it has by then is said.
 
 Exit code 0: fit; 1: not fit, or measured for too short a time to say so.")]
 pub struct Args {
@@ -65,12 +67,9 @@ pub fn run(args: Args) -> CommandResult {
     let mut findings = machine.findings();
     findings.extend(machine.serial_ports());
     findings.extend(findings::disk(&args.runs, args.run.value()));
-    let soak = soak::soak(
-        request,
-        Duration::from_secs_f64(args.duration.value()),
-        args.why,
-    )
-    .map_err(Failure::failed)?;
+    let stop = signals::ends_measuring();
+    let soak =
+        soak::soak(request, span(args.duration), args.why, &stop).map_err(Failure::failed)?;
     let (fit, verdict) = verdict(&soak, &findings);
     let report = Report {
         fit,

@@ -1,6 +1,6 @@
 //! `cellpos watch`: the live page of a run, from its folder.
 
-use crate::arguments::{positive, run_folder};
+use crate::arguments::{positive, run_folder, span};
 use crate::outcome::{CommandResult, Outcome};
 use cellpos_session::view::{ViewAddress, Watch};
 use cellpos_units::Seconds;
@@ -43,9 +43,7 @@ pub fn run(args: Args) -> CommandResult {
     let mut watch = Watch::open(&args.run, at)?;
     eprintln!("page, to look: {}", watch.link());
     let start = Instant::now();
-    let limit = args
-        .duration
-        .map(|duration| Duration::from_secs_f64(duration.value()));
+    let limit = args.duration.map(|duration| span(duration));
     while limit.is_none_or(|limit| start.elapsed() < limit) {
         let more = watch.look()?;
         std::thread::sleep(if more { WHILE_FILLING } else { LOOK_EVERY });

@@ -380,3 +380,26 @@ fn a_stop_in_the_first_moments_of_any_command_that_holds_a_rig_is_an_end() {
         }
     }
 }
+
+/// A soak of a night that is ended in the morning says what it has measured.
+#[test]
+fn doctor_that_is_interrupted_says_what_it_has() {
+    let folder = tempfile::tempdir().unwrap();
+    let child = start(folder.path(), "doctor --for 99999999999999999999h --json");
+    let threads = format!("/proc/{}/task", child.id());
+    until("measuring thread", || {
+        let all = std::fs::read_dir(&threads).ok()?;
+        let mut names = all
+            .flatten()
+            .filter_map(|task| std::fs::read_to_string(task.path().join("comm")).ok());
+        names
+            .any(|name| name.trim() == "cellpos-doctor")
+            .then_some(())
+    });
+    tell(&child, Signal::INT);
+    let (out, json) = end(child);
+    assert!(matches!(out.status.code(), Some(0 | 1)), "{out:?}");
+    assert_eq!(json["schema"], "cellpos.doctor", "{out:?}");
+    assert!(json["seconds"].as_f64().unwrap() < PATIENCE.as_secs_f64());
+    assert!(json["wakeups"].as_u64().unwrap() >= 1);
+}

@@ -3,7 +3,7 @@
 use super::suspect::Suspect;
 use super::traced::{LateWindows, Tracing};
 use cellpos_runtime::latency::Quantiles;
-use cellpos_runtime::realtime::{self, Conditions, Request, bare_loop};
+use cellpos_runtime::realtime::{self, Conditions, Request, bare_loop_while};
 use serde::Serialize;
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
@@ -34,8 +34,13 @@ pub struct Soak {
     pub why: Option<String>,
 }
 
-/// Runs the loop. `why`: whether to look at what else runs (ten looks a second, at low priority).
-pub fn soak(request: Request, duration: Duration, why: bool) -> std::io::Result<Soak> {
+/// Runs the loop, until `stop` is raised. `why`: whether to look at what else runs (ten looks a second, at low priority).
+pub fn soak(
+    request: Request,
+    duration: Duration,
+    why: bool,
+    stop: &AtomicBool,
+) -> std::io::Result<Soak> {
     let late = AtomicU64::new(0);
     let done = AtomicBool::new(false);
     let windows = LateWindows::new();
@@ -51,11 +56,12 @@ pub fn soak(request: Request, duration: Duration, why: bool) -> std::io::Result<
             .spawn_scoped(scope, || {
                 let conditions = realtime::apply(&request);
                 let start = Instant::now();
-                let (latency, missed) = bare_loop(duration, |late_ns| {
+                let (latency, missed) = bare_loop_while(duration, |late_ns| {
                     if late_ns > LATE_NS {
                         late.fetch_add(1, Ordering::Relaxed);
                         windows.add(cellpos_rig::clock::monotonic_ns(), late_ns as i64);
                     }
+                    !stop.load(Ordering::Relaxed)
                 });
                 (conditions, latency, missed, start.elapsed().as_secs_f64())
             });

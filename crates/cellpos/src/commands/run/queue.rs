@@ -5,6 +5,7 @@ mod population;
 
 use super::over::Over;
 use super::{Args, fresh, start};
+use crate::arguments::span;
 use crate::outcome::{CommandResult, Failure, Outcome, print_json_of, print_text};
 use cellpos_runtime::life::Refusal;
 use cellpos_script::CycleRow;
@@ -57,7 +58,7 @@ pub(super) fn run(args: &Args, cells: u64) -> CommandResult {
     let mut ended_early = None;
     for number in 1..=cells {
         if number > 1 && live {
-            pause(Duration::from_secs_f64(args.queue.between.value()));
+            pause(span(args.queue.between));
         }
         match queue.cell(args, number, live)? {
             None => {}
