@@ -44,7 +44,7 @@ pub fn quantities() -> impl Iterator<Item = Quantity> {
 /// # Errors
 /// The file cannot be read; a quantity without a unit, or with one of another kind.
 pub fn read<T: DeserializeOwned>(path: &Path) -> Result<T, Failure> {
-    let text = std::fs::read_to_string(path).map_err(|error| {
+    let text = cellpos_table::read_text(path, 16 << 20).map_err(|error| {
         Failure::bad_input(
             format!("{}: {error}", path.display()),
             "give the path of a TOML file",

@@ -65,6 +65,9 @@ fn replace(
     })
 }
 
+/// More than any record of a day has, bytes.
+pub const MOST_OF_A_RECORD: u64 = 32 << 30;
+
 /// Reads a text file that a person or a program has written, and nothing else: a device that never ends is refused, and so
 /// is more than `most` bytes. A pipe is read up to its end.
 ///
@@ -90,7 +93,8 @@ pub fn read_text(path: &Path, most: u64) -> io::Result<String> {
         let text = format!("is larger than {} MB: not a file of this kind", most >> 20);
         return Err(io::Error::other(text));
     }
-    String::from_utf8(bytes).map_err(|_| io::Error::other("is not text in UTF-8"))
+    String::from_utf8(bytes)
+        .map_err(|_| io::Error::new(io::ErrorKind::InvalidData, "is not text in UTF-8"))
 }
 
 #[cfg(test)]

@@ -1,7 +1,7 @@
 //! The record: step, command, position.
 
 use crate::error::{Problem, TableError};
-use crate::file::write_atomically;
+use crate::file::{MOST_OF_A_RECORD, read_text, write_atomically};
 use crate::mapping::{Gaps, Mapping};
 use crate::sampling;
 use crate::table::Table;
@@ -91,8 +91,10 @@ impl Record {
             line: None,
             problem,
         };
-        let bytes = std::fs::read(path).map_err(|source| fail(Problem::Read(source)))?;
-        let text = String::from_utf8(bytes).map_err(|_| fail(Problem::NotText))?;
+        let text = read_text(path, MOST_OF_A_RECORD).map_err(|source| match source.kind() {
+            std::io::ErrorKind::InvalidData => fail(Problem::NotText),
+            _ => fail(Problem::Read(source)),
+        })?;
         Self::parse(path, &text, mapping)
     }
 

@@ -156,6 +156,11 @@ pub fn run(args: Args) -> CommandResult {
     let output = args
         .out
         .unwrap_or_else(|| beside(&args.run, &format!(".{}", format.extension())));
+    let output = if output.as_os_str() == "-" {
+        PathBuf::from("/dev/stdout")
+    } else {
+        output
+    };
     let unreadable = std::mem::take(&mut sessions.unreadable);
     let count = sessions.readers.len();
     let source = sessions.into_source().map_err(Failure::failed)?;
@@ -194,23 +199,32 @@ fn tell(
             "unreadable": unreadable,
         }))?;
     } else {
+        // What goes down a pipe is the export alone.
+        let say = |text: &str| {
+            if is_device(Some(output)) {
+                eprint!("{text}");
+                Ok(())
+            } else {
+                print_text(text)
+            }
+        };
         let of = if sessions > 1 {
             format!(" of {sessions} sessions")
         } else {
             String::new()
         };
-        print_text(&format!("{}: {} rows{of}\n", output.display(), done.rows))?;
+        say(&format!("{}: {} rows{of}\n", output.display(), done.rows))?;
         if missing + damaged + damaged_bytes > 0 {
-            print_text(&format!(
+            say(&format!(
                 "{missing} rows are missing between others; {damaged} rows are damaged or were never written to the disk; \
                  {damaged_bytes} bytes make no sense\n",
             ))?;
         }
         for folder in unreadable {
-            print_text(&format!("left out: {folder}\n"))?;
+            say(&format!("left out: {folder}\n"))?;
         }
         if cut_off > 0 {
-            print_text("the run was cut off: it reads up to its last flush\n")?;
+            say("the run was cut off: it reads up to its last flush\n")?;
         }
     }
     let whole = missing + damaged + damaged_bytes == 0 && unreadable.is_empty();

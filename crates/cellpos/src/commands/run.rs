@@ -302,7 +302,7 @@ fn start(args: &Args, ready: Ready, tell: bool) -> Result<Over, Failure> {
     let root = home.as_ref().map_or(runs.as_path(), |(_, root)| root);
     let ticks = (plan.longest_s() + BEFORE_S) * 1e6 / rig.file().timing.period_us;
     connect::room(root, Some(ticks as u64), &meta)?;
-    let writer = RunWriter::create(root, meta).map_err(Failure::failed)?;
+    let writer = RunWriter::create(root, meta).map_err(Failure::input)?;
     let session = writer.folder().to_owned();
     let folder = home.map_or_else(|| writer.folder().to_owned(), |(folder, _)| folder);
     let sink = sink(writer, &folder, &config, &plan, &setup, &rig)?;

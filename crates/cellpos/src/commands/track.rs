@@ -268,7 +268,7 @@ fn writer(args: &Args, rig: &Rig, setup: &Setup) -> Result<Option<RunWriter>, Fa
     let meta = connect::meta(&args.name, args.clock, &inputs, setup, rig)?;
     let ticks = ticks(args.duration, file.timing.period_us)?;
     connect::room(&args.runs, ticks, &meta)?;
-    let writer = RunWriter::create(&args.runs, meta).map_err(Failure::failed)?;
+    let writer = RunWriter::create(&args.runs, meta).map_err(Failure::input)?;
     Ok(Some(writer))
 }
 

@@ -26,6 +26,17 @@ fn what_cannot_be_right_gets_a_sentence_in_plain_words() {
         ("run one.toml --cells -1", "must not be below zero"),
         ("doctor --for -1s", "--for"),
         ("bundle latest-one --out one.csv/packed", "one.csv"),
+        ("identify --data /dev/zero", "device"),
+        ("reconcile --model eq6 --data /dev/zero", "device"),
+        (
+            "simulate --model eq6 --input /dev/zero --out s.csv",
+            "device",
+        ),
+        ("track --target 0um --duration 1s --rig /dev/zero", "device"),
+        (
+            "track --target 0um --duration 1s --clock virtual --frames off --runs one.csv",
+            "one.csv",
+        ),
     ] {
         std::fs::write(at.join("one.csv"), "").unwrap();
         let ran = cellpos(at, line);
@@ -38,6 +49,22 @@ fn what_cannot_be_right_gets_a_sentence_in_plain_words() {
     }
     let left: Vec<_> = std::fs::read_dir(at).unwrap().flatten().collect();
     assert_eq!(left.len(), 2, "runs and one.csv: {left:?}");
+}
+
+/// On standard output stands what was exported, and nothing else.
+#[cfg(unix)]
+#[test]
+fn an_export_goes_down_a_pipe() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    succeed(
+        at,
+        "track --target 0um --duration 1s --clock virtual --frames off --name one",
+    );
+    for out in ["-", "/dev/stdout"] {
+        let line = format!("export latest-one --out {out} --columns seq --to 2ms");
+        assert_eq!(succeed(at, &line).out, "seq\n0\n1\n2\n");
+    }
 }
 
 /// A page, a table or a model for a device goes to the device.

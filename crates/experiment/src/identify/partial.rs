@@ -59,8 +59,8 @@ pub fn load(path: &Path, plan: &Plan) -> Result<Vec<RecordedSegment>, Failure> {
         Failure::bad_input(format!("{}: {problem}", path.display()), help)
     };
     let help = "give the file that the stopped identification named";
-    let text =
-        std::fs::read_to_string(path).map_err(|e| refuse(format!("cannot read: {e}"), help))?;
+    let text = cellpos_table::read_text(path, cellpos_table::MOST_OF_A_RECORD)
+        .map_err(|e| refuse(format!("cannot read: {e}"), help))?;
     let partial: Partial = serde_json::from_str(&text).map_err(|e| refuse(e.to_string(), help))?;
     if partial.plan != describe(plan) {
         return Err(refuse(

@@ -50,7 +50,7 @@ pub fn read(path: &Path, args: &Args) -> Result<Vec<Source>, Failure> {
 }
 
 fn text_of(path: &Path) -> Result<String, Failure> {
-    std::fs::read_to_string(path).map_err(|error| {
+    cellpos_table::read_text(path, cellpos_table::MOST_OF_A_RECORD).map_err(|error| {
         Failure::bad_input(
             format!("{}: cannot be read ({error})", path.display()),
             "name a record or a run folder",

@@ -96,16 +96,10 @@ fn record_name(path: &Path) -> String {
 
 pub(super) fn read(path: &Path, columns: &Columns) -> Result<Record, Failure> {
     let name = record_name(path);
-    let bytes = std::fs::read(path).map_err(|e| {
+    let text = cellpos_table::read_text(path, cellpos_table::MOST_OF_A_RECORD).map_err(|e| {
         Failure::bad_input(
             format!("cannot read {}: {e}", path.display()),
-            "check --data",
-        )
-    })?;
-    let text = String::from_utf8(bytes).map_err(|_| {
-        Failure::bad_input(
-            format!("{} is not a text file", path.display()),
-            "records are CSV: time_s,pzt_um,bead_um",
+            "check --data; records are CSV: time_s,pzt_um,bead_um",
         )
     })?;
     let table = Table::parse(path, &text).map_err(Failure::input)?;
