@@ -43,7 +43,7 @@ pub fn run(args: Args) -> CommandResult {
     let mut watch = Watch::open(&args.run, at)?;
     eprintln!("page, to look: {}", watch.link());
     let start = Instant::now();
-    let limit = args.duration.map(|duration| span(duration));
+    let limit = args.duration.map(span);
     while limit.is_none_or(|limit| start.elapsed() < limit) {
         let more = watch.look()?;
         std::thread::sleep(if more { WHILE_FILLING } else { LOOK_EVERY });
