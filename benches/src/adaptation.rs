@@ -32,7 +32,7 @@ const ADAPT_S: f64 = 5.0;
 const MEASURE_S: f64 = 10.0;
 
 /// Ms of the linear equivalent of a law tuned to `gain` and `delay` more samples, on a plant of `regime`; infinite if unstable.
-fn effective_ms(config: &LoopConfig, gain: f64, delay_samples: f64, regime: Regime) -> f64 {
+pub fn effective_ms(config: &LoopConfig, gain: f64, delay_samples: f64, regime: Regime) -> f64 {
     let ts = config.model.sample_time_s;
     let model = LoopModel {
         delay_s: config.model.delay_s + delay_samples * ts,
