@@ -19,7 +19,7 @@ const OPEN: [&str; 7] = [
 /// The schema of one value.
 fn infer(value: &Value, key: &str) -> Value {
     match value {
-        Value::Null => json!({ "type": ["null"] }),
+        Value::Null => of_types(&["null".to_owned()]),
         Value::Bool(_) => json!({ "type": ["boolean"] }),
         Value::Number(_) => json!({ "type": ["number"] }),
         Value::String(_) => json!({ "type": ["string"] }),
@@ -47,13 +47,32 @@ fn words(schema: &Value, key: &str) -> Vec<String> {
     list.filter_map(Value::as_str).map(str::to_owned).collect()
 }
 
+/// A schema of these types. Of a value that was null in every run it is not known what else it may be: it is left open.
+fn of_types(types: &[String]) -> Value {
+    if types == ["null"] {
+        json!({ "description": "null in the runs that this was made from, and open" })
+    } else {
+        json!({ "type": types })
+    }
+}
+
+/// The types of a schema that [`of_types`] made.
+fn types(schema: &Value) -> Vec<String> {
+    let types = words(schema, "type");
+    if types.is_empty() {
+        vec!["null".to_owned()]
+    } else {
+        types
+    }
+}
+
 /// What both schemas allow.
 fn merged(a: &Value, b: &Value) -> Value {
-    let mut types = words(a, "type");
-    types.extend(words(b, "type"));
-    types.sort();
-    types.dedup();
-    let mut out = json!({ "type": types });
+    let mut both = types(a);
+    both.extend(types(b));
+    both.sort();
+    both.dedup();
+    let mut out = of_types(&both);
     match (a.get("items"), b.get("items")) {
         (Some(a), Some(b)) => out["items"] = merged(a, b),
         (Some(one), None) | (None, Some(one)) => out["items"] = one.clone(),
@@ -119,6 +138,11 @@ fn folder() -> tempfile::TempDir {
     std::fs::write(folder.path().join("wild.toml"), wild).unwrap();
     let emulated = "[actuator]\nkind = \"emulated\"\n[camera]\nkind = \"emulated\"\n";
     std::fs::write(folder.path().join("emulated.toml"), emulated).unwrap();
+    // A bead that goes the other way: arming refuses it.
+    let plant = "working_point_um = 20.0\n[plant]\nnum = [-400.0]\nden = [1.0, 0.0]\n";
+    std::fs::write(folder.path().join("backwards-plant.toml"), plant).unwrap();
+    let backwards = "[emulator]\nmodel = \"backwards-plant.toml\"\n";
+    std::fs::write(folder.path().join("backwards.toml"), backwards).unwrap();
     folder
 }
 
@@ -153,6 +177,14 @@ fn the_objects_of_quick_commands_fit_their_schemas() {
     for (line, code) in [
         ("track --target 900um", 2),
         ("check wild.toml", 1),
+        (
+            "track --target 0um --duration 2s --clock virtual --frames off --rig backwards.toml",
+            1,
+        ),
+        (
+            "run wave.toml --clock virtual --frames off --rig backwards.toml",
+            1,
+        ),
         ("no-such-command", 2),
     ] {
         let ran = cellpos(at, &format!("{line} --json"));
