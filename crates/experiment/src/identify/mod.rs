@@ -9,6 +9,7 @@ use cellpos_ident::experiment::{Cause, Measured, Plan, RecordedSegment, Turn};
 use cellpos_ident::frequency_response::Settings;
 use cellpos_ident::summary::{Identification, summarise};
 use cellpos_plant::Hertz;
+use cellpos_runtime::SafeReason;
 use cellpos_runtime::life::Refusal;
 use cellpos_session::view::Pages;
 use cellpos_session::{Ended, Failure};
@@ -302,7 +303,8 @@ fn on_rig(
 /// Whether another run may go well without anybody's doing: a stall may be over, and where a bead was held before, the next
 /// one comes as that one did.
 fn may_go_on(ended: &Ended, had_bead: bool) -> bool {
-    ended.may_pass() || had_bead && ended.refusal == Some(Refusal::NoBead)
+    let lost = ended.refusal == Some(Refusal::NoBead) || ended.reason == Some(SafeReason::BeadLost);
+    ended.may_pass() || had_bead && lost
 }
 
 /// Segments that are not measured yet. One that was spoilt once may have met with a stall and is run as it is planned; spoilt
