@@ -8,6 +8,8 @@ use std::time::Instant;
 
 const FRAMES: usize = 2000;
 const EMPTY: usize = 100;
+const WIDTH: usize = 256;
+const HEIGHT: usize = 96;
 
 /// A frame and what it shows: place, length and area, px.
 struct Scene {
@@ -22,7 +24,7 @@ fn main() {
         "optimised build"
     };
     println!(
-        "conditions: emulated frames of 256 x 64 px with walls, cell of 40 px at rest, contrast 80, noise 1.9 grey levels,\n\
+        "conditions: emulated frames of {WIDTH} x {HEIGHT} px with walls, cell of 40 px at rest, contrast 80, noise 1.9 grey levels,\n\
          \x20           background of {EMPTY} frames, {FRAMES} frames each, one thread, {build}"
     );
     println!(
@@ -33,11 +35,12 @@ fn main() {
         let config = world(stretch);
         let scenes = scenes(&config, stretch);
         let empty = World::empty_frames(&config, EMPTY).expect("a valid world");
-        let mut finder = CellFinder::new(256, 64, Default::default()).expect("valid settings");
+        let mut finder =
+            CellFinder::new(WIDTH, HEIGHT, Default::default()).expect("valid settings");
         for pixels in &empty {
             finder.take_background(&frame(pixels)).expect("one size");
         }
-        let mean: Vec<f64> = (0..256 * 64)
+        let mean: Vec<f64> = (0..WIDTH * HEIGHT)
             .map(|k| empty.iter().map(|p| f64::from(p[k])).sum::<f64>() / EMPTY as f64)
             .collect();
         let threshold = 5.0 * finder.noise_grey();
@@ -59,8 +62,8 @@ fn main() {
 
 fn frame(pixels: &[u8]) -> Frame<'_> {
     Frame {
-        width: 256,
-        height: 64,
+        width: WIDTH,
+        height: HEIGHT,
         pixels: Pixels::Mono8(pixels),
     }
 }
@@ -69,7 +72,7 @@ fn frame(pixels: &[u8]) -> Frame<'_> {
 fn world(stretch: f64) -> WorldConfig {
     WorldConfig {
         pixel_um: 0.2,
-        height_px: 64,
+        height_px: HEIGHT as u16,
         cell: Some(CellConfig {
             entry_um: -1000.0,
             stretch_first: stretch,
@@ -107,7 +110,7 @@ fn thresholded(pixels: &[u8], mean: &[f64], threshold: f64) -> Option<[f64; 3]> 
     let [mut n, mut sx, mut sxx] = [0.0; 3];
     for (k, (p, m)) in pixels.iter().zip(mean).enumerate() {
         if (f64::from(*p) - m).abs() > threshold {
-            let x = (k % 256) as f64;
+            let x = (k % WIDTH) as f64;
             n += 1.0;
             sx += x;
             sxx += x * x;

@@ -17,8 +17,8 @@ const SETTLED_PX: f64 = 0.005;
 /// A shift up to here is told by the slopes at rest, px: it is none where it is below this share of the least one, or leaves more
 /// than this share of the squares.
 const LINEAR_PX: f64 = 0.5;
-const STILL: f64 = 0.8;
-const ALIKE: f64 = 0.96;
+const STILL: f64 = 0.5;
+const ALIKE: f64 = 0.99;
 /// A shift is believed when it leaves at most this share of the squares, each counted up to so many standard deviations.
 const BETTER: f64 = 0.9;
 const MOST_OFF: f64 = 20.0;
@@ -52,6 +52,8 @@ struct Step {
     px: (f64, f64),
     /// Standard deviations of the shift.
     sd: (f64, f64),
+    /// What pixels differ by, grey levels, at least the noise.
+    spread: f64,
     /// What a pixel of the background differs by at most.
     limit: f64,
 }
@@ -93,7 +95,8 @@ impl Sums {
         }
         let most = |v: f64| v.clamp(-1.0, 1.0);
         let spread = 1.25 * self.off / self.n;
-        let variance = spread.max(noise).powi(2);
+        let least_spread = spread.max(noise);
+        let variance = least_spread * least_spread;
         Some(Step {
             px: (
                 most((rx * yy - ry * xy) / determinant),
@@ -103,6 +106,7 @@ impl Sums {
                 (variance * yy / determinant).sqrt(),
                 (variance * xx / determinant).sqrt(),
             ),
+            spread: least_spread,
             limit: (8.0 * spread).max(4.0 * noise),
         })
     }
@@ -227,7 +231,9 @@ impl Background {
                 break;
             }
         }
-        let small = |d: f64, sd: f64| d.abs() < STILL * LEAST.0.max(LEAST.1 * sd);
+        // By the noise alone: objects, and a shift that has not been made good, count as spread.
+        let own = noise / last.spread;
+        let small = |d: f64, sd: f64| d.abs() < STILL * LEAST.0.max(LEAST.1 * own * sd);
         if f64::hypot(at.0, at.1) < LINEAR_PX {
             let left = Sums::of(slopes, at, last.limit, noise).clipped;
             if small(at.0, last.sd.0) && small(at.1, last.sd.1) || left > ALIKE * unmoved.clipped {

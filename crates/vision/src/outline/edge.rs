@@ -28,8 +28,25 @@ const REACH_PX: f64 = 4.5;
 const ROUGHLY: (f64, f64) = (4.0, 0.5);
 /// Widths of the blur that are tried, px.
 const BLURS_PX: [f64; 5] = [0.7, 1.0, 1.4, 2.0, 2.8];
-/// First step (px), factor of the blur and stride of the values about the best of a search.
-const NEAR: (f64, f64, usize) = (0.5 * FINE_PX, 1.19, 1);
+/// About the best of those tried; from a start that is guessed; about the best of that.
+const NEAR: Search = Search {
+    step_px: 0.5 * FINE_PX,
+    factor: 1.19,
+    stride: 1,
+    rounds: 3,
+};
+const COARSE: Search = Search {
+    step_px: FINE_PX,
+    factor: 1.2,
+    stride: 2,
+    rounds: 3,
+};
+const FINE: Search = Search {
+    step_px: 0.25 * FINE_PX,
+    factor: 1.1,
+    stride: 1,
+    rounds: 1,
+};
 /// What a blurred step with lobes and rim may leave of the profile (RMS share): up to here its middle alone counts, from
 /// there on it does not.
 const MODEL_LEFT: (f64, f64) = (0.02, 0.04);
@@ -40,9 +57,7 @@ const WIDTHS: [(f64, With); 2] = [(1.9, With::LobesAndRim), (2.9, With::Rim)];
 /// Squares that a plain step leaves, over those that one with lobes leaves: up to here there are no lobes, from there on
 /// there are.
 const PLAIN: (f64, f64) = (4.0, 12.0);
-/// Rounds in which the best of them is refined, how far the lowest point of a parabola may lie, in steps, and by how much the next
-/// round is closer.
-const ROUNDS: usize = 3;
+/// How far the lowest point of a parabola may lie, in steps, and by how much the next round is closer.
 const FARTHEST: f64 = 1.5;
 const CLOSER: f64 = 0.3;
 
@@ -214,11 +229,11 @@ impl Profile {
                 blur_px: width_px / widths,
                 ..PhaseEdge::NONE
             };
-            let coarse = self.refined(shapes, start, with, (FINE_PX, 1.2, 2));
+            let coarse = self.refined(shapes, start, with, COARSE);
             if coarse.left > ROUGHLY.0 * MODEL_LEFT.1 * MODEL_LEFT.1 * power {
                 return coarse;
             }
-            self.refined(shapes, coarse, with, (0.25 * FINE_PX, 1.1, 1))
+            self.refined(shapes, coarse, with, FINE)
         });
         let [lobes, plain] = tried;
         let within =
@@ -290,22 +305,16 @@ impl Profile {
         best
     }
 
-    /// The best about a start, by parabolas over place and logarithm of the blur: `step_px` and `factor` to either side, by every
-    /// `stride`th value, and closer by once one lies between.
-    fn refined(
-        &self,
-        shapes: &Shapes,
-        start: PhaseEdge,
-        with: With,
-        (mut step_px, factor, stride): (f64, f64, usize),
-    ) -> PhaseEdge {
-        let mut wider = factor.ln();
+    /// The best about a start, by parabolas over place and logarithm of the blur, closer by once one lies between.
+    fn refined(&self, shapes: &Shapes, start: PhaseEdge, with: With, search: Search) -> PhaseEdge {
+        let (mut step_px, mut wider) = (search.step_px, search.factor.ln());
+        let stride = search.stride;
         let at = |from: &PhaseEdge, (i, j): (f64, f64), (step_px, wider): (f64, f64)| {
             let place = (from.at_px + i * step_px, from.blur_px * (j * wider).exp());
             self.phase_edge_at(shapes, place, stride, with)
         };
         let mut best = self.phase_edge_at(shapes, (start.at_px, start.blur_px), stride, with);
-        for _ in 0..ROUNDS {
+        for _ in 0..search.rounds {
             let (from, steps) = (best, (step_px, wider));
             let [left, right, narrow, wide, corner] =
                 [(-1.0, 0.0), (1.0, 0.0), (0.0, -1.0), (0.0, 1.0), (1.0, 1.0)]
@@ -442,6 +451,17 @@ impl Sums {
             lobes,
         }
     }
+}
+
+/// How the best step about a start is looked for.
+#[derive(Debug, Clone, Copy)]
+struct Search {
+    /// First steps to either side: of the place, and factor of the blur.
+    step_px: f64,
+    factor: f64,
+    /// Every which value of the profile counts.
+    stride: usize,
+    rounds: usize,
 }
 
 /// What is fitted beside the step.
