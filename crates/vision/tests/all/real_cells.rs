@@ -227,8 +227,13 @@ fn faint_cells_stay_whole_and_have_the_area_that_the_file_says() {
         .zip(file_x)
         .map(|((_, c, _), x)| (c.unwrap().x_px - x).abs())
         .collect();
+    let file_y = [
+        20.025, 20.026, 20.234, 19.054, 19.183, 20.124, 20.285, 18.785,
+    ];
+    let across = pairs.iter().zip(file_y);
+    let across: Vec<f64> = across.map(|((_, c, _), y)| c.unwrap().y_px - y).collect();
     println!(
-        "along the channel {:.2} px from the file's places",
+        "from the file's places: along the channel {:.2} px, across it {across:.2?} px",
         median(&away)
     );
     assert!(away.iter().all(|away| *away <= 0.3), "{away:?}");
