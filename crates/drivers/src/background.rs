@@ -40,7 +40,7 @@ pub enum BackgroundError {
     /// Something moved.
     #[error(
         "{from}: frame {frame} differs from the others by {area_px:.0} px about x = {x_px:.0}, y = {y_px:.0} px: the channel \
-         was not empty, or the light changed"
+         was not empty, the light changed, or the pictures were compressed with loss"
     )]
     NotEmpty {
         /// Where the frames come from.
