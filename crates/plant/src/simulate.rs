@@ -3,10 +3,11 @@
 //! Delay and exposure are exact: the chain is stopped at the very instants that a frame sees, and the exposure is the
 //! integral of the position in closed form. Nothing is interpolated.
 
+mod camera;
+
 use crate::chain::{Chain, ChainError, in_range};
-use crate::effects::{Action, Shown};
 use crate::model::Model;
-use crate::random::Gaussian;
+use camera::Camera;
 
 /// On which side of the command a row's position is taken, where the two coincide.
 ///
@@ -61,76 +62,6 @@ pub enum SimulateError {
         /// Number of displacements.
         commands: usize,
     },
-}
-
-/// The camera's part of a model.
-#[derive(Debug, Clone)]
-struct Camera {
-    delay_s: f64,
-    exposure_s: f64,
-    /// `t' = (1 + skew) t`.
-    skew: f64,
-    /// What light, table and sensor make of a position.
-    shown: Vec<Box<dyn Shown>>,
-    localisation_um: f64,
-    noise: Option<Gaussian>,
-}
-
-impl Camera {
-    fn new(model: &Model, seed: Option<u64>) -> Result<Self, ChainError> {
-        in_range(
-            "localisation_um",
-            model.noise.localisation_um,
-            "um",
-            0.0,
-            100.0,
-        )?;
-        let mut camera = Self {
-            delay_s: 0.0,
-            exposure_s: 0.0,
-            skew: 0.0,
-            shown: Vec::new(),
-            localisation_um: model.noise.localisation_um,
-            // A stream of its own, so that the Brownian path does not depend on the camera.
-            noise: seed.map(|s| Gaussian::new(s ^ 0x9e37_79b9_7f4a_7c15)),
-        };
-        let mut exposures = 0;
-        for effect in model.ordered_effects() {
-            match effect.act() {
-                Action::Delay(s) => camera.delay_s += s,
-                Action::Exposure(s) => {
-                    camera.exposure_s = s;
-                    exposures += 1;
-                }
-                Action::Skew(e) => camera.skew += e,
-                Action::Show(mut shown) => {
-                    if let Some(seed) = seed {
-                        shown.seed(seed ^ 0xd1b5_4a32_d192_ed03);
-                    }
-                    camera.shown.push(shown);
-                }
-                _ => {}
-            }
-        }
-        if exposures > 1 {
-            return Err(ChainError::Repeated {
-                id: "exposure-averaging",
-            });
-        }
-        Ok(camera)
-    }
-
-    /// From the position that the frame saw to the recorded one.
-    fn record(&mut self, seen_um: f64, time_s: f64) -> f64 {
-        let mut y = seen_um;
-        for shown in &mut self.shown {
-            y = shown.show(y, time_s);
-        }
-        if let Some(noise) = &mut self.noise {
-            y += self.localisation_um * noise.next_normal();
-        }
-        y
-    }
 }
 
 /// An instant that lies `whole` samples and `part_s` before a row's time.

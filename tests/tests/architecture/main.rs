@@ -203,14 +203,6 @@ fn no_files_of_a_crate_stand_in_a_circle() {
 /// Longest file, lines: what a reader takes in as one thing.
 const MOST_LINES: usize = 500;
 
-/// Files that are longer and wait to be taken apart: none may join them.
-const LONG: [&str; 4] = [
-    "crates/cellpos/src/commands/report.rs",
-    "crates/drivers/tests/all/recordings.rs",
-    "crates/plant/src/simulate.rs",
-    "crates/record/tests/all/run.rs",
-];
-
 #[test]
 fn no_file_is_longer_than_a_reader_takes_in() {
     let mut files = vec![];
@@ -221,7 +213,6 @@ fn no_file_is_longer_than_a_reader_takes_in() {
         .iter()
         .map(|file| file.strip_prefix(root()).unwrap())
         .filter(|file| !file.iter().any(|part| part == "target"))
-        .filter(|file| !LONG.iter().any(|known| file.ends_with(known)))
         .filter_map(|file| {
             let text = std::fs::read_to_string(root().join(file)).unwrap();
             let lines = text.lines().count();

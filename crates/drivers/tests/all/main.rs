@@ -1,6 +1,7 @@
 //! Cameras and recordings as sources of positions.
 
 mod fake_camera;
+mod published;
 mod recordings;
 #[cfg(feature = "hdf5")]
 mod rtdc;

@@ -2,4 +2,5 @@
 
 mod docs;
 mod exports;
+mod own_columns;
 mod run;
