@@ -251,7 +251,7 @@ fn no_test_that_lacks_its_records_is_green() {
         let names = |line: &str| {
             line.contains(concat!("../shared", "/data")) && !line.contains("ignore = ")
         };
-        if !at.ends_with("build/measured_data.rs") && text.lines().any(|line| names(line)) {
+        if !at.ends_with("build/measured_data.rs") && text.lines().any(names) {
             wrong.push(format!(
                 "{at}: takes records from beside the project, where they may not be"
             ));
