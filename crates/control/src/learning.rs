@@ -2,7 +2,7 @@
 //!
 //! Each harmonic `h` of the addition `u_L = sum_h Re(theta_h e^(j 2 pi h phase))` is estimated, not descended to. While the
 //! addition is steady the error at the harmonic is `d + T theta` with the response `T` of the closed loop, and noise; a
-//! stretch of ticks gives its phasor `r` with the variance that the noise of the stretch leaves it ([`evidence`]). Then
+//! stretch of ticks gives its phasor `r` with the variance that the noise of the stretch leaves it (`learning/evidence.rs`). Then
 //! `theta -= K r / T` with Kalman's `K = P / (P + R)`: nearly 1 while what is there is far above the noise, falling as 1/cycles
 //! after that, `P` growing with each correction by what `T` is uncertain. The error is that at the exposure's own time stamp,
 //! so neither a wrong gain nor a wrong delay of the loop's model remains in the result; a time stamp that is itself wrong cannot
