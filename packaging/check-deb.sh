@@ -9,7 +9,8 @@ root=$(mktemp -d)
 copy=$(mktemp -d)
 trap 'rm -rf "$root"; rmdir "$copy"' EXIT
 dpkg-deb --extract "$deb" "$root"
-dpkg-deb --info "$deb" | grep -q 'Package: cellpos'
+# (What is read whole before it is looked at does not end by a closed pipe.)
+grep -q 'Package: cellpos' <<< "$(dpkg-deb --info "$deb")"
 fail() { echo "check-deb: $1" >&2; exit 1; }
 for program in cellpos firmware-sim; do
     file="$root/usr/bin/$program"
@@ -18,7 +19,7 @@ for program in cellpos firmware-sim; do
     [ "$size" -le 20971520 ] || fail "$program has $size bytes, more than 20 MB"
     echo "$program: $size bytes"
 done
-"$root/usr/bin/cellpos" --version | grep -Eq '^cellpos [0-9.]+ \(.+\)$' || fail "--version names no commit"
+grep -Eq '^cellpos [0-9.]+ \(.+\)$' <<< "$("$root/usr/bin/cellpos" --version)" || fail "--version names no commit"
 for command in $("$root/usr/bin/cellpos" --help | sed -n '/^Commands:/,/^$/p' | awk 'NR > 1 && NF { print $1 }'); do
     [ "$command" = help ] || [ -f "$root/usr/share/man/man1/cellpos-$command.1.gz" ] || fail "no manual page of $command"
 done
@@ -46,10 +47,10 @@ installed() {
     cp "$deb" "$copy/root/tmp/cellpos.deb"
     inside() { chroot "$copy/root" env -i PATH=/usr/sbin:/usr/bin:/sbin:/bin HOME=/root "$@"; }
     inside dpkg --install /tmp/cellpos.deb >/dev/null
-    inside dpkg --status cellpos | grep -q '^Status: install ok installed'
+    grep -q '^Status: install ok installed' <<< "$(inside dpkg --status cellpos)"
     inside cellpos --version
     inside getent group realtime >/dev/null
-    inside id cellpos | grep -q realtime
+    grep -q realtime <<< "$(inside id cellpos)"
     inside sh -c 'cd /tmp && cellpos track --target 0um --duration 1s --clock virtual --frames off && cellpos report latest' >/dev/null
     inside dpkg --install /tmp/cellpos.deb >/dev/null
     inside dpkg --purge cellpos >/dev/null
