@@ -5,7 +5,8 @@
 //! makes positions a random walk; a doublet, because it leaves the bead where it was. Of a bead that is
 //! farther from position 0 than the doublet moves it, the first half goes towards 0, so that one at the border of the view stays
 //! in it. Increments near a skipped tick or a late frame are the answer to another pulse and are left
-//! out; where what is left refuses the plant, or cannot tell, the pulse is made again and fitted together with the ones before.
+//! out as long as enough are left; where they refuse the plant, or cannot tell, the pulse is made again and fitted together
+//! with the ones before.
 
 use crate::life::Refusal;
 use cellpos_plant::{DiscretePlant, PlantError, TransferFunction};
@@ -101,10 +102,12 @@ pub struct ArmingState {
     last: Option<(u32, f64)>,
     /// Ticks in a row without a frame.
     silent: u32,
-    /// Increments of all pulses.
-    sums: Sums,
-    /// Tick of the pulse at which time last did not pass as planned.
+    /// Increments of all pulses, and those that nothing disturbed.
+    all: Sums,
+    calm: Sums,
+    /// Tick of the pulse at which time last did not pass as planned, and how many such ticks it has had.
     disturbed_at: Option<u32>,
+    disturbances: u32,
     /// Pulses made again.
     repeated: u32,
 }
@@ -260,13 +263,14 @@ impl Arming {
         state.pulse = Some(tick);
         if input.disturbed {
             state.disturbed_at = Some(tick);
+            state.disturbances += 1;
         }
         self.take(state, input, tick);
         match self.program_um.get(tick as usize) {
             Some(offset_um) => Step::Command(state.base_um + state.way() * offset_um),
             None => {
-                let verdict = self.judge(state);
-                let doubtful = !verdict.sure || state.disturbed_at.is_some();
+                let verdict = self.judge(state, tick);
+                let doubtful = !verdict.sure || state.disturbances > 0;
                 if verdict.refusal.is_none() || !doubtful || state.repeated >= MOST_REPEATED {
                     return Step::Done(verdict);
                 }
@@ -274,7 +278,8 @@ impl Arming {
                 *state = ArmingState {
                     repeated: state.repeated + 1,
                     seen: true,
-                    sums: state.sums,
+                    all: state.all,
+                    calm: state.calm,
                     ..ArmingState::default()
                 };
                 Step::Again(base_um, verdict)
@@ -299,27 +304,40 @@ impl Arming {
         let disturbed = state
             .disturbed_at
             .is_some_and(|at| at + self.settling_ticks > from);
-        if let (Some(from_um), Some(to_um)) = (expected_um(from), expected_um(tick))
-            && !disturbed
-        {
-            state
-                .sums
-                .add(state.way() * (to_um - from_um), now_um - before_um);
+        if let (Some(from_um), Some(to_um)) = (expected_um(from), expected_um(tick)) {
+            let (x, y) = (state.way() * (to_um - from_um), now_um - before_um);
+            state.all.add(x, y);
+            if !disturbed {
+                state.calm.add(x, y);
+            }
         }
     }
 
-    /// Straight-line fit of the increments.
-    fn judge(&self, state: &ArmingState) -> Verdict {
-        let s = &state.sums;
+    /// What the pulses up to a tick of the present one tell: from the increments that nothing disturbed, or from all where those
+    /// are too few.
+    fn judge(&self, state: &ArmingState, tick: u32) -> Verdict {
+        if let Some(verdict) = self.fitted(&state.calm) {
+            return verdict;
+        }
+        let Some(verdict) = self.fitted(&state.all) else {
+            return Verdict::unmeasured(Some(Refusal::NoBead));
+        };
+        // A path that is always late delays the answer and leaves its size; one that is late now and then may do anything to it.
+        let always = state.disturbances + self.settling_ticks >= tick;
+        match verdict.refusal {
+            Some(_) if !always => Verdict::unmeasured(Some(Refusal::Disturbed)),
+            _ => verdict,
+        }
+    }
+
+    /// Straight-line fit of increments; none where they are too few.
+    fn fitted(&self, s: &Sums) -> Option<Verdict> {
         let sxx = s.xx - s.x * s.x / s.n.max(1.0);
         let sxy = s.xy - s.x * s.y / s.n.max(1.0);
         let syy = s.yy - s.y * s.y / s.n.max(1.0);
         // Half of a pulse must have been seen, or the ratio means nothing.
         if s.n < f64::from(self.config.pulse_ticks) || sxx.is_nan() || sxx <= 0.0 {
-            return Verdict::unmeasured(Some(match state.disturbed_at {
-                Some(_) => Refusal::Disturbed,
-                None => Refusal::NoBead,
-            }));
+            return None;
         }
         let gain_ratio = sxy / sxx;
         let variance = ((syy - gain_ratio * sxy) / (s.n - 2.0).max(1.0)).max(0.0);
@@ -336,12 +354,12 @@ impl Arming {
         } else {
             (None, true)
         };
-        Verdict {
+        Some(Verdict {
             gain_ratio,
             ci95,
             refusal,
             sure,
-        }
+        })
     }
 }
 

@@ -179,6 +179,56 @@ fn what_cannot_be_told_for_stalls_is_said_of_the_stalls_and_not_of_the_plant() {
 }
 
 #[test]
+fn frames_that_are_always_late_are_no_reason_to_refuse_and_hide_no_wrong_plant() {
+    for (factor, refusal) in [
+        (1.0, None),
+        (-1.0, Some(Refusal::WrongSign)),
+        (4.0, Some(Refusal::WrongGain)),
+        (0.0, Some(Refusal::NoResponse)),
+    ] {
+        let (mut truth, mut state) = late_by_two(factor);
+        let verdict = loop {
+            match truth(&mut state) {
+                Step::Done(verdict) => break verdict,
+                Step::Command(_) | Step::Again(..) => {}
+            }
+        };
+        assert_eq!(verdict.refusal, refusal, "{factor}: {verdict:?}");
+    }
+}
+
+/// A plant whose frames come two ticks later than the model says, each told as late: a tick of arming at each call.
+fn late_by_two(factor: f64) -> (impl FnMut(&mut ArmingState) -> Step, ArmingState) {
+    let late = Seconds(DELAY.value() + 2e-3);
+    let plant = DiscretePlant::new(&TransferFunction::eq6(), SAMPLE, late).expect("eq6");
+    let arming = Arming::new(
+        ArmingConfig::default(),
+        &TransferFunction::eq6(),
+        SAMPLE,
+        DELAY,
+    )
+    .expect("eq6");
+    let (mut truth, mut command) = (plant.state(0.0), 20.0);
+    let tick = move |state: &mut ArmingState| {
+        let input = ArmingInput {
+            position_um: Some(factor * plant.output_um(&truth)),
+            framed: true,
+            command_um: command,
+            neutral_um: 20.0,
+            disturbed: true,
+            steps: 1,
+        };
+        let step = arming.step(state, &input);
+        if let Step::Command(next) | Step::Again(next, _) = step {
+            command = next;
+        }
+        plant.step(&mut truth, command - 20.0);
+        step
+    };
+    (tick, ArmingState::default())
+}
+
+#[test]
 fn a_bead_that_jitters_too_much_for_one_pulse_is_told_by_several() {
     let arming = Arming::new(
         ArmingConfig::default(),

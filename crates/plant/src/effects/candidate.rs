@@ -117,6 +117,20 @@ impl Candidate {
         }
     }
 
+    /// The same beside a model of the slow and one of the fast gain, see [`super::Form::anchored`].
+    pub const fn anchored(self) -> [Self; 2] {
+        [
+            Self {
+                name: "slow-gain",
+                ..self
+            },
+            Self {
+                name: "fast-gain",
+                ..self
+            },
+        ]
+    }
+
     /// The same with the range of its first number that real rigs show.
     pub const fn typical(self, low: f64, high: f64) -> Self {
         Self {

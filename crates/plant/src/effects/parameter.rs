@@ -69,6 +69,21 @@ impl Form {
             lists: &[],
         }
     }
+
+    /// The two forms of an effect that changes slow motion against fast: beside a model whose gain is that of slow motion (the
+    /// first, and the default in files), and beside one whose gain is that of fast motion.
+    pub const fn anchored(scalars: &'static [ParameterSpec]) -> [Self; 2] {
+        [
+            Self {
+                name: "slow-gain",
+                ..Self::only(scalars)
+            },
+            Self {
+                name: "fast-gain",
+                ..Self::only(scalars)
+            },
+        ]
+    }
 }
 
 /// A parameter that an effect does not have, or a value that it cannot take.

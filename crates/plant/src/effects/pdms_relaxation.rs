@@ -49,18 +49,7 @@ static SPEC: Spec = Spec {
     equation: "(1 + (1 + strength) time s)/(1 + time s), over 1 + strength where the model's gain is that of fast motion",
     signature: "a step in gain with a phase bump at 1/(2 pi time), in proportion to the amplitude",
     ahead_of_plant: false,
-    forms: &[
-        Form {
-            name: "slow-gain",
-            scalars: NUMBERS,
-            lists: &[],
-        },
-        Form {
-            name: "fast-gain",
-            scalars: NUMBERS,
-            lists: &[],
-        },
-    ],
+    forms: &Form::anchored(NUMBERS),
     confused_with: &["pzt-creep", "leak", "gain-error"],
     inseparable_from: &[],
     experiment: Experiment::Slow,
@@ -82,16 +71,7 @@ impl EffectKind for PdmsRelaxation {
     }
 
     fn candidates(&self) -> &'static [Candidate] {
-        const ALL: &[Candidate] = &[
-            Candidate {
-                name: "slow-gain",
-                ..FREE
-            },
-            Candidate {
-                name: "fast-gain",
-                ..FREE
-            },
-        ];
+        const ALL: &[Candidate] = &FREE.anchored();
         ALL
     }
 

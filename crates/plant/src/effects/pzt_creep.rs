@@ -43,18 +43,7 @@ static SPEC: Spec = Spec {
     equation: "x = x0 (1 + g log10(t/0.1 s)) after a step; t/1 ms where the model's gain is that of fast motion",
     signature: "a tail in the logarithm of time that flips with the sign of the step; a constant phase of about -39 g deg",
     ahead_of_plant: false,
-    forms: &[
-        Form {
-            name: "slow-gain",
-            scalars: NUMBERS,
-            lists: &[],
-        },
-        Form {
-            name: "fast-gain",
-            scalars: NUMBERS,
-            lists: &[],
-        },
-    ],
+    forms: &Form::anchored(NUMBERS),
     confused_with: &["pdms-relaxation", "leak", "pzt-hysteresis"],
     inseparable_from: &[],
     experiment: Experiment::Slow,
@@ -75,16 +64,7 @@ impl EffectKind for PztCreep {
     }
 
     fn candidates(&self) -> &'static [Candidate] {
-        const ALL: &[Candidate] = &[
-            Candidate {
-                name: "slow-gain",
-                ..FREE
-            },
-            Candidate {
-                name: "fast-gain",
-                ..FREE
-            },
-        ];
+        const ALL: &[Candidate] = &FREE.anchored();
         ALL
     }
 
