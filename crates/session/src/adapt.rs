@@ -74,8 +74,10 @@ pub(crate) fn sentence(kind: &EventKind) -> String {
         parts.push(format!("delay {way} by {:.2} ms", more_ms.abs()));
     }
     let hint = match (gain_changed, ratio < 1.0) {
-        (true, true) => "; is the channel clogging?",
-        (true, false) => "; has a constriction opened, or the bead moved to the middle?",
+        (true, true) => "; is the channel clogging, or does a pump or the mains shake the bead?",
+        (true, false) => {
+            "; has a constriction opened, the bead moved to the middle, or does a pump or the mains shake it?"
+        }
         (false, _) => "; does the camera or the amplifier take longer than the rig file says?",
     };
     let what = parts.join(", ");
@@ -107,7 +109,7 @@ mod tests {
     fn a_change_reads_as_a_sentence() {
         assert_eq!(
             told([1.0, 0.7], 0.0, 40.0, false),
-            "Gain fell to 0.70 over 40.0 s: adapted; is the channel clogging?"
+            "Gain fell to 0.70 over 40.0 s: adapted; is the channel clogging, or does a pump or the mains shake the bead?"
         );
         assert_eq!(
             told([1.0, 1.04], 1.0, 0.5, false),

@@ -140,12 +140,35 @@ fn a_run_that_ended_because_the_line_stalled_is_gone_on_with() {
 }
 
 #[test]
-fn an_identification_stopped_by_a_lost_bead_keeps_its_segments_and_goes_on_from_them() {
+fn an_identification_goes_on_with_the_bead_that_comes_after_one_that_was_lost_for_good() {
+    let folder = tempfile::tempdir().unwrap();
+    rig(
+        folder.path(),
+        "rig.toml",
+        "[emulator.faults]\nevent = [{ kind = \"lose-bead\", at_s = 17.0 }]\n",
+    );
+    let ran = succeed(
+        folder.path(),
+        &format!("identify --rig rig.toml --seed 2 {FEW}"),
+    );
+    let r = ran.json();
+    assert!((gain(&r) / TRUE_GAIN_PER_S - 1.0).abs() < 0.02, "{r}");
+    assert_eq!(r["frequencies"].as_array().unwrap().len(), 5);
+    let told = "the bead was not seen for longer";
+    assert!(
+        ran.err.contains(told) && ran.err.contains("measuring again"),
+        "{}",
+        ran.err
+    );
+}
+
+#[test]
+fn an_identification_stopped_by_a_lost_camera_keeps_its_segments_and_goes_on_from_them() {
     let folder = tempfile::tempdir().unwrap();
     rig(
         folder.path(),
         "bad.toml",
-        "[emulator.faults]\nevent = [{ kind = \"lose-bead\", at_s = 17.0 }]\n",
+        "[emulator.faults]\nevent = [{ kind = \"drop-frames\", at_s = 17.0 }]\n",
     );
     rig(folder.path(), "good.toml", "[emulator]\nseed = 2\n");
     let ran = cellpos(
@@ -155,8 +178,7 @@ fn an_identification_stopped_by_a_lost_bead_keeps_its_segments_and_goes_on_from_
     assert_eq!(ran.code, Some(1), "{}\n{}", ran.out, ran.err);
     let text = message(&ran);
     assert!(
-        text.contains("the bead was not seen for longer")
-            && text.contains("3 of 5 segments are kept"),
+        text.contains("no frames came for longer") && text.contains("3 of 5 segments are kept"),
         "{text}"
     );
     assert!(text.contains("--resume m.partial.json"), "{text}");
