@@ -30,6 +30,7 @@ pub mod design;
 mod deviation;
 mod error;
 mod estimator;
+mod exposure;
 mod feedforward;
 pub mod law;
 pub mod learning;

@@ -18,32 +18,47 @@ fn run_disturbed(
     blind: impl Fn(u32) -> bool,
     skipped: impl Fn(u32) -> u32,
 ) -> (Verdict, f64, u32) {
+    let seen = |tick: u32, um: f64| {
+        let jitter =
+            0.02 * (f64::from(tick.wrapping_mul(2_654_435_761)) / f64::from(u32::MAX) - 0.5);
+        let position = factor * um + 0.01 * f64::from(tick) + jitter;
+        (!blind(tick)).then_some(position)
+    };
+    arm(config, DELAY, seen, |tick| {
+        (skipped(tick), skipped(tick) > 0)
+    })
+}
+
+/// Arms Eq. (6) behind a true delay. `seen`: the position that tick makes of the plant's, um; `time`: ticks skipped before
+/// a tick, and whether it is told as disturbed. Gives the verdict, how far the PZT went, um, and the pulses made again.
+fn arm(
+    config: ArmingConfig,
+    delay: Seconds,
+    mut seen: impl FnMut(u32, f64) -> Option<f64>,
+    time: impl Fn(u32) -> (u32, bool),
+) -> (Verdict, f64, u32) {
     let arming =
         Arming::new(config, &TransferFunction::eq6(), SAMPLE, DELAY).expect("eq6 is a plant");
     let plant =
-        DiscretePlant::new(&TransferFunction::eq6(), SAMPLE, DELAY).expect("eq6 is a plant");
+        DiscretePlant::new(&TransferFunction::eq6(), SAMPLE, delay).expect("eq6 is a plant");
     let mut truth = plant.state(0.0);
     let mut state = ArmingState::default();
     let mut command = 20.0;
     let mut largest: f64 = 0.0;
     let mut again = 0;
     for tick in 0..10_000u32 {
+        let (skipped, disturbed) = time(tick);
         // The last command stands while the loop does not run.
-        for _ in 0..skipped(tick) {
+        for _ in 0..skipped {
             plant.step(&mut truth, command - 20.0);
         }
-        let jitter =
-            0.02 * (f64::from(tick.wrapping_mul(2_654_435_761)) / f64::from(u32::MAX) - 0.5);
-        let position = factor * plant.output_um(&truth) + 0.01 * f64::from(tick) + jitter;
-        let seen = (!blind(tick)).then_some(position);
-        let steps = u64::from(skipped(tick)) + 1;
         let input = ArmingInput {
-            position_um: seen,
+            position_um: seen(tick, plant.output_um(&truth)),
             framed: true,
             command_um: command,
             neutral_um: 20.0,
-            disturbed: steps > 1,
-            steps,
+            disturbed,
+            steps: u64::from(skipped) + 1,
         };
         match arming.step(&mut state, &input) {
             Step::Command(next) => command = next,
@@ -186,87 +201,30 @@ fn frames_that_are_always_late_are_no_reason_to_refuse_and_hide_no_wrong_plant()
         (4.0, Some(Refusal::WrongGain)),
         (0.0, Some(Refusal::NoResponse)),
     ] {
-        let (mut truth, mut state) = late_by_two(factor);
-        let verdict = loop {
-            match truth(&mut state) {
-                Step::Done(verdict) => break verdict,
-                Step::Command(_) | Step::Again(..) => {}
-            }
-        };
+        // Two ticks later than the model says, and told as late.
+        let late = Seconds(DELAY.value() + 2e-3);
+        let seen = |_, um: f64| Some(factor * um);
+        let (verdict, ..) = arm(ArmingConfig::default(), late, seen, |_| (0, true));
         assert_eq!(verdict.refusal, refusal, "{factor}: {verdict:?}");
     }
 }
 
-/// A plant whose frames come two ticks later than the model says, each told as late: a tick of arming at each call.
-fn late_by_two(factor: f64) -> (impl FnMut(&mut ArmingState) -> Step, ArmingState) {
-    let late = Seconds(DELAY.value() + 2e-3);
-    let plant = DiscretePlant::new(&TransferFunction::eq6(), SAMPLE, late).expect("eq6");
-    let arming = Arming::new(
-        ArmingConfig::default(),
-        &TransferFunction::eq6(),
-        SAMPLE,
-        DELAY,
-    )
-    .expect("eq6");
-    let (mut truth, mut command) = (plant.state(0.0), 20.0);
-    let tick = move |state: &mut ArmingState| {
-        let input = ArmingInput {
-            position_um: Some(factor * plant.output_um(&truth)),
-            framed: true,
-            command_um: command,
-            neutral_um: 20.0,
-            disturbed: true,
-            steps: 1,
-        };
-        let step = arming.step(state, &input);
-        if let Step::Command(next) | Step::Again(next, _) = step {
-            command = next;
-        }
-        plant.step(&mut truth, command - 20.0);
-        step
-    };
-    (tick, ArmingState::default())
-}
-
 #[test]
 fn a_bead_that_jitters_too_much_for_one_pulse_is_told_by_several() {
-    let arming = Arming::new(
-        ArmingConfig::default(),
-        &TransferFunction::eq6(),
-        SAMPLE,
-        DELAY,
-    )
-    .expect("eq6");
-    let plant = DiscretePlant::new(&TransferFunction::eq6(), SAMPLE, DELAY).expect("eq6");
     // 0.3 um RMS of white noise: 0.42 um an increment beside the 0.2 um that the pulse makes of it.
     let told = |factor: f64, seed: u32| {
-        let (mut truth, mut state) = (plant.state(0.0), ArmingState::default());
-        let (mut command, mut again, mut random) = (20.0, 0, seed);
-        loop {
+        let mut random = seed;
+        let seen = |_, um: f64| {
             let noise: f64 = (0..12)
                 .map(|_| {
                     random = random.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
                     f64::from(random) / f64::from(u32::MAX) - 0.5
                 })
                 .sum();
-            let input = ArmingInput {
-                position_um: Some(factor * plant.output_um(&truth) + 0.3 * noise),
-                framed: true,
-                command_um: command,
-                neutral_um: 20.0,
-                disturbed: false,
-                steps: 1,
-            };
-            match arming.step(&mut state, &input) {
-                Step::Command(next) => command = next,
-                Step::Again(next, _) => {
-                    command = next;
-                    again += 1;
-                }
-                Step::Done(verdict) => return (verdict, again),
-            }
-            plant.step(&mut truth, command - 20.0);
-        }
+            Some(factor * um + 0.3 * noise)
+        };
+        let (verdict, _, again) = arm(ArmingConfig::default(), DELAY, seen, |_| (0, false));
+        (verdict, again)
     };
     let mut most = 0;
     for seed in 0..20 {
@@ -284,33 +242,14 @@ fn a_bead_that_jitters_too_much_for_one_pulse_is_told_by_several() {
 
 #[test]
 fn the_pulse_takes_a_bead_at_the_border_towards_the_middle_and_back() {
-    let plant =
-        DiscretePlant::new(&TransferFunction::eq6(), SAMPLE, DELAY).expect("eq6 is a plant");
-    let config = ArmingConfig::default();
-    let arming =
-        Arming::new(config, &TransferFunction::eq6(), SAMPLE, DELAY).expect("eq6 is a plant");
     for start_um in [11.0, -11.0] {
-        let mut truth = plant.state(0.0);
-        let mut state = ArmingState::default();
-        let mut command = 20.0;
         let (mut nearest, mut farthest) = (f64::INFINITY, 0.0_f64);
-        let verdict = loop {
-            let position = start_um + plant.output_um(&truth);
+        let seen = |_, um: f64| {
+            let position = start_um + um;
             (nearest, farthest) = (nearest.min(position.abs()), farthest.max(position.abs()));
-            let input = ArmingInput {
-                position_um: Some(position),
-                framed: true,
-                command_um: command,
-                neutral_um: 20.0,
-                disturbed: false,
-                steps: 1,
-            };
-            match arming.step(&mut state, &input) {
-                Step::Command(next) | Step::Again(next, _) => command = next,
-                Step::Done(verdict) => break verdict,
-            }
-            plant.step(&mut truth, command - 20.0);
+            Some(position)
         };
+        let (verdict, ..) = arm(ArmingConfig::default(), DELAY, seen, |_| (0, false));
         assert_eq!(verdict.refusal, None, "{verdict:?}");
         assert!(farthest < 11.05, "{farthest} um from the middle");
         assert!((8.5..9.5).contains(&nearest), "{nearest} um");

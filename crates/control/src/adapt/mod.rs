@@ -21,6 +21,7 @@ mod window;
 
 use crate::error::BuildError;
 use crate::estimator::{Estimator, EstimatorConfig, Fix, PredictedState};
+use crate::exposure;
 use crate::loop_model::LoopModel;
 use serde::Serialize;
 use supervisor::Force;
@@ -322,25 +323,7 @@ impl Adapter {
         }
     }
 
-    /// Mean of the model's position over an exposure whose middle is so many ticks ago, um: between ticks the bead jumps by the direct
-    /// feedthrough and then moves evenly.
-    fn exposed(&self, state: &AdaptState, ago: f64) -> Option<f64> {
-        let half = 0.5 * self.exposure_ticks;
-        let (mut from, until) = ((ago - half).max(0.0), ago + half);
-        let length = until - from;
-        if length < 1e-6 {
-            return Self::past(state, ago);
-        }
-        let mut sum = 0.0;
-        while from < until {
-            let to = (from.floor() + 1.0).min(until);
-            sum += (to - from) * Self::past(state, 0.5 * (from + to))?;
-            from = to;
-        }
-        Some(sum / length)
-    }
-
-    /// Position of the model so many ticks ago, um.
+    /// Position of the model so many ticks ago, um: between ticks the bead jumps by the direct feedthrough and then moves evenly.
     fn past(state: &AdaptState, ago: f64) -> Option<f64> {
         let newer = ago.max(0.0).floor();
         let (part, newer) = (ago.max(0.0) - newer, newer as usize);
@@ -356,7 +339,9 @@ impl Adapter {
         if let Some(fix) = fix {
             let ago = self.delay_samples + fix.age as f64 + fix.offset;
             for ((at, extra), open) in at_um.iter_mut().zip(DELAYS).zip(usable) {
-                match self.exposed(state, ago + extra) {
+                match exposure::mean(ago + extra, self.exposure_ticks, |ago| {
+                    Self::past(state, ago)
+                }) {
                     Some(um) => *at = um,
                     None if open => known = false,
                     None => {}

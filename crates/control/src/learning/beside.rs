@@ -1,6 +1,7 @@
 //! A learner beside a loop: each fix is laid on the reference and the phase at the time of its exposure.
 
 use super::{Driven, LearnedTable, Learner, LearnerState};
+use crate::exposure;
 
 /// References of past ticks that a [`CycleLearning`] keeps: the oldest exposure that it can learn from.
 const PAST: usize = 12;
@@ -66,30 +67,14 @@ impl CycleLearning {
     pub fn learn(&mut self, fix: Option<(f64, f64)>, driven: &Driven) {
         let error = fix.and_then(|(position_um, age_ticks)| {
             let phase = self.phase - age_ticks * self.learner.advance;
-            Some((phase, position_um - self.exposed_um(age_ticks)?))
+            let path_um = |age_ticks| self.past_reference_um(age_ticks);
+            let seen_um = exposure::mean(age_ticks, self.learner.exposure_ticks, path_um)?;
+            Some((phase, position_um - seen_um))
         });
         self.jumps_um.copy_within(0..PAST - 1, 1);
         self.jumps_um[0] = driven.jump_um;
         let now = (self.phase, driven);
         self.learner.learn(&mut self.state, error, now);
-    }
-
-    /// Mean of the reference's path over an exposure whose middle is so many ticks old, um; `None` if it is not known.
-    fn exposed_um(&self, age_ticks: f64) -> Option<f64> {
-        let half = 0.5 * self.learner.exposure_ticks;
-        let (mut from, until) = ((age_ticks - half).max(0.0), age_ticks + half);
-        let length = until - from;
-        if length < 1e-6 {
-            return self.past_reference_um(age_ticks);
-        }
-        let mut sum = 0.0;
-        // Between ticks the path is straight: its mean is that in the middle.
-        while from < until {
-            let to = (from.floor() + 1.0).min(until);
-            sum += (to - from) * self.past_reference_um(0.5 * (from + to))?;
-            from = to;
-        }
-        Some(sum / length)
     }
 
     /// The reference's path at an age in ticks, um.
