@@ -44,19 +44,19 @@ pub(crate) fn learner(
     Learner::new(LearnConfig::default(), frequency_hz, 1e-3, &responses).unwrap()
 }
 
-/// A run along a profile; `each(k, true error, learner's state)` at each tick.
+/// A run along a profile; `each(k, true error, learner's state)` at each tick. What was learned in the end.
 pub(crate) fn run(
-    controller: ControllerConfig,
+    config: LoopConfig,
     rig: RigConfig,
     profile: &Profile,
     learning: Option<(&Learner, LearnerState)>,
     ticks: u64,
     lost: impl Fn(u64) -> bool,
     mut each: impl FnMut(u64, f64, Option<LearnedTable>),
-) {
+) -> Option<LearnedTable> {
     let delay_s = rig.delay_s;
     let mut rig = SimulatedRig::new(rig).unwrap();
-    let mut controller = Controller::new(config(controller)).unwrap();
+    let mut controller = Controller::new(config).unwrap();
     controller.start(20.0, 20.0);
     let mut preview = vec![0.0; controller.preview_len()];
     let mut learning = learning.map(|(l, state)| CycleLearning::new(l.clone(), state));
@@ -90,6 +90,7 @@ pub(crate) fn run(
         }
         rig.advance(out.command_um);
     }
+    learning.map(|learning| learning.table())
 }
 
 fn rms_um(
@@ -101,7 +102,7 @@ fn rms_um(
 ) -> f64 {
     let (mut sum, mut n) = (0.0, 0.0);
     run(
-        controller,
+        config(controller),
         wrong_rig(seed),
         profile,
         learner.map(|l| (l, l.start())),
@@ -162,7 +163,7 @@ fn a_table_learned_before_serves_from_the_first_cycle() {
     let learner = learner(controller, &profile, 100.0);
     let mut learned = None;
     run(
-        controller,
+        config(controller),
         wrong_rig(1),
         &profile,
         Some((&learner, learner.start())),
@@ -179,7 +180,7 @@ fn a_table_learned_before_serves_from_the_first_cycle() {
     let first_cycles = |state| {
         let mut sum = 0.0;
         run(
-            controller,
+            config(controller),
             wrong_rig(2),
             &profile,
             Some((&learner, state)),
@@ -220,7 +221,7 @@ fn nothing_is_learned_while_the_bead_is_lost_and_shortly_after() {
     let learner = learner(controller, &profile, 100.0);
     let mut seen: Vec<LearnedTable> = Vec::new();
     run(
-        controller,
+        config(controller),
         wrong_rig(1),
         &profile,
         Some((&learner, learner.start())),
@@ -260,7 +261,7 @@ fn a_learner_told_the_opposite_response_retreats_and_gives_up_instead_of_growing
     let learner = Learner::new(LearnConfig::default(), 100.0, 1e-3, &wrong).unwrap();
     let (mut worst, mut last) = (0.0_f64, None);
     run(
-        controller,
+        config(controller),
         wrong_rig(1),
         &profile,
         Some((&learner, learner.start())),

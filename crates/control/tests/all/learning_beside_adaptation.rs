@@ -13,41 +13,13 @@ fn adapting_errors_nm(
     learner: Option<&Learner>,
     ticks: u64,
 ) -> (Vec<f64>, Option<LearnedTable>) {
-    let delay_s = rig.delay_s;
-    let mut rig = SimulatedRig::new(rig).unwrap();
     let mut config = config(controller);
     config.estimator.adapt = true;
-    let mut controller = Controller::new(config).unwrap();
-    controller.start(20.0, 20.0);
-    let mut preview = vec![0.0; controller.preview_len()];
-    let mut learning = learner.map(|l| CycleLearning::new(l.clone(), l.start()));
     let mut errors = Vec::new();
-    for k in 0..ticks {
-        let time_s = k as f64 * 1e-3;
-        let reference_um = profile.at_um(time_s);
-        fill_preview(profile, k, 1e-3, &mut preview);
-        errors.push(1e3 * (rig.true_um() - reference_um));
-        let mut fix = rig.measure();
-        fix.offset_samples = (delay_s - 2e-3) / 1e-3;
-        let fix = Some(fix);
-        let mut input = LoopInput {
-            measurement: fix,
-            reference_um,
-            preview_um: &preview,
-            ..LoopInput::default()
-        };
-        if let Some(learning) = &mut learning {
-            input.learned_um = learning.addition_um(profile.phase(time_s), reference_um);
-            input.feed_forward_gain = learning.feed_forward_gain();
-        }
-        let out = controller.step(&input);
-        if let Some(learning) = &mut learning {
-            let fix = fix.map(|fix| (fix.position_um, delay_s / 1e-3));
-            learning.learn(fix, &out.driven);
-        }
-        rig.advance(out.command_um);
-    }
-    (errors, learning.map(|learning| learning.table()))
+    let learning = learner.map(|l| (l, l.start()));
+    let each = |_, error_um: f64, _| errors.push(1e3 * error_um);
+    let learned = run(config, rig, profile, learning, ticks, |_| false, each);
+    (errors, learned)
 }
 
 fn rms(values: &[f64]) -> f64 {
@@ -115,7 +87,7 @@ fn frames_that_do_not_come_do_not_keep_a_loop_from_learning() {
     rig.plant = rig.plant.scaled(1.2).unwrap();
     let mut profile_errors = Vec::new();
     run(
-        lqg,
+        config(lqg),
         rig,
         &profile,
         Some((&learner, learner.start())),
@@ -168,7 +140,7 @@ fn several_lines_at_once_are_learned_each_for_itself() {
             }
             last = table;
         };
-        run(lqg, rig(), &profile, start, 1400, |_| false, each);
+        run(config, rig(), &profile, start, 1400, |_| false, each);
         let learned: Vec<u32> = last.unwrap().harmonics.iter().map(|h| h.harmonic).collect();
         assert!(
             [1, 2, 4].iter().all(|h| learned.contains(h)),
