@@ -16,7 +16,7 @@ for program in cellpos firmware-sim; do
     file="$root/usr/bin/$program"
     [ -x "$file" ] || fail "$program is not there"
     size=$(stat -c %s "$file")
-    [ "$size" -le 20971520 ] || fail "$program has $size bytes, more than 20 MB"
+    [ "$size" -le 20000000 ] || fail "$program has $size bytes, more than 20 MB"
     echo "$program: $size bytes"
 done
 grep -Eq '^cellpos [0-9.]+ \(.+\)$' <<< "$("$root/usr/bin/cellpos" --version)" || fail "--version names no commit"

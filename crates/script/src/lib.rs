@@ -36,7 +36,7 @@ mod table;
 pub use check::{Check, CheckError, CheckLimits, Violation, WaveCheck, check};
 pub use cursor::{Cursor, Output, Seen, Status, StopReason};
 pub use cycles::{
-    Alarm, AmplitudeWatch, CycleColumns, CycleFlags, CycleRow, CycleTable, FatigueStop,
+    Alarm, AmplitudeWatch, AtRest, CycleColumns, CycleFlags, CycleRow, CycleTable, FatigueStop,
     FatigueWatch, HeadError, Mean, ReadCycles, Saturating, Trend, read_cycles, trend,
 };
 pub use error::ScriptError;

@@ -281,7 +281,7 @@ pub fn learned_text(table: &LearnedTable) -> String {
     let nm =
         |um: Option<f64>| um.map_or_else(|| "-".to_string(), |um| format!("{:.1} nm", um * 1e3));
     format!(
-        "{:.0} cycles, measured error {} RMS at first, {} at the end{}{}",
+        "{:.0} cycles, measured error {} RMS in the first few, {} in the last few{}{}",
         table.cycles,
         nm(table.error_before_um),
         nm(table.error_after_um),

@@ -224,7 +224,9 @@ fn tell(
             say(&format!("left out: {folder}\n"))?;
         }
         if cut_off > 0 {
-            say("the run was cut off: it reads up to its last flush\n")?;
+            say(
+                "the run was cut off (killed, or its disk was full): it reads up to its last flush\n",
+            )?;
         }
     }
     let whole = missing + damaged + damaged_bytes == 0 && unreadable.is_empty();

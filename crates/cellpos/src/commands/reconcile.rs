@@ -213,6 +213,18 @@ fn rig(args: &Args, model: &Model) -> Result<OnRig, Failure> {
     )
 }
 
+/// What a page is headed with: the names of two records at most, the others are in its table.
+fn heading<'a>(records: impl Iterator<Item = &'a Path>) -> String {
+    let names: Vec<String> = records
+        .map(|path| path.file_name().unwrap_or(path.as_os_str()))
+        .map(|name| name.to_string_lossy().into_owned())
+        .collect();
+    match names.as_slice() {
+        [first, _, _, ..] => format!("{first} and {} more", names.len() - 1),
+        few => few.join(", "),
+    }
+}
+
 fn write(args: &Args, result: &Reconciliation, collected: &[Collected]) -> Result<(), Failure> {
     if let Some(path) = &args.out {
         output::write(path, &result.augmented.to_toml_string())?;
@@ -226,13 +238,8 @@ fn write(args: &Args, result: &Reconciliation, collected: &[Collected]) -> Resul
         output::write(path, text)?;
     }
     if let Some(path) = &args.report {
-        let title = args
-            .data
-            .iter()
-            .map(|d| d.display().to_string())
-            .chain(collected.iter().map(|c| c.file.display().to_string()))
-            .collect::<Vec<_>>()
-            .join(", ");
+        let collected = collected.iter().map(|one| one.file.as_path());
+        let title = heading(args.data.iter().map(PathBuf::as_path).chain(collected));
         output::write(path, &cellpos_reconcile::report(result, &title).to_html())?;
     }
     let mut json = result.to_json();

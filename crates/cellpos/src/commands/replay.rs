@@ -158,8 +158,8 @@ fn left_out(s: &SessionReport) -> Vec<String> {
     }
     if !s.complete {
         lines.push(format!(
-            "not replayed: what came after the last row; the record has no end ({} unreadable bytes): the run was killed, or still \
-             goes on",
+            "not replayed: what came after the last row; the record has no end ({} unreadable bytes): the run was killed, its \
+             disk was full, or it still goes on",
             s.unreadable_bytes
         ));
     } else if s.unreadable_bytes > 0 {

@@ -267,7 +267,7 @@ fn head(page: &mut Report, sessions: &[Session], ticks: &Ticks) {
     }
     let rows = [
         ("ticks", ticks.rows.to_string()),
-        ("duration (s)", format!("{:.3}", ticks.end_s())),
+        ("duration (s)", format!("{:.3}", ticks.duration_s())),
         ("error, RMS (nm)", nm(ticks.rms_um())),
         ("error, mean (nm)", nm(ticks.mean_um())),
         ("error, largest (nm)", nm(ticks.peak_um())),
@@ -405,8 +405,8 @@ fn learned(page: &mut Report, run: &Path) -> Result<(), Failure> {
     let mut table = Table::new([
         Column::left("motion"),
         Column::right("cycles"),
-        Column::right("error at first (nm RMS)"),
-        Column::right("error at the end (nm RMS)"),
+        Column::right("error, first few (nm RMS)"),
+        Column::right("error, last few (nm RMS)"),
         Column::right("retreats"),
         Column::left("the plant was taken to be known to"),
     ]);
@@ -423,7 +423,10 @@ fn learned(page: &mut Report, run: &Path) -> Result<(), Failure> {
                 .map_or_else(|| "-".to_owned(), |margins| margins.to_string()),
         ]);
     }
-    table.caption("Measured errors over the first and the last cycles in full swing, localisation noise included.");
+    table.caption(
+        "Measured errors over the first few cycles in full swing and the last few, localisation noise included: two cycles or so \
+         tell an error to some 20 %.",
+    );
     page.table(table);
     Ok(())
 }

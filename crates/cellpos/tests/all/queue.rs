@@ -48,3 +48,51 @@ fn one_cell_after_the_other_goes_through_the_script_into_one_table() {
     assert_eq!(queue["cells"].as_array().map(Vec::len), Some(2), "{queue}");
     assert_eq!(queue["cells"][1]["outcome"], "stopped");
 }
+
+/// A cell that has not recovered before the next cycle: its stretch is by its length at first, in the table of the queue as in the
+/// report of its run.
+#[test]
+fn a_cells_stretch_is_one_number_in_the_table_of_the_queue_and_in_the_report_of_its_run() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    let script = "name = \"quick\"\n[[step]]\ndo = \"repeat\"\ntimes = 24\n\
+                  [[step.step]]\ndo = \"move\"\nto = \"8um\"\nduration = \"200ms\"\n[[step.step]]\ndo = \"hold\"\nduration = \"300ms\"\n\
+                  [[step.step]]\ndo = \"move\"\nto = \"0um\"\nduration = \"200ms\"\n[[step.step]]\ndo = \"hold\"\nduration = \"100ms\"\n";
+    std::fs::write(at.join("quick.toml"), script).unwrap();
+    let rig = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples/cell.toml");
+    let queue = succeed(
+        at,
+        &format!(
+            "run quick.toml --cells 1 --rig {} --clock virtual --frames off --json",
+            rig.display()
+        ),
+    )
+    .json();
+    let cell = &queue["cells"][0];
+    let report = succeed(
+        at,
+        &format!("report {} --json", cell["run"].as_str().unwrap()),
+    )
+    .json();
+    for (quantity, first, last) in [
+        ("stretch", "stretch_first", "stretch_last"),
+        ("recovery time", "recovery_first_s", "recovery_last_s"),
+    ] {
+        let trends = report["trends"].as_array().unwrap();
+        let trend = trends
+            .iter()
+            .find(|trend| trend["quantity"] == quantity)
+            .unwrap();
+        for (of_cell, of_report) in [(first, "first"), (last, "last")] {
+            let (a, b) = (number(cell, of_cell), number(trend, of_report));
+            assert!((a / b - 1.0).abs() < 1e-9, "{quantity}: {a} and {b}");
+        }
+    }
+    let trends = report["trends"].as_array().unwrap();
+    let start = trends
+        .iter()
+        .find(|trend| trend["quantity"] == "length at cycle start")
+        .unwrap();
+    let left = number(start, "last") / number(cell, "rest_length_um");
+    assert!(left > 1.1, "it recovers in time and tells nothing: {left}");
+}

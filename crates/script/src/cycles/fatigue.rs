@@ -1,6 +1,6 @@
 //! The script's stops on what the cell does: stretch, length at rest, recovery, each as a mean of ten cycles.
 
-use super::{CycleFlags, CycleRow};
+use super::{AtRest, CycleFlags, CycleRow};
 use crate::plan::ArmKind;
 use crate::script::Stop;
 use std::collections::VecDeque;
@@ -56,6 +56,7 @@ impl Ends {
 pub struct FatigueWatch {
     stop: Stop,
     motion: Option<(f64, f64)>,
+    at_rest: AtRest,
     stretch: Ends,
     rest: Ends,
     recovery: Ends,
@@ -73,6 +74,7 @@ impl FatigueWatch {
         any.then(|| Self {
             stop: *stop,
             motion: None,
+            at_rest: AtRest::default(),
             stretch: Ends::default(),
             rest: Ends::default(),
             recovery: Ends::default(),
@@ -82,6 +84,7 @@ impl FatigueWatch {
     /// Takes a row; gives the first limit that is passed. Rows of the static arm, of ramps and of disturbed cycles do not
     /// count; another motion begins anew.
     pub fn add(&mut self, row: &CycleRow) -> Option<FatigueStop> {
+        self.at_rest.take(row);
         if row.arm != ArmKind::Cyclic || row.flags.is_disturbed() || row.flags.has(CycleFlags::RAMP)
         {
             return None;
@@ -90,7 +93,7 @@ impl FatigueWatch {
             self.motion = Some((row.stroke_um, row.duration_s));
             (self.stretch, self.rest, self.recovery) = Default::default();
         }
-        self.stretch.add(row.length_peak_um / row.length_start_um);
+        self.stretch.add(self.at_rest.stretch(row));
         self.rest.add(row.length_start_um);
         self.recovery.add(row.recovery_s);
         self.judge()

@@ -10,6 +10,7 @@ mod minimum;
 mod open;
 mod outlier;
 mod place;
+mod rest;
 mod row;
 mod saturating;
 mod shape;
@@ -17,6 +18,7 @@ mod table;
 mod trend;
 
 pub use fatigue::{FatigueStop, FatigueWatch};
+pub use rest::AtRest;
 pub use row::{CycleFlags, CycleRow};
 pub use saturating::Saturating;
 pub use table::{CycleColumns, HeadError, ReadCycles, read_cycles};

@@ -10,7 +10,7 @@ use crate::recorded;
 use cellpos_live::{Banner, EventLine, Feed, Server};
 use cellpos_record::{CYCLES_CSV, Event, Follow, RunEnd, Sessions};
 use cellpos_runtime::{Statistics, TickRecord};
-use cellpos_script::{CycleRow, read_cycles};
+use cellpos_script::{AtRest, CycleRow, read_cycles};
 use std::collections::{BTreeSet, VecDeque};
 use std::io::{Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
@@ -40,6 +40,7 @@ pub struct Watch {
     last: Option<TickRecord>,
     changed: Instant,
     cycles: CyclesRead,
+    at_rest: AtRest,
     session: PathBuf,
     clips: (Option<Instant>, BTreeSet<String>),
     over: bool,
@@ -87,6 +88,7 @@ impl Watch {
             last: None,
             changed: Instant::now(),
             cycles: CyclesRead::default(),
+            at_rest: AtRest::default(),
             session,
             clips: (None, BTreeSet::new()),
             over: false,
@@ -116,7 +118,8 @@ impl Watch {
             self.watcher.event_line(line(&event));
         }
         for row in self.cycles.more(&self.folder.join(CYCLES_CSV)) {
-            self.watcher.cycle(cycle_row(&row));
+            self.at_rest.take(&row);
+            self.watcher.cycle(cycle_row(&row, &self.at_rest));
         }
         self.look_for_clips();
         self.tell();

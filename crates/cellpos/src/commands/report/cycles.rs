@@ -1,7 +1,7 @@
 //! The cycles of a run: their trends, each motion by itself, with the static arm beside.
 
 use cellpos_report::{Axis, Column, Figure, Panel, Report, Series, Status, Table};
-use cellpos_script::{ArmKind, CycleFlags, CycleRow, ReadCycles, Trend, trend};
+use cellpos_script::{ArmKind, AtRest, CycleFlags, CycleRow, ReadCycles, Trend, trend};
 use std::collections::BTreeMap;
 
 /// A quantity of the cycles.
@@ -10,26 +10,7 @@ struct Quantity {
     of_what: &'static str,
     name: &'static str,
     unit: &'static str,
-    of: fn(&CycleRow, &Rest) -> f64,
-}
-
-/// The cell before the first cycle; NaN where it was not measured.
-struct Rest {
-    length_um: f64,
-    area_um2: f64,
-}
-
-impl Rest {
-    fn of(rows: &[CycleRow]) -> Self {
-        let first = |of: fn(&CycleRow) -> f64| {
-            let mut values = rows.iter().map(of);
-            values.find(|value| value.is_finite()).unwrap_or(f64::NAN)
-        };
-        Self {
-            length_um: first(|row| row.length_start_um),
-            area_um2: first(|row| row.area_start_um2),
-        }
-    }
+    of: fn(&CycleRow, &AtRest) -> f64,
 }
 
 const QUANTITIES: [Quantity; 12] = [
@@ -79,13 +60,13 @@ const QUANTITIES: [Quantity; 12] = [
         of_what: "cell",
         name: "stretch",
         unit: "",
-        of: |row, rest| row.length_peak_um / rest.length_um,
+        of: |row, rest| rest.stretch(row),
     },
     Quantity {
         of_what: "cell",
         name: "areal stretch",
         unit: "",
-        of: |row, rest| row.area_peak_um2 / rest.area_um2,
+        of: |row, rest| rest.areal_stretch(row),
     },
     Quantity {
         of_what: "cell",
@@ -144,7 +125,7 @@ pub fn section(page: &mut Report, read: &ReadCycles) -> serde_json::Value {
             "{ramps} cycles in which a wave comes in or goes out are in cycles.csv, and in no trend."
         ));
     }
-    let rest = Rest::of(rows);
+    let rest = AtRest::of(rows);
     let groups = groups(rows);
     let mut table = Table::new([
         Column::left("of"),

@@ -3,7 +3,7 @@
 use super::cycles::on_the_way;
 use super::ticks::{Course, Ticks};
 use cellpos_report::{Axis, Figure, Panel, Report, Series};
-use cellpos_script::{ArmKind, CycleFlags, CycleRow};
+use cellpos_script::{ArmKind, AtRest, CycleFlags, CycleRow};
 
 /// The cycles whose course is drawn over each other: the first, the tenth, the hundredth, ... of those that have records.
 pub fn courses(rows: &[CycleRow]) -> Vec<Course> {
@@ -62,13 +62,10 @@ fn tens(values: &[(f64, f64)]) -> [Vec<f64>; 4] {
 
 /// Adds the section, where the run has cycles of a cell.
 pub fn section(page: &mut Report, rows: &[CycleRow], ticks: &Ticks) {
-    let rest_um = rows
-        .iter()
-        .map(|row| row.length_start_um)
-        .find(|um| um.is_finite());
-    let Some(rest_um) = rest_um.filter(|_| ticks.has_length) else {
+    let rest = AtRest::of(rows);
+    if rest.length_um.is_nan() || !ticks.has_length {
         return;
-    };
+    }
     page.section("The cell over its cycles");
     page.figure(
         Figure::new(
@@ -124,7 +121,7 @@ pub fn section(page: &mut Report, rows: &[CycleRow], ticks: &Ticks) {
     );
     type Value<'v> = &'v dyn Fn(&CycleRow) -> f64;
     let quantities: [(&str, &str, Value); 3] = [
-        ("stretch", "", &|row| row.length_peak_um / rest_um),
+        ("stretch", "", &|row| rest.stretch(row)),
         ("length at start", "um", &|row| row.length_start_um),
         ("recovery time", "s", &|row| row.recovery_s),
     ];

@@ -93,10 +93,15 @@ pub(super) fn provenance(page: &mut Report, sessions: &[Session]) {
         Column::left("SHA-256"),
     ]);
     let metas = sessions.iter().filter_map(|session| session.meta.as_ref());
-    for input in metas.flat_map(|meta| &meta.inputs) {
+    let inputs: Vec<_> = metas.flat_map(|meta| &meta.inputs).collect();
+    for input in &inputs {
         table.row([input.path.as_str(), &input.bytes.to_string(), &input.sha256]);
     }
-    page.table(table);
+    if inputs.is_empty() {
+        page.paragraph("No file went into this run.");
+    } else {
+        page.table(table);
+    }
     for (_, session) in ends(sessions) {
         page.subsection(&folder_name(&session.folder));
         let path = session.folder.join(cellpos_record::RUN_TOML);

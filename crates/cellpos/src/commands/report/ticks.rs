@@ -153,9 +153,14 @@ impl Ticks {
         })
     }
 
-    /// End of the last tick, s since the start of the run.
+    /// Start of the last tick, s since the start of the run.
     pub fn end_s(&self) -> f64 {
         self.end_s
+    }
+
+    /// From the first tick to the end of the last, pauses between sessions included, s.
+    pub fn duration_s(&self) -> f64 {
+        self.end_s + self.period_s()
     }
 
     /// Mean period of the ticks, s.

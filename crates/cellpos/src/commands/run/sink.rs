@@ -10,7 +10,7 @@ use cellpos_rig::Clock;
 use cellpos_runtime::live::Operator;
 use cellpos_runtime::recorder::Unconfirmed;
 use cellpos_runtime::{Event, Request, RunSink, Stage, Statistics, TickRecord};
-use cellpos_script::{Alarm, AmplitudeWatch, CycleRow, CycleTable, FatigueWatch, Plan};
+use cellpos_script::{Alarm, AmplitudeWatch, AtRest, CycleRow, CycleTable, FatigueWatch, Plan};
 use cellpos_session::say::say;
 use indicatif::{ProgressBar, ProgressStyle};
 use std::ops::Range;
@@ -40,7 +40,7 @@ pub struct ScriptSink {
     /// Why the rows of the table stopped it.
     row_stop: Option<&'static str>,
     /// Length of the cell at the start of the first cycle, um.
-    rest_um: Option<f64>,
+    at_rest: AtRest,
     stretch: Option<f64>,
     stalls: Option<Stalls>,
     keeper: Option<Keeper>,
@@ -137,7 +137,7 @@ impl ScriptSink {
             stage: Stage::None,
             alarms: 0,
             row_stop: None,
-            rest_um: None,
+            at_rest: AtRest::default(),
             stretch: None,
             stalls: None,
             keeper: None,
@@ -236,13 +236,12 @@ impl ScriptSink {
             self.unshown.line(time_s, level, text.clone());
             say(text);
         }
-        self.unshown.cycle(&row);
+        self.at_rest.take(&row);
+        self.unshown.cycle(&row, &self.at_rest);
         self.judge(&row, time_s);
         self.judge_cell(&row, time_s);
-        if row.length_start_um.is_finite() {
-            let rest_um = *self.rest_um.get_or_insert(row.length_start_um);
-            self.stretch = Some(row.length_peak_um / rest_um);
-        }
+        let stretch = self.at_rest.stretch(&row);
+        self.stretch = stretch.is_finite().then_some(stretch).or(self.stretch);
         self.waiting.push(row);
     }
 
@@ -293,8 +292,9 @@ impl ScriptSink {
 
     /// The same sink, that knows the cycles of the sessions before.
     pub fn with_cycles_done(mut self, rows: &[CycleRow]) -> Self {
-        if let Some(watch) = &mut self.fatigue {
-            for row in rows {
+        for row in rows {
+            self.at_rest.take(row);
+            if let Some(watch) = &mut self.fatigue {
                 watch.add(row);
             }
         }
@@ -323,7 +323,7 @@ impl ScriptSink {
         if let Some((_, per_cycle)) = self.watch.trend().filter(|(cycles, _)| *cycles >= 20) {
             amplitude.push_str(&format!(" ({:+.2} %/100 cycles)", per_cycle * 1e4));
         }
-        if let Some(stretch) = self.stretch.filter(|stretch| stretch.is_finite()) {
+        if let Some(stretch) = self.stretch {
             amplitude.push_str(&format!("  stretch {stretch:.2}"));
         }
         format!(

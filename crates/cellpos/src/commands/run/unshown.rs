@@ -1,6 +1,6 @@
 //! What a script's sink keeps for a live page until the page takes it.
 
-use cellpos_script::CycleRow;
+use cellpos_script::{AtRest, CycleRow};
 use cellpos_session::view::{self, EventLine};
 use std::collections::VecDeque;
 
@@ -21,10 +21,10 @@ impl Unshown {
         }
     }
 
-    /// A finished cycle.
-    pub(super) fn cycle(&mut self, row: &CycleRow) {
+    /// A finished cycle, of a cell that was like this at rest.
+    pub(super) fn cycle(&mut self, row: &CycleRow, rest: &AtRest) {
         if self.on {
-            self.cycles.push_back(view::cycle_row(row));
+            self.cycles.push_back(view::cycle_row(row, rest));
         }
     }
 

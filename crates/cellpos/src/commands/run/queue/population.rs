@@ -2,7 +2,7 @@
 
 use crate::commands::run::over::Over;
 use cellpos_report::{Axis, Column, Figure, Panel, Report, Series, Status, Table};
-use cellpos_script::{ArmKind, CycleFlags, CycleRow, trend};
+use cellpos_script::{ArmKind, AtRest, CycleFlags, CycleRow, trend};
 use serde::Serialize;
 use std::collections::BTreeMap;
 
@@ -19,7 +19,7 @@ pub(super) struct CellRow {
     cycles_disturbed: u64,
     /// Length at the start of the first cycle \[um\].
     rest_length_um: Option<f64>,
-    /// Longest over length at the start, mean of the first and of the last ten whole cycles of the cyclic arm.
+    /// Longest over length at the start of the first cycle, mean of the first and of the last ten whole cycles of the cyclic arm.
     stretch_first: Option<f64>,
     stretch_last: Option<f64>,
     /// Recovery time, likewise \[s\].
@@ -42,22 +42,19 @@ fn finite(value: f64) -> Option<f64> {
     value.is_finite().then_some(value)
 }
 
-fn stretch(row: &CycleRow) -> f64 {
-    row.length_peak_um / row.length_start_um
-}
-
 impl CellRow {
     pub(super) fn new(cell: u64, over: &Over) -> Self {
         let rows = &over.cycles;
-        let ends = |of: fn(&CycleRow) -> f64| {
+        let rest = AtRest::of(rows);
+        let ends = |of: &dyn Fn(&CycleRow) -> f64| {
             let trend = trend(counted(rows).map(|row| (row.cycle, of(row))));
             (
                 trend.as_ref().map(|t| t.first.mean),
                 trend.as_ref().map(|t| t.last.mean),
             )
         };
-        let (stretch_first, stretch_last) = ends(stretch);
-        let (recovery_first_s, recovery_last_s) = ends(|row| row.recovery_s);
+        let (stretch_first, stretch_last) = ends(&|row| rest.stretch(row));
+        let (recovery_first_s, recovery_last_s) = ends(&|row| row.recovery_s);
         let squares: Vec<f64> = rows
             .iter()
             .map(|row| row.rms_um * row.rms_um)
@@ -69,7 +66,7 @@ impl CellRow {
             outcome: over.outcome.to_owned(),
             cycles: rows.len() as u64,
             cycles_disturbed: rows.iter().filter(|row| row.flags.is_disturbed()).count() as u64,
-            rest_length_um: rows.iter().find_map(|row| finite(row.length_start_um)),
+            rest_length_um: finite(rest.length_um),
             stretch_first,
             stretch_last,
             recovery_first_s,
@@ -197,11 +194,11 @@ pub(super) fn page(name: &str, rows: &[CellRow], cycles: &[Vec<CycleRow>]) -> Re
         ),
     );
     page.section("The population over its cycles");
-    type Value = fn(&CycleRow) -> f64;
+    type Value = fn(&CycleRow, &AtRest) -> f64;
     let quantities: [(&str, &str, Value); 3] = [
-        ("stretch", "", stretch),
-        ("length at start", "um", |row| row.length_start_um),
-        ("recovery time", "s", |row| row.recovery_s),
+        ("stretch", "", |row, rest| rest.stretch(row)),
+        ("length at start", "um", |row, _| row.length_start_um),
+        ("recovery time", "s", |row, _| row.recovery_s),
     ];
     let mut figure = Figure::new(
         "population",
@@ -212,7 +209,8 @@ pub(super) fn page(name: &str, rows: &[CellRow], cycles: &[Vec<CycleRow>]) -> Re
     for (name, unit, value) in quantities {
         let courses: Vec<Vec<(f64, f64)>> = (cycles.iter())
             .map(|rows| {
-                let points = counted(rows).map(|row| (row.cycle as f64 + 1.0, value(row)));
+                let rest = AtRest::of(rows);
+                let points = counted(rows).map(|row| (row.cycle as f64 + 1.0, value(row, &rest)));
                 points.filter(|(_, value)| value.is_finite()).collect()
             })
             .collect();

@@ -1,0 +1,114 @@
+#!/usr/bin/env python3
+"""Pages as a browser lays them out, 1400 and 400 px wide, on a light and on a dark screen.
+
+    scripts/check_pages.py PICTURES PAGE.html...
+
+Says what of a figure's text is cut off, lies upon another text or cannot be read against its ground, which name stands twice in one
+legend, and what makes a page wider than its window; writes a picture of each into the folder PICTURES, to be looked at. Needs
+Chromium. Exit code 1: something was found.
+"""
+
+import html
+import json
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+WIDTHS = (1400, 400)
+SCREENS = ("light", "dark")
+
+# Runs in the page: what is seen of each figure, as the browser has placed it.
+LOOK = r"""
+<script>
+addEventListener("load", () => {
+  const found = [];
+  const wide = document.documentElement.scrollWidth - innerWidth;
+  if (wide > 0) {
+    const least = [...document.querySelectorAll("body *")].filter(e => !e.closest(".scroll,pre") && e.getBoundingClientRect().right > innerWidth + 0.5);
+    found.push(`the page is ${wide} px wider than its window: ${least.slice(0, 3).map(e => e.tagName + " " + e.textContent.slice(0, 40)).join("; ")}`);
+  }
+  const light = c => { const p = c.match(/[\d.]+/g).map(Number).slice(0, 3).map(v => v / 255).map(v => v <= 0.04045 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4);
+    return 0.2126 * p[0] + 0.7152 * p[1] + 0.0722 * p[2]; };
+  const contrast = (a, b) => (Math.max(light(a), light(b)) + 0.05) / (Math.min(light(a), light(b)) + 0.05);
+  let ground = getComputedStyle(document.body).backgroundColor;
+  if (/, 0\)$/.test(ground)) ground = "rgb(255, 255, 255)";
+  for (const svg of document.querySelectorAll("svg")) {
+    const frame = svg.getBoundingClientRect();
+    if (!frame.width) continue;
+    const name = svg.querySelector("title")?.textContent ?? svg.getAttribute("aria-label") ?? "figure";
+    const texts = [...svg.querySelectorAll("text")].filter(t => t.textContent.trim());
+    const boxes = texts.map(t => [t, t.getBoundingClientRect()]);
+    for (const [t, b] of boxes) {
+      if (b.left < frame.left - 1 || b.right > frame.right + 1 || b.top < frame.top - 1 || b.bottom > frame.bottom + 1)
+        found.push(`${name}: "${t.textContent}" is cut off`);
+      // Its ground is the last area drawn before it and below its middle.
+      const [x, y] = [(b.left + b.right) / 2, (b.top + b.bottom) / 2];
+      const below = [...svg.querySelectorAll("rect")].filter(r => {
+        const box = r.getBoundingClientRect();
+        return r.compareDocumentPosition(t) & Node.DOCUMENT_POSITION_FOLLOWING && box.left <= x && x <= box.right && box.top <= y && y <= box.bottom
+          && /^rgb\(/.test(getComputedStyle(r).fill) && +getComputedStyle(r).fillOpacity === 1;
+      }).pop();
+      const [ink, under] = [getComputedStyle(t).fill, below ? getComputedStyle(below).fill : ground];
+      if (/^rgb\(/.test(ink) && contrast(ink, under) < 3) found.push(`${name}: "${t.textContent}" is ${ink} on ${under}`);
+    }
+    boxes.forEach(([t, a], i) => boxes.slice(i + 1).forEach(([u, b]) => {
+      const across = Math.min(a.right, b.right) - Math.max(a.left, b.left), down = Math.min(a.bottom, b.bottom) - Math.max(a.top, b.top);
+      if (across > 2 && down > 0.3 * Math.min(a.height, b.height)) found.push(`${name}: "${t.textContent}" lies upon "${u.textContent}"`);
+    }));
+    // A legend's name stands behind its stroke.
+    const names = texts.filter(t => t.previousElementSibling?.matches("line.ln, circle, rect.bnd, rect.bar")).map(t => t.textContent);
+    names.filter((n, i) => names.indexOf(n) < i).forEach(n => found.push(`${name}: "${n}" stands twice in the legend`));
+  }
+  parent.postMessage({ height: document.documentElement.scrollHeight, found }, "*");
+});
+</script>
+"""
+
+AROUND = """<!doctype html><body style="margin:0;background:{ground}"><iframe src="{page}" width="{width}" height="900"
+style="border:0;display:block"></iframe><pre id="said" hidden></pre><script>
+addEventListener("message", e => {{ document.querySelector("iframe").height = e.data.height; document.getElementById("said").textContent = JSON.stringify(e.data); }});
+</script>"""
+
+
+def chromium(*words) -> str:
+    program = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+    if program is None:
+        print("check_pages: skipped: no Chromium")
+        sys.exit(0)
+    flags = ["--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", "--allow-file-access-from-files", "--virtual-time-budget=4000"]
+    return subprocess.run([program, *flags, *words], capture_output=True, text=True, check=True, timeout=300).stdout
+
+
+def main() -> None:
+    pictures, pages = Path(sys.argv[1]), [Path(word) for word in sys.argv[2:]]
+    pictures.mkdir(parents=True, exist_ok=True)
+    bad = 0
+    for page in pages:
+        for screen in SCREENS:
+            # The browser follows this machine's screen: the page is shown as if its question had been answered.
+            text = page.read_text()
+            answer = "all" if screen == "dark" else "not all"
+            text, times = re.subn(r"\(prefers-color-scheme:\s*dark\)", answer, text)
+            assert times, f"{page} knows no dark screen"
+            for width in WIDTHS:
+                with tempfile.TemporaryDirectory() as folder:
+                    copy, around = Path(folder) / "page.html", Path(folder) / "around.html"
+                    copy.write_text(text.replace("</head>", LOOK + "</head>", 1))
+                    around.write_text(AROUND.format(page="page.html", width=width, ground="#111" if screen == "dark" else "#fff"))
+                    dom = chromium(f"--window-size={max(width, 500)},900", "--dump-dom", around.as_uri())
+                    said = json.loads(html.unescape(re.search(r'<pre id="said"[^>]*>(.*?)</pre>', dom, re.S)[1]))
+                    name = f"{page.resolve().parent.name}-{page.stem}-{width}-{screen}"
+                    picture = (pictures / f"{name}.png").resolve()
+                    chromium(f"--window-size={max(width, 500)},{said['height']}", f"--screenshot={picture}", around.as_uri())
+                for what in said["found"]:
+                    print(f"{page}, {width} px, {screen}: {what}")
+                bad += len(said["found"])
+    print(f"{len(pages)} pages at {WIDTHS} px, light and dark: {bad} findings")
+    sys.exit(bad > 0)
+
+
+if __name__ == "__main__":
+    main()
