@@ -83,12 +83,38 @@ struct ErrorText {
     help: Option<String>,
 }
 
+/// What is behind an error and not said by it already, outermost first.
+fn causes(report: &miette::Report) -> Vec<String> {
+    let mut said = report.to_string();
+    let mut causes = Vec::new();
+    for cause in report.chain().skip(1).map(ToString::to_string) {
+        if !said.contains(&cause) {
+            said.push_str(&cause);
+            causes.push(cause);
+        }
+    }
+    causes
+}
+
+/// The error as it is shown: without a tail of causes that it has said itself.
+fn told_once(report: miette::Report) -> miette::Report {
+    let repeats = report.chain().len() > 1 && causes(&report).is_empty();
+    if !repeats || report.source_code().is_some() {
+        return report;
+    }
+    let help = report.help().map(|help| help.to_string());
+    match help {
+        Some(help) => miette::miette!(help = help, "{report}"),
+        None => miette::miette!("{report}"),
+    }
+}
+
 fn error_object(kind: &'static str, report: &miette::Report) -> ErrorObject {
     ErrorObject {
         error: ErrorText {
             kind,
             message: report.to_string(),
-            causes: report.chain().skip(1).map(ToString::to_string).collect(),
+            causes: causes(report),
             help: report.help().map(|help| help.to_string()),
         },
     }
@@ -102,6 +128,7 @@ pub fn exit(result: CommandResult, json: bool) -> ExitCode {
         Err(Failure::Failed(report)) => (1, "failed", report),
         Err(Failure::BadInput(report)) => (2, "bad-input", report),
     };
+    let report = told_once(report);
     cellpos_terminal::stderr().flush(PATIENCE);
     // Files are quoted in it: nothing in them gives orders to the terminal.
     eprintln!("{}", clean(&format!("{report:?}"), Colours::Kept));
@@ -166,4 +193,32 @@ pub fn exit_arguments(error: &clap::Error, json: bool) -> ExitCode {
         let _ = print_object("error", &object);
     }
     ExitCode::from(code)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[derive(Debug, thiserror::Error)]
+    #[error("{said}")]
+    struct Outer {
+        said: &'static str,
+        #[source]
+        behind: std::io::Error,
+    }
+
+    #[test]
+    fn a_cause_that_its_error_has_said_is_not_said_again() {
+        let shown = |said| {
+            let behind = std::io::Error::other("Permission denied");
+            let report = told_once(miette::Report::from_err(Outer { said, behind }));
+            (format!("{report:?}"), causes(&report))
+        };
+        let (text, behind) = shown("cannot write page.html: Permission denied");
+        assert_eq!(text.matches("Permission denied").count(), 1, "{text}");
+        assert!(behind.is_empty());
+        let (text, behind) = shown("cannot write page.html");
+        assert_eq!(text.matches("Permission denied").count(), 1, "{text}");
+        assert_eq!(behind, ["Permission denied"]);
+    }
 }

@@ -63,13 +63,16 @@ impl std::error::Error for Failure {
     }
 }
 
-/// An error with what is behind it, on one line.
+/// An error with what is behind it and not said by it already, on one line.
 pub fn describe(error: &dyn std::error::Error) -> String {
     let mut text = error.to_string();
     let mut source = error.source();
     while let Some(error) = source {
-        text.push_str(": ");
-        text.push_str(&error.to_string());
+        let behind = error.to_string();
+        if !text.contains(&behind) {
+            text.push_str(": ");
+            text.push_str(&behind);
+        }
         source = error.source();
     }
     text

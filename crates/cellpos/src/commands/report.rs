@@ -91,7 +91,8 @@ pub fn run(args: Args) -> CommandResult {
     events(&mut page, &sessions);
     provenance(&mut page, &sessions);
     let out = args.out.unwrap_or_else(|| args.run.join("report.html"));
-    page.write_with_figures(&out).map_err(Failure::failed)?;
+    page.write_with_figures(&out)
+        .map_err(|error| Failure::bad_input(error, "name a page that you may write with --out"))?;
     if args.json {
         print_json(&serde_json::json!({
             "out": out,

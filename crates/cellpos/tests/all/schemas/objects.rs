@@ -134,6 +134,10 @@ fn folder() -> tempfile::TempDir {
     }
     let wave = "[[step]]\ndo = \"sine\"\namplitude = \"1um\"\nfrequency = \"20Hz\"\ncycles = 40\n";
     std::fs::write(folder.path().join("wave.toml"), wave).unwrap();
+    let passages = "[[step]]\ndo = \"repeat\"\ntimes = 12\n[[step.step]]\ndo = \"move\"\nto = \"8um\"\nduration = \"200ms\"\n\
+                    [[step.step]]\ndo = \"hold\"\nduration = \"300ms\"\n[[step.step]]\ndo = \"move\"\nto = \"0um\"\nduration = \"200ms\"\n\
+                    [[step.step]]\ndo = \"hold\"\nduration = \"300ms\"\n";
+    std::fs::write(folder.path().join("passages.toml"), passages).unwrap();
     let wild = "[[step]]\ndo = \"move\"\nto = \"900um\"\nduration = \"2ms\"\n";
     std::fs::write(folder.path().join("wild.toml"), wild).unwrap();
     let emulated = "[actuator]\nkind = \"emulated\"\n[camera]\nkind = \"emulated\"\n";
@@ -146,6 +150,31 @@ fn folder() -> tempfile::TempDir {
     folder
 }
 
+/// The result of a replay that does not come out the same.
+fn replay_of_another_controller(at: &Path) -> Value {
+    let runs = std::fs::read_dir(at.join("runs")).unwrap();
+    let hold = runs
+        .map(|run| run.unwrap().path())
+        .find(|run| run.to_str().unwrap().ends_with("-hold"))
+        .unwrap();
+    let copy = at.join("runs/20200101T000000Z-changed");
+    std::fs::create_dir(&copy).unwrap();
+    std::fs::copy(hold.join("ticks.arrow"), copy.join("ticks.arrow")).unwrap();
+    let meta = std::fs::read_to_string(hold.join("run.toml")).unwrap();
+    let mut meta: toml::Table = meta.parse().unwrap();
+    meta["controller"]["pi"]["kp_um_per_um"] = toml::Value::Float(0.1);
+    meta["versions"]["cellpos"] = toml::Value::String("0.0.9".into());
+    std::fs::write(copy.join("run.toml"), meta.to_string()).unwrap();
+    let ran = cellpos(at, "replay latest-changed --json");
+    assert_eq!(ran.code, Some(1), "{}", ran.err);
+    let said = ran.json();
+    assert!(
+        said["identical"].as_u64() < said["ticks"].as_u64(),
+        "{said}"
+    );
+    said
+}
+
 #[test]
 fn the_objects_of_quick_commands_fit_their_schemas() {
     let folder = folder();
@@ -155,6 +184,7 @@ fn the_objects_of_quick_commands_fit_their_schemas() {
         "track --target 0um --sine 2um@20Hz --learn --controller mpc --duration 3s --clock virtual --frames off --name sine",
         "run wave.toml --clock virtual --frames off --name wave",
         "run wave.toml --cells 2 --clock virtual --frames off",
+        "run passages.toml --rig cell.toml --cells 2 --clock virtual --frames off",
         "report latest-hold",
         "report latest-wave",
         "export latest-wave --out wave.csv",
@@ -163,6 +193,7 @@ fn the_objects_of_quick_commands_fit_their_schemas() {
         "bundle --verify packed",
         "check wave.toml",
         "design --model eq6",
+        "design --model eq6 --controller lead",
         "simulate --model eq6 --input latest-hold --out simulated.csv",
         "rig check rig.toml",
         "board --rig emulated.toml --pings 50",
@@ -173,6 +204,10 @@ fn the_objects_of_quick_commands_fit_their_schemas() {
     ] {
         hold(line, &succeed(at, &format!("{line} --json")).json());
     }
+    hold(
+        "replay of a run that another version recorded with other gains",
+        &replay_of_another_controller(at),
+    );
     // What goes wrong is an object, too; limits that are broken, and a machine that is not fit, are results.
     for (line, code) in [
         ("track --target 900um", 2),
