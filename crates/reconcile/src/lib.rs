@@ -46,4 +46,4 @@ pub use verdict::result::{
     BandGap, Effect, Gap, GapStep, Interval, Reconciliation, RecordGap, Remainder, Trace, Traces,
     Verdict,
 };
-pub use verdict::workflow::{Options, reconcile};
+pub use verdict::workflow::{Options, WORK, reconcile};

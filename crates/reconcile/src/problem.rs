@@ -6,6 +6,8 @@ use crate::dot::dot;
 use crate::simulate::Base;
 use crate::thresholds::THRESHOLDS;
 use std::ops::Range;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 
 /// Start of a record with an analogue input that is not scored \[s\].
 const RUN_IN_S: f64 = 0.5;
@@ -150,6 +152,8 @@ pub(crate) struct Problem {
     pub soft: (f64, f64),
     /// The positions come in steps that are not small beside their increments.
     pub quantised: bool,
+    /// Work of all simulations until now; the copies of a problem count together.
+    work: Arc<AtomicU64>,
 }
 
 impl Problem {
@@ -211,7 +215,18 @@ impl Problem {
             noise,
             soft: (-0.4 * kick, 1.3 * kick),
             quantised: records.iter().any(Record::is_quantised),
+            work: Arc::default(),
         }
+    }
+
+    /// Counts the work of a simulation.
+    pub fn spend(&self, work: u64) {
+        self.work.fetch_add(work, Ordering::Relaxed);
+    }
+
+    /// Work of all simulations until now. The same for any number of threads, where none of them is at work.
+    pub fn spent(&self) -> u64 {
+        self.work.load(Ordering::Relaxed)
     }
 
     /// The same problem with other noise.

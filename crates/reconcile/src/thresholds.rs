@@ -30,6 +30,8 @@ pub struct Thresholds {
     /// After two effects, a set that leaves more than this part of the excess is on no way to an explanation: the search ends
     /// there, and the verdict will be `unknown`. Saves minutes, decides nothing that [`Self::closed_least`] does not.
     pub hopeless: f64,
+    /// The same after three.
+    pub hopeless_late: f64,
     /// Numbers that move by more than this part between parts of the records, beyond their intervals, belong to another
     /// equation. Pinned by `numbers_that_change_with_the_part_of_the_data_are_no_name`.
     pub split_share: f64,
@@ -124,6 +126,7 @@ pub const THRESHOLDS: Thresholds = Thresholds {
     left_sd: 5.0,
     free_run_fall: 0.2,
     hopeless: 0.6,
+    hopeless_late: 0.3,
     split_share: 0.15,
     split_gain: 0.01,
     small_share: 0.5,

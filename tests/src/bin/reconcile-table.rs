@@ -137,7 +137,7 @@ fn summary(cases: &[(Case, u64)], done: &[(&Case, &Row)]) {
         .fold((0, 0), |a, (_, r)| (a.0 + r.covered.0, a.1 + r.covered.1));
     println!("95 % intervals that hold the truth: {covered:?}");
     let slowest = done.iter().map(|(_, r)| r.seconds).fold(0.0, f64::max);
-    println!("slowest case, one thread: {slowest:.1} s");
+    println!("slowest case, time of one processor: {slowest:.1} s");
 }
 
 fn confusions(done: &[(&Case, &Row)]) {

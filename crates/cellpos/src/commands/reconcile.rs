@@ -78,6 +78,9 @@ pub struct Args {
     /// Most effects to add.
     #[arg(long, default_value_t = 4)]
     max_effects: usize,
+    /// Simulations that the search may take, in parts of what is enough for 30 s on two cores.
+    #[arg(long, default_value_t = 1.0)]
+    work: f64,
     /// Threads; the result does not depend on it.
     #[arg(long)]
     threads: Option<usize>,
@@ -123,6 +126,7 @@ pub fn run(args: Args) -> CommandResult {
     let mut options = Options {
         threads,
         max_effects: args.max_effects,
+        work: args.work,
         own_effects,
         ..Options::default()
     };

@@ -70,6 +70,8 @@ pub(crate) struct Fit {
     pub locking: Vec<Option<Locking>>,
     /// Sum of squares over the mask.
     pub chi2: f64,
+    /// What the last round of the descent gained; nothing once it stands still.
+    pub last_gain: f64,
     /// Innovations that count under the mask.
     pub count: usize,
     /// Innovations of all rows, masked or not, of all records.
@@ -144,7 +146,8 @@ impl Context<'_> {
             .map(|(r, ranges)| {
                 let mut y = Vec::new();
                 if !ranges.is_empty() {
-                    simulate(&self.problem.base, &r.u, &effects, &mut y, None);
+                    let work = simulate(&self.problem.base, &r.u, &effects, &mut y, None);
+                    self.problem.spend(work);
                 }
                 y
             })

@@ -14,6 +14,31 @@ use nalgebra::{DMatrix, DVector};
 /// in which the operator moves has to say.
 const WEIGHT_PRECISION: f64 = 100.0;
 
+/// A fit stands still when a round gains less than this, or than this part of what it leaves beyond the noise.
+const STILL: f64 = 0.02;
+const STILL_SHARE: f64 = 3e-6;
+
+/// Rounds before a fit may be given up: the first ones find their damping.
+const FEWEST: usize = 4;
+
+/// How far a fit is carried on.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Until {
+    pub iterations: usize,
+    /// It is given up where it will not come below this.
+    pub least_chi2: f64,
+}
+
+impl Until {
+    /// To the end.
+    pub fn done(iterations: usize) -> Self {
+        Self {
+            iterations,
+            least_chi2: f64::INFINITY,
+        }
+    }
+}
+
 impl Context<'_> {
     /// Fits a set of candidates from starting values.
     pub fn fit(&self, parts: Vec<Part>, mask: &Mask, iterations: usize) -> Fit {
@@ -22,7 +47,12 @@ impl Context<'_> {
 
     /// Carries a fit on.
     pub fn refit(&self, fit: &Fit, mask: &Mask, iterations: usize) -> Fit {
-        self.run(fit.clone(), mask, iterations)
+        self.run(fit.clone(), mask, Until::done(iterations))
+    }
+
+    /// Carries a fit on, as long as it may still come down to a sum of squares.
+    pub fn refit_towards(&self, fit: &Fit, mask: &Mask, until: Until) -> Fit {
+        self.run(fit.clone(), mask, until)
     }
 
     /// As [`Self::fit`], with the nuisances of an earlier fit as starting values where they apply.
@@ -32,6 +62,17 @@ impl Context<'_> {
         soft: Option<f64>,
         mask: &Mask,
         iterations: usize,
+    ) -> Fit {
+        self.fit_towards(parts, soft, mask, Until::done(iterations))
+    }
+
+    /// As [`Self::fit_from`], given up where it can no longer come down to a sum of squares.
+    pub fn fit_towards(
+        &self,
+        parts: Vec<Part>,
+        soft: Option<f64>,
+        mask: &Mask,
+        until: Until,
     ) -> Fit {
         let records = self.problem.records.len();
         let lines = parts
@@ -51,20 +92,22 @@ impl Context<'_> {
             positions: vec![[0.0; 2]; positions],
             locking: Vec::new(),
             chi2: 0.0,
+            last_gain: 0.0,
             count: self.problem.count(mask),
             innovations: Vec::new(),
             covariance: DMatrix::zeros(0, 0),
         };
-        self.run(fit, mask, iterations)
+        self.run(fit, mask, until)
     }
 
-    fn run(&self, mut fit: Fit, mask: &Mask, iterations: usize) -> Fit {
+    fn run(&self, mut fit: Fit, mask: &Mask, until: Until) -> Fit {
         fit.count = self.problem.count(mask);
         let mut state = self.state(&fit, mask);
         let mut lambda = 1e-3;
         let mut size;
         let mut normal;
         let mut round = 0;
+        let mut gained = 0.0;
         loop {
             let (n, columns) = self.columns(&fit, &state, mask);
             size = n;
@@ -80,7 +123,7 @@ impl Context<'_> {
                 }
                 at += freedom_of(p.variant(), self.problem.records.len());
             }
-            if round >= iterations {
+            if round >= until.iterations {
                 break;
             }
             round += 1;
@@ -111,11 +154,19 @@ impl Context<'_> {
                 }
                 lambda = (lambda * 8.0).max(1e-6);
             }
-            if improved < 0.02 {
+            gained = improved;
+            let rough = (state.chi2 - fit.count as f64).max(0.0);
+            if improved < STILL.max(STILL_SHARE * rough) {
+                break;
+            }
+            // Steps of a descent become smaller: even if they did not, the rest of them would not get there.
+            let most = improved * (until.iterations - round) as f64;
+            if round >= FEWEST && state.chi2 - most > until.least_chi2 {
                 break;
             }
         }
         fit.chi2 = state.chi2;
+        fit.last_gain = gained;
         fit.innovations = if mask.iter().any(Vec::is_empty) {
             self.state(&fit, &self.problem.all()).innovations
         } else {

@@ -4,7 +4,7 @@
 mod agreement;
 pub(crate) mod catalogue;
 pub(crate) mod context;
-mod descent;
+pub(crate) mod descent;
 mod evaluate;
 pub(crate) mod linear;
 pub(crate) mod locking;

@@ -2,6 +2,7 @@
 
 use crate::fit::catalogue::{self, Part};
 use crate::fit::context::{Context, Fit, freedom_of};
+use crate::fit::descent::Until;
 use crate::problem::Mask;
 use crate::search::screen::screen;
 use crate::thresholds::THRESHOLDS;
@@ -12,6 +13,15 @@ use cellpos_plant::effects::Candidate;
 pub(crate) struct Effort {
     pub threads: usize,
     pub max_effects: usize,
+    /// Work of simulations after which no further effect is looked for.
+    pub work: u64,
+}
+
+impl Effort {
+    /// Whether the work is done up.
+    fn is_spent(&self, ctx: &Context<'_>) -> bool {
+        ctx.problem.spent() > self.work
+    }
 }
 
 /// A set with the rivals met on the way.
@@ -23,6 +33,8 @@ pub(crate) struct Found {
     pub steps: Vec<(Vec<&'static str>, f64)>,
     /// For each effect of the set: rivals in its stead, id and sum of squares of the joint refit.
     pub rivals: Vec<Vec<Rival>>,
+    /// The search ended because its work was done up, not because nothing more was to be found.
+    pub cut_short: bool,
 }
 
 /// Another candidate in the stead of a named one.
@@ -78,7 +90,16 @@ pub(crate) fn prior_penalty(part: &Part, left: f64) -> f64 {
     }
 }
 
-/// Fits the best leads next to a set and returns the fits, best first.
+/// Sums of squares so far above that of a fit decide nothing beside it, whatever their prices.
+fn within(fit: &Fit) -> f64 {
+    100.0 + THRESHOLDS.untypical_share * left_over(fit)
+}
+
+/// Whatever is beyond chance, followed to the end.
+const FREELY: [f64; 2] = [0.0, f64::INFINITY];
+
+/// Fits the best leads next to a set and returns the fits, best first; `least` is what a lead must promise, `rival_of` the sum of
+/// squares from which on a fit is followed no further.
 fn extensions(
     ctx: &Context<'_>,
     fit: &Fit,
@@ -86,7 +107,7 @@ fn extensions(
     effort: Effort,
     wide: usize,
     forbidden: &[&str],
-    least: f64,
+    [least, rival_of]: [f64; 2],
 ) -> Vec<Fit> {
     let tangents = ctx.tangents(fit, mask);
     let leads = screen(ctx, fit, &tangents, mask, effort.threads, |v| {
@@ -132,7 +153,21 @@ fn extensions(
         .first()
         .map_or(0.0, |best| best.chi2 + 0.5 * (fit.chi2 - best.chi2));
     let rest = fits.split_off(fits.iter().take(4).filter(|f| f.chi2 <= close).count());
-    let mut fits = cellpos_parallel::map(&fits, effort.threads, |f| ctx.refit(f, mask, 14));
+    let target = fits
+        .first()
+        .map_or(f64::INFINITY, |best| best.chi2 + within(best));
+    let until = Until {
+        iterations: 14,
+        least_chi2: target.min(rival_of),
+    };
+    let mut fits = cellpos_parallel::map(&fits, effort.threads, |f| {
+        // Steps become smaller: what is out of reach with steps like the last is out of reach.
+        if f.chi2 - f.last_gain * until.iterations as f64 > until.least_chi2 {
+            f.clone()
+        } else {
+            ctx.refit_towards(f, mask, until)
+        }
+    });
     fits.extend(rest);
     fits.extend(own(ctx, fit, mask, effort, forbidden));
     fits.sort_by(|a, b| penalised_cost(ctx, a).total_cmp(&penalised_cost(ctx, b)));
@@ -182,7 +217,13 @@ fn eliminate(ctx: &Context<'_>, mut fit: Fit, null: f64, mask: &Mask, effort: Ef
         let without = cellpos_parallel::map(&indices, effort.threads, |&i| {
             let mut parts = fit.parts.clone();
             parts.remove(i);
-            ctx.fit_from(parts, Some(fit.soft), mask, 8)
+            // Only whether it comes so far down that the part was worth nothing is asked.
+            let least = THRESHOLDS.addition_share * (null - fit.chi2);
+            let until = Until {
+                iterations: 8,
+                least_chi2: fit.chi2 + threshold(fit.freedom()).max(least),
+            };
+            ctx.fit_towards(parts, Some(fit.soft), mask, until)
         });
         let Some(best) = without
             .into_iter()
@@ -198,9 +239,10 @@ fn eliminate(ctx: &Context<'_>, mut fit: Fit, null: f64, mask: &Mask, effort: Ef
 
 /// Replaces single effects by others while that helps; also gathers the rivals of each effect.
 fn replace(ctx: &Context<'_>, mut fit: Fit, mask: &Mask, effort: Effort) -> (Fit, Vec<Vec<Rival>>) {
-    for _ in 0..3 {
+    for round in 0..3 {
         let mut rivals: Vec<Vec<Rival>> = Vec::new();
         let mut better: Option<Fit> = None;
+        let target = fit.chi2 + within(&fit);
         let mut consider = |other: Fit, part: Part, list: &mut Vec<Rival>| {
             list.push(Rival {
                 id: part.id(),
@@ -227,7 +269,7 @@ fn replace(ctx: &Context<'_>, mut fit: Fit, mask: &Mask, effort: Effort) -> (Fit
                 effort,
                 4,
                 &[id],
-                0.25 * (without.chi2 - fit.chi2),
+                [0.25 * (without.chi2 - fit.chi2), target],
             ) {
                 let Some(part) = other.parts.last().cloned() else {
                     continue;
@@ -262,7 +304,11 @@ fn replace(ctx: &Context<'_>, mut fit: Fit, mask: &Mask, effort: Effort) -> (Fit
             for other in cellpos_parallel::map(&twins, effort.threads, |part| {
                 let mut parts = fit.parts.clone();
                 parts[i] = part.clone();
-                ctx.fit_from(parts, Some(fit.soft), mask, 12)
+                let until = Until {
+                    iterations: 12,
+                    least_chi2: target,
+                };
+                ctx.fit_towards(parts, Some(fit.soft), mask, until)
             }) {
                 let part = other.parts[i].clone();
                 consider(other, part, &mut list);
@@ -270,6 +316,8 @@ fn replace(ctx: &Context<'_>, mut fit: Fit, mask: &Mask, effort: Effort) -> (Fit
             rivals.push(list);
         }
         match better {
+            // An exchange that there is no work left to look beyond: the set stands as it was, with the better one as its rival.
+            Some(_) if round > 0 && effort.is_spent(ctx) => return (fit, rivals),
             Some(b) => fit = b,
             None => return (fit, rivals),
         }
@@ -300,7 +348,11 @@ fn reparametrise(ctx: &Context<'_>, mut fit: Fit, mask: &Mask, effort: Effort, r
         let fits = cellpos_parallel::map(&others, effort.threads, |part| {
             let mut parts = fit.parts.clone();
             parts[i] = part.clone();
-            ctx.fit_from(parts, Some(fit.soft), mask, 10)
+            let until = Until {
+                iterations: 10,
+                least_chi2: fit.chi2 + within(&fit),
+            };
+            ctx.fit_towards(parts, Some(fit.soft), mask, until)
         });
         if let Some(best) = fits
             .into_iter()
@@ -328,7 +380,7 @@ pub(crate) fn search(
     let null = ctx.fit(Vec::new(), mask, 6);
     let mut steps = vec![(Vec::new(), null.chi2)];
     progress("screening single effects");
-    let mut singles = extensions(ctx, &null, mask, effort, 8, &[], 0.0);
+    let mut singles = extensions(ctx, &null, mask, effort, 8, &[], FREELY);
     singles.retain(|f| worth_it(&null, f, null.chi2));
     let Some(best) = singles.first().cloned() else {
         return Found {
@@ -336,6 +388,7 @@ pub(crate) fn search(
             null,
             steps,
             rivals: Vec::new(),
+            cut_short: false,
         };
     };
     steps.push((ids(&best), best.chi2));
@@ -349,13 +402,26 @@ pub(crate) fn search(
     // The last set whose effects were weighed against their rivals.
     let mut weighed: Option<(Fit, Vec<Vec<Rival>>)> = None;
     let mut beam: Vec<Fit> = singles.into_iter().skip(1).take(2).collect();
+    let mut cut_short = false;
     while fit.parts.len() < effort.max_effects {
-        if fit.parts.len() >= 2 && left_over(&fit) > THRESHOLDS.hopeless * left_over(&null) {
+        if effort.is_spent(ctx) {
+            cut_short = true;
+            break;
+        }
+        let open = left_over(&fit) / left_over(&null).max(1e-12);
+        let few = fit.parts.len() < 3;
+        let most = if few {
+            THRESHOLDS.hopeless
+        } else {
+            THRESHOLDS.hopeless_late
+        };
+        if fit.parts.len() >= 2 && open > most {
             break;
         }
         progress(&format!("looking further beside {}", ids(&fit).join(" + ")));
         let least = THRESHOLDS.addition_share * (null.chi2 - fit.chi2);
-        let mut next: Vec<Fit> = extensions(ctx, &fit, mask, effort, 6, &[], least);
+        let mut next: Vec<Fit> =
+            extensions(ctx, &fit, mask, effort, 6, &[], [least, f64::INFINITY]);
         next.retain(|f| worth_it(&fit, f, null.chi2));
         if next.is_empty() {
             break;
@@ -364,7 +430,8 @@ pub(crate) fn search(
         let top_chi2 = next[0].chi2;
         for other in std::mem::take(&mut beam) {
             let least = 0.5 * (other.chi2 - top_chi2);
-            next.extend(extensions(ctx, &other, mask, effort, 4, &[], least));
+            let limits = [least, f64::INFINITY];
+            next.extend(extensions(ctx, &other, mask, effort, 4, &[], limits));
         }
         next.sort_by(|a, b| penalised_cost(ctx, a).total_cmp(&penalised_cost(ctx, b)));
         let Some(top) = next.first().cloned() else {
@@ -385,6 +452,12 @@ pub(crate) fn search(
                 continue;
             }
         }
+        if effort.is_spent(ctx) {
+            fit = top;
+            steps.push((ids(&fit), fit.chi2));
+            cut_short = true;
+            break;
+        }
         let (top, rivals) = replace(ctx, top, mask, effort);
         weighed = Some((top.clone(), rivals));
         let forms = top.parts.clone();
@@ -397,12 +470,21 @@ pub(crate) fn search(
         beam = Vec::new();
     }
     progress("refitting all together");
-    let (fit, rivals) = settle(ctx, fit, weighed, mask, effort);
+    // Rivals of a set that is no explanation, and that nothing more will be added to, decide nothing.
+    let hopeless =
+        cut_short && left_over(&fit) > (1.0 - THRESHOLDS.closed_least) * left_over(&null);
+    let (fit, rivals) = if hopeless {
+        let none = vec![Vec::new(); fit.parts.len()];
+        (fit, none)
+    } else {
+        settle(ctx, fit, weighed, mask, effort)
+    };
     Found {
         fit,
         null,
         steps,
         rivals,
+        cut_short,
     }
 }
 

@@ -34,15 +34,24 @@ pub(crate) struct Base {
 ///
 /// `edge`, where asked for, receives the step of the plant's input that acts at the instant of each frame, in parts of
 /// the plant's direct path: what a frame that straddles the edge may already show.
+///
+/// Returns how much work it was, in the advances of one mode by one step, or as much: known beforehand, the same on every machine.
 pub(crate) fn simulate(
     base: &Base,
     u: &[f64],
     effects: &[Effect],
     y: &mut Vec<f64>,
     edge: Option<&mut Vec<f64>>,
-) {
-    Chain::new(base, effects).run(u, y, edge);
+) -> u64 {
+    let chain = Chain::new(base, effects);
+    let work = u.len() as u64 * chain.work_per_row();
+    chain.run(u, y, edge);
+    work
 }
+
+/// Work of a step that every chain has, and of a block that is not linear, in advances of one mode.
+const WORK_OF_STEP: usize = 8;
+const WORK_OF_BLOCK: usize = 10;
 
 /// What happens to the signal before the plant, in order.
 enum Stage {
@@ -150,7 +159,8 @@ impl<'a> Chain<'a> {
             chain.fine = chain.fine.max(4);
         }
         let f = chain.frames;
-        let within = f.skew != 0.0 || f.delay_s != 0.0 || f.exposure_s != 0.0;
+        let frames = f.skew != 0.0 || f.delay_s != 0.0 || f.exposure_s != 0.0;
+        let within = frames && !chain.only_late();
         let slopes = chain.motion.iter().any(|b| b.needs_slopes() && b.bends());
         if (within || slopes) && has_fast_pole(&all, base.sample_s / chain.fine as f64) {
             chain.fine = chain.fine.max(4);
@@ -159,6 +169,29 @@ impl<'a> Chain<'a> {
             }
         }
         chain
+    }
+
+    /// Work of a row of a record, as [`simulate`] counts it.
+    fn work_per_row(&self) -> u64 {
+        let (mut modes, mut blocks) = (self.plant.poles.len(), self.motion.len());
+        for stage in &self.before {
+            match stage {
+                Stage::Linear(zpk) => modes += zpk.poles.len(),
+                Stage::Clip(..) | Stage::Slew(_) => {}
+                Stage::Block(_) => blocks += 1,
+            }
+        }
+        // What goes beside the plant has everything before it once more.
+        for zpk in &self.bypass {
+            modes += modes + zpk.poles.len();
+        }
+        blocks += 2 * self.ties.len();
+        let steps = if self.ties.is_empty() {
+            self.fine
+        } else {
+            self.fine.max(MOST_STEPS as usize / 4)
+        };
+        (steps * (modes + WORK_OF_BLOCK * blocks + WORK_OF_STEP)) as u64
     }
 
     fn run(mut self, u: &[f64], y: &mut Vec<f64>, edge: Option<&mut Vec<f64>>) {
@@ -192,20 +225,65 @@ impl<'a> Chain<'a> {
         }
         let f = self.frames;
         let plain = f.skew == 0.0 && f.delay_s == 0.0 && f.exposure_s == 0.0;
-        if plain && self.motion.is_empty() && self.bypass.is_empty() {
+        if plain && self.motion.is_empty() {
             let mut pos = Vec::new();
             modal.run(&x, &mut pos);
+            for zpk in &self.bypass {
+                let mut beside = Vec::new();
+                Modal::new(&pending.clone().series(zpk), h).run(&x, &mut beside);
+                pos.iter_mut().zip(beside).for_each(|(p, b)| *p += b);
+            }
             y.clear();
             y.extend(pos.into_iter().step_by(self.fine));
             return;
         }
+        if self.only_late() {
+            self.run_late(modal, &x, h, y);
+            return;
+        }
         let mut t = Trace::default();
-        modal.trace(&x, &mut t);
+        modal.trace(&x, self.fine, &mut t);
         if self.base.interpolated_input {
             t.straighten(h);
         }
         self.behind_plant(&mut t, &x, &pending, h);
         camera::sample(&t, f, h, self.fine, n, y);
+    }
+
+    /// Whether a delay is all that lies between plant and record: it is exact without a fine grid.
+    fn only_late(&self) -> bool {
+        let f = self.frames;
+        f.delay_s > 0.0
+            && f.skew == 0.0
+            && f.exposure_s == 0.0
+            && self.motion.is_empty()
+            && self.bypass.is_empty()
+            && self.ties.is_empty()
+            && !self.base.interpolated_input
+    }
+
+    /// Positions a delay earlier than the frames, as [`camera::sample`] has them.
+    fn run_late(&self, modal: Modal, x: &[f64], h: f64, y: &mut Vec<f64>) {
+        let late = self.frames.delay_s / h;
+        let steps = (late + 1e-7).floor() + 1.0;
+        let direct = modal.direct;
+        let mut seen = Vec::new();
+        let at = h * (steps - late).min(1.0);
+        modal.inside(at, h).run(x, &mut seen);
+        let steps = steps as usize;
+        // A frame that close behind an edge shows what the share of the edge says.
+        let samples = self.frames.delay_s / self.base.sample_s;
+        let edge = camera::near_whole(samples)
+            .is_some_and(|w| samples < w as f64 && steps == w * self.fine);
+        y.clear();
+        y.extend((0..x.len() / self.fine).map(|k| {
+            let Some(j) = (k * self.fine).checked_sub(steps) else {
+                return 0.0;
+            };
+            let before = if j == 0 { 0.0 } else { x[j - 1] };
+            let shown = if edge { direct * (x[j] - before) } else { 0.0 };
+            seen[j] - shown
+        }));
     }
 
     /// What enters the plant, step by step, without the linear blocks that come last before it.
@@ -277,7 +355,7 @@ impl<'a> Chain<'a> {
             for (j, mean) in means.iter_mut().enumerate() {
                 *mean = 0.5 * (*mean + t.pos.get(j + 1).copied().unwrap_or(position));
             }
-            Modal::new(&self.plant, h).trace(&means, &mut t);
+            Modal::new(&self.plant, h).trace(&means, 1, &mut t);
         }
         self.behind_plant(&mut t, &x, &Zpk::one(), h);
         camera::sample(&t, self.frames, h, self.fine, n, y);
@@ -290,7 +368,7 @@ impl<'a> Chain<'a> {
         }
         for zpk in &self.bypass {
             let mut beside = Trace::default();
-            Modal::new(&pending.clone().series(zpk), h).trace(x, &mut beside);
+            Modal::new(&pending.clone().series(zpk), h).trace(x, self.fine, &mut beside);
             if self.base.interpolated_input {
                 beside.straighten(h);
             }

@@ -47,10 +47,59 @@ struct Mode {
     slope: C,
 }
 
+/// Four first-order modes with states scaled so that the input enters each with weight 1; what is left over of four does nothing.
+#[derive(Debug, Clone, Copy, Default)]
+struct Four {
+    /// Decay over a step.
+    a: [f64; 4],
+    /// Weight in the position.
+    w: [f64; 4],
+    /// Weight in the slope.
+    s: [f64; 4],
+    /// Pole \[rad/s\] and drive over a step of the state as it was before scaling, for what lies inside a step.
+    p: [f64; 4],
+    b: [f64; 4],
+}
+
+impl Four {
+    /// Position and slope that the states give, lane by lane, and on to the next step.
+    #[inline(always)]
+    fn step(&self, z: &mut [f64; 4], u: f64, y: &mut [f64; 4], v: &mut [f64; 4]) {
+        for i in 0..4 {
+            y[i] += self.w[i] * z[i];
+            v[i] += self.s[i] * z[i];
+            z[i] = self.a[i] * z[i] + u;
+        }
+    }
+
+    /// The same without the slope.
+    #[inline(always)]
+    fn step_position(&self, z: &mut [f64; 4], u: f64, y: &mut [f64; 4]) {
+        for i in 0..4 {
+            y[i] += self.w[i] * z[i];
+            z[i] = self.a[i] * z[i] + u;
+        }
+    }
+}
+
+fn sum(x: [f64; 4]) -> f64 {
+    (x[0] + x[1]) + (x[2] + x[3])
+}
+
+/// `(exp(p t) - 1)/p`: what a constant input of 1 has made of a mode after `t`.
+fn driven(p: C, t: f64) -> C {
+    let x = p * t;
+    if x.norm() < 1e-5 {
+        (C::new(1.0, 0.0) + x * 0.5) * t
+    } else {
+        (x.exp() - 1.0) / p
+    }
+}
+
 /// The same chain, discretised for one step length.
 #[derive(Debug, Clone)]
 pub(crate) struct Modal {
-    real: Vec<[f64; 4]>,
+    real: Vec<Four>,
     complex: Vec<Mode>,
     /// Direct path of a biproper chain.
     pub direct: f64,
@@ -68,6 +117,19 @@ pub(crate) struct Trace {
 }
 
 impl Trace {
+    /// Empty, with room for so many steps.
+    fn clear(&mut self, steps: usize) {
+        for part in [
+            &mut self.pos,
+            &mut self.jump,
+            &mut self.start_slope,
+            &mut self.end_slope,
+        ] {
+            part.clear();
+            part.reserve(steps);
+        }
+    }
+
     /// Adds another motion.
     pub fn add(&mut self, other: &Self) {
         let add = |a: &mut [f64], b: &[f64]| a.iter_mut().zip(b).for_each(|(a, b)| *a += b);
@@ -92,12 +154,6 @@ impl Trace {
     }
 }
 
-/// Decay, drive and weight of four modes.
-fn columns(four: &[[f64; 4]]) -> ([f64; 4], [f64; 4], [f64; 4]) {
-    let column = |j: usize| std::array::from_fn(|i| four[i][j]);
-    (column(0), column(1), column(2))
-}
-
 impl Modal {
     /// Partial fractions of a proper transfer function, held-input recursion of step `h`.
     pub fn new(zpk: &Zpk, h: f64) -> Self {
@@ -106,6 +162,7 @@ impl Modal {
         let proper = zpk.zeros.len() < poles.len();
         let direct = if proper { 0.0 } else { zpk.gain };
         let mut real = Vec::new();
+        let mut lane = 4;
         let mut complex = Vec::new();
         let mut slope_direct = 0.0;
         for (i, &p) in poles.iter().enumerate() {
@@ -124,16 +181,22 @@ impl Modal {
             if p.im > 0.0 {
                 r *= 2.0;
             }
-            let x = p * h;
-            let a = x.exp();
-            let b = if x.norm() < 1e-5 {
-                (C::new(1.0, 0.0) + x * 0.5) * h
-            } else {
-                (a - 1.0) / p
-            };
+            let a = (p * h).exp();
+            let b = driven(p, h);
             slope_direct += r.re;
             if p.im == 0.0 {
-                real.push([a.re, b.re, r.re, (r * p).re]);
+                if lane == 4 {
+                    real.push(Four::default());
+                    lane = 0;
+                }
+                if let Some(four) = real.last_mut() {
+                    four.a[lane] = a.re;
+                    four.w[lane] = r.re * b.re;
+                    four.s[lane] = (r * p).re * b.re;
+                    four.p[lane] = p.re;
+                    four.b[lane] = b.re;
+                    lane += 1;
+                }
             } else {
                 complex.push(Mode {
                     a,
@@ -155,31 +218,15 @@ impl Modal {
     pub fn run(&self, u: &[f64], y: &mut Vec<f64>) {
         y.clear();
         y.resize(u.len(), 0.0);
-        if self.direct != 0.0 {
-            for k in 1..u.len() {
-                y[k] = self.direct * u[k - 1];
+        let mut states = vec![[0.0; 4]; self.real.len()];
+        let mut before = 0.0;
+        for (y, &u) in y.iter_mut().zip(u) {
+            let mut lanes = [0.0; 4];
+            for (four, z) in self.real.iter().zip(&mut states) {
+                four.step_position(z, u, &mut lanes);
             }
-        }
-        // Four at a time: each waits for its own last value only.
-        let mut fours = self.real.chunks_exact(4);
-        for four in &mut fours {
-            let (a, b, w) = columns(four);
-            let mut z = [0.0; 4];
-            for (y, &u) in y.iter_mut().zip(u) {
-                let mut sum = 0.0;
-                for i in 0..4 {
-                    sum += w[i] * z[i];
-                    z[i] = a[i] * z[i] + b[i] * u;
-                }
-                *y += sum;
-            }
-        }
-        for &[a, b, w, _] in fours.remainder() {
-            let mut z = 0.0;
-            for (y, &u) in y.iter_mut().zip(u) {
-                *y += w * z;
-                z = a * z + b * u;
-            }
+            *y = self.direct * before + sum(lanes);
+            before = u;
         }
         for m in &self.complex {
             let mut z = C::new(0.0, 0.0);
@@ -190,67 +237,145 @@ impl Modal {
         }
     }
 
+    /// The same chain seen `t` after the start of each step of `h`, 0 < t <= h: for [`Inside::run`].
+    pub fn inside(mut self, t: f64, h: f64) -> Inside {
+        let mut feed = self.direct;
+        for four in &mut self.real {
+            for i in 0..4 {
+                if four.b[i] == 0.0 {
+                    continue;
+                }
+                let p = C::new(four.p[i], 0.0);
+                feed += four.w[i] / four.b[i] * driven(p, t).re;
+                four.w[i] *= (p * t).exp().re;
+            }
+        }
+        for m in &mut self.complex {
+            // The pole from its slope and weight; a weight of nothing drives nothing.
+            if m.weight.norm() > 0.0 {
+                let p = m.slope / m.weight;
+                feed += (m.weight * driven(p, t)).re;
+                m.weight *= (p * t).exp();
+            }
+        }
+        // Just before the next step's input acts, the direct path still shows this step's.
+        debug_assert!(t > 0.0 && t <= h * (1.0 + 1e-6));
+        Inside { modal: self, feed }
+    }
+
     /// Positions with jumps and slopes, for what acts on the motion inside a step (adhesion, delay, exposure).
-    pub fn trace(&self, u: &[f64], t: &mut Trace) {
-        let n = u.len();
-        t.pos.clear();
-        t.pos.resize(n, 0.0);
-        t.jump.clear();
-        t.jump.reserve(n);
+    ///
+    /// `fine` steps make a sample: where the input is held over all of them, the modes go on by whole samples.
+    pub fn trace(&self, u: &[f64], fine: usize, t: &mut Trace) {
+        t.clear(u.len());
         let mut before = 0.0;
-        for (k, &u) in u.iter().enumerate() {
-            t.pos[k] = self.direct * before;
+        for &u in u {
             t.jump.push(self.direct * (u - before));
             before = u;
         }
-        // Slope of the modes at the start of each step, and of what would be the next.
-        let mut slope = vec![0.0; n + 1];
-        let mut fours = self.real.chunks_exact(4);
-        for four in &mut fours {
-            let (a, b, w) = columns(four);
-            let s: [f64; 4] = std::array::from_fn(|i| four[i][3]);
-            let mut z = [0.0; 4];
-            for ((&u, y), v) in u.iter().zip(&mut t.pos).zip(&mut slope) {
-                let (mut sum, mut rise) = (0.0, 0.0);
-                for i in 0..4 {
-                    sum += w[i] * z[i];
-                    rise += s[i] * z[i];
-                    z[i] = a[i] * z[i] + b[i] * u;
+        match fine {
+            4 => self.held::<4, 8>(u, t),
+            10 => self.held::<10, 20>(u, t),
+            _ => self.held::<1, 2>(u, t),
+        }
+        if !self.complex.is_empty() {
+            self.add_complex(u, t);
+        }
+    }
+
+    /// Position and slopes of the real modes and of the direct path, `FINE` steps at once; `BOTH` is twice that.
+    fn held<const FINE: usize, const BOTH: usize>(&self, u: &[f64], t: &mut Trace) {
+        // What a state at the start of a sample, and an input of 1 over it, give at each of its steps: position, then slope.
+        let mut of_state = vec![[[0.0; BOTH]; 4]; self.real.len()];
+        let mut of_input = [0.0; BOTH];
+        let mut far = self.real.clone();
+        for ((four, table), far) in self.real.iter().zip(&mut of_state).zip(&mut far) {
+            for i in 0..4 {
+                let (mut decay, mut drive) = (1.0, 0.0);
+                for k in 0..FINE {
+                    table[i][k] = four.w[i] * decay;
+                    table[i][FINE + k] = four.s[i] * decay;
+                    of_input[k] += four.w[i] * drive;
+                    of_input[FINE + k] += four.s[i] * drive;
+                    drive = four.a[i] * drive + 1.0;
+                    decay *= four.a[i];
                 }
-                *y += sum;
-                *v += rise;
+                far.a[i] = decay;
+                far.b[i] = drive;
             }
-            slope[n] += (0..4).map(|i| s[i] * z[i]).sum::<f64>();
         }
-        for &[a, b, w, s] in fours.remainder() {
-            let mut z = 0.0;
-            for ((&u, y), v) in u.iter().zip(&mut t.pos).zip(&mut slope) {
-                *y += w * z;
-                *v += s * z;
-                z = a * z + b * u;
+        let mut states = vec![[0.0; 4]; self.real.len()];
+        let mut before = 0.0;
+        for piece in u.chunks(FINE) {
+            let first = piece[0];
+            // A single step gains nothing by the tables.
+            if FINE > 1 && piece.len() == FINE && piece.iter().all(|u| *u == first) {
+                let mut out = of_input.map(|x| x * first);
+                for ((table, far), z) in of_state.iter().zip(&far).zip(&mut states) {
+                    for i in 0..4 {
+                        for (out, x) in out.iter_mut().zip(&table[i]) {
+                            *out += x * z[i];
+                        }
+                    }
+                    for i in 0..4 {
+                        z[i] = far.a[i] * z[i] + far.b[i] * first;
+                    }
+                }
+                let straight = self.slope_direct * first;
+                out[0] += self.direct * before;
+                out[1..FINE]
+                    .iter_mut()
+                    .for_each(|y| *y += self.direct * first);
+                t.pos.extend_from_slice(&out[..FINE]);
+                t.start_slope
+                    .extend(out[FINE..].iter().map(|v| v + straight));
+                before = first;
+                continue;
             }
-            slope[n] += s * z;
+            for &u in piece {
+                let (mut y, mut v) = ([0.0; 4], [0.0; 4]);
+                for (four, z) in self.real.iter().zip(&mut states) {
+                    four.step(z, u, &mut y, &mut v);
+                }
+                t.pos.push(self.direct * before + sum(y));
+                t.start_slope.push(self.slope_direct * u + sum(v));
+                before = u;
+            }
         }
+        // The slope at the end of a step is that at the start of the next, without what the next input does at once.
+        let last: f64 = self
+            .real
+            .iter()
+            .zip(&states)
+            .map(|(four, z)| (0..4).map(|i| four.s[i] * z[i]).sum::<f64>())
+            .sum();
+        let n = u.len();
+        t.end_slope.extend((1..n).map(|k| {
+            let of_next = t.start_slope[k] - self.slope_direct * u[k];
+            of_next + self.slope_direct * u[k - 1]
+        }));
+        if let Some(u) = u.last() {
+            t.end_slope.push(last + self.slope_direct * u);
+        }
+    }
+
+    fn add_complex(&self, u: &[f64], t: &mut Trace) {
         for m in &self.complex {
             let mut z = C::new(0.0, 0.0);
-            for ((&u, y), v) in u.iter().zip(&mut t.pos).zip(&mut slope) {
+            let rows = t.pos.iter_mut().zip(&mut t.start_slope);
+            for ((&u, (y, v)), end) in u.iter().zip(rows).zip(&mut t.end_slope) {
                 *y += m.weight.re * z.re - m.weight.im * z.im;
                 *v += m.slope.re * z.re - m.slope.im * z.im;
                 z = m.a * z + m.b * u;
+                *end += m.slope.re * z.re - m.slope.im * z.im;
             }
-            slope[n] += m.slope.re * z.re - m.slope.im * z.im;
         }
-        let straight = |(u, v): (&f64, &f64)| self.slope_direct * u + v;
-        t.start_slope.clear();
-        t.start_slope.extend(u.iter().zip(&slope).map(straight));
-        t.end_slope.clear();
-        t.end_slope.extend(u.iter().zip(&slope[1..]).map(straight));
     }
 
     /// The mean of the output over each step, for a smooth signal that goes into a nonlinear block next.
     pub fn means(&self, u: &[f64]) -> Vec<f64> {
         let mut t = Trace::default();
-        self.trace(u, &mut t);
+        self.trace(u, 1, &mut t);
         let n = u.len();
         (0..n)
             .map(|j| {
@@ -259,5 +384,26 @@ impl Modal {
                 0.5 * (start + end)
             })
             .collect()
+    }
+}
+
+/// A chain seen at one instant inside every step: exact, so that a delay needs no finer grid.
+#[derive(Debug, Clone)]
+pub(crate) struct Inside {
+    modal: Modal,
+    /// What the input of the step itself has made by then.
+    feed: f64,
+}
+
+impl Inside {
+    /// The position at that instant of every step.
+    pub fn run(&self, u: &[f64], y: &mut Vec<f64>) {
+        let direct = self.modal.direct;
+        self.modal.run(u, y);
+        let mut before = 0.0;
+        for (y, &u) in y.iter_mut().zip(u) {
+            *y += self.feed * u - direct * before;
+            before = u;
+        }
     }
 }

@@ -44,6 +44,7 @@ pub(crate) fn assemble(
         null,
         steps,
         rivals,
+        cut_short,
     } = found;
     let null_map = map::map(ctx, &null);
     let after_map = map::map(ctx, &fit);
@@ -67,6 +68,9 @@ pub(crate) fn assemble(
     let verdict = judgement.verdict;
     places.extend(counted_places);
     places.extend(judgement.reasons);
+    if cut_short {
+        places.push("the search ended with its budget of simulations, not because nothing more was to be found: --work 4 gives it four times as much".to_owned());
+    }
     let named = if verdict == Verdict::Unknown {
         Vec::new()
     } else {

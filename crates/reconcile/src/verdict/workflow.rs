@@ -19,6 +19,9 @@ use crate::verdict::result::Reconciliation;
 use cellpos_plant::effects::Scope;
 use cellpos_plant::{Effect, Model};
 
+/// The work that a search is given: advances of one mode of the plant by one step. About 20 s of one processor of 2020.
+pub const WORK: f64 = 1.5e10;
+
 /// How to run.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Options {
@@ -33,6 +36,8 @@ pub struct Options {
     pub free_gain: bool,
     /// The plant need not have rested at its working point before a record: its transients are free in every record.
     pub free_start: bool,
+    /// Work of simulations after which the search looks for no further effect, and says so; in units of [`WORK`].
+    pub work: f64,
     /// Ids of effects of the user's own to look for beside the catalogue; others that a model file has defined are
     /// simulated and not looked for.
     pub own_effects: Vec<&'static str>,
@@ -43,6 +48,7 @@ impl Default for Options {
         Self {
             threads: 2,
             max_effects: 4,
+            work: 1.0,
             interpolated_input: false,
             free_gain: false,
             free_start: false,
@@ -100,6 +106,7 @@ pub fn reconcile(
         } else {
             options.max_effects.min(1)
         },
+        work: (options.work * WORK) as u64,
     };
     let mut noise = noise;
     let mut problem = problem;
@@ -117,6 +124,7 @@ pub fn reconcile(
         round += 1;
         // A floor that was measured is not talked down by a fit that has numbers to spare.
         if round >= 2
+            || found.cut_short
             || !floor.source.is_known()
             || refined.innovation_um() > 0.97 * noise.innovation_um()
         {
@@ -129,7 +137,10 @@ pub fn reconcile(
         white: evidence(model, &noise, trusted, &problem),
         ..context(&problem, scope, &fixed, options)
     };
-    progress("held-out check");
+    progress(&format!(
+        "held-out check (the search took {:.2} of its work)",
+        problem.spent() as f64 / (options.work.max(1e-9) * WORK)
+    ));
     drop_small(&ctx, &mut found);
     let mut held = held_out::check(&ctx, &found.fit, options.threads);
     // What does not help where it was not fitted is not named.
