@@ -32,8 +32,9 @@ mod thresholds;
 mod verdict;
 
 pub use data::actuator::constant_gain;
+pub use data::coloured::NoiseKind;
 pub use data::floor::FloorSource;
-pub use data::noise::Noise;
+pub use data::noise::{Coloured, Noise};
 pub use data::record::Record;
 pub use error::ReconcileError;
 pub use report::report;

@@ -10,7 +10,7 @@ use cellpos_experiment::collect::{self, Collected, Collecting, refused};
 use cellpos_experiment::on_rig::OnRig;
 use cellpos_plant::Model;
 use cellpos_plant::effects::Definition;
-use cellpos_reconcile::{Options, Reconciliation, Verdict, reconcile};
+use cellpos_reconcile::{NoiseKind, Options, Reconciliation, Verdict, reconcile};
 use records::{Columns, at_rest_of_runs, files, fitted, is_run, read, read_run, with_camera_delay};
 use std::path::{Path, PathBuf};
 
@@ -81,9 +81,33 @@ pub struct Args {
     /// Simulations that the search may take, in parts of what is enough for 30 s on two cores.
     #[arg(long, default_value_t = 1.0)]
     work: f64,
+    /// Noise of the records: auto (a walk and white noise; of a model that states no diffusion, coloured noise where the
+    /// likelihood asks for it), walk, coloured (first-order and white noise), white.
+    #[arg(long, value_enum, default_value = "auto")]
+    noise: NoiseArg,
     /// Threads; the result does not depend on it.
     #[arg(long)]
     threads: Option<usize>,
+}
+
+/// Kinds of noise, as they are given on the command line.
+#[derive(Debug, Clone, Copy, clap::ValueEnum)]
+enum NoiseArg {
+    Auto,
+    Walk,
+    Coloured,
+    White,
+}
+
+impl From<NoiseArg> for NoiseKind {
+    fn from(arg: NoiseArg) -> Self {
+        match arg {
+            NoiseArg::Auto => Self::Auto,
+            NoiseArg::Walk => Self::Walk,
+            NoiseArg::Coloured => Self::Coloured,
+            NoiseArg::White => Self::White,
+        }
+    }
 }
 
 /// Runs the command.
@@ -127,6 +151,7 @@ pub fn run(args: Args) -> CommandResult {
         threads,
         max_effects: args.max_effects,
         work: args.work,
+        noise: args.noise.into(),
         own_effects,
         ..Options::default()
     };

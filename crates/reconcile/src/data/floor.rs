@@ -1,6 +1,7 @@
 //! The noise floor, from the records or from what is stated, before any model is believed; or the statement that it is not
 //! known.
 
+use crate::data::coloured::{Alone, NoiseKind, choose};
 use crate::data::noise::{Noise, increment_moments};
 use crate::data::record::Record;
 use crate::thresholds::THRESHOLDS;
@@ -51,12 +52,15 @@ pub(crate) struct Floor {
 }
 
 /// Variance and lag-1 covariance of increments, how many, and where from.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone)]
 struct Estimate {
     c0: f64,
     c1: f64,
     rows: usize,
     source: FloorSource,
+    /// The noise itself, lines and jumps off, and which rows count.
+    alone: (Vec<f64>, Vec<bool>),
+    share: f64,
 }
 
 impl Estimate {
@@ -77,18 +81,22 @@ pub(crate) fn estimate(
     present: &[Vec<bool>],
     residuals: &[Vec<f64>],
     stated: Option<Noise>,
+    kind: NoiseKind,
 ) -> Floor {
     let whole = crate::data::record::command_range_um(records);
     let mut found: Vec<Estimate> = Vec::new();
     let mut own: Vec<Estimate> = Vec::new();
     let of = |e: &[f64], ok: &[bool], sample_s: f64, source, share: f64| {
         let clean = without_lines(e, ok, sample_s);
-        let (c0, c1, rows) = increment_moments(&clean, &without_jumps(&clean, ok));
+        let counts = without_jumps(&clean, ok);
+        let (c0, c1, rows) = increment_moments(&clean, &counts);
         Estimate {
             c0: share * c0,
             c1: share * c1,
             rows,
             source,
+            alone: (clean, counts),
+            share,
         }
     };
     for (i, r) in records.iter().enumerate() {
@@ -127,14 +135,28 @@ pub(crate) fn estimate(
             c1,
             rows,
             source: FloorSource::Unknown,
+            alone: Default::default(),
+            share: 1.0,
         });
     }
     let quantum_um2 = quantisation_um2(records);
     found.retain(|f| f.rows >= THRESHOLDS.floor_rows && f.c0 > 0.0);
     if let Some(least) = found.iter().min_by(|a, b| a.sigma().total_cmp(&b.sigma())) {
         let pooled = pooled(&found, least.sigma());
+        let walk = Noise::from_increments(pooled.c0, pooled.c1);
+        let alone = Alone {
+            values: &least.alone.0,
+            counts: &least.alone.1,
+            share: least.share,
+        };
+        // Steps of a sensor that counts are no Gaussian process: nothing is read from their correlation unasked.
+        let noise = if kind == NoiseKind::Auto && quantum_um2 > 0.0 {
+            walk
+        } else {
+            choose(kind, walk, &alone)
+        };
         return Floor {
-            noise: Noise::from_increments(pooled.c0, pooled.c1).at_least(quantum_um2),
+            noise: noise.at_least(quantum_um2),
             source: least.source,
             rows: pooled.rows,
         };
@@ -177,6 +199,8 @@ fn pooled(of: &[Estimate], least: f64) -> Estimate {
         c1: mean(|f| f.c1),
         rows: n as usize,
         source: FloorSource::Unknown,
+        alone: Default::default(),
+        share: 1.0,
     }
 }
 

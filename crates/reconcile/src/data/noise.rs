@@ -12,6 +12,29 @@ pub struct Noise {
     pub walk_um2: f64,
     /// Variance of the localisation noise \[um^2\].
     pub white_um2: f64,
+    /// Noise of a sensor that is slow and returns.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub coloured: Option<Coloured>,
+}
+
+/// A first-order Gauss-Markov process.
+#[derive(Debug, Clone, Copy, PartialEq, Default, serde::Serialize)]
+pub struct Coloured {
+    /// Its variance \[um^2\].
+    pub variance_um2: f64,
+    /// Its correlation time \[rows\].
+    pub time_rows: f64,
+}
+
+impl Coloured {
+    /// What is left of a value a row later.
+    pub fn keep(&self) -> f64 {
+        if self.time_rows > 0.0 {
+            (-1.0 / self.time_rows).exp()
+        } else {
+            0.0
+        }
+    }
 }
 
 impl Noise {
@@ -20,6 +43,7 @@ impl Noise {
         Self {
             walk_um2: 2.0 * d_um2_per_s * sample_s,
             white_um2: localisation_um * localisation_um,
+            coloured: None,
         }
     }
 
@@ -30,6 +54,7 @@ impl Noise {
         Self {
             walk_um2: variance - 2.0 * white,
             white_um2: white,
+            coloured: None,
         }
     }
 
@@ -38,6 +63,18 @@ impl Noise {
         Self {
             white_um2: self.white_um2.max(white_um2),
             ..self
+        }
+    }
+
+    /// The same times a factor in variance.
+    pub fn scaled(self, factor: f64) -> Self {
+        Self {
+            walk_um2: factor * self.walk_um2,
+            white_um2: factor * self.white_um2,
+            coloured: self.coloured.map(|c| Coloured {
+                variance_um2: factor * c.variance_um2,
+                ..c
+            }),
         }
     }
 
@@ -64,6 +101,12 @@ impl Noise {
 
     /// Standard deviation of the innovation in the steady state \[um\]: the floor.
     pub fn innovation_um(&self) -> f64 {
+        if let Some(coloured) = self.coloured {
+            // No closed form: the filter after so many rows that it stands still.
+            let rows = 64 + (8.0 * coloured.time_rows).min(20_000.0) as usize;
+            let filter = Whitener::new(self, &vec![true; rows], None);
+            return 1.0 / filter.inverse_sigma[rows - 1];
+        }
         let (q, r) = (self.walk_um2, self.white_um2);
         let p = 0.5 * (q + (q * q + 4.0 * q * r).sqrt());
         (p + r).sqrt()
@@ -75,6 +118,23 @@ impl Noise {
 pub(crate) struct Whitener {
     gain: Vec<f64>,
     inverse_sigma: Vec<f64>,
+    coloured: Option<ColouredGain>,
+}
+
+/// The gains of the state of coloured noise.
+#[derive(Debug, Clone)]
+struct ColouredGain {
+    gain: Vec<f64>,
+    /// Decay from row to row.
+    keep: f64,
+}
+
+/// Covariance of walk and coloured noise.
+#[derive(Debug, Clone, Copy)]
+struct Spread {
+    walk: f64,
+    coloured: f64,
+    both: f64,
 }
 
 impl Whitener {
@@ -82,51 +142,100 @@ impl Whitener {
     pub fn new(noise: &Noise, present: &[bool], extra_walk: Option<&[f64]>) -> Self {
         let n = present.len();
         let (mut gain, mut inverse_sigma) = (vec![0.0; n], vec![0.0; n]);
-        let mut p = f64::INFINITY;
+        let coloured = noise.coloured.unwrap_or_default();
+        let (variance, keep) = (coloured.variance_um2, coloured.keep());
+        let mut coloured_gain = noise.coloured.map(|_| vec![0.0; n]);
+        let mut p = Spread {
+            walk: f64::INFINITY,
+            coloured: variance,
+            both: 0.0,
+        };
         for k in 0..n {
-            p += noise.walk_um2 + extra_walk.map_or(0.0, |w| w[k]);
+            if k > 0 {
+                p.coloured = keep * keep * p.coloured + (1.0 - keep * keep) * variance;
+                p.both *= keep;
+            }
+            p.walk += noise.walk_um2 + extra_walk.map_or(0.0, |w| w[k]);
             if !present[k] {
                 continue;
             }
-            if p.is_finite() {
-                let s = p + noise.white_um2;
-                gain[k] = p / s;
-                inverse_sigma[k] = 1.0 / s.sqrt();
-                p *= 1.0 - gain[k];
-            } else {
+            if !p.walk.is_finite() {
                 // The first frame only says where the bead is: the start is a nuisance.
                 gain[k] = 1.0;
-                p = noise.white_um2;
+                p = Spread {
+                    walk: noise.white_um2 + p.coloured,
+                    coloured: p.coloured,
+                    both: -p.coloured,
+                };
+                continue;
             }
+            let s = p.walk + 2.0 * p.both + p.coloured + noise.white_um2;
+            gain[k] = (p.walk + p.both) / s;
+            inverse_sigma[k] = 1.0 / s.sqrt();
+            let of_coloured = (p.coloured + p.both) / s;
+            if let Some(g) = &mut coloured_gain {
+                g[k] = of_coloured;
+            }
+            p = Spread {
+                walk: p.walk - gain[k] * gain[k] * s,
+                coloured: p.coloured - of_coloured * of_coloured * s,
+                both: p.both - gain[k] * of_coloured * s,
+            };
         }
         Self {
             gain,
             inverse_sigma,
+            coloured: coloured_gain.map(|gain| ColouredGain { gain, keep }),
         }
     }
 
     /// Innovations of a residual, in standard deviations. The filter is linear: columns of a Jacobian go through it too.
     pub fn apply(&self, r: &[f64], e: &mut [f64]) {
+        let rows = r.iter().zip(e).zip(&self.gain).zip(&self.inverse_sigma);
         let mut m = 0.0;
-        for (((r, e), k), s) in r.iter().zip(e).zip(&self.gain).zip(&self.inverse_sigma) {
-            let d = r - m;
-            *e = d * s;
-            m += k * d;
+        match &self.coloured {
+            None => {
+                for (((r, e), k), s) in rows {
+                    let d = r - m;
+                    *e = d * s;
+                    m += k * d;
+                }
+            }
+            Some(coloured) => {
+                let mut c = 0.0;
+                for ((((r, e), k), s), g) in rows.zip(&coloured.gain) {
+                    let d = r - m - c;
+                    *e = d * s;
+                    m += k * d;
+                    c = coloured.keep * (c + g * d);
+                }
+            }
         }
     }
 
-    /// The walk at every row from the rows before it alone: what a regressor may know without being correlated with the
+    /// The slow noise at every row from the rows before it alone: what a regressor may know without being correlated with the
     /// row's own innovation.
     pub fn ahead(&self, r: &[f64]) -> Vec<f64> {
         let mut m = r.first().copied().unwrap_or(0.0);
+        let mut c = 0.0;
         r.iter()
-            .zip(&self.gain)
-            .map(|(r, k)| {
-                let before = m;
-                m += k * (r - m);
+            .enumerate()
+            .map(|(k, r)| {
+                let before = m + c;
+                let d = r - before;
+                m += self.gain[k] * d;
+                if let Some(coloured) = &self.coloured {
+                    c = coloured.keep * (c + coloured.gain[k] * d);
+                }
                 before
             })
             .collect()
+    }
+
+    /// Sum of the logarithms of the innovations' variances, of the rows that count.
+    pub fn log_determinant(&self) -> f64 {
+        let of = |s: &f64| if *s > 0.0 { -2.0 * s.ln() } else { 0.0 };
+        self.inverse_sigma.iter().map(of).sum()
     }
 
     /// The walk at every row from the rows before and after it, but not from the row itself: independent of its noise.
@@ -162,11 +271,15 @@ impl Whitener {
     /// The transpose of [`Self::apply`]: what a residual at each row adds to the weighted sum of innovations.
     pub fn transpose(&self, weights: &[f64]) -> Vec<f64> {
         let mut z = vec![0.0; weights.len()];
-        let mut later = 0.0;
+        let (mut later, mut later_coloured) = (0.0, 0.0);
         for k in (0..weights.len()).rev() {
-            let own = self.inverse_sigma[k] * weights[k];
-            z[k] = own + self.gain[k] * later;
-            later = (1.0 - self.gain[k]) * later - own;
+            let mut own = self.inverse_sigma[k] * weights[k] + self.gain[k] * later;
+            if let Some(coloured) = &self.coloured {
+                own += coloured.keep * coloured.gain[k] * later_coloured;
+                later_coloured = coloured.keep * later_coloured - own;
+            }
+            z[k] = own;
+            later -= own;
         }
         z
     }
@@ -266,6 +379,41 @@ mod tests {
             (direct / transposed - 1.0).abs() < 1e-10,
             "{direct} {transposed}"
         );
+    }
+
+    #[test]
+    fn the_filter_of_coloured_noise_whitens_it_and_has_its_transpose() {
+        let n = Noise {
+            coloured: Some(Coloured {
+                variance_um2: 0.02,
+                time_rows: 9.0,
+            }),
+            ..Noise::new(0.33, 1e-3, 0.030)
+        };
+        // Covariance of three rows by hand, the level free: the determinant of the differences is that of the innovations.
+        let keep = n.coloured.unwrap().keep();
+        let (q, v, r) = (n.walk_um2, 0.02, n.white_um2);
+        let variance = q + 2.0 * v * (1.0 - keep) + 2.0 * r;
+        let next = v * (2.0 * keep - 1.0 - keep * keep) - r;
+        let filter = Whitener::new(&n, &[true; 3], None);
+        let expected = (variance * variance - next * next).ln();
+        assert!((filter.log_determinant() - expected).abs() < 1e-12);
+
+        let mut present = vec![true; 60];
+        present[17] = false;
+        let w = Whitener::new(&n, &present, None);
+        let wave = |a: f64| -> Vec<f64> { (0..60).map(|k| (a * f64::from(k)).sin()).collect() };
+        let (r, weights) = (wave(0.7), wave(1.9));
+        let mut e = vec![0.0; 60];
+        w.apply(&r, &mut e);
+        let direct: f64 = e.iter().zip(&weights).map(|(e, w)| e * w).sum();
+        let transposed: f64 = w
+            .transpose(&weights)
+            .iter()
+            .zip(&r)
+            .map(|(z, r)| z * r)
+            .sum();
+        assert!((direct / transposed - 1.0).abs() < 1e-10);
     }
 
     #[test]

@@ -158,6 +158,7 @@ pub(crate) fn refine(
         let noise = Noise {
             walk_um2: x[3].exp(),
             white_um2: x[4].exp(),
+            coloured: None,
         };
         let grid = Grid::new(&noise, wave, pixel)?;
         Some(cellpos_parallel::map(&tracks, threads, |t| {

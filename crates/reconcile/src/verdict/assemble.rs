@@ -8,7 +8,7 @@ use crate::fit::context::{Context, Fit};
 use crate::search::sequential::Found;
 use crate::verdict::augment::augment;
 use crate::verdict::held_out::{self, HeldOut};
-use crate::verdict::judge::{Evidence, judge};
+use crate::verdict::judge::{Evidence, figure, judge};
 use crate::verdict::map;
 use crate::verdict::names::{names, of_frames};
 use crate::verdict::proposal;
@@ -68,6 +68,14 @@ pub(crate) fn assemble(
     let verdict = judgement.verdict;
     places.extend(counted_places);
     places.extend(judgement.reasons);
+    if let Some(c) = ctx.problem.noise.coloured {
+        places.push(format!(
+            "the noise itself is slow: {} RMS with a correlation time of {} s beside white noise of {}; errors as small and as slow are not told from it",
+            figure(c.variance_um2.sqrt()),
+            figure(c.time_rows * ctx.problem.base.sample_s),
+            figure(ctx.problem.noise.localisation_um())
+        ));
+    }
     if cut_short {
         places.push("the search ended with its budget of simulations, not because nothing more was to be found: --work 4 gives it four times as much".to_owned());
     }

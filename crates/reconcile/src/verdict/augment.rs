@@ -4,7 +4,9 @@ use crate::data::floor::Floor;
 use crate::data::frames::FrameCounts;
 use crate::fit::context::{Context, Fit};
 use crate::simulate::near_whole;
+use crate::verdict::judge::figure;
 use crate::verdict::result::{Effect as NamedEffect, Verdict};
+use crate::verdict::workflow::COLOURED;
 use cellpos_plant::effects::{self, Role};
 use cellpos_plant::{Effect, Model};
 
@@ -121,6 +123,16 @@ pub(crate) fn augment(
     }
     out.provenance
         .insert("noise".to_owned(), floor.source.words().to_owned());
+    if let Some(c) = ctx.problem.noise.coloured {
+        let words = format!(
+            "{} um RMS with a correlation time of {} s, beside the noise stated",
+            figure(c.variance_um2.sqrt()),
+            figure(c.time_rows * ctx.problem.base.sample_s)
+        );
+        out.provenance.insert(COLOURED.to_owned(), words);
+    } else {
+        out.provenance.remove(COLOURED);
+    }
     if verdict != Verdict::Unknown {
         for i in 0..fit.parts.len() {
             if let Some(e) = effect_of(ctx, fit, i) {

@@ -92,7 +92,9 @@ fn free_run(ctx: &Context<'_>, null: &Fit, set: &Fit, test: &Mask) -> Sums {
         sums.free_after += energy(&after[i]);
         // A walk of n rows about its mean has the variance q n/6, about its regression line q n/15.
         let share = if ramp { 1.0 / 15.0 } else { 1.0 / 6.0 };
-        sums.free_floor += rows * (noise.walk_um2 * r.u.len() as f64 * share + noise.white_um2);
+        let coloured = noise.coloured.map_or(0.0, |c| c.variance_um2);
+        let still = noise.white_um2 + coloured;
+        sums.free_floor += rows * (noise.walk_um2 * r.u.len() as f64 * share + still);
         sums.rows += rows;
     }
     sums

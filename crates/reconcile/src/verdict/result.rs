@@ -308,6 +308,8 @@ impl Reconciliation {
                 "diffusion_um2_per_s": self.noise.diffusion_um2_per_s(self.sample_s),
                 "localisation_um": self.noise.localisation_um(),
                 "innovation_um": self.noise.innovation_um(),
+                "coloured_um": self.noise.coloured.map(|c| c.variance_um2.sqrt()),
+                "coloured_s": self.noise.coloured.map(|c| c.time_rows * self.sample_s),
             },
         })
     }

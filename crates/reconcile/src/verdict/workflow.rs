@@ -1,5 +1,6 @@
 //! The workflow: guards, null model, search, held-out check.
 
+use crate::data::coloured::NoiseKind;
 use crate::data::floor::{self, FloorSource};
 use crate::data::frames;
 use crate::data::noise::Noise;
@@ -38,6 +39,8 @@ pub struct Options {
     pub free_start: bool,
     /// Work of simulations after which the search looks for no further effect, and says so; in units of [`WORK`].
     pub work: f64,
+    /// The noise that the records are taken to have.
+    pub noise: NoiseKind,
     /// Ids of effects of the user's own to look for beside the catalogue; others that a model file has defined are
     /// simulated and not looked for.
     pub own_effects: Vec<&'static str>,
@@ -49,6 +52,7 @@ impl Default for Options {
             threads: 2,
             max_effects: 4,
             work: 1.0,
+            noise: NoiseKind::Auto,
             interpolated_input: false,
             free_gain: false,
             free_start: false,
@@ -93,7 +97,13 @@ pub fn reconcile(
     progress("null model and noise floor");
     let first = context(&problem, scope, &fixed, options).fit(Vec::new(), &problem.all(), 4);
     let residual = free_of_start(&context(&problem, scope, &fixed, options), &first);
-    let floor = floor::estimate(&records, &present, &residual, stated);
+    // Brownian motion of a bead is a walk; coloured noise is that of a sensor.
+    let of_bead = model.noise.diffusion_um2_per_s > 0.0 && !options.free_start;
+    let kind = match options.noise {
+        NoiseKind::Auto if of_bead => NoiseKind::Walk,
+        kind => kind,
+    };
+    let floor = floor::estimate(&records, &present, &residual, stated, kind);
     let (noise, trusted) = (floor.noise, floor.rows);
     let problem = problem.with_noise(noise);
     guard::motion(&context(&problem, scope, &fixed, options))?;
@@ -126,6 +136,9 @@ pub fn reconcile(
         if round >= 2
             || found.cut_short
             || !floor.source.is_known()
+            // Increments tell a walk from white noise, no more.
+            || options.noise == NoiseKind::White
+            || noise.coloured.is_some()
             || refined.innovation_um() > 0.97 * noise.innovation_um()
         {
             break;
@@ -171,6 +184,9 @@ pub fn reconcile(
     Ok(assemble::assemble(&given, &ctx, found, held))
 }
 
+/// Key of the provenance of a model whose noise has a part that `[noise]` has no word for.
+pub(crate) const COLOURED: &str = "noise.coloured";
+
 /// The noise that a model states, unless it says that its figures are a fit's own residual.
 fn stated_noise(model: &Model, sample_s: f64) -> Option<Noise> {
     let noise = &model.noise;
@@ -179,7 +195,8 @@ fn stated_noise(model: &Model, sample_s: f64) -> Option<Noise> {
         .get("noise")
         .is_some_and(|w| w == FloorSource::Unknown.words());
     let some = noise.diffusion_um2_per_s > 0.0 || noise.localisation_um > 0.0;
-    (some && !guessed)
+    let coloured = model.provenance.contains_key(COLOURED);
+    (some && !guessed && !coloured)
         .then(|| Noise::new(noise.diffusion_um2_per_s, sample_s, noise.localisation_um))
 }
 
@@ -286,7 +303,7 @@ fn evidence(
     problem: &Problem,
 ) -> Option<WhiteEvidence> {
     let model_um2 = model.noise.localisation_um.powi(2);
-    if trusted < 5000 || model_um2 <= 0.0 {
+    if trusted < 5000 || model_um2 <= 0.0 || noise.coloured.is_some() {
         return None;
     }
     let variance = noise.walk_um2 + 2.0 * noise.white_um2;

@@ -3,4 +3,5 @@
 mod labelled;
 mod measured;
 mod measured_piezo;
+mod noise;
 mod verdicts;
