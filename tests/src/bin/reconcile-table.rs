@@ -173,7 +173,7 @@ fn line(case: &Case, row: &Result<Row, String>) -> String {
     match row {
         Err(e) => format!("{:8} {:7} {hidden:40} refused: {e}", case.group, case.level),
         Ok(r) => format!(
-            "{:8} {:7} {hidden:40} {} {:16} {:40} closure {:6} fresh {:6} covered {}/{} threshold x {:5.1} {:5.1} s or: {} {}",
+            "{:8} {:7} {hidden:40} {} {:16} {:40} closure {:6} fresh {:6} covered {}/{} threshold x {:5.1} {:5.1} s or: {} {} {}",
             case.group,
             case.level,
             if r.named == r.hidden { "  " } else { "<>" },
@@ -188,7 +188,8 @@ fn line(case: &Case, row: &Result<Row, String>) -> String {
             r.above_threshold,
             r.seconds,
             join(&r.alternatives),
-            r.missed.join(", ")
+            r.missed.join(", "),
+            if r.named == r.hidden { "" } else { &r.reason }
         ),
     }
 }

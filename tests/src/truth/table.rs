@@ -26,6 +26,8 @@ pub struct Row {
     pub covered: (usize, usize),
     /// Those that do not, in words.
     pub missed: Vec<String>,
+    /// What `where` says last.
+    pub reason: String,
     /// Time that the search had of a processor \[s\], one thread.
     pub seconds: f64,
     /// How far the hidden effects lie above the threshold of detection: see [`above_threshold`].
@@ -98,6 +100,7 @@ pub fn evaluate(case: &Case, seed: u64) -> Result<Row, String> {
         named,
         inside,
         verdict: result.verdict,
+        reason: result.places.last().cloned().unwrap_or_default(),
         alternatives: result
             .effects
             .iter()

@@ -150,13 +150,10 @@ pub(crate) fn estimate(
             share: least.share,
         };
         // Steps of a sensor that counts are no Gaussian process: nothing is read from their correlation unasked.
-        let noise = if kind == NoiseKind::Auto && quantum_um2 > 0.0 {
-            walk
-        } else {
-            choose(kind, walk, &alone)
-        };
+        let unasked = kind == NoiseKind::Auto && quantum_um2 > 0.0;
+        let kind = if unasked { NoiseKind::Walk } else { kind };
         return Floor {
-            noise: noise.at_least(quantum_um2),
+            noise: choose(kind, walk, &alone).at_least(quantum_um2),
             source: least.source,
             rows: pooled.rows,
         };

@@ -370,6 +370,16 @@ fn much_left(fit: &Fit) -> bool {
     left_over(fit) > 0.01 * fit.count as f64
 }
 
+/// Whether a set is on no way to an explanation.
+fn is_hopeless(fit: &Fit, null: &Fit) -> bool {
+    let most = match fit.parts.len() {
+        0 | 1 => return false,
+        2 => THRESHOLDS.hopeless,
+        _ => THRESHOLDS.hopeless_late,
+    };
+    left_over(fit) > most * left_over(null)
+}
+
 /// The whole search on the rows of a mask.
 pub(crate) fn search(
     ctx: &Context<'_>,
@@ -408,14 +418,7 @@ pub(crate) fn search(
             cut_short = true;
             break;
         }
-        let open = left_over(&fit) / left_over(&null).max(1e-12);
-        let few = fit.parts.len() < 3;
-        let most = if few {
-            THRESHOLDS.hopeless
-        } else {
-            THRESHOLDS.hopeless_late
-        };
-        if fit.parts.len() >= 2 && open > most {
+        if is_hopeless(&fit, &null) {
             break;
         }
         progress(&format!("looking further beside {}", ids(&fit).join(" + ")));

@@ -183,7 +183,7 @@ impl<'a> Chain<'a> {
         }
         // What goes beside the plant has everything before it once more.
         for zpk in &self.bypass {
-            modes += modes + zpk.poles.len();
+            modes = 2 * modes + zpk.poles.len();
         }
         blocks += 2 * self.ties.len();
         let steps = if self.ties.is_empty() {

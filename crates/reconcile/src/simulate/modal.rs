@@ -289,12 +289,12 @@ impl Modal {
         let mut of_state = vec![[[0.0; BOTH]; 4]; self.real.len()];
         let mut of_input = [0.0; BOTH];
         let mut far = self.real.clone();
-        for ((four, table), far) in self.real.iter().zip(&mut of_state).zip(&mut far) {
-            for i in 0..4 {
+        for ((four, tables), far) in self.real.iter().zip(&mut of_state).zip(&mut far) {
+            for (i, table) in tables.iter_mut().enumerate() {
                 let (mut decay, mut drive) = (1.0, 0.0);
                 for k in 0..FINE {
-                    table[i][k] = four.w[i] * decay;
-                    table[i][FINE + k] = four.s[i] * decay;
+                    table[k] = four.w[i] * decay;
+                    table[FINE + k] = four.s[i] * decay;
                     of_input[k] += four.w[i] * drive;
                     of_input[FINE + k] += four.s[i] * drive;
                     drive = four.a[i] * drive + 1.0;
@@ -311,14 +311,12 @@ impl Modal {
             // A single step gains nothing by the tables.
             if FINE > 1 && piece.len() == FINE && piece.iter().all(|u| *u == first) {
                 let mut out = of_input.map(|x| x * first);
-                for ((table, far), z) in of_state.iter().zip(&far).zip(&mut states) {
-                    for i in 0..4 {
-                        for (out, x) in out.iter_mut().zip(&table[i]) {
-                            *out += x * z[i];
+                for ((tables, far), z) in of_state.iter().zip(&far).zip(&mut states) {
+                    for (i, (table, z)) in tables.iter().zip(z).enumerate() {
+                        for (out, x) in out.iter_mut().zip(table) {
+                            *out += x * *z;
                         }
-                    }
-                    for i in 0..4 {
-                        z[i] = far.a[i] * z[i] + far.b[i] * first;
+                        *z = far.a[i] * *z + far.b[i] * first;
                     }
                 }
                 let straight = self.slope_direct * first;

@@ -62,6 +62,7 @@ pub(crate) fn assemble(
             null_flagged: null_map.any_flagged(),
             after: &after_map,
             counted: !counted.is_empty(),
+            cut_short,
         },
         threads,
     );

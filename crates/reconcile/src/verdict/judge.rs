@@ -24,6 +24,8 @@ pub(crate) struct Evidence<'a> {
     pub after: &'a DiscrepancyMap,
     /// Whether missing or repeated frames were counted.
     pub counted: bool,
+    /// The search ended with its budget.
+    pub cut_short: bool,
 }
 
 /// The verdict with its reasons.
@@ -97,7 +99,9 @@ pub(crate) fn judge(ctx: &Context<'_>, e: &Evidence<'_>, threads: usize) -> Judg
         describe(ctx, e.null, &battery::library(ctx, e.null), None, &mut out);
         return out;
     }
-    if remains && (e.names.ambiguous || closed < THRESHOLDS.remainder_closed) {
+    // Names of a search that did not come to its end may be a compromise between others.
+    let unsure = e.names.ambiguous || e.cut_short || closed < THRESHOLDS.remainder_closed;
+    if remains && unsure {
         out.verdict = Verdict::Unknown;
         out.reasons.push(format!(
             "the best of the catalogue, {}, closes {:.1} % of it, and more than chance is left: no name",
