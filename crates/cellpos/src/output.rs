@@ -120,7 +120,7 @@ fn ready_one(path: &Path, force: bool) -> Result<(), Failure> {
     }
     let refused = |error: std::io::Error| {
         Failure::bad_input(
-            format!("{name}: cannot be written: {error}"),
+            format!("{name}: cannot be written: {}", why(path, &error)),
             "name a file in a folder that you may write to",
         )
     };
@@ -144,6 +144,16 @@ fn ready_one(path: &Path, force: bool) -> Result<(), Failure> {
         .open(path)
         .map_err(refused)?;
     std::fs::remove_file(path).map_err(refused)
+}
+
+/// Why a file cannot be written, where the system's own words ("File exists") would mislead.
+fn why(path: &Path, error: &std::io::Error) -> String {
+    let nearest = path.ancestors().skip(1).find(|folder| folder.exists());
+    match nearest.filter(|folder| !folder.is_dir()) {
+        Some(file) => format!("{} is a file, not a folder", file.display()),
+        None if path.is_symlink() => "it is a link that leads nowhere".to_owned(),
+        None => error.to_string(),
+    }
 }
 
 /// Writes a file whole or not at all; its folder is made.

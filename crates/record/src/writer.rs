@@ -323,7 +323,11 @@ impl RunWriter {
         if let Some(name) = columns::impossible(&meta.law_columns) {
             return Err(RecordError::LawColumn(name.to_owned()));
         }
-        std::fs::create_dir_all(root).map_err(RecordError::io("cannot create", root))?;
+        let made = std::fs::create_dir_all(root).map_err(|error| match root.is_file() {
+            true => io::Error::new(error.kind(), "it is a file, not a folder"),
+            false => error,
+        });
+        made.map_err(RecordError::io("cannot create", root))?;
         let now = jiff::Timestamp::now();
         meta.started_utc = now.strftime("%Y-%m-%dT%H:%M:%S%.3fZ").to_string();
         let stem = format!("{}-{}", now.strftime("%Y%m%dT%H%M%SZ"), meta.name);

@@ -26,6 +26,10 @@ fn what_cannot_be_right_gets_a_sentence_in_plain_words() {
         ("run one.toml --cells -1", "must not be below zero"),
         ("doctor --for -1s", "--for"),
         ("bundle latest-one --out one.csv/packed", "one.csv"),
+        (
+            "export latest-one --out one.csv/of/it.csv",
+            "one.csv is a file, not a folder",
+        ),
         ("identify --data /dev/zero", "device"),
         ("reconcile --model eq6 --data /dev/zero", "device"),
         (
@@ -35,7 +39,7 @@ fn what_cannot_be_right_gets_a_sentence_in_plain_words() {
         ("track --target 0um --duration 1s --rig /dev/zero", "device"),
         (
             "track --target 0um --duration 1s --clock virtual --frames off --runs one.csv",
-            "one.csv",
+            "cannot create one.csv: it is a file, not a folder",
         ),
     ] {
         std::fs::write(at.join("one.csv"), "").unwrap();
