@@ -7,6 +7,7 @@ mod fatigue;
 mod fault;
 mod session;
 mod spectrum;
+mod spread;
 mod ticks;
 
 use super::run::{learning, resume};
@@ -363,14 +364,13 @@ fn traces(page: &mut Report, ticks: &Ticks) {
 
 fn errors(page: &mut Report, ticks: &Ticks, bound: Option<&spectrum::Bound>) {
     page.section("Error");
-    let finite: Vec<f64> = ticks.error_um.iter().map(|um| um * 1e3).collect();
     page.figure(
         Figure::new("error-histogram", "Error of every position, closed loop.").panel(
             Panel::new(Axis::linear("error", "nm"), Axis::linear("positions", ""))
-                .series(Series::histogram("error", &finite, 80)),
+                .series(ticks.error_nm.histogram("error", 80)),
         ),
     );
-    let Some(spectrum) = spectrum::welch(&ticks.error_um, ticks.period_s()) else {
+    let Some(spectrum) = ticks.error_um.spectrum(ticks.period_s()) else {
         page.paragraph("The run is too short for a spectrum.");
         return;
     };

@@ -2,7 +2,7 @@
 
 use super::ticks::Ticks;
 use cellpos_record::{Lost, RunMeta};
-use cellpos_report::{Axis, Column, Figure, Panel, Report, Series, Status, Table};
+use cellpos_report::{Axis, Column, Figure, Panel, Report, Status, Table};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
@@ -18,18 +18,18 @@ pub(super) struct Session {
 
 pub(super) fn timing(page: &mut Report, sessions: &[Session], ticks: &Ticks) {
     page.section("Loop timing");
-    if ticks.compute_us.iter().all(|us| *us == 0.0) {
+    if ticks.compute_us.is_zero() {
         page.paragraph("Virtual clock: ticks take no time.");
     } else {
         page.figure(
             Figure::new("timing", "Wake-up and compute time of every tick.")
                 .panel(
                     Panel::new(Axis::linear("wake-up", "us"), Axis::linear("ticks", ""))
-                        .series(Series::histogram("wake-up", &ticks.wake_us, 80)),
+                        .series(ticks.wake_us.histogram("wake-up", 80)),
                 )
                 .panel(
                     Panel::new(Axis::linear("compute", "us"), Axis::linear("ticks", ""))
-                        .series(Series::histogram("compute", &ticks.compute_us, 80)),
+                        .series(ticks.compute_us.histogram("compute", 80)),
                 ),
         );
     }

@@ -3,11 +3,13 @@
 use super::ticks::Ticks;
 use cellpos_control::design::bound_rms_um;
 use cellpos_record::RunMeta;
-use realfft::RealFftPlanner;
+use realfft::{RealFftPlanner, RealToComplex};
 use std::f64::consts::{PI, TAU};
+use std::sync::Arc;
 
-/// Rows of a stretch.
+/// Rows of a stretch, and of one of a short run.
 const STRETCH: usize = 4096;
+const SHORT: usize = 512;
 
 /// An amplitude density.
 #[derive(Debug)]
@@ -16,56 +18,107 @@ pub struct Spectrum {
     pub nm_per_rthz: Vec<f64>,
 }
 
-/// Averaged spectrum (Hann windows overlapping by half, each stretch less its mean); values that are missing are taken as
-/// the mean, and stretches of which more than a twentieth is missing are left out. None without a whole stretch.
-pub fn welch(values_um: &[f64], period_s: f64) -> Option<Spectrum> {
-    let stretch = if values_um.len() >= STRETCH {
-        STRETCH
-    } else {
-        512
-    };
-    let fft = RealFftPlanner::<f64>::new().plan_fft_forward(stretch);
-    let window: Vec<f64> = (0..stretch)
-        .map(|k| 0.5 - 0.5 * (TAU * k as f64 / stretch as f64).cos())
-        .collect();
-    let power: f64 = window.iter().map(|w| w * w).sum();
-    let mut sum = vec![0.0; stretch / 2 + 1];
-    let mut count = 0.0;
-    let mut out = fft.make_output_vec();
-    let mut start = 0;
-    while let Some(part) = values_um.get(start..start + stretch) {
-        start += stretch / 2;
+/// Averaged spectrum of values as they go by (Hann windows overlapping by half, each stretch less its mean); values that are
+/// missing are taken as the mean, and stretches of which more than a twentieth is missing are left out.
+#[derive(Debug, Default)]
+pub struct Welch {
+    /// What is behind the last whole stretch, and half of that.
+    values_um: Vec<f64>,
+    long: Option<Stretches>,
+}
+
+impl Welch {
+    /// The next value; NaN where it is missing.
+    pub fn add(&mut self, value_um: f64) {
+        self.values_um.push(value_um);
+        if self.values_um.len() == STRETCH {
+            let long = self.long.get_or_insert_with(|| Stretches::of(STRETCH));
+            long.add(&self.values_um);
+            self.values_um.drain(..STRETCH / 2);
+        }
+    }
+
+    /// The spectrum; None without a whole stretch. A run too short for one has shorter ones.
+    pub fn spectrum(&self, period_s: f64) -> Option<Spectrum> {
+        if let Some(long) = &self.long {
+            return long.spectrum(period_s);
+        }
+        let mut short = Stretches::of(SHORT);
+        let mut start = 0;
+        while let Some(part) = self.values_um.get(start..start + SHORT) {
+            short.add(part);
+            start += SHORT / 2;
+        }
+        short.spectrum(period_s)
+    }
+}
+
+/// Sum of the power of stretches of one length.
+struct Stretches {
+    fft: Arc<dyn RealToComplex<f64>>,
+    window: Vec<f64>,
+    sum: Vec<f64>,
+    count: f64,
+}
+
+impl std::fmt::Debug for Stretches {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "{} stretches of {} rows", self.count, self.window.len())
+    }
+}
+
+impl Stretches {
+    fn of(rows: usize) -> Self {
+        Self {
+            fft: RealFftPlanner::<f64>::new().plan_fft_forward(rows),
+            window: (0..rows)
+                .map(|k| 0.5 - 0.5 * (TAU * k as f64 / rows as f64).cos())
+                .collect(),
+            sum: vec![0.0; rows / 2 + 1],
+            count: 0.0,
+        }
+    }
+
+    fn add(&mut self, part: &[f64]) {
         let seen = part.iter().filter(|um| um.is_finite());
         let n = seen.clone().count();
-        if n * 20 < stretch * 19 {
-            continue;
+        if n * 20 < part.len() * 19 {
+            return;
         }
         let mean = seen.sum::<f64>() / n as f64;
         let mut input: Vec<f64> = part
             .iter()
-            .zip(&window)
+            .zip(&self.window)
             .map(|(um, w)| if um.is_finite() { (um - mean) * w } else { 0.0 })
             .collect();
-        fft.process(&mut input, &mut out).ok()?;
-        for (sum, bin) in sum.iter_mut().zip(&out) {
+        let mut out = self.fft.make_output_vec();
+        if self.fft.process(&mut input, &mut out).is_err() {
+            return;
+        }
+        for (sum, bin) in self.sum.iter_mut().zip(&out) {
             *sum += bin.norm_sqr();
         }
-        count += 1.0;
+        self.count += 1.0;
     }
-    if count == 0.0 {
-        return None;
+
+    fn spectrum(&self, period_s: f64) -> Option<Spectrum> {
+        if self.count == 0.0 {
+            return None;
+        }
+        let rows = self.window.len();
+        let power: f64 = self.window.iter().map(|w| w * w).sum();
+        // The mean was taken away, and the window smears it into the first bin.
+        let bins = 2..rows / 2;
+        Some(Spectrum {
+            hz: bins
+                .clone()
+                .map(|k| k as f64 / (rows as f64 * period_s))
+                .collect(),
+            nm_per_rthz: bins
+                .map(|k| (2.0 * self.sum[k] * period_s / (power * self.count)).sqrt() * 1e3)
+                .collect(),
+        })
     }
-    // The mean was taken away, and the window smears it into the first bin.
-    let bins = 2..stretch / 2;
-    Some(Spectrum {
-        hz: bins
-            .clone()
-            .map(|k| k as f64 / (stretch as f64 * period_s))
-            .collect(),
-        nm_per_rthz: bins
-            .map(|k| (2.0 * sum[k] * period_s / (power * count)).sqrt() * 1e3)
-            .collect(),
-    })
 }
 
 /// What Brownian motion, delay and localisation noise leave to the best controller while holding.
@@ -115,6 +168,12 @@ impl Bound {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    fn welch(values_um: &[f64], period_s: f64) -> Option<Spectrum> {
+        let mut welch = Welch::default();
+        values_um.iter().for_each(|um| welch.add(*um));
+        welch.spectrum(period_s)
+    }
 
     #[test]
     fn the_spectrum_of_white_noise_is_flat_and_holds_its_variance() {

@@ -1,6 +1,8 @@
 //! What a report needs of the ticks, gathered as they go by.
 
 use super::envelope::Envelope;
+use super::spectrum::Welch;
+use super::spread::Spread;
 use cellpos_runtime::{Statistics, TickRecord};
 use std::collections::VecDeque;
 
@@ -37,8 +39,10 @@ pub struct Ticks {
     /// Reference, position, command and neutral over the whole run, um.
     pub traces: Envelope<4>,
     pub excerpt: Excerpt,
-    /// Of every tick whose error counts (see [`Statistics`]); NaN without a position.
-    pub error_um: Vec<f64>,
+    /// Errors of every tick whose error counts (see [`Statistics`]), nm.
+    pub error_nm: Spread,
+    /// Their spectrum, um; ticks without a position are missing values in it.
+    pub error_um: Welch,
     /// The figures of each session, as the terminal and run.toml have them.
     pub statistics: Vec<Statistics>,
     /// Length of the cell over the whole run, um; empty where none was measured.
@@ -47,8 +51,8 @@ pub struct Ticks {
     /// Cycles whose course is drawn.
     pub courses: Vec<Course>,
     session: u64,
-    pub wake_us: Vec<f64>,
-    pub compute_us: Vec<f64>,
+    pub wake_us: Spread,
+    pub compute_us: Spread,
     /// Sum and number of the stated variances of positions.
     variance_um2: (f64, u64),
     start_s: f64,
@@ -92,8 +96,8 @@ impl Ticks {
             self.past.pop_front();
         }
         self.past.push_back((r.time_ns, r.target_um));
-        self.wake_us.push(f64::from(r.wake_ns) * 1e-3);
-        self.compute_us.push(f64::from(r.compute_ns) * 1e-3);
+        self.wake_us.add(f64::from(r.wake_ns) * 1e-3);
+        self.compute_us.add(f64::from(r.compute_ns) * 1e-3);
         self.length.add(time_s, [r.length_um]);
         if r.length_um.is_finite() {
             self.has_length = true;
@@ -130,10 +134,12 @@ impl Ticks {
             return;
         }
         let then_um = self.target_at(r.mid_exposure_ns);
-        self.error_um.push(match then_um {
+        let error_um = match then_um {
             Some(then_um) if r.verdict == 0 => r.measured_um - then_um,
             _ => f64::NAN,
-        });
+        };
+        self.error_nm.add(error_um * 1e3);
+        self.error_um.add(error_um);
         if r.variance_um2.is_finite() {
             self.variance_um2.0 += r.variance_um2;
             self.variance_um2.1 += 1;
