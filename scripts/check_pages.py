@@ -2,6 +2,7 @@
 """Pages as a browser lays them out, 1400 and 400 px wide, on a light and on a dark screen.
 
     scripts/check_pages.py PICTURES PAGE.html...
+    scripts/check_pages.py PICTURES target/debug/cellpos    # of pages that it makes: runs, a cell's, cells, gap, identify, check, paper
 
 Says what of a figure's text is cut off, lies upon another text or cannot be read against its ground, which name stands twice in one
 legend, and what makes a page wider than its window; writes a picture of each into the folder PICTURES, to be looked at. Needs
@@ -82,9 +83,42 @@ def chromium(*words) -> str:
     return subprocess.run([program, *flags, *words], capture_output=True, text=True, check=True, timeout=300).stdout
 
 
+def step(do: str, **keys: str) -> str:
+    return f'[[step.step]]\ndo = "{do}"\n' + "".join(f'{key} = "{value}"\n' for key, value in keys.items())
+
+
+def made(program: Path, folder: Path) -> list[Path]:
+    """Pages of every kind, made on the emulated rig."""
+    rig = Path(__file__).resolve().parent.parent / "examples/cell.toml"
+    cycle = step("move", to="8um", duration="200ms") + step("hold", duration="400ms") + step("move", to="0um", duration="200ms")
+    repeat = f'[[step]]\ndo = "repeat"\nlabel = "cyclic"\ntimes = 30\n{cycle}{step("hold", duration="400ms")}'
+    (folder / "tire.toml").write_text(repeat + '[[step]]\ndo = "static"\nlike = "cyclic"\nload = "mean"\n')
+    fast = "--clock virtual --frames off"
+    for line in (
+        f"track --target 0um --duration 12s {fast} --name hold",
+        f"track --target 0um --sine 5um@20Hz --controller lqg --learn --duration 8s {fast} --name sine",
+        f"run tire.toml --rig {rig} {fast} --name tire",
+        f"run tire.toml --rig {rig} {fast} --cells 3 --name queue",
+        "report latest-hold --out hold.html",
+        "report latest-sine --out sine.html",
+        "report latest-tire --out tire.html",
+        "reconcile --model eq6 --data latest-sine latest-hold --report gap.html",
+        f"identify {fast} --seed 3 --out model.toml --report identify.html",
+        "check tire.toml --report check.html",
+        "paper --report paper.html",
+    ):
+        subprocess.run([program, *line.split()], cwd=folder, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    return [*sorted(folder.glob("*.html")), *folder.glob("runs/*/cells.html")]
+
+
 def main() -> None:
-    pictures, pages = Path(sys.argv[1]), [Path(word) for word in sys.argv[2:]]
+    pictures, given = Path(sys.argv[1]), [Path(word).resolve() for word in sys.argv[2:]]
     pictures.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory() as folder:
+        look(pictures, given if given[0].suffix == ".html" else made(given[0], Path(folder)))
+
+
+def look(pictures: Path, pages: list[Path]) -> None:
     bad = 0
     for page in pages:
         for screen in SCREENS:

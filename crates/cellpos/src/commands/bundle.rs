@@ -61,6 +61,12 @@ enum Links {
     Refused,
 }
 
+/// Whether a name is that of a file under way, which a program that was killed left behind: it is nobody's data.
+fn is_half_made(name: &std::ffi::OsStr) -> bool {
+    let name = name.as_encoded_bytes();
+    name.starts_with(b".") && name.ends_with(b".part")
+}
+
 /// Files below a folder, in order, as paths from it.
 fn files(folder: &Path, links: Links) -> Result<Vec<PathBuf>, Failure> {
     let mut found = Vec::new();
@@ -69,6 +75,9 @@ fn files(folder: &Path, links: Links) -> Result<Vec<PathBuf>, Failure> {
         let here = folder.join(&below);
         for entry in std::fs::read_dir(&here).map_err(io("cannot read", &here))? {
             let entry = entry.map_err(io("cannot read", &here))?;
+            if links == Links::Followed && is_half_made(&entry.file_name()) {
+                continue;
+            }
             let path = below.join(entry.file_name());
             let full = folder.join(&path);
             let mut kind = entry.file_type().map_err(io("cannot read", &full))?;

@@ -27,11 +27,15 @@ fn script(folder: &Path) {
     std::fs::write(folder.join("quick.toml"), text).unwrap();
 }
 
+/// What a program that is killed while it writes leaves behind.
+const HALF_MADE: &str = ".ticks.parquet.1.part";
+
 /// Makes a run what a kill leaves: no end, and the beginning of its records.
 fn killed(run: &Path, share: f64) {
     let meta = std::fs::read_to_string(run.join("run.toml")).unwrap();
     std::fs::write(run.join("run.toml"), &meta[..meta.find("[end]").unwrap()]).unwrap();
     let _ = std::fs::remove_file(run.join("ticks.parquet"));
+    std::fs::write(run.join(HALF_MADE), "PAR1").unwrap();
     let ticks = std::fs::OpenOptions::new()
         .write(true)
         .open(run.join("ticks.arrow"))
@@ -198,6 +202,8 @@ fn every_kind_of_run_goes_through_every_command_that_reads_one() {
             "{kind}: {bundle}"
         );
         succeed(at, &format!("bundle --verify {path}-bundle"));
+        let half_made = Path::new(&format!("{path}-bundle")).join(HALF_MADE);
+        assert!(!half_made.exists(), "{kind}: {}", half_made.display());
 
         let simulated = format!("{path}-simulated.csv");
         succeed(

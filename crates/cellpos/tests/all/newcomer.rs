@@ -134,8 +134,13 @@ fn the_quick_blocks_of_every_page_run_twice_in_one_folder() {
 }
 
 #[test]
-#[ignore = "all blocks, some minutes: cargo test --release -p cellpos --test all newcomer -- --ignored"]
+#[ignore = "all blocks, some minutes: cargo build --release -p cellpos-firmware-sim && cargo test --release -p cellpos --test all newcomer -- --ignored"]
 fn every_block_of_every_page_runs_twice_in_one_folder() {
+    let rig_in_a_box = Path::new(env!("CARGO_BIN_EXE_cellpos")).with_file_name("firmware-sim");
+    assert!(
+        rig_in_a_box.is_file(),
+        "build it first, in the same profile: cargo build -p cellpos-firmware-sim"
+    );
     let folder = folder();
     let mut failed = Vec::new();
     for round in 1..=2 {
