@@ -8,40 +8,10 @@
 //! more sample is one that no time stamp tells. Each stay is 5 s to adapt and 10 s measured; errors are of the true position,
 //! over the lowest possible on the plant in force. Ms is that of the tuning in force on that plant, each second.
 
-use cellpos_benches::adaptation::{Regime, Row, hold_through};
+use cellpos_benches::adaptation::{Row, hold_through, regimes};
 use cellpos_benches::parallel;
 use cellpos_benches::simulated::{controllers, loop_config};
 use cellpos_control::*;
-
-const GAINS: [f64; 5] = [0.5, 0.71, 1.0, 1.41, 2.0];
-
-/// Every gain with both delays, in an order by the seed; every other way is a drift.
-fn regimes(seed: u64) -> Vec<Regime> {
-    let mut order: Vec<(f64, u32)> = GAINS.iter().flat_map(|g| [(*g, 0), (*g, 1)]).collect();
-    // A linear congruential generator (Knuth's) is random enough for an order.
-    let mut state = seed
-        .wrapping_mul(2_862_933_555_777_941_757)
-        .wrapping_add(3_037_000_493);
-    for last in (1..order.len()).rev() {
-        state = state
-            .wrapping_mul(6_364_136_223_846_793_005)
-            .wrapping_add(1_442_695_040_888_963_407);
-        order.swap(last, ((state >> 33) % (last as u64 + 1)) as usize);
-    }
-    let drift = |k: usize| {
-        if (k + seed as usize).is_multiple_of(2) {
-            20.0
-        } else {
-            0.0
-        }
-    };
-    let regime = |(k, (gain, late_ticks))| Regime {
-        gain,
-        late_ticks,
-        drift_s: drift(k),
-    };
-    order.into_iter().enumerate().map(regime).collect()
-}
 
 fn changes(threads: usize, seeds: u64) {
     println!(

@@ -206,7 +206,12 @@ impl<L: ControlLaw> ControlLoop<L> {
             let over = 1.0 / driven.feed_forward_gain - 1.0 / gain;
             let learned_um = input.learned_um + over * driven.feed_forward_um;
             let usable = learned_um.is_finite();
-            (input.excitation_um, if usable { learned_um } else { 0.0 })
+            let probe_um = match (&self.adapter, &state.adapt) {
+                (Some(adapter), Some(adapt)) => adapter.probe_um(adapt),
+                _ => 0.0,
+            };
+            let added_um = input.excitation_um + probe_um;
+            (added_um, if usable { learned_um } else { 0.0 })
         } else {
             (0.0, 0.0)
         };
@@ -239,6 +244,7 @@ impl<L: ControlLaw> ControlLoop<L> {
             let told = Told {
                 fix: tick.fix,
                 command_um: output.command_um,
+                reference_um: tick.law.reference_um,
                 free: tick.controls && !estimate.stuck && !output.flags.not_finite,
             };
             self.adapt(state, &told);

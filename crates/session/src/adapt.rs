@@ -29,6 +29,10 @@ pub fn text(now: &Adaptation) -> String {
         AdaptMode::Moving => "on its way",
         AdaptMode::Paused => "paused",
         AdaptMode::Retreating => "back to the design",
+        AdaptMode::Testing => "being tested by a small motion",
+        AdaptMode::Disturbed => {
+            "something shakes the bead, so a small motion goes on that tells the gain"
+        }
     };
     let found = now.gain_estimate.map_or_else(String::new, |[gain, sd]| {
         format!(", estimated {gain:.2} +- {:.2}", 1.96 * sd)
@@ -74,10 +78,8 @@ pub(crate) fn sentence(kind: &EventKind) -> String {
         parts.push(format!("delay {way} by {:.2} ms", more_ms.abs()));
     }
     let hint = match (gain_changed, ratio < 1.0) {
-        (true, true) => "; is the channel clogging, or does a pump or the mains shake the bead?",
-        (true, false) => {
-            "; has a constriction opened, the bead moved to the middle, or does a pump or the mains shake it?"
-        }
+        (true, true) => "; is the channel clogging?",
+        (true, false) => "; has a constriction opened, or the bead moved to the middle?",
         (false, _) => "; does the camera or the amplifier take longer than the rig file says?",
     };
     let what = parts.join(", ");
@@ -109,7 +111,7 @@ mod tests {
     fn a_change_reads_as_a_sentence() {
         assert_eq!(
             told([1.0, 0.7], 0.0, 40.0, false),
-            "Gain fell to 0.70 over 40.0 s: adapted; is the channel clogging, or does a pump or the mains shake the bead?"
+            "Gain fell to 0.70 over 40.0 s: adapted; is the channel clogging?"
         );
         assert_eq!(
             told([1.0, 1.04], 1.0, 0.5, false),

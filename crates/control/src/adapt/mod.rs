@@ -7,6 +7,11 @@
 //! added to the command for that: a loop that holds a bead answers its Brownian motion in every tick, and an answer is
 //! independent of the noise that comes after it. A second of hold at 1 kHz tells the gain to some 5 %.
 //!
+//! **What shakes the bead** and is neither Brownian motion nor drift is answered as well, and the answer would pass for a gain. Lines
+//! (a pump, the mains) are found and taken out of all series ([`spectrum`], [`lines`]). Of a disturbance of many frequencies
+//! no estimate from fixes and commands alone can say whether it is one; so where the estimate leaves what was last
+//! confirmed a small motion of the loop's own decides ([`probe`]), and nothing is stated or told before.
+//!
 //! **Memory.** Old ticks are forgotten by the excitation of new ones, so that nothing is forgotten at rest. A slow window
 //! holds ten times what a fast one does; where they surely differ the plant has changed, and the slow one begins anew from
 //! the fast.
@@ -15,15 +20,23 @@
 //! for displacements counted in units of `1/g`, so that estimator, feedback, feed-forward and the plan of MPC stay those of the
 //! design, in other units; the delay changes the estimator, of which there is one for each, and the gains of PI.
 
+mod learn;
+mod lines;
+mod motion;
+mod probe;
+mod spectrum;
 mod supervisor;
 mod whiten;
 mod window;
 
 use crate::error::BuildError;
-use crate::estimator::{Estimator, EstimatorConfig, Fix, PredictedState};
-use crate::exposure;
+use crate::estimator::{Estimator, EstimatorConfig, Fix};
 use crate::loop_model::LoopModel;
+use lines::Lines;
+use motion::Motion;
+use probe::{Probe, Standing};
 use serde::Serialize;
+use spectrum::{Bank, Lineup};
 use supervisor::Force;
 pub use supervisor::{AdaptMode, AdaptNews};
 use whiten::{Track, Whitener};
@@ -51,20 +64,14 @@ const CHANGED_DELAY: f64 = 24.0;
 const LEAST_DOUBT: f64 = 0.1;
 /// Times the stated wandering of neutral for which the filter makes white noise of it: a real flow wanders more.
 const WANDERS: f64 = 2.0;
-/// Past positions of the model that are kept, ticks.
-const PAST: usize = 24;
-/// A fix so many standard deviations off, over twice what the model moved, is no fix of this bead.
-const OUTLIER: f64 = 6.0;
-/// Outliers in a row after which the series begin anew.
-const OUTLIERS: u8 = 12;
-/// Memory of the check whether what is left is white, ticks.
-const WHITE_TICKS: f64 = 2000.0;
 
-/// Memory of the mean square of what is left now, and of what is usually left, ticks. Where the first is below this part of
-/// the other the bead does not wander: something holds it, whatever else is known.
-const NOW_TICKS: f64 = 100.0;
-const USUAL_TICKS: f64 = 20_000.0;
-const STILL: f64 = 0.65;
+/// A reference that moves by more than this part of the noise a tick drives the model by itself: what is left is then no noise.
+const DRIVEN: f64 = 0.3;
+const DRIVEN_TICKS: f64 = 200.0;
+/// Ticks after a new line in which nothing is told.
+const NEW_LINE_TICKS: u16 = 1500;
+/// Doubt of a gain (of its logarithm) that counts in these ticks.
+const NEW_LINE_SD: f64 = 0.1;
 
 /// The tuning in force, as a law is told of it.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -110,21 +117,20 @@ pub(crate) struct Adapter {
     estimators: [Option<Estimator>; MEMBERS],
     nominal: Estimator,
     whitener: Whitener,
+    bank: Bank,
     /// Whole and fractional samples of the design's delay.
     delay_samples: f64,
     exposure_ticks: f64,
+    /// Command that moves the bead by a standard deviation of the noise of a tick, um.
+    probe_um: f64,
 }
 
 /// State of the adaptation.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct AdaptState {
-    model: PredictedState,
-    /// Positions of the model at this tick and those before, newest first, um.
-    past_um: [f64; PAST],
-    /// What the command moved the model at once at the tick before each of these, um.
-    jumps_um: [f64; PAST],
+    /// The model, driven with the commands.
+    model: Motion,
     seen: Option<Track>,
-    moved: [Track; MEMBERS],
     slow: Window,
     fast: Window,
     /// Squares of what is left, and its products with that of the tick before.
@@ -135,6 +141,17 @@ pub struct AdaptState {
     usual_um2: f64,
     ticks: f64,
     outliers: u8,
+    /// Notches at the lines of a disturbance, the search for more, and ticks in which a new one settles.
+    lines: Lines,
+    lineup: Lineup,
+    settling: u16,
+    /// Ticks since the newest of them.
+    since_line: u16,
+    /// The test of what is estimated.
+    probe: Probe,
+    /// Mean square of the steps of the reference, um^2, and where it was.
+    driven_um2: f64,
+    reference_um: f64,
     /// Gain and member of the newest finding.
     believed: (f64, usize),
     /// The newest finding.
@@ -151,6 +168,8 @@ pub(crate) struct Told {
     pub command_um: f64,
     /// The law decides, and nothing holds the bead.
     pub free: bool,
+    /// Where the bead is to be, um.
+    pub reference_um: f64,
 }
 
 impl Adapter {
@@ -163,10 +182,14 @@ impl Adapter {
         let walk_um2 = 2.0 * config.diffusion_um2_per_s * ts;
         let wander = WANDERS * config.neutral_walk_um_per_sqrt_s.max(0.01);
         let drift_um2 = (wander * model.gain_per_s * ts).powi(2) * ts;
+        let whitener = Whitener::new(walk_um2, drift_um2, config.fix_noise_um.powi(2))?;
+        let moves = model.feedthrough + model.fast_gain_per_s() * ts;
         Ok(Self {
+            probe_um: (whitener.noise_um2.sqrt() / moves).clamp(-0.5, 0.5),
             estimators: DELAYS.map(|extra| delayed(config, model, extra)),
             nominal: Estimator::new(config, model)?,
-            whitener: Whitener::new(walk_um2, drift_um2, config.fix_noise_um.powi(2))?,
+            whitener,
+            bank: Bank::default(),
             delay_samples: model.delay_samples(),
             exposure_ticks: config.exposure_ms * 1e-3 / ts,
         })
@@ -175,15 +198,8 @@ impl Adapter {
     /// Nothing known, the design in force, everything at rest at a command, um.
     pub fn start(&self, command_um: f64) -> AdaptState {
         AdaptState {
-            model: PredictedState {
-                n: command_um,
-                last_um: command_um,
-                ..PredictedState::default()
-            },
-            past_um: [0.0; PAST],
-            jumps_um: [0.0; PAST],
+            model: Motion::start(command_um),
             seen: None,
-            moved: [Track::default(); MEMBERS],
             slow: Window::new(FAST, SLOW, SLOW_TICKS),
             fast: Window::new(FAST, FAST, FAST_TICKS),
             white: [0.0; 2],
@@ -192,6 +208,13 @@ impl Adapter {
             usual_um2: 0.0,
             ticks: 0.0,
             outliers: 0,
+            lines: Lines::NONE,
+            lineup: Lineup::NONE,
+            settling: 0,
+            since_line: u16::MAX,
+            probe: Probe::new(),
+            driven_um2: 0.0,
+            reference_um: f64::NAN,
             believed: (1.0, NOMINAL),
             found: None,
             force: Force::default(),
@@ -231,15 +254,28 @@ impl Adapter {
         ((off + 2.0 * found.log_sd()) / stated.max(1e-3)).clamp(LEAST_DOUBT, 1.0)
     }
 
+    /// What is to be added to the command of this tick to put the estimate to the test, um.
+    pub fn probe_um(&self, state: &AdaptState) -> f64 {
+        state.probe.command_um
+    }
+
     /// Where it stands.
     pub fn adaptation(&self, state: &AdaptState) -> Adaptation {
         let found = state.found;
         Adaptation {
             gain: state.force.log_gain.exp(),
             delay_samples: DELAYS[state.force.member],
-            gain_estimate: found.map(|f| [f.gain, f.gain_sd]),
+            gain_estimate: found
+                .and_then(|f| state.probe.stated(f.gain.max(0.05).ln(), f.log_sd()))
+                .map(|(log_gain, sd)| [log_gain.exp(), sd * log_gain.exp()]),
             delay_estimate_samples: found.map(|f| [f.delay, f.delay_sd]),
-            mode: state.force.mode,
+            mode: match (state.force.mode, state.probe.standing) {
+                (AdaptMode::Agreeing | AdaptMode::Moving, Standing::Tested) => AdaptMode::Testing,
+                (AdaptMode::Agreeing | AdaptMode::Moving, Standing::Corrected) => {
+                    AdaptMode::Disturbed
+                }
+                (mode, _) => mode,
+            },
             news: state.news,
         }
     }
@@ -280,18 +316,30 @@ impl Adapter {
     /// of the next tick.
     pub fn step(&self, state: &mut AdaptState, told: &Told) {
         let learned = self.learn(state, told.fix.filter(|_| told.free));
+        state.probe.given_um = state.probe.command_um;
         self.drive(state, told.command_um);
         state.news = None;
+        let step_um = told.reference_um - state.reference_um;
+        if step_um.is_finite() {
+            state.driven_um2 += (step_um * step_um - state.driven_um2) / DRIVEN_TICKS;
+        }
+        state.reference_um = told.reference_um;
         if !told.free {
             state.force.pause();
+            state.probe.command_um = 0.0;
             return;
         }
         if learned {
             self.compare(state);
-            let found = self.finding(&state.slow, state);
-            state.found = found;
+            // After a new line little is known at first, and the line may not be out of it altogether.
+            let enough =
+                |f: &Finding| state.since_line > NEW_LINE_TICKS || f.log_sd() < NEW_LINE_SD;
+            let found = self.finding(&state.slow, state).filter(enough);
             state.believed = found.map_or(state.believed, |f| (f.gain.max(0.0), f.best));
-            if state.force.follow(found.as_ref(), &self.usable()) {
+            let driven = state.driven_um2 > DRIVEN * self.whitener.noise_um2;
+            let found = found.map(|found| found.judged(&mut state.probe, driven));
+            state.found = found;
+            if (state.force).follow(found.as_ref(), &self.usable(), state.probe.least()) {
                 state.found = None;
                 state.slow = Window::new(FAST, SLOW, SLOW_TICKS);
                 state.fast = Window::new(FAST, FAST, FAST_TICKS);
@@ -299,7 +347,17 @@ impl Adapter {
         } else {
             state.force.pause();
         }
-        state.news = state.force.news();
+        state.since_line = state.since_line.saturating_add(1);
+        let confirmed = state.probe.standing == Standing::Confirmed
+            && state.probe.is_near(state.force.log_gain);
+        if state.since_line <= NEW_LINE_TICKS {
+            state.force.hush();
+        } else if confirmed || state.force.mode == AdaptMode::Retreating {
+            state.news = state.force.news();
+        }
+        let louder = (self.left_um2(state) / self.whitener.noise_um2).sqrt();
+        let size_um = self.probe_um * louder.clamp(1.0, 2.0) / state.believed.0.clamp(0.4, 2.5);
+        state.probe.next(size_um);
     }
 
     /// A tick that never came: the command was held.
@@ -310,104 +368,14 @@ impl Adapter {
 
     /// The model one tick on.
     fn drive(&self, state: &mut AdaptState, command_um: f64) {
-        state.jumps_um.copy_within(0..PAST - 1, 1);
-        let change_um = command_um - state.model.last_um;
-        state.jumps_um[0] = self.nominal.model().feedthrough * change_um;
-        state.model = self.nominal.tick_state(&state.model, command_um);
-        state.past_um.copy_within(0..PAST - 1, 1);
-        state.past_um[0] = self.nominal.position(&state.model);
-        if !state.past_um[0].is_finite() {
+        let probe_um = state.probe.given_um;
+        let probing = (state.probe.instrument())
+            .is_none_or(|instrument| instrument.drive(&self.nominal, probe_um));
+        if !state.model.drive(&self.nominal, command_um) || !probing {
             let force = state.force;
             *state = self.start(command_um);
             state.force = force;
         }
-    }
-
-    /// Position of the model so many ticks ago, um: between ticks the bead jumps by the direct feedthrough and then moves evenly.
-    fn past(state: &AdaptState, ago: f64) -> Option<f64> {
-        let newer = ago.max(0.0).floor();
-        let (part, newer) = (ago.max(0.0) - newer, newer as usize);
-        let (a, b) = (state.past_um.get(newer)?, state.past_um.get(newer + 1)?);
-        Some(a + part * (b + state.jumps_um.get(newer)? - a))
-    }
-
-    /// One tick of the regression. Whether something was learned.
-    fn learn(&self, state: &mut AdaptState, fix: Option<Fix>) -> bool {
-        let (usable, noise_um2) = (self.usable(), self.left_um2(state));
-        let mut at_um = [0.0; MEMBERS];
-        let mut known = fix.is_some();
-        if let Some(fix) = fix {
-            let ago = self.delay_samples + fix.age as f64 + fix.offset;
-            for ((at, extra), open) in at_um.iter_mut().zip(DELAYS).zip(usable) {
-                match exposure::mean(ago + extra, self.exposure_ticks, |ago| {
-                    Self::past(state, ago)
-                }) {
-                    Some(um) => *at = um,
-                    None if open => known = false,
-                    None => {}
-                }
-            }
-        }
-        let Some(fix) = fix.filter(|_| known) else {
-            self.coast(state);
-            return false;
-        };
-        let Some(seen) = &mut state.seen else {
-            state.seen = Some(Whitener::begin(fix.position_um));
-            state.moved = at_um.map(Whitener::begin);
-            return false;
-        };
-        let y = Whitener::innovation(seen, fix.position_um);
-        let mut p = [0.0; MEMBERS];
-        for ((p, track), at) in p.iter_mut().zip(&state.moved).zip(at_um) {
-            *p = Whitener::innovation(track, at);
-        }
-        let (gain, member) = state.believed;
-        let left = y - gain * p[member];
-        let sd = noise_um2.sqrt();
-        let outlier = left.abs() > OUTLIER * sd + 2.0 * gain.max(1.0) * p[member].abs();
-        state.outliers = if outlier { state.outliers + 1 } else { 0 };
-        if outlier && state.outliers < OUTLIERS {
-            self.coast(state);
-            return false;
-        }
-        if outlier {
-            state.seen = None;
-            state.outliers = 0;
-            return false;
-        }
-        let z = seen.drift - gain * state.moved[member].drift;
-        self.whitener.step(seen, y);
-        for (track, p) in state.moved.iter_mut().zip(p) {
-            self.whitener.step(track, p);
-        }
-        let left = left.clamp(-3.0 * sd, 3.0 * sd);
-        if Self::is_still(state, left) {
-            return false;
-        }
-        state.slow.add(member, &p, z, y, noise_um2);
-        state.fast.add(member, &p, z, y, noise_um2);
-        let keep = 1.0 - 1.0 / WHITE_TICKS;
-        state.white[0] = keep * state.white[0] + left * left;
-        state.white[1] = keep * state.white[1] + left * state.left_um;
-        state.left_um = left;
-        true
-    }
-
-    /// A tick without a fix to learn from: what is not seen moves on as it did.
-    fn coast(&self, state: &mut AdaptState) {
-        for track in state.seen.iter_mut().chain(&mut state.moved) {
-            self.whitener.step(track, 0.0);
-        }
-    }
-
-    /// Whether the bead wanders so much less than it did that something must hold it.
-    fn is_still(state: &mut AdaptState, left_um: f64) -> bool {
-        let square = left_um * left_um;
-        state.ticks += 1.0;
-        state.now_um2 += (square - state.now_um2) / state.ticks.min(NOW_TICKS);
-        state.usual_um2 += (square - state.usual_um2) / state.ticks.min(USUAL_TICKS);
-        state.ticks > 2.0 * NOW_TICKS && state.now_um2 < STILL * state.usual_um2
     }
 
     /// Where the two windows surely differ the plant has changed: the slow one begins anew from the fast.
@@ -423,6 +391,9 @@ impl Adapter {
         let delay = fast.worse[slow.best] > CHANGED_DELAY;
         if gain || delay {
             state.slow = state.slow.taken_from(&state.fast);
+            if state.probe.standing == Standing::Tested {
+                state.probe.begin_anew();
+            }
         }
     }
 

@@ -22,6 +22,10 @@ pub enum AdaptMode {
     Paused = 3,
     /// The estimate is one that no plant can have: back to the design.
     Retreating = 4,
+    /// The estimate has left what was confirmed: a small motion of the loop's own decides whether it is the plant's.
+    Testing = 5,
+    /// A disturbance makes the estimate wrong; the gain is known by the loop's own motion, which goes on.
+    Disturbed = 6,
 }
 
 /// Gains, over the design's, that the law is tuned to.
@@ -42,6 +46,8 @@ const DELAY_SURE: f64 = 20.0;
 const DELAY_TICKS: [u16; 2] = [2, 50];
 /// Ticks that a retreat lasts at least.
 const RETREAT_TICKS: u16 = 1000;
+/// A retreat is told of after so many.
+const DOUBTFUL_TICKS: u16 = 1500;
 /// What is told of: change of the logarithm of the gain; of the delay, samples.
 const TOLD_GAIN: f64 = 0.14;
 const TOLD_DELAY: f64 = 0.5;
@@ -76,6 +82,8 @@ pub(super) struct Force {
     away: u64,
     still: u16,
     retreat_told: bool,
+    /// Ticks of a retreat so far.
+    doubtful: u16,
 }
 
 impl Default for Force {
@@ -91,6 +99,7 @@ impl Default for Force {
             away: 0,
             still: 0,
             retreat_told: false,
+            doubtful: 0,
         }
     }
 }
@@ -103,7 +112,13 @@ impl Force {
     }
 
     /// A tick in which the estimate may come into force. Whether it is one of doubt, in which what was found is worth nothing.
-    pub fn follow(&mut self, found: Option<&Finding>, usable: &[bool; MEMBERS]) -> bool {
+    /// The logarithm of the gain goes no lower than `least`.
+    pub fn follow(
+        &mut self,
+        found: Option<&Finding>,
+        usable: &[bool; MEMBERS],
+        least: f64,
+    ) -> bool {
         self.since_delay = self.since_delay.saturating_add(1);
         self.still = self.still.saturating_add(1);
         let Some(found) = found else {
@@ -126,10 +141,10 @@ impl Force {
             return false;
         }
         self.retreat_told = false;
-        let aim = found.gain.max(0.05).ln();
+        let aim = found.gain.max(0.05).ln().max(least);
         let (off, sd) = (aim - self.log_gain, found.log_sd());
-        let (least, sds) = if self.moving { ARRIVED } else { SET_OUT };
-        self.moving = off.abs() > least.max(sds * sd);
+        let (smallest, sds) = if self.moving { ARRIVED } else { SET_OUT };
+        self.moving = off.abs() > smallest.max(sds * sd);
         if self.moving {
             // Towards boldness to the near end of the interval and no further.
             self.go(if off < 0.0 { (off + sd).min(0.0) } else { off });
@@ -189,6 +204,11 @@ impl Force {
         }
     }
 
+    /// A tick of which nothing is told: a change has to stand for a while after it.
+    pub fn hush(&mut self) {
+        self.still = 0;
+    }
+
     /// What is worth telling of after this tick.
     pub fn news(&mut self) -> Option<AdaptNews> {
         let (told_gain, told_member) = self.told;
@@ -199,10 +219,17 @@ impl Force {
         } else {
             0
         };
-        // A retreat from next to nothing is none.
+        // A retreat from next to nothing is none, nor one that is soon over: something shook the bead.
+        let retreating = self.mode == AdaptMode::Retreating;
+        self.doubtful = if retreating {
+            self.doubtful.saturating_add(1)
+        } else {
+            0
+        };
         let far = told_gain.abs() > TOLD_GAIN || told_member != NOMINAL;
-        let doubt = self.mode == AdaptMode::Retreating && !self.retreat_told && far;
-        let much = gain_off > TOLD_GAIN || delay_off >= TOLD_DELAY;
+        let lasting = self.doubtful > DOUBTFUL_TICKS;
+        let doubt = lasting && !self.retreat_told && far;
+        let much = !retreating && (gain_off > TOLD_GAIN || delay_off >= TOLD_DELAY);
         let settled = self.still >= SETTLED_TICKS || gain_off > TOLD_AT_ONCE;
         if !(doubt || (much && settled)) {
             return None;

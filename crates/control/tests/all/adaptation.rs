@@ -1,11 +1,11 @@
 //! The loop adapts: to a gain and a delay that change under a held bead, and to nothing where nothing changes.
 
 #[path = "../../../../benches/src/adaptation.rs"]
-mod trial;
+pub mod trial;
 
 use crate::common::{config, mpc};
 use cellpos_control::*;
-use trial::{Regime, effective_ms, hold_through};
+use trial::{Regime, hold_through, regimes};
 
 fn adapting(controller: ControllerConfig) -> LoopConfig {
     let mut config = config(controller);
@@ -59,6 +59,33 @@ fn gain_and_delay_that_step_or_drift_are_followed_with_hold_error_and_margins_as
 }
 
 #[test]
+#[ignore = "long: run with --release -- --include-ignored"]
+fn every_gain_and_delay_of_the_spread_in_ten_orders_is_followed() {
+    for controller in [lqg(), mpc(SolverKind::ActiveSet)] {
+        let (mut over, mut ms, mut peak_um, mut sum) = (0.0_f64, 0.0_f64, 0.0_f64, 0.0);
+        for seed in 0..10 {
+            let regimes = regimes(seed);
+            let rows = hold_through(adapting(controller), RigConfig::eq6(seed), &regimes);
+            for (regime, row) in regimes.iter().zip(&rows) {
+                if row.over_bound > 1.18 || row.ms > 1.95 || row.peak_um > 1.2 {
+                    eprintln!("seed {seed}, {regime:?}: {row:?}");
+                }
+                (over, ms) = (over.max(row.over_bound), ms.max(row.ms));
+                (peak_um, sum) = (peak_um.max(row.peak_um), sum + row.over_bound);
+            }
+        }
+        println!(
+            "{:.3} of the bound, at most {over:.3}; Ms {ms:.2}; {peak_um:.2} um",
+            sum / 100.0
+        );
+        assert!(
+            over <= 1.2 && ms <= 2.0 && peak_um < 5.0,
+            "{controller:?}: {over}, Ms {ms}, {peak_um} um"
+        );
+    }
+}
+
+#[test]
 fn without_adaptation_the_same_plant_is_held_worse_and_at_the_edge() {
     let rows = hold_through(config(lqg()), RigConfig::eq6(0), &[regime(2.0, 1, 0.0)]);
     assert!(rows[0].ms > 8.0 && rows[0].over_bound > 1.3, "{rows:?}");
@@ -100,9 +127,11 @@ fn long_hold(seed: u64, ticks: u64) -> (f64, u32, [f64; 2]) {
         let now = controller.adaptation().unwrap();
         told += u32::from(now.news.is_some());
         if k > 10_000 {
-            let [gain, sd] = now.gain_estimate.unwrap();
-            squares += ((gain - 1.0) / sd).powi(2);
-            n += 1.0;
+            // A chance excursion is put to the test, and nothing is stated until it is over.
+            if let Some([gain, sd]) = now.gain_estimate {
+                squares += ((gain - 1.0) / sd).powi(2);
+                n += 1.0;
+            }
             force = [force[0].min(now.gain), force[1].max(now.gain)];
         }
     }
@@ -239,80 +268,5 @@ fn a_tuning_that_moves_makes_no_bump() {
             moved > 50 && largest_um < 0.5,
             "{moved} ticks, {largest_um} um"
         );
-    }
-}
-
-/// A flow that shakes the bead, um/s at a time in s.
-type Flow = fn(f64) -> f64;
-
-/// What came into force over 30 s of hold in a flow, from 2 s on.
-struct Shaken {
-    least: f64,
-    most: f64,
-    /// Largest sensitivity of the tuning in force on the plant, which does not change.
-    ms: f64,
-    events: u32,
-}
-
-fn in_a_flow(controller: ControllerConfig, seed: u64, flow: Flow) -> Shaken {
-    let config = adapting(controller);
-    let mut controller = Controller::new(config).unwrap();
-    controller.start(20.0, 20.0);
-    let mut rig = SimulatedRig::new(RigConfig::eq6(seed)).unwrap();
-    let mut seen = Shaken {
-        least: f64::INFINITY,
-        most: 0.0,
-        ms: 0.0,
-        events: 0,
-    };
-    for k in 0..30_000 {
-        rig.drift_um_per_s = flow(f64::from(k) * 1e-3);
-        tick(&mut controller, &mut rig);
-        let now = controller.adaptation().unwrap();
-        seen.events += u32::from(now.news.is_some());
-        if k > 2000 {
-            seen.least = seen.least.min(now.gain);
-            seen.most = seen.most.max(now.gain);
-        }
-        if k > 2000 && k % 1000 == 0 {
-            let ms = effective_ms(&config, now.gain, now.delay_samples, regime(1.0, 0, 0.0));
-            seen.ms = seen.ms.max(ms);
-        }
-    }
-    seen
-}
-
-/// A flow that shakes at one frequency cannot be told from the loop's answer to it: the gain is found too low at 10 to 30 Hz, and too
-/// high at 100 Hz, which makes the loop slow. What must hold is that the loop keeps its margins, and that what is slow
-/// is not taken for a gain.
-#[test]
-fn a_flow_that_shakes_the_bead_takes_no_margin_away_and_a_slow_one_changes_nothing() {
-    use std::f64::consts::TAU;
-    let flows: [(&str, bool, Flow); 7] = [
-        ("none", true, |_| 0.0),
-        ("0.3 Hz, 10 um/s", true, |t| 10.0 * (TAU * 0.3 * t).sin()),
-        ("2 Hz, 10 um/s", true, |t| 10.0 * (TAU * 2.0 * t).sin()),
-        ("steps of 10 um/s", true, |t| {
-            10.0 * (t / 0.5).floor().rem_euclid(2.0)
-        }),
-        ("10 Hz, 10 um/s", false, |t| 10.0 * (TAU * 10.0 * t).sin()),
-        ("30 Hz, 10 um/s", false, |t| 10.0 * (TAU * 30.0 * t).sin()),
-        ("100 Hz, 30 um/s", false, |t| 30.0 * (TAU * 100.0 * t).sin()),
-    ];
-    for (name, slow, flow) in flows {
-        for controller in [lqg(), mpc(SolverKind::ActiveSet)] {
-            let seen = in_a_flow(controller, 1, flow);
-            let Shaken {
-                least,
-                most,
-                ms,
-                events,
-            } = seen;
-            println!("{name}: gain in force {least:.2} to {most:.2}, Ms {ms:.2}, {events} events");
-            assert!(ms <= 2.0, "{name}: Ms {ms}");
-            if slow {
-                assert!(least > 0.85 && most < 1.15 && events == 0, "{name}");
-            }
-        }
     }
 }

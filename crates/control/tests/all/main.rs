@@ -4,6 +4,7 @@ mod adaptation;
 mod allocation;
 mod badly_scaled;
 mod common;
+mod disturbed;
 mod late_ticks;
 mod learning;
 mod learning_beside_adaptation;

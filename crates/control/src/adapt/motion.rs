@@ -1,0 +1,102 @@
+//! The model, driven with commands beside the loop, and what of its motion was not to be foreseen.
+
+use super::whiten::{Track, Whitener};
+use super::window::{DELAYS, MEMBERS};
+use crate::estimator::{Estimator, Fix, PredictedState};
+use crate::exposure;
+
+/// Past positions of the model that are kept, ticks.
+const PAST: usize = 24;
+
+/// The model and its recent positions, and each delay's series in the filter.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Motion {
+    model: PredictedState,
+    /// Positions of the model at this tick and those before, newest first, um.
+    past_um: [f64; PAST],
+    /// What the command moved the model at once at the tick before each of these, um.
+    jumps_um: [f64; PAST],
+    tracks: Option<[Track; MEMBERS]>,
+}
+
+impl Motion {
+    /// At rest at a command, um.
+    pub fn start(command_um: f64) -> Self {
+        Self {
+            model: PredictedState {
+                n: command_um,
+                last_um: command_um,
+                ..PredictedState::default()
+            },
+            past_um: [0.0; PAST],
+            jumps_um: [0.0; PAST],
+            tracks: None,
+        }
+    }
+
+    /// One tick on with a command, um. Whether the model is still finite.
+    #[must_use]
+    pub fn drive(&mut self, estimator: &Estimator, command_um: f64) -> bool {
+        self.jumps_um.copy_within(0..PAST - 1, 1);
+        let change_um = command_um - self.model.last_um;
+        self.jumps_um[0] = estimator.model().feedthrough * change_um;
+        self.model = estimator.tick_state(&self.model, command_um);
+        self.past_um.copy_within(0..PAST - 1, 1);
+        self.past_um[0] = estimator.position(&self.model);
+        self.past_um[0].is_finite()
+    }
+
+    /// Position so many ticks ago, um: between ticks the bead jumps by the direct feedthrough and then moves evenly.
+    fn past(&self, ago: f64) -> Option<f64> {
+        let newer = ago.max(0.0).floor();
+        let (part, newer) = (ago.max(0.0) - newer, newer as usize);
+        let (a, b) = (self.past_um.get(newer)?, self.past_um.get(newer + 1)?);
+        Some(a + part * (b + self.jumps_um.get(newer)? - a))
+    }
+
+    /// Positions at the exposure of a fix, for each delay beside `delay`, ticks; `None` where one that is open is not known.
+    pub fn at(
+        &self,
+        fix: &Fix,
+        delay: f64,
+        exposure: f64,
+        open: &[bool; MEMBERS],
+    ) -> Option<[f64; MEMBERS]> {
+        let ago = delay + fix.age as f64 + fix.offset;
+        let mut at_um = [0.0; MEMBERS];
+        for ((at, extra), open) in at_um.iter_mut().zip(DELAYS).zip(open) {
+            match exposure::mean(ago + extra, exposure, |ago| self.past(ago)) {
+                Some(um) => *at = um,
+                None if *open => return None,
+                None => {}
+            }
+        }
+        Some(at_um)
+    }
+
+    /// Series that begin at these positions.
+    pub fn begin(&mut self, at_um: [f64; MEMBERS]) {
+        self.tracks = Some(at_um.map(Whitener::begin));
+    }
+
+    /// What of the positions was not to be foreseen; `None` before [`Motion::begin`].
+    pub fn innovations(&self, at_um: &[f64; MEMBERS]) -> Option<[f64; MEMBERS]> {
+        let tracks = self.tracks.as_ref()?;
+        Some(std::array::from_fn(|j| {
+            Whitener::innovation(&tracks[j], at_um[j])
+        }))
+    }
+
+    /// Drift of a series, um a tick.
+    pub fn drift(&self, member: usize) -> f64 {
+        self.tracks.map_or(0.0, |tracks| tracks[member].drift)
+    }
+
+    /// One tick with those innovations.
+    pub fn follow(&mut self, whitener: &Whitener, innovations: &[f64; MEMBERS]) {
+        let tracks = self.tracks.iter_mut().flatten();
+        for (track, innovation) in tracks.zip(innovations) {
+            whitener.step(track, *innovation);
+        }
+    }
+}
