@@ -23,10 +23,13 @@ const MEMORY: f64 = 1500.0;
 const DECIDE_SD: f64 = 0.03;
 const DECIDE: f64 = 2.0;
 /// The same for a decision before that.
-const EARLY_SD: f64 = 0.15;
+const EARLY_SD: f64 = 0.2;
 const EARLY: f64 = 4.0;
 const AGREES: f64 = 1.5;
 const NEAR: f64 = 0.08;
+/// What a test that is no better than this says lets the tuning go further, to so many standard uncertainties from it.
+const LEAST_SD: f64 = 0.4;
+const LEAST_SDS: f64 = 2.5;
 /// Ticks of a test before anything is decided, and doubt of an estimate that is worth a decision.
 const LEAST_TICKS: u32 = 500;
 const WORTH_SD: f64 = 0.06;
@@ -175,14 +178,9 @@ impl Probe {
         match self.standing {
             Standing::Confirmed => self.confirmed - BOLD,
             Standing::Tested => {
-                let most = |(alone, sd): (f64, f64)| {
-                    if sd < EARLY_SD {
-                        alone + 2.0 * sd
-                    } else {
-                        self.confirmed
-                    }
-                };
-                (self.confirmed - BOLD).min(self.alone().map_or(self.confirmed, most))
+                let most = |(alone, sd): (f64, f64)| alone + LEAST_SDS * sd;
+                let known = self.alone().filter(|found| found.1 < LEAST_SD);
+                (self.confirmed - BOLD).min(known.map_or(self.confirmed, most))
             }
             Standing::Corrected => f64::NEG_INFINITY,
         }
