@@ -58,6 +58,14 @@ impl Reach {
         }
     }
 
+    /// The same with a move in a tick that is smaller by so much, um, and by a twentieth at most.
+    pub(crate) fn with_reserve(self, reserve_um: f64) -> Self {
+        Self {
+            move_um: self.move_um - reserve_um.min(0.05 * self.move_um),
+            ..self
+        }
+    }
+
     /// The nearest to `wanted` after `last`.
     pub(crate) fn clamp(&self, wanted: f64, last: f64) -> f64 {
         wanted

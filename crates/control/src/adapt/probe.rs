@@ -203,7 +203,8 @@ impl Probe {
                 // An estimate that is still on its way is slower than the test.
                 let surely = |found: &(f64, f64)| {
                     let off = (found.0 - log_gain).abs();
-                    self.ticks > LEAST_TICKS && found.1 < LEADS_SD && off > DECIDE * found.1
+                    let moving = self.ticks > LEAST_TICKS && self.shift > SHIFT;
+                    moving && found.1 < LEADS_SD && off > DECIDE * found.1
                 };
                 self.alone().filter(surely).unwrap_or((log_gain, sd))
             }
