@@ -1,5 +1,6 @@
 //! One module a command: `Args` (read by clap), `run(args)` (calls the libraries, prints the result).
 
+mod arrays;
 pub mod background;
 pub mod board;
 pub mod bundle;

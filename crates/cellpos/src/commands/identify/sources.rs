@@ -1,6 +1,7 @@
 //! What `cellpos identify --data` reads: run folders and records of cellpos, as they are; any other file by its columns.
 
 use super::Args;
+use crate::commands::arrays::read_table;
 use crate::commands::run::resume;
 use crate::outcome::Failure;
 use cellpos_record::RunReader;
@@ -50,7 +51,7 @@ pub fn read(path: &Path, args: &Args) -> Result<Vec<Source>, Failure> {
 }
 
 fn text_of(path: &Path) -> Result<String, Failure> {
-    cellpos_table::read_text(path, cellpos_table::MOST_OF_A_RECORD).map_err(|error| {
+    read_table(path).map_err(|error| {
         Failure::bad_input(
             format!("{}: cannot be read ({error})", path.display()),
             "name a record or a run folder",

@@ -1,5 +1,6 @@
 //! The records that a reconciliation reads: CSV files and run folders, and what they say about the model's working point.
 
+use crate::commands::arrays::read_table;
 use crate::commands::run::resume::sessions;
 use crate::outcome::Failure;
 use cellpos_experiment::collect::refused;
@@ -38,6 +39,9 @@ pub(super) struct Columns {
     rows: Option<String>,
 }
 
+/// Endings of the files that are taken for records where a folder is named.
+const RECORDS: [&str; 4] = ["csv", "dat", "npy", "mat"];
+
 /// All record files behind the arguments, in a fixed order.
 pub(super) fn files(data: &[PathBuf]) -> Result<Vec<PathBuf>, Failure> {
     let mut found = Vec::new();
@@ -54,7 +58,8 @@ pub(super) fn files(data: &[PathBuf]) -> Result<Vec<PathBuf>, Failure> {
                 .map(|e| e.path())
                 .filter(|p| {
                     (p.is_dir() && is_run(p))
-                        || p.extension().is_some_and(|e| e == "csv" || e == "dat")
+                        || p.extension()
+                            .is_some_and(|e| RECORDS.iter().any(|r| e == *r))
                 })
                 .collect();
             inside.sort();
@@ -96,7 +101,7 @@ fn record_name(path: &Path) -> String {
 
 pub(super) fn read(path: &Path, columns: &Columns) -> Result<Record, Failure> {
     let name = record_name(path);
-    let text = cellpos_table::read_text(path, cellpos_table::MOST_OF_A_RECORD).map_err(|e| {
+    let text = read_table(path).map_err(|e| {
         Failure::bad_input(
             format!("cannot read {}: {e}", path.display()),
             "check --data; records are CSV: time_s,pzt_um,bead_um",
