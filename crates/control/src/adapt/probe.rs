@@ -160,7 +160,9 @@ impl Probe {
             Standing::Corrected => self.shift < SHIFT.max(self.correction.1),
         };
         if usable {
-            return Some((log_gain, sd.hypot(self.doubt)));
+            // What is stated is all of the correction.
+            let rest = self.correction.0 - self.surely();
+            return Some((log_gain + rest, sd.hypot(self.doubt)));
         }
         let sure = |found: &(f64, f64)| found.1 < STATED_SD;
         let long = self.is_on() && self.ticks > LEAST_TICKS;
@@ -195,10 +197,17 @@ impl Probe {
         self.squares = [0.0; 3];
     }
 
+    /// The part of the correction that is in force: a test that is looked at again and again is now and then off by chance, and
+    /// only what is surely wrong is put right.
+    fn surely(&self) -> f64 {
+        let (wrong, doubt) = self.correction;
+        (wrong.abs() - doubt).max(0.0) * wrong.signum()
+    }
+
     /// Gain and standard uncertainty as they are put right; both are those of the logarithm.
     pub fn corrected(&self, log_gain: f64, sd: f64) -> (f64, f64) {
         match self.standing {
-            Standing::Corrected => (log_gain + self.correction.0, sd.hypot(self.correction.1)),
+            Standing::Corrected => (log_gain + self.surely(), sd.hypot(self.correction.1)),
             Standing::Tested => {
                 // An estimate that is still on its way is slower than the test.
                 let surely = |found: &(f64, f64)| {

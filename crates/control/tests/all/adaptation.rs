@@ -150,6 +150,7 @@ fn where_nothing_changes_the_estimate_is_as_good_as_it_says_and_nothing_is_told(
 #[ignore = "long: run with --release -- --include-ignored"]
 fn ten_hours_of_hold_tell_nothing_and_change_next_to_nothing() {
     let (off, told, force) = long_hold(2, 36_000_000);
+    println!("{off:.2} standard uncertainties, {told} told, {force:.2?} in force");
     assert!((0.5..1.3).contains(&off), "{off} standard uncertainties");
     assert_eq!(told, 0);
     assert!(force[0] > 0.85 && force[1] < 1.18, "{force:?}");
