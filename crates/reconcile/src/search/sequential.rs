@@ -492,7 +492,7 @@ pub(crate) fn search(
 }
 
 /// Refits all together; the rivals are weighed again unless that was done for this very set.
-fn settle(
+pub(crate) fn settle(
     ctx: &Context<'_>,
     mut fit: Fit,
     weighed: Option<(Fit, Vec<Vec<Rival>>)>,

@@ -184,33 +184,40 @@ fn no_floor(e: &Evidence<'_>, best: &str) -> String {
 
 /// A number that stopped at its bound was looking for another equation.
 fn at_bound(ctx: &Context<'_>, fit: &Fit) -> Option<String> {
+    first_at_bound(ctx, fit).map(|(_, words)| words)
+}
+
+/// The first part with such a number, and the number in words.
+pub(crate) fn first_at_bound(ctx: &Context<'_>, fit: &Fit) -> Option<(usize, String)> {
     let mut at = 0;
-    for part in &fit.parts {
+    for (i, part) in fit.parts.iter().enumerate() {
         for (j, (p, v)) in part.variant().params.iter().zip(part.natural()).enumerate() {
             let (low, high) = (p.coordinate(p.lower), p.coordinate(p.upper));
             let x = part.theta[j];
             let near = 1e-4 * (high - low);
             let sd = fit.covariance[(at + j, at + j)].max(0.0).sqrt();
             if x > high - near || (x < low + near && p.lower != 0.0) {
-                return Some(format!(
+                let words = format!(
                     "{} of {} stands at its bound, {}",
                     p.name,
                     part.id(),
                     figure(v)
-                ));
+                );
+                return Some((i, words));
             }
             if j == 0 && p.log && 1.96 * sd > 0.5 * (high - low) {
-                return Some(format!("{} of {} may be anything", p.name, part.id()));
+                return Some((i, format!("{} of {} may be anything", p.name, part.id())));
             }
             let nyquist_hz = 0.5 / ctx.scope.sample_s;
             if ctx.scope.sampled_input && p.name.ends_with("_hz") && v > nyquist_hz {
-                return Some(format!(
+                let words = format!(
                     "{} of {} is {} Hz, above half the sampling rate of {} Hz",
                     p.name,
                     part.id(),
                     figure(v),
                     figure(2.0 * nyquist_hz)
-                ));
+                );
+                return Some((i, words));
             }
         }
         at += part.theta.len();

@@ -10,12 +10,13 @@ use crate::fit::catalogue;
 use crate::fit::context::{Context, Fit, WhiteEvidence};
 use crate::fit::locking;
 use crate::problem::Problem;
-use crate::search::sequential::{Effort, Found, ids, search};
+use crate::search::sequential::{Effort, Found, ids, left_over, search, settle};
 use crate::simulate::{Base, Zpk};
 use crate::thresholds::THRESHOLDS;
 use crate::verdict::assemble;
 use crate::verdict::guard;
 use crate::verdict::held_out;
+use crate::verdict::judge;
 use crate::verdict::result::Reconciliation;
 use cellpos_plant::effects::Scope;
 use cellpos_plant::{Effect, Model};
@@ -154,7 +155,7 @@ pub fn reconcile(
         "held-out check (the search took {:.2} of its work)",
         problem.spent() as f64 / (options.work.max(1e-9) * WORK)
     ));
-    drop_small(&ctx, &mut found);
+    take_back(&ctx, &mut found, effort);
     let mut held = held_out::check(&ctx, &found.fit, options.threads);
     // What does not help where it was not fitted is not named.
     while let Some(i) = held.unconfirmed.first().copied() {
@@ -214,6 +215,12 @@ fn free_of_start(ctx: &Context<'_>, fit: &Fit) -> Vec<Vec<f64>> {
         .collect()
 }
 
+/// Takes back what is too small, and what stands at a bound.
+fn take_back(ctx: &Context<'_>, found: &mut Found, effort: Effort) {
+    drop_small(ctx, found);
+    drop_bound(ctx, found, effort);
+}
+
 /// Takes back what is smaller than anything that matters beside effects that explain the rest.
 fn drop_small(ctx: &Context<'_>, found: &mut Found) {
     let all = ctx.problem.all();
@@ -235,6 +242,24 @@ fn drop_small(ctx: &Context<'_>, found: &mut Found) {
             found.rivals.remove(i);
         }
         found.fit = without;
+    }
+}
+
+/// Takes back a part that stopped at a bound, where the set is whole without it: it took up what the equations of the others, that
+/// are not nature's to the last digit, leave over. Where the set is not, the part stays, and there is no name.
+fn drop_bound(ctx: &Context<'_>, found: &mut Found, effort: Effort) {
+    let all = ctx.problem.all();
+    while found.fit.parts.len() > 1
+        && let Some((i, _)) = judge::first_at_bound(ctx, &found.fit)
+    {
+        let mut parts = found.fit.parts.clone();
+        parts.remove(i);
+        let without = ctx.fit_from(parts, Some(found.fit.soft), &all, 12);
+        let open = 1.0 - THRESHOLDS.closed_whole;
+        if left_over(&without) > open * left_over(&found.null) {
+            return;
+        }
+        (found.fit, found.rivals) = settle(ctx, without, None, &all, effort);
     }
 }
 
