@@ -109,3 +109,46 @@ fn a_tick_that_comes_late_does_not_throw_the_zero_flow_displacement_and_sticks_n
         }
     }
 }
+
+/// Hold error, um RMS, over 20 s of a loop that gets a fix in every so many ticks, 2 ms old.
+fn hold_between_fixes(sample_time_s: f64, every: usize) -> f64 {
+    let base = crate::common::config(ControllerConfig::Lqg(Lqg::default()));
+    let config = LoopConfig {
+        model: LoopModel {
+            sample_time_s,
+            ..LoopModel::eq6(2e-3)
+        },
+        ..base
+    };
+    let rig = RigConfig {
+        sample_time_s,
+        ..RigConfig::eq6(1)
+    };
+    let mut rig = SimulatedRig::new(rig).unwrap();
+    let mut controller = Controller::new(config).unwrap();
+    controller.start(20.0, 20.0);
+    let preview = vec![0.0; controller.preview_len()];
+    let ticks = (20.0 / sample_time_s) as usize;
+    let mut squares = 0.0;
+    for k in 0..ticks {
+        squares += rig.true_um().powi(2);
+        let fix = rig.measure();
+        let input = LoopInput {
+            measurement: k.is_multiple_of(every).then_some(fix),
+            preview_um: &preview,
+            ..LoopInput::default()
+        };
+        rig.advance(controller.step(&input).command_um);
+    }
+    (squares / ticks as f64).sqrt()
+}
+
+#[test]
+fn a_loop_faster_than_its_camera_holds_better_than_one_as_fast() {
+    let as_fast_um = hold_between_fixes(1e-3, 1);
+    for (sample_time_s, every) in [(0.5e-3, 2), (0.2e-3, 5)] {
+        let hold_um = hold_between_fixes(sample_time_s, every);
+        println!("a fix in {every} ticks: {hold_um:.4} um, as fast: {as_fast_um:.4} um");
+        assert!(hold_um < as_fast_um, "{hold_um} um, {as_fast_um} um");
+    }
+}
