@@ -2,6 +2,7 @@
 
 use rustix::process::{Pid, Signal, kill_process};
 use serde_json::Value;
+use std::io::Read as _;
 use std::os::unix::process::ExitStatusExt;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
@@ -24,11 +25,19 @@ fn tell(child: &Child, signal: Signal) {
     kill_process(pid, signal).unwrap();
 }
 
-fn until<T>(what: &str, mut there: impl FnMut() -> Option<T>) -> T {
+/// Waits for what the child does; one that ended before it did says here why.
+fn until<T>(child: &mut Child, what: &str, mut there: impl FnMut() -> Option<T>) -> T {
     let start = Instant::now();
     loop {
         if let Some(found) = there() {
             return found;
+        }
+        if let Some(status) = child.try_wait().unwrap() {
+            let mut said = String::new();
+            let mut pipes = (child.stdout.take().unwrap(), child.stderr.take().unwrap());
+            pipes.0.read_to_string(&mut said).unwrap();
+            pipes.1.read_to_string(&mut said).unwrap();
+            panic!("{status} without a {what}:\n{said}");
         }
         assert!(start.elapsed() < PATIENCE, "no {what} in time");
         std::thread::sleep(Duration::from_millis(10));
@@ -45,8 +54,8 @@ fn in_runs(folder: &Path, name: &str) -> Option<PathBuf> {
 }
 
 /// Waits until the loop is closed, as the events say.
-fn running(folder: &Path) {
-    until("closed loop", || {
+fn running(child: &mut Child, folder: &Path) {
+    until(child, "closed loop", || {
         let text = std::fs::read_to_string(in_runs(folder, "events.jsonl")?).ok()?;
         text.contains("\"running\"").then_some(())
     });
@@ -65,8 +74,8 @@ const TRACK: &str =
 fn the_first_signal_freezes_the_second_parks_and_both_are_ends_as_asked() {
     for (signals, state) in [(1, "running"), (2, "safe")] {
         let folder = tempfile::tempdir().unwrap();
-        let child = start(folder.path(), TRACK);
-        running(folder.path());
+        let mut child = start(folder.path(), TRACK);
+        running(&mut child, folder.path());
         for _ in 0..signals {
             tell(&child, Signal::TERM);
             std::thread::sleep(Duration::from_millis(50));
@@ -81,8 +90,8 @@ fn the_first_signal_freezes_the_second_parks_and_both_are_ends_as_asked() {
 #[test]
 fn usr1_pauses_and_goes_on_and_ctrl_z_does_not_stop_a_program_that_holds_a_bead() {
     let folder = tempfile::tempdir().unwrap();
-    let child = start(folder.path(), TRACK);
-    running(folder.path());
+    let mut child = start(folder.path(), TRACK);
+    running(&mut child, folder.path());
     for signal in [Signal::USR1, Signal::TSTP, Signal::USR1, Signal::USR2] {
         tell(&child, signal);
         std::thread::sleep(Duration::from_millis(200));
@@ -108,7 +117,7 @@ fn nohup_holds_and_without_it_the_end_of_a_terminal_is_an_orderly_end() {
             .stderr(Stdio::piped())
             .spawn()
             .unwrap();
-        running(folder.path());
+        running(&mut child, folder.path());
         tell(&child, Signal::HUP);
         if ignored {
             std::thread::sleep(Duration::from_millis(1500));
@@ -125,7 +134,7 @@ fn nohup_holds_and_without_it_the_end_of_a_terminal_is_an_orderly_end() {
 fn a_signal_in_the_first_moments_leaves_no_run_half_way() {
     for delay_ms in [0, 3, 6, 10, 15, 20, 30, 40, 50, 60, 90] {
         let folder = tempfile::tempdir().unwrap();
-        let child = start(folder.path(), TRACK);
+        let mut child = start(folder.path(), TRACK);
         std::thread::sleep(Duration::from_millis(delay_ms));
         tell(&child, Signal::INT);
         let (out, _) = end(child);
@@ -152,8 +161,8 @@ fn a_circle_and_a_collection_that_are_interrupted_keep_what_is_recorded_and_say_
     ] {
         let folder = tempfile::tempdir().unwrap();
         std::fs::write(folder.path().join("rig.toml"), "[emulator]\nseed = 3\n").unwrap();
-        let child = start(folder.path(), &line);
-        let kept = until("finished segment", || {
+        let mut child = start(folder.path(), &line);
+        let kept = until(&mut child, "finished segment", || {
             let partial = in_runs(folder.path(), "partial.json");
             let record = Some(folder.path().join("more/survey-1.csv"));
             partial.or(record.filter(|path| path.exists()))
@@ -183,11 +192,11 @@ fn a_script_of_sixteen_thousand_steps_starts_on_the_clock_of_the_machine() {
     let step = "[[step]]\ndo = \"hold\"\nduration = \"10ms\"\n";
     let text = format!("name = \"long\"\n{}", step.repeat(16_000));
     std::fs::write(folder.path().join("long.toml"), text).unwrap();
-    let child = start(
+    let mut child = start(
         folder.path(),
         "run long.toml --clock real --frames off --best-effort --json",
     );
-    until("closed loop", || {
+    until(&mut child, "closed loop", || {
         let text = std::fs::read_to_string(in_runs(folder.path(), "events.jsonl")?).ok()?;
         text.contains("\"stage\":\"running\"").then_some(())
     });
@@ -206,8 +215,8 @@ fn an_identification_keeps_its_segments_as_they_end_whatever_ends_it() {
     for signal in [Signal::INT, Signal::KILL] {
         let folder = tempfile::tempdir().unwrap();
         std::fs::write(folder.path().join("rig.toml"), "[emulator]\nseed = 3\n").unwrap();
-        let child = start(folder.path(), IDENTIFY);
-        let partial = until("finished segment", || {
+        let mut child = start(folder.path(), IDENTIFY);
+        let partial = until(&mut child, "finished segment", || {
             in_runs(folder.path(), "partial.json")
         });
         tell(&child, signal);
@@ -324,7 +333,7 @@ fn no_command_that_holds_a_rig_is_ended_or_stopped_by_a_signal_that_is_no_stop()
             // Nothing is written until the end: the signal's own answer says whether the rig is held.
             std::thread::sleep(Duration::from_millis(1000));
         } else {
-            until(line, || {
+            until(&mut child, line, || {
                 let path = in_runs(folder.path(), sign).unwrap_or(folder.path().join(sign));
                 let there = std::fs::read_to_string(path).is_ok_and(|all| all.contains(text));
                 there.then_some(())
@@ -357,7 +366,7 @@ fn a_stop_in_the_first_moments_of_any_command_that_holds_a_rig_is_an_end() {
     for Holding { line, .. } in HOLDING {
         for delay_ms in [5, 25, 60] {
             let folder = prepared();
-            let child = start(folder.path(), line);
+            let mut child = start(folder.path(), line);
             std::thread::sleep(Duration::from_millis(delay_ms));
             tell(&child, Signal::INT);
             let (out, _) = end(child);
@@ -385,9 +394,9 @@ fn a_stop_in_the_first_moments_of_any_command_that_holds_a_rig_is_an_end() {
 #[test]
 fn doctor_that_is_interrupted_says_what_it_has() {
     let folder = tempfile::tempdir().unwrap();
-    let child = start(folder.path(), "doctor --for 99999999999999999999h --json");
+    let mut child = start(folder.path(), "doctor --for 99999999999999999999h --json");
     let threads = format!("/proc/{}/task", child.id());
-    until("measuring thread", || {
+    until(&mut child, "measuring thread", || {
         let all = std::fs::read_dir(&threads).ok()?;
         let mut names = all
             .flatten()
