@@ -2,7 +2,7 @@
 
 use arrow_array::cast::AsArray;
 use arrow_array::types::{Float64Type, Int8Type, UInt64Type};
-use cellpos_record::export::columns::{COLUMNS, Value, word};
+use cellpos_record::export::columns::{COLUMNS, Value};
 use cellpos_record::{
     Event, Format, RunEnd, RunMeta, RunWriter, Selection, Sessions, Source, export,
 };
@@ -200,7 +200,7 @@ fn hdf5(path: &Path, expected: &[Vec<f64>]) {
         let mut found = dataset.read_f64().unwrap();
         if let Value::Code(codes, _) = column.value {
             for value in &mut found {
-                if word(codes, *value as u8).is_none() {
+                if cellpos_record::export::columns::word(codes, *value as u8).is_none() {
                     *value = f64::NAN;
                 }
             }
