@@ -1,5 +1,6 @@
 //! `cellpos report`: what a run did, on one page.
 
+mod bound;
 mod clips;
 mod cycles;
 mod envelope;
@@ -81,7 +82,7 @@ pub fn run(args: Args) -> CommandResult {
     what_it_was(&mut page, &sessions);
     head(&mut page, &sessions, &ticks);
     traces(&mut page, &ticks);
-    let bound = spectrum::Bound::of(meta, &ticks);
+    let bound = bound::Bound::of(meta, &ticks);
     errors(&mut page, &ticks, bound.as_ref());
     let trends = cycles::section(&mut page, &cycles);
     fatigue::section(&mut page, &cycles.rows, &ticks);
@@ -362,7 +363,7 @@ fn traces(page: &mut Report, ticks: &Ticks) {
     );
 }
 
-fn errors(page: &mut Report, ticks: &Ticks, bound: Option<&spectrum::Bound>) {
+fn errors(page: &mut Report, ticks: &Ticks, bound: Option<&bound::Bound>) {
     page.section("Error");
     page.figure(
         Figure::new("error-histogram", "Error of every position, closed loop.").panel(

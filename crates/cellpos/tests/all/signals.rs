@@ -134,7 +134,7 @@ fn nohup_holds_and_without_it_the_end_of_a_terminal_is_an_orderly_end() {
 fn a_signal_in_the_first_moments_leaves_no_run_half_way() {
     for delay_ms in [0, 3, 6, 10, 15, 20, 30, 40, 50, 60, 90] {
         let folder = tempfile::tempdir().unwrap();
-        let mut child = start(folder.path(), TRACK);
+        let child = start(folder.path(), TRACK);
         std::thread::sleep(Duration::from_millis(delay_ms));
         tell(&child, Signal::INT);
         let (out, _) = end(child);
@@ -366,7 +366,7 @@ fn a_stop_in_the_first_moments_of_any_command_that_holds_a_rig_is_an_end() {
     for Holding { line, .. } in HOLDING {
         for delay_ms in [5, 25, 60] {
             let folder = prepared();
-            let mut child = start(folder.path(), line);
+            let child = start(folder.path(), line);
             std::thread::sleep(Duration::from_millis(delay_ms));
             tell(&child, Signal::INT);
             let (out, _) = end(child);

@@ -337,7 +337,7 @@ impl Adapter {
             let found = self.finding(&state.slow, state).filter(enough);
             state.believed = found.map_or(state.believed, |f| (f.gain.max(0.0), f.best));
             let driven = state.driven_um2 > DRIVEN * self.whitener.noise_um2;
-            let found = found.map(|found| found.judged(&mut state.probe, driven));
+            let found = found.map(|found| state.probe.judged(found, driven));
             state.found = found;
             if (state.force).follow(found.as_ref(), &self.usable(), state.probe.least()) {
                 state.found = None;

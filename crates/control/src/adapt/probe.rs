@@ -7,7 +7,7 @@
 //! is moved to and fro by a third of its own wandering in a tick, at random, until it is clear which of the two it is.
 
 use super::motion::Motion;
-use super::window::{MEMBERS, NOMINAL};
+use super::window::{Finding, MEMBERS, NOMINAL};
 
 /// Distance (of logarithms) of an estimate from what was confirmed at which it is put to the test, the same in standard
 /// uncertainties, and for so many ticks.
@@ -205,7 +205,7 @@ impl Probe {
     }
 
     /// Gain and standard uncertainty as they are put right; both are those of the logarithm.
-    pub fn corrected(&self, log_gain: f64, sd: f64) -> (f64, f64) {
+    fn corrected(&self, log_gain: f64, sd: f64) -> (f64, f64) {
         match self.standing {
             Standing::Corrected => (log_gain + self.surely(), sd.hypot(self.correction.1)),
             Standing::Tested => {
@@ -221,8 +221,23 @@ impl Probe {
         }
     }
 
+    /// An estimate as its test leaves it; `driven` where the reference moves the bead, which confirms by itself.
+    pub fn judged(&mut self, found: Finding, driven: bool) -> Finding {
+        let log_gain = found.gain.max(0.05).ln();
+        self.judge(log_gain, found.log_sd(), driven);
+        let (right, sd) = self.corrected(log_gain, found.log_sd());
+        if right == log_gain {
+            return found;
+        }
+        Finding {
+            gain: right.exp(),
+            gain_sd: sd * right.exp(),
+            ..found
+        }
+    }
+
     /// What the estimate leads to; `driven` where the reference moves the bead, which confirms by itself.
-    pub fn judge(&mut self, log_gain: f64, sd: f64, driven: bool) {
+    fn judge(&mut self, log_gain: f64, sd: f64, driven: bool) {
         if driven && self.standing != Standing::Corrected {
             self.confirm(log_gain, 0.0);
             return;

@@ -1,7 +1,5 @@
 //! Forgetful sums of the regression of whitened positions on whitened model positions, one member for each delay tried.
 
-use super::probe::Probe;
-
 /// Delays tried beside the design's, samples.
 pub const DELAYS: [f64; MEMBERS] = [-1.0, -0.5, 0.0, 0.5, 1.0, 1.5];
 /// How many.
@@ -55,21 +53,6 @@ pub(super) struct Finding {
 }
 
 impl Finding {
-    /// As the test of it leaves it.
-    pub fn judged(self, probe: &mut Probe, driven: bool) -> Self {
-        let log_gain = self.gain.max(0.05).ln();
-        probe.judge(log_gain, self.log_sd(), driven);
-        let (right, sd) = probe.corrected(log_gain, self.log_sd());
-        if right == log_gain {
-            return self;
-        }
-        Self {
-            gain: right.exp(),
-            gain_sd: sd * right.exp(),
-            ..self
-        }
-    }
-
     /// Standard uncertainty of the logarithm of the gain.
     pub fn log_sd(&self) -> f64 {
         self.gain_sd / self.gain.max(0.05)

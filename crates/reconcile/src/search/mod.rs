@@ -1,5 +1,6 @@
 //! Which candidates to fit: screening, additions one after another, replacements.
 
+pub(crate) mod cost;
 pub(crate) mod lead;
 pub(crate) mod lines;
 mod pixel;

@@ -6,9 +6,11 @@ use crate::fit::context::{Context, Fit};
 use crate::simulate::near_whole;
 use crate::verdict::judge::figure;
 use crate::verdict::result::{Effect as NamedEffect, Verdict};
-use crate::verdict::workflow::COLOURED;
 use cellpos_plant::effects::{self, Role};
 use cellpos_plant::{Effect, Model};
+
+/// Key of the provenance of a model whose noise has a part that `[noise]` has no word for.
+pub(crate) const COLOURED: &str = "noise.coloured";
 
 /// A delay a hair short of whole frames, whose frames do not show the edges of the command: whole frames for a simulator,
 /// which would show them.

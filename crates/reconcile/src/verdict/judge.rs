@@ -2,7 +2,8 @@
 
 use crate::data::floor::Floor;
 use crate::fit::context::{Context, Fit};
-use crate::search::sequential::{ids, left_over};
+use crate::search::cost::left_over;
+use crate::search::sequential::ids;
 use crate::thresholds::THRESHOLDS;
 use crate::verdict::battery::{self, Column, Hypothesis};
 use crate::verdict::held_out::HeldOut;

@@ -3,7 +3,8 @@
 use crate::data::frames::{self, FrameCounts};
 use crate::fit::catalogue::{Part, Variant};
 use crate::fit::context::{Context, Fit, freedom_of};
-use crate::search::sequential::{Rival, left_over, prior_penalty};
+use crate::search::cost::{left_over, prior_penalty};
+use crate::search::sequential::Rival;
 use crate::thresholds::THRESHOLDS;
 use crate::verdict::parameters::parameters;
 use crate::verdict::result::{Effect as NamedEffect, Interval};

@@ -2,7 +2,7 @@
 
 use crate::fit::context::{Context, Fit};
 use crate::problem::Mask;
-use crate::search::sequential::threshold;
+use crate::search::cost::threshold;
 use crate::thresholds::THRESHOLDS;
 use cellpos_plant::effects::Role;
 

@@ -10,10 +10,12 @@ use crate::fit::catalogue;
 use crate::fit::context::{Context, Fit, WhiteEvidence};
 use crate::fit::locking;
 use crate::problem::Problem;
-use crate::search::sequential::{Effort, Found, ids, left_over, search, settle};
+use crate::search::cost::left_over;
+use crate::search::sequential::{Effort, Found, ids, search, settle};
 use crate::simulate::{Base, Zpk};
 use crate::thresholds::THRESHOLDS;
 use crate::verdict::assemble;
+use crate::verdict::augment::COLOURED;
 use crate::verdict::guard;
 use crate::verdict::held_out;
 use crate::verdict::judge;
@@ -184,9 +186,6 @@ pub fn reconcile(
     };
     Ok(assemble::assemble(&given, &ctx, found, held))
 }
-
-/// Key of the provenance of a model whose noise has a part that `[noise]` has no word for.
-pub(crate) const COLOURED: &str = "noise.coloured";
 
 /// The noise that a model states, unless it says that its figures are a fit's own residual.
 fn stated_noise(model: &Model, sample_s: f64) -> Option<Noise> {
