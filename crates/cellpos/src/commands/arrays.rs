@@ -166,7 +166,9 @@ fn mat(bytes: &[u8]) -> io::Result<String> {
         .map(|(_, v)| v.len())
         .max_by_key(|n| (alike(*n), *n))
     else {
-        return Err(wrong("holds no vector or matrix of real numbers"));
+        return Err(wrong(
+            "holds no vector or matrix of real numbers, or is cut off",
+        ));
     };
     found.retain(|(_, v)| v.len() == length);
     let (names, columns): (Vec<String>, Vec<Vec<f64>>) = found.into_iter().unzip();

@@ -104,7 +104,7 @@ pub(super) fn read(path: &Path, columns: &Columns) -> Result<Record, Failure> {
     let text = read_table(path).map_err(|e| {
         Failure::bad_input(
             format!("cannot read {}: {e}", path.display()),
-            "check --data; records are CSV: time_s,pzt_um,bead_um",
+            "check --data; records are CSV (time_s,pzt_um,bead_um), .npy, or .mat up to version 7",
         )
     })?;
     let table = Table::parse(path, &text).map_err(Failure::input)?;
