@@ -68,12 +68,20 @@ fn replace(
 /// More than any record of a day has, bytes.
 pub const MOST_OF_A_RECORD: u64 = 32 << 30;
 
-/// Reads a text file that a person or a program has written, and nothing else: a device that never ends is refused, and so
-/// is more than `most` bytes. A pipe is read up to its end.
+/// Reads a text file that a person or a program has written, and nothing else, as [`read_bytes`] does.
+///
+/// # Errors
+/// Those of [`read_bytes`]; [`io::ErrorKind::InvalidData`] for what is no text.
+pub fn read_text(path: &Path, most: u64) -> io::Result<String> {
+    String::from_utf8(read_bytes(path, most)?)
+        .map_err(|_| io::Error::new(io::ErrorKind::InvalidData, "is not text in UTF-8"))
+}
+
+/// Reads a file: a device that never ends is refused, and so is more than `most` bytes. A pipe is read up to its end.
 ///
 /// # Errors
 /// [`io::Error`] with a sentence for what is no such file; [`io::ErrorKind::NotFound`] and the like as they come.
-pub fn read_text(path: &Path, most: u64) -> io::Result<String> {
+pub fn read_bytes(path: &Path, most: u64) -> io::Result<Vec<u8>> {
     let file = File::open(path)?;
     let meta = file.metadata()?;
     if meta.is_dir() {
@@ -93,8 +101,7 @@ pub fn read_text(path: &Path, most: u64) -> io::Result<String> {
         let text = format!("is larger than {} MB: not a file of this kind", most >> 20);
         return Err(io::Error::other(text));
     }
-    String::from_utf8(bytes)
-        .map_err(|_| io::Error::new(io::ErrorKind::InvalidData, "is not text in UTF-8"))
+    Ok(bytes)
 }
 
 #[cfg(test)]

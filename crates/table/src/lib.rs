@@ -30,7 +30,7 @@ mod sampling;
 mod table;
 
 pub use error::{Problem, TableError};
-pub use file::{MOST_OF_A_RECORD, read_text, write_atomically, write_unsynced};
+pub use file::{MOST_OF_A_RECORD, read_bytes, read_text, write_atomically, write_unsynced};
 pub use mapping::{ColumnRef, Gaps, Mapping};
 pub use record::Record;
 pub use table::Table;

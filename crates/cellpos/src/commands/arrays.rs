@@ -3,6 +3,7 @@
 //! Both become the text of a table, so that whatever reads a CSV file reads them, with the same messages. Not for structures,
 //! cells or complex numbers, and not for version 7.3 of `.mat`, which is HDF5.
 
+use cellpos_table::{MOST_OF_A_RECORD, read_bytes, read_text};
 use std::fmt::Write as _;
 use std::io;
 use std::path::Path;
@@ -15,9 +16,9 @@ use std::path::Path;
 pub fn read_table(path: &Path) -> io::Result<String> {
     let kind = path.extension().and_then(|e| e.to_str()).unwrap_or("");
     match kind.to_ascii_lowercase().as_str() {
-        "npy" => npy(&std::fs::read(path)?),
-        "mat" => mat(&std::fs::read(path)?),
-        _ => cellpos_table::read_text(path, cellpos_table::MOST_OF_A_RECORD),
+        "npy" => npy(&read_bytes(path, MOST_OF_A_RECORD)?),
+        "mat" => mat(&read_bytes(path, MOST_OF_A_RECORD)?),
+        _ => read_text(path, MOST_OF_A_RECORD),
     }
 }
 

@@ -266,7 +266,7 @@ impl Adapter {
             gain: state.force.log_gain.exp(),
             delay_samples: DELAYS[state.force.member],
             gain_estimate: found
-                .and_then(|f| state.probe.stated(f.gain.max(0.05).ln(), f.log_sd()))
+                .and_then(|f| state.probe.stated(f.log_gain(), f.log_sd()))
                 .map(|(log_gain, sd)| [log_gain.exp(), sd * log_gain.exp()]),
             delay_estimate_samples: found.map(|f| [f.delay, f.delay_sd]),
             mode: match (state.force.mode, state.probe.standing) {

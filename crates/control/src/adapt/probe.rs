@@ -223,7 +223,7 @@ impl Probe {
 
     /// An estimate as its test leaves it; `driven` where the reference moves the bead, which confirms by itself.
     pub fn judged(&mut self, found: Finding, driven: bool) -> Finding {
-        let log_gain = found.gain.max(0.05).ln();
+        let log_gain = found.log_gain();
         self.judge(log_gain, found.log_sd(), driven);
         let (right, sd) = self.corrected(log_gain, found.log_sd());
         if right == log_gain {

@@ -141,7 +141,7 @@ impl Force {
             return false;
         }
         self.retreat_told = false;
-        let aim = found.gain.max(0.05).ln().max(least);
+        let aim = found.log_gain().max(least);
         let (off, sd) = (aim - self.log_gain, found.log_sd());
         let (smallest, sds) = if self.moving { ARRIVED } else { SET_OUT };
         self.moving = off.abs() > smallest.max(sds * sd);

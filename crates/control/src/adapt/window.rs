@@ -53,6 +53,11 @@ pub(super) struct Finding {
 }
 
 impl Finding {
+    /// Logarithm of the gain; one that is no gain counts as a small one.
+    pub fn log_gain(&self) -> f64 {
+        self.gain.max(0.05).ln()
+    }
+
     /// Standard uncertainty of the logarithm of the gain.
     pub fn log_sd(&self) -> f64 {
         self.gain_sd / self.gain.max(0.05)
