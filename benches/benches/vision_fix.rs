@@ -2,7 +2,7 @@
 //! beside two methods without a template. Run: `cargo bench -p cellpos-benches --bench vision_fix`.
 
 use cellpos_vision::{
-    Detector, Frame, Localiser, LocaliserConfig, Noise, PixelResponse, Pixels, Polarity,
+    Detector, Frame, Localiser, LocaliserConfig, PixelNoise, PixelResponse, Pixels, Polarity,
     ProfileSpec, RadialProfile, RadialSymmetry, RingProfile,
 };
 use levenberg_marquardt::{LeastSquaresProblem, LevenbergMarquardt};
@@ -22,7 +22,7 @@ fn main() {
     };
     let config = LocaliserConfig {
         window_px: WINDOW,
-        noise: Noise::Estimated,
+        noise: PixelNoise::Estimated,
         ..LocaliserConfig::new(spec)
     };
     let mut localiser = Localiser::new(config).expect("the configuration is valid");

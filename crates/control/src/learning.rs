@@ -29,7 +29,7 @@ mod table;
 
 use crate::error::check;
 use crate::uncertainty::Uncertainty;
-use evidence::{Evidence, Noise, turn};
+use evidence::{ErrorNoise, Evidence, turn};
 use line::Line;
 use nalgebra::Complex;
 
@@ -66,7 +66,7 @@ pub struct Learner {
 pub struct LearnerState {
     lines: [Line; HARMONICS],
     evidence: Evidence,
-    noise: Noise,
+    noise: ErrorNoise,
     /// Gain that the feed-forward is divided by while anything is learned.
     feed_forward_gain: Option<f64>,
     /// Ticks since the addition changed, and of the stretch at which it is looked at next.
@@ -191,7 +191,7 @@ impl Learner {
         LearnerState {
             lines: [Line::default(); HARMONICS],
             evidence: Evidence::default(),
-            noise: Noise::default(),
+            noise: ErrorNoise::default(),
             feed_forward_gain: None,
             since_change: u32::MAX,
             next_look: self.ticks_of(self.config.watch_cycles),

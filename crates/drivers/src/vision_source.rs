@@ -13,7 +13,7 @@ use cellpos_rig::source::{
     Camera, CameraError, FrameBuffer, FrameStamp, FrameWatch, PositionSource, SeenFrame, SourceInfo,
 };
 use cellpos_vision::{
-    Cell, CellTracker, Commanded, Decision, Frame, TrackState, TrackStep, Tracker, Verdict,
+    Cell, CellTracker, Commanded, Decision, FixQuality, Frame, TrackState, TrackStep, Tracker,
 };
 
 /// What is followed.
@@ -252,7 +252,7 @@ impl<C: Camera> PositionSource for VisionSource<C> {
             variance_um2: taken.map_or(f64::NAN, |f| {
                 c.variance_um2(f.var_x_px2, f.var_y_px2, f.cov_xy_px2)
             }),
-            verdict: fix.map_or(Verdict::NoSignal, |f| f.verdict),
+            verdict: fix.map_or(FixQuality::NoSignal, |f| f.verdict),
             track: Some(step.map_or((self.followed.state(), Decision::Stale), |s| {
                 (s.state, s.decision)
             })),

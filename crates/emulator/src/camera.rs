@@ -5,7 +5,7 @@ use crate::faults::{FaultKind, Faults};
 use crate::random::{stream_of, uniform};
 use cellpos_plant::Model;
 use cellpos_plant::effects::Action;
-use cellpos_vision::Verdict;
+use cellpos_vision::FixQuality;
 use rand_xoshiro::Xoshiro256PlusPlus;
 use std::collections::VecDeque;
 
@@ -55,7 +55,7 @@ pub struct PositionFix {
     /// Peak contrast over the noise of one background pixel.
     pub snr: f64,
     /// What vision would say of the picture.
-    pub verdict: Verdict,
+    pub verdict: FixQuality,
 }
 
 /// One point of the path: true and apparent position, um.

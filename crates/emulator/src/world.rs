@@ -9,7 +9,7 @@ use crate::random::Gaussian;
 use crate::render::{Renderer, localisation_bound_um, mean_between};
 use cellpos_plant::effects::{Action, Shown};
 use cellpos_plant::{Chain, Model, Noise};
-use cellpos_vision::Verdict;
+use cellpos_vision::FixQuality;
 
 /// Turns a seed into that of frames of the empty channel.
 const EMPTY_SEED: u64 = 0x5eed_0f0e_3a97_7c41;
@@ -356,7 +356,7 @@ impl World {
         // Drawn for every frame, so that a lost bead does not shift the noise of later ones.
         let noise_um = self.localisation_um * self.localisation.normal();
         let verdict = self.verdict(&exposure, mean_um);
-        let good = verdict == Verdict::Good;
+        let good = verdict == FixQuality::Good;
         let or_nan = |value| if good { value } else { f64::NAN };
         let (length_um, area_um2) = match (&mut self.cell, mid_length_um(&exposure)) {
             (Some(cell), Some(length_um)) if good => cell.measured(length_um),
@@ -379,23 +379,23 @@ impl World {
         })
     }
 
-    fn verdict(&self, exposure: &Exposure, mean_um: f64) -> Verdict {
+    fn verdict(&self, exposure: &Exposure, mean_um: f64) -> FixQuality {
         let config = &self.config;
         let length_um = mid_length_um(exposure);
         if !is_visible(exposure) || !self.is_in_frame(mean_um, length_um) {
-            return Verdict::NoSignal;
+            return FixQuality::NoSignal;
         }
         let half_um = config.half_length_um(length_um);
         if mean_um.abs() > config.half_frame_um() - half_um {
-            return Verdict::AtBorder;
+            return FixQuality::AtBorder;
         }
         let other_um = config.half_length_um(config.cell.map(|cell| cell.rest_um));
         let merged = second_path(exposure)
             .is_some_and(|path| (path[0].0 - mean_um).abs() < half_um + other_um);
         if merged {
-            Verdict::BadFit
+            FixQuality::BadFit
         } else {
-            Verdict::Good
+            FixQuality::Good
         }
     }
 }

@@ -11,7 +11,7 @@ use crate::rows::{Rows, ended_spans, fix_noise_um};
 use cellpos_control::{ControllerFile, Pi};
 use cellpos_emulator::WorldConfig;
 use cellpos_ident::delay::dithered_edges;
-use cellpos_ident::excitation::Limits as ShapeLimits;
+use cellpos_ident::excitation::ExcitationLimits as ShapeLimits;
 use cellpos_ident::experiment::{Plan, RecordedSegment, Span, Turn};
 use cellpos_plant::Model;
 use cellpos_rig::clock::monotonic_ns;

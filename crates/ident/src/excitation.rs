@@ -318,7 +318,7 @@ pub fn odd_multisine(
 
 /// Limits that an excitation must respect.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Limits {
+pub struct ExcitationLimits {
     /// Largest bead amplitude (peak) that stays in view, um.
     pub bead_um: f64,
     /// Largest bead speed (peak), um/s: beyond a few pixels per exposure the image is a smear that no localiser trusts.
@@ -336,7 +336,7 @@ pub fn shaped_amplitude_um(
     frequency_hz: f64,
     plant: Complex<f64>,
     loop_gain: Complex<f64>,
-    limits: Limits,
+    limits: ExcitationLimits,
 ) -> f64 {
     let sensitivity = (1.0 / (1.0 + loop_gain)).norm();
     let w = 2.0 * std::f64::consts::PI * frequency_hz;
@@ -396,7 +396,7 @@ mod tests {
 
     #[test]
     fn shaped_amplitudes_keep_the_bead_in_view_in_open_and_closed_loop() {
-        let limits = Limits {
+        let limits = ExcitationLimits {
             bead_um_per_s: 1e9,
             bead_um: 8.0,
             pzt_um: 15.0,

@@ -6,8 +6,10 @@
 use nalgebra::Complex;
 
 use crate::error::IdentError;
-use crate::excitation::{Limits, Signal, Tone, fold, shaped_amplitude_um};
-use crate::frequency_response::{FrequencyPoint, Segment, SegmentResponse, Settings, measure};
+use crate::excitation::{ExcitationLimits, Signal, Tone, fold, shaped_amplitude_um};
+use crate::frequency_response::{
+    DrivenStretch, FrequencyPoint, SegmentResponse, Settings, measure,
+};
 use crate::noise::{NoiseModel, apply_noise_model};
 use crate::random::Random;
 
@@ -88,7 +90,7 @@ impl Plan {
     pub fn stepped_sines(
         lines_hz: &[f64],
         expected: Expected<'_>,
-        limits: Limits,
+        limits: ExcitationLimits,
         period_s: f64,
         seconds_at_1_hz: f64,
     ) -> Self {
@@ -130,7 +132,7 @@ impl Plan {
     pub fn multisine(
         lines_hz: &[f64],
         expected: Expected<'_>,
-        limits: Limits,
+        limits: ExcitationLimits,
         period_s: f64,
         seconds_at_1_hz: f64,
         seed: u64,
@@ -143,7 +145,7 @@ impl Plan {
         odd.sort_by(f64::total_cmp);
         odd.dedup();
         let peak = 3.0 * (0.5 * odd.len() as f64).sqrt();
-        let share = Limits {
+        let share = ExcitationLimits {
             bead_um: limits.bead_um / peak,
             bead_um_per_s: limits.bead_um_per_s / peak,
             pzt_um: limits.pzt_um / peak,
@@ -186,7 +188,7 @@ impl Plan {
     pub fn log_sweep(
         lines_hz: &[f64],
         expected: Expected<'_>,
-        limits: Limits,
+        limits: ExcitationLimits,
         period_s: f64,
         seconds_at_1_hz: f64,
     ) -> Self {
@@ -374,7 +376,7 @@ impl Plan {
             if planned.lines_hz.is_empty() {
                 continue;
             }
-            let segment = Segment {
+            let segment = DrivenStretch {
                 input: &record.input,
                 output: &record.output,
                 from: record.from,

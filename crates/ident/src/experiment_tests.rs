@@ -13,7 +13,7 @@ fn a_schedule_is_what_a_run_would_have_added_tick_by_tick() {
             })
         }
     }
-    let limits = Limits {
+    let limits = ExcitationLimits {
         bead_um: 8.0,
         bead_um_per_s: 400.0,
         pzt_um: 10.0,

@@ -13,7 +13,7 @@ use crate::tone_fit::{ToneFit, Whitening, block_borders, fit_block};
 
 /// One stretch of a record during which a fixed set of lines was driven.
 #[derive(Debug, Clone, Copy)]
-pub struct Segment<'a> {
+pub struct DrivenStretch<'a> {
     /// Input (commanded displacement, um), one value per row.
     pub input: &'a [f64],
     /// Output (bead position, um), `NaN` where a frame showed no bead.
@@ -147,7 +147,10 @@ pub struct SegmentResponse {
 ///
 /// # Errors
 /// [`IdentError::Lengths`], [`IdentError::TooShort`] (fewer than two usable blocks), [`IdentError::NoInput`].
-pub fn measure(segment: &Segment<'_>, settings: &Settings) -> Result<SegmentResponse, IdentError> {
+pub fn measure(
+    segment: &DrivenStretch<'_>,
+    settings: &Settings,
+) -> Result<SegmentResponse, IdentError> {
     if segment.input.len() != segment.output.len() {
         return Err(IdentError::Lengths {
             input: segment.input.len(),

@@ -29,6 +29,7 @@ pub mod experiment;
 pub mod feedback;
 pub mod foreign;
 pub mod frequency_response;
+pub mod identifiability;
 pub mod least_squares;
 pub mod noise;
 pub mod order_selection;
@@ -39,6 +40,5 @@ pub mod spectral;
 pub mod stats;
 pub mod summary;
 pub mod tone_fit;
-pub mod verdict;
 
 pub use error::IdentError;

@@ -3,7 +3,7 @@
 //! Complex, weighted least squares on what the record shows (hold, delay and exposure inside the model, not taken off
 //! the data). Candidates: integrator with delay; with a pole-zero pair; with the far zero; full Eq. (4). A higher order is
 //! taken only when an F-test rejects the lower one (1 %), AICc falls, and the fit to one half of the blocks predicts
-//! the other half better. What a parameter is worth is told by [`crate::verdict`].
+//! the other half better. What a parameter is worth is told by [`crate::identifiability`].
 
 pub use crate::candidate_order::{
     CandidateFit, CandidateFits, CandidateOrder, DelayPrior, index, model_of,

@@ -11,11 +11,11 @@ use crate::candidate_model::CandidateModel;
 use crate::delay::{DelayEstimate, disagreement_s};
 use crate::error::IdentError;
 use crate::experiment::Measured;
+use crate::identifiability::{Judged, judge};
 use crate::order_selection::{
     CandidateFits, CandidateOrder, DelayPrior, OrderSelection, index, model_of,
 };
 use crate::sampled::Sampling;
-use crate::verdict::{Judged, judge};
 
 /// One line of the compensated response.
 #[derive(Debug, Clone, Copy, PartialEq)]

@@ -3,7 +3,8 @@
 //! Prints the operator's link and the viewer's, and ends after the seconds given (60).
 
 use cellpos_live::{
-    Banner, Command, CycleRow, EventLine, Feed, Hello, Picture, Row, Server, ServerConfig, State,
+    Banner, CycleRow, EventLine, Feed, Hello, OperatorRequest, Picture, Row, Server, ServerConfig,
+    State,
 };
 use std::sync::mpsc;
 use std::time::{Duration, Instant};
@@ -66,9 +67,9 @@ fn main() {
         }
         while let Ok(command) = asks.try_recv() {
             match command {
-                Command::Target { um } => target_um = um,
-                Command::Freeze | Command::Pause => banner.state = "frozen",
-                Command::Park => banner.state = "safe",
+                OperatorRequest::Target { um } => target_um = um,
+                OperatorRequest::Freeze | OperatorRequest::Pause => banner.state = "frozen",
+                OperatorRequest::Park => banner.state = "safe",
                 _ => banner.state = "running",
             }
             feed.event(EventLine {

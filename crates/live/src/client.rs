@@ -1,7 +1,7 @@
 //! One client: its queue, and the thread that empties it into a socket and reads what the client asks.
 
 use crate::access::Role;
-use crate::command::{Command, CommandError};
+use crate::command::{CommandError, OperatorRequest};
 use crate::queue::Queue;
 use crate::shared::Shared;
 use std::net::TcpStream;
@@ -108,7 +108,7 @@ pub(crate) fn act(text: &str, role: Role, shared: &Shared) -> Result<(), Command
     if role != Role::Operator {
         return Err(CommandError::ViewerOnly);
     }
-    shared.ask(Command::read(text, shared.targets_um())?);
+    shared.ask(OperatorRequest::read(text, shared.targets_um())?);
     Ok(())
 }
 

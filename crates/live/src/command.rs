@@ -8,7 +8,7 @@ const NOTE_CHARACTERS: usize = 500;
 /// A request of the operator.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(tag = "do", rename_all = "kebab-case")]
-pub enum Command {
+pub enum OperatorRequest {
     /// Stop the bead where it is.
     Freeze,
     /// Go on after a freeze or a pause.
@@ -48,7 +48,7 @@ pub enum CommandError {
     ViewerOnly,
 }
 
-impl Command {
+impl OperatorRequest {
     /// Reads a request. `targets_um` bounds targets where it is known.
     ///
     /// # Errors
@@ -90,11 +90,11 @@ mod tests {
 
     #[test]
     fn requests_are_read_and_bounded() {
-        let read = |text| Command::read(text, VIEW);
-        assert_eq!(read(r#"{"do":"freeze"}"#), Ok(Command::Freeze));
+        let read = |text| OperatorRequest::read(text, VIEW);
+        assert_eq!(read(r#"{"do":"freeze"}"#), Ok(OperatorRequest::Freeze));
         assert_eq!(
             read(r#"{"do":"target","um":-3.5}"#),
-            Ok(Command::Target { um: -3.5 })
+            Ok(OperatorRequest::Target { um: -3.5 })
         );
         assert!(matches!(
             read(r#"{"do":"target","um":13}"#),
@@ -106,20 +106,23 @@ mod tests {
         ));
         assert!(read(r#"{"do":"arm"}"#).is_err());
         // A stop is a stop, whatever stands beside it.
-        assert_eq!(read(r#"{"do":"park","now":true}"#), Ok(Command::Park));
-        assert!(Command::read(r#"{"do":"target","um":13}"#, [f64::NAN; 2]).is_ok());
+        assert_eq!(
+            read(r#"{"do":"park","now":true}"#),
+            Ok(OperatorRequest::Park)
+        );
+        assert!(OperatorRequest::read(r#"{"do":"target","um":13}"#, [f64::NAN; 2]).is_ok());
     }
 
     #[test]
     fn a_note_loses_control_characters_and_has_an_end() {
-        let note = Command::read("{\"do\":\"note\",\"text\":\"a\\u001b[31mb\"}", VIEW);
+        let note = OperatorRequest::read("{\"do\":\"note\",\"text\":\"a\\u001b[31mb\"}", VIEW);
         assert_eq!(
             note,
-            Ok(Command::Note {
+            Ok(OperatorRequest::Note {
                 text: "a[31mb".to_string()
             })
         );
         let long = format!("{{\"do\":\"note\",\"text\":\"{}\"}}", "x".repeat(501));
-        assert_eq!(Command::read(&long, VIEW), Err(CommandError::Note));
+        assert_eq!(OperatorRequest::read(&long, VIEW), Err(CommandError::Note));
     }
 }

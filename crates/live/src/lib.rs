@@ -15,7 +15,7 @@
 //! There are two links: the operator's may freeze, park and move, the viewer's may look. Both carry a random word; the
 //! host and origin of each request are checked, so that a page from elsewhere cannot reach the server through the browser.
 //!
-//! The crate knows no camera, board or loop: whoever runs them fills a [`Feed`] and acts on [`Command`]s.
+//! The crate knows no camera, board or loop: whoever runs them fills a [`Feed`] and acts on [`OperatorRequest`]s.
 //!
 //! ```
 //! use cellpos_live::{Feed, Hello, Row, Server, ServerConfig};
@@ -44,7 +44,7 @@ mod shared;
 mod state;
 
 pub use access::{Role, Secrets};
-pub use command::{Command, CommandError};
+pub use command::{CommandError, OperatorRequest};
 pub use feed::{Feed, FeedHub, Line, Lost, PictureFeed};
 pub use film::{Film, FilmFrame, film_bytes};
 pub use row::{OUTLINE_POINTS, PICTURE_MARGIN, Picture, Row};

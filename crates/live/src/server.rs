@@ -2,7 +2,7 @@
 
 use crate::access::{Role, Secrets, is_our_host, is_our_origin};
 use crate::client;
-use crate::command::Command;
+use crate::command::OperatorRequest;
 use crate::feed::FeedHub;
 use crate::film::Film;
 use crate::http::{self, RequestError};
@@ -102,7 +102,7 @@ impl Server {
     pub fn start(
         config: &ServerConfig,
         feed: FeedHub,
-        command: impl Fn(Command) + Send + Sync + 'static,
+        command: impl Fn(OperatorRequest) + Send + Sync + 'static,
     ) -> Result<Self, LiveError> {
         if !config.address.ip().is_loopback() && !config.beyond_this_machine {
             return Err(LiveError::Reachable(config.address));

@@ -1,7 +1,7 @@
 //! What the server's threads share.
 
 use crate::access::{Role, Secrets};
-use crate::command::Command;
+use crate::command::OperatorRequest;
 use crate::film::Film;
 use crate::hub::Clients;
 use crate::state::Hello;
@@ -21,7 +21,7 @@ pub(crate) struct Shared {
     pub(crate) over: AtomicBool,
     pub(crate) clients: Clients,
     pub(crate) connections: AtomicUsize,
-    pub(crate) command: Box<dyn Fn(Command) + Send + Sync>,
+    pub(crate) command: Box<dyn Fn(OperatorRequest) + Send + Sync>,
     pub(crate) on_thread: Option<Arc<dyn Fn() + Send + Sync>>,
     pub(crate) film: Option<Film>,
 }
@@ -41,7 +41,7 @@ impl Shared {
         self.hello.targets_um()
     }
 
-    pub(crate) fn ask(&self, command: Command) {
+    pub(crate) fn ask(&self, command: OperatorRequest) {
         (self.command)(command);
     }
 

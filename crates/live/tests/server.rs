@@ -1,6 +1,8 @@
 //! The server as clients meet it: a browser that behaves, one that does not, a page from elsewhere.
 
-use cellpos_live::{Command, EventLine, Feed, Hello, Picture, Row, Server, ServerConfig, State};
+use cellpos_live::{
+    EventLine, Feed, Hello, OperatorRequest, Picture, Row, Server, ServerConfig, State,
+};
 use std::io::{Read, Write};
 use std::net::TcpStream;
 use std::sync::{Arc, Mutex};
@@ -11,7 +13,7 @@ use tungstenite::client::IntoClientRequest;
 struct Page {
     feed: Feed,
     server: Server,
-    asked: Arc<Mutex<Vec<Command>>>,
+    asked: Arc<Mutex<Vec<OperatorRequest>>>,
 }
 
 fn page() -> Page {
@@ -140,7 +142,7 @@ fn a_foreign_host_or_origin_is_refused_with_the_right_word() {
     assert!(page.asked.lock().unwrap().is_empty());
     assert!(page.socket(&url, "http://evil.example").is_err());
     assert!(post(&format!("Origin: http://{host}\r\n")).starts_with("HTTP/1.1 200"));
-    assert_eq!(*page.asked.lock().unwrap(), [Command::Park]);
+    assert_eq!(*page.asked.lock().unwrap(), [OperatorRequest::Park]);
 }
 
 #[test]
@@ -187,7 +189,10 @@ fn a_client_is_told_the_run_its_rows_and_pictures_and_the_operator_is_heard() {
         .send(Message::text(r#"{"do":"target","um":2.5}"#))
         .unwrap();
     until(&mut socket, text_with("done"));
-    assert_eq!(*page.asked.lock().unwrap(), [Command::Target { um: 2.5 }]);
+    assert_eq!(
+        *page.asked.lock().unwrap(),
+        [OperatorRequest::Target { um: 2.5 }]
+    );
     socket
         .send(Message::text(r#"{"do":"target","um":99}"#))
         .unwrap();
@@ -241,7 +246,12 @@ fn clients_that_flood_stall_or_talk_nonsense_do_not_keep_others_from_the_stop_ke
     }
     let mut socket = page.operator();
     socket.send(Message::text(r#"{"do":"freeze"}"#)).unwrap();
-    wait_for(|| page.asked.lock().unwrap().contains(&Command::Freeze));
+    wait_for(|| {
+        page.asked
+            .lock()
+            .unwrap()
+            .contains(&OperatorRequest::Freeze)
+    });
     let notes = page.asked.lock().unwrap().len();
     assert!(notes < 5 * 60, "{notes} requests of floods passed");
     stalled.clear();

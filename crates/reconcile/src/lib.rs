@@ -3,7 +3,7 @@
 //! [`reconcile`] takes a model and records and answers with one of five verdicts: effects are *named*, alone or with a
 //! *remainder* beside them, the records leave it *ambiguous* between several, it is *unknown* to the catalogue, or *nothing is
 //! missing*. All scores are sums of
-//! squared innovations of the model's own Kalman filter ([`Noise`]), because the free-run residual of a perfect model of
+//! squared innovations of the model's own Kalman filter ([`NoiseModel`]), because the free-run residual of a perfect model of
 //! this rig is a random walk.
 //!
 //! Not for identifying a plant from nothing (that is `cellpos-ident`), and not for files: records come as columns.
@@ -34,7 +34,7 @@ mod verdict;
 pub use data::actuator::constant_gain;
 pub use data::coloured::NoiseKind;
 pub use data::floor::FloorSource;
-pub use data::noise::{Coloured, Noise};
+pub use data::noise::{Coloured, NoiseModel};
 pub use data::record::Record;
 pub use error::ReconcileError;
 pub use report::report;

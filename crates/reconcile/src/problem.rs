@@ -1,6 +1,6 @@
 //! Records made ready for fitting: commands from the working point, whitening filters, masks.
 
-use crate::data::noise::{Noise, Whitener};
+use crate::data::noise::{NoiseModel, Whitener};
 use crate::data::record::{Record, command_range_um};
 use crate::dot::dot;
 use crate::simulate::Base;
@@ -144,7 +144,7 @@ fn transients(base: &Base, rows: usize) -> Vec<Vec<f64>> {
 pub(crate) struct Problem {
     pub base: Base,
     pub records: Vec<Prepared>,
-    pub noise: Noise,
+    pub noise: NoiseModel,
     /// Bounds of the share of the newest command's direct path that a frame already shows \[um per um\].
     ///
     /// The direct path of Eq. (6) acts at once; a frame whose exposure straddles the command's edge shows a part of it.
@@ -158,7 +158,7 @@ pub(crate) struct Problem {
 
 impl Problem {
     /// Prepares records; `repeated[i][k]` marks rows that repeat a frame and count as missing.
-    pub fn new(base: Base, records: &[Record], repeated: &[Vec<bool>], noise: Noise) -> Self {
+    pub fn new(base: Base, records: &[Record], repeated: &[Vec<bool>], noise: NoiseModel) -> Self {
         let direct = if base.zpk.zeros.len() == base.zpk.poles.len() {
             base.zpk.gain.abs()
         } else {
@@ -230,7 +230,7 @@ impl Problem {
     }
 
     /// The same problem with other noise.
-    pub fn with_noise(mut self, noise: Noise) -> Self {
+    pub fn with_noise(mut self, noise: NoiseModel) -> Self {
         self.noise = noise;
         for r in &mut self.records {
             r.whitener = Whitener::new(&noise, &r.present, r.extra_walk.as_deref());

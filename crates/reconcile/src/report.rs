@@ -2,7 +2,7 @@
 
 use crate::verdict::map::{BAND_EDGES_HZ, DiscrepancyMap, band_labels};
 use crate::verdict::result::{Reconciliation, Verdict};
-use cellpos_report::{Axis, Column, Figure, HeatMap, Panel, Report, Series, Status, Table};
+use cellpos_report::{Axis, Column, Emphasis, Figure, HeatMap, Panel, Report, Series, Table};
 
 /// Makes the report of a result; `title` names the data.
 pub fn report(result: &Reconciliation, title: &str) -> Report {
@@ -52,21 +52,21 @@ fn verdict(r: &mut Report, result: &Reconciliation) {
         .collect::<Vec<_>>()
         .join(" + ");
     match result.verdict {
-        Verdict::Named => r.note(Status::Good, &format!("named: {names}")),
+        Verdict::Named => r.note(Emphasis::Good, &format!("named: {names}")),
         Verdict::NamedWithRemainder => r.note(
-            Status::Warning,
+            Emphasis::Warning,
             &format!("named: {names}; and something remains"),
         ),
         Verdict::Ambiguous => r.note(
-            Status::Warning,
+            Emphasis::Warning,
             &format!("ambiguous: {names}, or what stands beside it below"),
         ),
         Verdict::Unknown => r.note(
-            Status::Bad,
+            Emphasis::Bad,
             "unknown: beyond the noise floor, and nothing in the catalogue closes enough of it",
         ),
         Verdict::NothingMissing => r.note(
-            Status::Good,
+            Emphasis::Good,
             "nothing missing: the model is at the noise floor",
         ),
     };
@@ -98,13 +98,13 @@ fn verdict(r: &mut Report, result: &Reconciliation) {
         r.table(t);
         for e in &result.effects {
             if let Some(s) = &e.separate_by {
-                r.note(Status::Warning, &format!("{}: {s}", e.id));
+                r.note(Emphasis::Warning, &format!("{}: {s}", e.id));
             }
         }
     }
     if let Some(rest) = &result.remainder {
         r.note(
-            Status::Warning,
+            Emphasis::Warning,
             &format!(
                 "Remainder, {:.1} % of the excess: {}; {}",
                 100.0 * rest.share,
@@ -115,7 +115,7 @@ fn verdict(r: &mut Report, result: &Reconciliation) {
     }
     if let Some(h) = &result.hypothesis {
         r.note(
-            Status::Warning,
+            Emphasis::Warning,
             &format!(
                 "Hypothesis, worth {:.0} % of the excess on held-out data: {}",
                 100.0 * h.held_out_worth,
@@ -222,7 +222,7 @@ fn response(r: &mut Report, result: &Reconciliation) {
     ));
     if !any {
         r.note(
-            Status::Plain,
+            Emphasis::Plain,
             "no band was driven enough to draw a response: nothing is drawn",
         );
         return;

@@ -168,7 +168,7 @@ impl RunReader {
     /// are filled: the command is held, the bead not seen. Takes 24 bytes a row; an export has the other columns.
     ///
     /// # Errors
-    /// [`RecordError`] when the rows cannot be read, [`cellpos_table::Problem::TooShort`] with fewer than two of them.
+    /// [`RecordError`] when the rows cannot be read, [`cellpos_table::TableProblem::TooShort`] with fewer than two of them.
     pub fn to_record(&self) -> Result<Record, RecordError> {
         let mut batches = self.batches()?;
         let mut time_s = Vec::new();

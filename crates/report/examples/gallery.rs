@@ -1,15 +1,15 @@
 //! Writes a report with every kind of figure, for looking at: `cargo run -p cellpos-report --example gallery -- DIR`.
 
-use cellpos_report::{Axis, Column, Figure, HeatMap, Panel, Report, Series, Status, Table};
+use cellpos_report::{Axis, Column, Emphasis, Figure, HeatMap, Panel, Report, Series, Table};
 use std::path::PathBuf;
 
 fn main() -> Result<(), cellpos_report::ReportError> {
     let folder = PathBuf::from(std::env::args().nth(1).unwrap_or_else(|| "gallery".into()));
     let mut report = Report::new("Gallery: every kind of figure");
     report.paragraph("Made-up data, to judge how figures look.");
-    report.note(Status::Good, "Holds within its limits.");
-    report.note(Status::Warning, "DEGRADED: no real-time priority.");
-    report.note(Status::Bad, "The bead was lost for 40 ms.");
+    report.note(Emphasis::Good, "Holds within its limits.");
+    report.note(Emphasis::Warning, "DEGRADED: no real-time priority.");
+    report.note(Emphasis::Bad, "The bead was lost for 40 ms.");
     report.section("Table");
     let mut table = Table::new([
         Column::left("parameter"),
@@ -19,7 +19,7 @@ fn main() -> Result<(), cellpos_report::ReportError> {
     ]);
     table.row(["K (1/s)", "428.1", "427.0 .. 429.2", "identified"]);
     table.row_with(
-        Status::Warning,
+        Emphasis::Warning,
         [
             "slow pole (rad/s)",
             "-0.0017",

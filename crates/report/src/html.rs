@@ -22,7 +22,7 @@ pub enum ReportError {
 
 /// How a note or a row is meant.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub enum Status {
+pub enum Emphasis {
     /// Neither good nor bad.
     #[default]
     Plain,
@@ -34,23 +34,23 @@ pub enum Status {
     Bad,
 }
 
-impl Status {
+impl Emphasis {
     fn class(self) -> &'static str {
         match self {
-            Status::Plain => "plain",
-            Status::Good => "good",
-            Status::Warning => "warning",
-            Status::Bad => "bad",
+            Emphasis::Plain => "plain",
+            Emphasis::Good => "good",
+            Emphasis::Warning => "warning",
+            Emphasis::Bad => "bad",
         }
     }
 
     /// A sign beside the colour, for readers who do not see colours and for prints.
     fn sign(self) -> &'static str {
         match self {
-            Status::Plain => "",
-            Status::Good => "\u{2713} ",
-            Status::Warning => "\u{25b2} ",
-            Status::Bad => "\u{2717} ",
+            Emphasis::Plain => "",
+            Emphasis::Good => "\u{2713} ",
+            Emphasis::Warning => "\u{25b2} ",
+            Emphasis::Bad => "\u{2717} ",
         }
     }
 }
@@ -84,7 +84,7 @@ impl Column {
 #[derive(Debug, Clone, PartialEq)]
 pub struct Table {
     columns: Vec<Column>,
-    rows: Vec<(Status, Vec<String>)>,
+    rows: Vec<(Emphasis, Vec<String>)>,
     caption: String,
 }
 
@@ -124,11 +124,11 @@ impl Table {
         I: IntoIterator,
         I::Item: AsRef<str>,
     {
-        self.row_with(Status::Plain, cells)
+        self.row_with(Emphasis::Plain, cells)
     }
 
     /// Adds a row that is marked as good, to be looked at, or bad.
-    pub fn row_with<I>(&mut self, status: Status, cells: I) -> &mut Self
+    pub fn row_with<I>(&mut self, status: Emphasis, cells: I) -> &mut Self
     where
         I: IntoIterator,
         I::Item: AsRef<str>,
@@ -175,7 +175,7 @@ enum Block {
     Section(String),
     Subsection(String),
     Paragraph(String),
-    Note(Status, String),
+    Note(Emphasis, String),
     List(Vec<String>),
     Verbatim(String),
     Table(Table),
@@ -220,7 +220,7 @@ impl Report {
     }
 
     /// Adds a note that stands out: a verdict, a warning.
-    pub fn note(&mut self, status: Status, text: &str) -> &mut Self {
+    pub fn note(&mut self, status: Emphasis, text: &str) -> &mut Self {
         self.push(Block::Note(status, text.to_owned()))
     }
 

@@ -40,5 +40,5 @@ mod thin;
 
 pub use axis::{Axis, Scale};
 pub use figure::{Figure, HeatMap, Panel};
-pub use html::{Column, Report, ReportError, Status, Table};
+pub use html::{Column, Emphasis, Report, ReportError, Table};
 pub use series::{Kind, Series};

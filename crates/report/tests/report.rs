@@ -1,6 +1,6 @@
 //! Behaviour of whole reports.
 
-use cellpos_report::{Axis, Column, Figure, HeatMap, Panel, Report, Series, Status, Table};
+use cellpos_report::{Axis, Column, Emphasis, Figure, HeatMap, Panel, Report, Series, Table};
 use proptest::prelude::*;
 
 /// A strict little XML check: tags nest, attributes are quoted, no bare ampersand or angle bracket.
@@ -50,13 +50,13 @@ fn sample(text: &str, data: &[f64]) -> Report {
         .section(text)
         .subsection(text)
         .paragraph(text)
-        .note(Status::Bad, text)
+        .note(Emphasis::Bad, text)
         .list(&[text])
         .verbatim(text);
     let mut table = Table::new([Column::left(text), Column::right(text)]);
     table
         .row([text, text, text])
-        .row_with(Status::Good, [text])
+        .row_with(Emphasis::Good, [text])
         .caption(text);
     report.table(table);
     for axis in [Axis::linear(text, text), Axis::log(text, text)] {

@@ -1,6 +1,6 @@
 //! One bead position on its way from vision to the loop.
 
-use cellpos_vision::{Decision, TrackState, Verdict};
+use cellpos_vision::{Decision, FixQuality, TrackState};
 
 /// A bead position as it travels through the measurement ring. Times are nanoseconds of the run's clock.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -16,7 +16,7 @@ pub struct Measurement {
     /// Variance of the position, um^2; NaN when there is none.
     pub variance_um2: f64,
     /// Verdict of vision on the fix itself.
-    pub verdict: Verdict,
+    pub verdict: FixQuality,
     /// State of the tracker after this frame, and what it decided of it; `None` without a tracker. A good fix that the
     /// tracker did not take (another bead, too far from the prediction) has no position.
     pub track: Option<(TrackState, Decision)>,
@@ -39,6 +39,6 @@ pub struct Measurement {
 impl Measurement {
     /// Whether the position may be controlled on: a good fix, and the bead that is followed.
     pub fn is_usable(&self) -> bool {
-        self.verdict == Verdict::Good && self.position_um.is_finite()
+        self.verdict == FixQuality::Good && self.position_um.is_finite()
     }
 }

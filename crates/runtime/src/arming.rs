@@ -51,7 +51,7 @@ impl Default for ArmingConfig {
 
 /// What the check found.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Verdict {
+pub struct GainCheck {
     /// Measured gain over the model's.
     pub gain_ratio: f64,
     /// Half width of its 95 % interval.
@@ -62,7 +62,7 @@ pub struct Verdict {
     sure: bool,
 }
 
-impl Verdict {
+impl GainCheck {
     /// Refused without a gain.
     fn unmeasured(refusal: Option<Refusal>) -> Self {
         Self {
@@ -173,9 +173,9 @@ pub enum Step {
     /// Hold this displacement, um.
     Command(f64),
     /// The pulse was disturbed or leaves a doubt; hold this displacement, um, until the bead is steady again.
-    Again(f64, Verdict),
+    Again(f64, GainCheck),
     /// The check is over.
-    Done(Verdict),
+    Done(GainCheck),
 }
 
 impl Arming {
@@ -240,7 +240,7 @@ impl Arming {
             }
             if state.steady >= self.config.steady_ticks {
                 if !self.config.check {
-                    return Step::Done(Verdict::unmeasured(None));
+                    return Step::Done(GainCheck::unmeasured(None));
                 }
                 state.pulse = Some(0);
                 state.last = position_um.map(|um| (0, um));
@@ -251,7 +251,7 @@ impl Arming {
                 return Step::Command(command_um + state.way() * first_um);
             }
             if state.ticks > self.config.patience_ticks {
-                return Step::Done(Verdict::unmeasured(Some(Refusal::NoBead)));
+                return Step::Done(GainCheck::unmeasured(Some(Refusal::NoBead)));
             }
             if state.seen || state.ticks <= UNSEEN_TICKS || !neutral_um.is_finite() {
                 return Step::Command(command_um);
@@ -315,23 +315,23 @@ impl Arming {
 
     /// What the pulses up to a tick of the present one tell: from the increments that nothing disturbed, or from all where those
     /// are too few.
-    fn judge(&self, state: &ArmingState, tick: u32) -> Verdict {
+    fn judge(&self, state: &ArmingState, tick: u32) -> GainCheck {
         if let Some(verdict) = self.fitted(&state.calm) {
             return verdict;
         }
         let Some(verdict) = self.fitted(&state.all) else {
-            return Verdict::unmeasured(Some(Refusal::NoBead));
+            return GainCheck::unmeasured(Some(Refusal::NoBead));
         };
         // A path that is always late delays the answer and leaves its size; one that is late now and then may do anything to it.
         let always = state.disturbances + self.settling_ticks >= tick;
         match verdict.refusal {
-            Some(_) if !always => Verdict::unmeasured(Some(Refusal::Disturbed)),
+            Some(_) if !always => GainCheck::unmeasured(Some(Refusal::Disturbed)),
             _ => verdict,
         }
     }
 
     /// Straight-line fit of increments; none where they are too few.
-    fn fitted(&self, s: &Sums) -> Option<Verdict> {
+    fn fitted(&self, s: &Sums) -> Option<GainCheck> {
         let sxx = s.xx - s.x * s.x / s.n.max(1.0);
         let sxy = s.xy - s.x * s.y / s.n.max(1.0);
         let syy = s.yy - s.y * s.y / s.n.max(1.0);
@@ -354,7 +354,7 @@ impl Arming {
         } else {
             (None, true)
         };
-        Some(Verdict {
+        Some(GainCheck {
             gain_ratio,
             ci95,
             refusal,

@@ -6,7 +6,7 @@ const SAMPLE: Seconds = Seconds(1e-3);
 const DELAY: Seconds = Seconds(2e-3);
 
 /// A plant of `factor` times Eq. (6) with drift and a reproducible jitter of the position.
-fn run(config: ArmingConfig, factor: f64, blind: impl Fn(u32) -> bool) -> (Verdict, f64) {
+fn run(config: ArmingConfig, factor: f64, blind: impl Fn(u32) -> bool) -> (GainCheck, f64) {
     let (verdict, largest, _) = run_disturbed(config, factor, blind, |_| 0);
     (verdict, largest)
 }
@@ -17,7 +17,7 @@ fn run_disturbed(
     factor: f64,
     blind: impl Fn(u32) -> bool,
     skipped: impl Fn(u32) -> u32,
-) -> (Verdict, f64, u32) {
+) -> (GainCheck, f64, u32) {
     let seen = |tick: u32, um: f64| {
         let jitter =
             0.02 * (f64::from(tick.wrapping_mul(2_654_435_761)) / f64::from(u32::MAX) - 0.5);
@@ -36,7 +36,7 @@ fn arm(
     delay: Seconds,
     mut seen: impl FnMut(u32, f64) -> Option<f64>,
     time: impl Fn(u32) -> (u32, bool),
-) -> (Verdict, f64, u32) {
+) -> (GainCheck, f64, u32) {
     let arming =
         Arming::new(config, &TransferFunction::eq6(), SAMPLE, DELAY).expect("eq6 is a plant");
     let plant =

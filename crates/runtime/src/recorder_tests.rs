@@ -1,7 +1,7 @@
 use super::*;
 use crate::life::Request;
 use crate::ticker::RingSizes;
-use cellpos_vision::Verdict;
+use cellpos_vision::FixQuality;
 use rtrb::{Producer, RingBuffer};
 
 /// What the loop's end of the rings is in a run.
@@ -33,7 +33,7 @@ impl Loop {
         let record = TickRecord {
             seq,
             time_ns: seq as i64 * 1_000_000,
-            verdict: Verdict::Good as u8,
+            verdict: FixQuality::Good as u8,
             ..TickRecord::unknown()
         };
         self.records.push(record).expect("room in the ring");

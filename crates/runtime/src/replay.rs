@@ -12,7 +12,7 @@ use crate::reference::ReferenceGenerator;
 use crate::tick_record::{TickFlags, TickRecord};
 use cellpos_control::{SolverStatus, SolverTerms};
 use cellpos_rig::{ActuatorFault, ActuatorReport, ActuatorState, Measurement};
-use cellpos_vision::{Decision, TrackState, Verdict};
+use cellpos_vision::{Decision, FixQuality, TrackState};
 use serde::Serialize;
 
 /// The first difference between a record and its replay.
@@ -151,15 +151,15 @@ impl<R: ReferenceGenerator> Replay<R> {
 /// What the tick of a record was given.
 fn input(record: &TickRecord, previous: Option<&TickRecord>) -> TickInput {
     let verdict = [
-        Verdict::Good,
-        Verdict::NoSignal,
-        Verdict::BadFit,
-        Verdict::AtBorder,
-        Verdict::NotConverged,
+        FixQuality::Good,
+        FixQuality::NoSignal,
+        FixQuality::BadFit,
+        FixQuality::AtBorder,
+        FixQuality::NotConverged,
     ]
     .into_iter()
     .find(|verdict| *verdict as u8 == record.verdict)
-    .unwrap_or(Verdict::NoSignal);
+    .unwrap_or(FixQuality::NoSignal);
     let measurement = (!record.flags.has(TickFlags::TIMER)).then_some(Measurement {
         frame_id: record.frame_id,
         mid_exposure_ns: record.mid_exposure_ns,

@@ -74,7 +74,7 @@ pub struct TickRecord {
     pub measured_um: f64,
     /// Variance of the measured position, um^2.
     pub variance_um2: f64,
-    /// Verdict of vision ([`cellpos_vision::Verdict`] as a number; 255: no frame).
+    /// Verdict of vision ([`cellpos_vision::FixQuality`] as a number; 255: no frame).
     pub verdict: u8,
     /// State of the tracker ([`cellpos_vision::TrackState`] as a number; 255: no frame, or no tracker).
     pub track: u8,

@@ -35,7 +35,7 @@ pub enum StopReason {
 
 /// Where a cursor is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Status {
+pub enum Progress {
     /// Moving or holding by the plan.
     Running,
     /// Waiting for a condition.
@@ -54,7 +54,7 @@ pub struct Output {
     /// Time of the plan, s: stands still while waiting.
     pub plan_s: f64,
     /// What is going on.
-    pub status: Status,
+    pub status: Progress,
     /// Number of the periodic motion in full swing ([`Plan::periodic`]), and its phase in cycles.
     pub swing: Option<(u16, f64)>,
 }
@@ -73,7 +73,7 @@ pub struct Cursor {
     settled_s: f64,
     lost_s: f64,
     first_length_um: Option<f64>,
-    status: Status,
+    status: Progress,
 }
 
 impl Plan {
@@ -102,13 +102,13 @@ impl Plan {
             settled_s: 0.0,
             lost_s: 0.0,
             first_length_um: None,
-            status: Status::Running,
+            status: Progress::Running,
         }
     }
 
     /// The reference of this tick; then the cursor goes on by `sample_s`. Allocates nothing and cannot panic.
     pub fn step(&self, cursor: &mut Cursor, sample_s: f64, seen: &Seen) -> Output {
-        if !matches!(cursor.status, Status::Done | Status::Stopped(_)) {
+        if !matches!(cursor.status, Progress::Done | Progress::Stopped(_)) {
             self.advance(cursor, sample_s, seen);
         }
         let output = Output {
@@ -118,10 +118,10 @@ impl Plan {
             swing: self
                 .segments()
                 .get(cursor.segment)
-                .filter(|_| cursor.status == Status::Running)
+                .filter(|_| cursor.status == Progress::Running)
                 .and_then(|segment| self.swing(segment, cursor.plan_s)),
         };
-        if cursor.status == Status::Running {
+        if cursor.status == Progress::Running {
             cursor.ticks += 1;
             cursor.plan_s = cursor.from_s + cursor.ticks as f64 * sample_s;
         }
@@ -131,14 +131,14 @@ impl Plan {
 
     /// A tick in which the plan's clock stands still: running time and stop conditions go on. Allocates nothing.
     pub fn stand(&self, cursor: &mut Cursor, sample_s: f64, seen: &Seen) -> Output {
-        if !matches!(cursor.status, Status::Done | Status::Stopped(_)) {
+        if !matches!(cursor.status, Progress::Done | Progress::Stopped(_)) {
             let blind = Seen {
                 // A bead that is being held is not tracked: its distance from the reference is no error.
                 error_um: seen.position_um.map(|_| 0.0),
                 ..*seen
             };
             if let Some(reason) = self.stop_reason(cursor, sample_s, &blind) {
-                cursor.status = Status::Stopped(reason);
+                cursor.status = Progress::Stopped(reason);
             }
         }
         cursor.elapsed_s += sample_s;
@@ -153,7 +153,7 @@ impl Plan {
     /// The reference of the ticks to come, the next one first, as far as it is known: from the next wait on it stays.
     /// Allocates nothing.
     pub fn preview(&self, cursor: &Cursor, sample_s: f64, preview_um: &mut [f64]) {
-        if cursor.status != Status::Running {
+        if cursor.status != Progress::Running {
             preview_um.fill(self.reference_um(cursor));
             return;
         }
@@ -175,10 +175,10 @@ impl Plan {
     fn advance(&self, cursor: &mut Cursor, sample_s: f64, seen: &Seen) {
         // Ends of segments are sums of durations: half a nanosecond of rounding is not a tick.
         const ROUNDING_S: f64 = 5e-10;
-        cursor.status = Status::Running;
+        cursor.status = Progress::Running;
         loop {
             let Some(segment) = self.segments().get(cursor.segment) else {
-                cursor.status = Status::Done;
+                cursor.status = Progress::Done;
                 return;
             };
             if let Motion::Wait {
@@ -196,11 +196,11 @@ impl Plan {
                         cursor.leave();
                         continue;
                     }
-                    cursor.status = Status::Stopped(StopReason::WaitTimeout);
+                    cursor.status = Progress::Stopped(StopReason::WaitTimeout);
                     return;
                 }
                 cursor.waited_s += sample_s;
-                cursor.status = Status::Waiting;
+                cursor.status = Progress::Waiting;
                 break;
             }
             if cursor.plan_s + ROUNDING_S < segment.start_s + segment.duration_s {
@@ -209,7 +209,7 @@ impl Plan {
             cursor.leave();
         }
         if let Some(reason) = self.stop_reason(cursor, sample_s, seen) {
-            cursor.status = Status::Stopped(reason);
+            cursor.status = Progress::Stopped(reason);
         }
     }
 
@@ -317,7 +317,7 @@ impl Cursor {
     }
 
     /// What is going on.
-    pub fn status(&self) -> Status {
+    pub fn status(&self) -> Progress {
         self.status
     }
 

@@ -1,6 +1,6 @@
 //! A script as the reference generator of a loop.
 
-use crate::cursor::{Cursor, Seen, Status, StopReason};
+use crate::cursor::{Cursor, Progress, Seen, StopReason};
 use crate::plan::Plan;
 use cellpos_runtime::{ReferenceGenerator, ReferenceInput, ReferenceOutput, Stage};
 use std::sync::Arc;
@@ -201,12 +201,12 @@ impl Follower {
     }
 }
 
-fn stage(status: Status) -> Stage {
+fn stage(status: Progress) -> Stage {
     match status {
-        Status::Running => Stage::Running,
-        Status::Waiting => Stage::Waiting,
-        Status::Done => Stage::Done,
-        Status::Stopped(reason) => match reason {
+        Progress::Running => Stage::Running,
+        Progress::Waiting => Stage::Waiting,
+        Progress::Done => Stage::Done,
+        Progress::Stopped(reason) => match reason {
             StopReason::Lost => Stage::StoppedLost,
             StopReason::Error => Stage::StoppedError,
             StopReason::LengthChange => Stage::StoppedLength,

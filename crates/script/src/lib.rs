@@ -34,7 +34,7 @@ mod shuffle;
 mod table;
 
 pub use check::{Check, CheckError, CheckLimits, Violation, WaveCheck, check};
-pub use cursor::{Cursor, Output, Seen, Status, StopReason};
+pub use cursor::{Cursor, Output, Progress, Seen, StopReason};
 pub use cycles::{
     Alarm, AmplitudeWatch, AtRest, CycleColumns, CycleFlags, CycleRow, CycleTable, FatigueStop,
     FatigueWatch, HeadError, Mean, ReadCycles, Saturating, Trend, read_cycles, trend,

@@ -35,7 +35,7 @@ pub fn setup(reader: &RunReader) -> Result<Setup, Failure> {
 }
 
 /// Diffusion coefficient of the bead, um^2/s: the emulator's, or the model's where the rig was real.
-pub fn diffusion_um2_per_s(meta: &RunMeta) -> Option<f64> {
+pub fn diffusion_of_run_um2_per_s(meta: &RunMeta) -> Option<f64> {
     let rig = meta.config.get("rig");
     let camera = rig.and_then(|rig| rig.get("camera")?.get("kind")?.as_str());
     let place = if camera == Some("emulated") {

@@ -11,12 +11,12 @@ pub struct TableError {
     /// The line, counted from 1 with the header, if the problem is at one.
     pub line: Option<usize>,
     /// What is wrong.
-    pub problem: Problem,
+    pub problem: TableProblem,
 }
 
 /// What is wrong with a table.
 #[derive(Debug, thiserror::Error)]
-pub enum Problem {
+pub enum TableProblem {
     /// The file could not be read.
     #[error("cannot be read: {0}")]
     Read(std::io::Error),

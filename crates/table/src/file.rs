@@ -1,6 +1,6 @@
 //! Whole files written in one step.
 
-use crate::error::{Problem, TableError};
+use crate::error::{TableError, TableProblem};
 use std::fs::File;
 use std::io::{self, Read, Write};
 use std::path::Path;
@@ -9,7 +9,7 @@ use std::path::Path;
 /// to the disk, then renamed over `path`. Folders are made as needed. A device or a pipe of this name is written to, and stays.
 ///
 /// # Errors
-/// [`Problem::Write`] with the file's name; the temporary file is removed.
+/// [`TableProblem::Write`] with the file's name; the temporary file is removed.
 pub fn write_atomically(path: &Path, bytes: &[u8]) -> Result<(), TableError> {
     replace(path, bytes, File::sync_data)
 }
@@ -61,7 +61,7 @@ fn replace(
     attempt().map_err(|source| TableError {
         path: path.to_owned(),
         line: None,
-        problem: Problem::Write(source),
+        problem: TableProblem::Write(source),
     })
 }
 

@@ -29,7 +29,7 @@ mod record;
 mod sampling;
 mod table;
 
-pub use error::{Problem, TableError};
+pub use error::{TableError, TableProblem};
 pub use file::{MOST_OF_A_RECORD, read_bytes, read_text, write_atomically, write_unsynced};
 pub use mapping::{ColumnRef, Gaps, Mapping};
 pub use record::Record;

@@ -1,6 +1,6 @@
 //! The record: step, command, position.
 
-use crate::error::{Problem, TableError};
+use crate::error::{TableError, TableProblem};
 use crate::file::{MOST_OF_A_RECORD, read_text, write_atomically};
 use crate::mapping::{Gaps, Mapping};
 use crate::sampling;
@@ -92,8 +92,8 @@ impl Record {
             problem,
         };
         let text = read_text(path, MOST_OF_A_RECORD).map_err(|source| match source.kind() {
-            std::io::ErrorKind::InvalidData => fail(Problem::NotText),
-            _ => fail(Problem::Read(source)),
+            std::io::ErrorKind::InvalidData => fail(TableProblem::NotText),
+            _ => fail(TableProblem::Read(source)),
         })?;
         Self::parse(path, &text, mapping)
     }
@@ -106,7 +106,7 @@ impl Record {
         check(path, mapping)?;
         let table = Table::parse(path, text)?;
         if mapping.by_name() && !table.has_header() {
-            return Err(table.fail(table.line(0), Problem::NoHeader));
+            return Err(table.fail(table.line(0), TableProblem::NoHeader));
         }
         let scaled = |values: Vec<f64>, factor: f64| -> Vec<f64> {
             if factor == 1.0 {
@@ -185,7 +185,7 @@ impl Record {
             problem,
         };
         if let Some(value) = pzt_um.iter().find(|value| !value.is_finite()) {
-            return Err(fail(Problem::Cell {
+            return Err(fail(TableProblem::Cell {
                 column: "pzt_um".to_owned(),
                 text: value.to_string(),
                 help: "a command is a number",
@@ -251,7 +251,7 @@ impl Record {
     /// Writes the record as CSV in one step: a reader never sees half a file.
     ///
     /// # Errors
-    /// [`Problem::Write`] with the file's name.
+    /// [`TableProblem::Write`] with the file's name.
     pub fn write(&self, path: &Path) -> Result<(), TableError> {
         write_atomically(path, self.to_csv().as_bytes())
     }
@@ -280,7 +280,7 @@ fn check(path: &Path, mapping: &Mapping) -> Result<(), TableError> {
         Err(TableError {
             path: path.to_owned(),
             line: None,
-            problem: Problem::Setting { key, value, help },
+            problem: TableProblem::Setting { key, value, help },
         })
     };
     for (key, value) in [

@@ -1,6 +1,6 @@
 //! The sampling step of a column of times, and the place of each row on the even grid.
 
-use crate::error::Problem;
+use crate::error::TableProblem;
 
 /// Rows laid on an even grid.
 pub(crate) struct Grid {
@@ -19,19 +19,19 @@ pub(crate) fn grid(
     time_s: &[f64],
     tolerance: f64,
     gaps: bool,
-) -> Result<Grid, (Option<usize>, Problem)> {
+) -> Result<Grid, (Option<usize>, TableProblem)> {
     let rows = time_s.len();
     let (Some(first), Some(last)) = (time_s.first(), time_s.last()) else {
-        return Err((None, Problem::TooShort { rows }));
+        return Err((None, TableProblem::TooShort { rows }));
     };
     if rows < 2 {
-        return Err((None, Problem::TooShort { rows }));
+        return Err((None, TableProblem::TooShort { rows }));
     }
     for (row, pair) in time_s.windows(2).enumerate() {
         if let [before_s, time_s] = *pair
             && (time_s <= before_s || !(time_s - before_s).is_finite())
         {
-            return Err((Some(row + 1), Problem::TimeOrder { before_s, time_s }));
+            return Err((Some(row + 1), TableProblem::TimeOrder { before_s, time_s }));
         }
     }
     let mut steps: Vec<f64> = time_s.windows(2).map(|pair| pair[1] - pair[0]).collect();
@@ -50,7 +50,7 @@ pub(crate) fn grid(
         // Times written with few decimals are rounded by up to one unit in the last place from step to step; that is
         // within the tolerance as long as the step itself is written with two figures or more.
         if off_s > tolerance * usual_s || (whole > 1.0 && !gaps) {
-            let problem = Problem::Sampling {
+            let problem = TableProblem::Sampling {
                 step_s,
                 expected_s: usual_s,
             };
@@ -60,7 +60,7 @@ pub(crate) fn grid(
         let missing = place + 1 - (row + 2).min(place + 1);
         // A file that says "a million rows are missing" must not fill the memory with them.
         if missing > rows * 10 + 1000 {
-            let problem = Problem::TooManyGaps {
+            let problem = TableProblem::TooManyGaps {
                 missing,
                 present: rows,
             };

@@ -1,6 +1,6 @@
 //! A table of fields, before anything is known of their meaning.
 
-use crate::error::{Problem, TableError};
+use crate::error::{TableError, TableProblem};
 use crate::mapping::ColumnRef;
 use std::path::{Path, PathBuf};
 
@@ -67,7 +67,7 @@ impl<'a> Table<'a> {
     /// A first line without any number is the header.
     ///
     /// # Errors
-    /// [`Problem::Empty`], [`Problem::Fields`], [`Problem::DuplicateColumn`], [`Problem::TooLarge`].
+    /// [`TableProblem::Empty`], [`TableProblem::Fields`], [`TableProblem::DuplicateColumn`], [`TableProblem::TooLarge`].
     pub fn parse(path: &Path, text: &'a str) -> Result<Self, TableError> {
         let fail = |line, problem| TableError {
             path: path.to_owned(),
@@ -75,7 +75,7 @@ impl<'a> Table<'a> {
             problem,
         };
         if u32::try_from(text.len()).is_err() {
-            return Err(fail(None, Problem::TooLarge));
+            return Err(fail(None, TableProblem::TooLarge));
         }
         let text = text.strip_prefix('\u{feff}').unwrap_or(text);
         let mut lines = text
@@ -87,7 +87,7 @@ impl<'a> Table<'a> {
                 !line.is_empty() && !line.starts_with(['#', '%'])
             });
         let Some((first_line, first)) = lines.next() else {
-            return Err(fail(None, Problem::Empty));
+            return Err(fail(None, TableProblem::Empty));
         };
         let separator = Separator::of(first);
         let mut fields = Vec::new();
@@ -102,7 +102,7 @@ impl<'a> Table<'a> {
             if !name.is_empty() && names.iter().take(place).any(|other| other == name) {
                 return Err(fail(
                     Some(first_line),
-                    Problem::DuplicateColumn(name.clone()),
+                    TableProblem::DuplicateColumn(name.clone()),
                 ));
             }
         }
@@ -126,7 +126,7 @@ impl<'a> Table<'a> {
             });
             let found = table.fields.len() - before;
             if found != table.names.len() {
-                let problem = Problem::Fields {
+                let problem = TableProblem::Fields {
                     expected: table.names.len(),
                     found,
                 };
@@ -135,7 +135,7 @@ impl<'a> Table<'a> {
             table.lines.push(line as u32);
         }
         if table.lines.is_empty() {
-            return Err(fail(None, Problem::Empty));
+            return Err(fail(None, TableProblem::Empty));
         }
         Ok(table)
     }
@@ -186,7 +186,7 @@ impl<'a> Table<'a> {
     /// A column as finite numbers; an empty field becomes NaN if `allow_empty`.
     ///
     /// # Errors
-    /// [`Problem::MissingColumn`], [`Problem::WrongUnit`], [`Problem::Cell`].
+    /// [`TableProblem::MissingColumn`], [`TableProblem::WrongUnit`], [`TableProblem::Cell`].
     pub fn numbers(&self, column: &ColumnRef, allow_empty: bool) -> Result<Vec<f64>, TableError> {
         let help = if allow_empty {
             "leave the field empty where there is no bead"
@@ -223,7 +223,7 @@ impl<'a> Table<'a> {
                 _ if is_none(field) => Ok(f64::NAN),
                 _ => Err(self.fail(
                     self.line(row),
-                    Problem::Cell {
+                    TableProblem::Cell {
                         column: self.names.get(place).cloned().unwrap_or_default(),
                         text: field.chars().take(40).collect(),
                         help,
@@ -233,7 +233,7 @@ impl<'a> Table<'a> {
             .collect()
     }
 
-    pub(crate) fn fail(&self, line: Option<usize>, problem: Problem) -> TableError {
+    pub(crate) fn fail(&self, line: Option<usize>, problem: TableProblem) -> TableError {
         TableError {
             path: self.path.clone(),
             line,
@@ -246,7 +246,7 @@ impl<'a> Table<'a> {
         let ColumnRef::Name(wanted) = column else {
             return self.fail(
                 None,
-                Problem::MissingColumn {
+                TableProblem::MissingColumn {
                     wanted: column.to_string(),
                     found: self.names.clone(),
                     hint: Some("columns are counted from 1".to_owned()),
@@ -254,13 +254,13 @@ impl<'a> Table<'a> {
             );
         };
         if !self.has_header() {
-            return self.fail(self.line(0), Problem::NoHeader);
+            return self.fail(self.line(0), TableProblem::NoHeader);
         }
         for name in &self.names {
             if let Some((unit, factor)) = other_unit(name, wanted) {
                 return self.fail(
                     None,
-                    Problem::WrongUnit {
+                    TableProblem::WrongUnit {
                         column: name.clone(),
                         unit,
                         wanted: wanted.clone(),
@@ -285,7 +285,7 @@ impl<'a> Table<'a> {
             .map(|name| format!("rename `{name}` if it is `{wanted}`"));
         self.fail(
             None,
-            Problem::MissingColumn {
+            TableProblem::MissingColumn {
                 wanted: wanted.clone(),
                 found: self.names.clone(),
                 hint,

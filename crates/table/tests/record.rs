@@ -1,6 +1,6 @@
 //! Behaviour of reading and writing records.
 
-use cellpos_table::{ColumnRef, Gaps, Mapping, Problem, Record, Table, TableError};
+use cellpos_table::{ColumnRef, Gaps, Mapping, Record, Table, TableError, TableProblem};
 use proptest::prelude::*;
 use std::path::Path;
 
@@ -58,7 +58,7 @@ fn a_missing_column_names_what_exists_and_what_was_probably_meant() {
         "{text}"
     );
     let error = parse("time_s,pzt_um\n0,1\n0.001,1\n").unwrap_err();
-    assert!(matches!(error.problem, Problem::MissingColumn { .. }));
+    assert!(matches!(error.problem, TableProblem::MissingColumn { .. }));
     assert!(
         Record::parse(
             Path::new("a"),
@@ -79,7 +79,7 @@ fn numbers_that_are_not_finite_are_refused_with_line_and_column() {
     }
     let error = parse("time_s,pzt_um,bead_um\n0,1,2\n0.001,,2\n").unwrap_err();
     assert!(
-        matches!(error.problem, Problem::Cell { .. }),
+        matches!(error.problem, TableProblem::Cell { .. }),
         "the command is never unknown"
     );
 }
@@ -88,13 +88,13 @@ fn numbers_that_are_not_finite_are_refused_with_line_and_column() {
 fn time_must_grow_and_be_even() {
     let error = parse("time_s,pzt_um,bead_um\n0,1,2\n0.001,1,2\n0.001,1,2\n").unwrap_err();
     assert_eq!(error.line, Some(4));
-    assert!(matches!(error.problem, Problem::TimeOrder { .. }));
+    assert!(matches!(error.problem, TableProblem::TimeOrder { .. }));
     let error = parse("time_s,pzt_um,bead_um\n0,1,\n0.001,1,\n0.002,1,\n0.0035,1,\n0.0045,1,\n")
         .unwrap_err();
     assert_eq!(error.line, Some(5));
-    assert!(matches!(error.problem, Problem::Sampling { .. }));
+    assert!(matches!(error.problem, TableProblem::Sampling { .. }));
     let error = parse("time_s,pzt_um,bead_um\n0,1,2\n").unwrap_err();
-    assert!(matches!(error.problem, Problem::TooShort { rows: 1 }));
+    assert!(matches!(error.problem, TableProblem::TooShort { rows: 1 }));
 }
 
 #[test]
@@ -118,7 +118,7 @@ fn missing_rows_are_refused_or_held_as_asked() {
         "time_s,pzt_um,bead_um,x\n0,1,2,5\n0.001,1.5,3,5\n0.004,7,8,5\n0.005,7,9,5\n0.006,7,9,5\n";
     assert!(matches!(
         parse(text).unwrap_err().problem,
-        Problem::Sampling { .. }
+        TableProblem::Sampling { .. }
     ));
     let mapping = Mapping {
         gaps: Gaps::Hold,
@@ -133,7 +133,7 @@ fn missing_rows_are_refused_or_held_as_asked() {
     let far = "time_s,pzt_um,bead_um\n0,1,2\n0.001,1,2\n0.002,1,2\n1e9,1,2\n";
     let error = Record::parse(Path::new("a"), far, &mapping).unwrap_err();
     assert!(
-        matches!(error.problem, Problem::TooManyGaps { .. }),
+        matches!(error.problem, TableProblem::TooManyGaps { .. }),
         "{error}"
     );
 }
@@ -150,7 +150,7 @@ fn foreign_data_are_read_by_place_rate_and_factor() {
     assert_eq!(record.bead_um, [3.0, 4.0, 5.0]);
     assert_eq!(record.step_s, 0.005);
     let error = Record::parse(Path::new("m.dat"), text, &Mapping::default()).unwrap_err();
-    assert!(matches!(error.problem, Problem::NoHeader), "{error}");
+    assert!(matches!(error.problem, TableProblem::NoHeader), "{error}");
     let error =
         Record::parse(Path::new("m.dat"), text, &Mapping::foreign("1", "4", 200.0)).unwrap_err();
     assert!(error.to_string().contains("counted from 1"), "{error}");
@@ -164,19 +164,22 @@ fn header_quirks_of_other_programs_do_no_harm() {
     assert_eq!(record.len(), 2);
     assert!(record.bead_um[1].is_nan());
     let error = parse("time_s,pzt_um,pzt_um\n0,1,2\n").unwrap_err();
-    assert!(matches!(error.problem, Problem::DuplicateColumn(_)));
+    assert!(matches!(error.problem, TableProblem::DuplicateColumn(_)));
     let error = parse("time_s,pzt_um,bead_um\n0,1\n").unwrap_err();
     assert!(matches!(
         error.problem,
-        Problem::Fields {
+        TableProblem::Fields {
             expected: 3,
             found: 2
         }
     ));
-    assert!(matches!(parse("").unwrap_err().problem, Problem::Empty));
+    assert!(matches!(
+        parse("").unwrap_err().problem,
+        TableProblem::Empty
+    ));
     assert!(matches!(
         parse("time_s,pzt_um,bead_um\n").unwrap_err().problem,
-        Problem::Empty
+        TableProblem::Empty
     ));
 }
 
@@ -185,10 +188,10 @@ fn a_file_that_is_no_text_or_not_there_is_named() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("a.csv");
     let error = Record::read(&path, &Mapping::default()).unwrap_err();
-    assert!(matches!(error.problem, Problem::Read(_)) && error.to_string().contains("a.csv"));
+    assert!(matches!(error.problem, TableProblem::Read(_)) && error.to_string().contains("a.csv"));
     std::fs::write(&path, [0xff, 0xfe, 0x00]).unwrap();
     let error = Record::read(&path, &Mapping::default()).unwrap_err();
-    assert!(matches!(error.problem, Problem::NotText));
+    assert!(matches!(error.problem, TableProblem::NotText));
 }
 
 #[test]

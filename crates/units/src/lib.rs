@@ -20,7 +20,7 @@ extern crate std;
 mod parse;
 mod spelling;
 
-pub use parse::{Problem, UnitError};
+pub use parse::{UnitError, UnitProblem};
 pub use spelling::{nearest, nearest_in};
 
 use core::fmt;

@@ -5,7 +5,7 @@ use core::fmt;
 
 /// What is wrong with a text that should have been a quantity.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Problem {
+pub enum UnitProblem {
     /// Nothing was written.
     Empty,
     /// No number at the start.
@@ -24,7 +24,7 @@ pub enum Problem {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct UnitError {
     /// What is wrong.
-    pub problem: Problem,
+    pub problem: UnitProblem,
     noun: &'static str,
     base: &'static str,
     symbols: &'static str,
@@ -64,23 +64,23 @@ impl fmt::Display for UnitError {
         let (noun, base, symbols) = (self.noun, self.base, self.symbols);
         let (number, unit) = (self.number.text(), self.unit.text());
         match self.problem {
-            Problem::Empty => write!(
+            UnitProblem::Empty => write!(
                 f,
                 "{noun} is missing: write for example 1{base} ({symbols})"
             ),
-            Problem::NotANumber => write!(
+            UnitProblem::NotANumber => write!(
                 f,
                 "`{number}{unit}` is not {noun}: write a number and a unit, for example 1{base} ({symbols})"
             ),
-            Problem::NotFinite => write!(
+            UnitProblem::NotFinite => write!(
                 f,
                 "{noun} must be finite: write a number and a unit, for example 1{base} ({symbols})"
             ),
-            Problem::NoUnit => write!(
+            UnitProblem::NoUnit => write!(
                 f,
                 "{noun} needs a unit: write for example {number}{base} ({symbols})"
             ),
-            Problem::WrongUnit => write!(
+            UnitProblem::WrongUnit => write!(
                 f,
                 "`{unit}` is not a unit of {noun}: write for example {number}{base} ({symbols})"
             ),
@@ -139,24 +139,24 @@ pub(crate) fn parse(text: &str, quantity: &Quantity) -> Result<f64, UnitError> {
         unit: Excerpt::new(unit),
     };
     if text.is_empty() {
-        return Err(fail(Problem::Empty));
+        return Err(fail(UnitProblem::Empty));
     }
     let lower_is = |word: &str| {
         unit.trim_start_matches(['+', '-'])
             .eq_ignore_ascii_case(word)
     };
     if number.is_empty() && (lower_is("nan") || lower_is("inf") || lower_is("infinity")) {
-        return Err(fail(Problem::NotFinite));
+        return Err(fail(UnitProblem::NotFinite));
     }
-    let value: f64 = number.parse().map_err(|_| fail(Problem::NotANumber))?;
+    let value: f64 = number.parse().map_err(|_| fail(UnitProblem::NotANumber))?;
     if unit.is_empty() {
-        return Err(fail(Problem::NoUnit));
+        return Err(fail(UnitProblem::NoUnit));
     }
     let factor = quantity
         .units
         .iter()
         .find(|candidate| candidate.symbol == unit)
-        .ok_or_else(|| fail(Problem::WrongUnit))?
+        .ok_or_else(|| fail(UnitProblem::WrongUnit))?
         .factor;
     // Dividing by a power of ten rounds once where multiplying by its inverse rounds twice: 250nm is 0.25um exactly.
     let value = if factor < 1.0 {
@@ -167,7 +167,7 @@ pub(crate) fn parse(text: &str, quantity: &Quantity) -> Result<f64, UnitError> {
     if value.is_finite() {
         Ok(value)
     } else {
-        Err(fail(Problem::NotFinite))
+        Err(fail(UnitProblem::NotFinite))
     }
 }
 
@@ -178,7 +178,7 @@ fn rounded_reciprocal(factor: f64) -> f64 {
 
 #[cfg(test)]
 mod tests {
-    use crate::{Degrees, Hertz, Micrometers, MicrometersPerSecond, Problem, Seconds, Volts};
+    use crate::{Degrees, Hertz, Micrometers, MicrometersPerSecond, Seconds, UnitProblem, Volts};
     use std::format;
     use std::string::ToString;
 
@@ -200,14 +200,14 @@ mod tests {
     #[test]
     fn a_bare_number_is_refused_and_the_message_says_what_to_write() {
         let error = "5".parse::<Micrometers>().unwrap_err();
-        assert_eq!(error.problem, Problem::NoUnit);
+        assert_eq!(error.problem, UnitProblem::NoUnit);
         assert!(error.to_string().contains("5um"), "{error}");
     }
 
     #[test]
     fn a_wrong_unit_names_itself_and_the_right_ones() {
         let error = "5V".parse::<Micrometers>().unwrap_err();
-        assert_eq!(error.problem, Problem::WrongUnit);
+        assert_eq!(error.problem, UnitProblem::WrongUnit);
         assert_eq!(
             error.to_string(),
             "`V` is not a unit of a length: write for example 5um (nm, um, mm, m)"
@@ -221,15 +221,15 @@ mod tests {
     #[test]
     fn nan_infinity_overflow_and_nonsense_are_refused() {
         for (text, problem) in [
-            ("", Problem::Empty),
-            ("NaNum", Problem::NotANumber),
-            ("nan", Problem::NotFinite),
-            ("-inf", Problem::NotFinite),
-            ("1e999um", Problem::NotFinite),
-            ("um", Problem::NotANumber),
-            ("--1um", Problem::NotANumber),
-            ("1.2.3um", Problem::WrongUnit),
-            ("1e", Problem::WrongUnit),
+            ("", UnitProblem::Empty),
+            ("NaNum", UnitProblem::NotANumber),
+            ("nan", UnitProblem::NotFinite),
+            ("-inf", UnitProblem::NotFinite),
+            ("1e999um", UnitProblem::NotFinite),
+            ("um", UnitProblem::NotANumber),
+            ("--1um", UnitProblem::NotANumber),
+            ("1.2.3um", UnitProblem::WrongUnit),
+            ("1e", UnitProblem::WrongUnit),
         ] {
             assert_eq!(
                 text.parse::<Micrometers>().unwrap_err().problem,

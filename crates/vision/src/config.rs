@@ -9,7 +9,7 @@ pub const MAX_WINDOW_PX: usize = 191;
 /// Noise of one pixel, grey levels.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(tag = "kind", rename_all = "kebab-case", deny_unknown_fields)]
-pub enum Noise {
+pub enum PixelNoise {
     /// The same in every pixel, measured on the border of each window and averaged over the frames.
     #[default]
     Estimated,
@@ -90,7 +90,7 @@ pub struct LocaliserConfig {
     pub pixel_response: PixelResponse,
     /// Noise of a pixel.
     #[serde(default)]
-    pub noise: Noise,
+    pub noise: PixelNoise,
     /// Peak contrast over the noise of a pixel below which there is no signal.
     #[serde(default = "defaults::min_snr")]
     pub min_snr: f64,
@@ -179,7 +179,7 @@ impl LocaliserConfig {
             window_px,
             polarity: Polarity::default(),
             pixel_response: PixelResponse::default(),
-            noise: Noise::default(),
+            noise: PixelNoise::default(),
             min_snr: defaults::min_snr(),
             max_residual_ratio: defaults::max_residual_ratio(),
             template_tolerance: defaults::template_tolerance(),
@@ -286,10 +286,10 @@ impl Learning {
     }
 }
 
-impl Noise {
+impl PixelNoise {
     fn check(&self) -> Result<(), ConfigError> {
         let check = ConfigError::unless;
-        let Noise::Known {
+        let PixelNoise::Known {
             read_sd_grey,
             shot_grey_per_electron: gain,
             black_level_grey,
@@ -343,7 +343,7 @@ mod tests {
     fn every_bad_setting_is_refused_by_name() {
         let good = LocaliserConfig::new(ProfileSpec::Ring { edge_px: 5.0 });
         assert!(good.template().is_ok());
-        let known = |read_sd_grey, shot_grey_per_electron, black_level_grey| Noise::Known {
+        let known = |read_sd_grey, shot_grey_per_electron, black_level_grey| PixelNoise::Known {
             read_sd_grey,
             shot_grey_per_electron,
             black_level_grey,

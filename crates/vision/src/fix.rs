@@ -3,7 +3,7 @@
 /// Whether a fix can be used, and if not, why.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[repr(u8)]
-pub enum Verdict {
+pub enum FixQuality {
     /// The position and its covariance are valid.
     Good = 0,
     /// Nothing stands out of the background by the required signal-to-noise ratio.
@@ -38,12 +38,12 @@ pub struct Fix {
     /// Peak contrast over the noise of one pixel.
     pub snr: f64,
     /// Whether the fix can be used.
-    pub verdict: Verdict,
+    pub verdict: FixQuality,
 }
 
 impl Fix {
     /// A fix without a position: the place looked at and the reason.
-    pub fn none(x_px: f64, y_px: f64, verdict: Verdict) -> Self {
+    pub fn none(x_px: f64, y_px: f64, verdict: FixQuality) -> Self {
         Fix {
             x_px,
             y_px,

@@ -28,9 +28,9 @@ pub mod track;
 
 pub use blobs::{Blob, Blobs};
 pub use cells::{Cell, CellConfig, CellError, CellFinder};
-pub use config::{ConfigError, Learning, LocaliserConfig, Noise, Polarity};
+pub use config::{ConfigError, Learning, LocaliserConfig, PixelNoise, Polarity};
 pub use detector::Detector;
-pub use fix::{Fix, Verdict};
+pub use fix::{Fix, FixQuality};
 pub use frame::{Frame, Pixels};
 pub use learn::LearningReport;
 pub use localiser::Localiser;

@@ -1,9 +1,9 @@
 //! Position of one bead in a frame: seed, template fit, covariance, verdict.
 
-use crate::config::{ConfigError, LocaliserConfig, MAX_WINDOW_PX, Noise};
+use crate::config::{ConfigError, LocaliserConfig, MAX_WINDOW_PX, PixelNoise};
 use crate::crop::{Crop, Row, STRIDE};
 use crate::fit::{self, Pass, Weights};
-use crate::fix::{Fix, Verdict};
+use crate::fix::{Fix, FixQuality};
 use crate::frame::Frame;
 use crate::learn::{Learner, LearningReport};
 use crate::seed;
@@ -133,28 +133,28 @@ impl Localiser {
 
     /// Position of the bead nearest to `guess` (px), or of the strongest in the frame when there is no guess.
     ///
-    /// A fix whose verdict is not [`Verdict::Good`] carries what was found, for the record; it must not be used as a
+    /// A fix whose verdict is not [`FixQuality::Good`] carries what was found, for the record; it must not be used as a
     /// position.
     pub fn locate(&mut self, frame: &Frame, guess: Option<(f64, f64)>) -> Fix {
         let radius_px = self.template.radius_px();
         let start =
             guess.or_else(|| seed::strongest(frame, self.sign, radius_px, self.config.min_snr));
         let Some((x_px, y_px)) = start else {
-            return Fix::none(0.0, 0.0, Verdict::NoSignal);
+            return Fix::none(0.0, 0.0, FixQuality::NoSignal);
         };
         let window_px = self.config.window_px;
         let fix = self.attempt(frame, (x_px, y_px), window_px);
-        if fix.verdict == Verdict::Good {
+        if fix.verdict == FixQuality::Good {
             self.learn(&fix);
         }
-        if matches!(fix.verdict, Verdict::Good | Verdict::AtBorder) {
+        if matches!(fix.verdict, FixQuality::Good | FixQuality::AtBorder) {
             return fix;
         }
         // A neighbour may have come into the window's corner: once more with a window that just holds the bead.
         let narrow_px = 2 * (NARROW_RADII * radius_px).ceil() as usize + 1;
         if narrow_px < window_px {
             let again = self.attempt(frame, (x_px, y_px), narrow_px);
-            if again.verdict == Verdict::Good {
+            if again.verdict == FixQuality::Good {
                 return again;
             }
         }
@@ -166,7 +166,7 @@ impl Localiser {
             return fix;
         };
         let again = self.attempt(frame, centroid, window_px);
-        if matches!(again.verdict, Verdict::Good | Verdict::AtBorder) {
+        if matches!(again.verdict, FixQuality::Good | FixQuality::AtBorder) {
             again
         } else {
             fix
@@ -227,7 +227,7 @@ impl Localiser {
         // attempt has come to on something else.
         self.comb = Comb::new(self.streak_px, self.template.radius_px());
         if !self.take_window(frame, x_px, y_px, side_px) {
-            return Fix::none(x_px, y_px, Verdict::AtBorder);
+            return Fix::none(x_px, y_px, FixQuality::AtBorder);
         }
         let mut fitted = self.fit(frame, x_px, y_px, side_px);
         if !self.comb.is_still() {
@@ -241,7 +241,7 @@ impl Localiser {
         let mut fix = self.judge(frame, fitted, (x_px, y_px));
         self.widen(&mut fix);
         let whole = side_px == self.config.window_px && self.comb.is_still();
-        if fix.verdict == Verdict::Good && whole {
+        if fix.verdict == FixQuality::Good && whole {
             self.update_noise();
         }
         fix
@@ -249,7 +249,7 @@ impl Localiser {
 
     /// Widens a good fix's covariance by what the template leaves of the window.
     fn widen(&mut self, fix: &mut Fix) {
-        if fix.verdict != Verdict::Good || fix.residual_ratio <= WIDENED_RATIO {
+        if fix.verdict != FixQuality::Good || fix.residual_ratio <= WIDENED_RATIO {
             return;
         }
         let now = fit::widening(
@@ -336,8 +336,8 @@ impl Localiser {
 
     fn update_noise(&mut self) {
         self.noise_variance = Some(match self.config.noise {
-            Noise::Known { read_sd_grey, .. } => read_sd_grey * read_sd_grey,
-            Noise::Estimated => {
+            PixelNoise::Known { read_sd_grey, .. } => read_sd_grey * read_sd_grey,
+            PixelNoise::Estimated => {
                 let now = self.crop.noise_variance().max(ROUNDING_VARIANCE);
                 match self.noise_variance {
                     Some(before) => before + NOISE_FORGETTING * (now - before),
@@ -351,7 +351,7 @@ impl Localiser {
     fn weights(&self, before: Option<&Pass>) -> Weights {
         match (self.config.noise, before) {
             (
-                Noise::Known {
+                PixelNoise::Known {
                     read_sd_grey,
                     shot_grey_per_electron: gain,
                     black_level_grey: black,
@@ -382,7 +382,7 @@ impl Localiser {
     /// Noise variance that a weight of 1 stands for: even weights are relative, those with shot noise absolute.
     fn weight_unit(&self) -> f64 {
         match self.config.noise {
-            Noise::Known {
+            PixelNoise::Known {
                 shot_grey_per_electron,
                 ..
             } if shot_grey_per_electron > 0.0 => 1.0,
@@ -391,7 +391,7 @@ impl Localiser {
     }
 
     fn fit(&mut self, frame: &Frame, x_px: f64, y_px: f64, side_px: usize) -> Option<Fitted> {
-        let shot = matches!(self.config.noise, Noise::Known { shot_grey_per_electron, .. } if shot_grey_per_electron > 0.0);
+        let shot = matches!(self.config.noise, PixelNoise::Known { shot_grey_per_electron, .. } if shot_grey_per_electron > 0.0);
         let reach_px = 0.4 * self.template.radius_px();
         let (mut x_px, mut y_px) = (x_px, y_px);
         let mut before: Option<Pass> = None;
@@ -454,7 +454,7 @@ impl Localiser {
 
     fn judge(&self, frame: &Frame, fitted: Option<Fitted>, guess: (f64, f64)) -> Fix {
         let Some(f) = fitted else {
-            return Fix::none(guess.0, guess.1, Verdict::NoSignal);
+            return Fix::none(guess.0, guess.1, FixQuality::NoSignal);
         };
         let amplitude = f.pass.amplitude;
         let background = f.pass.background + f64::from(self.crop.pedestal);
@@ -474,15 +474,15 @@ impl Localiser {
         let kept = in_window(f.x_px, self.crop.x0, self.crop.width)
             && in_window(f.y_px, self.crop.y0, self.crop.height);
         let verdict = if snr < self.config.min_snr {
-            Verdict::NoSignal
+            FixQuality::NoSignal
         } else if !f.converged || !kept {
-            Verdict::NotConverged
+            FixQuality::NotConverged
         } else if residual_ratio > tolerated {
-            Verdict::BadFit
+            FixQuality::BadFit
         } else if !inside(f.x_px, frame.width) || !inside(f.y_px, frame.height) {
-            Verdict::AtBorder
+            FixQuality::AtBorder
         } else {
-            Verdict::Good
+            FixQuality::Good
         };
         Fix {
             x_px: f.x_px,

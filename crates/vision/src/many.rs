@@ -5,7 +5,7 @@
 //! knowingly.
 
 use crate::detector::Detector;
-use crate::fix::{Fix, Verdict};
+use crate::fix::{Fix, FixQuality};
 use crate::frame::Frame;
 use crate::localiser::Localiser;
 
@@ -126,7 +126,7 @@ impl ManyTracker {
             let bead = match owner {
                 Some(t) => self.tracks[t].bead,
                 // A number is given only to what looks like a bead.
-                None if fix.verdict == Verdict::Good => {
+                None if fix.verdict == FixQuality::Good => {
                     let bead = self.next;
                     self.next += 1;
                     self.tracks.push(Track {

@@ -5,7 +5,7 @@
 //! becomes the template: aligned, fitted, aligned again. Offline; allocates.
 
 use crate::config::{LocaliserConfig, MAX_WINDOW_PX, Polarity};
-use crate::fix::Verdict;
+use crate::fix::FixQuality;
 use crate::frame::Frame;
 use crate::localiser::Localiser;
 use crate::objects::{Flat, Object, Refused};
@@ -167,7 +167,7 @@ fn learn(
             };
             let fix = localiser.locate(frame, Some((bead.x_px, bead.y_px)));
             let near = f64::hypot(fix.x_px - bead.x_px, fix.y_px - bead.y_px);
-            if fix.verdict == Verdict::Good && near < localiser.template().radius_px() {
+            if fix.verdict == FixQuality::Good && near < localiser.template().radius_px() {
                 (bead.x_px, bead.y_px) = (fix.x_px, fix.y_px);
                 fits.push((bead.frame, fix));
             }

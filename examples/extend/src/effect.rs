@@ -2,7 +2,7 @@
 
 use cellpos_plant::effects::{
     Action, Block, Candidate, Effect, EffectKind, Experiment, Form, ParameterSpec, Place, Scope,
-    Segment, Spec, log,
+    Piece, Spec, log,
 };
 
 /// Where it is known under its id: hand it to [`cellpos_plant::effects::register`].
@@ -85,8 +85,8 @@ impl OneSided {
 }
 
 impl Block for OneSided {
-    fn advance(&mut self, _: f64, h_s: f64, input: Segment) -> Segment {
-        Segment {
+    fn advance(&mut self, _: f64, h_s: f64, input: Piece) -> Piece {
+        Piece {
             start: self.at(input.start),
             end: self.at(input.end),
             integral: input.integral - self.lost(input.start, input.end, h_s),

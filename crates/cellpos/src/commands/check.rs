@@ -5,7 +5,7 @@ use crate::output;
 use crate::rig_file::RigFile;
 use crate::setup;
 use cellpos_plant::Model;
-use cellpos_report::{Axis, Column, Figure, Panel, Report, Series, Status, Table};
+use cellpos_report::{Axis, Column, Emphasis, Figure, Panel, Report, Series, Table};
 use cellpos_script::{Check, CheckLimits, Script, check};
 use cellpos_units::{Micrometers, MicrometersPerSecond};
 use std::path::PathBuf;
@@ -217,10 +217,10 @@ fn report(script: &Script, check: &Check, limits: &CheckLimits) -> Report {
         report.paragraph(&script.notes);
     }
     if check.violations.is_empty() {
-        report.note(Status::Good, "The script can run.");
+        report.note(Emphasis::Good, "The script can run.");
     }
     for line in violations(script, check) {
-        report.note(Status::Bad, &line);
+        report.note(Emphasis::Bad, &line);
     }
     let mut table = Table::new([Column::left("figure"), Column::right("value")]);
     for (name, value) in figures(check) {

@@ -16,7 +16,7 @@ use crate::arguments::run_folder;
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
 use crate::output;
 use cellpos_record::{CYCLES_CSV, RunEnd, RunReader};
-use cellpos_report::{Axis, Column, Figure, Panel, Report, Series, Status, Table};
+use cellpos_report::{Axis, Column, Emphasis, Figure, Panel, Report, Series, Table};
 use cellpos_runtime::Summary;
 use cellpos_runtime::summary::plan_warning;
 use cellpos_script::read_cycles;
@@ -128,12 +128,12 @@ fn nm(um: Option<f64>) -> String {
 }
 
 /// How a session ended.
-fn ending(session: &Session) -> (Status, String) {
+fn ending(session: &Session) -> (Emphasis, String) {
     match session.meta.as_ref().and_then(|meta| meta.end.as_ref()) {
-        Some(end) if end.outcome == "done" => (Status::Good, "came to its end".to_string()),
-        Some(end) => (Status::Warning, format!("ended: {}", end.outcome)),
+        Some(end) if end.outcome == "done" => (Emphasis::Good, "came to its end".to_string()),
+        Some(end) => (Emphasis::Warning, format!("ended: {}", end.outcome)),
         None => (
-            Status::Bad,
+            Emphasis::Bad,
             "was cut off: it reads up to its last flush".to_string(),
         ),
     }
@@ -243,7 +243,7 @@ fn head(page: &mut Report, sessions: &[Session], ticks: &Ticks) {
         .sum();
     if missing + damaged > 0 {
         let text = format!("{missing} rows are missing, {damaged} bytes damaged.");
-        page.note(Status::Warning, &text);
+        page.note(Emphasis::Warning, &text);
     }
     let unwritten = |of: fn(&RunEnd) -> u64| {
         let ends = sessions.iter().filter_map(end);
@@ -255,7 +255,7 @@ fn head(page: &mut Report, sessions: &[Session], ticks: &Ticks) {
     );
     if rows + events > 0 {
         let text = format!("{rows} rows and {events} events could not be written.");
-        page.note(Status::Warning, &text);
+        page.note(Emphasis::Warning, &text);
     }
     for end in sessions.iter().filter_map(end) {
         let percent = end
@@ -265,7 +265,7 @@ fn head(page: &mut Report, sessions: &[Session], ticks: &Ticks) {
         let most = Summary::PLAN_OFF_PERCENT;
         if let Some(percent) = percent.filter(|percent| percent.is_nan() || percent.abs() > most) {
             let text = format!("In this run {}.", plan_warning(percent));
-            page.note(Status::Warning, &text);
+            page.note(Emphasis::Warning, &text);
         }
     }
     let rows = [

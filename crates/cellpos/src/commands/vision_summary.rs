@@ -3,7 +3,7 @@
 use super::vision::Advice;
 use cellpos_drivers::CalibrationFile;
 use cellpos_drivers::sources::RecordingInfo;
-use cellpos_vision::{Cell, Fix, Verdict};
+use cellpos_vision::{Cell, Fix, FixQuality};
 use serde::Serialize;
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -115,7 +115,7 @@ pub struct Times {
 impl Tally {
     /// A bead's fix in a frame.
     pub fn fix(&mut self, frame: usize, bead: u32, fix: &Fix) {
-        if fix.verdict != Verdict::Good {
+        if fix.verdict != FixQuality::Good {
             self.refuse(verdict_name(fix.verdict));
             return;
         }
@@ -241,13 +241,13 @@ impl Tally {
 }
 
 /// The word for a verdict.
-pub fn verdict_name(verdict: Verdict) -> &'static str {
+pub fn verdict_name(verdict: FixQuality) -> &'static str {
     match verdict {
-        Verdict::Good => "good",
-        Verdict::NoSignal => "no-signal",
-        Verdict::BadFit => "bad-fit",
-        Verdict::AtBorder => "at-border",
-        Verdict::NotConverged => "not-converged",
+        FixQuality::Good => "good",
+        FixQuality::NoSignal => "no-signal",
+        FixQuality::BadFit => "bad-fit",
+        FixQuality::AtBorder => "at-border",
+        FixQuality::NotConverged => "not-converged",
     }
 }
 
@@ -298,7 +298,7 @@ mod tests {
                 &Fix {
                     x_px: x + ex,
                     y_px: y + ey,
-                    ..Fix::none(0.0, 0.0, Verdict::Good)
+                    ..Fix::none(0.0, 0.0, FixQuality::Good)
                 },
             );
         }

@@ -80,12 +80,12 @@ impl Default for Evidence {
 
 /// Variance of the differenced error, as far as it is noise.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Noise {
+pub(super) struct ErrorNoise {
     um2: f64,
     ticks: f64,
 }
 
-impl Default for Noise {
+impl Default for ErrorNoise {
     fn default() -> Self {
         Self {
             um2: FIRST_NOISE_UM2,
@@ -94,7 +94,7 @@ impl Default for Noise {
     }
 }
 
-impl Noise {
+impl ErrorNoise {
     fn with(&self, (um2, ticks): (f64, f64)) -> Self {
         let all = self.ticks + ticks;
         Self {
@@ -186,7 +186,7 @@ impl Evidence {
     }
 
     /// The noise with that of this stretch: what is left beside the harmonics.
-    pub fn noise(&self, harmonics: impl Iterator<Item = u32>, known: &Noise) -> Noise {
+    pub fn noise(&self, harmonics: impl Iterator<Item = u32>, known: &ErrorNoise) -> ErrorNoise {
         let n = f64::from(self.ticks.max(1));
         let (mut square, mut free) = (self.squares / n - (self.sum / n).powi(2), n - 1.0);
         for h in harmonics {
@@ -200,7 +200,7 @@ impl Evidence {
     }
 
     /// Variance of [`Evidence::error`], `E|.|^2`, um^2.
-    pub fn variance_um2(&self, harmonic: u32, advance: f64, noise: &Noise) -> f64 {
+    pub fn variance_um2(&self, harmonic: u32, advance: f64, noise: &ErrorNoise) -> f64 {
         4.0 * noise.um2 / f64::from(self.ticks.max(1)) / through(harmonic, advance).norm_sqr()
     }
 }

@@ -1,7 +1,7 @@
 //! What is known of one harmonic of the addition, and how a stretch of ticks corrects it.
 
 use super::config::HarmonicResponse;
-use super::evidence::{Driven, Evidence, Noise};
+use super::evidence::{Driven, ErrorNoise, Evidence};
 use nalgebra::Complex;
 
 /// Variances by which an error must stand out before it is learned: noise does it in one look of 8000.
@@ -42,7 +42,7 @@ impl Line {
         &mut self,
         response: &HarmonicResponse,
         evidence: &Evidence,
-        noise: &Noise,
+        noise: &ErrorNoise,
         (advance, floor, most): (f64, f64, f64),
         driven: &Driven,
     ) {

@@ -7,8 +7,8 @@ use cellpos_rig::{
     SeenFrame, SourceInfo,
 };
 use cellpos_vision::{
-    Decision, Localiser, LocaliserConfig, PixelResponse, ProfileSpec, Template, TrackState,
-    Tracker, TrackerConfig, Verdict,
+    Decision, FixQuality, Localiser, LocaliserConfig, PixelResponse, ProfileSpec, Template,
+    TrackState, Tracker, TrackerConfig,
 };
 use std::sync::{Arc, Mutex};
 
@@ -138,7 +138,7 @@ fn a_bead_flung_by_a_command_is_followed_and_one_flung_by_nothing_is_not_believe
                 if n == 10 {
                     assert_eq!(
                         (decision, m.verdict),
-                        (Decision::OutsideGate, Verdict::Good)
+                        (Decision::OutsideGate, FixQuality::Good)
                     );
                 }
             }

@@ -2,7 +2,7 @@
 
 use cellpos_emulator::{CellConfig, FaultEvent, FaultKind, Faults, World, WorldConfig};
 use cellpos_plant::Model;
-use cellpos_vision::{CellFinder, Frame, Pixels, Verdict};
+use cellpos_vision::{CellFinder, FixQuality, Frame, Pixels};
 
 fn config() -> WorldConfig {
     WorldConfig {
@@ -194,7 +194,7 @@ fn a_cell_that_reaches_out_of_the_frame_is_at_the_border_with_and_without_pictur
     let mut world = World::new(&config, &Model::eq6(), 0).unwrap();
     world.advance_to(10_000_000, config.neutral_um);
     let fix = world.take_position().unwrap();
-    assert_eq!(fix.verdict, Verdict::AtBorder);
+    assert_eq!(fix.verdict, FixQuality::AtBorder);
     assert!(fix.length_um.is_nan() && fix.area_um2.is_nan());
 }
 

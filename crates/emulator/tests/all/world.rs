@@ -2,7 +2,7 @@
 
 use cellpos_emulator::{FaultKind, Faults, FrameInfo, PositionFix, World, WorldConfig};
 use cellpos_plant::{Model, effects};
-use cellpos_vision::{Frame, Localiser, LocaliserConfig, Pixels, ProfileSpec, Verdict};
+use cellpos_vision::{FixQuality, Frame, Localiser, LocaliserConfig, Pixels, ProfileSpec};
 
 pub(crate) const MS: i64 = 1_000_000;
 
@@ -158,7 +158,7 @@ pub(crate) fn locate(
     world: &mut World,
     localiser: &mut Localiser,
     pixels: &mut Vec<u8>,
-) -> Option<(FrameInfo, f64, f64, Verdict)> {
+) -> Option<(FrameInfo, f64, f64, FixQuality)> {
     let info = world.take_frame(pixels)?;
     let frame = Frame {
         width: 256,
@@ -187,7 +187,7 @@ fn vision_finds_the_bead_where_it_is_with_the_noise_that_positions_are_given() {
         world.advance_to(k * MS, 20.0);
         if let Some((info, x_um, sd_um, verdict)) = locate(&mut world, &mut localiser, &mut pixels)
         {
-            assert_eq!(verdict, Verdict::Good, "frame {}", info.id);
+            assert_eq!(verdict, FixQuality::Good, "frame {}", info.id);
             let error = x_um - info.true_um;
             assert!(
                 error.abs() < 6.0 * sd_um,

@@ -2,7 +2,7 @@
 
 use crate::world::{MS, ids, localiser, locate, positions, quiet, world};
 use cellpos_emulator::{FaultKind, Faults, World, WorldConfig};
-use cellpos_vision::Verdict;
+use cellpos_vision::FixQuality;
 
 #[test]
 fn frames_are_dropped_doubled_reordered_and_go_stale_at_their_rates() {
@@ -65,7 +65,7 @@ fn a_lost_bead_is_gone_from_pictures_and_positions_and_comes_back() {
     let fixes = positions(&mut world(&config), 300, 20.0);
     let lost: Vec<u64> = fixes
         .iter()
-        .filter(|fix| fix.verdict != Verdict::Good)
+        .filter(|fix| fix.verdict != FixQuality::Good)
         .map(|fix| fix.info.id)
         .collect();
     // Exposed from 99.75 ms + 1 on: ids 99 (middle 100 ms, half lit) to 149.
@@ -81,7 +81,7 @@ fn a_lost_bead_is_gone_from_pictures_and_positions_and_comes_back() {
     assert!(
         verdicts
             .iter()
-            .all(|&(id, verdict)| (verdict == Verdict::Good) == (id < 99)),
+            .all(|&(id, verdict)| (verdict == FixQuality::Good) == (id < 99)),
         "{verdicts:?}"
     );
 }
@@ -132,8 +132,8 @@ fn a_second_bead_shows_in_the_picture_and_spoils_the_position_when_it_is_close()
     assert!(bright(&pixels, column(0.0)) && bright(&pixels, column(6.0)));
     assert!(!bright(&pixels, column(3.0)));
     let verdict = |world: &mut World| positions(world, 20, 20.0).pop().unwrap().verdict;
-    assert_eq!(verdict(&mut at(6.0)), Verdict::Good);
-    assert_eq!(verdict(&mut at(0.7)), Verdict::BadFit);
+    assert_eq!(verdict(&mut at(6.0)), FixQuality::Good);
+    assert_eq!(verdict(&mut at(0.7)), FixQuality::BadFit);
 }
 
 #[test]

@@ -4,7 +4,7 @@ pub mod held_bead;
 mod partial;
 
 use crate::on_rig::{Acquired, Listener, OnRig, Trouble};
-use cellpos_ident::excitation::Limits;
+use cellpos_ident::excitation::ExcitationLimits;
 use cellpos_ident::experiment::{Cause, Measured, Plan, RecordedSegment, Turn};
 use cellpos_ident::frequency_response::Settings;
 use cellpos_ident::summary::{Identification, summarise};
@@ -38,7 +38,7 @@ pub struct Job {
     /// How to excite.
     pub excitation: Excitation,
     /// Largest amplitudes.
-    pub limits: Limits,
+    pub limits: ExcitationLimits,
     /// Measuring time per line is this over the frequency, s at 1 Hz.
     pub seconds_at_1_hz: f64,
     /// Edges of the LED test; 0: none.
@@ -430,7 +430,7 @@ mod tests {
 
     #[test]
     fn a_segment_that_fails_again_and_again_is_run_more_gently_and_one_that_failed_once_is_not() {
-        let limits = Limits {
+        let limits = ExcitationLimits {
             bead_um: 8.0,
             bead_um_per_s: 400.0,
             pzt_um: 10.0,

@@ -10,7 +10,7 @@ pub use result::{Basis, Excitation, ForeignResult, ForeignSettings, Harmonic, Li
 
 use crate::error::IdentError;
 use crate::feedback::{by_reference, feedback};
-use crate::frequency_response::{DetectionLine, FrequencyPoint, Segment, Settings, measure};
+use crate::frequency_response::{DetectionLine, DrivenStretch, FrequencyPoint, Settings, measure};
 use crate::rational::{RationalFit, fit_orders};
 use crate::sampled::Sampling;
 use crate::spectral::{find_lines, residual_of, welch};
@@ -276,7 +276,7 @@ fn from_lines(
     } else {
         Whitening::Levels
     };
-    let segment = Segment {
+    let segment = DrivenStretch {
         input,
         output,
         from: 0,

@@ -3,15 +3,15 @@
 use crate::common::{PERIOD_S, PositionRig, expected};
 use cellpos_ident::candidate_model::CandidateModel;
 use cellpos_ident::delay::{SeenEdge, delay_from_edges, dithered_edges};
-use cellpos_ident::excitation::{Limits, PAPER_FREQUENCIES_HZ};
+use cellpos_ident::excitation::{ExcitationLimits, PAPER_FREQUENCIES_HZ};
 use cellpos_ident::experiment::{Measured, Plan};
 use cellpos_ident::frequency_response::Settings;
+use cellpos_ident::identifiability::{Judged, judge};
 use cellpos_ident::order_selection::{CandidateFits, DelayPrior, OrderSelection};
 use cellpos_ident::sampled::Sampling;
-use cellpos_ident::verdict::{Judged, judge};
 use cellpos_plant::TransferFunction;
 
-const LIMITS: Limits = Limits {
+const LIMITS: ExcitationLimits = ExcitationLimits {
     bead_um_per_s: 1e9,
     bead_um: 8.0,
     pzt_um: 3.5,

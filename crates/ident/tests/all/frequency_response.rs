@@ -4,9 +4,9 @@ use crate::common::{PERIOD_S, PositionRig, expected};
 use cellpos_ident::IdentError;
 use cellpos_ident::bare_fft;
 use cellpos_ident::candidate_model::CandidateModel;
-use cellpos_ident::excitation::{Limits, PAPER_FREQUENCIES_HZ, Signal, Tone};
+use cellpos_ident::excitation::{ExcitationLimits, PAPER_FREQUENCIES_HZ, Signal, Tone};
 use cellpos_ident::experiment::{Cause, Plan, PlannedSegment};
-use cellpos_ident::frequency_response::{Estimator, Segment, Settings, measure};
+use cellpos_ident::frequency_response::{DrivenStretch, Estimator, Settings, measure};
 use cellpos_ident::order_selection::OrderSelection;
 use cellpos_ident::random::Random;
 use cellpos_ident::sampled::Sampling;
@@ -41,7 +41,7 @@ fn a_drift_of_10_um_per_s_biases_the_sine_fit_by_less_than_a_fifth_of_a_percent_
         let (input, output) = drifting(f, 2000, 10.0);
         let truth = model.sampled_response(f, Sampling::held(1.0 / PERIOD_S));
         let lines = [f];
-        let segment = Segment {
+        let segment = DrivenStretch {
             input: &input,
             output: &output,
             from: 0,
@@ -127,7 +127,7 @@ fn feedback_at_low_coherence_biases_the_direct_estimate_and_not_the_joint_one() 
 
 #[test]
 fn a_lost_bead_ends_the_run_cleanly_and_the_experiment_resumes_at_its_segment() {
-    let limits = Limits {
+    let limits = ExcitationLimits {
         bead_um_per_s: 1e9,
         bead_um: 5.0,
         pzt_um: 3.0,
@@ -161,7 +161,7 @@ fn a_lost_bead_ends_the_run_cleanly_and_the_experiment_resumes_at_its_segment() 
 
 #[test]
 fn one_lost_frame_in_ten_costs_precision_and_no_accuracy() {
-    let limits = Limits {
+    let limits = ExcitationLimits {
         bead_um_per_s: 1e9,
         bead_um: 5.0,
         pzt_um: 3.0,
@@ -188,7 +188,7 @@ fn a_multisine_gives_the_same_plant_in_one_go_and_its_detection_lines_stay_silen
     let lines: Vec<f64> = (0..16)
         .map(|i| 2.0 * 150f64.powf(f64::from(i) / 15.0))
         .collect();
-    let limits = Limits {
+    let limits = ExcitationLimits {
         bead_um_per_s: 1e9,
         bead_um: 9.0,
         pzt_um: 3.5,
@@ -222,7 +222,7 @@ fn a_literal_63_per_s_is_flagged_as_a_factor_of_two_pi() {
     assert!(literal_per_hertz(428.0, 63.0).is_some());
     assert!(literal_per_hertz(379.0, 63.0).is_some());
     assert!(literal_per_hertz(428.0, 2.0 * std::f64::consts::PI * 63.0).is_none());
-    let limits = Limits {
+    let limits = ExcitationLimits {
         bead_um_per_s: 1e9,
         bead_um: 6.0,
         pzt_um: 3.0,
@@ -283,7 +283,7 @@ fn an_input_that_does_not_move_is_named() {
     let mut random = Random::new(1);
     let output: Vec<f64> = (0..4000).map(|_| random.normal()).collect();
     let input = vec![4.0; 4000];
-    let segment = Segment {
+    let segment = DrivenStretch {
         input: &input,
         output: &output,
         from: 0,

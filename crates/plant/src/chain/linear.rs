@@ -1,6 +1,6 @@
 //! A group of adjoining linear blocks, advanced exactly for inputs that are straight lines.
 
-use crate::effects::Segment;
+use crate::effects::Piece;
 use crate::modal::{Zpk, residues, separate};
 use crate::phi::phi;
 use nalgebra::Complex;
@@ -245,17 +245,17 @@ impl LinearGroup {
     }
 
     /// Advances over a piece. `want` says whether integral and slopes are needed.
-    pub(crate) fn advance(&mut self, h_s: f64, input: Segment, want: bool) -> Segment {
+    pub(crate) fn advance(&mut self, h_s: f64, input: Piece, want: bool) -> Piece {
         let rise = input.end - input.start;
         self.last_input = input.end;
         self.last_slope = input.speed_end;
         if h_s <= 0.0 {
             self.last_input = input.start;
             let value = self.state_output() + self.direct * input.start;
-            return Segment {
+            return Piece {
                 start: value,
                 end: value,
-                ..Segment::default()
+                ..Piece::default()
             };
         }
         let start = self.state_output() + self.direct * input.start;
@@ -267,7 +267,7 @@ impl LinearGroup {
         let index = self.slot(h_s);
         let mut integral = 0.0;
         let Some(slot) = self.slots.get(index) else {
-            return Segment::default();
+            return Piece::default();
         };
         let modes = self.real.iter().zip(&slot.real).zip(&mut self.x);
         for ((m, s), x) in modes {
@@ -285,7 +285,7 @@ impl LinearGroup {
             }
             *z = s.decay * *z + s.hold * input.start + s.ramp * rise;
         }
-        Segment {
+        Piece {
             start,
             end: self.state_output() + self.direct * input.end,
             integral: integral + self.direct * input.integral,

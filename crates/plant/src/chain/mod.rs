@@ -11,7 +11,7 @@ mod compile;
 mod linear;
 mod tied;
 
-use crate::effects::{EffectError, Segment};
+use crate::effects::{EffectError, Piece};
 use crate::model::Model;
 use crate::random::Gaussian;
 use compile::{Compiled, Stage};
@@ -86,7 +86,7 @@ pub struct Chain {
     time_s: f64,
     command_um: f64,
     driver_um: f64,
-    output: Segment,
+    output: Piece,
     offset_um: f64,
     area_um_s: f64,
     wants_area: bool,
@@ -124,7 +124,7 @@ impl Chain {
             time_s: 0.0,
             command_um: 0.0,
             driver_um: 0.0,
-            output: Segment::default(),
+            output: Piece::default(),
             offset_um: 0.0,
             area_um_s: 0.0,
             wants_area: false,
@@ -177,7 +177,7 @@ impl Chain {
         self.time_s = 0.0;
         self.command_um = 0.0;
         self.driver_um = 0.0;
-        self.output = Segment::default();
+        self.output = Piece::default();
         self.offset_um = 0.0;
         self.area_um_s = 0.0;
     }
@@ -239,8 +239,8 @@ impl Chain {
 
     fn piece(&mut self, h_s: f64, start: f64, end: f64) {
         let want = self.compiled.needs_slopes || self.wants_area;
-        let mut signal = Segment::line(start, end, h_s);
-        let mut beside = Segment::default();
+        let mut signal = Piece::line(start, end, h_s);
+        let mut beside = Piece::default();
         for (i, stage) in self.compiled.stages.iter_mut().enumerate() {
             if i == self.compiled.plant {
                 for group in &mut self.compiled.bypass {

@@ -1,7 +1,7 @@
 //! [`TiedPlant`]: the plant with what is tied to it, feedback of its position and equations in its stead.
 
 use super::linear::LinearGroup;
-use crate::effects::{Around, Seen, Segment};
+use crate::effects::{Around, Piece, Seen};
 use crate::modal::Zpk;
 
 /// A plant with effects that see its input and its position: what enters it may depend on where it is.
@@ -86,7 +86,7 @@ impl TiedPlant {
     }
 
     /// Advances over a step of `h_s` (zero: the input jumps) in which the input is a straight line.
-    pub fn advance(&mut self, time_s: f64, h_s: f64, input: Segment) -> Segment {
+    pub fn advance(&mut self, time_s: f64, h_s: f64, input: Piece) -> Piece {
         let (first, position, velocity) = self.beginning(time_s, input.start);
         let now = |input| Seen {
             time_s,
@@ -96,14 +96,14 @@ impl TiedPlant {
         };
         if h_s <= 0.0 {
             self.plant
-                .advance(0.0, Segment::line(first, first, 0.0), true);
+                .advance(0.0, Piece::line(first, first, 0.0), true);
             self.drive = first;
             (self.position, self.velocity) = (position, velocity);
             let shown = self.shown(&now(first), position);
-            return Segment {
+            return Piece {
                 start: shown,
                 end: shown,
-                ..Segment::default()
+                ..Piece::default()
             };
         }
         let (ahead, speed_ahead) = self.plant.ahead(h_s, first);
@@ -120,7 +120,7 @@ impl TiedPlant {
             from = tie.give(&seen);
             tie.advance(h_s, &seen, &later);
         }
-        let out = self.plant.advance(h_s, Segment::line(from, to, h_s), true);
+        let out = self.plant.advance(h_s, Piece::line(from, to, h_s), true);
         self.drive = to;
         self.velocity = out.speed_end;
         self.position = out.end;
@@ -134,7 +134,7 @@ impl TiedPlant {
             tie.advance(h_s, &seen, &later);
         }
         let end = self.shown(&later, out.end);
-        Segment::line(start, end, h_s)
+        Piece::line(start, end, h_s)
     }
 
     /// What is seen of a position.

@@ -40,7 +40,7 @@ pub enum Action {
 
 /// A signal over one piece of time: a straight line, or close enough to one, from `start` to `end`.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct Segment {
+pub struct Piece {
     /// Just after the piece's beginning, um.
     pub start: f64,
     /// Just before its end, um.
@@ -53,7 +53,7 @@ pub struct Segment {
     pub speed_end: f64,
 }
 
-impl Segment {
+impl Piece {
     /// A straight line over `h_s`.
     pub fn line(start: f64, end: f64, h_s: f64) -> Self {
         let speed = if h_s > 0.0 { (end - start) / h_s } else { 0.0 };
@@ -72,7 +72,7 @@ impl Segment {
 /// In the loop of an emulated rig: no allocation, no panic.
 pub trait Block: fmt::Debug + Send + Sync {
     /// Advances over a piece of `h_s` (zero: the input jumps, no time passes) that begins at `time_s`.
-    fn advance(&mut self, time_s: f64, h_s: f64, input: Segment) -> Segment;
+    fn advance(&mut self, time_s: f64, h_s: f64, input: Piece) -> Piece;
 
     /// Back to rest.
     fn reset(&mut self);

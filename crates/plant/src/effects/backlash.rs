@@ -2,8 +2,8 @@
 
 use super::candidate::one;
 use super::{
-    Action, Block, Candidate, Effect, EffectKind, Experiment, Form, ParameterSpec, Place, Scope,
-    Segment, Spec, log,
+    Action, Block, Candidate, Effect, EffectKind, Experiment, Form, ParameterSpec, Piece, Place,
+    Scope, Spec, log,
 };
 
 /// Play in the coupling to the syringe: `x = max(u - width/2, min(u + width/2, x))`.
@@ -67,14 +67,14 @@ struct Play {
 }
 
 impl Block for Play {
-    fn advance(&mut self, _: f64, h_s: f64, input: Segment) -> Segment {
+    fn advance(&mut self, _: f64, h_s: f64, input: Piece) -> Piece {
         let mut follow = |u: f64| {
             self.x = (u - self.half_um).max((u + self.half_um).min(self.x));
             self.x
         };
         let start = follow(input.start);
         let end = follow(input.end);
-        Segment::line(start, end, h_s)
+        Piece::line(start, end, h_s)
     }
 
     fn reset(&mut self) {

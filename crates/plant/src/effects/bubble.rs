@@ -3,7 +3,7 @@
 use super::candidate::{grid, one};
 use super::{
     Action, Block, Candidate, Effect, EffectKind, Experiment, FitParameter, Form, ParameterSpec,
-    Place, Scope, Segment, Spec, lin, log,
+    Piece, Place, Scope, Spec, lin, log,
 };
 use crate::modal::Zpk;
 use crate::phi::phi;
@@ -106,10 +106,10 @@ struct Dissolving {
 }
 
 impl Block for Dissolving {
-    fn advance(&mut self, time_s: f64, h_s: f64, input: Segment) -> Segment {
+    fn advance(&mut self, time_s: f64, h_s: f64, input: Piece) -> Piece {
         let start = self.y;
         if h_s <= 0.0 {
-            return Segment::line(start, start, 0.0);
+            return Piece::line(start, start, 0.0);
         }
         // The lag changes over seconds, a piece lasts less than a millisecond: its mean is enough.
         let now = (self.lag * (-self.dissolution * (time_s + 0.5 * h_s)).exp()).max(1e-9);
@@ -118,7 +118,7 @@ impl Block for Dissolving {
         let gain = h_s / now;
         self.y = f.exp.re * start + gain * (f.one.re * input.start + f.two.re * rise);
         self.speed = (input.end - self.y) / now;
-        Segment {
+        Piece {
             start,
             end: self.y,
             integral: input.integral - now * (self.y - start),

@@ -2,8 +2,8 @@
 
 use super::candidate::one;
 use super::{
-    Action, Block, Candidate, Effect, EffectKind, Experiment, Form, ParameterSpec, Place, Scope,
-    Segment, Spec, lin,
+    Action, Block, Candidate, Effect, EffectKind, Experiment, Form, ParameterSpec, Piece, Place,
+    Scope, Spec, lin,
 };
 
 /// A constant flow added to the plant's.
@@ -67,9 +67,9 @@ struct Flow {
 }
 
 impl Block for Flow {
-    fn advance(&mut self, time_s: f64, h_s: f64, input: Segment) -> Segment {
+    fn advance(&mut self, time_s: f64, h_s: f64, input: Piece) -> Piece {
         let v = self.um_per_s;
-        Segment {
+        Piece {
             start: input.start + v * time_s,
             end: input.end + v * (time_s + h_s),
             integral: input.integral + v * h_s * (time_s + 0.5 * h_s),

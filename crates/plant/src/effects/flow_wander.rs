@@ -1,7 +1,7 @@
 //! `flow-wander`: a flow that wanders.
 
 use super::{
-    Action, Block, Effect, EffectKind, Experiment, Form, ParameterSpec, Place, Scope, Segment, Spec,
+    Action, Block, Effect, EffectKind, Experiment, Form, ParameterSpec, Piece, Place, Scope, Spec,
 };
 use crate::random::Gaussian;
 
@@ -63,7 +63,7 @@ struct Wander {
 }
 
 impl Block for Wander {
-    fn advance(&mut self, _: f64, h_s: f64, input: Segment) -> Segment {
+    fn advance(&mut self, _: f64, h_s: f64, input: Piece) -> Piece {
         let (old, from) = (self.speed, self.way);
         if let Some(random) = &mut self.random
             && h_s > 0.0
@@ -73,7 +73,7 @@ impl Block for Wander {
                 keep * old + self.um_per_s * (1.0 - keep * keep).sqrt() * random.next_normal();
             self.way += 0.5 * (old + self.speed) * h_s;
         }
-        Segment {
+        Piece {
             start: input.start + from,
             end: input.end + self.way,
             integral: input.integral + 0.5 * (from + self.way) * h_s,

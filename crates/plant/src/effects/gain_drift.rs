@@ -2,8 +2,8 @@
 
 use super::candidate::one;
 use super::{
-    Action, Block, Candidate, Effect, EffectKind, Experiment, Form, ParameterSpec, Place, Scope,
-    Segment, Spec, lin,
+    Action, Block, Candidate, Effect, EffectKind, Experiment, Form, ParameterSpec, Piece, Place,
+    Scope, Spec, lin,
 };
 
 /// The velocity gain drifts: `K(t) = K0 (1 + per_s t)`.
@@ -65,11 +65,11 @@ struct Drift {
 }
 
 impl Block for Drift {
-    fn advance(&mut self, time_s: f64, h_s: f64, input: Segment) -> Segment {
+    fn advance(&mut self, time_s: f64, h_s: f64, input: Piece) -> Piece {
         let (before, after) = (1.0 + self.per_s * time_s, 1.0 + self.per_s * (time_s + h_s));
         let earlier = self.area;
         self.area += input.integral;
-        Segment {
+        Piece {
             start: before * input.start - self.per_s * earlier,
             end: after * input.end - self.per_s * self.area,
             integral: 0.5 * (before + after) * input.integral

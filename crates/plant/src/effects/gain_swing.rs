@@ -1,8 +1,8 @@
 //! `gain-swing`: a gain that goes up and down.
 
 use super::{
-    Action, Block, Candidate, Effect, EffectKind, Experiment, Form, ParameterSpec, Place, Scope,
-    Segment, Spec, lin, log,
+    Action, Block, Candidate, Effect, EffectKind, Experiment, Form, ParameterSpec, Piece, Place,
+    Scope, Spec, lin, log,
 };
 use std::f64::consts::TAU;
 
@@ -90,7 +90,7 @@ impl Swing {
 }
 
 impl Block for Swing {
-    fn advance(&mut self, time_s: f64, h_s: f64, input: Segment) -> Segment {
+    fn advance(&mut self, time_s: f64, h_s: f64, input: Piece) -> Piece {
         // A piece lasts less than a thousandth of a period: the gain in its middle is that of all of it.
         let (first, middle, last) = (
             self.gain(time_s),
@@ -100,7 +100,7 @@ impl Block for Swing {
         let start = self.output + first * (input.start - self.input);
         self.output = start + middle * (input.end - input.start);
         self.input = input.end;
-        Segment {
+        Piece {
             start,
             end: self.output,
             integral: h_s * start + middle * (input.integral - h_s * input.start),

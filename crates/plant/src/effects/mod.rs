@@ -50,7 +50,7 @@ mod user;
 mod valve_asymmetry;
 mod wall_adhesion;
 
-pub use action::{Action, Around, Block, Segment, Shown};
+pub use action::{Action, Around, Block, Piece, Shown};
 pub use backlash::backlash;
 pub use bubble::bubble;
 pub use camera_shake::camera_shake;

@@ -5,7 +5,7 @@
 use super::candidate::grid;
 use super::{
     Action, Block, Candidate, Effect, EffectKind, Experiment, FitParameter, Form, ParameterSpec,
-    Place, Scope, Segment, Spec, lin, log,
+    Piece, Place, Scope, Spec, lin, log,
 };
 
 /// Bouc-Wen: `x = u - fraction h`, `dh/dt = du/dt - beta |du/dt| h - gamma du/dt |h|`.
@@ -259,14 +259,14 @@ fn classes() -> ([f64; CLASSES], [f64; CLASSES]) {
 }
 
 /// A piece of a block without rate: it follows the input to both ends.
-fn followed(h_s: f64, input: Segment, mut follow: impl FnMut(f64) -> f64) -> Segment {
+fn followed(h_s: f64, input: Piece, mut follow: impl FnMut(f64) -> f64) -> Piece {
     let start = follow(input.start);
     let end = if input.end == input.start {
         start
     } else {
         follow(input.end)
     };
-    Segment::line(start, end, h_s)
+    Piece::line(start, end, h_s)
 }
 
 #[derive(Debug, Clone)]
@@ -300,7 +300,7 @@ impl BoucWen {
 }
 
 impl Block for BoucWen {
-    fn advance(&mut self, _: f64, h_s: f64, input: Segment) -> Segment {
+    fn advance(&mut self, _: f64, h_s: f64, input: Piece) -> Piece {
         followed(h_s, input, |u| self.follow(u))
     }
 
@@ -370,7 +370,7 @@ impl Play {
 }
 
 impl Block for Play {
-    fn advance(&mut self, _: f64, h_s: f64, input: Segment) -> Segment {
+    fn advance(&mut self, _: f64, h_s: f64, input: Piece) -> Piece {
         followed(h_s, input, |u| self.follow(u))
     }
 

@@ -1,6 +1,6 @@
 //! What acts on the speed of the input: the common frame of such blocks.
 
-use crate::effects::action::{Block, Segment};
+use crate::effects::action::{Block, Piece};
 use std::fmt;
 
 /// A law that makes the speed of the output of the speed of the input.
@@ -44,7 +44,7 @@ impl<L> OfSpeed<L> {
 }
 
 impl<L: SpeedLaw> Block for OfSpeed<L> {
-    fn advance(&mut self, _: f64, h_s: f64, input: Segment) -> Segment {
+    fn advance(&mut self, _: f64, h_s: f64, input: Piece) -> Piece {
         let start = self.output + self.law.jump(input.start - self.input);
         let travel = if h_s > 0.0 {
             let moved = input.end - input.start;
@@ -56,7 +56,7 @@ impl<L: SpeedLaw> Block for OfSpeed<L> {
         };
         self.input = input.end;
         self.output = start + travel;
-        Segment {
+        Piece {
             start,
             end: self.output,
             integral: h_s * (start + 0.5 * travel),

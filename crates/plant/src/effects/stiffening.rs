@@ -1,8 +1,8 @@
 //! `stiffening`: a chip that pushes back more the further it is driven.
 
 use super::{
-    Action, Block, Candidate, Effect, EffectKind, Experiment, Form, ParameterSpec, Place, Scope,
-    Segment, Spec, lin,
+    Action, Block, Candidate, Effect, EffectKind, Experiment, Form, ParameterSpec, Piece, Place,
+    Scope, Spec, lin,
 };
 
 /// Stiffening of the chip: the displacement that acts is `u + per_um2 u^3`, from the working point.
@@ -67,9 +67,9 @@ struct Cubic {
 }
 
 impl Block for Cubic {
-    fn advance(&mut self, _: f64, h_s: f64, input: Segment) -> Segment {
+    fn advance(&mut self, _: f64, h_s: f64, input: Piece) -> Piece {
         let at = |u: f64| u + self.per_um2 * u.powi(3);
-        Segment::line(at(input.start), at(input.end), h_s)
+        Piece::line(at(input.start), at(input.end), h_s)
     }
 
     fn reset(&mut self) {}

@@ -4,7 +4,7 @@
 //! A walk in its stead would swallow every slow error of a model of a static sensor; white noise alone would call the slow noise
 //! an error. Not for lines: a line is no noise, and a fit that leaves one is refused.
 
-use crate::data::noise::{Coloured, Noise, Whitener};
+use crate::data::noise::{Coloured, NoiseModel, Whitener};
 use realfft::RealFftPlanner;
 
 /// Which noise the records are taken to have.
@@ -43,7 +43,7 @@ pub(crate) struct Alone<'a> {
 }
 
 /// Twice the negative log-likelihood of noise of a shape, its size set free, and that size (of a white variance of 1).
-fn cost(alone: &Alone<'_>, shape: &Noise) -> (f64, f64) {
+fn cost(alone: &Alone<'_>, shape: &NoiseModel) -> (f64, f64) {
     let w = Whitener::new(shape, alone.counts, None);
     let mut e = vec![0.0; alone.values.len()];
     w.apply(alone.values, &mut e);
@@ -61,8 +61,8 @@ struct Shape {
 }
 
 impl Shape {
-    fn noise(self) -> Noise {
-        Noise {
+    fn noise(self) -> NoiseModel {
+        NoiseModel {
             walk_um2: self.walk.map_or(0.0, f64::exp),
             white_um2: 1.0,
             coloured: self.coloured.map(|(variance, rows)| Coloured {
@@ -128,7 +128,7 @@ fn coloured(alone: &Alone<'_>) -> Option<(Shape, f64)> {
 }
 
 /// Whether the innovations under a noise hold no line: the periodogram of white ones has none above its mean times [`LINE`].
-fn is_white(alone: &Alone<'_>, noise: &Noise) -> bool {
+fn is_white(alone: &Alone<'_>, noise: &NoiseModel) -> bool {
     let mut e = vec![0.0; alone.values.len()];
     Whitener::new(noise, alone.counts, None).apply(alone.values, &mut e);
     let plan = RealFftPlanner::<f64>::new().plan_fft_forward(e.len());
@@ -142,7 +142,7 @@ fn is_white(alone: &Alone<'_>, noise: &Noise) -> bool {
 }
 
 /// The noise of a kind that is seen alone: what `walk` (a walk and white noise) comes to where its likelihood asks for another.
-pub(crate) fn choose(kind: NoiseKind, walk: Noise, alone: &Alone<'_>) -> Noise {
+pub(crate) fn choose(kind: NoiseKind, walk: NoiseModel, alone: &Alone<'_>) -> NoiseModel {
     let n = alone.values.len().min(MOST_ROWS);
     let alone = Alone {
         values: &alone.values[..n],
@@ -225,7 +225,7 @@ mod tests {
             .collect()
     }
 
-    fn chosen(values: &[f64], kind: NoiseKind) -> Noise {
+    fn chosen(values: &[f64], kind: NoiseKind) -> NoiseModel {
         let counts = vec![true; values.len()];
         let (c0, c1, _) = crate::data::noise::increment_moments(values, &counts);
         let alone = Alone {
@@ -233,7 +233,7 @@ mod tests {
             counts: &counts,
             share: 1.0,
         };
-        choose(kind, Noise::from_increments(c0, c1), &alone)
+        choose(kind, NoiseModel::from_increments(c0, c1), &alone)
     }
 
     #[test]

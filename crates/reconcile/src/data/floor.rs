@@ -2,7 +2,7 @@
 //! known.
 
 use crate::data::coloured::{Alone, NoiseKind, choose};
-use crate::data::noise::{Noise, increment_moments};
+use crate::data::noise::{NoiseModel, increment_moments};
 use crate::data::record::Record;
 use crate::thresholds::THRESHOLDS;
 use serde::Serialize;
@@ -45,7 +45,7 @@ impl FloorSource {
 /// The noise floor of a set of records.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Floor {
-    pub noise: Noise,
+    pub noise: NoiseModel,
     pub source: FloorSource,
     /// Increments that it was measured from; 0 where it was not.
     pub rows: usize,
@@ -65,7 +65,7 @@ struct Estimate {
 
 impl Estimate {
     fn sigma(&self) -> f64 {
-        Noise::from_increments(self.c0, self.c1).innovation_um()
+        NoiseModel::from_increments(self.c0, self.c1).innovation_um()
     }
 }
 
@@ -80,7 +80,7 @@ pub(crate) fn estimate(
     records: &[Record],
     present: &[Vec<bool>],
     residuals: &[Vec<f64>],
-    stated: Option<Noise>,
+    stated: Option<NoiseModel>,
     kind: NoiseKind,
 ) -> Floor {
     let whole = crate::data::record::command_range_um(records);
@@ -143,7 +143,7 @@ pub(crate) fn estimate(
     found.retain(|f| f.rows >= THRESHOLDS.floor_rows && f.c0 > 0.0);
     if let Some(least) = found.iter().min_by(|a, b| a.sigma().total_cmp(&b.sigma())) {
         let pooled = pooled(&found, least.sigma());
-        let walk = Noise::from_increments(pooled.c0, pooled.c1);
+        let walk = NoiseModel::from_increments(pooled.c0, pooled.c1);
         let alone = Alone {
             values: &least.alone.0,
             counts: &least.alone.1,
@@ -164,7 +164,7 @@ pub(crate) fn estimate(
         .min_by(|a, b| a.sigma().total_cmp(&b.sigma()))
         .map(|least| {
             let all = pooled(&own, least.sigma());
-            Noise::from_increments(all.c0, all.c1).at_least(quantum_um2)
+            NoiseModel::from_increments(all.c0, all.c1).at_least(quantum_um2)
         });
     let sample_s = records.first().map_or(1e-3, |r| r.sample_s);
     match (stated, residual) {
@@ -178,7 +178,7 @@ pub(crate) fn estimate(
             }
         }
         (_, least) => Floor {
-            noise: least.unwrap_or_else(|| Noise::new(0.33, sample_s, 0.03)),
+            noise: least.unwrap_or_else(|| NoiseModel::new(0.33, sample_s, 0.03)),
             source: FloorSource::Unknown,
             rows: 0,
         },
@@ -211,7 +211,7 @@ fn quantisation_um2(records: &[Record]) -> f64 {
 }
 
 /// From the innovations' own model: increments of the raw residuals of a fit that is believed.
-pub(crate) fn from_residuals(present: &[Vec<bool>], residuals: &[Vec<f64>]) -> Noise {
+pub(crate) fn from_residuals(present: &[Vec<bool>], residuals: &[Vec<f64>]) -> NoiseModel {
     let (mut c0, mut c1, mut n) = (0.0, 0.0, 0.0);
     for (p, e) in present.iter().zip(residuals) {
         let (a, b, m) = increment_moments(e, p);
@@ -220,9 +220,9 @@ pub(crate) fn from_residuals(present: &[Vec<bool>], residuals: &[Vec<f64>]) -> N
         n += m as f64;
     }
     if n == 0.0 {
-        Noise::new(0.33, 1e-3, 0.03)
+        NoiseModel::new(0.33, 1e-3, 0.03)
     } else {
-        Noise::from_increments(c0 / n, c1 / n)
+        NoiseModel::from_increments(c0 / n, c1 / n)
     }
 }
 /// Rows that count, without those after an increment of more than six standard deviations (by the median of their sizes):

@@ -7,7 +7,7 @@
 
 /// Sizes of the two noises.
 #[derive(Debug, Clone, Copy, PartialEq, serde::Serialize)]
-pub struct Noise {
+pub struct NoiseModel {
     /// Variance gained by the walk in one sample, `2 D dt` \[um^2\].
     pub walk_um2: f64,
     /// Variance of the localisation noise \[um^2\].
@@ -37,7 +37,7 @@ impl Coloured {
     }
 }
 
-impl Noise {
+impl NoiseModel {
     /// Brownian motion of coefficient `d_um2_per_s` sampled every `sample_s`, and white noise of `localisation_um` RMS.
     pub fn new(d_um2_per_s: f64, sample_s: f64, localisation_um: f64) -> Self {
         Self {
@@ -139,7 +139,7 @@ struct Spread {
 
 impl Whitener {
     /// `present[k]`: the frame counts. `extra_walk[k]`: variance added to the walk before frame k \[um^2\].
-    pub fn new(noise: &Noise, present: &[bool], extra_walk: Option<&[f64]>) -> Self {
+    pub fn new(noise: &NoiseModel, present: &[bool], extra_walk: Option<&[f64]>) -> Self {
         let n = present.len();
         let (mut gain, mut inverse_sigma) = (vec![0.0; n], vec![0.0; n]);
         let coloured = noise.coloured.unwrap_or_default();
@@ -339,7 +339,7 @@ mod tests {
     #[test]
     fn the_innovation_floor_of_the_nominal_rig_is_45_nanometres() {
         // theta of the MA(1) increments solves theta/(1+theta^2) = R/(q+2R); the innovation variance is R/theta.
-        let n = Noise::new(0.33, 1e-3, 0.030);
+        let n = NoiseModel::new(0.33, 1e-3, 0.030);
         let c = n.white_um2 / (n.walk_um2 + 2.0 * n.white_um2);
         let theta = (1.0 - (1.0 - 4.0 * c * c).sqrt()) / (2.0 * c);
         let expected = (n.white_um2 / theta).sqrt();
@@ -349,7 +349,7 @@ mod tests {
 
     #[test]
     fn whitening_a_ramp_gives_its_closed_form_and_an_offset_gives_nothing() {
-        let n = Noise::new(0.33, 1e-3, 0.030);
+        let n = NoiseModel::new(0.33, 1e-3, 0.030);
         let w = Whitener::new(&n, &vec![true; 2000], None);
         let mut e = vec![0.0; 2000];
         w.apply(&vec![7.0; 2000], &mut e);
@@ -363,7 +363,7 @@ mod tests {
     }
 
     /// One row of sixty is missing.
-    fn transposed_as_applied(noise: &Noise) {
+    fn transposed_as_applied(noise: &NoiseModel) {
         let mut present = vec![true; 60];
         present[17] = false;
         let w = Whitener::new(noise, &present, None);
@@ -382,17 +382,17 @@ mod tests {
 
     #[test]
     fn the_transposed_filter_gives_the_same_inner_products() {
-        transposed_as_applied(&Noise::new(0.33, 1e-3, 0.030));
+        transposed_as_applied(&NoiseModel::new(0.33, 1e-3, 0.030));
     }
 
     #[test]
     fn the_filter_of_coloured_noise_whitens_it_and_has_its_transpose() {
-        let n = Noise {
+        let n = NoiseModel {
             coloured: Some(Coloured {
                 variance_um2: 0.02,
                 time_rows: 9.0,
             }),
-            ..Noise::new(0.33, 1e-3, 0.030)
+            ..NoiseModel::new(0.33, 1e-3, 0.030)
         };
         // Covariance of three rows by hand, the level free: the determinant of the differences is that of the innovations.
         let keep = n.coloured.unwrap().keep();
@@ -408,7 +408,7 @@ mod tests {
 
     #[test]
     fn a_missing_frame_counts_nothing_and_widens_the_next_innovation() {
-        let n = Noise::new(0.33, 1e-3, 0.030);
+        let n = NoiseModel::new(0.33, 1e-3, 0.030);
         let mut present = vec![true; 100];
         present[50] = false;
         let w = Whitener::new(&n, &present, None);

@@ -7,7 +7,7 @@
 //! likelihood `y - a sin(2 pi x/p) - b cos(2 pi x/p)` of the row. The normalising factors are the likelihood of the
 //! record, whose derivatives row by row give the scoring steps and the covariance.
 
-use crate::data::noise::Noise;
+use crate::data::noise::NoiseModel;
 use crate::fit::context::{Context, Fit};
 use crate::fit::position_error::{Locking, Numbers};
 use crate::simulate::simulate;
@@ -38,7 +38,7 @@ struct Grid {
 
 impl Grid {
     /// `None` where the grid would have too many points.
-    fn new(noise: &Noise, wave_um: [f64; 2], pixel_um: f64) -> Option<Self> {
+    fn new(noise: &NoiseModel, wave_um: [f64; 2], pixel_um: f64) -> Option<Self> {
         let (q, r) = (noise.walk_um2, noise.white_um2);
         let step_um = (0.4 * q.sqrt().min(r.sqrt())).min(pixel_um / 24.0);
         let ahead = 0.5 * (q + (q * q + 4.0 * q * r).sqrt());
@@ -155,7 +155,7 @@ pub(crate) fn refine(
     );
     let rows = |x: &Numbers| -> Option<Vec<Vec<f64>>> {
         let (wave, pixel) = ([x[0], x[1]], x[2].exp());
-        let noise = Noise {
+        let noise = NoiseModel {
             walk_um2: x[3].exp(),
             white_um2: x[4].exp(),
             coloured: None,
@@ -259,7 +259,7 @@ mod tests {
     use super::*;
 
     /// A walk seen with noise through an error of known size.
-    fn track(noise: &Noise, amplitude_um: f64, pixel_um: f64, rows: usize) -> Track {
+    fn track(noise: &NoiseModel, amplitude_um: f64, pixel_um: f64, rows: usize) -> Track {
         let mut state = 0x2545_F491_4F6C_DD1D_u64;
         let mut uniform = || {
             state ^= state << 13;
@@ -287,7 +287,7 @@ mod tests {
 
     #[test]
     fn without_an_error_the_filter_on_the_grid_is_the_kalman_filter() {
-        let noise = Noise::new(0.33, 1e-3, 0.03);
+        let noise = NoiseModel::new(0.33, 1e-3, 0.03);
         let t = track(&noise, 0.0, 0.25, 3000);
         let grid = Grid::new(&noise, [0.0; 2], 0.25).unwrap();
         let rows = grid.rows(&t, [0.0; 2], 0.25);
@@ -305,7 +305,7 @@ mod tests {
 
     #[test]
     fn the_likelihood_peaks_at_the_amplitude_that_made_the_records() {
-        let noise = Noise::new(0.33, 1e-3, 0.03);
+        let noise = NoiseModel::new(0.33, 1e-3, 0.03);
         let (pixel, amplitude) = (0.25, 0.025);
         let t = track(&noise, amplitude, pixel, 20_000);
         let of = |a: f64| -> f64 {

@@ -3,7 +3,7 @@
 use crate::dot::dot;
 use crate::fit::context::{Context, Fit};
 use crate::problem::Mask;
-use crate::search::lead::line_score;
+use crate::search::suspect::line_score;
 use crate::thresholds::THRESHOLDS;
 use std::f64::consts::TAU;
 

@@ -1,8 +1,8 @@
 //! Which candidates to fit: screening, additions one after another, replacements.
 
 pub(crate) mod cost;
-pub(crate) mod lead;
 pub(crate) mod lines;
 mod pixel;
 mod screen;
 pub(crate) mod sequential;
+pub(crate) mod suspect;

@@ -6,7 +6,7 @@
 use crate::fit::catalogue::{Part, Variant};
 use crate::fit::context::{Context, Fit};
 use crate::problem::{Mask, Prepared};
-use crate::search::lead::{Lead, pair_score};
+use crate::search::suspect::{Suspect, pair_score};
 use crate::thresholds::THRESHOLDS;
 use realfft::RealFftPlanner;
 use std::f64::consts::TAU;
@@ -30,7 +30,7 @@ pub(crate) fn pixel_scan(
     variant: Variant,
     mask: &Mask,
     threads: usize,
-) -> Option<Lead> {
+) -> Option<Suspect> {
     let records = &ctx.problem.records;
     let (residual, sim) = ctx.residual(fit);
     let around = |(r, (e, s)): (&Prepared, (&Vec<f64>, &Vec<f64>))| -> Vec<f64> {
@@ -101,7 +101,7 @@ pub(crate) fn pixel_scan(
     if score < THRESHOLDS.pixel_gain * middle {
         return None;
     }
-    Some(Lead {
+    Some(Suspect {
         part: Part::new(variant, &[1.0 / fine[best]]),
         score,
     })

@@ -7,8 +7,8 @@ use crate::fit::catalogue::{Part, Variant};
 use crate::fit::context::{Context, Fit};
 use crate::fit::linear::Tangents;
 use crate::problem::Mask;
-use crate::search::lead::{Lead, line_score};
 use crate::search::pixel::pixel_scan;
+use crate::search::suspect::{Suspect, line_score};
 use cellpos_plant::effects::Role;
 
 /// The best start of every variant not excluded, best first.
@@ -19,7 +19,7 @@ pub(crate) fn screen(
     mask: &Mask,
     threads: usize,
     allowed: impl Fn(Variant) -> bool,
-) -> Vec<Lead> {
+) -> Vec<Suspect> {
     let mut jobs: Vec<Part> = Vec::new();
     for v in &ctx.variants {
         if allowed(*v) && v.candidate().role != Role::Position {
@@ -49,12 +49,12 @@ pub(crate) fn screen(
             if g.scale > 0.02 { g.score } else { 0.0 }
         }
     });
-    let mut best: Vec<Lead> = Vec::new();
+    let mut best: Vec<Suspect> = Vec::new();
     for (part, score) in jobs.into_iter().zip(scores) {
         match best.iter_mut().find(|l| l.part.variant == part.variant) {
-            Some(lead) if lead.score < score => *lead = Lead { part, score },
+            Some(lead) if lead.score < score => *lead = Suspect { part, score },
             Some(_) => {}
-            None => best.push(Lead { part, score }),
+            None => best.push(Suspect { part, score }),
         }
     }
     if let Some(v) = ctx

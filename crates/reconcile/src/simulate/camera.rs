@@ -2,7 +2,7 @@
 
 use super::Frames;
 use super::modal::Trace;
-use cellpos_plant::effects::{Block, Segment};
+use cellpos_plant::effects::{Block, Piece};
 
 /// A block on a trace, step by step.
 pub(crate) fn advance(t: &mut Trace, block: &mut dyn Block, h: f64) {
@@ -16,7 +16,7 @@ pub(crate) fn advance(t: &mut Trace, block: &mut dyn Block, h: f64) {
             .get(j + 1)
             .copied()
             .unwrap_or(start + 0.5 * (a + b) * h);
-        let input = Segment {
+        let input = Piece {
             start,
             end,
             integral: h * (0.5 * (start + end) + h / 12.0 * (a - b)),

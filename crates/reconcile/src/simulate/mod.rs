@@ -10,7 +10,7 @@ mod modal;
 
 pub(crate) use camera::near_whole;
 use cellpos_plant::TiedPlant;
-use cellpos_plant::effects::{Action, Around, Block, Segment, Shown};
+use cellpos_plant::effects::{Action, Around, Block, Piece, Shown};
 pub(crate) use cellpos_plant::{Effect, Place, Zpk};
 use modal::{Modal, Trace, has_fast_pole};
 
@@ -312,7 +312,7 @@ impl<'a> Chain<'a> {
                     }
                     pending = Zpk::one();
                     for (j, v) in x.iter_mut().enumerate() {
-                        let held = Segment::line(*v, *v, h);
+                        let held = Piece::line(*v, *v, h);
                         *v = block.advance(j as f64 * h, h, held).integral / h;
                     }
                 }
@@ -343,7 +343,7 @@ impl<'a> Chain<'a> {
                 0 => u[0],
                 _ => x[j - 1],
             };
-            let out = tied.advance(j as f64 * h, h, Segment::line(start, end, h));
+            let out = tied.advance(j as f64 * h, h, Piece::line(start, end, h));
             t.pos.push(position);
             t.jump.push(out.start - position);
             t.start_slope.push(out.speed_start);

@@ -1,7 +1,7 @@
 //! What the workflow hands back: verdict, effects, where, gap, and what a report needs.
 
 use crate::data::floor::FloorSource;
-use crate::data::noise::Noise;
+use crate::data::noise::NoiseModel;
 use crate::fit::context::{Context, Fit};
 use crate::verdict::battery::Hypothesis;
 use crate::verdict::map::DiscrepancyMap;
@@ -261,7 +261,7 @@ pub struct Reconciliation {
     /// Where the noise floor comes from.
     pub floor: FloorSource,
     /// Noise of these records.
-    pub noise: Noise,
+    pub noise: NoiseModel,
     /// Sample time \[s\].
     pub sample_s: f64,
     /// The model with the effects added.

@@ -3,7 +3,7 @@
 use crate::data::coloured::NoiseKind;
 use crate::data::floor::{self, FloorSource};
 use crate::data::frames;
-use crate::data::noise::Noise;
+use crate::data::noise::NoiseModel;
 use crate::data::record::{Record, canonical};
 use crate::error::ReconcileError;
 use crate::fit::catalogue;
@@ -93,7 +93,7 @@ pub fn reconcile(
     let scope = scope_of(model, &records, &base);
     let fixed = model.effects.clone();
     let stated = stated_noise(model, base.sample_s);
-    let start = stated.unwrap_or_else(|| Noise::new(0.33, base.sample_s, 0.03));
+    let start = stated.unwrap_or_else(|| NoiseModel::new(0.33, base.sample_s, 0.03));
     let problem = Problem::new(base, &records, repeated, start);
     let present: Vec<Vec<bool>> = problem.records.iter().map(|r| r.present.clone()).collect();
 
@@ -188,7 +188,7 @@ pub fn reconcile(
 }
 
 /// The noise that a model states, unless it says that its figures are a fit's own residual.
-fn stated_noise(model: &Model, sample_s: f64) -> Option<Noise> {
+fn stated_noise(model: &Model, sample_s: f64) -> Option<NoiseModel> {
     let noise = &model.noise;
     let guessed = model
         .provenance
@@ -197,7 +197,7 @@ fn stated_noise(model: &Model, sample_s: f64) -> Option<Noise> {
     let some = noise.diffusion_um2_per_s > 0.0 || noise.localisation_um > 0.0;
     let coloured = model.provenance.contains_key(COLOURED);
     (some && !guessed && !coloured)
-        .then(|| Noise::new(noise.diffusion_um2_per_s, sample_s, noise.localisation_um))
+        .then(|| NoiseModel::new(noise.diffusion_um2_per_s, sample_s, noise.localisation_um))
 }
 
 /// Raw residuals without what an unknown state at the start makes.
@@ -322,7 +322,7 @@ fn scope_of(model: &Model, records: &[Record], base: &Base) -> Scope {
 
 fn evidence(
     model: &Model,
-    noise: &Noise,
+    noise: &NoiseModel,
     trusted: usize,
     problem: &Problem,
 ) -> Option<WhiteEvidence> {

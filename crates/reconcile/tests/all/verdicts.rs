@@ -1,8 +1,8 @@
 //! What a verdict rests on: a floor, numbers that hold everywhere, and a list of effects that grows from outside.
 
 use cellpos_plant::effects::{
-    self, Action, Block, Candidate, EffectKind, Experiment, Form, ParameterSpec, Place, Scope,
-    Segment, Spec, lin,
+    self, Action, Block, Candidate, EffectKind, Experiment, Form, ParameterSpec, Piece, Place,
+    Scope, Spec, lin,
 };
 use cellpos_plant::{Effect, Gaussian, Model, Noise, SimulateOptions, TransferFunction, simulate};
 use cellpos_reconcile::{FloorSource, Options, Reconciliation, Record, Verdict, reconcile};
@@ -221,9 +221,9 @@ struct Square {
 }
 
 impl Block for Square {
-    fn advance(&mut self, _: f64, h_s: f64, input: Segment) -> Segment {
+    fn advance(&mut self, _: f64, h_s: f64, input: Piece) -> Piece {
         let at = |u: f64| u + self.per_um * u * u;
-        Segment::line(at(input.start), at(input.end), h_s)
+        Piece::line(at(input.start), at(input.end), h_s)
     }
 
     fn reset(&mut self) {}

@@ -3,7 +3,7 @@
 use crate::common::{START_UM, controller, core, measurement, report};
 use cellpos_control::ControllerKind;
 use cellpos_runtime::{Action, FrameTally, Life, Request, TickInput};
-use cellpos_vision::Verdict;
+use cellpos_vision::FixQuality;
 use proptest::prelude::*;
 
 /// What may go wrong with one tick's measurement.
@@ -14,7 +14,7 @@ struct Tick {
     id_step: i64,
     age_ns: i64,
     time_step_ns: i64,
-    verdict: Verdict,
+    verdict: FixQuality,
     drained: u32,
     request: Request,
 }
@@ -34,7 +34,7 @@ fn tick() -> impl Strategy<Value = Tick> {
         prop_oneof![12 => Just(1_i64), 1 => -3..5_i64],
         prop_oneof![12 => Just(2_000_000_i64), 1 => -10_000_000..20_000_000_i64],
         prop_oneof![12 => Just(1_000_000_i64), 3 => 0..1_000_000_i64, 1 => 0..30_000_000_i64],
-        prop_oneof![12 => Just(Verdict::Good), 1 => Just(Verdict::NoSignal)],
+        prop_oneof![12 => Just(FixQuality::Good), 1 => Just(FixQuality::NoSignal)],
         0..4_u32,
         prop_oneof![60 => Just(Request::None), 1 => Just(Request::Freeze)],
     )

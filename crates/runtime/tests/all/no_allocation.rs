@@ -6,7 +6,7 @@ use cellpos_counting_alloc::{allocations, allocations_of};
 use cellpos_rig::Clock;
 use cellpos_runtime::ticker::{RingSizes, Ticker};
 use cellpos_runtime::{Action, Life, Request};
-use cellpos_vision::Verdict;
+use cellpos_vision::FixQuality;
 
 /// Ticks through arming, running, coasting, freezing, a stale frame, a stop by the operator and Safe.
 fn allocations_per_run(kind: ControllerKind) -> (u64, usize) {
@@ -25,7 +25,7 @@ fn allocations_per_run(kind: ControllerKind) -> (u64, usize) {
         let wobble_um = 0.1 * ((k * 7919) % 13) as f64 - 0.6;
         let mut m = measurement(k, wobble_um);
         match k {
-            500..510 | 700..900 => m.verdict = Verdict::NoSignal,
+            500..510 | 700..900 => m.verdict = FixQuality::NoSignal,
             // Nothing comes at all.
             1000..1030 => m.frame_id = 0,
             // An old buffer under a new id.

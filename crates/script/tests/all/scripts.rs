@@ -2,7 +2,7 @@
 
 use cellpos_control::Reference;
 use cellpos_plant::{Model, SimulateOptions, simulate};
-use cellpos_script::{ArmKind, CheckLimits, Plan, Script, Seen, Status, StopReason, check};
+use cellpos_script::{ArmKind, CheckLimits, Plan, Progress, Script, Seen, StopReason, check};
 use proptest::prelude::*;
 use std::path::{Path, PathBuf};
 
@@ -186,10 +186,10 @@ fn a_wait_stops_the_plans_clock_until_its_condition_is_met() {
     for tick in 0..1000 {
         let error = if tick < 100 { 1.0 } else { 0.05 };
         let output = plan.step(&mut cursor, 1e-3, &seen(error));
-        if output.status == Status::Waiting {
+        if output.status == Progress::Waiting {
             waiting += 1;
         }
-        if output.status == Status::Done {
+        if output.status == Progress::Done {
             assert_eq!(output.reference_um, 1.0);
             assert_eq!(tick, 10 + waiting + 10);
             break;
@@ -204,7 +204,7 @@ fn a_wait_stops_the_plans_clock_until_its_condition_is_met() {
         .map(|_| plan.step(&mut cursor, 1e-3, &seen(9.0)))
         .last()
         .unwrap();
-    assert_eq!(last.status, Status::Stopped(StopReason::WaitTimeout));
+    assert_eq!(last.status, Progress::Stopped(StopReason::WaitTimeout));
     assert_eq!(last.reference_um, 0.0);
 }
 
@@ -258,12 +258,12 @@ fn stop_conditions_end_a_script_and_hold_the_reference() {
         let mut tick = 0;
         let stopped = loop {
             let output = plan.step(&mut cursor, 1e-3, &seen);
-            if output.status != Status::Running {
+            if output.status != Progress::Running {
                 break output;
             }
             tick += 1;
         };
-        assert_eq!(stopped.status, Status::Stopped(reason));
+        assert_eq!(stopped.status, Progress::Stopped(reason));
         assert!((tick - ticks as i64).abs() <= 1, "{stop}: {tick}");
         let after = plan.step(&mut cursor, 1e-3, &seen);
         assert_eq!(after.reference_um, stopped.reference_um);
@@ -351,7 +351,7 @@ fn ten_thousand_cycles_are_each_there_once() {
     let mut cycles = 0;
     loop {
         let output = plan.step(&mut cursor, 1e-3, &seen);
-        if output.status == Status::Done {
+        if output.status == Progress::Done {
             break;
         }
         // The middle of a tick, so that no cycle's border is met by rounding.

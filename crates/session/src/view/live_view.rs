@@ -9,7 +9,7 @@ use crate::failure::Failure;
 use crate::rig::Rig;
 use crate::screen::{Screen, ScreenConfig};
 use crate::setup::Setup;
-use cellpos_live::{Command, Feed, Film, Hello, Server, ServerConfig};
+use cellpos_live::{Feed, Film, Hello, OperatorRequest, Server, ServerConfig};
 use cellpos_rig::FrameWatch;
 use cellpos_runtime::Request;
 use cellpos_runtime::live::Operator;
@@ -244,25 +244,25 @@ fn lock(addressee: &Addressee) -> std::sync::MutexGuard<'_, Arc<Operator>> {
     addressee.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-fn act(command: Command, addressee: &Addressee, noted: &Sender<String>) {
+fn act(command: OperatorRequest, addressee: &Addressee, noted: &Sender<String>) {
     let operator = lock(addressee);
     match command {
         // A freeze that does not end the run: whoever looks on may want to go on.
-        Command::Freeze | Command::Pause => {
+        OperatorRequest::Freeze | OperatorRequest::Pause => {
             let _ = operator.change(Request::None, Request::Pause)
                 || operator.change(Request::Skip, Request::Pause);
         }
-        Command::Resume => {
+        OperatorRequest::Resume => {
             let _ = operator.change(Request::Pause, Request::None);
         }
-        Command::Park => operator.ask(Request::Park),
-        Command::Skip => {
+        OperatorRequest::Park => operator.ask(Request::Park),
+        OperatorRequest::Skip => {
             let _ = operator.change(Request::None, Request::Skip)
                 || operator.change(Request::Pause, Request::Skip);
         }
-        Command::Target { um } => operator.steer(um),
+        OperatorRequest::Target { um } => operator.steer(um),
         // The run is over: nobody takes notes any more.
-        Command::Note { text } => drop(noted.send(text)),
+        OperatorRequest::Note { text } => drop(noted.send(text)),
     }
 }
 
@@ -279,10 +279,14 @@ mod tests {
             act(command, &addressee, &noted);
             operator.asked()
         };
-        assert_eq!(ask(Command::Freeze), Request::Pause);
-        assert_eq!(ask(Command::Resume), Request::None);
-        assert_eq!(ask(Command::Park), Request::Park);
-        for command in [Command::Freeze, Command::Resume, Command::Skip] {
+        assert_eq!(ask(OperatorRequest::Freeze), Request::Pause);
+        assert_eq!(ask(OperatorRequest::Resume), Request::None);
+        assert_eq!(ask(OperatorRequest::Park), Request::Park);
+        for command in [
+            OperatorRequest::Freeze,
+            OperatorRequest::Resume,
+            OperatorRequest::Skip,
+        ] {
             assert_eq!(ask(command), Request::Park);
         }
     }

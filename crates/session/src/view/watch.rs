@@ -59,7 +59,7 @@ impl Watch {
         let setup = recorded::setup(follow.reader())?;
         let meta = follow.reader().meta().ok();
         let diffusion = meta
-            .and_then(recorded::diffusion_um2_per_s)
+            .and_then(recorded::diffusion_of_run_um2_per_s)
             .unwrap_or(f64::NAN);
         let folder_name = folder.file_name().unwrap_or(folder.as_os_str());
         let page = Page {

@@ -246,7 +246,7 @@ fn a_wrong_sign_and_no_bead_end_with_different_words_and_different_advice() {
     assert!(sign.to_do.contains("`sign`"), "{sign}");
     let nobody = end(|m| {
         m.position_um = f64::NAN;
-        m.verdict = cellpos_vision::Verdict::NoSignal;
+        m.verdict = cellpos_vision::FixQuality::NoSignal;
     });
     assert_eq!(nobody.kind, EndKind::ArmingRefused);
     assert_eq!(nobody.refusal, Some(Refusal::NoBead), "{nobody}");

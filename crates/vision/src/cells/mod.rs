@@ -155,8 +155,8 @@ mod tests {
 
     const SIZE: (usize, usize) = (96, 48);
 
-    struct Noise(u64);
-    impl Noise {
+    struct PixelNoise(u64);
+    impl PixelNoise {
         fn next(&mut self) -> f64 {
             let mut sum = 0.0;
             for _ in 0..12 {
@@ -171,7 +171,7 @@ mod tests {
     }
 
     /// Uneven light, noise of 2 grey levels, and an elliptic cell with a dark rim when `cell` gives its centre.
-    fn picture(cell: Option<(f64, f64)>, light: f64, noise: &mut Noise) -> Vec<u8> {
+    fn picture(cell: Option<(f64, f64)>, light: f64, noise: &mut PixelNoise) -> Vec<u8> {
         let pixel = |k: usize| {
             let (x, y) = ((k % SIZE.0) as f64, (k / SIZE.0) as f64);
             let mut v = 110.0 + 0.4 * x - 0.3 * y;
@@ -198,7 +198,7 @@ mod tests {
         }
     }
 
-    fn taught(noise: &mut Noise) -> CellFinder {
+    fn taught(noise: &mut PixelNoise) -> CellFinder {
         let mut finder = CellFinder::new(SIZE.0, SIZE.1, CellConfig::default()).unwrap();
         for _ in 0..20 {
             finder
@@ -210,7 +210,7 @@ mod tests {
 
     #[test]
     fn a_cell_gets_its_place_size_and_intensity_in_uneven_and_flickering_light() {
-        let mut noise = Noise(4);
+        let mut noise = PixelNoise(4);
         let mut finder = taught(&mut noise);
         assert!(
             (finder.noise_grey() - 2.02).abs() < 0.1,
@@ -244,7 +244,7 @@ mod tests {
 
     #[test]
     fn an_empty_channel_has_no_cell() {
-        let mut noise = Noise(5);
+        let mut noise = PixelNoise(5);
         let mut finder = taught(&mut noise);
         for light in [0.9, 1.0, 1.1] {
             let pixels = picture(None, light, &mut noise);
@@ -254,7 +254,7 @@ mod tests {
 
     #[test]
     fn a_frame_of_another_size_a_short_one_and_a_missing_background_are_errors() {
-        let mut noise = Noise(6);
+        let mut noise = PixelNoise(6);
         let pixels = picture(None, 1.0, &mut noise);
         let mut finder = CellFinder::new(SIZE.0, SIZE.1, CellConfig::default()).unwrap();
         assert_eq!(finder.find(&frame(&pixels)), Err(CellError::NoBackground));

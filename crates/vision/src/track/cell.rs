@@ -11,7 +11,7 @@ use super::standing::{Chosen as Sighted, Standing};
 use super::stays::Stays;
 use crate::cells::{Cell, CellError, CellFinder};
 use crate::config::ConfigError;
-use crate::fix::{Fix, Verdict};
+use crate::fix::{Fix, FixQuality};
 use crate::frame::Frame;
 
 /// Largest change of the size, however long the cell was not seen, as a fraction.
@@ -310,9 +310,9 @@ fn fix(cell: &Cell, decision: Decision) -> Fix {
         residual_ratio: f64::NAN,
         snr: cell.snr,
         verdict: match decision {
-            Decision::Merged | Decision::InContact => Verdict::BadFit,
-            _ if cell.at_border => Verdict::AtBorder,
-            _ => Verdict::Good,
+            Decision::Merged | Decision::InContact => FixQuality::BadFit,
+            _ if cell.at_border => FixQuality::AtBorder,
+            _ => FixQuality::Good,
         },
     }
 }

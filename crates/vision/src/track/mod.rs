@@ -16,7 +16,7 @@ mod stays;
 
 use crate::config::ConfigError;
 use crate::detector::Detector;
-use crate::fix::{Fix, Verdict};
+use crate::fix::{Fix, FixQuality};
 use crate::frame::Frame;
 use crate::localiser::Localiser;
 pub use cell::{CellStep, CellTracker};
@@ -155,7 +155,7 @@ impl Tracker {
             .candidates
             .iter()
             .flatten()
-            .filter(|c| c.fix.verdict == Verdict::Good);
+            .filter(|c| c.fix.verdict == FixQuality::Good);
         let Some(best) = good
             .min_by(|a, b| distance(a).total_cmp(&distance(b)))
             .copied()
@@ -184,7 +184,9 @@ impl Tracker {
         let fix = self.localiser.locate(frame, Some(chosen.motion.position()));
         let size = self.localiser.relative_size(&fix);
         let near = self.within_gate(&chosen.motion, &fix);
-        if fix.verdict == Verdict::Good && near && chosen.identity.agrees(&self.config, &fix, size)
+        if fix.verdict == FixQuality::Good
+            && near
+            && chosen.identity.agrees(&self.config, &fix, size)
         {
             chosen.motion.update(&fix);
             chosen.identity.update(&fix, size);
@@ -217,7 +219,7 @@ impl Tracker {
             } else {
                 None
             };
-            let good = fix.verdict == Verdict::Good && self.within_gate(&chosen.motion, &fix);
+            let good = fix.verdict == FixQuality::Good && self.within_gate(&chosen.motion, &fix);
             if good && chosen.identity.agrees(&self.config, &fix, size) {
                 self.take(chosen, &Candidate { fix, size }, time_s);
                 return (Decision::Accepted, Some(fix));
@@ -248,7 +250,7 @@ impl Tracker {
                 .is_none_or(|n| chosen.motion.distance2(&c.fix) < chosen.motion.distance2(&n));
             if nearer {
                 nearest = Some(c.fix);
-                misfit = Some(if c.fix.verdict != Verdict::Good {
+                misfit = Some(if c.fix.verdict != FixQuality::Good {
                     refusal(c.fix.verdict)
                 } else if !self.within_gate(&chosen.motion, &c.fix) {
                     Decision::OutsideGate
@@ -256,7 +258,7 @@ impl Tracker {
                     Decision::OtherBead
                 });
             }
-            let mut ok = c.fix.verdict == Verdict::Good
+            let mut ok = c.fix.verdict == FixQuality::Good
                 && chosen.identity.agrees(&self.config, &c.fix, c.size);
             // A lost bead may come back anywhere; a coasting one only near its prediction.
             ok &=
@@ -352,7 +354,7 @@ impl Tracker {
                 let fix = self.localiser.locate_beside(frame, (x, y), beads, k);
                 let near = f64::hypot(fix.x_px - x, fix.y_px - y) < 2.0 * apart_px;
                 let usable =
-                    near && !matches!(fix.verdict, Verdict::NoSignal | Verdict::NotConverged);
+                    near && !matches!(fix.verdict, FixQuality::NoSignal | FixQuality::NotConverged);
                 if let (true, Some(bead)) = (usable, beads.get_mut(k)) {
                     *bead = (fix.x_px, fix.y_px, fix.amplitude);
                 }
@@ -374,7 +376,7 @@ impl Tracker {
         for fix in fixes
             .iter()
             .flatten()
-            .filter(|f| f.verdict == Verdict::Good)
+            .filter(|f| f.verdict == FixQuality::Good)
         {
             for slot in &mut self.candidates {
                 // A fit as if alone is drawn towards the other bead.
@@ -422,7 +424,7 @@ impl Tracker {
     /// Adds a candidate unless one is already there.
     fn add_candidate(&mut self, c: Candidate) {
         let apart_px = 0.5 * self.localiser.template().radius_px();
-        let good = |c: &Candidate| c.fix.verdict == Verdict::Good;
+        let good = |c: &Candidate| c.fix.verdict == FixQuality::Good;
         let same =
             |o: &Candidate| f64::hypot(o.fix.x_px - c.fix.x_px, o.fix.y_px - c.fix.y_px) < apart_px;
         if let Some(other) = self.candidates.iter_mut().flatten().find(|o| same(o)) {
@@ -436,12 +438,12 @@ impl Tracker {
 }
 
 /// The decision for a fix that cannot be used.
-fn refusal(verdict: Verdict) -> Decision {
+fn refusal(verdict: FixQuality) -> Decision {
     match verdict {
-        Verdict::NoSignal => Decision::NoSignal,
-        Verdict::BadFit => Decision::Merged,
-        Verdict::AtBorder => Decision::AtBorder,
-        Verdict::NotConverged => Decision::NotConverged,
-        Verdict::Good => Decision::OtherBead,
+        FixQuality::NoSignal => Decision::NoSignal,
+        FixQuality::BadFit => Decision::Merged,
+        FixQuality::AtBorder => Decision::AtBorder,
+        FixQuality::NotConverged => Decision::NotConverged,
+        FixQuality::Good => Decision::OtherBead,
     }
 }

@@ -133,14 +133,14 @@ fn variances(fix: &Fix) -> (f64, f64) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::fix::Verdict;
+    use crate::fix::FixQuality;
 
     fn fix(x_px: f64) -> Fix {
         Fix {
             x_px,
             var_x_px2: 1e-4,
             var_y_px2: 1e-4,
-            ..Fix::none(0.0, 5.0, Verdict::Good)
+            ..Fix::none(0.0, 5.0, FixQuality::Good)
         }
     }
 

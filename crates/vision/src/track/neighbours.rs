@@ -2,7 +2,7 @@
 
 use super::config::TrackerConfig;
 use super::motion::{Motion, Randomness};
-use crate::fix::{Fix, Verdict};
+use crate::fix::{Fix, FixQuality};
 
 /// Beads looked at in a frame.
 pub(crate) const MAX_BEADS: usize = 8;
@@ -28,8 +28,8 @@ pub(crate) enum Claim {
 }
 
 /// Whether a fix tells where a neighbour is: one cut by the border still does.
-fn is_sight(verdict: Verdict) -> bool {
-    matches!(verdict, Verdict::Good | Verdict::AtBorder)
+fn is_sight(verdict: FixQuality) -> bool {
+    matches!(verdict, FixQuality::Good | FixQuality::AtBorder)
 }
 
 #[derive(Debug, Clone, Copy)]

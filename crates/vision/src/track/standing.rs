@@ -2,7 +2,7 @@
 
 use super::config::{Decision, TrackState, TrackStep};
 use super::motion::Motion;
-use crate::fix::{Fix, Verdict};
+use crate::fix::{Fix, FixQuality};
 
 /// What is followed, as far as the state goes.
 #[derive(Debug, Clone, Copy)]
@@ -64,7 +64,7 @@ impl Standing {
         TrackStep {
             state: self.state,
             decision,
-            fix: fix.unwrap_or(Fix::none(x_px, y_px, Verdict::NoSignal)),
+            fix: fix.unwrap_or(Fix::none(x_px, y_px, FixQuality::NoSignal)),
             x_px,
             y_px,
             sd_px: now.map_or(f64::INFINITY, |c| c.motion.sd_px()),

@@ -2,15 +2,15 @@
 
 use crate::common::{BACKGROUND, Errors, Random, SIDE, bound, frame, render};
 use cellpos_vision::{
-    GaussianProfile, Learning, Localiser, LocaliserConfig, Noise, Polarity, ProfileSpec,
-    RadialProfile, RadialSymmetry, RingProfile, Verdict,
+    FixQuality, GaussianProfile, Learning, Localiser, LocaliserConfig, PixelNoise, Polarity,
+    ProfileSpec, RadialProfile, RadialSymmetry, RingProfile,
 };
 
 const NOISE: f64 = 100.0;
 const FRAMES: usize = 2000;
 
-fn known_noise() -> Noise {
-    Noise::Known {
+fn known_noise() -> PixelNoise {
+    PixelNoise::Known {
         read_sd_grey: NOISE,
         shot_grey_per_electron: 0.0,
         black_level_grey: 0.0,
@@ -59,7 +59,11 @@ fn error_reaches_the_cramer_rao_bound_without_bias() {
                 let pixels = render(profile.as_ref(), x, y, snr * NOISE, NOISE, &mut random);
                 let frame = frame(&pixels);
                 let fix = localiser.locate(&frame, None);
-                assert_eq!(fix.verdict, Verdict::Good, "{name} {snr} {x} {y} {fix:?}");
+                assert_eq!(
+                    fix.verdict,
+                    FixQuality::Good,
+                    "{name} {snr} {x} {y} {fix:?}"
+                );
                 let limit = bound(profile.as_ref(), x, y, snr);
                 bound_px += limit.0 / FRAMES as f64;
                 let (ex, ey) = (fix.x_px - x, fix.y_px - y);
@@ -131,7 +135,7 @@ fn shot_noise_is_weighted_as_the_bound_asks() {
     // Grey levels per electron so large that the core is four times as noisy as the ring.
     let (gain, read, amplitude, black) = (8.0, 60.0, 6000.0, BACKGROUND - 4000.0);
     let profile = RingProfile::new(RingProfile::MEASURED_EDGE_PX).unwrap();
-    let noise = Noise::Known {
+    let noise = PixelNoise::Known {
         read_sd_grey: read,
         shot_grey_per_electron: gain,
         black_level_grey: black,
@@ -139,7 +143,7 @@ fn shot_noise_is_weighted_as_the_bound_asks() {
     let spec = ProfileSpec::Ring {
         edge_px: RingProfile::MEASURED_EDGE_PX,
     };
-    let run = |noise: Noise| {
+    let run = |noise: PixelNoise| {
         let mut localiser = Localiser::new(LocaliserConfig {
             window_px: SIDE,
             noise,
@@ -158,7 +162,7 @@ fn shot_noise_is_weighted_as_the_bound_asks() {
             };
             let pixels: Vec<u16> = (0..SIDE * SIDE).map(pixel).collect();
             let fix = localiser.locate(&frame(&pixels), Some((12.0, 12.0)));
-            assert_eq!(fix.verdict, Verdict::Good, "{fix:?}");
+            assert_eq!(fix.verdict, FixQuality::Good, "{fix:?}");
             squares += ((fix.x_px - x).powi(2) + (fix.y_px - y).powi(2)) / (2 * FRAMES) as f64;
             claimed += (fix.var_x_px2 + fix.var_y_px2) / (2 * FRAMES) as f64;
             chi2 += fix.residual_ratio / FRAMES as f64;
@@ -166,7 +170,7 @@ fn shot_noise_is_weighted_as_the_bound_asks() {
         (squares.sqrt(), claimed.sqrt(), chi2)
     };
     let (weighted, claimed, chi2) = run(noise);
-    let (even, ..) = run(Noise::Estimated);
+    let (even, ..) = run(PixelNoise::Estimated);
     println!(
         "shot noise: weighted {weighted:.5} px, claimed {claimed:.5} px, even weights {even:.5} px, chi2 {chi2:.3}"
     );
@@ -293,9 +297,9 @@ fn dark_beads_are_found_by_a_dark_localiser_and_are_no_signal_to_a_bright_one() 
             .locate(&frame(&pixels), None)
     };
     let dark = locate(Polarity::Dark);
-    assert_eq!(dark.verdict, Verdict::Good);
+    assert_eq!(dark.verdict, FixQuality::Good);
     assert!((dark.x_px - 12.3).abs() < 0.1 && dark.snr > 30.0);
-    assert_eq!(locate(Polarity::Bright).verdict, Verdict::NoSignal);
+    assert_eq!(locate(Polarity::Bright).verdict, FixQuality::NoSignal);
 }
 
 #[test]
@@ -308,6 +312,6 @@ fn noise_alone_gives_no_signal() {
         let pixels = render(&nothing, 12.0, 12.0, 0.0, NOISE, &mut random);
         let guess = if n % 2 == 0 { None } else { Some((12.0, 12.0)) };
         let fix = localiser.locate(&frame(&pixels), guess);
-        assert_ne!(fix.verdict, Verdict::Good, "{fix:?}");
+        assert_ne!(fix.verdict, FixQuality::Good, "{fix:?}");
     }
 }

@@ -2,8 +2,8 @@
 
 use crate::common::Random;
 use cellpos_vision::{
-    Cell, CellConfig, CellError, CellFinder, CellTracker, Decision, Frame, Pixels, TrackState,
-    TrackerConfig, Verdict,
+    Cell, CellConfig, CellError, CellFinder, CellTracker, Decision, FixQuality, Frame, Pixels,
+    TrackState, TrackerConfig,
 };
 
 const WIDTH: usize = 240;
@@ -278,7 +278,7 @@ fn two_cells_that_touch_are_not_taken_and_the_right_one_comes_back() {
         touched += u32::from(step.track.decision == Decision::InContact);
         if matches!(step.track.decision, Decision::Merged | Decision::InContact) {
             refused += 1;
-            assert_eq!(step.track.fix.verdict, Verdict::BadFit);
+            assert_eq!(step.track.fix.verdict, FixQuality::BadFit);
         }
         if let Some(cell) = step.cell {
             assert!((cell.x_px - 80.0).abs() < 0.5, "{n}: {cell:?}");
@@ -452,7 +452,10 @@ fn a_cell_cut_by_the_border_and_an_empty_frame_say_so() {
     }
     let cut = run.see(&[Drawn::at(5.0)]);
     assert_eq!(cut.track.decision, Decision::AtBorder);
-    assert_eq!((cut.cell, cut.track.fix.verdict), (None, Verdict::AtBorder));
+    assert_eq!(
+        (cut.cell, cut.track.fix.verdict),
+        (None, FixQuality::AtBorder)
+    );
     assert_eq!(run.see(&[]).track.decision, Decision::NothingFound);
     let wrong = vec![0_u8; 100];
     let small = Frame {

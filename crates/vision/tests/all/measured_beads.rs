@@ -1,8 +1,8 @@
 //! Five measured beads in bright field, against positions found by another program.
 
 use cellpos_vision::{
-    Frame, Learning, LinkConfig, Localiser, LocaliserConfig, ManyTracker, Pixels, ProfileSpec,
-    RingProfile, Verdict,
+    FixQuality, Frame, Learning, LinkConfig, Localiser, LocaliserConfig, ManyTracker, Pixels,
+    ProfileSpec, RingProfile,
 };
 use std::path::Path;
 
@@ -83,7 +83,7 @@ fn all_five_measured_beads_keep_their_numbers_and_move_as_the_reference_says() {
             let sights = tracker.step(&frame);
             assert_eq!(sights.len(), BEADS, "{name}, frame {n}: {sights:?}");
             for s in sights {
-                assert_eq!(s.fix.verdict, Verdict::Good, "{name}, frame {n}: {s:?}");
+                assert_eq!(s.fix.verdict, FixQuality::Good, "{name}, frame {n}: {s:?}");
                 worst_ratio = worst_ratio.max(s.fix.residual_ratio);
                 least_snr = least_snr.min(s.fix.snr);
                 let distance = |b: usize| {

@@ -2,8 +2,8 @@
 
 use cellpos_counting_alloc::allocations;
 use cellpos_vision::{
-    CellConfig, CellFinder, CellTracker, Commanded, Frame, Learning, Localiser, LocaliserConfig,
-    Noise, PixelResponse, Pixels, ProfileSpec, Tracker, TrackerConfig, Verdict,
+    CellConfig, CellFinder, CellTracker, Commanded, FixQuality, Frame, Learning, Localiser,
+    LocaliserConfig, PixelNoise, PixelResponse, Pixels, ProfileSpec, Tracker, TrackerConfig,
 };
 
 #[test]
@@ -24,12 +24,12 @@ fn locating_allocates_nothing_for_any_verdict() {
     let bead: Vec<u8> = image.iter().map(|v| v.round() as u8).collect();
     let bead16: Vec<u16> = image.iter().map(|v| (v * 16.0) as u16).collect();
     let blank = vec![100_u8; 64 * 64];
-    let shot = Noise::Known {
+    let shot = PixelNoise::Known {
         read_sd_grey: 1.2,
         shot_grey_per_electron: 0.01,
         black_level_grey: 0.0,
     };
-    for noise in [Noise::Estimated, shot] {
+    for noise in [PixelNoise::Estimated, shot] {
         let mut localiser = Localiser::new(LocaliserConfig {
             noise,
             ..LocaliserConfig::new(spec)
@@ -61,7 +61,7 @@ fn locating_allocates_nothing_for_any_verdict() {
                     },
                     guess,
                 );
-                good += u32::from(fix.verdict == Verdict::Good);
+                good += u32::from(fix.verdict == FixQuality::Good);
             }
         }
         assert_eq!(allocations(), before);

@@ -2,8 +2,8 @@
 
 use crate::common::{BACKGROUND, Errors, Random};
 use cellpos_vision::{
-    Frame, Localiser, LocaliserConfig, Noise, Pixels, ProfileSpec, RadialProfile, RingProfile,
-    Verdict,
+    FixQuality, Frame, Localiser, LocaliserConfig, PixelNoise, Pixels, ProfileSpec, RadialProfile,
+    RingProfile,
 };
 use nalgebra::{Matrix4, Vector4};
 
@@ -74,7 +74,7 @@ fn bound(p: &RingProfile, way: (f64, f64), snr: f64) -> (f64, f64) {
 fn localiser() -> Localiser {
     let config = LocaliserConfig {
         window_px: WINDOW,
-        noise: Noise::Known {
+        noise: PixelNoise::Known {
             read_sd_grey: NOISE,
             shot_grey_per_electron: 0.0,
             black_level_grey: 0.0,
@@ -110,7 +110,7 @@ fn streaks_are_localised_at_their_bound_though_the_speed_is_half_known() {
                 localiser.expect_streak((known * way.0, known * way.1));
                 let guess = (at.0 + random.normal(), at.1 + random.normal());
                 let fix = localiser.locate(&frame(&pixels), Some(guess));
-                good += i32::from(fix.verdict == Verdict::Good);
+                good += i32::from(fix.verdict == FixQuality::Good);
                 residual += fix.residual_ratio / f64::from(n);
                 errors.add((fix.x_px - at.0, fix.y_px - at.1), limit);
             }
@@ -162,7 +162,7 @@ fn of_two_beads_that_touch_and_move_fast_each_is_localised_at_its_own_bound() {
                     localiser.locate_beside(&frame(&pixels), guess, &beads, 0)
                 });
                 assert_eq!(fresh, fix, "what was looked at before must not matter");
-                good += i32::from(fix.verdict == Verdict::Good);
+                good += i32::from(fix.verdict == FixQuality::Good);
                 errors.add((fix.x_px - at.0, fix.y_px - at.1), limit);
             }
             let (ratio, bias) = (errors.ratio(), errors.bias());
@@ -183,5 +183,5 @@ fn a_streak_that_nobody_expects_is_no_fix() {
     let way = (10.0, 0.0);
     let pixels = render(&profile, &[(32.0, 16.0)], way, 40.0, &mut random);
     let fix = localiser().locate(&frame(&pixels), Some((32.0, 16.0)));
-    assert_ne!(fix.verdict, Verdict::Good);
+    assert_ne!(fix.verdict, FixQuality::Good);
 }

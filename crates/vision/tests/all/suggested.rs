@@ -2,8 +2,8 @@
 
 use crate::common::stack::Stack;
 use cellpos_vision::{
-    Decision, Detector, Frame, LinkConfig, Localiser, LocaliserConfig, ManyTracker, Pixels,
-    ProfileSpec, RingProfile, Suggestion, Tracker, TrackerConfig, Verdict,
+    Decision, Detector, FixQuality, Frame, LinkConfig, Localiser, LocaliserConfig, ManyTracker,
+    Pixels, ProfileSpec, RingProfile, Suggestion, Tracker, TrackerConfig,
     suggest::{refine, suggest},
 };
 use std::path::Path;
@@ -78,7 +78,7 @@ fn five_measured_beads_are_all_seen_in_the_loops_tracker_with_suggested_settings
         for (n, frame) in stack.frames().enumerate() {
             let step = tracker.step(Some(&frame), n as f64 / 7.0, (0.0, 0.0));
             let taken = step.decision.is_accepted() || step.decision == Decision::Confirming;
-            seen += usize::from(taken && step.fix.verdict == Verdict::Good);
+            seen += usize::from(taken && step.fix.verdict == FixQuality::Good);
         }
     }
     assert_eq!(seen, 250);
@@ -210,7 +210,7 @@ fn a_size_given_a_fifth_too_large_or_too_small_is_put_right_by_learning() {
         let good = |sights: &[cellpos_vision::Sight]| {
             sights
                 .iter()
-                .filter(|s| s.fix.verdict == Verdict::Good)
+                .filter(|s| s.fix.verdict == FixQuality::Good)
                 .count()
         };
         let seen: usize = stack.frames().map(|frame| good(tracker.step(&frame))).sum();

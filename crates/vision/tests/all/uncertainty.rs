@@ -2,7 +2,7 @@
 
 use crate::common::Random;
 use cellpos_vision::{
-    Frame, Localiser, LocaliserConfig, Pixels, ProfileSpec, RadialProfile, RingProfile, Verdict,
+    FixQuality, Frame, Localiser, LocaliserConfig, Pixels, ProfileSpec, RadialProfile, RingProfile,
 };
 
 const SIDE: usize = 64;
@@ -137,7 +137,7 @@ fn ratio(spoilt: Spoilt) -> (f64, f64) {
             pixels: Pixels::Mono8(&pixels),
         };
         let fix = localiser.locate(&frame, Some((31.5, 31.5)));
-        assert_eq!(fix.verdict, Verdict::Good, "{spoilt:?} {fix:?}");
+        assert_eq!(fix.verdict, FixQuality::Good, "{spoilt:?} {fix:?}");
         error2 += (fix.x_px - at.0).powi(2) + (fix.y_px - at.1).powi(2);
         stated2 += fix.var_x_px2 + fix.var_y_px2;
     }

@@ -4,7 +4,7 @@ use cellpos_experiment::circle::Circle;
 use cellpos_experiment::circle::margins::{AMPLITUDES_UM, LoopMargins, Response};
 use cellpos_experiment::circle::stage::{Stage, Tracked};
 use cellpos_reconcile::Reconciliation;
-use cellpos_report::{Axis, Column, Figure, Panel, Report, Series, Status, Table};
+use cellpos_report::{Axis, Column, Emphasis, Figure, Panel, Report, Series, Table};
 use std::path::Path;
 
 fn effects(stage: &Stage) -> String {
@@ -149,9 +149,9 @@ fn verdict_and_names(circle: &Circle) -> String {
 pub fn report(circle: &Circle, gap: &Path) -> Report {
     let mut r = Report::new("Closed circle: identify, reconcile, design again, track");
     let status = match circle.reconciled.verdict {
-        cellpos_reconcile::Verdict::Unknown => Status::Bad,
-        cellpos_reconcile::Verdict::Ambiguous => Status::Warning,
-        _ => Status::Good,
+        cellpos_reconcile::Verdict::Unknown => Emphasis::Bad,
+        cellpos_reconcile::Verdict::Ambiguous => Emphasis::Warning,
+        _ => Emphasis::Good,
     };
     r.note(status, &verdict_and_names(circle));
 
@@ -238,7 +238,7 @@ fn margins(r: &mut Report, circle: &Circle) {
         for (which, m) in [("model it was designed on", s.predicted), ("rig", s.real)] {
             if m.is_some_and(|m| !m.stable) {
                 r.note(
-                    Status::Bad,
+                    Emphasis::Bad,
                     &format!(
                         "{}: unstable on the {which}; the figures describe its open loop only",
                         s.name
@@ -248,7 +248,7 @@ fn margins(r: &mut Report, circle: &Circle) {
         }
         if let Some(why) = &s.problem {
             r.note(
-                Status::Warning,
+                Emphasis::Warning,
                 &format!("{}: no controller on this model: {why}", s.name),
             );
         }

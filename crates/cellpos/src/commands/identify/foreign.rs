@@ -13,7 +13,7 @@ use cellpos_ident::foreign::{
 use cellpos_ident::rational::RationalFit;
 use cellpos_ident::sampled::Hold;
 use cellpos_plant::{Model, Noise, TransferFunction, effects};
-use cellpos_report::{Axis, Column, Figure, Panel, Report, Series, Status, Table};
+use cellpos_report::{Axis, Column, Emphasis, Figure, Panel, Report, Series, Table};
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
 use std::fmt::Write;
@@ -336,16 +336,16 @@ fn report(results: &[(std::path::PathBuf, ForeignResult)]) -> Report {
         report.section(&path.display().to_string());
         match (r.basis, verdict(r)) {
             (Basis::Nothing { .. }, Some(verdict)) => {
-                report.note(Status::Bad, &verdict);
+                report.note(Emphasis::Bad, &verdict);
                 continue;
             }
             (_, Some(verdict)) => {
-                report.note(Status::Plain, &verdict);
+                report.note(Emphasis::Plain, &verdict);
             }
             (_, None) => {}
         }
         if r.harmonics_remain() {
-            report.note(Status::Warning, NO_LINEAR);
+            report.note(Emphasis::Warning, NO_LINEAR);
         }
         match r.models.first() {
             Some(m) => {
@@ -359,7 +359,7 @@ fn report(results: &[(std::path::PathBuf, ForeignResult)]) -> Report {
                 ));
             }
             None => {
-                report.note(Status::Warning, no_model(r));
+                report.note(Emphasis::Warning, no_model(r));
             }
         }
         if !r.lines.is_empty() {

@@ -2,7 +2,7 @@
 
 use super::report::number;
 use cellpos_experiment::identify::{Done, Job};
-use cellpos_ident::verdict::Verdict;
+use cellpos_ident::identifiability::Identifiability;
 use cellpos_plant::{Hertz, TransferFunction};
 use serde_json::{Map, Value, json};
 use std::fmt::Write;
@@ -28,8 +28,8 @@ pub fn identification(done: &Done, job: &Job, model: &Path, report: &Path) -> Va
     let mut parameters = Map::new();
     for p in &result.judged.parameters {
         let (verdict, reason) = match &p.verdict {
-            Verdict::Identified => ("identified", Value::Null),
-            Verdict::NotIdentifiable { reason } => {
+            Identifiability::Identified => ("identified", Value::Null),
+            Identifiability::NotIdentifiable { reason } => {
                 ("not identifiable from this band", json!(reason))
             }
         };

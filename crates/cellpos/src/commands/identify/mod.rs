@@ -13,7 +13,7 @@ use cellpos_emulator::WorldConfig;
 use cellpos_experiment::identify::held_bead::Setup;
 use cellpos_experiment::identify::{self as identification, Excitation};
 use cellpos_experiment::on_rig::OnRig;
-use cellpos_ident::excitation::{Limits, PAPER_FREQUENCIES_HZ};
+use cellpos_ident::excitation::{ExcitationLimits, PAPER_FREQUENCIES_HZ};
 use cellpos_plant::Model;
 use cellpos_rig::Clock;
 use cellpos_session::provenance;
@@ -251,7 +251,7 @@ fn job(args: &Args) -> Result<identification::Job, Failure> {
     let limits = match &rig {
         Some(rig) => rig.limits(amplitudes.0, amplitudes.1, amplitudes.2),
         // As [`on_rig::OnRig::limits`] for the emulated board's 40 um/ms.
-        None => Limits {
+        None => ExcitationLimits {
             bead_um: amplitudes.0,
             bead_um_per_s: amplitudes.1,
             pzt_um: amplitudes.2,

@@ -2,10 +2,10 @@
 
 use cellpos_experiment::identify::Done;
 use cellpos_ident::candidate_model::CandidateModel;
+use cellpos_ident::identifiability::{Identifiability, IdentifiedParameter};
 use cellpos_ident::summary::Identification;
-use cellpos_ident::verdict::{Parameter, Verdict};
 use cellpos_plant::{EQ5_VELOCITY_GAIN_PER_S, Hertz, TransferFunction};
-use cellpos_report::{Axis, Column, Figure, Panel, Report, Series, Status, Table};
+use cellpos_report::{Axis, Column, Emphasis, Figure, Panel, Report, Series, Table};
 
 /// Frequencies for curves, Hz: `count` evenly in the logarithm.
 pub fn log_grid(low_hz: f64, high_hz: f64, count: usize) -> Vec<f64> {
@@ -294,7 +294,7 @@ fn interval(ends: [f64; 2]) -> String {
 }
 
 /// The table of parameters with verdicts.
-pub fn parameters(parameters: &[Parameter]) -> Table {
+pub fn parameters(parameters: &[IdentifiedParameter]) -> Table {
     let mut table = Table::new([
         Column::left("parameter"),
         Column::right("value"),
@@ -305,9 +305,9 @@ pub fn parameters(parameters: &[Parameter]) -> Table {
     ]);
     for p in parameters {
         let (status, verdict) = match &p.verdict {
-            Verdict::Identified => (Status::Good, "identified".to_owned()),
-            Verdict::NotIdentifiable { reason } => (
-                Status::Warning,
+            Identifiability::Identified => (Emphasis::Good, "identified".to_owned()),
+            Identifiability::NotIdentifiable { reason } => (
+                Emphasis::Warning,
                 format!("not identifiable from this band: {reason}"),
             ),
         };
@@ -371,9 +371,9 @@ pub fn candidates(result: &Identification) -> Table {
     for (i, r) in result.selection.candidates.iter().enumerate() {
         table.row_with(
             if i == result.selection.chosen {
-                Status::Good
+                Emphasis::Good
             } else {
-                Status::Plain
+                Emphasis::Plain
             },
             [
                 r.order.formula().to_owned(),
@@ -397,7 +397,7 @@ pub fn report(done: &Done, command_line: &str) -> Report {
         done.records.iter().map(|r| r.input.len()).sum::<usize>()
     ));
     for warning in &result.warnings {
-        report.note(Status::Warning, warning);
+        report.note(Emphasis::Warning, warning);
     }
     report
         .section("Parameters")

@@ -13,11 +13,11 @@ use cellpos_emulator::WorldConfig;
 use cellpos_experiment::identify::held_bead::{HeldBead, Setup};
 use cellpos_experiment::identify::{Done, Excitation, Job, run as identify};
 use cellpos_ident::bare_fft;
-use cellpos_ident::excitation::{Limits, PAPER_FREQUENCIES_HZ, Signal, Tone};
+use cellpos_ident::excitation::{ExcitationLimits, PAPER_FREQUENCIES_HZ, Signal, Tone};
 use cellpos_ident::experiment::{Cause, Plan, PlannedSegment, RecordedSegment};
-use cellpos_ident::frequency_response::{Segment, Settings, measure};
+use cellpos_ident::frequency_response::{DrivenStretch, Settings, measure};
 use cellpos_plant::Model;
-use cellpos_report::{Column, Report, Status, Table};
+use cellpos_report::{Column, Emphasis, Report, Table};
 use cellpos_rig::Clock;
 use std::path::PathBuf;
 
@@ -112,7 +112,7 @@ fn drifting(seed: u64, delay_s: f64) -> Result<Drifting, Failure> {
         .to_degrees()
         + hold_deg;
     let lines = [frequency_hz];
-    let segment = Segment {
+    let segment = DrivenStretch {
         input,
         output,
         from: 0,
@@ -137,7 +137,7 @@ fn job(seed: u64) -> Job {
         setup: setup(seed, WorldConfig::default().drift_um_per_s, 0.0, true),
         lines_hz: PAPER_FREQUENCIES_HZ.to_vec(),
         excitation: Excitation::Stepped,
-        limits: Limits {
+        limits: ExcitationLimits {
             bead_um: 8.0,
             bead_um_per_s: 400.0,
             pzt_um: 10.0,
@@ -206,9 +206,9 @@ fn report(
     ]);
     for row in rows {
         let status = match (row.holds, row.paper_is_wrong) {
-            (false, _) => Status::Bad,
-            (true, true) => Status::Warning,
-            (true, false) => Status::Good,
+            (false, _) => Emphasis::Bad,
+            (true, true) => Emphasis::Warning,
+            (true, false) => Emphasis::Good,
         };
         table.row_with(
             status,
@@ -255,7 +255,7 @@ fn report(
         .section("Fig. A1: the complex plane at 10 Hz, with drift")
         .figure(figures::fig_a1(drifting));
     for warning in &done.result.warnings {
-        report.note(Status::Warning, warning);
+        report.note(Emphasis::Warning, warning);
     }
     report
 }

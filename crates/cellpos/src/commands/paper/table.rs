@@ -7,8 +7,8 @@ use crate::commands::identify::report::number;
 use crate::outcome::Failure;
 use cellpos_experiment::identify::Done;
 use cellpos_ident::excitation::{PAPER_FREQUENCIES_HZ, check_grid};
+use cellpos_ident::identifiability::IdentifiedParameter;
 use cellpos_ident::summary::literal_per_hertz;
-use cellpos_ident::verdict::Parameter;
 use cellpos_plant::{EQ5_LITERAL_PER_S, EQ5_VELOCITY_GAIN_PER_S, Hertz, TransferFunction};
 
 fn within(value: f64, target: f64, tolerance: f64) -> bool {
@@ -58,7 +58,7 @@ fn a10_error_db(frequency_hz: f64) -> f64 {
 }
 
 /// A parameter of the identification.
-fn parameter<'a>(done: &'a Done, name: &str) -> Result<&'a Parameter, Failure> {
+fn parameter<'a>(done: &'a Done, name: &str) -> Result<&'a IdentifiedParameter, Failure> {
     done.result
         .judged
         .parameter(name)

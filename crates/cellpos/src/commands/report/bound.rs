@@ -27,7 +27,7 @@ impl Bound {
             }
             value.as_float()
         };
-        let diffusion_um2_per_s = cellpos_session::recorded::diffusion_um2_per_s(meta)?;
+        let diffusion_um2_per_s = cellpos_session::recorded::diffusion_of_run_um2_per_s(meta)?;
         let delay_s = at(&["timing", "camera_delay_ms"])? * 1e-3;
         let period_s = at(&["timing", "period_us"])? * 1e-6;
         Some(Self {

@@ -1,7 +1,7 @@
 //! The clips that were kept of the camera's picture: a strip of frames of each, bounded in number and size.
 
 use super::Session;
-use cellpos_report::{Report, Status};
+use cellpos_report::{Emphasis, Report};
 use cellpos_session::clips::{self, Film};
 use image::{GrayImage, ImageFormat, Luma};
 use std::io::Cursor;
@@ -46,7 +46,7 @@ pub(super) fn section(page: &mut Report, sessions: &[Session]) {
             }
             Err(error) => {
                 let text = format!("{path} cannot be shown: {error}");
-                page.note(Status::Warning, &text);
+                page.note(Emphasis::Warning, &text);
             }
         }
     }

@@ -1,6 +1,6 @@
 //! The cycles of a run: their trends, each motion by itself, with the static arm beside.
 
-use cellpos_report::{Axis, Column, Figure, Panel, Report, Series, Status, Table};
+use cellpos_report::{Axis, Column, Emphasis, Figure, Panel, Report, Series, Table};
 use cellpos_script::{ArmKind, AtRest, CycleFlags, CycleRow, ReadCycles, Trend, trend};
 use std::collections::BTreeMap;
 
@@ -97,14 +97,14 @@ pub fn section(page: &mut Report, read: &ReadCycles) -> serde_json::Value {
     page.section("Cycles");
     if let Some(error) = &read.head {
         page.note(
-            Status::Warning,
+            Emphasis::Warning,
             &format!(
                 "cycles.csv is not read: {error}. Was it changed, or written by a newer version?"
             ),
         );
     } else if unreadable > 0 {
         page.note(
-            Status::Warning,
+            Emphasis::Warning,
             &format!("{unreadable} lines of cycles.csv are no rows."),
         );
     }

@@ -3,7 +3,7 @@
 use super::Session;
 use crate::outcome::Failure;
 use cellpos_record::{Event, RunReader};
-use cellpos_report::{Axis, Column, Figure, Panel, Report, Series, Status, Table};
+use cellpos_report::{Axis, Column, Emphasis, Figure, Panel, Report, Series, Table};
 use cellpos_runtime::{TickFlags, TickRecord};
 use std::collections::VecDeque;
 
@@ -21,7 +21,7 @@ pub(super) fn section(page: &mut Report, sessions: &[Session]) -> Result<(), Fai
         let rows = rows(&reader, safe.time_s)?;
         page.section("What happened");
         let what = text(safe).unwrap_or("Safe was latched.");
-        page.note(Status::Bad, what);
+        page.note(Emphasis::Bad, what);
         told(page, session, safe);
         if !rows.is_empty() {
             page.figure(figure(&rows, session.start_s, safe.time_s));

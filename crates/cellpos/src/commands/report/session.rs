@@ -2,7 +2,7 @@
 
 use super::ticks::Ticks;
 use cellpos_record::{Lost, RunMeta};
-use cellpos_report::{Axis, Column, Figure, Panel, Report, Status, Table};
+use cellpos_report::{Axis, Column, Emphasis, Figure, Panel, Report, Table};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
@@ -107,7 +107,7 @@ pub(super) fn provenance(page: &mut Report, sessions: &[Session]) {
         let path = session.folder.join(cellpos_record::RUN_TOML);
         match std::fs::read_to_string(&path) {
             Ok(text) => page.verbatim(&text),
-            Err(error) => page.note(Status::Bad, &format!("{}: {error}", path.display())),
+            Err(error) => page.note(Emphasis::Bad, &format!("{}: {error}", path.display())),
         };
     }
 }

@@ -7,7 +7,7 @@ use crate::commands::vision_summary::{Tally, verdict_name};
 use crate::outcome::Failure;
 use cellpos_drivers::CalibrationFile;
 use cellpos_rig::FrameBuffer;
-use cellpos_vision::{LinkConfig, Localiser, ManyTracker, Verdict};
+use cellpos_vision::{FixQuality, LinkConfig, Localiser, ManyTracker};
 use std::fmt::Write as _;
 use std::time::Instant;
 
@@ -72,14 +72,14 @@ pub(super) fn find(
         if tracker.is_crowded() {
             tally.refuse("crowded");
         }
-        let good = sights.iter().filter(|s| s.fix.verdict == Verdict::Good);
+        let good = sights.iter().filter(|s| s.fix.verdict == FixQuality::Good);
         tally.frame(good.count());
         let marks = sights
             .iter()
             .map(|s| (Some(s.bead), s.fix))
             .chain(tracker.refused().iter().map(|fix| (None, *fix)))
             .map(|(bead, fix)| {
-                let good = fix.verdict == Verdict::Good;
+                let good = fix.verdict == FixQuality::Good;
                 (bead, fix.x_px, fix.y_px, radius_px, good)
             });
         sheet.add(n, &frame, marks);

@@ -1,7 +1,7 @@
 //! An effect of the user's own as a part of the chain.
 
 use super::core::{Core, Seen};
-use crate::effects::{Around, Block, Segment, Shown};
+use crate::effects::{Around, Block, Piece, Shown};
 
 /// At the driver, the piezo or the bead.
 #[derive(Debug, Clone)]
@@ -28,11 +28,11 @@ impl Inline {
 }
 
 impl Block for Inline {
-    fn advance(&mut self, time_s: f64, h_s: f64, input: Segment) -> Segment {
+    fn advance(&mut self, time_s: f64, h_s: f64, input: Piece) -> Piece {
         let now = self.seen(time_s, input.start, input.speed_start);
         let then = self.seen(time_s + h_s, input.end, input.speed_end);
         let (start, end) = self.core.piece(h_s, &now, &then);
-        Segment::line(start, end, h_s)
+        Piece::line(start, end, h_s)
     }
 
     fn reset(&mut self) {

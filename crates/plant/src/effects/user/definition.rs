@@ -1,6 +1,6 @@
 //! What a user writes down of an effect, and its check.
 
-use super::expression::{Problem, Program};
+use super::expression::{ExpressionProblem, Program};
 use crate::effects::Place;
 
 /// A definition that is refused: which key, and why.
@@ -168,7 +168,7 @@ impl Definition {
         names.extend(self.states.iter().map(|s| s.name.as_str()));
         let last_parameter = SIGNALS.len() + self.parameters.len();
         let of = |key: String, text: &str, known: &[&str]| {
-            Program::new(text, known).map_err(|Problem(words)| self.wrong(key, words))
+            Program::new(text, known).map_err(|ExpressionProblem(words)| self.wrong(key, words))
         };
         let seen = |key: &str, program: Program| -> Result<Program, DefinitionError> {
             let allowed = self.site.signals();

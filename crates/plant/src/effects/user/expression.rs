@@ -9,7 +9,7 @@ use fasteval3::{Compiler, EmptyNamespace, Parser, Slab};
 
 /// What is wrong with a part of a definition, and what would be right.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Problem(pub String);
+pub struct ExpressionProblem(pub String);
 
 type OfOne = (&'static str, fn(f64) -> f64);
 
@@ -54,12 +54,12 @@ impl Program {
     ///
     /// # Errors
     /// A text that is no expression, an unknown name or function: what is wrong and what would be right.
-    pub fn new(text: &str, names: &[&str]) -> Result<Self, Problem> {
+    pub fn new(text: &str, names: &[&str]) -> Result<Self, ExpressionProblem> {
         minus_before_power(text)?;
         let mut slab = Slab::new();
-        let parsed = Parser::new()
-            .parse(text, &mut slab.ps)
-            .map_err(|e| Problem(format!("`{text}` is no expression: {}", in_words(&e))))?;
+        let parsed = Parser::new().parse(text, &mut slab.ps).map_err(|e| {
+            ExpressionProblem(format!("`{text}` is no expression: {}", in_words(&e)))
+        })?;
         let top = parsed
             .from(&slab.ps)
             .compile(&slab.ps, &mut slab.cs, &mut EmptyNamespace);
@@ -74,7 +74,7 @@ impl Program {
         builder.instruction(&top)?;
         let program = builder.program;
         if program.steps.len() > LONGEST || program.depth() > DEEPEST {
-            return Err(Problem(format!(
+            return Err(ExpressionProblem(format!(
                 "`{text}` is too long: at most {LONGEST} numbers, names and operators, nested at most {DEEPEST} deep"
             )));
         }
@@ -155,35 +155,35 @@ fn power(x: f64, y: f64) -> f64 {
 }
 
 impl Builder<'_> {
-    fn push(&mut self, step: Step) -> Result<(), Problem> {
+    fn push(&mut self, step: Step) -> Result<(), ExpressionProblem> {
         self.program.steps.push(step);
         Ok(())
     }
 
-    fn number(&mut self, ic: &IC) -> Result<(), Problem> {
+    fn number(&mut self, ic: &IC) -> Result<(), ExpressionProblem> {
         match ic {
             IC::C(x) => self.push(Step::Number(*x)),
             IC::I(i) => self.at(*i),
         }
     }
 
-    fn at(&mut self, i: InstructionI) -> Result<(), Problem> {
+    fn at(&mut self, i: InstructionI) -> Result<(), ExpressionProblem> {
         let slab = self.slab;
         self.instruction(slab.cs.get_instr(i))
     }
 
-    fn one(&mut self, i: InstructionI, f: fn(f64) -> f64) -> Result<(), Problem> {
+    fn one(&mut self, i: InstructionI, f: fn(f64) -> f64) -> Result<(), ExpressionProblem> {
         self.at(i)?;
         self.push(Step::One(f))
     }
 
-    fn two(&mut self, a: &IC, b: &IC, f: fn(f64, f64) -> f64) -> Result<(), Problem> {
+    fn two(&mut self, a: &IC, b: &IC, f: fn(f64, f64) -> f64) -> Result<(), ExpressionProblem> {
         self.number(a)?;
         self.number(b)?;
         self.push(Step::Two(f))
     }
 
-    fn instruction(&mut self, instruction: &Instruction) -> Result<(), Problem> {
+    fn instruction(&mut self, instruction: &Instruction) -> Result<(), ExpressionProblem> {
         use Instruction as I;
         match instruction {
             I::IConst(x) => self.push(Step::Number(*x)),
@@ -212,7 +212,7 @@ impl Builder<'_> {
         }
     }
 
-    fn of_one_builtin(&mut self, instruction: &Instruction) -> Result<(), Problem> {
+    fn of_one_builtin(&mut self, instruction: &Instruction) -> Result<(), ExpressionProblem> {
         use Instruction as I;
         match instruction {
             I::IFuncInt(i) => self.one(*i, f64::trunc),
@@ -232,14 +232,16 @@ impl Builder<'_> {
             I::IFuncASinH(i) => self.one(*i, f64::asinh),
             I::IFuncACosH(i) => self.one(*i, f64::acosh),
             I::IFuncATanH(i) => self.one(*i, f64::atanh),
-            _ => Err(Problem("`print` is no function of an effect".to_owned())),
+            _ => Err(ExpressionProblem(
+                "`print` is no function of an effect".to_owned(),
+            )),
         }
     }
 
-    fn name(&mut self, name: &str) -> Result<(), Problem> {
+    fn name(&mut self, name: &str) -> Result<(), ExpressionProblem> {
         let Some(at) = self.names.iter().position(|n| *n == name) else {
             let near = cellpos_units::nearest(name, self.names.iter().copied());
-            return Err(Problem(format!(
+            return Err(ExpressionProblem(format!(
                 "`{name}` is not known here{}: what may stand here is {}",
                 near.map_or_else(String::new, |n| format!(" (did you mean `{n}`?)")),
                 self.names.join(", ")
@@ -249,21 +251,21 @@ impl Builder<'_> {
         self.push(Step::Name(at))
     }
 
-    fn function(&mut self, name: &str, args: &[IC]) -> Result<(), Problem> {
+    fn function(&mut self, name: &str, args: &[IC]) -> Result<(), ExpressionProblem> {
         // A name with empty parentheses is a name.
         if args.is_empty() && self.names.contains(&name) {
             return self.name(name);
         }
         let Some((_, f)) = OF_ONE.iter().find(|(n, _)| *n == name) else {
             let near = cellpos_units::nearest(name, FUNCTIONS.iter().copied());
-            return Err(Problem(format!(
+            return Err(ExpressionProblem(format!(
                 "there is no function `{name}`{}: there are {}",
                 near.map_or_else(String::new, |n| format!(" (did you mean `{n}`?)")),
                 FUNCTIONS.join(", ")
             )));
         };
         let [x] = args else {
-            return Err(Problem(format!(
+            return Err(ExpressionProblem(format!(
                 "`{name}` takes one number, not {}",
                 args.len()
             )));
@@ -274,7 +276,7 @@ impl Builder<'_> {
 }
 
 /// The parser takes `-a^2` for `(-a)^2`, the field for `-(a^2)`: neither is guessed.
-fn minus_before_power(text: &str) -> Result<(), Problem> {
+fn minus_before_power(text: &str) -> Result<(), ExpressionProblem> {
     let c: Vec<char> = text.chars().filter(|c| !c.is_whitespace()).collect();
     for (i, _) in c.iter().enumerate().filter(|(_, c)| **c == '-') {
         let before = i.checked_sub(1).and_then(|i| c.get(i));
@@ -304,7 +306,7 @@ fn minus_before_power(text: &str) -> Result<(), Problem> {
         }
         if c.get(end) == Some(&'^') {
             let operand: String = c[i + 1..end].iter().collect();
-            return Err(Problem(format!(
+            return Err(ExpressionProblem(format!(
                 "`-{operand}^` can be read in two ways: write -({operand}^...) or (-{operand})^..."
             )));
         }
@@ -339,7 +341,7 @@ mod tests {
     fn value(text: &str, values: [f64; 3]) -> f64 {
         match Program::new(text, NAMES) {
             Ok(p) => p.value(&values),
-            Err(Problem(words)) => panic!("{words}"),
+            Err(ExpressionProblem(words)) => panic!("{words}"),
         }
     }
 
@@ -377,7 +379,7 @@ mod tests {
     fn what_is_wrong_with_an_expression_is_said_with_what_would_be_right() {
         let words = |text: &str| match Program::new(text, NAMES) {
             Ok(_) => panic!("{text} is taken"),
-            Err(Problem(words)) => words,
+            Err(ExpressionProblem(words)) => words,
         };
         assert!(words("inpt * 2").contains("did you mean `input`?"));
         assert!(words("sqr(input)").contains("did you mean `sqrt`?"));

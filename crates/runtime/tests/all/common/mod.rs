@@ -6,7 +6,7 @@ use cellpos_plant::{Model, TransferFunction};
 use cellpos_rig::{ActuatorFault, ActuatorState};
 use cellpos_rig::{ActuatorReport, Measurement};
 use cellpos_runtime::{ArmingConfig, Core, Timing};
-use cellpos_vision::Verdict;
+use cellpos_vision::FixQuality;
 
 /// Where the board stands at the start, um.
 pub const START_UM: f64 = 20.0;
@@ -53,7 +53,7 @@ pub fn measurement(k: u64, position_um: f64) -> Measurement {
         ready_ns: now_ns,
         position_um,
         variance_um2: 4e-4,
-        verdict: Verdict::Good,
+        verdict: FixQuality::Good,
         track: None,
         length_um: f64::NAN,
         area_um2: f64::NAN,

@@ -1,7 +1,7 @@
 //! What the cells of a queue have in common, and how far they differ: a row a cell, a page over all.
 
 use crate::commands::run::over::Over;
-use cellpos_report::{Axis, Column, Figure, Panel, Report, Series, Status, Table};
+use cellpos_report::{Axis, Column, Emphasis, Figure, Panel, Report, Series, Table};
 use cellpos_script::{ArmKind, AtRest, CycleFlags, CycleRow, trend};
 use serde::Serialize;
 use std::collections::BTreeMap;
@@ -182,9 +182,9 @@ pub(super) fn page(name: &str, rows: &[CellRow], cycles: &[Vec<CycleRow>]) -> Re
     let mut page = Report::new(&format!("Cells: {name}"));
     let done = rows.iter().filter(|row| row.is_done()).count();
     let status = if done == rows.len() {
-        Status::Good
+        Emphasis::Good
     } else {
-        Status::Warning
+        Emphasis::Warning
     };
     page.note(
         status,

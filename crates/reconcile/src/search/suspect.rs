@@ -8,7 +8,7 @@ use std::f64::consts::TAU;
 
 /// One candidate that may be worth a fit.
 #[derive(Debug, Clone)]
-pub(crate) struct Lead {
+pub(crate) struct Suspect {
     pub part: Part,
     /// Expected fall of the sum of squares.
     pub score: f64,

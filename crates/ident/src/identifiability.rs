@@ -15,7 +15,7 @@ use crate::stats::{quantile, student_t_quantile};
 
 /// Whether the data determine a parameter.
 #[derive(Debug, Clone, PartialEq)]
-pub enum Verdict {
+pub enum Identifiability {
     /// The interval can be relied on.
     Identified,
     /// The band excited does not determine it; the reason in a sentence.
@@ -25,24 +25,24 @@ pub enum Verdict {
     },
 }
 
-impl Verdict {
+impl Identifiability {
     /// `identified` or `not identifiable from this band`.
     pub fn label(&self) -> &'static str {
         match self {
-            Verdict::Identified => "identified",
-            Verdict::NotIdentifiable { .. } => "not identifiable from this band",
+            Identifiability::Identified => "identified",
+            Identifiability::NotIdentifiable { .. } => "not identifiable from this band",
         }
     }
 
-    /// Whether it is [`Verdict::Identified`].
+    /// Whether it is [`Identifiability::Identified`].
     pub fn is_identified(&self) -> bool {
-        matches!(self, Verdict::Identified)
+        matches!(self, Identifiability::Identified)
     }
 }
 
 /// One parameter with everything that is known of it.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Parameter {
+pub struct IdentifiedParameter {
     /// Name with unit, for example `gain_per_s`.
     pub name: &'static str,
     /// What it is, in words.
@@ -56,14 +56,14 @@ pub struct Parameter {
     /// 95 % interval by bootstrap, where one was run.
     pub bootstrap95: Option<[f64; 2]>,
     /// The verdict.
-    pub verdict: Verdict,
+    pub verdict: Identifiability,
 }
 
 /// The parameters of a fit of candidate orders with verdicts, and the model to go on with.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Judged {
     /// One entry per parameter of Eq. (4) with delay.
-    pub parameters: Vec<Parameter>,
+    pub parameters: Vec<IdentifiedParameter>,
     /// The chosen model, with the delay of the prior where there is one.
     pub model: CandidateModel,
     /// Interval of the delay from the phase slope alone, far zero included (upper end infinite where unbounded), s.
@@ -74,7 +74,7 @@ pub struct Judged {
 
 impl Judged {
     /// The parameter called `name`.
-    pub fn parameter(&self, name: &str) -> Option<&Parameter> {
+    pub fn parameter(&self, name: &str) -> Option<&IdentifiedParameter> {
         self.parameters.iter().find(|p| p.name == name)
     }
 }
@@ -162,12 +162,12 @@ fn log_interval(value: f64, sd_log: f64, t: f64) -> [f64; 2] {
     [value * (-t * sd_log).exp(), value * (t * sd_log).exp()]
 }
 
-fn judge_width(value: f64, interval: [f64; 2], why_not: &str) -> Verdict {
+fn judge_width(value: f64, interval: [f64; 2], why_not: &str) -> Identifiability {
     let widest = (interval[1] - value).abs().max((value - interval[0]).abs());
     if widest.is_finite() && widest < WIDEST_RELATIVE * value.abs() {
-        Verdict::Identified
+        Identifiability::Identified
     } else {
-        Verdict::NotIdentifiable {
+        Identifiability::NotIdentifiable {
             reason: why_not.to_owned(),
         }
     }
@@ -211,7 +211,7 @@ pub fn judge(
 
     let gain = best.parameters[index::LN_GAIN].exp();
     let gain95 = log_interval(gain, sd(index::LN_GAIN), t);
-    parameters.push(Parameter {
+    parameters.push(IdentifiedParameter {
         name: "gain_per_s",
         meaning: "integrator gain K: bead speed per PZT displacement",
         unit: "1/s",
@@ -228,7 +228,7 @@ pub fn judge(
 
     let effective = best.parameters[index::EFFECTIVE_DELAY_MS];
     let half = t * sd(index::EFFECTIVE_DELAY_MS);
-    parameters.push(Parameter {
+    parameters.push(IdentifiedParameter {
         name: "effective_delay_ms",
         meaning: "delay less the far zero's lead: what the phase slope determines",
         unit: "ms",
@@ -237,9 +237,9 @@ pub fn judge(
         bootstrap95: drawn(&|x| x[index::EFFECTIVE_DELAY_MS]),
         // A delay may be near zero: its scale is the sampling period, not its own value.
         verdict: if half < 0.25 * period_ms {
-            Verdict::Identified
+            Identifiability::Identified
         } else {
-            Verdict::NotIdentifiable {
+            Identifiability::NotIdentifiable {
                 reason: "the phase slope is too uncertain: excite higher frequencies".to_owned(),
             }
         },
@@ -272,7 +272,7 @@ pub fn judge(
 }
 
 /// Zero and pole of the pair, where a fit has them.
-fn pair_parameters(fit: &CandidateFits, t: f64, drawn: &Drawn) -> Vec<Parameter> {
+fn pair_parameters(fit: &CandidateFits, t: f64, drawn: &Drawn) -> Vec<IdentifiedParameter> {
     let best = fit.best();
     let mut found = Vec::new();
     for (name, meaning, i) in [
@@ -298,7 +298,7 @@ fn pair_parameters(fit: &CandidateFits, t: f64, drawn: &Drawn) -> Vec<Parameter>
         let value = source.parameters[i].exp();
         let ci95 = log_interval(value, source.covariance[(i, i)].sqrt(), t);
         let chosen = best.order >= CandidateOrder::PoleZeroPair;
-        found.push(Parameter {
+        found.push(IdentifiedParameter {
             name,
             meaning,
             unit: "rad/s",
@@ -312,7 +312,7 @@ fn pair_parameters(fit: &CandidateFits, t: f64, drawn: &Drawn) -> Vec<Parameter>
                     "the pair is seen, but not where it lies: excite more lines about it",
                 )
             } else {
-                Verdict::NotIdentifiable {
+                Identifiability::NotIdentifiable {
                     reason: "the data do not need a pole-zero pair".to_owned(),
                 }
             },
@@ -366,20 +366,20 @@ fn delay_parameter(
     half_ms: f64,
     lead_ms: [f64; 2],
     period_ms: f64,
-) -> Parameter {
+) -> IdentifiedParameter {
     let meaning = "delay from the command to the middle of the exposure";
     match prior {
         Some(prior) => {
             let half = prior.half95_s * 1e3;
             let value = model.delay_s * 1e3;
-            Parameter {
+            IdentifiedParameter {
                 name: "delay_ms",
                 meaning,
                 unit: "ms",
                 value,
                 ci95: [value - half, value + half],
                 bootstrap95: None,
-                verdict: Verdict::Identified,
+                verdict: Identifiability::Identified,
             }
         }
         None => {
@@ -388,7 +388,7 @@ fn delay_parameter(
                 effective_ms + lead_ms[1] + half_ms,
             );
             let narrow = high - low < 0.25 * period_ms;
-            Parameter {
+            IdentifiedParameter {
                 name: "delay_ms",
                 meaning,
                 unit: "ms",
@@ -396,9 +396,9 @@ fn delay_parameter(
                 ci95: [low, high],
                 bootstrap95: None,
                 verdict: if narrow {
-                    Verdict::Identified
+                    Identifiability::Identified
                 } else {
-                    Verdict::NotIdentifiable {
+                    Identifiability::NotIdentifiable {
                         reason: "a far zero's lead trades against it behind a zero-order hold; the LED test tells them apart".to_owned(),
                     }
                 },
@@ -413,7 +413,7 @@ fn far_zero_parameter(
     prior: Option<DelayPrior>,
     lead_ms: [f64; 2],
     period_ms: f64,
-) -> Parameter {
+) -> IdentifiedParameter {
     let invert = |ms: f64| if ms > 0.0 { 1e3 / ms } else { f64::INFINITY };
     let ci95 = [
         if lead_ms[1].is_finite() {
@@ -439,7 +439,7 @@ fn far_zero_parameter(
         invert(middle.max(1e-3 * period_ms))
     };
     let verdict = if identified {
-        Verdict::Identified
+        Identifiability::Identified
     } else {
         let mut reason = format!(
             "its lead trades against the delay: the record alone allows leads of {:.3} to {} ms",
@@ -453,9 +453,9 @@ fn far_zero_parameter(
         if prior.is_some() {
             reason.push_str("; the value shown takes the LED test's delay as given");
         }
-        Verdict::NotIdentifiable { reason }
+        Identifiability::NotIdentifiable { reason }
     };
-    Parameter {
+    IdentifiedParameter {
         name: "far_zero_rad_per_s",
         meaning: "far zero of Eq. (4)",
         unit: "rad/s",
@@ -466,10 +466,10 @@ fn far_zero_parameter(
     }
 }
 
-fn slow_pole_parameter(value: f64, half: f64, chosen: CandidateOrder) -> Parameter {
+fn slow_pole_parameter(value: f64, half: f64, chosen: CandidateOrder) -> IdentifiedParameter {
     let identified = chosen == CandidateOrder::Eq4 && half < WIDEST_RELATIVE * value;
     let high = value + half;
-    Parameter {
+    IdentifiedParameter {
         name: "slow_pole_rad_per_s",
         meaning: "slow pole of Eq. (4)",
         unit: "rad/s",
@@ -477,9 +477,9 @@ fn slow_pole_parameter(value: f64, half: f64, chosen: CandidateOrder) -> Paramet
         ci95: [(value - half).max(0.0), high.max(0.0)],
         bootstrap95: None,
         verdict: if identified {
-            Verdict::Identified
+            Identifiability::Identified
         } else {
-            Verdict::NotIdentifiable {
+            Identifiability::NotIdentifiable {
                 reason: format!(
                     "it lies far below the lowest line; the data only say that it is below {:.2} rad/s",
                     high.max(0.0)
