@@ -3,17 +3,14 @@
 
 use cellpos_plant::Model;
 use cellpos_reconcile::{Options, ReconcileError, Reconciliation, Record, Verdict, reconcile};
-use cellpos_tests::truth::cases::Case;
-use cellpos_tests::truth::table::records;
-use cellpos_tests::truth::{Hidden, threshold::above_threshold};
+use cellpos_tests::truth::cases::{Case, Session, nulls};
+use cellpos_tests::truth::draw::{floorless, sets};
+use cellpos_tests::truth::table::{evaluate, records};
+use cellpos_tests::truth::threshold::above_threshold;
+use cellpos_tests::truth::{Excitation, Hidden, Second, Stranger};
 
 fn hiding(hidden: Hidden, seed: u64) -> Vec<Record> {
-    let case = Case {
-        group: "single",
-        level: "",
-        hidden: vec![hidden],
-    };
-    records(&case, seed)
+    records(&Case::new("single", vec![hidden], Session::STANDARD), seed)
 }
 
 fn run(records: &[Record]) -> Result<Reconciliation, ReconcileError> {
@@ -59,7 +56,7 @@ fn a_line_off_the_mains_is_unknown_with_a_formula_that_holds_on_held_out_data() 
 #[test]
 fn a_leak_twice_above_the_threshold_is_named_however_the_records_are_ordered_and_cut() {
     let weak = Hidden::Leak(0.08);
-    let times = above_threshold(&[weak], 13);
+    let times = above_threshold(&[weak], Excitation::Standard, 13);
     assert!((1.8..2.4).contains(&times), "{times} times the threshold");
     let mut files = hiding(weak, 13);
     let whole = run(&files).unwrap();
@@ -94,4 +91,51 @@ fn a_lag_too_short_to_tell_its_kind_is_ambiguous_with_every_kind_and_the_experim
         );
     }
     assert!(effect.separate_by.as_ref().unwrap().contains("300 Hz"));
+}
+
+#[test]
+fn a_play_between_flanks_that_give_way_is_backlash() {
+    let rounded = Hidden::Second(Second::RoundedPlay(0.2));
+    let result = run(&hiding(rounded, 15)).unwrap();
+    let named: Vec<&str> = result.effects.iter().map(|e| e.id.as_str()).collect();
+    assert_eq!(named, ["backlash"], "{:?}", result.places);
+}
+
+#[test]
+fn drawn_cases_differ_by_seed_and_are_the_same_for_one() {
+    let (one, again, other) = (
+        sets("pair", 2, 3, 5),
+        sets("pair", 2, 3, 5),
+        sets("pair", 2, 3, 6),
+    );
+    let hidden =
+        |cases: &[Case]| -> Vec<Vec<Hidden>> { cases.iter().map(|c| c.hidden.clone()).collect() };
+    assert_eq!(hidden(&one), hidden(&again));
+    assert_ne!(hidden(&one), hidden(&other));
+    assert_eq!(records(&one[0], 3), records(&one[0], 3));
+    assert_ne!(records(&one[0], 3)[0].pzt_um, records(&one[0], 4)[0].pzt_um);
+    assert!(one.iter().all(|c| c.hidden[0].id() != c.hidden[1].id()));
+}
+
+#[test]
+fn a_stranger_of_a_seed_gets_no_name_and_a_noise_that_is_slow_or_in_steps_none_either() {
+    let curved = Hidden::Stranger(Stranger::CurvedLens(1e-4));
+    let cases = [
+        Case::new("stranger", vec![curved], Session::DRAWN),
+        nulls(4)[1].clone(),
+        nulls(4)[3].clone(),
+    ];
+    for case in cases {
+        let row = evaluate(&case, 16).unwrap();
+        assert!(row.named.is_empty(), "{case:?}: {:?}", row.named);
+    }
+}
+
+#[test]
+fn without_rest_repeat_or_stated_noise_nothing_of_the_simulator_is_named() {
+    for case in floorless(17).into_iter().skip(1).take(2) {
+        let row = evaluate(&case, 17).unwrap();
+        assert_eq!(row.verdict, Verdict::Unknown, "{case:?}");
+        assert!(row.named.is_empty(), "{case:?}: {:?}", row.named);
+    }
 }

@@ -1,15 +1,35 @@
 //! Prints how well `reconcile` names effects that a simulator of another make hides: table, confusions, rates.
 //!
-//! `cargo run --release -p cellpos-tests --bin reconcile-table [all|singles|pairs|nulls|outside|further|levels] [seed] [text]`, the
-//! last to run only cases whose hidden effects, as printed, contain the text
+//! `cargo run --release -p cellpos-tests --bin reconcile-table [GROUP|all|levels] [seed] [text]`, the last to run only cases
+//! whose hidden effects, as printed, contain the text. Groups: see `GROUPS`; several at once with commas between them.
 
 #![forbid(unsafe_code)]
 
 use cellpos_reconcile::Verdict;
-use cellpos_tests::truth::cases::{Case, further, nulls, outside, pairs, singles};
+use cellpos_tests::truth::Excitation;
+use cellpos_tests::truth::cases::{Case, further, nulls, pairs, seconds, singles};
+use cellpos_tests::truth::draw::{actuators, floorless, noises, sets, strangers};
 use cellpos_tests::truth::table::{Row, evaluate};
 use cellpos_tests::truth::threshold::{above_threshold, weak};
 use std::collections::{BTreeMap, BTreeSet};
+
+/// Names of the groups of cases, in the order of their numbers.
+const GROUPS: [&str; 11] = [
+    "singles",
+    "fixed",
+    "nulls",
+    "strangers",
+    "further",
+    "seconds",
+    "pairs",
+    "triples",
+    "noises",
+    "floorless",
+    "actuators",
+];
+
+/// Amplitude over what can be detected at all, from which on a name is expected to carry.
+const CLEAR: f64 = 4.0;
 
 fn main() {
     let args: Vec<String> = std::env::args().skip(1).collect();
@@ -19,7 +39,7 @@ fn main() {
     if which == "levels" {
         // How far each single lies above the threshold of detection, without running the search.
         for (case, seed) in cases {
-            let times = above_threshold(&case.hidden, seed);
+            let times = above_threshold(&case.hidden, Excitation::Standard, seed);
             println!(
                 "{:7} {:40} {times:6.1}",
                 case.level,
@@ -37,7 +57,24 @@ fn main() {
         .filter_map(|(i, r)| Some((&cases[*i].0, r.as_ref().ok()?)))
         .collect();
     summary(&cases, &done);
+    figures(&done);
     confusions(&done);
+}
+
+fn group(name: &str, seed: u64) -> Vec<Case> {
+    match name {
+        "singles" => singles(),
+        "fixed" => pairs(),
+        "nulls" => nulls(40),
+        "strangers" => strangers(seed),
+        "further" => further(),
+        "seconds" => seconds(),
+        "pairs" => sets("pair", 2, 20, seed),
+        "triples" => sets("triple", 3, 12, seed),
+        "noises" => noises(seed),
+        "floorless" => floorless(seed),
+        _ => actuators(seed),
+    }
 }
 
 /// The cases of a group, each with the seed of its random numbers.
@@ -45,15 +82,10 @@ fn selected(which: &str, seed: u64) -> Vec<(Case, u64)> {
     // A case keeps its random numbers whatever else is run beside it.
     let mut cases: Vec<(Case, u64)> = Vec::new();
     let mut number = 0;
-    for (name, group) in [
-        ("singles", singles()),
-        ("pairs", pairs()),
-        ("nulls", nulls(40)),
-        ("outside", outside()),
-        ("further", further()),
-    ] {
-        for mut case in group {
-            if which == "all" || which == name || (which == "levels" && name == "singles") {
+    for name in GROUPS {
+        for mut case in group(name, seed) {
+            let asked = which == "all" || which.split(',').any(|w| w == name);
+            if asked || (which == "levels" && name == "singles") {
                 if case.level == "weak" {
                     for h in &mut case.hidden {
                         *h = weak(*h, seed * 1000 + number);
@@ -79,74 +111,89 @@ fn evaluated(cases: &[(Case, u64)]) -> BTreeMap<usize, Result<Row, String>> {
     rows.into_iter().enumerate().collect()
 }
 
+/// Counts of every group that was run; a refusal counts as neither exact nor inside, and names nothing.
 fn summary(cases: &[(Case, u64)], done: &[(&Case, &Row)]) {
-    let rate = |group: &str, good: &dyn Fn(&Row) -> bool| {
-        let n = done
-            .iter()
-            .filter(|(c, r)| c.group == group && good(r))
-            .count();
-        (n, cases.iter().filter(|(c, _)| c.group == group).count())
-    };
-    println!("\nsummary (good, all)");
     println!(
-        "singles, exact names       {:?}",
-        rate("single", &|r| r.named == r.hidden)
+        "\n{:10} {:>5} {:>6} {:>7} {:>11} {:>8} {:>9} {:>8} {:>8}",
+        "group",
+        "cases",
+        "exact",
+        "inside",
+        "false names",
+        "unknown",
+        "remainder",
+        "nothing",
+        "refused"
     );
-    println!(
-        "singles, truth inside set  {:?}",
-        rate("single", &|r| r.hidden.is_subset(&r.inside))
-    );
-    println!(
-        "pairs, exact names         {:?}",
-        rate("pair", &|r| r.named == r.hidden)
-    );
-    println!(
-        "nulls with a false name    {:?}",
-        rate("null", &|r| !r.named.is_empty())
-    );
-    println!(
-        "further, exact names       {:?}",
-        rate("further", &|r| r.named == r.hidden)
-    );
-    println!(
-        "outside, called unknown    {:?}",
-        rate("outside", &|r| r.verdict == Verdict::Unknown)
-    );
-    let closures = done
-        .iter()
-        .filter(|(c, _)| c.group == "single")
-        .filter_map(|(_, r)| r.closure)
-        .collect();
-    let fresh = done.iter().filter_map(|(_, r)| r.fresh).collect();
-    for (what, values) in [
-        ("closure on held-out records", closures),
-        ("fall of the RMS error on a fresh excitation", fresh),
-    ] {
-        let mut values: Vec<f64> = values;
-        values.sort_by(f64::total_cmp);
-        if !values.is_empty() {
-            println!(
-                "median over singles: {what}: {:.3}",
-                values[values.len() / 2]
-            );
+    let mut groups: Vec<&str> = Vec::new();
+    for (c, _) in cases {
+        if !groups.contains(&c.group) {
+            groups.push(c.group);
         }
     }
+    for group in groups {
+        let all = cases.iter().filter(|(c, _)| c.group == group).count();
+        let rows: Vec<&Row> = done
+            .iter()
+            .filter(|(c, _)| c.group == group)
+            .map(|(_, r)| *r)
+            .collect();
+        let count = |good: &dyn Fn(&Row) -> bool| rows.iter().filter(|r| good(r)).count();
+        println!(
+            "{group:10} {all:5} {:6} {:7} {:11} {:8} {:9} {:8} {:8}",
+            count(&|r| r.named == r.hidden),
+            count(&|r| r.hidden.is_subset(&r.inside)),
+            count(&|r| !r.false_names.is_empty()),
+            count(&|r| r.verdict == Verdict::Unknown),
+            count(&|r| r.verdict == Verdict::NamedWithRemainder),
+            count(&|r| r.verdict == Verdict::NothingMissing),
+            all - rows.len()
+        );
+    }
+}
+
+/// Closures, intervals and times.
+fn figures(done: &[(&Case, &Row)]) {
+    let clear = |r: &Row| r.above_threshold >= CLEAR;
+    let of = |f: &dyn Fn(&Row) -> Option<f64>| done.iter().filter_map(|(_, r)| f(r)).collect();
+    println!("\nmedian, tenth percentile, count");
+    spread("closure on held-out records", of(&|r| r.closure));
+    spread(
+        "free run on a fresh excitation, about its mean",
+        of(&|r| r.fresh.map(|f| f.plain)),
+    );
+    spread(
+        "the same about a straight line",
+        of(&|r| r.fresh.map(|f| f.response)),
+    );
+    spread(
+        "the same, effects of four times what can be detected",
+        of(&|r| r.fresh.filter(|_| clear(r)).map(|f| f.response)),
+    );
     let covered = done
         .iter()
-        .filter(|(c, _)| c.group == "single" || c.group == "pair")
         .fold((0, 0), |a, (_, r)| (a.0 + r.covered.0, a.1 + r.covered.1));
     println!("95 % intervals that hold the truth: {covered:?}");
     let slowest = done.iter().map(|(_, r)| r.seconds).fold(0.0, f64::max);
     println!("slowest case, time of one processor: {slowest:.1} s");
 }
 
+fn spread(what: &str, mut values: Vec<f64>) {
+    values.sort_by(f64::total_cmp);
+    if !values.is_empty() {
+        println!(
+            "{what}: {:.3} {:.3} {}",
+            values[values.len() / 2],
+            values[values.len() / 10],
+            values.len()
+        );
+    }
+}
+
 fn confusions(done: &[(&Case, &Row)]) {
     println!("\nconfusions (hidden -> verdict and names)");
     let mut confusions: BTreeMap<(String, String), usize> = BTreeMap::new();
-    for (_, r) in done
-        .iter()
-        .filter(|(c, r)| c.group == "single" && r.named != r.hidden)
-    {
+    for (_, r) in done.iter().filter(|(_, r)| r.named != r.hidden) {
         *confusions
             .entry((
                 join(&r.hidden),
@@ -167,22 +214,28 @@ fn line(case: &Case, row: &Result<Row, String>) -> String {
     let hidden = case
         .hidden
         .iter()
-        .map(|h| format!("{h:?}"))
+        .map(|h| format!("{h:.4?}"))
         .collect::<Vec<_>>()
         .join(" + ");
+    let figure = |x: Option<f64>| x.map_or_else(|| "-".to_owned(), |x| format!("{x:.3}"));
     match row {
-        Err(e) => format!("{:8} {:7} {hidden:40} refused: {e}", case.group, case.level),
+        Err(e) => format!("{:9} {:8} {hidden:40} refused: {e}", case.group, case.level),
         Ok(r) => format!(
-            "{:8} {:7} {hidden:40} {} {:16} {:40} closure {:6} fresh {:6} covered {}/{} threshold x {:5.1} {:5.1} s or: {} {} {}",
+            "{:9} {:8} {hidden:40} {} {:16} {:40} closure {:6} fresh {:6} {:6} covered {}/{} threshold x {:5.1} {:5.1} s or: {} {} {}",
             case.group,
             case.level,
-            if r.named == r.hidden { "  " } else { "<>" },
+            if !r.false_names.is_empty() {
+                "!!"
+            } else if r.named == r.hidden {
+                "  "
+            } else {
+                "<>"
+            },
             r.verdict.word(),
             join(&r.named),
-            r.closure
-                .map_or_else(|| "-".to_owned(), |c| format!("{c:.3}")),
-            r.fresh
-                .map_or_else(|| "-".to_owned(), |f| format!("{f:.3}")),
+            figure(r.closure),
+            figure(r.fresh.map(|f| f.plain)),
+            figure(r.fresh.map(|f| f.response)),
             r.covered.0,
             r.covered.1,
             r.above_threshold,

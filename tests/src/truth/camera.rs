@@ -2,6 +2,8 @@
 
 use super::hidden::Hidden;
 use super::random::Random;
+use super::second::Second;
+use super::strangers::Stranger;
 use std::f64::consts::TAU;
 
 /// What the frames show of a fine path.
@@ -9,15 +11,19 @@ use std::f64::consts::TAU;
 /// `path[i]` holds the position right before and right after time i h.
 pub(super) fn camera(
     path: &[[f64; 2]],
-    rows: usize,
+    u: &[f64],
     h: f64,
     hidden: &[Hidden],
     random: &mut Random,
 ) -> Vec<f64> {
     let (mut delay, mut exposure, mut skew) = (0.0, 0.0, 0.0);
+    let (mut unsteady, mut ramps) = (0.0, 0.0);
     let phase = TAU * random.uniform();
     for e in hidden {
         match *e {
+            Hidden::Second(Second::UnsteadyDelay(d)) => (delay, unsteady) = (d - 20e-6, 40e-6),
+            Hidden::Second(Second::ShutterRamps(e)) => (exposure, ramps) = (e, 0.2),
+            Hidden::Stranger(Stranger::FrameJitter(s)) => unsteady = s,
             Hidden::Delay(d) => delay = d,
             Hidden::Exposure(e) => exposure = e,
             Hidden::ClockSkew(ppm) => skew = 1e-6 * ppm,
@@ -35,15 +41,36 @@ pub(super) fn camera(
         }
         path[i][1] + (path[i + 1][0] - path[i][1]) * (x - i as f64)
     };
-    (0..rows)
+    let mut late = random.fork();
+    (0..u.len())
         .map(|k| {
-            let t = k as f64 * 1e-3 * (1.0 + skew) - delay;
+            let row_s = k as f64 * 1e-3;
+            let mut t = row_s * (1.0 + skew) - delay;
+            if unsteady > 0.0 {
+                t -= unsteady * late.uniform();
+            }
+            for e in hidden {
+                match *e {
+                    Hidden::Second(Second::SteppedSkew(ppm)) => {
+                        t += 1e-6 * ppm * (row_s * 10.0).floor() / 10.0;
+                    }
+                    Hidden::Stranger(Stranger::ClockWander(s, period)) => {
+                        t += s * ((TAU * row_s / period + phase).sin() - 1.0);
+                    }
+                    _ => {}
+                }
+            }
             let mut y = if exposure > 0.0 {
                 let n = 64;
-                (0..n)
-                    .map(|i| at(t - exposure * (f64::from(i) + 0.5) / f64::from(n)))
-                    .sum::<f64>()
-                    / f64::from(n)
+                let (mut sum, mut weights) = (0.0, 0.0);
+                for i in 0..n {
+                    let part = (f64::from(i) + 0.5) / f64::from(n);
+                    let edge = part.min(1.0 - part);
+                    let open = if edge < ramps { edge / ramps } else { 1.0 };
+                    sum += open * at(t - exposure * part);
+                    weights += open;
+                }
+                sum / weights
             } else {
                 at(t)
             };
@@ -52,6 +79,21 @@ pub(super) fn camera(
                     Hidden::Hum(hz, um) | Hidden::Line(hz, um) => {
                         y += um * (TAU * hz * k as f64 * 1e-3 + phase).sin()
                     }
+                    Hidden::Second(Second::RichHum(hz, um)) => {
+                        let angle = TAU * hz * row_s + phase;
+                        y += um * (angle.sin() + 0.15 * (3.0 * angle).sin());
+                    }
+                    Hidden::Second(Second::UnevenPixels(p, b)) => {
+                        let angle = TAU * y / p;
+                        y += b * p * (angle.sin() + 0.2 * (2.0 * angle).sin());
+                    }
+                    Hidden::Second(Second::Magnification(f)) => y *= f,
+                    Hidden::Stranger(Stranger::Pulsation(hz, um, second)) => {
+                        let angle = TAU * hz * row_s + phase;
+                        y += um * (angle.sin() + second * (2.0 * angle).sin());
+                    }
+                    Hidden::Stranger(Stranger::CurvedLens(c)) => y += c * y * y * y,
+                    Hidden::Stranger(Stranger::Crosstalk(c)) => y += c * u[k],
                     Hidden::PixelLocking(p, b) => y += b * p * (TAU * y / p).sin(),
                     Hidden::Distortion(c) => y += c * y * y,
                     _ => {}

@@ -1,16 +1,59 @@
 //! Which effects are hidden, at which levels.
 
-use super::Hidden;
+use super::{Excitation, Hidden, Kind, Rig, Second};
+
+/// What a case's records are like beside what is hidden in them.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Session {
+    /// What the rig is told to do.
+    pub excitation: Excitation,
+    /// What the rig is.
+    pub rig: Rig,
+    /// Kind of the localisation noise.
+    pub noise: Kind,
+    /// What a position is rounded to \[um\].
+    pub step_um: f64,
+}
+
+impl Session {
+    /// A bead, white noise, the same excitation for every seed.
+    pub const STANDARD: Self = Self {
+        excitation: Excitation::Standard,
+        rig: Rig::Bead,
+        noise: Kind::White,
+        step_um: 1e-4,
+    };
+
+    /// The same with an excitation drawn by the seed.
+    pub const DRAWN: Self = Self {
+        excitation: Excitation::Drawn,
+        ..Self::STANDARD
+    };
+}
 
 /// One case.
 #[derive(Debug, Clone)]
 pub struct Case {
-    /// Group: single, pair, null, outside.
+    /// Group: single, second, further, pair, triple, null, noise, floorless, actuator, stranger.
     pub group: &'static str,
     /// Level of a single: weak, middle, strong.
     pub level: &'static str,
     /// What is hidden.
     pub hidden: Vec<Hidden>,
+    /// Excitation, rig and noise.
+    pub session: Session,
+}
+
+impl Case {
+    /// A case of a group.
+    pub fn new(group: &'static str, hidden: Vec<Hidden>, session: Session) -> Self {
+        Self {
+            group,
+            level: "",
+            hidden,
+            session,
+        }
+    }
 }
 
 /// Weak, middle and strong of every effect of the vocabulary. Weak is twice the amplitude that can be detected at all, by
@@ -63,15 +106,57 @@ pub fn singles() -> Vec<Case> {
                 .into_iter()
                 .zip(["weak", "middle", "strong"])
                 .map(|(h, level)| Case {
-                    group: "single",
                     level,
-                    hidden: vec![h],
+                    ..Case::new("single", vec![h], Session::STANDARD)
                 })
         })
         .collect()
 }
 
-/// Twelve pairs.
+/// Every effect of the catalogue in its second equation, middle and strong.
+pub fn seconds() -> Vec<Case> {
+    use Second::*;
+    let levels: [[Second; 2]; 25] = [
+        [CapacitiveLag(400.0), CapacitiveLag(90.0)],
+        [GentleSlew(600.0), GentleSlew(250.0)],
+        [SoftClip(2.2, 5.8), SoftClip(2.8, 5.0)],
+        [Duhem(0.08), Duhem(0.2)],
+        [PowerCreep(0.015), PowerCreep(0.04)],
+        [DraggedResonance(600.0, 0.1), DraggedResonance(260.0, 0.15)],
+        [RoundedPlay(0.06), RoundedPlay(0.3)],
+        [SpreadRelaxation(0.2, 0.1), SpreadRelaxation(0.4, 0.35)],
+        [GasSpring(0.006), GasSpring(0.04)],
+        [OrificeLeak(0.7), OrificeLeak(5.0)],
+        [Magnification(0.85), Magnification(1.5)],
+        [ExponentialDrift(-0.005), ExponentialDrift(0.01)],
+        [CreepingAdhesion(12.0), CreepingAdhesion(60.0)],
+        [DrainingFlow(-5.0), DrainingFlow(30.0)],
+        [UnsteadyDelay(0.0013), UnsteadyDelay(0.0042)],
+        [ShutterRamps(0.0006), ShutterRamps(0.00095)],
+        [SteppedSkew(-90.0), SteppedSkew(400.0)],
+        [DropBursts(0.01), DropBursts(0.04)],
+        [RepeatBursts(0.01), RepeatBursts(0.04)],
+        [UnevenPixels(0.25, 0.06), UnevenPixels(0.3, 0.1)],
+        [RichHum(60.0, 0.05), RichHum(50.0, 0.3)],
+        [Sinh(0.02), Sinh(0.1)],
+        [StraightSwing(0.1, 5.0), StraightSwing(0.25, 9.0)],
+        [OpeningValve(0.01), OpeningValve(0.05)],
+        [LooseStand(90.0, 0.05, 0.02), LooseStand(180.0, 0.1, 0.1)],
+    ];
+    levels
+        .into_iter()
+        .flat_map(|two| {
+            two.into_iter()
+                .zip(["middle", "strong"])
+                .map(|(second, level)| Case {
+                    level,
+                    ..Case::new("second", vec![Hidden::Second(second)], Session::STANDARD)
+                })
+        })
+        .collect()
+}
+
+/// Twelve pairs that are always the same.
 pub fn pairs() -> Vec<Case> {
     use Hidden::*;
     [
@@ -89,55 +174,49 @@ pub fn pairs() -> Vec<Case> {
         [Repeats(0.02), DriverLag(150.0)],
     ]
     .into_iter()
-    .map(|p| Case {
-        group: "pair",
-        level: "",
-        hidden: p.to_vec(),
-    })
+    .map(|p| Case::new("fixed", p.to_vec(), Session::STANDARD))
     .collect()
 }
 
-/// Nothing hidden.
+/// Nothing hidden; excitations drawn, and by turns another noise.
 pub fn nulls(count: usize) -> Vec<Case> {
+    let noises = [
+        Session::DRAWN,
+        Session {
+            noise: Kind::Coloured(15.0),
+            ..Session::DRAWN
+        },
+        Session {
+            noise: Kind::HeavyTails,
+            ..Session::DRAWN
+        },
+        Session {
+            step_um: 0.05,
+            ..Session::DRAWN
+        },
+    ];
     (0..count)
-        .map(|_| Case {
-            group: "null",
-            level: "",
-            hidden: Vec::new(),
+        .map(|i| Case {
+            level: ["white", "coloured", "tails", "steps"][i % 4],
+            ..Case::new("null", Vec::new(), noises[i % 4])
         })
         .collect()
 }
 
-/// Effects that entered the catalogue later, at one level each.
+/// Effects that entered the catalogue later, in the first equation.
 pub fn further() -> Vec<Case> {
     use Hidden::*;
-    cases("further", &[Cube(20.0), Breathing(0.2), Valve(0.1)])
-}
-
-/// Effects that are not in the catalogue, or that it does not look for.
-pub fn outside() -> Vec<Case> {
-    use Hidden::*;
-    cases(
-        "outside",
-        &[
-            Square(60.0),
-            Line(37.0, 0.15),
-            Profile(0.3),
-            Spring(0.0005),
-            Echo(0.3, 0.02),
-            Distortion(0.003),
-            Jumps(1.5),
-        ],
-    )
-}
-
-fn cases(group: &'static str, hidden: &[Hidden]) -> Vec<Case> {
-    hidden
-        .iter()
-        .map(|h| Case {
-            group,
-            level: "",
-            hidden: vec![*h],
-        })
-        .collect()
+    [
+        Cube(20.0),
+        Stiffening(0.02),
+        Stiffening(0.1),
+        Swing(0.1, 5.0),
+        Swing(0.2, 9.0),
+        Valve(0.01),
+        Valve(0.1),
+        Shake(90.0, 0.05, 0.02),
+        Shake(180.0, 0.1, 0.1),
+    ]
+    .map(|h| Case::new("further", vec![h], Session::STANDARD))
+    .to_vec()
 }

@@ -1,5 +1,8 @@
 //! What a rig may hide.
 
+use super::second::Second;
+use super::strangers::Stranger;
+
 /// A hidden effect, in this simulator's own equations.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[allow(missing_docs)]
@@ -26,7 +29,15 @@ pub enum Hidden {
     Repeats(f64),
     PixelLocking(f64, f64),
     Hum(f64, f64),
+    /// The command plus c of its cube \[1/um^2\].
+    Stiffening(f64),
+    /// A mode of the camera's stand that the PZT's motion excites: Hz, damping, share.
+    Shake(f64, f64, f64),
+    /// Another equation of an effect of the catalogue.
+    Second(Second),
     // Not in the catalogue:
+    /// One of the other strangers.
+    Stranger(Stranger),
     /// Velocity += c d^2.
     Square(f64),
     /// Velocity += c d^3.
@@ -39,8 +50,8 @@ pub enum Hidden {
     Spring(f64),
     /// A second path arriving late: x(t) + c x(t - lag).
     Echo(f64, f64),
-    /// Gain swings in time: 1 + c sin(2 pi 0.7 t).
-    Breathing(f64),
+    /// Gain swings in time: 1 + c sin(2 pi t/T); c and T \[s\].
+    Swing(f64, f64),
     /// Motion down the channel is faster than up.
     Valve(f64),
     /// The camera's image is curved: y + c y^2.
@@ -71,6 +82,13 @@ impl Hidden {
             Self::Drops(p) | Self::Repeats(p) => vec![("rate", p)],
             Self::PixelLocking(pixel, b) => vec![("pixel_um", pixel), ("amplitude", b)],
             Self::Hum(hz, um) => vec![("hz", hz), ("um", um)],
+            Self::Stiffening(c) => vec![("per_um2", c)],
+            Self::Swing(depth, period) => vec![("depth", depth), ("period_s", period)],
+            Self::Valve(c) => vec![("asymmetry", c)],
+            Self::Shake(hz, zeta, share) => {
+                vec![("frequency_hz", hz), ("damping", zeta), ("share", share)]
+            }
+            Self::Second(second) => second.parameters(),
             _ => Vec::new(),
         }
     }
@@ -99,8 +117,10 @@ impl Hidden {
             Self::Repeats(_) => "frame-repeats",
             Self::PixelLocking(..) => "pixel-locking",
             Self::Hum(..) => "mains-hum",
-            Self::Cube(_) => "stiffening",
-            Self::Breathing(_) => "gain-swing",
+            Self::Cube(_) | Self::Stiffening(_) => "stiffening",
+            Self::Swing(..) => "gain-swing",
+            Self::Shake(..) => "camera-shake",
+            Self::Second(second) => second.id(),
             Self::Valve(_) => "valve-asymmetry",
             _ => "outside",
         }

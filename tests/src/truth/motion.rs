@@ -2,25 +2,47 @@
 
 use super::camera::camera;
 use super::hidden::Hidden;
+use super::noise::Nuisance;
 use super::random::Random;
 use super::relays::Relays;
+use super::second::{Memory, Second};
 use super::signal::{Through, low_pass, rk4};
+use super::strangers::{Odd, Stranger, turbulence};
 use std::f64::consts::TAU;
 
 /// Steps per millisecond.
 const FINE: usize = 64;
 
-/// Noise of a session.
-#[derive(Debug, Clone, Copy)]
-pub struct Nuisance {
-    /// Diffusion coefficient \[um^2/s\]; 0 for a noise-free run.
-    pub diffusion_um2_per_s: f64,
-    /// Localisation noise \[um\].
-    pub localisation_um: f64,
+/// What the rig is.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Rig {
+    /// A bead in a cell: Eq. (6), the command held through each row.
+    Bead,
+    /// An actuator with a sensor: a gain, the command an analogue signal that is sampled with the output.
+    Actuator(f64),
+}
+
+impl Rig {
+    /// The command in step `j`, from the middle of the range.
+    fn command(self, u: &[f64], j: usize) -> Through {
+        let (k, i) = (j / FINE, j % FINE);
+        match self {
+            Self::Bead => Through::held(u[k]),
+            Self::Actuator(_) => {
+                let next = u.get(k + 1).copied().unwrap_or(u[k]);
+                let at = |i: usize| u[k] + (next - u[k]) * i as f64 / FINE as f64;
+                let (start, end) = (at(i), at(i + 1));
+                Through {
+                    start,
+                    mean: 0.5 * (start + end),
+                    end,
+                }
+            }
+        }
+    }
 }
 
 /// What the hidden effects ahead of the plant remember.
-#[derive(Default)]
 struct Ahead {
     relays: Vec<Relays>,
     lag: f64,
@@ -31,9 +53,36 @@ struct Ahead {
     voigt: [f64; 7],
     ring: [f64; 2],
     past: Vec<f64>,
+    second: Memory,
+    odd: Odd,
+    stand: [f64; 2],
+    /// What the camera's stand adds to the picture at the step's end.
+    shake: f64,
 }
 
 impl Ahead {
+    fn new(hidden: &[Hidden], random: &Random) -> Self {
+        let relays = hidden.iter().filter_map(|h| match h {
+            Hidden::Preisach(_, w) => Some(Relays::new(*w)),
+            _ => None,
+        });
+        Self {
+            relays: relays.collect(),
+            lag: 0.0,
+            slew: 0.0,
+            play: 0.0,
+            solid: 0.0,
+            gas: 0.0,
+            voigt: [0.0; 7],
+            ring: [0.0; 2],
+            past: Vec::new(),
+            second: Memory::default(),
+            odd: Odd::new(random.fork()),
+            stand: [0.0; 2],
+            shake: 0.0,
+        }
+    }
+
     /// What the plant is given in step `j` of `h` seconds.
     fn step(&mut self, hidden: &[Hidden], mut x: Through, j: usize, h: f64) -> Through {
         for e in hidden {
@@ -93,6 +142,18 @@ impl Ahead {
                     let flow = low_pass(&mut self.solid, x, h, tau);
                     x = x.plus(strength, x).plus(-strength, flow);
                 }
+                Hidden::Stiffening(c) => x = x.map(|x| x + c * x * x * x),
+                Hidden::Shake(hz, zeta, share) => {
+                    let w = TAU * hz;
+                    let f = |r: [f64; 2]| [r[1], w * w * (x.mean - r[0]) - 2.0 * zeta * w * r[1]];
+                    self.stand = rk4(self.stand, h, f);
+                    self.shake = share * (x.end - self.stand[0]);
+                }
+                Hidden::Second(Second::LooseStand(hz, zeta, share)) => {
+                    self.shake = share * self.second.stand(hz, zeta, x, h);
+                }
+                Hidden::Second(second) => x = self.second.step(second, x, h),
+                Hidden::Stranger(stranger) => x = self.odd.step(stranger, x, j / FINE, h),
                 Hidden::Bubble(tau) => x = low_pass(&mut self.gas, x, h, tau),
                 Hidden::Echo(c, late) => {
                     let k = (late / h) as usize;
@@ -119,7 +180,14 @@ struct Way {
 }
 
 /// What the hidden effects behind the plant make of the bead's motion in step `j`.
-fn behind(hidden: &[Hidden], x: Through, way: Way, bead: f64, j: usize, h: f64) -> Way {
+fn behind(
+    hidden: &[Hidden],
+    odd: &mut Odd,
+    x: Through,
+    way: Way,
+    bead: f64,
+    (j, h): (usize, f64),
+) -> Way {
     let t = j as f64 * h;
     let Way {
         mut jump,
@@ -147,11 +215,18 @@ fn behind(hidden: &[Hidden], x: Through, way: Way, bead: f64, j: usize, h: f64) 
                 jump *= faster;
             }
             Hidden::Spring(c) => lost += c * bead * bead * bead,
-            Hidden::Breathing(c) => {
-                let swing = 1.0 + c * (TAU * 0.7 * t).sin();
+            Hidden::Swing(c, period) => {
+                let swing = 1.0 + c * (TAU * t / period).sin();
                 v *= swing;
                 jump *= swing;
             }
+            Hidden::Second(second) => {
+                // A jump is no flow: what goes by the speed lets it pass, or sees it as fast.
+                jump *= second.gain(t, if jump == 0.0 { 0.0 } else { 1e6 * jump });
+                v = v * second.gain(t, v) + second.flow(t);
+                lost += second.lost(bead);
+            }
+            Hidden::Stranger(stranger) => (jump, v) = odd.behind(stranger, jump, v, h),
             Hidden::Valve(c) => {
                 let way = |x: f64| if x > 0.0 { 1.0 + c } else { 1.0 - c };
                 v *= way(v);
@@ -167,6 +242,7 @@ fn behind(hidden: &[Hidden], x: Through, way: Way, bead: f64, j: usize, h: f64) 
 /// Positions that the camera sees at every row, without localisation noise \[um\].
 pub(super) fn positions(
     u: &[f64],
+    rig: Rig,
     hidden: &[Hidden],
     nuisance: Nuisance,
     random: &mut Random,
@@ -174,29 +250,28 @@ pub(super) fn positions(
     let h = 1e-3 / FINE as f64;
     let n = u.len() * FINE;
     let mut path = Vec::with_capacity(n + 1);
+    let resisted = hidden.iter().find_map(|h| match h {
+        Hidden::Stranger(Stranger::Turbulence(c)) => Some(*c),
+        _ => None,
+    });
     // Eq. (6) in controllable form.
-    let derivative = |s: [f64; 2], x: f64| [s[1], x - 76.3 * s[1] - 0.13 * s[0]];
+    let derivative = |s: [f64; 2], x: f64| {
+        let more = resisted.map_or(0.0, |c| turbulence(c, 76.3 * s[1]));
+        [s[1], x - 76.3 * (1.0 + more) * s[1] - 0.13 * s[0]]
+    };
     let output =
         |s: [f64; 2], x: f64| 0.01872 * ((20261.5 - 76.3) * s[1] + (1_745_041.0 - 0.13) * s[0] + x);
-    let relays: Vec<Relays> = hidden
-        .iter()
-        .filter_map(|h| {
-            if let Hidden::Preisach(_, w) = h {
-                Some(Relays::new(*w))
-            } else {
-                None
-            }
-        })
-        .collect();
-    let mut ahead = Ahead {
-        relays,
-        ..Ahead::default()
-    };
+    let mut ahead = Ahead::new(hidden, random);
     let mut s = [0.0; 2];
     let (mut last, mut bead, mut walk) = (0.0, 0.0, 0.0);
     path.push([0.0; 2]);
     for j in 0..n {
-        let x = ahead.step(hidden, Through::held(u[j / FINE]), j, h);
+        let x = ahead.step(hidden, rig.command(u, j), j, h);
+        if let Rig::Actuator(gain) = rig {
+            path[j][1] = gain * x.start;
+            path.push([gain * x.end; 2]);
+            continue;
+        }
         // What the direct path does at once is a jump of the bead, apart from the flow that follows.
         let start = output(s, x.start);
         s = rk4(s, h, |s| derivative(s, x.mean));
@@ -207,12 +282,12 @@ pub(super) fn positions(
             lost: 0.0,
         };
         last = end;
-        let Way { jump, v, lost } = behind(hidden, x, way, bead, j, h);
+        let Way { jump, v, lost } = behind(hidden, &mut ahead.odd, x, way, bead, (j, h));
         bead += jump;
-        path[j][1] = bead + walk;
+        path[j][1] = bead + walk + ahead.shake;
         bead += (v - lost) * h;
         walk += (2.0 * nuisance.diffusion_um2_per_s * h).sqrt() * random.normal();
-        path.push([bead + walk; 2]);
+        path.push([bead + walk + ahead.shake; 2]);
     }
-    camera(&path, u.len(), h, hidden, random)
+    camera(&path, u, h, hidden, random)
 }

@@ -1,10 +1,12 @@
 //! Runs cases and counts.
 
 use super::cases::Case;
+pub use super::fresh::Fresh;
+use super::fresh::fresh;
 use super::threshold::above_threshold;
-use super::{Nuisance, Random, run, scripts};
-use cellpos_plant::Model;
-use cellpos_reconcile::{Options, Reconciliation, Record, Verdict, reconcile};
+use super::{Excitation, Nuisance, Random, Rig, run, scripts};
+use cellpos_plant::{Model, Noise, TransferFunction};
+use cellpos_reconcile::{Options, Reconciliation, Record, Verdict, constant_gain, reconcile};
 use std::collections::BTreeSet;
 
 /// What a case came to.
@@ -16,6 +18,8 @@ pub struct Row {
     pub named: BTreeSet<String>,
     /// Named, or alternatives of what was named.
     pub inside: BTreeSet<String>,
+    /// Named, and neither hidden themselves nor with something hidden among their alternatives.
+    pub false_names: BTreeSet<String>,
     /// The verdict.
     pub verdict: Verdict,
     /// Closure of the gap on held-out records; `None` where only frames are missing or repeated, which is no gap.
@@ -32,21 +36,53 @@ pub struct Row {
     pub seconds: f64,
     /// How far the hidden effects lie above the threshold of detection: see [`above_threshold`].
     pub above_threshold: f64,
-    /// 1 - RMS error of the augmented over that of the null model, noise-free, on a fresh excitation; singles only.
-    pub fresh: Option<f64>,
+    /// How far the augmented model carries on a fresh excitation, where something of the catalogue is hidden and named.
+    pub fresh: Option<Fresh>,
 }
 
 /// The records of a case under a seed.
 pub fn records(case: &Case, seed: u64) -> Vec<Record> {
     let mut random = Random::new(seed);
+    let session = case.session;
     let nuisance = Nuisance {
         diffusion_um2_per_s: 0.33 * (0.8 + 0.4 * random.uniform()),
         localisation_um: 0.03,
+        kind: session.noise,
+        step_um: session.step_um,
     };
-    scripts(&mut random)
+    scripts(session.excitation, &mut random)
         .iter()
-        .map(|s| run(s, &case.hidden, nuisance, &mut random))
+        .map(|s| run(s, session.rig, &case.hidden, nuisance, &mut random))
         .collect()
+}
+
+/// What is known of the rig before: its model, and how it is read.
+fn base(case: &Case, records: &[Record]) -> Result<(Model, Options), String> {
+    let options = Options {
+        threads: 1,
+        ..Options::default()
+    };
+    if let Rig::Actuator(_) = case.session.rig {
+        let (gain, working_point_um) = constant_gain(records).map_err(|e| e.to_string())?;
+        let model = Model {
+            name: "fit".to_owned(),
+            plant: TransferFunction::new(vec![gain], vec![1.0]).map_err(|e| e.to_string())?,
+            working_point_um,
+            noise: Noise::NONE,
+            ..Model::eq6()
+        };
+        let options = Options {
+            interpolated_input: true,
+            free_gain: true,
+            ..options
+        };
+        return Ok((model, options));
+    }
+    let mut model = Model::eq6();
+    if case.session.excitation == Excitation::WithoutFloor {
+        model.noise = Noise::NONE;
+    }
+    Ok((model, options))
 }
 
 /// What this thread has had of a processor until now \[s\]: does not count what others take.
@@ -61,20 +97,13 @@ fn processor_s() -> f64 {
 /// The message of a refusal.
 pub fn evaluate(case: &Case, seed: u64) -> Result<Row, String> {
     let records = records(case, seed);
+    let (model, options) = base(case, &records)?;
     let start = processor_s();
-    let result = reconcile(
-        &Model::eq6(),
-        &records,
-        &Options {
-            threads: 1,
-            ..Options::default()
-        },
-        &mut |words| {
-            if std::env::var_os("RECONCILE_TABLE_PROGRESS").is_some() {
-                eprintln!("{:6.1} s {words}", processor_s() - start);
-            }
-        },
-    )
+    let result = reconcile(&model, &records, &options, &mut |words| {
+        if std::env::var_os("RECONCILE_TABLE_PROGRESS").is_some() {
+            eprintln!("{:6.1} s {words}", processor_s() - start);
+        }
+    })
     .map_err(|e| e.to_string())?;
     let seconds = processor_s() - start;
     let hidden: BTreeSet<String> = case
@@ -91,14 +120,28 @@ pub fn evaluate(case: &Case, seed: u64) -> Result<Row, String> {
         .cloned()
         .collect();
     let (covered, missed) = covered(case, &result);
-    let fresh = (case.group == "single"
-        && !named.is_empty()
-        && !named.iter().all(|n| n.starts_with("frame-")))
-    .then(|| fresh(case, &result, seed));
+    let false_names = result
+        .effects
+        .iter()
+        .filter(|e| {
+            !e.alternatives
+                .iter()
+                .chain([&e.id])
+                .any(|n| hidden.contains(n))
+        })
+        .map(|e| e.id.clone())
+        .collect();
+    let carries = !hidden.is_empty() && named.iter().any(|n| !n.starts_with("frame-"));
+    let fresh = if carries {
+        fresh(case, &result.augmented, &model, seed)
+    } else {
+        None
+    };
     Ok(Row {
         hidden,
         named,
         inside,
+        false_names,
         verdict: result.verdict,
         reason: result.places.last().cloned().unwrap_or_default(),
         alternatives: result
@@ -110,7 +153,10 @@ pub fn evaluate(case: &Case, seed: u64) -> Result<Row, String> {
         covered,
         missed,
         seconds,
-        above_threshold: above_threshold(&case.hidden, seed),
+        above_threshold: match case.session.rig {
+            Rig::Bead => above_threshold(&case.hidden, case.session.excitation, seed),
+            Rig::Actuator(_) => f64::NAN,
+        },
         closure: result
             .effects
             .iter()
@@ -143,38 +189,4 @@ fn covered(case: &Case, result: &Reconciliation) -> ((usize, usize), Vec<String>
         }
     }
     ((good, all), missed)
-}
-
-/// Fall of the RMS error on an excitation that was never fitted: another multisine, noise-free.
-fn fresh(case: &Case, result: &Reconciliation, seed: u64) -> f64 {
-    let mut random = Random::new(seed + 7_777_777);
-    let scripts = scripts(&mut random);
-    let quiet = Nuisance {
-        diffusion_um2_per_s: 0.0,
-        localisation_um: 0.0,
-    };
-    let truth = run(&scripts[2], &case.hidden, quiet, &mut random);
-    let error = |model: &Model| {
-        let options = cellpos_plant::SimulateOptions::default();
-        let y = simulate(model, &truth.pzt_um, truth.sample_s, options);
-        let d: Vec<f64> = y
-            .iter()
-            .zip(&truth.bead_um)
-            .filter(|(_, b)| b.is_finite())
-            .map(|(a, b)| a - b)
-            .collect();
-        let mean = d.iter().sum::<f64>() / d.len() as f64;
-        (d.iter().map(|d| (d - mean).powi(2)).sum::<f64>() / d.len() as f64).sqrt()
-    };
-    1.0 - error(&result.augmented) / error(&Model::eq6()).max(1e-12)
-}
-
-fn simulate(
-    model: &Model,
-    pzt_um: &[f64],
-    sample_s: f64,
-    options: cellpos_plant::SimulateOptions,
-) -> Vec<f64> {
-    cellpos_plant::simulate(model, pzt_um, sample_s, &options)
-        .unwrap_or_else(|e| panic!("the augmented model does not simulate: {e}"))
 }

@@ -5,7 +5,7 @@
 //! squares is the expected gain in twice the log-likelihood. The threshold is the gain that an addition must reach in a
 //! search over the whole vocabulary; distances are in amplitude, so the root of the ratio.
 
-use super::{Hidden, Nuisance, Random, run, scripts};
+use super::{Excitation, Hidden, Nuisance, Random, Rig, Second, run, scripts};
 
 /// Nominal diffusion, per row \[um^2\], and localisation noise \[um^2\].
 const WALK_UM2: f64 = 2.0 * 0.33e-3;
@@ -20,10 +20,10 @@ fn bar(numbers: f64) -> f64 {
 
 /// Numbers that the effect's name brings with it, in six records.
 fn numbers(hidden: &Hidden) -> f64 {
-    match hidden {
-        Hidden::Preisach(..) | Hidden::PixelLocking(..) => 3.0,
-        Hidden::Saturation(..) | Hidden::Resonance(..) | Hidden::Relaxation(..) => 2.0,
-        Hidden::Hum(..) => 13.0,
+    match hidden.id() {
+        "pzt-hysteresis" | "pixel-locking" | "gain-swing" | "camera-shake" => 3.0,
+        "saturation" | "pzt-resonance" | "pdms-relaxation" => 2.0,
+        "mains-hum" => 13.0,
         _ => 1.0,
     }
 }
@@ -53,7 +53,7 @@ pub fn weak(hidden: Hidden, seed: u64) -> Hidden {
     let (mut near, mut far) = (1.0, 6.0);
     for _ in 0..12 {
         let middle = 0.5 * (near + far);
-        if above_threshold(&[at(middle)], seed) > 2.0 {
+        if above_threshold(&[at(middle)], Excitation::Standard, seed) > 2.0 {
             near = middle;
         } else {
             far = middle;
@@ -64,30 +64,38 @@ pub fn weak(hidden: Hidden, seed: u64) -> Hidden {
 
 /// Amplitude of a hidden effect over the amplitude that just reaches the threshold; for effects of single frames, their
 /// rate over the least rate that is named.
-pub fn above_threshold(hidden: &[Hidden], seed: u64) -> f64 {
+pub fn above_threshold(hidden: &[Hidden], excitation: Excitation, seed: u64) -> f64 {
     match hidden {
-        [Hidden::Drops(rate)] => return rate / 2e-4,
+        [Hidden::Drops(rate) | Hidden::Second(Second::DropBursts(rate))] => return rate / 2e-4,
         // At a resolution of 0.1 nm one increment in about 1100 is zero by chance; half as many again are named.
-        [Hidden::Repeats(rate)] => return rate / 5e-4,
+        [Hidden::Repeats(rate) | Hidden::Second(Second::RepeatBursts(rate))] => return rate / 5e-4,
         _ => {}
     }
     // Beside others, missing and repeated frames are left out of the account.
     let hidden: Vec<Hidden> = hidden
         .iter()
         .copied()
-        .filter(|h| !matches!(h, Hidden::Drops(_) | Hidden::Repeats(_)))
+        .filter(|h| !h.id().starts_with("frame-"))
         .collect();
     let hidden = hidden.as_slice();
-    let quiet = Nuisance {
-        diffusion_um2_per_s: 0.0,
-        localisation_um: 0.0,
-    };
     let mut random = Random::new(seed);
     random.uniform();
     let (mut dd, mut ds, mut ss) = (0.0, 0.0, 0.0);
-    for script in scripts(&mut random) {
-        let with = run(&script, hidden, quiet, &mut random.clone());
-        let without = run(&script, &[], quiet, &mut random.clone());
+    for script in scripts(excitation, &mut random) {
+        let with = run(
+            &script,
+            Rig::Bead,
+            hidden,
+            Nuisance::QUIET,
+            &mut random.clone(),
+        );
+        let without = run(
+            &script,
+            Rig::Bead,
+            &[],
+            Nuisance::QUIET,
+            &mut random.clone(),
+        );
         let d: Vec<f64> = with
             .bead_um
             .iter()
@@ -113,7 +121,7 @@ pub fn above_threshold(hidden: &[Hidden], seed: u64) -> f64 {
     let blur: f64 = hidden
         .iter()
         .map(|h| match h {
-            Hidden::PixelLocking(pixel, _) => {
+            Hidden::PixelLocking(pixel, _) | Hidden::Second(Second::UnevenPixels(pixel, _)) => {
                 let p =
                     0.5 * (WALK_UM2 + (WALK_UM2 * WALK_UM2 + 4.0 * WALK_UM2 * WHITE_UM2).sqrt());
                 (-p * (std::f64::consts::TAU / pixel).powi(2)).exp()
