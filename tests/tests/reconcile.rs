@@ -119,9 +119,9 @@ fn drawn_cases_differ_by_seed_and_are_the_same_for_one() {
 
 #[test]
 fn a_stranger_of_a_seed_gets_no_name_and_a_noise_that_is_slow_or_in_steps_none_either() {
-    let curved = Hidden::Stranger(Stranger::CurvedLens(1e-4));
+    let jitter = Hidden::Stranger(Stranger::FrameJitter(5e-4));
     let cases = [
-        Case::new("stranger", vec![curved], Session::DRAWN),
+        Case::new("stranger", vec![jitter], Session::DRAWN),
         nulls(4)[1].clone(),
         nulls(4)[3].clone(),
     ];
