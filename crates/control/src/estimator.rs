@@ -19,6 +19,7 @@ use crate::loop_model::{LoopModel, MODES};
 use transition::Transition;
 
 pub use config::EstimatorConfig;
+pub(crate) use config::planned_gap;
 pub use transition::PredictedState;
 
 /// Past commands held: a delay of up to 15 samples, which is 3 ms at 5 kHz.

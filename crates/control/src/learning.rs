@@ -28,6 +28,7 @@ mod line;
 mod table;
 
 use crate::error::check;
+use crate::estimator::planned_gap;
 use crate::uncertainty::Uncertainty;
 use evidence::{ErrorNoise, Evidence, turn};
 use line::Line;
@@ -49,10 +50,13 @@ pub const HIGHEST_PART: f64 = 0.35;
 pub struct Learner {
     config: LearnConfig,
     frequency_hz: f64,
-    /// Cycles per tick.
+    /// Cycles per tick, and from fix to fix.
     advance: f64,
+    fix_advance: f64,
+    /// Ticks in a row that may be without a fix.
+    planned_gap: u32,
     exposure_ticks: f64,
-    /// Ticks of the guard's cycle.
+    /// Fixes of the guard's cycle.
     guard_ticks: u32,
     /// Ticks over which a change of the addition comes in.
     ramp_ticks: u32,
@@ -82,6 +86,8 @@ pub struct LearnerState {
     sum_um2: f64,
     ticks: u32,
     pause: u32,
+    /// Ticks in a row without a fix.
+    silent: u32,
     retreats: u32,
     /// Retreats of late, and the cycle of the last.
     in_row: u32,
@@ -119,13 +125,13 @@ impl Learner {
         responses: &[HarmonicResponse],
     ) -> Result<Self, LearnError> {
         config.validate(sample_time_s)?;
-        let highest_hz = HIGHEST_PART / sample_time_s;
+        let highest_hz = HIGHEST_PART / (sample_time_s * config.ticks_per_fix);
         check(
             "frequency_hz",
             "Hz",
             frequency_hz,
             frequency_hz > 0.0 && frequency_hz <= highest_hz,
-            "above 0 and at most 0.35 of the sampling frequency",
+            "above 0 and at most 0.35 of the camera's rate",
         )?;
         let usable = |r: &&HarmonicResponse| {
             let size = r.re_um_per_um.hypot(r.im_um_per_um);
@@ -157,12 +163,15 @@ impl Learner {
             });
         }
         let advance = frequency_hz * sample_time_s;
+        let fix_advance = advance * config.ticks_per_fix;
         Ok(Self {
             config,
             frequency_hz,
             advance,
+            fix_advance,
+            planned_gap: planned_gap(config.ticks_per_fix),
             exposure_ticks: config.exposure_s / sample_time_s,
-            guard_ticks: ((GUARD_TICKS * advance).ceil() / advance).round() as u32,
+            guard_ticks: ((GUARD_TICKS * fix_advance).ceil() / fix_advance).round() as u32,
             ramp_ticks: (1.0 / advance).ceil().clamp(4.0, 20.0) as u32,
             responses: kept,
             refused,
@@ -194,7 +203,7 @@ impl Learner {
             noise: ErrorNoise::default(),
             feed_forward_gain: None,
             since_change: u32::MAX,
-            next_look: self.ticks_of(self.config.watch_cycles),
+            next_look: self.fixes_of(self.config.watch_cycles),
             stretch: self.config.watch_cycles,
             cycles: 0.0,
             first_um2: None,
@@ -202,16 +211,19 @@ impl Learner {
             sum_um2: 0.0,
             ticks: 0,
             pause: 0,
+            silent: 0,
             retreats: 0,
             in_row: 0,
             retreat_cycle: 0.0,
         }
     }
 
-    /// Ticks of so many cycles; at least those that are watched.
-    fn ticks_of(&self, cycles: f64) -> u32 {
-        let least = f64::from(self.config.watch_ticks) * self.advance;
-        (cycles.max(least.ceil()) / self.advance).round().min(1e9) as u32
+    /// Fixes of so many cycles; at least those that are watched.
+    fn fixes_of(&self, cycles: f64) -> u32 {
+        let least = f64::from(self.config.watch_ticks) * self.fix_advance;
+        (cycles.max(least.ceil()) / self.fix_advance)
+            .round()
+            .min(1e9) as u32
     }
 
     fn harmonics(&self) -> impl Iterator<Item = u32> + '_ {
@@ -232,7 +244,7 @@ impl Learner {
             });
         }
         let mut state = self.start();
-        let sampling_hz = self.frequency_hz / self.advance;
+        let sampling_hz = self.frequency_hz / self.fix_advance;
         for h in &table.harmonics {
             let line = (h.harmonic as usize)
                 .checked_sub(1)
@@ -327,6 +339,14 @@ impl Learner {
     ) {
         let c = &self.config;
         state.since_change = state.since_change.saturating_add(1);
+        state.silent = if error.is_some() {
+            0
+        } else {
+            state.silent.saturating_add(1)
+        };
+        if error.is_none() && state.silent <= self.planned_gap {
+            return;
+        }
         let Some((phase, error_um)) = error.filter(|(p, e)| p.is_finite() && e.abs() < 1e3) else {
             state.pause = c.settle_ticks;
             (state.sum_um2, state.ticks) = (0.0, 0);
@@ -345,7 +365,7 @@ impl Learner {
             state.evidence.pass(error_um);
             return;
         }
-        state.cycles += self.advance;
+        state.cycles += self.fix_advance;
         state
             .evidence
             .add(self.harmonics(), (phase, error_um), (now, driven));
@@ -358,14 +378,14 @@ impl Learner {
     fn begin(&self, state: &mut LearnerState, cycles: f64) {
         state.evidence.begin_again();
         state.stretch = cycles.min(self.config.longest_cycles);
-        state.next_look = self.ticks_of(state.stretch);
+        state.next_look = self.fixes_of(state.stretch);
     }
 
     /// The end of a stretch: what stands out of the noise is corrected.
     fn look(&self, state: &mut LearnerState, driven: &Driven) {
         let evidence = state.evidence;
         let noise = evidence.noise(self.harmonics(), &state.noise);
-        let cycles = f64::from(evidence.ticks()) * self.advance;
+        let cycles = f64::from(evidence.ticks()) * self.fix_advance;
         let floor = 1.0 - (1.0 - 1.0 / self.config.longest_cycles.max(2.0)).powf(cycles);
         let (mut learning, mut changed) = (false, false);
         for response in self.responses.iter().filter(|_| !evidence.is_limited()) {
@@ -373,7 +393,7 @@ impl Learner {
                 continue;
             };
             let before = line.theta;
-            let how = (self.advance, floor, self.config.most_um);
+            let how = (self.fix_advance, floor, self.config.most_um);
             line.correct(response, &evidence, &noise, how, driven);
             line.from = before;
             learning |= line.active;
@@ -395,7 +415,7 @@ impl Learner {
             self.begin(state, state.stretch * LONGER);
         } else {
             // Not yet enough to tell: the stretch goes on.
-            state.next_look = self.ticks_of(cycles * LONGER);
+            state.next_look = self.fixes_of(cycles * LONGER);
         }
     }
 

@@ -22,70 +22,101 @@ const LOOK_TICKS: f64 = 64.0;
 const NOW_TICKS: f64 = 100.0;
 const USUAL_TICKS: f64 = 20_000.0;
 const STILL: f64 = 0.65;
+/// Fixes missing in a row over which a line is followed.
+const LONGEST_GAP: f64 = 64.0;
+
+/// What became of a tick.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Lesson {
+    /// Something was learned.
+    Learned,
+    /// There was nothing to learn from, or it was of no use.
+    Nothing,
+    /// No fix was to come.
+    Between,
+}
 
 impl Adapter {
-    /// One tick of the regression. Whether something was learned.
-    pub(super) fn learn(&self, state: &mut AdaptState, fix: Option<Fix>) -> bool {
+    /// One tick of the regression.
+    pub(super) fn learn(&self, state: &mut AdaptState, fix: Option<Fix>) -> Lesson {
         let (usable, noise_um2) = (self.usable(), self.left_um2(state));
-        let (delay, exposure) = (self.delay_samples, self.exposure_ticks);
-        let at = |motion: &Motion| motion.at(&fix?, delay, exposure, &usable);
+        let (delays, exposure) = ((self.delay_samples, self.interval), self.exposure_ticks);
+        let at = |motion: &Motion| motion.at(&fix?, delays, exposure, &usable);
+        state.since_fix += 1.0;
         let Some((fix, at_um)) = fix.zip(at(&state.model)) else {
-            self.coast(state);
-            return false;
+            state.silent = state.silent.saturating_add(1);
+            return if fix.is_none() && state.silent <= self.planned_gap {
+                Lesson::Between
+            } else {
+                Lesson::Nothing
+            };
         };
+        state.silent = 0;
+        // From exposure to exposure, whenever the ticks were that used them.
+        let ago = fix.age as f64 + fix.offset;
+        let correction = self
+            .whitener
+            .correction(state.covariance, state.since_fix - ago);
         let instrument = state.probe.instrument().and_then(|motion| {
             let at_um = at(motion)?;
-            let innovations = motion.innovations(&at_um);
+            let innovations = motion.innovations(&correction, &at_um);
             if innovations.is_none() {
                 motion.begin(at_um);
             }
             innovations
         });
-        let begun = state.seen.as_mut().zip(state.model.innovations(&at_um));
-        let Some((seen, mut p)) = begun else {
+        let begun = (state.seen.as_mut()).zip(state.model.innovations(&correction, &at_um));
+        let Some((seen, p)) = begun else {
             state.seen = Some(Whitener::begin(fix.position_um));
             state.model.begin(at_um);
-            return false;
+            state.since_fix = ago;
+            return Lesson::Nothing;
         };
-        let y = Whitener::innovation(seen, fix.position_um);
+        let y = correction.innovation(seen, fix.position_um);
         let (gain, member) = state.believed;
-        let z = seen.drift - gain * state.model.drift(member);
+        let z = (seen.drift - gain * state.model.drift(member)) * correction.ticks;
         let (told_y, told_p) = (y, p);
+        let weight = correction.weight;
         let mut values = [0.0; SERIES];
-        values[0] = y;
-        values[1..=MEMBERS].copy_from_slice(&p);
-        values[SERIES - 1] = z;
+        values[0] = weight * y;
+        for (value, p) in values[1..=MEMBERS].iter_mut().zip(p) {
+            *value = weight * p;
+        }
+        values[SERIES - 1] = weight * z;
         let mut lines = state.lines;
+        let times = (correction.ticks / self.interval).round().min(LONGEST_GAP);
+        (1..times as u32).for_each(|_| lines.coast());
         let force = (state.force.log_gain.exp(), state.force.member);
         lines.step(&mut values, force.0, force.1, noise_um2);
         let (y, z) = (values[0], values[SERIES - 1]);
+        let mut p = told_p;
         p.copy_from_slice(&values[1..=MEMBERS]);
         let left = y - gain * p[member];
         let sd = noise_um2.sqrt();
         let outlier = left.abs() > OUTLIER * sd + 2.0 * gain.max(1.0) * p[member].abs();
         state.outliers = if outlier { state.outliers + 1 } else { 0 };
-        if outlier && state.outliers < OUTLIERS {
-            self.coast(state);
-            return false;
-        }
         if outlier {
-            state.seen = None;
-            state.outliers = 0;
-            return false;
+            if state.outliers >= OUTLIERS {
+                state.seen = None;
+                state.outliers = 0;
+            }
+            return Lesson::Nothing;
         }
         state.lines = lines;
-        self.whitener.step(seen, told_y);
-        state.model.follow(&self.whitener, &told_p);
+        correction.step(seen, told_y);
+        state.model.follow(&correction, &told_p);
         if let Some((motion, d)) = state.probe.instrument().zip(instrument) {
-            motion.follow(&self.whitener, &d);
+            motion.follow(&correction, &d);
         }
+        state.covariance = correction.after;
+        state.since_fix = ago;
         let in_force = y - force.0 * p[force.1];
         if self.listen(state, in_force.clamp(-6.0 * sd, 6.0 * sd)) {
-            return false;
+            return Lesson::Nothing;
         }
         let left = left.clamp(-3.0 * sd, 3.0 * sd);
         if Self::is_still(state, left) {
-            return false;
+            return Lesson::Nothing;
         }
         state.slow.add(member, &p, z, y, noise_um2);
         state.fast.add(member, &p, z, y, noise_um2);
@@ -94,8 +125,9 @@ impl Adapter {
                 seen_um: y,
                 moved_um: p[member],
                 gain,
-                instrument_um: instrument,
+                instrument_um: instrument.map(|um| weight * um),
                 delay: state.found.map_or(DELAYS[member], |f| f.delay),
+                spreads: !self.is_faster(),
                 noise_um2,
             });
         }
@@ -103,7 +135,7 @@ impl Adapter {
         state.white[0] = keep * state.white[0] + left * left;
         state.white[1] = keep * state.white[1] + left * state.left_um;
         state.left_um = left;
-        true
+        Lesson::Learned
     }
 
     /// Looks for a line in what is left beside the tuning in force. Whether a new notch settles and nothing is to be learned.
@@ -131,18 +163,6 @@ impl Adapter {
         state.probe.begin_anew();
         state.since_line = 0;
         true
-    }
-
-    /// A tick without a fix to learn from: what is not seen moves on as it did.
-    fn coast(&self, state: &mut AdaptState) {
-        if let Some(seen) = &mut state.seen {
-            self.whitener.step(seen, 0.0);
-        }
-        state.model.follow(&self.whitener, &[0.0; MEMBERS]);
-        if let Some(instrument) = state.probe.instrument() {
-            instrument.follow(&self.whitener, &[0.0; MEMBERS]);
-        }
-        state.lines.coast();
     }
 
     /// Whether the bead wanders so much less than it did that something must hold it.

@@ -32,6 +32,7 @@ mod window;
 use crate::error::BuildError;
 use crate::estimator::{Estimator, EstimatorConfig, Fix};
 use crate::loop_model::LoopModel;
+use learn::Lesson;
 use lines::Lines;
 use motion::Motion;
 use probe::{Probe, Standing};
@@ -39,7 +40,7 @@ use serde::Serialize;
 use spectrum::{Bank, Lineup};
 use supervisor::Force;
 pub use supervisor::{AdaptMode, AdaptNews};
-use whiten::{Track, Whitener};
+use whiten::{Covariance, Track, Whitener};
 use window::{DELAYS, Finding, MEMBERS, NOMINAL, Window};
 
 /// Names of the columns that adaptation adds to a law's own in the record.
@@ -70,6 +71,8 @@ const DRIVEN: f64 = 0.3;
 const DRIVEN_TICKS: f64 = 200.0;
 /// Ticks after a new line in which nothing is told.
 const NEW_LINE_TICKS: u16 = 1500;
+/// Doubt of a delay, times from fix to fix, where commands come in bursts.
+const BURSTS: f64 = 0.25;
 /// Doubt of a gain (of its logarithm) that counts in these ticks.
 const NEW_LINE_SD: f64 = 0.1;
 
@@ -120,6 +123,9 @@ pub(crate) struct Adapter {
     bank: Bank,
     /// Whole and fractional samples of the design's delay.
     delay_samples: f64,
+    /// Ticks from one fix to the next, and those in a row that may be without one.
+    interval: f64,
+    planned_gap: u32,
     exposure_ticks: f64,
     /// Command that moves the bead by a standard deviation of the noise of a tick, um.
     probe_um: f64,
@@ -131,6 +137,11 @@ pub struct AdaptState {
     /// The model, driven with the commands.
     model: Motion,
     seen: Option<Track>,
+    /// Of the filter of all series, and ticks since the exposure of the last fix that it took.
+    covariance: Covariance,
+    since_fix: f64,
+    /// Ticks in a row without a fix.
+    silent: u32,
     slow: Window,
     fast: Window,
     /// Squares of what is left, and its products with that of the tick before.
@@ -182,15 +193,18 @@ impl Adapter {
         let walk_um2 = 2.0 * config.diffusion_um2_per_s * ts;
         let wander = WANDERS * config.neutral_walk_um_per_sqrt_s.max(0.01);
         let drift_um2 = (wander * model.gain_per_s * ts).powi(2) * ts;
-        let whitener = Whitener::new(walk_um2, drift_um2, config.fix_noise_um.powi(2))?;
+        let fix_um2 = config.fix_noise_um.powi(2);
+        let whitener = Whitener::new(walk_um2, drift_um2, fix_um2, config.ticks_per_fix)?;
         let moves = model.feedthrough + model.fast_gain_per_s() * ts;
         Ok(Self {
             probe_um: (whitener.noise_um2.sqrt() / moves).clamp(-0.5, 0.5),
-            estimators: DELAYS.map(|extra| delayed(config, model, extra)),
+            estimators: DELAYS.map(|extra| delayed(config, model, extra * config.ticks_per_fix)),
             nominal: Estimator::new(config, model)?,
             whitener,
             bank: Bank::default(),
             delay_samples: model.delay_samples(),
+            interval: config.ticks_per_fix,
+            planned_gap: config.planned_gap(),
             exposure_ticks: config.exposure_ms * 1e-3 / ts,
         })
     }
@@ -200,6 +214,9 @@ impl Adapter {
         AdaptState {
             model: Motion::start(command_um),
             seen: None,
+            covariance: self.whitener.settled(),
+            since_fix: 0.0,
+            silent: 0,
             slow: Window::new(FAST, SLOW, SLOW_TICKS),
             fast: Window::new(FAST, FAST, FAST_TICKS),
             white: [0.0; 2],
@@ -222,6 +239,11 @@ impl Adapter {
         }
     }
 
+    /// Samples of delay beyond the design's.
+    fn extra_samples(&self, member: usize) -> f64 {
+        DELAYS[member] * self.interval
+    }
+
     fn usable(&self) -> [bool; MEMBERS] {
         self.estimators.map(|one| one.is_some())
     }
@@ -239,7 +261,7 @@ impl Adapter {
         let design = self.delay_samples + 0.5;
         Tuning {
             gain: state.force.log_gain.exp(),
-            delay: (design + DELAYS[state.force.member]) / design,
+            delay: (design + self.extra_samples(state.force.member)) / design,
         }
     }
 
@@ -264,11 +286,15 @@ impl Adapter {
         let found = state.found;
         Adaptation {
             gain: state.force.log_gain.exp(),
-            delay_samples: DELAYS[state.force.member],
+            delay_samples: self.extra_samples(state.force.member),
             gain_estimate: found
                 .and_then(|f| state.probe.stated(f.log_gain(), f.log_sd()))
                 .map(|(log_gain, sd)| [log_gain.exp(), sd * log_gain.exp()]),
-            delay_estimate_samples: found.map(|f| [f.delay, f.delay_sd]),
+            delay_estimate_samples: found.map(|f| {
+                // A loop that is faster than its camera moves in bursts: from one to the next the delay makes no difference.
+                let least = if self.is_faster() { BURSTS } else { 0.0 };
+                [f.delay, f.delay_sd.max(least)].map(|delay| delay * self.interval)
+            }),
             mode: match (state.force.mode, state.probe.standing) {
                 (AdaptMode::Agreeing | AdaptMode::Moving, Standing::Tested) => AdaptMode::Testing,
                 (AdaptMode::Agreeing | AdaptMode::Moving, Standing::Corrected) => {
@@ -276,7 +302,7 @@ impl Adapter {
                 }
                 (mode, _) => mode,
             },
-            news: state.news,
+            news: state.news.map(|news| news.in_ticks(self.interval)),
         }
     }
 
@@ -315,10 +341,15 @@ impl Adapter {
     /// After the command of a tick: learns from the fix, and moves the tuning where it may. The tuning that it leaves is that
     /// of the next tick.
     pub fn step(&self, state: &mut AdaptState, told: &Told) {
-        let learned = self.learn(state, told.fix.filter(|_| told.free));
+        let lesson = self.learn(state, told.fix.filter(|_| told.free));
         state.probe.given_um = state.probe.command_um;
         self.drive(state, told.command_um);
         state.news = None;
+        if told.free && lesson == Lesson::Between {
+            // Everything else goes by the fixes.
+            state.probe.tick();
+            return;
+        }
         let step_um = told.reference_um - state.reference_um;
         if step_um.is_finite() {
             state.driven_um2 += (step_um * step_um - state.driven_um2) / DRIVEN_TICKS;
@@ -326,10 +357,10 @@ impl Adapter {
         state.reference_um = told.reference_um;
         if !told.free {
             state.force.pause();
-            state.probe.command_um = 0.0;
+            state.probe.hush();
             return;
         }
-        if learned {
+        if lesson == Lesson::Learned {
             self.compare(state);
             // After a new line little is known at first, and the line may not be out of it altogether.
             let enough =
@@ -357,7 +388,27 @@ impl Adapter {
         }
         let louder = (self.left_um2(state) / self.whitener.noise_um2).sqrt();
         let size_um = self.probe_um * louder.clamp(1.0, 2.0) / state.believed.0.clamp(0.4, 2.5);
-        state.probe.next(size_um);
+        state.probe.next(size_um, self.until_before_exposure(state));
+        state.probe.tick();
+    }
+
+    /// Whether there are two ticks at least from fix to fix.
+    fn is_faster(&self) -> bool {
+        self.interval >= 2.0
+    }
+
+    /// Ticks that a move of the test waits. A loop that is faster than its camera has all but undone it a few ticks later, so it is
+    /// made before a frame is exposed, with a tick to spare for a delay that is not quite known.
+    fn until_before_exposure(&self, state: &AdaptState) -> u32 {
+        let delay = self.delay_samples + self.extra_samples(state.force.member);
+        // The exposures to come, in ticks from now; what is decided now is given in the next tick at the earliest.
+        let first = (-delay - state.since_fix + state.since_fix.floor()).rem_euclid(self.interval);
+        let soonest = if self.is_faster() { 3.0 } else { 2.0 };
+        let mut exposed = first;
+        while exposed < soonest {
+            exposed += self.interval;
+        }
+        (exposed - soonest) as u32
     }
 
     /// A tick that never came: the command was held.

@@ -1,6 +1,6 @@
 //! The model, driven with commands beside the loop, and what of its motion was not to be foreseen.
 
-use super::whiten::{Track, Whitener};
+use super::whiten::{Correction, Track, Whitener};
 use super::window::{DELAYS, MEMBERS};
 use crate::estimator::{Estimator, Fix, PredictedState};
 use crate::exposure;
@@ -54,18 +54,19 @@ impl Motion {
         Some(a + part * (b + self.jumps_um.get(newer)? - a))
     }
 
-    /// Positions at the exposure of a fix, for each delay beside `delay`, ticks; `None` where one that is open is not known.
+    /// Positions at the exposure of a fix, for each delay beside `delay`, ticks, where the members are `apart`; `None` where one that
+    /// is open is not known.
     pub fn at(
         &self,
         fix: &Fix,
-        delay: f64,
+        (delay, apart): (f64, f64),
         exposure: f64,
         open: &[bool; MEMBERS],
     ) -> Option<[f64; MEMBERS]> {
         let ago = delay + fix.age as f64 + fix.offset;
         let mut at_um = [0.0; MEMBERS];
         for ((at, extra), open) in at_um.iter_mut().zip(DELAYS).zip(open) {
-            match exposure::mean(ago + extra, exposure, |ago| self.past(ago)) {
+            match exposure::mean(ago + extra * apart, exposure, |ago| self.past(ago)) {
                 Some(um) => *at = um,
                 None if *open => return None,
                 None => {}
@@ -80,10 +81,10 @@ impl Motion {
     }
 
     /// What of the positions was not to be foreseen; `None` before [`Motion::begin`].
-    pub fn innovations(&self, at_um: &[f64; MEMBERS]) -> Option<[f64; MEMBERS]> {
+    pub fn innovations(&self, fix: &Correction, at_um: &[f64; MEMBERS]) -> Option<[f64; MEMBERS]> {
         let tracks = self.tracks.as_ref()?;
         Some(std::array::from_fn(|j| {
-            Whitener::innovation(&tracks[j], at_um[j])
+            fix.innovation(&tracks[j], at_um[j])
         }))
     }
 
@@ -92,11 +93,11 @@ impl Motion {
         self.tracks.map_or(0.0, |tracks| tracks[member].drift)
     }
 
-    /// One tick with those innovations.
-    pub fn follow(&mut self, whitener: &Whitener, innovations: &[f64; MEMBERS]) {
+    /// A fix with those innovations.
+    pub fn follow(&mut self, fix: &Correction, innovations: &[f64; MEMBERS]) {
         let tracks = self.tracks.iter_mut().flatten();
         for (track, innovation) in tracks.zip(innovations) {
-            whitener.step(track, *innovation);
+            fix.step(track, *innovation);
         }
     }
 }

@@ -82,6 +82,9 @@ pub(super) struct Probe {
     pub command_um: f64,
     /// The one before, which a tick that never comes holds.
     pub given_um: f64,
+    /// The one that is to be given, um, and in how many ticks.
+    pending_um: f64,
+    wait: u32,
     side: f64,
     bits: u32,
     ticks: u32,
@@ -109,6 +112,8 @@ pub(super) struct Trial {
     pub instrument_um: [f64; MEMBERS],
     /// Estimated delay beyond the design's, samples.
     pub delay: f64,
+    /// A move may fall into two samples: it takes a whole one.
+    pub spreads: bool,
     pub noise_um2: f64,
 }
 
@@ -123,6 +128,8 @@ impl Probe {
             instrument: Motion::start(0.0),
             command_um: 0.0,
             given_um: 0.0,
+            pending_um: 0.0,
+            wait: 0,
             side: 0.0,
             bits: 0x2545_f491,
             ticks: 0,
@@ -333,7 +340,7 @@ impl Probe {
         self.confirmed = log_gain;
         self.doubt = CONFIRMED_SD.max(0.7 * wrong.abs());
         self.away = 0;
-        self.command_um = 0.0;
+        self.hush();
         self.correction = (0.0, 0.0);
     }
 
@@ -344,6 +351,7 @@ impl Probe {
             moved_um,
             gain,
             delay,
+            spreads,
             noise_um2,
             ..
         } = *trial;
@@ -355,7 +363,11 @@ impl Probe {
             self.begins = begins;
             self.begin_anew();
         }
-        let instrument_um = now_um + self.before_um;
+        let instrument_um = if spreads {
+            now_um + self.before_um
+        } else {
+            now_um
+        };
         self.before_um = now_um;
         let keep = 1.0 - (instrument_um * instrument_um / noise_um2 / MEMORY).min(0.02);
         self.with_fixes = keep * self.with_fixes + instrument_um * seen_um;
@@ -368,9 +380,24 @@ impl Probe {
         }
     }
 
-    /// The next command, um, where a step of `step_um` moves the bead by a standard deviation of the noise of a tick.
-    pub fn next(&mut self, step_um: f64) {
+    /// A tick on: what is due becomes the command.
+    pub fn tick(&mut self) {
         self.command_um = 0.0;
+        if self.wait > 0 {
+            self.wait -= 1;
+        } else {
+            self.command_um = std::mem::take(&mut self.pending_um);
+        }
+    }
+
+    /// No test while the loop does not control the bead.
+    pub fn hush(&mut self) {
+        (self.command_um, self.pending_um, self.wait) = (0.0, 0.0, 0);
+    }
+
+    /// The next command, to be given after `wait` ticks, where a step of `step_um` moves the bead by a standard deviation of the noise
+    /// from fix to fix.
+    pub fn next(&mut self, step_um: f64, wait: u32) {
         if !self.is_on() {
             return;
         }
@@ -382,7 +409,8 @@ impl Probe {
         let bit = self.bits & 1;
         self.bits = (self.bits >> 1) ^ (0x8020_0003 * bit);
         let side = if bit == 1 { SIZE } else { -SIZE };
-        self.command_um = (side - self.side) * step_um;
+        self.pending_um += (side - self.side) * step_um;
+        self.wait = wait;
         self.side = side;
     }
 }

@@ -68,6 +68,17 @@ pub struct AdaptNews {
     pub retreat: bool,
 }
 
+impl AdaptNews {
+    /// With delays and times in ticks, of which there are so many from fix to fix.
+    pub(super) fn in_ticks(self, interval: f64) -> Self {
+        Self {
+            delay_samples: self.delay_samples.map(|delay| delay * interval),
+            ticks: (self.ticks as f64 * interval).round() as u64,
+            ..self
+        }
+    }
+}
+
 /// The tuning in force, and how it came to be.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Force {

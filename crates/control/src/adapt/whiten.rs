@@ -1,15 +1,38 @@
 //! The filter that makes white noise of a bead's wandering.
 
 use crate::error::BuildError;
-use crate::riccati::kalman_gain;
+use crate::riccati::solve_dare;
 use nalgebra::{DMatrix, DVector};
 
-/// Constant-gain Kalman filter of a random walk whose drift wanders as well.
+/// Times between two fixes that count, ticks.
+const APART: (f64, f64) = (0.25, 1000.0);
+
+/// Kalman filter of a random walk whose drift wanders as well, for fixes at any distance from each other.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Whitener {
-    gain: [f64; 2],
-    /// Variance of what it makes of the wandering, um^2.
+    /// Variances per tick of the walk and of the drift's change, and that of a fix, um^2.
+    walk_um2: f64,
+    drift_um2: f64,
+    fix_um2: f64,
+    /// Covariance after a fix, where all have come as they should: position, both, drift; um^2.
+    settled: Covariance,
+    /// Variance of what it makes of the wandering where fixes come as they should, um^2.
     pub noise_um2: f64,
+}
+
+/// Covariance after a fix: position, both, drift; um^2.
+pub(super) type Covariance = [f64; 3];
+
+/// What a fix does to every series: they were filtered alike and are.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Correction {
+    /// Ticks since the fix before.
+    pub ticks: f64,
+    gain: [f64; 2],
+    /// Covariance after it.
+    pub after: Covariance,
+    /// What makes the variance of an innovation that of [`Whitener::noise_um2`]: less than 1 after a gap.
+    pub weight: f64,
 }
 
 /// Position and drift per tick of one series, um.
@@ -20,31 +43,51 @@ pub(super) struct Track {
 }
 
 impl Whitener {
-    /// For variances per tick of the walk and of the drift's change, and of a fix; um^2.
-    pub fn new(walk_um2: f64, drift_um2: f64, fix_um2: f64) -> Result<Self, BuildError> {
-        let a = DMatrix::from_row_slice(2, 2, &[1.0, 1.0, 0.0, 1.0]);
+    /// For variances per tick of the walk and of the drift's change, and of a fix, um^2, of which one comes every so many ticks.
+    pub fn new(
+        walk_um2: f64,
+        drift_um2: f64,
+        fix_um2: f64,
+        ticks: f64,
+    ) -> Result<Self, BuildError> {
+        let a = DMatrix::from_row_slice(2, 2, &[1.0, ticks, 0.0, 1.0]);
         let seen = DVector::from_vec(vec![1.0, 0.0]);
-        let q = DMatrix::from_diagonal(&DVector::from_vec(vec![walk_um2, drift_um2]));
+        let q = [walk_um2 * ticks, drift_um2 * ticks];
+        let q = DMatrix::from_diagonal(&DVector::from_row_slice(&q));
         // Exact fixes leave no equation to solve.
-        let fix_um2 = fix_um2.max(1e-3 * walk_um2);
-        let gain = kalman_gain(&a, &seen, &q, fix_um2)?;
-        // K = P / (P + R), so the innovation's variance P + R is R / (1 - K).
-        let left = (1.0 - gain[0]).max(1e-6);
+        let fix_um2 = fix_um2.max(1e-3 * walk_um2 * ticks);
+        let prior = solve_dare(&a.transpose(), &(&seen * seen.transpose() / fix_um2), &q)?;
+        let prior = [prior[(0, 0)], prior[(0, 1)], prior[(1, 1)]];
+        let (_, settled) = corrected(prior, fix_um2);
         Ok(Self {
-            gain: [gain[0], gain[1]],
-            noise_um2: fix_um2 / left,
+            walk_um2,
+            drift_um2,
+            fix_um2,
+            settled,
+            noise_um2: prior[0] + fix_um2,
         })
     }
 
-    /// What of a value was not to be foreseen.
-    pub fn innovation(track: &Track, value: f64) -> f64 {
-        value - (track.at + track.drift)
+    /// Covariance with which series begin.
+    pub fn settled(&self) -> Covariance {
+        self.settled
     }
 
-    /// One tick with that innovation, or with none.
-    pub fn step(&self, track: &mut Track, innovation: f64) {
-        track.at += track.drift + self.gain[0] * innovation;
-        track.drift += self.gain[1] * innovation;
+    /// What a fix so many ticks after the one before does.
+    pub fn correction(&self, [pp, pd, dd]: Covariance, ticks: f64) -> Correction {
+        let ticks = ticks.clamp(APART.0, APART.1);
+        let prior = [
+            pp + ticks * (2.0 * pd + ticks * dd) + self.walk_um2 * ticks,
+            pd + ticks * dd,
+            dd + self.drift_um2 * ticks,
+        ];
+        let (gain, after) = corrected(prior, self.fix_um2);
+        Correction {
+            ticks,
+            gain,
+            after,
+            weight: (self.noise_um2 / (prior[0] + self.fix_um2)).sqrt(),
+        }
     }
 
     /// A series that begins here.
@@ -52,6 +95,52 @@ impl Whitener {
         Track {
             at: value,
             drift: 0.0,
+        }
+    }
+}
+
+/// Gain of a fix, and the covariance after it.
+fn corrected([pp, pd, dd]: Covariance, fix_um2: f64) -> ([f64; 2], Covariance) {
+    let gain = [pp / (pp + fix_um2), pd / (pp + fix_um2)];
+    let left = 1.0 - gain[0];
+    (gain, [left * pp, left * pd, dd - gain[1] * pd])
+}
+
+impl Correction {
+    /// What of a value was not to be foreseen.
+    pub fn innovation(&self, track: &Track, value: f64) -> f64 {
+        value - (track.at + track.drift * self.ticks)
+    }
+
+    /// A fix with that innovation.
+    pub fn step(&self, track: &mut Track, innovation: f64) {
+        track.at += track.drift * self.ticks + self.gain[0] * innovation;
+        track.drift += self.gain[1] * innovation;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn fixes_that_come_as_they_should_keep_the_covariance_and_after_a_gap_it_comes_back() {
+        for ticks in [1.0, 2.0, 5.0] {
+            let whitener = Whitener::new(6.6e-4, 1e-9, 4e-4, ticks).unwrap();
+            let near = |a: Covariance, b: Covariance| {
+                a.iter()
+                    .zip(b)
+                    .all(|(a, b)| (a - b).abs() < 1e-9 * b.abs().max(1e-9))
+            };
+            let one = whitener.correction(whitener.settled(), ticks);
+            assert!(near(one.after, whitener.settled()), "{one:?}");
+            assert!((one.weight - 1.0).abs() < 1e-9, "{one:?}");
+            let mut gap = whitener.correction(whitener.settled(), 3.0 * ticks);
+            assert!(gap.weight < 0.8, "{gap:?}");
+            for _ in 0..20_000 {
+                gap = whitener.correction(gap.after, ticks);
+            }
+            assert!(near(gap.after, whitener.settled()), "{gap:?}");
         }
     }
 }

@@ -3,6 +3,15 @@
 use crate::error::{BuildError, check};
 use serde::{Deserialize, Serialize};
 
+/// Ticks in a row that may be without a fix where one comes every so many.
+pub(crate) fn planned_gap(ticks_per_fix: f64) -> u32 {
+    if ticks_per_fix > 1.0 {
+        ticks_per_fix.ceil() as u32
+    } else {
+        0
+    }
+}
+
 /// Noise and gate of the estimator.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -24,6 +33,10 @@ pub struct EstimatorConfig {
     pub ltr_noise_scaling: f64,
     /// Exposure of a frame, ms; at most a tick. A fix is the mean over it of a path that bends where a command takes effect.
     pub exposure_ms: f64,
+    /// Ticks from one fix to the next, 1 to 16: above 1 where the loop is faster than its camera. Ticks between fixes are run on
+    /// prediction and are no loss.
+    #[serde(skip_serializing_if = "is_one")]
+    pub ticks_per_fix: f64,
     /// An innovation larger than this many standard deviations is refused.
     pub gate_sigma: f64,
     /// ... unless it is smaller than this and the fastest motion of the last ticks, um.
@@ -44,6 +57,12 @@ fn is_off(adapt: &bool) -> bool {
     !adapt
 }
 
+/// A file without the key is of a camera as fast as the loop.
+#[expect(clippy::trivially_copy_pass_by_ref, reason = "serde calls it so")]
+fn is_one(ticks: &f64) -> bool {
+    *ticks == 1.0
+}
+
 impl Default for EstimatorConfig {
     /// A 1 um bead mid-slit (D = 0.33 um^2/s) with 20 nm fixes.
     fn default() -> Self {
@@ -55,6 +74,7 @@ impl Default for EstimatorConfig {
             fix_noise_um: 0.020,
             ltr_noise_scaling: 10.0,
             exposure_ms: 0.0,
+            ticks_per_fix: 1.0,
             gate_sigma: 6.0,
             gate_floor_um: 0.5,
             gate_most: 10,
@@ -65,6 +85,12 @@ impl Default for EstimatorConfig {
 }
 
 impl EstimatorConfig {
+    /// Ticks in a row that may be without a fix and are no loss: none where every tick has one, else those between two fixes and
+    /// one more, since fixes come a tick late now and then.
+    pub fn planned_gap(&self) -> u32 {
+        planned_gap(self.ticks_per_fix)
+    }
+
     /// Checks every value.
     pub(super) fn validate(&self, sample_time_s: f64) -> Result<(), BuildError> {
         let c = self;
@@ -117,6 +143,13 @@ impl EstimatorConfig {
             c.exposure_ms,
             (0.0..=1e3 * sample_time_s).contains(&c.exposure_ms),
             "0 to a tick",
+        )?;
+        check(
+            "ticks_per_fix",
+            "",
+            c.ticks_per_fix,
+            (1.0..=16.0).contains(&c.ticks_per_fix),
+            "1 to 16",
         )?;
         check(
             "gate_sigma",

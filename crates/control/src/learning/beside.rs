@@ -4,7 +4,7 @@ use super::{Driven, LearnedTable, Learner, LearnerState};
 use crate::exposure;
 
 /// References of past ticks that a [`CycleLearning`] keeps: the oldest exposure that it can learn from.
-const PAST: usize = 12;
+const PAST: usize = 24;
 
 /// A learner beside a loop: it lays each fix on the reference and the phase at the time of its exposure.
 #[derive(Debug, Clone, PartialEq)]

@@ -39,6 +39,8 @@ pub struct LearnConfig {
     pub retreat_growth: f64,
     /// Ticks without learning after the bead was lost.
     pub settle_ticks: u32,
+    /// Ticks from one fix to the next, 1 to 16; see [`crate::EstimatorConfig::ticks_per_fix`].
+    pub ticks_per_fix: f64,
     /// Exposure of a frame, s; at most 4 ticks. A fix is the mean over it of a path whose velocity changes with each
     /// command, and is compared with the mean of the reference's path: at 300 Hz the two differ from the positions at the
     /// middle by a fifth of the amplitude.
@@ -55,6 +57,7 @@ impl Default for LearnConfig {
             most_um: 20.0,
             retreat_growth: 1.5,
             settle_ticks: 20,
+            ticks_per_fix: 1.0,
             exposure_s: 0.0,
         }
     }
@@ -77,6 +80,9 @@ impl LearnConfig {
             room,
             "watch_cycles or more",
         )?;
+        let apart = self.ticks_per_fix;
+        let known = (1.0..=16.0).contains(&apart);
+        check("ticks_per_fix", "", apart, known, "1 to 16")?;
         let growth = self.retreat_growth;
         check("retreat_growth", "", growth, growth > 1.0, "above 1")?;
         let open = (0.0..=4.0 * sample_time_s).contains(&self.exposure_s);

@@ -10,6 +10,7 @@ mod learning;
 mod learning_beside_adaptation;
 mod limits;
 mod monitor;
+mod multi_rate;
 mod pi_loop;
 mod solvers;
 mod state_feedback;
