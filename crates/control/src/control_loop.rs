@@ -278,11 +278,16 @@ impl<L: ControlLaw> ControlLoop<L> {
         state.estimator.neutral_um = state.estimator.neutral_um.clamp(low, high);
         estimate.neutral_um = state.estimator.neutral_um;
         estimate.now.n = state.estimator.neutral_um;
+        let moved_um = match (&self.adapter, &state.adapt) {
+            (Some(adapter), Some(adapt)) => adapter.moved_um(adapt),
+            _ => 0.0,
+        };
+        estimate.now.q -= moved_um;
         // What a PI controller sees: the fix itself where there is one, else what the model says it would be.
         let bead_um = match fix {
             Some(fix) if estimate.fresh => fix.position_um,
             _ => estimate.predicted_measurement_um,
-        };
+        } - moved_um;
         let reference_ok = input.reference_um.abs() < FAR_UM;
         Tick {
             controls: input.mode == Mode::Run && reference_ok && estimate.seen,

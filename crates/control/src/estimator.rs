@@ -386,12 +386,7 @@ impl Estimator {
         } else {
             part.advance(&from, command)
         };
-        let bend_um = if state.stuck {
-            0.0
-        } else {
-            Self::command(state, back) - Self::command(state, back + 1)
-        };
-        let predicted = self.position(&at) + self.exposed_um(part.fraction, bend_um);
+        let predicted = self.position(&at) + self.exposed_um(state, part.fraction, back);
         let innovation = fix.position_um - predicted;
         if !state.seen {
             self.place(state, innovation, fix.variance_um2);

@@ -4,7 +4,8 @@
 //! on the change of these from tick to tick, and on a constant: `dy_k = c + g (dp_k - lag (dp_k - dp_(k-1)) / Ts)`. `g` is the
 //! gain over the model's, a positive lag a pole that the model lacks. Increments, because Brownian motion makes positions a
 //! random walk. Ticks in which the model predicts no motion to speak of are not counted and nothing is forgotten in
-//! them, so that an estimate does not decay while the bead is held: the forgetting is by excitation.
+//! them, so that an estimate does not decay while the bead is held: the forgetting is by excitation. Where the loop is faster than its
+//! camera the increments are those from fix to fix.
 //!
 //! A fast estimate (some 40 moving ticks) is held against a slow one (some 1000), so that a gain that was wrong from the
 //! start is no alarm. It only watches: no command depends on it.
@@ -143,7 +144,10 @@ impl Sums {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PlantMonitor {
     estimator: Estimator,
+    /// From fix to fix.
     sample_ms: f64,
+    /// Ticks in a row that may be without a fix.
+    planned_gap: u32,
     noise_um2: f64,
     least_um: f64,
 }
@@ -155,6 +159,9 @@ pub struct PlantMonitorState {
     commands_um: [f64; HISTORY + 2],
     fast: Sums,
     slow: Sums,
+    /// Increment of the model since the last fix, um, and ticks since.
+    gathered_um: f64,
+    silent: u32,
     predicted_um: Option<f64>,
     measured_um: Option<f64>,
     before_um: f64,
@@ -188,11 +195,13 @@ impl PlantMonitor {
     /// # Errors
     /// As [`Estimator::new`].
     pub fn new(config: EstimatorConfig, model: LoopModel) -> Result<Self, BuildError> {
-        let walk = 2.0 * config.diffusion_um2_per_s * model.sample_time_s;
+        let apart_s = model.sample_time_s * config.ticks_per_fix;
+        let walk = 2.0 * config.diffusion_um2_per_s * apart_s;
         let noise_um2 = walk + 2.0 * config.fix_noise_um.powi(2);
         Ok(Self {
             estimator: Estimator::new(config, model)?,
-            sample_ms: model.sample_time_s * 1e3,
+            sample_ms: apart_s * 1e3,
+            planned_gap: config.planned_gap(),
             noise_um2,
             least_um: LEAST_SIGMA * noise_um2.sqrt(),
         })
@@ -205,6 +214,8 @@ impl PlantMonitor {
             commands_um: [command_um; HISTORY + 2],
             fast: NOTHING,
             slow: NOTHING,
+            gathered_um: 0.0,
+            silent: 0,
             predicted_um: None,
             measured_um: None,
             before_um: 0.0,
@@ -254,10 +265,16 @@ impl PlantMonitor {
         } else {
             command_um
         };
-        let increment_um = self.estimator.position_measured(&to, part) - before;
+        state.gathered_um += self.estimator.position_measured(&to, part) - before;
         state.model = to;
         state.commands_um.rotate_right(1);
         state.commands_um[0] = command_um;
+        if measured_um.is_none() && state.silent < self.planned_gap {
+            state.silent += 1;
+            return state.verdict;
+        }
+        state.silent = 0;
+        let increment_um = std::mem::take(&mut state.gathered_um);
         if let (Some(now), Some(last), Some(predicted)) =
             (measured_um, state.measured_um, state.predicted_um)
         {

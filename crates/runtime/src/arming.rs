@@ -78,6 +78,10 @@ impl GainCheck {
 #[derive(Debug, Clone, PartialEq)]
 pub struct Arming {
     config: ArmingConfig,
+    /// Increments that must have been seen.
+    least: u32,
+    /// Ticks in a row without a frame that a steady bead may have.
+    most_silent: u32,
     /// Displacement at each tick of the pulse less the one before the pulse, um.
     program_um: Vec<f64>,
     /// Measured position at each tick, um, as the model says.
@@ -141,7 +145,7 @@ impl ArmingState {
     }
 }
 
-/// Ticks in a row without a frame that a steady bead may have.
+/// Ticks in a row without a frame that a steady bead may have where each tick has one.
 const MOST_SILENT: u32 = 3;
 /// Pulses made again at most: a rig that is disturbed every time is not fit to be closed.
 const MOST_REPEATED: u32 = 8;
@@ -179,7 +183,8 @@ pub enum Step {
 }
 
 impl Arming {
-    /// Prepares the pulse for a plant seen through a camera path of `camera_delay` and a sample time.
+    /// Prepares the pulse for a plant seen through a camera path of `camera_delay` and a sample time, with a fix in so many ticks:
+    /// patience and pulse are so much longer.
     ///
     /// # Errors
     /// The plant cannot be discretised.
@@ -188,7 +193,15 @@ impl Arming {
         plant: &TransferFunction,
         sample: Seconds,
         camera_delay: Seconds,
+        ticks_per_fix: f64,
     ) -> Result<Self, PlantError> {
+        let times = ticks_per_fix.ceil().max(1.0) as u32;
+        let least = config.pulse_ticks;
+        let config = ArmingConfig {
+            patience_ticks: config.patience_ticks.saturating_mul(times),
+            pulse_ticks: config.pulse_ticks.saturating_mul(times),
+            ..config
+        };
         let discrete = DiscretePlant::new(plant, sample, camera_delay)?;
         let rest = (camera_delay.value() / sample.value()).ceil() as u32 + 4;
         let up = config.pulse_ticks;
@@ -210,6 +223,8 @@ impl Arming {
             .collect();
         Ok(Self {
             config,
+            least,
+            most_silent: MOST_SILENT.saturating_mul(times),
             program_um,
             positions_um,
             settling_ticks: rest,
@@ -235,7 +250,7 @@ impl Arming {
         let Some(pulse) = state.pulse else {
             if position_um.is_some() {
                 state.steady += 1;
-            } else if input.framed || state.silent > MOST_SILENT {
+            } else if input.framed || state.silent > self.most_silent {
                 state.steady = 0;
             }
             if state.steady >= self.config.steady_ticks {
@@ -336,7 +351,7 @@ impl Arming {
         let sxy = s.xy - s.x * s.y / s.n.max(1.0);
         let syy = s.yy - s.y * s.y / s.n.max(1.0);
         // Half of a pulse must have been seen, or the ratio means nothing.
-        if s.n < f64::from(self.config.pulse_ticks) || sxx.is_nan() || sxx <= 0.0 {
+        if s.n < f64::from(self.least) || sxx.is_nan() || sxx <= 0.0 {
             return None;
         }
         let gain_ratio = sxy / sxx;

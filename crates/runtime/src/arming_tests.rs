@@ -38,7 +38,7 @@ fn arm(
     time: impl Fn(u32) -> (u32, bool),
 ) -> (GainCheck, f64, u32) {
     let arming =
-        Arming::new(config, &TransferFunction::eq6(), SAMPLE, DELAY).expect("eq6 is a plant");
+        Arming::new(config, &TransferFunction::eq6(), SAMPLE, DELAY, 1.0).expect("eq6 is a plant");
     let plant =
         DiscretePlant::new(&TransferFunction::eq6(), SAMPLE, delay).expect("eq6 is a plant");
     let mut truth = plant.state(0.0);
@@ -81,6 +81,7 @@ fn the_pzt_goes_to_the_believed_rest_only_where_no_bead_was_ever_seen() {
         &TransferFunction::eq6(),
         SAMPLE,
         DELAY,
+        1.0,
     )
     .expect("eq6 is a plant");
     let stands = |seen: bool| {

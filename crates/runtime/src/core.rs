@@ -59,9 +59,13 @@ struct State {
     stale_in_a_row: u32,
     late_in_a_row: u32,
     refused_in_a_row: u32,
-    /// Steps of the grid in a row without a position that was used.
+    /// Steps of the grid in a row without a position that was used, and those of them that are a loss.
+    blind: u32,
     missing: u32,
-    frames_silent: bool,
+    /// Ticks in a row without a frame.
+    frameless: u32,
+    /// The newest position that was used and the ticks that it is older than the camera path, for those in between.
+    newest: Option<(f64, u16)>,
     early_since_ns: Option<i64>,
     vision_slow_since_ns: Option<i64>,
     coasting_since_ns: Option<i64>,
@@ -86,6 +90,8 @@ pub struct Core<R> {
     timing: Timing,
     arming: Arming,
     sample_s: f64,
+    /// Ticks in a row that may be without a frame: those between two frames of a slower camera.
+    planned_gap: u32,
     preview_um: Vec<f64>,
     learners: Learners,
     late_solver_ns: Vec<Range<i64>>,
@@ -129,17 +135,20 @@ impl<R: ReferenceGenerator> Core<R> {
         timing.validate()?;
         let [displacement_um, neutral_um] = at_um;
         let sample_s = timing.period_us * 1e-6;
+        let estimator = controller.settings().estimator;
         let arming = Arming::new(
             arming,
             plant,
             Seconds(sample_s),
             Seconds(timing.camera_delay_ms * 1e-3),
+            estimator.ticks_per_fix,
         )?;
         let settings = controller.settings();
         let monitor = PlantMonitor::new(settings.estimator, settings.model)?;
         controller.start(displacement_um, neutral_um);
         Ok(Self {
             preview_um: vec![0.0; controller.preview_len()],
+            planned_gap: estimator.planned_gap(),
             controller,
             reference,
             timing,
@@ -163,8 +172,10 @@ impl<R: ReferenceGenerator> Core<R> {
                 stale_in_a_row: 0,
                 late_in_a_row: 0,
                 refused_in_a_row: 0,
+                blind: 0,
                 missing: 0,
-                frames_silent: false,
+                frameless: 0,
+                newest: None,
                 early_since_ns: None,
                 vision_slow_since_ns: None,
                 coasting_since_ns: None,
@@ -209,6 +220,12 @@ impl<R: ReferenceGenerator> Core<R> {
     /// What is being learned over cycles.
     pub fn learners(&self) -> &Learners {
         &self.learners
+    }
+
+    /// Time from frame to frame, ns: a period of the loop, or more where the camera is slower.
+    pub fn frame_period_ns(&self) -> i64 {
+        let ticks = self.controller.settings().estimator.ticks_per_fix;
+        (self.timing.period_ns() as f64 * ticks).round() as i64
     }
 
     /// Where the run stands.
@@ -320,7 +337,7 @@ impl<R: ReferenceGenerator> Core<R> {
         if output.requested_um.is_nan() {
             self.latch(SafeReason::NotFinite, &mut tick);
         }
-        self.account(&output, &mut tick);
+        self.account(input, &output, &mut tick);
         let action = self.action(&output, tick.index);
         self.count(input, &output, tick.flags);
         let record = self.record(input, &output, &generated, tick.flags);
@@ -348,14 +365,15 @@ impl<R: ReferenceGenerator> Core<R> {
             0
         };
         let length_um = input.measurement.map(|m| m.length_um);
+        let newest = self.newest_position(fix, input, tick.steps);
         let told = ReferenceInput {
             running,
             frozen: mode == Mode::Freeze,
             skip: running && input.request == Request::Skip,
             tick: since,
             sample_s: self.sample_s,
-            position_um: fix.map(|fix| fix.position_um),
-            age_ticks: fix.map_or(0, |fix| fix.age_samples),
+            position_um: newest.map(|(position_um, _)| position_um),
+            age_ticks: newest.map_or(0, |(_, age)| age),
             length_um: length_um.filter(|um| fix.is_some() && um.is_finite()),
             target_um: input.target_um,
         };
@@ -404,6 +422,21 @@ impl<R: ReferenceGenerator> Core<R> {
             });
         }
         (output, generated)
+    }
+
+    /// The position of this tick and its age beyond the camera path, ticks; between two frames of a slower camera that of the newest.
+    fn newest_position(
+        &mut self,
+        fix: Option<LoopMeasurement>,
+        input: &TickInput,
+        steps: u64,
+    ) -> Option<(f64, u16)> {
+        let steps = u16::try_from(steps).unwrap_or(u16::MAX);
+        let older = |(position_um, age): (f64, u16)| (position_um, age.saturating_add(steps));
+        let held = (self.state.newest.map(older))
+            .filter(|(_, age)| input.measurement.is_none() && u32::from(*age) <= self.planned_gap);
+        self.state.newest = fix.map(|fix| (fix.position_um, fix.age_samples)).or(held);
+        self.state.newest
     }
 
     fn solver_terms(&self, input: &TickInput) -> SolverTerms {

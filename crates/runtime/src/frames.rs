@@ -45,6 +45,7 @@ impl FrameTally {
 #[derive(Debug)]
 pub(crate) struct FrameWatch {
     account: FrameAccount,
+    /// From frame to frame.
     period_ns: i64,
     oldest_ns: i64,
     /// Exposure of the last frame that was too old, while no other has come.

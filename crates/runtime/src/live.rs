@@ -83,7 +83,7 @@ pub fn run<R: ReferenceGenerator + Send, S: RunSink + 'static>(
     operator: &Arc<Operator>,
 ) -> Result<Finished<S>, RunError> {
     let (ticker, ends) = Ticker::new(core, Clock::Real, monotonic_ns(), RingSizes::default());
-    let period_ns = ticker.core().timing().period_ns();
+    let period_ns = ticker.core().frame_period_ns();
     let Ends {
         measurements,
         orders,

@@ -3,7 +3,8 @@
 //! Camera and loop need not agree in rate or phase. A frame that comes when the tick of its step has been made waits for
 //! the next step; where the wait would be long, the frame after it is waited for instead. So a camera that drifts through
 //! the grid costs one tick without a frame, or one frame that is not used, each time that it is a whole period off, and
-//! no frame waits for longer than [`WAITS`] of a period. Knows no clock and no thread: it is told the time.
+//! no frame waits for longer than [`WAITS`] of a period. Where the camera is slower, ticks in which none of its frames is to come
+//! are made when they are due, without waiting for one. Knows no clock and no thread: it is told the time.
 
 /// A frame may come this late, in parts of a period after it was expected, before the timer stands in for it.
 const GRACE: f64 = 0.3;
@@ -28,16 +29,23 @@ pub(crate) enum Pace {
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Pacer {
     period_ns: i64,
-    /// When the next frame is expected.
+    /// From frame to frame.
+    frame_ns: i64,
+    /// When the next tick is expected to be due, by the frames.
     expected_ns: i64,
+    /// When the next frame is to come.
+    next_frame_ns: i64,
     last_ns: i64,
 }
 
 impl Pacer {
-    pub(crate) fn new(period_ns: i64, now_ns: i64) -> Self {
+    /// `periods_ns`: of the loop, and from frame to frame.
+    pub(crate) fn new([period_ns, frame_ns]: [i64; 2], now_ns: i64) -> Self {
         Self {
             period_ns,
+            frame_ns,
             expected_ns: now_ns.saturating_add(period_ns),
+            next_frame_ns: now_ns,
             last_ns: i64::MIN / 2,
         }
     }
@@ -69,7 +77,10 @@ impl Pacer {
                 Self::at(now_ns, next_ns.clamp(opens_ns, latest_ns))
             }
             None => {
-                let due_ns = self.expected_ns + self.part(GRACE);
+                // A frame that is to come in this tick is waited for.
+                let comes = self.next_frame_ns < self.expected_ns + self.period_ns / 2;
+                let grace_ns = if comes { self.part(GRACE) } else { 0 };
+                let due_ns = self.expected_ns + grace_ns;
                 Self::at(now_ns, due_ns.clamp(opens_ns, latest_ns))
             }
         }
@@ -87,6 +98,9 @@ impl Pacer {
     pub(crate) fn ticked(&mut self, start_ns: i64, ready_ns: Option<i64>) {
         self.last_ns = start_ns;
         self.expected_ns = ready_ns.unwrap_or(self.expected_ns) + self.period_ns;
+        if let Some(ready_ns) = ready_ns {
+            self.next_frame_ns = ready_ns + self.frame_ns;
+        }
     }
 }
 
@@ -108,7 +122,12 @@ mod tests {
 
     /// Ten minutes of frames at these times; says what became of them.
     fn pace(frames: impl Iterator<Item = i64>) -> Paced {
-        let mut pacer = Pacer::new(P, 0);
+        pace_beside(P, frames)
+    }
+
+    /// The same with a camera that is stated to give a frame so often.
+    fn pace_beside(frame_ns: i64, frames: impl Iterator<Item = i64>) -> Paced {
+        let mut pacer = Pacer::new([P, frame_ns], 0);
         let (mut grid, mut index) = (None::<Grid>, 0);
         let (mut now, mut last) = (0, None::<i64>);
         let mut ready = None;
@@ -143,7 +162,8 @@ mod tests {
                     if let Some(ready) = ready {
                         out.longest_wait_ns = out.longest_wait_ns.max(now - ready);
                     }
-                    if let Some(last) = last {
+                    // Before the first frames nothing is known of when they come.
+                    if let Some(last) = last.filter(|_| out.ticks > 10) {
                         out.closest_ns = out.closest_ns.min(now - last);
                     }
                     last = Some(now);
@@ -191,6 +211,23 @@ mod tests {
         let double = pace(camera(2000.0, 60.0));
         assert!(double.ticks.abs_diff(60_000) < 3 && double.without_frame == 0);
         assert!(double.unused.abs_diff(60_000) < 5);
+    }
+
+    #[test]
+    fn between_the_frames_of_a_slower_camera_ticks_are_as_even_as_the_clock() {
+        let paced = pace_beside(5 * P, camera(200.0, 60.0));
+        assert!(paced.ticks.abs_diff(60_000) < 7, "{}", paced.ticks);
+        assert!(paced.without_frame.abs_diff(48_000) < 7);
+        assert!(
+            paced.longest_wait_ns <= P / 100,
+            "{}",
+            paced.longest_wait_ns
+        );
+        let closest_ns = paced.closest_ns;
+        assert!(
+            closest_ns >= P - P / 20,
+            "{closest_ns} ns from tick to tick"
+        );
     }
 
     #[test]

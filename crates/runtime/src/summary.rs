@@ -89,7 +89,7 @@ pub struct Statistics {
 }
 
 /// Ticks whose references are kept: the oldest exposure that is compared with its own reference.
-const TARGETS: usize = 8;
+const TARGETS: usize = 32;
 
 /// How the bead went from where it was to where it should be, after the loop was closed.
 #[derive(Debug, Clone, Copy, PartialEq)]

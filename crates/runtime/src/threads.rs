@@ -179,9 +179,10 @@ impl<'a, R: ReferenceGenerator> Controlling<'a, R> {
         operator: &'a Operator,
         shared: &'a Shared,
     ) -> Self {
-        let period_ns = ticker.core().timing().period_ns();
+        let core = ticker.core();
+        let periods_ns = [core.timing().period_ns(), core.frame_period_ns()];
         Self {
-            pacer: Pacer::new(period_ns, clock.now_ns()),
+            pacer: Pacer::new(periods_ns, clock.now_ns()),
             watch: EndWatch::new(end),
             recorder: PulseWatch::default(),
             ticker,

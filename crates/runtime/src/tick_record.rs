@@ -45,6 +45,8 @@ impl TickFlags {
     pub const EARLY: u32 = 1 << 16;
     /// The board talks, and does not do what it is told.
     pub const BOARD_TROUBLE: u32 = 1 << 17;
+    /// No frame was to come in this tick: the loop is faster than its camera.
+    pub const BETWEEN: u32 = 1 << 18;
 
     /// Whether all bits of `mask` are set.
     pub fn has(self, mask: u32) -> bool {

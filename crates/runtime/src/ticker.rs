@@ -123,7 +123,7 @@ impl<R: ReferenceGenerator> Ticker<R> {
         let ticker = Self {
             budget_ns: core.timing().budget_ns(),
             solver_time: Duration::from_secs_f64(core.timing().solver_us * 1e-6),
-            frames: FrameWatch::new(core.timing().period_ns(), core.timing().oldest_ns()),
+            frames: FrameWatch::new(core.frame_period_ns(), core.timing().oldest_ns()),
             core,
             clock,
             start_ns,

@@ -136,6 +136,7 @@ impl LearnSpec {
             frequency_hz: wanted.frequency_hz,
             config: LearnConfig {
                 exposure_s: setup.controller.estimator.exposure_ms * 1e-3,
+                ticks_per_fix: setup.controller.estimator.ticks_per_fix,
                 ..LearnConfig::default()
             },
             responses,

@@ -1,4 +1,4 @@
-//! A controller fitted to a rig: its limits, what the camera sees, how long a frame is exposed.
+//! A controller fitted to a rig: its limits, what the camera sees, how long a frame is exposed and how often one comes.
 
 use crate::Failure;
 use crate::prepared::Prepared;
@@ -9,7 +9,7 @@ use cellpos_plant::Model;
 use cellpos_plant::effects::Action;
 
 /// Narrows the controller's limits to what rig file and board allow, and the positions that MPC plans for to what the
-/// camera sees; tells the estimator how long a frame is exposed.
+/// camera sees; tells the estimator how long a frame is exposed and how often one comes.
 pub(crate) fn narrow(setup: &mut Prepared, file: &RigFile, rig: &Connected) {
     let board = rig.actuator.info();
     let own = setup.controller.limits;
@@ -18,7 +18,11 @@ pub(crate) fn narrow(setup: &mut Prepared, file: &RigFile, rig: &Connected) {
         setup::within(asked, [board.low_um, board.high_um, board.slew_um_per_s]);
     let exposure_ms = 1e3 * exposure_s(file, &setup.model);
     let estimator = &mut setup.controller.estimator;
-    if estimator.exposure_ms == 0.0 && exposure_ms <= file.timing.period_us * 1e-3 {
+    if estimator.ticks_per_fix == 1.0 {
+        estimator.ticks_per_fix = ticks_per_fix(file.timing.period_us, rig.source.info().rate_hz);
+    }
+    let apart_ms = file.timing.period_us * 1e-3 * estimator.ticks_per_fix;
+    if estimator.exposure_ms == 0.0 && exposure_ms <= apart_ms {
         estimator.exposure_ms = exposure_ms;
     }
     let [low_um, high_um] = rig.source.info().field_um;
@@ -27,6 +31,18 @@ pub(crate) fn narrow(setup: &mut Prepared, file: &RigFile, rig: &Connected) {
         let given = |view_um: Option<f64>| view_um.filter(|um| um.is_finite());
         mpc.view_low_um = given(Some(mpc.view_low_um.map_or(low_um, |um| um.max(low_um))));
         mpc.view_high_um = given(Some(mpc.view_high_um.map_or(high_um, |um| um.min(high_um))));
+    }
+}
+
+/// Ticks from frame to frame of a camera that is slower than the loop, 1 where it is about as fast.
+fn ticks_per_fix(period_us: f64, rate_hz: f64) -> f64 {
+    /// A camera that is off by less is meant to be as fast.
+    const AS_FAST: f64 = 1.25;
+    let ticks = 1e6 / (period_us * rate_hz);
+    if ticks.is_finite() && ticks >= AS_FAST {
+        ticks.min(16.0)
+    } else {
+        1.0
     }
 }
 

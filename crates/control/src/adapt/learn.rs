@@ -40,8 +40,8 @@ impl Adapter {
     /// One tick of the regression.
     pub(super) fn learn(&self, state: &mut AdaptState, fix: Option<Fix>) -> Lesson {
         let (usable, noise_um2) = (self.usable(), self.left_um2(state));
-        let (delays, exposure) = ((self.delay_samples, self.interval), self.exposure_ticks);
-        let at = |motion: &Motion| motion.at(&fix?, delays, exposure, &usable);
+        let (delay, exposure) = (self.delay_samples, self.exposure_ticks);
+        let at = |motion: &Motion| motion.at(&fix?, delay, exposure, &usable);
         state.since_fix += 1.0;
         let Some((fix, at_um)) = fix.zip(at(&state.model)) else {
             state.silent = state.silent.saturating_add(1);
@@ -54,9 +54,8 @@ impl Adapter {
         state.silent = 0;
         // From exposure to exposure, whenever the ticks were that used them.
         let ago = fix.age as f64 + fix.offset;
-        let correction = self
-            .whitener
-            .correction(state.covariance, state.since_fix - ago);
+        let apart = state.since_fix - ago;
+        let correction = (self.whitener).correction(state.covariance, apart, fix.variance_um2);
         let instrument = state.probe.instrument().and_then(|motion| {
             let at_um = at(motion)?;
             let innovations = motion.innovations(&correction, &at_um);

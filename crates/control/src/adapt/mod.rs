@@ -71,7 +71,7 @@ const DRIVEN: f64 = 0.3;
 const DRIVEN_TICKS: f64 = 200.0;
 /// Ticks after a new line in which nothing is told.
 const NEW_LINE_TICKS: u16 = 1500;
-/// Doubt of a delay, times from fix to fix, where commands come in bursts.
+/// Doubt of a delay, samples, where commands come in bursts between two fixes: from one burst to the next it makes no difference.
 const BURSTS: f64 = 0.25;
 /// Doubt of a gain (of its logarithm) that counts in these ticks.
 const NEW_LINE_SD: f64 = 0.1;
@@ -198,7 +198,7 @@ impl Adapter {
         let moves = model.feedthrough + model.fast_gain_per_s() * ts;
         Ok(Self {
             probe_um: (whitener.noise_um2.sqrt() / moves).clamp(-0.5, 0.5),
-            estimators: DELAYS.map(|extra| delayed(config, model, extra * config.ticks_per_fix)),
+            estimators: DELAYS.map(|extra| delayed(config, model, extra)),
             nominal: Estimator::new(config, model)?,
             whitener,
             bank: Bank::default(),
@@ -239,11 +239,6 @@ impl Adapter {
         }
     }
 
-    /// Samples of delay beyond the design's.
-    fn extra_samples(&self, member: usize) -> f64 {
-        DELAYS[member] * self.interval
-    }
-
     fn usable(&self) -> [bool; MEMBERS] {
         self.estimators.map(|one| one.is_some())
     }
@@ -261,7 +256,7 @@ impl Adapter {
         let design = self.delay_samples + 0.5;
         Tuning {
             gain: state.force.log_gain.exp(),
-            delay: (design + self.extra_samples(state.force.member)) / design,
+            delay: (design + DELAYS[state.force.member]) / design,
         }
     }
 
@@ -281,19 +276,28 @@ impl Adapter {
         state.probe.command_um
     }
 
+    /// How far the test has moved the bead from where it is to be, um. A loop as fast as its camera is left to undo it: the frames see
+    /// it before. One that is faster would have undone it before the next frame, and is not told of it.
+    pub fn moved_um(&self, state: &AdaptState) -> f64 {
+        if self.is_faster() {
+            state.probe.moved_um() * state.force.log_gain.exp()
+        } else {
+            0.0
+        }
+    }
+
     /// Where it stands.
     pub fn adaptation(&self, state: &AdaptState) -> Adaptation {
         let found = state.found;
         Adaptation {
             gain: state.force.log_gain.exp(),
-            delay_samples: self.extra_samples(state.force.member),
+            delay_samples: DELAYS[state.force.member],
             gain_estimate: found
                 .and_then(|f| state.probe.stated(f.log_gain(), f.log_sd()))
                 .map(|(log_gain, sd)| [log_gain.exp(), sd * log_gain.exp()]),
             delay_estimate_samples: found.map(|f| {
-                // A loop that is faster than its camera moves in bursts: from one to the next the delay makes no difference.
                 let least = if self.is_faster() { BURSTS } else { 0.0 };
-                [f.delay, f.delay_sd.max(least)].map(|delay| delay * self.interval)
+                [f.delay, f.delay_sd.max(least)]
             }),
             mode: match (state.force.mode, state.probe.standing) {
                 (AdaptMode::Agreeing | AdaptMode::Moving, Standing::Tested) => AdaptMode::Testing,
@@ -397,10 +401,10 @@ impl Adapter {
         self.interval >= 2.0
     }
 
-    /// Ticks that a move of the test waits. A loop that is faster than its camera has all but undone it a few ticks later, so it is
-    /// made before a frame is exposed, with a tick to spare for a delay that is not quite known.
+    /// Ticks that a move of the test waits: in a loop that is faster than its camera it is over before a frame is exposed, with a tick
+    /// to spare for a delay that is not quite known.
     fn until_before_exposure(&self, state: &AdaptState) -> u32 {
-        let delay = self.delay_samples + self.extra_samples(state.force.member);
+        let delay = self.delay_samples + DELAYS[state.force.member];
         // The exposures to come, in ticks from now; what is decided now is given in the next tick at the earliest.
         let first = (-delay - state.since_fix + state.since_fix.floor()).rem_euclid(self.interval);
         let soonest = if self.is_faster() { 3.0 } else { 2.0 };

@@ -46,6 +46,11 @@ impl Motion {
         self.past_um[0].is_finite()
     }
 
+    /// Position now, um.
+    pub fn now_um(&self) -> f64 {
+        self.past_um[0]
+    }
+
     /// Position so many ticks ago, um: between ticks the bead jumps by the direct feedthrough and then moves evenly.
     fn past(&self, ago: f64) -> Option<f64> {
         let newer = ago.max(0.0).floor();
@@ -54,19 +59,18 @@ impl Motion {
         Some(a + part * (b + self.jumps_um.get(newer)? - a))
     }
 
-    /// Positions at the exposure of a fix, for each delay beside `delay`, ticks, where the members are `apart`; `None` where one that
-    /// is open is not known.
+    /// Positions at the exposure of a fix, for each delay beside `delay`, ticks; `None` where one that is open is not known.
     pub fn at(
         &self,
         fix: &Fix,
-        (delay, apart): (f64, f64),
+        delay: f64,
         exposure: f64,
         open: &[bool; MEMBERS],
     ) -> Option<[f64; MEMBERS]> {
         let ago = delay + fix.age as f64 + fix.offset;
         let mut at_um = [0.0; MEMBERS];
         for ((at, extra), open) in at_um.iter_mut().zip(DELAYS).zip(open) {
-            match exposure::mean(ago + extra * apart, exposure, |ago| self.past(ago)) {
+            match exposure::mean(ago + extra, exposure, |ago| self.past(ago)) {
                 Some(um) => *at = um,
                 None if *open => return None,
                 None => {}

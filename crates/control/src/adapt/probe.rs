@@ -30,6 +30,8 @@ const NEAR: f64 = 0.08;
 /// What a test that is no better than this says lets the tuning go further, to so many standard uncertainties from it.
 const LEAST_SD: f64 = 0.4;
 const LEAST_SDS: f64 = 2.5;
+/// Ticks of a test before it says anything.
+const FEW_TICKS: u32 = 50;
 /// Ticks of a test before anything is decided, and doubt of an estimate that is worth a decision.
 const LEAST_TICKS: u32 = 500;
 const WORTH_SD: f64 = 0.06;
@@ -112,7 +114,7 @@ pub(super) struct Trial {
     pub instrument_um: [f64; MEMBERS],
     /// Estimated delay beyond the design's, samples.
     pub delay: f64,
-    /// A move may fall into two samples: it takes a whole one.
+    /// A move may fall into two samples: it takes a whole one, and the loop undoes it.
     pub spreads: bool,
     pub noise_um2: f64,
 }
@@ -151,6 +153,15 @@ impl Probe {
     /// The instrument, where the bead is being moved.
     pub fn instrument(&mut self) -> Option<&mut Motion> {
         self.is_on().then_some(&mut self.instrument)
+    }
+
+    /// How far the test has moved the bead, um, where the gain is the model's.
+    pub fn moved_um(&self) -> f64 {
+        if self.is_on() {
+            self.instrument.now_um()
+        } else {
+            0.0
+        }
     }
 
     /// Whether the estimate is off what was confirmed.
@@ -280,7 +291,9 @@ impl Probe {
                 self.begin_anew();
             }
             Standing::Corrected => {
-                let still = |found: &(f64, f64)| found.1 < CORRECTS_SD && self.shift < SHIFT;
+                let long = self.ticks > LEAST_TICKS;
+                let still =
+                    |found: &(f64, f64)| long && found.1 < CORRECTS_SD && self.shift < SHIFT;
                 if let Some(found) = self.found().filter(still) {
                     self.correction = found;
                     if found.1 < DECIDE_SD && found.0.abs() < OVER {
@@ -293,7 +306,9 @@ impl Probe {
 
     /// By how much the estimate is to be put right, and the standard uncertainty of that; logarithms.
     fn found(&self) -> Option<(f64, f64)> {
-        let usable = self.with_motion > 0.0
+        // Of a few ticks nothing is left beside the fit, and nothing is known of how well it is.
+        let usable = self.ticks > FEW_TICKS
+            && self.with_motion > 0.0
             && self.with_model > 0.0
             && self.with_fixes > 0.02 * self.with_model;
         usable.then(|| {
@@ -357,7 +372,13 @@ impl Probe {
         } = *trial;
         // What moves the bead falls into this sample and the next, wherever in between the delay is: the sum of two ticks holds
         // all of it, and a delay that is off by a part of a sample is not taken for a gain.
-        let begins = (NOMINAL as f64 + 2.0 * (delay - EARLIER).floor()).max(0.0) as usize;
+        let begins = if spreads {
+            NOMINAL as f64 + 2.0 * (delay - EARLIER).floor()
+        } else {
+            // Over well before the exposure, wherever in between it was.
+            NOMINAL as f64
+        };
+        let begins = begins.max(0.0) as usize;
         let now_um = trial.instrument_um[begins.min(MEMBERS - 1)];
         if begins != self.begins {
             self.begins = begins;

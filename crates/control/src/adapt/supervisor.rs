@@ -69,10 +69,9 @@ pub struct AdaptNews {
 }
 
 impl AdaptNews {
-    /// With delays and times in ticks, of which there are so many from fix to fix.
+    /// With times in ticks, of which there are so many from fix to fix.
     pub(super) fn in_ticks(self, interval: f64) -> Self {
         Self {
-            delay_samples: self.delay_samples.map(|delay| delay * interval),
             ticks: (self.ticks as f64 * interval).round() as u64,
             ..self
         }

@@ -10,10 +10,10 @@ const APART: (f64, f64) = (0.25, 1000.0);
 /// Kalman filter of a random walk whose drift wanders as well, for fixes at any distance from each other.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Whitener {
-    /// Variances per tick of the walk and of the drift's change, and that of a fix, um^2.
+    /// Variances per tick of the walk and of the drift's change, and the least of a fix, um^2.
     walk_um2: f64,
     drift_um2: f64,
-    fix_um2: f64,
+    least_um2: f64,
     /// Covariance after a fix, where all have come as they should: position, both, drift; um^2.
     settled: Covariance,
     /// Variance of what it makes of the wandering where fixes come as they should, um^2.
@@ -31,7 +31,8 @@ pub(super) struct Correction {
     gain: [f64; 2],
     /// Covariance after it.
     pub after: Covariance,
-    /// What makes the variance of an innovation that of [`Whitener::noise_um2`]: less than 1 after a gap.
+    /// What makes the variance of an innovation that of [`Whitener::noise_um2`]: less than 1 after a gap, more where a fix is better
+    /// than was assumed.
     pub weight: f64,
 }
 
@@ -55,14 +56,15 @@ impl Whitener {
         let q = [walk_um2 * ticks, drift_um2 * ticks];
         let q = DMatrix::from_diagonal(&DVector::from_row_slice(&q));
         // Exact fixes leave no equation to solve.
-        let fix_um2 = fix_um2.max(1e-3 * walk_um2 * ticks);
+        let least_um2 = 1e-3 * walk_um2 * ticks;
+        let fix_um2 = fix_um2.max(least_um2);
         let prior = solve_dare(&a.transpose(), &(&seen * seen.transpose() / fix_um2), &q)?;
         let prior = [prior[(0, 0)], prior[(0, 1)], prior[(1, 1)]];
         let (_, settled) = corrected(prior, fix_um2);
         Ok(Self {
             walk_um2,
             drift_um2,
-            fix_um2,
+            least_um2,
             settled,
             noise_um2: prior[0] + fix_um2,
         })
@@ -73,20 +75,21 @@ impl Whitener {
         self.settled
     }
 
-    /// What a fix so many ticks after the one before does.
-    pub fn correction(&self, [pp, pd, dd]: Covariance, ticks: f64) -> Correction {
+    /// What a fix of this variance, um^2, does so many ticks after the one before.
+    pub fn correction(&self, [pp, pd, dd]: Covariance, ticks: f64, fix_um2: f64) -> Correction {
+        let fix_um2 = fix_um2.max(self.least_um2);
         let ticks = ticks.clamp(APART.0, APART.1);
         let prior = [
             pp + ticks * (2.0 * pd + ticks * dd) + self.walk_um2 * ticks,
             pd + ticks * dd,
             dd + self.drift_um2 * ticks,
         ];
-        let (gain, after) = corrected(prior, self.fix_um2);
+        let (gain, after) = corrected(prior, fix_um2);
         Correction {
             ticks,
             gain,
             after,
-            weight: (self.noise_um2 / (prior[0] + self.fix_um2)).sqrt(),
+            weight: (self.noise_um2 / (prior[0] + fix_um2)).sqrt(),
         }
     }
 
@@ -132,13 +135,13 @@ mod tests {
                     .zip(b)
                     .all(|(a, b)| (a - b).abs() < 1e-9 * b.abs().max(1e-9))
             };
-            let one = whitener.correction(whitener.settled(), ticks);
+            let one = whitener.correction(whitener.settled(), ticks, 4e-4);
             assert!(near(one.after, whitener.settled()), "{one:?}");
             assert!((one.weight - 1.0).abs() < 1e-9, "{one:?}");
-            let mut gap = whitener.correction(whitener.settled(), 3.0 * ticks);
+            let mut gap = whitener.correction(whitener.settled(), 3.0 * ticks, 4e-4);
             assert!(gap.weight < 0.8, "{gap:?}");
             for _ in 0..20_000 {
-                gap = whitener.correction(gap.after, ticks);
+                gap = whitener.correction(gap.after, ticks, 4e-4);
             }
             assert!(near(gap.after, whitener.settled()), "{gap:?}");
         }

@@ -1,12 +1,12 @@
 //! Forgetful sums of the regression of whitened positions on whitened model positions, one member for each delay tried.
 
-/// Delays tried beside the design's, in times from fix to fix: samples, where the camera is as fast as the loop.
+/// Delays tried beside the design's, samples.
 pub const DELAYS: [f64; MEMBERS] = [-1.0, -0.5, 0.0, 0.5, 1.0, 1.5];
 /// How many.
 pub const MEMBERS: usize = 6;
 /// The design's own among them.
 pub const NOMINAL: usize = 2;
-/// From one delay to the next.
+/// Samples from one delay to the next.
 const APART: f64 = 0.5;
 
 /// Part of the gain that no measurement decides: a real plant is no linear one.
@@ -43,7 +43,7 @@ pub(super) struct Finding {
     /// Gain over the model's, and its standard uncertainty.
     pub gain: f64,
     pub gain_sd: f64,
-    /// Delay beyond the design's, in the unit of [`DELAYS`], and its standard uncertainty.
+    /// Delay beyond the design's, samples, and its standard uncertainty.
     pub delay: f64,
     pub delay_sd: f64,
     /// The member that fits best.

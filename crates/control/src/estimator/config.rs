@@ -31,7 +31,7 @@ pub struct EstimatorConfig {
     /// that trusts the model takes away (loop transfer recovery, Doyle and Stein 1979). The gate has the variance as it is.
     #[serde(alias = "recovery")]
     pub ltr_noise_scaling: f64,
-    /// Exposure of a frame, ms; at most a tick. A fix is the mean over it of a path that bends where a command takes effect.
+    /// Exposure of a frame, ms; at most the time from fix to fix. A fix is the mean over it of a path that bends where a command takes effect.
     pub exposure_ms: f64,
     /// Ticks from one fix to the next, 1 to 16: above 1 where the loop is faster than its camera. Ticks between fixes are run on
     /// prediction and are no loss.
@@ -141,8 +141,8 @@ impl EstimatorConfig {
             "exposure_ms",
             "ms",
             c.exposure_ms,
-            (0.0..=1e3 * sample_time_s).contains(&c.exposure_ms),
-            "0 to a tick",
+            (0.0..=1e3 * sample_time_s * c.ticks_per_fix.max(1.0) + 1e-9).contains(&c.exposure_ms),
+            "0 to the time from fix to fix",
         )?;
         check(
             "ticks_per_fix",

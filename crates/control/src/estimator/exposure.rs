@@ -1,12 +1,34 @@
 //! What a fix shows of a path that bends while the frame is exposed.
 
-use super::Estimator;
+use super::{Estimator, EstimatorState};
 
 impl Estimator {
+    /// Mean over an exposure less the position at its middle, um. The middle is `fraction` of a tick after the time at which the
+    /// command `back` ticks ago took effect.
+    pub(super) fn exposed_um(&self, state: &EstimatorState, fraction: f64, back: usize) -> f64 {
+        let half = self.half_exposure();
+        if state.stuck || half <= 0.0 {
+            return 0.0;
+        }
+        // Every command that took effect while the frame was exposed.
+        let reach = (half + 1.0) as usize;
+        let first = back.saturating_sub(reach).max(1);
+        (first..=back + reach)
+            .map(|ago| {
+                let bend_um = Self::command(state, ago) - Self::command(state, ago + 1);
+                self.bent_um(fraction + ago as f64 - back as f64, bend_um)
+            })
+            .sum()
+    }
+
+    fn half_exposure(&self) -> f64 {
+        0.5e-3 * self.config.exposure_ms / self.model.sample_time_s
+    }
+
     /// Mean over an exposure of what a change of the command by `bend_um` does to the path, less what it has done at the
     /// middle, um. The change takes effect `after` ticks before the middle.
-    pub(super) fn exposed_um(&self, after: f64, bend_um: f64) -> f64 {
-        let half = 0.5e-3 * self.config.exposure_ms / self.model.sample_time_s;
+    fn bent_um(&self, after: f64, bend_um: f64) -> f64 {
+        let half = self.half_exposure();
         if half <= after.abs() {
             return 0.0;
         }
@@ -51,7 +73,7 @@ mod tests {
                     .map(|x| path(x * exposure_ms))
                     .sum::<f64>()
                     / f64::from(points);
-                let found = estimator.exposed_um(after, 2.0);
+                let found = estimator.bent_um(after, 2.0);
                 let expected = mean - path(0.0);
                 assert!(
                     (found - expected).abs() < 1e-5,

@@ -41,7 +41,7 @@ pub struct LearnConfig {
     pub settle_ticks: u32,
     /// Ticks from one fix to the next, 1 to 16; see [`crate::EstimatorConfig::ticks_per_fix`].
     pub ticks_per_fix: f64,
-    /// Exposure of a frame, s; at most 4 ticks. A fix is the mean over it of a path whose velocity changes with each
+    /// Exposure of a frame, s; at most 4 ticks, or the time from fix to fix where that is longer. A fix is the mean over it of a path whose velocity changes with each
     /// command, and is compared with the mean of the reference's path: at 300 Hz the two differ from the positions at the
     /// middle by a fifth of the amplitude.
     pub exposure_s: f64,
@@ -85,8 +85,15 @@ impl LearnConfig {
         check("ticks_per_fix", "", apart, known, "1 to 16")?;
         let growth = self.retreat_growth;
         check("retreat_growth", "", growth, growth > 1.0, "above 1")?;
-        let open = (0.0..=4.0 * sample_time_s).contains(&self.exposure_s);
-        check("exposure_s", "s", self.exposure_s, open, "0 to 4 ticks")
+        let most_s = self.ticks_per_fix.max(4.0) * sample_time_s + 1e-12;
+        let open = (0.0..=most_s).contains(&self.exposure_s);
+        check(
+            "exposure_s",
+            "s",
+            self.exposure_s,
+            open,
+            "0 to 4 ticks, or to the time from fix to fix",
+        )
     }
 }
 

@@ -10,13 +10,26 @@ use cellpos_rig::ActuatorFault;
 
 impl<R: ReferenceGenerator> Core<R> {
     /// Flags and events that follow from the controller's output.
-    pub(super) fn account(&mut self, output: &LoopOutput, tick: &mut Tick) {
+    pub(super) fn account(&mut self, input: &TickInput, output: &LoopOutput, tick: &mut Tick) {
         let flags = output.flags;
+        self.state.blind = if flags.coasting {
+            let steps = u32::try_from(tick.steps).unwrap_or(u32::MAX);
+            self.state.blind.saturating_add(steps)
+        } else {
+            0
+        };
+        self.state.missing = self.state.blind.saturating_sub(self.planned_gap);
+        // A frame that came and was of no use is a loss, whatever is planned.
+        let between = flags.coasting
+            && self.state.missing == 0
+            && input.measurement.is_none()
+            && !tick.flags.has(TickFlags::STALE);
         for (set, mask) in [
             (flags.range_limited, TickFlags::RANGE_LIMITED),
             (flags.slew_limited, TickFlags::SLEW_LIMITED),
             (flags.not_finite, TickFlags::NOT_FINITE),
-            (flags.coasting, TickFlags::COASTING),
+            (flags.coasting && !between, TickFlags::COASTING),
+            (between, TickFlags::BETWEEN),
             (flags.gated, TickFlags::GATED),
             (flags.stuck, TickFlags::STUCK),
         ] {
@@ -24,12 +37,6 @@ impl<R: ReferenceGenerator> Core<R> {
                 tick.flags.set(mask);
             }
         }
-        self.state.missing = if flags.coasting {
-            let steps = u32::try_from(tick.steps).unwrap_or(u32::MAX);
-            self.state.missing.saturating_add(steps)
-        } else {
-            0
-        };
         if self.state.life != Life::Running {
             return;
         }

@@ -69,7 +69,7 @@ impl<R: ReferenceGenerator> Core<R> {
         self.tell_frames(&input.frames, tick);
         let slow = EventKind::VisionSlowStarted {
             vision_ms: f64::from(input.slow_vision_ns.unwrap_or(0)) * 1e-6,
-            period_ms: self.timing.period_us * 1e-3,
+            period_ms: self.frame_period_ns() as f64 * 1e-6,
         };
         tick.span(
             &mut self.state.vision_slow_since_ns,
@@ -77,7 +77,11 @@ impl<R: ReferenceGenerator> Core<R> {
             slow,
             |lasted_ms| EventKind::VisionSlowEnded { lasted_ms },
         );
-        self.state.frames_silent = input.frames.arrived == 0;
+        self.state.frameless = if input.frames.arrived == 0 {
+            self.state.frameless.saturating_add(1)
+        } else {
+            0
+        };
         let Some(m) = &input.measurement else {
             tick.flags.set(TickFlags::TIMER);
             if input.frames.refused() > 0 && input.frames.backlog == 0 {

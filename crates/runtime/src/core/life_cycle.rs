@@ -53,13 +53,13 @@ impl<R: ReferenceGenerator> Core<R> {
                         tick.event(EventKind::Running);
                         self.state.life = Life::Running;
                         self.state.running_since = tick.index;
-                        self.state.missing = 0;
+                        (self.state.blind, self.state.missing) = (0, 0);
                     }
                 },
             }
         }
         if self.state.life == Life::Running {
-            let cause = if self.state.frames_silent {
+            let cause = if self.state.frameless > self.planned_gap {
                 (FreezeReason::CameraStalled, SafeReason::CameraLost)
             } else {
                 (FreezeReason::BeadLost, SafeReason::BeadLost)

@@ -22,6 +22,8 @@ pub(super) struct Open {
     /// n, sums of u, v, u u, u v, of the speed v against the displacement u away from neutral.
     gain: [f64; 5],
     far_um: f64,
+    /// The last position was at the far end.
+    dwells: bool,
     lengths_um: Series,
     areas_um2: Series,
     /// Ticks whose command was late or was not the controller's own, and ticks whose position was refused.
@@ -61,6 +63,7 @@ impl Open {
             } else {
                 low
             },
+            dwells: false,
             lengths_um: Series::default(),
             areas_um2: Series::default(),
             late: 0,
@@ -88,6 +91,9 @@ impl Open {
     ) {
         self.count(record, place);
         let good = place.fresh && record.verdict == 0 && record.measured_um.is_finite();
+        if record.flags.has(TickFlags::BETWEEN) && self.dwells {
+            self.row.dwell_s += period_s;
+        }
         if place.stage == Stage::Paused {
             // Time goes on and the cycle does not.
             self.last_seen = None;
@@ -99,7 +105,8 @@ impl Open {
     fn count(&mut self, record: &TickRecord, place: &Place) {
         let row = &mut self.row;
         let has = |mask| record.flags.has(mask);
-        let lost = has(TickFlags::LOST) || !place.fresh;
+        // Between two frames of a slower camera nothing was to come.
+        let lost = has(TickFlags::LOST) || !(place.fresh || has(TickFlags::BETWEEN));
         let limited = has(TickFlags::RANGE_LIMITED) || has(TickFlags::SLEW_LIMITED);
         let late = has(TickFlags::LATE) || has(TickFlags::ACTUATOR_RING_FULL);
         self.late += u64::from(late);
@@ -155,7 +162,9 @@ impl Open {
         if place.stage == Stage::Running {
             self.fit.add(phase, place.target_um, at_um);
         }
-        if self.row.stroke_um > 0.0 && (at_um - self.far_um).abs() < 0.2 * self.row.stroke_um {
+        self.dwells =
+            self.row.stroke_um > 0.0 && (at_um - self.far_um).abs() < 0.2 * self.row.stroke_um;
+        if self.dwells {
             self.row.dwell_s += period_s;
         }
         if let (Some((then_ns, then_um)), Some(u)) = (self.last_seen, flow_um) {

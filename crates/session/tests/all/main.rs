@@ -1,6 +1,7 @@
 //! Sessions with a rig.
 
 mod between_runs;
+mod multi_rate;
 mod rig_keys;
 mod rig_schema;
 mod rig_walk;
