@@ -6,7 +6,7 @@ use super::probe::Trial;
 use super::spectrum::Lineup;
 use super::whiten::Whitener;
 use super::window::{DELAYS, MEMBERS, Window};
-use super::{AdaptState, Adapter, DRIVEN, FAST, FAST_TICKS, SLOW, SLOW_TICKS};
+use super::{AdaptState, Adapter, DRIVEN, FAST, FAST_TICKS, Lesson, SLOW, SLOW_TICKS};
 use crate::estimator::Fix;
 
 /// A fix so many standard deviations off, over twice what the model moved, is no fix of this bead.
@@ -24,17 +24,6 @@ const USUAL_TICKS: f64 = 20_000.0;
 const STILL: f64 = 0.65;
 /// Fixes missing in a row over which a line is followed.
 const LONGEST_GAP: f64 = 64.0;
-
-/// What became of a tick.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Lesson {
-    /// Something was learned.
-    Learned,
-    /// There was nothing to learn from, or it was of no use.
-    Nothing,
-    /// No fix was to come.
-    Between,
-}
 
 impl Adapter {
     /// One tick of the regression.

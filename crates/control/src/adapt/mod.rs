@@ -32,7 +32,6 @@ mod window;
 use crate::error::BuildError;
 use crate::estimator::{Estimator, EstimatorConfig, Fix};
 use crate::loop_model::LoopModel;
-use learn::Lesson;
 use lines::Lines;
 use motion::Motion;
 use probe::{Probe, Standing};
@@ -181,6 +180,17 @@ pub(crate) struct Told {
     pub free: bool,
     /// Where the bead is to be, um.
     pub reference_um: f64,
+}
+
+/// What became of a tick.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Lesson {
+    /// Something was learned.
+    Learned,
+    /// There was nothing to learn from, or it was of no use.
+    Nothing,
+    /// No fix was to come.
+    Between,
 }
 
 impl Adapter {
