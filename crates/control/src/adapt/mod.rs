@@ -384,7 +384,12 @@ impl Adapter {
             let driven = state.driven_um2 > DRIVEN * self.whitener.noise_um2;
             let found = found.map(|found| state.probe.judged(found, driven));
             state.found = found;
-            if (state.force).follow(found.as_ref(), &self.usable(), state.probe.least()) {
+            let range = [state.probe.least(), state.probe.most()];
+            if found.is_none() && state.since_line <= NEW_LINE_TICKS {
+                state.probe.above = 0;
+                state.force.back_to(state.probe.confirmed());
+            }
+            if (state.force).follow(found.as_ref(), &self.usable(), range) {
                 state.found = None;
                 state.slow = Window::new(FAST, SLOW, SLOW_TICKS);
                 state.fast = Window::new(FAST, FAST, FAST_TICKS);

@@ -37,6 +37,11 @@ const LEAST_TICKS: u32 = 500;
 const WORTH_SD: f64 = 0.06;
 /// How far below what was confirmed the tuning may go meanwhile (Ms is 2.0 where the estimate was wrong).
 const BOLD: f64 = 0.28;
+/// How far above it (1.4 times), and the gain (1.3, as a logarithm) that it may go to in any case.
+const CAUTIOUS: f64 = 0.34;
+const ENOUGH: f64 = 0.26;
+/// Ticks after which it goes further all the same: a line is found in less.
+const PATIENCE_TICKS: u16 = 1500;
 /// How far an estimate may leave its mean over the test (of logarithms), where it is less than the uncertainty of that, for the
 /// test to say anything of it.
 const SHIFT: f64 = 0.05;
@@ -77,6 +82,8 @@ pub(super) struct Probe {
     /// Doubt of it, of the logarithm.
     doubt: f64,
     away: u16,
+    /// Ticks in a row in which the estimate was above [`Probe::enough`].
+    pub above: u16,
     /// By how much the logarithm of the estimate is put right, and how well that is known.
     correction: (f64, f64),
     instrument: Motion,
@@ -126,6 +133,7 @@ impl Probe {
             confirmed: 0.0,
             doubt: CONFIRMED_SD,
             away: 0,
+            above: 0,
             correction: (0.0, 0.0),
             instrument: Motion::start(0.0),
             command_um: 0.0,
@@ -206,6 +214,35 @@ impl Probe {
         }
     }
 
+    /// The most that it may go to. What shakes the bead all of a sudden and a plant of more gain look alike at first: a plant of twice the
+    /// design's gain is held well enough from here, and the rest of the way has time until the test has told, or until a line would
+    /// have been found.
+    pub fn most(&self) -> f64 {
+        let most = self.enough();
+        if self.above >= PATIENCE_TICKS {
+            return f64::INFINITY;
+        }
+        match self.standing {
+            Standing::Confirmed => most,
+            Standing::Tested => {
+                let least = |(alone, sd): (f64, f64)| alone - LEAST_SDS * sd;
+                let long = self.ticks > LEAST_TICKS;
+                let known = (self.alone()).filter(|found| long && found.1 < LEAST_SD);
+                known.map_or(most, |found| most.max(least(found)))
+            }
+            Standing::Corrected => f64::INFINITY,
+        }
+    }
+
+    fn enough(&self) -> f64 {
+        (self.confirmed + CAUTIOUS).max(ENOUGH)
+    }
+
+    /// Logarithm of the gain that was confirmed.
+    pub fn confirmed(&self) -> f64 {
+        self.confirmed
+    }
+
     /// What has been found so far does not count: the estimate begins anew.
     pub fn begin_anew(&mut self) {
         self.ticks = 0;
@@ -242,6 +279,11 @@ impl Probe {
     /// An estimate as its test leaves it; `driven` where the reference moves the bead, which confirms by itself.
     pub fn judged(&mut self, found: Finding, driven: bool) -> Finding {
         let log_gain = found.log_gain();
+        self.above = if log_gain > self.enough() {
+            self.above.saturating_add(1)
+        } else {
+            0
+        };
         self.judge(log_gain, found.log_sd(), driven);
         let (right, sd) = self.corrected(log_gain, found.log_sd());
         if right == log_gain {
@@ -275,6 +317,7 @@ impl Probe {
                         standing: Standing::Tested,
                         confirmed: self.confirmed,
                         doubt: self.doubt,
+                        above: self.above,
                         bits: self.bits,
                         ..Self::new()
                     };

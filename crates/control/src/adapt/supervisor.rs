@@ -44,6 +44,8 @@ const DELAY_OFF: f64 = 0.3;
 const DELAY_SURE: f64 = 20.0;
 /// Ticks between two changes of the delay, upwards and downwards.
 const DELAY_TICKS: [u16; 2] = [2, 50];
+/// Ticks for which less delay must have been better: what begins to shake the bead is a line after less.
+const LESS_TICKS: u16 = 400;
 /// Ticks that a retreat lasts at least.
 const RETREAT_TICKS: u16 = 1000;
 /// A retreat is told of after so many.
@@ -86,6 +88,8 @@ pub(super) struct Force {
     pub mode: AdaptMode,
     moving: bool,
     since_delay: u16,
+    /// Ticks in a row in which less delay was surely better.
+    less: u16,
     retreat: u16,
     told: (f64, usize),
     /// Ticks since what is in force left what was told; ticks without motion.
@@ -104,6 +108,7 @@ impl Default for Force {
             mode: AdaptMode::Waiting,
             moving: false,
             since_delay: u16::MAX,
+            less: 0,
             retreat: 0,
             told: (0.0, NOMINAL),
             away: 0,
@@ -122,16 +127,17 @@ impl Force {
     }
 
     /// A tick in which the estimate may come into force. Whether it is one of doubt, in which what was found is worth nothing.
-    /// The logarithm of the gain goes no lower than `least`.
+    /// The logarithm of the gain goes no lower than `least` and no higher than `most`, unless it is there.
     pub fn follow(
         &mut self,
         found: Option<&Finding>,
         usable: &[bool; MEMBERS],
-        least: f64,
+        [least, most]: [f64; 2],
     ) -> bool {
         self.since_delay = self.since_delay.saturating_add(1);
         self.still = self.still.saturating_add(1);
         let Some(found) = found else {
+            self.less = 0;
             if self.mode != AdaptMode::Retreating {
                 self.mode = AdaptMode::Waiting;
             }
@@ -151,7 +157,7 @@ impl Force {
             return false;
         }
         self.retreat_told = false;
-        let aim = found.log_gain().max(least);
+        let aim = found.log_gain().min(most.max(self.log_gain)).max(least);
         let (off, sd) = (aim - self.log_gain, found.log_sd());
         let (smallest, sds) = if self.moving { ARRIVED } else { SET_OUT };
         self.moving = off.abs() > smallest.max(sds * sd);
@@ -180,6 +186,7 @@ impl Force {
     fn follow_delay(&mut self, found: &Finding, usable: &[bool; MEMBERS]) -> bool {
         let off = found.delay - DELAYS[self.member];
         if off.abs() < DELAY_OFF {
+            self.less = 0;
             return false;
         }
         let next = if off > 0.0 {
@@ -189,7 +196,13 @@ impl Force {
         };
         let open = usable.get(next).copied().unwrap_or(false);
         let surely = open && found.worse[self.member] - found.worse[next] > DELAY_SURE;
-        if !surely || self.since_delay < DELAY_TICKS[usize::from(off < 0.0)] {
+        self.less = if surely && off < 0.0 {
+            self.less.saturating_add(1)
+        } else {
+            0
+        };
+        let bold = off < 0.0 && self.less < LESS_TICKS;
+        if bold || !surely || self.since_delay < DELAY_TICKS[usize::from(off < 0.0)] {
             return false;
         }
         self.member = next;
@@ -198,14 +211,25 @@ impl Force {
         true
     }
 
+    /// A tick in which nothing is known any more: a step of the way back to a gain (its logarithm) that was, and to the delay last
+    /// told of.
+    pub fn back_to(&mut self, log_gain: f64) {
+        self.go(log_gain - self.log_gain);
+        self.step_delay(self.told.1);
+    }
+
     /// A step of the way back to the design.
     fn retreat_step(&mut self) {
         self.mode = AdaptMode::Retreating;
         self.moving = false;
         self.retreat = self.retreat.saturating_sub(1);
         self.go(-self.log_gain);
-        if self.member != NOMINAL && self.since_delay >= DELAY_TICKS[1] {
-            self.member = if self.member > NOMINAL {
+        self.step_delay(NOMINAL);
+    }
+
+    fn step_delay(&mut self, to: usize) {
+        if self.member != to && self.since_delay >= DELAY_TICKS[1] {
+            self.member = if self.member > to {
                 self.member - 1
             } else {
                 self.member + 1

@@ -214,3 +214,49 @@ fn noise_that_is_stated_wrong_is_not_stated_as_a_gain() {
         assert!(held.stated * 2 > held.asked && held.ms <= 2.0);
     }
 }
+
+/// Strong lines: a pump that is switched on.
+const STRONG: [&[(f64, f64)]; 8] = [
+    &[(20.0, 1.0)],
+    &[(50.0, 1.0)],
+    &[(100.0, 0.3)],
+    &[(100.0, 1.0)],
+    &[(150.0, 0.5)],
+    &[(200.0, 0.3)],
+    &[(200.0, 1.0)],
+    &[(300.0, 0.3)],
+];
+
+#[test]
+fn a_strong_line_that_starts_takes_the_tuning_a_little_way_and_not_for_long() {
+    for lines in STRONG {
+        let mut held = Held::new(ControllerConfig::Lqg(Lqg::default()), RigConfig::eq6(1));
+        held.hold(10, false, || 0.0);
+        let mut flow = tones(lines);
+        let (mut low, mut high, mut most_ms, mut off_ticks) = (f64::INFINITY, 0.0_f64, 0.0_f64, 0);
+        for k in 0..15_000 {
+            let now = held.tick(flow());
+            (low, high) = (low.min(now.gain), high.max(now.gain));
+            off_ticks += u32::from(now.gain.ln().abs() > 0.3);
+            if k % 100 == 0 {
+                let plant = Regime {
+                    gain: 1.0,
+                    late_ticks: 0,
+                    drift_s: 0.0,
+                };
+                let ms = effective_ms(&held.config, now.gain, now.delay_samples, plant);
+                most_ms = most_ms.max(ms);
+            }
+        }
+        let last = held.controller.adaptation().unwrap();
+        println!(
+            "{lines:?}: {low:.2} to {high:.2}, off for {off_ticks} ticks, Ms {most_ms:.2}; {last:?}"
+        );
+        assert!(held.events.is_empty(), "{lines:?}: {:?}", held.events);
+        assert!(low > 0.7 && high < 1.5, "{lines:?}: {low} to {high}");
+        assert!(off_ticks < 1500, "{lines:?}: {off_ticks} ticks");
+        // A delay that is too long costs as much as one that is not known, and leads away from the edge on a plant that has it.
+        assert!(most_ms < 2.3, "{lines:?}: Ms {most_ms}");
+        assert!(last.gain.ln().abs() < 0.25, "{lines:?}: {last:?}");
+    }
+}
