@@ -8,8 +8,10 @@ use arrow_array::types::Int8Type;
 use arrow_array::{ArrayRef, Float64Array, RecordBatch, StringArray, UInt64Array};
 use arrow_schema::{DataType, Field, Schema, SchemaRef};
 use parquet::arrow::ArrowWriter;
+use parquet::basic::Encoding;
 use parquet::file::properties::WriterProperties;
-use std::collections::HashMap;
+use parquet::schema::types::ColumnPath;
+use std::collections::{HashMap, HashSet};
 use std::io::BufWriter;
 use std::path::Path;
 use std::sync::Arc;
@@ -36,23 +38,50 @@ pub fn write_parquet(
     let columns = selection.columns(source)?;
     let schema = schema(&columns, source);
     whole(path, |file| {
-        let properties = WriterProperties::builder()
-            .set_max_row_group_row_count(Some(ROW_GROUP))
-            .build();
-        let out = BufWriter::new(file);
-        let mut writer = ArrowWriter::try_new(out, Arc::clone(&schema), Some(properties))
-            .map_err(|error| encode(&error))?;
+        let mut out = Some(BufWriter::new(file));
+        let mut writer: Option<ArrowWriter<_>> = None;
         let done = source.rows(selection, |rows| {
             let arrays = columns.iter().map(|column| array(column, rows)).collect();
             let batch = RecordBatch::try_new(Arc::clone(&schema), arrays);
-            batch
+            let batch = batch.map_err(|error| encode(&error))?;
+            if let Some(out) = out.take() {
+                let made = ArrowWriter::try_new(out, batch.schema(), Some(layout(&columns, rows)));
+                writer = Some(made.map_err(|error| encode(&error))?);
+            }
+            writer
+                .as_mut()
+                .map_or(Ok(()), |writer| writer.write(&batch))
                 .map_err(|error| encode(&error))
-                .and_then(|batch| writer.write(&batch).map_err(|error| encode(&error)))
         })?;
-        let out = writer.into_inner().map_err(|error| encode(&error))?;
-        out.into_inner().map_err(|error| encode(&error))?;
+        if let Some(writer) = writer {
+            let out = writer.into_inner().map_err(|error| encode(&error))?;
+            out.into_inner().map_err(|error| encode(&error))?;
+        }
         Ok(done)
     })
+}
+
+/// How the columns are laid out, by the first rows: a number that seldom comes twice gets no dictionary, which would hold every
+/// value beside its place; a whole number that always grows (a tick, a time) is kept as its steps.
+fn layout(columns: &[Column<'_>], rows: &[Row]) -> WriterProperties {
+    let mut layout = WriterProperties::builder().set_max_row_group_row_count(Some(ROW_GROUP));
+    for column in columns {
+        let bits: Vec<u64> = match column.value {
+            Value::Number(get) => rows.iter().map(|row| get(row).to_bits()).collect(),
+            Value::Whole(get) => rows.iter().map(get).collect(),
+            Value::Code(..) => continue,
+        };
+        let different = bits.iter().collect::<HashSet<_>>().len();
+        if 4 * different <= bits.len() {
+            continue;
+        }
+        let path = ColumnPath::from(column.name);
+        layout = layout.set_column_dictionary_enabled(path.clone(), false);
+        if matches!(column.value, Value::Whole(_)) {
+            layout = layout.set_column_encoding(path, Encoding::DELTA_BINARY_PACKED);
+        }
+    }
+    layout.build()
 }
 
 /// The columns with unit, meaning and words, and what the run is.
