@@ -71,4 +71,4 @@ echo "firmware mps2-an386: no panic path, no double precision, no allocator"
 
 rp2350
 cargo build --workspace --bins --locked
-CELLPOS_FIRMWARE="$firmware" cargo test --workspace --locked --test firmware_qemu -- --ignored --nocapture --test-threads 1
+CELLPOS_FIRMWARE="$firmware" cargo test --workspace --locked --test all firmware_qemu:: -- --ignored --nocapture --test-threads 1

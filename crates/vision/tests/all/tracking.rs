@@ -81,6 +81,18 @@ struct Encounters {
     worst_px: f64,
 }
 
+impl Encounters {
+    fn with(self, more: Self) -> Self {
+        Self {
+            kept: self.kept + more.kept,
+            given_up: self.given_up + more.given_up,
+            switched: self.switched + more.switched,
+            coasted_frames: self.coasted_frames + more.coasted_frames,
+            worst_px: self.worst_px.max(more.worst_px),
+        }
+    }
+}
+
 /// One encounter: the neighbour passes at `impact_px` with the relative speed `speed`, under a common flow.
 fn encounter(scene: &mut Scene, seed: u64, outcome: &mut Encounters) {
     let mut random = Random(seed);
@@ -133,11 +145,22 @@ fn encounter(scene: &mut Scene, seed: u64, outcome: &mut Encounters) {
 
 #[test]
 fn two_hundred_encounters_pass_without_a_silent_switch() {
-    let mut outcome = Encounters::default();
-    let mut scene = Scene::new();
-    for seed in 1..=200 {
-        encounter(&mut scene, seed * 7919, &mut outcome);
-    }
+    let halves = std::thread::scope(|scope| {
+        [1..=100, 101..=200]
+            .map(|seeds| {
+                scope.spawn(move || {
+                    let (mut outcome, mut scene) = (Encounters::default(), Scene::new());
+                    for seed in seeds {
+                        encounter(&mut scene, seed * 7919, &mut outcome);
+                    }
+                    outcome
+                })
+            })
+            .map(|half| half.join().expect("no encounter panics"))
+    });
+    let outcome = halves
+        .into_iter()
+        .fold(Encounters::default(), Encounters::with);
     println!("200 encounters of two like beads: {outcome:?}");
     assert_eq!(outcome.switched, 0, "{outcome:?}");
     // Giving up is honest, but a tracker that always gives up is of no use.

@@ -63,7 +63,7 @@ fn the_chain_has_every_command_in_its_order() {
 }
 
 #[test]
-#[ignore = "long: identifies in real time, a minute to three: cargo test --workspace --test rig_page -- --ignored --nocapture"]
+#[ignore = "long: identifies in real time, a minute to three: cargo test --workspace --test all rig_page:: -- --ignored --nocapture"]
 fn a_newcomer_comes_from_the_box_to_a_held_bead_with_the_commands_of_the_page() {
     let folder = tempfile::tempdir().expect("a folder");
     let rig = RigInABox::start(folder.path(), &["--duration", "600s"]);

@@ -1,5 +1,5 @@
 //! The live page in a real browser, on a real run of the emulated rig. Needs Debian's chromium and chromium-driver, which
-//! `.ci/run` installs: `cargo test -p cellpos-tests --test live_page -- --ignored`.
+//! `.ci/run` installs: `cargo test --workspace --test all live_page:: -- --ignored`.
 
 mod other_commands;
 mod watched;

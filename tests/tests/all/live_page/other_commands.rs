@@ -1,6 +1,6 @@
 //! The live page of commands that hold no bead for its own sake.
 
-use crate::watched::{RUNNING, Watched, pictures, shows};
+use super::watched::{RUNNING, Watched, pictures, shows};
 use cellpos_tests::browser::Browser;
 use cellpos_tests::programs;
 use std::time::Duration;

@@ -1,0 +1,12 @@
+//! Whole-system tests, one program: while one waits for a rig in real time, the other core computes.
+
+mod architecture;
+mod attacks;
+mod cell_rig;
+mod firmware_qemu;
+mod live_page;
+mod readme;
+mod reconcile;
+mod rig_in_a_box;
+mod rig_page;
+mod scripts;
