@@ -35,6 +35,9 @@ pub struct Hello {
     pub pictures: bool,
     /// Whether the run is over and read from its folder.
     pub recorded: bool,
+    /// Where in a record's columns of the law those of adaptation begin, where it adapts; the page is told in words.
+    #[serde(skip)]
+    pub adaptation_at: Option<usize>,
 }
 
 impl Default for Hello {
@@ -55,6 +58,7 @@ impl Default for Hello {
             script: false,
             pictures: false,
             recorded: false,
+            adaptation_at: None,
         }
     }
 }

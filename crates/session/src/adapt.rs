@@ -43,6 +43,32 @@ pub fn text(now: &Adaptation) -> String {
     )
 }
 
+/// Where adaptation stood in a tick, from its columns in the record; `None` where they are empty.
+pub(crate) fn recorded(columns: &[f32]) -> Option<Adaptation> {
+    let [gain, delay_samples, found, sd, mode, ..] = *columns else {
+        return None;
+    };
+    let modes = [
+        AdaptMode::Waiting,
+        AdaptMode::Agreeing,
+        AdaptMode::Moving,
+        AdaptMode::Paused,
+        AdaptMode::Retreating,
+        AdaptMode::Testing,
+        AdaptMode::Disturbed,
+    ];
+    let mode = modes.into_iter().find(|m| f32::from(*m as u8) == mode)?;
+    let known = found.is_finite() && sd.is_finite();
+    Some(Adaptation {
+        gain: f64::from(gain),
+        delay_samples: f64::from(delay_samples),
+        gain_estimate: known.then_some([f64::from(found), f64::from(sd)]),
+        delay_estimate_samples: None,
+        mode,
+        news: None,
+    })
+}
+
 /// The sentence of [`EventKind::Adapted`]; nothing for another event.
 pub(crate) fn sentence(kind: &EventKind) -> String {
     let EventKind::Adapted {
@@ -105,6 +131,19 @@ mod tests {
             over_s,
             retreat,
         })
+    }
+
+    #[test]
+    fn what_a_record_holds_of_adaptation_reads_as_a_line() {
+        let now = recorded(&[0.5, 1.0, 0.75, 0.02, 2.0, f32::NAN]).expect("a tick that adapts");
+        assert_eq!(
+            text(&now),
+            "tuned to 0.50 of the model's gain, estimated 0.75 +- 0.04, +1.0 samples of delay; on its way"
+        );
+        let unknown = recorded(&[1.0, 0.0, f32::NAN, f32::NAN, 0.0]).expect("too little motion");
+        assert!(!text(&unknown).contains("estimated"));
+        assert_eq!(recorded(&[f32::NAN; 5]), None);
+        assert_eq!(recorded(&[1.0]), None);
     }
 
     #[test]

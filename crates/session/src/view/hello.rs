@@ -3,6 +3,7 @@
 use crate::connect;
 use crate::rig::Rig;
 use crate::setup::Setup;
+use cellpos_control::ADAPT_COLUMNS;
 use cellpos_control::design::bound_rms_um;
 use cellpos_live::Hello;
 use std::f64::consts::PI;
@@ -48,11 +49,19 @@ pub(super) fn hello_of(setup: &Setup, diffusion: f64, page: &Page) -> Hello {
         budget_us: timing.budget_us,
         bound_nm: (diffusion > 0.0).then(|| 1e3 * bound_rms_um(diffusion, 0.0, delay_s, period_s)),
         bound_spectrum: lowest_spectrum(diffusion, delay_s + period_s, 0.5 / period_s),
+        adaptation_at: adaptation_at(setup),
         steered: page.steered,
         script: page.script,
         notes: page.notes,
         ..Hello::default()
     }
+}
+
+/// Where in the law's columns those of adaptation begin.
+fn adaptation_at(setup: &Setup) -> Option<usize> {
+    let law = setup.law().ok()?;
+    let first = ADAPT_COLUMNS.first()?;
+    law.columns().iter().position(|name| name == first)
 }
 
 /// Amplitude spectral density (nm/sqrt(Hz), one-sided) of the lowest possible error: Brownian motion of the last `blind_s`

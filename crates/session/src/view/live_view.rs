@@ -81,6 +81,7 @@ impl View {
         let addressee: Addressee = Arc::new(Mutex::new(Arc::clone(operator)));
         let run = Arc::new(OnceLock::new());
         let pictures = channel();
+        let adaptation_at = hello.adaptation_at;
         let mut feeds = vec![];
         let mut server = None;
         if let Some(at) = wanted.page {
@@ -111,7 +112,7 @@ impl View {
         Ok(Self {
             screen,
             server,
-            watcher: Some(Watcher::new(feeds)),
+            watcher: Some(Watcher::new(feeds).with_adaptation(adaptation_at)),
             notes: Some(notes),
             pictures,
             addressee,

@@ -72,6 +72,7 @@ impl Watch {
         let mut hello = hello_of(&setup, diffusion, &page);
         hello.recorded = true;
         let most_waiting = (HELD_S * 1e6 / hello.period_us) as usize;
+        let adaptation_at = hello.adaptation_at;
         let (feed, hub) = Feed::new(hello);
         let of = session.clone();
         let config = config(at, Some(Arc::new(move |name| film_of(&of, name))));
@@ -79,7 +80,7 @@ impl Watch {
             .map_err(|error| Failure::bad_input(error, "127.0.0.1:0 takes any free port"))?;
         Ok(Self {
             server,
-            watcher: Watcher::new(vec![feed]),
+            watcher: Watcher::new(vec![feed]).with_adaptation(adaptation_at),
             follow,
             folder: folder.to_owned(),
             statistics: Statistics::default(),

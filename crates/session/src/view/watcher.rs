@@ -1,6 +1,7 @@
 //! What page and screen are told of a run, from what its recorder is given.
 
 use super::tail::Tail;
+use crate::adapt;
 use crate::words::{Level, safe_reason, sentence};
 use cellpos_live::{Banner, ClipLine, CycleRow, EventLine, Feed, Row, State};
 use cellpos_runtime::life::EventKind;
@@ -48,6 +49,8 @@ pub(super) struct Watcher {
     standing: (u8, bool),
     /// Ticks and time, s, of the runs before this one on the same page.
     before: (u64, f64),
+    /// Where in the law's columns those of adaptation begin.
+    adaptation_at: Option<usize>,
 }
 
 impl Watcher {
@@ -63,6 +66,15 @@ impl Watcher {
             told: 0,
             standing: (0, false),
             before: (0, 0.0),
+            adaptation_at: None,
+        }
+    }
+
+    /// The same for a run whose record has the columns of adaptation there.
+    pub(super) fn with_adaptation(self, adaptation_at: Option<usize>) -> Self {
+        Self {
+            adaptation_at,
+            ..self
         }
     }
 
@@ -209,7 +221,14 @@ impl Watcher {
                 "running",
                 "No position: the loop runs on prediction.".to_string(),
             ),
-            Some(Life::Running) => ("running", "The loop is closed.".to_string()),
+            Some(Life::Running) => {
+                let columns = self.adaptation_at.and_then(|at| record.law.get(at..));
+                let adaptation = columns
+                    .and_then(adapt::recorded)
+                    .map(|now| adapt::text(&now));
+                let adaptation = adaptation.map_or_else(String::new, |text| format!("; {text}"));
+                ("running", format!("The loop is closed{adaptation}."))
+            }
             Some(Life::Safe) => ("safe", format!("The PZT parks: {}.", self.safe)),
             _ => (
                 "armed",

@@ -5,7 +5,7 @@ use crate::cyclic;
 use cellpos_runtime::Summary;
 use cellpos_runtime::realtime::Conditions;
 use cellpos_script::CycleRow;
-use cellpos_session::Ended;
+use cellpos_session::{Ended, adapt};
 use serde::Serialize;
 
 /// How the session ended.
@@ -137,6 +137,9 @@ impl<'a> Report<'a> {
             ),
         );
         line("lowest possible", or_dash(self.bound_rms_nm, "nm RMS"));
+        if let Some(now) = &self.summary.adaptation {
+            line("adaptation", adapt::text(now));
+        }
         let c = &self.summary.counts;
         line(
             "frames",
