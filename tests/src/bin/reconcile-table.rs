@@ -221,7 +221,7 @@ fn line(case: &Case, row: &Result<Row, String>) -> String {
     match row {
         Err(e) => format!("{:9} {:8} {hidden:40} refused: {e}", case.group, case.level),
         Ok(r) => format!(
-            "{:9} {:8} {hidden:40} {} {:16} {:40} closure {:6} fresh {:6} {:6} covered {}/{} threshold x {:5.1} {:5.1} s or: {} {} {}",
+            "{:9} {:8} {hidden:40} {} {:16} {:40} closure {:6} fresh {:6} {:6} of {:6} um covered {}/{} threshold x {:5.1} {:5.1} s or: {} {} {} {}",
             case.group,
             case.level,
             if !r.false_names.is_empty() {
@@ -236,12 +236,14 @@ fn line(case: &Case, row: &Result<Row, String>) -> String {
             figure(r.closure),
             figure(r.fresh.map(|f| f.plain)),
             figure(r.fresh.map(|f| f.response)),
+            figure(r.fresh.map(|f| f.gap_um[0])),
             r.covered.0,
             r.covered.1,
             r.above_threshold,
             r.seconds,
             join(&r.alternatives),
             r.missed.join(", "),
+            if r.named == r.hidden { "" } else { &r.numbers },
             if r.named == r.hidden { "" } else { &r.reason }
         ),
     }

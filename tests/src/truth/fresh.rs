@@ -15,6 +15,8 @@ pub struct Fresh {
     pub plain: f64,
     /// About a straight line: what the record's start may be is no part of the response.
     pub response: f64,
+    /// RMS error about that line without the effects, and what the walk of the bead alone makes of a record as long \[um\].
+    pub gap_um: [f64; 2],
 }
 
 /// Runs both models over another large multisine than that of the records; `None` where nothing is hidden in the response
@@ -53,9 +55,13 @@ pub fn fresh(case: &Case, augmented: &Model, base: &Model, seed: u64) -> Option<
         without(&mut d, columns);
         (d.iter().map(|d| d * d).sum::<f64>() / d.len() as f64).sqrt()
     };
-    (rms(base, true) > NO_GAP_UM).then(|| Fresh {
+    let before = rms(base, true);
+    // A walk about its regression line: a fifteenth of its variance at the end.
+    let walk_um2 = 2.0 * 0.33 * truth.duration_s() / 15.0;
+    (before > NO_GAP_UM).then(|| Fresh {
         plain: 1.0 - rms(augmented, false) / rms(base, false),
-        response: 1.0 - rms(augmented, true) / rms(base, true),
+        response: 1.0 - rms(augmented, true) / before,
+        gap_um: [before, walk_um2.sqrt()],
     })
 }
 

@@ -147,7 +147,7 @@ impl Ahead {
                     let w = TAU * hz;
                     let f = |r: [f64; 2]| [r[1], w * w * (x.mean - r[0]) - 2.0 * zeta * w * r[1]];
                     self.stand = rk4(self.stand, h, f);
-                    self.shake = share * (x.end - self.stand[0]);
+                    self.shake = share * (x.end - self.stand[0] - 2.0 * zeta * self.stand[1] / w);
                 }
                 Hidden::Second(Second::LooseStand(hz, zeta, share)) => {
                     self.shake = share * self.second.stand(hz, zeta, x, h);

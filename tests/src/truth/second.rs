@@ -211,8 +211,10 @@ impl Memory {
 
     /// What a loose stand adds to the picture.
     pub fn stand(&mut self, hz: f64, zeta: f64, x: Through, h: f64) -> f64 {
-        self.stand = dragged(self.stand, TAU * hz, zeta, x.mean, h);
-        x.end - self.stand[0]
+        let w = TAU * hz;
+        self.stand = dragged(self.stand, w, zeta, x.mean, h);
+        let [at, speed] = self.stand;
+        x.end - at - 2.0 * zeta * drag(speed, w) * speed / w
     }
 
     /// Exact along a straight way: the lag behind the input tends to `(1 - b)/a` in the direction of motion.
@@ -259,11 +261,16 @@ impl Memory {
     }
 }
 
-/// One step of a mass on a spring in a fluid: the damping doubles at 2 um of amplitude.
+/// Damping of a mass in a fluid over that at rest: it doubles at 2 um of amplitude.
+fn drag(speed: f64, w: f64) -> f64 {
+    1.0 + speed.abs() / (2.0 * w)
+}
+
+/// One step of a mass on a spring in a fluid.
 fn dragged(s: [f64; 2], w: f64, zeta: f64, x: f64, h: f64) -> [f64; 2] {
     rk4(s, h, |r| {
-        let drag = 1.0 + r[1].abs() / (2.0 * w);
-        [r[1], w * w * (x - r[0]) - 2.0 * zeta * drag * w * r[1]]
+        let damping = 2.0 * zeta * drag(r[1], w);
+        [r[1], w * w * (x - r[0]) - damping * w * r[1]]
     })
 }
 

@@ -6,7 +6,7 @@ use super::fresh::fresh;
 use super::threshold::above_threshold;
 use super::{Excitation, Nuisance, Random, Rig, run, scripts};
 use cellpos_plant::{Model, Noise, TransferFunction};
-use cellpos_reconcile::{Options, Reconciliation, Record, Verdict, constant_gain, reconcile};
+use cellpos_reconcile::{Effect, Options, Reconciliation, Record, Verdict, constant_gain, reconcile};
 use std::collections::BTreeSet;
 
 /// What a case came to.
@@ -30,7 +30,9 @@ pub struct Row {
     pub covered: (usize, usize),
     /// Those that do not, in words.
     pub missed: Vec<String>,
-    /// What `where` says last.
+    /// The numbers of what is named, in words.
+    pub numbers: String,
+    /// What `where` says.
     pub reason: String,
     /// Time that the search had of a processor \[s\], one thread.
     pub seconds: f64,
@@ -143,7 +145,8 @@ pub fn evaluate(case: &Case, seed: u64) -> Result<Row, String> {
         inside,
         false_names,
         verdict: result.verdict,
-        reason: result.places.last().cloned().unwrap_or_default(),
+        numbers: numbers(&result),
+        reason: result.places.join(" | "),
         alternatives: result
             .effects
             .iter()
@@ -164,6 +167,20 @@ pub fn evaluate(case: &Case, seed: u64) -> Result<Row, String> {
             .then(|| result.gap.closure()),
         fresh,
     })
+}
+
+/// The numbers of what is named.
+fn numbers(result: &Reconciliation) -> String {
+    let one = |e: &Effect| {
+        let values: Vec<String> = e
+            .parameters
+            .iter()
+            .map(|(name, p)| format!("{name} {:.4}", p.value))
+            .collect();
+        format!("{}({})", e.id, values.join(", "))
+    };
+    let all: Vec<String> = result.effects.iter().map(one).collect();
+    all.join(" + ")
 }
 
 /// Whether the intervals of named effects hold what was hidden, where both have the same equation.
