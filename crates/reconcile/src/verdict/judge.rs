@@ -82,6 +82,10 @@ pub(crate) fn judge(ctx: &Context<'_>, e: &Evidence<'_>, threads: usize) -> Judg
             out.verdict = Verdict::Unknown;
             out.reasons
                 .push(no_floor(e, "nothing of the catalogue helps"));
+        } else if beyond && e.counted {
+            // Missing frames are counted, whatever the rest is.
+            out.verdict = Verdict::NamedWithRemainder;
+            out.remainder = Some(remainder(ctx, e, &library, term, 1.0));
         } else if beyond {
             out.verdict = Verdict::Unknown;
             out.reasons
