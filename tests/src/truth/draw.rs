@@ -132,6 +132,27 @@ fn behind(kind: usize, second: bool, random: &mut Random) -> Hidden {
     }
 }
 
+/// Effects whose order matters, from the driver to the bead: a stand shakes with the piezo, not with what a bubble leaves of it.
+const CHAIN: [&str; 17] = [
+    "driver-lag",
+    "slew-limit",
+    "saturation",
+    "pzt-hysteresis",
+    "pzt-creep",
+    "pzt-resonance",
+    "backlash",
+    "camera-shake",
+    "stiffening",
+    "pdms-relaxation",
+    "bubble",
+    "leak",
+    "gain-error",
+    "gain-drift",
+    "gain-swing",
+    "wall-adhesion",
+    "flow-drift",
+];
+
 /// Whether no record of command and position can tell two effects from one of them with other numbers: two lags with one
 /// exponential; an exposure beside a lag or a delay; a play beside play operators; a gain beside what has an anchoring of its own.
 fn merges(a: &str, b: &str) -> bool {
@@ -165,6 +186,8 @@ pub fn sets(group: &'static str, size: usize, count: usize, seed: u64) -> Vec<Ca
                     hidden.push(next);
                 }
             }
+            // In the order of the chain, whatever was drawn first.
+            hidden.sort_by_key(|h| CHAIN.iter().position(|id| *id == h.id()));
             Case::new(group, hidden, Session::DRAWN)
         })
         .collect()

@@ -6,7 +6,9 @@ use super::fresh::fresh;
 use super::threshold::above_threshold;
 use super::{Excitation, Nuisance, Random, Rig, run, scripts};
 use cellpos_plant::{Model, Noise, TransferFunction};
-use cellpos_reconcile::{Effect, Options, Reconciliation, Record, Verdict, constant_gain, reconcile};
+use cellpos_reconcile::{
+    Effect, Options, Reconciliation, Record, Verdict, constant_gain, reconcile,
+};
 use std::collections::BTreeSet;
 
 /// What a case came to.

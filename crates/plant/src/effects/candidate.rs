@@ -99,6 +99,8 @@ pub struct Candidate {
     pub role: Role,
     /// The smallest that matters: index of a number and its least size.
     pub smallest: Option<(usize, f64)>,
+    /// What that size is counted from: 1 for a factor.
+    pub neutral: f64,
     /// A rich form, tried only once the effect was found in a simple one.
     pub late: bool,
 }
@@ -113,6 +115,7 @@ impl Candidate {
             off_response: false,
             role: Role::Chain,
             smallest: None,
+            neutral: 0.0,
             late: false,
         }
     }
@@ -145,6 +148,11 @@ impl Candidate {
             smallest: Some((index, size)),
             ..self
         }
+    }
+
+    /// The same with the value of that number that changes nothing.
+    pub const fn about(self, neutral: f64) -> Self {
+        Self { neutral, ..self }
     }
 
     /// Whether its numbers include a gain of the whole chain.

@@ -52,8 +52,10 @@ impl EffectKind for GainError {
     }
 
     fn candidates(&self) -> &'static [Candidate] {
-        const ALL: &[Candidate] =
-            &[Candidate::chain(&[lin("factor", 0.05, 20.0, 1e-3)]).typical(0.4, 2.5)];
+        const ALL: &[Candidate] = &[Candidate::chain(&[lin("factor", 0.05, 20.0, 1e-3)])
+            .typical(0.4, 2.5)
+            .smallest(0, 0.01)
+            .about(1.0)];
         ALL
     }
 

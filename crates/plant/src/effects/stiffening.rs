@@ -43,13 +43,14 @@ impl EffectKind for Stiffening {
     }
 
     fn candidates(&self) -> &'static [Candidate] {
+        // What softens is none: the round knee of a saturation took that name.
         const ALL: &[Candidate] =
-            &[Candidate::chain(&[lin("per_um2", -0.5, 0.5, 1e-4)]).typical(-0.3, 0.3)];
+            &[Candidate::chain(&[lin("per_um2", 0.0, 0.5, 1e-4)]).typical(0.0, 0.3)];
         ALL
     }
 
     fn starts(&self, _: usize, scope: &Scope) -> Vec<Vec<f64>> {
-        [-0.1, -0.02, 0.02, 0.1]
+        [0.02, 0.1]
             .iter()
             .map(|c| vec![c / scope.stroke_um.powi(2).max(1e-6)])
             .collect()

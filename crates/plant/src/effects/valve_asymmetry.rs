@@ -49,7 +49,7 @@ impl EffectKind for ValveAsymmetry {
     fn candidates(&self) -> &'static [Candidate] {
         const ALL: &[Candidate] = &[Candidate::chain(&[lin("asymmetry", -0.5, 0.5, 1e-4)])
             .typical(-0.2, 0.2)
-            .smallest(0, 0.0005)];
+            .smallest(0, 0.002)];
         ALL
     }
 

@@ -105,7 +105,11 @@ impl Part {
     /// Whether it is at least as large as the smallest that matters.
     pub fn matters(&self) -> bool {
         match self.variant().smallest {
-            Some((at, least)) => self.natural().get(at).is_none_or(|v| v.abs() >= least),
+            Some((at, least)) => {
+                let neutral = self.variant().neutral;
+                let values = self.natural();
+                values.get(at).is_none_or(|v| (v - neutral).abs() >= least)
+            }
             None => true,
         }
     }

@@ -38,6 +38,28 @@ pub(crate) fn left_over(fit: &Fit) -> f64 {
     (fit.chi2 - fit.count as f64).max(0.0)
 }
 
+/// Scatter of a sum of squares over `n` rows: chance, and the error of the noise estimate.
+pub(crate) fn scatter(n: f64) -> f64 {
+    (2.0 * n + (0.012 * n).powi(2)).sqrt()
+}
+
+/// What a set must close to count as whole. Positions are known only within the noise where a pixel's error is steep: an error
+/// periodic in position never closes altogether.
+fn whole(fit: &Fit) -> f64 {
+    if fit.has("pixel-locking") {
+        THRESHOLDS.closed_least
+    } else {
+        THRESHOLDS.closed_whole
+    }
+}
+
+/// Whether a set leaves more than chance, and more than equations leave that are not nature's to the last digit.
+pub(crate) fn leaves_much(null: &Fit, fit: &Fit) -> bool {
+    let left = left_over(fit);
+    left > THRESHOLDS.left_sd * scatter(fit.count as f64)
+        && left > (1.0 - whole(fit)) * left_over(null)
+}
+
 /// A price for a main parameter outside the range that real rigs show: decides ties between names. A fit that leaves
 /// something over (`left`) is wrong somewhere else, and by how much tells how little its last percent decides.
 pub(crate) fn prior_penalty(part: &Part, left: f64) -> f64 {

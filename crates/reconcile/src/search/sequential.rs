@@ -4,7 +4,7 @@ use crate::fit::catalogue::{self, Part};
 use crate::fit::context::{Context, Fit};
 use crate::fit::descent::Until;
 use crate::problem::Mask;
-use crate::search::cost::{left_over, penalised_cost, threshold, threshold_of};
+use crate::search::cost::{leaves_much, left_over, penalised_cost, threshold, threshold_of};
 use crate::search::screen::screen;
 use crate::thresholds::THRESHOLDS;
 
@@ -428,10 +428,8 @@ pub(crate) fn search(
         beam = Vec::new();
     }
     progress("refitting all together");
-    // Rivals of a set that is no explanation, and that nothing more will be added to, decide nothing.
-    let hopeless =
-        cut_short && left_over(&fit) > (1.0 - THRESHOLDS.closed_least) * left_over(&null);
-    let (fit, rivals) = if hopeless {
+    // Rivals of a set that is no whole explanation, and that nothing more will be added to, decide nothing: no name.
+    let (fit, rivals) = if cut_short && leaves_much(&null, &fit) {
         let none = vec![Vec::new(); fit.parts.len()];
         (fit, none)
     } else {

@@ -2,7 +2,7 @@
 
 use crate::data::floor::Floor;
 use crate::fit::context::{Context, Fit};
-use crate::search::cost::left_over;
+use crate::search::cost::{leaves_much, left_over, scatter};
 use crate::search::sequential::ids;
 use crate::thresholds::THRESHOLDS;
 use crate::verdict::battery::{self, Column, Hypothesis};
@@ -53,7 +53,7 @@ pub fn figure(x: f64) -> String {
 
 pub(crate) fn judge(ctx: &Context<'_>, e: &Evidence<'_>, threads: usize) -> Judgement {
     let n = e.null.count as f64;
-    let scatter = (2.0 * n + (0.012 * n).powi(2)).sqrt();
+    let scatter = scatter(n);
     let excess = e.null.chi2 - n;
     let left = e.fit.chi2 - n;
     let closed = if excess > 0.0 {
@@ -68,7 +68,7 @@ pub(crate) fn judge(ctx: &Context<'_>, e: &Evidence<'_>, threads: usize) -> Judg
     let gained = (e.null.chi2 - e.fit.chi2).max(0.0);
     let term = strongest
         .filter(|(_, gain)| *gain > THRESHOLDS.term_least.max(THRESHOLDS.term_share * gained));
-    let much = left > THRESHOLDS.left_sd * scatter && closed < whole(e.fit);
+    let much = leaves_much(e.null, e.fit);
     let remains = much || term.is_some();
     let mut out = Judgement {
         verdict: Verdict::NothingMissing,
@@ -127,16 +127,6 @@ pub(crate) fn judge(ctx: &Context<'_>, e: &Evidence<'_>, threads: usize) -> Judg
         out.remainder = Some(remainder(ctx, e, &library, term, 1.0 - closed));
     }
     out
-}
-
-/// What a set must close to count as whole. Positions are known only within the noise where a pixel's error is steep: an error
-/// periodic in position never closes altogether.
-fn whole(fit: &Fit) -> f64 {
-    if fit.has("pixel-locking") {
-        THRESHOLDS.closed_least
-    } else {
-        THRESHOLDS.closed_whole
-    }
 }
 
 /// Why a set is no name, if it is none.
