@@ -4,6 +4,7 @@
 //! cargo run --release -p cellpos-benches --bin minute-table          a minute of each
 //! cargo run --release -p cellpos-benches --bin minute-table -- 10    ten seconds of each
 //! cargo run --release -p cellpos-benches --bin minute-table -- 60 touched    of the loads with this in their name
+//! cargo run --release -p cellpos-benches --bin minute-table -- 60 --bare 500us    the bare loop alone, at another period
 //! ```
 //!
 //! Late: woken, or a command handed over, more than half a period after its time. Skipped: periods without a tick. Lost: the
@@ -13,7 +14,7 @@
 
 use cellpos_benches::track;
 use cellpos_rig::Clock;
-use cellpos_runtime::realtime::{self, bare_loop};
+use cellpos_runtime::realtime::{self, bare_loop_at};
 use std::fs::File;
 use std::hint::black_box;
 use std::io::{Seek, Write};
@@ -110,6 +111,9 @@ fn touch() -> ! {
     }
 }
 
+/// Period of the loop.
+const LOOP: Duration = Duration::from_millis(1);
+
 /// Late and skipped of so many ticks.
 #[derive(Debug, Clone, Copy)]
 struct Figures {
@@ -137,15 +141,18 @@ impl Figures {
     }
 }
 
-fn bare(seconds: u64) -> Figures {
+/// The bare loop at a period.
+fn bare(seconds: u64, period: Duration) -> Figures {
     let measured = std::thread::spawn(move || {
         let conditions = realtime::apply(&realtime::Request::control_thread());
         for line in &conditions.degraded {
             eprintln!("DEGRADED: {line}");
         }
         let mut late = 0;
-        let (latency, skipped) = bare_loop(Duration::from_secs(seconds), |late_ns| {
-            late += u64::from(late_ns > 500_000);
+        let much = period / 2;
+        let (latency, skipped) = bare_loop_at(period, Duration::from_secs(seconds), |late_ns| {
+            late += u64::from(u128::from(late_ns) > much.as_nanos());
+            true
         });
         let wake = latency.quantiles_us();
         Figures {
@@ -189,6 +196,13 @@ fn main() -> ExitCode {
         "| load | loop | ticks | late | skipped | lost | wake-up, 99.9 % (us) | largest (us) |"
     );
     println!("|---|---|---|---|---|---|---|---|");
+    if let [_, word, period] = words.as_slice()
+        && word == "--bare"
+    {
+        let period: u64 = (period.trim_end_matches("us").parse()).expect("microseconds");
+        bare(seconds, Duration::from_micros(period)).line("idle", "bare");
+        return ExitCode::SUCCESS;
+    }
     let mut holds = true;
     let wanted = words.get(1).map_or("", String::as_str);
     for (load, name) in Load::ALL
@@ -198,9 +212,9 @@ fn main() -> ExitCode {
         let loading =
             (load != Load::Idle).then(|| Loading::start(name).expect("this program starts"));
         // Beside means in turn: half of the bare loop before, half after.
-        let before = bare(seconds.div_ceil(2));
+        let before = bare(seconds.div_ceil(2), LOOP);
         let ours = looped(seconds);
-        let after = bare(seconds / 2);
+        let after = bare(seconds / 2, LOOP);
         drop(loading);
         let yardstick = Figures {
             ticks: before.ticks + after.ticks,

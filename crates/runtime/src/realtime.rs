@@ -197,20 +197,29 @@ pub fn bare_loop(duration: Duration, mut woken: impl FnMut(u64)) -> (Latency, u6
 }
 
 /// As [`bare_loop`], until `woken` says that it is enough.
-pub fn bare_loop_while(duration: Duration, mut woken: impl FnMut(u64) -> bool) -> (Latency, u64) {
-    const PERIOD_NS: i64 = 1_000_000;
+pub fn bare_loop_while(duration: Duration, woken: impl FnMut(u64) -> bool) -> (Latency, u64) {
+    bare_loop_at(Duration::from_millis(1), duration, woken)
+}
+
+/// As [`bare_loop_while`] at any period; one of less than a microsecond counts as that.
+pub fn bare_loop_at(
+    period: Duration,
+    duration: Duration,
+    mut woken: impl FnMut(u64) -> bool,
+) -> (Latency, u64) {
+    let period_ns = i64::try_from(period.as_nanos()).map_or(i64::MAX / 4, |ns| ns.max(1000));
     let mut latency = Latency::new();
     let mut missed = 0;
-    let start = monotonic_ns() + PERIOD_NS;
-    let ticks = i64::try_from(duration.as_nanos() / PERIOD_NS as u128).unwrap_or(i64::MAX);
+    let start = monotonic_ns() + period_ns;
+    let ticks = i64::try_from(duration.as_nanos() / period_ns as u128).unwrap_or(i64::MAX);
     let mut tick = 0;
     while tick < ticks {
-        let due = start + tick * PERIOD_NS;
+        let due = start + tick * period_ns;
         sleep_until_ns(due);
         let late = (monotonic_ns() - due).max(0);
         latency.record(late as u64, tick as u64);
         let goes_on = woken(late as u64);
-        let skipped = late / PERIOD_NS;
+        let skipped = late / period_ns;
         missed += skipped as u64;
         tick = tick.saturating_add(1 + skipped);
         if !goes_on {
@@ -294,5 +303,8 @@ mod tests {
         assert_eq!(latency.count(), heard);
         // The last wake-up may be late by more periods than were left.
         assert!(heard > 0 && heard + missed >= 50, "{heard} {missed}");
+        let (period, duration) = (Duration::from_micros(500), Duration::from_millis(50));
+        let (latency, missed) = bare_loop_at(period, duration, |_| true);
+        assert!(latency.count() + missed >= 100, "{missed}");
     }
 }
