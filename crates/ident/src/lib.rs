@@ -19,6 +19,7 @@
 #![forbid(unsafe_code)]
 
 pub mod bare_fft;
+pub mod base;
 mod bootstrap;
 pub mod candidate_model;
 mod candidate_order;
