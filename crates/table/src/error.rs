@@ -32,10 +32,10 @@ pub enum TableProblem {
     /// No rows at all.
     #[error("has no rows")]
     Empty,
-    /// The first line holds numbers where the names of the columns should be.
+    /// Numbers where the names of the columns should be: a text without a header, or an array.
     #[error(
-        "the first line holds numbers, not the names of the columns; write `time_s,pzt_um,bead_um` above it, or say \
-         which column is which and the sampling rate"
+        "its columns have no names (it begins with numbers): say which column is which by its number from 1, and the sampling \
+         rate; or, in a text file, write `time_s,pzt_um,bead_um` above them"
     )]
     NoHeader,
     /// A column is not there.

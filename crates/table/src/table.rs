@@ -4,8 +4,9 @@ use crate::error::{TableError, TableProblem};
 use crate::mapping::ColumnRef;
 use std::path::{Path, PathBuf};
 
-/// A text file of rows and columns: separated by commas, semicolons, tabs or white space, with or without a header.
-/// Blank lines and lines that start with `#` or `%` are skipped; a byte-order mark and Windows line ends do no harm.
+/// A text file of rows and columns: separated by semicolons, tabs, commas or white space, with or without a header.
+/// Blank lines and lines that start with `#` or `%` are skipped, and so is a line of units below the header; a byte-order mark and
+/// Windows line ends do no harm. Where commas do not separate, a number may have a decimal comma.
 #[derive(Debug, Clone)]
 pub struct Table<'a> {
     path: PathBuf,
@@ -34,7 +35,8 @@ enum Separator {
 
 impl Separator {
     fn of(line: &str) -> Self {
-        [',', ';', '\t']
+        // A comma may be a decimal one; the others separate and nothing else.
+        [';', '\t', ',']
             .into_iter()
             .find(|separator| line.contains(*separator))
             .map_or(Self::White, Self::Char)
@@ -56,9 +58,27 @@ fn unquote(field: &str) -> &str {
         .map_or(field, str::trim)
 }
 
-/// A number in the notation of any program, "nan" and "inf" included; None if it is something else.
+/// A number in the notation of any program, "nan" and "inf" included, with a decimal point or one decimal comma; None if it is
+/// something else.
 fn number(field: &str) -> Option<f64> {
-    field.parse().ok()
+    let parsed = field.parse().ok();
+    if parsed.is_some() || field.contains('.') || field.matches(',').count() != 1 {
+        return parsed;
+    }
+    field.replace(',', ".").parse().ok()
+}
+
+/// Ways in which programs write that there is no value.
+fn is_no_value(field: &str) -> bool {
+    ["", "nan", "na", "n/a", "null", "none", "-"]
+        .iter()
+        .any(|word| field.eq_ignore_ascii_case(word))
+}
+
+/// A column's name as people say it: without the unit in brackets, in small letters.
+fn said(name: &str) -> String {
+    let plain = name.split(['[', '(']).next().unwrap_or(name);
+    plain.trim().to_lowercase()
 }
 
 impl<'a> Table<'a> {
@@ -114,7 +134,11 @@ impl<'a> Table<'a> {
             lines: Vec::new(),
         };
         let header = (!is_header).then_some((first_line, first));
+        let mut may_be_units = is_header;
         for (line, row) in header.into_iter().chain(lines) {
+            if std::mem::take(&mut may_be_units) && is_units(separator, row, table.names.len()) {
+                continue;
+            }
             let before = table.fields.len();
             separator.split(row, |field| {
                 // A field is a part of the text, whose length fits.
@@ -173,10 +197,19 @@ impl<'a> Table<'a> {
             })
     }
 
-    /// Place of a column, counted from 0, if it exists.
+    /// Place of a column, counted from 0, if it exists. Where no name is the one asked for, the only one that is it with a
+    /// unit in brackets behind it is taken.
     pub fn find(&self, column: &ColumnRef) -> Option<usize> {
         match column {
-            ColumnRef::Name(name) => self.names.iter().position(|other| other == name),
+            ColumnRef::Name(name) => {
+                let exact = self.names.iter().position(|other| other == name);
+                exact.or_else(|| {
+                    let mut like = (0..self.names.len())
+                        .filter(|i| self.names[*i].contains(['[', '(']))
+                        .filter(|i| said(&self.names[*i]) == said(name));
+                    like.next().filter(|_| like.next().is_none())
+                })
+            }
             ColumnRef::Number(number) => number
                 .checked_sub(1)
                 .filter(|place| *place < self.names.len()),
@@ -196,15 +229,13 @@ impl<'a> Table<'a> {
         self.column(column, help, |field| field.is_empty() && allow_empty)
     }
 
-    /// A column of a file that others have written: what is empty or `nan` becomes NaN.
+    /// A column of a file that others have written: what is empty, `nan`, `NA`, `null` or `-` becomes NaN.
     ///
     /// # Errors
     /// As [`Table::numbers`].
     pub fn numbers_or_nan(&self, column: &ColumnRef) -> Result<Vec<f64>, TableError> {
         let help = "leave the field empty, or write nan, where there is no value";
-        self.column(column, help, |field| {
-            field.is_empty() || field.eq_ignore_ascii_case("nan")
-        })
+        self.column(column, help, is_no_value)
     }
 
     fn column(
@@ -292,6 +323,17 @@ impl<'a> Table<'a> {
             },
         )
     }
+}
+
+/// Whether the line below a header is one of units: as many fields, all of them short words, none a value or its absence.
+fn is_units(separator: Separator, line: &str, columns: usize) -> bool {
+    let (mut fields, mut words) = (0, 0);
+    separator.split(line, |field| {
+        fields += 1;
+        let short = field.chars().count() <= 12;
+        words += usize::from(short && number(field).is_none() && !is_no_value(field));
+    });
+    fields == columns && words == fields
 }
 
 /// If `name` is `wanted` with another unit: that unit, and the factor from it to the wanted one.

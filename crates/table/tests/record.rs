@@ -253,3 +253,26 @@ fn a_foreign_column_may_say_nan_where_it_has_no_value_and_comments_of_other_prog
         "{error}"
     );
 }
+
+#[test]
+fn tables_of_other_programs_are_read_with_decimal_commas_units_and_words_for_no_value() {
+    let text = "Zeit;Heizleistung [W];Temperatur [\u{b0}C]\ns;W;\u{b0}C\n0;7,71;21,5\n2;8,00;NA\n4;-1,5e1;22\n";
+    let table = cellpos_table::Table::parse("heater.csv".as_ref(), text).unwrap();
+    assert_eq!(table.len(), 3, "the line of units is no row");
+    let column = |name: &str| table.numbers_or_nan(&name.into()).unwrap();
+    assert_eq!(column("heizleistung"), [7.71, 8.0, -15.0]);
+    let warm = column("Temperatur");
+    assert!(warm[0] == 21.5 && warm[1].is_nan() && warm[2] == 22.0);
+    // Where commas separate, they are nothing else.
+    let table = cellpos_table::Table::parse("a.csv".as_ref(), "a,b\n1,5\n2,5\n").unwrap();
+    assert_eq!(table.numbers_or_nan(&"b".into()).unwrap(), [5.0, 5.0]);
+    // A name that fits two columns is no name.
+    let text = "p [bar],p [Pa]\n1,2\n";
+    let table = cellpos_table::Table::parse("b.csv".as_ref(), text).unwrap();
+    assert!(table.numbers_or_nan(&"p".into()).is_err());
+    // Words in the first row that are no units stay an error with their place.
+    let text = "time_s,pzt_um\n0.0,much\n";
+    let table = cellpos_table::Table::parse("c.csv".as_ref(), text).unwrap();
+    let error = table.numbers_or_nan(&"pzt_um".into()).unwrap_err();
+    assert!(error.to_string().contains("much"), "{error}");
+}

@@ -2,12 +2,14 @@
 
 mod arrays;
 pub mod background;
+mod base;
 pub mod board;
 pub mod bundle;
 pub mod calibrate;
 pub mod camera;
 pub mod check;
 pub mod circle;
+mod columns;
 pub mod design;
 pub mod doctor;
 pub mod export;

@@ -1,17 +1,19 @@
 //! `cellpos reconcile`: where simulation and measurement disagree, what is missing, added and shown.
 
+mod model;
 mod records;
 
 use crate::commands::identify::HoldKind;
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
 use crate::output;
 use crate::rig_file::{ClockKind, Frames, RigFile};
-use cellpos_experiment::collect::{self, Collected, Collecting, refused};
+use cellpos_experiment::collect::{self, Collected, Collecting};
 use cellpos_experiment::on_rig::OnRig;
 use cellpos_plant::Model;
 use cellpos_plant::effects::Definition;
-use cellpos_reconcile::{NoiseKind, Options, Reconciliation, Verdict, reconcile};
-use records::{Columns, at_rest_of_runs, files, fitted, is_run, read, read_run, with_camera_delay};
+use cellpos_reconcile::{NoiseKind, Options, Reconciliation, Verdict};
+use model::Data;
+use records::{Columns, files, is_run, read, read_run};
 use std::path::{Path, PathBuf};
 
 /// Find where simulation and measurement disagree, name what is missing, add it to the model.
@@ -20,7 +22,8 @@ use std::path::{Path, PathBuf};
 Examples:
   cellpos reconcile --model eq6 --data runs/monday --out augmented.toml --report gap.html --json result.json
   cellpos reconcile --model eq6 --collect more --rig rig.toml --out augmented.toml
-  cellpos reconcile --model base.toml --data d.csv --effects mine.toml --out augmented.toml
+  cellpos reconcile --model base.toml --data d.csv --input u --output y --out augmented.toml
+  cellpos reconcile --base order=2,delay --data d.csv --input 'p [kW]' --output 'T [degC]' --effects mine.toml
   cellpos reconcile --model fit --data Model_Vi_Do.dat --rows 0:8027 --input-column 1 --output-column 5 --rate 200Hz
 
 Verdicts: named, named-with-remainder (and something is left beside), ambiguous (the data cannot separate, and what would), unknown (nothing in the catalogue closes enough),
@@ -29,7 +32,11 @@ pub struct Args {
     /// Model: eq6, the path of a model.toml, or `fit` for a constant gain fitted to the records.
     #[arg(long, default_value = "eq6")]
     model: String,
-    /// CSV files, run folders, or folders of both.
+    /// In the place of --model, for data of another rig: a linear base model of this form, fitted to the records: order=N, with
+    /// zeros=N, delay, integrating where they are wanted; or static.
+    #[arg(long, conflicts_with_all = ["model", "collect"])]
+    base: Option<cellpos_ident::base::Form>,
+    /// Records (text, .npy, .mat), run folders, or folders of both.
     #[arg(long, required_unless_present = "collect", num_args = 1.., value_parser = crate::arguments::run_folder())]
     data: Vec<PathBuf>,
     /// Where the records leave it open, or there are none, run what would decide on the rig, keep its records in FOLDER
@@ -140,7 +147,7 @@ pub fn run(args: Args) -> CommandResult {
             records.push(record);
             rests_um.extend(rest_um);
         } else {
-            records.push(read(file, &args.columns)?);
+            records.push(read(file, &args.columns, args.hold != Some(HoldKind::None))?);
         }
     }
     let threads = args
@@ -155,25 +162,12 @@ pub fn run(args: Args) -> CommandResult {
         own_effects,
         ..Options::default()
     };
-    let model = if args.model == "fit" {
-        options.interpolated_input = true;
-        options.free_gain = true;
-        fitted(&records)?
-    } else {
-        let mut model = Model::load(&args.model).map_err(Failure::input)?;
-        // A model of other data says how its input was sampled; such a plant need not have rested before a record.
-        let stated = model.provenance.get("hold").cloned();
-        options.free_start = stated.is_some();
-        options.interpolated_input = match args.hold {
-            Some(hold) => hold == HoldKind::None,
-            None => stated.as_deref() == Some("none"),
-        };
-        at_rest_of_runs(&mut model, &records, &rests_um);
-        if files.iter().all(|file| is_run(file)) {
-            with_camera_delay(&mut model);
-        }
-        model
+    let data = Data {
+        records: &records,
+        rests_um: &rests_um,
+        of_runs: files.iter().all(|file| is_run(file)),
     };
+    let model = model::model_of(&args, &data, &mut options)?;
     let bar = output::progress_bar(None);
     let mut progress = |text: &str| {
         bar.set_message(text.to_owned());
@@ -181,7 +175,7 @@ pub fn run(args: Args) -> CommandResult {
     };
     let mut collected = Vec::new();
     let result = match &args.collect {
-        None => reconcile(&model, &records, &options, &mut progress).map_err(refused)?,
+        None => model::reconcile_or_refit(&model, &records, &options, &mut progress)?,
         Some(folder) => {
             let mut model = model;
             let rig = rig(&args, &model)?;

@@ -165,6 +165,13 @@ fn widening(residual: &[f64]) -> f64 {
     sum.sqrt()
 }
 
+/// Whether a residual is a random walk: Durbin and Watson's ratio is far below 2.
+fn is_walk(residual: &[f64]) -> bool {
+    let levels: f64 = residual.iter().map(|e| e * e).sum();
+    let changes: f64 = residual.windows(2).map(|w| (w[1] - w[0]).powi(2)).sum();
+    levels > 0.0 && changes < 0.1 * levels
+}
+
 /// A fit as a model in seconds, with standard deviations.
 pub(super) fn finished(data: &Data, form: &Form, found: &Found, rate_hz: f64) -> Option<BaseFit> {
     let solved = data.solve(form, &found.theta, None)?;
@@ -200,6 +207,7 @@ pub(super) fn finished(data: &Data, form: &Form, found: &Found, rate_hz: f64) ->
         output_rms: data.output_rms,
         residual_rms,
         held_out_rms: None,
+        wanders: form.integrating && is_walk(&solved.residual),
         at_bound: data.at_bound(form, &found.theta),
         model: RationalFit {
             order: n,

@@ -42,6 +42,8 @@ pub struct BaseFit {
     pub residual_rms: f64,
     /// The same of halves of the records that a fit to the other halves predicts, output unit; None where only one form was asked for.
     pub held_out_rms: Option<f64>,
+    /// Whether the plant integrates and what its free run leaves is a random walk: Brownian motion or drift, no error of the model.
+    pub wanders: bool,
     /// Whether a number stands at an end of what the sampling and the length of the records can tell.
     pub at_bound: bool,
 }

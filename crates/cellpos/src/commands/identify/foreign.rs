@@ -2,7 +2,8 @@
 
 use super::report::{log_grid, number};
 use super::sources::{self, Source};
-use super::{Args, HoldKind};
+use super::Args;
+use crate::commands::base::{self, Base, coefficients};
 use crate::commands::report::with_interval;
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
 use cellpos_ident::feedback::feedback;
@@ -11,11 +12,9 @@ use cellpos_ident::foreign::{
     nothing_to_tell,
 };
 use cellpos_ident::rational::RationalFit;
-use cellpos_ident::sampled::Hold;
-use cellpos_plant::{Model, Noise, TransferFunction, effects};
+use cellpos_plant::Model;
 use cellpos_report::{Axis, Column, Emphasis, Figure, Panel, Report, Series, Table};
 use serde_json::{Value, json};
-use std::collections::BTreeMap;
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
 
@@ -35,50 +34,43 @@ fn no_model(r: &ForeignResult) -> &'static str {
     }
 }
 
-/// Coefficients with their 95 % intervals.
-fn coefficients(values: &[f64], sds: &[f64]) -> String {
-    let terms: Vec<String> = values
-        .iter()
-        .zip(sds)
-        .map(|(value, sd)| match *sd {
-            0.0 => number(*value),
-            sd => format!("{} +- {}", number(*value), number(1.96 * sd)),
-        })
-        .collect();
-    format!("[{}]", terms.join(", "))
-}
-
 /// Runs the command on records.
 pub fn run(args: &Args) -> CommandResult {
-    if args.input.is_some() != args.rate.is_some() || args.input.is_some() != args.output.is_some()
-    {
+    if args.base.is_some() && args.data.is_empty() {
         return Err(Failure::bad_input(
-            "--input, --output and --rate are given together, or not at all",
-            "for example --input pzt_um --output bead_um --rate 1kHz",
+            "--base is the form of a model of records",
+            "name them with --data",
         ));
     }
     let mut results = Vec::new();
-    let mut means = Vec::new();
+    let mut sources = Vec::new();
     for path in &args.data {
         for source in sources::read(path, args)? {
-            let result = judge(&source, args).map_err(|e| {
-                Failure::bad_input(
-                    format!("{}: {e}", source.name),
-                    "check --input, --output and --rate, or give a longer record",
-                )
-            })?;
-            let input = &source.input;
-            means.push(input.iter().sum::<f64>() / input.len().max(1) as f64);
-            results.push((PathBuf::from(source.name), result));
+            let result = judge(&source, args);
+            // What has no spectrum may still have a model in time.
+            match result {
+                Ok(result) => results.push((PathBuf::from(&source.name), result)),
+                Err(e) if args.input.is_none() => {
+                    return Err(Failure::bad_input(
+                        format!("{}: {e}", source.name),
+                        "check --input, --output and --rate, or give a longer record",
+                    ));
+                }
+                Err(e) => tracing::warn!("{}: no frequency response: {e}", source.name),
+            }
+            sources.push(source);
         }
     }
-    let told = results
-        .iter()
-        .zip(&means)
-        .find(|((_, r), _)| !r.models.is_empty());
+    let base = base_of(args, &sources, &results)?;
+    let told = results.iter().find(|(_, r)| !r.models.is_empty());
+    let model = match (&base, told) {
+        (Some(base), _) => Some(base.model()?),
+        (None, Some((_, r))) => Some(model_of_response(r, mean_input(&sources))?),
+        (None, None) => None,
+    };
     if let Some(path) = &args.out {
-        match told {
-            Some(((_, first), mean)) => write_model(path, first, *mean)?,
+        match &model {
+            Some(model) => crate::output::write(path, &model.to_toml_string())?,
             None => eprintln!(
                 "WARNING: {}: not written, there is no model",
                 path.display()
@@ -86,36 +78,81 @@ pub fn run(args: &Args) -> CommandResult {
         }
     }
     if let Some(path) = &args.report {
-        report(&results)
+        report(&results, base.as_ref())
             .write_with_figures(path)
             .map_err(Failure::failed)?;
     }
     if args.json {
         let files: Vec<Value> = results.iter().map(|(p, r)| to_json(p, r)).collect();
-        print_json(&json!({ "files": files }))?;
+        print_json(&json!({ "files": files, "base": base.as_ref().map(Base::to_json) }))?;
     } else {
-        let text: String = results.iter().map(|(p, r)| to_text(p, r)).collect();
+        let mut text: String = (results.iter())
+            .map(|(p, r)| to_text(p, r, base.is_none()))
+            .collect();
+        text += &base.as_ref().map(Base::words).unwrap_or_default();
         print_text(&text)?;
     }
     // A record that says nothing of the plant is no success, nor is a model asked for and not there.
     let silent = results
         .iter()
         .any(|(_, r)| matches!(r.basis, Basis::Nothing { .. }));
-    Ok(if silent || (args.out.is_some() && told.is_none()) {
+    Ok(if silent || (args.out.is_some() && model.is_none()) {
         Outcome::Broken
     } else {
         Outcome::Done
     })
 }
 
+/// The model of other rigs' records, fitted to all of them in time. None for records of this rig, of a loop, or of too few rows
+/// where no form was asked for.
+fn base_of(
+    args: &Args,
+    sources: &[Source],
+    results: &[(PathBuf, ForeignResult)],
+) -> Result<Option<Base>, Failure> {
+    let of_loop = results.iter().any(|(_, r)| r.basis != Basis::Input);
+    if args.input.is_none() || (of_loop && args.base.is_none()) {
+        return Ok(None);
+    }
+    if of_loop {
+        tracing::warn!(
+            "a record looks like that of a loop: its noise is in its input too, and the base model may be the controller's inverse"
+        );
+    }
+    // One or two frequencies tell gain and lag there; more of a model than that must be asked for.
+    let sparse = results.iter().all(|(_, r)| r.points.len() < 3) && !results.is_empty();
+    if sparse && args.base.is_none() {
+        return Ok(None);
+    }
+    let rate_hz = base::common_rate(sources.iter().map(|s| s.rate_hz))?;
+    let records: Vec<_> = (sources.iter())
+        .map(|s| cellpos_ident::base::Series {
+            input: s.input.clone(),
+            output: s.output.clone(),
+        })
+        .collect();
+    let hold = base::hold_of(args.hold);
+    let found = base::fit(&records, rate_hz, hold, args.base, usize::from(args.order));
+    let spectral = results.iter().any(|(_, r)| !r.models.is_empty());
+    match found {
+        // Brownian motion on an integrator is no error of the free run: the response, fitted on increments, knows more.
+        Ok(base) if base.fit.wanders && spectral && args.base.is_none() => Ok(None),
+        Ok(base) => Ok(Some(base)),
+        Err(error) if args.base.is_some() || !spectral => Err(error),
+        Err(_) => Ok(None),
+    }
+}
+
+fn mean_input(sources: &[Source]) -> f64 {
+    let first = sources.first().map_or(&[][..], |s| &s.input);
+    first.iter().sum::<f64>() / first.len().max(1) as f64
+}
+
 fn judge(source: &Source, args: &Args) -> Result<ForeignResult, cellpos_ident::IdentError> {
     let settings = ForeignSettings {
         rate_hz: source.rate_hz,
         most_order: usize::from(args.order),
-        hold: match args.hold {
-            HoldKind::ZeroOrder => Hold::ZeroOrder,
-            HoldKind::None => Hold::None,
-        },
+        hold: base::hold_of(args.hold),
     };
     let (input, output) = (&source.input, &source.output);
     let found = feedback(input, output);
@@ -170,60 +207,17 @@ fn model_verdict(m: &RationalFit) -> &'static str {
     }
 }
 
-/// The best model (those that grow are left out before) as a model file: its delay is an effect, and how its input was sampled is said, so that what reads
-/// it next takes both as they are.
-fn write_model(path: &Path, result: &ForeignResult, at_rest: f64) -> Result<(), Failure> {
+/// The best model of a frequency response (those that grow are left out before).
+fn model_of_response(result: &ForeignResult, at_rest: f64) -> Result<Model, Failure> {
     let Some(best) = result.models.first() else {
         return Err(Failure::bad_input(
-            format!(
-                "no model for {}: every one that fits has a pole that grows",
-                path.display()
-            ),
+            "no model: every one that fits has a pole that grows",
             "try another --order or --hold, or a record that excites more",
         ));
     };
-    let plant = TransferFunction::new(best.numerator.clone(), best.denominator.clone())
-        .map_err(Failure::failed)?;
-    let delay_s = best.delay_s.max(0.0);
-    let mut intervals = BTreeMap::new();
-    if best.delay_sd_s.is_finite() && delay_s > 0.0 {
-        let wide_s = 1.96 * best.delay_sd_s;
-        intervals.insert(
-            "time-delay.delay_s".to_owned(),
-            [best.delay_s - wide_s, best.delay_s + wide_s],
-        );
-    }
-    let hold = match result.sampling.hold {
-        Hold::ZeroOrder => "zero-order",
-        Hold::None => "none",
-    };
-    let mut model = Model {
-        name: "identified".to_owned(),
-        description: format!("linear model of order {} from records", best.order),
-        plant,
-        working_point_um: at_rest,
-        effects: Vec::new(),
-        noise: Noise::NONE,
-        // A delay that the record shows is not known to be the camera's.
-        camera_delay_s: None,
-        covariance: None,
-        intervals,
-        provenance: BTreeMap::from([
-            ("command".to_owned(), super::command_line()),
-            (
-                "version".to_owned(),
-                cellpos_session::provenance::VERSION_AND_COMMIT.to_owned(),
-            ),
-            ("hold".to_owned(), hold.to_owned()),
-            ("verdict".to_owned(), model_verdict(best).to_owned()),
-        ]),
-    };
-    if delay_s > 0.0 {
-        let delay = effects::time_delay(delay_s);
-        delay.validate().map_err(Failure::input)?;
-        model = model.with_effect(delay);
-    }
-    crate::output::write(path, &model.to_toml_string())
+    let mut model = base::model_of(best, result.sampling.hold, at_rest)?;
+    (model.provenance).insert("verdict".to_owned(), model_verdict(best).to_owned());
+    Ok(model)
 }
 
 fn to_json(path: &Path, r: &ForeignResult) -> Value {
@@ -276,7 +270,7 @@ fn to_json(path: &Path, r: &ForeignResult) -> Value {
     })
 }
 
-fn to_text(path: &Path, r: &ForeignResult) -> String {
+fn to_text(path: &Path, r: &ForeignResult, with_model: bool) -> String {
     let mut out = format!("{}\n", path.display());
     if let Some(verdict) = verdict(r) {
         let _ = writeln!(out, "  {verdict}");
@@ -306,7 +300,9 @@ fn to_text(path: &Path, r: &ForeignResult) -> String {
     if r.harmonics_remain() {
         let _ = writeln!(out, "  {NO_LINEAR}");
     }
-    if let Some(m) = r.models.first() {
+    if !with_model {
+        // The base model of all records stands below.
+    } else if let Some(m) = r.models.first() {
         let _ = writeln!(
             out,
             "  linear model of order {}: num {}, den {}, delay {} ms: {}",
@@ -330,8 +326,12 @@ fn to_text(path: &Path, r: &ForeignResult) -> String {
     out
 }
 
-fn report(results: &[(std::path::PathBuf, ForeignResult)]) -> Report {
+fn report(results: &[(PathBuf, ForeignResult)], base: Option<&Base>) -> Report {
     let mut report = Report::new("Identification of records");
+    if let Some(base) = base {
+        report.section("Base model of all records");
+        report.paragraph(&base.words());
+    }
     for (index, (path, r)) in results.iter().enumerate() {
         report.section(&path.display().to_string());
         match (r.basis, verdict(r)) {
@@ -348,6 +348,7 @@ fn report(results: &[(std::path::PathBuf, ForeignResult)]) -> Report {
             report.note(Emphasis::Warning, NO_LINEAR);
         }
         match r.models.first() {
+            _ if base.is_some() => {}
             Some(m) => {
                 report.paragraph(&format!(
                     "Linear model of order {}: num {}, den {}, delay {} ms (95 % intervals): {}.",

@@ -38,20 +38,31 @@ pub enum Switch {
     cellpos identify --rig rig.toml --out model.toml\n  \
     cellpos identify --data runs/20261121T190000Z-sine\n  \
     cellpos identify --data record.csv --input pzt_um --output bead_um --rate 1kHz\n  \
+    cellpos identify --data heater.csv --input 'power [W]' --output 'T [degC]' --base order=2,delay --out base.toml\n  \
     cellpos identify --data Model_Vi_Do.dat --input 1 --output 5 --rate 200Hz --hold none")]
 pub struct Args {
-    /// Run folders, records of cellpos, or records of any rig with --input, --output and --rate; one after the other.
+    /// Run folders, records of cellpos, or records of any rig with --input and --output; the model is fitted to all of them.
     #[arg(long, num_args = 1.., value_parser = crate::arguments::run_folder())]
     data: Vec<PathBuf>,
-    /// Input column: a name of the header, or a number from 1.
-    #[arg(long, requires_all = ["data", "output", "rate"])]
+    /// Input column: a name of the header (a unit in brackets may be left out), or a number from 1.
+    #[arg(long, alias = "input-column", requires_all = ["data", "output"])]
     input: Option<String>,
     /// Output column: a name of the header, or a number from 1.
-    #[arg(long)]
+    #[arg(long, alias = "output-column", requires = "input")]
     output: Option<String>,
-    /// Rows per second of the records.
-    #[arg(long, value_parser = crate::arguments::positive::<Hertz>)]
+    /// Column of the time, in the unit of its name (`t [ms]`), else in seconds [default: the one called time or t].
+    #[arg(long, requires = "input")]
+    time_column: Option<String>,
+    /// Rows per second of records without a column of time.
+    #[arg(long, requires = "input", value_parser = crate::arguments::positive::<Hertz>)]
     rate: Option<Hertz>,
+    /// Rows FROM:TO of every file, counted from 0, TO not included.
+    #[arg(long, value_name = "FROM:TO", requires = "input")]
+    rows: Option<String>,
+    /// Form of the model of other rigs' records: order=N, with zeros=N, delay, integrating where they are wanted; or
+    /// static. Left out: the simplest that predicts records as well as any, up to --order.
+    #[arg(long, requires = "input")]
+    base: Option<cellpos_ident::base::Form>,
     /// What the records' input does between rows: a command is held (zero-order), a measured signal is not (none).
     #[arg(long, value_enum, default_value_t = HoldKind::ZeroOrder)]
     hold: HoldKind,

@@ -1,7 +1,8 @@
 //! What `cellpos identify --data` reads: run folders and records of cellpos, as they are; any other file by its columns.
 
-use super::Args;
+use super::{Args, HoldKind};
 use crate::commands::arrays::read_table;
+use crate::commands::columns::{self, Wanted};
 use crate::commands::run::resume;
 use crate::outcome::Failure;
 use cellpos_record::RunReader;
@@ -31,18 +32,24 @@ pub fn read(path: &Path, args: &Args) -> Result<Vec<Source>, Failure> {
     if path.is_dir() {
         return runs(path);
     }
-    if let (Some(input), Some(output), Some(rate)) = (&args.input, &args.output, args.rate) {
-        let text = text_of(path)?;
-        let table = Table::parse(path, &text).map_err(Failure::input)?;
-        let (input, output) = (
-            ColumnRef::from(input.as_str()),
-            ColumnRef::from(output.as_str()),
-        );
+    if let (Some(input), Some(output)) = (&args.input, &args.output) {
+        let record = columns::read(
+            path,
+            &Wanted {
+                input,
+                output: Some(output),
+                time: args.time_column.as_deref(),
+                rate: args.rate,
+                factors: [1.0, 1.0],
+                rows: args.rows.as_deref(),
+                held: args.hold == HoldKind::ZeroOrder,
+            },
+        )?;
         return Ok(vec![Source {
             name: path.display().to_string(),
-            rate_hz: rate.0,
-            input: table.numbers(&input, false).map_err(Failure::input)?,
-            output: table.numbers_or_nan(&output).map_err(Failure::input)?,
+            rate_hz: 1.0 / record.sample_s,
+            input: record.pzt_um,
+            output: record.bead_um,
             reference: None,
             closed: false,
         }]);
@@ -67,7 +74,7 @@ fn own_record(path: &Path) -> Result<Vec<Source>, Failure> {
     let foreign = |error: String| {
         Failure::bad_input(
             format!("{name}: is no record of cellpos: {error}"),
-            "say which columns it has, and how many rows a second: --input pzt_um --output bead_um --rate 1kHz",
+            "say which columns are input and output, and which the time or how many rows a second: --input u --output y --rate 1kHz",
         )
     };
     let table = Table::parse(path, &text).map_err(|error| foreign(error.to_string()))?;

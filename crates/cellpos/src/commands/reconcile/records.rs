@@ -1,6 +1,6 @@
 //! The records that a reconciliation reads: CSV files and run folders, and what they say about the model's working point.
 
-use crate::commands::arrays::read_table;
+use crate::commands::columns::{self, Wanted};
 use crate::commands::run::resume::sessions;
 use crate::outcome::Failure;
 use cellpos_experiment::collect::refused;
@@ -10,28 +10,28 @@ use cellpos_plant::{Model, Noise, TransferFunction};
 use cellpos_reconcile::Record;
 use cellpos_record::RunReader;
 use cellpos_runtime::TickRecord;
-use cellpos_table::{ColumnRef, Table};
 use std::path::{Path, PathBuf};
 
 /// Where CSV files have what, and in which units.
 #[derive(Debug, clap::Args)]
 pub(super) struct Columns {
-    /// Column of the command: its name, or its number from 1.
-    #[arg(long, default_value = "pzt_um")]
-    input_column: String,
-    /// Column of the position: its name, or its number from 1.
-    #[arg(long, default_value = "bead_um")]
-    output_column: String,
-    /// Column of the time in seconds: its name, or its number from 1.
-    #[arg(long, default_value = "time_s")]
-    time_column: String,
-    /// Sampling rate of files without a time column, with unit (200Hz).
+    /// Column of the input: its name (a unit in brackets may be left out), or its number from 1.
+    #[arg(long, alias = "input", default_value = "pzt_um")]
+    pub(super) input_column: String,
+    /// Column of the output: its name, or its number from 1.
+    #[arg(long, alias = "output", default_value = "bead_um")]
+    pub(super) output_column: String,
+    /// Column of the time: its name, or its number from 1; in the unit of its name (`t [ms]`, time_min), else in seconds
+    /// [default: the one called time or t].
     #[arg(long)]
+    time_column: Option<String>,
+    /// Sampling rate, with unit (200Hz), of files without a time column.
+    #[arg(long, value_parser = crate::arguments::positive::<cellpos_units::Hertz>)]
     rate: Option<cellpos_units::Hertz>,
-    /// Factor from the command's column to um (4 for volts).
+    /// Factor on the input; for a model in um from a column in volts: 4. Data of another rig need none.
     #[arg(long, default_value_t = 1.0)]
     input_um_per_unit: f64,
-    /// Factor from the position's column to um (0.001 for nanometres).
+    /// Factor on the output; for a model in um from a column in nanometres: 0.001. Data of another rig need none.
     #[arg(long, default_value_t = 1.0)]
     output_um_per_unit: f64,
     /// Rows FROM:TO of every file, counted from 0, TO not included.
@@ -40,7 +40,7 @@ pub(super) struct Columns {
 }
 
 /// Endings of the files that are taken for records where a folder is named.
-const RECORDS: [&str; 4] = ["csv", "dat", "npy", "mat"];
+const RECORDS: [&str; 6] = ["csv", "dat", "txt", "tsv", "npy", "mat"];
 
 /// All record files behind the arguments, in a fixed order.
 pub(super) fn files(data: &[PathBuf]) -> Result<Vec<PathBuf>, Failure> {
@@ -65,8 +65,8 @@ pub(super) fn files(data: &[PathBuf]) -> Result<Vec<PathBuf>, Failure> {
             inside.sort();
             if inside.is_empty() {
                 return Err(Failure::bad_input(
-                    format!("no CSV file and no run folder in {}", path.display()),
-                    "--data takes CSV files (time_s,pzt_um,bead_um), run folders, or a folder of them",
+                    format!("no record (csv, dat, txt, npy, mat) and no run folder in {}", path.display()),
+                    "--data takes record files (text, .npy, .mat), run folders, or a folder of them",
                 ));
             }
             found.extend(inside);
@@ -99,48 +99,17 @@ fn record_name(path: &Path) -> String {
     )
 }
 
-pub(super) fn read(path: &Path, columns: &Columns) -> Result<Record, Failure> {
-    let name = record_name(path);
-    let text = read_table(path).map_err(|e| {
-        Failure::bad_input(
-            format!("cannot read {}: {e}", path.display()),
-            "check --data; records are CSV (time_s,pzt_um,bead_um), .npy, or .mat up to version 7",
-        )
-    })?;
-    let table = Table::parse(path, &text).map_err(Failure::input)?;
-    let column = |c: &str, empty| {
-        table
-            .numbers(&ColumnRef::from(c), empty)
-            .map_err(Failure::input)
+pub(super) fn read(path: &Path, columns: &Columns, held: bool) -> Result<Record, Failure> {
+    let wanted = Wanted {
+        input: &columns.input_column,
+        output: Some(&columns.output_column),
+        time: columns.time_column.as_deref(),
+        rate: columns.rate,
+        factors: [columns.input_um_per_unit, columns.output_um_per_unit],
+        rows: columns.rows.as_deref(),
+        held,
     };
-    let mut u = column(&columns.input_column, false)?;
-    let mut y = column(&columns.output_column, true)?;
-    let mut t = match columns.rate {
-        Some(rate) => (0..u.len()).map(|k| k as f64 / rate.value()).collect(),
-        None => column(&columns.time_column, false)?,
-    };
-    if let Some(rows) = &columns.rows {
-        let wrong = || {
-            Failure::bad_input(
-                format!("--rows {rows}: not FROM:TO within 0..{}", u.len()),
-                "for example --rows 0:6000",
-            )
-        };
-        let (from, to) = rows.split_once(':').ok_or_else(wrong)?;
-        let (from, to): (usize, usize) = (
-            from.parse().map_err(|_| wrong())?,
-            to.parse().map_err(|_| wrong())?,
-        );
-        if from >= to || to > u.len() {
-            return Err(wrong());
-        }
-        u = u[from..to].to_vec();
-        y = y[from..to].to_vec();
-        t = t[from..to].to_vec();
-    }
-    u.iter_mut().for_each(|v| *v *= columns.input_um_per_unit);
-    y.iter_mut().for_each(|v| *v *= columns.output_um_per_unit);
-    Record::from_rows(&name, &t, &u, &y).map_err(refused)
+    columns::read(path, &wanted)
 }
 
 /// A run folder, of an open or a closed loop: the commands given, and the positions as the camera delivered them; and where
