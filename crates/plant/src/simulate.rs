@@ -129,9 +129,9 @@ impl Simulator {
     /// A simulator at rest at the working point before row 0.
     ///
     /// # Errors
-    /// A model with numbers out of range, a sample time outside 1 us..10 s.
+    /// A model with numbers out of range, a sample time outside 0.1 us..1e5 s.
     pub fn new(model: &Model, sample_s: f64, seed: Option<u64>) -> Result<Self, ChainError> {
-        in_range("sample time", sample_s, "s", 1e-6, 10.0)?;
+        in_range("sample time", sample_s, "s", 1e-7, 1e5)?;
         let mut chain = match seed {
             Some(seed) => Chain::with_brownian_motion(model, seed)?,
             None => Chain::new(model)?,
@@ -142,6 +142,7 @@ impl Simulator {
         }
         let end = Ago::new(camera.delay_s, sample_s);
         let begin = Ago::new(camera.delay_s + camera.exposure_s, sample_s);
+        in_range("delay in rows", begin.whole as f64, "", 0.0, 1e7)?;
         let (a, b) = (end.offset_s(sample_s), begin.offset_s(sample_s));
         Ok(Self {
             chain,
@@ -288,7 +289,7 @@ impl Simulator {
 /// 0 um. Frames are neither dropped nor repeated here: see [`crate::frame_fates`].
 ///
 /// # Errors
-/// A model with numbers out of range, a sample time outside 1 us..10 s, displacements that are not finite.
+/// A model with numbers out of range, a sample time outside 0.1 us..1e5 s, displacements that are not finite.
 pub fn simulate(
     model: &Model,
     pzt_um: &[f64],

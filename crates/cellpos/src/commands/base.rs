@@ -94,7 +94,10 @@ pub fn fit(
             number(fit.output_rms)
         ));
     }
-    let changes = inputs().zip(inputs().skip(1)).filter(|(a, b)| a != b).count();
+    let changes = inputs()
+        .zip(inputs().skip(1))
+        .filter(|(a, b)| a != b)
+        .count();
     // Steps that last are held, whatever fits.
     if 2 * changes > inputs().count() {
         let other = match hold {
@@ -179,11 +182,17 @@ impl Base {
     pub fn words(&self) -> String {
         let m = &self.fit.model;
         let mut text = format!(
-            "base model {}: num {}, den {}, delay {} ms\n  its free run is off by {} RMS; the output moves by {} RMS",
+            "base model {}: num {}, den {}, {}\n  its free run is off by {} RMS; the output moves by {} RMS",
             self.fit.form,
             coefficients(&m.numerator, &m.numerator_sd),
             coefficients(&m.denominator, &m.denominator_sd),
-            super::report::with_interval(m.delay_s * 1e3, 1.96e3 * m.delay_sd_s),
+            match self.fit.form.delay {
+                true => format!(
+                    "delay {} ms",
+                    super::report::with_interval(m.delay_s * 1e3, 1.96e3 * m.delay_sd_s)
+                ),
+                false => "no delay".to_owned(),
+            },
             number(self.fit.residual_rms),
             number(self.fit.output_rms),
         );

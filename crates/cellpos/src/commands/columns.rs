@@ -93,15 +93,39 @@ pub fn read(path: &Path, wanted: &Wanted<'_>) -> Result<Record, Failure> {
         || path.display().to_string(),
         |s| s.to_string_lossy().into_owned(),
     );
-    Record::from_rows(&name, &t, &u, &y).map_err(refused)
+    let mut record = Record::from_rows(&name, &t, &u, &y).map_err(refused)?;
+    if wanted.held {
+        hold_over_gaps(&mut record);
+    }
+    Ok(record)
+}
+
+/// A command that was interpolated over missing rows keeps the value before them, as a held one does.
+fn hold_over_gaps(record: &mut Record) {
+    let u = &mut record.pzt_um;
+    let mut k = 1;
+    while k < u.len() {
+        let end = (k..u.len()).find(|&i| !record.filled[i]).unwrap_or(u.len());
+        if end > k && end < u.len() {
+            let (before, after) = (u[k - 1], u[end]);
+            let line =
+                |i: usize| before + (after - before) * (i + 1 - k) as f64 / (end + 1 - k) as f64;
+            let size = 1e-9 * (before.abs() + after.abs());
+            // What another period told stays.
+            if (k..end).all(|i| (u[i] - line(i)).abs() <= size) {
+                u[k..end].fill(before);
+            }
+        }
+        k = end + 1;
+    }
 }
 
 /// The unit of a column as its name says it: in brackets, or behind the last `_`; None where it says none that is known.
 pub fn unit_of(name: &str) -> Option<&str> {
     const KNOWN: [&str; 40] = [
-        "V", "mV", "kV", "A", "mA", "W", "kW", "N", "mN", "kN", "Nm", "m", "mm", "cm", "um", "nm", "degC", "\u{b0}C", "C", "K",
-        "bar", "mbar", "Pa", "kPa", "MPa", "rpm", "rad", "deg", "Hz", "L", "l", "%", "lmin", "Lmin", "m3h", "rads", "mT", "T",
-        "g", "kg",
+        "V", "mV", "kV", "A", "mA", "W", "kW", "N", "mN", "kN", "Nm", "m", "mm", "cm", "um", "nm",
+        "degC", "\u{b0}C", "C", "K", "bar", "mbar", "Pa", "kPa", "MPa", "rpm", "rad", "deg", "Hz",
+        "L", "l", "%", "lmin", "Lmin", "m3h", "rads", "mT", "T", "g", "kg",
     ];
     if let Some((_, rest)) = name.split_once(['[', '(']) {
         let unit = rest.trim_end_matches([']', ')']).trim();
@@ -189,7 +213,17 @@ fn evened(t: &[f64], u: &[f64], y: &[f64], held: bool) -> Option<(Vec<f64>, Vec<
     if off.sqrt() < 0.03 || sorted.len() <= 6 {
         return None;
     }
-    let step = near.iter().sum::<f64>() / near.len() as f64;
+    // Steps that are far longer are gaps of several rows.
+    let count: f64 = (steps.iter())
+        .map(|s| {
+            if *s > 2.5 * usual {
+                (s / usual).round()
+            } else {
+                1.0
+            }
+        })
+        .sum();
+    let step = (t[t.len() - 1] - t[0]) / count;
     let rows = ((t[t.len() - 1] - t[0]) / step).floor() as usize + 1;
     if rows > 20 * t.len() + 1000 {
         return None;
@@ -236,7 +270,9 @@ mod tests {
 
     #[test]
     fn time_is_found_by_its_name_and_taken_in_its_unit() {
-        let rows: String = (0..40).map(|k| format!("{};{},5;{}\n", 50 * k, k, k * k)).collect();
+        let rows: String = (0..40)
+            .map(|k| format!("{};{},5;{}\n", 50 * k, k, k * k))
+            .collect();
         let text = format!("Zeit [ms];U [V];n\n{rows}");
         let record = read_of(&text, &wanted("U", "n")).unwrap();
         assert!((record.sample_s - 0.05).abs() < 1e-12);
@@ -260,6 +296,7 @@ mod tests {
         assert_eq!(record.rows(), 40);
         assert!(record.filled[7] && record.bead_um[7].is_nan());
         assert_eq!(record.bead_um[8], 16.0);
+        assert_eq!(record.pzt_um[7], 6.0, "a held command stays where it was");
     }
 
     #[test]

@@ -3,6 +3,7 @@
 mod model;
 mod records;
 
+use crate::commands::columns;
 use crate::commands::identify::HoldKind;
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
 use crate::output;
@@ -147,7 +148,11 @@ pub fn run(args: Args) -> CommandResult {
             records.push(record);
             rests_um.extend(rest_um);
         } else {
-            records.push(read(file, &args.columns, args.hold != Some(HoldKind::None))?);
+            records.push(read(
+                file,
+                &args.columns,
+                args.hold != Some(HoldKind::None),
+            )?);
         }
     }
     let threads = args
@@ -174,7 +179,7 @@ pub fn run(args: Args) -> CommandResult {
         bar.tick();
     };
     let mut collected = Vec::new();
-    let result = match &args.collect {
+    let mut result = match &args.collect {
         None => model::reconcile_or_refit(&model, &records, &options, &mut progress)?,
         Some(folder) => {
             let mut model = model;
@@ -198,6 +203,15 @@ pub fn run(args: Args) -> CommandResult {
         }
     };
     bar.finish_and_clear();
+    if options.free_start || options.free_gain {
+        let unit =
+            |column: &str, else_it_is| columns::unit_of(column).unwrap_or(else_it_is).to_owned();
+        let of_input = unit(&args.columns.input_column, "input units");
+        result.tell_in(
+            &of_input,
+            &unit(&args.columns.output_column, "output units"),
+        );
+    }
     write(&args, &result, &collected)?;
     Ok(Outcome::Done)
 }

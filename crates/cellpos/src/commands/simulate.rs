@@ -1,8 +1,13 @@
 //! `cellpos simulate`: the noise-free response of a model to the commands of a record.
 
+use crate::commands::base;
+use crate::commands::columns::{self, Wanted};
+use crate::commands::identify::HoldKind;
 use crate::commands::run::resume::sessions;
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
 use crate::output;
+use cellpos_ident::base::Grid;
+use cellpos_ident::sampled::Hold;
 use cellpos_plant::{Model, SimulateOptions, simulate};
 use cellpos_record::{RunReader, SESSIONS};
 use cellpos_table::{Mapping, Record};
@@ -11,20 +16,39 @@ use std::path::PathBuf;
 /// Arguments of `cellpos simulate`.
 #[derive(Debug, clap::Args)]
 #[command(
-    after_help = "Example:\n  cellpos simulate --model eq6 --input in.csv --out out.csv\n\n\
+    after_help = "Examples:\n  cellpos simulate --model eq6 --input in.csv --out out.csv\n  \
+                        cellpos simulate --model base.toml --input d.csv --input-column 'power [W]' --output-column 'T [degC]' --out s.csv\n\n\
                         The input needs the columns time_s and pzt_um; the output has time_s, pzt_um and bead_um, the \
-                        position just before the row's command takes effect. The bead starts at rest at 0 um."
+                        position just before the row's command takes effect. The bead starts at rest at 0 um. \
+                        With --input-column (data of another rig, a model of identify --data or reconcile --base) the columns have the \
+                        names that are given, the plant starts at rest at the model's working point, and its output counts from where it \
+                        stood on average when it was identified."
 )]
 pub struct Args {
     /// `eq6`, or a model file.
     #[arg(long)]
     model: String,
-    /// A record (CSV), or a run folder.
+    /// A record (text, .npy, .mat), or a run folder.
     #[arg(long, value_parser = crate::arguments::run_folder())]
     input: PathBuf,
     /// The record to write.
     #[arg(long)]
     out: PathBuf,
+    /// Column of the input of another rig's record: its name, or its number from 1.
+    #[arg(long)]
+    input_column: Option<String>,
+    /// Name of the output's column in what is written [default: output].
+    #[arg(long, requires = "input_column")]
+    output_column: Option<String>,
+    /// Column of the time, in the unit of its name, else in seconds [default: the one called time or t].
+    #[arg(long, requires = "input_column")]
+    time_column: Option<String>,
+    /// Rows per second of a record without a column of time.
+    #[arg(long, requires = "input_column", value_parser = crate::arguments::positive::<cellpos_units::Hertz>)]
+    rate: Option<cellpos_units::Hertz>,
+    /// What the input does between rows [default: as the model was identified, else zero-order].
+    #[arg(long, value_enum)]
+    hold: Option<HoldKind>,
     /// Adds Brownian motion and localisation noise from this seed.
     #[arg(long)]
     seed: Option<u64>,
@@ -51,17 +75,35 @@ pub fn run(args: Args) -> CommandResult {
             .and_then(|run| run.to_record())
             .map_err(Failure::input)?
     } else {
-        Record::read(&args.input, &Mapping::commands_only()).map_err(Failure::input)?
+        match &args.input_column {
+            Some(column) => foreign(&args, column)?,
+            None => Record::read(&args.input, &Mapping::commands_only()).map_err(Failure::input)?,
+        }
     };
     let options = SimulateOptions {
         seed: args.seed,
         ..SimulateOptions::default()
     };
-    let bead_um =
-        simulate(&model, &input.pzt_um, input.step_s, &options).map_err(Failure::input)?;
+    let held = match args.hold {
+        Some(hold) => hold == HoldKind::ZeroOrder,
+        None => model
+            .provenance
+            .get(base::HOLD)
+            .is_none_or(|hold| hold != "none"),
+    };
+    let bead_um = match held {
+        true => simulate(&model, &input.pzt_um, input.step_s, &options).map_err(Failure::input)?,
+        false => between_rows(&model, &input, &options)?,
+    };
     let mut answer = Record::new(&input.name, input.step_s, input.pzt_um, bead_um);
     answer.start_s = input.start_s;
-    answer.write(&args.out).map_err(Failure::failed)?;
+    match &args.input_column {
+        Some(column) => {
+            let output = args.output_column.as_deref().unwrap_or("output");
+            write_named(&args, &model, &answer, [column, output])?;
+        }
+        None => answer.write(&args.out).map_err(Failure::failed)?,
+    }
     if args.json {
         print_json(&serde_json::json!({
             "out": args.out,
@@ -72,4 +114,71 @@ pub fn run(args: Args) -> CommandResult {
         print_text(&format!("{}: {} rows\n", args.out.display(), answer.len()))?;
     }
     Ok(Outcome::Done)
+}
+
+/// The input of another rig's record.
+fn foreign(args: &Args, column: &str) -> Result<Record, Failure> {
+    let read = columns::read(
+        &args.input,
+        &Wanted {
+            input: column,
+            output: None,
+            time: args.time_column.as_deref(),
+            rate: args.rate,
+            factors: [1.0, 1.0],
+            rows: None,
+            held: args.hold != Some(HoldKind::None),
+        },
+    )?;
+    let mut record = Record::new(&read.name, read.sample_s, read.pzt_um, read.bead_um);
+    record.start_s = read.start_s;
+    Ok(record)
+}
+
+/// The response to an input that is sampled and not held: on a grid four times as fine, as `reconcile` has it.
+fn between_rows(
+    model: &Model,
+    input: &Record,
+    options: &SimulateOptions,
+) -> Result<Vec<f64>, Failure> {
+    let direct = model.plant.relative_degree() == 0;
+    let grid = Grid::new(&input.pzt_um, Hold::None, direct);
+    let step_s = input.step_s / grid.steps as f64;
+    // A direct path shows the value at the end of the step before: the row's own.
+    let first = grid.held.first().copied();
+    let fine: Vec<f64> = match direct {
+        true => first.into_iter().chain(grid.held.iter().copied()).collect(),
+        false => grid.held,
+    };
+    let fine_um = simulate(model, &fine, step_s, options).map_err(Failure::input)?;
+    let skip = usize::from(direct);
+    Ok((fine_um.into_iter().skip(skip).step_by(grid.steps))
+        .take(input.len())
+        .collect())
+}
+
+/// Writes the columns under the names that the user has for them.
+fn write_named(
+    args: &Args,
+    model: &Model,
+    answer: &Record,
+    names: [&str; 2],
+) -> Result<(), Failure> {
+    use std::fmt::Write as _;
+    let rest: f64 = (model.provenance.get(base::REST_OUTPUT))
+        .and_then(|text| text.parse().ok())
+        .unwrap_or(0.0);
+    let quoted = |name: &str| match name.contains(',') {
+        true => format!("\"{name}\""),
+        false => name.to_owned(),
+    };
+    // A column that was a number has no name of its own.
+    let input = names[0].parse::<usize>().map_or(names[0], |_| "input");
+    let mut text = format!("time_s,{},{}\n", quoted(input), quoted(names[1]));
+    for (k, (u, y)) in answer.pzt_um.iter().zip(&answer.bead_um).enumerate() {
+        let t = answer.start_s + k as f64 * answer.step_s;
+        // Writing into a String cannot fail.
+        let _ = writeln!(text, "{t:.9},{u},{}", y + rest);
+    }
+    output::write(&args.out, &text)
 }

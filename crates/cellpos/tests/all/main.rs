@@ -10,6 +10,7 @@ mod identify;
 mod identify_rig;
 mod kinds_of_runs;
 mod newcomer;
+mod other_plants;
 mod queue;
 mod replay;
 mod schemas;

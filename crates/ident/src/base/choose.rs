@@ -5,14 +5,20 @@ use super::fit::{Found, descend, finished, most_delay, search};
 use super::form::Form;
 use super::{BaseFit, Series, checked};
 use crate::error::IdentError;
+use crate::rational::roots;
 use crate::sampled::Hold;
 
 /// Rows that starts are tried on, and that the last fit sees.
-const ROWS_TO_START: usize = 6_000;
-const ROWS_TO_FIT: usize = 24_000;
+const ROWS_TO_START: usize = 3_000;
+const ROWS_TO_FIT: usize = 12_000;
 
-/// By how much a richer form must predict better than a simpler one.
-const LEAST_GAIN: f64 = 0.02;
+/// By what factor the error of prediction must fall for every number more that a form has.
+const PER_NUMBER: f64 = 0.97;
+
+/// A slowest pole that turns by less than this over the longest stretch is a pole at zero for all that the records tell.
+const AS_GOOD_AS_ZERO: f64 = 1.0;
+/// One that turns by more is none.
+const NEVER_ZERO: f64 = 30.0;
 
 const NO_FIT: IdentError = IdentError::NoFit {
     what: "a base model",
@@ -23,7 +29,7 @@ const NO_FIT: IdentError = IdentError::NoFit {
 ///
 /// With `asked`, the model has that form (its zeros chosen where they are left open). Without, the order is chosen up to
 /// `most_order`, with and without a pole at zero, with a delay where one helps, by how well a fit to the first halves of the records
-/// runs freely through the last and the other way round: the simplest within 2 % of the best.
+/// runs freely through the last and the other way round, every number more having to pay for itself by 3 %.
 ///
 /// # Errors
 /// [`IdentError::Lengths`], [`IdentError::OutOfRange`] (rate, an input that is constant), [`IdentError::TooShort`],
@@ -45,58 +51,97 @@ pub fn choose(
     checked(records, rate_hz, form.parameters())?;
     let most = most_order.min(super::form::MOST_ORDER);
     let top = asked.map_or(most, |form| form.order);
-    let mut trials = Vec::new();
-    let kinds: &[bool] = match asked {
-        Some(form) if form.integrating => &[true],
-        Some(_) => &[false],
-        None => &[false, true],
-    };
     let skipped = match asked {
         Some(form) if !form.delay => 2,
         _ => 0,
     };
     let few = Data::new(records, hold, ROWS_TO_START, skipped);
     let many = Data::new(records, hold, ROWS_TO_FIT, skipped);
-    for &integrating in kinds {
-        let delay = asked.is_none_or(|form| form.delay);
-        let mut below: Vec<Option<Found>> = Vec::new();
-        for order in usize::from(integrating)..=top {
-            let form = Form {
-                order,
-                zeros: Some(order.saturating_sub(1)),
-                delay,
-                integrating,
-            };
-            if checked(records, rate_hz, form.parameters()).is_err() {
-                break;
+    let enough = |form: &Form| checked(records, rate_hz, form.parameters()).is_ok();
+    let chain = |integrating| orders(&few, &many, asked, top, integrating, &enough);
+    let stable = match asked {
+        Some(form) if form.integrating => Vec::new(),
+        _ => chain(false),
+    };
+    let best_stable = simplest(&stable);
+    let at_rest = best_stable.is_some_and(|t| t.slowest(&many) > NEVER_ZERO);
+    let integrating = match asked {
+        Some(form) if !form.integrating => Vec::new(),
+        None if at_rest => Vec::new(),
+        _ => chain(true),
+    };
+    let best = match (best_stable, simplest(&integrating)) {
+        (Some(stable), Some(integrating)) => {
+            // A ramp beside an integrator follows anything slow: that alone is no reason to take one.
+            let slow = stable.at_bound || stable.slowest(&many) < AS_GOOD_AS_ZERO;
+            let factor = if slow { 1.05 } else { 0.7 };
+            if integrating.held_out_rms < factor * stable.held_out_rms {
+                integrating
+            } else {
+                stable
             }
-            let found = search(&few, &form, &below);
-            if let Some(found) = &found
-                && asked.is_none_or(|asked| asked.order == order)
-            {
-                trials.extend(Trial::new(&many, form, &found.theta));
-            }
-            below.push(found);
         }
-    }
-    let mut best = simplest(&trials).ok_or(NO_FIT)?.clone();
-    trials = variants(&many, &best, asked);
-    best = simplest(&trials).unwrap_or(&best).clone();
+        (stable, integrating) => stable.or(integrating).ok_or(NO_FIT)?,
+    };
+    let mut left = variants(&many, best, asked);
     let mut fits: Vec<BaseFit> = Vec::new();
-    for trial in std::iter::once(&best).chain(&trials) {
-        if fits.iter().any(|fit| fit.form == trial.form) {
-            continue;
-        }
+    while let Some(trial) = simplest(&left).cloned() {
+        left.retain(|t| t.form != trial.form);
         let Some(mut fit) = finished(&many, &trial.form, &trial.found, rate_hz) else {
             continue;
         };
         fit.held_out_rms = Some(trial.held_out_rms);
         fits.push(fit);
     }
+    // A number that the records do not see at all is one too many.
+    fits.sort_by_key(|fit| !fit.is_seen());
     if fits.is_empty() {
         return Err(NO_FIT);
     }
     Ok(fits)
+}
+
+/// The best of every order, richest numerator first, up to where more poles do not help.
+fn orders(
+    few: &Data,
+    many: &Data,
+    asked: Option<Form>,
+    top: usize,
+    integrating: bool,
+    enough: &dyn Fn(&Form) -> bool,
+) -> Vec<Trial> {
+    let mut below: Vec<Option<Found>> = Vec::new();
+    let mut trials: Vec<Trial> = Vec::new();
+    let (mut best, mut idle) = (f64::INFINITY, 0);
+    for order in usize::from(integrating)..=top {
+        let form = Form {
+            order,
+            zeros: Some(order.saturating_sub(1)),
+            delay: asked.is_none_or(|form| form.delay),
+            integrating,
+        };
+        if !enough(&form) {
+            break;
+        }
+        let found = search(few, &form, &below);
+        if let Some(found) = &found
+            && asked.is_none_or(|asked| asked.order == order)
+            && let Some(trial) = Trial::new(many, form, &found.theta)
+        {
+            idle = if trial.held_out_rms < 0.98 * best {
+                0
+            } else {
+                idle + 1
+            };
+            best = best.min(trial.held_out_rms);
+            trials.push(trial);
+        }
+        below.push(found);
+        if idle >= 2 {
+            break;
+        }
+    }
+    trials
 }
 
 /// A form that was fitted and tested.
@@ -136,24 +181,28 @@ impl Trial {
         })
     }
 
+    /// By how much the slowest pole turns over the longest stretch; nothing for a static plant.
+    fn slowest(&self, data: &Data) -> f64 {
+        let poles = roots(&data.denominator(&self.form, &self.found.theta));
+        let slowest = poles.iter().map(|p| p.norm()).fold(f64::INFINITY, f64::min);
+        slowest * data.longest as f64
+    }
+
     /// Numbers of the form: a pole at zero is no number, and is preferred to one that is only near it.
     fn size(&self) -> usize {
         self.form.free_poles() + self.form.zeros.unwrap_or(0) + usize::from(self.form.delay)
     }
 }
 
-/// The simplest of those that predict within 2 % of the best, and stand at no bound where others do not.
+/// The one whose error of prediction, every number paid for, is least, and that stands at no bound where others do not.
 fn simplest(trials: &[Trial]) -> Option<&Trial> {
     let free = trials.iter().any(|t| !t.at_bound);
-    let eligible = || trials.iter().filter(move |t| !(free && t.at_bound));
-    let best = eligible()
-        .map(|t| t.held_out_rms)
-        .fold(f64::INFINITY, f64::min);
-    eligible()
-        .filter(|t| t.held_out_rms <= best * (1.0 + LEAST_GAIN))
-        .min_by(|a, b| {
-            (a.size().cmp(&b.size())).then_with(|| a.held_out_rms.total_cmp(&b.held_out_rms))
-        })
+    let cost =
+        |t: &Trial| t.held_out_rms.max(f64::MIN_POSITIVE).ln() - PER_NUMBER.ln() * t.size() as f64;
+    trials
+        .iter()
+        .filter(|t| !(free && t.at_bound))
+        .min_by(|a, b| cost(a).total_cmp(&cost(b)))
 }
 
 /// The chosen order with other zeros, and, where the form was left open, without a delay.

@@ -105,11 +105,17 @@ fn starts(data: &Data, form: &Form, below: &[Option<Found>]) -> Vec<Vec<f64>> {
 /// The best of a form on some of the rows: every start, the best three of them searched.
 pub(super) fn search(data: &Data, form: &Form, below: &[Option<Found>]) -> Option<Found> {
     let longest = most_delay(data.longest);
-    let delays: Vec<f64> = match form.delay {
-        true => DELAYS.into_iter().filter(|d| *d <= longest).collect(),
-        false => Vec::new(),
-    };
     let n = form.free_poles();
+    // Further poles are tried about the delay that the lower orders have found.
+    let known = |order: usize| Some(*below.get(order)?.as_ref()?.theta.get(order)?);
+    let delays: Vec<f64> = match (form.delay, n) {
+        (false, _) => Vec::new(),
+        (true, 3..) => [known(n - 1), known(n - 2), Some(0.0)]
+            .into_iter()
+            .flatten()
+            .collect(),
+        (true, _) => DELAYS.into_iter().filter(|d| *d <= longest).collect(),
+    };
     let mut tried: Vec<Found> = Vec::new();
     let mut attempt = |theta: Vec<f64>| {
         if let Some(solved) = data.solve(form, &theta, None) {

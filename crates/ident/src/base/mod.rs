@@ -14,6 +14,7 @@ mod response;
 
 pub use choose::choose;
 pub use form::{Form, FormError};
+pub use response::Grid;
 
 use crate::error::IdentError;
 use crate::rational::RationalFit;
@@ -46,6 +47,15 @@ pub struct BaseFit {
     pub wanders: bool,
     /// Whether a number stands at an end of what the sampling and the length of the records can tell.
     pub at_bound: bool,
+}
+
+impl BaseFit {
+    /// Whether the records tell every number of the model.
+    fn is_seen(&self) -> bool {
+        let m = &self.model;
+        let all = m.numerator_sd.iter().chain(&m.denominator_sd);
+        all.chain([&m.delay_sd_s]).all(|sd| sd.is_finite())
+    }
 }
 
 /// Least rows with an output for a model with `parameters` numbers.

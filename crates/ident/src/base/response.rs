@@ -8,9 +8,9 @@ const FINE: usize = 4;
 
 /// An input on the grid on which it is constant from step to step.
 #[derive(Debug, Clone)]
-pub(super) struct Grid {
-    /// Value in each step.
-    held: Vec<f64>,
+pub struct Grid {
+    /// Value in each step, the input's unit.
+    pub held: Vec<f64>,
     /// Value at the end of each step, which a direct path shows.
     end: Vec<f64>,
     /// Steps between two rows.
@@ -18,7 +18,7 @@ pub(super) struct Grid {
 }
 
 impl Grid {
-    /// A held input is its own grid; between samples of a smooth one go cubics whose slope at a sample is that of its neighbours,
+    /// The grid of an input, one value a row. A held input is its own grid; between samples of a smooth one go cubics whose slope at a sample is that of its neighbours,
     /// or straight lines into a plant with a direct path.
     pub fn new(input: &[f64], hold: Hold, direct: bool) -> Self {
         if hold == Hold::ZeroOrder {
@@ -60,7 +60,7 @@ impl Grid {
     }
 
     /// The grid from a row on, `rows` long.
-    pub fn part(&self, from: usize, rows: usize) -> Self {
+    pub(super) fn part(&self, from: usize, rows: usize) -> Self {
         let range = from * self.steps..(from + rows) * self.steps;
         Self {
             held: self.held[range.clone()].to_vec(),

@@ -22,7 +22,10 @@ static SPEC: Spec = Spec {
     equation: "y(t - delay)",
     signature: "phase in proportion to frequency, flat gain",
     ahead_of_plant: false,
-    forms: &[Form::only(&[ParameterSpec::new("delay_s", "s", 0.0, 1.0)])],
+    // A heater or a tank may be minutes late.
+    forms: &[Form::only(&[ParameterSpec::new(
+        "delay_s", "s", 0.0, 3600.0,
+    )])],
     confused_with: &["driver-lag", "exposure-averaging", "bubble"],
     inseparable_from: &[],
     experiment: Experiment::Band,

@@ -128,7 +128,7 @@ fn numbers_that_are_not_finite_or_out_of_range_name_key_value_unit_and_range() {
         assert_eq!(
             message,
             format!(
-                "m.toml:7:11: `effects[0].delay_s` = {said}: it must be a finite number in 0..1 s"
+                "m.toml:7:11: `effects[0].delay_s` = {said}: it must be a finite number in 0..3600 s"
             )
         );
     }

@@ -128,6 +128,17 @@ pub(crate) fn motion(ctx: &Context<'_>) -> Result<(), ReconcileError> {
             hint,
         })
     };
+    if explained > 0.25 && problem.base.free_start {
+        // Of another plant nothing is known of its units but what the model has.
+        return if (0.3..=3.0).contains(&gain) {
+            Ok(())
+        } else {
+            units(
+                "model and records differ in a factor",
+                "they have other units (--input-um-per-unit, --output-um-per-unit), or the model is of another plant: identify it from these records",
+            )
+        };
+    }
     if explained > 0.25 {
         if gain < 0.0 {
             return units(

@@ -15,4 +15,5 @@ pub(crate) mod result;
 mod sentences;
 mod significance;
 mod split;
+mod units;
 pub(crate) mod workflow;

@@ -1,8 +1,8 @@
 //! `cellpos identify --data`: anybody's records.
 
+use super::Args;
 use super::report::{log_grid, number};
 use super::sources::{self, Source};
-use super::Args;
 use crate::commands::base::{self, Base, coefficients};
 use crate::commands::report::with_interval;
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
@@ -136,11 +136,22 @@ fn base_of(
     let spectral = results.iter().any(|(_, r)| !r.models.is_empty());
     match found {
         // Brownian motion on an integrator is no error of the free run: the response, fitted on increments, knows more.
-        Ok(base) if base.fit.wanders && spectral && args.base.is_none() => Ok(None),
+        Ok(base) if base.fit.wanders && responds(results) && args.base.is_none() => Ok(None),
         Ok(base) => Ok(Some(base)),
         Err(error) if args.base.is_some() || !spectral => Err(error),
         Err(_) => Ok(None),
     }
+}
+
+/// Whether a frequency response has told a plant that integrates, number by number.
+fn responds(results: &[(PathBuf, ForeignResult)]) -> bool {
+    results.iter().any(|(_, r)| {
+        let slowest = r.points.first().map_or(0.0, |p| p.frequency_hz);
+        (r.models.first()).is_some_and(|m| {
+            let below = std::f64::consts::TAU * slowest;
+            identified(m) && m.poles.iter().any(|p| p.norm() < below)
+        })
+    })
 }
 
 fn mean_input(sources: &[Source]) -> f64 {

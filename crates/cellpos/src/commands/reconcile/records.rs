@@ -65,7 +65,10 @@ pub(super) fn files(data: &[PathBuf]) -> Result<Vec<PathBuf>, Failure> {
             inside.sort();
             if inside.is_empty() {
                 return Err(Failure::bad_input(
-                    format!("no record (csv, dat, txt, npy, mat) and no run folder in {}", path.display()),
+                    format!(
+                        "no record (csv, dat, txt, npy, mat) and no run folder in {}",
+                        path.display()
+                    ),
                     "--data takes record files (text, .npy, .mat), run folders, or a folder of them",
                 ));
             }
