@@ -142,15 +142,20 @@ fn seconds_in(name: &str) -> f64 {
         Some((_, rest)) => rest.trim_end_matches([']', ')']).trim(),
         None => name.rsplit_once('_').map_or("", |(_, unit)| unit),
     };
-    match unit.to_lowercase().as_str() {
+    seconds_of(&unit.to_lowercase()).unwrap_or(1.0)
+}
+
+fn seconds_of(unit: &str) -> Option<f64> {
+    Some(match unit {
+        "s" | "sec" | "seconds" => 1.0,
         "ms" | "msec" => 1e-3,
         "us" | "\u{b5}s" | "\u{3bc}s" | "usec" => 1e-6,
         "ns" => 1e-9,
         "min" => 60.0,
         "h" | "hours" => 3600.0,
         "d" | "days" => 86400.0,
-        _ => 1.0,
-    }
+        _ => return None,
+    })
 }
 
 /// The column of time, and the seconds of its unit.
@@ -166,8 +171,13 @@ fn time_column(
     }
     let called = |name: &&String| {
         let plain = name.to_lowercase();
-        let stem = plain.split(['[', '(', '_', ' ']).next().unwrap_or("");
-        TIMES.contains(&stem)
+        let mut words = plain
+            .split(['[', '(', '_', ' ', ']', ')'])
+            .filter(|word| !word.is_empty());
+        let stem = words.next().unwrap_or("");
+        // `T [degC]` is a temperature.
+        let of_time = words.next().is_none_or(|unit| seconds_of(unit).is_some());
+        TIMES.contains(&stem) && of_time
     };
     let mut found = table.names.iter().filter(called);
     match (found.next(), found.next()) {

@@ -13,7 +13,7 @@ use cellpos_experiment::on_rig::OnRig;
 use cellpos_plant::Model;
 use cellpos_plant::effects::Definition;
 use cellpos_reconcile::{NoiseKind, Options, Reconciliation, Verdict};
-use model::Data;
+use model::{Asked, Data};
 use records::{Columns, files, is_run, read, read_run};
 use std::path::{Path, PathBuf};
 
@@ -172,7 +172,12 @@ pub fn run(args: Args) -> CommandResult {
         rests_um: &rests_um,
         of_runs: files.iter().all(|file| is_run(file)),
     };
-    let model = model::model_of(&args, &data, &mut options)?;
+    let asked = Asked {
+        model: &args.model,
+        base: args.base,
+        hold: args.hold,
+    };
+    let model = model::model_of(&asked, &data, &mut options)?;
     let bar = output::progress_bar(None);
     let mut progress = |text: &str| {
         bar.set_message(text.to_owned());

@@ -3,7 +3,7 @@
 use super::design::Data;
 use super::fit::{Found, descend, finished, most_delay, search};
 use super::form::Form;
-use super::{BaseFit, Series, checked};
+use super::types::{BaseFit, Series, checked};
 use crate::error::IdentError;
 use crate::rational::roots;
 use crate::sampled::Hold;
@@ -159,8 +159,9 @@ impl Trial {
         let longest = most_delay(data.longest);
         let found = descend(data, &form, start, longest)?;
         let (mut left, mut rows) = (0.0, 0);
+        let delay = found.theta.get(form.free_poles()).copied().unwrap_or(0.0);
         for last in [false, true] {
-            let (seen, unseen) = (data.half(last), data.half(!last));
+            let (seen, unseen) = (data.half(last, delay), data.half(!last, delay));
             let of_half = descend(&seen, &form, &found.theta, longest)?;
             let gains = seen.solve(&form, &of_half.theta, None)?.numerator;
             let predicted = unseen.solve(&form, &of_half.theta, Some(&gains))?;

@@ -1,8 +1,8 @@
 //! What a set of poles and a delay leave of the records, with everything linear solved for.
 
-use super::Series;
 use super::form::Form;
 use super::response::{Grid, driven, free};
+use super::types::Series;
 use crate::sampled::Hold;
 use nalgebra::{DMatrix, DVector};
 
@@ -87,14 +87,17 @@ impl Data {
     }
 
     /// The same records with the first or the last halves alone counting: the others must be predicted.
-    pub fn half(&self, last: bool) -> Self {
+    pub fn half(&self, last: bool, delay: f64) -> Self {
+        // What a delay reaches back to lies before the cut: those rows say nothing.
+        let late = if last { delay.ceil() as usize + 1 } else { 0 };
         let cut = |s: &Stretch| {
             let n = s.output.len();
             let range = if last { n / 2..n } else { 0..n / 2 };
+            let counts = s.counts[range.clone()].iter().enumerate();
             Stretch {
                 held: [0, 1].map(|i: usize| s.held[i].part(range.start, range.len())),
-                output: s.output[range.clone()].to_vec(),
-                counts: s.counts[range].to_vec(),
+                counts: counts.map(|(k, counts)| *counts && k >= late).collect(),
+                output: s.output[range].to_vec(),
             }
         };
         Self::of(self.stretches.iter().map(cut).collect())

@@ -1,8 +1,8 @@
 //! The fit of one form: starts, the search over poles and delay, and what the numbers are worth.
 
-use super::BaseFit;
 use super::design::{Data, Solved};
 use super::form::Form;
+use super::types::BaseFit;
 use crate::least_squares::{covariance, minimise};
 use crate::rational::{RationalFit, roots};
 use nalgebra::DMatrix;

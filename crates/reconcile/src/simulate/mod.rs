@@ -45,9 +45,28 @@ pub(crate) fn simulate(
 ) -> u64 {
     let chain = Chain::new(base, effects);
     let work = u.len() as u64 * chain.work_per_row();
-    chain.run(u, y, edge);
+    let late = (chain.frames.delay_s / base.sample_s).ceil();
+    if !base.free_start || late < 1.0 || u.is_empty() {
+        chain.run(u, y, edge);
+        return work;
+    }
+    // A plant that need not have rested had its first command before the record too, as far back as a delay reaches: the response to
+    // the step from rest falls into the start, which is free.
+    let before = late.min(MOST_BEFORE) as usize;
+    let longer: Vec<f64> = std::iter::repeat_n(u[0], before)
+        .chain(u.iter().copied())
+        .collect();
+    let mut edge = edge;
+    chain.run(&longer, y, edge.as_deref_mut());
+    y.drain(..before);
+    if let Some(edge) = edge {
+        edge.drain(..before);
+    }
     work
 }
+
+/// Most rows that are put before a record.
+const MOST_BEFORE: f64 = 50_000.0;
 
 /// Work of a step that every chain has, and of a block that is not linear, in advances of one mode.
 const WORK_OF_STEP: usize = 8;

@@ -284,8 +284,10 @@ pub fn number(value: f64) -> String {
         format!("{value:.1}")
     } else if value.abs() >= 1.0 {
         format!("{value:.3}")
-    } else {
+    } else if value.abs() >= 1e-3 {
         format!("{value:.4}")
+    } else {
+        format!("{value:.3e}")
     }
 }
 

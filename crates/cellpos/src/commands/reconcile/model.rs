@@ -1,7 +1,6 @@
 //! The model that a reconciliation extends: a file, a gain, or a base that is fitted to the records; and fitted once more where
 //! that is all that was missing.
 
-use super::Args;
 use super::records::{at_rest_of_runs, fitted, with_camera_delay};
 use crate::commands::base::{self, Base};
 use crate::commands::identify::HoldKind;
@@ -9,7 +8,10 @@ use crate::outcome::Failure;
 use cellpos_experiment::collect::refused;
 use cellpos_ident::base::{Form, Series};
 use cellpos_ident::sampled::Hold;
-use cellpos_plant::Model;
+use cellpos_plant::effects::Action;
+use cellpos_plant::{
+    Effect, Model, Noise, Place, Sampled, SimulateOptions, TransferFunction, simulate,
+};
 use cellpos_reconcile::{Options, Reconciliation, Record, Verdict, reconcile};
 
 /// Records, and what is known of them.
@@ -21,9 +23,19 @@ pub(super) struct Data<'a> {
     pub of_runs: bool,
 }
 
+/// The model that is asked for.
+pub(super) struct Asked<'a> {
+    /// A name, a file, or `fit`.
+    pub model: &'a str,
+    /// The form of a base that stands in its place.
+    pub base: Option<Form>,
+    /// How the command acts between rows.
+    pub hold: Option<HoldKind>,
+}
+
 /// The model to extend; says in `options` how its records are to be taken.
 pub(super) fn model_of(
-    args: &Args,
+    args: &Asked<'_>,
     data: &Data<'_>,
     options: &mut Options,
 ) -> Result<Model, Failure> {
@@ -35,7 +47,7 @@ pub(super) fn model_of(
     let mut model = match args.base {
         Some(form) => {
             let hold = args.hold.unwrap_or(HoldKind::ZeroOrder);
-            let base = fit(data.records, base::hold_of(hold), form)?;
+            let base = fit(data.records, &[], base::hold_of(hold), form)?;
             for line in base.words().lines() {
                 tracing::info!("{line}");
             }
@@ -44,7 +56,7 @@ pub(super) fn model_of(
             }
             base.model()?
         }
-        None => Model::load(&args.model).map_err(Failure::input)?,
+        None => Model::load(args.model).map_err(Failure::input)?,
     };
     // A model of other data says how its input was sampled; such a plant need not have rested before a record.
     let stated = model.provenance.get(base::HOLD).cloned();
@@ -60,22 +72,24 @@ pub(super) fn model_of(
     Ok(model)
 }
 
-fn fit(records: &[Record], hold: Hold, form: Form) -> Result<Base, Failure> {
+/// Fits a base behind what is known to happen to its input (`ahead`, row by row of every record; none where nothing does).
+fn fit(records: &[Record], ahead: &[Vec<f64>], hold: Hold, form: Form) -> Result<Base, Failure> {
     let rate_hz = base::common_rate(records.iter().map(|r| 1.0 / r.sample_s))?;
-    let series: Vec<Series> = (records.iter())
-        .map(|r| Series {
-            input: r.pzt_um.clone(),
+    let series: Vec<Series> = (records.iter().enumerate())
+        .map(|(i, r)| Series {
+            input: ahead.get(i).unwrap_or(&r.pzt_um).clone(),
             output: r.bead_um.clone(),
         })
         .collect();
     base::fit(&series, rate_hz, hold, Some(form), form.order)
 }
 
-/// Part of what an effect closes, beyond which the base itself, fitted again, is what was wrong.
-const LEAST_PART: f64 = 0.8;
+/// Most times that the base is fitted again.
+const ROUNDS: usize = 3;
 
-/// Reconciles; where an effect is named and the base model of these data, fitted again to these records with the same form, closes
-/// as much without any effect, the base was what was off, and the records are looked at again with that one.
+/// Reconciles. Where a set is named of which a part is linear, and the model is a base that was fitted to data, that part may be
+/// no more than what the fit of the base got wrong, not knowing of the others: the base is fitted again, with the same form, behind
+/// what the others do to its input, and the records are looked at once more. What is then not needed any longer was no effect.
 ///
 /// # Errors
 /// Records or a model about which no verdict is possible.
@@ -85,50 +99,121 @@ pub(super) fn reconcile_or_refit(
     options: &Options,
     progress: &mut dyn FnMut(&str),
 ) -> Result<Reconciliation, Failure> {
-    let found = reconcile(model, records, options, progress).map_err(refused)?;
+    let mut found = reconcile(model, records, options, progress).map_err(refused)?;
+    let Some(form) = base::form_of(model).filter(|_| options.free_start) else {
+        return Ok(found);
+    };
+    let mut present = model.clone();
+    let mut gone: Vec<String> = Vec::new();
+    for _ in 0..ROUNDS {
+        let lines = linear_of(&found, &present);
+        if lines.is_empty() {
+            break;
+        }
+        progress("the base model, fitted again beside what was found");
+        let Some(again) = refitted(&found, &present, records, options, form) else {
+            break;
+        };
+        let Ok(next) = reconcile(&again, records, options, progress) else {
+            break;
+        };
+        if !is_simpler(&next, &found, &again, lines.len()) {
+            break;
+        }
+        let left: Vec<&str> = next.effects.iter().map(|e| e.id.as_str()).collect();
+        gone.extend(lines.into_iter().filter(|id| !left.contains(&id.as_str())));
+        (found, present) = (next, again);
+    }
+    if !gone.is_empty() {
+        found.places.push(format!(
+            "the base model itself was off: fitted again with the same form ({form}) it needs no {}, so that is no name; the plant is now num {:?}, den {:?}",
+            gone.join(", "),
+            present.plant.num(),
+            present.plant.den(),
+        ));
+    }
+    Ok(found)
+}
+
+/// The linear ones among the effects that were named.
+fn linear_of(found: &Reconciliation, model: &Model) -> Vec<String> {
     let named = matches!(
         found.verdict,
         Verdict::Named | Verdict::NamedWithRemainder | Verdict::Ambiguous
     );
-    let Some(form) = base::form_of(model).filter(|_| named && options.free_start) else {
-        return Ok(found);
+    let new = found.augmented.effects.iter().filter(|e| {
+        let was = model.effect(e.id()).is_some();
+        named && !was && is_linear(e)
+    });
+    new.map(|e| e.id().to_owned()).collect()
+}
+
+fn is_linear(effect: &Effect) -> bool {
+    matches!(
+        effect.act(),
+        Action::Linear(_) | Action::Bypass(_) | Action::Delay(_) | Action::Exposure(_)
+    )
+}
+
+/// The base fitted again behind the effects that were found before it and are not linear.
+fn refitted(
+    found: &Reconciliation,
+    model: &Model,
+    records: &[Record],
+    options: &Options,
+    form: Form,
+) -> Option<Model> {
+    let early = |e: &&Effect| {
+        let spec = e.kind().spec();
+        (spec.place < Place::Chip || spec.ahead_of_plant) && !is_linear(e)
     };
+    let ahead = Model {
+        plant: TransferFunction::new(vec![1.0], vec![1.0]).ok()?,
+        working_point_um: model.working_point_um,
+        effects: (found.augmented.effects.iter())
+            .filter(early)
+            .cloned()
+            .collect(),
+        noise: Noise::NONE,
+        ..Model::eq6()
+    };
+    let mut inputs = Vec::new();
+    if !ahead.effects.is_empty() {
+        let after = SimulateOptions {
+            sampled: Sampled::AfterCommand,
+            ..SimulateOptions::default()
+        };
+        for r in records {
+            let from_rest = simulate(&ahead, &r.pzt_um, r.sample_s, &after).ok()?;
+            let input = from_rest.iter().map(|v| v + model.working_point_um);
+            inputs.push(input.collect());
+        }
+    }
     let hold = match options.interpolated_input {
         true => Hold::None,
         false => Hold::ZeroOrder,
     };
-    let Ok(again) = fit(records, hold, form) else {
-        return Ok(found);
-    };
-    let mut again = again.model()?;
-    // Effects that the model had besides its delay stay.
-    for effect in &model.effects {
-        if effect.id() != "time-delay" {
-            again = again.with_effect(effect.clone());
-        }
+    let mut again = fit(records, &inputs, hold, form).ok()?.model().ok()?;
+    if !form.integrating || !ahead.effects.is_empty() {
+        again.working_point_um = model.working_point_um;
     }
+    // What the model had besides its delay stays.
+    let kept = model.effects.iter().filter(|e| e.id() != "time-delay");
+    again.effects.extend(kept.cloned());
     again.noise = model.noise;
-    progress("the base model, fitted again to these records");
-    let alone = Options {
-        max_effects: 0,
-        ..options.clone()
-    };
-    let Ok(without) = reconcile(&again, records, &alone, progress) else {
-        return Ok(found);
-    };
-    let closed = |left: f64| found.gap.before.powi(2) - left.powi(2);
-    if closed(without.gap.after) < LEAST_PART * closed(found.gap.after) {
-        return Ok(found);
-    }
-    let mut result = reconcile(&again, records, options, progress).map_err(refused)?;
-    let names: Vec<&str> = found.effects.iter().map(|e| e.id.as_str()).collect();
-    result.places.push(format!(
-        "the base model itself was off: fitted again to these records with the same form ({form}) it closes {:.0} % of what {} would close, \
-         so that is no name; plant now num {:?}, den {:?}",
-        100.0 * closed(without.gap.after) / closed(found.gap.after),
-        names.join(" + "),
-        again.plant.num(),
-        again.plant.den(),
-    ));
-    Ok(result)
+    Some(again)
 }
+
+/// Whether a result needs fewer linear effects, or none, and leaves hardly more than another.
+fn is_simpler(next: &Reconciliation, found: &Reconciliation, again: &Model, linear: usize) -> bool {
+    let fewer = match next.verdict {
+        Verdict::NothingMissing => true,
+        Verdict::Unknown => false,
+        _ => linear_of(next, again).len() < linear,
+    };
+    let closed = found.gap.before.powi(2) - found.gap.after.powi(2);
+    fewer && next.gap.after.powi(2) <= found.gap.after.powi(2) + MORE_LEFT * closed.max(0.0)
+}
+
+/// Part of what a set closes that may be open again without its linear effects.
+const MORE_LEFT: f64 = 0.01;
