@@ -129,15 +129,7 @@ pub(crate) fn motion(ctx: &Context<'_>) -> Result<(), ReconcileError> {
         })
     };
     if explained > 0.25 && problem.base.free_start {
-        // Of another plant nothing is known of its units but what the model has.
-        return if (0.3..=3.0).contains(&gain) {
-            Ok(())
-        } else {
-            units(
-                "model and records differ in a factor",
-                "they have other units (--input-um-per-unit, --output-um-per-unit), or the model is of another plant: identify it from these records",
-            )
-        };
+        return of_other_data(gain);
     }
     if explained > 0.25 {
         if gain < 0.0 {
@@ -179,6 +171,18 @@ pub(crate) fn motion(ctx: &Context<'_>) -> Result<(), ReconcileError> {
     Err(ReconcileError::AnotherRig {
         explained_percent: 100.0 * explained.max(alike).clamp(0.0, 1.0),
         detail: String::new(),
+    })
+}
+
+/// Of another plant nothing is known of its units but what the model has.
+fn of_other_data(gain: f64) -> Result<(), ReconcileError> {
+    if (0.3..=3.0).contains(&gain) {
+        return Ok(());
+    }
+    Err(ReconcileError::Units {
+        what: "model and records differ in a factor",
+        ratio: gain,
+        hint: "they have other units (--input-um-per-unit, --output-um-per-unit), or the model is of another plant: identify it from these records",
     })
 }
 

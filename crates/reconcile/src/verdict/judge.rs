@@ -157,7 +157,7 @@ fn refusal(
             "the best of the catalogue, {best}, is no name: {words}"
         ));
     }
-    if let Some(words) = not_earned(e) {
+    if let Some(words) = not_earned(e, ctx.problem.base.free_start) {
         return Some(format!(
             "the best of the catalogue, {best}, is no name: {words}"
         ));
@@ -221,11 +221,14 @@ pub(crate) fn first_at_bound(ctx: &Context<'_>, fit: &Fit) -> Option<(usize, Str
 }
 
 /// A name must help on data that was not fitted, in innovations and, where its effect is beyond what the walk makes, in free run.
-fn not_earned(e: &Evidence<'_>) -> Option<String> {
+fn not_earned(e: &Evidence<'_>, of_other_data: bool) -> Option<String> {
     let (before, after) = (e.held.free_before_um, e.held.free_after_um);
     // The walk's own scatter is as large as itself.
     let floor = 2.0 * e.held.free_floor_um;
-    if before > floor && after > floor && after > (1.0 - THRESHOLDS.free_run_fall) * before {
+    let falls = after <= (1.0 - THRESHOLDS.free_run_fall) * before;
+    // The walk is the same in both: whatever its size, a base that was fitted to the records does not run worse with what it lacks.
+    let grows = of_other_data && after > (1.0 + THRESHOLDS.free_run_fall) * before;
+    if grows || (before > floor && after > floor && !falls) {
         return Some(format!(
             "the free run on held-out records is off by {} with it and by {} without",
             figure(after),
