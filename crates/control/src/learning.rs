@@ -18,7 +18,7 @@
 //! that it saves is no longer above the variance that it brings.
 //!
 //! **Guard.** Without a fix, for some ticks after, and where the command meets its limits, nothing is learned; the addition
-//! goes on. When the error of a cycle grows past that of the start, the addition is taken back and learning begins anew; the third time
+//! goes on; where two stretches in a row meet the limits it is taken back. When the error of a cycle grows past that of the start, the addition is taken back and learning begins anew; the third time
 //! it ends.
 
 mod beside;
@@ -86,6 +86,8 @@ pub struct LearnerState {
     sum_um2: f64,
     ticks: u32,
     pause: u32,
+    /// Stretches in a row in which the command met its limits while something learned was in force.
+    limited: u32,
     /// Ticks in a row without a fix.
     silent: u32,
     retreats: u32,
@@ -109,6 +111,8 @@ const FORGIVEN_CYCLES: f64 = 200.0;
 const NOISE_UM: f64 = 0.1;
 /// Shortest time over which the guard looks, ticks.
 const GUARD_TICKS: f64 = 20.0;
+/// Stretches in a row that limits may spoil before what was learned is taken back.
+const MOST_LIMITED: u32 = 2;
 /// Growth of the stretches.
 const LONGER: f64 = 1.5;
 
@@ -211,6 +215,7 @@ impl Learner {
             sum_um2: 0.0,
             ticks: 0,
             pause: 0,
+            limited: 0,
             silent: 0,
             retreats: 0,
             in_row: 0,
@@ -384,6 +389,17 @@ impl Learner {
     /// The end of a stretch: what stands out of the noise is corrected.
     fn look(&self, state: &mut LearnerState, driven: &Driven) {
         let evidence = state.evidence;
+        // Beyond range or slew the addition does not do what the response says, and what it does instead is not learned.
+        let learned = state.lines.iter().any(|line| line.active);
+        state.limited = if evidence.is_limited() && learned {
+            state.limited + 1
+        } else {
+            0
+        };
+        if state.limited >= MOST_LIMITED {
+            self.retreat(state);
+            return;
+        }
         let noise = evidence.noise(self.harmonics(), &state.noise);
         let cycles = f64::from(evidence.ticks()) * self.fix_advance;
         let floor = 1.0 - (1.0 - 1.0 / self.config.longest_cycles.max(2.0)).powf(cycles);
@@ -432,9 +448,14 @@ impl Learner {
         let first_um2 = *state.first_um2.get_or_insert(mean_um2);
         let limit = first_um2.max(NOISE_UM * NOISE_UM) * self.config.retreat_growth.powi(2);
         let learned = state.lines.iter().any(|line| line.active);
-        if mean_um2 <= limit || !learned || state.in_row >= MOST_RETREATS {
-            return;
+        if mean_um2 > limit && learned && state.in_row < MOST_RETREATS {
+            self.retreat(state);
         }
+    }
+
+    /// Takes the addition back, and learns anew unless that has been in vain.
+    fn retreat(&self, state: &mut LearnerState) {
+        state.limited = 0;
         if state.cycles - state.retreat_cycle > FORGIVEN_CYCLES {
             state.in_row = 0;
         }

@@ -382,3 +382,66 @@ fn a_model_known_well_lets_more_be_learned_and_one_known_badly_less() {
     assert!(learned && learned_too && !refused);
     assert!(sharp < 0.4 * fixed && vague > 1.0);
 }
+
+#[test]
+fn where_the_slew_does_not_carry_the_motion_nothing_learned_stays_in_force() {
+    // 1.5 um at 300 Hz asks for 12 um of PZT a tick, and the slew allows 10.
+    for (amplitude_um, gain, adapt) in [
+        (1.5, 0.8, true),
+        (1.5, 0.8, false),
+        (1.5, 1.0, true),
+        (1.5, 1.2, true),
+        (1.5, 1.2, false),
+        (1.2, 0.8, true),
+        (1.2, 0.8, false),
+        (1.0, 0.8, true),
+    ] {
+        let frequency_hz = 300.0;
+        let lqg = ControllerConfig::Lqg(Lqg::default());
+        let profile = sine(amplitude_um, frequency_hz);
+        let learner = learner(lqg, &profile, frequency_hz);
+        let mut config = config(lqg);
+        config.estimator.adapt = adapt;
+        for seed in 0..3 {
+            let eq6 = RigConfig::eq6(seed);
+            let rig = RigConfig {
+                plant: eq6.plant.scaled(gain).unwrap(),
+                delay_s: 2.25e-3,
+                ..eq6
+            };
+            let rms_um = |learning: Option<(&Learner, LearnerState)>| {
+                let (mut squares, mut ticks) = (0.0, 0.0_f64);
+                let each = |k: u64, error_um: f64, _| {
+                    if k >= 600 {
+                        squares += error_um * error_um;
+                        ticks += 1.0;
+                    }
+                };
+                let table = run(
+                    config,
+                    rig.clone(),
+                    &profile,
+                    learning,
+                    4000,
+                    |_| false,
+                    each,
+                );
+                ((squares / ticks).sqrt(), table)
+            };
+            let (without_um, _) = rms_um(None);
+            let (with_um, table) = rms_um(Some((&learner, learner.start())));
+            let table = table.expect("a learner");
+            assert!(
+                with_um < 1.05 * without_um,
+                "{amplitude_um} um, gain {gain}, {adapt}: {without_um} um, {with_um} um"
+            );
+            // Of those without adaptation only that within the slew can be mended.
+            let carried = amplitude_um < 1.5 || gain > 1.0;
+            if !carried {
+                assert!(table.harmonics.is_empty(), "{table:?}");
+            } else if !adapt {
+                assert!(with_um < 0.4 * without_um, "{without_um} um, {with_um} um");
+            }
+        }
+    }
+}
