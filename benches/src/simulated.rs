@@ -64,7 +64,7 @@ pub struct Seen {
     pub output: LoopOutput,
 }
 
-/// Runs a controller along a profile, with learning if a learner is given; `before` may change the rig at each tick, `each`
+/// Runs a controller along a profile, with a fix in every so many ticks as its estimator is told, with learning if a learner is given; `before` may change the rig at each tick, `each`
 /// sees what happened. What was learned is given back.
 ///
 /// # Panics
@@ -81,6 +81,7 @@ pub fn run(
     let ts = config.model.sample_time_s;
     let late = (rig.delay_s - config.model.delay_s) / ts;
     let age_ticks = rig.delay_s / ts;
+    let every = config.estimator.ticks_per_fix.round() as u64;
     let mut rig = SimulatedRig::new(rig).expect("a sound rig");
     let mut controller = Controller::new(config).expect("a sound controller");
     controller.start(20.0, 20.0);
@@ -96,7 +97,7 @@ pub fn run(
         // A frame says by its time stamp how old it is.
         fix.offset_samples = late;
         let input = LoopInput {
-            measurement: Some(fix),
+            measurement: tick.is_multiple_of(every).then_some(fix),
             reference_um,
             preview_um: &preview,
             learned_um: learning.as_mut().map_or(0.0, |learning| {
@@ -107,7 +108,8 @@ pub fn run(
         };
         let output = controller.step(&input);
         if let Some(learning) = &mut learning {
-            learning.learn(Some((fix.position_um, age_ticks)), &output.driven);
+            let seen = input.measurement.map(|fix| (fix.position_um, age_ticks));
+            learning.learn(seen, &output.driven);
         }
         rig.advance(output.command_um);
         each(Seen {
