@@ -156,7 +156,9 @@ pub(crate) fn motion(ctx: &Context<'_>) -> Result<(), ReconcileError> {
                 "convert at 4 um per volt, or pass its scale with --input-um-per-unit 4",
             );
         }
-        if !(0.3..=3.0).contains(&gain) {
+        // A lag takes fast motion away, and no unit: the gain of slow motion has a say.
+        let plausible = 0.3..=3.0;
+        if !plausible.contains(&gain) && !plausible.contains(&level_likeness(problem, &sim).1) {
             return units(
                 "the gain of command or position",
                 "check the units of both columns and the model file",
@@ -164,7 +166,7 @@ pub(crate) fn motion(ctx: &Context<'_>) -> Result<(), ReconcileError> {
         }
         return Ok(());
     }
-    let alike = level_likeness(problem, &sim);
+    let (alike, _) = level_likeness(problem, &sim);
     if explained.max(alike) > THRESHOLDS.least_alike {
         return Ok(());
     }
@@ -186,9 +188,9 @@ fn of_other_data(gain: f64) -> Result<(), ReconcileError> {
     })
 }
 
-/// Part of the variance of the positions that the model's own positions explain at the best gain and delay.
-fn level_likeness(problem: &crate::problem::Problem, sim: &[Vec<f64>]) -> f64 {
-    let (mut best, mut yy, mut ss) = (0.0f64, 0.0, 0.0);
+/// Part of the variance of the positions that the model's own positions explain at the best gain and delay, and that gain.
+fn level_likeness(problem: &crate::problem::Problem, sim: &[Vec<f64>]) -> (f64, f64) {
+    let (mut best, mut gain, mut yy, mut ss) = (0.0f64, 0.0f64, 0.0, 0.0);
     let pairs: Vec<(Vec<f64>, Vec<f64>)> = problem
         .records
         .iter()
@@ -205,11 +207,12 @@ fn level_likeness(problem: &crate::problem::Problem, sim: &[Vec<f64>]) -> f64 {
             .iter()
             .map(|(y, s)| dot(&y[d.min(y.len())..], &s[..s.len().saturating_sub(d)]))
             .sum();
-        if ss > 0.0 && yy > 0.0 {
-            best = best.max(ys * ys / (ss * yy));
+        if ss > 0.0 && yy > 0.0 && ys * ys / (ss * yy) > best {
+            best = ys * ys / (ss * yy);
+            gain = ys / ss;
         }
     }
-    best
+    (best, gain)
 }
 
 /// By how many samples the output leads, where it fits clearly better so than with any delay.
