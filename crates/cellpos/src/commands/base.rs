@@ -15,6 +15,25 @@ pub const HOLD: &str = "hold";
 const FORM: &str = "base";
 pub const REST_OUTPUT: &str = "rest_output";
 
+/// Marks of the inputs that a base was fitted to.
+const RECORDS: &str = "records";
+
+/// A mark by which a record's input is known again.
+fn mark(input: &[f64]) -> String {
+    // FNV-1a over the bits.
+    let bytes = input.iter().flat_map(|v| v.to_bits().to_le_bytes());
+    let hash = bytes.fold(0xcbf2_9ce4_8422_2325_u64, |hash, byte| {
+        (hash ^ u64::from(byte)).wrapping_mul(0x0100_0000_01b3)
+    });
+    format!("{hash:016x}")
+}
+
+/// Whether a model says that it was fitted to a record of this input.
+pub fn was_fitted_to(model: &Model, input: &[f64]) -> bool {
+    let marks = model.provenance.get(RECORDS);
+    marks.is_some_and(|marks| marks.split(' ').any(|known| known == mark(input)))
+}
+
 pub fn hold_of(kind: HoldKind) -> Hold {
     match kind {
         HoldKind::ZeroOrder => Hold::ZeroOrder,
@@ -40,6 +59,7 @@ pub struct Base {
     pub hold: Hold,
     /// What a user should know before using it.
     pub advice: Vec<String>,
+    marks: String,
     mean_input: f64,
     range: (f64, f64),
     mean_output: f64,
@@ -120,7 +140,9 @@ pub fn fit(
             ));
         }
     }
+    let marks: Vec<String> = records.iter().map(|r| mark(&r.input)).collect();
     Ok(Base {
+        marks: marks.join(" "),
         mean_input: mean(&mut inputs()),
         mean_output: mean(&mut { outputs }),
         range,
@@ -164,6 +186,7 @@ impl Base {
             model.provenance.insert(key.to_owned(), value);
         };
         say(FORM, self.fit.form.to_string());
+        say(RECORDS, self.marks.clone());
         if !self.fit.form.integrating {
             say(REST_OUTPUT, self.mean_output.to_string());
         }

@@ -11,7 +11,7 @@ use crate::rig_file::{ClockKind, Frames, RigFile};
 use cellpos_experiment::collect::{self, Collected, Collecting};
 use cellpos_experiment::on_rig::OnRig;
 use cellpos_plant::Model;
-use cellpos_plant::effects::Definition;
+use cellpos_plant::effects::{self, Definition};
 use cellpos_reconcile::{NoiseKind, Options, Reconciliation, Verdict};
 use model::{Asked, Data};
 use records::{Columns, files, is_run, read, read_run};
@@ -208,6 +208,9 @@ pub fn run(args: Args) -> CommandResult {
         }
     };
     bar.finish_and_clear();
+    if result.verdict == Verdict::NothingMissing {
+        result.places.push(not_looked_for());
+    }
     if options.free_start || options.free_gain {
         let unit =
             |column: &str, else_it_is| columns::unit_of(column).unwrap_or(else_it_is).to_owned();
@@ -336,6 +339,18 @@ fn proposed(args: &Args, result: &Reconciliation) -> Option<(PathBuf, String)> {
         .proposal_toml()
         .filter(|_| result.verdict == Verdict::Unknown)?;
     Some((proposal_path(args.out.as_ref()?), text))
+}
+
+/// What a verdict of nothing missing does not speak of: effects that are simulated and that no search tries.
+fn not_looked_for() -> String {
+    let unsought = effects::all()
+        .into_iter()
+        .filter(|kind| kind.candidates().is_empty());
+    let ids: Vec<&str> = unsought.map(|kind| kind.spec().id).collect();
+    format!(
+        "not looked for: {}; the floor may hold them, and nothing is said of them",
+        ids.join(", ")
+    )
 }
 
 fn proposal_path(out: &Path) -> PathBuf {

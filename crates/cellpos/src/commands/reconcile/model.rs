@@ -87,7 +87,7 @@ fn fit(records: &[Record], ahead: &[Vec<f64>], hold: Hold, form: Form) -> Result
 /// Most times that the base is fitted again.
 const ROUNDS: usize = 3;
 
-/// Reconciles. Where a set is named of which a part is linear, and the model is a base that was fitted to data, that part may be
+/// Reconciles. Where a set is named of which a part is linear, and the model is a base that was fitted to these very records, that part may be
 /// no more than what the fit of the base got wrong, not knowing of the others: the base is fitted again, with the same form, behind
 /// what the others do to its input, and the records are looked at once more. What is then not needed any longer was no effect.
 ///
@@ -100,7 +100,10 @@ pub(super) fn reconcile_or_refit(
     progress: &mut dyn FnMut(&str),
 ) -> Result<Reconciliation, Failure> {
     let mut found = reconcile(model, records, options, progress).map_err(refused)?;
-    let Some(form) = base::form_of(model).filter(|_| options.free_start) else {
+    // A base that comes from other records has not bent to what is missing in these: what is linear there is a change, and a name.
+    let bent = |r: &Record| base::was_fitted_to(model, &r.pzt_um);
+    let own = options.free_start && records.iter().any(bent);
+    let Some(form) = base::form_of(model).filter(|_| own) else {
         return Ok(found);
     };
     let mut present = model.clone();
