@@ -208,18 +208,7 @@ pub fn run(args: Args) -> CommandResult {
         }
     };
     bar.finish_and_clear();
-    if result.verdict == Verdict::NothingMissing {
-        result.places.push(not_looked_for());
-    }
-    if options.free_start || options.free_gain {
-        let unit =
-            |column: &str, else_it_is| columns::unit_of(column).unwrap_or(else_it_is).to_owned();
-        let of_input = unit(&args.columns.input_column, "input units");
-        result.tell_in(
-            &of_input,
-            &unit(&args.columns.output_column, "output units"),
-        );
-    }
+    tell(&args, &options, &mut result);
     write(&args, &result, &collected)?;
     Ok(Outcome::Done)
 }
@@ -341,11 +330,29 @@ fn proposed(args: &Args, result: &Reconciliation) -> Option<(PathBuf, String)> {
     Some((proposal_path(args.out.as_ref()?), text))
 }
 
+/// Says what was not looked for, and everything in the units of the records.
+fn tell(args: &Args, options: &Options, result: &mut Reconciliation) {
+    if result.verdict == Verdict::NothingMissing {
+        result.places.push(not_looked_for());
+    }
+    if options.free_start || options.free_gain {
+        let unit =
+            |column: &str, else_it_is| columns::unit_of(column).unwrap_or(else_it_is).to_owned();
+        let of_input = unit(&args.columns.input_column, "input units");
+        result.tell_in(
+            &of_input,
+            &unit(&args.columns.output_column, "output units"),
+        );
+    }
+}
+
 /// What a verdict of nothing missing does not speak of: effects that are simulated and that no search tries.
 fn not_looked_for() -> String {
+    // Frames that are missing or repeated are counted, not fitted.
+    let counted = ["frame-drops", "frame-repeats"];
     let unsought = effects::all()
         .into_iter()
-        .filter(|kind| kind.candidates().is_empty());
+        .filter(|kind| kind.candidates().is_empty() && !counted.contains(&kind.spec().id));
     let ids: Vec<&str> = unsought.map(|kind| kind.spec().id).collect();
     format!(
         "not looked for: {}; the floor may hold them, and nothing is said of them",
