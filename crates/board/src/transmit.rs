@@ -38,21 +38,25 @@ impl TransmitBuffer {
             self.unsent = self.unsent.saturating_add(1);
             return;
         };
-        for &byte in frame {
-            let place = (self.first + self.filled) % CAPACITY;
-            if let Some(place) = self.bytes.get_mut(place) {
-                *place = byte;
-                self.filled += 1;
-            }
+        // To the end of the ring, and what is left from its beginning.
+        let end = (self.first + self.filled) % CAPACITY;
+        let before = CAPACITY - end;
+        for (place, byte) in self.bytes.iter_mut().skip(end).zip(frame) {
+            *place = *byte;
         }
+        for (place, byte) in self.bytes.iter_mut().zip(frame.iter().skip(before)) {
+            *place = *byte;
+        }
+        self.filled += frame.len();
     }
 
     pub(crate) fn take(&mut self, out: &mut [u8]) -> usize {
         let count = self.filled.min(out.len());
-        for to in out.iter_mut().take(count) {
-            *to = self.bytes.get(self.first).copied().unwrap_or(0);
-            self.first = (self.first + 1) % CAPACITY;
+        let ring = self.bytes.iter().skip(self.first).chain(&self.bytes);
+        for (to, byte) in out.iter_mut().take(count).zip(ring) {
+            *to = *byte;
         }
+        self.first = (self.first + count) % CAPACITY;
         self.filled -= count;
         count
     }

@@ -78,13 +78,14 @@ pub(crate) fn mean_between(path: &[(f64, f64)], from: f64, to: f64) -> (f64, f64
         return at(from);
     }
     let (mut x, mut y) = (0.0, 0.0);
-    let mut u = from;
+    let (mut u, mut a) = (from, at(from));
     while u < to {
-        let next = (u.floor() + 1.0).min(to);
-        let (a, b) = (at(u), at(next));
+        // Never negative: cutting off is rounding down, and no call.
+        let next = ((u as usize + 1) as f64).min(to);
+        let b = at(next);
         x += 0.5 * (a.0 + b.0) * (next - u);
         y += 0.5 * (a.1 + b.1) * (next - u);
-        u = next;
+        (u, a) = (next, b);
     }
     (x / (to - from), y / (to - from))
 }

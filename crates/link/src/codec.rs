@@ -131,27 +131,42 @@ impl<M: Message> Decoder<M> {
 
     /// Takes bytes off the front of `bytes` until a message is complete; `None` when all are used up.
     pub fn next_message(&mut self, bytes: &mut &[u8]) -> Option<M> {
-        while let Some((&byte, rest)) = bytes.split_first() {
+        while !bytes.is_empty() {
+            // Up to the next delimiter in one go.
+            let until = bytes.iter().position(|&byte| byte == DELIMITER);
+            let (body, rest) = bytes.split_at_checked(until.unwrap_or(bytes.len()))?;
+            self.keep(body);
             *bytes = rest;
-            if let Some(message) = self.push(byte) {
-                return Some(message);
+            if let Some((_, rest)) = rest.split_first() {
+                *bytes = rest;
+                if let Some(message) = self.end_of_frame() {
+                    return Some(message);
+                }
             }
         }
         None
     }
 
+    /// Takes bytes none of which is a delimiter.
+    fn keep(&mut self, bytes: &[u8]) {
+        let room = self.buffer.get_mut(self.filled..).unwrap_or_default();
+        for (place, byte) in room.iter_mut().zip(bytes) {
+            *place = *byte;
+        }
+        self.overlong |= bytes.len() > room.len();
+        self.filled += bytes.len().min(room.len());
+    }
+
     /// Takes one byte; yields a message if it completes one.
     pub fn push(&mut self, byte: u8) -> Option<M> {
         if byte != DELIMITER {
-            match self.buffer.get_mut(self.filled) {
-                Some(place) => {
-                    *place = byte;
-                    self.filled += 1;
-                }
-                None => self.overlong = true,
-            }
+            self.keep(&[byte]);
             return None;
         }
+        self.end_of_frame()
+    }
+
+    fn end_of_frame(&mut self) -> Option<M> {
         let length = core::mem::take(&mut self.filled);
         let overlong = core::mem::take(&mut self.overlong);
         if length == 0 {
