@@ -1,24 +1,8 @@
 //! `cellpos identify` and `cellpos paper` as a user runs them: through frames, on the virtual clock.
 
+use crate::script_runs::{cellpos, json};
 use serde_json::Value;
 use std::path::Path;
-use std::process::Command;
-
-fn cellpos(folder: &Path, args: &[&str]) -> (Option<i32>, String, String) {
-    let out = Command::new(env!("CARGO_BIN_EXE_cellpos"))
-        .args(args)
-        .current_dir(folder)
-        .output()
-        .unwrap();
-    let text = |bytes: Vec<u8>| String::from_utf8(bytes).unwrap();
-    (out.status.code(), text(out.stdout), text(out.stderr))
-}
-
-fn json(folder: &Path, args: &[&str]) -> Value {
-    let (code, out, err) = cellpos(folder, args);
-    assert_eq!(code, Some(0), "{out}\n{err}");
-    serde_json::from_str(&out).unwrap()
-}
 
 #[test]
 fn identify_through_frames_finds_eq6_its_delay_and_what_it_cannot_tell() {

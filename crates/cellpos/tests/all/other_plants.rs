@@ -1,19 +1,9 @@
 //! Records of plants that are not this rig's, in chains of commands, as somebody uses them who has read `--help`.
 
+use crate::script_runs::cellpos;
 use serde_json::Value;
 use std::fmt::Write as _;
 use std::path::Path;
-use std::process::Command;
-
-fn cellpos(folder: &Path, args: &[&str]) -> (Option<i32>, String, String) {
-    let out = Command::new(env!("CARGO_BIN_EXE_cellpos"))
-        .args(args)
-        .current_dir(folder)
-        .output()
-        .unwrap();
-    let text = |bytes: Vec<u8>| String::from_utf8(bytes).unwrap();
-    (out.status.code(), text(out.stdout), text(out.stderr))
-}
 
 fn done(folder: &Path, args: &[&str]) -> String {
     let (code, out, err) = cellpos(folder, args);
@@ -53,18 +43,26 @@ fn german((power, temperature): &(Vec<f64>, Vec<f64>)) -> String {
     text
 }
 
+/// The columns of that file, as options.
+const COLUMNS: [&str; 4] = [
+    "--input-column",
+    "Leistung",
+    "--output-column",
+    "Temperatur",
+];
+
+/// A folder with that file, `heater.csv`.
+fn with_heater(rows: usize) -> tempfile::TempDir {
+    let folder = tempfile::tempdir().unwrap();
+    std::fs::write(folder.path().join("heater.csv"), german(&heater(rows))).unwrap();
+    folder
+}
+
 #[test]
 fn a_heater_goes_from_its_logger_through_identify_simulate_and_reconcile_and_back() {
-    let folder = tempfile::tempdir().unwrap();
+    let folder = with_heater(900);
     let here = folder.path();
-    std::fs::write(here.join("heater.csv"), german(&heater(900))).unwrap();
-    let columns = [
-        "--input-column",
-        "Leistung",
-        "--output-column",
-        "Temperatur",
-    ];
-    let with = |first: &[&'static str], last: &[&'static str]| [first, &columns[..], last].concat();
+    let with = |first: &[&'static str], last: &[&'static str]| [first, &COLUMNS[..], last].concat();
 
     let base = [
         "identify",
@@ -135,15 +133,8 @@ fn a_heater_goes_from_its_logger_through_identify_simulate_and_reconcile_and_bac
 
 #[test]
 fn a_base_that_is_a_little_off_is_fitted_again_and_no_effect_is_made_of_it() {
-    let folder = tempfile::tempdir().unwrap();
+    let folder = with_heater(900);
     let here = folder.path();
-    std::fs::write(here.join("heater.csv"), german(&heater(900))).unwrap();
-    let columns = [
-        "--input-column",
-        "Leistung",
-        "--output-column",
-        "Temperatur",
-    ];
     let identify = [
         "identify",
         "--data",
@@ -153,7 +144,7 @@ fn a_base_that_is_a_little_off_is_fitted_again_and_no_effect_is_made_of_it() {
     ];
     done(
         here,
-        &[&identify[..], &columns, &["--out", "base.toml"]].concat(),
+        &[&identify[..], &COLUMNS, &["--out", "base.toml"]].concat(),
     );
     let mut model = cellpos_plant::Model::load_file(&here.join("base.toml")).unwrap();
     let (num, den) = (model.plant.num()[0], model.plant.den()[1]);
@@ -161,7 +152,7 @@ fn a_base_that_is_a_little_off_is_fitted_again_and_no_effect_is_made_of_it() {
         cellpos_plant::TransferFunction::new(vec![1.06 * num], vec![1.0, 1.1 * den]).unwrap();
     std::fs::write(here.join("off.toml"), model.to_toml_string()).unwrap();
     let reconcile = ["reconcile", "--data", "heater.csv", "--model", "off.toml"];
-    let said = done(here, &[&reconcile[..], &columns].concat());
+    let said = done(here, &[&reconcile[..], &COLUMNS].concat());
     assert!(
         !said.contains("verdict: named") && !said.contains("verdict: ambiguous"),
         "{said}"
@@ -170,9 +161,8 @@ fn a_base_that_is_a_little_off_is_fitted_again_and_no_effect_is_made_of_it() {
 
 #[test]
 fn what_cannot_be_read_says_what_would_be_right() {
-    let folder = tempfile::tempdir().unwrap();
+    let folder = with_heater(200);
     let here = folder.path();
-    std::fs::write(here.join("heater.csv"), german(&heater(200))).unwrap();
     let fails = |args: &[&str], says: &[&str]| {
         let (code, out, err) = cellpos(here, args);
         assert_eq!(code, Some(2), "{args:?}\n{out}\n{err}");

@@ -1,13 +1,11 @@
 //! What becomes of the bead where one run ends and the next begins, on the emulated rig and the virtual clock.
 
+use crate::common::{hold, run};
 use cellpos_emulator::EmulatedRig;
-use cellpos_plant::Model;
-use cellpos_rig::Clock;
 use cellpos_runtime::life::EventKind;
-use cellpos_runtime::{EndRule, Event, RunSink, Statistics, TickFlags, TickRecord};
-use cellpos_session::rig_file::{ClockKind, Frames};
+use cellpos_runtime::{Event, RunSink, Statistics, TickFlags, TickRecord};
+use cellpos_session::RigFile;
 use cellpos_session::setup::ReferenceSpec;
-use cellpos_session::{EndKind, Options, Rig, RigFile};
 use std::time::Duration;
 
 /// Gain of Eq. (6) below its pole-zero pair, 1/s.
@@ -29,36 +27,10 @@ impl RunSink for Kept {
     fn progress(&mut self, _: &Statistics) {}
 }
 
-/// A run of some ticks on a rig of which the world is kept.
-fn run(file: RigFile, reference: ReferenceSpec, ticks: u64) -> (EmulatedRig, Kept) {
-    let clock = Clock::virtual_at(0);
-    let model = Model::load("eq6").expect("built in");
-    let emulated =
-        EmulatedRig::new(file.board, &file.emulator, &model, clock.clone()).expect("a rig");
-    let options = Options {
-        clock: ClockKind::Virtual,
-        frames: Frames::Off,
-        best_effort: true,
-    };
-    let board = Box::new(emulated.actuator().expect("it answers"));
-    let source = Box::new(emulated.positions());
-    let mut rig = Rig::with_devices(file, options, source, board, clock).expect("a session");
-    let prepared = rig.prepare("eq6", "pi").expect("a PI for Eq. (6)");
-    let setup = rig.set_up(prepared, reference).expect("the PZT stands");
-    let core = setup.core().expect("a loop");
-    let end = EndRule {
-        ticks: Some(ticks),
-        ..EndRule::default()
-    };
-    let armed = rig.arm(&setup, core, Kept::default(), end).ok();
-    let finished = armed.expect("armed").start().and_then(|run| run.wait());
-    let finished = finished.expect("a run");
-    assert_eq!(finished.ended.kind, EndKind::Done, "{}", finished.ended);
-    (emulated, finished.sink)
-}
-
-fn hold() -> ReferenceSpec {
-    ReferenceSpec::Hold { position_um: 0.0 }
+/// A run with a PI: the world, which goes on, and what was kept.
+fn pi_run(file: RigFile, reference: ReferenceSpec, ticks: u64) -> (EmulatedRig, Kept) {
+    let ran = run(file, "pi", reference, ticks);
+    (ran.emulated, ran.sink)
 }
 
 #[test]
@@ -67,7 +39,7 @@ fn a_bead_at_the_border_of_the_view_stays_in_view_while_arming_and_is_brought_to
         let mut file = RigFile::default();
         file.emulator.start_um = start_um;
         file.emulator.seed = seed;
-        let (_, kept) = run(file, hold(), 1500);
+        let (_, kept) = pi_run(file, hold(), 1500);
         let first = kept
             .ticks
             .iter()
@@ -99,7 +71,7 @@ fn after_a_run_the_bead_goes_with_the_flow_that_park_leaves_and_not_otherwise() 
             file.board.power_up_um = park_um;
             let drift_um_per_s = file.emulator.drift_um_per_s;
             let beside_um = park_um - file.emulator.neutral_um;
-            let (emulated, kept) = run(file, reference.clone(), ticks);
+            let (emulated, kept) = pi_run(file, reference.clone(), ticks);
             let last_um = kept.ticks.last().expect("ticks").true_um;
             let at_um = |emulated: &EmulatedRig| emulated.now().world().bead_um();
             // Frozen where it was, within the delay of the camera and what the bead goes while the command arrives.

@@ -1,6 +1,7 @@
 //! Sessions with a rig.
 
 mod between_runs;
+mod common;
 mod multi_rate;
 mod rig_keys;
 mod rig_schema;

@@ -1,14 +1,10 @@
 //! A loop and a camera of different rates, on the emulated rig and the virtual clock.
 
+use crate::common::{Ran, hold, run};
 use cellpos_control::Adaptation;
-use cellpos_emulator::EmulatedRig;
-use cellpos_plant::Model;
-use cellpos_rig::Clock;
 use cellpos_runtime::life::EventKind;
-use cellpos_runtime::{EndRule, Event, RunSink, Statistics, Summary, TickFlags, TickRecord};
-use cellpos_session::rig_file::{ClockKind, Frames};
-use cellpos_session::setup::ReferenceSpec;
-use cellpos_session::{EndKind, Options, Rig, RigFile};
+use cellpos_runtime::{Event, RunSink, Statistics, TickFlags, TickRecord};
+use cellpos_session::RigFile;
 
 /// What went by.
 #[derive(Default)]
@@ -43,35 +39,10 @@ fn rig_file(period_us: f64, rate_hz: f64) -> RigFile {
     file
 }
 
-/// Seconds of hold with a law; what the loop was told of the rates, too.
-fn hold(file: RigFile, law: &str, seconds: f64) -> (Summary, Kept, f64) {
-    let clock = Clock::virtual_at(0);
-    let model = Model::load("eq6").expect("built in");
-    let emulated =
-        EmulatedRig::new(file.board, &file.emulator, &model, clock.clone()).expect("a rig");
-    let options = Options {
-        clock: ClockKind::Virtual,
-        frames: Frames::Off,
-        best_effort: true,
-    };
-    let board = Box::new(emulated.actuator().expect("it answers"));
-    let source = Box::new(emulated.positions());
+/// Seconds of hold with a law.
+fn hold_for(file: RigFile, law: &str, seconds: f64) -> Ran<Kept> {
     let ticks = (seconds * 1e6 / file.timing.period_us) as u64;
-    let mut rig = Rig::with_devices(file, options, source, board, clock).expect("a session");
-    let prepared = rig.prepare("eq6", law).expect("a law for Eq. (6)");
-    let reference = ReferenceSpec::Hold { position_um: 0.0 };
-    let setup = rig.set_up(prepared, reference).expect("the PZT stands");
-    let core = setup.core().expect("a loop");
-    let ticks_per_fix = core.controller().settings().estimator.ticks_per_fix;
-    let end = EndRule {
-        ticks: Some(ticks),
-        ..EndRule::default()
-    };
-    let armed = rig.arm(&setup, core, Kept::default(), end).ok();
-    let finished = armed.expect("armed").start().and_then(|run| run.wait());
-    let finished = finished.expect("a run");
-    assert_eq!(finished.ended.kind, EndKind::Done, "{}", finished.ended);
-    (finished.summary, finished.sink, ticks_per_fix)
+    run(file, law, hold(), ticks)
 }
 
 /// In force is what is there, and so is what is stated; nothing is while chance is put to the test.
@@ -86,7 +57,8 @@ fn is_right(adaptation: &Adaptation) {
 fn ticks_between_the_frames_of_a_slower_camera_are_no_loss_and_no_wrong_gain() {
     for (period_us, law) in [(500.0, "mpc"), (200.0, "lqg")] {
         let every = (1000.0 / period_us) as u64;
-        let (summary, kept, told) = hold(rig_file(period_us, 1000.0), law, 20.0);
+        let ran = hold_for(rig_file(period_us, 1000.0), law, 20.0);
+        let (summary, kept, told) = (ran.summary, ran.sink, ran.ticks_per_fix);
         let counts = summary.counts;
         println!("{period_us} us: {summary:?}");
         assert_eq!(told, every as f64);
@@ -117,7 +89,8 @@ fn ticks_between_the_frames_of_a_slower_camera_are_no_loss_and_no_wrong_gain() {
 
 #[test]
 fn a_camera_faster_than_the_loop_costs_frames_and_nothing_else() {
-    let (summary, kept, told) = hold(rig_file(1000.0, 2000.0), "lqg", 20.0);
+    let ran = hold_for(rig_file(1000.0, 2000.0), "lqg", 20.0);
+    let (summary, kept, told) = (ran.summary, ran.sink, ran.ticks_per_fix);
     println!("{summary:?}");
     let counts = summary.counts;
     assert_eq!(told, 1.0);
