@@ -17,7 +17,8 @@ mod view_args;
 use cellpos_session::{cyclic, provenance, recording, rig_file, setup, signals, toml_file};
 use clap::{CommandFactory, FromArgMatches, Parser};
 use std::process::ExitCode;
-use tracing_subscriber::EnvFilter;
+use tracing_subscriber::filter::{LevelFilter, Targets};
+use tracing_subscriber::prelude::*;
 
 /// Closed-loop positioning of a cell or bead in a PDMS microchannel at 1 kHz.
 #[derive(Debug, Parser)]
@@ -42,17 +43,17 @@ struct Cli {
 }
 
 /// What is logged: as the environment says, else as the options do.
-fn log_filter(verbose: u8, quiet: bool) -> EnvFilter {
+fn log_filter(verbose: u8, quiet: bool) -> Targets {
     let said = ["RUST_LOG", "CELLPOS_LOG"]
         .into_iter()
-        .find_map(|name| EnvFilter::try_from_env(name).ok());
+        .find_map(|name| std::env::var(name).ok()?.parse().ok());
     let level = match (quiet, verbose) {
-        (true, _) => "error",
-        (false, 0) => "warn",
-        (false, 1) => "info",
-        (false, _) => "debug",
+        (true, _) => LevelFilter::ERROR,
+        (false, 0) => LevelFilter::WARN,
+        (false, 1) => LevelFilter::INFO,
+        (false, _) => LevelFilter::DEBUG,
     };
-    said.unwrap_or_else(|| EnvFilter::new(level))
+    said.unwrap_or_else(|| Targets::new().with_default(level))
 }
 
 /// The program's arguments, for completions and manual pages too.
@@ -80,12 +81,13 @@ fn main() -> ExitCode {
         Ok(cli) => cli,
         Err(error) => return outcome::exit_arguments(&error, json),
     };
-    tracing_subscriber::fmt()
+    let lines = tracing_subscriber::fmt::layer()
         .with_writer(|| cellpos_terminal::Log)
         .with_ansi(std::io::IsTerminal::is_terminal(&std::io::stderr()))
         .without_time()
-        .with_env_filter(log_filter(cli.verbose, cli.quiet))
-        .with_target(false)
+        .with_target(false);
+    tracing_subscriber::registry()
+        .with(lines.with_filter(log_filter(cli.verbose, cli.quiet)))
         .init();
     output::configure(output::Settings {
         command: matches.subcommand_name().unwrap_or("cellpos").to_owned(),
