@@ -29,6 +29,7 @@ mod report;
 mod search;
 mod simulate;
 mod thresholds;
+mod units;
 mod verdict;
 
 pub use data::actuator::constant_gain;
@@ -39,8 +40,8 @@ pub use data::record::Record;
 pub use error::ReconcileError;
 pub use report::report;
 pub use thresholds::{THRESHOLDS, Thresholds};
+pub use units::{Units, figure, figure_of};
 pub use verdict::battery::{Hypothesis, Term};
-pub use verdict::judge::figure;
 pub use verdict::map::{BAND_EDGES_HZ, Cell, DiscrepancyMap, MapRow, band_labels};
 pub use verdict::response::BandRatio;
 pub use verdict::result::{

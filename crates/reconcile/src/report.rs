@@ -1,5 +1,6 @@
 //! The HTML report: verdict, map, response before and after, traces, and the shrinking gap.
 
+use crate::units::figure;
 use crate::verdict::map::{BAND_EDGES_HZ, DiscrepancyMap, band_labels};
 use crate::verdict::result::{Reconciliation, Verdict};
 use cellpos_report::{Axis, Column, Emphasis, Figure, HeatMap, Panel, Report, Series, Table};
@@ -36,12 +37,27 @@ pub fn report(result: &Reconciliation, title: &str) -> Report {
     }
     r.table(t);
     r.paragraph(&format!(
-        "Noise of these records: Brownian motion of {:.3} um^2/s, localisation noise of {:.1} nm RMS; together an innovation of {:.1} nm RMS, which is the floor of every figure here.",
-        result.noise.diffusion_um2_per_s(result.sample_s),
-        1e3 * result.noise.localisation_um(),
-        1e3 * result.noise.innovation_um()
+        "Noise of these records: a random walk of {} {}^2/s, white noise of {} RMS; together an innovation of {} RMS, which is the floor of every figure here.",
+        figure(result.noise.diffusion_um2_per_s(result.sample_s)),
+        result.gap.unit,
+        small(result, result.noise.localisation_um()),
+        small(result, result.noise.innovation_um())
     ));
     r
+}
+
+/// What figures of the gap are printed in: nanometres of micrometres, else the unit of the records, and the factor.
+fn fine(result: &Reconciliation) -> (f64, &str) {
+    match result.gap.unit.as_str() {
+        "um" => (1e3, "nm"),
+        unit => (1.0, unit),
+    }
+}
+
+/// A figure of the gap.
+fn small(result: &Reconciliation, value: f64) -> String {
+    let (factor, unit) = fine(result);
+    format!("{} {unit}", figure(factor * value))
 }
 
 fn verdict(r: &mut Report, result: &Reconciliation) {
@@ -248,16 +264,17 @@ fn response(r: &mut Report, result: &Reconciliation) {
 fn gap(r: &mut Report, result: &Reconciliation) {
     r.section("The gap");
     let g = &result.gap;
+    let (factor, unit) = fine(result);
     r.paragraph(&format!(
-        "On held-out records: {:.1} nm before, {:.1} nm after, floor {:.1} nm RMS of innovation; closure {:.1} %.",
-        1e3 * g.before,
-        1e3 * g.after,
-        1e3 * g.floor,
+        "On held-out records: {} before, {} after, floor {} RMS of innovation; closure {:.1} %.",
+        small(result, g.before),
+        small(result, g.after),
+        small(result, g.floor),
         100.0 * g.closure()
     ));
     let mut t = Table::new([
         Column::left("model, as the search went on"),
-        Column::right("RMS innovation [nm]"),
+        Column::right(&format!("RMS innovation [{unit}]")),
     ]);
     for s in &g.steps {
         let name = if s.effects.is_empty() {
@@ -268,19 +285,19 @@ fn gap(r: &mut Report, result: &Reconciliation) {
         } else {
             s.effects.join(" + ")
         };
-        t.row([name, format!("{:.2}", 1e3 * s.rms)]);
+        t.row([name, figure(factor * s.rms)]);
     }
     r.table(t);
     let mut t = Table::new([
         Column::left("held-out record"),
-        Column::right("before [nm]"),
-        Column::right("after [nm]"),
+        Column::right(&format!("before [{unit}]")),
+        Column::right(&format!("after [{unit}]")),
     ]);
     for p in &g.per_record {
         t.row([
             p.record.clone(),
-            format!("{:.2}", 1e3 * p.before),
-            format!("{:.2}", 1e3 * p.after),
+            figure(factor * p.before),
+            figure(factor * p.after),
         ]);
     }
     r.table(t);
@@ -290,13 +307,13 @@ fn gap(r: &mut Report, result: &Reconciliation) {
         .map(|b| (b.low_hz.max(0.3) * b.high_hz).sqrt())
         .collect();
     let pick = |f: fn(&crate::verdict::result::BandGap) -> f64| {
-        g.bands.iter().map(|b| 1e3 * f(b)).collect::<Vec<f64>>()
+        g.bands.iter().map(|b| factor * f(b)).collect::<Vec<f64>>()
     };
     r.figure(
         Figure::new("spectrum", "Innovations by band").panel(
             Panel::new(
                 Axis::log("frequency", "Hz"),
-                Axis::log("innovation", "nm RMS"),
+                Axis::log("innovation", &format!("{unit} RMS")),
             )
             .series(Series::line("before", &x, &pick(|b| b.before)))
             .series(Series::line("after", &x, &pick(|b| b.after)))
@@ -310,6 +327,7 @@ fn traces(r: &mut Report, result: &Reconciliation) {
     r.paragraph(
         "Free runs of both models from the start of each record. A perfect model's residual wanders like a Brownian path.",
     );
+    let unit = &result.gap.unit;
     for t in &result.traces.0 {
         r.figure(
             Figure::new(
@@ -317,13 +335,13 @@ fn traces(r: &mut Report, result: &Reconciliation) {
                 &format!("{}: position and free-run residual", t.record),
             )
             .panel(
-                Panel::new(Axis::linear("time", "s"), Axis::linear("position", "um"))
+                Panel::new(Axis::linear("time", "s"), Axis::linear("position", unit))
                     .series(Series::line("measured", &t.time_s, &t.measured_um))
                     .series(Series::line("before", &t.time_s, &t.before_um).thin())
                     .series(Series::line("after", &t.time_s, &t.after_um).thin()),
             )
             .panel(
-                Panel::new(Axis::linear("time", "s"), Axis::linear("residual", "um"))
+                Panel::new(Axis::linear("time", "s"), Axis::linear("residual", unit))
                     .series(
                         Series::line("", &t.time_s, &t.residual_before_um)
                             .thin()

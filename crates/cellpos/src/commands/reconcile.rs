@@ -12,7 +12,7 @@ use cellpos_experiment::collect::{self, Collected, Collecting};
 use cellpos_experiment::on_rig::OnRig;
 use cellpos_plant::Model;
 use cellpos_plant::effects::{self, Definition};
-use cellpos_reconcile::{NoiseKind, Options, Reconciliation, Verdict};
+use cellpos_reconcile::{NoiseKind, Options, Reconciliation, Units, Verdict, figure_of};
 use model::{Asked, Data};
 use records::{Columns, files, is_run, read, read_run};
 use std::path::{Path, PathBuf};
@@ -178,6 +178,9 @@ pub fn run(args: Args) -> CommandResult {
         hold: args.hold,
     };
     let model = model::model_of(&asked, &data, &mut options)?;
+    if options.free_start || options.free_gain {
+        options.units = units(&args.columns);
+    }
     let bar = output::progress_bar(None);
     let mut progress = |text: &str| {
         bar.set_message(text.to_owned());
@@ -208,7 +211,7 @@ pub fn run(args: Args) -> CommandResult {
         }
     };
     bar.finish_and_clear();
-    tell(&args, &options, &mut result);
+    tell(&mut result);
     write(&args, &result, &collected)?;
     Ok(Outcome::Done)
 }
@@ -330,19 +333,19 @@ fn proposed(args: &Args, result: &Reconciliation) -> Option<(PathBuf, String)> {
     Some((proposal_path(args.out.as_ref()?), text))
 }
 
-/// Says what was not looked for, and everything in the units of the records.
-fn tell(args: &Args, options: &Options, result: &mut Reconciliation) {
+/// Says what was not looked for.
+fn tell(result: &mut Reconciliation) {
     if result.verdict == Verdict::NothingMissing {
         result.places.push(not_looked_for());
     }
-    if options.free_start || options.free_gain {
-        let unit =
-            |column: &str, else_it_is| columns::unit_of(column).unwrap_or(else_it_is).to_owned();
-        let of_input = unit(&args.columns.input_column, "input units");
-        result.tell_in(
-            &of_input,
-            &unit(&args.columns.output_column, "output units"),
-        );
+}
+
+/// The units of other data, as the names of its columns give them.
+fn units(columns: &Columns) -> Units {
+    let unit = |column: &str, else_it_is| columns::unit_of(column).unwrap_or(else_it_is).to_owned();
+    Units {
+        input: unit(&columns.input_column, "input units"),
+        output: unit(&columns.output_column, "output units"),
     }
 }
 
@@ -378,8 +381,11 @@ fn summary(result: &Reconciliation) -> String {
         for (name, p) in &e.parameters {
             let _ = writeln!(
                 s,
-                "    {name} = {:.6} {} (95 %: {:.6} .. {:.6})",
-                p.value, p.unit, p.ci95[0], p.ci95[1]
+                "    {name} = {} {} (95 %: {} .. {})",
+                figure_of(p.value, 6),
+                p.unit,
+                figure_of(p.ci95[0], 6),
+                figure_of(p.ci95[1], 6)
             );
         }
         if !e.alternatives.is_empty() {

@@ -71,6 +71,9 @@ pub struct Scope {
     /// The command is an analogue signal sampled with the output, not held between rows: nothing faster than half the
     /// sampling rate can be seen.
     pub sampled_input: bool,
+    /// What one unit of the records' command and of their position counts for \[um\]: an effect of the user's own has their
+    /// units.
+    pub per_unit: [f64; 2],
 }
 
 /// How a candidate enters the fit.

@@ -196,6 +196,7 @@ pub struct Effect {
     form: usize,
     scalars: Vec<f64>,
     lists: Vec<Vec<f64>>,
+    per_unit: [f64; 2],
 }
 
 impl fmt::Debug for Effect {
@@ -236,7 +237,19 @@ impl Effect {
             form,
             scalars,
             lists,
+            per_unit: [1.0, 1.0],
         }
+    }
+
+    /// The same in a chain where one unit of the records' command and of their position count for so many micrometres: an
+    /// effect of the user's own keeps its numbers, and its signals are brought to its units.
+    pub fn counted_in(self, per_unit: [f64; 2]) -> Self {
+        Self { per_unit, ..self }
+    }
+
+    /// What one unit of the command and of the position count for \[um\].
+    pub fn per_unit(&self) -> [f64; 2] {
+        self.per_unit
     }
 
     /// What kind of effect this is.

@@ -149,6 +149,7 @@ mod tests {
             sample_s: 1e-3,
             length_s: 16.0,
             sampled_input: false,
+            per_unit: [1.0, 1.0],
         };
         for kind in TABLE {
             for (i, c) in kind.candidates().iter().enumerate() {

@@ -34,6 +34,7 @@ const SCOPE: Scope = Scope {
     sample_s: 1e-3,
     length_s: 6.0,
     sampled_input: false,
+    per_unit: [1.0, 1.0],
 };
 
 fn predicted(model: &Model, pzt_um: &[f64]) -> Vec<f64> {

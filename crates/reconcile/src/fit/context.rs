@@ -4,6 +4,7 @@ use crate::fit::catalogue::{Part, Variant};
 use crate::fit::position_error::Locking;
 use crate::problem::{Mask, Problem};
 use crate::simulate::{Effect, Place, simulate};
+use crate::units::Scales;
 use cellpos_plant::effects::{Candidate, Role, Scope, find};
 use nalgebra::DMatrix;
 
@@ -20,6 +21,8 @@ pub(crate) struct Context<'a> {
     pub white: Option<WhiteEvidence>,
     /// The positions come in steps that are not small beside their increments.
     pub quantised: bool,
+    /// What the figures of the search are in the units of the records.
+    pub scales: Scales,
 }
 
 /// What the size of the white noise says about averaging in the camera.

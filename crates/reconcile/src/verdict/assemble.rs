@@ -6,9 +6,10 @@ use crate::data::record::Record;
 use crate::fit::catalogue::{Part, Variant};
 use crate::fit::context::{Context, Fit};
 use crate::search::sequential::Found;
+use crate::units::figure;
 use crate::verdict::augment::augment;
 use crate::verdict::held_out::{self, HeldOut};
-use crate::verdict::judge::{Evidence, figure, judge};
+use crate::verdict::judge::{Evidence, judge};
 use crate::verdict::map;
 use crate::verdict::names::{names, of_frames};
 use crate::verdict::proposal;
@@ -72,9 +73,9 @@ pub(crate) fn assemble(
     if let Some(c) = ctx.problem.noise.coloured {
         places.push(format!(
             "the noise itself is slow: {} RMS with a correlation time of {} s beside white noise of {}; errors as small and as slow are not told from it",
-            figure(c.variance_um2.sqrt()),
+            ctx.scales.told(c.variance_um2.sqrt()),
             figure(c.time_rows * ctx.problem.base.sample_s),
-            figure(ctx.problem.noise.localisation_um())
+            ctx.scales.told(ctx.problem.noise.localisation_um())
         ));
     }
     if cut_short {

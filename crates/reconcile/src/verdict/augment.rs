@@ -4,7 +4,7 @@ use crate::data::floor::Floor;
 use crate::data::frames::FrameCounts;
 use crate::fit::context::{Context, Fit};
 use crate::simulate::near_whole;
-use crate::verdict::judge::figure;
+use crate::units::figure;
 use crate::verdict::result::{Effect as NamedEffect, Verdict};
 use cellpos_plant::effects::{self, Role};
 use cellpos_plant::{Effect, Model};
@@ -117,8 +117,9 @@ pub(crate) fn augment(
         diffusion_um2_per_s: ctx
             .problem
             .noise
-            .diffusion_um2_per_s(ctx.problem.base.sample_s),
-        localisation_um: ctx.problem.noise.localisation_um(),
+            .diffusion_um2_per_s(ctx.problem.base.sample_s)
+            / ctx.scales.per_unit()[1].powi(2),
+        localisation_um: ctx.scales.output(ctx.problem.noise.localisation_um()),
     };
     if floor.source.is_known() && noise.diffusion_um2_per_s < 1e4 && noise.localisation_um < 100.0 {
         out.noise = noise;
@@ -127,8 +128,8 @@ pub(crate) fn augment(
         .insert("noise".to_owned(), floor.source.words().to_owned());
     if let Some(c) = ctx.problem.noise.coloured {
         let words = format!(
-            "{} um RMS with a correlation time of {} s, beside the noise stated",
-            figure(c.variance_um2.sqrt()),
+            "{} RMS with a correlation time of {} s, beside the noise stated",
+            ctx.scales.told(c.variance_um2.sqrt()),
             figure(c.time_rows * ctx.problem.base.sample_s)
         );
         out.provenance.insert(COLOURED.to_owned(), words);
@@ -138,7 +139,7 @@ pub(crate) fn augment(
     if verdict != Verdict::Unknown {
         for i in 0..fit.parts.len() {
             if let Some(e) = effect_of(ctx, fit, i) {
-                add(&mut out.effects, e);
+                add(&mut out.effects, ctx.scales.effect_out(&e));
             }
         }
         if frames.drops_named() {

@@ -8,6 +8,7 @@ use crate::problem::{Mask, split_in_time};
 use crate::search::lines::{strongest_line, without_line};
 use crate::simulate::simulate;
 use crate::thresholds::THRESHOLDS;
+use crate::units::Side;
 use nalgebra::{DMatrix, DVector};
 
 /// A formula for the unexplained part.
@@ -38,7 +39,8 @@ pub struct Term {
 pub(crate) struct Column {
     pub name: &'static str,
     pub place: &'static str,
-    pub unit: &'static str,
+    /// Powers of command, position and second in it.
+    pub powers: [i32; 3],
     /// What it would mean, in words.
     pub says: &'static str,
     pub innovations: Vec<Vec<f64>>,
@@ -55,94 +57,107 @@ struct Row {
 
 type Formula = fn(&Row) -> f64;
 
-/// Name, unit beside um per power, words, formula.
-const TERMS: &[(&str, &str, &str, Formula)] = &[
+/// Name, powers of command, position and second, words, formula.
+const TERMS: &[(&str, [i32; 3], &str, Formula)] = &[
     (
         "d^2",
-        "1/um",
+        [2, 0, 0],
         "the response is not the same up and down: it goes with the square of the command",
         |r| r.d * r.d,
     ),
     (
         "d^3",
-        "1/um^2",
+        [3, 0, 0],
         "the response changes with amplitude",
         |r| r.d.powi(3),
     ),
     (
         "|d|",
-        "1",
+        [1, 0, 0],
         "the response is not the same on both sides of the working point",
         |r| r.d.abs(),
     ),
     (
         "d |d|",
-        "1/um",
+        [2, 0, 0],
         "the response changes with amplitude",
         |r| r.d * r.d.abs(),
     ),
     (
         "sign(dd/dt)",
-        "um",
+        [0, 0, 0],
         "the response depends on the direction of the command: friction or hysteresis",
         |r| sign(r.rate),
     ),
     (
         "|dd/dt|",
-        "s",
+        [1, 0, -1],
         "the response depends on the speed of the command, not on its direction",
         |r| r.rate.abs(),
     ),
-    ("t d", "1/s", "the gain changes with time", |r| r.t * r.d),
+    ("t d", [1, 0, 1], "the gain changes with time", |r| {
+        r.t * r.d
+    }),
     (
         "y",
-        "1",
+        [0, 1, 0],
         "a force that goes with the position: another stiffness or outflow",
         |r| r.y,
     ),
     (
         "y^2",
-        "1/um",
+        [0, 2, 0],
         "a force or an image that bends with the position",
         |r| r.y * r.y,
     ),
     (
         "y^3",
-        "1/um^2",
+        [0, 3, 0],
         "a stiffness that grows with the position",
         |r| r.y.powi(3),
     ),
-    ("|y|", "1", "the two sides of the position differ", |r| {
-        r.y.abs()
-    }),
-    ("y d", "1/um", "the gain depends on the position", |r| {
+    (
+        "|y|",
+        [0, 1, 0],
+        "the two sides of the position differ",
+        |r| r.y.abs(),
+    ),
+    ("y d", [1, 1, 0], "the gain depends on the position", |r| {
         r.y * r.d
     }),
-    ("y^2 d", "1/um^2", "the gain depends on the position", |r| {
-        r.y * r.y * r.d
-    }),
-    ("v", "s", "another damping", |r| r.v),
-    ("v |v|", "s^2/um", "a damping that grows with speed", |r| {
-        r.v * r.v.abs()
-    }),
-    ("v^3", "s^3/um^2", "a damping that grows with speed", |r| {
+    (
+        "y^2 d",
+        [1, 2, 0],
+        "the gain depends on the position",
+        |r| r.y * r.y * r.d,
+    ),
+    ("v", [0, 1, -1], "another damping", |r| r.v),
+    (
+        "v |v|",
+        [0, 2, -2],
+        "a damping that grows with speed",
+        |r| r.v * r.v.abs(),
+    ),
+    ("v^3", [0, 3, -3], "a damping that grows with speed", |r| {
         r.v.powi(3)
     }),
-    ("|v|", "s", "motion differs by its direction", |r| r.v.abs()),
-    ("sign(v)", "um", "dry friction", |r| sign(r.v)),
+    ("|v|", [0, 1, -1], "motion differs by its direction", |r| {
+        r.v.abs()
+    }),
+    ("sign(v)", [0, 0, 0], "dry friction", |r| sign(r.v)),
     (
         "y v",
-        "s/um",
+        [0, 2, -1],
         "damping or scale depends on the position",
         |r| r.y * r.v,
     ),
     (
         "y^2 v",
-        "s/um^2",
+        [0, 3, -1],
         "damping or scale depends on the position",
         |r| r.y * r.y * r.v,
     ),
-    ("t", "um/s", "a drift that grows with time", |r| r.t),
+    ("t", [0, 0, 1], "a drift that grows with time", |r| r.t),
 ];
 
 fn sign(x: f64) -> f64 {
@@ -185,7 +200,7 @@ pub(crate) fn library(ctx: &Context<'_>, fit: &Fit) -> Vec<Column> {
         .map(|i| rows(ctx, i, &sim[i], &residual[i]))
         .collect();
     let mut all = Vec::new();
-    for &(name, unit, says, formula) in TERMS {
+    for &(name, powers, says, formula) in TERMS {
         for place in ["input", "output"] {
             let innovations = records
                 .iter()
@@ -207,7 +222,7 @@ pub(crate) fn library(ctx: &Context<'_>, fit: &Fit) -> Vec<Column> {
             all.push(Column {
                 name,
                 place,
-                unit,
+                powers,
                 says,
                 innovations,
             });
@@ -317,14 +332,22 @@ pub(crate) fn hypothesis(ctx: &Context<'_>, fit: &Fit, library: &[Column]) -> Op
     let line = line.map(|l| Term {
         term: format!("sin(2 pi {:.2} Hz t + phase of the record)", l.hz),
         place: "output",
-        coefficient: l.amplitude_um,
-        unit: "um".to_owned(),
+        coefficient: ctx.scales.output(l.amplitude_um),
+        unit: ctx.scales.output_unit().to_owned(),
     });
-    let of_library = chosen.iter().zip(coefficients.iter()).map(|(i, x)| Term {
-        term: library[*i].name.to_owned(),
-        place: library[*i].place,
-        coefficient: *x,
-        unit: library[*i].unit.to_owned(),
+    let of_library = chosen.iter().zip(coefficients.iter()).map(|(i, x)| {
+        let column = &library[*i];
+        let side = match column.place {
+            "input" => Side::Input,
+            _ => Side::Output,
+        };
+        let (coefficient, unit) = ctx.scales.coefficient(*x, side, column.powers);
+        Term {
+            term: column.name.to_owned(),
+            place: column.place,
+            coefficient,
+            unit,
+        }
     });
     let terms: Vec<Term> = line.into_iter().chain(of_library).collect();
     let formula = terms

@@ -5,10 +5,12 @@ use crate::fit::context::{Context, Fit};
 use crate::search::cost::{leaves_much, left_over, scatter};
 use crate::search::sequential::ids;
 use crate::thresholds::THRESHOLDS;
+use crate::units::figure;
 use crate::verdict::battery::{self, Column, Hypothesis};
 use crate::verdict::held_out::HeldOut;
 use crate::verdict::map::DiscrepancyMap;
 use crate::verdict::names::Names;
+use crate::verdict::parameters;
 use crate::verdict::result::{Remainder, Verdict};
 use crate::verdict::sentences::sentences;
 use crate::verdict::split;
@@ -36,19 +38,6 @@ pub(crate) struct Judgement {
     pub reasons: Vec<String>,
     pub hypothesis: Option<Hypothesis>,
     pub remainder: Option<Remainder>,
-}
-
-/// A figure with digits for whatever unit it is in.
-pub fn figure(x: f64) -> String {
-    if x == 0.0 || !x.is_finite() {
-        return format!("{x}");
-    }
-    let digits = (2 - x.abs().log10().floor() as i32).clamp(0, 12) as usize;
-    if x.abs() < 1e-9 {
-        format!("{x:.2e}")
-    } else {
-        format!("{x:.digits$}")
-    }
 }
 
 pub(crate) fn judge(ctx: &Context<'_>, e: &Evidence<'_>, threads: usize) -> Judgement {
@@ -81,7 +70,7 @@ pub(crate) fn judge(ctx: &Context<'_>, e: &Evidence<'_>, threads: usize) -> Judg
         if !e.floor.source.is_known() {
             out.verdict = Verdict::Unknown;
             out.reasons
-                .push(no_floor(e, "nothing of the catalogue helps"));
+                .push(no_floor(ctx, e, "nothing of the catalogue helps"));
         } else if beyond && e.counted {
             // Missing frames are counted, whatever the rest is.
             out.verdict = Verdict::NamedWithRemainder;
@@ -139,7 +128,11 @@ fn refusal(
 ) -> Option<String> {
     let best = ids(e.fit).join(" + ");
     if !e.floor.source.is_known() {
-        return Some(no_floor(e, &format!("the best of the catalogue is {best}")));
+        return Some(no_floor(
+            ctx,
+            e,
+            &format!("the best of the catalogue is {best}"),
+        ));
     }
     if e.names.curvature {
         return Some(format!(
@@ -157,7 +150,7 @@ fn refusal(
             "the best of the catalogue, {best}, is no name: {words}"
         ));
     }
-    if let Some(words) = not_earned(e, ctx.problem.base.free_start) {
+    if let Some(words) = not_earned(ctx, e) {
         return Some(format!(
             "the best of the catalogue, {best}, is no name: {words}"
         ));
@@ -167,13 +160,13 @@ fn refusal(
 }
 
 /// What is said where there is no floor.
-fn no_floor(e: &Evidence<'_>, best: &str) -> String {
+fn no_floor(ctx: &Context<'_>, e: &Evidence<'_>, best: &str) -> String {
     format!(
         "without a noise floor no name is given (no rest, no repeated command, no stated noise); {best}: innovations {} before, {} after, free run {} before, {} after, on held-out records; record a rest of 10 s or the command twice, and look again",
-        figure(e.held.before_um),
-        figure(e.held.after_um),
-        figure(e.held.free_before_um),
-        figure(e.held.free_after_um)
+        ctx.scales.told(e.held.before_um),
+        ctx.scales.told(e.held.after_um),
+        ctx.scales.told(e.held.free_before_um),
+        ctx.scales.told(e.held.free_after_um)
     )
 }
 
@@ -196,7 +189,7 @@ pub(crate) fn first_at_bound(ctx: &Context<'_>, fit: &Fit) -> Option<(usize, Str
                     "{} of {} stands at its bound, {}",
                     p.name,
                     part.id(),
-                    figure(v)
+                    figure(parameters::told(ctx, part, p.name, v).value)
                 );
                 return Some((i, words));
             }
@@ -221,7 +214,8 @@ pub(crate) fn first_at_bound(ctx: &Context<'_>, fit: &Fit) -> Option<(usize, Str
 }
 
 /// A name must help on data that was not fitted, in innovations and, where its effect is beyond what the walk makes, in free run.
-fn not_earned(e: &Evidence<'_>, of_other_data: bool) -> Option<String> {
+fn not_earned(ctx: &Context<'_>, e: &Evidence<'_>) -> Option<String> {
+    let of_other_data = ctx.problem.base.free_start;
     let (before, after) = (e.held.free_before_um, e.held.free_after_um);
     // The walk's own scatter is as large as itself.
     let floor = 2.0 * e.held.free_floor_um;
@@ -231,15 +225,15 @@ fn not_earned(e: &Evidence<'_>, of_other_data: bool) -> Option<String> {
     if grows || (before > floor && after > floor && !falls) {
         return Some(format!(
             "the free run on held-out records is off by {} with it and by {} without",
-            figure(after),
-            figure(before)
+            ctx.scales.told(after),
+            ctx.scales.told(before)
         ));
     }
     if e.held.after_um > e.held.before_um {
         return Some(format!(
             "the innovations on held-out records are {} with it and {} without",
-            figure(e.held.after_um),
-            figure(e.held.before_um)
+            ctx.scales.told(e.held.after_um),
+            ctx.scales.told(e.held.before_um)
         ));
     }
     None

@@ -15,5 +15,5 @@ pub(crate) mod result;
 mod sentences;
 mod significance;
 mod split;
-mod units;
+mod tell;
 pub(crate) mod workflow;

@@ -6,7 +6,7 @@ use crate::fit::context::{Context, Fit, freedom_of};
 use crate::search::cost::{left_over, prior_penalty};
 use crate::search::sequential::Rival;
 use crate::thresholds::THRESHOLDS;
-use crate::verdict::parameters::parameters;
+use crate::verdict::parameters::{parameters, told};
 use crate::verdict::result::{Effect as NamedEffect, Interval};
 use crate::verdict::significance;
 use cellpos_plant::effects;
@@ -108,7 +108,7 @@ pub(crate) fn names(ctx: &Context<'_>, null: &Fit, fit: &Fit, rivals: &[Vec<Riva
             if r.part.variant == part.variant && r.chi2 - fit.chi2 < THRESHOLDS.valley {
                 for (p, value) in part.variant().params.iter().zip(r.part.natural()) {
                     if let Some(found) = parameters.get_mut(p.name) {
-                        found.reach(value);
+                        found.reach(told(ctx, part, p.name, value).value);
                     }
                 }
             }

@@ -60,7 +60,31 @@ pub(crate) fn parameters(
         }
         Role::Chain => {}
     }
+    for interval in out.values_mut() {
+        tell(ctx, part, interval);
+    }
     out
+}
+
+/// One number of a part as the search has it, in the unit of the records.
+pub(crate) fn told(ctx: &Context<'_>, part: &Part, name: &str, value: f64) -> Interval {
+    let mut interval = Interval {
+        value,
+        ci95: [value; 2],
+        unit: unit_of(part, name).to_owned(),
+    };
+    tell(ctx, part, &mut interval);
+    interval
+}
+
+fn tell(ctx: &Context<'_>, part: &Part, interval: &mut Interval) {
+    let scaled =
+        effects::find(part.id()).and_then(|kind| ctx.scales.of_number(kind, &interval.unit));
+    if let Some((factor, unit)) = scaled {
+        interval.value *= factor;
+        interval.ci95 = interval.ci95.map(|v| v * factor);
+        interval.unit = unit;
+    }
 }
 
 /// A value with so many standard deviations about it as make 95 %.

@@ -1,6 +1,7 @@
 //! A hypothesis as effects of the user's own, to be edited and run again with `--effects`.
 
 use crate::fit::context::Context;
+use crate::units::Side;
 use crate::verdict::battery::{Hypothesis, Term};
 use cellpos_plant::effects::{Definition, Site, UserParameter, UserState};
 
@@ -89,14 +90,18 @@ fn definition(ctx: &Context<'_>, site: Site, terms: &[&Term]) -> Definition {
     if site == Site::Chip {
         let has = |name: &str| terms.iter().any(|t| t.term == name);
         let per = ctx.scope.stroke_um / ctx.scope.travel_um.max(1e-12);
+        let (stiffness, of_stiffness) = ctx.scales.coefficient(per, Side::Input, [0, 1, 0]);
         add("gain", "", "input", 0.5, 0.0);
         if !has("y") {
-            add("stiffness", "1", "position", per, 0.0);
+            add("stiffness", &of_stiffness, "position", stiffness, 0.0);
         }
         if !has("v") {
             let poles = &ctx.problem.base.zpk.poles;
             let fastest = poles.iter().map(|p| p.norm()).fold(1e-3, f64::max);
-            add("damping", "s", "velocity", per / fastest, 0.0);
+            let (damping, of_damping) =
+                ctx.scales
+                    .coefficient(per / fastest, Side::Input, [0, 1, -1]);
+            add("damping", &of_damping, "velocity", damping, 0.0);
         }
     }
     let states = if output.contains("before") {

@@ -3,6 +3,7 @@
 use crate::fit::context::{Context, Fit};
 use crate::problem::Prepared;
 use crate::thresholds::THRESHOLDS;
+use crate::units::figure;
 use crate::verdict::map::{BAND_EDGES_HZ, DiscrepancyMap, MapRow};
 
 /// Sentences about where the null model fails.
@@ -22,7 +23,7 @@ pub(crate) fn sentences(ctx: &Context<'_>, fit: &Fit, map: &DiscrepancyMap) -> V
     let mut out = vec![span(records, map, &flagged), response(map)];
     out.extend(course(&map.rows[records.len()..]));
     out.extend(jumps(ctx, fit));
-    out.extend(largest(records, map));
+    out.extend(largest(ctx, map));
     out
 }
 
@@ -160,9 +161,9 @@ fn jumps(ctx: &Context<'_>, fit: &Fit) -> Option<String> {
     let excess = fit.chi2 - fit.count as f64;
     if jumps >= 5 && (jumps as f64) < 0.01 * fit.count as f64 && energy > 0.5 * excess {
         return Some(format!(
-            "in single rows: {jumps} jumps hold {:.0} % of the excess, the largest of about {:.2} um in {} at {:.3} s",
+            "in single rows: {jumps} jumps hold {:.0} % of the excess, the largest of about {} in {} at {:.3} s",
             100.0 * (energy / excess).min(1.0),
-            most.0 * ctx.problem.noise.innovation_um(),
+            ctx.scales.told(most.0 * ctx.problem.noise.innovation_um()),
             ctx.problem.records[most.1].name,
             most.2 as f64 * ctx.problem.base.sample_s,
         ));
@@ -171,8 +172,8 @@ fn jumps(ctx: &Context<'_>, fit: &Fit) -> Option<String> {
 }
 
 /// The record with the largest excess, with its stroke.
-fn largest(records: &[Prepared], map: &DiscrepancyMap) -> Option<String> {
-    let mut by_stroke: Vec<(f64, f64, &str)> = records
+fn largest(ctx: &Context<'_>, map: &DiscrepancyMap) -> Option<String> {
+    let mut by_stroke: Vec<(f64, f64, &str)> = (ctx.problem.records)
         .iter()
         .zip(&map.rows)
         .filter(|(r, _)| !r.rest)
@@ -191,8 +192,10 @@ fn largest(records: &[Prepared], map: &DiscrepancyMap) -> Option<String> {
         && *excess > 0.0
     {
         return Some(format!(
-            "largest in {name}: {:.3} um RMS of innovation beyond the floor at {rms:.2} um RMS of command",
-            excess
+            "largest in {name}: {} RMS of innovation beyond the floor at {} {} RMS of command",
+            ctx.scales.told(*excess),
+            figure(ctx.scales.input(*rms)),
+            ctx.scales.input_unit()
         ));
     }
     None

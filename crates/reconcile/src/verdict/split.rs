@@ -4,6 +4,8 @@ use crate::fit::context::{Context, Fit};
 use crate::problem::Mask;
 use crate::search::cost::threshold;
 use crate::thresholds::THRESHOLDS;
+use crate::units::figure;
+use crate::verdict::parameters::told;
 use cellpos_plant::effects::Role;
 
 /// A set of rows, with its name for messages.
@@ -93,11 +95,11 @@ pub(crate) fn disagreement(
                         worst = Some((
                             share,
                             format!(
-                                "{} of {} is {:.4} in {name} and {:.4} over all: another equation",
+                                "{} of {} is {} in {name} and {} over all: another equation",
                                 p.name,
                                 a.id(),
-                                vb[j],
-                                va[j]
+                                figure(told(ctx, a, p.name, vb[j]).value),
+                                figure(told(ctx, a, p.name, va[j]).value)
                             ),
                         ));
                     }

@@ -14,6 +14,7 @@ use crate::search::cost::left_over;
 use crate::search::sequential::{Effort, Found, ids, search, settle};
 use crate::simulate::{Base, Zpk};
 use crate::thresholds::THRESHOLDS;
+use crate::units::{Scales, Units};
 use crate::verdict::assemble;
 use crate::verdict::augment::COLOURED;
 use crate::verdict::guard;
@@ -44,6 +45,8 @@ pub struct Options {
     pub work: f64,
     /// The noise that the records are taken to have.
     pub noise: NoiseKind,
+    /// Units in which the records are, and in which results are told.
+    pub units: Units,
     /// Ids of effects of the user's own to look for beside the catalogue; others that a model file has defined are
     /// simulated and not looked for.
     pub own_effects: Vec<&'static str>,
@@ -59,6 +62,7 @@ impl Default for Options {
             interpolated_input: false,
             free_gain: false,
             free_start: false,
+            units: Units::default(),
             own_effects: Vec::new(),
         }
     }
@@ -77,10 +81,27 @@ pub fn reconcile(
     options: &Options,
     progress: &mut dyn FnMut(&str),
 ) -> Result<Reconciliation, ReconcileError> {
-    let records = canonical(records.to_vec());
+    let foreign = options.free_start || options.free_gain;
+    let scales = Scales::of(records, &options.units, foreign);
+    let mut result = within(model, records, options, &scales, progress)?;
+    result.tell(&scales);
+    Ok(result)
+}
+
+/// The workflow, with records of other units at the size of this rig's.
+fn within(
+    given: &Model,
+    records: &[Record],
+    options: &Options,
+    scales: &Scales,
+    progress: &mut dyn FnMut(&str),
+) -> Result<Reconciliation, ReconcileError> {
+    let model = &scales.model(given)?;
+    let as_given = records;
+    let records = canonical(scales.records(records));
     guard::records(&records, !options.free_start && !options.free_gain)?;
     if !options.free_start {
-        guard::working_point(&records, model.working_point_um)?;
+        guard::working_point(as_given, given.working_point_um)?;
     }
     let frames = frames::count(&records);
     let none: Vec<Vec<bool>> = records.iter().map(|r| vec![false; r.rows()]).collect();
@@ -90,7 +111,7 @@ pub fn reconcile(
         &none
     };
     let base = base_of(model, &records, options)?;
-    let scope = scope_of(model, &records, &base);
+    let scope = scope_of(model, &records, &base, scales);
     let fixed = model.effects.clone();
     let stated = stated_noise(model, base.sample_s);
     let start = stated.unwrap_or_else(|| NoiseModel::new(0.33, base.sample_s, 0.03));
@@ -98,8 +119,9 @@ pub fn reconcile(
     let present: Vec<Vec<bool>> = problem.records.iter().map(|r| r.present.clone()).collect();
 
     progress("null model and noise floor");
-    let first = context(&problem, scope, &fixed, options).fit(Vec::new(), &problem.all(), 4);
-    let residual = free_of_start(&context(&problem, scope, &fixed, options), &first);
+    let first =
+        context(&problem, scope, &fixed, options, scales).fit(Vec::new(), &problem.all(), 4);
+    let residual = free_of_start(&context(&problem, scope, &fixed, options, scales), &first);
     // Brownian motion of a bead is a walk; coloured noise is that of a sensor.
     let of_bead = model.noise.diffusion_um2_per_s > 0.0 && !options.free_start;
     let kind = match options.noise {
@@ -109,7 +131,7 @@ pub fn reconcile(
     let floor = floor::estimate(&records, &present, &residual, stated, kind);
     let (noise, trusted) = (floor.noise, floor.rows);
     let problem = problem.with_noise(noise);
-    guard::motion(&context(&problem, scope, &fixed, options))?;
+    guard::motion(&context(&problem, scope, &fixed, options, scales))?;
 
     let effort = Effort {
         threads: options.threads,
@@ -128,7 +150,7 @@ pub fn reconcile(
     loop {
         let ctx = Context {
             white: evidence(model, &noise, trusted, &problem),
-            ..context(&problem, scope, &fixed, options)
+            ..context(&problem, scope, &fixed, options, scales)
         };
         found = search(&ctx, &problem.all(), effort, &mut *progress);
         // What the final residual shows is at least as good an estimate of the noise, if the fit is good.
@@ -151,7 +173,7 @@ pub fn reconcile(
     }
     let ctx = Context {
         white: evidence(model, &noise, trusted, &problem),
-        ..context(&problem, scope, &fixed, options)
+        ..context(&problem, scope, &fixed, options, scales)
     };
     progress(&format!(
         "held-out check (the search took {:.2} of its work)",
@@ -178,7 +200,7 @@ pub fn reconcile(
         .collect();
     progress("map and verdict");
     let given = assemble::Given {
-        model,
+        model: given,
         records: &records,
         frames: &frames,
         floor: &floor,
@@ -267,6 +289,7 @@ fn context<'a>(
     scope: Scope,
     fixed: &[Effect],
     options: &Options,
+    scales: &Scales,
 ) -> Context<'a> {
     Context {
         problem,
@@ -276,6 +299,7 @@ fn context<'a>(
         free_gain: options.free_gain,
         white: None,
         quantised: problem.quantised,
+        scales: scales.clone(),
     }
 }
 
@@ -295,7 +319,7 @@ fn base_of(model: &Model, records: &[Record], options: &Options) -> Result<Base,
     })
 }
 
-fn scope_of(model: &Model, records: &[Record], base: &Base) -> Scope {
+fn scope_of(model: &Model, records: &[Record], base: &Base, scales: &Scales) -> Scope {
     let (low, high) = records
         .iter()
         .map(Record::pzt_range_um)
@@ -317,6 +341,7 @@ fn scope_of(model: &Model, records: &[Record], base: &Base) -> Scope {
         sample_s: base.sample_s,
         length_s: records.iter().map(Record::duration_s).fold(0.0, f64::max),
         sampled_input: base.interpolated_input,
+        per_unit: scales.per_unit(),
     }
 }
 

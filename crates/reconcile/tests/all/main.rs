@@ -4,4 +4,5 @@ mod labelled;
 mod measured;
 mod measured_piezo;
 mod noise;
+mod units;
 mod verdicts;

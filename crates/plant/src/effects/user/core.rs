@@ -29,14 +29,16 @@ pub(super) struct Core {
     count: usize,
     start: [f64; MOST_STATES],
     states: [f64; MOST_STATES],
-    /// What was given last.
+    /// What was given last, um.
     output: f64,
+    /// What one unit of the equations counts for in what enters, in the position, and in what is given, um.
+    units: [f64; 3],
 }
 
 type Values = [f64; SIGNALS.len() + MOST];
 
 impl Core {
-    pub fn new(compiled: Arc<Compiled>, parameters: &[f64]) -> Self {
+    pub fn new(compiled: Arc<Compiled>, parameters: &[f64], units: [f64; 3]) -> Self {
         let mut all = [0.0; MOST];
         for (slot, p) in all.iter_mut().zip(parameters) {
             *slot = *p;
@@ -48,6 +50,7 @@ impl Core {
             start: [0.0; MOST_STATES],
             states: [0.0; MOST_STATES],
             output: 0.0,
+            units,
         };
         let values = core.values(&Seen::default(), &core.states);
         for (start, program) in core.start.iter_mut().zip(&core.compiled.starts) {
@@ -69,10 +72,11 @@ impl Core {
 
     fn values(&self, seen: &Seen, states: &[f64; MOST_STATES]) -> Values {
         let mut v: Values = [0.0; SIGNALS.len() + MOST];
-        v[INPUT] = seen.input;
-        v[OUTPUT] = self.output;
-        v[POSITION] = seen.position;
-        v[VELOCITY] = seen.velocity;
+        let [entering, position, given] = self.units;
+        v[INPUT] = seen.input / entering;
+        v[OUTPUT] = self.output / given;
+        v[POSITION] = seen.position / position;
+        v[VELOCITY] = seen.velocity / position;
         v[TIME] = seen.time_s;
         let own = &mut v[SIGNALS.len()..];
         own[..self.count].copy_from_slice(&self.parameters[..self.count]);
@@ -90,7 +94,7 @@ impl Core {
     fn output_with(&self, seen: &Seen, states: &[f64; MOST_STATES]) -> f64 {
         let value = self.compiled.output.value(&self.values(seen, states));
         if value.is_finite() {
-            value
+            value * self.units[2]
         } else {
             self.output
         }

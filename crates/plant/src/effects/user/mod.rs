@@ -148,7 +148,15 @@ impl UserKind {
         let values: Vec<f64> = (0..self.definition.parameters.len())
             .map(|i| effect.scalar(i))
             .collect();
-        Core::new(Arc::clone(&self.compiled), &values)
+        let [input, output] = effect.per_unit();
+        // What enters, what the plant gives, and what the effect gives.
+        let units = match self.definition.site {
+            Site::Driver | Site::Pzt => [input, output, input],
+            Site::Chip => [input, output, input],
+            Site::Plant => [input, output, output],
+            Site::Bead | Site::Camera => [output, output, output],
+        };
+        Core::new(Arc::clone(&self.compiled), &values, units)
     }
 }
 
@@ -183,8 +191,8 @@ impl EffectKind for UserKind {
         self.starts.clone()
     }
 
-    fn build(&'static self, _: usize, values: &[f64], _: &Scope) -> Effect {
-        Effect::new(self, 0, values, &[])
+    fn build(&'static self, _: usize, values: &[f64], scope: &Scope) -> Effect {
+        Effect::new(self, 0, values, &[]).counted_in(scope.per_unit)
     }
 
     fn definition(&self) -> Option<&Definition> {
