@@ -1,6 +1,7 @@
 //! The data of a figure as CSV.
 
 use crate::figure::{Content, Figure};
+use cellpos_table::csv_field;
 use std::fmt::Write;
 
 impl Figure {
@@ -12,13 +13,8 @@ impl Figure {
     }
 }
 
-/// A field, in quotes where CSV needs them.
 fn field(text: &str) -> String {
-    if text.contains([',', '"', '\n', '\r']) {
-        format!("\"{}\"", text.replace('"', "\"\""))
-    } else {
-        text.to_owned()
-    }
+    csv_field(text).into_owned()
 }
 
 /// A number that reads back to the same bits; nothing for one that does not exist.

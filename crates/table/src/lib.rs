@@ -23,6 +23,7 @@
 #![forbid(unsafe_code)]
 
 mod error;
+mod field;
 mod file;
 mod mapping;
 mod record;
@@ -30,6 +31,7 @@ mod sampling;
 mod table;
 
 pub use error::{TableError, TableProblem};
+pub use field::csv_field;
 pub use file::{MOST_OF_A_RECORD, read_bytes, read_text, write_atomically, write_unsynced};
 pub use mapping::{ColumnRef, Gaps, Mapping};
 pub use record::Record;

@@ -38,15 +38,42 @@ impl Separator {
         // A comma may be a decimal one; the others separate and nothing else.
         [';', '\t', ',']
             .into_iter()
-            .find(|separator| line.contains(*separator))
+            .find(|separator| {
+                let mut bare = bare(&[';', '\t', ',']);
+                line.chars().any(|c| bare(c) && c == *separator)
+            })
             .map_or(Self::White, Self::Char)
     }
 
     fn split(self, line: &str, mut take: impl FnMut(&str)) {
         match self {
             Self::White => line.split_whitespace().for_each(&mut take),
+            Self::Char(separator) if line.contains('"') => {
+                line.split(bare(&[separator]))
+                    .map(unquote)
+                    .for_each(&mut take);
+            }
             Self::Char(separator) => line.split(separator).map(unquote).for_each(&mut take),
         }
+    }
+}
+
+/// Whether a character, one after the other of a line, is one of these separators and no part of a field in quotes: one that begins with
+/// a quote.
+fn bare(separators: &[char]) -> impl FnMut(char) -> bool {
+    let (mut blank, mut quotes, mut open) = (true, false, false);
+    move |c| {
+        if c == '"' && blank {
+            (quotes, open) = (true, true);
+        } else if c == '"' && quotes {
+            open = !open;
+        }
+        let ends = separators.contains(&c) && !open;
+        (blank, quotes) = match ends {
+            true => (true, false),
+            false => (blank && c.is_whitespace(), quotes),
+        };
+        ends
     }
 }
 
@@ -111,7 +138,7 @@ impl<'a> Table<'a> {
         };
         let separator = Separator::of(first);
         let mut fields = Vec::new();
-        separator.split(first, |field| fields.push(field.to_owned()));
+        separator.split(first, |field| fields.push(field.replace("\"\"", "\"")));
         let is_header = fields.iter().all(|field| number(field).is_none());
         let names: Vec<String> = if is_header {
             fields

@@ -10,7 +10,7 @@ use cellpos_ident::base::Grid;
 use cellpos_ident::sampled::Hold;
 use cellpos_plant::{Model, SimulateOptions, simulate};
 use cellpos_record::{RunReader, SESSIONS};
-use cellpos_table::{Mapping, Record};
+use cellpos_table::{Mapping, Record, csv_field};
 use std::path::PathBuf;
 
 /// Arguments of `cellpos simulate`.
@@ -168,13 +168,9 @@ fn write_named(
     let rest: f64 = (model.provenance.get(base::REST_OUTPUT))
         .and_then(|text| text.parse().ok())
         .unwrap_or(0.0);
-    let quoted = |name: &str| match name.contains(',') {
-        true => format!("\"{name}\""),
-        false => name.to_owned(),
-    };
     // A column that was a number has no name of its own.
     let input = names[0].parse::<usize>().map_or(names[0], |_| "input");
-    let mut text = format!("time_s,{},{}\n", quoted(input), quoted(names[1]));
+    let mut text = format!("time_s,{},{}\n", csv_field(input), csv_field(names[1]));
     for (k, (u, y)) in answer.pzt_um.iter().zip(&answer.bead_um).enumerate() {
         let t = answer.start_s + k as f64 * answer.step_s;
         // Writing into a String cannot fail.

@@ -42,14 +42,15 @@ impl EffectKind for TimeDelay {
     }
 
     fn candidates(&self) -> &'static [Candidate] {
-        const ALL: &[Candidate] = &[Candidate::chain(&[lin("delay_s", 0.0, 0.1, 1e-5)])
+        // What is too long for a record is the search's business.
+        const ALL: &[Candidate] = &[Candidate::chain(&[lin("delay_s", 0.0, 3600.0, 1e-5)])
             .typical(0.0002, 0.05)
             .smallest(0, 5e-5)];
         ALL
     }
 
     fn starts(&self, _: usize, scope: &Scope) -> Vec<Vec<f64>> {
-        one([0.1, 0.3, 1.0, 2.0, 4.0, 8.0].map(|k| k * scope.sample_s))
+        one([0.1, 0.3, 1.0, 2.0, 4.0, 8.0, 20.0, 50.0].map(|k| k * scope.sample_s))
     }
 
     fn build(&'static self, _: usize, values: &[f64], _: &Scope) -> Effect {

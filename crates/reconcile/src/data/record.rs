@@ -384,7 +384,8 @@ fn fill(u: &mut [f64]) {
         .fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), &v| {
             (a.min(v), b.max(v))
         });
-    let tolerance = 1e-4 * (scale.1 - scale.0) + 1.1e-5;
+    // Values that were rounded differ by their last digit.
+    let tolerance = 1e-4 * (scale.1 - scale.0) + 1.1 * resolution(&known);
     let agrees = |p: usize| {
         (p..n).step_by(3).all(|k| {
             known[k].is_nan()
@@ -432,15 +433,23 @@ fn fill(u: &mut [f64]) {
 
 /// The finest step that the values show: a power of ten of which all are multiples, or the smallest increment.
 fn resolution(values: &[f64]) -> f64 {
+    let largest = values
+        .iter()
+        .filter(|v| v.is_finite())
+        .fold(0.0f64, |a, v| a.max(v.abs()));
+    // Numbers may be in any unit: ten decades below the largest.
+    let top = if largest.is_normal() {
+        largest.log10().floor() as i32
+    } else {
+        0
+    };
     for e in 0..10 {
-        let step = 10f64.powi(-e);
-        let mut seen = false;
+        let step = 10f64.powi(top - e);
         let fits = values.iter().filter(|v| v.is_finite()).take(4000).all(|v| {
-            seen = true;
             let x = v / step;
             (x - x.round()).abs() < 1e-5 + 1e-12 * x.abs()
         });
-        if seen && fits {
+        if largest > 0.0 && fits {
             return step.max(least_increment(values));
         }
     }

@@ -132,6 +132,22 @@ impl Context<'_> {
             && find(id).is_some_and(|k| matches!(k.spec().place, Place::Chip | Place::Bead))
     }
 
+    /// The longest delay that is a number of these records \[s\]: a tenth of a second on this rig; of another plant as many rows as
+    /// its slowest lag, at least a hundred, and at most a quarter of a record.
+    pub fn longest_delay_s(&self) -> f64 {
+        const ON_THIS_RIG_S: f64 = 0.1;
+        const LEAST_ROWS: f64 = 100.0;
+        let base = &self.problem.base;
+        if !base.free_start {
+            return ON_THIS_RIG_S;
+        }
+        let slowest_s = (base.zpk.poles.iter())
+            .map(|p| 1.0 / p.norm())
+            .filter(|lag_s| lag_s.is_finite())
+            .fold(LEAST_ROWS * base.sample_s, f64::max);
+        slowest_s.min(0.25 * self.scope.length_s).max(ON_THIS_RIG_S)
+    }
+
     /// The effects of the model and of a set, as they are simulated.
     pub fn effects(&self, parts: &[Part]) -> Vec<Effect> {
         let mut effects = self.fixed.clone();

@@ -9,6 +9,18 @@ use crate::thresholds::THRESHOLDS;
 /// Samples by which an output may be delayed, or seem to lead.
 const MOST_SAMPLES: usize = 20;
 
+/// Delays that are tried, in samples: one by one, and of another plant on as far as its lags reach, in steps of a tenth.
+fn delays(ctx: &Context<'_>) -> Vec<usize> {
+    let mut all: Vec<usize> = (0..=MOST_SAMPLES).collect();
+    let most = (ctx.longest_delay_s() / ctx.problem.base.sample_s) as usize;
+    let mut next = MOST_SAMPLES + 2;
+    while ctx.problem.base.free_start && next <= most {
+        all.push(next);
+        next += next / 10;
+    }
+    all
+}
+
 /// What can be seen without a model.
 pub(crate) fn records(records: &[Record], bead: bool) -> Result<(), ReconcileError> {
     let Some(first) = records.first() else {
@@ -78,7 +90,7 @@ pub(crate) fn working_point(
 pub(crate) fn motion(ctx: &Context<'_>) -> Result<(), ReconcileError> {
     let problem = ctx.problem;
     let sim = ctx.simulated(&[], &problem.all());
-    let most = MOST_SAMPLES;
+    let delays = delays(ctx);
     let (mut yy, mut count) = (0.0, 0.0);
     let mut white: Vec<(Vec<f64>, Vec<f64>)> = Vec::new();
     for (r, s) in problem.records.iter().zip(&sim) {
@@ -95,7 +107,7 @@ pub(crate) fn motion(ctx: &Context<'_>) -> Result<(), ReconcileError> {
     }
     let (mut best, mut gain) = (0.0f64, 0.0f64);
     let ss: f64 = white.iter().map(|(_, s)| dot(s, s)).sum();
-    for d in 0..=most {
+    for &d in &delays {
         let ys: f64 = white
             .iter()
             .map(|(y, s)| dot(&y[d.min(y.len())..], &s[..s.len().saturating_sub(d)]))
@@ -105,7 +117,7 @@ pub(crate) fn motion(ctx: &Context<'_>) -> Result<(), ReconcileError> {
             gain = ys / ss;
         }
     }
-    if let Some(lead) = leads(&white) {
+    if let Some(lead) = leads(&white, &delays) {
         return Err(ReconcileError::Leads {
             lead_s: lead as f64 * problem.base.sample_s,
         });
@@ -158,7 +170,9 @@ pub(crate) fn motion(ctx: &Context<'_>) -> Result<(), ReconcileError> {
         }
         // A lag takes fast motion away, and no unit: the gain of slow motion has a say.
         let plausible = 0.3..=3.0;
-        if !plausible.contains(&gain) && !plausible.contains(&level_likeness(problem, &sim).1) {
+        if !plausible.contains(&gain)
+            && !plausible.contains(&level_likeness(problem, &sim, &delays).1)
+        {
             return units(
                 "the gain of command or position",
                 "check the units of both columns and the model file",
@@ -166,7 +180,7 @@ pub(crate) fn motion(ctx: &Context<'_>) -> Result<(), ReconcileError> {
         }
         return Ok(());
     }
-    let (alike, _) = level_likeness(problem, &sim);
+    let (alike, _) = level_likeness(problem, &sim, &delays);
     if explained.max(alike) > THRESHOLDS.least_alike {
         return Ok(());
     }
@@ -189,7 +203,11 @@ fn of_other_data(gain: f64) -> Result<(), ReconcileError> {
 }
 
 /// Part of the variance of the positions that the model's own positions explain at the best gain and delay, and that gain.
-fn level_likeness(problem: &crate::problem::Problem, sim: &[Vec<f64>]) -> (f64, f64) {
+fn level_likeness(
+    problem: &crate::problem::Problem,
+    sim: &[Vec<f64>],
+    delays: &[usize],
+) -> (f64, f64) {
     let (mut best, mut gain, mut yy, mut ss) = (0.0f64, 0.0f64, 0.0, 0.0);
     let pairs: Vec<(Vec<f64>, Vec<f64>)> = problem
         .records
@@ -202,7 +220,7 @@ fn level_likeness(problem: &crate::problem::Problem, sim: &[Vec<f64>]) -> (f64, 
         yy += dot(y, y);
         ss += dot(s, s);
     }
-    for d in 0..=MOST_SAMPLES {
+    for &d in delays {
         let ys: f64 = pairs
             .iter()
             .map(|(y, s)| dot(&y[d.min(y.len())..], &s[..s.len().saturating_sub(d)]))
@@ -216,7 +234,7 @@ fn level_likeness(problem: &crate::problem::Problem, sim: &[Vec<f64>]) -> (f64, 
 }
 
 /// By how many samples the output leads, where it fits clearly better so than with any delay.
-fn leads(white: &[(Vec<f64>, Vec<f64>)]) -> Option<usize> {
+fn leads(white: &[(Vec<f64>, Vec<f64>)], delays: &[usize]) -> Option<usize> {
     let at = |d: isize| -> f64 {
         let k = d.unsigned_abs();
         let ys: f64 = white
@@ -229,7 +247,7 @@ fn leads(white: &[(Vec<f64>, Vec<f64>)]) -> Option<usize> {
         ys * ys
     };
     let most = MOST_SAMPLES as isize;
-    let late = (0..=most).map(at).fold(0.0, f64::max);
+    let late = (delays.iter()).map(|d| at(*d as isize)).fold(0.0, f64::max);
     let (lead, early) = (2..=most)
         .map(|d| (d, at(-d)))
         .max_by(|a, b| a.1.total_cmp(&b.1))?;

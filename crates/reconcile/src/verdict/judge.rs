@@ -196,6 +196,15 @@ pub(crate) fn first_at_bound(ctx: &Context<'_>, fit: &Fit) -> Option<(usize, Str
             if j == 0 && p.log && 1.96 * sd > 0.5 * (high - low) {
                 return Some((i, format!("{} of {} may be anything", p.name, part.id())));
             }
+            if p.name == "delay_s" && v >= ctx.longest_delay_s() {
+                let words = format!(
+                    "{} of {} is {} s, longer than these records tell",
+                    p.name,
+                    part.id(),
+                    figure(v)
+                );
+                return Some((i, words));
+            }
             let nyquist_hz = 0.5 / ctx.scope.sample_s;
             if ctx.scope.sampled_input && p.name.ends_with("_hz") && v > nyquist_hz {
                 let words = format!(

@@ -144,7 +144,49 @@ fn play_of_millivolts_is_play_of_volts() {
     let one = look(&hidden, [1.0, 1.0]);
     assert_eq!(one.effects.len(), 1, "{:?}", one.places);
     assert_eq!(one.effects[0].id, "backlash");
-    for scale in [[1e-3, 1.0], [1e3, 1e4]] {
+    for scale in [[1e-3, 1.0], [1e-9, 1e-12]] {
         same_but_for_units(&hidden, &one, scale);
     }
+}
+
+#[test]
+fn a_slow_plant_may_be_later_than_a_fast_one() {
+    // A heater of 60 s, a row a second, 35 s later than its model says.
+    let heater = Model {
+        plant: TransferFunction::new(vec![2.0], vec![60.0, 1.0]).unwrap(),
+        working_point_um: 50.0,
+        noise: Noise {
+            diffusion_um2_per_s: 0.0,
+            localisation_um: 0.1,
+        },
+        ..plant()
+    };
+    let mut random = Gaussian::new(3);
+    let mut u = Vec::new();
+    while u.len() < 2400 {
+        u.extend(std::iter::repeat_n(50.0 + 20.0 * random.next_normal(), 80));
+    }
+    let hidden = heater.clone().with_effect(effects::time_delay(35.0));
+    let options = SimulateOptions {
+        seed: Some(4),
+        ..SimulateOptions::default()
+    };
+    let y = simulate(&hidden, &u, 1.0, &options).unwrap();
+    let t: Vec<f64> = (0..u.len()).map(|k| k as f64).collect();
+    let record = Record::from_rows("heater", &t, &u, &y).unwrap();
+    let options = Options {
+        free_start: true,
+        ..Options::default()
+    };
+    let found = reconcile(&heater, &[record], &options, &mut |_| {}).unwrap();
+    let ids: Vec<&str> = found.effects.iter().map(|e| e.id.as_str()).collect();
+    assert_eq!(
+        ids,
+        ["time-delay"],
+        "{:?} {:?}",
+        found.verdict,
+        found.places
+    );
+    let delay = &found.effects[0].parameters["delay_s"];
+    assert!((delay.value - 35.0).abs() < 0.5, "{delay:?}");
 }
