@@ -18,7 +18,7 @@ use crate::units::{Scales, Units};
 use crate::verdict::assemble;
 use crate::verdict::augment::COLOURED;
 use crate::verdict::guard;
-use crate::verdict::held_out;
+use crate::verdict::held_out::{self, HeldOut};
 use crate::verdict::judge;
 use crate::verdict::result::Reconciliation;
 use cellpos_plant::effects::Scope;
@@ -180,21 +180,7 @@ fn within(
         problem.spent() as f64 / (options.work.max(1e-9) * WORK)
     ));
     take_back(&ctx, &mut found, effort);
-    let mut held = held_out::check(&ctx, &found.fit, options.threads);
-    // What does not help where it was not fitted is not named.
-    while let Some(i) = held.unconfirmed.first().copied() {
-        progress(&format!(
-            "{} does not hold on held-out data: taken back",
-            ids(&found.fit)[i]
-        ));
-        let mut parts = found.fit.parts.clone();
-        parts.remove(i);
-        if i < found.rivals.len() {
-            found.rivals.remove(i);
-        }
-        found.fit = ctx.fit(parts, &problem.all(), 12);
-        held = held_out::check(&ctx, &found.fit, options.threads);
-    }
+    let held = confirmed(&ctx, &mut found, options.threads, progress);
     found.fit.locking = (0..found.fit.parts.len())
         .map(|i| locking::refine(&ctx, &found.fit, i, options.threads))
         .collect();
@@ -207,6 +193,30 @@ fn within(
         threads: options.threads,
     };
     Ok(assemble::assemble(&given, &ctx, found, held))
+}
+
+/// Takes back what does not help where it was not fitted: it is not named.
+fn confirmed(
+    ctx: &Context<'_>,
+    found: &mut Found,
+    threads: usize,
+    progress: &mut dyn FnMut(&str),
+) -> HeldOut {
+    let mut held = held_out::check(ctx, &found.fit, threads);
+    while let Some(i) = held.unconfirmed.first().copied() {
+        progress(&format!(
+            "{} does not hold on held-out data: taken back",
+            ids(&found.fit)[i]
+        ));
+        let mut parts = found.fit.parts.clone();
+        parts.remove(i);
+        if i < found.rivals.len() {
+            found.rivals.remove(i);
+        }
+        found.fit = ctx.fit(parts, &ctx.problem.all(), 12);
+        held = held_out::check(ctx, &found.fit, threads);
+    }
+    held
 }
 
 /// The noise that a model states, unless it says that its figures are a fit's own residual.
