@@ -25,6 +25,8 @@ pub(crate) struct Given<'a> {
     pub frames: &'a FrameCounts,
     pub floor: &'a Floor,
     pub threads: usize,
+    /// What is to be said where the records hardly go with the model.
+    pub unlike: Option<&'a str>,
 }
 
 pub(crate) fn assemble(
@@ -39,6 +41,7 @@ pub(crate) fn assemble(
         frames,
         floor,
         threads,
+        unlike,
     } = *given;
     let Found {
         fit,
@@ -49,7 +52,8 @@ pub(crate) fn assemble(
     } = found;
     let null_map = map::map(ctx, &null);
     let after_map = map::map(ctx, &fit);
-    let mut places = sentences(ctx, &null, &null_map);
+    let mut places: Vec<String> = unlike.map(str::to_owned).into_iter().collect();
+    places.extend(sentences(ctx, &null, &null_map, floor.source.is_known()));
     let names = names(ctx, &null, &fit, &rivals);
     let (counted, counted_places) = of_frames(frames);
     let judgement = judge(
@@ -64,6 +68,7 @@ pub(crate) fn assemble(
             after: &after_map,
             counted: !counted.is_empty(),
             cut_short,
+            unlike,
         },
         threads,
     );

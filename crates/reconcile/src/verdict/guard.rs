@@ -5,6 +5,7 @@ use crate::dot::dot;
 use crate::error::ReconcileError;
 use crate::fit::context::Context;
 use crate::thresholds::THRESHOLDS;
+use crate::verdict::unlike::unlike;
 
 /// Samples by which an output may be delayed, or seem to lead.
 const MOST_SAMPLES: usize = 20;
@@ -86,8 +87,9 @@ pub(crate) fn working_point(
 }
 
 /// Whether the motion goes with the command as the model says, at any gain and any delay up to 20 samples; judged by the
-/// innovations of a bead, and by the positions themselves, which a strong nonlinearity leaves more alike.
-pub(crate) fn motion(ctx: &Context<'_>) -> Result<(), ReconcileError> {
+/// innovations of a bead, and by the positions themselves, which a strong nonlinearity leaves more alike. Of another plant, whose
+/// model may come from these very records, it is no error but what there is to say of them.
+pub(crate) fn motion(ctx: &Context<'_>) -> Result<Option<String>, ReconcileError> {
     let problem = ctx.problem;
     let sim = ctx.simulated(&[], &problem.all());
     let delays = delays(ctx);
@@ -130,7 +132,7 @@ pub(crate) fn motion(ctx: &Context<'_>) -> Result<(), ReconcileError> {
         });
     }
     if excess < 0.02 * count {
-        return Ok(());
+        return Ok(None);
     }
     let explained = best / excess;
     let units = |what, hint| {
@@ -141,7 +143,7 @@ pub(crate) fn motion(ctx: &Context<'_>) -> Result<(), ReconcileError> {
         })
     };
     if explained > 0.25 && problem.base.free_start {
-        return of_other_data(gain);
+        return of_other_data(gain).map(|()| None);
     }
     if explained > 0.25 {
         if gain < 0.0 {
@@ -178,11 +180,23 @@ pub(crate) fn motion(ctx: &Context<'_>) -> Result<(), ReconcileError> {
                 "check the units of both columns and the model file",
             );
         }
-        return Ok(());
+        return Ok(None);
     }
     let (alike, _) = level_likeness(problem, &sim, &delays);
     if explained.max(alike) > THRESHOLDS.least_alike {
-        return Ok(());
+        return Ok(None);
+    }
+    if problem.base.free_start {
+        let signless: Vec<Vec<f64>> = sim
+            .iter()
+            .map(|s| s.iter().map(|v| v.abs()).collect())
+            .collect();
+        let (without_sign, _) = level_likeness(problem, &signless, &delays);
+        return Ok(Some(unlike(
+            &problem.records,
+            explained.max(alike),
+            without_sign,
+        )));
     }
     Err(ReconcileError::AnotherRig {
         explained_percent: 100.0 * explained.max(alike).clamp(0.0, 1.0),

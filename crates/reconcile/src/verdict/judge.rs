@@ -29,6 +29,8 @@ pub(crate) struct Evidence<'a> {
     pub counted: bool,
     /// The search ended with its budget.
     pub cut_short: bool,
+    /// What is said where the records hardly go with the model.
+    pub unlike: Option<&'a str>,
 }
 
 /// The verdict with its reasons.
@@ -132,6 +134,12 @@ fn refusal(
             ctx,
             e,
             &format!("the best of the catalogue is {best}"),
+        ));
+    }
+    // Beside a model that is none of these records nothing of the catalogue is missing; equations of the user's own may stand for it.
+    if e.unlike.is_some() && e.fit.parts.iter().all(|p| !p.variant.is_own()) {
+        return Some(format!(
+            "the best of the catalogue, {best}, is no name beside a model that these records do not follow"
         ));
     }
     if e.names.curvature {
@@ -282,7 +290,7 @@ fn remainder(
     share: f64,
 ) -> Remainder {
     Remainder {
-        places: sentences(ctx, e.fit, e.after),
+        places: sentences(ctx, e.fit, e.after, e.floor.source.is_known()),
         how: term.map_or_else(
             || "nothing of the library of terms stands out".to_owned(),
             |(i, _)| {

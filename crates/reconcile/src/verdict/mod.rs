@@ -16,4 +16,5 @@ mod sentences;
 mod significance;
 mod split;
 mod tell;
+mod unlike;
 pub(crate) mod workflow;

@@ -7,7 +7,12 @@ use crate::units::figure;
 use crate::verdict::map::{BAND_EDGES_HZ, DiscrepancyMap, MapRow};
 
 /// Sentences about where the null model fails.
-pub(crate) fn sentences(ctx: &Context<'_>, fit: &Fit, map: &DiscrepancyMap) -> Vec<String> {
+pub(crate) fn sentences(
+    ctx: &Context<'_>,
+    fit: &Fit,
+    map: &DiscrepancyMap,
+    floor_known: bool,
+) -> Vec<String> {
     let records = &ctx.problem.records;
     let flagged: Vec<&MapRow> = map
         .rows
@@ -16,9 +21,11 @@ pub(crate) fn sentences(ctx: &Context<'_>, fit: &Fit, map: &DiscrepancyMap) -> V
         .filter(|r| r.cells.iter().any(|c| c.flagged))
         .collect();
     if flagged.is_empty() {
-        return vec![
-            "nowhere: every record, band and third of the time is at the noise floor".to_owned(),
-        ];
+        return vec![match floor_known {
+            true => "nowhere: every record, band and third of the time is at the noise floor",
+            false => "nowhere more than elsewhere: no record, band or third of the time stands out, and how much of it is noise is not known",
+        }
+        .to_owned()];
     }
     let mut out = vec![span(records, map, &flagged), response(map)];
     out.extend(course(&map.rows[records.len()..]));

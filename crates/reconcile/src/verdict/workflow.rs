@@ -131,7 +131,7 @@ fn within(
     let floor = floor::estimate(&records, &present, &residual, stated, kind);
     let (noise, trusted) = (floor.noise, floor.rows);
     let problem = problem.with_noise(noise);
-    guard::motion(&context(&problem, scope, &fixed, options, scales))?;
+    let unlike = guard::motion(&context(&problem, scope, &fixed, options, scales))?;
 
     let effort = Effort {
         threads: options.threads,
@@ -191,6 +191,7 @@ fn within(
         frames: &frames,
         floor: &floor,
         threads: options.threads,
+        unlike: unlike.as_deref(),
     };
     Ok(assemble::assemble(&given, &ctx, found, held))
 }

@@ -150,7 +150,8 @@ impl Set {
         ways.push(("turned", turned));
         for (way, records) in ways {
             println!("{way}:");
-            if let Ok(r) = self.run(model, &records) {
+            {
+                let r = self.run(model, &records).unwrap();
                 assert!(
                     r.effects.is_empty(),
                     "{way}: a false name: {:?}, {:?}",
@@ -218,7 +219,12 @@ fn drives_with_a_rectifying_sensor_have_no_name_in_the_catalogue() {
         Hold::ZeroOrder,
     );
     // A belt of 1.5 Hz behind a lag of 0.3 s.
-    s.no_name(&rough(1.0, &[0.0034, 0.0158, 0.33, 1.0], 0.0));
+    let model = rough(1.0, &[0.0034, 0.0158, 0.33, 1.0], 0.0);
+    s.no_name(&model);
+    let result = s.run(&model, &s.records(|n| 0..n)).unwrap();
+    assert_eq!(result.verdict, Verdict::Unknown);
+    let said = result.places.join("; ");
+    assert!(said.contains("without its sign"), "{said}");
 }
 
 fn silverbox() -> Set {
