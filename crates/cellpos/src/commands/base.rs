@@ -3,12 +3,13 @@
 use super::identify::HoldKind;
 use super::identify::report::number;
 use crate::outcome::Failure;
-use cellpos_ident::base::{BaseFit, Form, Series, choose};
+use cellpos_ident::base::{BaseFit, Form, FormError, Series, choose};
 use cellpos_ident::rational::RationalFit;
 use cellpos_ident::sampled::Hold;
 use cellpos_plant::{Model, Noise, TransferFunction, effects};
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
+use std::str::FromStr;
 
 /// Provenance of a model of other data: how its input was sampled, its form, and the output while its input rests.
 pub const HOLD: &str = "hold";
@@ -65,6 +66,60 @@ pub struct Base {
     mean_output: f64,
 }
 
+/// A form as it is given on the command line: stated, or chosen by the records.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Asked {
+    /// By how well halves of the records predict each other.
+    Chosen,
+    /// As it is stated.
+    Stated(Form),
+}
+
+impl FromStr for Asked {
+    type Err = FormError;
+
+    fn from_str(text: &str) -> Result<Self, FormError> {
+        match text.trim() {
+            "auto" => Ok(Self::Chosen),
+            form => form.parse().map(Self::Stated),
+        }
+    }
+}
+
+impl Asked {
+    /// The stated form, if there is one.
+    pub fn form(self) -> Option<Form> {
+        match self {
+            Self::Chosen => None,
+            Self::Stated(form) => Some(form),
+        }
+    }
+}
+
+/// Highest order that is tried where nobody states one.
+pub const MOST_ORDER: usize = 4;
+
+/// Forms that hold one thing more than another: a pole, a delay.
+pub fn richer(form: Form) -> Vec<Form> {
+    let delayed = Form {
+        delay: true,
+        ..form
+    };
+    let higher = Form {
+        order: form.order + 1,
+        zeros: None,
+        ..form
+    };
+    let mut all = Vec::new();
+    if !form.delay {
+        all.push(delayed);
+    }
+    if higher.order <= cellpos_ident::base::MOST_ORDER {
+        all.push(higher);
+    }
+    all
+}
+
 /// Fits a base model to records of one rate.
 ///
 /// # Errors
@@ -114,6 +169,11 @@ pub fn fit(
             number(fit.output_rms)
         ));
     }
+    if let Some(form) = asked {
+        advice.extend(too_poor(form, &fit, |richer| {
+            choose(records, rate_hz, hold, Some(richer), richer.order)
+        }));
+    }
     let changes = inputs()
         .zip(inputs().skip(1))
         .filter(|(a, b)| a != b)
@@ -150,6 +210,28 @@ pub fn fit(
         hold,
         advice,
     })
+}
+
+/// What is said of a stated form where one with a pole or a delay more predicts halves of the records far better.
+fn too_poor(
+    form: Form,
+    fit: &BaseFit,
+    fits: impl Fn(Form) -> Result<Vec<BaseFit>, cellpos_ident::IdentError>,
+) -> Option<String> {
+    /// A form that is right predicts as well as one that has more: the rest is by so much worse.
+    const FAR_BETTER: f64 = 0.8;
+    let stated = fit.held_out_rms?;
+    let better = richer(form).into_iter().filter_map(|richer| {
+        let found = fits(richer).ok()?.into_iter().next()?;
+        let held_out = found.held_out_rms.filter(|e| *e < FAR_BETTER * stated)?;
+        (!found.at_bound).then_some((richer, held_out))
+    });
+    let (richer, held_out) = better.min_by(|a, b| a.1.total_cmp(&b.1))?;
+    Some(format!(
+        "the stated form is too poor: beside {form}, {richer} predicts halves of the records with an error of {} in the place of {}; state --base {richer}, or leave the form open",
+        number(held_out),
+        number(stated)
+    ))
 }
 
 /// The rate of records that are to be fitted together.

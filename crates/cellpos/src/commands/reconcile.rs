@@ -3,6 +3,7 @@
 mod model;
 mod records;
 
+use crate::commands::base;
 use crate::commands::columns;
 use crate::commands::identify::HoldKind;
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
@@ -24,6 +25,7 @@ Examples:
   cellpos reconcile --model eq6 --data runs/monday --out augmented.toml --report gap.html --json result.json
   cellpos reconcile --model eq6 --collect more --rig rig.toml --out augmented.toml
   cellpos reconcile --model base.toml --data d.csv --input u --output y --out augmented.toml
+  cellpos reconcile --base --data d.csv --input u --output y --out augmented.toml
   cellpos reconcile --base order=2,delay --data d.csv --input 'p [kW]' --output 'T [degC]' --effects mine.toml
   cellpos reconcile --model fit --data Model_Vi_Do.dat --rows 0:8027 --input-column 1 --output-column 5 --rate 200Hz
 
@@ -34,9 +36,9 @@ pub struct Args {
     #[arg(long, default_value = "eq6")]
     model: String,
     /// In the place of --model, for data of another rig: a linear base model of this form, fitted to the records: order=N, with
-    /// zeros=N, delay, integrating where they are wanted; or static.
-    #[arg(long, conflicts_with_all = ["model", "collect"])]
-    base: Option<cellpos_ident::base::Form>,
+    /// zeros=N, delay, integrating where they are wanted; or static. Without a form, or with auto, the records choose it.
+    #[arg(long, conflicts_with_all = ["model", "collect"], num_args = 0..=1, default_missing_value = "auto", value_name = "FORM")]
+    base: Option<base::Asked>,
     /// Records (text, .npy, .mat), run folders, or folders of both.
     #[arg(long, required_unless_present = "collect", num_args = 1.., value_parser = crate::arguments::run_folder())]
     data: Vec<PathBuf>,

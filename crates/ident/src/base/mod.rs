@@ -14,7 +14,7 @@ mod response;
 mod types;
 
 pub use choose::choose;
-pub use form::{Form, FormError};
+pub use form::{Form, FormError, MOST_ORDER};
 pub use response::Grid;
 pub use types::{BaseFit, Series};
 

@@ -4,6 +4,7 @@
 use crate::data::coloured::{Alone, NoiseKind, choose};
 use crate::data::noise::{NoiseModel, increment_moments};
 use crate::data::record::Record;
+use crate::data::repeats::{Repeats, repeats, rests, whole_periods};
 use crate::thresholds::THRESHOLDS;
 use serde::Serialize;
 use std::f64::consts::TAU;
@@ -103,21 +104,8 @@ pub(crate) fn estimate(
         let (e, present_i) = (&residuals[i], &present[i]);
         if r.rests_within(THRESHOLDS.rest_share * whole) {
             found.push(of(e, present_i, r.sample_s, FloorSource::Rest, 1.0));
-        } else if let Some(p) = r.period_rows() {
-            let from = if r.rows() >= 4 * p { 2 * p } else { p };
-            let rows = from..r.rows();
-            let ok: Vec<bool> = rows
-                .clone()
-                .map(|k| present_i[k] && present_i[k - p])
-                .collect();
-            // The noise of a measured input goes through the model into the residuals, and not into the positions.
-            let y = &r.bead_um;
-            for d in [
-                rows.clone().map(|k| e[k] - e[k - p]).collect::<Vec<f64>>(),
-                rows.map(|k| y[k] - y[k - p])
-                    .map(|d| if d.is_finite() { d } else { 0.0 })
-                    .collect(),
-            ] {
+        } else if let Some(repeats) = whole_periods(r) {
+            for (d, ok) in between_periods(r, e, present_i, &repeats) {
                 found.push(of(&d, &ok, r.sample_s, FloorSource::Periods, 0.5));
             }
         }
@@ -140,7 +128,23 @@ pub(crate) fn estimate(
         });
     }
     let quantum_um2 = quantisation_um2(records);
-    found.retain(|f| f.rows >= THRESHOLDS.floor_rows && f.c0 > 0.0);
+    let counts = |f: &Estimate| f.rows >= THRESHOLDS.floor_rows && f.c0 > 0.0;
+    // Where no record as a whole tells the noise, parts of them may: a misfit can only add.
+    if !found.iter().any(counts) {
+        for (i, r) in records.iter().enumerate() {
+            let (e, ok) = (&residuals[i], &present[i]);
+            if let Some(repeats) = repeats(r) {
+                for (d, ok) in between_periods(r, e, ok, &repeats) {
+                    found.push(of(&d, &ok, r.sample_s, FloorSource::Periods, 0.5));
+                }
+            }
+            for rows in rests(r) {
+                let (e, ok) = (&e[rows.clone()], &ok[rows]);
+                found.push(of(e, ok, r.sample_s, FloorSource::Rest, 1.0));
+            }
+        }
+    }
+    found.retain(counts);
     if let Some(least) = found.iter().min_by(|a, b| a.sigma().total_cmp(&b.sigma())) {
         let pooled = pooled(&found, least.sigma());
         let walk = NoiseModel::from_increments(pooled.c0, pooled.c1);
@@ -183,6 +187,34 @@ pub(crate) fn estimate(
             rows: 0,
         },
     }
+}
+
+/// Differences of residuals and of positions between a row and the row a period before, and which of them count.
+fn between_periods(
+    r: &Record,
+    e: &[f64],
+    present: &[bool],
+    repeats: &Repeats,
+) -> [(Vec<f64>, Vec<bool>); 2] {
+    let p = repeats.rows;
+    let first = repeats.ranges.first().map_or(p, |range| range.start);
+    let last = repeats.ranges.last().map_or(p, |range| range.end);
+    let rows = first..last;
+    let ok: Vec<bool> = rows
+        .clone()
+        .map(|k| {
+            let inside = repeats.ranges.iter().any(|range| range.contains(&k));
+            inside && present[k] && present[k - p]
+        })
+        .collect();
+    // The noise of a measured input goes through the model into the residuals, and not into the positions.
+    let y = &r.bead_um;
+    let of_residuals = rows.clone().map(|k| e[k] - e[k - p]).collect();
+    let of_positions = rows
+        .map(|k| y[k] - y[k - p])
+        .map(|d| if d.is_finite() { d } else { 0.0 })
+        .collect();
+    [(of_residuals, ok.clone()), (of_positions, ok)]
 }
 
 /// Those within 3 % of the least together.

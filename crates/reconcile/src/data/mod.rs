@@ -6,3 +6,4 @@ pub(crate) mod floor;
 pub(crate) mod frames;
 pub(crate) mod noise;
 pub(crate) mod record;
+pub(crate) mod repeats;

@@ -270,14 +270,14 @@ pub(crate) fn command_range_um(records: &[Record]) -> f64 {
 }
 
 /// Variance about the mean.
-fn variance(x: &[f64]) -> f64 {
+pub(crate) fn variance(x: &[f64]) -> f64 {
     let n = x.len().max(1) as f64;
     let mean = x.iter().sum::<f64>() / n;
     x.iter().map(|v| (v - mean).powi(2)).sum::<f64>() / n
 }
 
 /// Mean square of `x_k - x_(k-p)` for every shift p up to half the length, through the autocorrelation.
-fn differences(x: &[f64]) -> Option<Vec<f64>> {
+pub(crate) fn differences(x: &[f64]) -> Option<Vec<f64>> {
     let n = x.len();
     let mean = x.iter().sum::<f64>() / n as f64;
     let size = (2 * n).next_power_of_two();

@@ -169,8 +169,10 @@ fn refusal(
 
 /// What is said where there is no floor.
 fn no_floor(ctx: &Context<'_>, e: &Evidence<'_>, best: &str) -> String {
+    // On this rig ten seconds; what is sampled slowly rests for as many rows as a floor needs.
+    let rest_s = (2.0 * THRESHOLDS.floor_rows as f64 * ctx.scope.sample_s).max(10.0);
     format!(
-        "without a noise floor no name is given (no rest, no repeated command, no stated noise); {best}: innovations {} before, {} after, free run {} before, {} after, on held-out records; record a rest of 10 s or the command twice, and look again",
+        "without a noise floor no name is given (no rest, no repeated command, no stated noise); {best}: innovations {} before, {} after, free run {} before, {} after, on held-out records; record a rest of {rest_s:.0} s or the command twice, and look again",
         ctx.scales.told(e.held.before_um),
         ctx.scales.told(e.held.after_um),
         ctx.scales.told(e.held.free_before_um),

@@ -132,7 +132,13 @@ fn base_of(
         })
         .collect();
     let hold = base::hold_of(args.hold);
-    let found = base::fit(&records, rate_hz, hold, args.base, usize::from(args.order));
+    let found = base::fit(
+        &records,
+        rate_hz,
+        hold,
+        args.base.and_then(base::Asked::form),
+        usize::from(args.order),
+    );
     let spectral = results.iter().any(|(_, r)| !r.models.is_empty());
     match found {
         // Brownian motion on an integrator is no error of the free run: the response, fitted on increments, knows more.

@@ -60,9 +60,9 @@ pub struct Args {
     #[arg(long, value_name = "FROM:TO", requires = "input")]
     rows: Option<String>,
     /// Form of the model of other rigs' records: order=N, with zeros=N, delay, integrating where they are wanted; or
-    /// static. Left out: the simplest that predicts records as well as any, up to --order.
+    /// static. Left out, or auto: the simplest that predicts records as well as any, up to --order.
     #[arg(long, requires = "input")]
-    base: Option<cellpos_ident::base::Form>,
+    base: Option<super::base::Asked>,
     /// What the records' input does between rows: a command is held (zero-order), a measured signal is not (none).
     #[arg(long, value_enum, default_value_t = HoldKind::ZeroOrder)]
     hold: HoldKind,

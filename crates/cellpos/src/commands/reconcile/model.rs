@@ -28,7 +28,7 @@ pub(super) struct Asked<'a> {
     /// A name, a file, or `fit`.
     pub model: &'a str,
     /// The form of a base that stands in its place.
-    pub base: Option<Form>,
+    pub base: Option<base::Asked>,
     /// How the command acts between rows.
     pub hold: Option<HoldKind>,
 }
@@ -45,9 +45,9 @@ pub(super) fn model_of(
         return fitted(data.records);
     }
     let mut model = match args.base {
-        Some(form) => {
+        Some(asked) => {
             let hold = args.hold.unwrap_or(HoldKind::ZeroOrder);
-            let base = fit(data.records, &[], base::hold_of(hold), form)?;
+            let base = fit(data.records, &[], base::hold_of(hold), asked.form())?;
             for line in base.words().lines() {
                 tracing::info!("{line}");
             }
@@ -73,7 +73,12 @@ pub(super) fn model_of(
 }
 
 /// Fits a base behind what is known to happen to its input (`ahead`, row by row of every record; none where nothing does).
-fn fit(records: &[Record], ahead: &[Vec<f64>], hold: Hold, form: Form) -> Result<Base, Failure> {
+fn fit(
+    records: &[Record],
+    ahead: &[Vec<f64>],
+    hold: Hold,
+    form: Option<Form>,
+) -> Result<Base, Failure> {
     let rate_hz = base::common_rate(records.iter().map(|r| 1.0 / r.sample_s))?;
     let series: Vec<Series> = (records.iter().enumerate())
         .map(|(i, r)| Series {
@@ -81,7 +86,8 @@ fn fit(records: &[Record], ahead: &[Vec<f64>], hold: Hold, form: Form) -> Result
             output: r.bead_um.clone(),
         })
         .collect();
-    base::fit(&series, rate_hz, hold, Some(form), form.order)
+    let most = form.map_or(base::MOST_ORDER, |form| form.order);
+    base::fit(&series, rate_hz, hold, form, most)
 }
 
 /// Most times that the base is fitted again.
@@ -127,6 +133,9 @@ pub(super) fn reconcile_or_refit(
         gone.extend(lines.into_iter().filter(|id| !left.contains(&id.as_str())));
         (found, present) = (next, again);
     }
+    if let Some(instead) = of_a_richer_base(&found, &present, records, options, form, progress) {
+        return Ok(instead);
+    }
     if !gone.is_empty() {
         found.places.push(format!(
             "the base model itself was off: fitted again with the same form ({form}) it needs no {}, so that is no name; the plant is now num {:?}, den {:?}",
@@ -136,6 +145,41 @@ pub(super) fn reconcile_or_refit(
         ));
     }
     Ok(found)
+}
+
+/// What is found beside a base of one pole or one delay more, where that needs fewer linear effects: of a base that was fitted to
+/// these very records, with a form that somebody stated, these are what the form has no place for, and no names.
+fn of_a_richer_base(
+    found: &Reconciliation,
+    present: &Model,
+    records: &[Record],
+    options: &Options,
+    form: Form,
+    progress: &mut dyn FnMut(&str),
+) -> Option<Reconciliation> {
+    let lines = linear_of(found, present);
+    if lines.is_empty() {
+        return None;
+    }
+    for richer in base::richer(form) {
+        progress(&format!("beside a base of {richer}"));
+        let Some(again) = refitted(found, present, records, options, richer) else {
+            continue;
+        };
+        let Ok(mut next) = reconcile(&again, records, options, progress) else {
+            continue;
+        };
+        if is_simpler(&next, found, &again, lines.len()) {
+            next.places.insert(0, format!(
+                "the base is too poor: beside {form} there would be {}; beside {richer} these records need no such effect, so that is no name; state --base {richer}, or leave the form open; the plant is now num {:?}, den {:?}",
+                lines.join(", "),
+                again.plant.num(),
+                again.plant.den(),
+            ));
+            return Some(next);
+        }
+    }
+    None
 }
 
 /// The linear ones among the effects that were named.
@@ -196,7 +240,7 @@ fn refitted(
         true => Hold::None,
         false => Hold::ZeroOrder,
     };
-    let mut again = fit(records, &inputs, hold, form).ok()?.model().ok()?;
+    let mut again = fit(records, &inputs, hold, Some(form)).ok()?.model().ok()?;
     if !form.integrating || !ahead.effects.is_empty() {
         again.working_point_um = model.working_point_um;
     }
