@@ -1,15 +1,15 @@
 //! The base model of a plant that is not this rig's: fitted to records in time, written as a model file, said in words.
 
+use super::form::richer;
 use super::identify::HoldKind;
 use super::identify::report::number;
 use crate::outcome::Failure;
-use cellpos_ident::base::{BaseFit, Form, FormError, Series, choose};
+use cellpos_ident::base::{BaseFit, Form, Series, choose};
 use cellpos_ident::rational::RationalFit;
 use cellpos_ident::sampled::Hold;
 use cellpos_plant::{Model, Noise, TransferFunction, effects};
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
-use std::str::FromStr;
 
 /// Provenance of a model of other data: how its input was sampled, its form, and the output while its input rests.
 pub const HOLD: &str = "hold";
@@ -64,60 +64,6 @@ pub struct Base {
     mean_input: f64,
     range: (f64, f64),
     mean_output: f64,
-}
-
-/// A form as it is given on the command line: stated, or chosen by the records.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Asked {
-    /// By how well halves of the records predict each other.
-    Chosen,
-    /// As it is stated.
-    Stated(Form),
-}
-
-impl FromStr for Asked {
-    type Err = FormError;
-
-    fn from_str(text: &str) -> Result<Self, FormError> {
-        match text.trim() {
-            "auto" => Ok(Self::Chosen),
-            form => form.parse().map(Self::Stated),
-        }
-    }
-}
-
-impl Asked {
-    /// The stated form, if there is one.
-    pub fn form(self) -> Option<Form> {
-        match self {
-            Self::Chosen => None,
-            Self::Stated(form) => Some(form),
-        }
-    }
-}
-
-/// Highest order that is tried where nobody states one.
-pub const MOST_ORDER: usize = 4;
-
-/// Forms that hold one thing more than another: a pole, a delay.
-pub fn richer(form: Form) -> Vec<Form> {
-    let delayed = Form {
-        delay: true,
-        ..form
-    };
-    let higher = Form {
-        order: form.order + 1,
-        zeros: None,
-        ..form
-    };
-    let mut all = Vec::new();
-    if !form.delay {
-        all.push(delayed);
-    }
-    if higher.order <= cellpos_ident::base::MOST_ORDER {
-        all.push(higher);
-    }
-    all
 }
 
 /// Fits a base model to records of one rate.

@@ -120,6 +120,19 @@ fn hold_over_gaps(record: &mut Record) {
     }
 }
 
+/// The names of columns as a file has them; as they were asked for, where it has none.
+pub fn names_in(path: &Path, asked: [&str; 2]) -> [String; 2] {
+    let header = read_table(path).ok();
+    let table = header
+        .as_deref()
+        .and_then(|text| Table::parse(path, text).ok());
+    asked.map(|asked| {
+        let place = table.as_ref().and_then(|t| t.find(&ColumnRef::from(asked)));
+        let name = table.as_ref().zip(place).map(|(t, place)| &t.names[place]);
+        name.map_or_else(|| asked.to_owned(), Clone::clone)
+    })
+}
+
 /// The unit of a column as its name says it: in brackets, or behind the last `_`; None where it says none that is known.
 pub fn unit_of(name: &str) -> Option<&str> {
     const KNOWN: [&str; 40] = [

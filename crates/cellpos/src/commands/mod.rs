@@ -13,6 +13,7 @@ mod columns;
 pub mod design;
 pub mod doctor;
 pub mod export;
+pub mod form;
 pub mod generate;
 pub mod identify;
 pub mod jog;

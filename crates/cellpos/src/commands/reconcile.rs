@@ -3,8 +3,8 @@
 mod model;
 mod records;
 
-use crate::commands::base;
 use crate::commands::columns;
+use crate::commands::form;
 use crate::commands::identify::HoldKind;
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
 use crate::output;
@@ -38,7 +38,7 @@ pub struct Args {
     /// In the place of --model, for data of another rig: a linear base model of this form, fitted to the records: order=N, with
     /// zeros=N, delay, integrating where they are wanted; or static. Without a form, or with auto, the records choose it.
     #[arg(long, conflicts_with_all = ["model", "collect"], num_args = 0..=1, default_missing_value = "auto", value_name = "FORM")]
-    base: Option<base::Asked>,
+    base: Option<form::Asked>,
     /// Records (text, .npy, .mat), run folders, or folders of both.
     #[arg(long, required_unless_present = "collect", num_args = 1.., value_parser = crate::arguments::run_folder())]
     data: Vec<PathBuf>,
@@ -181,7 +181,7 @@ pub fn run(args: Args) -> CommandResult {
     };
     let model = model::model_of(&asked, &data, &mut options)?;
     if options.free_start || options.free_gain {
-        options.units = units(&args.columns);
+        options.units = units(&args.columns, &files);
     }
     let bar = output::progress_bar(None);
     let mut progress = |text: &str| {
@@ -342,12 +342,23 @@ fn tell(result: &mut Reconciliation) {
     }
 }
 
-/// The units of other data, as the names of its columns give them.
-fn units(columns: &Columns) -> Units {
-    let unit = |column: &str, else_it_is| columns::unit_of(column).unwrap_or(else_it_is).to_owned();
+/// The units of other data, as the names of its columns in the first file give them.
+fn units(columns: &Columns, files: &[PathBuf]) -> Units {
+    let asked = [
+        columns.input_column.as_str(),
+        columns.output_column.as_str(),
+    ];
+    let file = files.iter().find(|file| !is_run(file));
+    let [input, output] = match file {
+        Some(file) => columns::names_in(file, asked),
+        None => asked.map(str::to_owned),
+    };
+    let unit = |name: &str, else_it_is: &str| {
+        columns::unit_of(name).map_or_else(|| else_it_is.to_owned(), str::to_owned)
+    };
     Units {
-        input: unit(&columns.input_column, "input units"),
-        output: unit(&columns.output_column, "output units"),
+        input: unit(&input, "input units"),
+        output: unit(&output, "output units"),
     }
 }
 

@@ -87,19 +87,6 @@ pub(crate) fn estimate(
     let whole = crate::data::record::command_range_um(records);
     let mut found: Vec<Estimate> = Vec::new();
     let mut own: Vec<Estimate> = Vec::new();
-    let of = |e: &[f64], ok: &[bool], sample_s: f64, source, share: f64| {
-        let clean = without_lines(e, ok, sample_s);
-        let counts = without_jumps(&clean, ok);
-        let (c0, c1, rows) = increment_moments(&clean, &counts);
-        Estimate {
-            c0: share * c0,
-            c1: share * c1,
-            rows,
-            source,
-            alone: (clean, counts),
-            share,
-        }
-    };
     for (i, r) in records.iter().enumerate() {
         let (e, present_i) = (&residuals[i], &present[i]);
         if r.rests_within(THRESHOLDS.rest_share * whole) {
@@ -186,6 +173,21 @@ pub(crate) fn estimate(
             source: FloorSource::Unknown,
             rows: 0,
         },
+    }
+}
+
+/// An estimate from residuals or differences that hold nothing but noise, `share` of it that of one record.
+fn of(e: &[f64], ok: &[bool], sample_s: f64, source: FloorSource, share: f64) -> Estimate {
+    let clean = without_lines(e, ok, sample_s);
+    let counts = without_jumps(&clean, ok);
+    let (c0, c1, rows) = increment_moments(&clean, &counts);
+    Estimate {
+        c0: share * c0,
+        c1: share * c1,
+        rows,
+        source,
+        alone: (clean, counts),
+        share,
     }
 }
 

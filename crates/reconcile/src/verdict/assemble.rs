@@ -75,14 +75,7 @@ pub(crate) fn assemble(
     let verdict = judgement.verdict;
     places.extend(counted_places);
     places.extend(judgement.reasons);
-    if let Some(c) = ctx.problem.noise.coloured {
-        places.push(format!(
-            "the noise itself is slow: {} RMS with a correlation time of {} s beside white noise of {}; errors as small and as slow are not told from it",
-            ctx.scales.told(c.variance_um2.sqrt()),
-            figure(c.time_rows * ctx.problem.base.sample_s),
-            ctx.scales.told(ctx.problem.noise.localisation_um())
-        ));
-    }
+    places.extend(slow_noise(ctx));
     if cut_short {
         places.push("the search ended with its budget of simulations, not because nothing more was to be found: --work 4 gives it four times as much".to_owned());
     }
@@ -139,6 +132,17 @@ pub(crate) fn assemble(
             .map(|r| (r.name.clone(), r.rows(), r.frames()))
             .collect(),
     }
+}
+
+/// What is said where the noise is coloured.
+fn slow_noise(ctx: &Context<'_>) -> Option<String> {
+    let c = ctx.problem.noise.coloured?;
+    Some(format!(
+        "the noise itself is slow: {} RMS with a correlation time of {} s beside white noise of {}; errors as small and as slow are not told from it",
+        ctx.scales.told(c.variance_um2.sqrt()),
+        figure(c.time_rows * ctx.problem.base.sample_s),
+        ctx.scales.told(ctx.problem.noise.localisation_um())
+    ))
 }
 
 /// How far the gap has shrunk: fits and maps without and with the effects.

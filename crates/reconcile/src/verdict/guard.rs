@@ -146,30 +146,7 @@ pub(crate) fn motion(ctx: &Context<'_>) -> Result<Option<String>, ReconcileError
         return of_other_data(gain).map(|()| None);
     }
     if explained > 0.25 {
-        if gain < 0.0 {
-            return units(
-                "sign",
-                "the bead moves against the model: swap the sign of the bead or of the command",
-            );
-        }
-        if gain > 100.0 {
-            return units(
-                "bead_um looks like nanometres",
-                "divide the column by 1000, or pass its scale with --output-um-per-unit 0.001",
-            );
-        }
-        if gain < 0.01 {
-            return units(
-                "bead_um looks like millimetres",
-                "multiply the column by 1000, or pass its scale with --output-um-per-unit 1000",
-            );
-        }
-        if (3.0..5.5).contains(&gain) {
-            return units(
-                "pzt_um looks like volts",
-                "convert at 4 um per volt, or pass its scale with --input-um-per-unit 4",
-            );
-        }
+        of_a_bead(gain)?;
         // A lag takes fast motion away, and no unit: the gain of slow motion has a say.
         let plausible = 0.3..=3.0;
         if !plausible.contains(&gain)
@@ -202,6 +179,42 @@ pub(crate) fn motion(ctx: &Context<'_>) -> Result<Option<String>, ReconcileError
         explained_percent: 100.0 * explained.max(alike).clamp(0.0, 1.0),
         detail: String::new(),
     })
+}
+
+/// What a gain says of the units of a bead's records.
+fn of_a_bead(gain: f64) -> Result<(), ReconcileError> {
+    let units = |what, hint| {
+        Err(ReconcileError::Units {
+            what,
+            ratio: gain,
+            hint,
+        })
+    };
+    if gain < 0.0 {
+        return units(
+            "sign",
+            "the bead moves against the model: swap the sign of the bead or of the command",
+        );
+    }
+    if gain > 100.0 {
+        return units(
+            "bead_um looks like nanometres",
+            "divide the column by 1000, or pass its scale with --output-um-per-unit 0.001",
+        );
+    }
+    if gain < 0.01 {
+        return units(
+            "bead_um looks like millimetres",
+            "multiply the column by 1000, or pass its scale with --output-um-per-unit 1000",
+        );
+    }
+    if (3.0..5.5).contains(&gain) {
+        return units(
+            "pzt_um looks like volts",
+            "convert at 4 um per volt, or pass its scale with --input-um-per-unit 4",
+        );
+    }
+    Ok(())
 }
 
 /// Of another plant nothing is known of its units but what the model has.

@@ -4,6 +4,7 @@ use super::Args;
 use super::report::{log_grid, number};
 use super::sources::{self, Source};
 use crate::commands::base::{self, Base, coefficients};
+use crate::commands::form::Asked;
 use crate::commands::report::with_interval;
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
 use cellpos_ident::feedback::feedback;
@@ -136,7 +137,7 @@ fn base_of(
         &records,
         rate_hz,
         hold,
-        args.base.and_then(base::Asked::form),
+        args.base.and_then(Asked::form),
         usize::from(args.order),
     );
     let spectral = results.iter().any(|(_, r)| !r.models.is_empty());

@@ -62,7 +62,7 @@ pub struct Args {
     /// Form of the model of other rigs' records: order=N, with zeros=N, delay, integrating where they are wanted; or
     /// static. Left out, or auto: the simplest that predicts records as well as any, up to --order.
     #[arg(long, requires = "input")]
-    base: Option<super::base::Asked>,
+    base: Option<super::form::Asked>,
     /// What the records' input does between rows: a command is held (zero-order), a measured signal is not (none).
     #[arg(long, value_enum, default_value_t = HoldKind::ZeroOrder)]
     hold: HoldKind,

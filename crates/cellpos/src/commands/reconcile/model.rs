@@ -3,6 +3,7 @@
 
 use super::records::{at_rest_of_runs, fitted, with_camera_delay};
 use crate::commands::base::{self, Base};
+use crate::commands::form;
 use crate::commands::identify::HoldKind;
 use crate::outcome::Failure;
 use cellpos_experiment::collect::refused;
@@ -28,7 +29,7 @@ pub(super) struct Asked<'a> {
     /// A name, a file, or `fit`.
     pub model: &'a str,
     /// The form of a base that stands in its place.
-    pub base: Option<base::Asked>,
+    pub base: Option<form::Asked>,
     /// How the command acts between rows.
     pub hold: Option<HoldKind>,
 }
@@ -86,7 +87,7 @@ fn fit(
             output: r.bead_um.clone(),
         })
         .collect();
-    let most = form.map_or(base::MOST_ORDER, |form| form.order);
+    let most = form.map_or(form::MOST_ORDER, |form| form.order);
     base::fit(&series, rate_hz, hold, form, most)
 }
 
@@ -161,7 +162,7 @@ fn of_a_richer_base(
     if lines.is_empty() {
         return None;
     }
-    for richer in base::richer(form) {
+    for richer in form::richer(form) {
         progress(&format!("beside a base of {richer}"));
         let Some(again) = refitted(found, present, records, options, richer) else {
             continue;
