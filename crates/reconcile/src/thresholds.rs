@@ -99,6 +99,9 @@ pub struct Thresholds {
     pub needed_s: f64,
     /// Fewest rows from which effects can be told apart.
     pub needed_rows: usize,
+    /// The same of records of other plants, which may be sampled slowly: fewer rows than a floor needs end without a name, and
+    /// with what the rest looks like.
+    pub needed_rows_of_others: usize,
     /// Below this part of the motion a record does not go with the model in any sense.
     pub least_alike: f64,
     /// Fewest missing or repeated frames that are a fault of the camera: fewer are a start-up glitch. Pinned by the counts of
@@ -154,6 +157,7 @@ pub const THRESHOLDS: Thresholds = Thresholds {
     split_sd: 4.0,
     needed_s: 5.0,
     needed_rows: 400,
+    needed_rows_of_others: 150,
     least_alike: 0.08,
     faults_least: 5,
     faults_rate: 2e-4,

@@ -213,6 +213,9 @@ pub fn run(args: Args) -> CommandResult {
         }
     };
     bar.finish_and_clear();
+    for model in [&mut result.augmented, &mut result.best] {
+        model::put_output_at_rest(model, &records, &options)?;
+    }
     tell(&mut result);
     write(&args, &result, &collected)?;
     Ok(Outcome::Done)

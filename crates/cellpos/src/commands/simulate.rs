@@ -91,10 +91,7 @@ pub fn run(args: Args) -> CommandResult {
             .get(base::HOLD)
             .is_none_or(|hold| hold != "none"),
     };
-    let bead_um = match held {
-        true => simulate(&model, &input.pzt_um, input.step_s, &options).map_err(Failure::input)?,
-        false => between_rows(&model, &input, &options)?,
-    };
+    let bead_um = response(&model, &input.pzt_um, input.step_s, held, &options)?;
     let mut answer = Record::new(&input.name, input.step_s, input.pzt_um, bead_um);
     answer.start_s = input.start_s;
     match &args.input_column {
@@ -135,15 +132,33 @@ fn foreign(args: &Args, column: &str) -> Result<Record, Failure> {
     Ok(record)
 }
 
+/// The response of a model to an input that is held between rows, or not.
+///
+/// # Errors
+/// What cannot be simulated.
+pub(super) fn response(
+    model: &Model,
+    input: &[f64],
+    step_s: f64,
+    held: bool,
+    options: &SimulateOptions,
+) -> Result<Vec<f64>, Failure> {
+    match held {
+        true => simulate(model, input, step_s, options).map_err(Failure::input),
+        false => between_rows(model, input, step_s, options),
+    }
+}
+
 /// The response to an input that is sampled and not held: on a grid four times as fine, as `reconcile` has it.
 fn between_rows(
     model: &Model,
-    input: &Record,
+    input: &[f64],
+    step_s: f64,
     options: &SimulateOptions,
 ) -> Result<Vec<f64>, Failure> {
     let direct = model.plant.relative_degree() == 0;
-    let grid = Grid::new(&input.pzt_um, Hold::None, direct);
-    let step_s = input.step_s / grid.steps as f64;
+    let grid = Grid::new(input, Hold::None, direct);
+    let step_s = step_s / grid.steps as f64;
     // A direct path shows the value at the end of the step before: the row's own.
     let first = grid.held.first().copied();
     let fine: Vec<f64> = match direct {

@@ -2,6 +2,7 @@
 
 use crate::data::record::Record;
 use crate::thresholds::THRESHOLDS;
+use std::collections::BTreeMap;
 
 /// What was counted.
 #[derive(Debug, Clone, PartialEq)]
@@ -16,6 +17,8 @@ pub(crate) struct FrameCounts {
     pub in_a_row: usize,
     /// The positions come in steps that are not small beside their increments.
     pub quantised: bool,
+    /// Whether rows are frames of a camera, whose faults have names; else they are rows of a logger.
+    pub of_camera: bool,
     /// Rows that repeat the one before, per record.
     pub repeated: Vec<Vec<bool>>,
 }
@@ -31,13 +34,16 @@ impl FrameCounts {
 
     /// More missing frames than a start-up glitch.
     pub fn drops_named(&self) -> bool {
-        self.missing >= THRESHOLDS.faults_least && self.drop_rate() > THRESHOLDS.faults_rate
+        self.of_camera
+            && self.missing >= THRESHOLDS.faults_least
+            && self.drop_rate() > THRESHOLDS.faults_rate
     }
 
     /// Beyond chance by five standard deviations and by a half of what chance gives.
     pub fn repeats_named(&self) -> bool {
         let excess = self.repeats as f64 - self.by_chance;
-        self.repeats >= THRESHOLDS.faults_least
+        self.of_camera
+            && self.repeats >= THRESHOLDS.faults_least
             && excess > THRESHOLDS.repeats_sd * (self.by_chance + 1.0).sqrt()
             && excess > THRESHOLDS.repeats_share * self.by_chance
             && self.repeat_rate() > THRESHOLDS.faults_rate
@@ -56,7 +62,7 @@ impl FrameCounts {
 }
 
 /// Counts missing frames and exact repeats.
-pub(crate) fn count(records: &[Record]) -> FrameCounts {
+pub(crate) fn count(records: &[Record], of_camera: bool) -> FrameCounts {
     let mut c = FrameCounts {
         rows: 0,
         missing: 0,
@@ -64,6 +70,7 @@ pub(crate) fn count(records: &[Record]) -> FrameCounts {
         repeats: 0,
         by_chance: 0.0,
         in_a_row: 0,
+        of_camera,
         quantised: records.iter().any(Record::is_quantised),
         repeated: Vec::new(),
     };
@@ -82,7 +89,7 @@ pub(crate) fn count(records: &[Record]) -> FrameCounts {
                 .count();
         }
         let mut repeated = vec![false; n];
-        let step = r.resolution_um;
+        let steps = Steps::of(r);
         let mut near = 0usize;
         for (k, repeats) in repeated.iter_mut().enumerate().skip(1) {
             let (a, b) = (r.bead_um[k - 1], r.bead_um[k]);
@@ -91,6 +98,7 @@ pub(crate) fn count(records: &[Record]) -> FrameCounts {
             }
             c.pairs += 1;
             let d = (b - a).abs();
+            let step = steps.at(b);
             if d == 0.0 || d < 1e-3 * step {
                 *repeats = true;
                 c.repeats += 1;
@@ -106,6 +114,42 @@ pub(crate) fn count(records: &[Record]) -> FrameCounts {
     c
 }
 
+/// The step in which positions are written: with so many digits behind the point it is one, with so many digits in all it grows
+/// with the position.
+struct Steps {
+    finest: f64,
+    /// Smallest increment by the position's power of two.
+    by_size: BTreeMap<i32, f64>,
+}
+
+impl Steps {
+    fn of(r: &Record) -> Self {
+        let mut by_size: BTreeMap<i32, f64> = BTreeMap::new();
+        for w in r.bead_um.windows(2) {
+            let (d, power) = ((w[1] - w[0]).abs(), power_of_two(w[1]));
+            // What rounding of the arithmetic leaves is no step.
+            let counts = d.is_finite() && d > 1e-12 * w[1].abs();
+            if counts && power == power_of_two(w[0]) {
+                let least = by_size.entry(power).or_insert(d);
+                *least = least.min(d);
+            }
+        }
+        Self {
+            finest: r.resolution_um,
+            by_size,
+        }
+    }
+
+    fn at(&self, position_um: f64) -> f64 {
+        let here = self.by_size.get(&power_of_two(position_um));
+        here.map_or(self.finest, |step| step.max(self.finest))
+    }
+}
+
+fn power_of_two(x: f64) -> i32 {
+    x.abs().max(f64::MIN_POSITIVE).log2().floor() as i32
+}
+
 /// 95 % interval of a rate (Wilson).
 pub(crate) fn wilson(k: f64, n: f64) -> [f64; 2] {
     let z = 1.96;
@@ -114,4 +158,41 @@ pub(crate) fn wilson(k: f64, n: f64) -> [f64; 2] {
     let m = p + z * z / (2.0 * n);
     let w = z * (p * (1.0 - p) / n + z * z / (4.0 * n * n)).sqrt();
     [((m - w) / d).max(0.0), ((m + w) / d).min(1.0)]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn rows_that_are_alike_because_of_six_digits_in_all_are_no_repeats_of_a_camera() {
+        // A ramp to 900 with noise of 0.05, as other programs write it.
+        let mut noise = 1u64;
+        let y: Vec<f64> = (0..60_000)
+            .map(|k| {
+                noise = noise
+                    .wrapping_mul(6_364_136_223_846_793_005)
+                    .wrapping_add(1_442_695_040_888_963_407);
+                let chance = (noise >> 33) as f64 / f64::from(u32::MAX >> 1) - 0.5;
+                let value: f64 = 0.015 * f64::from(k) + 0.1 * chance;
+                format!("{value:.5e}").parse().unwrap()
+            })
+            .collect();
+        let t: Vec<f64> = (0..60_000).map(f64::from).collect();
+        let mut r = Record::from_rows("r", &t, &t, &y).unwrap();
+        let counts = count(std::slice::from_ref(&r), true);
+        assert!(counts.repeats > 50, "{}", counts.repeats);
+        assert!(
+            !counts.repeats_named(),
+            "{} {}",
+            counts.repeats,
+            counts.by_chance
+        );
+        // The same, and a camera that gives every hundredth frame twice.
+        for k in (100..60_000).step_by(100) {
+            r.bead_um[k] = r.bead_um[k - 1];
+        }
+        assert!(count(std::slice::from_ref(&r), true).repeats_named());
+        assert!(!count(&[r], false).repeats_named());
+    }
 }

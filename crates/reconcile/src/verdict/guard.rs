@@ -42,10 +42,14 @@ pub(crate) fn records(records: &[Record], bead: bool) -> Result<(), ReconcileErr
     }
     let seconds: f64 = moving.iter().map(|r| r.frames() as f64 * r.sample_s).sum();
     let rows: usize = records.iter().map(Record::frames).sum();
+    let least = match bead {
+        true => THRESHOLDS.needed_rows,
+        false => THRESHOLDS.needed_rows_of_others,
+    };
     let needed = if bead && seconds < THRESHOLDS.needed_s {
         format!("{} s", THRESHOLDS.needed_s)
-    } else if rows < THRESHOLDS.needed_rows {
-        format!("{} rows", THRESHOLDS.needed_rows)
+    } else if rows < least {
+        format!("{least} rows")
     } else {
         return Ok(());
     };
@@ -125,7 +129,8 @@ pub(crate) fn motion(ctx: &Context<'_>) -> Result<Option<String>, ReconcileError
         });
     }
     let excess = yy - count;
-    if excess < 0.02 * count && ss > 0.5 * count {
+    // Of another plant the noise may be the residual of a base that is far too poor.
+    if excess < 0.02 * count && ss > 0.5 * count && !problem.base.free_start {
         return Err(ReconcileError::AnotherRig {
             explained_percent: 0.0,
             detail: "; the bead hardly moves although the command does".to_owned(),

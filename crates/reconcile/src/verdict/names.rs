@@ -177,6 +177,10 @@ pub(crate) fn of_frames(frames: &FrameCounts) -> (Vec<NamedEffect>, Vec<String>)
         });
         places.push(format!("{id}: {count} of {total} frames"));
     }
+    let missing = frames.missing;
+    if !frames.of_camera && missing > 0 {
+        places.push(format!("{missing} of {} rows have no output", frames.rows));
+    }
     (named, places)
 }
 

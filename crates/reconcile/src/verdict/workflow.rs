@@ -103,7 +103,7 @@ fn within(
     if !options.free_start {
         guard::working_point(as_given, given.working_point_um)?;
     }
-    let frames = frames::count(&records);
+    let frames = frames::count(&records, !options.free_start && !options.free_gain);
     let none: Vec<Vec<bool>> = records.iter().map(|r| vec![false; r.rows()]).collect();
     let repeated = if frames.repeats_named() {
         &frames.repeated

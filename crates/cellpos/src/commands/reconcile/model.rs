@@ -5,6 +5,7 @@ use super::records::{at_rest_of_runs, fitted, with_camera_delay};
 use crate::commands::base::{self, Base};
 use crate::commands::form;
 use crate::commands::identify::HoldKind;
+use crate::commands::simulate::response;
 use crate::outcome::Failure;
 use cellpos_experiment::collect::refused;
 use cellpos_ident::base::{Form, Series};
@@ -71,6 +72,36 @@ pub(super) fn model_of(
         with_camera_delay(&mut model);
     }
     Ok(model)
+}
+
+/// Where the output stands while the model's is zero: of a model that was extended it is no longer where the base had it.
+pub(super) fn put_output_at_rest(
+    model: &mut Model,
+    records: &[Record],
+    options: &Options,
+) -> Result<(), Failure> {
+    /// Part of a record in which its start still shows.
+    const START: usize = 5;
+    if !model.provenance.contains_key(base::REST_OUTPUT) {
+        return Ok(());
+    }
+    let (mut sum, mut count) = (0.0, 0.0);
+    for r in records {
+        let plain = SimulateOptions::default();
+        let held = !options.interpolated_input;
+        let simulated = response(model, &r.pzt_um, r.sample_s, held, &plain)?;
+        let from = r.rows() / START;
+        for (y, s) in r.bead_um.iter().zip(&simulated).skip(from) {
+            if y.is_finite() && s.is_finite() {
+                (sum, count) = (sum + y - s, count + 1.0);
+            }
+        }
+    }
+    if count > 0.0 {
+        let rest = sum / count;
+        (model.provenance).insert(base::REST_OUTPUT.to_owned(), rest.to_string());
+    }
+    Ok(())
 }
 
 /// Fits a base behind what is known to happen to its input (`ahead`, row by row of every record; none where nothing does).
