@@ -30,6 +30,7 @@ pub mod experiment;
 pub mod feedback;
 pub mod foreign;
 pub mod frequency_response;
+pub mod from_response;
 pub mod identifiability;
 pub mod least_squares;
 pub mod noise;

@@ -118,7 +118,17 @@ pub fn fit_rational(
     order: usize,
     zeros: usize,
 ) -> Result<RationalFit, IdentError> {
-    let parameters = checked(points, order + zeros + 2)?;
+    fit_with(points, sampling, [order, zeros], true)
+}
+
+/// The same, with a delay or without one.
+pub(crate) fn fit_with(
+    points: &[FrequencyPoint],
+    sampling: Sampling,
+    [order, zeros]: [usize; 2],
+    delayed: bool,
+) -> Result<RationalFit, IdentError> {
+    let parameters = checked(points, order + zeros + 1 + usize::from(delayed))?;
     let zeros = zeros.min(order);
     let two_pi = 2.0 * std::f64::consts::PI;
     let log_mean = points.iter().map(|p| p.frequency_hz.ln()).sum::<f64>() / points.len() as f64;
@@ -138,7 +148,8 @@ pub fn fit_rational(
                 .enumerate()
                 .map(|(i, a)| a * scale.powi(i as i32 + 1)),
         );
-        (numerator, denominator, x[zeros + 1 + order] / scale)
+        let delay = x.get(zeros + 1 + order).map_or(0.0, |delay| delay / scale);
+        (numerator, denominator, delay)
     };
     let fill = |x: &[f64], out: &mut [f64]| {
         let (numerator, denominator, delay_s) = unscale(x);
@@ -150,10 +161,10 @@ pub fn fit_rational(
             out[2 * i + 1] = e.im;
         }
     };
-    let starts = (0..10).filter_map(|i| {
+    let starts = (0..if delayed { 10 } else { 1 }).filter_map(|i| {
         let delay_s = i as f64 * 0.5 * sampling.period_s;
         let mut x = sanathanan_koerner(points, &weights, sampling, order, zeros, scale, delay_s)?;
-        x.push(delay_s * scale);
+        x.extend(delayed.then_some(delay_s * scale));
         Some(x)
     });
     let found = best_minimum(starts, 2 * points.len(), &fill).ok_or(IdentError::NoFit {
@@ -191,7 +202,11 @@ pub fn fit_rational(
         numerator,
         denominator,
         delay_s,
-        delay_sd_s: sd[parameters - 1] / scale,
+        delay_sd_s: if delayed {
+            sd[parameters - 1] / scale
+        } else {
+            0.0
+        },
         numerator_sd: sd_unit[..=zeros].to_vec(),
         denominator_sd,
         chi2: found.chi2,

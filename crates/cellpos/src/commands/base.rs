@@ -292,6 +292,11 @@ pub fn coefficients(values: &[f64], sds: &[f64]) -> String {
     format!("[{}]", terms.join(", "))
 }
 
+/// Says in a model with which form it was fitted.
+pub fn say_form(model: &mut Model, form: Form) {
+    model.provenance.insert(FORM.to_owned(), form.to_string());
+}
+
 /// A linear fit as a model: its delay is an effect, and how its input was sampled is said, so that what reads it next takes both
 /// as they are.
 ///

@@ -37,12 +37,6 @@ fn no_model(r: &ForeignResult) -> &'static str {
 
 /// Runs the command on records.
 pub fn run(args: &Args) -> CommandResult {
-    if args.base.is_some() && args.data.is_empty() {
-        return Err(Failure::bad_input(
-            "--base is the form of a model of records",
-            "name them with --data",
-        ));
-    }
     let mut results = Vec::new();
     let mut sources = Vec::new();
     for path in &args.data {

@@ -3,6 +3,7 @@
 mod foreign;
 pub mod json;
 pub mod report;
+mod response;
 mod sources;
 
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
@@ -39,11 +40,16 @@ pub enum Switch {
     cellpos identify --data runs/20261121T190000Z-sine\n  \
     cellpos identify --data record.csv --input pzt_um --output bead_um --rate 1kHz\n  \
     cellpos identify --data heater.csv --input 'power [W]' --output 'T [degC]' --base order=2,delay --out base.toml\n  \
+    cellpos identify --response bode.csv --out base.toml\n  \
     cellpos identify --data Model_Vi_Do.dat --input 1 --output 5 --rate 200Hz --hold none")]
 pub struct Args {
     /// Run folders, records of cellpos, or records of any rig with --input and --output; the model is fitted to all of them.
     #[arg(long, num_args = 1.., value_parser = crate::arguments::run_folder())]
     data: Vec<PathBuf>,
+    /// A frequency response in the place of records: a table (text, .npy, .mat) with freq [Hz] or w [rad/s], and gain (or gain [dB])
+    /// and phase [deg] (or [rad]), or re and im.
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["data", "rig", "resume"])]
+    response: Option<PathBuf>,
     /// Input column: a name of the header (a unit in brackets may be left out), or a number from 1.
     #[arg(long, alias = "input-column", requires_all = ["data", "output"])]
     input: Option<String>,
@@ -61,7 +67,7 @@ pub struct Args {
     rows: Option<String>,
     /// Form of the model of other rigs' records: order=N, with zeros=N, delay, integrating where they are wanted; or
     /// static. Left out, or auto: the simplest that predicts records as well as any, up to --order.
-    #[arg(long, requires = "input")]
+    #[arg(long)]
     base: Option<super::form::Asked>,
     /// What the records' input does between rows: a command is held (zero-order), a measured signal is not (none).
     #[arg(long, value_enum, default_value_t = HoldKind::ZeroOrder)]
@@ -304,6 +310,15 @@ fn pages(args: &Args, job: &identification::Job) -> Result<Option<Pages>, Failur
 /// Runs `cellpos identify`.
 pub fn run(args: Args) -> CommandResult {
     output::ready(args.out.iter().chain(&args.report))?;
+    if args.base.is_some() && args.input.is_none() && args.response.is_none() {
+        return Err(Failure::bad_input(
+            "--base is the form of a model of other rigs' records, or of a response",
+            "name them with --data, --input and --output, or with --response",
+        ));
+    }
+    if let Some(path) = &args.response {
+        return response::run(&args, path);
+    }
     if !args.data.is_empty() {
         return foreign::run(&args);
     }
