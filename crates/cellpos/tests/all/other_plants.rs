@@ -204,3 +204,42 @@ fn what_cannot_be_read_says_what_would_be_right() {
     ];
     fails(&both, &["--model"]);
 }
+
+/// A fan: its speed goes with the square of the voltage, behind a lag of half a second; levels, the whole twice.
+fn fan(rows: usize) -> String {
+    let volts = |k: usize| 5.5 + 4.5 * chance(k % (rows / 2) / 40);
+    let mut rpm = 900.0;
+    let mut text = "time_s,U [V],n [rpm]\n".to_owned();
+    for k in 0..rows {
+        let seen = rpm + 3.0 * chance(11_000 + k) + 3.0 * chance(90_000 + k);
+        writeln!(text, "{:.2},{:.4},{seen:.2}", 0.05 * k as f64, volts(k)).unwrap();
+        let target = 30.0 * volts(k) * volts(k);
+        rpm = target + (rpm - target) * (-0.1f64).exp();
+    }
+    text
+}
+
+#[test]
+fn a_fan_whose_speed_goes_with_the_square_gets_no_name_of_the_catalogue() {
+    let folder = tempfile::tempdir().unwrap();
+    let here = folder.path();
+    std::fs::write(here.join("fan.csv"), fan(1600)).unwrap();
+    let args = [
+        "reconcile",
+        "--base",
+        "order=1",
+        "--data",
+        "fan.csv",
+        "--input",
+        "U",
+        "--output",
+        "n",
+    ];
+    let said = done(
+        here,
+        &[&args[..], &["--out", "fan.toml", "--json"]].concat(),
+    );
+    let found: Value = serde_json::from_str(&said).unwrap();
+    assert_eq!(found["verdict"], "unknown", "{found}");
+    assert_eq!(found["effects"].as_array().map(Vec::len), Some(0));
+}

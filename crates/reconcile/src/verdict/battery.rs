@@ -46,6 +46,14 @@ pub(crate) struct Column {
     pub innovations: Vec<Vec<f64>>,
 }
 
+impl Column {
+    /// Whether it bends: no linear plant makes it.
+    pub fn is_curved(&self) -> bool {
+        let linear = matches!(self.name, "y" | "v" | "t" | "t d");
+        !linear
+    }
+}
+
 /// What a term of the library is made of, row by row.
 struct Row {
     d: f64,

@@ -163,8 +163,32 @@ fn refusal(
             "the best of the catalogue, {best}, is no name: {words}"
         ));
     }
+    if let Some(words) = one_term(ctx, e) {
+        return Some(format!(
+            "the best of the catalogue, {best}, is no name: {words}"
+        ));
+    }
     split::disagreement(ctx, e.null, e.fit, threads)
         .map(|words| format!("the best of the catalogue, {best}, is no name: {words}"))
+}
+
+/// Of another plant: a single term of the library that explains as much as several effects together. A curved characteristic is not
+/// missing from the catalogue's list of parts because several of them bend like it.
+fn one_term(ctx: &Context<'_>, e: &Evidence<'_>) -> Option<String> {
+    if !ctx.problem.base.free_start || e.fit.parts.len() < 2 {
+        return None;
+    }
+    let all = ctx.problem.all();
+    let mut library = battery::library(ctx, e.null);
+    library.retain(Column::is_curved);
+    let (i, gain) = battery::strongest(&library, &ctx.tangents(e.null, &all), e.null, &all)?;
+    let column = &library[i];
+    (gain >= e.null.chi2 - e.fit.chi2).then(|| {
+        format!(
+            "one term alone, {} at the {}, explains as much: {}",
+            column.name, column.place, column.says
+        )
+    })
 }
 
 /// What is said where there is no floor.

@@ -92,11 +92,12 @@ fn definition(ctx: &Context<'_>, site: Site, terms: &[&Term]) -> Definition {
         let per = ctx.scope.stroke_um / ctx.scope.travel_um.max(1e-12);
         let (stiffness, of_stiffness) = ctx.scales.coefficient(per, Side::Input, [0, 1, 0]);
         add("gain", "", "input", 0.5, 0.0);
-        if !has("y") {
+        // A plant of one lag has two numbers, and a gain beside them would leave none of them certain.
+        let poles = &ctx.problem.base.zpk.poles;
+        if !has("y") && !poles.is_empty() {
             add("stiffness", &of_stiffness, "position", stiffness, 0.0);
         }
-        if !has("v") {
-            let poles = &ctx.problem.base.zpk.poles;
+        if !has("v") && poles.len() > 1 {
             let fastest = poles.iter().map(|p| p.norm()).fold(1e-3, f64::max);
             let (damping, of_damping) =
                 ctx.scales

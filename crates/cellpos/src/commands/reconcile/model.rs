@@ -158,6 +158,15 @@ pub(super) fn reconcile_or_refit(
         let Ok(next) = reconcile(&again, records, options, progress) else {
             break;
         };
+        if has_better_formula(&next, &found) {
+            let names: Vec<&str> = found.effects.iter().map(|e| e.id.as_str()).collect();
+            let mut next = next;
+            next.places.insert(0, format!(
+                "{} are no names: beside a base that is fitted again, a formula of fewer numbers explains more than they do",
+                names.join(" + ")
+            ));
+            return Ok(next);
+        }
         if !is_simpler(&next, &found, &again, lines.len()) {
             break;
         }
@@ -212,6 +221,16 @@ fn of_a_richer_base(
         }
     }
     None
+}
+
+/// Whether a result without a name has a formula of no more terms than another has effects, which explains more of what is beyond the
+/// floor on data that it has not seen than those do.
+fn has_better_formula(next: &Reconciliation, found: &Reconciliation) -> bool {
+    let left = found.remainder.as_ref().map_or(0.0, |rest| rest.share);
+    next.verdict == Verdict::Unknown
+        && (next.hypothesis.as_ref()).is_some_and(|formula| {
+            formula.terms.len() <= found.effects.len() && formula.held_out_worth > 1.0 - left
+        })
 }
 
 /// The linear ones among the effects that were named.
