@@ -220,7 +220,7 @@ fn fan(rows: usize) -> String {
 }
 
 #[test]
-fn a_fan_whose_speed_goes_with_the_square_gets_no_name_of_the_catalogue() {
+fn a_fan_whose_speed_goes_with_the_square_gets_no_name_and_then_its_own() {
     let folder = tempfile::tempdir().unwrap();
     let here = folder.path();
     std::fs::write(here.join("fan.csv"), fan(1600)).unwrap();
@@ -241,5 +241,19 @@ fn a_fan_whose_speed_goes_with_the_square_gets_no_name_of_the_catalogue() {
     );
     let found: Value = serde_json::from_str(&said).unwrap();
     assert_eq!(found["verdict"], "unknown", "{found}");
-    assert_eq!(found["effects"].as_array().map(Vec::len), Some(0));
+    let formula = found["hypothesis"]["formula"].as_str().unwrap();
+    assert!(formula.contains("[1/V] d^2"), "{formula}");
+    // What it proposes, run again as it is, is a name.
+    let again = [
+        &args[..],
+        &["--effects", "fan.effects.toml", "--max-effects", "1"],
+        &["--out", "named.toml", "--json"],
+    ];
+    let said = done(here, &again.concat());
+    let found: Value = serde_json::from_str(&said).unwrap();
+    assert_eq!(found["verdict"], "named", "{found}");
+    let c1 = &found["effects"][0]["parameters"]["c1"];
+    assert_eq!(c1["unit"], "1/V");
+    let low = c1["ci95"][0].as_f64().unwrap();
+    assert!(low > 0.05, "as uncertain as that it is no number: {c1}");
 }

@@ -276,6 +276,57 @@ fn inner(a: &[Vec<f64>], b: &[Vec<f64>], mask: &Mask) -> f64 {
 /// Most terms of a formula.
 const MOST_TERMS: usize = 4;
 
+/// Part of a column that must be its own beside the numbers of a base.
+const LEAST_OWN: f64 = 1e-4;
+
+/// What a change of gain, stiffness and damping of another plant's base would make, orthonormal on the rows of a mask.
+fn straight(ctx: &Context<'_>, library: &[Column], mask: &Mask) -> Vec<Vec<Vec<f64>>> {
+    if !ctx.problem.base.free_start {
+        return Vec::new();
+    }
+    let gain = ctx.problem.records.iter().map(|r| {
+        let (mut y, mut w) = (Vec::new(), vec![0.0; r.u.len()]);
+        simulate(&ctx.problem.base, &r.u, &[], &mut y, None);
+        r.whiten(&y, &mut w);
+        w
+    });
+    let of_base = library
+        .iter()
+        .filter(|c| c.place == "input" && matches!(c.name, "y" | "v"))
+        .map(|c| c.innovations.clone());
+    let mut basis: Vec<Vec<Vec<f64>>> = Vec::new();
+    for column in std::iter::once(gain.collect()).chain(of_base) {
+        let size = inner(&column, &column, mask);
+        let mut left = without(&column, &basis, mask);
+        let rest = inner(&left, &left, mask);
+        if rest > 1e-9 * size && rest > 0.0 {
+            let scale = 1.0 / rest.sqrt();
+            left.iter_mut().flatten().for_each(|x| *x *= scale);
+            basis.push(left);
+        }
+    }
+    basis
+}
+
+/// What an orthonormal basis leaves of a column.
+fn without(column: &[Vec<f64>], basis: &[Vec<Vec<f64>>], mask: &Mask) -> Vec<Vec<f64>> {
+    let mut left = column.to_vec();
+    for q in basis {
+        let share = inner(q, &left, mask);
+        for (l, q) in left.iter_mut().zip(q) {
+            l.iter_mut().zip(q).for_each(|(l, q)| *l -= share * q);
+        }
+    }
+    left
+}
+
+/// The columns of a library without what a basis makes of them.
+fn beside(library: &[Column], basis: &[Vec<Vec<f64>>], mask: &Mask) -> Vec<Vec<Vec<f64>>> {
+    (library.iter())
+        .map(|c| without(&c.innovations, basis, mask))
+        .collect()
+}
+
 /// Forward selection on the first part of every record; each term must also help in the rest.
 pub(crate) fn hypothesis(ctx: &Context<'_>, fit: &Fit, library: &[Column]) -> Option<Hypothesis> {
     let (train, test) = split_in_time(&ctx.problem.records);
@@ -285,6 +336,13 @@ pub(crate) fn hypothesis(ctx: &Context<'_>, fit: &Fit, library: &[Column]) -> Op
         .and_then(|hz| without_line(ctx, fit, hz, &train))
         .filter(|l| inner(&l.left, &l.left, &test) < inner(all, all, &test) - 10.0);
     let e = line.as_ref().map_or(all, |l| &l.left);
+    // A base that was fitted to records of a plant that bends has another gain and lag than the plant: what these change is no term.
+    let straight = straight(ctx, library, &train);
+    let (columns, e) = (
+        beside(library, &straight, &train),
+        without(e, &straight, &train),
+    );
+    let e = &e;
     let mut chosen: Vec<usize> = Vec::new();
     let mut coefficients = DVector::zeros(0);
     let mut left = e.clone();
@@ -292,9 +350,12 @@ pub(crate) fn hypothesis(ctx: &Context<'_>, fit: &Fit, library: &[Column]) -> Op
         let (best, gain) = (0..library.len())
             .filter(|i| !chosen.contains(i))
             .map(|i| {
-                let c = &library[i].innovations;
+                let c = &columns[i];
                 let (cc, ce) = (inner(c, c, &train), inner(c, &left, &train));
-                (i, if cc > 0.0 { ce * ce / cc } else { 0.0 })
+                let own = &library[i].innovations;
+                // What the base's own numbers make as well is none.
+                let seen = cc > LEAST_OWN * inner(own, own, &train);
+                (i, if seen { ce * ce / cc } else { 0.0 })
             })
             .max_by(|a, b| a.1.total_cmp(&b.1))?;
         if gain < THRESHOLDS.term_worth {
@@ -303,7 +364,7 @@ pub(crate) fn hypothesis(ctx: &Context<'_>, fit: &Fit, library: &[Column]) -> Op
         let mut trial = chosen.clone();
         trial.push(best);
         let n = trial.len();
-        let column = |i: usize| &library[trial[i]].innovations;
+        let column = |i: usize| &columns[trial[i]];
         // Terms of very different units: each in parts of its own size.
         let size: Vec<f64> = (0..n)
             .map(|i| {
@@ -322,7 +383,7 @@ pub(crate) fn hypothesis(ctx: &Context<'_>, fit: &Fit, library: &[Column]) -> Op
         let x = DVector::from_fn(n, |i, _| x[i] / size[i]);
         let mut next = e.clone();
         for (i, x) in trial.iter().zip(x.iter()) {
-            for (next, c) in next.iter_mut().zip(&library[*i].innovations) {
+            for (next, c) in next.iter_mut().zip(&columns[*i]) {
                 next.iter_mut().zip(c).for_each(|(n, c)| *n -= x * c);
             }
         }
