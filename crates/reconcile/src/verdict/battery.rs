@@ -276,6 +276,21 @@ fn inner(a: &[Vec<f64>], b: &[Vec<f64>], mask: &Mask) -> f64 {
 /// Most terms of a formula.
 const MOST_TERMS: usize = 4;
 
+/// A column with its coefficient, in the units of the records.
+fn term_of(ctx: &Context<'_>, column: &Column, value: f64) -> Term {
+    let side = match column.place {
+        "input" => Side::Input,
+        _ => Side::Output,
+    };
+    let (coefficient, unit) = ctx.scales.coefficient(value, side, column.powers);
+    Term {
+        term: column.name.to_owned(),
+        place: column.place,
+        coefficient,
+        unit,
+    }
+}
+
 /// Part of a column that must be its own beside the numbers of a base.
 const LEAST_OWN: f64 = 1e-4;
 
@@ -404,20 +419,8 @@ pub(crate) fn hypothesis(ctx: &Context<'_>, fit: &Fit, library: &[Column]) -> Op
         coefficient: ctx.scales.output(l.amplitude_um),
         unit: ctx.scales.output_unit().to_owned(),
     });
-    let of_library = chosen.iter().zip(coefficients.iter()).map(|(i, x)| {
-        let column = &library[*i];
-        let side = match column.place {
-            "input" => Side::Input,
-            _ => Side::Output,
-        };
-        let (coefficient, unit) = ctx.scales.coefficient(*x, side, column.powers);
-        Term {
-            term: column.name.to_owned(),
-            place: column.place,
-            coefficient,
-            unit,
-        }
-    });
+    let of_library =
+        (chosen.iter().zip(coefficients.iter())).map(|(i, x)| term_of(ctx, &library[*i], *x));
     let terms: Vec<Term> = line.into_iter().chain(of_library).collect();
     let formula = terms
         .iter()
