@@ -230,8 +230,13 @@ proptest! {
 
     #[test]
     fn no_byte_string_rich_in_zeros_makes_the_decoder_panic_or_believe_it(
-        bytes in proptest::collection::vec(prop_oneof![Just(0_u8), Just(1), Just(2), Just(0xb1), any::<u8>()], 0..2000),
+        drawn in proptest::collection::vec(any::<u16>(), 0..2000),
     ) {
+        // A fifth each of zeros, ones, twos, bytes of 0xb1, and any byte. (A strategy of its own for each byte takes seconds.)
+        let bytes: Vec<u8> = drawn
+            .iter()
+            .map(|n| *[0, 1, 2, 0xb1].get(usize::from(n >> 8) % 5).unwrap_or(&(*n as u8)))
+            .collect();
         prop_assert!(decode_all::<ToBoard>(&bytes).0.is_empty());
     }
 
