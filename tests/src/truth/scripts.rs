@@ -95,7 +95,7 @@ pub enum Excitation {
     Standard,
     /// Amplitudes, frequencies, bands and lengths drawn.
     Drawn,
-    /// Likewise; nothing rests and nothing repeats.
+    /// Likewise; nothing rests and nothing repeats, nor does a part of it.
     WithoutFloor,
 }
 
@@ -193,8 +193,36 @@ fn without_floor(random: &mut Random) -> Vec<Script> {
     let rows = 7000 + random.index(6000);
     let large_um = random.between(0.6, 1.1);
     vec![
-        script("sines", sines(random)),
+        script("sweep", sweep(random, rows)),
         script("multisine", multisine(random, large_um, rows, rows)),
-        script("levels", levels(random, rows)),
+        script("restless", restless(random, rows)),
     ]
+}
+
+/// Levels of drawn height, each held for a drawn time that is too short to measure noise in it \[um\].
+fn restless(random: &mut Random, rows: usize) -> Vec<f64> {
+    let size = random.between(0.03, 0.12);
+    let mut out = Vec::new();
+    while out.len() < rows {
+        let height = size * (2.0 * random.uniform() - 1.0);
+        out.resize(out.len() + 40 + random.index(120), height);
+    }
+    out.truncate(rows);
+    out
+}
+
+/// A sine whose frequency grows by the same factor in equal times: no stretch of it comes twice.
+fn sweep(random: &mut Random, rows: usize) -> Vec<f64> {
+    let (amplitude, first, last) = (
+        random.between(0.5, 1.4),
+        random.between(0.5, 2.0),
+        random.between(200.0, 350.0),
+    );
+    let rate = (last / first).ln() / rows as f64;
+    (0..rows)
+        .map(|k| {
+            let cycles = first * 1e-3 * ((rate * k as f64).exp() - 1.0) / rate;
+            amplitude * (TAU * cycles).sin()
+        })
+        .collect()
 }
