@@ -134,6 +134,17 @@ impl Steps {
                 *least = least.min(d);
             }
         }
+        // A step does not get finer where positions get larger, and grows by ten where they do: what a size with few rows may have
+        // missed, its neighbours tell.
+        let told = by_size.clone();
+        for (power, step) in &mut by_size {
+            for (other, least) in &told {
+                let decades = (f64::from(power - other) * std::f64::consts::LOG10_2)
+                    .ceil()
+                    .max(0.0);
+                *step = step.min(least * 10f64.powf(decades));
+            }
+        }
         Self {
             finest: r.resolution_um,
             by_size,
@@ -194,5 +205,32 @@ mod tests {
         }
         assert!(count(std::slice::from_ref(&r), true).repeats_named());
         assert!(!count(&[r], false).repeats_named());
+    }
+
+    #[test]
+    fn the_rate_of_repeats_is_right_of_a_bead_that_crosses_zero() {
+        // A bead about zero, in steps of 0.1 nm: few rows of it are of any one small size.
+        let mut noise = 5u64;
+        let mut y: Vec<f64> = (0..20_000)
+            .map(|k| {
+                noise = noise
+                    .wrapping_mul(6_364_136_223_846_793_005)
+                    .wrapping_add(1_442_695_040_888_963_407);
+                let chance = (noise >> 33) as f64 / f64::from(u32::MAX >> 1) - 0.5;
+                let value = 0.3 * (1e-3 * f64::from(k)).sin() + 0.2 * chance;
+                (value * 1e4).round() * 1e-4
+            })
+            .collect();
+        for k in (100..y.len()).step_by(100) {
+            y[k] = y[k - 1];
+        }
+        let t: Vec<f64> = (0..y.len()).map(|k| k as f64 * 1e-3).collect();
+        let counts = count(&[Record::from_rows("r", &t, &t, &y).unwrap()], true);
+        assert!(
+            (counts.repeat_rate() - 0.01).abs() < 1e-3,
+            "{} of {} repeats by chance",
+            counts.by_chance,
+            counts.repeats
+        );
     }
 }
