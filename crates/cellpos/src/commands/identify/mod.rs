@@ -46,8 +46,8 @@ pub struct Args {
     /// Run folders, records of cellpos, or records of any rig with --input and --output; the model is fitted to all of them.
     #[arg(long, num_args = 1.., value_parser = crate::arguments::run_folder())]
     data: Vec<PathBuf>,
-    /// A frequency response in the place of records: a table (text, .npy, .mat) with freq [Hz] or w [rad/s], and gain (or gain [dB])
-    /// and phase [deg] (or [rad]), or re and im.
+    /// A frequency response in the place of records: a table (text, .npy, .mat) with `freq [Hz]` or `w [rad/s]`, and gain (or
+    /// `gain [dB]`) and `phase [deg]` (or `[rad]`), or re and im.
     #[arg(long, value_name = "FILE", conflicts_with_all = ["data", "rig", "resume"])]
     response: Option<PathBuf>,
     /// Input column: a name of the header (a unit in brackets may be left out), or a number from 1.
