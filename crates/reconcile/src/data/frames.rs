@@ -209,7 +209,7 @@ mod tests {
 
     #[test]
     fn the_rate_of_repeats_is_right_of_a_bead_that_crosses_zero() {
-        // A bead about zero, in steps of 0.1 nm: few rows of it are of any one small size.
+        // A bead about zero, in fine steps: few rows of it are of any one small size, and their least increment is no step.
         let mut noise = 5u64;
         let mut y: Vec<f64> = (0..20_000)
             .map(|k| {
@@ -218,16 +218,16 @@ mod tests {
                     .wrapping_add(1_442_695_040_888_963_407);
                 let chance = (noise >> 33) as f64 / f64::from(u32::MAX >> 1) - 0.5;
                 let value = 0.3 * (1e-3 * f64::from(k)).sin() + 0.2 * chance;
-                (value * 1e4).round() * 1e-4
+                (value * 1e6).round() * 1e-6
             })
             .collect();
-        for k in (100..y.len()).step_by(100) {
+        for k in (1000..y.len()).step_by(1000) {
             y[k] = y[k - 1];
         }
         let t: Vec<f64> = (0..y.len()).map(|k| k as f64 * 1e-3).collect();
         let counts = count(&[Record::from_rows("r", &t, &t, &y).unwrap()], true);
         assert!(
-            (counts.repeat_rate() - 0.01).abs() < 1e-3,
+            (counts.repeat_rate() - 19.0 / 20_000.0).abs() < 1e-4,
             "{} of {} repeats by chance",
             counts.by_chance,
             counts.repeats
