@@ -39,6 +39,15 @@ pub struct Thresholds {
     pub split_gain: f64,
     /// An effect smaller than the smallest that matters is not named unless it explains this part of the excess.
     pub small_share: f64,
+    /// An effect beside larger ones that explains less than this part of the gap may be the difference between the catalogue's
+    /// equation of these and the rig's: it is no name where their freer forms gain as much. Beyond it, and of two of like size,
+    /// nobody would say which is the other's form. Pinned by `a_small_effect_that_another_form_of_the_large_one_explains_is_no_name`.
+    pub companion_share: f64,
+    /// Larger is what explains so many times as much. Pinned with it.
+    pub companion_times: f64,
+    /// A hysteresis of which a curve without memory in front of the plant explains this part is none: of relays it explains 0.4 to
+    /// 0.8. Pinned with the two above.
+    pub curve_share: f64,
     /// Rows of rest or of repeated command from which noise is known to a few percent.
     pub floor_rows: usize,
     /// A command counts as at rest where its range is below this part of the range of all records: a measured input is
@@ -115,6 +124,9 @@ pub struct Thresholds {
     pub repeats_share: f64,
     /// Rows that repeat more often than this are no camera's: a sensor that counts, or rows that were held.
     pub repeats_most: f64,
+    /// Repeats of which more than this part follow each other at one distance are rows that were held.
+    /// Pinned by `frames_that_come_thrice_are_a_fault_and_rows_held_in_a_rhythm_or_for_long_are_none`.
+    pub repeats_rhythm: f64,
 }
 
 /// The numbers in use.
@@ -133,6 +145,9 @@ pub const THRESHOLDS: Thresholds = Thresholds {
     split_share: 0.15,
     split_gain: 0.01,
     small_share: 0.5,
+    companion_share: 0.1,
+    companion_times: 3.0,
+    curve_share: 0.95,
     floor_rows: 400,
     rest_share: 1e-3,
     repeat_share: 0.14,
@@ -164,4 +179,5 @@ pub const THRESHOLDS: Thresholds = Thresholds {
     repeats_sd: 5.0,
     repeats_share: 0.5,
     repeats_most: 0.25,
+    repeats_rhythm: 0.5,
 };

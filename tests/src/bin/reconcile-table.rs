@@ -243,7 +243,12 @@ fn line(case: &Case, row: &Result<Row, String>) -> String {
             r.seconds,
             join(&r.alternatives),
             r.missed.join(", "),
-            if r.named == r.hidden { "" } else { &r.numbers },
+            // One name that is right needs no more; of several it is asked what each is worth.
+            if r.named == r.hidden && r.named.len() < 2 {
+                ""
+            } else {
+                &r.numbers
+            },
             if r.named == r.hidden { "" } else { &r.reason }
         ),
     }

@@ -179,7 +179,12 @@ fn numbers(result: &Reconciliation) -> String {
             .iter()
             .map(|(name, p)| format!("{name} {:.4}", p.value))
             .collect();
-        format!("{}({})", e.id, values.join(", "))
+        format!(
+            "{}({}; of the gap {:.4})",
+            e.id,
+            values.join(", "),
+            e.explained
+        )
     };
     let all: Vec<String> = result.effects.iter().map(one).collect();
     all.join(" + ")

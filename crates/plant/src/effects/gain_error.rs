@@ -51,6 +51,10 @@ impl EffectKind for GainError {
         Ok(())
     }
 
+    fn has_doubles(&self) -> bool {
+        true
+    }
+
     fn candidates(&self) -> &'static [Candidate] {
         const ALL: &[Candidate] = &[Candidate::chain(&[lin("factor", 0.05, 20.0, 1e-3)])
             .typical(0.4, 2.5)

@@ -162,6 +162,16 @@ pub trait EffectKind: fmt::Debug + Send + Sync {
         Ok(())
     }
 
+    /// Whether it is a curve of what goes into it and nothing else, without memory: another curve is another form of it.
+    fn is_curve(&self) -> bool {
+        false
+    }
+
+    /// Whether something that has no name of its own answers alike from command to bead: what tells them apart is then always said.
+    fn has_doubles(&self) -> bool {
+        false
+    }
+
     /// The forms that a search may try; none for an effect that is not looked for by fitting.
     fn candidates(&self) -> &'static [Candidate] {
         &[]

@@ -51,6 +51,10 @@ impl EffectKind for Saturation {
         Ok(())
     }
 
+    fn is_curve(&self) -> bool {
+        true
+    }
+
     fn candidates(&self) -> &'static [Candidate] {
         const ALL: &[Candidate] = &[BOTH, HIGH, LOW];
         ALL

@@ -42,6 +42,10 @@ impl EffectKind for Stiffening {
         }))
     }
 
+    fn is_curve(&self) -> bool {
+        true
+    }
+
     fn candidates(&self) -> &'static [Candidate] {
         // What softens is none: the round knee of a saturation took that name.
         const ALL: &[Candidate] =

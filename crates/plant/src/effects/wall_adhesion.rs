@@ -32,7 +32,7 @@ static SPEC: Spec = Spec {
     confused_with: &["backlash", "pzt-hysteresis"],
     inseparable_from: &[],
     experiment: Experiment::Amplitudes,
-    separate_by: "an amplitude sweep: the lag of backlash shrinks to nothing, hysteresis grows, adhesion stops the bead at small amplitude",
+    separate_by: "an amplitude sweep: the lag of backlash shrinks to nothing, hysteresis grows, adhesion stops the bead at small amplitude; a dead zone of the driver does the same behind a plant whose speed follows the command: measure the displacement of the piezo itself",
 };
 
 impl EffectKind for WallAdhesion {
@@ -44,6 +44,10 @@ impl EffectKind for WallAdhesion {
         Action::Block(Box::new(OfSpeed::new(Adhesion {
             threshold: effect.scalar(0),
         })))
+    }
+
+    fn has_doubles(&self) -> bool {
+        true
     }
 
     fn candidates(&self) -> &'static [Candidate] {

@@ -13,8 +13,11 @@ pub(crate) struct FrameCounts {
     pub repeats: usize,
     /// Exact zero increments that the resolution of the file gives by chance.
     pub by_chance: f64,
-    /// Repeats of a row that is a repeat itself.
-    pub in_a_row: usize,
+    /// Runs of repeats that follow a run in the same record, and how many of them do so at the distance met most.
+    pub runs: usize,
+    pub in_rhythm: usize,
+    /// Repeats in runs longer than a camera's stutter.
+    pub at_rest: usize,
     /// The positions come in steps that are not small beside their increments.
     pub quantised: bool,
     /// Whether rows are frames of a camera, whose faults have names; else they are rows of a logger.
@@ -50,16 +53,19 @@ impl FrameCounts {
             && self.looks_like_a_camera()
     }
 
-    /// A sensor that counts, a row that was held or interpolated, and a plant that stands still give equal rows as well: those
-    /// come in runs or in a rhythm, camera faults one by one and seldom.
+    /// A sensor that counts, rows that were held, and a plant that stands still give equal rows as well: those come often, in a
+    /// rhythm, or for long; faults of a camera come seldom and by chance, alone or a few at a time.
     fn looks_like_a_camera(&self) -> bool {
         let rate = self.repeats as f64 / self.pairs.max(1) as f64;
-        let expected = rate * self.repeats as f64;
         !self.quantised
             && rate < THRESHOLDS.repeats_most
-            && self.in_a_row as f64 <= 2.0 * expected + 5.0 * expected.sqrt() + 3.0
+            && self.in_rhythm as f64 <= THRESHOLDS.repeats_rhythm * self.runs as f64 + 2.0
+            && 2 * self.at_rest < self.repeats
     }
 }
+
+/// Repeats in a row beyond which nothing moves, or the stream has stopped: no stutter of a camera.
+const STUTTER: usize = 10;
 
 /// Counts missing frames and exact repeats.
 pub(crate) fn count(records: &[Record], of_camera: bool) -> FrameCounts {
@@ -69,11 +75,14 @@ pub(crate) fn count(records: &[Record], of_camera: bool) -> FrameCounts {
         pairs: 0,
         repeats: 0,
         by_chance: 0.0,
-        in_a_row: 0,
+        runs: 0,
+        in_rhythm: 0,
+        at_rest: 0,
         of_camera,
         quantised: records.iter().any(Record::is_quantised),
         repeated: Vec::new(),
     };
+    let mut distances: BTreeMap<usize, usize> = BTreeMap::new();
     for r in records {
         let n = r.rows();
         // What lies before the first bead seen and behind the last says nothing of the camera.
@@ -108,9 +117,23 @@ pub(crate) fn count(records: &[Record], of_camera: bool) -> FrameCounts {
         }
         // Twenty neighbouring values of the increment, each as likely as zero by chance.
         c.by_chance += near as f64 / 20.0;
-        c.in_a_row += repeated.windows(2).filter(|w| w[0] && w[1]).count();
+        let mut start = 0;
+        let mut last = None;
+        for run in repeated.chunk_by(|a, b| a == b) {
+            if run[0] {
+                if run.len() > STUTTER {
+                    c.at_rest += run.len();
+                }
+                if let Some(last) = last.replace(start) {
+                    c.runs += 1;
+                    *distances.entry(start - last).or_default() += 1;
+                }
+            }
+            start += run.len();
+        }
         c.repeated.push(repeated);
     }
+    c.in_rhythm = distances.into_values().max().unwrap_or(0);
     c
 }
 
@@ -205,6 +228,41 @@ mod tests {
         }
         assert!(count(std::slice::from_ref(&r), true).repeats_named());
         assert!(!count(&[r], false).repeats_named());
+    }
+
+    /// A random walk in which the rows that `repeats` says are those before them.
+    fn walk(rows: usize, repeats: impl Fn(usize, f64) -> bool) -> Record {
+        let mut noise = 11u64;
+        let mut chance = || {
+            noise = noise
+                .wrapping_mul(6_364_136_223_846_793_005)
+                .wrapping_add(1_442_695_040_888_963_407);
+            (noise >> 33) as f64 / f64::from(u32::MAX >> 1)
+        };
+        let (mut y, mut x) = (vec![0.0; rows], 0.0);
+        for k in 1..rows {
+            x += 0.1 * (chance() - 0.5);
+            y[k] = if repeats(k, chance()) { y[k - 1] } else { x };
+        }
+        let t: Vec<f64> = (0..rows).map(|k| k as f64 * 1e-3).collect();
+        Record::from_rows("r", &t, &t, &y).unwrap()
+    }
+
+    #[test]
+    fn frames_that_come_thrice_are_a_fault_and_rows_held_in_a_rhythm_or_for_long_are_none() {
+        let named = |r: Record| count(&[r], true).repeats_named();
+        let last = std::cell::Cell::new(0);
+        let bursts = walk(20_000, |k, chance| {
+            if chance < 0.01 {
+                last.set(k);
+            }
+            last.get() > 0 && k <= last.get() + 1
+        });
+        assert!(named(bursts));
+        assert!(named(walk(20_000, |_, chance| chance < 0.02)));
+        // A sensor of 800 Hz in a log of 1 kHz; one that stands still for a tenth of a second now and then.
+        assert!(!named(walk(20_000, |k, _| k % 5 == 4)));
+        assert!(!named(walk(20_000, |k, _| k % 1003 > 900)));
     }
 
     #[test]

@@ -26,6 +26,11 @@ impl Variant {
         self.kind.definition().is_some()
     }
 
+    /// Whether it is a curve of its input alone.
+    pub fn is_curve(self) -> bool {
+        self.kind.is_curve()
+    }
+
     pub fn candidate(self) -> &'static Candidate {
         &self.kind.candidates()[self.form]
     }

@@ -8,6 +8,7 @@ use crate::fit::context::{Context, Fit};
 use crate::search::sequential::Found;
 use crate::units::figure;
 use crate::verdict::augment::augment;
+use crate::verdict::form::Aside;
 use crate::verdict::held_out::{self, HeldOut};
 use crate::verdict::judge::{Evidence, judge};
 use crate::verdict::map;
@@ -27,6 +28,8 @@ pub(crate) struct Given<'a> {
     pub threads: usize,
     /// What is to be said where the records hardly go with the model.
     pub unlike: Option<&'a str>,
+    /// What was taken out of the names as another form of the others.
+    pub aside: &'a Aside,
 }
 
 pub(crate) fn assemble(
@@ -42,6 +45,7 @@ pub(crate) fn assemble(
         floor,
         threads,
         unlike,
+        aside,
     } = *given;
     let Found {
         fit,
@@ -69,6 +73,7 @@ pub(crate) fn assemble(
             counted: !counted.is_empty(),
             cut_short,
             unlike,
+            aside,
         },
         threads,
     );

@@ -7,6 +7,7 @@ use crate::search::sequential::ids;
 use crate::thresholds::THRESHOLDS;
 use crate::units::figure;
 use crate::verdict::battery::{self, Column, Hypothesis};
+use crate::verdict::form::Aside;
 use crate::verdict::held_out::HeldOut;
 use crate::verdict::map::DiscrepancyMap;
 use crate::verdict::names::Names;
@@ -31,6 +32,8 @@ pub(crate) struct Evidence<'a> {
     pub cut_short: bool,
     /// What is said where the records hardly go with the model.
     pub unlike: Option<&'a str>,
+    /// What was taken out of the names as another form of the others.
+    pub aside: &'a Aside,
 }
 
 /// The verdict with its reasons.
@@ -60,7 +63,7 @@ pub(crate) fn judge(ctx: &Context<'_>, e: &Evidence<'_>, threads: usize) -> Judg
     let term = strongest
         .filter(|(_, gain)| *gain > THRESHOLDS.term_least.max(THRESHOLDS.term_share * gained));
     let much = leaves_much(e.null, e.fit);
-    let remains = much || term.is_some();
+    let remains = much || term.is_some() || !e.aside.companions.is_empty();
     let mut out = Judgement {
         verdict: Verdict::NothingMissing,
         reasons: Vec::new(),
@@ -89,12 +92,24 @@ pub(crate) fn judge(ctx: &Context<'_>, e: &Evidence<'_>, threads: usize) -> Judg
         }
         return out;
     }
-    if let Some(reason) = refusal(ctx, e, closed, left > THRESHOLDS.left_sd * scatter, threads) {
+    // Numbers of an equation that is off in its form differ a little from record to record; with the companions they must not.
+    let whole = e.aside.whole.as_ref().unwrap_or(e.fit);
+    let refused = refusal(ctx, e, closed, left > THRESHOLDS.left_sd * scatter);
+    let moved = match refused {
+        None => split::disagreement(ctx, e.null, whole, threads),
+        Some(_) => None,
+    };
+    let of_size = moved
+        .as_ref()
+        .filter(|m| m.of_size)
+        .map(|m| no_name(e.fit, &m.words));
+    if let Some(reason) = refused.or(of_size) {
         out.verdict = Verdict::Unknown;
         out.reasons.push(reason);
         describe(ctx, e.null, &battery::library(ctx, e.null), None, &mut out);
         return out;
     }
+    let remains = remains || moved.is_some();
     // Names of a search that did not come to its end may be a compromise between others.
     let unsure = e.names.ambiguous || e.cut_short || closed < THRESHOLDS.remainder_closed;
     if remains && unsure {
@@ -115,19 +130,25 @@ pub(crate) fn judge(ctx: &Context<'_>, e: &Evidence<'_>, threads: usize) -> Judg
         Verdict::Named
     };
     if remains {
-        out.remainder = Some(remainder(ctx, e, &library, term, 1.0 - closed));
+        let mut left = remainder(ctx, e, &library, term, 1.0 - closed);
+        if let Some(moved) = moved {
+            left.how = format!("{}; {}", moved.words, left.how);
+        }
+        out.remainder = Some(left);
     }
     out
 }
 
+/// That a set is no name, and why.
+fn no_name(fit: &Fit, words: &str) -> String {
+    format!(
+        "the best of the catalogue, {}, is no name: {words}",
+        ids(fit).join(" + ")
+    )
+}
+
 /// Why a set is no name, if it is none.
-fn refusal(
-    ctx: &Context<'_>,
-    e: &Evidence<'_>,
-    closed: f64,
-    open: bool,
-    threads: usize,
-) -> Option<String> {
+fn refusal(ctx: &Context<'_>, e: &Evidence<'_>, closed: f64, open: bool) -> Option<String> {
     let best = ids(e.fit).join(" + ");
     if !e.floor.source.is_known() {
         return Some(no_floor(
@@ -144,7 +165,7 @@ fn refusal(
     }
     if e.names.curvature {
         return Some(format!(
-            "the best of the catalogue, {best}, needs a static curvature more than the memory of a hysteresis: no name"
+            "the best of the catalogue, {best}, needs a static curvature of the response more than the memory of a hysteresis: no name"
         ));
     }
     if open && closed < THRESHOLDS.closed_least {
@@ -153,23 +174,10 @@ fn refusal(
             100.0 * closed
         ));
     }
-    if let Some(words) = at_bound(ctx, e.fit) {
-        return Some(format!(
-            "the best of the catalogue, {best}, is no name: {words}"
-        ));
-    }
-    if let Some(words) = not_earned(ctx, e) {
-        return Some(format!(
-            "the best of the catalogue, {best}, is no name: {words}"
-        ));
-    }
-    if let Some(words) = one_term(ctx, e) {
-        return Some(format!(
-            "the best of the catalogue, {best}, is no name: {words}"
-        ));
-    }
-    split::disagreement(ctx, e.null, e.fit, threads)
-        .map(|words| format!("the best of the catalogue, {best}, is no name: {words}"))
+    at_bound(ctx, e.fit)
+        .or_else(|| not_earned(ctx, e))
+        .or_else(|| one_term(ctx, e))
+        .map(|words| no_name(e.fit, &words))
 }
 
 /// Of another plant: a single term of the library that explains as much as several effects together. A curved characteristic is not
@@ -315,17 +323,29 @@ fn remainder(
     term: Option<(usize, f64)>,
     share: f64,
 ) -> Remainder {
+    let mut how: Vec<String> = e
+        .aside
+        .companions
+        .iter()
+        .map(|(id, share)| {
+            format!(
+                "{:.2} % of the gap that a small {id} would explain, and another form of the named effect as well",
+                100.0 * share
+            )
+        })
+        .collect();
+    how.extend(term.map(|(i, _)| {
+        format!(
+            "{} ({} at the {})",
+            library[i].says, library[i].name, library[i].place
+        )
+    }));
+    if how.is_empty() {
+        how.push("nothing of the library of terms stands out".to_owned());
+    }
     Remainder {
         places: sentences(ctx, e.fit, e.after, e.floor.source.is_known()),
-        how: term.map_or_else(
-            || "nothing of the library of terms stands out".to_owned(),
-            |(i, _)| {
-                format!(
-                    "{} ({} at the {})",
-                    library[i].says, library[i].name, library[i].place
-                )
-            },
-        ),
+        how: how.join("; "),
         share: share.clamp(0.0, 1.0),
         formula: battery::hypothesis(ctx, e.fit, library),
     }

@@ -3,6 +3,7 @@
 mod assemble;
 mod augment;
 pub(crate) mod battery;
+mod form;
 mod guard;
 mod held_out;
 pub(crate) mod judge;

@@ -6,6 +6,7 @@ use crate::fit::context::{Context, Fit, freedom_of};
 use crate::search::cost::{left_over, prior_penalty};
 use crate::search::sequential::Rival;
 use crate::thresholds::THRESHOLDS;
+use crate::verdict::form;
 use crate::verdict::parameters::{parameters, told};
 use crate::verdict::result::{Effect as NamedEffect, Interval};
 use crate::verdict::significance;
@@ -33,7 +34,7 @@ pub(crate) struct Names {
     pub effects: Vec<NamedEffect>,
     /// Whether other names explain the records as well.
     pub ambiguous: bool,
-    /// Whether play operators explain by their static curvature more than by their memory.
+    /// Whether a hysteresis explains by its static curvature more than by its memory.
     pub curvature: bool,
 }
 
@@ -98,7 +99,9 @@ pub(crate) fn names(ctx: &Context<'_>, null: &Fit, fit: &Fit, rivals: &[Vec<Riva
         parts.remove(i);
         let without = ctx.fit_from(parts, Some(fit.soft), &all, 8);
         let gain = (without.chi2 - fit.chi2).max(0.0);
-        out.curvature |= mostly_curvature(ctx, fit, i, gain);
+        out.curvature |= id == "pzt-hysteresis"
+            && (mostly_curvature(ctx, fit, i, gain)
+                || form::gained_by_a_curve(ctx, &without) > THRESHOLDS.curve_share * gain);
         let rivals = rivals.get(i).map_or(&[][..], Vec::as_slice);
         let (alternatives, open) = alternatives(ctx, fit, i, rivals);
         out.ambiguous |= open;
@@ -113,7 +116,8 @@ pub(crate) fn names(ctx: &Context<'_>, null: &Fit, fit: &Fit, rivals: &[Vec<Riva
                 }
             }
         }
-        let needs_text = !alternatives.is_empty() || id == "gain-error";
+        let needs_text =
+            !alternatives.is_empty() || effects::find(id).is_some_and(|k| k.has_doubles());
         let freedom = freedom_of(part.variant(), ctx.problem.records.len());
         out.effects.push(NamedEffect {
             id: id.to_owned(),

@@ -48,18 +48,26 @@ fn groupings(ctx: &Context<'_>) -> Vec<Vec<Group>> {
     all
 }
 
-/// What does not agree between parts of the records, in words; `None` where everything does.
+/// A number that is not the same in all parts of the records.
+pub(crate) struct Disagreement {
+    /// It is the first of its effect, that says how large it is; another says how it is shaped.
+    pub of_size: bool,
+    pub words: String,
+}
+
+/// What does not agree between parts of the records, sizes before shapes; `None` where everything does.
 pub(crate) fn disagreement(
     ctx: &Context<'_>,
     null: &Fit,
     fit: &Fit,
     threads: usize,
-) -> Option<String> {
+) -> Option<Disagreement> {
     let numbers: usize = fit.parts.iter().map(|p| p.theta.len()).sum();
     if numbers == 0 || fit.parts.iter().all(|p| p.variant().role != Role::Chain) {
         return None;
     }
     let gained = (null.chi2 - fit.chi2).max(0.0);
+    let mut of_shape = None;
     for groups in groupings(ctx) {
         let fits = cellpos_parallel::map(&groups, threads, |(_, mask)| {
             (fit.chi2_on(mask), ctx.refit(fit, mask, 6))
@@ -74,7 +82,7 @@ pub(crate) fn disagreement(
             continue;
         }
         // The number that moves most beyond its own uncertainty, in the group that asks for it.
-        let mut worst: Option<(f64, String)> = None;
+        let mut worst: Option<(bool, f64, String)> = None;
         for ((name, _), (joint, own)) in groups.iter().zip(&fits) {
             if joint - own.chi2 < 0.5 * better / groups.len() as f64 {
                 continue;
@@ -87,12 +95,15 @@ pub(crate) fn disagreement(
                     let moved = (b.theta[j] - a.theta[j]).abs();
                     let size = (va[j].abs().max(vb[j].abs())).max(1e-300);
                     let share = (va[j] - vb[j]).abs() / size;
+                    // The weights of a sum are its size together.
+                    let of_size = j == 0 || p.name == "weights";
                     if a.variant().role == Role::Chain
                         && moved > THRESHOLDS.split_sd * sd
                         && share > THRESHOLDS.split_share
-                        && worst.as_ref().is_none_or(|w| share > w.0)
+                        && worst.as_ref().is_none_or(|w| (of_size, share) > (w.0, w.1))
                     {
                         worst = Some((
+                            of_size,
                             share,
                             format!(
                                 "{} of {} is {} in {name} and {} over all: another equation",
@@ -107,9 +118,13 @@ pub(crate) fn disagreement(
                 at += a.theta.len();
             }
         }
-        if let Some((_, words)) = worst {
-            return Some(words);
+        if let Some((of_size, _, words)) = worst {
+            let found = Disagreement { of_size, words };
+            if of_size {
+                return Some(found);
+            }
+            of_shape.get_or_insert(found);
         }
     }
-    None
+    of_shape
 }

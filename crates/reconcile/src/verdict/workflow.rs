@@ -17,6 +17,7 @@ use crate::thresholds::THRESHOLDS;
 use crate::units::{Scales, Units};
 use crate::verdict::assemble;
 use crate::verdict::augment::COLOURED;
+use crate::verdict::form;
 use crate::verdict::guard;
 use crate::verdict::held_out::{self, HeldOut};
 use crate::verdict::judge;
@@ -180,7 +181,11 @@ fn within(
         problem.spent() as f64 / (options.work.max(1e-9) * WORK)
     ));
     take_back(&ctx, &mut found, effort);
-    let held = confirmed(&ctx, &mut found, options.threads, progress);
+    let mut held = confirmed(&ctx, &mut found, options.threads, progress);
+    let aside = form::set_aside(&ctx, &mut found, options.threads);
+    if !aside.companions.is_empty() {
+        held = confirmed(&ctx, &mut found, options.threads, progress);
+    }
     found.fit.locking = (0..found.fit.parts.len())
         .map(|i| locking::refine(&ctx, &found.fit, i, options.threads))
         .collect();
@@ -192,6 +197,7 @@ fn within(
         floor: &floor,
         threads: options.threads,
         unlike: unlike.as_deref(),
+        aside: &aside,
     };
     Ok(assemble::assemble(&given, &ctx, found, held))
 }

@@ -85,6 +85,44 @@ fn one_effect_in_another_anchoring_is_one_effect() {
     }
 }
 
+#[test]
+fn a_small_effect_that_another_form_of_the_large_one_explains_is_no_name() {
+    // A clip whose knee is round, in front of the plant. Beside a sharp one a hysteresis would explain the knee; of a knee as wide as
+    // the clip it would explain nearly all, and so would any curve.
+    for (softness, verdict) in [(0.2, Verdict::NamedWithRemainder), (0.6, Verdict::Unknown)] {
+        let clip = |u: &f64| {
+            let soft = |x: f64| softness * (1.0 + (x / softness).exp()).ln();
+            u - soft(u - 1.0) + soft(-1.2 - u)
+        };
+        let mut records: Vec<Record> = (0..3)
+            .map(|k| {
+                let u = levels(6000, 1.0, 1 + 10 * k);
+                let clipped: Vec<f64> = u.iter().map(clip).collect();
+                let y = record("y", &plant(), &clipped, 41 + k).bead_um;
+                let t: Vec<f64> = (0..u.len()).map(|k| k as f64 * 1e-3).collect();
+                Record::from_rows(&format!("levels-{k}"), &t, &u, &y).unwrap()
+            })
+            .collect();
+        records.push(record("rest", &plant(), &vec![0.0; 6000], 50));
+        let r = run(&plant(), &records);
+        assert_eq!(
+            r.verdict,
+            verdict,
+            "{softness}: {:?} {:?}",
+            named(&r),
+            r.places
+        );
+        if verdict == Verdict::NamedWithRemainder {
+            assert_eq!(named(&r), ["saturation"], "{softness}");
+            let how = r.remainder.unwrap().how;
+            assert!(
+                how.contains("a small pzt-hysteresis would explain"),
+                "{how}"
+            );
+        }
+    }
+}
+
 /// Random records without rest, repeat or stated noise, some with an effect: none may be named.
 fn never_named(count: u64) {
     let silent = Model {

@@ -1,0 +1,282 @@
+//! Small effects that stand for nothing but the form of the large ones beside them.
+//!
+//! The catalogue has one equation for an effect, and a rig another. What the two differ by is small beside the effect, and like a
+//! little of something else: a knee like a gain, a drag like a slew limit. Whether a small companion is such a difference is asked
+//! of the large effects themselves: their numbers are let go with command, position, speed and time, spread about their values, and
+//! made slower or faster in parts. Where that gains as much as the companion does, the companion is no name.
+
+use crate::dot::dot;
+use crate::fit::context::{Context, Fit};
+use crate::fit::linear::Columns;
+use crate::problem::Mask;
+use crate::search::cost::left_over;
+use crate::search::sequential::Found;
+use crate::simulate::simulate;
+use crate::thresholds::THRESHOLDS;
+use cellpos_plant::effects::Role;
+use nalgebra::{DMatrix, DVector};
+
+/// What was taken out of the names.
+#[derive(Debug, Default)]
+pub(crate) struct Aside {
+    /// Ids with the part of the gap that they explain.
+    pub companions: Vec<(&'static str, f64)>,
+    /// The set with them.
+    pub whole: Option<Fit>,
+}
+
+/// Time constants of what is slower in parts \[s\].
+const SMOOTH_S: [f64; 4] = [1e-3, 1e-2, 0.1, 1.0];
+/// How far numbers are spread, in parts of themselves.
+const SPREAD: [f64; 2] = [0.04, 0.12];
+/// Rounds of a fit without a part.
+const ROUNDS: usize = 12;
+
+/// Takes companions out of a set that are no more than the form of the others, smallest first.
+pub(crate) fn set_aside(ctx: &Context<'_>, found: &mut Found, threads: usize) -> Aside {
+    let mut aside = Aside::default();
+    let all = ctx.problem.all();
+    let gap = left_over(&found.null).max(1e-12);
+    while found.fit.parts.len() > 1 {
+        let indices: Vec<usize> = (0..found.fit.parts.len()).collect();
+        let without = cellpos_parallel::map(&indices, threads, |&i| {
+            let mut parts = found.fit.parts.clone();
+            parts.remove(i);
+            ctx.fit_from(parts, Some(found.fit.soft), &all, ROUNDS)
+        });
+        let worth: Vec<f64> = without
+            .iter()
+            .map(|w| (w.chi2 - found.fit.chi2).max(0.0) / gap)
+            .collect();
+        let mut order = indices;
+        order.sort_by(|a, b| worth[*a].total_cmp(&worth[*b]));
+        let Some(i) = order.into_iter().find(|&i| {
+            let part = &found.fit.parts[i];
+            worth[i] < THRESHOLDS.companion_share
+                && part.variant().role == Role::Chain
+                && !part.variant().off_response
+                && !part.variant.is_own()
+                && is_form(ctx, &found.fit, i, &without[i], &worth, &all)
+        }) else {
+            break;
+        };
+        aside
+            .companions
+            .push((found.fit.parts[i].id(), worth[i].min(1.0)));
+        let smaller = without[i].clone();
+        let whole = std::mem::replace(&mut found.fit, smaller);
+        aside.whole.get_or_insert(whole);
+        if i < found.rivals.len() {
+            found.rivals.remove(i);
+        }
+    }
+    aside
+}
+
+/// Whether freer forms of the parts that are larger than part `i` gain as much as it does.
+fn is_form(
+    ctx: &Context<'_>,
+    fit: &Fit,
+    i: usize,
+    without: &Fit,
+    worth: &[f64],
+    mask: &Mask,
+) -> bool {
+    let gained = without.chi2 - fit.chi2;
+    let larger: Vec<usize> = (0..fit.parts.len())
+        .filter(|&k| k != i && worth[k] > THRESHOLDS.companion_times * worth[i])
+        // In the set without it, parts behind it have moved up.
+        .map(|k| if k > i { k - 1 } else { k })
+        .collect();
+    let free = freer(ctx, without, &larger, mask);
+    if free.first().is_none_or(Vec::is_empty) {
+        return false;
+    }
+    let free = gained_beside(ctx, without, free, mask);
+    free > gained
+}
+
+/// What twice the log-likelihood would gain by a curve in front of the plant beside a fit: any, without memory.
+pub(crate) fn gained_by_a_curve(ctx: &Context<'_>, fit: &Fit) -> f64 {
+    gained_beside(ctx, fit, bends(ctx), &ctx.problem.all())
+}
+
+/// What twice the log-likelihood would gain by columns beside a fit, its numbers free as well, beyond what chance gives.
+fn gained_beside(ctx: &Context<'_>, fit: &Fit, more: Vec<Vec<Vec<f64>>>, mask: &Mask) -> f64 {
+    let mut columns = ctx.tangents(fit, mask).columns;
+    let own = gain_of(&columns, &fit.innovations);
+    let at = columns
+        .iter()
+        .flatten()
+        .map(|(k, _)| k + 1)
+        .max()
+        .unwrap_or(0);
+    let count = more.first().map_or(0, Vec::len);
+    for (columns, more) in columns.iter_mut().zip(more) {
+        columns.extend(more.into_iter().enumerate().map(|(k, c)| (at + k, c)));
+    }
+    gain_of(&columns, &fit.innovations) - own - count as f64
+}
+
+/// Innovations by record and column of what freer forms of some parts of a fit would change.
+fn freer(ctx: &Context<'_>, fit: &Fit, parts: &[usize], mask: &Mask) -> Vec<Vec<Vec<f64>>> {
+    let records = &ctx.problem.records;
+    let mut out: Vec<Vec<Vec<f64>>> = vec![Vec::new(); records.len()];
+    let mut curved = false;
+    let sim = ctx.simulated(&fit.parts, mask);
+    let moved = |k: usize, j: usize, step: f64| {
+        let mut parts = fit.parts.clone();
+        parts[k].theta[j] += step;
+        ctx.simulated(&parts, mask)
+    };
+    for &k in parts {
+        let part = &fit.parts[k];
+        if part.variant().role != Role::Chain {
+            continue;
+        }
+        curved |= part.variant.is_curve();
+        for (j, p) in part.variant().params.iter().enumerate() {
+            if p.name == "weights" {
+                continue;
+            }
+            for spread in SPREAD {
+                let step = if p.log {
+                    spread
+                } else {
+                    spread * part.theta[j].abs()
+                };
+                let (up, down) = (moved(k, j, step), moved(k, j, -step));
+                for (i, r) in records.iter().enumerate() {
+                    let rows = 0..r.u.len();
+                    let (a, b, c) = (&up[i], &down[i], &sim[i]);
+                    let mut raw = vec![rows.clone().map(|n| a[n] + b[n] - 2.0 * c[n]).collect()];
+                    if spread == SPREAD[0] {
+                        let slope: Vec<f64> = rows.map(|n| a[n] - b[n]).collect();
+                        raw.extend(let_go(ctx, &slope, &r.u, c));
+                    }
+                    out[i].extend(raw.iter().map(|raw: &Vec<f64>| {
+                        let mut w = vec![0.0; raw.len()];
+                        r.whiten(raw, &mut w);
+                        w
+                    }));
+                }
+            }
+        }
+    }
+    if curved {
+        for (out, bends) in out.iter_mut().zip(bends(ctx)) {
+            out.extend(bends);
+        }
+    }
+    out
+}
+
+/// Places of the command's range, in parts of it, at which a curve may bend.
+const KNOTS: [f64; 7] = [0.125, 0.25, 0.375, 0.5, 0.625, 0.75, 0.875];
+
+/// Innovations by record and column of a curve in front of the plant that bends at places of the command's range.
+fn bends(ctx: &Context<'_>) -> Vec<Vec<Vec<f64>>> {
+    let records = &ctx.problem.records;
+    let (low, high) = records
+        .iter()
+        .flat_map(|r| &r.u)
+        .fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), u| {
+            (a.min(*u), b.max(*u))
+        });
+    records
+        .iter()
+        .map(|r| {
+            KNOTS
+                .iter()
+                .map(|knot| {
+                    let at = low + knot * (high - low);
+                    let bent: Vec<f64> = r.u.iter().map(|u| (u - at).max(0.0)).collect();
+                    let mut y = Vec::new();
+                    simulate(&ctx.problem.base, &bent, &[], &mut y, None);
+                    let mut w = vec![0.0; y.len()];
+                    r.whiten(&y, &mut w);
+                    w
+                })
+                .collect()
+        })
+        .collect()
+}
+
+/// A change by a number, as it would be if the number went with command, position, speed or time, or its effect came later.
+fn let_go(ctx: &Context<'_>, slope: &[f64], u: &[f64], y: &[f64]) -> Vec<Vec<f64>> {
+    let dt = ctx.problem.base.sample_s;
+    let with = |f: &dyn Fn(usize) -> f64| -> Vec<f64> {
+        slope.iter().enumerate().map(|(k, s)| s * f(k)).collect()
+    };
+    let speed = |x: &[f64], k: usize| x[k] - x[k.saturating_sub(1)];
+    let acts = |f: &dyn Fn(usize) -> f64| -> Vec<f64> {
+        let mut sum = 0.0;
+        (0..slope.len())
+            .map(|k| {
+                sum += speed(slope, k) * f(k);
+                sum
+            })
+            .collect()
+    };
+    let mut out = vec![
+        with(&|k| u[k]),
+        with(&|k| u[k].abs()),
+        with(&|k| u[k] * u[k]),
+        with(&|k| y[k]),
+        with(&|k| y[k].abs()),
+        with(&|k| y[k] * y[k]),
+        with(&|k| speed(y, k).abs()),
+        with(&|k| k as f64 * dt),
+        acts(&|k| u[k]),
+        acts(&|k| u[k].abs()),
+        acts(&|k| u[k] * u[k]),
+        acts(&|k| speed(y, k).abs()),
+    ];
+    for tau in SMOOTH_S {
+        let share = -(-dt / tau).exp_m1();
+        let mut low = 0.0;
+        out.push(
+            slope
+                .iter()
+                .map(|s| {
+                    low += share * (s - low);
+                    low
+                })
+                .collect(),
+        );
+    }
+    out
+}
+
+/// What twice the log-likelihood gains when all columns are fitted to innovations; each in parts of its own size.
+fn gain_of(columns: &[Columns], e: &[Vec<f64>]) -> f64 {
+    let n = columns
+        .iter()
+        .flatten()
+        .map(|(k, _)| k + 1)
+        .max()
+        .unwrap_or(0);
+    let (mut a, mut g) = (DMatrix::<f64>::zeros(n, n), DVector::<f64>::zeros(n));
+    for (columns, e) in columns.iter().zip(e) {
+        for (x, (i, ci)) in columns.iter().enumerate() {
+            g[*i] += dot(ci, e);
+            for (j, cj) in &columns[..=x] {
+                let v = dot(ci, cj);
+                a[(*i, *j)] += v;
+                if i != j {
+                    a[(*j, *i)] += v;
+                }
+            }
+        }
+    }
+    let size: Vec<f64> = (0..n)
+        .map(|i| a[(i, i)].sqrt())
+        .map(|s| if s > 0.0 { 1.0 / s } else { 0.0 })
+        .collect();
+    let scaled = DMatrix::from_fn(n, n, |i, j| {
+        let v = a[(i, j)] * size[i] * size[j];
+        if i == j { v + 1e-7 } else { v }
+    });
+    let g = DVector::from_fn(n, |i, _| g[i] * size[i]);
+    scaled.cholesky().map_or(0.0, |c| g.dot(&c.solve(&g)))
+}
