@@ -75,7 +75,7 @@ pub use pdms_relaxation::{pdms_relaxation, pdms_relaxation_of_fast_gain};
 pub use pixel_locking::pixel_locking;
 pub use pump_pulsation::pump_pulsation;
 pub use pzt_creep::{pzt_creep, pzt_creep_of_fast_gain};
-pub use pzt_hysteresis::{bouc_wen, bouc_wen_explicit, exponential_play, play};
+pub use pzt_hysteresis::{Curve, bouc_wen, bouc_wen_explicit, curved_play, exponential_play, play};
 pub use pzt_resonance::pzt_resonance;
 pub use saturation::saturation;
 pub use slew_limit::slew_limit;

@@ -31,7 +31,36 @@ pub fn bouc_wen_explicit(fraction: f64, beta_per_um: f64, gamma_per_um: f64) -> 
 /// Kuhnen 2003, Eur. J. Control 9:407. Thresholds `r_i` in um, rising, not negative, the first usually 0; the quadratic
 /// output term is the asymmetry of a piezo driven by voltage.
 pub fn play(thresholds_um: &[f64], weights: &[f64], quadratic_per_um: f64) -> Effect {
-    Effect::new(&KIND, PLAY, &[quadratic_per_um], &[thresholds_um, weights])
+    let curve = Curve {
+        quadratic_per_um,
+        ..Curve::default()
+    };
+    curved_play(thresholds_um, weights, curve)
+}
+
+/// Static curves around play operators: `x = v + quadratic_per_um v^2 + cubic_per_um2 v^3 + input_quadratic_per_um u^2`.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Curve {
+    /// Of the operators' sum \[1/um\]: the gain differs between the two ends of the stroke.
+    pub quadratic_per_um: f64,
+    /// Of the operators' sum \[1/um^2\]: the gain differs between the ends and the middle of the stroke.
+    pub cubic_per_um2: f64,
+    /// Of the input, past the memory \[1/um\]: with a quadratic term of the other sign the loops lose more at one end of the
+    /// stroke than at the other.
+    pub input_quadratic_per_um: f64,
+}
+
+/// Play operators inside static curves, for loops that are not the same at all places of the stroke.
+///
+/// Operators and a polynomial of the input as in Gu, Zhu, Su 2014, IEEE Trans. Ind. Electron. 61:1583 (modified
+/// Prandtl-Ishlinskii), with a curved output.
+pub fn curved_play(thresholds_um: &[f64], weights: &[f64], curve: Curve) -> Effect {
+    let scalars = [
+        curve.quadratic_per_um,
+        curve.cubic_per_um2,
+        curve.input_quadratic_per_um,
+    ];
+    Effect::new(&KIND, PLAY, &scalars, &[thresholds_um, weights])
 }
 
 /// Play operators whose density falls off exponentially with the threshold, `fraction/width exp(-r/width)`, beside
@@ -83,7 +112,11 @@ static SPEC: Spec = Spec {
         },
         Form {
             name: "play",
-            scalars: &[ParameterSpec::new("quadratic_per_um", "1/um", -1.0, 1.0).or(0.0)],
+            scalars: &[
+                ParameterSpec::new("quadratic_per_um", "1/um", -1.0, 1.0).or(0.0),
+                ParameterSpec::new("cubic_per_um2", "1/um^2", -1.0, 1.0).or(0.0),
+                ParameterSpec::new("input_quadratic_per_um", "1/um", -1.0, 1.0).or(0.0),
+            ],
             lists: &[
                 ParameterSpec::new("thresholds_um", "um", 0.0, 1e4),
                 ParameterSpec::new("weights", "", -1e3, 1e3),
@@ -96,10 +129,15 @@ static SPEC: Spec = Spec {
     separate_by: "the same sine at a second amplitude and a second frequency, and its third harmonic",
 };
 
-/// Thresholds of the freely weighted play operators in parts of the stroke.
-const LEVELS: [f64; 8] = [0.0, 0.03, 0.08, 0.15, 0.25, 0.4, 0.6, 0.8];
+/// Thresholds of the freely weighted play operators in parts of the stroke: even, closer together where small loops are, and
+/// up to the ends of the stroke, where only the widest loops turn.
+const LEVELS: [f64; 12] = [
+    0.0, 0.03, 0.08, 0.15, 0.25, 0.35, 0.45, 0.55, 0.65, 0.75, 0.85, 0.95,
+];
 const WEIGHT: FitParameter = lin("weights", -3.0, 5.0, 1e-3);
 const QUADRATIC: FitParameter = lin("quadratic_per_um", -0.2, 0.2, 1e-4);
+const CUBIC: FitParameter = lin("cubic_per_um2", -0.2, 0.2, 1e-5);
+const INPUT_QUADRATIC: FitParameter = lin("input_quadratic_per_um", -0.2, 0.2, 1e-4);
 
 const CANDIDATES: &[Candidate] = &[
     Candidate {
@@ -123,14 +161,28 @@ const CANDIDATES: &[Candidate] = &[
         name: "free play",
         late: true,
         ..Candidate::chain(&[
-            WEIGHT, WEIGHT, WEIGHT, WEIGHT, WEIGHT, WEIGHT, WEIGHT, WEIGHT, QUADRATIC,
+            WEIGHT,
+            WEIGHT,
+            WEIGHT,
+            WEIGHT,
+            WEIGHT,
+            WEIGHT,
+            WEIGHT,
+            WEIGHT,
+            WEIGHT,
+            WEIGHT,
+            WEIGHT,
+            WEIGHT,
+            QUADRATIC,
+            CUBIC,
+            INPUT_QUADRATIC,
         ])
     },
     // Never started from: what is left of play operators when they remember nothing.
     Candidate {
         name: "curvature",
         late: true,
-        ..Candidate::chain(&[QUADRATIC])
+        ..Candidate::chain(&[QUADRATIC, CUBIC])
     },
 ];
 
@@ -145,7 +197,11 @@ impl EffectKind for PztHysteresis {
             Box::new(Play {
                 thresholds: effect.list(0).to_vec(),
                 weights: effect.list(1).to_vec(),
-                quadratic: a,
+                curve: Curve {
+                    quadratic_per_um: a,
+                    cubic_per_um2: b,
+                    input_quadratic_per_um: c,
+                },
                 p: vec![0.0; effect.list(0).len()],
             })
         } else {
@@ -198,10 +254,15 @@ impl EffectKind for PztHysteresis {
                 .into_iter()
                 .map(|v| vec![v[0], v[1] * scope.stroke_um])
                 .collect(),
-            2 => vec![
-                vec![0.9, 0.02, 0.02, 0.02, 0.02, 0.02, 0.02, 0.02, 0.0],
-                vec![0.7, 0.05, 0.05, 0.05, 0.05, 0.05, 0.05, 0.05, 0.0],
-            ],
+            2 => [0.02, 0.05]
+                .iter()
+                .map(|wide| {
+                    let mut start = vec![*wide; LEVELS.len()];
+                    start[0] = 1.0 - 5.0 * wide;
+                    start.resize(CANDIDATES[index].params.len(), 0.0);
+                    start
+                })
+                .collect(),
             _ => Vec::new(),
         }
     }
@@ -212,8 +273,24 @@ impl EffectKind for PztHysteresis {
         match index {
             0 => bouc_wen_explicit(at(0), at(1), at(2).clamp(-at(1), at(1))),
             1 => exponential_play(at(0), at(1)),
-            2 => play(&thresholds, &values[..LEVELS.len()], at(LEVELS.len())),
-            _ => play(&thresholds[..1], &[1.0], at(0)),
+            2 => curved_play(
+                &thresholds,
+                &values[..LEVELS.len()],
+                Curve {
+                    quadratic_per_um: at(LEVELS.len()),
+                    cubic_per_um2: at(LEVELS.len() + 1),
+                    input_quadratic_per_um: at(LEVELS.len() + 2),
+                },
+            ),
+            _ => curved_play(
+                &thresholds[..1],
+                &[1.0],
+                Curve {
+                    quadratic_per_um: at(0),
+                    cubic_per_um2: at(1),
+                    ..Curve::default()
+                },
+            ),
         }
     }
 }
@@ -354,7 +431,7 @@ fn relax(g: f64, rate: f64, way: f64) -> f64 {
 struct Play {
     thresholds: Vec<f64>,
     weights: Vec<f64>,
-    quadratic: f64,
+    curve: Curve,
     p: Vec<f64>,
 }
 
@@ -365,7 +442,12 @@ impl Play {
             *p = (u - r).max((u + r).min(*p));
             v += w * *p;
         }
-        v + self.quadratic * v * v
+        let Curve {
+            quadratic_per_um,
+            cubic_per_um2,
+            input_quadratic_per_um,
+        } = self.curve;
+        v + v * v * (quadratic_per_um + cubic_per_um2 * v) + input_quadratic_per_um * u * u
     }
 }
 

@@ -188,22 +188,24 @@ pub(crate) fn of_frames(frames: &FrameCounts) -> (Vec<NamedEffect>, Vec<String>)
     (named, places)
 }
 
-/// Whether most of what play operators gain is their static quadratic term, which is no hysteresis.
+/// Whether most of what play operators gain is their static curve, which is no hysteresis.
 fn mostly_curvature(ctx: &Context<'_>, fit: &Fit, index: usize, gain: f64) -> bool {
     let part = &fit.parts[index];
-    let Some(quadratic) = part
-        .variant()
-        .params
-        .iter()
-        .position(|p| p.name == "quadratic_per_um")
-    else {
+    if !part.variant().params.iter().any(|p| p.name == "weights") {
         return false;
-    };
+    }
     let Some(v) = Variant::named("pzt-hysteresis", "curvature") else {
         return false;
     };
+    // Without memory the sum of the operators is the input.
+    let of = |word: &str| -> f64 {
+        let curves = part.variant().params.iter().zip(part.natural());
+        let alike = curves.filter(|(p, _)| p.name.ends_with(word));
+        alike.map(|(_, value)| value).sum()
+    };
+    let curve = v.candidate().params.iter().map(|p| of(p.name));
     let mut parts = fit.parts.clone();
-    parts[index] = Part::new(v, &[part.natural()[quadratic]]);
+    parts[index] = Part::new(v, &curve.collect::<Vec<_>>());
     let forgetful = ctx.fit_from(parts, Some(fit.soft), &ctx.problem.all(), 12);
     // What memory adds must be at least a half of the whole.
     forgetful.chi2 - fit.chi2 < 0.5 * gain

@@ -141,6 +141,38 @@ fn play_operators_have_the_loop_of_their_sum() {
 }
 
 #[test]
+fn curved_play_operators_lose_more_at_one_end_of_the_stroke() {
+    let curve = effects::Curve {
+        quadratic_per_um: -0.03,
+        cubic_per_um2: 0.002,
+        input_quadratic_per_um: 0.05,
+    };
+    let effect = effects::curved_play(&[0.0, 0.5], &[0.6, 0.4], curve);
+    assert_eq!(effect.get("cubic_per_um2"), Some(0.002));
+    let y = run(
+        &unity().with_effect(effect),
+        &[2.0, 0.0, -2.0, 0.0, 0.0],
+        1e-3,
+    );
+    let of = |u: f64, p1: f64| {
+        let v = 0.6 * u + 0.4 * p1;
+        v - 0.03 * v.powi(2) + 0.002 * v.powi(3) + 0.05 * u.powi(2)
+    };
+    for (y, (u, p1)) in y[1..]
+        .iter()
+        .zip([(2.0, 1.5), (0.0, 0.5), (-2.0, -1.5), (0.0, -0.5)])
+    {
+        assert!((y - of(u, p1)).abs() < 1e-12);
+    }
+    // Width of the loop between -2 and 2, near either end: on the way out the wide operator lags by 0.5, on the way back it leads.
+    let width = |u: f64| of(u, u + 0.5) - of(u, u - 0.5);
+    assert!(width(-1.5) > 1.1 * width(1.5));
+    // The plain form is the one without curves.
+    let flat = effects::curved_play(&[0.0, 0.5], &[0.6, 0.4], effects::Curve::default());
+    assert_eq!(flat, play(vec![0.0, 0.5], vec![0.6, 0.4], 0.0));
+}
+
+#[test]
 fn many_play_operators_show_rayleighs_third_harmonic_one_fifth_of_the_quadrature() {
     // Uniform density of thresholds: the loop's branches are parabolas, which is Rayleigh's law.
     let n = 60;
