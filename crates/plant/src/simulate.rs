@@ -106,6 +106,16 @@ struct Note {
     area_um_s: f64,
 }
 
+impl Note {
+    /// At an instant before the start (or at it), where everything rests.
+    fn before(rest_um: f64, at_s: f64) -> Self {
+        Self {
+            bead_um: rest_um,
+            area_um_s: rest_um * at_s,
+        }
+    }
+}
+
 /// A chain with its camera at a fixed sample time, row by row: for closed loops without frames, and for records.
 ///
 /// For each row: [`Simulator::measure`], then [`Simulator::hold`]. Neither allocates. The clock-skew effect needs
@@ -144,7 +154,7 @@ impl Simulator {
         let begin = Ago::new(camera.delay_s + camera.exposure_s, sample_s);
         in_range("delay in rows", begin.whole as f64, "", 0.0, 1e7)?;
         let (a, b) = (end.offset_s(sample_s), begin.offset_s(sample_s));
-        Ok(Self {
+        let mut simulator = Self {
             chain,
             sample_s,
             end,
@@ -155,7 +165,23 @@ impl Simulator {
             begins: vec![Note::default(); begin.whole + 1],
             camera,
             row: 0,
-        })
+        };
+        simulator.note_rest();
+        Ok(simulator)
+    }
+
+    /// What the first rows see of the time before the record.
+    fn note_rest(&mut self) {
+        let rest_um = self.chain.bead_um();
+        for (ring, exposure_s) in [
+            (&mut self.ends, 0.0),
+            (&mut self.begins, self.camera.exposure_s),
+        ] {
+            for (row, note) in ring.iter_mut().enumerate() {
+                let at_s = row as f64 * self.sample_s - self.camera.delay_s - exposure_s;
+                *note = Note::before(rest_um, at_s);
+            }
+        }
     }
 
     fn note(&self) -> Note {
@@ -253,8 +279,7 @@ impl Simulator {
     /// Restarts at rest at the working point, at row 0. The random numbers go on.
     pub fn reset(&mut self) {
         self.chain.reset();
-        self.ends.fill(Note::default());
-        self.begins.fill(Note::default());
+        self.note_rest();
         self.row = 0;
     }
 
@@ -286,7 +311,7 @@ impl Simulator {
 /// The bead positions \[um\] that a model records in answer to displacements \[um\] held for `sample_s` each.
 ///
 /// Row k of the answer belongs to row k of `pzt_um`. The rig rests at the working point before row 0 with the bead at
-/// 0 um. Frames are neither dropped nor repeated here: see [`crate::frame_fates`].
+/// 0 um, or where equations in the plant's place begin. Frames are neither dropped nor repeated here: see [`crate::frame_fates`].
 ///
 /// # Errors
 /// A model with numbers out of range, a sample time outside 0.1 us..1e5 s, displacements that are not finite.
@@ -367,6 +392,7 @@ fn irregular(
     let exposure = camera.exposure_s;
     // Row k's exposure ends at end(k) and begins `exposure` before, in time since the first row.
     let end = |k: usize| (1.0 + camera.skew) * (time_s[k] - origin) - camera.delay_s;
+    let rest_um = chain.bead_um();
     let mut ends = vec![Note::default(); n];
     let mut begins = vec![Note::default(); n];
     let (mut next_end, mut next_begin) = (0, 0);
@@ -405,7 +431,7 @@ fn irregular(
                 now = instant_in;
             }
             let note = if instant < -COINCIDENT_S {
-                Note::default()
+                Note::before(rest_um, instant)
             } else {
                 Note {
                     bead_um: chain.bead_um(),

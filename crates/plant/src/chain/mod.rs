@@ -117,7 +117,7 @@ impl Chain {
             0.0,
             1e4,
         )?;
-        Ok(Self {
+        let mut chain = Self {
             compiled: compile::compile(model),
             working_point_um: model.working_point_um,
             brownian: None,
@@ -128,7 +128,9 @@ impl Chain {
             offset_um: 0.0,
             area_um_s: 0.0,
             wants_area: false,
-        })
+        };
+        chain.rest();
+        Ok(chain)
     }
 
     /// The chain of a model with the bead's Brownian motion, fixed by the seed.
@@ -162,7 +164,8 @@ impl Chain {
         self.wants_area = true;
     }
 
-    /// Back to rest at the working point at time 0, the bead at 0 um. The random numbers go on.
+    /// Back to rest at the working point at time 0, the bead at 0 um (or where equations in the plant's place begin). The random
+    /// numbers go on.
     pub fn reset(&mut self) {
         for stage in &mut self.compiled.stages {
             match stage {
@@ -180,6 +183,15 @@ impl Chain {
         self.output = Piece::default();
         self.offset_um = 0.0;
         self.area_um_s = 0.0;
+        self.rest();
+    }
+
+    /// Shows where equations that stand in the plant's place begin: a level that is not 0 is there before the first command.
+    fn rest(&mut self) {
+        let begins = |s: &Stage| matches!(s, Stage::Tied(tied) if tied.replaces_output());
+        if self.compiled.stages.iter().any(begins) {
+            self.piece(0.0, 0.0, 0.0);
+        }
     }
 
     /// Holds a command \[um of PZT displacement, absolute\] for `dt_s`.

@@ -56,6 +56,16 @@ impl TiedPlant {
         self.velocity = 0.0;
     }
 
+    /// Whether something stands in the place of what the plant gives: at rest it need not be at 0.
+    pub fn replaces_output(&self) -> bool {
+        self.ties.iter().any(|t| t.replaces_output())
+    }
+
+    /// Where it is at rest, before any input.
+    pub fn at_rest(&mut self) -> f64 {
+        self.shown(&Seen::default(), 0.0)
+    }
+
     /// The slope of the position at the end of the last step.
     pub fn velocity(&self) -> f64 {
         self.velocity
@@ -124,7 +134,7 @@ impl TiedPlant {
         self.drive = to;
         self.velocity = out.speed_end;
         self.position = out.end;
-        if !self.ties.iter().any(|t| t.replaces_output()) {
+        if !self.replaces_output() {
             return out;
         }
         let seen = now(from);

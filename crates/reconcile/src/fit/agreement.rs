@@ -140,6 +140,18 @@ share = { unit = "", lower = 0.0, upper = 1.0, start = [0.05, 0.3] }
 lag = { unit = "s", lower = 0.01, upper = 10.0, start = 0.2 }
 
 [[effects]]
+id = "agree-level"
+place = "plant"
+says = "a level that is there from the start"
+output = "level"
+[effects.states]
+level = { rate = "filling*input - drain*sqrt(max(level, 0))", start = "begin" }
+[effects.parameters]
+filling = { unit = "1/s", lower = 0.0, upper = 10.0, start = 0.1 }
+drain = { unit = "um/s", lower = 0.0, upper = 10.0, start = 0.5 }
+begin = { unit = "um", lower = 0.0, upper = 10.0, start = [3.0, 8.0] }
+
+[[effects]]
 id = "agree-tire"
 place = "bead"
 says = "a bead that follows less and less"
@@ -159,7 +171,7 @@ bend = { unit = "1/um^2", lower = -0.01, upper = 0.01, start = 1e-5 }
 #[test]
 fn the_two_agree_on_effects_of_a_user_s_own_at_every_place() {
     let defined = Definition::from_toml_str(OWN, "own.toml").unwrap_or_else(|e| panic!("{e}"));
-    assert_eq!(defined.len(), 6);
+    assert_eq!(defined.len(), 7);
     let own: Vec<&str> = OWN
         .lines()
         .filter_map(|l| l.strip_prefix("id = \"")?.strip_suffix('"'))
@@ -171,6 +183,25 @@ fn the_two_agree_on_effects_of_a_user_s_own_at_every_place() {
     // Equations that both take in steps, and not at the same instants.
     let bad = apart(&of_file, &u, &bare, 1e-2);
     assert!(bad.is_empty(), "{}", bad.join("\n"));
+
+    // What does not begin at 0 is seen from the first row on, whatever the frames do.
+    let level = of_file.iter().find(|v| v.id() == "agree-level").unwrap();
+    let level = level.starts(&SCOPE)[0].effect(&SCOPE);
+    for further in [
+        None,
+        Some(effects::time_delay(0.0025)),
+        Some(effects::exposure_averaging(0.0007)),
+        Some(effects::gain_error(1.1)),
+    ] {
+        let mut model = Model::eq6().with_effect(level.clone());
+        let factor = further.as_ref().and_then(|e| e.get("factor"));
+        model.effects.extend(further);
+        for y in [predicted(&model, &u), simulated(&model, &u)] {
+            let shown = 3.0 * factor.unwrap_or(1.0);
+            let off: Vec<f64> = y[..4].iter().map(|y| (y - shown).abs()).collect();
+            assert!(off.iter().all(|off| *off < 0.02), "{model:?}: {off:?}");
+        }
+    }
 }
 
 #[test]

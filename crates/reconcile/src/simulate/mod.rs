@@ -354,7 +354,8 @@ impl<'a> Chain<'a> {
             x.iter_mut().for_each(|v| *v *= pending.gain);
         }
         let mut t = Trace::default();
-        let mut position = 0.0;
+        let rest = tied.at_rest();
+        let mut position = rest;
         for (j, &end) in x.iter().enumerate() {
             // A sampled input goes in straight lines to the value at the step's end, a held one jumps.
             let start = match j {
@@ -374,7 +375,13 @@ impl<'a> Chain<'a> {
             for (j, mean) in means.iter_mut().enumerate() {
                 *mean = 0.5 * (*mean + t.pos.get(j + 1).copied().unwrap_or(position));
             }
-            Modal::new(&self.plant, h).trace(&means, 1, &mut t);
+            let behind = Modal::new(&self.plant, h);
+            behind.trace(&means, 1, &mut t);
+            // What they let through at once is there before the first command.
+            if let (Some(position), Some(jump)) = (t.pos.first_mut(), t.jump.first_mut()) {
+                *position += behind.direct * rest;
+                *jump -= behind.direct * rest;
+            }
         }
         self.behind_plant(&mut t, &x, &Zpk::one(), h);
         camera::sample(&t, self.frames, h, self.fine, n, y);

@@ -434,6 +434,6 @@ fn tanks_with_an_overflow_from_a_file_follow_what_they_have_not_seen() {
     println!("zero {zero:.3} V, without it {raw:.3} V");
     let after = free_run(&result.best, s.hold, s.sample_s, (u, y), zero);
     println!("fresh record: {after:.3} V");
-    // 0.306 V; a linear model is off by 0.60 V.
-    assert!(after < 0.32, "{after} V");
+    // 0.281 V; a linear model is off by 0.60 V.
+    assert!(after <= 0.30, "{after} V");
 }
