@@ -161,6 +161,21 @@ const CANDIDATES: &[Candidate] = &[
         name: "free play",
         late: true,
         ..Candidate::chain(&[
+            WEIGHT, WEIGHT, WEIGHT, WEIGHT, WEIGHT, WEIGHT, WEIGHT, WEIGHT, WEIGHT, WEIGHT, WEIGHT,
+            WEIGHT, QUADRATIC,
+        ])
+    },
+    // Never started from: what is left of play operators when they remember nothing.
+    Candidate {
+        name: "curvature",
+        late: true,
+        ..Candidate::chain(&[QUADRATIC, CUBIC])
+    },
+    // Where the piezo itself is what is measured. Behind a chip a cubic curve may be a saturation's or a spring's, which have names.
+    Candidate {
+        name: "curved play",
+        late: true,
+        ..Candidate::chain(&[
             WEIGHT,
             WEIGHT,
             WEIGHT,
@@ -177,12 +192,6 @@ const CANDIDATES: &[Candidate] = &[
             CUBIC,
             INPUT_QUADRATIC,
         ])
-    },
-    // Never started from: what is left of play operators when they remember nothing.
-    Candidate {
-        name: "curvature",
-        late: true,
-        ..Candidate::chain(&[QUADRATIC, CUBIC])
     },
 ];
 
@@ -254,7 +263,7 @@ impl EffectKind for PztHysteresis {
                 .into_iter()
                 .map(|v| vec![v[0], v[1] * scope.stroke_um])
                 .collect(),
-            2 => [0.02, 0.05]
+            2 | 4 if index == 2 || scope.sampled_input => [0.02, 0.05]
                 .iter()
                 .map(|wide| {
                     let mut start = vec![*wide; LEVELS.len()];
@@ -273,7 +282,7 @@ impl EffectKind for PztHysteresis {
         match index {
             0 => bouc_wen_explicit(at(0), at(1), at(2).clamp(-at(1), at(1))),
             1 => exponential_play(at(0), at(1)),
-            2 => curved_play(
+            2 | 4 => curved_play(
                 &thresholds,
                 &values[..LEVELS.len()],
                 Curve {
