@@ -46,7 +46,7 @@ pub struct Thresholds {
     /// Larger is what explains so many times as much. Pinned with it.
     pub companion_times: f64,
     /// A hysteresis of which a curve without memory in front of the plant explains this part is none: of relays it explains 0.4 to
-    /// 0.8. Pinned with the two above.
+    /// 0.8. Pinned by `a_hysteresis_that_any_curve_explains_is_no_name`.
     pub curve_share: f64,
     /// Rows of rest or of repeated command from which noise is known to a few percent.
     pub floor_rows: usize,

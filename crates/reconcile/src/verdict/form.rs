@@ -6,6 +6,7 @@
 //! made slower or faster in parts. Where that gains as much as the companion does, the companion is no name.
 
 use crate::dot::dot;
+use crate::fit::catalogue::Part;
 use crate::fit::context::{Context, Fit};
 use crate::fit::linear::Columns;
 use crate::problem::Mask;
@@ -19,8 +20,8 @@ use nalgebra::{DMatrix, DVector};
 /// What was taken out of the names.
 #[derive(Debug, Default)]
 pub(crate) struct Aside {
-    /// Ids with the part of the gap that they explain.
-    pub companions: Vec<(&'static str, f64)>,
+    /// Ids, of several that go together with "and" between, with the part of the gap that they explain.
+    pub companions: Vec<(String, f64)>,
     /// The set with them.
     pub whole: Option<Fit>,
 }
@@ -37,6 +38,7 @@ pub(crate) fn set_aside(ctx: &Context<'_>, found: &mut Found, threads: usize) ->
     let mut aside = Aside::default();
     let all = ctx.problem.all();
     let gap = left_over(&found.null).max(1e-12);
+    one_form(ctx, found, &mut aside, threads);
     while found.fit.parts.len() > 1 {
         let indices: Vec<usize> = (0..found.fit.parts.len()).collect();
         let without = cellpos_parallel::map(&indices, threads, |&i| {
@@ -52,17 +54,17 @@ pub(crate) fn set_aside(ctx: &Context<'_>, found: &mut Found, threads: usize) ->
         order.sort_by(|a, b| worth[*a].total_cmp(&worth[*b]));
         let Some(i) = order.into_iter().find(|&i| {
             let part = &found.fit.parts[i];
-            worth[i] < THRESHOLDS.companion_share
-                && part.variant().role == Role::Chain
-                && !part.variant().off_response
-                && !part.variant.is_own()
-                && is_form(ctx, &found.fit, i, &without[i], &worth, &all)
+            let gained = without[i].chi2 - found.fit.chi2;
+            may_be_form(part)
+                && (remembers_nothing(ctx, part, &without[i], gained)
+                    || worth[i] < THRESHOLDS.companion_share
+                        && is_form(ctx, &found.fit, i, &without[i], &worth, &all))
         }) else {
             break;
         };
         aside
             .companions
-            .push((found.fit.parts[i].id(), worth[i].min(1.0)));
+            .push((found.fit.parts[i].id().to_owned(), worth[i].min(1.0)));
         let smaller = without[i].clone();
         let whole = std::mem::replace(&mut found.fit, smaller);
         aside.whole.get_or_insert(whole);
@@ -71,6 +73,49 @@ pub(crate) fn set_aside(ctx: &Context<'_>, found: &mut Found, threads: usize) ->
         }
     }
     aside
+}
+
+/// Takes all but one out of a set of several that share what one of them, alone and in a freer form, explains as well: none of them
+/// is then small beside the others.
+fn one_form(ctx: &Context<'_>, found: &mut Found, aside: &mut Aside, threads: usize) {
+    let all = ctx.problem.all();
+    let gap = left_over(&found.null).max(1e-12);
+    let count = found.fit.parts.len();
+    if count < 3 || !found.fit.parts.iter().all(may_be_form) {
+        return;
+    }
+    let indices: Vec<usize> = (0..count).collect();
+    let alone = cellpos_parallel::map(&indices, threads, |&i| {
+        let part = found.fit.parts[i].clone();
+        ctx.fit_from(vec![part], Some(found.fit.soft), &all, ROUNDS)
+    });
+    let Some(best) = indices
+        .into_iter()
+        .min_by(|a, b| alone[*a].chi2.total_cmp(&alone[*b].chi2))
+    else {
+        return;
+    };
+    let one = &alone[best];
+    let gained = one.chi2 - found.fit.chi2;
+    if gained > THRESHOLDS.companion_share * gap
+        || gained_beside(ctx, one, freer(ctx, one, &[0], &all), &all) < gained
+    {
+        return;
+    }
+    let others = found.fit.parts.iter().enumerate();
+    let others: Vec<&str> = others
+        .filter(|(i, _)| *i != best)
+        .map(|(_, part)| part.id())
+        .collect();
+    aside.companions.push((others.join(" and "), gained / gap));
+    found.rivals = found.rivals.get(best).cloned().into_iter().collect();
+    aside.whole = Some(std::mem::replace(&mut found.fit, one.clone()));
+}
+
+/// Whether a part is one whose share of the response another effect's form may take.
+fn may_be_form(part: &Part) -> bool {
+    let variant = part.variant();
+    variant.role == Role::Chain && !variant.off_response && !part.variant.is_own()
 }
 
 /// Whether freer forms of the parts that are larger than part `i` gain as much as it does.
@@ -96,9 +141,17 @@ fn is_form(
     free > gained
 }
 
-/// What twice the log-likelihood would gain by a curve in front of the plant beside a fit: any, without memory.
-pub(crate) fn gained_by_a_curve(ctx: &Context<'_>, fit: &Fit) -> f64 {
-    gained_beside(ctx, fit, bends(ctx), &ctx.problem.all())
+/// Whether a part is a hysteresis of which a curve without memory in front of the plant, any, gains as good as all beside the
+/// others.
+pub(crate) fn remembers_nothing(
+    ctx: &Context<'_>,
+    part: &Part,
+    without: &Fit,
+    gained: f64,
+) -> bool {
+    part.id() == "pzt-hysteresis"
+        && gained_beside(ctx, without, bends(ctx), &ctx.problem.all())
+            > THRESHOLDS.curve_share * gained
 }
 
 /// What twice the log-likelihood would gain by columns beside a fit, its numbers free as well, beyond what chance gives.

@@ -329,7 +329,7 @@ fn remainder(
         .iter()
         .map(|(id, share)| {
             format!(
-                "{:.2} % of the gap that a small {id} would explain, and another form of the named effect as well",
+                "{:.2} % of the gap that {id} beside it would explain, and another form of the named effect as well",
                 100.0 * share
             )
         })

@@ -99,9 +99,8 @@ pub(crate) fn names(ctx: &Context<'_>, null: &Fit, fit: &Fit, rivals: &[Vec<Riva
         parts.remove(i);
         let without = ctx.fit_from(parts, Some(fit.soft), &all, 8);
         let gain = (without.chi2 - fit.chi2).max(0.0);
-        out.curvature |= id == "pzt-hysteresis"
-            && (mostly_curvature(ctx, fit, i, gain)
-                || form::gained_by_a_curve(ctx, &without) > THRESHOLDS.curve_share * gain);
+        out.curvature |= mostly_curvature(ctx, fit, i, gain)
+            || form::remembers_nothing(ctx, part, &without, gain);
         let rivals = rivals.get(i).map_or(&[][..], Vec::as_slice);
         let (alternatives, open) = alternatives(ctx, fit, i, rivals);
         out.ambiguous |= open;
