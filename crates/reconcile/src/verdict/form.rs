@@ -2,8 +2,9 @@
 //!
 //! The catalogue has one equation for an effect, and a rig another. What the two differ by is small beside the effect, and like a
 //! little of something else: a knee like a gain, a drag like a slew limit. Whether a small companion is such a difference is asked
-//! of the large effects themselves: their numbers are let go with command, position, speed and time, spread about their values, and
-//! made slower or faster in parts. Where that gains as much as the companion does, the companion is no name.
+//! of the large effects themselves: their numbers are let go with command, position, speed and time, at the output and where they
+//! act, spread about their values, and slowed in parts; a curve may bend elsewhere. Where that gains as much as the companion does,
+//! the companion is no name.
 
 use crate::dot::dot;
 use crate::fit::catalogue::Part;
@@ -26,8 +27,8 @@ pub(crate) struct Aside {
     pub whole: Option<Fit>,
 }
 
-/// Time constants of what is slower in parts \[s\].
-const SMOOTH_S: [f64; 4] = [1e-3, 1e-2, 0.1, 1.0];
+/// Time constants of what is slower in parts, in rows.
+const SMOOTH_ROWS: [f64; 4] = [1.0, 10.0, 100.0, 1000.0];
 /// How far numbers are spread, in parts of themselves.
 const SPREAD: [f64; 2] = [0.04, 0.12];
 /// Rounds of a fit without a part.
@@ -137,8 +138,7 @@ fn is_form(
     if free.first().is_none_or(Vec::is_empty) {
         return false;
     }
-    let free = gained_beside(ctx, without, free, mask);
-    free > gained
+    gained_beside(ctx, without, free, mask) > gained
 }
 
 /// Whether a part is a hysteresis of which a curve without memory in front of the plant, any, gains as good as all beside the
@@ -285,8 +285,8 @@ fn let_go(ctx: &Context<'_>, slope: &[f64], u: &[f64], y: &[f64]) -> Vec<Vec<f64
         acts(&|k| u[k] * u[k]),
         acts(&|k| speed(y, k).abs()),
     ];
-    for tau in SMOOTH_S {
-        let share = -(-dt / tau).exp_m1();
+    for rows in SMOOTH_ROWS {
+        let share = -(-1.0 / rows).exp_m1();
         let mut low = 0.0;
         out.push(
             slope
