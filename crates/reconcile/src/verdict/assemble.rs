@@ -60,6 +60,7 @@ pub(crate) fn assemble(
     places.extend(sentences(ctx, &null, &null_map, floor.source.is_known()));
     let names = names(ctx, &null, &fit, &rivals);
     let (counted, counted_places) = of_frames(frames);
+    let gap = gap(ctx, &held, [&null, &fit], &steps, [&null_map, &after_map]);
     let judgement = judge(
         ctx,
         &Evidence {
@@ -67,6 +68,7 @@ pub(crate) fn assemble(
             fit: &fit,
             names: &names,
             held: &held,
+            closure: gap.closure(),
             floor,
             null_flagged: null_map.any_flagged(),
             after: &after_map,
@@ -96,7 +98,6 @@ pub(crate) fn assemble(
         });
         effects
     };
-    let gap = gap(ctx, &held, [&null, &fit], &steps, [&null_map, &after_map]);
     let augmented = augment(model, ctx, &fit, frames, &named, verdict, floor);
     // The same with the set that was best, whether or not it earned its names.
     let mut best = augment(

@@ -22,6 +22,8 @@ pub(crate) struct Evidence<'a> {
     pub fit: &'a Fit,
     pub names: &'a Names,
     pub held: &'a HeldOut,
+    /// Part of the gap in innovations that closes on held-out records.
+    pub closure: f64,
     pub floor: &'a Floor,
     /// Whether the map of the null shows anything beyond the floor.
     pub null_flagged: bool,
@@ -285,6 +287,12 @@ fn not_earned(ctx: &Context<'_>, e: &Evidence<'_>) -> Option<String> {
             "the innovations on held-out records are {} with it and {} without",
             ctx.scales.told(e.held.after_um),
             ctx.scales.told(e.held.before_um)
+        ));
+    }
+    if e.closure < THRESHOLDS.held_out_least {
+        return Some(format!(
+            "it closes {:.0} % of the gap on held-out records",
+            100.0 * e.closure
         ));
     }
     None
