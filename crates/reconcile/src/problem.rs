@@ -54,6 +54,13 @@ impl Prepared {
         }
     }
 
+    /// The same in rows of their own.
+    pub fn whitened(&self, r: &[f64]) -> Vec<f64> {
+        let mut e = vec![0.0; r.len()];
+        self.whiten(r, &mut e);
+        e
+    }
+
     /// Orthonormal innovations of the transients under the present whitener.
     fn free_transients(&mut self) {
         let mut free: Vec<Vec<f64>> = Vec::new();

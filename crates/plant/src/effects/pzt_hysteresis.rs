@@ -138,6 +138,14 @@ const WEIGHT: FitParameter = lin("weights", -3.0, 5.0, 1e-3);
 const QUADRATIC: FitParameter = lin("quadratic_per_um", -0.2, 0.2, 1e-4);
 const CUBIC: FitParameter = lin("cubic_per_um2", -0.2, 0.2, 1e-5);
 const INPUT_QUADRATIC: FitParameter = lin("input_quadratic_per_um", -0.2, 0.2, 1e-4);
+/// Weights, and the curves around them.
+const PLAY_NUMBERS: &[FitParameter] = &{
+    let mut all = [WEIGHT; LEVELS.len() + 3];
+    all[LEVELS.len()] = QUADRATIC;
+    all[LEVELS.len() + 1] = CUBIC;
+    all[LEVELS.len() + 2] = INPUT_QUADRATIC;
+    all
+};
 
 const CANDIDATES: &[Candidate] = &[
     Candidate {
@@ -160,10 +168,7 @@ const CANDIDATES: &[Candidate] = &[
     Candidate {
         name: "free play",
         late: true,
-        ..Candidate::chain(&[
-            WEIGHT, WEIGHT, WEIGHT, WEIGHT, WEIGHT, WEIGHT, WEIGHT, WEIGHT, WEIGHT, WEIGHT, WEIGHT,
-            WEIGHT, QUADRATIC,
-        ])
+        ..Candidate::chain(PLAY_NUMBERS.split_at(LEVELS.len() + 1).0)
     },
     // Never started from: what is left of play operators when they remember nothing.
     Candidate {
@@ -175,23 +180,7 @@ const CANDIDATES: &[Candidate] = &[
     Candidate {
         name: "curved play",
         late: true,
-        ..Candidate::chain(&[
-            WEIGHT,
-            WEIGHT,
-            WEIGHT,
-            WEIGHT,
-            WEIGHT,
-            WEIGHT,
-            WEIGHT,
-            WEIGHT,
-            WEIGHT,
-            WEIGHT,
-            WEIGHT,
-            WEIGHT,
-            QUADRATIC,
-            CUBIC,
-            INPUT_QUADRATIC,
-        ])
+        ..Candidate::chain(PLAY_NUMBERS)
     },
 ];
 

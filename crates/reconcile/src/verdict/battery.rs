@@ -222,9 +222,7 @@ pub(crate) fn library(ctx: &Context<'_>, fit: &Fit) -> Vec<Column> {
                     } else {
                         raw
                     };
-                    let mut w = vec![0.0; moved.len()];
-                    r.whiten(&moved, &mut w);
-                    w
+                    r.whitened(&moved)
                 })
                 .collect();
             all.push(Column {

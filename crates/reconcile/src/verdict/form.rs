@@ -10,7 +10,6 @@ use crate::dot::dot;
 use crate::fit::catalogue::Part;
 use crate::fit::context::{Context, Fit};
 use crate::fit::linear::Columns;
-use crate::problem::Mask;
 use crate::search::cost::left_over;
 use crate::search::sequential::Found;
 use crate::simulate::simulate;
@@ -59,7 +58,7 @@ pub(crate) fn set_aside(ctx: &Context<'_>, found: &mut Found, threads: usize) ->
             may_be_form(part)
                 && (remembers_nothing(ctx, part, &without[i], gained)
                     || worth[i] < THRESHOLDS.companion_share
-                        && is_form(ctx, &found.fit, i, &without[i], &worth, &all))
+                        && is_form(ctx, &found.fit, i, &without[i], &worth))
         }) else {
             break;
         };
@@ -99,7 +98,7 @@ fn one_form(ctx: &Context<'_>, found: &mut Found, aside: &mut Aside, threads: us
     let one = &alone[best];
     let gained = one.chi2 - found.fit.chi2;
     if gained > THRESHOLDS.companion_share * gap
-        || gained_beside(ctx, one, freer(ctx, one, &[0], &all), &all) < gained
+        || gained_beside(ctx, one, freer(ctx, one, &[0])) < gained
     {
         return;
     }
@@ -120,25 +119,18 @@ fn may_be_form(part: &Part) -> bool {
 }
 
 /// Whether freer forms of the parts that are larger than part `i` gain as much as it does.
-fn is_form(
-    ctx: &Context<'_>,
-    fit: &Fit,
-    i: usize,
-    without: &Fit,
-    worth: &[f64],
-    mask: &Mask,
-) -> bool {
+fn is_form(ctx: &Context<'_>, fit: &Fit, i: usize, without: &Fit, worth: &[f64]) -> bool {
     let gained = without.chi2 - fit.chi2;
     let larger: Vec<usize> = (0..fit.parts.len())
         .filter(|&k| k != i && worth[k] > THRESHOLDS.companion_times * worth[i])
         // In the set without it, parts behind it have moved up.
         .map(|k| if k > i { k - 1 } else { k })
         .collect();
-    let free = freer(ctx, without, &larger, mask);
+    let free = freer(ctx, without, &larger);
     if free.first().is_none_or(Vec::is_empty) {
         return false;
     }
-    gained_beside(ctx, without, free, mask) > gained
+    gained_beside(ctx, without, free) > gained
 }
 
 /// Whether a part is a hysteresis of which a curve without memory in front of the plant, any, gains as good as all beside the
@@ -150,13 +142,12 @@ pub(crate) fn remembers_nothing(
     gained: f64,
 ) -> bool {
     part.id() == "pzt-hysteresis"
-        && gained_beside(ctx, without, bends(ctx), &ctx.problem.all())
-            > THRESHOLDS.curve_share * gained
+        && gained_beside(ctx, without, bends(ctx)) > THRESHOLDS.curve_share * gained
 }
 
 /// What twice the log-likelihood would gain by columns beside a fit, its numbers free as well, beyond what chance gives.
-fn gained_beside(ctx: &Context<'_>, fit: &Fit, more: Vec<Vec<Vec<f64>>>, mask: &Mask) -> f64 {
-    let mut columns = ctx.tangents(fit, mask).columns;
+fn gained_beside(ctx: &Context<'_>, fit: &Fit, more: Vec<Vec<Vec<f64>>>) -> f64 {
+    let mut columns = ctx.tangents(fit, &ctx.problem.all()).columns;
     let own = gain_of(&columns, &fit.innovations);
     let at = columns
         .iter()
@@ -172,15 +163,16 @@ fn gained_beside(ctx: &Context<'_>, fit: &Fit, more: Vec<Vec<Vec<f64>>>, mask: &
 }
 
 /// Innovations by record and column of what freer forms of some parts of a fit would change.
-fn freer(ctx: &Context<'_>, fit: &Fit, parts: &[usize], mask: &Mask) -> Vec<Vec<Vec<f64>>> {
+fn freer(ctx: &Context<'_>, fit: &Fit, parts: &[usize]) -> Vec<Vec<Vec<f64>>> {
+    let all = ctx.problem.all();
     let records = &ctx.problem.records;
     let mut out: Vec<Vec<Vec<f64>>> = vec![Vec::new(); records.len()];
     let mut curved = false;
-    let sim = ctx.simulated(&fit.parts, mask);
+    let sim = ctx.simulated(&fit.parts, &all);
     let moved = |k: usize, j: usize, step: f64| {
         let mut parts = fit.parts.clone();
         parts[k].theta[j] += step;
-        ctx.simulated(&parts, mask)
+        ctx.simulated(&parts, &all)
     };
     for &k in parts {
         let part = &fit.parts[k];
@@ -207,11 +199,7 @@ fn freer(ctx: &Context<'_>, fit: &Fit, parts: &[usize], mask: &Mask) -> Vec<Vec<
                         let slope: Vec<f64> = rows.map(|n| a[n] - b[n]).collect();
                         raw.extend(let_go(ctx, &slope, &r.u, c));
                     }
-                    out[i].extend(raw.iter().map(|raw: &Vec<f64>| {
-                        let mut w = vec![0.0; raw.len()];
-                        r.whiten(raw, &mut w);
-                        w
-                    }));
+                    out[i].extend(raw.iter().map(|raw: &Vec<f64>| r.whitened(raw)));
                 }
             }
         }
@@ -246,9 +234,7 @@ fn bends(ctx: &Context<'_>) -> Vec<Vec<Vec<f64>>> {
                     let bent: Vec<f64> = r.u.iter().map(|u| (u - at).max(0.0)).collect();
                     let mut y = Vec::new();
                     simulate(&ctx.problem.base, &bent, &[], &mut y, None);
-                    let mut w = vec![0.0; y.len()];
-                    r.whiten(&y, &mut w);
-                    w
+                    r.whitened(&y)
                 })
                 .collect()
         })

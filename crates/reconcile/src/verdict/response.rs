@@ -203,8 +203,7 @@ pub(super) fn ratios(
         if r.rest {
             continue;
         }
-        let mut s = vec![0.0; r.u.len()];
-        r.whiten(&sim[i], &mut s);
+        let s = r.whitened(&sim[i]);
         let e = &fit.innovations[i];
         add(
             &mut bands,
