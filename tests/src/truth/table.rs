@@ -4,7 +4,7 @@ use super::cases::Case;
 pub use super::fresh::Fresh;
 use super::fresh::fresh;
 use super::threshold::above_threshold;
-use super::{Excitation, Nuisance, Random, Rig, run, scripts};
+use super::{Excitation, Hidden, Nuisance, Random, Rig, Second, run, scripts};
 use cellpos_plant::{Model, Noise, TransferFunction};
 use cellpos_reconcile::{
     Effect, Options, Reconciliation, Record, Verdict, constant_gain, reconcile,
@@ -190,15 +190,29 @@ fn numbers(result: &Reconciliation) -> String {
     all.join(" + ")
 }
 
+/// By what the camera is wrong about the size of a pixel.
+fn magnified(behind: &[Hidden]) -> f64 {
+    let factor = |h: &Hidden| match h {
+        Hidden::Second(Second::Magnification(f)) => *f,
+        _ => 1.0,
+    };
+    behind.iter().map(factor).product()
+}
+
 /// Whether the intervals of named effects hold what was hidden, where both have the same equation.
 fn covered(case: &Case, result: &Reconciliation) -> ((usize, usize), Vec<String>) {
     let (mut good, mut all) = (0, 0);
     let mut missed = Vec::new();
-    for h in &case.hidden {
+    for (i, h) in case.hidden.iter().enumerate() {
         let Some(effect) = result.effects.iter().find(|e| e.id == h.id()) else {
             continue;
         };
         for (name, value) in h.parameters() {
+            // A pixel is as large as the micrometres that the camera takes it for.
+            let value = match name {
+                "pixel_um" => value * magnified(&case.hidden[i..]),
+                _ => value,
+            };
             if let Some(p) = effect.parameters.get(name) {
                 all += 1;
                 if p.ci95[0] <= value && value <= p.ci95[1] {

@@ -92,6 +92,11 @@ impl Fit {
             .sum()
     }
 
+    /// The parts that act in one way, in their order.
+    pub fn of_role(&self, role: Role) -> impl Iterator<Item = &Part> {
+        self.parts.iter().filter(move |p| p.variant().role == role)
+    }
+
     pub fn has(&self, id: &str) -> bool {
         self.parts.iter().any(|p| p.id() == id)
     }

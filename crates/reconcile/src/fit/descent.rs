@@ -290,9 +290,9 @@ impl Context<'_> {
         self.state(fit, mask).residual
     }
 
-    /// Raw residual and simulated position of a fit.
+    /// Raw residual of a fit, and its position with the lines that shake it.
     pub fn residual(&self, fit: &Fit) -> (Vec<Vec<f64>>, Vec<Vec<f64>>) {
         let s = self.state(fit, &self.problem.all());
-        (s.residual, s.sim)
+        (s.residual, s.path)
     }
 }

@@ -11,6 +11,8 @@ use std::f64::consts::TAU;
 /// One evaluation of the model.
 pub(crate) struct State {
     pub sim: Vec<Vec<f64>>,
+    /// The same with the lines that shake it: what the pixels see.
+    pub path: Vec<Vec<f64>>,
     /// Raw residual.
     pub residual: Vec<Vec<f64>>,
     pub innovations: Vec<Vec<f64>>,
@@ -46,45 +48,39 @@ impl Context<'_> {
         }
         let mut residual = Vec::with_capacity(sim.len());
         let mut innovations = Vec::with_capacity(sim.len());
-        for (i, (r, s)) in self.problem.records.iter().zip(&sim).enumerate() {
+        let mut path = sim.clone();
+        for (i, (r, s)) in self.problem.records.iter().zip(&mut path).enumerate() {
             if s.is_empty() {
                 residual.push(Vec::new());
                 innovations.push(Vec::new());
                 continue;
             }
-            let mut e: Vec<f64> = r.y.iter().zip(s).map(|(y, s)| y - s).collect();
-            let mut line = 0;
-            let mut position = 0;
-            for p in &fit.parts {
-                match p.variant().role {
-                    Role::Chain => {}
-                    Role::Line => {
-                        let [a, b] = fit.lines[line][i];
-                        if a != 0.0 || b != 0.0 {
-                            self.rotate(p.natural()[0], e.len(), |k, sin, cos| {
-                                e[k] -= a * sin + b * cos
-                            });
-                        }
-                        line += 1;
-                    }
-                    Role::Position => {
-                        let [a, b] = fit.positions[position];
-                        if a != 0.0 || b != 0.0 {
-                            let pixel = p.natural()[0];
-                            // Once to take the error off the neighbours that tell the position, once in earnest.
-                            let mut straight = e.clone();
-                            for _ in 0..2 {
-                                let walk = r.whitener.around(&straight);
-                                for k in 0..e.len() {
-                                    let (sin, cos) = (TAU * (s[k] + walk[k]) / pixel).sin_cos();
-                                    straight[k] = e[k] - a * sin - b * cos;
-                                }
-                            }
-                            e = straight;
-                        }
-                        position += 1;
+            let mut e: Vec<f64> = r.y.iter().zip(&*s).map(|(y, s)| y - s).collect();
+            for (p, amplitudes) in fit.of_role(Role::Line).zip(&fit.lines) {
+                let [a, b] = amplitudes[i];
+                if a != 0.0 || b != 0.0 {
+                    self.rotate(p.natural()[0], e.len(), |k, sin, cos| {
+                        let line = a * sin + b * cos;
+                        e[k] -= line;
+                        s[k] += line;
+                    });
+                }
+            }
+            for (p, [a, b]) in fit.of_role(Role::Position).zip(&fit.positions) {
+                if *a == 0.0 && *b == 0.0 {
+                    continue;
+                }
+                let pixel = p.natural()[0];
+                // Once to take the error off the neighbours that tell the position, once in earnest.
+                let mut straight = e.clone();
+                for _ in 0..2 {
+                    let walk = r.whitener.around(&straight);
+                    for k in 0..e.len() {
+                        let (sin, cos) = (TAU * (s[k] + walk[k]) / pixel).sin_cos();
+                        straight[k] = e[k] - a * sin - b * cos;
                     }
                 }
+                e = straight;
             }
             let mut w = vec![0.0; e.len()];
             r.whiten(&e, &mut w);
@@ -97,6 +93,7 @@ impl Context<'_> {
         let chi2 = sum_squares(&innovations, mask);
         State {
             sim,
+            path,
             residual,
             innovations,
             soft,
@@ -171,7 +168,7 @@ impl Context<'_> {
                         let walk = r.whitener.around(&state.residual[i]);
                         let mut d = [vec![0.0; n], vec![0.0; n], vec![0.0; n]];
                         for k in 0..n {
-                            let angle = TAU * (state.sim[i][k] + walk[k]) / pixel;
+                            let angle = TAU * (state.path[i][k] + walk[k]) / pixel;
                             let (s, c) = angle.sin_cos();
                             d[0][k] = angle * (a * c - b * s);
                             d[1][k] = -s;

@@ -130,6 +130,28 @@ fn a_small_effect_that_another_form_of_the_large_one_explains_is_no_name() {
 }
 
 #[test]
+fn pixels_see_what_a_hum_shakes() {
+    // The hum moves the image by more than a pixel: the error within a pixel turns with it.
+    let model = Model::eq6();
+    let hidden = model
+        .clone()
+        .with_effect(effects::mains_hum(50.0, 0.35, 20.0))
+        .with_effect(effects::pixel_locking(0.25, 0.08, 0.0));
+    let about = |u: Vec<f64>| -> Vec<f64> { u.iter().map(|u| 4.0 + u).collect() };
+    let mut records: Vec<Record> = (0..3)
+        .map(|k| {
+            let u = about(levels(6000, 1.0, k));
+            record(&format!("levels-{k}"), &hidden, &u, k + 50)
+        })
+        .collect();
+    records.push(record("rest", &hidden, &vec![4.0; 10_000], 60));
+    let r = reconcile(&model, &records, &Options::default(), &mut |_| {}).unwrap();
+    assert_eq!(named(&r), ["mains-hum", "pixel-locking"]);
+    let amplitude = &r.effects[1].parameters["amplitude"];
+    assert!((amplitude.value - 0.08).abs() < 0.008, "{amplitude:?}");
+}
+
+#[test]
 fn a_hysteresis_that_any_curve_explains_is_no_name() {
     // A clip whose knee is round, nearly as wide as the clip: beside a sharp one a hysteresis would explain it.
     let r = behind(|u| {
