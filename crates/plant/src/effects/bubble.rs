@@ -6,8 +6,7 @@ use super::{
     Piece, Place, Scope, Spec, lin, log,
 };
 use crate::modal::Zpk;
-use crate::phi::phi;
-use nalgebra::Complex;
+use crate::phi::phi_real;
 
 /// A gas bubble, compliance `C = V/(n P)` behind the flow resistance R: `1 / (1 + lag s)`, `lag = R C`.
 ///
@@ -113,10 +112,10 @@ impl Block for Dissolving {
         }
         // The lag changes over seconds, a piece lasts less than a millisecond: its mean is enough.
         let now = (self.lag * (-self.dissolution * (time_s + 0.5 * h_s)).exp()).max(1e-9);
-        let f = phi(Complex::new(-h_s / now, 0.0));
+        let [exp, one, two] = phi_real(-h_s / now);
         let rise = input.end - input.start;
         let gain = h_s / now;
-        self.y = f.exp.re * start + gain * (f.one.re * input.start + f.two.re * rise);
+        self.y = exp * start + gain * (one * input.start + two * rise);
         self.speed = (input.end - self.y) / now;
         Piece {
             start,

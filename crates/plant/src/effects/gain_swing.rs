@@ -46,6 +46,7 @@ impl EffectKind for GainSwing {
             phase: effect.scalar(2).to_radians(),
             input: 0.0,
             output: 0.0,
+            known: (f64::NAN, 0.0),
         }))
     }
 
@@ -81,6 +82,8 @@ struct Swing {
     phase: f64,
     input: f64,
     output: f64,
+    /// The last time that was asked for, with its gain: one piece begins where the one before it ends.
+    known: (f64, f64),
 }
 
 impl Swing {
@@ -91,12 +94,16 @@ impl Swing {
 
 impl Block for Swing {
     fn advance(&mut self, time_s: f64, h_s: f64, input: Piece) -> Piece {
-        // A piece lasts less than a thousandth of a period: the gain in its middle is that of all of it.
-        let (first, middle, last) = (
-            self.gain(time_s),
-            self.gain(time_s + 0.5 * h_s),
-            self.gain(time_s + h_s),
-        );
+        let end_s = time_s + h_s;
+        let first = if (time_s - self.known.0).abs() < 1e-12 {
+            self.known.1
+        } else {
+            self.gain(time_s)
+        };
+        let last = self.gain(end_s);
+        self.known = (end_s, last);
+        // A piece lasts less than a thousandth of a period: the mean of its gains is that of all of it.
+        let middle = 0.5 * (first + last);
         let start = self.output + first * (input.start - self.input);
         self.output = start + middle * (input.end - input.start);
         self.input = input.end;
@@ -112,6 +119,7 @@ impl Block for Swing {
     fn reset(&mut self) {
         self.input = 0.0;
         self.output = 0.0;
+        self.known = (f64::NAN, 0.0);
     }
 
     fn duplicate(&self) -> Box<dyn Block> {

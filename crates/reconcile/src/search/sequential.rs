@@ -51,11 +51,11 @@ fn within(fit: &Fit) -> f64 {
 }
 
 /// Whatever is beyond chance, followed to the end.
-const FREELY: [f64; 2] = [0.0, f64::INFINITY];
+pub(crate) const FREELY: [f64; 2] = [0.0, f64::INFINITY];
 
 /// Fits the best leads next to a set and returns the fits, best first; `least` is what a lead must promise, `rival_of` the sum of
 /// squares from which on a fit is followed no further.
-fn extensions(
+pub(crate) fn extensions(
     ctx: &Context<'_>,
     fit: &Fit,
     mask: &Mask,

@@ -133,6 +133,12 @@ fn is_form(ctx: &Context<'_>, fit: &Fit, i: usize, without: &Fit, worth: &[f64])
     gained_beside(ctx, without, free) > gained
 }
 
+/// What twice the log-likelihood gains by freer forms of the first parts of a fit, beyond what chance gives.
+pub(crate) fn gain_of_freer(ctx: &Context<'_>, fit: &Fit, first: usize) -> f64 {
+    let parts: Vec<usize> = (0..first).collect();
+    gained_beside(ctx, fit, freer(ctx, fit, &parts))
+}
+
 /// Whether a part is a hysteresis of which a curve without memory in front of the plant, any, gains as good as all beside the
 /// others.
 pub(crate) fn remembers_nothing(

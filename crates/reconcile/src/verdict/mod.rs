@@ -15,6 +15,7 @@ pub(crate) mod response;
 pub(crate) mod result;
 mod sentences;
 mod significance;
+mod small;
 mod split;
 mod tell;
 mod unlike;

@@ -22,6 +22,7 @@ use crate::verdict::guard;
 use crate::verdict::held_out::{self, HeldOut};
 use crate::verdict::judge;
 use crate::verdict::result::Reconciliation;
+use crate::verdict::small;
 use cellpos_plant::effects::Scope;
 use cellpos_plant::{Effect, Model};
 
@@ -183,8 +184,14 @@ fn within(
     take_back(&ctx, &mut found, effort);
     let mut held = confirmed(&ctx, &mut found, options.threads, progress);
     let aside = form::set_aside(&ctx, &mut found, options.threads);
+    let large = found.fit.parts.len();
     if !aside.companions.is_empty() {
         held = confirmed(&ctx, &mut found, options.threads, progress);
+    } else if floor.source.is_known() && !found.cut_short && unlike.is_none() {
+        small::add(&ctx, &mut found, effort, progress);
+        if found.fit.parts.len() > large {
+            held = confirmed(&ctx, &mut found, options.threads, progress);
+        }
     }
     found.fit.locking = (0..found.fit.parts.len())
         .map(|i| locking::refine(&ctx, &found.fit, i, options.threads))

@@ -129,6 +129,33 @@ fn a_small_effect_that_another_form_of_the_large_one_explains_is_no_name() {
     }
 }
 
+/// Records of this rig: levels about the working point, and a rest.
+fn on_this_rig(hidden: &Model, rows: usize) -> Vec<Record> {
+    let mut records: Vec<Record> = (0..3)
+        .map(|k| {
+            let u: Vec<f64> = levels(rows, 1.0, k).iter().map(|u| 4.0 + u).collect();
+            record(&format!("levels-{k}"), hidden, &u, k + 50)
+        })
+        .collect();
+    records.push(record("rest", hidden, &vec![4.0; 10_000], 60));
+    records
+}
+
+#[test]
+fn a_small_effect_of_its_own_is_named_beside_a_large_one() {
+    let hidden = Model::eq6()
+        .with_effect(effects::time_delay(0.006))
+        .with_effect(effects::pzt_creep(0.015));
+    let records = on_this_rig(&hidden, 16_000);
+    let r = reconcile(&Model::eq6(), &records, &Options::default(), &mut |_| {}).unwrap();
+    assert_eq!(named(&r), ["time-delay", "pzt-creep"]);
+    assert!(
+        r.effects[1].explained < 0.0015,
+        "{}",
+        r.effects[1].explained
+    );
+}
+
 #[test]
 fn pixels_see_what_a_hum_shakes() {
     // The hum moves the image by more than a pixel: the error within a pixel turns with it.
@@ -137,14 +164,7 @@ fn pixels_see_what_a_hum_shakes() {
         .clone()
         .with_effect(effects::mains_hum(50.0, 0.35, 20.0))
         .with_effect(effects::pixel_locking(0.25, 0.08, 0.0));
-    let about = |u: Vec<f64>| -> Vec<f64> { u.iter().map(|u| 4.0 + u).collect() };
-    let mut records: Vec<Record> = (0..3)
-        .map(|k| {
-            let u = about(levels(6000, 1.0, k));
-            record(&format!("levels-{k}"), &hidden, &u, k + 50)
-        })
-        .collect();
-    records.push(record("rest", &hidden, &vec![4.0; 10_000], 60));
+    let records = on_this_rig(&hidden, 6000);
     let r = reconcile(&model, &records, &Options::default(), &mut |_| {}).unwrap();
     assert_eq!(named(&r), ["mains-hum", "pixel-locking"]);
     let amplitude = &r.effects[1].parameters["amplitude"];

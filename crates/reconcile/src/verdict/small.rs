@@ -1,0 +1,67 @@
+//! Effects so small beside the large ones that the search passes them by: looked for last, and asked hardest.
+//!
+//! What explains a thousandth of the gap may be the difference between the catalogue's equation of a large effect and the rig's, so
+//! the search asks for more (`addition_share`). A slow creep beside a delay explains no more either, and spoils the free run all the
+//! same. At the end the two can be told apart: where the small one is real, nothing is left that freer forms of the large ones
+//! could take up; where it only stands for their form, they go on gaining beside it. Beside large ones whose form is known to be
+//! another, since something was set aside, nothing small is looked for.
+
+use crate::fit::context::{Context, Fit};
+use crate::search::cost::threshold;
+use crate::search::sequential::{Effort, FREELY, Found, extensions, ids, settle};
+use crate::thresholds::THRESHOLDS;
+use crate::verdict::{form, held_out, judge, split};
+
+/// Leads that are followed to the end.
+const LEADS: usize = 3;
+
+/// Adds what is left beside a set and stands on its own, one after another.
+pub(crate) fn add(
+    ctx: &Context<'_>,
+    found: &mut Found,
+    effort: Effort,
+    progress: &mut dyn FnMut(&str),
+) {
+    let all = ctx.problem.all();
+    while !found.fit.parts.is_empty() && found.fit.parts.len() < effort.max_effects {
+        progress(&format!(
+            "looking for what is small beside {}",
+            ids(&found.fit).join(" + ")
+        ));
+        let next = extensions(ctx, &found.fit, &all, effort, LEADS, &[], FREELY);
+        let Some(top) = next.first() else {
+            return;
+        };
+        if !stands(ctx, found, top, &next[1..], effort.threads) {
+            return;
+        }
+        let (fit, rivals) = settle(ctx, top.clone(), None, &all, effort);
+        // What was named before stands.
+        if !top.parts.iter().all(|p| fit.has(p.id())) {
+            return;
+        }
+        found.steps.push((ids(&fit), fit.chi2));
+        (found.fit, found.rivals) = (fit, rivals);
+    }
+}
+
+/// Whether the last part of a set that is one larger than what was found is an effect of its own: the cheap questions first.
+fn stands(ctx: &Context<'_>, found: &Found, top: &Fit, others: &[Fit], threads: usize) -> bool {
+    let large = found.fit.parts.len();
+    let part = &top.parts[large];
+    let gained = found.fit.chi2 - top.chi2;
+    let added = top.freedom().saturating_sub(found.fit.freedom()).max(1);
+    let rivalled = others.iter().any(|f| {
+        f.chi2 - top.chi2 < THRESHOLDS.tie && f.parts.last().is_some_and(|p| p.id() != part.id())
+    });
+    // What gains more was weighed by the search.
+    let most = THRESHOLDS.addition_share * (found.null.chi2 - found.fit.chi2);
+    gained < most
+        && gained > THRESHOLDS.small_gain * threshold(added)
+        && part.matters()
+        && !rivalled
+        && judge::first_at_bound(ctx, top).is_none()
+        && form::gain_of_freer(ctx, top, large) < THRESHOLDS.small_rest * gained
+        && held_out::check(ctx, top, threads).unconfirmed.is_empty()
+        && split::disagreement(ctx, &found.null, top, threads).is_none_or(|m| !m.of_size)
+}
