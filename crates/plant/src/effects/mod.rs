@@ -167,6 +167,11 @@ pub trait EffectKind: fmt::Debug + Send + Sync {
         false
     }
 
+    /// Whether slow motion gets another gain by it than fast motion: which of the two the model's gain is, is a matter of anchoring.
+    fn has_two_gains(&self) -> bool {
+        false
+    }
+
     /// Whether something that has no name of its own answers alike from command to bead: what tells them apart is then always said.
     fn has_doubles(&self) -> bool {
         false

@@ -63,6 +63,10 @@ impl EffectKind for PztCreep {
         Action::Linear(creep(effect.scalar(0), reference_s))
     }
 
+    fn has_two_gains(&self) -> bool {
+        true
+    }
+
     fn candidates(&self) -> &'static [Candidate] {
         const ALL: &[Candidate] = &FREE.anchored();
         ALL

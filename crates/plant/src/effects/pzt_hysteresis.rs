@@ -238,6 +238,10 @@ impl EffectKind for PztHysteresis {
         Ok(())
     }
 
+    fn has_two_gains(&self) -> bool {
+        true
+    }
+
     fn candidates(&self) -> &'static [Candidate] {
         CANDIDATES
     }

@@ -23,7 +23,7 @@ pub(super) fn threshold_of(v: &Candidate, records: usize) -> f64 {
 }
 
 /// Sum of squares with a price per parameter, so that a form with many numbers wins only if it is worth them.
-pub(super) fn penalised_cost(ctx: &Context<'_>, fit: &Fit) -> f64 {
+pub(crate) fn penalised_cost(ctx: &Context<'_>, fit: &Fit) -> f64 {
     let left = left_over(fit);
     let typical: f64 = fit.parts.iter().map(|p| prior_penalty(p, left)).sum();
     // Decides ties only: the localisation noise of a rig need not be that of its model.

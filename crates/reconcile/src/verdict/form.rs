@@ -4,7 +4,7 @@
 //! little of something else: a knee like a gain, a drag like a slew limit. Whether a small companion is such a difference is asked
 //! of the large effects themselves: their numbers are let go with command, position, speed and time, at the output and where they
 //! act, spread about their values, and slowed in parts; a curve may bend elsewhere. Where that gains as much as the companion does,
-//! the companion is no name.
+//! and goes on gaining beside it, the companion is no name.
 
 use crate::dot::dot;
 use crate::fit::catalogue::Part;
@@ -97,9 +97,7 @@ fn one_form(ctx: &Context<'_>, found: &mut Found, aside: &mut Aside, threads: us
     };
     let one = &alone[best];
     let gained = one.chi2 - found.fit.chi2;
-    if gained > THRESHOLDS.companion_share * gap
-        || gained_beside(ctx, one, freer(ctx, one, &[0])) < gained
-    {
+    if gained > THRESHOLDS.companion_share * gap || gain_of_freer(ctx, one, &[0]) < gained {
         return;
     }
     let others = found.fit.parts.iter().enumerate();
@@ -118,25 +116,26 @@ fn may_be_form(part: &Part) -> bool {
     variant.role == Role::Chain && !variant.off_response && !part.variant.is_own()
 }
 
-/// Whether freer forms of the parts that are larger than part `i` gain as much as it does.
+/// Whether part `i` only stands for the form of the parts that are larger: their freer forms gain as much in its stead, and go on
+/// gaining beside it. Of a companion that is real they may be able to imitate much, but leave nothing beside it.
 fn is_form(ctx: &Context<'_>, fit: &Fit, i: usize, without: &Fit, worth: &[f64]) -> bool {
     let gained = without.chi2 - fit.chi2;
     let larger: Vec<usize> = (0..fit.parts.len())
         .filter(|&k| k != i && worth[k] > THRESHOLDS.companion_times * worth[i])
-        // In the set without it, parts behind it have moved up.
-        .map(|k| if k > i { k - 1 } else { k })
         .collect();
-    let free = freer(ctx, without, &larger);
-    if free.first().is_none_or(Vec::is_empty) {
-        return false;
-    }
-    gained_beside(ctx, without, free) > gained
+    // In the set without it, parts behind it have moved up.
+    let moved: Vec<usize> = larger.iter().map(|&k| k - usize::from(k > i)).collect();
+    gain_of_freer(ctx, without, &moved) > gained
+        && gain_of_freer(ctx, fit, &larger) > THRESHOLDS.companion_rest * gained
 }
 
-/// What twice the log-likelihood gains by freer forms of the first parts of a fit, beyond what chance gives.
-pub(crate) fn gain_of_freer(ctx: &Context<'_>, fit: &Fit, first: usize) -> f64 {
-    let parts: Vec<usize> = (0..first).collect();
-    gained_beside(ctx, fit, freer(ctx, fit, &parts))
+/// What twice the log-likelihood gains by freer forms of some parts of a fit, beyond what chance gives; nothing where they have none.
+pub(crate) fn gain_of_freer(ctx: &Context<'_>, fit: &Fit, parts: &[usize]) -> f64 {
+    let free = freer(ctx, fit, parts);
+    if free.first().is_none_or(Vec::is_empty) {
+        return 0.0;
+    }
+    gained_beside(ctx, fit, free)
 }
 
 /// Whether a part is a hysteresis of which a curve without memory in front of the plant, any, gains as good as all beside the

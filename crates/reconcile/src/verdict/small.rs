@@ -7,7 +7,7 @@
 //! another, since something was set aside, nothing small is looked for.
 
 use crate::fit::context::{Context, Fit};
-use crate::search::cost::threshold;
+use crate::search::cost::{penalised_cost, threshold};
 use crate::search::sequential::{Effort, FREELY, Found, extensions, ids, settle};
 use crate::thresholds::THRESHOLDS;
 use crate::verdict::{form, held_out, judge, split};
@@ -51,17 +51,23 @@ fn stands(ctx: &Context<'_>, found: &Found, top: &Fit, others: &[Fit], threads: 
     let part = &top.parts[large];
     let gained = found.fit.chi2 - top.chi2;
     let added = top.freedom().saturating_sub(found.fit.freedom()).max(1);
+    let before: Vec<usize> = (0..large).collect();
+    let cost = penalised_cost(ctx, top);
     let rivalled = others.iter().any(|f| {
-        f.chi2 - top.chi2 < THRESHOLDS.tie && f.parts.last().is_some_and(|p| p.id() != part.id())
+        penalised_cost(ctx, f) - cost < THRESHOLDS.tie
+            && f.parts.last().is_some_and(|p| p.id() != part.id())
     });
+    let another_anchoring =
+        part.id() == "gain-error" && top.parts.iter().any(|p| p.variant.has_two_gains());
     // What gains more was weighed by the search.
     let most = THRESHOLDS.addition_share * (found.null.chi2 - found.fit.chi2);
     gained < most
         && gained > THRESHOLDS.small_gain * threshold(added)
         && part.matters()
         && !rivalled
+        && !another_anchoring
         && judge::first_at_bound(ctx, top).is_none()
-        && form::gain_of_freer(ctx, top, large) < THRESHOLDS.small_rest * gained
+        && form::gain_of_freer(ctx, top, &before) < THRESHOLDS.companion_rest * gained
         && held_out::check(ctx, top, threads).unconfirmed.is_empty()
         && split::disagreement(ctx, &found.null, top, threads).is_none_or(|m| !m.of_size)
 }
