@@ -335,29 +335,41 @@ fn is_hopeless(fit: &Fit, null: &Fit) -> bool {
     left_over(fit) > most * left_over(null)
 }
 
-/// The whole search on the rows of a mask.
+/// The whole search on the rows of a mask; with `start`, on from a set that was found under another noise.
 pub(crate) fn search(
     ctx: &Context<'_>,
     mask: &Mask,
     effort: Effort,
+    start: Option<&Fit>,
     mut progress: impl FnMut(&str),
 ) -> Found {
     let null = ctx.fit(Vec::new(), mask, 6);
     let mut steps = vec![(Vec::new(), null.chi2)];
-    progress("screening single effects");
-    let mut singles = extensions(ctx, &null, mask, effort, 8, &[], FREELY);
-    singles.retain(|f| worth_it(&null, f, null.chi2));
-    let Some(best) = singles.first().cloned() else {
-        return Found {
-            fit: null.clone(),
-            null,
-            steps,
-            rivals: Vec::new(),
-            cut_short: false,
-        };
+    let mut beam: Vec<Fit> = Vec::new();
+    let mut fit = match start.filter(|f| !f.parts.is_empty()) {
+        Some(start) => {
+            let again = ctx.fit_from(start.parts.clone(), Some(start.soft), mask, 12);
+            eliminate(ctx, again, null.chi2, mask, effort)
+        }
+        None => {
+            progress("screening single effects");
+            let mut singles = extensions(ctx, &null, mask, effort, 8, &[], FREELY);
+            singles.retain(|f| worth_it(&null, f, null.chi2));
+            let mut singles = singles.into_iter();
+            let Some(best) = singles.next() else {
+                return Found {
+                    fit: null.clone(),
+                    null,
+                    steps,
+                    rivals: Vec::new(),
+                    cut_short: false,
+                };
+            };
+            beam.extend(singles.take(2));
+            best
+        }
     };
-    steps.push((ids(&best), best.chi2));
-    let mut fit = best;
+    steps.push((ids(&fit), fit.chi2));
     // What a simple form leaves over must not be given a name of its own before the richer form was tried.
     let reparametrised = reparametrise(ctx, fit.clone(), mask, effort, much_left(&fit));
     if reparametrised.parts != fit.parts {
@@ -366,7 +378,6 @@ pub(crate) fn search(
     }
     // The last set whose effects were weighed against their rivals.
     let mut weighed: Option<(Fit, Vec<Vec<Rival>>)> = None;
-    let mut beam: Vec<Fit> = singles.into_iter().skip(1).take(2).collect();
     let mut cut_short = false;
     while fit.parts.len() < effort.max_effects {
         if effort.is_spent(ctx) {

@@ -148,13 +148,14 @@ fn within(
     let mut noise = noise;
     let mut problem = problem;
     let mut found;
+    let mut start: Option<Fit> = None;
     let mut round = 0;
     loop {
         let ctx = Context {
             white: evidence(model, &noise, trusted, &problem),
             ..context(&problem, scope, &fixed, options, scales)
         };
-        found = search(&ctx, &problem.all(), effort, &mut *progress);
+        found = search(&ctx, &problem.all(), effort, start.as_ref(), &mut *progress);
         // What the final residual shows is at least as good an estimate of the noise, if the fit is good.
         let (residual, _) = ctx.residual(&found.fit);
         let refined = floor::from_residuals(&present, &residual);
@@ -172,6 +173,7 @@ fn within(
         }
         noise = refined;
         problem = problem.with_noise(noise);
+        start = Some(found.fit);
     }
     let ctx = Context {
         white: evidence(model, &noise, trusted, &problem),
