@@ -110,6 +110,8 @@ pub struct Thresholds {
     pub term_share: f64,
     /// With a remainder a set must close so much at least for its names to stand.
     pub remainder_closed: f64,
+    /// Most by which the scatter of a number between the records widens its interval: a single record may end in another valley.
+    pub birge_most: f64,
     /// And, with [`Self::split_share`], by more than so many standard deviations. Pinned with it.
     pub split_sd: f64,
     /// Shortest total length of records with a changing command, of a rig whose noise is a walk \[s\].
@@ -181,6 +183,7 @@ pub const THRESHOLDS: Thresholds = Thresholds {
     term_least: 80.0,
     term_share: 0.01,
     remainder_closed: 0.9,
+    birge_most: 5.0,
     split_sd: 4.0,
     needed_s: 5.0,
     needed_rows: 400,

@@ -335,6 +335,15 @@ fn is_hopeless(fit: &Fit, null: &Fit) -> bool {
     left_over(fit) > most * left_over(null)
 }
 
+/// The best single effect and its two rivals; `None` where nothing is worth a name.
+fn first(ctx: &Context<'_>, null: &Fit, mask: &Mask, effort: Effort) -> Option<(Fit, Vec<Fit>)> {
+    let mut singles = extensions(ctx, null, mask, effort, 8, &[], FREELY);
+    singles.retain(|f| worth_it(null, f, null.chi2));
+    let mut singles = singles.into_iter();
+    let best = singles.next()?;
+    Some((best, singles.take(2).collect()))
+}
+
 /// The whole search on the rows of a mask; with `start`, on from a set that was found under another noise.
 pub(crate) fn search(
     ctx: &Context<'_>,
@@ -345,29 +354,24 @@ pub(crate) fn search(
 ) -> Found {
     let null = ctx.fit(Vec::new(), mask, 6);
     let mut steps = vec![(Vec::new(), null.chi2)];
-    let mut beam: Vec<Fit> = Vec::new();
-    let mut fit = match start.filter(|f| !f.parts.is_empty()) {
+    let begun = match start.filter(|f| !f.parts.is_empty()) {
         Some(start) => {
             let again = ctx.fit_from(start.parts.clone(), Some(start.soft), mask, 12);
-            eliminate(ctx, again, null.chi2, mask, effort)
+            Some((eliminate(ctx, again, null.chi2, mask, effort), Vec::new()))
         }
         None => {
             progress("screening single effects");
-            let mut singles = extensions(ctx, &null, mask, effort, 8, &[], FREELY);
-            singles.retain(|f| worth_it(&null, f, null.chi2));
-            let mut singles = singles.into_iter();
-            let Some(best) = singles.next() else {
-                return Found {
-                    fit: null.clone(),
-                    null,
-                    steps,
-                    rivals: Vec::new(),
-                    cut_short: false,
-                };
-            };
-            beam.extend(singles.take(2));
-            best
+            first(ctx, &null, mask, effort)
         }
+    };
+    let Some((mut fit, mut beam)) = begun else {
+        return Found {
+            fit: null.clone(),
+            null,
+            steps,
+            rivals: Vec::new(),
+            cut_short: false,
+        };
     };
     steps.push((ids(&fit), fit.chi2));
     // What a simple form leaves over must not be given a name of its own before the richer form was tried.

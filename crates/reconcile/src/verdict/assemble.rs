@@ -58,7 +58,7 @@ pub(crate) fn assemble(
     let after_map = map::map(ctx, &fit);
     let mut places: Vec<String> = unlike.map(str::to_owned).into_iter().collect();
     places.extend(sentences(ctx, &null, &null_map, floor.source.is_known()));
-    let names = names(ctx, &null, &fit, &rivals);
+    let names = names(ctx, &null, &fit, &rivals, threads);
     let (counted, counted_places) = of_frames(frames);
     let gap = gap(ctx, &held, [&null, &fit], &steps, [&null_map, &after_map]);
     let judgement = judge(

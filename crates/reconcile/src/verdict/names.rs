@@ -10,6 +10,7 @@ use crate::verdict::form;
 use crate::verdict::parameters::{parameters, told};
 use crate::verdict::result::{Effect as NamedEffect, Interval};
 use crate::verdict::significance;
+use crate::verdict::split;
 use cellpos_plant::effects;
 use std::collections::BTreeMap;
 
@@ -84,7 +85,13 @@ fn alternatives(
 }
 
 /// The effects of a fit, with the rivals of each.
-pub(crate) fn names(ctx: &Context<'_>, null: &Fit, fit: &Fit, rivals: &[Vec<Rival>]) -> Names {
+pub(crate) fn names(
+    ctx: &Context<'_>,
+    null: &Fit,
+    fit: &Fit,
+    rivals: &[Vec<Rival>],
+    threads: usize,
+) -> Names {
     let all = ctx.problem.all();
     let n = null.count as f64;
     let excess = null.chi2 - n;
@@ -93,6 +100,7 @@ pub(crate) fn names(ctx: &Context<'_>, null: &Fit, fit: &Fit, rivals: &[Vec<Riva
         ambiguous: false,
         curvature: false,
     };
+    let birge = split::birge(ctx, fit, threads);
     for (i, part) in fit.parts.iter().enumerate() {
         let id = part.id();
         let mut parts = fit.parts.clone();
@@ -104,7 +112,7 @@ pub(crate) fn names(ctx: &Context<'_>, null: &Fit, fit: &Fit, rivals: &[Vec<Riva
         let rivals = rivals.get(i).map_or(&[][..], Vec::as_slice);
         let (alternatives, open) = alternatives(ctx, fit, i, rivals);
         out.ambiguous |= open;
-        let mut parameters = parameters(ctx, fit, i, (fit.chi2 - n) / n);
+        let mut parameters = parameters(ctx, fit, i, (fit.chi2 - n) / n, &birge);
         // Other valleys of the same equation that fit as well.
         for r in rivals {
             if r.part.variant == part.variant && r.chi2 - fit.chi2 < THRESHOLDS.valley {

@@ -3,19 +3,26 @@
 use crate::fit::catalogue::Part;
 use crate::fit::context::{Context, Fit};
 use crate::verdict::result::Interval;
-use cellpos_plant::effects::{self, Role};
+use cellpos_plant::effects::{self, FitParameter, Role};
 use std::collections::BTreeMap;
 
 /// Relative error of a parameter that no length of record takes away: two integrators of the same equations, a commanded edge
 /// in one and in the other, agree to about a thousandth (two of these).
 const NUMERIC: f64 = 5e-4;
 
-/// Parameters of part `index` with 95 % intervals in their units.
+/// That error in the fit's coordinates.
+pub(crate) fn numeric_error(p: &FitParameter, x: f64) -> f64 {
+    NUMERIC * if p.log { 1.0 } else { x.abs() }
+}
+
+/// Parameters of part `index` with 95 % intervals in their units; `birge` is by how much each number of the set scatters between the
+/// records beyond its uncertainty.
 pub(crate) fn parameters(
     ctx: &Context<'_>,
     fit: &Fit,
     index: usize,
     left_per_row: f64,
+    birge: &[f64],
 ) -> BTreeMap<String, Interval> {
     let offset: usize = fit.parts[..index]
         .iter()
@@ -28,7 +35,7 @@ pub(crate) fn parameters(
     for (j, p) in part.variant().params.iter().enumerate() {
         let x = part.theta[j];
         let scatter = fit.covariance[(offset + j, offset + j)].max(0.0).sqrt() * wide;
-        let sd = scatter.hypot(NUMERIC * if p.log { 1.0 } else { x.abs() });
+        let sd = birge[offset + j] * scatter.hypot(numeric_error(p, x));
         let (low, high) = (p.natural(x - 1.96 * sd), p.natural(x + 1.96 * sd));
         let name = if p.name == "weights" {
             format!("weights[{j}]")

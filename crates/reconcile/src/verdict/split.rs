@@ -5,16 +5,15 @@ use crate::problem::Mask;
 use crate::search::cost::threshold;
 use crate::thresholds::THRESHOLDS;
 use crate::units::figure;
-use crate::verdict::parameters::told;
+use crate::verdict::parameters::{numeric_error, told};
 use cellpos_plant::effects::Role;
 
 /// A set of rows, with its name for messages.
 type Group = (String, Mask);
 
-/// Records one by one, and halves of the time.
+/// Halves of the time, and records one by one.
 fn groupings(ctx: &Context<'_>) -> Vec<Vec<Group>> {
     let records = &ctx.problem.records;
-    let none = || vec![Vec::new(); records.len()];
     let halves: Vec<Group> = [
         ("the first half of the time", 0),
         ("the second half of the time", 1),
@@ -31,21 +30,58 @@ fn groupings(ctx: &Context<'_>) -> Vec<Vec<Group>> {
         ((*name).to_owned(), mask)
     })
     .collect();
-    let moving: Vec<usize> = (0..records.len()).filter(|&i| !records[i].rest).collect();
+    let moving = moving(ctx);
     let mut all = vec![halves];
     if moving.len() > 1 {
-        all.push(
-            moving
-                .iter()
-                .map(|&i| {
-                    let mut mask = none();
-                    mask[i] = std::iter::once(0..records[i].u.len()).collect();
-                    (records[i].name.clone(), mask)
-                })
-                .collect(),
-        );
+        all.push(moving);
     }
     all
+}
+
+/// Records whose command moves, one by one.
+fn moving(ctx: &Context<'_>) -> Vec<Group> {
+    let records = &ctx.problem.records;
+    (0..records.len())
+        .filter(|&i| !records[i].rest)
+        .map(|i| {
+            let mut mask = vec![Vec::new(); records.len()];
+            mask[i] = std::iter::once(0..records[i].u.len()).collect();
+            (records[i].name.clone(), mask)
+        })
+        .collect()
+}
+
+/// By how much the numbers of a set scatter between the records, in parts of what their uncertainties make of it, at least 1: the
+/// Birge ratio (Birge 1932, Phys. Rev. 40:207) of each number of each part. An equation that is not quite the rig's fits each
+/// excitation with another number, and is less sure than the curvature of the joint fit says.
+pub(crate) fn birge(ctx: &Context<'_>, fit: &Fit, threads: usize) -> Vec<f64> {
+    let numbers: usize = fit.parts.iter().map(|p| p.theta.len()).sum();
+    let groups = moving(ctx);
+    if groups.len() < 2 {
+        return vec![1.0; numbers];
+    }
+    let fits = cellpos_parallel::map(&groups, threads, |(_, mask)| ctx.refit(fit, mask, 6));
+    let mut ratios = Vec::with_capacity(numbers);
+    let mut at = 0;
+    for (i, part) in fit.parts.iter().enumerate() {
+        for (j, p) in part.variant().params.iter().enumerate() {
+            let numeric = numeric_error(p, part.theta[j]);
+            let (mut weights, mut sum, mut squares) = (0.0, 0.0, 0.0);
+            for own in &fits {
+                let moved = own.parts[i].theta[j] - part.theta[j];
+                let weight = 1.0
+                    / (own.covariance[(at + j, at + j)].max(0.0) + numeric * numeric).max(1e-24);
+                weights += weight;
+                sum += weight * moved;
+                squares += weight * moved * moved;
+            }
+            let spread = squares - sum * sum / weights;
+            let ratio = (spread / (groups.len() - 1) as f64).max(1.0).sqrt();
+            ratios.push(ratio.min(THRESHOLDS.birge_most));
+        }
+        at += part.theta.len();
+    }
+    ratios
 }
 
 /// A number that is not the same in all parts of the records.

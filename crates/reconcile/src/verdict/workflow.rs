@@ -17,7 +17,7 @@ use crate::thresholds::THRESHOLDS;
 use crate::units::{Scales, Units};
 use crate::verdict::assemble;
 use crate::verdict::augment::COLOURED;
-use crate::verdict::form;
+use crate::verdict::form::{self, Aside};
 use crate::verdict::guard;
 use crate::verdict::held_out::{self, HeldOut};
 use crate::verdict::judge;
@@ -184,17 +184,9 @@ fn within(
         problem.spent() as f64 / (options.work.max(1e-9) * WORK)
     ));
     take_back(&ctx, &mut found, effort);
-    let mut held = confirmed(&ctx, &mut found, options.threads, progress);
-    let aside = form::set_aside(&ctx, &mut found, options.threads);
-    let large = found.fit.parts.len();
-    if !aside.companions.is_empty() {
-        held = confirmed(&ctx, &mut found, options.threads, progress);
-    } else if floor.source.is_known() && !found.cut_short && unlike.is_none() {
-        small::add(&ctx, &mut found, effort, progress);
-        if found.fit.parts.len() > large {
-            held = confirmed(&ctx, &mut found, options.threads, progress);
-        }
-    }
+    // Without a floor, and beside a model of another rig, nothing small is a name.
+    let small = floor.source.is_known() && unlike.is_none();
+    let (held, aside) = companions(&ctx, &mut found, effort, small, progress);
     found.fit.locking = (0..found.fit.parts.len())
         .map(|i| locking::refine(&ctx, &found.fit, i, options.threads))
         .collect();
@@ -209,6 +201,27 @@ fn within(
         aside: &aside,
     };
     Ok(assemble::assemble(&given, &ctx, found, held))
+}
+
+/// Takes out companions that stand for the form of the others and, where none does, adds (`small`) what is little beside them; with the
+/// held-out check of what stands in the end.
+fn companions(
+    ctx: &Context<'_>,
+    found: &mut Found,
+    effort: Effort,
+    small: bool,
+    progress: &mut dyn FnMut(&str),
+) -> (HeldOut, Aside) {
+    let held = confirmed(ctx, found, effort.threads, progress);
+    let count = found.fit.parts.len();
+    let aside = form::set_aside(ctx, found, effort.threads);
+    if small && aside.companions.is_empty() && !found.cut_short {
+        small::add(ctx, found, effort, progress);
+    }
+    if found.fit.parts.len() == count {
+        return (held, aside);
+    }
+    (confirmed(ctx, found, effort.threads, progress), aside)
 }
 
 /// Takes back what does not help where it was not fitted: it is not named.
