@@ -51,6 +51,9 @@ pub struct Thresholds {
     /// Beside a companion that is real, freer forms of the large ones gain less than this part of what it gains: in the tests' simulator
     /// 0.05 at most where it was hidden, 0.16 at least where it was not. Pinned with it.
     pub companion_rest: f64,
+    /// Of a companion whose main number lies outside the range that rigs show, freer forms need gain this part only: a creep by a power
+    /// law leaves what looks like a relaxation of a millisecond.
+    pub companion_untypical: f64,
     /// What is smaller beside the others than [`Self::addition_share`] must gain so many times what any addition must.
     /// Pinned by `a_small_effect_of_its_own_is_named_beside_a_large_one`.
     pub small_gain: f64,
@@ -160,6 +163,7 @@ pub const THRESHOLDS: Thresholds = Thresholds {
     companion_share: 0.1,
     companion_times: 3.0,
     companion_rest: 0.1,
+    companion_untypical: 0.5,
     small_gain: 4.0,
     curve_share: 0.95,
     floor_rows: 400,

@@ -87,6 +87,11 @@ impl EffectKind for Bubble {
         values.first().copied()
     }
 
+    fn from_lag(&self, index: usize, lag_s: f64) -> Option<Vec<f64>> {
+        // Where nothing dissolves the two forms are one.
+        (index == 1).then(|| vec![lag_s, 0.0])
+    }
+
     fn of_lag(&self, lag_s: f64, _: &Scope) -> Vec<(usize, Vec<f64>)> {
         vec![(0, vec![lag_s])]
     }

@@ -197,6 +197,12 @@ pub trait EffectKind: fmt::Debug + Send + Sync {
         None
     }
 
+    /// A start of one of its candidates in the stead of what delays a slow motion by `lag_s`, where that is all that can be said of it.
+    fn from_lag(&self, index: usize, lag_s: f64) -> Option<Vec<f64>> {
+        let _ = (index, lag_s);
+        None
+    }
+
     /// Candidates (index and values) that delay a slow motion by `lag_s`.
     fn of_lag(&self, lag_s: f64, scope: &Scope) -> Vec<(usize, Vec<f64>)> {
         let _ = (lag_s, scope);

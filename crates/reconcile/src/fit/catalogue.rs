@@ -48,6 +48,17 @@ impl Variant {
             .collect()
     }
 
+    /// The same for a form in the stead of another: where the kind knows what the other comes to, from there.
+    pub fn starts_from(self, part: &Part, scope: &Scope) -> Vec<Part> {
+        match part
+            .lag_s()
+            .and_then(|lag_s| self.kind.from_lag(self.form, lag_s))
+        {
+            Some(start) => vec![Part::new(self, &start)],
+            None => self.starts(scope),
+        }
+    }
+
     /// The form of an effect by its name among the forms.
     pub fn named(id: &str, form: &str) -> Option<Self> {
         let kind = effects::find(id)?;

@@ -1,6 +1,7 @@
 //! Which candidates to fit: screening, additions one after another, replacements.
 
 pub(crate) mod cost;
+pub(crate) mod effort;
 pub(crate) mod lines;
 mod pixel;
 mod screen;

@@ -5,24 +5,9 @@ use crate::fit::context::{Context, Fit};
 use crate::fit::descent::Until;
 use crate::problem::Mask;
 use crate::search::cost::{leaves_much, left_over, penalised_cost, threshold, threshold_of};
+use crate::search::effort::Effort;
 use crate::search::screen::screen;
 use crate::thresholds::THRESHOLDS;
-
-/// How hard to search.
-#[derive(Debug, Clone, Copy)]
-pub(crate) struct Effort {
-    pub threads: usize,
-    pub max_effects: usize,
-    /// Work of simulations after which no further effect is looked for.
-    pub work: u64,
-}
-
-impl Effort {
-    /// Whether the work is done up.
-    fn is_spent(&self, ctx: &Context<'_>) -> bool {
-        ctx.problem.spent() > self.work
-    }
-}
 
 /// A set with the rivals met on the way.
 #[derive(Debug, Clone)]
@@ -31,7 +16,8 @@ pub(crate) struct Found {
     pub null: Fit,
     /// Sum of squares after each step, with the set of that step.
     pub steps: Vec<(Vec<&'static str>, f64)>,
-    /// For each effect of the set: rivals in its stead, id and sum of squares of the joint refit.
+    /// For each effect of the set: rivals in its stead, id and sum of squares of the joint refit. Shorter than the set: they were not
+    /// weighed.
     pub rivals: Vec<Vec<Rival>>,
     /// The search ended because its work was done up, not because nothing more was to be found.
     pub cut_short: bool,
@@ -192,7 +178,7 @@ fn eliminate(ctx: &Context<'_>, mut fit: Fit, null: f64, mask: &Mask, effort: Ef
     fit
 }
 
-/// Replaces single effects by others while that helps; also gathers the rivals of each effect.
+/// Replaces single effects by others while that helps; also gathers the rivals of each effect: of none where there is no work left.
 fn replace(ctx: &Context<'_>, mut fit: Fit, mask: &Mask, effort: Effort) -> (Fit, Vec<Vec<Rival>>) {
     for round in 0..3 {
         let mut rivals: Vec<Vec<Rival>> = Vec::new();
@@ -213,6 +199,9 @@ fn replace(ctx: &Context<'_>, mut fit: Fit, mask: &Mask, effort: Effort) -> (Fit
             }
         };
         for i in 0..fit.parts.len() {
+            if effort.is_over(ctx) {
+                return (fit, Vec::new());
+            }
             let mut parts = fit.parts.clone();
             let id = parts.remove(i).id();
             let without = ctx.fit_from(parts, Some(fit.soft), mask, 10);
@@ -284,6 +273,9 @@ fn replace(ctx: &Context<'_>, mut fit: Fit, mask: &Mask, effort: Effort) -> (Fit
 /// Tries the other forms of the same effects (play operators for Bouc-Wen, a dissolving bubble, two-sided clipping).
 fn reparametrise(ctx: &Context<'_>, mut fit: Fit, mask: &Mask, effort: Effort, rich: bool) -> Fit {
     for i in 0..fit.parts.len() {
+        if effort.is_over(ctx) {
+            return fit;
+        }
         let id = fit.parts[i].id();
         let others: Vec<Part> = ctx
             .variants
@@ -298,7 +290,7 @@ fn reparametrise(ctx: &Context<'_>, mut fit: Fit, mask: &Mask, effort: Effort, r
                 let dissolving = id == "driver-lag" && v.id() == "bubble" && late;
                 (form || dissolving) && (rich || !late)
             })
-            .flat_map(|v| v.starts(&ctx.scope))
+            .flat_map(|v| v.starts_from(&fit.parts[i], &ctx.scope))
             .collect();
         let fits = cellpos_parallel::map(&others, effort.threads, |part| {
             let mut parts = fit.parts.clone();
@@ -472,12 +464,12 @@ pub(crate) fn settle(
         fit = refined;
     }
     match weighed {
-        // The very same, up to the last digits of the fit.
+        // The very same, up to what decides nothing.
         Some((before, rivals))
             if rivals.len() == fit.parts.len()
                 && rivals.iter().any(|r| !r.is_empty())
                 && alike(&before.parts, &fit.parts)
-                && (before.chi2 - fit.chi2).abs() < 0.1 =>
+                && (before.chi2 - fit.chi2).abs() < 0.1 * THRESHOLDS.tie =>
         {
             (fit, rivals)
         }

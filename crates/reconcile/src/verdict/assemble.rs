@@ -74,6 +74,7 @@ pub(crate) fn assemble(
             after: &after_map,
             counted: !counted.is_empty(),
             cut_short,
+            unweighed: rivals.len() < fit.parts.len(),
             unlike,
             aside,
         },

@@ -10,7 +10,7 @@ use crate::dot::dot;
 use crate::fit::catalogue::Part;
 use crate::fit::context::{Context, Fit};
 use crate::fit::linear::Columns;
-use crate::search::cost::left_over;
+use crate::search::cost::{left_over, prior_penalty};
 use crate::search::sequential::Found;
 use crate::simulate::simulate;
 use crate::thresholds::THRESHOLDS;
@@ -125,8 +125,12 @@ fn is_form(ctx: &Context<'_>, fit: &Fit, i: usize, without: &Fit, worth: &[f64])
         .collect();
     // In the set without it, parts behind it have moved up.
     let moved: Vec<usize> = larger.iter().map(|&k| k - usize::from(k > i)).collect();
-    gain_of_freer(ctx, without, &moved) > gained
-        && gain_of_freer(ctx, fit, &larger) > THRESHOLDS.companion_rest * gained
+    let first = gain_of_freer(ctx, without, &moved);
+    // A number that no rig shows asks for less.
+    if prior_penalty(&fit.parts[i], 0.0) > 0.0 && first > THRESHOLDS.companion_untypical * gained {
+        return true;
+    }
+    first > gained && gain_of_freer(ctx, fit, &larger) > THRESHOLDS.companion_rest * gained
 }
 
 /// What twice the log-likelihood gains by freer forms of some parts of a fit, beyond what chance gives; nothing where they have none.

@@ -32,6 +32,8 @@ pub(crate) struct Evidence<'a> {
     pub counted: bool,
     /// The search ended with its budget.
     pub cut_short: bool,
+    /// And before other effects were tried in the stead of those that it found.
+    pub unweighed: bool,
     /// What is said where the records hardly go with the model.
     pub unlike: Option<&'a str>,
     /// What was taken out of the names as another form of the others.
@@ -112,8 +114,13 @@ pub(crate) fn judge(ctx: &Context<'_>, e: &Evidence<'_>, threads: usize) -> Judg
         return out;
     }
     let remains = remains || moved.is_some();
-    // Names of a search that did not come to its end may be a compromise between others.
-    let unsure = e.names.ambiguous || e.cut_short || closed < THRESHOLDS.remainder_closed;
+    // Names of a search that did not come to its end may be a compromise between others, unless they close all but the remainder.
+    let least = if e.cut_short {
+        THRESHOLDS.closed_whole
+    } else {
+        THRESHOLDS.remainder_closed
+    };
+    let unsure = e.names.ambiguous || closed < least;
     if remains && unsure {
         out.verdict = Verdict::Unknown;
         out.reasons.push(format!(
@@ -157,6 +164,11 @@ fn refusal(ctx: &Context<'_>, e: &Evidence<'_>, closed: f64, open: bool) -> Opti
             ctx,
             e,
             &format!("the best of the catalogue is {best}"),
+        ));
+    }
+    if e.unweighed {
+        return Some(format!(
+            "the best of the catalogue is {best}, but the search ended with its budget before others were tried in its stead: no name"
         ));
     }
     // Beside a model that is none of these records nothing of the catalogue is missing; equations of the user's own may stand for it.

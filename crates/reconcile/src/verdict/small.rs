@@ -7,8 +7,9 @@
 //! another, since something was set aside, nothing small is looked for.
 
 use crate::fit::context::{Context, Fit};
-use crate::search::cost::{penalised_cost, threshold};
-use crate::search::sequential::{Effort, FREELY, Found, extensions, ids, settle};
+use crate::search::cost::{penalised_cost, prior_penalty, threshold};
+use crate::search::effort::Effort;
+use crate::search::sequential::{FREELY, Found, extensions, ids, settle};
 use crate::thresholds::THRESHOLDS;
 use crate::verdict::{form, held_out, judge, split};
 
@@ -64,6 +65,7 @@ fn stands(ctx: &Context<'_>, found: &Found, top: &Fit, others: &[Fit], threads: 
     gained < most
         && gained > THRESHOLDS.small_gain * threshold(added)
         && part.matters()
+        && prior_penalty(part, 0.0) == 0.0
         && !rivalled
         && !another_anchoring
         && judge::first_at_bound(ctx, top).is_none()

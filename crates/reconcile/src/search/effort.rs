@@ -1,0 +1,27 @@
+//! How hard to search.
+
+use crate::fit::context::Context;
+
+/// By how much a search may go beyond its work to weigh the rivals of what it has found.
+const BEYOND: f64 = 2.0;
+
+/// How hard to search.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Effort {
+    pub threads: usize,
+    pub max_effects: usize,
+    /// Work of simulations after which no further effect is looked for.
+    pub work: u64,
+}
+
+impl Effort {
+    /// Whether the work is done up: nothing more is looked for.
+    pub fn is_spent(&self, ctx: &Context<'_>) -> bool {
+        ctx.problem.spent() > self.work
+    }
+
+    /// Whether it is so far beyond that not even the rivals of a set are weighed any more, which is then no name.
+    pub fn is_over(&self, ctx: &Context<'_>) -> bool {
+        ctx.problem.spent() as f64 > BEYOND * self.work as f64
+    }
+}
