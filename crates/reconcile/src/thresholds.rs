@@ -111,6 +111,8 @@ pub struct Thresholds {
     pub term_least: f64,
     /// And in parts of what the set gains.
     pub term_share: f64,
+    /// With a remainder a set of a search that ended with its budget must close so much: else it may be a compromise between others.
+    pub cut_closed: f64,
     /// With a remainder a set must close so much at least for its names to stand.
     pub remainder_closed: f64,
     /// Most by which the scatter of a number between the records widens its interval: a single record may end in another valley.
@@ -186,6 +188,7 @@ pub const THRESHOLDS: Thresholds = Thresholds {
     term_worth: 40.0,
     term_least: 80.0,
     term_share: 0.01,
+    cut_closed: 0.999,
     remainder_closed: 0.9,
     birge_most: 5.0,
     split_sd: 4.0,

@@ -114,9 +114,8 @@ pub(crate) fn judge(ctx: &Context<'_>, e: &Evidence<'_>, threads: usize) -> Judg
         return out;
     }
     let remains = remains || moved.is_some();
-    // Names of a search that did not come to its end may be a compromise between others, unless they close all but the remainder.
     let least = if e.cut_short {
-        THRESHOLDS.closed_whole
+        THRESHOLDS.cut_closed
     } else {
         THRESHOLDS.remainder_closed
     };
