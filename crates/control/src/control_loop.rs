@@ -89,10 +89,10 @@ impl<L: ControlLaw> ControlLoop<L> {
         &self.estimator
     }
 
-    /// A state at rest at a command, with a first belief of neutral (both um).
+    /// A state at rest at a command, with a first belief of neutral (both um); one that no actuator reaches is none, and the command's.
     pub fn start(&self, command_um: f64, neutral_um: f64) -> LoopState<L::State> {
         let command = self.parts.limits.nearest(command_um);
-        let neutral = if neutral_um.is_finite() {
+        let neutral = if neutral_um.abs() <= FAR_UM {
             neutral_um
         } else {
             command

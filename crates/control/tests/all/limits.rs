@@ -103,6 +103,23 @@ prop_compose! {
     }
 }
 
+#[test]
+fn a_first_belief_of_neutral_that_no_actuator_reaches_is_none() {
+    let config = LoopConfig {
+        model: LoopModel::eq6(0.0),
+        estimator: EstimatorConfig::default(),
+        controller: ControllerConfig::Pi(Pi::new(0.46, 19.5)),
+        limits: Limits::default(),
+    };
+    for neutral_um in [1.7e308, -1.7e308, f64::INFINITY, f64::NAN] {
+        let mut controller = Controller::new(config).unwrap();
+        controller.start(20.0, neutral_um);
+        let out = controller.step(&LoopInput::default());
+        assert!(out.estimate_um.is_finite(), "{neutral_um}: {out:?}");
+        assert!((out.neutral_um - 20.0).abs() < 1.0, "{neutral_um}: {out:?}");
+    }
+}
+
 proptest! {
     #![proptest_config(ProptestConfig { cases: 400, failure_persistence: None, ..ProptestConfig::default() })]
 

@@ -87,7 +87,7 @@ impl EffectKind for Bubble {
         values.first().copied()
     }
 
-    fn from_lag(&self, index: usize, lag_s: f64) -> Option<Vec<f64>> {
+    fn start_of_lag(&self, index: usize, lag_s: f64) -> Option<Vec<f64>> {
         // Where nothing dissolves the two forms are one.
         (index == 1).then(|| vec![lag_s, 0.0])
     }

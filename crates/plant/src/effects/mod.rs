@@ -198,7 +198,7 @@ pub trait EffectKind: fmt::Debug + Send + Sync {
     }
 
     /// A start of one of its candidates in the stead of what delays a slow motion by `lag_s`, where that is all that can be said of it.
-    fn from_lag(&self, index: usize, lag_s: f64) -> Option<Vec<f64>> {
+    fn start_of_lag(&self, index: usize, lag_s: f64) -> Option<Vec<f64>> {
         let _ = (index, lag_s);
         None
     }

@@ -52,7 +52,7 @@ impl Variant {
     pub fn starts_from(self, part: &Part, scope: &Scope) -> Vec<Part> {
         match part
             .lag_s()
-            .and_then(|lag_s| self.kind.from_lag(self.form, lag_s))
+            .and_then(|lag_s| self.kind.start_of_lag(self.form, lag_s))
         {
             Some(start) => vec![Part::new(self, &start)],
             None => self.starts(scope),
