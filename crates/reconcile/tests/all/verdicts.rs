@@ -157,6 +157,25 @@ fn a_small_effect_of_its_own_is_named_beside_a_large_one() {
 }
 
 #[test]
+fn what_a_search_had_no_time_to_weigh_is_no_name() {
+    let hidden = Model::eq6().with_effect(effects::time_delay(0.0039));
+    let options = Options {
+        work: 1e-4,
+        ..Options::default()
+    };
+    let records = on_this_rig(&hidden, 6000);
+    let r = reconcile(&Model::eq6(), &records, &options, &mut |_| {}).unwrap();
+    assert_eq!(r.verdict, Verdict::Unknown);
+    assert!(
+        r.places
+            .iter()
+            .any(|p| p.contains("before others were tried")),
+        "{:?}",
+        r.places
+    );
+}
+
+#[test]
 fn pixels_see_what_a_hum_shakes() {
     // The hum moves the image by more than a pixel: the error within a pixel turns with it.
     let model = Model::eq6();
