@@ -37,8 +37,8 @@ pub(crate) fn add(
             return;
         }
         let (fit, rivals) = settle(ctx, top.clone(), None, &all, effort);
-        // What was named before stands.
-        if !top.parts.iter().all(|p| fit.has(p.id())) {
+        // What was named before stands, and there was work left to weigh it all.
+        if rivals.len() < fit.parts.len() || !top.parts.iter().all(|p| fit.has(p.id())) {
             return;
         }
         found.steps.push((ids(&fit), fit.chi2));
