@@ -77,6 +77,8 @@ pub(crate) struct Sample {
 pub(crate) struct Exposure {
     pub id: u64,
     pub mid_ns: i64,
+    /// The frame grabber hangs: the picture is the one before, to the bit.
+    pub frozen: bool,
     pub samples: [Sample; EXPOSURE_STEPS + 1],
 }
 
@@ -174,6 +176,10 @@ impl Camera {
         let now = Exposure {
             id: self.next_id,
             mid_ns: self.mid_ns(self.next_id),
+            frozen: self.faults.active(
+                FaultKind::FrozenPicture,
+                self.mid_ns(self.next_id) - self.start_ns,
+            ),
             samples: self.samples,
         };
         // All four are drawn for every frame, so that one rate does not shift the others' luck.

@@ -19,6 +19,12 @@ pub struct WorldConfig {
     pub diffusion_um2_per_s: f64,
     /// Flow that passes whatever the PZT does, um/s; added to a flow-drift of the model.
     pub drift_um_per_s: f64,
+    /// How far the zero flow wanders about `neutral_um` (Ornstein-Uhlenbeck), um RMS.
+    pub zero_flow_wander_um: f64,
+    /// Correlation time of the wandering, s.
+    pub zero_flow_wander_time_s: f64,
+    /// How fast the zero flow drifts, um of PZT displacement per second.
+    pub zero_flow_drift_um_per_s: f64,
     /// Bead position at the start, um from the middle of the frame.
     pub start_um: f64,
     /// The frame follows the bead across the channel to within this distance of its middle line, um.
@@ -64,6 +70,9 @@ impl Default for WorldConfig {
             neutral_um: 20.0,
             diffusion_um2_per_s: 0.33,
             drift_um_per_s: 3.0,
+            zero_flow_wander_um: 0.0,
+            zero_flow_wander_time_s: 20.0,
+            zero_flow_drift_um_per_s: 0.0,
             start_um: 0.0,
             lateral_um: 0.25,
             width_px: 256,
@@ -151,6 +160,27 @@ impl WorldConfig {
             -1e4,
             1e4,
             "-10000..10000 um/s",
+        )?;
+        within(
+            "zero_flow_wander_um",
+            self.zero_flow_wander_um,
+            0.0,
+            100.0,
+            "0..100 um",
+        )?;
+        within(
+            "zero_flow_wander_time_s",
+            self.zero_flow_wander_time_s,
+            1e-3,
+            1e6,
+            "0.001..1000000 s",
+        )?;
+        within(
+            "zero_flow_drift_um_per_s",
+            self.zero_flow_drift_um_per_s,
+            -10.0,
+            10.0,
+            "-10..10 um/s",
         )?;
         within("start_um", self.start_um, -1e4, 1e4, "-10000..10000 um")?;
         Ok(())

@@ -24,6 +24,14 @@ pub enum FaultKind {
     DoubleFrames,
     /// Frames come in the wrong order: each even one after its successor.
     ReorderFrames,
+    /// The same picture under new ids and new time stamps: a frame grabber that hangs.
+    FrozenPicture,
+    /// The zero flow stands [`Faults::flow_step_um`] off while it lasts: a tap on the syringe.
+    FlowStep,
+    /// The PZT moves the bead the wrong way: its sign is flipped about the zero flow.
+    GainFlip,
+    /// The amplifier gives no displacement beyond [`Faults::clip_um`].
+    ClipAmplifier,
     /// Random bytes on the line to the board and from it, one burst per millisecond.
     LinkGarbage,
     /// No byte passes the line to the board or from it.
@@ -64,6 +72,10 @@ pub struct Faults {
     pub garbage_per_s: f64,
     /// Where a second bead appears, um from the first.
     pub second_bead_um: f64,
+    /// How far the zero flow steps, um.
+    pub flow_step_um: f64,
+    /// Largest displacement of an amplifier that clips, um.
+    pub clip_um: f64,
     /// Scheduled faults.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub event: Vec<FaultEvent>,
@@ -78,6 +90,8 @@ impl Default for Faults {
             reorder_rate: 0.0,
             garbage_per_s: 0.0,
             second_bead_um: 3.0,
+            flow_step_um: 0.3,
+            clip_um: 20.5,
             event: Vec::new(),
         }
     }
@@ -163,6 +177,18 @@ impl Faults {
             self.second_bead_um.abs() <= 1e4,
             "faults.second_bead_um",
             self.second_bead_um,
+            "finite, within +-10000 um",
+        )?;
+        check(
+            self.flow_step_um.abs() <= 1e3,
+            "faults.flow_step_um",
+            self.flow_step_um,
+            "finite, within +-1000 um",
+        )?;
+        check(
+            self.clip_um.abs() <= 1e4,
+            "faults.clip_um",
+            self.clip_um,
             "finite, within +-10000 um",
         )?;
         for event in &self.event {

@@ -40,6 +40,7 @@ mod render;
 mod rig_in_a_box;
 pub mod scene;
 mod world;
+mod zero_flow;
 
 pub use board_config::{BoardConfig, BoardConfigError};
 pub use camera::{FrameInfo, PositionFix};

@@ -15,7 +15,7 @@ const fn cell(plain: &'static str, with_unit: &'static str) -> Quantity {
 }
 
 /// Every length, speed, time and frequency of the tables of [`crate::BoardConfig`] and [`crate::WorldConfig`] in a rig file.
-pub const QUANTITIES: [Quantity; 33] = [
+pub const QUANTITIES: [Quantity; 38] = [
     board("low", "low_um"),
     board("high", "high_um"),
     board("slew", "slew_um_per_s"),
@@ -29,6 +29,9 @@ pub const QUANTITIES: [Quantity; 33] = [
     board("late", "late_us"),
     world("neutral", "neutral_um"),
     world("drift", "drift_um_per_s"),
+    world("zero_flow_wander", "zero_flow_wander_um"),
+    world("zero_flow_wander_time", "zero_flow_wander_time_s"),
+    world("zero_flow_drift", "zero_flow_drift_um_per_s"),
     world("start", "start_um"),
     world("lateral", "lateral_um"),
     world("pixel", "pixel_um"),
@@ -47,6 +50,8 @@ pub const QUANTITIES: [Quantity; 33] = [
     cell("focus", "focus_um"),
     cell("noise", "noise_um"),
     Quantity::new("emulator.faults", "second_bead", "second_bead_um"),
+    Quantity::new("emulator.faults", "flow_step", "flow_step_um"),
+    Quantity::new("emulator.faults", "clip", "clip_um"),
     Quantity::new("emulator.faults.event", "at", "at_s"),
     Quantity::new("emulator.faults.event", "for", "for_s"),
 ];

@@ -7,10 +7,14 @@ use crate::error::WorldError;
 use crate::faults::FaultKind;
 use crate::random::Gaussian;
 use crate::render::{Renderer, localisation_bound_um, mean_between};
+use crate::zero_flow::ZeroFlow;
 use cellpos_plant::effects::{Action, Shown};
 use cellpos_plant::{Chain, Model, Noise};
+use cellpos_units::Hertz;
 use cellpos_vision::FixQuality;
 
+/// Where the gain of a plant without a slow pair of pole and zero is read: the middle of what a loop at 1 kHz controls.
+const STEP_FREQUENCY: Hertz = Hertz(30.0);
 /// Turns a seed into that of frames of the empty channel.
 const EMPTY_SEED: u64 = 0x5eed_0f0e_3a97_7c41;
 
@@ -33,6 +37,11 @@ const EMPTY_SEED: u64 = 0x5eed_0f0e_3a97_7c41;
 pub struct World {
     config: WorldConfig,
     chain: Chain,
+    zero_flow: ZeroFlow,
+    /// Where the zero flow is now, um from the mean.
+    zero_flow_um: f64,
+    /// Speed of the bead over displacement of the PZT from the zero flow, 1/s.
+    gain_per_s: f64,
     camera: Camera,
     renderer: Renderer,
     start_ns: i64,
@@ -54,6 +63,9 @@ pub struct World {
     led: bool,
     has_events: bool,
     cell: Option<Cell>,
+    /// Picture and position that a frame grabber that hangs would give again.
+    newest_picture: Vec<u8>,
+    newest_position: Option<PositionFix>,
 }
 
 impl World {
@@ -89,7 +101,10 @@ impl World {
         Ok(Self {
             camera: Camera::new(config, model, start_ns),
             offset_um: config.start_um - chain.bead_um(),
+            gain_per_s: gain_per_s(model),
             chain,
+            zero_flow: ZeroFlow::new(config),
+            zero_flow_um: 0.0,
             renderer,
             start_ns,
             now_ns: start_ns,
@@ -115,6 +130,8 @@ impl World {
             led: false,
             has_events: !config.faults.event.is_empty(),
             cell: config.cell.map(|cell| Cell::new(cell, config.seed)),
+            newest_picture: Vec::new(),
+            newest_position: None,
             config: config.clone(),
         })
     }
@@ -148,6 +165,12 @@ impl World {
     /// True PZT displacement now, um.
     pub fn pzt_um(&self) -> f64 {
         self.chain.pzt_um()
+    }
+
+    /// True zero flow now: the displacement at which the wandering, drifting and stepping flow stands still, um. The steady flow of
+    /// [`WorldConfig::drift_um_per_s`] is not in it.
+    pub fn zero_flow_um(&self) -> f64 {
+        self.config.neutral_um + self.zero_flow_um
     }
 
     /// Standard deviation of positions delivered without pictures, um RMS.
@@ -214,12 +237,14 @@ impl World {
         let dt_s = (t_ns - self.now_ns) as f64 * 1e-9;
         let before_um = self.chain.bead_um();
         let at_um = self.bead_um();
-        self.chain.advance(applied_um, dt_s);
+        self.chain.advance(self.reached_um(applied_um), dt_s);
         if let Some(cell) = &mut self.cell {
             self.offset_um += cell.surplus_um(at_um, self.chain.bead_um() - before_um);
             cell.advance(at_um, dt_s);
         }
-        self.offset_um += self.config.drift_um_per_s * dt_s;
+        let stepped = self.active(FaultKind::FlowStep);
+        self.zero_flow_um = self.zero_flow.advance(dt_s, stepped);
+        self.offset_um += (self.config.drift_um_per_s - self.gain_per_s * self.zero_flow_um) * dt_s;
         let spread_um = (2.0 * self.config.diffusion_um2_per_s * dt_s).sqrt();
         self.lateral_um = confined(
             self.lateral_um + spread_um * self.brownian.normal(),
@@ -228,6 +253,20 @@ impl World {
         self.now_ns = t_ns;
         if self.has_events {
             self.follow_events(spread_um);
+        }
+    }
+
+    /// What the amplifier makes of the board's output, um.
+    fn reached_um(&self, applied_um: f64) -> f64 {
+        let flipped_um = if self.active(FaultKind::GainFlip) {
+            2.0 * self.config.neutral_um - applied_um
+        } else {
+            applied_um
+        };
+        if self.active(FaultKind::ClipAmplifier) {
+            flipped_um.min(self.config.faults.clip_um)
+        } else {
+            flipped_um
         }
     }
 
@@ -295,7 +334,8 @@ impl World {
         }
         let since_ns = *self.out_since_ns.get_or_insert(self.now_ns);
         // A bead that crosses the frame in less than five hundred exposures is no use to anybody.
-        let flow_um_per_s = self.chain.flow_um_per_s() + self.config.drift_um_per_s;
+        let flow_um_per_s = self.chain.flow_um_per_s() + self.config.drift_um_per_s
+            - self.gain_per_s * self.zero_flow_um;
         let field_um = f64::from(self.config.width_px) * self.config.pixel_um;
         let slow = flow_um_per_s.abs() < 0.002 * field_um * self.config.rate_hz;
         if slow && (self.now_ns - since_ns) as f64 * 1e-6 >= after_ms {
@@ -318,6 +358,10 @@ impl World {
     /// Draws the next frame that has been delivered by now into `pixels` (rows contiguous, one byte per pixel).
     pub fn take_frame(&mut self, pixels: &mut Vec<u8>) -> Option<FrameInfo> {
         let (exposure, info) = self.camera.take(self.now_ns)?;
+        if exposure.frozen && !self.newest_picture.is_empty() {
+            pixels.clone_from(&self.newest_picture);
+            return Some(info);
+        }
         let px = |um: (f64, f64)| {
             (
                 self.config.px_from_um(um.0),
@@ -343,6 +387,9 @@ impl World {
             (false, Some(second)) => self.renderer.draw(&[second], info.lit, pixels),
             (false, None) => self.renderer.draw(&[], info.lit, pixels),
         }
+        if self.has_events {
+            self.newest_picture.clone_from(pixels);
+        }
         Some(info)
     }
 
@@ -351,6 +398,11 @@ impl World {
     /// Frames and positions come from the same queue: take either the one or the other.
     pub fn take_position(&mut self) -> Option<PositionFix> {
         let (exposure, info) = self.camera.take(self.now_ns)?;
+        if exposure.frozen
+            && let Some(newest) = self.newest_position
+        {
+            return Some(PositionFix { info, ..newest });
+        }
         let path = exposure.samples.map(|s| (s.seen_um, s.lateral_um));
         let (mean_um, _) = mean_between(&path, 0.0, EXPOSURE_STEPS as f64);
         // Drawn for every frame, so that a lost bead does not shift the noise of later ones.
@@ -366,7 +418,7 @@ impl World {
             Some(cell) if length_um.is_finite() => cell.noise(length_um),
             _ => (f64::NAN, f64::NAN),
         };
-        Some(PositionFix {
+        let fix = PositionFix {
             length_um,
             area_um2,
             length_sd_um,
@@ -376,7 +428,9 @@ impl World {
             variance_um2: or_nan(self.localisation_um * self.localisation_um),
             snr: self.snr,
             verdict,
-        })
+        };
+        self.newest_position = Some(fix);
+        Some(fix)
     }
 
     fn verdict(&self, exposure: &Exposure, mean_um: f64) -> FixQuality {
@@ -404,6 +458,14 @@ impl World {
 fn mid_length_um(exposure: &Exposure) -> Option<f64> {
     let middle = exposure.samples.get(EXPOSURE_STEPS / 2)?;
     Some(middle.length_um).filter(|um| um.is_finite())
+}
+
+/// Speed of the bead over displacement, 1/s: what a step of the zero flow drives at once.
+fn gain_per_s(model: &Model) -> f64 {
+    let plant = &model.plant;
+    plant
+        .velocity_gain_above_pair()
+        .unwrap_or_else(|| plant.velocity_gain_at(STEP_FREQUENCY))
 }
 
 fn renderer(config: &WorldConfig) -> Result<Renderer, WorldError> {

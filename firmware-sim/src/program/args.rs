@@ -79,6 +79,34 @@ pub struct Args {
         allow_hyphen_values = true
     )]
     pub second_bead_offset: Option<Micrometers>,
+    /// The same picture again and again under new ids and times
+    #[arg(long, value_name = "AT[,FOR]", help_heading = "Faults")]
+    pub frozen_picture: Vec<Span>,
+    /// The zero flow steps: a tap on the syringe
+    #[arg(long, value_name = "AT[,FOR]", help_heading = "Faults")]
+    pub flow_step: Vec<Span>,
+    /// How far it steps, in displacement of the PZT [default: 0.3um]
+    #[arg(
+        long,
+        value_name = "LENGTH",
+        help_heading = "Faults",
+        allow_hyphen_values = true
+    )]
+    pub flow_step_size: Option<Micrometers>,
+    /// The PZT moves the bead the wrong way
+    #[arg(long, value_name = "AT[,FOR]", help_heading = "Faults")]
+    pub gain_flip: Vec<Span>,
+    /// The amplifier clips
+    #[arg(long, value_name = "AT[,FOR]", help_heading = "Faults")]
+    pub clip_amplifier: Vec<Span>,
+    /// Largest displacement of the amplifier that clips [default: 20.5um]
+    #[arg(
+        long,
+        value_name = "LENGTH",
+        help_heading = "Faults",
+        allow_hyphen_values = true
+    )]
+    pub clip_at: Option<Micrometers>,
     /// Bursts of random bytes on the line: how many a second (2Hz), or a time span with one each millisecond
     #[arg(long, value_name = "RATE|AT[,FOR]", help_heading = "Faults")]
     pub link_garbage: Vec<FrequencyOrSpan>,
@@ -230,6 +258,10 @@ impl Args {
             (&self.stick_bead, FaultKind::StickBead),
             (&self.second_bead, FaultKind::SecondBead),
             (&self.link_loss, FaultKind::LinkLoss),
+            (&self.frozen_picture, FaultKind::FrozenPicture),
+            (&self.flow_step, FaultKind::FlowStep),
+            (&self.gain_flip, FaultKind::GainFlip),
+            (&self.clip_amplifier, FaultKind::ClipAmplifier),
         ] {
             spans.extend(given.iter().map(|&span| (kind, span)));
         }
@@ -271,6 +303,12 @@ impl Args {
         if let Some(offset) = self.second_bead_offset {
             faults.second_bead_um = offset.value();
         }
+        if let Some(size) = self.flow_step_size {
+            faults.flow_step_um = size.value();
+        }
+        if let Some(most) = self.clip_at {
+            faults.clip_um = most.value();
+        }
         for (kind, span) in spans {
             let (at_s, for_s) = (span.at.value(), span.length.map(Seconds::value));
             faults
@@ -306,7 +344,9 @@ mod tests {
     #[test]
     fn faults_of_the_command_line_reach_the_world() {
         let line = "--drop-frames 1% --stale-frames 0.02 --double-frames 2s,10ms --lose-bead 5s,500ms \
-                    --lose-bead 9s --link-garbage 3Hz --link-loss 1.5s --second-bead-offset -2um --seed 9";
+                    --lose-bead 9s --link-garbage 3Hz --link-loss 1.5s --second-bead-offset -2um --seed 9 \
+                    --flow-step 3s,1s --flow-step-size -0.5um --gain-flip 4s --frozen-picture 7s,3s --clip-amplifier 8s \
+                    --clip-at 21um";
         let world = parse(line).unwrap().setup().unwrap().world;
         let faults = &world.faults;
         assert_eq!(world.seed, 9);
@@ -321,6 +361,16 @@ mod tests {
         assert!(!faults.active(FaultKind::LoseBead, ns(5.6)));
         assert!(faults.active(FaultKind::LoseBead, ns(1e6)));
         assert!(faults.active(FaultKind::LinkLoss, ns(1.5)));
+        assert_eq!((faults.flow_step_um, faults.clip_um), (-0.5, 21.0));
+        for (kind, at_s) in [
+            (FaultKind::FlowStep, 3.5),
+            (FaultKind::GainFlip, 4.1),
+            (FaultKind::FrozenPicture, 7.1),
+            (FaultKind::ClipAmplifier, 8.1),
+        ] {
+            assert!(faults.active(kind, ns(at_s)), "{kind:?}");
+            assert!(!faults.active(kind, ns(2.9)), "{kind:?}");
+        }
     }
 
     #[test]

@@ -167,3 +167,72 @@ fn a_bead_that_was_carried_off_is_replaced_once_the_flow_is_slow() {
     // At 51 um/s or less, dying away with the pole at 76 rad/s, and the slow pole's 3 um/s for 0.3 s.
     assert!(world.bead_um().abs() < 2.0, "{}", world.bead_um());
 }
+
+#[test]
+fn a_step_of_the_flow_carries_the_bead_at_once_and_ends() {
+    let config = WorldConfig {
+        faults: Faults {
+            flow_step_um: -0.3,
+            ..Faults::default().with(FaultKind::FlowStep, 0.1, Some(0.1))
+        },
+        ..quiet()
+    };
+    let mut world = world(&config);
+    world.advance_to(100 * MS, 20.0);
+    assert!(world.bead_um().abs() < 1e-9);
+    world.advance_to(101 * MS, 20.0);
+    assert!((world.zero_flow_um() - 19.7).abs() < 1e-12);
+    world.advance_to(200 * MS, 20.0);
+    // 379 /s of Eq. (6) above its pair, times 0.3 um, for 0.1 s.
+    assert!((world.bead_um() - 11.4).abs() < 0.2, "{}", world.bead_um());
+    let at_um = world.bead_um();
+    world.advance_to(300 * MS, 20.0);
+    assert!((world.bead_um() - at_um).abs() < 0.2);
+    assert_eq!(world.zero_flow_um(), 20.0);
+}
+
+#[test]
+fn a_gain_that_is_flipped_and_an_amplifier_that_clips_move_the_bead_otherwise() {
+    let speed = |kind, applied_um| {
+        let config = WorldConfig {
+            faults: Faults {
+                clip_um: 20.4,
+                ..Faults::default().with(kind, 0.1, None)
+            },
+            ..quiet()
+        };
+        let mut world = world(&config);
+        world.advance_to(200 * MS, 20.0);
+        let at_um = world.bead_um();
+        world.advance_to(300 * MS, applied_um);
+        (world.bead_um() - at_um) / 0.1
+    };
+    let free = speed(FaultKind::SlowSolver, 20.5);
+    assert!((speed(FaultKind::GainFlip, 20.5) / free + 1.0).abs() < 1e-6);
+    assert!((speed(FaultKind::ClipAmplifier, 20.5) / free - 0.8).abs() < 1e-6);
+    assert!((speed(FaultKind::ClipAmplifier, 20.3) / free - 0.6).abs() < 1e-6);
+}
+
+#[test]
+fn a_frozen_picture_is_the_same_to_the_bit_under_new_numbers_while_the_bead_goes_on() {
+    let config = WorldConfig {
+        drift_um_per_s: 10.0,
+        faults: Faults::default().with(FaultKind::FrozenPicture, 0.05, Some(0.05)),
+        ..WorldConfig::default()
+    };
+    let mut world = world(&config);
+    world.advance_to(130 * MS, 20.0);
+    let (mut before, mut pixels) = (Vec::new(), Vec::new());
+    let (mut equal, mut last) = (0, None);
+    while let Some(info) = world.take_frame(&mut pixels) {
+        if let Some((id, true_um)) = last {
+            assert_eq!(info.id, id + 1);
+            assert_ne!(info.true_um, true_um);
+        }
+        equal += usize::from(pixels == before);
+        assert_eq!(pixels == before, (49..99).contains(&info.id), "{}", info.id);
+        last = Some((info.id, info.true_um));
+        before.clone_from(&pixels);
+    }
+    assert_eq!(equal, 50);
+}
