@@ -128,6 +128,7 @@ pub const BOARD: Codes = &[
     (2, "running"),
     (3, "frozen"),
     (4, "safe"),
+    (5, "holding"),
 ];
 /// Faults that the board latches.
 pub const BOARD_FAULT: Codes = &[
@@ -135,6 +136,7 @@ pub const BOARD_FAULT: Codes = &[
     (1, "command-timeout"),
     (2, "freeze-timeout"),
     (3, "arm-timeout"),
+    (4, "device"),
 ];
 /// Stages of a script.
 pub const STAGE: Codes = &[

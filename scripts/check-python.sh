@@ -1,0 +1,16 @@
+#!/usr/bin/env bash
+# The Python package: installed into an environment of its own as a user would, then its tests, with the snippets of docs/python.md.
+# The program is built with the profile and into the folder that the tests of the workspace use, so that nothing is built twice.
+# Skipped with the reason where the environment cannot be made.
+set -euo pipefail
+cd "$(dirname "$0")/.."
+env=target/python
+if ! { [ -x "$env/bin/python" ] || python3 -m venv "$env"; } \
+    || ! "$env/bin/pip" install -q --disable-pip-version-check "maturin>=1.7,<2" numpy pandas matplotlib pytest mypy; then
+    echo "check-python: skipped: maturin, numpy, pandas, matplotlib, pytest and mypy cannot be installed here"
+    exit 0
+fi
+CARGO_TARGET_DIR="$PWD/target" MATURIN_PEP517_ARGS="--profile dev" PATH="$PWD/$env/bin:$PATH" \
+    "$env/bin/pip" install -q --disable-pip-version-check --no-build-isolation --no-deps --force-reinstall ./python
+cd python
+env -u CELLPOS_PROGRAM "../$env/bin/python" -m pytest -q "$@"
