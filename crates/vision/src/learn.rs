@@ -1,8 +1,9 @@
-//! The template learnt in place: the radial mean of good fixes, guarded against learning something else.
+//! The template learnt in place: the profile of good fixes, guarded against learning something else.
 
 use crate::config::Learning;
 use crate::crop::Crop;
 use crate::profile::{clamped_curvatures, spline_value};
+use crate::smooth::Rings;
 use crate::template::Template;
 
 /// Knots of the learnt profile.
@@ -11,8 +12,6 @@ const KNOTS: usize = 48;
 const REFRESH_STRIDE: u32 = 16;
 /// Share of a refresh in the profile.
 const REFRESH_SHARE: f64 = 0.25;
-/// The least good signal-to-noise ratio that is learnt from.
-const LEAST_SNR: f64 = 8.0;
 
 type Knots = [f64; KNOTS];
 
@@ -25,6 +24,8 @@ pub struct LearningReport {
     pub taken: u32,
     /// Templates refused because they differed too much.
     pub refused: u32,
+    /// Times that the profile in use predicted half of the fixes as well as one learnt from the other half: it stayed.
+    pub confirmed: u32,
 }
 
 /// Accumulates the radial profile and replaces the template.
@@ -32,8 +33,7 @@ pub struct LearningReport {
 pub(crate) struct Learner {
     settings: Learning,
     knot_px: f64,
-    weight: Knots,
-    sum: Knots,
+    rings: Box<Rings>,
     /// The profile in use and the one that refreshes may not drift away from.
     profile: Knots,
     anchor: Knots,
@@ -45,7 +45,8 @@ impl Learner {
     /// For windows of side `window_px`; `template` is the configured one.
     pub fn new(settings: Learning, window_px: usize, template: &Template) -> Self {
         // The corner of the window is the last pixel that can contribute.
-        let knot_px = (window_px as f64 / 2.0 * core::f64::consts::SQRT_2) / (KNOTS - 1) as f64;
+        let reach_px = window_px as f64 / 2.0 * core::f64::consts::SQRT_2;
+        let knot_px = reach_px / (KNOTS - 1) as f64;
         let configured = core::array::from_fn(|k| {
             let r_px = k as f64 * knot_px;
             f64::from(template.value_at_squared((r_px * r_px) as f32))
@@ -53,8 +54,7 @@ impl Learner {
         Learner {
             settings,
             knot_px,
-            weight: [0.0; KNOTS],
-            sum: [0.0; KNOTS],
+            rings: Box::new(Rings::new(reach_px)),
             profile: configured,
             anchor: configured,
             since: 0,
@@ -70,6 +70,11 @@ impl Learner {
         self.report
     }
 
+    /// Whether the first profile is still to be learnt.
+    pub fn is_first(&self) -> bool {
+        self.report.taken + self.report.confirmed == 0
+    }
+
     /// Takes in a good fix: position in frame coordinates, amplitude and background (above the crop's pedestal).
     pub fn take_in(
         &mut self,
@@ -77,39 +82,29 @@ impl Learner {
         (x_px, y_px): (f64, f64),
         amplitude: f64,
         background: f64,
-        snr: f64,
     ) -> bool {
         self.since = self.since.saturating_add(1);
-        let learnt = self.report.taken > 0;
-        if snr < LEAST_SNR
-            || (learnt
-                && (self.settings.refresh_fixes == 0 || !self.since.is_multiple_of(REFRESH_STRIDE)))
+        let learnt = !self.is_first();
+        if learnt
+            && (self.settings.refresh_fixes == 0 || !self.since.is_multiple_of(REFRESH_STRIDE))
         {
             return false;
         }
         self.report.fixes += 1;
+        self.rings.next_bead();
         let (x, y) = (
             (x_px - crop.x0 as f64) as f32,
             (y_px - crop.y0 as f64) as f32,
         );
-        let (scale, background) = (1.0 / amplitude, background);
-        let per_px = (1.0 / self.knot_px) as f32;
+        // Even noise of the pixels is noise over the amplitude here.
+        let (scale, weight) = (1.0 / amplitude, amplitude * amplitude);
         for (j, row) in crop.rows.iter().enumerate().take(crop.height) {
             let dy = j as f32 - y;
             for (i, p) in row.iter().enumerate().take(crop.width) {
                 let dx = i as f32 - x;
-                let u = (dx * dx + dy * dy).sqrt() * per_px;
-                let k = u as usize;
-                let t = f64::from(u - k as f32);
-                let v = (f64::from(*p) - background) * scale;
-                if let (Some([w0, w1]), Some([s0, s1])) =
-                    (self.weight.get_mut(k..k + 2), self.sum.get_mut(k..k + 2))
-                {
-                    *w0 += 1.0 - t;
-                    *w1 += t;
-                    *s0 += (1.0 - t) * v;
-                    *s1 += t * v;
-                }
+                let r_px = f64::from((dx * dx + dy * dy).sqrt());
+                self.rings
+                    .add(r_px, (f64::from(*p) - background) * scale, weight);
             }
         }
         self.since
@@ -120,13 +115,22 @@ impl Learner {
             }
     }
 
-    /// Replaces the template by what has been gathered, unless that differs too much. Allocates nothing.
+    /// Replaces the template by what has been gathered, if that predicts beads better and does not differ too much.
+    /// Allocates nothing.
     pub fn refresh(&mut self, template: &mut Template) {
         self.since = 0;
-        let mut fresh = self.mean();
-        self.weight = [0.0; KNOTS];
-        self.sum = [0.0; KNOTS];
-        let first = self.report.taken == 0;
+        let first = self.is_first();
+        let learnt = self
+            .rings
+            .learn_beyond(|r_px| f64::from(template.value_at_squared((r_px * r_px) as f32)));
+        self.rings.clear();
+        if !learnt.deviates {
+            self.report.confirmed = self.report.confirmed.saturating_add(1);
+            return;
+        }
+        let mut fresh = normalised(core::array::from_fn(|k| {
+            learnt.value(k as f64 * self.knot_px)
+        }));
         let allowed = if first {
             self.settings.max_change
         } else {
@@ -154,32 +158,27 @@ impl Learner {
             spline_value(&fresh, &curvatures, r_px / knot_px)
         });
     }
+}
 
-    /// The gathered profile: 1 at the centre, 0 at the last knots. Knots that no pixel reached keep their value.
-    fn mean(&self) -> Knots {
-        let mut v = self.profile;
-        for ((v, s), w) in v.iter_mut().zip(&self.sum).zip(&self.weight) {
-            if *w > 1.0 {
-                *v = s / w;
-            }
-        }
-        // Amplitude and background are free in every fit: the profile's own are fixed here, at the centre (area mean
-        // of the first knots) and over the outer fifth.
-        let mean = |range: core::ops::Range<usize>, v: &Knots| {
-            let part = v.iter().zip(&self.weight).take(range.end).skip(range.start);
-            let (s, w) = part.fold((0.0, 0.0), |(s, w), (v, n)| (s + v * n, w + n));
-            s / w
-        };
-        let floor = mean(KNOTS * 4 / 5..KNOTS, &v);
-        let top = mean(0..4, &v);
-        for (k, v) in v.iter_mut().enumerate() {
-            let fade = ((KNOTS - 1 - k) as f64 / 4.0).min(1.0);
-            *v = fade * (*v - floor) / (top - floor);
-        }
-        // The innermost knot sees less than a pixel per frame: smooth there, as any image is.
-        v[0] = v[1] + (v[1] - v[2]) / 3.0;
-        v
+/// The profile with 1 at the centre and 0 at the last knots.
+fn normalised(mut v: Knots) -> Knots {
+    // Amplitude and background are free in every fit: the profile's own are fixed here, by means over the area of the
+    // first knots and of the outer fifth.
+    let mean = |range: core::ops::Range<usize>, v: &Knots| {
+        let part = v.iter().enumerate().take(range.end).skip(range.start);
+        let (s, w) = part.fold((0.0, 0.0), |(s, w), (k, v)| {
+            let n = k as f64 + 0.125;
+            (s + v * n, w + n)
+        });
+        s / w
+    };
+    let floor = mean(KNOTS * 4 / 5..KNOTS, &v);
+    let top = mean(0..4, &v);
+    for (k, v) in v.iter_mut().enumerate() {
+        let fade = ((KNOTS - 1 - k) as f64 / 4.0).min(1.0);
+        *v = fade * (*v - floor) / (top - floor);
     }
+    v
 }
 
 /// RMS difference of two profiles over the area of the disc, after the best match of scale.

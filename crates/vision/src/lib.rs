@@ -20,6 +20,7 @@ mod objects;
 mod outline;
 pub mod profile;
 mod seed;
+mod smooth;
 mod streak;
 pub mod suggest;
 pub mod symmetry;

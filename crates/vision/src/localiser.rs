@@ -323,13 +323,7 @@ impl Localiser {
             return;
         };
         let background = fix.background - f64::from(self.crop.pedestal);
-        if learner.take_in(
-            &self.crop,
-            (fix.x_px, fix.y_px),
-            fix.amplitude,
-            background,
-            fix.snr,
-        ) {
+        if learner.take_in(&self.crop, (fix.x_px, fix.y_px), fix.amplitude, background) {
             learner.refresh(&mut self.template);
         }
     }
@@ -374,7 +368,7 @@ impl Localiser {
     fn template_tolerance(&self) -> f64 {
         let configured = self.config.template_tolerance;
         match &self.learner {
-            Some(l) if l.report().taken == 0 => configured.max(l.max_change()),
+            Some(l) if l.is_first() => configured.max(l.max_change()),
             _ => configured,
         }
     }

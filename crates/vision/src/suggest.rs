@@ -9,7 +9,8 @@ use crate::fix::FixQuality;
 use crate::frame::Frame;
 use crate::localiser::Localiser;
 use crate::objects::{Flat, Object, Refused};
-use crate::template::{ProfileSpec, TABLE_KNOTS};
+use crate::smooth::{Learnt, Parametric, Rings};
+use crate::template::{ProfileSpec, TABLE_KNOTS, Template};
 
 /// Passes of aligning and averaging.
 const PASSES: usize = 4;
@@ -21,8 +22,6 @@ const FEWEST: usize = 5;
 const REACH: f64 = 1.6;
 /// Share of the profile's extreme below which there is nothing left of it.
 const FADED: f64 = 0.03;
-/// Weight of a level profile at the centre, pixels.
-const LEVEL: f64 = 0.5;
 /// Margin on the residual that the beads themselves have.
 const TOLERANCE_MARGIN: f64 = 2.0;
 /// Largest tolerance suggested.
@@ -31,7 +30,8 @@ const MOST_TOLERANCE: f64 = 0.5;
 /// What was found in a recording.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Suggestion {
-    /// Settings of the localiser, the learnt profile in them.
+    /// Settings of the localiser. Their profile is a table where a learnt one predicts beads not seen better than the best
+    /// Gaussian or ring, and that Gaussian or ring where it does not.
     pub config: LocaliserConfig,
     /// Farthest that a bead went from frame to frame, with a margin, px.
     pub max_step_px: f64,
@@ -154,10 +154,13 @@ fn learn(
     let objects = beads.len();
     let failed = NothingToSuggest::NoProfile { objects };
     let mut config = None;
+    let mut template: Option<Template> = None;
     let mut fits = Vec::new();
     for pass in 0..PASSES {
-        let profile = mean_profile(flats, &beads, reach_px).ok_or(failed)?;
-        let mut settings = settings(&profile, reach_px).ok_or(failed)?;
+        let rings = collect(flats, &beads, template.as_ref(), reach_px);
+        let parametric = rings.parametric().ok_or(failed)?;
+        let learnt = rings.learn_from(parametric).ok_or(failed)?;
+        let mut settings = settings(&learnt, parametric, reach_px).ok_or(failed)?;
         settings.template_tolerance = MOST_TOLERANCE;
         let mut localiser = Localiser::new(settings.clone()).map_err(|_| failed)?;
         fits.clear();
@@ -172,6 +175,7 @@ fn learn(
                 fits.push((bead.frame, fix));
             }
         }
+        template = Some(localiser.template().clone());
         if fits.len() * 2 < objects && pass + 1 == PASSES {
             return Err(failed);
         }
@@ -217,70 +221,80 @@ fn commonest(objects: &[Object]) -> Vec<Object> {
     best.map(alike).unwrap_or_default()
 }
 
-/// Mean contrast over the distance from the objects' centres, at [`TABLE_KNOTS`] distances up to `reach_px`.
-fn mean_profile(flats: &[Flat], beads: &[Object], reach_px: f64) -> Option<[f64; TABLE_KNOTS]> {
-    let knot_px = reach_px / (TABLE_KNOTS - 1) as f64;
-    // Least squares of straight lines between the knots: a mean of what is near a knot would blunt the profile.
-    let (mut own, mut next, mut right) =
-        ([0.0; TABLE_KNOTS], [0.0; TABLE_KNOTS], [0.0; TABLE_KNOTS]);
+/// Grey values over the distance from the objects' centres, up to `reach_px`: of each object its own contrast and level taken
+/// off by the template of the pass before.
+fn collect(
+    flats: &[Flat],
+    beads: &[Object],
+    template: Option<&Template>,
+    reach_px: f64,
+) -> Box<Rings> {
+    let mut rings = Box::new(Rings::new(reach_px));
     for bead in beads {
         let Some(flat) = flats.get(bead.frame) else {
             continue;
         };
         let (x0, x1) = crate::template::span(bead.x_px, reach_px, flat.width);
         let (y0, y1) = crate::template::span(bead.y_px, reach_px, flat.height);
-        for y in y0..y1 {
-            for x in x0..x1 {
-                let u = f64::hypot(x as f64 - bead.x_px, y as f64 - bead.y_px) / knot_px;
-                let (k, t) = (u as usize, u.fract());
-                if k + 1 < TABLE_KNOTS {
-                    let v = f64::from(flat.values[y * flat.width + x]);
-                    own[k] += (1.0 - t) * (1.0 - t);
-                    own[k + 1] += t * t;
-                    next[k] += t * (1.0 - t);
-                    right[k] += (1.0 - t) * v;
-                    right[k + 1] += t * v;
-                }
-            }
-        }
-    }
-    lines(own, next, right)
-}
-
-/// Solves the symmetric system with `own` on the diagonal and `next` beside it; `None` where nothing is known of a knot.
-fn lines(
-    mut own: [f64; TABLE_KNOTS],
-    next: [f64; TABLE_KNOTS],
-    mut right: [f64; TABLE_KNOTS],
-) -> Option<[f64; TABLE_KNOTS]> {
-    // Few pixels lie at the centre itself: there the profile is level.
-    own[0] += LEVEL;
-    own[1] += LEVEL;
-    let mut beside = next;
-    beside[0] -= LEVEL;
-    for k in 1..TABLE_KNOTS {
-        if own[k - 1] <= 0.0 {
-            return None;
-        }
-        let factor = beside[k - 1] / own[k - 1];
-        own[k] -= factor * beside[k - 1];
-        right[k] -= factor * right[k - 1];
-    }
-    let mut profile = [0.0; TABLE_KNOTS];
-    for k in (0..TABLE_KNOTS).rev() {
-        let after = if k + 1 < TABLE_KNOTS {
-            beside[k] * profile[k + 1]
-        } else {
-            0.0
+        let pixels = || {
+            (y0..y1)
+                .flat_map(move |y| (x0..x1).map(move |x| (x, y)))
+                .map(|(x, y)| {
+                    let r_px = f64::hypot(x as f64 - bead.x_px, y as f64 - bead.y_px);
+                    (r_px, f64::from(flat.values[y * flat.width + x]))
+                })
         };
-        profile[k] = (right[k] - after) / own[k];
+        let (contrast, level) = template
+            .and_then(|template| contrast_and_level(template, pixels()))
+            .unwrap_or((1.0, 0.0));
+        // The sign stays with the values: it is the polarity.
+        let contrast = contrast.abs();
+        rings.next_bead();
+        for (r_px, v) in pixels() {
+            rings.add(r_px, (v - level) / contrast, contrast * contrast);
+        }
     }
-    profile.iter().all(|v| v.is_finite()).then_some(profile)
+    rings
 }
 
-/// Settings for a mean profile, grey levels.
-fn settings(profile: &[f64; TABLE_KNOTS], reach_px: f64) -> Option<LocaliserConfig> {
+/// Contrast and level of a template that fit the pixels best.
+fn contrast_and_level(
+    template: &Template,
+    pixels: impl Iterator<Item = (f64, f64)>,
+) -> Option<(f64, f64)> {
+    let (mut n, mut g1, mut g2, mut s1, mut sg) = (0.0, 0.0, 0.0, 0.0, 0.0);
+    for (r_px, v) in pixels {
+        let g = f64::from(template.value_at_squared((r_px * r_px) as f32));
+        n += 1.0;
+        g1 += g;
+        g2 += g * g;
+        s1 += v;
+        sg += g * v;
+    }
+    let contrast = (n * sg - g1 * s1) / (n * g2 - g1 * g1);
+    let level = (s1 - contrast * g1) / n;
+    (contrast.is_finite() && contrast != 0.0 && level.is_finite()).then_some((contrast, level))
+}
+
+/// Settings for a learnt profile.
+fn settings(learnt: &Learnt, parametric: Parametric, reach_px: f64) -> Option<LocaliserConfig> {
+    if !learnt.deviates {
+        let spec = match parametric {
+            Parametric::Gaussian(sigma_px) => ProfileSpec::Gaussian {
+                sigma_px: rounded(sigma_px, 1e3),
+            },
+            Parametric::Ring(edge_px) => ProfileSpec::Ring {
+                edge_px: rounded(edge_px, 1e3),
+            },
+        };
+        let mut config = LocaliserConfig::new(spec);
+        if learnt.value(0.0) < learnt.value(reach_px) {
+            config.polarity = Polarity::Dark;
+        }
+        return Some(config);
+    }
     let knot_px = reach_px / (TABLE_KNOTS - 1) as f64;
+    let profile: [f64; TABLE_KNOTS] = core::array::from_fn(|k| learnt.value(k as f64 * knot_px));
     let outer = &profile[TABLE_KNOTS * 5 / 6..];
     let floor = outer.iter().sum::<f64>() / outer.len() as f64;
     let extreme = profile.iter().map(|v| v - floor).fold(0.0_f64, |best, v| {

@@ -4,6 +4,7 @@ mod bound;
 mod cells;
 mod common;
 mod detector;
+mod learnt;
 mod measured_beads;
 mod no_allocation;
 mod real_cells;

@@ -72,7 +72,9 @@ fn locating_allocates_nothing_for_any_verdict() {
 #[test]
 fn tracking_through_an_encounter_and_a_loss_allocates_nothing() {
     let spec = ProfileSpec::Ring { edge_px: 4.5 };
-    let template = spec.template(PixelResponse::Point).unwrap();
+    // Not quite the configured one: there is something to learn.
+    let drawn = ProfileSpec::Ring { edge_px: 4.7 };
+    let template = drawn.template(PixelResponse::Point).unwrap();
     let learning = Some(Learning {
         first_fixes: 5,
         refresh_fixes: 16,

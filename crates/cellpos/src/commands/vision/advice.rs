@@ -43,6 +43,21 @@ impl Advice {
         }
     }
 
+    /// What the profile rests on.
+    fn profile(&self) -> &'static str {
+        match self.vision.profile {
+            ProfileSpec::Table { .. } => {
+                "profile: learnt; it predicts beads that it was not learnt from better than a Gaussian and the measured ring do"
+            }
+            ProfileSpec::Gaussian { .. } => {
+                "profile: a Gaussian; a learnt one predicts beads that it was not learnt from no better"
+            }
+            ProfileSpec::Ring { .. } => {
+                "profile: the measured ring, scaled; a learnt one predicts beads that it was not learnt from no better"
+            }
+        }
+    }
+
     /// The settings as a table to paste, with what they rest on.
     pub fn text(&self) -> String {
         let given = self
@@ -50,8 +65,14 @@ impl Advice {
             .map_or(String::new(), |px| format!(" (given: {px:.2} px)"));
         let mut text = format!(
             "settings found: {} of {} objects are beads of radius {:.2} px{given}; {} of another size or contrast, {} at the border, \
-             {} not round like these\npaste into rig.toml:\n\n",
-            self.taken, self.objects, self.radius_px, self.other, self.at_border, self.bad_fit
+             {} not round like these\n{}\npaste into rig.toml:\n\n",
+            self.taken,
+            self.objects,
+            self.radius_px,
+            self.other,
+            self.at_border,
+            self.bad_fit,
+            self.profile()
         );
         // Settings that come out of a file go back into one.
         match toml::to_string(&toml::Table::from_iter([(
