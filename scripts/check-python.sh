@@ -6,10 +6,11 @@ set -euo pipefail
 cd "$(dirname "$0")/.."
 env=target/python
 if ! { [ -x "$env/bin/python" ] || python3 -m venv "$env"; } \
-    || ! "$env/bin/pip" install -q --disable-pip-version-check "maturin>=1.7,<2" numpy pandas matplotlib pytest mypy; then
-    echo "check-python: skipped: maturin, numpy, pandas, matplotlib, pytest and mypy cannot be installed here"
+    || ! "$env/bin/pip" install -q --disable-pip-version-check "maturin>=1.7,<2" numpy pandas matplotlib pytest mypy pypylon imageio; then
+    echo "check-python: skipped: maturin, numpy, pandas, matplotlib, pytest, mypy, pypylon and imageio cannot be installed here"
     exit 0
 fi
+cargo build -q --locked -p cellpos-firmware-sim
 CARGO_TARGET_DIR="$PWD/target" MATURIN_PEP517_ARGS="--profile dev" PATH="$PWD/$env/bin:$PATH" \
     "$env/bin/pip" install -q --disable-pip-version-check --no-build-isolation --no-deps --force-reinstall ./python
 cd python

@@ -261,6 +261,23 @@ mod tests {
     }
 
     #[test]
+    fn the_header_on_the_page_is_this_one() {
+        let page = include_str!("../../../docs/camera-socket.md");
+        let (_, after) = page.split_once("has the header\n\n```text\n").unwrap();
+        let (hex, _) = after.split_once("```").unwrap();
+        let mut bytes = hex
+            .split_whitespace()
+            .map(|byte| u8::from_str_radix(byte, 16).unwrap());
+        assert!(
+            HEADER
+                .to_bytes()
+                .into_iter()
+                .all(|b| bytes.next() == Some(b))
+        );
+        assert_eq!(bytes.next(), None);
+    }
+
+    #[test]
     fn every_flipped_bit_of_a_header_is_noticed() {
         for bit in 0..HEADER_LEN * 8 {
             let mut bytes = HEADER.to_bytes();

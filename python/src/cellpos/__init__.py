@@ -11,13 +11,14 @@
 
 from __future__ import annotations
 
+from ._camera import CameraServer, CameraStats, Frame, read_camera, serve_camera
 from ._columns import FLAGS
 from ._program import Failed, Live, Result, Row, command, identify, program, reconcile, run, track
 from ._run import Run, Session, Table, open, read_csv, runs
 from ._tiff import Clip
 
 __all__ = [
-    "FLAGS", "Clip", "Failed", "Live", "Result", "Row", "Run", "Session", "Table", "command", "identify", "open", "program",
-    "read_csv", "reconcile", "run", "runs", "track",
+    "FLAGS", "CameraServer", "CameraStats", "Clip", "Failed", "Frame", "Live", "Result", "Row", "Run", "Session", "Table",
+    "command", "identify", "open", "program", "read_camera", "read_csv", "reconcile", "run", "runs", "serve_camera", "track",
 ]  # fmt: skip
 __version__ = "0.1.0"

@@ -1,0 +1,66 @@
+"""Serves a Basler camera through pypylon (pip install pypylon). PYLON_CAMEMU=1 has an emulated one.
+
+    python examples/python/pylon_camera.py camera.sock [--rate 1000] [--bead box.sock]
+
+With --bead the picture of firmware-sim's camera takes the place of the emulated camera's test pattern, so that a bead can be held
+over the whole path of a Basler camera.
+"""
+
+import argparse
+import threading
+import time
+
+from pypylon import pylon
+
+import cellpos
+
+arguments = argparse.ArgumentParser()
+arguments.add_argument("socket")
+arguments.add_argument("--rate", type=float, default=1000.0)
+arguments.add_argument("--exposure-us", type=float, default=500.0)
+arguments.add_argument("--bead")
+options = arguments.parse_args()
+
+
+def grabbed():
+    camera = pylon.InstantCamera(pylon.TlFactory.GetInstance().CreateFirstDevice())
+    camera.Open()
+    camera.Width.Value, camera.Height.Value, camera.PixelFormat.Value = 256, 32, "Mono8"
+    camera.ExposureTimeAbs.Value = options.exposure_us
+    camera.AcquisitionFrameRateEnable.Value = True
+    camera.AcquisitionFrameRateAbs.Value = options.rate
+    # A real camera's TimeStamp counts from its own start: the offset to this machine's clock is the smallest difference seen. The
+    # emulated one has no TimeStamp.
+    offset_ns = None
+    camera.StartGrabbing(pylon.GrabStrategy_LatestImageOnly)
+    while camera.IsGrabbing():
+        with camera.RetrieveResult(2000, pylon.TimeoutHandling_ThrowException) as result:
+            if not result.GrabSucceeded():
+                continue
+            now_ns, stamp_ns = time.monotonic_ns(), result.TimeStamp
+            if stamp_ns:
+                offset_ns = min(now_ns - stamp_ns, offset_ns if offset_ns is not None else now_ns - stamp_ns)
+                now_ns = stamp_ns + offset_ns
+            mid_ns = now_ns - int(500 * options.exposure_us)
+            yield result.Array, mid_ns, result.ImageNumber
+
+
+def with_bead(frames, box):
+    newest = []
+
+    def look():
+        for frame in cellpos.read_camera(box):
+            newest[:] = [frame]
+
+    threading.Thread(target=look, daemon=True).start()
+    last = -1
+    for pixels, _, _ in frames:
+        if newest and newest[0].frame_id != last:
+            frame = newest[0]
+            last = frame.frame_id
+            pixels[:] = frame.pixels
+            yield pixels, frame.mid_exposure_ns, frame.frame_id
+
+
+frames = grabbed() if options.bead is None else with_bead(grabbed(), options.bead)
+print(cellpos.serve_camera(frames, options.rate, options.socket, exposure_s=1e-6 * options.exposure_us))

@@ -1,0 +1,197 @@
+"""Frames from Python: the protocol, losses, and a bead that is held over them."""
+
+import os
+import re
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import ROOT
+
+import cellpos
+from cellpos._camera import pack_header
+
+
+def test_the_header_on_the_page_is_the_one_that_is_sent():
+    page = (ROOT / "docs/camera-socket.md").read_text()
+    text = re.search(r"has the header\n\n```text\n(.*?)```", page, re.S)[1]
+    assert pack_header(77, 123456789012, 123458789012, 500000, 6, 2, 8, 12) == bytes.fromhex(text)
+
+
+def served(frames, path, **options):
+    return cellpos.CameraServer(frames, 1000.0, path, real_time=False, **options)
+
+
+def test_frames_arrive_as_they_were_with_stamp_and_number(tmp_path):
+    path, given = tmp_path / "c.sock", []
+
+    def frames():
+        rng = np.random.default_rng(1)
+        while len(given) < 300:
+            kind = np.uint8 if len(given) % 2 else np.uint16
+            given.append((rng.integers(0, 200, (5, 7)).astype(kind), 10**9 + len(given), 3 * len(given)))
+            yield given[-1]
+
+    with served(frames(), path, pace=True) as server:
+        got = list(cellpos.read_camera(path))
+    assert len(got) > 100
+    by_id = {frame_id: (pixels, stamp_ns) for pixels, stamp_ns, frame_id in given}
+    for frame in got:
+        pixels, stamp_ns = by_id[frame.frame_id]
+        assert frame.mid_exposure_ns == stamp_ns and frame.pixels.dtype == pixels.dtype
+        np.testing.assert_array_equal(frame.pixels, pixels)
+    assert server.stats.sent == len(got) and server.stats.unseen == 300 - len(got)
+
+
+def test_a_slow_reader_loses_whole_frames_that_are_counted_and_the_source_goes_on(tmp_path):
+    path, size = tmp_path / "c.sock", (200, 300)
+    frames = (np.full(size, i % 251, np.uint8) for i in range(10**9))
+    with served(frames, path, pace=True) as server:
+        reader = cellpos.read_camera(path)
+        got = [next(reader)]
+        before = server.stats
+        time.sleep(1.0)
+        after = server.stats
+        # A period of waiting for each frame that is dropped, not more.
+        assert after.frames - before.frames > 200
+        assert after.dropped - before.dropped > 150
+        got += [next(reader) for _ in range(50)]
+        stats = server.stats
+    numbers = [frame.frame_id for frame in got]
+    assert all(np.all(frame.pixels == frame.frame_id % 251) for frame in got)
+    lost = np.diff(numbers) - 1
+    assert lost.min() >= 0 and lost.max() > 150
+    assert int(lost.sum()) <= stats.dropped
+    # What waited in the socket is a few frames, not a second of them.
+    assert int(np.argmax(lost)) <= 12
+
+
+def test_a_reader_may_go_and_come_back(tmp_path):
+    path = tmp_path / "c.sock"
+    frames = (np.full((4, 4), i % 251, np.uint8) for i in range(10**9))
+    with served(frames, path, pace=True) as server:
+        for _ in range(3):
+            reader = cellpos.read_camera(path)
+            got = [next(reader) for _ in range(20)]
+            assert [f.frame_id for f in got] == list(range(got[0].frame_id, got[0].frame_id + 20)) or server.stats.dropped
+            reader.close()
+        assert server.stats.clients == 3
+
+
+def test_a_socket_that_is_served_is_not_taken_and_one_left_behind_is(tmp_path):
+    path = tmp_path / "c.sock"
+    dead = socket.socket(socket.AF_UNIX)
+    dead.bind(str(path))
+    dead.close()
+    frames = (np.zeros((4, 4), np.uint8) for _ in range(10**9))
+    with served(frames, path, pace=True), pytest.raises(OSError, match="served by another program"):
+        served([], path)
+    assert not path.exists()
+
+
+def test_what_is_no_frame_is_named(tmp_path):
+    with pytest.raises(TypeError, match=r"uint8 or uint16, this one is float64 of shape \(2, 2\)"):
+        cellpos.serve_camera([np.zeros((2, 2))], 1000.0, tmp_path / "c.sock", real_time=False)
+    with pytest.raises(ValueError, match="rate = 0"):
+        cellpos.CameraServer([], 0, tmp_path / "c.sock")
+
+
+def firmware_sim() -> Path:
+    found = [Path(cellpos.program()).parent / "firmware-sim", ROOT / "target/debug/firmware-sim"]
+    for path in found:
+        if path.is_file():
+            return path
+    pytest.skip("firmware-sim is not built: cargo build -p cellpos-firmware-sim")
+
+
+@pytest.fixture
+def box(tmp_path):
+    """firmware-sim, and a rig that sees it through `python.sock`. Times are those of a machine that tests share."""
+    text = (ROOT / "examples/rig.toml").read_text()
+    for key, value in (("oldest_ms", 60.0), ("faults_in_a_row", 1000), ("lost_ticks", 20000), ("watchdog_ms", 100)):
+        text = re.sub(rf"(?m)^{key} = \S+", f"{key} = {value}", text)
+    (tmp_path / "rig.toml").write_text(text)
+    (tmp_path / "python.toml").write_text(text.replace('"camera.sock"', '"python.sock"'))
+    words = [firmware_sim(), "--rig", "rig.toml", "--pty-link", "pzt", "--socket", "camera.sock", "--duration", "60s"]
+    child = subprocess.Popen(words, cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    for _ in range(200):
+        if (tmp_path / "camera.sock").exists():
+            break
+        time.sleep(0.02)
+    yield tmp_path
+    child.terminate()
+    child.wait()
+
+
+def watched(folder: Path, name: str):
+    seen = cellpos.command("camera", socket=name, duration="2s", cwd=folder).result
+    interval, age = seen["interval_ms"], seen["age_ms"]
+    print(
+        f"{name:12} {seen['rate_hz']:7.1f} Hz, {seen['dropped']:4d} dropped, interval p50 {interval['p50']:.3f} p99"
+        f" {interval['p99']:.3f} max {interval['max']:.2f} ms, age p50 {age['p50']:.3f} p99 {age['p99']:.3f} max {age['max']:.2f} ms"
+    )
+    return seen
+
+
+def held_over(folder: Path, script: str, *words: str):
+    """A bead held over a camera that an example serves from a process of its own."""
+    env = dict(os.environ, PYTHONPATH=os.pathsep.join(sys.path), PYLON_CAMEMU="1")
+    server = subprocess.Popen(
+        [sys.executable, ROOT / "examples/python" / script, *words], cwd=folder, env=env, stdout=subprocess.PIPE, text=True
+    )
+    try:
+        for _ in range(300):
+            if (folder / "python.sock").exists() or server.poll() is not None:
+                break
+            time.sleep(0.02)
+        time.sleep(0.5)
+        # One after the other: two readers of the box would take each other's time.
+        direct, through = watched(folder, "camera.sock"), watched(folder, "python.sock")
+        for _ in range(3):
+            result = cellpos.track("0um", "6s", rig="python.toml", best_effort=True, cwd=folder).wait()
+            # A machine that stalls for longer than the board waits ends a run in Safe, as it must: then once more.
+            if result.ended == "done" and result["rms_measured_nm"] is not None:
+                break
+    finally:
+        server.send_signal(2)
+        said, _ = server.communicate(timeout=10)
+        print(said)
+    print(f"held over Python: {result['rms_measured_nm']} nm RMS as measured (PI in one process: 58), {result['frames_lost']} frames lost of {result['ticks']}")
+    return direct, through, result, said
+
+
+def test_a_bead_is_held_over_a_rendered_stream(box):
+    direct, through, result, said = held_over(box, "rendered_stream.py", "camera.sock", "python.sock")
+    assert result.ended == "done", result.values_["ended"]
+    # As measured: in-process PI holds 58 nm; frames that come some ms late now and then cost something.
+    assert result["rms_measured_nm"] < 120
+    assert through["interval_ms"]["p50"] == pytest.approx(1.0, abs=0.3)
+    assert "jitter" in said and "dropped" in said
+
+
+def test_a_bead_is_held_over_the_basler_emulator(box):
+    pytest.importorskip("pypylon")
+    _, _, result, said = held_over(box, "pylon_camera.py", "python.sock", "--bead", "camera.sock")
+    assert result.ended == "done", result.values_["ended"]
+    assert result["rms_measured_nm"] < 150
+    assert "jitter" in said
+
+
+def test_a_folder_of_pictures_is_served(tmp_path):
+    imageio = pytest.importorskip("imageio.v3")
+    (tmp_path / "pictures").mkdir()
+    for i in range(40):
+        imageio.imwrite(tmp_path / f"pictures/{i:03}.png", np.full((8, 9, 3), i, np.uint8))
+    env = dict(os.environ, PYTHONPATH=os.pathsep.join(sys.path))
+    words = [sys.executable, ROOT / "examples/python/folder_camera.py", "pictures", "c.sock", "--rate", "40"]
+    server = subprocess.Popen(words, cwd=tmp_path, env=env, stdout=subprocess.PIPE, text=True)
+    while not (tmp_path / "c.sock").exists():
+        assert server.poll() is None
+        time.sleep(0.01)
+    got = list(cellpos.read_camera(tmp_path / "c.sock"))
+    assert got and all(np.all(frame.pixels == frame.frame_id) for frame in got)
+    assert "40 frames" in server.communicate(timeout=10)[0]
