@@ -3,6 +3,11 @@
 //! One pass over the rows joins runs of pixels above the threshold (8-connected) with a union-find over a bounded
 //! table of labels. Nothing is allocated after [`Blobs::new`]; what does not fit is counted, not lost silently.
 
+/// Widest frame for which nothing is allocated later, px.
+pub(crate) const WIDEST: usize = 16_384;
+/// Pixels that are compared with the threshold at once.
+const CHUNK: usize = 32;
+
 /// A connected region of pixels above a threshold.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Blob {
@@ -67,6 +72,8 @@ pub struct Blobs {
     before: Vec<Run>,
     now: Vec<Run>,
     found: Vec<Blob>,
+    /// Contrast of the row at hand.
+    row: Vec<f32>,
     /// All runs of the frame, row by row, where they are wanted.
     runs: Vec<(u32, Run)>,
     dropped_runs: u64,
@@ -84,6 +91,7 @@ impl Blobs {
             before: Vec::with_capacity(max_runs),
             now: Vec::with_capacity(max_runs),
             found: Vec::with_capacity(max_labels),
+            row: Vec::with_capacity(WIDEST),
             runs: Vec::new(),
             dropped_runs: 0,
             max_runs,
@@ -112,14 +120,14 @@ impl Blobs {
         &self.found
     }
 
-    /// Labels a frame of `width` x `height`; `contrast(x, y)` is a pixel's contrast, and pixels above `threshold` belong
-    /// to a region. Regions of fewer than `min_area_px` pixels are left out.
+    /// Labels a frame of `width` x `height`; `contrast(y, row)` writes the contrast of a row, and pixels above `threshold`
+    /// belong to a region. Regions of fewer than `min_area_px` pixels are left out.
     pub fn label(
         &mut self,
         (width, height): (usize, usize),
         threshold: f32,
         min_area_px: f64,
-        mut contrast: impl FnMut(usize, usize) -> f32,
+        mut contrast: impl FnMut(usize, &mut [f32]),
     ) -> &[Blob] {
         self.labels.clear();
         self.before.clear();
@@ -127,25 +135,21 @@ impl Blobs {
         self.found.clear();
         self.dropped_runs = 0;
         self.runs.clear();
+        // Taken out while runs are joined.
+        let mut row = std::mem::take(&mut self.row);
+        row.clear();
+        row.resize(width, 0.0);
         for y in 0..height {
+            contrast(y, &mut row);
             let edge_row = y == 0 || y + 1 == height;
             let mut x = 0;
-            while x < width {
-                let first = contrast(x, y);
-                if first <= threshold {
-                    x += 1;
-                    continue;
-                }
-                let start = x;
-                let mut sums = Label::at(first, x, y);
-                x += 1;
-                while x < width {
-                    let v = contrast(x, y);
-                    if v <= threshold {
-                        break;
-                    }
-                    sums.add(&Label::at(v, x, y));
-                    x += 1;
+            while let Some(start) = next_above(&row, x, threshold) {
+                let run = row.iter().enumerate().skip(start);
+                x = start;
+                let mut sums = Label::EMPTY;
+                for (at, v) in run.take_while(|(_, v)| **v > threshold) {
+                    sums.add(&Label::at(*v, at, y));
+                    x = at + 1;
                 }
                 sums.at_border = edge_row || start == 0 || x == width;
                 sums.bounds = [start as u32, y as u32, x as u32, y as u32 + 1];
@@ -160,6 +164,7 @@ impl Blobs {
             std::mem::swap(&mut self.before, &mut self.now);
             self.now.clear();
         }
+        self.row = row;
         for (label, i) in self.labels.iter().zip(0_u32..) {
             if label.parent == i && label.n >= min_area_px {
                 self.found.push(Blob {
@@ -258,7 +263,35 @@ impl Blobs {
     }
 }
 
+/// The first place from `from` on that is above the threshold.
+fn next_above(row: &[f32], from: usize, threshold: f32) -> Option<usize> {
+    let mut from = from;
+    for chunk in row.get(from..)?.chunks(CHUNK) {
+        // Without a branch per pixel: most of a frame is background.
+        if chunk.iter().fold(false, |any, v| any | (*v > threshold)) {
+            let at = chunk.iter().position(|v| *v > threshold)?;
+            return Some(from + at);
+        }
+        from += chunk.len();
+    }
+    None
+}
+
 impl Label {
+    const EMPTY: Label = Label {
+        parent: 0,
+        n: 0.0,
+        sx: 0.0,
+        sy: 0.0,
+        w: 0.0,
+        ww: 0.0,
+        wx: 0.0,
+        wy: 0.0,
+        peak: f64::NEG_INFINITY,
+        at_border: false,
+        bounds: [u32::MAX, u32::MAX, 0, 0],
+    };
+
     fn at(contrast: f32, x: usize, y: usize) -> Self {
         let (v, x, y) = (f64::from(contrast), x as f64, y as f64);
         Label {
@@ -313,12 +346,15 @@ mod tests {
 
     fn label(blobs: &mut Blobs, picture: &[&str], min_area_px: f64) -> Vec<Blob> {
         let rows: Vec<&[u8]> = picture.iter().map(|r| r.as_bytes()).collect();
-        let contrast = |x: usize, y: usize| {
-            if rows[y][x] == b'.' {
+        let grey = |v: &u8| {
+            if *v == b'.' {
                 0.0
             } else {
-                f32::from(rows[y][x] - b'0')
+                f32::from(*v - b'0')
             }
+        };
+        let contrast = |y: usize, row: &mut [f32]| {
+            row.iter_mut().zip(rows[y]).for_each(|(c, v)| *c = grey(v));
         };
         blobs
             .label((rows[0].len(), rows.len()), 0.5, min_area_px, contrast)

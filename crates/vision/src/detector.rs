@@ -1,10 +1,10 @@
 //! Finds every bead of a frame by threshold above the background about it: seeds for [`crate::Localiser::locate`].
 
-use crate::blobs::{Blob, Blobs};
+use crate::blobs::{Blob, Blobs, WIDEST};
 use crate::frame::{Frame, Pixels};
 use crate::level::Level;
 use crate::localiser::Localiser;
-use crate::seed::{LEAST_NOISE, background};
+use crate::seed::{LEAST_NOISE, PATCH, background, patch_sums};
 
 /// Share of the strongest contrast in the frame that a bead must reach to be seen beside it, in one look.
 const WEAKEST_SHARE: f32 = 0.3;
@@ -25,6 +25,8 @@ pub struct Detector {
     blobs: Blobs,
     level: Level,
     found: Vec<Blob>,
+    /// Sums over patches along a row.
+    sums: Vec<f32>,
     sign: f64,
     radius_px: f64,
     min_snr: f64,
@@ -43,6 +45,7 @@ impl Detector {
             blobs: Blobs::new(room, room),
             level: Level::new(),
             found: Vec::with_capacity(room),
+            sums: Vec::with_capacity(WIDEST),
             sign: localiser.sign(),
             radius_px: localiser.template().radius_px(),
             min_snr: localiser.config().min_snr,
@@ -92,7 +95,7 @@ impl Detector {
         self.level
             .take(pixels, (width, height), self.radius_px, mean as f32);
         let step = if self.radius_px >= 3.0 { 2 } else { 1 };
-        let strongest = self.level.strongest(pixels, (width, height), sign, step);
+        let strongest = self.strongest(pixels, (width, height), sign, step);
         let least = (self.min_snr.max(4.0) * noise.max(LEAST_NOISE)) as f32;
         let smooth = self.thorough && self.radius_px >= SMOOTH_RADIUS_PX;
         if strongest <= if smooth { SMOOTHED * least } else { least } {
@@ -108,29 +111,56 @@ impl Detector {
         for threshold in thresholds.into_iter().flatten() {
             let level = &mut self.level;
             self.blobs
-                .label((width, height), threshold, min_area_px, |x, y| {
-                    let value = pixels.get(y * width + x).map_or(0.0, |v| f32::from(*v));
-                    sign * (value - level.at(x, y))
+                .label((width, height), threshold, min_area_px, |y, row| {
+                    let from = pixels.get(y * width..).unwrap_or(&[]);
+                    for ((c, v), level) in row.iter_mut().zip(from).zip(level.row(y)) {
+                        *c = sign * (f32::from(*v) - level);
+                    }
                 });
             self.keep_new();
         }
         if smooth {
             // Beads as weak as the noise of a pixel: means of 3 x 3 pixels have a third of it.
-            let level = &mut self.level;
+            let (level, sums) = (&mut self.level, &mut self.sums);
             let inside = (width.saturating_sub(2), height.saturating_sub(2));
             let threshold = SMOOTHED * least;
-            self.blobs.label(inside, threshold, min_area_px, |x, y| {
-                let row = |j: usize| {
-                    let from = (y + j) * width + x;
-                    let three = pixels.get(from..from + 3).unwrap_or(&[]);
-                    three.iter().map(|v| f32::from(*v)).sum::<f32>()
-                };
-                sign * ((row(0) + row(1) + row(2)) / 9.0 - level.at(x + 1, y + 1))
+            self.blobs.label(inside, threshold, min_area_px, |y, row| {
+                patch_sums(pixels, width, y, sums);
+                let levels = level.row(y + 1).get(1..).unwrap_or(&[]);
+                for ((c, sum), level) in row.iter_mut().zip(sums.iter()).zip(levels) {
+                    *c = sign * (sum / (PATCH * PATCH) as f32 - level);
+                }
             });
             self.keep_new();
         }
         self.found
             .sort_unstable_by(|a, b| b.contrast_sum.total_cmp(&a.contrast_sum));
+    }
+
+    /// Largest contrast of a patch, patches `step` rows apart, of the sign asked for, grey levels.
+    fn strongest<T: Copy>(
+        &mut self,
+        pixels: &[T],
+        (width, height): (usize, usize),
+        sign: f32,
+        step: usize,
+    ) -> f32
+    where
+        f32: From<T>,
+    {
+        let mut best = 0.0_f32;
+        if width < PATCH || height < PATCH {
+            return best;
+        }
+        for y in (0..=height - PATCH).step_by(step) {
+            patch_sums(pixels, width, y, &mut self.sums);
+            let levels = self.level.row(y + 1).get(1..).unwrap_or(&[]);
+            for (sum, level) in self.sums.iter().zip(levels) {
+                let contrast = sign * (sum / (PATCH * PATCH) as f32 - level);
+                best = if contrast > best { contrast } else { best };
+            }
+        }
+        best
     }
 
     /// Keeps of the last look what no stronger one has shown.

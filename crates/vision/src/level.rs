@@ -1,14 +1,12 @@
 //! Grey level of the background from place to place: medians of tiles, and straight between their middles.
 
-use crate::seed::PATCH;
+use crate::blobs::WIDEST;
 
 /// Side of a tile, in radii of a bead: one in it leaves the median alone.
 const RADII: f64 = 6.0;
 /// Most tiles either way, and pixels of each that serve for its median.
 const MOST: usize = 16;
 const SAMPLES: usize = 160;
-/// Widest frame for which it is done, px.
-const WIDEST: usize = 16_384;
 
 /// The background's level. Allocates only when made.
 #[derive(Debug, Clone)]
@@ -86,27 +84,24 @@ impl Level {
         }
     }
 
-    /// Level at a pixel; cheap for pixels of one row after another.
-    #[inline(always)]
-    pub fn at(&mut self, x: usize, y: usize) -> f32 {
-        if self.columns * self.rows == 1 {
-            return self.values[0][0];
-        }
-        if self.y != y {
+    /// Level along a row.
+    pub fn row(&mut self, y: usize) -> &[f32] {
+        let one = self.columns * self.rows == 1;
+        if self.y != y && !(one && self.row.len() == self.width) {
             self.fill(y);
         }
-        self.row.get(x).copied().unwrap_or(0.0)
+        self.y = y;
+        &self.row
     }
 
     fn fill(&mut self, y: usize) {
-        self.y = y;
-        self.row.clear();
-        let between = |k: usize, side: f32, count: usize| {
-            let place = ((k as f32 + 0.5) / side - 0.5).clamp(0.0, (count - 1) as f32);
-            let low = (place as usize).min(count.saturating_sub(2));
-            (low, (low + 1).min(count - 1), place - low as f32)
+        self.row.resize(self.width, 0.0);
+        let (above, below, v) = {
+            let last = (self.rows - 1) as f32;
+            let place = ((y as f32 + 0.5) / self.tile.1 - 0.5).clamp(0.0, last);
+            let low = (place as usize).min(self.rows.saturating_sub(2));
+            (low, (low + 1).min(self.rows - 1), place - low as f32)
         };
-        let (above, below, v) = between(y, self.tile.1, self.rows);
         let mut line = [0.0_f32; MOST];
         for ((value, a), b) in line
             .iter_mut()
@@ -115,44 +110,25 @@ impl Level {
         {
             *value = a + v * (b - a);
         }
-        for x in 0..self.width {
-            let (left, right, u) = between(x, self.tile.0, self.columns);
-            let (a, b) = (line[left], line[right]);
-            self.row.push(a + u * (b - a));
-        }
-    }
-
-    /// Largest contrast of a patch of 3 x 3 pixels, `step` pixels apart, of the sign asked for, grey levels.
-    pub fn strongest<T: Copy>(
-        &mut self,
-        pixels: &[T],
-        (width, height): (usize, usize),
-        sign: f32,
-        step: usize,
-    ) -> f32
-    where
-        f32: From<T>,
-    {
-        let mut best = 0.0_f32;
-        if width < PATCH || height < PATCH {
-            return best;
-        }
-        for j in (0..=height - PATCH).step_by(step) {
-            let row = |k: usize| {
-                pixels
-                    .get((j + k) * width..(j + k + 1) * width)
-                    .unwrap_or(&[])
+        // Straight from the middle of a tile to that of the next; level before the first and after the last.
+        let middle = |k: usize| (k as f32 + 0.5) * self.tile.0 - 0.5;
+        let mut done = 0;
+        for k in 0..=self.columns {
+            let end = if k < self.columns {
+                (middle(k).ceil().max(0.0) as usize).min(self.width)
+            } else {
+                self.width
             };
-            let columns = row(0)
-                .windows(PATCH)
-                .zip(row(1).windows(PATCH))
-                .zip(row(2).windows(PATCH));
-            for (i, ((a, b), c)) in columns.enumerate().step_by(step) {
-                let add = |w: &[T]| w.iter().map(|v| f32::from(*v)).sum::<f32>();
-                let mean = (add(a) + add(b) + add(c)) / (PATCH * PATCH) as f32;
-                best = best.max(sign * (mean - self.at(i + 1, j + 1)));
+            let (left, right) = (k.saturating_sub(1), k.min(self.columns - 1));
+            let slope = (line[right] - line[left]) / self.tile.0;
+            let start = line[left] - slope * middle(left);
+            if let Some(part) = self.row.get_mut(done..end) {
+                let start = start + slope * done as f32;
+                for (n, value) in (0_i32..).zip(part) {
+                    *value = start + slope * n as f32;
+                }
             }
+            done = done.max(end);
         }
-        best
     }
 }

@@ -132,8 +132,10 @@ impl Flat {
         let least = self.noise * (1.0 + LEAST_SIGMA / 7.0);
         let threshold = least.max(LEAST_SHARE * strongest);
         let mut blobs = Blobs::new(self.width / 2 + 1, 16 * 1024);
-        let at = |x: usize, y: usize| strength[y * self.width + x];
-        let found = blobs.label((self.width, self.height), threshold, 20.0, at);
+        let row = |y: usize, to: &mut [f32]| {
+            to.copy_from_slice(&strength[y * self.width..(y + 1) * self.width]);
+        };
+        let found = blobs.label((self.width, self.height), threshold, 20.0, row);
         for blob in found {
             if blob.at_border {
                 refused.at_border += 1;

@@ -31,22 +31,33 @@ where
 {
     // An odd step does not walk down a column of a frame of even width.
     let step = pixels.len().div_ceil(STATISTICS_PIXELS).max(1) | 1;
-    let grey = |v: &T| f64::from(f32::from(*v));
+    // Copied together first: the passes over them are without a branch.
+    let (mut values, mut steps) = ([0.0_f64; STATISTICS_PIXELS], [0.0_f64; STATISTICS_PIXELS]);
+    let mut count = 0;
+    let pairs = pixels.windows(2).step_by(step);
+    for ((pair, value), step) in pairs.zip(&mut values).zip(&mut steps) {
+        let [a, b] = pair else { continue };
+        let (a, b) = (f32::from(*a), f32::from(*b));
+        (*value, *step) = (f64::from(a), f64::from((b - a).abs()));
+        count += 1;
+    }
+    let (values, steps) = (&values[..count], &steps[..count]);
     let (mut mean, mut spread, mut limit) = (0.0_f64, f64::INFINITY, f64::INFINITY);
     for _ in 0..3 {
         let (mut n, mut s, mut s2, mut differences, mut sum) = (0.0_f64, 0.0, 0.0, 0.0_f64, 0.0);
-        for pair in pixels.windows(2).step_by(step) {
-            let [a, b] = pair else { continue };
-            let (v, d) = (grey(a), (grey(b) - grey(a)).abs());
-            if spread.is_infinite() || (v - mean).abs() <= 2.5 * spread {
-                n += 1.0;
-                s += v;
-                s2 += v * v;
-            }
-            if d <= limit {
-                differences += 1.0;
-                sum += d;
-            }
+        let reach = if spread.is_infinite() {
+            f64::INFINITY
+        } else {
+            2.5 * spread
+        };
+        for (v, d) in values.iter().zip(steps) {
+            let near = f64::from(u8::from((v - mean).abs() <= reach));
+            n += near;
+            s += near * v;
+            s2 += near * v * v;
+            let small = f64::from(u8::from(*d <= limit));
+            differences += small;
+            sum += small * d;
         }
         if n < 1.0 {
             break;
@@ -94,7 +105,32 @@ where
     ))
 }
 
-/// Largest sum over a patch, and the patch's centre; patches are `step` pixels apart both ways.
+/// Sums over the patches whose first row is `y`, from left to right.
+pub(crate) fn patch_sums<T: Copy>(pixels: &[T], width: usize, y: usize, sums: &mut Vec<f32>)
+where
+    f32: From<T>,
+{
+    let row = |k: usize| {
+        pixels
+            .get((y + k) * width..(y + k + 1) * width)
+            .unwrap_or(&[])
+    };
+    sums.clear();
+    let columns = row(0).iter().zip(row(1)).zip(row(2));
+    sums.extend(columns.map(|((a, b), c)| f32::from(*a) + f32::from(*b) + f32::from(*c)));
+    add_neighbours(sums);
+}
+
+/// Replaces each value by its sum with the next two; the last two fall away.
+fn add_neighbours(sums: &mut Vec<f32>) {
+    let kept = sums.len().saturating_sub(PATCH - 1);
+    for k in 0..kept {
+        sums[k] += sums[k + 1] + sums[k + 2];
+    }
+    sums.truncate(kept);
+}
+
+/// Largest sum over a patch, and the patch's centre; patches are `step` rows apart.
 fn brightest_patch<T: Copy>(
     pixels: &[T],
     width: usize,
@@ -105,25 +141,33 @@ fn brightest_patch<T: Copy>(
 where
     f32: From<T>,
 {
+    /// Columns looked at together.
+    const COLUMNS: usize = 256;
     if width < PATCH || height < PATCH {
         return None;
     }
     let (mut best, mut at) = (f32::NEG_INFINITY, (0, 0));
+    let mut sums = [0.0_f32; COLUMNS];
     for j in (0..=(height - PATCH)).step_by(step) {
-        let rows = [
-            pixels.get(j * width..)?,
-            pixels.get((j + 1) * width..)?,
-            pixels.get((j + 2) * width..)?,
-        ];
-        let columns = rows[0]
-            .windows(PATCH)
-            .zip(rows[1].windows(PATCH))
-            .zip(rows[2].windows(PATCH));
-        for (i, ((a, b), c)) in columns.enumerate().take(width - PATCH + 1).step_by(step) {
-            let add = |w: &[T]| w.iter().map(|v| f32::from(*v)).sum::<f32>();
-            let sum = sign * (add(a) + add(b) + add(c));
-            if sum > best {
-                (best, at) = (sum, (i + 1, j + 1));
+        for first in (0..=width - PATCH).step_by(COLUMNS - 2) {
+            let end = (first + COLUMNS).min(width);
+            let row = |k: usize| pixels.get((j + k) * width + first..(j + k) * width + end);
+            let columns = row(0)?.iter().zip(row(1)?).zip(row(2)?);
+            for (sum, ((a, b), c)) in sums.iter_mut().zip(columns) {
+                *sum = sign * (f32::from(*a) + f32::from(*b) + f32::from(*c));
+            }
+            let sums = &sums[..end - first];
+            let patches = || {
+                let three = sums.iter().zip(sums.get(1..)?).zip(sums.get(2..)?);
+                Some(three.map(|((a, b), c)| a + b + c))
+            };
+            let above = patches()?.fold(false, |any, sum| any | (sum > best));
+            if above {
+                for (i, sum) in patches()?.enumerate() {
+                    if sum > best {
+                        (best, at) = (sum, (first + i + 1, j + 1));
+                    }
+                }
             }
         }
     }

@@ -66,9 +66,13 @@ impl Regions {
         self.sum_patches(contrast, width);
         self.close();
         let (closed, columns) = (&self.closed, self.columns);
-        let at = |x: usize, y: usize| closed.get(y * columns + x).copied().unwrap_or(0.0);
+        let row = |y: usize, to: &mut [f32]| {
+            if let Some(from) = closed.get(y * columns..(y + 1) * columns) {
+                to.copy_from_slice(from);
+            }
+        };
         self.blobs
-            .label((columns, self.rows), threshold * threshold, 1.0, at);
+            .label((columns, self.rows), threshold * threshold, 1.0, row);
         self.bounds.clear();
         let strong = self
             .blobs
