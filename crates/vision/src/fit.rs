@@ -8,7 +8,7 @@
 use crate::crop::{Crop, LANES, Row, STRIDE};
 use crate::streak::Comb;
 use crate::template::Template;
-use nalgebra::{Matrix2, Matrix3, Matrix4, Vector2, Vector3, Vector4};
+use nalgebra::{Matrix2, Matrix3, Matrix4, Vector3, Vector4};
 use wide::f32x4;
 
 /// How the noise of a pixel depends on its grey level.
@@ -105,17 +105,17 @@ pub(crate) fn pass(
 }
 
 /// One row of the model's image and its derivatives by the centre.
-struct Image {
+pub(crate) struct Image {
     lanes_end: usize,
     entry: [u32; STRIDE],
     offset: Row,
-    value: Row,
-    by_x: Row,
-    by_y: Row,
+    pub value: Row,
+    pub by_x: Row,
+    pub by_y: Row,
 }
 
 impl Image {
-    fn new(lanes_end: usize) -> Self {
+    pub fn new(lanes_end: usize) -> Self {
         Image {
             lanes_end,
             entry: [0; STRIDE],
@@ -128,7 +128,7 @@ impl Image {
 
     /// The row `dy` px below the centre, which lies in the column `x`.
     #[inline(always)]
-    fn draw_row(&mut self, template: &Template, comb: &Comb, x: f32, dy: f32) {
+    pub fn draw_row(&mut self, template: &Template, comb: &Comb, x: f32, dy: f32) {
         let n = self.lanes_end;
         let mut first = true;
         for (ox, oy) in comb.offsets() {
@@ -273,145 +273,6 @@ pub(crate) fn scale(
     let change = solution[2] / solution[0];
     let sd = (inverse[(2, 2)] * variance).sqrt() / solution[0].abs();
     (change.is_finite() && sd.is_finite()).then_some((change, sd))
-}
-
-/// Side of the patches over which what the template leaves counts as one, px and bead radii: noise that a camera, a codec
-/// or a blur has spread, and what sticks to a bead, are alike over some pixels.
-const PATCH: (f64, f64) = (5.0, 0.5);
-/// Share of even noise's variance that is left in a patch of values between the pixels.
-const INTERPOLATED: f64 = 0.83;
-/// Most patches in a window.
-const MAX_PATCHES: usize = 256;
-
-/// By how much the variance of the position is larger than from noise of the even `variance` (grey^2), judged by what the
-/// template leaves of the window (a clustered sandwich): mean over the two directions. A residual that is the same all
-/// round, or on opposite sides of the centre, as a template of another focus or size leaves it, does not move the position
-/// and does not count. `None` for a window with the bead far off its middle.
-pub(crate) fn widening(
-    crop: &Crop,
-    template: &Template,
-    comb: &Comb,
-    (x_px, y_px): (f64, f64),
-    (amplitude, background): (f64, f64),
-    variance: f64,
-    left: &mut [Row],
-) -> Option<f64> {
-    let (x, y) = (
-        (x_px - crop.x0 as f64) as f32,
-        (y_px - crop.y0 as f64) as f32,
-    );
-    let (amplitude, background) = (amplitude as f32, background as f32);
-    let mut image = Image::new(crop.width.next_multiple_of(LANES).min(STRIDE));
-    for ((j, pixels), left) in crop
-        .rows
-        .iter()
-        .enumerate()
-        .zip(left.iter_mut())
-        .take(crop.height)
-    {
-        image.draw_row(template, comb, x, j as f32 - y);
-        for ((l, p), f) in left
-            .iter_mut()
-            .zip(pixels)
-            .zip(&image.value)
-            .take(crop.width)
-        {
-            *l = p - background - amplitude * f;
-        }
-    }
-    take_off_radial_mean(crop, (x, y), left);
-    // Points at whole distances from the centre: those opposite each other lie alike between the pixels.
-    let reach = |c: f32, len: usize| c.min(len as f32 - 1.0 - c).floor().max(0.0) as usize;
-    let (across, down) = (reach(x, crop.width), reach(y, crop.height));
-    if 2 * across + 1 < crop.width / 2 || 2 * down + 1 < crop.height / 2 {
-        return None;
-    }
-    let at = |u: f32, v: f32| -> f32 {
-        let (i, j) = (u as usize, v as usize);
-        let (a, b) = (u - i as f32, v - j as f32);
-        let get = |j: usize, i: usize| {
-            left.get(j)
-                .and_then(|row| row.get(i))
-                .copied()
-                .unwrap_or(0.0)
-        };
-        let (upper, lower) = (
-            get(j, i) + a * (get(j, i + 1) - get(j, i)),
-            get(j + 1, i) + a * (get(j + 1, i + 1) - get(j + 1, i)),
-        );
-        upper + b * (lower - upper)
-    };
-    let side = (PATCH.0.max(PATCH.1 * template.radius_px()) as usize)
-        .max((2 * across.max(down) + 1).div_ceil(15));
-    let columns = (2 * across + 1).div_ceil(side);
-    let mut patches = [Vector2::zeros(); MAX_PATCHES];
-    let mut information = Matrix2::zeros();
-    for n in 0..=2 * down {
-        let dy = n as f32 - down as f32;
-        image.draw_row(template, comb, across as f32, dy);
-        for m in 0..=2 * across {
-            let dx = m as f32 - across as f32;
-            let (Some(gx), Some(gy), Some(patch)) = (
-                image.by_x.get(m),
-                image.by_y.get(m),
-                patches.get_mut(n / side * columns + m / side),
-            ) else {
-                continue;
-            };
-            let g = Vector2::new(f64::from(*gx), f64::from(*gy));
-            information += g * g.transpose();
-            // Half the difference: the part that can move the position.
-            *patch += g * (0.5 * f64::from(at(x + dx, y + dy) - at(x - dx, y - dy)));
-        }
-    }
-    let mut scores = Matrix2::zeros();
-    let mut strongest = 0.0_f64;
-    for u in &patches {
-        scores += u * u.transpose();
-        strongest = strongest.max(u.norm_squared());
-    }
-    // Every patch has its opposite with the same score; the scores of a fit sum to zero, which takes some off.
-    let effective = (scores.trace() / strongest.max(1e-12)).max(4.0);
-    let scores = scores * (2.0 / INTERPOLATED * effective / (effective - 1.5));
-    let inverse = information.try_inverse()?;
-    let robust = inverse * scores * inverse;
-    let plain = inverse * variance;
-    let ratio = robust.trace() / plain.trace();
-    ratio.is_finite().then_some(ratio)
-}
-
-/// Takes the mean over each ring about the centre off what the template leaves: that of a template of another focus or size,
-/// which does not move the position.
-fn take_off_radial_mean(crop: &Crop, (x, y): (f32, f32), left: &mut [Row]) {
-    const RINGS: usize = 2 * STRIDE;
-    let place = |i: usize, j: usize| {
-        let u = f32::hypot(i as f32 - x, j as f32 - y);
-        (u as usize, u.fract())
-    };
-    let (mut sums, mut weights) = ([0.0_f32; RINGS], [0.0_f32; RINGS]);
-    for (j, row) in left.iter().enumerate().take(crop.height) {
-        for (i, v) in row.iter().enumerate().take(crop.width) {
-            let (k, t) = place(i, j);
-            if k + 1 < RINGS {
-                sums[k] += (1.0 - t) * v;
-                weights[k] += 1.0 - t;
-                sums[k + 1] += t * v;
-                weights[k + 1] += t;
-            }
-        }
-    }
-    for (sum, weight) in sums.iter_mut().zip(&weights) {
-        // A ring of few pixels would take their own noise off.
-        *sum = if *weight > 6.0 { *sum / weight } else { 0.0 };
-    }
-    for (j, row) in left.iter_mut().enumerate().take(crop.height) {
-        for (i, v) in row.iter_mut().enumerate().take(crop.width) {
-            let (k, t) = place(i, j);
-            if k + 1 < RINGS {
-                *v -= sums[k] + t * (sums[k + 1] - sums[k]);
-            }
-        }
-    }
 }
 
 /// Change of the comb's length, as a fraction of it, that fits the window best at a fixed position, beside amplitude and

@@ -19,6 +19,7 @@ pub mod many;
 mod objects;
 mod outline;
 pub mod profile;
+mod residue;
 mod seed;
 mod smooth;
 mod streak;

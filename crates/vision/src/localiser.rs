@@ -1,11 +1,12 @@
 //! Position of one bead in a frame: seed, template fit, covariance, verdict.
 
-use crate::config::{ConfigError, LocaliserConfig, MAX_WINDOW_PX, PixelNoise};
-use crate::crop::{Crop, Row, STRIDE};
+use crate::config::{ConfigError, LocaliserConfig, PixelNoise};
+use crate::crop::Crop;
 use crate::fit::{self, Pass, Weights};
 use crate::fix::{Fix, FixQuality};
 use crate::frame::Frame;
 use crate::learn::{Learner, LearningReport};
+use crate::residue::Residues;
 use crate::seed;
 use crate::streak::Comb;
 use crate::template::Template;
@@ -32,8 +33,6 @@ const MAX_OTHERS: usize = 8;
 const NOISE_FORGETTING: f64 = 1.0 / 64.0;
 /// Residual ratio from which the variance is judged by the residual: noise alone does not reach it.
 const WIDENED_RATIO: f64 = 1.3;
-/// Share of a new fix in the running widening.
-const WIDENING_FORGETTING: f64 = 1.0 / 16.0;
 /// Variance of rounding to whole grey levels, grey^2: the least that a pixel's noise can be.
 const ROUNDING_VARIANCE: f64 = 1.0 / 12.0;
 
@@ -54,10 +53,8 @@ pub struct Localiser {
     /// Way of the bead during the exposure, expected and in use (px).
     streak_px: (f64, f64),
     comb: Comb,
-    /// Running ratio of the position's variance to that from even noise; 0 before the first fix.
-    widening: f64,
-    /// Room for what the template leaves of a window.
-    left: Box<[Row; MAX_WINDOW_PX]>,
+    /// What the template leaves of the beads' windows.
+    residues: Residues,
     /// Beads taken off the window: x, y, amplitude.
     others: [(f64, f64, f64); MAX_OTHERS],
 }
@@ -90,10 +87,14 @@ impl Localiser {
             learner,
             streak_px: (0.0, 0.0),
             comb: Comb::STILL,
-            widening: 0.0,
-            left: Box::new([[0.0; STRIDE]; MAX_WINDOW_PX]),
+            residues: Residues::new(),
             others: [(0.0, 0.0, 0.0); MAX_OTHERS],
         })
+    }
+
+    /// Makes room to remember how so many beads look: what stays of a bead's look does not scatter its position.
+    pub fn remember_beads(&mut self, beads: usize) {
+        self.residues.reserve(beads);
     }
 
     /// The settings.
@@ -252,7 +253,7 @@ impl Localiser {
         if fix.verdict != FixQuality::Good || fix.residual_ratio <= WIDENED_RATIO {
             return;
         }
-        let now = fit::widening(
+        let widening = self.residues.widening(
             &self.crop,
             &self.template,
             &self.comb,
@@ -261,20 +262,25 @@ impl Localiser {
                 fix.amplitude,
                 fix.background - f64::from(self.crop.pedestal),
             ),
-            self.weight_unit(),
-            self.left.as_mut_slice(),
-        )
-        .unwrap_or(fix.residual_ratio);
-        // One window has few patches: the mean over the last fixes is surer. The first is taken as it is.
-        self.widening = if self.widening > 0.0 {
-            self.widening + WIDENING_FORGETTING * (now - self.widening)
-        } else {
-            now
-        };
-        let widening = self.widening.max(1.0);
+            self.pixel_variance(fix.background),
+        );
+        let widening = widening.unwrap_or(fix.residual_ratio).max(1.0);
         fix.var_x_px2 *= widening;
         fix.var_y_px2 *= widening;
         fix.cov_xy_px2 *= widening;
+    }
+
+    /// Noise variance of a pixel at a grey level, grey^2.
+    fn pixel_variance(&self, grey: f64) -> f64 {
+        let shot = match self.config.noise {
+            PixelNoise::Known {
+                shot_grey_per_electron: gain,
+                black_level_grey: black,
+                ..
+            } => gain * (grey - black).max(0.0),
+            PixelNoise::Estimated => 0.0,
+        };
+        self.noise_variance.unwrap_or(1.0) + shot
     }
 
     /// Refines the length of a streak beside the position. By symmetry the two do not depend on each other, so that they

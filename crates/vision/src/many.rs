@@ -9,6 +9,9 @@ use crate::fix::{Fix, FixQuality};
 use crate::frame::Frame;
 use crate::localiser::Localiser;
 
+/// Most beads whose look is remembered.
+const MOST_REMEMBERED: usize = 2000;
+
 /// How beads are linked from frame to frame.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct LinkConfig {
@@ -52,7 +55,8 @@ pub struct ManyTracker {
 
 impl ManyTracker {
     /// A tracker without beads.
-    pub fn new(localiser: Localiser, config: LinkConfig) -> Self {
+    pub fn new(mut localiser: Localiser, config: LinkConfig) -> Self {
+        localiser.remember_beads(config.max_beads.min(MOST_REMEMBERED));
         let detector = Detector::thorough(&localiser, config.max_beads);
         ManyTracker {
             config,

@@ -218,3 +218,62 @@ fn a_size_given_a_fifth_too_large_or_too_small_is_put_right_by_learning() {
         assert!(seen >= 238, "{factor}: {seen}");
     }
 }
+
+#[test]
+#[cfg_attr(no_shared_data, ignore = "needs ../shared/data/beads-brightfield")]
+fn every_other_pixel_of_measured_beads_shows_them_half_a_pixel_further_as_well_as_is_stated() {
+    // Four pictures out of each: every other column and row, from the first or the second on. Their noise is independent and
+    // the way from one to the next is known.
+    let stack = beads();
+    let (width, height) = (stack.width / 2, stack.height / 2);
+    let starts = [(0, 0), (1, 0), (1, 1), (0, 1)];
+    let mut thinned = Stack {
+        width,
+        height,
+        pages: Vec::new(),
+    };
+    for page in &stack.pages {
+        for (dx, dy) in starts {
+            let pixel =
+                |k: usize| page[(2 * (k / width) + dy) * stack.width + 2 * (k % width) + dx];
+            thinned.pages.push((0..width * height).map(pixel).collect());
+        }
+    }
+    let found = suggestion(&thinned);
+    let link = LinkConfig {
+        max_step_px: 6.0,
+        memory_frames: 3,
+        max_beads: 20,
+    };
+    let mut tracker = ManyTracker::new(Localiser::new(found.config).unwrap(), link);
+    let (mut error2, mut stated2, mut count, mut lies) = (0.0, 0.0, 0.0, 0);
+    let mut before: Vec<cellpos_vision::Sight> = Vec::new();
+    for (n, frame) in thinned.frames().enumerate() {
+        let sights: Vec<_> = tracker.step(&frame).to_vec();
+        // After ten pictures each bead is known.
+        for s in sights.iter().filter(|_| !n.is_multiple_of(4) && n >= 40) {
+            let Some(b) = before.iter().find(|b| b.bead == s.bead) else {
+                continue;
+            };
+            let ((ax, ay), (bx, by)) = (starts[(n - 1) % 4], starts[n % 4]);
+            let way = |from: usize, to: usize| 0.5 * (from as f64 - to as f64);
+            let ex = s.fix.x_px - b.fix.x_px - way(ax, bx);
+            let ey = s.fix.y_px - b.fix.y_px - way(ay, by);
+            let stated = (
+                s.fix.var_x_px2 + b.fix.var_x_px2,
+                s.fix.var_y_px2 + b.fix.var_y_px2,
+            );
+            error2 += ex * ex + ey * ey;
+            stated2 += stated.0 + stated.1;
+            count += 1.0;
+            lies += usize::from(ex * ex > 25.0 * stated.0 || ey * ey > 25.0 * stated.1);
+        }
+        before = sights;
+    }
+    let ratio = (error2 / stated2).sqrt();
+    println!(
+        "{count} steps of half a pixel: error {:.4} px a fix, over stated {ratio:.2}, {lies} beyond five standard deviations",
+        (error2 / count / 4.0).sqrt()
+    );
+    assert!(count > 500.0 && lies == 0 && (0.5..1.5).contains(&ratio));
+}

@@ -1,0 +1,281 @@
+//! What the template leaves of a bead's windows, and by how much that widens the variance of its position.
+//!
+//! The part of it that stays from fix to fix is the look of the bead: it offsets its centre by a constant and scatters
+//! nothing. The part that changes is noise that is more, or wider, than the pixels' own, something that turns with the bead
+//! or that the bead passes, and the pixel lattice under a template that is not quite right.
+
+use crate::config::MAX_WINDOW_PX;
+use crate::crop::{Crop, LANES, Row, STRIDE};
+use crate::fit::Image;
+use crate::streak::Comb;
+use crate::template::Template;
+use nalgebra::{Matrix2, Vector2};
+
+/// Side of the patches over which what the template leaves counts as one, px and bead radii: noise that a camera, a codec
+/// or a blur has spread, and what sticks to a bead, are alike over some pixels.
+const PATCH: (f64, f64) = (5.0, 0.5);
+/// Share of even noise's variance that is left in a patch of values between the pixels.
+const INTERPOLATED: f64 = 0.83;
+/// Most patches in a window.
+const MAX_PATCHES: usize = 256;
+/// Share of a new fix in the running widening, and in a bead's running look.
+const WIDENING_FORGETTING: f64 = 1.0 / 16.0;
+const LOOK_FORGETTING: f64 = 1.0 / 64.0;
+/// A fix this near to a bead's last one is of that bead, bead radii: beads do not overlap.
+const SAME_RADII: f64 = 2.0;
+/// Beads remembered when nobody says how many there are: the followed one and its neighbours.
+const FEW_BEADS: usize = 12;
+
+/// One vector a patch: what its pixels add to the score of the position, relative to the bead's contrast.
+type Scores = [[f32; 2]; MAX_PATCHES];
+
+/// A bead's look.
+#[derive(Debug, Clone)]
+struct Look {
+    x_px: f64,
+    y_px: f64,
+    used: u64,
+    fixes: u32,
+    /// Half the window that the scores are from: of another one they are not comparable.
+    half: usize,
+    mean: Scores,
+    widening: f64,
+}
+
+impl Look {
+    /// Of a bead that is nowhere.
+    const NONE: Look = Look {
+        x_px: f64::NAN,
+        y_px: f64::NAN,
+        used: 0,
+        fixes: 0,
+        half: 0,
+        mean: [[0.0; 2]; MAX_PATCHES],
+        widening: 0.0,
+    };
+}
+
+/// The looks of the beads, and room to work.
+#[derive(Debug, Clone)]
+pub(crate) struct Residues {
+    looks: Vec<Look>,
+    fixes: u64,
+    left: Box<[Row; MAX_WINDOW_PX]>,
+}
+
+impl Residues {
+    pub fn new() -> Self {
+        Residues {
+            looks: vec![Look::NONE; FEW_BEADS],
+            fixes: 0,
+            left: Box::new([[0.0; STRIDE]; MAX_WINDOW_PX]),
+        }
+    }
+
+    /// Makes room for the looks of so many beads.
+    pub fn reserve(&mut self, beads: usize) {
+        let room = beads.max(self.looks.len());
+        self.looks.resize(room, Look::NONE);
+    }
+
+    /// By how much the variance of the position is larger than from noise of the even `variance` (grey^2), judged by what
+    /// the template leaves of this window and has left of the bead's windows before. `None` for a window with the bead far
+    /// off its middle. Allocates nothing.
+    pub fn widening(
+        &mut self,
+        crop: &Crop,
+        template: &Template,
+        comb: &Comb,
+        at: (f64, f64),
+        (amplitude, background): (f64, f64),
+        variance: f64,
+    ) -> Option<f64> {
+        let half = crop.width.max(crop.height) / 2;
+        let (scores, inverse) = self.scores(crop, template, comb, at, (amplitude, background))?;
+        let relative = variance / (amplitude * amplitude);
+        let reach_px = SAME_RADII * template.radius_px();
+        let look = self.look(at, reach_px, half);
+        let known = f64::from(look.fixes);
+        // The mean so far has an error of its own: of n fixes 1/n of their variance.
+        let forgetting = (1.0 / (known + 1.0)).max(LOOK_FORGETTING);
+        let own = if look.fixes == 0 {
+            1.0
+        } else {
+            1.0 + forgetting
+        };
+        let now = widening_of(&scores, &look.mean, inverse, relative * own)?;
+        // One window has few patches: the mean over the last fixes is surer. The first says nothing of what stays.
+        let share = (1.0 / known.max(1.0)).max(WIDENING_FORGETTING);
+        look.widening += share * (now - look.widening);
+        for (mean, score) in look.mean.iter_mut().zip(&scores) {
+            for (m, s) in mean.iter_mut().zip(score) {
+                *m += forgetting as f32 * (s - *m);
+            }
+        }
+        look.fixes = look.fixes.saturating_add(1);
+        Some(look.widening)
+    }
+
+    /// The look of the bead at a place: the one of the nearest fix before, or a new one in place of that unused for longest.
+    fn look(&mut self, (x_px, y_px): (f64, f64), reach_px: f64, half: usize) -> &mut Look {
+        self.fixes += 1;
+        let away = |look: &Look| f64::hypot(look.x_px - x_px, look.y_px - y_px);
+        let near = (self.looks.iter().enumerate())
+            .filter(|(_, look)| look.half == half && away(look) < reach_px)
+            .min_by(|a, b| away(a.1).total_cmp(&away(b.1)))
+            .map(|(k, _)| k);
+        let oldest = || (self.looks.iter().enumerate()).min_by_key(|(_, look)| look.used);
+        let k = near.or_else(|| oldest().map(|(k, _)| k)).unwrap_or(0);
+        if near.is_none() {
+            self.looks[k] = Look { half, ..Look::NONE };
+        }
+        let look = &mut self.looks[k];
+        (look.x_px, look.y_px, look.used) = (x_px, y_px, self.fixes);
+        look
+    }
+
+    /// The patches' scores, and the inverse of the information about the position, both for a contrast of 1. A residual that
+    /// is the same all round, or on opposite sides of the centre, as a template of another focus or size leaves it, does
+    /// not move the position and does not count.
+    fn scores(
+        &mut self,
+        crop: &Crop,
+        template: &Template,
+        comb: &Comb,
+        (x_px, y_px): (f64, f64),
+        (amplitude, background): (f64, f64),
+    ) -> Option<(Scores, Matrix2<f64>)> {
+        let left = self.left.as_mut_slice();
+        let (x, y) = (
+            (x_px - crop.x0 as f64) as f32,
+            (y_px - crop.y0 as f64) as f32,
+        );
+        let (amplitude, background) = (amplitude as f32, background as f32);
+        let mut image = Image::new(crop.width.next_multiple_of(LANES).min(STRIDE));
+        for ((j, pixels), left) in crop
+            .rows
+            .iter()
+            .enumerate()
+            .zip(left.iter_mut())
+            .take(crop.height)
+        {
+            image.draw_row(template, comb, x, j as f32 - y);
+            for ((l, p), f) in left
+                .iter_mut()
+                .zip(pixels)
+                .zip(&image.value)
+                .take(crop.width)
+            {
+                *l = p - background - amplitude * f;
+            }
+        }
+        take_off_radial_mean(crop, (x, y), left);
+        // Points at whole distances from the centre: those opposite each other lie alike between the pixels.
+        let reach = |c: f32, len: usize| c.min(len as f32 - 1.0 - c).floor().max(0.0) as usize;
+        let (across, down) = (reach(x, crop.width), reach(y, crop.height));
+        if 2 * across + 1 < crop.width / 2 || 2 * down + 1 < crop.height / 2 {
+            return None;
+        }
+        let at = |u: f32, v: f32| -> f32 {
+            let (i, j) = (u as usize, v as usize);
+            let (a, b) = (u - i as f32, v - j as f32);
+            let get = |j: usize, i: usize| {
+                left.get(j)
+                    .and_then(|row| row.get(i))
+                    .copied()
+                    .unwrap_or(0.0)
+            };
+            let (upper, lower) = (
+                get(j, i) + a * (get(j, i + 1) - get(j, i)),
+                get(j + 1, i) + a * (get(j + 1, i + 1) - get(j + 1, i)),
+            );
+            upper + b * (lower - upper)
+        };
+        // Counted from the centre, so that a patch is the same part of the bead in every window.
+        let half = crop.width.max(crop.height) / 2 + 1;
+        let side =
+            (PATCH.0.max(PATCH.1 * template.radius_px()) as usize).max((2 * half + 1).div_ceil(15));
+        let columns = (2 * half + 1).div_ceil(side);
+        let mut patches = [[0.0; 2]; MAX_PATCHES];
+        let mut information = Matrix2::zeros();
+        for n in 0..=2 * down {
+            let dy = n as f32 - down as f32;
+            image.draw_row(template, comb, across as f32, dy);
+            for m in 0..=2 * across {
+                let dx = m as f32 - across as f32;
+                let (Some(gx), Some(gy), Some(patch)) = (
+                    image.by_x.get(m),
+                    image.by_y.get(m),
+                    patches
+                        .get_mut((n + half - down) / side * columns + (m + half - across) / side),
+                ) else {
+                    continue;
+                };
+                let g = Vector2::new(f64::from(*gx), f64::from(*gy));
+                information += g * g.transpose();
+                // Half the difference: the part that can move the position.
+                let odd = 0.5 / amplitude * (at(x + dx, y + dy) - at(x - dx, y - dy));
+                patch[0] += odd * gx;
+                patch[1] += odd * gy;
+            }
+        }
+        Some((patches, information.try_inverse()?))
+    }
+}
+
+/// The clustered sandwich: what the patches' scores scatter the position by, over what noise of `variance` does; the mean of
+/// the two directions.
+fn widening_of(
+    scores: &Scores,
+    mean: &Scores,
+    inverse: Matrix2<f64>,
+    variance: f64,
+) -> Option<f64> {
+    let mut sum = Matrix2::zeros();
+    let mut strongest = 0.0_f64;
+    for (score, mean) in scores.iter().zip(mean) {
+        let u = Vector2::new(f64::from(score[0] - mean[0]), f64::from(score[1] - mean[1]));
+        sum += u * u.transpose();
+        strongest = strongest.max(u.norm_squared());
+    }
+    // Every patch has its opposite with the same score; the scores of a fit sum to zero, which takes some off.
+    let effective = (sum.trace() / strongest.max(1e-24)).max(4.0);
+    let sum = sum * (2.0 / INTERPOLATED * effective / (effective - 1.5));
+    let robust = inverse * sum * inverse;
+    let ratio = robust.trace() / (inverse * variance).trace();
+    ratio.is_finite().then_some(ratio)
+}
+
+/// Takes the mean over each ring about the centre off what the template leaves: that of a template of another focus or size,
+/// which does not move the position.
+fn take_off_radial_mean(crop: &Crop, (x, y): (f32, f32), left: &mut [Row]) {
+    const RINGS: usize = 2 * STRIDE;
+    let place = |i: usize, j: usize| {
+        let u = f32::hypot(i as f32 - x, j as f32 - y);
+        (u as usize, u.fract())
+    };
+    let (mut sums, mut weights) = ([0.0_f32; RINGS], [0.0_f32; RINGS]);
+    for (j, row) in left.iter().enumerate().take(crop.height) {
+        for (i, v) in row.iter().enumerate().take(crop.width) {
+            let (k, t) = place(i, j);
+            if k + 1 < RINGS {
+                sums[k] += (1.0 - t) * v;
+                weights[k] += 1.0 - t;
+                sums[k + 1] += t * v;
+                weights[k + 1] += t;
+            }
+        }
+    }
+    for (sum, weight) in sums.iter_mut().zip(&weights) {
+        // A ring of few pixels would take their own noise off.
+        *sum = if *weight > 6.0 { *sum / weight } else { 0.0 };
+    }
+    for (j, row) in left.iter_mut().enumerate().take(crop.height) {
+        for (i, v) in row.iter_mut().enumerate().take(crop.width) {
+            let (k, t) = place(i, j);
+            if k + 1 < RINGS {
+                *v -= sums[k] + t * (sums[k + 1] - sums[k]);
+            }
+        }
+    }
+}
