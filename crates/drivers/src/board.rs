@@ -1,13 +1,13 @@
 //! The host's side of the conversation with the PZT board, on any byte port.
 
+use crate::outbox::{Kind, Outbox};
 use cellpos_link::{
-    Arm, BoardState, Command, Decoder, Fault, Identity, Limits, MAX_FRAME, Message,
-    PROTOCOL_VERSION, Refusal, Request, Status, ToBoard, ToHost, encode, picometres,
-    um_from_picometres,
+    Arm, BoardState, Command, Decoder, Fault, Identity, Limits, MAX_FRAME, Order, PROTOCOL_VERSION,
+    Refusal, Request, Status, ToBoard, ToHost, encode, order, picometres, um_from_picometres,
 };
 use cellpos_rig::{
     Actuator, ActuatorError, ActuatorFault, ActuatorInfo, ActuatorReport, ActuatorState,
-    ArmRequest, Clock,
+    ArmRequest, Clock, CommandAccount,
 };
 use std::time::Duration;
 
@@ -15,15 +15,15 @@ use std::time::Duration;
 pub trait Port: Send {
     /// Name, for messages.
     fn name(&self) -> &str;
-    /// Writes all bytes.
+    /// Writes as many of the bytes as the line takes now, and says how many: 0 when it takes none.
     ///
     /// # Errors
-    /// The line is broken, or did not take the bytes in a reasonable time.
-    fn write_all(&mut self, bytes: &[u8]) -> std::io::Result<()>;
+    /// The line is gone; a later call may find it again.
+    fn write_some(&mut self, bytes: &[u8]) -> std::io::Result<usize>;
     /// Reads what is there, at most `buffer.len()` bytes; 0 when nothing is.
     ///
     /// # Errors
-    /// The line is broken.
+    /// The line is gone; a later call may find it again.
     fn read_available(&mut self, buffer: &mut [u8]) -> std::io::Result<usize>;
 }
 
@@ -32,8 +32,8 @@ impl<P: Port + ?Sized> Port for Box<P> {
         (**self).name()
     }
 
-    fn write_all(&mut self, bytes: &[u8]) -> std::io::Result<()> {
-        (**self).write_all(bytes)
+    fn write_some(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
+        (**self).write_some(bytes)
     }
 
     fn read_available(&mut self, buffer: &mut [u8]) -> std::io::Result<usize> {
@@ -108,10 +108,16 @@ pub struct BoardHost<P> {
     port: P,
     clock: Clock,
     decoder: Decoder<ToHost>,
+    outbox: Outbox,
     identity: Identity,
     session: u16,
     seq: u32,
     first_seq: u32,
+    account: CommandAccount,
+    /// Newest command that a status of this session has named as obeyed.
+    answered_seq: Option<u32>,
+    /// Commands of earlier sessions that the line did not take.
+    not_taken_before: u64,
     newest: Option<ActuatorReport>,
 }
 
@@ -125,6 +131,7 @@ impl<P: Port> BoardHost<P> {
             port,
             clock,
             decoder: Decoder::new(),
+            outbox: Outbox::default(),
             identity: Identity {
                 protocol: 0,
                 firmware: [0; 3],
@@ -143,6 +150,9 @@ impl<P: Port> BoardHost<P> {
             session: 0,
             seq: 0,
             first_seq: 0,
+            account: CommandAccount::default(),
+            answered_seq: None,
+            not_taken_before: 0,
             newest: None,
         };
         let hello = ToBoard::Hello {
@@ -174,6 +184,11 @@ impl<P: Port> BoardHost<P> {
         &self.identity
     }
 
+    /// The port.
+    pub fn port_mut(&mut self) -> &mut P {
+        &mut self.port
+    }
+
     /// Frames from the board that could not be read.
     pub fn bad_frames(&self) -> u32 {
         self.decoder.bad_frames()
@@ -184,7 +199,7 @@ impl<P: Port> BoardHost<P> {
     /// # Errors
     /// The line is broken.
     pub fn led(&mut self, on: bool) -> Result<(), ActuatorError> {
-        self.send(&ToBoard::Led { on })
+        self.order(&ToBoard::Led { on })
     }
 
     /// Sends a ping and waits for its answer; gives the round trip and the board's time (us since its start), `None` when no
@@ -248,14 +263,53 @@ impl<P: Port> BoardHost<P> {
         }
     }
 
-    fn send<M: Message>(&mut self, message: &M) -> Result<(), ActuatorError> {
+    /// Puts a message on its way; whether the line has taken all of it.
+    fn send(&mut self, message: &ToBoard) -> Result<bool, ActuatorError> {
         let mut wire = [0; MAX_FRAME];
         // The longest message fits by the link's own bound; an encoding error would be a defect of the link.
         let length = encode(message, &mut wire)
             .map_err(|error| self.line_error("encoding a message", std::io::Error::other(error)))?;
-        self.port
-            .write_all(&wire[..length])
+        let kind = match message {
+            ToBoard::Command(_) => Kind::Command,
+            _ => Kind::Order,
+        };
+        self.outbox.put(&wire, length, kind);
+        self.flush()
+    }
+
+    fn flush(&mut self) -> Result<bool, ActuatorError> {
+        self.outbox
+            .push(&mut self.port)
             .map_err(|error| self.line_error("writing", error))
+    }
+
+    /// Sends what must reach the board: waits for a line that takes nothing, and leaves the message to
+    /// [`Actuator::poll`] when that takes longer than an answer may.
+    fn order(&mut self, message: &ToBoard) -> Result<(), ActuatorError> {
+        let give_up_ns = self.clock.now_ns() + ANSWER_WITHIN.as_nanos() as i64;
+        let mut sent = self.send(message)?;
+        while !sent && self.clock.now_ns() < give_up_ns {
+            self.clock.sleep(Duration::from_micros(200));
+            sent = self.flush()?;
+        }
+        Ok(())
+    }
+
+    /// Counts the commands of this session that the board has obeyed, by the numbers that its reports name.
+    fn answered(&mut self, status: &Status) {
+        let Some(seq) = status.last_seq.filter(|_| status.session == self.session) else {
+            return;
+        };
+        let passed_over = match self.answered_seq {
+            None => seq.wrapping_sub(self.first_seq),
+            Some(last) => match order(last, seq) {
+                Order::Newer { skipped } => skipped,
+                Order::Same | Order::Older => return,
+            },
+        };
+        self.account.answered += 1;
+        self.account.passed_over += u64::from(passed_over);
+        self.answered_seq = Some(seq);
     }
 
     fn note(&mut self, status: &Status) -> ActuatorReport {
@@ -294,6 +348,7 @@ impl<P: Port> BoardHost<P> {
             let mut found = None;
             while let Some(message) = self.decoder.next_message(&mut bytes) {
                 if let ToHost::Status(status) = &message {
+                    self.answered(status);
                     self.note(status);
                 }
                 found = found.or_else(|| each(message));
@@ -388,6 +443,8 @@ impl<P: Port> Actuator for BoardHost<P> {
             }),
             ..Arm::session(request.session)
         };
+        (self.account, self.answered_seq) = (CommandAccount::default(), None);
+        self.not_taken_before = self.outbox.not_taken();
         self.session = request.session;
         self.seq = self.first_seq;
         self.ask(&ToBoard::Arm(arm), Request::Arm, |answer| match answer {
@@ -429,24 +486,36 @@ impl<P: Port> Actuator for BoardHost<P> {
             neutral_pm,
         };
         self.seq = self.seq.wrapping_add(1);
-        self.send(&ToBoard::Command(command))
+        self.account.commands += 1;
+        self.send(&ToBoard::Command(command)).map(|_| ())
     }
 
     fn freeze(&mut self) -> Result<(), ActuatorError> {
-        self.send(&ToBoard::Freeze)
+        self.order(&ToBoard::Freeze)
     }
 
     fn park(&mut self) -> Result<(), ActuatorError> {
-        self.send(&ToBoard::Park)
+        self.order(&ToBoard::Park)
     }
 
     fn disarm(&mut self) -> Result<(), ActuatorError> {
-        self.send(&ToBoard::Disarm)
+        self.order(&ToBoard::Disarm)
     }
 
     fn poll(&mut self) -> Result<Option<ActuatorReport>, ActuatorError> {
         self.newest = None;
+        if !self.outbox.is_empty() {
+            self.flush()?;
+        }
         self.receive(|_| None::<()>)?;
         Ok(self.newest.take())
+    }
+
+    fn account(&self) -> Option<CommandAccount> {
+        let not_taken = self.outbox.not_taken() - self.not_taken_before;
+        Some(CommandAccount {
+            not_taken,
+            ..self.account
+        })
     }
 }

@@ -4,7 +4,9 @@
 //! tracker asks, one camera delay later, what flow was commanded between two exposures. Written by the actuator thread
 //! and read by the camera thread, behind a lock that either holds for less than a microsecond; never used in a tick.
 
-use cellpos_rig::actuator::{Actuator, ActuatorError, ActuatorInfo, ActuatorReport, ArmRequest};
+use cellpos_rig::actuator::{
+    Actuator, ActuatorError, ActuatorInfo, ActuatorReport, ArmRequest, CommandAccount,
+};
 use cellpos_rig::clock::Clock;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
@@ -114,6 +116,10 @@ impl<A: Actuator> Actuator for FlowTap<A> {
 
     fn arm(&mut self, request: &ArmRequest) -> Result<ActuatorReport, ActuatorError> {
         self.inner.arm(request)
+    }
+
+    fn account(&self) -> Option<CommandAccount> {
+        self.inner.account()
     }
 
     fn command(

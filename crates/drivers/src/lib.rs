@@ -22,6 +22,7 @@ pub mod board;
 pub mod calibration;
 pub mod calibration_file;
 pub mod flow;
+mod outbox;
 pub mod serial;
 pub mod socket;
 pub mod sources;

@@ -1,16 +1,31 @@
 //! The PZT board on a serial port (a real one, a USB adapter, or a pseudo-terminal).
 
 use crate::board::Port;
-use serialport::{SerialPort, TTYPort};
-use std::io::{Error, ErrorKind, Read, Write};
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
+use rustix::fs::{FlockOperation, Mode, OFlags, flock};
+use rustix::io::Errno;
+use rustix::termios::{
+    ControlModes, InputModes, OptionalActions, QueueSelector, ioctl_tiocexcl, tcflush, tcgetattr,
+    tcsetattr,
+};
+use std::io::{Error, ErrorKind};
+use std::os::fd::OwnedFd;
 use std::path::Path;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
-/// An open serial port.
+/// How long a line that takes nothing is waited for, ns: half a period of the loop, so that the answers that arrive meanwhile
+/// are still read in the period of their command.
+const WAIT_NS: i64 = 500_000;
+/// How often a line that is gone is looked for: opening a USB port takes milliseconds.
+const LOOK_EVERY: Duration = Duration::from_millis(20);
+
+/// An open serial port. One that was unplugged is opened again once it is back.
 #[derive(Debug)]
 pub struct SerialLine {
-    port: TTYPort,
+    port: Option<OwnedFd>,
     name: String,
+    baud: u32,
+    looked: Instant,
 }
 
 impl SerialLine {
@@ -19,16 +34,11 @@ impl SerialLine {
     /// # Errors
     /// The port does not exist, is in use, or is no serial port.
     pub fn open(path: &str, baud: u32) -> std::io::Result<Self> {
-        let port = serialport::new(path, baud)
-            // Reads return at once; see `read_available`.
-            .timeout(Duration::from_millis(1))
-            .open_native()
-            .map_err(Error::from)?;
-        port.clear(serialport::ClearBuffer::All)
-            .map_err(Error::from)?;
         Ok(Self {
-            port,
+            port: Some(open(path, baud)?),
             name: path.to_string(),
+            baud,
+            looked: Instant::now(),
         })
     }
 
@@ -41,6 +51,41 @@ impl SerialLine {
             .join("latency_timer");
         std::fs::read_to_string(timer).ok()?.trim().parse().ok()
     }
+
+    /// The port, opened again if it was gone.
+    fn port(&mut self) -> std::io::Result<&OwnedFd> {
+        if self.port.is_none() && self.looked.elapsed() >= LOOK_EVERY {
+            self.looked = Instant::now();
+            self.port = open(&self.name, self.baud).ok();
+        }
+        self.port
+            .as_ref()
+            .ok_or_else(|| Error::new(ErrorKind::NotConnected, "the port is gone"))
+    }
+
+    fn gone(&mut self, error: impl Into<Error>) -> Error {
+        self.port = None;
+        self.looked = Instant::now();
+        error.into()
+    }
+}
+
+/// Raw mode: 8 data bits, no parity, one stop bit, no flow control; nothing blocks.
+fn open(path: &str, baud: u32) -> std::io::Result<OwnedFd> {
+    let flags = OFlags::RDWR | OFlags::NOCTTY | OFlags::NONBLOCK | OFlags::CLOEXEC;
+    let port = rustix::fs::open(path, flags, Mode::empty())?;
+    let mut settings = tcgetattr(&port)?;
+    // The first keeps other programs out, the second those of the superuser.
+    ioctl_tiocexcl(&port)?;
+    flock(&port, FlockOperation::NonBlockingLockExclusive)?;
+    settings.make_raw();
+    settings.input_modes -= InputModes::IXON | InputModes::IXOFF | InputModes::IXANY;
+    settings.control_modes -= ControlModes::CSTOPB | ControlModes::CRTSCTS;
+    settings.control_modes |= ControlModes::CREAD | ControlModes::CLOCAL;
+    settings.set_speed(baud)?;
+    tcsetattr(&port, OptionalActions::Now, &settings)?;
+    tcflush(&port, QueueSelector::IOFlush)?;
+    Ok(port)
 }
 
 impl Port for SerialLine {
@@ -48,22 +93,35 @@ impl Port for SerialLine {
         &self.name
     }
 
-    fn write_all(&mut self, bytes: &[u8]) -> std::io::Result<()> {
-        self.port.write_all(bytes)
+    fn write_some(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
+        let port = self.port()?;
+        // Written first and waited for afterwards: a USB line says that it is not writable while a transfer is in flight, and
+        // takes the next one all the same.
+        let taken = match rustix::io::write(port, bytes) {
+            Err(Errno::AGAIN) => {
+                let span = Timespec {
+                    tv_sec: 0,
+                    tv_nsec: WAIT_NS,
+                };
+                let _ = poll(&mut [PollFd::new(port, PollFlags::OUT)], Some(&span));
+                rustix::io::write(port, bytes)
+            }
+            taken => taken,
+        };
+        match taken {
+            Ok(taken) => Ok(taken),
+            Err(Errno::AGAIN | Errno::INTR) => Ok(0),
+            Err(error) => Err(self.gone(error)),
+        }
     }
 
     fn read_available(&mut self, buffer: &mut [u8]) -> std::io::Result<usize> {
-        let waiting = self.port.bytes_to_read().map_err(Error::from)? as usize;
-        if waiting == 0 {
-            return Ok(0);
-        }
-        let most = waiting.min(buffer.len());
-        match self.port.read(&mut buffer[..most]) {
+        match rustix::io::read(self.port()?, buffer) {
+            // A terminal that has nothing says AGAIN; the end of the file is the end of the line.
+            Ok(0) => Err(self.gone(ErrorKind::UnexpectedEof)),
             Ok(length) => Ok(length),
-            Err(error) if matches!(error.kind(), ErrorKind::TimedOut | ErrorKind::Interrupted) => {
-                Ok(0)
-            }
-            Err(error) => Err(error),
+            Err(Errno::AGAIN | Errno::INTR) => Ok(0),
+            Err(error) => Err(self.gone(error)),
         }
     }
 }
@@ -71,27 +129,83 @@ impl Port for SerialLine {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
+    use rustix::termios::{Action, tcflow};
+    use std::os::unix::fs::symlink;
+    use std::path::PathBuf;
 
-    #[test]
-    fn bytes_cross_a_pseudo_terminal_and_an_empty_line_reads_nothing() {
-        let (mut far, near) = TTYPort::pair().expect("this system has pseudo-terminals");
-        let mut line = SerialLine {
-            port: near,
-            name: "pty".to_string(),
-        };
-        let mut buffer = [0; 16];
-        assert_eq!(line.read_available(&mut buffer).expect("open"), 0);
-        far.write_all(&[0, 1, 255]).expect("open");
-        while line.port.bytes_to_read().expect("open") < 3 {
-            std::thread::yield_now();
+    /// The board's end of a pseudo-terminal, in raw mode once the line is open, and the path of the host's.
+    fn pair() -> (OwnedFd, String) {
+        let flags = OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC;
+        let far = openpt(flags).expect("this system has pseudo-terminals");
+        grantpt(&far).expect("granted");
+        unlockpt(&far).expect("unlocked");
+        let name = ptsname(&far, Vec::new()).expect("a name");
+        (far, name.to_string_lossy().into_owned())
+    }
+
+    fn read_all(line: &mut SerialLine, count: usize) -> Vec<u8> {
+        let until = Instant::now() + Duration::from_secs(5);
+        let (mut all, mut buffer) = (Vec::new(), [0; 16]);
+        while all.len() < count && Instant::now() < until {
+            let length = line.read_available(&mut buffer).expect("open");
+            all.extend_from_slice(&buffer[..length]);
         }
-        assert_eq!(line.read_available(&mut buffer).expect("open"), 3);
-        assert_eq!(buffer[..3], [0, 1, 255]);
+        all
     }
 
     #[test]
-    fn a_port_that_does_not_exist_is_an_error_and_no_panic() {
+    fn bytes_cross_a_pseudo_terminal_and_an_empty_line_reads_nothing() {
+        let (far, path) = pair();
+        let mut line = SerialLine::open(&path, 921_600).expect("a terminal");
+        assert_eq!(line.read_available(&mut [0; 16]).expect("open"), 0);
+        rustix::io::write(&far, &[0, 1, 17, 19, 255]).expect("open");
+        assert_eq!(read_all(&mut line, 5), [0, 1, 17, 19, 255]);
+    }
+
+    #[test]
+    fn a_line_that_takes_nothing_is_waited_for_half_a_period_and_is_no_error() {
+        let (far, path) = pair();
+        let mut line = SerialLine::open(&path, 921_600).expect("a terminal");
+        tcflow(line.port().expect("open"), Action::OOff).expect("stopped");
+        let from = Instant::now();
+        assert_eq!(line.write_some(&[1, 2, 3]).expect("no error"), 0);
+        assert!(from.elapsed() >= Duration::from_micros(500));
+        tcflow(line.port().expect("open"), Action::OOn).expect("goes on");
+        assert_eq!(line.write_some(&[1, 2, 3]).expect("open"), 3);
+        let mut buffer = [0; 16];
+        assert_eq!(rustix::io::read(&far, &mut buffer).expect("open"), 3);
+    }
+
+    #[test]
+    fn a_line_that_was_unplugged_is_opened_again_when_it_is_back() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let link: PathBuf = folder.path().join("pzt");
+        let (far, path) = pair();
+        symlink(&path, &link).expect("linked");
+        let name = link.to_string_lossy().into_owned();
+        let mut line = SerialLine::open(&name, 921_600).expect("a terminal");
+        drop(far);
+        std::fs::remove_file(&link).expect("unlinked");
+        assert!(line.read_available(&mut [0; 16]).is_err());
+        assert!(line.write_some(&[1]).is_err());
+        let (far, path) = pair();
+        symlink(&path, &link).expect("linked");
+        let until = Instant::now() + Duration::from_secs(5);
+        while line.write_some(&[7]).is_err() {
+            assert!(Instant::now() < until, "not opened again");
+        }
+        let mut buffer = [0; 16];
+        assert_eq!(rustix::io::read(&far, &mut buffer).expect("open"), 1);
+    }
+
+    #[test]
+    fn a_port_that_does_not_exist_or_is_in_use_is_an_error_and_no_panic() {
         assert!(SerialLine::open("/dev/does-not-exist", 1_000_000).is_err());
+        assert!(SerialLine::open("/dev/null", 1_000_000).is_err());
         assert_eq!(SerialLine::latency_timer_ms("/dev/does-not-exist"), None);
+        let (_far, path) = pair();
+        let _line = SerialLine::open(&path, 921_600).expect("a terminal");
+        assert!(SerialLine::open(&path, 921_600).is_err());
     }
 }

@@ -151,11 +151,11 @@ impl Port for EmulatedPort {
         "emulated"
     }
 
-    fn write_all(&mut self, bytes: &[u8]) -> std::io::Result<()> {
+    fn write_some(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
         let mut rig = self.rig.now();
         let now_ns = rig.now_ns();
         rig.receive(bytes, now_ns);
-        Ok(())
+        Ok(bytes.len())
     }
 
     fn read_available(&mut self, buffer: &mut [u8]) -> std::io::Result<usize> {

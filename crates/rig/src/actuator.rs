@@ -204,7 +204,35 @@ pub struct ArmRequest {
     pub hold_watchdog_ms: Option<u16>,
 }
 
+/// What became of the commands of a session, as far as the actuator's reports say.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
+pub struct CommandAccount {
+    /// Commands handed over.
+    pub commands: u64,
+    /// Commands that a report has named as obeyed.
+    pub answered: u64,
+    /// Commands that the line did not take before a newer one replaced them.
+    pub not_taken: u64,
+    /// Commands that the reports passed over: a later one was named, these never were.
+    pub passed_over: u64,
+}
+
+impl CommandAccount {
+    /// Commands known to be lost so far. Those newer than the last report may still be on their way.
+    pub fn lost(&self) -> u64 {
+        self.passed_over.max(self.not_taken)
+    }
+
+    /// Commands that were lost, once nothing is on its way any more.
+    pub fn lost_in_all(&self) -> u64 {
+        self.commands.saturating_sub(self.answered)
+    }
+}
+
 /// A PZT actuator. Called from the actuator thread only; may block.
+///
+/// An error of the line is no end: what was to be sent is lost, and the next call tries again. Only silence of the actuator
+/// ends a run.
 ///
 /// An actuator enforces range and slew of its session itself, at its output, and acts on silence by itself: a killed
 /// host must end in park.
@@ -246,6 +274,10 @@ pub trait Actuator: Send {
     /// # Errors
     /// The line is broken.
     fn poll(&mut self) -> Result<Option<ActuatorReport>, ActuatorError>;
+    /// What became of the commands of this session; `None` where the actuator does not say.
+    fn account(&self) -> Option<CommandAccount> {
+        None
+    }
 }
 
 #[cfg(test)]

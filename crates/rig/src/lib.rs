@@ -13,7 +13,8 @@ pub mod measurement;
 pub mod source;
 
 pub use actuator::{
-    Actuator, ActuatorError, ActuatorFault, ActuatorInfo, ActuatorReport, ActuatorState, ArmRequest,
+    Actuator, ActuatorError, ActuatorFault, ActuatorInfo, ActuatorReport, ActuatorState,
+    ArmRequest, CommandAccount,
 };
 pub use clock::Clock;
 pub use freshness::{FrameAccount, FrameCounts, FrameKind, IdKind, Judged};

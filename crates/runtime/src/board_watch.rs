@@ -23,7 +23,7 @@ const REMEMBERED: usize = 1024;
 /// How long before the command that a report names others may explain where the output stands, us: a board that
 /// interpolates, or whose slew is less than the loop's, is still on its way from them.
 const EXPLAINS_US: u64 = 30_000;
-/// Trouble must last for so long, ns.
+/// An output that is off must be so for this long, ns.
 const LASTS_NS: i64 = 100_000_000;
 /// Commands handed over meanwhile, at least: a loop that stood still gave none to obey.
 const COMMANDS: u32 = 20;
@@ -42,11 +42,14 @@ pub(crate) struct BoardWatch {
     /// When, by the host's time that goes with the command (us), and where to.
     given: Box<[(u64, f64); REMEMBERED]>,
     next: usize,
+    /// Commands that reach nobody are the line's silence in one direction: as long is waited as for the other, ns.
+    silence_ns: i64,
 }
 
 impl BoardWatch {
-    pub(crate) fn new() -> Self {
+    pub(crate) fn new(silence_ns: i64) -> Self {
         Self {
+            silence_ns,
             session: None,
             state: None,
             last_seq: None,
@@ -65,6 +68,12 @@ impl BoardWatch {
             *slot = (time_us, command_um);
         }
         self.next = (self.next + 1) % REMEMBERED;
+    }
+
+    /// Commands handed over before were not taken by the line: the board cannot obey them.
+    pub(crate) fn not_taken(&mut self, count: u64) {
+        let count = u32::try_from(count).unwrap_or(u32::MAX);
+        self.commands = self.commands.saturating_sub(count);
     }
 
     /// The board reported.
@@ -86,7 +95,7 @@ impl BoardWatch {
         }
         if report.last_seq != self.last_seq {
             (self.last_seq, self.moved_ns, self.commands) = (report.last_seq, now_ns, 0);
-        } else if self.commands >= COMMANDS && now_ns - self.moved_ns > LASTS_NS {
+        } else if self.commands >= COMMANDS && now_ns - self.moved_ns > self.silence_ns {
             return Some(BoardTrouble::NotObeying);
         }
         if report.state == ActuatorState::Holding || self.explains(report) {
@@ -139,7 +148,7 @@ mod tests {
 
     /// A second of a slow sine at a board that answers with a report each millisecond; the first trouble and when, ms.
     fn watch(answer: impl Fn(i64, &mut ActuatorReport)) -> Option<(BoardTrouble, i64)> {
-        let mut watch = BoardWatch::new();
+        let mut watch = BoardWatch::new(200 * MS);
         for k in 0..1000_i64 {
             watch.commanded(1000 * k.unsigned_abs(), command_um(k));
             let mut report = ActuatorReport {
@@ -202,7 +211,7 @@ mod tests {
             }
         };
         assert_eq!(watch(rests(300)), None);
-        assert_eq!(watch(rests(600)), Some((BoardTrouble::NotObeying, 301)));
+        assert_eq!(watch(rests(600)), Some((BoardTrouble::NotObeying, 401)));
     }
 
     #[test]
@@ -212,7 +221,7 @@ mod tests {
         };
         assert_eq!(watch(foreign), Some((BoardTrouble::Foreign, 300)));
         let deaf = |k: i64, report: &mut ActuatorReport| under(k.min(300), report);
-        assert_eq!(watch(deaf), Some((BoardTrouble::NotObeying, 401)));
+        assert_eq!(watch(deaf), Some((BoardTrouble::NotObeying, 501)));
         let elsewhere = |k: i64, report: &mut ActuatorReport| {
             if k >= 300 {
                 report.applied_um = 31.0;

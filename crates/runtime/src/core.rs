@@ -26,7 +26,7 @@ mod life_cycle;
 use crate::arming::{Arming, ArmingConfig, ArmingState};
 use crate::grid::Grid;
 use crate::learners::Learners;
-use crate::life::{EventKind, Events, FreezeReason, Life, Request, SafeReason};
+use crate::life::{EventKind, Events, FreezeReason, FreezeReasons, Life, Request, SafeReason};
 use crate::reference::{ReferenceGenerator, ReferenceInput, ReferenceOutput, Stage};
 use crate::tick::Tick;
 pub use crate::tick::{Action, Counts, TickInput, TickOutput};
@@ -69,13 +69,17 @@ struct State {
     early_since_ns: Option<i64>,
     vision_slow_since_ns: Option<i64>,
     coasting_since_ns: Option<i64>,
-    /// Why and since when, ns.
-    frozen: Option<(FreezeReason, i64)>,
+    frozen: FreezeReasons,
+    frozen_since_ns: i64,
     stuck_since_ns: Option<i64>,
     stuck_told: bool,
     saturated_since_ns: Option<i64>,
     board: Option<ActuatorReport>,
     board_heard_ns: i64,
+    /// Ticks in a row without a report of the board.
+    unheard: u32,
+    /// Ticks in a row in which a command was lost, or the board held the zero flow by itself.
+    unled: u32,
     parked_at: Option<u64>,
     unrecorded_since_ns: Option<i64>,
     plant: PlantMonitorState,
@@ -179,12 +183,15 @@ impl<R: ReferenceGenerator> Core<R> {
                 early_since_ns: None,
                 vision_slow_since_ns: None,
                 coasting_since_ns: None,
-                frozen: None,
+                frozen: FreezeReasons::default(),
+                frozen_since_ns: 0,
                 stuck_since_ns: None,
                 stuck_told: false,
                 saturated_since_ns: None,
                 board: None,
                 board_heard_ns: 0,
+                unheard: 0,
+                unled: 0,
                 parked_at: None,
                 unrecorded_since_ns: None,
                 stage: Stage::None,
@@ -327,9 +334,7 @@ impl<R: ReferenceGenerator> Core<R> {
                 if input.request == Request::Skip {
                     tick.event(EventKind::StepSkipped);
                 }
-                if matches!(self.state.frozen, Some((FreezeReason::Operator, _))) {
-                    self.thaw(&mut tick);
-                }
+                self.thaw(FreezeReason::Operator, &mut tick);
             }
         }
         let mode = self.advance_life(fix.map(|fix| fix.position_um), &mut tick);

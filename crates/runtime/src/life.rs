@@ -127,6 +127,32 @@ pub enum FreezeReason {
     CameraStalled,
     /// The run is no longer being recorded.
     Unrecorded,
+    /// Commands do not reach the board, or its reports do not come.
+    LineStalled,
+}
+
+/// The reasons for which the bead is frozen at present: it goes on when the last is gone.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub(crate) struct FreezeReasons(u8);
+
+impl FreezeReasons {
+    pub(crate) fn any(self) -> bool {
+        self.0 != 0
+    }
+
+    /// Adds one; whether it is the first.
+    pub(crate) fn add(&mut self, reason: FreezeReason) -> bool {
+        let first = !self.any();
+        self.0 |= 1 << reason as u8;
+        first
+    }
+
+    /// Takes one away; whether it was the last.
+    pub(crate) fn remove(&mut self, reason: FreezeReason) -> bool {
+        let before = *self;
+        self.0 &= !(1 << reason as u8);
+        before.any() && !self.any()
+    }
 }
 
 /// Why arming was refused.

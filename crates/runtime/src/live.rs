@@ -87,7 +87,7 @@ pub fn run<R: ReferenceGenerator + Send, S: RunSink + 'static>(
     let Ends {
         measurements,
         orders,
-        reports,
+        heard,
         records,
         events,
         learned,
@@ -109,7 +109,7 @@ pub fn run<R: ReferenceGenerator + Send, S: RunSink + 'static>(
             .name("cellpos-actuator".to_string())
             .spawn_scoped(scope, move || {
                 realtime::apply(&threads.actuator);
-                let failed = actuate(Acting::new(&mut *actuator, orders, reports));
+                let failed = actuate(Acting::new(&mut *actuator, orders, heard));
                 (actuator, failed)
             })
             .map_err(start("actuator"))?;
@@ -162,18 +162,14 @@ pub fn run<R: ReferenceGenerator + Send, S: RunSink + 'static>(
             Err(_) => io_error = Some(RunError::Panicked { thread: "camera" }),
         }
         let control_end = control_end.map_err(|_| RunError::Panicked { thread: "control" })?;
-        Ok((control_end, io_error))
+        Ok((control_end, io_error, actuator.account()))
     });
-    let ticks = ended.as_ref().map_or(0, |((end, _), _)| end.counts.ticks);
+    let ticks = ended.as_ref().map_or(0, |((end, _), ..)| end.counts.ticks);
     let recorded = recorder.wait(ticks, LAST_PATIENCE);
-    let ((control_end, conditions), io_error) = ended?;
-    Ok(finished(
-        control_end,
-        conditions,
-        recorded?,
-        io_error,
-        operator,
-    ))
+    let ((control_end, conditions), io_error, commands) = ended?;
+    let mut finished = finished(control_end, conditions, recorded?, io_error, operator);
+    finished.summary = finished.summary.with_commands(commands);
+    Ok(finished)
 }
 
 /// What the recorder's thread gives back.

@@ -205,6 +205,7 @@ fn input(record: &TickRecord, previous: Option<&TickRecord>) -> TickInput {
             .has(TickFlags::BOARD_TROUBLE)
             .then_some(BoardTrouble::Foreign),
         previous_refused: previous.is_some_and(|p| p.flags.has(TickFlags::ACTUATOR_RING_FULL)),
+        command_lost: record.flags.has(TickFlags::COMMAND_LOST),
         board,
         request: Request::from_number(record.request),
         // A reference that can be steered was told just this; the others do not listen.

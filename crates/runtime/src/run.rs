@@ -1,15 +1,13 @@
 //! What both drivers share: the recorder's sink, when a run ends, and how the actuator is served.
 
-use crate::core::{Action, CoreError};
+use crate::core::CoreError;
 use crate::life::{Event, Life, Request};
 use crate::realtime::Conditions;
 use crate::recording::{RecorderReport, Unconfirmed};
 use crate::summary::{End, Statistics, Summary};
 use crate::tick_record::TickRecord;
-use crate::ticker::Order;
 use cellpos_control::{LearnedTable, LearnerState};
-use cellpos_rig::{Actuator, ActuatorError, ActuatorReport, CameraError};
-use rtrb::{Consumer, Producer};
+use cellpos_rig::{Actuator, ActuatorError, ActuatorReport, CameraError, CommandAccount};
 use std::time::Duration;
 
 /// Where records and events go. Called on the recorder thread; may block, allocate and fail in its own way: a sink that
@@ -196,35 +194,13 @@ impl EndWatch {
     }
 }
 
-/// Carries out what waits in the order ring and reads what the board says. A newer command replaces an older one that
-/// has not been sent: a burst after a stall would only make the PZT rattle through the past.
-pub(crate) fn serve_actuator(
-    actuator: &mut dyn Actuator,
-    orders: &mut Consumer<Order>,
-    reports: &mut Producer<ActuatorReport>,
-) -> Result<(), ActuatorError> {
-    let mut newest = None;
-    let mut park = false;
-    while let Ok(order) = orders.pop() {
-        match order.action {
-            Action::Command {
-                command_um,
-                neutral_um,
-            } => newest = Some((command_um, neutral_um, order.time_us)),
-            Action::Park => park = true,
-            Action::None => {}
-        }
-    }
-    if park {
-        actuator.park()?;
-    } else if let Some((command_um, neutral_um, time_us)) = newest {
-        actuator.command(command_um, neutral_um, time_us)?;
-    }
-    if let Some(report) = actuator.poll()? {
-        // A full ring means that the loop is not running: it will hear the next one.
-        let _ = reports.push(report);
-    }
-    Ok(())
+/// What the actuator thread tells the loop.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Heard {
+    /// The newest report, if one came.
+    pub report: Option<ActuatorReport>,
+    /// What became of the commands so far, where the actuator says so.
+    pub account: CommandAccount,
 }
 
 /// Leaves the hardware in a defined state after the last tick: frozen at neutral for a moment, then at park.
@@ -238,6 +214,8 @@ pub(crate) fn close_session(
     }
     actuator.freeze()?;
     wait(Duration::from_millis(20));
+    // What is still on its way: the account of the commands is complete after it.
+    actuator.poll()?;
     actuator.disarm()
 }
 

@@ -8,6 +8,7 @@ use crate::reference::Stage;
 use crate::tick_record::{TickFlags, TickRecord};
 use crate::ticker::Account;
 use cellpos_control::Adaptation;
+use cellpos_rig::CommandAccount;
 use serde::Serialize;
 
 /// Running sums of one error.
@@ -310,6 +311,10 @@ pub struct Summary {
     pub records_lost: u64,
     /// Events that found their ring full.
     pub events_lost: u64,
+    /// Commands handed over that the board never named as obeyed; `None` where the actuator does not say.
+    pub commands_lost: Option<u64>,
+    /// Of these, commands that the line did not take before a newer one replaced them.
+    pub commands_not_taken: Option<u64>,
     /// RMS of measured position less reference, nm.
     pub rms_measured_nm: Option<f64>,
     /// RMS of true position less reference, nm (emulated rig).
@@ -356,6 +361,16 @@ impl Summary {
         self
     }
 
+    /// The same figures with what became of the commands.
+    #[must_use]
+    pub fn with_commands(self, account: Option<CommandAccount>) -> Self {
+        Self {
+            commands_lost: account.map(|account| account.lost_in_all()),
+            commands_not_taken: account.map(|account| account.not_taken),
+            ..self
+        }
+    }
+
     /// The same figures with what adaptation came to.
     #[must_use]
     pub fn with_adaptation(self, adaptation: Option<Adaptation>) -> Self {
@@ -382,6 +397,8 @@ impl Summary {
             counts,
             records_lost: account.records_lost,
             events_lost: account.events_lost,
+            commands_lost: None,
+            commands_not_taken: None,
             rms_measured_nm: statistics.measured.rms_nm(),
             rms_true_nm: statistics.truth.rms_nm(),
             mean_error_nm: statistics.measured.mean_nm(),

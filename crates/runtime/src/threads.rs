@@ -1,18 +1,18 @@
 //! What each thread of a run does, a round at a time: the threads themselves only wait in between ([`crate::live`]), so
 //! that a test can run the same rounds on a clock of its own, in any order.
 
-use crate::core::Counts;
+use crate::core::{Action, Counts};
 use crate::life::{Life, SafeReason};
 use crate::operator::Operator;
 use crate::pacer::{Pace, Pacer};
 use crate::recorder::{Pulse, PulseWatch};
 use crate::recording::RecorderFault;
 use crate::reference::ReferenceGenerator;
-use crate::run::{EndRule, EndWatch, RunError, serve_actuator};
+use crate::run::{EndRule, EndWatch, Heard, RunError};
 use crate::summary::End;
 use crate::ticker::{Account, Order, Ticker};
 use cellpos_control::{Adaptation, LearnedTable};
-use cellpos_rig::{Actuator, ActuatorReport, Clock, Measurement, PositionSource};
+use cellpos_rig::{Actuator, ActuatorError, ActuatorReport, Clock, Measurement, PositionSource};
 use rtrb::{Consumer, Producer};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
@@ -236,45 +236,90 @@ impl<'a, R: ReferenceGenerator> Controlling<'a, R> {
 }
 
 /// The actuator thread: orders -> board, board -> reports.
+///
+/// An error of the line ends nothing: a command that was not taken is lost, and the next one is tried. A board that stays
+/// silent ends the run, in control.
 pub(crate) struct Acting<'a> {
     actuator: &'a mut dyn Actuator,
     orders: Consumer<Order>,
-    reports: Producer<ActuatorReport>,
-    failed: Option<RunError>,
+    heard: Producer<Heard>,
+    /// Whether the PZT is to be parked and the line has not taken it.
+    park: bool,
+    /// Commands lost that control knows of.
+    told_lost: u64,
+    /// What went wrong since the board was last heard.
+    trouble: Option<RunError>,
 }
 
 impl<'a> Acting<'a> {
     pub(crate) fn new(
         actuator: &'a mut dyn Actuator,
         orders: Consumer<Order>,
-        reports: Producer<ActuatorReport>,
+        heard: Producer<Heard>,
     ) -> Self {
         Self {
             actuator,
             orders,
-            reports,
-            failed: None,
+            heard,
+            park: false,
+            told_lost: 0,
+            trouble: None,
         }
     }
 
-    /// Carries out what waits; says whether the run is over. Once the board has failed nothing more is sent: control hears
-    /// nothing of it and latches Safe.
+    /// Carries out what waits and reads what the board says; whether the run is over.
     pub(crate) fn round(&mut self) -> bool {
         // Asked first: what was ordered before control ended is still carried out below.
         let over = self.orders.is_abandoned();
-        if self.failed.is_some() {
-            while self.orders.pop().is_ok() {}
-        } else if let Err(error) =
-            serve_actuator(self.actuator, &mut self.orders, &mut self.reports)
-        {
-            self.failed = Some(error.into());
+        let sent = self.send();
+        let polled = self.actuator.poll();
+        let report = polled.as_ref().ok().copied().flatten();
+        self.tell(report);
+        match sent.and(polled) {
+            Ok(Some(_)) => self.trouble = None,
+            Ok(None) => {}
+            Err(error) => self.trouble = Some(error.into()),
         }
         over
     }
 
-    /// What went wrong, if anything did.
+    /// Sends what waits. A newer command replaces an older one that has not been sent: a burst after a stall would only make the
+    /// PZT rattle through the past.
+    fn send(&mut self) -> Result<(), ActuatorError> {
+        let mut newest = None;
+        while let Ok(order) = self.orders.pop() {
+            match order.action {
+                Action::Command {
+                    command_um,
+                    neutral_um,
+                } => newest = Some((command_um, neutral_um, order.time_us)),
+                Action::Park => self.park = true,
+                Action::None => {}
+            }
+        }
+        if self.park {
+            // Asked again until the line has taken it.
+            self.actuator.park()?;
+            self.park = false;
+        } else if let Some((command_um, neutral_um, time_us)) = newest {
+            self.actuator.command(command_um, neutral_um, time_us)?;
+        }
+        Ok(())
+    }
+
+    /// Tells control what is new.
+    fn tell(&mut self, report: Option<ActuatorReport>) {
+        let account = self.actuator.account().unwrap_or_default();
+        if report.is_some() || account.lost() != self.told_lost {
+            self.told_lost = account.lost();
+            // A full ring means that the loop is not running: it will hear the next one.
+            let _ = self.heard.push(Heard { report, account });
+        }
+    }
+
+    /// What was wrong with the line when the run ended, if anything was.
     pub(crate) fn finish(self) -> Option<RunError> {
-        self.failed
+        self.trouble
     }
 }
 

@@ -21,6 +21,8 @@ pub struct TickInput {
     pub previous_late_ns: Option<u32>,
     /// The previous tick's command found the actuator ring full.
     pub previous_refused: bool,
+    /// Since the previous tick it became known that a command was lost on the way to the board.
+    pub command_lost: bool,
     /// The newest report of the board, if one came since the previous tick.
     pub board: Option<ActuatorReport>,
     /// What is wrong with a board that talks, if anything is.

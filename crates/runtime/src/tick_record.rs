@@ -48,6 +48,9 @@ impl TickFlags {
     /// No frame was to come in this tick: the loop is faster than its camera.
     pub const BETWEEN: u32 = 1 << 18;
 
+    /// Since the previous tick it became known that a command was lost: the line did not take it, or the board never named it.
+    pub const COMMAND_LOST: u32 = 1 << 19;
+
     /// Whether all bits of `mask` are set.
     pub fn has(self, mask: u32) -> bool {
         self.0 & mask == mask

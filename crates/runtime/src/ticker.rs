@@ -6,10 +6,12 @@ use crate::frames::FrameWatch;
 use crate::latency::Latency;
 use crate::life::{Event, Life, Request};
 use crate::reference::ReferenceGenerator;
+use crate::run::Heard;
 use crate::tick_record::{TickFlags, TickRecord};
+use crate::timing::Timing;
 use cellpos_control::{LearnerState, SolverTerms};
 use cellpos_rig::clock::monotonic_ns;
-use cellpos_rig::{ActuatorReport, Clock, Measurement};
+use cellpos_rig::{ActuatorReport, Clock, CommandAccount, Measurement};
 use rtrb::{Consumer, Producer, RingBuffer};
 use std::time::{Duration, Instant};
 
@@ -33,7 +35,7 @@ pub struct Ends {
     /// For the actuator thread.
     pub orders: Consumer<Order>,
     /// For the actuator thread.
-    pub reports: Producer<ActuatorReport>,
+    pub heard: Producer<Heard>,
     /// For the recorder thread.
     pub records: Consumer<TickRecord>,
     /// For the recorder thread.
@@ -95,7 +97,7 @@ pub struct Ticker<R> {
     measurements: Consumer<Measurement>,
     frames: FrameWatch,
     orders: Producer<Order>,
-    reports: Consumer<ActuatorReport>,
+    heard: Consumer<Heard>,
     records: Producer<TickRecord>,
     events: Producer<Event>,
     learned: Producer<(u16, LearnerState)>,
@@ -105,6 +107,8 @@ pub struct Ticker<R> {
     previous_refused: bool,
     slow_vision_ns: Option<u32>,
     board_watch: BoardWatch,
+    /// What had become of the commands by the last tick.
+    commands: CommandAccount,
     /// Sequence number, host's and board's time (us) of the last command that the board has reported.
     obeyed: Option<(u32, u64, u64)>,
     records_lost_before: bool,
@@ -116,10 +120,11 @@ impl<R: ReferenceGenerator> Ticker<R> {
     pub fn new(core: Core<R>, clock: Clock, start_ns: i64, sizes: RingSizes) -> (Self, Ends) {
         let (measurements_in, measurements) = RingBuffer::new(sizes.measurements.max(1));
         let (orders, orders_out) = RingBuffer::new(sizes.orders.max(1));
-        let (reports_in, reports) = RingBuffer::new(64);
+        let (heard_in, heard) = RingBuffer::new(64);
         let (records, records_out) = RingBuffer::new(sizes.records.max(1));
         let (events, events_out) = RingBuffer::new(sizes.events.max(1));
         let (learned, learned_out) = RingBuffer::new(16);
+        let silence_ns = Timing::ms_to_ns(core.timing().board_silence_ms);
         let ticker = Self {
             budget_ns: core.timing().budget_ns(),
             solver_time: Duration::from_secs_f64(core.timing().solver_us * 1e-6),
@@ -129,7 +134,7 @@ impl<R: ReferenceGenerator> Ticker<R> {
             start_ns,
             measurements,
             orders,
-            reports,
+            heard,
             records,
             events,
             learned,
@@ -138,7 +143,8 @@ impl<R: ReferenceGenerator> Ticker<R> {
             steered_um: None,
             previous_refused: false,
             slow_vision_ns: None,
-            board_watch: BoardWatch::new(),
+            board_watch: BoardWatch::new(silence_ns),
+            commands: CommandAccount::default(),
             obeyed: None,
             records_lost_before: false,
             account: Account {
@@ -153,7 +159,7 @@ impl<R: ReferenceGenerator> Ticker<R> {
         let ends = Ends {
             measurements: measurements_in,
             orders: orders_out,
-            reports: reports_in,
+            heard: heard_in,
             records: records_out,
             events: events_out,
             learned: learned_out,
@@ -223,7 +229,14 @@ impl<R: ReferenceGenerator> Ticker<R> {
         let (newest, frames) = self.frames.take(start_ns);
         let mut board = None;
         let mut board_trouble = None;
-        while let Ok(report) = self.reports.pop() {
+        let lost_before = self.commands.lost();
+        while let Ok(heard) = self.heard.pop() {
+            let not_taken = heard.account.not_taken - self.commands.not_taken;
+            self.board_watch.not_taken(not_taken);
+            self.commands = heard.account;
+            let Some(report) = heard.report else {
+                continue;
+            };
             self.spacing(&report);
             board_trouble = board_trouble.or(self.board_watch.heard(start_ns, &report));
             board = Some(report);
@@ -241,6 +254,7 @@ impl<R: ReferenceGenerator> Ticker<R> {
             previous_late_ns: self.previous_late_ns,
             previous_refused: self.previous_refused,
             slow_vision_ns: self.slow_vision_ns,
+            command_lost: self.commands.lost() > lost_before,
             board,
             board_trouble,
             request,

@@ -39,12 +39,15 @@ impl Default for Timing {
             faults_in_a_row: 5,
             coast_ticks: 20,
             lost_ticks: 1000,
-            board_silence_ms: 200.0,
+            board_silence_ms: Self::BOARD_SILENCE_MS,
         }
     }
 }
 
 impl Timing {
+    /// A line that stalls for 200 ms, the 10 ms between two reports of the board, and a period of the loop on either side.
+    pub const BOARD_SILENCE_MS: f64 = 212.0;
+
     /// Period of the loop, ns.
     pub fn period_ns(&self) -> i64 {
         (self.period_us * 1e3).round() as i64

@@ -8,15 +8,16 @@ use crate::life::Request;
 use crate::realtime::Conditions;
 use crate::recorder::{Feed, Pulse, Recorder};
 use crate::reference::ReferenceGenerator;
-use crate::run::{EndRule, EndWatch, Finished, RunError, RunSink, close_session, serve_actuator};
+use crate::run::{EndRule, EndWatch, Finished, RunError, RunSink, close_session};
 use crate::summary::{Statistics, Summary};
+use crate::threads::Acting;
 use crate::ticker::{Ends, RingSizes, Ticker};
 use cellpos_rig::{Actuator, Clock, PositionSource};
 
 /// Runs until `end` says so. `request` is asked at each tick with its sequence number.
 ///
 /// # Errors
-/// The actuator fails in a way that ends the run. A camera that fails is silence: the loop freezes, then parks.
+/// None today. A camera that fails is silence: the loop freezes, then parks; a board that is silent is, too.
 #[allow(
     clippy::too_many_arguments,
     reason = "each is one part of the rig or one rule of the run"
@@ -37,8 +38,8 @@ pub fn run<R: ReferenceGenerator, S: RunSink>(
     let (mut ticker, ends) = Ticker::new(core, clock.clone(), start_ns, RingSizes::default());
     let Ends {
         mut measurements,
-        mut orders,
-        mut reports,
+        orders,
+        heard,
         records,
         events,
         learned,
@@ -52,6 +53,7 @@ pub fn run<R: ReferenceGenerator, S: RunSink>(
     let mut recorder = Recorder::new(feed, &mut sink, &mut statistics, &pulse);
     let mut watch = EndWatch::new(end);
     let mut io_error = None;
+    let mut acting = Acting::new(&mut *actuator, orders, heard);
     let mut tick = 0_u64;
     let end = loop {
         let now_ns = start_ns + tick as i64 * period_ns;
@@ -71,7 +73,7 @@ pub fn run<R: ReferenceGenerator, S: RunSink>(
             asked = Request::Unrecorded;
         }
         let life = ticker.tick(now_ns, asked);
-        serve_actuator(actuator, &mut orders, &mut reports)?;
+        acting.round();
         // A recorder that waits for its disk leaves records in the ring; a full ring refuses, and the refusal is counted.
         recorder.round(now_ns);
         if tick.is_multiple_of(PROGRESS_TICKS) {
@@ -85,7 +87,10 @@ pub fn run<R: ReferenceGenerator, S: RunSink>(
         }
     };
     let life = ticker.core().life();
-    close_session(actuator, life, |span| clock.sleep(span))?;
+    io_error = io_error.or(acting.finish());
+    if let Err(error) = close_session(actuator, life, |span| clock.sleep(span)) {
+        io_error.get_or_insert(error.into());
+    }
     let recorded = recorder.finish();
     let summary = Summary::new(
         life,
@@ -97,6 +102,7 @@ pub fn run<R: ReferenceGenerator, S: RunSink>(
         ticker.core().timing().period_us,
     )
     .with_unkept(&recorded)
+    .with_commands(actuator.account())
     .with_adaptation(ticker.core().controller().adaptation());
     let conditions = Conditions {
         policy: "virtual clock".to_string(),

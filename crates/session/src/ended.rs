@@ -339,7 +339,7 @@ impl Clues {
                 "see that one program uses the board, then start again",
             ),
             SafeReason::BoardNotObeying => sentences(
-                " (for 100 ms)",
+                format!(" (for {} ms)", timing.board_silence_ms),
                 "a sequence number that moves with the commands",
                 "check the line to the board for damaged frames, and its baud rate",
             ),

@@ -58,6 +58,7 @@ fn freeze_reason(reason: FreezeReason) -> &'static str {
         FreezeReason::Operator => "the operator asked for it",
         FreezeReason::BeadLost => "the bead is not seen",
         FreezeReason::CameraStalled => "no frames come",
+        FreezeReason::LineStalled => "the line to the board is stalled",
         FreezeReason::Unrecorded => "the run can no longer be recorded",
     }
 }

@@ -29,7 +29,7 @@ pub struct Args {
     pub pty_link: Option<PathBuf>,
     /// Provide plant and camera only, around a board that runs elsewhere: the terminal on which it says the codes of its
     /// converter (three bytes each, see firmware/README.md); the host talks to that board directly
-    #[arg(long, value_name = "TTY", conflicts_with_all = ["pty_link", "link_garbage", "link_loss"])]
+    #[arg(long, value_name = "TTY", conflicts_with_all = ["pty_link", "link_garbage", "link_loss", "line_stall", "usb_chunks"])]
     pub board: Option<PathBuf>,
     /// Unix socket for the camera's frames [default: firmware-sim-PID.sock in the directory for temporary files]
     #[arg(long, value_name = "PATH")]
@@ -113,6 +113,13 @@ pub struct Args {
     /// No byte passes the line
     #[arg(long, value_name = "AT[,FOR]", help_heading = "Faults")]
     pub link_loss: Vec<Span>,
+    /// The line takes and gives nothing, and loses nothing: from a time on (5s,100ms), or at a mean rate and for up to a time
+    /// (0.5Hz,180ms)
+    #[arg(long, value_name = "AT,FOR|RATE,LONGEST", help_heading = "Faults")]
+    pub line_stall: Vec<StallOption>,
+    /// Bytes pass the line in packets of at most so many, one each way in 125 us
+    #[arg(long, value_name = "BYTES", help_heading = "Faults", value_parser = clap::value_parser!(u16).range(1..=4096))]
+    pub usb_chunks: Option<u16>,
 }
 
 const EXAMPLE: &str = "\
@@ -171,6 +178,37 @@ impl FromStr for RateOrSpan {
             )),
             Err(_) => text.parse().map(Self::Span),
         }
+    }
+}
+
+/// A stall at a time, or stalls at random.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum StallOption {
+    /// From a time on.
+    Span(Span),
+    /// Now and then.
+    Random {
+        /// Mean number of stalls a second.
+        rate: Hertz,
+        /// Longest; the shortest is a millisecond.
+        longest: Seconds,
+    },
+}
+
+impl FromStr for StallOption {
+    type Err = String;
+    fn from_str(text: &str) -> Result<Self, String> {
+        let (first, length) = text.split_once(',').ok_or_else(|| {
+            "a stall has two parts: a time and a length (5s,100ms), or a rate and a longest length (0.5Hz,180ms)".to_owned()
+        })?;
+        let Ok(rate) = first.parse::<Hertz>() else {
+            return text.parse().map(Self::Span);
+        };
+        let longest: Seconds = length.parse().map_err(|error| format!("{error}"))?;
+        if rate.value() <= 0.0 || longest.value() < 1e-3 {
+            return Err("stalls come at more than 0Hz and last for 1ms or more".to_owned());
+        }
+        Ok(Self::Random { rate, longest })
     }
 }
 
@@ -410,6 +448,9 @@ mod tests {
             ("--link-garbage 5", "2Hz"),
             ("--lose-bead 5s,0s", "more than 0s"),
             ("--duration 10", "10s"),
+            ("--line-stall 5s", "5s,100ms"),
+            ("--line-stall 0Hz,10ms", "more than 0Hz"),
+            ("--usb-chunks 0", "1..=4096"),
         ] {
             let error = parse(line).unwrap_err().to_string();
             assert!(error.contains(hint), "{line}: {error}");

@@ -160,7 +160,7 @@ impl Around {
             }
             let delivery_ns = self.world.next_delivery_ns().unwrap_or(i64::MAX);
             wait(
-                self.terminal.as_fd(),
+                Some(self.terminal.as_fd()),
                 delivery_ns.min(now_ns + LONGEST_SLEEP_NS),
             )?;
         }

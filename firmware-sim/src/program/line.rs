@@ -5,7 +5,7 @@ use rustix::fs::{OFlags, fcntl_getfl, fcntl_setfl};
 use rustix::io::Errno;
 use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
 use rustix::termios::{
-    OptionalActions, QueueSelector, ioctl_tiocnxcl, tcflush, tcgetattr, tcsetattr,
+    Action, OptionalActions, QueueSelector, ioctl_tiocnxcl, tcflow, tcflush, tcgetattr, tcsetattr,
 };
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 use std::path::{Path, PathBuf};
@@ -104,6 +104,15 @@ impl Line {
                 error,
             )),
         }
+    }
+
+    /// Has the line take nothing from the host, or take it again, as a USB line whose device does not answer.
+    ///
+    /// # Errors
+    /// What the operating system refuses.
+    pub fn stall(&self, stalled: bool) -> Result<(), ProgramError> {
+        let action = if stalled { Action::OOff } else { Action::OOn };
+        tcflow(&self.host_end, action).map_err(ProgramError::system("stopping the pseudo-terminal"))
     }
 
     /// Lifts the lock of exclusive use that a killed host leaves behind, so that the next one can open the line.

@@ -8,6 +8,7 @@ mod line;
 mod log;
 mod pace;
 mod run;
+mod usb;
 
 pub use args::Args;
 pub use error::ProgramError;

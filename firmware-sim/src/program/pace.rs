@@ -40,18 +40,18 @@ pub fn send_frames(world: &mut World, server: &mut FrameServer, pixels: &mut Vec
     frames
 }
 
-/// Sleeps until `deadline_ns` or until the host has written. The time left is taken from the absolute deadline at the last
+/// Sleeps until `deadline_ns` or until `readiness` can be read. The time left is taken from the absolute deadline at the last
 /// moment, so that delays do not add up.
-pub fn wait(readiness: BorrowedFd<'_>, deadline_ns: i64) -> Result<(), ProgramError> {
+pub fn wait(readiness: Option<BorrowedFd<'_>>, deadline_ns: i64) -> Result<(), ProgramError> {
     let left_ns = (deadline_ns - monotonic_ns()).max(0);
     let timeout = Timespec {
         tv_sec: 0,
         tv_nsec: left_ns.min(LONGEST_SLEEP_NS),
     };
-    match poll(
-        &mut [PollFd::new(&readiness, PollFlags::IN)],
-        Some(&timeout),
-    ) {
+    let mut watched = readiness
+        .as_ref()
+        .map(|readiness| PollFd::new(readiness, PollFlags::IN));
+    match poll(watched.as_mut_slice(), Some(&timeout)) {
         Ok(_) | Err(Errno::INTR) => Ok(()),
         Err(error) => Err(ProgramError::system("waiting")(error)),
     }

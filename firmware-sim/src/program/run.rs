@@ -7,6 +7,7 @@ use super::frame_server::FrameServer;
 use super::line::Line;
 use super::log::{Instant, Log};
 use super::pace::{HOUSEKEEPING_NS, LONGEST_SLEEP_NS, monotonic_ns, send_frames, wait};
+use super::usb::Usb;
 use cellpos_emulator::RigInABox;
 use std::io::Write;
 use std::path::Path;
@@ -70,7 +71,16 @@ pub fn run(args: &Args) -> Result<(), ProgramError> {
     if !args.best_effort {
         ask_for_real_time();
     }
-    let frames = pace(&mut rig, &line, &mut server, log.as_mut(), end_ns, &stop)?;
+    let chunk = args.usb_chunks.map(usize::from);
+    let mut usb = Usb::new(&args.line_stall, chunk, setup.world.seed, start_ns);
+    let frames = pace(
+        &mut rig,
+        (&line, &mut usb),
+        &mut server,
+        log.as_mut(),
+        end_ns,
+        &stop,
+    )?;
     if let Some(log) = &mut log {
         log.flush()?;
     }
@@ -128,7 +138,7 @@ fn ask_for_real_time() {
 /// The loop; returns the number of frames handed to clients.
 fn pace(
     rig: &mut RigInABox,
-    line: &Line,
+    (line, usb): (&Line, &mut Usb),
     server: &mut FrameServer,
     mut log: Option<&mut Log>,
     end_ns: i64,
@@ -137,20 +147,37 @@ fn pace(
     let mut buffer = [0; 4096];
     let mut pixels = Vec::new();
     let (mut frames, mut watched, mut next_housekeeping_ns) = (0, false, 0);
+    let mut was_stalled = false;
     loop {
         let now_ns = monotonic_ns();
-        let heard = line.read(&mut buffer)?;
+        let stalled = usb.is_stalled(now_ns);
+        if stalled != was_stalled {
+            line.stall(stalled)?;
+            was_stalled = stalled;
+        }
+        let room = match stalled {
+            true => 0,
+            false => usb.packet(buffer.len(), now_ns),
+        };
+        let heard = match buffer.get_mut(..room) {
+            Some(buffer) if room > 0 => line.read(buffer)?,
+            _ => 0,
+        };
         if heard > 0 {
             rig.receive(buffer.get(..heard).unwrap_or(&[]), now_ns);
         } else {
             rig.advance_to(now_ns);
         }
         loop {
-            let count = rig.transmit(&mut buffer);
+            // A packet a time; without packets, all that there is.
+            let count = rig.transmit(buffer.get_mut(..room).unwrap_or(&mut []));
             if count == 0 {
                 break;
             }
             line.write(buffer.get(..count).unwrap_or(&[]))?;
+            if room < buffer.len() {
+                break;
+            }
         }
         if now_ns >= next_housekeeping_ns {
             next_housekeeping_ns = now_ns + HOUSEKEEPING_NS;
@@ -175,9 +202,9 @@ fn pace(
         if stop.load(Ordering::Relaxed) || now_ns >= end_ns {
             return Ok(frames);
         }
-        wait(
-            line.readiness(),
-            rig.next_event_ns().min(now_ns + LONGEST_SLEEP_NS),
-        )?;
+        // A line that is stalled, or between two packets, is not looked at before its time.
+        let event_ns = rig.next_event_ns().min(usb.next_event_ns(now_ns));
+        let readiness = (room > 0).then(|| line.readiness());
+        wait(readiness, event_ns.min(now_ns + LONGEST_SLEEP_NS))?;
     }
 }

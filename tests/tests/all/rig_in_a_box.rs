@@ -119,6 +119,50 @@ fn a_bead_is_held_over_a_pseudo_terminal_and_a_socket_and_the_pzt_is_parked_afte
 }
 
 #[test]
+fn a_line_that_stalls_now_and_then_ends_no_run_and_its_lost_commands_are_counted() {
+    let _alone = alone();
+    let folder = tempfile::tempdir().unwrap();
+    write_rig(folder.path(), WATCHDOG_MS);
+    let rig = folder.path().join("rig.toml");
+    let text = std::fs::read_to_string(&rig).unwrap();
+    // The stalls of this machine come on top.
+    let text = text.replace("hold_watchdog_ms = 150", "hold_watchdog_ms = 2000")
+        + "board_silence_ms = 1000.0\n";
+    std::fs::write(rig, text).unwrap();
+    let faults = [
+        "--line-stall",
+        "2Hz,180ms",
+        "--line-stall",
+        "3s,180ms",
+        "--usb-chunks",
+        "64",
+    ];
+    let rig = RigInABox::start(folder.path(), &faults);
+    let output = cellpos(
+        folder.path(),
+        "track --target 0um --rig rig.toml --duration 8s --json",
+    )
+    .output()
+    .unwrap();
+    let rows = rig.finish();
+    let text = stdout(&output);
+    let r: Value = serde_json::from_str(&text).unwrap_or_default();
+    let why = String::from_utf8_lossy(&output.stderr);
+    assert!(
+        output.status.success() && r["state"] == "running",
+        "{text}\n{why}"
+    );
+    let count = |key: &str| r[key].as_u64().unwrap_or_else(|| panic!("{key}: {r}"));
+    let (lost, not_taken) = (count("commands_lost"), count("commands_not_taken"));
+    // The stall of 180 ms alone loses what the line did not take of it; what is lost is most of what was stalled.
+    assert!(
+        not_taken > 20 && lost >= not_taken && lost < count("ticks") / 2,
+        "{r}"
+    );
+    assert!(rows.iter().any(|row| row.state == "Holding"));
+}
+
+#[test]
 fn the_board_parks_by_itself_when_the_program_is_killed_and_the_record_reads_back() {
     let _alone = alone();
     // A stall of the machine longer than the watchdog's time ends the run before the kill: then once more.

@@ -450,6 +450,9 @@ fn text(report: &Report) -> String {
             format!("{} rows are not on the disk", s.records_lost),
         );
     }
+    if let Some(lost) = s.commands_lost.filter(|&lost| lost > 0) {
+        line("commands", commands_lost(lost, s.commands_not_taken));
+    }
     line("loop delay", format!("{:.2} ms", s.loop_delay_ms));
     let c = &s.counts;
     line(
@@ -478,4 +481,10 @@ fn text(report: &Report) -> String {
         line("run", run.clone());
     }
     out
+}
+
+/// What became of commands on the way to the board, in words.
+pub(crate) fn commands_lost(lost: u64, not_taken: Option<u64>) -> String {
+    let not_taken = not_taken.unwrap_or(0);
+    format!("{lost} lost on the way to the board, of which its line did not take {not_taken}")
 }

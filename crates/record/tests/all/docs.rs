@@ -56,6 +56,7 @@ fn every_bit_of_the_flags_is_on_the_page() {
         ("dropped-frame", TickFlags::DROPPED_FRAME),
         ("records-lost", TickFlags::RECORDS_LOST),
         ("stuck", TickFlags::STUCK),
+        ("command-lost", TickFlags::COMMAND_LOST),
     ] {
         assert!(page.contains(&format!("| {value} | {name} |")), "{name}");
     }

@@ -9,7 +9,7 @@ use crate::tick::{Tick, TickInput};
 use crate::tick_record::TickFlags;
 use crate::timing::Timing;
 use cellpos_control::{Driven, Measurement as LoopMeasurement};
-use cellpos_rig::ActuatorReport;
+use cellpos_rig::{ActuatorReport, ActuatorState};
 use cellpos_vision::Decision;
 
 impl<R: ReferenceGenerator> Core<R> {
@@ -37,7 +37,7 @@ impl<R: ReferenceGenerator> Core<R> {
                 .step(&mut self.state.plant, None, neutral_um, held_um);
             let told = ReferenceInput {
                 running,
-                frozen: self.state.frozen.is_some(),
+                frozen: self.state.frozen.any(),
                 skip: false,
                 tick: if running {
                     index - self.state.running_since
@@ -51,9 +51,7 @@ impl<R: ReferenceGenerator> Core<R> {
                 target_um: None,
             };
             let passed = self.reference.step(&told, &mut []);
-            let phase = passed
-                .phase
-                .filter(|_| running && self.state.frozen.is_none());
+            let phase = passed.phase.filter(|_| running && !self.state.frozen.any());
             self.learners
                 .addition_um(passed.motion, phase, passed.reference_um);
             self.learners.learn(None, &Driven::default());
@@ -249,6 +247,36 @@ impl<R: ReferenceGenerator> Core<R> {
             > Timing::ms_to_ns(self.timing.board_silence_ms)
         {
             self.latch(SafeReason::LinkLost, tick);
+        }
+        self.check_line(input, tick);
+    }
+
+    /// While the board does not follow, the loop's commands are no input of the plant: an estimator that took them for one would
+    /// run away. The bead is frozen, as the board freezes it meanwhile.
+    fn check_line(&mut self, input: &TickInput, tick: &mut Tick) {
+        let holds = self
+            .state
+            .board
+            .is_some_and(|board| board.state == ActuatorState::Holding);
+        let state = &mut self.state;
+        state.unheard = match input.board {
+            Some(_) => 0,
+            None => state.unheard.saturating_add(1),
+        };
+        if input.command_lost {
+            tick.flags.set(TickFlags::COMMAND_LOST);
+            tick.disturbed = true;
+        }
+        if input.command_lost || holds {
+            state.unled = state.unled.saturating_add(1);
+        } else {
+            state.unled = 0;
+        }
+        let patience = self.timing.faults_in_a_row.min(self.timing.coast_ticks);
+        if state.unled >= patience || state.unheard >= self.timing.coast_ticks {
+            self.freeze(FreezeReason::LineStalled, tick);
+        } else if state.unled == 0 && state.unheard == 0 {
+            self.thaw(FreezeReason::LineStalled, tick);
         }
     }
 }

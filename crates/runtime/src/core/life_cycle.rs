@@ -2,7 +2,7 @@
 
 use super::Core;
 use crate::arming::{ArmingInput, Step};
-use crate::life::{EventKind, FreezeReason, Life, SafeReason};
+use crate::life::{EventKind, FreezeReason, FreezeReasons, Life, SafeReason};
 use crate::reference::ReferenceGenerator;
 use crate::tick::Tick;
 use crate::tick_record::TickFlags;
@@ -68,17 +68,14 @@ impl<R: ReferenceGenerator> Core<R> {
                 self.latch(cause.1, tick);
             } else if self.state.missing >= self.timing.coast_ticks {
                 self.freeze(cause.0, tick);
-            } else if self.state.missing == 0
-                && let Some((FreezeReason::BeadLost | FreezeReason::CameraStalled, _)) =
-                    self.state.frozen
-            {
-                // What was frozen for another reason stays so, however well the bead is seen.
-                self.thaw(tick);
+            } else if self.state.missing == 0 {
+                self.thaw(FreezeReason::BeadLost, tick);
+                self.thaw(FreezeReason::CameraStalled, tick);
             }
         }
-        match (self.state.life, self.state.frozen) {
-            (Life::Running, None) => Mode::Run,
-            (Life::Running, Some(_)) => {
+        match (self.state.life, self.state.frozen.any()) {
+            (Life::Running, false) => Mode::Run,
+            (Life::Running, true) => {
                 tick.flags.set(TickFlags::FREEZE);
                 Mode::Freeze
             }
@@ -90,22 +87,23 @@ impl<R: ReferenceGenerator> Core<R> {
         if self.state.life != Life::Safe {
             self.state.life = Life::Safe;
             self.state.safe_reason = Some(reason);
-            self.state.frozen = None;
+            self.state.frozen = FreezeReasons::default();
             tick.event(EventKind::SafeLatched { reason });
         }
     }
 
     pub(super) fn freeze(&mut self, reason: FreezeReason, tick: &mut Tick) {
-        if self.state.life == Life::Running && self.state.frozen.is_none() {
-            self.state.frozen = Some((reason, tick.time_ns));
+        if self.state.life == Life::Running && self.state.frozen.add(reason) {
+            self.state.frozen_since_ns = tick.time_ns;
             tick.event(EventKind::FreezeStarted { reason });
         }
     }
 
-    pub(super) fn thaw(&mut self, tick: &mut Tick) {
-        if let Some((_, since_ns)) = self.state.frozen.take() {
+    /// A reason to freeze is gone: the bead is held again when it was the last.
+    pub(super) fn thaw(&mut self, reason: FreezeReason, tick: &mut Tick) {
+        if self.state.frozen.remove(reason) {
             tick.event(EventKind::FreezeEnded {
-                lasted_ms: (tick.time_ns - since_ns) as f64 * 1e-6,
+                lasted_ms: (tick.time_ns - self.state.frozen_since_ns) as f64 * 1e-6,
             });
         }
     }

@@ -17,9 +17,9 @@ use crate::timing::Timing;
 
 use cellpos_control::{ControllerFile, Limits, Pi};
 use cellpos_drivers::{BoardHost, Port};
-use cellpos_emulator::{BoardConfig, RigInABox, WorldConfig};
+use cellpos_emulator::{BoardConfig, LineFaults, MisbehavingLine, RigInABox, WorldConfig};
 use cellpos_plant::{Model, TransferFunction};
-use cellpos_rig::{ArmRequest, CameraError, SourceInfo};
+use cellpos_rig::{ArmRequest, CameraError, CommandAccount, SourceInfo};
 use rtrb::RingBuffer;
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, MutexGuard};
@@ -281,6 +281,68 @@ fn each_thread_that_dies_ends_the_run_by_its_name() {
         };
         assert_eq!(reason, expected, "{thread:?}");
         assert_eq!(ran.io_error.is_some(), thread == Thread::Line, "{thread:?}");
+    }
+}
+
+#[test]
+fn a_line_that_stalls_for_less_than_200_ms_ends_no_run_and_one_that_stays_silent_does() {
+    for (stall_ms, reason) in [
+        (1, None),
+        (5, None),
+        (50, None),
+        (120, None),
+        (199, None),
+        (300, Some(SafeReason::LinkLost)),
+    ] {
+        let faults = Faults {
+            line: LineFaults {
+                stalled_ns: vec![[1500 * MS, (1500 + stall_ms) * MS]],
+                ..LineFaults::default()
+            },
+            ..Faults::default()
+        };
+        let ran = run(31, 3000, &faults, &[]);
+        check(&ran, &faults);
+        let end = ran.end.as_ref().expect("control lives");
+        assert_eq!(end.safe_reason, reason, "{stall_ms} ms");
+        let lost = ran.commands.expect("counted");
+        let stall = stall_ms.unsigned_abs();
+        if reason.is_none() {
+            let flagged = ran
+                .records
+                .iter()
+                .filter(|r| r.flags.has(TickFlags::COMMAND_LOST));
+            assert!(flagged.count() as u64 >= stall / 2, "{stall_ms} ms");
+            assert!(
+                lost.lost_in_all().abs_diff(stall) <= 3,
+                "{stall_ms} ms: {lost:?}"
+            );
+            assert!(ran.io_error.is_none(), "{stall_ms} ms");
+        }
+        replays(&ran);
+    }
+}
+
+#[test]
+fn a_line_that_is_unplugged_and_comes_back_ends_no_run_before_the_board_is_silent_for_too_long() {
+    for (away_ms, ends) in [(20, false), (150, false), (400, true)] {
+        let faults = Faults {
+            line: LineFaults {
+                unplugged_ns: vec![[1500 * MS, (1500 + away_ms) * MS]],
+                ..LineFaults::default()
+            },
+            ..Faults::default()
+        };
+        let ran = run(37, 3000, &faults, &[]);
+        check(&ran, &faults);
+        let end = ran.end.as_ref().expect("control lives");
+        let reason = ends.then_some(SafeReason::LinkLost);
+        assert_eq!(end.safe_reason, reason, "{away_ms} ms");
+        let lost = ran.commands.expect("counted").lost_in_all();
+        assert!(
+            ends || lost.abs_diff(away_ms.unsigned_abs()) <= 3,
+            "{away_ms} ms: {lost}"
+        );
     }
 }
 

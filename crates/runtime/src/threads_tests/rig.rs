@@ -64,6 +64,8 @@ pub(super) struct Faults {
     /// The board hears no command any more from a time on, ns; it is heard all the same.
     pub(super) deaf: Option<i64>,
     pub(super) dies: Option<(Thread, i64)>,
+    /// What goes wrong on the line to the board; its times count from the start of the run.
+    pub(super) line: LineFaults,
     pub(super) camera_hz: f64,
     /// Frames are sound until then, ns.
     pub(super) calm_ns: i64,
@@ -99,6 +101,7 @@ impl Default for Faults {
             unconfirmed: None,
             deaf: None,
             dies: None,
+            line: LineFaults::default(),
             camera_hz: 1000.0,
             calm_ns: 0,
         }
@@ -157,6 +160,14 @@ impl Faults {
         }
         if dice.hits(0.1) {
             faults.deaf = Some(dice.within(0, duration_ns));
+        }
+        if dice.hits(0.3) {
+            faults.line = LineFaults {
+                stalls_per_s: maybe(dice, 0.5, 3.0),
+                part: maybe(dice, 0.5, 0.2),
+                byte_loss: maybe(dice, 0.5, 1e-3),
+                ..LineFaults::default()
+            };
         }
         if dice.hits(0.3) {
             let threads = [
@@ -230,23 +241,26 @@ impl Port for Line {
         "line"
     }
 
-    fn write_all(&mut self, bytes: &[u8]) -> std::io::Result<()> {
+    fn write_some(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
         let now_ns = self.clock.now_ns();
         let mut rig = at(&self.rig, now_ns);
         if rig.line_is_dead {
             return Err(std::io::ErrorKind::BrokenPipe.into());
         }
         if rig.is_deaf {
-            return Ok(());
+            return Ok(bytes.len());
         }
         let now_ns = now_ns.max(rig.emulated.now_ns());
         rig.emulated.receive(bytes, now_ns);
         rig.look();
-        Ok(())
+        Ok(bytes.len())
     }
 
     fn read_available(&mut self, buffer: &mut [u8]) -> std::io::Result<usize> {
         let mut rig = at(&self.rig, self.clock.now_ns());
+        if rig.line_is_dead {
+            return Err(std::io::ErrorKind::BrokenPipe.into());
+        }
         Ok(rig.emulated.transmit(buffer))
     }
 }

@@ -6,6 +6,7 @@ use super::*;
 pub(super) struct Ran {
     /// `None`: control died.
     pub(super) end: Option<ControlEnd>,
+    pub(super) commands: Option<CommandAccount>,
     pub(super) io_error: Option<RunError>,
     pub(super) report: RecorderReport,
     /// What the operator's end of the loop was told of the recorder.
@@ -172,7 +173,7 @@ impl Scheduler<'_> {
     }
 }
 
-pub(super) type HostBoard = BoardHost<Line>;
+pub(super) type HostBoard = BoardHost<MisbehavingLine<Line>>;
 
 /// A rig whose board is armed, with the displacement at which it stands.
 pub(super) fn armed(seed: u64, faults: &Faults, clock: &Clock) -> (Shelf, HostBoard, f64) {
@@ -193,6 +194,8 @@ pub(super) fn armed(seed: u64, faults: &Faults, clock: &Clock) -> (Shelf, HostBo
         rig: Arc::clone(&rig),
         clock: clock.clone(),
     };
+    // Sound until the run has begun.
+    let line = MisbehavingLine::new(line, clock.clone(), LineFaults::default(), seed);
     let mut board = BoardHost::connect(line, clock.clone()).expect("a board");
     board.count_from(faults.first.2);
     let limits = file().limits;
@@ -242,6 +245,7 @@ pub(super) fn run(seed: u64, periods: u64, faults: &Faults, asks: &[(i64, Reques
     let [camera_clock, control_clock, actuator_clock, recorder_clock] = &clocks;
     let (rig, mut board, stands_um) = armed(seed, faults, actuator_clock);
     let start_ns = actuator_clock.now_ns();
+    board.port_mut().misbehave(faults.line.from(start_ns));
     for clock in &clocks {
         clock.sleep_until_ns(start_ns);
     }
@@ -299,7 +303,7 @@ pub(super) fn run(seed: u64, periods: u64, faults: &Faults, asks: &[(i64, Reques
             &shared,
         )),
         end: None,
-        acting: Some(Acting::new(&mut board, ends.orders, ends.reports)),
+        acting: Some(Acting::new(&mut board, ends.orders, ends.heard)),
         io_error: None,
         recorder: Recorder::new(feed, &mut sink, &mut statistics, &shared.pulse),
         recorded: false,
@@ -324,6 +328,7 @@ pub(super) fn run(seed: u64, periods: u64, faults: &Faults, asks: &[(i64, Reques
     let mut rig = at(&rig, over_ns);
     Ran {
         end,
+        commands: board.account(),
         io_error,
         report,
         fault: operator.recorder_fault(),

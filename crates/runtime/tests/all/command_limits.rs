@@ -108,6 +108,7 @@ proptest! {
 board_trouble: None,
                 previous_late_ns: None,
                 previous_refused: false,
+            command_lost: false,
                 board: Some(report(k as u64)),
                 request: if calm { Request::None } else { tick.request },
                 target_um: None,

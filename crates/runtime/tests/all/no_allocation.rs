@@ -5,7 +5,7 @@ use cellpos_control::ControllerKind;
 use cellpos_counting_alloc::{allocations, allocations_of};
 use cellpos_rig::Clock;
 use cellpos_runtime::ticker::{RingSizes, Ticker};
-use cellpos_runtime::{Action, Life, Request};
+use cellpos_runtime::{Action, Heard, Life, Request};
 use cellpos_vision::FixQuality;
 
 /// Ticks through arming, running, coasting, freezing, a stale frame, a stop by the operator and Safe.
@@ -42,7 +42,11 @@ fn allocations_per_run(kind: ControllerKind) -> (u64, usize) {
         };
         let mut said = report(k);
         said.applied_um = applied_um;
-        ends.reports.push(said).unwrap();
+        let heard = Heard {
+            report: Some(said),
+            ..Heard::default()
+        };
+        ends.heard.push(heard).unwrap();
         ran += usize::from(ticker.tick(due_ns, request) == Life::Running);
         // The other ends of the rings, which live on threads that may allocate, do not here.
         while let Ok(order) = ends.orders.pop() {

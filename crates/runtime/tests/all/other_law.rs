@@ -68,6 +68,7 @@ fn record(ticks: u64) -> Vec<TickRecord> {
                 board_trouble: None,
                 previous_late_ns: None,
                 previous_refused: false,
+                command_lost: false,
                 board: Some(report(k)),
                 request: Request::None,
                 target_um: None,

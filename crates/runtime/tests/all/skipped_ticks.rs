@@ -31,6 +31,7 @@ fn commands(
             board_trouble: None,
             previous_late_ns: None,
             previous_refused: false,
+            command_lost: false,
             board: Some(report(k)),
             request: Request::None,
             target_um: None,

@@ -1,6 +1,7 @@
 //! What `cellpos run` prints in the end.
 
 use super::learning::NamedTable;
+use crate::commands::track::commands_lost;
 use crate::cyclic;
 use cellpos_runtime::Summary;
 use cellpos_runtime::realtime::Conditions;
@@ -155,6 +156,12 @@ impl<'a> Report<'a> {
                 c.ticks, self.summary.duration_s, c.late, c.skipped, self.summary.records_lost
             ),
         );
+        if let Some(lost) = self.summary.commands_lost.filter(|&lost| lost > 0) {
+            line(
+                "commands",
+                commands_lost(lost, self.summary.commands_not_taken),
+            );
+        }
         for learned in self.learned {
             let text = cyclic::learned_text(&learned.table);
             line("learned", format!("{}: {text}", learned.name));
