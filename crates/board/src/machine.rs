@@ -7,7 +7,7 @@
 //!
 //! | state | output | left by |
 //! |---|---|---|
-//! | disarmed | at power-up displacement, after a session at park | arm |
+//! | disarmed | at power-up displacement; after a session, or a reset in one, at park | arm |
 //! | armed | holds where it was | first command, hold watchdog (to safe), freeze, park, disarm |
 //! | running | follows commands, within range and slew | watchdog (to holding), freeze, park, disarm |
 //! | holding | last zero-flow estimate | fresh command (to running), hold watchdog (to safe), arm, freeze, park, disarm |
@@ -43,6 +43,8 @@ pub struct Board {
     fault: Fault,
     /// Whether a host of the right protocol version said hello.
     greeted: bool,
+    /// Whether the output is on its way to park after a reset.
+    returning: bool,
     led: bool,
     now_us: u64,
     /// When the hold watchdog was last fed.
@@ -70,6 +72,7 @@ impl Board {
             state: BoardState::Disarmed,
             fault: Fault::None,
             greeted: false,
+            returning: false,
             led: false,
             now_us: 0,
             held_since_us: 0,
@@ -79,6 +82,23 @@ impl Board {
             clipped: 0,
             config,
         })
+    }
+
+    /// A board whose microcontroller was reset while its converter stood at `applied_pm`: nobody moves a bead out of there, so
+    /// the output goes to park by the ramp before anything else. It is armed when it has arrived.
+    ///
+    /// # Errors
+    /// [`ConfigError`] names the first value that cannot be; a displacement outside the range is one.
+    pub fn after_reset(config: Config, applied_pm: i32) -> Result<Self, ConfigError> {
+        let stands = Config {
+            power_up_pm: applied_pm,
+            ..config
+        };
+        let mut board = Self::new(stands)?;
+        board.config = config;
+        board.trajectory = Trajectory::hold(config.park_pm);
+        board.returning = true;
+        Ok(board)
     }
 
     /// Takes bytes that arrived at `now_us`. The output follows at the next [`Board::tick`].
@@ -189,6 +209,7 @@ impl Board {
     fn advance(&mut self) {
         let (target_pm, rate_nm_per_s) = self.target();
         self.output.advance(self.now_us, target_pm, rate_nm_per_s);
+        self.returning &= !self.output.arrived(target_pm);
     }
 
     /// Where the output has to go in the present state (pm), and how fast (nm/s).
@@ -336,6 +357,9 @@ impl Board {
     fn arm(&mut self, arm: &Arm) -> Result<(), Refusal> {
         if !self.greeted {
             return Err(Refusal::Protocol);
+        }
+        if self.returning {
+            return Err(Refusal::State);
         }
         // A host whose commands are fresh is at work: it has to end its session first, or fall silent.
         if self.state == BoardState::Running && arm.session != self.session.number {

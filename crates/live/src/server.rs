@@ -12,13 +12,15 @@ use crate::queue::Queue;
 use crate::shared::Shared;
 use std::fmt;
 use std::net::{SocketAddr, TcpListener, TcpStream};
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex};
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
 /// Most connections at a time.
 pub const MOST_CLIENTS: usize = 32;
+/// Places that viewers leave free: an operator always finds one to freeze and park from.
+const FOR_OPERATORS: usize = 8;
 /// How often the hub sends.
 const ROUND_EVERY: Duration = Duration::from_millis(40);
 /// How often new connections are looked for.
@@ -121,6 +123,7 @@ impl Server {
             over: AtomicBool::new(false),
             clients: Clients::default(),
             connections: AtomicUsize::new(0),
+            silent: Mutex::default(),
             command: Box::new(command),
             on_thread: config.on_thread.clone(),
             film: config.film.clone(),
@@ -202,10 +205,14 @@ fn serve_hub(mut hub: Hub, shared: &Shared) {
 
 fn accept(listener: &TcpListener, shared: &Arc<Shared>) {
     let mut clients: Vec<JoinHandle<()>> = vec![];
+    let mut number = 0;
     while !shared.is_over() {
         clients.retain(|client| !client.is_finished());
         match listener.accept() {
-            Ok((stream, _)) => clients.extend(greet(stream, shared)),
+            Ok((stream, _)) => {
+                number += 1;
+                clients.extend(greet(stream, number, shared));
+            }
             Err(_) => thread::sleep(ACCEPT_EVERY),
         }
     }
@@ -214,11 +221,12 @@ fn accept(listener: &TcpListener, shared: &Arc<Shared>) {
     }
 }
 
-/// Gives a connection a thread, or sends it away.
-fn greet(mut stream: TcpStream, shared: &Arc<Shared>) -> Option<JoinHandle<()>> {
+/// Gives a connection a thread, in place of one that has said nothing yet if need be, or sends it away.
+fn greet(mut stream: TcpStream, number: u64, shared: &Arc<Shared>) -> Option<JoinHandle<()>> {
     // The listener does not wait; its connections do.
     stream.set_nonblocking(false).ok()?;
-    if shared.connections.fetch_add(1, Ordering::AcqRel) >= MOST_CLIENTS {
+    let full = shared.connections.fetch_add(1, Ordering::AcqRel) >= MOST_CLIENTS;
+    if full && !shared.end_silent() {
         shared.connections.fetch_sub(1, Ordering::AcqRel);
         let _ = stream.set_write_timeout(Some(Duration::from_millis(100)));
         http::say(
@@ -228,24 +236,29 @@ fn greet(mut stream: TcpStream, shared: &Arc<Shared>) -> Option<JoinHandle<()>> 
         );
         return None;
     }
+    shared.await_word(number, &stream);
     let held = Arc::clone(shared);
     let thread = thread::Builder::new()
         .name("live-client".to_string())
         .stack_size(STACK)
         .spawn(move || {
             held.enter_thread();
-            converse(stream, &held);
+            converse(stream, number, &held);
+            held.has_spoken(number);
             held.connections.fetch_sub(1, Ordering::AcqRel);
         });
     if thread.is_err() {
+        shared.has_spoken(number);
         shared.connections.fetch_sub(1, Ordering::AcqRel);
     }
     thread.ok()
 }
 
 /// One connection: a file, a request, or the live line.
-fn converse(mut stream: TcpStream, shared: &Shared) {
-    let request = match http::read_request(&mut stream) {
+fn converse(mut stream: TcpStream, number: u64, shared: &Shared) {
+    let request = http::read_request(&mut stream);
+    shared.has_spoken(number);
+    let request = match request {
         Ok(request) => request,
         Err(RequestError::Gone) => return,
         Err(RequestError::Bad) => {
@@ -289,6 +302,15 @@ fn converse(mut stream: TcpStream, shared: &Shared) {
         // A browser always says where a script comes from: without an origin it is not our page.
         ("GET", "/live", Some(_)) if request.origin.is_none() => {
             http::say(&mut stream, "403 Forbidden", "no origin");
+        }
+        ("GET", "/live", Some(_))
+            if role == Role::Viewer && shared.clients.count() >= MOST_CLIENTS - FOR_OPERATORS =>
+        {
+            http::say(
+                &mut stream,
+                "503 Service Unavailable",
+                "too many pages are open",
+            );
         }
         ("GET", "/live", Some(key)) => {
             if http::switch_to_websocket(&mut stream, key).is_ok() {

@@ -6,9 +6,10 @@ use crate::film::Film;
 use crate::hub::Clients;
 use crate::state::Hello;
 use serde::Serialize;
-use std::net::SocketAddr;
-use std::sync::Arc;
+use std::collections::VecDeque;
+use std::net::{Shutdown, SocketAddr, TcpStream};
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use tungstenite::Message;
 
 /// What the server's threads share.
@@ -21,6 +22,8 @@ pub(crate) struct Shared {
     pub(crate) over: AtomicBool,
     pub(crate) clients: Clients,
     pub(crate) connections: AtomicUsize,
+    /// Connections that have not yet said what they want, oldest first, by their number.
+    pub(crate) silent: Mutex<VecDeque<(u64, TcpStream)>>,
     pub(crate) command: Box<dyn Fn(OperatorRequest) + Send + Sync>,
     pub(crate) on_thread: Option<Arc<dyn Fn() + Send + Sync>>,
     pub(crate) film: Option<Film>,
@@ -52,6 +55,28 @@ impl Shared {
             operator: role == Role::Operator,
         };
         Message::text(serde_json::to_string(&greeting).unwrap_or_default())
+    }
+
+    /// Remembers a connection until it says what it wants.
+    pub(crate) fn await_word(&self, number: u64, stream: &TcpStream) {
+        if let Ok(stream) = stream.try_clone() {
+            self.silent().push_back((number, stream));
+        }
+    }
+
+    /// A connection has said what it wants, or is gone.
+    pub(crate) fn has_spoken(&self, number: u64) {
+        self.silent().retain(|(of, _)| *of != number);
+    }
+
+    /// Ends the connection that has been silent for longest; whether there was one.
+    pub(crate) fn end_silent(&self) -> bool {
+        let oldest = self.silent().pop_front();
+        oldest.is_some_and(|(_, stream)| stream.shutdown(Shutdown::Both).is_ok())
+    }
+
+    fn silent(&self) -> MutexGuard<'_, VecDeque<(u64, TcpStream)>> {
+        self.silent.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// The first act of a thread of the server.

@@ -269,6 +269,32 @@ fn more_than_enough_connections_are_sent_away_and_the_rest_stays() {
 }
 
 #[test]
+fn silent_connections_and_viewers_do_not_keep_an_operator_from_the_stop_key() {
+    let page = page();
+    let address = page.server.address();
+    let connect = || TcpStream::connect(address).unwrap();
+    let silent: Vec<TcpStream> = (0..cellpos_live::MOST_CLIENTS).map(|_| connect()).collect();
+    std::thread::sleep(Duration::from_millis(100));
+    let from = Instant::now();
+    let mut socket = page.operator();
+    socket.send(Message::text(r#"{"do":"freeze"}"#)).unwrap();
+    let asked = |request| page.asked.lock().unwrap().contains(&request);
+    wait_for(|| asked(OperatorRequest::Freeze));
+    // Before any of them has been given up for its silence.
+    assert!(from.elapsed() < Duration::from_secs(2));
+    drop((silent, socket));
+    let origin = format!("http://{address}");
+    let viewer = page.server.viewer_url();
+    let viewers: Vec<_> = (0..cellpos_live::MOST_CLIENTS)
+        .map(|_| page.socket(&viewer, &origin))
+        .collect();
+    assert!(viewers.iter().any(Result::is_err));
+    let mut socket = page.operator();
+    socket.send(Message::text(r#"{"do":"park"}"#)).unwrap();
+    wait_for(|| asked(OperatorRequest::Park));
+}
+
+#[test]
 fn an_address_that_others_can_reach_must_be_asked_for_by_name() {
     let config = ServerConfig {
         address: "0.0.0.0:0".parse().unwrap(),

@@ -337,7 +337,7 @@ impl<R: ReferenceGenerator> Core<R> {
                 self.thaw(FreezeReason::Operator, &mut tick);
             }
         }
-        let mode = self.advance_life(fix.map(|fix| fix.position_um), &mut tick);
+        let mode = self.advance_life(fix.map(|fix| fix.position_um), input.request, &mut tick);
         let (output, generated) = self.control(fix, input, mode, slew_time_s, &mut tick);
         if output.requested_um.is_nan() {
             self.latch(SafeReason::NotFinite, &mut tick);

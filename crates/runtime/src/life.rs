@@ -64,6 +64,11 @@ pub enum Request {
 }
 
 impl Request {
+    /// Whether the bead is to be stopped where it is.
+    pub(crate) fn stops(self) -> bool {
+        matches!(self, Self::Freeze | Self::Pause)
+    }
+
     /// The request of a number in a record; anything unknown is the safest, [`Request::Park`].
     pub fn from_number(number: u8) -> Self {
         match number {

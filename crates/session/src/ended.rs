@@ -313,7 +313,7 @@ impl Clues {
             SafeReason::LinkLost => sentences(
                 format!(" ({} ms)", timing.board_silence_ms),
                 "a status every 10 ms",
-                "check cable and power of the board; its own watchdog has parked the PZT",
+                "check cable and power of the board; by its own watchdogs it holds the bead at zero flow, and parks the PZT after that",
             ),
             SafeReason::NotFinite => sentences(
                 "",
@@ -400,7 +400,7 @@ fn failed(error: &RunError) -> Sentences {
         RunError::Actuator(_) => sentences(
             seen,
             "a board that answers until the run ends",
-            "check its cable and power; its own watchdog parks the PZT",
+            "check its cable and power; by its own watchdogs it holds the bead at zero flow, and parks the PZT after that",
         ),
         _ => sentences(
             seen,

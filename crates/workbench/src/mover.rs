@@ -52,6 +52,15 @@ impl Mover {
                 hold_watchdog_ms,
             })
             .map_err(Failure::failed)?;
+        if limits.low_um >= limits.high_um {
+            return Err(Failure::bad_input(
+                format!(
+                    "[limits] of rig.toml ({} to {} um) and the board's range ({} to {} um) do not meet",
+                    file.limits.low_um, file.limits.high_um, info.low_um, info.high_um
+                ),
+                "change low_um and high_um in [limits]",
+            ));
+        }
         let clock = Clock::Real;
         let now_ns = clock.now_ns();
         Ok(Self {
@@ -60,7 +69,9 @@ impl Mover {
             clock,
             start_ns: now_ns,
             due_ns: now_ns,
-            at_um: newest.applied_um,
+            // Where it rests may be outside the limits: by a step of the converter, or at a park that the limits leave out. The
+            // board takes no command there.
+            at_um: newest.applied_um.clamp(limits.low_um, limits.high_um),
             session,
             newest,
             _place: place,
@@ -139,5 +150,27 @@ impl Drop for Mover {
     fn drop(&mut self) {
         // What fails here, the board's own watchdog does.
         let _ = self.board.disarm();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::Bench;
+
+    #[test]
+    fn a_pzt_that_rests_a_converter_step_outside_the_limits_is_moved() {
+        let mut file = RigFile::default();
+        file.board.power_up_um = 20.0;
+        // Codes are 0.6 nm apart: the board stands at 20.0003 um.
+        file.limits.low_um = 20.0008;
+        file.limits.park_um = 20.0;
+        let bench = Bench::of(file).expect("a bench");
+        let mut mover = Mover::arm(bench.board().expect("a board"), bench.file()).expect("armed");
+        assert!(mover.newest().applied_um < 20.0008);
+        let rests_um = mover.at_um();
+        mover.step(rests_um, 100.0).expect("it may rest");
+        while !mover.step(20.5, 1000.0).expect("it may move") {}
+        assert!(mover.step(19.9, 1000.0).is_err());
     }
 }

@@ -1,7 +1,7 @@
 //! The PZT board on a Raspberry Pi Pico 2 (RP2350): USB CDC to the host, a 16-bit converter on SPI.
 //!
 //! The output is updated every 100 us by a task that interrupts all else and alone feeds the hardware watchdog: a firmware that
-//! answers and no longer steps is reset after 5 ms. After such a reset the output goes on from where the ADC sees it; after
+//! answers and no longer steps is reset after 5 ms. After such a reset the output ramps to park from where the ADC sees it; after
 //! power-up it stands at the converter's own code 0. Where the output does not show what was written, the board parks and
 //! the Pico's LED blinks. A panic ends in the watchdog's reset.
 #![no_std]
@@ -159,15 +159,17 @@ async fn main(_spawner: Spawner) {
         adc: p.ADC,
         looked_at: p.PIN_26,
     });
-    let mut config = CONFIG;
-    // The converter knows nothing of the reset of its microcontroller: a jump to code 0 is no way to begin again.
-    if matches!(watchdog.reset_reason(), Some(ResetReason::TimedOut))
-        && let Some(code) = converter.shown()
-    {
-        config.power_up_pm = displacement_pm(code);
-    }
+    // The converter knows nothing of the reset of its microcontroller: it is led to park from where it stands.
+    let stands = match watchdog.reset_reason() {
+        Some(ResetReason::TimedOut | ResetReason::Forced) => converter.shown(),
+        None => None,
+    };
+    let board = match stands {
+        Some(code) => Board::after_reset(CONFIG, displacement_pm(code)),
+        None => Board::new(CONFIG),
+    };
     // The configuration is a constant that the tests of the library check; without a board nothing steps, and nothing moves.
-    let Ok(board) = Board::new(config) else {
+    let Ok(board) = board else {
         return;
     };
     BOARD.lock(|place| place.replace(Some(board)));

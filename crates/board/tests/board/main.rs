@@ -27,8 +27,12 @@ struct Desk {
 
 impl Desk {
     fn new(config: Config) -> Self {
+        Self::of(Board::new(config).unwrap())
+    }
+
+    fn of(board: Board) -> Self {
         Self {
-            board: Board::new(config).unwrap(),
+            board,
             decoder: Decoder::new(),
             now_us: 0,
             seq: 0,

@@ -1,8 +1,10 @@
 //! How the board stops: silence, freeze, park, disarm, and how it comes back.
 
 use crate::{Desk, STEP_UM};
-use cellpos_board::Config;
-use cellpos_link::{Arm, BoardState, Fault, Limits, ToBoard, ToHost};
+use cellpos_board::{Board, Config};
+use cellpos_link::{
+    Arm, BoardState, Fault, Limits, PROTOCOL_VERSION, Refusal, Request, ToBoard, ToHost,
+};
 
 #[test]
 fn silence_first_goes_to_zero_flow_at_the_slew_and_holds_then_parks_at_its_rate() {
@@ -220,4 +222,36 @@ fn ignored_commands_do_not_feed_the_watchdog() {
         desk.run(1.0);
     }
     assert_eq!(desk.board.fault(), Fault::CommandTimeout);
+}
+
+#[test]
+fn after_a_reset_in_mid_flight_the_output_ramps_to_park_before_anything_else() {
+    let config = Config {
+        park_pm: 2_000_000,
+        ..Config::DEFAULT
+    };
+    let board = Board::after_reset(config, 23_000_000).unwrap();
+    let mut desk = Desk::of(board);
+    assert!((desk.applied_um() - 23.0).abs() <= STEP_UM, "no jump");
+    let way = desk.run(10.0);
+    desk.say(ToBoard::Hello {
+        protocol: PROTOCOL_VERSION,
+    });
+    desk.say(ToBoard::Arm(Arm::session(1)));
+    assert_eq!(desk.board.state(), BoardState::Disarmed);
+    assert!(desk.hear().contains(&ToHost::Refused {
+        request: Request::Arm,
+        refusal: Refusal::State,
+    }));
+    let way: Vec<f64> = way.into_iter().chain(desk.run(20.0)).collect();
+    for (k, um) in way.iter().enumerate() {
+        let expected = (23.0 - 0.1 * (k + 1) as f64).max(2.0);
+        assert!(
+            (um - expected).abs() <= STEP_UM,
+            "{k}: {um} against {expected}"
+        );
+    }
+    desk.say(ToBoard::Arm(Arm::session(1)));
+    assert_eq!(desk.board.state(), BoardState::Armed);
+    assert!(Board::after_reset(config, 41_000_000).is_err());
 }

@@ -1,8 +1,8 @@
 //! The life cycle: armed, running, frozen, safe.
 
 use super::Core;
-use crate::arming::{ArmingInput, Step};
-use crate::life::{EventKind, FreezeReason, FreezeReasons, Life, SafeReason};
+use crate::arming::{ArmingInput, ArmingState, Step};
+use crate::life::{EventKind, FreezeReason, FreezeReasons, Life, Request, SafeReason};
 use crate::reference::ReferenceGenerator;
 use crate::tick::Tick;
 use crate::tick_record::TickFlags;
@@ -10,7 +10,18 @@ use cellpos_control::Mode;
 
 impl<R: ReferenceGenerator> Core<R> {
     /// Life cycle; gives what the controller is to do.
-    pub(super) fn advance_life(&mut self, position_um: Option<f64>, tick: &mut Tick) -> Mode {
+    pub(super) fn advance_life(
+        &mut self,
+        position_um: Option<f64>,
+        request: Request,
+        tick: &mut Tick,
+    ) -> Mode {
+        if self.state.life == Life::Armed && request.stops() {
+            // The pulse ends here; should the loop go on, it begins anew.
+            self.state.arming = ArmingState::default();
+            tick.flags.set(TickFlags::FREEZE);
+            return Mode::Freeze;
+        }
         if self.state.life == Life::Armed {
             let held = self.controller.previous_command_um();
             let neutral_um = self.controller.neutral_um();

@@ -501,6 +501,43 @@ fn a_program_that_stood_still_as_a_whole_does_not_blame_its_recorder() {
 }
 
 #[test]
+fn an_operator_who_stops_the_run_while_it_is_arming_ends_the_pulse_at_once() {
+    let mut cut = 0;
+    for at_ms in (0..160).step_by(5) {
+        let ran = run(
+            2,
+            20_000,
+            &Faults::default(),
+            &[(at_ms * MS, Request::Freeze)],
+        );
+        check(&ran, &Faults::default());
+        assert_eq!(ran.end.as_ref().map(|end| end.end), Some(End::Operator));
+        let asked = ran
+            .records
+            .iter()
+            .position(|r| r.request == Request::Freeze as u8);
+        let (before, after) = ran.records.split_at(asked.expect("asked"));
+        if before.last().is_none_or(|r| r.life != Life::Armed as u8) {
+            continue;
+        }
+        let off_um = |r: &TickRecord| (r.command_um - r.neutral_um).abs();
+        cut += u32::from(before.last().is_some_and(|r| off_um(r) > 0.05));
+        // Ten periods for the way back at the slew.
+        assert!(
+            after
+                .iter()
+                .all(|r| r.flags.has(TickFlags::FREEZE) && r.life == Life::Armed as u8)
+        );
+        assert!(
+            after.iter().skip(10).all(|r| off_um(r) < 0.05),
+            "{at_ms} ms"
+        );
+        replays(&ran);
+    }
+    assert!(cut > 1, "no pulse was cut");
+}
+
+#[test]
 fn freeze_and_park_take_the_clocks_time_with_doubled_frames() {
     let faults = Faults {
         doubled: 1.0,

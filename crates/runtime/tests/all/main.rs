@@ -3,6 +3,7 @@
 mod a_day;
 mod command_limits;
 mod common;
+mod freezes;
 mod live_threads;
 mod no_allocation;
 mod other_law;
