@@ -47,7 +47,7 @@ pub struct Acquired {
     pub records: Vec<RecordedSegment>,
     /// Estimate of neutral at the end, um.
     pub neutral_um: f64,
-    /// Mean time from the arrival of a frame to its tick, s: part of the record's delay, and not of the camera's.
+    /// Median time from the arrival of a frame to its tick, s: part of the record's delay, and not of the camera's.
     pub wait_s: f64,
     /// From the middle of an exposure to the arrival of its frame, by the stamps of the frames, s.
     pub path_s: f64,
