@@ -6,8 +6,8 @@ set -euo pipefail
 cd "$(dirname "$0")/.."
 env=target/python
 if ! { [ -x "$env/bin/python" ] || python3 -m venv "$env"; } \
-    || ! "$env/bin/pip" install -q --disable-pip-version-check "maturin>=1.7,<2" numpy pandas matplotlib pytest mypy pypylon imageio; then
-    echo "check-python: skipped: maturin, numpy, pandas, matplotlib, pytest, mypy, pypylon and imageio cannot be installed here"
+    || ! "$env/bin/pip" install -q --disable-pip-version-check "maturin>=1.7,<2" numpy pandas matplotlib pytest mypy pypylon imageio pyserial; then
+    echo "check-python: skipped: maturin, numpy, pandas, matplotlib, pytest, mypy, pypylon, imageio and pyserial cannot be installed here"
     exit 0
 fi
 cargo build -q --locked -p cellpos-firmware-sim

@@ -2,7 +2,9 @@
 
 import builtins
 import importlib.util
+import json
 import re
+import shutil
 import subprocess
 import sys
 
@@ -38,3 +40,20 @@ def test_the_module_is_typed():
     words = [sys.executable, "-m", "mypy", "--config-file", ROOT / "python/pyproject.toml", "--cache-dir", ROOT / "target/mypy"]
     done = subprocess.run([*words, ROOT / "python/src/cellpos"], cwd=ROOT / "python", capture_output=True, text=True)
     assert done.returncode == 0, done.stdout
+
+
+def test_the_notebook_runs(tmp_path, monkeypatch):
+    pytest.importorskip("matplotlib", reason="the notebook plots")
+    (tmp_path / "python").mkdir()
+    shutil.copytree(ROOT / "examples/scripts", tmp_path / "scripts")
+    monkeypatch.chdir(tmp_path / "python")
+    monkeypatch.setenv("MPLBACKEND", "Agg")
+    cells = json.loads((ROOT / "examples/python/run.ipynb").read_text())["cells"]
+    space: dict = {}
+    for cell in cells:
+        if cell["cell_type"] == "code":
+            exec(compile("".join(cell["source"]), "run.ipynb", "exec"), space)
+    model = space["model"]
+    # Eq. (6) has 428 /s below its pair and 379 /s above it; the camera path is 2 ms.
+    assert abs(model["delay_ms"] - 2.0) < 0.2
+    assert 350 < model["num"][0] < 450, model

@@ -23,6 +23,7 @@ pub mod calibration;
 pub mod calibration_file;
 pub mod flow;
 mod outbox;
+pub mod program;
 pub mod serial;
 pub mod socket;
 pub mod sources;

@@ -38,6 +38,39 @@ pub(crate) fn foreign_rate_hz(ticks: &[TickRecord], period_ns: i64) -> Option<f6
     (off.abs() > AGREES).then(|| 1e9 / spacing_ns)
 }
 
+/// Frames of a camera that is faster than the loop, counted in periods of the loop: each tick takes the newest of several, and a
+/// record has a row for each tick.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct InPeriods {
+    period_ns: i64,
+    /// Middle of the first exposure, ns.
+    first_ns: Option<i64>,
+}
+
+impl InPeriods {
+    /// `None` where the camera gives at most one frame a period.
+    pub(crate) fn of(rate_hz: f64, period_ns: i64) -> Option<Self> {
+        /// Frames a period: halfway between one and two.
+        const SEVERAL: f64 = 1.5;
+        (rate_hz * 1e-9 * period_ns as f64 > SEVERAL).then_some(Self {
+            period_ns,
+            first_ns: None,
+        })
+    }
+
+    /// The tick with the number of its frame in periods.
+    pub(crate) fn count(&mut self, mut tick: TickRecord) -> TickRecord {
+        let has_frame = !tick.flags.has(TickFlags::TIMER) && tick.mid_exposure_ns > 0;
+        if has_frame {
+            let first_ns = *self.first_ns.get_or_insert(tick.mid_exposure_ns);
+            // The first exposure is in the middle of its period, so that a frame more or less changes nothing.
+            let since_ns = tick.mid_exposure_ns - first_ns + self.period_ns / 2;
+            tick.frame_id = u64::try_from(since_ns / self.period_ns).unwrap_or(0);
+        }
+        tick
+    }
+}
+
 /// That in a sentence, and what to do.
 pub(crate) fn other_rate(rate_hz: f64, period_ns: i64) -> Failure {
     Failure::bad_input(
@@ -70,6 +103,20 @@ mod tests {
                 tick
             })
             .collect()
+    }
+
+    #[test]
+    fn frames_of_a_faster_camera_are_counted_in_periods() {
+        let period_ns = 20_000_000;
+        assert!(InPeriods::of(50.0, period_ns).is_none());
+        let mut in_periods = InPeriods::of(1000.0, period_ns).unwrap();
+        for k in 0..4000_i64 {
+            let mut tick = TickRecord::unknown();
+            // A frame sooner or later, whatever its own number.
+            tick.mid_exposure_ns = 5_000_000 + k * period_ns + (k % 3 - 1) * 1_000_000;
+            tick.frame_id = 20 * k as u64 + 7;
+            assert_eq!(in_periods.count(tick).frame_id, k as u64);
+        }
     }
 
     #[test]

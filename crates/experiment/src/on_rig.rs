@@ -3,7 +3,7 @@
 //!
 //! The loop freezes and thaws by its own rules when the bead is lost; a segment in which it did is measured again.
 
-use crate::camera_rate::{foreign_rate_hz, other_rate};
+use crate::camera_rate::{InPeriods, foreign_rate_hz, other_rate};
 use crate::exciting::{Exciting, Handing};
 use crate::identify::held_bead::{DelayTest, Setup, mean_grey};
 pub use crate::rows::is_unseen;
@@ -47,7 +47,7 @@ pub struct Acquired {
     pub records: Vec<RecordedSegment>,
     /// Estimate of neutral at the end, um.
     pub neutral_um: f64,
-    /// Median time from the arrival of a frame to its tick, s: part of the record's delay, and not of the camera's.
+    /// Mean time from the arrival of a frame to its tick, s: part of the record's delay, and not of the camera's.
     pub wait_s: f64,
     /// From the middle of an exposure to the arrival of its frame, by the stamps of the frames, s.
     pub path_s: f64,
@@ -111,6 +111,7 @@ impl OnRig {
         } else {
             ClockKind::Real
         });
+        let model = file.actuator.before(model);
         let mut controller = setup::controller("pi", &model, &file.timing)?;
         // The rig's own limits alone: a controller's narrower ones are for holding, not for driving.
         controller.limits = file.limits;
@@ -207,6 +208,11 @@ impl OnRig {
         let core = setup.core_following(Exciting::new(&schedule))?;
         let (sender, received) = std::sync::mpsc::channel();
         let period_ns = self.file.timing.period_ns();
+        let mut in_periods = InPeriods::of(rig.source().rate_hz, period_ns);
+        let mut counted = move |tick| match &mut in_periods {
+            Some(periods) => periods.count(tick),
+            None => tick,
+        };
         let mut view = match pages {
             Some(pages) => pages.next(&mut rig, &setup)?,
             None => None,
@@ -218,7 +224,7 @@ impl OnRig {
         let mut ticks: Vec<TickRecord> = Vec::new();
         let mut ended = 0;
         let finished = running.wait_with(LOOK_EVERY, || {
-            ticks.extend(received.try_iter());
+            ticks.extend(received.try_iter().map(&mut counted));
             (listener.progress)(ticks.len());
             if foreign_rate_hz(&ticks, period_ns).is_some() {
                 // Known after a second; nothing of it can be used.
@@ -232,7 +238,7 @@ impl OnRig {
             }
         })?;
         finished.sink.give_back(view);
-        ticks.extend(received.try_iter());
+        ticks.extend(received.try_iter().map(&mut counted));
         if let Some(rate_hz) = foreign_rate_hz(&ticks, period_ns) {
             return Err(other_rate(rate_hz, period_ns));
         }

@@ -40,8 +40,8 @@ pub(crate) struct Rows {
     usable: Vec<bool>,
     /// The frame came, without a bead to be trusted.
     pub(crate) unseen: Vec<bool>,
-    /// Times from the arrival of a frame to its tick, ns.
-    waited: Vec<i64>,
+    /// Sum and number of the times from the arrival of a frame to its tick, ns.
+    waited: (i64, i64),
     /// Row of each tick since the loop was closed.
     of_tick: Vec<usize>,
     /// From the middle of an exposure to the arrival of its frame, ns.
@@ -78,7 +78,7 @@ impl Rows {
             output: Vec::new(),
             usable: Vec::new(),
             unseen: Vec::new(),
-            waited: Vec::new(),
+            waited: (0, 0),
             of_tick: Vec::new(),
             path_ns: 0,
         };
@@ -113,7 +113,8 @@ impl Rows {
             let late_ns = tick.time_ns - tick.mid_exposure_ns - rows.path_ns;
             let on_time = new_frame && !has(TickFlags::LOST) && 2 * late_ns < period_ns;
             if on_time {
-                rows.waited.push(late_ns);
+                rows.waited.0 += late_ns;
+                rows.waited.1 += 1;
             }
             rows.input[row] = tick.command_um;
             rows.output[row] = if on_time { tick.measured_um } else { f64::NAN };
@@ -127,12 +128,13 @@ impl Rows {
         rows
     }
 
-    /// Time from the arrival of a frame to its tick, s: the median, which stalls of the machine do not move.
     pub(crate) fn wait_s(&self) -> f64 {
-        let mut waited = self.waited.clone();
-        waited.sort_unstable();
-        let median_ns = waited.get(waited.len() / 2).copied().unwrap_or(0);
-        1e-9 * median_ns as f64
+        let (sum_ns, count) = self.waited;
+        if count > 0 {
+            1e-9 * sum_ns as f64 / count as f64
+        } else {
+            0.0
+        }
     }
 
     /// A segment, or what keeps it from being one.

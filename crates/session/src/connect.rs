@@ -118,6 +118,9 @@ fn anchored(file: &RigFile) -> Result<RigFile, Failure> {
     if let CameraConfig::Socket { socket, .. } = &mut file.camera {
         *socket = absolute(socket)?;
     }
+    if let ActuatorConfig::Program { socket, .. } = &mut file.actuator {
+        *socket = absolute(socket)?;
+    }
     if let ActuatorConfig::Serial { port, .. } = &mut file.actuator
         // Else it is a name of the system's own (COM5).
         && Path::new(port).exists()

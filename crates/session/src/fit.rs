@@ -69,6 +69,7 @@ fn exposure_s(file: &RigFile, model: &Model) -> f64 {
 /// Model and controller by their options, before a board is known.
 pub fn prepare(model: &str, controller: &str, file: &RigFile) -> Result<Prepared, Failure> {
     let model = Model::load(model).map_err(Failure::input)?;
+    let model = file.actuator.before(model);
     let controller = setup::controller(controller, &model, &file.timing)?;
     Ok(Prepared { model, controller })
 }

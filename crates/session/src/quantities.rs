@@ -10,10 +10,13 @@ const fn q(table: &'static str, plain: &'static str, with_unit: &'static str) ->
 }
 
 /// Those of the host's own tables.
-const OF_THE_HOST: [Quantity; 21] = [
+const OF_THE_HOST: [Quantity; 24] = [
     q("", "first_neutral", "first_neutral_um"),
     q("", "near", "near_um"),
     q("actuator", "watchdog", "watchdog_ms"),
+    q("actuator", "period", "period_ms"),
+    q("actuator", "regulator", "regulator_ms"),
+    q("actuator", "compliance", "compliance_ms"),
     q("actuator", "hold_watchdog", "hold_watchdog_ms"),
     q("camera", "rate", "rate_hz"),
     q("camera", "exposure", "exposure_us"),

@@ -1,11 +1,10 @@
 //! The devices of a rig file, without a tracker.
 
-use cellpos_drivers::serial::SerialLine;
 use cellpos_drivers::{BoardHost, Port};
 use cellpos_emulator::EmulatedRig;
 use cellpos_plant::Model;
 use cellpos_rig::{Camera, Clock};
-use cellpos_session::rig_file::{ActuatorConfig, CameraConfig};
+use cellpos_session::rig_file::CameraConfig;
 use cellpos_session::{Failure, RigFile};
 
 /// Board and camera on the machine's clock; each is opened when it is asked for.
@@ -23,15 +22,15 @@ impl Bench {
     /// # Errors
     /// A value of the emulated rig that cannot be.
     pub fn of(file: RigFile) -> Result<Self, Failure> {
-        let emulated = if matches!(file.actuator, ActuatorConfig::Emulated {})
-            || matches!(file.camera, CameraConfig::Emulated {})
-        {
-            let model = Model::load(&file.emulator.model).map_err(Failure::input)?;
-            let rig = EmulatedRig::new(file.board, &file.emulator, &model, Clock::Real);
-            Some(rig.map_err(Failure::input)?)
-        } else {
-            None
-        };
+        let emulated =
+            if file.actuator.is_emulated() || matches!(file.camera, CameraConfig::Emulated {}) {
+                let model = Model::load(&file.emulator.model).map_err(Failure::input)?;
+                let model = file.actuator.before(model);
+                let rig = EmulatedRig::new(file.board, &file.emulator, &model, Clock::Real);
+                Some(rig.map_err(Failure::input)?)
+            } else {
+                None
+            };
         Ok(Self { file, emulated })
     }
 
@@ -45,20 +44,9 @@ impl Bench {
     /// # Errors
     /// The port cannot be opened, or no board answers.
     pub fn board(&self) -> Result<Board, Failure> {
-        let port: Box<dyn Port> = match (&self.file.actuator, &self.emulated) {
-            (ActuatorConfig::Serial { port, baud, .. }, _) => {
-                let line = SerialLine::open(port, *baud).map_err(|error| {
-                    Failure::bad_input(
-                        format!("[actuator] port = \"{port}\": {error}"),
-                        "is the board plugged in, and may you read and write the device? See docs/rig.md, Permissions",
-                    )
-                })?;
-                Box::new(line)
-            }
-            (ActuatorConfig::Emulated {}, Some(rig)) => Box::new(rig.port()),
-            (ActuatorConfig::Emulated {}, None) => {
-                return Err(Failure::bad_input("no emulated rig", "name a serial port"));
-            }
+        let port: Box<dyn Port> = match &self.emulated {
+            Some(rig) if self.file.actuator.is_emulated() => Box::new(rig.port()),
+            _ => self.file.line()?,
         };
         BoardHost::connect(port, Clock::Real).map_err(Failure::failed)
     }

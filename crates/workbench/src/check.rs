@@ -87,7 +87,7 @@ impl Findings<'_> {
     /// Watchdogs against the period and against each other.
     fn watchdogs(&mut self) {
         let period_ms = self.file.timing.period_us * 1e-3;
-        let (table, board) = if let ActuatorConfig::Emulated {} = self.file.actuator {
+        let (table, board) = if self.file.actuator.is_emulated() {
             let board = &self.file.board;
             (
                 "board",
@@ -138,7 +138,7 @@ impl Findings<'_> {
             );
         }
         let emulated_camera = matches!(file.camera, CameraConfig::Emulated {});
-        if emulated_camera != matches!(file.actuator, ActuatorConfig::Emulated {}) {
+        if emulated_camera != file.actuator.is_emulated() {
             self.say(
                 Error,
                 ("camera", "kind"),

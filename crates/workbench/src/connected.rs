@@ -42,10 +42,13 @@ pub fn connect(bench: &Bench, path: &Path) -> Connected {
     let board = board(bench)
         .map_err(|failure| {
             let (key, value) = match &file.actuator {
-                ActuatorConfig::Serial { port, .. } => ("port", port.as_str()),
-                ActuatorConfig::Emulated {} => ("kind", "emulated"),
+                ActuatorConfig::Serial { port, .. } => ("port", port.clone()),
+                ActuatorConfig::Program { socket, .. } => ("socket", socket.display().to_string()),
+                ActuatorConfig::Emulated {} | ActuatorConfig::EmulatedPressure { .. } => {
+                    ("kind", "emulated".to_string())
+                }
             };
-            say_failure(&mut found, ("actuator", key), value, &failure);
+            say_failure(&mut found, ("actuator", key), &value, &failure);
         })
         .ok();
     let camera = camera(bench)

@@ -11,6 +11,7 @@
 
 from __future__ import annotations
 
+from ._actuator import ActuatorServer, ActuatorStats, serve_actuator
 from ._camera import CameraServer, CameraStats, Frame, read_camera, serve_camera
 from ._columns import FLAGS
 from ._program import Failed, Live, Result, Row, command, identify, program, reconcile, run, track
@@ -18,7 +19,8 @@ from ._run import Run, Session, Table, open, read_csv, runs
 from ._tiff import Clip
 
 __all__ = [
-    "FLAGS", "CameraServer", "CameraStats", "Clip", "Failed", "Frame", "Live", "Result", "Row", "Run", "Session", "Table",
-    "command", "identify", "open", "program", "read_camera", "read_csv", "reconcile", "run", "runs", "serve_camera", "track",
+    "FLAGS", "ActuatorServer", "ActuatorStats", "CameraServer", "CameraStats", "Clip", "Failed", "Frame", "Live", "Result", "Row", "Run", "Session", "Table",
+    "command", "identify", "open", "program", "read_camera", "read_csv", "reconcile", "run", "runs", "serve_actuator",
+    "serve_camera", "track",
 ]  # fmt: skip
 __version__ = "0.1.0"

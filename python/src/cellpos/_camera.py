@@ -81,6 +81,25 @@ class CameraStats(NamedTuple):
         )
 
 
+def listen(path: Path) -> socket.socket:
+    """A Unix socket that listens; one that a server left behind is taken, one that is served is not."""
+    try:
+        with socket.socket(socket.AF_UNIX) as other:
+            other.connect(str(path))
+        raise OSError(f"{path} is served by another program")
+    except (FileNotFoundError, ConnectionRefusedError):
+        path.unlink(missing_ok=True)
+    listener = socket.socket(socket.AF_UNIX)
+    try:
+        listener.bind(str(path))
+    except OSError as error:
+        listener.close()
+        raise OSError(f"{path}: {error}; a socket's path has at most 107 bytes") from None
+    listener.listen(1)
+    listener.setblocking(False)
+    return listener
+
+
 class CameraServer:
     """Serves frames on a Unix socket for `[camera] kind = "socket"`. Use serve_camera, or this one with `with` to serve from a
     thread while the same process does something else."""
@@ -113,25 +132,7 @@ class CameraServer:
         self._ages = np.zeros(_KEPT)
         self._aged = 0
         self._first_s = self._last_s = 0.0
-        self._listener = self._listen()
-
-    def _listen(self) -> socket.socket:
-        try:
-            # A socket that a server left behind; one that is served answers.
-            with socket.socket(socket.AF_UNIX) as other:
-                other.connect(str(self._path))
-            raise OSError(f"{self._path} is served by another program")
-        except (FileNotFoundError, ConnectionRefusedError):
-            self._path.unlink(missing_ok=True)
-        listener = socket.socket(socket.AF_UNIX)
-        try:
-            listener.bind(str(self._path))
-        except OSError as error:
-            listener.close()
-            raise OSError(f"{self._path}: {error}; a socket's path has at most 107 bytes") from None
-        listener.listen(1)
-        listener.setblocking(False)
-        return listener
+        self._listener = listen(self._path)
 
     # -- the loop
 

@@ -155,12 +155,16 @@ pub fn run(args: Args) -> CommandResult {
 
 /// The plant as the loop sees it: the model with the delay and the sample time of the rig, or those given.
 fn plant(args: &Args, model: &Model) -> Result<DesignPlant, Failure> {
-    let timing = args
+    let file = args
         .rig
         .as_deref()
         .map(|path| crate::rig_file::RigFile::load(Some(path)))
-        .transpose()?
-        .map(|file| file.timing);
+        .transpose()?;
+    let timing = file.as_ref().map(|file| file.timing);
+    let model = &match &file {
+        Some(file) => file.actuator.before(model.clone()),
+        None => model.clone(),
+    };
     let sample_time_s = timing
         .as_ref()
         .map_or(args.sample.value(), |timing| timing.period_us * 1e-6);

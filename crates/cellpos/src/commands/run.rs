@@ -195,11 +195,21 @@ fn fresh(args: &Args) -> Result<Ready, Failure> {
 
 /// The emulated rig as the model says: everything of the rig file but its devices.
 fn rehearse(file: &mut RigFile, model: &str) {
-    file.actuator = ActuatorConfig::Emulated {};
+    file.actuator = match (file.actuator.period_ms(), file.actuator.lags_ms()) {
+        (Some(period_ms), [regulator_ms, compliance_ms]) => ActuatorConfig::EmulatedPressure {
+            period_ms,
+            regulator_ms,
+            compliance_ms,
+        },
+        (None, _) => ActuatorConfig::Emulated {},
+    };
     file.camera = CameraConfig::Emulated {};
     file.calibration = None;
     file.emulator.model = model.to_string();
-    file.emulator.rate_hz = 1e6 / file.timing.period_us;
+    // A loop at the pace of a slow actuator takes the newest of several frames.
+    if file.actuator.period_ms().is_none() {
+        file.emulator.rate_hz = 1e6 / file.timing.period_us;
+    }
     file.emulator.latency_ms = file.timing.camera_delay_ms;
     if file.cell.is_some() && file.emulator.cell.is_none() {
         file.emulator.cell = Some(CellConfig::default());

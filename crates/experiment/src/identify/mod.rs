@@ -67,7 +67,7 @@ pub struct Done {
     pub led: Option<DelayTest>,
     /// PZT displacement at rest, um.
     pub neutral_um: f64,
-    /// Median time from the arrival of a frame to its tick, s; contained in the delay.
+    /// Mean time from the arrival of a frame to its tick, s; contained in the delay.
     pub wait_s: f64,
 }
 

@@ -2,9 +2,12 @@
 
 use super::{ActuatorConfig, CameraConfig, ClockKind, Frames, RigFile};
 use crate::Failure;
+use cellpos_drivers::program::ProgramLine;
 use cellpos_drivers::serial::SerialLine;
 use cellpos_drivers::socket::SocketCamera;
-use cellpos_drivers::{BoardHost, Calibration, CommandedFlow, FlowTap, Followed, VisionSource};
+use cellpos_drivers::{
+    BoardHost, Calibration, CommandedFlow, FlowTap, Followed, Port, VisionSource,
+};
 use cellpos_emulator::EmulatedRig;
 use cellpos_plant::Model;
 use cellpos_rig::{Actuator, Camera, Clock, PositionSource};
@@ -104,8 +107,8 @@ impl RigFile {
     /// Connects camera and board.
     pub fn connect(&self, clock: ClockKind, frames: Frames) -> Result<Connected, Failure> {
         match (&self.actuator, &self.camera) {
-            (ActuatorConfig::Emulated {}, CameraConfig::Emulated {}) => self.emulate(clock, frames),
-            (ActuatorConfig::Serial { port, baud, .. }, camera)
+            _ if self.is_emulated() => self.emulate(clock, frames),
+            (ActuatorConfig::Serial { .. } | ActuatorConfig::Program { .. }, camera)
                 if *camera != (CameraConfig::Emulated {}) =>
             {
                 if clock == ClockKind::Virtual || frames == Frames::Off {
@@ -114,7 +117,7 @@ impl RigFile {
                         "leave them out, or leave out --rig",
                     ));
                 }
-                self.open(port, *baud)
+                self.open()
             }
             _ => Err(Failure::bad_input(
                 "the emulated board moves the emulated bead only: [actuator] and [camera] must both be emulated, or neither",
@@ -129,6 +132,7 @@ impl RigFile {
             ClockKind::Virtual => Clock::virtual_at(0),
         };
         let model = Model::load(&self.emulator.model).map_err(Failure::input)?;
+        let model = self.actuator.before(model);
         let emulated = EmulatedRig::new(self.board, &self.emulator, &model, clock.clone())
             .map_err(Failure::input)?;
         let flow = nominal_flow()?;
@@ -211,16 +215,43 @@ impl RigFile {
         })
     }
 
-    fn open(&self, port: &str, baud: u32) -> Result<Connected, Failure> {
+    /// The line to the board, or to the program that serves an actuator.
+    ///
+    /// # Errors
+    /// It cannot be opened; the emulated board has none.
+    pub fn line(&self) -> Result<Box<dyn Port>, Failure> {
+        match &self.actuator {
+            ActuatorConfig::Serial { port, baud, .. } => {
+                let line = SerialLine::open(port, *baud).map_err(|error| {
+                    Failure::bad_input(
+                        format!("[actuator] port = \"{port}\": {error}"),
+                        "is the board plugged in (or firmware-sim running), and may you read and write the device? See docs/rig.md, Permissions",
+                    )
+                })?;
+                Ok(Box::new(line))
+            }
+            ActuatorConfig::Program { socket, .. } => {
+                let line = ProgramLine::open(socket).map_err(|error| {
+                    Failure::bad_input(
+                        format!("[actuator] socket = \"{}\": {error}", socket.display()),
+                        "start the program that serves the actuator (cellpos.serve_actuator in Python) first",
+                    )
+                })?;
+                Ok(Box::new(line))
+            }
+            ActuatorConfig::Emulated {} | ActuatorConfig::EmulatedPressure { .. } => Err(
+                Failure::bad_input("the emulated board has no line", "name a serial port"),
+            ),
+        }
+    }
+
+    fn open(&self) -> Result<Connected, Failure> {
         let calibration = self.real_calibration()?;
-        let line = SerialLine::open(port, baud).map_err(|error| {
-            Failure::bad_input(
-                format!("[actuator] port = \"{port}\": {error}"),
-                "is the board plugged in (or firmware-sim running), and may you read and write the device?",
-            )
-        })?;
+        let line = self.line()?;
         let mut warnings = Vec::new();
-        if let Some(ms) = SerialLine::latency_timer_ms(port).filter(|&ms| ms > 1) {
+        if let ActuatorConfig::Serial { port, .. } = &self.actuator
+            && let Some(ms) = SerialLine::latency_timer_ms(port).filter(|&ms| ms > 1)
+        {
             warnings.push(format!(
                 "the USB adapter of {port} holds answers back for {ms} ms: write 1 to its latency_timer"
             ));

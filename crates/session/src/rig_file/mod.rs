@@ -10,10 +10,13 @@ use cellpos_control::Limits;
 use cellpos_drivers::sources::Region;
 use cellpos_drivers::{Calibration, CalibrationFile};
 use cellpos_emulator::{BoardConfig, WorldConfig};
+use cellpos_plant::Model;
+use cellpos_plant::effects::{bubble, driver_lag};
 use cellpos_runtime::{ArmingConfig, Timing};
 use cellpos_script::Sample;
 use cellpos_vision::{CellConfig, CellFinder, LocaliserConfig, TrackerConfig};
 use serde::{Deserialize, Serialize};
+use std::f64::consts::TAU;
 use std::path::{Path, PathBuf};
 
 /// A rig.toml. Every table and key may be left out: what is left is the emulated rig of the paper.
@@ -78,6 +81,19 @@ pub struct CellInView {
 pub enum ActuatorConfig {
     /// The firmware library in this process.
     Emulated {},
+    /// A pressure controller in the PZT's place, in this process: slow commands, a regulator, a tube that stretches. Its unit is um
+    /// of PZT displacement.
+    EmulatedPressure {
+        /// Between two commands, ms: the period of the loop.
+        #[serde(default = "command_period_ms")]
+        period_ms: f64,
+        /// Lag of the regulator (63 % of a step), ms.
+        #[serde(default = "regulator_ms")]
+        regulator_ms: f64,
+        /// Lag of the tube, ms. With one the model may have no pole-zero pair of its own: the estimator holds two lags.
+        #[serde(default)]
+        compliance_ms: f64,
+    },
     /// A board behind a serial port.
     Serial {
         /// Device, for example /dev/ttyUSB0; a relative path is meant from the folder of the file.
@@ -93,6 +109,90 @@ pub enum ActuatorConfig {
         #[serde(default, skip_serializing_if = "Option::is_none")]
         hold_watchdog_ms: Option<u16>,
     },
+    /// A program that serves an actuator on a Unix socket in the board's protocol, such as `cellpos.serve_actuator`.
+    Program {
+        /// Path of the socket.
+        socket: PathBuf,
+        /// Between two commands, ms: the period of the loop.
+        #[serde(default = "command_period_ms")]
+        period_ms: f64,
+        /// Lag of its regulator (63 % of a step), ms; 0: none, or in the model.
+        #[serde(default)]
+        regulator_ms: f64,
+        /// Lag of the tube that stretches behind it, ms; 0: none, or in the model.
+        #[serde(default)]
+        compliance_ms: f64,
+        /// Without a fresh command for this long it goes to the zero-flow displacement and holds it, ms; left out: its own.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        watchdog_ms: Option<u16>,
+        /// When it has held for this long it parks, ms; left out: its own.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        hold_watchdog_ms: Option<u16>,
+    },
+}
+
+impl ActuatorConfig {
+    /// Whether it moves the emulated bead.
+    pub fn is_emulated(&self) -> bool {
+        matches!(self, Self::Emulated {} | Self::EmulatedPressure { .. })
+    }
+
+    /// Between two commands, where it is slower than the board, ms.
+    pub fn period_ms(&self) -> Option<f64> {
+        match self {
+            Self::Program { period_ms, .. } | Self::EmulatedPressure { period_ms, .. } => {
+                Some(*period_ms)
+            }
+            Self::Emulated {} | Self::Serial { .. } => None,
+        }
+    }
+
+    /// Lags of regulator and tube, ms.
+    pub fn lags_ms(&self) -> [f64; 2] {
+        match self {
+            Self::Program {
+                regulator_ms,
+                compliance_ms,
+                ..
+            }
+            | Self::EmulatedPressure {
+                regulator_ms,
+                compliance_ms,
+                ..
+            } => [*regulator_ms, *compliance_ms],
+            Self::Emulated {} | Self::Serial { .. } => [0.0; 2],
+        }
+    }
+
+    /// A plant as this actuator moves it: with the lags of regulator and tube, unless the model has effects for them, or was
+    /// measured with the actuator in it (then it knows the delay of its camera path).
+    #[must_use]
+    pub fn before(&self, mut model: Model) -> Model {
+        if model.camera_delay_s.is_some() {
+            return model;
+        }
+        let [regulator_s, compliance_s] = self.lags_ms().map(|ms| ms * 1e-3);
+        let lags = [
+            (regulator_s > 0.0).then(|| driver_lag(1.0 / (TAU * regulator_s))),
+            (compliance_s > 0.0).then(|| bubble(compliance_s, 0.0)),
+        ];
+        for lag in lags.into_iter().flatten() {
+            if model.effects.iter().all(|effect| effect.id() != lag.id()) {
+                model.effects.push(lag);
+            }
+        }
+        model
+    }
+}
+
+/// Of a fast pressure controller, ms.
+fn regulator_ms() -> f64 {
+    50.0
+}
+
+/// What pressure controllers take, ms.
+fn command_period_ms() -> f64 {
+    20.0
 }
 
 fn baud() -> u32 {
@@ -217,6 +317,12 @@ impl RigFile {
         if let CameraConfig::Socket { socket, .. } = &mut file.camera {
             *socket = folder.join(&*socket);
         }
+        if let ActuatorConfig::Program { socket, .. } = &mut file.actuator {
+            *socket = folder.join(&*socket);
+        }
+        if let Some(period_ms) = file.actuator.period_ms() {
+            file.keep_the_pace_of(period_ms * 1e3);
+        }
         if let ActuatorConfig::Serial { port, .. } = &mut file.actuator {
             // A relative path is a link beside the file if there is one, else a name of the system's own (COM5).
             let beside = folder.join(&*port);
@@ -228,6 +334,19 @@ impl RigFile {
             file.emulator.model = folder.join(&file.emulator.model).display().to_string();
         }
         Ok(file)
+    }
+
+    /// Runs the loop at the period of an actuator that is slower than the camera. The arming pulse keeps its time as far as the
+    /// period allows.
+    fn keep_the_pace_of(&mut self, period_us: f64) {
+        let own = Self::default();
+        if self.timing.period_us == own.timing.period_us {
+            self.timing.period_us = period_us;
+        }
+        if self.arming.pulse_ticks == own.arming.pulse_ticks {
+            let pulse_us = f64::from(own.arming.pulse_ticks) * own.timing.period_us;
+            self.arming.pulse_ticks = (pulse_us / period_us).round().max(1.0) as u32;
+        }
     }
 
     fn validate(&self, path: &Path) -> Result<(), Failure> {
@@ -247,6 +366,34 @@ impl RigFile {
         self.timing
             .validate()
             .map_err(|error| say("timing", &error))?;
+        if let Some(period_ms) = self.actuator.period_ms() {
+            let period_us = period_ms * 1e3;
+            let one_ms = Self::default().timing.period_us;
+            if !(1.0..=1000.0).contains(&period_ms) {
+                return Err(say(
+                    "actuator",
+                    &format!("period_ms = {period_ms}: must be 1 to 1000 ms"),
+                ));
+            }
+            let lags_ms = self.actuator.lags_ms();
+            for (key, ms) in ["regulator_ms", "compliance_ms"].iter().zip(lags_ms) {
+                if !(0.0..=10_000.0).contains(&ms) {
+                    return Err(say(
+                        "actuator",
+                        &format!("{key} = {ms}: must be 0 to 10000 ms"),
+                    ));
+                }
+            }
+            if ![one_ms, period_us].contains(&self.timing.period_us) {
+                return Err(say(
+                    "timing",
+                    &format!(
+                        "period_us = {}: the actuator takes a command each {period_us} us; leave period_us out",
+                        self.timing.period_us
+                    ),
+                ));
+            }
+        }
         self.board
             .validate()
             .map_err(|error| say("board", &error))?;
@@ -295,10 +442,7 @@ impl RigFile {
 
     /// Whether all of it is emulated in this process.
     pub fn is_emulated(&self) -> bool {
-        matches!(
-            (&self.actuator, &self.camera),
-            (ActuatorConfig::Emulated {}, CameraConfig::Emulated {})
-        )
+        self.actuator.is_emulated() && self.camera == CameraConfig::Emulated {}
     }
 
     /// Whether a cell is followed, so that its length and area are measured.
@@ -324,8 +468,17 @@ impl RigFile {
                 watchdog_ms,
                 hold_watchdog_ms,
                 ..
+            }
+            | ActuatorConfig::Program {
+                watchdog_ms,
+                hold_watchdog_ms,
+                ..
             } => [watchdog_ms, hold_watchdog_ms],
             ActuatorConfig::Emulated {} => [None, None],
+            // Five periods, as a program's: the board's own 20 ms would pass between two commands.
+            ActuatorConfig::EmulatedPressure { period_ms, .. } => {
+                [Some((5.0 * period_ms).round() as u16), None]
+            }
         }
     }
 }

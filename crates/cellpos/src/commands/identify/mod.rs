@@ -18,6 +18,7 @@ use cellpos_ident::excitation::{ExcitationLimits, PAPER_FREQUENCIES_HZ};
 use cellpos_plant::Model;
 use cellpos_rig::Clock;
 use cellpos_session::provenance;
+use cellpos_session::rig_file::ActuatorConfig;
 use cellpos_session::view::{Page, Pages};
 use cellpos_units::{Hertz, Micrometers, MicrometersPerSecond, Seconds};
 use std::collections::BTreeMap;
@@ -209,6 +210,13 @@ fn checked(args: &Args) -> Result<(), Failure> {
     Ok(())
 }
 
+/// Of a loop with a longer period the paper's lines are above half its rate, us.
+const SLOW_LOOP_US: f64 = 1500.0;
+/// Lines for an actuator of some 10 ms, from what a tube's compliance does to what its regulator does, Hz.
+const SLOW_FREQUENCIES_HZ: [f64; 10] = [0.2, 0.5, 1.0, 2.0, 3.0, 5.0, 7.0, 10.0, 14.0, 20.0];
+/// Highest of them, as part of the loop's rate: beyond, hold and alias weigh as much as the plant.
+const HIGHEST_LINE: f64 = 0.3;
+
 /// The rig of `--rig`, with a PI for its delay.
 fn on_rig(args: &Args, model: &Model) -> Result<Option<OnRig>, Failure> {
     let Some(path) = &args.rig else {
@@ -227,14 +235,21 @@ fn on_rig(args: &Args, model: &Model) -> Result<Option<OnRig>, Failure> {
 
 fn job(args: &Args) -> Result<identification::Job, Failure> {
     let model = Model::load(&args.model).map_err(Failure::input)?;
-    let mut lines_hz: Vec<f64> = if args.frequency.is_empty() {
-        PAPER_FREQUENCIES_HZ.to_vec()
-    } else {
+    let rig = on_rig(args, &model)?;
+    let period_us = rig.as_ref().map_or(1000.0, |rig| rig.file.timing.period_us);
+    let mut lines_hz: Vec<f64> = if !args.frequency.is_empty() {
         args.frequency.iter().map(|f| f.0).collect()
+    } else if period_us > SLOW_LOOP_US {
+        let highest_hz = HIGHEST_LINE * 1e6 / period_us;
+        SLOW_FREQUENCIES_HZ
+            .into_iter()
+            .filter(|hz| *hz < highest_hz)
+            .collect()
+    } else {
+        PAPER_FREQUENCIES_HZ.to_vec()
     };
     lines_hz.sort_by(f64::total_cmp);
     lines_hz.dedup();
-    let rig = on_rig(args, &model)?;
     let seed = args
         .seed
         .or(rig.as_ref().map(|rig| rig.file.emulator.seed))
@@ -281,7 +296,11 @@ fn job(args: &Args) -> Result<identification::Job, Failure> {
         lines_hz,
         excitation: args.excitation,
         seconds_at_1_hz: 40.0,
-        led_edges: args.led_edges,
+        // What a program serves has no LED in front of the camera.
+        led_edges: match rig.as_ref().map(|rig| &rig.file.actuator) {
+            Some(ActuatorConfig::Program { .. }) => 0,
+            _ => args.led_edges,
+        },
         bootstrap: args.bootstrap,
         seed,
         rig,

@@ -1,0 +1,85 @@
+"""The emulated rig with a pressure controller in the PZT's place: commands every 20 ms, a regulator of 50 ms, a tube that stretches."""
+
+import pytest
+from conftest import ROOT
+
+import cellpos
+
+INTEGRATOR = """name = "integrator"
+working_point_um = 20.0
+[plant]
+num = [428.0]
+den = [1.0, 0.0]
+[noise]
+diffusion_um2_per_s = 0.33
+localisation_um = 0.03
+"""
+
+
+@pytest.fixture
+def rigs(tmp_path):
+    pressure = '[actuator]\nkind = "emulated-pressure"\n'
+    (tmp_path / "pressure.toml").write_text(pressure)
+    (tmp_path / "integrator.toml").write_text(INTEGRATOR)
+    own = '[emulator]\nmodel = "integrator.toml"\n'
+    (tmp_path / "regulator.toml").write_text(pressure + own)
+    (tmp_path / "tube.toml").write_text(pressure + 'regulator = "50ms"\ncompliance = "20ms"\n' + own)
+    return tmp_path
+
+
+def held(folder, rig, law, model="eq6"):
+    options = {"rig": rig, "controller": law, "model": model, "clock": "virtual", "frames": "off", "adapt": "off"}
+    result = cellpos.track("0um", "120s", cwd=folder, no_record=True, **options).result
+    assert result.ended == "done" and result["ticks"] == 6000
+    return result["rms_true_nm"], result["bound_rms_nm"]
+
+
+def test_a_bead_is_held_at_20_ms_a_command(rigs):
+    pi, bound = held(rigs, "pressure.toml", "pi")
+    lqg, _ = held(rigs, "pressure.toml", "lqg")
+    with_tube, _ = held(rigs, "tube.toml", "lqg", "integrator.toml")
+    print(f"PI {pi:.0f} nm, LQG {lqg:.0f} nm, LQG with a tube of 20 ms {with_tube:.0f} nm; dead time and noise alone: {bound:.0f} nm")
+    assert bound < lqg < 0.9 * pi < 240
+    assert lqg < with_tube < 270
+
+
+def test_identify_finds_the_regulator(rigs):
+    options = {"rig": "regulator.toml", "model": "integrator.toml", "frames": "off", "led_edges": 0, "out": "m.toml"}
+    result = cellpos.identify(seed=1, cwd=rigs, **options).result
+    assert [line["frequency_hz"] for line in result["frequencies"]][-1] == 14.0
+    parameters = result["parameters"]
+    for name, truth in (("gain_per_s", 428.0), ("pair_pole_rad_per_s", 20.0)):
+        low, high = parameters[name]["ci95"]
+        assert low <= truth <= high and high - low < 0.05 * truth, (name, parameters[name])
+
+
+def test_a_script_is_checked_rehearsed_and_run(rigs):
+    staircase = ROOT / "examples/scripts/staircase.toml"
+    rehearsed = cellpos.run(staircase, rig="pressure.toml", dry=True, controller="lqg", cwd=rigs).result
+    assert rehearsed["cycles_done"] == 60
+    # Ticks of 20 ms: the rehearsal is on the slow actuator, too.
+    assert rehearsed.run.summary["ticks"] < 1000
+    result = cellpos.run(staircase, rig="pressure.toml", controller="lqg", clock="virtual", frames="off", cwd=rigs).result
+    assert result["cycles_done"] == 60 and result["cycle_rms_nm"] < 300
+
+
+def test_design_counts_the_lags_of_the_rig_file(rigs):
+    def gains(rig):
+        return cellpos.command("design", model="eq6", rig=rig, out="c.toml", force=True, cwd=rigs).result
+
+    (rigs / "pzt.toml").write_text("[timing]\nperiod_us = 20000.0\n")
+    slow, fast = gains("pressure.toml"), gains("pzt.toml")
+    assert slow["controller"]["kp_um_per_um"] < 0.5 * fast["controller"]["kp_um_per_um"]
+
+
+@pytest.mark.parametrize(
+    "text, said",
+    [
+        ("regulator_ms = -1.0", "regulator_ms = -1: must be 0 to 10000 ms"),
+        ("period_ms = 0.5", "period_ms = 0.5: must be 1 to 1000 ms"),
+    ],
+)
+def test_values_that_cannot_be_are_named(rigs, text, said):
+    (rigs / "wrong.toml").write_text(f'[actuator]\nkind = "emulated-pressure"\n{text}\n')
+    with pytest.raises(cellpos.Failed, match=said):
+        cellpos.track("0um", rig="wrong.toml", cwd=rigs).wait()
