@@ -6,12 +6,13 @@ set -euo pipefail
 cd "$(dirname "$0")/.."
 env=target/python
 if ! { [ -x "$env/bin/python" ] || python3 -m venv "$env"; } \
-    || ! "$env/bin/pip" install -q --disable-pip-version-check "maturin>=1.7,<2" numpy pandas matplotlib pytest mypy pypylon imageio pyserial; then
-    echo "check-python: skipped: maturin, numpy, pandas, matplotlib, pytest, mypy, pypylon, imageio and pyserial cannot be installed here"
+    || ! "$env/bin/pip" install -q --disable-pip-version-check "maturin>=1.7,<2" numpy pandas matplotlib pytest pytest-xdist mypy pypylon imageio pyserial; then
+    echo "check-python: skipped: maturin, numpy, pandas, matplotlib, pytest, pytest-xdist, mypy, pypylon, imageio and pyserial cannot be installed here"
     exit 0
 fi
 cargo build -q --locked -p cellpos-firmware-sim
 CARGO_TARGET_DIR="$PWD/target" MATURIN_PEP517_ARGS="--profile dev" PATH="$PWD/$env/bin:$PATH" \
     "$env/bin/pip" install -q --disable-pip-version-check --no-build-isolation --no-deps --force-reinstall ./python
 cd python
-env -u CELLPOS_PROGRAM "../$env/bin/python" -m pytest -q "$@"
+# Two at once: most of them wait for rigs in real time.
+env -u CELLPOS_PROGRAM "../$env/bin/python" -m pytest -q -n 2 --dist loadfile "$@"

@@ -192,6 +192,15 @@ class Lab:
     def sets(self):
         return np.loadtxt(self.folder / "sets.txt", ndmin=2)
 
+    def driven(self, live) -> None:
+        """Waits until the bead is held: commands come."""
+        next(live.batches())
+        for _ in range(500):
+            if len(self.sets()) > 40:
+                return
+            time.sleep(0.02)
+        raise AssertionError("no commands")
+
     def track(self, duration="8s"):
         return cellpos.track(
             "0um", duration, rig="rig.toml", model="model.toml", controller="lqg", best_effort=True, cwd=self.folder
@@ -238,7 +247,7 @@ def test_a_bead_is_held_by_a_function_called_every_20_ms(lab_of_pressure):
 
 def test_a_program_that_is_killed_ends_in_hold_and_then_park(lab_of_pressure):
     live = lab_of_pressure.track("30s")
-    next(live.batches())
+    lab_of_pressure.driven(live)
     time.sleep(1.0)
     os.kill(live.pid, signal.SIGKILL)
     killed_s = time.monotonic()
@@ -254,7 +263,7 @@ def test_a_program_that_is_killed_ends_in_hold_and_then_park(lab_of_pressure):
 
 def test_an_actuator_that_dies_ends_the_run_and_is_named(lab_of_pressure):
     live = lab_of_pressure.track("30s")
-    next(live.batches())
+    lab_of_pressure.driven(live)
     lab_of_pressure.server.kill()
     result = live.wait(timeout=10)
     assert result.code == 1 and result.ended in ("failed", "safe"), result.values_["ended"]
@@ -263,7 +272,7 @@ def test_an_actuator_that_dies_ends_the_run_and_is_named(lab_of_pressure):
 
 def test_an_actuator_that_stalls_ends_the_run_in_safe_and_parks_when_it_wakes(lab_of_pressure):
     live = lab_of_pressure.track("30s")
-    next(live.batches())
+    lab_of_pressure.driven(live)
     lab_of_pressure.server.send_signal(signal.SIGSTOP)
     result = live.wait(timeout=10)
     assert result.code == 1 and result.ended in ("failed", "safe"), result.values_["ended"]

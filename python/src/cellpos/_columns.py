@@ -153,6 +153,7 @@ FLAGS: Dict[str, int] = {
             "early",
             "board-trouble",
             "between",
+            "command-lost",
         )
     )
 }
