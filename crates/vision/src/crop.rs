@@ -10,6 +10,9 @@ pub(crate) const LANES: usize = 4;
 /// Row length of the buffer: the largest window rounded up to whole lanes.
 pub(crate) const STRIDE: usize = MAX_WINDOW_PX.next_multiple_of(LANES);
 
+/// Most pixels of a window that are left out of a fit.
+const MOST_HOLES: usize = 32;
+
 /// One row of a window.
 pub(crate) type Row = [f32; STRIDE];
 
@@ -23,6 +26,9 @@ pub(crate) struct Crop {
     pub y0: usize,
     pub width: usize,
     pub height: usize,
+    /// Row and column of the pixels that count for nothing.
+    holes: [(usize, usize); MOST_HOLES],
+    holes_used: usize,
     /// Grey level taken off every pixel, so that single precision loses nothing.
     pub pedestal: f32,
 }
@@ -37,6 +43,8 @@ impl Crop {
             y0: 0,
             width: 0,
             height: 0,
+            holes: [(0, 0); MOST_HOLES],
+            holes_used: 0,
             pedestal: 0.0,
         }
     }
@@ -53,6 +61,7 @@ impl Crop {
             return false;
         }
         (self.x0, self.y0, self.width, self.height) = (x0, y0, x1 - x0, y1 - y0);
+        self.holes_used = 0;
         for (i, m) in self.mask.iter_mut().enumerate() {
             *m = f32::from(u8::from(i < self.width));
         }
@@ -64,6 +73,30 @@ impl Crop {
             self.take_off_pedestal();
         }
         copied
+    }
+
+    /// Leaves a pixel out of the fits in this window, with `value` in its place for what does not ask. False where there is
+    /// no more room.
+    pub fn leave_out(&mut self, (row, column): (usize, usize), value: f32) -> bool {
+        let slot = self.holes.get_mut(self.holes_used);
+        let pixel = self.rows.get_mut(row).and_then(|r| r.get_mut(column));
+        let (Some(slot), Some(pixel)) = (slot, pixel) else {
+            return false;
+        };
+        (*slot, *pixel) = ((row, column), value);
+        self.holes_used += 1;
+        true
+    }
+
+    /// Columns of a row that are left out.
+    pub fn left_out(&self, row: usize) -> impl Iterator<Item = usize> {
+        let holes = self.holes.iter().take(self.holes_used);
+        holes.filter(move |hole| hole.0 == row).map(|hole| hole.1)
+    }
+
+    /// Whether any pixel is left out.
+    pub fn has_holes(&self) -> bool {
+        self.holes_used > 0
     }
 
     /// Takes the image of a bead, drawn out along `comb`, off the window.

@@ -5,6 +5,7 @@ use crate::frame::{Frame, Pixels};
 use crate::level::Level;
 use crate::localiser::Localiser;
 use crate::seed::{LEAST_NOISE, PATCH, background, patch_sums};
+use crate::speckle;
 
 /// Share of the strongest contrast in the frame that a bead must reach to be seen beside it, in one look.
 const WEAKEST_SHARE: f32 = 0.3;
@@ -16,6 +17,8 @@ const OWN_RADII: f64 = 1.5;
 /// contrast over the noise, px: 3 times the noise down, and a Gaussian of 0.75 px is 2.8 times lower in them.
 const SMOOTHED: f32 = 0.4;
 const SMOOTH_RADIUS_PX: f64 = 1.5;
+/// A region as small as this may be one hot pixel, or two next to each other, and what means of 3 x 3 pixels make of them.
+const SPECK_AREA_PX: f64 = 12.0;
 /// Most beads that a detector is made for.
 const MOST_BEADS: usize = 20_000;
 
@@ -117,7 +120,7 @@ impl Detector {
                         *c = sign * (f32::from(*v) - level);
                     }
                 });
-            self.keep_new();
+            self.keep_new(pixels, (width, height), least, 0);
         }
         if smooth {
             // Beads as weak as the noise of a pixel: means of 3 x 3 pixels have a third of it.
@@ -131,7 +134,8 @@ impl Detector {
                     *c = sign * (sum / (PATCH * PATCH) as f32 - level);
                 }
             });
-            self.keep_new();
+            // The means' places are those of their first pixels.
+            self.keep_new(pixels, (width, height), least, 1);
         }
         self.found
             .sort_unstable_by(|a, b| b.contrast_sum.total_cmp(&a.contrast_sum));
@@ -164,11 +168,18 @@ impl Detector {
     }
 
     /// Keeps of the last look what no stronger one has shown.
-    fn keep_new(&mut self) {
+    fn keep_new<T: Copy>(&mut self, pixels: &[T], size: (usize, usize), least: f32, offset: u32)
+    where
+        f32: From<T>,
+    {
         self.left_out += self.blobs.dropped_runs();
         let own_px = OWN_RADII * self.radius_px;
         let known = self.found.len();
         for blob in self.blobs.found() {
+            let mut blob = *blob;
+            blob.x_px += f64::from(offset);
+            blob.y_px += f64::from(offset);
+            blob.bounds = blob.bounds.map(|b| b + offset);
             let [left, top, right, bottom] = blob.bounds.map(f64::from);
             // Of a stronger one this look shows more, or the ring about it.
             let holds = |b: &Blob| {
@@ -176,8 +187,18 @@ impl Detector {
                 inside || f64::hypot(b.x_px - blob.x_px, b.y_px - blob.y_px) < own_px
             };
             let seen = self.found.iter().take(known).any(holds);
+            if blob.area_px <= SPECK_AREA_PX {
+                let (x, y) = (blob.x_px.round() as usize, blob.y_px.round() as usize);
+                let noise = least / self.min_snr.max(4.0) as f32;
+                let level = self.level.row(y).get(x).copied().unwrap_or(0.0);
+                let mean = speckle::mean_without(pixels, size, (x, y), noise);
+                let contrast = |mean: f32| self.sign as f32 * (mean - level);
+                if mean.is_some_and(|mean| contrast(mean) < SMOOTHED * least) {
+                    continue;
+                }
+            }
             if !seen && self.found.len() < self.found.capacity() {
-                self.found.push(*blob);
+                self.found.push(blob);
             }
         }
     }

@@ -30,6 +30,8 @@ pub(crate) struct Pass {
     pub step_x_px: f64,
     pub step_y_px: f64,
     pub amplitude: f64,
+    /// In the units of the weights.
+    pub amplitude_variance: f64,
     /// Above the crop's pedestal.
     pub background: f64,
     /// Weighted residual sum of squares after the step.
@@ -93,6 +95,16 @@ pub(crate) fn pass(
                 *w = m / (base + gain_times_amplitude * f).max(floor);
             }
         }
+        let mut with_holes: Row;
+        let weight = if crop.has_holes() {
+            with_holes = weight;
+            for column in crop.left_out(j) {
+                with_holes[column.min(STRIDE - 1)] = 0.0;
+            }
+            &with_holes
+        } else {
+            &weight
+        };
         sums.add_row(
             &weight[..lanes_end],
             &image.value[..lanes_end],
@@ -232,6 +244,7 @@ impl Sums {
             step_x_px: solution[0] / amplitude,
             step_y_px: solution[1] / amplitude,
             amplitude,
+            amplitude_variance: inverse[(2, 2)],
             background: solution[3],
             chi2,
             covariance: inverse.fixed_view::<2, 2>(0, 0) / (amplitude * amplitude),

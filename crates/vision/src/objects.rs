@@ -4,6 +4,7 @@ use crate::blobs::Blobs;
 use crate::config::MAX_WINDOW_PX;
 use crate::frame::{Frame, Pixels};
 use crate::seed;
+use crate::speckle;
 use crate::symmetry::RadialSymmetry;
 
 /// Contrast of an object over the noise of a mean of 5 x 5 pixels.
@@ -58,6 +59,7 @@ impl Flat {
             values,
             noise: noise.max(0.29) as f32,
         };
+        speckle::clean_picture(&mut flat.values, flat.width, flat.noise);
         flat.flatten();
         flat
     }

@@ -60,7 +60,8 @@ impl Look {
 pub(crate) struct Residues {
     looks: Vec<Look>,
     fixes: u64,
-    left: Box<[Row; MAX_WINDOW_PX]>,
+    /// Room for what the template leaves of a window.
+    pub left: Box<[Row; MAX_WINDOW_PX]>,
 }
 
 impl Residues {

@@ -9,20 +9,20 @@ use cellpos_vision::{
 };
 use nalgebra::{Matrix4, Vector4};
 
-const SIDE: usize = 200;
-const BACKGROUND: f64 = 20_000.0;
-const AMPLITUDE: f64 = 4000.0;
+pub const SIDE: usize = 200;
+pub const BACKGROUND: f64 = 20_000.0;
+pub const AMPLITUDE: f64 = 4000.0;
 /// Frames that settings are learnt from, and frames that are then measured.
 const LEARNT_FROM: usize = 20;
 
 /// A field of beads far enough from each other to have nothing in common.
-struct Field {
-    places: Vec<(f64, f64)>,
-    pixels: Vec<u16>,
+pub struct Field {
+    pub places: Vec<(f64, f64)>,
+    pub pixels: Vec<u16>,
 }
 
 impl Field {
-    fn new(profile: &dyn RadialProfile, snr: f64, random: &mut Random) -> Self {
+    pub fn new(profile: &dyn RadialProfile, snr: f64, random: &mut Random) -> Self {
         let pitch = (2.6 * profile.support_px().min(4.5 * profile.radius_px())).max(24.0);
         let count = (SIDE as f64 / pitch) as usize;
         let pitch = SIDE as f64 / count as f64;
@@ -55,7 +55,7 @@ impl Field {
         }
     }
 
-    fn frame(&self) -> Frame<'_> {
+    pub fn frame(&self) -> Frame<'_> {
         Frame {
             width: SIDE,
             height: SIDE,
@@ -66,7 +66,7 @@ impl Field {
 
 /// Cramer-Rao bound of one coordinate, px, averaged over the places within a pixel: the whole picture is used, amplitude and
 /// background are free.
-fn bound(profile: &dyn RadialProfile, snr: f64) -> f64 {
+pub fn bound(profile: &dyn RadialProfile, snr: f64) -> f64 {
     let reach = profile.support_px().ceil() as i32 + 1;
     let mut sum = 0.0;
     let cells = 4;
@@ -90,11 +90,11 @@ fn bound(profile: &dyn RadialProfile, snr: f64) -> f64 {
 
 /// What became of the good fixes of a field.
 #[derive(Debug, Default, Clone)]
-struct Score {
-    beads: f64,
-    good: f64,
-    lies: f64,
-    phantoms: f64,
+pub struct Score {
+    pub beads: f64,
+    pub good: f64,
+    pub lies: f64,
+    pub phantoms: f64,
     error2: f64,
     stated2: f64,
 }
@@ -117,25 +117,27 @@ impl Score {
             self.stated2 += 0.5 * (fix.var_x_px2 + fix.var_y_px2);
         }
     }
-    fn rms(&self) -> f64 {
+    pub fn rms(&self) -> f64 {
         (self.error2 / self.good).sqrt()
     }
-    fn stated(&self) -> f64 {
+    pub fn stated(&self) -> f64 {
         (self.stated2 / self.good).sqrt()
     }
 }
 
-fn measured(
+pub fn measured_in(
     localiser: &mut Localiser,
     profile: &dyn RadialProfile,
     snr: f64,
     random: &mut Random,
     fixes: usize,
+    spoil: &dyn Fn(&mut [u16]),
 ) -> Score {
     let mut detector = Detector::thorough(localiser, 200);
     let mut score = Score::default();
     while score.beads < fixes as f64 {
-        let field = Field::new(profile, snr, random);
+        let mut field = Field::new(profile, snr, random);
+        spoil(&mut field.pixels);
         let frame = field.frame();
         let places: Vec<_> = detector.detect(&frame).to_vec();
         let mut found: Vec<cellpos_vision::Fix> = Vec::new();
@@ -153,12 +155,22 @@ fn measured(
     score
 }
 
-fn gaussian(sigma_px: f64) -> (String, Box<dyn RadialProfile>) {
+fn measured(
+    localiser: &mut Localiser,
+    profile: &dyn RadialProfile,
+    snr: f64,
+    random: &mut Random,
+    fixes: usize,
+) -> Score {
+    measured_in(localiser, profile, snr, random, fixes, &|_| {})
+}
+
+pub fn gaussian(sigma_px: f64) -> (String, Box<dyn RadialProfile>) {
     let profile = GaussianProfile::new(sigma_px).unwrap();
     (format!("Gaussian {sigma_px} px"), Box::new(profile))
 }
 
-fn ring(edge_px: f64) -> (String, Box<dyn RadialProfile>) {
+pub fn ring(edge_px: f64) -> (String, Box<dyn RadialProfile>) {
     let profile = RingProfile::new(edge_px).unwrap();
     (format!("ring {edge_px} px"), Box::new(profile))
 }
@@ -185,7 +197,7 @@ impl RadialProfile for Disc {
     }
 }
 
-fn disc(radius_px: f64) -> (String, Box<dyn RadialProfile>) {
+pub fn disc(radius_px: f64) -> (String, Box<dyn RadialProfile>) {
     let edge_px = 0.6;
     (
         format!("disc {radius_px} px"),

@@ -9,6 +9,7 @@ mod measured_beads;
 mod no_allocation;
 mod real_cells;
 mod streak;
+mod stress;
 mod suggested;
 mod tracking;
 mod uncertainty;

@@ -1,5 +1,8 @@
 //! Position of one bead in a frame: seed, template fit, covariance, verdict.
 
+mod certainty;
+mod noise;
+
 use crate::config::{ConfigError, LocaliserConfig, PixelNoise};
 use crate::crop::Crop;
 use crate::fit::{self, Pass, Weights};
@@ -8,6 +11,7 @@ use crate::frame::Frame;
 use crate::learn::{Learner, LearningReport};
 use crate::residue::Residues;
 use crate::seed;
+use crate::speckle;
 use crate::streak::Comb;
 use crate::template::Template;
 
@@ -17,6 +21,8 @@ const CONVERGED_PX: f64 = 0.01;
 const RECENTRE_PX: f64 = 1.0;
 /// How often the window may be taken anew.
 const MAX_RECENTRES: u32 = 4;
+/// How often specks are looked for in what a fit leaves: each time those half as strong as the strongest are left out.
+const MOST_LOOKS_FOR_SPECKS: usize = 5;
 /// Half-width in bead radii of the window that leaves neighbours out.
 const NARROW_RADII: f64 = 1.3;
 /// Steps in the length of a streak per fit.
@@ -29,12 +35,8 @@ const MOST_STRETCH: f64 = 2.5;
 const SECANT: f64 = 0.1;
 /// Beads that can be taken off a window.
 const MAX_OTHERS: usize = 8;
-/// Share of a new frame in the running noise estimate.
-const NOISE_FORGETTING: f64 = 1.0 / 64.0;
 /// Residual ratio from which the variance is judged by the residual: noise alone does not reach it.
 const WIDENED_RATIO: f64 = 1.3;
-/// Variance of rounding to whole grey levels, grey^2: the least that a pixel's noise can be.
-const ROUNDING_VARIANCE: f64 = 1.0 / 12.0;
 
 /// Localises one bead per call. Buffers are made in [`Localiser::new`]; [`Localiser::locate`] allocates nothing.
 ///
@@ -208,6 +210,9 @@ impl Localiser {
     /// Copies a window, with the images of other beads taken off.
     fn take_window(&mut self, frame: &Frame, x_px: f64, y_px: f64, side_px: usize) -> bool {
         let taken = self.crop.take(frame, x_px, y_px, side_px);
+        if taken && let Some(variance) = self.noise_variance {
+            speckle::clean(&mut self.crop, variance.sqrt() as f32);
+        }
         for (x, y, amplitude) in self.others {
             if taken && amplitude != 0.0 {
                 self.crop
@@ -230,17 +235,32 @@ impl Localiser {
         if !self.take_window(frame, x_px, y_px, side_px) {
             return Fix::none(x_px, y_px, FixQuality::AtBorder);
         }
-        let mut fitted = self.fit(frame, x_px, y_px, side_px);
-        if !self.comb.is_still() {
-            fitted = self.fit_length(frame, fitted, side_px);
-        }
         // The noise is read off the border of a whole window that holds one bead in its middle; anywhere else edges
         // would count as noise.
         if self.noise_variance.is_none() {
             self.update_noise();
         }
+        let mut fitted = self.fit(frame, (x_px, y_px), side_px, MAX_RECENTRES);
+        if !self.comb.is_still() {
+            fitted = self.fit_length(frame, fitted, side_px);
+        }
+        for _ in 0..MOST_LOOKS_FOR_SPECKS {
+            let Some(again) = fitted
+                .as_ref()
+                .and_then(|f| self.without_specks(frame, f, side_px))
+            else {
+                break;
+            };
+            fitted = Some(again);
+        }
+        let found = fitted.as_ref().map(|f| f.pass);
         let mut fix = self.judge(frame, fitted, (x_px, y_px));
-        self.widen(&mut fix);
+        let widening = self.widen(&mut fix);
+        if fix.verdict == FixQuality::Good
+            && !found.is_some_and(|p| self.is_certain(&p, (fix.x_px, fix.y_px), widening))
+        {
+            fix.verdict = FixQuality::NoSignal;
+        }
         let whole = side_px == self.config.window_px && self.comb.is_still();
         if fix.verdict == FixQuality::Good && whole {
             self.update_noise();
@@ -248,10 +268,29 @@ impl Localiser {
         fix
     }
 
-    /// Widens a good fix's covariance by what the template leaves of the window.
-    fn widen(&mut self, fix: &mut Fix) {
+    /// The fit without the specks that one has left; `None` where it leaves none.
+    fn without_specks(&mut self, frame: &Frame, f: &Fitted, side_px: usize) -> Option<Fitted> {
+        let brightest =
+            f.pass.background + f.pass.amplitude.max(0.0) + f64::from(self.crop.pedestal);
+        let noise = self.pixel_variance(brightest).sqrt() as f32;
+        let tolerance = self.template_tolerance() as f32;
+        let found = speckle::leave_out(
+            &mut self.crop,
+            &self.template,
+            &self.comb,
+            (f.x_px, f.y_px),
+            (f.pass.amplitude, f.pass.background),
+            (noise, tolerance),
+            self.residues.left.as_mut_slice(),
+        );
+        // The window stays: a new one would have the specks again.
+        (found > 0).then(|| self.fit(frame, (f.x_px, f.y_px), side_px, 0))?
+    }
+
+    /// Widens a good fix's covariance by what the template leaves of the window; by how much.
+    fn widen(&mut self, fix: &mut Fix) -> f64 {
         if fix.verdict != FixQuality::Good || fix.residual_ratio <= WIDENED_RATIO {
-            return;
+            return 1.0;
         }
         let widening = self.residues.widening(
             &self.crop,
@@ -268,19 +307,7 @@ impl Localiser {
         fix.var_x_px2 *= widening;
         fix.var_y_px2 *= widening;
         fix.cov_xy_px2 *= widening;
-    }
-
-    /// Noise variance of a pixel at a grey level, grey^2.
-    fn pixel_variance(&self, grey: f64) -> f64 {
-        let shot = match self.config.noise {
-            PixelNoise::Known {
-                shot_grey_per_electron: gain,
-                black_level_grey: black,
-                ..
-            } => gain * (grey - black).max(0.0),
-            PixelNoise::Estimated => 0.0,
-        };
-        self.noise_variance.unwrap_or(1.0) + shot
+        widening
     }
 
     /// Refines the length of a streak beside the position. By symmetry the two do not depend on each other, so that they
@@ -315,7 +342,7 @@ impl Localiser {
             if self.has_others() && !self.take_window(frame, x_px, y_px, side_px) {
                 return Some(fitted);
             }
-            fitted = self.fit(frame, fitted.x_px, fitted.y_px, side_px)?;
+            fitted = self.fit(frame, (fitted.x_px, fitted.y_px), side_px, MAX_RECENTRES)?;
         }
         Some(fitted)
     }
@@ -334,42 +361,6 @@ impl Localiser {
         }
     }
 
-    fn update_noise(&mut self) {
-        self.noise_variance = Some(match self.config.noise {
-            PixelNoise::Known { read_sd_grey, .. } => read_sd_grey * read_sd_grey,
-            PixelNoise::Estimated => {
-                let now = self.crop.noise_variance().max(ROUNDING_VARIANCE);
-                match self.noise_variance {
-                    Some(before) => before + NOISE_FORGETTING * (now - before),
-                    None => now,
-                }
-            }
-        });
-    }
-
-    /// Weights for the next pass, given what the pass before found: relative to [`Localiser::weight_unit`].
-    fn weights(&self, before: Option<&Pass>) -> Weights {
-        match (self.config.noise, before) {
-            (
-                PixelNoise::Known {
-                    read_sd_grey,
-                    shot_grey_per_electron: gain,
-                    black_level_grey: black,
-                },
-                Some(p),
-            ) if gain > 0.0 => {
-                let variance = read_sd_grey * read_sd_grey;
-                let light = p.background + f64::from(self.crop.pedestal) - black;
-                Weights::Shot {
-                    base: (variance + gain * light.max(0.0)) as f32,
-                    gain_times_amplitude: (gain * p.amplitude) as f32,
-                    floor: variance as f32,
-                }
-            }
-            _ => Weights::Even { variance: 1.0 },
-        }
-    }
-
     /// Until the first template is learnt, as much is tolerated as learning may change: it could not start otherwise.
     fn template_tolerance(&self) -> f64 {
         let configured = self.config.template_tolerance;
@@ -379,18 +370,13 @@ impl Localiser {
         }
     }
 
-    /// Noise variance that a weight of 1 stands for: even weights are relative, those with shot noise absolute.
-    fn weight_unit(&self) -> f64 {
-        match self.config.noise {
-            PixelNoise::Known {
-                shot_grey_per_electron,
-                ..
-            } if shot_grey_per_electron > 0.0 => 1.0,
-            _ => self.noise_variance.unwrap_or(1.0),
-        }
-    }
-
-    fn fit(&mut self, frame: &Frame, x_px: f64, y_px: f64, side_px: usize) -> Option<Fitted> {
+    fn fit(
+        &mut self,
+        frame: &Frame,
+        (x_px, y_px): (f64, f64),
+        side_px: usize,
+        max_recentres: u32,
+    ) -> Option<Fitted> {
         let shot = matches!(self.config.noise, PixelNoise::Known { shot_grey_per_electron, .. } if shot_grey_per_electron > 0.0);
         let reach_px = 0.4 * self.template.radius_px();
         let (mut x_px, mut y_px) = (x_px, y_px);
@@ -420,7 +406,7 @@ impl Localiser {
                 (x_px - self.crop.x0 as f64 - (self.crop.width as f64 - 1.0) / 2.0).abs(),
                 (y_px - self.crop.y0 as f64 - (self.crop.height as f64 - 1.0) / 2.0).abs(),
             );
-            if off_centre > RECENTRE_PX && recentres < MAX_RECENTRES {
+            if off_centre > RECENTRE_PX && recentres < max_recentres {
                 let (x0, y0) = (self.crop.x0, self.crop.y0);
                 if !self.take_window(frame, x_px, y_px, side_px) {
                     return Some(Fitted {
