@@ -34,7 +34,7 @@ pub(crate) struct Prepared {
     pub y: Vec<f64>,
     pub present: Vec<bool>,
     pub whitener: Whitener,
-    extra_walk: Option<Vec<f64>>,
+    pub extra_walk: Option<Vec<f64>>,
     pub rest: bool,
     /// Motions by which the plant may come to rest from where it was before the record, as they are.
     transients: Vec<Vec<f64>>,
@@ -244,6 +244,17 @@ impl Problem {
             r.free_transients();
         }
         self
+    }
+
+    /// Which rows of each record hold a position that counts.
+    pub fn present(&self) -> Vec<Vec<bool>> {
+        self.records.iter().map(|r| r.present.clone()).collect()
+    }
+
+    /// Sum of the logarithms of the innovations' variances: what a noise pays for its size.
+    pub fn log_determinant(&self) -> f64 {
+        let of = |r: &Prepared| r.whitener.log_determinant();
+        self.records.iter().map(of).sum()
     }
 
     /// All rows.

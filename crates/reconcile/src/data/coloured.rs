@@ -65,6 +65,7 @@ impl Shape {
         NoiseModel {
             walk_um2: self.walk.map_or(0.0, f64::exp),
             white_um2: 1.0,
+            zero_flow: None,
             coloured: self.coloured.map(|(variance, rows)| Coloured {
                 variance_um2: variance.exp(),
                 time_rows: rows.exp(),

@@ -7,3 +7,4 @@ pub(crate) mod frames;
 pub(crate) mod noise;
 pub(crate) mod record;
 pub(crate) mod repeats;
+pub(crate) mod zero_flow;

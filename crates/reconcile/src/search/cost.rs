@@ -5,6 +5,9 @@ use crate::fit::context::{Context, Fit, freedom_of};
 use crate::thresholds::THRESHOLDS;
 use cellpos_plant::effects::Candidate;
 
+/// Price of a free number in twice the log-likelihood: what its value takes to be told from its range, to a few percent of it.
+pub(crate) const NUMBER: f64 = 8.0;
+
 /// Upper quantile of chi-square with `k` degrees of freedom at `z` standard normal deviations (Wilson-Hilferty).
 fn chi2_quantile(k: f64, z: f64) -> f64 {
     let a = 2.0 / (9.0 * k);
@@ -30,7 +33,7 @@ pub(crate) fn penalised_cost(ctx: &Context<'_>, fit: &Fit) -> f64 {
     let white = ctx.white.map_or(0.0, |w| {
         w.distance(&fit.parts, ctx.problem.base.sample_s).min(40.0)
     });
-    fit.chi2 + 8.0 * fit.freedom() as f64 + typical + white
+    fit.chi2 + NUMBER * fit.freedom() as f64 + typical + white
 }
 
 /// Sum of squares beyond the noise.
