@@ -6,6 +6,8 @@
 //! units used here, whatever the length of the record. All scores of this crate are sums of squares of those
 //! innovations, so a log-likelihood is half their difference. Missing frames are predictions without an update.
 
+use crate::data::motion::ZeroFlow;
+
 /// Sizes of the two noises.
 #[derive(Debug, Clone, Copy, PartialEq, serde::Serialize)]
 pub struct NoiseModel {
@@ -19,41 +21,6 @@ pub struct NoiseModel {
     /// Motion of the zero flow; never beside [`Self::coloured`], which is that of a sensor without a bead.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub zero_flow: Option<ZeroFlow>,
-}
-
-/// The velocity that a zero flow gives to the bead: a first-order Gauss-Markov process about that of the working point. A time longer
-/// than the records is a walk, a large variance with a long time an offset with a drift.
-#[derive(Debug, Clone, Copy, PartialEq, serde::Serialize)]
-pub struct ZeroFlow {
-    /// Variance of the motion in a row that it makes \[um^2\].
-    pub motion_um2: f64,
-    /// Its correlation time \[rows\].
-    pub time_rows: f64,
-}
-
-impl ZeroFlow {
-    /// What is left of a velocity a row later.
-    fn keep(&self) -> f64 {
-        (-1.0 / self.time_rows).exp()
-    }
-
-    /// Variance gained in a row.
-    fn fresh_um2(&self) -> f64 {
-        -(-2.0 / self.time_rows).exp_m1() * self.motion_um2
-    }
-
-    /// Mean square of the path that it makes of so many rows, about its mean or, with `ramp`, about its regression line \[um^2\].
-    pub fn path_um2(&self, rows: f64, ramp: bool) -> f64 {
-        // A velocity kept for good is a ramp, n^2/12 about its mean; one that walks by q a row makes q n^3/30 and q n^3/420 about the
-        // line; one forgotten at once is a walk of 2 V T a row. What it is in truth is below each of them.
-        let walk = 2.0 * self.motion_um2 * self.time_rows * rows;
-        let changes = self.fresh_um2() * rows.powi(3);
-        if ramp {
-            (walk / 15.0).min(changes / 420.0)
-        } else {
-            (walk / 6.0).min(self.motion_um2 * rows * rows / 12.0)
-        }
-    }
 }
 
 /// A first-order Gauss-Markov process.
@@ -412,37 +379,6 @@ impl Whitener {
     }
 }
 
-/// Variance and lag-1 covariance of increments over runs of present frames, and how many increments.
-pub(crate) fn increment_moments(r: &[f64], present: &[bool]) -> (f64, f64, usize) {
-    let (mut c0, mut c1, mut n0, mut n1, mut mean) = (0.0, 0.0, 0usize, 0usize, 0.0);
-    let valid = |k: usize| k >= 1 && present[k] && present[k - 1];
-    for k in 1..r.len() {
-        if valid(k) {
-            mean += r[k] - r[k - 1];
-            n0 += 1;
-        }
-    }
-    if n0 == 0 {
-        return (0.0, 0.0, 0);
-    }
-    mean /= n0 as f64;
-    for k in 1..r.len() {
-        if valid(k) {
-            let d = r[k] - r[k - 1] - mean;
-            c0 += d * d;
-            if valid(k - 1) {
-                c1 += d * (r[k - 1] - r[k - 2] - mean);
-                n1 += 1;
-            }
-        }
-    }
-    (
-        c0 / n0 as f64,
-        if n1 > 0 { c1 / n1 as f64 } else { 0.0 },
-        n0,
-    )
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -522,6 +458,7 @@ mod tests {
         let zero_flow = ZeroFlow {
             motion_um2: 4e-4,
             time_rows: 7.0,
+            drifts: false,
         };
         let n = NoiseModel {
             zero_flow: Some(zero_flow),

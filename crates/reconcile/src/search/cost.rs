@@ -2,11 +2,8 @@
 
 use crate::fit::catalogue::Part;
 use crate::fit::context::{Context, Fit, freedom_of};
-use crate::thresholds::THRESHOLDS;
+use crate::thresholds::{NUMBER, THRESHOLDS};
 use cellpos_plant::effects::Candidate;
-
-/// Price of a free number in twice the log-likelihood: what its value takes to be told from its range, to a few percent of it.
-pub(crate) const NUMBER: f64 = 8.0;
 
 /// Upper quantile of chi-square with `k` degrees of freedom at `z` standard normal deviations (Wilson-Hilferty).
 fn chi2_quantile(k: f64, z: f64) -> f64 {
@@ -21,7 +18,7 @@ pub(crate) fn threshold(freedom: usize) -> f64 {
 }
 
 /// The same for a variant in a problem of so many records.
-pub(super) fn threshold_of(v: &Candidate, records: usize) -> f64 {
+pub(crate) fn threshold_of(v: &Candidate, records: usize) -> f64 {
     threshold(freedom_of(v, records))
 }
 

@@ -83,8 +83,7 @@ pub(crate) fn assemble(
     let verdict = judgement.verdict;
     places.extend(counted_places);
     places.extend(judgement.reasons);
-    places.extend(slow_noise(ctx));
-    places.extend(zero_flow(ctx));
+    places.extend(slow_noise(ctx).or_else(|| zero_flow(ctx)));
     if cut_short {
         places.push("the search ended with its budget of simulations, not because nothing more was to be found: --work 4 gives it four times as much".to_owned());
     }
@@ -165,8 +164,9 @@ fn zero_flow(ctx: &Context<'_>) -> Option<String> {
     let time_s = z.time_rows * dt;
     let in_a_second_um = speed_um_per_s * (2.0 / time_s).min(1.0).sqrt() / speed_per_um;
     Some(format!(
-        "the zero flow moves by {} of displacement in a second: noise, and no effect",
-        ctx.scales.told(in_a_second_um)
+        "the zero flow moves by {} of displacement in a second{}: noise, and no effect",
+        ctx.scales.told(in_a_second_um),
+        if z.drifts { ", and drifts" } else { "" }
     ))
 }
 

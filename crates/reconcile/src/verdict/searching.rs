@@ -4,16 +4,15 @@ use crate::data::coloured::NoiseKind;
 use crate::data::floor::{Floor, from_residuals};
 use crate::data::noise::NoiseModel;
 use crate::data::zero_flow;
-use crate::fit::catalogue;
-use crate::fit::context::{Context, Fit, WhiteEvidence};
+use crate::fit::catalogue::{self, Part};
+use crate::fit::context::{Context, Fit, WhiteEvidence, freedom_of};
 use crate::problem::Problem;
-use crate::search::cost::{NUMBER, penalised_cost};
+use crate::search::cost::{penalised_cost, threshold_of};
 use crate::search::effort::Effort;
 use crate::search::sequential::{Found, search};
-use crate::thresholds::THRESHOLDS;
+use crate::thresholds::{NUMBER, THRESHOLDS};
 use crate::units::Scales;
 use crate::verdict::held_out;
-use crate::verdict::workflow::Options;
 use cellpos_plant::effects::Scope;
 use cellpos_plant::{Effect, Model};
 
@@ -22,7 +21,11 @@ pub(super) struct Searching<'a> {
     pub model: &'a Model,
     pub scope: Scope,
     pub fixed: &'a [Effect],
-    pub options: &'a Options,
+    /// Ids of effects of the user's own.
+    pub own_effects: &'a [&'static str],
+    pub free_gain: bool,
+    /// The noise that was asked for.
+    pub kind: NoiseKind,
     pub scales: &'a Scales,
 }
 
@@ -39,8 +42,8 @@ impl Searching<'_> {
             problem,
             scope: self.scope,
             fixed: self.fixed.to_vec(),
-            variants: catalogue::variants(&self.options.own_effects),
-            free_gain: self.options.free_gain,
+            variants: catalogue::variants(self.own_effects),
+            free_gain: self.free_gain,
             white: evidence(self.model, &problem.noise, trusted, problem),
             quantised: problem.quantised,
             scales: self.scales.clone(),
@@ -77,7 +80,7 @@ impl Searching<'_> {
                 || found.cut_short
                 || !floor.source.is_known()
                 // Increments tell a walk from white noise, no more.
-                || self.options.noise == NoiseKind::White
+                || self.kind == NoiseKind::White
                 || noise.coloured.is_some()
                 || refined.innovation_um() > 0.97 * noise.innovation_um()
             {
@@ -105,7 +108,7 @@ impl Searching<'_> {
         const MOST_ROUNDS: usize = 3;
         let base = &still.problem.base;
         let rests = base.free_start
-            || self.options.free_gain
+            || self.free_gain
             || !held_out::integrates(&self.context(&still.problem, 0));
         let sensor = still.problem.noise.coloured.is_some();
         if rests || sensor || !floor.source.is_known() {
@@ -192,15 +195,19 @@ impl Searching<'_> {
         })
     }
 
-    /// Twice the negative log-likelihood of a set under a problem's noise, with the prices of their numbers.
+    /// Twice the negative log-likelihood of a set under a problem's noise, with the price of the noise's numbers and, for each part,
+    /// what any addition must gain.
     fn cost(&self, problem: &Problem, fit: &Fit) -> f64 {
-        let numbers = match problem.noise.zero_flow {
-            Some(_) => 2.0,
-            None => 0.0,
+        let numbers =
+            (problem.noise.zero_flow).map_or(0, |z| zero_flow::numbers(&z, problem.records.len()));
+        let records = problem.records.len();
+        let dearer = |p: &Part| {
+            threshold_of(p.variant(), records) - NUMBER * freedom_of(p.variant(), records) as f64
         };
         penalised_cost(&self.context(problem, 0), fit)
+            + fit.parts.iter().map(dearer).sum::<f64>().max(0.0)
             + problem.log_determinant()
-            + NUMBER * numbers
+            + NUMBER * numbers as f64
     }
 }
 

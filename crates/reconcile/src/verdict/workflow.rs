@@ -123,7 +123,9 @@ fn within(
         model,
         scope,
         fixed: &model.effects,
-        options,
+        own_effects: &options.own_effects,
+        free_gain: options.free_gain,
+        kind: options.noise,
         scales,
     };
 
