@@ -191,6 +191,7 @@ impl<C: Camera> VisionSource<C> {
             flow_px_per_s: before_ns
                 .map_or((0.0, 0.0), |before_ns| mean_px_per_s(before_ns, at_ns)),
             streak_px: (x * exposed_s, y * exposed_s),
+            exposure_s: exposed_s,
         };
         let time_s = (at_ns - first_ns) as f64 * 1e-9;
         self.followed
