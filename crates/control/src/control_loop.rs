@@ -245,7 +245,10 @@ impl<L: ControlLaw> ControlLoop<L> {
                 fix: tick.fix,
                 command_um: output.command_um,
                 reference_um: tick.law.reference_um,
-                free: tick.controls && !estimate.stuck && !output.flags.not_finite,
+                free: tick.controls
+                    && !estimate.stuck
+                    && !estimate.stepped
+                    && !output.flags.not_finite,
             };
             self.adapt(state, &told);
         }
