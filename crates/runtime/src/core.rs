@@ -21,6 +21,7 @@
 
 mod account;
 mod checks;
+mod in_force;
 mod life_cycle;
 
 use crate::arming::{Arming, ArmingConfig, ArmingState};
@@ -80,6 +81,9 @@ struct State {
     unheard: u32,
     /// Ticks in a row in which a command was lost, or the board held the zero flow by itself.
     unled: u32,
+    /// What stands at the PZT, and the zero flow that went with the last command, um.
+    in_force: in_force::Board,
+    told_um: f64,
     parked_at: Option<u64>,
     unrecorded_since_ns: Option<i64>,
     plant: PlantMonitorState,
@@ -192,6 +196,8 @@ impl<R: ReferenceGenerator> Core<R> {
                 board_heard_ns: 0,
                 unheard: 0,
                 unled: 0,
+                in_force: in_force::Board::new(displacement_um, neutral_um),
+                told_um: neutral_um,
                 parked_at: None,
                 unrecorded_since_ns: None,
                 stage: Stage::None,
@@ -315,6 +321,7 @@ impl<R: ReferenceGenerator> Core<R> {
         let slew_time_s = if first {
             tick.event(EventKind::Armed);
             self.state.board_heard_ns = input.time_ns;
+            self.state.in_force.start(input.time_ns);
             None
         } else {
             self.catch_up(&mut tick);
@@ -391,7 +398,14 @@ impl<R: ReferenceGenerator> Core<R> {
                 });
             }
         }
+        let told_um = self.state.told_um;
+        let period_ns = self.timing.period_ns();
+        let in_force =
+            self.state
+                .in_force
+                .step(input.time_ns, input.board.as_ref(), told_um, period_ns);
         let given = LoopInput {
+            in_force,
             measurement: fix,
             reference_um: generated.reference_um,
             preview_um: &self.preview_um,
@@ -407,6 +421,7 @@ impl<R: ReferenceGenerator> Core<R> {
             excitation_um: self.reference.excitation_um(),
         };
         let output = self.controller.step(&given);
+        self.state.told_um = output.neutral_um;
         let nominal = self.timing.camera_delay_ms * 1e-3 / self.sample_s;
         let used = fix.filter(|_| !output.flags.coasting && !output.flags.stuck);
         let seen = used.map(|fix| {
