@@ -13,9 +13,10 @@ use std::f64::consts::TAU;
 const STEPS_PER_S: f64 = 0.01;
 /// Natural logarithm of the fastest flow over the slowest that is told from the quiet walk: 400, as the tracker takes it.
 const LOG_RANGE: f64 = 6.0;
-/// An innovation of up to so many times what the last commands moved the bead in a tick can come from a plant that is not the model's: twice the gain adds
-/// the motion once more, and a tick of delay on top adds at most twice as much where the motion turns round.
-const MOTION_SHARE: f64 = 3.0;
+/// An innovation of up to so many times what the last commands moved the bead in a tick can come from a plant that is not the
+/// model's: a gain that jumps from half to twice is four times what the law has followed and adds the motion three times; a tick
+/// of delay where the motion turns round makes it twice that.
+const MOTION_SHARE: f64 = 6.0;
 
 impl Estimator {
     /// Whether a step of the flow since the last fix that was used explains an innovation better than the quiet model does, in
