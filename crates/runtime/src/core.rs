@@ -21,6 +21,7 @@
 
 mod account;
 mod checks;
+mod following;
 mod in_force;
 mod life_cycle;
 
@@ -84,6 +85,11 @@ struct State {
     /// What stands at the PZT, and the zero flow that went with the last command, um.
     in_force: in_force::Board,
     told_um: f64,
+    following: following::Following,
+    /// Zero flow of the last seconds, um: where the PZT goes when the newest is in doubt.
+    quiet_um: f64,
+    /// Frames in a row that were the picture before.
+    pictures_repeated: u32,
     parked_at: Option<u64>,
     unrecorded_since_ns: Option<i64>,
     plant: PlantMonitorState,
@@ -153,6 +159,11 @@ impl<R: ReferenceGenerator> Core<R> {
         )?;
         let settings = controller.settings();
         let monitor = PlantMonitor::new(settings.estimator, settings.model)?;
+        let following = following::Following::new(
+            sample_s,
+            settings.model.gain_per_s,
+            timing.camera_delay_ms * 1e-3,
+        );
         controller.start(displacement_um, neutral_um);
         Ok(Self {
             preview_um: vec![0.0; controller.preview_len()],
@@ -198,6 +209,9 @@ impl<R: ReferenceGenerator> Core<R> {
                 unled: 0,
                 in_force: in_force::Board::new(displacement_um, neutral_um),
                 told_um: neutral_um,
+                following,
+                quiet_um: neutral_um,
+                pictures_repeated: 0,
                 parked_at: None,
                 unrecorded_since_ns: None,
                 stage: Stage::None,
@@ -380,7 +394,7 @@ impl<R: ReferenceGenerator> Core<R> {
         let newest = self.newest_position(fix, input, tick.steps);
         let told = ReferenceInput {
             running,
-            frozen: mode == Mode::Freeze,
+            frozen: self.state.frozen.any(),
             skip: running && input.request == Request::Skip,
             tick: since,
             sample_s: self.sample_s,
@@ -422,6 +436,7 @@ impl<R: ReferenceGenerator> Core<R> {
         };
         let output = self.controller.step(&given);
         self.state.told_um = output.neutral_um;
+        self.watch_following(fix, generated.reference_um, &output, tick);
         let nominal = self.timing.camera_delay_ms * 1e-3 / self.sample_s;
         let used = fix.filter(|_| !output.flags.coasting && !output.flags.stuck);
         let seen = used.map(|fix| {
@@ -442,6 +457,37 @@ impl<R: ReferenceGenerator> Core<R> {
             });
         }
         (output, generated)
+    }
+
+    /// A bead that moves against the commands is frozen, at the zero flow of before.
+    fn watch_following(
+        &mut self,
+        fix: Option<LoopMeasurement>,
+        reference_um: f64,
+        output: &LoopOutput,
+        tick: &mut Tick,
+    ) {
+        /// Time over which the quiet zero flow follows, s.
+        const QUIET_S: f64 = 1.0;
+        let runs = self.state.life == Life::Running && !self.state.frozen.any();
+        let Some(fix) = fix.filter(|_| runs && !output.flags.stuck) else {
+            if !runs || output.flags.stuck {
+                self.state.following.clear();
+            }
+            return;
+        };
+        let share = (self.sample_s / QUIET_S).min(1.0);
+        let before_um = self.state.quiet_um;
+        self.state.quiet_um += share * (output.neutral_um - before_um);
+        let seen = following::Seen {
+            position_um: fix.position_um,
+            error_um: fix.position_um - reference_um,
+            command_um: output.command_um,
+            zero_flow_um: output.neutral_um,
+        };
+        if self.state.following.step(seen) {
+            self.freeze(FreezeReason::NotFollowing, tick);
+        }
     }
 
     /// The position of this tick and its age beyond the camera path, ticks; between two frames of a slower camera that of the newest.

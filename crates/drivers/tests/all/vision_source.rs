@@ -286,11 +286,14 @@ fn nothing_is_allocated_per_frame_in_any_state() {
     }
     let flow = CommandedFlow::new(400.0);
     let mut source = source(camera, straight()).with_flow(flow.clone());
-    // The first frame makes the buffer as large as it is.
-    source.next(0).unwrap();
+    // The first two frames make the buffers as large as they are.
     let mut states = [0_u32; 4];
+    for _ in 0..2 {
+        let (state, _) = source.next(0).unwrap().unwrap().track.unwrap();
+        states[state as usize] += 1;
+    }
     let before = allocations();
-    for n in 1..300_i64 {
+    for n in 2..300_i64 {
         flow.note(n * PERIOD_NS, 1e-4);
         if let Ok(Some(m)) = source.next(0) {
             let (state, _) = m.track.unwrap_or((TrackState::Lost, Decision::NoFrame));
@@ -304,4 +307,26 @@ fn nothing_is_allocated_per_frame_in_any_state() {
     );
     drop(std::hint::black_box(vec![0_u8; 100]));
     assert_eq!(allocations(), before + 1, "the counter must count");
+}
+
+#[test]
+fn the_same_picture_under_new_numbers_is_stale() {
+    let template = template();
+    let mut camera = Scripted::new();
+    // It hangs for frames 5 to 8.
+    for n in 0..12_i64 {
+        camera.frame(&template, n as u64, n * PERIOD_NS, &[(30.0, 32.0, 1.0)]);
+        if (5..9).contains(&n) {
+            camera.frames[n as usize].1 = camera.frames[4].1.clone();
+        }
+    }
+    let localiser = Localiser::new(LocaliserConfig::new(ring())).unwrap();
+    let tracker = Tracker::new(localiser, TrackerConfig::default()).unwrap();
+    let mut source = VisionSource::new(camera, tracker, straight(), Clock::virtual_at(0));
+    let seen = all(&mut source);
+    for (n, m) in seen.iter().enumerate().skip(4) {
+        let stale = matches!(m.track, Some((_, Decision::Stale)));
+        assert_eq!(stale, (5..9).contains(&n), "frame {n}: {m:?}");
+        assert_eq!(m.is_usable(), !stale, "frame {n}: {m:?}");
+    }
 }

@@ -8,7 +8,16 @@ use crate::tick::Tick;
 use crate::tick_record::TickFlags;
 use cellpos_control::Mode;
 
+/// Frames in a row that show the picture before once more after which the bead is frozen. Shot noise never repeats: one is
+/// already no chance.
+const REPEATED_PICTURES: u32 = 3;
+
 impl<R: ReferenceGenerator> Core<R> {
+    /// Time without a bead after which a run ends, ns.
+    fn lost_ns(&self) -> i64 {
+        i64::from(self.timing.lost_ticks) * self.timing.period_ns()
+    }
+
     /// Life cycle; gives what the controller is to do.
     pub(super) fn advance_life(
         &mut self,
@@ -70,7 +79,17 @@ impl<R: ReferenceGenerator> Core<R> {
             }
         }
         if self.state.life == Life::Running {
-            let cause = if self.state.frameless > self.planned_gap {
+            if self.state.pictures_repeated >= REPEATED_PICTURES {
+                self.freeze(FreezeReason::PictureFrozen, tick);
+            }
+            if self.state.frozen.has(FreezeReason::NotFollowing)
+                && tick.time_ns - self.state.frozen_since_ns >= self.lost_ns()
+            {
+                self.latch(SafeReason::NotFollowing, tick);
+            }
+            let cause = if self.state.pictures_repeated > 0 {
+                (FreezeReason::PictureFrozen, SafeReason::StaleFrames)
+            } else if self.state.frameless > self.planned_gap {
                 (FreezeReason::CameraStalled, SafeReason::CameraLost)
             } else {
                 (FreezeReason::BeadLost, SafeReason::BeadLost)
@@ -82,10 +101,17 @@ impl<R: ReferenceGenerator> Core<R> {
             } else if self.state.missing == 0 {
                 self.thaw(FreezeReason::BeadLost, tick);
                 self.thaw(FreezeReason::CameraStalled, tick);
+                self.thaw(FreezeReason::PictureFrozen, tick);
             }
         }
-        match (self.state.life, self.state.frozen.any()) {
+        let frozen = self.state.frozen;
+        match (self.state.life, frozen.any()) {
             (Life::Running, false) => Mode::Run,
+            (Life::Running, true) if frozen.has(FreezeReason::NotFollowing) => {
+                tick.flags.set(TickFlags::FREEZE);
+                // What the estimator has learnt of a plant that is another says nothing of the zero flow.
+                Mode::Direct(self.state.quiet_um)
+            }
             (Life::Running, true) => {
                 tick.flags.set(TickFlags::FREEZE);
                 Mode::Freeze
