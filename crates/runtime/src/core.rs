@@ -24,6 +24,7 @@ mod checks;
 mod following;
 mod in_force;
 mod life_cycle;
+mod rest;
 
 use crate::arming::{Arming, ArmingConfig, ArmingState};
 use crate::grid::Grid;
@@ -86,8 +87,10 @@ struct State {
     in_force: in_force::Board,
     told_um: f64,
     following: following::Following,
-    /// Zero flow of the last seconds, um: where the PZT goes when the newest is in doubt.
-    quiet_um: f64,
+    /// Where the flow stands still, for a PZT that has to stop without a bead to tell.
+    rest: rest::Rest,
+    /// That of the freeze in force, um.
+    rest_um: f64,
     /// Frames in a row that were the picture before.
     pictures_repeated: u32,
     parked_at: Option<u64>,
@@ -104,6 +107,7 @@ pub struct Core<R> {
     timing: Timing,
     arming: Arming,
     sample_s: f64,
+    diffusion_um2_per_s: f64,
     /// Ticks in a row that may be without a frame: those between two frames of a slower camera.
     planned_gap: u32,
     preview_um: Vec<f64>,
@@ -164,6 +168,7 @@ impl<R: ReferenceGenerator> Core<R> {
             settings.model.gain_per_s,
             timing.camera_delay_ms * 1e-3,
         );
+        let diffusion_um2_per_s = settings.estimator.diffusion_um2_per_s;
         controller.start(displacement_um, neutral_um);
         Ok(Self {
             preview_um: vec![0.0; controller.preview_len()],
@@ -173,6 +178,7 @@ impl<R: ReferenceGenerator> Core<R> {
             timing,
             arming,
             sample_s,
+            diffusion_um2_per_s,
             learners: Learners::default(),
             late_solver_ns: Vec::new(),
             monitor,
@@ -210,7 +216,8 @@ impl<R: ReferenceGenerator> Core<R> {
                 in_force: in_force::Board::new(displacement_um, neutral_um),
                 told_um: neutral_um,
                 following,
-                quiet_um: neutral_um,
+                rest: rest::Rest::new(neutral_um),
+                rest_um: neutral_um,
                 pictures_repeated: 0,
                 parked_at: None,
                 unrecorded_since_ns: None,
@@ -467,8 +474,6 @@ impl<R: ReferenceGenerator> Core<R> {
         output: &LoopOutput,
         tick: &mut Tick,
     ) {
-        /// Time over which the quiet zero flow follows, s.
-        const QUIET_S: f64 = 1.0;
         let runs = self.state.life == Life::Running && !self.state.frozen.any();
         let Some(fix) = fix.filter(|_| runs && !output.flags.stuck) else {
             if !runs || output.flags.stuck {
@@ -476,9 +481,14 @@ impl<R: ReferenceGenerator> Core<R> {
             }
             return;
         };
-        let share = (self.sample_s / QUIET_S).min(1.0);
-        let before_um = self.state.quiet_um;
-        self.state.quiet_um += share * (output.neutral_um - before_um);
+        let walk_um2 = 2.0 * self.diffusion_um2_per_s * self.sample_s;
+        self.state.rest.step(
+            output.neutral_um,
+            output.innovation_um,
+            walk_um2 + fix.variance_um2.max(0.0),
+            output.flags,
+            self.sample_s,
+        );
         let seen = following::Seen {
             position_um: fix.position_um,
             error_um: fix.position_um - reference_um,

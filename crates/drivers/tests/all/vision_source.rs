@@ -7,8 +7,8 @@ use cellpos_rig::{
     SeenFrame, SourceInfo,
 };
 use cellpos_vision::{
-    Decision, FixQuality, Localiser, LocaliserConfig, PixelResponse, ProfileSpec, Template,
-    TrackState, Tracker, TrackerConfig,
+    Decision, Localiser, LocaliserConfig, PixelResponse, ProfileSpec, Template, TrackState,
+    Tracker, TrackerConfig,
 };
 use std::sync::{Arc, Mutex};
 

@@ -2,15 +2,15 @@
 //!
 //! With a wrong sign, a gain far off or an actuator that does not follow, the error grows while the command pushes ever harder
 //! against it. A step of the flow makes the error grow as well, but the harder the command pushes, the slower the bead becomes. So
-//! the last 21 ms are looked at in three parts, each longer than the delay: the command pushed in the second part and harder in the
+//! the last 12 and the last 21 ms are looked at in three parts, each longer than the delay: the command pushed in the second part and harder in the
 //! third, and the bead went against it, faster in the third part than in the second.
 
 /// Time from sample to sample, s.
 const BETWEEN_S: f64 = 0.001;
-/// Samples from the beginning to the end of each of the three parts.
-const PART: usize = 7;
+/// Samples in each of the three parts: a large gain drives a bead away within 12 ms, a small one within 21.
+const PARTS: [usize; 2] = [4, 7];
 /// Samples in all.
-const SAMPLES: usize = 3 * PART + 1;
+const SAMPLES: usize = 22;
 /// Commands remembered: their way to a fix takes the camera's delay.
 const COMMANDS: usize = 64;
 /// By how much the push must have become harder from part to part. A wrong sign makes it grow by more than the half in 7 ms, or
@@ -102,22 +102,31 @@ impl Following {
             zero_flow_um: seen.zero_flow_um,
         };
         self.count = (self.count + 1).min(SAMPLES);
-        self.count == SAMPLES && self.drives_away()
+        let longer = |part: &usize| *part as u32 * self.stride > self.delay as u32;
+        let parts = PARTS.into_iter().filter(longer);
+        let (count, this) = (self.count, &*self);
+        parts
+            .filter(|part| 3 * part < count)
+            .any(|part| this.drives_away(part))
     }
 
-    fn drives_away(&self) -> bool {
-        let part = |n: usize| self.samples.get(n * PART..=(n + 1) * PART).unwrap_or(&[]);
+    fn drives_away(&self, length: usize) -> bool {
+        let from = SAMPLES - 1 - 3 * length;
+        let part = |n: usize| {
+            let first = from + n * length;
+            self.samples.get(first..=first + length).unwrap_or(&[])
+        };
         // The zero flow of the beginning: what was learnt since may be what is wrong.
-        let rest_um = self.samples[0].zero_flow_um;
+        let rest_um = part(0).first().map_or(f64::NAN, |s| s.zero_flow_um);
         let push_um = |n| -> f64 {
-            let ways = part(n).iter().take(PART);
+            let ways = part(n).iter().take(length);
             self.gain * ways.map(|s| s.command_um - rest_um).sum::<f64>()
         };
         let went_um = |n| match part(n) {
             [first, .., last] => last.position_um - first.position_um,
             _ => 0.0,
         };
-        let error_um = |n| part(n).iter().map(|s| s.error_um).sum::<f64>() / (PART + 1) as f64;
+        let error_um = |n| part(n).iter().map(|s| s.error_um).sum::<f64>() / (length + 1) as f64;
         // Seen from the side to which the bead is now.
         let side = error_um(2).signum();
         let against = |n| -side * push_um(n);

@@ -107,14 +107,20 @@ impl<R: ReferenceGenerator> Core<R> {
         let frozen = self.state.frozen;
         match (self.state.life, frozen.any()) {
             (Life::Running, false) => Mode::Run,
-            (Life::Running, true) if frozen.has(FreezeReason::NotFollowing) => {
-                tick.flags.set(TickFlags::FREEZE);
-                // What the estimator has learnt of a plant that is another says nothing of the zero flow.
-                Mode::Direct(self.state.quiet_um)
-            }
             (Life::Running, true) => {
                 tick.flags.set(TickFlags::FREEZE);
-                Mode::Freeze
+                // With the bead in view the estimate of the zero flow goes on and is the best there is.
+                let blind = [
+                    FreezeReason::BeadLost,
+                    FreezeReason::CameraStalled,
+                    FreezeReason::PictureFrozen,
+                    FreezeReason::NotFollowing,
+                ];
+                if blind.into_iter().any(|reason| frozen.has(reason)) {
+                    Mode::Direct(self.state.rest_um)
+                } else {
+                    Mode::Freeze
+                }
             }
             _ => Mode::Park,
         }
@@ -132,6 +138,7 @@ impl<R: ReferenceGenerator> Core<R> {
     pub(super) fn freeze(&mut self, reason: FreezeReason, tick: &mut Tick) {
         if self.state.life == Life::Running && self.state.frozen.add(reason) {
             self.state.frozen_since_ns = tick.time_ns;
+            self.state.rest_um = self.state.rest.zero_flow_um(self.controller.neutral_um());
             tick.event(EventKind::FreezeStarted { reason });
         }
     }
