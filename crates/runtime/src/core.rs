@@ -474,11 +474,7 @@ impl<R: ReferenceGenerator> Core<R> {
         output: &LoopOutput,
         tick: &mut Tick,
     ) {
-        let runs = self.state.life == Life::Running && !self.state.frozen.any();
-        let Some(fix) = fix.filter(|_| runs && !output.flags.stuck) else {
-            if !runs || output.flags.stuck {
-                self.state.following.clear();
-            }
+        let Some(fix) = fix.filter(|_| self.state.life == Life::Running) else {
             return;
         };
         let walk_um2 = 2.0 * self.diffusion_um2_per_s * self.sample_s;
@@ -489,6 +485,10 @@ impl<R: ReferenceGenerator> Core<R> {
             output.flags,
             self.sample_s,
         );
+        if self.state.frozen.any() || output.flags.stuck {
+            self.state.following.clear();
+            return;
+        }
         let seen = following::Seen {
             position_um: fix.position_um,
             error_um: fix.position_um - reference_um,

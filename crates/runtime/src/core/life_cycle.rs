@@ -136,9 +136,14 @@ impl<R: ReferenceGenerator> Core<R> {
     }
 
     pub(super) fn freeze(&mut self, reason: FreezeReason, tick: &mut Tick) {
-        if self.state.life == Life::Running && self.state.frozen.add(reason) {
-            self.state.frozen_since_ns = tick.time_ns;
+        if self.state.life != Life::Running {
+            return;
+        }
+        if !self.state.frozen.has(reason) {
             self.state.rest_um = self.state.rest.zero_flow_um(self.controller.neutral_um());
+        }
+        if self.state.frozen.add(reason) {
+            self.state.frozen_since_ns = tick.time_ns;
             tick.event(EventKind::FreezeStarted { reason });
         }
     }
