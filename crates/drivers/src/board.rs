@@ -1,6 +1,7 @@
 //! The host's side of the conversation with the PZT board, on any byte port.
 
 use crate::outbox::{Kind, Outbox};
+use crate::port::Port;
 use cellpos_link::{
     Arm, BoardState, Command, Decoder, Fault, Identity, Limits, MAX_FRAME, Order, PROTOCOL_VERSION,
     Refusal, Request, Status, ToBoard, ToHost, encode, order, picometres, um_from_picometres,
@@ -10,36 +11,6 @@ use cellpos_rig::{
     ArmRequest, Clock, CommandAccount,
 };
 use std::time::Duration;
-
-/// A byte port that never blocks for long.
-pub trait Port: Send {
-    /// Name, for messages.
-    fn name(&self) -> &str;
-    /// Writes as many of the bytes as the line takes now, and says how many: 0 when it takes none.
-    ///
-    /// # Errors
-    /// The line is gone; a later call may find it again.
-    fn write_some(&mut self, bytes: &[u8]) -> std::io::Result<usize>;
-    /// Reads what is there, at most `buffer.len()` bytes; 0 when nothing is.
-    ///
-    /// # Errors
-    /// The line is gone; a later call may find it again.
-    fn read_available(&mut self, buffer: &mut [u8]) -> std::io::Result<usize>;
-}
-
-impl<P: Port + ?Sized> Port for Box<P> {
-    fn name(&self) -> &str {
-        (**self).name()
-    }
-
-    fn write_some(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
-        (**self).write_some(bytes)
-    }
-
-    fn read_available(&mut self, buffer: &mut [u8]) -> std::io::Result<usize> {
-        (**self).read_available(buffer)
-    }
-}
 
 /// How long an answer to a request may take.
 const ANSWER_WITHIN: Duration = Duration::from_millis(500);

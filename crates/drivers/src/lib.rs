@@ -23,14 +23,16 @@ pub mod calibration;
 pub mod calibration_file;
 pub mod flow;
 mod outbox;
+mod port;
 pub mod program;
 pub mod serial;
 pub mod socket;
 pub mod sources;
 pub mod vision_source;
 
-pub use board::{BoardHost, Port};
+pub use board::BoardHost;
 pub use calibration::{Axis, Calibration};
 pub use calibration_file::{CalibrationError, CalibrationFile};
 pub use flow::{CommandedFlow, FlowTap};
+pub use port::Port;
 pub use vision_source::{Followed, VisionSource};

@@ -1,6 +1,6 @@
 //! Frames on their way to the board over a line that may take nothing, or a part of a frame, at a time.
 
-use crate::board::Port;
+use crate::port::Port;
 use cellpos_link::MAX_FRAME;
 
 /// What a frame holds: commands give way to newer ones, orders do not.

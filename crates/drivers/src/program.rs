@@ -1,6 +1,6 @@
 //! An actuator that another program serves on a Unix socket: the board's protocol (docs/board.md) on a stream.
 
-use crate::board::Port;
+use crate::port::Port;
 use std::io::{Error, ErrorKind, Read, Write};
 use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};

@@ -1,6 +1,6 @@
 //! The PZT board on a serial port (a real one, a USB adapter, or a pseudo-terminal).
 
-use crate::board::Port;
+use crate::port::Port;
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::fs::{FlockOperation, Mode, OFlags, flock};
 use rustix::io::Errno;

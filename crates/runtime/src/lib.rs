@@ -36,6 +36,7 @@ pub use learners::Learners;
 pub use life::{Event, EventKind, Life, Request, SafeReason};
 pub use recorder::{RecorderFault, RecorderReport};
 pub use reference::{ReferenceGenerator, ReferenceInput, ReferenceOutput, Stage, Steered};
-pub use run::{EndRule, Finished, Heard, NoSink, RunError, RunSink};
+pub use run::{EndRule, Finished, NoSink, RunError, RunSink};
 pub use summary::{End, Statistics, Summary};
+pub use tick::Heard;
 pub use tick_record::{TickFlags, TickRecord};

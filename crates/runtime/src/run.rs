@@ -7,7 +7,7 @@ use crate::recording::{RecorderReport, Unconfirmed};
 use crate::summary::{End, Statistics, Summary};
 use crate::tick_record::TickRecord;
 use cellpos_control::{LearnedTable, LearnerState};
-use cellpos_rig::{Actuator, ActuatorError, ActuatorReport, CameraError, CommandAccount};
+use cellpos_rig::{Actuator, ActuatorError, CameraError};
 use std::time::Duration;
 
 /// Where records and events go. Called on the recorder thread; may block, allocate and fail in its own way: a sink that
@@ -192,15 +192,6 @@ impl EndWatch {
             _ => None,
         }
     }
-}
-
-/// What the actuator thread tells the loop.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct Heard {
-    /// The newest report, if one came.
-    pub report: Option<ActuatorReport>,
-    /// What became of the commands so far, where the actuator says so.
-    pub account: CommandAccount,
 }
 
 /// Leaves the hardware in a defined state after the last tick: frozen at neutral for a moment, then at park.

@@ -5,7 +5,7 @@ use crate::frames::FrameTally;
 use crate::life::{Event, EventKind, Events, Request};
 use crate::tick_record::{TickFlags, TickRecord};
 use cellpos_control::SolverTerms;
-use cellpos_rig::{ActuatorReport, Measurement};
+use cellpos_rig::{ActuatorReport, CommandAccount, Measurement};
 use serde::Serialize;
 
 /// What a tick is given by its driver.
@@ -35,6 +35,15 @@ pub struct TickInput {
     pub slow_vision_ns: Option<u32>,
     /// How long an optimising controller may take, or how it ended when this tick was recorded.
     pub solver: SolverTerms,
+}
+
+/// What the actuator thread tells the loop.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Heard {
+    /// The newest report, if one came.
+    pub report: Option<ActuatorReport>,
+    /// What became of the commands so far, where the actuator says so.
+    pub account: CommandAccount,
 }
 
 /// What the actuator thread is to do.

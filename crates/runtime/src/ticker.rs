@@ -6,7 +6,7 @@ use crate::frames::FrameWatch;
 use crate::latency::Latency;
 use crate::life::{Event, Life, Request};
 use crate::reference::ReferenceGenerator;
-use crate::run::Heard;
+use crate::tick::Heard;
 use crate::tick_record::{TickFlags, TickRecord};
 use crate::timing::Timing;
 use cellpos_control::{LearnerState, SolverTerms};

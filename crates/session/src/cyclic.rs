@@ -3,7 +3,7 @@
 use crate::Failure;
 use crate::prepared::Prepared;
 use crate::rig_file::RigFile;
-use cellpos_control::design::{DesignPlant, Uncertainty, harmonic_responses};
+use cellpos_control::design::{DesignPlant, Uncertainty, harmonic_responses, sine_figures};
 use cellpos_control::{
     CycleLearning, HarmonicResponse, LearnConfig, LearnError, LearnedTable, Learner, Profile,
     Reference, Shape,
@@ -42,6 +42,137 @@ impl FromStr for Sine {
             frequency,
         })
     }
+}
+
+impl Sine {
+    /// Whether a loop can follow it at all: its frequency is seen once per frame, and the PZT has to go where the plant needs it.
+    ///
+    /// # Errors
+    /// A frequency from half the loop's rate on; more stroke or slew than `prepared` has.
+    pub fn check(&self, prepared: &Prepared, file: &RigFile) -> Result<(), Failure> {
+        let (amplitude_um, hz) = (self.amplitude.value(), self.frequency.value());
+        let rate_hz = 1e6 / file.timing.period_us;
+        if hz >= 0.5 * rate_hz {
+            return Err(Failure::bad_input(
+                format!(
+                    "--sine {}@{}: at {rate_hz:.0} ticks a second no motion from {:.0} Hz on can be told from a slower one",
+                    self.amplitude,
+                    self.frequency,
+                    0.5 * rate_hz
+                ),
+                "choose a lower frequency, or a faster loop and camera (period_us in [timing])",
+            ));
+        }
+        let gain = design_plant(prepared, file)?
+            .plant
+            .response(self.frequency)
+            .norm();
+        let limits = &prepared.controller.limits;
+        let drive_um = amplitude_um / gain;
+        let stroke_um = 0.5 * (limits.high_um - limits.low_um);
+        let slew_um = limits.slew_um_per_s / (std::f64::consts::TAU * hz);
+        // The smaller of what the range and the slew leave of the amplitude.
+        let share = stroke_um.min(slew_um) / drive_um;
+        if share < 1.0 {
+            let which = if slew_um < stroke_um {
+                format!("a slew of {} um/s", limits.slew_um_per_s)
+            } else {
+                format!("a range of {} to {} um", limits.low_um, limits.high_um)
+            };
+            return Err(Failure::bad_input(
+                format!(
+                    "--sine {}@{}: the PZT would have to swing by +-{drive_um:.1} um, and {which} does not carry that",
+                    self.amplitude, self.frequency
+                ),
+                format!(
+                    "choose an amplitude of {:.2}um at most, or a lower frequency",
+                    0.95 * share * amplitude_um
+                ),
+            ));
+        }
+        Ok(())
+    }
+
+    /// RMS error that the design predicts without noise, um.
+    ///
+    /// # Errors
+    /// A model or a controller of which no loop can be made.
+    pub fn predicted_rms_um(&self, prepared: &Prepared, file: &RigFile) -> Result<f64, Failure> {
+        let config = prepared
+            .controller
+            .loop_config(&prepared.model)
+            .map_err(Failure::input)?;
+        let plant = design_plant(prepared, file)?;
+        let (amplitude_um, hz) = (self.amplitude.value(), self.frequency.value());
+        let figures = sine_figures(&plant, &config, amplitude_um, hz).map_err(Failure::input)?;
+        Ok(figures.rms_um)
+    }
+
+    /// What to say of a loop that is predicted to miss this sine by more than a tenth of its amplitude; `better` gives the same rig
+    /// with another controller.
+    ///
+    /// # Errors
+    /// A model or a controller of which no loop can be made.
+    pub fn warning(
+        &self,
+        prepared: &Prepared,
+        file: &RigFile,
+        better: impl Fn(&'static str) -> Result<Prepared, Failure>,
+    ) -> Result<Option<String>, Failure> {
+        let allowed_um = 0.1 * self.amplitude.value();
+        let rms_um = self.predicted_rms_um(prepared, file)?;
+        if rms_um <= allowed_um {
+            return Ok(None);
+        }
+        let mut advice = "a lower frequency or amplitude, or --learn, brings it down".to_string();
+        for name in ["lead", "lqg", "mpc"] {
+            let um = self.predicted_rms_um(&better(name)?, file)?;
+            if um <= allowed_um {
+                advice = format!("--controller {name} is predicted to follow with {um:.3} um RMS");
+                break;
+            }
+        }
+        Ok(Some(format!(
+            "{}@{}: this controller is predicted to miss it by {rms_um:.2} um RMS; {advice}",
+            self.amplitude, self.frequency
+        )))
+    }
+}
+
+/// Refuses a sine that the loop cannot follow, and gives what to say of one that it will miss; said already, before anything moves. A
+/// sine that is learned is not missed. `better` gives the same rig with another controller.
+///
+/// # Errors
+/// See [`Sine::check`].
+pub fn predicted(
+    sine: Option<Sine>,
+    learns: bool,
+    prepared: &Prepared,
+    file: &RigFile,
+    better: impl Fn(&'static str) -> Result<Prepared, Failure>,
+) -> Result<Option<String>, Failure> {
+    let Some(sine) = sine else {
+        return Ok(None);
+    };
+    sine.check(prepared, file)?;
+    if learns {
+        return Ok(None);
+    }
+    let warning = sine.warning(prepared, file, better)?;
+    if let Some(warning) = &warning {
+        tracing::warn!("{warning}");
+    }
+    Ok(warning)
+}
+
+/// The plant as a controller was designed for, about the displacement at which this rig's bead first rests.
+fn design_plant(setup: &Prepared, file: &RigFile) -> Result<DesignPlant, Failure> {
+    let sample_s = file.timing.period_us * 1e-6;
+    let delay_s = Some(setup.controller.delay_ms * 1e-3);
+    let mut plant =
+        DesignPlant::from_model(&setup.model, delay_s, sample_s).map_err(Failure::input)?;
+    plant.neutral_um = file.first_neutral_um;
+    Ok(plant)
 }
 
 /// What is learned in a run, from what: enough for a replay.
@@ -113,14 +244,7 @@ impl LearnSpec {
             .controller
             .loop_config(&setup.model)
             .map_err(Failure::input)?;
-        let sample_s = file.timing.period_us * 1e-6;
-        let mut plant = DesignPlant::from_model(
-            &setup.model,
-            Some(setup.controller.delay_ms * 1e-3),
-            sample_s,
-        )
-        .map_err(Failure::input)?;
-        plant.neutral_um = file.first_neutral_um;
+        let plant = design_plant(setup, file)?;
         let margins = Uncertainty::of_model(&setup.model, plant.delay_s);
         let responses = harmonic_responses(
             &plant,
@@ -143,7 +267,7 @@ impl LearnSpec {
             margins: Some(margins),
             table,
         };
-        spec.learning(sample_s)?;
+        spec.learning(plant.sample_time_s)?;
         Ok(spec)
     }
 

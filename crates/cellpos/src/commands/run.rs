@@ -9,7 +9,7 @@ pub(super) mod resume;
 mod session_config;
 mod shown;
 mod sink;
-mod text;
+pub(crate) mod text;
 mod unshown;
 
 use crate::arguments::run_name;

@@ -149,6 +149,8 @@ pub fn run(args: Args) -> CommandResult {
     for end in [-reach, reach] {
         check_target(Micrometers(args.target.value() + end), &rig)?;
     }
+    let better = |name: &'static str| rig.prepare(&args.model, name);
+    let predicted = cyclic::predicted(args.sine, args.learn, &prepared, rig.file(), better)?;
     let limits = prepared.controller.limits;
     let learn = learn(&args, &prepared, rig.file())?;
     let mut setup = rig.set_up(prepared, reference(&args))?;
@@ -198,7 +200,7 @@ pub fn run(args: Args) -> CommandResult {
     match rig.arm(&setup, core, sink, end) {
         Ok(armed) => {
             let finished = armed.start()?.wait()?;
-            conclude(&args, &setup, finished, view)
+            conclude(&args, &setup, finished, predicted, view)
         }
         Err(not_armed) => {
             drop(view);
@@ -318,9 +320,11 @@ fn conclude(
     args: &Args,
     setup: &Setup,
     finished: Finished<Viewed<Clipped<Recording>>>,
+    predicted: Option<String>,
     view: Option<View>,
 ) -> CommandResult {
     let mut warnings = connect::warnings(&finished);
+    warnings.extend(predicted);
     let Finished {
         ended,
         rig,
@@ -451,7 +455,10 @@ fn text(report: &Report) -> String {
         );
     }
     if let Some(lost) = s.commands_lost.filter(|&lost| lost > 0) {
-        line("commands", commands_lost(lost, s.commands_not_taken));
+        line(
+            "commands",
+            super::run::text::commands_lost(lost, s.commands_not_taken),
+        );
     }
     line("loop delay", format!("{:.2} ms", s.loop_delay_ms));
     let c = &s.counts;
@@ -481,10 +488,4 @@ fn text(report: &Report) -> String {
         line("run", run.clone());
     }
     out
-}
-
-/// What became of commands on the way to the board, in words.
-pub(crate) fn commands_lost(lost: u64, not_taken: Option<u64>) -> String {
-    let not_taken = not_taken.unwrap_or(0);
-    format!("{lost} lost on the way to the board, of which its line did not take {not_taken}")
 }

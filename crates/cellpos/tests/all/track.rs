@@ -421,3 +421,46 @@ fn a_sine_is_learned_kept_with_the_run_replayed_and_gone_on_from() {
     assert_eq!(other.code, Some(2));
     assert!(other.err.contains("100 Hz"), "{}", other.err);
 }
+
+#[test]
+fn a_sine_that_no_loop_can_follow_is_refused_and_one_that_this_one_misses_is_told_before() {
+    let folder = tempfile::tempdir().unwrap();
+    let line = "track --target 0um --duration 3s --clock virtual --frames off --no-record";
+    for (sine, word) in [
+        ("5um@600Hz", "500 Hz"),
+        ("5um@500Hz", "500 Hz"),
+        ("12um@200Hz", "slew"),
+    ] {
+        let output = cellpos(folder.path(), &format!("{line} --sine {sine}"));
+        assert_eq!(output.code, Some(2), "{sine}: {}", output.err);
+        assert!(output.err.contains(word), "{sine}: {}", output.err);
+    }
+    let narrow = "[limits]\nlow_um = 18.0\nhigh_um = 22.0\npark_um = 20.0\n";
+    std::fs::write(folder.path().join("narrow.toml"), narrow).unwrap();
+    let output = cellpos(
+        folder.path(),
+        &format!("{line} --rig narrow.toml --sine 5um@50Hz"),
+    );
+    assert_eq!(output.code, Some(2), "{}", output.err);
+    assert!(output.err.contains("18 to 22 um"), "{}", output.err);
+    let missed = succeed(
+        folder.path(),
+        &format!("{line} --sine 5um@100Hz --controller pi"),
+    );
+    assert!(
+        missed.err.contains("predicted to miss it by"),
+        "{}",
+        missed.err
+    );
+    assert!(missed.err.contains("--controller lqg"), "{}", missed.err);
+    let followed = succeed(
+        folder.path(),
+        &format!("{line} --sine 5um@100Hz --controller lqg"),
+    );
+    assert!(!followed.err.contains("predicted"), "{}", followed.err);
+    let slow = succeed(
+        folder.path(),
+        &format!("{line} --sine 2um@1Hz --controller pi"),
+    );
+    assert!(!slow.err.contains("predicted"), "{}", slow.err);
+}

@@ -26,4 +26,7 @@ pub use report::{
 };
 pub use search::{PiSearch, search_pi};
 pub use spread::{SpreadRow, spread};
-pub use step::{DisturbanceFigures, SetUpError, StepFigures, disturbance_figures, step_figures};
+pub use step::{
+    DisturbanceFigures, SetUpError, SineFigures, StepFigures, disturbance_figures, sine_figures,
+    step_figures,
+};

@@ -13,7 +13,6 @@ mod parameters;
 mod proposal;
 pub(crate) mod response;
 pub(crate) mod result;
-mod searching;
 mod sentences;
 mod significance;
 mod small;

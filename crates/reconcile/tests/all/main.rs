@@ -6,4 +6,3 @@ mod measured_piezo;
 mod noise;
 mod units;
 mod verdicts;
-mod zero_flow;

@@ -1,7 +1,6 @@
 //! What `cellpos run` prints in the end.
 
 use super::learning::NamedTable;
-use crate::commands::track::commands_lost;
 use crate::cyclic;
 use cellpos_runtime::Summary;
 use cellpos_runtime::realtime::Conditions;
@@ -181,4 +180,10 @@ impl<'a> Report<'a> {
         }
         out
     }
+}
+
+/// What became of commands on the way to the board, in words.
+pub(crate) fn commands_lost(lost: u64, not_taken: Option<u64>) -> String {
+    let not_taken = not_taken.unwrap_or(0);
+    format!("{lost} lost on the way to the board, of which its line did not take {not_taken}")
 }
