@@ -189,6 +189,7 @@ impl<L: ControlLaw> ControlLoop<L> {
     /// One tick.
     pub fn step(&self, state: &mut LoopState<L::State>, input: &LoopInput) -> LoopOutput {
         let law = &self.parts.controller;
+        self.take_in_force(state, input);
         let tick = self.estimate(state, input);
         let gain = tick.law.tuning.gain;
         let decided = if tick.controls {
@@ -226,7 +227,9 @@ impl<L: ControlLaw> ControlLoop<L> {
         };
         if tick.controls {
             // The excitation is no saturation: an integrator must not be pulled along with it.
-            let applied_um = (output.command_um - added_um) * gain;
+            // Nor does what never reached the actuator wind it up.
+            let stood_um = input.in_force.map(|stood| stood.displacement_um);
+            let applied_um = stood_um.unwrap_or(output.command_um - added_um) * gain;
             law.applied(&mut state.law, &tick.law, decided.wish_um, applied_um);
         } else {
             law.follow(&mut state.law, &tick.law, output.command_um * gain);
@@ -245,11 +248,29 @@ impl<L: ControlLaw> ControlLoop<L> {
                 fix: tick.fix,
                 command_um: output.command_um,
                 reference_um: tick.law.reference_um,
-                free: tick.controls && !estimate.stuck && !output.flags.not_finite,
+                free: tick.controls
+                    && !estimate.stuck
+                    && !estimate.stepped
+                    && !output.flags.not_finite,
             };
             self.adapt(state, &told);
         }
         output
+    }
+
+    /// What is known to have stood at the actuator takes the place of the commands that did not reach it.
+    fn take_in_force(&self, state: &mut LoopState<L::State>, input: &LoopInput) {
+        let Some(stood) = input
+            .in_force
+            .filter(|stood| stood.displacement_um.is_finite())
+        else {
+            return;
+        };
+        let scaled_um = stood.displacement_um * self.tuning(state).gain;
+        let newest = state.estimator.history_um.iter_mut().take(stood.ticks);
+        newest.for_each(|um| *um = scaled_um);
+        state.previous_um = stood.displacement_um;
+        state.hidden_um = 0.0;
     }
 
     /// A tick that never came: the command was held and the bead moved on. The estimator follows; integrator and

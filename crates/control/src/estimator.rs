@@ -10,6 +10,7 @@
 
 mod config;
 mod exposure;
+mod flow_step;
 mod retune;
 mod stuck;
 mod transition;
@@ -30,9 +31,6 @@ const LONGEST_LAG: usize = 3;
 
 /// Ticks over which the fastest motion is looked for.
 const FASTEST_TICKS: usize = 6;
-
-/// Uncertainty of neutral once the filter has been wrong for many fixes, um: half the range of the PZT.
-const LOST_NEUTRAL_UM: f64 = 20.0;
 
 /// Delay that a model may lack: a bead in fast motion is that many ticks of it away from where it is expected, and is still
 /// the same bead.
@@ -77,6 +75,10 @@ pub struct EstimatorState {
     pub lag: u8,
     /// Refused measurements in a row.
     pub gated: u8,
+    /// Ticks since the newest measurement that was used.
+    pub ticks_since_fix: u8,
+    /// Ticks for which a step of the flow that was granted counts as new.
+    pub stepped_ticks: u8,
     /// A measurement has been used.
     pub seen: bool,
     /// The bead is taken for stuck.
@@ -102,6 +104,8 @@ pub struct Estimate {
     pub coasting: bool,
     /// The measurement was refused by the innovation gate.
     pub gated: bool,
+    /// A step of the flow was granted within the last ticks: what is seen in them says nothing of gain and delay.
+    pub stepped: bool,
     /// A measurement has been used at some time.
     pub seen: bool,
     /// The bead is taken for stuck.
@@ -190,6 +194,8 @@ impl Estimator {
             gain_doubt: 1.0,
             lag: 0,
             gated: 0,
+            ticks_since_fix: 0,
+            stepped_ticks: 0,
             seen: false,
             stuck: false,
             released_ticks: 0,
@@ -316,7 +322,9 @@ impl Estimator {
     /// One tick: time moves on, the measurement (if any) is used, the present is predicted.
     pub(crate) fn step(&self, state: &mut EstimatorState, fix: Option<Fix>) -> Estimate {
         state.lag = state.lag.saturating_add(1);
+        state.ticks_since_fix = state.ticks_since_fix.saturating_add(1);
         state.released_ticks = state.released_ticks.saturating_sub(1);
+        state.stepped_ticks = state.stepped_ticks.saturating_sub(1);
         let was_stuck = state.stuck;
         let mut innovation_um = 0.0;
         let (mut used, mut fresh, mut gated) = (false, false, false);
@@ -335,6 +343,9 @@ impl Estimator {
                     self.advance_filter(state);
                 }
             }
+        }
+        if used {
+            state.ticks_since_fix = 0;
         }
         if was_stuck && !state.stuck {
             state.released_ticks = RELEASED_TICKS;
@@ -367,6 +378,7 @@ impl Estimator {
             fresh,
             coasting: !used,
             gated,
+            stepped: state.stepped_ticks > 0,
             seen: state.seen,
             stuck: state.stuck,
             authority_um: self.authority_um(state),
@@ -403,19 +415,25 @@ impl Estimator {
         let widest = if state.stuck { 10.0 } else { 1.0 };
         let floor_um = self.config.gate_floor_um + GATE_LAG_TICKS * self.fastest_motion(state);
         let gate = widest * (self.config.gate_sigma * spread.sqrt()).max(floor_um);
-        if innovation.abs() > gate {
+        let beyond = innovation.abs() > gate;
+        if beyond {
             state.gated = state.gated.saturating_add(1);
-            if state.gated > self.config.gate_most {
-                self.place(state, innovation, fix.variance_um2);
-                // So many refusals in a row can mean that neutral is wrong: it is learned anew.
-                state.covariance_um2[2] = LOST_NEUTRAL_UM.powi(2);
-                state.stuck_evidence = 0.0;
-                state.stuck = false;
-                return (true, innovation);
+            if state.gated <= self.config.gate_most {
+                return (false, innovation);
             }
-            return (false, innovation);
+            state.stuck_evidence = 0.0;
+            state.stuck = false;
         }
         state.gated = 0;
+        if self.is_step(state, innovation, spread, fix) {
+            self.grant_step(state, innovation);
+            self.correct(state, h, innovation, walk_um2, fix.variance_um2);
+            return (true, innovation);
+        }
+        if beyond {
+            self.place(state, innovation, fix.variance_um2);
+            return (true, innovation);
+        }
         let was_stuck = state.stuck;
         self.weigh_stuck(state, innovation, motion_um, fix.variance_um2);
         if state.stuck {
@@ -434,12 +452,26 @@ impl Estimator {
             state.covariance_um2[2] = p22.max(RELEASED_NEUTRAL_UM.powi(2));
             return (true, innovation);
         }
-        let trusted = spread - fix.variance_um2 + fix.variance_um2 / self.config.ltr_noise_scaling;
-        let (k1, k2) = (ph1 / trusted, ph2 / trusted);
-        state.integrator_um += k1 * innovation;
-        state.neutral_um += k2 * innovation;
-        state.covariance_um2 = [p11 - k1 * ph1, p12 - k1 * ph2, p22 - k2 * ph2];
+        self.correct(state, h, innovation, walk_um2, fix.variance_um2);
         (true, innovation)
+    }
+
+    /// Corrects the estimate by an innovation; `h` is the sensitivity of the fix to neutral.
+    fn correct(
+        &self,
+        state: &mut EstimatorState,
+        h: f64,
+        innovation_um: f64,
+        walk_um2: f64,
+        variance_um2: f64,
+    ) {
+        let [p11, p12, p22] = state.covariance_um2;
+        let (ph1, ph2) = (p11 + h * p12, p12 + h * p22);
+        let trusted = ph1 + h * ph2 + walk_um2 + variance_um2 / self.config.ltr_noise_scaling;
+        let (k1, k2) = (ph1 / trusted, ph2 / trusted);
+        state.integrator_um += k1 * innovation_um;
+        state.neutral_um += k2 * innovation_um;
+        state.covariance_um2 = [p11 - k1 * ph1, p12 - k1 * ph2, p22 - k2 * ph2];
     }
 
     /// Takes the position from the fix alone, keeping neutral.

@@ -66,7 +66,7 @@ pub use learning::{
 };
 pub use limits::{Limited, Limits};
 pub use linear::LinearLaw;
-pub use loop_io::{LoopFlags, LoopInput, LoopOutput, LoopParts, Measurement, Mode};
+pub use loop_io::{InForce, LoopFlags, LoopInput, LoopOutput, LoopParts, Measurement, Mode};
 pub use loop_model::{LoopMode, LoopModel, MODES};
 pub use lqg::{Feedback, Lqg, LqgLaw, LqgState};
 pub use monitor::{PlantEstimate, PlantMonitor, PlantMonitorState, PlantVerdict};

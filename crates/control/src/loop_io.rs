@@ -33,6 +33,16 @@ pub enum Mode {
     Direct(f64),
 }
 
+/// The displacement that stood at the actuator, where it is known to be another than what was commanded: the line was silent,
+/// the board held, or its limits said otherwise.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct InForce {
+    /// Displacement, um.
+    pub displacement_um: f64,
+    /// Ticks up to the one before this for which it stood.
+    pub ticks: usize,
+}
+
 /// What a tick is given.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct LoopInput<'a> {
@@ -54,6 +64,8 @@ pub struct LoopInput<'a> {
     pub feed_forward_gain: Option<f64>,
     /// Time since the previous command, s, where it is shorter than a tick: the slew limit holds by the clock.
     pub slew_time_s: Option<f64>,
+    /// What stood at the actuator instead of the last commands; `None`: they did. Estimator, law and slew limit go on from it.
+    pub in_force: Option<InForce>,
     /// How long an optimising controller may take.
     pub solver: SolverTerms,
 }

@@ -91,12 +91,23 @@ pub struct FlowTap<A> {
     inner: A,
     flow: CommandedFlow,
     clock: Clock,
+    /// Displacement that counts as no flow, um, and its time, ns.
+    reference: Option<(f64, i64)>,
 }
+
+/// Time in which the reference of the flow follows the loop's zero flow, s. The tracker has a velocity of its own for what no
+/// command explains; a zero flow that the loop corrects within a few ticks must not count twice.
+const REFERENCE_S: f64 = 1.0;
 
 impl<A> FlowTap<A> {
     /// Puts the tap in front of an actuator; `clock` is the one of the camera's time stamps.
     pub fn new(inner: A, flow: CommandedFlow, clock: Clock) -> Self {
-        Self { inner, flow, clock }
+        Self {
+            inner,
+            flow,
+            clock,
+            reference: None,
+        }
     }
 
     /// The actuator behind the tap.
@@ -104,8 +115,22 @@ impl<A> FlowTap<A> {
         &mut self.inner
     }
 
-    fn rest(&self) {
+    fn rest(&mut self) {
+        self.reference = None;
         self.flow.note(self.clock.now_ns(), 0.0);
+    }
+
+    /// The displacement that counts as no flow at `now_ns`, um, when the loop's zero flow is `neutral_um`.
+    fn reference_um(&mut self, neutral_um: f64, now_ns: i64) -> f64 {
+        let moved_um = self.reference.map_or(neutral_um, |(um, at_ns)| {
+            let share = -(-((now_ns - at_ns) as f64 * 1e-9) / REFERENCE_S).exp_m1();
+            um + share * (neutral_um - um)
+        });
+        // A zero flow that is no number is no reason to forget the last one.
+        if moved_um.is_finite() {
+            self.reference = Some((moved_um, now_ns));
+        }
+        self.reference.map_or(f64::NAN, |(um, _)| um)
     }
 }
 
@@ -128,7 +153,9 @@ impl<A: Actuator> Actuator for FlowTap<A> {
         neutral_um: f64,
         time_us: u64,
     ) -> Result<(), ActuatorError> {
-        self.flow.note(self.clock.now_ns(), command_um - neutral_um);
+        let now_ns = self.clock.now_ns();
+        let reference_um = self.reference_um(neutral_um, now_ns);
+        self.flow.note(now_ns, command_um - reference_um);
         self.inner.command(command_um, neutral_um, time_us)
     }
 

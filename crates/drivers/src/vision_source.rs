@@ -98,6 +98,10 @@ pub struct VisionSource<C> {
     clock: Clock,
     flow: Option<CommandedFlow>,
     buffer: FrameBuffer,
+    /// The frame before.
+    before: FrameBuffer,
+    /// Pictures without noise may be equal.
+    noise_free: bool,
     /// Time stamp of the first frame: the tracker's times count from it.
     first_ns: Option<i64>,
     account: FrameAccount,
@@ -141,6 +145,8 @@ impl<C: Camera> VisionSource<C> {
             clock,
             flow: None,
             buffer: FrameBuffer::default(),
+            before: FrameBuffer::default(),
+            noise_free: false,
             first_ns: None,
             newest_ns: None,
             watches: Vec::new(),
@@ -150,6 +156,13 @@ impl<C: Camera> VisionSource<C> {
     /// Lets the tracker predict from what is commanded.
     pub fn with_flow(mut self, flow: CommandedFlow) -> Self {
         self.flow = Some(flow);
+        self
+    }
+
+    /// The camera's pictures have no noise: two of them may be equal. Those of a real camera never are, for shot noise does not
+    /// repeat; equal ones come from a grabber or a driver that hangs, and count as stale.
+    pub fn noise_free(mut self) -> Self {
+        self.noise_free = true;
         self
     }
 
@@ -165,7 +178,7 @@ impl<C: Camera> VisionSource<C> {
         self
     }
 
-    /// Looks at the frame in the buffer; `None` for one that is not new ([`FrameAccount`]).
+    /// Looks at the frame in the buffer; `None` for one that is not new ([`FrameAccount`]), or is the picture before once more.
     fn look(
         &mut self,
         stamp: &FrameStamp,
@@ -173,6 +186,10 @@ impl<C: Camera> VisionSource<C> {
         let at_ns = stamp.mid_exposure_ns;
         let judged = self.account.step(stamp.id, at_ns, stamp.arrival_ns);
         if !judged.kind.is_new() {
+            return Ok(None);
+        }
+        // The comparison ends at the first pixel that differs.
+        if !self.noise_free && self.buffer == self.before {
             return Ok(None);
         }
         let before_ns = self.newest_ns.replace(at_ns);
@@ -191,6 +208,7 @@ impl<C: Camera> VisionSource<C> {
             flow_px_per_s: before_ns
                 .map_or((0.0, 0.0), |before_ns| mean_px_per_s(before_ns, at_ns)),
             streak_px: (x * exposed_s, y * exposed_s),
+            exposure_s: exposed_s,
         };
         let time_s = (at_ns - first_ns) as f64 * 1e-9;
         self.followed
@@ -231,7 +249,9 @@ impl<C: Camera> VisionSource<C> {
 
 impl<C: Camera> PositionSource for VisionSource<C> {
     fn next(&mut self, deadline_ns: i64) -> Result<Option<Measurement>, CameraError> {
+        std::mem::swap(&mut self.buffer, &mut self.before);
         let Some(stamp) = self.camera.next_frame(&mut self.buffer, deadline_ns)? else {
+            std::mem::swap(&mut self.buffer, &mut self.before);
             return Ok(None);
         };
         let (step, cell) = match self.look(&stamp)? {

@@ -1,5 +1,6 @@
 //! Records made ready for fitting: commands from the working point, whitening filters, masks.
 
+use crate::data::motion::parabola;
 use crate::data::noise::{NoiseModel, Whitener};
 use crate::data::record::{Record, command_range_um};
 use crate::dot::dot;
@@ -34,9 +35,10 @@ pub(crate) struct Prepared {
     pub y: Vec<f64>,
     pub present: Vec<bool>,
     pub whitener: Whitener,
-    extra_walk: Option<Vec<f64>>,
+    pub extra_walk: Option<Vec<f64>>,
     pub rest: bool,
-    /// Motions by which the plant may come to rest from where it was before the record, as they are.
+    /// Motions by which the plant may come to rest from where it was before the record, as they are, and what a drift of the zero
+    /// flow makes.
     transients: Vec<Vec<f64>>,
     /// The same in the space of innovations, orthonormal.
     free: Vec<Vec<f64>>,
@@ -61,8 +63,13 @@ impl Prepared {
         e
     }
 
-    /// Orthonormal innovations of the transients under the present whitener.
-    fn free_transients(&mut self) {
+    /// The filter of a noise, and orthonormal innovations of the transients under it.
+    fn set_noise(&mut self, base: &Base, noise: &NoiseModel) {
+        self.whitener = Whitener::new(noise, &self.present, self.extra_walk.as_deref());
+        self.transients = transients(base, self.u.len());
+        if noise.zero_flow.is_some_and(|z| z.drifts) {
+            self.transients.push(parabola(self.u.len()));
+        }
         let mut free: Vec<Vec<f64>> = Vec::new();
         for t in &self.transients {
             let mut w = vec![0.0; t.len()];
@@ -202,7 +209,7 @@ impl Problem {
                 let extra_walk = uncertain_command(r, velocity * base.sample_s);
                 let whitener = Whitener::new(&noise, &present, extra_walk.as_deref());
                 let mut prepared = Prepared {
-                    transients: transients(&base, r.rows()),
+                    transients: Vec::new(),
                     free: Vec::new(),
                     name: r.name.clone(),
                     u,
@@ -212,7 +219,7 @@ impl Problem {
                     extra_walk,
                     rest: r.rests_within(THRESHOLDS.rest_share * range_um),
                 };
-                prepared.free_transients();
+                prepared.set_noise(&base, &noise);
                 prepared
             })
             .collect();
@@ -240,10 +247,20 @@ impl Problem {
     pub fn with_noise(mut self, noise: NoiseModel) -> Self {
         self.noise = noise;
         for r in &mut self.records {
-            r.whitener = Whitener::new(&noise, &r.present, r.extra_walk.as_deref());
-            r.free_transients();
+            r.set_noise(&self.base, &noise);
         }
         self
+    }
+
+    /// Which rows of each record hold a position that counts.
+    pub fn present(&self) -> Vec<Vec<bool>> {
+        self.records.iter().map(|r| r.present.clone()).collect()
+    }
+
+    /// Sum of the logarithms of the innovations' variances: what a noise pays for its size.
+    pub fn log_determinant(&self) -> f64 {
+        let of = |r: &Prepared| r.whitener.log_determinant();
+        self.records.iter().map(of).sum()
     }
 
     /// All rows.

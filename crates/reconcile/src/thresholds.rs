@@ -1,5 +1,8 @@
 //! Every number that decides a verdict, with its reason and the test that pins it.
 
+/// Price of a free number in twice the log-likelihood: what its value takes to be told from its range, to a few percent of it.
+pub(crate) const NUMBER: f64 = 8.0;
+
 /// The numbers that decide. There is one set, [`THRESHOLDS`]; they are fields so that each has its reason beside it.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Thresholds {

@@ -22,7 +22,7 @@ pub struct FrameStamp {
 }
 
 /// Room for one frame, used again and again. Grows to the first frame's size and then allocates no more.
-#[derive(Debug, Clone, Default)]
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct FrameBuffer {
     /// Pixels per row.
     pub width: usize,

@@ -21,7 +21,10 @@
 
 mod account;
 mod checks;
+mod following;
+mod in_force;
 mod life_cycle;
+mod rest;
 
 use crate::arming::{Arming, ArmingConfig, ArmingState};
 use crate::grid::Grid;
@@ -80,6 +83,16 @@ struct State {
     unheard: u32,
     /// Ticks in a row in which a command was lost, or the board held the zero flow by itself.
     unled: u32,
+    /// What stands at the PZT, and the zero flow that went with the last command, um.
+    in_force: in_force::Board,
+    told_um: f64,
+    following: following::Following,
+    /// Where the flow stands still, for a PZT that has to stop without a bead to tell.
+    rest: rest::Rest,
+    /// That of the freeze in force, um.
+    rest_um: f64,
+    /// Frames in a row that were the picture before.
+    pictures_repeated: u32,
     parked_at: Option<u64>,
     unrecorded_since_ns: Option<i64>,
     plant: PlantMonitorState,
@@ -94,6 +107,7 @@ pub struct Core<R> {
     timing: Timing,
     arming: Arming,
     sample_s: f64,
+    diffusion_um2_per_s: f64,
     /// Ticks in a row that may be without a frame: those between two frames of a slower camera.
     planned_gap: u32,
     preview_um: Vec<f64>,
@@ -149,6 +163,12 @@ impl<R: ReferenceGenerator> Core<R> {
         )?;
         let settings = controller.settings();
         let monitor = PlantMonitor::new(settings.estimator, settings.model)?;
+        let following = following::Following::new(
+            sample_s,
+            settings.model.gain_per_s,
+            timing.camera_delay_ms * 1e-3,
+        );
+        let diffusion_um2_per_s = settings.estimator.diffusion_um2_per_s;
         controller.start(displacement_um, neutral_um);
         Ok(Self {
             preview_um: vec![0.0; controller.preview_len()],
@@ -158,6 +178,7 @@ impl<R: ReferenceGenerator> Core<R> {
             timing,
             arming,
             sample_s,
+            diffusion_um2_per_s,
             learners: Learners::default(),
             late_solver_ns: Vec::new(),
             monitor,
@@ -192,6 +213,12 @@ impl<R: ReferenceGenerator> Core<R> {
                 board_heard_ns: 0,
                 unheard: 0,
                 unled: 0,
+                in_force: in_force::Board::new(displacement_um, neutral_um),
+                told_um: neutral_um,
+                following,
+                rest: rest::Rest::new(neutral_um),
+                rest_um: neutral_um,
+                pictures_repeated: 0,
                 parked_at: None,
                 unrecorded_since_ns: None,
                 stage: Stage::None,
@@ -315,6 +342,7 @@ impl<R: ReferenceGenerator> Core<R> {
         let slew_time_s = if first {
             tick.event(EventKind::Armed);
             self.state.board_heard_ns = input.time_ns;
+            self.state.in_force.start(input.time_ns);
             None
         } else {
             self.catch_up(&mut tick);
@@ -373,7 +401,7 @@ impl<R: ReferenceGenerator> Core<R> {
         let newest = self.newest_position(fix, input, tick.steps);
         let told = ReferenceInput {
             running,
-            frozen: mode == Mode::Freeze,
+            frozen: self.state.frozen.any(),
             skip: running && input.request == Request::Skip,
             tick: since,
             sample_s: self.sample_s,
@@ -391,7 +419,14 @@ impl<R: ReferenceGenerator> Core<R> {
                 });
             }
         }
+        let told_um = self.state.told_um;
+        let period_ns = self.timing.period_ns();
+        let in_force =
+            self.state
+                .in_force
+                .step(input.time_ns, input.board.as_ref(), told_um, period_ns);
         let given = LoopInput {
+            in_force,
             measurement: fix,
             reference_um: generated.reference_um,
             preview_um: &self.preview_um,
@@ -407,6 +442,8 @@ impl<R: ReferenceGenerator> Core<R> {
             excitation_um: self.reference.excitation_um(),
         };
         let output = self.controller.step(&given);
+        self.state.told_um = output.neutral_um;
+        self.watch_following(fix, generated.reference_um, &output, tick);
         let nominal = self.timing.camera_delay_ms * 1e-3 / self.sample_s;
         let used = fix.filter(|_| !output.flags.coasting && !output.flags.stuck);
         let seen = used.map(|fix| {
@@ -427,6 +464,40 @@ impl<R: ReferenceGenerator> Core<R> {
             });
         }
         (output, generated)
+    }
+
+    /// A bead that moves against the commands is frozen, at the zero flow of before.
+    fn watch_following(
+        &mut self,
+        fix: Option<LoopMeasurement>,
+        reference_um: f64,
+        output: &LoopOutput,
+        tick: &mut Tick,
+    ) {
+        let Some(fix) = fix.filter(|_| self.state.life == Life::Running) else {
+            return;
+        };
+        let walk_um2 = 2.0 * self.diffusion_um2_per_s * self.sample_s;
+        self.state.rest.step(
+            output.neutral_um,
+            output.innovation_um,
+            walk_um2 + fix.variance_um2.max(0.0),
+            output.flags,
+            self.sample_s,
+        );
+        if self.state.frozen.any() || output.flags.stuck {
+            self.state.following.clear();
+            return;
+        }
+        let seen = following::Seen {
+            position_um: fix.position_um,
+            error_um: fix.position_um - reference_um,
+            command_um: output.command_um,
+            zero_flow_um: output.neutral_um,
+        };
+        if self.state.following.step(seen) {
+            self.freeze(FreezeReason::NotFollowing, tick);
+        }
     }
 
     /// The position of this tick and its age beyond the camera path, ticks; between two frames of a slower camera that of the newest.

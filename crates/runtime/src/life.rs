@@ -94,6 +94,8 @@ pub enum SafeReason {
     CameraLost,
     /// Frames that were old or repeated, too many in a row.
     StaleFrames,
+    /// The bead moved against the commands: a wrong sign, a gain far off, an actuator that does not follow.
+    NotFollowing,
     /// Frames grew old because vision takes longer for one than the camera.
     VisionSlow,
     /// Commands handed over late, too many in a row.
@@ -130,6 +132,10 @@ pub enum FreezeReason {
     BeadLost,
     /// No frames.
     CameraStalled,
+    /// The camera gives the same picture again and again.
+    PictureFrozen,
+    /// The bead moves against the commands.
+    NotFollowing,
     /// The run is no longer being recorded.
     Unrecorded,
     /// Commands do not reach the board, or its reports do not come.
@@ -143,6 +149,10 @@ pub(crate) struct FreezeReasons(u8);
 impl FreezeReasons {
     pub(crate) fn any(self) -> bool {
         self.0 != 0
+    }
+
+    pub(crate) fn has(self, reason: FreezeReason) -> bool {
+        self.0 & (1 << reason as u8) != 0
     }
 
     /// Adds one; whether it is the first.

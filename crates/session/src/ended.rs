@@ -343,6 +343,11 @@ impl Clues {
                 "a sequence number that moves with the commands",
                 "check the line to the board for damaged frames, and its baud rate",
             ),
+            SafeReason::NotFollowing => sentences(
+                " further and further, until it was frozen",
+                "a bead that goes where the commands push it",
+                "look at the sign of the calibration, at the amplifier and at the tubes; then measure the plant anew with `cellpos identify`",
+            ),
             SafeReason::BoardNotFollowing => sentences(
                 " (for 100 ms)",
                 "an output within 0.2 um of the commands of the last 30 ms",

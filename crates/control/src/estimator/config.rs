@@ -77,7 +77,7 @@ impl Default for EstimatorConfig {
             ticks_per_fix: 1.0,
             gate_sigma: 6.0,
             gate_floor_um: 0.5,
-            gate_most: 10,
+            gate_most: 1,
             stuck_speed_um_per_tick: 0.5,
             adapt: false,
         }

@@ -65,6 +65,7 @@ impl Shape {
         NoiseModel {
             walk_um2: self.walk.map_or(0.0, f64::exp),
             white_um2: 1.0,
+            zero_flow: None,
             coloured: self.coloured.map(|(variance, rows)| Coloured {
                 variance_um2: variance.exp(),
                 time_rows: rows.exp(),
@@ -227,7 +228,7 @@ mod tests {
 
     fn chosen(values: &[f64], kind: NoiseKind) -> NoiseModel {
         let counts = vec![true; values.len()];
-        let (c0, c1, _) = crate::data::noise::increment_moments(values, &counts);
+        let (c0, c1, _) = crate::data::floor::increment_moments(values, &counts);
         let alone = Alone {
             values,
             counts: &counts,

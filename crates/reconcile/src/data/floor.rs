@@ -2,7 +2,7 @@
 //! known.
 
 use crate::data::coloured::{Alone, NoiseKind, choose};
-use crate::data::noise::{NoiseModel, increment_moments};
+use crate::data::noise::NoiseModel;
 use crate::data::record::Record;
 use crate::data::repeats::{Repeats, repeats, rests, whole_periods};
 use crate::thresholds::THRESHOLDS;
@@ -259,6 +259,37 @@ pub(crate) fn from_residuals(present: &[Vec<bool>], residuals: &[Vec<f64>]) -> N
         NoiseModel::from_increments(c0 / n, c1 / n)
     }
 }
+/// Variance and lag-1 covariance of increments over runs of present frames, and how many increments.
+pub(crate) fn increment_moments(r: &[f64], present: &[bool]) -> (f64, f64, usize) {
+    let (mut c0, mut c1, mut n0, mut n1, mut mean) = (0.0, 0.0, 0usize, 0usize, 0.0);
+    let valid = |k: usize| k >= 1 && present[k] && present[k - 1];
+    for k in 1..r.len() {
+        if valid(k) {
+            mean += r[k] - r[k - 1];
+            n0 += 1;
+        }
+    }
+    if n0 == 0 {
+        return (0.0, 0.0, 0);
+    }
+    mean /= n0 as f64;
+    for k in 1..r.len() {
+        if valid(k) {
+            let d = r[k] - r[k - 1] - mean;
+            c0 += d * d;
+            if valid(k - 1) {
+                c1 += d * (r[k - 1] - r[k - 2] - mean);
+                n1 += 1;
+            }
+        }
+    }
+    (
+        c0 / n0 as f64,
+        if n1 > 0 { c1 / n1 as f64 } else { 0.0 },
+        n0,
+    )
+}
+
 /// Rows that count, without those after an increment of more than six standard deviations (by the median of their sizes):
 /// a bead that jumps is no noise, and must not raise the floor under which its jumps would then hide.
 fn without_jumps(e: &[f64], present: &[bool]) -> Vec<bool> {

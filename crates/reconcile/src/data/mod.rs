@@ -4,6 +4,8 @@ pub(crate) mod actuator;
 pub(crate) mod coloured;
 pub(crate) mod floor;
 pub(crate) mod frames;
+pub(crate) mod motion;
 pub(crate) mod noise;
 pub(crate) mod record;
 pub(crate) mod repeats;
+pub(crate) mod zero_flow;

@@ -1,20 +1,26 @@
-//! What is always present: Brownian motion of the bead and white localisation noise, and the filter that knows them.
+//! What is always present: Brownian motion of the bead and white localisation noise; what may be: a sensor that is slow, a zero flow
+//! that moves. And the filter that knows them.
 //!
 //! The free-run residual of a PERFECT model is a random walk plus white noise: its size says nothing. Its innovations in
 //! the Kalman filter of that process (state: the walk; measurement: walk plus noise) are white with variance 1 in the
 //! units used here, whatever the length of the record. All scores of this crate are sums of squares of those
 //! innovations, so a log-likelihood is half their difference. Missing frames are predictions without an update.
 
+use crate::data::motion::ZeroFlow;
+
 /// Sizes of the two noises.
 #[derive(Debug, Clone, Copy, PartialEq, serde::Serialize)]
 pub struct NoiseModel {
     /// Variance gained by the walk in one sample, `2 D dt` \[um^2\].
     pub walk_um2: f64,
-    /// Variance of the localisation noise \[um^2\].
+    /// Variance of the localisation noise, less what the exposure averages off the walk \[um^2\].
     pub white_um2: f64,
     /// Noise of a sensor that is slow and returns.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub coloured: Option<Coloured>,
+    /// Motion of the zero flow; never beside [`Self::coloured`], which is that of a sensor without a bead.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub zero_flow: Option<ZeroFlow>,
 }
 
 /// A first-order Gauss-Markov process.
@@ -44,17 +50,21 @@ impl NoiseModel {
             walk_um2: 2.0 * d_um2_per_s * sample_s,
             white_um2: localisation_um * localisation_um,
             coloured: None,
+            zero_flow: None,
         }
     }
 
-    /// From variance and lag-1 covariance of increments, `q + 2 R` and `-R`, kept physical.
+    /// From variance and lag-1 covariance of increments, `q + 2 R` and `-R`, kept physical: a camera that averages over its exposure
+    /// takes up to `q / 6` off the white part, that of a whole row.
     pub fn from_increments(variance: f64, lag1: f64) -> Self {
         let variance = variance.max(1e-40);
-        let white = (-lag1).clamp(0.005 * variance, 0.4995 * variance);
+        // q/6 of q - 2 q/6.
+        let white = (-lag1).clamp(-0.25 * variance, 0.4995 * variance);
         Self {
             walk_um2: variance - 2.0 * white,
             white_um2: white,
             coloured: None,
+            zero_flow: None,
         }
     }
 
@@ -75,6 +85,10 @@ impl NoiseModel {
                 variance_um2: factor * c.variance_um2,
                 ..c
             }),
+            zero_flow: self.zero_flow.map(|z| ZeroFlow {
+                motion_um2: factor * z.motion_um2,
+                ..z
+            }),
         }
     }
 
@@ -85,7 +99,7 @@ impl NoiseModel {
 
     /// Localisation noise, RMS \[um\].
     pub fn localisation_um(&self) -> f64 {
-        self.white_um2.sqrt()
+        self.white_um2.max(0.0).sqrt()
     }
 
     /// Variance of the position of a row as known from the rows around it \[um^2\].
@@ -101,9 +115,11 @@ impl NoiseModel {
 
     /// Standard deviation of the innovation in the steady state \[um\]: the floor.
     pub fn innovation_um(&self) -> f64 {
-        if let Some(coloured) = self.coloured {
+        let slow_rows =
+            (self.coloured.map(|c| c.time_rows)).or_else(|| self.zero_flow.map(|z| z.time_rows));
+        if let Some(time_rows) = slow_rows {
             // No closed form: the filter after so many rows that it stands still.
-            let rows = 64 + (8.0 * coloured.time_rows).min(20_000.0) as usize;
+            let rows = 64 + (8.0 * time_rows).min(20_000.0) as usize;
             let filter = Whitener::new(self, &vec![true; rows], None);
             return 1.0 / filter.inverse_sigma[rows - 1];
         }
@@ -118,96 +134,141 @@ impl NoiseModel {
 pub(crate) struct Whitener {
     gain: Vec<f64>,
     inverse_sigma: Vec<f64>,
-    coloured: Option<ColouredGain>,
+    second: Second,
 }
 
-/// The gains of the state of coloured noise.
+/// The state beside the walk.
 #[derive(Debug, Clone)]
-struct ColouredGain {
+enum Second {
+    None,
+    /// Coloured noise, which is added to the position.
+    Added(SecondGain),
+    /// A zero flow, which is added to the walk in every row.
+    Moves(SecondGain),
+}
+
+/// The gains of that state.
+#[derive(Debug, Clone)]
+struct SecondGain {
     gain: Vec<f64>,
     /// Decay from row to row.
     keep: f64,
 }
 
-/// Covariance of walk and coloured noise.
+/// Covariance of the walk and the state beside it.
 #[derive(Debug, Clone, Copy)]
 struct Spread {
     walk: f64,
-    coloured: f64,
+    second: f64,
     both: f64,
 }
 
 impl Whitener {
     /// `present[k]`: the frame counts. `extra_walk[k]`: variance added to the walk before frame k \[um^2\].
     pub fn new(noise: &NoiseModel, present: &[bool], extra_walk: Option<&[f64]>) -> Self {
+        debug_assert!(noise.coloured.is_none() || noise.zero_flow.is_none());
         let n = present.len();
         let (mut gain, mut inverse_sigma) = (vec![0.0; n], vec![0.0; n]);
-        let coloured = noise.coloured.unwrap_or_default();
-        let (variance, keep) = (coloured.variance_um2, coloured.keep());
-        let mut coloured_gain = noise.coloured.map(|_| vec![0.0; n]);
+        let (variance, keep, fresh) = match (&noise.coloured, &noise.zero_flow) {
+            (Some(c), _) => {
+                let keep = c.keep();
+                (c.variance_um2, keep, (1.0 - keep * keep) * c.variance_um2)
+            }
+            (None, Some(z)) => (z.motion_um2, z.keep(), z.fresh_um2()),
+            (None, None) => (0.0, 0.0, 0.0),
+        };
+        let moves = noise.zero_flow.is_some();
+        let added = noise.coloured.is_some();
+        let mut second_gain = vec![0.0; if moves || added { n } else { 0 }];
         let mut p = Spread {
             walk: f64::INFINITY,
-            coloured: variance,
+            second: variance,
             both: 0.0,
         };
         for k in 0..n {
             if k > 0 {
-                p.coloured = keep * keep * p.coloured + (1.0 - keep * keep) * variance;
+                if moves {
+                    p.walk += 2.0 * p.both + p.second;
+                    p.both += p.second;
+                }
+                p.second = keep * keep * p.second + fresh;
                 p.both *= keep;
             }
             p.walk += noise.walk_um2 + extra_walk.map_or(0.0, |w| w[k]);
             if !present[k] {
                 continue;
             }
+            // What the second state adds to the position itself.
+            let (own, shared) = if added {
+                (p.second, p.both)
+            } else {
+                (0.0, 0.0)
+            };
             if !p.walk.is_finite() {
                 // The first frame only says where the bead is: the start is a nuisance.
                 gain[k] = 1.0;
                 p = Spread {
-                    walk: noise.white_um2 + p.coloured,
-                    coloured: p.coloured,
-                    both: -p.coloured,
+                    walk: noise.white_um2 + own,
+                    second: p.second,
+                    both: -own,
                 };
                 continue;
             }
-            let s = p.walk + 2.0 * p.both + p.coloured + noise.white_um2;
-            gain[k] = (p.walk + p.both) / s;
+            let s = p.walk + 2.0 * shared + own + noise.white_um2;
+            gain[k] = (p.walk + shared) / s;
             inverse_sigma[k] = 1.0 / s.sqrt();
-            let of_coloured = (p.coloured + p.both) / s;
-            if let Some(g) = &mut coloured_gain {
-                g[k] = of_coloured;
+            let of_second = (own + p.both) / s;
+            if let Some(g) = second_gain.get_mut(k) {
+                *g = of_second;
             }
             p = Spread {
                 walk: p.walk - gain[k] * gain[k] * s,
-                coloured: p.coloured - of_coloured * of_coloured * s,
-                both: p.both - gain[k] * of_coloured * s,
+                second: p.second - of_second * of_second * s,
+                both: p.both - gain[k] * of_second * s,
             };
         }
+        let second = SecondGain {
+            gain: second_gain,
+            keep,
+        };
         Self {
             gain,
             inverse_sigma,
-            coloured: coloured_gain.map(|gain| ColouredGain { gain, keep }),
+            second: match (moves, added) {
+                (true, _) => Second::Moves(second),
+                (false, true) => Second::Added(second),
+                (false, false) => Second::None,
+            },
         }
     }
 
     /// Innovations of a residual, in standard deviations. The filter is linear: columns of a Jacobian go through it too.
     pub fn apply(&self, r: &[f64], e: &mut [f64]) {
         let rows = r.iter().zip(e).zip(&self.gain).zip(&self.inverse_sigma);
-        let mut m = 0.0;
-        match &self.coloured {
-            None => {
+        let (mut m, mut c) = (0.0, 0.0);
+        match &self.second {
+            Second::None => {
                 for (((r, e), k), s) in rows {
                     let d = r - m;
                     *e = d * s;
                     m += k * d;
                 }
             }
-            Some(coloured) => {
-                let mut c = 0.0;
-                for ((((r, e), k), s), g) in rows.zip(&coloured.gain) {
+            Second::Added(second) => {
+                for ((((r, e), k), s), g) in rows.zip(&second.gain) {
                     let d = r - m - c;
                     *e = d * s;
                     m += k * d;
-                    c = coloured.keep * (c + g * d);
+                    c = second.keep * (c + g * d);
+                }
+            }
+            Second::Moves(second) => {
+                for ((((r, e), k), s), g) in rows.zip(&second.gain) {
+                    let d = r - m;
+                    *e = d * s;
+                    c += g * d;
+                    m += k * d + c;
+                    c *= second.keep;
                 }
             }
         }
@@ -221,11 +282,20 @@ impl Whitener {
         r.iter()
             .enumerate()
             .map(|(k, r)| {
-                let before = m + c;
+                let before = match self.second {
+                    Second::Added(_) => m + c,
+                    _ => m,
+                };
                 let d = r - before;
                 m += self.gain[k] * d;
-                if let Some(coloured) = &self.coloured {
-                    c = coloured.keep * (c + coloured.gain[k] * d);
+                match &self.second {
+                    Second::None => {}
+                    Second::Added(second) => c = second.keep * (c + second.gain[k] * d),
+                    Second::Moves(second) => {
+                        c += second.gain[k] * d;
+                        m += c;
+                        c *= second.keep;
+                    }
                 }
                 before
             })
@@ -271,12 +341,20 @@ impl Whitener {
     /// The transpose of [`Self::apply`]: what a residual at each row adds to the weighted sum of innovations.
     pub fn transpose(&self, weights: &[f64]) -> Vec<f64> {
         let mut z = vec![0.0; weights.len()];
-        let (mut later, mut later_coloured) = (0.0, 0.0);
+        // What the states before the next row add to the weighted sum.
+        let (mut later, mut later_second) = (0.0, 0.0);
         for k in (0..weights.len()).rev() {
             let mut own = self.inverse_sigma[k] * weights[k] + self.gain[k] * later;
-            if let Some(coloured) = &self.coloured {
-                own += coloured.keep * coloured.gain[k] * later_coloured;
-                later_coloured = coloured.keep * later_coloured - own;
+            match &self.second {
+                Second::None => {}
+                Second::Added(second) => {
+                    own += second.keep * second.gain[k] * later_second;
+                    later_second = second.keep * later_second - own;
+                }
+                Second::Moves(second) => {
+                    later_second = later + second.keep * later_second;
+                    own += second.gain[k] * later_second;
+                }
             }
             z[k] = own;
             later -= own;
@@ -299,37 +377,6 @@ impl Whitener {
     pub fn sigma_um(&self, k: usize) -> Option<f64> {
         (self.inverse_sigma[k] > 0.0).then(|| 1.0 / self.inverse_sigma[k])
     }
-}
-
-/// Variance and lag-1 covariance of increments over runs of present frames, and how many increments.
-pub(crate) fn increment_moments(r: &[f64], present: &[bool]) -> (f64, f64, usize) {
-    let (mut c0, mut c1, mut n0, mut n1, mut mean) = (0.0, 0.0, 0usize, 0usize, 0.0);
-    let valid = |k: usize| k >= 1 && present[k] && present[k - 1];
-    for k in 1..r.len() {
-        if valid(k) {
-            mean += r[k] - r[k - 1];
-            n0 += 1;
-        }
-    }
-    if n0 == 0 {
-        return (0.0, 0.0, 0);
-    }
-    mean /= n0 as f64;
-    for k in 1..r.len() {
-        if valid(k) {
-            let d = r[k] - r[k - 1] - mean;
-            c0 += d * d;
-            if valid(k - 1) {
-                c1 += d * (r[k - 1] - r[k - 2] - mean);
-                n1 += 1;
-            }
-        }
-    }
-    (
-        c0 / n0 as f64,
-        if n1 > 0 { c1 / n1 as f64 } else { 0.0 },
-        n0,
-    )
 }
 
 #[cfg(test)]
@@ -402,6 +449,40 @@ mod tests {
         let filter = Whitener::new(&n, &[true; 3], None);
         let expected = (variance * variance - next * next).ln();
         assert!((filter.log_determinant() - expected).abs() < 1e-12);
+
+        transposed_as_applied(&n);
+    }
+
+    #[test]
+    fn the_filter_of_a_zero_flow_that_moves_whitens_it_and_has_its_transpose() {
+        let zero_flow = ZeroFlow {
+            motion_um2: 4e-4,
+            time_rows: 7.0,
+            drifts: false,
+        };
+        let n = NoiseModel {
+            zero_flow: Some(zero_flow),
+            ..NoiseModel::new(0.33, 1e-3, 0.030)
+        };
+        // Increments of three rows by hand: a step of the walk, the motion of the row before, and the difference of two white numbers.
+        let (q, r, v) = (n.walk_um2, n.white_um2, zero_flow.motion_um2);
+        let variance = q + 2.0 * r + v;
+        let next = zero_flow.keep() * v - r;
+        let filter = Whitener::new(&n, &[true; 3], None);
+        let expected = (variance * variance - next * next).ln();
+        assert!((filter.log_determinant() - expected).abs() < 1e-12);
+        // And their sum of squares.
+        let y = [0.3, 0.41, 0.37];
+        let (a, b) = (y[1] - y[0], y[2] - y[1]);
+        let by_hand =
+            (variance * (a * a + b * b) - 2.0 * next * a * b) / (variance * variance - next * next);
+        let mut e = [0.0; 3];
+        filter.apply(&y, &mut e);
+        let filtered: f64 = e.iter().map(|e| e * e).sum();
+        assert!(
+            (filtered / by_hand - 1.0).abs() < 1e-12,
+            "{filtered} {by_hand}"
+        );
 
         transposed_as_applied(&n);
     }

@@ -11,7 +11,7 @@ use cellpos_plant::effects::Role;
 use nalgebra::{DMatrix, DVector};
 
 /// Precision with which a weight of a play operator keeps its value in one step of a fit: nothing beside what a record
-/// in which the operator moves has to say.
+/// in which the operator moves has to say. It is no information: a weight that no record moves may be anything.
 const WEIGHT_PRECISION: f64 = 100.0;
 
 /// A fit stands still when a round gains less than this, or than this part of what it leaves beyond the noise.
@@ -37,6 +37,27 @@ impl Until {
             least_chi2: f64::INFINITY,
         }
     }
+}
+
+/// The covariance that goes with an information matrix. A number that the records do not see has none: its variance is infinite, and
+/// it makes no other number less sure.
+fn covariance(information: &DMatrix<f64>) -> DMatrix<f64> {
+    let n = information.nrows();
+    let unseen: Vec<usize> = (0..n).filter(|&i| information[(i, i)] <= 0.0).collect();
+    let mut regular = information.clone();
+    for i in 0..n {
+        regular[(i, i)] *= 1.0 + 1e-9;
+    }
+    for &i in &unseen {
+        regular[(i, i)] = 1.0;
+    }
+    let mut inverse = regular
+        .try_inverse()
+        .unwrap_or_else(|| DMatrix::from_diagonal_element(n, n, f64::INFINITY));
+    for i in unseen {
+        inverse[(i, i)] = f64::INFINITY;
+    }
+    inverse
 }
 
 impl Context<'_> {
@@ -114,11 +135,12 @@ impl Context<'_> {
             let (a, g) = normal_equations(n, &columns, &state.innovations, mask);
             normal = a;
             // Operators wider than any swing of the records never move: their weights stay where they are.
+            let mut held = normal.clone();
             let mut at = 0;
             for p in &fit.parts {
                 for (j, q) in p.variant().params.iter().enumerate() {
                     if q.name == "weights" {
-                        normal[(at + j, at + j)] += WEIGHT_PRECISION;
+                        held[(at + j, at + j)] += WEIGHT_PRECISION;
                     }
                 }
                 at += freedom_of(p.variant(), self.problem.records.len());
@@ -129,11 +151,10 @@ impl Context<'_> {
             round += 1;
             let mut improved = 0.0;
             for _ in 0..8 {
-                let mut damped = normal.clone();
+                let mut damped = held.clone();
                 for i in 0..n {
-                    damped[(i, i)] += lambda * normal[(i, i)]
-                        + 1e-12
-                        + if normal[(i, i)] == 0.0 { 1.0 } else { 0.0 };
+                    damped[(i, i)] +=
+                        lambda * held[(i, i)] + 1e-12 + if held[(i, i)] == 0.0 { 1.0 } else { 0.0 };
                 }
                 let Some(step) = damped.cholesky().map(|c| c.solve(&(-&g))) else {
                     lambda *= 10.0;
@@ -172,21 +193,8 @@ impl Context<'_> {
         } else {
             state.innovations
         };
-        let mut regular = normal.clone();
-        for i in 0..size {
-            regular[(i, i)] +=
-                1e-9 * normal[(i, i)] + if normal[(i, i)] == 0.0 { 1e9 } else { 0.0 };
-        }
-        let inverse = regular
-            .try_inverse()
-            .unwrap_or_else(|| DMatrix::identity(size, size));
-        let sd = |i: usize| {
-            if normal[(i, i)] > 0.0 {
-                inverse[(i, i)].max(0.0).sqrt()
-            } else {
-                0.0
-            }
-        };
+        let inverse = covariance(&normal);
+        let sd = |i: usize| inverse[(i, i)].max(0.0).sqrt();
         fit.errors = if self.free_gain {
             [sd(size - 2), sd(size - 1)]
         } else {
@@ -294,5 +302,24 @@ impl Context<'_> {
     pub fn residual(&self, fit: &Fit) -> (Vec<Vec<f64>>, Vec<Vec<f64>>) {
         let s = self.state(fit, &self.problem.all());
         (s.residual, s.path)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_the_records_do_not_see_has_no_information_and_takes_none_from_the_rest() {
+        let seen = [4.0, 1.0, 1.0, 2.0];
+        let mut information = DMatrix::zeros(3, 3);
+        for (at, v) in [(0, 0), (0, 2), (2, 0), (2, 2)].into_iter().zip(seen) {
+            information[at] = v;
+        }
+        let c = covariance(&information);
+        assert_eq!(c[(1, 1)], f64::INFINITY);
+        // The inverse of [4 1; 1 2] is [2 -1; -1 4]/7.
+        assert!((c[(0, 0)] - 2.0 / 7.0).abs() < 1e-6);
+        assert!((c[(2, 2)] - 4.0 / 7.0).abs() < 1e-6);
     }
 }

@@ -151,7 +151,7 @@ pub(crate) fn refine(
         fit.positions[at][1] / sharpness,
         pixel.ln(),
         noise.walk_um2.ln(),
-        noise.white_um2.ln(),
+        noise.white_um2.max(1e-3 * noise.walk_um2).ln(),
     );
     let rows = |x: &Numbers| -> Option<Vec<Vec<f64>>> {
         let (wave, pixel) = ([x[0], x[1]], x[2].exp());
@@ -159,6 +159,7 @@ pub(crate) fn refine(
             walk_um2: x[3].exp(),
             white_um2: x[4].exp(),
             coloured: None,
+            zero_flow: None,
         };
         let grid = Grid::new(&noise, wave, pixel)?;
         Some(cellpos_parallel::map(&tracks, threads, |t| {

@@ -2,7 +2,7 @@
 
 use crate::fit::catalogue::Part;
 use crate::fit::context::{Context, Fit, freedom_of};
-use crate::thresholds::THRESHOLDS;
+use crate::thresholds::{NUMBER, THRESHOLDS};
 use cellpos_plant::effects::Candidate;
 
 /// Upper quantile of chi-square with `k` degrees of freedom at `z` standard normal deviations (Wilson-Hilferty).
@@ -18,7 +18,7 @@ pub(crate) fn threshold(freedom: usize) -> f64 {
 }
 
 /// The same for a variant in a problem of so many records.
-pub(super) fn threshold_of(v: &Candidate, records: usize) -> f64 {
+pub(crate) fn threshold_of(v: &Candidate, records: usize) -> f64 {
     threshold(freedom_of(v, records))
 }
 
@@ -30,7 +30,7 @@ pub(crate) fn penalised_cost(ctx: &Context<'_>, fit: &Fit) -> f64 {
     let white = ctx.white.map_or(0.0, |w| {
         w.distance(&fit.parts, ctx.problem.base.sample_s).min(40.0)
     });
-    fit.chi2 + 8.0 * fit.freedom() as f64 + typical + white
+    fit.chi2 + NUMBER * fit.freedom() as f64 + typical + white
 }
 
 /// Sum of squares beyond the noise.

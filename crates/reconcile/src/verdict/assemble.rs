@@ -83,7 +83,7 @@ pub(crate) fn assemble(
     let verdict = judgement.verdict;
     places.extend(counted_places);
     places.extend(judgement.reasons);
-    places.extend(slow_noise(ctx));
+    places.extend(slow_noise(ctx).or_else(|| zero_flow(ctx)));
     if cut_short {
         places.push("the search ended with its budget of simulations, not because nothing more was to be found: --work 4 gives it four times as much".to_owned());
     }
@@ -149,6 +149,24 @@ fn slow_noise(ctx: &Context<'_>) -> Option<String> {
         ctx.scales.told(c.variance_um2.sqrt()),
         figure(c.time_rows * ctx.problem.base.sample_s),
         ctx.scales.told(ctx.problem.noise.localisation_um())
+    ))
+}
+
+/// What is said where the zero flow moves: by how much displacement in a second, from the speed of the bead that it makes.
+fn zero_flow(ctx: &Context<'_>) -> Option<String> {
+    let z = ctx.problem.noise.zero_flow?;
+    let dt = ctx.problem.base.sample_s;
+    // A plant that integrates has one gain from displacement to speed in the middle of its range.
+    let middle = std::f64::consts::TAU;
+    let at = nalgebra::Complex::new(0.0, middle);
+    let speed_per_um = (ctx.problem.base.zpk.at(at).norm() * middle).max(1e-12);
+    let speed_um_per_s = z.motion_um2.sqrt() / dt;
+    let time_s = z.time_rows * dt;
+    let in_a_second_um = speed_um_per_s * (2.0 / time_s).min(1.0).sqrt() / speed_per_um;
+    Some(format!(
+        "the zero flow moves by {} of displacement in a second{}: noise, and no effect",
+        ctx.scales.told(in_a_second_um),
+        if z.drifts { ", and drifts" } else { "" }
     ))
 }
 

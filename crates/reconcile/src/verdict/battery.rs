@@ -220,7 +220,16 @@ pub(crate) fn library(ctx: &Context<'_>, fit: &Fit) -> Vec<Column> {
                         simulate(&ctx.problem.base, &raw, &[], &mut y, None);
                         y
                     } else {
-                        raw
+                        // A loop has set a row's command by its position: what shows at the output is that of the row before.
+                        let shown = rows.windows(2).map(|w| {
+                            let [before, now] = w else { return 0.0 };
+                            formula(&Row {
+                                d: before.d,
+                                rate: before.rate,
+                                ..*now
+                            })
+                        });
+                        raw.iter().take(1).copied().chain(shown).collect()
                     };
                     r.whitened(&moved)
                 })

@@ -53,7 +53,7 @@ impl Sums {
 }
 
 /// Whether the plant integrates slowly enough for a nanometre of displacement to become a ramp.
-fn integrates(ctx: &Context<'_>) -> bool {
+pub(super) fn integrates(ctx: &Context<'_>) -> bool {
     let longest = ctx.scope.length_s;
     ctx.problem
         .base
@@ -92,9 +92,11 @@ fn free_run(ctx: &Context<'_>, null: &Fit, set: &Fit, test: &Mask) -> Sums {
         sums.free_after += energy(&after[i]);
         // A walk of n rows about its mean has the variance q n/6, about its regression line q n/15.
         let share = if ramp { 1.0 / 15.0 } else { 1.0 / 6.0 };
+        let of_rows = r.u.len() as f64;
+        let flow = noise.zero_flow.map_or(0.0, |z| z.path_um2(of_rows, ramp));
         let coloured = noise.coloured.map_or(0.0, |c| c.variance_um2);
         let still = noise.white_um2 + coloured;
-        sums.free_floor += rows * (noise.walk_um2 * r.u.len() as f64 * share + still);
+        sums.free_floor += rows * (noise.walk_um2 * of_rows * share + flow + still);
         sums.rows += rows;
     }
     sums

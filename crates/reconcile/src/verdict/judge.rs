@@ -281,8 +281,13 @@ pub(crate) fn first_at_bound(ctx: &Context<'_>, fit: &Fit) -> Option<(usize, Str
 fn not_earned(ctx: &Context<'_>, e: &Evidence<'_>) -> Option<String> {
     let of_other_data = ctx.problem.base.free_start;
     let (before, after) = (e.held.free_before_um, e.held.free_after_um);
-    // The walk's own scatter is as large as itself.
-    let floor = 2.0 * e.held.free_floor_um;
+    // The walk's own scatter is as large as itself. What a zero flow makes is nearly one curve of one size: 3.3 standard deviations of
+    // one number are one in a thousand.
+    let times = match ctx.problem.noise.zero_flow {
+        Some(_) => 3.3,
+        None => 2.0,
+    };
+    let floor = times * e.held.free_floor_um;
     let falls = after <= (1.0 - THRESHOLDS.free_run_fall) * before;
     // The walk is the same in both: whatever its size, a base that was fitted to the records does not run worse with what it lacks.
     let grows = of_other_data && after > (1.0 + THRESHOLDS.free_run_fall) * before;

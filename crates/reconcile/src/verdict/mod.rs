@@ -13,6 +13,7 @@ mod parameters;
 mod proposal;
 pub(crate) mod response;
 pub(crate) mod result;
+mod searching;
 mod sentences;
 mod significance;
 mod small;

@@ -36,7 +36,12 @@ pub(crate) fn parameters(
         let x = part.theta[j];
         let scatter = fit.covariance[(offset + j, offset + j)].max(0.0).sqrt() * wide;
         let sd = birge[offset + j] * scatter.hypot(numeric_error(p, x));
-        let (low, high) = (p.natural(x - 1.96 * sd), p.natural(x + 1.96 * sd));
+        // What no record sees may be anything in its range.
+        let (low, high) = if sd.is_finite() {
+            (p.natural(x - 1.96 * sd), p.natural(x + 1.96 * sd))
+        } else {
+            (p.lower, p.upper)
+        };
         let name = if p.name == "weights" {
             format!("weights[{j}]")
         } else {

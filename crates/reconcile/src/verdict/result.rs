@@ -310,6 +310,8 @@ impl Reconciliation {
                 "innovation_um": self.noise.innovation_um(),
                 "coloured_um": self.noise.coloured.map(|c| c.variance_um2.sqrt()),
                 "coloured_s": self.noise.coloured.map(|c| c.time_rows * self.sample_s),
+                "zero_flow_um_per_s": self.noise.zero_flow.map(|z| z.motion_um2.sqrt() / self.sample_s),
+                "zero_flow_s": self.noise.zero_flow.map(|z| z.time_rows * self.sample_s),
             },
         })
     }

@@ -66,17 +66,27 @@ pub(crate) fn birge(ctx: &Context<'_>, fit: &Fit, threads: usize) -> Vec<f64> {
     for (i, part) in fit.parts.iter().enumerate() {
         for (j, p) in part.variant().params.iter().enumerate() {
             let numeric = numeric_error(p, part.theta[j]);
-            let (mut weights, mut sum, mut squares) = (0.0, 0.0, 0.0);
+            // A record that leaves a number anywhere in its range does not know it, and agrees with nothing.
+            let range = p.coordinate(p.upper) - p.coordinate(p.lower);
+            let (mut weights, mut sum, mut squares, mut told) = (0.0, 0.0, 0.0, 0usize);
             for own in &fits {
+                let variance = own.covariance[(at + j, at + j)].max(0.0);
+                if variance >= range * range {
+                    continue;
+                }
                 let moved = own.parts[i].theta[j] - part.theta[j];
-                let weight = 1.0
-                    / (own.covariance[(at + j, at + j)].max(0.0) + numeric * numeric).max(1e-24);
+                let weight = 1.0 / (variance + numeric * numeric).max(1e-24);
                 weights += weight;
                 sum += weight * moved;
                 squares += weight * moved * moved;
+                told += 1;
+            }
+            if told < 2 {
+                ratios.push(1.0);
+                continue;
             }
             let spread = squares - sum * sum / weights;
-            let ratio = (spread / (groups.len() - 1) as f64).max(1.0).sqrt();
+            let ratio = (spread / (told - 1) as f64).max(1.0).sqrt();
             ratios.push(ratio.min(THRESHOLDS.birge_most));
         }
         at += part.theta.len();

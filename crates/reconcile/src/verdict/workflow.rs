@@ -6,13 +6,12 @@ use crate::data::frames;
 use crate::data::noise::NoiseModel;
 use crate::data::record::{Record, canonical};
 use crate::error::ReconcileError;
-use crate::fit::catalogue;
-use crate::fit::context::{Context, Fit, WhiteEvidence};
+use crate::fit::context::{Context, Fit};
 use crate::fit::locking;
 use crate::problem::Problem;
 use crate::search::cost::left_over;
 use crate::search::effort::Effort;
-use crate::search::sequential::{Found, ids, search, settle};
+use crate::search::sequential::{Found, ids, settle};
 use crate::simulate::{Base, Zpk};
 use crate::thresholds::THRESHOLDS;
 use crate::units::{Scales, Units};
@@ -23,9 +22,10 @@ use crate::verdict::guard;
 use crate::verdict::held_out::{self, HeldOut};
 use crate::verdict::judge;
 use crate::verdict::result::Reconciliation;
+use crate::verdict::searching::{Searched, Searching};
 use crate::verdict::small;
+use cellpos_plant::Model;
 use cellpos_plant::effects::Scope;
-use cellpos_plant::{Effect, Model};
 
 /// The work that a search is given: advances of one mode of the plant by one step. About 20 s of one processor of 2020.
 pub const WORK: f64 = 1.5e10;
@@ -115,16 +115,25 @@ fn within(
     };
     let base = base_of(model, &records, options)?;
     let scope = scope_of(model, &records, &base, scales);
-    let fixed = model.effects.clone();
     let stated = stated_noise(model, base.sample_s);
     let start = stated.unwrap_or_else(|| NoiseModel::new(0.33, base.sample_s, 0.03));
     let problem = Problem::new(base, &records, repeated, start);
-    let present: Vec<Vec<bool>> = problem.records.iter().map(|r| r.present.clone()).collect();
+    let present = problem.present();
+    let searching = Searching {
+        model,
+        scope,
+        fixed: &model.effects,
+        own_effects: &options.own_effects,
+        free_gain: options.free_gain,
+        kind: options.noise,
+        scales,
+    };
 
     progress("null model and noise floor");
-    let first =
-        context(&problem, scope, &fixed, options, scales).fit(Vec::new(), &problem.all(), 4);
-    let residual = free_of_start(&context(&problem, scope, &fixed, options, scales), &first);
+    let first = searching
+        .context(&problem, 0)
+        .fit(Vec::new(), &problem.all(), 4);
+    let residual = free_of_start(&searching.context(&problem, 0), &first);
     // Brownian motion of a bead is a walk; coloured noise is that of a sensor.
     let of_bead = model.noise.diffusion_um2_per_s > 0.0 && !options.free_start;
     let kind = match options.noise {
@@ -132,9 +141,8 @@ fn within(
         kind => kind,
     };
     let floor = floor::estimate(&records, &present, &residual, stated, kind);
-    let (noise, trusted) = (floor.noise, floor.rows);
-    let problem = problem.with_noise(noise);
-    let unlike = guard::motion(&context(&problem, scope, &fixed, options, scales))?;
+    let problem = problem.with_noise(floor.noise);
+    let unlike = guard::motion(&searching.context(&problem, 0))?;
 
     let effort = Effort {
         threads: options.threads,
@@ -146,40 +154,10 @@ fn within(
         },
         work: (options.work * WORK) as u64,
     };
-    let mut noise = noise;
-    let mut problem = problem;
-    let mut found;
-    let mut start: Option<Fit> = None;
-    let mut round = 0;
-    loop {
-        let ctx = Context {
-            white: evidence(model, &noise, trusted, &problem),
-            ..context(&problem, scope, &fixed, options, scales)
-        };
-        found = search(&ctx, &problem.all(), effort, start.as_ref(), &mut *progress);
-        // What the final residual shows is at least as good an estimate of the noise, if the fit is good.
-        let (residual, _) = ctx.residual(&found.fit);
-        let refined = floor::from_residuals(&present, &residual);
-        round += 1;
-        // A floor that was measured is not talked down by a fit that has numbers to spare.
-        if round >= 2
-            || found.cut_short
-            || !floor.source.is_known()
-            // Increments tell a walk from white noise, no more.
-            || options.noise == NoiseKind::White
-            || noise.coloured.is_some()
-            || refined.innovation_um() > 0.97 * noise.innovation_um()
-        {
-            break;
-        }
-        noise = refined;
-        problem = problem.with_noise(noise);
-        start = Some(found.fit);
-    }
-    let ctx = Context {
-        white: evidence(model, &noise, trusted, &problem),
-        ..context(&problem, scope, &fixed, options, scales)
-    };
+    let still = searching.search(problem, &floor, effort, None, &mut *progress);
+    let Searched { mut found, problem } =
+        searching.beside_zero_flow(still, &floor, effort, &mut *progress);
+    let ctx = searching.context(&problem, floor.rows);
     progress(&format!(
         "held-out check (the search took {:.2} of its work)",
         problem.spent() as f64 / (options.work.max(1e-9) * WORK)
@@ -324,25 +302,6 @@ fn drop_bound(ctx: &Context<'_>, found: &mut Found, effort: Effort) {
     }
 }
 
-fn context<'a>(
-    problem: &'a Problem,
-    scope: Scope,
-    fixed: &[Effect],
-    options: &Options,
-    scales: &Scales,
-) -> Context<'a> {
-    Context {
-        problem,
-        scope,
-        fixed: fixed.to_vec(),
-        variants: catalogue::variants(&options.own_effects),
-        free_gain: options.free_gain,
-        white: None,
-        quantised: problem.quantised,
-        scales: scales.clone(),
-    }
-}
-
 fn base_of(model: &Model, records: &[Record], options: &Options) -> Result<Base, ReconcileError> {
     let zpk = Zpk::of(&model.plant);
     if zpk.poles.iter().any(|p| p.re > 1e-6) {
@@ -383,28 +342,4 @@ fn scope_of(model: &Model, records: &[Record], base: &Base, scales: &Scales) -> 
         sampled_input: base.interpolated_input,
         per_unit: scales.per_unit(),
     }
-}
-
-fn evidence(
-    model: &Model,
-    noise: &NoiseModel,
-    trusted: usize,
-    problem: &Problem,
-) -> Option<WhiteEvidence> {
-    let model_um2 = model.noise.localisation_um.powi(2);
-    if trusted < 5000 || model_um2 <= 0.0 || noise.coloured.is_some() {
-        return None;
-    }
-    let variance = noise.walk_um2 + 2.0 * noise.white_um2;
-    // Only where the walk is that of the model: else the model's noise says nothing about this rig.
-    let walk = 2.0 * model.noise.diffusion_um2_per_s * problem.base.sample_s;
-    if walk <= 0.0 || (noise.walk_um2 / walk - 1.0).abs() > THRESHOLDS.walk_alike {
-        return None;
-    }
-    Some(WhiteEvidence {
-        estimate_um2: noise.white_um2,
-        error_um2: 1.5 * variance / (trusted as f64).sqrt(),
-        model_um2,
-        walk_um2: noise.walk_um2,
-    })
 }

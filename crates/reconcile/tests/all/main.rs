@@ -6,3 +6,4 @@ mod measured_piezo;
 mod noise;
 mod units;
 mod verdicts;
+mod zero_flow;

@@ -107,6 +107,8 @@ impl<R: ReferenceGenerator> Core<R> {
         ] {
             *counter += u64::from(more);
         }
+        // Pictures that came once more under new numbers.
+        counts.stale += u64::from(self.state.pictures_repeated > 0 && input.measurement.is_some());
         counts.frames_lost = counts.frames_lost.saturating_sub(u64::from(frames.late));
         counts.late += u64::from(input.previous_late_ns.is_some());
         counts.refused += u64::from(input.previous_refused);

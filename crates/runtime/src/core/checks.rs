@@ -99,6 +99,13 @@ impl<R: ReferenceGenerator> Core<R> {
             return None;
         };
         self.state.stale_in_a_row = 0;
+        self.state.pictures_repeated = if matches!(m.track, Some((_, Decision::Stale))) {
+            tick.flags.set(TickFlags::STALE);
+            tick.disturbed = true;
+            self.state.pictures_repeated.saturating_add(1)
+        } else {
+            0
+        };
         self.state.last_frame = Some((m.frame_id, m.mid_exposure_ns));
         let period = self.timing.period_ns();
         let age_ns = input.time_ns - m.mid_exposure_ns;

@@ -8,7 +8,16 @@ use crate::tick::Tick;
 use crate::tick_record::TickFlags;
 use cellpos_control::Mode;
 
+/// Frames in a row that show the picture before once more after which the bead is frozen. Shot noise never repeats: one is
+/// already no chance.
+const REPEATED_PICTURES: u32 = 3;
+
 impl<R: ReferenceGenerator> Core<R> {
+    /// Time without a bead after which a run ends, ns.
+    fn lost_ns(&self) -> i64 {
+        i64::from(self.timing.lost_ticks) * self.timing.period_ns()
+    }
+
     /// Life cycle; gives what the controller is to do.
     pub(super) fn advance_life(
         &mut self,
@@ -70,7 +79,17 @@ impl<R: ReferenceGenerator> Core<R> {
             }
         }
         if self.state.life == Life::Running {
-            let cause = if self.state.frameless > self.planned_gap {
+            if self.state.pictures_repeated >= REPEATED_PICTURES {
+                self.freeze(FreezeReason::PictureFrozen, tick);
+            }
+            if self.state.frozen.has(FreezeReason::NotFollowing)
+                && tick.time_ns - self.state.frozen_since_ns >= self.lost_ns()
+            {
+                self.latch(SafeReason::NotFollowing, tick);
+            }
+            let cause = if self.state.pictures_repeated > 0 {
+                (FreezeReason::PictureFrozen, SafeReason::StaleFrames)
+            } else if self.state.frameless > self.planned_gap {
                 (FreezeReason::CameraStalled, SafeReason::CameraLost)
             } else {
                 (FreezeReason::BeadLost, SafeReason::BeadLost)
@@ -82,13 +101,26 @@ impl<R: ReferenceGenerator> Core<R> {
             } else if self.state.missing == 0 {
                 self.thaw(FreezeReason::BeadLost, tick);
                 self.thaw(FreezeReason::CameraStalled, tick);
+                self.thaw(FreezeReason::PictureFrozen, tick);
             }
         }
-        match (self.state.life, self.state.frozen.any()) {
+        let frozen = self.state.frozen;
+        match (self.state.life, frozen.any()) {
             (Life::Running, false) => Mode::Run,
             (Life::Running, true) => {
                 tick.flags.set(TickFlags::FREEZE);
-                Mode::Freeze
+                // With the bead in view the estimate of the zero flow goes on and is the best there is.
+                let blind = [
+                    FreezeReason::BeadLost,
+                    FreezeReason::CameraStalled,
+                    FreezeReason::PictureFrozen,
+                    FreezeReason::NotFollowing,
+                ];
+                if blind.into_iter().any(|reason| frozen.has(reason)) {
+                    Mode::Direct(self.state.rest_um)
+                } else {
+                    Mode::Freeze
+                }
             }
             _ => Mode::Park,
         }
@@ -104,7 +136,13 @@ impl<R: ReferenceGenerator> Core<R> {
     }
 
     pub(super) fn freeze(&mut self, reason: FreezeReason, tick: &mut Tick) {
-        if self.state.life == Life::Running && self.state.frozen.add(reason) {
+        if self.state.life != Life::Running {
+            return;
+        }
+        if !self.state.frozen.has(reason) {
+            self.state.rest_um = self.state.rest.zero_flow_um(self.controller.neutral_um());
+        }
+        if self.state.frozen.add(reason) {
             self.state.frozen_since_ns = tick.time_ns;
             tick.event(EventKind::FreezeStarted { reason });
         }

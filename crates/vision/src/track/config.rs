@@ -12,6 +12,8 @@ pub struct Commanded {
     /// Way that the flow goes while the frame is exposed, px: a fast bead's image is drawn out along it. Noughts where the
     /// exposure is not known.
     pub streak_px: (f64, f64),
+    /// Exposure time, s; 0 where it is not known.
+    pub exposure_s: f64,
 }
 
 impl From<(f64, f64)> for Commanded {
@@ -20,6 +22,7 @@ impl From<(f64, f64)> for Commanded {
         Commanded {
             flow_px_per_s,
             streak_px: (0.0, 0.0),
+            exposure_s: 0.0,
         }
     }
 }
@@ -38,6 +41,9 @@ pub struct TrackerConfig {
     pub gate_sigma: f64,
     /// ... or within this distance of it, px.
     pub least_gate_px: f64,
+    /// Fastest flow that the actuator can drive, px/s. A bead that is alone in the picture is taken wherever such a flow can
+    /// have carried it since its last fix.
+    pub fastest_flow_px_per_s: f64,
     /// Frames in a row that must agree before a bead counts as tracked.
     pub confirm_frames: u32,
     /// Time without an accepted fix after which a bead is lost, s.
@@ -64,6 +70,8 @@ impl Default for TrackerConfig {
             flow_error: 0.5,
             gate_sigma: 5.0,
             least_gate_px: 1.0,
+            // The stroke of 45 um times the gain of 380 /s.
+            fastest_flow_px_per_s: 171_000.0,
             confirm_frames: 3,
             coast_limit_s: 0.05,
             max_amplitude_change: 0.35,
@@ -83,6 +91,7 @@ impl TrackerConfig {
         TrackerConfig {
             diffusion_px2_per_s: default.diffusion_px2_per_s * scale * scale,
             velocity_walk_px_per_s15: default.velocity_walk_px_per_s15 * scale,
+            fastest_flow_px_per_s: default.fastest_flow_px_per_s * scale,
             ..default
         }
     }
@@ -129,6 +138,13 @@ impl TrackerConfig {
             0.05,
             100.0,
             "0.05 to 100 px",
+        )?;
+        range(
+            "fastest_flow_px_per_s",
+            self.fastest_flow_px_per_s,
+            0.0,
+            1e9,
+            "0 to 1e9 px/s",
         )?;
         range(
             "confirm_frames",
@@ -224,7 +240,7 @@ pub enum Decision {
     AtBorder = 5,
     /// The fit did not converge.
     NotConverged = 6,
-    /// A bead, but too far from the prediction.
+    /// A bead, but further from the prediction than any flow can have carried it, or as far as another bead may be.
     OutsideGate = 7,
     /// A bead at the right place with another intensity, size or residual.
     OtherBead = 8,

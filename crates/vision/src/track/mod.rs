@@ -1,8 +1,9 @@
 //! Following one bead from frame to frame, never on to another without saying so.
 //!
 //! Each frame ends in one of four states and one decision. The bead's motion is predicted from the commanded flow and
-//! an estimated drift; a fix is taken when it lies within the gate of the prediction and agrees in intensity, size and
-//! residual. Other beads near by are followed too: when two beads have touched, a fix is taken only if every reading in
+//! an estimated drift. A fix that lies within the gate of the prediction and agrees in intensity, size and residual is taken.
+//! If there is none, the whole frame is looked at: a bead that is alone in it is taken wherever a step of the flow can have
+//! carried it. Other beads near by are followed too: when two beads have touched, a fix is taken only if every reading in
 //! which it belongs to the other is less likely by a set margin. Otherwise the tracker coasts and, after its limit, is
 //! lost: being lost is an answer, following another bead is not.
 
@@ -31,6 +32,8 @@ const SIZE_STRIDE: u32 = 8;
 
 /// Share of the chosen bead's amplitude below which a candidate is not a bead.
 const LEAST_SHARE: f64 = 0.3;
+/// A way during an exposure below which an image is not drawn out enough to matter, px: it widens by a twelfth of its square.
+const STREAK_PX: f64 = 0.5;
 /// Beads nearer than this many radii are fitted together.
 const TOUCHING_RADII: f64 = 4.0;
 /// Times that beads fitted together are each gone through.
@@ -57,6 +60,9 @@ pub struct Tracker {
     chosen: Option<Chosen>,
     aim: Option<(f64, f64)>,
     frames: u32,
+    /// Expected way during this frame's exposure, px, and the exposure time, s.
+    streak_px: (f64, f64),
+    exposure_s: f64,
     candidates: [Option<Candidate>; MAX_BEADS],
 }
 
@@ -78,6 +84,8 @@ impl Tracker {
             chosen: None,
             aim: None,
             frames: 0,
+            streak_px: (0.0, 0.0),
+            exposure_s: 0.0,
             candidates: [None; MAX_BEADS],
         })
     }
@@ -112,8 +120,17 @@ impl Tracker {
         let Commanded {
             flow_px_per_s,
             streak_px,
+            exposure_s,
         } = commanded.into();
-        self.localiser.expect_streak(streak_px);
+        let unexplained = self
+            .chosen
+            .map_or((0.0, 0.0), |c| c.motion.unexplained_px_per_s());
+        self.streak_px = (
+            streak_px.0 + unexplained.0 * exposure_s,
+            streak_px.1 + unexplained.1 * exposure_s,
+        );
+        self.exposure_s = exposure_s;
+        self.localiser.expect_streak(self.streak_px);
         let (dt_s, time_s) = self.standing.elapse(time_s);
         self.frames = self.frames.wrapping_add(1);
         if let Some(chosen) = &mut self.chosen {
@@ -240,6 +257,7 @@ impl Tracker {
         let fix = self.localiser.locate(frame, Some(chosen.motion.position()));
         let size = self.localiser.relative_size(&fix);
         self.add_candidate(Candidate { fix, size });
+        self.fit_as_carried(frame, &chosen);
         self.part_touching_beads(frame, &chosen);
 
         let (mut best, mut nearest) = (None::<usize>, None::<Fix>);
@@ -252,7 +270,7 @@ impl Tracker {
                 nearest = Some(c.fix);
                 misfit = Some(if c.fix.verdict != FixQuality::Good {
                     refusal(c.fix.verdict)
-                } else if !self.within_gate(&chosen.motion, &c.fix) {
+                } else if !self.within_reach(&chosen.motion, &c.fix) {
                     Decision::OutsideGate
                 } else {
                     Decision::OtherBead
@@ -260,14 +278,14 @@ impl Tracker {
             }
             let mut ok = c.fix.verdict == FixQuality::Good
                 && chosen.identity.agrees(&self.config, &c.fix, c.size);
-            // A lost bead may come back anywhere; a coasting one only near its prediction.
-            ok &=
-                self.standing.state == TrackState::Lost || self.within_gate(&chosen.motion, &c.fix);
-            let surprise = |i: usize| {
-                let other = self.candidates.get(i).copied().flatten();
-                other.map_or(f64::INFINITY, |o| chosen.motion.surprise(&o.fix))
+            // A lost bead may come back anywhere; a coasting one where the flow can have carried it.
+            ok &= self.standing.state == TrackState::Lost
+                || self.within_reach(&chosen.motion, &c.fix);
+            let cost = |i| {
+                self.neighbours
+                    .cost(&chosen.motion, &self.candidates, Some(i))
             };
-            if ok && best.is_none_or(|b| surprise(k) < surprise(b)) {
+            if ok && best.is_none_or(|b| cost(k) < cost(b)) {
                 best = Some(k);
             }
         }
@@ -286,6 +304,12 @@ impl Tracker {
             Some(Claim::Ours) => best,
             _ => None,
         };
+        let taken_fix = taken.and_then(|k| Some(self.candidates.get(k)?.as_ref()?.fix));
+        if let Some(fix) = taken_fix
+            && chosen.motion.has_stepped(&fix)
+        {
+            self.neighbours.carry(chosen.motion.way_to(&fix));
+        }
         self.neighbours.update(
             &chosen.motion,
             &self.candidates,
@@ -318,6 +342,37 @@ impl Tracker {
             (None, Some(_)) => (Decision::Ambiguous, nearest),
             (None, None) => (misfit.unwrap_or(Decision::NothingFound), nearest),
         }
+    }
+
+    /// Fits again what is unlike the bead: a step of the flow that carried it there draws its image out, too.
+    fn fit_as_carried(&mut self, frame: &Frame, chosen: &Chosen) {
+        let since_s = chosen.motion.since_s();
+        if self.exposure_s <= 0.0 || since_s <= 0.0 {
+            return;
+        }
+        for slot in &mut self.candidates {
+            let Some(c) = *slot else { continue };
+            let good = |c: &Candidate| {
+                c.fix.verdict == FixQuality::Good
+                    && chosen.identity.agrees(&self.config, &c.fix, c.size)
+            };
+            let way = chosen.motion.way_to(&c.fix);
+            let along_px = f64::hypot(way.0, way.1) * self.exposure_s / since_s;
+            if good(&c) || along_px < STREAK_PX {
+                continue;
+            }
+            let share = self.exposure_s / since_s;
+            self.localiser.expect_streak((
+                self.streak_px.0 + way.0 * share,
+                self.streak_px.1 + way.1 * share,
+            ));
+            let fix = self.localiser.locate(frame, Some((c.fix.x_px, c.fix.y_px)));
+            let carried = Candidate { fix, size: None };
+            if good(&carried) {
+                *slot = Some(carried);
+            }
+        }
+        self.localiser.expect_streak(self.streak_px);
     }
 
     /// Fits beads whose images overlap: in turn, each with the others' images taken off the frame. The results replace
@@ -405,6 +460,13 @@ impl Tracker {
         let (x, y) = motion.position();
         motion.distance2(fix) <= self.config.gate_sigma * self.config.gate_sigma
             || f64::hypot(fix.x_px - x, fix.y_px - y) <= self.config.least_gate_px
+    }
+
+    /// Whether any flow that the actuator can drive has carried the bead there since its last fix.
+    fn within_reach(&self, motion: &Motion, fix: &Fix) -> bool {
+        let (x, y) = motion.way_to(fix);
+        f64::hypot(x, y) <= self.config.fastest_flow_px_per_s * motion.since_s()
+            || self.within_gate(motion, fix)
     }
 
     /// Locates every bead that the detector sees.

@@ -1,14 +1,26 @@
 //! Predicted motion of one object: commanded flow plus an unexplained velocity, with Brownian motion.
+//!
+//! Two hypotheses stand beside each other in every frame. In the quiet one the unexplained velocity walks. In the other the
+//! flow has stepped since the last fix: a tap on the syringe, a valve. How fast it is then is known to the order of magnitude
+//! only, up to what the whole stroke of the actuator drives. A fix is worth what the likelier of the two says.
 
 use super::config::TrackerConfig;
 use crate::fix::Fix;
+use std::f64::consts::TAU;
 
 /// The least standard deviation granted to a fix, px: a template is never exact.
 const LEAST_FIX_SD_PX: f64 = 0.02;
 /// Standard deviation of the unexplained velocity at the start, px/s.
 const START_VELOCITY_SD: f64 = 300.0;
 
-/// Largest squared distance that counts in a comparison of readings.
+/// Steps of the flow that are expected in a second. A tap or a valve comes a few times in a minute; ten times more or less
+/// change the cost of a step by 4.6, a third of the certainty that is asked for.
+const STEPS_PER_S: f64 = 1.0;
+/// Natural logarithm of the fastest step over the slowest that is told from the quiet walk: 400, from half a pixel a frame to
+/// the whole stroke. Any speed in between is as likely as any other on a logarithmic scale.
+const LOG_RANGE: f64 = 6.0;
+/// Largest squared distance of another bead that counts in a comparison of readings. A bead that is not followed may have
+/// met something; its prediction may not decide alone.
 const MOST_DISTANCE2: f64 = 16.0;
 
 /// Random parts of the motion.
@@ -62,6 +74,15 @@ impl Axis {
         self.vv += r.velocity_walk * r.velocity_walk * dt_s;
     }
 
+    /// Moves on with the flow that has carried it by `way` in `since_s`. The step came at any time in between, so that the speed
+    /// is known to its own size.
+    fn carry(&mut self, way: f64, since_s: f64) {
+        let (way2, speed) = (way * way, way / since_s);
+        self.pp += way2;
+        self.pv += way * speed;
+        self.vv += speed * speed;
+    }
+
     fn update(&mut self, innovation: f64, fix_var: f64) {
         let s = self.pp + fix_var;
         let (kp, kv) = (self.pp / s, self.pv / s);
@@ -78,6 +99,8 @@ impl Axis {
 pub(crate) struct Motion {
     x: Axis,
     y: Axis,
+    /// Since the last fix that was taken in, s.
+    since_s: f64,
 }
 
 impl Motion {
@@ -86,16 +109,33 @@ impl Motion {
         Motion {
             x: Axis::new(fix.x_px, rx),
             y: Axis::new(fix.y_px, ry),
+            since_s: 0.0,
         }
     }
 
     pub fn predict(&mut self, dt_s: f64, (flow_x, flow_y): (f64, f64), randomness: &Randomness) {
         self.x.predict(dt_s, flow_x, randomness);
         self.y.predict(dt_s, flow_y, randomness);
+        self.since_s += dt_s;
     }
 
     pub fn position(&self) -> (f64, f64) {
         (self.x.p, self.y.p)
+    }
+
+    /// The velocity that no command explains, px/s.
+    pub fn unexplained_px_per_s(&self) -> (f64, f64) {
+        (self.x.v, self.y.v)
+    }
+
+    /// Time since the last fix that was taken in, s.
+    pub fn since_s(&self) -> f64 {
+        self.since_s
+    }
+
+    /// From the prediction to a fix, px.
+    pub fn way_to(&self, fix: &Fix) -> (f64, f64) {
+        (fix.x_px - self.x.p, fix.y_px - self.y.p)
     }
 
     /// Standard deviation of the predicted position, the larger axis, px.
@@ -110,18 +150,67 @@ impl Motion {
             + (fix.y_px - self.y.p).powi(2) / (self.y.pp + ry)
     }
 
-    /// Minus twice the logarithm of the density of the fix under the prediction, up to a constant. The distance counts
-    /// only up to four standard deviations: beyond that the model of the motion is the likelier culprit, and no single
-    /// bead's prediction may decide alone.
-    pub fn surprise(&self, fix: &Fix) -> f64 {
-        let (rx, ry) = variances(fix);
-        self.distance2(fix).min(MOST_DISTANCE2) + ((self.x.pp + rx) * (self.y.pp + ry)).ln()
+    /// Minus twice the logarithm of the density of the fix (per px^2) while the flow is quiet.
+    pub fn quiet_cost(&self, fix: &Fix) -> f64 {
+        self.distance2(fix) + self.cost_of_width(fix)
     }
 
+    /// As [`Self::quiet_cost`], of a bead whose motion may not decide alone.
+    pub fn capped_cost(&self, fix: &Fix) -> f64 {
+        self.distance2(fix).min(MOST_DISTANCE2) + self.cost_of_width(fix)
+    }
+
+    fn cost_of_width(&self, fix: &Fix) -> f64 {
+        let (rx, ry) = variances(fix);
+        ((self.x.pp + rx) * (self.y.pp + ry)).ln() + 2.0 * TAU.ln()
+    }
+
+    /// Minus twice the logarithm of the density of the fix (per px^2) when the flow has stepped since the last fix: the chance
+    /// of a step in that time, and a speed of any magnitude in any direction, `1 / (LOG_RANGE 2 pi way^2)`.
+    pub fn step_cost(&self, fix: &Fix) -> f64 {
+        let (x, y) = self.way_to(fix);
+        // Nearer than the prediction is known no step can be told.
+        let way2 = (x * x + y * y).max(self.x.pp + self.y.pp);
+        let chance = (STEPS_PER_S * self.since_s).min(1.0);
+        -2.0 * (chance / (LOG_RANGE * TAU * way2)).ln()
+    }
+
+    /// Whether a step of the flow explains the fix better than the quiet walk.
+    pub fn has_stepped(&self, fix: &Fix) -> bool {
+        self.step_cost(fix) < self.quiet_cost(fix)
+    }
+
+    /// Minus twice the logarithm of the density of the fix (per px^2) under the likelier hypothesis.
+    pub fn surprise(&self, fix: &Fix) -> f64 {
+        self.step_cost(fix).min(self.quiet_cost(fix))
+    }
+
+    /// Goes along with a step of the flow that has carried the bead this far from the prediction since its last fix: the
+    /// velocity is as uncertain as what has been seen of it.
+    pub fn carry(&mut self, way_px: (f64, f64)) {
+        if self.since_s > 0.0 {
+            self.x.carry(way_px.0, self.since_s);
+            self.y.carry(way_px.1, self.since_s);
+        }
+    }
+
+    /// Takes a fix in, with a step of the flow where that is the likelier hypothesis.
     pub fn update(&mut self, fix: &Fix) {
+        if self.has_stepped(fix) {
+            self.carry(self.way_to(fix));
+        }
         let (rx, ry) = variances(fix);
         self.x.update(fix.x_px - self.x.p, rx);
         self.y.update(fix.y_px - self.y.p, ry);
+        self.since_s = 0.0;
+    }
+
+    /// The motion as it is predicted when the flow has carried everything this far beside the prediction.
+    pub fn shifted(&self, way_px: (f64, f64)) -> Self {
+        let mut shifted = *self;
+        shifted.x.p += way_px.0;
+        shifted.y.p += way_px.1;
+        shifted
     }
 }
 

@@ -96,23 +96,39 @@ impl Neighbours {
         }
     }
 
-    /// Cost of the reading in which the chosen bead is the candidate `own`, or hidden: the neighbours take the nearest
-    /// of what is left, each candidate once.
-    fn cost(&self, ours: &Motion, candidates: &Candidates, own: Option<usize>) -> f64 {
+    /// Cost of the reading in which the chosen bead is the candidate `own`, or hidden. A flow that has stepped carries all beads
+    /// alike: in that hypothesis the others are looked for as far from their predictions as the chosen one was found.
+    pub fn cost(&self, ours: &Motion, candidates: &Candidates, own: Option<usize>) -> f64 {
+        let own_fix = own.and_then(|k| Some(candidates.get(k)?.as_ref()?.fix));
+        let Some(fix) = own_fix else {
+            return MISS + self.cost_of_others(candidates, None, (0.0, 0.0));
+        };
+        let quiet = ours.quiet_cost(&fix) + self.cost_of_others(candidates, own, (0.0, 0.0));
+        let stepped =
+            ours.step_cost(&fix) + self.cost_of_others(candidates, own, ours.way_to(&fix));
+        quiet.min(stepped)
+    }
+
+    /// Cost of the other beads, all carried by `way_px` beside their predictions: they take the nearest of the candidates but
+    /// `own`, each candidate once.
+    fn cost_of_others(
+        &self,
+        candidates: &Candidates,
+        own: Option<usize>,
+        way_px: (f64, f64),
+    ) -> f64 {
         let mut used = [false; MAX_BEADS];
-        let mut cost = MISS;
-        if let Some(k) = own
-            && let (Some(Some(c)), Some(flag)) = (candidates.get(k), used.get_mut(k))
-        {
+        if let Some(flag) = own.and_then(|k| used.get_mut(k)) {
             *flag = true;
-            cost = ours.surprise(&c.fix);
         }
+        let mut cost = 0.0;
         for n in self.beads.iter().flatten() {
+            let motion = n.motion.shifted(way_px);
             let mut least = (MISS, None);
             for (k, c) in candidates.iter().enumerate() {
                 let Some(c) = c else { continue };
                 let free = used.get(k).is_some_and(|u| !u);
-                let surprise = n.motion.surprise(&c.fix);
+                let surprise = motion.capped_cost(&c.fix);
                 if free && is_sight(c.fix.verdict) && surprise < least.0 {
                     least = (surprise, Some(k));
                 }
@@ -123,6 +139,13 @@ impl Neighbours {
             }
         }
         cost
+    }
+
+    /// Goes along with a step of the flow that has carried the chosen bead this far.
+    pub fn carry(&mut self, way_px: (f64, f64)) {
+        for n in self.beads.iter_mut().flatten() {
+            n.motion.carry(way_px);
+        }
     }
 
     /// Takes in what was seen beside the chosen bead (`taken`, whose motion is `ours`). While the chosen bead itself is
@@ -147,7 +170,7 @@ impl Neighbours {
             for (k, c) in candidates.iter().enumerate() {
                 let Some(c) = c else { continue };
                 let distance2 = n.motion.distance2(&c.fix);
-                let lead = ours.surprise(&c.fix) - n.motion.surprise(&c.fix);
+                let lead = ours.surprise(&c.fix) - n.motion.capped_cost(&c.fix);
                 if taken.is_none() && lead < config.certainty {
                     continue;
                 }
