@@ -456,24 +456,6 @@ impl Estimator {
         (true, innovation)
     }
 
-    /// Corrects the estimate by an innovation; `h` is the sensitivity of the fix to neutral.
-    fn correct(
-        &self,
-        state: &mut EstimatorState,
-        h: f64,
-        innovation_um: f64,
-        walk_um2: f64,
-        variance_um2: f64,
-    ) {
-        let [p11, p12, p22] = state.covariance_um2;
-        let (ph1, ph2) = (p11 + h * p12, p12 + h * p22);
-        let trusted = ph1 + h * ph2 + walk_um2 + variance_um2 / self.config.ltr_noise_scaling;
-        let (k1, k2) = (ph1 / trusted, ph2 / trusted);
-        state.integrator_um += k1 * innovation_um;
-        state.neutral_um += k2 * innovation_um;
-        state.covariance_um2 = [p11 - k1 * ph1, p12 - k1 * ph2, p22 - k2 * ph2];
-    }
-
     /// Takes the position from the fix alone, keeping neutral.
     fn place(&self, state: &mut EstimatorState, innovation_um: f64, variance_um2: f64) {
         state.integrator_um += innovation_um;

@@ -25,6 +25,7 @@ mod following;
 mod in_force;
 mod life_cycle;
 mod rest;
+mod watches;
 
 use crate::arming::{Arming, ArmingConfig, ArmingState};
 use crate::grid::Grid;
@@ -466,82 +467,12 @@ impl<R: ReferenceGenerator> Core<R> {
         (output, generated)
     }
 
-    /// A bead that moves against the commands is frozen, at the zero flow of before.
-    fn watch_following(
-        &mut self,
-        fix: Option<LoopMeasurement>,
-        reference_um: f64,
-        output: &LoopOutput,
-        tick: &mut Tick,
-    ) {
-        let Some(fix) = fix.filter(|_| self.state.life == Life::Running) else {
-            return;
-        };
-        let walk_um2 = 2.0 * self.diffusion_um2_per_s * self.sample_s;
-        self.state.rest.step(
-            output.neutral_um,
-            output.innovation_um,
-            walk_um2 + fix.variance_um2.max(0.0),
-            output.flags,
-            self.sample_s,
-        );
-        if self.state.frozen.any() || output.flags.stuck {
-            self.state.following.clear();
-            return;
-        }
-        let seen = following::Seen {
-            position_um: fix.position_um,
-            error_um: fix.position_um - reference_um,
-            command_um: output.command_um,
-            zero_flow_um: output.neutral_um,
-        };
-        if self.state.following.step(seen) {
-            self.freeze(FreezeReason::NotFollowing, tick);
-        }
-    }
-
-    /// The position of this tick and its age beyond the camera path, ticks; between two frames of a slower camera that of the newest.
-    fn newest_position(
-        &mut self,
-        fix: Option<LoopMeasurement>,
-        input: &TickInput,
-        steps: u64,
-    ) -> Option<(f64, u16)> {
-        let steps = u16::try_from(steps).unwrap_or(u16::MAX);
-        let older = |(position_um, age): (f64, u16)| (position_um, age.saturating_add(steps));
-        let held = (self.state.newest.map(older))
-            .filter(|(_, age)| input.measurement.is_none() && u32::from(*age) <= self.planned_gap);
-        self.state.newest = fix.map(|fix| (fix.position_um, fix.age_samples)).or(held);
-        self.state.newest
-    }
-
     fn solver_terms(&self, input: &TickInput) -> SolverTerms {
         let late = |span: &Range<i64>| span.contains(&input.time_ns);
         if self.late_solver_ns.iter().any(late) {
             SolverTerms::Recorded(SolverStatus::PreviousPlan, 0)
         } else {
             input.solver
-        }
-    }
-
-    /// Gain and lag of the plant from its motion; their changes are events.
-    fn watch_plant(&mut self, fix: Option<LoopMeasurement>, output: &LoopOutput, tick: &mut Tick) {
-        // Increments are those of one tick only between frames that are on time.
-        let on_time = fix.filter(|fix| fix.age_samples == 0 && fix.offset_samples.abs() < 0.2);
-        let before = self.monitor.verdict(&self.state.plant);
-        let verdict = self.monitor.step(
-            &mut self.state.plant,
-            on_time.map(|fix| fix.position_um),
-            output.neutral_um,
-            output.command_um,
-        );
-        if verdict != before && self.state.life == Life::Running {
-            let estimate = self.monitor.estimate(&self.state.plant);
-            tick.event(EventKind::PlantChanged {
-                verdict,
-                gain_ratio: estimate.map_or(f64::NAN, |e| e.gain_ratio),
-                lag_ms: estimate.map_or(f64::NAN, |e| e.lag_ms),
-            });
         }
     }
 

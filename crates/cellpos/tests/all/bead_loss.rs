@@ -6,15 +6,20 @@ use cellpos_runtime::{Life, TickRecord};
 use cellpos_vision::{Decision, TrackState};
 use std::path::{Path, PathBuf};
 
-struct Run {
-    folder: PathBuf,
-    json: serde_json::Value,
-    ticks: Vec<TickRecord>,
-    events: Vec<serde_json::Value>,
+pub(crate) struct Run {
+    pub(crate) folder: PathBuf,
+    pub(crate) json: serde_json::Value,
+    pub(crate) ticks: Vec<TickRecord>,
+    pub(crate) events: Vec<serde_json::Value>,
 }
 
 /// Holds the bead at 0 um through `faults`, on the virtual clock, through frames.
 fn hold(folder: &Path, faults: &str, duration: &str, seed: u64) -> Run {
+    hold_by(folder, "pi", faults, duration, seed)
+}
+
+/// The same by a control law.
+pub(crate) fn hold_by(folder: &Path, law: &str, faults: &str, duration: &str, seed: u64) -> Run {
     std::fs::write(
         folder.join("rig.toml"),
         format!("[emulator.faults]\n{faults}\n"),
@@ -23,7 +28,7 @@ fn hold(folder: &Path, faults: &str, duration: &str, seed: u64) -> Run {
     let ran = cellpos(
         folder,
         &format!(
-            "track --target 0um --duration {duration} --clock virtual --frames on --json --rig rig.toml --seed {seed} --name s{seed}"
+            "track --target 0um --duration {duration} --clock virtual --frames on --json --rig rig.toml --seed {seed} --name s{seed} --controller {law}"
         ),
     );
     let json = ran.json();

@@ -8,6 +8,7 @@ mod common;
 mod design;
 mod identify;
 mod identify_rig;
+mod keeping;
 mod kinds_of_runs;
 mod newcomer;
 mod other_plants;

@@ -147,6 +147,21 @@ impl<R: ReferenceGenerator> Core<R> {
         })
     }
 
+    /// The position of this tick and its age beyond the camera path, ticks; between two frames of a slower camera that of the newest.
+    pub(super) fn newest_position(
+        &mut self,
+        fix: Option<LoopMeasurement>,
+        input: &TickInput,
+        steps: u64,
+    ) -> Option<(f64, u16)> {
+        let steps = u16::try_from(steps).unwrap_or(u16::MAX);
+        let older = |(position_um, age): (f64, u16)| (position_um, age.saturating_add(steps));
+        let held = (self.state.newest.map(older))
+            .filter(|(_, age)| input.measurement.is_none() && u32::from(*age) <= self.planned_gap);
+        self.state.newest = fix.map(|fix| (fix.position_um, fix.age_samples)).or(held);
+        self.state.newest
+    }
+
     /// Flags and events of the frames that came.
     fn tell_frames(&self, frames: &FrameTally, tick: &mut Tick) {
         if frames.doubled + frames.late > 0 {

@@ -7,6 +7,7 @@
 //! which it belongs to the other is less likely by a set margin. Otherwise the tracker coasts and, after its limit, is
 //! lost: being lost is an answer, following another bead is not.
 
+mod carried;
 mod cell;
 mod config;
 mod identity;
@@ -32,8 +33,6 @@ const SIZE_STRIDE: u32 = 8;
 
 /// Share of the chosen bead's amplitude below which a candidate is not a bead.
 const LEAST_SHARE: f64 = 0.3;
-/// A way during an exposure below which an image is not drawn out enough to matter, px: it widens by a twelfth of its square.
-const STREAK_PX: f64 = 0.5;
 /// Beads nearer than this many radii are fitted together.
 const TOUCHING_RADII: f64 = 4.0;
 /// Times that beads fitted together are each gone through.
@@ -342,37 +341,6 @@ impl Tracker {
             (None, Some(_)) => (Decision::Ambiguous, nearest),
             (None, None) => (misfit.unwrap_or(Decision::NothingFound), nearest),
         }
-    }
-
-    /// Fits again what is unlike the bead: a step of the flow that carried it there draws its image out, too.
-    fn fit_as_carried(&mut self, frame: &Frame, chosen: &Chosen) {
-        let since_s = chosen.motion.since_s();
-        if self.exposure_s <= 0.0 || since_s <= 0.0 {
-            return;
-        }
-        for slot in &mut self.candidates {
-            let Some(c) = *slot else { continue };
-            let good = |c: &Candidate| {
-                c.fix.verdict == FixQuality::Good
-                    && chosen.identity.agrees(&self.config, &c.fix, c.size)
-            };
-            let way = chosen.motion.way_to(&c.fix);
-            let along_px = f64::hypot(way.0, way.1) * self.exposure_s / since_s;
-            if good(&c) || along_px < STREAK_PX {
-                continue;
-            }
-            let share = self.exposure_s / since_s;
-            self.localiser.expect_streak((
-                self.streak_px.0 + way.0 * share,
-                self.streak_px.1 + way.1 * share,
-            ));
-            let fix = self.localiser.locate(frame, Some((c.fix.x_px, c.fix.y_px)));
-            let carried = Candidate { fix, size: None };
-            if good(&carried) {
-                *slot = Some(carried);
-            }
-        }
-        self.localiser.expect_streak(self.streak_px);
     }
 
     /// Fits beads whose images overlap: in turn, each with the others' images taken off the frame. The results replace

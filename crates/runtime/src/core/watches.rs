@@ -1,0 +1,69 @@
+//! What is watched besides the bead: whether it follows the commands, and what its motion tells of the plant.
+
+use super::{Core, following};
+use crate::life::{EventKind, FreezeReason, Life};
+use crate::reference::ReferenceGenerator;
+use crate::tick::Tick;
+use cellpos_control::{LoopOutput, Measurement as LoopMeasurement};
+
+impl<R: ReferenceGenerator> Core<R> {
+    /// A bead that moves against the commands is frozen, at the zero flow of before.
+    pub(super) fn watch_following(
+        &mut self,
+        fix: Option<LoopMeasurement>,
+        reference_um: f64,
+        output: &LoopOutput,
+        tick: &mut Tick,
+    ) {
+        let Some(fix) = fix.filter(|_| self.state.life == Life::Running) else {
+            return;
+        };
+        let walk_um2 = 2.0 * self.diffusion_um2_per_s * self.sample_s;
+        self.state.rest.step(
+            output.neutral_um,
+            output.innovation_um,
+            walk_um2 + fix.variance_um2.max(0.0),
+            output.flags,
+            self.sample_s,
+        );
+        if self.state.frozen.any() || output.flags.stuck {
+            self.state.following.clear();
+            return;
+        }
+        let seen = following::Seen {
+            position_um: fix.position_um,
+            error_um: fix.position_um - reference_um,
+            command_um: output.command_um,
+            zero_flow_um: output.neutral_um,
+        };
+        if self.state.following.step(seen) {
+            self.freeze(FreezeReason::NotFollowing, tick);
+        }
+    }
+
+    /// Gain and lag of the plant from its motion; their changes are events.
+    pub(super) fn watch_plant(
+        &mut self,
+        fix: Option<LoopMeasurement>,
+        output: &LoopOutput,
+        tick: &mut Tick,
+    ) {
+        // Increments are those of one tick only between frames that are on time.
+        let on_time = fix.filter(|fix| fix.age_samples == 0 && fix.offset_samples.abs() < 0.2);
+        let before = self.monitor.verdict(&self.state.plant);
+        let verdict = self.monitor.step(
+            &mut self.state.plant,
+            on_time.map(|fix| fix.position_um),
+            output.neutral_um,
+            output.command_um,
+        );
+        if verdict != before && self.state.life == Life::Running {
+            let estimate = self.monitor.estimate(&self.state.plant);
+            tick.event(EventKind::PlantChanged {
+                verdict,
+                gain_ratio: estimate.map_or(f64::NAN, |e| e.gain_ratio),
+                lag_ms: estimate.map_or(f64::NAN, |e| e.lag_ms),
+            });
+        }
+    }
+}

@@ -1,0 +1,42 @@
+//! Beads that a flow carries while the frame is exposed.
+
+use super::neighbours::Candidate;
+use super::{Chosen, Tracker};
+use crate::fix::FixQuality;
+use crate::frame::Frame;
+
+/// A way during an exposure below which an image is not drawn out enough to matter, px: it widens by a twelfth of its square.
+const STREAK_PX: f64 = 0.5;
+
+impl Tracker {
+    /// Fits again what is unlike the bead: a step of the flow that carried it there draws its image out, too.
+    pub(super) fn fit_as_carried(&mut self, frame: &Frame, chosen: &Chosen) {
+        let since_s = chosen.motion.since_s();
+        if self.exposure_s <= 0.0 || since_s <= 0.0 {
+            return;
+        }
+        for slot in &mut self.candidates {
+            let Some(c) = *slot else { continue };
+            let good = |c: &Candidate| {
+                c.fix.verdict == FixQuality::Good
+                    && chosen.identity.agrees(&self.config, &c.fix, c.size)
+            };
+            let way = chosen.motion.way_to(&c.fix);
+            let along_px = f64::hypot(way.0, way.1) * self.exposure_s / since_s;
+            if good(&c) || along_px < STREAK_PX {
+                continue;
+            }
+            let share = self.exposure_s / since_s;
+            self.localiser.expect_streak((
+                self.streak_px.0 + way.0 * share,
+                self.streak_px.1 + way.1 * share,
+            ));
+            let fix = self.localiser.locate(frame, Some((c.fix.x_px, c.fix.y_px)));
+            let carried = Candidate { fix, size: None };
+            if good(&carried) {
+                *slot = Some(carried);
+            }
+        }
+        self.localiser.expect_streak(self.streak_px);
+    }
+}
