@@ -3,7 +3,7 @@
 //! With a wrong sign, a gain far off or an actuator that does not follow, the error grows while the command pushes ever harder
 //! against it. A step of the flow makes the error grow as well, but the harder the command pushes, the slower the bead becomes. So
 //! the last 12 and the last 21 ms are looked at in three parts, each longer than the delay: the command pushed in the second part and harder in the
-//! third, and the bead went against it, faster in the third part than in the second.
+//! third, and the bead went against it by as much more as the push became harder. A flow that rises does not: the push catches up.
 
 /// Time from sample to sample, s.
 const BETWEEN_S: f64 = 0.001;
@@ -16,6 +16,9 @@ const COMMANDS: usize = 64;
 /// By how much the push must have become harder from part to part. A wrong sign makes it grow by more than the half in 7 ms, or
 /// nothing is lost yet.
 const HARDER: f64 = 1.5;
+/// What of the way over the push must be left in the last part. A bead that the push drives away keeps all of it; of a flow that
+/// rises at a constant rate the push takes a delay to follow, and the share falls below a half from part to part.
+const KEPT_SHARE: f64 = 0.7;
 /// What of the push the bead must have gone against it: an actuator that does not move at all leaves the bead to the flow.
 const LEAST_SHARE: f64 = 0.5;
 /// Growth of the error, and push in a part, below which nothing is concluded, um: five standard deviations of a bead of 1 um that is held.
@@ -133,7 +136,9 @@ impl Following {
         let away = |n| side * went_um(n);
         let grows = side * error_um(2) - side * error_um(1) > LEAST_UM;
         let harder = against(1) > LEAST_UM && against(2) > HARDER * against(1);
-        grows && harder && away(1) > 0.0 && away(2) > away(1) && away(2) > LEAST_SHARE * against(2)
+        // By the push: as much more as that became harder.
+        let driven = away(1) > 0.0 && away(2) * against(1) > KEPT_SHARE * away(1) * against(2);
+        grows && harder && driven && away(2) > LEAST_SHARE * against(2)
     }
 }
 
@@ -141,17 +146,23 @@ impl Following {
 mod tests {
     use super::*;
 
-    /// A proportional loop with 2 ms of delay and a flow that steps by `flow_um` at 0.1 s, on a plant of `sign` times the gain.
-    fn run(sign: f64, flow_um: f64) -> Option<usize> {
+    /// A proportional loop with 2 ms of delay on a plant of `sign` times the gain from 0.1 s on, and a flow that rises to `flow_um`
+    /// in `rise` ms then.
+    fn run(sign: f64, flow_um: f64, rise: f64) -> Option<usize> {
         let (gain, kp) = (0.38, 0.4);
         let mut following = Following::new(1e-3, 380.0, 2e-3);
         let mut commands = [0.0; 4];
         let (mut bead_um, mut zero_um) = (0.05, 0.0);
         let mut seen_um = [0.0; 3];
-        for k in 0..400 {
+        for k in 0..400_i32 {
             // The walk of a bead is what a wrong sign makes grow.
             bead_um += if k == 100 { 0.05 } else { 0.0 };
-            let (flow, sign) = if k < 100 { (0.0, 1.0) } else { (flow_um, sign) };
+            let since = (f64::from(k) - 99.0) / rise;
+            let (flow, sign) = if k < 100 {
+                (0.0, 1.0)
+            } else {
+                (flow_um * since.min(1.0), sign)
+            };
             bead_um += gain * (sign * commands[0] - flow);
             seen_um.rotate_left(1);
             seen_um[2] = bead_um;
@@ -167,18 +178,20 @@ mod tests {
                 zero_flow_um: zero_um,
             };
             if following.step(seen) {
-                return Some(k - 100);
+                return Some((k - 100) as usize);
             }
         }
         None
     }
 
     #[test]
-    fn a_flipped_sign_is_told_within_40_ms_and_a_step_of_the_flow_never() {
-        let told = run(-1.0, 0.0);
+    fn a_flipped_sign_is_told_within_40_ms_and_a_flow_that_rises_never() {
+        let told = run(-1.0, 0.0, 1.0);
         assert!(told.is_some_and(|ticks| ticks < 40), "{told:?}");
         for flow_um in [0.1, -0.3, 1.0, -2.6] {
-            assert_eq!(run(1.0, flow_um), None, "{flow_um}");
+            for rise in [1.0, 3.0, 6.0, 10.0, 20.0, 40.0, 80.0] {
+                assert_eq!(run(1.0, flow_um, rise), None, "{flow_um} um in {rise} ms");
+            }
         }
     }
 }
