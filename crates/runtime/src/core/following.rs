@@ -46,6 +46,8 @@ pub(super) struct Following {
     /// Newest commands first, um, and how many ticks a fix is behind them.
     commands_um: [f64; COMMANDS],
     delay: usize,
+    /// The parts are a piezo's: the lags of a slow actuator are longer than they.
+    fast: bool,
 }
 
 /// What a tick shows.
@@ -76,6 +78,7 @@ impl Following {
             gain: gain_per_s * sample_s * stride,
             commands_um: [0.0; COMMANDS],
             delay: delay as usize,
+            fast: sample_s <= 2.0 * BETWEEN_S,
         }
     }
 
@@ -105,7 +108,7 @@ impl Following {
             zero_flow_um: seen.zero_flow_um,
         };
         self.count = (self.count + 1).min(SAMPLES);
-        let longer = |part: &usize| *part as u32 * self.stride > self.delay as u32;
+        let longer = |part: &usize| self.fast && *part as u32 * self.stride > self.delay as u32;
         let parts = PARTS.into_iter().filter(longer);
         let (count, this) = (self.count, &*self);
         parts

@@ -54,9 +54,12 @@ impl Board {
         told_um: f64,
         period_ns: i64,
     ) -> Option<InForce> {
+        // A loop slower than a board's answers hears one in a tick at best.
+        let least_ns = SILENT_NS.max(3 * period_ns);
+        let watchdog_ns = WATCHDOG_NS.max(2 * least_ns);
         let since_ns = now_ns - self.heard_ns;
         if let Some(report) = report {
-            let pause_ns = since_ns.min(WATCHDOG_NS) as f64;
+            let pause_ns = since_ns.min(watchdog_ns) as f64;
             self.pause_ns = (KEPT * self.pause_ns).max(pause_ns);
             self.heard_ns = now_ns;
             self.applied_um = report.applied_um;
@@ -68,11 +71,11 @@ impl Board {
                 ticks: 1,
             });
         }
-        let allowed_ns = (1.5 * self.pause_ns).clamp(SILENT_NS as f64, WATCHDOG_NS as f64);
+        let allowed_ns = (1.5 * self.pause_ns).clamp(least_ns as f64, watchdog_ns as f64);
         if since_ns as f64 <= allowed_ns {
             return None;
         }
-        let holds = self.holding || since_ns > WATCHDOG_NS;
+        let holds = self.holding || since_ns > watchdog_ns;
         let ticks = if self.silent {
             1
         } else {
