@@ -189,7 +189,7 @@ impl<L: ControlLaw> ControlLoop<L> {
     /// One tick.
     pub fn step(&self, state: &mut LoopState<L::State>, input: &LoopInput) -> LoopOutput {
         let law = &self.parts.controller;
-        self.take_in_force(state, input);
+        let stood_um = self.take_in_force(state, input);
         let tick = self.estimate(state, input);
         let gain = tick.law.tuning.gain;
         let decided = if tick.controls {
@@ -228,7 +228,6 @@ impl<L: ControlLaw> ControlLoop<L> {
         if tick.controls {
             // The excitation is no saturation: an integrator must not be pulled along with it.
             // Nor does what never reached the actuator wind it up.
-            let stood_um = input.in_force.map(|stood| stood.displacement_um);
             let applied_um = stood_um.unwrap_or(output.command_um - added_um) * gain;
             law.applied(&mut state.law, &tick.law, decided.wish_um, applied_um);
         } else {
@@ -258,19 +257,17 @@ impl<L: ControlLaw> ControlLoop<L> {
         output
     }
 
-    /// What is known to have stood at the actuator takes the place of the commands that did not reach it.
-    fn take_in_force(&self, state: &mut LoopState<L::State>, input: &LoopInput) {
-        let Some(stood) = input
+    /// What is known to have stood at the actuator takes the place of the commands that did not reach it. Gives it, um.
+    fn take_in_force(&self, state: &mut LoopState<L::State>, input: &LoopInput) -> Option<f64> {
+        let stood = input
             .in_force
-            .filter(|stood| stood.displacement_um.is_finite())
-        else {
-            return;
-        };
+            .filter(|stood| stood.displacement_um.is_finite())?;
         let scaled_um = stood.displacement_um * self.tuning(state).gain;
         let newest = state.estimator.history_um.iter_mut().take(stood.ticks);
         newest.for_each(|um| *um = scaled_um);
         state.previous_um = stood.displacement_um;
         state.hidden_um = 0.0;
+        Some(stood.displacement_um)
     }
 
     /// A tick that never came: the command was held and the bead moved on. The estimator follows; integrator and
