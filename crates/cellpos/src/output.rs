@@ -5,7 +5,7 @@ use cellpos_session::Failure;
 use indicatif::{ProgressDrawTarget, TermLike};
 use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
-use std::sync::{Mutex, MutexGuard, OnceLock, PoisonError};
+use std::sync::{Mutex, MutexGuard, PoisonError, RwLock};
 
 /// What the command line says for every command.
 #[derive(Debug, Clone, Default)]
@@ -18,16 +18,23 @@ pub struct Settings {
     pub quiet: bool,
 }
 
-static SETTINGS: OnceLock<Settings> = OnceLock::new();
+static SETTINGS: RwLock<Settings> = RwLock::new(Settings {
+    command: String::new(),
+    force: false,
+    quiet: false,
+});
 
-/// Keeps what the command line says; the first call counts.
+/// Keeps what the command line says.
 pub fn configure(settings: Settings) {
-    let _ = SETTINGS.set(settings);
+    *SETTINGS.write().unwrap_or_else(PoisonError::into_inner) = settings;
 }
 
 /// What the command line says.
-pub fn settings() -> &'static Settings {
-    SETTINGS.get_or_init(Settings::default)
+pub fn settings() -> Settings {
+    SETTINGS
+        .read()
+        .unwrap_or_else(PoisonError::into_inner)
+        .clone()
 }
 
 /// A progress bar, or a spinner without a length; hidden where nobody wants to see it.

@@ -4,9 +4,8 @@
 //! [`DiscretePlant`] without delay, the measurement the same plant with the camera path's delay, so that a fractional
 //! delay is exact.
 
+use cellpos_numeric::Random;
 use cellpos_plant::{DiscretePlant, DiscreteState, PlantError, Seconds, TransferFunction};
-use rand_core::{Rng, SeedableRng};
-use rand_xoshiro::Xoshiro256PlusPlus;
 use std::collections::VecDeque;
 
 use crate::loop_io::Measurement;
@@ -76,7 +75,7 @@ pub struct SimulatedRig {
     /// What fixes without noise showed at this tick and those before, newest first, um.
     shown: [f64; 8],
     held: Option<(f64, VecDeque<f64>)>,
-    random: Gaussian,
+    random: Random,
 }
 
 impl SimulatedRig {
@@ -104,7 +103,7 @@ impl SimulatedRig {
             late_ticks: 0,
             shown: [0.0; 8],
             held: None,
-            random: Gaussian::new(config.seed),
+            random: Random::new(config.seed),
             config,
         })
     }
@@ -139,7 +138,7 @@ impl SimulatedRig {
         let position_um = *self.shown.get(self.late_ticks).unwrap_or(&position_um);
         let noise = self.config.fix_noise_um;
         Measurement {
-            position_um: position_um + noise * self.random.draw(),
+            position_um: position_um + noise * self.random.normal(),
             variance_um2: noise * noise,
             age_samples: 0,
             offset_samples: 0.0,
@@ -158,11 +157,11 @@ impl SimulatedRig {
         let spread = (2.0 * self.config.diffusion_um2_per_s * ts).sqrt();
         let drift = self.drift_um_per_s * ts;
         let (early, late) = (1.0 - self.fraction, self.fraction);
-        let middle = now + drift * early + spread * early.sqrt() * self.random.draw();
+        let middle = now + drift * early + spread * early.sqrt() * self.random.normal();
         let next = middle
             + drift * late
             + if late > 0.0 {
-                spread * late.sqrt() * self.random.draw()
+                spread * late.sqrt() * self.random.normal()
             } else {
                 0.0
             };
@@ -187,35 +186,5 @@ impl SimulatedRig {
             past.push_front(*position_um);
             past.truncate(self.whole + 1);
         }
-    }
-}
-
-/// Normal deviates by Box and Muller's method, reproducible to the bit for a seed.
-#[derive(Debug, Clone)]
-struct Gaussian {
-    source: Xoshiro256PlusPlus,
-    spare: Option<f64>,
-}
-
-impl Gaussian {
-    fn new(seed: u64) -> Self {
-        Self {
-            source: Xoshiro256PlusPlus::seed_from_u64(seed),
-            spare: None,
-        }
-    }
-
-    fn uniform(&mut self) -> f64 {
-        ((self.source.next_u64() >> 11) as f64 + 0.5) / (1u64 << 53) as f64
-    }
-
-    fn draw(&mut self) -> f64 {
-        if let Some(spare) = self.spare.take() {
-            return spare;
-        }
-        let radius = (-2.0 * self.uniform().ln()).sqrt();
-        let angle = std::f64::consts::TAU * self.uniform();
-        self.spare = Some(radius * angle.sin());
-        radius * angle.cos()
     }
 }

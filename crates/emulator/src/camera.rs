@@ -2,11 +2,10 @@
 
 use crate::config::WorldConfig;
 use crate::faults::{FaultKind, Faults};
-use crate::random::{stream_of, uniform};
+use cellpos_numeric::Random;
 use cellpos_plant::Model;
 use cellpos_plant::effects::Action;
 use cellpos_vision::FixQuality;
-use rand_xoshiro::Xoshiro256PlusPlus;
 use std::collections::VecDeque;
 
 /// The path during an exposure is sampled at both ends and in between, this many intervals.
@@ -100,7 +99,7 @@ pub(crate) struct Camera {
     taken: usize,
     queue: VecDeque<Pending>,
     recent: VecDeque<Exposure>,
-    rng: Xoshiro256PlusPlus,
+    rng: Random,
 }
 
 impl Camera {
@@ -116,7 +115,7 @@ impl Camera {
             taken: 0,
             queue: VecDeque::with_capacity(QUEUE_LEN + 2),
             recent: VecDeque::with_capacity(STALE_BY + 1),
-            rng: stream_of(config.seed, 20),
+            rng: Random::stream(config.seed, 20),
         };
         camera.take_over(model);
         camera
@@ -183,7 +182,7 @@ impl Camera {
             samples: self.samples,
         };
         // All four are drawn for every frame, so that one rate does not shift the others' luck.
-        let luck: [f64; 4] = core::array::from_fn(|_| uniform(&mut self.rng));
+        let luck: [f64; 4] = core::array::from_fn(|_| self.rng.uniform());
         let elapsed_ns = now.mid_ns - self.start_ns;
         let hit = |kind, luck: f64, rate: f64| luck < rate || self.faults.active(kind, elapsed_ns);
         let dropped = hit(FaultKind::DropFrames, luck[0], self.faults.drop_rate);

@@ -6,7 +6,7 @@
 //! moves it faster. Not here: friction at the wall and adhesion.
 
 use crate::error::{WorldError, within};
-use crate::random::Gaussian;
+use cellpos_numeric::Random;
 use serde::{Deserialize, Serialize};
 use std::f64::consts::FRAC_PI_4;
 
@@ -134,7 +134,7 @@ pub(crate) struct Cell {
     length_um: f64,
     passages: u32,
     was_inside: bool,
-    noise: Gaussian,
+    noise: Random,
 }
 
 impl Cell {
@@ -144,7 +144,7 @@ impl Cell {
             length_um: config.rest_um,
             passages: 0,
             was_inside: false,
-            noise: Gaussian::new(seed, 3),
+            noise: Random::stream(seed, 3),
         }
     }
 

@@ -1,8 +1,8 @@
 //! A line to the board that misbehaves as USB and serial lines do: it stalls, takes a part of what it is given, loses bytes,
 //! is unplugged and comes back. It repeats and reorders nothing.
 
-use crate::random::Gaussian;
 use cellpos_drivers::Port;
+use cellpos_numeric::Random;
 use cellpos_rig::Clock;
 use std::io::{Error, ErrorKind, Result};
 
@@ -58,7 +58,7 @@ pub struct MisbehavingLine<P> {
     line: P,
     clock: Clock,
     faults: LineFaults,
-    dice: Gaussian,
+    dice: Random,
     /// Start and end of the next random stall, ns.
     stall_ns: [i64; 2],
     /// Whether the frame that a stall cuts is still to come.
@@ -69,7 +69,7 @@ impl<P> MisbehavingLine<P> {
     /// Puts faults in front of a line; `seed` fixes them.
     pub fn new(line: P, clock: Clock, faults: LineFaults, seed: u64) -> Self {
         let mut this = Self {
-            dice: Gaussian::new(seed, 31),
+            dice: Random::stream(seed, 31),
             stall_ns: [i64::MAX; 2],
             cuts: true,
             line,

@@ -6,10 +6,8 @@
 
 use crate::cell_picture::{CellPicture, HalfAxes, walls};
 use crate::config::WorldConfig;
-use crate::random::{Gaussian, stream_of};
+use cellpos_numeric::Random;
 use cellpos_vision::{PixelResponse, RadialProfile, RingProfile, Template};
-use rand_core::Rng;
-use rand_xoshiro::Xoshiro256PlusPlus;
 
 /// A bead's path is replaced by points no further apart than this; the error of the blur is of second order in it.
 const POINT_SPACING_PX: f64 = 0.25;
@@ -123,7 +121,7 @@ pub(crate) struct Renderer {
     gaussian: Vec<f32>,
     /// Room for the objects' light in a piece of one row.
     values: Vec<f32>,
-    rng: Xoshiro256PlusPlus,
+    rng: Random,
 }
 
 impl Renderer {
@@ -131,7 +129,7 @@ impl Renderer {
     pub(crate) fn new(config: &WorldConfig) -> Option<Self> {
         let profile = RingProfile::new(config.bead_radius_px())?;
         let template = Template::new(&profile, PixelResponse::Point);
-        let mut noise = Gaussian::new(config.seed, 10);
+        let mut noise = Random::stream(config.seed, 10);
         let gaussian: Vec<f32> = (0..GAUSSIAN_LEN + usize::from(config.width_px))
             .map(|_| noise.normal() as f32)
             .collect();
@@ -157,7 +155,7 @@ impl Renderer {
             strip,
             gaussian,
             values: vec![0.0; usize::from(config.width_px)],
-            rng: stream_of(config.seed, 11),
+            rng: Random::stream(config.seed, 11),
         })
     }
 
@@ -194,7 +192,7 @@ impl Renderer {
     fn draw_bodies(&mut self, bodies: &[Body], pixels: &mut Vec<u8>) {
         pixels.resize(self.width * self.height, 0);
         for row in pixels.chunks_exact_mut(self.width) {
-            let from = (self.rng.next_u64() >> 40) as usize % STRIP_LEN;
+            let from = (self.rng.bits() >> 40) as usize % STRIP_LEN;
             if let Some(piece) = self.strip.get(from..from + row.len()) {
                 row.copy_from_slice(piece);
             }
@@ -245,7 +243,7 @@ impl Renderer {
                     }
                 }
             }
-            let at = (self.rng.next_u64() >> 40) as usize % GAUSSIAN_LEN;
+            let at = (self.rng.bits() >> 40) as usize % GAUSSIAN_LEN;
             let Some(noise) = self.gaussian.get(at..at + row.len()) else {
                 continue;
             };

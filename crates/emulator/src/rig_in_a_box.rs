@@ -8,10 +8,10 @@ use crate::board_config::{BoardConfig, BoardConfigError};
 use crate::config::WorldConfig;
 use crate::error::WorldError;
 use crate::faults::FaultKind;
-use crate::random::Gaussian;
 use crate::world::World;
 use cellpos_board::Board;
 use cellpos_link::um_from_picometres;
+use cellpos_numeric::Random;
 use cellpos_plant::Model;
 
 /// Why there is no such box.
@@ -35,7 +35,7 @@ pub struct RigInABox {
     world: World,
     start_ns: i64,
     applied_um: f64,
-    garbage: Gaussian,
+    garbage: Random,
     next_garbage_ns: Option<i64>,
     /// Random bytes on the way to the host.
     noise: [u8; GARBAGE_LEN],
@@ -59,7 +59,7 @@ impl RigInABox {
             board,
             world: World::new(world, model, start_ns)?,
             start_ns,
-            garbage: Gaussian::new(world.seed, 30),
+            garbage: Random::stream(world.seed, 30),
             next_garbage_ns: None,
             noise: [0; GARBAGE_LEN],
             noise_len: 0,

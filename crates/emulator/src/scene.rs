@@ -3,11 +3,10 @@
 //! For trying vision, not for closing a loop: nothing moves by command here. The rig with its plant is
 //! [`EmulatedRig`](crate::EmulatedRig). A seed fixes every picture to the bit.
 
+use cellpos_numeric::Random;
 use cellpos_rig::clock::Clock;
 use cellpos_rig::source::{Camera, CameraError, FrameBuffer, FrameStamp, SourceInfo};
 use cellpos_vision::{RadialProfile, RingProfile};
-use rand_core::{Rng, SeedableRng};
-use rand_xoshiro::Xoshiro256PlusPlus;
 use serde::{Deserialize, Serialize};
 use std::f64::consts::TAU;
 
@@ -152,7 +151,7 @@ pub struct SceneCamera {
     places: Vec<(f64, f64)>,
     light: Vec<f64>,
     image: Vec<f64>,
-    random: Xoshiro256PlusPlus,
+    random: Random,
     clock: Clock,
     start_ns: Option<i64>,
     frames: u64,
@@ -239,7 +238,7 @@ impl SceneCamera {
             profiles.push(RingProfile::new(b.edge_px).ok_or(refused)?);
         }
         let light = uneven_light(&config);
-        let random = Xoshiro256PlusPlus::seed_from_u64(config.seed);
+        let random = Random::new(config.seed);
         let places = config.beads.iter().map(|b| (b.x_px, b.y_px)).collect();
         let image = vec![0.0; light.len()];
         Ok(SceneCamera {
@@ -260,12 +259,6 @@ impl SceneCamera {
         &self.places
     }
 
-    fn normal(&mut self) -> f64 {
-        let mut uniform = || (self.random.next_u64() >> 11) as f64 / (1_u64 << 53) as f64;
-        let radius = (-2.0 * (1.0 - uniform()).ln()).sqrt();
-        radius * (TAU * uniform()).cos()
-    }
-
     fn render(&mut self, buffer: &mut FrameBuffer) {
         let interval_s = 1.0 / self.config.rate_hz;
         let time_s = self.frames as f64 * interval_s;
@@ -278,7 +271,10 @@ impl SceneCamera {
             let bead = self.config.beads[k];
             let step_px = (2.0 * bead.diffusion_px2_per_s * interval_s).sqrt();
             if self.frames > 0 {
-                let (dx, dy) = (step_px * self.normal(), step_px * self.normal());
+                let (dx, dy) = (
+                    step_px * self.random.normal(),
+                    step_px * self.random.normal(),
+                );
                 self.places[k].0 += bead.x_px_per_s * interval_s + dx;
                 self.places[k].1 += bead.y_px_per_s * interval_s + dy;
             }
@@ -298,7 +294,7 @@ impl SceneCamera {
             let sd = (read * read + gain * v.max(0.0)).sqrt();
             buffer
                 .mono8
-                .push((v + sd * self.normal()).round().clamp(0.0, 255.0) as u8);
+                .push((v + sd * self.random.normal()).round().clamp(0.0, 255.0) as u8);
         }
         (buffer.width, buffer.height, buffer.bits) =
             (self.config.width_px, self.config.height_px, 8);

@@ -5,9 +5,9 @@ use crate::cell::Cell;
 use crate::config::WorldConfig;
 use crate::error::WorldError;
 use crate::faults::FaultKind;
-use crate::random::Gaussian;
 use crate::render::{Renderer, localisation_bound_um, mean_between};
 use crate::zero_flow::ZeroFlow;
+use cellpos_numeric::Random;
 use cellpos_plant::effects::{Action, Shown};
 use cellpos_plant::{Chain, Model, Noise};
 use cellpos_units::Hertz;
@@ -52,8 +52,8 @@ pub struct World {
     /// Second bead: distance along the channel from the first, and position across it.
     second_um: Option<(f64, f64)>,
     stuck_um: Option<f64>,
-    brownian: Gaussian,
-    localisation: Gaussian,
+    brownian: Random,
+    localisation: Random,
     localisation_um: f64,
     snr: f64,
     /// Exposure since which the bead has been out of the frame.
@@ -111,8 +111,8 @@ impl World {
             lateral_um: 0.0,
             second_um: None,
             stuck_um: None,
-            brownian: Gaussian::new(config.seed, 1),
-            localisation: Gaussian::new(config.seed, 2),
+            brownian: Random::stream(config.seed, 1),
+            localisation: Random::stream(config.seed, 2),
             localisation_um,
             snr: config.contrast_grey.abs() / pixel_variance.sqrt(),
             out_since_ns: None,

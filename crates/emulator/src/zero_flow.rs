@@ -4,7 +4,7 @@
 //! (Ornstein-Uhlenbeck) and drifts. A tap on the syringe makes it step.
 
 use crate::config::WorldConfig;
-use crate::random::Gaussian;
+use cellpos_numeric::Random;
 
 /// Distance of the zero flow from [`WorldConfig::neutral_um`], um.
 #[derive(Debug, Clone)]
@@ -15,13 +15,13 @@ pub(crate) struct ZeroFlow {
     step_um: f64,
     wandered_um: f64,
     drifted_um: f64,
-    noise: Gaussian,
+    noise: Random,
 }
 
 impl ZeroFlow {
     /// At its mean, but for the part that wanders, which starts where it would be after a long time.
     pub fn new(config: &WorldConfig) -> Self {
-        let mut noise = Gaussian::new(config.seed, 30);
+        let mut noise = Random::stream(config.seed, 30);
         Self {
             wander_um: config.zero_flow_wander_um,
             time_s: config.zero_flow_wander_time_s,

@@ -1,7 +1,7 @@
 //! Replicates of a fit: what its parameters would be on other draws of the same noise.
 
 use crate::order_selection::{CandidateFits, OrderSelection};
-use crate::random::Random;
+use cellpos_numeric::Random;
 use nalgebra::Complex;
 
 /// Parameter vectors of the chosen order fitted to resampled blocks, each with the weak bounds on the feedthrough drawn anew.

@@ -6,7 +6,7 @@
 //! that the edge falls into is used as well. Not for the delay of the PZT and the flow: that is in the phase slope.
 
 use crate::error::IdentError;
-use crate::random::Random;
+use cellpos_numeric::Random;
 
 /// One edge and what the camera saw of it.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -151,7 +151,7 @@ pub fn delay_from_edges(edges: &[SeenEdge]) -> Result<DelayEstimate, IdentError>
     let mean = middles.iter().sum::<f64>() / n as f64;
     let variance = middles.iter().map(|m| (m - mean).powi(2)).sum::<f64>() / (n - 1) as f64;
     let sd_s = (variance / n as f64).sqrt();
-    let t = crate::stats::student_t_quantile(0.975, (n - 1) as f64);
+    let t = cellpos_numeric::statistics::student_t_quantile(0.975, (n - 1) as f64);
     Ok(DelayEstimate {
         delay_s: mean,
         sd_s,

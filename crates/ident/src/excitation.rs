@@ -7,7 +7,7 @@
 use nalgebra::Complex;
 
 use crate::error::IdentError;
-use crate::random::Random;
+use cellpos_numeric::Random;
 
 /// The ten drive frequencies of the paper's Fig. 4 and 7, Hz.
 pub const PAPER_FREQUENCIES_HZ: [f64; 10] = [

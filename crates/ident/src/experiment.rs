@@ -11,7 +11,7 @@ use crate::frequency_response::{
     DrivenStretch, FrequencyPoint, SegmentResponse, Settings, measure,
 };
 use crate::noise::{NoiseModel, apply_noise_model};
-use crate::random::Random;
+use cellpos_numeric::Random;
 
 /// One tick of a record.
 #[derive(Debug, Clone, Copy, PartialEq)]

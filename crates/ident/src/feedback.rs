@@ -112,7 +112,7 @@ pub fn by_reference(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::random::Random;
+    use cellpos_numeric::Random;
     use nalgebra::Complex;
     use std::f64::consts::TAU;
 

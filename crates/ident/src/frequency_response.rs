@@ -310,7 +310,7 @@ fn detection_line(
         outputs.iter().map(|y| (y - output).norm_sqr()).sum::<f64>() / (blocks * (blocks - 1.0));
     let dof = 2.0 * (blocks - 1.0);
     let p_value = if variance > 0.0 {
-        crate::stats::f_exceeds(output.norm_sqr() / variance, 2.0, dof)
+        cellpos_numeric::statistics::f_exceeds(output.norm_sqr() / variance, 2.0, dof)
     } else {
         0.0
     };

@@ -11,7 +11,7 @@ use crate::candidate_model::CandidateModel;
 use crate::order_selection::{
     CandidateFits, CandidateOrder, DelayPrior, OrderSelection, index, model_of,
 };
-use crate::stats::{quantile, student_t_quantile};
+use cellpos_numeric::statistics::{quantile, student_t_quantile};
 
 /// Whether the data determine a parameter.
 #[derive(Debug, Clone, PartialEq)]

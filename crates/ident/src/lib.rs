@@ -35,11 +35,9 @@ pub mod identifiability;
 pub mod least_squares;
 pub mod noise;
 pub mod order_selection;
-pub mod random;
 pub mod rational;
 pub mod sampled;
 pub mod spectral;
-pub mod stats;
 pub mod summary;
 pub mod tone_fit;
 

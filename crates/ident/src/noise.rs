@@ -8,7 +8,7 @@
 use nalgebra::Complex;
 
 use crate::frequency_response::FrequencyPoint;
-use crate::stats::{chi2_exceeds, student_t_quantile};
+use cellpos_numeric::statistics::{chi2_exceeds, student_t_quantile};
 
 /// Brownian motion plus localisation noise, as seen in position records.
 #[derive(Debug, Clone, Copy, PartialEq)]

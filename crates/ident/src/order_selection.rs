@@ -15,7 +15,7 @@ use crate::error::IdentError;
 use crate::frequency_response::FrequencyPoint;
 use crate::least_squares::{Minimum, covariance, minimise};
 use crate::sampled::Sampling;
-use crate::stats::f_exceeds;
+use cellpos_numeric::statistics::f_exceeds;
 
 /// What the candidates are fitted to.
 #[derive(Debug, Clone)]

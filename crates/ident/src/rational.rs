@@ -349,7 +349,7 @@ pub fn fit_orders(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::random::Random;
+    use cellpos_numeric::Random;
 
     fn points_of(
         truth: &PartialFractions,

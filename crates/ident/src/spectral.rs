@@ -248,7 +248,7 @@ pub fn welch(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::random::Random;
+    use cellpos_numeric::Random;
 
     #[test]
     fn the_lines_of_a_sum_of_sines_are_found_with_their_amplitudes() {

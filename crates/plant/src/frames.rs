@@ -2,7 +2,7 @@
 
 use crate::effects::Action;
 use crate::model::Model;
-use crate::random::Gaussian;
+use cellpos_numeric::Random;
 
 /// What becomes of one frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -29,7 +29,7 @@ pub fn frame_fates(model: &Model, frames: usize, seed: u64) -> Vec<FrameFate> {
         }
     }
     let (drops, repeats) = (1.0 - not_dropped, 1.0 - not_repeated);
-    let mut random = Gaussian::new(seed ^ 0x5851_f42d_4c95_7f2d);
+    let mut random = Random::new(seed ^ 0x5851_f42d_4c95_7f2d);
     (0..frames)
         .map(|k| {
             let (a, b) = (random.uniform(), random.uniform());

@@ -36,7 +36,6 @@ mod model_file;
 mod phi;
 mod physical;
 pub mod quantities;
-mod random;
 mod roots;
 mod simulate;
 mod state_space;
@@ -53,7 +52,6 @@ pub use modal::Zpk;
 pub use model::{Covariance, Model, Noise};
 pub use nalgebra::Complex;
 pub use physical::{NotIdentifiable, PhysicalParameters, SecondOrder};
-pub use random::Gaussian;
 pub use simulate::{Sampled, SimulateError, SimulateOptions, Simulator, simulate, simulate_at};
 pub use state_space::StateSpace;
 pub use transfer::{

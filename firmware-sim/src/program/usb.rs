@@ -1,7 +1,7 @@
 //! The line as USB makes it: moments in which it takes nothing, and bytes in packets.
 
 use super::args::StallOption;
-use cellpos_emulator::Gaussian;
+use cellpos_numeric::Random;
 
 /// A microframe of high-speed USB, ns: a packet each way.
 const MICROFRAME_NS: i64 = 125_000;
@@ -20,7 +20,7 @@ pub struct Usb {
 struct RandomStalls {
     per_s: f64,
     longest_ms: f64,
-    dice: Gaussian,
+    dice: Random,
     now_ns: [i64; 2],
 }
 
@@ -58,7 +58,7 @@ impl Usb {
                     let mut random = RandomStalls {
                         per_s: rate.value(),
                         longest_ms: longest.value() * 1e3,
-                        dice: Gaussian::new(seed, number),
+                        dice: Random::stream(seed, number),
                         now_ns: [i64::MAX; 2],
                     };
                     random.draw(start_ns);

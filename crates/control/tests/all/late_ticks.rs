@@ -1,9 +1,7 @@
 //! A loop that is woken late now and then: its fixes are exposed between the ticks.
 
 use cellpos_control::*;
-use rand_core::Rng;
-use rand_xoshiro::Xoshiro256PlusPlus;
-use rand_xoshiro::rand_core::SeedableRng;
+use cellpos_numeric::Random;
 
 const PERIOD_S: f64 = 1e-3;
 const DELAY_S: f64 = 2e-3;
@@ -14,20 +12,15 @@ const DIFFUSION_UM2_PER_S: f64 = 0.33;
 
 /// Brownian motion and flow in fine steps; every position is kept.
 struct World {
-    random: Xoshiro256PlusPlus,
+    random: Random,
     gain_per_s: f64,
     path_um: Vec<f64>,
 }
 
 impl World {
-    fn normal(&mut self) -> f64 {
-        let mut uniform = || (self.random.next_u64() >> 11) as f64 / (1_u64 << 53) as f64;
-        (-2.0 * (1.0 - uniform()).ln()).sqrt() * (std::f64::consts::TAU * uniform()).cos()
-    }
-
     fn advance(&mut self, command_um: f64) {
         let dt = PERIOD_S / FINE as f64;
-        let walk_um = (2.0 * DIFFUSION_UM2_PER_S * dt).sqrt() * self.normal();
+        let walk_um = (2.0 * DIFFUSION_UM2_PER_S * dt).sqrt() * self.random.normal();
         let here = self.path_um.last().copied().unwrap_or(0.0);
         let flow = self.gain_per_s * (command_um - NEUTRAL_UM);
         self.path_um.push(here + flow * dt + walk_um);
@@ -40,7 +33,7 @@ impl World {
 fn hold(seed: u64, late: f64, every: usize) -> (f64, f64, usize) {
     let model = LoopModel::eq6(DELAY_S);
     let mut world = World {
-        random: Xoshiro256PlusPlus::seed_from_u64(seed),
+        random: Random::new(seed),
         gain_per_s: model.gain_per_s,
         path_um: vec![0.0; 3 * FINE],
     };
@@ -63,7 +56,7 @@ fn hold(seed: u64, late: f64, every: usize) -> (f64, f64, usize) {
         while world.path_um.len() <= 3 * FINE + tick * FINE + behind_steps {
             world.advance(command_um);
         }
-        let noise_um = 6.5e-4 * world.normal();
+        let noise_um = 6.5e-4 * world.random.normal();
         let age_samples = (behind + 0.5).floor();
         let out = controller.step(&LoopInput {
             measurement: Some(Measurement {

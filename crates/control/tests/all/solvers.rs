@@ -2,20 +2,19 @@
 
 use cellpos_control::active_set::{QpEnd, QpMatrices, QpVectors, ROWS, Stop, VARS, WorkingSet};
 use cellpos_control::*;
+use cellpos_numeric::Random;
 use clarabel::algebra::CscMatrix;
 use clarabel::solver::{
     DefaultSettingsBuilder, DefaultSolver, IPSolver, SolverStatus, SupportedConeT,
 };
 use nalgebra::DMatrix;
-use rand_core::{Rng, SeedableRng};
-use rand_xoshiro::Xoshiro256PlusPlus;
 
-fn uniform(random: &mut Xoshiro256PlusPlus, low: f64, high: f64) -> f64 {
-    low + (high - low) * (random.next_u64() >> 11) as f64 / (1u64 << 53) as f64
+fn uniform(random: &mut Random, low: f64, high: f64) -> f64 {
+    low + (high - low) * random.uniform()
 }
 
 /// Matrices of the shape of MPC: bounds on each variable, on differences, and on random mixtures.
-fn matrices(random: &mut Xoshiro256PlusPlus) -> QpMatrices {
+fn matrices(random: &mut Random) -> QpMatrices {
     let root = DMatrix::from_fn(VARS, VARS, |i, j| {
         if j <= i {
             uniform(random, -1.0, 1.0)
@@ -39,7 +38,7 @@ fn matrices(random: &mut Xoshiro256PlusPlus) -> QpMatrices {
 }
 
 /// Bounds that a random point keeps, some of them exactly, so that rows are often active together and dependent.
-fn vectors(m: &QpMatrices, random: &mut Xoshiro256PlusPlus) -> QpVectors {
+fn vectors(m: &QpMatrices, random: &mut Random) -> QpVectors {
     let mut inside = [0.0; VARS];
     let step = uniform(random, 0.1, 1.0);
     for b in 0..VARS {
@@ -113,7 +112,7 @@ fn the_active_set_solver_agrees_with_clarabel_to_1_nm_in_the_first_move() {
     } else {
         100_000
     };
-    let mut random = Xoshiro256PlusPlus::seed_from_u64(5);
+    let mut random = Random::new(5);
     let (mut solved, mut infeasible, mut constrained) = (0, 0, 0);
     let mut largest_um: f64 = 0.0;
     let mut set = WorkingSet::default();
@@ -177,7 +176,7 @@ fn the_active_set_solver_agrees_with_clarabel_to_1_nm_in_the_first_move() {
 
 #[test]
 fn a_problem_without_a_point_within_its_bounds_is_called_infeasible() {
-    let mut random = Xoshiro256PlusPlus::seed_from_u64(1);
+    let mut random = Random::new(1);
     let m = matrices(&mut random);
     let mut v = vectors(&m, &mut random);
     // Two neighbours are held apart further than their slew allows.

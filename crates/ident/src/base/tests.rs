@@ -1,6 +1,6 @@
 use super::*;
-use crate::random::Random;
 use crate::sampled::Hold;
+use cellpos_numeric::Random;
 
 /// Steps that are held for `held` rows.
 fn steps(rows: usize, held: usize, seed: u64) -> Vec<f64> {

@@ -14,8 +14,8 @@ use crate::frequency_response::{DetectionLine, DrivenStretch, FrequencyPoint, Se
 use crate::rational::{RationalFit, fit_orders};
 use crate::sampled::Sampling;
 use crate::spectral::{find_lines, residual_of, welch};
-use crate::stats::student_t_quantile;
 use crate::tone_fit::{ToneFit, Whitening};
+use cellpos_numeric::statistics::student_t_quantile;
 use nalgebra::Complex;
 
 fn rms(x: &[f64]) -> f64 {

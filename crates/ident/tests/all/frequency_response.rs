@@ -8,9 +8,9 @@ use cellpos_ident::excitation::{ExcitationLimits, PAPER_FREQUENCIES_HZ, Signal, 
 use cellpos_ident::experiment::{Cause, Plan, PlannedSegment};
 use cellpos_ident::frequency_response::{DrivenStretch, Estimator, Settings, measure};
 use cellpos_ident::order_selection::OrderSelection;
-use cellpos_ident::random::Random;
 use cellpos_ident::sampled::Sampling;
 use cellpos_ident::summary::{literal_per_hertz, summarise};
+use cellpos_numeric::Random;
 use cellpos_plant::{Complex, DiscretePlant, Seconds, TransferFunction};
 
 const TWO_PI: f64 = 2.0 * std::f64::consts::PI;

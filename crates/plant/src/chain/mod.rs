@@ -13,7 +13,7 @@ mod tied;
 
 use crate::effects::{EffectError, Piece};
 use crate::model::Model;
-use crate::random::Gaussian;
+use cellpos_numeric::Random;
 use compile::{Compiled, Stage};
 pub use tied::TiedPlant;
 
@@ -96,7 +96,7 @@ pub struct Chain {
 #[derive(Debug, Clone)]
 struct Brownian {
     diffusion_um2_per_s: f64,
-    gaussian: Gaussian,
+    gaussian: Random,
     on: bool,
 }
 
@@ -146,7 +146,7 @@ impl Chain {
         }
         chain.brownian = Some(Brownian {
             diffusion_um2_per_s: model.noise.diffusion_um2_per_s,
-            gaussian: Gaussian::new(seed),
+            gaussian: Random::new(seed),
             on: true,
         });
         Ok(chain)
@@ -281,11 +281,11 @@ impl Chain {
             && h_s > 0.0
         {
             let variance = 2.0 * b.diffusion_um2_per_s * h_s;
-            let step = variance.sqrt() * b.gaussian.next_normal();
+            let step = variance.sqrt() * b.gaussian.normal();
             if self.wants_area {
                 // The integral of a Brownian path given its ends: mean of the ends, variance 2 D h^3/12.
                 self.area_um_s +=
-                    h_s * (0.5 * step + (variance / 12.0).sqrt() * b.gaussian.next_normal());
+                    h_s * (0.5 * step + (variance / 12.0).sqrt() * b.gaussian.normal());
             }
             self.offset_um += step;
         }

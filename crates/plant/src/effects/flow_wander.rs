@@ -3,7 +3,7 @@
 use super::{
     Action, Block, Effect, EffectKind, Experiment, Form, ParameterSpec, Piece, Place, Scope, Spec,
 };
-use crate::random::Gaussian;
+use cellpos_numeric::Random;
 
 /// A flow that wanders: an Ornstein-Uhlenbeck process of `um_per_s` RMS and the correlation time `time_s`; nothing without a seed.
 pub fn flow_wander(um_per_s: f64, time_s: f64) -> Effect {
@@ -59,7 +59,7 @@ struct Wander {
     time_s: f64,
     speed: f64,
     way: f64,
-    random: Option<Gaussian>,
+    random: Option<Random>,
 }
 
 impl Block for Wander {
@@ -69,8 +69,7 @@ impl Block for Wander {
             && h_s > 0.0
         {
             let keep = (-h_s / self.time_s).exp();
-            self.speed =
-                keep * old + self.um_per_s * (1.0 - keep * keep).sqrt() * random.next_normal();
+            self.speed = keep * old + self.um_per_s * (1.0 - keep * keep).sqrt() * random.normal();
             self.way += 0.5 * (old + self.speed) * h_s;
         }
         Piece {
@@ -100,6 +99,6 @@ impl Block for Wander {
     }
 
     fn seed(&mut self, seed: u64) {
-        self.random = Some(Gaussian::new(seed));
+        self.random = Some(Random::new(seed));
     }
 }

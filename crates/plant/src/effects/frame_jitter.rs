@@ -3,7 +3,7 @@
 use super::{
     Action, Effect, EffectKind, Experiment, Form, ParameterSpec, Place, Scope, Shown, Spec,
 };
-use crate::random::Gaussian;
+use cellpos_numeric::Random;
 
 /// Each frame is late by a time drawn evenly from 0 to `up_to_s`; nothing without a seed.
 pub fn frame_jitter(up_to_s: f64) -> Effect {
@@ -52,7 +52,7 @@ struct Jitter {
     up_to_s: f64,
     /// Position and time before.
     last: Option<(f64, f64)>,
-    random: Option<Gaussian>,
+    random: Option<Random>,
 }
 
 impl Shown for Jitter {
@@ -76,6 +76,6 @@ impl Shown for Jitter {
     }
 
     fn seed(&mut self, seed: u64) {
-        self.random = Some(Gaussian::new(seed));
+        self.random = Some(Random::new(seed));
     }
 }

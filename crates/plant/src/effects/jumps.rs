@@ -3,7 +3,7 @@
 use super::{
     Action, Effect, EffectKind, Experiment, Form, ParameterSpec, Place, Scope, Shown, Spec,
 };
-use crate::random::Gaussian;
+use cellpos_numeric::Random;
 
 /// Steps of `um` either way at random times, `per_s` a second; nothing without a seed.
 pub fn jumps(per_s: f64, um: f64) -> Effect {
@@ -58,7 +58,7 @@ struct Steps {
     um: f64,
     at_um: f64,
     last_s: f64,
-    random: Option<Gaussian>,
+    random: Option<Random>,
 }
 
 impl Shown for Steps {
@@ -84,6 +84,6 @@ impl Shown for Steps {
     }
 
     fn seed(&mut self, seed: u64) {
-        self.random = Some(Gaussian::new(seed));
+        self.random = Some(Random::new(seed));
     }
 }

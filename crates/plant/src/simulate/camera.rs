@@ -3,7 +3,7 @@
 use crate::chain::{ChainError, in_range};
 use crate::effects::{Action, Shown};
 use crate::model::Model;
-use crate::random::Gaussian;
+use cellpos_numeric::Random;
 
 /// The camera's part of a model.
 #[derive(Debug, Clone)]
@@ -15,7 +15,7 @@ pub(super) struct Camera {
     /// What light, table and sensor make of a position.
     pub(super) shown: Vec<Box<dyn Shown>>,
     pub(super) localisation_um: f64,
-    pub(super) noise: Option<Gaussian>,
+    pub(super) noise: Option<Random>,
 }
 
 impl Camera {
@@ -34,7 +34,7 @@ impl Camera {
             shown: Vec::new(),
             localisation_um: model.noise.localisation_um,
             // A stream of its own, so that the Brownian path does not depend on the camera.
-            noise: seed.map(|s| Gaussian::new(s ^ 0x9e37_79b9_7f4a_7c15)),
+            noise: seed.map(|s| Random::new(s ^ 0x9e37_79b9_7f4a_7c15)),
         };
         let mut exposures = 0;
         for effect in model.ordered_effects() {
@@ -69,7 +69,7 @@ impl Camera {
             y = shown.show(y, time_s);
         }
         if let Some(noise) = &mut self.noise {
-            y += self.localisation_um * noise.next_normal();
+            y += self.localisation_um * noise.normal();
         }
         y
     }

@@ -1,8 +1,8 @@
 //! The exact discretisation and the chain against fine numerical integration and against each other.
 
+use cellpos_numeric::Random;
 use cellpos_plant::{
-    Chain, Complex, DiscretePlant, Gaussian, Hertz, Model, Seconds, StateSpace, TransferFunction,
-    effects,
+    Chain, Complex, DiscretePlant, Hertz, Model, Seconds, StateSpace, TransferFunction, effects,
 };
 use std::f64::consts::TAU;
 
@@ -39,8 +39,8 @@ fn integrate(
 }
 
 fn noise(n: usize, seed: u64) -> Vec<f64> {
-    let mut g = Gaussian::new(seed);
-    (0..n).map(|_| g.next_normal()).collect()
+    let mut g = Random::new(seed);
+    (0..n).map(|_| g.normal()).collect()
 }
 
 fn plants() -> Vec<TransferFunction> {

@@ -1,9 +1,9 @@
 //! The paper's facts, as far as they can be recomputed from its equations.
 
+use cellpos_numeric::Random;
 use cellpos_plant::{
-    Complex, DiscretePlant, EQ5_LITERAL_PER_S, EQ5_VELOCITY_GAIN_PER_S, Gaussian, Hertz,
-    NotIdentifiable, PhysicalParameters, SecondOrder, Seconds, StateSpace, TransferFunction,
-    probably_per_hertz,
+    Complex, DiscretePlant, EQ5_LITERAL_PER_S, EQ5_VELOCITY_GAIN_PER_S, Hertz, NotIdentifiable,
+    PhysicalParameters, SecondOrder, Seconds, StateSpace, TransferFunction, probably_per_hertz,
 };
 use std::f64::consts::TAU;
 
@@ -74,11 +74,11 @@ fn the_63_of_eq_5_is_a_gain_at_1_hz_and_means_2_pi_63_per_second() {
     }
 }
 
-fn between(random: &mut Gaussian, low: f64, high: f64) -> f64 {
+fn between(random: &mut Random, low: f64, high: f64) -> f64 {
     low * (high / low).powf(random.uniform())
 }
 
-fn random_rig(random: &mut Gaussian) -> PhysicalParameters {
+fn random_rig(random: &mut Random) -> PhysicalParameters {
     PhysicalParameters {
         a1_m2: between(random, 1e-6, 1e-3),
         a2_m2: between(random, 1e-11, 1e-9),
@@ -94,7 +94,7 @@ fn random_rig(random: &mut Gaussian) -> PhysicalParameters {
 
 #[test]
 fn eq_4_agrees_with_a_numeric_solution_of_eq_1_to_3_for_random_rigs() {
-    let mut random = Gaussian::new(1);
+    let mut random = Random::new(1);
     for _ in 0..500 {
         let rig = random_rig(&mut random);
         let eq4 = rig.second_order().transfer_function().unwrap();
@@ -111,7 +111,7 @@ fn eq_4_agrees_with_a_numeric_solution_of_eq_1_to_3_for_random_rigs() {
 
 #[test]
 fn the_limits_a5_and_a6_are_those_of_the_response() {
-    let mut random = Gaussian::new(2);
+    let mut random = Random::new(2);
     for _ in 0..100 {
         let rig = random_rig(&mut random);
         let slow = rig.solve(Hertz(1e-9)).unwrap().norm();
@@ -165,7 +165,7 @@ fn the_listed_damping_ratios_are_rounded_and_eq_6_is_not_made_of_them() {
 
 #[test]
 fn physical_parameters_come_back_once_geometry_and_one_mass_are_given() {
-    let mut random = Gaussian::new(3);
+    let mut random = Random::new(3);
     for _ in 0..100 {
         let rig = random_rig(&mut random);
         let back = PhysicalParameters::from_second_order(
@@ -193,7 +193,7 @@ fn physical_parameters_come_back_once_geometry_and_one_mass_are_given() {
 
 #[test]
 fn scaling_all_forces_or_both_areas_cannot_be_seen_in_the_transfer_function() {
-    let rig = random_rig(&mut Gaussian::new(4));
+    let rig = random_rig(&mut Random::new(4));
     let scaled = PhysicalParameters {
         a1_m2: 2.0 * rig.a1_m2,
         a2_m2: 2.0 * rig.a2_m2,

@@ -1,6 +1,7 @@
 //! Sensors whose noise is slow and returns: neither a walk, that would swallow slow errors, nor an error of the model.
 
-use cellpos_plant::{Gaussian, Model, Noise, SimulateOptions, TransferFunction, effects, simulate};
+use cellpos_numeric::Random;
+use cellpos_plant::{Model, Noise, SimulateOptions, TransferFunction, effects, simulate};
 use cellpos_reconcile::{NoiseKind, Options, Reconciliation, Record, Verdict, reconcile};
 
 const ROWS: usize = 6000;
@@ -22,20 +23,20 @@ fn plant() -> Model {
 
 /// The model's answer to held random levels of a size, with slow and white noise.
 fn record(name: &str, model: &Model, size: f64, seed: u64) -> Record {
-    let mut random = Gaussian::new(seed);
+    let mut random = Random::new(seed);
     let mut u = Vec::with_capacity(ROWS);
     while u.len() < ROWS {
-        let level = size * random.next_normal();
+        let level = size * random.normal();
         u.extend(std::iter::repeat_n(level, 20));
     }
     let keep = (-1.0 / SLOW_ROWS).exp();
-    let mut slow = SLOW_UM * random.next_normal();
+    let mut slow = SLOW_UM * random.normal();
     let y: Vec<f64> = simulate(model, &u, 1e-3, &SimulateOptions::default())
         .unwrap()
         .iter()
         .map(|y| {
-            slow = keep * slow + SLOW_UM * (1.0 - keep * keep).sqrt() * random.next_normal();
-            y + slow + WHITE_UM * random.next_normal()
+            slow = keep * slow + SLOW_UM * (1.0 - keep * keep).sqrt() * random.normal();
+            y + slow + WHITE_UM * random.normal()
         })
         .collect();
     let t: Vec<f64> = (0..ROWS).map(|k| k as f64 * 1e-3).collect();

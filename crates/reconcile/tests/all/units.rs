@@ -1,7 +1,8 @@
 //! What is said of records must not depend on the units that they are in.
 
+use cellpos_numeric::Random;
 use cellpos_plant::effects::{self, Place};
-use cellpos_plant::{Effect, Gaussian, Model, Noise, SimulateOptions, TransferFunction, simulate};
+use cellpos_plant::{Effect, Model, Noise, SimulateOptions, TransferFunction, simulate};
 use cellpos_reconcile::{Options, Reconciliation, Record, Units, Verdict, reconcile};
 
 const STEP_S: f64 = 1e-2;
@@ -39,10 +40,10 @@ fn records(hidden: Effect, [input, output]: [f64; 2]) -> Vec<Record> {
     let model = plant().with_effect(hidden);
     (0..2)
         .map(|seed| {
-            let mut random = Gaussian::new(seed);
+            let mut random = Random::new(seed);
             let mut u = Vec::new();
             while u.len() < 1500 {
-                u.extend(std::iter::repeat_n(1.0 + random.next_normal(), 25));
+                u.extend(std::iter::repeat_n(1.0 + random.normal(), 25));
             }
             let options = SimulateOptions {
                 seed: Some(seed + 7),
@@ -161,10 +162,10 @@ fn a_slow_plant_may_be_later_than_a_fast_one() {
         },
         ..plant()
     };
-    let mut random = Gaussian::new(3);
+    let mut random = Random::new(3);
     let mut u = Vec::new();
     while u.len() < 2400 {
-        u.extend(std::iter::repeat_n(50.0 + 20.0 * random.next_normal(), 80));
+        u.extend(std::iter::repeat_n(50.0 + 20.0 * random.normal(), 80));
     }
     let hidden = heater.clone().with_effect(effects::time_delay(35.0));
     let options = SimulateOptions {

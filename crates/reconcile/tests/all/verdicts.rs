@@ -1,10 +1,11 @@
 //! What a verdict rests on: a floor, numbers that hold everywhere, and a list of effects that grows from outside.
 
+use cellpos_numeric::Random;
 use cellpos_plant::effects::{
     self, Action, Block, Candidate, EffectKind, Experiment, Form, ParameterSpec, Piece, Place,
     Scope, Spec, lin,
 };
-use cellpos_plant::{Effect, Gaussian, Model, Noise, SimulateOptions, TransferFunction, simulate};
+use cellpos_plant::{Effect, Model, Noise, SimulateOptions, TransferFunction, simulate};
 use cellpos_reconcile::{FloorSource, Options, Reconciliation, Record, Verdict, reconcile};
 use std::f64::consts::TAU;
 
@@ -24,10 +25,10 @@ fn plant() -> Model {
 
 /// Held levels at random, 20 rows each.
 fn levels(rows: usize, size: f64, seed: u64) -> Vec<f64> {
-    let mut random = Gaussian::new(seed);
+    let mut random = Random::new(seed);
     let mut u = Vec::with_capacity(rows);
     while u.len() < rows {
-        let level = size * random.next_normal();
+        let level = size * random.normal();
         u.extend(std::iter::repeat_n(level, 20));
     }
     u.truncate(rows);
@@ -249,8 +250,8 @@ fn without_a_floor_nothing_is_named_in_a_thousand_records() {
 
 #[test]
 fn a_measured_input_rests_and_repeats_within_its_own_noise() {
-    let mut random = Gaussian::new(3);
-    let mut noisy = |u: f64| u + 0.01 * random.next_normal();
+    let mut random = Random::new(3);
+    let mut noisy = |u: f64| u + 0.01 * random.normal();
     let t: Vec<f64> = (0..4000).map(|k| k as f64 * 1e-3).collect();
     let sine: Vec<f64> = (0..4000)
         .map(|k| noisy((TAU * 2.0 * f64::from(k) * 1e-3).sin()))
@@ -273,8 +274,8 @@ fn a_measured_input_rests_and_repeats_within_its_own_noise() {
 /// One moving record and a measured rest: the floor comes from the rest, the held-out check from the end of the record.
 #[test]
 fn a_rest_that_is_measured_gives_the_floor_of_one_moving_record() {
-    let mut random = Gaussian::new(4);
-    let mut noisy = |u: f64| u + 0.01 * random.next_normal();
+    let mut random = Random::new(4);
+    let mut noisy = |u: f64| u + 0.01 * random.normal();
     // A rest that is measured: the floor comes from it.
     let truth = plant().with_effect(effects::gain_error(1.2));
     let rest: Vec<f64> = (0..2000).map(|_| noisy(0.0) * 0.03).collect();

@@ -1,6 +1,7 @@
 //! A rig in a closed loop whose zero flow moves: the command then holds what the flow did, and no effect may be made of it.
 
-use cellpos_plant::{Gaussian, Model, Noise};
+use cellpos_numeric::Random;
+use cellpos_plant::{Model, Noise};
 use cellpos_reconcile::{Options, Reconciliation, Record, Verdict, reconcile};
 use std::f64::consts::TAU;
 
@@ -28,12 +29,12 @@ fn closed_loop(flow: Flow, gain: f64, seed: u64) -> Record {
         num[1] / den[0] - direct * slow[0],
         num[2] / den[0] - direct * slow[1],
     ];
-    let mut random = Gaussian::new(seed);
+    let mut random = Random::new(seed);
     let step_s = ROW_S / STEPS_A_ROW as f64;
     let late = (DELAY_S / step_s).round() as usize;
     let mut commands = vec![0.0; ROWS * STEPS_A_ROW + late];
     let keep = (-ROW_S / flow.time_s).exp();
-    let mut wander = flow.wander_um * random.next_normal();
+    let mut wander = flow.wander_um * random.normal();
     let (mut x, mut walk, mut sum) = ([0.0, 0.0], 0.0, 0.0);
     let (mut t, mut u, mut y) = (Vec::new(), Vec::new(), Vec::new());
     for k in 0..ROWS {
@@ -48,7 +49,7 @@ fn closed_loop(flow: Flow, gain: f64, seed: u64) -> Record {
             let bends = input - slow[0] * x[1] - slow[1] * x[0];
             x = [x[0] + step_s * x[1], x[1] + step_s * bends];
         }
-        let seen = position + walk + 0.012 * random.next_normal();
+        let seen = position + walk + 0.012 * random.normal();
         sum += seen * ROW_S;
         let tones: f64 = [0.7, 1.9, 4.1, 9.7, 17.3, 31.1, 53.9]
             .iter()
@@ -62,8 +63,8 @@ fn closed_loop(flow: Flow, gain: f64, seed: u64) -> Record {
         t.push(now_s);
         u.push(WORKING_POINT_UM + command);
         y.push(seen);
-        walk += (2.0 * 0.33 * ROW_S).sqrt() * random.next_normal();
-        wander = keep * wander + (1.0 - keep * keep).sqrt() * flow.wander_um * random.next_normal();
+        walk += (2.0 * 0.33 * ROW_S).sqrt() * random.normal();
+        wander = keep * wander + (1.0 - keep * keep).sqrt() * flow.wander_um * random.normal();
     }
     Record::from_rows("loop", &t, &u, &y).unwrap()
 }

@@ -4,7 +4,7 @@ use super::Drifting;
 use cellpos_experiment::identify::Done;
 use cellpos_ident::bare_fft;
 use cellpos_ident::excitation::PAPER_FREQUENCIES_HZ;
-use cellpos_ident::random::Random;
+use cellpos_numeric::Random;
 use cellpos_report::{Axis, Figure, Panel, Series};
 
 const TWO_PI: f64 = 2.0 * std::f64::consts::PI;

@@ -2,7 +2,7 @@
 
 use cellpos_ident::candidate_model::CandidateModel;
 use cellpos_ident::experiment::{Bench, Row};
-use cellpos_ident::random::Random;
+use cellpos_numeric::Random;
 use cellpos_plant::{Complex, DiscretePlant, DiscreteState, Seconds, TransferFunction};
 
 /// Positions only, 1 kHz, held by PI.
