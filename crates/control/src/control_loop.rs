@@ -358,6 +358,7 @@ impl<L: ControlLaw> ControlLoop<L> {
             command_um: limited.command_um,
             requested_um,
             estimate_um: estimate.position_um,
+            estimate_sd_um: estimate.position_sd_um,
             predicted_measurement_um: estimate.predicted_measurement_um,
             neutral_um,
             innovation_um: estimate.innovation_um,

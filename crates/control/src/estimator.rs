@@ -14,6 +14,7 @@ mod flow_step;
 mod retune;
 mod stuck;
 mod transition;
+mod uncertainty;
 
 use crate::error::BuildError;
 use crate::loop_model::{LoopModel, MODES};
@@ -92,6 +93,8 @@ pub struct EstimatorState {
 pub struct Estimate {
     /// Bead position now, just before the command takes effect, um.
     pub position_um: f64,
+    /// Standard deviation of that position, um.
+    pub position_sd_um: f64,
     /// Neutral: the PZT displacement at which the bead rests, um.
     pub neutral_um: f64,
     /// What this tick's measurement shows by the model, um.
@@ -372,6 +375,7 @@ impl Estimator {
         );
         Estimate {
             position_um: self.position(&m),
+            position_sd_um: self.present_sd_um(state, back),
             neutral_um: state.neutral_um,
             predicted_measurement_um: self.position(&predicted),
             innovation_um,

@@ -96,6 +96,8 @@ pub struct LoopOutput {
     pub requested_um: f64,
     /// Bead position now (just before the command takes effect), um.
     pub estimate_um: f64,
+    /// Standard deviation of that estimate, um.
+    pub estimate_sd_um: f64,
     /// Predicted (or, with a measurement, filtered) position at the nominal time of this tick's measurement, um.
     pub predicted_measurement_um: f64,
     /// PZT displacement at which the bead rests, um.

@@ -286,6 +286,10 @@ impl<C: Camera> PositionSource for VisionSource<C> {
         }))
     }
 
+    fn truth_um(&mut self) -> f64 {
+        self.camera.truth_um()
+    }
+
     fn info(&self) -> SourceInfo {
         let mut info = self.camera.info();
         info.field_um = self.calibration.field_um(info.width_px, info.height_px);

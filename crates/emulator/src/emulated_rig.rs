@@ -198,6 +198,10 @@ impl Camera for EmulatedCamera {
         }))
     }
 
+    fn truth_um(&mut self) -> f64 {
+        self.rig.now().world().bead_um()
+    }
+
     fn info(&self) -> SourceInfo {
         self.rig.info("emulated camera", true)
     }
@@ -232,6 +236,10 @@ impl PositionSource for EmulatedPositions {
                 true_pzt_um,
             }),
         )
+    }
+
+    fn truth_um(&mut self) -> f64 {
+        self.rig.now().world().bead_um()
     }
 
     fn info(&self) -> SourceInfo {

@@ -219,7 +219,8 @@ impl OnRig {
         };
         let handing = Handing::new(sender, &schedule.spans, 1e-9 * period_ns as f64);
         let sink = Viewed::new(handing, view.as_deref_mut());
-        let running = rig.arm(&setup, core, sink, EndRule::default())?.start()?;
+        let armed = rig.arm(&setup, core, sink, EndRule::default())?;
+        let running = armed.moving_the_bead().start()?;
         let operator = Arc::clone(running.operator());
         let mut ticks: Vec<TickRecord> = Vec::new();
         let mut ended = 0;
@@ -246,7 +247,10 @@ impl OnRig {
         let (done, of) = (acquired.records.len(), schedule.spans.len());
         acquired.trouble = if done == of {
             None
-        } else if finished.ended.kind == EndKind::ReferenceOver {
+        } else if matches!(
+            finished.ended.kind,
+            EndKind::ReferenceOver | EndKind::NotKept
+        ) {
             Some(Trouble::Spoilt {
                 missing: of - done,
                 of,

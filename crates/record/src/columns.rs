@@ -135,6 +135,7 @@ columns! {
     verdict U8 Loop,
     target_um F64 Loop,
     estimate_um F64 Loop,
+    estimate_sd_um F64 Loop,
     neutral_um F64 Loop,
     requested_um F64 Loop,
     command_um F64 Loop,

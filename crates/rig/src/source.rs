@@ -114,6 +114,11 @@ pub trait Camera: Send {
         deadline_ns: i64,
     ) -> Result<Option<FrameStamp>, CameraError>;
 
+    /// Where the bead truly is now, um, where anything knows (emulated rig only, else NaN): for moments without a frame.
+    fn truth_um(&mut self) -> f64 {
+        f64::NAN
+    }
+
     /// What the camera says of itself; `field_um` counts from the left border when the calibration is not known here.
     fn info(&self) -> SourceInfo;
 }
@@ -125,6 +130,10 @@ impl<C: Camera + ?Sized> Camera for Box<C> {
         deadline_ns: i64,
     ) -> Result<Option<FrameStamp>, CameraError> {
         (**self).next_frame(buffer, deadline_ns)
+    }
+
+    fn truth_um(&mut self) -> f64 {
+        (**self).truth_um()
     }
 
     fn info(&self) -> SourceInfo {
@@ -180,6 +189,11 @@ pub trait PositionSource: Send {
     /// # Errors
     /// [`CameraError`] when there will be no more.
     fn next(&mut self, deadline_ns: i64) -> Result<Option<Measurement>, CameraError>;
+
+    /// Where the bead truly is now, um, where anything knows (emulated rig only, else NaN): for moments without a position.
+    fn truth_um(&mut self) -> f64 {
+        f64::NAN
+    }
 
     /// What the source says of itself.
     fn info(&self) -> SourceInfo;

@@ -21,6 +21,7 @@
 
 mod account;
 mod checks;
+mod clipped;
 mod following;
 mod in_force;
 mod life_cycle;
@@ -42,7 +43,6 @@ use cellpos_control::{
 };
 use cellpos_plant::TransferFunction;
 use cellpos_rig::ActuatorReport;
-use cellpos_rig::ActuatorState;
 use cellpos_units::Seconds;
 use std::ops::Range;
 
@@ -88,6 +88,7 @@ struct State {
     in_force: in_force::Board,
     told_um: f64,
     following: following::Following,
+    clipped: clipped::Clipped,
     /// Where the flow stands still, for a PZT that has to stop without a bead to tell.
     rest: rest::Rest,
     /// That of the freeze in force, um.
@@ -169,6 +170,11 @@ impl<R: ReferenceGenerator> Core<R> {
             settings.model.gain_per_s,
             timing.camera_delay_ms * 1e-3,
         );
+        let clipped = clipped::Clipped::new(
+            &settings.estimator,
+            &settings.model,
+            timing.camera_delay_ms * 1e-3,
+        );
         let diffusion_um2_per_s = settings.estimator.diffusion_um2_per_s;
         controller.start(displacement_um, neutral_um);
         Ok(Self {
@@ -217,6 +223,7 @@ impl<R: ReferenceGenerator> Core<R> {
                 in_force: in_force::Board::new(displacement_um, neutral_um),
                 told_um: neutral_um,
                 following,
+                clipped,
                 rest: rest::Rest::new(neutral_um),
                 rest_um: neutral_um,
                 pictures_repeated: 0,
@@ -445,6 +452,8 @@ impl<R: ReferenceGenerator> Core<R> {
         let output = self.controller.step(&given);
         self.state.told_um = output.neutral_um;
         self.watch_following(fix, generated.reference_um, &output, tick);
+        let obeyed = in_force.is_none();
+        self.watch_clipping(fix, generated.reference_um, obeyed, &output, tick);
         let nominal = self.timing.camera_delay_ms * 1e-3 / self.sample_s;
         let used = fix.filter(|_| !output.flags.coasting && !output.flags.stuck);
         let seen = used.map(|fix| {
@@ -473,28 +482,6 @@ impl<R: ReferenceGenerator> Core<R> {
             SolverTerms::Recorded(SolverStatus::PreviousPlan, 0)
         } else {
             input.solver
-        }
-    }
-
-    fn action(&mut self, output: &LoopOutput, index: u64) -> Action {
-        /// Periods after which an order to park that the board has not confirmed is given again.
-        const REPEAT: u64 = 10;
-        if self.state.life != Life::Safe {
-            return Action::Command {
-                command_um: output.command_um,
-                neutral_um: output.neutral_um,
-            };
-        }
-        let confirmed = self
-            .state
-            .board
-            .is_some_and(|b| matches!(b.state, ActuatorState::Safe | ActuatorState::Disarmed));
-        match self.state.parked_at {
-            Some(at) if confirmed || index < at + REPEAT => Action::None,
-            _ => {
-                self.state.parked_at = Some(index);
-                Action::Park
-            }
         }
     }
 }

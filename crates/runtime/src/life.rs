@@ -345,6 +345,11 @@ pub enum EventKind {
         /// How long it was there.
         lasted_ms: f64,
     },
+    /// The bead follows the commands up to a level and no further: amplifier, supply or PZT is clipped.
+    ActuatorClipped {
+        /// The level, about, um of PZT.
+        level_um: f64,
+    },
     /// The board reports another state or fault.
     BoardChanged {
         /// State.

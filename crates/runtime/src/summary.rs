@@ -1,6 +1,7 @@
 //! What a run amounts to: errors, losses and timing, gathered as the records go by.
 
 use crate::core::Counts;
+use crate::keeping::{Hold, KeepWatch, Kept};
 use crate::latency::Quantiles;
 use crate::life::{Life, SafeReason};
 use crate::recording::RecorderReport;
@@ -11,31 +12,25 @@ use cellpos_control::Adaptation;
 use cellpos_rig::CommandAccount;
 use serde::Serialize;
 
-/// Running sums of one error.
+/// Running sums of one quantity.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 struct Moments {
     n: u64,
     sum: f64,
     sum_of_squares: f64,
-    peak: f64,
 }
 
 impl Moments {
-    fn add(&mut self, error_um: f64) {
-        if error_um.is_finite() {
+    fn add(&mut self, value: f64) {
+        if value.is_finite() {
             self.n += 1;
-            self.sum += error_um;
-            self.sum_of_squares += error_um * error_um;
-            self.peak = self.peak.max(error_um.abs());
+            self.sum += value;
+            self.sum_of_squares += value * value;
         }
     }
 
     fn rms_nm(&self) -> Option<f64> {
         (self.n > 0).then(|| (self.sum_of_squares / self.n as f64).sqrt() * 1e3)
-    }
-
-    fn mean_nm(&self) -> Option<f64> {
-        (self.n > 0).then(|| self.sum / self.n as f64 * 1e3)
     }
 }
 
@@ -78,8 +73,9 @@ pub const SETTLED_AFTER_S: f64 = 2.0;
 pub struct Statistics {
     settled_after_ns: i64,
     running_since_ns: Option<i64>,
-    frozen: bool,
-    measured: Moments,
+    /// The bead of the newest record is held.
+    held: bool,
+    keeping: KeepWatch,
     truth: Moments,
     variance: Moments,
     step: Option<StepWatch>,
@@ -142,14 +138,23 @@ impl Statistics {
         Self {
             settled_after_ns: (settled_after_s * 1e9) as i64,
             running_since_ns: None,
-            frozen: false,
-            measured: Moments::default(),
+            held: false,
+            keeping: KeepWatch::default(),
             truth: Moments::default(),
             variance: Moments::default(),
             step: None,
             plan: PlanWatch::default(),
             last: None,
             targets: [(i64::MIN, f64::NAN); TARGETS],
+        }
+    }
+
+    /// The same for a run that is to hold a bead, as well as can be expected.
+    #[must_use]
+    pub fn holding(self, hold: Hold) -> Self {
+        Self {
+            keeping: KeepWatch::expecting(hold),
+            ..self
         }
     }
 
@@ -160,12 +165,11 @@ impl Statistics {
         }
         self.targets.copy_within(0..TARGETS - 1, 1);
         self.targets[0] = (record.time_ns, record.target_um);
-        // A bead that is frozen is not being held on its reference: what it wanders is no error of the loop. The same way
-        // back as after closing the loop when it goes on.
-        if record.flags.has(TickFlags::FREEZE) {
-            self.frozen = true;
-        } else if record.is_running() {
-            if std::mem::take(&mut self.frozen) && self.running_since_ns.is_some() {
+        // A bead that the operator froze is not being held on its reference: what it wanders is no error of the loop. The same way
+        // back as after closing the loop when it goes on. A bead that was not seen is no less far off for that.
+        let held = KeepWatch::is_held(record);
+        if held {
+            if !self.held && self.running_since_ns.is_some() {
                 self.running_since_ns = Some(record.time_ns);
             }
             let seen_um = if record.true_um.is_finite() {
@@ -187,15 +191,17 @@ impl Statistics {
             if let Some(step) = &mut self.step {
                 step.add(seen_um, record.time_ns - since);
             }
-            // A bead that is frozen is not tracked: its distance from the reference is no error.
-            let tracked = !record.flags.has(TickFlags::FREEZE);
-            if tracked && record.time_ns - since >= self.settled_after_ns {
-                self.measured
-                    .add(record.measured_um - self.target_at(record.mid_exposure_ns));
+            let counts = record.time_ns - since >= self.settled_after_ns;
+            let then_um = self.target_at(record.mid_exposure_ns);
+            self.keeping.add(record, then_um, counts);
+            if counts {
                 self.truth.add(record.true_um - record.target_um);
                 self.variance.add(record.variance_um2);
             }
+        } else {
+            self.keeping.pause();
         }
+        self.held = held;
         self.last = Some(*record);
     }
 
@@ -239,32 +245,33 @@ impl Statistics {
 
     /// RMS of measured position less reference so far, nm.
     pub fn rms_measured_nm(&self) -> Option<f64> {
-        self.measured.rms_nm()
+        self.keeping.rms_measured_nm()
     }
 
     /// Positions that the errors are of.
     pub fn positions(&self) -> u64 {
-        self.measured.n
+        self.keeping.positions()
     }
 
     /// Mean of measured position less reference so far, nm.
     pub fn mean_error_nm(&self) -> Option<f64> {
-        self.measured.mean_nm()
+        self.keeping.mean_nm()
     }
 
     /// Largest distance of a measured position from its reference so far, nm.
     pub fn peak_error_nm(&self) -> Option<f64> {
-        (self.measured.n > 0).then_some(self.measured.peak * 1e3)
+        self.keeping.peak_nm()
     }
 
-    /// Whether the errors of this tick are among those counted: the loop closed and settled, the bead not frozen.
+    /// How the run has kept its bead so far.
+    pub fn kept(&self) -> Kept {
+        self.keeping.kept()
+    }
+
+    /// Whether the errors of this tick are among those counted: the loop closed and settled, the bead not frozen by the operator.
     pub fn counts_now(&self) -> bool {
-        let running = self
-            .last
-            .as_ref()
-            .filter(|r| r.is_running() && !self.frozen);
-        running
-            .zip(self.running_since_ns)
+        let held = self.last.as_ref().filter(|_| self.held);
+        held.zip(self.running_since_ns)
             .is_some_and(|(r, since)| r.time_ns - since >= self.settled_after_ns)
     }
 }
@@ -290,12 +297,51 @@ pub enum End {
     Safe,
 }
 
-/// The figures of a run. Errors count from two seconds after the loop was closed (or went on after a freeze) until the bead is
-/// frozen or the PZT parks; `None` where there is nothing to say.
+/// In what state a run ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum EndState {
+    /// The board was not armed.
+    Disarmed,
+    /// The loop was never closed.
+    Armed,
+    /// The loop ran, and kept its bead.
+    Running,
+    /// The loop ran to the end and did not keep its bead: [`Kept::why`].
+    NotKept,
+    /// Safe was latched.
+    Safe,
+}
+
+impl EndState {
+    fn new(life: Life, kept: &Kept) -> Self {
+        match life {
+            Life::Disarmed => Self::Disarmed,
+            Life::Armed => Self::Armed,
+            Life::Running if kept.why.is_some() => Self::NotKept,
+            Life::Running => Self::Running,
+            Life::Safe => Self::Safe,
+        }
+    }
+
+    /// Its name.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Disarmed => "disarmed",
+            Self::Armed => "armed",
+            Self::Running => "running",
+            Self::NotKept => "not-kept",
+            Self::Safe => "safe",
+        }
+    }
+}
+
+/// The figures of a run. Errors count from two seconds after the loop was closed (or went on after a freeze by the operator) until
+/// the PZT parks, moments without a fix among them; `None` where there is nothing to say.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Summary {
-    /// Life-cycle state in which the run ended: `running` unless something went wrong.
-    pub state: Life,
+    /// State in which the run ended: `running` unless something went wrong.
+    pub state: EndState,
     /// Why it ended.
     pub end: End,
     /// Why Safe was latched, if it was.
@@ -315,7 +361,9 @@ pub struct Summary {
     pub commands_lost: Option<u64>,
     /// Of these, commands that the line did not take before a newer one replaced them.
     pub commands_not_taken: Option<u64>,
-    /// RMS of measured position less reference, nm.
+    /// How the run kept its bead, and its error.
+    pub kept: Kept,
+    /// RMS of measured position less reference, nm; moments without a fix count through the estimate.
     pub rms_measured_nm: Option<f64>,
     /// RMS of true position less reference, nm (emulated rig).
     pub rms_true_nm: Option<f64>,
@@ -388,8 +436,9 @@ impl Summary {
         period_us: f64,
     ) -> Self {
         let last_ns = statistics.last().map_or(0, |record| record.time_ns);
+        let kept = statistics.kept();
         Self {
-            state: life,
+            state: EndState::new(life, &kept),
             end,
             safe_reason,
             duration_s: (last_ns as f64 + period_us * 1e3) * 1e-9,
@@ -399,10 +448,11 @@ impl Summary {
             events_lost: account.events_lost,
             commands_lost: None,
             commands_not_taken: None,
-            rms_measured_nm: statistics.measured.rms_nm(),
+            kept,
+            rms_measured_nm: statistics.keeping.rms_measured_nm(),
             rms_true_nm: statistics.truth.rms_nm(),
-            mean_error_nm: statistics.measured.mean_nm(),
-            peak_error_nm: (statistics.measured.n > 0).then_some(statistics.measured.peak * 1e3),
+            mean_error_nm: statistics.keeping.mean_nm(),
+            peak_error_nm: statistics.keeping.peak_nm(),
             fix_noise_nm: statistics.fix_noise_um().map(|um| um * 1e3),
             step: statistics.step_result(),
             adaptation: None,

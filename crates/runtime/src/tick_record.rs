@@ -51,6 +51,9 @@ impl TickFlags {
     /// Since the previous tick it became known that a command was lost: the line did not take it, or the board never named it.
     pub const COMMAND_LOST: u32 = 1 << 19;
 
+    /// The bead does not follow the commands beyond a level: the actuator is clipped.
+    pub const CLIPPED: u32 = 1 << 20;
+
     /// Whether all bits of `mask` are set.
     pub fn has(self, mask: u32) -> bool {
         self.0 & mask == mask
@@ -102,6 +105,8 @@ pub struct TickRecord {
     pub area_sd_um2: f64,
     /// Estimated bead position at the tick, um.
     pub estimate_um: f64,
+    /// Standard deviation of that estimate, um.
+    pub estimate_sd_um: f64,
     /// Estimated PZT displacement at which the bead is at rest, um.
     pub neutral_um: f64,
     /// Output of the controller before the limits, um.
@@ -166,6 +171,7 @@ impl TickRecord {
             decision: 255,
             target_um: f64::NAN,
             estimate_um: f64::NAN,
+            estimate_sd_um: f64::NAN,
             neutral_um: f64::NAN,
             requested_um: f64::NAN,
             command_um: f64::NAN,

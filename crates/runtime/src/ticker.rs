@@ -104,6 +104,8 @@ pub struct Ticker<R> {
     ticks: u64,
     previous_late_ns: Option<u32>,
     steered_um: Option<f64>,
+    /// Where the bead truly is at this tick, um, where anything knows.
+    truth_um: f64,
     previous_refused: bool,
     slow_vision_ns: Option<u32>,
     board_watch: BoardWatch,
@@ -141,6 +143,7 @@ impl<R: ReferenceGenerator> Ticker<R> {
             ticks: 0,
             previous_late_ns: None,
             steered_um: None,
+            truth_um: f64::NAN,
             previous_refused: false,
             slow_vision_ns: None,
             board_watch: BoardWatch::new(silence_ns),
@@ -217,6 +220,11 @@ impl<R: ReferenceGenerator> Ticker<R> {
         self.steered_um = target_um;
     }
 
+    /// Says where the bead truly is now, um: for the record of a tick without a frame.
+    pub(crate) fn tell_truth(&mut self, bead_um: f64) {
+        self.truth_um = bead_um;
+    }
+
     /// One tick, due at `due_ns`. Before its time has come ([`Ticker::opens_ns`]) nothing is done.
     pub fn tick(&mut self, due_ns: i64, request: Request) -> Life {
         let start_ns = self.clock.now_ns();
@@ -270,6 +278,9 @@ impl<R: ReferenceGenerator> Ticker<R> {
             return self.core.life();
         };
         let mut record = output.record;
+        if record.true_um.is_nan() {
+            record.true_um = self.truth_um;
+        }
         self.previous_refused = false;
         if output.action != Action::None {
             let order = Order {

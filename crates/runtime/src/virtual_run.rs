@@ -72,6 +72,7 @@ pub fn run<R: ReferenceGenerator, S: RunSink>(
         if recorder.fault().is_some() && asked != Request::Park {
             asked = Request::Unrecorded;
         }
+        ticker.tell_truth(source.truth_um());
         let life = ticker.tick(now_ns, asked);
         acting.round();
         // A recorder that waits for its disk leaves records in the ring; a full ring refuses, and the refusal is counted.

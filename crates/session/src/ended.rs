@@ -5,7 +5,9 @@ use crate::words::{is_odd, safe_reason};
 use cellpos_rig::{ActuatorFault as Fault, ActuatorState as State};
 use cellpos_runtime::life::{EventKind, Refusal, SafeReason};
 use cellpos_runtime::recorder::RecorderFault;
-use cellpos_runtime::{ArmingConfig, End, Event, Life, RunError, Summary, Timing};
+use cellpos_runtime::{
+    ArmingConfig, End, EndState, Event, Kept, NotKept, RunError, Summary, Timing,
+};
 use serde::Serialize;
 use std::fmt;
 
@@ -21,6 +23,8 @@ pub enum EndKind {
     Operator,
     /// The loop was never closed: the plant did not answer the arming pulse as the model says, or no bead was seen.
     ArmingRefused,
+    /// It ran as long as it was to, and did not keep its bead.
+    NotKept,
     /// The loop went safe while it ran.
     Safe,
     /// The run could no longer be recorded.
@@ -113,6 +117,8 @@ pub(crate) struct Clues {
     late_us: Option<f64>,
     stale_ms: Option<f64>,
     vision_ms: Option<[f64; 2]>,
+    /// Displacement beyond which the bead does not follow, um.
+    clipped_um: Option<f64>,
 }
 
 impl Clues {
@@ -127,6 +133,7 @@ impl Clues {
                 self.refused_at = event.seq;
             }
             EventKind::ArmingPassed { gain_ratio, ci95 } => self.passed = Some((gain_ratio, ci95)),
+            EventKind::ActuatorClipped { level_um } => self.clipped_um = Some(level_um),
             EventKind::BoardChanged { state, fault } => self.board = Some((state, fault)),
             EventKind::LateTick { compute_us } => self.late_us = Some(compute_us),
             EventKind::FrameStale { age_ms } => self.stale_ms = Some(age_ms),
@@ -173,20 +180,23 @@ impl Clues {
         let refused = summary.safe_reason == Some(SafeReason::ArmingRefused);
         let by_operator = summary.end == End::Operator
             || summary.safe_reason == Some(SafeReason::Operator)
-            || trouble.is_none() && summary.state != Life::Safe && summary.end == End::Safe;
+            || trouble.is_none() && summary.state != EndState::Safe && summary.end == End::Safe;
+        let kept = &summary.kept;
         let kind = match (trouble, summary.state) {
             (Some(_), _) => EndKind::Failed,
             _ if recorder.is_some() => EndKind::Unrecorded,
             _ if by_operator => EndKind::Operator,
-            (None, Life::Safe) if refused => EndKind::ArmingRefused,
-            (None, Life::Safe) => EndKind::Safe,
-            (None, Life::Armed | Life::Disarmed) => EndKind::ArmingRefused,
-            (None, Life::Running) if summary.end == End::Script => EndKind::ReferenceOver,
-            (None, Life::Running) => EndKind::Done,
+            (None, EndState::Safe) if refused => EndKind::ArmingRefused,
+            (None, EndState::Safe) => EndKind::Safe,
+            (None, EndState::Armed | EndState::Disarmed) => EndKind::ArmingRefused,
+            (None, EndState::NotKept) => EndKind::NotKept,
+            (None, EndState::Running) if summary.end == End::Script => EndKind::ReferenceOver,
+            (None, EndState::Running) => EndKind::Done,
         };
         let (seen, wanted, to_do) = match kind {
             EndKind::Done => sentences("the time of the run was over", "", ""),
             EndKind::ReferenceOver => sentences("the reference came to its end", "", ""),
+            EndKind::NotKept => not_kept(kept, self.clipped_um),
             EndKind::Operator => sentences("the operator ended the run", "", ""),
             EndKind::Unrecorded => sentences(
                 recorder.map_or("the run was not recorded", RecorderFault::sentence),
@@ -391,6 +401,58 @@ impl Clues {
             "a board that follows this run's commands alone",
             "see that one program uses the board, and that this one is not suspended; then start again",
         )
+    }
+}
+
+/// A run that came to its end without the bead that it was to keep.
+fn not_kept(kept: &Kept, clipped_um: Option<f64>) -> Sentences {
+    let within_um = kept.held_within_nm.unwrap_or(f64::NAN) * 1e-3;
+    let held = kept.held_percent.map_or_else(String::new, |percent| {
+        format!("; {percent:.1} % of the time it was within {within_um:.2} um")
+    });
+    let times = |n: u64| {
+        if n == 1 {
+            "once".to_owned()
+        } else {
+            format!("{n} times")
+        }
+    };
+    let a_hold =
+        format!("within {within_um:.2} um of its reference (five standard deviations of hold)");
+    match kept.why {
+        Some(NotKept::AnotherBead) => sentences(
+            format!(
+                "the bead was lost, and {} a bead was taken that may be another",
+                times(kept.other_beads)
+            ),
+            "one bead in view from beginning to end",
+            "look at the events and the clip of the loss; a smaller density of beads, or a larger field of view, keeps one in view",
+        ),
+        Some(NotKept::OutOfSight) => sentences(
+            format!(
+                "the bead was out of sight when the run ended, for {:.0} ms",
+                kept.unseen_at_end_ms
+            ),
+            "a bead in view",
+            "check the camera (cellpos camera), and bring a bead into view",
+        ),
+        Some(NotKept::Clipped) => sentences(
+            match clipped_um {
+                Some(um) => format!("the bead did not follow the commands beyond {um:.1} um: the amplifier or the PZT is clipped"),
+                None => "the bead did not follow the commands beyond a level: the amplifier or the PZT is clipped".to_owned(),
+            },
+            "motion in proportion to the command over the whole range",
+            "check offset, supply and limits of the amplifier, and the range in [limits] of rig.toml",
+        ),
+        Some(NotKept::Strayed) | None => sentences(
+            format!(
+                "the bead strayed {}, up to {:.2} um from its reference{held}",
+                times(kept.strayed),
+                kept.furthest_um
+            ),
+            a_hold,
+            "look at the flow (leaks, taps, tubes), at the amplifier and at the model; cellpos report shows when it was",
+        ),
     }
 }
 

@@ -1,5 +1,6 @@
 //! A rig in hand, as types: [`Rig`] -> [`Armed`] -> [`Running`] -> [`Finished`].
 
+use crate::connect::diffusion_um2_per_s;
 use crate::devices::{Devices, Options, check_armed, session_number};
 use crate::ended::{Clues, Ended, Expected};
 use crate::failure::Failure;
@@ -18,7 +19,8 @@ use cellpos_runtime::live::{Operator, Threads};
 use cellpos_runtime::realtime::Conditions;
 use cellpos_runtime::recorder::RecorderReport;
 use cellpos_runtime::{
-    Core, EndRule, ReferenceGenerator, RunError, RunSink, Statistics, Summary, live, virtual_run,
+    Core, EndRule, Hold, ReferenceGenerator, RunError, RunSink, Statistics, Summary, live,
+    virtual_run,
 };
 use std::sync::Arc;
 use std::time::Duration;
@@ -208,12 +210,19 @@ impl Rig {
         sink: S,
         end: EndRule,
     ) -> Result<Armed<R, S>, Box<NotArmed<S>>> {
+        let timing = &setup.config.timing;
+        let hold = Hold::new(
+            diffusion_um2_per_s(&self.file, &setup.model),
+            timing.camera_delay_ms * 1e-3,
+            timing.period_us * 1e-6,
+        );
         match self.try_arm(setup) {
             Ok((place, memory)) => Ok(Armed {
                 rig: self,
                 core,
                 sink,
                 end,
+                statistics: Statistics::default().holding(hold),
                 expected: Expected {
                     timing: setup.config.timing,
                     arming: setup.config.arming,
@@ -307,6 +316,7 @@ pub struct Armed<R, S> {
     core: Core<R>,
     sink: S,
     end: EndRule,
+    statistics: Statistics,
     expected: Expected,
     _memory: Option<LockedMemory>,
     _place: Place,
@@ -320,6 +330,15 @@ where
     /// Who may ask for freeze, park, pause.
     pub fn operator(&self) -> &Arc<Operator> {
         &self.rig.operator
+    }
+
+    /// The same for an experiment that moves the bead: how far it goes from its reference is no failure.
+    #[must_use]
+    pub fn moving_the_bead(self) -> Self {
+        Self {
+            statistics: Statistics::default(),
+            ..self
+        }
     }
 
     /// Starts the loop on threads of its own.
@@ -345,6 +364,7 @@ where
             core,
             sink,
             end,
+            statistics,
             expected,
         } = self;
         let sink = Witness {
@@ -354,7 +374,6 @@ where
         let operator = std::mem::take(&mut rig.operator);
         let connected = &mut rig.devices.connected;
         let (source, actuator) = (connected.source.as_mut(), connected.actuator.as_mut());
-        let statistics = Statistics::default();
         let finished = if connected.clock.is_virtual() {
             let asked = |_| operator.take();
             let clock = &connected.clock;

@@ -182,6 +182,9 @@ fn text(kind: &EventKind) -> String {
         EventKind::StuckStarted => "The bead does not follow the PZT: it sticks.".to_string(),
         EventKind::StuckEnded { lasted_ms } => ended("The bead follows again", lasted_ms),
         EventKind::SaturationStarted => "The PZT is at an end of its range.".to_string(),
+        EventKind::ActuatorClipped { level_um } => format!(
+            "The bead does not follow the commands beyond about {level_um:.1} um: the amplifier or the PZT is clipped."
+        ),
         EventKind::SaturationEnded { lasted_ms } => {
             ended("The PZT is off the end of its range", lasted_ms)
         }

@@ -101,6 +101,7 @@ ORDER: Tuple[str, ...] = (
     "sigma_um",
     "target_um",
     "estimate_um",
+    "estimate_sd_um",
     "neutral_um",
     "requested_um",
     "applied_um",

@@ -61,7 +61,7 @@ pub fn run(args: Args) -> CommandResult {
             ticks.end_s() + gap_s.unwrap_or(0.0)
         };
         let mut batches = reader.batches().map_err(Failure::failed)?;
-        ticks.begin(start_s);
+        ticks.begin(start_s, reader.meta().ok().and_then(bound::hold_of));
         for batch in batches.by_ref() {
             batch.iter().for_each(|record| ticks.add(record));
         }

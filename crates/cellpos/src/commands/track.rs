@@ -2,6 +2,7 @@
 
 use crate::arguments::{positive, run_name};
 use crate::clips;
+use crate::kept;
 use crate::keys::{self, Steering};
 use crate::notify::{NotifyArgs, What};
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
@@ -404,12 +405,11 @@ fn text(report: &Report) -> String {
         "duration",
         format!("{:.3} s, {} ticks", s.duration_s, s.counts.ticks),
     );
+    line("error", kept::error(&s.kept));
+    line("held", kept::held(&s.kept));
     line(
         "error, measured",
-        format!(
-            "{} RMS from 2 s after the loop was closed until the freeze",
-            nm(s.rms_measured_nm)
-        ),
+        format!("{} RMS, noise of the fixes included", nm(s.rms_measured_nm)),
     );
     if s.rms_true_nm.is_some() {
         line(

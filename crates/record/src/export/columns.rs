@@ -194,6 +194,8 @@ columns! {
         "Reference at the tick.";
     "estimate_um" "um" Number(|r| r.tick.estimate_um),
         "Estimated position of the bead at the tick.";
+    "estimate_sd_um" "um" Number(|r| r.tick.estimate_sd_um),
+        "Standard deviation of that estimate. It grows while the bead is not seen.";
     "neutral_um" "um" Number(|r| r.tick.neutral_um),
         "Estimated zero-flow displacement: the PZT displacement at which the bead rests.";
     "requested_um" "um" Number(|r| r.tick.requested_um),

@@ -3,10 +3,10 @@
 use super::Core;
 use crate::life::{EventKind, Life};
 use crate::reference::{ReferenceGenerator, ReferenceOutput};
-use crate::tick::{Tick, TickInput};
+use crate::tick::{Action, Tick, TickInput};
 use crate::tick_record::{TickFlags, TickRecord};
 use cellpos_control::{LoopOutput, SolverStatus};
-use cellpos_rig::ActuatorFault;
+use cellpos_rig::{ActuatorFault, ActuatorState};
 
 impl<R: ReferenceGenerator> Core<R> {
     /// Flags and events that follow from the controller's output.
@@ -164,6 +164,7 @@ impl<R: ReferenceGenerator> Core<R> {
             length_sd_um: m.map_or(f64::NAN, |m| m.length_sd_um),
             area_sd_um2: m.map_or(f64::NAN, |m| m.area_sd_um2),
             estimate_um: output.estimate_um,
+            estimate_sd_um: output.estimate_sd_um,
             neutral_um: output.neutral_um,
             requested_um: output.requested_um,
             command_um: output.command_um,
@@ -185,6 +186,29 @@ impl<R: ReferenceGenerator> Core<R> {
             solver_active: output.solver.active.min(255) as u8,
             solver_ns: output.solver.solve_ns,
             law: self.controller.record(),
+        }
+    }
+
+    /// What the board is told.
+    pub(super) fn action(&mut self, output: &LoopOutput, index: u64) -> Action {
+        /// Periods after which an order to park that the board has not confirmed is given again.
+        const REPEAT: u64 = 10;
+        if self.state.life != Life::Safe {
+            return Action::Command {
+                command_um: output.command_um,
+                neutral_um: output.neutral_um,
+            };
+        }
+        let confirmed = self
+            .state
+            .board
+            .is_some_and(|b| matches!(b.state, ActuatorState::Safe | ActuatorState::Disarmed));
+        match self.state.parked_at {
+            Some(at) if confirmed || index < at + REPEAT => Action::None,
+            _ => {
+                self.state.parked_at = Some(index);
+                Action::Park
+            }
         }
     }
 }

@@ -4,6 +4,7 @@ use super::{Core, following};
 use crate::life::{EventKind, FreezeReason, Life};
 use crate::reference::ReferenceGenerator;
 use crate::tick::Tick;
+use crate::tick_record::TickFlags;
 use cellpos_control::{LoopOutput, Measurement as LoopMeasurement};
 
 impl<R: ReferenceGenerator> Core<R> {
@@ -38,6 +39,39 @@ impl<R: ReferenceGenerator> Core<R> {
         };
         if self.state.following.step(seen) {
             self.freeze(FreezeReason::NotFollowing, tick);
+        }
+    }
+
+    /// A bead that follows the commands up to a level and no further.
+    pub(super) fn watch_clipping(
+        &mut self,
+        fix: Option<LoopMeasurement>,
+        reference_um: f64,
+        obeyed: bool,
+        output: &LoopOutput,
+        tick: &mut Tick,
+    ) {
+        let state = &mut self.state;
+        if state.clipped.is_told() {
+            tick.flags.set(TickFlags::CLIPPED);
+        }
+        let driven = state.life == Life::Running && !state.frozen.any();
+        if !driven || !obeyed || output.flags.stuck {
+            state.clipped.clear();
+            return;
+        }
+        let on_time = fix.filter(|fix| {
+            !tick.disturbed && fix.age_samples == 0 && fix.offset_samples.abs() < 0.2
+        });
+        let level_um = state.clipped.step(
+            on_time.map(|fix| (fix.position_um, fix.variance_um2)),
+            reference_um,
+            output.command_um,
+            output.neutral_um,
+        );
+        if let Some(level_um) = level_um {
+            tick.flags.set(TickFlags::CLIPPED);
+            tick.event(EventKind::ActuatorClipped { level_um });
         }
     }
 

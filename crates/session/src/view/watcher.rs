@@ -5,7 +5,7 @@ use crate::adapt;
 use crate::words::{Level, safe_reason, sentence};
 use cellpos_live::{Banner, ClipLine, CycleRow, EventLine, Feed, Row, State};
 use cellpos_runtime::life::EventKind;
-use cellpos_runtime::{Event, Life, NoSink, Statistics, Summary, TickFlags, TickRecord};
+use cellpos_runtime::{EndState, Event, Life, NoSink, Statistics, Summary, TickFlags, TickRecord};
 
 /// What a sink knows of its run that the page is to show besides what passes through it.
 pub trait Shown {
@@ -253,7 +253,7 @@ impl Watcher {
             records_lost: summary.records_lost,
             ..std::mem::take(&mut self.state)
         };
-        self.over(summary.state == Life::Safe, ended);
+        self.over(summary.state == EndState::Safe, ended);
     }
 
     /// The run is over, for a reason in a sentence.

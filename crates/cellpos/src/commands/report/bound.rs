@@ -3,6 +3,7 @@
 use super::ticks::Ticks;
 use cellpos_control::design::bound_rms_um;
 use cellpos_record::RunMeta;
+use cellpos_runtime::Hold;
 use std::f64::consts::PI;
 
 /// What Brownian motion, delay and localisation noise leave to the best controller while holding.
@@ -15,21 +16,28 @@ pub struct Bound {
     period_s: f64,
 }
 
+/// Diffusion of the bead, um^2/s, delay of the camera and period of the loop, s, as a run.toml has them.
+fn loop_of(meta: &RunMeta) -> Option<(f64, f64, f64)> {
+    let timing = meta.config.get("timing")?;
+    let at = |key: &str| timing.get(key)?.as_float();
+    let diffusion_um2_per_s = cellpos_session::recorded::diffusion_of_run_um2_per_s(meta)?;
+    Some((
+        diffusion_um2_per_s,
+        at("camera_delay_ms")? * 1e-3,
+        at("period_us")? * 1e-6,
+    ))
+}
+
+/// How well the bead of a run is to be held, if its run.toml says enough.
+pub fn hold_of(meta: &RunMeta) -> Option<Hold> {
+    let (diffusion_um2_per_s, delay_s, period_s) = loop_of(meta)?;
+    Some(Hold::new(diffusion_um2_per_s, delay_s, period_s))
+}
+
 impl Bound {
     /// The bound of a run, if its run.toml says enough.
     pub fn of(meta: Option<&RunMeta>, ticks: &Ticks) -> Option<Self> {
-        let meta = meta?;
-        let at = |path: &[&str]| -> Option<f64> {
-            let (first, rest) = path.split_first()?;
-            let mut value = meta.config.get(*first)?;
-            for key in rest {
-                value = value.get(*key)?;
-            }
-            value.as_float()
-        };
-        let diffusion_um2_per_s = cellpos_session::recorded::diffusion_of_run_um2_per_s(meta)?;
-        let delay_s = at(&["timing", "camera_delay_ms"])? * 1e-3;
-        let period_s = at(&["timing", "period_us"])? * 1e-6;
+        let (diffusion_um2_per_s, delay_s, period_s) = loop_of(meta?)?;
         Some(Self {
             diffusion_um2_per_s,
             rms_um: bound_rms_um(diffusion_um2_per_s, ticks.noise_um(), delay_s, period_s),

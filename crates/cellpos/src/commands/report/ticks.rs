@@ -3,7 +3,7 @@
 use super::envelope::Envelope;
 use super::spectrum::Welch;
 use super::spread::Spread;
-use cellpos_runtime::{Statistics, TickRecord};
+use cellpos_runtime::{Hold, Statistics, TickRecord};
 use std::collections::VecDeque;
 
 /// Ticks remembered to find the reference of the time of an exposure.
@@ -71,14 +71,15 @@ impl Ticks {
         }
     }
 
-    /// A session begins at a time of the run.
-    pub fn begin(&mut self, start_s: f64) {
+    /// A session begins at a time of the run; its bead is to be held so well.
+    pub fn begin(&mut self, start_s: f64, hold: Option<Hold>) {
         self.start_s = start_s;
         self.past.clear();
         self.traces.gap();
         self.length.gap();
         self.session += 1;
-        self.statistics.push(Statistics::default());
+        let statistics = Statistics::default();
+        (self.statistics).push(hold.map_or(statistics, |hold| statistics.holding(hold)));
     }
 
     /// The next tick.

@@ -9,7 +9,7 @@ use cellpos_script::{CycleRow, Plan};
 use cellpos_session::clips::Clipped;
 use cellpos_session::setup::Setup;
 use cellpos_session::view::{View, Viewed};
-use cellpos_session::{Ended, Finished, connect};
+use cellpos_session::{EndKind, Ended, Finished, connect};
 use std::path::PathBuf;
 
 /// A run that is over.
@@ -58,7 +58,9 @@ pub(super) fn conclude(
     drop(view);
     warnings.extend(clips::warnings(kept_clips));
     let script = sink.end();
+    let not_kept = ended.kind == EndKind::NotKept;
     let outcome = match (ended.as_asked(), script.complete()) {
+        (false, false) if not_kept && script.is_stop() => "stopped",
         (false, _) => summary.state.name(),
         (true, true) => "done",
         (true, false) if script.is_stop() => "stopped",

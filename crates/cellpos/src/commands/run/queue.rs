@@ -127,7 +127,7 @@ impl Queue {
                 EndKind::Done | EndKind::ReferenceOver => None,
                 EndKind::Operator if over.outcome != "aborted" => None,
                 // One cell that is lost is one row; a rig that fails would fail every further cell.
-                EndKind::Safe => None,
+                EndKind::Safe | EndKind::NotKept => None,
                 _ => Some(format!("cell {number}: {}", over.ended)),
             };
             self.add(number, over)?;

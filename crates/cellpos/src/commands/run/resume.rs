@@ -193,7 +193,10 @@ pub fn ready(folder: &Path, best_effort: bool) -> Result<Option<Ready>, Failure>
         .checked_sub(1)
         .and_then(|last| plan.cycle(last))
         .map_or(0.0, |last| last.start_s + last.duration_s);
-    let over = meta.end.as_ref().is_some_and(|end| end.outcome == "done");
+    let over = meta
+        .end
+        .as_ref()
+        .is_some_and(|end| WHOLE.contains(&end.outcome.as_str()));
     let sessions = sessions(folder);
     let last = sessions.last().map_or(folder, PathBuf::as_path);
     let last_done = is_done(last);
@@ -257,11 +260,14 @@ pub fn ready(folder: &Path, best_effort: bool) -> Result<Option<Ready>, Failure>
     }))
 }
 
+/// Outcomes of a script that came to its end.
+const WHOLE: [&str; 2] = ["done", "not-kept"];
+
 /// Whether a session's script came to its end.
 fn is_done(session: &Path) -> bool {
     RunReader::open(session).ok().is_some_and(|reader| {
         let end = reader.meta().ok().and_then(|meta| meta.end.as_ref());
-        end.is_some_and(|end| end.outcome == "done")
+        end.is_some_and(|end| WHOLE.contains(&end.outcome.as_str()))
     })
 }
 

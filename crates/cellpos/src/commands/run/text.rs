@@ -2,6 +2,7 @@
 
 use super::learning::NamedTable;
 use crate::cyclic;
+use crate::kept;
 use cellpos_runtime::Summary;
 use cellpos_runtime::realtime::Conditions;
 use cellpos_script::CycleRow;
@@ -129,13 +130,8 @@ impl<'a> Report<'a> {
             "error",
             format!("{} RMS over the cycles", or_dash(self.cycle_rms_nm, "nm")),
         );
-        line(
-            "error, all",
-            format!(
-                "{} RMS from 2 s after the loop was closed until the freeze",
-                or_dash(self.summary.rms_measured_nm, "nm")
-            ),
-        );
+        line("error, all", kept::error(&self.summary.kept));
+        line("held", kept::held(&self.summary.kept));
         line("lowest possible", or_dash(self.bound_rms_nm, "nm RMS"));
         if let Some(now) = &self.summary.adaptation {
             line("adaptation", adapt::text(now));
@@ -172,7 +168,7 @@ impl<'a> Report<'a> {
             line("WARNING", warning.clone());
         }
         line("run", self.ending.run.clone());
-        if self.ending.outcome != "done" {
+        if !["done", "not-kept"].contains(&self.ending.outcome) {
             line(
                 "go on with",
                 format!("cellpos run --resume {}", self.ending.folder),

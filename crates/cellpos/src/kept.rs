@@ -1,0 +1,25 @@
+//! How a run kept its bead, in the words of its last lines.
+
+use cellpos_runtime::Kept;
+
+/// The error of the bead.
+pub fn error(kept: &Kept) -> String {
+    let nm = (kept.rms_nm).map_or_else(|| "-".to_owned(), |nm| format!("{nm:.1} nm"));
+    let unseen = if kept.unseen_ms > 0.0 {
+        format!(", {:.0} ms without a position among them", kept.unseen_ms)
+    } else {
+        String::new()
+    };
+    format!("{nm} RMS from 2 s after the loop was closed{unseen}")
+}
+
+/// How long it was where it should be.
+pub fn held(kept: &Kept) -> String {
+    let Some((percent, nm)) = kept.held_percent.zip(kept.held_within_nm) else {
+        return "-".to_owned();
+    };
+    format!(
+        "{percent:.2} % of the time within {nm:.0} nm (five standard deviations of hold), at most {:.2} um off",
+        kept.furthest_um
+    )
+}
