@@ -283,6 +283,16 @@ impl<L: ControlLaw> ControlLoop<L> {
         }
     }
 
+    /// The PZT is brought to a zero flow that is not the newest estimate: what was learnt since is not believed, and the bead is
+    /// expected where it was seen last. Without that it would be expected as far away as the wrong zero flow says, and the command
+    /// would jump when it is seen again. um of PZT.
+    pub fn rest_at(&self, state: &mut LoopState<L::State>, zero_flow_um: f64) {
+        if zero_flow_um.is_finite() {
+            let scaled_um = self.parts.limits.nearest(zero_flow_um) * self.tuning(state).gain;
+            self.estimator_of(state).rest_at(&mut state.estimator, scaled_um);
+        }
+    }
+
     /// Estimate and reference of a tick.
     fn estimate<'a>(&self, state: &mut LoopState<L::State>, input: &LoopInput<'a>) -> Tick<'a> {
         let fix = input.measurement.as_ref().and_then(|m| self.fix(m));

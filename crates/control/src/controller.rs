@@ -52,6 +52,7 @@ trait AnyLoop: std::fmt::Debug + Send {
     fn start(&mut self, command_um: f64, neutral_um: f64);
     fn step(&mut self, input: &LoopInput) -> LoopOutput;
     fn skip(&mut self);
+    fn rest_at(&mut self, zero_flow_um: f64);
     fn estimator(&self) -> &EstimatorState;
     fn previous_command_um(&self) -> f64;
     fn neutral_um(&self) -> f64;
@@ -78,6 +79,10 @@ impl<L: ControlLaw> AnyLoop for Running<L> {
 
     fn skip(&mut self) {
         self.control.skip(&mut self.state);
+    }
+
+    fn rest_at(&mut self, zero_flow_um: f64) {
+        self.control.rest_at(&mut self.state, zero_flow_um);
     }
 
     fn estimator(&self) -> &EstimatorState {
@@ -227,6 +232,11 @@ impl Controller {
     /// A tick that never came, see [`ControlLoop::skip`].
     pub fn skip(&mut self) {
         self.running.skip();
+    }
+
+    /// The PZT is brought to a zero flow that is not the newest estimate, see [`ControlLoop::rest_at`].
+    pub fn rest_at(&mut self, zero_flow_um: f64) {
+        self.running.rest_at(zero_flow_um);
     }
 
     /// One tick.

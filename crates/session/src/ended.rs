@@ -353,6 +353,7 @@ impl Clues {
                 "a sequence number that moves with the commands",
                 "check the line to the board for damaged frames, and its baud rate",
             ),
+            SafeReason::NotFollowing if self.clipped_um.is_some() => return clipped(self.clipped_um),
             SafeReason::NotFollowing => sentences(
                 " further and further, until it was frozen",
                 "a bead that goes where the commands push it",
@@ -404,6 +405,18 @@ impl Clues {
     }
 }
 
+/// A bead that did not follow the commands beyond a level.
+fn clipped(level_um: Option<f64>) -> Sentences {
+    let beyond = level_um.map_or_else(|| "a level".to_owned(), |um| format!("about {um:.1} um"));
+    sentences(
+        format!(
+            "the bead did not follow the commands beyond {beyond}: the amplifier or the PZT is clipped, or the flow grows as fast as the commands"
+        ),
+        "motion in proportion to the command over the whole range",
+        "check offset, supply and limits of the amplifier, and the range in [limits] of rig.toml",
+    )
+}
+
 /// A run that came to its end without the bead that it was to keep.
 fn not_kept(kept: &Kept, clipped_um: Option<f64>) -> Sentences {
     let within_um = kept.held_within_nm.unwrap_or(f64::NAN) * 1e-3;
@@ -436,14 +449,7 @@ fn not_kept(kept: &Kept, clipped_um: Option<f64>) -> Sentences {
             "a bead in view",
             "check the camera (cellpos camera), and bring a bead into view",
         ),
-        Some(NotKept::Clipped) => sentences(
-            match clipped_um {
-                Some(um) => format!("the bead did not follow the commands beyond {um:.1} um: the amplifier or the PZT is clipped"),
-                None => "the bead did not follow the commands beyond a level: the amplifier or the PZT is clipped".to_owned(),
-            },
-            "motion in proportion to the command over the whole range",
-            "check offset, supply and limits of the amplifier, and the range in [limits] of rig.toml",
-        ),
+        Some(NotKept::Clipped) => clipped(clipped_um),
         Some(NotKept::Strayed) | None => sentences(
             format!(
                 "the bead strayed {}, up to {:.2} um from its reference{held}",

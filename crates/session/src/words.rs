@@ -39,7 +39,7 @@ pub fn safe_reason(reason: SafeReason) -> &'static str {
         SafeReason::Board => "the board left the session by itself",
         SafeReason::BoardForeign => "the board is in the session of another program",
         SafeReason::BoardNotObeying => "the board is heard but obeys no command",
-        SafeReason::NotFollowing => "the bead moved against the commands",
+        SafeReason::NotFollowing => "the bead did not follow the commands, or moved against them",
         SafeReason::BoardNotFollowing => "the board's output does not follow the commands",
         SafeReason::LinkLost => "the board was not heard for longer than allowed",
         SafeReason::ActuatorRingFull => "commands could not be handed over to the board",
@@ -61,7 +61,7 @@ fn freeze_reason(reason: FreezeReason) -> &'static str {
         FreezeReason::CameraStalled => "no frames come",
         FreezeReason::LineStalled => "the line to the board is stalled",
         FreezeReason::PictureFrozen => "the camera gives the same picture again and again",
-        FreezeReason::NotFollowing => "the bead moves against the commands",
+        FreezeReason::NotFollowing => "the bead does not follow the commands, or moves against them",
         FreezeReason::Unrecorded => "the run can no longer be recorded",
     }
 }

@@ -1,6 +1,6 @@
-//! How well the present position is known.
+//! How well the present position is known, and a zero flow that is believed instead of the estimate.
 
-use super::{Estimator, EstimatorState};
+use super::{Estimator, EstimatorState, HISTORY};
 
 impl Estimator {
     /// Standard deviation of the position `back` ticks after the filter's time: what is not known of the bead and of neutral then, and
@@ -19,5 +19,13 @@ impl Estimator {
             p22 += neutral_walk_um2;
         }
         p11.max(0.0).sqrt()
+    }
+
+    /// Believes this zero flow, and that the PZT has been there since the newest fix.
+    pub(crate) fn rest_at(&self, state: &mut EstimatorState, neutral_um: f64) {
+        state.neutral_um = neutral_um;
+        state.history_um = [neutral_um; HISTORY];
+        state.modes = Default::default();
+        state.covariance_um2[1] = 0.0;
     }
 }

@@ -20,8 +20,8 @@ const STEP_SIGMA: f64 = 5.0;
 const LEARNING_S: f64 = 0.025;
 /// Time over which the distance from the reference is averaged, and for which it must have been too large, s. The slowest integral
 /// of a law here is through in 0.15 s.
-const AVERAGE_S: f64 = 0.1;
-const AWAY_S: f64 = 0.5;
+const AVERAGE_S: f64 = 0.05;
+const AWAY_S: f64 = 0.1;
 /// Share of a fix in the innovations' variance.
 const VARIANCE_SHARE: f64 = 0.002;
 /// Ways in which commands push the bead.

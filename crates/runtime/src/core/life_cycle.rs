@@ -12,6 +12,14 @@ use cellpos_control::Mode;
 /// already no chance.
 const REPEATED_PICTURES: u32 = 3;
 
+/// Reasons to stop the bead for which the newest estimate of the zero flow may be what went wrong.
+const BLIND: [FreezeReason; 4] = [
+    FreezeReason::BeadLost,
+    FreezeReason::CameraStalled,
+    FreezeReason::PictureFrozen,
+    FreezeReason::NotFollowing,
+];
+
 impl<R: ReferenceGenerator> Core<R> {
     /// Time without a bead after which a run ends, ns.
     fn lost_ns(&self) -> i64 {
@@ -110,13 +118,7 @@ impl<R: ReferenceGenerator> Core<R> {
             (Life::Running, true) => {
                 tick.flags.set(TickFlags::FREEZE);
                 // With the bead in view the estimate of the zero flow goes on and is the best there is.
-                let blind = [
-                    FreezeReason::BeadLost,
-                    FreezeReason::CameraStalled,
-                    FreezeReason::PictureFrozen,
-                    FreezeReason::NotFollowing,
-                ];
-                if blind.into_iter().any(|reason| frozen.has(reason)) {
+                if BLIND.into_iter().any(|reason| frozen.has(reason)) {
                     Mode::Direct(self.state.rest_um)
                 } else {
                     Mode::Freeze
@@ -140,7 +142,11 @@ impl<R: ReferenceGenerator> Core<R> {
             return;
         }
         if !self.state.frozen.has(reason) {
-            self.state.rest_um = self.state.rest.zero_flow_um(self.controller.neutral_um());
+            let newest_um = self.controller.neutral_um();
+            self.state.rest_um = self.state.rest.zero_flow_um(newest_um);
+            if BLIND.contains(&reason) && self.state.rest_um != newest_um {
+                self.controller.rest_at(self.state.rest_um);
+            }
         }
         if self.state.frozen.add(reason) {
             self.state.frozen_since_ns = tick.time_ns;

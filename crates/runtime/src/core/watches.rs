@@ -72,6 +72,7 @@ impl<R: ReferenceGenerator> Core<R> {
         if let Some(level_um) = level_um {
             tick.flags.set(TickFlags::CLIPPED);
             tick.event(EventKind::ActuatorClipped { level_um });
+            self.freeze(FreezeReason::NotFollowing, tick);
         }
     }
 

@@ -2,6 +2,7 @@
 
 mod between_runs;
 mod common;
+mod keeping;
 mod multi_rate;
 mod rig_keys;
 mod rig_schema;

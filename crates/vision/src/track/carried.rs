@@ -1,6 +1,6 @@
 //! Beads that a flow carries while the frame is exposed.
 
-use super::neighbours::Candidate;
+use super::neighbours::{Candidate, MAX_BEADS};
 use super::{Chosen, Tracker};
 use crate::fix::FixQuality;
 use crate::frame::Frame;
@@ -15,7 +15,8 @@ impl Tracker {
         if self.exposure_s <= 0.0 || since_s <= 0.0 {
             return;
         }
-        for slot in &mut self.candidates {
+        let mut refitted = [None; MAX_BEADS];
+        for (slot, again) in self.candidates.iter_mut().zip(&mut refitted) {
             let Some(c) = *slot else { continue };
             let good = |c: &Candidate| {
                 c.fix.verdict == FixQuality::Good
@@ -34,9 +35,27 @@ impl Tracker {
             let fix = self.localiser.locate(frame, Some((c.fix.x_px, c.fix.y_px)));
             let carried = Candidate { fix, size: None };
             if good(&carried) {
-                *slot = Some(carried);
+                *slot = None;
+                *again = Some(carried);
             }
         }
         self.localiser.expect_streak(self.streak_px);
+        let radius_px = self.localiser.template().radius_px();
+        let drawn_out_px = f64::hypot(self.streak_px.0, self.streak_px.1) + radius_px;
+        for c in refitted.into_iter().flatten() {
+            // A fit with the wrong streak to the same light is no other bead, and one bead found twice is one.
+            for slot in &mut self.candidates {
+                let same = |o: &Candidate| {
+                    let apart_px = f64::hypot(o.fix.x_px - c.fix.x_px, o.fix.y_px - c.fix.y_px);
+                    let good = o.fix.verdict == FixQuality::Good
+                        && chosen.identity.agrees(&self.config, &o.fix, o.size);
+                    !good && apart_px < drawn_out_px
+                };
+                if slot.as_ref().is_some_and(same) {
+                    *slot = None;
+                }
+            }
+            self.add_candidate(c);
+        }
     }
 }

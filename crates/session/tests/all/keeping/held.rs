@@ -1,0 +1,320 @@
+//! One run of the table, and how it went by the truth.
+
+use super::law::Proportional;
+use cellpos_control::Controller;
+use cellpos_emulator::{FaultEvent, FaultKind};
+use cellpos_runtime::{EndRule, Event, RunSink, Statistics, TickFlags, TickRecord};
+use cellpos_session::rig_file::{ClockKind, Frames};
+use cellpos_session::setup::ReferenceSpec;
+use cellpos_session::{Options, Rig, RigFile};
+use std::fmt;
+
+/// Gain of Eq. (6) at the frequencies of a hold, 1/s.
+pub const GAIN_PER_S: f64 = 379.0;
+/// Start of the first event, and its errors count from there, s.
+const EVENT_S: f64 = 2.6;
+const FROM_NS: i64 = 2_550_000_000;
+
+/// What happens to a bead that is held.
+#[derive(Debug, Clone)]
+pub struct Row {
+    pub law: &'static str,
+    pub rate_hz: f64,
+    pub pixel_um: f64,
+    /// A second bead that far away from the beginning, um.
+    pub second_um: Option<f64>,
+    /// Speed of the flow that steps, um/s.
+    pub flow_um_per_s: f64,
+    pub events: Vec<(FaultKind, f64)>,
+    pub clip_um: f64,
+    pub drift_um_per_s: f64,
+    pub seconds: f64,
+}
+
+impl Row {
+    fn quiet(law: &'static str) -> Self {
+        Self {
+            law,
+            rate_hz: 1000.0,
+            pixel_um: 0.1,
+            second_um: None,
+            flow_um_per_s: 0.0,
+            events: Vec::new(),
+            clip_um: 40.0,
+            drift_um_per_s: 1e-3,
+            seconds: 4.0,
+        }
+    }
+
+    /// The flow steps, and back after 0.7 s.
+    pub fn step(law: &'static str, flow_um_per_s: f64) -> Self {
+        Self {
+            flow_um_per_s,
+            events: vec![(FaultKind::FlowStep, 0.7)],
+            ..Self::quiet(law)
+        }
+    }
+
+    /// A fault by its name in rig.toml, for a time.
+    pub fn event(law: &'static str, kind: &str, for_s: f64) -> Self {
+        let kind = toml::Value::String(kind.to_owned()).try_into();
+        Self {
+            events: vec![(kind.expect("a kind of fault"), for_s)],
+            ..Self::quiet(law)
+        }
+    }
+
+    /// The amplifier gives no more than this, um.
+    pub fn clipped(law: &'static str, clip_um: f64) -> Self {
+        Self {
+            clip_um,
+            events: vec![(FaultKind::ClipAmplifier, 9.0)],
+            seconds: 6.0,
+            ..Self::quiet(law)
+        }
+    }
+
+    /// The zero flow runs away faster than the law's integral follows.
+    pub fn drifting(law: &'static str, drift_um_per_s: f64) -> Self {
+        Self {
+            drift_um_per_s,
+            seconds: 3.0,
+            ..Self::quiet(law)
+        }
+    }
+
+    pub fn flow_step_um(&self) -> f64 {
+        self.flow_um_per_s / GAIN_PER_S
+    }
+
+    fn file(&self, seed: u64) -> RigFile {
+        let mut file = RigFile::default();
+        let period_us = 1e6 / self.rate_hz;
+        file.timing.period_us = period_us;
+        file.timing.budget_us = 0.5 * period_us;
+        file.timing.solver_us = 0.17 * period_us;
+        file.timing.coast_ticks = (20e3 / period_us) as u32;
+        file.timing.lost_ticks = (1e6 / period_us) as u32;
+        let world = &mut file.emulator;
+        world.seed = seed;
+        world.rate_hz = self.rate_hz;
+        world.exposure_ms = world.exposure_ms.min(0.5e3 / self.rate_hz);
+        world.pixel_um = self.pixel_um;
+        world.zero_flow_wander_um = 6e-3;
+        world.zero_flow_drift_um_per_s = self.drift_um_per_s;
+        world.faults.flow_step_um = self.flow_step_um();
+        world.faults.clip_um = self.clip_um;
+        let mut events = self.events.clone();
+        if let Some(um) = self.second_um {
+            world.faults.second_bead_um = um;
+            world.faults.event.push(FaultEvent {
+                kind: FaultKind::SecondBead,
+                at_s: 0.0,
+                for_s: None,
+            });
+            file.near_um = Some(0.0);
+        }
+        file.emulator
+            .faults
+            .event
+            .extend(events.drain(..).map(|(kind, for_s)| FaultEvent {
+                kind,
+                at_s: EVENT_S,
+                for_s: Some(for_s),
+            }));
+        file
+    }
+
+    /// Delay of this loop with half a tick of hold, and a tick, s.
+    pub fn delay_and_tick_s(&self) -> (f64, f64) {
+        let tick_s = 1.0 / self.rate_hz;
+        (2e-3 + 0.5 * tick_s, tick_s)
+    }
+}
+
+impl fmt::Display for Row {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let beside = self
+            .second_um
+            .map_or_else(|| "alone".to_owned(), |um| format!("beside {um} um"));
+        let events: Vec<String> = self
+            .events
+            .iter()
+            .map(|(kind, for_s)| format!("{kind:?} {for_s} s"))
+            .collect();
+        write!(
+            f,
+            "{:>4} {:>5} Hz {:.2} um/px {beside:>13} {:>6.0} um/s {}",
+            self.law,
+            self.rate_hz,
+            self.pixel_um,
+            self.flow_um_per_s,
+            events.join(", ")
+        )
+    }
+}
+
+#[derive(Default)]
+struct Ticks(Vec<TickRecord>);
+
+impl RunSink for Ticks {
+    fn tick(&mut self, record: &TickRecord) {
+        self.0.push(*record);
+    }
+    fn event(&mut self, _: &Event) {}
+    fn progress(&mut self, _: &Statistics) {}
+}
+
+/// How a run went.
+#[derive(Debug)]
+pub struct Held {
+    pub state: String,
+    pub why: Option<String>,
+    pub as_asked: bool,
+    pub ended: String,
+    /// Largest true distance from the target from the event on, um.
+    pub worst_um: f64,
+    /// RMS of the true distance over the ticks whose errors count, and the one that the run states, nm.
+    pub true_rms_nm: f64,
+    pub stated_rms_nm: f64,
+    /// Share of them within five standard deviations by the truth, and as stated, percent.
+    pub true_held_percent: f64,
+    pub stated_held_percent: f64,
+    /// Longest time without a break further off than that, ms.
+    pub longest_away_ms: f64,
+    pub other_beads: u64,
+    /// At the end another bead was being held.
+    pub changed: bool,
+}
+
+impl Held {
+    pub const HEAD: &'static str =
+        "row | worst um, RMS nm true (stated), held % true (stated), away ms, state";
+}
+
+impl fmt::Display for Held {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(
+            f,
+            "{:.2} | {:.1} ({:.1}) | {:.2} ({:.2}) | {:.0} | {}{}",
+            self.worst_um,
+            self.true_rms_nm,
+            self.stated_rms_nm,
+            self.true_held_percent,
+            self.stated_held_percent,
+            self.longest_away_ms,
+            self.state,
+            self.why
+                .as_deref()
+                .map_or_else(String::new, |why| format!(": {why}"))
+        )
+    }
+}
+
+/// Runs a row.
+pub fn hold(row: &Row, seed: u64) -> Held {
+    let options = Options {
+        clock: ClockKind::Virtual,
+        frames: Frames::On,
+        best_effort: true,
+    };
+    let mut rig = Rig::open(row.file(seed), options).expect("an emulated rig");
+    let own = row.law == "own";
+    let prepared = rig.prepare("eq6", if own { "lqg" } else { row.law });
+    let hold = ReferenceSpec::Hold { position_um: 0.0 };
+    let setup = rig
+        .set_up(prepared.expect("a law"), hold)
+        .expect("a set-up");
+    let core = if own {
+        let config = setup
+            .controller
+            .loop_config(&setup.model)
+            .expect("a configuration");
+        let law = config.with(Proportional { kp_um_per_um: 0.4 });
+        setup.core_with(Controller::with_law(law).expect("a loop"))
+    } else {
+        setup.core()
+    };
+    let end = EndRule {
+        ticks: Some((row.seconds * row.rate_hz) as u64),
+        ..EndRule::default()
+    };
+    let armed = rig.arm(&setup, core.expect("a core"), Ticks::default(), end);
+    let finished = armed
+        .ok()
+        .expect("armed")
+        .start()
+        .and_then(|run| run.wait());
+    let finished = finished.expect("a run");
+    judged(
+        &finished.sink.0,
+        &finished.summary,
+        finished.ended.as_asked(),
+        finished.ended.to_string(),
+    )
+}
+
+fn judged(
+    ticks: &[TickRecord],
+    summary: &cellpos_runtime::Summary,
+    as_asked: bool,
+    ended: String,
+) -> Held {
+    let kept = &summary.kept;
+    let within_um = kept.held_within_nm.expect("a hold") * 1e-3;
+    let off_um = |t: &TickRecord| (t.true_um - t.target_um).abs();
+    let after = || {
+        ticks
+            .iter()
+            .filter(|t| t.time_ns > FROM_NS && t.is_running())
+    };
+    assert!(
+        after().all(|t| off_um(t).is_finite()),
+        "the truth of every tick"
+    );
+    let closed_ns = ticks
+        .iter()
+        .find(|t| t.is_running())
+        .map_or(0, |t| t.time_ns);
+    let counted = || after_of(ticks, closed_ns + 2_000_000_000);
+    let n = counted().count().max(1) as f64;
+    let squares: f64 = counted().map(|t| off_um(t).powi(2)).sum();
+    let held = counted().filter(|t| off_um(t) <= within_um).count() as f64;
+    let (mut away_ns, mut since_ns) = (0, None);
+    for t in after() {
+        if off_um(t) > within_um {
+            let from_ns = *since_ns.get_or_insert(t.time_ns);
+            away_ns = away_ns.max(t.time_ns - from_ns);
+        } else {
+            since_ns = None;
+        }
+    }
+    let seen: Vec<&TickRecord> = after().filter(|t| t.measured_um.is_finite()).collect();
+    let changed = seen.iter().rev().take(20).any(|t| {
+        // The fix is of two milliseconds ago: a bead that is held has not gone far since.
+        (t.measured_um - t.true_um).abs() > 1.0 && !t.flags.has(TickFlags::STALE)
+    });
+    Held {
+        state: summary.state.name().to_owned(),
+        why: kept.why.map(|why| {
+            let word = serde_json::to_value(why).expect("a word");
+            word.as_str().unwrap_or_default().to_owned()
+        }),
+        as_asked,
+        ended,
+        worst_um: after().map(off_um).fold(0.0, f64::max),
+        true_rms_nm: (squares / n).sqrt() * 1e3,
+        stated_rms_nm: kept.rms_nm.unwrap_or(f64::NAN),
+        true_held_percent: 100.0 * held / n,
+        stated_held_percent: kept.held_percent.unwrap_or(f64::NAN),
+        longest_away_ms: away_ns as f64 * 1e-6,
+        other_beads: kept.other_beads,
+        changed,
+    }
+}
+
+fn after_of(ticks: &[TickRecord], from_ns: i64) -> impl Iterator<Item = &TickRecord> {
+    ticks
+        .iter()
+        .filter(move |t| t.time_ns >= from_ns && t.is_running())
+}

@@ -1,0 +1,96 @@
+//! The rows of the table, and what must hold in them.
+
+use super::held::{Held, Row};
+
+/// The laws: those of this project, and one of a user's own.
+pub const LAWS: [&str; 4] = ["lqg", "pi", "mpc", "own"];
+
+/// Every row of the nightly table.
+pub fn all() -> Vec<Row> {
+    let mut rows = Vec::new();
+    for law in LAWS {
+        for um_per_s in [38.0, -114.0, 190.0, -379.0, 568.0, -985.0] {
+            rows.push(Row::step(law, um_per_s));
+        }
+        for um_per_s in [-38.0, 379.0, -985.0] {
+            for rate_hz in [2000.0, 5000.0] {
+                rows.push(Row {
+                    rate_hz,
+                    ..Row::step(law, um_per_s)
+                });
+            }
+            for pixel_um in [0.15, 0.2, 0.25] {
+                rows.push(Row {
+                    pixel_um,
+                    ..Row::step(law, -um_per_s)
+                });
+            }
+            // Three radii of the bead.
+            rows.push(Row {
+                second_um: Some(1.5),
+                ..Row::step(law, um_per_s)
+            });
+        }
+        for for_s in [0.005, 0.02, 0.05, 0.1, 0.19] {
+            rows.push(Row::event(law, "link-loss", for_s));
+        }
+        for for_s in [0.02, 0.1, 0.4] {
+            rows.push(Row::event(law, "stall-camera", for_s));
+            rows.push(Row::event(law, "frozen-picture", for_s));
+            rows.push(Row::event(law, "drop-frames", for_s));
+            rows.push(Row::event(law, "stale-frames", for_s));
+        }
+        for kind in ["double-frames", "reorder-frames", "link-garbage"] {
+            rows.push(Row::event(law, kind, 0.5));
+        }
+    }
+    rows
+}
+
+/// What is asked of a run.
+pub struct Limits {
+    /// RMS of a quiet hold, um, and the largest error of the stated one.
+    hold_um: f64,
+    stated: f64,
+}
+
+impl Limits {
+    pub fn of_the_loop() -> Self {
+        Self {
+            hold_um: 0.057,
+            stated: 0.1,
+        }
+    }
+
+    /// The furthest that a bead may go when the flow steps, um.
+    pub fn furthest_um(&self, row: &Row) -> f64 {
+        let (delay_s, tick_s) = row.delay_and_tick_s();
+        1.3 * row.flow_um_per_s.abs() * (delay_s + 2.0 * tick_s) + 4.0 * self.hold_um
+    }
+
+    /// What a run broke.
+    pub fn broken(&self, row: &Row, held: &Held) -> Vec<String> {
+        let mut broken = Vec::new();
+        if held.changed || held.other_beads > 0 {
+            broken.push(format!("another bead: {held}"));
+        }
+        let lost = held.state != "running" && held.state != "not-kept";
+        if row.flow_um_per_s != 0.0 {
+            let most_um = self.furthest_um(row);
+            if held.worst_um > most_um {
+                broken.push(format!("at most {most_um:.2} um: {held}"));
+            }
+            if held.state != "running" {
+                broken.push(format!("not kept: {}", held.ended));
+            }
+        } else if lost {
+            broken.push(format!("lost: {}", held.ended));
+        }
+        let error = held.stated_rms_nm / held.true_rms_nm - 1.0;
+        // An error that no fix tells of is known as far as its uncertainty goes.
+        if !(error.abs() <= self.stated) {
+            broken.push(format!("stated error {:+.1} %: {held}", 100.0 * error));
+        }
+        broken
+    }
+}
