@@ -9,6 +9,7 @@
 mod arguments;
 mod clips;
 mod commands;
+mod kept;
 mod keyboard;
 mod keys;
 mod notify;
