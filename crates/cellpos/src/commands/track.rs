@@ -43,8 +43,9 @@ pub struct Args {
     /// How long; left out: until Ctrl-C.
     #[arg(long, value_parser = positive::<Seconds>)]
     duration: Option<Seconds>,
-    /// pi, lead, lqg, mpc, or the path of a controller.toml.
-    #[arg(long, default_value = "pi")]
+    /// pi, lead, lqg, mpc, or the path of a controller.toml. lqg holds closest, and keeps the bead when the flow steps; pi asks less
+    /// of the model.
+    #[arg(long, default_value = "lqg")]
     controller: String,
     /// A sine about the target, amplitude@frequency.
     #[arg(long, value_name = "5um@50Hz")]
