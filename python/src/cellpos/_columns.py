@@ -155,6 +155,7 @@ FLAGS: Dict[str, int] = {
             "board-trouble",
             "between",
             "command-lost",
+            "clipped",
         )
     )
 }

@@ -231,10 +231,12 @@ class Run:
 
     def settled(self, after_s: float = 2.0) -> Array:
         """Ticks that the program's error figures count: from `after_s` after the loop was closed, or went on after a
-        freeze, until the bead was frozen or the PZT parked."""
+        freeze by the operator, until the operator froze the bead or the PZT parked."""
         parts = []
         for session in self.sessions:
-            ns, frozen = session.stream.column("time_ns"), session.stream.column("flags") & FLAGS["freeze"] != 0
+            ns, request = session.stream.column("time_ns"), session.stream.column("request")
+            # A skipped step (3) asks for no freeze. A bead that was not seen is no less far off for that.
+            frozen = (session.stream.column("flags") & FLAGS["freeze"] != 0) & (request != 0) & (request != 3)
             held = (session.stream.column("life") == 2) & ~frozen
             # The time at which each stretch of holding began; a stretch ends with a freeze alone.
             first = np.flatnonzero(held)[:1]

@@ -57,6 +57,7 @@ fn every_bit_of_the_flags_is_on_the_page() {
         ("records-lost", TickFlags::RECORDS_LOST),
         ("stuck", TickFlags::STUCK),
         ("command-lost", TickFlags::COMMAND_LOST),
+        ("clipped", TickFlags::CLIPPED),
     ] {
         assert!(page.contains(&format!("| {value} | {name} |")), "{name}");
     }
