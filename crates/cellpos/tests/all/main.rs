@@ -6,6 +6,7 @@ mod cell;
 mod circle;
 mod common;
 mod design;
+mod error_at_exposure;
 mod identify;
 mod identify_rig;
 mod keeping;
