@@ -13,6 +13,7 @@ mod keeping;
 mod kinds_of_runs;
 mod newcomer;
 mod other_plants;
+mod own_camera;
 mod queue;
 mod replay;
 mod schemas;

@@ -13,6 +13,8 @@ pub(super) struct Range {
     pub(super) base_pm: i32,
     pub(super) high_pm: i32,
     pub(super) park_pm: i32,
+    /// Park of a board that knows of no session.
+    pub(super) own_park_pm: i32,
     pub(super) slew_nm_per_s: u32,
     /// Rate at which the output goes to park.
     pub(super) ramp_nm_per_s: u32,
@@ -51,6 +53,7 @@ impl Range {
             base_pm,
             high_pm: base_pm + amplitude,
             park_pm,
+            own_park_pm: identity.park_pm,
             slew_nm_per_s: slow.clamp(1, slew.max(1)),
             ramp_nm_per_s: identity.ramp_nm_per_s,
             step_pm: i32::try_from(step).ok()?,

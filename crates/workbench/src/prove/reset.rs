@@ -26,8 +26,8 @@ pub(super) fn reset(
     let Some(mut t) = talk.take() else {
         return Ok(());
     };
-    // Whichever end of the range is farther from park.
-    let far = |pm: &i32| (pm - range.park_pm).abs();
+    // Whichever end of the range is farther from where it will go.
+    let far = |pm: &i32| (pm - range.own_park_pm).abs();
     let at_pm = [range.low_pm, range.high_pm].into_iter().max_by_key(far);
     let at_pm = at_pm.unwrap_or(range.high_pm);
     let armed = range.session(&mut t, |_| {}, Some((at_pm, at_pm)))?;
@@ -36,11 +36,11 @@ pub(super) fn reset(
     let hello = t.hello()?;
     let first = t.must_status()?;
     // The way to park begins before anything else, and nobody is armed on it.
-    let refused = match range.is_at(&first, range.park_pm) {
+    let refused = match range.is_at(&first, range.own_park_pm) {
         true => None,
-        false => range.session(&mut t, |_| {}, None)?.err(),
+        false => Some(range.session(&mut t, |_| {}, None)?),
     };
-    let rest = range.settle(&mut t, range.park_pm)?;
+    let rest = range.settle(&mut t, range.own_park_pm)?;
     let restarted = first.board_time_us < before.board_time_us;
     sheet.judge(
         of(NAME),
@@ -48,10 +48,12 @@ pub(super) fn reset(
             && hello.is_some()
             && restarted
             && first.state == BoardState::Disarmed
-            && refused.as_ref().is_none_or(|why| why == "state")
-            && range.is_at(&rest, range.park_pm),
-        (um((rest.applied_pm - range.park_pm).abs()), "um"),
-        "disarmed, goes to park by itself, and refuses to be armed (state) until it is there",
+            && refused
+                .as_ref()
+                .is_none_or(|answer| answer.as_ref().is_err_and(|why| why == "state"))
+            && range.is_at(&rest, range.own_park_pm),
+        (um((rest.applied_pm - range.own_park_pm).abs()), "um"),
+        "disarmed, goes to its own park by itself, and refuses to be armed (state) until it is there",
         format!(
             "{}; first seen at {:.3} um, then at {:.3} um; arm on the way: {}",
             if restarted {
@@ -61,7 +63,11 @@ pub(super) fn reset(
             },
             um(first.applied_pm),
             um(rest.applied_pm),
-            refused.unwrap_or_else(|| "not tried, it was at park".to_string())
+            match refused {
+                None => "not tried, it was at park already".to_string(),
+                Some(Ok(())) => "armed".to_string(),
+                Some(Err(why)) => why,
+            }
         ),
     );
     t.request(&ToBoard::Disarm, Request::Disarm)?.ok();
