@@ -3,6 +3,7 @@
 use crate::bench::Bench;
 use crate::capture::Kept;
 use crate::snapshot::Eye;
+use cellpos_numeric::statistics::quantile;
 use cellpos_session::Failure;
 use cellpos_vision::Localiser;
 use serde::Serialize;
@@ -63,10 +64,10 @@ impl Sight {
             frames: (places.len() - before) as u64,
             seen: sds.len() as u64,
             before: before as u64,
-            stated_px: quantile(&mut sds, 0.5),
+            stated_px: quantile(&sds, 0.5),
             measured_px: noise_px(&places),
-            snr: quantile(&mut snrs, 0.5),
-            look_us: [quantile(&mut times_us, 0.5), quantile(&mut times_us, 0.99)],
+            snr: quantile(&snrs, 0.5),
+            look_us: [quantile(&times_us, 0.5), quantile(&times_us, 0.99)],
         })
     }
 
@@ -74,13 +75,6 @@ impl Sight {
     pub fn recall(&self) -> f64 {
         self.seen as f64 / self.frames.max(1) as f64
     }
-}
-
-fn quantile(values: &mut [f64], part: f64) -> f64 {
-    values.sort_by(f64::total_cmp);
-    let last = values.len().saturating_sub(1) as f64;
-    let at = (last * part).round() as usize;
-    values.get(at).copied().unwrap_or(f64::NAN)
 }
 
 /// Noise of a position from frames that follow each other: noise makes successive steps oppose each other, a free bead's motion
