@@ -289,7 +289,8 @@ impl<L: ControlLaw> ControlLoop<L> {
     pub fn rest_at(&self, state: &mut LoopState<L::State>, zero_flow_um: f64) {
         if zero_flow_um.is_finite() {
             let scaled_um = self.parts.limits.nearest(zero_flow_um) * self.tuning(state).gain;
-            self.estimator_of(state).rest_at(&mut state.estimator, scaled_um);
+            self.estimator_of(state)
+                .rest_at(&mut state.estimator, scaled_um);
         }
     }
 

@@ -3,6 +3,7 @@
 use crate::cell::CellConfig;
 use crate::error::{WorldError, within};
 use crate::faults::Faults;
+use crate::look::BeadLook;
 use serde::{Deserialize, Serialize};
 
 /// The emulated world, the table `[emulator]` of rig.toml. Every key may be left out.
@@ -43,6 +44,8 @@ pub struct WorldConfig {
     pub latency_ms: f64,
     /// Radius of the bead, um: where its profile first crosses the background; of no effect with a cell.
     pub bead_radius_um: f64,
+    /// What the bead looks like.
+    pub bead_look: BeadLook,
     /// Contrast of the middle of bead or cell against the background, grey levels of 8 bits.
     pub contrast_grey: f64,
     /// Background, grey levels.
@@ -82,6 +85,7 @@ impl Default for WorldConfig {
             exposure_ms: 0.5,
             latency_ms: 2.0,
             bead_radius_um: 0.5,
+            bead_look: BeadLook::Ring,
             contrast_grey: 80.0,
             background_grey: 100.0,
             read_noise_grey: 1.0,

@@ -35,6 +35,7 @@ mod emulated_rig;
 mod error;
 mod faults;
 mod line;
+mod look;
 mod quantities;
 mod render;
 mod rig_in_a_box;
@@ -51,6 +52,7 @@ pub use emulated_rig::{EmulatedCamera, EmulatedPort, EmulatedPositions, Emulated
 pub use error::WorldError;
 pub use faults::{FaultEvent, FaultKind, Faults};
 pub use line::{LineFaults, MisbehavingLine};
+pub use look::BeadLook;
 pub use quantities::QUANTITIES;
 pub use rig_in_a_box::{BoxError, RigInABox};
 pub use world::World;

@@ -6,8 +6,9 @@
 
 use crate::cell_picture::{CellPicture, HalfAxes, walls};
 use crate::config::WorldConfig;
+use crate::look::Look;
 use cellpos_numeric::Random;
-use cellpos_vision::{PixelResponse, RadialProfile, RingProfile, Template};
+use cellpos_vision::{PixelResponse, RadialProfile, Template};
 
 /// A bead's path is replaced by points no further apart than this; the error of the blur is of second order in it.
 const POINT_SPACING_PX: f64 = 0.25;
@@ -127,7 +128,7 @@ pub(crate) struct Renderer {
 impl Renderer {
     /// `None` when the bead's radius makes no profile.
     pub(crate) fn new(config: &WorldConfig) -> Option<Self> {
-        let profile = RingProfile::new(config.bead_radius_px())?;
+        let profile = Look::of(config)?;
         let template = Template::new(&profile, PixelResponse::Point);
         let mut noise = Random::stream(config.seed, 10);
         let gaussian: Vec<f32> = (0..GAUSSIAN_LEN + usize::from(config.width_px))
@@ -320,7 +321,7 @@ fn grey(level: f32) -> u8 {
 ///
 /// By symmetry x is uncorrelated with y, contrast and background, so the information of x alone decides.
 pub(crate) fn localisation_bound_um(config: &WorldConfig) -> Option<f64> {
-    let profile = RingProfile::new(config.bead_radius_px())?;
+    let profile = Look::of(config)?;
     let picture = CellPicture::new(config.pixel_um, &config.cell.unwrap_or_default());
     let value = |dx: f64, dy: f64| match config.cell {
         None => profile.value(dx.hypot(dy)),

@@ -134,6 +134,7 @@ columns! {
     variance_um2 F64 Loop,
     verdict U8 Loop,
     target_um F64 Loop,
+    error_um F64 Loop,
     estimate_um F64 Loop,
     estimate_sd_um F64 Loop,
     neutral_um F64 Loop,

@@ -6,7 +6,7 @@
 
 use crate::columns::{CHECK, COLUMNS, Column, Kind};
 use arrow_ipc::{MessageHeader, Type, root_as_message};
-use cellpos_runtime::TickRecord;
+use cellpos_runtime::{ReferenceHistory, TickRecord};
 use std::io::{self, Read, Seek, SeekFrom};
 
 /// Marks the start of a message.
@@ -70,6 +70,8 @@ pub(crate) struct Stream<R> {
     length: u64,
     position: u64,
     layout: Vec<Place>,
+    /// For files from before the error was recorded.
+    references: ReferenceHistory,
     /// Rows whose check is wrong: never written, or damaged.
     pub(crate) damaged_rows: u64,
     /// Bytes passed over because they made no sense, before a message that did.
@@ -107,6 +109,7 @@ impl<R: Read + Seek> Stream<R> {
                     meaning: Meaning::Check,
                 }])
                 .collect(),
+            references: ReferenceHistory::default(),
             damaged_rows: 0,
             damaged_bytes: 0,
             torn_bytes: 0,
@@ -132,7 +135,8 @@ impl<R: Read + Seek> Stream<R> {
                 Some((message, end)) => {
                     self.position = end;
                     self.ended = matches!(message, Message::End);
-                    if let Message::Rows(batch) = message {
+                    if let Message::Rows(mut batch) = message {
+                        self.fill_errors(&mut batch.rows);
                         self.damaged_rows += batch.damaged;
                         return Ok(Some(batch.rows));
                     }
@@ -151,6 +155,19 @@ impl<R: Read + Seek> Stream<R> {
             }
         }
         Ok(None)
+    }
+
+    /// Computes the error of rows that were written without it.
+    fn fill_errors(&mut self, rows: &mut [TickRecord]) {
+        let recorded =
+            |place: &Place| matches!(place.meaning, Meaning::Value(c) if c.name == "error_um");
+        if self.layout.iter().any(recorded) {
+            return;
+        }
+        for row in rows {
+            self.references.add(row.time_ns, row.target_um);
+            row.error_um = row.error_at_exposure_um(&self.references);
+        }
     }
 
     /// Reads exactly `out.len()` bytes at a place known to be inside the file.

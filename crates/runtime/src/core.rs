@@ -33,6 +33,7 @@ use crate::grid::Grid;
 use crate::learners::Learners;
 use crate::life::{EventKind, Events, FreezeReason, FreezeReasons, Life, Request, SafeReason};
 use crate::reference::{ReferenceGenerator, ReferenceInput, ReferenceOutput, Stage};
+use crate::reference_history::ReferenceHistory;
 use crate::tick::Tick;
 pub use crate::tick::{Action, Counts, TickInput, TickOutput};
 use crate::tick_record::TickFlags;
@@ -116,6 +117,7 @@ pub struct Core<R> {
     learners: Learners,
     late_solver_ns: Vec<Range<i64>>,
     monitor: PlantMonitor,
+    references: ReferenceHistory,
     state: State,
 }
 
@@ -189,6 +191,7 @@ impl<R: ReferenceGenerator> Core<R> {
             learners: Learners::default(),
             late_solver_ns: Vec::new(),
             monitor,
+            references: ReferenceHistory::default(),
             state: State {
                 plant: monitor.start(displacement_um),
                 seq: 0,
@@ -381,6 +384,7 @@ impl<R: ReferenceGenerator> Core<R> {
         self.account(input, &output, &mut tick);
         let action = self.action(&output, tick.index);
         self.count(input, &output, tick.flags);
+        self.references.add(input.time_ns, generated.reference_um);
         let record = self.record(input, &output, &generated, tick.flags);
         // Wraps after half a thousand million years, and does not panic then.
         self.state.seq = self.state.seq.wrapping_add(1);

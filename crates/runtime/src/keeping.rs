@@ -235,16 +235,15 @@ impl KeepWatch {
         (self.outside, self.away) = (0.0, false);
     }
 
-    /// Takes a record whose bead is to be held; `target_um` is the reference when its frame was exposed, and `counts` says
-    /// whether its error is one that counts.
-    pub fn add(&mut self, record: &TickRecord, target_um: f64, counts: bool) {
+    /// Takes a record whose bead is to be held; `counts` says whether its error is one that counts.
+    pub fn add(&mut self, record: &TickRecord, counts: bool) {
         self.last_ns = record.time_ns;
         self.frozen = record.flags.has(TickFlags::FREEZE);
         self.clipped |= record.flags.has(TickFlags::CLIPPED);
         let stands = |&(um, _): &(f64, i64)| um == record.target_um;
         self.still =
             Some((self.still.filter(stands)).unwrap_or((record.target_um, record.time_ns)));
-        let error_um = record.measured_um - target_um;
+        let error_um = record.error_um;
         if error_um.is_finite() {
             self.take_fix(record, error_um, counts);
         } else if record.flags.has(TickFlags::BETWEEN) && self.gap.ticks == 0.0 {

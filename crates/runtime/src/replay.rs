@@ -119,6 +119,7 @@ impl<R: ReferenceGenerator> Replay<R> {
             ("estimate_um", record.estimate_um, replayed.estimate_um),
             ("neutral_um", record.neutral_um, replayed.neutral_um),
             ("target_um", record.target_um, replayed.target_um),
+            ("error_um", record.error_um, replayed.error_um),
             ("plan_ns", record.plan_ns as f64, replayed.plan_ns as f64),
             ("stage", f64::from(record.stage), f64::from(replayed.stage)),
             ("life", f64::from(record.life), f64::from(replayed.life)),

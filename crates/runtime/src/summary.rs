@@ -81,12 +81,7 @@ pub struct Statistics {
     step: Option<StepWatch>,
     plan: PlanWatch,
     last: Option<TickRecord>,
-    /// Time (ns) and reference (um) of the last ticks, newest first.
-    targets: [(i64, f64); TARGETS],
 }
-
-/// Ticks whose references are kept: the oldest exposure that is compared with its own reference.
-const TARGETS: usize = 32;
 
 /// How the bead went from where it was to where it should be, after the loop was closed.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -145,7 +140,6 @@ impl Statistics {
             step: None,
             plan: PlanWatch::default(),
             last: None,
-            targets: [(i64::MIN, f64::NAN); TARGETS],
         }
     }
 
@@ -163,8 +157,6 @@ impl Statistics {
         if let Some(before) = &self.last {
             self.plan.add(before, record);
         }
-        self.targets.copy_within(0..TARGETS - 1, 1);
-        self.targets[0] = (record.time_ns, record.target_um);
         // A bead that the operator froze is not being held on its reference: what it wanders is no error of the loop. The same way
         // back as after closing the loop when it goes on. A bead that was not seen is no less far off for that.
         let held = KeepWatch::is_held(record);
@@ -192,8 +184,7 @@ impl Statistics {
                 step.add(seen_um, record.time_ns - since);
             }
             let counts = record.time_ns - since >= self.settled_after_ns;
-            let then_um = self.target_at(record.mid_exposure_ns);
-            self.keeping.add(record, then_um, counts);
+            self.keeping.add(record, counts);
             if counts {
                 self.truth.add(record.true_um - record.target_um);
                 self.variance.add(record.variance_um2);
@@ -203,21 +194,6 @@ impl Statistics {
         }
         self.held = held;
         self.last = Some(*record);
-    }
-
-    /// The reference when a frame was exposed, um: on the line between the ticks before and after.
-    fn target_at(&self, time_ns: i64) -> f64 {
-        self.targets
-            .windows(2)
-            .find(|pair| pair[1].0 <= time_ns)
-            .map_or(f64::NAN, |pair| {
-                let ((late, after_um), (early, before_um)) = (pair[0], pair[1]);
-                if late <= time_ns || !before_um.is_finite() {
-                    return after_um;
-                }
-                let part = (time_ns - early) as f64 / (late - early) as f64;
-                before_um + part * (after_um - before_um)
-            })
     }
 
     /// The newest record.
@@ -363,7 +339,7 @@ pub struct Summary {
     pub commands_not_taken: Option<u64>,
     /// How the run kept its bead, and its error.
     pub kept: Kept,
-    /// RMS of measured position less reference, nm; moments without a fix count through the estimate.
+    /// RMS of measured position less the reference at its exposure ([`TickRecord::error_um`]), nm; moments without a fix count through the estimate.
     pub rms_measured_nm: Option<f64>,
     /// RMS of true position less reference, nm (emulated rig).
     pub rms_true_nm: Option<f64>,

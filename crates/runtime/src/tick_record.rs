@@ -1,7 +1,9 @@
 //! The plain record that each tick of the loop hands to the recorder ring.
 
 use crate::life::Life;
+use crate::reference_history::ReferenceHistory;
 use cellpos_control::LAW_COLUMNS;
+use cellpos_vision::FixQuality;
 
 /// What happened in a tick, as bits.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -90,6 +92,8 @@ pub struct TickRecord {
     pub decision: u8,
     /// Reference, um.
     pub target_um: f64,
+    /// Measured position less the reference at the exposure of its frame, um; NaN without a good position.
+    pub error_um: f64,
     /// Time of the script's plan, ns; stands still while a condition is waited for or the bead is frozen; -1 without a
     /// script.
     pub plan_ns: i64,
@@ -157,6 +161,15 @@ impl TickRecord {
         self.is_running() && !self.flags.has(TickFlags::FREEZE)
     }
 
+    /// [`TickRecord::error_um`], from the references up to this tick.
+    pub fn error_at_exposure_um(&self, references: &ReferenceHistory) -> f64 {
+        if self.verdict == FixQuality::Good as u8 {
+            self.measured_um - references.at(self.mid_exposure_ns)
+        } else {
+            f64::NAN
+        }
+    }
+
     /// A record in which nothing is known: what a missing column reads as.
     pub fn unknown() -> Self {
         Self {
@@ -170,6 +183,7 @@ impl TickRecord {
             track: 255,
             decision: 255,
             target_um: f64::NAN,
+            error_um: f64::NAN,
             estimate_um: f64::NAN,
             estimate_sd_um: f64::NAN,
             neutral_um: f64::NAN,

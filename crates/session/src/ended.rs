@@ -353,7 +353,9 @@ impl Clues {
                 "a sequence number that moves with the commands",
                 "check the line to the board for damaged frames, and its baud rate",
             ),
-            SafeReason::NotFollowing if self.clipped_um.is_some() => return clipped(self.clipped_um),
+            SafeReason::NotFollowing if self.clipped_um.is_some() => {
+                return clipped(self.clipped_um);
+            }
             SafeReason::NotFollowing => sentences(
                 " further and further, until it was frozen",
                 "a bead that goes where the commands push it",

@@ -48,7 +48,7 @@ impl LiveLine {
         columns: usize,
     ) -> String {
         let state = Life::from_number(record.life).map_or("?", Life::name);
-        let error_nm = (record.measured_um - record.target_um) * 1e3;
+        let error_nm = record.error_um * 1e3;
         let to_limit_um = (record.command_um - self.low_um).min(self.high_um - record.command_um);
         let mut parts: Vec<Part> = vec![
             (4, format!("{:.2}s", record.time_ns as f64 * 1e-9)),
@@ -108,7 +108,8 @@ mod tests {
         let record = TickRecord {
             time_ns: 12_345_600_000_000,
             measured_um: -12.3456,
-            target_um: -12.0,
+            target_um: -11.0,
+            error_um: -0.3456,
             command_um: 31.234,
             life: Life::Running as u8,
             ..TickRecord::unknown()

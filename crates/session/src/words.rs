@@ -61,7 +61,9 @@ fn freeze_reason(reason: FreezeReason) -> &'static str {
         FreezeReason::CameraStalled => "no frames come",
         FreezeReason::LineStalled => "the line to the board is stalled",
         FreezeReason::PictureFrozen => "the camera gives the same picture again and again",
-        FreezeReason::NotFollowing => "the bead does not follow the commands, or moves against them",
+        FreezeReason::NotFollowing => {
+            "the bead does not follow the commands, or moves against them"
+        }
         FreezeReason::Unrecorded => "the run can no longer be recorded",
     }
 }

@@ -44,11 +44,18 @@ impl Bench {
     /// # Errors
     /// The port cannot be opened, or no board answers.
     pub fn board(&self) -> Result<Board, Failure> {
-        let port: Box<dyn Port> = match &self.emulated {
-            Some(rig) if self.file.actuator.is_emulated() => Box::new(rig.port()),
-            _ => self.file.line()?,
-        };
-        BoardHost::connect(port, Clock::Real).map_err(Failure::failed)
+        BoardHost::connect(self.line()?, Clock::Real).map_err(Failure::failed)
+    }
+
+    /// The line to the board, with nothing said on it.
+    ///
+    /// # Errors
+    /// The port cannot be opened.
+    pub fn line(&self) -> Result<Box<dyn Port>, Failure> {
+        match &self.emulated {
+            Some(rig) if self.file.actuator.is_emulated() => Ok(Box::new(rig.port())),
+            _ => self.file.line(),
+        }
     }
 
     /// Opens the camera.

@@ -194,7 +194,7 @@ impl Findings<'_> {
                     &"",
                     "[vision] is missing: what a bead looks like to this camera is not known"
                         .to_string(),
-                    "record some frames with a bead in view; cellpos vision RECORDING prints the table",
+                    "bring a bead into view; cellpos camera --rig RIG --find-beads beads.png finds the settings and writes the table",
                 );
             }
         }

@@ -4,7 +4,7 @@ use crate::bench::Bench;
 use cellpos_drivers::sources::{self, SourceError};
 use cellpos_rig::{Camera, Clock, FrameBuffer};
 use cellpos_session::Failure;
-use cellpos_vision::{CellTracker, Commanded, Tracker, TrackerConfig};
+use cellpos_vision::{CellTracker, Commanded, Localiser, Tracker, TrackerConfig};
 use image::{Rgb, RgbImage};
 use serde::Serialize;
 use std::path::Path;
@@ -41,6 +41,8 @@ pub struct Seen {
     pub half_px: f64,
     /// Contrast over noise.
     pub snr: f64,
+    /// Standard deviation of the column as the fit states it, px.
+    pub sd_px: f64,
     /// Position along the channel, um; none without a calibration.
     pub position_um: Option<f64>,
 }
@@ -107,21 +109,23 @@ impl Eye {
     /// # Errors
     /// Settings that cannot be; no background for a cell.
     pub fn of(bench: &Bench) -> Result<Self, Failure> {
-        /// Of a bead of 1 um under an objective of 100 times, before anything is calibrated, um.
-        const USUAL_PIXEL_UM: f64 = 0.1;
         let file = bench.file();
-        let calibration = file.calibration;
-        let pixel_um = calibration.map_or(USUAL_PIXEL_UM, |c| c.pixel_um);
-        let config = file
-            .tracking
-            .unwrap_or_else(|| TrackerConfig::for_pixel_um(pixel_um));
-        Ok(if file.follows_a_cell() {
+        if file.follows_a_cell() {
+            let config = tracker_config(bench);
             let tracker = CellTracker::new(file.finder()?, config).map_err(Failure::input)?;
-            Self::Cell(Box::new(tracker), calibration)
+            Ok(Self::Cell(Box::new(tracker), file.calibration))
         } else {
-            let tracker = Tracker::new(file.localiser()?, config).map_err(Failure::input)?;
-            Self::Bead(Box::new(tracker), calibration)
-        })
+            Self::of_bead(bench, file.localiser()?)
+        }
+    }
+
+    /// A bead that another localiser looks for.
+    ///
+    /// # Errors
+    /// Settings of the tracker that cannot be.
+    pub fn of_bead(bench: &Bench, localiser: Localiser) -> Result<Self, Failure> {
+        let tracker = Tracker::new(localiser, tracker_config(bench)).map_err(Failure::input)?;
+        Ok(Self::Bead(Box::new(tracker), bench.file().calibration))
     }
 
     /// Looks at the next frame; `None` when nothing is believed of it.
@@ -154,9 +158,19 @@ impl Eye {
             y_px: fix.y_px,
             half_px,
             snr: fix.snr,
+            sd_px: fix.var_x_px2.sqrt(),
             position_um: calibration.map(|c| c.position_um(fix.x_px, fix.y_px)),
         }))
     }
+}
+
+fn tracker_config(bench: &Bench) -> TrackerConfig {
+    /// Of a bead of 1 um under an objective of 100 times, before anything is calibrated, um.
+    const USUAL_PIXEL_UM: f64 = 0.1;
+    let file = bench.file();
+    let pixel_um = file.calibration.map_or(USUAL_PIXEL_UM, |c| c.pixel_um);
+    file.tracking
+        .unwrap_or_else(|| TrackerConfig::for_pixel_um(pixel_um))
 }
 
 fn full_scale(buffer: &FrameBuffer) -> u16 {
@@ -175,7 +189,7 @@ fn grey_levels(buffer: &FrameBuffer) -> [u16; 3] {
     [low, high, full_scale(buffer)]
 }
 
-fn picture(buffer: &FrameBuffer) -> RgbImage {
+pub(crate) fn picture(buffer: &FrameBuffer) -> RgbImage {
     let full = f64::from(full_scale(buffer));
     let (width, height) = (buffer.width as u32, buffer.height as u32);
     RgbImage::from_fn(width, height, |x, y| {
@@ -190,7 +204,7 @@ fn picture(buffer: &FrameBuffer) -> RgbImage {
 }
 
 /// A square around what is seen, and a cross at its centre.
-fn mark(picture: &mut RgbImage, seen: &Seen) {
+pub(crate) fn mark(picture: &mut RgbImage, seen: &Seen) {
     const COLOUR: Rgb<u8> = Rgb([255, 64, 0]);
     let (x, y, half) = (
         seen.x_px.round() as i64,

@@ -124,7 +124,7 @@ pixel = \"0.1um\"          # of a stage micrometre; a guess until then
 origin_px = 127.5        # the column that is called 0 um
 sign = 1.0               # +1: the coordinate rises when the PZT extends
 
-[vision]                 # what a bead looks like: this is firmware-sim's; cellpos vision RECORDING prints the table for yours
+[vision]                 # what a bead looks like, at first firmware-sim's; cellpos camera --rig FILE --find-beads beads.png writes yours
 window_px = 21
 profile = {{ kind = \"ring\", edge_px = 5.0 }}
 "

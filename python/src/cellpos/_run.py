@@ -126,7 +126,7 @@ class Session:
             return (stream.column(TIMES[name], since) + self.offset_ns) / 1e9
         if name == "session":
             return np.full(len(stream.column("seq", since)), self.number)
-        if name == "error_um":
+        if name == "error_um" and name not in stream.columns:
             return self._errors(since)
         if name in MADE:
             raw, make = MADE[name]
@@ -140,7 +140,7 @@ class Session:
         return values
 
     def _errors(self, since: int) -> Array:
-        """Measured position less the reference of the time of its exposure."""
+        """Error of a run from before it was recorded: position less the reference at its exposure."""
         # The reference of an exposure that is older than the first row asked for is in the rows before.
         before = max(since - 1, 0)
         ns, target = self.stream.column("time_ns", before), self.stream.column("target_um", before)

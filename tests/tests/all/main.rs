@@ -9,4 +9,5 @@ mod readme;
 mod reconcile;
 mod rig_in_a_box;
 mod rig_page;
+mod rig_prove;
 mod scripts;

@@ -4,16 +4,16 @@ use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
 use cellpos_drivers::sources::{self, Playback, Region};
 use cellpos_rig::{Camera, CameraError, Clock, FrameBuffer};
 use cellpos_units::Seconds;
-use cellpos_workbench::Bench;
 use serde::Serialize;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::time::Duration;
 
 /// Arguments of `cellpos camera`.
 #[derive(Debug, clap::Args)]
 #[command(
     after_help = "Examples:\n  cellpos camera\n  cellpos camera --address 192.168.1.20 --rate-hz 1000 --region 64x64+200+120\n  \
-    cellpos camera --socket /tmp/rig/camera.sock --duration 10s\n  cellpos camera --rig rig.toml --snapshot frame.png --overlay"
+    cellpos camera --socket /tmp/rig/camera.sock --duration 10s\n  cellpos camera --rig rig.toml --snapshot frame.png --overlay\n  \
+    cellpos camera --rig rig.toml --record beads/ --duration 5s\n  cellpos camera --rig rig.toml --find-beads beads.png"
 )]
 pub struct Args {
     /// IP address of a GigE camera, or identifier of a USB3 camera (needs the feature aravis).
@@ -31,12 +31,19 @@ pub struct Args {
     /// Exposure of an industrial camera, us.
     #[arg(long)]
     exposure_us: Option<f64>,
-    /// Camera of this rig.toml; with --snapshot.
-    #[arg(long, group = "which", requires = "snapshot")]
+    /// Camera of this rig.toml; with --snapshot, --record or --find-beads.
+    #[arg(long, group = "which", requires = "of_rig")]
     rig: Option<PathBuf>,
     /// Write one frame of the rig's camera as a picture (.png), and say how bright it is.
-    #[arg(long, value_name = "FILE", requires = "rig")]
+    #[arg(long, value_name = "FILE", requires = "rig", group = "of_rig")]
     snapshot: Option<PathBuf>,
+    /// Record every frame of the rig's camera for --duration into this new folder, a PNG each, for cellpos vision.
+    #[arg(long, value_name = "FOLDER", requires = "rig", group = "of_rig")]
+    record: Option<PathBuf>,
+    /// Look at the rig's camera for --duration, find what its beads look like, write [vision] into the rig file (its comments
+    /// stay), and write a picture (.png) of what was taken for beads.
+    #[arg(long, value_name = "FILE", requires = "rig", group = "of_rig")]
+    find_beads: Option<PathBuf>,
     /// Mark the bead or cell as vision sees it in the picture.
     #[arg(long, requires = "snapshot")]
     overlay: bool,
@@ -118,57 +125,6 @@ pub(super) struct Listed {
     protocol: String,
 }
 
-/// Writes a frame of a rig's camera as a picture.
-fn snapshot(rig: &Path, path: &PathBuf, overlay: bool, json: bool) -> CommandResult {
-    crate::output::ready([path])?;
-    let bench = Bench::of(crate::rig_file::RigFile::load(Some(rig))?)?;
-    let (snapshot, picture) = cellpos_workbench::snapshot::take(&bench, overlay)?;
-    picture.save(path).map_err(|error| {
-        Failure::bad_input(
-            format!("{}: {error}", path.display()),
-            "name a file that ends in .png",
-        )
-    })?;
-    if json {
-        print_json(&snapshot)?;
-        return Ok(Outcome::Done);
-    }
-    let [low, high, full] = snapshot.grey;
-    let mut text = format!(
-        "{}: {} x {} px of {}, grey levels {low} to {high} of {full}\n",
-        path.display(),
-        snapshot.width_px,
-        snapshot.height_px,
-        snapshot.camera
-    );
-    match (&snapshot.seen, overlay) {
-        (Some(seen), _) => {
-            text += &format!(
-                "seen at column {:.1}, row {:.1}, {:.0} times the noise",
-                seen.x_px, seen.y_px, seen.snr
-            );
-            if let Some(um) = seen.position_um {
-                text += &format!(", {um:.2} um along the channel");
-            }
-            text.push('\n');
-        }
-        (None, true) => {
-            text += "no bead or cell that vision believes in within 5 s: see docs/rig.md, Light and focus\n"
-        }
-        (None, false) => {}
-    }
-    if high >= full {
-        text += "some pixels are white: less light, or a shorter exposure\n";
-    }
-    print_text(&text)?;
-    let wanted_in_vain = overlay && snapshot.seen.is_none();
-    Ok(if wanted_in_vain {
-        Outcome::Broken
-    } else {
-        Outcome::Done
-    })
-}
-
 /// Lists cameras, or watches one.
 pub fn run(args: Args) -> CommandResult {
     let duration_s = args.duration.value();
@@ -182,8 +138,16 @@ pub fn run(args: Args) -> CommandResult {
             "give 0.01 to 1e6 Hz",
         ));
     }
-    if let (Some(rig), Some(path)) = (&args.rig, &args.snapshot) {
-        return snapshot(rig, path, args.overlay, args.json);
+    if let Some(rig) = &args.rig {
+        return super::camera_of_rig::run(&super::camera_of_rig::Job {
+            rig,
+            snapshot: args.snapshot.as_deref(),
+            overlay: args.overlay,
+            record: args.record.as_deref(),
+            find_beads: args.find_beads.as_deref(),
+            duration_s,
+            json: args.json,
+        });
     }
     if let Some(path) = &args.socket {
         let patience = Duration::from_secs(2);

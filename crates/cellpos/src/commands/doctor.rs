@@ -85,6 +85,21 @@ pub fn run(args: Args) -> CommandResult {
     Ok(if fit { Outcome::Done } else { Outcome::Broken })
 }
 
+/// Whether this machine is fit by a measurement of so long, in words, and the wake-up latency that 99.9 % are below, us.
+pub(super) fn verdict_after(duration: std::time::Duration) -> Result<(bool, String, f64), Failure> {
+    let request = Request::control_thread();
+    let machine = Machine {
+        root: Path::new("/"),
+        cpu: request.cpu.unwrap_or(0),
+        cpus: allowed_cpus().len(),
+    };
+    let findings = machine.findings();
+    let stop = signals::ends_measuring();
+    let soak = soak::soak(request, duration, false, &stop).map_err(Failure::failed)?;
+    let (fit, words) = verdict(&soak, &findings);
+    Ok((fit, words, soak.wake_us.p999))
+}
+
 fn verdict(soak: &Soak, findings: &[Finding]) -> (bool, String) {
     let bad: Vec<&str> = findings
         .iter()

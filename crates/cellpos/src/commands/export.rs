@@ -14,7 +14,7 @@ use std::path::{Path, PathBuf};
 #[command(after_help = "Examples:
   cellpos export runs/20261121T093000Z-track
   cellpos export runs/20261121T093000Z-track --out track.parquet
-  cellpos export runs/20261121T190000Z-fatigue --from 60s --to 120s --every 10 --columns time_s,target_um,bead_um
+  cellpos export runs/20261121T190000Z-fatigue --from 60s --to 120s --every 10 --columns time_s,target_um,bead_um,error_um
 
 All sessions of a run that was resumed, one behind the other; the column session tells them apart. The columns, their units
 and words are in docs/data.md. Row k: the displacement commanded from time_s on, held until the next row; bead_um is the

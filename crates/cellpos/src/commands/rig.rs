@@ -27,6 +27,8 @@ enum Command {
         after_help = "Examples:\n  cellpos rig check rig.toml\n  cellpos rig check rig.toml --connect"
     )]
     Check(Check),
+    /// Try board, camera, vision and machine, and write a sheet for the lab book: passed, failed or not tried, with numbers.
+    Prove(super::prove::Args),
 }
 
 #[derive(Debug, clap::Args)]
@@ -67,6 +69,7 @@ pub fn run(args: Args) -> CommandResult {
     match args.command {
         Command::New(args) => new(args),
         Command::Check(args) => check(args),
+        Command::Prove(args) => super::prove::run(&args),
     }
 }
 

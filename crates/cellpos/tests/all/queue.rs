@@ -69,6 +69,21 @@ fn a_cells_stretch_is_one_number_in_the_table_of_the_queue_and_in_the_report_of_
     )
     .json();
     let cell = &queue["cells"][0];
+    // A mean over the rest before the first cycle, with its uncertainty: a frame of this camera is known to 0.05 um.
+    let (rest_um, sd_um) = (
+        number(cell, "rest_length_um"),
+        number(cell, "rest_length_sd_um"),
+    );
+    assert!(sd_um < 0.02, "{cell}");
+    assert!((rest_um - 8.0).abs() < 4.0 * sd_um, "{rest_um} +- {sd_um}");
+    let (stretch, ci95) = (
+        number(cell, "stretch_first"),
+        number(cell, "stretch_first_ci95"),
+    );
+    assert!(
+        ci95 >= 1.96 * stretch * sd_um / rest_um,
+        "the length at rest is in it: {cell}"
+    );
     let report = succeed(
         at,
         &format!("report {} --json", cell["run"].as_str().unwrap()),

@@ -182,6 +182,8 @@ columns! {
         "PZT displacement commanded from time_s on, held until the next row.";
     "bead_um" "um" Number(|r| bead_um(&r.tick)),
         "Position that the camera had delivered just before, exposed around mid_exposure_s; none without a bead.";
+    "error_um" "um" Number(|r| r.tick.error_um),
+        "Error: bead_um less the reference at mid_exposure_s, the one in force when the frame was exposed.";
     "seq" "" Whole(|r| r.tick.seq),
         "Number of the tick in its session; runs on over rows that were lost.";
     "frame_id" "" Whole(|r| r.tick.frame_id),

@@ -28,6 +28,7 @@ fn tick(seq: u64) -> TickRecord {
         variance_um2: now_and_then(11, 4e-4),
         verdict: (seq % 6) as u8,
         target_um: x / 3.0,
+        error_um: now_and_then(11, (x * 0.1).sin() - x / 3.0),
         command_um: 20.0 + x / 7.0,
         applied_um: now_and_then(5, 1.0 / (x + 1.0)),
         life: 2,

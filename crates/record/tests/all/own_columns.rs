@@ -3,6 +3,7 @@
 use super::run::{bits, policy, row};
 use cellpos_record::{RunEnd, RunMeta, RunReader, RunWriter, Selection, Source, write_csv};
 use cellpos_runtime::TickRecord;
+use std::path::{Path, PathBuf};
 
 #[test]
 fn arrow_itself_reads_the_stream() {
@@ -19,15 +20,13 @@ fn arrow_itself_reads_the_stream() {
     assert_eq!(rows, 50);
 }
 
-#[test]
-fn a_recording_from_before_a_column_existed_reads_with_nothing_known_of_it() {
-    let root = tempfile::tempdir().unwrap();
+/// A run of 50 rows as it was written before a column existed, and before rows had a check.
+fn recorded_without(root: &Path, missing: &str, row: impl Fn(u64) -> TickRecord) -> PathBuf {
     let mut writer =
-        RunWriter::create_with(root.path(), RunMeta::new("t", "virtual"), policy(16)).unwrap();
+        RunWriter::create_with(root, RunMeta::new("t", "virtual"), policy(16)).unwrap();
     (0..50).for_each(|seq| writer.tick(&row(seq)));
     let folder = writer.finish(RunEnd::new("done")).folder;
     let path = folder.join("ticks.arrow");
-    // The same rows as they were written before the loop measured areas.
     let file = std::fs::File::open(&path).unwrap();
     let mut batches: Vec<arrow_array::RecordBatch> =
         arrow_ipc::reader::StreamReader::try_new(file, None)
@@ -35,7 +34,7 @@ fn a_recording_from_before_a_column_existed_reads_with_nothing_known_of_it() {
             .map(Result::unwrap)
             .collect();
     for batch in &mut batches {
-        for name in ["area_um2", "check"] {
+        for name in [missing, "check"] {
             let place = batch.schema().index_of(name).unwrap();
             batch.remove_column(place);
         }
@@ -46,8 +45,36 @@ fn a_recording_from_before_a_column_existed_reads_with_nothing_known_of_it() {
         old.write(batch).unwrap();
     }
     old.finish().unwrap();
-    drop(old);
+    folder
+}
 
+#[test]
+fn the_error_of_a_recording_from_before_it_was_kept_is_counted_from_the_reference_at_the_exposure()
+{
+    let root = tempfile::tempdir().unwrap();
+    // A reference that goes on by 0.5 um each tick; the exposure is two ticks old.
+    let folder = recorded_without(root.path(), "error_um", |seq| TickRecord {
+        target_um: seq as f64 * 0.5,
+        verdict: u8::from(seq == 30),
+        ..row(seq)
+    });
+    let (ticks, _) = RunReader::open(&folder).unwrap().ticks().unwrap();
+    assert_eq!(ticks.len(), 50);
+    for tick in &ticks {
+        let then_um = (tick.seq as f64 - 2.0) * 0.5;
+        if tick.seq < 2 || tick.seq == 30 {
+            assert!(tick.error_um.is_nan(), "{}", tick.seq);
+        } else {
+            let off_um = tick.error_um - (tick.measured_um - then_um);
+            assert!(off_um.abs() < 1e-12, "{}: {off_um}", tick.seq);
+        }
+    }
+}
+
+#[test]
+fn a_recording_from_before_a_column_existed_reads_with_nothing_known_of_it() {
+    let root = tempfile::tempdir().unwrap();
+    let folder = recorded_without(root.path(), "area_um2", row);
     let (ticks, lost) = RunReader::open(&folder).unwrap().ticks().unwrap();
     assert_eq!(
         (ticks.len(), lost.damaged_bytes, lost.finished),

@@ -23,6 +23,7 @@ pub(crate) fn row(seq: u64) -> TickRecord {
         track: 1,
         decision: 10,
         target_um: 0.0,
+        error_um: (x * 0.1).sin(),
         estimate_um: (x * 0.1).cos(),
         neutral_um: 20.0,
         requested_um: 20.0 + x / 3.0,
@@ -76,6 +77,7 @@ pub(crate) fn bits(row: &TickRecord) -> Vec<u64> {
         row.measured_um,
         row.variance_um2,
         row.target_um,
+        row.error_um,
         row.estimate_um,
         row.neutral_um,
         row.requested_um,
@@ -260,12 +262,13 @@ fn exports_carry_units_in_their_names_and_follow_the_row_convention() {
     assert_eq!(third[0], "0.003");
     assert_eq!(third[1].parse::<f64>().unwrap(), 20.0 + 3.0 / 7.0);
     assert_eq!(third[2].parse::<f64>().unwrap(), (3.0f64 * 0.1).sin());
-    assert_eq!(
-        third[11], "",
-        "a number that does not exist is an empty field"
-    );
     let head = csv_head();
     let head: Vec<&str> = head.split(',').collect();
+    let applied = head.iter().position(|name| *name == "applied_um").unwrap();
+    assert_eq!(
+        third[applied], "",
+        "a number that does not exist is an empty field"
+    );
     assert_eq!(head.len(), third.len());
     let area = head.iter().position(|name| *name == "area_um2").unwrap();
     assert_eq!(third[area].parse::<f64>().unwrap(), 64.0);

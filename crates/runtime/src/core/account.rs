@@ -142,7 +142,7 @@ impl<R: ReferenceGenerator> Core<R> {
     ) -> TickRecord {
         let m = input.measurement;
         let (last_id, last_exposure) = self.state.last_frame.unwrap_or((0, 0));
-        TickRecord {
+        let record = TickRecord {
             seq: self.state.seq,
             time_ns: input.time_ns,
             frame_id: m.map_or(last_id, |m| m.frame_id),
@@ -157,6 +157,7 @@ impl<R: ReferenceGenerator> Core<R> {
                 .and_then(|m| m.track)
                 .map_or(255, |(_, decision)| decision as u8),
             target_um: generated.reference_um,
+            error_um: f64::NAN,
             plan_ns: generated.plan_ns,
             stage: generated.stage as u8,
             length_um: m.map_or(f64::NAN, |m| m.length_um),
@@ -186,6 +187,10 @@ impl<R: ReferenceGenerator> Core<R> {
             solver_active: output.solver.active.min(255) as u8,
             solver_ns: output.solver.solve_ns,
             law: self.controller.record(),
+        };
+        TickRecord {
+            error_um: record.error_at_exposure_um(&self.references),
+            ..record
         }
     }
 

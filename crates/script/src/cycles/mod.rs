@@ -11,6 +11,7 @@ mod open;
 mod outlier;
 mod place;
 mod rest;
+mod resting;
 mod row;
 mod saturating;
 mod shape;
@@ -29,6 +30,7 @@ use cellpos_runtime::{Life, Request, Stage, TickFlags, TickRecord};
 use open::Open;
 use outlier::Outliers;
 use place::{Place, bounds_ns};
+use resting::{Rest, Resting};
 use std::collections::VecDeque;
 use std::sync::Arc;
 
@@ -52,6 +54,7 @@ pub struct CycleTable {
     /// Spans of the plan that the operator skipped, ns.
     skips_ns: Vec<(i64, i64)>,
     outliers: Outliers,
+    resting: Resting,
 }
 
 /// What the loop did at a tick.
@@ -88,6 +91,7 @@ impl CycleTable {
             last_seq: None,
             skips_ns: Vec::new(),
             outliers: Outliers::default(),
+            resting: Resting::default(),
         }
     }
 
@@ -150,9 +154,14 @@ impl CycleTable {
             return;
         };
         self.close_until(place.plan_ns);
+        let rest = if fresh {
+            self.resting.add(record, place.target_um)
+        } else {
+            None
+        };
         self.pending.set(CycleFlags::SKIPPED_TICKS, late);
         if matches!(place.stage, Stage::Running | Stage::Waiting | Stage::Paused) {
-            self.gather(record, place);
+            self.gather(record, place, rest);
         }
     }
 
@@ -201,7 +210,7 @@ impl CycleTable {
             self.skips_ns.retain(|(_, to_ns)| *to_ns > end_ns);
             let expected = (end_ns - start_ns) as f64 / self.period_ns.max(1) as f64;
             let (mut row, worst) = match self.open.take() {
-                Some(open) => open.finish(expected),
+                Some(open) => open.finish(expected, self.resting.so_far()),
                 None => {
                     let mut row = CycleRow::empty(cycle.number, self.session, cycle.arm);
                     row.plan_s = cycle.start_s;
@@ -229,7 +238,8 @@ impl CycleTable {
         }
     }
 
-    fn gather(&mut self, record: &TickRecord, place: Place) {
+    /// `rest`: one that is over with this frame.
+    fn gather(&mut self, record: &TickRecord, place: Place, rest: Option<Rest>) {
         let Some(cycle) = self.plan.cycle(self.next) else {
             return;
         };
@@ -242,6 +252,7 @@ impl CycleTable {
         let open = self
             .open
             .get_or_insert_with(|| Open::new(&self.plan, &cycle, self.session, &place));
+        open.begins_after(rest);
         open.disturbed(self.pending);
         self.pending = CycleFlags::default();
         let phase = (place.plan_ns - start_ns) as f64 / (end_ns - start_ns).max(1) as f64;

@@ -2,6 +2,7 @@
 
 use super::fit::SineFit;
 use super::place::{Place, bounds_ns};
+use super::resting::Rest;
 use super::row::{CycleFlags, CycleRow};
 use super::shape::Series;
 use crate::plan::{Cycle, Plan};
@@ -26,6 +27,9 @@ pub(super) struct Open {
     dwells: bool,
     lengths_um: Series,
     areas_um2: Series,
+    /// Where the reference is at the start, um, and the rest of the cell there.
+    start_um: f64,
+    rest: Option<Rest>,
     /// Ticks whose command was late or was not the controller's own, and ticks whose position was refused.
     late: u64,
     gated: u64,
@@ -66,6 +70,8 @@ impl Open {
             dwells: false,
             lengths_um: Series::default(),
             areas_um2: Series::default(),
+            start_um,
+            rest: None,
             late: 0,
             gated: 0,
         }
@@ -73,6 +79,13 @@ impl Open {
 
     pub(super) fn last_seen_ns(&self) -> Option<i64> {
         self.last_seen.map(|last| last.0)
+    }
+
+    /// A rest is over: that before the cycle, if it was where the cycle begins.
+    pub(super) fn begins_after(&mut self, rest: Option<Rest>) {
+        if self.rest.is_none() {
+            self.rest = rest.filter(|rest| rest.was_at(self.start_um));
+        }
     }
 
     pub(super) fn disturbed(&mut self, flags: CycleFlags) {
@@ -179,9 +192,16 @@ impl Open {
         self.areas_um2.add(exposed_s, phase, record.area_um2);
     }
 
-    /// The row of the finished cycle, and the largest share of its `expected` ticks that one kind of trouble touched.
-    pub(super) fn finish(self, expected: f64) -> (CycleRow, f64) {
+    /// The row of the finished cycle, and the largest share of its `expected` ticks that one kind of trouble touched. `resting`:
+    /// the rest that goes on.
+    pub(super) fn finish(mut self, expected: f64, resting: Option<Rest>) -> (CycleRow, f64) {
+        // A cycle that never left its start is a rest as a whole.
+        self.begins_after(resting.filter(|_| self.row.stroke_um == 0.0));
         let mut row = self.row;
+        if let Some(rest) = self.rest {
+            (row.length_rest_um, row.length_rest_sd_um) = (rest.length_um.mean, rest.length_um.sd);
+            (row.area_rest_um2, row.area_rest_sd_um2) = (rest.area_um2.mean, rest.area_um2.sd);
+        }
         let missing = expected - row.ticks as f64;
         let worst = [
             row.lost,

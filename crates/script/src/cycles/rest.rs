@@ -2,20 +2,27 @@
 
 use super::CycleRow;
 
-/// Length and area of the cell at the start of the first cycle of a run that has them.
+/// Length and area of the cell at rest before the first cycle of a run that has them: means over the rest, with what they are
+/// known to. Of a table that an older version wrote: at the start of the first cycle, known to nobody knows what.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct AtRest {
     /// Length, um; NaN where it was not measured.
     pub length_um: f64,
+    /// Its standard deviation, um; NaN where it is not known.
+    pub length_sd_um: f64,
     /// Projected area, um^2; NaN where it was not measured.
     pub area_um2: f64,
+    /// Its standard deviation, um^2; NaN where it is not known.
+    pub area_sd_um2: f64,
 }
 
 impl Default for AtRest {
     fn default() -> Self {
         Self {
             length_um: f64::NAN,
+            length_sd_um: f64::NAN,
             area_um2: f64::NAN,
+            area_sd_um2: f64::NAN,
         }
     }
 }
@@ -30,12 +37,30 @@ impl AtRest {
 
     /// Takes the next row of the run: what is not known yet is taken from it.
     pub fn take(&mut self, row: &CycleRow) {
-        for (known, new) in [
-            (&mut self.length_um, row.length_start_um),
-            (&mut self.area_um2, row.area_start_um2),
+        let (length, area) = (
+            (row.length_rest_um, row.length_rest_sd_um),
+            (row.area_rest_um2, row.area_rest_sd_um2),
+        );
+        for (known, sd, (mean, mean_sd), start) in [
+            (
+                &mut self.length_um,
+                &mut self.length_sd_um,
+                length,
+                row.length_start_um,
+            ),
+            (
+                &mut self.area_um2,
+                &mut self.area_sd_um2,
+                area,
+                row.area_start_um2,
+            ),
         ] {
             if known.is_nan() {
-                *known = new;
+                (*known, *sd) = if mean.is_finite() {
+                    (mean, mean_sd)
+                } else {
+                    (start, f64::NAN)
+                };
             }
         }
     }
@@ -43,6 +68,12 @@ impl AtRest {
     /// The largest length of a cycle over that at rest; NaN where one of them was not measured.
     pub fn stretch(&self, row: &CycleRow) -> f64 {
         row.length_peak_um / self.length_um
+    }
+
+    /// Half width of the 95 % interval that the length at rest gives every stretch of the run alike, as a part of it; NaN where it
+    /// is not known.
+    pub fn stretch_ci95(&self) -> f64 {
+        1.96 * self.length_sd_um / self.length_um
     }
 
     /// The largest area of a cycle over that at rest; NaN likewise.
@@ -56,20 +87,31 @@ mod tests {
     use super::*;
     use crate::plan::ArmKind;
 
+    fn row(start_um: f64) -> CycleRow {
+        let mut row = CycleRow::empty(0, 1, ArmKind::Cyclic);
+        (row.length_start_um, row.length_peak_um) = (start_um, 24.0);
+        row
+    }
+
     #[test]
     fn a_cell_that_stays_longer_from_cycle_to_cycle_is_measured_by_the_first() {
-        let row = |start_um: f64| {
-            let mut row = CycleRow::empty(0, 1, ArmKind::Cyclic);
-            (row.length_start_um, row.length_peak_um) = (start_um, 24.0);
-            row
-        };
         let rows = [row(f64::NAN), row(8.0), row(12.0)];
         let rest = AtRest::of(&rows);
         assert_eq!(rest.length_um, 8.0);
         assert_eq!((rest.stretch(&rows[1]), rest.stretch(&rows[2])), (3.0, 3.0));
+        assert!(rest.stretch_ci95().is_nan(), "one frame, of an older table");
         assert!(
             rest.areal_stretch(&rows[2]).is_nan(),
             "no area was measured"
         );
+    }
+
+    #[test]
+    fn the_mean_over_the_rest_stands_for_the_one_frame_at_the_start() {
+        let mut first = row(8.3);
+        (first.length_rest_um, first.length_rest_sd_um) = (8.0, 0.02);
+        let rest = AtRest::of(&[first, row(12.0)]);
+        assert_eq!((rest.length_um, rest.stretch(&first)), (8.0, 3.0));
+        assert!((rest.stretch_ci95() - 0.0049).abs() < 1e-12);
     }
 }

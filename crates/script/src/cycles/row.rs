@@ -221,6 +221,14 @@ pub struct CycleRow {
     pub area_peak_um2: f64,
     /// Projected area of the cell at the end, um^2.
     pub area_end_um2: f64,
+    /// Mean length of the cell at rest where the cycle begins, before it left there, um.
+    pub length_rest_um: f64,
+    /// Standard deviation of that mean, um.
+    pub length_rest_sd_um: f64,
+    /// Mean projected area of the cell at rest, likewise, um^2.
+    pub area_rest_um2: f64,
+    /// Standard deviation of that mean, um^2.
+    pub area_rest_sd_um2: f64,
     /// What disturbed it.
     pub flags: CycleFlags,
 }
@@ -277,7 +285,11 @@ floats!(
     area_half_um2,
     area_three_quarters_um2,
     area_peak_um2,
-    area_end_um2
+    area_end_um2,
+    length_rest_um,
+    length_rest_sd_um,
+    area_rest_um2,
+    area_rest_sd_um2
 );
 
 impl CycleRow {
@@ -321,6 +333,10 @@ impl CycleRow {
             area_three_quarters_um2: 0.0,
             area_peak_um2: 0.0,
             area_end_um2: 0.0,
+            length_rest_um: 0.0,
+            length_rest_sd_um: 0.0,
+            area_rest_um2: 0.0,
+            area_rest_sd_um2: 0.0,
             flags: CycleFlags::default(),
         };
         for (_, _, set) in FLOATS {

@@ -5,13 +5,17 @@ use super::row::{FLOATS, WHOLES};
 use crate::plan::ArmKind;
 
 /// Columns that older versions did not write; of their cycles they are not known.
-const LATER: [&str; 6] = [
+const LATER: [&str; 10] = [
     "area_start_um2",
     "area_quarter_um2",
     "area_half_um2",
     "area_three_quarters_um2",
     "area_peak_um2",
     "area_end_um2",
+    "length_rest_um",
+    "length_rest_sd_um",
+    "area_rest_um2",
+    "area_rest_sd_um2",
 ];
 
 /// Why the head of a table is none of a per-cycle table.

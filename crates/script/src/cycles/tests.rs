@@ -63,6 +63,7 @@ fn records_skipping(
             variance_um2: 1e-6,
             verdict: 0,
             target_um: output.reference_um,
+            error_um: f64::NAN,
             plan_ns: output.plan_ns,
             stage: output.stage as u8,
             length_um: f64::NAN,

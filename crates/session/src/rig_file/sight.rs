@@ -53,7 +53,7 @@ impl RigFile {
             })),
             (None, _) => Err(Failure::bad_input(
                 "[vision] is missing: what a bead looks like to this camera is not known",
-                "record some frames with a bead in view; cellpos vision RECORDING then prints the table to paste",
+                "bring a bead into view; cellpos camera --rig RIG --find-beads beads.png finds the settings and writes the table",
             )),
         }
     }

@@ -29,16 +29,12 @@ pub trait Shown {
 
 impl Shown for NoSink {}
 
-/// References of the last ticks: the error of a position is counted from where the bead was to be when it was exposed.
-const TARGETS: usize = 16;
-
 /// How often the tails of the ticks' times are told, in states.
 const TAILS_EVERY: u32 = 10;
 
 /// What feeds page and screen, from what the recorder is given, or from what is read in its folder.
 pub(super) struct Watcher {
     feeds: Vec<Feed>,
-    targets: [(i64, f64); TARGETS],
     pub(super) state: State,
     freeze: String,
     pub(super) safe: String,
@@ -57,7 +53,6 @@ impl Watcher {
     pub(super) fn new(feeds: Vec<Feed>) -> Self {
         Self {
             feeds,
-            targets: [(i64::MIN, f64::NAN); TARGETS],
             state: State::default(),
             freeze: String::new(),
             safe: String::new(),
@@ -81,7 +76,6 @@ impl Watcher {
     /// What comes from now on is of another run: it is shown behind what there was.
     pub(super) fn next_run(&mut self) {
         self.before = (self.state.ticks, self.state.time_s);
-        self.targets = [(i64::MIN, f64::NAN); TARGETS];
         self.freeze.clear();
         self.safe.clear();
     }
@@ -122,16 +116,12 @@ impl Watcher {
 
     /// Shows a tick.
     pub(super) fn show(&mut self, record: &TickRecord) {
-        self.targets.copy_within(0..TARGETS - 1, 1);
-        self.targets[0] = (record.time_ns, record.target_um);
-        let exposed_ns = record.mid_exposure_ns;
-        let then = self.targets.iter().find(|(ns, _)| *ns <= exposed_ns);
         self.row(&Row {
             seq: (self.before.0 + record.seq) as u32,
             time_s: self.time_s(record.time_ns),
             measured_um: record.measured_um as f32,
             target_um: record.target_um as f32,
-            target_then_um: then.map_or(f32::NAN, |(_, um)| *um as f32),
+            target_then_um: (record.measured_um - record.error_um) as f32,
             command_um: record.command_um as f32,
             zero_flow_um: record.neutral_um as f32,
             length_um: record.length_um as f32,

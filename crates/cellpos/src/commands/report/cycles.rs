@@ -126,6 +126,15 @@ pub fn section(page: &mut Report, read: &ReadCycles) -> serde_json::Value {
         ));
     }
     let rest = AtRest::of(rows);
+    if let (true, true) = (rest.length_um.is_finite(), rest.length_sd_um.is_finite()) {
+        page.paragraph(&format!(
+            "Length at rest before the first cycle: {:.3} um, known to {:.3} um (standard deviation of the mean): every stretch is \
+             uncertain by {:.2} % more (95 %) than its cycles scatter, all of them alike.",
+            rest.length_um,
+            rest.length_sd_um,
+            100.0 * rest.stretch_ci95()
+        ));
+    }
     let groups = groups(rows);
     let mut table = Table::new([
         Column::left("of"),
@@ -143,7 +152,7 @@ pub fn section(page: &mut Report, read: &ReadCycles) -> serde_json::Value {
          change per cycle: of a straight line. A trend is one when it is beyond three times the line's 95 % interval. The law: \
          end + (start - end) exp(-cycle/constant), told where the cycles say at what it saturates; * where it describes them \
          better than the line. Each motion by itself, skipped cycles and the static arm's way to its load and back left out. Stretch and areal stretch: largest length and \
-         area over those at the start of the first cycle.",
+         area over those at rest before the first cycle.",
     );
     let mut figure = Figure::new("cycles", "The cycles of the run, each motion by itself.");
     let mut json = Vec::new();

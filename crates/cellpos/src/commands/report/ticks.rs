@@ -4,10 +4,6 @@ use super::envelope::Envelope;
 use super::spectrum::Welch;
 use super::spread::Spread;
 use cellpos_runtime::{Hold, Statistics, TickRecord};
-use std::collections::VecDeque;
-
-/// Ticks remembered to find the reference of the time of an exposure.
-const PAST: usize = 64;
 
 /// A stretch of the run, tick by tick.
 #[derive(Debug, Default)]
@@ -59,7 +55,7 @@ pub struct Ticks {
     end_s: f64,
     first_running_s: Option<f64>,
     period_s: (f64, u64),
-    past: VecDeque<(i64, f64)>,
+    last_ns: Option<i64>,
 }
 
 impl Ticks {
@@ -74,7 +70,7 @@ impl Ticks {
     /// A session begins at a time of the run; its bead is to be held so well.
     pub fn begin(&mut self, start_s: f64, hold: Option<Hold>) {
         self.start_s = start_s;
-        self.past.clear();
+        self.last_ns = None;
         self.traces.gap();
         self.length.gap();
         self.session += 1;
@@ -85,7 +81,7 @@ impl Ticks {
     /// The next tick.
     pub fn add(&mut self, r: &TickRecord) {
         let time_s = self.start_s + r.time_ns as f64 * 1e-9;
-        if let Some((last_ns, _)) = self.past.back() {
+        if let Some(last_ns) = self.last_ns.replace(r.time_ns) {
             self.period_s.0 += (r.time_ns - last_ns) as f64 * 1e-9;
             self.period_s.1 += 1;
         }
@@ -93,10 +89,6 @@ impl Ticks {
         self.traces.add(time_s, values);
         self.rows += 1;
         self.end_s = time_s;
-        if self.past.len() >= PAST {
-            self.past.pop_front();
-        }
-        self.past.push_back((r.time_ns, r.target_um));
         self.wake_us.add(f64::from(r.wake_ns) * 1e-3);
         self.compute_us.add(f64::from(r.compute_ns) * 1e-3);
         self.length.add(time_s, [r.length_um]);
@@ -134,30 +126,12 @@ impl Ticks {
         if !counts {
             return;
         }
-        let then_um = self.target_at(r.mid_exposure_ns);
-        let error_um = match then_um {
-            Some(then_um) if r.verdict == 0 => r.measured_um - then_um,
-            _ => f64::NAN,
-        };
-        self.error_nm.add(error_um * 1e3);
-        self.error_um.add(error_um);
+        self.error_nm.add(r.error_um * 1e3);
+        self.error_um.add(r.error_um);
         if r.variance_um2.is_finite() {
             self.variance_um2.0 += r.variance_um2;
             self.variance_um2.1 += 1;
         }
-    }
-
-    /// The reference at a time not long past.
-    fn target_at(&self, time_ns: i64) -> Option<f64> {
-        let after = self.past.partition_point(|past| past.0 <= time_ns);
-        let before = self.past.get(after.checked_sub(1)?)?;
-        Some(match self.past.get(after) {
-            Some(after) => {
-                let share = (time_ns - before.0) as f64 / (after.0 - before.0).max(1) as f64;
-                before.1 + (after.1 - before.1) * share
-            }
-            None => before.1,
-        })
     }
 
     /// Start of the last tick, s since the start of the run.

@@ -329,7 +329,7 @@ impl ScriptSink {
         format!(
             "{cycle}  {stage}  {} left{amplitude}  error {:+.0}nm",
             time(left_s),
-            (r.measured_um - r.target_um) * 1e3
+            r.error_um * 1e3
         )
     }
 }

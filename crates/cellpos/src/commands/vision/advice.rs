@@ -74,14 +74,14 @@ impl Advice {
             self.bad_fit,
             self.profile()
         );
-        // Settings that come out of a file go back into one.
-        match toml::to_string(&toml::Table::from_iter([(
-            "vision".to_string(),
-            toml::Value::try_from(&self.vision).unwrap_or(toml::Value::Boolean(false)),
-        )])) {
-            Ok(table) => text.push_str(&table),
-            Err(error) => text.push_str(&format!("# {error}\n")),
-        }
+        text.push_str(&vision_table(&self.vision));
         text
     }
+}
+
+/// Settings that come out of a file, as the table that goes back into one.
+pub(in crate::commands) fn vision_table(vision: &LocaliserConfig) -> String {
+    let value = toml::Value::try_from(vision).unwrap_or(toml::Value::Boolean(false));
+    toml::to_string(&toml::Table::from_iter([("vision".to_string(), value)]))
+        .unwrap_or_else(|error| format!("# {error}\n"))
 }

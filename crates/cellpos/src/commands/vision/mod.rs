@@ -7,6 +7,7 @@ mod cells;
 mod settings;
 
 pub use advice::Advice;
+pub(super) use advice::vision_table;
 
 use super::vision_sheet::Sheet;
 use super::vision_summary::{Summary, Tally};

@@ -17,11 +17,14 @@ pub(super) struct CellRow {
     cycles: u64,
     /// Of these: changed by what happened in them.
     cycles_disturbed: u64,
-    /// Length at the start of the first cycle \[um\].
+    /// Mean length at rest before the first cycle, and its standard deviation \[um\].
     rest_length_um: Option<f64>,
-    /// Longest over length at the start of the first cycle, mean of the first and of the last ten whole cycles of the cyclic arm.
+    rest_length_sd_um: Option<f64>,
+    /// Longest over length at rest, mean of the first and of the last ten whole cycles of the cyclic arm.
     stretch_first: Option<f64>,
     stretch_last: Option<f64>,
+    /// Half width of the 95 % interval of `stretch_first`: scatter of its cycles and the length at rest together.
+    stretch_first_ci95: Option<f64>,
     /// Recovery time, likewise \[s\].
     recovery_first_s: Option<f64>,
     recovery_last_s: Option<f64>,
@@ -54,6 +57,13 @@ impl CellRow {
             )
         };
         let (stretch_first, stretch_last) = ends(&|row| rest.stretch(row));
+        let scatter =
+            trend(counted(rows).map(|row| (row.cycle, rest.stretch(row)))).map(|t| t.first.ci95);
+        // The two are independent: the length at rest is of frames before the first cycle.
+        let stretch_first_ci95 = stretch_first.zip(scatter).map(|(stretch, scatter)| {
+            let of_rest = rest.stretch_ci95() * stretch;
+            scatter.hypot(if of_rest.is_finite() { of_rest } else { 0.0 })
+        });
         let (recovery_first_s, recovery_last_s) = ends(&|row| row.recovery_s);
         let squares: Vec<f64> = rows
             .iter()
@@ -67,8 +77,10 @@ impl CellRow {
             cycles: rows.len() as u64,
             cycles_disturbed: rows.iter().filter(|row| row.flags.is_disturbed()).count() as u64,
             rest_length_um: finite(rest.length_um),
+            rest_length_sd_um: finite(rest.length_sd_um),
             stretch_first,
             stretch_last,
+            stretch_first_ci95: stretch_first_ci95.and_then(finite),
             recovery_first_s,
             recovery_last_s,
             cycle_rms_nm: finite(mean.sqrt() * 1e3),
@@ -81,11 +93,13 @@ impl CellRow {
         self.outcome == "done"
     }
 
-    fn numbers(&self) -> [(&'static str, Option<f64>, usize); 6] {
+    fn numbers(&self) -> [(&'static str, Option<f64>, usize); 8] {
         [
             ("rest_length_um", self.rest_length_um, 3),
+            ("rest_length_sd_um", self.rest_length_sd_um, 4),
             ("stretch_first", self.stretch_first, 4),
             ("stretch_last", self.stretch_last, 4),
+            ("stretch_first_ci95", self.stretch_first_ci95, 4),
             ("recovery_first_s", self.recovery_first_s, 4),
             ("recovery_last_s", self.recovery_last_s, 4),
             ("cycle_rms_nm", self.cycle_rms_nm, 1),
@@ -96,7 +110,7 @@ impl CellRow {
 /// The table as CSV; a number that does not exist is an empty field.
 pub(super) fn csv(rows: &[CellRow]) -> String {
     let mut out = String::from(
-        "cell,outcome,cycles,cycles_disturbed,rest_length_um,stretch_first,stretch_last,recovery_first_s,recovery_last_s,\
+        "cell,outcome,cycles,cycles_disturbed,rest_length_um,rest_length_sd_um,stretch_first,stretch_last,stretch_first_ci95,recovery_first_s,recovery_last_s,\
          cycle_rms_nm,run\n",
     );
     for row in rows {
@@ -246,8 +260,10 @@ pub(super) fn page(name: &str, rows: &[CellRow], cycles: &[Vec<CycleRow>]) -> Re
         Column::right("cycles"),
         Column::right("disturbed"),
         Column::right("length at rest [um]"),
+        Column::right("its sd [um]"),
         Column::right("stretch, first ten"),
         Column::right("last ten"),
+        Column::right("+- (95 %, of the first)"),
         Column::right("recovery, first ten [s]"),
         Column::right("last ten"),
         Column::right("error RMS [nm]"),

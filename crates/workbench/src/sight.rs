@@ -1,0 +1,147 @@
+//! How well vision sees a bead or a cell in frames that follow each other.
+
+use crate::bench::Bench;
+use crate::capture::Kept;
+use crate::snapshot::Eye;
+use cellpos_numeric::statistics::quantile;
+use cellpos_session::Failure;
+use cellpos_vision::Localiser;
+use serde::Serialize;
+
+/// What the tracker of the loop made of frames.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Sight {
+    /// Frames, from the first in which it believed in a bead or cell.
+    pub frames: u64,
+    /// Of these, with a position.
+    pub seen: u64,
+    /// Frames before the first.
+    pub before: u64,
+    /// Noise of a position along the rows as the fit states it, median, px.
+    pub stated_px: f64,
+    /// The same from the steps between successive frames, px; none where the bead's own motion hides it.
+    pub measured_px: Option<f64>,
+    /// Contrast over noise, median.
+    pub snr: f64,
+    /// Time of looking at a frame, median and 99 of 100, us.
+    pub look_us: [f64; 2],
+}
+
+impl Sight {
+    /// Of frames as the rig file says.
+    ///
+    /// # Errors
+    /// Settings that cannot be, or a frame of another size than the background of a cell.
+    pub fn of(bench: &Bench, frames: &[Kept]) -> Result<Self, Failure> {
+        Self::through(&mut Eye::of(bench)?, frames)
+    }
+
+    /// Of frames with a bead that another localiser looks for.
+    ///
+    /// # Errors
+    /// Settings that cannot be.
+    pub fn of_bead(bench: &Bench, localiser: Localiser, frames: &[Kept]) -> Result<Self, Failure> {
+        Self::through(&mut Eye::of_bead(bench, localiser)?, frames)
+    }
+
+    fn through(eye: &mut Eye, frames: &[Kept]) -> Result<Self, Failure> {
+        let start_ns = frames.first().map_or(0, |kept| kept.stamp.mid_exposure_ns);
+        let mut places = Vec::with_capacity(frames.len());
+        let (mut sds, mut snrs, mut times_us) = (Vec::new(), Vec::new(), Vec::new());
+        for kept in frames {
+            let time_s = (kept.stamp.mid_exposure_ns - start_ns) as f64 * 1e-9;
+            let began = std::time::Instant::now();
+            let seen = eye.look(&kept.frame, time_s)?;
+            times_us.push(began.elapsed().as_secs_f64() * 1e6);
+            if let Some(seen) = seen {
+                sds.push(seen.sd_px);
+                snrs.push(seen.snr);
+            }
+            places.push((kept.stamp.id, seen.map(|seen| seen.x_px)));
+        }
+        let before = places.iter().take_while(|(_, x)| x.is_none()).count();
+        Ok(Self {
+            frames: (places.len() - before) as u64,
+            seen: sds.len() as u64,
+            before: before as u64,
+            stated_px: quantile(&sds, 0.5),
+            measured_px: noise_px(&places),
+            snr: quantile(&snrs, 0.5),
+            look_us: [quantile(&times_us, 0.5), quantile(&times_us, 0.99)],
+        })
+    }
+
+    /// Share of the frames with a position.
+    pub fn recall(&self) -> f64 {
+        self.seen as f64 / self.frames.max(1) as f64
+    }
+}
+
+/// Noise of a position from frames that follow each other: noise makes successive steps oppose each other, a free bead's motion
+/// does not, and the blur of the exposure makes them agree, so that this is a lower bound. `None` below twice its uncertainty.
+fn noise_px(places: &[(u64, Option<f64>)]) -> Option<f64> {
+    let steps: Vec<(f64, f64)> = places
+        .windows(3)
+        .filter_map(|three| match three {
+            [(a, Some(x)), (b, Some(y)), (c, Some(z))] if b - a == 1 && c - b == 1 => {
+                Some((y - x, z - y))
+            }
+            _ => None,
+        })
+        .collect();
+    let n = steps.len() as f64;
+    if n < 100.0 {
+        return None;
+    }
+    let mean = steps.iter().map(|(a, b)| 0.5 * (a + b)).sum::<f64>() / n;
+    let (mut cross, mut square) = (0.0, 0.0);
+    for (a, b) in &steps {
+        cross += (a - mean) * (b - mean) / n;
+        square += (a - mean) * (a - mean) / n;
+    }
+    // The covariance of two steps of n is known to the variance of a step over the root of n.
+    let uncertain = square / n.sqrt();
+    (-cross > 2.0 * uncertain).then(|| (-cross).sqrt())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Steps of a bead that wanders by `walk` a frame, seen with a noise of one, by a generator of numbers of variance one.
+    fn noise_of(walk: f64) -> Option<f64> {
+        let mut state = 1_u64;
+        let mut normal = move || {
+            let sum: f64 = (0..12)
+                .map(|_| {
+                    state = state
+                        .wrapping_mul(6_364_136_223_846_793_005)
+                        .wrapping_add(1);
+                    (state >> 11) as f64 / (1_u64 << 53) as f64
+                })
+                .sum();
+            sum - 6.0
+        };
+        let mut x = 0.0;
+        let places: Vec<(u64, Option<f64>)> = (0..20_000)
+            .map(|id| {
+                x += walk * normal();
+                (id, (id % 50 != 7).then(|| x + normal()))
+            })
+            .collect();
+        noise_px(&places)
+    }
+
+    #[test]
+    fn the_noise_of_a_bead_that_wanders_is_found_and_not_claimed_where_its_motion_hides_it() {
+        for walk in [0.0, 1.0, 3.0] {
+            let noise = noise_of(walk).expect("noise");
+            assert!((noise - 1.0).abs() < 0.15, "walk {walk}: {noise}");
+        }
+        assert_eq!(noise_of(30.0), None);
+        assert_eq!(
+            noise_px(&[(0, Some(1.0)), (1, Some(2.0)), (2, Some(1.0))]),
+            None
+        );
+    }
+}
