@@ -82,6 +82,9 @@ pub struct Args {
     /// `--rig`, or the most prominent.
     #[arg(long, allow_hyphen_values = true)]
     near: Option<Micrometers>,
+    /// Without the imperfections of a real rig (emulated rig): flow, light, focus and clocks stand still.
+    #[arg(long, conflicts_with = "resume")]
+    ideal: bool,
     /// Seed of the emulated rig; left out: that of rig.toml.
     #[arg(long)]
     seed: Option<u64>,
@@ -153,6 +156,9 @@ fn fresh(args: &Args) -> Result<Ready, Failure> {
     let mut file = RigFile::load(args.rig.as_deref())?;
     if let Some(seed) = args.seed {
         file.emulator.seed = seed;
+    }
+    if args.ideal {
+        file.make_ideal()?;
     }
     if args.dry {
         rehearse(&mut file, &args.model);

@@ -71,6 +71,9 @@ pub struct Args {
     /// `--rig`, or the most prominent.
     #[arg(long, allow_hyphen_values = true)]
     near: Option<Micrometers>,
+    /// Without the imperfections of a real rig (emulated rig): flow, light, focus and clocks stand still.
+    #[arg(long)]
+    ideal: bool,
     /// Seed of the emulated rig; left out: that of rig.toml.
     #[arg(long)]
     seed: Option<u64>,
@@ -130,6 +133,9 @@ pub fn run(args: Args) -> CommandResult {
     let mut file = RigFile::load(args.rig.as_deref())?;
     if let Some(seed) = args.seed {
         file.emulator.seed = seed;
+    }
+    if args.ideal {
+        file.make_ideal()?;
     }
     if let Some(near) = args.near {
         file.near_um = Some(near.value());

@@ -197,6 +197,22 @@ impl HeldBead {
         Ok(newest)
     }
 
+    /// Waits for the next frame, at most a quarter of a period longer than it should take: a tick starts with the arrival of a
+    /// frame, and the camera's clock is its own. The newest measurement then.
+    fn arrival(&mut self) -> Result<Option<Measurement>, Failure> {
+        let latest_ns = self.next_ns + self.period_ns / 4;
+        let first = match &mut self.source {
+            Some(source) => source.next(latest_ns).map_err(Failure::failed)?,
+            None => None,
+        };
+        self.next_ns = match &first {
+            Some(measurement) => measurement.ready_ns.max(self.next_ns - self.period_ns / 4),
+            None => latest_ns,
+        };
+        self.setup.clock.sleep_until_ns(self.next_ns);
+        Ok(self.newest(self.next_ns)?.or(first))
+    }
+
     fn send(&mut self, command_um: f64, neutral_um: f64) -> Result<(), Failure> {
         let time_us = u64::try_from((self.next_ns - self.start_ns) / 1000).unwrap_or(0);
         self.board
@@ -249,8 +265,7 @@ impl HeldBead {
     pub fn wait_for_bead(&mut self) -> Result<(), Failure> {
         let mut seen = 0;
         for _ in 0..10_000 {
-            self.setup.clock.sleep_until_ns(self.next_ns);
-            let good = self.newest(self.next_ns)?.is_some_and(|m| m.is_usable());
+            let good = self.arrival()?.is_some_and(|m| m.is_usable());
             self.send(self.neutral_um, self.neutral_um)?;
             self.next_ns += self.period_ns;
             seen = if good { seen + 1 } else { 0 };
@@ -287,9 +302,8 @@ impl Bench for HeldBead {
     type Error = Failure;
 
     fn tick(&mut self, excitation_um: f64) -> Result<Row, Failure> {
+        let newest = self.arrival()?;
         let now_ns = self.next_ns;
-        self.setup.clock.sleep_until_ns(now_ns);
-        let newest = self.newest(now_ns)?;
         let good = newest.filter(Measurement::is_usable);
         if let Some(m) = good.filter(|m| m.variance_um2.is_finite()) {
             self.variance_um2.0 += m.variance_um2;

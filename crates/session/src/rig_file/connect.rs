@@ -65,10 +65,7 @@ impl RigFile {
         camera: C,
         clock: &Clock,
     ) -> Result<Box<dyn PositionSource>, Failure> {
-        let emulated = || {
-            let middle_px = 0.5 * f64::from(self.emulator.width_px.saturating_sub(1));
-            Calibration::along_rows(self.emulator.pixel_um, middle_px, 1.0)
-        };
+        let emulated = || EmulatedRig::calibration_of(&self.emulator);
         let calibration = match self.camera {
             CameraConfig::Emulated {} => self.calibration.unwrap_or_else(emulated),
             _ => self.real_calibration()?,

@@ -440,6 +440,21 @@ impl RigFile {
         Ok(())
     }
 
+    /// Takes the imperfections of a real rig off the emulated one, but for those whose key is given.
+    ///
+    /// # Errors
+    /// The rig is not emulated.
+    pub fn make_ideal(&mut self) -> Result<(), Failure> {
+        if !self.is_emulated() {
+            return Err(Failure::bad_input(
+                "--ideal is for the emulated rig: a real one is as it is",
+                "leave it out; firmware-sim has an --ideal of its own",
+            ));
+        }
+        self.emulator.ideal = true;
+        Ok(())
+    }
+
     /// Whether all of it is emulated in this process.
     pub fn is_emulated(&self) -> bool {
         self.actuator.is_emulated() && self.camera == CameraConfig::Emulated {}
