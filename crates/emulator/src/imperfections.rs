@@ -49,8 +49,8 @@ impl Imperfections {
         zero_flow_drift_um_per_s: 0.001,
         lateral_um: 0.5,
         tilt_deg: 1.0,
-        // A micrometre of a stage that breathes: the ring of a 1 um bead by 2 %.
-        focus_wander: 0.02,
+        // A stage that breathes by some tens of nanometres while the focus is kept.
+        focus_wander: 0.005,
         focus_time_s: 5.0,
         dust: 3,
         light_slope: 0.1,

@@ -8,6 +8,7 @@ use nalgebra::Complex;
 
 pub use crate::bootstrap::bootstrap;
 use crate::candidate_model::CandidateModel;
+use crate::delay::apart_s;
 use crate::order_selection::{
     CandidateFits, CandidateOrder, DelayPrior, OrderSelection, index, model_of,
 };
@@ -70,6 +71,9 @@ pub struct Judged {
     pub phase_delay95_s: [f64; 2],
     /// Best delay from the phase slope alone, s: the smallest far-zero lead that the data allow.
     pub phase_delay_s: f64,
+    /// By how much the delay that was measured otherwise and the phase slope contradict each other, s. The record's own delay is
+    /// taken then: it is the one that the loop lives with.
+    pub contradiction_s: Option<f64>,
 }
 
 impl Judged {
@@ -84,6 +88,9 @@ const WIDEST_RELATIVE: f64 = 0.5;
 
 /// 95 % threshold of a profile's rise, chi-squared with one degree of freedom.
 const PROFILE_RISE: f64 = 3.841;
+
+/// What neither LED test nor phase slope accounts for, s: a step of the converter's update, the rounding of time stamps.
+const NOT_ACCOUNTED_S: f64 = 2e-5;
 
 /// Profile interval of the far zero's lead, ms, searched in 0..`LEAD_MOST_MS` sampling periods.
 fn lead_interval_ms(
@@ -248,10 +255,31 @@ pub fn judge(
     let lead = lead_ms.unwrap_or([0.0, f64::INFINITY]);
     let phase_low = effective + lead[0] - half;
     let phase_high = effective + lead[1] + half;
-    let model = with_prior(problem, fit, prior);
-    let delay = delay_parameter(&model, prior, effective, half, lead, period_ms);
+    let phase95_s = [phase_low * 1e-3, phase_high * 1e-3];
+    let contradiction_s = prior.and_then(|p| {
+        let given95_s = [p.delay_s - p.half95_s, p.delay_s + p.half95_s];
+        apart_s(given95_s, phase95_s, NOT_ACCOUNTED_S)
+    });
+    let agreed = prior.filter(|_| contradiction_s.is_none());
+    let model = with_prior(problem, fit, agreed);
+    let mut delay = delay_parameter(&model, agreed, effective, half, lead, period_ms);
+    if let (Some(gap_s), Some(prior)) = (contradiction_s, prior) {
+        let given_ms = prior.delay_s * 1e3;
+        delay.ci95 = [delay.ci95[0].min(given_ms), delay.ci95[1].max(given_ms)];
+        delay.verdict = Identifiability::NotIdentifiable {
+            reason: format!(
+                "the LED test says {given_ms:.2} ms, the phase slope {:.2} to {:.2} ms: {:.0} degrees at 200 Hz apart; measure both again on \
+                 an idle machine",
+                phase_low,
+                phase_high,
+                360.0 * 200.0 * gap_s
+            ),
+        };
+    }
     parameters.push(delay);
-    parameters.push(far_zero_parameter(fit, &model, prior, lead, period_ms));
+    parameters.push(far_zero_parameter(
+        fit, &model, agreed, lead, half, period_ms,
+    ));
     if let Some(full) = fit
         .candidates
         .iter()
@@ -266,7 +294,8 @@ pub fn judge(
     Judged {
         parameters,
         model,
-        phase_delay95_s: [phase_low * 1e-3, phase_high * 1e-3],
+        phase_delay95_s: phase95_s,
+        contradiction_s,
         phase_delay_s: (effective + lead[0]) * 1e-3,
     }
 }
@@ -412,8 +441,17 @@ fn far_zero_parameter(
     model: &CandidateModel,
     prior: Option<DelayPrior>,
     lead_ms: [f64; 2],
+    half_ms: f64,
     period_ms: f64,
 ) -> IdentifiedParameter {
+    // With a delay from elsewhere the lead is what that delay leaves of the phase slope, and so is its interval.
+    let lead_ms = match prior {
+        Some(prior) if model.far_lead_s > 0.0 => {
+            let (lead, half) = (model.far_lead_s * 1e3, half_ms.hypot(prior.half95_s * 1e3));
+            [(lead - half).max(0.0), lead + half]
+        }
+        _ => lead_ms,
+    };
     let invert = |ms: f64| if ms > 0.0 { 1e3 / ms } else { f64::INFINITY };
     let ci95 = [
         if lead_ms[1].is_finite() {
@@ -442,7 +480,7 @@ fn far_zero_parameter(
         Identifiability::Identified
     } else {
         let mut reason = format!(
-            "its lead trades against the delay: the record alone allows leads of {:.3} to {} ms",
+            "its lead trades against the delay: the data allow leads of {:.3} to {} ms",
             lead_ms[0],
             if lead_ms[1].is_finite() {
                 format!("{:.3}", lead_ms[1])

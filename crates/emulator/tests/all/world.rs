@@ -355,7 +355,7 @@ fn a_table_reads_back_as_it_was_written_and_an_unknown_key_is_refused() {
     assert_eq!(toml::from_str::<WorldConfig>(&text).unwrap(), config);
     assert_eq!(
         toml::from_str::<WorldConfig>("").unwrap(),
-        WorldConfig::ideal()
+        WorldConfig::default()
     );
     let error = toml::from_str::<WorldConfig>("latency_s = 0.002").unwrap_err();
     assert!(error.to_string().contains("latency_s"), "{error}");
