@@ -7,15 +7,12 @@ use crate::error::WorldError;
 use crate::faults::FaultKind;
 use crate::imperfections::Wander;
 use crate::render::{Renderer, localisation_bound_um, mean_between};
-use crate::zero_flow::ZeroFlow;
+use crate::zero_flow::{ZeroFlow, gain_per_s};
 use cellpos_numeric::Random;
 use cellpos_plant::effects::{Action, Shown};
 use cellpos_plant::{Chain, Model, Noise};
-use cellpos_units::Hertz;
 use cellpos_vision::FixQuality;
 
-/// Where the gain of a plant without a slow pair of pole and zero is read: the middle of what a loop at 1 kHz controls.
-const STEP_FREQUENCY: Hertz = Hertz(30.0);
 /// Turns a seed into that of frames of the empty channel.
 const EMPTY_SEED: u64 = 0x5eed_0f0e_3a97_7c41;
 
@@ -477,14 +474,6 @@ impl World {
             FixQuality::Good
         }
     }
-}
-
-/// Speed of the bead over displacement, 1/s: what a step of the zero flow drives at once.
-fn gain_per_s(model: &Model) -> f64 {
-    let plant = &model.plant;
-    plant
-        .velocity_gain_above_pair()
-        .unwrap_or_else(|| plant.velocity_gain_at(STEP_FREQUENCY))
 }
 
 fn renderer(config: &WorldConfig) -> Result<Renderer, WorldError> {

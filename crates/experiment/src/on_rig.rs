@@ -297,7 +297,17 @@ impl OnRig {
     /// The LED test on a rig with a real board: its LED is switched at dithered instants before its camera.
     pub fn delay_test(&self, edges: usize, seed: u64) -> Result<DelayTest, Failure> {
         const APART_S: f64 = 0.011;
+        const PINGS: u32 = 21;
         let (mut camera, mut board) = self.file.open_for_led()?;
+        let mut trips_s = Vec::new();
+        for token in 0..PINGS {
+            let trip = board.ping(token, Duration::from_millis(50));
+            trips_s.extend(
+                trip.map_err(Failure::failed)?
+                    .map(|(trip, _)| trip.as_secs_f64()),
+            );
+        }
+        trips_s.sort_by(f64::total_cmp);
         let seconds = |ns: i64| ns as f64 * 1e-9;
         let start_ns = monotonic_ns();
         let period_s = self.file.timing.period_us * 1e-6;
@@ -329,6 +339,8 @@ impl OnRig {
             }
         }
         board.led(false).map_err(Failure::failed)?;
-        DelayTest::evaluate(switched_s, seen)
+        let mut test = DelayTest::evaluate(switched_s, seen)?;
+        test.line_s = trips_s.get(trips_s.len() / 2).map(|trip_s| 0.5 * trip_s);
+        Ok(test)
     }
 }

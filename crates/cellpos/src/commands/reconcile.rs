@@ -246,12 +246,7 @@ fn collectable(args: &Args) -> Result<(), Failure> {
 /// The rig to collect on.
 fn rig(args: &Args, model: &Model) -> Result<OnRig, Failure> {
     let mut file = RigFile::load(args.rig.as_deref())?;
-    if let Some(seed) = args.seed {
-        file.emulator.seed = seed;
-    }
-    if args.ideal {
-        file.make_ideal()?;
-    }
+    file.emulate_as(args.seed, args.ideal)?;
     OnRig::new(
         file,
         model.clone(),

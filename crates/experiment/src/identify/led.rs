@@ -2,7 +2,8 @@
 
 use cellpos_ident::delay::{Brightness, DelayEstimate, SeenEdge, delay_from_edges, find_edges};
 use cellpos_rig::{FrameBuffer, FrameStamp};
-use cellpos_session::Failure;
+use cellpos_session::rig_file::CameraConfig;
+use cellpos_session::{Failure, RigFile};
 
 /// Frames of the test as they come.
 #[derive(Debug, Clone, Default)]
@@ -36,7 +37,12 @@ pub struct DelayTest {
     pub frame_s: Vec<f64>,
     /// Their mean grey levels.
     pub grey: Vec<f64>,
+    /// What a command takes to the board, s: half of a round trip; `None` where nobody asked.
+    pub line_s: Option<f64>,
 }
+
+/// Part of a period by which time stamps may be off before anybody is told.
+const WORTH_SAYING: f64 = 0.1;
 
 impl DelayTest {
     /// The delay between the switching times of the LED and what the frames saw.
@@ -57,6 +63,33 @@ impl DelayTest {
             switched_s,
             frame_s: frames.mid_s,
             grey: frames.grey,
+            line_s: None,
+        })
+    }
+
+    /// What to write when the frames' time stamps are not those of their exposures: what the LED test finds beyond the line is their
+    /// error. To be asked before [`DelayTest::up_to_the_tick`].
+    pub fn stamps_off(&self, file: &RigFile) -> Option<String> {
+        let off_s = self.estimate.delay_s - self.line_s?;
+        // The line's two ways need not take the same time.
+        let unsure_s = self.line_s? + 0.5 * (self.estimate.ci95_s[1] - self.estimate.ci95_s[0]);
+        if off_s.abs() < (WORTH_SAYING * 1e-6 * file.timing.period_us).max(unsure_s) {
+            return None;
+        }
+        let off_ms = off_s * 1e3;
+        Some(match &file.camera {
+            CameraConfig::Industrial { latency_ms, .. } => {
+                let set_ms = latency_ms.unwrap_or(CameraConfig::LATENCY_MS);
+                format!(
+                    "by the LED the exposures are {off_ms:+.2} ms from their time stamps, which [camera] latency_ms = {set_ms} makes: \
+                     write latency_ms = {:.2} and identify again",
+                    set_ms + off_ms
+                )
+            }
+            _ => format!(
+                "by the LED the exposures are {off_ms:+.2} ms from the time stamps that the camera's server gives them: correct the \
+                 server, or find what delays the LED"
+            ),
         })
     }
 

@@ -109,6 +109,7 @@ pub fn run_shown(
     // The LED test ends at the exposure, a row of the record at its tick.
     if let Some(test) = &mut led {
         warnings.extend(test.vague());
+        warnings.extend(job.rig.as_ref().and_then(|rig| test.stamps_off(&rig.file)));
         test.up_to_the_tick(age_s);
     }
     let mut result = conclude(job, measured, led.as_ref())?;

@@ -178,6 +178,7 @@ impl RigFile {
                 region,
                 exposure_us,
                 bits,
+                latency_ms,
             } => {
                 use cellpos_drivers::sources::industrial::{IndustrialCamera, IndustrialSettings};
                 let settings = IndustrialSettings {
@@ -186,7 +187,7 @@ impl RigFile {
                     rate_hz: *rate_hz,
                     exposure_us: *exposure_us,
                     bits: *bits,
-                    latency_ms: self.timing.camera_delay_ms,
+                    latency_ms: latency_ms.unwrap_or(CameraConfig::LATENCY_MS),
                     buffers: 50,
                 };
                 Ok(Box::new(

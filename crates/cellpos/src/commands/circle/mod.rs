@@ -93,12 +93,7 @@ pub fn run(args: Args) -> CommandResult {
     output::ready(args.out.iter().chain(&args.report))?;
     let given = Model::load(&args.model).map_err(Failure::input)?;
     let mut file = RigFile::load(args.rig.as_deref())?;
-    if let Some(seed) = args.seed {
-        file.emulator.seed = seed;
-    }
-    if args.ideal {
-        file.make_ideal()?;
-    }
+    file.emulate_as(args.seed, args.ideal)?;
     if let Some(hidden) = &args.hidden {
         if !file.is_emulated() {
             return Err(Failure::bad_input(

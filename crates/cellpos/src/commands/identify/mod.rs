@@ -226,12 +226,7 @@ fn on_rig(args: &Args, model: &Model) -> Result<Option<OnRig>, Failure> {
         return Ok(None);
     };
     let mut file = RigFile::load(Some(path))?;
-    if let Some(seed) = args.seed {
-        file.emulator.seed = seed;
-    }
-    if args.ideal {
-        file.make_ideal()?;
-    }
+    file.emulate_as(args.seed, args.ideal)?;
     let frames = match args.frames {
         Switch::On => Frames::On,
         Switch::Off => Frames::Off,
