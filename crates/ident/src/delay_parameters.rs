@@ -60,23 +60,7 @@ pub(crate) fn far_zero_parameter(
     half_ms: f64,
     period_ms: f64,
 ) -> IdentifiedParameter {
-    // With a delay from elsewhere the lead is what that delay leaves of the phase slope, and so is its interval.
-    let lead_ms = match prior {
-        Some(prior) if model.far_lead_s > 0.0 => {
-            let (lead, half) = (model.far_lead_s * 1e3, half_ms.hypot(prior.half95_s * 1e3));
-            [(lead - half).max(0.0), lead + half]
-        }
-        _ => lead_ms,
-    };
     let invert = |ms: f64| if ms > 0.0 { 1e3 / ms } else { f64::INFINITY };
-    let ci95 = [
-        if lead_ms[1].is_finite() {
-            invert(lead_ms[1])
-        } else {
-            0.0
-        },
-        invert(lead_ms[0]),
-    ];
     let middle = if lead_ms[1].is_finite() {
         0.5 * (lead_ms[0] + lead_ms[1])
     } else {
@@ -87,6 +71,22 @@ pub(crate) fn far_zero_parameter(
     let identified = fit.best().order >= CandidateOrder::FarZero
         && lead_ms[1] < 0.5 * period_ms
         && width < WIDEST_RELATIVE * middle;
+    // With a delay from elsewhere the lead is what that delay leaves of the phase slope, and so is its interval.
+    let shown_ms = match prior {
+        Some(prior) if model.far_lead_s > 0.0 => {
+            let (lead, half) = (model.far_lead_s * 1e3, half_ms.hypot(prior.half95_s * 1e3));
+            [(lead - half).max(0.0), lead + half]
+        }
+        _ => lead_ms,
+    };
+    let ci95 = [
+        if shown_ms[1].is_finite() {
+            invert(shown_ms[1])
+        } else {
+            0.0
+        },
+        invert(shown_ms[0]),
+    ];
     let value = if prior.is_some() && model.far_lead_s > 0.0 {
         1.0 / model.far_lead_s
     } else {
@@ -96,7 +96,7 @@ pub(crate) fn far_zero_parameter(
         Identifiability::Identified
     } else {
         let mut reason = format!(
-            "its lead trades against the delay: the data allow leads of {:.3} to {} ms",
+            "its lead trades against the delay: the record alone allows leads of {:.3} to {} ms",
             lead_ms[0],
             if lead_ms[1].is_finite() {
                 format!("{:.3}", lead_ms[1])

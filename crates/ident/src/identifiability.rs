@@ -90,8 +90,8 @@ pub(crate) const WIDEST_RELATIVE: f64 = 0.5;
 /// 95 % threshold of a profile's rise, chi-squared with one degree of freedom.
 const PROFILE_RISE: f64 = 3.841;
 
-/// What neither LED test nor phase slope accounts for, s: a step of the converter's update, the rounding of time stamps.
-const NOT_ACCOUNTED_S: f64 = 2e-5;
+/// What neither LED test nor phase slope accounts for, s: half of a step of the converter's update, 0.1 ms.
+const NOT_ACCOUNTED_S: f64 = 5e-5;
 
 /// Profile interval of the far zero's lead, ms, searched in 0..`LEAD_MOST_MS` sampling periods.
 fn lead_interval_ms(
