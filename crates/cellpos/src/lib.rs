@@ -7,6 +7,7 @@
 #![forbid(unsafe_code)]
 
 mod arguments;
+mod checked;
 mod clips;
 mod commands;
 mod kept;

@@ -20,7 +20,7 @@ const STALE_BY: usize = 5;
 pub struct FrameInfo {
     /// Rises by one per exposed frame, from 0.
     pub id: u64,
-    /// Middle of the exposure, ns.
+    /// Middle of the exposure by the camera's own clock, ns.
     pub mid_exposure_ns: i64,
     /// Exposure time, ns.
     pub exposure_ns: i64,
@@ -67,6 +67,8 @@ pub(crate) struct Sample {
     pub seen_um: f64,
     /// Position of a second bead, if there is one.
     pub second_um: Option<(f64, f64)>,
+    /// Size of the bead's ring against that in focus, less one.
+    pub defocus: f64,
     pub visible: bool,
     pub lit: bool,
 }
@@ -79,6 +81,34 @@ pub(crate) struct Exposure {
     /// The frame grabber hangs: the picture is the one before, to the bit.
     pub frozen: bool,
     pub samples: [Sample; EXPOSURE_STEPS + 1],
+}
+
+impl Exposure {
+    /// Length of the cell in the middle of the exposure, um; `None` for a bead.
+    pub(crate) fn mid_length_um(&self) -> Option<f64> {
+        let middle = self.samples.get(EXPOSURE_STEPS / 2)?;
+        Some(middle.length_um).filter(|um| um.is_finite())
+    }
+
+    /// Size of the bead's ring in the middle of the exposure against that in focus, less one.
+    pub(crate) fn defocus(&self) -> f64 {
+        self.samples
+            .get(EXPOSURE_STEPS / 2)
+            .map_or(0.0, |middle| middle.defocus)
+    }
+
+    pub(crate) fn is_visible(&self) -> bool {
+        self.samples.iter().all(|s| s.visible)
+    }
+
+    /// Path of the second bead, if it was there for the whole exposure.
+    pub(crate) fn second_path(&self) -> Option<[(f64, f64); EXPOSURE_STEPS + 1]> {
+        let mut path = [(0.0, 0.0); EXPOSURE_STEPS + 1];
+        for (place, sample) in path.iter_mut().zip(&self.samples) {
+            *place = sample.second_um?;
+        }
+        Some(path)
+    }
 }
 
 #[derive(Debug, Clone, Copy)]
@@ -100,13 +130,58 @@ pub(crate) struct Camera {
     queue: VecDeque<Pending>,
     recent: VecDeque<Exposure>,
     rng: Random,
+    strays: Strays,
+}
+
+/// How exposures and arrivals stray from their times.
+#[derive(Debug, Clone)]
+struct Strays {
+    exposure_ns: f64,
+    arrival_ns: f64,
+    exposures: Random,
+    arrivals: Random,
+    /// By how much the next exposure is late.
+    now_ns: i64,
+    /// No frame overtakes another on its way.
+    last_ns: i64,
+}
+
+impl Strays {
+    fn new(config: &WorldConfig) -> Self {
+        let it = config.imperfections();
+        let mut strays = Self {
+            exposure_ns: it.exposure_jitter_us * 1e3,
+            arrival_ns: it.arrival_jitter_us * 1e3,
+            exposures: Random::stream(config.seed, 34),
+            arrivals: Random::stream(config.seed, 35),
+            now_ns: 0,
+            last_ns: i64::MIN,
+        };
+        strays.next_exposure();
+        strays
+    }
+
+    fn next_exposure(&mut self) {
+        // Beyond four standard deviations two exposures could overlap.
+        let stray = self.exposures.normal().clamp(-4.0, 4.0);
+        self.now_ns = (stray * self.exposure_ns).round() as i64;
+    }
+
+    /// When a frame arrives that could arrive at `fastest_ns`.
+    fn arrival_ns(&mut self, fastest_ns: i64) -> i64 {
+        let beyond = -(1.0 - self.arrivals.uniform()).ln();
+        let arrival_ns = fastest_ns + (beyond * self.arrival_ns) as i64;
+        self.last_ns = self.last_ns.max(arrival_ns);
+        self.last_ns
+    }
 }
 
 impl Camera {
     pub(crate) fn new(config: &WorldConfig, model: &Model, start_ns: i64) -> Self {
         let mut camera = Self {
             start_ns,
-            period_ns: 1e9 / config.rate_hz,
+            period_ns: 1e9 / config.rate_hz
+                * (1.0 + 1e-6 * config.imperfections().camera_clock_ppm),
             exposure_ns: (config.exposure_ms * 1e6).round() as i64,
             latency_ns: (config.latency_ms * 1e6).round() as i64,
             faults: config.faults.clone(),
@@ -116,6 +191,7 @@ impl Camera {
             queue: VecDeque::with_capacity(QUEUE_LEN + 2),
             recent: VecDeque::with_capacity(STALE_BY + 1),
             rng: Random::stream(config.seed, 20),
+            strays: Strays::new(config),
         };
         camera.take_over(model);
         camera
@@ -149,7 +225,7 @@ impl Camera {
 
     /// When the bead has to be looked at next.
     pub(crate) fn next_sample_ns(&self) -> i64 {
-        self.mid_ns(self.next_id) - self.exposure_ns / 2
+        self.mid_ns(self.next_id) + self.strays.now_ns - self.exposure_ns / 2
             + self.exposure_ns * self.taken as i64 / EXPOSURE_STEPS as i64
     }
 
@@ -168,6 +244,7 @@ impl Camera {
         self.taken = 0;
         self.expose();
         self.next_id += 1;
+        self.strays.next_exposure();
         true
     }
 
@@ -202,7 +279,8 @@ impl Camera {
         if dropped {
             return;
         }
-        let mut delivery_ns = now.mid_ns + self.latency_ns;
+        let fastest_ns = now.mid_ns + self.strays.now_ns + self.latency_ns;
+        let mut delivery_ns = self.strays.arrival_ns(fastest_ns);
         if reordered {
             delivery_ns += (1.5 * self.period_ns) as i64;
         }

@@ -163,7 +163,7 @@ mod tests {
         let config = WorldConfig {
             pixel_um: 0.2,
             height_px: 64,
-            ..WorldConfig::default()
+            ..WorldConfig::ideal()
         };
         let cell = CellConfig::default();
         let walls = walls(&config, &cell);

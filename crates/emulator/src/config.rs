@@ -20,16 +20,8 @@ pub struct WorldConfig {
     pub diffusion_um2_per_s: f64,
     /// Flow that passes whatever the PZT does, um/s; added to a flow-drift of the model.
     pub drift_um_per_s: f64,
-    /// How far the zero flow wanders about `neutral_um` (Ornstein-Uhlenbeck), um RMS.
-    pub zero_flow_wander_um: f64,
-    /// Correlation time of the wandering, s.
-    pub zero_flow_wander_time_s: f64,
-    /// How fast the zero flow drifts, um of PZT displacement per second.
-    pub zero_flow_drift_um_per_s: f64,
     /// Bead position at the start, um from the middle of the frame.
     pub start_um: f64,
-    /// The frame follows the bead across the channel to within this distance of its middle line, um.
-    pub lateral_um: f64,
     /// Pixels per row.
     pub width_px: u16,
     /// Rows.
@@ -58,6 +50,50 @@ pub struct WorldConfig {
     pub localisation_um: Option<f64>,
     /// When the bead has been out of the frame for this long and the flow is slow, a new one comes, ms. Left out: never.
     pub new_bead_after_ms: Option<f64>,
+    /// Without any of the [`Imperfections`] of a real rig, but for those whose key is given.
+    pub ideal: bool,
+    /// [`Imperfections::zero_flow_wander_um`].
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub zero_flow_wander_um: Option<f64>,
+    /// [`Imperfections::zero_flow_wander_time_s`].
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub zero_flow_wander_time_s: Option<f64>,
+    /// [`Imperfections::zero_flow_drift_um_per_s`].
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub zero_flow_drift_um_per_s: Option<f64>,
+    /// [`Imperfections::lateral_um`].
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub lateral_um: Option<f64>,
+    /// [`Imperfections::tilt_deg`].
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub tilt_deg: Option<f64>,
+    /// [`Imperfections::focus_wander`].
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub focus_wander: Option<f64>,
+    /// [`Imperfections::focus_time_s`].
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub focus_time_s: Option<f64>,
+    /// [`Imperfections::dust`].
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub dust: Option<u16>,
+    /// [`Imperfections::light_slope`].
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub light_slope: Option<f64>,
+    /// [`Imperfections::vignette`].
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub vignette: Option<f64>,
+    /// [`Imperfections::wall_grey`].
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub wall_grey: Option<f64>,
+    /// [`Imperfections::camera_clock_ppm`].
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub camera_clock_ppm: Option<f64>,
+    /// [`Imperfections::exposure_jitter_us`].
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub exposure_jitter_us: Option<f64>,
+    /// [`Imperfections::arrival_jitter_us`].
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub arrival_jitter_us: Option<f64>,
     /// A cell and its constriction. Left out: a bead.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub cell: Option<CellConfig>,
@@ -73,11 +109,7 @@ impl Default for WorldConfig {
             neutral_um: 20.0,
             diffusion_um2_per_s: 0.33,
             drift_um_per_s: 3.0,
-            zero_flow_wander_um: 0.0,
-            zero_flow_wander_time_s: 20.0,
-            zero_flow_drift_um_per_s: 0.0,
             start_um: 0.0,
-            lateral_um: 0.25,
             width_px: 256,
             height_px: 32,
             pixel_um: 0.1,
@@ -92,6 +124,21 @@ impl Default for WorldConfig {
             electrons_per_grey: 40.0,
             localisation_um: None,
             new_bead_after_ms: None,
+            ideal: false,
+            zero_flow_wander_um: None,
+            zero_flow_wander_time_s: None,
+            zero_flow_drift_um_per_s: None,
+            lateral_um: None,
+            tilt_deg: None,
+            focus_wander: None,
+            focus_time_s: None,
+            dust: None,
+            light_slope: None,
+            vignette: None,
+            wall_grey: None,
+            camera_clock_ppm: None,
+            exposure_jitter_us: None,
+            arrival_jitter_us: None,
             cell: None,
             faults: Faults::default(),
         }
@@ -99,6 +146,14 @@ impl Default for WorldConfig {
 }
 
 impl WorldConfig {
+    /// A rig as in a paper: nothing but the plant, diffusion, drift and the noise of the pictures.
+    pub fn ideal() -> Self {
+        Self {
+            ideal: true,
+            ..Self::default()
+        }
+    }
+
     /// Column of position 0: the middle of the frame, px (pixel centres at whole numbers).
     pub fn origin_x_px(&self) -> f64 {
         0.5 * (f64::from(self.width_px) - 1.0)
@@ -137,6 +192,7 @@ impl WorldConfig {
         self.validate_motion()?;
         self.validate_frame()?;
         self.validate_picture()?;
+        self.validate_imperfections()?;
         if let Some(cell) = &self.cell {
             self.validate_cell(cell)?;
         }
@@ -165,27 +221,6 @@ impl WorldConfig {
             1e4,
             "-10000..10000 um/s",
         )?;
-        within(
-            "zero_flow_wander_um",
-            self.zero_flow_wander_um,
-            0.0,
-            100.0,
-            "0..100 um",
-        )?;
-        within(
-            "zero_flow_wander_time_s",
-            self.zero_flow_wander_time_s,
-            1e-3,
-            1e6,
-            "0.001..1000000 s",
-        )?;
-        within(
-            "zero_flow_drift_um_per_s",
-            self.zero_flow_drift_um_per_s,
-            -10.0,
-            10.0,
-            "-10..10 um/s",
-        )?;
         within("start_um", self.start_um, -1e4, 1e4, "-10000..10000 um")?;
         Ok(())
     }
@@ -206,14 +241,6 @@ impl WorldConfig {
             "8..4096 px",
         )?;
         within("pixel_um", self.pixel_um, 1e-3, 100.0, "0.001..100 um")?;
-        let half_height_um = 0.5 * f64::from(self.height_px) * self.pixel_um;
-        within(
-            "lateral_um",
-            self.lateral_um,
-            0.0,
-            half_height_um,
-            "0 um to half the frame's height",
-        )?;
         within("rate_hz", self.rate_hz, 1.0, 20_000.0, "1..20000 Hz")?;
         let period_ms = 1000.0 / self.rate_hz;
         within(
@@ -281,9 +308,18 @@ impl WorldConfig {
 
     fn validate_cell(&self, cell: &CellConfig) -> Result<(), WorldError> {
         cell.validate()?;
+        let tilt_deg = self.imperfections().tilt_deg;
+        within(
+            "tilt_deg",
+            tilt_deg,
+            0.0,
+            0.0,
+            "0 degrees with a cell: its constriction is along the rows",
+        )?;
         let across_um = f64::from(self.height_px) * self.pixel_um;
         let along_um = f64::from(self.width_px) * self.pixel_um;
-        let room_um = across_um - 2.0 * self.lateral_um - 2.0 * self.pixel_um;
+        let lateral_um = self.imperfections().lateral_um;
+        let room_um = across_um - 2.0 * lateral_um - 2.0 * self.pixel_um;
         within(
             "cell.rest_um",
             cell.rest_um,

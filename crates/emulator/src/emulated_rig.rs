@@ -79,9 +79,16 @@ impl EmulatedRig {
 
     /// The calibration of its camera.
     pub fn calibration(&self) -> Calibration {
-        let rig = self.now();
-        let config = rig.world().config();
-        Calibration::along_rows(config.pixel_um, config.origin_x_px(), 1.0)
+        Self::calibration_of(self.now().world().config())
+    }
+
+    /// The calibration of the camera of such a world.
+    pub fn calibration_of(config: &WorldConfig) -> Calibration {
+        Calibration {
+            tilt_deg: config.imperfections().tilt_deg,
+            origin_across_px: config.origin_y_px(),
+            ..Calibration::along_rows(config.pixel_um, config.origin_x_px(), 1.0)
+        }
     }
 
     /// Waits for the next delivery until `deadline_ns` and takes it.

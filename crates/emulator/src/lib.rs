@@ -2,7 +2,7 @@
 //!
 //! [`World`] is driven by the displacement that stands at the board's output and by time, and yields what a camera
 //! would deliver, when it would deliver it: frames of 8 bits with a ring-profile bead, or a cell in its channel, blurred
-//! along the true path during the exposure, with shot and read noise; or positions with the equivalent noise, for runs
+//! along the true path during the exposure, with shot and read noise, dust, uneven light and a focus that wanders ([`Imperfections`]); or positions with the equivalent noise, for runs
 //! that need no pictures. Beside them it knows the truth. Faults are injected from a schedule ([`Faults`]). The world has
 //! no clock but the times it is given.
 //!
@@ -34,6 +34,8 @@ mod config;
 mod emulated_rig;
 mod error;
 mod faults;
+mod imperfections;
+mod light;
 mod line;
 mod look;
 mod quantities;
@@ -51,6 +53,7 @@ pub use config::WorldConfig;
 pub use emulated_rig::{EmulatedCamera, EmulatedPort, EmulatedPositions, EmulatedRig};
 pub use error::WorldError;
 pub use faults::{FaultEvent, FaultKind, Faults};
+pub use imperfections::Imperfections;
 pub use line::{LineFaults, MisbehavingLine};
 pub use look::BeadLook;
 pub use quantities::QUANTITIES;

@@ -15,7 +15,7 @@ const fn cell(plain: &'static str, with_unit: &'static str) -> Quantity {
 }
 
 /// Every length, speed, time and frequency of the tables of [`crate::BoardConfig`] and [`crate::WorldConfig`] in a rig file.
-pub const QUANTITIES: [Quantity; 38] = [
+pub const QUANTITIES: [Quantity; 42] = [
     board("low", "low_um"),
     board("high", "high_um"),
     board("slew", "slew_um_per_s"),
@@ -34,6 +34,10 @@ pub const QUANTITIES: [Quantity; 38] = [
     world("zero_flow_drift", "zero_flow_drift_um_per_s"),
     world("start", "start_um"),
     world("lateral", "lateral_um"),
+    world("tilt", "tilt_deg"),
+    world("focus_time", "focus_time_s"),
+    world("exposure_jitter", "exposure_jitter_us"),
+    world("arrival_jitter", "arrival_jitter_us"),
     world("pixel", "pixel_um"),
     world("rate", "rate_hz"),
     world("exposure", "exposure_ms"),

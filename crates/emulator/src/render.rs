@@ -6,6 +6,7 @@
 
 use crate::cell_picture::{CellPicture, HalfAxes, walls};
 use crate::config::WorldConfig;
+use crate::light::empty_channel;
 use crate::look::Look;
 use cellpos_numeric::Random;
 use cellpos_vision::{PixelResponse, RadialProfile, Template};
@@ -98,7 +99,8 @@ pub(crate) struct Body {
 
 #[derive(Debug, Clone, Copy)]
 enum Form {
-    Bead,
+    /// A bead, with the size of its ring against that in focus.
+    Bead(f32),
     Cell(HalfAxes),
 }
 
@@ -117,6 +119,8 @@ pub(crate) struct Renderer {
     cell: CellPicture,
     /// Pixels on the channel's walls, by number, and the grey levels that they lose; empty without a cell.
     walls: Vec<(usize, f32)>,
+    /// Grey level of each pixel of the empty channel, and its noise; empty when the light is even.
+    light: Vec<(f32, f32)>,
     /// Grey values of background with noise.
     strip: Vec<u8>,
     gaussian: Vec<f32>,
@@ -138,6 +142,11 @@ impl Renderer {
         let grey_per_electron = (1.0 / config.electrons_per_grey) as f32;
         let background = config.background_grey as f32;
         let sd = f64::from(background * grey_per_electron + read_variance).sqrt();
+        let light = empty_channel(config).into_iter().map(|level| {
+            let variance = level * grey_per_electron + read_variance;
+            (level, variance.sqrt())
+        });
+        let light = light.collect();
         let strip = (0..STRIP_LEN + usize::from(config.width_px))
             .map(|_| grey(background + (sd * noise.normal()) as f32))
             .collect();
@@ -153,6 +162,7 @@ impl Renderer {
             template,
             cell: CellPicture::new(config.pixel_um, &config.cell.unwrap_or_default()),
             walls: config.cell.map_or(Vec::new(), |cell| walls(config, &cell)),
+            light,
             strip,
             gaussian,
             values: vec![0.0; usize::from(config.width_px)],
@@ -160,11 +170,11 @@ impl Renderer {
         })
     }
 
-    /// A bead that went along a path, px.
-    pub(crate) fn bead(&self, path: &[(f64, f64)]) -> Body {
+    /// A bead that went along a path, px; its ring is larger by `defocus`, a fraction.
+    pub(crate) fn bead(&self, path: &[(f64, f64)], defocus: f64) -> Body {
         Body {
             blur: Blur::along(path),
-            form: Form::Bead,
+            form: Form::Bead((1.0 + defocus) as f32),
         }
     }
 
@@ -192,12 +202,7 @@ impl Renderer {
 
     fn draw_bodies(&mut self, bodies: &[Body], pixels: &mut Vec<u8>) {
         pixels.resize(self.width * self.height, 0);
-        for row in pixels.chunks_exact_mut(self.width) {
-            let from = (self.rng.bits() >> 40) as usize % STRIP_LEN;
-            if let Some(piece) = self.strip.get(from..from + row.len()) {
-                row.copy_from_slice(piece);
-            }
-        }
+        self.draw_empty(pixels);
         for (number, wall) in &self.walls {
             if let Some(pixel) = pixels.get_mut(*number) {
                 *pixel = grey(f32::from(*pixel) - wall);
@@ -224,11 +229,15 @@ impl Renderer {
                 for &(bx, by) in body.blur.points() {
                     let (x, dy) = (bx - columns.0 as f32, y as f32 - by);
                     match body.form {
-                        Form::Bead => {
-                            let room2 = self.support_px * self.support_px - dy * dy;
+                        Form::Bead(size) => {
+                            let reach_px = size * self.support_px;
+                            let room2 = reach_px * reach_px - dy * dy;
+                            // The same light on a larger ring.
+                            let (weight, shrink) = (weight / (size * size), 1.0 / (size * size));
                             if room2 > 0.0 {
                                 add_chord(values, x, room2.sqrt(), |dx| {
-                                    weight * self.template.value_at_squared(dx * dx + dy * dy)
+                                    let r2 = shrink * (dx * dx + dy * dy);
+                                    weight * self.template.value_at_squared(r2)
                                 });
                             }
                         }
@@ -256,6 +265,13 @@ impl Renderer {
                     None => break,
                 }
             }
+            if let Some(light) = self.light.get(first..first + row.len()) {
+                // What shows in the light is as bright as the light is there.
+                let share = 1.0 / self.background;
+                for (value, (level, _)) in values.iter_mut().zip(light) {
+                    *value = level * (1.0 + *value * share) - self.background;
+                }
+            }
             for ((pixel, value), noise) in row.iter_mut().zip(&*values).zip(noise) {
                 let level = (self.background + value).max(0.0);
                 let sd = (level * self.grey_per_electron + self.read_variance).sqrt();
@@ -264,10 +280,31 @@ impl Renderer {
         }
     }
 
+    /// The channel with nothing in it.
+    fn draw_empty(&mut self, pixels: &mut [u8]) {
+        let rows = pixels.chunks_exact_mut(self.width);
+        if self.light.is_empty() {
+            for row in rows {
+                let from = (self.rng.bits() >> 40) as usize % STRIP_LEN;
+                if let Some(piece) = self.strip.get(from..from + row.len()) {
+                    row.copy_from_slice(piece);
+                }
+            }
+            return;
+        }
+        for (row, light) in rows.zip(self.light.chunks_exact(self.width)) {
+            let from = (self.rng.bits() >> 40) as usize % GAUSSIAN_LEN;
+            let noise = self.gaussian.get(from..from + row.len()).unwrap_or(&[]);
+            for ((pixel, (level, sd)), noise) in row.iter_mut().zip(light).zip(noise) {
+                *pixel = grey(level + sd * noise);
+            }
+        }
+    }
+
     /// Columns and rows (from, to) that hold all objects' neighbourhoods; `None` when none is in the frame.
     fn neighbourhood(&self, bodies: &[Body]) -> Option<((usize, usize), (usize, usize))> {
         let reach = |body: &Body| match body.form {
-            Form::Bead => (self.support_px, self.support_px),
+            Form::Bead(size) => (size * self.support_px, size * self.support_px),
             Form::Cell(axes) => self.cell.reach_px(axes),
         };
         let (mut low, mut high) = (
@@ -379,7 +416,7 @@ mod tests {
 
     #[test]
     fn the_background_has_the_level_and_the_noise_that_were_set() {
-        let config = WorldConfig::default();
+        let config = WorldConfig::ideal();
         let mut renderer = Renderer::new(&config).unwrap();
         let mut pixels = Vec::new();
         let (mut sum, mut square, mut n) = (0.0, 0.0, 0.0);
@@ -403,9 +440,9 @@ mod tests {
 
     #[test]
     fn pixels_on_the_bead_have_the_shot_noise_of_their_own_level() {
-        let config = WorldConfig::default();
+        let config = WorldConfig::ideal();
         let mut renderer = Renderer::new(&config).unwrap();
-        let bead = renderer.bead(&[(128.0, 16.0)]);
+        let bead = renderer.bead(&[(128.0, 16.0)], 0.0);
         let centre = 16 * 256 + 128;
         let mut pixels = Vec::new();
         let values: Vec<f64> = (0..4000)
@@ -426,15 +463,15 @@ mod tests {
 
     #[test]
     fn a_bead_beyond_the_border_draws_nothing_and_one_on_it_is_cut() {
-        let config = WorldConfig::default();
+        let config = WorldConfig::ideal();
         let mut renderer = Renderer::new(&config).unwrap();
         let mut pixels = Vec::new();
         for x in [-1e6, -40.0, 300.0, 1e9] {
-            let bead = renderer.bead(&[(x, 16.0)]);
+            let bead = renderer.bead(&[(x, 16.0)], 0.0);
             renderer.draw(&[bead], 0.0, &mut pixels);
             assert!(pixels.iter().all(|&p| p < 130), "bead at {x}");
         }
-        let bead = renderer.bead(&[(0.0, 16.0)]);
+        let bead = renderer.bead(&[(0.0, 16.0)], 0.0);
         renderer.draw(&[bead], 0.0, &mut pixels);
         assert!(pixels[16 * 256] > 150);
     }

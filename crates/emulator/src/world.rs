@@ -5,16 +5,14 @@ use crate::cell::Cell;
 use crate::config::WorldConfig;
 use crate::error::WorldError;
 use crate::faults::FaultKind;
+use crate::imperfections::Wander;
 use crate::render::{Renderer, localisation_bound_um, mean_between};
-use crate::zero_flow::ZeroFlow;
+use crate::zero_flow::{ZeroFlow, gain_per_s};
 use cellpos_numeric::Random;
 use cellpos_plant::effects::{Action, Shown};
 use cellpos_plant::{Chain, Model, Noise};
-use cellpos_units::Hertz;
 use cellpos_vision::FixQuality;
 
-/// Where the gain of a plant without a slow pair of pole and zero is read: the middle of what a loop at 1 kHz controls.
-const STEP_FREQUENCY: Hertz = Hertz(30.0);
 /// Turns a seed into that of frames of the empty channel.
 const EMPTY_SEED: u64 = 0x5eed_0f0e_3a97_7c41;
 
@@ -23,7 +21,7 @@ const EMPTY_SEED: u64 = 0x5eed_0f0e_3a97_7c41;
 /// ```
 /// use cellpos_emulator::{World, WorldConfig};
 /// use cellpos_plant::Model;
-/// let mut world = World::new(&WorldConfig::default(), &Model::eq6(), 0).unwrap();
+/// let mut world = World::new(&WorldConfig::ideal(), &Model::eq6(), 0).unwrap();
 /// let mut pixels = Vec::new();
 /// while let None = world.take_frame(&mut pixels) {
 ///     // The board's output stands at 20 um, where the bead is at rest, for another 0.1 ms.
@@ -42,6 +40,12 @@ pub struct World {
     zero_flow_um: f64,
     /// Speed of the bead over displacement of the PZT from the zero flow, 1/s.
     gain_per_s: f64,
+    focus: Wander,
+    defocus: f64,
+    /// Of the angle between the rows of the picture and the channel.
+    sin_cos: (f64, f64),
+    /// How far across the channel the bead goes, um.
+    most_lateral_um: f64,
     camera: Camera,
     renderer: Renderer,
     start_ns: i64,
@@ -78,6 +82,7 @@ impl World {
     /// [`WorldError`] names the value that cannot be.
     pub fn new(config: &WorldConfig, model: &Model, start_ns: i64) -> Result<Self, WorldError> {
         config.validate()?;
+        let it = config.imperfections();
         let mut running = model.clone();
         running.working_point_um = config.neutral_um;
         running.noise = Noise {
@@ -104,6 +109,14 @@ impl World {
             gain_per_s: gain_per_s(model),
             chain,
             zero_flow: ZeroFlow::new(config),
+            focus: Wander::new(
+                it.focus_wander,
+                it.focus_time_s,
+                Random::stream(config.seed, 32),
+            ),
+            defocus: 0.0,
+            sin_cos: it.tilt_deg.to_radians().sin_cos(),
+            most_lateral_um: it.lateral_um,
             zero_flow_um: 0.0,
             renderer,
             start_ns,
@@ -220,6 +233,7 @@ impl World {
             self.step_to(sample_ns, applied_um);
             let sample = self.look();
             if self.camera.sample(sample) {
+                self.defocus = self.focus.advance(1.0 / self.config.rate_hz);
                 self.after_frame();
             }
         }
@@ -248,7 +262,7 @@ impl World {
         let spread_um = (2.0 * self.config.diffusion_um2_per_s * dt_s).sqrt();
         self.lateral_um = confined(
             self.lateral_um + spread_um * self.brownian.normal(),
-            self.config.lateral_um,
+            self.most_lateral_um,
         );
         self.now_ns = t_ns;
         if self.has_events {
@@ -280,7 +294,7 @@ impl World {
                 along + std::f64::consts::SQRT_2 * spread_um * self.brownian.normal(),
                 confined(
                     across + spread_um * self.brownian.normal(),
-                    self.config.lateral_um,
+                    self.most_lateral_um,
                 ),
             ))
         } else {
@@ -308,6 +322,7 @@ impl World {
             lateral_um: self.lateral_um,
             seen_um,
             second_um,
+            defocus: self.defocus,
             visible: !self.active(FaultKind::LoseBead),
             lit: self.led,
         }
@@ -362,26 +377,32 @@ impl World {
             pixels.clone_from(&self.newest_picture);
             return Some(info);
         }
-        let px = |um: (f64, f64)| {
+        let (sin, cos) = self.sin_cos;
+        let px = |(along_um, across_um): (f64, f64)| {
+            let (x_um, y_um) = (
+                along_um * cos - across_um * sin,
+                along_um * sin + across_um * cos,
+            );
             (
-                self.config.px_from_um(um.0),
-                self.config.origin_y_px() + um.1 / self.config.pixel_um,
+                self.config.px_from_um(x_um),
+                self.config.origin_y_px() + y_um / self.config.pixel_um,
             )
         };
+        let defocus = exposure.defocus();
         let path = exposure.samples.map(|s| px((s.seen_um, s.lateral_um)));
-        let first = match (self.config.cell, mid_length_um(&exposure)) {
+        let first = match (self.config.cell, exposure.mid_length_um()) {
             (Some(cell), Some(um)) => self.renderer.cell(&path, um, cell.width_um(um)),
-            _ => self.renderer.bead(&path),
+            _ => self.renderer.bead(&path, defocus),
         };
-        let second = second_path(&exposure).map(|path| match self.config.cell {
+        let second = exposure.second_path().map(|path| match self.config.cell {
             // Another cell, at rest.
             Some(cell) => {
                 let path = path.map(px);
                 self.renderer.cell(&path, cell.rest_um, cell.rest_um)
             }
-            None => self.renderer.bead(&path.map(px)),
+            None => self.renderer.bead(&path.map(px), defocus),
         });
-        match (is_visible(&exposure), second) {
+        match (exposure.is_visible(), second) {
             (true, None) => self.renderer.draw(&[first], info.lit, pixels),
             (true, Some(second)) => self.renderer.draw(&[first, second], info.lit, pixels),
             (false, Some(second)) => self.renderer.draw(&[second], info.lit, pixels),
@@ -410,7 +431,7 @@ impl World {
         let verdict = self.verdict(&exposure, mean_um);
         let good = verdict == FixQuality::Good;
         let or_nan = |value| if good { value } else { f64::NAN };
-        let (length_um, area_um2) = match (&mut self.cell, mid_length_um(&exposure)) {
+        let (length_um, area_um2) = match (&mut self.cell, exposure.mid_length_um()) {
             (Some(cell), Some(length_um)) if good => cell.measured(length_um),
             _ => (f64::NAN, f64::NAN),
         };
@@ -435,8 +456,8 @@ impl World {
 
     fn verdict(&self, exposure: &Exposure, mean_um: f64) -> FixQuality {
         let config = &self.config;
-        let length_um = mid_length_um(exposure);
-        if !is_visible(exposure) || !self.is_in_frame(mean_um, length_um) {
+        let length_um = exposure.mid_length_um();
+        if !exposure.is_visible() || !self.is_in_frame(mean_um, length_um) {
             return FixQuality::NoSignal;
         }
         let half_um = config.half_length_um(length_um);
@@ -444,7 +465,8 @@ impl World {
             return FixQuality::AtBorder;
         }
         let other_um = config.half_length_um(config.cell.map(|cell| cell.rest_um));
-        let merged = second_path(exposure)
+        let merged = exposure
+            .second_path()
             .is_some_and(|path| (path[0].0 - mean_um).abs() < half_um + other_um);
         if merged {
             FixQuality::BadFit
@@ -454,39 +476,12 @@ impl World {
     }
 }
 
-/// Length of the cell in the middle of the exposure, um; `None` for a bead.
-fn mid_length_um(exposure: &Exposure) -> Option<f64> {
-    let middle = exposure.samples.get(EXPOSURE_STEPS / 2)?;
-    Some(middle.length_um).filter(|um| um.is_finite())
-}
-
-/// Speed of the bead over displacement, 1/s: what a step of the zero flow drives at once.
-fn gain_per_s(model: &Model) -> f64 {
-    let plant = &model.plant;
-    plant
-        .velocity_gain_above_pair()
-        .unwrap_or_else(|| plant.velocity_gain_at(STEP_FREQUENCY))
-}
-
 fn renderer(config: &WorldConfig) -> Result<Renderer, WorldError> {
     Renderer::new(config).ok_or(WorldError::Value {
         key: "bead_radius_um",
         value: config.bead_radius_um,
         must: "above 0 um",
     })
-}
-
-fn is_visible(exposure: &Exposure) -> bool {
-    exposure.samples.iter().all(|s| s.visible)
-}
-
-/// Path of the second bead, if it was there for the whole exposure.
-fn second_path(exposure: &Exposure) -> Option<[(f64, f64); EXPOSURE_STEPS + 1]> {
-    let mut path = [(0.0, 0.0); EXPOSURE_STEPS + 1];
-    for (place, sample) in path.iter_mut().zip(&exposure.samples) {
-        *place = sample.second_um?;
-    }
-    Some(path)
 }
 
 /// Reflects a position across the channel at the borders of what the frame follows.

@@ -4,47 +4,48 @@
 //! (Ornstein-Uhlenbeck) and drifts. A tap on the syringe makes it step.
 
 use crate::config::WorldConfig;
+use crate::imperfections::Wander;
 use cellpos_numeric::Random;
+use cellpos_plant::Model;
+use cellpos_units::Hertz;
 
+/// Where the gain of a plant without a slow pair of pole and zero is read: the middle of what a loop at 1 kHz controls.
+const STEP_FREQUENCY: Hertz = Hertz(30.0);
 /// Distance of the zero flow from [`WorldConfig::neutral_um`], um.
 #[derive(Debug, Clone)]
 pub(crate) struct ZeroFlow {
-    wander_um: f64,
-    time_s: f64,
+    wander: Wander,
     drift_um_per_s: f64,
     step_um: f64,
-    wandered_um: f64,
     drifted_um: f64,
-    noise: Random,
 }
 
 impl ZeroFlow {
     /// At its mean, but for the part that wanders, which starts where it would be after a long time.
     pub fn new(config: &WorldConfig) -> Self {
-        let mut noise = Random::stream(config.seed, 30);
+        let it = config.imperfections();
+        let noise = Random::stream(config.seed, 31);
         Self {
-            wander_um: config.zero_flow_wander_um,
-            time_s: config.zero_flow_wander_time_s,
-            drift_um_per_s: config.zero_flow_drift_um_per_s,
+            wander: Wander::new(it.zero_flow_wander_um, it.zero_flow_wander_time_s, noise),
+            drift_um_per_s: it.zero_flow_drift_um_per_s,
             step_um: config.faults.flow_step_um,
-            wandered_um: config.zero_flow_wander_um * noise.normal(),
             drifted_um: 0.0,
-            noise,
         }
     }
 
     /// Moves on by `dt_s`. Returns the distance from the mean now, um.
     pub fn advance(&mut self, dt_s: f64, stepped: bool) -> f64 {
         self.drifted_um += self.drift_um_per_s * dt_s;
-        if self.wander_um > 0.0 {
-            // Exact for any step, so that the wandering does not depend on who asks how often.
-            let kept = (-dt_s / self.time_s).exp();
-            let fresh = (1.0 - kept * kept).sqrt();
-            self.wandered_um =
-                kept * self.wandered_um + fresh * self.wander_um * self.noise.normal();
-        }
-        self.wandered_um + self.drifted_um + if stepped { self.step_um } else { 0.0 }
+        self.wander.advance(dt_s) + self.drifted_um + if stepped { self.step_um } else { 0.0 }
     }
+}
+
+/// Speed of the bead over displacement, 1/s: what a step of the zero flow drives at once.
+pub(crate) fn gain_per_s(model: &Model) -> f64 {
+    let plant = &model.plant;
+    plant
+        .velocity_gain_above_pair()
+        .unwrap_or_else(|| plant.velocity_gain_at(STEP_FREQUENCY))
 }
 
 #[cfg(test)]
@@ -53,9 +54,9 @@ mod tests {
 
     fn wandering() -> WorldConfig {
         WorldConfig {
-            zero_flow_wander_um: 0.006,
-            zero_flow_wander_time_s: 2.0,
-            zero_flow_drift_um_per_s: 0.001,
+            zero_flow_wander_um: Some(0.006),
+            zero_flow_wander_time_s: Some(2.0),
+            zero_flow_drift_um_per_s: Some(0.001),
             ..WorldConfig::default()
         }
     }
@@ -63,7 +64,7 @@ mod tests {
     #[test]
     fn the_zero_flow_wanders_as_far_and_as_fast_as_it_is_told_to() {
         let config = WorldConfig {
-            zero_flow_drift_um_per_s: 0.0,
+            zero_flow_drift_um_per_s: Some(0.0),
             ..wandering()
         };
         let mut zero = ZeroFlow::new(&config);
@@ -83,7 +84,7 @@ mod tests {
     #[test]
     fn it_drifts_and_steps() {
         let config = WorldConfig {
-            zero_flow_wander_um: 0.0,
+            zero_flow_wander_um: Some(0.0),
             faults: crate::Faults {
                 flow_step_um: -0.3,
                 ..crate::Faults::default()

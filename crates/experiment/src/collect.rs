@@ -122,7 +122,9 @@ pub fn run_experiment(
     Ok(Ran {
         neutral_um: neutral_um(&record, rig.model.plant.velocity_gain_at(Hertz(2.0))),
         record,
-        age_s: acquired.path_s + acquired.wait_s,
+        age_s: acquired
+            .age_s
+            .unwrap_or(rig.file.timing.camera_delay_ms * 1e-3),
     })
 }
 

@@ -5,7 +5,8 @@
 
 use crate::camera_rate::{InPeriods, foreign_rate_hz, other_rate};
 use crate::exciting::{Exciting, Handing};
-use crate::identify::held_bead::{DelayTest, Setup, mean_grey};
+use crate::identify::held_bead::Setup;
+use crate::identify::led::{DelayTest, LitFrames};
 pub use crate::rows::is_unseen;
 use crate::rows::{Rows, ended_spans, fix_noise_um};
 use cellpos_control::{ControllerFile, Pi};
@@ -47,10 +48,9 @@ pub struct Acquired {
     pub records: Vec<RecordedSegment>,
     /// Estimate of neutral at the end, um.
     pub neutral_um: f64,
-    /// Mean time from the arrival of a frame to its tick, s: part of the record's delay, and not of the camera's.
-    pub wait_s: f64,
-    /// From the middle of an exposure to the arrival of its frame, by the stamps of the frames, s.
-    pub path_s: f64,
+    /// Mean time from the middle of an exposure to the tick that used it, by the stamps of the frames, s; frames that a stall
+    /// has held up are left out. `None` before the first.
+    pub age_s: Option<f64>,
     /// Localisation noise as vision stated it, um RMS.
     pub fix_noise_um: Option<f64>,
     /// The whole run from where the loop was closed, row by row: commanded displacement, um, and bead position, um, NaN
@@ -274,8 +274,7 @@ impl OnRig {
             neutral_um: ticks
                 .last()
                 .map_or(self.file.first_neutral_um, |t| t.neutral_um),
-            wait_s: rows.wait_s(),
-            path_s: 1e-9 * rows.path_ns as f64,
+            age_s: rows.age_s(),
             fix_noise_um: fix_noise_um(ticks),
             rows: (rows.input, rows.output),
             unseen: rows.unseen,
@@ -284,8 +283,7 @@ impl OnRig {
     }
 
     fn rows(&self, ticks: &[TickRecord]) -> Rows {
-        let timing = &self.file.timing;
-        Rows::of(ticks, timing.period_ns(), timing.camera_delay_ms)
+        Rows::of(ticks, self.file.timing.period_ns())
     }
 
     /// The first segment that is spoilt, and what spoilt it.
@@ -303,14 +301,24 @@ impl OnRig {
     /// The LED test on a rig with a real board: its LED is switched at dithered instants before its camera.
     pub fn delay_test(&self, edges: usize, seed: u64) -> Result<DelayTest, Failure> {
         const APART_S: f64 = 0.011;
+        const PINGS: u32 = 21;
         let (mut camera, mut board) = self.file.open_for_led()?;
+        let mut trips_s = Vec::new();
+        for token in 0..PINGS {
+            let trip = board.ping(token, Duration::from_millis(50));
+            trips_s.extend(
+                trip.map_err(Failure::failed)?
+                    .map(|(trip, _)| trip.as_secs_f64()),
+            );
+        }
+        trips_s.sort_by(f64::total_cmp);
         let seconds = |ns: i64| ns as f64 * 1e-9;
         let start_ns = monotonic_ns();
         let period_s = self.file.timing.period_us * 1e-6;
         let edges_s = dithered_edges(edges, APART_S, period_s, seconds(start_ns) + 0.1, seed);
         let end_ns = start_ns + ((0.2 + APART_S * edges as f64) * 1e9) as i64;
         let mut buffer = FrameBuffer::default();
-        let (mut frame_s, mut grey, mut switched_s) = (Vec::new(), Vec::new(), Vec::new());
+        let (mut seen, mut switched_s) = (LitFrames::default(), Vec::new());
         let mut on = false;
         let mut waiting = edges_s.iter().map(|s| (s * 1e9).round() as i64).peekable();
         loop {
@@ -331,11 +339,12 @@ impl OnRig {
                 .next_frame(&mut buffer, until_ns)
                 .map_err(Failure::failed)?;
             if let Some(stamp) = stamp {
-                frame_s.push(seconds(stamp.arrival_ns));
-                grey.push(mean_grey(&buffer));
+                seen.push(&stamp, &buffer);
             }
         }
         board.led(false).map_err(Failure::failed)?;
-        DelayTest::evaluate(switched_s, frame_s, grey)
+        let mut test = DelayTest::evaluate(switched_s, seen)?;
+        test.line_s = trips_s.get(trips_s.len() / 2).map(|trip_s| 0.5 * trip_s);
+        Ok(test)
     }
 }

@@ -40,53 +40,38 @@ pub(crate) struct Rows {
     usable: Vec<bool>,
     /// The frame came, without a bead to be trusted.
     pub(crate) unseen: Vec<bool>,
-    /// Sum and number of the times from the arrival of a frame to its tick, ns.
-    waited: (i64, i64),
+    /// Sum and number of the ages of the frames that came in time, ns.
+    ages: (i64, i64),
     /// Row of each tick since the loop was closed.
     of_tick: Vec<usize>,
-    /// From the middle of an exposure to the arrival of its frame, ns.
-    pub(crate) path_ns: i64,
 }
 
-/// The camera path: as configured, unless the stamps of most frames say that it is another by half a period or more. Then
-/// it is that of the fastest frames, and what is later than those has waited.
-fn camera_path_ns(ticks: &[TickRecord], period_ns: i64, configured_ms: f64) -> i64 {
-    let configured_ns = (configured_ms * 1e6).round() as i64;
+/// How old frames are at their ticks, by their own stamps: the median, which no stall moves; `None` without frames.
+fn usual_age_ns(ticks: &[TickRecord]) -> Option<i64> {
     let mut ages_ns: Vec<i64> = ticks
         .iter()
         .filter(|t| !t.flags.has(TickFlags::TIMER) && !t.flags.has(TickFlags::STALE))
         .map(|t| t.time_ns - t.mid_exposure_ns)
         .collect();
     ages_ns.sort_unstable();
-    match (
-        ages_ns.get(ages_ns.len() / 2),
-        ages_ns.get(ages_ns.len() / 100),
-    ) {
-        (Some(median_ns), Some(fastest_ns))
-            if 2 * (median_ns - configured_ns).abs() >= period_ns =>
-        {
-            *fastest_ns
-        }
-        _ => configured_ns,
-    }
+    ages_ns.get(ages_ns.len() / 2).copied()
 }
 
 impl Rows {
-    pub(crate) fn of(ticks: &[TickRecord], period_ns: i64, camera_delay_ms: f64) -> Self {
+    pub(crate) fn of(ticks: &[TickRecord], period_ns: i64) -> Self {
         let mut rows = Self {
             input: Vec::new(),
             output: Vec::new(),
             usable: Vec::new(),
             unseen: Vec::new(),
-            waited: (0, 0),
+            ages: (0, 0),
             of_tick: Vec::new(),
-            path_ns: 0,
         };
         let closed = ticks
             .iter()
             .position(TickRecord::is_running)
             .unwrap_or(ticks.len());
-        rows.path_ns = camera_path_ns(&ticks[closed..], period_ns, camera_delay_ms);
+        let usual_ns = usual_age_ns(&ticks[closed..]).unwrap_or(0);
         let mut first_id = None;
         // The excitation is played by the clock: a tick's place in it is its number on the clock's grid.
         let grid = Grid::new(ticks.first().map_or(0, |t| t.time_ns), period_ns);
@@ -110,11 +95,13 @@ impl Rows {
                 rows.usable.push(true);
                 rows.unseen.push(false);
             }
-            let late_ns = tick.time_ns - tick.mid_exposure_ns - rows.path_ns;
-            let on_time = new_frame && !has(TickFlags::LOST) && 2 * late_ns < period_ns;
+            let age_ns = tick.time_ns - tick.mid_exposure_ns;
+            // A frame that is half a period off the usual belongs to another row.
+            let on_time =
+                new_frame && !has(TickFlags::LOST) && 2 * (age_ns - usual_ns).abs() < period_ns;
             if on_time {
-                rows.waited.0 += late_ns;
-                rows.waited.1 += 1;
+                rows.ages.0 += age_ns;
+                rows.ages.1 += 1;
             }
             rows.input[row] = tick.command_um;
             rows.output[row] = if on_time { tick.measured_um } else { f64::NAN };
@@ -128,13 +115,10 @@ impl Rows {
         rows
     }
 
-    pub(crate) fn wait_s(&self) -> f64 {
-        let (sum_ns, count) = self.waited;
-        if count > 0 {
-            1e-9 * sum_ns as f64 / count as f64
-        } else {
-            0.0
-        }
+    /// Mean time from the middle of an exposure to its tick, s; `None` where no frame came in time.
+    pub(crate) fn age_s(&self) -> Option<f64> {
+        let (sum_ns, count) = self.ages;
+        (count > 0).then(|| 1e-9 * sum_ns as f64 / count as f64)
     }
 
     /// A segment, or what keeps it from being one.

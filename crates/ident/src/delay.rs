@@ -1,22 +1,36 @@
-//! The delay of the camera path by dithered edges: the LED test of the paper's Fig. 6, below a millisecond.
+//! The delay from a command to the exposure that shows it, by dithered edges: the LED test of the paper's Fig. 6, below a
+//! millisecond.
 //!
-//! One edge seen through a 1 kHz camera tells the delay to within a frame. Edges at random phases of the frame clock
-//! tell more: an edge sent at `e` shows first in a frame taken at or after `e + L`, so each edge is an interval for `L`,
-//! and the intervals of N edges share one that shrinks as 1/N. Where the exposure is long the brightness of the frame
-//! that the edge falls into is used as well. Not for the delay of the PZT and the flow: that is in the phase slope.
+//! One edge seen through a 1 kHz camera tells the delay to within a frame. An edge that falls into an exposure tells it by the
+//! brightness of that frame to some microseconds, one that falls between two exposures to within the gap. Times are those of the
+//! exposures, by the frames' own time stamps: when a frame arrived, and how long the machine stalled before it was read, does not
+//! enter. The median does the rest: an edge that was sent late by a stall is one edge. Not for the delay of the PZT and the flow:
+//! that is in the phase slope.
 
 use crate::error::IdentError;
 use cellpos_numeric::Random;
 
-/// One edge and what the camera saw of it.
+/// One edge and what the camera saw of it. The light changed between two times of the camera, which are equal when the
+/// brightness of a frame tells the time.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SeenEdge {
     /// Time at which the light was switched, s.
     pub sent_s: f64,
-    /// Time stamp of the last frame without the edge, s.
+    /// The light had not changed yet, s.
     pub before_s: f64,
-    /// Time stamp of the first frame with it, s.
+    /// The light had changed, s.
     pub after_s: f64,
+}
+
+/// Frames of the test: one row each.
+#[derive(Debug, Clone, Copy)]
+pub struct Brightness<'a> {
+    /// Middle of the exposure by the frame's time stamp, s; rising.
+    pub mid_s: &'a [f64],
+    /// Exposure, s; 0 where the camera does not say: then a frame tells only whether the light was on in its middle.
+    pub exposure_s: f64,
+    /// Mean grey level.
+    pub grey: &'a [f64],
 }
 
 /// A delay with its confidence.
@@ -58,45 +72,58 @@ pub fn dithered_edges(
         .collect()
 }
 
-/// Finds each edge in a brightness record: frame time stamps and brightness, threshold half way between dark and
-/// bright. `sent_s` are rising or falling edges in turn, starting with rising.
+/// Finds each edge in a brightness record. `sent_s` are rising or falling edges in turn, starting with rising.
 ///
 /// # Errors
 /// [`IdentError::EdgesNotSeen`] when fewer than half the edges show, [`IdentError::Lengths`].
-pub fn find_edges(
-    sent_s: &[f64],
-    frame_s: &[f64],
-    brightness: &[f64],
-) -> Result<Vec<SeenEdge>, IdentError> {
-    if frame_s.len() != brightness.len() {
+pub fn find_edges(sent_s: &[f64], frames: Brightness) -> Result<Vec<SeenEdge>, IdentError> {
+    let Brightness {
+        mid_s,
+        exposure_s,
+        grey,
+    } = frames;
+    if mid_s.len() != grey.len() {
         return Err(IdentError::Lengths {
-            input: frame_s.len(),
-            output: brightness.len(),
+            input: mid_s.len(),
+            output: grey.len(),
         });
     }
-    let low = brightness.iter().copied().fold(f64::INFINITY, f64::min);
-    let high = brightness.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+    let low = grey.iter().copied().fold(f64::INFINITY, f64::min);
+    let high = grey.iter().copied().fold(f64::NEG_INFINITY, f64::max);
     let threshold = 0.5 * (low + high);
+    let levels = Levels::of(grey, threshold);
     let mut seen = Vec::with_capacity(sent_s.len());
     for (i, &sent) in sent_s.iter().enumerate() {
         let rising = i % 2 == 0;
         let until = sent_s.get(i + 1).copied().unwrap_or(f64::INFINITY);
-        let start = frame_s.partition_point(|&t| t < sent - 1e-12);
-        let lit = |k: usize| (brightness[k] > threshold) == rising;
+        // A frame that was over when the light was switched; stamps may be off by an exposure.
+        let start = mid_s.partition_point(|&t| t < sent - 0.5 * exposure_s - 1e-12);
+        let turned = |k: usize| {
+            let lit = levels.share(grey[k]);
+            if rising { lit } else { 1.0 - lit }
+        };
         // An edge belongs to a switch only if the light was in the other state when it was sent.
-        if start == 0 || start >= frame_s.len() || lit(start - 1) {
+        if start == 0 || start >= mid_s.len() || turned(start - 1) > 0.5 {
             continue;
         }
-        let found = (start..frame_s.len())
-            .take_while(|&k| frame_s[k] < until)
-            .find(|&k| lit(k));
-        if let Some(k) = found {
-            seen.push(SeenEdge {
-                sent_s: sent,
-                before_s: frame_s[k - 1],
-                after_s: frame_s[k],
-            });
-        }
+        let found = (start..mid_s.len())
+            .take_while(|&k| mid_s[k] < until)
+            .find(|&k| turned(k) > levels.doubt);
+        let Some(k) = found else {
+            continue;
+        };
+        let (share, half_s) = (turned(k), 0.5 * exposure_s);
+        let (before_s, after_s) = if exposure_s > 0.0 && share < 1.0 - levels.doubt {
+            let at_s = mid_s[k] + half_s - share * exposure_s;
+            (at_s, at_s)
+        } else {
+            (mid_s[k - 1] + half_s, mid_s[k] - half_s)
+        };
+        seen.push(SeenEdge {
+            sent_s: sent,
+            before_s,
+            after_s: after_s.max(before_s),
+        });
     }
     if seen.len() * 2 < sent_s.len() || seen.is_empty() {
         return Err(IdentError::EdgesNotSeen {
@@ -108,11 +135,53 @@ pub fn find_edges(
     Ok(seen)
 }
 
-/// The delay from edges: the value that contradicts fewest of their intervals, with the spread that is left.
+/// Grey levels of the light off and on.
+struct Levels {
+    dark: f64,
+    lit: f64,
+    /// Share of the light that noise may feign.
+    doubt: f64,
+}
+
+impl Levels {
+    fn of(grey: &[f64], threshold: f64) -> Self {
+        let side = |above: bool| {
+            let mut side: Vec<f64> = grey
+                .iter()
+                .copied()
+                .filter(|g| (*g > threshold) == above)
+                .collect();
+            side.sort_by(f64::total_cmp);
+            let at = |share: f64| {
+                let last = side.len().saturating_sub(1) as f64;
+                side.get((share * last) as usize)
+                    .copied()
+                    .unwrap_or(threshold)
+            };
+            // Frames with an edge in them are few: the middle half of the others has its share of the noise's quartiles.
+            (at(0.5), 0.74 * (at(0.75) - at(0.25)))
+        };
+        let ((dark, dark_sd), (lit, lit_sd)) = (side(false), side(true));
+        let swing = (lit - dark).max(f64::MIN_POSITIVE);
+        // Five standard deviations: one frame of a million is mistaken. Less than 1 % of an exposure tells nothing more.
+        let doubt = (5.0 * dark_sd.max(lit_sd) / swing).clamp(0.01, 0.45);
+        Self { dark, lit, doubt }
+    }
+
+    /// Part of the exposure for which the light was on, 0 to 1.
+    fn share(&self, grey: f64) -> f64 {
+        ((grey - self.dark) / (self.lit - self.dark).max(f64::MIN_POSITIVE)).clamp(0.0, 1.0)
+    }
+}
+
+/// Fewest edges with a time whose median has an interval by ranks that is not all of them.
+const ENOUGH_TIMES: usize = 12;
+
+/// The delay from edges, as a median: what a stall has delayed is outvoted.
 ///
-/// Each edge says `before - sent < L <= after - sent`. For jitter-free clocks the delay lies in the intersection, anywhere
-/// with equal right (the dither covers the period evenly), so the 95 % interval is its middle 95 %; with jitter the intersection may be empty, and the middle of the edges' intervals is taken
-/// with its standard error (about 0.3/sqrt(N) of a frame period).
+/// Edges whose time is known (they fell into an exposure, whatever their delay, by the dither) have a median with an interval by
+/// its ranks, free of any distribution. Where there are too few, each edge says `before - sent < L <= after - sent` and the value
+/// in most of these intervals is taken; its interval is by drawing the edges again.
 ///
 /// # Errors
 /// [`IdentError::TooShort`] below four edges.
@@ -125,45 +194,81 @@ pub fn delay_from_edges(edges: &[SeenEdge]) -> Result<DelayEstimate, IdentError>
             needed: 4,
         });
     }
-    let low = edges
+    let mut times: Vec<f64> = edges
         .iter()
-        .map(|e| e.before_s - e.sent_s)
-        .fold(f64::NEG_INFINITY, f64::max);
-    let high = edges
-        .iter()
+        .filter(|e| e.before_s == e.after_s)
         .map(|e| e.after_s - e.sent_s)
-        .fold(f64::INFINITY, f64::min);
-    if low < high {
-        let width = high - low;
-        let (delay_s, sd_s) = (0.5 * (low + high), width / 12f64.sqrt());
-        let half = 0.475 * width;
-        return Ok(DelayEstimate {
-            delay_s,
-            sd_s,
-            ci95_s: [delay_s - half, delay_s + half],
-            edges: n,
-        });
-    }
-    let middles: Vec<f64> = edges
-        .iter()
-        .map(|e| 0.5 * (e.before_s + e.after_s) - e.sent_s)
         .collect();
-    let mean = middles.iter().sum::<f64>() / n as f64;
-    let variance = middles.iter().map(|m| (m - mean).powi(2)).sum::<f64>() / (n - 1) as f64;
-    let sd_s = (variance / n as f64).sqrt();
-    let t = cellpos_numeric::statistics::student_t_quantile(0.975, (n - 1) as f64);
+    if times.len() >= ENOUGH_TIMES {
+        times.sort_by(f64::total_cmp);
+        return Ok(median(&times, n));
+    }
+    let spans: Vec<[f64; 2]> = edges
+        .iter()
+        .map(|e| [e.before_s - e.sent_s, e.after_s - e.sent_s])
+        .collect();
+    let [low, high] = most_agreed(&spans);
+    let mut random = Random::new(n as u64);
+    let mut drawn: Vec<[f64; 2]> = (0..200)
+        .map(|_| {
+            let again: Vec<[f64; 2]> = (0..n).map(|_| spans[random.below(n)]).collect();
+            most_agreed(&again)
+        })
+        .collect();
+    let delay_s = 0.5 * (low + high);
+    drawn.sort_by(|a, b| a[0].total_cmp(&b[0]));
+    let least = drawn[5][0].min(low);
+    drawn.sort_by(|a, b| a[1].total_cmp(&b[1]));
+    let most = drawn[194][1].max(high);
     Ok(DelayEstimate {
-        delay_s: mean,
-        sd_s,
-        ci95_s: [mean - t * sd_s, mean + t * sd_s],
+        delay_s,
+        sd_s: (most - least) / 3.92,
+        ci95_s: [least, most],
         edges: n,
     })
 }
 
-/// Whether two delays contradict each other: the intervals of LED test and phase slope do not touch, allowing
-/// `tolerance_s` for what neither accounts for. `None`: they agree; else by how much they miss each other, s.
-pub fn disagreement_s(led: &DelayEstimate, phase95_s: [f64; 2], tolerance_s: f64) -> Option<f64> {
-    let gap = (phase95_s[0] - led.ci95_s[1]).max(led.ci95_s[0] - phase95_s[1]);
+/// Median of sorted times with its 95 % interval: the ranks `n/2 -+ 0.98 sqrt(n)` of a binomial.
+fn median(times: &[f64], edges: usize) -> DelayEstimate {
+    let n = times.len() as f64;
+    let at = |rank: f64| times[(rank.max(0.0) as usize).min(times.len() - 1)];
+    let half = 0.98 * n.sqrt();
+    let delay_s = 0.5 * (at(0.5 * n - 0.5) + at(0.5 * n));
+    // What the brightness of 8 bits resolves, and the camera's own jitter: never surer than some microseconds.
+    const LEAST_S: f64 = 2e-6;
+    let low = at((0.5 * n - half).floor()).min(delay_s - LEAST_S);
+    let high = at((0.5 * n + half).ceil()).max(delay_s + LEAST_S);
+    DelayEstimate {
+        delay_s,
+        sd_s: (high - low) / 3.92,
+        ci95_s: [low, high],
+        edges,
+    }
+}
+
+/// Where most intervals overlap.
+fn most_agreed(spans: &[[f64; 2]]) -> [f64; 2] {
+    let mut ends: Vec<(f64, i32)> = spans
+        .iter()
+        .flat_map(|[low, high]| [(*low, 1), (*high, -1)])
+        .collect();
+    // At the same time an interval begins before another ends.
+    ends.sort_by(|a, b| a.0.total_cmp(&b.0).then(b.1.cmp(&a.1)));
+    let (mut depth, mut deepest, mut best) = (0, 0, [0.0, 0.0]);
+    for (i, (at, step)) in ends.iter().enumerate() {
+        depth += step;
+        if depth > deepest {
+            deepest = depth;
+            let end = ends.get(i + 1).map_or(*at, |next| next.0);
+            best = [*at, end];
+        }
+    }
+    best
+}
+
+/// By how much two intervals miss each other, s, where it is more than `tolerance_s`; `None`: they agree.
+pub fn apart_s(one95_s: [f64; 2], other95_s: [f64; 2], tolerance_s: f64) -> Option<f64> {
+    let gap = (other95_s[0] - one95_s[1]).max(one95_s[0] - other95_s[1]);
     (gap > tolerance_s).then_some(gap)
 }
 
@@ -171,43 +276,72 @@ pub fn disagreement_s(led: &DelayEstimate, phase95_s: [f64; 2], tolerance_s: f64
 mod tests {
     use super::*;
 
-    /// Frames at 1 kHz whose brightness is the light `delay_s` earlier, stamped with their own time.
-    fn test_record(edges_s: &[f64], delay_s: f64, jitter_s: f64) -> (Vec<f64>, Vec<f64>) {
+    /// Frames at 1 kHz, and the light that was on while they were exposed; each switch reaches the light later by `line_s`.
+    fn test_record(
+        sent_s: &[f64],
+        exposure_s: f64,
+        line_s: impl Fn(usize) -> f64,
+    ) -> (Vec<f64>, Vec<f64>) {
         let mut random = Random::new(5);
-        let last = edges_s[edges_s.len() - 1] + 0.05;
-        let frames: Vec<f64> = (0..(last * 1e3) as usize)
+        let last = sent_s[sent_s.len() - 1] + 0.05;
+        let mid_s: Vec<f64> = (0..(last * 1e3) as usize)
             .map(|k| k as f64 * 1e-3)
             .collect();
-        let brightness = frames
+        let switched: Vec<f64> = (sent_s.iter().enumerate())
+            .map(|(i, s)| s + line_s(i))
+            .collect();
+        let lit_at = |t: f64| switched.partition_point(|e| *e <= t) % 2 == 1;
+        let grey = mid_s
             .iter()
-            .map(|t| {
-                let switched =
-                    edges_s.partition_point(|e| *e <= t - delay_s + jitter_s * random.normal());
-                if switched % 2 == 1 {
-                    200.0 + random.normal()
-                } else {
-                    20.0 + random.normal()
-                }
+            .map(|mid| {
+                let steps = if exposure_s > 0.0 { 500 } else { 1 };
+                let part = |k: usize| (k as f64 + 0.5) / steps as f64 - 0.5;
+                let lit = (0..steps)
+                    .filter(|k| lit_at(mid + exposure_s * part(*k)))
+                    .count();
+                20.0 + 180.0 * lit as f64 / steps as f64 + 0.1 * random.normal()
             })
             .collect();
-        (frames, brightness)
+        (mid_s, grey)
     }
 
     #[test]
-    fn a_hundred_dithered_edges_recover_the_delay_to_a_tenth_of_a_millisecond() {
-        for delay_s in [0.0007, 0.0020, 0.0033] {
-            for seed in 0..10 {
-                for jitter_s in [0.0, 5e-5] {
+    fn a_hundred_dithered_edges_recover_the_delay_below_a_tenth_of_a_millisecond_whatever_stalls() {
+        for (exposure_s, within_s) in [(0.0, 1e-4), (1e-4, 1e-4), (5e-4, 2e-5), (1e-3, 2e-5)] {
+            let mut covered = 0;
+            for seed in 0..20 {
+                for delay_s in [0.000_07, 0.0007, 0.0033] {
                     let sent = dithered_edges(100, 0.011, 1e-3, 0.01, seed);
-                    let (frames, brightness) = test_record(&sent, delay_s, jitter_s);
-                    let edges = find_edges(&sent, &frames, &brightness).unwrap();
+                    let mut random = Random::new(seed + 100);
+                    // Of the switches some are held up by the machine: by 0.1 to 4 ms, each fifth.
+                    let held: Vec<f64> = (0..sent.len())
+                        .map(|_| match random.uniform() {
+                            u if u < 0.2 => 1e-4 + 4e-3 * random.uniform(),
+                            _ => 5e-6 * random.normal(),
+                        })
+                        .collect();
+                    let (mid_s, grey) = test_record(&sent, exposure_s, |i| delay_s + held[i]);
+                    let frames = Brightness {
+                        mid_s: &mid_s,
+                        exposure_s,
+                        grey: &grey,
+                    };
+                    let edges = find_edges(&sent, frames).unwrap();
                     let found = delay_from_edges(&edges).unwrap();
+                    let off_s = found.delay_s - delay_s;
                     assert!(
-                        (found.delay_s - delay_s).abs() < 1e-4,
-                        "{delay_s} s, seed {seed}: {found:?}"
+                        off_s.abs() < within_s,
+                        "{exposure_s} {delay_s} s, seed {seed}: {found:?}"
                     );
+                    assert!(found.ci95_s[0] <= found.delay_s && found.delay_s <= found.ci95_s[1]);
+                    // The delay that half of the switches exceed, held up or not.
+                    let mut all: Vec<f64> = held.iter().map(|h| delay_s + h).collect();
+                    all.sort_by(f64::total_cmp);
+                    let truth = 0.5 * (all[49] + all[50]);
+                    covered += usize::from(found.ci95_s[0] <= truth && truth <= found.ci95_s[1]);
                 }
             }
+            assert!(covered >= 54, "{exposure_s}: {covered} of 60");
         }
     }
 
@@ -220,7 +354,12 @@ mod tests {
             .map(|t| (t * 700.0).sin())
             .map(|v| v.min(0.0) * 0.0)
             .collect();
-        let error = find_edges(&sent, &frames, &dark).unwrap_err();
+        let frames = Brightness {
+            mid_s: &frames,
+            exposure_s: 0.0,
+            grey: &dark,
+        };
+        let error = find_edges(&sent, frames).unwrap_err();
         assert!(
             matches!(
                 error,
@@ -236,14 +375,10 @@ mod tests {
 
     #[test]
     fn two_delays_that_contradict_each_other_are_reported_with_the_gap() {
-        let led = DelayEstimate {
-            delay_s: 0.002,
-            sd_s: 1e-6,
-            ci95_s: [0.00199, 0.00201],
-            edges: 100,
-        };
-        assert_eq!(disagreement_s(&led, [0.0015, 0.0025], 1e-5), None);
-        let gap = disagreement_s(&led, [0.0026, 0.0028], 1e-5).unwrap();
+        let led = [0.00199, 0.00201];
+        assert_eq!(apart_s(led, [0.0015, 0.0025], 1e-5), None);
+        let gap = apart_s(led, [0.0026, 0.0028], 1e-5).unwrap();
         assert!((gap - 0.00059).abs() < 1e-9);
+        assert_eq!(apart_s([0.0026, 0.0028], led, 1e-5), Some(gap));
     }
 }

@@ -8,6 +8,8 @@ use nalgebra::Complex;
 
 pub use crate::bootstrap::bootstrap;
 use crate::candidate_model::CandidateModel;
+use crate::delay::apart_s;
+use crate::delay_parameters::{delay_parameter, far_zero_parameter, slow_pole_parameter};
 use crate::order_selection::{
     CandidateFits, CandidateOrder, DelayPrior, OrderSelection, index, model_of,
 };
@@ -70,6 +72,9 @@ pub struct Judged {
     pub phase_delay95_s: [f64; 2],
     /// Best delay from the phase slope alone, s: the smallest far-zero lead that the data allow.
     pub phase_delay_s: f64,
+    /// By how much the delay that was measured otherwise and the phase slope contradict each other, s. The record's own delay is
+    /// taken then: it is the one that the loop lives with.
+    pub contradiction_s: Option<f64>,
 }
 
 impl Judged {
@@ -80,10 +85,13 @@ impl Judged {
 }
 
 /// Half-width, relative to the value, above which an interval no longer identifies a parameter.
-const WIDEST_RELATIVE: f64 = 0.5;
+pub(crate) const WIDEST_RELATIVE: f64 = 0.5;
 
 /// 95 % threshold of a profile's rise, chi-squared with one degree of freedom.
 const PROFILE_RISE: f64 = 3.841;
+
+/// What neither LED test nor phase slope accounts for, s: half of a step of the converter's update, 0.1 ms.
+const NOT_ACCOUNTED_S: f64 = 5e-5;
 
 /// Profile interval of the far zero's lead, ms, searched in 0..`LEAD_MOST_MS` sampling periods.
 fn lead_interval_ms(
@@ -248,10 +256,31 @@ pub fn judge(
     let lead = lead_ms.unwrap_or([0.0, f64::INFINITY]);
     let phase_low = effective + lead[0] - half;
     let phase_high = effective + lead[1] + half;
-    let model = with_prior(problem, fit, prior);
-    let delay = delay_parameter(&model, prior, effective, half, lead, period_ms);
+    let phase95_s = [phase_low * 1e-3, phase_high * 1e-3];
+    let contradiction_s = prior.and_then(|p| {
+        let given95_s = [p.delay_s - p.half95_s, p.delay_s + p.half95_s];
+        apart_s(given95_s, phase95_s, NOT_ACCOUNTED_S)
+    });
+    let agreed = prior.filter(|_| contradiction_s.is_none());
+    let model = with_prior(problem, fit, agreed);
+    let mut delay = delay_parameter(&model, agreed, effective, half, lead, period_ms);
+    if let (Some(gap_s), Some(prior)) = (contradiction_s, prior) {
+        let given_ms = prior.delay_s * 1e3;
+        delay.ci95 = [delay.ci95[0].min(given_ms), delay.ci95[1].max(given_ms)];
+        delay.verdict = Identifiability::NotIdentifiable {
+            reason: format!(
+                "the LED test says {given_ms:.2} ms, the phase slope {:.2} to {:.2} ms: {:.0} degrees at 200 Hz apart; measure both again on \
+                 an idle machine",
+                phase_low,
+                phase_high,
+                360.0 * 200.0 * gap_s
+            ),
+        };
+    }
     parameters.push(delay);
-    parameters.push(far_zero_parameter(fit, &model, prior, lead, period_ms));
+    parameters.push(far_zero_parameter(
+        fit, &model, agreed, lead, half, period_ms,
+    ));
     if let Some(full) = fit
         .candidates
         .iter()
@@ -266,7 +295,8 @@ pub fn judge(
     Judged {
         parameters,
         model,
-        phase_delay95_s: [phase_low * 1e-3, phase_high * 1e-3],
+        phase_delay95_s: phase95_s,
+        contradiction_s,
         phase_delay_s: (effective + lead[0]) * 1e-3,
     }
 }
@@ -357,134 +387,4 @@ fn with_prior(
         })
         .min_by(|a, b| a.chi2.total_cmp(&b.chi2));
     found.map_or(best.model, |f| model_of(&f.parameters, order))
-}
-
-fn delay_parameter(
-    model: &CandidateModel,
-    prior: Option<DelayPrior>,
-    effective_ms: f64,
-    half_ms: f64,
-    lead_ms: [f64; 2],
-    period_ms: f64,
-) -> IdentifiedParameter {
-    let meaning = "delay from the command to the middle of the exposure";
-    match prior {
-        Some(prior) => {
-            let half = prior.half95_s * 1e3;
-            let value = model.delay_s * 1e3;
-            IdentifiedParameter {
-                name: "delay_ms",
-                meaning,
-                unit: "ms",
-                value,
-                ci95: [value - half, value + half],
-                bootstrap95: None,
-                verdict: Identifiability::Identified,
-            }
-        }
-        None => {
-            let (low, high) = (
-                effective_ms + lead_ms[0] - half_ms,
-                effective_ms + lead_ms[1] + half_ms,
-            );
-            let narrow = high - low < 0.25 * period_ms;
-            IdentifiedParameter {
-                name: "delay_ms",
-                meaning,
-                unit: "ms",
-                value: effective_ms + lead_ms[0],
-                ci95: [low, high],
-                bootstrap95: None,
-                verdict: if narrow {
-                    Identifiability::Identified
-                } else {
-                    Identifiability::NotIdentifiable {
-                        reason: "a far zero's lead trades against it behind a zero-order hold; the LED test tells them apart".to_owned(),
-                    }
-                },
-            }
-        }
-    }
-}
-
-fn far_zero_parameter(
-    fit: &CandidateFits,
-    model: &CandidateModel,
-    prior: Option<DelayPrior>,
-    lead_ms: [f64; 2],
-    period_ms: f64,
-) -> IdentifiedParameter {
-    let invert = |ms: f64| if ms > 0.0 { 1e3 / ms } else { f64::INFINITY };
-    let ci95 = [
-        if lead_ms[1].is_finite() {
-            invert(lead_ms[1])
-        } else {
-            0.0
-        },
-        invert(lead_ms[0]),
-    ];
-    let middle = if lead_ms[1].is_finite() {
-        0.5 * (lead_ms[0] + lead_ms[1])
-    } else {
-        lead_ms[0]
-    };
-    let width = 0.5 * (lead_ms[1] - lead_ms[0]);
-    // A lead that may reach half a sampling period is told from a delay only by which rows show it.
-    let identified = fit.best().order >= CandidateOrder::FarZero
-        && lead_ms[1] < 0.5 * period_ms
-        && width < WIDEST_RELATIVE * middle;
-    let value = if prior.is_some() && model.far_lead_s > 0.0 {
-        1.0 / model.far_lead_s
-    } else {
-        invert(middle.max(1e-3 * period_ms))
-    };
-    let verdict = if identified {
-        Identifiability::Identified
-    } else {
-        let mut reason = format!(
-            "its lead trades against the delay: the record alone allows leads of {:.3} to {} ms",
-            lead_ms[0],
-            if lead_ms[1].is_finite() {
-                format!("{:.3}", lead_ms[1])
-            } else {
-                "any number of".to_owned()
-            }
-        );
-        if prior.is_some() {
-            reason.push_str("; the value shown takes the LED test's delay as given");
-        }
-        Identifiability::NotIdentifiable { reason }
-    };
-    IdentifiedParameter {
-        name: "far_zero_rad_per_s",
-        meaning: "far zero of Eq. (4)",
-        unit: "rad/s",
-        value,
-        ci95,
-        bootstrap95: None,
-        verdict,
-    }
-}
-
-fn slow_pole_parameter(value: f64, half: f64, chosen: CandidateOrder) -> IdentifiedParameter {
-    let identified = chosen == CandidateOrder::Eq4 && half < WIDEST_RELATIVE * value;
-    let high = value + half;
-    IdentifiedParameter {
-        name: "slow_pole_rad_per_s",
-        meaning: "slow pole of Eq. (4)",
-        unit: "rad/s",
-        value: value.max(0.0),
-        ci95: [(value - half).max(0.0), high.max(0.0)],
-        bootstrap95: None,
-        verdict: if identified {
-            Identifiability::Identified
-        } else {
-            Identifiability::NotIdentifiable {
-                reason: format!(
-                    "it lies far below the lowest line; the data only say that it is below {:.2} rad/s",
-                    high.max(0.0)
-                ),
-            }
-        },
-    }
 }

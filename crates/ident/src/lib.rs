@@ -24,6 +24,7 @@ mod bootstrap;
 pub mod candidate_model;
 mod candidate_order;
 pub mod delay;
+mod delay_parameters;
 mod error;
 pub mod excitation;
 pub mod experiment;

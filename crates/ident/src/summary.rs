@@ -8,7 +8,7 @@ use cellpos_plant::{Covariance, Model, Noise, PlantError, TransferFunction, prob
 use nalgebra::{Complex, DMatrix};
 
 use crate::candidate_model::CandidateModel;
-use crate::delay::{DelayEstimate, disagreement_s};
+use crate::delay::DelayEstimate;
 use crate::error::IdentError;
 use crate::experiment::Measured;
 use crate::identifiability::{Judged, judge};
@@ -32,7 +32,7 @@ pub struct CompensatedPoint {
     pub delayed_phase_deg: f64,
     /// Phase of the plant: hold, exposure and delay taken off, deg.
     pub phase_deg: f64,
-    /// Standard deviation of the phase, deg, without that of the delay.
+    /// Standard deviation of the phase, deg, with that of the delay that was taken off.
     pub phase_sd_deg: f64,
     /// Coherence.
     pub coherence: f64,
@@ -94,7 +94,15 @@ pub fn summarise(
         half95_s: (0.5 * (l.ci95_s[1] - l.ci95_s[0])).max(1e-7),
     });
     let judged = judge(&problem, &selection, prior, bootstrap, seed);
-    let disagreement = led.and_then(|l| disagreement_s(&l, judged.phase_delay95_s, 2e-5));
+    let disagreement = judged.contradiction_s;
+    let delay_sd_s = judged
+        .parameter("delay_ms")
+        .map_or(0.0, |p| (p.ci95[1] - p.ci95[0]) * 1e-3 / 3.92);
+    let delay_sd_s = if delay_sd_s.is_finite() {
+        delay_sd_s
+    } else {
+        0.0
+    };
     let compensated = measured
         .points
         .iter()
@@ -108,7 +116,7 @@ pub fn summarise(
                 raw_phase_deg: continued(p.phase_deg(), -180.0),
                 delayed_phase_deg: phase_deg - 360.0 * p.frequency_hz * judged.model.delay_s,
                 phase_deg,
-                phase_sd_deg: p.phase_sd_deg(),
+                phase_sd_deg: (p.phase_sd_deg()).hypot(360.0 * p.frequency_hz * delay_sd_s),
                 coherence: p.coherence,
             }
         })
@@ -146,11 +154,13 @@ fn warnings(result: &Identification, stated_per_s: Option<f64>) -> Vec<String> {
     if let (Some(gap), Some(led)) = (result.disagreement_s, result.led) {
         out.push(format!(
             "the LED test's delay ({:.3} ms) and the phase slope's ({:.3} to {:.3} ms) miss each other by {:.3} ms: \
-             something between the board's output and the bead delays too (amplifier, tube), or one of the tests is wrong",
+             something between the board's output and the bead delays too (amplifier, tube), or one of the tests is wrong. The phase of \
+             the plant is off by as much ({:.0} degrees at 200 Hz), whichever it is",
             led.delay_s * 1e3,
             result.judged.phase_delay95_s[0] * 1e3,
             result.judged.phase_delay95_s[1] * 1e3,
-            gap * 1e3
+            gap * 1e3,
+            360.0 * 200.0 * gap
         ));
     }
     if result.selection.scale > 2.0 {

@@ -1,10 +1,11 @@
 //! A run on the virtual clock: the same core, rings and I/O as in real time, one after the other in one thread.
 //!
-//! Each period: frames that have been delivered by now, the tick, the actuator, the recorder. A seed of the emulated
-//! rig fixes every bit of the records; wake-up and compute times in them are zero.
+//! Frames as they are delivered until a tick is due, by the same rule as on threads; the tick, the actuator, the recorder. A seed of
+//! the emulated rig fixes every bit of the records; compute times in them are zero.
 
 use crate::core::Core;
 use crate::life::Request;
+use crate::pacer::{Pace, Pacer};
 use crate::realtime::Conditions;
 use crate::recorder::{Feed, Pulse, Recorder};
 use crate::reference::ReferenceGenerator;
@@ -33,8 +34,9 @@ pub fn run<R: ReferenceGenerator, S: RunSink>(
     mut request: impl FnMut(u64) -> Request,
 ) -> Result<Finished<S>, RunError> {
     const PROGRESS_TICKS: u64 = 100;
-    let period_ns = core.timing().period_ns();
+    let periods_ns = [core.timing().period_ns(), core.frame_period_ns()];
     let start_ns = clock.now_ns();
+    let mut pacer = Pacer::new(periods_ns, start_ns);
     let (mut ticker, ends) = Ticker::new(core, clock.clone(), start_ns, RingSizes::default());
     let Ends {
         mut measurements,
@@ -56,27 +58,48 @@ pub fn run<R: ReferenceGenerator, S: RunSink>(
     let mut acting = Acting::new(&mut *actuator, orders, heard);
     let mut tick = 0_u64;
     let end = loop {
-        let now_ns = start_ns + tick as i64 * period_ns;
-        clock.sleep_until_ns(now_ns);
-        while io_error.is_none() {
-            match source.next(now_ns) {
-                Ok(Some(measurement)) => {
-                    // A refused measurement shows as a gap in the frame ids.
-                    let _ = measurements.push(measurement);
+        // The first tick is made at once, the others as on the real clock: on the arrival of a frame, or on the timer.
+        let due_ns = loop {
+            while io_error.is_none() {
+                match source.next(clock.now_ns()) {
+                    Ok(Some(measurement)) => {
+                        // A refused measurement shows as a gap in the frame ids.
+                        let _ = measurements.push(measurement);
+                    }
+                    Ok(None) => break,
+                    Err(error) => io_error = Some(error.into()),
                 }
-                Ok(None) => break,
-                Err(error) => io_error = Some(error.into()),
             }
-        }
+            let ready_ns = ticker.look();
+            let now_ns = clock.now_ns();
+            let pace = match tick {
+                0 => Pace::Tick(now_ns),
+                _ => pacer.decide(now_ns, ticker.opens_ns(), ready_ns),
+            };
+            match pace {
+                Pace::Tick(due_ns) => {
+                    pacer.ticked(now_ns, ready_ns);
+                    break due_ns;
+                }
+                Pace::Wait(until_ns) if io_error.is_none() => match source.next(until_ns) {
+                    Ok(Some(measurement)) => {
+                        let _ = measurements.push(measurement);
+                    }
+                    Ok(None) => clock.sleep_until_ns(until_ns),
+                    Err(error) => io_error = Some(error.into()),
+                },
+                Pace::Wait(until_ns) => clock.sleep_until_ns(until_ns),
+            }
+        };
         let mut asked = request(tick);
         if recorder.fault().is_some() && asked != Request::Park {
             asked = Request::Unrecorded;
         }
         ticker.tell_truth(source.truth_um());
-        let life = ticker.tick(now_ns, asked);
+        let life = ticker.tick(due_ns, asked);
         acting.round();
         // A recorder that waits for its disk leaves records in the ring; a full ring refuses, and the refusal is counted.
-        recorder.round(now_ns);
+        recorder.round(clock.now_ns());
         if tick.is_multiple_of(PROGRESS_TICKS) {
             recorder.progress();
         }

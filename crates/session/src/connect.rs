@@ -251,17 +251,8 @@ pub fn bound_rms_nm(file: &RigFile, setup: &Setup, summary: &Summary) -> Option<
 
 /// What is wrong when the frames of a run were not as old as the rig file says: the loop was made for another delay.
 pub fn delay_warning(file: &RigFile, summary: &Summary) -> Option<String> {
-    /// Part of a period: what time stamps can tell without being a setting.
-    const WORTH_SAYING: f64 = 0.3;
-    let timing = &file.timing;
-    let period_ms = timing.period_us * 1e-3;
-    let found_ms = summary.loop_delay_ms - 0.5 * period_ms;
-    ((found_ms - timing.camera_delay_ms).abs() > WORTH_SAYING * period_ms).then(|| {
-        format!(
-            "the frames were {found_ms:.2} ms old when they were used, camera_delay_ms says {} ms: correct it in rig.toml",
-            timing.camera_delay_ms
-        )
-    })
+    let found_ms = summary.loop_delay_ms - 0.5e-3 * file.timing.period_us;
+    crate::setup::camera_delay_advice(found_ms, &file.timing)
 }
 
 /// What the user should know of a run that is over.

@@ -3,7 +3,9 @@
 use crate::Failure;
 use crate::prepared::Prepared;
 use crate::rig_file::RigFile;
-use cellpos_control::design::{DesignPlant, Uncertainty, harmonic_responses, sine_figures};
+use cellpos_control::design::{
+    CycleFigures, DesignPlant, Uncertainty, cycle_figures, harmonic_responses,
+};
 use cellpos_control::{
     CycleLearning, HarmonicResponse, LearnConfig, LearnError, LearnedTable, Learner, Profile,
     Reference, Shape,
@@ -93,22 +95,52 @@ impl Sine {
         Ok(())
     }
 
-    /// RMS error that the design predicts without noise, um.
+    /// The sine about 0.
+    fn profile(&self) -> Profile {
+        Profile::Wave {
+            shape: Shape::Sine,
+            centre_um: 0.0,
+            amplitude_um: self.amplitude.value(),
+            frequency_hz: self.frequency.value(),
+            fade_s: FADE_S,
+        }
+    }
+}
+
+/// A periodic motion that a loop is to follow.
+pub struct Motion<'a> {
+    /// In words.
+    pub name: String,
+    /// The motion by itself.
+    pub reference: &'a dyn Reference,
+    /// From when on it is in full swing, s.
+    pub from_s: f64,
+    /// Frequency of its cycles, Hz.
+    pub frequency_hz: f64,
+}
+
+impl Motion<'_> {
+    /// What the design predicts without noise.
     ///
     /// # Errors
     /// A model or a controller of which no loop can be made.
-    pub fn predicted_rms_um(&self, prepared: &Prepared, file: &RigFile) -> Result<f64, Failure> {
+    pub fn figures(&self, prepared: &Prepared, file: &RigFile) -> Result<CycleFigures, Failure> {
         let config = prepared
             .controller
             .loop_config(&prepared.model)
             .map_err(Failure::input)?;
         let plant = design_plant(prepared, file)?;
-        let (amplitude_um, hz) = (self.amplitude.value(), self.frequency.value());
-        let figures = sine_figures(&plant, &config, amplitude_um, hz).map_err(Failure::input)?;
-        Ok(figures.rms_um)
+        cycle_figures(
+            &plant,
+            &config,
+            self.reference,
+            self.from_s,
+            self.frequency_hz,
+        )
+        .map_err(Failure::input)
     }
 
-    /// What to say of a loop that is predicted to miss this sine by more than a tenth of its amplitude; `better` gives the same rig
+    /// What to say of a loop that is predicted to miss this motion by more than a tenth of its amplitude; `better` gives the same rig
     /// with another controller.
     ///
     /// # Errors
@@ -119,22 +151,22 @@ impl Sine {
         file: &RigFile,
         better: impl Fn(&'static str) -> Result<Prepared, Failure>,
     ) -> Result<Option<String>, Failure> {
-        let allowed_um = 0.1 * self.amplitude.value();
-        let rms_um = self.predicted_rms_um(prepared, file)?;
-        if rms_um <= allowed_um {
+        let figures = self.figures(prepared, file)?;
+        let allowed_um = 0.1 * figures.amplitude_um;
+        if figures.rms_um <= allowed_um {
             return Ok(None);
         }
         let mut advice = "a lower frequency or amplitude, or --learn, brings it down".to_string();
         for name in ["lead", "lqg", "mpc"] {
-            let um = self.predicted_rms_um(&better(name)?, file)?;
+            let um = self.figures(&better(name)?, file)?.rms_um;
             if um <= allowed_um {
                 advice = format!("--controller {name} is predicted to follow with {um:.3} um RMS");
                 break;
             }
         }
         Ok(Some(format!(
-            "{}@{}: this controller is predicted to miss it by {rms_um:.2} um RMS; {advice}",
-            self.amplitude, self.frequency
+            "{}: this controller is predicted to miss it by {:.2} um RMS; {advice}",
+            self.name, figures.rms_um
         )))
     }
 }
@@ -158,7 +190,13 @@ pub fn predicted(
     if learns {
         return Ok(None);
     }
-    let warning = sine.warning(prepared, file, better)?;
+    let motion = Motion {
+        name: format!("{}@{}", sine.amplitude, sine.frequency),
+        reference: &sine.profile(),
+        from_s: FADE_S,
+        frequency_hz: sine.frequency.value(),
+    };
+    let warning = motion.warning(prepared, file, better)?;
     if let Some(warning) = &warning {
         tracing::warn!("{warning}");
     }
@@ -217,15 +255,8 @@ impl LearnSpec {
         table: Option<LearnedTable>,
     ) -> Result<Self, Failure> {
         let frequency_hz = sine.frequency.value();
-        let reference = Profile::Wave {
-            shape: Shape::Sine,
-            centre_um: 0.0,
-            amplitude_um: sine.amplitude.value(),
-            frequency_hz,
-            fade_s: FADE_S,
-        };
         let wanted = Wanted {
-            reference: &reference,
+            reference: &sine.profile(),
             from_s: FADE_S,
             frequency_hz,
             harmonics: SINE_HARMONICS,

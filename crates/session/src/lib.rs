@@ -56,7 +56,7 @@ pub mod words;
 pub use devices::Options;
 pub use ended::{EndKind, Ended};
 pub use failure::Failure;
-pub use rig::{Armed, Finished, NotArmed, Rig, Running};
+pub use rig::{Armed, Finished, FramesSeen, NotArmed, Rig, Running};
 pub use rig_file::RigFile;
 
 /// The README's Rust is compiled and run.

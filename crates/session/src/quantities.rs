@@ -10,7 +10,7 @@ const fn q(table: &'static str, plain: &'static str, with_unit: &'static str) ->
 }
 
 /// Those of the host's own tables.
-const OF_THE_HOST: [Quantity; 24] = [
+const OF_THE_HOST: [Quantity; 25] = [
     q("", "first_neutral", "first_neutral_um"),
     q("", "near", "near_um"),
     q("actuator", "watchdog", "watchdog_ms"),
@@ -20,6 +20,7 @@ const OF_THE_HOST: [Quantity; 24] = [
     q("actuator", "hold_watchdog", "hold_watchdog_ms"),
     q("camera", "rate", "rate_hz"),
     q("camera", "exposure", "exposure_us"),
+    q("camera", "latency", "latency_ms"),
     q("calibration", "pixel", "pixel_um"),
     q("calibration", "tilt", "tilt_deg"),
     q("limits", "low", "low_um"),

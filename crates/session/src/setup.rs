@@ -266,15 +266,33 @@ pub fn loop_delay_s(timing: &Timing) -> f64 {
     timing.camera_delay_ms * 1e-3 + 0.5e-6 * timing.period_us
 }
 
-/// What is wrong when a model was measured with another camera path than the rig has: one of the two is not that of today.
-pub fn model_delay_warning(model: &Model, timing: &Timing) -> Option<String> {
-    /// Part of a period: half of it costs a controller some degrees of its margin.
-    const WORTH_SAYING: f64 = 0.3;
-    let (measured_ms, rig_ms) = (model.camera_delay_s? * 1e3, timing.camera_delay_ms);
-    ((measured_ms - rig_ms).abs() > WORTH_SAYING * timing.period_us * 1e-3).then(|| {
+/// Part of a period by which a delay may differ before anybody is told: half of it costs a controller some degrees of its margin.
+/// One figure for all who compare delays, so that none takes back what another advises.
+const WORTH_SAYING: f64 = 0.3;
+
+/// What to write when frames are not as old at their ticks as the rig file says. `found_ms` is by the stamps of the frames, from the
+/// middle of their exposure to the tick that used them: the one measurement behind this key, whoever makes it.
+pub fn camera_delay_advice(found_ms: f64, timing: &Timing) -> Option<String> {
+    let configured_ms = timing.camera_delay_ms;
+    ((found_ms - configured_ms).abs() > WORTH_SAYING * timing.period_us * 1e-3).then(|| {
         format!(
-            "the model was measured with a camera path of {measured_ms:.2} ms, the rig file says camera_delay_ms = {rig_ms}: \
-             correct it, or measure the plant again (cellpos identify)"
+            "frames are {found_ms:.2} ms old when they are used (middle of the exposure to the tick), rig.toml says {configured_ms} ms: \
+             write [timing] camera_delay_ms = {found_ms:.2} and design the controller again"
+        )
+    })
+}
+
+/// What is wrong when a model was measured with another delay than the rig has. The model's is from the command to the exposure that
+/// shows it and on to the tick; the rig file's begins at the exposure. So the model's may be the longer one, by line and amplifier.
+pub fn model_delay_warning(model: &Model, timing: &Timing) -> Option<String> {
+    let (measured_ms, rig_ms) = (model.camera_delay_s? * 1e3, timing.camera_delay_ms);
+    let beyond_ms = measured_ms - rig_ms;
+    (beyond_ms.abs() > WORTH_SAYING * timing.period_us * 1e-3).then(|| {
+        format!(
+            "the model was measured with {measured_ms:.2} ms from the command to the tick that uses its picture, the camera's part of it \
+             is camera_delay_ms = {rig_ms} by the rig file: measure the plant again (cellpos identify), which says if that key is wrong; \
+             if it is right, line and amplifier take {beyond_ms:.2} ms: cellpos design --delay {:.2}ms",
+            measured_ms + 0.5e-3 * timing.period_us
         )
     })
 }

@@ -1,6 +1,6 @@
 //! What does not fit together in a rig file that reads well.
 
-pub use crate::connected::{CameraSeen, Connected, connect};
+pub use crate::connected::{CameraSeen, Connected, connect, of_frames};
 use crate::finding::Found;
 pub use crate::finding::{Finding, Weight};
 use cellpos_session::RigFile;
@@ -46,17 +46,28 @@ impl Findings<'_> {
                 ("camera", *rate_hz, exposure)
             }
         };
-        if (rate_hz * timing.period_us * 1e-6 - 1.0).abs() > 0.01 {
+        // The estimator predicts between the frames of a slower camera, over so many ticks at most.
+        const MOST_TICKS_A_FRAME: f64 = 16.0;
+        let ticks_a_frame = 1e6 / (rate_hz * timing.period_us);
+        // A slow actuator takes the newest of several frames.
+        let of_the_newest = self.file.actuator.period_ms().is_some() && ticks_a_frame < 1.0;
+        if (ticks_a_frame - 1.0).abs() > 0.01 && !of_the_newest {
+            let impossible = ticks_a_frame > MOST_TICKS_A_FRAME;
             self.say(
-                Error,
+                if impossible { Error } else { Warning },
                 (table, "rate_hz"),
                 &rate_hz,
                 format!(
-                    "rate_hz = {rate_hz}: a frame each {} us, [timing] period_us is {}",
+                    "rate_hz = {rate_hz}: a frame each {} us, [timing] period_us is {}: {}",
                     (1e6 / rate_hz).round(),
-                    timing.period_us
+                    timing.period_us,
+                    match ticks_a_frame {
+                        _ if impossible => "too long to predict from one to the next",
+                        more if more > 1.0 => "between frames the loop runs on prediction",
+                        _ => "frames are left out",
+                    }
                 ),
-                "make period_us one million divided by the rate: the loop makes one tick a frame",
+                "one tick a frame is usual: period_us is one million divided by the rate",
             );
         }
         if let Some((key, exposure, us)) = exposure
@@ -173,6 +184,29 @@ impl Findings<'_> {
         }
     }
 
+    /// Frames of the empty channel.
+    fn background(&mut self, path: Option<&Path>) {
+        const REMEDY: &str =
+            "record the empty channel: cellpos background --rig RIG.toml --out empty.tif";
+        let key = ("cell", "background");
+        match path {
+            None => self.say(
+                Error,
+                key,
+                &"",
+                "[cell] background is missing: a camera needs frames of the empty channel to see a cell".to_string(),
+                REMEDY,
+            ),
+            Some(path) => {
+                let shown = path.display();
+                if let Err(error) = cellpos_drivers::sources::open(path) {
+                    let what = format!("background = {shown}: {error}");
+                    self.say(Error, key, &shown, what, REMEDY);
+                }
+            }
+        }
+    }
+
     /// What a real camera needs beside a rate.
     fn camera(&mut self, path: &Path) {
         let file = self.file;
@@ -186,6 +220,9 @@ impl Findings<'_> {
                         .to_string(),
                     "cellpos calibrate writes a file; name it with calibration_file",
                 );
+            }
+            if let Some(cell) = &file.cell {
+                self.background(cell.background.as_deref());
             }
             if file.vision.is_none() && file.cell.is_none() {
                 self.say(

@@ -6,7 +6,8 @@ use crate::line_test::{self, LineTest, Quantiles};
 use cellpos_drivers::Axis;
 use cellpos_rig::{Camera, Clock, FrameBuffer};
 use cellpos_session::rig_file::{ActuatorConfig, CameraConfig};
-use cellpos_session::{Failure, RigFile};
+use cellpos_session::setup::camera_delay_advice;
+use cellpos_session::{Failure, FramesSeen, RigFile};
 use serde::Serialize;
 use std::path::Path;
 
@@ -32,6 +33,8 @@ pub struct CameraSeen {
     pub rate_hz: f64,
     /// From mid-exposure to arrival, ms.
     pub age_ms: Quantiles,
+    /// From mid-exposure to when vision is through with it, ms, median; none where vision is not set up.
+    pub used_ms: Option<f64>,
 }
 
 /// Opens board and camera of a rig file that was read from `path`. Nothing moves. One that is not there, or does not answer,
@@ -97,11 +100,22 @@ fn camera(bench: &Bench) -> Result<CameraSeen, Failure> {
         }
     }
     let rate_hz = ages_ms.len() as f64 / ((clock.now_ns() - start_ns) as f64 * 1e-9);
+    let name = camera.info().name;
+    // As the loop takes them: through vision.
+    let used_ms = bench
+        .file()
+        .watch(camera, &clock)
+        .ok()
+        .and_then(|mut source| {
+            let seen = FramesSeen::of(source.as_mut(), &clock, WATCH_NS / 2).ok()?;
+            seen.age_ms
+        });
     Ok(CameraSeen {
-        name: camera.info().name,
+        name,
         size_px: [buffer.width, buffer.height],
         rate_hz,
         age_ms: Quantiles::of(ages_ms),
+        used_ms,
     })
 }
 
@@ -183,35 +197,69 @@ fn judge_board(found: &mut Found, file: &RigFile, line: &LineTest) {
     }
 }
 
-/// Rate and age of the frames against what the loop is set up for; the calibration's origin against their size.
-fn judge_camera(found: &mut Found, file: &RigFile, camera: &CameraSeen) {
-    let timing = &file.timing;
-    let period_us = timing.period_us;
-    let promised_hz = 1e6 / period_us;
-    if camera.rate_hz < 0.9 * promised_hz {
+/// What the frames of a rig that is open say against its file, which was read from `path`.
+pub fn of_frames(file: &RigFile, seen: &FramesSeen, path: &Path) -> Vec<Finding> {
+    let mut found = Found::in_file(path);
+    judge_frames(&mut found, file, seen);
+    found.findings
+}
+
+/// Rate and age of the frames against the file.
+fn judge_frames(found: &mut Found, file: &RigFile, seen: &FramesSeen) {
+    /// A rate that is off by less is a camera's own; below, frames are lost.
+    const KEPT: f64 = 0.1;
+    let stated = match &file.camera {
+        CameraConfig::Socket { rate_hz, .. } | CameraConfig::Industrial { rate_hz, .. } => {
+            ("camera", *rate_hz)
+        }
+        CameraConfig::Emulated {} => ("emulator", file.emulator.rate_hz),
+    };
+    let (table, rate_hz) = stated;
+    if (seen.rate_hz / rate_hz - 1.0).abs() > KEPT {
+        let faster = seen.rate_hz > rate_hz;
         found.say(
-            Weight::Warning,
-            ("timing", "period_us"),
-            &period_us,
+            if faster { Weight::Error } else { Weight::Warning },
+            (table, "rate_hz"),
+            &rate_hz,
             format!(
-                "period_us = {period_us}: promises {promised_hz:.0} Hz, the camera delivers {:.0} Hz",
-                camera.rate_hz
+                "rate_hz = {rate_hz}: the camera delivers {:.0} frames a second",
+                seen.rate_hz
             ),
-            "smaller region, shorter exposure, faster link: cellpos camera shows which frames are missing",
+            if faster {
+                "write the camera's own rate: what is estimated between frames depends on it"
+            } else {
+                "smaller region, shorter exposure, faster link: cellpos camera shows which frames are missing"
+            },
         );
     }
-    let (age_ms, delay_ms) = (camera.age_ms.p50, timing.camera_delay_ms);
-    if (age_ms - delay_ms).abs() > 0.5 * period_us * 1e-3 {
+    let advice = seen
+        .age_ms
+        .and_then(|age_ms| camera_delay_advice(age_ms, &file.timing));
+    if let Some(advice) = advice {
         found.say(
             Weight::Warning,
             ("timing", "camera_delay_ms"),
-            &delay_ms,
-            format!(
-                "camera_delay_ms = {delay_ms}: frames are {age_ms:.2} ms old on arrival (median)"
-            ),
-            "cellpos identify measures the delay with the LED",
+            &file.timing.camera_delay_ms,
+            advice,
+            "design the controller again, too: cellpos design --rig",
         );
     }
+}
+
+/// Rate and age of the frames against what the loop is set up for; the calibration's origin against their size.
+fn judge_camera(found: &mut Found, file: &RigFile, camera: &CameraSeen) {
+    judge_frames(
+        found,
+        file,
+        &FramesSeen {
+            rate_hz: camera.rate_hz,
+            age_ms: camera.used_ms.or_else(|| {
+                // Before its arrival no frame is used: without vision only that much is known.
+                let arrived_ms = camera.age_ms.p50;
+                (arrived_ms > file.timing.camera_delay_ms).then_some(arrived_ms)
+            }),
+        },
+    );
     if let Some(calibration) = &file.calibration {
         let [width, height] = camera.size_px;
         let across = match calibration.axis {
@@ -297,6 +345,7 @@ mod tests {
                 p50: 2.0,
                 ..Quantiles::default()
             },
+            used_ms: None,
         };
         let found = in_file(FILE, |found, file| {
             judge_board(found, file, &line);
@@ -312,7 +361,7 @@ mod tests {
             ("limits.park_um", Some(15)),
             ("actuator.port", Some(3)),
             // The key is left out: its table.
-            ("timing.period_us", Some(16)),
+            ("camera.rate_hz", Some(4)),
             ("timing.camera_delay_ms", Some(17)),
             ("calibration.origin_px", Some(9)),
         ];

@@ -24,6 +24,9 @@ pub struct Args {
     /// Fixes every random number
     #[arg(long)]
     pub seed: Option<u64>,
+    /// A rig without the imperfections of a real one: flow, light, focus and clocks stand still
+    #[arg(long)]
+    pub ideal: bool,
     /// Make a symbolic link to the pseudo-terminal here, so that its name is always the same
     #[arg(long, value_name = "PATH")]
     pub pty_link: Option<PathBuf>,
@@ -267,6 +270,7 @@ impl Args {
         if let Some(seed) = self.seed {
             file.emulator.seed = seed;
         }
+        file.emulator.ideal |= self.ideal;
         if let Some(model) = &self.model {
             file.emulator.model.clone_from(model);
         } else if let Some(beside) = self.rig.as_deref().and_then(Path::parent) {
@@ -387,7 +391,8 @@ mod tests {
                     --clip-at 21um";
         let world = parse(line).unwrap().setup().unwrap().world;
         let faults = &world.faults;
-        assert_eq!(world.seed, 9);
+        assert_eq!((world.seed, world.ideal), (9, false));
+        assert!(parse("--ideal").unwrap().setup().unwrap().world.ideal);
         assert_eq!(
             (faults.drop_rate, faults.stale_rate, faults.double_rate),
             (0.01, 0.02, 0.0)

@@ -55,6 +55,9 @@ pub struct Args {
     /// Factor on the duration of the experiments, 0.2 to 10.
     #[arg(long, default_value_t = 1.0, requires = "collect")]
     effort: f64,
+    /// Without the imperfections of a real rig (emulated rig): flow, light, focus and clocks stand still.
+    #[arg(long, requires = "collect")]
+    ideal: bool,
     /// Seed of the emulated rig and of the excitations [default: that of rig.toml].
     #[arg(long, requires = "collect")]
     seed: Option<u64>,
@@ -243,9 +246,7 @@ fn collectable(args: &Args) -> Result<(), Failure> {
 /// The rig to collect on.
 fn rig(args: &Args, model: &Model) -> Result<OnRig, Failure> {
     let mut file = RigFile::load(args.rig.as_deref())?;
-    if let Some(seed) = args.seed {
-        file.emulator.seed = seed;
-    }
+    file.emulate_as(args.seed, args.ideal)?;
     OnRig::new(
         file,
         model.clone(),

@@ -1,5 +1,6 @@
 //! `cellpos run`: a setpoint script in closed loop, with a row for each cycle; resumed after whatever ended it.
 
+mod following;
 pub(super) mod learning;
 mod load;
 mod over;
@@ -13,6 +14,7 @@ pub(crate) mod text;
 mod unshown;
 
 use crate::arguments::run_name;
+use crate::checked;
 use crate::clips;
 use crate::keys;
 use crate::notify::NotifyArgs;
@@ -83,6 +85,12 @@ pub struct Args {
     /// `--rig`, or the most prominent.
     #[arg(long, allow_hyphen_values = true)]
     near: Option<Micrometers>,
+    /// Run although the rig file has errors (cellpos rig check).
+    #[arg(long)]
+    anyway: bool,
+    /// Without the imperfections of a real rig (emulated rig): flow, light, focus and clocks stand still.
+    #[arg(long, conflicts_with = "resume")]
+    ideal: bool,
     /// Seed of the emulated rig; left out: that of rig.toml.
     #[arg(long)]
     seed: Option<u64>,
@@ -152,9 +160,7 @@ fn fresh(args: &Args) -> Result<Ready, Failure> {
     let path = args.script.as_deref().unwrap_or(Path::new(""));
     let (reference, script, mut inputs) = load::script(path)?;
     let mut file = RigFile::load(args.rig.as_deref())?;
-    if let Some(seed) = args.seed {
-        file.emulator.seed = seed;
-    }
+    file.emulate_as(args.seed, args.ideal)?;
     if args.dry {
         rehearse(&mut file, &args.model);
     }
@@ -290,10 +296,16 @@ fn start(args: &Args, ready: Ready, tell: bool) -> Result<Over, Failure> {
         },
         best_effort: config.best_effort,
     };
-    let mut rig = Rig::open(file, options)?;
+    let path = args.rig.as_deref().filter(|_| !args.dry);
+    let mut rig = checked::open(file, options, path, args.anyway)?;
     rig.fit(&mut prepared);
-    allowed(&script, &prepared, &rig)?;
-    let mut warnings = Vec::new();
+    let checked = allowed(&script, &prepared, &rig)?;
+    following::below_nyquist(&script, &checked, rig.file())?;
+    let mut warnings = match config.learn {
+        // What is learned is not missed.
+        true => Vec::new(),
+        false => following::warnings(&plan, &prepared, &rig)?,
+    };
     let mut motions = Vec::new();
     if config.learn {
         let known = match &home {

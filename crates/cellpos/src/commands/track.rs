@@ -1,6 +1,7 @@
 //! `cellpos track`: hold a bead, or go to a position, in closed loop.
 
 use crate::arguments::{positive, run_name};
+use crate::checked;
 use crate::clips;
 use crate::kept;
 use crate::keys::{self, Steering};
@@ -73,6 +74,12 @@ pub struct Args {
     /// `--rig`, or the most prominent.
     #[arg(long, allow_hyphen_values = true)]
     near: Option<Micrometers>,
+    /// Run although the rig file has errors (cellpos rig check).
+    #[arg(long)]
+    anyway: bool,
+    /// Without the imperfections of a real rig (emulated rig): flow, light, focus and clocks stand still.
+    #[arg(long)]
+    ideal: bool,
     /// Seed of the emulated rig; left out: that of rig.toml.
     #[arg(long)]
     seed: Option<u64>,
@@ -130,9 +137,7 @@ struct Report<'a> {
 /// Holds the bead.
 pub fn run(args: Args) -> CommandResult {
     let mut file = RigFile::load(args.rig.as_deref())?;
-    if let Some(seed) = args.seed {
-        file.emulator.seed = seed;
-    }
+    file.emulate_as(args.seed, args.ideal)?;
     if let Some(near) = args.near {
         file.near_um = Some(near.value());
     }
@@ -145,7 +150,7 @@ pub fn run(args: Args) -> CommandResult {
     let mut prepared = connect::prepare(&args.model, &args.controller, &file)?;
     choose_solver(args.solver, &mut prepared.controller)?;
     adapt::choose(args.adapt, &mut prepared.controller);
-    let mut rig = Rig::open(file, options)?;
+    let mut rig = checked::open(file, options, args.rig.as_deref(), args.anyway)?;
     rig.fit(&mut prepared);
     let reach = args.sine.map_or(0.0, |sine| sine.amplitude.value());
     for end in [-reach, reach] {

@@ -27,6 +27,6 @@ pub use report::{
 pub use search::{PiSearch, search_pi};
 pub use spread::{SpreadRow, spread};
 pub use step::{
-    DisturbanceFigures, SetUpError, SineFigures, StepFigures, disturbance_figures, sine_figures,
+    CycleFigures, DisturbanceFigures, SetUpError, StepFigures, cycle_figures, disturbance_figures,
     step_figures,
 };

@@ -4,6 +4,7 @@ use crate::controller::{Controller, LoopConfig};
 use crate::design::plant::DesignPlant;
 use crate::error::BuildError;
 use crate::loop_io::LoopInput;
+use crate::reference::Reference;
 use crate::simulation::{RigConfig, SimulatedRig};
 use cellpos_plant::PlantError;
 use thiserror::Error;
@@ -154,43 +155,46 @@ pub fn step_figures(
     })
 }
 
-/// How a loop follows a sine that it is told of in advance as far as its law looks ahead.
+/// Figures of a periodic motion in full swing.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct SineFigures {
-    /// RMS error in full swing, um.
+pub struct CycleFigures {
+    /// Half of peak to peak of the reference, um.
+    pub amplitude_um: f64,
+    /// RMS error, um.
     pub rms_um: f64,
     /// Largest command change per tick, um.
     pub largest_move_um: f64,
 }
 
-/// Error along a sine, noise-free, through the loop's limits. It comes in over 0.2 s and is in full swing for a second or
-/// three periods before the error of a second or three periods more is taken.
+/// Error along a periodic reference, noise-free, through the loop's limits. After `from_s` the reference is in full swing for a
+/// second or three periods before the error of a second or three periods more is taken.
 ///
 /// # Errors
 /// A plant or a loop that cannot be built.
-pub fn sine_figures(
+pub fn cycle_figures(
     plant: &DesignPlant,
     config: &LoopConfig,
-    amplitude_um: f64,
+    reference: &dyn Reference,
+    from_s: f64,
     frequency_hz: f64,
-) -> Result<SineFigures, SetUpError> {
-    const FADE_S: f64 = 0.2;
-    // A sine of minutes is followed by any law; so much of it is simulated.
+) -> Result<CycleFigures, SetUpError> {
+    // A motion of minutes is followed by any law; so much of it is simulated.
     const LONGEST_S: f64 = 20.0;
     let ts = plant.sample_time_s;
     let span_s = (3.0 / frequency_hz).clamp(1.0, LONGEST_S);
     let ticks = |s: f64| (s / ts).round() as usize;
-    let wish_um = |k: usize| {
-        let t = k as f64 * ts;
-        let swing = amplitude_um * (t / FADE_S).min(1.0);
-        swing * (std::f64::consts::TAU * frequency_hz * t).sin()
-    };
-    let all = ticks(FADE_S + 2.0 * span_s);
+    let wish_um = |k: usize| reference.at_um(k as f64 * ts);
+    let all = ticks(from_s + 2.0 * span_s);
     let (y, largest_move_um) = run(plant, config, all, 0.0, wish_um)?;
-    let from = ticks(FADE_S + span_s);
+    let from = ticks(from_s + span_s);
     let squares = y.iter().enumerate().skip(from);
     let squares = squares.map(|(k, um)| (um - wish_um(k)).powi(2));
-    Ok(SineFigures {
+    let (low_um, high_um) = (from..all).map(wish_um).fold(
+        (f64::INFINITY, f64::NEG_INFINITY),
+        |(low, high), um| (low.min(um), high.max(um)),
+    );
+    Ok(CycleFigures {
+        amplitude_um: 0.5 * (high_um - low_um).max(0.0),
         rms_um: (squares.sum::<f64>() / (all - from).max(1) as f64).sqrt(),
         largest_move_um,
     })

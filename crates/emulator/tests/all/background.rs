@@ -10,7 +10,7 @@ fn empty(count: usize) -> Vec<FrameBuffer> {
         pixel_um: 0.2,
         height_px: 64,
         cell: Some(EmulatedCell::default()),
-        ..WorldConfig::default()
+        ..WorldConfig::ideal()
     };
     let buffer = |mono8| FrameBuffer::of_mono8(256, 64, mono8);
     let frames = World::empty_frames(&world, count).unwrap();

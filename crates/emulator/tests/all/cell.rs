@@ -9,7 +9,7 @@ fn config() -> WorldConfig {
         pixel_um: 0.2,
         height_px: 64,
         cell: Some(CellConfig::default()),
-        ..WorldConfig::default()
+        ..WorldConfig::ideal()
     }
 }
 
@@ -228,7 +228,7 @@ fn a_second_cell_is_drawn_whole() {
 fn a_cell_that_does_not_fit_into_the_frame_is_refused_by_name() {
     let low = WorldConfig {
         cell: Some(CellConfig::default()),
-        ..WorldConfig::default()
+        ..WorldConfig::ideal()
     };
     let error = low.validate().unwrap_err().to_string();
     assert!(

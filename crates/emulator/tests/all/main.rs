@@ -2,6 +2,7 @@
 
 mod background;
 mod cell;
+mod imperfections;
 mod line;
 mod rig_in_a_box;
 mod scene;

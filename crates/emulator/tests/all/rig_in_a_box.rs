@@ -64,7 +64,7 @@ fn quiet(faults: Faults) -> WorldConfig {
         diffusion_um2_per_s: 0.0,
         drift_um_per_s: 0.0,
         faults,
-        ..WorldConfig::default()
+        ..WorldConfig::ideal()
     }
 }
 
@@ -96,7 +96,7 @@ fn the_same_seed_and_commands_give_the_same_bits_and_stops_in_between_leave_the_
         let mut bench = Bench::new(&WorldConfig {
             faults,
             exposure_ms: 0.0,
-            ..WorldConfig::default()
+            ..WorldConfig::ideal()
         });
         let mut positions = Vec::new();
         for k in 1..500 {

@@ -10,7 +10,7 @@ pub(crate) fn quiet() -> WorldConfig {
     WorldConfig {
         diffusion_um2_per_s: 0.0,
         drift_um_per_s: 0.0,
-        ..WorldConfig::default()
+        ..WorldConfig::ideal()
     }
 }
 
@@ -39,7 +39,7 @@ pub(crate) fn ids(fixes: &[PositionFix]) -> Vec<u64> {
 fn the_bead_diffuses_with_a_variance_of_2_d_t_along_and_stays_confined_across() {
     let config = WorldConfig {
         drift_um_per_s: 0.0,
-        ..WorldConfig::default()
+        ..WorldConfig::ideal()
     };
     let mut world = world(&config);
     let (mut sum, mut n, mut widest) = (0.0, 0.0, 0.0_f64);
@@ -177,7 +177,7 @@ fn vision_finds_the_bead_where_it_is_with_the_noise_that_positions_are_given() {
         diffusion_um2_per_s: 0.33,
         drift_um_per_s: 30.0,
         start_um: -8.0,
-        ..WorldConfig::default()
+        ..WorldConfig::ideal()
     };
     let mut world = world(&config);
     let mut localiser = localiser();
@@ -233,7 +233,7 @@ fn positions_scatter_by_the_localisation_noise_and_say_so() {
 #[test]
 fn pictures_and_positions_come_from_the_same_true_path() {
     let run = |pictures: bool| {
-        let mut world = world(&WorldConfig::default());
+        let mut world = world(&WorldConfig::ideal());
         let mut truth = Vec::new();
         let mut pixels = Vec::new();
         for k in 1..=200_i64 {
@@ -255,7 +255,7 @@ fn the_same_seed_gives_the_same_pixels_and_another_seed_others() {
     let run = |seed| {
         let mut world = world(&WorldConfig {
             seed,
-            ..WorldConfig::default()
+            ..WorldConfig::ideal()
         });
         let mut pixels = Vec::new();
         world.advance_to(50 * MS, 20.0);
@@ -296,7 +296,7 @@ fn the_led_lights_up_the_exposures_after_it() {
 
 #[test]
 fn values_that_cannot_be_are_refused_by_the_name_of_their_key() {
-    let base = WorldConfig::default();
+    let base = WorldConfig::ideal();
     for (config, key) in [
         (
             WorldConfig {
@@ -349,7 +349,7 @@ fn a_table_reads_back_as_it_was_written_and_an_unknown_key_is_refused() {
     let config = WorldConfig {
         localisation_um: Some(0.03),
         faults: Faults::default().with(FaultKind::LinkLoss, 2.0, Some(0.5)),
-        ..WorldConfig::default()
+        ..WorldConfig::ideal()
     };
     let text = toml::to_string(&config).unwrap();
     assert_eq!(toml::from_str::<WorldConfig>(&text).unwrap(), config);

@@ -218,7 +218,7 @@ fn a_frozen_picture_is_the_same_to_the_bit_under_new_numbers_while_the_bead_goes
     let config = WorldConfig {
         drift_um_per_s: 10.0,
         faults: Faults::default().with(FaultKind::FrozenPicture, 0.05, Some(0.05)),
-        ..WorldConfig::default()
+        ..WorldConfig::ideal()
     };
     let mut world = world(&config);
     world.advance_to(130 * MS, 20.0);

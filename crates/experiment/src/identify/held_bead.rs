@@ -4,6 +4,7 @@
 //! taken, the controller steps, the command goes to the board. Afterwards the board's LED is switched at dithered
 //! instants in front of the same camera for the delay test.
 
+use super::led::{DelayTest, LitFrames};
 use cellpos_control::{
     Controller, ControllerConfig, EstimatorConfig, Limits, LoopConfig, LoopInput, LoopModel,
     Measurement as Fix, Mode, Pi,
@@ -13,7 +14,7 @@ use cellpos_emulator::BoardConfig;
 use cellpos_emulator::EmulatedPort;
 use cellpos_emulator::EmulatedRig;
 use cellpos_emulator::WorldConfig;
-use cellpos_ident::delay::{DelayEstimate, SeenEdge, delay_from_edges, dithered_edges, find_edges};
+use cellpos_ident::delay::dithered_edges;
 use cellpos_ident::experiment::{Bench, Row};
 use cellpos_ident::sampled::{Hold, Sampling};
 use cellpos_plant::{Complex, DiscretePlant, Hertz, Model, Seconds};
@@ -98,6 +99,8 @@ pub struct HeldBead {
     neutral_um: f64,
     /// Sum and number of the variances that vision stated, um^2.
     variance_um2: (f64, u64),
+    /// Sum and number of the ages of frames at their ticks, ns.
+    ages: (i64, i64),
 }
 
 impl HeldBead {
@@ -105,6 +108,15 @@ impl HeldBead {
     pub fn fix_noise_um(&self) -> Option<f64> {
         let (sum, count) = self.variance_um2;
         (count > 0).then(|| (sum / count as f64).max(0.0).sqrt())
+    }
+
+    /// Mean time from the middle of an exposure to the tick that used it, s.
+    pub fn age_s(&self) -> f64 {
+        let (sum_ns, count) = self.ages;
+        match count {
+            0 => self.setup.world.latency_ms * 1e-3,
+            _ => 1e-9 * sum_ns as f64 / count as f64,
+        }
     }
 
     /// Switches the rig on, arms the board and lets the loop settle for half a second.
@@ -178,6 +190,7 @@ impl HeldBead {
             neutral_um,
             setup,
             variance_um2: (0.0, 0),
+            ages: (0, 0),
         };
         for _ in 0..500 {
             bead.tick(0.0)?;
@@ -195,6 +208,22 @@ impl HeldBead {
             newest = Some(measurement);
         }
         Ok(newest)
+    }
+
+    /// Waits for the next frame, at most a quarter of a period longer than it should take: a tick starts with the arrival of a
+    /// frame, and the camera's clock is its own. The newest measurement then.
+    fn arrival(&mut self) -> Result<Option<Measurement>, Failure> {
+        let latest_ns = self.next_ns + self.period_ns / 4;
+        let first = match &mut self.source {
+            Some(source) => source.next(latest_ns).map_err(Failure::failed)?,
+            None => None,
+        };
+        self.next_ns = match &first {
+            Some(measurement) => measurement.ready_ns.max(self.next_ns - self.period_ns / 4),
+            None => latest_ns,
+        };
+        self.setup.clock.sleep_until_ns(self.next_ns);
+        Ok(self.newest(self.next_ns)?.or(first))
     }
 
     fn send(&mut self, command_um: f64, neutral_um: f64) -> Result<(), Failure> {
@@ -216,7 +245,7 @@ impl HeldBead {
         let sent_s = dithered_edges(edges, 0.011, period_s, first_s, seed);
         let end_ns = self.next_ns + ((edges as f64 * 0.011 + 0.06) * 1e9) as i64;
         let mut buffer = FrameBuffer::default();
-        let (mut frame_s, mut grey) = (Vec::new(), Vec::new());
+        let mut seen = LitFrames::default();
         let mut on = false;
         let mut switched_s = Vec::with_capacity(edges);
         let mut waiting = sent_s.iter().map(|s| (s * 1e9).round() as i64).peekable();
@@ -236,21 +265,19 @@ impl HeldBead {
                 .next_frame(&mut buffer, self.next_ns)
                 .map_err(Failure::failed)?
             {
-                frame_s.push(stamp.arrival_ns as f64 * 1e-9);
-                grey.push(mean_grey(&buffer));
+                seen.push(&stamp, &buffer);
             }
             self.send(self.neutral_um, self.neutral_um)?;
             self.next_ns += self.period_ns;
         }
-        DelayTest::evaluate(switched_s, frame_s, grey)
+        DelayTest::evaluate(switched_s, seen)
     }
 
     /// Rests at neutral until a bead has been seen for 100 ms on end, at most for 10 s, then holds it for half a second.
     pub fn wait_for_bead(&mut self) -> Result<(), Failure> {
         let mut seen = 0;
         for _ in 0..10_000 {
-            self.setup.clock.sleep_until_ns(self.next_ns);
-            let good = self.newest(self.next_ns)?.is_some_and(|m| m.is_usable());
+            let good = self.arrival()?.is_some_and(|m| m.is_usable());
             self.send(self.neutral_um, self.neutral_um)?;
             self.next_ns += self.period_ns;
             seen = if good { seen + 1 } else { 0 };
@@ -287,9 +314,8 @@ impl Bench for HeldBead {
     type Error = Failure;
 
     fn tick(&mut self, excitation_um: f64) -> Result<Row, Failure> {
+        let newest = self.arrival()?;
         let now_ns = self.next_ns;
-        self.setup.clock.sleep_until_ns(now_ns);
-        let newest = self.newest(now_ns)?;
         let good = newest.filter(Measurement::is_usable);
         if let Some(m) = good.filter(|m| m.variance_um2.is_finite()) {
             self.variance_um2.0 += m.variance_um2;
@@ -320,53 +346,13 @@ impl Bench for HeldBead {
         self.next_ns += self.period_ns;
         // A row is a position of the nominal age: an older one belongs to an earlier row and is left out.
         let on_time = good.filter(|_| age_samples == 0);
+        if on_time.is_some() {
+            self.ages.0 += age_ns;
+            self.ages.1 += 1;
+        }
         Ok(Row {
             command_um: out.command_um,
             bead_um: on_time.map(|m| m.position_um),
         })
-    }
-}
-
-/// A delay test with what it saw.
-pub struct DelayTest {
-    /// The delay.
-    pub estimate: DelayEstimate,
-    /// Edges seen.
-    pub seen: Vec<SeenEdge>,
-    /// When the LED was switched, s of the rig's clock.
-    pub switched_s: Vec<f64>,
-    /// When frames arrived, s.
-    pub frame_s: Vec<f64>,
-    /// Their mean grey levels.
-    pub grey: Vec<f64>,
-}
-
-impl DelayTest {
-    /// The delay between the switching times of the LED and what the frames saw.
-    pub fn evaluate(
-        switched_s: Vec<f64>,
-        frame_s: Vec<f64>,
-        grey: Vec<f64>,
-    ) -> Result<Self, Failure> {
-        let seen = find_edges(&switched_s, &frame_s, &grey).map_err(Failure::failed)?;
-        let estimate = delay_from_edges(&seen).map_err(Failure::failed)?;
-        Ok(Self {
-            estimate,
-            seen,
-            switched_s,
-            frame_s,
-            grey,
-        })
-    }
-}
-
-/// Mean grey level of a frame.
-pub fn mean_grey(buffer: &FrameBuffer) -> f64 {
-    if buffer.bits > 8 {
-        let sum: f64 = buffer.mono16.iter().map(|&p| f64::from(p)).sum();
-        sum / buffer.mono16.len().max(1) as f64
-    } else {
-        let sum: f64 = buffer.mono8.iter().map(|&p| f64::from(p)).sum();
-        sum / buffer.mono8.len().max(1) as f64
     }
 }

@@ -1,6 +1,7 @@
 //! From arguments to a finished identification: plan, run, delay test, summary.
 
 pub mod held_bead;
+pub mod led;
 mod partial;
 
 use crate::on_rig::{Acquired, Listener, OnRig, Trouble};
@@ -12,8 +13,9 @@ use cellpos_plant::Hertz;
 use cellpos_runtime::SafeReason;
 use cellpos_runtime::life::Refusal;
 use cellpos_session::view::Pages;
-use cellpos_session::{Ended, Failure};
-use held_bead::{DelayTest, HeldBead, Setup};
+use cellpos_session::{Ended, Failure, setup};
+use held_bead::{HeldBead, Setup};
+use led::DelayTest;
 use std::path::PathBuf;
 
 /// How to excite.
@@ -67,8 +69,8 @@ pub struct Done {
     pub led: Option<DelayTest>,
     /// PZT displacement at rest, um.
     pub neutral_um: f64,
-    /// Mean time from the arrival of a frame to its tick, s; contained in the delay.
-    pub wait_s: f64,
+    /// Mean time from the middle of an exposure to the tick that used it, s: the camera's part of the delay.
+    pub age_s: f64,
 }
 
 /// Runs a job; `progress` hears ticks done and ticks in all.
@@ -93,10 +95,9 @@ pub fn run_shown(
         records,
         mut led,
         neutral_um,
-        wait_s,
-        path_s,
+        age_s,
         fix_noise_um,
-        warnings,
+        mut warnings,
     } = match &job.rig {
         Some(rig) => on_rig(job, rig, &plan, records, &mut heard, pages)?,
         None => held_bead(job, &plan, records, &mut heard)?,
@@ -105,22 +106,18 @@ pub fn run_shown(
         .analyse(&records, &Settings::default())
         .map_err(Failure::failed)?;
     progress(total, total);
-    // The LED test ends at the frame's arrival, a row of the record at its tick.
+    // The LED test ends at the exposure, a row of the record at its tick.
     if let Some(test) = &mut led {
-        test.estimate.delay_s += wait_s;
-        test.estimate.ci95_s = test.estimate.ci95_s.map(|end| end + wait_s);
+        warnings.extend(test.vague());
+        warnings.extend(job.rig.as_ref().and_then(|rig| test.stamps_off(&rig.file)));
+        test.up_to_the_tick(age_s);
     }
     let mut result = conclude(job, measured, led.as_ref())?;
     result.stated_noise_um = fix_noise_um;
     result.warnings.extend(warnings);
-    if let (Some(rig), Some(path_s)) = (&job.rig, path_s) {
-        let (found_ms, configured_ms) = (path_s * 1e3, rig.file.timing.camera_delay_ms);
-        if (found_ms - configured_ms).abs() > 1e-6 {
-            result.warnings.push(format!(
-                "frames come {found_ms:.2} ms after the middle of their exposure, rig.toml says {configured_ms} ms: write \
-                 [timing] camera_delay_ms = {found_ms:.2} and design the controller again"
-            ));
-        }
+    if let Some(rig) = &job.rig {
+        let advice = setup::camera_delay_advice(age_s * 1e3, &rig.file.timing);
+        result.warnings.extend(advice);
     }
     Ok(Done {
         plan,
@@ -128,7 +125,7 @@ pub fn run_shown(
         result,
         led,
         neutral_um,
-        wait_s,
+        age_s,
     })
 }
 
@@ -152,8 +149,7 @@ struct Raw {
     records: Vec<RecordedSegment>,
     led: Option<DelayTest>,
     neutral_um: f64,
-    wait_s: f64,
-    path_s: Option<f64>,
+    age_s: f64,
     fix_noise_um: Option<f64>,
     warnings: Vec<String>,
 }
@@ -175,15 +171,13 @@ fn held_bead(
         None
     };
     let neutral_um = bead.neutral_um();
-    let fix_noise_um = bead.fix_noise_um();
+    let (fix_noise_um, age_s) = (bead.fix_noise_um(), bead.age_s());
     bead.close()?;
     Ok(Raw {
         records,
         led,
         neutral_um,
-        // Ticks fall on the arrivals of frames here.
-        wait_s: 0.0,
-        path_s: None,
+        age_s,
         fix_noise_um,
         warnings: Vec::new(),
     })
@@ -204,7 +198,8 @@ fn on_rig(
     let mut spoilt = vec![0; plan.segments.len()];
     let mut warnings = Vec::new();
     let mut had_bead = false;
-    let (mut neutral_um, mut wait_s, mut path_s) = (rig.file.first_neutral_um, 0.0, None);
+    let mut neutral_um = rig.file.first_neutral_um;
+    let mut age_s = rig.file.timing.camera_delay_ms * 1e-3;
     let mut fix_noise_um = None;
     loop {
         let todo = missing(plan, &records, &spoilt);
@@ -229,8 +224,8 @@ fn on_rig(
         } else {
             0
         };
-        (neutral_um, wait_s) = (acquired.neutral_um, acquired.wait_s);
-        path_s = Some(acquired.path_s);
+        neutral_um = acquired.neutral_um;
+        age_s = acquired.age_s.unwrap_or(age_s);
         fix_noise_um = acquired.fix_noise_um.or(fix_noise_um);
         had_bead |= !acquired.rows.0.is_empty();
         let run_through = matches!(acquired.trouble, Some(Trouble::Spoilt { .. }));
@@ -293,8 +288,7 @@ fn on_rig(
         records,
         led,
         neutral_um,
-        wait_s,
-        path_s,
+        age_s,
         fix_noise_um,
         warnings,
     })

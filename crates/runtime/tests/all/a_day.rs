@@ -87,7 +87,8 @@ fn held(ticks: u64) {
         (0, 0, 0)
     );
     assert!(
-        (summary.duration_s - ticks as f64 * 1e-3).abs() < 1e-6,
+        // Ticks start with the arrivals of frames, which jitter, and the camera's clock is not the loop's.
+        (summary.duration_s - ticks as f64 * 1e-3).abs() < 2e-3 + 20e-6 * summary.duration_s,
         "{summary:?}"
     );
     let sink = finished.sink;

@@ -65,10 +65,7 @@ impl RigFile {
         camera: C,
         clock: &Clock,
     ) -> Result<Box<dyn PositionSource>, Failure> {
-        let emulated = || {
-            let middle_px = 0.5 * f64::from(self.emulator.width_px.saturating_sub(1));
-            Calibration::along_rows(self.emulator.pixel_um, middle_px, 1.0)
-        };
+        let emulated = || EmulatedRig::calibration_of(&self.emulator);
         let calibration = match self.camera {
             CameraConfig::Emulated {} => self.calibration.unwrap_or_else(emulated),
             _ => self.real_calibration()?,
@@ -181,6 +178,7 @@ impl RigFile {
                 region,
                 exposure_us,
                 bits,
+                latency_ms,
             } => {
                 use cellpos_drivers::sources::industrial::{IndustrialCamera, IndustrialSettings};
                 let settings = IndustrialSettings {
@@ -189,7 +187,7 @@ impl RigFile {
                     rate_hz: *rate_hz,
                     exposure_us: *exposure_us,
                     bits: *bits,
-                    latency_ms: self.timing.camera_delay_ms,
+                    latency_ms: latency_ms.unwrap_or(CameraConfig::LATENCY_MS),
                     buffers: 50,
                 };
                 Ok(Box::new(

@@ -58,6 +58,9 @@ pub struct Args {
     /// Most further experiments where the first leaves names open.
     #[arg(long, default_value_t = 1)]
     rounds: u8,
+    /// Without the imperfections of a real rig (emulated rig): flow, light, focus and clocks stand still.
+    #[arg(long)]
+    ideal: bool,
     /// Seed of the emulated rig and of the excitations [default: that of rig.toml].
     #[arg(long)]
     seed: Option<u64>,
@@ -90,9 +93,7 @@ pub fn run(args: Args) -> CommandResult {
     output::ready(args.out.iter().chain(&args.report))?;
     let given = Model::load(&args.model).map_err(Failure::input)?;
     let mut file = RigFile::load(args.rig.as_deref())?;
-    if let Some(seed) = args.seed {
-        file.emulator.seed = seed;
-    }
+    file.emulate_as(args.seed, args.ideal)?;
     if let Some(hidden) = &args.hidden {
         if !file.is_emulated() {
             return Err(Failure::bad_input(

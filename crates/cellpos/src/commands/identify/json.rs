@@ -86,7 +86,7 @@ pub fn identification(done: &Done, job: &Job, model: &Path, report: &Path) -> Va
         "delay": {
             "led_ms": result.led.map(|l| l.delay_s * 1e3),
             "led_ci95_ms": result.led.map(|l| ends([l.ci95_s[0] * 1e3, l.ci95_s[1] * 1e3])),
-            "arrival_to_tick_ms": done.wait_s * 1e3,
+            "exposure_to_tick_ms": done.age_s * 1e3,
             "led_edges": result.led.map(|l| l.edges),
             "phase_slope_ms": result.judged.phase_delay_s * 1e3,
             "phase_slope_ci95_ms": ends([phase[0] * 1e3, phase[1] * 1e3]),

@@ -91,6 +91,9 @@ pub struct Args {
     /// Plant that amplitudes and the holding loop are made for, and that of the emulated rig: `eq6` or a model.toml.
     #[arg(long, default_value = "eq6")]
     model: String,
+    /// Without the imperfections of a real rig (emulated rig): flow, light, focus and clocks stand still.
+    #[arg(long)]
+    ideal: bool,
     /// Seed of the emulated rig, the excitation and the bootstrap [default: that of rig.toml, else 1].
     #[arg(long)]
     seed: Option<u64>,
@@ -223,9 +226,7 @@ fn on_rig(args: &Args, model: &Model) -> Result<Option<OnRig>, Failure> {
         return Ok(None);
     };
     let mut file = RigFile::load(Some(path))?;
-    if let Some(seed) = args.seed {
-        file.emulator.seed = seed;
-    }
+    file.emulate_as(args.seed, args.ideal)?;
     let frames = match args.frames {
         Switch::On => Frames::On,
         Switch::Off => Frames::Off,
@@ -259,6 +260,7 @@ fn job(args: &Args) -> Result<identification::Job, Failure> {
         None => Setup {
             world: WorldConfig {
                 model: args.model.clone(),
+                ideal: args.ideal,
                 ..WorldConfig::default()
             },
             model,

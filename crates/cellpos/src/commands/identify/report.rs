@@ -192,7 +192,7 @@ pub fn traces(done: &Done) -> Figure {
 pub fn delay_test(
     name: &str,
     caption: &str,
-    led: &cellpos_experiment::identify::held_bead::DelayTest,
+    led: &cellpos_experiment::identify::led::DelayTest,
 ) -> Figure {
     let first = led.switched_s.first().copied().unwrap_or(0.0);
     let until = led.switched_s.get(4).copied().unwrap_or(first) + 0.006;

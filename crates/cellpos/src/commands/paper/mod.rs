@@ -56,7 +56,8 @@ fn setup(seed: u64, drift_um_per_s: f64, start_um: f64, closed_loop: bool) -> Se
             seed,
             drift_um_per_s,
             start_um,
-            ..WorldConfig::default()
+            // The paper's figures are those of its model, not of a rig that wanders.
+            ..WorldConfig::ideal()
         },
         model: Model::eq6(),
         frames: true,

@@ -1,0 +1,62 @@
+//! A rig that is opened for a run, with all that `cellpos rig check` has to say of it.
+
+use crate::outcome::Failure;
+use cellpos_session::{Options, Rig, RigFile};
+use cellpos_workbench::check::{self, Finding, Weight};
+use std::path::Path;
+
+/// Opens a rig whose file was read from `path` (none: the emulated rig as it is). What does not fit together in the file is said before
+/// a device is opened, what its frames say against it before anything moves; an error ends it, unless `anyway`.
+///
+/// # Errors
+/// As [`Rig::open`], or a finding that is an error.
+pub fn open(
+    file: RigFile,
+    options: Options,
+    path: Option<&Path>,
+    anyway: bool,
+) -> Result<Rig, Failure> {
+    /// Some hundred frames.
+    const LOOK_NS: i64 = 300_000_000;
+    let Some(path) = path else {
+        return Rig::open(file, options);
+    };
+    before_a_run(&check::findings(&file, path), path, anyway)?;
+    let mut rig = Rig::open(file, options)?;
+    // An emulated camera is what its table says.
+    if !rig.file().is_emulated() {
+        let seen = rig.look(LOOK_NS)?;
+        before_a_run(&check::of_frames(rig.file(), &seen, path), path, anyway)?;
+    }
+    Ok(rig)
+}
+
+/// What a run asks before anything moves: warnings are said, an error ends it unless `anyway`.
+fn before_a_run(findings: &[Finding], path: &Path, anyway: bool) -> Result<(), Failure> {
+    let place = |finding: &Finding| {
+        let line = finding
+            .line
+            .map_or(String::new(), |line| format!(":{line}"));
+        format!("{}{line}: {}", path.display(), finding.what)
+    };
+    let errors: Vec<&Finding> = findings
+        .iter()
+        .filter(|f| f.weight == Weight::Error)
+        .collect();
+    for finding in findings
+        .iter()
+        .filter(|f| anyway || f.weight == Weight::Warning)
+    {
+        tracing::warn!("{}; {}", place(finding), finding.remedy);
+    }
+    match errors.first() {
+        Some(first) if !anyway => {
+            let all: Vec<String> = errors.iter().map(|finding| place(finding)).collect();
+            Err(Failure::bad_input(
+                all.join("\n"),
+                format!("{}; --anyway runs all the same", first.remedy),
+            ))
+        }
+        _ => Ok(()),
+    }
+}

@@ -1,0 +1,70 @@
+//! Whether the loop can follow the motions of a script, before anything moves.
+
+use crate::cyclic::Motion;
+use crate::outcome::Failure;
+use cellpos_script::{Check, PeriodicReference, Plan, Script};
+use cellpos_session::setup::{self, Prepared};
+use cellpos_session::{Rig, RigFile};
+
+/// Most motions whose error is predicted: each takes a simulation for each controller that could do better.
+const MOST_MOTIONS: usize = 16;
+
+/// Refuses a wave that is too fast to be told from a slower one.
+///
+/// # Errors
+/// A frequency from half the loop's rate on, with its line.
+pub(super) fn below_nyquist(script: &Script, check: &Check, file: &RigFile) -> Result<(), Failure> {
+    let rate_hz = 1e6 / file.timing.period_us;
+    match check
+        .waves
+        .iter()
+        .find(|wave| wave.frequency_hz >= 0.5 * rate_hz)
+    {
+        Some(wave) => Err(Failure::bad_input(
+            format!(
+                "{}:{}: a wave of {} Hz: at {rate_hz:.0} ticks a second no motion from {:.0} Hz on can be told from a slower one",
+                script.file,
+                wave.line,
+                wave.frequency_hz,
+                0.5 * rate_hz
+            ),
+            "choose a lower frequency, or a faster loop and camera (period_us in [timing])",
+        )),
+        None => Ok(()),
+    }
+}
+
+/// What to say of each periodic motion that the loop is predicted to miss by more than a tenth of its amplitude.
+///
+/// # Errors
+/// A model or a controller of which no loop can be made.
+pub(super) fn warnings(
+    plan: &Plan,
+    prepared: &Prepared,
+    rig: &Rig,
+) -> Result<Vec<String>, Failure> {
+    let better = |name: &'static str| {
+        let model = prepared.model.clone();
+        let controller = setup::controller(name, &model, &rig.file().timing)?;
+        let mut other = Prepared { model, controller };
+        rig.fit(&mut other);
+        Ok(other)
+    };
+    let mut warnings = Vec::new();
+    for (number, motion) in plan.periodic().iter().enumerate().take(MOST_MOTIONS) {
+        let Some(reference) = plan.periodic_reference(number) else {
+            continue;
+        };
+        let motion = Motion {
+            name: motion.name(),
+            reference: &reference,
+            from_s: PeriodicReference::FADE_S,
+            frequency_hz: motion.frequency_hz,
+        };
+        warnings.extend(motion.warning(prepared, rig.file(), better)?);
+    }
+    for warning in &warnings {
+        tracing::warn!("{warning}");
+    }
+    Ok(warnings)
+}
