@@ -1,6 +1,7 @@
 //! What a run folder says of a run, and what the user should know of one that is over.
 
 use crate::Failure;
+use crate::ended::Ended;
 pub use crate::failure::describe;
 pub use crate::fit::{prepare, stated_exposure_s};
 use crate::provenance;
@@ -158,6 +159,9 @@ pub fn table(value: &impl Serialize) -> Result<toml::Table, Failure> {
     toml::Table::try_from(value).map_err(Failure::failed)
 }
 
+/// Key of the summary in `run.toml` that says how the run ended, in sentences: an [`Ended`].
+pub const ENDED: &str = "ended";
+
 /// A run folder that is ended.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Kept {
@@ -170,13 +174,16 @@ pub struct Kept {
 /// Ends a run folder; what is not on the disk is counted in the summary and said in the warnings.
 pub fn finish(
     mut writer: RunWriter,
-    outcome: &str,
+    (outcome, ended): (&str, &Ended),
     summary: &mut Summary,
     conditions: &Conditions,
     warnings: &mut Vec<String>,
 ) -> Kept {
     let mut end = RunEnd::new(outcome);
     end.summary = toml::Table::try_from(&*summary).unwrap_or_default();
+    if let Ok(ended) = toml::Value::try_from(ended) {
+        end.summary.insert(ENDED.to_string(), ended);
+    }
     writer.add_conditions(provenance::granted(conditions));
     // Those that never came to the writer; it adds its own.
     end.rows_lost = summary.records_lost;

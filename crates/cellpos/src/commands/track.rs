@@ -170,7 +170,8 @@ pub fn run(args: Args) -> CommandResult {
     let recording = Recording::new(
         writer(&args, &rig, &setup)?,
         (!args.json && !args.view.tui() && !crate::output::settings().quiet).then_some(line),
-    );
+    )
+    .steered(steered);
     let end = EndRule {
         ticks,
         ..EndRule::default()
@@ -203,8 +204,9 @@ pub fn run(args: Args) -> CommandResult {
             conclude(&args, &setup, finished, predicted, view)
         }
         Err(not_armed) => {
+            let sink = not_armed.sink.refused(&not_armed.failure);
             drop(view);
-            if let Some(writer) = not_armed.sink.into_sink().into_parts().0.into_writer() {
+            if let Some(writer) = sink.into_parts().0.into_writer() {
                 connect::not_armed(writer, &not_armed.failure);
             }
             let reason = not_armed.failure.to_string();
@@ -342,13 +344,19 @@ fn conclude(
     } else {
         summary.state.name()
     };
-    let (sink, kept_clips) = sink.into_inner(&summary, &ended.seen).into_parts();
+    let (sink, kept_clips) = sink.into_inner(&summary, &ended).into_parts();
     // The terminal is given back, and the page is over, before anything is said.
     drop(view);
     warnings.extend(clips::warnings(kept_clips));
-    let kept = sink
-        .into_writer()
-        .map(|writer| connect::finish(writer, outcome, &mut summary, &conditions, &mut warnings));
+    let kept = sink.into_writer().map(|writer| {
+        connect::finish(
+            writer,
+            (outcome, &ended),
+            &mut summary,
+            &conditions,
+            &mut warnings,
+        )
+    });
     let whole = kept.as_ref().is_none_or(|kept| kept.whole);
     let run = kept.map(|kept| kept.run);
     if let (Some(run), Some(table)) = (&run, &learned)
