@@ -263,7 +263,9 @@ pub fn delay_warning(file: &RigFile, summary: &Summary) -> Option<String> {
     let timing = &file.timing;
     let period_ms = timing.period_us * 1e-3;
     let found_ms = summary.loop_delay_ms - 0.5 * period_ms;
-    ((found_ms - timing.camera_delay_ms).abs() > WORTH_SAYING * period_ms).then(|| {
+    // Without a frame that was used nothing is known of their age: the delay is that of the hold alone.
+    let used = summary.exposure_to_command_us.max > 0.0;
+    (used && (found_ms - timing.camera_delay_ms).abs() > WORTH_SAYING * period_ms).then(|| {
         format!(
             "the frames were {found_ms:.2} ms old when they were used, camera_delay_ms says {} ms: correct it in rig.toml",
             timing.camera_delay_ms
