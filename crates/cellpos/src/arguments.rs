@@ -44,16 +44,45 @@ fn latest(runs: &Path, name: Option<&str>) -> Result<PathBuf, String> {
     };
     let entries = std::fs::read_dir(runs)
         .map_err(|error| format!("there is no folder {} here: {error}", runs.display()))?;
-    entries
-        .flatten()
-        .map(|entry| entry.path())
-        .filter_map(|folder| Some((wanted(&folder)?, folder)))
-        .max()
-        .map(|(_, folder)| folder)
-        .ok_or_else(|| match name {
-            Some(name) => format!("{} holds no run named {name}", runs.display()),
-            None => format!("{} holds no run", runs.display()),
-        })
+    let folders: Vec<PathBuf> = entries.flatten().map(|entry| entry.path()).collect();
+    let newest = (folders.iter())
+        .filter_map(|folder| Some((wanted(folder)?, folder)))
+        .max();
+    let shown = runs.display();
+    match (newest, name) {
+        (Some((_, folder)), _) => Ok(folder.clone()),
+        (None, None) => Err(format!("{shown} holds no run")),
+        (None, Some(name)) => Err(format!(
+            "{shown} holds no run named {name}{}",
+            what_there_is(&folders)
+        )),
+    }
+}
+
+/// The names of the runs that there are, newest first.
+fn what_there_is(folders: &[PathBuf]) -> String {
+    const MOST: usize = 8;
+    let mut names: Vec<&str> = (folders.iter())
+        .filter(|folder| folder.join(cellpos_record::RUN_TOML).exists())
+        .filter_map(|folder| folder.file_name()?.to_str())
+        .collect();
+    names.sort_unstable_by(|one, other| other.cmp(one));
+    let mut known: Vec<&str> = Vec::new();
+    for name in names {
+        let Some((_, name)) = name.split_once('-') else {
+            continue;
+        };
+        if !known.contains(&name) {
+            known.push(name);
+        }
+    }
+    let more = known.len().saturating_sub(MOST);
+    known.truncate(MOST);
+    match (known.is_empty(), more) {
+        (true, _) => ", and no other".to_string(),
+        (false, 0) => format!("; there are {}", known.join(", ")),
+        (false, more) => format!("; there are {} and {more} older names", known.join(", ")),
+    }
 }
 
 /// A time as a program waits it. Longer than thirty years is thirty years: no clock counts on for ever.
@@ -103,6 +132,21 @@ where
     } else {
         Err("it must be above zero, for example 10s for a time".to_owned())
     }
+}
+
+/// Reads the delay of a loop: a few milliseconds, so that a number without a unit is taken for a slip of those.
+///
+/// # Errors
+/// Says what would be right.
+pub fn loop_delay(text: &str) -> Result<Seconds, String> {
+    let bare = text.trim().parse::<f64>().is_ok_and(f64::is_finite);
+    if bare {
+        let number = text.trim();
+        return Err(format!(
+            "a delay needs a unit: write {number}ms for milliseconds (us, ms, s)"
+        ));
+    }
+    positive(text)
 }
 
 /// The words of a command line, with each value that begins with a minus and a digit joined to the option before it
@@ -163,6 +207,9 @@ mod tests {
                 .unwrap_err()
                 .contains("unit")
         );
+        assert!(loop_delay("2.5").unwrap_err().contains("2.5ms"));
+        assert_eq!(loop_delay("2.5ms"), Ok(cellpos_units::Seconds(0.0025)));
+        assert!(loop_delay("-1ms").is_err() && loop_delay("ms").is_err());
         assert_eq!(positive("3s"), Ok(cellpos_units::Seconds(3.0)));
         assert_eq!(span(Seconds(0.5)), Duration::from_millis(500));
         assert_eq!(span(Seconds(1e30)).as_secs(), 1_000_000_000);
@@ -195,7 +242,12 @@ mod tests {
             found(Some("sine-fast")).unwrap(),
             "20261121T120000Z-sine-fast"
         );
-        assert!(found(Some("night")).unwrap_err().contains("night"));
+        let error = found(Some("night")).unwrap_err();
+        assert!(
+            error.contains("night")
+                && error.ends_with("there are sine-fast, hold-2, hold-10, hold"),
+            "{error}"
+        );
         assert!(latest(Path::new("/nowhere"), None).is_err());
     }
 }

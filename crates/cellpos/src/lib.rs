@@ -27,6 +27,10 @@ use tracing_subscriber::prelude::*;
 
 pub use outcome::{CommandResult, Failure, Outcome};
 
+/// Heading of the options that every command has; they come last.
+const EVERYWHERE: &str = "Options of every command";
+const LAST: usize = 1000;
+
 /// Closed-loop positioning of a cell or bead in a PDMS microchannel at 1 kHz.
 #[derive(Debug, Parser)]
 #[command(
@@ -37,13 +41,13 @@ pub use outcome::{CommandResult, Failure, Outcome};
 )]
 struct Cli {
     /// Log more on standard error; twice: more still.
-    #[arg(long, global = true, action = clap::ArgAction::Count, conflicts_with = "quiet")]
+    #[arg(long, global = true, action = clap::ArgAction::Count, conflicts_with = "quiet", help_heading = EVERYWHERE, display_order = LAST)]
     verbose: u8,
     /// Log errors alone, and show no progress.
-    #[arg(long, global = true)]
+    #[arg(long, global = true, help_heading = EVERYWHERE, display_order = LAST)]
     quiet: bool,
     /// Write over files that are there already.
-    #[arg(long, global = true)]
+    #[arg(long, global = true, help_heading = EVERYWHERE, display_order = LAST)]
     force: bool,
     #[command(subcommand)]
     command: commands::Command,
@@ -65,7 +69,12 @@ fn log_filter(verbose: u8, quiet: bool) -> Targets {
 
 /// The program's arguments, for completions and manual pages too.
 fn command_line() -> clap::Command {
-    Cli::command()
+    let command = Cli::command();
+    let groups = commands::groups(&command);
+    // The groups take the place of clap's one long list.
+    command.help_template(format!(
+        "{{about-with-newline}}\n{{usage-heading}} {{usage}}\n\n{groups}\n{{options}}{{after-help}}"
+    ))
 }
 
 /// The parsed command line, with the name of its command.

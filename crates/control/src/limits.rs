@@ -56,9 +56,17 @@ impl Limits {
             "um",
             self.low_um,
             self.low_um.abs() <= 1e6,
-            "finite",
+            "at least -1e6 um: the range of the PZT begins at 0 or a few um below",
         )?;
-        let high_ok = self.high_um > self.low_um && self.high_um.abs() <= 1e6;
+        let in_reach = self.high_um.abs() <= 1e6;
+        check(
+            "high_um",
+            "um",
+            self.high_um,
+            in_reach,
+            "at most 1e6 um: the range of the PZT, some 40 um",
+        )?;
+        let high_ok = self.high_um > self.low_um;
         check("high_um", "um", self.high_um, high_ok, "larger than low_um")?;
         check(
             "slew_um_per_s",

@@ -38,7 +38,7 @@ fn main() {
         view_um: [-12.8, 12.8],
         budget_us: 500.0,
         bound_nm: Some(44.5),
-        bound_spectrum: (1..500).map(|f| [f64::from(f), 2.0]).collect(),
+        predicted_spectrum: (1..500).map(|f| [f64::from(f), 2.0, 0.0]).collect(),
         steered: true,
         script: true,
         pictures: true,

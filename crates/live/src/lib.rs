@@ -49,4 +49,4 @@ pub use feed::{Feed, FeedHub, Line, Lost, PictureFeed};
 pub use film::{Film, FilmFrame, film_bytes};
 pub use row::{OUTLINE_POINTS, PICTURE_MARGIN, Picture, Row};
 pub use server::{LiveError, MOST_CLIENTS, Server, ServerConfig};
-pub use state::{Banner, ClipLine, CycleRow, EventLine, Hello, State};
+pub use state::{Banner, ClipLine, CycleRow, EventLine, Hello, LastWord, State};

@@ -7,6 +7,8 @@ pub(crate) fn asset(path: &str) -> Option<(&'static str, &'static str)> {
         "/trace.js" => (SCRIPT, include_str!("page/trace.js")),
         "/spectrum.js" => (SCRIPT, include_str!("page/spectrum.js")),
         "/picture.js" => (SCRIPT, include_str!("page/picture.js")),
+        "/theme.js" => (SCRIPT, include_str!("page/theme.js")),
+        "/view.js" => (SCRIPT, include_str!("page/view.js")),
         "/clips.js" => (SCRIPT, include_str!("page/clips.js")),
         "/wire.js" => (SCRIPT, include_str!("page/wire.js")),
         "/page.js" => (SCRIPT, include_str!("page/page.js")),

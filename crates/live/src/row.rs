@@ -1,7 +1,7 @@
 //! What the page gets of a tick, and of a frame, in bytes.
 
 /// Bytes of one row on the wire.
-pub(crate) const ROW_BYTES: usize = 56;
+pub(crate) const ROW_BYTES: usize = 64;
 /// Bytes of a picture's head on the wire.
 pub(crate) const PICTURE_HEAD: usize = 40;
 /// Largest picture, pixels: a crop, not a frame.
@@ -29,6 +29,10 @@ pub struct Row {
     pub zero_flow_um: f32,
     /// Length of the cell, um.
     pub length_um: f32,
+    /// Projected area of the cell, um^2.
+    pub area_um2: f32,
+    /// The plant's gain as the loop estimates it, over the model's.
+    pub gain: f32,
     /// Start of the tick after its due time, us.
     pub wake_us: f32,
     /// Start of the tick to the hand-over of the command, us.
@@ -50,6 +54,8 @@ impl Default for Row {
             command_um: f32::NAN,
             zero_flow_um: f32::NAN,
             length_um: f32::NAN,
+            area_um2: f32::NAN,
+            gain: f32::NAN,
             wake_us: 0.0,
             compute_us: 0.0,
             flags: 0,
@@ -73,6 +79,8 @@ impl Row {
             self.length_um,
             self.wake_us,
             self.compute_us,
+            self.area_um2,
+            self.gain,
         ] {
             out.extend(value.to_le_bytes());
         }

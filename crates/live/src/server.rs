@@ -11,6 +11,7 @@ use crate::page;
 use crate::queue::Queue;
 use crate::shared::Shared;
 use std::fmt;
+use std::io::{Read, Write};
 use std::net::{SocketAddr, TcpListener, TcpStream};
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex};
@@ -71,7 +72,7 @@ pub enum LiveError {
     )]
     Reachable(SocketAddr),
     /// The address cannot be listened on.
-    #[error("no page at {address}: is another program, or another run, listening there?")]
+    #[error("no page at {address}: {}", held(*.address))]
     Listen {
         /// Address asked for.
         address: SocketAddr,
@@ -83,6 +84,35 @@ pub enum LiveError {
     #[error("the page cannot be served")]
     System(#[from] std::io::Error),
 }
+
+/// Who has an address that cannot be listened on, as the end of a sentence.
+fn held(address: SocketAddr) -> &'static str {
+    let heard = || -> std::io::Result<String> {
+        let mut stream = TcpStream::connect_timeout(&address, PATIENCE)?;
+        stream.set_read_timeout(Some(PATIENCE))?;
+        stream.set_write_timeout(Some(PATIENCE))?;
+        let host = address.to_string();
+        stream.write_all(
+            format!("GET /wire.js HTTP/1.1\r\nHost: {host}\r\nConnection: close\r\n\r\n")
+                .as_bytes(),
+        )?;
+        let mut text = String::new();
+        stream.take(4096).read_to_string(&mut text)?;
+        Ok(text)
+    };
+    match heard() {
+        Ok(text) if text.contains(ITS_FIRST_LINE) => {
+            "another cellpos serves the page of its run there; end that run, or take another port (0: any that is free)"
+        }
+        Ok(_) => "another program listens there",
+        Err(_) => "is another program listening there, and is the address one of this machine's?",
+    }
+}
+
+/// How long whoever has the address is given to say who it is.
+const PATIENCE: Duration = Duration::from_millis(300);
+/// By what the page of a run is known: its line to the program says this of itself.
+const ITS_FIRST_LINE: &str = "The line to the program: messages in, requests out";
 
 /// A page that is being served; dropping it ends its threads.
 pub struct Server {

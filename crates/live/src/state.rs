@@ -21,8 +21,9 @@ pub struct Hello {
     pub budget_us: f64,
     /// Lowest possible RMS error of holding, nm, where the model tells.
     pub bound_nm: Option<f64>,
-    /// Spectral density of the lowest possible error: pairs of frequency in Hz and amplitude in nm/sqrt(Hz).
-    pub bound_spectrum: Vec<[f64; 2]>,
+    /// Spectral density that the linear model of this loop predicts for the measured error while it holds: frequency in Hz, amplitude
+    /// from Brownian motion in nm/sqrt(Hz), and amplitude for each nm RMS of localisation noise; empty where it predicts none.
+    pub predicted_spectrum: Vec<[f64; 3]>,
     /// Whether the operator may set the target.
     pub steered: bool,
     /// Whether the target is a displacement of the PZT, moved by hand, rather than a position that a loop holds.
@@ -31,6 +32,8 @@ pub struct Hello {
     pub notes: bool,
     /// Whether a script says where the bead is to be: it can be paused, and its steps skipped.
     pub script: bool,
+    /// Whether a cell is followed rather than a bead.
+    pub cell: bool,
     /// Whether the run has pictures.
     pub pictures: bool,
     /// Whether the run is over and read from its folder.
@@ -51,11 +54,12 @@ impl Default for Hello {
             view_um: [f64::NAN; 2],
             budget_us: f64::NAN,
             bound_nm: None,
-            bound_spectrum: vec![],
+            predicted_spectrum: vec![],
             steered: false,
             by_hand: false,
             notes: true,
             script: false,
+            cell: false,
             pictures: false,
             recorded: false,
             adaptation_at: None,
@@ -92,6 +96,19 @@ impl Default for Banner {
     }
 }
 
+/// The last word of a run: how it ended, and where that leaves the rig. The page keeps it when the program is gone.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct LastWord {
+    /// `done`, `stopped` (by the operator), `safe`, `failed`.
+    pub how: &'static str,
+    /// What was seen, and what was expected where that is something else.
+    pub seen: String,
+    /// What to do; empty if there is nothing.
+    pub to_do: String,
+    /// Where the PZT is.
+    pub pzt: String,
+}
+
 /// How the run stands, a few times a second. The same numbers as in the run's summary.
 #[derive(Debug, Clone, PartialEq, Serialize, Default)]
 pub struct State {
@@ -103,6 +120,8 @@ pub struct State {
     pub ticks: u64,
     /// RMS of the measured error since the loop settled, nm.
     pub rms_nm: Option<f64>,
+    /// Localisation noise as vision states it, nm RMS.
+    pub fix_noise_nm: Option<f64>,
     /// Wake-up of the ticks behind their due time, us: the least time that 99.9 % of them do not exceed.
     pub wake_us: Option<f64>,
     /// Computing time of the ticks, us, likewise.
@@ -127,6 +146,8 @@ pub struct State {
     pub next: Option<String>,
     /// Time left, s, where it is known.
     pub left_s: Option<f64>,
+    /// How it ended, once it has.
+    pub last_word: Option<LastWord>,
 }
 
 /// One event as a sentence.

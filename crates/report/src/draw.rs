@@ -38,7 +38,7 @@ pub(crate) fn figure(figure: &Figure, alone: bool, width_px: f64) -> String {
     let _ = write!(
         out,
         "<svg xmlns=\"http://www.w3.org/2000/svg\" class=\"fg\" viewBox=\"0 0 {w} {h}\" width=\"{w}\" height=\"{h}\" role=\"img\"><title>{}</title>",
-        svg::escape(&figure.caption)
+        svg::set(&figure.caption)
     );
     if alone {
         let _ = write!(

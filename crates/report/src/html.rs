@@ -2,8 +2,9 @@
 
 use crate::draw;
 use crate::figure::Figure;
-use crate::picture::Picture;
-use crate::svg::{STYLE, escape};
+use crate::picture::{Picture, base64};
+use crate::style::PAGE_STYLE;
+use crate::svg::{STYLE, escape, set};
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
 
@@ -148,7 +149,7 @@ impl Table {
         if self.columns.iter().any(|column| !column.head.is_empty()) {
             out.push_str("<thead><tr>");
             for column in &self.columns {
-                let _ = write!(out, "<th{}>{}</th>", side(column), escape(&column.head));
+                let _ = write!(out, "<th{}>{}</th>", side(column), set(&column.head));
             }
             out.push_str("</tr></thead>");
         }
@@ -158,14 +159,14 @@ impl Table {
             for (index, column) in self.columns.iter().enumerate() {
                 let cell = cells.get(index).map_or("", String::as_str);
                 let sign = if index == 0 { status.sign() } else { "" };
-                let _ = write!(out, "<td{}>{sign}{}</td>", side(column), escape(cell));
+                let _ = write!(out, "<td{}>{sign}{}</td>", side(column), set(cell));
             }
             out.push_str("</tr>\n");
         }
         out.push_str("</tbody></table></div>\n");
         // Outside of what scrolls: on a narrow screen it is read whole.
         if !self.caption.is_empty() {
-            let _ = writeln!(out, "<p class=\"caption\">{}</p>", escape(&self.caption));
+            let _ = writeln!(out, "<p class=\"caption\">{}</p>", set(&self.caption));
         }
     }
 }
@@ -181,6 +182,9 @@ enum Block {
     Table(Table),
     Figure(Figure),
     Picture(Picture),
+    Result(Emphasis, String),
+    Fold(String),
+    Unfold,
 }
 
 /// A report: see the crate's documentation.
@@ -222,6 +226,21 @@ impl Report {
     /// Adds a note that stands out: a verdict, a warning.
     pub fn note(&mut self, status: Emphasis, text: &str) -> &mut Self {
         self.push(Block::Note(status, text.to_owned()))
+    }
+
+    /// Adds the answer to what the reader came for: one sentence, at the top of the page.
+    pub fn result(&mut self, status: Emphasis, sentence: &str) -> &mut Self {
+        self.push(Block::Result(status, sentence.to_owned()))
+    }
+
+    /// What is added until [`Report::unfold`] is folded behind this title: it is there, and not in the way.
+    pub fn fold(&mut self, title: &str) -> &mut Self {
+        self.push(Block::Fold(title.to_owned()))
+    }
+
+    /// Ends what [`Report::fold`] began.
+    pub fn unfold(&mut self) -> &mut Self {
+        self.push(Block::Unfold)
     }
 
     /// Adds a list.
@@ -268,9 +287,14 @@ impl Report {
         })
     }
 
-    /// The whole report as one HTML page.
+    /// The whole report as one HTML page; its figures' data are within it.
     pub fn to_html(&self) -> String {
-        let title = escape(&self.title);
+        self.page(None)
+    }
+
+    /// The page; `beside` is the folder with its figures, if there is one.
+    fn page(&self, beside: Option<&str>) -> String {
+        let title = set(&self.title);
         let mut out = String::new();
         let _ = write!(
             out,
@@ -287,39 +311,31 @@ impl Report {
                 _ => None,
             })
             .collect();
-        if sections.len() > 3 {
-            out.push_str("<nav><ul>\n");
-            for (index, title) in sections.iter().enumerate() {
-                let _ = writeln!(
-                    out,
-                    "<li><a href=\"#section-{}\">{}</a></li>",
-                    index + 1,
-                    escape(title)
-                );
-            }
-            out.push_str("</ul></nav>\n");
-        }
         let mut section = 0;
         for block in &self.blocks {
             match block {
                 Block::Section(title) => {
+                    // Behind the result, which comes first.
+                    if section == 0 && sections.len() > 3 {
+                        contents(&mut out, &sections);
+                    }
                     section += 1;
-                    let _ = writeln!(out, "<h2 id=\"section-{section}\">{}</h2>", escape(title));
+                    let _ = writeln!(out, "<h2 id=\"section-{section}\">{}</h2>", set(title));
                 }
                 Block::Subsection(title) => {
-                    let _ = writeln!(out, "<h3>{}</h3>", escape(title));
+                    let _ = writeln!(out, "<h3>{}</h3>", set(title));
                 }
                 Block::Paragraph(text) => {
-                    let _ = writeln!(out, "<p>{}</p>", escape(text));
+                    let _ = writeln!(out, "<p>{}</p>", set(text));
                 }
                 Block::Note(status, text) => {
                     let (class, sign) = (status.class(), status.sign());
-                    let _ = writeln!(out, "<p class=\"note {class}\">{sign}{}</p>", escape(text));
+                    let _ = writeln!(out, "<p class=\"note {class}\">{sign}{}</p>", set(text));
                 }
                 Block::List(items) => {
                     out.push_str("<ul>\n");
                     for item in items {
-                        let _ = writeln!(out, "<li>{}</li>", escape(item));
+                        let _ = writeln!(out, "<li>{}</li>", set(item));
                     }
                     out.push_str("</ul>\n");
                 }
@@ -327,14 +343,21 @@ impl Report {
                     let _ = writeln!(out, "<pre>{}</pre>", escape(text));
                 }
                 Block::Table(table) => table.html(&mut out),
-                Block::Picture(picture) => picture.html(&mut out, escape),
+                Block::Result(status, text) => {
+                    let (class, sign) = (status.class(), status.sign());
+                    let _ = writeln!(out, "<p class=\"result {class}\">{sign}{}</p>", set(text));
+                }
+                Block::Fold(title) => {
+                    let _ = writeln!(out, "<details><summary>{}</summary>", set(title));
+                }
+                Block::Unfold => out.push_str("</details>\n"),
+                Block::Picture(picture) => picture.html(&mut out, set),
                 Block::Figure(figure) => {
                     let _ = write!(out, "<figure>\n{}", draw::in_page(figure));
-                    if !figure.caption.is_empty() {
-                        let caption = escape(&figure.caption);
-                        let _ = writeln!(out, "<figcaption>{caption}</figcaption>");
-                    }
-                    out.push_str("</figure>\n");
+                    let caption = set(&figure.caption);
+                    let _ = write!(out, "<figcaption>{caption} <span class=\"take\">");
+                    take(&mut out, figure, beside);
+                    out.push_str("</span></figcaption>\n</figure>\n");
                 }
             }
         }
@@ -357,15 +380,16 @@ impl Report {
     /// # Errors
     /// [`ReportError::Write`] names the file.
     pub fn write_with_figures(&self, path: &Path) -> Result<(), ReportError> {
-        self.write(path)?;
         if is_device(path) {
-            return Ok(());
+            return self.write(path);
         }
         let stem = path.file_stem().map_or_else(
             || "report".into(),
             |stem| stem.to_string_lossy().into_owned(),
         );
-        let folder = path.with_file_name(format!("{stem}-figures"));
+        let beside = format!("{stem}-figures");
+        write_file(path, &self.page(Some(&beside)))?;
+        let folder = path.with_file_name(&beside);
         for figure in self.figures() {
             write_file(
                 &folder.join(format!("{}.svg", figure.name)),
@@ -378,6 +402,52 @@ impl Report {
         }
         Ok(())
     }
+}
+
+/// The sections, to jump to.
+fn contents(out: &mut String, sections: &[&String]) {
+    out.push_str("<nav><ul>\n");
+    for (index, title) in (1..).zip(sections) {
+        let title = set(title);
+        let _ = writeln!(out, "<li><a href=\"#section-{index}\">{title}</a></li>");
+    }
+    out.push_str("</ul></nav>\n");
+}
+
+/// Links by which a reader takes a figure along: to the files beside the page, or to the same within it.
+fn take(out: &mut String, figure: &Figure, beside: Option<&str>) {
+    let name = figure.name();
+    for (ending, kind) in [("svg", "image/svg+xml"), ("csv", "text/csv")] {
+        let target = match beside {
+            Some(folder) => format!("{}/{name}.{ending}", encoded(folder)),
+            None => {
+                let data = if ending == "svg" {
+                    figure.to_svg()
+                } else {
+                    figure.to_csv()
+                };
+                format!("data:{kind};base64,{}", base64(data.as_bytes()))
+            }
+        };
+        let shown = ending.to_uppercase();
+        let _ = write!(
+            out,
+            "<a download=\"{name}.{ending}\" href=\"{target}\">{shown}</a> "
+        );
+    }
+}
+
+/// A file name as a part of an address.
+fn encoded(name: &str) -> String {
+    let mut out = String::new();
+    for byte in name.bytes() {
+        if byte.is_ascii_alphanumeric() || matches!(byte, b'-' | b'_' | b'.') {
+            out.push(char::from(byte));
+        } else {
+            let _ = write!(out, "%{byte:02X}");
+        }
+    }
+    out
 }
 
 /// Whether there is something of this name that is no file: a device or a pipe, which no file may take the place of.
@@ -409,30 +479,3 @@ fn write_file(path: &Path, text: &str) -> Result<(), ReportError> {
         source,
     })
 }
-
-const PAGE_STYLE: &str = "\
-:root{color-scheme:light dark}\
-body{margin:0;background:#fff;color:#1d2127;font:15px/1.55 system-ui,'DejaVu Sans','Segoe UI',Helvetica,Arial,sans-serif}\
-main{max-width:1000px;margin:0 auto;padding:24px 20px 60px}\
-h1{font-size:26px;line-height:1.25;margin:8px 0 16px;overflow-wrap:anywhere}h2{font-size:20px;margin:38px 0 10px;padding-top:8px;border-top:1px solid #dfe3e8}\
-h3{font-size:16px;margin:24px 0 6px}p{margin:8px 0}ul{margin:8px 0;padding-left:22px}\
-nav ul{columns:2;list-style:none;padding:10px 14px;background:#f5f7f9;border-radius:6px;font-size:14px}\
-a{color:#0063a0}figure{margin:18px 0}figure svg,img.pixels{max-width:100%;height:auto;display:block}img.pixels{image-rendering:pixelated}\
-figcaption{color:#5c6470;font-size:13px;margin-top:4px}\
-.slim{display:none}\
-@media(max-width:760px){.wide{display:none}.slim{display:block}.slim svg{width:100%;max-width:520px}figure .scroll svg{max-width:none}td:last-child:not(.num){min-width:15em}}\
-.scroll{overflow-x:auto;margin:12px 0}table{border-collapse:collapse;font-size:13.5px}\
-p.caption{color:#5c6470;font-size:13px;margin-top:4px}\
-th{text-align:left;font-weight:600;border-bottom:2px solid #c3cad2;padding:4px 14px 4px 6px;vertical-align:bottom}\
-td{border-bottom:1px solid #e8ebef;padding:4px 14px 4px 6px;vertical-align:top}\
-.num{text-align:right;font-variant-numeric:tabular-nums;padding:4px 8px}td.num{white-space:nowrap}\
-tr.good td:first-child{color:#00724f}tr.warning td:first-child{color:#8a5a00}tr.bad td:first-child{color:#b3261e;font-weight:600}\
-.note{padding:10px 14px;border-left:4px solid #9aa3ae;background:#f5f7f9;border-radius:0 6px 6px 0;margin:12px 0}\
-.note.good{border-color:#009e73;background:#eaf6f1}.note.warning{border-color:#d99a00;background:#fdf6e3}.note.bad{border-color:#c8372d;background:#fcecea}\
-pre{background:#f5f7f9;padding:10px 14px;border-radius:6px;overflow-x:auto;font-size:13px;line-height:1.4}\
-@media (prefers-color-scheme:dark){\
-body{background:#14171b;color:#e4e7eb}h2{border-color:#2f353d}a{color:#6cb8ee}figcaption,p.caption{color:#a3acb8}\
-nav ul,.note,pre{background:#1e2329}th{border-color:#4a525d}td{border-color:#2a2f37}\
-tr.good td:first-child{color:#3ccf9f}tr.warning td:first-child{color:#f0b429}tr.bad td:first-child{color:#ff8078}\
-.note.good{background:#10281f}.note.warning{background:#2c2410}.note.bad{background:#301614}}\
-@media print{.wide{display:block}.slim{display:none}main{max-width:none}h2{break-after:avoid}figure,table{break-inside:avoid}}";

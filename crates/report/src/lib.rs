@@ -35,10 +35,13 @@ mod marks;
 mod panel;
 mod picture;
 mod series;
+mod style;
 mod svg;
 mod thin;
+mod typeset;
 
 pub use axis::{Axis, Scale};
 pub use figure::{Figure, HeatMap, Panel};
 pub use html::{Column, Emphasis, Report, ReportError, Table};
 pub use series::{Kind, Series};
+pub use typeset::typeset;

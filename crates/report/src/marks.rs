@@ -55,7 +55,10 @@ pub(crate) fn draw_series(svg: &mut Svg, series: &Series, color: usize, x: &Plac
                     let (_, low, high) = series.values(index);
                     let place = |value: Option<f64>| value.and_then(|value| y.at(value));
                     let at = series.x.get(index).and_then(|value| x.at(*value));
-                    if let (Some(at), Some(low), Some(high)) = (at, place(low), place(high)) {
+                    // One that its point covers cannot be seen.
+                    if let (Some(at), Some(low), Some(high)) = (at, place(low), place(high))
+                        && (high - low).abs() > 2.0 * radius
+                    {
                         let class = format!("ln s{color}");
                         svg.line(&class, (at, height - low), (at, height - high));
                         for end in [low, high] {

@@ -1,5 +1,6 @@
 //! Writing SVG elements: numbers, text, styles.
 
+use crate::typeset::typeset;
 use std::fmt::Write;
 
 /// Style shared by all figures. Plain rules instead of CSS variables: several SVG viewers know no variables.
@@ -57,6 +58,11 @@ pub(crate) fn escape(text: &str) -> String {
         }
     }
     out
+}
+
+/// [`escape`] of a text with its units as people write them.
+pub(crate) fn set(text: &str) -> String {
+    escape(&typeset(text))
 }
 
 /// A coordinate to a tenth of a pixel, as short as it goes.
@@ -147,7 +153,7 @@ impl Svg {
             "<text class=\"{class}\" x=\"{}\" y=\"{}\" text-anchor=\"{anchor}\">{}</text>",
             px(at.0),
             px(at.1),
-            escape(text)
+            set(text)
         );
     }
 
@@ -157,7 +163,7 @@ impl Svg {
         let _ = write!(
             self.out,
             "<text class=\"{class}\" x=\"{x}\" y=\"{y}\" text-anchor=\"middle\" transform=\"rotate(-90 {x} {y})\">{}</text>",
-            escape(text)
+            set(text)
         );
     }
 }

@@ -1,6 +1,7 @@
 //! What a run folder says of a run, and what the user should know of one that is over.
 
 use crate::Failure;
+use crate::ended::Ended;
 pub use crate::failure::describe;
 pub use crate::fit::{prepare, stated_exposure_s};
 use crate::provenance;
@@ -158,6 +159,9 @@ pub fn table(value: &impl Serialize) -> Result<toml::Table, Failure> {
     toml::Table::try_from(value).map_err(Failure::failed)
 }
 
+/// Key of the summary in `run.toml` that says how the run ended, in sentences: an [`Ended`].
+pub const ENDED: &str = "ended";
+
 /// A run folder that is ended.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Kept {
@@ -170,13 +174,16 @@ pub struct Kept {
 /// Ends a run folder; what is not on the disk is counted in the summary and said in the warnings.
 pub fn finish(
     mut writer: RunWriter,
-    outcome: &str,
+    (outcome, ended): (&str, &Ended),
     summary: &mut Summary,
     conditions: &Conditions,
     warnings: &mut Vec<String>,
 ) -> Kept {
     let mut end = RunEnd::new(outcome);
     end.summary = toml::Table::try_from(&*summary).unwrap_or_default();
+    if let Ok(ended) = toml::Value::try_from(ended) {
+        end.summary.insert(ENDED.to_string(), ended);
+    }
     writer.add_conditions(provenance::granted(conditions));
     // Those that never came to the writer; it adds its own.
     end.rows_lost = summary.records_lost;
@@ -251,6 +258,10 @@ pub fn bound_rms_nm(file: &RigFile, setup: &Setup, summary: &Summary) -> Option<
 
 /// What is wrong when the frames of a run were not as old as the rig file says: the loop was made for another delay.
 pub fn delay_warning(file: &RigFile, summary: &Summary) -> Option<String> {
+    // Without a frame that was used nothing is known of their age: the delay is that of the hold alone.
+    if summary.exposure_to_command_us.max <= 0.0 {
+        return None;
+    }
     let found_ms = summary.loop_delay_ms - 0.5e-3 * file.timing.period_us;
     crate::setup::camera_delay_advice(found_ms, &file.timing)
 }

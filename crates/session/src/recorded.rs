@@ -21,16 +21,24 @@ pub fn setup(reader: &RunReader) -> Result<Setup, Failure> {
             "a replay needs the configuration in run.toml",
         )
     })?;
+    let name = reader.folder().join("run.toml").display().to_string();
+    setup_of(meta, &name)
+}
+
+/// The loop as the metadata of a run describe it; `name` is what errors call them.
+///
+/// # Errors
+/// A loop that this version cannot build.
+pub fn setup_of(meta: &RunMeta, name: &str) -> Result<Setup, Failure> {
     let mut config = meta.config.clone();
     config.remove("rig");
     config.remove("session");
-    let name = reader.folder().join("run.toml").display().to_string();
     let text = |table: &toml::Table| toml::to_string(table).map_err(Failure::failed);
     Ok(Setup {
-        model: Model::from_toml_str(&text(&meta.model)?, &name).map_err(Failure::input)?,
-        controller: ControllerFile::from_toml_str(&text(&meta.controller)?, &name)
+        model: Model::from_toml_str(&text(&meta.model)?, name).map_err(Failure::input)?,
+        controller: ControllerFile::from_toml_str(&text(&meta.controller)?, name)
             .map_err(Failure::input)?,
-        config: toml_file::parse::<SetupConfig>(&text(&config)?, &name)?,
+        config: toml_file::parse::<SetupConfig>(&text(&config)?, name)?,
     })
 }
 

@@ -1,11 +1,12 @@
 //! Where the recorder thread's rows go: the run folder, and the live line on the terminal.
 
 use crate::live_line::LiveLine;
-use crate::view::Shown;
-use crate::words::sentence;
+use crate::view::{EventLine, Shown};
+use crate::words::{Level, sentence};
 use cellpos_record::{Event as LogEvent, RunWriter};
 use cellpos_runtime::recorder::Unconfirmed;
 use cellpos_runtime::{Event, RunSink, Statistics, TickRecord};
+use std::collections::VecDeque;
 use std::io::IsTerminal;
 
 /// Writes a run folder (if there is one) and a live line (if standard error is a terminal).
@@ -13,6 +14,9 @@ pub struct Recording {
     writer: Option<RunWriter>,
     line: Option<LiveLine>,
     late: u64,
+    /// Target of the last tick, um, of a run whose operator may set it; and what the page is still to be told of it.
+    steered: Option<f64>,
+    told: VecDeque<EventLine>,
 }
 
 impl Recording {
@@ -22,7 +26,46 @@ impl Recording {
             writer,
             line: line.filter(|_| std::io::stderr().is_terminal()),
             late: 0,
+            steered: None,
+            told: VecDeque::new(),
         }
+    }
+
+    /// The same for a run whose operator may set the target: each new one is an event of the record.
+    #[must_use]
+    pub fn steered(mut self, steered: bool) -> Self {
+        self.steered = steered.then_some(f64::NAN);
+        self
+    }
+
+    fn watch_target(&mut self, record: &TickRecord) {
+        let Some(before_um) = self.steered.replace(record.target_um) else {
+            self.steered = None;
+            return;
+        };
+        if before_um.is_nan() || before_um == record.target_um {
+            return;
+        }
+        let (time_s, level) = (record.time_ns as f64 * 1e-9, Level::Info.name());
+        let text = format!(
+            "The operator set the target to {} um.",
+            (record.target_um * 1e3).round() / 1e3
+        );
+        if let Some(writer) = &mut self.writer {
+            let event = LogEvent::new(time_s, "target-set")
+                .with("tick", record.seq)
+                .with("level", level)
+                .with("text", text.as_str())
+                .with("target_um", record.target_um);
+            writer.event(&event);
+        }
+        self.told.push_back(EventLine {
+            time_s,
+            level,
+            text,
+        });
+        // Without a page nobody takes them.
+        self.told.truncate(100);
     }
 
     /// The run folder, if there is one.
@@ -61,13 +104,18 @@ pub fn log_event(event: &Event) -> LogEvent {
     logged
 }
 
-impl Shown for Recording {}
+impl Shown for Recording {
+    fn next_line(&mut self) -> Option<EventLine> {
+        self.told.pop_front()
+    }
+}
 
 impl RunSink for Recording {
     fn tick(&mut self, record: &TickRecord) {
         if record.flags.has(cellpos_runtime::TickFlags::LATE) {
             self.late += 1;
         }
+        self.watch_target(record);
         if let Some(writer) = &mut self.writer {
             writer.tick(record);
         }

@@ -5,7 +5,8 @@ use crate::Failure;
 use crate::cyclic::LearnSpec;
 pub use crate::prepared::Prepared;
 use cellpos_control::design::{
-    DesignPlant, DesignRequest, PiSearch, Requested, default_lead, design,
+    DesignPlant, DesignRequest, PiSearch, Requested, default_lead, design, margins,
+    predicted_density_um,
 };
 use cellpos_control::{
     Controller, ControllerConfig, ControllerFile, ControllerKind, Limits, Profile, Shape,
@@ -178,6 +179,25 @@ pub struct SetupConfig {
     pub motions: Vec<MotionSpec>,
 }
 
+/// The predicted amplitude density of the measured error, one-sided, in two parts whose squares add.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Predicted {
+    /// From Brownian motion, nm/sqrt(Hz).
+    pub walk_nm: Vec<f64>,
+    /// From localisation noise, for each nm RMS of it, 1/sqrt(Hz).
+    pub per_noise: Vec<f64>,
+}
+
+impl Predicted {
+    /// Both, nm/sqrt(Hz), with this localisation noise, nm RMS.
+    pub fn with_noise_nm(&self, noise_nm: f64) -> Vec<f64> {
+        let parts = self.walk_nm.iter().zip(&self.per_noise);
+        parts
+            .map(|(walk, fix)| walk.hypot(fix * noise_nm))
+            .collect()
+    }
+}
+
 /// Learning on a periodic motion of a script.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -237,6 +257,31 @@ impl Setup {
     /// A value that cannot be, named.
     pub fn core_following<R: ReferenceGenerator>(&self, reference: R) -> Result<Core<R>, Failure> {
         self.joined(self.law()?, reference)
+    }
+
+    /// What the linear model of this loop predicts for the measured error while it holds, at each frequency, Hz. `None`: nothing
+    /// diffuses, the law has no linear form, or the model calls the loop unstable.
+    pub fn predicted_density(&self, diffusion_um2_per_s: f64, hz: &[f64]) -> Option<Predicted> {
+        let sample_s = self.config.timing.period_us * 1e-6;
+        let delay_s = self.controller.delay_ms * 1e-3;
+        let mut plant = DesignPlant::from_model(&self.model, Some(delay_s), sample_s).ok()?;
+        let config = self.controller.loop_config(&self.model).ok()?;
+        let law = (config.controller).linear(&config.estimator, &config.model);
+        let law = law.ok()?;
+        if !margins(&plant, &law).is_ok_and(|margins| margins.stable) {
+            return None;
+        }
+        let mut of = |diffusion: f64, fix: f64| {
+            (plant.diffusion_um2_per_s, plant.fix_noise_um) = (diffusion, fix);
+            predicted_density_um(&plant, &law, hz).ok()
+        };
+        Some(Predicted {
+            walk_nm: of(Some(diffusion_um2_per_s).filter(|d| *d > 0.0)?, 0.0)?
+                .into_iter()
+                .map(|um| um * 1e3)
+                .collect(),
+            per_noise: of(0.0, 1.0)?,
+        })
     }
 
     fn joined<R: ReferenceGenerator>(

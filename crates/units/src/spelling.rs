@@ -25,7 +25,12 @@ pub fn nearest_in(message: &str) -> Option<&str> {
     }
     let mut quoted = message.split('`').skip(1).step_by(2);
     let wrong = quoted.next()?;
-    nearest(wrong, quoted)
+    // The unit left out is the slip that is made most.
+    let with_unit = quoted.clone().find(|known| {
+        let rest = known.strip_prefix(wrong);
+        rest.is_some_and(|rest| rest.starts_with('_'))
+    });
+    with_unit.or_else(|| nearest(wrong, quoted))
 }
 
 fn letter(c: char) -> char {

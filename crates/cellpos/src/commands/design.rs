@@ -1,6 +1,7 @@
 //! `cellpos design`: a controller for a model and a loop delay, with margins, predicted error and spread.
 
 mod print;
+mod report;
 
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
 use crate::output;
@@ -34,7 +35,7 @@ enum Kind {
 #[command(after_help = "Examples:
   cellpos design --model eq6 --delay 2.5ms
   cellpos design --model eq6 --delay 2.5ms --kp 0.46 --ki 19.5 --json
-  cellpos design --model model.toml --max-ms 1.6 --min-pm 40 --out controller.toml
+  cellpos design --model model.toml --max-ms 1.6 --min-pm 40 --out controller.toml --report design.html
 
 The loop delay is the camera path (from the middle of an exposure to the tick that uses it) and half a sample of hold: a 2 ms
 camera path at 1 kHz is 2.5ms. A model.toml of cellpos identify carries its camera path, and the sum is done here. Without gains the PI controller of
@@ -46,7 +47,7 @@ pub struct Args {
     model: String,
     /// Loop delay: camera path (camera_delay_ms of rig.toml) and half a sample of hold; left out: of --rig, else as the model
     /// was measured with, else 2.5ms.
-    #[arg(long, value_parser = crate::arguments::positive::<Seconds>)]
+    #[arg(long, value_parser = crate::arguments::loop_delay)]
     delay: Option<Seconds>,
     /// The rig whose camera_delay_ms and period make the loop delay.
     #[arg(long, conflicts_with_all = ["delay", "sample"])]
@@ -103,6 +104,9 @@ pub struct Args {
     /// Write the controller to this file.
     #[arg(long)]
     out: Option<PathBuf>,
+    /// Write a page with margins, Bode and Nyquist plots, step and predicted spectrum to this file.
+    #[arg(long)]
+    report: Option<PathBuf>,
     /// Print one JSON object on standard output.
     #[arg(long)]
     json: bool,
@@ -111,6 +115,7 @@ pub struct Args {
 /// Designs or checks a controller, prints its figures.
 pub fn run(args: Args) -> CommandResult {
     output::ready(&args.out)?;
+    output::ready(&args.report)?;
     let model = Model::load(&args.model).map_err(Failure::input)?;
     let plant = plant(&args, &model)?;
     let limits = limits(&args)?;
@@ -134,6 +139,14 @@ pub fn run(args: Args) -> CommandResult {
     if let Some(path) = &args.out {
         let file = controller_file(&request, &report);
         output::write(path, &file.to_toml_string())?;
+    }
+    if let Some(path) = &args.report {
+        report::page(&args.model, &request, &report)
+            .map_err(Failure::failed)?
+            .write_with_figures(path)
+            .map_err(|error| {
+                Failure::bad_input(error, "name a page that you may write with --report")
+            })?;
     }
     for warning in &report.warnings {
         eprintln!("WARNING: {warning}");

@@ -14,6 +14,9 @@ use std::path::{Path, PathBuf};
 #[command(after_help = "Examples:
   cellpos export runs/20261121T093000Z-track
   cellpos export runs/20261121T093000Z-track --out track.parquet
+  cellpos export runs/20261121T093000Z-track --out track.h5      # HDF5
+  cellpos export runs/20261121T093000Z-track --out track.mat     # MATLAB
+  cellpos export runs/20261121T190000Z-fatigue --out cell.rtdc   # Shape-Out: a cell's runs
   cellpos export runs/20261121T190000Z-fatigue --from 60s --to 120s --every 10 --columns time_s,target_um,bead_um,error_um
 
 All sessions of a run that was resumed, one behind the other; the column session tells them apart. The columns, their units

@@ -55,7 +55,7 @@ pub enum Command {
     Report(report::Args),
     /// A run packed for archiving, with a manifest.
     Bundle(bundle::Args),
-    /// A run as CSV or Parquet, for other programs.
+    /// A run as CSV, Parquet, HDF5, MAT or RT-DC, for other programs.
     Export(export::Args),
     /// Is this machine fit for a 1 kHz loop: verdict, reasons, what to change.
     Doctor(doctor::Args),
@@ -83,6 +83,52 @@ pub enum Command {
     Paper(paper::Args),
     /// Completions and manual pages, for packages and for a home of one's own.
     Generate(generate::Args),
+}
+
+/// The commands by what a person wants to do.
+const GROUPS: [(&str, &[&str]); 6] = [
+    ("Hold and move", &["track", "run", "jog"]),
+    (
+        "Look at a run",
+        &["watch", "report", "replay", "export", "bundle"],
+    ),
+    (
+        "Plan and predict",
+        &["design", "check", "simulate", "paper"],
+    ),
+    ("Measure the plant", &["identify", "reconcile", "circle"]),
+    (
+        "Set up the rig",
+        &[
+            "doctor",
+            "rig",
+            "board",
+            "camera",
+            "background",
+            "vision",
+            "calibrate",
+        ],
+    ),
+    ("The program itself", &["generate", "help"]),
+];
+
+/// The commands in groups, as the help shows them.
+pub fn groups(command: &clap::Command) -> String {
+    let line = |name: &str| {
+        let about = match name {
+            "help" => "This text, or the help of a command".to_string(),
+            name => (command.find_subcommand(name)?.get_about())
+                .map_or_else(String::new, ToString::to_string),
+        };
+        Some(format!("  {name:<11} {about}\n"))
+    };
+    GROUPS
+        .iter()
+        .map(|(title, names)| {
+            let lines: String = names.iter().filter_map(|name| line(name)).collect();
+            format!("{title}:\n{lines}\n")
+        })
+        .collect()
 }
 
 impl Command {
@@ -125,4 +171,25 @@ fn beside(run: &std::path::Path, behind: &str) -> std::path::PathBuf {
     let mut name = folder.file_name().unwrap_or("run".as_ref()).to_owned();
     name.push(behind);
     folder.with_file_name(name)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_command_is_in_one_group_of_the_help() {
+        let command = <Command as clap::Subcommand>::augment_subcommands(clap::Command::new("c"));
+        let mut known: Vec<&str> = (command.get_subcommands())
+            .map(clap::Command::get_name)
+            .collect();
+        known.push("help");
+        known.sort_unstable();
+        let mut grouped: Vec<&str> = GROUPS
+            .iter()
+            .flat_map(|(_, names)| names.iter().copied())
+            .collect();
+        grouped.sort_unstable();
+        assert_eq!(grouped, known);
+    }
 }

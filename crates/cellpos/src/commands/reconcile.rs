@@ -18,6 +18,9 @@ use model::{Asked, Data};
 use records::{Columns, files, is_run, read, read_run};
 use std::path::{Path, PathBuf};
 
+/// Heading of the options that need a rig.
+const ON_A_RIG: &str = "To collect on a rig what the records leave open";
+
 /// Find where simulation and measurement disagree, name what is missing, add it to the model.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "\
@@ -44,31 +47,31 @@ pub struct Args {
     data: Vec<PathBuf>,
     /// Where the records leave it open, or there are none, run what would decide on the rig, keep its records in FOLDER
     /// and look again.
-    #[arg(long, value_name = "FOLDER")]
+    #[arg(long, value_name = "FOLDER", help_heading = ON_A_RIG)]
     collect: Option<PathBuf>,
     /// The rig to collect on, through the same loop as `cellpos track`; left out: the emulated one.
-    #[arg(long, requires = "collect")]
+    #[arg(long, requires = "collect", help_heading = ON_A_RIG)]
     rig: Option<PathBuf>,
     /// Most experiments to run.
-    #[arg(long, default_value_t = 2, requires = "collect", value_parser = clap::value_parser!(u8).range(1..=10))]
+    #[arg(long, default_value_t = 2, requires = "collect", value_parser = clap::value_parser!(u8).range(1..=10), help_heading = ON_A_RIG)]
     rounds: u8,
     /// Factor on the duration of the experiments, 0.2 to 10.
-    #[arg(long, default_value_t = 1.0, requires = "collect")]
+    #[arg(long, default_value_t = 1.0, requires = "collect", help_heading = ON_A_RIG)]
     effort: f64,
     /// Without the imperfections of a real rig (emulated rig): flow, light, focus and clocks stand still.
     #[arg(long, requires = "collect")]
     ideal: bool,
     /// Seed of the emulated rig and of the excitations [default: that of rig.toml].
-    #[arg(long, requires = "collect")]
+    #[arg(long, requires = "collect", help_heading = ON_A_RIG)]
     seed: Option<u64>,
     /// Clock of the emulated rig [default: virtual; a real rig has the real one].
-    #[arg(long, value_enum, requires = "collect")]
+    #[arg(long, value_enum, requires = "collect", help_heading = ON_A_RIG)]
     clock: Option<ClockKind>,
     /// Whether the emulated rig renders frames.
-    #[arg(long, value_enum, default_value = "on", requires = "collect")]
+    #[arg(long, value_enum, default_value = "on", requires = "collect", help_heading = ON_A_RIG)]
     frames: Frames,
     /// Do not ask the operating system for real time.
-    #[arg(long, requires = "collect")]
+    #[arg(long, requires = "collect", help_heading = ON_A_RIG)]
     best_effort: bool,
     /// Effects of your own, searched like those of the catalogue (TOML, see docs/reconcile.md).
     #[arg(long, value_name = "FILE")]

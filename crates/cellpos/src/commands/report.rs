@@ -6,6 +6,7 @@ mod cycles;
 mod envelope;
 mod fatigue;
 mod fault;
+mod result;
 mod session;
 mod spectrum;
 mod spread;
@@ -15,7 +16,7 @@ use super::run::{learning, resume};
 use crate::arguments::run_folder;
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
 use crate::output;
-use cellpos_record::{CYCLES_CSV, RunEnd, RunReader};
+use cellpos_record::{CYCLES_CSV, RunEnd, RunMeta, RunReader};
 use cellpos_report::{Axis, Column, Emphasis, Figure, Panel, Report, Series, Table};
 use cellpos_runtime::Summary;
 use cellpos_runtime::summary::plan_warning;
@@ -76,28 +77,41 @@ pub fn run(args: Args) -> CommandResult {
     let meta = first.meta().ok();
     let name = meta.map_or("run", |meta| meta.name.as_str());
     let mut page = Report::new(&format!("Run {name}"));
-    if let Some(notes) = notes(&first) {
-        page.paragraph(&notes);
-    }
-    what_it_was(&mut page, &sessions);
+    let bound = bound::Bound::of(meta, &ticks);
+    let sentence = result::section(&mut page, &sessions, &ticks, &cycles.rows, bound.as_ref());
+    let of_a_cell = fatigue::figure(&cycles.rows).filter(|_| ticks.has_length);
+    let is_cell = of_a_cell.is_some();
+    page.figure(of_a_cell.unwrap_or_else(|| result::error_figure(&ticks, bound.as_ref())));
     head(&mut page, &sessions, &ticks);
     traces(&mut page, &ticks);
-    let bound = bound::Bound::of(meta, &ticks);
-    errors(&mut page, &ticks, bound.as_ref());
+    if is_cell {
+        page.section("Error");
+        page.figure(result::error_figure(&ticks, bound.as_ref()));
+    }
+    spectrum(&mut page, &ticks, meta);
     let trends = cycles::section(&mut page, &cycles);
     fatigue::section(&mut page, &cycles.rows, &ticks);
     learned(&mut page, &args.run)?;
-    timing(&mut page, &sessions, &ticks);
+    timing(&mut page, &ticks);
     fault::section(&mut page, &sessions)?;
     clips::section(&mut page, &sessions);
     events(&mut page, &sessions);
+    page.section("What was run");
+    what_it_was(&mut page, &sessions);
+    if let Some(notes) = notes(&first) {
+        page.paragraph(&notes);
+    }
+    page.fold("Figures, configuration and provenance in full");
+    session::figures(&mut page, &sessions);
     provenance(&mut page, &sessions);
+    page.unfold();
     let out = args.out.unwrap_or_else(|| args.run.join("report.html"));
     page.write_with_figures(&out)
         .map_err(|error| Failure::bad_input(error, "name a page that you may write with --out"))?;
     if args.json {
         print_json(&serde_json::json!({
             "out": out,
+            "result": sentence,
             "sessions": sessions.len(),
             "ticks": ticks.rows,
             "cycles": cycles.rows.len(),
@@ -233,7 +247,10 @@ fn head(page: &mut Report, sessions: &[Session], ticks: &Ticks) {
             1 => format!("The run {text}."),
             many => format!("The last of {many} sessions {text}."),
         };
-        page.note(status, &text);
+        // A run that came to its end says so in its result.
+        if sessions.len() > 1 || status != Emphasis::Good {
+            page.note(status, &text);
+        }
     }
     let end = |session: &Session| session.meta.as_ref()?.end.clone();
     let missing: u64 = sessions.iter().map(|session| session.lost.rows).sum();
@@ -306,42 +323,64 @@ fn head(page: &mut Report, sessions: &[Session], ticks: &Ticks) {
     }
 }
 
+/// A column as an envelope with its median, or as it is where each point is one tick.
+fn enveloped(panel: Panel, ticks: &Ticks, column: usize, name: &str, color: usize) -> Panel {
+    let course = ticks.traces.course(column);
+    let median = Series::line(name, &course.time_s, &course.median).thin();
+    if ticks.traces.is_bare() {
+        return panel.series(median.color(color));
+    }
+    let band = Series::band("", &course.time_s, &course.low, &course.high);
+    panel.series(band.color(color)).series(median.color(color))
+}
+
 fn traces(page: &mut Report, ticks: &Ticks) {
     page.section("Traces");
     let time = || Axis::linear("time", "s");
-    let times_s = ticks.traces.times_s();
-    let [target_um, measured_um, command_um, neutral_um] =
-        std::array::from_fn(|column| ticks.traces.column(column));
-    let caption = match ticks.traces.rows() {
-        1 => "Reference, position, PZT over the whole run.".to_string(),
-        rows => format!(
-            "Reference, position, PZT over the whole run: the smallest and the largest of every {rows} ticks."
-        ),
+    let caption = match ticks.traces.is_bare() {
+        true => "Position and target (above), PZT and zero flow (below) over the whole run.".to_string(),
+        false => "Position and target (above), PZT and zero flow (below) over the whole run: area from the smallest to the largest \
+                  value of each stretch of time, line: median; the target by its two ends."
+            .to_string(),
     };
+    // The target is thin and on top; one that moves fast has an upper and a lower end.
+    let target = ticks.traces.course(0);
+    let mut bead = enveloped(
+        Panel::new(time(), Axis::linear("position", "um")),
+        ticks,
+        1,
+        "measured",
+        0,
+    )
+    .series(
+        Series::line("target", &target.time_s, &target.low)
+            .thin()
+            .color(1),
+    );
+    if !ticks.traces.is_bare() {
+        bead = bead.series(
+            Series::line("", &target.time_s, &target.high)
+                .thin()
+                .color(1),
+        );
+    }
+    let pzt = enveloped(
+        Panel::new(time(), Axis::linear("PZT", "um")),
+        ticks,
+        2,
+        "command",
+        2,
+    );
+    let neutral = ticks.traces.course(3);
+    let pzt = pzt.series(
+        Series::line("zero flow", &neutral.time_s, &neutral.median)
+            .thin()
+            .color(3),
+    );
     page.figure(
         Figure::new("traces", &caption)
-            .panel(
-                Panel::new(time(), Axis::linear("bead", "um"))
-                    .series(
-                        Series::line("measured", &times_s, &measured_um)
-                            .thin()
-                            .color(1),
-                    )
-                    .series(
-                        Series::line("reference", &times_s, &target_um)
-                            .thin()
-                            .color(0),
-                    ),
-            )
-            .panel(
-                Panel::new(time(), Axis::linear("PZT", "um"))
-                    .series(
-                        Series::line("command", &times_s, &command_um)
-                            .thin()
-                            .color(2),
-                    )
-                    .series(Series::line("neutral", &times_s, &neutral_um).color(3)),
-            )
+            .panel(bead)
+            .panel(pzt)
             .share_x(),
     );
     let near = &ticks.excerpt;
@@ -351,9 +390,17 @@ fn traces(page: &mut Report, ticks: &Ticks) {
             "Every tick of the first two seconds of the closed loop.",
         )
         .panel(
-            Panel::new(time(), Axis::linear("bead", "um"))
-                .series(Series::line("reference", &near.time_s, &near.target_um))
-                .series(Series::line("measured", &near.time_s, &near.measured_um).thin()),
+            Panel::new(time(), Axis::linear("position", "um"))
+                .series(
+                    Series::line("measured", &near.time_s, &near.measured_um)
+                        .thin()
+                        .color(0),
+                )
+                .series(
+                    Series::line("target", &near.time_s, &near.target_um)
+                        .thin()
+                        .color(1),
+                ),
         )
         .panel(
             Panel::new(time(), Axis::linear("PZT", "um"))
@@ -363,14 +410,8 @@ fn traces(page: &mut Report, ticks: &Ticks) {
     );
 }
 
-fn errors(page: &mut Report, ticks: &Ticks, bound: Option<&bound::Bound>) {
-    page.section("Error");
-    page.figure(
-        Figure::new("error-histogram", "Error of every position, closed loop.").panel(
-            Panel::new(Axis::linear("error", "nm"), Axis::linear("positions", ""))
-                .series(ticks.error_nm.histogram("error", 80)),
-        ),
-    );
+fn spectrum(page: &mut Report, ticks: &Ticks, meta: Option<&RunMeta>) {
+    page.section("Spectrum of the error");
     let Some(spectrum) = ticks.error_um.spectrum(ticks.period_s()) else {
         page.paragraph("The run is too short for a spectrum.");
         return;
@@ -379,23 +420,29 @@ fn errors(page: &mut Report, ticks: &Ticks, bound: Option<&bound::Bound>) {
         Axis::log("frequency", "Hz"),
         Axis::log("density", "nm/rtHz"),
     )
-    .series(Series::line("error", &spectrum.hz, &spectrum.nm_per_rthz));
-    let mut caption = "Amplitude density of the error, one-sided.".to_string();
-    if let Some(bound) = bound {
-        let density: Vec<f64> = spectrum
-            .hz
-            .iter()
-            .map(|hz| bound.nm_per_rthz(*hz))
-            .collect();
-        panel = panel.series(Series::line("bound", &spectrum.hz, &density).dashed());
-        caption.push_str(&format!(
-            " Dashed: what Brownian motion ({} um2/s), delay and localisation noise leave to the best controller while \
-             holding, {:.1} nm RMS.",
-            bound.diffusion_um2_per_s,
-            bound.rms_um * 1e3
-        ));
+    .series(Series::line("measured", &spectrum.hz, &spectrum.nm_per_rthz).color(0));
+    let mut caption = "Amplitude density of the measured error, one-sided.".to_string();
+    if let Some(predicted) = predicted(meta, ticks, &spectrum.hz) {
+        panel = panel.series(
+            Series::line("predicted", &spectrum.hz, &predicted)
+                .dashed()
+                .color(1),
+        );
+        caption.push_str(
+            " Dashed: what the linear model of this loop predicts for a hold, from Brownian motion and the localisation noise that \
+             vision stated.",
+        );
     }
     page.figure(Figure::new("error-spectrum", &caption).panel(panel));
+}
+
+/// The spectrum that the run's own set-up predicts; none where it cannot be set up again, or the target moves.
+fn predicted(meta: Option<&RunMeta>, ticks: &Ticks, hz: &[f64]) -> Option<Vec<f64>> {
+    let meta = meta.filter(|_| !ticks.target_moves)?;
+    let diffusion = cellpos_session::recorded::diffusion_of_run_um2_per_s(meta)?;
+    let setup = cellpos_session::recorded::setup_of(meta, "run.toml").ok()?;
+    let predicted = setup.predicted_density(diffusion, hz)?;
+    Some(predicted.with_noise_nm(ticks.noise_um() * 1e3))
 }
 
 fn learned(page: &mut Report, run: &Path) -> Result<(), Failure> {

@@ -348,11 +348,9 @@ fn start(args: &Args, ready: Ready, tell: bool) -> Result<Over, Failure> {
     let armed = match rig.arm(&setup, core, sink, EndRule::default()) {
         Ok(armed) => armed,
         Err(not_armed) => {
+            let sink = not_armed.sink.refused(&not_armed.failure);
             drop(view);
-            connect::not_armed(
-                not_armed.sink.into_sink().into_parts().0.close().0,
-                &not_armed.failure,
-            );
+            connect::not_armed(sink.into_parts().0.close().0, &not_armed.failure);
             return Err(not_armed.failure);
         }
     };

@@ -152,10 +152,7 @@ pub fn run(args: Args) -> CommandResult {
     adapt::choose(args.adapt, &mut prepared.controller);
     let mut rig = checked::open(file, options, args.rig.as_deref(), args.anyway)?;
     rig.fit(&mut prepared);
-    let reach = args.sine.map_or(0.0, |sine| sine.amplitude.value());
-    for end in [-reach, reach] {
-        check_target(Micrometers(args.target.value() + end), &rig)?;
-    }
+    check_target(args.target, args.sine.map(|sine| sine.amplitude), &rig)?;
     let better = |name: &'static str| rig.prepare(&args.model, name);
     let predicted = cyclic::predicted(args.sine, args.learn, &prepared, rig.file(), better)?;
     let limits = prepared.controller.limits;
@@ -177,7 +174,8 @@ pub fn run(args: Args) -> CommandResult {
     let recording = Recording::new(
         writer(&args, &rig, &setup)?,
         (!args.json && !args.view.tui() && !crate::output::settings().quiet).then_some(line),
-    );
+    )
+    .steered(steered);
     let end = EndRule {
         ticks,
         ..EndRule::default()
@@ -210,8 +208,9 @@ pub fn run(args: Args) -> CommandResult {
             conclude(&args, &setup, finished, predicted, view)
         }
         Err(not_armed) => {
+            let sink = not_armed.sink.refused(&not_armed.failure);
             drop(view);
-            if let Some(writer) = not_armed.sink.into_sink().into_parts().0.into_writer() {
+            if let Some(writer) = sink.into_parts().0.into_writer() {
                 connect::not_armed(writer, &not_armed.failure);
             }
             let reason = not_armed.failure.to_string();
@@ -312,10 +311,36 @@ fn choose_solver(solver: Option<Solver>, controller: &mut ControllerFile) -> Res
     Ok(())
 }
 
-fn check_target(target: Micrometers, rig: &Rig) -> Result<(), Failure> {
+/// Target, and the ends of a sine about it, have to be in view.
+fn check_target(
+    target: Micrometers,
+    amplitude: Option<Micrometers>,
+    rig: &Rig,
+) -> Result<(), Failure> {
     let [low_um, high_um] = rig.source().field_um;
-    if (low_um..=high_um).contains(&target.value()) {
-        return Ok(());
+    let seen = |um: f64| (low_um..=high_um).contains(&um);
+    if seen(target.value()) {
+        let Some(reach) = amplitude else {
+            return Ok(());
+        };
+        let ends = [
+            target.value() - reach.value(),
+            target.value() + reach.value(),
+        ];
+        if ends.into_iter().all(seen) {
+            return Ok(());
+        }
+        let most = (target.value() - low_um).min(high_um - target.value());
+        return Err(Failure::bad_input(
+            format!(
+                "--sine {reach}: about --target {target} it goes from {:.1}um to {:.1}um, and the camera sees {low_um:.1}um to \
+                 {high_um:.1}um",
+                ends[0], ends[1]
+            ),
+            format!(
+                "write an amplitude of at most {most:.1}um, or move the field of view (origin_px, width_px)"
+            ),
+        ));
     }
     Err(Failure::bad_input(
         format!("--target {target}: outside what the camera sees, {low_um:.1}um to {high_um:.1}um"),
@@ -349,13 +374,19 @@ fn conclude(
     } else {
         summary.state.name()
     };
-    let (sink, kept_clips) = sink.into_inner(&summary, &ended.seen).into_parts();
+    let (sink, kept_clips) = sink.into_inner(&summary, &ended).into_parts();
     // The terminal is given back, and the page is over, before anything is said.
     drop(view);
     warnings.extend(clips::warnings(kept_clips));
-    let kept = sink
-        .into_writer()
-        .map(|writer| connect::finish(writer, outcome, &mut summary, &conditions, &mut warnings));
+    let kept = sink.into_writer().map(|writer| {
+        connect::finish(
+            writer,
+            (outcome, &ended),
+            &mut summary,
+            &conditions,
+            &mut warnings,
+        )
+    });
     let whole = kept.as_ref().is_none_or(|kept| kept.whole);
     let run = kept.map(|kept| kept.run);
     if let (Some(run), Some(table)) = (&run, &learned)

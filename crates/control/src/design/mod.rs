@@ -5,6 +5,8 @@
 //! sample of hold, so the discrete delay is `T / Ts - 1/2` samples.
 
 mod bound;
+mod curves;
+mod density;
 mod learning;
 mod margins;
 mod noise;
@@ -16,6 +18,8 @@ mod step;
 
 pub use crate::uncertainty::{MarginSource, Uncertainty};
 pub use bound::{bound_rms_um, kalman_posterior_um2};
+pub use curves::{loop_response, step_response};
+pub use density::predicted_density_um;
 pub use learning::harmonic_responses;
 pub use margins::{Margins, margins};
 pub use noise::{NoiseFigures, noise_figures};

@@ -65,7 +65,7 @@ fn rig(plant: &DesignPlant) -> Result<SimulatedRig, PlantError> {
 }
 
 /// True positions of a noise-free run: `reference(k)` at each tick, a drift from `SETTLE_TICKS` on.
-fn run(
+pub(crate) fn noise_free(
     plant: &DesignPlant,
     config: &LoopConfig,
     ticks: usize,
@@ -132,7 +132,7 @@ pub fn step_figures(
     config: &LoopConfig,
     size_um: f64,
 ) -> Result<StepFigures, SetUpError> {
-    let (y, largest_move_um) = run(plant, config, 2000, 0.0, |_| size_um)?;
+    let (y, largest_move_um) = noise_free(plant, config, 2000, 0.0, |_| size_um)?;
     let ts = plant.sample_time_s;
     let first = |level: f64| {
         y.iter()
@@ -185,7 +185,7 @@ pub fn cycle_figures(
     let ticks = |s: f64| (s / ts).round() as usize;
     let wish_um = |k: usize| reference.at_um(k as f64 * ts);
     let all = ticks(from_s + 2.0 * span_s);
-    let (y, largest_move_um) = run(plant, config, all, 0.0, wish_um)?;
+    let (y, largest_move_um) = noise_free(plant, config, all, 0.0, wish_um)?;
     let from = ticks(from_s + span_s);
     let squares = y.iter().enumerate().skip(from);
     let squares = squares.map(|(k, um)| (um - wish_um(k)).powi(2));
@@ -209,7 +209,7 @@ pub fn disturbance_figures(
     config: &LoopConfig,
     drift_um_per_s: f64,
 ) -> Result<DisturbanceFigures, SetUpError> {
-    let (y, _) = run(plant, config, 4000, drift_um_per_s, |_| 0.0)?;
+    let (y, _) = noise_free(plant, config, 4000, drift_um_per_s, |_| 0.0)?;
     let peak_um = y.iter().fold(0.0_f64, |m, p| m.max(p.abs()));
     Ok(DisturbanceFigures {
         drift_um_per_s,

@@ -256,14 +256,20 @@ fn on_rig(
             Some(trouble) => {
                 let (done, of) = (records.len(), plan.segments.len());
                 if let Some(pages) = pages {
-                    pages.over(&format!("{trouble}; {done} of {of} segments are measured."));
+                    pages.over(
+                        false,
+                        &format!("{trouble}; {done} of {of} segments are measured."),
+                    );
                 }
                 return Err(stopped(job, plan, &records, &trouble)?);
             }
         }
     }
     if let Some(pages) = pages {
-        pages.over("all segments are measured, and the model is being fitted.");
+        pages.over(
+            true,
+            "all segments are measured, and the model is being fitted.",
+        );
     }
     let led = match (job.led_edges, rig.file.is_emulated()) {
         (0, _) => None,

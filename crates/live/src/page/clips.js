@@ -1,6 +1,7 @@
 // The clips that were kept of the run: a list, and one of them to be played or stepped through.
 
 import { wordOfLink } from "/wire.js";
+import { isRed } from "/theme.js";
 
 // A clip as the program sends it: head, then time, centre and pixels of each frame, padded to eight bytes.
 export function readFilm(buffer) {
@@ -82,10 +83,10 @@ export class Clips {
     this.$("clip-at").value = n;
     const canvas = this.$("clip"), scale = Math.max(1, Math.round(canvas.clientWidth * (window.devicePixelRatio || 1) / film.width));
     canvas.width = film.width * scale; canvas.height = film.height * scale;
-    const context = canvas.getContext("2d"), image = new ImageData(film.width, film.height), [low, stretch] = this.grey;
+    const context = canvas.getContext("2d"), image = new ImageData(film.width, film.height), [low, stretch] = this.grey, red = isRed();
     for (let k = 0; k < frame.pixels.length; k++) {
       const value = (frame.pixels[k] - low) * stretch;
-      image.data[4 * k] = value; image.data[4 * k + 1] = value; image.data[4 * k + 2] = value; image.data[4 * k + 3] = 255;
+      image.data[4 * k] = value; image.data[4 * k + 1] = red ? 0 : value; image.data[4 * k + 2] = red ? 0 : value; image.data[4 * k + 3] = 255;
     }
     this.small ??= document.createElement("canvas");
     this.small.width = film.width; this.small.height = film.height;
@@ -94,7 +95,7 @@ export class Clips {
     context.drawImage(this.small, 0, 0, canvas.width, canvas.height);
     if (isFinite(frame.centre[0])) {
       const x = (frame.centre[0] + 0.5) * scale, y = (frame.centre[1] + 0.5) * scale, arm = 5 * scale;
-      context.strokeStyle = "#5ad1ff"; context.lineWidth = Math.max(1.5, scale / 3); context.beginPath();
+      context.strokeStyle = red ? "#ff5a4a" : "#5ad1ff"; context.lineWidth = Math.max(1.5, scale / 3); context.beginPath();
       for (const [dx, dy] of [[1, 0], [-1, 0], [0, 1], [0, -1]]) { context.moveTo(x + dx * arm, y + dy * arm); context.lineTo(x + 2 * dx * arm, y + 2 * dy * arm); }
       context.stroke();
     }

@@ -81,11 +81,14 @@ function axes(canvas, [xLow, xHigh], [yLow, yHigh], xLabel, yLabel) {
   return { context, x, y, left, right: width - right, bottom: height - bottom };
 }
 
-export function drawSpectrum(canvas, rows, rate, bound) {
+// The error's spectrum and what the loop's own linear model predicts of it.
+export function drawSpectrum(canvas, rows, rate, predicted, noise) {
   const errors = newestErrors(rows, Math.min(16 * SEGMENT, Math.round(8 * rate)));
   const found = density(errors, rate);
-  const peak = Math.max(1, ...found.map(([, a]) => a)), least = Math.min(...found.map(([, a]) => a || Infinity), peak / 100);
-  const frame = axes(canvas, [rate / SEGMENT, rate / 2], [Math.max(1e-3, least / 1.5), peak * 1.5], "Hz", "nm/√Hz");
+  const within = predicted.map(([f, walk, fix]) => [f, Math.hypot(walk, fix * (noise ?? 0))]).filter(([f, a]) => f >= rate / SEGMENT && f <= rate / 2 && a > 0);
+  const all = [...found, ...within].map(([, a]) => a).filter(a => a > 0);
+  const peak = Math.max(1, ...all), least = Math.min(peak / 100, ...all);
+  const frame = axes(canvas, [rate / SEGMENT, rate / 2], [Math.max(1e-3, peak / 1e4, least / 1.5), peak * 1.5], "Hz", "nm/√Hz");
   const line = (points, paint, dash) => {
     frame.context.strokeStyle = paint; frame.context.lineWidth = 1.6; frame.context.setLineDash(dash);
     frame.context.save(); frame.context.beginPath(); frame.context.rect(frame.left, 0, frame.right - frame.left, frame.bottom); frame.context.clip();
@@ -94,12 +97,12 @@ export function drawSpectrum(canvas, rows, rate, bound) {
     frame.context.stroke(); frame.context.restore(); frame.context.setLineDash([]);
   };
   line(found, colour("position"), []);
+  line(within, colour("target"), [6, 4]);
   frame.context.textAlign = "left"; frame.context.textBaseline = "top";
-  frame.context.fillStyle = colour("position"); frame.context.fillText("error", frame.left + 8, 10);
-  if (bound.length) {
-    line(bound.filter(([f, a]) => f >= rate / SEGMENT && f <= rate / 2 && a > 0), colour("target"), [6, 4]);
-    frame.context.fillStyle = colour("target"); frame.context.fillText("lowest possible", frame.left + 48, 10);
-  }
+  [["error", "position"], ...(within.length ? [["predicted for this loop while it holds", "target"]] : [])].forEach(([name, paint], n) => {
+    frame.context.fillStyle = colour("card"); frame.context.fillRect(frame.left + 5, frame.bottom - 37 + 15 * n, frame.context.measureText(name).width + 6, 15);
+    frame.context.fillStyle = colour(paint); frame.context.fillText(name, frame.left + 8, frame.bottom - 36 + 15 * n);
+  });
 }
 
 const BINS = 60, LEAST_US = 1, MOST_US = 1e5;
@@ -118,7 +121,7 @@ export class Lateness {
   }
   draw(canvas, budget) {
     const most = Math.max(10, ...this.wake, ...this.compute);
-    const frame = axes(canvas, [LEAST_US, MOST_US], [0.7, most * 1.5], "us", "ticks");
+    const frame = axes(canvas, [LEAST_US, MOST_US], [0.7, most * 1.5], "µs", "ticks");
     const { context } = frame;
     [[this.wake, "target", "wake-up"], [this.compute, "position", "computing"]].forEach(([counts, paint, label], n) => {
       context.strokeStyle = colour(paint); context.lineWidth = 1.8; context.beginPath();
@@ -149,7 +152,7 @@ function bin(us) {
 
 // Amplitude, stretch and recovery over the cycles, each in a strip of its own.
 export function drawCycles(canvas, cycles) {
-  const strips = [["amplitude_um", "amplitude, um", "position"], ["stretch", "stretch", "pzt"], ["recovery_s", "recovery, s", "target"]]
+  const strips = [["amplitude_um", "amplitude, µm", "position"], ["stretch", "stretch", "pzt"], ["recovery_s", "recovery, s", "target"]]
     .map(([key, label, paint]) => ({ label, paint, points: cycles.filter(c => c[key] !== null).map(c => [c.cycle, c[key]]) }))
     .filter(strip => strip.points.length > 1);
   const context = sharp(canvas);

@@ -1,6 +1,9 @@
 // Traces over time: panels on one canvas, each pixel column drawn from the least to the greatest of its rows, so that no
 // excursion of a single tick is lost whatever the time base.
 
+import { RMS_S } from "/wire.js";
+import { isRed } from "/theme.js";
+
 export function sharp(canvas) {
   const ratio = window.devicePixelRatio || 1;
   const width = Math.round(canvas.clientWidth * ratio), height = Math.round(canvas.clientHeight * ratio);
@@ -42,57 +45,79 @@ export function number(value, span) {
   return (Math.abs(value) < 1e-12 ? 0 : value).toFixed(digits);
 }
 
-const LEFT = 74, RIGHT = 10, TOP = 8, BOTTOM = 24, GAP = 12;
+const LEFT = 74, RIGHT = 10, TOP = 8, BOTTOM = 26, GAP = 12;
+// What can be drawn. A panel that is bound to zero keeps it in its middle or at its foot.
 export const PANELS = [
-  { share: 0.42, unit: "um", series: [["measured", "position", "position"], ["target", "target", "target"]] },
-  { share: 0.29, unit: "nm", series: [["error", "error", "position"]], zero: true },
-  { share: 0.29, unit: "um", series: [["command", "PZT", "pzt"], ["zeroFlow", "zero flow", "zero-flow"]] },
+  { id: "position", name: "Position", unit: "µm", share: 1.4, series: [["measured", "position", "position"], ["target", "target", "target"]] },
+  { id: "error", name: "Error", unit: "nm", share: 1, zero: true, series: [["error", "error", "position"]] },
+  { id: "pzt", name: "PZT", unit: "µm", share: 1, series: [["command", "PZT", "pzt"], ["zeroFlow", "zero flow", "zero-flow"]] },
+  { id: "gain", name: "Gain", unit: "of the model's", share: 1, series: [["gain", "estimated gain", "pzt"]] },
+  { id: "length", name: "Length", unit: "µm", share: 1, series: [["length", "length of the cell", "position"]] },
+  { id: "area", name: "Area", unit: "µm²", share: 1, series: [["area", "area of the cell", "position"]] },
+  { id: "lateness", name: "Lateness", unit: "µs", share: 1, foot: true, series: [["wake", "wake-up", "target"], ["compute", "computing", "position"]] },
 ];
+// While the target rests, the error is the position once more: its running RMS says what the position does not.
+const HOLDING = { id: "error", name: "Error", unit: "nm", share: 1, foot: true, series: [["rms", `error, RMS of ${1e3 * RMS_S} ms`, "position"]] };
 
 export class Traces {
-  constructor(canvas, rows) { this.canvas = canvas; this.rows = rows; this.cursor = null; }
+  constructor(canvas, rows) {
+    this.canvas = canvas; this.rows = rows; this.cursor = null; this.bound = null;
+    this.chosen = new Set(["position", "error", "pzt"]);
+    this.scales = {}; // a panel's own [low, high]; without one it follows its data
+    this.drawn = []; // panels as they were drawn: {id, top, bottom, low, high}
+  }
   // Seconds of the run at a place of the canvas.
   timeAt(x) {
     const width = this.canvas.clientWidth - LEFT - RIGHT;
     return this.from + (x - LEFT) / width * (this.to - this.from);
+  }
+  get perPixel() { return (this.to - this.from) / Math.max(1, this.canvas.clientWidth - LEFT - RIGHT); }
+  onAxis(x) { return x < LEFT; }
+  panelAt(y) { return this.drawn.find(panel => y >= panel.top && y <= panel.bottom); }
+  // Makes a panel's scale finer or coarser about a value of it.
+  zoom(panel, y, factor) {
+    const value = panel.low + (panel.bottom - y) / (panel.bottom - panel.top) * (panel.high - panel.low);
+    this.scales[panel.id] = [value + (panel.low - value) * factor, value + (panel.high - value) * factor];
+  }
+  // The panels that are drawn of a span of time.
+  panels(from, to) {
+    const holding = this.chosen.has("position") && this.rows.atRest(from, to);
+    return PANELS.filter(panel => this.chosen.has(panel.id)).map(panel => panel.id === "error" && holding ? HOLDING : panel);
   }
   draw(from, to, mark) {
     const { rows } = this;
     const context = sharp(this.canvas);
     const width = this.canvas.clientWidth, height = this.canvas.clientHeight;
     this.from = from; this.to = to;
-    const plotWidth = width - LEFT - RIGHT;
-    const columns = Math.max(1, Math.floor(plotWidth));
+    const plotWidth = width - LEFT - RIGHT, columns = Math.max(1, Math.floor(plotWidth));
     const first = rows.after(from), last = rows.after(to);
     const x = time => LEFT + (time - from) / (to - from) * plotWidth;
     context.font = "12px system-ui, sans-serif";
-    const room = height - TOP - BOTTOM - GAP * (PANELS.length - 1);
+    const panels = this.panels(from, to), shares = panels.reduce((sum, panel) => sum + panel.share, 0);
+    const room = height - TOP - BOTTOM - GAP * (panels.length - 1);
     let top = TOP;
-    for (const panel of PANELS) {
-      const tall = room * panel.share;
+    this.drawn = [];
+    for (const panel of panels) {
+      const tall = room * panel.share / shares;
       const found = panel.series.map(([key]) => reduce(rows, rows[key], first, last, from, to, columns));
-      let low = Math.min(...found.map(f => f.low)), high = Math.max(...found.map(f => f.high));
-      if (!(low <= high)) { low = -1; high = 1; }
-      if (panel.zero) { high = Math.max(high, -low, 1e-3); low = -high; }
-      const margin = Math.max(0.06 * (high - low), panel.unit === "nm" ? 5 : 0.01);
-      low -= margin; high += margin;
+      const bound = panel === HOLDING && this.bound !== null ? this.bound : null;
+      const [low, high] = this.scales[panel.id] ?? limits(panel, found, bound);
+      this.drawn.push({ id: panel.id, top, bottom: top + tall, low, high });
       const y = value => top + tall - (value - low) / (high - low) * tall;
-      context.strokeStyle = colour("line"); context.fillStyle = colour("quiet"); context.lineWidth = 1;
-      context.textAlign = "right"; context.textBaseline = "middle";
-      for (const value of steps(low, high, Math.max(2, tall / 42))) {
-        context.beginPath(); context.moveTo(LEFT, y(value)); context.lineTo(width - RIGHT, y(value)); context.stroke();
-        context.fillText(number(value, high - low), LEFT - 6, y(value));
-      }
-      context.save();
-      context.translate(13, top + tall / 2); context.rotate(-Math.PI / 2); context.textAlign = "center";
-      context.fillText(panel.unit, 0, 0); context.restore();
+      grid(context, panel, { low, high, y, top, tall, width });
       context.save();
       context.beginPath(); context.rect(LEFT, top, plotWidth, tall); context.clip();
-      panel.series.forEach(([, , paint], n) => stroke(context, found[n], colour(paint), y));
+      if (bound !== null) {
+        context.strokeStyle = colour("target"); context.lineWidth = 1.2; context.setLineDash([6, 4]); context.beginPath();
+        context.moveTo(LEFT, y(bound)); context.lineTo(width - RIGHT, y(bound)); context.stroke(); context.setLineDash([]);
+      }
+      panel.series.forEach(([, , paint], n) => stroke(context, found[n], colour(paint), y, isRed() && ["target", "zero-flow"].includes(paint)));
       context.restore();
       context.textAlign = "left"; context.textBaseline = "top";
       let at = LEFT + 6;
-      for (const [, label, paint] of panel.series) {
+      const names = panel.series.map(([, label, paint]) => [label, paint]);
+      if (bound !== null) names.push([`lowest possible RMS, ${bound.toFixed(1)} nm`, "target"]);
+      for (const [label, paint] of names) {
         context.fillStyle = colour("card"); context.fillRect(at - 2, top + 1, context.measureText(label).width + 4, 15);
         context.fillStyle = colour(paint); context.fillText(label, at, top + 2);
         at += context.measureText(label).width + 14;
@@ -116,11 +141,34 @@ export class Traces {
     const i = Math.min(rows.count - 1, rows.after(this.cursor));
     const k = rows.at(i);
     const say = (value, digits) => isFinite(value) ? value.toFixed(digits) : "-";
-    return `${rows.time[k].toFixed(3)} s: position ${say(rows.measured[k], 3)} um, target ${say(rows.target[k], 3)} um, `
-      + `error ${say(rows.error[k], 0)} nm, PZT ${say(rows.command[k], 3)} um, zero flow ${say(rows.zeroFlow[k], 3)} um`
-      + (isFinite(rows.length[k]) ? `, length ${say(rows.length[k], 3)} um` : "")
-      + `, wake-up ${say(rows.wake[k], 0)} us, computing ${say(rows.compute[k], 0)} us`;
+    return `${rows.time[k].toFixed(3)} s: position ${say(rows.measured[k], 3)} µm, target ${say(rows.target[k], 3)} µm, `
+      + `error ${say(rows.error[k], 0)} nm, PZT ${say(rows.command[k], 3)} µm, zero flow ${say(rows.zeroFlow[k], 3)} µm`
+      + (isFinite(rows.gain[k]) ? `, gain ${say(rows.gain[k], 2)} of the model's` : "")
+      + (isFinite(rows.length[k]) ? `, length ${say(rows.length[k], 3)} µm` : "")
+      + (isFinite(rows.area[k]) ? `, area ${say(rows.area[k], 2)} µm²` : "")
+      + `, wake-up ${say(rows.wake[k], 0)} µs, computing ${say(rows.compute[k], 0)} µs`;
   }
+}
+
+// Ends of a panel's scale, from its data.
+function limits(panel, found, bound) {
+  let low = Math.min(...found.map(f => f.low)), high = Math.max(...found.map(f => f.high), bound ?? -Infinity);
+  if (!(low <= high)) { low = -1; high = 1; }
+  if (panel.zero) { high = Math.max(high, -low, 1e-3); low = -high; }
+  const margin = Math.max(0.08 * (high - low), panel.unit === "nm" ? 5 : 0.01);
+  return panel.foot ? [0, high + margin] : [low - margin, high + margin];
+}
+
+function grid(context, panel, { low, high, y, top, tall, width }) {
+  context.strokeStyle = colour("line"); context.fillStyle = colour("quiet"); context.lineWidth = 1;
+  context.textAlign = "right"; context.textBaseline = "middle";
+  for (const value of steps(low, high, Math.max(2, tall / 42))) {
+    context.beginPath(); context.moveTo(LEFT, y(value)); context.lineTo(width - RIGHT, y(value)); context.stroke();
+    context.fillText(number(value, high - low), LEFT - 6, y(value));
+  }
+  context.save();
+  context.translate(13, top + tall / 2); context.rotate(-Math.PI / 2); context.textAlign = "center";
+  context.fillText(panel.unit, 0, 0); context.restore();
 }
 
 // Least and greatest of each pixel column; where columns outnumber rows, the rows themselves.
@@ -150,7 +198,9 @@ function reduce(rows, values, first, last, from, to, columns) {
   return found;
 }
 
-function stroke(context, found, paint, y) {
+// In red light colours say nothing: then a second curve is dashed.
+function stroke(context, found, paint, y, dashed) {
+  context.setLineDash(dashed ? [5, 4] : []);
   context.strokeStyle = paint; context.lineWidth = 1.4; context.lineJoin = "round";
   context.beginPath();
   for (const [column, first, low, high, last, broken] of found.points) {
@@ -160,4 +210,5 @@ function stroke(context, found, paint, y) {
     context.lineTo(x, y(last));
   }
   context.stroke();
+  context.setLineDash([]);
 }

@@ -1,21 +1,26 @@
 // The line to the program: messages in, requests out, and a new line when the old one breaks.
 
-const ROW_BYTES = 56;
+const ROW_BYTES = 64;
 const PICTURE_HEAD = 40;
+// Time over which the running RMS of the error is taken, s: long against the loop's own memory (1/6T, some 15 ms), short against a
+// disturbance that an operator looks for.
+export const RMS_S = 0.25;
 const word = new URLSearchParams(location.search).get("word") ?? "";
 export const wordOfLink = word;
 
 // Columns of typed arrays in which the newest rows overwrite the oldest; nothing grows while a run goes on.
 export class Rows {
-  constructor(capacity) {
+  constructor(capacity, perSecond) {
     this.capacity = capacity;
+    this.window = Math.min(capacity, Math.max(1, Math.round(RMS_S * (perSecond ?? 1000))));
     this.time = new Float64Array(capacity);
-    for (const name of ["measured", "target", "error", "command", "zeroFlow", "length", "wake", "compute"]) {
+    for (const name of ["measured", "target", "error", "rms", "command", "zeroFlow", "length", "area", "gain", "wake", "compute"]) {
       this[name] = new Float32Array(capacity);
     }
     this.count = 0; // rows ever taken; row i lies at i % capacity
     this.lastSeq = null;
     this.missing = 0;
+    this.squares = 0; this.counted = 0;
   }
   get first() { return Math.max(0, this.count - this.capacity); }
   at(i) { return i % this.capacity; }
@@ -32,6 +37,7 @@ export class Rows {
       this.lastSeq = seq;
       const k = this.at(this.count);
       const f = n => view.getFloat32(at + 16 + 4 * n, true);
+      this.running(1e3 * (f(0) - f(2)), k);
       this.time[k] = view.getFloat64(at, true);
       this.measured[k] = f(0);
       this.target[k] = f(1);
@@ -41,8 +47,21 @@ export class Rows {
       this.length[k] = f(5);
       this.wake[k] = f(6);
       this.compute[k] = f(7);
+      this.area[k] = f(8);
+      this.gain[k] = f(9);
       this.count++;
     }
+  }
+  // The RMS of the newest errors: one comes, one leaves.
+  running(error, k) {
+    if (this.count >= this.window) {
+      const old = this.error[this.at(this.count - this.window)];
+      if (old === old) { this.squares -= old * old; this.counted--; }
+    }
+    // As the column keeps it, so that what leaves is what came.
+    const kept = Math.fround(error);
+    if (kept === kept) { this.squares += kept * kept; this.counted++; }
+    this.rms[k] = this.counted > this.window / 2 ? Math.sqrt(Math.max(0, this.squares) / this.counted) : NaN;
   }
   // Index of the first row at or after a time; times rise.
   after(time) {
@@ -54,6 +73,18 @@ export class Rows {
     return low;
   }
   get newest() { return this.count ? this.time[this.at(this.count - 1)] : 0; }
+  get oldest() { return this.count ? this.time[this.at(this.first)] : 0; }
+  // Whether the target is at rest between two times.
+  atRest(from, to) {
+    const first = this.after(from), last = this.after(to);
+    let low = Infinity, high = -Infinity;
+    for (let i = first; i < last; i++) {
+      const value = this.target[this.at(i)];
+      if (value < low) low = value;
+      if (value > high) high = value;
+    }
+    return !(high > low);
+  }
 }
 
 export function readPicture(view) {
@@ -71,6 +102,7 @@ export class Wire {
   constructor(handlers) {
     this.handlers = handlers;
     this.wait = 250;
+    this.asked = []; // where the answers to what was asked are to be shown, in order
     this.connect();
   }
   connect() {
@@ -78,26 +110,33 @@ export class Wire {
     socket.binaryType = "arraybuffer";
     socket.onopen = () => { this.wait = 250; };
     socket.onmessage = message => {
-      if (typeof message.data === "string") this.handlers.told(JSON.parse(message.data));
-      else {
+      if (typeof message.data === "string") {
+        const told = JSON.parse(message.data);
+        const answer = told.refused ?? (told.done ? "" : undefined);
+        if (answer !== undefined) this.handlers.answered(answer, this.asked.shift());
+        else this.handlers.told(told);
+      } else {
         const view = new DataView(message.data);
         if (view.getUint8(0) === 1) this.handlers.rows(view);
         else if (view.getUint8(0) === 2) this.handlers.picture(readPicture(view));
       }
     };
     socket.onclose = () => {
-      this.handlers.closed();
+      for (const where of this.asked.splice(0)) this.handlers.answered("The line broke before the answer came.", where);
+      // After its last word a program is not looked for any more.
+      if (this.handlers.closed()) return;
       setTimeout(() => this.connect(), this.wait);
       this.wait = Math.min(4000, 2 * this.wait);
     };
     this.socket = socket;
   }
-  // A request goes by the line; where that is down, by a request of its own, so that a stop key always works.
-  ask(request) {
+  // A request goes by the line; where that is down, by a request of its own, so that a stop key always works. Its answer comes to
+  // `where`: empty if it was done.
+  ask(request, where) {
     const text = JSON.stringify(request);
-    if (this.socket.readyState === WebSocket.OPEN) { this.socket.send(text); return; }
+    if (this.socket.readyState === WebSocket.OPEN) { this.asked.push(where); this.socket.send(text); return; }
     fetch(`/do?word=${encodeURIComponent(word)}`, { method: "POST", body: text })
-      .then(async answer => { if (!answer.ok) this.handlers.told({ refused: await answer.text() }); })
-      .catch(() => this.handlers.told({ refused: "The program does not answer. The board parks by itself when it is gone." }));
+      .then(async answer => this.handlers.answered(answer.ok ? "" : await answer.text(), where))
+      .catch(() => this.handlers.answered("The program does not answer. Without it the board parks the PZT.", where));
   }
 }

@@ -1,5 +1,6 @@
 //! The page of a PZT that is moved by hand: no loop is closed, and nothing is recorded.
 
+use super::last_word;
 use super::live_view::View;
 use super::watcher::Watcher;
 use crate::words::Level;
@@ -66,6 +67,6 @@ impl ByHand {
 
     /// It is over, for a reason in a sentence.
     pub fn over(mut self, reason: &str) {
-        self.watcher.over(false, reason);
+        self.watcher.over(last_word::of_reason("stopped", reason));
     }
 }

@@ -6,7 +6,6 @@ use crate::setup::Setup;
 use cellpos_control::ADAPT_COLUMNS;
 use cellpos_control::design::bound_rms_um;
 use cellpos_live::Hello;
-use std::f64::consts::PI;
 
 /// What the page says of the run.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -30,6 +29,7 @@ pub(super) fn hello(rig: &Rig, setup: &Setup, page: &Page) -> Hello {
     Hello {
         view_um: source.field_um,
         pictures: source.width_px > 0,
+        cell: rig.file().follows_a_cell(),
         ..hello_of(setup, diffusion, page)
     }
 }
@@ -48,7 +48,7 @@ pub(super) fn hello_of(setup: &Setup, diffusion: f64, page: &Page) -> Hello {
         slew_um_per_s: limits.slew_um_per_s,
         budget_us: timing.budget_us,
         bound_nm: (diffusion > 0.0).then(|| 1e3 * bound_rms_um(diffusion, 0.0, delay_s, period_s)),
-        bound_spectrum: lowest_spectrum(diffusion, delay_s + period_s, 0.5 / period_s),
+        predicted_spectrum: predicted_spectrum(setup, diffusion),
         adaptation_at: adaptation_at(setup),
         steered: page.steered,
         script: page.script,
@@ -64,43 +64,21 @@ fn adaptation_at(setup: &Setup) -> Option<usize> {
     law.columns().iter().position(|name| name == first)
 }
 
-/// Amplitude spectral density (nm/sqrt(Hz), one-sided) of the lowest possible error: Brownian motion of the last `blind_s`
-/// seconds, which no command could answer yet, up to `end_hz`. Its square integrates to 2 D times `blind_s`.
-fn lowest_spectrum(diffusion_um2_per_s: f64, blind_s: f64, end_hz: f64) -> Vec<[f64; 2]> {
-    const POINTS: usize = 300;
-    if diffusion_um2_per_s.is_nan() || diffusion_um2_per_s <= 0.0 {
-        return vec![];
-    }
+/// What the linear model of the loop predicts for the measured error while it holds (see [`Hello::predicted_spectrum`]), up to half
+/// the sampling rate; empty for a law without a linear form, a model without noise, or a loop that the model calls unstable.
+fn predicted_spectrum(setup: &Setup, diffusion_um2_per_s: f64) -> Vec<[f64; 3]> {
+    const POINTS: usize = 200;
+    let end_hz = 0.5e6 / setup.config.timing.period_us;
     let low_hz = 0.5_f64.min(0.1 * end_hz);
-    (0..=POINTS)
-        .map(|n| {
-            let hz = low_hz * (end_hz / low_hz).powf(n as f64 / POINTS as f64);
-            let per_s = PI * hz;
-            let density = 4.0 * diffusion_um2_per_s * ((per_s * blind_s).sin() / per_s).powi(2);
-            [hz, 1e3 * density.sqrt()]
-        })
+    let hz: Vec<f64> = (0..POINTS)
+        .map(|n| low_hz * (end_hz / low_hz).powf(n as f64 / POINTS as f64))
+        .collect();
+    let Some(prediction) = setup.predicted_density(diffusion_um2_per_s, &hz) else {
+        return vec![];
+    };
+    let parts = prediction.walk_nm.iter().zip(&prediction.per_noise);
+    hz.iter()
+        .zip(parts)
+        .map(|(hz, (walk, fix))| [*hz, *walk, *fix])
         .collect()
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn the_lowest_spectrum_integrates_to_the_lowest_error() {
-        let (diffusion, blind_s) = (0.33, 3e-3);
-        let spectrum = lowest_spectrum(diffusion, blind_s, 50_000.0);
-        let below = spectrum[0][0] * spectrum[0][1].powi(2);
-        let squares: f64 = spectrum
-            .windows(2)
-            .map(|pair| 0.5 * (pair[1][0] - pair[0][0]) * (pair[0][1].powi(2) + pair[1][1].powi(2)))
-            .sum();
-        let rms_nm = (squares + below).sqrt();
-        let bound_nm = 1e3 * bound_rms_um(diffusion, 0.0, 2e-3, 1e-3);
-        assert!(
-            (rms_nm / bound_nm - 1.0).abs() < 0.02,
-            "{rms_nm} {bound_nm}"
-        );
-        assert!(lowest_spectrum(0.0, blind_s, 500.0).is_empty());
-    }
 }

@@ -1,6 +1,7 @@
 //! The page and the screen of a command that holds a rig.
 
 use super::hello::{Page, hello};
+use super::last_word;
 use super::pictures::Pictures;
 use super::watcher::Watcher;
 use crate::beside::beside_the_loop;
@@ -211,10 +212,11 @@ impl Pages {
         Ok(self.view.as_mut())
     }
 
-    /// Nothing follows any more, for a reason in a sentence.
-    pub fn over(&mut self, reason: &str) {
+    /// Nothing follows any more, for a reason in a sentence; whether everything was done.
+    pub fn over(&mut self, done: bool, reason: &str) {
         if let Some(watcher) = self.view.as_mut().and_then(|view| view.watcher.as_mut()) {
-            watcher.over(false, reason);
+            let how = if done { "done" } else { "stopped" };
+            watcher.over(last_word::of_reason(how, reason));
         }
     }
 }

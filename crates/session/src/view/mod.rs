@@ -7,6 +7,7 @@
 mod by_hand;
 mod cycle;
 mod hello;
+mod last_word;
 mod live_view;
 mod pictures;
 mod tail;

@@ -1,7 +1,10 @@
 //! A sink that shows what passes through it.
 
+use super::last_word;
 use super::live_view::View;
 use super::watcher::{Shown, Watcher};
+use crate::ended::Ended;
+use crate::failure::Failure;
 use crate::words::Level;
 use cellpos_runtime::{Event, RunSink, Statistics, Summary, TickRecord};
 use std::sync::mpsc::Receiver;
@@ -20,7 +23,7 @@ impl<S> Viewed<S> {
     }
 
     /// The sink within. The page shows the summary's own figures from now on.
-    pub fn into_inner(self, summary: &Summary, ended: &str) -> S {
+    pub fn into_inner(self, summary: &Summary, ended: &Ended) -> S {
         if let Some((mut watcher, _)) = self.page {
             watcher.conclude(summary, ended);
         }
@@ -36,8 +39,11 @@ impl<S> Viewed<S> {
         self.sink
     }
 
-    /// The sink within, of a run that did not come to a summary.
-    pub fn into_sink(self) -> S {
+    /// The sink within, of a run whose board could not be armed: the page says why.
+    pub fn refused(self, failure: &Failure) -> S {
+        if let Some((mut watcher, _)) = self.page {
+            watcher.over(last_word::of_refusal(failure));
+        }
         self.sink
     }
 }

@@ -2,6 +2,7 @@
 
 use super::cycle::cycle_row;
 use super::hello::{Page, hello_of};
+use super::last_word;
 use super::live_view::{ViewAddress, config, film_of};
 use super::watcher::Watcher;
 use crate::clips;
@@ -184,6 +185,7 @@ impl Watch {
         }
         let state = &mut self.watcher.state;
         state.rms_nm = self.statistics.rms_measured_nm();
+        state.fix_noise_nm = self.statistics.fix_noise_um().map(|um| um * 1e3);
         let silent = self.changed.elapsed() > SILENT_AFTER;
         // The end is written behind the last row: it is looked for when none comes any more.
         let end = (self.changed.elapsed() > SILENT_AFTER / 5)
@@ -194,15 +196,15 @@ impl Watch {
             conclude(&mut self.watcher, &end);
             return;
         }
+        // A run that is written again takes its last word back.
+        state.last_word = None;
         if silent {
+            let word = last_word::of_gone(self.changed.elapsed().as_secs());
             state.banner = Banner {
                 state: "disconnected",
-                reason: format!(
-                    "Nothing was written for {} s, and the run has no end: the program is gone, or its disk is. What is shown is \
-                     old.",
-                    self.changed.elapsed().as_secs()
-                ),
+                reason: word.seen.clone(),
             };
+            state.last_word = Some(word);
         } else if let Some(last) = &self.last {
             self.watcher.state.banner = self.watcher.banner(last);
         }
@@ -255,6 +257,7 @@ fn conclude(watcher: &mut Watcher, end: &RunEnd) {
     let count = |key: &str, counted: u64| number(key).map_or(counted, |n| n as u64);
     let state = &mut watcher.state;
     state.rms_nm = number("rms_measured_nm").or(state.rms_nm);
+    state.fix_noise_nm = number("fix_noise_nm").or(state.fix_noise_nm);
     state.late = count("late", state.late);
     state.skipped = count("skipped", state.skipped);
     state.frames_lost = count("frames_lost", state.frames_lost);
@@ -267,7 +270,7 @@ fn conclude(watcher: &mut Watcher, end: &RunEnd) {
     };
     state.wake_us = tail("wake_us").or(state.wake_us);
     state.compute_us = tail("tick_us").or(state.compute_us);
-    watcher.over(end.outcome == "safe", &format!("{}.", end.outcome));
+    watcher.over(last_word::of_record(end));
 }
 
 fn text<'e>(event: &'e Event, key: &str) -> Option<&'e str> {

@@ -1,9 +1,11 @@
 //! What page and screen are told of a run, from what its recorder is given.
 
+use super::last_word;
 use super::tail::Tail;
 use crate::adapt;
+use crate::ended::Ended;
 use crate::words::{Level, safe_reason, sentence};
-use cellpos_live::{Banner, ClipLine, CycleRow, EventLine, Feed, Row, State};
+use cellpos_live::{Banner, ClipLine, CycleRow, EventLine, Feed, LastWord, Row, State};
 use cellpos_runtime::life::EventKind;
 use cellpos_runtime::{EndState, Event, Life, NoSink, Statistics, Summary, TickFlags, TickRecord};
 
@@ -66,11 +68,9 @@ impl Watcher {
     }
 
     /// The same for a run whose record has the columns of adaptation there.
-    pub(super) fn with_adaptation(self, adaptation_at: Option<usize>) -> Self {
-        Self {
-            adaptation_at,
-            ..self
-        }
+    pub(super) fn with_adaptation(mut self, adaptation_at: Option<usize>) -> Self {
+        self.adaptation_at = adaptation_at;
+        self
     }
 
     /// What comes from now on is of another run: it is shown behind what there was.
@@ -125,11 +125,22 @@ impl Watcher {
             command_um: record.command_um as f32,
             zero_flow_um: record.neutral_um as f32,
             length_um: record.length_um as f32,
+            area_um2: record.area_um2 as f32,
+            gain: self.gain(record),
             wake_us: record.wake_ns as f32 * 1e-3,
             compute_us: record.compute_ns as f32 * 1e-3,
             flags: record.flags.0,
             life: record.life,
         });
+    }
+
+    /// The plant's gain over the model's as adaptation estimates it; NaN where it does not.
+    fn gain(&self, record: &TickRecord) -> f32 {
+        let columns = self.adaptation_at.and_then(|at| record.law.get(at..));
+        columns
+            .and_then(adapt::recorded)
+            .and_then(|now| now.gain_estimate)
+            .map_or(f32::NAN, |[gain, _]| gain as f32)
     }
 
     /// Counts a tick.
@@ -189,6 +200,7 @@ impl Watcher {
             return;
         };
         self.state.rms_nm = statistics.rms_measured_nm();
+        self.state.fix_noise_nm = statistics.fix_noise_um().map(|um| um * 1e3);
         self.tails();
         self.stands(record, sink);
     }
@@ -229,10 +241,12 @@ impl Watcher {
     }
 
     /// The figures of the run's own summary, and its end.
-    pub(super) fn conclude(&mut self, summary: &Summary, ended: &str) {
+    pub(super) fn conclude(&mut self, summary: &Summary, ended: &Ended) {
         let counts = &summary.counts;
+        let before = std::mem::take(&mut self.state);
         self.state = State {
             rms_nm: summary.rms_measured_nm,
+            fix_noise_nm: summary.fix_noise_nm,
             wake_us: Some(summary.wake_us.p999),
             compute_us: Some(summary.tick_us.p999),
             late: counts.late,
@@ -241,19 +255,33 @@ impl Watcher {
             stale: counts.stale,
             coasted: counts.coasted,
             records_lost: summary.records_lost,
-            ..std::mem::take(&mut self.state)
+            ..before
         };
-        self.over(summary.state == EndState::Safe, ended);
+        self.over(ended.last_word());
     }
 
-    /// The run is over, for a reason in a sentence.
-    pub(super) fn over(&mut self, safe: bool, ended: &str) {
+    /// The run is over.
+    pub(super) fn over(&mut self, word: LastWord) {
         self.state.banner = Banner {
-            state: if safe { "safe" } else { "over" },
-            reason: format!("The run is over: {ended}"),
+            state: match word.how {
+                "safe" => "safe",
+                "failed" => "failed",
+                _ => "over",
+            },
+            reason: word.seen.clone(),
         };
+        self.state.last_word = Some(word);
         self.state.left_s = None;
         self.state.next = None;
         self.tell_state();
+    }
+}
+
+impl Drop for Watcher {
+    /// A run that came to no summary has a last word nevertheless.
+    fn drop(&mut self) {
+        if self.state.last_word.is_none() && self.state.ticks > 0 {
+            self.over(last_word::of_silence());
+        }
     }
 }

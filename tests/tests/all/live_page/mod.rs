@@ -1,6 +1,7 @@
 //! The live page in a real browser, on a real run of the emulated rig. Needs Debian's chromium and chromium-driver, which
 //! `.ci/run` installs: `cargo test --workspace --test all live_page:: -- --ignored`.
 
+mod last_word;
 mod other_commands;
 mod watched;
 

@@ -33,6 +33,10 @@ pub enum Switch {
     Off,
 }
 
+/// Headings of the two uses.
+const ON_A_RIG: &str = "To measure a rig";
+const ON_RECORDS: &str = "To fit records of any rig";
+
 /// Arguments of `cellpos identify`.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:\n  \
@@ -45,84 +49,84 @@ pub enum Switch {
     cellpos identify --data Model_Vi_Do.dat --input 1 --output 5 --rate 200Hz --hold none")]
 pub struct Args {
     /// Run folders, records of cellpos, or records of any rig with --input and --output; the model is fitted to all of them.
-    #[arg(long, num_args = 1.., value_parser = crate::arguments::run_folder())]
+    #[arg(long, num_args = 1.., value_parser = crate::arguments::run_folder(), help_heading = ON_RECORDS)]
     data: Vec<PathBuf>,
     /// A frequency response in the place of records: a table (text, .npy, .mat) with `freq [Hz]` or `w [rad/s]`, and gain (or
     /// `gain [dB]`) and `phase [deg]` (or `[rad]`), or re and im.
-    #[arg(long, value_name = "FILE", conflicts_with_all = ["data", "rig", "resume"])]
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["data", "rig", "resume"], help_heading = ON_RECORDS)]
     response: Option<PathBuf>,
     /// Input column: a name of the header (a unit in brackets may be left out), or a number from 1.
-    #[arg(long, alias = "input-column", requires_all = ["data", "output"])]
+    #[arg(long, alias = "input-column", requires_all = ["data", "output"], help_heading = ON_RECORDS)]
     input: Option<String>,
     /// Output column: a name of the header, or a number from 1.
-    #[arg(long, alias = "output-column", requires = "input")]
+    #[arg(long, alias = "output-column", requires = "input", help_heading = ON_RECORDS)]
     output: Option<String>,
     /// Column of the time, in the unit of its name (`t [ms]`), else in seconds [default: the one called time or t].
-    #[arg(long, requires = "input")]
+    #[arg(long, requires = "input", help_heading = ON_RECORDS)]
     time_column: Option<String>,
     /// Rows per second of records without a column of time.
-    #[arg(long, requires = "input", value_parser = crate::arguments::positive::<Hertz>)]
+    #[arg(long, requires = "input", value_parser = crate::arguments::positive::<Hertz>, help_heading = ON_RECORDS)]
     rate: Option<Hertz>,
     /// Rows FROM:TO of every file, counted from 0, TO not included.
-    #[arg(long, value_name = "FROM:TO", requires = "input")]
+    #[arg(long, value_name = "FROM:TO", requires = "input", help_heading = ON_RECORDS)]
     rows: Option<String>,
     /// Form of the model of other rigs' records: order=N, with zeros=N, delay, integrating where they are wanted; or
     /// static. Left out, or auto: the simplest that predicts records as well as any, up to --order.
-    #[arg(long)]
+    #[arg(long, help_heading = ON_RECORDS)]
     base: Option<super::form::Asked>,
     /// What the records' input does between rows: a command is held (zero-order), a measured signal is not (none).
-    #[arg(long, value_enum, default_value_t = HoldKind::ZeroOrder)]
+    #[arg(long, value_enum, default_value_t = HoldKind::ZeroOrder, help_heading = ON_RECORDS)]
     hold: HoldKind,
     /// Highest order of a linear model tried on records.
-    #[arg(long, default_value_t = 4, value_parser = clap::value_parser!(u8).range(0..=8))]
+    #[arg(long, default_value_t = 4, value_parser = clap::value_parser!(u8).range(0..=8), help_heading = ON_RECORDS)]
     order: u8,
     /// The rig, through the same loop as `cellpos track`; left out: an emulated one.
-    #[arg(long, conflicts_with_all = ["data", "open_loop"])]
+    #[arg(long, conflicts_with_all = ["data", "open_loop"], help_heading = ON_A_RIG)]
     rig: Option<PathBuf>,
     /// Go on from the finished segments of an identification that was stopped.
-    #[arg(long, conflicts_with = "data")]
+    #[arg(long, conflicts_with = "data", help_heading = ON_A_RIG)]
     resume: Option<PathBuf>,
     /// Exposure of the camera of `--rig`; left out: that of its `[emulator]`.
-    #[arg(long, requires = "rig", value_parser = crate::arguments::positive::<Seconds>)]
+    #[arg(long, requires = "rig", value_parser = crate::arguments::positive::<Seconds>, help_heading = ON_A_RIG)]
     exposure: Option<Seconds>,
     /// Do not ask the operating system for real time.
-    #[arg(long, requires = "rig")]
+    #[arg(long, requires = "rig", help_heading = ON_A_RIG)]
     best_effort: bool,
     /// Plant that amplitudes and the holding loop are made for, and that of the emulated rig: `eq6` or a model.toml.
-    #[arg(long, default_value = "eq6")]
+    #[arg(long, default_value = "eq6", help_heading = ON_A_RIG)]
     model: String,
     /// Without the imperfections of a real rig (emulated rig): flow, light, focus and clocks stand still.
     #[arg(long)]
     ideal: bool,
     /// Seed of the emulated rig, the excitation and the bootstrap [default: that of rig.toml, else 1].
-    #[arg(long)]
+    #[arg(long, help_heading = ON_A_RIG)]
     seed: Option<u64>,
     /// Clock of the emulated rig [default: virtual; a real rig has the real one].
-    #[arg(long, value_enum)]
+    #[arg(long, value_enum, help_heading = ON_A_RIG)]
     clock: Option<ClockKind>,
     /// Frames through the localiser, or positions with the noise that frames would give.
-    #[arg(long, value_enum, default_value_t = Switch::On)]
+    #[arg(long, value_enum, default_value_t = Switch::On, help_heading = ON_A_RIG)]
     frames: Switch,
     /// How to excite.
-    #[arg(long, value_enum, default_value_t = Excitation::Stepped)]
+    #[arg(long, value_enum, default_value_t = Excitation::Stepped, help_heading = ON_A_RIG)]
     excitation: Excitation,
     /// Lines to drive (default: the paper's ten).
-    #[arg(long, num_args = 1.., value_delimiter = ',')]
+    #[arg(long, num_args = 1.., value_delimiter = ',', help_heading = ON_A_RIG)]
     frequency: Vec<Hertz>,
     /// Largest bead amplitude (peak) while a line is driven.
-    #[arg(long, default_value = "8um")]
+    #[arg(long, default_value = "8um", help_heading = ON_A_RIG)]
     bead_amplitude: Micrometers,
     /// Largest bead speed (peak): its image must not smear by more than about two pixels during an exposure.
-    #[arg(long, default_value = "400um/s")]
+    #[arg(long, default_value = "400um/s", help_heading = ON_A_RIG)]
     bead_speed: MicrometersPerSecond,
     /// Largest PZT amplitude (peak).
-    #[arg(long, default_value = "10um")]
+    #[arg(long, default_value = "10um", help_heading = ON_A_RIG)]
     pzt_amplitude: Micrometers,
     /// Move the PZT about neutral without holding the bead; drift and low lines will take it out of view.
-    #[arg(long)]
+    #[arg(long, help_heading = ON_A_RIG)]
     open_loop: bool,
     /// Edges of the LED delay test; 0 leaves it out.
-    #[arg(long, default_value_t = 300)]
+    #[arg(long, default_value_t = 300, help_heading = ON_A_RIG)]
     led_edges: usize,
     /// Bootstrap replicates; 0 leaves it out.
     #[arg(long, default_value_t = 200)]
@@ -130,6 +134,9 @@ pub struct Args {
     /// Where to write the model [default: model.toml in a new folder of runs/].
     #[arg(long)]
     out: Option<PathBuf>,
+    /// Draw and list Eq. (6) of the paper beside what was measured: a comparison with another rig.
+    #[arg(long)]
+    eq6: bool,
     /// Where to write the report, figures beside it [default: report.html in a new folder of runs/].
     #[arg(long)]
     report: Option<PathBuf>,
@@ -405,7 +412,7 @@ pub fn run(args: Args) -> CommandResult {
         .model("identified", done.neutral_um, provenance)
         .map_err(Failure::failed)?;
     output::write(&model_path, &model.to_toml_string())?;
-    report::report(&done, &command_line())
+    report::report(&done, &command_line(), args.eq6)
         .write_with_figures(&report_path)
         .map_err(Failure::failed)?;
     if args.json {

@@ -18,19 +18,49 @@ fn unwrapped_deg(phase: f64) -> f64 {
     phase - 360.0 * ((phase + 90.0) / 360.0).round()
 }
 
-/// Bode plot of the compensated points, the fitted model with its 95 % band, Eq. (6) and 2 pi 63/s.
-pub fn bode(name: &str, caption: &str, result: &Identification, high_hz: f64) -> Figure {
+/// A band so many times as wide as the intervals of the points beside it says nothing of what was measured.
+const WIDEST_BAND: f64 = 30.0;
+
+/// Ends of the fit's 95 % band (gain or phase) at each frequency; NaN beyond the measured lines, and where the nearest point is known
+/// better by far: what the band shows there is a parameter that these lines do not determine.
+fn band(result: &Identification, grid: &[f64], phase: bool) -> [Vec<f64>; 2] {
+    let points = &result.compensated;
+    let mut ends = [Vec::new(), Vec::new()];
+    for f in grid {
+        let (gain, angle) = result.band(*f);
+        let here = if phase { angle } else { gain };
+        let nearest = points.iter().min_by(|a, b| {
+            let off = |hz: f64| (hz / f).ln().abs();
+            off(a.frequency_hz).total_cmp(&off(b.frequency_hz))
+        });
+        let sd = nearest.map_or(
+            f64::NAN,
+            |p| if phase { p.phase_sd_deg } else { p.gain_sd_db },
+        );
+        let of =
+            |pick: fn(f64, f64) -> f64| points.iter().map(|p| p.frequency_hz).fold(f64::NAN, pick);
+        let measured = (of(f64::min)..=of(f64::max)).contains(f);
+        let fits = here[1] - here[0] <= WIDEST_BAND * 2.0 * 1.96 * sd;
+        for (end, value) in ends.iter_mut().zip(here) {
+            end.push(if measured && fits { value } else { f64::NAN });
+        }
+    }
+    ends
+}
+
+/// Bode plot of the compensated points, the fitted model with its 95 % band, and, if asked for, Eq. (6) and 2 pi 63/s.
+pub fn bode(
+    name: &str,
+    caption: &str,
+    result: &Identification,
+    (high_hz, eq6): (f64, bool),
+) -> Figure {
     let points = &result.compensated;
     let f: Vec<f64> = points.iter().map(|p| p.frequency_hz).collect();
     let lowest = f.iter().copied().fold(f64::INFINITY, f64::min);
     let grid = log_grid(0.7 * lowest, high_hz, 160);
-    let bands: Vec<_> = grid.iter().map(|&f| result.band(f)).collect();
-    let band = |phase: bool, end: usize| -> Vec<f64> {
-        bands
-            .iter()
-            .map(|(gain, angle)| if phase { angle[end] } else { gain[end] })
-            .collect()
-    };
+    let ([gain_from, gain_to], [phase_from, phase_to]) =
+        (band(result, &grid, false), band(result, &grid, true));
     let gain: Vec<f64> = points.iter().map(|p| p.gain_db).collect();
     let phase: Vec<f64> = points.iter().map(|p| p.phase_deg).collect();
     let shifted = |sign: f64| -> (Vec<f64>, Vec<f64>) {
@@ -54,27 +84,15 @@ pub fn bode(name: &str, caption: &str, result: &Identification, high_hz: f64) ->
             .unzip()
     };
     let (model_gain, model_phase) = curve(&|f| model.response(f));
-    let eq6 = TransferFunction::eq6();
-    let (eq6_gain, eq6_phase) = curve(&|f| eq6.response(Hertz(f)));
-    let integrator = CandidateModel::integrator(EQ5_VELOCITY_GAIN_PER_S, 0.0);
-    let (eq5_gain, eq5_phase) = curve(&|f| integrator.response(f));
     let delayed: Vec<f64> = points.iter().map(|p| p.delayed_phase_deg).collect();
-    Figure::bode(name, caption)
+    let figure = Figure::bode(name, caption)
         .bode_series(
-            Series::band("95 % of the fit", &grid, &band(false, 0), &band(false, 1)),
-            Series::band("95 % of the fit", &grid, &band(true, 0), &band(true, 1)),
+            Series::band("95 % of the fit", &grid, &gain_from, &gain_to),
+            Series::band("95 % of the fit", &grid, &phase_from, &phase_to),
         )
         .bode_series(
             Series::line("fit", &grid, &model_gain),
             Series::line("fit", &grid, &model_phase),
-        )
-        .bode_series(
-            Series::line("Eq. (6)", &grid, &eq6_gain).dashed(),
-            Series::line("Eq. (6)", &grid, &eq6_phase).dashed(),
-        )
-        .bode_series(
-            Series::line("2\u{3c0} 63/s", &grid, &eq5_gain).thin(),
-            Series::line("2\u{3c0} 63/s", &grid, &eq5_phase).thin(),
         )
         .bode_series(
             Series::intervals("measured", &f, &gain, &gain_low, &gain_high),
@@ -90,6 +108,22 @@ pub fn bode(name: &str, caption: &str, result: &Identification, high_hz: f64) ->
         .bode_series(
             Series::points("measured, delay left in", &[], &[]),
             Series::points("measured, delay left in", &f, &delayed),
+        );
+    if !eq6 {
+        return figure;
+    }
+    let nominal = TransferFunction::eq6();
+    let (eq6_gain, eq6_phase) = curve(&|f| nominal.response(Hertz(f)));
+    let integrator = CandidateModel::integrator(EQ5_VELOCITY_GAIN_PER_S, 0.0);
+    let (eq5_gain, eq5_phase) = curve(&|f| integrator.response(f));
+    figure
+        .bode_series(
+            Series::line("Eq. (6)", &grid, &eq6_gain).dashed(),
+            Series::line("Eq. (6)", &grid, &eq6_phase).dashed(),
+        )
+        .bode_series(
+            Series::line("2\u{3c0} 63/s", &grid, &eq5_gain).thin(),
+            Series::line("2\u{3c0} 63/s", &grid, &eq5_phase).thin(),
         )
 }
 
@@ -328,34 +362,43 @@ pub fn parameters(parameters: &[IdentifiedParameter]) -> Table {
     table
 }
 
-/// The table of lines beside Eq. (6).
-pub fn lines(result: &Identification) -> Table {
-    let eq6 = TransferFunction::eq6();
-    let mut table = Table::new([
-        Column::right("Hz"),
-        Column::right("gain dB"),
-        Column::right("+-95 %"),
-        Column::right("Eq. (6) dB"),
-        Column::right("phase deg"),
-        Column::right("+-95 %"),
-        Column::right("Eq. (6) deg"),
-        Column::right("with delay deg"),
-        Column::right("in the record deg"),
-        Column::right("coherence"),
-    ]);
+/// The table of lines, beside Eq. (6) if asked for.
+pub fn lines(result: &Identification, eq6: bool) -> Table {
+    let nominal = TransferFunction::eq6();
+    let heads = [
+        ("Hz", false),
+        ("gain dB", false),
+        ("+-95 %", false),
+        ("Eq. (6) dB", true),
+        ("phase deg", false),
+        ("+-95 %", false),
+        ("Eq. (6) deg", true),
+        ("with delay deg", false),
+        ("in the record deg", false),
+        ("coherence", false),
+    ];
+    let shown = |of_eq6: bool| eq6 || !of_eq6;
+    let columns = heads.iter().filter(|(_, of_eq6)| shown(*of_eq6));
+    let mut table = Table::with_columns(columns.map(|(name, _)| Column::right(name)).collect());
     for p in &result.compensated {
-        table.row([
+        let cells = [
             format!("{}", p.frequency_hz),
             format!("{:.3}", p.gain_db),
             format!("{:.3}", 1.96 * p.gain_sd_db),
-            format!("{:.2}", eq6.gain_db(Hertz(p.frequency_hz)).0),
+            format!("{:.2}", nominal.gain_db(Hertz(p.frequency_hz)).0),
             format!("{:.2}", p.phase_deg),
             format!("{:.2}", 1.96 * p.phase_sd_deg),
-            format!("{:.2}", eq6.phase_deg(Hertz(p.frequency_hz)).0),
+            format!("{:.2}", nominal.phase_deg(Hertz(p.frequency_hz)).0),
             format!("{:.1}", p.delayed_phase_deg),
             format!("{:.1}", p.raw_phase_deg),
             format!("{:.5}", p.coherence),
-        ]);
+        ];
+        let cells = cells.into_iter().zip(heads);
+        table.row(
+            cells
+                .filter(|(_, (_, of_eq6))| shown(*of_eq6))
+                .map(|(cell, _)| cell),
+        );
     }
     table
 }
@@ -390,13 +433,67 @@ pub fn candidates(result: &Identification) -> Table {
     table
 }
 
+/// What was measured, in a sentence: gain, delay, and how sure they are.
+fn sentence(done: &Done) -> (Emphasis, String) {
+    let result = &done.result;
+    let known: Vec<&IdentifiedParameter> = (result.judged.parameters.iter())
+        .filter(|p| matches!(p.verdict, Identifiability::Identified))
+        .collect();
+    let unknown = result.judged.parameters.len() - known.len();
+    let told = |p: &IdentifiedParameter| {
+        let unit = if p.unit.is_empty() {
+            String::new()
+        } else {
+            format!(" {}", p.unit)
+        };
+        format!(
+            "{} {}{unit} (95 %: {})",
+            p.meaning,
+            number(p.value),
+            interval(p.ci95)
+        )
+    };
+    // Gain and delay decide what a loop can do; the others are in the table.
+    let delay = known.iter().skip(1).rfind(|p| p.meaning.contains("delay"));
+    let parts: Vec<String> = known
+        .first()
+        .into_iter()
+        .chain(delay)
+        .map(|p| told(p))
+        .collect();
+    let mut text = match parts.is_empty() {
+        true => "No parameter of the plant is identified from this band.".to_owned(),
+        false => format!("{}.", parts.join("; ")),
+    };
+    if let (Some(first), false) = (text.get(..1), parts.is_empty()) {
+        text = format!("{}{}", first.to_uppercase(), &text[1..]);
+    }
+    if unknown > 0 && !known.is_empty() {
+        let all = result.judged.parameters.len();
+        text.push_str(&format!(
+            " {unknown} of the {all} parameters cannot be told from these lines."
+        ));
+    }
+    let status = match (known.is_empty(), result.warnings.is_empty()) {
+        (true, _) => Emphasis::Bad,
+        (false, false) => Emphasis::Warning,
+        (false, true) => Emphasis::Good,
+    };
+    (status, text)
+}
+
 /// The whole report.
-pub fn report(done: &Done, command_line: &str) -> Report {
+pub fn report(done: &Done, command_line: &str, eq6: bool) -> Report {
     let result = &done.result;
     let mut report = Report::new("Identification");
-    report.paragraph(&format!(
-        "`{command_line}`; {} rows of record.",
-        done.records.iter().map(|r| r.input.len()).sum::<usize>()
+    let (status, sentence) = sentence(done);
+    report.result(status, &sentence);
+    report.figure(bode(
+        "bode",
+        "Gain and phase of the plant as measured (intervals 95 %, where they are larger than the points), and the fit with its 95 % \
+         band where these lines determine it; hold, exposure and delay are taken off.",
+        result,
+        (480.0, eq6),
     ));
     for warning in &result.warnings {
         report.note(Emphasis::Warning, warning);
@@ -414,14 +511,9 @@ pub fn report(done: &Done, command_line: &str) -> Report {
             if noise.used { ", used for the weights" } else { ", not used: the scatter of each line weighs it" }
         ));
     }
-    report.section("Frequency response").figure(bode(
-        "bode",
-        "Gain and phase of the plant with the 95 % band of the fit; hold, exposure and delay taken off.",
-        result,
-        480.0,
-    ));
     report
-        .table(lines(result))
+        .section("Frequency response")
+        .table(lines(result, eq6))
         .figure(nyquist(result))
         .figure(residuals(result));
     report
@@ -445,5 +537,9 @@ pub fn report(done: &Done, command_line: &str) -> Report {
         report.figure(delay_test("delay-test", "Light sent by the board and seen by the camera, and what each edge allows the delay to be.", led));
     }
     report.section("Traces").figure(traces(done));
+    report.section("How it was measured").paragraph(&format!(
+        "`{command_line}`; {} rows of record.",
+        done.records.iter().map(|r| r.input.len()).sum::<usize>()
+    ));
     report
 }

@@ -242,14 +242,14 @@ fn report(
         "fig7-bode",
         "Gain and phase with the recording delay taken off and left in (hold and exposure are off in both).",
         &done.result,
-        320.0,
+        (320.0, true),
     ));
-    report.table(plots::lines(&done.result));
+    report.table(plots::lines(&done.result, true));
     report.section("Fig. 8: the fit up to 1 kHz").figure(plots::bode(
         "fig8-fit",
         "The fitted model with its 95 % band, continued to 1 kHz; above 300 Hz nothing was measured.",
         &done.result,
-        1000.0,
+        (1000.0, true),
     ));
     report.table(plots::candidates(&done.result));
     report

@@ -119,6 +119,16 @@ pub fn section(page: &mut Report, read: &ReadCycles) -> serde_json::Value {
          their ticks.",
         rows.len()
     ));
+    let elsewhere = count(|row| was_elsewhere(row));
+    if elsewhere > 0 {
+        page.note(
+            Emphasis::Warning,
+            &format!(
+                "In {elsewhere} cycles bead or cell was elsewhere than the script had it (more than a tenth of the stroke from the \
+                 target in the mean): they are in cycles.csv, and in no mean and no trend."
+            ),
+        );
+    }
     let ramps = count(|row| row.flags.has(CycleFlags::RAMP));
     if ramps > 0 {
         page.paragraph(&format!(
@@ -201,6 +211,13 @@ struct Group<'r> {
     rows: Vec<&'r CycleRow>,
 }
 
+/// Whether bead or cell was elsewhere than the script had it: its mean distance from the target is more than a tenth of the stroke,
+/// where that of a cycle that went as planned is a few percent. Its lengths are of another place in the channel.
+pub fn was_elsewhere(row: &CycleRow) -> bool {
+    const OF_STROKE: f64 = 0.1;
+    row.arm == ArmKind::Cyclic && row.bias_um.abs() > OF_STROKE * row.stroke_um.abs()
+}
+
 /// Whether a cycle of the static arm is one in which the bead goes to its load or back.
 pub fn on_the_way(row: &CycleRow) -> bool {
     const STILL_UM: f64 = 0.01;
@@ -222,7 +239,10 @@ const MOST_GROUPS: usize = 8;
 fn groups(rows: &[CycleRow]) -> Vec<Group<'_>> {
     let mut groups: Vec<Group> = Vec::new();
     for row in rows {
-        if row.flags.has(CycleFlags::RAMP) || row.flags.has(CycleFlags::SKIPPED) || on_the_way(row)
+        if row.flags.has(CycleFlags::RAMP)
+            || row.flags.has(CycleFlags::SKIPPED)
+            || on_the_way(row)
+            || was_elsewhere(row)
         {
             continue;
         }

@@ -1,7 +1,30 @@
-//! A long trace, drawn by the smallest and largest value of each stretch: no peak is lost, whatever the length.
+//! A long trace, drawn by the smallest, the largest and the median value of each stretch: no peak is lost, whatever the length.
 
 /// Stretches kept, at most twice this many.
 const STRETCHES: usize = 5_000;
+/// Values of a stretch that are kept for its median, evenly spaced in time: a column of a figure is some ten stretches, so that its
+/// median is one of fifty values or more, and off by less than a fifth of their standard deviation.
+const SAMPLES: usize = 8;
+/// Columns of a figure: as many as it has px for.
+const COLUMNS: usize = 700;
+
+/// A column as a figure shows it: an envelope and its middle, one entry for each stretch of time; NaN at a gap.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Course {
+    pub time_s: Vec<f64>,
+    pub low: Vec<f64>,
+    pub median: Vec<f64>,
+    pub high: Vec<f64>,
+}
+
+impl Course {
+    fn push(&mut self, time_s: f64, low: f64, median: f64, high: f64) {
+        self.time_s.push(time_s);
+        self.low.push(low);
+        self.median.push(median);
+        self.high.push(high);
+    }
+}
 
 /// Smallest and largest values of `N` columns over stretches of equal numbers of rows.
 #[derive(Debug)]
@@ -18,6 +41,9 @@ struct Stretch<const N: usize> {
     rows: u64,
     low: [f64; N],
     high: [f64; N],
+    /// Values for the median, and how many of them there are.
+    samples: [[f64; N]; SAMPLES],
+    sampled: usize,
     /// Nothing is joined across a gap in the record.
     last_before_gap: bool,
 }
@@ -42,15 +68,25 @@ impl<const N: usize> Envelope<N> {
     /// The next row; values that are not finite count as missing.
     pub fn add(&mut self, time_s: f64, values: [f64; N]) {
         match self.stretches.last_mut() {
-            Some(last) if last.rows < self.rows && !last.last_before_gap => last.take(values),
+            Some(last) if last.rows < self.rows && !last.last_before_gap => {
+                // Evenly over the stretch: as many rows lie between two samples as it has room for.
+                let every = self.rows.div_ceil(SAMPLES as u64);
+                if last.rows.is_multiple_of(every) {
+                    last.sample(values);
+                }
+                last.take(values);
+            }
             _ => {
                 let mut new = Stretch {
                     time_s,
                     rows: 0,
                     low: [f64::NAN; N],
                     high: [f64::NAN; N],
+                    samples: [[f64::NAN; N]; SAMPLES],
+                    sampled: 0,
                     last_before_gap: false,
                 };
+                new.sample(values);
                 new.take(values);
                 self.stretches.push(new);
             }
@@ -70,6 +106,7 @@ impl<const N: usize> Envelope<N> {
                     last.take(stretch.high);
                     // Two rows were counted above for those of the stretch.
                     last.rows = last.rows + stretch.rows - 2;
+                    last.join_samples(stretch);
                     last.last_before_gap = stretch.last_before_gap;
                 }
                 _ => joined.push(*stretch),
@@ -78,41 +115,70 @@ impl<const N: usize> Envelope<N> {
         self.stretches = joined;
     }
 
-    /// Rows of a stretch.
-    pub fn rows(&self) -> u64 {
-        self.rows
-    }
-
-    /// Times, each twice, and after a gap once more.
-    pub fn times_s(&self) -> Vec<f64> {
-        self.points(|stretch| [stretch.time_s; 2])
-    }
-
-    /// Smallest and largest value of a column in turn; NaN at a gap.
-    pub fn column(&self, column: usize) -> Vec<f64> {
+    /// A column as a figure of so many px shows it.
+    pub fn course(&self, column: usize) -> Course {
         let at = |values: &[f64; N]| values.get(column).copied().unwrap_or(f64::NAN);
-        self.points(|stretch| [at(&stretch.low), at(&stretch.high)])
+        let joined = self.stretches.len().div_ceil(COLUMNS).max(1);
+        let mut course = Course::default();
+        for part in (self.stretches).chunk_by(|one, _| !one.last_before_gap) {
+            for some in part.chunks(joined) {
+                let (low, high) = some
+                    .iter()
+                    .fold((f64::NAN, f64::NAN), |(low, high), stretch| {
+                        (low.min(at(&stretch.low)), high.max(at(&stretch.high)))
+                    });
+                let samples = some
+                    .iter()
+                    .flat_map(|stretch| stretch.samples.iter().take(stretch.sampled));
+                let mut values: Vec<f64> =
+                    samples.map(at).filter(|value| value.is_finite()).collect();
+                let time_s = some.first().map_or(f64::NAN, |stretch| stretch.time_s);
+                course.push(time_s, low, median(&mut values), high);
+            }
+            course.push(f64::NAN, f64::NAN, f64::NAN, f64::NAN);
+        }
+        course
     }
 
-    fn points(&self, of: impl Fn(&Stretch<N>) -> [f64; 2]) -> Vec<f64> {
-        // A stretch of one row is a point.
-        let single = self.rows == 1;
-        let mut all = Vec::with_capacity(2 * self.stretches.len());
-        for stretch in &self.stretches {
-            let [low, high] = of(stretch);
-            all.push(low);
-            if !single {
-                all.push(high);
-            }
-            if stretch.last_before_gap {
-                all.push(f64::NAN);
-            }
-        }
-        all
+    /// Whether each point of a [`Course`] is one row: then there is no envelope.
+    pub fn is_bare(&self) -> bool {
+        self.rows == 1 && self.stretches.len() <= COLUMNS
+    }
+}
+
+/// The middle of some values; NaN of none.
+fn median(values: &mut [f64]) -> f64 {
+    values.sort_by(f64::total_cmp);
+    let middle = values.len() / 2;
+    match (values.get(middle), values.len() % 2) {
+        (Some(upper), 0) => 0.5 * (upper + values[middle - 1]),
+        (Some(only), _) => *only,
+        (None, _) => f64::NAN,
     }
 }
 
 impl<const N: usize> Stretch<N> {
+    fn sample(&mut self, values: [f64; N]) {
+        if let Some(free) = self.samples.get_mut(self.sampled) {
+            *free = values;
+            self.sampled += 1;
+        }
+    }
+
+    /// Takes over every second sample of two stretches that become one, once they are too many.
+    fn join_samples(&mut self, other: &Self) {
+        let own = self.samples.iter().take(self.sampled);
+        let all: Vec<[f64; N]> = own
+            .chain(other.samples.iter().take(other.sampled))
+            .copied()
+            .collect();
+        let every = all.len().div_ceil(SAMPLES).max(1);
+        self.sampled = 0;
+        for values in all.into_iter().step_by(every) {
+            self.sample(values);
+        }
+    }
+
     fn take(&mut self, values: [f64; N]) {
         self.rows += 1;
         for ((low, high), value) in self.low.iter_mut().zip(&mut self.high).zip(values) {
@@ -126,6 +192,26 @@ impl<const N: usize> Stretch<N> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn the_median_of_a_noisy_ramp_is_the_ramp_and_its_envelope_holds_the_noise() {
+        for rows in [500_usize, 5_000, 123_457] {
+            let mut envelope = Envelope::<1>::default();
+            for k in 0..rows {
+                let noise = ((k as f64 * 0.618_034).fract() - 0.5) * 2.0;
+                envelope.add(k as f64 * 1e-3, [5.0 * k as f64 / rows as f64 + noise]);
+            }
+            let course = envelope.course(0);
+            assert!(course.time_s.len() <= COLUMNS + 2, "{rows}");
+            for (k, time_s) in course.time_s.iter().enumerate() {
+                let ramp = 5.0 * time_s / (rows as f64 * 1e-3);
+                if rows > 100_000 && time_s.is_finite() {
+                    assert!((course.median[k] - ramp).abs() < 0.5, "{rows}, {time_s}");
+                    assert!(course.low[k] < ramp - 0.8 && course.high[k] > ramp + 0.8);
+                }
+            }
+        }
+    }
 
     #[test]
     fn the_peaks_of_a_long_record_stay_and_gaps_show() {
@@ -142,15 +228,22 @@ mod tests {
             }
             envelope.add(f64::from(k) * 1e-3, [value]);
         }
-        let (times, values) = (envelope.times_s(), envelope.column(0));
-        assert_eq!(times.len(), values.len());
-        assert!(times.len() <= 4 * STRETCHES + 2, "{}", times.len());
-        let finite = || values.iter().copied().filter(|value| value.is_finite());
-        assert_eq!(finite().fold(0.0, f64::max), 9.0);
-        assert_eq!(finite().fold(0.0, f64::min), -7.0);
-        let at = values.iter().position(|value| *value == 9.0).unwrap();
-        assert!((times[at] - 12.345).abs() < 1e-3 * envelope.rows() as f64);
-        assert_eq!(values.iter().filter(|value| value.is_nan()).count(), 1);
+        let course = envelope.course(0);
+        assert!(
+            course.time_s.len() <= COLUMNS + 4,
+            "{}",
+            course.time_s.len()
+        );
+        assert_eq!(course.high.iter().copied().fold(0.0, f64::max), 9.0);
+        assert_eq!(course.low.iter().copied().fold(0.0, f64::min), -7.0);
+        let at = course.high.iter().position(|value| *value == 9.0).unwrap();
+        let wide = course.time_s[1] - course.time_s[0];
+        assert!((course.time_s[at] - 12.345).abs() <= wide);
+        // The gap, and the end.
+        assert_eq!(
+            course.time_s.iter().filter(|value| value.is_nan()).count(),
+            2
+        );
         let joined = envelope.stretches.iter().map(|one| one.rows).sum::<u64>();
         assert_eq!(joined, 100_000);
     }

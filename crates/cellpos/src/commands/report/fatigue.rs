@@ -1,11 +1,11 @@
 //! The fatigue figure: what the cycles did to the cell.
 
-use super::cycles::on_the_way;
+use super::cycles::{on_the_way, was_elsewhere};
 use super::ticks::{Course, Ticks};
 use cellpos_report::{Axis, Figure, Panel, Report, Series};
 use cellpos_script::{ArmKind, AtRest, CycleFlags, CycleRow};
 
-/// The cycles whose course is drawn over each other: the first, the tenth, the hundredth, ... of those that have records.
+/// The cycles whose course is drawn over each other: the first, the tenth, the hundredth, ... and the last of those that have records.
 pub fn courses(rows: &[CycleRow]) -> Vec<Course> {
     let cyclic: Vec<&CycleRow> = rows.iter().filter(is_whole).collect();
     let mut wanted = Vec::new();
@@ -13,6 +13,10 @@ pub fn courses(rows: &[CycleRow]) -> Vec<Course> {
     while number <= cyclic.len() {
         wanted.push(number);
         number *= 10;
+    }
+    // What came of it is in the last one.
+    if wanted.last().is_some_and(|last| *last != cyclic.len()) {
+        wanted.push(cyclic.len());
     }
     wanted
         .into_iter()
@@ -31,7 +35,7 @@ pub fn courses(rows: &[CycleRow]) -> Vec<Course> {
         .collect()
 }
 
-fn is_whole(row: &&CycleRow) -> bool {
+pub(super) fn is_whole(row: &&CycleRow) -> bool {
     row.arm == ArmKind::Cyclic
         && row.start_s.is_finite()
         && !row.flags.has(CycleFlags::SKIPPED)
@@ -60,21 +64,33 @@ fn tens(values: &[(f64, f64)]) -> [Vec<f64>; 4] {
     columns
 }
 
-/// Adds the section, where the run has cycles of a cell.
+/// The length of the cell over the run and over single cycles, where the run has cycles of a cell.
 pub fn section(page: &mut Report, rows: &[CycleRow], ticks: &Ticks) {
-    let rest = AtRest::of(rows);
-    if rest.length_um.is_nan() || !ticks.has_length {
+    if AtRest::of(rows).length_um.is_nan() || !ticks.has_length {
         return;
     }
     page.section("The cell over its cycles");
+    let course = ticks.length.course(0);
+    let mut length = Panel::new(Axis::linear("time", "s"), Axis::linear("length", "um"));
+    if !ticks.length.is_bare() {
+        let band = Series::band(
+            "smallest to largest",
+            &course.time_s,
+            &course.low,
+            &course.high,
+        );
+        length = length.series(band.color(0));
+    }
     page.figure(
         Figure::new(
             "length",
-            "Length of the cell over the whole run: the smallest and the largest of every few ticks.",
+            "Length of the cell over the whole run: median of each stretch of time, and envelope.",
         )
         .panel(
-            Panel::new(Axis::linear("time", "s"), Axis::linear("length", "um")).series(
-                Series::line("length", &ticks.length.times_s(), &ticks.length.column(0)).thin(),
+            length.series(
+                Series::line("median", &course.time_s, &course.median)
+                    .color(0)
+                    .thin(),
             ),
         ),
     );
@@ -88,36 +104,54 @@ pub fn section(page: &mut Report, rows: &[CycleRow], ticks: &Ticks) {
         .filter(|course| !course.time_s.is_empty())
         .collect();
     for course in &drawn {
-        panel = panel.series(
-            Series::line(
-                &format!("cycle {}", course.number),
-                &course.time_s,
-                &course.length_um,
-            )
-            .thin(),
-        );
+        let name = format!("cycle {}", course.number);
+        panel = panel.series(Series::line(&name, &course.time_s, &course.length_um).thin());
     }
     if !drawn.is_empty() {
         page.figure(
             Figure::new(
                 "cycles-over-each-other",
-                "Length over single cycles, laid over each other.",
+                "Length of the cell over single cycles, laid over each other: the first, the tenth, the hundredth, the last.",
             )
             .panel(panel),
         );
     }
+}
+
+/// What the cycles did to the cell, where the run has cycles of a cell: the figure that answers the question of such a run.
+pub fn figure(rows: &[CycleRow]) -> Option<Figure> {
+    let rest = AtRest::of(rows);
+    if rest.length_um.is_nan() {
+        return None;
+    }
     let of = |arm: ArmKind, value: &dyn Fn(&CycleRow) -> f64| -> Vec<(f64, f64)> {
         rows.iter()
-            .filter(|row| row.arm == arm && !on_the_way(row))
+            .filter(|row| row.arm == arm && !on_the_way(row) && !was_elsewhere(row))
             .filter(|row| !row.flags.has(CycleFlags::SKIPPED) && !row.flags.has(CycleFlags::RAMP))
             .map(|row| (row.cycle as f64 + 1.0, value(row)))
             .filter(|(_, value)| value.is_finite())
             .collect()
     };
+    let of_arm = |arm: ArmKind| {
+        rows.iter()
+            .filter(move |row| row.arm == arm)
+            .map(|row| row.cycle)
+    };
+    let same_cell = match (of_arm(ArmKind::Cyclic).min(), of_arm(ArmKind::Static).min()) {
+        (Some(cyclic), Some(fixed)) if cyclic < fixed => {
+            " Both arms are of this one run: the static arm is of the cell that went through the cycles, not of a fresh one."
+        }
+        (Some(_), Some(_)) => {
+            " Both arms are of this one run: the cycles are of the cell that was under the static load before."
+        }
+        _ => "",
+    };
     let mut figure = Figure::new(
         "fatigue",
-        "Stretch, length at the start and recovery time of every cycle (points), and of ten cycles in the mean with the 95 % \
-         interval of that mean. The static arm stands beside.",
+        &format!(
+            "Stretch, length at the start and recovery time of every cycle (points), and of ten cycles in the mean with the 95 % \
+             interval of that mean.{same_cell}"
+        ),
     );
     type Value<'v> = &'v dyn Fn(&CycleRow) -> f64;
     let quantities: [(&str, &str, Value); 3] = [
@@ -148,7 +182,7 @@ pub fn section(page: &mut Report, rows: &[CycleRow], ticks: &Ticks) {
         }
         figure = figure.panel(panel);
     }
-    page.figure(figure.share_x());
+    Some(figure.share_x())
 }
 
 #[cfg(test)]
@@ -156,7 +190,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_first_tenth_and_hundredth_whole_cycle_are_drawn_over_each_other() {
+    fn the_first_tenth_hundredth_and_last_whole_cycle_are_drawn_over_each_other() {
         let rows: Vec<CycleRow> = (0..150)
             .map(|cycle| {
                 let mut row = CycleRow::empty(cycle, 1 + cycle / 100, ArmKind::Cyclic);
@@ -168,7 +202,7 @@ mod tests {
             .iter()
             .map(|course| (course.number, course.session))
             .collect();
-        assert_eq!(found, vec![(1, 1), (10, 1), (100, 1)]);
+        assert_eq!(found, vec![(1, 1), (10, 1), (100, 1), (150, 2)]);
         assert!(courses(&[]).is_empty());
     }
 

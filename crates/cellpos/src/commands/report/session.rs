@@ -16,23 +16,27 @@ pub(super) struct Session {
     pub(super) start_s: f64,
 }
 
-pub(super) fn timing(page: &mut Report, sessions: &[Session], ticks: &Ticks) {
+pub(super) fn timing(page: &mut Report, ticks: &Ticks) {
     page.section("Loop timing");
-    if ticks.compute_us.is_zero() {
+    if ticks.compute_us.is_empty() {
         page.paragraph("Virtual clock: ticks take no time.");
     } else {
         page.figure(
-            Figure::new("timing", "Wake-up and compute time of every tick.")
-                .panel(
-                    Panel::new(Axis::linear("wake-up", "us"), Axis::linear("ticks", ""))
-                        .series(ticks.wake_us.histogram("wake-up", 80)),
-                )
-                .panel(
-                    Panel::new(Axis::linear("compute", "us"), Axis::linear("ticks", ""))
-                        .series(ticks.compute_us.histogram("compute", 80)),
-                ),
+            Figure::new(
+                "timing",
+                "Wake-up of every tick behind its due time, and the time in which it was computed; a bin is a twelfth of a decade.",
+            )
+            .panel(
+                Panel::new(Axis::log("time", "us"), Axis::log("ticks", ""))
+                    .series(ticks.wake_us.steps("wake-up"))
+                    .series(ticks.compute_us.steps("computing")),
+            ),
         );
     }
+}
+
+/// The figures of the first and the last session, as run.toml has them.
+pub(super) fn figures(page: &mut Report, sessions: &[Session]) {
     for (number, session) in ends(sessions) {
         let end = session.meta.as_ref().and_then(|meta| meta.end.as_ref());
         if let Some(end) = end.filter(|end| !end.summary.is_empty()) {
@@ -86,7 +90,7 @@ pub(super) fn events(page: &mut Report, sessions: &[Session]) {
 }
 
 pub(super) fn provenance(page: &mut Report, sessions: &[Session]) {
-    page.section("Conditions and provenance");
+    page.subsection("Inputs");
     let mut table = Table::new([
         Column::left("input"),
         Column::right("bytes"),

@@ -41,10 +41,10 @@ impl Spread {
         }
     }
 
-    /// Whether all values are zero, or there are none.
-    pub fn is_zero(&self) -> bool {
-        self.kept.iter().all(|value| *value == 0.0)
-            && (self.narrow.as_ref()).is_none_or(|narrow| narrow.low == 0.0 && narrow.high == 0.0)
+    /// How many values there are.
+    pub fn count(&self) -> u64 {
+        let narrow = self.narrow.as_ref();
+        narrow.map_or(self.kept.len() as u64, |narrow| narrow.counts.iter().sum())
     }
 
     /// Counts in equal bins between the smallest and the largest value.
@@ -64,6 +64,48 @@ impl Spread {
             .map(|bin| narrow.low + (bin as f64 + 0.5) * width)
             .collect();
         Series::bars(label, &centres, &counts, width)
+    }
+}
+
+/// Counts of positive values in bins of a twelfth of a decade: what spans decades is seen on logarithmic axes alone.
+#[derive(Debug, Default)]
+pub struct Decades {
+    counts: std::collections::BTreeMap<i32, u64>,
+}
+
+impl Decades {
+    const A_DECADE: f64 = 12.0;
+
+    /// Whether there is no positive value.
+    pub fn is_empty(&self) -> bool {
+        self.counts.is_empty()
+    }
+
+    /// The next value; one that is not positive has no place on such an axis.
+    pub fn add(&mut self, value: f64) {
+        if value > 0.0 && value.is_finite() {
+            *self
+                .counts
+                .entry((value.log10() * Self::A_DECADE).floor() as i32)
+                .or_default() += 1;
+        }
+    }
+
+    /// Counts as steps, from the first bin to behind the last; a bin without values is a gap.
+    pub fn steps(&self, label: &str) -> Series {
+        let edge = |bin: i32| 10f64.powf(f64::from(bin) / Self::A_DECADE);
+        let ends = (self.counts.keys().next(), self.counts.keys().next_back());
+        let (Some(&first), Some(&last)) = ends else {
+            return Series::step(label, &[], &[]);
+        };
+        let bins = first..=last + 1;
+        let count = |bin: i32| self.counts.get(&bin).map_or(f64::NAN, |n| *n as f64);
+        let x: Vec<f64> = bins.clone().map(edge).collect();
+        // The last step goes to its upper edge.
+        let y: Vec<f64> = bins
+            .map(|bin| if bin > last { count(last) } else { count(bin) })
+            .collect();
+        Series::step(label, &x, &y)
     }
 }
 
@@ -152,7 +194,7 @@ mod tests {
         values[7] = f64::NAN;
         let mut spread = Spread::default();
         values.iter().for_each(|value| spread.add(*value));
-        assert!(spread.narrow.is_some() && spread.kept.is_empty() && !spread.is_zero());
+        assert!(spread.narrow.is_some() && spread.kept.is_empty());
         let (x, y) = counts(&spread.histogram("v", 80));
         let (all_x, all_y) = counts(&Series::histogram("v", &values, 80));
         assert_eq!(
@@ -169,7 +211,6 @@ mod tests {
         }
         let mut zeros = Spread::default();
         (0..2 * KEPT).for_each(|_| zeros.add(0.0));
-        assert!(zeros.is_zero() && Spread::default().is_zero());
         let (_, y) = counts(&zeros.histogram("v", 80));
         assert_eq!(y.iter().sum::<f64>(), 2.0 * KEPT as f64);
     }

@@ -2,7 +2,7 @@
 
 use super::envelope::Envelope;
 use super::spectrum::Welch;
-use super::spread::Spread;
+use super::spread::{Decades, Spread};
 use cellpos_runtime::{Hold, Statistics, TickRecord};
 
 /// A stretch of the run, tick by tick.
@@ -37,6 +37,11 @@ pub struct Ticks {
     pub excerpt: Excerpt,
     /// Errors of every tick whose error counts (see [`Statistics`]), nm.
     pub error_nm: Spread,
+    /// The same over the run, nm; NaN where it does not count.
+    pub error: Envelope<1>,
+    /// Whether the target moved while the error counted.
+    pub target_moves: bool,
+    counted_target_um: Option<f64>,
     /// Their spectrum, um; ticks without a position are missing values in it.
     pub error_um: Welch,
     /// The figures of each session, as the terminal and run.toml have them.
@@ -47,8 +52,8 @@ pub struct Ticks {
     /// Cycles whose course is drawn.
     pub courses: Vec<Course>,
     session: u64,
-    pub wake_us: Spread,
-    pub compute_us: Spread,
+    pub wake_us: Decades,
+    pub compute_us: Decades,
     /// Sum and number of the stated variances of positions.
     variance_um2: (f64, u64),
     start_s: f64,
@@ -73,6 +78,7 @@ impl Ticks {
         self.last_ns = None;
         self.traces.gap();
         self.length.gap();
+        self.error.gap();
         self.session += 1;
         let statistics = Statistics::default();
         (self.statistics).push(hold.map_or(statistics, |hold| statistics.holding(hold)));
@@ -113,6 +119,9 @@ impl Ticks {
             }
             None => false,
         };
+        if !counts {
+            self.error.add(time_s, [f64::NAN]);
+        }
         if !r.is_running() {
             return;
         }
@@ -126,6 +135,9 @@ impl Ticks {
         if !counts {
             return;
         }
+        self.error.add(time_s, [r.error_um * 1e3]);
+        let first_um = *self.counted_target_um.get_or_insert(r.target_um);
+        self.target_moves |= (r.target_um - first_um).abs() > 1e-9;
         self.error_nm.add(r.error_um * 1e3);
         self.error_um.add(r.error_um);
         if r.variance_um2.is_finite() {
@@ -162,6 +174,20 @@ impl Ticks {
     pub fn rms_um(&self) -> Option<f64> {
         let (n, sum) = self.sums(|statistics| statistics.rms_measured_nm().map(|nm| nm * nm));
         (n > 0.0).then(|| (sum / n).sqrt() * 1e-3)
+    }
+
+    /// Half the 95 % interval of that RMS, um. The variance of a record of the length T has the variance 1/T times the integral of
+    /// the squared one-sided power density (Bartlett).
+    pub fn rms_ci95_um(&self) -> Option<f64> {
+        let spectrum = self.error_um.spectrum(self.period_s())?;
+        let [first, second, ..] = spectrum.hz.as_slice() else {
+            return None;
+        };
+        let squares: f64 = spectrum.nm_per_rthz.iter().map(|nm| nm.powi(4)).sum();
+        let counted_s = self.error_nm.count() as f64 * self.period_s();
+        let variance_sd = (squares * (second - first) / counted_s).sqrt();
+        let rms_nm = self.rms_um()? * 1e3;
+        Some(1.96 * variance_sd / (2.0 * rms_nm) * 1e-3)
     }
 
     /// Mean error, um.

@@ -53,7 +53,7 @@ pub(super) fn conclude(
         sink,
         ..
     } = finished;
-    let (sink, kept_clips) = sink.into_inner(&summary, &ended.seen).into_parts();
+    let (sink, kept_clips) = sink.into_inner(&summary, &ended).into_parts();
     // The terminal is given back, and the page is over, before anything is said.
     drop(view);
     warnings.extend(clips::warnings(kept_clips));
@@ -74,7 +74,13 @@ pub(super) fn conclude(
             cycle_faults.first.clone().unwrap_or_default()
         ));
     }
-    let kept = connect::finish(writer, outcome, &mut summary, &conditions, &mut warnings);
+    let kept = connect::finish(
+        writer,
+        (outcome, &ended),
+        &mut summary,
+        &conditions,
+        &mut warnings,
+    );
     let learned = learning::named(&setup.config.motions, &learned);
     if !learned.is_empty()
         && let Err(error) = learning::save(&folder, learned.clone())
