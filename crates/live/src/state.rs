@@ -99,7 +99,7 @@ impl Default for Banner {
 /// The last word of a run: how it ended, and where that leaves the rig. The page keeps it when the program is gone.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct LastWord {
-    /// `done`, `stopped` (by the operator), `safe`, `failed`.
+    /// `done`, `stopped` (by the operator), `not-kept`, `safe`, `failed`.
     pub how: &'static str,
     /// What was seen, and what was expected where that is something else.
     pub seen: String,

@@ -189,10 +189,11 @@ pub fn cycle_figures(
     let from = ticks(from_s + span_s);
     let squares = y.iter().enumerate().skip(from);
     let squares = squares.map(|(k, um)| (um - wish_um(k)).powi(2));
-    let (low_um, high_um) = (from..all).map(wish_um).fold(
-        (f64::INFINITY, f64::NEG_INFINITY),
-        |(low, high), um| (low.min(um), high.max(um)),
-    );
+    let (low_um, high_um) = (from..all)
+        .map(wish_um)
+        .fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), um| {
+            (low.min(um), high.max(um))
+        });
     Ok(CycleFigures {
         amplitude_um: 0.5 * (high_um - low_um).max(0.0),
         rms_um: (squares.sum::<f64>() / (all - from).max(1) as f64).sqrt(),

@@ -10,7 +10,7 @@ import { Sound, themes } from "/theme.js";
 
 const LONGEST_S = 600, MOST_ROWS = 1_200_000, MOST_EVENTS = 500, MOST_CYCLES = 20_000;
 // What an ending is called on the banner.
-const ENDINGS = { done: "run over", stopped: "stopped", safe: "safe", failed: "failed" };
+const ENDINGS = { done: "run over", stopped: "stopped", "not-kept": "bead not kept", safe: "safe", failed: "failed" };
 const $ = id => document.getElementById(id);
 let hello = null, operator = false, rows = new Rows(1024), traces = new Traces($("traces"), rows), lateness = new Lateness();
 let state = null, cycles = [], unheard = null;

@@ -8,7 +8,7 @@ use cellpos_plant::Model;
 use cellpos_rig::{Actuator, ArmRequest, Clock};
 use cellpos_runtime::replay::Replay;
 use cellpos_runtime::{
-    EndRule, Event, Life, Request, RunSink, Statistics, TickRecord, virtual_run,
+    EndRule, EndState, Event, Request, RunSink, Statistics, TickRecord, virtual_run,
 };
 
 /// Replays each record as it comes.
@@ -77,7 +77,10 @@ fn held(ticks: u64) {
     .unwrap();
     let summary = &finished.summary;
     assert_eq!(summary.counts.ticks, ticks, "{summary:?}");
-    assert_eq!((summary.state, summary.safe_reason), (Life::Running, None));
+    assert_eq!(
+        (summary.state, summary.safe_reason),
+        (EndState::Running, None)
+    );
     assert_eq!(
         (
             summary.counts.skipped,

@@ -23,6 +23,7 @@ impl Ended {
         let how = match self.kind {
             EndKind::Done | EndKind::ReferenceOver => "done",
             EndKind::Operator => "stopped",
+            EndKind::NotKept => "not-kept",
             EndKind::ArmingRefused | EndKind::Safe => "safe",
             EndKind::Unrecorded | EndKind::Failed => "failed",
         };

@@ -7,7 +7,7 @@ use crate::ended::Ended;
 use crate::words::{Level, safe_reason, sentence};
 use cellpos_live::{Banner, ClipLine, CycleRow, EventLine, Feed, LastWord, Row, State};
 use cellpos_runtime::life::EventKind;
-use cellpos_runtime::{EndState, Event, Life, NoSink, Statistics, Summary, TickFlags, TickRecord};
+use cellpos_runtime::{Event, Life, NoSink, Statistics, Summary, TickFlags, TickRecord};
 
 /// What a sink knows of its run that the page is to show besides what passes through it.
 pub trait Shown {
@@ -265,7 +265,7 @@ impl Watcher {
         self.state.banner = Banner {
             state: match word.how {
                 "safe" => "safe",
-                "failed" => "failed",
+                "failed" | "not-kept" => "failed",
                 _ => "over",
             },
             reason: word.seen.clone(),

@@ -100,8 +100,8 @@ impl Row {
         world.rate_hz = self.rate_hz;
         world.exposure_ms = world.exposure_ms.min(0.5e3 / self.rate_hz);
         world.pixel_um = self.pixel_um;
-        world.zero_flow_wander_um = 6e-3;
-        world.zero_flow_drift_um_per_s = self.drift_um_per_s;
+        world.zero_flow_wander_um = Some(6e-3);
+        world.zero_flow_drift_um_per_s = Some(self.drift_um_per_s);
         world.faults.flow_step_um = self.flow_step_um();
         world.faults.clip_um = self.clip_um;
         let mut events = self.events.clone();
