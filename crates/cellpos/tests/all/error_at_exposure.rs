@@ -59,7 +59,11 @@ fn the_error_of_a_moving_bead_is_the_same_in_the_summary_and_in_the_exports() {
         (exported_nm / stated_nm - 1.0).abs() < 1e-3,
         "{exported_nm} exported, {stated_nm} stated"
     );
-    // The reference goes on by up to 1.3 um while a frame is on its way: this is no error.
-    let at_tick: Vec<f64> = bead_um.iter().zip(&target_um).map(|(b, t)| b - t).collect();
-    assert!(counted(&at_tick) > 1.5 * stated_nm || counted(&at_tick) < stated_nm / 1.5);
+    // The reference goes on by up to 1.2 um while a frame is on its way: what a row's own reference gives is another number.
+    let at_tick = bead_um.iter().zip(&target_um).map(|(b, t)| b - t);
+    let apart = at_tick
+        .zip(&error_um)
+        .map(|(tick, error)| (tick - error).abs());
+    let most_um = apart.filter(|um| um.is_finite()).fold(0.0, f64::max);
+    assert!((1.0..1.4).contains(&most_um), "{most_um} um apart");
 }
