@@ -71,6 +71,7 @@ fn records_skipping(
             length_sd_um: f64::NAN,
             area_sd_um2: f64::NAN,
             estimate_um: measured_um,
+            estimate_sd_um: 0.01,
             neutral_um: 20.0,
             requested_um: 20.0,
             command_um: 20.0,
