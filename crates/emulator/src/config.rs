@@ -124,7 +124,7 @@ impl Default for WorldConfig {
             electrons_per_grey: 40.0,
             localisation_um: None,
             new_bead_after_ms: None,
-            ideal: false,
+            ideal: true,
             zero_flow_wander_um: None,
             zero_flow_wander_time_s: None,
             zero_flow_drift_um_per_s: None,
@@ -150,6 +150,14 @@ impl WorldConfig {
     pub fn ideal() -> Self {
         Self {
             ideal: true,
+            ..Self::default()
+        }
+    }
+
+    /// A rig with the [`Imperfections`] of a real one.
+    pub fn real() -> Self {
+        Self {
+            ideal: false,
             ..Self::default()
         }
     }

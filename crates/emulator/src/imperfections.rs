@@ -1,7 +1,7 @@
 //! What a real rig is not spared: its flow, its light and its clocks are never quite what they should be.
 //!
-//! Every key of `[emulator]` that stands for one of them may be left out. Then it is as on a real rig, or nothing at all with
-//! `ideal = true`. A key that is given is what it says on either rig.
+//! Every key of `[emulator]` that stands for one of them may be left out. Then it is as on a real rig with `ideal = false`, and
+//! nothing at all on an ideal rig. A key that is given is what it says on either rig.
 
 use crate::config::WorldConfig;
 use crate::error::{WorldError, within};
@@ -244,7 +244,7 @@ mod tests {
     #[test]
     fn a_key_left_out_is_that_of_a_real_rig_or_nothing_on_an_ideal_one_and_a_key_given_holds_on_both()
      {
-        assert_eq!(WorldConfig::default().imperfections(), Imperfections::REAL);
+        assert_eq!(WorldConfig::real().imperfections(), Imperfections::REAL);
         assert_eq!(WorldConfig::ideal().imperfections(), Imperfections::IDEAL);
         for ideal in [false, true] {
             let given = WorldConfig {

@@ -13,7 +13,8 @@ use crate::run::{EndRule, EndWatch, Finished, RunError, RunSink, close_session};
 use crate::summary::{Statistics, Summary};
 use crate::threads::Acting;
 use crate::ticker::{Ends, RingSizes, Ticker};
-use cellpos_rig::{Actuator, Clock, PositionSource};
+use cellpos_rig::{Actuator, Clock, Measurement, PositionSource};
+use rtrb::Producer;
 
 /// Runs until `end` says so. `request` is asked at each tick with its sequence number.
 ///
@@ -60,16 +61,7 @@ pub fn run<R: ReferenceGenerator, S: RunSink>(
     let end = loop {
         // The first tick is made at once, the others as on the real clock: on the arrival of a frame, or on the timer.
         let due_ns = loop {
-            while io_error.is_none() {
-                match source.next(clock.now_ns()) {
-                    Ok(Some(measurement)) => {
-                        // A refused measurement shows as a gap in the frame ids.
-                        let _ = measurements.push(measurement);
-                    }
-                    Ok(None) => break,
-                    Err(error) => io_error = Some(error.into()),
-                }
-            }
+            while receive(source, clock.now_ns(), &mut measurements, &mut io_error) {}
             let ready_ns = ticker.look();
             let now_ns = clock.now_ns();
             let pace = match tick {
@@ -78,17 +70,17 @@ pub fn run<R: ReferenceGenerator, S: RunSink>(
             };
             match pace {
                 Pace::Tick(due_ns) => {
-                    pacer.ticked(now_ns, ready_ns);
+                    // The first is not one of those that frames are expected by.
+                    if tick > 0 {
+                        pacer.ticked(now_ns, ready_ns);
+                    }
                     break due_ns;
                 }
-                Pace::Wait(until_ns) if io_error.is_none() => match source.next(until_ns) {
-                    Ok(Some(measurement)) => {
-                        let _ = measurements.push(measurement);
+                Pace::Wait(until_ns) => {
+                    if !receive(source, until_ns, &mut measurements, &mut io_error) {
+                        clock.sleep_until_ns(until_ns);
                     }
-                    Ok(None) => clock.sleep_until_ns(until_ns),
-                    Err(error) => io_error = Some(error.into()),
-                },
-                Pace::Wait(until_ns) => clock.sleep_until_ns(until_ns),
+                }
             }
         };
         let mut asked = request(tick);
@@ -140,4 +132,28 @@ pub fn run<R: ReferenceGenerator, S: RunSink>(
         learned: ticker.core().learners().tables(),
         io_error,
     })
+}
+
+/// Takes the next frame that is delivered by `deadline_ns`; whether one was. After a failure of the camera none is.
+fn receive(
+    source: &mut dyn PositionSource,
+    deadline_ns: i64,
+    measurements: &mut Producer<Measurement>,
+    failure: &mut Option<RunError>,
+) -> bool {
+    if failure.is_some() {
+        return false;
+    }
+    match source.next(deadline_ns) {
+        Ok(Some(measurement)) => {
+            // A refused measurement shows as a gap in the frame ids.
+            let _ = measurements.push(measurement);
+            true
+        }
+        Ok(None) => false,
+        Err(error) => {
+            *failure = Some(error.into());
+            false
+        }
+    }
 }

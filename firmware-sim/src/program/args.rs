@@ -24,9 +24,9 @@ pub struct Args {
     /// Fixes every random number
     #[arg(long)]
     pub seed: Option<u64>,
-    /// A rig without the imperfections of a real one: flow, light, focus and clocks stand still
-    #[arg(long)]
-    pub ideal: bool,
+    /// Whether the rig stands still, or has the imperfections of a real one (false): flow, light, focus and clocks stray
+    #[arg(long, value_name = "BOOL", num_args = 0..=1, require_equals = true, default_missing_value = "true")]
+    pub ideal: Option<bool>,
     /// Make a symbolic link to the pseudo-terminal here, so that its name is always the same
     #[arg(long, value_name = "PATH")]
     pub pty_link: Option<PathBuf>,
@@ -270,7 +270,7 @@ impl Args {
         if let Some(seed) = self.seed {
             file.emulator.seed = seed;
         }
-        file.emulator.ideal |= self.ideal;
+        file.emulator.ideal = self.ideal.unwrap_or(file.emulator.ideal);
         if let Some(model) = &self.model {
             file.emulator.model.clone_from(model);
         } else if let Some(beside) = self.rig.as_deref().and_then(Path::parent) {
@@ -391,8 +391,9 @@ mod tests {
                     --clip-at 21um";
         let world = parse(line).unwrap().setup().unwrap().world;
         let faults = &world.faults;
-        assert_eq!((world.seed, world.ideal), (9, false));
-        assert!(parse("--ideal").unwrap().setup().unwrap().world.ideal);
+        assert_eq!(world.seed, 9);
+        let ideal = |line: &str| parse(line).unwrap().setup().unwrap().world.ideal;
+        assert!(ideal("--ideal") && !ideal("--ideal=false"));
         assert_eq!(
             (faults.drop_rate, faults.stale_rate, faults.double_rate),
             (0.01, 0.02, 0.0)

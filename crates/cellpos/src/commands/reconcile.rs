@@ -58,9 +58,9 @@ pub struct Args {
     /// Factor on the duration of the experiments, 0.2 to 10.
     #[arg(long, default_value_t = 1.0, requires = "collect", help_heading = ON_A_RIG)]
     effort: f64,
-    /// Without the imperfections of a real rig (emulated rig): flow, light, focus and clocks stand still.
-    #[arg(long, requires = "collect")]
-    ideal: bool,
+    /// Whether the emulated rig stands still, or has the imperfections of a real one (false) [default: as rig.toml says].
+    #[arg(long, value_name = "BOOL", num_args = 0..=1, require_equals = true, default_missing_value = "true", requires = "collect")]
+    ideal: Option<bool>,
     /// Seed of the emulated rig and of the excitations [default: that of rig.toml].
     #[arg(long, requires = "collect", help_heading = ON_A_RIG)]
     seed: Option<u64>,

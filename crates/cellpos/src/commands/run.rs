@@ -88,9 +88,9 @@ pub struct Args {
     /// Run although the rig file has errors (cellpos rig check).
     #[arg(long)]
     anyway: bool,
-    /// Without the imperfections of a real rig (emulated rig): flow, light, focus and clocks stand still.
-    #[arg(long, conflicts_with = "resume")]
-    ideal: bool,
+    /// Whether the emulated rig stands still, or has the imperfections of a real one (false) [default: as rig.toml says].
+    #[arg(long, value_name = "BOOL", num_args = 0..=1, require_equals = true, default_missing_value = "true", conflicts_with = "resume")]
+    ideal: Option<bool>,
     /// Seed of the emulated rig; left out: that of rig.toml.
     #[arg(long)]
     seed: Option<u64>,

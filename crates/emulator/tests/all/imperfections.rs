@@ -1,4 +1,4 @@
-//! The rig as it is by default: nothing about it stands quite still.
+//! The rig as a real one is: nothing about it stands quite still.
 
 use crate::world::{MS, positions, world};
 use cellpos_emulator::{EmulatedRig, Imperfections, World, WorldConfig};
@@ -14,8 +14,8 @@ fn quiet() -> WorldConfig {
 }
 
 #[test]
-fn the_default_rig_has_the_imperfections_of_a_real_one() {
-    let mut real = world(&WorldConfig::default());
+fn a_rig_that_is_not_ideal_has_the_imperfections_of_a_real_one() {
+    let mut real = world(&WorldConfig::real());
     let fixes = positions(&mut real, 1000, 20.0);
     let first = &fixes[0].info;
     let last = &fixes[fixes.len() - 1].info;
@@ -36,7 +36,7 @@ fn the_default_rig_has_the_imperfections_of_a_real_one() {
     // The exposure's own jitter of 2 us, four of it at most, is the only thing before the fastest.
     assert!(beyond_us.iter().all(|us| *us >= -8.0), "{beyond_us:?}");
     assert_eq!(
-        world(&WorldConfig::default()).config().imperfections(),
+        world(&WorldConfig::real()).config().imperfections(),
         Imperfections::REAL
     );
 }
@@ -45,7 +45,7 @@ fn the_default_rig_has_the_imperfections_of_a_real_one() {
 fn frames_arrive_in_their_order_whatever_the_jitter() {
     let config = WorldConfig {
         arrival_jitter_us: Some(2000.0),
-        ..WorldConfig::default()
+        ..WorldConfig::real()
     };
     let fixes = positions(&mut world(&config), 2000, 20.0);
     assert!(fixes.windows(2).all(|pair| {
@@ -67,7 +67,7 @@ fn a_seed_fixes_every_picture_and_an_ideal_rig_stands_still() {
         }
         (all, world.zero_flow_um())
     };
-    let config = WorldConfig::default();
+    let config = WorldConfig::real();
     let (once, wandered_um) = frames(&config);
     assert!(once.len() > 40 && wandered_um != 20.0);
     assert_eq!(once, frames(&config).0);

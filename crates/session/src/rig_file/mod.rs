@@ -324,21 +324,21 @@ impl RigFile {
         Ok(())
     }
 
-    /// Takes a seed for the emulated rig and, with `ideal`, the imperfections of a real one off it, but for those whose key is given.
+    /// Takes a seed for the emulated rig, and whether it is ideal or has the imperfections of a real one; what is not given stays.
     ///
     /// # Errors
-    /// An ideal rig is asked for, and the rig is not emulated.
-    pub fn emulate_as(&mut self, seed: Option<u64>, ideal: bool) -> Result<(), Failure> {
+    /// The rig is not emulated, and something is said of its imperfections.
+    pub fn emulate_as(&mut self, seed: Option<u64>, ideal: Option<bool>) -> Result<(), Failure> {
         if let Some(seed) = seed {
             self.emulator.seed = seed;
         }
-        if ideal && !self.is_emulated() {
+        if ideal.is_some() && !self.is_emulated() {
             return Err(Failure::bad_input(
                 "--ideal is for the emulated rig: a real one is as it is",
                 "leave it out; firmware-sim has an --ideal of its own",
             ));
         }
-        self.emulator.ideal |= ideal;
+        self.emulator.ideal = ideal.unwrap_or(self.emulator.ideal);
         Ok(())
     }
 

@@ -58,9 +58,9 @@ pub struct Args {
     /// Most further experiments where the first leaves names open.
     #[arg(long, default_value_t = 1)]
     rounds: u8,
-    /// Without the imperfections of a real rig (emulated rig): flow, light, focus and clocks stand still.
-    #[arg(long)]
-    ideal: bool,
+    /// Whether the emulated rig stands still, or has the imperfections of a real one (false) [default: as rig.toml says].
+    #[arg(long, value_name = "BOOL", num_args = 0..=1, require_equals = true, default_missing_value = "true")]
+    ideal: Option<bool>,
     /// Seed of the emulated rig and of the excitations [default: that of rig.toml].
     #[arg(long)]
     seed: Option<u64>,

@@ -95,9 +95,9 @@ pub struct Args {
     /// Plant that amplitudes and the holding loop are made for, and that of the emulated rig: `eq6` or a model.toml.
     #[arg(long, default_value = "eq6", help_heading = ON_A_RIG)]
     model: String,
-    /// Without the imperfections of a real rig (emulated rig): flow, light, focus and clocks stand still.
-    #[arg(long)]
-    ideal: bool,
+    /// Whether the emulated rig stands still, or has the imperfections of a real one (false) [default: as rig.toml says].
+    #[arg(long, value_name = "BOOL", num_args = 0..=1, require_equals = true, default_missing_value = "true")]
+    ideal: Option<bool>,
     /// Seed of the emulated rig, the excitation and the bootstrap [default: that of rig.toml, else 1].
     #[arg(long, help_heading = ON_A_RIG)]
     seed: Option<u64>,
@@ -267,7 +267,7 @@ fn job(args: &Args) -> Result<identification::Job, Failure> {
         None => Setup {
             world: WorldConfig {
                 model: args.model.clone(),
-                ideal: args.ideal,
+                ideal: args.ideal.unwrap_or(WorldConfig::default().ideal),
                 ..WorldConfig::default()
             },
             model,
