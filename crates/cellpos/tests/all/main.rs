@@ -7,6 +7,7 @@ mod circle;
 mod common;
 mod design;
 mod error_at_exposure;
+mod following;
 mod identify;
 mod identify_rig;
 mod keeping;

@@ -1,0 +1,78 @@
+//! What a loop cannot follow is said before anything moves: `cellpos run` with a script, `track` with a rig that does not fit.
+
+use crate::common::{cellpos, succeed};
+
+fn wave(frequency: &str) -> String {
+    format!(
+        "name = \"wave\"\n[[step]]\ndo = \"hold\"\nduration = \"200ms\"\n[[step]]\ndo = \"sine\"\namplitude = \"1um\"\n\
+         frequency = \"{frequency}\"\ncycles = 40\n"
+    )
+}
+
+#[test]
+fn a_script_is_warned_of_a_motion_that_its_loop_will_miss_and_refused_beyond_half_its_rate() {
+    let folder = tempfile::tempdir().unwrap();
+    std::fs::write(folder.path().join("fast.toml"), wave("60Hz")).unwrap();
+    let run = |controller: &str| {
+        let line = format!("run fast.toml --dry --json --controller {controller}");
+        succeed(folder.path(), &line)
+    };
+    let ran = run("pi");
+    let said = format!("{} {}", ran.err, ran.json());
+    assert!(
+        said.contains("predicted to miss") && said.contains("--controller"),
+        "{said}"
+    );
+    let ran = run("mpc");
+    let said = format!("{} {}", ran.err, ran.json());
+    assert!(!said.contains("predicted to miss"), "{said}");
+    std::fs::write(folder.path().join("beyond.toml"), wave("600Hz")).unwrap();
+    let ran = cellpos(folder.path(), "run beyond.toml --dry --json");
+    assert_eq!(ran.code, Some(2), "{}", ran.err);
+    assert!(
+        ran.err.contains("500 Hz") && ran.err.contains("beyond.toml:5"),
+        "{}",
+        ran.err
+    );
+}
+
+#[test]
+fn track_and_rig_check_say_the_same_of_a_rig_file_and_an_error_ends_both() {
+    let folder = tempfile::tempdir().unwrap();
+    // Every frame would be stale.
+    std::fs::write(
+        folder.path().join("rig.toml"),
+        "[timing]\nperiod_us = 1000.0\noldest_ms = 1.5\n",
+    )
+    .unwrap();
+    let check = cellpos(folder.path(), "rig check rig.toml");
+    let track = "track --rig rig.toml --target 0um --duration 300ms --clock virtual --frames off --no-record";
+    let refused = cellpos(folder.path(), track);
+    assert_eq!(
+        (check.code, refused.code),
+        (Some(1), Some(2)),
+        "{}",
+        refused.err
+    );
+    for said in [&check.out, &refused.err] {
+        assert!(said.contains("oldest_ms = 1.5"), "{said}");
+    }
+    assert!(refused.err.contains("--anyway"), "{}", refused.err);
+    let anyway = cellpos(folder.path(), &format!("{track} --anyway"));
+    assert_ne!(anyway.code, Some(2), "{}", anyway.err);
+    // A camera that is slower than the loop is predicted through: both say so, and none refuses it.
+    std::fs::write(
+        folder.path().join("slow.toml"),
+        "[emulator]\nrate_hz = 500.0\n",
+    )
+    .unwrap();
+    let check = cellpos(folder.path(), "rig check slow.toml");
+    assert_eq!(check.code, Some(0), "{}", check.out);
+    let ran = succeed(
+        folder.path(),
+        "track --rig slow.toml --target 0um --duration 2s --clock virtual --frames off --no-record",
+    );
+    for said in [&check.out, &ran.err] {
+        assert!(said.contains("rate_hz = 500"), "{said}");
+    }
+}
