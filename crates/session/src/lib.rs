@@ -34,6 +34,7 @@ mod devices;
 pub mod ended;
 mod failure;
 mod fit;
+mod frames_seen;
 pub mod live_line;
 mod prepared;
 pub mod provenance;
@@ -56,7 +57,8 @@ pub mod words;
 pub use devices::Options;
 pub use ended::{EndKind, Ended};
 pub use failure::Failure;
-pub use rig::{Armed, Finished, FramesSeen, NotArmed, Rig, Running};
+pub use frames_seen::FramesSeen;
+pub use rig::{Armed, Finished, NotArmed, Rig, Running};
 pub use rig_file::RigFile;
 
 /// The README's Rust is compiled and run.
