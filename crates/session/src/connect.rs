@@ -242,18 +242,32 @@ pub fn diffusion_um2_per_s(file: &RigFile, model: &cellpos_plant::Model) -> f64 
     }
 }
 
-/// Smallest RMS error that any controller could reach, nm: Brownian motion, delay and noise in force.
+/// Smallest RMS error that any controller could reach, nm: Brownian motion and noise in force, with the delay that the run measured,
+/// not the one that was set. `None` where the run did better than that: then diffusion or noise are not what is stated, and the
+/// figure would be no bound.
 pub fn bound_rms_nm(file: &RigFile, setup: &Setup, summary: &Summary) -> Option<f64> {
-    let diffusion = diffusion_um2_per_s(file, &setup.model);
-    summary.fix_noise_nm.map(|noise_nm| {
-        let timing = &setup.config.timing;
-        1e3 * bound_rms_um(
-            diffusion,
+    /// Time over which the error of a hold is correlated, s: a loop of 30 Hz or so.
+    const CORRELATED_S: f64 = 0.005;
+    let noise_nm = summary.fix_noise_nm?;
+    let timing = &setup.config.timing;
+    let measured_s = 1e-3 * summary.loop_delay_ms - 0.5e-6 * timing.period_us;
+    let delay_s = match summary.exposure_to_command_us.max > 0.0 {
+        true => measured_s.max(0.0),
+        false => timing.camera_delay_ms * 1e-3,
+    };
+    let bound_nm = 1e3
+        * bound_rms_um(
+            diffusion_um2_per_s(file, &setup.model),
             noise_nm * 1e-3,
-            timing.camera_delay_ms * 1e-3,
+            delay_s,
             timing.period_us * 1e-6,
-        )
-    })
+        );
+    let measured_nm = |nm: f64| (nm * nm - noise_nm * noise_nm).max(0.0).sqrt();
+    let reached_nm = (summary.rms_true_nm).or(summary.rms_measured_nm.map(measured_nm));
+    // An RMS of n independent values has a relative standard deviation of 1/sqrt(2 n); three of them.
+    let unsure = 3.0 * (CORRELATED_S / summary.duration_s.max(CORRELATED_S)).sqrt();
+    let beaten = reached_nm.is_some_and(|nm| nm < bound_nm * (1.0 - unsure));
+    (!beaten).then_some(bound_nm)
 }
 
 /// What is wrong when the frames of a run were not as old as the rig file says: the loop was made for another delay.

@@ -1,6 +1,6 @@
 //! What a loop cannot follow is said before anything moves: `cellpos run` with a script, `track` with a rig that does not fit.
 
-use crate::common::{cellpos, succeed};
+use crate::common::{cellpos, number, succeed};
 
 fn wave(frequency: &str) -> String {
     format!(
@@ -75,4 +75,20 @@ fn track_and_rig_check_say_the_same_of_a_rig_file_and_an_error_ends_both() {
     for said in [&check.out, &ran.err] {
         assert!(said.contains("rate_hz = 500"), "{said}");
     }
+}
+
+#[test]
+fn the_bound_is_that_of_the_delay_that_was_measured_not_of_the_one_that_was_set() {
+    let folder = tempfile::tempdir().unwrap();
+    std::fs::write(
+        folder.path().join("rig.toml"),
+        "[emulator]\nlatency_ms = 1.0\n[timing]\ncamera_delay_ms = 2.0\n",
+    )
+    .unwrap();
+    let line = "track --rig rig.toml --target 0um --controller pi --duration 6s --clock virtual --frames off --json --no-record";
+    let r = succeed(folder.path(), line).json();
+    // 2 ms of Brownian motion at 0.33 um^2/s that no command can answer; 44.5 nm for the 3 ms of the file.
+    let bound = number(&r, "bound_rms_nm");
+    assert!((bound - 36.3).abs() < 1.0, "{bound}");
+    assert!(number(&r, "rms_true_nm") > 0.9 * bound, "{r}");
 }
