@@ -2,9 +2,9 @@
 """Pages as a browser lays them out, 1400 and 400 px wide, on a light and on a dark screen.
 
     scripts/check_pages.py PICTURES PAGE.html...
-    scripts/check_pages.py PICTURES target/debug/cellpos    # of pages that it makes: runs, a cell's, cells, gap, identify, check, paper
+    scripts/check_pages.py PICTURES target/debug/cellpos    # of pages that it makes: runs, a cell's, cells, gap, identify, design, check, paper
 
-Says what of a figure's text is cut off, lies upon another text or cannot be read against its ground, which name stands twice in one
+Says which page does not show its result on the first screen, which figure has no caption or cannot be taken along, what of a figure's text is cut off, lies upon another text or cannot be read against its ground, which name stands twice in one
 legend, and what makes a page wider than its window; writes a picture of each into the folder PICTURES, to be looked at. Needs
 Chromium. Exit code 1: something was found.
 """
@@ -31,6 +31,23 @@ addEventListener("load", () => {
     const least = [...document.querySelectorAll("body *")].filter(e => !e.closest(".scroll,pre") && e.getBoundingClientRect().right > innerWidth + 0.5);
     found.push(`the page is ${wide} px wider than its window: ${least.slice(0, 3).map(e => e.tagName + " " + e.textContent.slice(0, 40)).join("; ")}`);
   }
+  // A reader of the first screen knows what was done and what came out: a sentence, and the beginning of a figure.
+  const seen = [...document.querySelectorAll("p.result")].filter(e => e.getBoundingClientRect().bottom <= 850);
+  if (!seen.length) found.push("the first screen has no result");
+  const first = [...document.querySelectorAll("figure")].find(e => e.getBoundingClientRect().width)?.getBoundingClientRect();
+  if (innerWidth > 1000 && !(first?.top <= 450)) found.push("the first screen has no figure");
+  for (const figure of document.querySelectorAll("figure")) {
+    const caption = figure.querySelector("figcaption")?.firstChild?.textContent.trim() ?? "";
+    if (caption.length < 20) found.push(`a figure has the caption "${caption}"`);
+    if (figure.querySelector("svg") && figure.querySelectorAll("a[download]").length < 2) found.push(`a figure cannot be taken along: ${caption.slice(0, 40)}`);
+  }
+  const names = [...document.querySelectorAll("figure a[download]")].map(a => a.download);
+  names.filter((n, i) => names.indexOf(n) < i).forEach(n => found.push(`the figure ${n} stands twice`));
+  if (innerWidth > 1000) for (const table of document.querySelectorAll(".scroll")) {
+    if (table.scrollWidth > table.clientWidth + 1) found.push(`a table is wider than the page: ${table.textContent.trim().slice(0, 40)}`);
+  }
+  const unset = [...document.querySelectorAll("p, th, td, li, figcaption, text")].filter(e => !e.closest("pre") && /(^|[\s(])um([\s)/]|$)/.test(e.textContent) && !e.querySelector("p, th, td, li"));
+  unset.slice(0, 3).forEach(e => found.push(`um for µm: ${e.textContent.trim().slice(0, 60)}`));
   const light = c => { const p = c.match(/[\d.]+/g).map(Number).slice(0, 3).map(v => v / 255).map(v => v <= 0.04045 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4);
     return 0.2126 * p[0] + 0.7152 * p[1] + 0.0722 * p[2]; };
   const contrast = (a, b) => (Math.max(light(a), light(b)) + 0.05) / (Math.min(light(a), light(b)) + 0.05);
@@ -104,6 +121,7 @@ def made(program: Path, folder: Path) -> list[Path]:
         "report latest-tire --out tire.html",
         "reconcile --model eq6 --data latest-sine latest-hold --report gap.html",
         f"identify {fast} --seed 3 --out model.toml --report identify.html",
+        "design --model eq6 --delay 2.5ms --report design.html",
         "check tire.toml --report check.html",
         "paper --report paper.html",
     ):

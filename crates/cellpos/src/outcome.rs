@@ -48,11 +48,31 @@ fn print_object(name: &str, value: &impl Serialize) -> Result<(), Failure> {
         value,
     };
     let text = serde_json::to_string_pretty(&object).map_err(Failure::failed)?;
-    print_text(&format!("{text}\n"))
+    print(&format!("{text}\n"))
 }
 
-/// Prints text on standard output; a closed pipe (`| head`) is no error.
+/// Prints text on standard output; a closed pipe (`| head`) is no error. On a terminal people read, and units are as people write
+/// them; in a pipe or a file they are as programs write them.
 pub fn print_text(text: &str) -> Result<(), Failure> {
+    use std::io::IsTerminal;
+    if std::io::stdout().is_terminal() && reads_utf8() {
+        print(&cellpos_report::typeset(text))
+    } else {
+        print(text)
+    }
+}
+
+/// Whether the terminal's locale has letters beyond ASCII.
+fn reads_utf8() -> bool {
+    let set = |name| std::env::var(name).ok().filter(|value| !value.is_empty());
+    let locale = ["LC_ALL", "LC_CTYPE", "LANG"].into_iter().find_map(set);
+    locale.is_some_and(|locale| {
+        let locale = locale.to_ascii_lowercase();
+        locale.contains("utf-8") || locale.contains("utf8")
+    })
+}
+
+fn print(text: &str) -> Result<(), Failure> {
     use std::io::Write;
     // What a run was told to say is shown below what it said while it ran.
     cellpos_terminal::stderr().flush(PATIENCE);

@@ -67,25 +67,37 @@ fn verdict(r: &mut Report, result: &Reconciliation) {
         .map(|e| e.id.as_str())
         .collect::<Vec<_>>()
         .join(" + ");
-    match result.verdict {
-        Verdict::Named => r.note(Emphasis::Good, &format!("named: {names}")),
-        Verdict::NamedWithRemainder => r.note(
+    let (status, text) = match result.verdict {
+        Verdict::Named => (Emphasis::Good, format!("The model lacks {names}.")),
+        Verdict::NamedWithRemainder => (
             Emphasis::Warning,
-            &format!("named: {names}; and something remains"),
+            format!("The model lacks {names}, and something more that the catalogue does not name."),
         ),
-        Verdict::Ambiguous => r.note(
+        Verdict::Ambiguous => (
             Emphasis::Warning,
-            &format!("ambiguous: {names}, or what stands beside it below"),
+            format!("The model lacks {names}, or an effect that these records cannot tell from it."),
         ),
-        Verdict::Unknown => r.note(
+        Verdict::Unknown => (
             Emphasis::Bad,
-            "unknown: beyond the noise floor, and nothing in the catalogue closes enough of it",
+            "The model lacks something: the gap is beyond the noise floor, and nothing in the catalogue closes enough of it."
+                .to_owned(),
         ),
-        Verdict::NothingMissing => r.note(
+        Verdict::NothingMissing => (
             Emphasis::Good,
-            "nothing missing: the model is at the noise floor",
+            "Nothing is missing: the model is at the noise floor.".to_owned(),
         ),
     };
+    let gap = &result.gap;
+    r.result(
+        status,
+        &format!(
+            "{text} Gap on held-out records: {} before, {} after, {} is the noise floor.",
+            small(result, gap.before),
+            small(result, gap.after),
+            small(result, gap.floor)
+        ),
+    );
+    innovations(r, result);
     if !result.effects.is_empty() {
         let mut t = Table::new([
             Column::left("effect"),
@@ -301,6 +313,12 @@ fn gap(r: &mut Report, result: &Reconciliation) {
         ]);
     }
     r.table(t);
+}
+
+/// The figure that answers the question: where the model fell short before, and where it does now.
+fn innovations(r: &mut Report, result: &Reconciliation) {
+    let g = &result.gap;
+    let (factor, unit) = fine(result);
     let x: Vec<f64> = g
         .bands
         .iter()
@@ -310,7 +328,10 @@ fn gap(r: &mut Report, result: &Reconciliation) {
         g.bands.iter().map(|b| factor * f(b)).collect::<Vec<f64>>()
     };
     r.figure(
-        Figure::new("spectrum", "Innovations by band").panel(
+        Figure::new(
+            "spectrum",
+            "Prediction error (innovation) by frequency band on held-out records, of the model as it was and with the effects added; dashed: \
+             the noise floor of these records.").panel(
             Panel::new(
                 Axis::log("frequency", "Hz"),
                 Axis::log("innovation", &format!("{unit} RMS")),

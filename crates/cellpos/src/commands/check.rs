@@ -213,15 +213,47 @@ fn json(script: &Script, check: &Check) -> serde_json::Value {
 
 fn report(script: &Script, check: &Check, limits: &CheckLimits) -> Report {
     let mut report = Report::new(&format!("Script {}", script.name));
+    match check.violations.len() {
+        0 => report.result(
+            Emphasis::Good,
+            "The script can run within the limits of this rig.",
+        ),
+        1 => report.result(
+            Emphasis::Bad,
+            "The script cannot run: it breaks one limit of this rig.",
+        ),
+        many => report.result(
+            Emphasis::Bad,
+            &format!("The script cannot run: it breaks limits of this rig in {many} places."),
+        ),
+    };
     if !script.notes.is_empty() {
         report.paragraph(&script.notes);
-    }
-    if check.violations.is_empty() {
-        report.note(Emphasis::Good, "The script can run.");
     }
     for line in violations(script, check) {
         report.note(Emphasis::Bad, &line);
     }
+    let time = || Axis::linear("time", "s");
+    report.figure(
+        Figure::new(
+            "reference",
+            "Reference and PZT demand; long repeats and waves are shortened, waits take no time.",
+        )
+        .panel(
+            Panel::new(time(), Axis::linear("bead", "um")).series(Series::line(
+                "reference",
+                &check.time_s,
+                &check.reference_um,
+            )),
+        )
+        .panel(
+            Panel::new(time(), Axis::linear("PZT", "um"))
+                .series(Series::step("demand", &check.time_s, &check.demand_um).color(2))
+                .horizontal(limits.low_um, "lower limit")
+                .horizontal(limits.high_um, "upper limit"),
+        )
+        .share_x(),
+    );
     let mut table = Table::new([Column::left("figure"), Column::right("value")]);
     for (name, value) in figures(check) {
         table.row([name, value.as_str()]);
@@ -246,27 +278,6 @@ fn report(script: &Script, check: &Check, limits: &CheckLimits) -> Report {
         }
         report.table(table);
     }
-    let time = || Axis::linear("time", "s");
-    report.figure(
-        Figure::new(
-            "reference",
-            "Reference and PZT demand; long repeats and waves are shortened, waits take no time.",
-        )
-        .panel(
-            Panel::new(time(), Axis::linear("bead", "um")).series(Series::line(
-                "reference",
-                &check.time_s,
-                &check.reference_um,
-            )),
-        )
-        .panel(
-            Panel::new(time(), Axis::linear("PZT", "um"))
-                .series(Series::step("demand", &check.time_s, &check.demand_um).color(2))
-                .horizontal(limits.low_um, "lower limit")
-                .horizontal(limits.high_um, "upper limit"),
-        )
-        .share_x(),
-    );
     report.section("Script");
     report.verbatim(&script.text);
     report

@@ -40,6 +40,14 @@ function begin(told) {
   buttons();
 }
 
+// The program's sentences as this page says them: µ where there is one, and the cell where a cell is followed. What a person wrote
+// stays as it was written.
+function words(text) {
+  if (/^(Note|Mark): /.test(text)) return text;
+  const set = text.replace(/(^|[\s\d(])um(?=[\s),.;:/]|$)/g, "$1µm").replace(/(\d ?)us(?=[\s),.;:]|$)/g, "$1µs").replaceAll("+-", "±");
+  return hello?.cell ? set.replace(/\bbead\b/g, "cell").replace(/\bBead\b/g, "Cell") : set;
+}
+
 function what() { return hello?.cell ? "cell" : "bead"; }
 
 // What can be asked for now.
@@ -67,10 +75,10 @@ function show(told) {
   // Without a line the picture of that stays, unless this is the last word.
   document.body.dataset.state = state.banner.state;
   $("state").textContent = word && state.banner.state !== "disconnected" ? ENDINGS[word.how] : state.banner.state === "disconnected" ? "no line" : state.banner.state;
-  $("reason").textContent = state.banner.reason;
+  $("reason").textContent = words(state.banner.reason);
   $("last-word").hidden = !word;
-  $("to-do").textContent = word?.to_do ? `${word.to_do}.` : "";
-  $("pzt-word").textContent = word?.pzt ?? "";
+  $("to-do").textContent = word?.to_do ? words(`${word.to_do}.`) : "";
+  $("pzt-word").textContent = words(word?.pzt ?? "");
   if (word && !before?.last_word) sound.play(word.how === "done" || word.how === "stopped" ? "warning" : "fault");
   else if (!word && state.banner.state === "safe" && before?.banner.state !== "safe") sound.play("fault");
   buttons();
@@ -85,7 +93,7 @@ function show(told) {
   if (state.cycle) parts.push(`Cycle ${state.cycle[0]} of ${state.cycle[1]}.`);
   if (state.next) parts.push(`Next: ${state.next}.`);
   if (state.left_s !== null) parts.push(`${clock(state.left_s)} left.`);
-  $("script-text").textContent = parts.join(" ");
+  $("script-text").textContent = words(parts.join(" "));
   $("lateness-text").textContent = state.wake_us === null ? ""
     : `99.9 % of all ticks: wake-up within ${state.wake_us.toFixed(0)} µs, computing within ${state.compute_us.toFixed(0)} µs.`;
 }
@@ -101,7 +109,7 @@ function happened(events) {
   for (const event of events) {
     const item = document.createElement("li"), time = document.createElement("span");
     item.className = event.level; time.textContent = `${event.time_s.toFixed(3)} s`;
-    item.append(time, event.text); // text, never markup
+    item.append(time, words(event.text)); // text, never markup
     list.prepend(item);
     if (event.level !== "info" && !hello?.recorded && events.length < 20) sound.play(event.level);
     if (event.level === "fault" && event.text.startsWith("The PZT parks")) holdFault(event.time_s);
@@ -133,7 +141,7 @@ function answer(text, where, good) {
 
 const wire = new Wire({
   told,
-  answered: (refused, where) => answer(refused || "Done.", where, !refused),
+  answered: (refused, where) => answer(words(refused || "Done."), where, !refused),
   rows: fresh => { rows.take(fresh); },
   picture: shown => {
     picture.show(shown);

@@ -165,9 +165,9 @@ fn gauge_line(hello: &Hello, history: &History, columns: u16) -> Paragraph<'stat
         (f64::from(row.command_um), f64::from(row.zero_flow_um))
     });
     let text = if command.is_finite() {
-        format!(" {command:6.2} um")
+        format!(" {command:6.2} µm")
     } else {
-        "      - um".to_string()
+        "      - µm".to_string()
     };
     let (first, last) = (format!("PZT {low:.0} "), format!(" {high:.0}"));
     let used = first.chars().count() + last.chars().count() + text.chars().count();
@@ -207,14 +207,14 @@ struct Panel {
 type Trace = (&'static str, Color, fn(&super::history::Bin) -> [f64; 2]);
 
 const POSITION: Panel = Panel {
-    unit: "um",
+    unit: "µm",
     lines: &[
         ("target", Color::Yellow, |bin| bin.target_um),
         ("position", Color::Cyan, |bin| bin.position_um),
     ],
 };
 const PZT: Panel = Panel {
-    unit: "um",
+    unit: "µm",
     lines: &[("PZT", Color::Green, |bin| bin.command_um)],
 };
 
@@ -305,7 +305,7 @@ fn cycle_table(frame: &mut Frame<'_>, area: Rect, history: &History) {
                 number(cycle.recovery_s, 3),
             ])
         });
-    let head = Row::new(["cycle", "ampl. um", "stretch", "recov. s"]).fg(Color::Gray);
+    let head = Row::new(["cycle", "ampl. µm", "stretch", "recov. s"]).fg(Color::Gray);
     let widths = [Constraint::Length(8); 4];
     frame.render_widget(Table::new(rows, widths).header(head), area);
 }
@@ -389,7 +389,7 @@ mod tests {
             "1:02:03",
             "RMS 57.3 nm",
             "late 3",
-            "20.00 um",
+            "20.00 µm",
             "cycle 12 of 40",
             "next: hold",
             "0:01:01 left",
@@ -397,7 +397,7 @@ mod tests {
             "1.987",
             "f freeze, q stop",
             "-10 s",
-            "target position um",
+            "target position µm",
         ] {
             assert!(text.contains(part), "{part}\n{text}");
         }

@@ -13,6 +13,10 @@ const LOSES: &str = "[[emulator.faults.event]]\nkind = \"lose-bead\"\nat_s = 6.0
 
 /// The page when its program is gone for a while: state, banner, reason, what to do, where the PZT is.
 fn when_gone(page: &Browser) -> [String; 5] {
+    page.wait_for(
+        "return !['running', 'frozen', 'armed', 'connecting'].includes(document.body.dataset.state)",
+        programs::PATIENCE,
+    );
     // Longer than the page waits before it tries again for the first time.
     std::thread::sleep(Duration::from_secs(2));
     let state = page.run("return document.body.dataset.state");
@@ -83,6 +87,10 @@ fn a_run_that_goes_safe_says_why_and_what_to_do_and_it_stays() {
     let rig = format!("{PATIENT}{LOSES}");
     let (folder, page, run) = start(&rig, "--duration 120s");
     assert_eq!(run.ended().code(), Some(1));
+    page.wait_for(
+        "return !document.getElementById('last-word').hidden",
+        programs::PATIENCE,
+    );
     let [state, word, reason, to_do, pzt] = when_gone(&page);
     assert_eq!((state.as_str(), word.as_str()), ("safe", "safe"));
     assert!(reason.contains("bead"), "{reason}");

@@ -145,6 +145,38 @@ fn verdict_and_names(circle: &Circle) -> String {
     format!("{}: {}", verdict.word(), names.join(" + "))
 }
 
+/// What was added, with its delays together, and what came of it.
+fn sentence(circle: &Circle) -> String {
+    let mut text = format!("{}.", verdict_and_names(circle));
+    if let Some(first) = text.get(..1) {
+        text = format!("{}{}", first.to_uppercase(), &text[1..]);
+    }
+    let identified_ms = circle.identified.result.judged.model.delay_s * 1e3;
+    let added_ms: f64 = (circle.reconciled.effects.iter())
+        .flat_map(|effect| &effect.parameters)
+        .filter(|(_, p)| p.unit == "ms")
+        .map(|(_, p)| p.value)
+        .sum();
+    if added_ms != 0.0 {
+        text.push_str(&format!(
+            " Delays that belong together: {identified_ms:.2} ms identified in the loop, {added_ms:.2} ms in the effects that were added to a \
+             model without it."
+        ));
+    }
+    if let [first, .., last] = circle.stages.as_slice() {
+        text.push_str(&format!(
+            " Sine: {} with the controller for the {} model, {} with that for the {} model; hold: {} and {}.",
+            rms(first.sine.as_ref()),
+            first.name,
+            rms(last.sine.as_ref()),
+            last.name,
+            rms(first.hold.as_ref()),
+            rms(last.hold.as_ref())
+        ));
+    }
+    text
+}
+
 /// The page.
 pub fn report(circle: &Circle, gap: &Path) -> Report {
     let mut r = Report::new("Closed circle: identify, reconcile, design again, track");
@@ -153,7 +185,8 @@ pub fn report(circle: &Circle, gap: &Path) -> Report {
         cellpos_reconcile::Verdict::Ambiguous => Emphasis::Warning,
         _ => Emphasis::Good,
     };
-    r.note(status, &verdict_and_names(circle));
+    r.result(status, &sentence(circle));
+    r.figure(traces(circle));
 
     r.section("Identified");
     let model = &circle.identified.result.judged.model;
@@ -284,7 +317,6 @@ fn tracking(r: &mut Report, circle: &Circle) {
         m.duration_s, m.amplitude_um, m.frequency_hz
     ));
     r.table(t);
-    r.figure(traces(circle));
 }
 
 fn margins_table(circle: &Circle) -> Table {

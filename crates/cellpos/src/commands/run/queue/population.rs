@@ -1,8 +1,9 @@
 //! What the cells of a queue have in common, and how far they differ: a row a cell, a page over all.
 
+use crate::commands::report::with_interval;
 use crate::commands::run::over::Over;
 use cellpos_report::{Axis, Column, Emphasis, Figure, Panel, Report, Series, Table};
-use cellpos_script::{ArmKind, AtRest, CycleFlags, CycleRow, trend};
+use cellpos_script::{ArmKind, AtRest, CycleFlags, CycleRow, Trend, trend};
 use serde::Serialize;
 use std::collections::BTreeMap;
 
@@ -191,6 +192,47 @@ fn mean_course(courses: &[Vec<(f64, f64)>]) -> [Vec<f64>; 4] {
     columns
 }
 
+/// What became of the cells: mean of their first and of their last stretch and recovery, with the interval between cells.
+pub(super) fn sentence(done: usize, rows: &[CellRow], cycles: &[Vec<CycleRow>]) -> String {
+    let mut text = format!(
+        "{done} of {} cells went through the whole script.",
+        rows.len()
+    );
+    type Value = fn(&CycleRow, &AtRest) -> f64;
+    let quantities: [(&str, &str, Value); 2] = [
+        ("Stretch", "", |row, rest| rest.stretch(row)),
+        ("recovery time", " s", |row, _| row.recovery_s),
+    ];
+    let mut parts = Vec::new();
+    for (name, unit, value) in quantities {
+        let trends: Vec<Trend> = (cycles.iter())
+            .filter_map(|rows| {
+                let rest = AtRest::of(rows);
+                trend(counted(rows).map(|row| (row.cycle, value(row, &rest))))
+            })
+            .collect();
+        let mean = |of: fn(&Trend) -> f64| {
+            let values: Vec<f64> = trends.iter().map(of).collect();
+            let mean = values.iter().sum::<f64>() / values.len() as f64;
+            with_interval(mean, half95(&values))
+        };
+        if trends.len() > 1 {
+            parts.push(format!(
+                "{name} from {} to {}{unit}",
+                mean(|trend| trend.first.mean),
+                mean(|trend| trend.last.mean)
+            ));
+        }
+    }
+    if !parts.is_empty() {
+        text.push_str(&format!(
+            " {} (mean of the cells, first and last ten cycles of each, 95 % interval between cells).",
+            parts.join(", ")
+        ));
+    }
+    text
+}
+
 /// The page: the figure of the population, and the table.
 pub(super) fn page(name: &str, rows: &[CellRow], cycles: &[Vec<CycleRow>]) -> Report {
     let mut page = Report::new(&format!("Cells: {name}"));
@@ -200,14 +242,7 @@ pub(super) fn page(name: &str, rows: &[CellRow], cycles: &[Vec<CycleRow>]) -> Re
     } else {
         Emphasis::Warning
     };
-    page.note(
-        status,
-        &format!(
-            "{done} of {} cells went through the whole script",
-            rows.len()
-        ),
-    );
-    page.section("The population over its cycles");
+    page.result(status, &sentence(done, rows, cycles));
     type Value = fn(&CycleRow, &AtRest) -> f64;
     let quantities: [(&str, &str, Value); 3] = [
         ("stretch", "", |row, rest| rest.stretch(row)),
