@@ -1,5 +1,7 @@
 //! `cellpos track`: hold a bead, or go to a position, in closed loop.
 
+mod target;
+
 use crate::arguments::{positive, run_name};
 use crate::checked;
 use crate::clips;
@@ -152,7 +154,7 @@ pub fn run(args: Args) -> CommandResult {
     adapt::choose(args.adapt, &mut prepared.controller);
     let mut rig = checked::open(file, options, args.rig.as_deref(), args.anyway)?;
     rig.fit(&mut prepared);
-    check_target(args.target, args.sine.map(|sine| sine.amplitude), &rig)?;
+    target::check(args.target, args.sine.map(|sine| sine.amplitude), &rig)?;
     let better = |name: &'static str| rig.prepare(&args.model, name);
     let predicted = cyclic::predicted(args.sine, args.learn, &prepared, rig.file(), better)?;
     let limits = prepared.controller.limits;
@@ -309,43 +311,6 @@ fn choose_solver(solver: Option<Solver>, controller: &mut ControllerFile) -> Res
         Solver::ActiveSet => SolverKind::ActiveSet,
     };
     Ok(())
-}
-
-/// Target, and the ends of a sine about it, have to be in view.
-fn check_target(
-    target: Micrometers,
-    amplitude: Option<Micrometers>,
-    rig: &Rig,
-) -> Result<(), Failure> {
-    let [low_um, high_um] = rig.source().field_um;
-    let seen = |um: f64| (low_um..=high_um).contains(&um);
-    if seen(target.value()) {
-        let Some(reach) = amplitude else {
-            return Ok(());
-        };
-        let ends = [
-            target.value() - reach.value(),
-            target.value() + reach.value(),
-        ];
-        if ends.into_iter().all(seen) {
-            return Ok(());
-        }
-        let most = (target.value() - low_um).min(high_um - target.value());
-        return Err(Failure::bad_input(
-            format!(
-                "--sine {reach}: about --target {target} it goes from {:.1}um to {:.1}um, and the camera sees {low_um:.1}um to \
-                 {high_um:.1}um",
-                ends[0], ends[1]
-            ),
-            format!(
-                "write an amplitude of at most {most:.1}um, or move the field of view (origin_px, width_px)"
-            ),
-        ));
-    }
-    Err(Failure::bad_input(
-        format!("--target {target}: outside what the camera sees, {low_um:.1}um to {high_um:.1}um"),
-        "choose a target inside, or move the field of view (origin_px, width_px)",
-    ))
 }
 
 fn conclude(

@@ -5,6 +5,7 @@ pub mod json;
 pub mod report;
 mod response;
 mod sources;
+mod tables;
 
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
 use crate::output;

@@ -119,16 +119,7 @@ pub fn section(page: &mut Report, read: &ReadCycles) -> serde_json::Value {
          their ticks.",
         rows.len()
     ));
-    let elsewhere = count(|row| was_elsewhere(row));
-    if elsewhere > 0 {
-        page.note(
-            Emphasis::Warning,
-            &format!(
-                "In {elsewhere} cycles bead or cell was elsewhere than the script had it (more than a tenth of the stroke from the \
-                 target in the mean): they are in cycles.csv, and in no mean and no trend."
-            ),
-        );
-    }
+    elsewhere(page, rows);
     let ramps = count(|row| row.flags.has(CycleFlags::RAMP));
     if ramps > 0 {
         page.paragraph(&format!(
@@ -200,6 +191,20 @@ pub fn section(page: &mut Report, read: &ReadCycles) -> serde_json::Value {
     page.figure(figure.share_x());
     flags(page, rows);
     serde_json::Value::Array(json)
+}
+
+/// Says how many cycles were not where the script had them.
+fn elsewhere(page: &mut Report, rows: &[CycleRow]) {
+    let elsewhere = rows.iter().filter(|row| was_elsewhere(row)).count();
+    if elsewhere > 0 {
+        page.note(
+            Emphasis::Warning,
+            &format!(
+                "In {elsewhere} cycles bead or cell was elsewhere than the script had it (more than a tenth of the stroke from the \
+                 target in the mean): they are in cycles.csv, and in no mean and no trend."
+            ),
+        );
+    }
 }
 
 /// Cycles of one motion in one arm.
