@@ -1,6 +1,5 @@
 //! What a bead looks like to the emulated camera.
 
-use crate::config::WorldConfig;
 use cellpos_vision::RadialProfile;
 use cellpos_vision::profile::{RingProfile, SplineProfile};
 use serde::{Deserialize, Serialize};
@@ -27,10 +26,9 @@ pub(crate) enum Look {
 
 impl Look {
     /// `None` when the bead's radius makes no profile.
-    pub(crate) fn of(config: &WorldConfig) -> Option<Self> {
+    pub(crate) fn new(look: BeadLook, radius_px: f64) -> Option<Self> {
         /// Knots to the radius.
         const FINE: u16 = 10;
-        let radius_px = config.bead_radius_px();
         let sampled = |radii: u16, value: fn(f64) -> f64| {
             let values: Vec<f64> = (0..=radii * FINE)
                 .map(|knot| value(f64::from(knot) / f64::from(FINE)))
@@ -38,7 +36,7 @@ impl Look {
             let knot_px = radius_px / f64::from(FINE);
             SplineProfile::new(&values, knot_px, radius_px).map(Self::Sampled)
         };
-        match config.bead_look {
+        match look {
             BeadLook::Ring => RingProfile::new(radius_px).map(Self::Ring),
             // The edge goes from a tenth to nine tenths over a third of the radius; what is left at twice the radius is 2e-6.
             BeadLook::Disc => sampled(2, |r| 1.0 / (1.0 + ((r - 1.0) * 13.0).exp())),
@@ -84,13 +82,10 @@ mod tests {
             (BeadLook::Disc, 0.5),
             (BeadLook::Spot, (-2.0_f64).exp()),
         ] {
-            let config = WorldConfig {
-                bead_look: look,
-                ..WorldConfig::default()
-            };
-            let profile = Look::of(&config).unwrap();
+            let radius_px = 5.0;
+            let profile = Look::new(look, radius_px).unwrap();
             assert!((profile.value(0.0) - 1.0).abs() < 1e-3, "{look:?}");
-            let edge = profile.value(config.bead_radius_px());
+            let edge = profile.value(radius_px);
             assert!((edge - at_radius).abs() < 1e-3, "{look:?}: {edge}");
             assert!(profile.value(0.999 * profile.support_px()).abs() < 1e-3);
             assert_eq!(profile.value(1.001 * profile.support_px()), 0.0);

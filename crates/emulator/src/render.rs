@@ -132,7 +132,7 @@ pub(crate) struct Renderer {
 impl Renderer {
     /// `None` when the bead's radius makes no profile.
     pub(crate) fn new(config: &WorldConfig) -> Option<Self> {
-        let profile = Look::of(config)?;
+        let profile = Look::new(config.bead_look, config.bead_radius_px())?;
         let template = Template::new(&profile, PixelResponse::Point);
         let mut noise = Random::stream(config.seed, 10);
         let gaussian: Vec<f32> = (0..GAUSSIAN_LEN + usize::from(config.width_px))
@@ -358,7 +358,7 @@ fn grey(level: f32) -> u8 {
 ///
 /// By symmetry x is uncorrelated with y, contrast and background, so the information of x alone decides.
 pub(crate) fn localisation_bound_um(config: &WorldConfig) -> Option<f64> {
-    let profile = Look::of(config)?;
+    let profile = Look::new(config.bead_look, config.bead_radius_px())?;
     let picture = CellPicture::new(config.pixel_um, &config.cell.unwrap_or_default());
     let value = |dx: f64, dy: f64| match config.cell {
         None => profile.value(dx.hypot(dy)),

@@ -33,7 +33,6 @@ use crate::grid::Grid;
 use crate::learners::Learners;
 use crate::life::{EventKind, Events, FreezeReason, FreezeReasons, Life, Request, SafeReason};
 use crate::reference::{ReferenceGenerator, ReferenceInput, ReferenceOutput, Stage};
-use crate::reference_history::ReferenceHistory;
 use crate::tick::Tick;
 pub use crate::tick::{Action, Counts, TickInput, TickOutput};
 use crate::tick_record::TickFlags;
@@ -117,7 +116,7 @@ pub struct Core<R> {
     learners: Learners,
     late_solver_ns: Vec<Range<i64>>,
     monitor: PlantMonitor,
-    references: ReferenceHistory,
+    references: crate::reference_history::ReferenceHistory,
     state: State,
 }
 
@@ -177,7 +176,6 @@ impl<R: ReferenceGenerator> Core<R> {
             &settings.model,
             timing.camera_delay_ms * 1e-3,
         );
-        let diffusion_um2_per_s = settings.estimator.diffusion_um2_per_s;
         controller.start(displacement_um, neutral_um);
         Ok(Self {
             preview_um: vec![0.0; controller.preview_len()],
@@ -187,11 +185,11 @@ impl<R: ReferenceGenerator> Core<R> {
             timing,
             arming,
             sample_s,
-            diffusion_um2_per_s,
+            diffusion_um2_per_s: estimator.diffusion_um2_per_s,
             learners: Learners::default(),
             late_solver_ns: Vec::new(),
             monitor,
-            references: ReferenceHistory::default(),
+            references: Default::default(),
             state: State {
                 plant: monitor.start(displacement_um),
                 seq: 0,
@@ -384,7 +382,6 @@ impl<R: ReferenceGenerator> Core<R> {
         self.account(input, &output, &mut tick);
         let action = self.action(&output, tick.index);
         self.count(input, &output, tick.flags);
-        self.references.add(input.time_ns, generated.reference_um);
         let record = self.record(input, &output, &generated, tick.flags);
         // Wraps after half a thousand million years, and does not panic then.
         self.state.seq = self.state.seq.wrapping_add(1);

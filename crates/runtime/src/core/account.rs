@@ -134,12 +134,13 @@ impl<R: ReferenceGenerator> Core<R> {
 
     /// The tick's record.
     pub(super) fn record(
-        &self,
+        &mut self,
         input: &TickInput,
         output: &LoopOutput,
         generated: &ReferenceOutput,
         flags: TickFlags,
     ) -> TickRecord {
+        self.references.add(input.time_ns, generated.reference_um);
         let m = input.measurement;
         let (last_id, last_exposure) = self.state.last_frame.unwrap_or((0, 0));
         let record = TickRecord {

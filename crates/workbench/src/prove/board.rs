@@ -3,6 +3,8 @@
 use super::moves::Range;
 use super::sheet::Sheet;
 use super::talk::{ANSWER_MS, Talk};
+pub use super::trial::Trial;
+use super::trial::{of, um};
 use crate::line_test::Quantiles;
 use cellpos_link::{Arm, Identity, Limits, PROTOCOL_VERSION, Request, ToBoard, ToHost};
 use cellpos_rig::Clock;
@@ -40,22 +42,6 @@ pub const LINES: [&str; 29] = [
     "messages unsent",
     "reset in mid-flight",
 ];
-
-/// How a board is tried.
-pub struct Trial<'a> {
-    /// Range and slew of the rig file, which the trial stays within, um and um/s.
-    pub limits_um: [f64; 3],
-    /// Where the PZT is left, um.
-    pub park_um: f64,
-    /// How far the output is moved to each side, um.
-    pub amplitude_um: f64,
-    /// Opens the line again after a reset, and asks for the reset; none: the reset is not tried.
-    pub reset: Option<&'a mut dyn FnMut(Talk) -> Result<Talk, Failure>>,
-}
-
-pub(super) const fn of(name: &'static str) -> (&'static str, &'static str) {
-    ("board", name)
-}
 
 /// Tries everything; what a broken line keeps it from is not tried. The board is left parked and disarmed.
 pub fn board(sheet: &mut Sheet, talk: Talk, trial: &mut Trial) {
@@ -171,11 +157,6 @@ fn hello(sheet: &mut Sheet, t: &mut Talk) -> Result<Option<Identity>, Failure> {
     // The conversation goes on in its own version.
     t.hello()?;
     Ok(sound.then_some(identity))
-}
-
-/// A picometre number in um.
-pub(super) fn um(pm: i32) -> f64 {
-    cellpos_link::um_from_picometres(pm)
 }
 
 fn line(sheet: &mut Sheet, t: &mut Talk) -> Result<(), Failure> {

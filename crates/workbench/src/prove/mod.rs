@@ -12,6 +12,7 @@ mod sheet;
 mod silence;
 pub mod socket;
 mod talk;
+mod trial;
 
 pub use camera::{camera, vision};
 pub use sheet::{Line, Sheet, Verdict};

@@ -1,8 +1,8 @@
 //! A board that is armed and moves: what it obeys, and that its output keeps range and slew.
 
-use super::board::{Trial, of, um};
 use super::sheet::Sheet;
 use super::talk::{ANSWER_MS, Talk};
+use super::trial::{Trial, of, um};
 use cellpos_link::{Arm, BoardState, Identity, Limits, Request, Status, ToBoard, ToHost};
 use cellpos_session::Failure;
 

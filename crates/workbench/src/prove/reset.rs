@@ -1,9 +1,9 @@
 //! A microcontroller that is reset while its output stands off park.
 
-use super::board::{Trial, of, um};
 use super::moves::Range;
 use super::sheet::Sheet;
 use super::talk::Talk;
+use super::trial::{Trial, of, um};
 use cellpos_link::{BoardState, Request, ToBoard};
 use cellpos_session::Failure;
 

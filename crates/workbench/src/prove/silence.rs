@@ -1,9 +1,9 @@
 //! What a board does when nobody speaks to it, and the stops that are asked for.
 
-use super::board::{of, um};
 use super::moves::Range;
 use super::sheet::Sheet;
 use super::talk::Talk;
+use super::trial::{of, um};
 use cellpos_link::{BoardState, Fault, Request, ToBoard, ToHost};
 use cellpos_session::Failure;
 

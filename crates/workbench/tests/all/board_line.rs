@@ -100,12 +100,12 @@ impl DeskPort {
         }
     }
 
-    pub fn to_board(mut self, tamper: Tamper<ToBoard>) -> Self {
+    pub fn changing_orders(mut self, tamper: Tamper<ToBoard>) -> Self {
         self.to_board = Some((Decoder::new(), tamper));
         self
     }
 
-    pub fn to_host(mut self, tamper: Tamper<ToHost>) -> Self {
+    pub fn changing_answers(mut self, tamper: Tamper<ToHost>) -> Self {
         self.to_host = Some((Decoder::new(), tamper));
         self
     }

@@ -34,10 +34,10 @@ fn failed(sheet: &Sheet) -> Vec<&'static str> {
 fn sheet_of(to_board: Option<Tamper<ToBoard>>, to_host: Option<Tamper<ToHost>>) -> Sheet {
     let mut port = DeskPort::new(&Desk::new());
     if let Some(tamper) = to_board {
-        port = port.to_board(tamper);
+        port = port.changing_orders(tamper);
     }
     if let Some(tamper) = to_host {
-        port = port.to_host(tamper);
+        port = port.changing_answers(tamper);
     }
     let mut sheet = Sheet::default();
     board(&mut sheet, Talk::on(Box::new(port)), &mut trial());

@@ -1,0 +1,25 @@
+//! How a board is tried, and how its lines are named.
+
+use super::talk::Talk;
+use cellpos_session::Failure;
+
+/// How a board is tried.
+pub struct Trial<'a> {
+    /// Range and slew of the rig file, which the trial stays within, um and um/s.
+    pub limits_um: [f64; 3],
+    /// Where the PZT is left, um.
+    pub park_um: f64,
+    /// How far the output is moved to each side, um.
+    pub amplitude_um: f64,
+    /// Opens the line again after a reset, and asks for the reset; none: the reset is not tried.
+    pub reset: Option<&'a mut dyn FnMut(Talk) -> Result<Talk, Failure>>,
+}
+
+pub(super) const fn of(name: &'static str) -> (&'static str, &'static str) {
+    ("board", name)
+}
+
+/// A picometre number in um.
+pub(super) fn um(pm: i32) -> f64 {
+    cellpos_link::um_from_picometres(pm)
+}
