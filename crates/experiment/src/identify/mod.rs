@@ -183,6 +183,29 @@ fn held_bead(
     })
 }
 
+/// The delay that the edges of an LED tell, if the job asks for it.
+fn led_delay(job: &Job, rig: &OnRig) -> Result<Option<DelayTest>, Failure> {
+    Ok(match (job.led_edges, rig.file.is_emulated()) {
+        (0, _) => None,
+        (edges, true) => {
+            let mut world = rig.file.emulator.clone();
+            world.faults = Default::default();
+            let model = cellpos_plant::Model::load(&world.model).map_err(Failure::input)?;
+            let clock = job.setup.clock.clone();
+            let setup = Setup {
+                world,
+                model,
+                clock,
+                frames: true,
+                closed_loop: true,
+                pi: None,
+            };
+            Some(HeldBead::open(setup)?.delay_test(edges, job.seed)?)
+        }
+        (edges, false) => Some(rig.delay_test(edges, job.seed)?),
+    })
+}
+
 /// Runs on the rig of a rig.toml until no segment is missing or four runs in a row have measured none: again where a bead was lost for a while,
 /// or the machine or the line stalled; not where somebody has to do something first.
 fn on_rig(
@@ -271,25 +294,7 @@ fn on_rig(
             "all segments are measured, and the model is being fitted.",
         );
     }
-    let led = match (job.led_edges, rig.file.is_emulated()) {
-        (0, _) => None,
-        (edges, true) => {
-            let mut world = rig.file.emulator.clone();
-            world.faults = Default::default();
-            let model = cellpos_plant::Model::load(&world.model).map_err(Failure::input)?;
-            let clock = job.setup.clock.clone();
-            let setup = Setup {
-                world,
-                model,
-                clock,
-                frames: true,
-                closed_loop: true,
-                pi: None,
-            };
-            Some(HeldBead::open(setup)?.delay_test(edges, job.seed)?)
-        }
-        (edges, false) => Some(rig.delay_test(edges, job.seed)?),
-    };
+    let led = led_delay(job, rig)?;
     Ok(Raw {
         records,
         led,
