@@ -139,6 +139,17 @@ impl Crop {
         true
     }
 
+    /// Takes off light that rises by so much a pixel along the row and along the column, and is 0 at a place of the window.
+    pub fn take_off_slope(&mut self, (x, y): (f32, f32), (along, down): (f32, f32)) {
+        let width = self.width;
+        for (j, row) in self.rows.iter_mut().enumerate().take(self.height) {
+            let start = down * (j as f32 - y) - along * x;
+            for (i, v) in row.iter_mut().enumerate().take(width) {
+                *v -= start + along * i as f32;
+            }
+        }
+    }
+
     fn take_off_pedestal(&mut self) {
         let (mut sum, mut count) = (0.0, 0.0_f32);
         self.border(|v, _| {

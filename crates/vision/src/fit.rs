@@ -24,6 +24,32 @@ pub(crate) enum Weights {
     },
 }
 
+impl Weights {
+    /// Weights of a row where they are the same everywhere.
+    pub fn of_even(self, crop: &Crop) -> Row {
+        let mut weight = crop.mask;
+        if let Weights::Even { variance } = self {
+            weight.iter_mut().for_each(|w| *w /= variance);
+        }
+        weight
+    }
+
+    /// Weights of a row where they depend on its light.
+    #[inline(always)]
+    pub fn of_shot(self, crop: &Crop, value: &[f32], weight: &mut Row) {
+        if let Weights::Shot {
+            base,
+            gain_times_amplitude,
+            floor,
+        } = self
+        {
+            for ((w, m), f) in weight.iter_mut().zip(&crop.mask).zip(value) {
+                *w = m / (base + gain_times_amplitude * f).max(floor);
+            }
+        }
+    }
+}
+
 /// What a pass found.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Pass {
@@ -73,28 +99,11 @@ pub(crate) fn pass(
     let y = (y_px - crop.y0 as f64) as f32;
     let lanes_end = crop.width.next_multiple_of(LANES).min(STRIDE);
     let mut image = Image::new(lanes_end);
-    let mut weight: Row = crop.mask;
-    if let Weights::Even { variance } = weights {
-        weight.iter_mut().for_each(|w| *w /= variance);
-    }
+    let mut weight = weights.of_even(crop);
     let mut sums = Sums::default();
     for (j, pixels) in crop.rows.iter().enumerate().take(crop.height) {
         image.draw_row(template, comb, x, j as f32 - y);
-        if let Weights::Shot {
-            base,
-            gain_times_amplitude,
-            floor,
-        } = weights
-        {
-            for ((w, m), f) in weight
-                .iter_mut()
-                .zip(&crop.mask)
-                .zip(&image.value)
-                .take(lanes_end)
-            {
-                *w = m / (base + gain_times_amplitude * f).max(floor);
-            }
-        }
+        weights.of_shot(crop, &image.value[..lanes_end], &mut weight);
         let mut with_holes: Row;
         let weight = if crop.has_holes() {
             with_holes = weight;
@@ -142,6 +151,7 @@ impl Image {
     #[inline(always)]
     pub fn draw_row(&mut self, template: &Template, comb: &Comb, x: f32, dy: f32) {
         let n = self.lanes_end;
+        let factor = -2.0 * template.slope_factor();
         let mut first = true;
         for (ox, oy) in comb.offsets() {
             let (x, dy) = (x + ox, dy - oy);
@@ -160,7 +170,7 @@ impl Image {
             for (i, (((v, gx), gy), (e, t))) in rows.zip(places).enumerate() {
                 let (f, df) = template.read((*e, *t));
                 // The derivative by the centre is minus twice that by the squared radius, times the distance.
-                let g = -2.0 * df;
+                let g = factor * df;
                 let (fx, fy) = (g * (i as f32 - x), g * dy);
                 if first {
                     (*v, *gx, *gy) = (f, fx, fy);
@@ -269,6 +279,7 @@ pub(crate) fn scale(
         (y_px - crop.y0 as f64) as f32,
     );
     let (mut normal, mut right) = (Matrix3::zeros(), Vector3::zeros());
+    let factor = -2.0 * template.slope_factor();
     for (j, row) in crop.rows.iter().enumerate().take(crop.height) {
         let dy = j as f32 - y;
         for (i, p) in row.iter().enumerate().take(crop.width) {
@@ -276,7 +287,7 @@ pub(crate) fn scale(
             let q = dx * dx + dy * dy;
             let (f, df) = template.at(q);
             // f(r / s) changes by -r f'(r) per unit of s, and r f' = 2 q df/dq.
-            let g = Vector3::new(f64::from(f), 1.0, f64::from(-2.0 * q * df));
+            let g = Vector3::new(f64::from(f), 1.0, f64::from(factor * q * df));
             normal += g * g.transpose();
             right += g * f64::from(*p);
         }

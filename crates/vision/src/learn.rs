@@ -120,6 +120,7 @@ impl Learner {
     pub fn refresh(&mut self, template: &mut Template) {
         self.since = 0;
         let first = self.is_first();
+        template.stretch_to(1.0);
         let learnt = self
             .rings
             .learn_beyond(|r_px| f64::from(template.value_at_squared((r_px * r_px) as f32)));

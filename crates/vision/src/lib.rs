@@ -4,6 +4,7 @@
 //! uses buffers made beforehand and allocates nothing. Not for devices or files: frames come in as slices.
 #![forbid(unsafe_code)]
 
+mod beyond;
 pub mod blobs;
 pub mod cells;
 pub mod config;
@@ -18,7 +19,9 @@ mod lines;
 mod localiser;
 pub mod many;
 mod objects;
+mod offsets;
 mod outline;
+mod pool;
 pub mod profile;
 mod residue;
 mod seed;

@@ -24,7 +24,7 @@ pub struct Refused {
 }
 
 /// An object that stands out.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Object {
     pub frame: usize,
     pub x_px: f64,

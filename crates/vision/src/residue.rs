@@ -7,6 +7,7 @@
 use crate::config::MAX_WINDOW_PX;
 use crate::crop::{Crop, LANES, Row, STRIDE};
 use crate::fit::Image;
+use crate::pool::Pool;
 use crate::streak::Comb;
 use crate::template::Template;
 use nalgebra::{Matrix2, Vector2};
@@ -25,6 +26,10 @@ const LOOK_FORGETTING: f64 = 1.0 / 64.0;
 const SAME_RADII: f64 = 2.0;
 /// Beads remembered when nobody says how many there are: the followed one and its neighbours.
 const FEW_BEADS: usize = 12;
+
+/// Fixes of the bead itself that count as much as all others: a window's few patches tell a variance to half of it, beads of
+/// a recording differ by less.
+const POOLED_FIXES: f64 = 4.0;
 
 /// One vector a patch: what its pixels add to the score of the position, relative to the bead's contrast.
 type Scores = [[f32; 2]; MAX_PATCHES];
@@ -60,6 +65,8 @@ impl Look {
 pub(crate) struct Residues {
     looks: Vec<Look>,
     fixes: u64,
+    /// What first and later fixes of all beads were widened by.
+    pooled: [Pool; 2],
     /// Room for what the template leaves of a window.
     pub left: Box<[Row; MAX_WINDOW_PX]>,
 }
@@ -69,6 +76,7 @@ impl Residues {
         Residues {
             looks: vec![Look::NONE; FEW_BEADS],
             fixes: 0,
+            pooled: [Pool::default(); 2],
             left: Box::new([[0.0; STRIDE]; MAX_WINDOW_PX]),
         }
     }
@@ -95,7 +103,8 @@ impl Residues {
         let (scores, inverse) = self.scores(crop, template, comb, at, (amplitude, background))?;
         let relative = variance / (amplitude * amplitude);
         let reach_px = SAME_RADII * template.radius_px();
-        let look = self.look(at, reach_px, half);
+        let k = self.look(at, reach_px, half);
+        let look = &mut self.looks[k];
         let known = f64::from(look.fixes);
         // The mean so far has an error of its own: of n fixes 1/n of their variance.
         let forgetting = (1.0 / (known + 1.0)).max(LOOK_FORGETTING);
@@ -105,6 +114,7 @@ impl Residues {
             1.0 + forgetting
         };
         let now = widening_of(&scores, &look.mean, inverse, relative * own)?;
+        let pool = &mut self.pooled[usize::from(look.fixes > 0)];
         // One window has few patches: the mean over the last fixes is surer. The first says nothing of what stays.
         let share = (1.0 / known.max(1.0)).max(WIDENING_FORGETTING);
         look.widening += share * (now - look.widening);
@@ -114,11 +124,15 @@ impl Residues {
             }
         }
         look.fixes = look.fixes.saturating_add(1);
-        Some(look.widening)
+        Some(pool.shrink(
+            look.widening,
+            known.clamp(1.0, 1.0 / WIDENING_FORGETTING),
+            POOLED_FIXES,
+        ))
     }
 
     /// The look of the bead at a place: the one of the nearest fix before, or a new one in place of that unused for longest.
-    fn look(&mut self, (x_px, y_px): (f64, f64), reach_px: f64, half: usize) -> &mut Look {
+    fn look(&mut self, (x_px, y_px): (f64, f64), reach_px: f64, half: usize) -> usize {
         self.fixes += 1;
         let away = |look: &Look| f64::hypot(look.x_px - x_px, look.y_px - y_px);
         let near = (self.looks.iter().enumerate())
@@ -132,20 +146,37 @@ impl Residues {
         }
         let look = &mut self.looks[k];
         (look.x_px, look.y_px, look.used) = (x_px, y_px, self.fixes);
-        look
+        k
     }
 
-    /// The patches' scores, and the inverse of the information about the position, both for a contrast of 1. A residual that
-    /// is the same all round, or on opposite sides of the centre, as a template of another focus or size leaves it, does
-    /// not move the position and does not count.
-    fn scores(
+    /// Mean square of what the template leaves besides its mean all round: a bead in another focus has none, whatever it has made of
+    /// the profile, and it moves no bead; two beads, or a bead and something else, have.
+    pub fn lopsided(
+        &mut self,
+        crop: &Crop,
+        template: &Template,
+        comb: &Comb,
+        at: (f64, f64),
+        (amplitude, background): (f64, f64),
+    ) -> f64 {
+        let middle = self.fill_left(crop, template, comb, at, (amplitude, background));
+        let left = self.left.as_mut_slice();
+        take_off_radial_mean(crop, middle, left);
+        let rows = left.iter().take(crop.height);
+        let square = |row: &Row| row.iter().take(crop.width).map(|v| v * v).sum::<f32>();
+        let sum: f32 = rows.map(square).sum();
+        f64::from(sum) / ((crop.width * crop.height) as f64)
+    }
+
+    /// Fills `left` with what the template leaves; the bead's place in the window.
+    fn fill_left(
         &mut self,
         crop: &Crop,
         template: &Template,
         comb: &Comb,
         (x_px, y_px): (f64, f64),
         (amplitude, background): (f64, f64),
-    ) -> Option<(Scores, Matrix2<f64>)> {
+    ) -> (f32, f32) {
         let left = self.left.as_mut_slice();
         let (x, y) = (
             (x_px - crop.x0 as f64) as f32,
@@ -170,6 +201,28 @@ impl Residues {
                 *l = p - background - amplitude * f;
             }
         }
+        for (j, left) in left.iter_mut().enumerate().take(crop.height) {
+            for column in crop.left_out(j) {
+                left[column.min(STRIDE - 1)] = 0.0;
+            }
+        }
+        (x, y)
+    }
+
+    /// The patches' scores, and the inverse of the information about the position, both for a contrast of 1. A residual that
+    /// is the same all round, or on opposite sides of the centre, as a template of another focus or size leaves it, does
+    /// not move the position and does not count.
+    fn scores(
+        &mut self,
+        crop: &Crop,
+        template: &Template,
+        comb: &Comb,
+        (x_px, y_px): (f64, f64),
+        (amplitude, background): (f64, f64),
+    ) -> Option<(Scores, Matrix2<f64>)> {
+        let (x, y) = self.fill_left(crop, template, comb, (x_px, y_px), (amplitude, background));
+        let (left, amplitude) = (self.left.as_mut_slice(), amplitude as f32);
+        let mut image = Image::new(crop.width.next_multiple_of(LANES).min(STRIDE));
         take_off_radial_mean(crop, (x, y), left);
         // Points at whole distances from the centre: those opposite each other lie alike between the pixels.
         let reach = |c: f32, len: usize| c.min(len as f32 - 1.0 - c).floor().max(0.0) as usize;

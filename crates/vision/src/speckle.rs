@@ -4,18 +4,17 @@
 //! by far more than they differ among themselves is not of the picture.
 
 use crate::config::MAX_WINDOW_PX;
-use crate::crop::{Crop, LANES, Row, STRIDE};
-use crate::fit::Image;
-use crate::streak::Comb;
-use crate::template::Template;
+use crate::crop::{Crop, Row};
 
 /// A speck differs by so many standard deviations of the noise at least: of 10,000 pixels, noise makes one in 50,000 frames.
-const LEAST_SIGMA: f32 = 6.0;
+pub(crate) const LEAST_SIGMA: f32 = 6.0;
 /// ... and by so many times as its neighbours among themselves. The sharpest image of a point, a Gaussian of 0.7 px on the
 /// middle of a pixel, differs by 3.3 times.
 const LEAST_SPREADS: f32 = 4.0;
 /// Largest share of a speck that its neighbours have on average. They have 0.36 of that sharpest image.
 const MOST_SHARED: f32 = 0.25;
+/// Largest share of a speck that is left on the other side of the bead's centre: interpolation makes it uncertain by less.
+const MOST_OPPOSITE: f32 = 0.5;
 
 /// What a pixel should be if it is a speck among its eight neighbours: their mean without the two extremes.
 pub(crate) fn replacement(value: f32, mut near: [f32; 8], noise: f32) -> Option<f32> {
@@ -80,8 +79,10 @@ pub(crate) fn clean_picture(values: &mut [f32], width: usize, noise: f32) {
     }
 }
 
-/// Replaces the specks of a window that show without knowing the bead. Those next to each other hide one another.
-pub(crate) fn clean(crop: &mut Crop, noise: f32) {
+/// Replaces the specks of a window that show without knowing the bead, and says how many. Those next to each other hide one
+/// another.
+pub(crate) fn clean(crop: &mut Crop, noise: f32) -> usize {
+    let mut found = 0;
     for j in 1..crop.height.saturating_sub(1) {
         for i in 1..crop.width.saturating_sub(1) {
             let [above, row, below] =
@@ -96,51 +97,52 @@ pub(crate) fn clean(crop: &mut Crop, noise: f32) {
             let near = [*a, *b, *c, *d, *e, *f, *g, *h];
             if let Some(instead) = replacement(*value, near, noise) {
                 crop.rows[j][i] = instead;
+                found += 1;
             }
         }
     }
+    found
 }
 
 /// Leaves the specks that a fit shows out of the next fits in the window: the strongest, and those half as strong. A fit
 /// that a strong speck has drawn off shows others that are none.
-/// `tolerance` is the share of the bead's own light that the template may be wrong by. Returns how many there are.
+/// `left` is what the fit leaves, `strongest` its largest; `tolerance` is the share of the bead's own light that the template
+/// may be wrong by. Returns how many there are.
 pub(crate) fn leave_out(
     crop: &mut Crop,
-    template: &Template,
-    comb: &Comb,
     (x_px, y_px): (f64, f64),
-    (amplitude, background): (f64, f64),
+    background: f64,
     (noise, tolerance): (f32, f32),
-    left: &mut [Row],
+    left: &[Row],
+    strongest: f32,
 ) -> usize {
+    let background = background as f32;
     let (x, y) = (
         (x_px - crop.x0 as f64) as f32,
         (y_px - crop.y0 as f64) as f32,
     );
-    let (amplitude, background) = (amplitude as f32, background as f32);
-    let mut image = Image::new(crop.width.next_multiple_of(LANES).min(STRIDE));
-    let mut strongest = 0.0_f32;
-    let rows = crop.rows.iter().enumerate().zip(left.iter_mut());
-    for ((j, pixels), left) in rows.take(crop.height) {
-        image.draw_row(template, comb, x, j as f32 - y);
-        let row = left.iter_mut().zip(pixels).zip(&image.value);
-        for ((l, p), f) in row.take(crop.width) {
-            *l = p - background - amplitude * f;
-            strongest = if l.abs() > strongest {
-                l.abs()
-            } else {
-                strongest
-            };
-        }
-        for column in crop.left_out(j) {
-            left[column.min(STRIDE - 1)] = 0.0;
-        }
-    }
     let least = LEAST_SIGMA * noise;
     if strongest <= least {
         return 0;
     }
     let get = |j: usize, i: usize| left.get(j)?.get(i).copied();
+    // What is left on the other side of the centre, between the pixels.
+    let (width, height) = (crop.width, crop.height);
+    let opposite = |j: usize, i: usize| {
+        let (u, v) = ((2.0 * x - i as f32).max(0.0), (2.0 * y - j as f32).max(0.0));
+        let (k, l) = (u as usize, v as usize);
+        let (a, b) = (u - k as f32, v - l as f32);
+        let at = |l, k| {
+            if k < width && l < height {
+                get(l, k).unwrap_or(0.0)
+            } else {
+                0.0
+            }
+        };
+        let upper = at(l, k) + a * (at(l, k + 1) - at(l, k));
+        let lower = at(l + 1, k) + a * (at(l + 1, k + 1) - at(l + 1, k));
+        upper + b * (lower - upper)
+    };
     let mut threshold = least;
     let mut found = 0;
     // The strongest that is a speck first; then those half as strong.
@@ -173,6 +175,10 @@ pub(crate) fn leave_out(
                 }
                 let shared = sum / n.max(1.0) * own.signum() > MOST_SHARED * own.abs();
                 if shared || own.abs() <= least + tolerance * light {
+                    continue;
+                }
+                // A template of another focus is wrong on both sides alike, and a speck in the very middle moves nothing.
+                if opposite(j, i) * own.signum() > MOST_OPPOSITE * own.abs() {
                     continue;
                 }
                 most = most.max(own.abs());

@@ -22,10 +22,17 @@ const FEWEST: usize = 5;
 const REACH: f64 = 1.6;
 /// Share of the profile's extreme below which there is nothing left of it.
 const FADED: f64 = 0.03;
-/// Margin on the residual that the beads themselves have.
+/// Kinds of objects tried, the commonest first.
+const KINDS: usize = 3;
+/// Margin on the residual that the beads themselves have: that of nine in ten, since dust and neighbours spoil some.
 const TOLERANCE_MARGIN: f64 = 2.0;
-/// Largest tolerance suggested.
-const MOST_TOLERANCE: f64 = 0.5;
+const TOLERANCE_SHARE: f64 = 0.9;
+/// Contrast over the noise that a bead may fall to, as a share of what the recording has: five times the noise, with a margin for
+/// beads that are fainter than most.
+const ROOM_FOR_NOISE: f64 = 0.13;
+/// Largest tolerance: at 0.26 the template explains half of what a bead adds to its window (mean square 0.135 of the contrast's:
+/// [`crate::Localiser`]), and most beads must be explained by half of that.
+const MOST_TOLERANCE: f64 = 0.26;
 
 /// What was found in a recording.
 #[derive(Debug, Clone, PartialEq)]
@@ -90,19 +97,30 @@ pub fn suggest(frames: &[Frame]) -> Result<Suggestion, NothingToSuggest> {
     if objects.is_empty() {
         return Err(NothingToSuggest::Nothing { frames: count });
     }
-    let alike = commonest(&objects);
-    if alike.len() < FEWEST.min(count.max(2)) {
-        return Err(NothingToSuggest::NoneAlike {
-            objects: seen,
-            frames: count,
-        });
+    let total = objects.len();
+    let mut failed = None;
+    for _ in 0..KINDS {
+        let alike = commonest(&objects);
+        if alike.len() < FEWEST.min(count.max(2)) {
+            break;
+        }
+        // Those that have no common round shape, as pairs of beads in any direction, may hide others that have.
+        objects.retain(|o| !alike.contains(o));
+        refused.other = total - alike.len();
+        match learn(frames, &flats, alike, refused) {
+            Ok(suggestion) => {
+                return Ok(Suggestion {
+                    objects: seen,
+                    ..suggestion
+                });
+            }
+            Err(error) => failed = failed.or(Some(error)),
+        }
     }
-    refused.other = objects.len() - alike.len();
-    let suggestion = learn(frames, &flats, alike, refused)?;
-    Ok(Suggestion {
+    Err(failed.unwrap_or(NothingToSuggest::NoneAlike {
         objects: seen,
-        ..suggestion
-    })
+        frames: count,
+    }))
 }
 
 /// The template learnt from the beads that a detector with rough settings sees, whatever their fits say: a size that is
@@ -156,6 +174,7 @@ fn learn(
     let mut config = None;
     let mut template: Option<Template> = None;
     let mut fits = Vec::new();
+    let mut filled = 1.0_f64;
     for pass in 0..PASSES {
         let rings = collect(flats, &beads, template.as_ref(), reach_px);
         let parametric = rings.parametric().ok_or(failed)?;
@@ -175,7 +194,8 @@ fn learn(
                 fits.push((bead.frame, fix));
             }
         }
-        template = Some(localiser.template().clone());
+        template = settings.template().ok();
+        filled = localiser.filled();
         if fits.len() * 2 < objects && pass + 1 == PASSES {
             return Err(failed);
         }
@@ -187,13 +207,13 @@ fn learn(
     // What the beads' own residuals need, with a margin for those not looked at.
     let needed = fits.iter().map(|(_, f)| {
         let excess = (f.residual_ratio - config.max_residual_ratio).max(0.0);
-        excess.sqrt() / f.snr.max(1.0)
+        (excess / filled).sqrt() / f.snr.max(1.0)
     });
-    let needed = quantile(needed, 0.98);
+    let needed = quantile(needed, TOLERANCE_SHARE);
     let rough = LocaliserConfig::new(config.profile);
     config.template_tolerance =
         (TOLERANCE_MARGIN * needed).clamp(rough.template_tolerance, MOST_TOLERANCE);
-    config.min_snr = (0.2 * snr).clamp(3.0, 20.0).floor();
+    config.min_snr = (ROOM_FOR_NOISE * snr).clamp(3.0, 20.0);
     let max_step_px = step_px(&fits, reach_px);
     Ok(Suggestion {
         config,

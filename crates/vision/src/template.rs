@@ -78,7 +78,9 @@ pub(crate) type Entry = [f32; 4];
 #[derive(Debug, Clone)]
 pub struct Template {
     pub(crate) table: Box<[Entry; TABLE_LEN]>,
-    pub(crate) entries_per_px2: f32,
+    entries_per_px2: f32,
+    /// Size at which the bead is looked at, relative to the profile's: another focus changes it.
+    size: f32,
     radius_px: f64,
     support_px: f64,
 }
@@ -89,6 +91,7 @@ impl Template {
         let mut template = Template {
             table: Box::new([[0.0; 4]; TABLE_LEN]),
             entries_per_px2: 1.0,
+            size: 1.0,
             radius_px: profile.radius_px(),
             support_px: profile.support_px(),
         };
@@ -129,7 +132,25 @@ impl Template {
         // Beyond the support there is nothing.
         self.table[TABLE_LEN - 1] = [0.0; 4];
         self.entries_per_px2 = (1.0 / step_px2) as f32;
+        self.size = 1.0;
         self.support_px = support_px;
+    }
+
+    /// Stretches the profile to a size relative to the one that was tabulated. Radius and support stay those of size 1.
+    pub(crate) fn stretch_to(&mut self, size: f64) {
+        let change = size as f32 / self.size;
+        self.entries_per_px2 /= change * change;
+        self.size = size as f32;
+    }
+
+    /// Size at which the bead is looked at, relative to the profile's.
+    pub(crate) fn size(&self) -> f64 {
+        f64::from(self.size)
+    }
+
+    /// Factor of the derivatives that [`Template::read`] gives, px^2/px^2: they are those at size 1.
+    pub(crate) fn slope_factor(&self) -> f32 {
+        1.0 / (self.size * self.size)
     }
 
     /// Place in the table of the squared radius `q_px2`: entry number in the low bits, and the distance to it.
@@ -144,14 +165,16 @@ impl Template {
         (shifted.to_bits(), u - (shifted - TWO_TO_23))
     }
 
-    /// Value and derivative with respect to the squared radius (1/px^2) at a [`Template::place`].
+    /// Value and derivative with respect to the squared radius (1/px^2, over [`Template::slope_factor`]) at a
+    /// [`Template::place`].
     #[inline(always)]
     pub(crate) fn read(&self, (entry, t): (u32, f32)) -> (f32, f32) {
         let e = &self.table[entry as usize & (TABLE_LEN - 1)];
         (e[0] + t * e[1], e[2] + t * e[3])
     }
 
-    /// Value and derivative with respect to the squared radius (1/px^2) at the squared radius `q_px2`.
+    /// Value and derivative with respect to the squared radius (1/px^2, over [`Template::slope_factor`]) at the squared radius
+    /// `q_px2`.
     #[inline(always)]
     pub(crate) fn at(&self, q_px2: f32) -> (f32, f32) {
         self.read(self.place(q_px2))

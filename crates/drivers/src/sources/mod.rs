@@ -1,11 +1,15 @@
-//! Recordings on disk as cameras: folders of PNG or TIFF pictures, TIFF stacks, Photron recordings, `.rtdc` files.
+//! Recordings on disk as cameras: folders of PNG, TIFF or JPEG pictures, TIFF stacks, Photron recordings, AVI films, NumPy
+//! arrays, `.rtdc` files.
 //!
 //! [`open`] tells the kind by the name; [`Playback`] plays a recording at its frame rate behind the
 //! [`Camera`](cellpos_rig::Camera) trait. Not for writing.
 
+pub mod avi;
 mod grey;
 #[cfg(feature = "aravis")]
 pub mod industrial;
+mod jpeg;
+pub mod npy;
 pub mod photron;
 pub mod pictures;
 pub mod playback;
@@ -13,10 +17,14 @@ pub mod region;
 #[cfg(feature = "hdf5")]
 pub mod rtdc;
 pub mod tiff;
+#[cfg(feature = "hdf5")]
+mod zstandard;
 
 use cellpos_rig::source::FrameBuffer;
 use std::path::{Path, PathBuf};
 
+pub use avi::AviFilm;
+pub use npy::NpyStack;
 pub use photron::PhotronRecording;
 pub use pictures::PictureFolder;
 pub use playback::Playback;
@@ -39,12 +47,22 @@ pub enum SourceError {
     },
     /// No known kind of recording.
     #[error(
-        "{}: not a recording: give a folder of PNG or TIFF pictures, a .tif or .tiff stack, a Photron .cihx, .cih or .mraw file, or an .rtdc file",
+        "{}: not a recording: give a folder of PNG, TIFF or JPEG pictures, a .tif or .tiff stack, a Photron .cihx, .cih or .mraw file, an .avi film, an .npy array, or an .rtdc file",
         path.display()
     )]
     UnknownKind {
         /// Which file.
         path: PathBuf,
+    },
+    /// A film in a format that is not read here.
+    #[error("{}: {format} is not read here: convert it without loss with `{command}` and give that film", path.display())]
+    Film {
+        /// Which file.
+        path: PathBuf,
+        /// The format, with its codec where it is known.
+        format: String,
+        /// The command that converts it.
+        command: String,
     },
     /// A recording without frames.
     #[error("{}: no frames: {expected}", path.display())]
@@ -77,14 +95,12 @@ pub enum SourceError {
         expected: &'static str,
     },
     /// A folder with pictures of two kinds.
-    #[error("{}: {png} PNG and {tiff} TIFF pictures: give a folder with pictures of one kind", path.display())]
+    #[error("{}: {found} pictures: give a folder with pictures of one kind", path.display())]
     TwoKinds {
         /// Which folder.
         path: PathBuf,
-        /// PNG pictures.
-        png: usize,
-        /// TIFF pictures.
-        tiff: usize,
+        /// How many of each kind.
+        found: String,
     },
     /// A compression that is not read here.
     #[error(
@@ -231,14 +247,77 @@ pub fn open(path: &Path) -> Result<Box<dyn Recording>, SourceError> {
         "mraw" | "cih" | "cihx" => Ok(Box::new(PhotronRecording::open(path)?)),
         #[cfg(feature = "hdf5")]
         "rtdc" => Ok(Box::new(rtdc::RtdcRecording::open(path)?)),
-        "png" => Ok(Box::new(PictureFolder::of(path, vec![path.to_path_buf()])?)),
+        "png" | "jpg" | "jpeg" => Ok(Box::new(PictureFolder::of(path, vec![path.to_path_buf()])?)),
+        "avi" => Ok(Box::new(AviFilm::open(path)?)),
+        "npy" => Ok(Box::new(NpyStack::open(path)?)),
         _ if !path.exists() => Err(SourceError::Unreadable {
             path: path.to_path_buf(),
             cause: std::io::Error::new(std::io::ErrorKind::NotFound, "no such file or folder"),
         }),
+        name if FILMS.iter().any(|(film, _)| *film == name) => Err(SourceError::Film {
+            path: path.to_path_buf(),
+            format: FILMS
+                .iter()
+                .find(|(film, _)| *film == name)
+                .map_or(String::new(), |(_, format)| (*format).to_string()),
+            command: conversion(path),
+        }),
         _ => Err(SourceError::UnknownKind {
             path: path.to_path_buf(),
         }),
+    }
+}
+
+/// Films that are not read, by the ends of their names.
+const FILMS: [(&str, &str); 9] = [
+    ("mp4", "MP4"),
+    ("m4v", "MP4"),
+    ("mov", "QuickTime"),
+    ("mkv", "Matroska"),
+    ("webm", "WebM"),
+    ("wmv", "Windows Media"),
+    ("mpg", "MPEG"),
+    ("mpeg", "MPEG"),
+    ("gif", "GIF"),
+];
+
+/// The command that makes an uncompressed grey film of any other.
+fn conversion(path: &Path) -> String {
+    let quoted = |path: &Path| format!("'{}'", path.display().to_string().replace('\'', "'\\''"));
+    let to = path.with_extension("grey.avi");
+    format!(
+        "ffmpeg -i {} -an -fps_mode passthrough -c:v rawvideo -pix_fmt gray {}",
+        quoted(path),
+        quoted(&to)
+    )
+}
+
+/// Refuses a frame beyond the end.
+pub(crate) fn no_such_frame(info: &RecordingInfo, frame: usize) -> Result<(), SourceError> {
+    if frame < info.frames {
+        return Ok(());
+    }
+    Err(SourceError::NoSuchFrame {
+        path: info.path.clone(),
+        frame,
+        frames: info.frames,
+    })
+}
+
+/// Fills a buffer with a frame's bytes as they lie in a file, one after another.
+pub(crate) fn fill(info: &RecordingInfo, bytes: &[u8], big_endian: bool, buffer: &mut FrameBuffer) {
+    (buffer.width, buffer.height, buffer.bits) = (info.width_px, info.height_px, info.bits);
+    if info.bits == 8 {
+        buffer.mono8.clear();
+        buffer.mono8.extend_from_slice(bytes);
+        return;
+    }
+    let words = bytes.as_chunks::<2>().0.iter();
+    buffer.mono16.clear();
+    if big_endian {
+        buffer.mono16.extend(words.map(|b| u16::from_be_bytes(*b)));
+    } else {
+        buffer.mono16.extend(words.map(|b| u16::from_le_bytes(*b)));
     }
 }
 

@@ -1,4 +1,4 @@
-//! A folder of pictures, one a file: PNG or TIFF, in the order of their names.
+//! A folder of pictures, one a file: PNG, TIFF or JPEG, in the order of their names.
 //!
 //! Numbers in the names are frame numbers: where one is missing, a frame was lost, and the recording says so.
 
@@ -22,6 +22,7 @@ pub struct PictureFolder {
 enum Kind {
     Png,
     Tiff,
+    Jpeg,
 }
 
 impl Kind {
@@ -30,6 +31,7 @@ impl Kind {
         match extension.as_str() {
             "png" => Some(Kind::Png),
             "tif" | "tiff" => Some(Kind::Tiff),
+            "jpg" | "jpeg" => Some(Kind::Jpeg),
             _ => None,
         }
     }
@@ -58,12 +60,21 @@ impl PictureFolder {
                 .filter(|p| Kind::of(p) == Some(kind))
                 .count()
         };
-        let (png, tiff) = (count(Kind::Png), count(Kind::Tiff));
-        if png > 0 && tiff > 0 {
+        let kinds = [
+            (Kind::Png, "PNG"),
+            (Kind::Tiff, "TIFF"),
+            (Kind::Jpeg, "JPEG"),
+        ];
+        let found: Vec<String> = kinds
+            .iter()
+            .map(|(kind, name)| (count(*kind), name))
+            .filter(|(count, _)| *count > 0)
+            .map(|(count, name)| format!("{count} {name}"))
+            .collect();
+        if found.len() > 1 {
             return Err(SourceError::TwoKinds {
                 path: folder.to_path_buf(),
-                png,
-                tiff,
+                found: found.join(" and "),
             });
         }
         pictures.sort_by_cached_key(|p| {
@@ -80,11 +91,12 @@ impl PictureFolder {
         let Some(first) = pictures.first() else {
             return Err(SourceError::Empty {
                 path: path.to_path_buf(),
-                expected: "the folder should hold .png or .tif pictures",
+                expected: "the folder should hold .png, .tif or .jpg pictures",
             });
         };
         let kind = match Kind::of(first) {
             Some(Kind::Tiff) => "TIFF folder",
+            Some(Kind::Jpeg) => "JPEG folder",
             _ => "PNG folder",
         };
         let mut buffer = FrameBuffer::default();
@@ -140,8 +152,22 @@ fn decode(
 ) -> Result<Option<&'static str>, SourceError> {
     match Kind::of(path) {
         Some(Kind::Tiff) => super::tiff::decode_file(path, frame, buffer),
+        Some(Kind::Jpeg) => {
+            let bytes = std::fs::read(path).map_err(|cause| SourceError::Unreadable {
+                path: path.to_path_buf(),
+                cause,
+            })?;
+            super::jpeg::decode(path, frame, &bytes, buffer)
+        }
         _ => decode_png(path, frame, buffer),
     }
+}
+
+/// What a picture may take of memory: a header that claims more is broken.
+pub(crate) fn limits() -> image::Limits {
+    let mut limits = image::Limits::default();
+    limits.max_alloc = Some(16 * MAX_PIXELS as u64);
+    limits
 }
 
 fn decode_png(
@@ -160,9 +186,7 @@ fn decode_png(
     };
     let mut reader = ImageReader::open(path).map_err(unreadable)?;
     reader.set_format(image::ImageFormat::Png);
-    let mut limits = image::Limits::default();
-    limits.max_alloc = Some(16 * MAX_PIXELS as u64);
-    reader.limits(limits);
+    reader.limits(limits());
     let picture = reader.decode().map_err(damaged)?;
     let (width, height) = (picture.width() as usize, picture.height() as usize);
     check_size(path, width, height)?;

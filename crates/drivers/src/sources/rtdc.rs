@@ -4,9 +4,10 @@
 //! Read: `events/image`, `events/image_bg`, `events/frame`, and of the root's attributes `imaging:pixel size` and
 //! `imaging:frame rate`. Masks and features of the instrument are not: vision measures by itself.
 
+use super::zstandard::Rows;
 use super::{Recording, RecordingInfo, SourceError, check_size};
 use cellpos_rig::source::FrameBuffer;
-use hdf5_pure::{AttrValue, Dataset, Error, File};
+use hdf5_pure::{AttrValue, Error, File};
 use std::path::{Path, PathBuf};
 
 /// Most backgrounds that are averaged, and pictures of which a median is taken where the file holds none.
@@ -16,15 +17,15 @@ const FILTERS: [(u16, &str); 4] = [
     (307, "bzip2"),
     (32_001, "Blosc"),
     (32_004, "LZ4"),
-    (32_015, "Zstandard"),
+    (32_008, "Bitshuffle"),
 ];
 
 /// An `.rtdc` file.
 #[derive(Debug)]
 pub struct RtdcRecording {
     info: RecordingInfo,
-    pictures: Dataset,
-    backgrounds: Option<Dataset>,
+    pictures: Rows,
+    backgrounds: Option<Rows>,
     /// Numbers of the frames, where they grow.
     numbers: Vec<u64>,
 }
@@ -48,9 +49,10 @@ impl RtdcRecording {
                 .is_ok_and(|names| names.iter().any(|n| n == name))
         };
         // What is there but damaged is told; what was never saved is done without.
+        let source = path;
         let dataset = |name: &str| {
             let path = format!("events/{name}");
-            let found = held(name).then(|| file.dataset(&path));
+            let found = held(name).then(|| Rows::new(file.dataset(&path)?, source));
             found.transpose().map_err(wrong)
         };
         let Some(pictures) = dataset("image")? else {
@@ -82,11 +84,11 @@ impl RtdcRecording {
             (value.is_finite() && value > 0.0).then_some(value)
         };
         let numbers = match dataset("frame")? {
-            Some(frames) => frames.read_f64().map_err(wrong)?,
+            Some(mut frames) => frames.numbers().map_err(wrong)?,
             None => Vec::new(),
         };
         let backgrounds = dataset("image_bg")?;
-        let alike = |other: &Dataset| other.shape().is_ok_and(|own| own == shape);
+        let alike = |other: &Rows| other.shape().is_ok_and(|own| own == shape);
         let mut recording = RtdcRecording {
             info: RecordingInfo {
                 path: path.to_path_buf(),
@@ -110,26 +112,31 @@ impl RtdcRecording {
         Ok(recording)
     }
 
-    fn take(&self, from: &Dataset, index: usize, to: &mut FrameBuffer) -> Result<(), SourceError> {
-        let wrong = |error: Error| told(&self.info.path, index, &error);
-        let pixels = self.info.width_px * self.info.height_px;
-        (to.width, to.height) = (self.info.width_px, self.info.height_px);
+    fn take(
+        info: &RecordingInfo,
+        from: &mut Rows,
+        index: usize,
+        to: &mut FrameBuffer,
+    ) -> Result<(), SourceError> {
+        let wrong = |error: Error| told(&info.path, index, &error);
+        let pixels = info.width_px * info.height_px;
+        (to.width, to.height) = (info.width_px, info.height_px);
         let bytes = from.element_size().map_err(wrong)?;
         let row = index as u64;
         let read = match bytes {
             1 => {
-                (to.bits, to.mono8) = (8, from.read_raw_rows(row, 1).map_err(wrong)?);
+                (to.bits, to.mono8) = (8, from.bytes(row).map_err(wrong)?);
                 to.mono8.len()
             }
             2 => {
-                (to.bits, to.mono16) = (16, from.read_u16_rows(row, 1).map_err(wrong)?);
+                (to.bits, to.mono16) = (16, from.words(row).map_err(wrong)?);
                 to.mono16.len()
             }
             _ => 0,
         };
         if read != pixels {
             return Err(SourceError::PixelKind {
-                path: self.info.path.clone(),
+                path: info.path.clone(),
                 frame: index,
                 found: format!("{read} of {pixels} pixels, of {bytes} bytes each"),
                 expected: "pixels of 8 or 16 bits are needed",
@@ -156,15 +163,15 @@ impl Recording for RtdcRecording {
                 frames: self.info.frames,
             });
         }
-        self.take(&self.pictures, index, buffer)
+        Self::take(&self.info, &mut self.pictures, index, buffer)
     }
 
     fn background(&mut self) -> Result<Option<FrameBuffer>, SourceError> {
         let count = self.info.frames.min(MOST_BACKGROUNDS);
-        let from = self.backgrounds.as_ref().unwrap_or(&self.pictures);
+        let from = self.backgrounds.as_mut().unwrap_or(&mut self.pictures);
         let mut frames = vec![FrameBuffer::default(); count];
         for (k, frame) in frames.iter_mut().enumerate() {
-            self.take(from, k * self.info.frames / count, frame)?;
+            Self::take(&self.info, from, k * self.info.frames / count, frame)?;
         }
         Ok(median(&frames))
     }

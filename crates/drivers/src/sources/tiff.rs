@@ -164,6 +164,9 @@ fn decode(
     check_size(path, width, height)?;
     check_compression(decoder, path, frame)?;
     let kind = decoder.colortype().map_err(damaged)?;
+    if let ColorType::Gray(bits @ (10 | 12 | 14)) = kind {
+        return packed(decoder, path, (frame, bits.into()), (width, height), buffer);
+    }
     let channels = match kind {
         ColorType::Gray(8 | 16) => (1, false),
         ColorType::GrayA(8 | 16) => (2, true),
@@ -200,6 +203,71 @@ fn decode(
     }
     (buffer.width, buffer.height) = (width, height);
     grey::take(path, frame, values, channels, buffer)
+}
+
+/// Grey pixels of 10, 12 or 14 bits one right after another, the high bits first, each row from a byte of its own: strips of
+/// whole rows, not compressed.
+fn packed(
+    decoder: &mut Decoder<BufReader<File>>,
+    path: &Path,
+    (frame, bits): (usize, u16),
+    (width, height): (usize, usize),
+    buffer: &mut FrameBuffer,
+) -> Result<Option<&'static str>, SourceError> {
+    let damaged = |e: TiffError| damage(path, frame, &e);
+    let plain = decoder.get_tag_u32(Tag::Compression).unwrap_or(1) == 1
+        && decoder.find_tag(Tag::StripOffsets).ok().flatten().is_some()
+        && decoder.get_tag_u32(Tag::FillOrder).unwrap_or(1) == 1;
+    if !plain {
+        let found = format!("packed pixels of {bits} bits, compressed or in tiles");
+        return Err(SourceError::PixelKind {
+            path: path.to_path_buf(),
+            frame,
+            found,
+            expected: "save it uncompressed, or with 16 bits a pixel",
+        });
+    }
+    let offsets = decoder
+        .get_tag_u64_vec(Tag::StripOffsets)
+        .map_err(damaged)?;
+    let lengths = decoder
+        .get_tag_u64_vec(Tag::StripByteCounts)
+        .map_err(damaged)?;
+    let row = (width * usize::from(bits)).div_ceil(8);
+    let mut bytes = vec![0; row * height];
+    let mut rest = bytes.as_mut_slice();
+    for (offset, length) in offsets.iter().zip(&lengths) {
+        let part = rest.len().min(*length as usize);
+        let (strip, after) = rest.split_at_mut(part);
+        let file = decoder.inner();
+        let read = file.seek(SeekFrom::Start(*offset));
+        read.and_then(|_| file.read_exact(strip))
+            .map_err(|e| damaged(TiffError::IoError(e)))?;
+        rest = after;
+    }
+    if !rest.is_empty() {
+        return Err(SourceError::Damaged {
+            path: path.to_path_buf(),
+            frame,
+            problem: format!("{} of {} bytes are missing", rest.len(), row * height),
+        });
+    }
+    (buffer.width, buffer.height, buffer.bits) = (width, height, bits);
+    buffer.mono16.clear();
+    for row in bytes.chunks_exact(row) {
+        let (mut held, mut have) = (0_u32, 0);
+        let mut next = row.iter();
+        for _ in 0..width {
+            while have < bits {
+                held = held << 8 | u32::from(next.next().copied().unwrap_or(0));
+                have += 8;
+            }
+            have -= bits;
+            buffer.mono16.push((held >> have) as u16);
+            held &= (1 << have) - 1;
+        }
+    }
+    Ok(None)
 }
 
 /// Names a compression that cannot be read.
@@ -322,19 +390,7 @@ impl RawStack {
         let at = self.start + index as u64 * self.bytes.len() as u64;
         self.file.seek(SeekFrom::Start(at)).map_err(damaged)?;
         self.file.read_exact(&mut self.bytes).map_err(damaged)?;
-        (buffer.width, buffer.height, buffer.bits) = (info.width_px, info.height_px, info.bits);
-        if info.bits == 8 {
-            buffer.mono8.clear();
-            buffer.mono8.extend_from_slice(&self.bytes);
-        } else {
-            let words = self.bytes.as_chunks::<2>().0.iter();
-            buffer.mono16.clear();
-            if self.big_endian {
-                buffer.mono16.extend(words.map(|b| u16::from_be_bytes(*b)));
-            } else {
-                buffer.mono16.extend(words.map(|b| u16::from_le_bytes(*b)));
-            }
-        }
+        super::fill(info, &self.bytes, self.big_endian, buffer);
         Ok(())
     }
 }

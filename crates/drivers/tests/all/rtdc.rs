@@ -55,17 +55,59 @@ fn pictures_of_sixteen_bits_come_out_in_either_byte_order_and_numbers_that_are_n
 }
 
 #[test]
-fn a_compression_that_is_not_read_is_named_and_what_is_cut_off_or_no_hdf5_is_told() {
-    let error = sources::open(&file("zstandard.rtdc")).unwrap_err();
-    let SourceError::Compression { method, name, .. } = error else {
-        panic!("{error}");
+fn what_zstandard_has_compressed_comes_back_whatever_the_chunks_and_filters_before_it() {
+    let mut recording = sources::open(&file("zstandard.rtdc")).unwrap();
+    let mut frame = FrameBuffer::default();
+    recording.read(0, &mut frame).unwrap();
+    assert_eq!(sum(&frame), 291_493);
+    // Several frames, and a part of their rows, in a chunk; the last chunks are partly filled.
+    let mut recording = sources::open(&file("zstandard-chunks.rtdc")).unwrap();
+    let info = recording.info().clone();
+    assert_eq!((info.width_px, info.height_px, info.frames), (11, 9, 7));
+    assert_eq!((info.pixel_um, info.rate_hz), (Some(0.34), Some(3000.0)));
+    assert_eq!([0, 1, 6].map(|n| recording.number(n)), [0, 2, 12]);
+    for n in [0, 6, 3, 4] {
+        recording.read(n, &mut frame).unwrap();
+        let expected: Vec<u8> = (0..99)
+            .map(|k| (((99 * n + k) * 7 + 3) % 251) as u8)
+            .collect();
+        assert_eq!(frame.mono8, expected, "{n}");
+    }
+    let empty = recording.background().unwrap().unwrap();
+    let mut of_pixel = |k: usize| {
+        let mut values: Vec<u8> = (0..7)
+            .map(|n| (((99 * n + k) * 5 + 1) % 253) as u8)
+            .collect();
+        values.sort_unstable();
+        values[3]
     };
-    assert_eq!((method, name), (32_015, "Zstandard"));
+    let expected: Vec<u8> = (0..99).map(&mut of_pixel).collect();
+    assert_eq!(empty.mono8, expected);
+    let mut recording = sources::open(&file("zstandard-words.rtdc")).unwrap();
+    for n in [5, 0] {
+        recording.read(n, &mut frame).unwrap();
+        let expected: Vec<u16> = (0..99).map(|k| ((99 * n + k) * 137 + 300) as u16).collect();
+        assert_eq!((frame.bits, &frame.mono16), (16, &expected), "{n}");
+    }
+}
+
+#[test]
+fn what_is_cut_off_or_no_hdf5_is_told() {
     let folder = tempfile::tempdir().unwrap();
     let whole = std::fs::read(file("faint-cells.rtdc")).unwrap();
+    let packed = std::fs::read(file("zstandard.rtdc")).unwrap();
+    let mut flipped = packed.clone();
+    // The first bytes of a compressed chunk.
+    let at = packed
+        .windows(4)
+        .position(|w| w == [0x28, 0xB5, 0x2F, 0xFD])
+        .unwrap();
+    flipped[at] = 0;
     for (name, bytes) in [
         ("cut.rtdc", &whole[..whole.len() / 2]),
         ("text.rtdc", b"text"),
+        ("zstandard.rtdc", &packed[..packed.len() - 200]),
+        ("flipped.rtdc", &flipped),
     ] {
         let path = folder.path().join(name);
         std::fs::write(&path, bytes).unwrap();

@@ -1,14 +1,18 @@
 //! Position of one bead in a frame: seed, template fit, covariance, verdict.
 
 mod certainty;
+mod judge;
 mod noise;
+mod refine;
 
+use crate::beyond::Left;
 use crate::config::{ConfigError, LocaliserConfig, PixelNoise};
 use crate::crop::Crop;
-use crate::fit::{self, Pass, Weights};
+use crate::fit::{self, Pass};
 use crate::fix::{Fix, FixQuality};
 use crate::frame::Frame;
 use crate::learn::{Learner, LearningReport};
+use crate::pool::Pool;
 use crate::residue::Residues;
 use crate::seed;
 use crate::speckle;
@@ -21,8 +25,6 @@ const CONVERGED_PX: f64 = 0.01;
 const RECENTRE_PX: f64 = 1.0;
 /// How often the window may be taken anew.
 const MAX_RECENTRES: u32 = 4;
-/// How often specks are looked for in what a fit leaves: each time those half as strong as the strongest are left out.
-const MOST_LOOKS_FOR_SPECKS: usize = 5;
 /// Half-width in bead radii of the window that leaves neighbours out.
 const NARROW_RADII: f64 = 1.3;
 /// Steps in the length of a streak per fit.
@@ -35,9 +37,6 @@ const MOST_STRETCH: f64 = 2.5;
 const SECANT: f64 = 0.1;
 /// Beads that can be taken off a window.
 const MAX_OTHERS: usize = 8;
-/// Residual ratio from which the variance is judged by the residual: noise alone does not reach it.
-const WIDENED_RATIO: f64 = 1.3;
-
 /// Localises one bead per call. Buffers are made in [`Localiser::new`]; [`Localiser::locate`] allocates nothing.
 ///
 /// The position is the weighted least-squares fit of the template over the whole window in four parameters (x, y,
@@ -59,6 +58,18 @@ pub struct Localiser {
     residues: Residues,
     /// Beads taken off the window: x, y, amplitude.
     others: [(f64, f64, f64); MAX_OTHERS],
+    /// Whether specks that show without knowing the bead are replaced in the windows of this fix.
+    cleans: bool,
+    /// Whether a residual that is the same all round counts as none.
+    pardons: bool,
+    /// How much of a window the bead fills: the whole window, and the narrow one.
+    filled: [f64; 2],
+    /// Variance where the place is read off, over that of the noise; and of the offsets of rows and columns, grey^2.
+    local: Pool,
+    lines: [Pool; 2],
+    /// What the last fixes were widened by, and their residual ratios.
+    widened: Pool,
+    ratio: Pool,
 }
 
 /// A fit at rest or given up.
@@ -67,6 +78,8 @@ struct Fitted {
     y_px: f64,
     pass: Pass,
     converged: bool,
+    /// What it leaves, where that was looked at.
+    left: Left,
 }
 
 impl Localiser {
@@ -80,6 +93,7 @@ impl Localiser {
         let learner = config
             .learning
             .map(|l| Learner::new(l, config.window_px, &template));
+        let filled = judge::filled(&template, config.window_px);
         Ok(Localiser {
             config,
             template,
@@ -91,6 +105,13 @@ impl Localiser {
             comb: Comb::STILL,
             residues: Residues::new(),
             others: [(0.0, 0.0, 0.0); MAX_OTHERS],
+            cleans: false,
+            pardons: false,
+            filled,
+            local: Pool::default(),
+            lines: [Pool::default(); 2],
+            widened: Pool::default(),
+            ratio: Pool::default(),
         })
     }
 
@@ -161,6 +182,15 @@ impl Localiser {
                 return again;
             }
         }
+        // It may be out of focus, or blurred.
+        if fix.verdict == FixQuality::BadFit {
+            self.pardons = true;
+            let again = self.attempt(frame, (x_px, y_px), window_px);
+            self.pardons = false;
+            if again.verdict == FixQuality::Good {
+                return again;
+            }
+        }
         // The guess may have been out of the fit's reach: once more from the centroid.
         if !self.crop.take(frame, x_px, y_px, window_px) {
             return fix;
@@ -185,7 +215,8 @@ impl Localiser {
         }
         let variance = self.noise_variance.unwrap_or(1.0);
         let (change, sd) = fit::scale(&self.crop, &self.template, fix.x_px, fix.y_px, variance)?;
-        Some((1.0 + change, sd))
+        let size = self.template.size();
+        Some((size * (1.0 + change), size * sd))
     }
 
     /// Position of the bead `own` of `beads` (x and y in px, amplitude in grey levels) near `guess`, with the images of
@@ -210,7 +241,10 @@ impl Localiser {
     /// Copies a window, with the images of other beads taken off.
     fn take_window(&mut self, frame: &Frame, x_px: f64, y_px: f64, side_px: usize) -> bool {
         let taken = self.crop.take(frame, x_px, y_px, side_px);
-        if taken && let Some(variance) = self.noise_variance {
+        if taken
+            && self.cleans
+            && let Some(variance) = self.noise_variance
+        {
             speckle::clean(&mut self.crop, variance.sqrt() as f32);
         }
         for (x, y, amplitude) in self.others {
@@ -232,6 +266,8 @@ impl Localiser {
         // Before the window is taken: neighbours are taken off it as streaks of this length, not of one that an earlier
         // attempt has come to on something else.
         self.comb = Comb::new(self.streak_px, self.template.radius_px());
+        self.template.stretch_to(1.0);
+        self.cleans = false;
         if !self.take_window(frame, x_px, y_px, side_px) {
             return Fix::none(x_px, y_px, FixQuality::AtBorder);
         }
@@ -244,70 +280,27 @@ impl Localiser {
         if !self.comb.is_still() {
             fitted = self.fit_length(frame, fitted, side_px);
         }
-        for _ in 0..MOST_LOOKS_FOR_SPECKS {
-            let Some(again) = fitted
-                .as_ref()
-                .and_then(|f| self.without_specks(frame, f, side_px))
-            else {
-                break;
-            };
-            fitted = Some(again);
-        }
+        let fitted = self.refine(frame, fitted, (x_px, y_px), side_px);
         let found = fitted.as_ref().map(|f| f.pass);
+        let left = fitted.as_ref().map_or(Left::default(), |f| f.left);
         let mut fix = self.judge(frame, fitted, (x_px, y_px));
-        let widening = self.widen(&mut fix);
+        if fix.verdict == FixQuality::BadFit && self.pardons {
+            self.pardon(frame, &mut fix);
+        }
+        let widening = self.widen(&mut fix, &left);
         if fix.verdict == FixQuality::Good
             && !found.is_some_and(|p| self.is_certain(&p, (fix.x_px, fix.y_px), widening))
         {
             fix.verdict = FixQuality::NoSignal;
         }
         let whole = side_px == self.config.window_px && self.comb.is_still();
+        if fix.verdict == FixQuality::Good && self.comb.is_still() {
+            self.widened.take_in(widening);
+        }
         if fix.verdict == FixQuality::Good && whole {
             self.update_noise();
         }
         fix
-    }
-
-    /// The fit without the specks that one has left; `None` where it leaves none.
-    fn without_specks(&mut self, frame: &Frame, f: &Fitted, side_px: usize) -> Option<Fitted> {
-        let brightest =
-            f.pass.background + f.pass.amplitude.max(0.0) + f64::from(self.crop.pedestal);
-        let noise = self.pixel_variance(brightest).sqrt() as f32;
-        let tolerance = self.template_tolerance() as f32;
-        let found = speckle::leave_out(
-            &mut self.crop,
-            &self.template,
-            &self.comb,
-            (f.x_px, f.y_px),
-            (f.pass.amplitude, f.pass.background),
-            (noise, tolerance),
-            self.residues.left.as_mut_slice(),
-        );
-        // The window stays: a new one would have the specks again.
-        (found > 0).then(|| self.fit(frame, (f.x_px, f.y_px), side_px, 0))?
-    }
-
-    /// Widens a good fix's covariance by what the template leaves of the window; by how much.
-    fn widen(&mut self, fix: &mut Fix) -> f64 {
-        if fix.verdict != FixQuality::Good || fix.residual_ratio <= WIDENED_RATIO {
-            return 1.0;
-        }
-        let widening = self.residues.widening(
-            &self.crop,
-            &self.template,
-            &self.comb,
-            (fix.x_px, fix.y_px),
-            (
-                fix.amplitude,
-                fix.background - f64::from(self.crop.pedestal),
-            ),
-            self.pixel_variance(fix.background),
-        );
-        let widening = widening.unwrap_or(fix.residual_ratio).max(1.0);
-        fix.var_x_px2 *= widening;
-        fix.var_y_px2 *= widening;
-        fix.cov_xy_px2 *= widening;
-        widening
     }
 
     /// Refines the length of a streak beside the position. By symmetry the two do not depend on each other, so that they
@@ -358,6 +351,7 @@ impl Localiser {
         let background = fix.background - f64::from(self.crop.pedestal);
         if learner.take_in(&self.crop, (fix.x_px, fix.y_px), fix.amplitude, background) {
             learner.refresh(&mut self.template);
+            self.filled = judge::filled(&self.template, self.config.window_px);
         }
     }
 
@@ -414,6 +408,7 @@ impl Localiser {
                         y_px,
                         pass,
                         converged: false,
+                        left: Left::default(),
                     });
                 }
                 recentres += 1;
@@ -427,6 +422,7 @@ impl Localiser {
                     y_px,
                     pass,
                     converged: true,
+                    left: Left::default(),
                 });
             }
         }
@@ -435,52 +431,7 @@ impl Localiser {
             y_px,
             pass,
             converged: false,
+            left: Left::default(),
         })
-    }
-
-    fn judge(&self, frame: &Frame, fitted: Option<Fitted>, guess: (f64, f64)) -> Fix {
-        let Some(f) = fitted else {
-            return Fix::none(guess.0, guess.1, FixQuality::NoSignal);
-        };
-        let amplitude = f.pass.amplitude;
-        let background = f.pass.background + f64::from(self.crop.pedestal);
-        let pixels = (self.crop.width * self.crop.height) as f64;
-        let unit = self.weight_unit();
-        let residual_ratio = f.pass.chi2.max(0.0) / (unit * (pixels - 4.0));
-        let variance = match self.weights(Some(&f.pass)) {
-            Weights::Even { .. } => unit,
-            Weights::Shot { base, .. } => f64::from(base),
-        };
-        let snr = self.sign * amplitude / variance.sqrt();
-        let tolerated = self.config.max_residual_ratio + (self.template_tolerance() * snr).powi(2);
-        let margin_px = self.template.radius_px();
-        let inside = |c: f64, len: usize| c >= margin_px && c <= len as f64 - 1.0 - margin_px;
-        let in_window =
-            |c: f64, first: usize, len: usize| c >= first as f64 && c <= (first + len - 1) as f64;
-        let kept = in_window(f.x_px, self.crop.x0, self.crop.width)
-            && in_window(f.y_px, self.crop.y0, self.crop.height);
-        let verdict = if snr < self.config.min_snr {
-            FixQuality::NoSignal
-        } else if !f.converged || !kept {
-            FixQuality::NotConverged
-        } else if residual_ratio > tolerated {
-            FixQuality::BadFit
-        } else if !inside(f.x_px, frame.width) || !inside(f.y_px, frame.height) {
-            FixQuality::AtBorder
-        } else {
-            FixQuality::Good
-        };
-        Fix {
-            x_px: f.x_px,
-            y_px: f.y_px,
-            var_x_px2: unit * f.pass.covariance[(0, 0)],
-            var_y_px2: unit * f.pass.covariance[(1, 1)],
-            cov_xy_px2: unit * f.pass.covariance[(0, 1)],
-            amplitude,
-            background,
-            residual_ratio,
-            snr,
-            verdict,
-        }
     }
 }

@@ -10,6 +10,8 @@ mod no_allocation;
 mod real_cells;
 mod streak;
 mod stress;
+mod stress_scene;
+mod stress_table;
 mod suggested;
 mod tracking;
 mod uncertainty;

@@ -28,7 +28,8 @@ use std::path::{Path, PathBuf};
     cellpos vision cells.tif --cells --background-frames 50"
 )]
 pub struct Args {
-    /// Folder of PNG or TIFF pictures, TIFF stack, or Photron recording (.cihx, .cih, .mraw).
+    /// Folder of PNG, TIFF or JPEG pictures, TIFF stack, Photron recording (.cihx, .cih, .mraw), AVI film, NumPy stack (.npy), or .rtdc
+    /// file.
     source: PathBuf,
     /// Radius at which a ring-profile bead (bright core, dark ring) first crosses the background, px. Without a size or a
     /// rig the profile is learnt from the recording itself.

@@ -1,0 +1,194 @@
+//! What a fit is worth: its verdict, and the variance of its place.
+
+use super::{Fitted, Localiser, NARROW_RADII};
+use crate::beyond::Left;
+use crate::config::PixelNoise;
+use crate::fit::Weights;
+use crate::fix::{Fix, FixQuality};
+use crate::frame::Frame;
+use crate::template::Template;
+
+/// Residual ratio from which the variance is judged by the residual: noise alone does not reach it; and the same of the pixels
+/// that tell the place, few in a narrow bead, over the last fixes: noise alone varies by 0.06.
+pub(super) const WIDENED_RATIO: f64 = 1.3;
+const WIDENED_LOCALLY: f64 = 1.2;
+/// Mean square of the measured ring about its mean in its window of 25 px (`the_measured_bead_fills_its_window...`).
+const MEASURED: f64 = 0.135;
+
+/// Radius of a bead below which the patches of a window, of 5 px at least, do not resolve it: what the template leaves where the place
+/// is read off counts in full then.
+const UNRESOLVED_PX: f64 = 3.5;
+/// Share of a bead's contrast in its window that the template must explain where the rest is the same all round.
+const LEAST_EXPLAINED: f64 = 0.5;
+
+impl Localiser {
+    /// The verdict of a fit, and its figures.
+    pub(super) fn judge(&self, frame: &Frame, fitted: Option<Fitted>, guess: (f64, f64)) -> Fix {
+        let Some(f) = fitted else {
+            return Fix::none(guess.0, guess.1, FixQuality::NoSignal);
+        };
+        let amplitude = f.pass.amplitude;
+        let background = f.pass.background + f64::from(self.crop.pedestal);
+        let pixels = (self.crop.width * self.crop.height) as f64;
+        let unit = self.weight_unit();
+        let residual_ratio = f.pass.chi2.max(0.0) / (unit * (pixels - 4.0));
+        let variance = match self.weights(Some(&f.pass)) {
+            Weights::Even { .. } => unit,
+            Weights::Shot { base, .. } => f64::from(base),
+        };
+        let snr = self.sign * amplitude / variance.sqrt();
+        let in_window =
+            |c: f64, first: usize, len: usize| c >= first as f64 && c <= (first + len - 1) as f64;
+        let kept = in_window(f.x_px, self.crop.x0, self.crop.width)
+            && in_window(f.y_px, self.crop.y0, self.crop.height);
+        let verdict = if snr < self.config.min_snr {
+            FixQuality::NoSignal
+        } else if !f.converged || !kept {
+            FixQuality::NotConverged
+        } else if residual_ratio > self.tolerated(snr) {
+            FixQuality::BadFit
+        } else {
+            self.whole(frame, (f.x_px, f.y_px))
+        };
+        Fix {
+            x_px: f.x_px,
+            y_px: f.y_px,
+            var_x_px2: unit * f.pass.covariance[(0, 0)],
+            var_y_px2: unit * f.pass.covariance[(1, 1)],
+            cov_xy_px2: unit * f.pass.covariance[(0, 1)],
+            amplitude,
+            background,
+            residual_ratio,
+            snr,
+            verdict,
+        }
+    }
+
+    /// Residual ratio up to which a template's error explains the residual of a bead of this contrast over the noise.
+    fn tolerated(&self, snr: f64) -> f64 {
+        let filled = self.filled[usize::from(self.crop.width < self.config.window_px)];
+        self.config.max_residual_ratio + filled * (self.template_tolerance() * snr).powi(2)
+    }
+
+    /// The verdict on a place: good unless the border cuts the bead.
+    fn whole(&self, frame: &Frame, (x_px, y_px): (f64, f64)) -> FixQuality {
+        let margin_px = self.template.radius_px();
+        let inside = |c: f64, len: usize| c >= margin_px && c <= len as f64 - 1.0 - margin_px;
+        if inside(x_px, frame.width) && inside(y_px, frame.height) {
+            FixQuality::Good
+        } else {
+            FixQuality::AtBorder
+        }
+    }
+
+    /// Lets a bad fit pass whose residual is the same all round: a bead in another focus, or blurred. The template has to explain
+    /// most of what the bead adds to the window.
+    pub(super) fn pardon(&mut self, frame: &Frame, fix: &mut Fix) {
+        let variance = self.pixel_variance(fix.background);
+        let filled = self.filled[usize::from(self.crop.width < self.config.window_px)];
+        let explained = filled * MEASURED * fix.snr * fix.snr;
+        let left = (fix.residual_ratio - 1.0).max(0.0);
+        if !self.comb.is_still() || explained < LEAST_EXPLAINED * (explained + left) {
+            return;
+        }
+        let background = fix.background - f64::from(self.crop.pedestal);
+        let lopsided = self.residues.lopsided(
+            &self.crop,
+            &self.template,
+            &self.comb,
+            (fix.x_px, fix.y_px),
+            (fix.amplitude, background),
+        );
+        if lopsided / variance <= self.tolerated(fix.snr) {
+            fix.verdict = self.whole(frame, (fix.x_px, fix.y_px));
+        }
+    }
+
+    /// Narrows a fix's covariance where the last fixes have left less than the noise that was read off the windows' borders: the
+    /// end of a ring that lies there counts as noise.
+    fn narrow(&mut self, fix: &mut Fix) {
+        self.ratio.take_in(fix.residual_ratio);
+        if let PixelNoise::Estimated = self.config.noise {
+            let factor = self.ratio.mean.clamp(0.5, 1.0);
+            fix.var_x_px2 *= factor;
+            fix.var_y_px2 *= factor;
+            fix.cov_xy_px2 *= factor;
+        }
+    }
+
+    /// Widens a good fix's covariance by what the template leaves of the window; by how much.
+    pub(super) fn widen(&mut self, fix: &mut Fix, left: &Left) -> f64 {
+        if fix.verdict != FixQuality::Good {
+            return 1.0;
+        }
+        // A streak's residual says nothing of others.
+        if self.comb.is_still() {
+            self.narrow(fix);
+            self.add_lines(fix, left);
+        }
+        if fix.residual_ratio <= WIDENED_RATIO && self.local.mean <= WIDENED_LOCALLY {
+            return 1.0;
+        }
+        let widening = self.residues.widening(
+            &self.crop,
+            &self.template,
+            &self.comb,
+            (fix.x_px, fix.y_px),
+            (
+                fix.amplitude,
+                fix.background - f64::from(self.crop.pedestal),
+            ),
+            self.pixel_variance(fix.background),
+        );
+        let mut widening = widening.unwrap_or(fix.residual_ratio).max(1.0);
+        if self.template.radius_px() < UNRESOLVED_PX {
+            widening = widening.max(left.local_variance / self.pixel_variance(fix.background));
+        }
+        fix.var_x_px2 *= widening;
+        fix.var_y_px2 *= widening;
+        fix.cov_xy_px2 *= widening;
+        widening
+    }
+
+    /// Part of the whole window that the bead fills, for the tolerance of a template's error: see [`filled`].
+    pub(crate) fn filled(&self) -> f64 {
+        self.filled[0]
+    }
+}
+
+/// How much of a window, and of the narrow one, a bead fills, at most 1: the template's square about its mean over that of the
+/// measured bead's in its default window. An error that is a fraction of the bead is a smaller one of a window that the
+/// bead fills in part.
+pub(super) fn filled(template: &Template, window_px: usize) -> [f64; 2] {
+    let narrow_px = 2 * (NARROW_RADII * template.radius_px()).ceil() as usize + 1;
+    [window_px, narrow_px.min(window_px)].map(|side| {
+        let half = (side / 2) as i32;
+        let (mut sum, mut square, mut n) = (0.0, 0.0, 0.0);
+        for (y, x) in (-half..=half).flat_map(|y| (-half..=half).map(move |x| (y, x))) {
+            let f = f64::from(template.value_at_squared((x * x + y * y) as f32));
+            (sum, square, n) = (sum + f, square + f * f, n + 1.0);
+        }
+        ((square / n - sum * sum / (n * n)) / MEASURED).min(1.0)
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::LocaliserConfig;
+    use crate::profile::RingProfile;
+    use crate::template::ProfileSpec;
+
+    #[test]
+    fn the_measured_bead_fills_its_window_and_a_small_spot_does_not() {
+        let edge_px = RingProfile::MEASURED_EDGE_PX;
+        let of = |spec| {
+            let localiser = Localiser::new(LocaliserConfig::new(spec)).unwrap();
+            localiser.filled()
+        };
+        let ring = of(ProfileSpec::Ring { edge_px });
+        let spot = of(ProfileSpec::Gaussian { sigma_px: 1.0 });
+        assert!((0.97..=1.0).contains(&ring), "{ring}");
+        assert!(spot < 0.2, "{spot}");
+    }
+}

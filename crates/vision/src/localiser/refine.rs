@@ -1,0 +1,133 @@
+//! What comes after the first fit: specks are left out, and rising light and another focus are fitted where the window asks.
+
+use super::judge::WIDENED_RATIO;
+use super::{Fitted, Localiser, MAX_RECENTRES};
+use crate::beyond::{self, Left};
+use crate::fix::Fix;
+use crate::frame::Frame;
+use crate::speckle;
+
+/// How often specks are looked for in what a fit leaves: each time those half as strong as the strongest are left out.
+const MOST_LOOKS_FOR_SPECKS: usize = 5;
+
+/// Share of what a fit leaves beyond noise that offsets of the lines must explain to count.
+const LEAST_OF_LINES: f64 = 0.5;
+
+impl Localiser {
+    /// The fit without specks, with the light's slope and the size where a test finds them.
+    pub(super) fn refine(
+        &mut self,
+        frame: &Frame,
+        first: Option<Fitted>,
+        guess: (f64, f64),
+        side_px: usize,
+    ) -> Option<Fitted> {
+        let mut fitted = first;
+        let mut left = fitted.as_ref().map(|f| self.left_by(f));
+        let noise = self.noise_variance.unwrap_or(1.0).sqrt() as f32;
+        if left.is_none_or(|l| l.strongest > speckle::LEAST_SIGMA * noise) {
+            // A speck may have drawn the fit to itself: those that show without the bead go first, in every window.
+            self.cleans = true;
+            if speckle::clean(&mut self.crop, noise) > 0
+                && self.take_window(frame, guess.0, guess.1, side_px)
+            {
+                fitted = self.fit(frame, guess, side_px, MAX_RECENTRES);
+                if !self.comb.is_still() {
+                    fitted = self.fit_length(frame, fitted, side_px);
+                }
+                left = fitted.as_ref().map(|f| self.left_by(f));
+            }
+        }
+        for _ in 0..MOST_LOOKS_FOR_SPECKS {
+            let (f, l) = (fitted.as_ref()?, left?);
+            let brightest =
+                f.pass.background + f.pass.amplitude.max(0.0) + f64::from(self.crop.pedestal);
+            let noise = self.pixel_variance(brightest).sqrt() as f32;
+            let tolerance = self.template_tolerance() as f32;
+            let (at, background) = ((f.x_px, f.y_px), f.pass.background);
+            let found = speckle::leave_out(
+                &mut self.crop,
+                at,
+                background,
+                (noise, tolerance),
+                self.residues.left.as_slice(),
+                l.strongest,
+            );
+            if found == 0 {
+                break;
+            }
+            // The window stays: a new one would have the specks again.
+            fitted = self.fit(frame, at, side_px, 0);
+            left = fitted.as_ref().map(|f| self.left_by(f));
+        }
+        let (f, l) = (
+            Fitted {
+                left: left?,
+                ..fitted?
+            },
+            left?,
+        );
+        let level = f.pass.background + f64::from(self.crop.pedestal);
+        // Where what is left is wider or more than noise, a score of it is, too.
+        let asked = l.asks(self.pixel_variance(level) * self.widened.mean.max(1.0));
+        if !asked.slopes && !asked.size {
+            return Some(f);
+        }
+        let weights = self.weights(Some(&f.pass));
+        let pixels = (self.crop.width * self.crop.height) as f64;
+        let misfit = f.pass.chi2 - self.weight_unit() * (pixels - 4.0);
+        let start = ((f.x_px, f.y_px), misfit);
+        let found = beyond::fit(
+            &mut self.crop,
+            &mut self.template,
+            &self.comb,
+            start,
+            weights,
+            asked,
+        );
+        let Some((x_px, y_px, pass)) = found else {
+            return Some(f);
+        };
+        let found = Fitted {
+            x_px,
+            y_px,
+            pass,
+            ..f
+        };
+        Some(Fitted {
+            left: self.left_by(&found),
+            ..found
+        })
+    }
+
+    /// Widens a good fix's covariance by the offsets that rows and columns have had in the last fixes, and takes in this one's.
+    pub(super) fn add_lines(&mut self, fix: &mut Fix, left: &Left) {
+        let variance = self.pixel_variance(fix.background);
+        self.local.take_in(left.local_variance / variance);
+        let excess = left.lines.map(|lines| lines.excess(variance));
+        // What a template leaves differs from line to line, too, but by little of all that it leaves.
+        let beyond_noise = (fix.residual_ratio - 1.0) * variance;
+        let explained = excess[0].max(0.0) + excess[1].max(0.0);
+        if fix.residual_ratio > WIDENED_RATIO && explained < LEAST_OF_LINES * beyond_noise {
+            return;
+        }
+        for (pool, excess) in self.lines.iter_mut().zip(excess) {
+            pool.take_in(excess);
+        }
+        let [rows, columns] = self.lines.map(|pool| pool.mean.max(0.0));
+        fix.var_y_px2 += rows * left.lines[0].moves;
+        fix.var_x_px2 += columns * left.lines[1].moves;
+    }
+
+    /// What a fit leaves of the window.
+    fn left_by(&mut self, f: &Fitted) -> Left {
+        beyond::examine(
+            &self.crop,
+            &self.template,
+            &self.comb,
+            (f.x_px, f.y_px),
+            (f.pass.amplitude, f.pass.background),
+            self.residues.left.as_mut_slice(),
+        )
+    }
+}
