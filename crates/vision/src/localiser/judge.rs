@@ -15,9 +15,9 @@ const WIDENED_LOCALLY: f64 = 1.2;
 /// Mean square of the measured ring about its mean in its window of 25 px (`the_measured_bead_fills_its_window...`).
 const MEASURED: f64 = 0.135;
 
-/// Radius of a bead below which the patches of a window, of 5 px at least, do not resolve it: what the template leaves where the place
-/// is read off counts in full then.
-const UNRESOLVED_PX: f64 = 3.5;
+/// Radius of a bead that is narrower than the smallest patch, of 5 px: patches do not resolve it, and what the template leaves where
+/// the place is read off counts in full.
+const UNRESOLVED_PX: f64 = 2.5;
 /// Share of a bead's contrast in its window that the template must explain where the rest is the same all round.
 const LEAST_EXPLAINED: f64 = 0.5;
 

@@ -73,6 +73,10 @@ impl Localiser {
         if !asked.slopes && !asked.size {
             return Some(f);
         }
+        // What is no bead without them must not become one by more parameters.
+        if !self.is_certain(&f.pass, (f.x_px, f.y_px), 1.0) {
+            return Some(f);
+        }
         let weights = self.weights(Some(&f.pass));
         let pixels = (self.crop.width * self.crop.height) as f64;
         let misfit = f.pass.chi2 - self.weight_unit() * (pixels - 4.0);

@@ -178,21 +178,21 @@ fn shot_noise_is_weighted_as_the_bound_asks() {
     assert!(weighted < even);
 }
 
-/// The measured bead with a ring of half its depth: no size of the configured one is like it.
+/// The measured bead with a shallower ring: no size of the configured one is like it.
 struct Shallow(RingProfile);
+
+impl Shallow {
+    fn fill(r_px: f64) -> f64 {
+        0.15 * (-0.25 * (r_px - 9.0).powi(2)).exp()
+    }
+}
 
 impl RadialProfile for Shallow {
     fn value(&self, r_px: f64) -> f64 {
-        let v = self.0.value(r_px);
-        if v < 0.0 { 0.5 * v } else { v }
+        self.0.value(r_px) + Self::fill(r_px)
     }
     fn slope(&self, r_px: f64) -> f64 {
-        let slope = self.0.slope(r_px);
-        if self.0.value(r_px) < 0.0 {
-            0.5 * slope
-        } else {
-            slope
-        }
+        self.0.slope(r_px) - 0.5 * (r_px - 9.0) * Self::fill(r_px)
     }
     fn radius_px(&self) -> f64 {
         self.0.radius_px()
@@ -240,7 +240,7 @@ fn a_learnt_template_brings_a_wrong_one_to_the_bound() {
     println!("configured with too deep a ring: RMS/CRB {fixed:.3}, residual {fixed_residual:.1}");
     println!("learnt: RMS/CRB {learnt:.3}, residual {learnt_residual:.2}, {report:?}");
     assert!(
-        learnt <= 1.03 && learnt < fixed,
+        learnt <= 1.05 && learnt < fixed,
         "learnt {learnt}, configured {fixed}"
     );
     assert!(learnt_residual < 1.2 && fixed_residual > 2.0);
