@@ -129,6 +129,7 @@ struct Gap {
     peak: f64,
     furthest: f64,
     last: f64,
+    last_sd: f64,
 }
 
 impl Gap {
@@ -144,7 +145,7 @@ impl Gap {
         self.held += f64::from(u8::from(likely_um <= limit_um));
         self.peak = self.peak.max(error_um.abs());
         self.furthest = self.furthest.max(likely_um);
-        self.last = error_um;
+        (self.last, self.last_sd) = (error_um, sd_um);
     }
 
     /// Its errors when nothing is known of its end.
@@ -205,7 +206,8 @@ pub(crate) struct KeepWatch {
     blind_ns: i64,
     blind_since_ns: Option<i64>,
     last_ns: i64,
-    frozen: bool,
+    /// Since when the bead has been frozen: nothing drives it back.
+    frozen_since_ns: Option<i64>,
     clipped: bool,
 }
 
@@ -238,7 +240,8 @@ impl KeepWatch {
     /// Takes a record whose bead is to be held; `counts` says whether its error is one that counts.
     pub fn add(&mut self, record: &TickRecord, counts: bool) {
         self.last_ns = record.time_ns;
-        self.frozen = record.flags.has(TickFlags::FREEZE);
+        let frozen = record.flags.has(TickFlags::FREEZE);
+        self.frozen_since_ns = frozen.then(|| self.frozen_since_ns.unwrap_or(record.time_ns));
         self.clipped |= record.flags.has(TickFlags::CLIPPED);
         let stands = |&(um, _): &(f64, i64)| um == record.target_um;
         self.still =
@@ -264,15 +267,21 @@ impl KeepWatch {
         (self.hold).map_or(f64::INFINITY, |hold| hold.limit_um(variance_um2))
     }
 
+    /// Variance of the bead's walk in a time, um^2.
+    fn walk_um2(&self, seconds: f64) -> f64 {
+        (self.hold).map_or(0.0, |hold| 2.0 * hold.diffusion_um2_per_s * seconds)
+    }
+
     fn take_fix(&mut self, record: &TickRecord, error_um: f64, counts: bool) {
         let limit_um = self.limit_um(record.variance_um2);
         let other = record.decision == Decision::Reacquired as u8;
         self.other_beads += u64::from(other);
         let outside = self.outside_since(error_um, limit_um, record.time_ns);
         if self.gap.ticks > 0.0 && self.gap_counts {
-            let walk_um2 =
-                (self.hold).map_or(0.0, |hold| 2.0 * hold.diffusion_um2_per_s * hold.period_s);
-            let gap = if other {
+            let walk_um2 = self.walk_um2(self.hold.map_or(0.0, |hold| hold.period_s));
+            // Three standard deviations from where the lost one should be it is hardly the same.
+            let elsewhere = (error_um - self.gap.last).abs() > 3.0 * self.gap.last_sd;
+            let gap = if other && elsewhere {
                 self.gap.open()
             } else {
                 self.gap.closed(error_um, walk_um2, outside)
@@ -298,7 +307,12 @@ impl KeepWatch {
             });
         }
         self.between = 0;
-        self.judge(outside, error_um, record.time_ns);
+        let walk_um2 = self.frozen_since_ns.map_or(0.0, |since_ns| {
+            self.walk_um2((record.time_ns - since_ns) as f64 * 1e-9)
+        });
+        let walked_um = self.limit_um(record.variance_um2.max(0.0) + walk_um2);
+        let strayed = self.outside_since(error_um, walked_um, record.time_ns);
+        self.judge(strayed, error_um, record.time_ns);
         self.seen = Some(Seen {
             time_ns: record.time_ns,
             error_um,
@@ -324,7 +338,7 @@ impl KeepWatch {
         }
     }
 
-    /// Whether the bead has strayed from a reference that stands still.
+    /// Whether the bead has strayed from a reference that stands still; one that is frozen may walk.
     fn judge(&mut self, outside: f64, error_um: f64, now_ns: i64) {
         let Some(hold) = self.hold else { return };
         let ns = |delays: f64| delays * hold.delay_s * 1e9;
@@ -401,7 +415,7 @@ impl KeepWatch {
             .map_or(0, |since_ns| self.last_ns - since_ns);
         let why = if self.other_beads > 0 {
             Some(NotKept::AnotherBead)
-        } else if self.frozen && self.blind_since_ns.is_some() {
+        } else if self.frozen_since_ns.is_some() && self.blind_since_ns.is_some() {
             Some(NotKept::OutOfSight)
         } else if self.clipped {
             Some(NotKept::Clipped)

@@ -64,9 +64,8 @@ pub struct Args {
     /// Rehearse: on the virtual clock, with an emulated rig that behaves as --model says.
     #[arg(long)]
     dry: bool,
-    /// pi, lead, lqg, mpc, or the path of a controller.toml. lqg holds closest, and keeps the bead when the flow steps; pi asks less
-    /// of the model.
-    #[arg(long, default_value = "lqg")]
+    /// pi, lead, lqg, mpc, or the path of a controller.toml.
+    #[arg(long, default_value = "pi")]
     controller: String,
     /// Whether the law follows the gain and delay of the plant while it runs; left out: lqg and mpc do, pi and lead do not, a
     /// controller.toml says by itself.

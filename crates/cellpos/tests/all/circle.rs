@@ -197,7 +197,7 @@ fn arguments_that_contradict_each_other_end_with_code_2_and_a_sentence() {
 #[test]
 fn a_run_of_track_is_data_wherever_its_bead_rested() {
     let folder = tempfile::tempdir().unwrap();
-    let track = "track --target 0um --sine 3um@10Hz --duration 10s --clock virtual --frames off --seed 2 --json";
+    let track = "track --target 0um --controller pi --sine 3um@10Hz --duration 10s --clock virtual --frames off --seed 2 --json";
     let run = succeed(folder.path(), track).json();
     // Neutral is at 20 um on the emulated rig; the model was made at 4 um.
     let line = format!(
@@ -224,8 +224,7 @@ fn frames_that_came_without_a_fix_are_no_dropped_frames() {
         .collect();
     let faults = format!("[emulator.faults]\nevent = [{}]\n", events.join(", "));
     std::fs::write(folder.path().join("rig.toml"), faults).unwrap();
-    let track =
-        "track --target 0um --sine 3um@10Hz --duration 8s --clock virtual --rig rig.toml --json";
+    let track = "track --target 0um --controller pi --sine 3um@10Hz --duration 8s --clock virtual --rig rig.toml --json";
     let run = succeed(folder.path(), track).json();
     assert!(number(&run, "fixes_lost") > 200.0, "{run}");
     let data = run["run"].as_str().unwrap();
@@ -264,7 +263,7 @@ fn what_identify_writes_reconcile_reads_and_what_that_writes_the_others_read() {
     let identified = Model::load_file(&folder.path().join("model.toml")).unwrap();
     let delay_s = identified.camera_delay_s.unwrap();
     assert!((delay_s - 2e-3).abs() < 0.1e-3, "{delay_s} s");
-    let track = "track --target 0um --sine 3um@10Hz --duration 10s --clock virtual --frames off --seed 2 --json";
+    let track = "track --target 0um --controller pi --sine 3um@10Hz --duration 10s --clock virtual --frames off --seed 2 --json";
     let run = succeed(folder.path(), track).json();
     let r = succeed(
         folder.path(),

@@ -121,7 +121,7 @@ fn rows_that_the_run_lost_at_its_end_are_said_to_be_not_replayed() {
 #[test]
 fn another_controller_is_named_by_its_first_difference_and_another_law_is_refused() {
     let folder = tempfile::tempdir().unwrap();
-    let run = held(folder.path(), "");
+    let run = held(folder.path(), "--controller pi");
     let meta = std::fs::read_to_string(run.join("run.toml")).unwrap();
     edit(&run, |text| {
         let at = text.find("\nkp_um_per_um = ").unwrap() + "\nkp_um_per_um = ".len();

@@ -180,7 +180,7 @@ fn the_objects_of_quick_commands_fit_their_schemas() {
     let folder = folder();
     let at = folder.path();
     for line in [
-        "track --target 0um --duration 4s --clock virtual --frames off --name hold",
+        "track --target 0um --controller pi --duration 4s --clock virtual --frames off --name hold",
         "track --target 0um --sine 2um@20Hz --learn --controller mpc --duration 3s --clock virtual --frames off --name sine",
         "run wave.toml --clock virtual --frames off --name wave",
         "run wave.toml --cells 2 --clock virtual --frames off",

@@ -27,7 +27,6 @@ pub struct Row {
     pub flow_um_per_s: f64,
     pub events: Vec<(FaultKind, f64)>,
     pub clip_um: f64,
-    pub drift_um_per_s: f64,
     pub seconds: f64,
 }
 
@@ -41,7 +40,6 @@ impl Row {
             flow_um_per_s: 0.0,
             events: Vec::new(),
             clip_um: 40.0,
-            drift_um_per_s: 1e-3,
             seconds: 4.0,
         }
     }
@@ -74,13 +72,16 @@ impl Row {
         }
     }
 
-    /// The zero flow runs away faster than the law's integral follows.
-    pub fn drifting(law: &'static str, drift_um_per_s: f64) -> Self {
-        Self {
-            drift_um_per_s,
-            seconds: 3.0,
-            ..Self::quiet(law)
-        }
+    /// Whether the bead is not seen for a time.
+    pub fn is_blind(&self) -> bool {
+        let blind = [
+            FaultKind::StallCamera,
+            FaultKind::FrozenPicture,
+            FaultKind::DropFrames,
+            FaultKind::StaleFrames,
+            FaultKind::LoseBead,
+        ];
+        self.events.iter().any(|(kind, _)| blind.contains(kind))
     }
 
     pub fn flow_step_um(&self) -> f64 {
@@ -101,7 +102,7 @@ impl Row {
         world.exposure_ms = world.exposure_ms.min(0.5e3 / self.rate_hz);
         world.pixel_um = self.pixel_um;
         world.zero_flow_wander_um = Some(6e-3);
-        world.zero_flow_drift_um_per_s = Some(self.drift_um_per_s);
+        world.zero_flow_drift_um_per_s = Some(1e-3);
         world.faults.flow_step_um = self.flow_step_um();
         world.faults.clip_um = self.clip_um;
         let mut events = self.events.clone();
