@@ -101,6 +101,8 @@ impl Row {
         world.rate_hz = self.rate_hz;
         world.exposure_ms = world.exposure_ms.min(0.5e3 / self.rate_hz);
         world.pixel_um = self.pixel_um;
+        // The limits are those of a clean rig whose zero flow wanders.
+        world.ideal = true;
         world.zero_flow_wander_um = Some(6e-3);
         world.zero_flow_drift_um_per_s = Some(1e-3);
         world.faults.flow_step_um = self.flow_step_um();
