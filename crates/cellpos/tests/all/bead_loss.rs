@@ -70,7 +70,14 @@ fn event_ms(run: &Run, name: &str) -> f64 {
 fn a_lost_bead_is_followed_again_within_50_ms_of_its_return_and_the_record_says_how() {
     let folder = tempfile::tempdir().unwrap();
     let mut longest_ms = 0.0_f64;
-    for (seed, gone_ms) in [(1, 30_i32), (2, 100), (3, 150), (4, 250), (5, 400), (6, 600)] {
+    for (seed, gone_ms) in [
+        (1, 30_i32),
+        (2, 100),
+        (3, 150),
+        (4, 250),
+        (5, 400),
+        (6, 600),
+    ] {
         let faults = format!(
             "event = [{{ kind = \"lose-bead\", at_s = 1.5, for_s = {} }}]",
             f64::from(gone_ms) * 1e-3
