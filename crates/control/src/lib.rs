@@ -1,7 +1,7 @@
 //! Controllers, estimators, references, output limits and loop design.
 //!
-//! Everything here is a pure step function: configuration is immutable and kept apart from the state, no device
-//! and no clock is known, and a step neither allocates nor can panic. The same [`ControlLoop`] runs on the real clock,
+//! Everything here is a pure step function. Configuration is immutable and separate from the state. A step knows neither
+//! device nor clock, allocates nothing and cannot panic. The same [`ControlLoop`] runs on the real clock,
 //! on the virtual one, in a replay and in [`design`]'s simulations.
 //!
 //! Units: micrometres, seconds and 1/s throughout. A displacement is of the PZT unless the name says `bead`.

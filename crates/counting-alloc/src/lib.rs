@@ -1,6 +1,6 @@
 //! For tests only: an allocator that counts, to show that a step of the loop allocates nothing.
 //!
-//! A test installs it for its own program and counts what a piece of work takes from the heap on the calling thread:
+//! A test installs it for its own program and counts the heap allocations of a piece of work on the calling thread:
 //! ```
 //! use cellpos_counting_alloc::{CountingAllocator, allocations_of};
 //!

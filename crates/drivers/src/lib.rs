@@ -1,11 +1,11 @@
-//! Drivers: what implements the traits of `cellpos-rig` for real devices.
+//! Drivers: the traits of `cellpos-rig` for real devices.
 //!
-//! Behind [`Camera`](cellpos_rig::Camera) stand a camera server's socket ([`socket`]), GigE and USB3 Vision cameras
-//! (`sources::industrial`, feature `aravis`) and recordings on disk ([`sources`]); [`VisionSource`] joins any of them, or
-//! a camera of your own, with a tracker and a calibration to a stream of positions. Behind
-//! [`Actuator`](cellpos_rig::Actuator) stands the PZT board at the end of any byte [`Port`].
+//! Three kinds of [`Camera`](cellpos_rig::Camera) are here: a camera server's socket ([`socket`]), GigE and USB3 Vision
+//! cameras (`sources::industrial`, feature `aravis`), and recordings on disk ([`sources`]). [`VisionSource`] joins a camera
+//! with a tracker and a calibration to a stream of positions. The [`Actuator`](cellpos_rig::Actuator) is the PZT board at
+//! the end of any byte [`Port`].
 //!
-//! Drivers know no simulator. They may block, allocate and take locks: they run on the I/O threads, never in a tick.
+//! Drivers know no simulator. They may block, allocate and take locks: they run on I/O threads, never in a tick.
 //!
 //! ```
 //! use cellpos_drivers::Calibration;

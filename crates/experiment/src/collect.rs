@@ -14,7 +14,7 @@ use std::path::{Path, PathBuf};
 pub fn refused(error: ReconcileError) -> Failure {
     Failure::bad_input(
         error,
-        "no verdict: see docs/reconcile.md for what records are needed",
+        "no verdict: see docs/find-missing.md for what records are needed",
     )
 }
 

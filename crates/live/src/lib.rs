@@ -1,7 +1,7 @@
 //! The live page of a run: picture, traces, events and the stop key in a browser.
 //!
-//! A [`Feed`] takes what happens - rows, pictures, events, the state - from the threads of a run; none of its calls waits, and what
-//! finds its ring full is counted and lost. [`Server::start`] serves one page, baked into the program, on threads of its own:
+//! A [`Feed`] takes rows, pictures, events and the state from the threads of a run. None of its calls waits. If a ring is full,
+//! the item is dropped and counted. [`Server::start`] serves one page, which is part of the program, on its own threads:
 //!
 //! | thread | does | waits for |
 //! |---|---|---|
@@ -9,11 +9,11 @@
 //! | live-accept | new connections, at most [`MOST_CLIENTS`] | a connection |
 //! | live-client | one client: its queue out, its requests in | 10 ms |
 //!
-//! A client's queue holds two seconds; when the client does not take it, the oldest message goes and is counted, and after
-//! five seconds without progress the connection is closed. A client can only slow itself down.
+//! A client's queue holds two seconds. If the client does not read it, the oldest message is dropped and counted. After five
+//! seconds without progress the connection is closed. So a client can only slow itself down.
 //!
-//! There are two links: the operator's may freeze, park and move, the viewer's may look. Both carry a random word; the
-//! host and origin of each request are checked, so that a page from elsewhere cannot reach the server through the browser.
+//! There are two links: the operator's may freeze, park and move, the viewer's may look. Both carry a random word. The server
+//! checks host and origin of each request, so a page from elsewhere cannot reach it through the browser.
 //!
 //! The crate knows no camera, board or loop: whoever runs them fills a [`Feed`] and acts on [`OperatorRequest`]s.
 //!

@@ -3,7 +3,7 @@
 //!
 //! - [`TransferFunction`] with Eq. (6) built in, [`PhysicalParameters`] for Eq. (1)-(4), [`StateSpace`] for analysis.
 //! - [`DiscretePlant`]: exact zero-order hold with any delay, for controllers and estimators.
-//! - [`Model`]: plant, [`Effect`]s and [`Noise`], the one artifact that all commands share; `model.toml` on disk.
+//! - [`Model`]: plant, [`Effect`]s and [`Noise`]; all commands share it. On disk it is `model.toml`.
 //! - [`Chain`]: a model as a time-stepping machine from the command to the true bead position; [`Simulator`] adds the
 //!   camera at a fixed sample time; [`simulate`] and [`simulate_at`] answer whole records.
 //!

@@ -1,10 +1,9 @@
-//! Finds where simulation and measurement disagree, names what is missing, adds it to the model and shows the gap shrink.
+//! Finds where simulation and measurement disagree, names the missing effect, adds it to the model and measures the gap again.
 //!
-//! [`reconcile`] takes a model and records and answers with one of five verdicts: effects are *named*, alone or with a
-//! *remainder* beside them, the records leave it *ambiguous* between several, it is *unknown* to the catalogue, or *nothing is
-//! missing*. All scores are sums of
-//! squared innovations of the model's own Kalman filter ([`NoiseModel`]), because the free-run residual of a perfect model of
-//! this rig is a random walk.
+//! [`reconcile`] takes a model and records and returns one of five verdicts: *named*, *named with a remainder*, *ambiguous*
+//! (the records cannot separate several effects), *unknown* (no effect of the catalogue explains enough), or *nothing
+//! missing*. All scores are sums of squared innovations of the model's own Kalman filter ([`NoiseModel`]). The free-run
+//! residual would not do: for a perfect model of this rig it is a random walk.
 //!
 //! Not for identifying a plant from nothing (that is `cellpos-ident`), and not for files: records come as columns.
 //!

@@ -13,12 +13,12 @@
 //! | `learned.toml` | of a script: the feed-forward learned over its cycles | replaced in one step each second |
 //! | `sessions/` | of a run that was resumed: a run folder for each further session | |
 //!
-//! **While running** a [`RunWriter`] belongs to the recorder thread. It may allocate and block on the disk, so nothing
-//! of it is ever called in a tick. What a full disk or a failing one refuses waits in memory and is tried again; what never
-//! got there is counted ([`Faults`]), and the run ends readable, because a batch that was cut is taken back.
+//! **While running** a [`RunWriter`] belongs to the recorder thread. It may allocate and block on the disk, so a tick
+//! never calls it. Rows that the disk refuses wait in memory and are tried again. Rows that never reached the disk are counted
+//! ([`Faults`]). The run ends readable, because a truncated batch is removed.
 //!
-//! **Afterwards** a [`RunReader`] reads what is there: a run cut off anywhere up to its last complete batch, a damaged
-//! one around the damage. It never panics on a damaged file, and says what is missing ([`Lost`]).
+//! **Afterwards** a [`RunReader`] reads a truncated run up to its last complete batch, and a damaged one around the damage. It
+//! never panics on a damaged file, and it reports the missing rows ([`Lost`]).
 //!
 //! Plain CSV records (`time_s,pzt_um,bead_um`) are read and written by `cellpos-table`, which needs neither Arrow nor
 //! Parquet; [`RunReader::to_record`] makes one from a run.

@@ -1,14 +1,13 @@
 //! Self-contained HTML reports with inline SVG plots.
 //!
-//! A [`Report`] is a title and a sequence of sections, paragraphs, notes, tables and [`Figure`]s. It is written as one
-//! HTML file without scripts, fonts or anything else from the network, readable on light and dark screens, and, if
-//! wanted, every figure beside it as SVG and as CSV. The same calls always give the same bytes: nothing here reads a
-//! clock, a locale or a random number.
+//! A [`Report`] is a title and a sequence of sections, paragraphs, notes, tables and [`Figure`]s. It becomes one
+//! HTML file that loads nothing from the network and suits light and dark screens. Every figure can also be written as SVG
+//! and CSV. The same calls always give the same bytes: nothing here reads a clock, a locale or a random number.
 //!
-//! Long traces are thinned to what a screen can show (minimum and maximum per pixel column), so that an hour at 1 kHz
-//! stays a small picture with every spike in it; [`Figure::to_csv`] writes the data as given. Axes carry their unit.
+//! Long traces are thinned to the minimum and maximum of each pixel column, so an hour at 1 kHz stays a small picture with
+//! every spike in it. [`Figure::to_csv`] writes the data as given. Axes carry their unit.
 //!
-//! Not for interactive plots, and not for numbers that a program should read: write JSON beside the report for that.
+//! Not for interactive plots, and not for numbers that a program should read: write JSON for that.
 //!
 //! ```
 //! use cellpos_report::{Axis, Figure, Panel, Report, Series};

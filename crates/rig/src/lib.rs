@@ -1,9 +1,9 @@
-//! What the loop asks of a rig: where positions come from, and where PZT commands go.
+//! The interface between loop and rig: the source of positions, and the receiver of PZT commands.
 //!
-//! Traits and plain types, no device: [`PositionSource`] yields positions, [`Camera`] the frames that a tracker makes
-//! positions of, [`Actuator`] takes displacements and reports in its own words what it does with them. Drivers of real
-//! devices are in `cellpos-drivers`, the emulated rig in `cellpos-emulator`. What implements the traits may block,
-//! allocate and take locks: it runs on I/O threads, never in a tick.
+//! Traits and plain types, no device. A [`PositionSource`] yields positions. A [`Camera`] yields frames, from which a tracker
+//! makes positions. An [`Actuator`] takes displacements and reports its state. Drivers of real devices are in
+//! `cellpos-drivers`, the emulated rig is in `cellpos-emulator`. Implementations may block, allocate and take locks: they
+//! run on I/O threads, never in a tick.
 #![forbid(unsafe_code)]
 
 pub mod actuator;

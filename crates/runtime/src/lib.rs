@@ -1,4 +1,18 @@
 //! The 1 kHz loop: threads, rings, pacing, deadline account, safe states.
+//!
+//! [`Core`] is one tick as a pure function: it knows neither clock nor device. [`live`] runs it on threads, [`virtual_run`] on
+//! a simulated clock, [`replay`] on a record; all three give the same bits for the same inputs. A tick never waits,
+//! allocates, locks, formats or logs. A full ring refuses, and the refusal is counted.
+//!
+//! Ticks follow the clock's grid, whatever the frames do:
+//!
+//! ```
+//! use cellpos_runtime::Grid;
+//! let grid = Grid::new(0, 1_000_000);
+//! assert_eq!(grid.index(4_200_000), 4, "4.2 ms after the first tick at 1 kHz");
+//! ```
+//!
+//! Not here: devices (`cellpos-rig` has their traits), files of a run (`cellpos-record`), set-up (`cellpos-session`).
 #![forbid(unsafe_code)]
 
 pub mod arming;

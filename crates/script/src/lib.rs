@@ -1,8 +1,8 @@
-//! Setpoint scripts: what the bead or cell shall do, as a TOML file with units.
+//! Setpoint scripts: the motion of the bead or cell, as a TOML file with units.
 //!
-//! [`Script`] is the file, read with errors that name line and column. [`Plan`] is the script laid out in time: the
-//! reference at any instant without allocation (a [`Plan`] is a [`cellpos_control::Reference`]), the cycles, and a [`Cursor`] that walks through it,
-//! waits for conditions and ends on stop conditions. [`check()`] compares a plan with a model and limits before
+//! [`Script`] is the file, read with errors that name line and column. [`Plan`] is the script laid out in time: it
+//! gives the reference at any instant without allocation (it is a [`cellpos_control::Reference`]), and the cycles. A
+//! [`Cursor`] walks through it, waits for conditions and ends on stop conditions. [`check()`] compares a plan with a model and limits before
 //! anything moves: peak position, speed and PZT demand, and the largest amplitude that the rig could do.
 //!
 //! The format is described in `docs/scripts.md`. [`Follower`] makes it the reference generator of a loop, [`CycleTable`]

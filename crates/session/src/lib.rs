@@ -1,9 +1,15 @@
 //! A rig in hand, from its file to the end of a run.
 //!
-//! [`Rig`] (connected, nothing moves) -> [`Armed`] (the board waits for its first command) -> [`Running`] (the loop runs on
-//! threads of its own) -> [`Finished`] (parked; how it ended, in sentences). The board is armed last, when everything else is
-//! ready, and whatever holds it parks it when it is dropped: on an error, on a panic, at the end. Real-time rights and locked
-//! memory end with the run. A program calls [`signals::listen`] first thing, and Ctrl-C freezes and parks.
+//! A run goes through four types:
+//!
+//! 1. [`Rig`]: connected, nothing moves.
+//! 2. [`Armed`]: the board waits for its first command.
+//! 3. [`Running`]: the loop runs on its own threads.
+//! 4. [`Finished`]: parked; it says how the run ended.
+//!
+//! The board is armed last, when everything else is ready. The value that holds it parks it on drop: on an error, on a panic,
+//! at the end. Real-time rights and locked memory end with the run. A program calls [`signals::listen`] first; then Ctrl-C
+//! freezes and parks.
 //!
 //! ```
 //! use cellpos_runtime::{EndRule, NoSink};
@@ -61,7 +67,8 @@ pub use frames_seen::FramesSeen;
 pub use rig::{Armed, Finished, NotArmed, Rig, Running};
 pub use rig_file::RigFile;
 
-/// The README's Rust is compiled and run.
+/// The Rust of the book is compiled and run.
 #[cfg(doctest)]
-#[doc = include_str!("../../../README.md")]
-struct Readme;
+#[doc = include_str!("../../../docs/embed.md")]
+#[doc = include_str!("../../../docs/extend.md")]
+struct Book;

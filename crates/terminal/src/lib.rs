@@ -1,15 +1,14 @@
 //! Messages and the live line on a terminal that nobody waits for.
 //!
-//! A terminal can stop taking output for as long as it likes: Ctrl-S, a stalled ssh connection, a pager. A [`Terminal`] has
-//! a thread of its own that alone writes to it, fed by a ring of [`RING`] messages. A full ring drops the message and counts
-//! it; the number is told once the terminal takes output again. So nothing that holds a rig, records or reacts to a signal
-//! ever waits for a screen.
+//! A terminal can stop taking output for as long as it likes: Ctrl-S, a stalled ssh connection, a pager. Only one
+//! thread writes to a [`Terminal`], fed by a ring of [`RING`] messages. A full ring drops the message and counts it; the
+//! terminal shows the number when it takes output again. So a thread that holds a rig, records or reacts to a signal never
+//! waits for a screen.
 //!
-//! The whole terminal can be taken for a while ([`Terminal::open_screen`]): what is said meanwhile is kept and told when the
-//! terminal is given back, on whatever way the program ends ([`give_back`]).
+//! A view can take the whole terminal ([`Terminal::open_screen`]). Messages that arrive meanwhile are kept and shown when the
+//! view ends, however the program ends ([`give_back`]).
 //!
-//! What is shown is cleaned ([`clean`]): text that came from a file cannot move the cursor, rename the window or hide what
-//! follows. Not for the result of a command, which goes to standard output when nothing waits any more.
+//! All text is cleaned ([`clean`]): text from a file cannot move the cursor, rename the window or hide other text. Not for the result of a command, which goes to standard output when nothing waits any more.
 //!
 //! ```
 //! use cellpos_terminal::{Colours, clean};

@@ -1,8 +1,8 @@
-//! Work at the bench, before the loop is closed: what a rig file says and what is there, the board's line, moves by hand,
-//! pictures, recordings, settings of vision, calibration.
+//! Work at the bench, before the loop is closed: check a rig file against its devices, test the board's line, move the PZT by
+//! hand, take pictures and recordings, find the settings of vision, calibrate.
 //!
-//! All of it opens the devices of a rig file without a tracker ([`Bench`]) and leaves the board parked. Not for closed loops:
-//! those are `cellpos-session`'s.
+//! Each task opens the devices of a rig file without a tracker ([`Bench`]) and leaves the board parked. Closed loops are in
+//! `cellpos-session`.
 #![forbid(unsafe_code)]
 
 pub mod beads;

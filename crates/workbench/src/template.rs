@@ -136,7 +136,7 @@ profile = {{ kind = \"ring\", edge_px = 5.0 }}
         list("Cameras", &found.cameras),
     );
     format!(
-        "# A rig for cellpos: see docs/rig.md for every key. Read it with: cellpos rig check FILE [--connect]
+        "# A rig for cellpos: see docs/rig-toml.md for every key. Read it with: cellpos rig check FILE [--connect]
 # Quantities are written with a unit (park = \"20um\"), or bare with the unit in the key (park_um = 20.0).
 {ports}{cameras}
 first_neutral = \"20um\"   # first belief of the displacement at which the bead is at rest; the loop finds the rest

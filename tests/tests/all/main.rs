@@ -2,10 +2,10 @@
 
 mod architecture;
 mod attacks;
+mod book;
 mod cell_rig;
 mod firmware_qemu;
 mod live_page;
-mod readme;
 mod reconcile;
 mod rig_in_a_box;
 mod rig_page;

@@ -73,7 +73,7 @@ pub struct Args {
     /// Do not ask the operating system for real time.
     #[arg(long, requires = "collect", help_heading = ON_A_RIG)]
     best_effort: bool,
-    /// Effects of your own, searched like those of the catalogue (TOML, see docs/reconcile.md).
+    /// Effects of your own, searched like those of the catalogue (TOML, see docs/find-missing.md).
     #[arg(long, value_name = "FILE")]
     effects: Vec<PathBuf>,
     /// Write the augmented model here (TOML); where the verdict is unknown, its hypothesis goes beside it as NAME.effects.toml.

@@ -12,7 +12,6 @@ mod identify;
 mod identify_rig;
 mod keeping;
 mod kinds_of_runs;
-mod newcomer;
 mod other_plants;
 mod own_camera;
 mod queue;

@@ -3,6 +3,7 @@
 mod allocation;
 mod discretisation;
 mod effects;
+mod effects_page;
 mod hidden_effects;
 mod noise;
 mod paper;

@@ -241,7 +241,7 @@ impl RigFile {
                 .map_or_else(String::new, |line| format!(":{line}"));
             Failure::bad_input(
                 format!("{}{line}: {message}", path.display()),
-                "docs/rig.md has every key; see the commented files under examples/, too",
+                "docs/rig-toml.md has every key; see the commented files under examples/, too",
             )
         };
         self.limits

@@ -1,4 +1,4 @@
-//! Every key that the types of rig.toml take is in docs/rig.md, and the page names none that they do not take.
+//! Every key that the types of rig.toml take is in docs/rig-toml.md, and the page names none that they do not take.
 //!
 //! What the types take they say themselves: an unknown key is refused with the list of the known ones, for each table and each
 //! `kind` of one.
@@ -10,8 +10,8 @@ use std::collections::BTreeSet;
 use std::path::Path;
 
 pub fn page() -> String {
-    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../docs/rig.md");
-    std::fs::read_to_string(path).expect("docs/rig.md")
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../docs/rig-toml.md");
+    std::fs::read_to_string(path).expect("docs/rig-toml.md")
 }
 
 /// The keys of the page's tables, from their first column, and the forms with a unit from the second.

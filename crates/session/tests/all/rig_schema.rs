@@ -1,4 +1,4 @@
-//! docs/schemas/rig.json is what the types of rig.toml take, with the words of docs/rig.md: editors complete and check from it.
+//! docs/schemas/rig.json is what the types of rig.toml take, with the words of docs/rig-toml.md: editors complete and check from it.
 
 use crate::rig_keys::page;
 use crate::rig_walk::{UNKNOWN, all_below, expected, keys_of, kinds_of, needs, refusal};
