@@ -127,15 +127,7 @@ pub fn section(page: &mut Report, read: &ReadCycles) -> serde_json::Value {
         ));
     }
     let rest = AtRest::of(rows);
-    if let (true, true) = (rest.length_um.is_finite(), rest.length_sd_um.is_finite()) {
-        page.paragraph(&format!(
-            "Length at rest before the first cycle: {:.3} um, known to {:.3} um (standard deviation of the mean): every stretch is \
-             uncertain by {:.2} % more (95 %) than its cycles scatter, all of them alike.",
-            rest.length_um,
-            rest.length_sd_um,
-            100.0 * rest.stretch_ci95()
-        ));
-    }
+    at_rest(page, &rest);
     let groups = groups(rows);
     let mut table = Table::new([
         Column::left("of"),
@@ -191,6 +183,19 @@ pub fn section(page: &mut Report, read: &ReadCycles) -> serde_json::Value {
     page.figure(figure.share_x());
     flags(page, rows);
     serde_json::Value::Array(json)
+}
+
+/// Says what the cell's length at rest adds to the uncertainty of every stretch.
+fn at_rest(page: &mut Report, rest: &AtRest) {
+    if let (true, true) = (rest.length_um.is_finite(), rest.length_sd_um.is_finite()) {
+        page.paragraph(&format!(
+            "Length at rest before the first cycle: {:.3} um, known to {:.3} um (standard deviation of the mean): every stretch is \
+             uncertain by {:.2} % more (95 %) than its cycles scatter, all of them alike.",
+            rest.length_um,
+            rest.length_sd_um,
+            100.0 * rest.stretch_ci95()
+        ));
+    }
 }
 
 /// Says how many cycles were not where the script had them.
