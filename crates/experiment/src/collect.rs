@@ -196,10 +196,11 @@ pub fn look(
     collecting: &Collecting<'_>,
     progress: &mut (dyn FnMut(&str) + Send),
 ) -> Result<(Reconciliation, Vec<Collected>), Failure> {
+    let mut options = options.clone();
     let mut collected: Vec<Collected> = Vec::new();
     let mut done: Vec<Experiment> = Vec::new();
     loop {
-        let result = reconcile(model, records, options, &mut |text| progress(text));
+        let result = reconcile(model, records, &options, &mut |text| progress(text));
         if let Some(last) = collected.last_mut() {
             last.verdict = match &result {
                 Ok(r) => r.verdict.word().to_owned(),
@@ -234,7 +235,7 @@ pub fn look(
             &file,
             progress,
         )?;
-        at_rest(model, &record, neutral_um);
+        options.free_working_point |= at_rest(model, &record, neutral_um);
         collected.push(Collected {
             experiment: experiment.name(),
             what: experiment.what(),
@@ -248,12 +249,15 @@ pub fn look(
     }
 }
 
-/// The bead rests where the loop found it to rest, if the model was made at another place.
-pub fn at_rest(model: &mut Model, record: &Record, neutral_um: f64) {
+/// The bead rests where the loop found it to rest, if the model was made at another place. Whether it was: the place is then no better
+/// known than the loop found it.
+pub fn at_rest(model: &mut Model, record: &Record, neutral_um: f64) -> bool {
     let (low, high) = record.pzt_range_um();
-    if !(low..=high).contains(&model.working_point_um) {
+    let elsewhere = !(low..=high).contains(&model.working_point_um);
+    if elsewhere {
         model.working_point_um = neutral_um;
     }
+    elsewhere
 }
 
 /// A file that is not there yet: nothing is overwritten.

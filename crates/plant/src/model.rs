@@ -63,7 +63,25 @@ pub struct Model {
     pub provenance: BTreeMap<String, String>,
 }
 
+/// Keys of the provenance of a model whose lengths are in the units of its records: how their input was sampled, and what reconcile
+/// writes beside a base that was fitted to them.
+const UNITS_OF_RECORDS: [&str; 2] = ["hold", Model::UNITS];
+
+/// [`Model::is_in_any_unit`] of a provenance.
+pub(crate) fn is_in_any_unit(provenance: &BTreeMap<String, String>) -> bool {
+    let has = |key: &&str| provenance.contains_key(*key);
+    UNITS_OF_RECORDS.iter().any(has)
+}
+
 impl Model {
+    /// Key of the provenance that tells the units of the records that a model is of, where they are not micrometres.
+    pub const UNITS: &str = "units";
+
+    /// Whether lengths are in the units of the records that the model is of: bounds in micrometres do not hold for them.
+    pub fn is_in_any_unit(&self) -> bool {
+        is_in_any_unit(&self.provenance)
+    }
+
     /// Eq. (6) about a working point of 4 um, without effects, with the Brownian motion of a 1 um bead in mid-slit
     /// (D = 0.33 um^2/s) and 30 nm of localisation noise.
     pub fn eq6() -> Self {

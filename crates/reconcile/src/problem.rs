@@ -18,11 +18,19 @@ pub(crate) type Mask = Vec<Vec<Range<usize>>>;
 
 /// The first 60 % of every record, to fit on, and the rest, to judge by.
 pub(crate) fn split_in_time(records: &[Prepared]) -> (Mask, Mask) {
-    let part = |range: fn(usize) -> Range<usize>| -> Mask {
-        let of = |r: &Prepared| vec![range(r.u.len())];
-        records.iter().map(of).collect()
-    };
+    let part = |range| part_of(records, range);
     (part(|n| 0..n * 6 / 10), part(|n| n * 6 / 10..n))
+}
+
+/// The last 60 % of every record, to fit on, and the rest, to judge by.
+pub(crate) fn split_from_the_end(records: &[Prepared]) -> (Mask, Mask) {
+    let part = |range| part_of(records, range);
+    (part(|n| n * 4 / 10..n), part(|n| 0..n * 4 / 10))
+}
+
+fn part_of(records: &[Prepared], range: fn(usize) -> Range<usize>) -> Mask {
+    let of = |r: &Prepared| vec![range(r.u.len())];
+    records.iter().map(of).collect()
 }
 
 /// One record, ready.
@@ -125,13 +133,18 @@ impl Prepared {
     }
 }
 
-/// Decays of the poles of a plant that did not rest before the record, from its first row.
+/// Decays of the poles of a plant that did not rest before the record, from its first row, and the ramp of a working point that is not
+/// known.
 fn transients(base: &Base, rows: usize) -> Vec<Vec<f64>> {
+    let mut all = Vec::new();
+    if base.free_working_point {
+        // What a plant that integrates makes of a command that is off its rest, whatever else it does to it.
+        all.push((0..rows).map(|k| k as f64).collect());
+    }
     if !base.free_start {
-        return Vec::new();
+        return all;
     }
     let (dt, length_s) = (base.sample_s, rows as f64 * base.sample_s);
-    let mut all = Vec::new();
     for p in &base.zpk.poles {
         // Slower is a level, faster is over at once.
         if p.im < 0.0 || p.norm() * length_s < 0.05 || -p.re * dt > 5.0 {

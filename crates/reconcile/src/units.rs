@@ -164,6 +164,16 @@ impl Scales {
         [self.input, self.output]
     }
 
+    /// Whether the records are in units of their own.
+    pub fn is_of_records(&self) -> bool {
+        self.per_unit() != [1.0, 1.0]
+    }
+
+    /// Those units in words.
+    pub fn words(&self) -> String {
+        format!("{} -> {}", self.names.input, self.names.output)
+    }
+
     fn side(&self, side: Side) -> (f64, &str) {
         match side {
             Side::Input => (self.input, &self.names.input),
@@ -243,6 +253,7 @@ impl Scales {
         let same = Effect::new(kind, effect.form_index(), &scalars, &lists);
         match inwards {
             true => same.counted_in(self.per_unit()),
+            false if self.is_of_records() => same.in_any_unit(),
             false => same,
         }
     }
@@ -257,7 +268,7 @@ impl Scales {
     /// # Errors
     /// A plant whose gain has no number then.
     pub fn model(&self, model: &Model) -> Result<Model, ReconcileError> {
-        if self.per_unit() == [1.0, 1.0] {
+        if !self.is_of_records() {
             return Ok(model.clone());
         }
         let plant = (model.plant.scaled(self.output / self.input))
@@ -279,7 +290,7 @@ impl Scales {
     /// Records as the search has them.
     pub fn records(&self, records: &[Record]) -> Vec<Record> {
         let mut records = records.to_vec();
-        if self.per_unit() != [1.0, 1.0] {
+        if self.is_of_records() {
             for r in &mut records {
                 r.pzt_um.iter_mut().for_each(|v| *v *= self.input);
                 r.bead_um.iter_mut().for_each(|v| *v *= self.output);

@@ -109,14 +109,13 @@ impl Chain {
         for effect in &model.effects {
             effect.validate()?;
         }
-        in_range("working_point_um", model.working_point_um, "um", -1e4, 1e4)?;
-        in_range(
-            "diffusion_um2_per_s",
-            model.noise.diffusion_um2_per_s,
-            "um^2/s",
-            0.0,
-            1e4,
-        )?;
+        let most = match model.is_in_any_unit() {
+            true => f64::MAX,
+            false => 1e4,
+        };
+        let (point, diffusion) = (model.working_point_um, model.noise.diffusion_um2_per_s);
+        in_range("working_point_um", point, "um", -most, most)?;
+        in_range("diffusion_um2_per_s", diffusion, "um^2/s", 0.0, most)?;
         let mut chain = Self {
             compiled: compile::compile(model),
             working_point_um: model.working_point_um,

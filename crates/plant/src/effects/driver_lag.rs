@@ -50,6 +50,10 @@ impl EffectKind for DriverLag {
         Action::Linear(Zpk::low_pass(TAU * effect.scalar(0)))
     }
 
+    fn memory_s(&self, effect: &Effect) -> f64 {
+        (std::f64::consts::TAU * effect.scalar(0)).recip()
+    }
+
     fn candidates(&self) -> &'static [Candidate] {
         const ALL: &[Candidate] =
             &[Candidate::chain(&[log("bandwidth_hz", 0.5, 2e4)]).typical(50.0, 5000.0)];

@@ -43,6 +43,10 @@ impl EffectKind for ExposureAveraging {
         Action::Exposure(effect.scalar(0))
     }
 
+    fn memory_s(&self, effect: &Effect) -> f64 {
+        effect.scalar(0)
+    }
+
     fn candidates(&self) -> &'static [Candidate] {
         const ALL: &[Candidate] =
             &[Candidate::chain(&[lin("exposure_s", 1e-6, 0.02, 1e-5)]).typical(0.0, 0.0011)];

@@ -55,6 +55,10 @@ impl EffectKind for GainError {
         true
     }
 
+    fn memory_s(&self, _: &Effect) -> f64 {
+        0.0
+    }
+
     fn candidates(&self) -> &'static [Candidate] {
         const ALL: &[Candidate] = &[Candidate::chain(&[lin("factor", 0.05, 20.0, 1e-3)])
             .typical(0.4, 2.5)

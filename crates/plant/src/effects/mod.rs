@@ -74,7 +74,7 @@ pub use parameter::{EffectError, Form, Parameter, ParameterSpec, Spec};
 pub use pdms_relaxation::{pdms_relaxation, pdms_relaxation_of_fast_gain};
 pub use pixel_locking::pixel_locking;
 pub use pump_pulsation::pump_pulsation;
-pub use pzt_creep::{pzt_creep, pzt_creep_of_fast_gain};
+pub use pzt_creep::{pzt_creep, pzt_creep_from, pzt_creep_of_fast_gain};
 pub use pzt_hysteresis::{Curve, bouc_wen, bouc_wen_explicit, curved_play, exponential_play, play};
 pub use pzt_resonance::pzt_resonance;
 pub use saturation::saturation;
@@ -177,6 +177,13 @@ pub trait EffectKind: fmt::Debug + Send + Sync {
         false
     }
 
+    /// For how long it remembers what went into it \[s\]: another equation of it is slower than that by a decade at most. Without end
+    /// where nothing is said.
+    fn memory_s(&self, effect: &Effect) -> f64 {
+        let _ = effect;
+        f64::INFINITY
+    }
+
     /// The forms that a search may try; none for an effect that is not looked for by fitting.
     fn candidates(&self) -> &'static [Candidate] {
         &[]
@@ -218,6 +225,7 @@ pub struct Effect {
     scalars: Vec<f64>,
     lists: Vec<Vec<f64>>,
     per_unit: [f64; 2],
+    any_unit: bool,
 }
 
 impl fmt::Debug for Effect {
@@ -259,6 +267,15 @@ impl Effect {
             scalars,
             lists,
             per_unit: [1.0, 1.0],
+            any_unit: false,
+        }
+    }
+
+    /// The same effect of a plant whose lengths are in a unit of its own: bounds in micrometres do not hold for them.
+    pub fn in_any_unit(self) -> Self {
+        Self {
+            any_unit: true,
+            ..self
         }
     }
 

@@ -168,6 +168,19 @@ impl ParameterSpec {
         }
     }
 
+    /// The same of a plant whose lengths are in a unit of its own: what is a length, or made of one, keeps its sign alone.
+    #[must_use]
+    pub fn in_any_unit(self) -> Self {
+        if !self.unit.contains("um") {
+            return self;
+        }
+        Self {
+            lower: if self.lower < 0.0 { -f64::MAX } else { 0.0 },
+            upper: if self.upper > 0.0 { f64::MAX } else { 0.0 },
+            ..self
+        }
+    }
+
     /// The same with a value when the key is left out.
     pub const fn or(self, default: f64) -> Self {
         Self {
@@ -239,12 +252,18 @@ impl Effect {
     /// Names, units, values and physical bounds of all parameters.
     pub fn parameters(&self) -> Vec<Parameter> {
         let form = self.spec_of_form();
-        let of = |spec: &ParameterSpec, name: String, value: f64| Parameter {
-            name,
-            value,
-            unit: spec.unit,
-            lower: spec.lower,
-            upper: spec.upper,
+        let of = |spec: &ParameterSpec, name: String, value: f64| {
+            let spec = match self.any_unit {
+                true => spec.in_any_unit(),
+                false => *spec,
+            };
+            Parameter {
+                name,
+                value,
+                unit: spec.unit,
+                lower: spec.lower,
+                upper: spec.upper,
+            }
         };
         let mut all: Vec<Parameter> = form
             .scalars

@@ -1,8 +1,9 @@
 //! `pzt-creep`: the displacement goes on with the logarithm of time.
 
-use super::candidate::one;
+use super::candidate::{grid, one};
 use super::{
-    Action, Candidate, Effect, EffectKind, Experiment, Form, ParameterSpec, Place, Scope, Spec, lin,
+    Action, Candidate, Effect, EffectKind, Experiment, Form, ParameterSpec, Place, Scope, Spec,
+    lin, log,
 };
 use crate::modal::Zpk;
 use nalgebra::Complex;
@@ -20,14 +21,32 @@ pub fn pzt_creep_of_fast_gain(per_decade: f64) -> Effect {
     Effect::new(&KIND, AT_SPEED, &[per_decade], &[])
 }
 
+/// Creep that begins some time after a step: `x = x0 (1 + g log10(1 + t/onset))`, beside a model of the gain before that.
+pub fn pzt_creep_from(per_decade: f64, onset_s: f64) -> Effect {
+    Effect::new(&KIND, WITH_ONSET, &[per_decade, onset_s], &[])
+}
+
 /// The model's gain is that of a step after 0.1 s.
 const AT_REST: usize = 0;
 /// The model's gain is that of a step after 1 ms.
 const AT_SPEED: usize = 1;
+/// Creep begins later than the model's fast motion.
+const WITH_ONSET: usize = 2;
 
-const NUMBERS: &[ParameterSpec] = &[ParameterSpec::new("per_decade", "", -0.2, 0.2)];
+const PER_DECADE: ParameterSpec = ParameterSpec::new("per_decade", "", -0.2, 0.2);
+const ONSET: ParameterSpec = ParameterSpec::new("onset_s", "s", 1e-4, 100.0);
 
-const FREE: Candidate = Candidate::chain(&[lin("per_decade", 1e-5, 0.19, 1e-3)])
+const FORMS: [Form; 3] = {
+    let [slow, fast] = Form::anchored(&[PER_DECADE]);
+    let onset = Form {
+        name: "onset",
+        ..Form::only(&[PER_DECADE, ONSET])
+    };
+    [slow, fast, onset]
+};
+
+const PER_DECADE_FREE: super::FitParameter = lin("per_decade", 1e-5, 0.19, 1e-3);
+const FREE: Candidate = Candidate::chain(&[PER_DECADE_FREE])
     .typical(0.0, 0.06)
     .smallest(0, 0.003);
 
@@ -40,10 +59,10 @@ static SPEC: Spec = Spec {
     id: "pzt-creep",
     place: Place::Pzt,
     shown_at: "",
-    equation: "x = x0 (1 + g log10(t/0.1 s)) after a step; t/1 ms where the model's gain is that of fast motion",
+    equation: "x = x0 (1 + g log10(t/0.1 s)) after a step; t/1 ms where the model's gain is that of fast motion; 1 + t/onset where creep begins later",
     signature: "a tail in the logarithm of time that flips with the sign of the step; a constant phase of about -39 g deg",
     ahead_of_plant: false,
-    forms: &Form::anchored(NUMBERS),
+    forms: &FORMS,
     confused_with: &["pdms-relaxation", "leak", "pzt-hysteresis"],
     inseparable_from: &[],
     experiment: Experiment::Slow,
@@ -56,11 +75,12 @@ impl EffectKind for PztCreep {
     }
 
     fn act(&self, effect: &Effect) -> Action {
-        let reference_s = match effect.form_index() {
-            AT_SPEED => FAST_REFERENCE_S,
-            _ => CREEP_REFERENCE_S,
+        let since = match effect.form_index() {
+            WITH_ONSET => Since::Onset(effect.scalar(1)),
+            AT_SPEED => Since::Always(FAST_REFERENCE_S),
+            _ => Since::Always(CREEP_REFERENCE_S),
         };
-        Action::Linear(creep(effect.scalar(0), reference_s))
+        Action::Linear(creep(effect.scalar(0), since))
     }
 
     fn has_two_gains(&self) -> bool {
@@ -68,12 +88,24 @@ impl EffectKind for PztCreep {
     }
 
     fn candidates(&self) -> &'static [Candidate] {
-        const ALL: &[Candidate] = &FREE.anchored();
-        ALL
+        const ALL: [Candidate; 3] = {
+            let [slow, fast] = FREE.anchored();
+            // An onset below the shortest row is the form before it, one beyond the records no creep.
+            let onset = Candidate {
+                name: "onset",
+                params: &[PER_DECADE_FREE, log("onset_s", 1e-3, 3.0)],
+                ..FREE
+            };
+            [slow, fast, onset]
+        };
+        const { &ALL }
     }
 
-    fn starts(&self, _: usize, _: &Scope) -> Vec<Vec<f64>> {
-        one([0.01, 0.05])
+    fn starts(&self, form: usize, _: &Scope) -> Vec<Vec<f64>> {
+        match form {
+            WITH_ONSET => grid(&[0.03], &[0.01, 0.1]),
+            _ => one([0.01, 0.05]),
+        }
     }
 
     fn build(&'static self, form: usize, values: &[f64], _: &Scope) -> Effect {
@@ -96,20 +128,45 @@ fn creep_times() -> impl Iterator<Item = f64> {
         .map(|i| CREEP_FASTEST_S * 10f64.powf((i as f64 + 0.5) / CREEP_PER_DECADE as f64))
 }
 
-/// `1 + sum (g/n) (1/(1 + tau s) - (1 - exp(-t0/tau)))`: the step response is `1 + g log10(t/t0)`.
-fn creep(per_decade: f64, reference_s: f64) -> Zpk {
+/// What the logarithm counts from.
+#[derive(Debug, Clone, Copy)]
+enum Since {
+    /// The step: the displacement is the nominal one this long after it \[s\].
+    Always(f64),
+    /// A time after the step \[s\].
+    Onset(f64),
+}
+
+/// Share of a lag below which it is left out, in parts of the others': its zero would be its pole.
+const LEAST_SHARE: f64 = 1e-6;
+
+/// `1 + sum (g/n) (1/(1 + tau s) - (1 - exp(-t0/tau)))`: the step response is `1 + g log10(t/t0)`. With an onset the shares are
+/// `(g/n) exp(-onset/tau)`: the integral of `(1 - exp(-t/tau)) exp(-onset/tau)` over `ln tau` is `ln(1 + t/onset)` (Frullani).
+fn creep(per_decade: f64, since: Since) -> Zpk {
     if per_decade == 0.0 {
         return Zpk::one();
     }
     let share = per_decade / CREEP_PER_DECADE as f64;
-    let rates: Vec<f64> = creep_times().map(|tau| 1.0 / tau).collect();
-    let direct = 1.0
-        + share
-            * rates
+    let lags: Vec<(f64, f64)> = creep_times()
+        .map(|tau| match since {
+            Since::Always(_) => (1.0 / tau, share),
+            Since::Onset(onset_s) => (1.0 / tau, share * (-onset_s / tau).exp()),
+        })
+        .filter(|(_, of_lag)| of_lag.abs() >= LEAST_SHARE * share.abs())
+        .collect();
+    let rates: Vec<f64> = lags.iter().map(|(rate, _)| *rate).collect();
+    let before = |(rate, of_lag): &(f64, f64)| match since {
+        Since::Always(reference_s) => of_lag * (-reference_s * rate).exp_m1(),
+        Since::Onset(_) => 0.0,
+    };
+    let direct = 1.0 + lags.iter().map(before).sum::<f64>();
+    let value = |s: f64| {
+        direct
+            + lags
                 .iter()
-                .map(|r| (-reference_s * r).exp_m1())
-                .sum::<f64>();
-    let value = |s: f64| direct + rates.iter().map(|r| share * r / (s + r)).sum::<f64>();
+                .map(|(r, of_lag)| of_lag * r / (s + r))
+                .sum::<f64>()
+    };
     // Poles in falling order -r (r falls). A zero lies between each pair of neighbours; the last one lies beyond the
     // fastest pole for g > 0 and between the slowest pole and the origin for g < 0.
     let mut brackets: Vec<(f64, f64)> = rates.windows(2).map(|w| (-w[0], -w[1])).collect();
@@ -146,4 +203,35 @@ fn creep(per_decade: f64, reference_s: f64) -> Zpk {
 
 fn real(p: f64) -> Complex<f64> {
     Complex::new(p, 0.0)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn creep_with_an_onset_is_the_logarithm_of_one_and_the_time_in_onsets() {
+        for onset_s in [2e-3, 0.02, 0.3] {
+            let zpk = creep(0.06, Since::Onset(onset_s));
+            for t in [0.3 * onset_s, onset_s, 10.0 * onset_s, 30.0] {
+                // The step response by the residues at its poles.
+                let step: f64 = zpk
+                    .poles
+                    .iter()
+                    .map(|p| {
+                        let above: f64 = zpk.zeros.iter().map(|z| p.re - z.re).product();
+                        let others = zpk.poles.iter().filter(|q| *q != p);
+                        let below: f64 = others.map(|q| p.re - q.re).product();
+                        zpk.gain * above / below / p.re * (p.re * t).exp_m1()
+                    })
+                    .sum::<f64>()
+                    + zpk.gain;
+                let expected = 1.0 + 0.06 * (1.0 + t / onset_s).log10();
+                assert!(
+                    (step - expected).abs() < 2e-4,
+                    "{onset_s} {t}: {step} {expected}"
+                );
+            }
+        }
+    }
 }

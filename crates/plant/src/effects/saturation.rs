@@ -55,6 +55,10 @@ impl EffectKind for Saturation {
         true
     }
 
+    fn memory_s(&self, _: &Effect) -> f64 {
+        0.0
+    }
+
     fn candidates(&self) -> &'static [Candidate] {
         const ALL: &[Candidate] = &[BOTH, HIGH, LOW];
         ALL

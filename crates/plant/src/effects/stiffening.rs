@@ -46,6 +46,10 @@ impl EffectKind for Stiffening {
         true
     }
 
+    fn memory_s(&self, _: &Effect) -> f64 {
+        0.0
+    }
+
     fn candidates(&self) -> &'static [Candidate] {
         // What softens is none: the round knee of a saturation took that name.
         const ALL: &[Candidate] =

@@ -41,6 +41,10 @@ impl EffectKind for TimeDelay {
         Action::Delay(effect.scalar(0))
     }
 
+    fn memory_s(&self, effect: &Effect) -> f64 {
+        effect.scalar(0)
+    }
+
     fn candidates(&self) -> &'static [Candidate] {
         // What is too long for a record is the search's business.
         const ALL: &[Candidate] = &[Candidate::chain(&[lin("delay_s", 0.0, 3600.0, 1e-5)])

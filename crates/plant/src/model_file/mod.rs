@@ -9,7 +9,7 @@ mod tests;
 
 use crate::effects::{self, Effect, EffectError, ParameterSpec};
 use crate::error::{ModelError, ModelProblem, Position};
-use crate::model::{Covariance, Model, Noise};
+use crate::model::{Covariance, Model, Noise, is_in_any_unit};
 use crate::transfer::TransferFunction;
 use std::collections::BTreeMap;
 use table::{Table, Value, nearest};
@@ -86,11 +86,21 @@ fn read(text: &str, file: &str) -> Result<Model, ModelError> {
         Some(v) => top.text_of("description", v)?,
         None => String::new(),
     };
+    let provenance = match top.get("provenance") {
+        None => BTreeMap::new(),
+        Some(v) => read_provenance(&top.table("provenance", v)?)?,
+    };
+    let any_unit = is_in_any_unit(&provenance);
+    let of_plant = |spec: ParameterSpec| match any_unit {
+        true => spec.in_any_unit(),
+        false => spec,
+    };
     let working_point = top.need(
         "working_point_um",
         "the PZT displacement at which the bead is at rest, for example working_point_um = 4.0",
     )?;
-    let working_point_um = top.number("working_point_um", working_point, &WORKING_POINT)?;
+    let working_point_um =
+        top.number("working_point_um", working_point, &of_plant(WORKING_POINT))?;
     let plant = top.need(
         "plant",
         "a table with the coefficients num and den, highest power of s first",
@@ -106,12 +116,12 @@ fn read(text: &str, file: &str) -> Result<Model, ModelError> {
             "effects",
             v,
             "an array of tables, [[effects]]",
-            |name, v| read_effect(&top.table(name, v)?),
+            |name, v| read_effect(&top.table(name, v)?, any_unit),
         )?,
     };
     let noise = match top.get("noise") {
         None => Noise::NONE,
-        Some(v) => read_noise(&top.table("noise", v)?)?,
+        Some(v) => read_noise(&top.table("noise", v)?, &of_plant)?,
     };
     let camera_delay_s = match top.get("camera") {
         None => None,
@@ -129,20 +139,6 @@ fn read(text: &str, file: &str) -> Result<Model, ModelError> {
     let intervals = match top.get("intervals") {
         None => BTreeMap::new(),
         Some(v) => read_intervals(&top.table("intervals", v)?)?,
-    };
-    let provenance = match top.get("provenance") {
-        None => BTreeMap::new(),
-        Some(v) => {
-            let table = top.table("provenance", v)?;
-            let mut map = BTreeMap::new();
-            for (key, value) in table.entries {
-                map.insert(
-                    key.get_ref().to_string(),
-                    table.text_of(key.get_ref(), value)?,
-                );
-            }
-            map
-        }
     };
     Ok(Model {
         name,
@@ -180,15 +176,27 @@ fn read_plant(table: &Table<'_, '_>) -> Result<TransferFunction, ModelError> {
         .map_err(|source| table.refuse(table.span.clone(), ModelProblem::Plant(source)))
 }
 
-fn read_noise(table: &Table<'_, '_>) -> Result<Noise, ModelError> {
+fn read_provenance(table: &Table<'_, '_>) -> Result<BTreeMap<String, String>, ModelError> {
+    let mut map = BTreeMap::new();
+    for (key, value) in table.entries {
+        let name: &str = key.get_ref();
+        map.insert(name.to_owned(), table.text_of(name, value)?);
+    }
+    Ok(map)
+}
+
+fn read_noise(
+    table: &Table<'_, '_>,
+    of_plant: &dyn Fn(ParameterSpec) -> ParameterSpec,
+) -> Result<Noise, ModelError> {
     table.only(&["diffusion_um2_per_s", "localisation_um"])?;
-    let number = |name: &str, spec: &ParameterSpec| match table.get(name) {
+    let number = |name: &str, spec: ParameterSpec| match table.get(name) {
         None => Ok(0.0),
-        Some(v) => table.number(name, v, spec),
+        Some(v) => table.number(name, v, &of_plant(spec)),
     };
     Ok(Noise {
-        diffusion_um2_per_s: number("diffusion_um2_per_s", &DIFFUSION)?,
-        localisation_um: number("localisation_um", &LOCALISATION)?,
+        diffusion_um2_per_s: number("diffusion_um2_per_s", DIFFUSION)?,
+        localisation_um: number("localisation_um", LOCALISATION)?,
     })
 }
 
@@ -245,7 +253,11 @@ fn read_intervals(table: &Table<'_, '_>) -> Result<BTreeMap<String, [f64; 2]>, M
     Ok(map)
 }
 
-fn read_effect(table: &Table<'_, '_>) -> Result<Effect, ModelError> {
+fn read_effect(table: &Table<'_, '_>, any_unit: bool) -> Result<Effect, ModelError> {
+    let bounds = |spec: &ParameterSpec| match any_unit {
+        true => spec.in_any_unit(),
+        false => *spec,
+    };
     let unknown = |key: &str, value: &Value<'_>, found: String, known: &[&str]| {
         table.refuse(
             value.span(),
@@ -285,6 +297,7 @@ fn read_effect(table: &Table<'_, '_>) -> Result<Effect, ModelError> {
     table.only(&known)?;
     let mut scalars = Vec::with_capacity(specs.scalars.len());
     for spec in specs.scalars {
+        let spec = &bounds(spec);
         scalars.push(match (table.get(spec.name), spec.default) {
             (Some(v), _) => table.number(spec.name, v, spec)?,
             (None, Some(default)) => default,
@@ -308,12 +321,15 @@ fn read_effect(table: &Table<'_, '_>) -> Result<Effect, ModelError> {
         let value = table.need(spec.name, "a list of numbers, one per play operator")?;
         lists.push(
             table.list(spec.name, value, "a list of numbers", |name, v| {
-                table.number(name, v, spec)
+                table.number(name, v, &bounds(spec))
             })?,
         );
     }
     let lists: Vec<&[f64]> = lists.iter().map(Vec::as_slice).collect();
-    let effect = Effect::new(kind, form, &scalars, &lists);
+    let mut effect = Effect::new(kind, form, &scalars, &lists);
+    if any_unit {
+        effect = effect.in_any_unit();
+    }
     effect.validate().map_err(|error| {
         let message = match error {
             EffectError::Inconsistent { message, .. } => {

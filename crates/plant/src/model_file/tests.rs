@@ -1,6 +1,6 @@
 use crate::effects::{self, Effect};
 use crate::error::ModelProblem;
-use crate::model::{Covariance, Model};
+use crate::model::{Covariance, Model, Noise};
 use proptest::prelude::*;
 
 const SMALL: &str = "working_point_um = 4\n[plant]\nnum = [428.0]\nden = [1, 0]\n";
@@ -223,5 +223,48 @@ proptest! {
         model.plant = crate::TransferFunction::new(vec![value], vec![1.0, 0.0]).unwrap();
         let back = Model::from_toml_str(&model.to_toml_string(), "m.toml").unwrap();
         prop_assert_eq!(back.plant.num()[0].to_bits(), bits);
+    }
+}
+
+#[test]
+fn a_plant_of_other_units_has_lengths_of_any_size() {
+    let model = Model {
+        working_point_um: 3e7,
+        noise: Noise {
+            diffusion_um2_per_s: 1e12,
+            localisation_um: 4e5,
+        },
+        effects: vec![
+            effects::saturation(-2e9, 7e9).in_any_unit(),
+            effects::stiffening(641.0).in_any_unit(),
+        ],
+        ..Model::eq6()
+    };
+    let refused = Model::from_toml_str(&model.to_toml_string(), "m.toml").unwrap_err();
+    assert!(
+        refused.to_string().contains("working_point_um"),
+        "{refused}"
+    );
+    assert!(crate::Chain::new(&model).is_err());
+    let provenance = [(Model::UNITS.to_owned(), "nm -> nm".to_owned())];
+    let model = Model {
+        provenance: provenance.into(),
+        ..model
+    };
+    let read = Model::from_toml_str(&model.to_toml_string(), "m.toml").unwrap();
+    assert_eq!(read, model);
+    crate::Chain::new(&read).unwrap();
+    // A sign and a pure number have bounds in any unit.
+    let text = model.to_toml_string();
+    for (was, wrong) in [
+        (
+            "diffusion_um2_per_s = 1000000000000.0",
+            "diffusion_um2_per_s = -1.0",
+        ),
+        ("localisation_um = 400000.0", "localisation_um = -0.1"),
+    ] {
+        assert!(text.contains(was), "{text}");
+        let refused = Model::from_toml_str(&text.replace(was, wrong), "m.toml").unwrap_err();
+        assert!(refused.to_string().contains("in 0.."), "{refused}");
     }
 }

@@ -20,19 +20,18 @@ pub(super) struct Camera {
 
 impl Camera {
     pub(super) fn new(model: &Model, seed: Option<u64>) -> Result<Self, ChainError> {
-        in_range(
-            "localisation_um",
-            model.noise.localisation_um,
-            "um",
-            0.0,
-            100.0,
-        )?;
+        let most = match model.is_in_any_unit() {
+            true => f64::MAX,
+            false => 100.0,
+        };
+        let localisation_um = model.noise.localisation_um;
+        in_range("localisation_um", localisation_um, "um", 0.0, most)?;
         let mut camera = Self {
             delay_s: 0.0,
             exposure_s: 0.0,
             skew: 0.0,
             shown: Vec::new(),
-            localisation_um: model.noise.localisation_um,
+            localisation_um,
             // A stream of its own, so that the Brownian path does not depend on the camera.
             noise: seed.map(|s| Random::new(s ^ 0x9e37_79b9_7f4a_7c15)),
         };

@@ -44,6 +44,7 @@ fn predicted(model: &Model, pzt_um: &[f64]) -> Vec<f64> {
         sample_s: 1e-3,
         interpolated_input: false,
         free_start: false,
+        free_working_point: false,
     };
     let u: Vec<f64> = pzt_um.iter().map(|v| v - 4.0).collect();
     let mut y = Vec::new();

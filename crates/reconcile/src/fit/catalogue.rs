@@ -135,6 +135,11 @@ impl Part {
         }
     }
 
+    /// For how long it remembers what went into it \[s\].
+    pub fn memory_s(&self, scope: &Scope) -> f64 {
+        self.variant.kind.memory_s(&self.effect(scope))
+    }
+
     pub fn effect(&self, scope: &Scope) -> Effect {
         self.variant
             .kind

@@ -25,6 +25,8 @@ pub(crate) struct Base {
     pub interpolated_input: bool,
     /// The plant need not have rested before a record: its transients are free in every record.
     pub free_start: bool,
+    /// The working point is not known: what an error of it makes is free in every record.
+    pub free_working_point: bool,
 }
 
 /// Simulates a record: displacement from the working point \[um\] in, bead position \[um\] out.

@@ -112,7 +112,7 @@ pub(crate) fn augment(
     if let Ok(plant) = model.plant.scaled(fit.gain) {
         out.plant = plant;
     }
-    // Without a floor there is no noise to write, and numbers beyond what a model may hold are none.
+    // Without a floor there is no noise to write.
     let noise = cellpos_plant::Noise {
         diffusion_um2_per_s: ctx
             .problem
@@ -121,8 +121,12 @@ pub(crate) fn augment(
             / ctx.scales.per_unit()[1].powi(2),
         localisation_um: ctx.scales.output(ctx.problem.noise.localisation_um()),
     };
-    if floor.source.is_known() && noise.diffusion_um2_per_s < 1e4 && noise.localisation_um < 100.0 {
+    if floor.source.is_known() {
         out.noise = noise;
+    }
+    if ctx.scales.is_of_records() {
+        out.provenance
+            .insert(Model::UNITS.to_owned(), ctx.scales.words());
     }
     out.provenance
         .insert("noise".to_owned(), floor.source.words().to_owned());

@@ -26,7 +26,7 @@ pub(crate) struct Aside {
     pub whole: Option<Fit>,
 }
 
-/// Time constants of what is slower in parts, in rows.
+/// Time constants of what is slower in parts, in rows: as far as a decade beyond what the effect remembers.
 const SMOOTH_ROWS: [f64; 4] = [1.0, 10.0, 100.0, 1000.0];
 /// How far numbers are spread, in parts of themselves.
 const SPREAD: [f64; 2] = [0.04, 0.12];
@@ -189,6 +189,7 @@ fn freer(ctx: &Context<'_>, fit: &Fit, parts: &[usize]) -> Vec<Vec<Vec<f64>>> {
             continue;
         }
         curved |= part.variant.is_curve();
+        let memory_rows = part.memory_s(&ctx.scope) / ctx.problem.base.sample_s;
         for (j, p) in part.variant().params.iter().enumerate() {
             if p.name == "weights" {
                 continue;
@@ -206,7 +207,7 @@ fn freer(ctx: &Context<'_>, fit: &Fit, parts: &[usize]) -> Vec<Vec<Vec<f64>>> {
                     let mut raw = vec![rows.clone().map(|n| a[n] + b[n] - 2.0 * c[n]).collect()];
                     if spread == SPREAD[0] {
                         let slope: Vec<f64> = rows.map(|n| a[n] - b[n]).collect();
-                        raw.extend(let_go(ctx, &slope, &r.u, c));
+                        raw.extend(let_go(ctx, &slope, &r.u, c, memory_rows));
                     }
                     out[i].extend(raw.iter().map(|raw: &Vec<f64>| r.whitened(raw)));
                 }
@@ -251,7 +252,13 @@ fn bends(ctx: &Context<'_>) -> Vec<Vec<Vec<f64>>> {
 }
 
 /// A change by a number, as it would be if the number went with command, position, speed or time, or its effect came later.
-fn let_go(ctx: &Context<'_>, slope: &[f64], u: &[f64], y: &[f64]) -> Vec<Vec<f64>> {
+fn let_go(
+    ctx: &Context<'_>,
+    slope: &[f64],
+    u: &[f64],
+    y: &[f64],
+    memory_rows: f64,
+) -> Vec<Vec<f64>> {
     let dt = ctx.problem.base.sample_s;
     let with = |f: &dyn Fn(usize) -> f64| -> Vec<f64> {
         slope.iter().enumerate().map(|(k, s)| s * f(k)).collect()
@@ -280,7 +287,8 @@ fn let_go(ctx: &Context<'_>, slope: &[f64], u: &[f64], y: &[f64]) -> Vec<Vec<f64
         acts(&|k| u[k] * u[k]),
         acts(&|k| speed(y, k).abs()),
     ];
-    for rows in SMOOTH_ROWS {
+    let slowest = 10.0 * memory_rows;
+    for rows in SMOOTH_ROWS.into_iter().filter(|r| *r <= slowest.max(1.0)) {
         let share = -(-1.0 / rows).exp_m1();
         let mut low = 0.0;
         out.push(

@@ -1,8 +1,9 @@
-//! The check on data not used in fitting: whole records (frequencies, amplitudes, wave forms) and the last part of the
-//! time.
+//! The check on data not used in fitting: whole records (frequencies, amplitudes, wave forms), and the end of the time by its beginning
+//! and the beginning by the end: what is at work in one part of a record alone is seen there alone.
 
 use crate::fit::context::{Context, Fit};
-use crate::problem::{Mask, Prepared, split_in_time};
+use crate::problem::{Mask, Prepared, split_from_the_end, split_in_time};
+use crate::thresholds::THRESHOLDS;
 use crate::verdict::map::{BAND_EDGES_HZ, DiscrepancyMap};
 use crate::verdict::result::{BandGap, Interval, RecordGap};
 
@@ -20,7 +21,8 @@ pub(crate) struct HeldOut {
     /// What the walk and the white noise alone are expected to make of it \[um\].
     pub free_floor_um: f64,
     pub per_record: Vec<RecordGap>,
-    /// Parts that do not help in the last 40 % of the time when fitted on the first 60 %.
+    /// Parts that do not help in the last 40 % and in the first 40 % of the time together, each when fitted on the rest, or that one of the
+    /// two speaks against.
     pub unconfirmed: Vec<usize>,
     /// How far a free base gain moves when it is refitted together with the set.
     pub gain_shift: Interval,
@@ -106,8 +108,9 @@ fn free_run(ctx: &Context<'_>, null: &Fit, set: &Fit, test: &Mask) -> Sums {
 pub(crate) fn check(ctx: &Context<'_>, fit: &Fit, threads: usize) -> HeldOut {
     let records = &ctx.problem.records;
     let sigma = ctx.problem.noise.innovation_um();
-    let (train, test) = split_in_time(records);
-    // Records: each predicted by a fit to all others, where those are enough; else the end of each by its beginning.
+    let splits = [split_in_time(records), split_from_the_end(records)];
+    // Records: each predicted by a fit to all others, where those are enough; else the end of each by its beginning, and the beginning
+    // by the end.
     // Amplitudes and phases of lines are each record's own: kept.
     let folds: Vec<usize> = (0..records.len()).collect();
     let results = cellpos_parallel::map(&folds, threads, |&i| {
@@ -123,28 +126,15 @@ pub(crate) fn check(ctx: &Context<'_>, fit: &Fit, threads: usize) -> HeldOut {
                 .count(&mask.iter().zip(records).map(moves).collect())
         };
         let enough = records[i].rest || 4 * moving(&others) > moving(&others) + moving(&own);
-        let (others, own) = if enough {
-            (others, own)
-        } else {
-            let mut end: Mask = vec![Vec::new(); records.len()];
-            end[i].clone_from(&test[i]);
-            (train.clone(), end)
-        };
-        let null = ctx.fit(Vec::new(), &others, 3);
-        let set = if fit.parts.is_empty() {
-            null.clone()
-        } else {
-            let mut f = ctx.refit(fit, &others, 4);
-            f.lines.clone_from(&fit.lines);
-            f.innovations = ctx.innovations(&f, &ctx.problem.all()).0;
-            f
-        };
-        Sums {
-            before: null.chi2_on(&own),
-            after: set.chi2_on(&own),
-            count: ctx.problem.count(&own),
-            ..free_run(ctx, &null, &set, &own)
+        if enough {
+            return fold(ctx, fit, &others, &own);
         }
+        let of_splits = splits.iter().map(|(train, test)| {
+            let mut own: Mask = vec![Vec::new(); records.len()];
+            own[i].clone_from(&test[i]);
+            fold(ctx, fit, train, &own)
+        });
+        of_splits.fold(Sums::default(), |a, s| a.plus(&s))
     });
     let innovation = |c: f64, n: usize| sigma * (c / n.max(1) as f64).sqrt();
     let per_record: Vec<RecordGap> = records
@@ -162,23 +152,6 @@ pub(crate) fn check(ctx: &Context<'_>, fit: &Fit, threads: usize) -> HeldOut {
         })
         .collect();
     let total = results.iter().fold(Sums::default(), |a, s| a.plus(s));
-    // Time: the first 60 % of every record predict the rest.
-    let indices: Vec<usize> = (0..fit.parts.len()).collect();
-    let whole = (!fit.parts.is_empty()).then(|| ctx.refit(fit, &train, 4).chi2_on(&test));
-    let unconfirmed = cellpos_parallel::map(&indices, threads, |&i| {
-        let mut parts = fit.parts.clone();
-        parts.remove(i);
-        let without = ctx
-            .fit_from(parts, Some(fit.soft), &train, 6)
-            .chi2_on(&test);
-        whole.is_some_and(|w| without - w < 2.0)
-    });
-    let unconfirmed = indices
-        .into_iter()
-        .zip(unconfirmed)
-        .filter(|(_, u)| *u)
-        .map(|(i, _)| i)
-        .collect();
     let free = |e: f64| (e / total.rows.max(1.0)).sqrt();
     HeldOut {
         before_um: innovation(total.before, total.count),
@@ -187,9 +160,63 @@ pub(crate) fn check(ctx: &Context<'_>, fit: &Fit, threads: usize) -> HeldOut {
         free_after_um: free(total.free_after),
         free_floor_um: free(total.free_floor),
         per_record,
-        unconfirmed,
+        unconfirmed: unconfirmed(ctx, fit, &splits, threads),
         gain_shift: gain_shift(ctx, fit),
     }
+}
+
+/// Rounds of a fit without the held-out rows: it stops before where it stands still.
+const ROUNDS: usize = 12;
+
+/// What the set and the null make of rows that neither was fitted to.
+fn fold(ctx: &Context<'_>, fit: &Fit, others: &Mask, own: &Mask) -> Sums {
+    let null = ctx.fit(Vec::new(), others, ROUNDS);
+    let set = if fit.parts.is_empty() {
+        null.clone()
+    } else {
+        let mut f = ctx.refit(fit, others, ROUNDS);
+        f.lines.clone_from(&fit.lines);
+        f.innovations = ctx.innovations(&f, &ctx.problem.all()).0;
+        f
+    };
+    Sums {
+        before: null.chi2_on(own),
+        after: set.chi2_on(own),
+        count: ctx.problem.count(own),
+        ..free_run(ctx, &null, &set, own)
+    }
+}
+
+/// Parts that rows which they were not fitted to do not speak for, or that one of the splits speaks against by [`THRESHOLDS`]' tie. Rows
+/// in which a part makes no difference (a clipping command that is small there) gain nothing and say nothing.
+fn unconfirmed(
+    ctx: &Context<'_>,
+    fit: &Fit,
+    splits: &[(Mask, Mask)],
+    threads: usize,
+) -> Vec<usize> {
+    if fit.parts.is_empty() {
+        return Vec::new();
+    }
+    let whole: Vec<f64> = splits
+        .iter()
+        .map(|(train, test)| ctx.refit(fit, train, ROUNDS).chi2_on(test))
+        .collect();
+    let indices: Vec<usize> = (0..fit.parts.len()).collect();
+    let fails = cellpos_parallel::map(&indices, threads, |&i| {
+        let mut parts = fit.parts.clone();
+        parts.remove(i);
+        let gains = splits.iter().zip(&whole).map(|((train, test), whole)| {
+            let without = ctx.fit_from(parts.clone(), Some(fit.soft), train, ROUNDS);
+            without.chi2_on(test) - whole
+        });
+        let (sum, least) = gains.fold((0.0, f64::INFINITY), |(s, l): (f64, f64), g| {
+            (s + g, l.min(g))
+        });
+        sum < 2.0 || least < -THRESHOLDS.tie
+    });
+    let failed = indices.into_iter().zip(fails).filter(|(_, fails)| *fails);
+    failed.map(|(i, _)| i).collect()
 }
 
 /// Refits with a free gain beside the set (or alone) and says how far it moves from 1.

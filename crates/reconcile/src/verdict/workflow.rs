@@ -44,6 +44,9 @@ pub struct Options {
     pub free_gain: bool,
     /// The plant need not have rested at its working point before a record: its transients are free in every record.
     pub free_start: bool,
+    /// The working point was taken from these very records: the ramp that an error of it makes of a bead's position is free in every
+    /// record, and no flow is named for it.
+    pub free_working_point: bool,
     /// Work of simulations after which the search looks for no further effect, and says so; in units of [`WORK`].
     pub work: f64,
     /// The noise that the records are taken to have.
@@ -65,6 +68,7 @@ impl Default for Options {
             interpolated_input: false,
             free_gain: false,
             free_start: false,
+            free_working_point: false,
             units: Units::default(),
             own_effects: Vec::new(),
         }
@@ -315,6 +319,7 @@ fn base_of(model: &Model, records: &[Record], options: &Options) -> Result<Base,
         sample_s: records[0].sample_s,
         interpolated_input: options.interpolated_input,
         free_start: options.free_start,
+        free_working_point: options.free_working_point,
     })
 }
 

@@ -93,6 +93,11 @@ fn same_but_for_units(hidden: &Effect, one: &Reconciliation, scale: [f64; 2]) {
     assert!(near(output * one.gap.before, other.gap.before), "{scale:?}");
     assert!(near(output * one.gap.after, other.gap.after), "{scale:?}");
     assert_eq!(other.gap.unit, "rpm");
+    // The file that is written is read and simulated, however large its numbers are.
+    let text = other.augmented.to_toml_string();
+    let read = Model::from_toml_str(&text, "augmented.toml").unwrap();
+    assert_eq!(read, other.augmented, "{scale:?}");
+    simulate(&read, &[scale[0]; 3], STEP_S, &SimulateOptions::default()).unwrap();
     let ids =
         |r: &Reconciliation| -> Vec<String> { r.effects.iter().map(|e| e.id.clone()).collect() };
     assert_eq!(ids(one), ids(&other), "{scale:?}");
@@ -134,7 +139,7 @@ fn a_record_times_a_thousand_is_the_same_record() {
     let high = &one.effects[0].parameters["high_um"];
     assert_eq!(high.unit, "V");
     assert!((high.value - 2.2).abs() < 0.02, "{high:?}");
-    for scale in [[1e3, 1.0], [1.0, 1e-3], [1e-3, 1e3], [1e3, 1e3]] {
+    for scale in [[1e3, 1.0], [1.0, 1e-3], [1e-3, 1e3], [1e9, 1e9]] {
         same_but_for_units(&hidden, &one, scale);
     }
 }
@@ -145,7 +150,7 @@ fn play_of_millivolts_is_play_of_volts() {
     let one = look(&hidden, [1.0, 1.0]);
     assert_eq!(one.effects.len(), 1, "{:?}", one.places);
     assert_eq!(one.effects[0].id, "backlash");
-    for scale in [[1e-3, 1.0], [1e-9, 1e-12]] {
+    for scale in [[1e-3, 1.0], [1e-9, 1e-12], [1e6, 1e-6]] {
         same_but_for_units(&hidden, &one, scale);
     }
 }

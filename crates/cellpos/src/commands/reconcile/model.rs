@@ -67,7 +67,7 @@ pub(super) fn model_of(
         Some(hold) => hold == HoldKind::None,
         None => stated.as_deref() == Some("none"),
     };
-    at_rest_of_runs(&mut model, data.records, data.rests_um);
+    options.free_working_point = at_rest_of_runs(&mut model, data.records, data.rests_um);
     if data.of_runs {
         with_camera_delay(&mut model);
     }

@@ -150,14 +150,14 @@ fn held(t: &TickRecord) -> bool {
 }
 
 /// Runs hold a bead wherever its rest is, and that is another place every day: where no record comes near the model's
-/// working point, the runs' own is taken.
-pub(super) fn at_rest_of_runs(model: &mut Model, records: &[Record], rests_um: &[f64]) {
+/// working point, the runs' own is taken. Whether it was: it is then no better known than these records tell.
+pub(super) fn at_rest_of_runs(model: &mut Model, records: &[Record], rests_um: &[f64]) -> bool {
     let inside = records.iter().any(|r| {
         let (low, high) = r.pzt_range_um();
         (low..=high).contains(&model.working_point_um)
     });
     if inside || rests_um.is_empty() {
-        return;
+        return false;
     }
     let rest_um = rests_um.iter().sum::<f64>() / rests_um.len() as f64;
     tracing::warn!(
@@ -166,6 +166,7 @@ pub(super) fn at_rest_of_runs(model: &mut Model, records: &[Record], rests_um: &
         model.working_point_um
     );
     model.working_point_um = rest_um;
+    true
 }
 
 /// A run shows its bead as late as the camera path is: a model that was identified with that delay beside its plant has it as
