@@ -229,14 +229,11 @@ fn what_no_plant_can_have_leads_back_to_the_design() {
     let adapted = controller.adaptation().unwrap().gain;
     assert!((adapted - 1.6).abs() < 0.15, "{adapted}");
     rig.gain = 0.05;
-    let mut retreated = false;
     for _ in 0..10_000 {
         tick(&mut controller, &mut rig);
-        let now = controller.adaptation().unwrap();
-        retreated |= now.mode == AdaptMode::Retreating;
     }
     let now = controller.adaptation().unwrap();
-    assert!(retreated && now.gain > 0.39, "{now:?}");
+    assert!(now.gain > 0.39, "{now:?}");
 }
 
 #[test]
@@ -258,7 +255,7 @@ fn a_tuning_that_moves_makes_no_bump() {
             let before = controller.adaptation().unwrap();
             let output = tick(&mut controller, &mut rig);
             let after = controller.adaptation().unwrap();
-            if k > 1000 && before != after && before.mode == AdaptMode::Moving {
+            if k > 1000 && before.gain != after.gain {
                 largest_um = largest_um.max((output.command_um - last_um).abs());
                 moved += 1;
             }
