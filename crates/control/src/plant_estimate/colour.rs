@@ -72,11 +72,6 @@ impl Colour {
         self.left_um[0] = left_um;
     }
 
-    /// What shook the bead so far says little of what does now.
-    pub fn begin_anew(&mut self) {
-        self.fixes = 0.0;
-    }
-
     /// The best prediction by the correlations so far (Levinson and Durbin).
     pub fn solve(&mut self) {
         let r = &self.correlations_um2;

@@ -17,18 +17,14 @@ const BLOCK: u32 = 16;
 /// Memory, s. With the dither at one per cent of hold error a second tells the gain to 0.18 of it; a memory of five to 0.057, and it ages
 /// by less than that at [`GAIN_WALK`].
 const MEMORY_S: f64 = 5.0;
-/// Jumps that are looked for: the ratio of gains, and the change of delay, samples. Half and twice are to be found soon; a quarter is
-/// the least that is found sooner than the memory has it.
-const JUMPS: [(f64, f64); 6] = [
-    (2.0, 0.0),
-    (1.25, 0.0),
-    (0.8, 0.0),
-    (0.5, 0.0),
-    (1.0, 1.0),
-    (1.0, -1.0),
-];
+/// Jumps that are looked for: the ratio of gains, and the change of delay, samples. Half way to each is four standard deviations of
+/// the estimate, so that its own error starts no search; of less the memory tells in its time.
+const JUMPS: [(f64, f64); 4] = [(2.0, 0.0), (0.5, 0.0), (1.0, 1.0), (1.0, -1.0)];
 /// Time after which Page's test of a jump finds one by chance, s; it costs a second in which less is known.
 const CHANCE_S: f64 = 1200.0;
+/// Memory, s, of what the last blocks say beside the estimate: where they leave it by more than chance the estimate is as uncertain as that
+/// before the test of a jump has decided. A change of half the gain is two of its standard deviations.
+const FAST_S: f64 = 1.0;
 /// Standard deviations of the estimate by which a jump must leave it.
 const APART: f64 = 2.5;
 /// Random walk of the logarithm of a real plant's gain, 1/sqrt(s): a channel that clogs to half in an hour.
@@ -64,6 +60,8 @@ pub(super) struct Finding {
     /// Gain over the model's, and its standard deviation.
     pub gain: f64,
     pub gain_sd: f64,
+    /// The latter but for what the last blocks say beside it.
+    own_sd: f64,
     /// Delay beyond the design's, samples, and its standard deviation.
     pub delay: f64,
     pub delay_sd: f64,
@@ -109,6 +107,32 @@ pub(super) fn dot(a: &Vector, b: &Vector) -> f64 {
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 struct Jump {
     evidence: f64,
+    /// Gain and delay that it starts from.
+    from: (f64, f64),
+}
+
+/// What the last blocks say of the gain beside the estimate: sums of scores, of their information, and of that with weights squared.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+struct Fast {
+    score: f64,
+    information: f64,
+    squares: f64,
+}
+
+impl Fast {
+    fn take(&mut self, score: f64, information: f64, keep: f64) {
+        self.score = keep * self.score + score;
+        self.information = keep * self.information + information;
+        self.squares = keep * keep * self.squares + information;
+    }
+
+    /// Square by which the gain left the estimate beyond what chance makes of it.
+    fn beyond(&self) -> f64 {
+        if self.information <= 0.0 {
+            return 0.0;
+        }
+        (self.score.powi(2) - self.squares).max(0.0) / self.information.powi(2)
+    }
 }
 
 /// What is remembered.
@@ -119,6 +143,7 @@ pub(super) struct Evidence {
     memory: Sums,
     /// One search for each of [`JUMPS`].
     jumps: [Jump; JUMPS.len()],
+    fast: Fast,
     pub found: Option<Finding>,
 }
 
@@ -140,6 +165,7 @@ impl Evidence {
             fixes: 0,
             memory: Sums::default(),
             jumps: [Jump::default(); JUMPS.len()],
+            fast: Fast::default(),
             found: None,
         }
     }
@@ -179,28 +205,50 @@ impl Evidence {
         let keep = (-block_s / MEMORY_S).exp();
         self.memory.take(&block, keep);
         if let Some(found) = self.found {
-            self.look_for_a_jump(&block, &left, &found, block_s);
+            self.look_for_a_jump(&block, &found, block_s);
         }
         self.found = self.memory.finding(delay, least, block_s);
+        if let Some(found) = &mut self.found {
+            found.gain_sd = found.own_sd.hypot(self.fast.beyond().sqrt());
+        }
     }
 
-    /// Page's test of each jump. Nothing of what was before is then worth anything.
-    fn look_for_a_jump(&mut self, block: &Sums, left: &Vector, found: &Finding, block_s: f64) {
+    /// Page's test of each jump, from where the estimate stood when its evidence began. Nothing of what was before is then worth anything.
+    fn look_for_a_jump(&mut self, block: &Sums, found: &Finding, block_s: f64) {
+        let quiet = (found.gain.max(0.1), found.delay);
+        let of = |xp: &Matrix, by: &Vector| -> f64 {
+            let moved: Vector = std::array::from_fn(|i| dot(&xp[i], by));
+            (0..MEMBERS)
+                .map(|j| by[j] * dot(&found.score[j], &moved))
+                .sum()
+        };
+        let score = |from: (f64, f64), by: &Vector| -> f64 {
+            let now = weights(from.1);
+            let left: Vector =
+                std::array::from_fn(|i| block.xy[i] - from.0 * dot(&block.xp[i], &now));
+            (0..MEMBERS)
+                .map(|j| by[j] * dot(&found.score[j], &left))
+                .sum()
+        };
         let now = weights(found.delay);
-        let gain = found.gain.max(0.1);
-        let score: Vector = std::array::from_fn(|j| dot(&found.score[j], left));
+        self.fast.take(
+            score(quiet, &now),
+            of(&block.xp, &now),
+            (-block_s / FAST_S).exp(),
+        );
         for (jump, (ratio, late)) in self.jumps.iter_mut().zip(JUMPS) {
-            let then = weights((found.delay + late).clamp(LAGS[0], LAGS[MEMBERS - 1]));
-            let by: Vector = std::array::from_fn(|j| gain * (ratio * then[j] - now[j]));
-            let of = |xp: &Matrix| -> f64 {
-                let moved: Vector = std::array::from_fn(|i| dot(&xp[i], &by));
-                (0..MEMBERS)
-                    .map(|j| by[j] * dot(&found.score[j], &moved))
-                    .sum()
-            };
-            jump.evidence += dot(&score, &by) - 0.5 * of(&block.xp);
+            if jump.evidence <= 0.0 {
+                jump.from = quiet;
+            }
+            let (gain, delay) = jump.from;
+            let (before, after) = (
+                weights(delay),
+                weights((delay + late).clamp(LAGS[0], LAGS[MEMBERS - 1])),
+            );
+            let by: Vector = std::array::from_fn(|j| gain * (ratio * after[j] - before[j]));
+            jump.evidence += score(jump.from, &by) - 0.5 * of(&block.xp, &by);
             let near = if late == 0.0 {
-                (ratio - 1.0).abs() * gain < APART * found.gain_sd
+                (ratio - 1.0).abs() * gain < APART * found.own_sd
             } else {
                 late.abs() < APART * found.delay_sd
             };
@@ -209,11 +257,10 @@ impl Evidence {
                 continue;
             }
             // By chance Page's sum is above `h` every `exp(h)` over its mean decrease.
-            let decrease = 0.5 * of(&self.memory.xp) / self.memory.n;
+            let decrease = 0.5 * of(&self.memory.xp, &by) / self.memory.n;
             if jump.evidence > (decrease / block_s * CHANCE_S).max(1.0).ln() {
                 // Not those of the search: they were chosen for being far off.
-                self.memory = Sums::default();
-                self.jumps = [Jump::default(); JUMPS.len()];
+                *self = Self::new();
                 return;
             }
         }
@@ -297,9 +344,11 @@ impl Sums {
         let score = columns.map(|a| backward(&l, &a).map(|w| w * self.n2 / self.n));
         // A mean with exponential weights is half its memory old, a quarter of what its blocks span.
         let walk2 = (GAIN_WALK * gain).powi(2) * 0.25 * n * block_s;
+        let gain_sd = ((square / sum - gain * gain).max(0.0) + walk2).sqrt();
         Some(Finding {
             gain,
-            gain_sd: ((square / sum - gain * gain).max(0.0) + walk2).sqrt(),
+            gain_sd,
+            own_sd: gain_sd,
             delay,
             delay_sd: ((at2 / sum - delay * delay).max(0.0) + STEP * STEP / 12.0).sqrt(),
             likelihood,

@@ -3,7 +3,7 @@
 use super::evidence::{MEMBERS, Products, dot, weights};
 use super::retuning::DELAYS;
 use super::whiten::Whitener;
-use super::{AdaptState, Adapter, Evidence};
+use super::{AdaptState, Adapter};
 use crate::estimator::Fix;
 
 /// Standard deviations from which on less is taken of a fix (Huber).
@@ -112,11 +112,7 @@ impl Adapter {
         let in_force = dot(&p, &weights(late));
         let rise = (state.noise.add(y, in_force, gain)).min(ENOUGH - state.force.log_gain);
         if rise > 0.0 {
-            // At once; what was known before is of another plant.
             state.force.go(rise);
-            state.evidence = Evidence::new();
-            state.colour.begin_anew();
-            return false;
         }
         let usual_um2 = state.noise.usual_um2;
         let still =

@@ -227,7 +227,8 @@ fn what_no_plant_can_have_leads_back_to_the_design() {
         tick(&mut controller, &mut rig);
     });
     let adapted = controller.adaptation().unwrap().gain;
-    assert!((adapted - 1.6).abs() < 0.15, "{adapted}");
+    // 2.5 of the standard deviations that the dither leaves.
+    assert!((adapted - 1.6).abs() < 0.25, "{adapted}");
     rig.gain = 0.05;
     for _ in 0..10_000 {
         tick(&mut controller, &mut rig);
