@@ -24,9 +24,9 @@ pub fn choose(asked: Option<Adapt>, controller: &mut ControllerFile) {
 /// Where adaptation stands, in a line.
 pub fn text(now: &Adaptation) -> String {
     let mode = match now.mode {
-        AdaptMode::Waiting => "too little to go by",
-        AdaptMode::Agreeing => "in force",
-        AdaptMode::Moving => "on its way",
+        AdaptMode::Learning => "learning",
+        AdaptMode::Known => "known",
+        AdaptMode::Uncertain => "uncertain",
     };
     let found = now.gain_estimate.map_or_else(String::new, |[gain, sd]| {
         format!(", estimated {gain:.2} +- {:.2}", 1.96 * sd)
@@ -42,7 +42,7 @@ pub(crate) fn recorded(columns: &[f32]) -> Option<Adaptation> {
     let [gain, delay_samples, found, sd, mode, ..] = *columns else {
         return None;
     };
-    let modes = [AdaptMode::Waiting, AdaptMode::Agreeing, AdaptMode::Moving];
+    let modes = [AdaptMode::Learning, AdaptMode::Known, AdaptMode::Uncertain];
     let mode = modes.into_iter().find(|m| f32::from(*m as u8) == mode)?;
     let known = found.is_finite() && sd.is_finite();
     Some(Adaptation {
@@ -116,7 +116,7 @@ mod tests {
         let now = recorded(&[0.5, 1.0, 0.75, 0.02, 2.0, f32::NAN]).expect("a tick that adapts");
         assert_eq!(
             text(&now),
-            "tuned to 0.50 of the model's gain, estimated 0.75 +- 0.04, +1.0 samples of delay; on its way"
+            "tuned to 0.50 of the model's gain, estimated 0.75 +- 0.04, +1.0 samples of delay; uncertain"
         );
         let unknown = recorded(&[1.0, 0.0, f32::NAN, f32::NAN, 0.0]).expect("too little motion");
         assert!(!text(&unknown).contains("estimated"));

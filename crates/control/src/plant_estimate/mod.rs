@@ -205,7 +205,7 @@ impl Adapter {
     /// How uncertain the gain in force is, as a part of `stated`: two standard deviations of the estimate and what is in force
     /// beside it. All of it while nothing is known.
     pub fn gain_doubt(&self, state: &AdaptState, stated: f64) -> f64 {
-        let sure = state.force.mode != AdaptMode::Waiting;
+        let sure = state.force.mode != AdaptMode::Learning;
         let Some(found) = state
             .evidence
             .found

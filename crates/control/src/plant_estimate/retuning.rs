@@ -14,11 +14,11 @@ pub enum AdaptMode {
     /// Too little motion so far to say anything of the plant, or nothing to learn from: the bead is lost or held by something, or
     /// the loop does not control it. Nothing changes.
     #[default]
-    Waiting = 0,
+    Learning = 0,
     /// What is in force agrees with the estimate.
-    Agreeing = 1,
-    /// The tuning is on its way to the estimate.
-    Moving = 2,
+    Known = 1,
+    /// The estimate has left what is in force, which is on its way to it.
+    Uncertain = 2,
 }
 
 /// Delays that the law is tuned to beside the design's, samples.
@@ -86,7 +86,7 @@ impl Default for Force {
         Self {
             log_gain: 0.0,
             member: NOMINAL,
-            mode: AdaptMode::Waiting,
+            mode: AdaptMode::Learning,
             moving: false,
             since_delay: u16::MAX,
             told: (0.0, NOMINAL),
@@ -98,7 +98,7 @@ impl Default for Force {
 impl Force {
     /// A tick in which nothing may change.
     pub fn wait(&mut self) {
-        self.mode = AdaptMode::Waiting;
+        self.mode = AdaptMode::Learning;
         self.moving = false;
     }
 
@@ -126,9 +126,9 @@ impl Force {
         self.moving &= off.abs() > UP_PER_TICK || off < 0.0;
         let delay_moves = self.follow_delay(found, usable);
         self.mode = if self.moving || delay_moves {
-            AdaptMode::Moving
+            AdaptMode::Uncertain
         } else {
-            AdaptMode::Agreeing
+            AdaptMode::Known
         };
     }
 

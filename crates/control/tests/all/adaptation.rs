@@ -206,7 +206,7 @@ fn a_bead_at_rest_without_excitation_and_one_that_is_lost_change_nothing() {
     let now = controller.adaptation().unwrap();
     assert_eq!(
         (now.gain, now.delay_samples, now.mode),
-        (1.0, 0.0, AdaptMode::Waiting)
+        (1.0, 0.0, AdaptMode::Learning)
     );
     for _ in 0..50_000 {
         rig.measure();

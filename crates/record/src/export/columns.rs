@@ -300,7 +300,7 @@ pub const OF_LAWS: &[(&str, &str)] = &[
     ("adapt_gain_sd", "Standard deviation of the estimated gain."),
     (
         "adapt_mode",
-        "Adaptation: 0 too little to go by, 1 in agreement, 2 moving.",
+        "What is known of the plant: 0 learning, 1 known, 2 uncertain (on its way to the estimate).",
     ),
     (
         "adapt_dither_um",
