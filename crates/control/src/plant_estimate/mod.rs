@@ -148,7 +148,8 @@ impl Adapter {
             (config.neutral_walk_um_per_sqrt_s.max(0.01) * model.gain_per_s * ts).powi(2) * ts;
         let fix_um2 = config.fix_noise_um.powi(2);
         let hold_um = bound_rms_um(config.diffusion_um2_per_s, 0.0, model.delay_s, ts);
-        let moves = model.fast_gain_per_s() * ts;
+        // Where a lag keeps the plant from moving at once it still gets there, and where it moves at once it may not stay.
+        let moves = model.gain_per_s.abs().max(model.fast_gain_per_s().abs()) * ts;
         Ok(Self {
             // Independent of the rest of the error, so that the squares add.
             side_um: (0.02 * config.dither_percent).sqrt() * hold_um / moves,
