@@ -1,12 +1,12 @@
 //! One tick of the loop: estimate, control law, limits.
 
-use crate::adapt::{AdaptState, Adaptation, Adapter, Told, Tuning};
 use crate::error::BuildError;
 use crate::estimator::{Estimate, Estimator, EstimatorState, Fix};
 use crate::law::{ControlLaw, FAR_UM, LawInput, LawOutput};
 use crate::learning::Driven;
 use crate::limits::Limits;
 use crate::loop_io::{LoopFlags, LoopInput, LoopOutput, LoopParts, Measurement, Mode};
+use crate::plant_estimate::{AdaptState, Adaptation, Adapter, Told, Tuning};
 
 /// State of a loop whose law has the state `S`.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -207,11 +207,11 @@ impl<L: ControlLaw> ControlLoop<L> {
             let over = 1.0 / driven.feed_forward_gain - 1.0 / gain;
             let learned_um = input.learned_um + over * driven.feed_forward_um;
             let usable = learned_um.is_finite();
-            let probe_um = match (&self.adapter, &state.adapt) {
-                (Some(adapter), Some(adapt)) => adapter.probe_um(adapt),
+            let dither_um = match (&self.adapter, &state.adapt) {
+                (Some(adapter), Some(adapt)) => adapter.dither_um(adapt),
                 _ => 0.0,
             };
-            let added_um = input.excitation_um + probe_um;
+            let added_um = input.excitation_um + dither_um;
             (added_um, if usable { learned_um } else { 0.0 })
         } else {
             (0.0, 0.0)
@@ -246,7 +246,11 @@ impl<L: ControlLaw> ControlLoop<L> {
             let told = Told {
                 fix: tick.fix,
                 command_um: output.command_um,
-                reference_um: tick.law.reference_um,
+                chosen_um: if tick.controls {
+                    input.excitation_um + driven.feed_forward_um / gain
+                } else {
+                    0.0
+                },
                 free: tick.controls
                     && !estimate.stuck
                     && !estimate.stepped
@@ -307,16 +311,23 @@ impl<L: ControlLaw> ControlLoop<L> {
         state.estimator.neutral_um = state.estimator.neutral_um.clamp(low, high);
         estimate.neutral_um = state.estimator.neutral_um;
         estimate.now.n = state.estimator.neutral_um;
-        let moved_um = match (&self.adapter, &state.adapt) {
-            (Some(adapter), Some(adapt)) => adapter.moved_um(adapt),
-            _ => 0.0,
-        };
-        estimate.now.q -= moved_um;
+        // Nor is the loop to undo the dither.
+        let mut dithered_um = 0.0;
+        if let (Some(adapter), Some(adapt)) = (&self.adapter, &state.adapt) {
+            let made = adapter.dithered(adapt);
+            estimate.now.q -= made.q;
+            estimate.now.last_um -= made.last_um;
+            for (mode, made) in estimate.now.modes.iter_mut().zip(made.modes) {
+                *mode -= made;
+            }
+            let at = fix.as_ref().filter(|_| estimate.fresh);
+            dithered_um = adapter.dither_seen_um(adapt, at);
+        }
         // What a PI controller sees: the fix itself where there is one, else what the model says it would be.
         let bead_um = match fix {
             Some(fix) if estimate.fresh => fix.position_um,
             _ => estimate.predicted_measurement_um,
-        } - moved_um;
+        } - dithered_um;
         let reference_ok = input.reference_um.abs() < FAR_UM;
         Tick {
             controls: input.mode == Mode::Run && reference_ok && estimate.seen,

@@ -1,6 +1,5 @@
 //! A loop with any law behind one type, and the laws of this crate by their configuration.
 
-use crate::adapt::{ADAPT_COLUMNS, Adaptation};
 use crate::control_loop::{ControlLoop, LoopState};
 use crate::error::BuildError;
 use crate::estimator::{EstimatorConfig, EstimatorState};
@@ -11,6 +10,7 @@ use crate::loop_model::LoopModel;
 use crate::lqg::{Lqg, LqgLaw};
 use crate::mpc::{Mpc, MpcLaw};
 use crate::pi::{Pi, PiLaw};
+use crate::plant_estimate::{ADAPT_COLUMNS, Adaptation};
 
 /// Which control law of this crate.
 #[derive(Debug, Clone, Copy, PartialEq)]

@@ -42,8 +42,8 @@
 //! # Ok::<(), BuildError>(())
 //! ```
 
-use crate::adapt::Tuning;
 use crate::estimator::Estimate;
+use crate::plant_estimate::Tuning;
 use std::fmt::Debug;
 
 /// Columns of its own that a law may have in the record.

@@ -22,7 +22,6 @@
 #![forbid(unsafe_code)]
 
 pub mod active_set;
-mod adapt;
 mod config;
 mod control_loop;
 mod controller;
@@ -42,13 +41,13 @@ mod lqg;
 mod monitor;
 mod mpc;
 mod pi;
+mod plant_estimate;
 mod reference;
 pub mod riccati;
 mod simulation;
 mod toml_file;
 mod uncertainty;
 
-pub use adapt::{ADAPT_COLUMNS, AdaptMode, AdaptNews, AdaptState, Adaptation, Tuning};
 pub use config::{ControllerFile, ControllerKind, PiFile};
 pub use control_loop::{ControlLoop, LoopState};
 pub use controller::{Controller, ControllerConfig, LoopConfig};
@@ -72,6 +71,7 @@ pub use lqg::{Feedback, Lqg, LqgLaw, LqgState};
 pub use monitor::{PlantEstimate, PlantMonitor, PlantMonitorState, PlantVerdict};
 pub use mpc::{HORIZON, Mpc, MpcLaw, MpcState, SolverKind, TimedSolve};
 pub use pi::{Lead, Pi, PiLaw, PiState};
+pub use plant_estimate::{ADAPT_COLUMNS, AdaptMode, AdaptNews, AdaptState, Adaptation, Tuning};
 pub use reference::{Points, Profile, Reference, Shape, fill_preview};
 pub use simulation::{RigConfig, SimulatedRig};
 pub use toml_file::ConfigError;

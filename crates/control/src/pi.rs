@@ -4,9 +4,9 @@
 //! Tustin's rule, whose phase is that of the continuous one.
 //! Gains: `kp` in um of PZT per um of bead, `ki` in 1/s (um of PZT per um of bead and second).
 
-use crate::adapt::Tuning;
 use crate::error::{BuildError, check};
 use crate::law::{ControlLaw, FAR_UM, LawInput, LawOutput};
+use crate::plant_estimate::Tuning;
 use serde::{Deserialize, Serialize};
 
 /// A lead `(1 + s/wz) / (1 + s/wp)` with `wz < wp`, discretised by Tustin's rule.

@@ -471,7 +471,6 @@ impl<R: ReferenceGenerator> Core<R> {
                 delay_before_ms: ms(news.delay_samples[0]),
                 delay_ms: ms(news.delay_samples[1]),
                 over_s: news.ticks as f64 * self.sample_s,
-                retreat: news.retreat,
             });
         }
         (output, generated)

@@ -328,8 +328,6 @@ pub enum EventKind {
         delay_ms: f64,
         /// Time that the change took, s.
         over_s: f64,
-        /// What was found is no plant: the design is in force again.
-        retreat: bool,
     },
     /// The bead does not follow the PZT.
     StuckStarted,

@@ -24,15 +24,9 @@ pub fn choose(asked: Option<Adapt>, controller: &mut ControllerFile) {
 /// Where adaptation stands, in a line.
 pub fn text(now: &Adaptation) -> String {
     let mode = match now.mode {
-        AdaptMode::Waiting => "too little motion to say",
-        AdaptMode::Agreeing => "in force",
-        AdaptMode::Moving => "on its way",
-        AdaptMode::Paused => "paused",
-        AdaptMode::Retreating => "back to the design",
-        AdaptMode::Testing => "being tested by a small motion",
-        AdaptMode::Disturbed => {
-            "something shakes the bead, so a small motion goes on that tells the gain"
-        }
+        AdaptMode::Learning => "learning",
+        AdaptMode::Known => "known",
+        AdaptMode::Uncertain => "uncertain",
     };
     let found = now.gain_estimate.map_or_else(String::new, |[gain, sd]| {
         format!(", estimated {gain:.2} +- {:.2}", 1.96 * sd)
@@ -48,15 +42,7 @@ pub(crate) fn recorded(columns: &[f32]) -> Option<Adaptation> {
     let [gain, delay_samples, found, sd, mode, ..] = *columns else {
         return None;
     };
-    let modes = [
-        AdaptMode::Waiting,
-        AdaptMode::Agreeing,
-        AdaptMode::Moving,
-        AdaptMode::Paused,
-        AdaptMode::Retreating,
-        AdaptMode::Testing,
-        AdaptMode::Disturbed,
-    ];
+    let modes = [AdaptMode::Learning, AdaptMode::Known, AdaptMode::Uncertain];
     let mode = modes.into_iter().find(|m| f32::from(*m as u8) == mode)?;
     let known = found.is_finite() && sd.is_finite();
     Some(Adaptation {
@@ -77,18 +63,11 @@ pub(crate) fn sentence(kind: &EventKind) -> String {
         delay_before_ms,
         delay_ms,
         over_s,
-        retreat,
     } = *kind
     else {
         return String::new();
     };
     let (gain, delay_ms) = ([gain_before, gain], [delay_before_ms, delay_ms]);
-    if retreat {
-        return format!(
-            "What the motion says is no plant: tuned to the design again, from {:.2} of the gain.",
-            gain[0]
-        );
-    }
     /// A change of the gain that is worth a word beside one of the delay.
     const CHANGED: f64 = 1.1;
     let ratio = gain[1] / gain[0];
@@ -122,14 +101,13 @@ pub(crate) fn sentence(kind: &EventKind) -> String {
 mod tests {
     use super::*;
 
-    fn told(gain: [f64; 2], delay_ms: f64, over_s: f64, retreat: bool) -> String {
+    fn told(gain: [f64; 2], delay_ms: f64, over_s: f64) -> String {
         sentence(&EventKind::Adapted {
             gain_before: gain[0],
             gain: gain[1],
             delay_before_ms: 0.0,
             delay_ms,
             over_s,
-            retreat,
         })
     }
 
@@ -138,24 +116,23 @@ mod tests {
         let now = recorded(&[0.5, 1.0, 0.75, 0.02, 2.0, f32::NAN]).expect("a tick that adapts");
         assert_eq!(
             text(&now),
-            "tuned to 0.50 of the model's gain, estimated 0.75 +- 0.04, +1.0 samples of delay; on its way"
+            "tuned to 0.50 of the model's gain, estimated 0.75 +- 0.04, +1.0 samples of delay; uncertain"
         );
         let unknown = recorded(&[1.0, 0.0, f32::NAN, f32::NAN, 0.0]).expect("too little motion");
         assert!(!text(&unknown).contains("estimated"));
-        assert_eq!(recorded(&[f32::NAN; 5]), None);
+        assert_eq!(recorded(&[f32::NAN; 6]), None);
         assert_eq!(recorded(&[1.0]), None);
     }
 
     #[test]
     fn a_change_reads_as_a_sentence() {
         assert_eq!(
-            told([1.0, 0.7], 0.0, 40.0, false),
+            told([1.0, 0.7], 0.0, 40.0),
             "Gain fell to 0.70 over 40.0 s: adapted; is the channel clogging?"
         );
         assert_eq!(
-            told([1.0, 1.04], 1.0, 0.5, false),
+            told([1.0, 1.04], 1.0, 0.5),
             "Delay grew by 1.00 ms over 0.5 s: adapted; does the camera or the amplifier take longer than the rig file says?"
         );
-        assert!(told([1.6, 1.0], 0.0, 1.0, true).contains("design again"));
     }
 }

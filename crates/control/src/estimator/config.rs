@@ -49,6 +49,18 @@ pub struct EstimatorConfig {
     /// Gain and delay of the plant are estimated while the loop runs, and the law follows them.
     #[serde(skip_serializing_if = "is_off")]
     pub adapt: bool,
+    /// What the dither of adaptation may add to the hold error, %: the gain is known by it, with a standard deviation that falls with the root.
+    #[serde(skip_serializing_if = "is_usual_dither")]
+    pub dither_percent: f64,
+}
+
+/// Dither of a file without the key, % of the hold error.
+const USUAL_DITHER_PERCENT: f64 = 1.0;
+
+/// A file without the key is of the usual dither.
+#[expect(clippy::trivially_copy_pass_by_ref, reason = "serde calls it so")]
+fn is_usual_dither(percent: &f64) -> bool {
+    *percent == USUAL_DITHER_PERCENT
 }
 
 /// A file without the key is one that does not adapt.
@@ -80,6 +92,7 @@ impl Default for EstimatorConfig {
             gate_most: 1,
             stuck_speed_um_per_tick: 0.5,
             adapt: false,
+            dither_percent: USUAL_DITHER_PERCENT,
         }
     }
 }
@@ -150,6 +163,13 @@ impl EstimatorConfig {
             c.ticks_per_fix,
             (1.0..=16.0).contains(&c.ticks_per_fix),
             "1 to 16",
+        )?;
+        check(
+            "dither_percent",
+            "%",
+            c.dither_percent,
+            (0.1..=10.0).contains(&c.dither_percent),
+            "0.1 to 10; adapt = false runs without dither and without adaptation",
         )?;
         check(
             "gate_sigma",

@@ -206,7 +206,7 @@ fn a_bead_at_rest_without_excitation_and_one_that_is_lost_change_nothing() {
     let now = controller.adaptation().unwrap();
     assert_eq!(
         (now.gain, now.delay_samples, now.mode),
-        (1.0, 0.0, AdaptMode::Waiting)
+        (1.0, 0.0, AdaptMode::Learning)
     );
     for _ in 0..50_000 {
         rig.measure();
@@ -227,16 +227,14 @@ fn what_no_plant_can_have_leads_back_to_the_design() {
         tick(&mut controller, &mut rig);
     });
     let adapted = controller.adaptation().unwrap().gain;
-    assert!((adapted - 1.6).abs() < 0.15, "{adapted}");
+    // 2.5 of the standard deviations that the dither leaves.
+    assert!((adapted - 1.6).abs() < 0.25, "{adapted}");
     rig.gain = 0.05;
-    let mut retreated = false;
     for _ in 0..10_000 {
         tick(&mut controller, &mut rig);
-        let now = controller.adaptation().unwrap();
-        retreated |= now.mode == AdaptMode::Retreating;
     }
     let now = controller.adaptation().unwrap();
-    assert!(retreated && now.gain > 0.39, "{now:?}");
+    assert!(now.gain > 0.39, "{now:?}");
 }
 
 #[test]
@@ -258,7 +256,7 @@ fn a_tuning_that_moves_makes_no_bump() {
             let before = controller.adaptation().unwrap();
             let output = tick(&mut controller, &mut rig);
             let after = controller.adaptation().unwrap();
-            if k > 1000 && before != after && before.mode == AdaptMode::Moving {
+            if k > 1000 && before.gain != after.gain {
                 largest_um = largest_um.max((output.command_um - last_um).abs());
                 moved += 1;
             }

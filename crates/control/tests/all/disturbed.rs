@@ -260,3 +260,36 @@ fn a_strong_line_that_starts_takes_the_tuning_a_little_way_and_not_for_long() {
         assert!(last.gain.ln().abs() < 0.25, "{lines:?}: {last:?}");
     }
 }
+
+/// How often a stated interval held the truth, and what was told, over some holds.
+#[test]
+#[ignore = "long: run with --release -- --include-ignored"]
+fn intervals_hold_the_truth_over_every_flow_and_gain() {
+    for gain in [0.5, 1.0, 2.0] {
+        for (name, _) in flows() {
+            let (mut asked, mut stated, mut outside, mut farthest, mut events) =
+                (0, 0, 0, 0.0_f64, 0);
+            let mut error = 0.0;
+            for seed in 0..8 {
+                let (_, mut flow) = flows().into_iter().find(|f| f.0 == name).unwrap();
+                let mut held =
+                    Held::new(ControllerConfig::Lqg(Lqg::default()), RigConfig::eq6(seed));
+                held.rig.gain = gain;
+                held.hold(10, false, &mut flow);
+                held.events.clear();
+                let last = held.hold(60, true, &mut flow);
+                error += (last.gain / gain).ln().abs() / 8.0;
+                asked += held.asked;
+                stated += held.stated;
+                outside += held.outside;
+                farthest = farthest.max(held.farthest);
+                events += held.events.len();
+            }
+            println!(
+                "{gain}, {name}: stated {:.0} %, outside {:.1} %, {farthest:.1} sd at most, {events} told, off {error:.2}",
+                100.0 * f64::from(stated) / f64::from(asked),
+                100.0 * f64::from(outside) / f64::from(stated.max(1))
+            );
+        }
+    }
+}

@@ -300,7 +300,11 @@ pub const OF_LAWS: &[(&str, &str)] = &[
     ("adapt_gain_sd", "Standard deviation of the estimated gain."),
     (
         "adapt_mode",
-        "Adaptation: 0 too little motion, 1 in agreement, 2 moving, 3 paused, 4 back to the design, 5 being tested by a small motion, 6 corrected beside a disturbance.",
+        "What is known of the plant: 0 learning, 1 known, 2 uncertain (on its way to the estimate).",
+    ),
+    (
+        "adapt_dither_um",
+        "Dither in the command: the random motion by which gain and delay are known.",
     ),
 ];
 

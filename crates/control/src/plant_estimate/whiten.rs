@@ -40,7 +40,7 @@ pub(super) struct Correction {
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(super) struct Track {
     at: f64,
-    pub drift: f64,
+    drift: f64,
 }
 
 impl Whitener {

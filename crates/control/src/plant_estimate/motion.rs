@@ -1,7 +1,7 @@
 //! The model, driven with commands beside the loop, and what of its motion was not to be foreseen.
 
+use super::evidence::{LAGS, MEMBERS};
 use super::whiten::{Correction, Track, Whitener};
-use super::window::{DELAYS, MEMBERS};
 use crate::estimator::{Estimator, Fix, PredictedState};
 use crate::exposure;
 
@@ -46,11 +46,6 @@ impl Motion {
         self.past_um[0].is_finite()
     }
 
-    /// Position now, um.
-    pub fn now_um(&self) -> f64 {
-        self.past_um[0]
-    }
-
     /// Position so many ticks ago, um: between ticks the bead jumps by the direct feedthrough and then moves evenly.
     fn past(&self, ago: f64) -> Option<f64> {
         let newer = ago.max(0.0).floor();
@@ -59,22 +54,22 @@ impl Motion {
         Some(a + part * (b + self.jumps_um.get(newer)? - a))
     }
 
-    /// Positions at the exposure of a fix, for each delay beside `delay`, ticks; `None` where one that is open is not known.
-    pub fn at(
-        &self,
-        fix: &Fix,
-        delay: f64,
-        exposure: f64,
-        open: &[bool; MEMBERS],
-    ) -> Option<[f64; MEMBERS]> {
+    /// State of the model now.
+    pub fn state(&self) -> &PredictedState {
+        &self.model
+    }
+
+    /// Position at the exposure of a fix that is `delay` ticks old, um; `None` where that is not known any more.
+    pub fn seen(&self, delay: f64, exposure: f64) -> Option<f64> {
+        exposure::mean(delay, exposure, |ago| self.past(ago))
+    }
+
+    /// The same for each lag beyond `delay`, ticks.
+    pub fn at(&self, fix: &Fix, delay: f64, exposure: f64) -> Option<[f64; MEMBERS]> {
         let ago = delay + fix.age as f64 + fix.offset;
         let mut at_um = [0.0; MEMBERS];
-        for ((at, extra), open) in at_um.iter_mut().zip(DELAYS).zip(open) {
-            match exposure::mean(ago + extra, exposure, |ago| self.past(ago)) {
-                Some(um) => *at = um,
-                None if *open => return None,
-                None => {}
-            }
+        for (at, lag) in at_um.iter_mut().zip(LAGS) {
+            *at = self.seen(ago + lag, exposure)?;
         }
         Some(at_um)
     }
@@ -90,11 +85,6 @@ impl Motion {
         Some(std::array::from_fn(|j| {
             fix.innovation(&tracks[j], at_um[j])
         }))
-    }
-
-    /// Drift of a series, um a tick.
-    pub fn drift(&self, member: usize) -> f64 {
-        self.tracks.map_or(0.0, |tracks| tracks[member].drift)
     }
 
     /// A fix with those innovations.

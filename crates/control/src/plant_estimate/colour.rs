@@ -1,0 +1,128 @@
+//! What is left of the fixes may have a colour (a pump, the mains, a flow that wanders): its prediction from what was left before.
+//!
+//! All series of the regression go through the same filter, so that it changes no gain; a disturbance that can be predicted
+//! from its past then hides less of the motion that was chosen.
+
+use super::evidence::MEMBERS;
+
+/// Order of the prediction: two for each of three lines, and two for a colour.
+const ORDER: usize = 8;
+/// Memory of the correlations, fixes: a line that drifts by one per cent in that time stays within the notch that it makes.
+const MEMORY_FIXES: f64 = 1000.0;
+/// Standard deviations of what is left from which on it counts for no more in the correlations.
+const MOST: f64 = 4.0;
+/// Part of the variance that is taken for white: what a mean over [`MEMORY_FIXES`] does not know any better.
+const WHITE: f64 = 1.0 / MEMORY_FIXES;
+
+/// The series: fix, motion for each lag, instrument for each lag.
+const SERIES: usize = 1 + 2 * MEMBERS;
+
+/// The prediction and the past that it needs.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Colour {
+    correlations_um2: [f64; ORDER + 1],
+    prediction: [f64; ORDER],
+    /// Mean square of what is left beside the prediction, um^2.
+    pub white_um2: f64,
+    left_um: [f64; ORDER],
+    past_um: [[f64; SERIES]; ORDER],
+    fixes: f64,
+}
+
+impl Colour {
+    pub fn new(white_um2: f64) -> Self {
+        let mut correlations_um2 = [0.0; ORDER + 1];
+        correlations_um2[0] = white_um2;
+        Self {
+            correlations_um2,
+            prediction: [0.0; ORDER],
+            white_um2,
+            left_um: [0.0; ORDER],
+            past_um: [[0.0; SERIES]; ORDER],
+            fixes: 0.0,
+        }
+    }
+
+    /// Takes what the past tells out of the series of a fix of which `left_um` is left.
+    pub fn take_out(&mut self, series: &mut [f64; SERIES], left_um: f64) {
+        let now = *series;
+        for (past, part) in self.past_um.iter().zip(self.prediction) {
+            series
+                .iter_mut()
+                .zip(past)
+                .for_each(|(s, past)| *s -= part * past);
+        }
+        self.past_um.copy_within(0..ORDER - 1, 1);
+        self.past_um[0] = now;
+        // A model that is wrong along a reference is no disturbance.
+        let chosen_um2 = (now.iter().skip(1 + MEMBERS)).fold(0.0_f64, |most, x| most.max(x * x));
+        if chosen_um2 > self.white_um2 {
+            return;
+        }
+        let most = MOST * self.correlations_um2[0].sqrt();
+        let left_um = left_um.clamp(-most, most);
+        self.fixes += 1.0;
+        let part = 1.0 / (0.2 * MEMORY_FIXES + self.fixes).min(MEMORY_FIXES);
+        let [own, others @ ..] = &mut self.correlations_um2;
+        *own += part * (left_um * left_um - *own);
+        for (mean, past) in others.iter_mut().zip(self.left_um) {
+            *mean += part * (left_um * past - *mean);
+        }
+        self.left_um.copy_within(0..ORDER - 1, 1);
+        self.left_um[0] = left_um;
+    }
+
+    /// The best prediction by the correlations so far (Levinson and Durbin).
+    pub fn solve(&mut self) {
+        let r = &self.correlations_um2;
+        let mut error = r[0] * (1.0 + WHITE);
+        let mut a = [0.0; ORDER];
+        for k in 0..ORDER {
+            if error <= 0.0 {
+                break;
+            }
+            let known: f64 = (0..k).map(|i| a[i] * r[k - i]).sum();
+            let reflection = (r[k + 1] - known) / error;
+            let before = a;
+            for i in 0..k {
+                a[i] = before[i] - reflection * before[k - 1 - i];
+            }
+            a[k] = reflection;
+            error *= 1.0 - reflection * reflection;
+        }
+        (self.prediction, self.white_um2) = (a, error.max(0.0));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_sine_is_predicted_and_white_noise_is_not() {
+        for (amplitude, most) in [(0.0, 1.1), (10.0, 3.0)] {
+            let mut colour = Colour::new(1.0);
+            let (mut state, mut squares) = (1_u64, 0.0);
+            for k in 0..20_000 {
+                let mut noise = -6.0;
+                for _ in 0..12 {
+                    state = state
+                        .wrapping_mul(6_364_136_223_846_793_005)
+                        .wrapping_add(1_442_695_040_888_963_407);
+                    noise += (state >> 11) as f64 / (1_u64 << 53) as f64;
+                }
+                let value = noise + amplitude * (0.3 * f64::from(k)).sin();
+                let mut series = [0.0; SERIES];
+                series[0] = value;
+                colour.take_out(&mut series, value);
+                if k % 16 == 0 {
+                    colour.solve();
+                }
+                if k >= 10_000 {
+                    squares += series[0] * series[0] / 10_000.0;
+                }
+            }
+            assert!((0.9..most).contains(&squares), "{amplitude}: {squares}");
+        }
+    }
+}

@@ -1,0 +1,330 @@
+//! The estimate of the plant: gain and delay, while the loop runs, and what of them comes into force.
+//!
+//! In a closed loop the command answers whatever shakes the bead, and a disturbance of the right colour is no different from a gain
+//! that fell or rose, for any estimate from fixes and commands alone. So the loop always moves the bead a little, at random
+//! ([`dither`]): what of the fixes goes with a motion that was chosen without regard to them is the plant's, whatever else
+//! shakes the bead. The dither is an instrument in the sense of instrumental variables, and so is a reference. The regression is
+//! that of [`evidence`]; the commands drive the model beside the loop ([`motion`]), and all series go through one filter that
+//! makes white noise of Brownian motion, drift and localisation noise ([`whiten`]), so that as much as can be is known of each fix.
+//!
+//! **In force.** See [`retuning`]. The law itself is not made again: a plant of `g` times the gain is the plant of the design
+//! for displacements counted in units of `1/g`, so that estimator, feedback, feed-forward and the plan of MPC stay those of the
+//! design, in other units; the delay changes the estimator, of which there is one for each, and the gains of PI.
+
+mod colour;
+mod dither;
+mod evidence;
+mod learn;
+mod motion;
+mod retuning;
+mod whiten;
+
+use crate::design::bound_rms_um;
+use crate::error::BuildError;
+use crate::estimator::{Estimator, EstimatorConfig, Fix, PredictedState};
+use crate::loop_model::LoopModel;
+use colour::Colour;
+use dither::Dither;
+use evidence::Evidence;
+use motion::Motion;
+pub use retuning::{AdaptMode, AdaptNews};
+use retuning::{DELAYS, Force, NOMINAL, TUNINGS};
+use serde::Serialize;
+use whiten::{Covariance, Track, Whitener};
+
+/// Names of the columns that adaptation adds to a law's own in the record.
+pub const ADAPT_COLUMNS: [&str; 6] = [
+    "adapt_gain",
+    "adapt_delay_samples",
+    "adapt_gain_estimate",
+    "adapt_gain_sd",
+    "adapt_mode",
+    "adapt_dither_um",
+];
+
+/// Standard deviation of the logarithm of the gain above which the dither is louder, and by how much at most: something shakes the
+/// bead more than noise does, or the plant has just changed, and then it costs four times as much for some seconds.
+const KNOWN: f64 = 0.075;
+const LOUDEST: f64 = 2.0;
+/// Part of the stated uncertainty of the gain that stays, whatever is found.
+const LEAST_DOUBT: f64 = 0.1;
+
+/// The tuning in force, as a law is told of it.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Tuning {
+    /// Gain of the plant over the design's. Displacements that a law is given, and those that it answers, are of the PZT
+    /// times this; so are limits of displacement that it keeps by itself.
+    pub gain: f64,
+    /// Loop delay (with the half sample of hold) over the design's.
+    pub delay: f64,
+}
+
+impl Default for Tuning {
+    /// That of the design.
+    fn default() -> Self {
+        Self {
+            gain: 1.0,
+            delay: 1.0,
+        }
+    }
+}
+
+/// Where adaptation stands.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Adaptation {
+    /// Gain in force, over the design's.
+    pub gain: f64,
+    /// Delay in force beyond the design's, samples.
+    pub delay_samples: f64,
+    /// Estimated gain over the model's, and its standard uncertainty; `None` before there was motion enough.
+    pub gain_estimate: Option<[f64; 2]>,
+    /// Estimated delay beyond the design's and its standard uncertainty, samples.
+    pub delay_estimate_samples: Option<[f64; 2]>,
+    /// Where the tuning stands.
+    pub mode: AdaptMode,
+    /// A change worth telling of, in this tick.
+    #[serde(skip)]
+    pub news: Option<AdaptNews>,
+}
+
+/// The estimate of the plant for one model. Immutable; the state is apart and `Copy`.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Adapter {
+    estimators: [Option<Estimator>; TUNINGS],
+    nominal: Estimator,
+    whitener: Whitener,
+    /// Whole and fractional samples of the design's delay.
+    delay_samples: f64,
+    sample_s: f64,
+    /// Ticks from one fix to the next, and those in a row that may be without one.
+    interval: f64,
+    planned_gap: u32,
+    exposure_ticks: f64,
+    /// Command for a tick that moves the bead from the middle to a side of the dither, um.
+    side_um: f64,
+}
+
+/// State of the estimate.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct AdaptState {
+    /// The model, driven with all commands, and with those that were chosen.
+    model: Motion,
+    instrument: Motion,
+    dither: Dither,
+    seen: Option<Track>,
+    /// Of the filter of all series, and ticks since the exposure of the last fix that it took.
+    covariance: Covariance,
+    since_fix: f64,
+    /// Ticks in a row without a fix.
+    silent: u32,
+    evidence: Evidence,
+    colour: Colour,
+    noise: learn::Noise,
+    force: Force,
+    news: Option<AdaptNews>,
+}
+
+/// What the estimate is told of a tick.
+pub(crate) struct Told {
+    /// The fix that came, whether or not it was used.
+    pub fix: Option<Fix>,
+    /// Command that takes effect now, um of PZT.
+    pub command_um: f64,
+    /// Part of it that was chosen without regard to the fixes, but for the dither, um of PZT.
+    pub chosen_um: f64,
+    /// The law decides, and nothing holds the bead.
+    pub free: bool,
+}
+
+impl Adapter {
+    /// For a model and the noise of its estimator.
+    ///
+    /// # Errors
+    /// As [`Estimator::new`].
+    pub fn new(config: EstimatorConfig, model: LoopModel) -> Result<Self, BuildError> {
+        let ts = model.sample_time_s;
+        let walk_um2 = 2.0 * config.diffusion_um2_per_s * ts;
+        let drift_um2 =
+            (config.neutral_walk_um_per_sqrt_s.max(0.01) * model.gain_per_s * ts).powi(2) * ts;
+        let fix_um2 = config.fix_noise_um.powi(2);
+        let hold_um = bound_rms_um(config.diffusion_um2_per_s, 0.0, model.delay_s, ts);
+        // Where a lag keeps the plant from moving at once it still gets there, and where it moves at once it may not stay.
+        let moves = model.gain_per_s.abs().max(model.fast_gain_per_s().abs()) * ts;
+        Ok(Self {
+            // Independent of the rest of the error, so that the squares add.
+            side_um: (0.02 * config.dither_percent).sqrt() * hold_um / moves,
+            estimators: DELAYS.map(|extra| delayed(config, model, extra)),
+            nominal: Estimator::new(config, model)?,
+            whitener: Whitener::new(walk_um2, drift_um2, fix_um2, config.ticks_per_fix)?,
+            delay_samples: model.delay_samples(),
+            sample_s: ts,
+            interval: config.ticks_per_fix,
+            planned_gap: config.planned_gap(),
+            exposure_ticks: config.exposure_ms * 1e-3 / ts,
+        })
+    }
+
+    /// Nothing known, the design in force, everything at rest at a command, um.
+    pub fn start(&self, command_um: f64) -> AdaptState {
+        AdaptState {
+            model: Motion::start(command_um),
+            instrument: Motion::start(0.0),
+            dither: Dither::new(),
+            seen: None,
+            covariance: self.whitener.settled(),
+            since_fix: 0.0,
+            silent: 0,
+            evidence: Evidence::new(),
+            colour: Colour::new(self.whitener.noise_um2),
+            noise: learn::Noise::new(self.whitener.noise_um2),
+            force: Force::default(),
+            news: None,
+        }
+    }
+
+    fn usable(&self) -> [bool; TUNINGS] {
+        self.estimators.map(|one| one.is_some())
+    }
+
+    /// The estimator of the delay in force.
+    pub fn estimator(&self, state: &AdaptState) -> &Estimator {
+        self.estimators
+            .get(state.force.member)
+            .and_then(Option::as_ref)
+            .unwrap_or(&self.nominal)
+    }
+
+    /// The tuning in force.
+    pub fn tuning(&self, state: &AdaptState) -> Tuning {
+        let design = self.delay_samples + 0.5;
+        Tuning {
+            gain: state.force.log_gain.exp(),
+            delay: (design + DELAYS[state.force.member]) / design,
+        }
+    }
+
+    /// How uncertain the gain in force is, as a part of `stated`: two standard deviations of the estimate and what is in force
+    /// beside it. All of it while nothing is known.
+    pub fn gain_doubt(&self, state: &AdaptState, stated: f64) -> f64 {
+        let sure = state.force.mode != AdaptMode::Learning;
+        let Some(found) = state
+            .evidence
+            .found
+            .filter(|found| sure && found.gain > 0.0)
+        else {
+            return 1.0;
+        };
+        let off = (found.gain.ln() - state.force.log_gain).abs();
+        ((off + 2.0 * found.log_sd()) / stated.max(1e-3)).clamp(LEAST_DOUBT, 1.0)
+    }
+
+    /// What is to be added to the command of this tick, um.
+    pub fn dither_um(&self, state: &AdaptState) -> f64 {
+        state.dither.command_um
+    }
+
+    /// State of the model that the dither made, in the units of the law: the loop is not to undo it.
+    pub fn dithered(&self, state: &AdaptState) -> PredictedState {
+        let gain = state.force.log_gain.exp();
+        let at = state.dither.state();
+        PredictedState {
+            q: gain * at.q,
+            n: 0.0,
+            modes: at.modes.map(|x| gain * x),
+            last_um: gain * at.last_um,
+        }
+    }
+
+    /// How far the dither moved the bead at the time of a fix, or of one that would come now, um.
+    pub fn dither_seen_um(&self, state: &AdaptState, fix: Option<&Fix>) -> f64 {
+        let age = fix.map_or(0.0, |fix| fix.age as f64 + fix.offset);
+        let delay = self.delay_samples + DELAYS[state.force.member] + age;
+        let seen = state.dither.motion.seen(delay, self.exposure_ticks);
+        state.force.log_gain.exp() * seen.unwrap_or(0.0)
+    }
+
+    /// Where it stands.
+    pub fn adaptation(&self, state: &AdaptState) -> Adaptation {
+        let found = state.evidence.found;
+        Adaptation {
+            gain: state.force.log_gain.exp(),
+            delay_samples: DELAYS[state.force.member],
+            gain_estimate: found.map(|f| [f.gain, f.gain_sd]),
+            delay_estimate_samples: found.map(|f| [f.delay, f.delay_sd]),
+            mode: state.force.mode,
+            news: state.news.map(|news| news.in_ticks(self.interval)),
+        }
+    }
+
+    /// After the command of a tick: learns from the fix, and moves the tuning where it may. The tuning that it leaves is that
+    /// of the next tick.
+    pub fn step(&self, state: &mut AdaptState, told: &Told) {
+        state.news = None;
+        let learned = self.learn(state, told.fix.filter(|_| told.free));
+        let finite = self.drive(state, told.command_um, told.chosen_um);
+        if !told.free {
+            state.force.wait();
+            state.dither.rest();
+        }
+        if !finite {
+            let force = state.force;
+            *state = self.start(told.command_um);
+            state.force = force;
+        }
+        if learned {
+            let found = state.evidence.found;
+            state.force.follow(found.as_ref(), &self.usable());
+            state.news = state.force.news(found.as_ref());
+        } else if state.silent > self.planned_gap {
+            state.force.wait();
+        }
+    }
+
+    /// A tick that never came: the command was held.
+    pub fn skip(&self, state: &mut AdaptState, command_um: f64) {
+        self.learn(state, None);
+        // The dither that was given stays for another tick.
+        state.dither.command_um = state.dither.given_um;
+        if !self.drive(state, command_um, 0.0) {
+            *state = self.start(command_um);
+        }
+    }
+
+    /// The models one tick on. Whether all is finite.
+    fn drive(&self, state: &mut AdaptState, command_um: f64, chosen_um: f64) -> bool {
+        let chosen_um = chosen_um + state.dither.command_um;
+        let louder = (state.evidence.found).map_or(LOUDEST, |found| found.log_sd() / KNOWN);
+        let side_um = self.side_um * louder.clamp(1.0, LOUDEST) * (-state.force.log_gain).exp();
+        let dithered = state.dither.tick(&self.nominal, side_um);
+        let instrument = state.instrument.drive(&self.nominal, chosen_um);
+        state.model.drive(&self.nominal, command_um) && dithered && instrument
+    }
+
+    /// The values of [`ADAPT_COLUMNS`].
+    pub fn record(&self, state: &AdaptState, out: &mut [f32]) {
+        let now = self.adaptation(state);
+        let [gain, sd] = now.gain_estimate.unwrap_or([f64::NAN; 2]);
+        let values = [now.gain, now.delay_samples, gain, sd];
+        for (out, value) in out.iter_mut().zip(values) {
+            *out = value as f32;
+        }
+        if let Some(out) = out.get_mut(values.len()) {
+            *out = f32::from(now.mode as u8);
+        }
+        if let Some(out) = out.get_mut(values.len() + 1) {
+            *out = state.dither.given_um as f32;
+        }
+    }
+}
+
+/// The estimator for so many more samples of delay; `None` where there is none.
+fn delayed(config: EstimatorConfig, model: LoopModel, extra: f64) -> Option<Estimator> {
+    let delay_s = model.delay_s + extra * model.sample_time_s;
+    if delay_s < -1e-9 {
+        return None;
+    }
+    Estimator::new(config, LoopModel { delay_s, ..model }).ok()
+}
+
+/// Checks that nominal is where it is said to be.
+const _: () = assert!(DELAYS[NOMINAL] == 0.0);
