@@ -30,7 +30,7 @@ fn a_script_is_warned_of_a_motion_that_its_loop_will_miss_and_refused_beyond_hal
     let ran = cellpos(folder.path(), "run beyond.toml --dry --json");
     assert_eq!(ran.code, Some(2), "{}", ran.err);
     assert!(
-        ran.err.contains("500 Hz") && ran.err.contains("beyond.toml:5"),
+        ran.err.contains("600Hz") && ran.err.contains("beyond.toml:8"),
         "{}",
         ran.err
     );

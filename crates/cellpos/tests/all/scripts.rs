@@ -32,7 +32,12 @@ fn rehearsed(folder: &Path, script: &Path) -> PathBuf {
     };
     assert_eq!(done, expected, "{name}");
     // While a motion is learned, its first cycles stand out from the later ones.
-    let standing_out = if name == "sine-sweep" { done / 10 } else { 0 };
+    // In twelve minutes one cycle may be taken for stuck by chance.
+    let standing_out = match name {
+        "sine-sweep" => done / 10,
+        "fatigue" => 1,
+        _ => 0,
+    };
     let disturbed = run["cycles_disturbed"].as_u64().unwrap();
     assert!(disturbed <= standing_out, "{name}: {disturbed}");
     assert_eq!(run["summary"]["range_limited"], 0, "{name}");
@@ -278,13 +283,7 @@ fn a_report_shows_the_run_and_a_bundle_is_what_its_manifest_says() {
         assert!(page.contains(part), "{part}");
     }
     assert!(!page.contains("http-equiv") && !page.contains("src=\"http"));
-    for figure in [
-        "traces",
-        "excerpt",
-        "error-histogram",
-        "error-spectrum",
-        "cycles",
-    ] {
+    for figure in ["traces", "excerpt", "error", "error-spectrum", "cycles"] {
         assert!(
             run.join(format!("report-figures/{figure}.csv")).exists(),
             "{figure}"

@@ -220,7 +220,7 @@ fn settings_come_out_of_the_recording_and_go_into_a_rig_whose_loop_sees_the_same
     std::fs::write(root.join("bare.toml"), format!("[calibration]{rest}")).unwrap();
     let ran = cellpos(root, "vision beads --as-loop bare.toml --out none");
     assert_eq!(ran.code, Some(2));
-    assert!(message(&ran).contains("cellpos vision"), "{}", ran.err);
+    assert!(message(&ran).contains("--find-beads"), "{}", ran.err);
 }
 
 #[test]

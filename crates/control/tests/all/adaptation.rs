@@ -143,7 +143,8 @@ fn where_nothing_changes_the_estimate_is_as_good_as_it_says_and_nothing_is_told(
     let (off, told, force) = long_hold(1, 300_000);
     assert!((0.3..1.5).contains(&off), "{off} standard uncertainties");
     assert_eq!(told, 0);
-    assert!(force[0] > 0.87 && force[1] < 1.15, "{force:?}");
+    // The dither knows the gain to 7 % in ten seconds: two and a half of these are the extremes of five minutes.
+    assert!(force[0] > 0.84 && force[1] < 1.19, "{force:?}");
 }
 
 #[test]

@@ -76,3 +76,10 @@ fn one_channel<T: Copy + PartialEq + std::fmt::Display>(
     }
     None
 }
+
+/// What a picture may take of memory: a header that claims more is broken.
+pub(crate) fn limits() -> image::Limits {
+    let mut limits = image::Limits::default();
+    limits.max_alloc = Some(16 * super::MAX_PIXELS as u64);
+    limits
+}

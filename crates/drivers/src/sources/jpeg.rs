@@ -19,7 +19,7 @@ pub(crate) fn decode(
     buffer: &mut FrameBuffer,
 ) -> Result<Option<&'static str>, SourceError> {
     let mut reader = ImageReader::with_format(Cursor::new(bytes), ImageFormat::Jpeg);
-    reader.limits(super::pictures::limits());
+    reader.limits(grey::limits());
     let picture = reader.decode().map_err(|e| SourceError::Damaged {
         path: path.to_path_buf(),
         frame,

@@ -3,7 +3,7 @@
 //! Numbers in the names are frame numbers: where one is missing, a frame was lost, and the recording says so.
 
 use super::grey::{self, Grey};
-use super::{MAX_PIXELS, Recording, RecordingInfo, SourceError, check_same, check_size};
+use super::{Recording, RecordingInfo, SourceError, check_same, check_size};
 use cellpos_rig::source::FrameBuffer;
 use image::{DynamicImage, ImageReader};
 use std::path::{Path, PathBuf};
@@ -163,13 +163,6 @@ fn decode(
     }
 }
 
-/// What a picture may take of memory: a header that claims more is broken.
-pub(crate) fn limits() -> image::Limits {
-    let mut limits = image::Limits::default();
-    limits.max_alloc = Some(16 * MAX_PIXELS as u64);
-    limits
-}
-
 fn decode_png(
     path: &Path,
     frame: usize,
@@ -186,7 +179,7 @@ fn decode_png(
     };
     let mut reader = ImageReader::open(path).map_err(unreadable)?;
     reader.set_format(image::ImageFormat::Png);
-    reader.limits(limits());
+    reader.limits(grey::limits());
     let picture = reader.decode().map_err(damaged)?;
     let (width, height) = (picture.width() as usize, picture.height() as usize);
     check_size(path, width, height)?;

@@ -21,8 +21,10 @@ struct Replaying {
 impl RunSink for Replaying {
     fn tick(&mut self, record: &TickRecord) {
         self.replay.add(record);
+        // Ticks start with the arrivals of frames, which jitter by less than half a period.
         let after = self.last.is_some_and(|last| {
-            (record.seq, record.time_ns) != (last.seq + 1, last.time_ns + 1_000_000)
+            let step_ns = record.time_ns - last.time_ns;
+            record.seq != last.seq + 1 || !(500_000..1_500_000).contains(&step_ns)
         });
         self.gaps += u64::from(after);
         self.last = Some(*record);
