@@ -38,10 +38,10 @@ def test_every_column_of_an_export_has_the_same_values(here, name):
 
 def test_the_columns_words_and_flags_are_those_of_the_page_on_data():
     page = (ROOT / "docs/data.md").read_text()
-    table = page.split("### Ticks")[1].split("Behind them stand")[0]
+    table = page.split("### Ticks")[1].split("The control law's own columns")[0]
     names = [line.split("`")[1] for line in table.splitlines() if line.startswith("| `")]
     assert list(ORDER) == names
-    words = page.split("Words and the numbers")[1].split("The bits of")[0]
+    words = page.split("Words and their numbers")[1].split("The bits of")[0]
     for line in words.splitlines():
         if line.startswith("| `"):
             parts = line.split("`")

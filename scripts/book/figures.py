@@ -205,7 +205,7 @@ def live(bench: Bench):
         raise Skip("the moving picture needs Pillow: pip install pillow") from error
     if not shutil.which("chromedriver"):
         raise Skip("screenshots need chromium and chromium-driver")
-    with Browser(1180, 740) as browser:
+    with Browser(1180, 980) as browser:
         browser.open("about:blank")
         run = subprocess.Popen(["cellpos", "track", "--target", "0um", "--view", "--name", "live", "--duration", "120s"], cwd=bench.folder, stderr=subprocess.PIPE,
                                stdout=subprocess.DEVNULL, text=True)
@@ -215,22 +215,21 @@ def live(bench: Bench):
         go = lambda um: browser.run(f"const t = document.getElementById('target'); t.value = '{um}'; t.form.requestSubmit();")
         press = lambda name: browser.run(f"document.getElementById('{name}').click()")
         time.sleep(3)
-        acts = [(2.0, lambda: go(6)), (4.0, lambda: go(-4)), (6.0, lambda: press("freeze")), (8.5, lambda: press("resume")), (10.0, lambda: go(0))]
-        pictures, begin = [], time.monotonic()
-        while (now := time.monotonic() - begin) < 12.0:
-            while acts and acts[0][0] <= now:
-                acts.pop(0)[1]()
-            pictures.append((now, Image.open(io.BytesIO(browser.screenshot())).convert("RGB")))
+        # By pictures and not by the clock, so that a slow browser shows every act.
+        acts = [(lambda: None, 4), (lambda: go(6), 5), (lambda: go(-4), 5), (lambda: press("freeze"), 4), (lambda: press("resume"), 3), (lambda: go(0), 4)]
+        pictures = []
+        for act, count in acts:
+            act()
+            time.sleep(0.2)
+            pictures += [Image.open(io.BytesIO(browser.screenshot())).convert("RGB") for _ in range(count)]
         run.terminate()
         run.wait()
-    keep("live-page.png", png(pictures[len(pictures) // 3][1]))
-    frozen = min(pictures, key=lambda item: abs(item[0] - 7.5))[1]
-    keep("live-frozen.png", png(frozen))
-    small = [picture.resize((820, 820 * picture.height // picture.width), Image.LANCZOS) for _, picture in pictures]
-    times = [int(1000 * (b - a)) for (a, _), (b, _) in zip(pictures, pictures[1:])] + [800]
+    keep("live-page.png", png(pictures[7]))
+    keep("live-frozen.png", png(pictures[16]))
+    small = [picture.resize((820, 820 * picture.height // picture.width), Image.LANCZOS) for picture in pictures]
     for quality in (60, 40, 25, 15):
         film = io.BytesIO()
-        small[0].save(film, "WEBP", save_all=True, append_images=small[1:], duration=times, loop=0, quality=quality, method=4)
+        small[0].save(film, "WEBP", save_all=True, append_images=small[1:], duration=350, loop=0, quality=quality, method=4)
         if film.tell() < 1_900_000:
             break
     print(f"{len(small)} pictures, quality {quality}")
