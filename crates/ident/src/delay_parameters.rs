@@ -1,7 +1,7 @@
 //! The parameters that trade against each other behind a hold: delay, far zero, and the slow pole below the band.
 
 use crate::candidate_model::CandidateModel;
-use crate::identifiability::{Identifiability, IdentifiedParameter, WIDEST_RELATIVE};
+use crate::identified_parameter::{Identifiability, IdentifiedParameter, WIDEST_RELATIVE};
 use crate::order_selection::{CandidateFits, CandidateOrder, DelayPrior};
 
 pub(crate) fn delay_parameter(

@@ -10,56 +10,12 @@ pub use crate::bootstrap::bootstrap;
 use crate::candidate_model::CandidateModel;
 use crate::delay::apart_s;
 use crate::delay_parameters::{delay_parameter, far_zero_parameter, slow_pole_parameter};
+use crate::identified_parameter::WIDEST_RELATIVE;
+pub use crate::identified_parameter::{Identifiability, IdentifiedParameter};
 use crate::order_selection::{
     CandidateFits, CandidateOrder, DelayPrior, OrderSelection, index, model_of,
 };
 use cellpos_numeric::statistics::{quantile, student_t_quantile};
-
-/// Whether the data determine a parameter.
-#[derive(Debug, Clone, PartialEq)]
-pub enum Identifiability {
-    /// The interval can be relied on.
-    Identified,
-    /// The band excited does not determine it; the reason in a sentence.
-    NotIdentifiable {
-        /// What the data do say, and what trades against it.
-        reason: String,
-    },
-}
-
-impl Identifiability {
-    /// `identified` or `not identifiable from this band`.
-    pub fn label(&self) -> &'static str {
-        match self {
-            Identifiability::Identified => "identified",
-            Identifiability::NotIdentifiable { .. } => "not identifiable from this band",
-        }
-    }
-
-    /// Whether it is [`Identifiability::Identified`].
-    pub fn is_identified(&self) -> bool {
-        matches!(self, Identifiability::Identified)
-    }
-}
-
-/// One parameter with everything that is known of it.
-#[derive(Debug, Clone, PartialEq)]
-pub struct IdentifiedParameter {
-    /// Name with unit, for example `gain_per_s`.
-    pub name: &'static str,
-    /// What it is, in words.
-    pub meaning: &'static str,
-    /// Unit.
-    pub unit: &'static str,
-    /// Best value.
-    pub value: f64,
-    /// 95 % interval by covariance (infinite ends where the data give no bound).
-    pub ci95: [f64; 2],
-    /// 95 % interval by bootstrap, where one was run.
-    pub bootstrap95: Option<[f64; 2]>,
-    /// The verdict.
-    pub verdict: Identifiability,
-}
 
 /// The parameters of a fit of candidate orders with verdicts, and the model to go on with.
 #[derive(Debug, Clone, PartialEq)]
@@ -83,9 +39,6 @@ impl Judged {
         self.parameters.iter().find(|p| p.name == name)
     }
 }
-
-/// Half-width, relative to the value, above which an interval no longer identifies a parameter.
-pub(crate) const WIDEST_RELATIVE: f64 = 0.5;
 
 /// 95 % threshold of a profile's rise, chi-squared with one degree of freedom.
 const PROFILE_RISE: f64 = 3.841;

@@ -33,6 +33,7 @@ pub mod foreign;
 pub mod frequency_response;
 pub mod from_response;
 pub mod identifiability;
+mod identified_parameter;
 pub mod least_squares;
 pub mod noise;
 pub mod order_selection;

@@ -86,7 +86,8 @@ impl Pacer {
         }
     }
 
-    fn at(now_ns: i64, due_ns: i64) -> Pace {
+    /// A tick at a time that is known.
+    pub(crate) fn at(now_ns: i64, due_ns: i64) -> Pace {
         if now_ns >= due_ns {
             Pace::Tick(due_ns)
         } else {

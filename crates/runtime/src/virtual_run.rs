@@ -57,21 +57,23 @@ pub fn run<R: ReferenceGenerator, S: RunSink>(
     let mut watch = EndWatch::new(end);
     let mut io_error = None;
     let mut acting = Acting::new(&mut *actuator, orders, heard);
-    let mut tick = 0_u64;
+    let (mut tick, mut met) = (0_u64, false);
     let end = loop {
-        // The first tick is made at once, the others as on the real clock: on the arrival of a frame, or on the timer.
+        // As on the real clock: on the arrival of a frame, or on the timer.
         let due_ns = loop {
             while receive(source, clock.now_ns(), &mut measurements, &mut io_error) {}
             let ready_ns = ticker.look();
             let now_ns = clock.now_ns();
-            let pace = match tick {
-                0 => Pace::Tick(now_ns),
-                _ => pacer.decide(now_ns, ticker.opens_ns(), ready_ns),
+            met |= ready_ns.is_some();
+            let pace = if met {
+                pacer.decide(now_ns, ticker.opens_ns(), ready_ns)
+            } else {
+                // Before the first frame there is none to wait for.
+                Pacer::at(now_ns, start_ns + tick as i64 * periods_ns[0])
             };
             match pace {
                 Pace::Tick(due_ns) => {
-                    // The first is not one of those that frames are expected by.
-                    if tick > 0 {
+                    if met {
                         pacer.ticked(now_ns, ready_ns);
                     }
                     break due_ns;
