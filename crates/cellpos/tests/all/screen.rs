@@ -237,7 +237,8 @@ fn a_terminal_that_stalls_costs_the_run_nothing() {
             .and_then(|mut runs| runs.next()?.ok())
             .and_then(|run| std::fs::read_to_string(run.path().join("run.toml")).ok())
             .unwrap_or_default();
-        if text.contains("outcome = \"done\"") {
+        // However the run ends on a loaded machine, it ends, and its rows are on the disk.
+        if text.contains("records_lost") {
             assert!(text.contains("records_lost = 0"), "{text}");
             break;
         }
