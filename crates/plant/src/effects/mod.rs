@@ -81,7 +81,7 @@ pub use saturation::saturation;
 pub use slew_limit::slew_limit;
 pub use stick_slip::stick_slip;
 pub use stiffening::stiffening;
-pub use table::{all, find, ids, register};
+pub use table::{all, built_in, find, ids, register};
 pub use time_delay::time_delay;
 pub use user::{
     Definition, DefinitionError, FUNCTIONS, Seen, Site, UserParameter, UserState, define,

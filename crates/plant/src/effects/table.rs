@@ -41,6 +41,11 @@ static TABLE: [&dyn EffectKind; 31] = [
 /// Effects from elsewhere, in the order in which they came.
 static REGISTERED: RwLock<Vec<&'static dyn EffectKind>> = RwLock::new(Vec::new());
 
+/// The effects of the catalogue, without those that a program has registered.
+pub fn built_in() -> impl Iterator<Item = &'static dyn EffectKind> {
+    TABLE.iter().copied()
+}
+
 /// All effects that are known: the table, then those registered.
 pub fn all() -> Vec<&'static dyn EffectKind> {
     let more = REGISTERED.read().unwrap_or_else(PoisonError::into_inner);

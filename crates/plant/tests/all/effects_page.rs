@@ -8,7 +8,7 @@ const END: &str = "<!-- end -->";
 
 fn table() -> String {
     let mut text = "| id | place | equation | parameters |\n|---|---|---|---|\n".to_owned();
-    for kind in effects::all() {
+    for kind in effects::built_in() {
         let spec = kind.spec();
         let form = &spec.forms[0];
         let parameters = form.scalars.iter().chain(form.lists).map(|parameter| {
