@@ -233,15 +233,6 @@ pub fn not_armed(writer: RunWriter, failure: &Failure) {
     let _ = writer.finish(end);
 }
 
-/// Diffusion of the bead, um^2/s: of the emulated rig, or as the model says.
-pub fn diffusion_um2_per_s(file: &RigFile, model: &cellpos_plant::Model) -> f64 {
-    if file.is_emulated() {
-        file.emulator.diffusion_um2_per_s
-    } else {
-        model.noise.diffusion_um2_per_s
-    }
-}
-
 /// Smallest RMS error that any controller could reach, nm: Brownian motion and noise in force, with the delay that the run measured,
 /// not the one that was set. `None` where the run did better than that: then diffusion or noise are not what is stated, and the
 /// figure would be no bound.
@@ -257,7 +248,7 @@ pub fn bound_rms_nm(file: &RigFile, setup: &Setup, summary: &Summary) -> Option<
     };
     let bound_nm = 1e3
         * bound_rms_um(
-            diffusion_um2_per_s(file, &setup.model),
+            crate::fit::diffusion_um2_per_s(file, &setup.model),
             noise_nm * 1e-3,
             delay_s,
             timing.period_us * 1e-6,

@@ -73,3 +73,12 @@ pub fn prepare(model: &str, controller: &str, file: &RigFile) -> Result<Prepared
     let controller = setup::controller(controller, &model, &file.timing)?;
     Ok(Prepared { model, controller })
 }
+
+/// Diffusion of the bead, um^2/s: of the emulated rig, or as the model says.
+pub(crate) fn diffusion_um2_per_s(file: &RigFile, model: &cellpos_plant::Model) -> f64 {
+    if file.is_emulated() {
+        file.emulator.diffusion_um2_per_s
+    } else {
+        model.noise.diffusion_um2_per_s
+    }
+}

@@ -1,10 +1,10 @@
 //! A rig in hand, as types: [`Rig`] -> [`Armed`] -> [`Running`] -> [`Finished`].
 
-use crate::connect::diffusion_um2_per_s;
 use crate::devices::{Devices, Options, check_armed, session_number};
 use crate::ended::{Clues, Ended, Expected};
 use crate::failure::Failure;
 use crate::fit;
+use crate::fit::diffusion_um2_per_s;
 use crate::frames_seen::FramesSeen;
 use crate::real_time::LockedMemory;
 use crate::rig_file::{ClockKind, Connected, RigFile};

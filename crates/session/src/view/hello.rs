@@ -1,6 +1,5 @@
 //! What the page is told of a run before it begins.
 
-use crate::connect;
 use crate::rig::Rig;
 use crate::setup::Setup;
 use cellpos_control::ADAPT_COLUMNS;
@@ -25,7 +24,7 @@ pub struct Page {
 /// What rig and set-up say of a run.
 pub(super) fn hello(rig: &Rig, setup: &Setup, page: &Page) -> Hello {
     let source = rig.source();
-    let diffusion = connect::diffusion_um2_per_s(rig.file(), &setup.model);
+    let diffusion = crate::fit::diffusion_um2_per_s(rig.file(), &setup.model);
     Hello {
         view_um: source.field_um,
         pictures: source.width_px > 0,
