@@ -50,48 +50,48 @@ pub struct WorldConfig {
     pub localisation_um: Option<f64>,
     /// When the bead has been out of the frame for this long and the flow is slow, a new one comes, ms. Left out: never.
     pub new_bead_after_ms: Option<f64>,
-    /// Without any of the [`Imperfections`] of a real rig, but for those whose key is given.
+    /// Without any of the `Imperfections` of a real rig, but for those whose key is given.
     pub ideal: bool,
-    /// [`Imperfections::zero_flow_wander_um`].
+    /// `Imperfections::zero_flow_wander_um`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub zero_flow_wander_um: Option<f64>,
-    /// [`Imperfections::zero_flow_wander_time_s`].
+    /// `Imperfections::zero_flow_wander_time_s`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub zero_flow_wander_time_s: Option<f64>,
-    /// [`Imperfections::zero_flow_drift_um_per_s`].
+    /// `Imperfections::zero_flow_drift_um_per_s`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub zero_flow_drift_um_per_s: Option<f64>,
-    /// [`Imperfections::lateral_um`].
+    /// `Imperfections::lateral_um`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub lateral_um: Option<f64>,
-    /// [`Imperfections::tilt_deg`].
+    /// `Imperfections::tilt_deg`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub tilt_deg: Option<f64>,
-    /// [`Imperfections::focus_wander`].
+    /// `Imperfections::focus_wander`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub focus_wander: Option<f64>,
-    /// [`Imperfections::focus_time_s`].
+    /// `Imperfections::focus_time_s`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub focus_time_s: Option<f64>,
-    /// [`Imperfections::dust`].
+    /// `Imperfections::dust`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub dust: Option<u16>,
-    /// [`Imperfections::light_slope`].
+    /// `Imperfections::light_slope`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub light_slope: Option<f64>,
-    /// [`Imperfections::vignette`].
+    /// `Imperfections::vignette`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub vignette: Option<f64>,
-    /// [`Imperfections::wall_grey`].
+    /// `Imperfections::wall_grey`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub wall_grey: Option<f64>,
-    /// [`Imperfections::camera_clock_ppm`].
+    /// `Imperfections::camera_clock_ppm`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub camera_clock_ppm: Option<f64>,
-    /// [`Imperfections::exposure_jitter_us`].
+    /// `Imperfections::exposure_jitter_us`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub exposure_jitter_us: Option<f64>,
-    /// [`Imperfections::arrival_jitter_us`].
+    /// `Imperfections::arrival_jitter_us`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub arrival_jitter_us: Option<f64>,
     /// A cell and its constriction. Left out: a bead.
@@ -154,7 +154,7 @@ impl WorldConfig {
         }
     }
 
-    /// A rig with the [`Imperfections`] of a real one.
+    /// A rig with the `Imperfections` of a real one.
     pub fn real() -> Self {
         Self {
             ideal: false,

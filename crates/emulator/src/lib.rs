@@ -2,7 +2,7 @@
 //!
 //! [`World`] takes the board's output and the time, and delivers frames as a camera would, when a camera would. A frame shows
 //! a bead with a ring profile, or a cell in its channel. It is blurred along the true path during the exposure. It has shot
-//! and read noise, dust, uneven light and a focus that wanders ([`Imperfections`]). Runs that need no pictures get positions
+//! and read noise, dust, uneven light and a focus that wanders (`Imperfections`). Runs that need no pictures get positions
 //! with the equivalent noise. The world also knows the truth. Faults come from a schedule ([`Faults`]). The only clock is the
 //! time that the caller passes.
 //!
