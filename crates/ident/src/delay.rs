@@ -207,6 +207,18 @@ pub fn delay_from_edges(edges: &[SeenEdge]) -> Result<DelayEstimate, IdentError>
         .iter()
         .map(|e| [e.before_s - e.sent_s, e.after_s - e.sent_s])
         .collect();
+    let low = spans.iter().map(|s| s[0]).fold(f64::NEG_INFINITY, f64::max);
+    let high = spans.iter().map(|s| s[1]).fold(f64::INFINITY, f64::min);
+    if low < high {
+        // No edge contradicts another: the delay is anywhere between with equal right, for the dither covers the period evenly.
+        let (delay_s, width) = (0.5 * (low + high), high - low);
+        return Ok(DelayEstimate {
+            delay_s,
+            sd_s: width / 12f64.sqrt(),
+            ci95_s: [delay_s - 0.475 * width, delay_s + 0.475 * width],
+            edges: n,
+        });
+    }
     let [low, high] = most_agreed(&spans);
     let mut random = Random::new(n as u64);
     let mut drawn: Vec<[f64; 2]> = (0..200)
