@@ -37,6 +37,9 @@ static SPEC: Spec = Spec {
     separate_by: "excite to 300 Hz and beyond: a pole rolls off, an exposure follows a sinc, a resonance peaks, a delay changes the phase only",
 };
 
+/// What tells a bubble from a lag of the driver.
+pub(super) const FROM_DRIVER_LAG: &str = "a lag of the driver and a bubble in the chip give the same response from command to bead: measure the piezo itself (strain gauge or capacitive sensor) with the fluid disconnected, or repeat after an hour: a bubble's lag drifts as it dissolves";
+
 impl EffectKind for Bubble {
     fn spec(&self) -> &'static Spec {
         &SPEC
@@ -57,6 +60,10 @@ impl EffectKind for Bubble {
 
     fn at_start(&self, effect: &Effect) -> Option<Zpk> {
         Some(Zpk::low_pass(1.0 / effect.scalar(0)))
+    }
+
+    fn separate_from_double(&self) -> Option<&'static str> {
+        Some(FROM_DRIVER_LAG)
     }
 
     fn candidates(&self) -> &'static [Candidate] {

@@ -50,6 +50,10 @@ impl EffectKind for DriverLag {
         Action::Linear(Zpk::low_pass(TAU * effect.scalar(0)))
     }
 
+    fn separate_from_double(&self) -> Option<&'static str> {
+        Some(super::bubble::FROM_DRIVER_LAG)
+    }
+
     fn memory_s(&self, effect: &Effect) -> f64 {
         (std::f64::consts::TAU * effect.scalar(0)).recip()
     }

@@ -43,6 +43,11 @@ impl EffectKind for ExposureAveraging {
         Action::Exposure(effect.scalar(0))
     }
 
+    fn combined(&'static self, _: &Effect, second: &Effect) -> Option<Effect> {
+        // A camera has one exposure: the later estimate replaces the earlier.
+        Some(second.clone())
+    }
+
     fn memory_s(&self, effect: &Effect) -> f64 {
         effect.scalar(0)
     }

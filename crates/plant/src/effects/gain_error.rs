@@ -51,6 +51,14 @@ impl EffectKind for GainError {
         Ok(())
     }
 
+    fn is_gain(&self) -> bool {
+        true
+    }
+
+    fn combined(&'static self, first: &Effect, second: &Effect) -> Option<Effect> {
+        Some(gain_error(first.scalar(0) * second.scalar(0)))
+    }
+
     fn has_doubles(&self) -> bool {
         true
     }

@@ -172,6 +172,32 @@ pub trait EffectKind: fmt::Debug + Send + Sync {
         false
     }
 
+    /// Whether it multiplies all motion by one factor and does nothing else.
+    fn is_gain(&self) -> bool {
+        false
+    }
+
+    /// The candidate that keeps the static curve of the effect and none of its memory, where it has one.
+    fn memoryless(&self) -> Option<usize> {
+        None
+    }
+
+    /// Whether its simple forms are so different that the second best may become the best beside other effects.
+    fn has_unlike_forms(&self) -> bool {
+        false
+    }
+
+    /// One effect that does what two of this kind do one after the other; `None` where only both can.
+    fn combined(&'static self, first: &Effect, second: &Effect) -> Option<Effect> {
+        let _ = (first, second);
+        None
+    }
+
+    /// The experiment that tells it from an effect of [`Spec::inseparable_from`], in words.
+    fn separate_from_double(&self) -> Option<&'static str> {
+        None
+    }
+
     /// Whether something that has no name of its own answers alike from command to bead: what tells them apart is then always said.
     fn has_doubles(&self) -> bool {
         false

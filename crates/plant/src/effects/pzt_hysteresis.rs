@@ -242,6 +242,14 @@ impl EffectKind for PztHysteresis {
         true
     }
 
+    fn memoryless(&self) -> Option<usize> {
+        CANDIDATES.iter().position(|c| c.name == "curvature")
+    }
+
+    fn has_unlike_forms(&self) -> bool {
+        true
+    }
+
     fn candidates(&self) -> &'static [Candidate] {
         CANDIDATES
     }

@@ -41,6 +41,10 @@ impl EffectKind for TimeDelay {
         Action::Delay(effect.scalar(0))
     }
 
+    fn combined(&'static self, first: &Effect, second: &Effect) -> Option<Effect> {
+        Some(time_delay(first.scalar(0) + second.scalar(0)))
+    }
+
     fn memory_s(&self, effect: &Effect) -> f64 {
         effect.scalar(0)
     }

@@ -1,7 +1,7 @@
 //! The candidates of a search: every form of every known effect, and a form with its numbers.
 
 use cellpos_plant::Effect;
-use cellpos_plant::effects::{self, Candidate, EffectKind, Scope};
+use cellpos_plant::effects::{self, Action, Candidate, EffectKind, Scope};
 
 /// One form of an effect.
 #[derive(Debug, Clone, Copy)]
@@ -59,11 +59,31 @@ impl Variant {
         }
     }
 
-    /// The form of an effect by its name among the forms.
-    pub fn named(id: &str, form: &str) -> Option<Self> {
-        let kind = effects::find(id)?;
-        let form = kind.candidates().iter().position(|c| c.name == form)?;
-        Some(Self { kind, form })
+    /// Whether it is a factor on all motion.
+    pub fn is_gain(self) -> bool {
+        self.kind.is_gain()
+    }
+
+    /// The form of the same effect that has its static curve and none of its memory.
+    pub fn memoryless(self) -> Option<Self> {
+        let form = self.kind.memoryless()?;
+        Some(Self { form, ..self })
+    }
+
+    /// How many simple forms of the effect are worth following beside a set: of forms that are limits of each other the best one.
+    pub fn forms_worth_following(self) -> usize {
+        1 + usize::from(self.kind.has_unlike_forms())
+    }
+
+    /// Whether it is a richer form of an effect that no record tells from another.
+    pub fn is_rich_double_of(self, other: Self) -> bool {
+        self.candidate().late && (self.kind.spec().inseparable_from).contains(&other.id())
+    }
+
+    /// The variant that is a factor on all motion, the base model's gain set free.
+    pub fn gain() -> Option<Self> {
+        let kind = effects::all().into_iter().find(|k| k.is_gain())?;
+        Some(Self { kind, form: 0 })
     }
 }
 
@@ -138,6 +158,14 @@ impl Part {
     /// For how long it remembers what went into it \[s\].
     pub fn memory_s(&self, scope: &Scope) -> f64 {
         self.variant.kind.memory_s(&self.effect(scope))
+    }
+
+    /// Over how long the camera averages the motion with it \[s\].
+    pub fn averages_s(&self, scope: &Scope) -> f64 {
+        match self.effect(scope).act() {
+            Action::Exposure(exposure_s) => exposure_s,
+            _ => 0.0,
+        }
     }
 
     pub fn effect(&self, scope: &Scope) -> Effect {

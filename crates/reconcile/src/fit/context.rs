@@ -44,13 +44,10 @@ pub(crate) struct WhiteEvidence {
 
 impl WhiteEvidence {
     /// Squared distance, in standard deviations, between the estimate and what a set of parts leads one to expect.
-    pub fn distance(&self, parts: &[Part], sample_s: f64) -> f64 {
-        let exposure_s: f64 = parts
-            .iter()
-            .filter(|p| p.id() == "exposure-averaging")
-            .map(|p| p.natural()[0])
-            .sum();
-        let expected = self.model_um2 - self.walk_um2 * (exposure_s / sample_s).min(2.0) / 6.0;
+    pub fn distance(&self, parts: &[Part], scope: &Scope) -> f64 {
+        let exposure_s: f64 = parts.iter().map(|p| p.averages_s(scope)).sum();
+        let rows = (exposure_s / scope.sample_s).min(2.0);
+        let expected = self.model_um2 - self.walk_um2 * rows / 6.0;
         ((self.estimate_um2 - expected) / self.error_um2).powi(2)
     }
 }
@@ -130,11 +127,12 @@ impl Context<'_> {
     /// Whether an effect is no candidate: behind a bare actuator there is neither a chip nor a bead, and a free gain
     /// is no error; a sensor that counts in steps has no pixels.
     pub fn excludes(&self, id: &str) -> bool {
-        if self.quantised && id == "pixel-locking" {
-            return true;
-        }
-        self.free_gain
-            && find(id).is_some_and(|k| matches!(k.spec().place, Place::Chip | Place::Bead))
+        let Some(kind) = find(id) else {
+            return false;
+        };
+        let of_pixels = kind.candidates().iter().any(|c| c.role == Role::Position);
+        let of_bead = matches!(kind.spec().place, Place::Chip | Place::Bead);
+        self.quantised && of_pixels || self.free_gain && of_bead
     }
 
     /// The longest delay that is a number of these records \[s\]: a tenth of a second on this rig; of another plant as many rows as

@@ -3,7 +3,7 @@
 use crate::fit::catalogue::Part;
 use crate::fit::context::{Context, Fit, freedom_of};
 use crate::thresholds::{NUMBER, THRESHOLDS};
-use cellpos_plant::effects::Candidate;
+use cellpos_plant::effects::{Candidate, Role};
 
 /// Upper quantile of chi-square with `k` degrees of freedom at `z` standard normal deviations (Wilson-Hilferty).
 fn chi2_quantile(k: f64, z: f64) -> f64 {
@@ -27,9 +27,9 @@ pub(crate) fn penalised_cost(ctx: &Context<'_>, fit: &Fit) -> f64 {
     let left = left_over(fit);
     let typical: f64 = fit.parts.iter().map(|p| prior_penalty(p, left)).sum();
     // Decides ties only: the localisation noise of a rig need not be that of its model.
-    let white = ctx.white.map_or(0.0, |w| {
-        w.distance(&fit.parts, ctx.problem.base.sample_s).min(40.0)
-    });
+    let white = ctx
+        .white
+        .map_or(0.0, |w| w.distance(&fit.parts, &ctx.scope).min(40.0));
     fit.chi2 + NUMBER * fit.freedom() as f64 + typical + white
 }
 
@@ -46,7 +46,7 @@ pub(crate) fn scatter(n: f64) -> f64 {
 /// What a set must close to count as whole. Positions are known only within the noise where a pixel's error is steep: an error
 /// periodic in position never closes altogether.
 fn whole(fit: &Fit) -> f64 {
-    if fit.has("pixel-locking") {
+    if fit.of_role(Role::Position).next().is_some() {
         THRESHOLDS.closed_least
     } else {
         THRESHOLDS.closed_whole

@@ -76,7 +76,7 @@ pub(crate) fn extensions(
     let worth = worth.into_iter().filter(|part| {
         let id = part.id();
         let before = seen.iter().filter(|s| **s == id).count();
-        let new = before == 0 || (before == 1 && id == "pzt-hysteresis");
+        let new = before < part.variant.forms_worth_following();
         if new {
             seen.push(id);
         }
@@ -286,9 +286,8 @@ fn reparametrise(ctx: &Context<'_>, mut fit: Fit, mask: &Mask, effort: Effort, r
                 }
                 let form = v.id() == id && **v != fit.parts[i].variant;
                 // A lag that dissolves is a bubble.
-                let late = v.candidate().late;
-                let dissolving = id == "driver-lag" && v.id() == "bubble" && late;
-                (form || dissolving) && (rich || !late)
+                let dissolving = v.is_rich_double_of(fit.parts[i].variant);
+                (form || dissolving) && (rich || !v.candidate().late)
             })
             .flat_map(|v| v.starts_from(&fit.parts[i], &ctx.scope))
             .collect();

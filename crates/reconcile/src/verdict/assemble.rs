@@ -235,7 +235,7 @@ fn gap_steps(
         if let Some(first) = out.first_mut() {
             first.base_gain = Some(null.gain);
         }
-    } else if let Some(v) = Variant::named("gain-error", "") {
+    } else if let Some(v) = Variant::gain() {
         let parts = vec![Part::new(v, &[1.0])];
         let free = ctx.fit_from(parts, Some(null.soft), &ctx.problem.all(), 6);
         let step = GapStep {

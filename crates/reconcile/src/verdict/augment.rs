@@ -6,7 +6,7 @@ use crate::fit::context::{Context, Fit};
 use crate::simulate::near_whole;
 use crate::units::figure;
 use crate::verdict::result::{Effect as NamedEffect, Verdict};
-use cellpos_plant::effects::{self, Role};
+use cellpos_plant::effects::{self, Action, Role};
 use cellpos_plant::{Effect, Model};
 
 /// Key of the provenance of a model whose noise has a part that `[noise]` has no word for.
@@ -39,10 +39,15 @@ fn effect_of(ctx: &Context<'_>, fit: &Fit, index: usize) -> Option<Effect> {
             .count()
     };
     match part.variant().role {
-        Role::Chain if part.id() == "time-delay" => {
-            Some(effects::time_delay(without_edge(ctx, fit, v[0])))
+        Role::Chain => {
+            let effect = part.effect(&ctx.scope);
+            let Action::Delay(delay_s) = effect.act() else {
+                return Some(effect);
+            };
+            let mut whole = part.clone();
+            whole.theta[0] = part.variant().params[0].coordinate(without_edge(ctx, fit, delay_s));
+            Some(whole.effect(&ctx.scope))
         }
-        Role::Chain => Some(part.effect(&ctx.scope)),
         Role::Line => {
             let line = &fit.lines[before(Role::Line)];
             let [a, b] = line.first().copied()?;
@@ -72,7 +77,13 @@ fn effect_of(ctx: &Context<'_>, fit: &Fit, index: usize) -> Option<Effect> {
                 }
             };
             let phase_deg = b.atan2(a).to_degrees();
-            Some(effects::pixel_locking(pixel_um, amplitude, phase_deg))
+            let mut own = part.clone();
+            own.theta[0] = part.variant().params[0].coordinate(pixel_um);
+            own.effect(&ctx.scope)
+                // Beyond half a pixel the positions would fold: no model has that.
+                .with_parameter("amplitude", amplitude.min(0.5))
+                .and_then(|e| e.with_parameter("phase_deg", phase_deg))
+                .ok()
         }
     }
 }
@@ -84,11 +95,9 @@ fn add(effects: &mut Vec<Effect>, found: Effect) {
         effects.push(found);
         return;
     };
-    match found.id() {
-        "time-delay" => *old = effects::time_delay(old.scalar(0) + found.scalar(0)),
-        "gain-error" => *old = effects::gain_error(old.scalar(0) * found.scalar(0)),
-        "exposure-averaging" => *old = found,
-        _ => effects.push(found),
+    match found.kind().combined(old, &found) {
+        Some(one) => *old = one,
+        None => effects.push(found),
     }
 }
 

@@ -150,7 +150,7 @@ pub(crate) fn remembers_nothing(
     without: &Fit,
     gained: f64,
 ) -> bool {
-    part.id() == "pzt-hysteresis"
+    part.variant.memoryless().is_some()
         && gained_beside(ctx, without, bends(ctx)) > THRESHOLDS.curve_share * gained
 }
 

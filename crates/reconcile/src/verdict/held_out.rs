@@ -232,14 +232,14 @@ fn gain_shift(ctx: &Context<'_>, fit: &Fit) -> Interval {
             unit,
         };
     }
-    if fit.has("gain-error") {
+    if fit.parts.iter().any(|p| p.variant.is_gain()) {
         return Interval {
             value: 1.0,
             ci95: [1.0, 1.0],
             unit,
         };
     }
-    let Some(v) = crate::fit::catalogue::Variant::named("gain-error", "") else {
+    let Some(v) = crate::fit::catalogue::Variant::gain() else {
         return Interval {
             value: 1.0,
             ci95: [1.0, 1.0],

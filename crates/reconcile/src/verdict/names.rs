@@ -1,7 +1,7 @@
 //! The effects of a set as results: numbers with intervals, rivals, and what would tell them apart.
 
 use crate::data::frames::{self, FrameCounts};
-use crate::fit::catalogue::{Part, Variant};
+use crate::fit::catalogue::Part;
 use crate::fit::context::{Context, Fit, freedom_of};
 use crate::search::cost::{left_over, prior_penalty};
 use crate::search::sequential::Rival;
@@ -21,13 +21,12 @@ fn inseparable(a: &str, b: &str) -> bool {
 
 /// What would tell an effect from its rivals, in words for the result.
 fn separate_by(id: &str, alternatives: &[String]) -> String {
-    let lag = |a: &str| matches!(a, "driver-lag" | "bubble");
-    if lag(id) && alternatives.iter().any(|a| lag(a)) {
-        return "a lag of the driver and a bubble in the chip give the same response from command to bead: measure the piezo itself (strain gauge or capacitive sensor) with the fluid disconnected, or repeat after an hour: a bubble's lag drifts as it dissolves".to_owned();
-    }
-    effects::find(id)
-        .map_or("", |k| k.spec().separate_by)
-        .to_owned()
+    let Some(kind) = effects::find(id) else {
+        return String::new();
+    };
+    let double = alternatives.iter().any(|a| inseparable(id, a));
+    let of_double = kind.separate_from_double().filter(|_| double);
+    of_double.unwrap_or(kind.spec().separate_by).to_owned()
 }
 
 /// The effects of a set.
@@ -57,8 +56,8 @@ fn alternatives(
         let decided = ctx.white.is_some_and(|w| {
             let mut other = fit.parts.clone();
             other[index] = r.part.clone();
-            let s = ctx.problem.base.sample_s;
-            w.distance(&other, s) - w.distance(&fit.parts, s) > THRESHOLDS.white_decides
+            let distance = |parts: &[Part]| w.distance(parts, &ctx.scope);
+            distance(&other) - distance(&fit.parts) > THRESHOLDS.white_decides
         });
         // A richer form that only holds the winner as a limit of its numbers is no rival; one as simple is, however
         // unusual its size, unless what is left over says that the last percent decides nothing.
@@ -148,7 +147,7 @@ pub(crate) fn of_frames(frames: &FrameCounts) -> (Vec<NamedEffect>, Vec<String>)
     let (mut named, mut places) = (Vec::new(), Vec::new());
     let rows = [
         (
-            "frame-drops",
+            effects::frame_drops(0.0).id(),
             frames.drops_named(),
             frames.missing,
             frames.rows,
@@ -156,7 +155,7 @@ pub(crate) fn of_frames(frames: &FrameCounts) -> (Vec<NamedEffect>, Vec<String>)
             0.0,
         ),
         (
-            "frame-repeats",
+            effects::frame_repeats(0.0).id(),
             frames.repeats_named(),
             frames.repeats,
             frames.pairs,
@@ -201,7 +200,7 @@ fn mostly_curvature(ctx: &Context<'_>, fit: &Fit, index: usize, gain: f64) -> bo
     if !part.variant().params.iter().any(|p| p.name == "weights") {
         return false;
     }
-    let Some(v) = Variant::named("pzt-hysteresis", "curvature") else {
+    let Some(v) = part.variant.memoryless() else {
         return false;
     };
     // Without memory the sum of the operators is the input.

@@ -59,7 +59,7 @@ fn stands(ctx: &Context<'_>, found: &Found, top: &Fit, others: &[Fit], threads: 
             && f.parts.last().is_some_and(|p| p.id() != part.id())
     });
     let another_anchoring =
-        part.id() == "gain-error" && top.parts.iter().any(|p| p.variant.has_two_gains());
+        part.variant.is_gain() && top.parts.iter().any(|p| p.variant.has_two_gains());
     // What gains more was weighed by the search.
     let most = THRESHOLDS.addition_share * (found.null.chi2 - found.fit.chi2);
     gained < most
