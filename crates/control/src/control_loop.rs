@@ -70,7 +70,7 @@ impl<L: ControlLaw> ControlLoop<L> {
         let (config, model) = (parts.estimator, parts.model);
         let adapter = config
             .adapt
-            .then(|| Adapter::new(config, model))
+            .then(|| Adapter::new(config, model, parts.controller.feeds_forward()))
             .transpose()?;
         Ok(Self {
             estimator: Estimator::new(config, model)?,
@@ -202,10 +202,15 @@ impl<L: ControlLaw> ControlLoop<L> {
             })
         };
         let driven = driven(input, &tick, &decided);
+        // The part that cancels a line in the flow is hidden from the estimator like the learned part: the bead shows neither.
+        let cancel_um = match (&self.adapter, &state.adapt) {
+            (Some(adapter), Some(adapt)) if tick.controls => adapter.cancel_um(adapt),
+            _ => 0.0,
+        };
         let (excitation_um, learned_um) = if tick.controls {
             // What a feed-forward divided by another gain is more than the law's own.
             let over = 1.0 / driven.feed_forward_gain - 1.0 / gain;
-            let learned_um = input.learned_um + over * driven.feed_forward_um;
+            let learned_um = input.learned_um + over * driven.feed_forward_um + cancel_um;
             let usable = learned_um.is_finite();
             let dither_um = match (&self.adapter, &state.adapt) {
                 (Some(adapter), Some(adapt)) => adapter.dither_um(adapt),
@@ -251,6 +256,7 @@ impl<L: ControlLaw> ControlLoop<L> {
                 } else {
                     0.0
                 },
+                cancel_um,
                 free: tick.controls
                     && !estimate.stuck
                     && !estimate.stepped

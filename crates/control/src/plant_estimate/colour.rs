@@ -59,7 +59,7 @@ impl Colour {
         if chosen_um2 > self.white_um2 {
             return;
         }
-        let most = MOST * self.correlations_um2[0].sqrt();
+        let most = self.most_um();
         let left_um = left_um.clamp(-most, most);
         self.fixes += 1.0;
         let part = 1.0 / (0.2 * MEMORY_FIXES + self.fixes).min(MEMORY_FIXES);
@@ -70,6 +70,11 @@ impl Colour {
         }
         self.left_um.copy_within(0..ORDER - 1, 1);
         self.left_um[0] = left_um;
+    }
+
+    /// Residuals are clipped to this, um.
+    pub fn most_um(&self) -> f64 {
+        MOST * self.correlations_um2[0].sqrt()
     }
 
     /// The best prediction by the correlations so far (Levinson and Durbin).

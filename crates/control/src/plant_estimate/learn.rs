@@ -115,8 +115,10 @@ impl Adapter {
             state.force.go(rise);
         }
         let usual_um2 = state.noise.usual_um2;
+        // The usual mean square may hold a line that is cancelled by now; a bead that is held wanders less than a free one as well.
+        let wanders_um2 = usual_um2.min(self.whitener.noise_um2);
         let still =
-            state.noise.fixes > 2.0 * NOW_FIXES && state.noise.left(gain) < STILL * usual_um2;
+            state.noise.fixes > 2.0 * NOW_FIXES && state.noise.left(gain) < STILL * wanders_um2;
         if still {
             return false;
         }
@@ -125,6 +127,16 @@ impl Adapter {
             None => (gain, late),
         };
         let moved = dot(&p, &weights(believed.1));
+        // The error of the model along a reference is not a line.
+        let chosen_um = x.iter().fold(0.0_f64, |most, x| most.max(x.abs()));
+        if self.cancels && chosen_um * chosen_um < usual_um2 {
+            let most = state.colour.most_um();
+            let left_um = (y - gain * in_force).clamp(-most, most) / gain;
+            let noise_um2 = state.colour.white_um2 / (gain * gain);
+            let shown_ago = delay + late + fix.age as f64 + fix.offset;
+            let left = (left_um, noise_um2);
+            (state.lines).learn(&self.lines, &self.whitener, left, shown_ago);
+        }
         let mut series = [0.0; 1 + 2 * MEMBERS];
         series[0] = y;
         series[1..=MEMBERS].copy_from_slice(&p);

@@ -15,6 +15,7 @@ mod colour;
 mod dither;
 mod evidence;
 mod learn;
+mod lines;
 mod motion;
 mod retuning;
 mod whiten;
@@ -22,10 +23,12 @@ mod whiten;
 use crate::design::bound_rms_um;
 use crate::error::BuildError;
 use crate::estimator::{Estimator, EstimatorConfig, Fix, PredictedState};
+use crate::feedforward::{FeedForward, FeedForwardState};
 use crate::loop_model::LoopModel;
 use colour::Colour;
 use dither::Dither;
 use evidence::Evidence;
+use lines::{LineSettings, Lines};
 use motion::Motion;
 pub use retuning::{AdaptMode, AdaptNews};
 use retuning::{DELAYS, Force, NOMINAL, TUNINGS};
@@ -100,6 +103,10 @@ pub(crate) struct Adapter {
     interval: f64,
     planned_gap: u32,
     exposure_ticks: f64,
+    /// The loop cancels lines.
+    cancels: bool,
+    lines: LineSettings,
+    forward: FeedForward,
     /// Command for a tick that moves the bead from the middle to a side of the dither, um.
     side_um: f64,
 }
@@ -120,6 +127,10 @@ pub struct AdaptState {
     evidence: Evidence,
     colour: Colour,
     noise: learn::Noise,
+    lines: Lines,
+    /// The model on the path that cancels the lines, and its next command, um; `None` while the loop does not control the bead.
+    inverse: Option<FeedForwardState>,
+    cancel_um: f64,
     force: Force,
     news: Option<AdaptNews>,
 }
@@ -132,16 +143,22 @@ pub(crate) struct Told {
     pub command_um: f64,
     /// Part of it that was chosen without regard to the fixes, but for the dither, um of PZT.
     pub chosen_um: f64,
+    /// Part of it that cancels the lines in the flow, um of PZT.
+    pub cancel_um: f64,
     /// The law decides, and nothing holds the bead.
     pub free: bool,
 }
 
 impl Adapter {
-    /// For a model and the noise of its estimator.
+    /// For a model and the noise of its estimator; it cancels lines in the flow if `cancels`.
     ///
     /// # Errors
     /// As [`Estimator::new`].
-    pub fn new(config: EstimatorConfig, model: LoopModel) -> Result<Self, BuildError> {
+    pub fn new(
+        config: EstimatorConfig,
+        model: LoopModel,
+        cancels: bool,
+    ) -> Result<Self, BuildError> {
         let ts = model.sample_time_s;
         let walk_um2 = 2.0 * config.diffusion_um2_per_s * ts;
         let drift_um2 =
@@ -156,6 +173,9 @@ impl Adapter {
             estimators: DELAYS.map(|extra| delayed(config, model, extra)),
             nominal: Estimator::new(config, model)?,
             whitener: Whitener::new(walk_um2, drift_um2, fix_um2, config.ticks_per_fix)?,
+            cancels,
+            lines: LineSettings::new(ts, config.ticks_per_fix),
+            forward: FeedForward::new(&model),
             delay_samples: model.delay_samples(),
             sample_s: ts,
             interval: config.ticks_per_fix,
@@ -177,6 +197,9 @@ impl Adapter {
             evidence: Evidence::new(),
             colour: Colour::new(self.whitener.noise_um2),
             noise: learn::Noise::new(self.whitener.noise_um2),
+            lines: Lines::new(),
+            inverse: None,
+            cancel_um: 0.0,
             force: Force::default(),
             news: None,
         }
@@ -223,6 +246,11 @@ impl Adapter {
         state.dither.command_um
     }
 
+    /// Part of the command of this tick that cancels the lines, um.
+    pub fn cancel_um(&self, state: &AdaptState) -> f64 {
+        state.cancel_um
+    }
+
     /// State of the model that the dither made, in the units of the law: the loop is not to undo it.
     pub fn dithered(&self, state: &AdaptState) -> PredictedState {
         let gain = state.force.log_gain.exp();
@@ -261,7 +289,10 @@ impl Adapter {
     pub fn step(&self, state: &mut AdaptState, told: &Told) {
         state.news = None;
         let learned = self.learn(state, told.fix.filter(|_| told.free));
-        let finite = self.drive(state, told.command_um, told.chosen_um);
+        let rest_um = told.command_um - told.cancel_um;
+        let finite = self.drive(state, rest_um, told.chosen_um);
+        state.lines.tick(&self.lines);
+        self.cancel_lines(state, told.free);
         if !told.free {
             state.force.wait();
             state.dither.rest();
@@ -283,11 +314,27 @@ impl Adapter {
     /// A tick that never came: the command was held.
     pub fn skip(&self, state: &mut AdaptState, command_um: f64) {
         self.learn(state, None);
-        // The dither that was given stays for another tick.
+        // The dither stays for another tick. The command that cancels the lines should have changed, and what it lacks moves the bead.
         state.dither.command_um = state.dither.given_um;
-        if !self.drive(state, command_um, 0.0) {
+        let rest_um = command_um - state.cancel_um;
+        let finite = self.drive(state, rest_um, 0.0);
+        state.lines.tick(&self.lines);
+        self.cancel_lines(state, state.inverse.is_some());
+        if !finite {
             *state = self.start(command_um);
         }
+    }
+
+    /// The command of the next tick: it moves the model opposite to the lines.
+    fn cancel_lines(&self, state: &mut AdaptState, free: bool) {
+        state.cancel_um = 0.0;
+        if !(free && self.cancels) {
+            state.inverse = None;
+            return;
+        }
+        let (now_um, next_um) = (-state.lines.at_um(0.0), -state.lines.at_um(1.0));
+        let model = state.inverse.get_or_insert(FeedForward::rest(now_um));
+        state.cancel_um = self.forward.step(model, next_um);
     }
 
     /// The models one tick on. Whether all is finite.

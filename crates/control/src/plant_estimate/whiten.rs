@@ -16,6 +16,9 @@ pub(super) struct Whitener {
     least_um2: f64,
     /// Covariance after a fix, where all have come as they should: position, both, drift; um^2.
     settled: Covariance,
+    /// Gain of such a fix on position and drift, and the ticks between two.
+    gain: [f64; 2],
+    ticks: f64,
     /// Variance of what it makes of the wandering where fixes come as they should, um^2.
     pub noise_um2: f64,
 }
@@ -60,14 +63,37 @@ impl Whitener {
         let fix_um2 = fix_um2.max(least_um2);
         let prior = solve_dare(&a.transpose(), &(&seen * seen.transpose() / fix_um2), &q)?;
         let prior = [prior[(0, 0)], prior[(0, 1)], prior[(1, 1)]];
-        let (_, settled) = corrected(prior, fix_um2);
+        let (gain, settled) = corrected(prior, fix_um2);
         Ok(Self {
             walk_um2,
             drift_um2,
             least_um2,
             settled,
+            gain,
+            ticks,
             noise_um2: prior[0] + fix_um2,
         })
+    }
+
+    /// Its frequency response at an angle from fix to fix, rad: real and imaginary part.
+    pub fn response(&self, angle: f64) -> [f64; 2] {
+        // 1/(1 + L), L = w (K0/(1 - w) + T K1/(1 - w)^2) with w = exp(-i angle).
+        let (sin, cos) = angle.sin_cos();
+        let (w, beside) = ([cos, -sin], [1.0 - cos, sin]);
+        let over = |a: [f64; 2], b: [f64; 2]| {
+            let b2 = b[0] * b[0] + b[1] * b[1];
+            [
+                (a[0] * b[0] + a[1] * b[1]) / b2,
+                (a[1] * b[0] - a[0] * b[1]) / b2,
+            ]
+        };
+        let one = over(w, beside);
+        let two = over(one, beside);
+        let [k0, k1] = [self.gain[0], self.ticks * self.gain[1]];
+        over(
+            [1.0, 0.0],
+            [1.0 + k0 * one[0] + k1 * two[0], k0 * one[1] + k1 * two[1]],
+        )
     }
 
     /// Covariance with which series begin.

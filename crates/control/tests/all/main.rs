@@ -11,6 +11,7 @@ mod learning_beside_adaptation;
 mod limits;
 mod monitor;
 mod multi_rate;
+mod periodic;
 mod pi_loop;
 mod solvers;
 mod state_feedback;
