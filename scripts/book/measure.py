@@ -56,15 +56,15 @@ def hold(bench: Bench, figures: Figures):
     for law in ("pi", "lead", "lqg", "mpc"):
         line = f"--target 0um --controller {law} --duration 20s"
         runs = track(bench, line)
-        figures.put(f"hold.{law}", f"bead held with {law}, through frames: RMS of the true position", mean(runs, "rms_true_nm"), "nm", 1, "cellpos track --target 0um --controller LAW --duration 20s --clock virtual, seeds 1 to 5")
-    figures.put("hold.bound", "lowest possible for any controller (Brownian motion, 2.5 ms of delay)", mean(runs, "bound_rms_nm"), "nm", 1, "cellpos track --target 0um --controller LAW --duration 20s --clock virtual, seeds 1 to 5")
+        figures.put(f"hold.{law}", f"{law}, with pictures: true RMS error", mean(runs, "rms_true_nm"), "nm", 1, "cellpos track --target 0um --controller LAW --duration 20s --clock virtual, seeds 1 to 5")
+    figures.put("hold.bound", "lowest possible (Brownian motion, 2.5 ms of delay)", mean(runs, "bound_rms_nm"), "nm", 1, "cellpos track --target 0um --controller LAW --duration 20s --clock virtual, seeds 1 to 5")
 
 
 def sine(bench: Bench, figures: Figures):
     for name, law in (("pi", "--controller pi"), ("lqg", "--controller lqg"), ("learned", "--controller lqg --learn")):
         line = f"--target 0um --sine 5um@50Hz {law} --duration 6s --frames off"
         runs = track(bench, line)
-        figures.put(f"sine.{name}", f"sine of 5 um at 50 Hz, {law.removeprefix('--controller ').replace(' --', ', ')}: RMS error", mean(runs, "rms_true_nm"), "nm", 1,
+        figures.put(f"sine.{name}", f"{law.removeprefix('--controller ').replace(' --', ', ')}: RMS error", mean(runs, "rms_true_nm"), "nm", 1,
                     "cellpos track --target 0um --sine 5um@50Hz --controller LAW --duration 6s --frames off --clock virtual, seeds 1 to 5")
 
 
@@ -90,7 +90,7 @@ def cell(bench: Bench, figures: Figures):
     recovery = [float(row["recovery_s"]) for row in rows if row["recovery_s"]]
     for name, values, hidden, unit, digits in (("stretch", stretch, "3.80 to 2.86", "", 2), ("recovery", recovery, "0.16 to 0.37 s", "s", 3)):
         text = f"{values[0]:.{digits}f} to {values[-1]:.{digits}f} {unit}".strip()
-        figures.put(f"cell.{name}", f"{name} of the emulated cell, first to last of 180 passages (hidden: {hidden})", values[-1], unit, digits, f"cellpos {command}", text)
+        figures.put(f"cell.{name}", f"{name}, first to last of 180 passages (hidden: {hidden})", values[-1], unit, digits, f"cellpos {command}", text)
 
 
 def identify(bench: Bench, figures: Figures):
@@ -98,7 +98,7 @@ def identify(bench: Bench, figures: Figures):
     for key, label, unit, digits, truth in (("gain_per_s", "gain", "1/s", 1, None), ("delay_ms", "camera delay", "ms", 3, 2.0)):
         values = [run["parameters"][key]["value"] for run in found]
         more = f" (hidden: {truth})" if truth else ""
-        figures.put(f"identify.{key}", f"identified {label}, mean of five seeds{more}", statistics.fmean(values), unit, digits, "cellpos identify --clock virtual --frames off, seeds 1 to 5")
+        figures.put(f"identify.{key}", f"{label}, mean{more}", statistics.fmean(values), unit, digits, "cellpos identify --clock virtual --frames off, seeds 1 to 5")
 
 
 def reconcile(bench: Bench, figures: Figures):
@@ -107,14 +107,14 @@ def reconcile(bench: Bench, figures: Figures):
     effect = next(e for e in walk(found, "effects") if e["id"] == "driver-lag")
     number = effect["parameters"]["bandwidth_hz"]
     low, high = number["ci95"]
-    figures.put("reconcile.driver-lag", "bandwidth of a hidden amplifier (hidden: 80 Hz), 95 % interval", number["value"], "Hz", 1, f"cellpos {line}", f"{number['value']:.1f} Hz ({low:.1f} to {high:.1f})")
+    figures.put("reconcile.driver-lag", "bandwidth of an amplifier (hidden: 80 Hz), 95 % interval", number["value"], "Hz", 1, f"cellpos {line}", f"{number['value']:.1f} Hz ({low:.1f} to {high:.1f})")
     if not DATA.is_dir():
         raise Skip("the measured records are not in ../shared/data")
     piezo = DATA / "piezo-picma"
     result = json.loads(bench.cellpos(f"reconcile --model fit --data {piezo}/Model_Vi_Do.dat {piezo}/Test_Vi_Do_Di.dat --rows 0:5051 --input-column 1 --output-column 5 --rate 200Hz --json"))
     gap = result["gap"]
-    figures.put("reconcile.piezo", "measured piezo: free run on held-out records, before and after", gap["free_run_after"], "um", 2,
-                "cellpos reconcile, see the case study", f"{gap['free_run_before']:.2f} um, {gap['free_run_after']:.2f} um")
+    figures.put("reconcile.piezo", "error on held-out records, before and after", gap["free_run_after"], "um", 2,
+                "cellpos reconcile, see [the case study](case-piezo.md)", f"{gap['free_run_before']:.2f} µm, {gap['free_run_after']:.2f} µm")
 
 
 def labelled(bench: Bench, figures: Figures):
@@ -159,7 +159,7 @@ def vision(bench: Bench, figures: Figures):
         frames, program, recall, error = cells[0], cells[1].split()[0], cells[2], float(cells[3])
         short = {"rendered, SNR 10": "", "rendered, SNR 40": "-snr40", "beads-brightfield": "-beads", "trapped-bead": "-trapped"}.get(frames)
         if short is not None:
-            figures.put(f"vision.{program}{short}", f"{program}: RMS error of a position; {frames} (recall {recall})", error, "px", 4, "scripts/vision-beside-trackpy.py")
+            figures.put(f"vision.{program}{short}", f"{program}, {frames}: RMS error (recall {recall})", error, "px", 4, "scripts/vision-beside-trackpy.py")
 
 
 def times(bench: Bench, figures: Figures):
@@ -187,14 +187,14 @@ LONG = [
 def write(figures: Figures, bench: Bench):
     entries = list(figures.all.values())
     figures.save()
-    page = ["# Measurements", "", "Every figure that the project claims, with its command and date. `scripts/book-measure` writes this page; no other page repeats a figure by hand.", "",
+    page = ["# Measurements", "", "Every figure that the project claims. `scripts/book-measure` writes this page.", "",
             "Measured with " + ", ".join(sorted({e["program"] for e in entries})) + ".", "",
-            "Closed loops run on the emulated rig, on the virtual clock: a seed fixes every bit. The emulator proves what it contains and no more; see [Limits](limits.md).", ""]
+            "Closed loops run on the emulated rig, on the virtual clock. The emulator proves what it contains and no more; see [Limits](limits.md).", ""]
     for line in dict.fromkeys(e["command"] for e in entries):
         alike = [e for e in entries if e["command"] == line]
         page += [f"**{command(line)}** ({max(e['date'] for e in alike)})", "", "| figure | what | value |", "|---|---|---|"]
         page += [f"| `{e['id']}` | {e['what']} | {e['shown']} |" for e in alike] + [""]
-    page += ["## Long tables", "", "These take minutes to hours. Run them for your machine and version:", "", "| command | shows |", "|---|---|"]
+    page += ["## Long tables", "", "These take minutes to hours:", "", "| command | shows |", "|---|---|"]
     page += [f"| `{line}` | {what} |" for line, what in LONG]
     (ROOT / "docs/measurements.md").write_text("\n".join(page) + "\n")
     readme = ROOT / "README.md"

@@ -94,7 +94,7 @@ pub fn span(time: Seconds) -> Duration {
 /// Reads the name of a run.
 ///
 /// # Errors
-/// Says what a name may hold.
+/// Names the characters that a name may have.
 pub fn run_name(text: &str) -> Result<String, String> {
     cellpos_record::check_name(text)
         .map(|()| text.to_owned())
@@ -134,7 +134,7 @@ where
     }
 }
 
-/// Reads the delay of a loop: a few milliseconds, so that a number without a unit is taken for a slip of those.
+/// Reads the delay of a loop: a number without a unit probably means milliseconds.
 ///
 /// # Errors
 /// Says what would be right.
@@ -149,8 +149,8 @@ pub fn loop_delay(text: &str) -> Result<Seconds, String> {
     positive(text)
 }
 
-/// The words of a command line, with each value that begins with a minus and a digit joined to the option before it
-/// (`--duration -3s`): else it would be taken for an option of its own, and the message would not be about the value.
+/// The words of a command line, with each value that begins with a minus and a digit joined to the option in front of it (`--duration
+/// -3s`). Otherwise clap takes it for an option, and the message is not about the value.
 pub fn joined(words: impl IntoIterator<Item = OsString>) -> Vec<OsString> {
     let mut joined: Vec<OsString> = Vec::new();
     for word in words {

@@ -1,4 +1,4 @@
-//! A rig that is opened for a run, with all that `cellpos rig check` has to say of it.
+//! A rig opened for a run, with all findings that `cellpos rig check` has about it.
 
 use crate::outcome::Failure;
 use cellpos_session::{Options, Rig, RigFile};
@@ -23,7 +23,7 @@ pub fn open(
     };
     before_a_run(&check::findings(&file, path), path, anyway)?;
     let mut rig = Rig::open(file, options)?;
-    // An emulated camera is what its table says.
+    // An emulated camera matches its table.
     if !rig.file().is_emulated() {
         let seen = rig.look(LOOK_NS)?;
         before_a_run(&check::of_frames(rig.file(), &seen, path), path, anyway)?;
@@ -31,7 +31,7 @@ pub fn open(
     Ok(rig)
 }
 
-/// What a run asks before anything moves: warnings are said, an error ends it unless `anyway`.
+/// Check of a run before anything moves: warnings are printed, an error ends it unless `anyway`.
 fn before_a_run(findings: &[Finding], path: &Path, anyway: bool) -> Result<(), Failure> {
     let place = |finding: &Finding| {
         let line = finding

@@ -5,8 +5,7 @@ use cellpos_session::clips::{ClipConfig, Clips, Schedule};
 use cellpos_session::{Failure, Rig};
 use std::path::Path;
 
-/// The clips of the next run on a rig, into its folder; none where there are no frames, or where the run is not of the real
-/// clock: there nobody looks on, and the run is over before a picture is written.
+/// The clips of the next run on a rig, into its folder. There are none without frames or on the virtual clock.
 pub fn of(rig: &mut Rig, folder: &Path, wishes: &ClipWishes) -> Result<Option<Clips>, Failure> {
     let source = rig.source();
     if source.width_px == 0 || rig.clock().is_virtual() {
@@ -40,7 +39,7 @@ pub fn schedule(plan: &Plan, wishes: &ClipWishes) -> Schedule {
     schedule
 }
 
-/// What the user should know of the clips of a run that is over.
+/// Summary of the clips of a run that is over.
 pub fn warnings(clips: Option<Clips>) -> Vec<String> {
     let Some(clips) = clips else {
         return Vec::new();

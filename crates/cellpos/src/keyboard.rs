@@ -1,4 +1,4 @@
-//! Single keys from the terminal, without echo, while something else goes on.
+//! Single keys from the terminal, without echo, in the background.
 
 use rustix::termios::{self, LocalModes, OptionalActions, SpecialCodeIndex, Termios};
 use std::sync::Arc;

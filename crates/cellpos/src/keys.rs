@@ -1,4 +1,4 @@
-//! Keys while a run goes on. The signals that do the same where there is no keyboard are those of every session.
+//! Keys during a run. The signals that do the same where there is no keyboard are those of every session.
 
 use crate::keyboard::{self, Keyboard};
 use cellpos_runtime::Request;
@@ -16,7 +16,7 @@ pub const OF_A_MOTION: &str = "f freeze, q stop";
 /// Which keys a script takes.
 pub const OF_A_SCRIPT: &str = "p pause, s next step, q stop";
 
-/// Keys of a script: p pauses and goes on, s skips, q stops.
+/// Keys of a script: p pauses and continues, s skips, q stops.
 pub fn of_a_script(operator: &Arc<Operator>) -> Option<Keyboard> {
     let operator = Arc::clone(operator);
     keyboard::listen(move |keys| keys.iter().for_each(|key| press(*key, &operator)))
@@ -27,8 +27,8 @@ pub fn of_a_track(mut steering: Steering) -> Option<Keyboard> {
     keyboard::listen(move |keys| steering.take(keys))
 }
 
-/// What keys do to a run whose target the operator may move: by arrows (left and right 0.1 um, down and up 1 um), or by a
-/// number and Enter. f, p or space freezes and goes on, q freezes, then parks; Escape takes back what was typed.
+/// Keys of a run whose target the operator may move. Arrows move it (left and right 0.1 um, down and up 1 um); a number and Enter
+/// sets it. f, p or space freezes and continues, q freezes, then parks. Escape deletes the typed number.
 pub struct Steering {
     operator: Arc<Operator>,
     typed: Typed,
@@ -57,7 +57,7 @@ impl Steering {
         }
     }
 
-    /// What was read at once: an arrow is several bytes, and comes as a whole.
+    /// Bytes of one read: an arrow has several bytes, which come together.
     fn take(&mut self, keys: &[u8]) {
         let mut rest = keys;
         while let Some((&key, behind)) = rest.split_first() {

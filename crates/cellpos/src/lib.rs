@@ -37,16 +37,16 @@ const LAST: usize = 1000;
     name = "cellpos",
     version = provenance::VERSION_AND_COMMIT,
     arg_required_else_help = true,
-    after_help = "RUST_LOG (else CELLPOS_LOG) sets what is logged, for example RUST_LOG=cellpos_rig=debug."
+    after_help = "RUST_LOG or CELLPOS_LOG selects logs, for example RUST_LOG=cellpos_rig=debug."
 )]
 struct Cli {
-    /// Log more on standard error; twice: more still.
+    /// Log more on standard error; twice: even more.
     #[arg(long, global = true, action = clap::ArgAction::Count, conflicts_with = "quiet", help_heading = EVERYWHERE, display_order = LAST)]
     verbose: u8,
-    /// Log errors alone, and show no progress.
+    /// Log errors only, without progress.
     #[arg(long, global = true, help_heading = EVERYWHERE, display_order = LAST)]
     quiet: bool,
-    /// Write over files that are there already.
+    /// Overwrite existing files.
     #[arg(long, global = true, help_heading = EVERYWHERE, display_order = LAST)]
     force: bool,
     #[command(subcommand)]

@@ -10,13 +10,12 @@ const PATIENCE: Duration = Duration::from_secs(10);
 /// Options of commands that can take a night.
 #[derive(Debug, clap::Args)]
 pub struct NotifyArgs {
-    /// A command for the shell when the run is over: CELLPOS_EVENT is end, stop, safe or failed, CELLPOS_REASON a sentence,
-    /// CELLPOS_RUN the run folder, CELLPOS_NAME the run's name. It is started when the PZT is parked.
+    /// Shell command that runs after the end, with the PZT parked. CELLPOS_EVENT is end, stop, safe or failed; CELLPOS_REASON a sentence; CELLPOS_RUN the folder; CELLPOS_NAME the name.
     #[arg(long, value_name = "COMMAND")]
     notify: Option<String>,
 }
 
-/// What is told.
+/// Contents of a notification.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum What {
     /// The run came to its end.
@@ -51,7 +50,7 @@ impl NotifyArgs {
             .env("CELLPOS_NAME", name)
             .env("CELLPOS_REASON", reason)
             .env("CELLPOS_RUN", run.unwrap_or(""))
-            // What it prints goes where messages go: standard output is the result's.
+            // Its output goes to standard error, because standard output holds the result.
             .stdin(Stdio::null())
             .stdout(Stdio::null())
             .spawn();

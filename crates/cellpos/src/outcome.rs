@@ -7,7 +7,7 @@ use serde::Serialize;
 use std::process::ExitCode;
 use std::time::Duration;
 
-/// What a command that ran to its end has to say.
+/// Result of a command that ran to its end.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Outcome {
     /// Done: exit code 0.
@@ -36,7 +36,7 @@ pub fn print_json(value: &impl Serialize) -> Result<(), Failure> {
     print_object(&crate::output::settings().command, value)
 }
 
-/// Prints a value as JSON under a schema of its own: a command that has results of two kinds.
+/// Prints a value as JSON under its schema, for a command with results of two kinds.
 pub fn print_json_of(schema: &str, value: &impl Serialize) -> Result<(), Failure> {
     print_object(schema, value)
 }
@@ -74,7 +74,7 @@ fn reads_utf8() -> bool {
 
 fn print(text: &str) -> Result<(), Failure> {
     use std::io::Write;
-    // What a run was told to say is shown below what it said while it ran.
+    // The summary comes after the messages of the run.
     cellpos_terminal::stderr().flush(PATIENCE);
     match std::io::stdout().write_all(clean(text, Colours::Kept).as_bytes()) {
         Err(error) if error.kind() != std::io::ErrorKind::BrokenPipe => Err(Failure::Failed(
@@ -153,7 +153,7 @@ pub fn exit(result: CommandResult, json: bool) -> ExitCode {
     // Files are quoted in it: nothing in them gives orders to the terminal.
     eprintln!("{}", clean(&format!("{report:?}"), Colours::Kept));
     if json {
-        // Nobody is left to be told of a standard output that is gone.
+        // Nobody reads a message about a closed standard output.
         let _ = print_object("error", &error_object(kind, &report));
     }
     ExitCode::from(code)
@@ -190,8 +190,8 @@ pub fn exit_arguments(error: &clap::Error, json: bool) -> ExitCode {
         });
     if let Some(run) = surplus {
         eprintln!(
-            "\n  help: {run} is one more run, and this command takes one (did a glob match two?): name it, or write latest-NAME \
-             for the newest of a name"
+            "\n  help: {run} is a second run, and this command takes one (did a glob match two?): name one, or write latest-NAME \
+             for the newest of that name"
         );
     }
     let code = u8::try_from(error.exit_code()).unwrap_or(2);

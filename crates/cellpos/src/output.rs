@@ -7,7 +7,7 @@ use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, MutexGuard, PoisonError, RwLock};
 
-/// What the command line says for every command.
+/// Options of every command.
 #[derive(Debug, Clone, Default)]
 pub struct Settings {
     /// Name of the command.
@@ -24,12 +24,12 @@ static SETTINGS: RwLock<Settings> = RwLock::new(Settings {
     quiet: false,
 });
 
-/// Keeps what the command line says.
+/// Keeps these options.
 pub fn configure(settings: Settings) {
     *SETTINGS.write().unwrap_or_else(PoisonError::into_inner) = settings;
 }
 
-/// What the command line says.
+/// These options.
 pub fn settings() -> Settings {
     SETTINGS
         .read()
@@ -98,7 +98,7 @@ impl TermLike for Screen {
     }
 }
 
-/// Looks at files that are to be written, before anything is measured: each must be new, unless `--force` is given, and its
+/// Checks the output files before anything is measured. Each must be new, unless `--force` is given, and its
 /// folder there or possible to make, with room for a file in it.
 ///
 /// # Errors
@@ -144,7 +144,7 @@ fn ready_one(path: &Path, force: bool) -> Result<(), Failure> {
     {
         std::fs::create_dir_all(folder).map_err(refused)?;
     }
-    // Made and taken away again: what the system grants cannot be told from its permission bits alone.
+    // Makes a file and removes it: permission bits alone do not show whether writing works.
     std::fs::OpenOptions::new()
         .write(true)
         .create_new(true)

@@ -1,4 +1,4 @@
-//! `--view` and `--tui`: a run as it is seen while it goes on.
+//! `--view` and `--tui`: the view of a running run.
 
 use cellpos_session::live_line::Typed;
 use cellpos_session::rig_file::ClockKind;
@@ -12,12 +12,10 @@ use std::net::SocketAddr;
 /// Options of commands that show a live page.
 #[derive(Debug, clap::Args)]
 pub struct PageArgs {
-    /// Show it in a browser: picture, traces, events, stop keys. Prints two links, one to act and one to look. Without an
-    /// address: a free port of this machine.
+    /// Show the run in a browser. Prints two links: one to act, one to look. Default address: a free port of this machine.
     #[arg(long, value_name = "ADDRESS", num_args = 0..=1, default_missing_value = "127.0.0.1:0")]
     view: Option<SocketAddr>,
-    /// Let other machines reach --view: whoever has the link can move the PZT, and nothing is encrypted. An SSH tunnel is safer:
-    /// ssh -L 8000:127.0.0.1:PORT HOST.
+    /// Let other machines reach --view, without encryption: everybody with the link can move the PZT. Safer: ssh -L 8000:127.0.0.1:PORT HOST.
     #[arg(long, requires = "view")]
     view_unsafe_address: bool,
 }
@@ -27,7 +25,7 @@ pub struct PageArgs {
 pub struct ViewArgs {
     #[command(flatten)]
     page: PageArgs,
-    /// Show the run on the whole terminal: state, traces, gauge, events, cycles. Keys as without it.
+    /// Show the run on the whole terminal.
     #[arg(long)]
     tui: bool,
 }
@@ -127,7 +125,7 @@ pub fn said(view: &View) {
     }
 }
 
-/// On the terminal, which the screen may have: then it is told when it is given back.
+/// On the terminal; if the screen has it, after the screen has released it.
 fn eprintln_or_keep(view: &View, text: &str) {
     if view.has_screen() {
         cellpos_session::say::say(text);

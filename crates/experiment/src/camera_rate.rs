@@ -1,20 +1,18 @@
 //! Whether the camera gives a frame in each period of the loop.
 //!
-//! A record has a row for each frame, and its excitation is played by the loop's clock: with a camera of another rate every
-//! frequency of it would be wrong.
+//! A record has a row per frame, and the loop's clock plays its excitation: with a camera of another rate every frequency would be wrong.
 
 use cellpos_runtime::{TickFlags, TickRecord};
 use cellpos_session::Failure;
 
 /// Frames in a window: the stamps of two frames may be off by a tenth of a period each.
 const WINDOW: u64 = 500;
-/// Windows that tell: in one of them the camera may have restarted, and not have counted what it lost.
+/// Windows for the decision: in one the camera may have restarted without counting lost frames.
 const WINDOWS: usize = 3;
 /// What is agreed to: a crystal is off by 0.01 %.
 const AGREES: f64 = 1e-3;
 
-/// Frames per second by the stamps of the camera, where that is not one in each period of the loop; `None` where it is, and
-/// while that is not known.
+/// Frames per second by the stamps of the camera, if it differs from one per period of the loop; `None` if it is, or not known yet.
 pub(crate) fn foreign_rate_hz(ticks: &[TickRecord], period_ns: i64) -> Option<f64> {
     let mut from: Option<(u64, i64)> = None;
     let mut spacings_ns = Vec::new();

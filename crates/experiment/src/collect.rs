@@ -62,11 +62,11 @@ pub struct Ran {
     pub age_s: f64,
 }
 
-/// Runs one experiment, all its times multiplied by `share`. What there is of its record is written to `file` as each part
-/// ends, so that it is there whatever ends the process.
+/// Runs one experiment, all its times multiplied by `share`. Its record so far is written to `file` after each part, so that it
+/// survives the process.
 ///
 /// # Errors
-/// The rig failed, or the run ended before its time; what was recorded lies in `file`.
+/// The rig failed, or the run ended early; its record is in `file`.
 pub fn run_experiment(
     rig: &OnRig,
     experiment: Experiment,

@@ -1,7 +1,7 @@
 //! Experiments that tell effects apart: excitations added to the command of a held bead.
 //!
-//! Which one is wanted follows from the names that the records leave open. All of them keep the bead in view, so that they
-//! run unattended; what needs hands (another bead, the fluid disconnected) is not here.
+//! Which one is wanted follows from the names that the records leave open. All keep the bead in view and run unattended; experiments
+//! that need hands (another bead, the fluid disconnected) are not here.
 
 use crate::on_rig::OnRig;
 use cellpos_ident::excitation::{Signal, Tone};
@@ -150,7 +150,7 @@ impl Experiment {
                 let slow = |frequency_hz: f64| {
                     let tone = Tone {
                         frequency_hz,
-                        // The loop gives way to it; the bead moves by what its sensitivity leaves.
+                        // The loop acts against it; the bead moves by the sensitivity times the excitation.
                         amplitude_um: 1.0,
                         phase_rad: 0.0,
                     };

@@ -1,4 +1,4 @@
-//! What a run of an identification plays, and where its ticks go.
+//! Segments of an identification's run, and the sink of its ticks.
 
 use cellpos_ident::experiment::{Schedule, Span};
 use cellpos_runtime::{
@@ -11,13 +11,12 @@ use std::sync::mpsc::Sender;
 /// Ticks at rest between closing the loop and the first segment.
 pub(crate) const SETTLE_TICKS: usize = 500;
 
-/// Ticks at rest behind the last segment: what the excitation has left is made good and the zero-flow displacement is known
-/// again before the bead is frozen there.
+/// Ticks at rest after the last segment: the loop settles and knows the zero flow again before the bead is frozen there.
 pub(crate) const REST_TICKS: usize = 400;
 
 /// Holds the bead at 0 um and plays the excitation, counted from where the loop was closed.
 ///
-/// A segment in which the bead is frozen is spoilt; what is left of it is not played. The bead that is found again is caught
+/// A segment with a frozen bead is spoilt; the rest is not played. The bead that is found again is caught
 /// by a loop at rest, not by one that is being shaken, and the next segment begins from there.
 #[derive(Debug)]
 pub(crate) struct Exciting {
@@ -79,7 +78,7 @@ impl ReferenceGenerator for Exciting {
 /// Hands every tick on, to whoever waits for the run.
 pub(crate) struct Handing {
     ticks: Sender<TickRecord>,
-    /// The segments, by ticks since the first of them.
+    /// The segments, by ticks since the first one.
     spans: Vec<Span>,
     /// The tick in which the loop was closed, and the newest.
     closed: Option<u64>,
@@ -88,7 +87,7 @@ pub(crate) struct Handing {
 }
 
 impl Handing {
-    /// Of a run that measures `spans`, by ticks since the first of them, at a period of `period_s`.
+    /// Of a run that measures `spans`, by ticks since the first one, at a period of `period_s`.
     pub(crate) fn new(ticks: Sender<TickRecord>, spans: &[Span], period_s: f64) -> Self {
         Self {
             ticks,
@@ -106,7 +105,7 @@ impl RunSink for Handing {
             self.closed = Some(record.seq);
         }
         self.newest = record.seq;
-        // Nobody who hears it: the run is given up already.
+        // No receiver: the run has already ended.
         let _ = self.ticks.send(*record);
     }
     fn event(&mut self, _: &Event) {}

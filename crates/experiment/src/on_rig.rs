@@ -67,13 +67,13 @@ pub struct Acquired {
 pub enum Trouble {
     /// The run ended before its time: another one would end like it, until something is done.
     Ended(Ended),
-    /// The bead was lost for long in some of them: measured again, they may be whole.
+    /// In some the bead was lost for long; a repetition may be complete.
     Spoilt {
         /// How many.
         missing: usize,
         /// Of how many.
         of: usize,
-        /// The first of them, and what spoilt it.
+        /// The first one, and the reason.
         first: String,
     },
 }
@@ -89,11 +89,11 @@ impl std::fmt::Display for Trouble {
     }
 }
 
-/// Who hears of a run while it goes on.
+/// Receiver of the progress of a run.
 pub struct Listener<'a> {
     /// Ticks so far.
     pub progress: &'a mut (dyn FnMut(usize) + Send),
-    /// What there is whenever a segment has ended.
+    /// State after each segment.
     pub segment: &'a mut (dyn FnMut(&Acquired) + Send),
 }
 
@@ -125,7 +125,7 @@ impl OnRig {
         })
     }
 
-    /// What an excitation is shaped by: the model expected, the loop's PI and delay.
+    /// Inputs of the excitation's design: expected model, PI and delay of the loop.
     pub fn bench_setup(&self) -> Setup {
         let timing = &self.file.timing;
         let real = !self.file.is_emulated() || self.clock == ClockKind::Real;
@@ -228,7 +228,7 @@ impl OnRig {
             ticks.extend(received.try_iter().map(&mut counted));
             (listener.progress)(ticks.len());
             if foreign_rate_hz(&ticks, period_ns).is_some() {
-                // Known after a second; nothing of it can be used.
+                // Detected after a second; the record is useless.
                 operator.ask(Request::Park);
                 return;
             }

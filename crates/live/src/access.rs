@@ -82,7 +82,7 @@ pub(crate) fn is_our_host(host: &str, address: SocketAddr) -> bool {
     let Ok(ip) = name.parse::<std::net::IpAddr>() else {
         return false;
     };
-    // An address cannot be rebound; where the server listens on all of them, any is its own.
+    // An address cannot be rebound; a server on all addresses accepts any.
     ip.is_loopback() || ip == address.ip() || address.ip().is_unspecified()
 }
 

@@ -1,4 +1,4 @@
-//! One client: its queue, and the thread that empties it into a socket and reads what the client asks.
+//! One client: its queue, and the thread that empties it into a socket and reads requests.
 
 use crate::access::Role;
 use crate::command::{CommandError, OperatorRequest};
@@ -11,9 +11,9 @@ use tungstenite::{Error, Message, WebSocket};
 
 /// How often a client is looked after when nothing comes.
 const LOOK_EVERY: Duration = Duration::from_millis(10);
-/// A client that takes nothing for this long is let go.
+/// A client that takes nothing for this long is disconnected.
 const STALLED_AFTER: Duration = Duration::from_secs(5);
-/// Requests of a second; a client that asks more is let go.
+/// Requests per second; a client with more is disconnected.
 const MOST_REQUESTS: u32 = 50;
 /// Longest message of a client, bytes.
 const MESSAGE_BYTES: usize = 4096;
@@ -77,7 +77,7 @@ impl Client {
         Ok(())
     }
 
-    /// Reads and acts on what the client has asked.
+    /// Reads and executes the client's requests.
     fn requests(&mut self, shared: &Shared) -> Result<(), Error> {
         if self.second.elapsed() > Duration::from_secs(1) {
             self.second = Instant::now();

@@ -9,13 +9,13 @@ const NOTE_CHARACTERS: usize = 500;
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(tag = "do", rename_all = "kebab-case")]
 pub enum OperatorRequest {
-    /// Stop the bead where it is.
+    /// Stop the bead.
     Freeze,
     /// Go on after a freeze or a pause.
     Resume,
     /// Ramp to park: the run ends.
     Park,
-    /// Stop the script's clock, and the bead where it is.
+    /// Stop the script's clock and the bead.
     Pause,
     /// Go on with the script's next step.
     Skip,
@@ -26,7 +26,7 @@ pub enum OperatorRequest {
     },
     /// A note into the run's events.
     Note {
-        /// What it says; control characters are taken out.
+        /// Its text, without control characters.
         text: String,
     },
 }
@@ -49,7 +49,7 @@ pub enum CommandError {
 }
 
 impl OperatorRequest {
-    /// Reads a request. `targets_um` bounds targets where it is known.
+    /// Reads a request. `targets_um` bounds targets if known.
     ///
     /// # Errors
     /// [`CommandError`], to be told to whoever asked.
@@ -105,7 +105,7 @@ mod tests {
             Err(CommandError::Unreadable(_) | CommandError::OutOfView(..))
         ));
         assert!(read(r#"{"do":"arm"}"#).is_err());
-        // A stop is a stop, whatever stands beside it.
+        // A stop is executed with any other content.
         assert_eq!(
             read(r#"{"do":"park","now":true}"#),
             Ok(OperatorRequest::Park)

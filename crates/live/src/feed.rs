@@ -150,7 +150,7 @@ impl Feed {
 }
 
 impl FeedHub {
-    /// What the run is.
+    /// The run.
     pub fn hello(&self) -> &Hello {
         &self.hello
     }
@@ -160,7 +160,7 @@ impl FeedHub {
         self.rows.pop().ok()
     }
 
-    /// The next of what is told in words, likewise.
+    /// The next message in words, if any.
     pub fn next_line(&mut self) -> Option<Line> {
         self.lines.pop().ok()
     }

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-/// Gives a clip by its name, as [`film_bytes`] makes it; `None`: there is none of that name.
+/// Gives a clip by its name, as [`film_bytes`] makes it; `None`: no clip of that name.
 pub type Film = Arc<dyn Fn(&str) -> Option<Vec<u8>> + Send + Sync>;
 
 /// A frame of a clip.
@@ -10,7 +10,7 @@ pub type Film = Arc<dyn Fn(&str) -> Option<Vec<u8>> + Send + Sync>;
 pub struct FilmFrame {
     /// Time since the start of the run, s.
     pub time_s: f64,
-    /// Centre of bead or cell, px; NaN when there was none.
+    /// Centre of bead or cell, px; NaN without one.
     pub centre_px: [f32; 2],
     /// `width * height` grey values, row by row.
     pub pixels: Vec<u8>,

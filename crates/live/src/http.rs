@@ -11,7 +11,7 @@ const BODY_BYTES: usize = 4096;
 /// A request has to be there after this long.
 const REQUEST_WITHIN: Duration = Duration::from_secs(3);
 
-/// What every answer says to the browser: no page may frame this one, and nothing may come from elsewhere.
+/// Headers of every answer: no page may frame this one, and no content may come from elsewhere.
 const SAFE_HEADERS: &str = "Content-Security-Policy: default-src 'none'; script-src 'self'; style-src 'self'; \
 img-src 'self' blob: data:; connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'\r\n\
 X-Content-Type-Options: nosniff\r\nX-Frame-Options: DENY\r\nReferrer-Policy: no-referrer\r\n\

@@ -1,4 +1,4 @@
-//! From the rings to every client, and what a new client gets first.
+//! From the rings to every client, and the first messages for a new client.
 
 use crate::feed::{FeedHub, Line};
 use crate::queue::Queue;
@@ -13,7 +13,7 @@ use tungstenite::{Bytes, Message};
 const ROWS: u8 = 1;
 /// First byte of a picture.
 const PICTURE: u8 = 2;
-/// Rows that a new client gets of the past of a run that goes on; of one that is over, all that the page can hold.
+/// Past rows for a new client of a running run; of one that is over, as many as the page can hold.
 const PAST_ROWS: usize = 10_000;
 /// What the page can hold of a run, s, and rows at most.
 const HELD: (f64, usize) = (600.0, 1_200_000);
@@ -28,7 +28,7 @@ const PAST_CLIPS: usize = 1000;
 /// Rows of one message: a client that reads slowly loses little at a time.
 const ROWS_OF_A_MESSAGE: usize = 2000;
 
-/// What is told in words.
+/// Messages in words.
 #[derive(Debug, Serialize)]
 #[serde(rename_all = "kebab-case")]
 enum Told<'a> {

@@ -1,4 +1,4 @@
-//! What waits for one client: bounded, the oldest goes first.
+//! Queue of one client: bounded, the oldest message is dropped first.
 
 use std::collections::VecDeque;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};

@@ -21,7 +21,7 @@ pub struct Row {
     pub measured_um: f32,
     /// Reference, um.
     pub target_um: f32,
-    /// Reference at the exposure of the measurement, um: what its error is counted from.
+    /// Reference at the exposure of the measurement, um; the error refers to it.
     pub target_then_um: f32,
     /// Commanded PZT displacement, um.
     pub command_um: f32,
@@ -103,7 +103,7 @@ pub struct Picture {
     pub upright: bool,
     /// Position along the channel of the centre of the first pixel, um.
     pub first_um: f32,
-    /// Centre of bead or cell, px; NaN when there was none.
+    /// Centre of bead or cell, px; NaN without one.
     pub centre_px: [f32; 2],
     /// Half width of what is drawn around it, px, along columns and rows.
     pub half_px: [f32; 2],

@@ -111,7 +111,7 @@ fn held(address: SocketAddr) -> &'static str {
 
 /// How long whoever has the address is given to say who it is.
 const PATIENCE: Duration = Duration::from_millis(300);
-/// By what the page of a run is known: its line to the program says this of itself.
+/// Identity of a run's page on its line to the program.
 const ITS_FIRST_LINE: &str = "The line to the program: messages in, requests out";
 
 /// A page that is being served; dropping it ends its threads.

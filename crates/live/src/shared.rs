@@ -22,7 +22,7 @@ pub(crate) struct Shared {
     pub(crate) over: AtomicBool,
     pub(crate) clients: Clients,
     pub(crate) connections: AtomicUsize,
-    /// Connections that have not yet said what they want, oldest first, by their number.
+    /// Connections without a request yet, oldest first, by number.
     pub(crate) silent: Mutex<VecDeque<(u64, TcpStream)>>,
     pub(crate) command: Box<dyn Fn(OperatorRequest) + Send + Sync>,
     pub(crate) on_thread: Option<Arc<dyn Fn() + Send + Sync>>,
@@ -57,14 +57,14 @@ impl Shared {
         Message::text(serde_json::to_string(&greeting).unwrap_or_default())
     }
 
-    /// Remembers a connection until it says what it wants.
+    /// Remembers a connection until its request.
     pub(crate) fn await_word(&self, number: u64, stream: &TcpStream) {
         if let Ok(stream) = stream.try_clone() {
             self.silent().push_back((number, stream));
         }
     }
 
-    /// A connection has said what it wants, or is gone.
+    /// A connection has sent its request, or is closed.
     pub(crate) fn has_spoken(&self, number: u64) {
         self.silent().retain(|(of, _)| *of != number);
     }

@@ -1,4 +1,4 @@
-//! What the page is told in words: what the run is, how it stands, what happened.
+//! Messages in words for the page: the run, its state, its events.
 
 use serde::Serialize;
 
@@ -15,7 +15,7 @@ pub struct Hello {
     pub range_um: [f64; 2],
     /// Slew limit, um/s.
     pub slew_um_per_s: f64,
-    /// Ends of the field of view along the channel, um; NaN where it is not known.
+    /// Ends of the field of view along the channel, um; NaN if unknown.
     pub view_um: [f64; 2],
     /// Budget of a tick, us.
     pub budget_us: f64,
@@ -38,7 +38,7 @@ pub struct Hello {
     pub pictures: bool,
     /// Whether the run is over and read from its folder.
     pub recorded: bool,
-    /// Where in a record's columns of the law those of adaptation begin, where it adapts; the page is told in words.
+    /// First column of adaptation among the law's columns, if it adapts; the page gets words.
     #[serde(skip)]
     pub adaptation_at: Option<usize>,
 }
@@ -68,7 +68,7 @@ impl Default for Hello {
 }
 
 impl Hello {
-    /// Between which ends a target lies, um; NaN where that is not known.
+    /// Range of targets, um; NaN if unknown.
     pub fn targets_um(&self) -> [f64; 2] {
         if self.by_hand {
             self.range_um
@@ -81,7 +81,7 @@ impl Hello {
 /// The banner: one word and one sentence.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct Banner {
-    /// `armed`, `running`, `frozen`, `paused`, `safe`, `over`: the banner's colour goes with it.
+    /// `armed`, `running`, `frozen`, `paused`, `safe`, `over`: it sets the banner's colour.
     pub state: &'static str,
     /// Why, in a sentence.
     pub reason: String,
@@ -101,7 +101,7 @@ impl Default for Banner {
 pub struct LastWord {
     /// `done`, `stopped` (by the operator), `not-kept`, `safe`, `failed`.
     pub how: &'static str,
-    /// What was seen, and what was expected where that is something else.
+    /// Observation, and expectation if different.
     pub seen: String,
     /// What to do; empty if there is nothing.
     pub to_do: String,
@@ -124,7 +124,7 @@ pub struct State {
     pub fix_noise_nm: Option<f64>,
     /// Wake-up of the ticks behind their due time, us: the least time that 99.9 % of them do not exceed.
     pub wake_us: Option<f64>,
-    /// Computing time of the ticks, us, likewise.
+    /// Computing time of the ticks, us, with the same percentile.
     pub compute_us: Option<f64>,
     /// Ticks handed over late.
     pub late: u64,
@@ -144,7 +144,7 @@ pub struct State {
     pub doing: Option<String>,
     /// What comes next in the script.
     pub next: Option<String>,
-    /// Time left, s, where it is known.
+    /// Time left, s, if known.
     pub left_s: Option<f64>,
     /// How it ended, once it has.
     pub last_word: Option<LastWord>,
@@ -166,7 +166,7 @@ pub struct EventLine {
 pub struct ClipLine {
     /// Its name.
     pub name: String,
-    /// What it is kept of: time since the start of the run, s.
+    /// Its moment: time since the start of the run, s.
     pub time_s: f64,
     /// Its frames.
     pub frames: u64,

@@ -1,8 +1,7 @@
 //! A plan against a model and limits, before anything moves.
 //!
 //! The PZT displacement that a plan asks for is that of the exact inverse of the model's plant under a zero-order hold
-//! (strictly proper form, minimum phase): u_k is solved from y_(k+1). What noise, drift and a wrong gain ask on top is
-//! covered by a reserve.
+//! (strictly proper form, minimum phase): u_k is solved from y_(k+1). A reserve covers noise, drift and a wrong gain.
 
 use crate::error::ScriptError;
 use crate::plan::{Motion, Plan, Segment};
@@ -237,7 +236,7 @@ pub fn check(script: &Script, model: &Model, limits: &CheckLimits) -> Result<Che
 }
 
 impl Check {
-    /// Accounts for a tick of a wave whose PZT demand could be so many times larger.
+    /// Accounts for a tick of a wave whose PZT demand could be larger by this factor.
     fn wave(&mut self, segment: &Segment, times: f64, view_um: f64) {
         let Motion::Wave {
             shape,

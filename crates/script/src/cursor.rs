@@ -83,7 +83,7 @@ impl Plan {
     }
 
     /// A cursor at a time of the plan, to resume at a whole cycle. Waits before it count as done, and as having taken no
-    /// time; [`Cursor::expect_elapsed`] says what they did take.
+    /// time; [`Cursor::expect_elapsed`] has their real time.
     pub fn start_at(&self, plan_s: f64) -> Cursor {
         let segment = self.segments().partition_point(|s| s.start_s < plan_s);
         let segment = match self.segments().get(segment.saturating_sub(1)) {
@@ -106,7 +106,7 @@ impl Plan {
         }
     }
 
-    /// The reference of this tick; then the cursor goes on by `sample_s`. Allocates nothing and cannot panic.
+    /// The reference of this tick; then the cursor advances by `sample_s`. Allocates nothing and cannot panic.
     pub fn step(&self, cursor: &mut Cursor, sample_s: f64, seen: &Seen) -> Output {
         if !matches!(cursor.status, Progress::Done | Progress::Stopped(_)) {
             self.advance(cursor, sample_s, seen);
@@ -290,12 +290,12 @@ impl Cursor {
         self.first_length_um = length_um;
     }
 
-    /// Counts the running time on from here, s: what the sessions before took.
+    /// Adds the running time of earlier sessions, s.
     pub fn expect_elapsed(&mut self, elapsed_s: f64) {
         self.elapsed_s = elapsed_s;
     }
 
-    /// Time of the script in which nothing of the plan is followed: on the way to where it goes on.
+    /// Time of the script without the plan: on the way to its next position.
     pub(crate) fn pass(&mut self, sample_s: f64) {
         self.elapsed_s += sample_s;
     }

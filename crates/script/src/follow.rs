@@ -12,7 +12,7 @@ const TAIL_TICKS: u32 = 25;
 
 /// Walks a loop through a plan.
 ///
-/// Before the plan's clock starts, and after a step was skipped, the bead is led to where the plan begins or goes on (a
+/// Before the plan's clock starts, and after a step was skipped, the bead is led to where the plan begins or continues (a
 /// minimum-jerk move of at most [`Follower::APPROACH_UM_PER_S`]) and given time to settle there. While the bead is
 /// frozen the plan's clock stands still, so that no cycle is lost to a pause; running time and stop conditions go on.
 #[derive(Debug, Clone)]
@@ -45,7 +45,7 @@ enum Approach {
 impl Follower {
     /// Highest speed of the approach, um/s.
     pub const APPROACH_UM_PER_S: f64 = 100.0;
-    /// Time to settle before the plan goes on, s.
+    /// Time to settle before the plan continues, s.
     pub const SETTLE_S: f64 = 0.2;
 
     /// Follows a plan from a time on (0, or the end of the last cycle that is done). `delay_ticks`: from the middle of an
@@ -68,7 +68,7 @@ impl Follower {
         }
     }
 
-    /// The same, with the length that the cell had when the run began, um: what its change is counted from.
+    /// The same, with the cell's length at the start of the run, um, as the reference of its change.
     #[must_use]
     pub fn with_first_length(mut self, length_um: Option<f64>) -> Self {
         self.cursor.expect_length(length_um);
@@ -89,7 +89,7 @@ impl Follower {
         &self.plan
     }
 
-    /// What it is doing.
+    /// Its activity.
     pub fn stage(&self) -> Stage {
         self.stage
     }
@@ -366,7 +366,7 @@ mod tests {
         };
         let found = ticks(&mut follower(text), &change);
         assert!(about(found, 2000), "{found}");
-        // The session before ran for 1.4 s, and the plan goes on from 1 s.
+        // The session before ran for 1.4 s, and the plan continues from 1 s.
         let plan = Arc::new(Plan::new(&Script::parse(text, "t.toml").unwrap()).unwrap());
         let resumed = |elapsed_s| Follower::new(Arc::clone(&plan), 1.0, 2).with_elapsed(elapsed_s);
         assert!(about(ticks(&mut resumed(Some(1.4)), &|_, _| {}), 600));

@@ -16,7 +16,7 @@ pub const MOST_BYTES: u64 = 1 << 26;
 /// Most steps that a script may have after its sweeps are written out.
 const MAX_STEPS: usize = 100_000;
 impl Script {
-    /// Reads a script; files that it names are looked for beside it.
+    /// Reads a script; the files that it names are in its folder.
     ///
     /// # Errors
     /// [`ScriptError`] with the place; a file that cannot be read is an error at line 1.

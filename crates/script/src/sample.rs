@@ -33,7 +33,7 @@ pub struct Sample {
 }
 
 impl Sample {
-    /// This one, with what it leaves out taken from another.
+    /// This one, with missing values from another.
     #[must_use]
     pub fn or(&self, other: &Self) -> Self {
         let text = |a: &Option<String>, b: &Option<String>| a.clone().or_else(|| b.clone());

@@ -1,4 +1,4 @@
-//! What a script says. Reading it from a file: `read.rs`.
+//! Content of a script. Reading it from a file: `read.rs`.
 
 use crate::sample::Sample;
 use std::ops::Range;
@@ -68,7 +68,7 @@ pub enum OnTimeout {
     /// The script stops.
     #[default]
     Stop,
-    /// The script goes on.
+    /// The script continues.
     Continue,
 }
 
@@ -94,7 +94,7 @@ pub enum Load {
     Peak,
 }
 
-/// When a script stops by itself.
+/// Stop conditions of a script.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Stop {
     /// No bead or cell seen for longer than this, s.
@@ -106,10 +106,10 @@ pub struct Stop {
     pub amplitude_error_above: Option<f64>,
     /// Length of the cell changed by more than this since the first frame, um.
     pub length_change_above_um: Option<f64>,
-    /// Mean stretch of ten cycles below that of the first ten by this share of it. This and the next two are judged on the
+    /// Mean stretch of ten cycles below that of the first ten by this share. This and the next two are judged on the
     /// rows of the per-cycle table, see [`crate::FatigueWatch`].
     pub stretch_down: Option<f64>,
-    /// Mean length of the cell at the start of ten cycles away from that of the first ten by this share of it, up or down.
+    /// Mean length of the cell at the start of ten cycles away from that of the first ten by this share, up or down.
     pub rest_length_change: Option<f64>,
     /// Mean recovery time of ten cycles above this, s.
     pub recovery_above_s: Option<f64>,
@@ -124,13 +124,13 @@ pub struct Stop {
 pub struct ClipWishes {
     /// Cycles, from 1.
     pub cycles: Vec<u64>,
-    /// Phases of them, as shares of a cycle.
+    /// Phases, as fractions of a cycle.
     pub phases: Vec<f64>,
     /// Time before the moment, s.
     pub before_s: f64,
     /// Time behind it, s.
     pub after_s: f64,
-    /// All of them together, MB at most.
+    /// Largest size of all clips together, MB.
     pub most_mb: u64,
     /// Whether what happens (the bead lost, a freeze, Safe) is kept too.
     pub events: bool,
@@ -227,7 +227,7 @@ pub enum StepKind {
     },
     /// Static control: as long as a labelled step, at its load, without cycles.
     Static {
-        /// Label of the step that it stands beside.
+        /// Label of its cyclic step.
         like: String,
         /// Which load.
         load: Load,
@@ -245,7 +245,7 @@ pub struct Script {
     pub name: String,
     /// Free text, kept with the run.
     pub notes: String,
-    /// What was in the channel; what it leaves out is the rig file's.
+    /// Content of the channel; missing values come from the rig file.
     pub sample: Sample,
     /// Position at which the script starts, um.
     pub start_um: f64,
@@ -253,7 +253,7 @@ pub struct Script {
     pub learn: bool,
     /// Stop conditions.
     pub stop: Stop,
-    /// Clips to keep, if any are wanted beside those of what happens.
+    /// Clips to keep, besides those of events.
     pub clips: Option<ClipWishes>,
     /// The steps.
     pub steps: Vec<Step>,

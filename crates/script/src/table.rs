@@ -1,4 +1,4 @@
-//! Tables of a script beside its steps: `[stop]`, `[sample]` and `[clips]`.
+//! Tables of a script besides its steps: `[stop]`, `[sample]` and `[clips]`.
 
 use crate::error::ScriptError;
 use crate::node::{Node, length, time};

@@ -1,4 +1,4 @@
-//! Adaptation of the loop to the plant: whether it is asked for, and what came of it in words.
+//! Adaptation of the loop to the plant: whether it is on, and its outcome in words.
 
 use cellpos_control::{AdaptMode, Adaptation, ControllerFile};
 use cellpos_runtime::life::EventKind;
@@ -13,7 +13,7 @@ pub enum Adapt {
     Off,
 }
 
-/// What the command line asks for goes before what the controller has: `lqg` and `mpc` by name adapt, a controller.toml does as
+/// The command line precedes the controller: `lqg` and `mpc` by name adapt, a controller.toml does as
 /// its key `adapt` in `[estimator]` says.
 pub fn choose(asked: Option<Adapt>, controller: &mut ControllerFile) {
     if let Some(asked) = asked {
@@ -37,7 +37,7 @@ pub fn text(now: &Adaptation) -> String {
     )
 }
 
-/// Where adaptation stood in a tick, from its columns in the record; `None` where they are empty.
+/// State of adaptation in a tick, from its columns in the record; `None` if they are empty.
 pub(crate) fn recorded(columns: &[f32]) -> Option<Adaptation> {
     let [gain, delay_samples, found, sd, mode, ..] = *columns else {
         return None;
@@ -68,7 +68,7 @@ pub(crate) fn sentence(kind: &EventKind) -> String {
         return String::new();
     };
     let (gain, delay_ms) = ([gain_before, gain], [delay_before_ms, delay_ms]);
-    /// A change of the gain that is worth a word beside one of the delay.
+    /// Smallest change of the gain that is mentioned with a change of the delay.
     const CHANGED: f64 = 1.1;
     let ratio = gain[1] / gain[0];
     let gain_changed = !(1.0 / CHANGED..=CHANGED).contains(&ratio);

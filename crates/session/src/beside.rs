@@ -15,7 +15,7 @@ pub(crate) fn beside_the_loop() {
     };
     let mut set = CpuSet::new();
     others.iter().for_each(|cpu| set.set(*cpu));
-    // Refused, it shares all of them by the ordinary scheduler, below the loop's threads.
+    // If refused, it shares all CPUs under the ordinary scheduler, below the loop's threads.
     let _ = sched_setaffinity(None, &set);
 }
 

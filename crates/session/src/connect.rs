@@ -1,4 +1,4 @@
-//! What a run folder says of a run, and what the user should know of one that is over.
+//! The description of a run in its folder, and the warnings after its end.
 
 use crate::Failure;
 use crate::ended::Ended;
@@ -50,7 +50,7 @@ pub fn meta(
     }
     meta.config = table(&setup.config)?;
     let mut anchored = anchored(file)?;
-    // What the script says of the sample goes before what the rig file says.
+    // The script's sample precedes that of the rig file.
     let of_script = setup.config.reference.script()?;
     let of_script = of_script.map_or_else(Sample::default, |(script, _)| script.sample);
     let sample = of_script.or(&anchored.sample.unwrap_or_default());
@@ -98,8 +98,7 @@ pub fn room(root: &Path, ticks: Option<u64>, meta: &RunMeta) -> Result<(), Failu
     space::check(root, ticks, &meta.columns).map_err(Failure::input)
 }
 
-/// The rig with absolute paths, as it is kept with a run: whoever goes on with the run need not start the program from the
-/// same folder.
+/// The rig with absolute paths, as kept with a run, so that a resume works from any folder.
 fn anchored(file: &RigFile) -> Result<RigFile, Failure> {
     let absolute = |path: &Path| {
         std::path::absolute(path).map_err(|error| {
@@ -171,7 +170,7 @@ pub struct Kept {
     pub whole: bool,
 }
 
-/// Ends a run folder; what is not on the disk is counted in the summary and said in the warnings.
+/// Ends a run folder. The summary counts rows that are not on the disk, and a warning names them.
 pub fn finish(
     mut writer: RunWriter,
     (outcome, ended): (&str, &Ended),
@@ -229,7 +228,7 @@ pub fn not_armed(writer: RunWriter, failure: &Failure) {
     let mut end = RunEnd::new("not-armed");
     end.summary
         .insert("why".to_string(), toml::Value::String(failure.text()));
-    // The failure itself is what the user hears of.
+    // The user sees the failure itself.
     let _ = writer.finish(end);
 }
 
@@ -255,7 +254,7 @@ pub fn bound_rms_nm(file: &RigFile, setup: &Setup, summary: &Summary) -> Option<
         );
     let measured_nm = |nm: f64| (nm * nm - noise_nm * noise_nm).max(0.0).sqrt();
     let reached_nm = (summary.rms_true_nm).or(summary.rms_measured_nm.map(measured_nm));
-    // An RMS of n independent values has a relative standard deviation of 1/sqrt(2 n); three of them.
+    // An RMS of n independent values has a relative standard deviation of 1/sqrt(2 n); three standard deviations.
     let unsure = 3.0 * (CORRELATED_S / summary.duration_s.max(CORRELATED_S)).sqrt();
     let beaten = reached_nm.is_some_and(|nm| nm < bound_nm * (1.0 - unsure));
     (!beaten).then_some(bound_nm)
@@ -271,7 +270,7 @@ pub fn delay_warning(file: &RigFile, summary: &Summary) -> Option<String> {
     crate::setup::camera_delay_advice(found_ms, &file.timing)
 }
 
-/// What the user should know of a run that is over.
+/// Warnings about a run that is over.
 pub fn warnings<S>(finished: &Finished<S>) -> Vec<String> {
     let mut warnings = finished.rig.warnings().to_vec();
     warnings.extend(delay_warning(finished.rig.file(), &finished.summary));
@@ -280,7 +279,7 @@ pub fn warnings<S>(finished: &Finished<S>) -> Vec<String> {
     warnings
 }
 
-/// What a gain that is not the model's may come from. Positions in pixels times a wrong pixel size are a gain wrong by the
+/// Possible causes of a gain that differs from the model's. Positions in pixels times a wrong pixel size are a gain wrong by the
 /// same factor.
 fn gain_warning(ratio: f64, calibration: Option<&Calibration>) -> String {
     let pixel = calibration.map_or_else(String::new, |c| {

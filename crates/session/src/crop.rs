@@ -17,7 +17,7 @@ pub(crate) struct Crop {
 }
 
 impl Crop {
-    /// At most `most` px about bead or cell, or about where it is expected. The crop moves with it in `steps` of its size.
+    /// At most `most` px about bead or cell, or about its expected place. The crop moves with it in `steps` of its size.
     pub(crate) fn about(seen: &SeenFrame<'_>, most: (usize, usize), steps: usize) -> Self {
         let frame = &seen.frame;
         let about = seen.centre_px.unwrap_or(seen.expected_px);

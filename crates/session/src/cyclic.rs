@@ -73,7 +73,7 @@ impl Sine {
         let drive_um = amplitude_um / gain;
         let stroke_um = 0.5 * (limits.high_um - limits.low_um);
         let slew_um = limits.slew_um_per_s / (std::f64::consts::TAU * hz);
-        // The smaller of what the range and the slew leave of the amplitude.
+        // Amplitude after the limits of range and slew, whichever is smaller.
         let share = stroke_um.min(slew_um) / drive_um;
         if share < 1.0 {
             let which = if slew_um < stroke_um {
@@ -111,7 +111,7 @@ impl Sine {
 pub struct Motion<'a> {
     /// In words.
     pub name: String,
-    /// The motion by itself.
+    /// The motion alone.
     pub reference: &'a dyn Reference,
     /// From when on it is in full swing, s.
     pub from_s: f64,
@@ -140,7 +140,7 @@ impl Motion<'_> {
         .map_err(Failure::input)
     }
 
-    /// What to say of a loop that is predicted to miss this motion by more than a tenth of its amplitude; `better` gives the same rig
+    /// Warning about a loop with a predicted error above a tenth of this motion's amplitude; `better` gives the same rig
     /// with another controller.
     ///
     /// # Errors
@@ -236,7 +236,7 @@ const SINE_HARMONICS: u32 = 3;
 
 /// A periodic motion that is to be learned.
 pub struct Wanted<'a> {
-    /// The motion by itself.
+    /// The motion alone.
     pub reference: &'a dyn Reference,
     /// From when on it is in full swing, s.
     pub from_s: f64,
@@ -308,7 +308,7 @@ impl LearnSpec {
             .map(|learner| learner.with_margins(self.margins))
     }
 
-    /// The learner beside the loop.
+    /// The learner of the loop.
     pub fn learning(&self, sample_s: f64) -> Result<CycleLearning, Failure> {
         let learner = self.learner(sample_s).map_err(|error| match self.margins {
             Some(margins) if matches!(error, LearnError::NotConvergent { .. }) => {
@@ -347,8 +347,7 @@ struct LearnedFile {
     motion: Vec<NamedTable>,
 }
 
-/// What a run learned; nothing when it left no file. What was learned can be learned again: a file that was cut off is said to
-/// be, and passed over.
+/// What a run learned; nothing when it left no file. Learning can be repeated: a truncated file gives a warning and is ignored.
 pub fn load_learned(folder: &Path) -> Vec<NamedTable> {
     let path = folder.join(LEARNED_TOML);
     let read = match cellpos_table::read_text(&path, MOST_BYTES) {

@@ -13,7 +13,7 @@ pub struct Options {
     pub clock: ClockKind,
     /// Whether an emulated rig renders frames.
     pub frames: Frames,
-    /// Do not ask the operating system for real time.
+    /// Run without real-time priority.
     pub best_effort: bool,
 }
 
@@ -66,7 +66,7 @@ impl Drop for Devices {
     }
 }
 
-/// What the board answered to `arm` must be that it is armed, and where it was.
+/// What the board answered to `arm` must be: armed, and the displacement that it had.
 pub(crate) fn check_armed(
     report: &ActuatorReport,
     session: u16,

@@ -46,7 +46,7 @@ pub struct Ended {
     pub seen: String,
     /// What was expected; empty where nothing went wrong.
     pub expected: String,
-    /// What to do; empty where there is nothing.
+    /// What to do; empty if nothing.
     pub to_do: String,
 }
 

@@ -22,7 +22,7 @@ impl Failure {
         Self::Failed(miette::Report::from_err(error))
     }
 
-    /// A run that could not be carried through, with what was expected and what to do where that is known.
+    /// A run that failed, with the expectation and the remedy if known.
     pub fn of_run(error: RunError) -> Self {
         match error {
             RunError::RecorderHangs { .. } => Self::Failed(miette::miette!(

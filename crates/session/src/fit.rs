@@ -34,7 +34,7 @@ pub(crate) fn narrow(setup: &mut Prepared, file: &RigFile, rig: &Connected) {
     }
 }
 
-/// Ticks from frame to frame of a camera that is slower than the loop, 1 where it is about as fast.
+/// Ticks per frame of a camera that is slower than the loop; 1 if it is about as fast.
 fn ticks_per_fix(period_us: f64, rate_hz: f64) -> f64 {
     /// A camera that is off by less is meant to be as fast.
     const AS_FAST: f64 = 1.25;

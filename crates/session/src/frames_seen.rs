@@ -22,7 +22,7 @@ impl FramesSeen {
         clock: &Clock,
         span_ns: i64,
     ) -> Result<Self, Failure> {
-        // What has piled up is old.
+        // The queued frames are old.
         while source
             .next(clock.now_ns())
             .map_err(Failure::failed)?

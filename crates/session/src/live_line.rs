@@ -12,11 +12,11 @@ pub struct LiveLine {
     pub high_um: f64,
     /// Which keys do what; empty: none are listened to.
     pub keys: &'static str,
-    /// What the operator is typing.
+    /// Number that the operator is typing.
     pub typed: Typed,
 }
 
-/// What the operator is typing, shared by the thread of the keys and the one of the line; neither has real-time rights.
+/// The typed number, shared by the threads of keys and line; neither is real-time.
 #[derive(Debug, Clone, Default)]
 pub struct Typed(Arc<Mutex<String>>);
 
@@ -26,7 +26,7 @@ impl Typed {
         *self.0.lock().unwrap_or_else(PoisonError::into_inner) = text.to_string();
     }
 
-    /// What there is.
+    /// Content.
     pub fn text(&self) -> String {
         self.0
             .lock()
@@ -39,7 +39,7 @@ impl Typed {
 type Part = (u8, String);
 
 impl LiveLine {
-    /// The line for a terminal of so many columns.
+    /// The line for a terminal of this width.
     pub fn text(
         &self,
         record: &TickRecord,
@@ -87,7 +87,7 @@ fn fit(mut parts: Vec<Part>, columns: usize) -> String {
         let least = (0..parts.len()).max_by_key(|&n| parts[n].0);
         match least {
             Some(n) if parts[n].0 > 0 => drop(parts.remove(n)),
-            // The cursor stands behind the line: it needs a column.
+            // The cursor needs a column after the line.
             _ => return line.chars().take(columns.saturating_sub(1)).collect(),
         }
     }

@@ -1,4 +1,4 @@
-//! What a run folder says of the loop that was in force.
+//! The recorded set-up of a run's loop.
 
 use crate::failure::Failure;
 use crate::setup::{Setup, SetupConfig};

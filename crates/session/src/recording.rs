@@ -78,7 +78,7 @@ impl Recording {
     /// The run folder's writer, to be finished.
     pub fn into_writer(self) -> Option<RunWriter> {
         if self.line.is_some() {
-            // The last line stays above what the command says.
+            // The last line stays above the command's output.
             cellpos_terminal::stderr().leave();
         }
         self.writer

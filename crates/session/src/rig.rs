@@ -47,8 +47,8 @@ impl Rig {
     }
 
     /// A rig of devices that no rig file knows: any stream of positions, any actuator. Of `file` the loop's part is taken:
-    /// limits, times, arming. `clock` is the one that the stamps of the positions are of; where it is virtual, nothing in the
-    /// devices may wait for the machine's.
+    /// limits, times, arming. `clock` is the one that the stamps of the positions are of; if it is virtual, no device may wait
+    /// for the machine's clock.
     ///
     /// # Errors
     /// Never in practice: the nominal model is built in.
@@ -91,12 +91,12 @@ impl Rig {
         &self.devices.connected.clock
     }
 
-    /// What the board says of itself.
+    /// Description of the board.
     pub fn actuator(&self) -> ActuatorInfo {
         self.devices.connected.actuator.info()
     }
 
-    /// What the camera says of itself.
+    /// Description of the camera.
     pub fn source(&self) -> SourceInfo {
         self.devices.connected.source.info()
     }
@@ -120,7 +120,7 @@ impl Rig {
         &self.operator
     }
 
-    /// What the user should know of it.
+    /// Warnings about it.
     pub fn warnings(&self) -> &[String] {
         &self.devices.connected.warnings
     }
@@ -183,7 +183,7 @@ impl Rig {
         loop {
             let report = connected.actuator.poll().map_err(Failure::failed)?;
             if let Some(report) = report {
-                // What was just switched on, in this process, has not moved yet.
+                // A device that was just switched on in this process has not moved yet.
                 let still = self.fresh && connected.clock.is_virtual();
                 if still || last == Some(report.applied_um) {
                     return Ok(Some(report.applied_um));
@@ -208,11 +208,11 @@ impl Rig {
         }
     }
 
-    /// Arms the board: the last thing before the loop runs, when folder, script, loop and recorder are ready. The sink comes
-    /// back where it fails, so that what is in it is not lost.
+    /// Arms the board: the last thing before the loop runs, when folder, script, loop and recorder are ready. On failure the sink
+    /// is returned, so that its content is not lost.
     ///
     /// # Errors
-    /// A stop was asked for, the board refused, or it is not where or what it has to be. It is disarmed again.
+    /// A stop was requested, the board refused, or its state or displacement is wrong. It is disarmed again.
     pub fn arm<R, S>(
         mut self,
         setup: &Setup,
@@ -269,7 +269,7 @@ impl Rig {
         let session = ArmRequest {
             session: id,
             park_um: limits.park_um,
-            // The rig's own slew limit: a controller may ask for less from tick to tick, but what it asks for is to be reached
+            // The rig's own slew limit: a controller may ask for less from tick to tick, but its command should be reached
             // as early in the tick as the rig allows.
             limits: [
                 limits.low_um,
@@ -321,7 +321,7 @@ impl<S> From<Box<NotArmed<S>>> for Failure {
 
 /// A rig whose board is armed and waits for the first command. Dropped, it is parked.
 pub struct Armed<R, S> {
-    // Fields are dropped in this order: the board is parked before the place among those that signals go to is given up.
+    // Fields are dropped in this order: the board is parked before the signals stop reaching it.
     rig: Rig,
     core: Core<R>,
     sink: S,
@@ -351,7 +351,7 @@ where
         }
     }
 
-    /// Starts the loop on threads of its own.
+    /// Starts the loop on its threads.
     ///
     /// # Errors
     /// No thread could be had; the board is parked.
@@ -366,7 +366,7 @@ where
 
     /// The loop, on threads that it makes for itself; the calling one waits for them.
     fn run(self) -> Result<Finished<S>, Failure> {
-        // Dropped in reverse order where the driver panics: the rig is parked before the place is given up.
+        // Dropped in reverse order if the driver panics: the rig is parked before the signals stop reaching it.
         let Self {
             _place: place,
             _memory: memory,
@@ -425,7 +425,7 @@ where
     }
 }
 
-/// A loop that runs, and what it ends in.
+/// A running loop and its end.
 pub type Running<S> = running::Running<Finished<S>>;
 
 /// A run that is over; the PZT is at park or on its way there.
@@ -444,7 +444,7 @@ pub struct Finished<S> {
     pub recorder: RecorderReport,
     /// Gain over the model's as the arming pulse showed it, where it was accepted and is nevertheless not the model's.
     pub odd_gain: Option<f64>,
-    /// What went wrong on a thread beside control, if anything did.
+    /// Failure of a thread other than control, if any.
     pub trouble: Option<RunError>,
     /// The sink, with all that it was given.
     pub sink: S,

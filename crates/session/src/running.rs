@@ -1,4 +1,4 @@
-//! A loop that runs on threads of its own, and whoever waits for it.
+//! A loop on its threads, and its waiter.
 
 use crate::failure::Failure;
 use cellpos_runtime::live::Operator;

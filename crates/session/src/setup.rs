@@ -22,7 +22,7 @@ use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::Arc;
 
-/// What the bead is to follow.
+/// The bead's reference.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "kind", rename_all = "kebab-case", deny_unknown_fields)]
 pub enum ReferenceSpec {
@@ -53,7 +53,7 @@ pub enum ReferenceSpec {
         /// Time that the script ran in the sessions before, s; left out: as long as the plan says.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         ran_s: Option<f64>,
-        /// Length of the cell when the run began, um, for a session that goes on with it.
+        /// Length of the cell at the start of the run, um, for a resumed session.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         first_length_um: Option<f64>,
         /// Texts of the waveforms that it names.
@@ -157,7 +157,7 @@ pub struct Setup {
     pub config: SetupConfig,
 }
 
-/// The part of a [`Setup`] that has no file of its own.
+/// The part of a [`Setup`] without a separate file.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct SetupConfig {
@@ -165,13 +165,13 @@ pub struct SetupConfig {
     pub displacement_um: f64,
     /// First belief of neutral, um.
     pub neutral_um: f64,
-    /// What the bead is to follow.
+    /// The bead's reference.
     pub reference: ReferenceSpec,
     /// Times and counts of the loop.
     pub timing: Timing,
     /// The check before the loop is closed.
     pub arming: ArmingConfig,
-    /// Learning over cycles, where it is on.
+    /// Learning over cycles, if it is on.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub learn: Option<LearnSpec>,
     /// Learning on the periodic motions of a script.
@@ -184,7 +184,7 @@ pub struct SetupConfig {
 pub struct Predicted {
     /// From Brownian motion, nm/sqrt(Hz).
     pub walk_nm: Vec<f64>,
-    /// From localisation noise, for each nm RMS of it, 1/sqrt(Hz).
+    /// From localisation noise, per nm RMS, 1/sqrt(Hz).
     pub per_noise: Vec<f64>,
 }
 
@@ -242,7 +242,7 @@ impl Setup {
         Controller::new(config).map_err(Failure::input)
     }
 
-    /// Builds the loop with the reference of the set-up and a control law of one's own ([`Controller::with_law`]), without
+    /// Builds the loop with the reference of the set-up and another control law ([`Controller::with_law`]), without
     /// learning.
     ///
     /// # Errors
@@ -251,7 +251,7 @@ impl Setup {
         self.joined(law, self.config.reference.generator(&self.config.timing)?)
     }
 
-    /// Builds the loop with a reference generator of one's own.
+    /// Builds the loop with another reference generator.
     ///
     /// # Errors
     /// A value that cannot be, named.
@@ -311,11 +311,11 @@ pub fn loop_delay_s(timing: &Timing) -> f64 {
     timing.camera_delay_ms * 1e-3 + 0.5e-6 * timing.period_us
 }
 
-/// Part of a period by which a delay may differ before anybody is told: half of it costs a controller some degrees of its margin.
+/// Difference of a delay that gives a warning, as a fraction of the period: half a period costs a controller some degrees of margin.
 /// One figure for all who compare delays, so that none takes back what another advises.
 const WORTH_SAYING: f64 = 0.3;
 
-/// What to write when frames are not as old at their ticks as the rig file says. `found_ms` is by the stamps of the frames, from the
+/// Remedy if the age of frames at their ticks differs from the rig file. `found_ms` is by the stamps of the frames, from the
 /// middle of their exposure to the tick that used them: the one measurement behind this key, whoever makes it.
 pub fn camera_delay_advice(found_ms: f64, timing: &Timing) -> Option<String> {
     let configured_ms = timing.camera_delay_ms;
@@ -408,7 +408,7 @@ pub fn controller(name: &str, model: &Model, timing: &Timing) -> Result<Controll
     if let Some(config) = &report.config {
         file.estimator = config.estimator;
     }
-    // PI is robust by itself, and robust is what it is chosen for.
+    // PI is robust without it, and is chosen for that.
     file.estimator.adapt = kind.is_some();
     Ok(file)
 }

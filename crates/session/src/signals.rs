@@ -75,8 +75,8 @@ pub fn hold(operator: &Arc<Operator>) -> Result<Place, Stopped> {
     Ok(Place(Arc::clone(operator)))
 }
 
-/// A flag that the first INT, TERM, HUP or QUIT raises in place of ending the program: a long measurement without a rig comes to
-/// an end and says what it has. The next one ends the program, as always.
+/// A flag that the first INT, TERM, HUP or QUIT raises instead of ending the program: a long measurement without a rig ends early
+/// with its results. The next one ends the program, as always.
 pub fn ends_measuring() -> Arc<AtomicBool> {
     let flag = Arc::new(AtomicBool::new(false));
     desk().measuring = Some(Arc::clone(&flag));
@@ -103,8 +103,8 @@ fn inherited_ignored(signal: i32) -> bool {
     ignored.is_some_and(|mask| mask >> (signal - 1) & 1 == 1)
 }
 
-/// Puts the policy in force, on a thread of its own; to be called first thing by a program. A library that embeds a session
-/// and has a policy of its own leaves it out, and asks the session's [`Operator`] instead.
+/// Starts the policy on its own thread. A program calls it first. A library with another policy does not call it, and uses the
+/// session's [`Operator`] instead.
 ///
 /// # Errors
 /// The operating system refused a handler or a thread.
@@ -175,7 +175,7 @@ fn act(signal: i32) {
     }
 }
 
-/// What a key does: p or space pauses and goes on, s skips to the next step, q stops.
+/// What a key does: p or space pauses and continues, s skips to the next step, q stops.
 pub fn press(key: u8, operator: &Operator) {
     // Whichever of two requests holds; neither once a stop has been asked for.
     let toggle = |from, to, back| {

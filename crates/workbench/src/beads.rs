@@ -30,7 +30,7 @@ pub struct FoundBeads {
     pub objects: usize,
     /// Of these, taken as beads.
     pub taken: usize,
-    /// Cut by the border; of another size or contrast than most; not fitted by the mean profile.
+    /// Cut by the border; with unusual size or contrast; not fitted by the mean profile.
     pub refused: [usize; 3],
     /// Median contrast over noise.
     pub snr: f64,
@@ -81,7 +81,7 @@ pub fn find(
     }
 }
 
-/// The settings with what the loop's tracker makes of them.
+/// The settings and the tracker's result with them.
 fn tried(bench: &Bench, capture: &Capture, found: Suggestion) -> Result<FoundBeads, Failure> {
     let localiser = Localiser::new(found.config.clone()).map_err(Failure::input)?;
     let sight = Sight::of_bead(bench, localiser, &capture.frames)?;
@@ -131,7 +131,7 @@ fn sheet(frames: &[&FrameBuffer], config: Option<&LocaliserConfig>) -> Result<Rg
             for blob in detector.detect(&frame.frame()) {
                 let fix = localiser.locate(&frame.frame(), Some((blob.x_px, blob.y_px)));
                 if fix.verdict == FixQuality::Good {
-                    // The centre of a pixel stays where it is in the enlarged picture.
+                    // The centre of a pixel is kept in the enlarged picture.
                     let at = |px: f64| (px + 0.5) * f64::from(scale) - 0.5;
                     let seen = Seen {
                         x_px: at(fix.x_px),
@@ -203,7 +203,7 @@ fn with_vision(text: &str, vision: &LocaliserConfig) -> Result<(String, bool), S
         }
     };
     for (key, item) in new.iter() {
-        // Tables within are written on a line of their own key: their place is then this table.
+        // Inner tables are written as a key of this table.
         let value = match item.clone() {
             Item::Table(inner) => Value::InlineTable(inner.into_inline_table()),
             Item::Value(value) => value,

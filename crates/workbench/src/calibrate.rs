@@ -1,7 +1,7 @@
 //! Axis, sign and tilt of the channel in the picture, from pulses of the PZT in open loop.
 //!
-//! The PZT sets the bead's velocity, v = K (x1 - neutral): pulses to both sides move it to and fro, and what of its motion goes
-//! with the pulses is a vector in the picture, whatever drift and Brownian motion do besides. Its direction is axis, sign and
+//! The PZT sets the bead's velocity, v = K (x1 - neutral): pulses to both sides move it to and fro. The part of its motion that
+//! correlates with the pulses is a vector in the picture, independent of drift and Brownian motion. Its direction is axis, sign and
 //! tilt. Its length is K in pixels: with a pixel size from elsewhere it is compared with the model, so that a pixel size that is
 //! wrong by a factor is noticed.
 
@@ -23,7 +23,7 @@ pub struct Pulses {
     pub amplitude_um: f64,
     /// Of each side, ms.
     pub length_ms: u32,
-    /// Pairs of them.
+    /// Pairs of pulses.
     pub pairs: u32,
 }
 
@@ -99,7 +99,7 @@ impl Response {
     }
 }
 
-/// Moves the PZT by pulses about where it stands and looks what the bead does. Parked on every way out.
+/// Moves the PZT by pulses about its displacement and watches the bead. Parked on every way out.
 ///
 /// # Errors
 /// No camera, no board, no bead, a bead that does not move with the PZT.
@@ -282,7 +282,7 @@ fn fit(commands: &[(i64, f64)], sightings: &[Sighting], size_px: [usize; 2]) -> 
         .map(|(_, response)| response)
 }
 
-/// The sum of squares that a lag leaves unexplained, (px/s)^2, and what it finds.
+/// The residual sum of squares of a lag, (px/s)^2, and its fit.
 fn regress(
     commands: &[(i64, f64)],
     pairs: &[(Sighting, Sighting)],

@@ -57,7 +57,7 @@ pub struct Recorded {
 }
 
 impl Capture {
-    /// Keeps what the camera of a rig delivers for a time.
+    /// Records the camera of a rig for a time.
     ///
     /// # Errors
     /// No frame comes, the camera breaks, or the frames would not fit into memory.
@@ -80,7 +80,7 @@ impl Capture {
             ));
         }
         let clock = Clock::Real;
-        // What has piled up since the camera was opened is old.
+        // Frames queued since the camera was opened are old.
         while camera
             .next_frame(&mut buffer, clock.now_ns())
             .map_err(Failure::failed)?

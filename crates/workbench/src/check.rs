@@ -7,7 +7,7 @@ use cellpos_session::RigFile;
 use cellpos_session::rig_file::{ActuatorConfig, CameraConfig};
 use std::path::Path;
 
-/// Findings of what the file says, in the making.
+/// Findings about the file, under construction.
 struct Findings<'a> {
     file: &'a RigFile,
     found: Found,
@@ -46,7 +46,7 @@ impl Findings<'_> {
                 ("camera", *rate_hz, exposure)
             }
         };
-        // The estimator predicts between the frames of a slower camera, over so many ticks at most.
+        // Largest number of ticks that the estimator predicts between frames of a slower camera.
         const MOST_TICKS_A_FRAME: f64 = 16.0;
         let ticks_a_frame = 1e6 / (rate_hz * timing.period_us);
         // A slow actuator takes the newest of several frames.
@@ -207,7 +207,7 @@ impl Findings<'_> {
         }
     }
 
-    /// What a real camera needs beside a rate.
+    /// Requirements of a real camera besides a rate.
     fn camera(&mut self, path: &Path) {
         let file = self.file;
         if !matches!(file.camera, CameraConfig::Emulated {}) {

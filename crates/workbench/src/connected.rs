@@ -90,7 +90,7 @@ fn camera(bench: &Bench) -> Result<CameraSeen, Failure> {
     let mut next = |until_ns: i64, buffer: &mut FrameBuffer| {
         camera.next_frame(buffer, until_ns).map_err(Failure::failed)
     };
-    // What has piled up since it was opened is old.
+    // Frames queued since it was opened are old.
     while next(clock.now_ns(), &mut buffer)?.is_some() {}
     let start_ns = clock.now_ns();
     let mut ages_ms = Vec::new();
@@ -197,7 +197,7 @@ fn judge_board(found: &mut Found, file: &RigFile, line: &LineTest) {
     }
 }
 
-/// What the frames of a rig that is open say against its file, which was read from `path`.
+/// Contradictions between the frames of an open rig and its file, read from `path`.
 pub fn of_frames(file: &RigFile, seen: &FramesSeen, path: &Path) -> Vec<Finding> {
     let mut found = Found::in_file(path);
     judge_frames(&mut found, file, seen);
@@ -246,7 +246,7 @@ fn judge_frames(found: &mut Found, file: &RigFile, seen: &FramesSeen) {
     }
 }
 
-/// Rate and age of the frames against what the loop is set up for; the calibration's origin against their size.
+/// Rate and age of the frames against the loop's set-up; the calibration's origin against their size.
 fn judge_camera(found: &mut Found, file: &RigFile, camera: &CameraSeen) {
     judge_frames(
         found,

@@ -23,7 +23,7 @@ pub struct Finding {
     pub line: Option<usize>,
     /// The key with its table, as `camera.rate_hz`.
     pub key: String,
-    /// Its value, with the unit of the key; empty where it is not there.
+    /// Its value, with the unit of the key; empty if missing.
     pub value: String,
     /// Why it does not fit, with key and value.
     pub what: String,

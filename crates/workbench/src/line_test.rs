@@ -1,4 +1,4 @@
-//! What a board says of itself, and how good the line to it is.
+//! Identity of a board, and quality of the line.
 
 use crate::bench::Board;
 use cellpos_link::Status;
@@ -38,7 +38,7 @@ impl Quantiles {
 /// What was found.
 #[derive(Debug, Clone, Serialize)]
 pub struct LineTest {
-    /// What the board is.
+    /// Identity of the board.
     pub info: ActuatorInfo,
     /// Its state in words.
     pub state: String,

@@ -1,4 +1,4 @@
-//! The PZT moved by hand: armed with the rig file's limits, at a speed of one's own, parked on every way out.
+//! The PZT moved by hand: armed with the rig file's limits, at the user's speed, parked on every way out.
 
 use crate::bench::Board;
 use cellpos_control::Limits;
@@ -28,7 +28,7 @@ pub struct Mover {
 }
 
 impl Mover {
-    /// Arms a board with the limits of a rig file. Nothing moves: it goes on from where it stands.
+    /// Arms a board with the limits of a rig file. Nothing moves: it continues from its present displacement.
     ///
     /// # Errors
     /// No answer, a refusal, or limits that do not meet the board's.
@@ -97,7 +97,7 @@ impl Mover {
     /// says. Whether it is there.
     ///
     /// # Errors
-    /// A displacement outside the limits; a signal asked for the end; the line breaks; the board went safe or belongs to another host.
+    /// A displacement outside the limits, a signal to end, a broken line, or a board that is safe or belongs to another host.
     pub fn step(&mut self, to_um: f64, speed_um_per_s: f64) -> Result<bool, Failure> {
         if !(self.limits.low_um..=self.limits.high_um).contains(&to_um) {
             return Err(Failure::bad_input(
@@ -162,7 +162,7 @@ mod tests {
     fn a_pzt_that_rests_a_converter_step_outside_the_limits_is_moved() {
         let mut file = RigFile::default();
         file.board.power_up_um = 20.0;
-        // Codes are 0.6 nm apart: the board stands at 20.0003 um.
+        // Codes are 0.6 nm apart: the board is at 20.0003 um.
         file.limits.low_um = 20.0008;
         file.limits.park_um = 20.0;
         let bench = Bench::of(file).expect("a bench");

@@ -128,7 +128,7 @@ impl Eye {
         Ok(Self::Bead(Box::new(tracker), bench.file().calibration))
     }
 
-    /// Looks at the next frame; `None` when nothing is believed of it.
+    /// Looks at the next frame; `None` without a valid object.
     ///
     /// # Errors
     /// A frame of another size than the background.

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-/// What the new file is to be for.
+/// Devices for the new file.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Kind {
     /// Everything in this process.

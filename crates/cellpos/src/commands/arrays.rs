@@ -1,4 +1,4 @@
-//! Records as other programs keep them: `.npy` (NumPy) and `.mat` (MATLAB up to version 7) beside text.
+//! Records as other programs keep them: `.npy` (NumPy) and `.mat` (MATLAB up to version 7) and text.
 //!
 //! Both become the text of a table, so that whatever reads a CSV file reads them, with the same messages. Not for structures,
 //! cells or complex numbers, and not for version 7.3 of `.mat`, which is HDF5.

@@ -54,7 +54,7 @@ pub fn form_of(model: &Model) -> Option<Form> {
     model.provenance.get(FORM)?.parse().ok()
 }
 
-/// A base model that was fitted, and what is to be said beside it.
+/// A fitted base model and its messages.
 pub struct Base {
     pub fit: BaseFit,
     pub hold: Hold,
@@ -229,7 +229,7 @@ impl Base {
         Ok(model)
     }
 
-    /// What is to be said of it.
+    /// Messages about it.
     pub fn words(&self) -> String {
         let m = &self.fit.model;
         let mut text = format!(
@@ -297,8 +297,7 @@ pub fn say_form(model: &mut Model, form: Form) {
     model.provenance.insert(FORM.to_owned(), form.to_string());
 }
 
-/// A linear fit as a model: its delay is an effect, and how its input was sampled is said, so that what reads it next takes both
-/// as they are.
+/// A linear fit as a model. The delay is an effect; the sampling of the input is in the provenance, for the next command.
 ///
 /// # Errors
 /// A model that no file can hold.

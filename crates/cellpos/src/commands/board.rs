@@ -1,4 +1,4 @@
-//! `cellpos board`: what the PZT board is, its counters, its LED, and how good the line to it is.
+//! `cellpos board`: identity, counters and LED of the PZT board, and quality of its line.
 
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
 use crate::rig_file::{ActuatorConfig, RigFile};

@@ -18,13 +18,13 @@ const INPUTS: &str = "inputs";
   cellpos bundle runs/20261121T190000Z-fatigue
   cellpos bundle --verify runs/20261121T190000Z-fatigue-bundle
 
-A bundle is a plain folder: the run with all its sessions, the files that went into it as far as they are still what they
-were, and MANIFEST.sha256, which sha256sum -c reads too. Exit code 1: a bundle is not what its manifest says.")]
+A bundle is a plain folder: the run with all sessions, its unchanged input files, and MANIFEST.sha256, which sha256sum -c reads, too.
+Exit code 1: a bundle differs from its manifest.")]
 pub struct Args {
     /// The run's folder.
     #[arg(required_unless_present = "verify", conflicts_with = "verify", value_parser = run_folder())]
     run: Option<PathBuf>,
-    /// The folder to make; left out: the run's with -bundle behind its name.
+    /// New folder; default: that of the run with -bundle appended.
     #[arg(long)]
     out: Option<PathBuf>,
     /// Check a bundle against its manifest.
@@ -49,13 +49,13 @@ fn io(what: &str, path: &Path) -> impl FnOnce(std::io::Error) -> Failure {
     move |error| Failure::Failed(miette::miette!("{message}: {error}"))
 }
 
-/// How deep folders may lie in a run: a link that leads back up would never end.
+/// Depth limit of folders in a run, against links that lead back up.
 const DEEPEST: usize = 16;
 
 /// What is done about symbolic links.
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum Links {
-    /// What they lead to is taken.
+    /// Their targets are copied.
     Followed,
     /// They are refused.
     Refused,
@@ -130,7 +130,7 @@ fn pack(run: &Path, out: Option<&Path>, json: bool) -> CommandResult {
             "a bundle is never overwritten: give another --out",
         ));
     }
-    // Made under a name of its own first: a folder of the wanted name is a whole bundle.
+    // Made under a temporary name first, so that a folder of the final name is complete.
     let mut name = std::ffi::OsString::from(".");
     name.push(out.file_name().unwrap_or_default());
     name.push(format!(".{}.part", std::process::id()));

@@ -14,8 +14,7 @@ use std::path::PathBuf;
 /// Arguments of `cellpos calibrate`.
 #[derive(Debug, clap::Args)]
 #[command(
-    after_help = "The PZT is moved by pulses about where it stands, within [limits], and parked at the end. Axis and sign come from \
-    the bead's answer; the pixel size from a stage micrometre or from you.\n\n\
+    after_help = "Pulses move the PZT about its present displacement, within [limits]; then it is parked. Axis and sign come from the bead's answer, the pixel size from a stage micrometer or from you.\n\n\
     Examples:\n  cellpos calibrate --rig rig.toml --micrometer lines.png --spacing 10um --out calibration.toml\n  \
     cellpos calibrate --rig rig.toml --pixel 0.1um --out calibration.toml"
 )]
@@ -26,7 +25,7 @@ pub struct Args {
     /// New calibration file; name it in rig.toml with calibration_file.
     #[arg(long)]
     out: PathBuf,
-    /// Picture of a stage micrometre, lines across the channel (cellpos camera --snapshot).
+    /// Picture of a stage micrometer, lines across the channel (cellpos camera --snapshot).
     #[arg(
         long,
         requires = "spacing",
@@ -37,19 +36,19 @@ pub struct Args {
     /// Distance of its lines.
     #[arg(long, value_parser = crate::arguments::positive::<Micrometers>)]
     spacing: Option<Micrometers>,
-    /// Pixel size in the object plane, where it is known.
+    /// Pixel size in the object plane, if you know it.
     #[arg(long, value_parser = crate::arguments::positive::<Micrometers>)]
     pixel: Option<Micrometers>,
-    /// Standard deviation of --pixel; left out: a hundredth of it.
+    /// Standard deviation of --pixel; default: 1 % of it.
     #[arg(long, requires = "pixel", value_parser = crate::arguments::positive::<Micrometers>)]
     pixel_sd: Option<Micrometers>,
-    /// Model that the answer is compared with: eq6 or a model.toml.
+    /// Model to compare the answer with: eq6 or a model.toml.
     #[arg(long, default_value = "eq6")]
     model: String,
-    /// How far the pulses go, to each side.
+    /// Amplitude of the pulses.
     #[arg(long, default_value = "0.2um", value_parser = crate::arguments::positive::<Micrometers>)]
     amplitude: Micrometers,
-    /// How many pulses to each side.
+    /// Number of pulses to each side.
     #[arg(long, default_value_t = 40, value_parser = clap::value_parser!(u32).range(5..=10_000))]
     pairs: u32,
     /// Print one JSON object on standard output.
@@ -93,7 +92,7 @@ pub fn run(args: Args) -> CommandResult {
     };
     let model = Model::load(&args.model).map_err(Failure::input)?;
     let mut file = RigFile::load(Some(&args.rig))?;
-    // What was calibrated before has no say in this.
+    // An earlier calibration is not used.
     file.calibration = None;
     let bench = Bench::of(file)?;
     let pulses = Pulses {
@@ -111,7 +110,7 @@ pub fn run(args: Args) -> CommandResult {
         pixel_um_sd,
         format!("{source}; axis and sign by PZT pulses"),
     );
-    // What the pulses are made of lies about here.
+    // Start of the pulses.
     let gain_per_s = model.plant.velocity_gain_at(Hertz(20.0)).abs();
     let pixel_of_model_um = gain_per_s / response.gain();
     let gain_ratio = pixel_um / pixel_of_model_um;

@@ -1,4 +1,4 @@
-//! `cellpos camera`: which cameras there are, and whether one delivers what it promises.
+//! `cellpos camera`: list of cameras, and a test of one.
 
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
 use cellpos_drivers::sources::{self, Playback, Region};
@@ -25,7 +25,7 @@ pub struct Args {
     /// Recording, played at its frame rate.
     #[arg(long, group = "which")]
     recording: Option<PathBuf>,
-    /// Frame rate promised, Hz.
+    /// Expected frame rate, Hz.
     #[arg(long, default_value_t = 1000.0)]
     rate_hz: f64,
     /// Exposure of an industrial camera, us.
@@ -34,17 +34,16 @@ pub struct Args {
     /// Camera of this rig.toml; with --snapshot, --record or --find-beads.
     #[arg(long, group = "which", requires = "of_rig")]
     rig: Option<PathBuf>,
-    /// Write one frame of the rig's camera as a picture (.png), and say how bright it is.
+    /// Write one frame of the rig's camera as a picture (.png) and print its brightness.
     #[arg(long, value_name = "FILE", requires = "rig", group = "of_rig")]
     snapshot: Option<PathBuf>,
-    /// Record every frame of the rig's camera for --duration into this new folder, a PNG each, for cellpos vision.
+    /// Record the rig's camera for --duration into this new folder, as PNG files for cellpos vision.
     #[arg(long, value_name = "FOLDER", requires = "rig", group = "of_rig")]
     record: Option<PathBuf>,
-    /// Look at the rig's camera for --duration, find what its beads look like, write [vision] into the rig file (its comments
-    /// stay), and write a picture (.png) of what was taken for beads.
+    /// Find the look of the beads in view, write [vision] into the rig file, and a picture (.png) with the beads marked.
     #[arg(long, value_name = "FILE", requires = "rig", group = "of_rig")]
     find_beads: Option<PathBuf>,
-    /// Mark the bead or cell as vision sees it in the picture.
+    /// Mark the bead or cell in the picture.
     #[arg(long, requires = "snapshot")]
     overlay: bool,
     /// Part of the sensor or of the recording: WIDTHxHEIGHT+X+Y, px.
@@ -53,7 +52,7 @@ pub struct Args {
     /// From the middle of an exposure to its fastest arrival, ms.
     #[arg(long, default_value_t = 2.0)]
     latency_ms: f64,
-    /// How long to watch.
+    /// Duration.
     #[arg(long, default_value = "5s", value_parser = crate::arguments::positive::<Seconds>)]
     duration: Seconds,
     /// Print one JSON object on standard output.

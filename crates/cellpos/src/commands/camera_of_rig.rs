@@ -61,7 +61,7 @@ fn picture_ready(path: &Path) -> Result<(), Failure> {
     crate::output::ready([&path.to_path_buf()])
 }
 
-/// What a recording is called in JSON.
+/// Name of a recording in JSON.
 #[derive(Debug, Serialize)]
 struct Recording {
     folder: PathBuf,

@@ -22,7 +22,7 @@ pub struct Args {
     /// `eq6`, or a model file.
     #[arg(long, default_value = "eq6")]
     model: String,
-    /// The rig whose limits hold; left out: 0um to 40um, the bead at rest at 20um, 10000um/s, a view of 50um to either side.
+    /// Rig file with the limits; default: 0um to 40um, zero flow at 20um, 10000um/s, a view of 50um to either side.
     #[arg(long)]
     rig: Option<PathBuf>,
     /// Smallest PZT displacement, instead of the rig's.
@@ -31,16 +31,16 @@ pub struct Args {
     /// Largest PZT displacement, instead of the rig's.
     #[arg(long)]
     high: Option<Micrometers>,
-    /// PZT displacement at which the bead rests, instead of the rig's.
+    /// Zero-flow displacement, instead of the rig's.
     #[arg(long, allow_hyphen_values = true)]
     neutral: Option<Micrometers>,
     /// Largest speed of the PZT, instead of the rig's.
     #[arg(long)]
     slew: Option<MicrometersPerSecond>,
-    /// Half of the field of view along the channel; that of a camera is not in its file.
+    /// Half of the field of view along the channel.
     #[arg(long)]
     view: Option<Micrometers>,
-    /// Writes the reference and the PZT demand as a report (HTML, figures beside it).
+    /// Write reference and PZT demand as a report.
     #[arg(long)]
     report: Option<PathBuf>,
     /// Print one JSON object on standard output.
@@ -72,7 +72,7 @@ pub fn run(args: Args) -> CommandResult {
     })
 }
 
-/// The limits of the rig, and what is said instead of them.
+/// The limits of the rig, and the options that replace them.
 fn limits(args: &Args) -> Result<CheckLimits, Failure> {
     let mut limits = CheckLimits::default();
     if let Some(path) = &args.rig {

@@ -1,5 +1,4 @@
-//! Which columns of a file are what: one reader for `identify`, `reconcile` and `simulate`, so that what one reads the next one
-//! reads.
+//! The columns of a file: one reader for `identify`, `reconcile` and `simulate`, so that all read the same files.
 
 use super::arrays::read_table;
 use crate::outcome::Failure;
@@ -120,7 +119,7 @@ fn hold_over_gaps(record: &mut Record) {
     }
 }
 
-/// The names of columns as a file has them; as they were asked for, where it has none.
+/// The names of columns as in the file; as requested if it has none.
 pub fn names_in(path: &Path, asked: [&str; 2]) -> [String; 2] {
     let header = read_table(path).ok();
     let table = header
@@ -220,7 +219,7 @@ fn range_of(rows: &str, all: usize) -> Result<std::ops::Range<usize>, Failure> {
     }
 }
 
-/// Rows whose times lie on no even grid, put on one; None for those that do, gaps and times that were rounded included.
+/// Resamples rows with uneven times; None if the times are even, except for gaps and rounding.
 fn evened(t: &[f64], u: &[f64], y: &[f64], held: bool) -> Option<(Vec<f64>, Vec<f64>, Vec<f64>)> {
     let steps: Vec<f64> = t.windows(2).map(|w| w[1] - w[0]).collect();
     if steps.len() < 15 || steps.iter().any(|s| s.is_nan() || *s <= 0.0) {

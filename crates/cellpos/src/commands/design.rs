@@ -24,9 +24,9 @@ enum Kind {
     Pi,
     /// PI with lead.
     Lead,
-    /// State feedback on the estimate (a Smith predictor with drift state).
+    /// State feedback on the estimate.
     Lqg,
-    /// Model predictive control; margins are those of its law without active constraints.
+    /// Model predictive control; margins without active constraints.
     Mpc,
 }
 
@@ -37,19 +37,17 @@ enum Kind {
   cellpos design --model eq6 --delay 2.5ms --kp 0.46 --ki 19.5 --json
   cellpos design --model model.toml --max-ms 1.6 --min-pm 40 --out controller.toml --report design.html
 
-The loop delay is the camera path (from the middle of an exposure to the tick that uses it) and half a sample of hold: a 2 ms
-camera path at 1 kHz is 2.5ms. A model.toml of cellpos identify carries its camera path, and the sum is done here. Without gains the PI controller of
-largest integral gain (fastest rejection of drift) under --max-ms and --max-mt is searched. Exit code 1 when the loop is
-unstable or a limit is broken, 2 on bad input.")]
+The loop delay is the camera delay (from the middle of an exposure to the tick that uses it) plus half a sample of hold: 2 ms at 1 kHz
+give 2.5ms. A model.toml of cellpos identify contains its camera delay. Without gains, design finds the PI controller of largest
+integral gain within --max-ms and --max-mt. Exit code 1: the loop is unstable, or a limit is broken; 2: bad input.")]
 pub struct Args {
     /// Model file, or `eq6` for the built-in nominal plant.
     #[arg(long, default_value = "eq6")]
     model: String,
-    /// Loop delay: camera path (camera_delay_ms of rig.toml) and half a sample of hold; left out: of --rig, else as the model
-    /// was measured with, else 2.5ms.
+    /// Loop delay: camera delay and half a sample of hold; default: of --rig, else of the model, else 2.5ms.
     #[arg(long, value_parser = crate::arguments::loop_delay)]
     delay: Option<Seconds>,
-    /// The rig whose camera_delay_ms and period make the loop delay.
+    /// Rig file with the camera delay and the period.
     #[arg(long, conflicts_with_all = ["delay", "sample"])]
     rig: Option<PathBuf>,
     /// Sample time.
@@ -77,10 +75,10 @@ pub struct Args {
     /// max_overshoot_percent, max_settling_ms, stable_over_spread.
     #[arg(long)]
     limits: Option<PathBuf>,
-    /// Largest peak of the sensitivity S (also the search's; default of the search 1.6).
+    /// Largest peak of the sensitivity S; the search aims at 1.6 by default.
     #[arg(long)]
     max_ms: Option<f64>,
-    /// Largest peak of the complementary sensitivity T (also the search's; default of the search 1.3).
+    /// Largest peak of the complementary sensitivity T; the search aims at 1.3 by default.
     #[arg(long)]
     max_mt: Option<f64>,
     /// Smallest phase margin, deg.
@@ -95,16 +93,16 @@ pub struct Args {
     /// Largest predicted hold error, nm RMS.
     #[arg(long)]
     max_rms: Option<f64>,
-    /// Every point of the spread (gain x 0.5..2, delay +0/+1 sample) must be stable.
+    /// Require stability for all of the spread (gain x 0.5..2, delay +0/+1 sample).
     #[arg(long)]
     stable_over_spread: bool,
-    /// Localisation noise, where not the model's.
+    /// Localisation noise; default: that of the model.
     #[arg(long)]
     fix_noise: Option<cellpos_units::Micrometers>,
     /// Write the controller to this file.
     #[arg(long)]
     out: Option<PathBuf>,
-    /// Write a page with margins, Bode and Nyquist plots, step and predicted spectrum to this file.
+    /// Write a report to this file: margins, Bode, Nyquist, step, predicted spectrum.
     #[arg(long)]
     report: Option<PathBuf>,
     /// Print one JSON object on standard output.

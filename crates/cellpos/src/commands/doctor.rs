@@ -21,20 +21,19 @@ use std::path::{Path, PathBuf};
   cellpos doctor
   cellpos doctor --for 10h --why
 
-Ctrl-C ends the measurement, and what it has by then is said.
-
-Exit code 0: fit; 1: not fit, or measured for too short a time to say so.")]
+Ctrl-C ends the measurement early.
+Exit code 0: fit; 1: not fit, or not measured for long enough.")]
 pub struct Args {
-    /// How long to measure the timer latency.
+    /// Duration of the measurement.
     #[arg(long = "for", alias = "duration", value_name = "DURATION", default_value = "5s", value_parser = positive::<Seconds>)]
     duration: Seconds,
-    /// Name what ran when a wake-up was late.
+    /// Name the program that delayed a wake-up.
     #[arg(long)]
     why: bool,
-    /// Length of the run that is planned: is there room for its record?
+    /// Check the room on the disk for a run of this length
     #[arg(long, default_value = "1h", value_parser = positive::<Seconds>)]
     run: Seconds,
-    /// Where run folders will go.
+    /// Folder of the runs.
     #[arg(long, default_value = "runs")]
     runs: PathBuf,
     /// Print one JSON object on standard output.

@@ -19,9 +19,8 @@ use std::path::{Path, PathBuf};
   cellpos export runs/20261121T190000Z-fatigue --out cell.rtdc   # Shape-Out: a cell's runs
   cellpos export runs/20261121T190000Z-fatigue --from 60s --to 120s --every 10 --columns time_s,target_um,bead_um,error_um
 
-All sessions of a run that was resumed, one behind the other; the column session tells them apart. The columns, their units
-and words are in docs/data.md. Row k: the displacement commanded from time_s on, held until the next row; bead_um is the
-position that the camera had delivered just before. Exit code 1: rows of the run are missing.")]
+Joins the sessions of a resumed run; the column session tells them apart. docs/data.md has columns, units and words. error_um is the
+error; do not subtract target_um from bead_um, which is some ms older. Exit code 1: rows of the run are missing.")]
 pub struct Args {
     /// The run's folder.
     #[arg(value_parser = run_folder())]
@@ -29,19 +28,19 @@ pub struct Args {
     /// What to write; left out: what the name of --out ends in, else CSV.
     #[arg(long, value_enum)]
     format: Option<ExportFormat>,
-    /// The file to write; left out: the run's name beside its folder.
+    /// File to write; default: the run's name, next to its folder.
     #[arg(long)]
     out: Option<PathBuf>,
-    /// From this time of the run on.
+    /// Start time in the run.
     #[arg(long)]
     from: Option<Seconds>,
-    /// Up to this time of the run.
+    /// End time in the run.
     #[arg(long)]
     to: Option<Seconds>,
-    /// These columns, in this order.
+    /// Columns, in this order.
     #[arg(long, value_delimiter = ',')]
     columns: Option<Vec<String>>,
-    /// Every so many rows one.
+    /// Keep one of N rows.
     #[arg(long, default_value = "1")]
     every: NonZeroU64,
     /// Only this session.
@@ -142,7 +141,7 @@ fn selection(args: &Args) -> Result<Selection, Failure> {
     Ok(selection)
 }
 
-/// Writes the file and says what of the run is missing.
+/// Writes the file and reports missing rows.
 pub fn run(args: Args) -> CommandResult {
     let format = chosen(&args)?;
     let selection = selection(&args)?;
@@ -202,7 +201,7 @@ fn tell(
             "unreadable": unreadable,
         }))?;
     } else {
-        // What goes down a pipe is the export alone.
+        // A pipe gets the export only.
         let say = |text: &str| {
             if is_device(Some(output)) {
                 eprint!("{text}");

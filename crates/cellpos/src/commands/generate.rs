@@ -46,7 +46,7 @@ pub fn run(args: Args) -> CommandResult {
     Ok(Outcome::Done)
 }
 
-/// Writes the page of a command and those of its own commands; `files` is told of each.
+/// Writes the pages of a command and its subcommands; `files` is told of each.
 fn manual(command: &clap::Command, to: &Path, files: &mut Vec<PathBuf>) -> std::io::Result<()> {
     files.push(clap_mangen::Man::new(command.clone()).generate_to(to)?);
     for one in command.get_subcommands().filter(|one| !one.is_hide_set()) {
@@ -89,7 +89,7 @@ mod tests {
             .map(|page| page.unwrap().file_name().into_string().unwrap())
             .collect();
         assert_eq!(pages, commands);
-        // What the unit of the package refers to is there.
+        // The files that the unit of the package names exist.
         let packaging = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../packaging");
         let unit = std::fs::read_to_string(packaging.join("cellpos-run@.service")).unwrap();
         let referred: Vec<&str> = unit

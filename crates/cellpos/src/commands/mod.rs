@@ -37,55 +37,55 @@ use crate::outcome::CommandResult;
 /// The commands, in the order in which a lab needs them.
 #[derive(Debug, clap::Subcommand)]
 pub enum Command {
-    /// Hold a bead, or go to a position, in closed loop.
+    /// Hold a bead in closed loop: at a position, or on a sine.
     Track(track::Args),
-    /// Run a setpoint script in closed loop, or go on with one.
+    /// Run a setpoint script in closed loop, or resume one.
     Run(Box<run::Args>),
-    /// A controller for a model and a loop delay: margins, predicted error, spread, controller.toml.
+    /// Make a controller for a model and a delay: margins, predicted error, spread, controller.toml.
     Design(design::Args),
-    /// A setpoint script against a model and the rig's limits, before anything moves.
+    /// Check a setpoint script against model and limits; nothing moves.
     Check(check::Args),
-    /// Noise-free response of a model to the commands of a record.
+    /// Simulate the response of a model to the commands of a record.
     Simulate(simulate::Args),
-    /// Run a recorded run through its controller again and compare to the bit.
+    /// Repeat a recorded run and compare the commands to the last bit.
     Replay(replay::Args),
-    /// A run that goes on or is over, on the live page, from its folder.
+    /// Show a run on the live page, from its folder.
     Watch(watch::Args),
-    /// What a run did, on one page: traces, errors, cycles, timing, events, provenance.
+    /// Write a run's report: result, traces, errors, cycles, timing, events.
     Report(report::Args),
-    /// A run packed for archiving, with a manifest.
+    /// Pack a run for archiving, with a manifest.
     Bundle(bundle::Args),
-    /// A run as CSV, Parquet, HDF5, MAT or RT-DC, for other programs.
+    /// Convert a run to CSV, Parquet, HDF5, MAT or RT-DC.
     Export(export::Args),
-    /// Is this machine fit for a 1 kHz loop: verdict, reasons, what to change.
+    /// Test whether this machine is fit for a 1 kHz loop.
     Doctor(doctor::Args),
-    /// Measure the rig's frequency response and fit a model to it, or fit one to records.
+    /// Measure the plant on a rig, or fit a model to records.
     Identify(Box<identify::Args>),
-    /// Find where simulation and measurement disagree, name what is missing, add it to the model.
+    /// Find what a model lacks, compared with records.
     Reconcile(Box<reconcile::Args>),
-    /// Identify, reconcile, design again, track again: margins predicted and true, errors before and after.
+    /// Identify, reconcile, design and track in one go, with errors before and after.
     Circle(Box<circle::Args>),
-    /// Positions and their quality from a recording: CSV, contact sheet, summary.
+    /// Find beads or cells in a recording: CSV, contact sheet, summary.
     Vision(Box<vision::Args>),
-    /// A rig file: a new one, or what is wrong with one.
+    /// Write, check or prove a rig.
     Rig(rig::Args),
-    /// What the PZT board is, its counters, and how good the line to it is.
+    /// Test the line to the PZT board; show its identity and counters.
     Board(board::Args),
     /// Move the PZT by hand.
     Jog(jog::Args),
-    /// Axis, sign and pixel size of the camera's picture: calibration.toml.
+    /// Calibrate the camera's picture: axis, sign, pixel size.
     Calibrate(calibrate::Args),
-    /// Which cameras there are; delivered rate, intervals, age and losses of one.
+    /// List cameras, or measure rate, intervals, age and losses of one.
     Camera(camera::Args),
-    /// Frames of the empty channel, against which a cell is seen.
+    /// Record the empty channel: the background for cells.
     Background(background::Args),
-    /// Reproduce the figures and numbers of Mizoue et al. 2017 from the emulated rig, and say where the paper errs.
+    /// Repeat Mizoue et al. 2017 on the emulated rig and compare every number.
     Paper(paper::Args),
-    /// Completions and manual pages, for packages and for a home of one's own.
+    /// Write shell completions and manual pages.
     Generate(generate::Args),
 }
 
-/// The commands by what a person wants to do.
+/// The commands by task.
 const GROUPS: [(&str, &[&str]); 6] = [
     ("Hold and move", &["track", "run", "jog"]),
     (
@@ -162,7 +162,7 @@ impl Command {
     }
 }
 
-/// The path beside a run's folder that has its name and something behind it. A folder given as `.` has a name too.
+/// The path next to a run's folder with its name and a suffix. A folder given as `.` has a name too.
 fn beside(run: &std::path::Path, behind: &str) -> std::path::PathBuf {
     let folder = match run.file_name() {
         Some(_) => run.to_owned(),

@@ -18,7 +18,7 @@ use std::time::{Duration, Instant};
 /// Arguments of `cellpos rig prove`.
 #[derive(Debug, clap::Args)]
 #[command(
-    after_help = "The PZT moves by --amplitude about park, within [limits], and is left parked and disarmed. A bead in view goes with it.\n\n\
+    after_help = "The PZT moves by --amplitude about park, within [limits], and is left parked and disarmed. A bead in view moves, too.\n\n\
     Examples:\n  cellpos rig prove rig.toml --out proved.html\n  cellpos rig prove rig.toml --board           # does this board keep docs/board.md?\n  \
     cellpos rig prove rig.toml --camera --duration 10s   # does this server keep docs/camera-socket.md?\n\n\
     Exit code 0: every line that was tried passed; 1: a line failed."
@@ -29,16 +29,16 @@ pub struct Args {
     /// Only the board: the conformance test of docs/board.md.
     #[arg(long)]
     board: bool,
-    /// Only the camera: the conformance test of docs/camera-socket.md for a socket, and what any camera delivers.
+    /// Only the camera: rate, losses and age; of a socket the conformance test of docs/camera-socket.md.
     #[arg(long)]
     camera: bool,
-    /// How long the camera is watched.
+    /// Duration of the camera test.
     #[arg(long, default_value = "60s", value_parser = positive::<Seconds>)]
     duration: Seconds,
-    /// How far the PZT is moved to each side of park.
+    /// Motion of the PZT to each side of park.
     #[arg(long, default_value = "2um", value_parser = positive::<Micrometers>)]
     amplitude: Micrometers,
-    /// Have the board reset while it is off park: press its reset button when you are asked to.
+    /// Test a reset: press the board's reset button when asked.
     #[arg(long)]
     reset: bool,
     /// Write the sheet as a page, too (.html).
@@ -49,7 +49,7 @@ pub struct Args {
     json: bool,
 }
 
-/// The sheet with what it is of.
+/// The sheet with its subject.
 #[derive(Debug, Serialize)]
 struct Proved {
     rig: PathBuf,

@@ -21,7 +21,7 @@ use std::path::{Path, PathBuf};
 /// Heading of the options that need a rig.
 const ON_A_RIG: &str = "To collect on a rig what the records leave open";
 
-/// Find where simulation and measurement disagree, name what is missing, add it to the model.
+/// Find what a model lacks, compared with records.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "\
 Examples:
@@ -32,33 +32,31 @@ Examples:
   cellpos reconcile --base order=2,delay --data d.csv --input 'p [kW]' --output 'T [degC]' --effects mine.toml
   cellpos reconcile --model fit --data Model_Vi_Do.dat --rows 0:8027 --input-column 1 --output-column 5 --rate 200Hz
 
-Verdicts: named, named-with-remainder (and something is left beside), ambiguous (the data cannot separate, and what would), unknown (nothing in the catalogue closes enough),
-nothing-missing. Exit code 0 whenever a verdict was reached, 2 for bad input.")]
+Verdicts: named; named-with-remainder (something small is left); ambiguous (the records fit several effects; the result names the experiment that decides);
+unknown (no effect of the catalogue explains enough); nothing-missing. Exit code 0: any verdict; 2: bad input.")]
 pub struct Args {
     /// Model: eq6, the path of a model.toml, or `fit` for a constant gain fitted to the records.
     #[arg(long, default_value = "eq6")]
     model: String,
-    /// In the place of --model, for data of another rig: a linear base model of this form, fitted to the records: order=N, with
-    /// zeros=N, delay, integrating where they are wanted; or static. Without a form, or with auto, the records choose it.
+    /// For another rig, instead of --model: a linear model of this form, fitted to the records: order=N, with zeros=N, delay, integrating if you want them; or static. Without a form, or with auto, the records choose it.
     #[arg(long, conflicts_with_all = ["model", "collect"], num_args = 0..=1, default_missing_value = "auto", value_name = "FORM")]
     base: Option<form::Asked>,
     /// Records (text, .npy, .mat), run folders, or folders of both.
     #[arg(long, required_unless_present = "collect", num_args = 1.., value_parser = crate::arguments::run_folder())]
     data: Vec<PathBuf>,
-    /// Where the records leave it open, or there are none, run what would decide on the rig, keep its records in FOLDER
-    /// and look again.
+    /// Run the experiments on the rig that decide, and keep their records in FOLDER.
     #[arg(long, value_name = "FOLDER", help_heading = ON_A_RIG)]
     collect: Option<PathBuf>,
-    /// The rig to collect on, through the same loop as `cellpos track`; left out: the emulated one.
+    /// Rig file to collect with; default: the emulated rig.
     #[arg(long, requires = "collect", help_heading = ON_A_RIG)]
     rig: Option<PathBuf>,
-    /// Most experiments to run.
+    /// Largest number of experiments.
     #[arg(long, default_value_t = 2, requires = "collect", value_parser = clap::value_parser!(u8).range(1..=10), help_heading = ON_A_RIG)]
     rounds: u8,
     /// Factor on the duration of the experiments, 0.2 to 10.
     #[arg(long, default_value_t = 1.0, requires = "collect", help_heading = ON_A_RIG)]
     effort: f64,
-    /// Whether the emulated rig stands still, or has the imperfections of a real one (false) [default: as rig.toml says].
+    /// false: the emulated rig has the imperfections of a real one [default: as rig.toml says].
     #[arg(long, value_name = "BOOL", num_args = 0..=1, require_equals = true, default_missing_value = "true", requires = "collect")]
     ideal: Option<bool>,
     /// Seed of the emulated rig and of the excitations [default: that of rig.toml].
@@ -67,16 +65,16 @@ pub struct Args {
     /// Clock of the emulated rig [default: virtual; a real rig has the real one].
     #[arg(long, value_enum, requires = "collect", help_heading = ON_A_RIG)]
     clock: Option<ClockKind>,
-    /// Whether the emulated rig renders frames.
+    /// Render frames of the emulated rig.
     #[arg(long, value_enum, default_value = "on", requires = "collect", help_heading = ON_A_RIG)]
     frames: Frames,
-    /// Do not ask the operating system for real time.
+    /// Run without real-time priority.
     #[arg(long, requires = "collect", help_heading = ON_A_RIG)]
     best_effort: bool,
-    /// Effects of your own, searched like those of the catalogue (TOML, see docs/find-missing.md).
+    /// Your own effects, searched like those of the catalogue (see docs/find-missing.md).
     #[arg(long, value_name = "FILE")]
     effects: Vec<PathBuf>,
-    /// Write the augmented model here (TOML); where the verdict is unknown, its hypothesis goes beside it as NAME.effects.toml.
+    /// Write the augmented model here; with the verdict unknown, a hypothesis goes to NAME.effects.toml.
     #[arg(long)]
     out: Option<PathBuf>,
     /// Write the report here (HTML).
@@ -87,21 +85,20 @@ pub struct Args {
     json: Option<PathBuf>,
     #[command(flatten)]
     columns: Columns,
-    /// How the command acts between rows: zero-order (held) or none (sampled with the output) [default: as the model was
+    /// Input between rows: a command is held (zero-order), a measured signal is not (none) [default: as the model was
     /// identified, else zero-order].
     #[arg(long, value_enum)]
     hold: Option<HoldKind>,
-    /// Most effects to add.
+    /// Largest number of effects to add.
     #[arg(long, default_value_t = 4)]
     max_effects: usize,
-    /// Simulations that the search may take, in parts of what is enough for 30 s on two cores.
+    /// Factor on the number of simulations of the search.
     #[arg(long, default_value_t = 1.0)]
     work: f64,
-    /// Noise of the records: auto (a walk and white noise; of a model that states no diffusion, coloured noise where the
-    /// likelihood asks for it), walk, coloured (first-order and white noise), white.
+    /// Noise of the records: auto (walk and white noise; without a stated diffusion, coloured if the likelihood asks for it), walk, coloured (first-order and white noise), white.
     #[arg(long, value_enum, default_value = "auto")]
     noise: NoiseArg,
-    /// Threads; the result does not depend on it.
+    /// Threads; the result does not depend on them.
     #[arg(long)]
     threads: Option<usize>,
 }
@@ -259,7 +256,7 @@ fn rig(args: &Args, model: &Model) -> Result<OnRig, Failure> {
     )
 }
 
-/// What a page is headed with: the names of two records at most, the others are in its table.
+/// Title of a page: at most two names of records.
 fn heading<'a>(records: impl Iterator<Item = &'a Path>) -> String {
     let names: Vec<String> = records
         .map(|path| path.file_name().unwrap_or(path.as_os_str()))
@@ -328,13 +325,13 @@ fn write(args: &Args, result: &Reconciliation, collected: &[Collected]) -> Resul
     print_text(&text)
 }
 
-/// With effects of one's own and no name: the file of the model with the best set.
+/// With user-defined effects and no name: the file of the model with the best set.
 fn unnamed(args: &Args, result: &Reconciliation) -> Option<PathBuf> {
     let wanted = !args.effects.is_empty() && result.verdict == Verdict::Unknown;
     wanted.then(|| args.out.as_ref().map(|out| out.with_extension("best.toml")))?
 }
 
-/// Where a verdict is unknown and has a formula: the file beside the augmented model, and its text.
+/// If the verdict is unknown and has a formula: the file next to the augmented model, and its text.
 fn proposed(args: &Args, result: &Reconciliation) -> Option<(PathBuf, String)> {
     let text = result
         .proposal_toml()
@@ -342,7 +339,7 @@ fn proposed(args: &Args, result: &Reconciliation) -> Option<(PathBuf, String)> {
     Some((proposal_path(args.out.as_ref()?), text))
 }
 
-/// Says what was not looked for.
+/// Lists the effects that were not searched for.
 fn tell(result: &mut Reconciliation) {
     if result.verdict == Verdict::NothingMissing {
         result.places.push(not_looked_for());
@@ -369,7 +366,7 @@ fn units(columns: &Columns, files: &[PathBuf]) -> Units {
     }
 }
 
-/// What a verdict of nothing missing does not speak of: effects that are simulated and that no search tries.
+/// Limits of the verdict nothing-missing: effects that are simulated but not searched for.
 fn not_looked_for() -> String {
     // Frames that are missing or repeated are counted, not fitted.
     let counted = ["frame-drops", "frame-repeats"];

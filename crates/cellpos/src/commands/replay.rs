@@ -11,9 +11,8 @@ use std::path::PathBuf;
 /// Arguments of `cellpos replay`.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Example:\n  cellpos replay runs/20261121T090000Z-track\n
-Every recorded measurement of every session goes through the recorded controller again; the commands must come out the
-same to the last bit. Exit code 0: all do; 1: one does not, or rows are missing and those behind the gap cannot be replayed.
-What was not replayed is said: rows that are missing, damaged or lost, those behind a gap, and the end of a run that was killed.")]
+Puts every recorded measurement through the recorded controller again and compares the commands. Exit code 0: equal to the last bit;
+1: different, or rows are missing. The result counts rows that cannot be replayed: missing, damaged, behind a gap, after a kill.")]
 pub struct Args {
     /// The run folder.
     #[arg(value_parser = run_folder())]
@@ -33,13 +32,13 @@ struct SessionReport {
     identical: u64,
     missing_rows: u64,
     damaged_rows: u64,
-    /// Rows of the run that are not in the record, as run.toml says, beside those that are missing or damaged in between.
+    /// Rows of the run that are not in the record, as run.toml says, besides those that are missing or damaged in between.
     lost_rows: u64,
-    /// Whether the record ends where the run did; it does not where the run was killed, or still goes on.
+    /// Whether the record ends where the run did; it does not if the run was killed or still runs.
     complete: bool,
     /// Bytes of a batch that is cut off or damaged beyond being rows.
     unreadable_bytes: u64,
-    /// The version that recorded it, where it is another one.
+    /// The version that recorded it, if different.
     recorded_by: Option<String>,
     ended_at_gap: Option<Gap>,
     first_mismatch: Option<Mismatch>,
@@ -144,7 +143,7 @@ fn same_law(reader: &RunReader, columns: &[&'static str]) -> Result<(), Failure>
     ))
 }
 
-/// What of a session was not replayed, beside what stands behind a gap.
+/// Rows of a session that were not replayed, besides those behind a gap.
 fn left_out(s: &SessionReport) -> Vec<String> {
     let mut lines = Vec::new();
     if s.lost_rows > 0 {

@@ -1,4 +1,4 @@
-//! `cellpos report`: what a run did, on one page.
+//! `cellpos report`: a run on one page.
 
 mod bound;
 mod clips;
@@ -31,13 +31,13 @@ use ticks::Ticks;
 #[command(after_help = "Example:
   cellpos report runs/20261121T190000Z-fatigue
 
-Writes report.html into the run folder, and beside it report-figures/ with every figure as SVG and its data as CSV. The
-sessions of a run that was resumed are joined; the gaps show.")]
+Writes report.html into the run folder, and report-figures/ with every figure as SVG and its data as CSV. It joins the sessions of a
+resumed run and shows the gaps.")]
 pub struct Args {
-    /// The run's folder; `latest`, or `latest-NAME`: the newest below runs/.
+    /// Run folder; `latest`, or `latest-NAME`: the newest in runs/.
     #[arg(value_parser = run_folder())]
     run: PathBuf,
-    /// The page to write; left out: report.html in the run folder.
+    /// Page to write; default: report.html in the run folder.
     #[arg(long)]
     out: Option<PathBuf>,
     /// Print one JSON object on standard output.
@@ -134,7 +134,7 @@ fn notes(reader: &RunReader) -> Option<String> {
 }
 
 fn nm(um: Option<f64>) -> String {
-    // What rounds to nothing has no sign.
+    // A value that rounds to zero has no sign.
     um.map_or_else(
         || "-".to_string(),
         |um| format!("{:.1}", (um * 1e4).round() / 10.0 + 0.0),
@@ -153,7 +153,7 @@ fn ending(session: &Session) -> (Emphasis, String) {
     }
 }
 
-/// Sample, date, machine, devices, controller and gains: what a reader asks first.
+/// Sample, date, machine, devices, controller and gains.
 fn what_it_was(page: &mut Report, sessions: &[Session]) {
     let Some(meta) = sessions.iter().find_map(|session| session.meta.as_ref()) else {
         return;

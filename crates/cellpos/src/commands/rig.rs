@@ -17,26 +17,26 @@ pub struct Args {
 
 #[derive(Debug, clap::Subcommand)]
 enum Command {
-    /// Print a commented rig file, with what this machine offers.
+    /// Print a commented rig file with the devices of this machine.
     #[command(after_help = "Examples:\n  cellpos rig new --emulated > rig.toml\n  \
         cellpos rig new --serial /dev/ttyACM0 --camera 192.168.1.20 > rig.toml\n  \
         cellpos rig new --serial pzt --camera camera.sock > rig.toml")]
     New(New),
-    /// Read a rig file and say what is wrong with it and what does not fit together.
+    /// Check a rig file: every wrong key, with the remedy.
     #[command(
         after_help = "Examples:\n  cellpos rig check rig.toml\n  cellpos rig check rig.toml --connect"
     )]
     Check(Check),
-    /// Try board, camera, vision and machine, and write a sheet for the lab book: passed, failed or not tried, with numbers.
+    /// Test board, camera, vision and machine, and write a sheet for the lab book.
     Prove(super::prove::Args),
 }
 
 #[derive(Debug, clap::Args)]
 struct New {
-    /// Board and camera in this process.
+    /// Emulated board and camera.
     #[arg(long, conflicts_with_all = ["serial", "camera"])]
     emulated: bool,
-    /// Serial port of the board; left out: the first one found.
+    /// Serial port of the board; default: the first one found.
     #[arg(long, value_name = "PORT")]
     serial: Option<String>,
     /// Socket of a camera server, or address of a GigE or USB3 Vision camera.
@@ -48,7 +48,7 @@ struct New {
 struct Check {
     /// The file.
     rig: PathBuf,
-    /// Open board and camera, too, and say what they are. Nothing moves.
+    /// Open board and camera, too; nothing moves.
     #[arg(long)]
     connect: bool,
     /// Print one JSON object on standard output.

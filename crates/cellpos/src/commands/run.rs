@@ -50,65 +50,63 @@ use std::sync::Arc;
   cellpos run --resume runs/20261121T190000Z-fatigue
   cellpos run examples/scripts/fatigue.toml --rig rig.toml --cells 20 --between 30s
 
-The script is checked first, as by cellpos check with the limits of the rig. Keys, where standard input is a terminal: p
-pauses and goes on, s skips to the next step, q freezes the bead, then parks the PZT. SIGUSR1 does what p does, SIGUSR2
-what s does, Ctrl-C and SIGTERM what q does; a second one parks at once. Every cycle that is over is in cycles.csv in the run folder; --resume goes on behind the last of them,
-after a crash too. Exit code 0: the script came to its end; 1: it did not; 2: bad input, or the rig cannot do it.")]
+cellpos check runs first, with the limits of the rig. Keys on a terminal: p pauses and continues, s skips to the next step, q freezes
+the bead, then parks the PZT. Signals do the same: SIGUSR1 (p), SIGUSR2 (s), Ctrl-C and SIGTERM (q); a second one parks at once.
+--resume continues after the last complete cycle in cycles.csv, after a crash too. Exit code 0: the script reached its end; 1: it did
+not; 2: bad input, or the rig cannot do it.")]
 pub struct Args {
     /// The script.
     #[arg(required_unless_present = "resume", conflicts_with = "resume")]
     script: Option<PathBuf>,
-    /// Go on with a run that was cut off or stopped, as it was set up.
+    /// Resume a run that was stopped or cut off.
     #[arg(long, value_name = "RUN", value_parser = crate::arguments::run_folder())]
     resume: Option<PathBuf>,
-    /// Rehearse: on the virtual clock, with an emulated rig that behaves as --model says.
+    /// Rehearse on the virtual clock, on an emulated rig like --model.
     #[arg(long)]
     dry: bool,
     /// pi, lead, lqg, mpc, or the path of a controller.toml.
     #[arg(long, default_value = "pi")]
     controller: String,
-    /// Whether the law follows the gain and delay of the plant while it runs; left out: lqg and mpc do, pi and lead do not, a
-    /// controller.toml says by itself.
+    /// Follow gain and delay of the plant; default: on for lqg and mpc, off for pi and lead, else as controller.toml says.
     #[arg(long, value_enum, conflicts_with = "resume")]
     adapt: Option<Adapt>,
-    /// The rig; left out: emulated.
+    /// Rig file; default: the emulated rig.
     #[arg(long)]
     rig: Option<PathBuf>,
-    /// The plant that the controller is made for: a model.toml, or eq6.
+    /// Model that the controller is made for: a model.toml, or eq6.
     #[arg(long, default_value = "eq6")]
     model: String,
-    /// Learn the feed-forward of periodic motions over their cycles, as `learn = true` in the script does.
+    /// Learn the feed-forward of periodic motions, like `learn = true` in the script.
     #[arg(long, conflicts_with = "resume")]
     learn: bool,
-    /// Of several beads or cells in view, follow the one nearest to this position at the start; left out: `near_um` of
-    /// `--rig`, or the most prominent.
+    /// Follow the bead or cell nearest to this position; default: `near_um` of `--rig`, else the most prominent.
     #[arg(long, allow_hyphen_values = true)]
     near: Option<Micrometers>,
-    /// Run although the rig file has errors (cellpos rig check).
+    /// Run in spite of errors of the rig file.
     #[arg(long)]
     anyway: bool,
-    /// Whether the emulated rig stands still, or has the imperfections of a real one (false) [default: as rig.toml says].
+    /// false: the emulated rig has the imperfections of a real one [default: as rig.toml says].
     #[arg(long, value_name = "BOOL", num_args = 0..=1, require_equals = true, default_missing_value = "true", conflicts_with = "resume")]
     ideal: Option<bool>,
-    /// Seed of the emulated rig; left out: that of rig.toml.
+    /// Seed of the emulated rig; default: that of rig.toml.
     #[arg(long)]
     seed: Option<u64>,
-    /// Clock of the emulated rig; left out: real, and virtual with --dry.
+    /// Clock of the emulated rig; default: real, with --dry virtual.
     #[arg(long, value_enum)]
     clock: Option<ClockKind>,
-    /// Whether the emulated rig renders frames; left out: on, and off with --dry.
+    /// Render frames of the emulated rig; default: on, with --dry off.
     #[arg(long, value_enum)]
     frames: Option<Frames>,
-    /// Amplitude error, in percent of the commanded amplitude (mean of ten cycles), above which an alarm is given.
+    /// Amplitude error that gives an alarm, % of the commanded amplitude (mean of ten cycles).
     #[arg(long, default_value_t = 10.0)]
     alarm_percent: f64,
-    /// Do not ask the operating system for real time.
+    /// Run without real-time priority.
     #[arg(long)]
     best_effort: bool,
-    /// Where run folders go.
+    /// Folder of the runs.
     #[arg(long, default_value = "runs")]
     runs: PathBuf,
-    /// Name of the run; left out: that of the script.
+    /// Name of the run; default: that of the script.
     #[arg(long, value_parser = run_name)]
     name: Option<String>,
     #[command(flatten)]
@@ -122,7 +120,7 @@ pub struct Args {
     json: bool,
 }
 
-/// Runs a script, or goes on with one, or on one cell after another.
+/// Runs a script, resumes one, or runs it on one cell after another.
 pub fn run(args: Args) -> CommandResult {
     if let Some(cells) = args.queue.cells {
         return queue::run(&args, cells);
@@ -379,7 +377,7 @@ fn page(name: &str, script: &Script) -> Page {
     }
 }
 
-/// A length can only be waited for where it is measured.
+/// Waiting for a length needs a measured length.
 fn measurable(script: &Script, plan: &Plan, file: &RigFile) -> Result<(), Failure> {
     if !plan.needs_length() || file.follows_a_cell() {
         return Ok(());

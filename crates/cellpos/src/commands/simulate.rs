@@ -18,11 +18,7 @@ use std::path::PathBuf;
 #[command(
     after_help = "Examples:\n  cellpos simulate --model eq6 --input in.csv --out out.csv\n  \
                         cellpos simulate --model base.toml --input d.csv --input-column 'power [W]' --output-column 'T [degC]' --out s.csv\n\n\
-                        The input needs the columns time_s and pzt_um; the output has time_s, pzt_um and bead_um, the \
-                        position just before the row's command takes effect. The bead starts at rest at 0 um. \
-                        With --input-column (data of another rig, a model of identify --data or reconcile --base) the columns have the \
-                        names that are given, the plant starts at rest at the model's working point, and its output counts from where it \
-                        stood on average when it was identified."
+                        The input needs the columns time_s and pzt_um; the output has time_s, pzt_um and bead_um, the position just before the row's command takes effect. The bead starts at rest at 0 um. With --input-column (another rig, a model of identify --data or reconcile --base) the plant starts at rest at the model's working point, and its output counts from the mean of the identified records."
 )]
 pub struct Args {
     /// `eq6`, or a model file.
@@ -34,22 +30,22 @@ pub struct Args {
     /// The record to write.
     #[arg(long)]
     out: PathBuf,
-    /// Column of the input of another rig's record: its name, or its number from 1.
+    /// Input column of another rig's record: its name, or its number from 1.
     #[arg(long)]
     input_column: Option<String>,
-    /// Name of the output's column in what is written [default: output].
+    /// Name of the output column in the written record [default: output].
     #[arg(long, requires = "input_column")]
     output_column: Option<String>,
-    /// Column of the time, in the unit of its name, else in seconds [default: the one called time or t].
+    /// Time column, in the unit of its name, else in seconds [default: the one called time or t].
     #[arg(long, requires = "input_column")]
     time_column: Option<String>,
-    /// Rows per second of a record without a column of time.
+    /// Sampling rate of a record without a time column.
     #[arg(long, requires = "input_column", value_parser = crate::arguments::positive::<cellpos_units::Hertz>)]
     rate: Option<cellpos_units::Hertz>,
-    /// What the input does between rows [default: as the model was identified, else zero-order].
+    /// Input between rows [default: as the model was identified, else zero-order].
     #[arg(long, value_enum)]
     hold: Option<HoldKind>,
-    /// Adds Brownian motion and localisation noise from this seed.
+    /// Add Brownian motion and localisation noise from this seed.
     #[arg(long)]
     seed: Option<u64>,
     /// Print one JSON object on standard output.
@@ -64,7 +60,7 @@ pub fn run(args: Args) -> CommandResult {
     let input = if args.input.is_dir() {
         let sessions = sessions(&args.input).len();
         if sessions > 1 {
-            // Each begins with a bead of its own.
+            // Each begins with another bead.
             tracing::warn!(
                 "{} has {sessions} sessions: the first is simulated; name the folder of another one, below {}",
                 args.input.display(),
@@ -183,7 +179,7 @@ fn write_named(
     let rest: f64 = (model.provenance.get(base::REST_OUTPUT))
         .and_then(|text| text.parse().ok())
         .unwrap_or(0.0);
-    // A column that was a number has no name of its own.
+    // A column given by number has no name.
     let input = names[0].parse::<usize>().map_or(names[0], |_| "input");
     let mut text = format!("time_s,{},{}\n", csv_field(input), csv_field(names[1]));
     for (k, (u, y)) in answer.pzt_um.iter().zip(&answer.bead_um).enumerate() {

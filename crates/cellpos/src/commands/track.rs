@@ -36,71 +36,68 @@ use std::path::{Path, PathBuf};
   cellpos track --target 0um --rig rig.toml --controller controller.toml
   cellpos track --target 0um --sine 5um@50Hz --controller lqg --learn --duration 5s
 
-Without --rig the rig is emulated: frames are rendered, the board is the firmware library. Ctrl-C freezes the bead, then
-parks the PZT; a second Ctrl-C parks at once. Keys, where standard input is a terminal: f freezes and goes on, q does what
-Ctrl-C does; the arrows move the target (left, right: 0.1 um; down, up: 1 um), a number and Enter sets it. Exit code 0: the run ended as asked; 1: it ended in Safe; 2: bad input.")]
+Without --rig the rig is emulated. Ctrl-C freezes the bead, then parks the PZT; a second Ctrl-C parks at once. Keys on a terminal:
+f freezes and continues, q ends like Ctrl-C, the arrows move the target (left, right: 0.1 um; down, up: 1 um), a number and Enter
+sets it. Exit code 0: done; 1: Safe, or the bead was not kept; 2: bad input.")]
 pub struct Args {
-    /// Where the bead is to be.
+    /// Position to hold.
     #[arg(long, allow_hyphen_values = true)]
     target: Micrometers,
-    /// How long; left out: until Ctrl-C.
+    /// Duration; default: until Ctrl-C.
     #[arg(long, value_parser = positive::<Seconds>)]
     duration: Option<Seconds>,
-    /// pi, lead, lqg, mpc, or the path of a controller.toml. lqg holds closest, and keeps the bead when the flow steps; pi asks less
-    /// of the model.
+    /// pi, lead, lqg, mpc, or the path of a controller.toml. lqg holds best; pi needs less of a model.
     #[arg(long, default_value = "lqg")]
     controller: String,
-    /// A sine about the target, amplitude@frequency.
+    /// Follow a sine about the target: amplitude@frequency.
     #[arg(long, value_name = "5um@50Hz")]
     sine: Option<Sine>,
-    /// Learn the sine's feed-forward over its cycles; what is learned is kept in the run folder as learned.toml.
+    /// Learn the feed-forward of the sine; the run folder keeps it as learned.toml.
     #[arg(long, requires = "sine")]
     learn: bool,
-    /// Go on from the learned.toml of an earlier run.
+    /// Start from the learned.toml of an earlier run.
     #[arg(long, requires = "learn")]
     learned: Option<PathBuf>,
-    /// Solver of mpc; left out: that of controller.toml, active-set where it names none.
+    /// Solver of mpc; default: that of controller.toml, else active-set.
     #[arg(long, value_enum)]
     solver: Option<Solver>,
-    /// Whether the law follows the gain and delay of the plant while it runs; left out: lqg and mpc do, pi and lead do not, a
-    /// controller.toml says by itself.
+    /// Follow gain and delay of the plant; default: on for lqg and mpc, off for pi and lead, else as controller.toml says.
     #[arg(long, value_enum)]
     adapt: Option<Adapt>,
-    /// The rig; left out: emulated.
+    /// Rig file; default: the emulated rig.
     #[arg(long)]
     rig: Option<PathBuf>,
-    /// The plant that the controller is made for: a model.toml, or eq6.
+    /// Model that the controller is made for: a model.toml, or eq6.
     #[arg(long, default_value = "eq6")]
     model: String,
-    /// Of several beads or cells in view, follow the one nearest to this position at the start; left out: `near_um` of
-    /// `--rig`, or the most prominent.
+    /// Follow the bead or cell nearest to this position; default: `near_um` of `--rig`, else the most prominent.
     #[arg(long, allow_hyphen_values = true)]
     near: Option<Micrometers>,
-    /// Run although the rig file has errors (cellpos rig check).
+    /// Run in spite of errors of the rig file.
     #[arg(long)]
     anyway: bool,
-    /// Whether the emulated rig stands still, or has the imperfections of a real one (false) [default: as rig.toml says].
+    /// false: the emulated rig has the imperfections of a real one [default: as rig.toml says].
     #[arg(long, value_name = "BOOL", num_args = 0..=1, require_equals = true, default_missing_value = "true")]
     ideal: Option<bool>,
-    /// Seed of the emulated rig; left out: that of rig.toml.
+    /// Seed of the emulated rig; default: that of rig.toml.
     #[arg(long)]
     seed: Option<u64>,
     /// Clock of the emulated rig.
     #[arg(long, value_enum, default_value = "real")]
     clock: ClockKind,
-    /// Whether the emulated rig renders frames.
+    /// Render frames of the emulated rig.
     #[arg(long, value_enum, default_value = "on")]
     frames: Frames,
-    /// Do not ask the operating system for real time.
+    /// Run without real-time priority.
     #[arg(long)]
     best_effort: bool,
-    /// Where run folders go.
+    /// Folder of the runs.
     #[arg(long, default_value = "runs")]
     runs: PathBuf,
     /// Name of the run.
     #[arg(long, default_value = "track", value_parser = run_name)]
     name: String,
-    /// Leave no run folder.
+    /// Do not write a run folder.
     #[arg(long)]
     no_record: bool,
     #[command(flatten)]
@@ -115,9 +112,9 @@ pub struct Args {
 /// Solvers of mpc.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
 enum Solver {
-    /// Interior point.
+    /// Interior-point method.
     Clarabel,
-    /// Dual active set: faster, no allocation.
+    /// Dual active-set method: faster, no allocation.
     ActiveSet,
 }
 
@@ -340,7 +337,7 @@ fn conclude(
         summary.state.name()
     };
     let (sink, kept_clips) = sink.into_inner(&summary, &ended).into_parts();
-    // The terminal is given back, and the page is over, before anything is said.
+    // First release the terminal and end the page, then print.
     drop(view);
     warnings.extend(clips::warnings(kept_clips));
     let kept = sink.into_writer().map(|writer| {

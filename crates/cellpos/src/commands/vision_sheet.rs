@@ -46,7 +46,7 @@ pub struct Sheet {
 }
 
 impl Sheet {
-    /// A sheet for a recording of `frames` frames: nine of them, evenly spread.
+    /// A contact sheet for a recording of `frames` frames: nine, evenly spread.
     pub fn new(frames: usize) -> Self {
         let last = frames.saturating_sub(1);
         let mut wanted: Vec<usize> = (0..TILES).map(|k| k * last / (TILES - 1)).collect();

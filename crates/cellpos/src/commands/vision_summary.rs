@@ -86,7 +86,7 @@ pub struct BeadFigures {
     pub noise_px: Option<f64>,
     /// Good fixes by the fractional part of x and y.
     pub subpixel_counts: [u64; BINS],
-    /// Chi^2 per degree of freedom of these counts against equal ones.
+    /// Chi^2 per degree of freedom of the counts against equal counts.
     pub subpixel_chi2: f64,
 }
 

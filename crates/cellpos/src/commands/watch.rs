@@ -14,19 +14,18 @@ use std::time::{Duration, Instant};
   cellpos watch latest
   cellpos watch runs/20261121T090000Z-track --for 1min
 
-The run may be going on in another program, or be over; nothing is asked of that program, and the page may look only. Of a
-long run the last ten minutes are shown. Ctrl-C ends it.")]
+The run may be over, or running in another program. The page may only look. It shows the last ten minutes. Ctrl-C ends it.")]
 pub struct Args {
     /// The run folder.
     #[arg(value_parser = run_folder())]
     run: PathBuf,
-    /// Where the page is served; port 0: any that is free.
+    /// Address of the page; port 0: any free one.
     #[arg(long, default_value = "127.0.0.1:0")]
     view: SocketAddr,
-    /// Let other machines reach the page; nothing is encrypted.
+    /// Let other machines reach the page, without encryption.
     #[arg(long)]
     view_unsafe_address: bool,
-    /// For how long; left out: until Ctrl-C.
+    /// Duration; default: until Ctrl-C.
     #[arg(long = "for", value_parser = positive::<Seconds>)]
     duration: Option<Seconds>,
 }

@@ -55,6 +55,41 @@ fn what_cannot_be_right_gets_a_sentence_in_plain_words() {
     assert_eq!(left.len(), 2, "runs and one.csv: {left:?}");
 }
 
+/// The remedy is in the message: what is too large, which option is wrong, which unit, which key, which runs there are.
+#[test]
+fn a_mistake_is_answered_with_the_text_to_write() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    succeed(
+        at,
+        "track --target 0um --duration 1s --clock virtual --frames off --name one",
+    );
+    for (text, line, words) in [
+        (
+            "[limits]\nhigh_um = 1e9\n",
+            "rig check rig.toml",
+            "rig.toml:2: high_um = 1000000000 um: must be at most",
+        ),
+        ("", "track --target 0um --sine 500um@1Hz", "--sine 500um"),
+        ("", "design --model eq6 --delay 2.5", "write 2.5ms"),
+        (
+            "",
+            "report latest-passages",
+            "no run named passages; there are one",
+        ),
+    ] {
+        std::fs::write(at.join("rig.toml"), text).unwrap();
+        let ran = cellpos(at, line);
+        assert_ne!(ran.code, Some(0), "{line}");
+        let said =
+            [&ran.out, &ran.err].map(|text| text.split_whitespace().collect::<Vec<_>>().join(" "));
+        assert!(
+            said.iter().any(|said| said.contains(words)),
+            "{line}: {said:?}"
+        );
+    }
+}
+
 /// On standard output stands what was exported, and nothing else.
 #[cfg(unix)]
 #[test]

@@ -342,3 +342,23 @@ fn a_device_is_no_script_and_a_script_gives_the_terminal_no_orders() {
         assert_eq!(orders, [false, false], "{line}");
     }
 }
+
+#[test]
+fn several_runs_where_one_is_meant_get_a_sentence() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    let make = format!("track --target 0um --duration 1s --name two {FAST}");
+    let [one, other] = [made(at, &make), made(at, &make)];
+    for command in ["replay", "report", "export", "watch"] {
+        // As a shell hands over runs/*-two*.
+        let line = format!("{command} {} {}", one.display(), other.display());
+        let ran = cellpos(at, &line);
+        assert_eq!(ran.code, Some(2), "{line}: {}", ran.err);
+        let said = ran.err.split_whitespace().collect::<Vec<_>>().join(" ");
+        assert!(
+            said.contains("this command takes one") && said.contains("latest-NAME"),
+            "{line}: {said}"
+        );
+    }
+    succeed(at, "replay latest-two");
+}

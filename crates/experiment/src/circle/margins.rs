@@ -1,7 +1,7 @@
 //! Margins of a control law on any model, nonlinear effects included: on the response to small sines.
 //!
-//! A hysteresis or a backlash has no transfer function; what a loop that holds a bead meets is its response to motion of
-//! the size that holding needs. That response is simulated line by line without noise, so the same figures can be given
+//! A hysteresis or a backlash has no transfer function; a holding loop meets its response to motion of that size. That response is
+//! simulated line by line without noise, so the same figures can be given
 //! for the model that a controller was designed on and for the rig that it runs on.
 
 use cellpos_control::LinearLaw;
@@ -29,7 +29,7 @@ pub struct Response {
 }
 
 impl Response {
-    /// The response of a model to sines that move the bead by `amplitude_um`, or the PZT where that is less.
+    /// The response of a model to sines that move the bead by `amplitude_um`, or the PZT if that is less.
     pub fn of(model: &Model, amplitude_um: f64, sample_s: f64) -> Result<Self, Failure> {
         let mut response = Self {
             hz: Vec::with_capacity(LINES),
@@ -104,7 +104,7 @@ pub struct LoopMargins {
     pub crossover_hz: f64,
     /// Smallest factor above 1 on the gain that makes the loop unstable, dB; null without a phase crossover.
     pub gm_db: Option<f64>,
-    /// Smallest delay beside its own that makes the loop unstable, ms.
+    /// Smallest additional delay that makes the loop unstable, ms.
     pub delay_margin_ms: f64,
 }
 

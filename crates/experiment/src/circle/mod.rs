@@ -1,7 +1,7 @@
 //! The circle: identify, reconcile, design again, track again, and what each step was worth.
 //!
-//! The steps are shown a model and a rig; what the rig hides stays in the rig. On the emulated rig the truth is known, so that
-//! the margins that each model predicts can be set beside those that the loop has.
+//! The steps get a model and a rig; the hidden model stays in the rig. On the emulated rig the truth is known, so the margins that
+//! each model predicts are compared with those of the loop.
 
 pub mod margins;
 pub mod stage;
@@ -18,7 +18,7 @@ use stage::{Motion, Stage};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-/// What to go round with.
+/// Settings of the circle.
 pub struct Job<'a> {
     /// The model that is believed in at the start.
     pub given: Model,
@@ -42,9 +42,9 @@ pub struct Job<'a> {
     pub resume: Option<&'a Path>,
 }
 
-/// Everything that came of it.
+/// Its results.
 pub struct Circle {
-    /// The measured response and what it was fitted by.
+    /// The measured response and its fit.
     pub identified: Done,
     /// Whether the model that reconcile extended is the identified one (else the one given), and why.
     pub base: (&'static str, String),
@@ -86,8 +86,7 @@ pub fn close(job: Job<'_>, progress: &mut (dyn FnMut(&str) + Send)) -> Result<Ci
             .map_err(Failure::failed)?
     };
     let (mut start, base) = base(&done, &given, &identified);
-    // What the rig file states needs no finding. Left out, the way that the bead goes in a part of an exposure is taken for
-    // delay: 14 us of it at 0.5 ms.
+    // What the rig file states needs no finding. Without it, the motion within an exposure counts as delay: 14 us at 0.5 ms.
     if let Some(exposure_s) = connect::stated_exposure_s(file).filter(|s| *s > 0.0)
         && start.effect("exposure-averaging").is_none()
     {

@@ -33,7 +33,7 @@ pub struct Tracked {
     pub rms_measured_nm: Option<f64>,
     /// RMS of true position less reference after 2 s, nm; emulated rigs only.
     pub rms_true_nm: Option<f64>,
-    /// The last half second: time, s, and error (true where it is known), um.
+    /// The last half second: time, s, and error (true error if known), um.
     #[serde(skip)]
     pub trace: (Vec<f64>, Vec<f64>),
 }

@@ -1,4 +1,4 @@
-//! A bead held by PI on the emulated rig, with an excitation added: what an identification experiment runs on.
+//! A bead held by PI on the emulated rig, with an excitation, for identification.
 //!
 //! The path is the rig's own: firmware library, plant, rendered frames, localiser. Each period the newest measurement is
 //! taken, the controller steps, the command goes to the board. Afterwards the board's LED is switched at dithered
@@ -236,7 +236,7 @@ impl HeldBead {
     }
 
     /// The LED test: `edges` dithered switches of the board's LED, seen in the mean grey level of the frames. The bead is
-    /// let go; the PZT rests at neutral.
+    /// released; the PZT rests at neutral.
     pub fn delay_test(&mut self, edges: usize, seed: u64) -> Result<DelayTest, Failure> {
         self.source = None;
         let mut camera = self.rig.camera();

@@ -1,4 +1,4 @@
-//! The LED test: when the light was switched, and what the frames saw of it.
+//! The LED test: switching times, and brightness of the frames.
 
 use cellpos_ident::delay::{Brightness, DelayEstimate, SeenEdge, delay_from_edges, find_edges};
 use cellpos_rig::{FrameBuffer, FrameStamp};
@@ -25,7 +25,7 @@ impl LitFrames {
     }
 }
 
-/// A delay test with what it saw.
+/// A delay test and its observations.
 pub struct DelayTest {
     /// From the command to the exposure that shows it, by the frames' stamps; [`DelayTest::up_to_the_tick`] adds the way of the frame.
     pub estimate: DelayEstimate,
@@ -41,11 +41,11 @@ pub struct DelayTest {
     pub line_s: Option<f64>,
 }
 
-/// Part of a period by which time stamps may be off before anybody is told.
+/// Error of time stamps that gives a warning, as a fraction of the period.
 const WORTH_SAYING: f64 = 0.1;
 
 impl DelayTest {
-    /// The delay between the switching times of the LED and what the frames saw.
+    /// The delay between the switching times of the LED and the frames.
     ///
     /// # Errors
     /// Fewer than half of the edges show.
@@ -67,8 +67,8 @@ impl DelayTest {
         })
     }
 
-    /// What to write when the frames' time stamps are not those of their exposures: what the LED test finds beyond the line is their
-    /// error. To be asked before [`DelayTest::up_to_the_tick`].
+    /// Remedy for time stamps that are not those of the exposures: the delay of the LED test beyond the line is their error. To
+    /// be asked before [`DelayTest::up_to_the_tick`].
     pub fn stamps_off(&self, file: &RigFile) -> Option<String> {
         let off_s = self.estimate.delay_s - self.line_s?;
         // The line's two ways need not take the same time.
@@ -93,7 +93,7 @@ impl DelayTest {
         })
     }
 
-    /// The delay of a record, in which a position stands at the tick that used it: with the age of the frames at their ticks.
+    /// The delay of a record, in which a position belongs to the tick that used it: the age of the frames at their ticks is included.
     pub fn up_to_the_tick(&mut self, age_s: f64) {
         self.estimate.delay_s += age_s;
         self.estimate.ci95_s = self.estimate.ci95_s.map(|end| end + age_s);

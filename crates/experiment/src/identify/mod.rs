@@ -24,9 +24,9 @@ use std::path::PathBuf;
 pub enum Excitation {
     /// One sine after the other.
     Stepped,
-    /// All lines at once, random phases, odd lines with detection lines between.
+    /// All frequencies at once, with random phases; odd lines, with detection lines between.
     Multisine,
-    /// A logarithmic sweep through all lines, repeated.
+    /// A repeated logarithmic sweep through all frequencies.
     Sweep,
 }
 
@@ -57,7 +57,7 @@ pub struct Job {
     pub keep_in: Option<PathBuf>,
 }
 
-/// What came of it.
+/// The outcome.
 pub struct Done {
     /// The plan that was run.
     pub plan: Plan,
@@ -263,7 +263,7 @@ fn on_rig(
                 turn.part
             )
         }));
-        // A run that ended early has tried none behind the one in which it did.
+        // A run that ended early has not tried the later ones.
         let tried = if run_through { failed.len() } else { 1 };
         for turn in failed.iter().take(tried) {
             spoilt[turn.index] += 1;
@@ -385,8 +385,7 @@ fn conclude(
     .map_err(Failure::failed)
 }
 
-/// Runs a plan. A bead that is lost once is given up and a new one waited for: the experiment resumes at the segment
-/// that failed, at most three times.
+/// Runs a plan. After a lost bead the experiment waits for a new one and resumes at the failed segment, at most three times.
 fn acquire(
     job: &Job,
     plan: &Plan,

@@ -9,7 +9,7 @@ use std::path::Path;
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Partial {
-    /// One description per planned segment: a plan that differs in any of them is another experiment.
+    /// One description per planned segment: a plan with any difference is another experiment.
     plan: Vec<String>,
     segments: Vec<Kept>,
 }

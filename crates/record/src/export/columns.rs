@@ -153,7 +153,7 @@ pub const STAGE: Codes = &[
     (14, "stopped-cycles"),
     (15, "stopped-wait"),
 ];
-/// How the optimiser ended.
+/// Result of the optimiser.
 pub const SOLVER: Codes = &[
     (0, "not-used"),
     (1, "solved"),
@@ -177,81 +177,81 @@ use Value::{Code, Number, Whole};
 
 columns! {
     "time_s" "s" Number(|r| seconds(r.offset_ns.saturating_add(r.tick.time_ns))),
-        "Start of the tick since the start of the run; a further session begins where its pause ends.";
+        "Start of the tick since the start of the run, pauses between sessions included.";
     "pzt_um" "um" Number(|r| r.tick.command_um),
-        "PZT displacement commanded from time_s on, held until the next row.";
+        "Commanded PZT displacement, held from time_s until the next row.";
     "bead_um" "um" Number(|r| bead_um(&r.tick)),
-        "Position that the camera had delivered just before, exposed around mid_exposure_s; none without a bead.";
+        "Measured position at mid_exposure_s; none without a bead.";
     "error_um" "um" Number(|r| r.tick.error_um),
-        "Error: bead_um less the reference at mid_exposure_s, the one in force when the frame was exposed.";
+        "bead_um minus the reference at mid_exposure_s.";
     "seq" "" Whole(|r| r.tick.seq),
-        "Number of the tick in its session; runs on over rows that were lost.";
+        "Number of the tick in its session, lost rows counted.";
     "frame_id" "" Whole(|r| r.tick.frame_id),
-        "Number of the frame used, unwrapped; of the last one seen on a tick of the timer.";
+        "Number of the newest frame, unwrapped.";
     "mid_exposure_s" "s" Number(|r| seconds(r.offset_ns.saturating_add(r.tick.mid_exposure_ns))),
         "Middle of that frame's exposure, on the clock of time_s.";
     "sigma_um" "um" Number(|r| r.tick.variance_um2.sqrt()),
-        "Standard deviation of the measured position as vision states it.";
+        "Standard deviation of bead_um as vision states it.";
     "target_um" "um" Number(|r| r.tick.target_um),
         "Reference at the tick.";
     "estimate_um" "um" Number(|r| r.tick.estimate_um),
-        "Estimated position of the bead at the tick.";
+        "Estimated position at the tick.";
     "estimate_sd_um" "um" Number(|r| r.tick.estimate_sd_um),
-        "Standard deviation of that estimate. It grows while the bead is not seen.";
+        "Standard deviation of the estimate; it grows while the bead is not seen.";
     "neutral_um" "um" Number(|r| r.tick.neutral_um),
-        "Estimated zero-flow displacement: the PZT displacement at which the bead rests.";
+        "Estimated zero-flow displacement.";
     "requested_um" "um" Number(|r| r.tick.requested_um),
         "Output of the controller before range and slew limits.";
     "applied_um" "um" Number(|r| r.tick.applied_um),
-        "PZT displacement that the board reported last.";
+        "PZT displacement that the board last reported.";
     "true_um" "um" Number(|r| r.tick.true_um),
         "True position of the bead at the tick; emulated rig only.";
     "verdict" "" Code(VERDICT, |r| r.tick.verdict),
-        "What vision says of the frame; none without a frame.";
+        "Judgement of vision; none without a frame.";
     "life" "" Code(LIFE, |r| r.tick.life),
         "State of the run's life cycle.";
     "request" "" Code(REQUEST, |r| r.tick.request),
-        "What operator or program asked for at this tick.";
+        "Request of operator or program.";
     "board" "" Code(BOARD, |r| r.tick.board),
-        "State that the board reported last; none before its first report.";
+        "State that the board last reported.";
     "board_fault" "" Code(BOARD_FAULT, |r| r.tick.board_fault),
-        "Fault that the board reported last.";
+        "Fault that the board last reported.";
     "flags" "" Whole(|r| r.tick.flags.0.into()),
-        "What happened in the tick, as bits.";
+        "Events of the tick, as bits.";
     "drained" "" Whole(|r| r.tick.drained.into()),
-        "Positions found waiting at this tick: one is used, the others are counted.";
+        "Positions that waited at this tick; the newest is used.";
     "wake_us" "us" Number(|r| f64::from(r.tick.wake_ns) / 1e3),
-        "From the arrival of the position, or the time at which the tick was due, to the start of the tick; 0 on the virtual clock.";
+        "From the arrival of the position, or the due time, to the start of the tick; 0 on the virtual clock.";
     "compute_us" "us" Number(|r| f64::from(r.tick.compute_ns) / 1e3),
         "From the start of the tick to the hand-over of the command; 0 on the virtual clock.";
     "track" "" Code(TRACK, |r| r.tick.track),
         "State of the tracker; none without a frame or a tracker.";
     "decision" "" Code(DECISION, |r| r.tick.decision),
-        "What the tracker decided of the frame; none without a frame or a tracker.";
+        "Decision of the tracker; none without a frame or a tracker.";
     "plan_s" "s" Number(|r| if r.tick.plan_ns < 0 { f64::NAN } else { seconds(r.tick.plan_ns) }),
-        "Time of the script's plan; stands still while the script waits or is paused; none without a script.";
+        "Time of the script's plan, which stops during waits and pauses.";
     "stage" "" Code(STAGE, |r| r.tick.stage),
-        "What the script is doing.";
+        "Stage of the script.";
     "length_um" "um" Number(|r| r.tick.length_um),
-        "Measured length of the cell along the channel; none when a bead is followed.";
+        "Length of the cell along the channel.";
     "area_um2" "um2" Number(|r| r.tick.area_um2),
-        "Measured projected area of the cell; none when a bead is followed.";
+        "Projected area of the cell.";
     "length_sd_um" "um" Number(|r| r.tick.length_sd_um),
-        "Standard deviation of the length: of the picture, not of the pixel size.";
+        "Standard deviation of the length, pixel size not included.";
     "area_sd_um2" "um2" Number(|r| r.tick.area_sd_um2),
-        "Standard deviation of the area: of the picture, not of the pixel size.";
+        "Standard deviation of the area, pixel size not included.";
     "measured_um" "um" Number(|r| r.tick.measured_um),
-        "Position as vision gave it, whatever its verdict.";
+        "Position from vision, whatever the verdict.";
     "solver_status" "" Code(SOLVER, |r| r.tick.solver_status),
-        "How the optimiser ended.";
+        "Result of the optimiser.";
     "solver_iterations" "" Whole(|r| r.tick.solver_iterations.into()),
         "Iterations of the optimiser, at most 255.";
     "solver_active" "" Whole(|r| r.tick.solver_active.into()),
-        "Constraints active at the optimiser's solution, at most 255.";
+        "Active constraints at the solution, at most 255.";
     "solver_us" "us" Number(|r| f64::from(r.tick.solver_ns) / 1e3),
-        "Time that the optimiser took; 0 on the virtual clock.";
+        "Time of the optimiser; 0 on the virtual clock.";
     "session" "" Whole(|r| r.session),
-        "Session of the run: 1, and one more each time that it was resumed.";
+        "Session: 1, one more per resume.";
 }
 
 fn law<const INDEX: usize>(row: &Row) -> f64 {
@@ -265,25 +265,13 @@ const LAW: [fn(&Row) -> f64; LAW_COLUMNS] = [
 
 /// What the columns are that the laws of cellpos and their adaptation have; those of a law from elsewhere it knows alone.
 pub const OF_LAWS: &[(&str, &str)] = &[
-    (
-        "pi_integral_um",
-        "Integral part of PI, in displacement of the PZT.",
-    ),
-    (
-        "pi_lead_um",
-        "State of the lead, in displacement of the PZT.",
-    ),
-    (
-        "lqg_feed_forward_um",
-        "Displacement that LQG adds for the motion that it knows beforehand.",
-    ),
-    (
-        "mpc_feed_forward_um",
-        "Displacement that MPC adds for the motion that it knows beforehand.",
-    ),
+    ("pi_integral_um", "Integral part of PI."),
+    ("pi_lead_um", "State of the lead."),
+    ("lqg_feed_forward_um", "Feed-forward of LQG."),
+    ("mpc_feed_forward_um", "Feed-forward of MPC."),
     (
         "mpc_fallback_integral_um",
-        "Integral part of the PI that stands in for MPC.",
+        "Integral part of the PI that replaces MPC.",
     ),
     (
         "adapt_gain",

@@ -1,4 +1,4 @@
-//! The script's stops on what the cell does: stretch, length at rest, recovery, each as a mean of ten cycles.
+//! The script's stop conditions for the cell: stretch, length at rest, recovery, each as a mean of ten cycles.
 
 use super::{AtRest, CycleFlags, CycleRow};
 use crate::plan::ArmKind;
@@ -51,7 +51,7 @@ impl Ends {
     }
 }
 
-/// Watches what the cell does over its cycles. Feed it the rows in order, those of earlier sessions of the run too.
+/// Watches the cell over its cycles. Feed it the rows in order, those of earlier sessions of the run too.
 #[derive(Debug, Clone)]
 pub struct FatigueWatch {
     stop: Stop,
@@ -82,7 +82,7 @@ impl FatigueWatch {
     }
 
     /// Takes a row; gives the first limit that is passed. Rows of the static arm, of ramps and of disturbed cycles do not
-    /// count; another motion begins anew.
+    /// count; another motion restarts the count.
     pub fn add(&mut self, row: &CycleRow) -> Option<FatigueStop> {
         self.at_rest.take(row);
         if row.arm != ArmKind::Cyclic || row.flags.is_disturbed() || row.flags.has(CycleFlags::RAMP)

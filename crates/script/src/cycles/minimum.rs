@@ -1,7 +1,7 @@
 //! The minimum of a cost over one number.
 
 /// Where a cost with one minimum but flat ends is least between `low` and `high`: looked at in `looks` equal steps, then
-/// `rounds` golden sections about the best. None where it is least at an end: the minimum lies outside.
+/// `rounds` golden sections about the best. None if it is least at an end: the minimum is outside.
 pub(super) fn minimum(
     low: f64,
     high: f64,

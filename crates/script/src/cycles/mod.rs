@@ -202,7 +202,7 @@ impl CycleTable {
             if end_ns > plan_ns {
                 return;
             }
-            // Also of a cycle that went on behind the step that was skipped: it is not what the script says.
+            // Also of a cycle that continued after the skipped step: it differs from the script.
             let skipped = self
                 .skips_ns
                 .iter()

@@ -108,7 +108,7 @@ impl Open {
             self.row.dwell_s += period_s;
         }
         if place.stage == Stage::Paused {
-            // Time goes on and the cycle does not.
+            // Time continues and the cycle does not.
             self.last_seen = None;
         } else if good {
             self.position(record, place, phase, flow_um, period_s);
@@ -193,7 +193,7 @@ impl Open {
     }
 
     /// The row of the finished cycle, and the largest share of its `expected` ticks that one kind of trouble touched. `resting`:
-    /// the rest that goes on.
+    /// the remaining rest.
     pub(super) fn finish(mut self, expected: f64, resting: Option<Rest>) -> (CycleRow, f64) {
         // A cycle that never left its start is a rest as a whole.
         self.begins_after(resting.filter(|_| self.row.stroke_um == 0.0));

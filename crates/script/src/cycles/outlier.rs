@@ -12,7 +12,7 @@ pub(super) struct Outliers {
 
 /// Cycles that are compared with.
 const KEPT: usize = 21;
-/// Fewest of them.
+/// Smallest number.
 const FEWEST: usize = 5;
 /// An error this many times their median is another one.
 const TIMES: f64 = 3.0;
@@ -20,7 +20,7 @@ const TIMES: f64 = 3.0;
 const SMALL_UM: f64 = 0.15;
 
 impl Outliers {
-    /// Whether a finished cycle is one; an undisturbed cycle that is none is remembered.
+    /// Whether a finished cycle is an outlier; an undisturbed one that is not is remembered.
     pub(super) fn is_one(&mut self, row: &CycleRow) -> bool {
         if !self.motion.is_some_and(|motion| row.moves_as(motion)) {
             self.motion = Some((row.stroke_um, row.duration_s));

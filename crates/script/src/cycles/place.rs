@@ -10,7 +10,7 @@ pub(super) struct Place {
     pub(super) target_um: f64,
     pub(super) stage: Stage,
     pub(super) exposed_ns: i64,
-    /// Whether the tick has a frame of its own.
+    /// Whether the tick has its own frame.
     pub(super) fresh: bool,
 }
 

@@ -1,18 +1,18 @@
-//! The cell before the first cycle: what its stretch is measured by, wherever one is shown, judged or written.
+//! The cell before the first cycle: the reference of every stretch.
 
 use super::CycleRow;
 
-/// Length and area of the cell at rest before the first cycle of a run that has them: means over the rest, with what they are
-/// known to. Of a table that an older version wrote: at the start of the first cycle, known to nobody knows what.
+/// Length and area of the cell at rest before the first cycle of a run that has them: means over the rest, with their uncertainty. Of
+/// a table that an older version wrote: at the start of the first cycle, known to nobody knows what.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct AtRest {
     /// Length, um; NaN where it was not measured.
     pub length_um: f64,
-    /// Its standard deviation, um; NaN where it is not known.
+    /// Its standard deviation, um; NaN if unknown.
     pub length_sd_um: f64,
     /// Projected area, um^2; NaN where it was not measured.
     pub area_um2: f64,
-    /// Its standard deviation, um^2; NaN where it is not known.
+    /// Its standard deviation, um^2; NaN if unknown.
     pub area_sd_um2: f64,
 }
 
@@ -35,7 +35,7 @@ impl AtRest {
         rest
     }
 
-    /// Takes the next row of the run: what is not known yet is taken from it.
+    /// Takes the next row of the run and fills in unknown values.
     pub fn take(&mut self, row: &CycleRow) {
         let (length, area) = (
             (row.length_rest_um, row.length_rest_sd_um),
@@ -65,18 +65,17 @@ impl AtRest {
         }
     }
 
-    /// The largest length of a cycle over that at rest; NaN where one of them was not measured.
+    /// The largest length of a cycle over that at rest; NaN if one was not measured.
     pub fn stretch(&self, row: &CycleRow) -> f64 {
         row.length_peak_um / self.length_um
     }
 
-    /// Half width of the 95 % interval that the length at rest gives every stretch of the run alike, as a part of it; NaN where it
-    /// is not known.
+    /// Relative half width of the 95 % interval that the length at rest gives every stretch of the run; NaN if unknown.
     pub fn stretch_ci95(&self) -> f64 {
         1.96 * self.length_sd_um / self.length_um
     }
 
-    /// The largest area of a cycle over that at rest; NaN likewise.
+    /// The largest area of a cycle over that at rest; NaN if one was not measured.
     pub fn areal_stretch(&self, row: &CycleRow) -> f64 {
         row.area_peak_um2 / self.area_um2
     }

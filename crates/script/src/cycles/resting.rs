@@ -1,4 +1,4 @@
-//! The cell while it is at one place: its mean length and area, with what they are known to.
+//! The cell at one place: mean length and area with their uncertainty.
 
 use cellpos_runtime::TickRecord;
 use std::collections::VecDeque;
@@ -9,7 +9,7 @@ const SAME_PLACE_UM: f64 = 0.1;
 const THERE_UM: f64 = 1.0;
 /// Frames that are averaged at most, the newest ones: seconds of a rest that may last for an hour.
 const MOST: usize = 4000;
-/// Blocks whose scatter says what a mean is known to: errors of neighbouring frames (focus, light, outline) go together.
+/// Blocks whose scatter gives the uncertainty of a mean: errors of neighbouring frames (focus, light, outline) are correlated.
 const BLOCKS: usize = 10;
 
 /// A mean and its standard deviation; NaN where nothing was measured.
@@ -82,8 +82,8 @@ fn keep(values: &mut VecDeque<(f64, f64)>, value: f64, sd: f64) {
     }
 }
 
-/// The mean of values with stated standard deviations. It is known to what the scatter of the means of blocks says, and to no
-/// less than the stated deviations allow.
+/// The mean of values with stated standard deviations. Its uncertainty comes from the scatter of the means of blocks, and is at least
+/// that of the stated deviations.
 fn mean(values: &VecDeque<(f64, f64)>) -> MeanSd {
     let n = values.len() as f64;
     let mean = values.iter().map(|(value, _)| value).sum::<f64>() / n;
@@ -102,7 +102,7 @@ fn mean(values: &VecDeque<(f64, f64)>) -> MeanSd {
     let middle = blocks.iter().sum::<f64>() / m;
     let square: f64 = blocks.iter().map(|block| (block - middle).powi(2)).sum();
     let scattered = (square / (m - 1.0) / m).sqrt();
-    // `max` passes over what is not known: one frame has no scatter, a record without stated deviations has no such.
+    // `max` ignores unknown values: one frame has no scatter, and a record may lack stated deviations.
     MeanSd {
         mean,
         sd: scattered.max(stated),

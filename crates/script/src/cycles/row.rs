@@ -153,13 +153,13 @@ pub struct CycleRow {
     pub session: u64,
     /// Its arm.
     pub arm: ArmKind,
-    /// Start since the start of the session, s; NaN when no record of it is there.
+    /// Start since the start of the session, s; NaN without a record.
     pub start_s: f64,
     /// Start by the plan, s.
     pub plan_s: f64,
     /// Duration by the plan, s.
     pub duration_s: f64,
-    /// Ticks of it that are recorded.
+    /// Its recorded ticks.
     pub ticks: u64,
     /// Of these: with a position that counts.
     pub seen: u64,
@@ -225,7 +225,7 @@ pub struct CycleRow {
     pub length_rest_um: f64,
     /// Standard deviation of that mean, um.
     pub length_rest_sd_um: f64,
-    /// Mean projected area of the cell at rest, likewise, um^2.
+    /// Mean projected area of the cell at rest, um^2.
     pub area_rest_um2: f64,
     /// Standard deviation of that mean, um^2.
     pub area_rest_sd_um2: f64,

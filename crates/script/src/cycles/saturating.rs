@@ -1,4 +1,4 @@
-//! A law that saturates, beside the straight line: most of what tires in a cell does so in its first cycles.
+//! A law that saturates, as an alternative to the straight line: a cell tires mostly in its first cycles.
 
 use super::minimum::minimum;
 use nalgebra::{Matrix3, Vector3};
@@ -24,8 +24,8 @@ pub struct Saturating {
     pub better_than_line: bool,
 }
 
-/// The law through `(cycle, value)` points, against a line whose residuals have the sum of squares `line`. None where the
-/// points do not say at what it saturates: too few, or its constant is not within them.
+/// The law through `(cycle, value)` points, against a line whose residuals have the sum of squares `line`. None if the points do not
+/// determine its end: too few, or its constant is outside.
 pub(super) fn fit(points: &[(f64, f64)], line: f64) -> Option<Saturating> {
     /// Fewest points of a law with three parameters that is not chance.
     const FEWEST: usize = 12;
@@ -53,7 +53,7 @@ pub(super) fn fit(points: &[(f64, f64)], line: f64) -> Option<Saturating> {
     }
     let covariance = normal.try_inverse()? * variance;
     let ci95 = |k: usize| 1.96 * covariance[(k, k)].max(0.0).sqrt();
-    // A law whose constant or height is not told by the cycles is none.
+    // A law whose constant or height the cycles do not determine does not count.
     let told = ci95(2) < 0.5 * cycles && (start - end).abs() > 2.0 * ci95(0).hypot(ci95(1));
     if !told {
         return None;

@@ -18,7 +18,7 @@ const LATER: [&str; 10] = [
     "area_rest_sd_um2",
 ];
 
-/// Why the head of a table is none of a per-cycle table.
+/// Why a header is not that of a per-cycle table.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum HeadError {
     /// A column that this version does not know.
@@ -81,7 +81,7 @@ impl CycleColumns {
         columns.collect::<Result<_, _>>().map(Self)
     }
 
-    /// A line of the table; None if it is none.
+    /// A line of the table; None for other text.
     pub fn parse(&self, line: &str) -> Option<CycleRow> {
         let mut cells = line.split(',');
         let mut row = CycleRow::empty(0, 0, ArmKind::Cyclic);
@@ -110,7 +110,7 @@ impl CycleColumns {
 pub struct ReadCycles {
     /// Its rows.
     pub rows: Vec<CycleRow>,
-    /// Lines behind the head that are no rows: all of them where the head is none.
+    /// Lines after the header that are not rows; all of them after a wrong header.
     pub unreadable: usize,
     /// What is wrong with the head.
     pub head: Option<HeadError>,

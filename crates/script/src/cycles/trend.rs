@@ -20,15 +20,15 @@ pub struct Mean {
 pub struct Trend {
     /// Cycles with a value.
     pub cycles: u64,
-    /// Mean of the first ten of them (of the first half, where there are fewer than twenty).
+    /// Mean of the first ten (of the first half if there are fewer than twenty).
     pub first: Mean,
-    /// Mean of the last ten of them, likewise.
+    /// Mean of the last ten (of the last half if there are fewer than twenty).
     pub last: Mean,
     /// Change per cycle, of a straight line through all.
     pub per_cycle: f64,
     /// Half width of its 95 % interval, the residuals taken for white.
     pub ci95_per_cycle: f64,
-    /// RMS of what the straight line leaves.
+    /// RMS of the residual of the straight line.
     pub residual: f64,
     /// The law that saturates, where the cycles say at what.
     pub saturating: Option<Saturating>,
@@ -87,7 +87,7 @@ fn line(points: &[(f64, f64)]) -> Option<(f64, f64, f64)> {
 
 /// The trend of `(cycle, value)` pairs in their order; values that are not finite are left out. None with fewer than five.
 pub fn trend(values: impl IntoIterator<Item = (u64, f64)>) -> Option<Trend> {
-    /// Cycles at each end of which the mean is told.
+    /// Cycles at each end in the stated means.
     const ENDS: usize = 10;
     let points: Vec<(f64, f64)> = values
         .into_iter()
@@ -110,7 +110,7 @@ pub fn trend(values: impl IntoIterator<Item = (u64, f64)>) -> Option<Trend> {
     })
 }
 
-/// What the watch has to say.
+/// Messages of the watch.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Alarm {
     /// The amplitude error of the last cycles, as a share of the commanded amplitude, is above the limit.
@@ -172,7 +172,7 @@ impl AmplitudeWatch {
         }
         let error = row.reached_um / row.commanded_um - 1.0;
         self.errors.push_back((row.cycle, error));
-        // What another motion reaches is no trend of this one.
+        // Another motion is not part of this trend.
         if !row.moves_as(self.motion) {
             self.motion = (row.stroke_um, row.duration_s);
             self.long.clear();

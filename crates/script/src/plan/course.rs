@@ -1,4 +1,4 @@
-//! A periodic motion of a plan, by itself.
+//! A periodic motion of a plan, alone.
 
 use crate::script::WaveShape;
 use std::ops::Range;
@@ -8,7 +8,7 @@ use std::ops::Range;
 pub struct Periodic {
     /// Frequency of its cycles, Hz.
     pub frequency_hz: f64,
-    /// Cycles of it in full swing, in the whole plan.
+    /// Its cycles at full amplitude, in the whole plan.
     pub cycles: u64,
     pub(super) course: Course,
 }
@@ -43,7 +43,7 @@ impl Periodic {
         }
     }
 
-    /// Harmonics of it that are worth learning: a sine has others than its first only from nonlinearities.
+    /// Harmonics worth learning: a sine has others than its first only from nonlinearities.
     pub fn harmonics(&self) -> u32 {
         match self.course {
             Course::Wave {
@@ -59,7 +59,7 @@ impl Periodic {
         self.course == other.course && self.frequency_hz == other.frequency_hz
     }
 
-    /// Where the points of a waveform stand in the plan.
+    /// Place of a waveform's points in the plan.
     pub(super) fn span(&self) -> Option<Range<usize>> {
         match self.course {
             Course::Points { first, count } => Some(first..first + count),

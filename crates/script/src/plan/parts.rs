@@ -1,4 +1,4 @@
-//! What a plan is made of.
+//! Parts of a plan.
 
 use super::course::Periodic;
 use crate::script::{Condition, MoveShape, OnTimeout, Stop, WaveShape};
@@ -80,13 +80,12 @@ pub enum ArmKind {
     /// The one that moves.
     #[default]
     Cyclic,
-    /// The static control beside it.
+    /// Its static control arm.
     Static,
 }
 
 /// One cycle: a period of a wave, or a pass of a repeat or of a sweep that holds no wave (of a sweep within a repeat: the
-/// repeat's pass); in a static arm, as much time as a cycle of
-/// the arm that it stands beside takes in the mean.
+/// repeat's pass); in a static arm, the mean time of a cycle of the cyclic arm.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Cycle {
     /// Number, from 0.

@@ -5,7 +5,7 @@ use super::parts::{Motion, Plan, Segment};
 use super::shape::{rise, wave};
 use cellpos_control::Reference;
 
-/// A periodic motion about 0 um by itself, that comes in over [`PeriodicReference::FADE_S`].
+/// A periodic motion about 0 um alone, with a ramp over [`PeriodicReference::FADE_S`].
 #[derive(Debug, Clone, Copy)]
 pub struct PeriodicReference<'p> {
     plan: &'p Plan,
@@ -45,7 +45,7 @@ impl Plan {
         &self.periodic
     }
 
-    /// A periodic motion by itself.
+    /// A periodic motion alone.
     pub fn periodic_reference(&self, number: usize) -> Option<PeriodicReference<'_>> {
         self.periodic.get(number).map(|motion| PeriodicReference {
             plan: self,

@@ -81,7 +81,7 @@ fn times(run: &Path, name: &str) -> io::Result<Vec<(f64, [f32; 2])>> {
 /// A clip of a run folder, at most `most` of its frames.
 ///
 /// # Errors
-/// No clip of that name, or a file that is none.
+/// No clip of that name, or another file.
 pub fn read(run: &Path, name: &str, most: usize) -> io::Result<Film> {
     if !is_a_name(name) {
         return Err(io::ErrorKind::NotFound.into());

@@ -5,7 +5,7 @@
 //! recorder thread -> what happened (a channel) --^
 //! ```
 //!
-//! The camera thread copies each frame into a buffer that exists already; where none is empty the frame is left out and counted.
+//! The camera thread copies each frame into a buffer that exists already; without an empty one the frame is dropped and counted.
 //! Everything slow happens on the clip thread.
 
 mod film;
@@ -147,7 +147,7 @@ impl Clips {
         self.kept.try_recv().ok()
     }
 
-    /// Ends the thread when what it has heard of is written, and says what became of the clips.
+    /// Ends the thread after the announced clips are written, and returns their outcome.
     pub fn finish(mut self) -> ClipReport {
         self.end()
     }
@@ -260,7 +260,7 @@ impl Keeper {
         let offset_ns = self.ring.offset_ns(moment);
         match tiff_stack::write(&self.folder, moment, &shots, offset_ns) {
             Ok(()) => {
-                // Nobody who hears of it: no page is open.
+                // No receiver: no page is open.
                 let _ = self.told.send(ClipLine {
                     name: moment.name.clone(),
                     time_s: shots

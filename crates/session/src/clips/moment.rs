@@ -1,4 +1,4 @@
-//! What a clip is kept of.
+//! Reason for a clip.
 
 /// A moment to keep.
 #[derive(Debug, Clone, PartialEq)]

@@ -24,7 +24,7 @@ pub struct Clipped<S> {
 }
 
 impl<S> Clipped<S> {
-    /// A sink that keeps clips, or with none of them what it was. `events`: whether what happens is kept.
+    /// A sink with clips, or the bare sink without any. `events`: whether what happens is kept.
     pub fn new(sink: S, clips: Option<Clips>, schedule: Schedule, events: bool) -> Self {
         Self {
             sink,
@@ -62,7 +62,7 @@ impl<S> Clipped<S> {
             _ => return,
         };
         let time_s = event.time_ns as f64 * 1e-9;
-        // What ends the run is kept in any case.
+        // The clip of the run's end is always kept.
         if name != "safe" && time_s - self.last_event_s < APART_S {
             return;
         }

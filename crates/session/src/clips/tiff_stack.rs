@@ -1,4 +1,4 @@
-//! A clip on disk: a TIFF of one page a frame, and a table of their times beside it.
+//! A clip on disk: a TIFF with one page per frame, and a table of their times.
 
 use super::moment::Moment;
 use super::ring::Shot;

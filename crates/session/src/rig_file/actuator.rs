@@ -21,7 +21,7 @@ pub enum ActuatorConfig {
         /// Lag of the regulator (63 % of a step), ms.
         #[serde(default = "regulator_ms")]
         regulator_ms: f64,
-        /// Lag of the tube, ms. With one the model may have no pole-zero pair of its own: the estimator holds two lags.
+        /// Lag of the tube, ms. With one, the model must have no pole-zero pair: the estimator holds two lags.
         #[serde(default)]
         compliance_ms: f64,
     },
@@ -68,7 +68,7 @@ impl ActuatorConfig {
         matches!(self, Self::Emulated {} | Self::EmulatedPressure { .. })
     }
 
-    /// Between two commands, where it is slower than the board, ms.
+    /// Time between two commands if it is slower than the board, ms.
     pub fn period_ms(&self) -> Option<f64> {
         match self {
             Self::Program { period_ms, .. } | Self::EmulatedPressure { period_ms, .. } => {

@@ -136,7 +136,7 @@ impl RigFile {
         let source: Box<dyn PositionSource> = match frames {
             Frames::Off => Box::new(emulated.positions()),
             Frames::On => {
-                // A calibration of one's own, right or wrong, rehearses one of a real rig.
+                // A calibration in the file, right or wrong, rehearses one of a real rig.
                 let calibration = self.calibration.unwrap_or(emulated.calibration());
                 self.tracked(emulated.camera(), calibration, &clock, &flow)?
             }

@@ -18,7 +18,7 @@ use cellpos_vision::{CellConfig, CellFinder, LocaliserConfig, TrackerConfig};
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 
-/// A rig.toml. Every table and key may be left out: what is left is the emulated rig of the paper.
+/// A rig.toml. Every table and key may be left out; the defaults are the emulated rig of the paper.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct RigFile {
@@ -155,9 +155,9 @@ impl Default for RigFile {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "clap", derive(clap::ValueEnum))]
 pub enum Frames {
-    /// Render and localise.
+    /// Render frames and find the bead in them.
     On,
-    /// Positions with equivalent noise.
+    /// Positions with equivalent noise: faster.
     Off,
 }
 
@@ -165,14 +165,14 @@ pub enum Frames {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "clap", derive(clap::ValueEnum))]
 pub enum ClockKind {
-    /// The machine's.
+    /// The clock of this machine.
     Real,
-    /// As fast as the machine can; deterministic.
+    /// As fast as the machine can; a seed fixes every bit.
     Virtual,
 }
 
 impl RigFile {
-    /// Reads a rig.toml, or the defaults where there is none.
+    /// Reads a rig.toml; without one, the defaults.
     pub fn load(path: Option<&Path>) -> Result<Self, Failure> {
         let Some(path) = path else {
             return Ok(Self::default());
@@ -208,7 +208,7 @@ impl RigFile {
             file.keep_the_pace_of(period_ms * 1e3);
         }
         if let ActuatorConfig::Serial { port, .. } = &mut file.actuator {
-            // A relative path is a link beside the file if there is one, else a name of the system's own (COM5).
+            // A relative path is a link next to the file if it exists, else a name of the system (COM5).
             let beside = folder.join(&*port);
             if beside.exists() {
                 *port = beside.display().to_string();
@@ -324,7 +324,7 @@ impl RigFile {
         Ok(())
     }
 
-    /// Takes a seed for the emulated rig, and whether it is ideal or has the imperfections of a real one; what is not given stays.
+    /// Overrides seed and imperfections of the emulated rig; None leaves them.
     ///
     /// # Errors
     /// The rig is not emulated, and something is said of its imperfections.
@@ -342,7 +342,7 @@ impl RigFile {
         Ok(())
     }
 
-    /// Whether all of it is emulated in this process.
+    /// Whether the whole rig is emulated in this process.
     pub fn is_emulated(&self) -> bool {
         self.actuator.is_emulated() && self.camera == CameraConfig::Emulated {}
     }

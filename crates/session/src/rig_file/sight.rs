@@ -13,7 +13,7 @@ impl RigFile {
     /// # Errors
     /// No background, or one that cannot be used.
     pub fn finder(&self) -> Result<CellFinder, Failure> {
-        /// Frames of the empty channel that the emulated camera takes beforehand.
+        /// Frames of the empty channel that the emulated camera takes first.
         const EMPTY_FRAMES: usize = 100;
         let cell = self.cell.clone().unwrap_or_default();
         match (&self.camera, &cell.background) {
@@ -44,7 +44,7 @@ impl RigFile {
     /// Settings of the localiser.
     ///
     /// # Errors
-    /// A camera that shows something real, and nobody has said what its beads look like.
+    /// A real camera without a description of its beads.
     pub fn bead_settings(&self) -> Result<LocaliserConfig, Failure> {
         match (&self.vision, &self.camera) {
             (Some(config), _) => Ok(config.clone()),

@@ -9,9 +9,9 @@ use ratatui::symbols::Marker;
 use ratatui::text::{Line, Span};
 use ratatui::widgets::{Axis, Chart, Dataset, GraphType, Paragraph, Row, Table};
 
-/// From how many rows the PZT has a trace of its own.
+/// Rows from which the PZT has a separate trace.
 const ROWS_FOR_PZT: u16 = 24;
-/// From how many columns the cycles stand beside the events.
+/// Columns from which the cycles are to the right of the events.
 const COLUMNS_FOR_CYCLES: u16 = 72;
 
 /// Draws it all.
@@ -78,7 +78,7 @@ fn banner_line(history: &History) -> Paragraph<'_> {
     ]))
 }
 
-/// The parts side by side, as many of them as there is room for.
+/// The parts side by side, as far as there is room.
 fn fit(parts: Vec<(String, Style)>, columns: u16) -> Paragraph<'static> {
     let mut spans = vec![];
     let mut room = usize::from(columns);
@@ -178,7 +178,7 @@ fn gauge_line(hello: &Hello, history: &History, columns: u16) -> Paragraph<'stat
             .then(|| ((part.clamp(0.0, 1.0) * width as f64) as usize).min(width.saturating_sub(1)))
     };
     let (to, mark) = (place(command), place(rest));
-    // A tenth of the range is what is left to act with.
+    // A tenth of the range must remain for control.
     let near = command - low < 0.1 * (high - low) || high - command < 0.1 * (high - low);
     let colour = if near { Color::Red } else { Color::Green };
     let bar = (0..width).map(|n| {

@@ -4,7 +4,7 @@
 //! recorder thread -> ring -> screen thread (a picture of cells) -> terminal thread -> terminal
 //! ```
 //!
-//! The screen thread draws ten times a second and never writes: what it has drawn goes to [`cellpos_terminal`], whose thread alone
+//! The screen thread draws ten times a second and never writes: what it has drawn goes to [`cellpos_terminal`], , and only its thread
 //! waits for the terminal. A picture that finds the one before it unwritten is left out, and the next one is drawn whole.
 
 mod ansi;
@@ -26,19 +26,19 @@ use std::time::Duration;
 
 /// Time between two pictures.
 const EVERY: Duration = Duration::from_millis(100);
-/// How long the terminal is waited for when it is given back.
+/// Longest wait for the terminal when the screen releases it.
 const PATIENCE: Duration = Duration::from_secs(1);
 
-/// What the screen says besides the run.
+/// Further texts of the screen.
 #[derive(Debug, Clone, Default)]
 pub struct ScreenConfig {
     /// Which keys do what.
     pub keys: &'static str,
-    /// What the operator is typing.
+    /// Number that the operator is typing.
     pub typed: Typed,
 }
 
-/// The terminal while a run has it. Dropped, it is given back.
+/// The terminal while a run has it. Dropping it releases the terminal.
 pub struct Screen {
     stop: Arc<AtomicBool>,
     thread: Option<JoinHandle<()>>,

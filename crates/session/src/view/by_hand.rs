@@ -19,7 +19,7 @@ pub struct HandStep {
     pub wake_us: f64,
 }
 
-/// What tells the page of it.
+/// Its feed of the page.
 pub struct ByHand {
     watcher: Watcher,
     ticks: u64,

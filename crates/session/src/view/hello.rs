@@ -1,4 +1,4 @@
-//! What the page is told of a run before it begins.
+//! Data of a run for the page before it begins.
 
 use crate::rig::Rig;
 use crate::setup::Setup;
@@ -6,7 +6,7 @@ use cellpos_control::ADAPT_COLUMNS;
 use cellpos_control::design::bound_rms_um;
 use cellpos_live::Hello;
 
-/// What the page says of the run.
+/// Text of the page about the run.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Page {
     /// Its name.

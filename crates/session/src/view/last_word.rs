@@ -89,7 +89,7 @@ pub(super) fn of_gone(seconds: u64) -> LastWord {
     }
 }
 
-/// Of a run that is read in its folder: what its end says of itself.
+/// The recorded end of a run that is read from its folder.
 pub(super) fn of_record(end: &RunEnd) -> LastWord {
     let ended = end.summary.get(ENDED).and_then(toml::Value::as_table);
     let text = |key: &str| {

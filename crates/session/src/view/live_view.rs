@@ -47,12 +47,12 @@ impl Wanted {
     }
 }
 
-/// Whom the operator's requests go to: the run that goes on, or the last one.
+/// Receiver of the operator's requests: the present run, or the last one.
 type Addressee = Arc<Mutex<Arc<Operator>>>;
 
 /// What shows a run, or several one after the other.
 pub struct View {
-    // Fields are dropped in this order: the terminal is given back before anything else is said.
+    // Fields are dropped in this order: the terminal is released before further output.
     screen: Option<Screen>,
     server: Option<Server>,
     pub(super) watcher: Option<Watcher>,
@@ -101,7 +101,7 @@ impl View {
         }
         let mut screen = None;
         if let Some(config) = &wanted.screen {
-            // The screen has no pictures: what it is told of is no bigger than a line.
+            // The screen has no pictures: its messages are lines.
             let without = Hello {
                 pictures: false,
                 ..hello
@@ -136,7 +136,7 @@ impl View {
         }
     }
 
-    /// What shows it the camera's frames, unless another camera has it.
+    /// The source of its frames, unless another camera has it.
     pub fn pictures(&mut self) -> Option<Box<dyn FrameWatch>> {
         let pictures = self.pictures.1.try_recv().ok()?;
         Some(pictures.lend(&self.pictures.0))
@@ -175,7 +175,7 @@ impl View {
     }
 }
 
-/// What shows the runs of a command that has several, one after the other, all on one page.
+/// Shows several runs of a command, one after the other, on one page.
 pub struct Pages {
     wanted: Wanted,
     page: Page,
@@ -221,7 +221,7 @@ impl Pages {
     }
 }
 
-/// Where and how a page is served: beside the loop, by the ordinary scheduler.
+/// Address and thread of a page: the ordinary scheduler, not the loop's.
 pub(super) fn config(at: ViewAddress, film: Option<Film>) -> ServerConfig {
     ServerConfig {
         address: at.address,

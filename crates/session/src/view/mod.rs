@@ -1,8 +1,8 @@
-//! What the operator sees of a run, in a browser or on the whole terminal: a sink that feeds it beside the recording, and the
-//! operator's requests that come back.
+//! The operator's view of a run, in a browser or on the whole terminal: a sink that feeds it alongside the recording, and the
+//! operator's requests.
 //!
-//! [`View::open`] serves the page; [`Viewed`] wraps the run's own sink. Everything happens on the recorder's thread and on
-//! threads of the page's and the screen's own; the loop knows nothing of it but the target, which it reads once a tick.
+//! [`View::open`] serves the page; [`Viewed`] wraps the run's own sink. Everything runs on the threads of recorder, page and screen.
+//! The loop only reads the target, once a tick.
 
 mod by_hand;
 mod cycle;

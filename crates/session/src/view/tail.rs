@@ -1,4 +1,4 @@
-//! The tail of a time, so cheap that it can be asked for while a run goes on.
+//! The tail of a time, cheap enough for a running run.
 
 /// Steps of an octave: a value is told to 1 part in 64.
 const STEPS: usize = 64;
@@ -45,7 +45,7 @@ impl Tail {
 fn place(ns: u32) -> usize {
     let bits = (u32::BITS - ns.leading_zeros()) as usize;
     match bits.checked_sub(7) {
-        // Each nanosecond has a step of its own.
+        // One step per nanosecond.
         None => ns as usize,
         Some(shift) => STEPS * (shift + 1) + (ns >> shift) as usize - STEPS,
     }

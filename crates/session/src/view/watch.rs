@@ -1,4 +1,4 @@
-//! The page of a run that is read in its folder: one that goes on in another process, or one that is over.
+//! The page of a run that is read from its folder, over or still running in another process.
 
 use super::cycle::cycle_row;
 use super::hello::{Page, hello_of};
@@ -18,7 +18,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-/// Rows handed to the page at once: half of what its ring holds.
+/// Rows handed to the page at once: half of its ring.
 const ROWS_AT_ONCE: usize = 4096;
 /// Time of a run that the page holds, s.
 const HELD_S: f64 = 600.0;
@@ -283,7 +283,7 @@ fn reason(event: &Event) -> String {
         .to_string()
 }
 
-/// An event of the log as a line of the page: its sentence, or its name and what it says of itself.
+/// An event of the log as a line of the page: its sentence, or its name and data.
 fn line(event: &Event) -> EventLine {
     let level = match text(event, "level") {
         Some("fault") => "fault",

@@ -1,4 +1,4 @@
-//! What page and screen are told of a run, from what its recorder is given.
+//! The data of page and screen, from the rows of the recorder.
 
 use super::last_word;
 use super::tail::Tail;
@@ -9,7 +9,7 @@ use cellpos_live::{Banner, ClipLine, CycleRow, EventLine, Feed, LastWord, Row, S
 use cellpos_runtime::life::EventKind;
 use cellpos_runtime::{Event, Life, NoSink, Statistics, Summary, TickFlags, TickRecord};
 
-/// What a sink knows of its run that the page is to show besides what passes through it.
+/// Further facts of a sink for the page, besides the rows.
 pub trait Shown {
     /// Completes how the run stands.
     fn complete(&self, state: &mut State) {
@@ -19,7 +19,7 @@ pub trait Shown {
     fn next_cycle(&mut self) -> Option<CycleRow> {
         None
     }
-    /// The next thing that the sink found by itself since, an alarm or a mark.
+    /// The next event that the sink found, an alarm or a mark.
     fn next_line(&mut self) -> Option<EventLine> {
         None
     }
@@ -31,10 +31,10 @@ pub trait Shown {
 
 impl Shown for NoSink {}
 
-/// How often the tails of the ticks' times are told, in states.
+/// States between two reports of the tails of the ticks' times.
 const TAILS_EVERY: u32 = 10;
 
-/// What feeds page and screen, from what the recorder is given, or from what is read in its folder.
+/// Feeds page and screen with rows of the recorder, or with rows read from a folder.
 pub(super) struct Watcher {
     feeds: Vec<Feed>,
     pub(super) state: State,
@@ -73,7 +73,7 @@ impl Watcher {
         self
     }
 
-    /// What comes from now on is of another run: it is shown behind what there was.
+    /// The next rows belong to another run and are shown after the present ones.
     pub(super) fn next_run(&mut self) {
         self.before = (self.state.ticks, self.state.time_s);
         self.freeze.clear();
@@ -134,7 +134,7 @@ impl Watcher {
         });
     }
 
-    /// The plant's gain over the model's as adaptation estimates it; NaN where it does not.
+    /// Estimated gain of the plant over the model's; NaN without an estimate.
     fn gain(&self, record: &TickRecord) -> f32 {
         let columns = self.adaptation_at.and_then(|at| record.law.get(at..));
         columns
@@ -169,7 +169,7 @@ impl Watcher {
         self.tell_state();
     }
 
-    /// Tells an event, and counts what it says.
+    /// Shows an event and counts it.
     pub(super) fn event(&mut self, event: &Event, times: u64) {
         match event.kind {
             EventKind::FramesDropped { count } => self.state.frames_lost += count * times,

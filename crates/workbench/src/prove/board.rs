@@ -1,4 +1,4 @@
-//! Whether a board keeps docs/board.md: who it is, its line, what it refuses. Motion is in `moves`, silence in `silence`.
+//! Whether a board keeps docs/board.md: identity, line, refusals. Motion is in `moves`, silence in `silence`.
 
 use super::moves::Range;
 use super::sheet::Sheet;
@@ -43,7 +43,7 @@ pub const LINES: [&str; 29] = [
     "reset in mid-flight",
 ];
 
-/// Tries everything; what a broken line keeps it from is not tried. The board is left parked and disarmed.
+/// Tries everything; after a broken line the rest counts as not tried. The board is left parked and disarmed.
 pub fn board(sheet: &mut Sheet, talk: Talk, trial: &mut Trial) {
     let mut talk = Some(talk);
     if let Err(failure) = tried(sheet, &mut talk, trial) {
@@ -154,7 +154,7 @@ fn hello(sheet: &mut Sheet, t: &mut Talk) -> Result<Option<Identity>, Failure> {
             refused.err().unwrap_or_else(|| "ack".to_string())
         ),
     );
-    // The conversation goes on in its own version.
+    // The conversation continues in its version.
     t.hello()?;
     Ok(sound.then_some(identity))
 }
@@ -252,7 +252,7 @@ fn damage(sheet: &mut Sheet, t: &mut Talk) -> Result<(), Failure> {
     Ok(())
 }
 
-/// Statuses that come by themselves once a hello came.
+/// Unasked statuses after a hello.
 fn unasked(sheet: &mut Sheet, t: &mut Talk) -> Result<(), Failure> {
     const LISTEN_MS: f64 = 300.0;
     t.pump()?;

@@ -1,4 +1,4 @@
-//! What the loop will get from a camera, and what vision makes of it, through the drivers of the loop.
+//! Frames and fixes of a camera, through the drivers of the loop.
 
 use super::sheet::Sheet;
 use crate::bench::Bench;

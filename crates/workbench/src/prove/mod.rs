@@ -1,7 +1,7 @@
 //! A sheet for the lab book: what was proved of a rig, line by line, each with a number.
 //!
-//! [`board`] and [`socket`] are conformance tests of the two protocols (docs/board.md, docs/camera-socket.md): they speak them byte
-//! by byte and take nothing for granted, so that a foreign board or camera server passes or fails each line of its own. [`camera`]
+//! [`board`] and [`socket`] are conformance tests of the two protocols (docs/board.md, docs/camera-socket.md): they test them byte by
+//! byte, so that a foreign board or camera server passes or fails each line separately. [`camera`]
 //! and [`vision`] go through the drivers of the loop and hold for any camera.
 
 pub mod board;

@@ -1,4 +1,4 @@
-//! A board that is armed and moves: what it obeys, and that its output keeps range and slew.
+//! An armed, moving board: commands that it obeys, range and slew of its output.
 
 use super::sheet::Sheet;
 use super::talk::{ANSWER_MS, Talk};
@@ -6,7 +6,7 @@ use super::trial::{Trial, of, um};
 use cellpos_link::{Arm, BoardState, Identity, Limits, Request, Status, ToBoard, ToHost};
 use cellpos_session::Failure;
 
-/// Within what the output is moved, pm and nm/s.
+/// Limits of the test motion, pm and nm/s.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Range {
     pub(super) low_pm: i32,
@@ -24,7 +24,7 @@ pub(super) struct Range {
 
 /// Watchdog of the trial's sessions: a host that is stopped for a moment is no silence; where silence is tried it is shorter.
 const WATCHDOG_MS: u16 = 500;
-/// A session that nobody ends parks by itself.
+/// An abandoned session parks automatically.
 const HOLD_WATCHDOG_MS: u16 = 3000;
 
 impl Range {
@@ -81,7 +81,7 @@ impl Range {
         1e3 * f64::from((to_pm - from_pm).abs()) / rate.max(1.0) + 500.0
     }
 
-    /// Waits until the output stands at a displacement, to a step and a half; where it stands in the end.
+    /// Waits until the output is within a step and a half of a displacement; returns the last output.
     pub(super) fn settle(&self, t: &mut Talk, at_pm: i32) -> Result<Status, Failure> {
         let mut status = t.must_status()?;
         let end_ns = t.now_ns() + (self.way_ms(status.applied_pm, at_pm) * 1e6) as i64;

@@ -9,7 +9,7 @@ use cellpos_session::Failure;
 
 const NAME: &str = "reset in mid-flight";
 
-/// Moves the output off park, has the board reset, and sees what the output does before anybody arms it.
+/// Moves the output off park, has the board reset, and watches the output before arming.
 pub(super) fn reset(
     sheet: &mut Sheet,
     talk: &mut Option<Talk>,

@@ -23,11 +23,11 @@ pub struct Line {
     pub name: &'static str,
     /// How it came out.
     pub verdict: Verdict,
-    /// What was measured, in `unit`; none where there is nothing to measure.
+    /// The measured value, in `unit`; none if there is nothing to measure.
     pub value: Option<f64>,
     /// Unit of the value; empty for a count.
     pub unit: &'static str,
-    /// What it has to be.
+    /// The required value.
     pub limit: String,
     /// What else was seen.
     pub note: String,
@@ -58,7 +58,7 @@ impl Sheet {
             } else {
                 Verdict::Failed
             },
-            // A number that was not to be had is none.
+            // A value that could not be measured is not a number.
             value: value.into().filter(|value| value.is_finite()),
             unit,
             limit: limit.into(),

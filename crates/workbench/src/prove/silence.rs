@@ -1,4 +1,4 @@
-//! What a board does when nobody speaks to it, and the stops that are asked for.
+//! Behaviour of a board in silence, and requested stops.
 
 use super::moves::Range;
 use super::sheet::Sheet;
@@ -34,7 +34,7 @@ fn go(
     hold_ms: u16,
     (at_pm, neutral_pm): (i32, i32),
 ) -> Result<Result<(), String>, Failure> {
-    // Where a session before left the board, it is left by a new one; park first where it is on its way.
+    // A new session releases a board that an earlier one left; it parks first if moving.
     t.request(&ToBoard::Disarm, Request::Disarm)?.ok();
     range.settle(t, range.park_pm)?;
     let change = |arm: &mut cellpos_link::Arm| {

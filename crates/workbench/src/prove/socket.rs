@@ -82,7 +82,7 @@ impl Client {
         Self::fill(&mut self.stream, &mut head)?;
         let header =
             FrameHeader::from_bytes(&head).map_err(|error| Trouble::Broken(error.to_string()))?;
-        // What the decoder passes over is written as well: the length of the header, and zeros.
+        // Fields that the decoder ignores are tested, too: the header's length, and zeros.
         if header.to_bytes() != head {
             let at = (0..HEADER_LEN).find(|at| header.to_bytes().get(*at) != head.get(*at));
             return Err(Trouble::Broken(format!(
@@ -241,7 +241,7 @@ fn times(sheet: &mut Sheet, frames: &[Came], rate_hz: f64) {
     );
 }
 
-/// A reader that pauses for a second: what it gets then are whole frames, with a gap in their numbers, and few of them are old.
+/// A reader that pauses for a second must get whole frames afterwards, with a gap in their numbers, and few old ones.
 fn pauses(sheet: &mut Sheet, client: &mut Client, rate_hz: f64) {
     const PAUSE: Duration = Duration::from_secs(1);
     let Ok(before) = client.next() else { return };
@@ -249,7 +249,7 @@ fn pauses(sheet: &mut Sheet, client: &mut Client, rate_hz: f64) {
     let resumed_ns = monotonic_ns();
     let (mut waited, mut jump, mut last, mut trouble) =
         (0_u64, 0_u64, before.header.frame_id, None);
-    // What was exposed before the reader came back has waited; the first frame after it ends the search.
+    // Frames from before the reader's return have waited; the first newer frame ends the search.
     for _ in 0..(3.0 * rate_hz) as usize + 100 {
         match client.next() {
             Ok(came) => {

@@ -53,7 +53,7 @@ impl Talk {
         self.clock.sleep_until_ns(at_ns);
     }
 
-    /// Puts bytes on the line, all of them.
+    /// Writes all bytes to the line.
     pub(super) fn send_bytes(&mut self, mut bytes: &[u8]) -> Result<(), Failure> {
         let give_up_ns = self.now_ns() + (ANSWER_MS * 1e6) as i64;
         while !bytes.is_empty() {
@@ -248,7 +248,7 @@ impl Talk {
         Ok(self.must_status()?.board_time_us)
     }
 
-    /// Commands the last place again, so that the board's watchdog is fed, and gives the board time of what it said meanwhile, us.
+    /// Commands the last place again, so that the board's watchdog is fed, and returns the board time of its last message, us.
     ///
     /// # Errors
     /// The line breaks.

@@ -1,7 +1,7 @@
 //! `cellpos circle`: identify, reconcile, design again, track again, and what each step was worth.
 //!
-//! The loop is shown a model and a rig; what the rig hides stays in the rig. On the emulated rig the truth is known, so that
-//! the margins that each model predicts can be set beside those that the loop has.
+//! The loop gets a model and a rig; the hidden model stays in the rig. On the emulated rig the truth is known, so the margins that
+//! each model predicts are compared with those of the loop.
 
 mod report;
 
@@ -23,42 +23,41 @@ use std::path::{Path, PathBuf};
   cellpos circle --hidden hidden.toml --report circle.html --out augmented.toml
   cellpos circle --rig rig.toml --controller lqg --json
 
-A controller is designed on the model as given, as identified, and as reconciled, and the rig is run with each. The rig's own
-model ([emulator] model, or --hidden) is used by the emulated rig, and by the report for the true margins; the steps never see
-it. On a real rig there are no true margins. Exit code 0: the circle is closed; 1: the loop of the last step ended in Safe, or
-no verdict was reached.")]
+Designs a controller for the model as given, as identified, and as reconciled, and runs the rig with each. The hidden model (--hidden,
+or [emulator] model) drives the emulated rig and gives the true margins of the report; the steps never see it. Exit code 0: done; 1: the last
+loop ended in Safe, or there is no verdict.")]
 pub struct Args {
-    /// Model that the emulated rig runs and nobody is shown: a model.toml.
+    /// Hidden model of the emulated rig: a model.toml.
     #[arg(long)]
     hidden: Option<PathBuf>,
-    /// The rig; left out: the emulated one.
+    /// Rig file; default: the emulated rig.
     #[arg(long)]
     rig: Option<PathBuf>,
-    /// The model that is believed in at the start: eq6, or a model.toml.
+    /// Model to start from: eq6, or a model.toml.
     #[arg(long, default_value = "eq6")]
     model: String,
-    /// Which controller: pi, lead, lqg or mpc.
+    /// Control law: pi, lead, lqg or mpc.
     #[arg(long, default_value = "pi", value_parser = ["pi", "lead", "lqg", "mpc"])]
     controller: String,
-    /// Amplitude (half of peak to peak) of the sine that is tracked.
+    /// Amplitude of the sine (half of peak to peak).
     #[arg(long, default_value = "3um")]
     amplitude: Micrometers,
     /// Its frequency.
     #[arg(long, default_value = "10Hz")]
     frequency: Hertz,
-    /// How long each controller holds the bead, and tracks the sine.
+    /// Duration of each hold and each sine.
     #[arg(long, default_value = "8s")]
     duration: Seconds,
     /// Factor on the duration of the experiments for reconcile, 0.2 to 10.
     #[arg(long, default_value_t = 1.0)]
     effort: f64,
-    /// Most effects to add.
+    /// Largest number of effects to add.
     #[arg(long, default_value_t = 4)]
     max_effects: usize,
-    /// Most further experiments where the first leaves names open.
+    /// Largest number of further experiments.
     #[arg(long, default_value_t = 1)]
     rounds: u8,
-    /// Whether the emulated rig stands still, or has the imperfections of a real one (false) [default: as rig.toml says].
+    /// false: the emulated rig has the imperfections of a real one [default: as rig.toml says].
     #[arg(long, value_name = "BOOL", num_args = 0..=1, require_equals = true, default_missing_value = "true")]
     ideal: Option<bool>,
     /// Seed of the emulated rig and of the excitations [default: that of rig.toml].
@@ -67,19 +66,19 @@ pub struct Args {
     /// Clock of the emulated rig [default: virtual; a real rig has the real one].
     #[arg(long, value_enum)]
     clock: Option<ClockKind>,
-    /// Whether the emulated rig renders frames.
+    /// Render frames of the emulated rig.
     #[arg(long, value_enum, default_value = "on")]
     frames: Frames,
-    /// Do not ask the operating system for real time.
+    /// Run without real-time priority.
     #[arg(long)]
     best_effort: bool,
-    /// Go on from the finished segments of a circle that was stopped in its identification.
+    /// Continue from the finished segments of a circle that was stopped during identification.
     #[arg(long, value_name = "PARTIAL")]
     resume: Option<PathBuf>,
-    /// Write the augmented model here [default: augmented.toml in a new folder of runs/].
+    /// Augmented model [default: augmented.toml in a new folder of runs/].
     #[arg(long)]
     out: Option<PathBuf>,
-    /// Write the report here, figures beside it [default: report.html in a new folder of runs/].
+    /// Report [default: report.html in a new folder of runs/].
     #[arg(long)]
     report: Option<PathBuf>,
     /// Print one JSON object on standard output.

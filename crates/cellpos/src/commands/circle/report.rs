@@ -145,7 +145,7 @@ fn verdict_and_names(circle: &Circle) -> String {
     format!("{}: {}", verdict.word(), names.join(" + "))
 }
 
-/// What was added, with its delays together, and what came of it.
+/// The added effects, with all delays together, and their benefit.
 fn sentence(circle: &Circle) -> String {
     let mut text = format!("{}.", verdict_and_names(circle));
     if let Some(first) = text.get(..1) {

@@ -198,7 +198,7 @@ impl Machine<'_> {
         Some(if runtime < 0 || runtime >= period {
             good("real-time throttling", "off")
         } else {
-            // The loop uses a few percent; a program that runs away beside it at real-time priority is what it stops.
+            // The loop uses a few per cent. The limit stops a runaway program at real-time priority.
             finding(
                 "real-time throttling",
                 format!("on: real-time threads get {runtime} of every {period} us, all together"),

@@ -1,4 +1,4 @@
-//! A bare loop at 1 kHz for as long as wanted, and what ran beside it when it was late.
+//! A bare loop at 1 kHz, and the programs that ran when it was late.
 
 use super::suspect::Suspect;
 use super::traced::{LateWindows, Tracing};
@@ -172,7 +172,7 @@ fn watch_traced(
 
 fn watch(late: &AtomicU64, done: &AtomicBool, cpu: Option<usize>) -> Vec<Suspect> {
     const LOOK: Duration = Duration::from_millis(100);
-    /// A tenth of a second holds ten hundredths: what ran in one of them ran.
+    /// A tenth of a second holds ten samples: a program in one sample counts.
     const MOST: usize = 8;
     let mut found: BTreeMap<String, Suspect> = BTreeMap::new();
     let mut before = snapshot(cpu);

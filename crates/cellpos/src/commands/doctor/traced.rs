@@ -1,14 +1,14 @@
 //! Who had the CPU while the loop waited for it, from the kernel's own record of every switch: named to the microsecond.
 //!
-//! A trace instance of its own (a ring in the kernel's memory) hears `sched_switch` and `irq_handler_entry` while the loop is
-//! measured and goes away with it; nobody else's tracing is touched. It needs root and a mounted tracefs.
+//! A separate trace instance (a ring in the kernel's memory) records `sched_switch` and `irq_handler_entry` during the measurement
+//! and is removed afterwards. Other tracing is not touched. It needs root and a mounted tracefs.
 
 use super::suspect::Suspect;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicI64, Ordering};
 
-/// Late wake-ups that wait to be looked at: ten looks a second find no more of them.
+/// Late wake-ups that wait for evaluation, ten times a second.
 const WAITING: usize = 128;
 
 /// Late wake-ups, handed over without a lock: from the due time to the wake-up, ns of the monotonic clock. When it is full,
@@ -50,14 +50,14 @@ impl LateWindows {
 pub struct Tracing {
     folder: PathBuf,
     cpu: Option<usize>,
-    /// Late wake-ups that were looked at, and those of which the record no longer had the time.
+    /// Late wake-ups that were evaluated, and those that the record no longer covered.
     pub looked: u64,
     pub unknown: u64,
     found: BTreeMap<String, Suspect>,
 }
 
 impl Tracing {
-    /// Starts to listen on the CPU of the loop (all, where it is not pinned); says why it cannot.
+    /// Starts to record on the CPU of the loop (on all if it is not pinned), or returns the reason.
     pub fn start(cpu: Option<usize>) -> Result<Self, String> {
         let root = ["/sys/kernel/tracing", "/sys/kernel/debug/tracing"]
             .into_iter()
@@ -156,7 +156,7 @@ impl Drop for Tracing {
     }
 }
 
-/// Somebody on a CPU, or an interrupt (which has no end of its own).
+/// A task on a CPU, or an interrupt (without an end).
 #[derive(Debug, Clone, PartialEq)]
 struct OnCpu {
     name: String,

@@ -42,7 +42,7 @@ pub fn run(args: &Args) -> CommandResult {
     for path in &args.data {
         for source in sources::read(path, args)? {
             let result = judge(&source, args);
-            // What has no spectrum may still have a model in time.
+            // A record without a spectrum can still have a model in time.
             match result {
                 Ok(result) => results.push((PathBuf::from(&source.name), result)),
                 Err(e) if args.input.is_none() => {
@@ -98,7 +98,7 @@ pub fn run(args: &Args) -> CommandResult {
     })
 }
 
-/// The model of other rigs' records, fitted to all of them in time. None for records of this rig, of a loop, or of too few rows
+/// The model of other rigs' records, fitted in time to every record. None for records of this rig, of a loop, or of too few rows
 /// where no form was asked for.
 fn base_of(
     args: &Args,
@@ -198,7 +198,7 @@ fn verdict(r: &ForeignResult) -> Option<String> {
     }
 }
 
-/// Whether a model's numbers are told by the record: none has an interval wider than itself.
+/// Whether the record determines a model's numbers: no interval is wider than its number.
 fn identified(m: &RationalFit) -> bool {
     let told = |values: &[f64], sds: &[f64]| {
         values

@@ -8,7 +8,7 @@ use serde_json::{Map, Value, json};
 use std::fmt::Write;
 use std::path::Path;
 
-/// A number for JSON; what is not finite becomes `null`.
+/// A number for JSON; a number that is not finite becomes `null`.
 fn finite(value: f64) -> Value {
     if value.is_finite() {
         json!(value)

@@ -49,54 +49,52 @@ const ON_RECORDS: &str = "To fit records of any rig";
     cellpos identify --response bode.csv --out base.toml\n  \
     cellpos identify --data Model_Vi_Do.dat --input 1 --output 5 --rate 200Hz --hold none")]
 pub struct Args {
-    /// Run folders, records of cellpos, or records of any rig with --input and --output; the model is fitted to all of them.
+    /// Run folders, records of cellpos, or records of any rig with --input and --output.
     #[arg(long, num_args = 1.., value_parser = crate::arguments::run_folder(), help_heading = ON_RECORDS)]
     data: Vec<PathBuf>,
-    /// A frequency response in the place of records: a table (text, .npy, .mat) with `freq [Hz]` or `w [rad/s]`, and gain (or
-    /// `gain [dB]`) and `phase [deg]` (or `[rad]`), or re and im.
+    /// Frequency response instead of records: a table (text, .npy, .mat) with `freq [Hz]` or `w [rad/s]`, and gain (or `gain [dB]`) and `phase [deg]` (or `[rad]`), or re and im.
     #[arg(long, value_name = "FILE", conflicts_with_all = ["data", "rig", "resume"], help_heading = ON_RECORDS)]
     response: Option<PathBuf>,
-    /// Input column: a name of the header (a unit in brackets may be left out), or a number from 1.
+    /// Input column: its name, with or without the unit, or its number from 1.
     #[arg(long, alias = "input-column", requires_all = ["data", "output"], help_heading = ON_RECORDS)]
     input: Option<String>,
-    /// Output column: a name of the header, or a number from 1.
+    /// Output column: its name, or its number from 1.
     #[arg(long, alias = "output-column", requires = "input", help_heading = ON_RECORDS)]
     output: Option<String>,
-    /// Column of the time, in the unit of its name (`t [ms]`), else in seconds [default: the one called time or t].
+    /// Time column, in the unit of its name (`t [ms]`), else in seconds [default: the one called time or t].
     #[arg(long, requires = "input", help_heading = ON_RECORDS)]
     time_column: Option<String>,
-    /// Rows per second of records without a column of time.
+    /// Sampling rate of records without a time column.
     #[arg(long, requires = "input", value_parser = crate::arguments::positive::<Hertz>, help_heading = ON_RECORDS)]
     rate: Option<Hertz>,
-    /// Rows FROM:TO of every file, counted from 0, TO not included.
+    /// Rows of every file, from 0, TO not included.
     #[arg(long, value_name = "FROM:TO", requires = "input", help_heading = ON_RECORDS)]
     rows: Option<String>,
-    /// Form of the model of other rigs' records: order=N, with zeros=N, delay, integrating where they are wanted; or
-    /// static. Left out, or auto: the simplest that predicts records as well as any, up to --order.
+    /// Form of the model: order=N, with zeros=N, delay, integrating if you want them; or static. Default, or auto: the simplest that predicts as well as any, up to --order.
     #[arg(long, help_heading = ON_RECORDS)]
     base: Option<super::form::Asked>,
-    /// What the records' input does between rows: a command is held (zero-order), a measured signal is not (none).
+    /// Input between rows: a command is held (zero-order), a measured signal is not (none).
     #[arg(long, value_enum, default_value_t = HoldKind::ZeroOrder, help_heading = ON_RECORDS)]
     hold: HoldKind,
-    /// Highest order of a linear model tried on records.
+    /// Highest model order to try.
     #[arg(long, default_value_t = 4, value_parser = clap::value_parser!(u8).range(0..=8), help_heading = ON_RECORDS)]
     order: u8,
-    /// The rig, through the same loop as `cellpos track`; left out: an emulated one.
+    /// Rig file; default: the emulated rig.
     #[arg(long, conflicts_with_all = ["data", "open_loop"], help_heading = ON_A_RIG)]
     rig: Option<PathBuf>,
-    /// Go on from the finished segments of an identification that was stopped.
+    /// Continue a stopped identification from its finished segments.
     #[arg(long, conflicts_with = "data", help_heading = ON_A_RIG)]
     resume: Option<PathBuf>,
-    /// Exposure of the camera of `--rig`; left out: that of its `[emulator]`.
+    /// Exposure of the camera of `--rig`; default: that of its `[emulator]`.
     #[arg(long, requires = "rig", value_parser = crate::arguments::positive::<Seconds>, help_heading = ON_A_RIG)]
     exposure: Option<Seconds>,
-    /// Do not ask the operating system for real time.
+    /// Run without real-time priority.
     #[arg(long, requires = "rig", help_heading = ON_A_RIG)]
     best_effort: bool,
-    /// Plant that amplitudes and the holding loop are made for, and that of the emulated rig: `eq6` or a model.toml.
+    /// Model for amplitudes, for the holding loop and for the emulated rig: `eq6` or a model.toml.
     #[arg(long, default_value = "eq6", help_heading = ON_A_RIG)]
     model: String,
-    /// Whether the emulated rig stands still, or has the imperfections of a real one (false) [default: as rig.toml says].
+    /// false: the emulated rig has the imperfections of a real one [default: as rig.toml says].
     #[arg(long, value_name = "BOOL", num_args = 0..=1, require_equals = true, default_missing_value = "true")]
     ideal: Option<bool>,
     /// Seed of the emulated rig, the excitation and the bootstrap [default: that of rig.toml, else 1].
@@ -105,40 +103,40 @@ pub struct Args {
     /// Clock of the emulated rig [default: virtual; a real rig has the real one].
     #[arg(long, value_enum, help_heading = ON_A_RIG)]
     clock: Option<ClockKind>,
-    /// Frames through the localiser, or positions with the noise that frames would give.
+    /// Render frames of the emulated rig, or use positions with equivalent noise.
     #[arg(long, value_enum, default_value_t = Switch::On, help_heading = ON_A_RIG)]
     frames: Switch,
-    /// How to excite.
+    /// Form of the excitation.
     #[arg(long, value_enum, default_value_t = Excitation::Stepped, help_heading = ON_A_RIG)]
     excitation: Excitation,
-    /// Lines to drive (default: the paper's ten).
+    /// Frequencies to excite; default: the paper's ten.
     #[arg(long, num_args = 1.., value_delimiter = ',', help_heading = ON_A_RIG)]
     frequency: Vec<Hertz>,
-    /// Largest bead amplitude (peak) while a line is driven.
+    /// Largest amplitude of the bead (peak).
     #[arg(long, default_value = "8um", help_heading = ON_A_RIG)]
     bead_amplitude: Micrometers,
-    /// Largest bead speed (peak): its image must not smear by more than about two pixels during an exposure.
+    /// Largest speed of the bead (peak): its image should smear by less than two pixels in an exposure.
     #[arg(long, default_value = "400um/s", help_heading = ON_A_RIG)]
     bead_speed: MicrometersPerSecond,
     /// Largest PZT amplitude (peak).
     #[arg(long, default_value = "10um", help_heading = ON_A_RIG)]
     pzt_amplitude: Micrometers,
-    /// Move the PZT about neutral without holding the bead; drift and low lines will take it out of view.
+    /// Do not hold the bead: drift and low frequencies will take it out of view.
     #[arg(long, help_heading = ON_A_RIG)]
     open_loop: bool,
-    /// Edges of the LED delay test; 0 leaves it out.
+    /// Edges of the LED delay test; 0: no test.
     #[arg(long, default_value_t = 300, help_heading = ON_A_RIG)]
     led_edges: usize,
-    /// Bootstrap replicates; 0 leaves it out.
+    /// Bootstrap replicates; 0: none.
     #[arg(long, default_value_t = 200)]
     bootstrap: usize,
-    /// Where to write the model [default: model.toml in a new folder of runs/].
+    /// Model file [default: model.toml in a new folder of runs/].
     #[arg(long)]
     out: Option<PathBuf>,
-    /// Draw and list Eq. (6) of the paper beside what was measured: a comparison with another rig.
+    /// Compare with Eq. (6) of the paper.
     #[arg(long)]
     eq6: bool,
-    /// Where to write the report, figures beside it [default: report.html in a new folder of runs/].
+    /// Report [default: report.html in a new folder of runs/].
     #[arg(long)]
     report: Option<PathBuf>,
     #[command(flatten)]
@@ -151,7 +149,7 @@ pub struct Args {
 /// What the records' input does between rows.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
 pub enum HoldKind {
-    /// Keeps its value until the next row.
+    /// Held until the next row.
     ZeroOrder,
     /// Samples of a smooth signal.
     None,
@@ -223,9 +221,9 @@ fn checked(args: &Args) -> Result<(), Failure> {
 
 /// Of a loop with a longer period the paper's lines are above half its rate, us.
 const SLOW_LOOP_US: f64 = 1500.0;
-/// Lines for an actuator of some 10 ms, from what a tube's compliance does to what its regulator does, Hz.
+/// Frequencies for an actuator of some 10 ms, from the tube's compliance to the regulator's lag, Hz.
 const SLOW_FREQUENCIES_HZ: [f64; 10] = [0.2, 0.5, 1.0, 2.0, 3.0, 5.0, 7.0, 10.0, 14.0, 20.0];
-/// Highest of them, as part of the loop's rate: beyond, hold and alias weigh as much as the plant.
+/// Highest frequency, as a fraction of the loop's rate: beyond, hold and alias weigh as much as the plant.
 const HIGHEST_LINE: f64 = 0.3;
 
 /// The rig of `--rig`, with a PI for its delay.
@@ -306,7 +304,7 @@ fn job(args: &Args) -> Result<identification::Job, Failure> {
         lines_hz,
         excitation: args.excitation,
         seconds_at_1_hz: 40.0,
-        // What a program serves has no LED in front of the camera.
+        // An actuator program has no LED in front of the camera.
         led_edges: match rig.as_ref().map(|rig| &rig.file.actuator) {
             Some(ActuatorConfig::Program { .. }) => 0,
             _ => args.led_edges,

@@ -20,11 +20,11 @@ fn unwrapped_deg(phase: f64) -> f64 {
     phase - 360.0 * ((phase + 90.0) / 360.0).round()
 }
 
-/// A band so many times as wide as the intervals of the points beside it says nothing of what was measured.
+/// A band wider than the intervals of its points by this factor does not describe the measurement.
 const WIDEST_BAND: f64 = 30.0;
 
-/// Ends of the fit's 95 % band (gain or phase) at each frequency; NaN beyond the measured lines, and where the nearest point is known
-/// better by far: what the band shows there is a parameter that these lines do not determine.
+/// Ends of the fit's 95 % band (gain or phase) at each frequency; NaN beyond the measured frequencies, and if the nearest point is
+/// known far better: there the band shows a parameter that these data do not determine.
 fn band(result: &Identification, grid: &[f64], phase: bool) -> [Vec<f64>; 2] {
     let points = &result.compensated;
     let mut ends = [Vec::new(), Vec::new()];
@@ -129,7 +129,7 @@ pub fn bode(
         )
 }
 
-/// Nyquist plot of what the record shows against the fitted model with hold and delay.
+/// Nyquist plot of the record and the fitted model with hold and delay.
 pub fn nyquist(result: &Identification) -> Figure {
     let (re, im): (Vec<f64>, Vec<f64>) = result
         .measured
@@ -302,7 +302,7 @@ pub fn delay_test(
         )
 }
 
-/// What was measured, in a sentence: gain, delay, and how sure they are.
+/// The result in a sentence: gain and delay with their intervals.
 fn sentence(done: &Done) -> (Emphasis, String) {
     let result = &done.result;
     let known: Vec<&IdentifiedParameter> = (result.judged.parameters.iter())
@@ -322,7 +322,7 @@ fn sentence(done: &Done) -> (Emphasis, String) {
             interval(p.ci95)
         )
     };
-    // Gain and delay decide what a loop can do; the others are in the table.
+    // Gain and delay limit a loop; the other parameters are in the table.
     let delay = known.iter().skip(1).rfind(|p| p.meaning.contains("delay"));
     let parts: Vec<String> = known
         .first()

@@ -1,4 +1,4 @@
-//! What `cellpos identify --data` reads: run folders and records of cellpos, as they are; any other file by its columns.
+//! What `cellpos identify --data` reads: run folders and records of cellpos; other files by their columns.
 
 use super::{Args, HoldKind};
 use crate::commands::arrays::read_table;
@@ -11,7 +11,7 @@ use cellpos_table::{ColumnRef, Table};
 use std::collections::BTreeMap;
 use std::path::Path;
 
-/// A record with what is known of it.
+/// A record and its properties.
 pub struct Source {
     /// File or folder, and session where a run has several.
     pub name: String,
@@ -21,7 +21,7 @@ pub struct Source {
     pub input: Vec<f64>,
     /// The output; NaN where none was seen.
     pub output: Vec<f64>,
-    /// What the input was to bring about, where the record has it.
+    /// Reference, if the record has it.
     pub reference: Option<Vec<f64>>,
     /// Whether the record says itself that a loop was closed.
     pub closed: bool,
@@ -66,7 +66,7 @@ fn text_of(path: &Path) -> Result<String, Failure> {
     })
 }
 
-/// A CSV of cellpos: time_s, pzt_um, bead_um, and target_um where it has one. Where it says when the loop was closed (`life`), as
+/// A CSV of cellpos: time_s, pzt_um, bead_um, and perhaps target_um. Where it says when the loop was closed (`life`), as
 /// exports of runs do, it is taken as the run would be.
 fn own_record(path: &Path) -> Result<Vec<Source>, Failure> {
     let name = path.display().to_string();

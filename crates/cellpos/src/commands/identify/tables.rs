@@ -67,7 +67,7 @@ pub fn parameters(parameters: &[IdentifiedParameter]) -> Table {
     table
 }
 
-/// The table of lines, beside Eq. (6) if asked for.
+/// The table of frequencies, with Eq. (6) on request.
 pub fn lines(result: &Identification, eq6: bool) -> Table {
     let nominal = TransferFunction::eq6();
     let heads = [

@@ -22,23 +22,20 @@ use typed::Typed;
 /// Arguments of `cellpos jog`.
 #[derive(Debug, clap::Args)]
 #[command(
-    after_help = "Without --to, on a terminal, single keys move: + and up a step, - and down a step back, g goes to a displacement \
-    (g, 5um, Enter), q ends. Where standard input is no terminal its lines are read: `5um` goes there, `+` and `-` go a step, \
-    `+2um` and `-2um` go that far, `q` ends. The PZT is parked at the end, on Ctrl-C too. In open loop the bead flows at some \
-    400 um/s for each um away from zero flow: small steps keep it in view.\n\n\
+    after_help = "Keys on a terminal, without --to: + and up one step up, - and down one step down, g goes to a displacement (g, 5um, Enter), q ends. From a pipe, lines do the same: `5um`, `+`, `-`, `+2um`, `-2um`, `q`. The PZT is parked at the end, also after Ctrl-C. In open loop the bead flows at some 400 um/s per um from zero flow: small steps keep it in view.\n\n\
     Examples:\n  cellpos jog --rig rig.toml --to 15um --to 20um\n  cellpos jog --rig rig.toml --step 0.5um"
 )]
 pub struct Args {
     /// Rig.
     #[arg(long)]
     rig: PathBuf,
-    /// Go there, then to the next, then park.
+    /// Positions to visit before park.
     #[arg(long, value_name = "LENGTH", allow_hyphen_values = true)]
     to: Vec<Micrometers>,
-    /// How far `+` and `-` go.
+    /// Step of the keys `+` and `-`.
     #[arg(long, default_value = "1um", value_parser = crate::arguments::positive::<Micrometers>)]
     step: Micrometers,
-    /// How fast.
+    /// Speed.
     #[arg(long, default_value = "100um/s", value_parser = crate::arguments::positive::<MicrometersPerSecond>)]
     speed: MicrometersPerSecond,
     /// Do not look for a bead.
@@ -56,7 +53,7 @@ pub struct Args {
 struct Stop {
     commanded_um: f64,
     applied_um: f64,
-    /// Position of the bead along the channel, um, or in pixels where nothing is calibrated.
+    /// Position of the bead along the channel, um; without a calibration px.
     bead_um: Option<f64>,
     bead_px: Option<[f64; 2]>,
 }

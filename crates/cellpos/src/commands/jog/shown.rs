@@ -32,7 +32,7 @@ pub enum Asked {
     To(f64),
 }
 
-/// The page, and what it is fed from.
+/// The page and its source.
 pub struct Shown {
     by_hand: ByHand,
     operator: Arc<Operator>,
@@ -87,7 +87,7 @@ impl Shown {
         }))
     }
 
-    /// What the operator asks for; a target is told once.
+    /// Request of the operator; a target is reported once.
     pub fn asked(&self) -> Asked {
         match self.operator.asked() {
             Request::None | Request::Skip => {}
@@ -102,7 +102,7 @@ impl Shown {
         target_um.map_or(Asked::Nothing, Asked::To)
     }
 
-    /// Shows a millisecond of it.
+    /// Shows one millisecond.
     pub fn step(&mut self, mover: &Mover) {
         let time_ns = Clock::Real.now_ns() - self.start_ns;
         let seen = self.looking.as_mut().and_then(Looking::newest);
@@ -206,7 +206,7 @@ impl Drop for Looking {
     }
 }
 
-/// What the camera's thread has.
+/// State of the camera's thread.
 struct Eyes {
     camera: Box<dyn Camera>,
     eye: Option<Eye>,

@@ -1,4 +1,4 @@
-//! What is seen at a stop. The camera stays open: away from zero flow the bead goes on for as long as one is looked for.
+//! What is seen at a stop. The camera stays open: away from zero flow the bead moves during the search.
 
 use crate::outcome::Failure;
 use cellpos_rig::{Camera, Clock, FrameBuffer};

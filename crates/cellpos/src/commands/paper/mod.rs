@@ -1,7 +1,7 @@
 //! `cellpos paper`: the figures and numbers of Mizoue et al. 2017 from the emulated rig, through frames.
 //!
-//! Where the paper is inconsistent the table says so with the numbers. The bead is held while a line is driven, since
-//! in open loop the paper's 1.6 um peak to peak at 2 Hz would move it 54 um; only Fig. A1 is an open-loop record.
+//! Where the paper is inconsistent the table says so with the numbers. The bead is held during the excitation: in open loop the
+//! paper's 1.6 um peak to peak at 2 Hz would move it 54 um; only Fig. A1 is an open-loop record.
 
 mod figures;
 mod row;
@@ -28,7 +28,7 @@ pub struct Args {
     /// Seed of the emulated rig.
     #[arg(long, default_value_t = 1)]
     seed: u64,
-    /// Where to write the report, figures beside it [default: report.html in a new folder of runs/].
+    /// Report [default: report.html in a new folder of runs/].
     #[arg(long)]
     report: Option<PathBuf>,
     /// Print one JSON object on standard output.

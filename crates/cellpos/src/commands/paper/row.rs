@@ -1,4 +1,4 @@
-//! A row of the table: what the paper says, what came out here, and whether they agree.
+//! A row of the table: the paper's value, the value here, and whether they agree.
 
 use crate::commands::identify::report::number;
 use serde_json::{Value, json};

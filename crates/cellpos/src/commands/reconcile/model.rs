@@ -1,5 +1,5 @@
-//! The model that a reconciliation extends: a file, a gain, or a base that is fitted to the records; and fitted once more where
-//! that is all that was missing.
+//! The model that a reconciliation extends: a file, a gain, or a base fitted to the records. The base is fitted again if that
+//! explains the difference.
 
 use super::records::{at_rest_of_runs, fitted, with_camera_delay};
 use crate::commands::base::{self, Base};
@@ -16,12 +16,12 @@ use cellpos_plant::{
 };
 use cellpos_reconcile::{Options, Reconciliation, Record, Verdict, reconcile};
 
-/// Records, and what is known of them.
+/// Records and their properties.
 pub(super) struct Data<'a> {
     pub records: &'a [Record],
     /// Where the beads of run folders rested, um.
     pub rests_um: &'a [f64],
-    /// Whether all of them are run folders.
+    /// Whether all records are run folders.
     pub of_runs: bool,
 }
 
@@ -29,7 +29,7 @@ pub(super) struct Data<'a> {
 pub(super) struct Asked<'a> {
     /// A name, a file, or `fit`.
     pub model: &'a str,
-    /// The form of a base that stands in its place.
+    /// The form of the base that replaces it.
     pub base: Option<form::Asked>,
     /// How the command acts between rows.
     pub hold: Option<HoldKind>,
@@ -104,7 +104,7 @@ pub(super) fn put_output_at_rest(
     Ok(())
 }
 
-/// Fits a base behind what is known to happen to its input (`ahead`, row by row of every record; none where nothing does).
+/// Fits a base behind known effects on its input (`ahead`, row by row of every record; none without effects).
 fn fit(
     records: &[Record],
     ahead: &[Vec<f64>],
@@ -313,5 +313,5 @@ fn is_simpler(next: &Reconciliation, found: &Reconciliation, again: &Model, line
     fewer && next.gap.after.powi(2) <= found.gap.after.powi(2) + MORE_LEFT * closed.max(0.0)
 }
 
-/// Part of what a set closes that may be open again without its linear effects.
+/// Share of the closed gap that may be open again without the linear effects.
 const MORE_LEFT: f64 = 0.01;

@@ -1,4 +1,4 @@
-//! The records that a reconciliation reads: CSV files and run folders, and what they say about the model's working point.
+//! The records that a reconciliation reads: CSV files and run folders, and the working point that they give.
 
 use crate::commands::columns::{self, Wanted};
 use crate::commands::run::resume::sessions;
@@ -15,26 +15,26 @@ use std::path::{Path, PathBuf};
 /// Where CSV files have what, and in which units.
 #[derive(Debug, clap::Args)]
 pub(super) struct Columns {
-    /// Column of the input: its name (a unit in brackets may be left out), or its number from 1.
+    /// Input column: its name, with or without the unit, or its number from 1.
     #[arg(long, alias = "input", default_value = "pzt_um")]
     pub(super) input_column: String,
-    /// Column of the output: its name, or its number from 1.
+    /// Output column: its name, or its number from 1.
     #[arg(long, alias = "output", default_value = "bead_um")]
     pub(super) output_column: String,
-    /// Column of the time: its name, or its number from 1; in the unit of its name (`t [ms]`, time_min), else in seconds
+    /// Time column, in the unit of its name (`t [ms]`, time_min), else in seconds
     /// [default: the one called time or t].
     #[arg(long)]
     time_column: Option<String>,
-    /// Sampling rate, with unit (200Hz), of files without a time column.
+    /// Sampling rate (200Hz) of files without a time column.
     #[arg(long, value_parser = crate::arguments::positive::<cellpos_units::Hertz>)]
     rate: Option<cellpos_units::Hertz>,
-    /// Factor on the input; for a model in um from a column in volts: 4. Data of another rig need none.
+    /// Factor from the input column to um of the model: 4 for 4 um per volt. Data of another rig need none.
     #[arg(long, default_value_t = 1.0)]
     input_um_per_unit: f64,
-    /// Factor on the output; for a model in um from a column in nanometres: 0.001. Data of another rig need none.
+    /// Factor from the output column to um of the model: 0.001 for nanometres. Data of another rig need none.
     #[arg(long, default_value_t = 1.0)]
     output_um_per_unit: f64,
-    /// Rows FROM:TO of every file, counted from 0, TO not included.
+    /// Rows of every file, from 0, TO not included.
     #[arg(long, value_name = "FROM:TO")]
     rows: Option<String>,
 }

@@ -65,7 +65,7 @@ fn strip(film: &Film) -> Result<Vec<u8>, String> {
     if count == 0 || film.width == 0 || film.height == 0 {
         return Err("it has no frames".to_string());
     }
-    // Beside each other where that is wide enough to see something, else below each other.
+    // Side by side if wide enough, else one below the other.
     let upright = film.width > 2 * film.height;
     let across = if upright { 1 } else { count };
     let every = (across * film.width).div_ceil(WIDEST).max(1);

@@ -1,4 +1,4 @@
-//! The cycles of a run: their trends, each motion by itself, with the static arm beside.
+//! The cycles of a run: trends of each motion, and the static arm.
 
 use cellpos_report::{Axis, Column, Emphasis, Figure, Panel, Report, Series, Table};
 use cellpos_script::{ArmKind, AtRest, CycleFlags, CycleRow, ReadCycles, Trend, trend};
@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 
 /// A quantity of the cycles.
 struct Quantity {
-    /// What it says something of: the bead or cell itself, or how well the rig moved it.
+    /// Its subject: the bead or cell, or the motion of the rig.
     of_what: &'static str,
     name: &'static str,
     unit: &'static str,
@@ -185,7 +185,7 @@ pub fn section(page: &mut Report, read: &ReadCycles) -> serde_json::Value {
     serde_json::Value::Array(json)
 }
 
-/// Says what the cell's length at rest adds to the uncertainty of every stretch.
+/// States the share of the length at rest in the uncertainty of every stretch.
 fn at_rest(page: &mut Report, rest: &AtRest) {
     if let (true, true) = (rest.length_um.is_finite(), rest.length_sd_um.is_finite()) {
         page.paragraph(&format!(
@@ -221,20 +221,20 @@ struct Group<'r> {
     rows: Vec<&'r CycleRow>,
 }
 
-/// Whether bead or cell was elsewhere than the script had it: its mean distance from the target is more than a tenth of the stroke,
-/// where that of a cycle that went as planned is a few percent. Its lengths are of another place in the channel.
+/// Whether bead or cell was away from the script: its mean distance from the target exceeds a tenth of the stroke. In a good cycle it
+/// is a few per cent. Its lengths are of another place in the channel.
 pub fn was_elsewhere(row: &CycleRow) -> bool {
     const OF_STROKE: f64 = 0.1;
     row.arm == ArmKind::Cyclic && row.bias_um.abs() > OF_STROKE * row.stroke_um.abs()
 }
 
-/// Whether a cycle of the static arm is one in which the bead goes to its load or back.
+/// Whether the bead moves to its load or back in a cycle of the static arm.
 pub fn on_the_way(row: &CycleRow) -> bool {
     const STILL_UM: f64 = 0.01;
     row.arm == ArmKind::Static && row.stroke_um > STILL_UM
 }
 
-/// The name of a quantity beside its axis: a long one would be cut there.
+/// Short name of a quantity for its axis.
 fn axis_name(name: &str) -> &str {
     match name {
         "reached over commanded amplitude" => "reached / commanded",
@@ -242,7 +242,7 @@ fn axis_name(name: &str) -> &str {
     }
 }
 
-/// Motions that are told apart: of a sweep over more, the first.
+/// Largest number of motions shown; of a longer sweep the first ones.
 const MOST_GROUPS: usize = 8;
 
 /// The cycles by arm, stroke and duration: across amplitudes there is no trend.
@@ -267,7 +267,7 @@ fn groups(rows: &[CycleRow]) -> Vec<Group<'_>> {
         });
         match known {
             Some(group) => group.rows.push(row),
-            // A row without records has no stroke of its own.
+            // A row without records has no stroke.
             None if !full && row.stroke_um.is_finite() => groups.push(Group {
                 arm: row.arm,
                 name: String::new(),

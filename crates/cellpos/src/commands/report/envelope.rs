@@ -41,7 +41,7 @@ struct Stretch<const N: usize> {
     rows: u64,
     low: [f64; N],
     high: [f64; N],
-    /// Values for the median, and how many of them there are.
+    /// Values for the median, and their number.
     samples: [[f64; N]; SAMPLES],
     sampled: usize,
     /// Nothing is joined across a gap in the record.
@@ -115,7 +115,7 @@ impl<const N: usize> Envelope<N> {
         self.stretches = joined;
     }
 
-    /// A column as a figure of so many px shows it.
+    /// A column for a figure of this width, px.
     pub fn course(&self, column: usize) -> Course {
         let at = |values: &[f64; N]| values.get(column).copied().unwrap_or(f64::NAN);
         let joined = self.stretches.len().div_ceil(COLUMNS).max(1);

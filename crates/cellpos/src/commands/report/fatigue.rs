@@ -1,11 +1,11 @@
-//! The fatigue figure: what the cycles did to the cell.
+//! The fatigue figure: change of the cell over the cycles.
 
 use super::cycles::{on_the_way, was_elsewhere};
 use super::ticks::{Course, Ticks};
 use cellpos_report::{Axis, Figure, Panel, Report, Series};
 use cellpos_script::{ArmKind, AtRest, CycleFlags, CycleRow};
 
-/// The cycles whose course is drawn over each other: the first, the tenth, the hundredth, ... and the last of those that have records.
+/// The cycles that are drawn over each other: the first, the tenth, the hundredth, ... and the last one with records.
 pub fn courses(rows: &[CycleRow]) -> Vec<Course> {
     let cyclic: Vec<&CycleRow> = rows.iter().filter(is_whole).collect();
     let mut wanted = Vec::new();
@@ -14,7 +14,7 @@ pub fn courses(rows: &[CycleRow]) -> Vec<Course> {
         wanted.push(number);
         number *= 10;
     }
-    // What came of it is in the last one.
+    // The last one shows the outcome.
     if wanted.last().is_some_and(|last| *last != cyclic.len()) {
         wanted.push(cyclic.len());
     }
@@ -118,7 +118,7 @@ pub fn section(page: &mut Report, rows: &[CycleRow], ticks: &Ticks) {
     }
 }
 
-/// What the cycles did to the cell, where the run has cycles of a cell: the figure that answers the question of such a run.
+/// Change of the cell over the cycles: the main figure of a run with a cell.
 pub fn figure(rows: &[CycleRow]) -> Option<Figure> {
     let rest = AtRest::of(rows);
     if rest.length_um.is_nan() {

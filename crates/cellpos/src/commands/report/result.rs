@@ -7,7 +7,7 @@ use cellpos_report::{Axis, Emphasis, Figure, Panel, Report, Series};
 use cellpos_script::{ArmKind, AtRest, CycleRow, Trend, trend};
 use cellpos_session::connect::ENDED;
 
-/// Adds the sentence, and the figure unless the cycles of a cell have one of their own; gives the sentence.
+/// Adds the sentence, and the figure unless the cycles of a cell have one; returns the sentence.
 pub(super) fn section(
     page: &mut Report,
     sessions: &[Session],

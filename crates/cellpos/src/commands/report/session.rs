@@ -1,4 +1,4 @@
-//! The sessions of a run: when their ticks came, what happened in them, where they are from.
+//! The sessions of a run: timing, events, origin.
 
 use super::ticks::Ticks;
 use cellpos_record::{Lost, RunMeta};
@@ -58,7 +58,7 @@ pub(super) fn events(page: &mut Report, sessions: &[Session]) {
         table.row([*name, &count.to_string()]);
     }
     page.table(table);
-    // What comes by the thousand is in events.jsonl; here is what a person wants to see.
+    // Frequent events are only in events.jsonl.
     let daily = |name: &str| counts.get(name).is_some_and(|count| *count > 50);
     let mut table = Table::new([
         Column::right("time (s)"),

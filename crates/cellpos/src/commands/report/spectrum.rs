@@ -25,7 +25,7 @@ pub struct Welch {
 }
 
 impl Welch {
-    /// The next value; NaN where it is missing.
+    /// The next value; NaN if it is missing.
     pub fn add(&mut self, value_um: f64) {
         self.values_um.push(value_um);
         if self.values_um.len() == STRETCH {

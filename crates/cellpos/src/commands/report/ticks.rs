@@ -1,4 +1,4 @@
-//! What a report needs of the ticks, gathered as they go by.
+//! Figures of a report, gathered in one pass over the ticks.
 
 use super::envelope::Envelope;
 use super::spectrum::Welch;
@@ -37,7 +37,7 @@ pub struct Ticks {
     pub excerpt: Excerpt,
     /// Errors of every tick whose error counts (see [`Statistics`]), nm.
     pub error_nm: Spread,
-    /// The same over the run, nm; NaN where it does not count.
+    /// The same over the run, nm; NaN if it does not count.
     pub error: Envelope<1>,
     /// Whether the target moved while the error counted.
     pub target_moves: bool,
@@ -196,7 +196,7 @@ impl Ticks {
         (n > 0.0).then(|| sum / n * 1e-3)
     }
 
-    /// Number of positions, and sum over them of what their sessions have in the mean.
+    /// Number of positions, and the sum of their sessions' means.
     fn sums(&self, of: impl Fn(&Statistics) -> Option<f64>) -> (f64, f64) {
         self.statistics
             .iter()

@@ -9,7 +9,7 @@ use cellpos_session::{Rig, RigFile};
 /// Most motions whose error is predicted: each takes a simulation for each controller that could do better.
 const MOST_MOTIONS: usize = 16;
 
-/// Refuses a wave that is too fast to be told from a slower one.
+/// Refuses a wave above half the loop's rate.
 ///
 /// # Errors
 /// A frequency from half the loop's rate on, with its line.
@@ -34,7 +34,7 @@ pub(super) fn below_nyquist(script: &Script, check: &Check, file: &RigFile) -> R
     }
 }
 
-/// What to say of each periodic motion that the loop is predicted to miss by more than a tenth of its amplitude.
+/// Warnings about periodic motions with a predicted error above a tenth of the amplitude.
 ///
 /// # Errors
 /// A model or a controller of which no loop can be made.

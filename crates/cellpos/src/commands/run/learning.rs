@@ -67,7 +67,7 @@ pub fn motions(
     specs
 }
 
-/// Names and tables of what a loop has learned.
+/// Names and tables of the learned motions.
 pub fn named(specs: &[MotionSpec], tables: &[Option<LearnedTable>]) -> Vec<NamedTable> {
     let table = |spec: &MotionSpec| tables.get(usize::from(spec.motion))?.clone();
     specs
@@ -91,7 +91,7 @@ pub struct Keeper {
 }
 
 impl Keeper {
-    /// A keeper for the run's folder; None where nothing is learned.
+    /// Writer for the run's folder; None if nothing is learned.
     pub fn new(folder: &Path, specs: &[MotionSpec], sample_s: f64) -> Option<Self> {
         let count = specs
             .iter()
@@ -124,7 +124,7 @@ impl Keeper {
         }
     }
 
-    /// Writes what has changed. A disk that refuses is asked again with the next change: the run goes on all the same.
+    /// Writes what has changed. After a failed write the next change tries again; the run continues.
     pub fn save(&mut self) {
         if self.changed && save_learning(&self.folder, named(&self.specs, &self.tables)).is_ok() {
             self.changed = false;

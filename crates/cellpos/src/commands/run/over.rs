@@ -34,7 +34,7 @@ pub(super) struct Telling<'a> {
     pub tell: bool,
 }
 
-/// Writes what a run leaves, and says how it ended.
+/// Writes the files of a finished run and returns how it ended.
 pub(super) fn conclude(
     telling: Telling<'_>,
     setup: &Setup,
@@ -54,7 +54,7 @@ pub(super) fn conclude(
         ..
     } = finished;
     let (sink, kept_clips) = sink.into_inner(&summary, &ended).into_parts();
-    // The terminal is given back, and the page is over, before anything is said.
+    // First release the terminal and end the page, then print.
     drop(view);
     warnings.extend(clips::warnings(kept_clips));
     let script = sink.end();

@@ -1,5 +1,5 @@
-//! A queue of cells: one is caught, goes through the script, is let go, and the next is waited for. Each cell has a run folder
-//! of its own below the queue's; over all of them there are one table and one page.
+//! A queue of cells: catch one, run the script, release it, wait for the next. Each cell has a run folder below the queue's. One
+//! table and one page cover all.
 
 mod population;
 
@@ -20,13 +20,13 @@ use std::time::{Duration, Instant};
 /// How cells follow each other.
 #[derive(Debug, clap::Args)]
 pub(super) struct QueueArgs {
-    /// So many cells, one after the other: each is caught, goes through the script and is let go; one table and one page over all.
+    /// Run the script on N cells, one after the other; one table and one page over all.
     #[arg(long, value_name = "N", conflicts_with = "resume", value_parser = clap::value_parser!(u64).range(1..=10_000))]
     pub(super) cells: Option<u64>,
-    /// From the end of one cell to the search for the next: the flow takes one away and brings the other.
+    /// Pause between two cells: the flow takes one away and brings the next.
     #[arg(long, default_value = "5s", requires = "cells", value_parser = crate::arguments::positive::<Seconds>)]
     between: Seconds,
-    /// How long a cell is waited for before the queue ends.
+    /// End if no cell comes for this long.
     #[arg(long, default_value = "10min", requires = "cells", value_parser = crate::arguments::positive::<Seconds>)]
     patience: Seconds,
 }

@@ -1,4 +1,4 @@
-//! What stands before a run of a script is armed.
+//! Preparation of a script's run, before arming.
 
 use super::session_config::SessionConfig;
 use cellpos_record::InputFile;

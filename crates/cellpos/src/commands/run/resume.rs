@@ -18,8 +18,7 @@ use std::sync::Arc;
 /// Larger than the table of any run, bytes.
 const MOST_TABLE: u64 = 1 << 30;
 
-/// The acknowledged cycles of a run. Where the table is gone they are counted again from the ticks: beginning at cycle 0
-/// would do all of them a second time.
+/// The acknowledged cycles of a run. Without the table, cycles are counted from the ticks: starting at cycle 0 would repeat all.
 pub fn cycles(folder: &Path) -> Result<Vec<CycleRow>, Failure> {
     let path = folder.join(CYCLES_CSV);
     let text = match read_text(&path, MOST_TABLE) {
@@ -74,7 +73,7 @@ fn counted(folder: &Path) -> Result<Vec<CycleRow>, Failure> {
     Ok(rows)
 }
 
-/// Writes a run's table of cycles anew, whole or not at all.
+/// Rewrites a run's table of cycles, completely or not at all.
 fn write_cycles(path: &Path, rows: &[CycleRow]) -> Result<(), Failure> {
     let mut text = CycleRow::csv_head() + "\n";
     for row in rows {
@@ -84,8 +83,8 @@ fn write_cycles(path: &Path, rows: &[CycleRow]) -> Result<(), Failure> {
     cellpos_table::write_atomically(path, text.as_bytes()).map_err(Failure::failed)
 }
 
-/// Gives the table of a run that an older version began the columns of this one, in one step: new rows go below the
-/// same head, and what the older version did not measure stays empty.
+/// Gives the table of a run that an older version began the columns of this one, in one step: new rows have the same header, and
+/// values that the older version did not measure stay empty.
 fn renew(folder: &Path) -> Result<(), Failure> {
     let path = folder.join(CYCLES_CSV);
     let Ok(text) = read_text(&path, MOST_TABLE) else {
@@ -152,7 +151,7 @@ pub fn sessions(folder: &Path) -> Vec<PathBuf> {
     found.into_iter().map(|(_, path)| path).collect()
 }
 
-/// What a session's run.toml says of it.
+/// A session as described by its run.toml.
 pub fn session_config(reader: &RunReader) -> Option<SessionConfig> {
     let config = reader.meta().ok()?.config.get("session")?.clone();
     config.try_into().ok()
@@ -200,7 +199,7 @@ pub fn ready(folder: &Path, best_effort: bool) -> Result<Option<Ready>, Failure>
     let sessions = sessions(folder);
     let last = sessions.last().map_or(folder, PathBuf::as_path);
     let last_done = is_done(last);
-    // Without an end of its own a script whose last cycle is done may still have a step to go.
+    // A script without a recorded end may still have a step after its last cycle.
     if over || last_done {
         return Ok(None);
     }

@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-/// What a session needs to know beside the loop's set-up: the table `config.session` of run.toml.
+/// Settings of a session besides the loop's: the table `config.session` of run.toml.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct SessionConfig {

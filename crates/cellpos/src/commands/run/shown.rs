@@ -1,4 +1,4 @@
-//! What the live page is told of a script: the cycle, what comes next, the time left, and the cycles' trend as it grows.
+//! Progress of a script for the live page: cycle, next step, time left, trend of the cycles.
 
 use super::sink::ScriptSink;
 use cellpos_runtime::Stage;

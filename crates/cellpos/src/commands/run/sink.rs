@@ -78,7 +78,7 @@ impl End {
         self.row_stop.is_some() || self.stage.is_over()
     }
 
-    /// Whether the script did what it was to do.
+    /// Whether the script reached its end.
     pub fn complete(&self) -> bool {
         let over = [Stage::Done, Stage::StoppedCycles, Stage::StoppedTime];
         self.row_stop.is_none() && over.contains(&self.stage)
@@ -103,7 +103,7 @@ impl ScriptSink {
             begun = begun.with("gap_s", gap_s);
         }
         writer.event(&begun);
-        // Hidden by itself where standard error is no terminal.
+        // Hidden automatically if standard error is no terminal.
         let bar = crate::output::progress_bar(Some((plan.total_s() * 1e3) as u64));
         if let Ok(style) = ProgressStyle::with_template("{bar:30} {percent:>3}% {wide_msg}") {
             bar.set_style(style);
@@ -179,7 +179,7 @@ impl ScriptSink {
         }
     }
 
-    /// Acknowledges what is finished and gives the writer back, with what of the table could not be written.
+    /// Acknowledges finished rows and returns the writer, with the rows that could not be written.
     pub fn close(mut self) -> (RunWriter, Faults) {
         self.acknowledge();
         self.lines.close();
@@ -259,7 +259,7 @@ impl ScriptSink {
         self.stop("stopped: amplitude error too large");
     }
 
-    /// The script's own limits of what the cell does.
+    /// The script's limits for the cell.
     fn judge_cell(&mut self, row: &CycleRow, time_s: f64) {
         let Some(passed) = self.fatigue.as_mut().and_then(|watch| watch.add(row)) else {
             return;

@@ -37,7 +37,7 @@ pub struct Report<'a> {
     cycles_done: u64,
     /// Of these: changed by what happened in them.
     cycles_disturbed: u64,
-    /// Of the others: those in which anything at all happened.
+    /// Of the others: those with any event.
     cycles_touched: u64,
     /// Mean of reached over commanded amplitude, less 1, percent.
     amplitude_error_percent: Option<f64>,

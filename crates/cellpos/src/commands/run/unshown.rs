@@ -4,7 +4,7 @@ use cellpos_script::{AtRest, CycleRow};
 use cellpos_session::view::{self, EventLine};
 use std::collections::VecDeque;
 
-/// What is to be shown and was not yet; the page takes some of it a few times a second. Without a page nothing is kept.
+/// Rows that the page has not taken yet; it takes some a few times a second. Without a page nothing is kept.
 #[derive(Debug, Default)]
 pub(super) struct Unshown {
     on: bool,

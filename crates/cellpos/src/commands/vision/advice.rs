@@ -58,7 +58,7 @@ impl Advice {
         }
     }
 
-    /// The settings as a table to paste, with what they rest on.
+    /// The settings as a table to paste, with their basis.
     pub fn text(&self) -> String {
         let given = self
             .given_px

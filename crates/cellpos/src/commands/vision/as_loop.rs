@@ -1,4 +1,4 @@
-//! A recording through the loop's own tracker: what the loop would have seen, frame by frame.
+//! A recording through the loop's tracker, frame by frame.
 
 use super::{Args, out_folder, write};
 use crate::commands::vision_summary::verdict_name;
@@ -14,7 +14,7 @@ use std::path::Path;
 /// Time after which a recording that is read from a slow disk counts as stuck, ns.
 const PATIENCE_NS: i64 = 10_000_000_000;
 
-/// What the loop would have seen.
+/// Result of the loop's tracker.
 #[derive(Debug, Serialize)]
 struct Seen {
     source: String,
@@ -24,7 +24,7 @@ struct Seen {
     lost_frames: u64,
     /// Frames that gave the loop a position.
     positions: usize,
-    /// Frames by what the tracker decided of them.
+    /// Frames by the tracker's decision.
     decisions: BTreeMap<String, u64>,
     /// Median standard deviation of the positions, um.
     sd_um: Option<f64>,

@@ -1,4 +1,4 @@
-//! Beads of a recording, all of them.
+//! All beads of a recording.
 
 use super::settings::BeadSettings;
 use super::{Reader, end_row};

@@ -72,13 +72,13 @@ impl Numbers {
         (number, false)
     }
 
-    /// Forgets what was not seen in the last frames.
+    /// Forgets cells that the last frames did not show.
     fn forget(&mut self, n: usize) {
         self.known.retain(|k| k.seen + 5 > n);
     }
 }
 
-/// Finds the cells of each frame; gives the table of them.
+/// Finds the cells of each frame; returns their table.
 pub(super) fn find(
     args: &Args,
     calibration: Option<&CalibrationFile>,

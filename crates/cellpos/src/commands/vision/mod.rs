@@ -31,56 +31,55 @@ pub struct Args {
     /// Folder of PNG, TIFF or JPEG pictures, TIFF stack, Photron recording (.cihx, .cih, .mraw), AVI film, NumPy stack (.npy), or .rtdc
     /// file.
     source: PathBuf,
-    /// Radius at which a ring-profile bead (bright core, dark ring) first crosses the background, px. Without a size or a
-    /// rig the profile is learnt from the recording itself.
+    /// Radius at which a bead with a ring (bright core, dark ring) first crosses the background, px. Without size and rig the profile is learnt from the recording.
     #[arg(long, conflicts_with_all = ["sigma_px", "cells"])]
     edge_px: Option<f64>,
     /// Standard deviation of a Gaussian spot, px.
     #[arg(long, conflicts_with = "cells")]
     sigma_px: Option<f64>,
-    /// Take the tables vision, cell and tracking of this rig.toml, as the loop does.
+    /// Use the tables vision, cell and tracking of this rig.toml.
     #[arg(long, conflicts_with_all = ["edge_px", "sigma_px", "as_loop"])]
     rig: Option<PathBuf>,
-    /// Put the recording through the tracker of the loop of this rig.toml: one bead or cell, frame by frame.
+    /// Replay the recording through the tracker of this rig.toml: one bead or cell, frame by frame.
     #[arg(long, conflicts_with_all = ["edge_px", "sigma_px", "cells", "background"])]
     as_loop: Option<PathBuf>,
-    /// Side of the fitted window, px; left out: just wide enough for the bead with its ring.
+    /// Side of the fitted window, px; default: the width of the bead with its ring.
     #[arg(long)]
     window_px: Option<usize>,
     /// The beads' core is darker than the background.
     #[arg(long)]
     dark: bool,
-    /// Keep the profile of the given size; else the template is learnt from the recording.
+    /// Use the profile of the given size, without learning it from the recording.
     #[arg(long)]
     no_learning: bool,
-    /// Template error tolerated before a fit counts as bad, as a fraction of the amplitude; left out: what the beads need.
+    /// Allowed error of the template, as a fraction of the amplitude; default: as the beads need.
     #[arg(long)]
     template_tolerance: Option<f64>,
-    /// Farthest that a bead moves between frames, px; left out: what they do.
+    /// Largest step of a bead between frames, px; default: as measured.
     #[arg(long)]
     max_step_px: Option<f64>,
-    /// Look only at this part of each frame: WIDTHxHEIGHT+X+Y, px.
+    /// Use this part of each frame: WIDTHxHEIGHT+X+Y, px.
     #[arg(long)]
     region: Option<Region>,
-    /// Calibration file: adds positions along the channel in micrometres.
+    /// Calibration file: adds positions in micrometres.
     #[arg(long)]
     calibration: Option<PathBuf>,
-    /// Look for cells against a background instead of beads.
+    /// Find cells against a background, instead of beads.
     #[arg(long)]
     cells: bool,
-    /// Frames at the start that show no cell, averaged into the background.
+    /// Frames without a cell at the start, averaged into the background.
     #[arg(long, default_value_t = 20, conflicts_with = "background")]
     background_frames: usize,
-    /// Frames per second, for --as-loop; left out: what the recording says, else 1000.
+    /// Frame rate for --as-loop; default: that of the recording, else 1000.
     #[arg(long)]
     rate_hz: Option<f64>,
-    /// Recording of the empty channel, as `cellpos background` writes it, instead of frames at the start.
+    /// Recording of the empty channel (cellpos background), instead of frames at the start.
     #[arg(long, requires = "cells")]
     background: Option<PathBuf>,
     /// Stop after this many frames.
     #[arg(long)]
     frames: Option<usize>,
-    /// New folder for positions.csv, sheet.png and summary.json; left out: vision-NAME in this folder.
+    /// New folder for positions.csv, sheet.png and summary.json; default: vision-NAME.
     #[arg(long)]
     out: Option<PathBuf>,
     /// Print one JSON object on standard output.

@@ -13,7 +13,7 @@ const LOOKED_AT: usize = 20;
 /// Farthest that a bead moves between frames where nobody says, px.
 const MAX_STEP_PX: f64 = 6.0;
 
-/// What beads are looked for with.
+/// Settings of the search for beads.
 #[derive(Debug)]
 pub(super) struct BeadSettings {
     pub config: LocaliserConfig,

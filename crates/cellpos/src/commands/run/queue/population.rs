@@ -1,4 +1,4 @@
-//! What the cells of a queue have in common, and how far they differ: a row a cell, a page over all.
+//! Mean and spread of the cells of a queue: a row per cell, one page for all.
 
 use crate::commands::report::with_interval;
 use crate::commands::run::over::Over;
@@ -7,7 +7,7 @@ use cellpos_script::{ArmKind, AtRest, CycleFlags, CycleRow, Trend, trend};
 use serde::Serialize;
 use std::collections::BTreeMap;
 
-/// A cell. What was not measured is None.
+/// A cell. None: not measured.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub(super) struct CellRow {
     /// Its number in the queue, from 1.
