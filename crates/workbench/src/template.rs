@@ -86,12 +86,12 @@ pub fn text(kind: &Kind, found: &Found) -> String {
     let devices = match kind {
         Kind::Emulated => "\
 [actuator]
-kind = \"emulated\"        # the board's own state machine in this process; a real one: cellpos rig new --serial PORT
+kind = \"emulated\"        # the board's state machine in this process; a real board: cellpos rig new --serial PORT
 
 [camera]
-kind = \"emulated\"        # frames are drawn; a real one: --camera PATH_OF_A_SOCKET or --camera ADDRESS
+kind = \"emulated\"        # rendered frames; a real camera: --camera PATH_OF_A_SOCKET or --camera ADDRESS
 
-# [calibration]          # the emulated camera brings its own; one of yours, right or wrong, takes its place
+# [calibration]          # replaces that of the emulated camera: right, or wrong to rehearse
 # pixel = \"0.1um\"
 # origin_px = 127.5
 # sign = 1.0
@@ -104,7 +104,7 @@ kind = \"emulated\"        # frames are drawn; a real one: --camera PATH_OF_A_SO
                 ),
                 Camera::Industrial(address) => format!(
                     "kind = \"industrial\"      # program built with --features aravis\naddress = {address:?}\nrate = \"1kHz\"\n\
-                     exposure = \"200us\"       # short: a bead at 400 um/s moves 80 nm meanwhile\n\
+                     exposure = \"200us\"       # short: at 400 um/s a bead smears by 80 nm\n\
                      # region = {{ x_px = 0, y_px = 0, width_px = 256, height_px = 64 }}\n"
                 ),
             };
@@ -113,18 +113,18 @@ kind = \"emulated\"        # frames are drawn; a real one: --camera PATH_OF_A_SO
 [actuator]
 kind = \"serial\"
 port = {port:?}
-baud = 3000000           # of no effect on USB CDC and pseudo-terminals
-watchdog = \"20ms\"        # without a command for this long the board holds the zero-flow displacement
-hold_watchdog = \"2s\"     # when it has held for this long it parks
+baud = 3000000           # no effect on USB CDC and pseudo-terminals
+watchdog = \"20ms\"        # silence after which the board holds zero flow
+hold_watchdog = \"2s\"     # holding time after which it parks
 
 [camera]
 {camera}
-[calibration]            # cellpos calibrate measures axis and sign and writes a file: calibration_file = \"calibration.toml\"
-pixel = \"0.1um\"          # of a stage micrometre; a guess until then
-origin_px = 127.5        # the column that is called 0 um
+[calibration]            # cellpos calibrate writes a better one: calibration_file = \"calibration.toml\"
+pixel = \"0.1um\"          # a guess, until measured with a stage micrometer
+origin_px = 127.5        # column of position 0 um
 sign = 1.0               # +1: the coordinate rises when the PZT extends
 
-[vision]                 # what a bead looks like, at first firmware-sim's; cellpos camera --rig FILE --find-beads beads.png writes yours
+[vision]                 # beads of firmware-sim; for yours: cellpos camera --rig FILE --find-beads beads.png
 window_px = 21
 profile = {{ kind = \"ring\", edge_px = 5.0 }}
 "
@@ -136,22 +136,22 @@ profile = {{ kind = \"ring\", edge_px = 5.0 }}
         list("Cameras", &found.cameras),
     );
     format!(
-        "# A rig for cellpos: see docs/rig-toml.md for every key. Read it with: cellpos rig check FILE [--connect]
-# Quantities are written with a unit (park = \"20um\"), or bare with the unit in the key (park_um = 20.0).
+        "# A rig for cellpos. docs/rig-toml.md has every key; cellpos rig check FILE [--connect] checks it.
+# park = \"20um\" and park_um = 20.0 mean the same.
 {ports}{cameras}
-first_neutral = \"20um\"   # first belief of the displacement at which the bead is at rest; the loop finds the rest
+first_neutral = \"20um\"   # first estimate of zero flow (the bead is at rest there); the loop refines it
 
 {devices}
-[limits]                 # of the command; the board has its own, and the narrower ones hold
+[limits]                 # of the command; the board's limits hold, too
 low = \"0um\"
 high = \"40um\"
 slew = \"20um/ms\"
-park = \"20um\"            # where the PZT is left
+park = \"20um\"            # displacement of the PZT after a run
 
 [timing]
-period = \"1ms\"           # of the camera
-camera_delay = \"2ms\"     # from the middle of an exposure to its tick: cellpos identify measures it
-oldest = \"5ms\"           # an older exposure is stale
+period = \"1ms\"           # between two frames
+camera_delay = \"2ms\"     # from mid-exposure to the tick that uses the frame; cellpos identify measures it
+oldest = \"5ms\"           # older frames are not used
 "
     )
 }

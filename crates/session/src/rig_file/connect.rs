@@ -220,13 +220,7 @@ impl RigFile {
     pub fn line(&self) -> Result<Box<dyn Port>, Failure> {
         match &self.actuator {
             ActuatorConfig::Serial { port, baud, .. } => {
-                let line = SerialLine::open(port, *baud).map_err(|error| {
-                    Failure::bad_input(
-                        format!("[actuator] port = \"{port}\": {error}"),
-                        "is the board plugged in (or firmware-sim running), and may you read and write the device? See docs/rig.md, Permissions",
-                    )
-                })?;
-                Ok(Box::new(line))
+                Ok(Box::new(super::port::open(port, *baud)?))
             }
             ActuatorConfig::Program { socket, .. } => {
                 let line = ProgramLine::open(socket).map_err(|error| {
@@ -274,7 +268,7 @@ impl RigFile {
                 "leave the test out with --led-edges 0",
             ));
         };
-        let line = SerialLine::open(port, *baud).map_err(Failure::failed)?;
+        let line = super::port::open(port, *baud)?;
         let board = BoardHost::connect(line, Clock::Real).map_err(Failure::failed)?;
         Ok((self.open_camera()?, board))
     }

@@ -2,6 +2,7 @@
 
 mod actuator;
 mod connect;
+mod port;
 mod sight;
 
 pub use actuator::ActuatorConfig;

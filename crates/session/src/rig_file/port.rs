@@ -1,0 +1,92 @@
+//! The serial line of a board, and the reason if it cannot be opened.
+
+use crate::Failure;
+use cellpos_drivers::serial::SerialLine;
+use std::io::{Error, ErrorKind};
+use std::path::Path;
+
+/// Opens a port.
+///
+/// # Errors
+/// It cannot be opened: who has it, or what is missing.
+pub fn open(port: &str, baud: u32) -> Result<SerialLine, Failure> {
+    SerialLine::open(port, baud).map_err(|error| cannot_open(port, &error))
+}
+
+fn cannot_open(port: &str, error: &Error) -> Failure {
+    match error.kind() {
+        // The first answers a lock that is held, the second TIOCEXCL.
+        ErrorKind::WouldBlock | ErrorKind::ResourceBusy => Failure::bad_input(
+            format!("[actuator] port = \"{port}\": {} has it open", holder(port)),
+            "end that program, or wait until it has parked the PZT",
+        ),
+        ErrorKind::PermissionDenied => Failure::bad_input(
+            format!("[actuator] port = \"{port}\": {error}"),
+            "join the group of the port: sudo usermod -aG dialout $USER, then log in again; docs/rig.md, Permissions",
+        ),
+        _ => Failure::bad_input(
+            format!("[actuator] port = \"{port}\": {error}"),
+            "is the board plugged in (or firmware-sim running)? cellpos rig new lists the ports; docs/rig.md, Permissions",
+        ),
+    }
+}
+
+/// Name and process of the first program that has a file open, as far as this user may see it.
+fn holder(path: &str) -> String {
+    let wanted = std::fs::canonicalize(path).unwrap_or_else(|_| path.into());
+    let has_it = |process: &Path| {
+        let open = std::fs::read_dir(process.join("fd"));
+        (open.into_iter().flatten().flatten())
+            .any(|file| std::fs::read_link(file.path()).is_ok_and(|file| file == wanted))
+    };
+    let processes = std::fs::read_dir("/proc").into_iter().flatten().flatten();
+    let found = processes.map(|entry| entry.path()).find(|process| {
+        let number = process.file_name().and_then(|name| name.to_str());
+        number.is_some_and(|name| name.bytes().all(|c| c.is_ascii_digit())) && has_it(process)
+    });
+    match found {
+        Some(process) => {
+            let name = std::fs::read_to_string(process.join("comm")).unwrap_or_default();
+            let number = process.file_name().unwrap_or_default().to_string_lossy();
+            format!("{} (process {number})", name.trim())
+        }
+        None => "another program".to_owned(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_port_that_somebody_has_names_the_program() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("port");
+        let _held = std::fs::File::create(&path).expect("a file");
+        let path = path.display().to_string();
+        let own = format!("(process {})", std::process::id());
+        for kind in [ErrorKind::WouldBlock, ErrorKind::ResourceBusy] {
+            let said = cannot_open(&path, &kind.into()).text();
+            assert!(
+                said.contains(&own) && said.contains("has it open"),
+                "{said}"
+            );
+        }
+        assert_eq!(holder("/nowhere/at/all"), "another program");
+        let said = format!(
+            "{:?}",
+            cannot_open(&path, &ErrorKind::PermissionDenied.into())
+        );
+        assert!(said.contains("dialout") && !said.contains(&own), "{said}");
+    }
+
+    #[test]
+    fn a_port_that_is_not_there_is_named() {
+        let failure = open("/dev/does-not-exist", 1_000_000)
+            .err()
+            .expect("an error");
+        let said = failure.text();
+        assert!(said.contains("/dev/does-not-exist"), "{said}");
+        assert!(format!("{failure:?}").contains("plugged in"), "{failure:?}");
+    }
+}
