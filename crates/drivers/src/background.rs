@@ -64,7 +64,7 @@ pub enum BackgroundError {
     },
 }
 
-/// A finder that knows the empty channel from frames of it; `from` names them in messages.
+/// A finder with the empty channel from frames; `from` names them in messages.
 ///
 /// # Errors
 /// Too few frames, frames of different size, or frames in which something moved.

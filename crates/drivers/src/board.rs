@@ -150,7 +150,7 @@ impl<P: Port> BoardHost<P> {
         self.first_seq = seq;
     }
 
-    /// What the board says of itself.
+    /// Description of the board.
     pub fn identity(&self) -> &Identity {
         &self.identity
     }
@@ -234,7 +234,7 @@ impl<P: Port> BoardHost<P> {
         }
     }
 
-    /// Puts a message on its way; whether the line has taken all of it.
+    /// Sends a message; whether the line has taken it completely.
     fn send(&mut self, message: &ToBoard) -> Result<bool, ActuatorError> {
         let mut wire = [0; MAX_FRAME];
         // The longest message fits by the link's own bound; an encoding error would be a defect of the link.
@@ -330,7 +330,7 @@ impl<P: Port> BoardHost<P> {
         }
     }
 
-    /// Sends a request, again if need be, until `answer` finds what it is looking for.
+    /// Sends a request, again if need be, until `answer` succeeds.
     fn ask<T>(
         &mut self,
         message: &ToBoard,

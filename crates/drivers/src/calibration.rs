@@ -247,7 +247,7 @@ mod tests {
                 let (ox, oy) = c.origin();
                 assert!((c.position_um(ox + 0.1 * vx, oy + 0.1 * vy) - 3.0).abs() < 1e-12);
                 assert!(c.position_um(ox - vy, oy + vx).abs() < 1e-12);
-                // Round noise stays what it is, whatever the angle.
+                // Isotropic noise does not change with the angle.
                 assert!((c.variance_um2(2.0, 2.0, 0.0) - 0.02).abs() < 1e-12);
             }
         }

@@ -1,7 +1,7 @@
 //! The flow that was commanded, as vision uses it to predict where the bead will be.
 //!
-//! The PZT sets the bead's velocity: `v = K (x1 - neutral)`. What goes to the board is noted here with its time, and the
-//! tracker asks, one camera delay later, what flow was commanded between two exposures. Written by the actuator thread
+//! The PZT sets the bead's velocity: `v = K (x1 - neutral)`. This records the commands to the board with their times. One camera
+//! delay later the tracker asks for the flow commanded between two exposures. Written by the actuator thread
 //! and read by the camera thread, behind a lock that either holds for less than a microsecond; never used in a tick.
 
 use cellpos_rig::actuator::{
@@ -95,7 +95,7 @@ pub struct FlowTap<A> {
     reference: Option<(f64, i64)>,
 }
 
-/// Time in which the reference of the flow follows the loop's zero flow, s. The tracker has a velocity of its own for what no
+/// Time in which the reference of the flow follows the loop's zero flow, s. The tracker has a velocity state for motion that no
 /// command explains; a zero flow that the loop corrects within a few ticks must not count twice.
 const REFERENCE_S: f64 = 1.0;
 
@@ -164,7 +164,7 @@ impl<A: Actuator> Actuator for FlowTap<A> {
         self.inner.freeze()
     }
 
-    // Where the board's ramp to park stands is not known here; the bead is given up with it.
+    // The state of the board's ramp to park is unknown here; the bead is abandoned.
     fn park(&mut self) -> Result<(), ActuatorError> {
         self.rest();
         self.inner.park()
@@ -193,7 +193,7 @@ mod tests {
         flow.note(300, 0.5);
         assert_eq!(flow.mean_um_per_s(100, 200), 400.0);
         assert_eq!(flow.mean_um_per_s(150, 250), 400.0 * (0.5 - 1.0));
-        // Before the first command there was none; after the last it is held.
+        // Before the first command the flow is zero; after the last one it is held.
         assert_eq!(flow.mean_um_per_s(0, 200), 200.0);
         assert_eq!(flow.mean_um_per_s(300, 900), 200.0);
         assert_eq!(flow.mean_um_per_s(500, 500), 0.0);

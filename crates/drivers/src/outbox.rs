@@ -50,7 +50,7 @@ impl Outbox {
             written: 0,
             kind,
         };
-        // Not one byte of it is on the line: it may still be replaced.
+        // No byte is on the line yet: it may still be replaced.
         if self.next.is_none() {
             self.next = self.begun.take_if(|begun| begun.written == 0);
         }
@@ -104,7 +104,7 @@ mod tests {
     use super::*;
     use std::io::{Error, ErrorKind, Result};
 
-    /// Takes so many bytes in each call, then the next number; `None` is a line that is gone.
+    /// Takes these numbers of bytes, one per call; `None` is a line that is gone.
     struct Stingy {
         takes: Vec<Option<usize>>,
         got: Vec<u8>,

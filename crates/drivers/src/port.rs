@@ -1,4 +1,4 @@
-//! What bytes go through to the board.
+//! The line to the board.
 
 /// A byte port that never blocks for long.
 pub trait Port: Send {

@@ -52,7 +52,7 @@ impl ProgramLine {
         })
     }
 
-    /// What came of a call: 0 where it would have to wait, and no stream any more where the program has gone.
+    /// Result of a call: 0 if it would have to wait; the stream is dropped if the program is gone.
     fn judged(&mut self, result: std::io::Result<usize>) -> std::io::Result<usize> {
         match result {
             Err(error)

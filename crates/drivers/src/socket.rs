@@ -142,7 +142,7 @@ impl Camera for SocketCamera {
                 return Ok(Some(stamp));
             }
             let left_ns = deadline_ns - monotonic_ns();
-            // What has arrived is taken even when there is no time to wait for more.
+            // Frames that have arrived are taken even without time to wait for more.
             let overdue = left_ns <= 0;
             let Some(stream) = &mut self.stream else {
                 if overdue {

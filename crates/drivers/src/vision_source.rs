@@ -129,7 +129,7 @@ impl<C: Camera> VisionSource<C> {
         calibration: Calibration,
         clock: Clock,
     ) -> Self {
-        // A source without a rate of its own is looked at as if it gave a frame in a millisecond.
+        // A source without a stated rate counts as one frame per millisecond.
         let rate_hz = camera.info().rate_hz;
         let period_ns = if rate_hz > 0.0 {
             (1e9 / rate_hz) as i64
@@ -159,7 +159,7 @@ impl<C: Camera> VisionSource<C> {
         self
     }
 
-    /// The camera's pictures have no noise: two of them may be equal. Those of a real camera never are, for shot noise does not
+    /// The camera's pictures have no noise: two may be equal. Those of a real camera never are, for shot noise does not
     /// repeat; equal ones come from a grabber or a driver that hangs, and count as stale.
     pub fn noise_free(mut self) -> Self {
         self.noise_free = true;

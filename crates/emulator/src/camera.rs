@@ -1,4 +1,4 @@
-//! The camera of the emulated world: when it exposes, what it saw, when it delivers, and what goes wrong on the way.
+//! The camera of the emulated world: exposures, pictures, deliveries and faults.
 
 use crate::config::WorldConfig;
 use crate::faults::{FaultKind, Faults};

@@ -14,7 +14,7 @@ use std::f64::consts::FRAC_PI_4;
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct CellConfig {
-    /// Middle of the constriction's mouth; it goes on towards larger positions, um.
+    /// Middle of the constriction's mouth; it continues to larger positions, um.
     pub entry_um: f64,
     /// Length of the mouth, over which gain and load change, um.
     pub mouth_um: f64,
@@ -184,7 +184,7 @@ impl Cell {
     /// Standard deviations that [`Cell::measured`] has of a length: of the length (um) and of the area (um^2).
     pub(crate) fn noise(&self, length_um: f64) -> (f64, f64) {
         let noise_um = self.config.noise_um;
-        // The area goes with the root of the length.
+        // The area is proportional to the root of the length.
         let area_um2 = 0.5 * self.config.area_um2(length_um) / length_um * noise_um;
         (noise_um, area_um2)
     }

@@ -9,13 +9,13 @@ use crate::config::WorldConfig;
 
 /// Standard deviation of the soft edge that the microscope gives to everything in focus, um.
 const BLUR_UM: f64 = 0.2;
-/// Standard deviation of the blur that a distance from the focus adds, per um of it (numerical aperture 0.5 or so).
+/// Standard deviation of the blur that defocus adds, per um (numerical aperture of about 0.5).
 const BLUR_PER_FOCUS: f64 = 0.15;
 /// Distance from the focus at which the edge's phase shows with the contrast of [`CellConfig::halo`], um.
 const HALO_FOCUS_UM: f64 = 1.0;
 /// Largest contrast of the phase, in multiples of that.
 const MOST_PHASE: f64 = 2.0;
-/// Contrast of the rim on top of the body's, as a share of it, and its distance from the edge in edge widths.
+/// Additional contrast of the rim, as a fraction of the body's, and its distance from the edge in edge widths.
 const RIM: (f64, f64) = (0.3, 3.0);
 /// Edge widths beyond which nothing is drawn.
 const REACH: f64 = 5.0;
@@ -113,8 +113,8 @@ impl CellPicture {
     }
 }
 
-/// Grey levels that the channel's walls take from a pixel, by its number, where it is more than nothing: outside as far
-/// apart as the cell is wide at rest, in the constriction as when it is stretched least.
+/// Grey levels that the channel's walls take from a pixel, by its number, if above zero: outside as far apart as the cell at rest is
+/// wide, in the constriction as the least stretched cell.
 pub(crate) fn walls(config: &WorldConfig, cell: &CellConfig) -> Vec<(usize, f32)> {
     let blur_um = BLUR_UM.max(config.pixel_um);
     let inside_um = cell.width_um(cell.rest_um * cell.stretch_first.min(cell.stretch_last));

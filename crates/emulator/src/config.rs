@@ -1,4 +1,4 @@
-//! How the emulated world is set up.
+//! Settings of the emulated world.
 
 use crate::cell::CellConfig;
 use crate::error::{WorldError, within};
@@ -46,7 +46,7 @@ pub struct WorldConfig {
     pub read_noise_grey: f64,
     /// Photo-electrons per grey level: shot noise of variance `grey / electrons_per_grey`.
     pub electrons_per_grey: f64,
-    /// Localisation noise of positions delivered without pictures, um RMS. Left out: what the pictures would give.
+    /// Localisation noise of positions delivered without pictures, um RMS. Default: as from pictures.
     pub localisation_um: Option<f64>,
     /// When the bead has been out of the frame for this long and the flow is slow, a new one comes, ms. Left out: never.
     pub new_bead_after_ms: Option<f64>,

@@ -1,7 +1,7 @@
 //! The rig without a rig: the firmware library, the plant and the rendered camera in this process.
 //!
-//! Camera and actuator share one [`RigInABox`] behind a lock; only I/O threads touch it. On the real clock the world
-//! follows the clock whenever either of them looks; on the virtual clock they do the same and time stands still between.
+//! Camera and actuator share one [`RigInABox`] behind a lock; only I/O threads touch it. On the real clock the world follows the
+//! clock at each access; on the virtual clock as well, with time standing still in between.
 
 use crate::board_config::BoardConfig;
 use crate::config::WorldConfig;

@@ -12,7 +12,7 @@ pub enum FaultKind {
     LoseBead,
     /// A second bead swims along.
     SecondBead,
-    /// The bead sticks to the wall where it is; the flow goes on.
+    /// The bead sticks to the wall; the flow continues.
     StickBead,
     /// The camera delivers nothing; what was exposed meanwhile comes in one burst afterwards.
     StallCamera,
@@ -36,10 +36,9 @@ pub enum FaultKind {
     LinkGarbage,
     /// No byte passes the line to the board or from it.
     LinkLoss,
-    /// The optimiser gives no plan in time. The world knows nothing of it: the program lets its own loop suffer it.
+    /// The optimiser gives no plan in time. The world is not affected; the program applies it to its loop.
     SlowSolver,
-    /// The recorder takes nothing, as if its disk hung. The program's own, too, and for the virtual clock, on which no disk
-    /// can hang by itself.
+    /// The recorder takes nothing, as if its disk hung. Also applied by the program, for the virtual clock, on which no disk hangs.
     StallRecorder,
 }
 

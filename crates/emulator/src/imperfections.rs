@@ -1,7 +1,7 @@
-//! What a real rig is not spared: its flow, its light and its clocks are never quite what they should be.
+//! Imperfections of a real rig: flow, light and clocks.
 //!
 //! Every key of `[emulator]` that stands for one of them may be left out. Then it is as on a real rig with `ideal = false`, and
-//! nothing at all on an ideal rig. A key that is given is what it says on either rig.
+//! nothing at all on an ideal rig. A given key holds on either rig.
 
 use crate::config::WorldConfig;
 use crate::error::{WorldError, within};
@@ -36,7 +36,7 @@ pub struct Imperfections {
     pub camera_clock_ppm: f64,
     /// How far the exposures stray from the camera's clock, us RMS; its time stamps do not know.
     pub exposure_jitter_us: f64,
-    /// Mean of what the way of a frame takes beyond the fastest, us (exponential).
+    /// Mean additional delay of a frame over the fastest, us (exponential).
     pub arrival_jitter_us: f64,
 }
 
@@ -91,7 +91,7 @@ impl WorldConfig {
         let rest = match (self.ideal, self.cell) {
             (true, _) => Imperfections::IDEAL,
             (false, None) => Imperfections::REAL,
-            // Its constriction is along the rows, leaves no room for a walk, and has walls of its own.
+            // Its constriction is along the rows, leaves no room for a walk, and has its own walls.
             (false, Some(_)) => Imperfections {
                 lateral_um: Imperfections::IDEAL.lateral_um,
                 tilt_deg: 0.0,

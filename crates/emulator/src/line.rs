@@ -1,5 +1,5 @@
-//! A line to the board that misbehaves as USB and serial lines do: it stalls, takes a part of what it is given, loses bytes,
-//! is unplugged and comes back. It repeats and reorders nothing.
+//! A line to the board that misbehaves as USB and serial lines do: it stalls, takes a part of the bytes, loses bytes, is unplugged
+//! and returns. It repeats and reorders nothing.
 
 use cellpos_drivers::Port;
 use cellpos_numeric::Random;

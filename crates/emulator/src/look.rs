@@ -38,7 +38,7 @@ impl Look {
         };
         match look {
             BeadLook::Ring => RingProfile::new(radius_px).map(Self::Ring),
-            // The edge goes from a tenth to nine tenths over a third of the radius; what is left at twice the radius is 2e-6.
+            // The edge rises from a tenth to nine tenths over a third of the radius; 2e-6 remains at twice the radius.
             BeadLook::Disc => sampled(2, |r| 1.0 / (1.0 + ((r - 1.0) * 13.0).exp())),
             // Cut at four standard deviations, at 3e-4.
             BeadLook::Spot => sampled(2, |r| (-2.0 * r * r).exp()),

@@ -1,7 +1,7 @@
 //! From positions of beads and cells to grey values.
 //!
-//! Only the neighbourhood of an object is computed; everything else is background, whose noise is drawn beforehand into a
-//! long strip of grey values from which each row takes a piece at a random place. A piece comes again after a hundred
+//! Only the neighbourhood of an object is computed; everything else is background. Its noise is drawn once into a long strip of grey
+//! values, and each row takes a piece at a random place. A piece comes again after a hundred
 //! thousand pixels, at another place of another frame.
 
 use crate::cell_picture::{CellPicture, HalfAxes, walls};
@@ -266,7 +266,7 @@ impl Renderer {
                 }
             }
             if let Some(light) = self.light.get(first..first + row.len()) {
-                // What shows in the light is as bright as the light is there.
+                // Objects are as bright as the light at their place.
                 let share = 1.0 / self.background;
                 for (value, (level, _)) in values.iter_mut().zip(light) {
                     *value = level * (1.0 + *value * share) - self.background;

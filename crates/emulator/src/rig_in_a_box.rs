@@ -1,8 +1,8 @@
 //! Board and world joined on one clock: bytes of the host in, bytes of the board and camera frames out.
 //!
 //! The box is advanced to given times and acts at its own exact instants in between: the board's output steps every
-//! update period while it moves, the world holds it from step to step. So the same code serves the virtual clock, where it
-//! is deterministic to the bit, and the real one. Not a driver: ports, sockets and sleeping are the caller's.
+//! update period while it moves, the world holds it from step to step. So the same code serves the virtual clock, bit by bit
+//! deterministic, and the real one. Not a driver: ports, sockets and sleeping are the caller's.
 
 use crate::board_config::{BoardConfig, BoardConfigError};
 use crate::config::WorldConfig;
@@ -73,7 +73,7 @@ impl RigInABox {
         &self.board
     }
 
-    /// The world: the truth, and what the camera will deliver.
+    /// The world: the truth, and the camera's future frames.
     pub fn world(&self) -> &World {
         &self.world
     }
@@ -93,15 +93,14 @@ impl RigInABox {
         self.world.now_ns()
     }
 
-    /// When the box next does something by itself that shows outside, ns: a step of the output, a watchdog, a status, a
-    /// delivery of a frame already exposed.
+    /// Time of the box's next visible action, ns: a step of the output, a watchdog, a status, a delivery of an exposed frame.
     pub fn next_event_ns(&self) -> i64 {
         let board_ns = self.ns_from_us(self.board.next_event_us());
         let delivery_ns = self.world.next_delivery_ns().unwrap_or(i64::MAX);
         board_ns.min(delivery_ns)
     }
 
-    /// Advances to `t_ns`; does nothing for a time that is past.
+    /// Advances to `t_ns`; does nothing for a past time.
     pub fn advance_to(&mut self, t_ns: i64) {
         loop {
             let board_ns = self.ns_from_us(self.board.next_event_us());

@@ -200,8 +200,8 @@ impl World {
         x_um.abs() < self.config.half_frame_um() + self.config.half_length_um(length_um)
     }
 
-    /// Frames of the same rig without bead or cell, rows contiguous, one byte per pixel: what a camera sees of the empty
-    /// channel. They have a noise of their own, so that taking them changes nothing in a world with the same seed.
+    /// Frames of the empty channel of the same rig, rows contiguous, one byte per pixel. Their noise is separate, so they change
+    /// nothing in a world with the same seed.
     ///
     /// # Errors
     /// [`WorldError`] names the value that cannot be.
@@ -220,7 +220,7 @@ impl World {
         Ok((0..count).map(draw).collect())
     }
 
-    /// Advances to `t_ns` while the board's output stands at `applied_um`; does nothing for a time that is past.
+    /// Advances to `t_ns` while the board's output stands at `applied_um`; does nothing for a past time.
     ///
     /// A new output takes effect at the world's present time: call this up to the instant of the change with the old output, then
     /// go on with the new one.
@@ -484,7 +484,7 @@ fn renderer(config: &WorldConfig) -> Result<Renderer, WorldError> {
     })
 }
 
-/// Reflects a position across the channel at the borders of what the frame follows.
+/// Reflects a position across the channel at the borders of the frame's range.
 fn confined(lateral_um: f64, limit_um: f64) -> f64 {
     if lateral_um.abs() <= limit_um {
         lateral_um

@@ -9,7 +9,7 @@ use cellpos_numeric::Random;
 use cellpos_plant::Model;
 use cellpos_units::Hertz;
 
-/// Where the gain of a plant without a slow pair of pole and zero is read: the middle of what a loop at 1 kHz controls.
+/// Frequency at which the gain of a plant without a slow pole-zero pair is read: the middle of the band of a loop at 1 kHz.
 const STEP_FREQUENCY: Hertz = Hertz(30.0);
 /// Distance of the zero flow from [`WorldConfig::neutral_um`], um.
 #[derive(Debug, Clone)]
@@ -40,7 +40,7 @@ impl ZeroFlow {
     }
 }
 
-/// Speed of the bead over displacement, 1/s: what a step of the zero flow drives at once.
+/// Speed of the bead over displacement, 1/s: the immediate effect of a step of the zero flow.
 pub(crate) fn gain_per_s(model: &Model) -> f64 {
     let plant = &model.plant;
     plant

@@ -1,14 +1,14 @@
-//! Replicates of a fit: what its parameters would be on other draws of the same noise.
+//! Replicates of a fit: its parameters for other draws of the same noise.
 
 use crate::order_selection::{CandidateFits, OrderSelection};
 use cellpos_numeric::Random;
 use nalgebra::Complex;
 
-/// Parameter vectors of the chosen order fitted to resampled blocks, each with the weak bounds on the feedthrough drawn anew.
+/// Parameter vectors of the chosen order fitted to resampled blocks, each with a new draw of the weak bounds on the feedthrough.
 ///
 /// A fit held by a bound that is right on average errs by less than its covariance says where the bound acts, and by how
-/// much less depends on where it landed: replicates about that place alone would repeat its luck. With the bound drawn
-/// as a datum beside the lines their spread is that of the covariance (randomise, then optimise), and the shape that of the
+/// much less depends on where it landed: replicates about that place alone would repeat its luck. With the bound drawn as a datum
+/// like the lines, their spread is that of the covariance (randomise, then optimise), and the shape that of the
 /// fit as it is, not of its linear part.
 pub fn bootstrap(
     problem: &OrderSelection<'_>,
@@ -29,8 +29,8 @@ pub fn bootstrap(
                         return p.response;
                     }
                     let sum: Complex<f64> = (0..n).map(|_| p.block_errors[random.below(n)]).sum();
-                    // Resampled means are narrower than the truth by (n-1)/n; the noise model sets the size, and what the
-                    // order leaves over widens it as it widens the covariance.
+                    // Resampled means are narrower than the truth by (n-1)/n; the noise model sets the size, and
+                    // the misfit of the order widens it as it widens the covariance.
                     let size = (p.variance / p.scatter_variance.max(f64::MIN_POSITIVE) * n as f64
                         / (n as f64 - 1.0)
                         * fit.scale)

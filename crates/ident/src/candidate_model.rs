@@ -24,8 +24,8 @@ pub struct CandidateModel {
     pub slow_pole_rad_per_s: f64,
     /// Delay from the command to the middle of the exposure, s.
     pub delay_s: f64,
-    /// Which part of the feedthrough a record shows one row later than the rest. `None`: what the exposure and an
-    /// output that steps at once make of it. It hangs on where within the exposure the output really steps, a matter of
+    /// Which part of the feedthrough a record shows one row later than the rest. `None`: the effect of the exposure and of an
+    /// output that steps at once. It hangs on where within the exposure the output really steps, a matter of
     /// microseconds that no band below half the sampling rate tells; a fit therefore leaves it free.
     pub feedthrough_share: Option<f64>,
 }

@@ -1,4 +1,4 @@
-//! The candidate models, their parameter vectors, and what a fit of them gives.
+//! The candidate models, their parameter vectors, and the result of a fit.
 
 use crate::candidate_model::CandidateModel;
 use nalgebra::DMatrix;
@@ -109,7 +109,7 @@ pub struct CandidateFits {
     pub candidates: Vec<CandidateFit>,
     /// Index of the chosen order in `orders`.
     pub chosen: usize,
-    /// Factor on variances because residuals exceed the noise (1 where they do not).
+    /// Factor on variances because residuals exceed the noise (else 1).
     pub scale: f64,
     /// Degrees of freedom for intervals.
     pub interval_dof: f64,

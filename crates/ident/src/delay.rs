@@ -10,7 +10,7 @@
 use crate::error::IdentError;
 use cellpos_numeric::Random;
 
-/// One edge and what the camera saw of it. The light changed between two times of the camera, which are equal when the
+/// One edge and its frames. The light changed between two times of the camera, which are equal when the
 /// brightness of a frame tells the time.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SeenEdge {
@@ -174,13 +174,13 @@ impl Levels {
     }
 }
 
-/// Fewest edges with a time whose median has an interval by ranks that is not all of them.
+/// Smallest number of timed edges for an interval of the median by ranks.
 const ENOUGH_TIMES: usize = 12;
 
-/// The delay from edges, as a median: what a stall has delayed is outvoted.
+/// The delay from edges, as a median: edges delayed by a stall are outvoted.
 ///
 /// Edges whose time is known (they fell into an exposure, whatever their delay, by the dither) have a median with an interval by
-/// its ranks, free of any distribution. Where there are too few, each edge says `before - sent < L <= after - sent` and the value
+/// its ranks, free of any distribution. With too few, each edge gives `before - sent < L <= after - sent` and the value
 /// in most of these intervals is taken; its interval is by drawing the edges again.
 ///
 /// # Errors
@@ -278,7 +278,7 @@ fn most_agreed(spans: &[[f64; 2]]) -> [f64; 2] {
     best
 }
 
-/// By how much two intervals miss each other, s, where it is more than `tolerance_s`; `None`: they agree.
+/// Distance of two intervals, s, if it is more than `tolerance_s`; `None`: they agree.
 pub fn apart_s(one95_s: [f64; 2], other95_s: [f64; 2], tolerance_s: f64) -> Option<f64> {
     let gap = (other95_s[0] - one95_s[1]).max(one95_s[0] - other95_s[1]);
     (gap > tolerance_s).then_some(gap)

@@ -67,7 +67,7 @@ pub(crate) fn far_zero_parameter(
         lead_ms[0]
     };
     let width = 0.5 * (lead_ms[1] - lead_ms[0]);
-    // A lead that may reach half a sampling period is told from a delay only by which rows show it.
+    // A lead of up to half a sampling period differs from a delay only in the rows that show it.
     let identified = fit.best().order >= CandidateOrder::FarZero
         && lead_ms[1] < 0.5 * period_ms
         && width < WIDEST_RELATIVE * middle;

@@ -28,7 +28,7 @@ pub struct Tone {
 /// A signal to add to the PZT command.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Signal {
-    /// No excitation: what the noise does.
+    /// No excitation: noise only.
     Rest,
     /// A sum of sines, faded in over `fade_in_s`.
     Tones {

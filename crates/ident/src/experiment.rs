@@ -36,7 +36,7 @@ pub trait Bench {
 /// One stretch of an experiment.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PlannedSegment {
-    /// What it is, for reports.
+    /// Its name, for reports.
     pub label: String,
     /// What to add to the command.
     pub signal: Signal,
@@ -182,8 +182,8 @@ impl Plan {
         }
     }
 
-    /// A logarithmic sweep from the lowest line to the highest, repeated every four seconds and measured at the lines
-    /// (moved to multiples of 0.25 Hz), where it is periodic. Its amplitude is the largest that keeps the expected bead
+    /// A logarithmic sweep from the lowest line to the highest, repeated every four seconds and measured at the lines (moved to
+    /// multiples of 0.25 Hz), at which it is periodic. Its amplitude is the largest that keeps the expected bead
     /// and PZT within `limits` at every frequency, so low lines get less than a stepped sine would give them.
     pub fn log_sweep(
         lines_hz: &[f64],
@@ -434,7 +434,7 @@ pub struct Schedule {
     pub spans: Vec<Span>,
 }
 
-/// Where a segment lies in a [`Schedule`].
+/// Place of a segment in a [`Schedule`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Span {
     /// The segment's place in the plan.
@@ -460,7 +460,7 @@ pub struct RecordedSegment {
     pub output: Vec<f64>,
 }
 
-/// Why a run ended early, and what it had by then.
+/// Why a run ended early, and its results so far.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Stopped<E> {
     /// Segments finished before.

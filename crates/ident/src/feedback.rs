@@ -12,7 +12,7 @@ use nalgebra::{DMatrix, DVector};
 /// Whether the input of a record answers its output.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Feedback {
-    /// Part of the input's change, beyond what its own past tells, that the output's past predicts.
+    /// Fraction of the input's change that the output's past predicts beyond the input's past.
     pub share: f64,
     /// The test's F statistic.
     pub f: f64,
@@ -55,7 +55,7 @@ pub fn feedback(input: &[f64], output: &[f64]) -> Option<Feedback> {
     let own = full.columns(0, LAGS + 1).into_owned();
     let left = |x: &DMatrix<f64>| -> Option<f64> {
         let mut normal = x.transpose() * x;
-        // A pure sine makes its own past linearly dependent: what it predicts is not changed by so little.
+        // A pure sine makes its past linearly dependent; this regularisation does not change the prediction.
         let scale = normal.diagonal().max().max(f64::MIN_POSITIVE);
         for i in 0..normal.nrows() {
             normal[(i, i)] += 1e-12 * scale;
@@ -66,7 +66,7 @@ pub fn feedback(input: &[f64], output: &[f64]) -> Option<Feedback> {
     let (own, both) = (left(&own)?, left(&full)?);
     let moved = target.norm_squared();
     if own <= 1e-9 * moved || own <= 0.0 {
-        // The input is told by its own past alone: nothing is left for an output to explain.
+        // The input's past predicts it completely: nothing is left for an output to explain.
         return Some(Feedback { share: 0.0, f: 0.0 });
     }
     let freedom = (rows.len() - 2 * LAGS - 1) as f64;

@@ -87,7 +87,7 @@ pub struct FrequencyPoint {
     pub input: Complex<f64>,
     /// Mean output phasor (peak amplitude, output unit).
     pub output: Complex<f64>,
-    /// Response of each block less `response`, to first order: what a bootstrap draws from.
+    /// Response of each block less `response`, to first order: the pool of the bootstrap.
     pub block_errors: Vec<Complex<f64>>,
     /// Rows used.
     pub rows: usize,
@@ -130,7 +130,7 @@ pub struct DetectionLine {
     pub p_value: f64,
 }
 
-/// The response at all lines of a segment, and what the detection lines hold.
+/// The response at all lines of a segment, and the detection lines.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SegmentResponse {
     /// One point per driven line.
@@ -175,7 +175,7 @@ pub fn measure(
             needed: periods.max(2 * (columns + 4)),
         });
     }
-    // Blocks long enough for the regressors, so that a multisine is cut into fewer of them.
+    // Blocks long enough for the regressors, so that a multisine is cut into fewer blocks.
     let most = settings.most_blocks.min(rows / (2 * columns)).max(2);
     let borders = block_borders(
         segment.from,

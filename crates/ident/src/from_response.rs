@@ -38,13 +38,13 @@ impl Measured {
         }
     }
 
-    /// Whether all of it has a value.
+    /// Whether all its parameters have a value.
     pub fn is_known(&self) -> bool {
         self.hz.is_finite() && self.response.re.is_finite() && self.response.im.is_finite()
     }
 }
 
-/// A model of a response, with what it leaves.
+/// A model of a response, with its residual.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ResponseFit {
     /// What was fitted.

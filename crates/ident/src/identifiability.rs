@@ -1,4 +1,4 @@
-//! What each parameter is worth: intervals by covariance and by bootstrap, and a verdict for every one.
+//! Quality of each parameter: intervals by covariance and by bootstrap, and a verdict.
 //!
 //! No parameter leaves without an interval and a verdict. A parameter is identified when the chosen order holds it and
 //! its 95 % interval is narrower than half the value on either side; the slow pole and the far zero are judged on the

@@ -27,12 +27,12 @@ impl Identifiability {
     }
 }
 
-/// One parameter with everything that is known of it.
+/// One parameter with all its results.
 #[derive(Debug, Clone, PartialEq)]
 pub struct IdentifiedParameter {
     /// Name with unit, for example `gain_per_s`.
     pub name: &'static str,
-    /// What it is, in words.
+    /// Its name in words.
     pub meaning: &'static str,
     /// Unit.
     pub unit: &'static str,

@@ -1,9 +1,9 @@
 //! Fit of candidate models of rising order to a frequency response, and the choice of the order that the data support.
 //!
-//! Complex, weighted least squares on what the record shows (hold, delay and exposure inside the model, not taken off
-//! the data). Candidates: integrator with delay; with a pole-zero pair; with the far zero; full Eq. (4). A higher order is
+//! Complex, weighted least squares on the record's response (hold, delay and exposure are in the model, not removed from the data).
+//! Candidates: integrator with delay; with a pole-zero pair; with the far zero; full Eq. (4). A higher order is
 //! taken only when an F-test rejects the lower one (1 %), AICc falls, and the fit to one half of the blocks predicts
-//! the other half better. What a parameter is worth is told by [`crate::identifiability`].
+//! the other half better. The quality of a parameter comes from [`crate::identifiability`].
 
 pub use crate::candidate_order::{
     CandidateFit, CandidateFits, CandidateOrder, DelayPrior, index, model_of,
@@ -17,7 +17,7 @@ use crate::least_squares::{Minimum, covariance, minimise};
 use crate::sampled::Sampling;
 use cellpos_numeric::statistics::f_exceeds;
 
-/// What the candidates are fitted to.
+/// Data of the fit.
 #[derive(Debug, Clone)]
 pub struct OrderSelection<'a> {
     points: &'a [FrequencyPoint],
@@ -118,8 +118,8 @@ impl<'a> OrderSelection<'a> {
         self
     }
 
-    /// The same problem with the weak bounds on the feedthrough's share and on the far zero's lead moved, in their
-    /// standard deviations: what is known beforehand is uncertain too, and a replicate of the fit draws it anew.
+    /// The same problem with the weak bounds on the feedthrough's share and on the far zero's lead moved, in standard deviations:
+    /// prior knowledge is uncertain too, and each replicate of the fit draws it again.
     pub fn with_bounds_moved(mut self, share_and_lead: [f64; 2]) -> Self {
         self.bounds_moved = share_and_lead;
         self

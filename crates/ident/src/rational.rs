@@ -236,7 +236,7 @@ fn best_minimum(
     best
 }
 
-/// Refuses points that cannot determine so many parameters; gives their number back.
+/// Refuses too few points for the parameters; returns their number.
 fn checked(points: &[FrequencyPoint], parameters: usize) -> Result<usize, IdentError> {
     if 2 * points.len() < parameters || points.is_empty() {
         return Err(IdentError::TooFewPoints {

@@ -61,9 +61,9 @@ pub struct Identification {
     pub warnings: Vec<String>,
 }
 
-/// Response of the plant itself at a measured point: what the record shows, divided by what sampling and delay make of
-/// the model and multiplied by the model. Exact where the model is right, and insensitive where it is not, since only
-/// the ratio of the model with and without sampling enters.
+/// Response of the plant at a measured point: the record's response, divided by that of the model with sampling and delay, times that
+/// of the model alone. Exact for a correct model, and insensitive otherwise, because only the ratio of the model with and without
+/// sampling enters.
 pub fn compensated(
     measured: Complex<f64>,
     frequency_hz: f64,
@@ -73,8 +73,8 @@ pub fn compensated(
     measured * model.response(frequency_hz) / model.sampled_response(frequency_hz, sampling)
 }
 
-/// Fits, judges and compensates. `bootstrap` replicates (0: none) are drawn with `seed`. `stated_per_s` is the velocity
-/// gain that somebody believed in before, for a warning where it is the measured one less a factor of 2 pi.
+/// Fits, judges and compensates. `bootstrap` replicates (0: none) are drawn with `seed`. `stated_per_s` is the velocity gain believed
+/// before, for a warning if it is the measured one divided by 2 pi.
 ///
 /// # Errors
 /// Those of [`OrderSelection::new`] and [`OrderSelection::fit`].
@@ -200,7 +200,7 @@ fn warnings(result: &Identification, stated_per_s: Option<f64>) -> Vec<String> {
                 .iter()
                 .filter(|d| d.p_value < 1e-4 && d.output.norm() > 0.01 * point.output.norm())
                 .max_by(|a, b| a.output.norm().total_cmp(&b.output.norm()))?;
-            // Feedback passes a harmonic of the input on: only what the input does not hold speaks of a nonlinearity.
+            // Feedback passes on a harmonic of the input: only harmonics that the input lacks show a nonlinearity.
             let linear = point.response.norm() * worst.input.norm() * 3.0;
             (worst.output.norm() > linear).then(|| {
                 format!(
@@ -222,8 +222,8 @@ fn warnings(result: &Identification, stated_per_s: Option<f64>) -> Vec<String> {
 }
 
 impl Identification {
-    /// Localisation noise for a model, um RMS: what the scatter of the lines says, or what vision stated where Brownian motion
-    /// drowns it in the scatter; 0 where neither tells.
+    /// Localisation noise for a model, um RMS: from the scatter of the lines, or as stated by vision if Brownian motion dominates
+    /// the scatter; 0 if neither is known.
     fn localisation_um(&self) -> f64 {
         let measured_um = self.measured.noise.map_or(0.0, |n| n.localisation_um);
         match self.stated_noise_um {
@@ -233,7 +233,7 @@ impl Identification {
     }
 
     /// The identified plant as a model file: transfer function without the delay, noise, intervals, covariance of the
-    /// coefficients, and the delay of the camera path beside them.
+    /// coefficients, and the delay of the camera path.
     ///
     /// # Errors
     /// [`PlantError`] when the coefficients make no plant.

@@ -1,7 +1,7 @@
 //! Least-squares fit of sines plus polynomial drift to a record, block by block.
 //!
-//! A bare FFT puts `v/(pi f)` of a drift `v` into every bin, whatever the record's length; here the drift has
-//! regressors of its own. A freely diffusing bead makes the noise a random walk: it is white in the increments, where
+//! A bare FFT puts `v/(pi f)` of a drift `v` into every bin, whatever the record's length; here the drift has separate regressors. A
+//! freely diffusing bead makes the noise a random walk: it is white in the increments, where
 //! least squares is the best linear estimate, so increments are fitted and the phasors carried back exactly
 //! (`Y = dY/(1 - e^(-jw))`). Rows without a bead (`NaN`) are left out. Not for records whose input is not periodic.
 
@@ -45,8 +45,8 @@ pub struct BlockPhasors {
     pub rows: usize,
 }
 
-/// Fits `frequencies_hz` and drift to rows `from..to` of `signal`; `None` when too few rows hold a value or the
-/// frequencies cannot be told apart in so short a block.
+/// Fits `frequencies_hz` and drift to rows `from..to` of `signal`; `None` if too few rows hold a value, or if the block is too short
+/// to separate the frequencies.
 pub fn fit_block(
     signal: &[f64],
     from: usize,

@@ -13,7 +13,7 @@ pub enum PlantError {
         /// The coefficient.
         value: f64,
     },
-    /// All coefficients of a polynomial are zero, or there are none.
+    /// All coefficients of a polynomial are zero or missing.
     #[error(
         "{which} has no coefficient other than zero: give the coefficients of s from the highest power down, for example [1.0, 76.3, 0.13]"
     )]
@@ -134,7 +134,7 @@ pub enum ModelProblem {
     /// The text is not TOML.
     #[error("{message}")]
     Syntax {
-        /// What the TOML parser says.
+        /// Message of the TOML parser.
         message: String,
     },
     /// A key that no model has.

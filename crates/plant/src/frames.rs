@@ -19,7 +19,7 @@ pub enum FrameFate {
 ///
 /// The first frame is always kept. The fate of a frame does not depend on the number of frames after it.
 pub fn frame_fates(model: &Model, frames: usize, seed: u64) -> Vec<FrameFate> {
-    // Independent causes: the chance to escape all of them is the product.
+    // Independent causes: the chance to escape all is the product.
     let (mut not_dropped, mut not_repeated) = (1.0, 1.0);
     for effect in &model.effects {
         match effect.act() {

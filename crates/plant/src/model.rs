@@ -41,7 +41,7 @@ pub struct Covariance {
 pub struct Model {
     /// A short name.
     pub name: String,
-    /// What it is a model of; may be empty.
+    /// The modelled object; may be empty.
     pub description: String,
     /// From PZT displacement (from the working point, um) to bead position (um).
     pub plant: TransferFunction,
@@ -63,8 +63,8 @@ pub struct Model {
     pub provenance: BTreeMap<String, String>,
 }
 
-/// Keys of the provenance of a model whose lengths are in the units of its records: how their input was sampled, and what reconcile
-/// writes beside a base that was fitted to them.
+/// Keys of the provenance of a model whose lengths are in the units of its records: sampling of the input, and the mark of reconcile
+/// for a base that was fitted to them.
 const UNITS_OF_RECORDS: [&str; 2] = ["hold", Model::UNITS];
 
 /// [`Model::is_in_any_unit`] of a provenance.
@@ -74,7 +74,7 @@ pub(crate) fn is_in_any_unit(provenance: &BTreeMap<String, String>) -> bool {
 }
 
 impl Model {
-    /// Key of the provenance that tells the units of the records that a model is of, where they are not micrometres.
+    /// Key of the provenance with the units of a model's records, if they are not micrometres.
     pub const UNITS: &str = "units";
 
     /// Whether lengths are in the units of the records that the model is of: bounds in micrometres do not hold for them.
@@ -167,7 +167,7 @@ impl Model {
                     camera *= Complex::from_polar(sinc, -half);
                 }
                 Action::Bypass(zpk) => beside.push(zpk.at(s)),
-                // A block counts as what it is at the start, where that is linear: see the documentation above.
+                // A block counts with its state at the start, if linear: see above.
                 Action::Block(_) => {
                     value *= match effect.kind().small_motion(effect, s) {
                         Some([input, position, velocity]) => input + position + velocity * s,
@@ -194,7 +194,7 @@ impl Model {
                 fed_back = fed_back * input + position + velocity * s;
             }
         }
-        // y = P (drive u + fed_back y), and what stands in for y sees what entered the plant.
+        // y = P (drive u + fed_back y), and the replacement of y sees the plant's input.
         let mut answer = plant * drive / (one - plant * fed_back);
         let entered = answer / plant;
         for (_, effect) in tied.iter().filter(|(replaces, _)| *replaces) {

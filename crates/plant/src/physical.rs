@@ -149,7 +149,7 @@ impl PhysicalParameters {
     }
 
     /// A numeric solution of Eq. (1)-(3) at a frequency: X2/X1 from the three linear equations in Xc, X2 and p,
-    /// without Eq. (4). `None` where they are singular.
+    /// without Eq. (4). `None` if they are singular.
     pub fn solve(&self, frequency: Hertz) -> Option<Complex<f64>> {
         let s = Complex::new(0.0, TAU * frequency.value());
         let wall = s * s * self.wall_mass_kg
@@ -256,7 +256,7 @@ impl PhysicalParameters {
 }
 
 impl SecondOrder {
-    /// The coefficients that the paper lists beside Eq. (6). They are rounded: `2 z1 w1` is 20343 where Eq. (6) has
+    /// The coefficients that the paper lists with Eq. (6). They are rounded: `2 z1 w1` is 20343 where Eq. (6) has
     /// 20261.5, `2 z2 w2` 75.46 where it has 76.3. Use [`TransferFunction::eq6`].
     pub const PAPER_ROUNDED: Self = Self {
         alpha: 0.01872,

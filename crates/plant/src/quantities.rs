@@ -1,4 +1,4 @@
-//! Quantities with units in TOML files (`park = "20um"`), beside bare numbers with the unit in the key (`park_um = 20.0`).
+//! Quantities with units in TOML files (`park = "20um"`), or as bare numbers with the unit in the key (`park_um = 20.0`).
 //!
 //! The text is rewritten to bare numbers before it is read, line for line, so that every later message names the right line.
 //! Which keys of a file are quantities its owner says ([`Quantity`]); everything else is left as it stands.
@@ -31,7 +31,7 @@ impl Quantity {
 
 /// A quantity without a unit, or with one of another kind.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
-#[error("{key} = {value:?}: {problem}")]
+#[error("{key} = {value}: {problem}")]
 pub struct QuantityError {
     /// Line of the key, from 1.
     pub line: usize,
@@ -80,21 +80,23 @@ fn in_table(
 ) -> Result<(), QuantityError> {
     for (key, value) in entries {
         let name = key.get_ref().as_ref();
+        let known = quantities
+            .iter()
+            .find(|known| known.table == table && known.plain == name);
+        let refused = |with_unit, problem| QuantityError {
+            line: 1 + text[..key.span().start].matches('\n').count(),
+            key: name.to_string(),
+            value: text[value.span()].to_string(),
+            problem,
+            with_unit,
+        };
         match value.get_ref() {
             DeValue::String(quantity) => {
-                let known = quantities
-                    .iter()
-                    .find(|known| known.table == table && known.plain == name);
                 let Some(&Quantity { with_unit, .. }) = known else {
                     continue;
                 };
-                let number = number(with_unit, quantity).map_err(|problem| QuantityError {
-                    line: 1 + text[..key.span().start].matches('\n').count(),
-                    key: name.to_string(),
-                    value: quantity.to_string(),
-                    problem,
-                    with_unit,
-                })?;
+                let number =
+                    number(with_unit, quantity).map_err(|problem| refused(with_unit, problem))?;
                 changes.push((key.span(), with_unit.to_string()));
                 changes.push((value.span(), number));
             }
@@ -107,6 +109,14 @@ fn in_table(
                     if let DeValue::Table(inner) = item.get_ref() {
                         in_table(text, &below, inner, quantities, changes)?;
                     }
+                }
+            }
+            DeValue::Integer(_) | DeValue::Float(_) => {
+                if let Some(&Quantity { with_unit, .. }) = known {
+                    let unit = with_unit[name.len()..].trim_start_matches('_');
+                    let unit = unit.replace("_per_", "/");
+                    let problem = format!("has no unit: write \"{}{unit}\"", &text[value.span()]);
+                    return Err(refused(with_unit, problem));
                 }
             }
             _ => {}
@@ -177,9 +187,15 @@ mod tests {
     #[test]
     fn a_quantity_of_another_kind_is_named_with_line_key_and_value() {
         for (text, line, key, value) in [
-            ("\n[board]\nwatchdog = \"20um\"\n", 3, "watchdog", "20um"),
-            ("[timing]\nperiod = \"1000\"\n", 2, "period", "1000"),
-            ("[[faults.event]]\n\nat = \"\"\n", 3, "at", ""),
+            (
+                "\n[board]\nwatchdog = \"20um\"\n",
+                3,
+                "watchdog",
+                "\"20um\"",
+            ),
+            ("[timing]\nperiod = \"1000\"\n", 2, "period", "\"1000\""),
+            ("[[faults.event]]\n\nat = \"\"\n", 3, "at", "\"\""),
+            ("[limits]\nslew = 20.5\n", 2, "slew", "20.5"),
         ] {
             let error = bare(text, &SOME).expect_err("refused");
             assert_eq!(
@@ -188,5 +204,15 @@ mod tests {
             );
             assert!(!error.problem.is_empty() && error.with_unit.starts_with(key));
         }
+    }
+
+    #[test]
+    fn a_number_without_its_unit_is_refused_with_the_text_to_write() {
+        let error = bare("near = 3\n[limits]\nslew_um_per_s = 2\n", &SOME).expect_err("refused");
+        assert_eq!(error.to_string(), "near = 3: has no unit: write \"3um\"");
+        let error = bare("[limits]\nslew = 2\n", &SOME).expect_err("refused");
+        assert!(error.problem.ends_with("\"2um/s\""), "{error}");
+        // The same word in another table is another key.
+        assert!(bare("[board]\nnear = 3\n", &SOME).is_ok());
     }
 }

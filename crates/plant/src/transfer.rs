@@ -226,7 +226,7 @@ pub const EQ5_LITERAL_PER_S: f64 = 63.0;
 /// Eq. (5) as meant: 63 is |G| at 1 Hz, so the plant is 63/f with f in Hz, that is `2 pi 63 / s` = 396/s.
 pub const EQ5_VELOCITY_GAIN_PER_S: f64 = TAU * 63.0;
 
-/// A velocity gain that is probably Eq. (5)'s 63 taken literally: what it is, and what was probably meant.
+/// A velocity gain that is probably Eq. (5)'s 63 taken literally: the value, and the probably intended one.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 #[error(
     "a velocity gain of {given_per_s}/s is within {percent:.1} % of 63, the number printed in Eq. (5): that is the gain at 1 Hz, 63/f with f in Hz; with s in rad/s the plant is 2 pi 63 / s = {meant_per_s:.0}/s. A controller designed on 63/s has 6.3 times too much loop gain"

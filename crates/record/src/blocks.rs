@@ -52,12 +52,12 @@ pub(crate) trait Sink {
     fn is_there(&self) -> io::Result<()>;
 }
 
-/// A file of which only whole blocks are kept: a block that fails is taken back and waits for the next try.
+/// A file with whole blocks only: a failed block is removed and waits for the next try.
 pub(crate) struct Blocks<S> {
     sink: S,
     /// Length up to which the file is whole.
     good: u64,
-    /// Whether bytes of a failed block may still stand behind `good`.
+    /// Whether bytes of a failed block may remain after `good`.
     torn: bool,
     /// Whether something was appended since the last sync.
     unsynced: bool,
@@ -134,7 +134,7 @@ impl<S: Sink> Blocks<S> {
         self.account(synced)
     }
 
-    /// Waits until the disk has what was synced, at most for a time. What it has not confirmed by then is not kept.
+    /// Waits until the disk has what was synced, at most for a time. Rows without confirmation by then count as lost.
     pub(crate) fn settle(&mut self, most: Duration) -> io::Result<()> {
         let settled = self.sink.settle(most);
         if let Err(error) = &settled
@@ -155,7 +155,7 @@ impl<S: Sink> Blocks<S> {
         usize::try_from(self.sink.awaited()).unwrap_or(usize::MAX)
     }
 
-    /// What the disk has said of the syncs so far. A system that could not write says so once and then forgets what it had.
+    /// Results of the syncs so far. A system that could not write reports it once and then drops the data.
     fn account(&mut self, synced: io::Result<()>) -> io::Result<()> {
         if synced.is_err() {
             self.unkept_units += self.pending.drain(..).sum::<u64>();
@@ -165,7 +165,7 @@ impl<S: Sink> Blocks<S> {
         synced
     }
 
-    /// What it is appended to.
+    /// The file to append to.
     pub(crate) fn sink(&self) -> &S {
         &self.sink
     }

@@ -1,8 +1,7 @@
 //! The end of a run folder, within a bound: a disk that has stopped to answer must not keep the program.
 //!
 //! Whatever touches the disk here is done on threads that are waited for as long as a slow disk may take, and left behind
-//! after that. A thread that stands in the kernel for good keeps nothing but itself; what the disk has not confirmed is
-//! counted as lost.
+//! after that. A thread that hangs in the kernel blocks only itself; unconfirmed rows count as lost.
 
 use crate::error::RecordError;
 use crate::export::{Selection, Source};
@@ -18,13 +17,13 @@ use std::sync::mpsc;
 use std::thread;
 use std::time::Duration;
 
-/// How long writing and reading so many bytes may take on a disk that is slow and works: a minute, and a second for each five
+/// Time limit of writing and reading on a slow disk that works: a minute, and a second for each five
 /// megabytes.
 fn patience(bytes: u64) -> Duration {
     Duration::from_secs(60 + bytes / 5_000_000)
 }
 
-/// What some work on a thread of its own comes to, or nothing where it does not come back in time.
+/// Result of work on a separate thread, or None after the time limit.
 fn within<T: Send + 'static>(
     most: Duration,
     work: impl FnOnce() -> T + Send + 'static,

@@ -1,4 +1,4 @@
-//! A run read while it goes on, or afterwards: what was written since the last look.
+//! A run read during its recording, or afterwards: the rows since the last look.
 
 use crate::error::RecordError;
 use crate::events::Event;

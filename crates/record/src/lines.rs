@@ -108,7 +108,7 @@ impl LineFile {
         }
     }
 
-    /// What was written and the disk has not confirmed, in lines.
+    /// Written lines that the disk has not confirmed.
     pub fn unconfirmed(&self) -> Unconfirmed {
         Unconfirmed {
             since: self.blocks.sink().unconfirmed(),

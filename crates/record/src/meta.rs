@@ -128,10 +128,10 @@ pub struct RunMeta {
     /// `real` or `virtual`.
     #[serde(default)]
     pub clock: String,
-    /// Versions of the program and of what it ran on.
+    /// Versions of program and system.
     #[serde(default)]
     pub versions: BTreeMap<String, String>,
-    /// The groups of columns that the run has beside [`Group::Loop`]; all of them unless it is said.
+    /// The groups of columns that the run has beside [`Group::Loop`]; all by default.
     #[serde(default = "all_groups")]
     pub columns: Vec<Group>,
     /// Names of the control law's own columns, in the order of [`cellpos_runtime::TickRecord::law`].

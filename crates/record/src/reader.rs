@@ -33,7 +33,7 @@ impl Gap {
     }
 }
 
-/// What of a run is not there.
+/// Missing parts of a run.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct Lost {
     /// Breaks in the sequence numbers, the first 1000.
@@ -97,7 +97,7 @@ impl RunReader {
         &self.folder
     }
 
-    /// The metadata, or why there are none.
+    /// The metadata, or the reason for their absence.
     ///
     /// # Errors
     /// A sentence that names the file.
@@ -168,7 +168,7 @@ impl RunReader {
     /// are filled: the command is held, the bead not seen. Takes 24 bytes a row; an export has the other columns.
     ///
     /// # Errors
-    /// [`RecordError`] when the rows cannot be read, [`cellpos_table::TableProblem::TooShort`] with fewer than two of them.
+    /// [`RecordError`] if the rows cannot be read, [`cellpos_table::TableProblem::TooShort`] with fewer than two.
     pub fn to_record(&self) -> Result<Record, RecordError> {
         let mut batches = self.batches()?;
         let mut time_s = Vec::new();
@@ -198,7 +198,7 @@ pub struct Batches {
 }
 
 impl Batches {
-    /// What was missing in the batches taken so far; complete once the iterator has ended.
+    /// Missing rows of the batches so far; complete after the iterator's end.
     pub fn lost(&self) -> Lost {
         Lost {
             damaged_rows: self.stream.damaged_rows,

@@ -18,7 +18,7 @@ const MAX_BODY: u64 = 1 << 30;
 /// Bytes looked through at a time when searching for the next message after damage.
 const SEARCH: usize = 1 << 16;
 
-/// What stands before the rows of a message.
+/// Header of a message's rows.
 struct Head {
     kind: MessageHeader,
     /// The description; empty for the end mark.
@@ -28,7 +28,7 @@ struct Head {
     end: u64,
 }
 
-/// The rows of a batch, and how many of it were not what was written.
+/// The rows of a batch, and the number of damaged rows.
 struct Rows {
     rows: Vec<TickRecord>,
     damaged: u64,
@@ -85,8 +85,7 @@ pub(crate) struct Stream<R> {
 }
 
 impl<R: Read + Seek> Stream<R> {
-    /// A stream from its beginning. `law` is how many columns of its own the control law has, in case the schema itself is
-    /// damaged.
+    /// A stream from its beginning. `law` is the number of the control law's columns, in case the schema is damaged.
     pub(crate) fn new(mut from: R, law: usize) -> io::Result<Self> {
         let length = from.seek(SeekFrom::End(0))?;
         Ok(Self {
@@ -176,7 +175,7 @@ impl<R: Read + Seek> Stream<R> {
         self.from.read_exact(out)
     }
 
-    /// The head of the message at a position; None if there is none, or none of the kinds that a recording has.
+    /// The header of the message at a position; None without one, or for a kind that recordings lack.
     fn head(&mut self, position: u64) -> io::Result<Option<Head>> {
         let left = self.length.saturating_sub(position);
         if left < 8 {
@@ -224,7 +223,7 @@ impl<R: Read + Seek> Stream<R> {
         }))
     }
 
-    /// The message at a position and its end; None if there is none.
+    /// The message at a position and its end; None without one.
     fn message(&mut self, position: u64) -> io::Result<Option<(Message, u64)>> {
         let Some(head) = self.head(position)? else {
             return Ok(None);

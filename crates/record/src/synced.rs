@@ -1,4 +1,4 @@
-//! A file whose syncs are waited for by a thread of its own, so that a slow disk never holds the recorder.
+//! A file whose syncs wait on a separate thread, so that a slow disk never holds the recorder.
 //!
 //! How long the disk leaves what was written unconfirmed is asked for ([`SyncedFile::unconfirmed`]); whether that is too long is
 //! for the run to say ([`cellpos_runtime::recorder::Unconfirmed`]), which also has the argument.
@@ -11,12 +11,12 @@ use std::time::{Duration, Instant};
 
 /// How long the end of a run waits for the disk.
 pub(crate) const LAST_PATIENCE: Duration = Duration::from_secs(15);
-/// A disk that works answers so soon when little is left to write. A file that is let go waits no longer for its last sync.
+/// A disk that works answers so soon when little is left to write. A dropped file does not wait for its last sync.
 pub(crate) const DISK_ANSWERS: Duration = Duration::from_secs(2);
 
 #[derive(Default)]
 struct State {
-    /// Syncs asked for, and of these those that are over.
+    /// Syncs requested, and syncs completed.
     asked: u64,
     done: u64,
     busy_since: Option<Instant>,
@@ -61,7 +61,7 @@ impl Shared {
                 let synced = sync();
                 state = self.lock();
                 state.busy_since = None;
-                // What was asked for meanwhile waits from now on: the disk has just shown that it works.
+                // Requests made meanwhile wait from now on: the disk has just shown that it works.
                 if state.waiting_since.is_some() {
                     state.waiting_since = Some(Instant::now());
                 }
@@ -85,7 +85,7 @@ impl Shared {
     }
 }
 
-/// A file that is synced on a thread of its own. That a sync failed is said by the next one.
+/// A file that a separate thread syncs. That a sync failed is said by the next one.
 pub(crate) struct SyncedFile {
     file: File,
     /// Made with the first sync.
@@ -256,7 +256,7 @@ mod tests {
         let second = Instant::now();
         end.send(Ok(())).unwrap();
         begins.recv().unwrap();
-        // The disk has answered: its time counts anew, though what is being synced now was asked for before.
+        // The disk has answered, so its time restarts, although the present sync was requested earlier.
         assert!(file.unconfirmed() <= second.elapsed());
         end.send(Ok(())).unwrap();
         file.settle(LAST_PATIENCE).unwrap();

@@ -86,7 +86,7 @@ pub(crate) struct Log<S: Sink> {
 }
 
 impl<S: Sink> Drop for Log<S> {
-    /// A log dropped on the way out of a failure leaves what it had.
+    /// A log dropped after a failure writes the rest.
     fn drop(&mut self) {
         if !self.closed {
             self.flush();
@@ -394,7 +394,7 @@ impl RunWriter {
         self.log.faults()
     }
 
-    /// What was taken and the disk has not confirmed. Rows that still gather for the next flush are among the rows; the time
+    /// Rows that the disk has not confirmed. Rows that still gather for the next flush are among the rows; the time
     /// counts from the flush.
     pub fn unconfirmed(&self) -> Unconfirmed {
         self.log.unconfirmed()

@@ -59,7 +59,7 @@ impl Axis {
         self
     }
 
-    /// Label and unit as written beside the axis.
+    /// Label and unit at the axis.
     pub(crate) fn title(&self) -> String {
         match (self.label.as_str(), self.unit.as_str()) {
             (label, "") => label.to_owned(),

@@ -26,7 +26,7 @@ pub(crate) fn in_page(shown: &Figure) -> String {
     }
 }
 
-/// The figure as SVG, so many px wide; `alone` adds the style sheet and the background that a page gives to inline figures.
+/// The figure as SVG, of a width in px; `alone` adds the style sheet and the background that a page gives to inline figures.
 pub(crate) fn figure(figure: &Figure, alone: bool, width_px: f64) -> String {
     let mut body = Svg { out: String::new() };
     let height_px = match &figure.content {
@@ -66,7 +66,7 @@ fn panels_grid(svg: &mut Svg, figure: &Figure, panels: &[Panel], width_px: f64) 
     };
     let width = width_px / columns as f64;
     let mut top = 4.0;
-    // What has been said of a colour is not said again.
+    // The legend of a colour is not repeated.
     let mut told: Vec<Entry<'_>> = Vec::new();
     if let Some((first, others)) = panels.split_first()
         && columns > 1

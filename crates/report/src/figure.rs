@@ -210,7 +210,7 @@ impl Figure {
         self
     }
 
-    /// Adds a marker line at a frequency to both panels of a Bode plot; the label stands in the upper one.
+    /// Adds a marker line at a frequency to both panels of a Bode plot; the label is in the upper one.
     #[must_use]
     pub fn bode_frequency(mut self, frequency_hz: f64, label: &str) -> Self {
         if let Content::Panels(panels) = &mut self.content {

@@ -45,7 +45,7 @@ impl Emphasis {
         }
     }
 
-    /// A sign beside the colour, for readers who do not see colours and for prints.
+    /// A sign besides the colour, for colour-blind readers and for prints.
     fn sign(self) -> &'static str {
         match self {
             Emphasis::Plain => "",
@@ -56,7 +56,7 @@ impl Emphasis {
     }
 }
 
-/// Head of a column and the side its cells stand on.
+/// Header of a column and alignment of its cells.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Column {
     head: String,
@@ -228,7 +228,7 @@ impl Report {
         self.push(Block::Note(status, text.to_owned()))
     }
 
-    /// Adds the answer to what the reader came for: one sentence, at the top of the page.
+    /// Adds the result: one sentence, at the top of the page.
     pub fn result(&mut self, status: Emphasis, sentence: &str) -> &mut Self {
         self.push(Block::Result(status, sentence.to_owned()))
     }
@@ -270,7 +270,7 @@ impl Report {
         self.push(Block::Figure(figure))
     }
 
-    /// Adds a picture of pixels, a PNG file, which the page carries within itself. `shows` says in a few words what it shows.
+    /// Adds a picture of pixels, a PNG file, which the page carries within itself. `shows` describes it in a few words.
     pub fn picture(&mut self, shows: &str, caption: &str, png: Vec<u8>) -> &mut Self {
         self.push(Block::Picture(Picture {
             shows: shows.to_owned(),
@@ -414,7 +414,7 @@ fn contents(out: &mut String, sections: &[&String]) {
     out.push_str("</ul></nav>\n");
 }
 
-/// Links by which a reader takes a figure along: to the files beside the page, or to the same within it.
+/// Download links of a figure: to the files next to the page, or to data within it.
 fn take(out: &mut String, figure: &Figure, beside: Option<&str>) {
     let name = figure.name();
     for (ending, kind) in [("svg", "image/svg+xml"), ("csv", "text/csv")] {

@@ -99,7 +99,7 @@ pub(crate) fn draw_series(svg: &mut Svg, series: &Series, color: usize, x: &Plac
     }
 }
 
-/// The points of a series in pixels, broken where one has no place.
+/// The points of a series in pixels, broken at points without a place.
 fn runs(series: &Series, x: &Placed, y: &Placed) -> Vec<thin::Run> {
     let mut all = vec![thin::Run::new()];
     for index in 0..series.len() {
@@ -114,7 +114,7 @@ fn runs(series: &Series, x: &Placed, y: &Placed) -> Vec<thin::Run> {
     all
 }
 
-/// The pairs of a band in pixels, broken where one has no place.
+/// The pairs of a band in pixels, broken at pairs without a place.
 fn band_runs(series: &Series, x: &Placed, y: &Placed) -> Vec<Vec<(f64, f64, f64)>> {
     let mut all = vec![Vec::new()];
     for index in 0..series.len() {

@@ -9,7 +9,7 @@ use std::fmt::Write;
 
 /// Room for the numbers and the title of the y axis, px.
 pub(crate) const LEFT_PX: f64 = 82.0;
-/// Room beside the axes on the right, px.
+/// Room to the right of the axes, px.
 pub(crate) const RIGHT_PX: f64 = 16.0;
 const LINE_PX: f64 = 18.0;
 
@@ -21,14 +21,14 @@ pub(crate) struct Frame<'a> {
     pub(crate) x_range: Option<(f64, f64)>,
     /// Whether the x axis has its numbers and title (only the lowest of panels that share it).
     pub(crate) show_x: bool,
-    /// What legends above have said.
+    /// Entries of the legends above.
     pub(crate) told: &'a [Entry<'a>],
 }
 
 /// A name, a colour and whether the stroke is dashed.
 pub(crate) type Entry<'a> = (&'a str, usize, bool);
 
-/// What a panel's legend says: names, colours and strokes.
+/// Entries of a panel's legend: names, colours and strokes.
 pub(crate) fn entries(panel: &Panel) -> Vec<Entry<'_>> {
     panel
         .series
@@ -295,7 +295,7 @@ fn colors(panel: &Panel) -> Vec<usize> {
         .collect()
 }
 
-/// Draws what the legend has to say beyond what was told before, in lines above the panel, and returns its height.
+/// Draws the new entries of the legend in lines above the panel, and returns their height.
 pub(crate) fn legend(
     svg: &mut Svg,
     panel: &Panel,

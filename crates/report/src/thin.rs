@@ -1,4 +1,4 @@
-//! Thinning of long traces to what a screen can show.
+//! Thinning of long traces to the resolution of a screen.
 
 /// A run of points, in pixels, without a gap.
 pub(crate) type Run = Vec<(f64, f64)>;

@@ -1,6 +1,6 @@
 //! Units as people write them: files and programs have `um`, pages have `µm`.
 
-/// Units that stand as a word of their own.
+/// Units that are separate words.
 const WORDS: [(&str, &str); 5] = [
     ("um", "\u{b5}m"),
     ("um2", "\u{b5}m\u{b2}"),

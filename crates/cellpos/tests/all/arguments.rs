@@ -70,6 +70,11 @@ fn a_mistake_is_answered_with_the_text_to_write() {
             "rig check rig.toml",
             "rig.toml:2: high_um = 1000000000 um: must be at most",
         ),
+        (
+            "[calibration]\npixel = 0.1\n",
+            "rig check rig.toml",
+            "rig.toml:2: pixel = 0.1: has no unit: write \"0.1um\"",
+        ),
         ("", "track --target 0um --sine 500um@1Hz", "--sine 500um"),
         ("", "design --model eq6 --delay 2.5", "write 2.5ms"),
         (

@@ -24,7 +24,7 @@ pub(crate) fn refuse(path: &Path, frame: usize, found: String) -> SourceError {
 }
 
 /// Puts the values into the buffer, whose size is set; `channels` in all, the last of which is transparency if the second
-/// says so. Gives what is to be said of it.
+/// says so. Returns its warnings.
 pub(crate) fn take(
     path: &Path,
     frame: usize,
@@ -77,7 +77,7 @@ fn one_channel<T: Copy + PartialEq + std::fmt::Display>(
     None
 }
 
-/// What a picture may take of memory: a header that claims more is broken.
+/// Memory limit of a picture: a header that claims more is broken.
 pub(crate) fn limits() -> image::Limits {
     let mut limits = image::Limits::default();
     limits.max_alloc = Some(16 * super::MAX_PIXELS as u64);

@@ -59,7 +59,7 @@ pub enum SourceError {
     Film {
         /// Which file.
         path: PathBuf,
-        /// The format, with its codec where it is known.
+        /// The format, with its codec if known.
         format: String,
         /// The command that converts it.
         command: String,
@@ -179,7 +179,7 @@ pub enum SourceError {
     },
 }
 
-/// What a recording says of itself.
+/// Description of a recording.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RecordingInfo {
     /// File or folder.
@@ -206,7 +206,7 @@ pub struct RecordingInfo {
 
 /// A recording: frames by number.
 pub trait Recording: Send + std::fmt::Debug {
-    /// What the recording says of itself.
+    /// Description of the recording.
     fn info(&self) -> &RecordingInfo;
 
     /// Number of the frame `index`, from 0: larger where frames before it were lost.
@@ -304,7 +304,7 @@ pub(crate) fn no_such_frame(info: &RecordingInfo, frame: usize) -> Result<(), So
     })
 }
 
-/// Fills a buffer with a frame's bytes as they lie in a file, one after another.
+/// Fills a buffer with a frame's bytes in the order of the file.
 pub(crate) fn fill(info: &RecordingInfo, bytes: &[u8], big_endian: bool, buffer: &mut FrameBuffer) {
     (buffer.width, buffer.height, buffer.bits) = (info.width_px, info.height_px, info.bits);
     if info.bits == 8 {

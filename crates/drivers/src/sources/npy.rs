@@ -20,7 +20,7 @@ pub struct NpyStack {
 }
 
 impl NpyStack {
-    /// Opens the file and compares its length with what the header says.
+    /// Opens the file and compares its length with the header.
     ///
     /// # Errors
     /// No array, values of another kind, another order or number of dimensions, or a file that is too short.
@@ -123,7 +123,7 @@ impl Recording for NpyStack {
 /// Bits of a value and whether the high byte comes first; frames, rows and columns.
 type KindAndSides = ((u16, bool), (usize, usize, usize));
 
-/// What the header says of the values and their order.
+/// Type and order of the values, from the header.
 fn kind_and_sides(path: &Path, text: &str) -> Result<KindAndSides, SourceError> {
     let refused = |key, value: &str, must_be| refused(path, key, value, must_be);
     let descr = value(text, "descr").unwrap_or_default();

@@ -1,4 +1,4 @@
-//! Photron recordings: a header (`.cihx`, XML, or the older `.cih`, lines of `key : value`) beside the pixels (`.mraw`).
+//! Photron recordings: a header (`.cihx`, XML, or the older `.cih`, lines of `key : value`) with the pixels (`.mraw`).
 //!
 //! The pixels lie frame after frame without gaps: 8 bits, 16 bits little-endian, or 12 bits packed, two pixels in three
 //! bytes with the high bits first. Frames of 12 effective bits in 16 may sit at the lower or the higher side.
@@ -24,7 +24,7 @@ pub struct PhotronRecording {
     info: RecordingInfo,
 }
 
-/// What the header says.
+/// Content of the header.
 #[derive(Debug, Clone, PartialEq)]
 struct Header {
     width: usize,
@@ -37,7 +37,7 @@ struct Header {
 }
 
 impl PhotronRecording {
-    /// Opens a recording by its header or by its pixels; the other file lies beside it under the same name.
+    /// Opens a recording by its header or by its pixels; the other file is next to it under the same name.
     ///
     /// # Errors
     /// A file is missing, or the header cannot be used.

@@ -1,6 +1,6 @@
 //! A folder of pictures, one a file: PNG, TIFF or JPEG, in the order of their names.
 //!
-//! Numbers in the names are frame numbers: where one is missing, a frame was lost, and the recording says so.
+//! Numbers in the names are frame numbers. A missing number is a lost frame, which the recording reports.
 
 use super::grey::{self, Grey};
 use super::{Recording, RecordingInfo, SourceError, check_same, check_size};
@@ -86,7 +86,7 @@ impl PictureFolder {
     /// A recording of the given pictures, in the given order.
     ///
     /// # Errors
-    /// There is none, or the first cannot be used.
+    /// There is no picture, or the first cannot be used.
     pub fn of(path: &Path, pictures: Vec<PathBuf>) -> Result<Self, SourceError> {
         let Some(first) = pictures.first() else {
             return Err(SourceError::Empty {
@@ -238,7 +238,7 @@ fn frame_numbers(pictures: &[PathBuf]) -> Vec<u64> {
     numbers.iter().map(|(_, n)| (n - first) / step).collect()
 }
 
-/// What a name has before its last number, and that number.
+/// The part of a name before its last number, and that number.
 fn last_number(path: &Path) -> Option<(String, u64)> {
     let stem = path.file_stem()?.to_str()?;
     let end = stem.rfind(|c: char| c.is_ascii_digit())? + 1;

@@ -1,4 +1,4 @@
-//! A part of the frame: what a camera reads out, or what is looked at of a recording.
+//! A part of the frame: read out by a camera, or used of a recording.
 
 use super::SourceError;
 use cellpos_rig::source::FrameBuffer;

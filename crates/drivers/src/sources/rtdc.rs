@@ -1,8 +1,8 @@
-//! Recordings of deformability cytometers (`.rtdc`): HDF5 with one picture an event, its background, and what the instrument
-//! says of camera and pixel.
+//! Recordings of deformability cytometers (`.rtdc`): HDF5 with one picture per event, its background, and the instrument's camera and
+//! pixel size.
 //!
 //! Read: `events/image`, `events/image_bg`, `events/frame`, and of the root's attributes `imaging:pixel size` and
-//! `imaging:frame rate`. Masks and features of the instrument are not: vision measures by itself.
+//! `imaging:frame rate`. Masks and features of the instrument are not used: vision measures independently.
 
 use super::zstandard::Rows;
 use super::{Recording, RecordingInfo, SourceError, check_size};
@@ -48,7 +48,7 @@ impl RtdcRecording {
                 .as_ref()
                 .is_ok_and(|names| names.iter().any(|n| n == name))
         };
-        // What is there but damaged is told; what was never saved is done without.
+        // Damaged parts are reported; parts that were never saved are optional.
         let source = path;
         let dataset = |name: &str| {
             let path = format!("events/{name}");

@@ -17,7 +17,7 @@ const MAX_PAGES: usize = 1 << 22;
 /// A TIFF stack of grey pages of 8 to 16 bits, all of one size.
 pub struct TiffStack {
     decoder: Decoder<BufReader<File>>,
-    /// The page that the decoder stands at.
+    /// The decoder's page.
     page: usize,
     /// Pictures one behind the other after the one directory.
     raw: Option<RawStack>,
@@ -132,7 +132,7 @@ fn decoder(path: &Path) -> Result<Decoder<BufReader<File>>, SourceError> {
     Ok(decoder.with_limits(limits))
 }
 
-/// The one picture of a file that belongs to a folder; gives what is to be said of it.
+/// The picture of a file in a folder, with its warnings.
 pub(crate) fn decode_file(
     path: &Path,
     frame: usize,
@@ -205,8 +205,8 @@ fn decode(
     grey::take(path, frame, values, channels, buffer)
 }
 
-/// Grey pixels of 10, 12 or 14 bits one right after another, the high bits first, each row from a byte of its own: strips of
-/// whole rows, not compressed.
+/// Grey pixels of 10, 12 or 14 bits one right after another, the high bits first, each row starts at a byte: strips of whole rows,
+/// not compressed.
 fn packed(
     decoder: &mut Decoder<BufReader<File>>,
     path: &Path,

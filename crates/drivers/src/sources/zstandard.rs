@@ -1,6 +1,5 @@
 //! Datasets whose chunks are compressed by Zstandard (HDF5 filter 32015), which the HDF5 reader does not decode: it says where
-//! the chunks lie, and they are read and decoded here. Of the other filters those that come with it: shuffle, and a
-//! checksum, which Zstandard has of its own.
+//! the chunks lie, and they are read and decoded here. Other filters: shuffle, and a checksum, which Zstandard has already.
 
 use hdf5_pure::{DType, Dataset, Error};
 use std::fs::File;
@@ -155,7 +154,7 @@ impl Packed {
         Ok(to)
     }
 
-    /// Copies what a chunk and the rows have in common, run by run along the last side.
+    /// Copies the intersection of a chunk and the rows, run by run along the last dimension.
     fn copy(&self, k: usize, bytes: &[u8], (first, count): (u64, u64), to: &mut [u8]) {
         let from = &self.chunks[k].0;
         let last = self.shape.len() - 1;

@@ -1,4 +1,4 @@
-//! Which form: as it was asked for, or the simplest of those that predict halves of the records as well as any.
+//! The form: as requested, or the simplest one that predicts halves of the records as well as any.
 
 use super::design::Data;
 use super::fit::{Found, descend, finished, most_delay, search};
@@ -17,7 +17,7 @@ const PER_NUMBER: f64 = 0.97;
 
 /// A slowest pole that turns by less than this over the longest stretch is a pole at zero for all that the records tell.
 const AS_GOOD_AS_ZERO: f64 = 1.0;
-/// One that turns by more is none.
+/// One that turns by more does not count.
 const NEVER_ZERO: f64 = 30.0;
 
 const NO_FIT: IdentError = IdentError::NoFit {
@@ -27,7 +27,7 @@ const NO_FIT: IdentError = IdentError::NoFit {
 
 /// Fits base models to records of one plant, all together; the best first.
 ///
-/// With `asked`, the model has that form (its zeros chosen where they are left open). Without, the order is chosen up to
+/// With `asked`, the model has that form (with chosen zeros if they are open). Without, the order is chosen up to
 /// `most_order`, with and without a pole at zero, with a delay where one helps, by how well a fit to the first halves of the records
 /// runs freely through the last and the other way round, every number more having to pay for itself by 3 %.
 ///
@@ -72,7 +72,7 @@ pub fn choose(
     };
     let best = match (best_stable, simplest(&integrating)) {
         (Some(stable), Some(integrating)) => {
-            // A ramp beside an integrator follows anything slow: that alone is no reason to take one.
+            // A ramp with an integrator follows anything slow, so that alone does not justify an integrator.
             let slow = stable.at_bound || stable.slowest(&many) < AS_GOOD_AS_ZERO;
             let factor = if slow { 1.05 } else { 0.7 };
             if integrating.held_out_rms < factor * stable.held_out_rms {
@@ -195,7 +195,7 @@ impl Trial {
     }
 }
 
-/// The one whose error of prediction, every number paid for, is least, and that stands at no bound where others do not.
+/// The form with the least penalised prediction error; one without a parameter at its bound has priority.
 fn simplest(trials: &[Trial]) -> Option<&Trial> {
     let free = trials.iter().any(|t| !t.at_bound);
     let cost =

@@ -15,11 +15,11 @@ const FASTEST: f64 = 8.0;
 struct Stretch {
     held: [Grid; 2],
     output: Vec<f64>,
-    /// Rows that count: an output is there, and the input that it answers lies in the record.
+    /// Rows that count: with an output, and with its input in the record.
     counts: Vec<bool>,
 }
 
-/// Records, or parts of them.
+/// Records, or parts of records.
 #[derive(Debug, Clone)]
 pub(super) struct Data {
     stretches: Vec<Stretch>,
@@ -43,7 +43,7 @@ pub(super) struct Solved {
 }
 
 impl Data {
-    /// Cuts no more than `most` rows out of the records, in stretches spread over all of them; the first `skipped` rows of each
+    /// Cuts no more than `most` rows out of the records, in stretches spread over all records; the first `skipped` rows of each
     /// give the input that a delay reaches back to.
     pub fn new(records: &[Series], hold: Hold, most: usize, skipped: usize) -> Self {
         let all: usize = records.iter().map(|r| r.input.len()).sum();
@@ -88,7 +88,7 @@ impl Data {
 
     /// The same records with the first or the last halves alone counting: the others must be predicted.
     pub fn half(&self, last: bool, delay: f64) -> Self {
-        // What a delay reaches back to lies before the cut: those rows say nothing.
+        // For these rows the delayed input is before the cut: they do not count.
         let late = if last { delay.ceil() as usize + 1 } else { 0 };
         let cut = |s: &Stretch| {
             let n = s.output.len();
@@ -127,7 +127,7 @@ impl Data {
         ((SLOWEST / self.longest as f64).ln(), FASTEST.ln())
     }
 
-    /// Whether a pole stands at an end of what is searched.
+    /// Whether a pole is at an end of the search range.
     pub fn at_bound(&self, form: &Form, theta: &[f64]) -> bool {
         let (low, high) = self.log_range();
         let n = form.free_poles();
@@ -242,7 +242,7 @@ impl Stretch {
         let direct = zeros == n;
         let mut all = driven(denominator, delay, &self.held[usize::from(direct)]);
         if direct {
-            // s^n / A is the input less what the lower powers hold of A.
+            // s^n / A is the input minus the lower powers of A.
             let mut top = all[n].clone();
             for (i, column) in all[..n].iter().enumerate() {
                 for (t, c) in top.iter_mut().zip(column) {
@@ -261,7 +261,7 @@ impl Stretch {
         all
     }
 
-    /// The output less what a numerator makes of the input.
+    /// The output minus the numerator's response to the input.
     fn target(&self, columns: &[Vec<f64>], numerator: Option<&[f64]>) -> Vec<f64> {
         let mut out: Vec<f64> = (self.output.iter().zip(&self.counts))
             .map(|(y, counts)| if *counts { *y } else { 0.0 })
@@ -286,7 +286,7 @@ pub(super) fn times(a: &[f64], b: &[f64]) -> Vec<f64> {
     out
 }
 
-/// Solves normal equations; what the records do not see (a slow start beside the sensor's zero) is left at nothing.
+/// Solves normal equations; unobservable parameters (a slow start next to the sensor's zero) stay zero.
 fn solved(gram: DMatrix<f64>, right: &DVector<f64>) -> Option<DVector<f64>> {
     let scale: Vec<f64> = (0..gram.nrows())
         .map(|i| match gram[(i, i)] {

@@ -1,4 +1,4 @@
-//! The fit of one form: starts, the search over poles and delay, and what the numbers are worth.
+//! The fit of one form: starts, the search over poles and delay, and intervals.
 
 use super::design::{Data, Solved};
 use super::form::Form;
@@ -19,7 +19,7 @@ fn sum_of_squares(solved: &Solved) -> f64 {
     solved.residual.iter().map(|e| e * e).sum()
 }
 
-/// Poles and delay, and what they leave.
+/// Poles and delay, and their residual.
 #[derive(Debug, Clone)]
 pub(super) struct Found {
     pub theta: Vec<f64>,
@@ -60,7 +60,7 @@ pub(super) fn most_delay(longest: usize) -> f64 {
     (longest as f64 / 8.0).min(120.0)
 }
 
-/// Starts of a form, from the best of the orders below it where they are known.
+/// Starts of a form, from the best lower orders if known.
 fn starts(data: &Data, form: &Form, below: &[Option<Found>]) -> Vec<Vec<f64>> {
     let n = form.free_poles();
     let poles = |order: usize| {
@@ -102,7 +102,7 @@ fn starts(data: &Data, form: &Form, below: &[Option<Found>]) -> Vec<Vec<f64>> {
     out
 }
 
-/// The best of a form on some of the rows: every start, the best three of them searched.
+/// The best fit of a form on some rows: every start, the best three refined.
 pub(super) fn search(data: &Data, form: &Form, below: &[Option<Found>]) -> Option<Found> {
     let longest = most_delay(data.longest);
     let n = form.free_poles();

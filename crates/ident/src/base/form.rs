@@ -1,4 +1,4 @@
-//! What a base model is to look like, and how that is written on a command line.
+//! The form of a base model, and its syntax on a command line.
 
 use std::fmt;
 use std::str::FromStr;
@@ -23,7 +23,7 @@ pub struct Form {
     pub zeros: Option<usize>,
     /// Whether there is a delay.
     pub delay: bool,
-    /// Whether a pole lies at zero.
+    /// Whether a pole is at zero.
     pub integrating: bool,
 }
 

@@ -4,7 +4,7 @@
 //! The model's free run is held against all records at once. Gain, zeros, the state at the start of each record and the sensor's
 //! zero enter linearly and are solved for; poles and delay are searched (variable projection). So a plant need not have
 //! rested before a record, the input need not repeat, and steps that are held do not leak into a spectrum.
-//! Not for records of a loop without a reference ([`crate::feedback`] tells them), and not for naming what is not linear.
+//! Not for records of a loop without a reference ([`crate::feedback`] detects them), and not for nonlinear effects.
 
 mod choose;
 mod design;

@@ -136,7 +136,7 @@ struct Step {
     driven: Vec<f64>,
 }
 
-/// One step of length `h` whose input changes a `part` of the step after its beginning: what the later value does, and the
+/// One step of length `h` whose input changes a `part` of the step after its beginning: responses to the later value and to the
 /// earlier one.
 fn steps(denominator: &[f64], h: f64, part: f64) -> (Step, Vec<f64>) {
     let early = transition(denominator, part * h);

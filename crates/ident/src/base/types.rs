@@ -1,10 +1,10 @@
-//! What goes into a base fit and what comes out of it.
+//! Inputs and results of a base fit.
 
 use super::form::Form;
 use crate::error::IdentError;
 use crate::rational::RationalFit;
 
-/// One record: input and output row by row at the same even rate, the output NaN where there is none.
+/// One record: input and output row by row at the same even rate, the output NaN if missing.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Series {
     /// Input, any unit.
@@ -13,7 +13,7 @@ pub struct Series {
     pub output: Vec<f64>,
 }
 
-/// A base model with what it leaves.
+/// A base model with its residual.
 #[derive(Debug, Clone, PartialEq)]
 pub struct BaseFit {
     /// What was fitted.
@@ -28,9 +28,9 @@ pub struct BaseFit {
     pub residual_rms: f64,
     /// The same of halves of the records that a fit to the other halves predicts, output unit; None where only one form was asked for.
     pub held_out_rms: Option<f64>,
-    /// Whether the plant integrates and what its free run leaves is a random walk: Brownian motion or drift, no error of the model.
+    /// Whether the plant integrates and the free run's residual is a random walk: Brownian motion or drift, not an error of the model.
     pub wanders: bool,
-    /// Whether a number stands at an end of what the sampling and the length of the records can tell.
+    /// Whether a number is at an end of the range that sampling and length of the records allow.
     pub at_bound: bool,
 }
 

@@ -1,7 +1,7 @@
 //! Identification of anybody's records: input and output columns at a rate, plant unknown.
 //!
-//! Lines are found in the input; gain and lag are coherent with them; harmonics in the output that the input does not
-//! hold are listed, because no linear model of any order makes them. Broadband inputs go through averaged spectra.
+//! Lines are found in the input; gain and lag are coherent with them; harmonics in the output that the input lacks are listed,
+//! because no linear model makes them. Broadband inputs go through averaged spectra.
 //! Not for naming what makes the harmonics: that is reconciliation.
 
 mod result;
@@ -163,7 +163,7 @@ pub fn identify_in_loop(
     Ok(result)
 }
 
-/// What a record says whose input answers its output, and that has no reference.
+/// Finding for a record in closed loop without a reference.
 pub fn nothing_to_tell(
     output: &[f64],
     settings: &ForeignSettings,

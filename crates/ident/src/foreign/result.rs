@@ -1,4 +1,4 @@
-//! What is asked of a foreign record, and what it answers.
+//! Analysis of a foreign record, and its results.
 
 use crate::frequency_response::FrequencyPoint;
 use crate::rational::RationalFit;
@@ -67,14 +67,14 @@ pub enum Basis {
     Input,
     /// The record is of a loop: both were projected on its reference, which the noise is not in (joint input-output).
     Reference,
-    /// The record is of a loop, and nothing from outside moved it: the response cannot be told from the controller.
+    /// The record is of a loop without external excitation: plant and controller cannot be separated.
     Nothing {
         /// Part of the input's change that the output's past predicts; None where it was not tested.
         share: Option<f64>,
     },
 }
 
-/// What a foreign record says.
+/// Results for a foreign record.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ForeignResult {
     /// What the response rests on.
@@ -91,7 +91,7 @@ pub struct ForeignResult {
     pub models: Vec<RationalFit>,
     /// RMS of the output about its own offset and ramp, output unit.
     pub output_rms: f64,
-    /// RMS of what the coherent linear response at the lines leaves (lines only), output unit.
+    /// RMS of the residual of the coherent linear response (lines only), output unit.
     pub linear_residual_rms: Option<f64>,
     /// How the record was sampled.
     pub sampling: Sampling,

@@ -20,7 +20,7 @@ pub(crate) struct Compiled {
     pub stages: Vec<Stage>,
     /// Index of the group that holds the plant and the tap of the PZT displacement.
     pub plant: usize,
-    /// Other ways from the input of that group to the record, beside the plant.
+    /// Other paths from the input of that group to the record, parallel to the plant.
     pub bypass: Vec<LinearGroup>,
     /// Displacements from the working point, um.
     pub low: f64,
@@ -48,7 +48,7 @@ struct Builder {
     needs_slopes: bool,
 }
 
-/// Shortest and longest sub-step where one is needed, s.
+/// Shortest and longest sub-step, s.
 const SHORTEST_S: f64 = 2e-5;
 const LONGEST_S: f64 = 2.5e-4;
 /// Sub-steps are this part of the fastest time constant before the block that needs them.
@@ -80,7 +80,7 @@ impl Builder {
         self.stages.push(Stage::Block(block));
     }
 
-    /// The plant with what is tied to it, a stage of its own; what leads to it is one as well, and tells the PZT's displacement.
+    /// The plant with its tied effects is one stage; the path to it is another, with the PZT's displacement as output.
     fn tied_plant(&mut self, plant: &Zpk, ties: Vec<Box<dyn Around>>) {
         self.tap = Some(self.pending.clone());
         self.flush();
@@ -112,7 +112,7 @@ pub(crate) fn compile(model: &Model) -> Compiled {
     let (mut low, mut high, mut rate) = (f64::NEG_INFINITY, f64::INFINITY, f64::INFINITY);
     let plant = Zpk::of(&model.plant);
     let mut plant_is_in = false;
-    // What leads from the PZT to the record beside the plant, and the linear blocks before it.
+    // The path from the PZT to the record parallel to the plant, and the linear blocks before it.
     let mut beside: Vec<Zpk> = Vec::new();
     let mut before_plant = Zpk::one();
     let effects = model.ordered_effects();

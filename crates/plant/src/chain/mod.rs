@@ -5,7 +5,7 @@
 //! exact as well. Where a block that is not linear follows one with dynamics (a driver lag before hysteresis, the
 //! plant before wall adhesion), sub-steps are chosen from the fastest time constant before it.
 //!
-//! Not here: what the camera makes of the position (see [`crate::Simulator`]).
+//! Not here: the camera (see [`crate::Simulator`]).
 
 mod compile;
 mod linear;
@@ -185,7 +185,7 @@ impl Chain {
         self.rest();
     }
 
-    /// Shows where equations that stand in the plant's place begin: a level that is not 0 is there before the first command.
+    /// Shows the start of equations that replace the plant: a level other than 0 exists before the first command.
     fn rest(&mut self) {
         let begins = |s: &Stage| matches!(s, Stage::Tied(tied) if tied.replaces_output());
         if self.compiled.stages.iter().any(begins) {
@@ -232,7 +232,7 @@ impl Chain {
         }
     }
 
-    /// A straight line of the driver's output, in sub-steps where they are needed.
+    /// A straight line of the driver's output, in sub-steps if necessary.
     fn divided(&mut self, h_s: f64, start: f64, end: f64) {
         if h_s <= self.compiled.substep_s {
             self.piece(h_s, start, end);

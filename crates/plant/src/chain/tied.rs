@@ -4,7 +4,7 @@ use super::linear::LinearGroup;
 use crate::effects::{Around, Piece, Seen};
 use crate::modal::Zpk;
 
-/// A plant with effects that see its input and its position: what enters it may depend on where it is.
+/// A plant with effects that see its input and its position: its input may depend on its position.
 ///
 /// Between two steps what enters is a straight line from its value at the beginning to the one expected at the end, and the
 /// plant's answer to that is exact: second order in the step, whatever the plant's poles. [`Self::longest_s`] keeps the step
@@ -56,7 +56,7 @@ impl TiedPlant {
         self.velocity = 0.0;
     }
 
-    /// Whether something stands in the place of what the plant gives: at rest it need not be at 0.
+    /// Whether something replaces the plant's output, which need not be 0 at rest.
     pub fn replaces_output(&self) -> bool {
         self.ties.iter().any(|t| t.replaces_output())
     }
@@ -71,7 +71,7 @@ impl TiedPlant {
         self.velocity
     }
 
-    /// What enters the plant, position and velocity just after the input has jumped to a value.
+    /// Input, position and velocity of the plant just after the input has jumped.
     fn beginning(&mut self, time_s: f64, input: f64) -> (f64, f64, f64) {
         let mut drive = self.drive;
         let (mut position, mut velocity) = self.plant.at_input(drive);

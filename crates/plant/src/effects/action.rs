@@ -20,9 +20,9 @@ pub enum Action {
     Slew(f64),
     /// Anything else between command and bead.
     Block(Box<dyn Block>),
-    /// Tied to the plant: changes what enters it, with its position known, or stands in for what it gives.
+    /// Tied to the plant: changes its input, knowing its position, or replaces its output.
     Around(Box<dyn Around>),
-    /// Another way from the PZT's displacement to the record, beside the plant.
+    /// Another path from the PZT's displacement to the record, parallel to the plant.
     Bypass(Zpk),
     /// `y(t - delay)`, s.
     Delay(f64),

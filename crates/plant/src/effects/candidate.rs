@@ -51,7 +51,7 @@ impl FitParameter {
     }
 }
 
-/// What the records allow: ranges from which starting values are taken.
+/// Ranges of starting values that the records allow.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Scope {
     /// Displacement about which the plant acts \[um\].
@@ -71,8 +71,7 @@ pub struct Scope {
     /// The command is an analogue signal sampled with the output, not held between rows: nothing faster than half the
     /// sampling rate can be seen.
     pub sampled_input: bool,
-    /// What one unit of the records' command and of their position counts for \[um\]: an effect of the user's own has their
-    /// units.
+    /// Size of the units of command and position \[um\]: a user-defined effect has these units.
     pub per_unit: [f64; 2],
 }
 
@@ -102,7 +101,7 @@ pub struct Candidate {
     pub role: Role,
     /// The smallest that matters: index of a number and its least size.
     pub smallest: Option<(usize, f64)>,
-    /// What that size is counted from: 1 for a factor.
+    /// Reference of that size: 1 for a factor.
     pub neutral: f64,
     /// A rich form, tried only once the effect was found in a simple one.
     pub late: bool,
@@ -166,7 +165,7 @@ impl Candidate {
     }
 }
 
-/// The kind of record that tells an effect from what it is confused with.
+/// The kind of record that separates an effect from similar ones.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Experiment {
     /// Many lines at once, up to high frequencies.

@@ -1,4 +1,4 @@
-//! `gain-swing`: a gain that goes up and down.
+//! `gain-swing`: a gain that rises and falls.
 
 use super::{
     Action, Block, Candidate, Effect, EffectKind, Experiment, Form, ParameterSpec, Piece, Place,
@@ -102,7 +102,7 @@ impl Block for Swing {
         };
         let last = self.gain(end_s);
         self.known = (end_s, last);
-        // A piece lasts less than a thousandth of a period: the mean of its gains is that of all of it.
+        // A piece lasts less than a thousandth of a period, so the mean of its end gains is its mean gain.
         let middle = 0.5 * (first + last);
         let start = self.output + first * (input.start - self.input);
         self.output = start + middle * (input.end - input.start);

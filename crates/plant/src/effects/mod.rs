@@ -3,7 +3,7 @@
 //! An effect is one type that implements [`EffectKind`]: its specification (id, place, parameters with units and bounds),
 //! its equation as an [`Action`] on the signal at its place, the [`Candidate`] forms that a search may try, and what tells
 //! it from others. The simulator, the emulator, the design, the search for discrepancies, its report and model files ask
-//! the kind; none of them knows an effect by its name.
+//! the kind; all are independent of the effect's name.
 //!
 //! To add one to this crate: its file here, and its line in `table.rs`. To add one from another crate: implement
 //! [`EffectKind`] there and hand it to [`register`]. To add one without a line of code: a [`Definition`], from a file.
@@ -135,7 +135,7 @@ pub trait EffectKind: fmt::Debug + Send + Sync {
     /// What the effect with these numbers does at its place.
     fn act(&self, effect: &Effect) -> Action;
 
-    /// The linear part at the start of a record of an effect that changes with time, where it has one.
+    /// The linear part, at the start of a record, of an effect that changes with time, if any.
     fn at_start(&self, effect: &Effect) -> Option<Zpk> {
         let _ = effect;
         None
@@ -162,7 +162,7 @@ pub trait EffectKind: fmt::Debug + Send + Sync {
         Ok(())
     }
 
-    /// Whether it is a curve of what goes into it and nothing else, without memory: another curve is another form of it.
+    /// Whether it is a memoryless curve of its input: another curve is another form.
     fn is_curve(&self) -> bool {
         false
     }
@@ -177,12 +177,12 @@ pub trait EffectKind: fmt::Debug + Send + Sync {
         false
     }
 
-    /// The candidate that keeps the static curve of the effect and none of its memory, where it has one.
+    /// The candidate with the static curve of the effect and without memory, if any.
     fn memoryless(&self) -> Option<usize> {
         None
     }
 
-    /// Whether its simple forms are so different that the second best may become the best beside other effects.
+    /// Whether its simple forms differ so much that the second best may win together with other effects.
     fn has_unlike_forms(&self) -> bool {
         false
     }
@@ -198,13 +198,12 @@ pub trait EffectKind: fmt::Debug + Send + Sync {
         None
     }
 
-    /// Whether something that has no name of its own answers alike from command to bead: what tells them apart is then always said.
+    /// Whether a nameless cause has the same response from command to bead: then the separating experiment is always named.
     fn has_doubles(&self) -> bool {
         false
     }
 
-    /// For how long it remembers what went into it \[s\]: another equation of it is slower than that by a decade at most. Without end
-    /// where nothing is said.
+    /// Memory of its input \[s\]: its freer forms are slower by a decade at most. Unlimited by default.
     fn memory_s(&self, effect: &Effect) -> f64 {
         let _ = effect;
         f64::INFINITY
@@ -297,7 +296,7 @@ impl Effect {
         }
     }
 
-    /// The same effect of a plant whose lengths are in a unit of its own: bounds in micrometres do not hold for them.
+    /// The same effect for a plant with another unit of length, without bounds in micrometres.
     pub fn in_any_unit(self) -> Self {
         Self {
             any_unit: true,
@@ -305,8 +304,8 @@ impl Effect {
         }
     }
 
-    /// The same in a chain where one unit of the records' command and of their position count for so many micrometres: an
-    /// effect of the user's own keeps its numbers, and its signals are brought to its units.
+    /// The same in a chain where one unit of the records' command and of their position count for so many micrometres: a
+    /// user-defined effect keeps its numbers, and its signals are converted to its units.
     pub fn counted_in(self, per_unit: [f64; 2]) -> Self {
         Self { per_unit, ..self }
     }

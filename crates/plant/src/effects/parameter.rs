@@ -13,7 +13,7 @@ pub struct Spec {
     pub shown_at: &'static str,
     /// The equation in one line, for documents.
     pub equation: &'static str,
-    /// By what it shows, for documents.
+    /// By its observable, for documents.
     pub signature: &'static str,
     /// Acts on the plant's input although its place is the chip.
     pub ahead_of_plant: bool,
@@ -70,8 +70,8 @@ impl Form {
         }
     }
 
-    /// The two forms of an effect that changes slow motion against fast: beside a model whose gain is that of slow motion (the
-    /// first, and the default in files), and beside one whose gain is that of fast motion.
+    /// The two forms of an effect that changes slow motion against fast: for a model with the gain of slow motion (the first, and
+    /// the default in files), and for one with the gain of fast motion.
     pub const fn anchored(scalars: &'static [ParameterSpec]) -> [Self; 2] {
         [
             Self {
@@ -168,7 +168,7 @@ impl ParameterSpec {
         }
     }
 
-    /// The same of a plant whose lengths are in a unit of its own: what is a length, or made of one, keeps its sign alone.
+    /// The same for a plant with another unit of length: a length keeps only its sign.
     #[must_use]
     pub fn in_any_unit(self) -> Self {
         if !self.unit.contains("um") {

@@ -1,4 +1,4 @@
-//! `pzt-creep`: the displacement goes on with the logarithm of time.
+//! `pzt-creep`: the displacement continues with the logarithm of time.
 
 use super::candidate::{grid, one};
 use super::{
@@ -16,12 +16,12 @@ pub fn pzt_creep(per_decade: f64) -> Effect {
     Effect::new(&KIND, AT_REST, &[per_decade], &[])
 }
 
-/// The same creep beside a model whose gain is that of fast motion: `x = x0 (1 + g log10(t / 1 ms))`.
+/// The same creep for a model with the gain of fast motion: `x = x0 (1 + g log10(t / 1 ms))`.
 pub fn pzt_creep_of_fast_gain(per_decade: f64) -> Effect {
     Effect::new(&KIND, AT_SPEED, &[per_decade], &[])
 }
 
-/// Creep that begins some time after a step: `x = x0 (1 + g log10(1 + t/onset))`, beside a model of the gain before that.
+/// Creep that begins some time after a step: `x = x0 (1 + g log10(1 + t/onset))`, for a model with the gain before that.
 pub fn pzt_creep_from(per_decade: f64, onset_s: f64) -> Effect {
     Effect::new(&KIND, WITH_ONSET, &[per_decade, onset_s], &[])
 }
@@ -119,7 +119,7 @@ const CREEP_DECADES: usize = 9;
 const CREEP_PER_DECADE: usize = 2;
 /// A creeping piezo has its nominal displacement this long after a step, s.
 const CREEP_REFERENCE_S: f64 = 0.1;
-/// The same beside a gain of fast motion.
+/// The same for the gain of fast motion.
 const FAST_REFERENCE_S: f64 = 1e-3;
 
 /// Time constants of the creep bank, s.
@@ -128,7 +128,7 @@ fn creep_times() -> impl Iterator<Item = f64> {
         .map(|i| CREEP_FASTEST_S * 10f64.powf((i as f64 + 0.5) / CREEP_PER_DECADE as f64))
 }
 
-/// What the logarithm counts from.
+/// Origin of the logarithm.
 #[derive(Debug, Clone, Copy)]
 enum Since {
     /// The step: the displacement is the nominal one this long after it \[s\].

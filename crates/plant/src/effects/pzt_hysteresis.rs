@@ -170,7 +170,7 @@ const CANDIDATES: &[Candidate] = &[
         late: true,
         ..Candidate::chain(PLAY_NUMBERS.split_at(LEVELS.len() + 1).0)
     },
-    // Never started from: what is left of play operators when they remember nothing.
+    // Never a start: play operators without memory.
     Candidate {
         name: "curvature",
         late: true,

@@ -48,7 +48,7 @@ impl Definition {
     /// Reads effects from the text of a TOML file, `[[effects]]` each, and makes them known; `file_name` is for the messages.
     ///
     /// # Errors
-    /// Text that is not TOML, unknown or missing keys, expressions that are none, names that are not known where they stand,
+    /// Text that is not TOML, unknown or missing keys, wrong expressions, names unknown at their place,
     /// bounds and starts that do not fit, an id that is taken: with line, column, key, value and what would be right.
     pub fn from_toml_str(
         text: &str,
@@ -123,7 +123,7 @@ pub(super) fn read_all<'i>(
     })
 }
 
-/// Where the value of a key with points stands, or of the longest part of it that is there.
+/// Place of the value of a dotted key, or of the longest existing part.
 fn span_of(entries: &DeTable<'_>, key: &str) -> Option<std::ops::Range<usize>> {
     let (head, rest) = key.split_once('.').unwrap_or((key, ""));
     let value = entries.get(head)?;

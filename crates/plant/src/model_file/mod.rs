@@ -106,7 +106,7 @@ fn read(text: &str, file: &str) -> Result<Model, ModelError> {
         "a table with the coefficients num and den, highest power of s first",
     )?;
     let plant = read_plant(&top.table("plant", plant)?)?;
-    // Effects of the user's own come first: those below may be of them.
+    // User-defined effects come first: those below may use them.
     if let Some(v) = top.get("definitions") {
         definitions::read_all("definitions", &top, v)?;
     }

@@ -1,4 +1,4 @@
-//! The camera's part of a model: what a frame makes of a position.
+//! The camera's part of a model: from a position to a frame's value.
 
 use crate::chain::{ChainError, in_range};
 use crate::effects::{Action, Shown};
@@ -32,7 +32,7 @@ impl Camera {
             skew: 0.0,
             shown: Vec::new(),
             localisation_um,
-            // A stream of its own, so that the Brownian path does not depend on the camera.
+            // A separate stream, so that the Brownian path does not depend on the camera.
             noise: seed.map(|s| Random::new(s ^ 0x9e37_79b9_7f4a_7c15)),
         };
         let mut exposures = 0;

@@ -19,11 +19,11 @@ pub type Codes = &'static [(u8, &'static str)];
 /// What a column holds.
 #[derive(Clone, Copy)]
 pub enum Value {
-    /// Numbers; NaN where there is none.
+    /// Numbers; NaN if missing.
     Number(fn(&Row) -> f64),
     /// Whole numbers.
     Whole(fn(&Row) -> u64),
-    /// One of some words; a number without a word is none.
+    /// A word; a number without a word counts as missing.
     Code(Codes, fn(&Row) -> u8),
 }
 
@@ -34,7 +34,7 @@ pub struct Column<'a> {
     pub name: &'a str,
     /// Unit; empty for counts and words.
     pub unit: &'static str,
-    /// What it is, in a sentence.
+    /// Meaning, in a sentence.
     pub about: &'static str,
     /// How it is read off a row.
     pub value: Value,
@@ -263,7 +263,7 @@ const LAW: [fn(&Row) -> f64; LAW_COLUMNS] = [
     law::<0>, law::<1>, law::<2>, law::<3>, law::<4>, law::<5>, law::<6>, law::<7>,
 ];
 
-/// What the columns are that the laws of cellpos and their adaptation have; those of a law from elsewhere it knows alone.
+/// Meaning of the columns of cellpos's laws and their adaptation. Only a foreign law knows its columns.
 pub const OF_LAWS: &[(&str, &str)] = &[
     ("pi_integral_um", "Integral part of PI."),
     ("pi_lead_um", "State of the lead."),

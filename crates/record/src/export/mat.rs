@@ -1,4 +1,4 @@
-//! A run as a MAT-file of version 5: one variable a column, which MATLAB, Octave and SciPy load by themselves.
+//! A run as a MAT-file of version 5: one variable per column, for MATLAB, Octave and SciPy.
 //!
 //! The rows are counted first, so that every variable has its place in the file before its values come, some rows of all
 //! variables at a time.

@@ -62,14 +62,14 @@ pub struct Source {
     law: Vec<String>,
 }
 
-/// What of a run is wanted.
+/// Selected part of a run.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Selection {
     /// From this time of the run on, s.
     pub from_s: f64,
     /// Up to this time of the run, s.
     pub to_s: f64,
-    /// Every so many rows one.
+    /// Keep one of N rows.
     pub every: NonZeroU64,
     /// Names of the columns, in the order wanted; None: all.
     pub columns: Option<Vec<String>>,
@@ -90,7 +90,7 @@ impl Selection {
     /// The columns wanted.
     ///
     /// # Errors
-    /// [`RecordError::Column`] for a name that is none, [`RecordError::Twice`] for one that is asked for twice.
+    /// [`RecordError::Column`] for an unknown name, [`RecordError::Twice`] for a repeated name.
     pub fn columns<'s>(&self, source: &'s Source) -> Result<Vec<Column<'s>>, RecordError> {
         let mut all: Vec<Column<'s>> = COLUMNS.to_vec();
         all.extend(columns::of_law(&source.law));
@@ -301,7 +301,7 @@ fn is_device(path: &Path) -> bool {
     std::fs::metadata(path).is_ok_and(|found| !found.is_file() && !found.is_dir())
 }
 
-/// Gives a file that is written whole its name. A device or a pipe gets the bytes and stays what it is.
+/// Gives a file that is written whole its name. A device or a pipe gets the bytes and is not replaced.
 fn settle(part: &Path, path: &Path) -> io::Result<()> {
     if !is_device(path) {
         return std::fs::rename(part, path);

@@ -16,7 +16,7 @@ use std::io::BufWriter;
 use std::path::Path;
 use std::sync::Arc;
 
-/// Rows of a row group: what the writer holds in memory at most.
+/// Rows of a row group, which the writer holds in memory.
 const ROW_GROUP: usize = 1 << 17;
 
 fn encode(error: &dyn std::fmt::Display) -> RecordError {
@@ -61,8 +61,8 @@ pub fn write_parquet(
     })
 }
 
-/// How the columns are laid out, by the first rows: a number that seldom comes twice gets no dictionary, which would hold every
-/// value beside its place; a whole number that always grows (a tick, a time) is kept as its steps.
+/// How the columns are laid out, by the first rows: a number that seldom repeats gets no dictionary, which would hold nearly every
+/// value; a whole number that always grows (a tick, a time) is kept as its steps.
 fn layout(columns: &[Column<'_>], rows: &[Row]) -> WriterProperties {
     let mut layout = WriterProperties::builder().set_max_row_group_row_count(Some(ROW_GROUP));
     for column in columns {
@@ -84,7 +84,7 @@ fn layout(columns: &[Column<'_>], rows: &[Row]) -> WriterProperties {
     layout.build()
 }
 
-/// The columns with unit, meaning and words, and what the run is.
+/// The columns with unit, meaning and words, and the run's description.
 fn schema(columns: &[Column<'_>], source: &Source) -> SchemaRef {
     let fields: Vec<Field> = columns
         .iter()
@@ -154,7 +154,7 @@ fn array(column: &Column<'_>, rows: &[Row]) -> ArrayRef {
 /// A column of a small table.
 #[derive(Debug, Clone, PartialEq)]
 pub enum TableColumn {
-    /// Numbers; NaN where there is none.
+    /// Numbers; NaN if missing.
     Numbers(Vec<f64>),
     /// Text.
     Texts(Vec<String>),

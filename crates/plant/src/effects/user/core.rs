@@ -1,4 +1,4 @@
-//! The equations of an effect of the user's own, with its states: what its blocks share.
+//! The equations of a user-defined effect, with its states, shared by its blocks.
 
 use super::definition::{
     Compiled, INPUT, MOST, MOST_STATES, OUTPUT, POSITION, SIGNALS, TIME, VELOCITY,
@@ -31,7 +31,7 @@ pub(super) struct Core {
     states: [f64; MOST_STATES],
     /// What was given last, um.
     output: f64,
-    /// What one unit of the equations counts for in what enters, in the position, and in what is given, um.
+    /// Size of the equations' unit at input, position and output, um.
     units: [f64; 3],
 }
 

@@ -15,7 +15,7 @@ pub struct DefinitionError {
     pub message: String,
 }
 
-/// Where an effect of the user's own acts, and what it sees there.
+/// Place of a user-defined effect, and its signals there.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Site {
     /// On the amplifier's output.
@@ -24,7 +24,7 @@ pub enum Site {
     Pzt,
     /// On what enters the plant; sees the plant's own position and velocity: feedback.
     Chip,
-    /// In the place of what the plant gives; sees what enters the plant as well.
+    /// Replaces the plant's output; sees the plant's input, too.
     Plant,
     /// On the bead's motion.
     Bead,
@@ -92,11 +92,11 @@ pub struct UserParameter {
     pub lower: f64,
     /// Largest value.
     pub upper: f64,
-    /// Values from which a search begins; a model's own value where it has one.
+    /// Values from which a search begins; the model's value if it has one.
     pub start: Vec<f64>,
 }
 
-/// A quantity with an equation of its own.
+/// A quantity with its own equation.
 #[derive(Debug, Clone, PartialEq)]
 pub struct UserState {
     /// Its name in expressions.
@@ -121,7 +121,7 @@ pub struct Definition {
     pub says: String,
     /// What leaves the place in the stead of `input` (at `plant`: in the stead of `position`).
     pub output: String,
-    /// Quantities with equations of their own.
+    /// Quantities with their own equations.
     pub states: Vec<UserState>,
     /// Its free numbers.
     pub parameters: Vec<UserParameter>,
@@ -142,7 +142,7 @@ pub(super) const MOST: usize = 16;
 /// Most states of an effect.
 pub(super) const MOST_STATES: usize = 6;
 
-/// A definition with its expressions compiled. Names stand in the order signals, parameters, states.
+/// A definition with its expressions compiled. Names have the order signals, parameters, states.
 #[derive(Debug, Clone)]
 pub(super) struct Compiled {
     pub output: Program,

@@ -1,8 +1,8 @@
 //! An expression in the field's notation, compiled once to a list of steps that are run without allocation.
 //!
 //! `+ - * / % ^`, comparisons and `&&`, `||`, `!` (1 for true, 0 for false), parentheses, numbers, names, and the functions of
-//! [`FUNCTIONS`]. Parsing and folding of constants are those of the crate `fasteval3`; its own evaluation looks names up by
-//! their letters and allocates for functions, so what it compiled is put into order here, with a place for every name.
+//! [`FUNCTIONS`]. Parsing and folding of constants are those of the crate `fasteval3`; its evaluation looks names up as text and
+//! allocates for functions, so its result is compiled again here, with a slot for every name.
 
 use fasteval3::compiler::{IC, Instruction, InstructionI};
 use fasteval3::{Compiler, EmptyNamespace, Parser, Slab};
@@ -13,7 +13,7 @@ pub struct ExpressionProblem(pub String);
 
 type OfOne = (&'static str, fn(f64) -> f64);
 
-/// Functions of one number, beside those of two or more.
+/// Functions of one number, besides those of two or more.
 const OF_ONE: &[OfOne] = &[
     ("sqrt", f64::sqrt),
     ("exp", f64::exp),

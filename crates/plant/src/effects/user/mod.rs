@@ -71,7 +71,7 @@ fn same(a: &Definition, b: &Definition) -> bool {
     bare(a) == bare(b)
 }
 
-/// Every combination of the starts of all numbers, at most so many.
+/// Every combination of the starts of all numbers, up to a limit.
 fn combinations(definition: &Definition) -> Vec<Vec<f64>> {
     const MOST: usize = 48;
     let mut all: Vec<Vec<f64>> = vec![Vec::new()];
@@ -149,7 +149,7 @@ impl UserKind {
             .map(|i| effect.scalar(i))
             .collect();
         let [input, output] = effect.per_unit();
-        // What enters, what the plant gives, and what the effect gives.
+        // Input, plant's output, and effect's output.
         let units = match self.definition.site {
             Site::Driver | Site::Pzt => [input, output, input],
             Site::Chip => [input, output, input],

@@ -22,7 +22,7 @@ use std::path::Path;
 /// in which they are not as few as can be, which is three from 65 536 rows on.
 const CHUNK: usize = 1 << 15;
 const _: () = assert!(CHUNK <= u16::MAX as usize);
-/// The number of a word that is none.
+/// The number for a missing word.
 const NO_WORD: u8 = 255;
 /// How hard to deflate: numbers of a measurement gain little from more.
 const LEVEL: u32 = 1;

@@ -79,7 +79,7 @@ pub fn write_rtdc(
     })
 }
 
-/// What has to be known of all events before the first is written.
+/// Facts about all events that the header needs.
 #[derive(Debug, Default)]
 struct Events {
     count: u64,
