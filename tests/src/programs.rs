@@ -1,8 +1,10 @@
 //! The programs of the workspace, as `cargo test --workspace` has built them.
 
+use std::cell::Cell;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
+use std::sync::{Mutex, MutexGuard};
 use std::time::{Duration, Instant};
 
 /// Generous: the machine may be busy with other tests.
@@ -56,10 +58,46 @@ pub fn wait_until(what: &str, mut holds: impl FnMut() -> bool) {
     }
 }
 
-/// `firmware-sim`, running: board at `pzt`, camera at `camera.sock`, log at `box.csv` of its folder.
+/// A test that has the machine's real time to itself, among those of its program.
+///
+/// Loop, camera and board ask for real-time priority: two rigs at once on two cores starve each other, and the one that is
+/// judged may be the one that had nothing. Whoever holds it may take it again.
+#[must_use = "it ends when it is dropped"]
+pub struct Alone {
+    _held: Option<MutexGuard<'static, ()>>,
+}
+
+/// Waits until no other test of this program runs in real time.
+pub fn alone() -> Alone {
+    static ONE_AT_A_TIME: Mutex<()> = Mutex::new(());
+    let depth = HELD.get();
+    HELD.set(depth + 1);
+    // A test that failed with it has left nothing behind.
+    let free = || {
+        ONE_AT_A_TIME
+            .lock()
+            .unwrap_or_else(|poisoned| poisoned.into_inner())
+    };
+    Alone {
+        _held: (depth == 0).then(free),
+    }
+}
+
+impl Drop for Alone {
+    fn drop(&mut self) {
+        HELD.set(HELD.get() - 1);
+    }
+}
+
+thread_local! {
+    static HELD: Cell<usize> = const { Cell::new(0) };
+}
+
+/// `firmware-sim`, running, [`alone`]: board at `pzt`, camera at `camera.sock`, log at `box.csv` of its folder.
 pub struct RigInABox {
     child: Child,
     folder: PathBuf,
+    _alone: Alone,
 }
 
 /// A millisecond of the box, from its log.
@@ -78,6 +116,7 @@ pub struct BoxRow {
 impl RigInABox {
     /// Starts it and waits until it is up.
     pub fn start(working_folder: &Path, options: &[&str]) -> Self {
+        let alone = alone();
         let child = Command::new(self::folder().join("firmware-sim"))
             .args([
                 "--pty-link",
@@ -101,6 +140,7 @@ impl RigInABox {
         let mut rig = Self {
             child,
             folder: working_folder.to_path_buf(),
+            _alone: alone,
         };
         wait_until("firmware-sim is up", || {
             if rig.child.try_wait().is_ok_and(|status| status.is_some()) {

@@ -124,7 +124,7 @@ impl Default for WorldConfig {
             electrons_per_grey: 40.0,
             localisation_um: None,
             new_bead_after_ms: None,
-            ideal: true,
+            ideal: false,
             zero_flow_wander_um: None,
             zero_flow_wander_time_s: None,
             zero_flow_drift_um_per_s: None,

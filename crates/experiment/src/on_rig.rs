@@ -4,7 +4,7 @@
 //! The loop freezes and thaws by its own rules when the bead is lost; a segment in which it did is measured again.
 
 use crate::camera_rate::{InPeriods, foreign_rate_hz, other_rate};
-use crate::exciting::{Exciting, Handing};
+use crate::exciting::Handing;
 use crate::identify::held_bead::Setup;
 use crate::identify::led::{DelayTest, LitFrames};
 pub use crate::rows::is_unseen;
@@ -15,13 +15,15 @@ use cellpos_ident::delay::dithered_edges;
 use cellpos_ident::excitation::ExcitationLimits as ShapeLimits;
 use cellpos_ident::experiment::{Plan, RecordedSegment, Span, Turn};
 use cellpos_plant::Model;
+use cellpos_record::RunWriter;
 use cellpos_rig::clock::monotonic_ns;
 use cellpos_rig::{Camera, Clock, FrameBuffer};
 use cellpos_runtime::{EndRule, Request, TickRecord};
 use cellpos_session::rig_file::{ClockKind, Frames, RigFile};
 use cellpos_session::setup::{self, Prepared, ReferenceSpec};
 use cellpos_session::view::{Pages, Viewed};
-use cellpos_session::{EndKind, Ended, Failure, Options, Rig};
+use cellpos_session::{EndKind, Ended, Failure, NotArmed, Options, Rig, connect};
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -40,6 +42,8 @@ pub struct OnRig {
     pub frames: Frames,
     /// Do not ask the operating system for real time.
     pub best_effort: bool,
+    /// Below which folder each run leaves its own; `None`: none is kept.
+    pub record_in: Option<PathBuf>,
 }
 
 /// What a run gave.
@@ -60,6 +64,8 @@ pub struct Acquired {
     pub unseen: Vec<bool>,
     /// Why segments are missing, if any are.
     pub trouble: Option<Trouble>,
+    /// Folder of the run.
+    pub run: Option<String>,
 }
 
 /// Why segments are missing.
@@ -122,6 +128,7 @@ impl OnRig {
             clock,
             frames,
             best_effort,
+            record_in: None,
         })
     }
 
@@ -204,8 +211,13 @@ impl OnRig {
             controller: self.controller,
         };
         rig.fit(&mut prepared);
-        let setup = rig.set_up(prepared, ReferenceSpec::Hold { position_um: 0.0 })?;
-        let core = setup.core_following(Exciting::new(&schedule))?;
+        let excitation = ReferenceSpec::Excitation {
+            plan: plan.clone(),
+            todo: todo.to_vec(),
+        };
+        let setup = rig.set_up(prepared, excitation)?;
+        let core = setup.core()?;
+        let writer = self.writer(&rig, &setup)?;
         let (sender, received) = std::sync::mpsc::channel();
         let period_ns = self.file.timing.period_ns();
         let mut in_periods = InPeriods::of(rig.source().rate_hz, period_ns);
@@ -217,9 +229,11 @@ impl OnRig {
             Some(pages) => pages.next(&mut rig, &setup)?,
             None => None,
         };
-        let handing = Handing::new(sender, &schedule.spans, 1e-9 * period_ns as f64);
+        let period_s = 1e-9 * period_ns as f64;
+        let handing = Handing::new(writer, sender, &schedule.spans, period_s);
         let sink = Viewed::new(handing, view.as_deref_mut());
-        let armed = rig.arm(&setup, core, sink, EndRule::default())?;
+        let armed = rig.arm(&setup, core, sink, EndRule::default());
+        let armed = armed.map_err(unarmed)?;
         let running = armed.moving_the_bead().start()?;
         let operator = Arc::clone(running.operator());
         let mut ticks: Vec<TickRecord> = Vec::new();
@@ -238,19 +252,41 @@ impl OnRig {
                 (listener.segment)(&self.acquired(&ticks, plan, &schedule.spans));
             }
         })?;
-        finished.sink.give_back(view);
+        let over = matches!(
+            finished.ended.kind,
+            EndKind::ReferenceOver | EndKind::NotKept
+        );
+        let outcome = if over {
+            "done"
+        } else {
+            finished.summary.state.name()
+        };
+        let (mut summary, conditions) = (finished.summary, finished.conditions);
+        let writer = finished.sink.give_back(view).into_writer();
+        let run = writer.map(|writer| {
+            let mut warnings = Vec::new();
+            let kept = connect::finish(
+                writer,
+                (outcome, &finished.ended),
+                &mut summary,
+                &conditions,
+                &mut warnings,
+            );
+            for warning in warnings {
+                tracing::warn!("{warning}");
+            }
+            kept.run
+        });
         ticks.extend(received.try_iter().map(&mut counted));
         if let Some(rate_hz) = foreign_rate_hz(&ticks, period_ns) {
             return Err(other_rate(rate_hz, period_ns));
         }
         let mut acquired = self.acquired(&ticks, plan, &schedule.spans);
+        acquired.run = run;
         let (done, of) = (acquired.records.len(), schedule.spans.len());
         acquired.trouble = if done == of {
             None
-        } else if matches!(
-            finished.ended.kind,
-            EndKind::ReferenceOver | EndKind::NotKept
-        ) {
+        } else if over {
             Some(Trouble::Spoilt {
                 missing: of - done,
                 of,
@@ -260,6 +296,16 @@ impl OnRig {
             Some(Trouble::Ended(finished.ended))
         };
         Ok(acquired)
+    }
+
+    /// The run folder, if one is wanted.
+    fn writer(&self, rig: &Rig, setup: &setup::Setup) -> Result<Option<RunWriter>, Failure> {
+        let Some(root) = &self.record_in else {
+            return Ok(None);
+        };
+        let meta = connect::meta("identify-run", self.clock, &[], setup, rig)?;
+        let writer = RunWriter::create(root, meta).map_err(Failure::input)?;
+        Ok(Some(writer))
     }
 
     /// What the ticks so far hold.
@@ -279,6 +325,7 @@ impl OnRig {
             rows: (rows.input, rows.output),
             unseen: rows.unseen,
             trouble: None,
+            run: None,
         }
     }
 
@@ -347,4 +394,13 @@ impl OnRig {
         test.line_s = trips_s.get(trips_s.len() / 2).map(|trip_s| 0.5 * trip_s);
         Ok(test)
     }
+}
+
+/// Ends the folder, and the page, of a run that was not armed.
+fn unarmed(not_armed: Box<NotArmed<Viewed<Handing>>>) -> Failure {
+    let NotArmed { sink, failure, .. } = *not_armed;
+    if let Some(writer) = sink.refused(&failure).into_writer() {
+        connect::not_armed(writer, &failure);
+    }
+    failure
 }

@@ -40,8 +40,8 @@ pub(crate) struct Rows {
     usable: Vec<bool>,
     /// The frame came, without a bead to be trusted.
     pub(crate) unseen: Vec<bool>,
-    /// Sum and number of the ages of the frames that came in time, ns.
-    ages: (i64, i64),
+    /// Age of each row's frame, ns, where it came in time.
+    ages_ns: Vec<Option<i64>>,
     /// Row of each tick since the loop was closed.
     of_tick: Vec<usize>,
 }
@@ -57,6 +57,13 @@ fn usual_age_ns(ticks: &[TickRecord]) -> Option<i64> {
     ages_ns.get(ages_ns.len() / 2).copied()
 }
 
+/// Mean of the ages that are known, s.
+fn mean_s(ages_ns: &[Option<i64>]) -> Option<f64> {
+    let known = ages_ns.iter().flatten();
+    let (sum_ns, count) = known.fold((0, 0), |(sum, count), ns| (sum + ns, count + 1));
+    (count > 0).then(|| 1e-9 * sum_ns as f64 / f64::from(count))
+}
+
 impl Rows {
     pub(crate) fn of(ticks: &[TickRecord], period_ns: i64) -> Self {
         let mut rows = Self {
@@ -64,7 +71,7 @@ impl Rows {
             output: Vec::new(),
             usable: Vec::new(),
             unseen: Vec::new(),
-            ages: (0, 0),
+            ages_ns: Vec::new(),
             of_tick: Vec::new(),
         };
         let closed = ticks
@@ -94,15 +101,13 @@ impl Rows {
                 rows.output.push(f64::NAN);
                 rows.usable.push(true);
                 rows.unseen.push(false);
+                rows.ages_ns.push(None);
             }
             let age_ns = tick.time_ns - tick.mid_exposure_ns;
             // A frame that is half a period off the usual belongs to another row.
             let on_time =
                 new_frame && !has(TickFlags::LOST) && 2 * (age_ns - usual_ns).abs() < period_ns;
-            if on_time {
-                rows.ages.0 += age_ns;
-                rows.ages.1 += 1;
-            }
+            rows.ages_ns[row] = on_time.then_some(age_ns);
             rows.input[row] = tick.command_um;
             rows.output[row] = if on_time { tick.measured_um } else { f64::NAN };
             rows.unseen[row] = is_unseen(tick);
@@ -117,8 +122,7 @@ impl Rows {
 
     /// Mean time from the middle of an exposure to its tick, s; `None` where no frame came in time.
     pub(crate) fn age_s(&self) -> Option<f64> {
-        let (sum_ns, count) = self.ages;
-        (count > 0).then(|| 1e-9 * sum_ns as f64 / count as f64)
+        mean_s(&self.ages_ns)
     }
 
     /// A segment, or what keeps it from being one.
@@ -152,6 +156,7 @@ impl Rows {
         Ok(RecordedSegment {
             index: span.index,
             from: from - start,
+            age_s: mean_s(&self.ages_ns[from..end]),
             input: self.input[start..end].to_vec(),
             output: output.to_vec(),
         })

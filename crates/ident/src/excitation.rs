@@ -8,6 +8,7 @@ use nalgebra::Complex;
 
 use crate::error::IdentError;
 use cellpos_numeric::Random;
+use serde::{Deserialize, Serialize};
 
 /// The ten drive frequencies of the paper's Fig. 4 and 7, Hz.
 pub const PAPER_FREQUENCIES_HZ: [f64; 10] = [
@@ -15,7 +16,7 @@ pub const PAPER_FREQUENCIES_HZ: [f64; 10] = [
 ];
 
 /// One sine of a signal.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Tone {
     /// Frequency, Hz.
     pub frequency_hz: f64,
@@ -26,7 +27,8 @@ pub struct Tone {
 }
 
 /// A signal to add to the PZT command.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
 pub enum Signal {
     /// No excitation: noise only.
     Rest,

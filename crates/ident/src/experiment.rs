@@ -11,7 +11,9 @@ use crate::frequency_response::{
     DrivenStretch, FrequencyPoint, SegmentResponse, Settings, measure,
 };
 use crate::noise::{NoiseModel, apply_noise_model};
+pub use crate::segments::{RecordedSegment, Schedule, Span, common_age_s};
 use cellpos_numeric::Random;
+use serde::{Deserialize, Serialize};
 
 /// One tick of a record.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -34,7 +36,7 @@ pub trait Bench {
 }
 
 /// One stretch of an experiment.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct PlannedSegment {
     /// Its name, for reports.
     pub label: String,
@@ -54,7 +56,7 @@ pub struct PlannedSegment {
 const RELEASE_S: f64 = 0.2;
 
 /// A list of segments at one sampling period.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Plan {
     /// Time between ticks, s.
     pub period_s: f64,
@@ -65,7 +67,7 @@ pub struct Plan {
 }
 
 /// A segment to be run, and how strongly.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Turn {
     /// Index of the segment in the plan.
     pub index: usize,
@@ -304,6 +306,7 @@ impl Plan {
             let mut record = RecordedSegment {
                 index,
                 from: settle,
+                age_s: None,
                 input: Vec::with_capacity(total),
                 output: Vec::with_capacity(total),
             };
@@ -360,7 +363,9 @@ impl Plan {
         Ok(done)
     }
 
-    /// Measures the response at every driven line of the recorded segments and brings the noise model in.
+    /// Measures the response at every driven line of the recorded segments and brings the noise model in. Each point is told how much
+    /// older its frames were than [`common_age_s`]: the clock of a camera that runs freely drifts through the loop's grid in a
+    /// minute, and each segment meets another part of it.
     ///
     /// # Errors
     /// Those of [`measure`].
@@ -371,6 +376,7 @@ impl Plan {
     ) -> Result<Measured, IdentError> {
         let mut points: Vec<FrequencyPoint> = Vec::new();
         let mut segments = Vec::new();
+        let common_s = common_age_s(records);
         for record in records {
             let planned = &self.segments[record.index];
             if planned.lines_hz.is_empty() {
@@ -389,7 +395,12 @@ impl Plan {
                 block_s: planned.signal.repeats_s(),
                 ..*settings
             };
-            let response = measure(&segment, &settings)?;
+            let mut response = measure(&segment, &settings)?;
+            if let (Some(age_s), Some(common_s)) = (record.age_s, common_s) {
+                for point in &mut response.points {
+                    point.later_s = age_s - common_s;
+                }
+            }
             points.extend(response.points.iter().cloned());
             segments.push(response);
         }
@@ -423,41 +434,6 @@ fn rows(seconds: f64, period_s: f64) -> usize {
 /// Share of the excitation in row `k` of `release` rows of fading out.
 fn fade_out(k: usize, release: usize) -> f64 {
     0.5 + 0.5 * (std::f64::consts::PI * (k + 1) as f64 / release as f64).cos()
-}
-
-/// Segments laid end to end.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Schedule {
-    /// What to add to the command, um, one value per tick.
-    pub excitation_um: Vec<f64>,
-    /// Where each segment lies.
-    pub spans: Vec<Span>,
-}
-
-/// Place of a segment in a [`Schedule`].
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Span {
-    /// The segment's place in the plan.
-    pub index: usize,
-    /// Its first tick.
-    pub start: usize,
-    /// Ticks of settling, not used.
-    pub settle: usize,
-    /// Ticks in all, settling included, fading out not.
-    pub rows: usize,
-}
-
-/// What a segment recorded.
-#[derive(Debug, Clone, PartialEq)]
-pub struct RecordedSegment {
-    /// Its place in the plan.
-    pub index: usize,
-    /// First row after settling.
-    pub from: usize,
-    /// Commanded displacement per row, um.
-    pub input: Vec<f64>,
-    /// Bead position per row, um; `NaN` where there was none.
-    pub output: Vec<f64>,
 }
 
 /// Why a run ended early, and its results so far.

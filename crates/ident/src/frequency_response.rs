@@ -91,9 +91,24 @@ pub struct FrequencyPoint {
     pub block_errors: Vec<Complex<f64>>,
     /// Rows used.
     pub rows: usize,
+    /// How much older the frames of this point were at their ticks than those of all points on average, s.
+    pub later_s: f64,
 }
 
 impl FrequencyPoint {
+    /// The same point, its output times `factor`.
+    pub(crate) fn scaled(&self, factor: Complex<f64>) -> Self {
+        let power = factor.norm_sqr();
+        Self {
+            response: self.response * factor,
+            output: self.output * factor,
+            scatter_variance: self.scatter_variance * power,
+            variance: self.variance * power,
+            block_errors: self.block_errors.iter().map(|e| e * factor).collect(),
+            ..self.clone()
+        }
+    }
+
     /// Gain, dB.
     pub fn gain_db(&self) -> f64 {
         20.0 * self.response.norm().log10()
@@ -296,6 +311,7 @@ fn point(
         output,
         block_errors,
         rows,
+        later_s: 0.0,
     })
 }
 

@@ -39,6 +39,7 @@ pub mod noise;
 pub mod order_selection;
 pub mod rational;
 pub mod sampled;
+mod segments;
 pub mod spectral;
 pub mod summary;
 pub mod tone_fit;

@@ -240,6 +240,7 @@ pub fn welch(
                 output: Complex::from(yy[i].sqrt() * scale),
                 block_errors: Vec::new(),
                 rows: input.len(),
+                later_s: 0.0,
             })
         })
         .collect()

@@ -11,6 +11,7 @@ use crate::candidate_model::CandidateModel;
 use crate::delay::DelayEstimate;
 use crate::error::IdentError;
 use crate::experiment::Measured;
+use crate::frequency_response::FrequencyPoint;
 use crate::identifiability::{Judged, judge};
 use crate::order_selection::{
     CandidateFits, CandidateOrder, DelayPrior, OrderSelection, index, model_of,
@@ -79,13 +80,14 @@ pub fn compensated(
 /// # Errors
 /// Those of [`OrderSelection::new`] and [`OrderSelection::fit`].
 pub fn summarise(
-    measured: Measured,
+    mut measured: Measured,
     sampling: Sampling,
     led: Option<DelayEstimate>,
     bootstrap: usize,
     seed: u64,
     stated_per_s: Option<f64>,
 ) -> Result<Identification, IdentError> {
+    measured.points = of_one_delay(measured.points, sampling)?;
     let problem = OrderSelection::new(&measured.points, sampling, None)?;
     let selection = problem.fit()?;
     let prior = led.map(|l| DelayPrior {
@@ -134,6 +136,36 @@ pub fn summarise(
     };
     result.warnings = warnings(&result, stated_per_s);
     Ok(result)
+}
+
+/// Points whose frames were older or younger than on average, as frames of the average age would have shown them.
+///
+/// More of a delay is more than a turn of the phase: what of the held command's images folds back onto a line turns by another
+/// angle. A fit of the points that are turned alone knows the plant well enough for that part.
+fn of_one_delay(
+    points: Vec<FrequencyPoint>,
+    sampling: Sampling,
+) -> Result<Vec<FrequencyPoint>, IdentError> {
+    if points.iter().all(|p| p.later_s == 0.0) {
+        return Ok(points);
+    }
+    let turned = points.iter().map(|p| {
+        let angle = std::f64::consts::TAU * p.frequency_hz * p.later_s;
+        p.scaled(Complex::from_polar(1.0, angle))
+    });
+    let turned: Vec<FrequencyPoint> = turned.collect();
+    let model = OrderSelection::new(&turned, sampling, None)?
+        .fit()?
+        .best()
+        .model;
+    let shown = |p: &FrequencyPoint, later_s: f64| {
+        let delay_s = model.delay_s + later_s;
+        CandidateModel { delay_s, ..model }.sampled_response(p.frequency_hz, sampling)
+    };
+    let all = points.iter();
+    Ok(all
+        .map(|p| p.scaled(shown(p, 0.0) / shown(p, p.later_s)))
+        .collect())
 }
 
 /// A phase moved by whole turns to within half a turn of `near`.

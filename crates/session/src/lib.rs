@@ -38,6 +38,7 @@ mod crop;
 pub mod cyclic;
 mod devices;
 pub mod ended;
+pub mod exciting;
 mod failure;
 mod fit;
 mod frames_seen;

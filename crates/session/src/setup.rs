@@ -3,6 +3,7 @@
 
 use crate::Failure;
 use crate::cyclic::LearnSpec;
+use crate::exciting::Exciting;
 pub use crate::prepared::Prepared;
 use cellpos_control::design::{
     DesignPlant, DesignRequest, PiSearch, Requested, default_lead, design, margins,
@@ -11,6 +12,7 @@ use cellpos_control::design::{
 use cellpos_control::{
     Controller, ControllerConfig, ControllerFile, ControllerKind, Limits, Profile, Shape,
 };
+use cellpos_ident::experiment::Turn;
 use cellpos_plant::Model;
 use cellpos_runtime::{
     ArmingConfig, Core, Learners, ReferenceGenerator, ReferenceInput, ReferenceOutput, Steered,
@@ -60,6 +62,13 @@ pub enum ReferenceSpec {
         #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
         waveforms: BTreeMap<String, String>,
     },
+    /// Hold at 0 um with an excitation of the command on top.
+    Excitation {
+        /// The segments planned.
+        plan: cellpos_ident::experiment::Plan,
+        /// Those of them that are played, in order.
+        todo: Vec<Turn>,
+    },
 }
 
 /// What generates the reference of a loop: a position, or a script.
@@ -71,6 +80,8 @@ pub enum AnyReference {
     Profile(Profile),
     /// A script.
     Script(Box<Follower>),
+    /// An excitation of the command.
+    Exciting(Box<Exciting>),
 }
 
 impl ReferenceGenerator for AnyReference {
@@ -79,6 +90,14 @@ impl ReferenceGenerator for AnyReference {
             Self::Hold(steered) => steered.step(input, preview_um),
             Self::Profile(profile) => ReferenceGenerator::step(profile, input, preview_um),
             Self::Script(follower) => follower.step(input, preview_um),
+            Self::Exciting(exciting) => exciting.step(input, preview_um),
+        }
+    }
+
+    fn excitation_um(&self) -> f64 {
+        match self {
+            Self::Exciting(exciting) => exciting.excitation_um(),
+            Self::Hold(_) | Self::Profile(_) | Self::Script(_) => 0.0,
         }
     }
 
@@ -86,6 +105,7 @@ impl ReferenceGenerator for AnyReference {
         match self {
             Self::Hold(_) | Self::Profile(_) => false,
             Self::Script(follower) => follower.finished(),
+            Self::Exciting(exciting) => exciting.finished(),
         }
     }
 }
@@ -141,6 +161,9 @@ impl ReferenceSpec {
                     .with_elapsed(*ran_s)
                     .with_first_length(*first_length_um);
                 AnyReference::Script(Box::new(follower))
+            }
+            Self::Excitation { plan, todo } => {
+                AnyReference::Exciting(Box::new(Exciting::new(plan, todo)))
             }
         })
     }

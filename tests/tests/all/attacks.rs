@@ -1,9 +1,11 @@
 //! A few of each attack; the command `attack` runs them in the numbers of a night.
 
 use cellpos_tests::attack::{self, Attacked, Chance};
+use cellpos_tests::programs::alone;
 use std::path::Path;
 
 fn stands(attack: impl Fn(&Path, u64, &mut Chance) -> Attacked, tries: u64) {
+    let _alone = alone();
     let folder = tempfile::tempdir().unwrap();
     let attacked = attack(folder.path(), tries, &mut Chance::new(7));
     assert!(attacked.tries >= 1, "{attacked:?}");

@@ -11,15 +11,12 @@ use serde_json::Value;
 use std::io::{BufRead, BufReader, Write};
 use std::path::PathBuf;
 use std::process::{Child, ChildStdout, Command, Stdio};
-use std::sync::Mutex;
 use std::time::Duration;
 
 const PARK_UM: f64 = 12.0;
 const SLEW_UM_PER_S: f64 = 3_000.0;
 const LOW_UM: f64 = 4.0;
 const HIGH_UM: f64 = 36.0;
-/// One rig at a time: each wants a CPU.
-static ONE_AT_A_TIME: Mutex<()> = Mutex::new(());
 
 /// QEMU with the firmware, and plant and camera around it.
 struct Rig {
@@ -207,7 +204,7 @@ fn finished(child: Child) -> Value {
 #[test]
 #[ignore = "needs qemu-system-arm and a cross build: scripts/firmware-qemu.sh"]
 fn a_bead_is_held_through_arm_code_for_twenty_seconds() {
-    let _alone = ONE_AT_A_TIME.lock().unwrap_or_else(|p| p.into_inner());
+    let _alone = programs::alone();
     let rig = Rig::start(300, 2_000);
     let result = finished(rig.track("--duration 20s"));
     assert_eq!(result["end"], "duration", "{result}");
@@ -234,7 +231,7 @@ fn a_bead_is_held_through_arm_code_for_twenty_seconds() {
 #[test]
 #[ignore = "needs qemu-system-arm and a cross build: scripts/firmware-qemu.sh"]
 fn a_killed_host_leaves_the_board_holding_and_then_parked() {
-    let _alone = ONE_AT_A_TIME.lock().unwrap_or_else(|p| p.into_inner());
+    let _alone = programs::alone();
     let rig = Rig::start(300, 1_500);
     let mut child = rig.track("");
     rig.wait_for_the_loop(&mut child);
@@ -266,7 +263,7 @@ fn a_killed_host_leaves_the_board_holding_and_then_parked() {
 #[test]
 #[ignore = "needs qemu-system-arm and a cross build: scripts/firmware-qemu.sh"]
 fn garbage_on_the_line_costs_frames_and_not_the_bead() {
-    let _alone = ONE_AT_A_TIME.lock().unwrap_or_else(|p| p.into_inner());
+    let _alone = programs::alone();
     let rig = Rig::start(300, 2_000);
     let mut child = rig.track("--duration 8s");
     rig.wait_for_the_loop(&mut child);
@@ -307,7 +304,7 @@ fn garbage_on_the_line_costs_frames_and_not_the_bead() {
 #[test]
 #[ignore = "needs qemu-system-arm and a cross build: scripts/firmware-qemu.sh"]
 fn a_host_that_stalls_is_held_for_and_takes_up_again_and_one_that_stays_away_is_parked() {
-    let _alone = ONE_AT_A_TIME.lock().unwrap_or_else(|p| p.into_inner());
+    let _alone = programs::alone();
     let rig = Rig::start(40, 2_000);
     let mut child = rig.track("--duration 8s");
     rig.wait_for_the_loop(&mut child);

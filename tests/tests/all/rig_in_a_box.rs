@@ -4,26 +4,16 @@
 //! where they are not what the test is about.
 
 use cellpos_record::RunReader;
-use cellpos_tests::programs::{BoxRow, RigInABox, cellpos, stdout, wait_until};
+use cellpos_tests::programs::{BoxRow, RigInABox, alone, cellpos, stdout, wait_until};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 use std::process::Stdio;
-use std::sync::{Mutex, MutexGuard};
 use std::time::Duration;
-
-/// One rig at a time: each wants a CPU.
-static ONE_AT_A_TIME: Mutex<()> = Mutex::new(());
 
 const PARK_UM: f64 = 12.0;
 const SLEW_UM_PER_S: f64 = 1000.0;
 const WATCHDOG_MS: f64 = 20.0;
 const HOLD_WATCHDOG_MS: f64 = 150.0;
-
-fn alone() -> MutexGuard<'static, ()> {
-    ONE_AT_A_TIME
-        .lock()
-        .unwrap_or_else(|poisoned| poisoned.into_inner())
-}
 
 /// rig.toml for the box, patient with stalls of the machine unless `watchdog_ms` is short.
 fn write_rig(folder: &Path, watchdog_ms: f64) {

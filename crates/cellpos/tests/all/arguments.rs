@@ -103,7 +103,7 @@ fn an_export_goes_down_a_pipe() {
     let at = folder.path();
     succeed(
         at,
-        "track --target 0um --duration 1s --clock virtual --frames off --name one",
+        "track --target 0um --duration 1s --clock virtual --frames off --ideal --name one",
     );
     for out in ["-", "/dev/stdout"] {
         let line = format!("export latest-one --out {out} --columns seq --to 2ms");

@@ -22,7 +22,7 @@ fn hold(folder: &Path, faults: &str, duration: &str, seed: u64) -> Run {
 pub(crate) fn hold_by(folder: &Path, law: &str, faults: &str, duration: &str, seed: u64) -> Run {
     std::fs::write(
         folder.join("rig.toml"),
-        format!("[emulator.faults]\n{faults}\n"),
+        format!("[emulator]\nideal = true\n[emulator.faults]\n{faults}\n"),
     )
     .unwrap();
     let ran = cellpos(
@@ -233,7 +233,7 @@ fn of_two_beads_in_view_the_one_that_was_asked_for_is_followed() {
     let at = folder.path();
     let rig = |more: &str| {
         format!(
-            "{more}[emulator.faults]\nsecond_bead_um = 6.0\nevent = [{{ kind = \"second-bead\", at_s = 0.0 }}]\n"
+            "{more}[emulator]\nideal = true\n[emulator.faults]\nsecond_bead_um = 6.0\nevent = [{{ kind = \"second-bead\", at_s = 0.0 }}]\n"
         )
     };
     std::fs::write(at.join("rig.toml"), rig("")).unwrap();

@@ -29,7 +29,7 @@ fn sensitivity(stage: &Value) -> (f64, f64) {
     (predicted / real, real)
 }
 
-const SHORT: &str = "--seed 5 --frames off --effort 0.2 --max-effects 2 --rounds 0 --duration 6s --json --out augmented.toml --report circle.html";
+const SHORT: &str = "--seed 5 --ideal --frames off --effort 0.2 --max-effects 2 --rounds 0 --duration 6s --json --out augmented.toml --report circle.html";
 
 #[test]
 fn a_delay_that_nobody_told_of_is_found_and_the_margins_come_back() {

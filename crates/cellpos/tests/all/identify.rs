@@ -70,6 +70,7 @@ fn a_model_with_a_literal_63_per_s_is_flagged_as_a_factor_of_two_pi() {
             "off",
             "--frequency",
             "5Hz,20Hz,60Hz,150Hz",
+            "--ideal",
             "--bootstrap",
             "0",
             "--led-edges",

@@ -24,7 +24,7 @@ const LOOKS: [(&str, &str); 3] = [
     ),
     (
         "faint-small",
-        "bead_look = \"spot\"\nbead_radius_um = 0.25\ncontrast_grey = 25.0\n",
+        "ideal = true\nbead_look = \"spot\"\nbead_radius_um = 0.25\ncontrast_grey = 25.0\n",
     ),
 ];
 

@@ -26,7 +26,7 @@ fn a_bead_is_held_through_frames_within_reach_of_the_lowest_possible_error() {
     let folder = tempfile::tempdir().unwrap();
     let r = track(
         folder.path(),
-        "--target 0um --duration 10s --frames on --seed 7",
+        "--target 0um --duration 10s --frames on --ideal --seed 7",
     );
     assert_eq!(r["state"], "running");
     assert_eq!(number(&r, "ticks"), 10_000.0);
@@ -322,7 +322,7 @@ fn previewed_sines_are_followed_within_1_5_times_the_hold_error_where_the_model_
     let folder = tempfile::tempdir().unwrap();
     std::fs::write(
         folder.path().join("rig.toml"),
-        "[emulator]\nlocalisation_um = 0.02\n",
+        "[emulator]\nideal = true\nlocalisation_um = 0.02\n",
     )
     .unwrap();
     for controller in ["lqg", "mpc --solver active-set"] {
@@ -349,7 +349,7 @@ fn a_sine_of_300_hz_is_learned_to_twice_the_hold_error_with_half_a_millisecond_o
     model_with_gain(folder.path(), 1.2);
     std::fs::write(
         folder.path().join("rig.toml"),
-        "[emulator]\nmodel = \"plant.toml\"\n[timing]\ncamera_delay_ms = 1.75\n",
+        "[emulator]\nideal = true\nmodel = \"plant.toml\"\n[timing]\ncamera_delay_ms = 1.75\n",
     )
     .unwrap();
     let line = "track --target 0um --controller lqg --duration 4s --clock virtual --frames off --seed 5 --no-record --json --rig rig.toml";
@@ -366,7 +366,7 @@ fn a_bead_that_is_drawn_out_over_its_frames_is_seen_in_each_of_them() {
     let folder = tempfile::tempdir().unwrap();
     for sine in ["5um@50Hz", "5um@100Hz"] {
         let line = format!(
-            "--target 0um --controller lqg --duration 3s --seed 5 --no-record --sine {sine}"
+            "--target 0um --controller lqg --duration 3s --ideal --seed 5 --no-record --sine {sine}"
         );
         let r = track(folder.path(), &line);
         assert!(number(&r, "fixes_lost") < 10.0, "{sine}: {r}");
@@ -379,7 +379,7 @@ fn a_bead_that_is_drawn_out_over_its_frames_is_seen_in_each_of_them() {
 fn a_sine_is_learned_kept_with_the_run_replayed_and_gone_on_from() {
     let folder = tempfile::tempdir().unwrap();
     model_with_gain(folder.path(), 0.8);
-    let line = "track --target 0um --sine 5um@100Hz --controller mpc --solver active-set --duration 2.6s --clock virtual --frames off --seed 3 --rig rig.toml --adapt off --json";
+    let line = "track --target 0um --ideal --sine 5um@100Hz --controller mpc --solver active-set --duration 2.6s --clock virtual --frames off --seed 3 --rig rig.toml --adapt off --json";
     let without = succeed(folder.path(), line).json();
     let with = succeed(folder.path(), &format!("{line} --learn")).json();
     assert!(number(&with, "rms_true_nm") < 100.0, "{with}");

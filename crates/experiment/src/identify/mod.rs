@@ -6,7 +6,7 @@ mod partial;
 
 use crate::on_rig::{Acquired, Listener, OnRig, Trouble};
 use cellpos_ident::excitation::ExcitationLimits;
-use cellpos_ident::experiment::{Cause, Measured, Plan, RecordedSegment, Turn};
+use cellpos_ident::experiment::{Cause, Measured, Plan, RecordedSegment, Turn, common_age_s};
 use cellpos_ident::frequency_response::Settings;
 use cellpos_ident::summary::{Identification, summarise};
 use cellpos_plant::Hertz;
@@ -71,6 +71,8 @@ pub struct Done {
     pub neutral_um: f64,
     /// Mean time from the middle of an exposure to the tick that used it, s: the camera's part of the delay.
     pub age_s: f64,
+    /// Folders of the runs on the rig, which replay and report as any other.
+    pub runs: Vec<String>,
 }
 
 /// Runs a job; `progress` hears ticks done and ticks in all.
@@ -98,10 +100,13 @@ pub fn run_shown(
         age_s,
         fix_noise_um,
         mut warnings,
+        runs,
     } = match &job.rig {
         Some(rig) => on_rig(job, rig, &plan, records, &mut heard, pages)?,
         None => held_bead(job, &plan, records, &mut heard)?,
     };
+    // What the lines were brought to is what the delay is made of.
+    let age_s = common_age_s(&records).unwrap_or(age_s);
     let measured = plan
         .analyse(&records, &Settings::default())
         .map_err(Failure::failed)?;
@@ -126,6 +131,7 @@ pub fn run_shown(
         led,
         neutral_um,
         age_s,
+        runs,
     })
 }
 
@@ -152,6 +158,7 @@ struct Raw {
     age_s: f64,
     fix_noise_um: Option<f64>,
     warnings: Vec<String>,
+    runs: Vec<String>,
 }
 
 fn held_bead(
@@ -180,6 +187,7 @@ fn held_bead(
         age_s,
         fix_noise_um,
         warnings: Vec::new(),
+        runs: Vec::new(),
     })
 }
 
@@ -220,6 +228,7 @@ fn on_rig(
     let mut in_vain = 0;
     let mut spoilt = vec![0; plan.segments.len()];
     let mut warnings = Vec::new();
+    let mut runs = Vec::new();
     let mut had_bead = false;
     let mut neutral_um = rig.file.first_neutral_um;
     let mut age_s = rig.file.timing.camera_delay_ms * 1e-3;
@@ -250,6 +259,7 @@ fn on_rig(
         neutral_um = acquired.neutral_um;
         age_s = acquired.age_s.unwrap_or(age_s);
         fix_noise_um = acquired.fix_noise_um.or(fix_noise_um);
+        runs.extend(acquired.run.clone());
         had_bead |= !acquired.rows.0.is_empty();
         let run_through = matches!(acquired.trouble, Some(Trouble::Spoilt { .. }));
         let failed = missing(plan, &records, &spoilt);
@@ -302,6 +312,7 @@ fn on_rig(
         age_s,
         fix_noise_um,
         warnings,
+        runs,
     })
 }
 
@@ -449,6 +460,7 @@ mod tests {
         let measured = RecordedSegment {
             index: 1,
             from: 0,
+            age_s: None,
             input: Vec::new(),
             output: Vec::new(),
         };

@@ -19,6 +19,8 @@ struct Partial {
 struct Kept {
     index: usize,
     from: usize,
+    #[serde(default)]
+    age_s: Option<f64>,
     input_um: Vec<f64>,
     /// `null` where no frame showed the bead.
     output_um: Vec<Option<f64>>,
@@ -40,6 +42,7 @@ pub fn save(path: &Path, plan: &Plan, records: &[RecordedSegment]) -> Result<(),
             .map(|r| Kept {
                 index: r.index,
                 from: r.from,
+                age_s: r.age_s,
                 input_um: r.input.clone(),
                 output_um: r
                     .output
@@ -72,6 +75,7 @@ pub fn load(path: &Path, plan: &Plan) -> Result<Vec<RecordedSegment>, Failure> {
         k.index < plan.segments.len()
             && k.input_um.len() == k.output_um.len()
             && k.from < k.input_um.len()
+            && k.age_s.is_none_or(f64::is_finite)
             && k.input_um.iter().all(|u| u.is_finite())
     };
     if !partial.segments.iter().all(sound) {
@@ -83,6 +87,7 @@ pub fn load(path: &Path, plan: &Plan) -> Result<Vec<RecordedSegment>, Failure> {
         .map(|k| RecordedSegment {
             index: k.index,
             from: k.from,
+            age_s: k.age_s,
             input: k.input_um,
             output: k
                 .output_um

@@ -37,7 +37,7 @@ fn held(ticks: u64) {
     let clock = Clock::virtual_at(0);
     let world = WorldConfig {
         seed: 24,
-        ..WorldConfig::default()
+        ..WorldConfig::ideal()
     };
     let rig =
         EmulatedRig::new(BoardConfig::default(), &world, &Model::eq6(), clock.clone()).unwrap();

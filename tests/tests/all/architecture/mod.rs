@@ -334,8 +334,8 @@ fn a_layer_knows_only_what_stands_below_it() {
         (
             "session",
             &[
-                "plant", "control", "vision", "emulator", "rig", "drivers", "runtime", "record",
-                "live", "script",
+                "plant", "ident", "control", "vision", "emulator", "rig", "drivers", "runtime",
+                "record", "live", "script",
             ],
         ),
         (
@@ -355,6 +355,7 @@ fn a_layer_knows_only_what_stands_below_it() {
                 "rig",
                 "drivers",
                 "runtime",
+                "record",
                 "session",
                 "ident",
                 "reconcile",

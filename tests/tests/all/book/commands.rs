@@ -5,7 +5,6 @@ use cellpos_tests::programs;
 use std::collections::BTreeMap;
 use std::path::Path;
 use std::process::Command;
-use std::sync::Mutex;
 use std::time::Instant;
 
 /// What builds and installs has been done by whoever runs this.
@@ -83,7 +82,7 @@ fn try_page(page: &str, script: &str) -> Result<(), String> {
     ))
 }
 
-/// All pages, two at a time; a page's commands run one after another.
+/// All pages, one after another: some of their commands hold a bead in real time.
 fn run_pages(slow: bool) {
     let with_commands: Vec<(String, String)> = pages()
         .into_iter()
@@ -98,22 +97,11 @@ fn run_pages(slow: bool) {
         with_commands.len() >= 4,
         "are the pages still marked with sh?"
     );
-    let queue = Mutex::new(with_commands.into_iter());
-    let failed = Mutex::new(Vec::new());
-    std::thread::scope(|scope| {
-        for _ in 0..2 {
-            scope.spawn(|| {
-                loop {
-                    let next = queue.lock().unwrap().next();
-                    let Some((page, script)) = next else { break };
-                    if let Err(said) = run(&page, &script) {
-                        failed.lock().unwrap().push(said);
-                    }
-                }
-            });
-        }
-    });
-    let failed = failed.into_inner().unwrap();
+    let _alone = programs::alone();
+    let failed: Vec<String> = with_commands
+        .iter()
+        .filter_map(|(page, script)| run(page, script).err())
+        .collect();
     assert!(failed.is_empty(), "{}", failed.join("\n\n"));
 }
 

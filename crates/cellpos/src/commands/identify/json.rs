@@ -102,6 +102,7 @@ pub fn identification(done: &Done, job: &Job, model: &Path, report: &Path) -> Va
         "ladder": orders,
         "neutral_um": done.neutral_um,
         "warnings": result.warnings,
+        "runs": done.runs,
         "model": model.display().to_string(),
         "report": report.display().to_string(),
     })
@@ -141,6 +142,9 @@ pub fn text(done: &Done, model: &Path, report: &Path) -> String {
     }
     for warning in &result.warnings {
         let _ = writeln!(out, "warning: {warning}");
+    }
+    if !done.runs.is_empty() {
+        let _ = writeln!(out, "runs  {}", done.runs.join(" "));
     }
     let _ = writeln!(out, "wrote {} and {}", model.display(), report.display());
     out

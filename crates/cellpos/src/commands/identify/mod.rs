@@ -362,6 +362,9 @@ pub fn run(args: Args) -> CommandResult {
         .as_ref()
         .map(|out| out.with_extension("partial.json"));
     job.keep_in = beside.or(folder.as_ref().map(|f| f.join("partial.json")));
+    if let Some(rig) = &mut job.rig {
+        rig.record_in = Some(PathBuf::from("runs"));
+    }
     let bar = output::progress_bar(Some(0));
     bar.set_style(
         indicatif::ProgressStyle::with_template("{bar:40} {pos}/{len} ticks, {eta} left")

@@ -7,6 +7,8 @@ use crate::commands::run::resume;
 use crate::outcome::Failure;
 use cellpos_record::RunReader;
 use cellpos_runtime::{Life, TickFlags, TickRecord};
+use cellpos_session::recorded;
+use cellpos_session::setup::{ReferenceSpec, SetupConfig};
 use cellpos_table::{ColumnRef, Table};
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -247,6 +249,17 @@ fn runs(path: &Path) -> Result<Vec<Source>, Failure> {
     let mut sources = Vec::new();
     for (number, folder) in (1u64..).zip(&folders) {
         let reader = RunReader::open(folder).map_err(Failure::input)?;
+        let config = recorded::setup(&reader).map(|setup| setup.config);
+        if let Ok(SetupConfig {
+            reference: ReferenceSpec::Excitation { .. },
+            ..
+        }) = config
+        {
+            return Err(Failure::bad_input(
+                format!("{}: is the run of an identification", path.display()),
+                "its model and report are what identify wrote; to measure again: cellpos identify --rig",
+            ));
+        }
         let ticks = || {
             let batches = reader.batches().map_err(Failure::input)?;
             Ok(batches.flatten().map(Tick::from))
