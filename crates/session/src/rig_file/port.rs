@@ -82,9 +82,7 @@ mod tests {
 
     #[test]
     fn a_port_that_is_not_there_is_named() {
-        let failure = open("/dev/does-not-exist", 1_000_000)
-            .err()
-            .expect("an error");
+        let failure = open("/dev/does-not-exist", 1_000_000).expect_err("an error");
         let said = failure.text();
         assert!(said.contains("/dev/does-not-exist"), "{said}");
         assert!(format!("{failure:?}").contains("plugged in"), "{failure:?}");
