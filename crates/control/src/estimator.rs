@@ -22,6 +22,7 @@ use transition::Transition;
 
 pub use config::EstimatorConfig;
 pub(crate) use config::planned_gap;
+pub use flow_step::flow_step_log_density;
 pub use transition::PredictedState;
 
 /// Past commands held: a delay of up to 15 samples, which is 3 ms at 5 kHz.

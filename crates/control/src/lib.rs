@@ -54,6 +54,7 @@ pub use controller::{Controller, ControllerConfig, LoopConfig};
 pub use error::{BuildError, Parameter};
 pub use estimator::{
     Estimate, Estimator, EstimatorConfig, EstimatorState, HISTORY, PredictedState,
+    flow_step_log_density,
 };
 pub use feedforward::FeedForwardState;
 pub use law::{

@@ -167,8 +167,8 @@ impl<R: ReferenceGenerator> Core<R> {
         let settings = controller.settings();
         let monitor = PlantMonitor::new(settings.estimator, settings.model)?;
         let following = following::Following::new(
-            sample_s,
-            settings.model.gain_per_s,
+            &settings.estimator,
+            &settings.model,
             timing.camera_delay_ms * 1e-3,
         );
         let clipped = clipped::Clipped::new(
@@ -452,9 +452,9 @@ impl<R: ReferenceGenerator> Core<R> {
         };
         let output = self.controller.step(&given);
         self.state.told_um = output.neutral_um;
-        self.watch_following(fix, generated.reference_um, &output, tick);
+        self.watch_rest(fix, &output);
         let obeyed = in_force.is_none();
-        self.watch_clipping(fix, generated.reference_um, obeyed, &output, tick);
+        self.watch_following(fix, generated.reference_um, obeyed, &output, tick);
         let nominal = self.timing.camera_delay_ms * 1e-3 / self.sample_s;
         let used = fix.filter(|_| !output.flags.coasting && !output.flags.stuck);
         let seen = used.map(|fix| {

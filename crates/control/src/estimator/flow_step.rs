@@ -13,10 +13,19 @@ use std::f64::consts::TAU;
 const STEPS_PER_S: f64 = 0.01;
 /// Natural logarithm of the fastest flow over the slowest that is told from the quiet walk: 400, as the tracker takes it.
 const LOG_RANGE: f64 = 6.0;
+/// No fix is better than that: nearer than it no step is told, um.
+const LEAST_OFF_UM: f64 = 1e-3;
 /// An innovation of up to so many times what the last commands moved the bead in a tick can come from a plant that is not the
 /// model's: a gain that jumps from half to twice is four times what the law has followed and adds the motion three times; a tick
 /// of delay where the motion turns round makes it twice that.
 const MOTION_SHARE: f64 = 6.0;
+
+/// Natural logarithm of the density (1/um) of a fix that is `off_um` from where a quiet flow would have it, if the flow has stepped
+/// within the last `since_s`: any speed is as likely as any other on a logarithmic scale.
+pub fn flow_step_log_density(off_um: f64, since_s: f64) -> f64 {
+    let chance = (STEPS_PER_S * since_s).min(1.0);
+    (chance / (2.0 * LOG_RANGE * off_um.abs().max(LEAST_OFF_UM))).ln()
+}
 
 impl Estimator {
     /// Whether a step of the flow since the last fix that was used explains an innovation better than the quiet model does, in
@@ -39,9 +48,7 @@ impl Estimator {
         let quiet =
             -0.5 * (innovation_um * innovation_um / variance_um2 + (TAU * variance_um2).ln());
         let since_s = f64::from(state.ticks_since_fix.max(1)) * self.model().sample_time_s;
-        let chance = (STEPS_PER_S * since_s).min(1.0);
-        let stepped = (chance / (2.0 * LOG_RANGE * innovation_um.abs())).ln();
-        stepped > quiet
+        flow_step_log_density(innovation_um, since_s) > quiet
     }
 
     /// What the swing of the last commands moves a bead in a tick, um. It does not lean on neutral, which may be what is wrong.

@@ -204,14 +204,14 @@ impl Clipped {
             let [with, without] = off.map(|um| um * um);
             least_um2 = least_um2.min(with).min(without);
             // Its commands push the bead this way, and it is away the other way.
-            let away = self.away_s >= AWAY_S && side * self.error_um < 0.0;
+            let away = self.away_s > 0.0 && side * self.error_um < 0.0;
             if !away {
                 *evidence = 0.0;
             } else if !stepped {
                 let odds = (with - without) / (2.0 * self.variance_um2);
                 *evidence = (*evidence + odds.clamp(-MOST_PER_FIX, MOST_PER_FIX)).max(0.0);
             }
-            if *evidence > EVIDENCE {
+            if *evidence > EVIDENCE && self.away_s >= AWAY_S {
                 level_um = Some(self.zero_flow_um);
             }
         }

@@ -1,6 +1,6 @@
 //! What is watched besides the bead: whether it follows the commands, and what its motion tells of the plant.
 
-use super::{Core, following};
+use super::Core;
 use crate::life::{EventKind, FreezeReason, Life};
 use crate::reference::ReferenceGenerator;
 use crate::tick::Tick;
@@ -8,14 +8,8 @@ use crate::tick_record::TickFlags;
 use cellpos_control::{LoopOutput, Measurement as LoopMeasurement};
 
 impl<R: ReferenceGenerator> Core<R> {
-    /// A bead that moves against the commands is frozen, at the zero flow of before.
-    pub(super) fn watch_following(
-        &mut self,
-        fix: Option<LoopMeasurement>,
-        reference_um: f64,
-        output: &LoopOutput,
-        tick: &mut Tick,
-    ) {
+    /// What the newest fix says of the zero flow at which a PZT would stop.
+    pub(super) fn watch_rest(&mut self, fix: Option<LoopMeasurement>, output: &LoopOutput) {
         let Some(fix) = fix.filter(|_| self.state.life == Life::Running) else {
             return;
         };
@@ -27,23 +21,10 @@ impl<R: ReferenceGenerator> Core<R> {
             output.flags,
             self.sample_s,
         );
-        if self.state.frozen.any() || output.flags.stuck {
-            self.state.following.clear();
-            return;
-        }
-        let seen = following::Seen {
-            position_um: fix.position_um,
-            error_um: fix.position_um - reference_um,
-            command_um: output.command_um,
-            zero_flow_um: output.neutral_um,
-        };
-        if self.state.following.step(seen) {
-            self.freeze(FreezeReason::NotFollowing, tick);
-        }
     }
 
-    /// A bead that follows the commands up to a level and no further.
-    pub(super) fn watch_clipping(
+    /// A bead that moves against the commands, or follows them up to a level and no further, is frozen at the zero flow of before.
+    pub(super) fn watch_following(
         &mut self,
         fix: Option<LoopMeasurement>,
         reference_um: f64,
@@ -58,20 +39,21 @@ impl<R: ReferenceGenerator> Core<R> {
         let driven = state.life == Life::Running && !state.frozen.any();
         if !driven || !obeyed || output.flags.stuck {
             state.clipped.clear();
+            state.following.clear();
             return;
         }
         let on_time = fix.filter(|fix| {
             !tick.disturbed && fix.age_samples == 0 && fix.offset_samples.abs() < 0.2
         });
-        let level_um = state.clipped.step(
-            on_time.map(|fix| (fix.position_um, fix.variance_um2)),
-            reference_um,
-            output.command_um,
-            output.neutral_um,
-        );
+        let seen = on_time.map(|fix| (fix.position_um, fix.variance_um2));
+        let against = state.following.step(seen, output.command_um);
+        let level_um =
+            (state.clipped).step(seen, reference_um, output.command_um, output.neutral_um);
         if let Some(level_um) = level_um {
             tick.flags.set(TickFlags::CLIPPED);
             tick.event(EventKind::ActuatorClipped { level_um });
+        }
+        if against || level_um.is_some() {
             self.freeze(FreezeReason::NotFollowing, tick);
         }
     }

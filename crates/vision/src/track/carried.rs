@@ -22,7 +22,8 @@ impl Tracker {
                 c.fix.verdict == FixQuality::Good
                     && chosen.identity.agrees(&self.config, &c.fix, c.size)
             };
-            let way = chosen.motion.way_to(&c.fix);
+            let from = chosen.motion.position();
+            let way = (c.seen_px.0 - from.0, c.seen_px.1 - from.1);
             let along_px = f64::hypot(way.0, way.1) * self.exposure_s / since_s;
             if good(&c) || along_px < STREAK_PX {
                 continue;
@@ -32,8 +33,8 @@ impl Tracker {
                 self.streak_px.0 + way.0 * share,
                 self.streak_px.1 + way.1 * share,
             ));
-            let fix = self.localiser.locate(frame, Some((c.fix.x_px, c.fix.y_px)));
-            let carried = Candidate { fix, size: None };
+            let fix = self.localiser.locate(frame, Some(c.seen_px));
+            let carried = Candidate::new(fix, None);
             if good(&carried) {
                 *slot = None;
                 *again = Some(carried);

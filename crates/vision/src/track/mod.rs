@@ -121,13 +121,9 @@ impl Tracker {
             streak_px,
             exposure_s,
         } = commanded.into();
-        let unexplained = self
+        self.streak_px = self
             .chosen
-            .map_or((0.0, 0.0), |c| c.motion.unexplained_px_per_s());
-        self.streak_px = (
-            streak_px.0 + unexplained.0 * exposure_s,
-            streak_px.1 + unexplained.1 * exposure_s,
-        );
+            .map_or(streak_px, |c| c.motion.way_px(streak_px, exposure_s));
         self.exposure_s = exposure_s;
         self.localiser.expect_streak(self.streak_px);
         let (dt_s, time_s) = self.standing.elapse(time_s);
@@ -237,7 +233,7 @@ impl Tracker {
             };
             let good = fix.verdict == FixQuality::Good && self.within_gate(&chosen.motion, &fix);
             if good && chosen.identity.agrees(&self.config, &fix, size) {
-                self.take(chosen, &Candidate { fix, size }, time_s);
+                self.take(chosen, &Candidate::new(fix, size), time_s);
                 return (Decision::Accepted, Some(fix));
             }
         }
@@ -255,7 +251,7 @@ impl Tracker {
         // The detector misses a bead that touches a stronger one; the fit at the prediction may still see it.
         let fix = self.localiser.locate(frame, Some(chosen.motion.position()));
         let size = self.localiser.relative_size(&fix);
-        self.add_candidate(Candidate { fix, size });
+        self.add_candidate(Candidate::new(fix, size));
         self.fit_as_carried(frame, &chosen);
         self.part_touching_beads(frame, &chosen);
 
@@ -410,10 +406,7 @@ impl Tracker {
                     *slot = None;
                 }
             }
-            self.add_candidate(Candidate {
-                fix: *fix,
-                size: None,
-            });
+            self.add_candidate(Candidate::new(*fix, None));
         }
     }
 
@@ -445,9 +438,10 @@ impl Tracker {
             let Some(blob) = self.detector.found().get(k).copied() else {
                 break;
             };
-            let fix = self.localiser.locate(frame, Some((blob.x_px, blob.y_px)));
+            let seen_px = (blob.x_px, blob.y_px);
+            let fix = self.localiser.locate(frame, Some(seen_px));
             let size = self.localiser.relative_size(&fix);
-            self.add_candidate(Candidate { fix, size });
+            self.add_candidate(Candidate { fix, size, seen_px });
         }
     }
 

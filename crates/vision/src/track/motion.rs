@@ -1,4 +1,4 @@
-//! Predicted motion of one object: commanded flow plus an unexplained velocity, with Brownian motion.
+//! Predicted motion of one object: commanded flow, as far as it acts, plus an unexplained velocity, with Brownian motion.
 //!
 //! Two hypotheses stand beside each other in every frame. In the quiet one the unexplained velocity walks. In the other the
 //! flow has stepped since the last fix: a tap on the syringe, a valve. How fast it is then is known to the order of magnitude
@@ -43,14 +43,22 @@ impl Randomness {
     }
 }
 
-/// Position and unexplained velocity along one axis, with covariance (Kalman filter).
+/// Time in which what was learnt of the commanded flow is forgotten, s: a few frames of a piezo in motion teach it anew.
+const FLOW_MEMORY_S: f64 = 0.05;
+
+/// Position, unexplained velocity and relative error of the commanded flow along one axis, with covariance (Kalman filter). An
+/// actuator that is clipped or whose sign is wrong has an error of -1 or -2.
 #[derive(Debug, Clone, Copy)]
 struct Axis {
     p: f64,
     v: f64,
+    e: f64,
     pp: f64,
     pv: f64,
     vv: f64,
+    pe: f64,
+    ve: f64,
+    ee: f64,
 }
 
 impl Axis {
@@ -58,19 +66,32 @@ impl Axis {
         Axis {
             p,
             v: 0.0,
+            e: 0.0,
             pp: var,
             pv: 0.0,
             vv: START_VELOCITY_SD * START_VELOCITY_SD,
+            pe: 0.0,
+            ve: 0.0,
+            ee: 0.0,
         }
     }
 
     fn predict(&mut self, dt_s: f64, flow: f64, r: &Randomness) {
-        self.p += dt_s * (self.v + flow);
-        let flow_sd = r.flow_error * flow * dt_s;
+        // Half of the error's variance stays from frame to frame (gain), half does not (delay).
+        let half = 0.5 * r.flow_error * r.flow_error;
+        let kept = (-dt_s / FLOW_MEMORY_S).exp();
+        self.e *= kept;
+        self.pe *= kept;
+        self.ve *= kept;
+        self.ee = kept * kept * self.ee + (1.0 - kept * kept) * half;
+        let way = dt_s * flow;
+        self.p += dt_s * self.v + way * (1.0 + self.e);
         self.pp += dt_s * (2.0 * self.pv + dt_s * self.vv)
+            + way * (2.0 * self.pe + 2.0 * dt_s * self.ve + way * self.ee)
             + 2.0 * r.diffusion_px2_per_s * dt_s
-            + flow_sd * flow_sd;
-        self.pv += dt_s * self.vv;
+            + half * way * way;
+        self.pv += dt_s * self.vv + way * self.ve;
+        self.pe += dt_s * self.ve + way * self.ee;
         self.vv += r.velocity_walk * r.velocity_walk * dt_s;
     }
 
@@ -85,11 +106,15 @@ impl Axis {
 
     fn update(&mut self, innovation: f64, fix_var: f64) {
         let s = self.pp + fix_var;
-        let (kp, kv) = (self.pp / s, self.pv / s);
+        let (kp, kv, ke) = (self.pp / s, self.pv / s, self.pe / s);
         self.p += kp * innovation;
         self.v += kv * innovation;
+        self.e += ke * innovation;
         self.vv -= kv * self.pv;
+        self.ve -= kv * self.pe;
+        self.ee -= ke * self.pe;
         self.pv *= 1.0 - kp;
+        self.pe *= 1.0 - kp;
         self.pp *= 1.0 - kp;
     }
 }
@@ -123,9 +148,10 @@ impl Motion {
         (self.x.p, self.y.p)
     }
 
-    /// The velocity that no command explains, px/s.
-    pub fn unexplained_px_per_s(&self) -> (f64, f64) {
-        (self.x.v, self.y.v)
+    /// The way that goes with a commanded one, px, and with what no command explains, in `time_s`.
+    pub fn way_px(&self, (x, y): (f64, f64), time_s: f64) -> (f64, f64) {
+        let way = |axis: &Axis, px: f64| px * (1.0 + axis.e) + axis.v * time_s;
+        (way(&self.x, x), way(&self.y, y))
     }
 
     /// Time since the last fix that was taken in, s.
@@ -255,6 +281,28 @@ mod tests {
             "the window must grow: {}",
             motion.sd_px()
         );
+    }
+
+    #[test]
+    fn commands_that_do_not_act_or_act_the_wrong_way_are_learnt_within_frames() {
+        let randomness = Randomness {
+            diffusion_px2_per_s: 33.0,
+            velocity_walk: 300.0,
+            flow_error: 0.5,
+        };
+        // 20 px a frame commanded; the bead stays, or goes the other way.
+        for acts in [0.0, -1.0] {
+            let mut motion = Motion::new(&fix(0.0));
+            for n in 1..=20 {
+                motion.predict(1e-3, (2e4, 0.0), &randomness);
+                motion.update(&fix(20.0 * acts * f64::from(n)));
+            }
+            motion.predict(1e-3, (2e4, 0.0), &randomness);
+            let off_px = motion.position().0 - 420.0 * acts;
+            let (streak_px, _) = motion.way_px((10.0, 0.0), 0.5e-3);
+            assert!(off_px.abs() < 2.0, "{acts}: {off_px}");
+            assert!((streak_px - 10.0 * acts).abs() < 1.0, "{acts}: {streak_px}");
+        }
     }
 
     #[test]

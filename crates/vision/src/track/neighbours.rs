@@ -18,6 +18,19 @@ const MISS: f64 = 30.0;
 pub(crate) struct Candidate {
     pub fix: Fix,
     pub size: Option<(f64, f64)>,
+    /// Where light was seen, px: a fit that expects another motion may have gone elsewhere from there.
+    pub seen_px: (f64, f64),
+}
+
+impl Candidate {
+    /// A fit, whatever it started from.
+    pub fn new(fix: Fix, size: Option<(f64, f64)>) -> Self {
+        Self {
+            fix,
+            size,
+            seen_px: (fix.x_px, fix.y_px),
+        }
+    }
 }
 
 /// Whose a fix is.
@@ -27,9 +40,9 @@ pub(crate) enum Claim {
     Unclear,
 }
 
-/// Whether a fix tells where a neighbour is: one cut by the border still does.
-fn is_sight(verdict: FixQuality) -> bool {
-    matches!(verdict, FixQuality::Good | FixQuality::AtBorder)
+/// Whether a fix tells where a neighbour is: one cut by the border still does, a place outside the frame does not.
+fn is_sight(fix: &Fix) -> bool {
+    matches!(fix.verdict, FixQuality::Good | FixQuality::AtBorder) && fix.amplitude != 0.0
 }
 
 #[derive(Debug, Clone, Copy)]
@@ -129,7 +142,7 @@ impl Neighbours {
                 let Some(c) = c else { continue };
                 let free = used.get(k).is_some_and(|u| !u);
                 let surprise = motion.capped_cost(&c.fix);
-                if free && is_sight(c.fix.verdict) && surprise < least.0 {
+                if free && is_sight(&c.fix) && surprise < least.0 {
                     least = (surprise, Some(k));
                 }
             }
@@ -174,10 +187,7 @@ impl Neighbours {
                 if taken.is_none() && lead < config.certainty {
                     continue;
                 }
-                if is_sight(c.fix.verdict)
-                    && used.get(k).is_some_and(|u| !u)
-                    && distance2 < nearest.0
-                {
+                if is_sight(&c.fix) && used.get(k).is_some_and(|u| !u) && distance2 < nearest.0 {
                     nearest = (distance2, Some((k, c.fix)));
                 }
             }
@@ -206,7 +216,7 @@ impl Neighbours {
         for (c, used) in candidates.iter().zip(used) {
             if let Some(c) = c
                 && !used
-                && is_sight(c.fix.verdict)
+                && is_sight(&c.fix)
                 && let Some(free) = self.beads.iter_mut().find(|n| n.is_none())
             {
                 *free = Some(Neighbour {

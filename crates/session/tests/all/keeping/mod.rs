@@ -79,6 +79,28 @@ fn a_run_that_did_not_keep_its_bead_says_so_whatever_the_reason() {
 }
 
 #[test]
+fn a_wrong_sign_is_said_under_every_law_before_the_bead_is_out_of_sight() {
+    for law in ["lqg", "pi", "mpc"] {
+        for seed in 1..=2 {
+            let row = Row {
+                seconds: 3.8,
+                ..Row::event(law, "gain-flip", 9.0)
+            };
+            let held = hold(&row, seed);
+            println!("{row} | {held}");
+            let against = held.ended.contains("moved against them");
+            assert!(
+                against && !held.as_asked,
+                "{row}, seed {seed}: {}",
+                held.ended
+            );
+            let stated = held.stated_rms_nm / held.true_rms_nm;
+            assert!((0.9..1.1).contains(&stated), "{row}, seed {seed}: {held}");
+        }
+    }
+}
+
+#[test]
 #[ignore = "hours with many seeds: meant for .ci/nightly; KEEPING_SEEDS says how many, KEEPING_ROWS which by a part of their name"]
 fn keeping_table() {
     let number = |name: &str| std::env::var(name).ok().and_then(|text| text.parse().ok());
