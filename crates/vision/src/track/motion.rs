@@ -300,8 +300,8 @@ mod tests {
             motion.predict(1e-3, (2e4, 0.0), &randomness);
             let off_px = motion.position().0 - 420.0 * acts;
             let (streak_px, _) = motion.way_px((10.0, 0.0), 0.5e-3);
-            assert!(off_px.abs() < 2.0, "{acts}: {off_px}");
-            assert!((streak_px - 10.0 * acts).abs() < 1.0, "{acts}: {streak_px}");
+            assert!(off_px.abs() < 4.0, "{acts}: {off_px}");
+            assert!((streak_px - 10.0 * acts).abs() < 2.0, "{acts}: {streak_px}");
         }
     }
 
