@@ -1,7 +1,9 @@
 //! The labelled records: made by a program of another make, with the hidden effect in the folder's name.
 
 use cellpos_plant::Model;
-use cellpos_reconcile::{Options, ReconcileError, Reconciliation, Record, Verdict, reconcile};
+use cellpos_reconcile::{
+    Options, ReconcileError, Reconciliation, Record, Verdict, reconcile, report,
+};
 use std::path::{Path, PathBuf};
 
 fn data() -> PathBuf {
@@ -33,7 +35,7 @@ fn run(records: &[Record]) -> Result<Reconciliation, ReconcileError> {
     reconcile(&Model::eq6(), records, &Options::default(), &mut |_| {})
 }
 
-fn expect(name: &str, ids: &[&str]) {
+fn expect(name: &str, ids: &[&str]) -> Reconciliation {
     let records = case(name);
     let result = run(&records).unwrap();
     let mut named: Vec<&str> = result.effects.iter().map(|e| e.id.as_str()).collect();
@@ -58,12 +60,24 @@ fn expect(name: &str, ids: &[&str]) {
             );
         }
     }
+    result
 }
 
 #[test]
 #[cfg_attr(no_shared_data, ignore = "needs ../shared/data/hidden-effects")]
-fn a_time_delay_is_named() {
-    expect("time-delay", &["time-delay"]);
+fn a_time_delay_is_named_and_the_report_says_so_before_anything_else() {
+    let result = expect("time-delay", &["time-delay"]);
+    let page = report(&result, "labelled").to_html();
+    let text = page.split("<body").nth(1).unwrap();
+    let order = [
+        "The model lacks time-delay at the camera (95 %: delay_s = 0.00",
+        "With that the prediction error on held-out records falls from",
+        "Prediction error of all records as the search went on",
+        "The effects in numbers",
+        "Records and noise",
+    ];
+    let at: Vec<Option<usize>> = order.iter().map(|words| text.find(words)).collect();
+    assert!(at.iter().all(Option::is_some) && at.is_sorted(), "{at:?}");
 }
 
 #[test]

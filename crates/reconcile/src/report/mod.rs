@@ -1,14 +1,22 @@
-//! The HTML report: verdict, map, response before and after, traces, and the shrinking gap.
+//! The HTML report: the answer first, then the shrinking gap, traces, what is left, and the numbers.
+
+mod answer;
 
 use crate::units::figure;
 use crate::verdict::map::{BAND_EDGES_HZ, DiscrepancyMap, band_labels};
-use crate::verdict::result::{Reconciliation, Verdict};
+use crate::verdict::result::Reconciliation;
 use cellpos_report::{Axis, Column, Emphasis, Figure, HeatMap, Panel, Report, Series, Table};
 
-/// Makes the report of a result; `title` names the data.
+/// Makes the report of a result, the answer first and the numbers last; `title` names the data.
 pub fn report(result: &Reconciliation, title: &str) -> Report {
     let mut r = Report::new(&format!("Reconcile: {title}"));
-    verdict(&mut r, result);
+    answer::answer(&mut r, result);
+    innovations(&mut r, result);
+    waterfall(&mut r, result);
+    traces(&mut r, result);
+    what_is_left(&mut r, result);
+    numbers(&mut r, result);
+    response(&mut r, result);
     r.section("Where");
     r.list(&result.places);
     heat(
@@ -23,9 +31,12 @@ pub fn report(result: &Reconciliation, title: &str) -> Report {
         "The same with the effects added",
         &result.after,
     );
-    response(&mut r, result);
     gap(&mut r, result);
-    traces(&mut r, result);
+    records(&mut r, result);
+    r
+}
+
+fn records(r: &mut Report, result: &Reconciliation) {
     r.section("Records and noise");
     let mut t = Table::new([
         Column::left("record"),
@@ -43,7 +54,6 @@ pub fn report(result: &Reconciliation, title: &str) -> Report {
         small(result, result.noise.localisation_um()),
         small(result, result.noise.innovation_um())
     ));
-    r
 }
 
 /// What figures of the gap are printed in: nanometres of micrometres, else the unit of the records, and the factor.
@@ -60,76 +70,52 @@ fn small(result: &Reconciliation, value: f64) -> String {
     format!("{} {unit}", figure(factor * value))
 }
 
-fn verdict(r: &mut Report, result: &Reconciliation) {
-    let names = result
-        .effects
+/// How the gap shrank, effect by effect.
+fn waterfall(r: &mut Report, result: &Reconciliation) {
+    let g = &result.gap;
+    let (factor, unit) = fine(result);
+    // The gain of the base set free is no step of the search.
+    let steps: Vec<_> = (g.steps.iter().enumerate())
+        .filter(|(i, s)| *i == 0 || !s.effects.is_empty())
+        .map(|(_, s)| s)
+        .collect();
+    if steps.len() < 2 {
+        return;
+    }
+    let names: Vec<String> = steps
         .iter()
-        .map(|e| e.id.as_str())
-        .collect::<Vec<_>>()
-        .join(" + ");
-    let (status, text) = match result.verdict {
-        Verdict::Named => (Emphasis::Good, format!("The model lacks {names}.")),
-        Verdict::NamedWithRemainder => (
-            Emphasis::Warning,
-            format!("The model lacks {names}, and something more that the catalogue does not name."),
-        ),
-        Verdict::Ambiguous => (
-            Emphasis::Warning,
-            format!("The model lacks {names}, or an effect that these records cannot tell from it."),
-        ),
-        Verdict::Unknown => (
-            Emphasis::Bad,
-            "The model lacks something: the gap is beyond the noise floor, and nothing in the catalogue closes enough of it."
-                .to_owned(),
-        ),
-        Verdict::NothingMissing => (
-            Emphasis::Good,
-            "Nothing is missing: the model is at the noise floor.".to_owned(),
-        ),
-    };
-    let gap = &result.gap;
-    r.result(
-        status,
-        &format!(
-            "{text} Gap on held-out records: {} before, {} after, {} is the noise floor.",
-            small(result, gap.before),
-            small(result, gap.after),
-            small(result, gap.floor)
+        .map(|s| match s.effects.is_empty() {
+            true => "null model".to_owned(),
+            false => s.effects.join(" + "),
+        })
+        .collect();
+    let at: Vec<f64> = (0..steps.len()).map(|i| i as f64).collect();
+    let rms: Vec<f64> = steps.iter().map(|s| factor * s.rms).collect();
+    r.figure(
+        Figure::new(
+            "waterfall",
+            "Prediction error of all records as the search went on; the line is the noise floor",
+        )
+        .panel(
+            Panel::new(
+                Axis::categories("model", &names),
+                Axis::linear("innovation", &format!("{unit} RMS")),
+            )
+            .series(Series::bars("", &at, &rms, 0.6))
+            .horizontal(factor * g.floor, "floor"),
         ),
     );
-    innovations(r, result);
-    if !result.effects.is_empty() {
-        let mut t = Table::new([
-            Column::left("effect"),
-            Column::left("place"),
-            Column::left("parameters (95 % interval)"),
-            Column::right("explains"),
-            Column::right("p"),
-            Column::left("or"),
-        ]);
-        for e in &result.effects {
-            let p = e
-                .parameters
-                .iter()
-                .map(|(n, v)| format!("{n} = {} {}", interval(v.value, v.ci95), v.unit))
-                .collect::<Vec<_>>()
-                .join("; ");
-            t.row([
-                e.id.clone(),
-                e.place.to_owned(),
-                p,
-                format!("{:.1} %", 100.0 * e.explained),
-                p_value(e.p_value),
-                e.alternatives.join(", "),
-            ]);
-        }
-        r.table(t);
-        for e in &result.effects {
-            if let Some(s) = &e.separate_by {
-                r.note(Emphasis::Warning, &format!("{}: {s}", e.id));
-            }
-        }
+}
+
+/// What no name explains, and the experiment that would tell more.
+fn what_is_left(r: &mut Report, result: &Reconciliation) {
+    let experiments: Vec<String> = (result.effects.iter())
+        .filter_map(|e| Some(format!("{}: {}", e.id, e.separate_by.as_ref()?)))
+        .collect();
+    if result.remainder.is_none() && result.hypothesis.is_none() && experiments.is_empty() {
+        return;
     }
+    r.section("What is left, and what would tell more");
     if let Some(rest) = &result.remainder {
         r.note(
             Emphasis::Warning,
@@ -151,6 +137,42 @@ fn verdict(r: &mut Report, result: &Reconciliation) {
             ),
         );
     }
+    for experiment in &experiments {
+        r.note(Emphasis::Plain, experiment);
+    }
+}
+
+/// The effects with all their numbers.
+fn numbers(r: &mut Report, result: &Reconciliation) {
+    if result.effects.is_empty() {
+        return;
+    }
+    r.section("The effects in numbers");
+    let mut t = Table::new([
+        Column::left("effect"),
+        Column::left("place"),
+        Column::left("parameters (95 % interval)"),
+        Column::right("explains"),
+        Column::right("p"),
+        Column::left("or"),
+    ]);
+    for e in &result.effects {
+        let p = e
+            .parameters
+            .iter()
+            .map(|(n, v)| format!("{n} = {} {}", interval(v.value, v.ci95), v.unit))
+            .collect::<Vec<_>>()
+            .join("; ");
+        t.row([
+            e.id.clone(),
+            e.place.to_owned(),
+            p,
+            format!("{:.1} %", 100.0 * e.explained),
+            p_value(e.p_value),
+            e.alternatives.join(", "),
+        ]);
+    }
+    r.table(t);
 }
 
 fn heat(r: &mut Report, name: &str, caption: &str, map: &DiscrepancyMap) {
