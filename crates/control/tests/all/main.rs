@@ -2,6 +2,7 @@
 
 mod adaptation;
 mod allocation;
+mod apart;
 mod badly_scaled;
 mod common;
 mod disturbed;
