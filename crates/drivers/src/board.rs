@@ -62,7 +62,7 @@ fn reason_of(refusal: Refusal) -> &'static str {
         Refusal::Limits => {
             "range or slew of the session are empty or wider than its own: narrow [limits] in rig.toml"
         }
-        Refusal::Park => "the park displacement lies outside its range: change park_um in rig.toml",
+        Refusal::Park => "the park displacement is outside its range: change park_um in rig.toml",
         Refusal::Watchdog => {
             "a watchdog time is zero or longer than it allows: change watchdog_ms or hold_watchdog_ms in rig.toml"
         }

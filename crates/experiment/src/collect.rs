@@ -103,7 +103,7 @@ pub fn run_experiment(
         let kept = record(&name, &acquired, plan.period_s).and_then(|r| write_record(&r, file));
         return Err(ended.failure(&match kept {
             Ok(()) => format!(
-                "what was recorded lies in {}: give it to --data, or run the command again",
+                "the records are in {}: give them to --data, or run the command again",
                 file.display()
             ),
             Err(_) => "run the command again; records already collected are kept".to_string(),

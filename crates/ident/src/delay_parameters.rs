@@ -139,7 +139,7 @@ pub(crate) fn slow_pole_parameter(
         } else {
             Identifiability::NotIdentifiable {
                 reason: format!(
-                    "it lies far below the lowest line; the data only say that it is below {:.2} rad/s",
+                    "it is far below the lowest frequency; the data only show that it is below {:.2} rad/s",
                     high.max(0.0)
                 ),
             }

@@ -154,7 +154,7 @@ pub fn check_grid(
                 key: "frequency_hz",
                 value: f,
                 unit: "Hz",
-                expected: "a drive line lies above 0 and below half the sampling rate",
+                expected: "a frequency must be above 0 and below half the sampling rate",
             });
         }
         for harmonic in 2..=harmonics {

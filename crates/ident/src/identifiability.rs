@@ -329,7 +329,7 @@ fn pair_parameters(fit: &CandidateFits, t: f64, drawn: &Drawn) -> Vec<Identified
                 judge_width(
                     value,
                     ci95,
-                    "the pair is seen, but not where it lies: excite more lines about it",
+                    "the pair is seen, but not its frequency: excite more frequencies around it",
                 )
             } else {
                 Identifiability::NotIdentifiable {

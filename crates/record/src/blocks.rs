@@ -18,7 +18,7 @@ pub(crate) fn open_here(options: &mut OpenOptions, path: &Path) -> io::Result<Fi
     }
     let file = options.open(path).map_err(|error| {
         if path.is_symlink() {
-            io::Error::other("is a symbolic link; what is written into a run stays in its folder")
+            io::Error::other("is a symbolic link; files of a run stay in its folder")
         } else {
             error
         }

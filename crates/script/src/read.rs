@@ -205,7 +205,7 @@ impl Reader<'_> {
             },
             _ => StepKind::Static {
                 like: node
-                    .need_text("like", "the label of the step that it stands beside")?
+                    .need_text("like", "the label of a step above")?
                     .value
                     .to_owned(),
                 load: node

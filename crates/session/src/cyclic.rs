@@ -356,7 +356,7 @@ pub fn load_learned(folder: &Path) -> Vec<NamedTable> {
         Ok(text) => tables(&text, &path.display().to_string()).map_err(|failure| failure.text()),
     };
     read.unwrap_or_else(|problem| {
-        tracing::warn!("what was learned is left out: {problem}");
+        tracing::warn!("the learned feed-forward is ignored: {problem}");
         Vec::new()
     })
 }

@@ -200,7 +200,7 @@ impl Clues {
             EndKind::Operator => sentences("the operator ended the run", "", ""),
             EndKind::Unrecorded => sentences(
                 recorder.map_or("the run was not recorded", RecorderFault::sentence),
-                "a disk that takes what is recorded",
+                "a disk that takes the record",
                 "make room, or name another folder with --runs; what was written is kept",
             ),
             EndKind::Failed => trouble.map_or_else(Default::default, failed),
@@ -249,7 +249,7 @@ impl Clues {
                     arming.patience_ticks
                 ),
                 format!("{} good positions in a row", arming.steady_ticks),
-                "bring a bead into view and into focus (cellpos camera and cellpos vision show what is seen), then start again",
+                "bring a bead into view and into focus (see cellpos camera --snapshot), then start again",
             ),
             Refusal::NoResponse => sentences(
                 format!(
@@ -305,7 +305,7 @@ impl Clues {
             SafeReason::CameraLost => sentences(
                 format!(" ({lost_ms:.0} ms)"),
                 format!("one every {} ms", timing.period_us * 1e-3),
-                "check cable, power and trigger of the camera (cellpos camera shows what it delivers)",
+                "check cable, power and trigger of the camera (see cellpos camera)",
             ),
             SafeReason::StaleFrames => sentences(
                 format!(" (more than {in_a_row}{})", last(self.stale_ms, "ms old")),
@@ -341,7 +341,7 @@ impl Clues {
             SafeReason::Stalled => sentences(
                 " (more than a second)",
                 format!("a tick every {} ms", timing.period_us * 1e-3),
-                "see that nothing suspends this program or this machine; the board has stopped the bead by itself",
+                "find out what suspended this program or this machine; the board has stopped the bead",
             ),
             SafeReason::BoardForeign => sentences(
                 "",
@@ -359,7 +359,7 @@ impl Clues {
             SafeReason::NotFollowing => sentences(
                 " further and further, until it was frozen",
                 "a bead that goes where the commands push it",
-                "look at the sign of the calibration, at the amplifier and at the tubes; then measure the plant anew with `cellpos identify`",
+                "check the sign of the calibration, the amplifier and the tubes; then measure the plant again with `cellpos identify`",
             ),
             SafeReason::BoardNotFollowing => sentences(
                 " (for 100 ms)",
@@ -384,18 +384,14 @@ impl Clues {
                 "the board parked the PZT by itself: no command came within both its watchdog times; this program was stopped, or the \
                  line was blocked"
             }
-            Some((_, Fault::FreezeTimeout)) => {
-                "the board parked the PZT by itself: nothing ended a freeze"
-            }
-            Some((_, Fault::ArmTimeout)) => {
-                "the board parked the PZT by itself: armed, and no command followed"
-            }
+            Some((_, Fault::FreezeTimeout)) => "the board parked the PZT: nothing ended a freeze",
+            Some((_, Fault::ArmTimeout)) => "the board parked the PZT: no command followed arming",
             Some((State::Disarmed, _)) => {
                 "the board is disarmed: another host did it, or it was switched off and on"
             }
             Some((State::Safe, _)) => "the board was told to park by another host",
             Some((_, Fault::Device)) => {
-                "the board reports a fault of its own: temperature, current, supply or converter"
+                "the board reports a fault: temperature, current, supply or converter"
             }
             _ => "the board is in another state or session than this run's",
         };

@@ -29,14 +29,12 @@ impl Level {
 pub fn safe_reason(reason: SafeReason) -> &'static str {
     match reason {
         SafeReason::Operator => "the operator asked for park",
-        SafeReason::BeadLost => {
-            "the bead was not seen for longer than the loop may go on without it"
-        }
-        SafeReason::CameraLost => "no frames came for longer than the loop may go on without them",
+        SafeReason::BeadLost => "the bead was not seen for longer than the loop may run without it",
+        SafeReason::CameraLost => "no frames came for longer than the loop may run without them",
         SafeReason::StaleFrames => "too many frames in a row were old or repeated",
         SafeReason::LateTicks => "too many commands in a row were handed over late",
         SafeReason::NotFinite => "the controller's output was not a number",
-        SafeReason::Board => "the board left the session by itself",
+        SafeReason::Board => "the board left the session",
         SafeReason::BoardForeign => "the board is in the session of another program",
         SafeReason::BoardNotObeying => "the board is heard but obeys no command",
         SafeReason::NotFollowing => "the bead did not follow the commands, or moved against them",
@@ -137,7 +135,7 @@ fn text(kind: &EventKind) -> String {
         EventKind::FreezeStarted { reason } => {
             format!("The bead is being stopped: {}.", freeze_reason(reason))
         }
-        EventKind::FreezeEnded { lasted_ms } => ended("Control goes on", lasted_ms),
+        EventKind::FreezeEnded { lasted_ms } => ended("Control continues", lasted_ms),
         EventKind::SafeLatched { reason } => format!("The PZT parks: {}.", safe_reason(reason)),
         EventKind::FramesDropped { count } => {
             let frames = plural(count, "frame is", "frames are");
@@ -164,7 +162,7 @@ fn text(kind: &EventKind) -> String {
             period_ms,
         } => format!("Vision takes {vision_ms:.2} ms for a frame of {period_ms:.2} ms."),
         EventKind::VisionSlowEnded { lasted_ms } => ended("Vision keeps up again", lasted_ms),
-        EventKind::CameraRestarted => "The camera began to count its frames anew.".to_string(),
+        EventKind::CameraRestarted => "The camera restarted its frame numbers.".to_string(),
         EventKind::BeadReacquired { position_um } => format!(
             "A bead was taken at {position_um:.3} um after the one followed had been lost: it may be another."
         ),
@@ -252,7 +250,7 @@ fn plant_changed(verdict: &str, gain_ratio: f64, lag_ms: f64) -> String {
 fn board_held(count: u16) -> String {
     let times = plural(u64::from(count), "time", "times");
     format!(
-        "Commands had stopped for the board's watchdog, {count} {times}: it held the bead by itself, and the loop takes up again."
+        "Commands had stopped for the board's watchdog, {count} {times}: it held the bead, and the loop takes up again."
     )
 }
 

@@ -150,7 +150,7 @@ fn pulsed(
     if !(centre_um - a_um >= low_um && centre_um + a_um <= high_um) {
         return Err(Failure::bad_input(
             format!(
-                "the PZT stands at {centre_um:.2} um, limits are {low_um} to {high_um} um: no room for {a_um} um to both sides"
+                "the PZT is at {centre_um:.2} um, limits are {low_um} to {high_um} um: no room for {a_um} um to both sides"
             ),
             "move it first: park_um in [limits] of rig.toml near the middle of the range, then cellpos jog --to that",
         ));

@@ -114,7 +114,7 @@ impl Capture {
         if capture.frames.is_empty() {
             return Err(Failure::bad_input(
                 format!("{}: no frame for {duration_s} s", capture.camera),
-                "see what it delivers with cellpos camera",
+                "test it with cellpos camera",
             ));
         }
         Ok(capture)

@@ -133,7 +133,7 @@ fn say_failure(found: &mut Found, of: (&str, &str), value: &str, failure: &Failu
     let (Failure::BadInput(report) | Failure::Failed(report)) = failure;
     let remedy = report.help().map_or_else(
         || {
-            "is it there, switched on, and no other program's? docs/rig.md, What a refusal means"
+            "is it there and switched on, and has no other program opened it? docs/rig.md, What a refusal means"
                 .to_string()
         },
         |help| help.to_string(),
@@ -165,7 +165,7 @@ fn judge_board(found: &mut Found, file: &RigFile, line: &LineTest) {
                 ("limits", key),
                 &value,
                 format!("{key} = {value}: wider than the board's own, {of_board}"),
-                "the board's holds; write it into the file so that it says what is so",
+                "the board's value holds; write it into the file",
             );
         }
     }
@@ -226,7 +226,7 @@ fn judge_frames(found: &mut Found, file: &RigFile, seen: &FramesSeen) {
                 seen.rate_hz
             ),
             if faster {
-                "write the camera's own rate: what is estimated between frames depends on it"
+                "write the camera's rate: the prediction between frames depends on it"
             } else {
                 "smaller region, shorter exposure, faster link: cellpos camera shows which frames are missing"
             },

@@ -136,7 +136,7 @@ impl Mover {
         if matches!(report.state, ActuatorState::Safe | ActuatorState::Disarmed) {
             return Err(Failure::bad_input(
                 format!(
-                    "the board went to park by itself ({:?}, {:?})",
+                    "the board went to park ({:?}, {:?})",
                     report.state, report.fault
                 ),
                 "no command came within both its watchdog times: is the machine overloaded?",

@@ -57,7 +57,7 @@ pub fn next_frame(camera: &mut dyn Camera, buffer: &mut FrameBuffer) -> Result<i
         Ok(Some(stamp)) => Ok(stamp.mid_exposure_ns),
         Ok(None) => Err(Failure::bad_input(
             format!("{}: no frame for 2 s", camera.info().name),
-            "see what it delivers with cellpos camera",
+            "test it with cellpos camera",
         )),
         Err(error) => Err(Failure::failed(error)),
     }

@@ -129,7 +129,7 @@ fn take(camera: &mut dyn Camera, count: usize) -> Result<Vec<FrameBuffer>, Failu
                         PATIENCE_NS / 1_000_000_000,
                         frames.len()
                     ),
-                    "see what it delivers with cellpos camera",
+                    "test it with cellpos camera",
                 ));
             }
             Err(error) => return Err(Failure::failed(error)),

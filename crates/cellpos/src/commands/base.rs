@@ -104,7 +104,7 @@ pub fn fit(
     let mut advice = Vec::new();
     if fit.at_bound {
         advice.push(
-            "a pole stands at the end of what these records can tell: a lower order, or longer records, would be sounder"
+            "a pole is at the end of the range that these records determine: use a lower order or longer records"
                 .to_owned(),
         );
     }

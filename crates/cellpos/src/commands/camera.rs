@@ -223,7 +223,7 @@ pub(super) fn cameras() -> (bool, Vec<Listed>, String) {
     });
     let listed: Vec<Listed> = listed.collect();
     let hint = if listed.is_empty() {
-        "no industrial camera answers: check power, cable, and that its address lies in this machine's network"
+        "no industrial camera answers: check power and cable, and whether its address is in this machine's network"
     } else {
         "watch one with: cellpos camera --address ADDRESS"
     };

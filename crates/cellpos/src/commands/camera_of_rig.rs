@@ -156,7 +156,7 @@ impl std::fmt::Display for Found {
         )?;
         writeln!(
             f,
-            "picture     {}: is what is marked the bead?",
+            "picture     {}: is the marked object the bead?",
             self.picture.display()
         )?;
         writeln!(

@@ -413,7 +413,7 @@ fn text(report: &Report) -> String {
     if s.rms_true_nm.is_some() {
         line(
             "error, true",
-            format!("{} RMS, likewise", nm(s.rms_true_nm)),
+            format!("{} RMS, from the same time on", nm(s.rms_true_nm)),
         );
     }
     line(

@@ -274,7 +274,7 @@ fn tracked(
     if finished.ended.kind == EndKind::Operator {
         return Err(finished
             .ended
-            .failure("what is finished lies in the run folder"));
+            .failure("the finished part is in the run folder"));
     }
     let errors = finished.sink.0;
     let last = errors

@@ -364,7 +364,7 @@ fn stopped(
     let kept = kept(job, plan, records)?;
     let go_on = match &kept {
         Some(path) => format!(
-            "go on with the same arguments and --resume {}: {} of {} segments are kept",
+            "continue with the same arguments and --resume {}: {} of {} segments are kept",
             path.display(),
             records.len(),
             plan.segments.len()

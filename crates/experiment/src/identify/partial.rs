@@ -68,7 +68,7 @@ pub fn load(path: &Path, plan: &Plan) -> Result<Vec<RecordedSegment>, Failure> {
     if partial.plan != describe(plan) {
         return Err(refuse(
             "was made with other lines, amplitudes, times or another model".to_owned(),
-            "repeat the arguments of the stopped identification, or start anew without --resume",
+            "repeat the arguments of the stopped identification, or start again without --resume",
         ));
     }
     let sound = |k: &Kept| {

@@ -97,7 +97,7 @@ impl FromStr for Form {
                 "integrating" if value.is_none() => integrating = true,
                 _ => {
                     return Err(wrong(format!(
-                        "`{word}` is none of order=N, zeros=N, static, integrating, delay"
+                        "`{word}` is not one of order=N, zeros=N, static, integrating, delay"
                     )));
                 }
             }

@@ -336,7 +336,7 @@ impl RigFile {
         if ideal.is_some() && !self.is_emulated() {
             return Err(Failure::bad_input(
                 "--ideal is for the emulated rig: a real one is as it is",
-                "leave it out; firmware-sim has an --ideal of its own",
+                "leave it out; firmware-sim has its own --ideal",
             ));
         }
         self.emulator.ideal = ideal.unwrap_or(self.emulator.ideal);

@@ -52,7 +52,7 @@ pub fn board(sheet: &mut Sheet, talk: Talk, trial: &mut Trial) {
             of("conversation"),
             false,
             (None, ""),
-            "goes on to the end",
+            "continues to the end",
             words,
         );
         if let Some(talk) = &mut talk {

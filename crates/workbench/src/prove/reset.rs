@@ -53,7 +53,7 @@ pub(super) fn reset(
                 .is_none_or(|answer| answer.as_ref().is_err_and(|why| why == "state"))
             && range.is_at(&rest, range.own_park_pm),
         (um((rest.applied_pm - range.own_park_pm).abs()), "um"),
-        "disarmed, goes to its own park by itself, and refuses to be armed (state) until it is there",
+        "disarmed, ramps to its park displacement, and refuses to be armed (state) until it is there",
         format!(
             "{}; first seen at {:.3} um, then at {:.3} um; arm on the way: {}",
             if restarted {

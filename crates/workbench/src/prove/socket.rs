@@ -273,7 +273,7 @@ fn pauses(sheet: &mut Sheet, client: &mut Client, rate_hz: f64) {
         of("a reader that pauses loses whole frames"),
         trouble.is_none() && accounted,
         (jump.saturating_sub(1) as f64, "lost"),
-        "after a pause of 1 s the stream goes on with whole frames, and the gap is in the numbers",
+        "after a pause of 1 s whole frames follow, and the gap is in the numbers",
         trouble.unwrap_or_default(),
     );
     sheet.judge(

@@ -107,7 +107,7 @@ impl Shown {
         let time_ns = Clock::Real.now_ns() - self.start_ns;
         let seen = self.looking.as_mut().and_then(Looking::newest);
         let (state, reason) = match self.operator.asked() {
-            Request::Pause => ("frozen", "The PZT stands still until it is told to go on."),
+            Request::Pause => ("frozen", "The PZT stands still until you continue."),
             Request::Freeze | Request::Park => ("safe", "The PZT parks: it was asked for."),
             _ => ("running", "The PZT is moved by hand; no loop is closed."),
         };

@@ -147,7 +147,7 @@ pub fn section(page: &mut Report, read: &ReadCycles) -> serde_json::Value {
          better than the line. Each motion by itself, skipped cycles and the static arm's way to its load and back left out. Stretch and areal stretch: largest length and \
          area over those at rest before the first cycle.",
     );
-    let mut figure = Figure::new("cycles", "The cycles of the run, each motion by itself.");
+    let mut figure = Figure::new("cycles", "The cycles of the run, by motion.");
     let mut json = Vec::new();
     for quantity in &QUANTITIES {
         let mut panel = Panel::new(

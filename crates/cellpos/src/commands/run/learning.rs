@@ -49,7 +49,7 @@ pub fn motions(
         let had = table.is_some();
         let spec = LearnSpec::new(setup, file, &wanted, table).or_else(|failure| {
             if had {
-                warnings.push(format!("learned anew: {name}: {}", failure.text()));
+                warnings.push(format!("learned again: {name}: {}", failure.text()));
                 LearnSpec::new(setup, file, &wanted, None)
             } else {
                 Err(failure)

@@ -41,7 +41,7 @@ pub fn cycles(folder: &Path) -> Result<Vec<CycleRow>, Failure> {
     };
     Err(Failure::bad_input(
         format!("{}: {problem}", path.display()),
-        "was it changed, or written by a newer version? put it right, go on with that version, or begin a new run",
+        "was it changed, or written by a newer version? correct it, use that version, or begin a new run",
     ))
 }
 
@@ -171,7 +171,7 @@ pub fn ready(folder: &Path, best_effort: bool) -> Result<Option<Ready>, Failure>
         session_config(&reader).ok_or_else(|| not_a_run("is no run of a script".to_string()))?;
     if first.number != 1 {
         return Err(not_a_run(
-            "is a further session of a run: give the folder that it lies in".to_string(),
+            "is a further session of a run: give the folder of that run".to_string(),
         ));
     }
     let meta = reader

@@ -153,7 +153,7 @@ fn append(file: &File, waiting: &mut [Vec<f64>]) -> Result<(), RecordError> {
 fn empty(source: &Source, all: &Events, path: &Path) -> Result<(), RecordError> {
     let meta = source
         .meta()
-        .ok_or_else(|| refused("run.toml cannot be read, and the format asks for what it says"))?;
+        .ok_or_else(|| refused("run.toml cannot be read, and the format needs it"))?;
     let mut builder = FileBuilder::new();
     for (name, value) in attributes(meta, all)? {
         builder.set_attr(name, value);
