@@ -38,7 +38,7 @@ def test_every_column_of_an_export_has_the_same_values(here, name):
 
 def test_the_columns_words_and_flags_are_those_of_the_page_on_data():
     page = (ROOT / "docs/data.md").read_text()
-    table = page.split("### Ticks")[1].split("The control law's own columns")[0]
+    table = page.split("### Ticks")[1].split("The control law's columns")[0]
     names = [line.split("`")[1] for line in table.splitlines() if line.startswith("| `")]
     assert list(ORDER) == names
     words = page.split("Words and their numbers")[1].split("The bits of")[0]
@@ -47,8 +47,8 @@ def test_the_columns_words_and_flags_are_those_of_the_page_on_data():
             parts = line.split("`")
             numbers = {int(parts[i].strip(" |,")): parts[i + 1] for i in range(2, len(parts) - 1, 2)}
             assert WORDS[parts[1]] == numbers, parts[1]
-    bits = page.split("The bits of `flags`")[1].split("### Cycles")[0]
-    named = [line.split("|")[2:4] for line in bits.splitlines() if line[:3].strip("| ").isdigit() or line.startswith("| 1")]
+    bits = page.split("The bits of `flags`")[1].split("## Reading it elsewhere")[0]
+    named = [line.split("|")[1:3] for line in bits.splitlines() if line[:3].strip("| ").isdigit() or line.startswith("| 1")]
     assert {name.strip(): int(value) for value, name in named} == FLAGS
 
 
