@@ -190,6 +190,7 @@ impl<L: ControlLaw> ControlLoop<L> {
     pub fn step(&self, state: &mut LoopState<L::State>, input: &LoopInput) -> LoopOutput {
         let law = &self.parts.controller;
         let stood_um = self.take_in_force(state, input);
+        self.shift(state, input.zero_flow_shift_um);
         let tick = self.estimate(state, input);
         let gain = tick.law.tuning.gain;
         let decided = if tick.controls {
@@ -265,6 +266,19 @@ impl<L: ControlLaw> ControlLoop<L> {
             self.adapt(state, &told);
         }
         output
+    }
+
+    /// The zero flow has moved by a known amount. What matters to the plant is how far the PZT was from it at each time: the past commands
+    /// move along. The command itself does not: the slew limit counts from where the PZT stands.
+    fn shift(&self, state: &mut LoopState<L::State>, by_um: f64) {
+        if by_um == 0.0 || !by_um.is_finite() {
+            return;
+        }
+        let scaled_um = by_um * self.tuning(state).gain;
+        state.estimator.neutral_um += scaled_um;
+        let history = state.estimator.history_um.iter_mut();
+        history.for_each(|um| *um += scaled_um);
+        self.parts.controller.shift(&mut state.law, scaled_um);
     }
 
     /// What is known to have stood at the actuator takes the place of the commands that did not reach it. Gives it, um.

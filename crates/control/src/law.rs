@@ -150,6 +150,10 @@ pub trait ControlLaw: Debug + Send + 'static {
     /// (not positions of the bead) are to be multiplied by it, so that the law goes on without a bump.
     fn rescale(&self, _state: &mut Self::State, _ratio: f64) {}
 
+    /// The zero flow has moved by a known amount ([`crate::LoopInput::zero_flow_shift_um`]): displacements that the state keeps are to move
+    /// with it, um in the units of [`LawInput`]; those from the zero flow stay.
+    fn shift(&self, _state: &mut Self::State, _by_um: f64) {}
+
     /// A tick that never came: the command was held.
     fn skip(&self, _state: &mut Self::State) {}
 

@@ -40,6 +40,7 @@ mod loop_model;
 mod lqg;
 mod monitor;
 mod mpc;
+mod partner;
 mod pi;
 mod plant_estimate;
 mod reference;
@@ -71,6 +72,9 @@ pub use loop_model::{LoopMode, LoopModel, MODES};
 pub use lqg::{Feedback, Lqg, LqgLaw, LqgState};
 pub use monitor::{PlantEstimate, PlantMonitor, PlantMonitorState, PlantVerdict};
 pub use mpc::{HORIZON, Mpc, MpcLaw, MpcState, SolverKind, TimedSolve};
+pub use partner::{
+    Partner, PartnerConfig, PartnerInput, PartnerOutput, PartnerState, PartnerStatus, Probe,
+};
 pub use pi::{Lead, Pi, PiLaw, PiState};
 pub use plant_estimate::{ADAPT_COLUMNS, AdaptMode, AdaptNews, AdaptState, Adaptation, Tuning};
 pub use reference::{Points, Profile, Reference, Shape, fill_preview};

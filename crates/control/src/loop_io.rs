@@ -66,6 +66,9 @@ pub struct LoopInput<'a> {
     pub slew_time_s: Option<f64>,
     /// What stood at the actuator instead of the last commands; `None`: they did. Estimator, law and slew limit go on from it.
     pub in_force: Option<InForce>,
+    /// By how much the zero flow moves with this tick through something that is known, such as a second actuator, um of PZT:
+    /// estimator, law and command go along.
+    pub zero_flow_shift_um: f64,
     /// How long an optimising controller may take.
     pub solver: SolverTerms,
 }

@@ -241,6 +241,10 @@ impl ControlLaw for PiLaw {
         state.integral_um *= ratio;
     }
 
+    fn shift(&self, state: &mut PiState, by_um: f64) {
+        state.integral_um += by_um;
+    }
+
     fn columns(&self) -> &'static [&'static str] {
         if self.lead.is_some() {
             &["pi_integral_um", "pi_lead_um"]

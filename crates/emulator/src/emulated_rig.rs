@@ -5,6 +5,7 @@
 
 use crate::board_config::BoardConfig;
 use crate::config::WorldConfig;
+use crate::partner::PressureConfig;
 use crate::rig_in_a_box::{BoxError, RigInABox};
 use cellpos_drivers::{BoardHost, Calibration, Port};
 use cellpos_plant::Model;
@@ -40,6 +41,24 @@ impl EmulatedRig {
         })
     }
 
+    /// The same with a slow partner of the PZT.
+    ///
+    /// # Errors
+    /// Its board cannot be.
+    pub fn with_partner(
+        board: BoardConfig,
+        world: &WorldConfig,
+        model: &Model,
+        clock: Clock,
+        partner: &PressureConfig,
+    ) -> Result<Self, BoxError> {
+        let rig = RigInABox::new(board, world, model, clock.now_ns())?.with_partner(partner)?;
+        Ok(Self {
+            rig: Arc::new(Mutex::new(rig)),
+            clock,
+        })
+    }
+
     /// The box, brought up to the present.
     pub fn now(&self) -> MutexGuard<'_, RigInABox> {
         // A thread that panicked while it held the lock left a world that is still a world.
@@ -64,7 +83,22 @@ impl EmulatedRig {
 
     /// The line to its board.
     pub fn port(&self) -> EmulatedPort {
-        EmulatedPort { rig: self.clone() }
+        EmulatedPort {
+            rig: self.clone(),
+            partner: false,
+        }
+    }
+
+    /// The partner of the PZT, at the end of an emulated line.
+    ///
+    /// # Errors
+    /// As [`BoardHost::connect`].
+    pub fn partner(&self) -> Result<BoardHost<EmulatedPort>, cellpos_rig::ActuatorError> {
+        let port = EmulatedPort {
+            rig: self.clone(),
+            partner: true,
+        };
+        BoardHost::connect(port, self.clock.clone())
     }
 
     /// Its camera: frames. Use either this or [`EmulatedRig::positions`], not both.
@@ -151,22 +185,37 @@ impl EmulatedRig {
 #[derive(Debug, Clone)]
 pub struct EmulatedPort {
     rig: EmulatedRig,
+    /// It leads to the slow partner.
+    partner: bool,
 }
 
 impl Port for EmulatedPort {
     fn name(&self) -> &str {
-        "emulated"
+        if self.partner {
+            "emulated partner"
+        } else {
+            "emulated"
+        }
     }
 
     fn write_some(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
         let mut rig = self.rig.now();
         let now_ns = rig.now_ns();
-        rig.receive(bytes, now_ns);
+        if self.partner {
+            rig.receive_partner(bytes, now_ns);
+        } else {
+            rig.receive(bytes, now_ns);
+        }
         Ok(bytes.len())
     }
 
     fn read_available(&mut self, buffer: &mut [u8]) -> std::io::Result<usize> {
-        Ok(self.rig.now().transmit(buffer))
+        let mut rig = self.rig.now();
+        Ok(if self.partner {
+            rig.transmit_partner(buffer)
+        } else {
+            rig.transmit(buffer)
+        })
     }
 }
 

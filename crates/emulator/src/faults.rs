@@ -36,6 +36,8 @@ pub enum FaultKind {
     LinkGarbage,
     /// No byte passes the line to the board or from it.
     LinkLoss,
+    /// No byte passes the line to the slow partner or from it.
+    PartnerLoss,
     /// The optimiser gives no plan in time. The world is not affected; the program applies it to its loop.
     SlowSolver,
     /// The recorder takes nothing, as if its disk hung. Also applied by the program, for the virtual clock, on which no disk hangs.

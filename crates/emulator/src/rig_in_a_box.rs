@@ -8,6 +8,7 @@ use crate::board_config::{BoardConfig, BoardConfigError};
 use crate::config::WorldConfig;
 use crate::error::WorldError;
 use crate::faults::FaultKind;
+use crate::partner::{PressureConfig, PressurePartner};
 use crate::world::World;
 use cellpos_board::Board;
 use cellpos_link::um_from_picometres;
@@ -68,6 +69,15 @@ impl RigInABox {
         Ok(this)
     }
 
+    /// The same with a slow partner of the PZT.
+    ///
+    /// # Errors
+    /// Its board cannot be.
+    pub fn with_partner(mut self, config: &PressureConfig) -> Result<Self, BoxError> {
+        self.world.set_partner(PressurePartner::new(config)?);
+        Ok(self)
+    }
+
     /// The board.
     pub fn board(&self) -> &Board {
         &self.board
@@ -103,7 +113,9 @@ impl RigInABox {
     /// Advances to `t_ns`; does nothing for a past time.
     pub fn advance_to(&mut self, t_ns: i64) {
         loop {
-            let board_ns = self.ns_from_us(self.board.next_event_us());
+            let partner_us = (self.world.partner_mut()).map(|p| p.board.next_event_us());
+            let partner_ns = partner_us.map_or(i64::MAX, |us| self.ns_from_us(us));
+            let board_ns = (self.ns_from_us(self.board.next_event_us())).min(partner_ns);
             let garbage_ns = self.next_garbage_ns.unwrap_or(i64::MAX);
             let event_ns = board_ns.min(garbage_ns);
             if event_ns > t_ns {
@@ -129,6 +141,28 @@ impl RigInABox {
         self.tick();
     }
 
+    /// Bytes of the host that arrive at the partner at `t_ns`.
+    pub fn receive_partner(&mut self, bytes: &[u8], t_ns: i64) {
+        self.advance_to(t_ns);
+        let (cut, now_us) = (self.partner_is_cut(), self.now_us());
+        if let Some(partner) = self.world.partner_mut().filter(|_| !cut) {
+            partner.board.receive(bytes, now_us);
+            partner.tick(now_us);
+        }
+    }
+
+    /// Moves bytes of the partner for the host into `out`; returns how many.
+    pub fn transmit_partner(&mut self, out: &mut [u8]) -> usize {
+        let cut = self.partner_is_cut();
+        let sent = (self.world.partner_mut()).map_or(0, |partner| partner.board.transmit(out));
+        if cut { 0 } else { sent }
+    }
+
+    fn partner_is_cut(&self) -> bool {
+        let faults = &self.world.config().faults;
+        faults.active(FaultKind::PartnerLoss, self.now_ns() - self.start_ns)
+    }
+
     /// Moves bytes for the host into `out`; returns how many.
     pub fn transmit(&mut self, out: &mut [u8]) -> usize {
         let count = self.noise_len.min(out.len());
@@ -152,6 +186,10 @@ impl RigInABox {
         self.board.tick(self.now_us());
         self.applied_um = um_from_picometres(self.board.applied_pm());
         self.world.set_led(self.board.led());
+        let now_us = self.now_us();
+        if let Some(partner) = self.world.partner_mut() {
+            partner.tick(now_us);
+        }
     }
 
     fn now_us(&self) -> u64 {

@@ -6,6 +6,7 @@ use crate::config::WorldConfig;
 use crate::error::WorldError;
 use crate::faults::FaultKind;
 use crate::imperfections::Wander;
+use crate::partner::PressurePartner;
 use crate::render::{Renderer, localisation_bound_um, mean_between};
 use crate::zero_flow::{ZeroFlow, gain_per_s};
 use cellpos_numeric::Random;
@@ -35,6 +36,7 @@ const EMPTY_SEED: u64 = 0x5eed_0f0e_3a97_7c41;
 pub struct World {
     config: WorldConfig,
     chain: Chain,
+    partner: Option<PressurePartner>,
     zero_flow: ZeroFlow,
     /// Where the zero flow is now, um from the mean.
     zero_flow_um: f64,
@@ -108,6 +110,7 @@ impl World {
             offset_um: config.start_um - chain.bead_um(),
             gain_per_s: gain_per_s(model),
             chain,
+            partner: None,
             zero_flow: ZeroFlow::new(config),
             focus: Wander::new(
                 it.focus_wander,
@@ -147,6 +150,16 @@ impl World {
             newest_position: None,
             config: config.clone(),
         })
+    }
+
+    /// A partner that moves the bead alongside the PZT.
+    pub(crate) fn set_partner(&mut self, partner: PressurePartner) {
+        self.partner = Some(partner);
+    }
+
+    /// The partner of the PZT, if there is one.
+    pub(crate) fn partner_mut(&mut self) -> Option<&mut PressurePartner> {
+        self.partner.as_mut()
     }
 
     /// The configuration it was made from.
@@ -251,7 +264,9 @@ impl World {
         let dt_s = (t_ns - self.now_ns) as f64 * 1e-9;
         let before_um = self.chain.bead_um();
         let at_um = self.bead_um();
-        self.chain.advance(self.reached_um(applied_um), dt_s);
+        let beside_um = self.partner.as_mut().map_or(0.0, |p| p.advance(dt_s));
+        self.chain
+            .advance(self.reached_um(applied_um) + beside_um, dt_s);
         if let Some(cell) = &mut self.cell {
             self.offset_um += cell.surplus_um(at_um, self.chain.bead_um() - before_um);
             cell.advance(at_um, dt_s);

@@ -26,4 +26,5 @@ pub mod excitation;
 mod exciting;
 pub mod identify;
 pub mod on_rig;
+pub mod partner;
 mod rows;

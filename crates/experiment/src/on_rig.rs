@@ -205,7 +205,10 @@ impl OnRig {
         /// How often the ticks are looked at.
         const LOOK_EVERY: Duration = Duration::from_millis(100);
         let schedule = plan.schedule(todo);
-        let mut rig = Rig::open(self.file.clone(), self.options())?;
+        // What is measured here is the PZT's: a slow partner stays parked.
+        let mut file = self.file.clone();
+        file.partner = None;
+        let mut rig = Rig::open(file, self.options())?;
         let mut prepared = Prepared {
             model: self.model.clone(),
             controller: self.controller,

@@ -57,15 +57,18 @@ pub enum Group {
     Solver,
     /// Plan and stage: runs of a script.
     Script,
+    /// The slow partner of the PZT: rigs that have one.
+    Partner,
 }
 
 /// All groups.
-pub(crate) const GROUPS: [Group; 5] = [
+pub(crate) const GROUPS: [Group; 6] = [
     Group::Loop,
     Group::Cell,
     Group::Truth,
     Group::Solver,
     Group::Script,
+    Group::Partner,
 ];
 
 /// A column of `ticks.arrow`.
@@ -162,6 +165,10 @@ columns! {
     area_um2 F64 Cell,
     length_sd_um F64 Cell,
     area_sd_um2 F64 Cell,
+    partner_command_um F64 Partner,
+    partner_applied_um F64 Partner,
+    partner_effect_um F64 Partner,
+    partner U8 Partner,
 }
 
 /// Name of the last column of the file: CRC-32 of the values before it in the row, each in its own width, little-endian. A

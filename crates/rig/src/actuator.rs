@@ -130,6 +130,15 @@ pub struct ActuatorReport {
     pub read_ns: i64,
 }
 
+/// The newest that a slow partner of the actuator has said.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PartnerReport {
+    /// State.
+    pub state: ActuatorState,
+    /// Where it stands, um of its own scale.
+    pub applied_um: f64,
+}
+
 /// Why the actuator did not do what it was asked.
 #[derive(Debug, thiserror::Error)]
 pub enum ActuatorError {
@@ -274,6 +283,16 @@ pub trait Actuator: Send {
     /// # Errors
     /// The line is broken.
     fn poll(&mut self) -> Result<Option<ActuatorReport>, ActuatorError>;
+    /// Hands a command to the slow partner, um of its own scale. What goes wrong there is silence of the partner, no error of this one.
+    fn command_partner(&mut self, _command_um: f64, _time_us: u64) {}
+    /// What the slow partner can do; `None` without one.
+    fn partner_info(&self) -> Option<ActuatorInfo> {
+        None
+    }
+    /// Reads what has arrived from the slow partner; its newest report, if any.
+    fn poll_partner(&mut self) -> Option<PartnerReport> {
+        None
+    }
     /// What became of the commands of this session; `None` where the actuator does not say.
     fn account(&self) -> Option<CommandAccount> {
         None

@@ -14,7 +14,7 @@ pub mod source;
 
 pub use actuator::{
     Actuator, ActuatorError, ActuatorFault, ActuatorInfo, ActuatorReport, ActuatorState,
-    ArmRequest, CommandAccount,
+    ArmRequest, CommandAccount, PartnerReport,
 };
 pub use clock::Clock;
 pub use freshness::{FrameAccount, FrameCounts, FrameKind, IdKind, Judged};

@@ -25,6 +25,7 @@ mod clipped;
 mod following;
 mod in_force;
 mod life_cycle;
+mod partner;
 mod rest;
 mod watches;
 
@@ -39,10 +40,10 @@ use crate::tick_record::TickFlags;
 pub use crate::timing::{CoreError, Timing};
 use cellpos_control::{
     Controller, CycleLearning, LoopConfig, LoopInput, LoopOutput, Measurement as LoopMeasurement,
-    Mode, PlantMonitor, PlantMonitorState, SolverStatus, SolverTerms,
+    Mode, Partner, PartnerState, PlantMonitor, PlantMonitorState, SolverStatus, SolverTerms,
 };
 use cellpos_plant::TransferFunction;
-use cellpos_rig::ActuatorReport;
+use cellpos_rig::{ActuatorReport, PartnerReport};
 use cellpos_units::Seconds;
 use std::ops::Range;
 
@@ -98,6 +99,11 @@ struct State {
     parked_at: Option<u64>,
     unrecorded_since_ns: Option<i64>,
     plant: PlantMonitorState,
+    partner: PartnerState,
+    /// Its newest report, and since when it is lost or at a limit.
+    partner_heard: Option<PartnerReport>,
+    partner_lost_since_ns: Option<i64>,
+    partner_limited_since_ns: Option<i64>,
     stage: Stage,
 }
 
@@ -116,6 +122,7 @@ pub struct Core<R> {
     learners: Learners,
     late_solver_ns: Vec<Range<i64>>,
     monitor: PlantMonitor,
+    partner: Option<Partner>,
     references: crate::reference_history::ReferenceHistory,
     state: State,
 }
@@ -189,6 +196,7 @@ impl<R: ReferenceGenerator> Core<R> {
             learners: Learners::default(),
             late_solver_ns: Vec::new(),
             monitor,
+            partner: None,
             references: Default::default(),
             state: State {
                 plant: monitor.start(displacement_um),
@@ -230,6 +238,10 @@ impl<R: ReferenceGenerator> Core<R> {
                 pictures_repeated: 0,
                 parked_at: None,
                 unrecorded_since_ns: None,
+                partner: PartnerState::default(),
+                partner_heard: None,
+                partner_lost_since_ns: None,
+                partner_limited_since_ns: None,
                 stage: Stage::None,
             },
         })
@@ -252,6 +264,13 @@ impl<R: ReferenceGenerator> Core<R> {
     #[must_use]
     pub fn with_late_solver(mut self, spans_ns: Vec<Range<i64>>) -> Self {
         self.late_solver_ns = spans_ns;
+        self
+    }
+
+    /// The same loop with a slow partner that returns the PZT to the middle of its stroke.
+    #[must_use]
+    pub fn with_partner(mut self, partner: Partner) -> Self {
+        self.partner = Some(partner);
         self
     }
 
@@ -375,7 +394,9 @@ impl<R: ReferenceGenerator> Core<R> {
             }
         }
         let mode = self.advance_life(fix.map(|fix| fix.position_um), input.request, &mut tick);
-        let (output, generated) = self.control(fix, input, mode, slew_time_s, &mut tick);
+        let moved = self.move_partner(input, mode, &mut tick);
+        let (output, generated) =
+            self.control(fix, input, mode, (slew_time_s, moved.shift_um), &mut tick);
         if output.requested_um.is_nan() {
             self.latch(SafeReason::NotFinite, &mut tick);
         }
@@ -387,6 +408,7 @@ impl<R: ReferenceGenerator> Core<R> {
         self.state.seq = self.state.seq.wrapping_add(1);
         Some(TickOutput {
             action,
+            partner_um: moved.command_um,
             record,
             events: tick.events,
         })
@@ -397,7 +419,7 @@ impl<R: ReferenceGenerator> Core<R> {
         fix: Option<LoopMeasurement>,
         input: &TickInput,
         mode: Mode,
-        slew_time_s: Option<f64>,
+        (slew_time_s, zero_flow_shift_um): (Option<f64>, f64),
         tick: &mut Tick,
     ) -> (LoopOutput, ReferenceOutput) {
         let running = self.state.life == Life::Running;
@@ -449,6 +471,7 @@ impl<R: ReferenceGenerator> Core<R> {
             ),
             feed_forward_gain: self.learners.feed_forward_gain(),
             excitation_um: self.reference.excitation_um(),
+            zero_flow_shift_um,
         };
         let output = self.controller.step(&given);
         self.state.told_um = output.neutral_um;

@@ -363,6 +363,20 @@ pub enum EventKind {
         /// Times since the last such event.
         count: u16,
     },
+    /// The slow partner is silent, parked or does not obey: the run goes on within the PZT's stroke.
+    PartnerLost,
+    /// It takes commands again.
+    PartnerBack {
+        /// How long it did not.
+        lasted_ms: f64,
+    },
+    /// The slow partner is at an end of its range.
+    PartnerLimitStarted,
+    /// It is off the end.
+    PartnerLimitEnded {
+        /// How long it was there.
+        lasted_ms: f64,
+    },
     /// Frames on the link were damaged.
     LinkGarbage {
         /// Damaged frames since the last such event.

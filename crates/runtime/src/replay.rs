@@ -11,7 +11,7 @@ use crate::life::Request;
 use crate::reference::ReferenceGenerator;
 use crate::tick_record::{TickFlags, TickRecord};
 use cellpos_control::{SolverStatus, SolverTerms};
-use cellpos_rig::{ActuatorFault, ActuatorReport, ActuatorState, Measurement};
+use cellpos_rig::{ActuatorFault, ActuatorReport, ActuatorState, Measurement, PartnerReport};
 use cellpos_vision::{Decision, FixQuality, TrackState};
 use serde::Serialize;
 
@@ -115,6 +115,11 @@ impl<R: ReferenceGenerator> Replay<R> {
         };
         let columns = [
             ("command_um", record.command_um, replayed.command_um),
+            (
+                "partner_command_um",
+                record.partner_command_um,
+                replayed.partner_command_um,
+            ),
             ("requested_um", record.requested_um, replayed.requested_um),
             ("estimate_um", record.estimate_um, replayed.estimate_um),
             ("neutral_um", record.neutral_um, replayed.neutral_um),
@@ -208,6 +213,13 @@ fn input(record: &TickRecord, previous: Option<&TickRecord>) -> TickInput {
         previous_refused: previous.is_some_and(|p| p.flags.has(TickFlags::ACTUATOR_RING_FULL)),
         command_lost: record.flags.has(TickFlags::COMMAND_LOST),
         board,
+        partner: record
+            .flags
+            .has(TickFlags::PARTNER_HEARD)
+            .then_some(PartnerReport {
+                state: ActuatorState::from_number(record.partner),
+                applied_um: record.partner_applied_um,
+            }),
         request: Request::from_number(record.request),
         // A reference that can be steered was told just this; the others do not listen.
         target_um: Some(record.target_um).filter(|um| um.is_finite()),

@@ -287,8 +287,9 @@ impl<'a> Acting<'a> {
     /// Sends what waits. A newer command replaces an older one that has not been sent: a burst after a stall would only make the
     /// PZT rattle through the past.
     fn send(&mut self) -> Result<(), ActuatorError> {
-        let mut newest = None;
+        let (mut newest, mut partner) = (None, None);
         while let Ok(order) = self.orders.pop() {
+            partner = order.partner_um.map(|um| (um, order.time_us)).or(partner);
             match order.action {
                 Action::Command {
                     command_um,
@@ -297,6 +298,9 @@ impl<'a> Acting<'a> {
                 Action::Park => self.park = true,
                 Action::None => {}
             }
+        }
+        if let Some((um, time_us)) = partner.filter(|_| !self.park) {
+            self.actuator.command_partner(um, time_us);
         }
         if self.park {
             // Asked again until the line has taken it.
@@ -311,10 +315,15 @@ impl<'a> Acting<'a> {
     /// Tells control what is new.
     fn tell(&mut self, report: Option<ActuatorReport>) {
         let account = self.actuator.account().unwrap_or_default();
-        if report.is_some() || account.lost() != self.told_lost {
+        let partner = self.actuator.poll_partner();
+        if report.is_some() || partner.is_some() || account.lost() != self.told_lost {
             self.told_lost = account.lost();
             // A full ring means that the loop is not running: it will hear the next one.
-            let _ = self.heard.push(Heard { report, account });
+            let _ = self.heard.push(Heard {
+                report,
+                partner,
+                account,
+            });
         }
     }
 

@@ -5,7 +5,7 @@ use crate::frames::FrameTally;
 use crate::life::{Event, EventKind, Events, Request};
 use crate::tick_record::{TickFlags, TickRecord};
 use cellpos_control::SolverTerms;
-use cellpos_rig::{ActuatorReport, CommandAccount, Measurement};
+use cellpos_rig::{ActuatorReport, CommandAccount, Measurement, PartnerReport};
 use serde::Serialize;
 
 /// What a tick is given by its driver.
@@ -25,6 +25,8 @@ pub struct TickInput {
     pub command_lost: bool,
     /// The newest report of the board, if one came since the previous tick.
     pub board: Option<ActuatorReport>,
+    /// The newest report of the slow partner, if one came since the previous tick.
+    pub partner: Option<PartnerReport>,
     /// What is wrong with a board that talks, if anything is.
     pub board_trouble: Option<BoardTrouble>,
     /// What the operator asks for.
@@ -42,6 +44,8 @@ pub struct TickInput {
 pub struct Heard {
     /// The newest report, if one came.
     pub report: Option<ActuatorReport>,
+    /// The newest report of the slow partner, if one came.
+    pub partner: Option<PartnerReport>,
     /// What became of the commands so far, where the actuator says so.
     pub account: CommandAccount,
 }
@@ -67,6 +71,8 @@ pub enum Action {
 pub struct TickOutput {
     /// What to do.
     pub action: Action,
+    /// Command for the slow partner, um of its own scale, if one is due.
+    pub partner_um: Option<f64>,
     /// The record, less what only the driver knows (wake-up, compute time, late, ring full).
     pub record: TickRecord,
     /// What happened.
@@ -114,6 +120,10 @@ pub struct Counts {
     pub range_limited: u64,
     /// Commands clipped to the slew limit.
     pub slew_limited: u64,
+    /// Ticks without the slow partner, of a loop that has one.
+    pub partner_lost: u64,
+    /// Ticks with the slow partner at an end of its range.
+    pub partner_limited: u64,
     /// Commands that found the actuator ring full.
     pub refused: u64,
     /// Ticks in which the optimiser ran out of time, and its best feasible point was followed.

@@ -56,6 +56,13 @@ impl TickFlags {
     /// The bead does not follow the commands beyond a level: the actuator is clipped.
     pub const CLIPPED: u32 = 1 << 20;
 
+    /// A report of the slow partner came since the previous tick.
+    pub const PARTNER_HEARD: u32 = 1 << 21;
+    /// The slow partner is silent, parked or does not obey: the PZT is alone.
+    pub const PARTNER_LOST: u32 = 1 << 22;
+    /// The slow partner is at an end of its range.
+    pub const PARTNER_LIMITED: u32 = 1 << 23;
+
     /// Whether all bits of `mask` are set.
     pub fn has(self, mask: u32) -> bool {
         self.0 & mask == mask
@@ -129,6 +136,14 @@ pub struct TickRecord {
     pub board: u8,
     /// Latched fault that the board last reported (number of the link's fault; 0: none).
     pub board_fault: u8,
+    /// Command of the slow partner in force, um of its own scale; NaN without one.
+    pub partner_command_um: f64,
+    /// Where the slow partner said last that it stands, um of its own scale.
+    pub partner_applied_um: f64,
+    /// Effect of the slow partner on the flow as the loop reckons it, um of PZT.
+    pub partner_effect_um: f64,
+    /// State that the slow partner last reported (as `board`; 255: none).
+    pub partner: u8,
     /// What happened.
     pub flags: TickFlags,
     /// Frames that came since the previous tick, at most 255 (one is used, the rest counted).
@@ -195,6 +210,10 @@ impl TickRecord {
             request: 0,
             board: 255,
             board_fault: 0,
+            partner_command_um: f64::NAN,
+            partner_applied_um: f64::NAN,
+            partner_effect_um: f64::NAN,
+            partner: 255,
             flags: TickFlags(0),
             drained: 0,
             wake_ns: 0,

@@ -23,6 +23,8 @@ const LEARNED_EVERY: u64 = 256;
 pub struct Order {
     /// What to do.
     pub action: Action,
+    /// Command for the slow partner, um of its own scale, if one is due.
+    pub partner_um: Option<f64>,
     /// Hand-over since the start of the run, us.
     pub time_us: u64,
 }
@@ -237,11 +239,13 @@ impl<R: ReferenceGenerator> Ticker<R> {
         let (newest, frames) = self.frames.take(start_ns);
         let mut board = None;
         let mut board_trouble = None;
+        let mut partner = None;
         let lost_before = self.commands.lost();
         while let Ok(heard) = self.heard.pop() {
             let not_taken = heard.account.not_taken - self.commands.not_taken;
             self.board_watch.not_taken(not_taken);
             self.commands = heard.account;
+            partner = heard.partner.or(partner);
             let Some(report) = heard.report else {
                 continue;
             };
@@ -264,6 +268,7 @@ impl<R: ReferenceGenerator> Ticker<R> {
             slow_vision_ns: self.slow_vision_ns,
             command_lost: self.commands.lost() > lost_before,
             board,
+            partner,
             board_trouble,
             request,
             target_um: self.steered_um,
@@ -282,9 +287,10 @@ impl<R: ReferenceGenerator> Ticker<R> {
             record.true_um = self.truth_um;
         }
         self.previous_refused = false;
-        if output.action != Action::None {
+        if output.action != Action::None || output.partner_um.is_some() {
             let order = Order {
                 action: output.action,
+                partner_um: output.partner_um,
                 time_us: (input.time_ns / 1000).max(0) as u64,
             };
             let time_us = order.time_us;

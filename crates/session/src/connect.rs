@@ -9,7 +9,8 @@ use crate::rig::{Finished, Rig};
 use crate::rig_file::{ActuatorConfig, CameraConfig, ClockKind, RigFile};
 use crate::setup::{ReferenceSpec, Setup};
 use cellpos_control::ControllerKind;
-use cellpos_control::design::bound_rms_um;
+use cellpos_control::LoopModel;
+use cellpos_control::design::{DesignPlant, bound_rms_of_path_um, bound_rms_um};
 use cellpos_drivers::Calibration;
 use cellpos_record::{Group, InputFile, RunEnd, RunMeta, RunWriter, space};
 use cellpos_runtime::Summary;
@@ -84,6 +85,7 @@ fn columns(setup: &Setup, file: &RigFile) -> Vec<Group> {
         (Group::Truth, !real),
         (Group::Solver, mpc),
         (Group::Script, script),
+        (Group::Partner, file.partner.is_some()),
     ]
     .into_iter()
     .filter_map(|(group, wanted)| wanted.then_some(group))
@@ -119,6 +121,9 @@ fn anchored(file: &RigFile) -> Result<RigFile, Failure> {
         *socket = absolute(socket)?;
     }
     if let ActuatorConfig::Program { socket, .. } = &mut file.actuator {
+        *socket = absolute(socket)?;
+    }
+    if let Some(socket) = (file.partner.as_mut()).and_then(|partner| partner.socket.as_mut()) {
         *socket = absolute(socket)?;
     }
     if let ActuatorConfig::Serial { port, .. } = &mut file.actuator
@@ -245,19 +250,29 @@ pub fn bound_rms_nm(file: &RigFile, setup: &Setup, summary: &Summary) -> Option<
         true => measured_s.max(0.0),
         false => timing.camera_delay_ms * 1e-3,
     };
-    let bound_nm = 1e3
-        * bound_rms_um(
-            crate::fit::diffusion_um2_per_s(file, &setup.model),
-            noise_nm * 1e-3,
-            delay_s,
-            timing.period_us * 1e-6,
-        );
+    let diffusion = crate::fit::diffusion_um2_per_s(file, &setup.model);
+    let bound_nm = 1e3 * bound_of_um(setup, diffusion, noise_nm * 1e-3, delay_s);
     let measured_nm = |nm: f64| (nm * nm - noise_nm * noise_nm).max(0.0).sqrt();
     let reached_nm = (summary.rms_true_nm).or(summary.rms_measured_nm.map(measured_nm));
     // An RMS of n independent values has a relative standard deviation of 1/sqrt(2 n); three standard deviations.
     let unsure = 3.0 * (CORRELATED_S / summary.duration_s.max(CORRELATED_S)).sqrt();
     let beaten = reached_nm.is_some_and(|nm| nm < bound_nm * (1.0 - unsure));
     (!beaten).then_some(bound_nm)
+}
+
+/// The bound of a set-up's path with another camera path, um.
+pub(crate) fn bound_of_um(setup: &Setup, diffusion: f64, noise_um: f64, delay_s: f64) -> f64 {
+    let sample_s = setup.config.timing.period_us * 1e-6;
+    let plant =
+        DesignPlant::from_model(&setup.model, Some(delay_s + 0.5 * sample_s), sample_s).ok();
+    let model = plant.and_then(|plant| plant.loop_model().ok());
+    match model {
+        Some(model) => {
+            let model = LoopModel { delay_s, ..model };
+            bound_rms_of_path_um(diffusion, noise_um, &model)
+        }
+        None => bound_rms_um(diffusion, noise_um, delay_s, sample_s),
+    }
 }
 
 /// What is wrong when the frames of a run were not as old as the rig file says: the loop was made for another delay.
@@ -274,9 +289,23 @@ pub fn delay_warning(file: &RigFile, summary: &Summary) -> Option<String> {
 pub fn warnings<S>(finished: &Finished<S>) -> Vec<String> {
     let mut warnings = finished.rig.warnings().to_vec();
     warnings.extend(delay_warning(finished.rig.file(), &finished.summary));
+    warnings.extend(partner_warning(&finished.summary));
     let calibration = finished.rig.file().calibration;
     warnings.extend((finished.odd_gain).map(|ratio| gain_warning(ratio, calibration.as_ref())));
     warnings
+}
+
+/// What the user should know of the slow partner of a run that is over.
+fn partner_warning(summary: &Summary) -> Option<String> {
+    let counts = &summary.counts;
+    let part = |ticks: u64| 100.0 * ticks as f64 / counts.ticks.max(1) as f64;
+    let (lost, limited) = (part(counts.partner_lost), part(counts.partner_limited));
+    (lost + limited > 0.0).then(|| {
+        format!(
+            "the slow actuator was missing for {lost:.1} % of the run and at an end of its range for {limited:.1} %: for that time the PZT \
+             was alone within its stroke; see the run's events"
+        )
+    })
 }
 
 /// Possible causes of a gain that differs from the model's. Positions in pixels times a wrong pixel size are a gain wrong by the

@@ -1,6 +1,6 @@
 //! The line of a run on the terminal: what matters most comes first, and what does not fit is left out.
 
-use cellpos_runtime::{Life, Statistics, TickRecord};
+use cellpos_runtime::{Life, Statistics, TickFlags, TickRecord};
 use std::sync::{Arc, Mutex, PoisonError};
 
 /// What the live line needs to know.
@@ -61,6 +61,11 @@ impl LiveLine {
         parts.push((5, format!("target {:+.3}um", record.target_um)));
         parts.push((6, format!("bead {:+.3}um", record.measured_um)));
         parts.push((1, format!("PZT {:.2}um", record.command_um)));
+        if record.flags.has(TickFlags::PARTNER_LOST) {
+            parts.push((1, "slow actuator MISSING".to_string()));
+        } else if record.partner_command_um.is_finite() {
+            parts.push((2, format!("slow {:.2}um", record.partner_command_um)));
+        }
         parts.push((7, format!("({to_limit_um:.1}um to limit)")));
         parts.push((if late > 0 { 2 } else { 8 }, format!("late {late}")));
         let typed = self.typed.text();

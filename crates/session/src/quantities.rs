@@ -10,7 +10,7 @@ const fn q(table: &'static str, plain: &'static str, with_unit: &'static str) ->
 }
 
 /// Those of the host's own tables.
-const OF_THE_HOST: [Quantity; 25] = [
+const OF_THE_HOST: [Quantity; 37] = [
     q("", "first_neutral", "first_neutral_um"),
     q("", "near", "near_um"),
     q("actuator", "watchdog", "watchdog_ms"),
@@ -18,6 +18,18 @@ const OF_THE_HOST: [Quantity; 25] = [
     q("actuator", "regulator", "regulator_ms"),
     q("actuator", "compliance", "compliance_ms"),
     q("actuator", "hold_watchdog", "hold_watchdog_ms"),
+    q("partner", "period", "period_ms"),
+    q("partner", "low", "low_um"),
+    q("partner", "high", "high_um"),
+    q("partner", "slew", "slew_um_per_s"),
+    q("partner", "park", "park_um"),
+    q("partner", "lag", "lag_ms"),
+    q("partner", "delay", "delay_ms"),
+    q("partner", "mid", "mid_um"),
+    q("partner", "watchdog", "watchdog_ms"),
+    q("partner", "hold_watchdog", "hold_watchdog_ms"),
+    q("partner", "emulated_regulator", "emulated_regulator_ms"),
+    q("partner", "emulated_compliance", "emulated_compliance_ms"),
     q("camera", "rate", "rate_hz"),
     q("camera", "exposure", "exposure_us"),
     q("camera", "latency", "latency_ms"),

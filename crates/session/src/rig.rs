@@ -12,7 +12,7 @@ use crate::running;
 use crate::setup::{Prepared, ReferenceSpec, Setup, SetupConfig};
 use crate::signals::{self, Place};
 use crate::witness::Witness;
-use cellpos_control::LearnedTable;
+use cellpos_control::{LearnedTable, Limits, PartnerConfig};
 use cellpos_rig::{
     Actuator, ActuatorInfo, ArmRequest, Clock, FrameWatch, PositionSource, SourceInfo,
 };
@@ -155,8 +155,10 @@ impl Rig {
     ) -> Result<Setup, Failure> {
         let disagrees = crate::setup::model_delay_warning(&prepared.model, &self.file.timing);
         self.devices.connected.warnings.extend(disagrees);
+        let partner = self.partner(&prepared.controller.limits)?;
         Ok(Setup {
             config: SetupConfig {
+                partner,
                 displacement_um: self
                     .standing_um()?
                     .unwrap_or(prepared.controller.limits.park_um),
@@ -169,6 +171,24 @@ impl Rig {
             },
             model: prepared.model,
             controller: prepared.controller,
+        })
+    }
+
+    /// The slow partner as the loop knows it, for a PZT with these limits.
+    fn partner(&self, limits: &Limits) -> Result<Option<PartnerConfig>, Failure> {
+        let Some(table) = &self.file.partner else {
+            return Ok(None);
+        };
+        let info = self.devices.connected.actuator.partner_info();
+        let step_um = info.map_or(0.0, |info| info.step_um);
+        let config = table
+            .config(limits)
+            .map(|config| PartnerConfig { step_um, ..config });
+        config.map(Some).ok_or_else(|| {
+            Failure::bad_input(
+                "[partner] gain is missing: the slow actuator's effect on the flow is not known",
+                "measure it: cellpos rig partner RIG --write; or leave the table [partner] out to run the PZT alone",
+            )
         })
     }
 

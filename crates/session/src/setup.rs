@@ -10,7 +10,8 @@ use cellpos_control::design::{
     predicted_density_um,
 };
 use cellpos_control::{
-    Controller, ControllerConfig, ControllerFile, ControllerKind, Limits, Profile, Shape,
+    Controller, ControllerConfig, ControllerFile, ControllerKind, Limits, Partner, PartnerConfig,
+    Profile, Shape,
 };
 use cellpos_ident::experiment::Turn;
 use cellpos_plant::Model;
@@ -194,6 +195,9 @@ pub struct SetupConfig {
     pub timing: Timing,
     /// The check before the loop is closed.
     pub arming: ArmingConfig,
+    /// The slow partner of the PZT, where there is one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub partner: Option<PartnerConfig>,
     /// Learning over cycles, if it is on.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub learn: Option<LearnSpec>,
@@ -316,7 +320,12 @@ impl Setup {
         let plant =
             DesignPlant::from_model(&self.model, Some(self.controller.delay_ms * 1e-3), sample_s)
                 .map_err(Failure::input)?;
-        Core::with_controller(
+        let partner = self
+            .config
+            .partner
+            .map(|config| Partner::new(config, &law.settings().limits, sample_s));
+        let partner = partner.transpose().map_err(Failure::input)?;
+        let core = Core::with_controller(
             law,
             reference,
             self.config.timing,
@@ -324,7 +333,11 @@ impl Setup {
             &plant.plant,
             [self.config.displacement_um, self.config.neutral_um],
         )
-        .map_err(Failure::input)
+        .map_err(Failure::input)?;
+        Ok(match partner {
+            Some(partner) => core.with_partner(partner),
+            None => core,
+        })
     }
 }
 
@@ -426,6 +439,12 @@ pub fn controller(name: &str, model: &Model, timing: &Timing) -> Result<Controll
     let mut file = ControllerFile::from_pi(pi, loop_delay_s);
     if let Some(kind) = kind {
         file.controller = kind;
+    }
+    // The usual effort keeps twice the gain stable with one more sample of delay. A sample longer than the whole camera path is no
+    // delay that a rig may have in hiding: there less effort is robust enough, and closer to the bound.
+    if sample_s > 2.0 * timing.camera_delay_ms * 1e-3 {
+        file.lqg.effort = 1.0;
+        file.mpc.effort = 1.0;
     }
     file.sample_time_ms = sample_s * 1e3;
     if let Some(config) = &report.config {

@@ -104,6 +104,8 @@ fn level(kind: &EventKind) -> Level {
         | EventKind::FramesEarlyEnded { .. }
         | EventKind::VisionSlowEnded { .. }
         | EventKind::StuckEnded { .. }
+        | EventKind::PartnerBack { .. }
+        | EventKind::PartnerLimitEnded { .. }
         | EventKind::SaturationEnded { .. }
         | EventKind::DiskSlowEnded { .. }
         | EventKind::Finished
@@ -192,6 +194,16 @@ fn text(kind: &EventKind) -> String {
             format!("The board reports {state:?}, fault {fault:?}.")
         }
         EventKind::BoardHeld { count } => board_held(count),
+        EventKind::PartnerLost => {
+            "The slow actuator is silent, parked or does not obey: the run goes on within the PZT's stroke.".to_string()
+        }
+        EventKind::PartnerBack { lasted_ms } => ended("The slow actuator obeys again", lasted_ms),
+        EventKind::PartnerLimitStarted => {
+            "The slow actuator is at an end of its range: what comes beyond is the PZT's alone.".to_string()
+        }
+        EventKind::PartnerLimitEnded { lasted_ms } => {
+            ended("The slow actuator is off the end of its range", lasted_ms)
+        }
         EventKind::LinkGarbage { count } => {
             let messages = plural(u64::from(count), "message", "messages");
             format!("{count} damaged {messages} on the link.")

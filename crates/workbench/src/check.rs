@@ -95,6 +95,38 @@ impl Findings<'_> {
         }
     }
 
+    /// A slow actuator whose effect is not known moves nothing.
+    fn partner(&mut self) {
+        let Some(partner) = &self.file.partner else {
+            return;
+        };
+        match partner.gain {
+            None => self.say(
+                Error,
+                ("partner", "kind"),
+                &"",
+                "gain is missing: the slow actuator's effect on the flow is not known".to_owned(),
+                "measure it: cellpos rig partner RIG --write",
+            ),
+            Some(gain) if partner.gain_ci95 > 0.1 * gain.abs() => {
+                let what = format!(
+                    "gain_ci95 = {}: more than a tenth of the gain, the slow actuator moves slowly for it",
+                    partner.gain_ci95
+                );
+                let remedy =
+                    "measure it for longer: cellpos rig partner RIG --duration 120s --write";
+                self.say(
+                    Warning,
+                    ("partner", "gain_ci95"),
+                    &partner.gain_ci95,
+                    what,
+                    remedy,
+                );
+            }
+            Some(_) => {}
+        }
+    }
+
     /// Watchdogs against the period and against each other.
     fn watchdogs(&mut self) {
         let period_ms = self.file.timing.period_us * 1e-3;
@@ -258,6 +290,7 @@ pub fn findings(file: &RigFile, path: &Path) -> Vec<Finding> {
     findings.times();
     findings.watchdogs();
     findings.board();
+    findings.partner();
     findings.camera(path);
     findings.found.findings
 }

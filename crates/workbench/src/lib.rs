@@ -14,6 +14,7 @@ mod connected;
 mod finding;
 pub mod line_test;
 pub mod mover;
+pub mod partner;
 pub mod prove;
 pub mod sight;
 pub mod snapshot;

@@ -13,6 +13,7 @@ WORDS: Dict[str, Dict[int, str]] = {
     "life": dict(enumerate(("disarmed", "armed", "running", "safe"))),
     "request": dict(enumerate(("none", "freeze", "park", "skip", "pause", "unrecorded"))),
     "board": dict(enumerate(("disarmed", "armed", "running", "frozen", "safe", "holding"))),
+    "partner": dict(enumerate(("disarmed", "armed", "running", "frozen", "safe", "holding"))),
     "board_fault": dict(enumerate(("none", "command-timeout", "freeze-timeout", "arm-timeout", "device"))),
     "track": dict(enumerate(("searching", "tracking", "coasting", "lost"))),
     "decision": dict(
@@ -128,6 +129,10 @@ ORDER: Tuple[str, ...] = (
     "solver_iterations",
     "solver_active",
     "solver_us",
+    "partner_command_um",
+    "partner_applied_um",
+    "partner_effect_um",
+    "partner",
     "session",
 )
 
@@ -156,6 +161,9 @@ FLAGS: Dict[str, int] = {
             "between",
             "command-lost",
             "clipped",
+            "partner-heard",
+            "partner-lost",
+            "partner-limited",
         )
     )
 }

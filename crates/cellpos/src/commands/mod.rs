@@ -19,6 +19,7 @@ pub mod generate;
 pub mod identify;
 pub mod jog;
 pub mod paper;
+mod partner;
 mod prove;
 pub mod reconcile;
 pub mod replay;

@@ -29,6 +29,8 @@ enum Command {
     Check(Check),
     /// Test board, camera, vision and machine, and write a sheet for the lab book.
     Prove(super::prove::Args),
+    /// Measure gain, lag and delay of the slow actuator, table [partner], while the bead is held.
+    Partner(super::partner::Args),
 }
 
 #[derive(Debug, clap::Args)]
@@ -70,6 +72,7 @@ pub fn run(args: Args) -> CommandResult {
         Command::New(args) => new(args),
         Command::Check(args) => check(args),
         Command::Prove(args) => super::prove::run(&args),
+        Command::Partner(args) => super::partner::run(&args),
     }
 }
 

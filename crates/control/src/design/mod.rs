@@ -17,7 +17,7 @@ mod spread;
 mod step;
 
 pub use crate::uncertainty::{MarginSource, Uncertainty};
-pub use bound::{bound_rms_um, kalman_posterior_um2};
+pub use bound::{bound_rms_of_path_um, bound_rms_um, kalman_posterior_um2};
 pub use curves::{loop_response, step_response};
 pub use density::predicted_density_um;
 pub use learning::harmonic_responses;

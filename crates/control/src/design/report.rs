@@ -1,7 +1,7 @@
 //! The whole design in one call: what `cellpos design` prints.
 
 use crate::controller::{Controller, ControllerConfig, LoopConfig};
-use crate::design::bound::bound_rms_um;
+use crate::design::bound::{bound_rms_of_path_um, bound_rms_um};
 use crate::design::margins::{Margins, margins};
 use crate::design::noise::{NoiseFigures, noise_figures};
 use crate::design::plant::{DesignPlant, DesignWarning};
@@ -283,18 +283,22 @@ pub fn design(request: &DesignRequest) -> Result<DesignReport, DesignError> {
         step,
         disturbance,
         noise: noise_figures(plant, &law)?,
-        bound_rms_um: bound_rms_um(
-            plant.diffusion_um2_per_s,
-            plant.fix_noise_um,
-            plant.delay_s,
-            plant.sample_time_s,
-        ),
+        bound_rms_um: bound_um(plant),
         spread,
         limits_broken: Vec::new(),
         warnings,
     };
     report.limits_broken = broken(&report, &request.limits);
     Ok(report)
+}
+
+/// The bound of the path; of a plant that the loop cannot hold that of its delay.
+fn bound_um(plant: &DesignPlant) -> f64 {
+    let (diffusion, noise) = (plant.diffusion_um2_per_s, plant.fix_noise_um);
+    match plant.loop_model() {
+        Ok(model) => bound_rms_of_path_um(diffusion, noise, &model),
+        Err(_) => bound_rms_um(diffusion, noise, plant.delay_s, plant.sample_time_s),
+    }
 }
 
 fn loop_config(

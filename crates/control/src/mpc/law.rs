@@ -345,6 +345,11 @@ impl ControlLaw for MpcLaw {
         self.pi.rescale(&mut state.pi, ratio);
     }
 
+    fn shift(&self, state: &mut MpcState, by_um: f64) {
+        state.plan_um.iter_mut().for_each(|um| *um += by_um);
+        self.pi.shift(&mut state.pi, by_um);
+    }
+
     fn follow(&self, state: &mut MpcState, input: &LawInput, command_um: f64) {
         state.forget();
         state.on_reference = FeedForward::rest(input.reference_um);

@@ -250,6 +250,14 @@ columns! {
         "Active constraints at the solution, at most 255.";
     "solver_us" "us" Number(|r| f64::from(r.tick.solver_ns) / 1e3),
         "Time of the optimiser; 0 on the virtual clock.";
+    "partner_command_um" "um" Number(|r| r.tick.partner_command_um),
+        "Command of the slow actuator in force, on its own scale; none without one.";
+    "partner_applied_um" "um" Number(|r| r.tick.partner_applied_um),
+        "Where the slow actuator said last that it stands, on its own scale.";
+    "partner_effect_um" "um" Number(|r| r.tick.partner_effect_um),
+        "Effect of the slow actuator on the flow as the loop reckons it, in displacement of the PZT.";
+    "partner" "" Code(BOARD, |r| r.tick.partner),
+        "State that the slow actuator reported last; none before its first report.";
     "session" "" Whole(|r| r.session),
         "Session: 1, one more per resume.";
 }

@@ -52,6 +52,9 @@ fn every_bit_of_the_flags_is_on_the_page() {
         ("stuck", TickFlags::STUCK),
         ("command-lost", TickFlags::COMMAND_LOST),
         ("clipped", TickFlags::CLIPPED),
+        ("partner-heard", TickFlags::PARTNER_HEARD),
+        ("partner-lost", TickFlags::PARTNER_LOST),
+        ("partner-limited", TickFlags::PARTNER_LIMITED),
     ] {
         assert!(page.contains(&format!("| {value} | {name} |")), "{name}");
     }

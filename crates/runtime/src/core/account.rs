@@ -127,6 +127,8 @@ impl<R: ReferenceGenerator> Core<R> {
             (TickFlags::FREEZE, &mut counts.frozen),
             (TickFlags::RANGE_LIMITED, &mut counts.range_limited),
             (TickFlags::SLEW_LIMITED, &mut counts.slew_limited),
+            (TickFlags::PARTNER_LOST, &mut counts.partner_lost),
+            (TickFlags::PARTNER_LIMITED, &mut counts.partner_limited),
         ] {
             *counter += u64::from(flags.has(mask));
         }
@@ -179,6 +181,10 @@ impl<R: ReferenceGenerator> Core<R> {
                 .state
                 .board
                 .map_or(ActuatorFault::None as u8, |b| b.fault as u8),
+            partner_command_um: self.state.partner.command_um(),
+            partner_applied_um: self.state.partner.applied_um(),
+            partner_effect_um: self.partner_effect_um(),
+            partner: self.state.partner_heard.map_or(255, |p| p.state as u8),
             flags,
             drained: input.frames.arrived.min(255) as u8,
             wake_ns: 0,

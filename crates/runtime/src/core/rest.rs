@@ -49,6 +49,11 @@ impl Rest {
         }
     }
 
+    /// The zero flow has moved by a known amount, um.
+    pub fn shift(&mut self, by_um: f64) {
+        self.quiet_um += by_um;
+    }
+
     /// The zero flow to stop at, um, when the newest estimate is `newest_um`.
     pub fn zero_flow_um(&self, newest_um: f64) -> f64 {
         if self.agreeing > AGREEING && newest_um.is_finite() {

@@ -105,6 +105,7 @@ proptest! {
                 measurement: (drained > 0).then_some(m),
                 frames: FrameTally { arrived: drained, ..FrameTally::default() },
                 slow_vision_ns: None,
+partner: None,
 board_trouble: None,
                 previous_late_ns: None,
                 previous_refused: false,

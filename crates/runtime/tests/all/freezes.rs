@@ -29,6 +29,7 @@ fn a_lost_bead_that_the_operator_froze_meanwhile_is_not_controlled_when_it_comes
                 ..FrameTally::default()
             },
             slow_vision_ns: None,
+            partner: None,
             board_trouble: None,
             previous_late_ns: None,
             previous_refused: false,

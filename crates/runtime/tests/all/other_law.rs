@@ -65,6 +65,7 @@ fn record(ticks: u64) -> Vec<TickRecord> {
                     ..FrameTally::default()
                 },
                 slow_vision_ns: None,
+                partner: None,
                 board_trouble: None,
                 previous_late_ns: None,
                 previous_refused: false,

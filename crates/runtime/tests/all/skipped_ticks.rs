@@ -28,6 +28,7 @@ fn commands(
                 ..FrameTally::default()
             },
             slow_vision_ns: None,
+            partner: None,
             board_trouble: None,
             previous_late_ns: None,
             previous_refused: false,

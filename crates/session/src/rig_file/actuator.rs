@@ -122,7 +122,7 @@ fn regulator_ms() -> f64 {
 }
 
 /// What pressure controllers take, ms.
-fn command_period_ms() -> f64 {
+pub(super) fn command_period_ms() -> f64 {
     20.0
 }
 

@@ -1,12 +1,12 @@
 //! The devices that a rig file names, opened.
 
-use super::{ActuatorConfig, CameraConfig, ClockKind, Frames, RigFile};
+use super::{ActuatorConfig, CameraConfig, ClockKind, Frames, PartnerTable, RigFile};
 use crate::Failure;
 use cellpos_drivers::program::ProgramLine;
 use cellpos_drivers::serial::SerialLine;
 use cellpos_drivers::socket::SocketCamera;
 use cellpos_drivers::{
-    BoardHost, Calibration, CommandedFlow, FlowTap, Followed, Port, VisionSource,
+    BoardHost, Calibration, CommandedFlow, FlowTap, Followed, Pair, Port, VisionSource,
 };
 use cellpos_emulator::EmulatedRig;
 use cellpos_plant::Model;
@@ -130,8 +130,12 @@ impl RigFile {
         };
         let model = Model::load(&self.emulator.model).map_err(Failure::input)?;
         let model = self.actuator.before(model);
-        let emulated = EmulatedRig::new(self.board, &self.emulator, &model, clock.clone())
-            .map_err(Failure::input)?;
+        let (board, world) = (self.board, &self.emulator);
+        let emulated = match self.partner.as_ref().map(PartnerTable::emulated) {
+            Some(slow) => EmulatedRig::with_partner(board, world, &model, clock.clone(), &slow),
+            None => EmulatedRig::new(board, world, &model, clock.clone()),
+        }
+        .map_err(Failure::input)?;
         let flow = nominal_flow()?;
         let source: Box<dyn PositionSource> = match frames {
             Frames::Off => Box::new(emulated.positions()),
@@ -149,9 +153,16 @@ impl RigFile {
                 self.emulator.latency_ms, self.timing.camera_delay_ms
             ));
         }
+        let fast = Box::new(FlowTap::new(board, flow.clone(), clock.clone()));
         Ok(Connected {
             source,
-            actuator: Box::new(FlowTap::new(board, flow.clone(), clock.clone())),
+            actuator: match &self.partner {
+                Some(partner) => {
+                    let slow = emulated.partner().map_err(Failure::failed)?;
+                    Box::new(Pair::new(fast, Box::new(slow), partner.request()))
+                }
+                None => fast,
+            },
             clock,
             warnings,
             flow,
@@ -251,13 +262,38 @@ impl RigFile {
         let board = BoardHost::connect(line, Clock::Real).map_err(Failure::failed)?;
         let flow = nominal_flow()?;
         let camera = self.open_camera()?;
+        let fast = Box::new(FlowTap::new(board, flow.clone(), Clock::Real));
         Ok(Connected {
             source: self.tracked(camera, calibration, &Clock::Real, &flow)?,
-            actuator: Box::new(FlowTap::new(board, flow.clone(), Clock::Real)),
+            actuator: self.paired(fast, &mut warnings),
             clock: Clock::Real,
             warnings,
             flow,
         })
+    }
+
+    /// The PZT with its slow partner. Where that is missing the PZT goes alone, and the user is warned.
+    fn paired(&self, fast: Box<dyn Actuator>, warnings: &mut Vec<String>) -> Box<dyn Actuator> {
+        let Some(partner) = &self.partner else {
+            return fast;
+        };
+        // A table without a socket was refused when the file was read.
+        let socket = partner.socket.clone().unwrap_or_default();
+        let line = ProgramLine::open(&socket).map_err(|error| error.to_string());
+        let slow = line.and_then(|line| {
+            BoardHost::connect(line, Clock::Real).map_err(|error| error.to_string())
+        });
+        match slow {
+            Ok(slow) => Box::new(Pair::new(fast, Box::new(slow), partner.request())),
+            Err(error) => {
+                warnings.push(format!(
+                    "the slow actuator is missing ([partner] socket = \"{}\": {error}): the run goes on within the PZT's stroke; \
+                     start the program that serves it, then the run, to have both",
+                    socket.display()
+                ));
+                fast
+            }
+        }
     }
 
     /// Camera and board without a tracker, for the LED test.

@@ -2,11 +2,13 @@
 
 mod actuator;
 mod connect;
+mod partner;
 mod port;
 mod sight;
 
 pub use actuator::ActuatorConfig;
 pub use connect::Connected;
+pub use partner::{PartnerKind, PartnerTable};
 
 use crate::{Failure, quantities};
 use cellpos_control::Limits;
@@ -34,6 +36,9 @@ pub struct RigFile {
     pub sample: Option<Sample>,
     /// The PZT board.
     pub actuator: ActuatorConfig,
+    /// A slow actuator alongside it; left out: none.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub partner: Option<PartnerTable>,
     /// The camera.
     pub camera: CameraConfig,
     /// From pixels to micrometres; left out for the emulated camera: its own.
@@ -132,6 +137,7 @@ impl Default for RigFile {
             near_um: None,
             sample: None,
             actuator: ActuatorConfig::Emulated {},
+            partner: None,
             camera: CameraConfig::Emulated {},
             calibration: None,
             calibration_file: None,
@@ -205,6 +211,9 @@ impl RigFile {
         if let ActuatorConfig::Program { socket, .. } = &mut file.actuator {
             *socket = folder.join(&*socket);
         }
+        if let Some(socket) = (file.partner.as_mut()).and_then(|partner| partner.socket.as_mut()) {
+            *socket = folder.join(&*socket);
+        }
         if let Some(period_ms) = file.actuator.period_ms() {
             file.keep_the_pace_of(period_ms * 1e3);
         }
@@ -276,6 +285,17 @@ impl RigFile {
                         "period_us = {}: the actuator takes a command each {period_us} us; leave period_us out",
                         self.timing.period_us
                     ),
+                ));
+            }
+        }
+        if let Some(partner) = &self.partner {
+            partner
+                .validate(&self.limits, self.timing.period_us * 1e-6)
+                .map_err(|error| say("partner", &error))?;
+            if (partner.kind == PartnerKind::EmulatedPressure) != self.is_emulated() {
+                return Err(say(
+                    "partner",
+                    &"[partner] kind: \"emulated-pressure\" is of the emulated rig, \"program\" of a real one",
                 ));
             }
         }

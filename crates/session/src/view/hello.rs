@@ -1,9 +1,9 @@
 //! Data of a run for the page before it begins.
 
+use crate::connect::bound_of_um;
 use crate::rig::Rig;
 use crate::setup::Setup;
 use cellpos_control::ADAPT_COLUMNS;
-use cellpos_control::design::bound_rms_um;
 use cellpos_live::Hello;
 
 /// Text of the page about the run.
@@ -37,7 +37,6 @@ pub(super) fn hello(rig: &Rig, setup: &Setup, page: &Page) -> Hello {
 pub(super) fn hello_of(setup: &Setup, diffusion: f64, page: &Page) -> Hello {
     let limits = setup.controller.limits;
     let timing = &setup.config.timing;
-    let period_s = timing.period_us * 1e-6;
     let delay_s = timing.camera_delay_ms * 1e-3;
     Hello {
         name: page.name.clone(),
@@ -46,7 +45,7 @@ pub(super) fn hello_of(setup: &Setup, diffusion: f64, page: &Page) -> Hello {
         range_um: [limits.low_um, limits.high_um],
         slew_um_per_s: limits.slew_um_per_s,
         budget_us: timing.budget_us,
-        bound_nm: (diffusion > 0.0).then(|| 1e3 * bound_rms_um(diffusion, 0.0, delay_s, period_s)),
+        bound_nm: (diffusion > 0.0).then(|| 1e3 * bound_of_um(setup, diffusion, 0.0, delay_s)),
         predicted_spectrum: predicted_spectrum(setup, diffusion),
         adaptation_at: adaptation_at(setup),
         steered: page.steered,
