@@ -74,7 +74,7 @@ impl RigInABox {
     /// # Errors
     /// Its board cannot be.
     pub fn with_partner(mut self, config: &PressureConfig) -> Result<Self, BoxError> {
-        self.world.set_partner(PressurePartner::new(config)?);
+        self.world.partner = Some(PressurePartner::new(config)?);
         Ok(self)
     }
 
@@ -113,7 +113,7 @@ impl RigInABox {
     /// Advances to `t_ns`; does nothing for a past time.
     pub fn advance_to(&mut self, t_ns: i64) {
         loop {
-            let partner_us = (self.world.partner_mut()).map(|p| p.board.next_event_us());
+            let partner_us = (self.world.partner.as_mut()).map(|p| p.board.next_event_us());
             let partner_ns = partner_us.map_or(i64::MAX, |us| self.ns_from_us(us));
             let board_ns = (self.ns_from_us(self.board.next_event_us())).min(partner_ns);
             let garbage_ns = self.next_garbage_ns.unwrap_or(i64::MAX);
@@ -145,7 +145,7 @@ impl RigInABox {
     pub fn receive_partner(&mut self, bytes: &[u8], t_ns: i64) {
         self.advance_to(t_ns);
         let (cut, now_us) = (self.partner_is_cut(), self.now_us());
-        if let Some(partner) = self.world.partner_mut().filter(|_| !cut) {
+        if let Some(partner) = self.world.partner.as_mut().filter(|_| !cut) {
             partner.board.receive(bytes, now_us);
             partner.tick(now_us);
         }
@@ -154,7 +154,7 @@ impl RigInABox {
     /// Moves bytes of the partner for the host into `out`; returns how many.
     pub fn transmit_partner(&mut self, out: &mut [u8]) -> usize {
         let cut = self.partner_is_cut();
-        let sent = (self.world.partner_mut()).map_or(0, |partner| partner.board.transmit(out));
+        let sent = (self.world.partner.as_mut()).map_or(0, |partner| partner.board.transmit(out));
         if cut { 0 } else { sent }
     }
 
@@ -187,7 +187,7 @@ impl RigInABox {
         self.applied_um = um_from_picometres(self.board.applied_pm());
         self.world.set_led(self.board.led());
         let now_us = self.now_us();
-        if let Some(partner) = self.world.partner_mut() {
+        if let Some(partner) = self.world.partner.as_mut() {
             partner.tick(now_us);
         }
     }

@@ -36,7 +36,7 @@ const EMPTY_SEED: u64 = 0x5eed_0f0e_3a97_7c41;
 pub struct World {
     config: WorldConfig,
     chain: Chain,
-    partner: Option<PressurePartner>,
+    pub(crate) partner: Option<PressurePartner>,
     zero_flow: ZeroFlow,
     /// Where the zero flow is now, um from the mean.
     zero_flow_um: f64,
@@ -150,16 +150,6 @@ impl World {
             newest_position: None,
             config: config.clone(),
         })
-    }
-
-    /// A partner that moves the bead alongside the PZT.
-    pub(crate) fn set_partner(&mut self, partner: PressurePartner) {
-        self.partner = Some(partner);
-    }
-
-    /// The partner of the PZT, if there is one.
-    pub(crate) fn partner_mut(&mut self) -> Option<&mut PressurePartner> {
-        self.partner.as_mut()
     }
 
     /// The configuration it was made from.

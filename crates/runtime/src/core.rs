@@ -40,10 +40,10 @@ use crate::tick_record::TickFlags;
 pub use crate::timing::{CoreError, Timing};
 use cellpos_control::{
     Controller, CycleLearning, LoopConfig, LoopInput, LoopOutput, Measurement as LoopMeasurement,
-    Mode, Partner, PartnerState, PlantMonitor, PlantMonitorState, SolverStatus, SolverTerms,
+    Mode, Partner, PlantMonitor, PlantMonitorState, SolverStatus, SolverTerms,
 };
 use cellpos_plant::TransferFunction;
-use cellpos_rig::{ActuatorReport, PartnerReport};
+use cellpos_rig::ActuatorReport;
 use cellpos_units::Seconds;
 use std::ops::Range;
 
@@ -99,11 +99,7 @@ struct State {
     parked_at: Option<u64>,
     unrecorded_since_ns: Option<i64>,
     plant: PlantMonitorState,
-    partner: PartnerState,
-    /// Its newest report, and since when it is lost or at a limit.
-    partner_heard: Option<PartnerReport>,
-    partner_lost_since_ns: Option<i64>,
-    partner_limited_since_ns: Option<i64>,
+    partner: partner::Slow,
     stage: Stage,
 }
 
@@ -238,10 +234,7 @@ impl<R: ReferenceGenerator> Core<R> {
                 pictures_repeated: 0,
                 parked_at: None,
                 unrecorded_since_ns: None,
-                partner: PartnerState::default(),
-                partner_heard: None,
-                partner_lost_since_ns: None,
-                partner_limited_since_ns: None,
+                partner: partner::Slow::default(),
                 stage: Stage::None,
             },
         })
@@ -264,13 +257,6 @@ impl<R: ReferenceGenerator> Core<R> {
     #[must_use]
     pub fn with_late_solver(mut self, spans_ns: Vec<Range<i64>>) -> Self {
         self.late_solver_ns = spans_ns;
-        self
-    }
-
-    /// The same loop with a slow partner that returns the PZT to the middle of its stroke.
-    #[must_use]
-    pub fn with_partner(mut self, partner: Partner) -> Self {
-        self.partner = Some(partner);
         self
     }
 

@@ -1,6 +1,6 @@
 //! The tick around the core: rings in, rings out, the deadline account. The same on both clocks.
 
-use crate::board_watch::BoardWatch;
+use crate::board_watch::{BoardTrouble, BoardWatch};
 use crate::core::{Action, Core, TickInput};
 use crate::frames::FrameWatch;
 use crate::latency::Latency;
@@ -11,7 +11,7 @@ use crate::tick_record::{TickFlags, TickRecord};
 use crate::timing::Timing;
 use cellpos_control::{LearnerState, SolverTerms};
 use cellpos_rig::clock::monotonic_ns;
-use cellpos_rig::{ActuatorReport, Clock, CommandAccount, Measurement};
+use cellpos_rig::{ActuatorReport, Clock, CommandAccount, Measurement, PartnerReport};
 use rtrb::{Consumer, Producer, RingBuffer};
 use std::time::{Duration, Instant};
 
@@ -237,22 +237,8 @@ impl<R: ReferenceGenerator> Ticker<R> {
         }
         self.look();
         let (newest, frames) = self.frames.take(start_ns);
-        let mut board = None;
-        let mut board_trouble = None;
-        let mut partner = None;
         let lost_before = self.commands.lost();
-        while let Ok(heard) = self.heard.pop() {
-            let not_taken = heard.account.not_taken - self.commands.not_taken;
-            self.board_watch.not_taken(not_taken);
-            self.commands = heard.account;
-            partner = heard.partner.or(partner);
-            let Some(report) = heard.report else {
-                continue;
-            };
-            self.spacing(&report);
-            board_trouble = board_trouble.or(self.board_watch.heard(start_ns, &report));
-            board = Some(report);
-        }
+        let (board, board_trouble, partner) = self.listen(start_ns);
         let since_start = |ns: i64| ns - self.start_ns;
         let ready_ns = newest.map_or(due_ns, |m| m.ready_ns.max(due_ns));
         let input = TickInput {
@@ -334,6 +320,31 @@ impl<R: ReferenceGenerator> Ticker<R> {
             let _ = self.learned.push(learned);
         }
         self.core.life()
+    }
+
+    /// What the actuator thread has told since the previous tick: the board's newest report, what is wrong with it, the partner's.
+    fn listen(
+        &mut self,
+        now_ns: i64,
+    ) -> (
+        Option<ActuatorReport>,
+        Option<BoardTrouble>,
+        Option<PartnerReport>,
+    ) {
+        let (mut board, mut trouble, mut partner) = (None, None, None);
+        while let Ok(heard) = self.heard.pop() {
+            let not_taken = heard.account.not_taken - self.commands.not_taken;
+            self.board_watch.not_taken(not_taken);
+            self.commands = heard.account;
+            partner = heard.partner.or(partner);
+            let Some(report) = heard.report else {
+                continue;
+            };
+            self.spacing(&report);
+            trouble = trouble.or(self.board_watch.heard(now_ns, &report));
+            board = Some(report);
+        }
+        (board, trouble, partner)
     }
 
     /// How far the spacing of commands that the board saw is off that at which they were handed over.

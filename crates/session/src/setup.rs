@@ -440,12 +440,6 @@ pub fn controller(name: &str, model: &Model, timing: &Timing) -> Result<Controll
     if let Some(kind) = kind {
         file.controller = kind;
     }
-    // The usual effort keeps twice the gain stable with one more sample of delay. A sample longer than the whole camera path is no
-    // delay that a rig may have in hiding: there less effort is robust enough, and closer to the bound.
-    if sample_s > 2.0 * timing.camera_delay_ms * 1e-3 {
-        file.lqg.effort = 1.0;
-        file.mpc.effort = 1.0;
-    }
     file.sample_time_ms = sample_s * 1e3;
     if let Some(config) = &report.config {
         file.estimator = config.estimator;

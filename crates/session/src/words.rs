@@ -194,16 +194,10 @@ fn text(kind: &EventKind) -> String {
             format!("The board reports {state:?}, fault {fault:?}.")
         }
         EventKind::BoardHeld { count } => board_held(count),
-        EventKind::PartnerLost => {
-            "The slow actuator is silent, parked or does not obey: the run goes on within the PZT's stroke.".to_string()
-        }
-        EventKind::PartnerBack { lasted_ms } => ended("The slow actuator obeys again", lasted_ms),
-        EventKind::PartnerLimitStarted => {
-            "The slow actuator is at an end of its range: what comes beyond is the PZT's alone.".to_string()
-        }
-        EventKind::PartnerLimitEnded { lasted_ms } => {
-            ended("The slow actuator is off the end of its range", lasted_ms)
-        }
+        EventKind::PartnerLost
+        | EventKind::PartnerBack { .. }
+        | EventKind::PartnerLimitStarted
+        | EventKind::PartnerLimitEnded { .. } => partner(kind),
         EventKind::LinkGarbage { count } => {
             let messages = plural(u64::from(count), "message", "messages");
             format!("{count} damaged {messages} on the link.")
@@ -220,6 +214,21 @@ fn text(kind: &EventKind) -> String {
         EventKind::Finished => "The time is up.".to_string(),
         EventKind::Script { stage } => format!("Script: {}.", stage.name()),
         EventKind::StepSkipped => "The operator went on with the next step.".to_string(),
+    }
+}
+
+/// What the slow actuator does.
+fn partner(kind: &EventKind) -> String {
+    match *kind {
+        EventKind::PartnerBack { lasted_ms } => ended("The slow actuator obeys again", lasted_ms),
+        EventKind::PartnerLimitStarted => {
+            "The slow actuator is at an end of its range: what comes beyond is the PZT's alone."
+                .to_string()
+        }
+        EventKind::PartnerLimitEnded { lasted_ms } => {
+            ended("The slow actuator is off the end of its range", lasted_ms)
+        }
+        _ => "The slow actuator is silent, parked or does not obey: the run goes on within the PZT's stroke.".to_string(),
     }
 }
 

@@ -251,13 +251,13 @@ columns! {
     "solver_us" "us" Number(|r| f64::from(r.tick.solver_ns) / 1e3),
         "Time of the optimiser; 0 on the virtual clock.";
     "partner_command_um" "um" Number(|r| r.tick.partner_command_um),
-        "Command of the slow actuator in force, on its own scale; none without one.";
+        "Slow actuator: command on its own scale.";
     "partner_applied_um" "um" Number(|r| r.tick.partner_applied_um),
-        "Where the slow actuator said last that it stands, on its own scale.";
+        "Slow actuator: reported position.";
     "partner_effect_um" "um" Number(|r| r.tick.partner_effect_um),
-        "Effect of the slow actuator on the flow as the loop reckons it, in displacement of the PZT.";
+        "Slow actuator: effect, as PZT displacement.";
     "partner" "" Code(BOARD, |r| r.tick.partner),
-        "State that the slow actuator reported last; none before its first report.";
+        "Slow actuator: reported state.";
     "session" "" Whole(|r| r.session),
         "Session: 1, one more per resume.";
 }

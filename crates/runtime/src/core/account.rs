@@ -181,10 +181,10 @@ impl<R: ReferenceGenerator> Core<R> {
                 .state
                 .board
                 .map_or(ActuatorFault::None as u8, |b| b.fault as u8),
-            partner_command_um: self.state.partner.command_um(),
-            partner_applied_um: self.state.partner.applied_um(),
+            partner_command_um: self.state.partner.state.command_um(),
+            partner_applied_um: self.state.partner.state.applied_um(),
             partner_effect_um: self.partner_effect_um(),
-            partner: self.state.partner_heard.map_or(255, |p| p.state as u8),
+            partner: self.state.partner.heard.map_or(255, |p| p.state as u8),
             flags,
             drained: input.frames.arrived.min(255) as u8,
             wake_ns: 0,

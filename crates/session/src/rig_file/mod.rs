@@ -288,17 +288,8 @@ impl RigFile {
                 ));
             }
         }
-        if let Some(partner) = &self.partner {
-            partner
-                .validate(&self.limits, self.timing.period_us * 1e-6)
-                .map_err(|error| say("partner", &error))?;
-            if (partner.kind == PartnerKind::EmulatedPressure) != self.is_emulated() {
-                return Err(say(
-                    "partner",
-                    &"[partner] kind: \"emulated-pressure\" is of the emulated rig, \"program\" of a real one",
-                ));
-            }
-        }
+        self.validate_partner()
+            .map_err(|problem| say("partner", &problem))?;
         self.board
             .validate()
             .map_err(|error| say("board", &error))?;
@@ -341,6 +332,17 @@ impl RigFile {
             tracking
                 .check()
                 .map_err(|error| say("tracking", &format!("[tracking] {error}")))?;
+        }
+        Ok(())
+    }
+
+    fn validate_partner(&self) -> Result<(), String> {
+        let Some(partner) = &self.partner else {
+            return Ok(());
+        };
+        partner.validate(&self.limits, self.timing.period_us * 1e-6)?;
+        if (partner.kind == PartnerKind::EmulatedPressure) != self.is_emulated() {
+            return Err("[partner] kind: \"emulated-pressure\" is of the emulated rig, \"program\" of a real one".to_owned());
         }
         Ok(())
     }
