@@ -187,10 +187,10 @@ fn a_drift_of_50_um_an_hour_is_taken_up_and_the_hold_is_that_of_the_pzt_alone() 
     // In two minutes the zero flow drifts by 1.7 um: more than the PZT has here.
     const SHORT: &str = "[limits]\nlow_um = 19.4\nhigh_um = 20.6\npark_um = 20.0\n";
     let drift = format!(
-        "{SHORT}[emulator]\nseed = 3\nzero_flow_drift_um_per_s = {}\n",
+        "{SHORT}[emulator]\nideal = true\nseed = 3\nzero_flow_drift_um_per_s = {}\n",
         50.0 / 3600.0
     );
-    let still = run("[emulator]\nseed = 3\n", "lqg", hold(), 120.0);
+    let still = run("[emulator]\nideal = true\nseed = 3\n", "lqg", hold(), 120.0);
     let pair = run(&format!("{PARTNER}{drift}"), "lqg", hold(), 120.0);
     assert_eq!(pair.ended.kind, EndKind::Done, "{}", pair.ended);
     let ((_, alone), (mean, both)) = (still.error_nm(5.0, 120.0), pair.error_nm(5.0, 120.0));
@@ -216,7 +216,7 @@ fn a_drift_of_50_um_an_hour_is_taken_up_and_the_hold_is_that_of_the_pzt_alone() 
 #[test]
 fn the_slow_ones_moves_do_not_show_in_the_error() {
     for law in ["lqg", "pi", "mpc"] {
-        let text = format!("{PARTNER}mid_um = 26.0\n[emulator]\nseed = 5\n");
+        let text = format!("{PARTNER}mid_um = 26.0\n[emulator]\nideal = true\nseed = 5\n");
         // The middle is 26 um, the zero flow 20: six have to go over, at 0.36 um/s.
         let ran = run(&text, law, hold(), 30.0);
         assert_eq!(ran.ended.kind, EndKind::Done, "{}", ran.ended);
@@ -269,7 +269,7 @@ fn a_staircase_of_ten_strokes_in_bead_and_in_flow() {
         waveforms: BTreeMap::new(),
     };
     let text = format!(
-        "{PARTNER}[limits]\nlow_um = 19.0\nhigh_um = 21.0\npark_um = 20.0\n[emulator]\nseed = 7\nzero_flow_drift_um_per_s = 0.3\nlocalisation_um = 0.02\n"
+        "{PARTNER}[limits]\nlow_um = 19.0\nhigh_um = 21.0\npark_um = 20.0\n[emulator]\nideal = true\nseed = 7\nzero_flow_drift_um_per_s = 0.3\nlocalisation_um = 0.02\n"
     );
     let ran = run(&text, "lqg", reference.clone(), 75.0);
     assert_eq!(ran.ended.kind, EndKind::ReferenceOver, "{}", ran.ended);
@@ -302,7 +302,7 @@ fn a_staircase_of_ten_strokes_in_bead_and_in_flow() {
 #[test]
 fn a_partner_that_dies_leaves_the_pzt_alone_and_the_run_says_so() {
     let text = format!(
-        "{PARTNER}slew_um_per_s = 1.0\n[emulator]\nseed = 2\nzero_flow_drift_um_per_s = 0.05\n[[emulator.faults.event]]\nkind = \"partner-loss\"\nat_s = 10.0\nfor_s = 10.0\n"
+        "{PARTNER}slew_um_per_s = 1.0\n[emulator]\nideal = true\nseed = 2\nzero_flow_drift_um_per_s = 0.05\n[[emulator.faults.event]]\nkind = \"partner-loss\"\nat_s = 10.0\nfor_s = 10.0\n"
     );
     let ran = run(&text, "lqg", hold(), 30.0);
     assert_eq!(ran.ended.kind, EndKind::Done, "{}", ran.ended);
@@ -333,7 +333,7 @@ fn a_pressure_path_is_held_within_1_15_of_its_own_bound() {
         (integrator.as_str(), 120.0),
     ] {
         let text = format!(
-            "[actuator]\nkind = \"emulated-pressure\"\ncompliance_ms = {tube_ms}\n[emulator]\nmodel = \"{model}\"\nseed = 4\n"
+            "[actuator]\nkind = \"emulated-pressure\"\ncompliance_ms = {tube_ms}\n[emulator]\nideal = true\nmodel = \"{model}\"\nseed = 4\n"
         );
         // The usual effort is for a device that may be a whole period late; 0.1 for one in step with the loop, with twice its gain stable.
         for (effort, most) in [(None, 1.35), (Some(0.1), 1.15)] {
@@ -356,12 +356,12 @@ fn a_pressure_path_is_held_within_1_15_of_its_own_bound() {
 fn eight_hours_of_50_um_an_hour() {
     let seconds = 8.0 * 3600.0;
     let text = format!(
-        "{PARTNER}[emulator]\nseed = 11\nzero_flow_drift_um_per_s = {}\n",
+        "{PARTNER}[emulator]\nideal = true\nseed = 11\nzero_flow_drift_um_per_s = {}\n",
         50.0 / 3600.0
     );
     let pair = run(&text, "lqg", hold(), seconds);
     assert_eq!(pair.ended.kind, EndKind::Done, "{}", pair.ended);
-    let alone = run("[emulator]\nseed = 11\n", "lqg", hold(), 600.0);
+    let alone = run("[emulator]\nideal = true\nseed = 11\n", "lqg", hold(), 600.0);
     let ((mean, both), (_, one)) = (pair.error_nm(5.0, seconds), alone.error_nm(5.0, 600.0));
     let furthest = pair.furthest_um(20.0, 5.0);
     println!(
