@@ -94,11 +94,11 @@ def cell(bench: Bench, figures: Figures):
 
 
 def identify(bench: Bench, figures: Figures):
-    found = [json.loads(bench.cellpos(f"identify --clock virtual --frames off --seed {seed} --out model.toml --force --json")) for seed in SEEDS]
+    found = [json.loads(bench.cellpos(f"identify --clock virtual --ideal --frames off --seed {seed} --out model.toml --force --json")) for seed in SEEDS]
     for key, label, unit, digits, truth in (("gain_per_s", "gain", "1/s", 1, None), ("delay_ms", "camera delay", "ms", 3, 2.0)):
         values = [run["parameters"][key]["value"] for run in found]
         more = f" (hidden: {truth})" if truth else ""
-        figures.put(f"identify.{key}", f"{label}, mean{more}", statistics.fmean(values), unit, digits, "cellpos identify --clock virtual --frames off, seeds 1 to 5")
+        figures.put(f"identify.{key}", f"{label}, mean{more}", statistics.fmean(values), unit, digits, "cellpos identify --clock virtual --ideal --frames off, seeds 1 to 5")
 
 
 def reconcile(bench: Bench, figures: Figures):

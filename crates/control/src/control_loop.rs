@@ -6,7 +6,8 @@ use crate::law::{ControlLaw, FAR_UM, LawInput, LawOutput};
 use crate::learning::Driven;
 use crate::limits::Limits;
 use crate::loop_io::{LoopFlags, LoopInput, LoopOutput, LoopParts, Measurement, Mode};
-use crate::plant_estimate::{AdaptState, Adaptation, Adapter, Told, Tuning};
+use crate::plant_estimate::{AdaptState, Adaptation, Adapter, Told};
+use crate::tuning::Tuning;
 
 /// State of a loop whose law has the state `S`.
 #[derive(Debug, Clone, Copy, PartialEq)]

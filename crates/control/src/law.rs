@@ -43,7 +43,7 @@
 //! ```
 
 use crate::estimator::Estimate;
-use crate::plant_estimate::Tuning;
+use crate::tuning::Tuning;
 use std::fmt::Debug;
 
 /// Columns of its own that a law may have in the record.

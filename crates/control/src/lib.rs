@@ -47,6 +47,7 @@ mod reference;
 pub mod riccati;
 mod simulation;
 mod toml_file;
+mod tuning;
 mod uncertainty;
 
 pub use config::{ControllerFile, ControllerKind, PiFile};
@@ -76,7 +77,8 @@ pub use partner::{
     Partner, PartnerConfig, PartnerInput, PartnerOutput, PartnerState, PartnerStatus, Probe,
 };
 pub use pi::{Lead, Pi, PiLaw, PiState};
-pub use plant_estimate::{ADAPT_COLUMNS, AdaptMode, AdaptNews, AdaptState, Adaptation, Tuning};
+pub use plant_estimate::{ADAPT_COLUMNS, AdaptMode, AdaptNews, AdaptState, Adaptation};
 pub use reference::{Points, Profile, Reference, Shape, fill_preview};
 pub use simulation::{RigConfig, SimulatedRig};
 pub use toml_file::ConfigError;
+pub use tuning::Tuning;

@@ -6,7 +6,7 @@
 
 use crate::error::{BuildError, check};
 use crate::law::{ControlLaw, FAR_UM, LawInput, LawOutput};
-use crate::plant_estimate::Tuning;
+use crate::tuning::Tuning;
 use serde::{Deserialize, Serialize};
 
 /// A lead `(1 + s/wz) / (1 + s/wp)` with `wz < wp`, discretised by Tustin's rule.

@@ -25,6 +25,7 @@ use crate::error::BuildError;
 use crate::estimator::{Estimator, EstimatorConfig, Fix, PredictedState};
 use crate::feedforward::{FeedForward, FeedForwardState};
 use crate::loop_model::LoopModel;
+use crate::tuning::Tuning;
 use colour::Colour;
 use dither::Dither;
 use evidence::Evidence;
@@ -51,26 +52,6 @@ const KNOWN: f64 = 0.075;
 const LOUDEST: f64 = 2.0;
 /// Part of the stated uncertainty of the gain that stays, whatever is found.
 const LEAST_DOUBT: f64 = 0.1;
-
-/// The tuning in force, as a law is told of it.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Tuning {
-    /// Gain of the plant over the design's. Displacements that a law is given, and those that it answers, are of the PZT
-    /// times this; so are limits of displacement that it keeps by itself.
-    pub gain: f64,
-    /// Loop delay (with the half sample of hold) over the design's.
-    pub delay: f64,
-}
-
-impl Default for Tuning {
-    /// That of the design.
-    fn default() -> Self {
-        Self {
-            gain: 1.0,
-            delay: 1.0,
-        }
-    }
-}
 
 /// Where adaptation stands.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]

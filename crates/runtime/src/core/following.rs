@@ -10,8 +10,8 @@
 
 use cellpos_control::{EstimatorConfig, LoopModel, flow_step_log_density};
 
-/// Natural logarithm of the odds that are asked for. Rises of 2 to 5 um in 80 ms and more reach 25, for their beginning looks like
-/// a wrong sign; a wrong sign reaches 32 before the bead is 10 um away at 1 kHz.
+/// Natural logarithm of the odds that are asked for, chosen among drawn flows: the beginning of a rise looks like a wrong sign, and
+/// a wrong sign is to be told before the bead is 10 um away at 1 kHz.
 const EVIDENCE: f64 = 32.0;
 /// Standard deviation of the gain over the model's: loops are made for a half to twice of it; and its limits.
 const GAIN_SD: f64 = 0.35;
