@@ -222,7 +222,10 @@ fn frames_that_came_without_a_fix_are_no_dropped_frames() {
             format!("{{ kind = \"lose-bead\", at_s = {at_s}, for_s = 0.008 }}")
         })
         .collect();
-    let faults = format!("[emulator.faults]\nevent = [{}]\n", events.join(", "));
+    let faults = format!(
+        "[emulator]\nideal = true\n[emulator.faults]\nevent = [{}]\n",
+        events.join(", ")
+    );
     std::fs::write(folder.path().join("rig.toml"), faults).unwrap();
     let track = "track --target 0um --controller pi --sine 3um@10Hz --duration 8s --clock virtual --rig rig.toml --json";
     let run = succeed(folder.path(), track).json();

@@ -24,7 +24,7 @@ fn a_log_sweep_finds_gain_and_delay_too() {
     let folder = tempfile::tempdir().unwrap();
     let r = succeed(
         folder.path(),
-        "identify --excitation sweep --seed 3 --json --out m.toml --report r.html",
+        "identify --excitation sweep --ideal --seed 3 --json --out m.toml --report r.html",
     )
     .json();
     let k = &r["parameters"]["gain_per_s"];

@@ -266,7 +266,7 @@ fn what_was_learned_is_expendable() {
     std::fs::write(&learned, &text[..text.len() / 2]).unwrap();
     let ran = succeed(at, &format!("report {} --json", run.display()));
     assert!(
-        ran.err.contains("learned.toml") && ran.err.contains("left out"),
+        ran.err.contains("learned.toml") && ran.err.contains("ignored"),
         "{}",
         ran.err
     );
