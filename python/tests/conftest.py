@@ -33,7 +33,7 @@ def started(folder: Path, *words: str) -> None:
 def lab(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with runs: `hold` (pictures), `long` (killed and resumed)."""
     folder = tmp_path_factory.mktemp("lab")
-    hold = "track --target 1um --duration 4s --clock virtual --seed 7 --name hold"
+    hold = "track --target 1um --duration 4s --clock virtual --ideal --seed 7 --name hold"
     started(folder, *hold.split())
     (folder / "long.toml").write_text(LONG)
     words = [cellpos.program(), "run", "long.toml", "--clock", "virtual", "--frames", "off"]

@@ -286,6 +286,7 @@ def test_an_actuator_that_stalls_ends_the_run_in_safe_and_parks_when_it_wakes(la
 def test_nobody_serving_is_named_with_what_to_do(tmp_path):
     (tmp_path / "rig.toml").write_text(
         '[actuator]\nkind = "program"\nsocket = "nobody.sock"\n[camera]\nkind = "socket"\nsocket = "c.sock"\n'
+        '[vision]\nwindow_px = 21\n[vision.profile]\nkind = "ring"\nedge_px = 5.0\n'
         "[calibration]\npixel_um = 0.1\norigin_px = 127.5\nsign = 1.0\n"
     )
     with pytest.raises(cellpos.Failed, match="nobody.sock.*start the program that serves the actuator"):

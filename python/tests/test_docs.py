@@ -53,7 +53,6 @@ def test_the_notebook_runs(tmp_path, monkeypatch):
     for cell in cells:
         if cell["cell_type"] == "code":
             exec(compile("".join(cell["source"]), "run.ipynb", "exec"), space)
-    model = space["model"]
-    # Eq. (6) has 428 /s below its pair and 379 /s above it; the camera path is 2 ms.
-    assert abs(model["delay_ms"] - 2.0) < 0.2
-    assert 350 < model["num"][0] < 450, model
+    # Eq. (6) has 428 /s below its pair; the camera's path is 2 ms, and frames wait for their ticks as clocks drift.
+    assert abs(space["delay"]["value"] - 2.0) < 0.2
+    assert abs(space["gain"]["value"] - 428) < 10

@@ -250,7 +250,10 @@ class Run:
 
     @property
     def rms_nm(self) -> float:
-        """RMS of error_um over the settled ticks, nm; NaN when there are none."""
+        """RMS of error_um over the settled ticks, nm; NaN when there are none.
+
+        Ticks without a fix do not count here; summary["rms_measured_nm"] counts them by the estimate.
+        """
         errors = self.error_um[self.settled()]
         errors = errors[np.isfinite(errors)]
         return float(np.sqrt(np.mean(errors**2)) * 1e3) if len(errors) else float("nan")
