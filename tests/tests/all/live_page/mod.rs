@@ -217,7 +217,7 @@ fn clips_are_played_and_a_name_of_evil_intent_is_text() {
     let folder = tempfile::tempdir().unwrap();
     let run = Watched::start(
         folder.path(),
-        "track --target 0um --view --duration 120s --name clipped",
+        "track --target 0um --ideal --view --duration 120s --name clipped",
     );
     let page = Browser::start(1400, 2000);
     page.open(&run.operator);
