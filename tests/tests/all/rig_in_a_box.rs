@@ -4,7 +4,7 @@
 //! where they are not what the test is about.
 
 use cellpos_record::RunReader;
-use cellpos_tests::programs::{BoxRow, RigInABox, alone, cellpos, stdout, wait_until};
+use cellpos_tests::programs::{BoxRow, RigInABox, cellpos, stdout, wait_until};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 use std::process::Stdio;
@@ -64,7 +64,6 @@ fn fastest_um_per_s(rows: &[BoxRow]) -> f64 {
 
 #[test]
 fn a_bead_is_held_over_a_pseudo_terminal_and_a_socket_and_the_pzt_is_parked_after() {
-    let _alone = alone();
     let folder = tempfile::tempdir().unwrap();
     write_rig(folder.path(), 500.0);
     let faults = ["--drop-frames", "0.2%", "--link-garbage", "2Hz"];
@@ -110,7 +109,6 @@ fn a_bead_is_held_over_a_pseudo_terminal_and_a_socket_and_the_pzt_is_parked_afte
 
 #[test]
 fn a_line_that_stalls_now_and_then_ends_no_run_and_its_lost_commands_are_counted() {
-    let _alone = alone();
     let folder = tempfile::tempdir().unwrap();
     write_rig(folder.path(), WATCHDOG_MS);
     let rig = folder.path().join("rig.toml");
@@ -154,7 +152,6 @@ fn a_line_that_stalls_now_and_then_ends_no_run_and_its_lost_commands_are_counted
 
 #[test]
 fn the_board_parks_by_itself_when_the_program_is_killed_and_the_record_reads_back() {
-    let _alone = alone();
     // A stall of the machine longer than the watchdog's time ends the run before the kill: then once more.
     let killed = (0..5).any(|_| kill_and_look());
     assert!(killed, "five times the run ended before it could be killed");
@@ -246,7 +243,6 @@ fn kill_and_look() -> bool {
 
 #[test]
 fn an_interrupt_freezes_the_bead_and_then_parks() {
-    let _alone = alone();
     let folder = tempfile::tempdir().unwrap();
     write_rig(folder.path(), 500.0);
     let rig = RigInABox::start(folder.path(), &[]);
