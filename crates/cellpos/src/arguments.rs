@@ -12,7 +12,7 @@ use std::time::Duration;
 const RUNS: &str = "runs";
 
 /// Reads a run folder: a path, `latest` for the newest run below runs/, `latest-NAME` for the newest of that name.
-pub fn run_folder() -> impl TypedValueParser<Value = PathBuf> {
+pub(crate) fn run_folder() -> impl TypedValueParser<Value = PathBuf> {
     OsStringValueParser::new().try_map(|text| {
         let path = PathBuf::from(text);
         match path.to_str() {
@@ -86,7 +86,7 @@ fn what_there_is(folders: &[PathBuf]) -> String {
 }
 
 /// A time as a program waits it. Longer than thirty years is thirty years: no clock counts on for ever.
-pub fn span(time: Seconds) -> Duration {
+pub(crate) fn span(time: Seconds) -> Duration {
     const MOST_S: f64 = 1e9;
     Duration::try_from_secs_f64(time.value().min(MOST_S)).unwrap_or_default()
 }
@@ -95,14 +95,14 @@ pub fn span(time: Seconds) -> Duration {
 ///
 /// # Errors
 /// Names the characters that a name may have.
-pub fn run_name(text: &str) -> Result<String, String> {
+pub(crate) fn run_name(text: &str) -> Result<String, String> {
     cellpos_record::check_name(text)
         .map(|()| text.to_owned())
         .map_err(|_| "use letters, digits, `-` and `_`, at most 64 of them".to_owned())
 }
 
 /// What is wrong with a whole number, in words for people; None for any other error.
-pub fn about_a_whole_number(
+pub(crate) fn about_a_whole_number(
     error: &(dyn std::error::Error + 'static),
     text: &str,
 ) -> Option<&'static str> {
@@ -121,7 +121,7 @@ pub fn about_a_whole_number(
 ///
 /// # Errors
 /// Says what would be right.
-pub fn positive<Q>(text: &str) -> Result<Q, String>
+pub(crate) fn positive<Q>(text: &str) -> Result<Q, String>
 where
     Q: FromStr + PartialOrd + Default,
     Q::Err: std::fmt::Display,
@@ -138,7 +138,7 @@ where
 ///
 /// # Errors
 /// Says what would be right.
-pub fn loop_delay(text: &str) -> Result<Seconds, String> {
+pub(crate) fn loop_delay(text: &str) -> Result<Seconds, String> {
     let bare = text.trim().parse::<f64>().is_ok_and(f64::is_finite);
     if bare {
         let number = text.trim();
@@ -151,7 +151,7 @@ pub fn loop_delay(text: &str) -> Result<Seconds, String> {
 
 /// The words of a command line, with each value that begins with a minus and a digit joined to the option in front of it (`--duration
 /// -3s`). Otherwise clap takes it for an option, and the message is not about the value.
-pub fn joined(words: impl IntoIterator<Item = OsString>) -> Vec<OsString> {
+pub(crate) fn joined(words: impl IntoIterator<Item = OsString>) -> Vec<OsString> {
     let mut joined: Vec<OsString> = Vec::new();
     for word in words {
         let negative = word.to_str().is_some_and(|text| {

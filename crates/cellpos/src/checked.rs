@@ -10,7 +10,7 @@ use std::path::Path;
 ///
 /// # Errors
 /// As [`Rig::open`], or a finding that is an error.
-pub fn open(
+pub(crate) fn open(
     file: RigFile,
     options: Options,
     path: Option<&Path>,

@@ -6,7 +6,11 @@ use cellpos_session::{Failure, Rig};
 use std::path::Path;
 
 /// The clips of the next run on a rig, into its folder. There are none without frames or on the virtual clock.
-pub fn of(rig: &mut Rig, folder: &Path, wishes: &ClipWishes) -> Result<Option<Clips>, Failure> {
+pub(crate) fn of(
+    rig: &mut Rig,
+    folder: &Path,
+    wishes: &ClipWishes,
+) -> Result<Option<Clips>, Failure> {
     let source = rig.source();
     if source.width_px == 0 || rig.clock().is_virtual() {
         return Ok(None);
@@ -24,7 +28,7 @@ pub fn of(rig: &mut Rig, folder: &Path, wishes: &ClipWishes) -> Result<Option<Cl
 }
 
 /// When a script wants clips, by its plan.
-pub fn schedule(plan: &Plan, wishes: &ClipWishes) -> Schedule {
+pub(crate) fn schedule(plan: &Plan, wishes: &ClipWishes) -> Schedule {
     let mut schedule = Schedule::new();
     for number in &wishes.cycles {
         let Some(cycle) = plan.cycle(number.saturating_sub(1)) else {
@@ -40,7 +44,7 @@ pub fn schedule(plan: &Plan, wishes: &ClipWishes) -> Schedule {
 }
 
 /// Summary of the clips of a run that is over.
-pub fn warnings(clips: Option<Clips>) -> Vec<String> {
+pub(crate) fn warnings(clips: Option<Clips>) -> Vec<String> {
     let Some(clips) = clips else {
         return Vec::new();
     };

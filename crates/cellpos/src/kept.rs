@@ -3,7 +3,7 @@
 use cellpos_runtime::Kept;
 
 /// The error of the bead.
-pub fn error(kept: &Kept) -> String {
+pub(crate) fn error(kept: &Kept) -> String {
     let nm = (kept.rms_nm).map_or_else(|| "-".to_owned(), |nm| format!("{nm:.1} nm"));
     let unseen = if kept.unseen_ms > 0.0 {
         format!(", {:.0} ms without a position among them", kept.unseen_ms)
@@ -14,7 +14,7 @@ pub fn error(kept: &Kept) -> String {
 }
 
 /// How long it was where it should be.
-pub fn held(kept: &Kept) -> String {
+pub(crate) fn held(kept: &Kept) -> String {
     let Some((percent, nm)) = kept.held_percent.zip(kept.held_within_nm) else {
         return "-".to_owned();
     };

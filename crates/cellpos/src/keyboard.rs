@@ -6,7 +6,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
 
 /// The keyboard while it is listened to; dropping it gives the terminal back as it was.
-pub struct Keyboard {
+pub(crate) struct Keyboard {
     before: Termios,
     stop: Arc<AtomicBool>,
     thread: Option<JoinHandle<()>>,
@@ -15,7 +15,7 @@ pub struct Keyboard {
 /// Hands what was typed to `on_keys`, as much as came at once (the key of an arrow is several bytes), on a thread of its own, if standard input is a terminal and this program is in its
 /// foreground: one in the background is stopped by the system when it touches the terminal, and a stopped program cannot hold a
 /// bead.
-pub fn listen(mut on_keys: impl FnMut(&[u8]) + Send + 'static) -> Option<Keyboard> {
+pub(crate) fn listen(mut on_keys: impl FnMut(&[u8]) + Send + 'static) -> Option<Keyboard> {
     let stdin = rustix::stdio::stdin();
     if !termios::isatty(stdin) {
         return None;

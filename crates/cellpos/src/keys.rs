@@ -9,27 +9,27 @@ use cellpos_session::signals::press;
 use std::sync::Arc;
 
 /// Which keys a hold takes, for the live line.
-pub const OF_A_HOLD: &str = "f freeze, q stop, arrows or 2.5 Enter: target";
+pub(crate) const OF_A_HOLD: &str = "f freeze, q stop, arrows or 2.5 Enter: target";
 /// Which keys a motion takes that is not steered.
-pub const OF_A_MOTION: &str = "f freeze, q stop";
+pub(crate) const OF_A_MOTION: &str = "f freeze, q stop";
 
 /// Which keys a script takes.
-pub const OF_A_SCRIPT: &str = "p pause, s next step, q stop";
+pub(crate) const OF_A_SCRIPT: &str = "p pause, s next step, q stop";
 
 /// Keys of a script: p pauses and continues, s skips, q stops.
-pub fn of_a_script(operator: &Arc<Operator>) -> Option<Keyboard> {
+pub(crate) fn of_a_script(operator: &Arc<Operator>) -> Option<Keyboard> {
     let operator = Arc::clone(operator);
     keyboard::listen(move |keys| keys.iter().for_each(|key| press(*key, &operator)))
 }
 
 /// Keys of a hold, or of a motion that is not steered.
-pub fn of_a_track(mut steering: Steering) -> Option<Keyboard> {
+pub(crate) fn of_a_track(mut steering: Steering) -> Option<Keyboard> {
     keyboard::listen(move |keys| steering.take(keys))
 }
 
 /// Keys of a run whose target the operator may move. Arrows move it (left and right 0.1 um, down and up 1 um); a number and Enter
 /// sets it. f, p or space freezes and continues, q freezes, then parks. Escape deletes the typed number.
-pub struct Steering {
+pub(crate) struct Steering {
     operator: Arc<Operator>,
     typed: Typed,
     number: String,
@@ -40,7 +40,7 @@ pub struct Steering {
 
 impl Steering {
     /// Keys for a run that begins at `first_um` and sees `view_um`; a run that is not `steered` takes no target.
-    pub fn new(
+    pub(crate) fn new(
         operator: &Arc<Operator>,
         typed: Typed,
         first_um: f64,

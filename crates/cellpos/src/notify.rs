@@ -9,7 +9,7 @@ const PATIENCE: Duration = Duration::from_secs(10);
 
 /// Options of commands that can take a night.
 #[derive(Debug, clap::Args)]
-pub struct NotifyArgs {
+pub(crate) struct NotifyArgs {
     /// Shell command that runs after the end, with the PZT parked. CELLPOS_EVENT is end, stop, safe or failed; CELLPOS_REASON a sentence; CELLPOS_RUN the folder; CELLPOS_NAME the name.
     #[arg(long, value_name = "COMMAND")]
     notify: Option<String>,
@@ -17,7 +17,7 @@ pub struct NotifyArgs {
 
 /// Contents of a notification.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum What {
+pub(crate) enum What {
     /// The run came to its end.
     End,
     /// The operator, or a condition of the script, stopped it.
@@ -41,7 +41,13 @@ impl What {
 
 impl NotifyArgs {
     /// Runs the user's command, if there is one; what went wrong with it comes back as a sentence.
-    pub fn tell(&self, what: What, name: &str, reason: &str, run: Option<&str>) -> Option<String> {
+    pub(crate) fn tell(
+        &self,
+        what: What,
+        name: &str,
+        reason: &str,
+        run: Option<&str>,
+    ) -> Option<String> {
         let line = self.notify.as_deref()?;
         let child = Command::new("sh")
             .arg("-c")
@@ -61,7 +67,7 @@ impl NotifyArgs {
     }
 
     /// The same at the end of a script, by the word for its outcome.
-    pub fn of_a_script(&self, outcome: &str, reason: &str, folder: &Path) -> Option<String> {
+    pub(crate) fn of_a_script(&self, outcome: &str, reason: &str, folder: &Path) -> Option<String> {
         let what = match outcome {
             "done" => What::End,
             "stopped" | "aborted" => What::Stop,

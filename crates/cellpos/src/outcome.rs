@@ -20,7 +20,7 @@ pub enum Outcome {
 pub type CommandResult = Result<Outcome, Failure>;
 
 /// Version of the JSON objects: it rises when a key changes its meaning or goes.
-pub const JSON_VERSION: u32 = 1;
+pub(crate) const JSON_VERSION: u32 = 1;
 
 /// A JSON object with the name of its schema (docs/schemas) and its version in front.
 #[derive(Serialize)]
@@ -32,12 +32,12 @@ struct Object<'a, T: Serialize> {
 }
 
 /// Prints `value` as the one JSON object on standard output.
-pub fn print_json(value: &impl Serialize) -> Result<(), Failure> {
+pub(crate) fn print_json(value: &impl Serialize) -> Result<(), Failure> {
     print_object(&crate::output::settings().command, value)
 }
 
 /// Prints a value as JSON under its schema, for a command with results of two kinds.
-pub fn print_json_of(schema: &str, value: &impl Serialize) -> Result<(), Failure> {
+pub(crate) fn print_json_of(schema: &str, value: &impl Serialize) -> Result<(), Failure> {
     print_object(schema, value)
 }
 
@@ -53,7 +53,7 @@ fn print_object(name: &str, value: &impl Serialize) -> Result<(), Failure> {
 
 /// Prints text on standard output; a closed pipe (`| head`) is no error. On a terminal people read, and units are as people write
 /// them; in a pipe or a file they are as programs write them.
-pub fn print_text(text: &str) -> Result<(), Failure> {
+pub(crate) fn print_text(text: &str) -> Result<(), Failure> {
     use std::io::IsTerminal;
     if std::io::stdout().is_terminal() && reads_utf8() {
         print(&cellpos_report::typeset(text))
@@ -141,7 +141,7 @@ fn error_object(kind: &'static str, report: &miette::Report) -> ErrorObject {
 }
 
 /// Prints the error, if any, and gives the exit code.
-pub fn exit(result: CommandResult, json: bool) -> ExitCode {
+pub(crate) fn exit(result: CommandResult, json: bool) -> ExitCode {
     let (code, kind, report) = match result {
         Ok(Outcome::Done) => return ExitCode::SUCCESS,
         Ok(Outcome::Broken) => return ExitCode::from(1),
@@ -176,7 +176,7 @@ fn number_in_words(error: &clap::Error) -> Option<clap::Error> {
 }
 
 /// Says what is wrong with the arguments, or shows the help or version that they ask for.
-pub fn exit_arguments(error: &clap::Error, json: bool) -> ExitCode {
+pub(crate) fn exit_arguments(error: &clap::Error, json: bool) -> ExitCode {
     let in_words = number_in_words(error);
     let error = in_words.as_ref().unwrap_or(error);
     let _ = error.print();

@@ -9,7 +9,7 @@ use std::sync::{Mutex, MutexGuard, PoisonError, RwLock};
 
 /// Options of every command.
 #[derive(Debug, Clone, Default)]
-pub struct Settings {
+pub(crate) struct Settings {
     /// Name of the command.
     pub command: String,
     /// Whether files that are there already may be written over.
@@ -25,12 +25,12 @@ static SETTINGS: RwLock<Settings> = RwLock::new(Settings {
 });
 
 /// Keeps these options.
-pub fn configure(settings: Settings) {
+pub(crate) fn configure(settings: Settings) {
     *SETTINGS.write().unwrap_or_else(PoisonError::into_inner) = settings;
 }
 
 /// These options.
-pub fn settings() -> Settings {
+pub(crate) fn settings() -> Settings {
     SETTINGS
         .read()
         .unwrap_or_else(PoisonError::into_inner)
@@ -38,7 +38,7 @@ pub fn settings() -> Settings {
 }
 
 /// A progress bar, or a spinner without a length; hidden where nobody wants to see it.
-pub fn progress_bar(length: Option<u64>) -> indicatif::ProgressBar {
+pub(crate) fn progress_bar(length: Option<u64>) -> indicatif::ProgressBar {
     let bar = match length {
         Some(length) => indicatif::ProgressBar::new(length),
         None => indicatif::ProgressBar::new_spinner(),
@@ -103,7 +103,7 @@ impl TermLike for Screen {
 ///
 /// # Errors
 /// Bad input that names the file.
-pub fn ready<'a>(paths: impl IntoIterator<Item = &'a PathBuf>) -> Result<(), Failure> {
+pub(crate) fn ready<'a>(paths: impl IntoIterator<Item = &'a PathBuf>) -> Result<(), Failure> {
     paths
         .into_iter()
         .try_for_each(|path| ready_one(path, settings().force))
@@ -167,7 +167,7 @@ fn why(path: &Path, error: &std::io::Error) -> String {
 ///
 /// # Errors
 /// A failure that names the file.
-pub fn write(path: &Path, text: &str) -> Result<(), Failure> {
+pub(crate) fn write(path: &Path, text: &str) -> Result<(), Failure> {
     let refused = |error: &dyn std::fmt::Display| {
         Failure::Failed(miette::miette!(
             "{}: cannot be written: {error}",

@@ -11,7 +11,7 @@ use std::net::SocketAddr;
 
 /// Options of commands that show a live page.
 #[derive(Debug, clap::Args)]
-pub struct PageArgs {
+pub(crate) struct PageArgs {
     /// Show the run in a browser. Prints two links: one to act, one to look. Default address: a free port of this machine.
     #[arg(long, value_name = "ADDRESS", num_args = 0..=1, default_missing_value = "127.0.0.1:0")]
     view: Option<SocketAddr>,
@@ -22,7 +22,7 @@ pub struct PageArgs {
 
 /// Options of commands that show a live page, or the run on the whole terminal.
 #[derive(Debug, clap::Args)]
-pub struct ViewArgs {
+pub(crate) struct ViewArgs {
     #[command(flatten)]
     page: PageArgs,
     /// Show the run on the whole terminal.
@@ -35,7 +35,7 @@ impl PageArgs {
     ///
     /// # Errors
     /// The virtual clock.
-    pub fn wanted(&self, clock: ClockKind) -> Result<Wanted, Failure> {
+    pub(crate) fn wanted(&self, clock: ClockKind) -> Result<Wanted, Failure> {
         let page = self.view.map(|address| ViewAddress {
             address,
             beyond_this_machine: self.view_unsafe_address,
@@ -61,7 +61,7 @@ fn on_real_clock(option: &str, clock: ClockKind) -> Result<(), Failure> {
 
 impl ViewArgs {
     /// Whether the whole terminal is wanted: no live line is shown then.
-    pub fn tui(&self) -> bool {
+    pub(crate) fn tui(&self) -> bool {
         self.tui
     }
 
@@ -69,7 +69,7 @@ impl ViewArgs {
     ///
     /// # Errors
     /// The virtual clock, or no terminal.
-    pub fn wanted(
+    pub(crate) fn wanted(
         &self,
         clock: ClockKind,
         keys: &'static str,
@@ -94,7 +94,7 @@ impl ViewArgs {
     ///
     /// # Errors
     /// As [`ViewArgs::wanted`]; an address that cannot be listened on.
-    pub fn open(
+    pub(crate) fn open(
         &self,
         rig: &mut Rig,
         setup: &Setup,
@@ -113,7 +113,7 @@ impl ViewArgs {
 }
 
 /// Says where a page is.
-pub fn said(view: &View) {
+pub(crate) fn said(view: &View) {
     if view.is_reachable() {
         eprintln_or_keep(
             view,

@@ -216,7 +216,7 @@ pub(crate) struct Wander {
 
 impl Wander {
     /// Starts where it would be after a long time. A process of size 0 draws nothing more.
-    pub fn new(rms: f64, time_s: f64, mut noise: Random) -> Self {
+    pub(crate) fn new(rms: f64, time_s: f64, mut noise: Random) -> Self {
         let value = rms * noise.normal();
         Self {
             rms,
@@ -227,7 +227,7 @@ impl Wander {
     }
 
     /// Moves on by `dt_s`; its value then.
-    pub fn advance(&mut self, dt_s: f64) -> f64 {
+    pub(crate) fn advance(&mut self, dt_s: f64) -> f64 {
         if self.rms > 0.0 {
             let kept = (-dt_s / self.time_s).exp();
             let fresh = (1.0 - kept * kept).sqrt();

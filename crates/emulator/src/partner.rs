@@ -28,7 +28,7 @@ pub(crate) struct PressurePartner {
 }
 
 impl PressurePartner {
-    pub fn new(config: &PressureConfig) -> Result<Self, BoardConfigError> {
+    pub(crate) fn new(config: &PressureConfig) -> Result<Self, BoardConfigError> {
         let board = config.board.board()?;
         let start_um = um_from_picometres(board.applied_pm());
         Ok(Self {
@@ -42,14 +42,14 @@ impl PressurePartner {
     }
 
     /// The board's time moves on.
-    pub fn tick(&mut self, now_us: u64) {
+    pub(crate) fn tick(&mut self, now_us: u64) {
         self.board.tick(now_us);
         self.applied_um = um_from_picometres(self.board.applied_pm());
     }
 
     /// Advances the pressure by `dt_s`; its mean effect over that time, um of PZT. Steps are of a fraction of a millisecond: the mean of
     /// a stage is taken as that of its ends.
-    pub fn advance(&mut self, dt_s: f64) -> f64 {
+    pub(crate) fn advance(&mut self, dt_s: f64) -> f64 {
         let mut into_um = self.applied_um;
         for (stage_um, lag_s) in self.stages_um.iter_mut().zip(self.lags_s) {
             let before_um = *stage_um;

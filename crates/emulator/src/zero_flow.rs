@@ -22,7 +22,7 @@ pub(crate) struct ZeroFlow {
 
 impl ZeroFlow {
     /// At its mean, but for the part that wanders, which starts where it would be after a long time.
-    pub fn new(config: &WorldConfig) -> Self {
+    pub(crate) fn new(config: &WorldConfig) -> Self {
         let it = config.imperfections();
         let noise = Random::stream(config.seed, 31);
         Self {
@@ -34,7 +34,7 @@ impl ZeroFlow {
     }
 
     /// Moves on by `dt_s`. Returns the distance from the mean now, um.
-    pub fn advance(&mut self, dt_s: f64, stepped: bool) -> f64 {
+    pub(crate) fn advance(&mut self, dt_s: f64, stepped: bool) -> f64 {
         self.drifted_um += self.drift_um_per_s * dt_s;
         self.wander.advance(dt_s) + self.drifted_um + if stepped { self.step_um } else { 0.0 }
     }

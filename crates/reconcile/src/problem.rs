@@ -54,7 +54,7 @@ pub(crate) struct Prepared {
 
 impl Prepared {
     /// Innovations of a residual, in standard deviations, without what an unknown state at the record's start makes.
-    pub fn whiten(&self, r: &[f64], e: &mut [f64]) {
+    pub(crate) fn whiten(&self, r: &[f64], e: &mut [f64]) {
         self.whitener.apply(r, e);
         for q in &self.free {
             let share = dot(q, e);
@@ -65,7 +65,7 @@ impl Prepared {
     }
 
     /// The same in rows of their own.
-    pub fn whitened(&self, r: &[f64]) -> Vec<f64> {
+    pub(crate) fn whitened(&self, r: &[f64]) -> Vec<f64> {
         let mut e = vec![0.0; r.len()];
         self.whiten(r, &mut e);
         e
@@ -98,7 +98,7 @@ impl Prepared {
     }
 
     /// What the transients and a level (and, where asked for, a ramp) leave of a residual.
-    pub fn without_start(&self, residual: &[f64], ramp: bool) -> Vec<f64> {
+    pub(crate) fn without_start(&self, residual: &[f64], ramp: bool) -> Vec<f64> {
         let n = residual.len();
         let mut columns: Vec<Vec<f64>> = vec![vec![1.0; n]];
         if ramp {
@@ -185,7 +185,12 @@ pub(crate) struct Problem {
 
 impl Problem {
     /// Prepares records; `repeated[i][k]` marks rows that repeat a frame and count as missing.
-    pub fn new(base: Base, records: &[Record], repeated: &[Vec<bool>], noise: NoiseModel) -> Self {
+    pub(crate) fn new(
+        base: Base,
+        records: &[Record],
+        repeated: &[Vec<bool>],
+        noise: NoiseModel,
+    ) -> Self {
         let direct = if base.zpk.zeros.len() == base.zpk.poles.len() {
             base.zpk.gain.abs()
         } else {
@@ -247,17 +252,17 @@ impl Problem {
     }
 
     /// Counts the work of a simulation.
-    pub fn spend(&self, work: u64) {
+    pub(crate) fn spend(&self, work: u64) {
         self.work.fetch_add(work, Ordering::Relaxed);
     }
 
     /// Work of all simulations until now. The same for any number of threads, where none of them is at work.
-    pub fn spent(&self) -> u64 {
+    pub(crate) fn spent(&self) -> u64 {
         self.work.load(Ordering::Relaxed)
     }
 
     /// The same problem with other noise.
-    pub fn with_noise(mut self, noise: NoiseModel) -> Self {
+    pub(crate) fn with_noise(mut self, noise: NoiseModel) -> Self {
         self.noise = noise;
         for r in &mut self.records {
             r.set_noise(&self.base, &noise);
@@ -266,18 +271,18 @@ impl Problem {
     }
 
     /// Which rows of each record hold a position that counts.
-    pub fn present(&self) -> Vec<Vec<bool>> {
+    pub(crate) fn present(&self) -> Vec<Vec<bool>> {
         self.records.iter().map(|r| r.present.clone()).collect()
     }
 
     /// Sum of the logarithms of the innovations' variances: what a noise pays for its size.
-    pub fn log_determinant(&self) -> f64 {
+    pub(crate) fn log_determinant(&self) -> f64 {
         let of = |r: &Prepared| r.whitener.log_determinant();
         self.records.iter().map(of).sum()
     }
 
     /// All rows.
-    pub fn all(&self) -> Mask {
+    pub(crate) fn all(&self) -> Mask {
         self.records
             .iter()
             .map(|r| std::iter::once(0..r.u.len()).collect())
@@ -285,7 +290,7 @@ impl Problem {
     }
 
     /// Number of innovations that count under a mask.
-    pub fn count(&self, mask: &Mask) -> usize {
+    pub(crate) fn count(&self, mask: &Mask) -> usize {
         self.records
             .iter()
             .zip(mask)

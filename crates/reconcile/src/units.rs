@@ -132,7 +132,7 @@ fn product(powers: &[(&str, i32)]) -> String {
 impl Scales {
     /// Of this rig's records: micrometres as they are.
     #[cfg(test)]
-    pub fn none() -> Self {
+    pub(crate) fn none() -> Self {
         Self {
             names: Units::default(),
             input: 1.0,
@@ -142,7 +142,7 @@ impl Scales {
 
     /// Of records of this rig (`foreign` is false) none but their names; else such that command and position have the size
     /// of this rig's.
-    pub fn of(records: &[Record], names: &Units, foreign: bool) -> Self {
+    pub(crate) fn of(records: &[Record], names: &Units, foreign: bool) -> Self {
         let mut scales = Self {
             names: names.clone(),
             input: 1.0,
@@ -160,17 +160,17 @@ impl Scales {
     }
 
     /// um per unit of command and of position.
-    pub fn per_unit(&self) -> [f64; 2] {
+    pub(crate) fn per_unit(&self) -> [f64; 2] {
         [self.input, self.output]
     }
 
     /// Whether the records are in units of their own.
-    pub fn is_of_records(&self) -> bool {
+    pub(crate) fn is_of_records(&self) -> bool {
         self.per_unit() != [1.0, 1.0]
     }
 
     /// Those units in words.
-    pub fn words(&self) -> String {
+    pub(crate) fn words(&self) -> String {
         format!("{} -> {}", self.names.input, self.names.output)
     }
 
@@ -182,32 +182,32 @@ impl Scales {
     }
 
     /// A command within the search, in the unit of the records.
-    pub fn input(&self, um: f64) -> f64 {
+    pub(crate) fn input(&self, um: f64) -> f64 {
         um / self.input
     }
 
     /// A position within the search, in the unit of the records.
-    pub fn output(&self, um: f64) -> f64 {
+    pub(crate) fn output(&self, um: f64) -> f64 {
         um / self.output
     }
 
     /// Name of the unit of the command.
-    pub fn input_unit(&self) -> &str {
+    pub(crate) fn input_unit(&self) -> &str {
         &self.names.input
     }
 
     /// Name of the unit of the position.
-    pub fn output_unit(&self) -> &str {
+    pub(crate) fn output_unit(&self) -> &str {
         &self.names.output
     }
 
     /// A position within the search, in words.
-    pub fn told(&self, um: f64) -> String {
+    pub(crate) fn told(&self, um: f64) -> String {
         format!("{} {}", figure(self.output(um)), self.names.output)
     }
 
     /// A coefficient that makes something of `side` of so many commands, positions and seconds: its value and its unit.
-    pub fn coefficient(&self, value: f64, side: Side, powers: [i32; 3]) -> (f64, String) {
+    pub(crate) fn coefficient(&self, value: f64, side: Side, powers: [i32; 3]) -> (f64, String) {
         let [of_input, of_output, seconds] = powers;
         let (made, name) = self.side(side);
         let factor = self.input.powi(of_input) * self.output.powi(of_output) / made;
@@ -222,7 +222,7 @@ impl Scales {
 
     /// The factor that brings a number of a kind of effect, as the search has it, into the unit of the records, and that unit;
     /// None of a number without a length.
-    pub fn of_number(&self, kind: &dyn EffectKind, unit: &str) -> Option<(f64, String)> {
+    pub(crate) fn of_number(&self, kind: &dyn EffectKind, unit: &str) -> Option<(f64, String)> {
         let power = power_of(unit);
         if power == 0 || kind.definition().is_some() {
             return None;
@@ -259,7 +259,7 @@ impl Scales {
     }
 
     /// An effect of the search, in the units of the records.
-    pub fn effect_out(&self, effect: &Effect) -> Effect {
+    pub(crate) fn effect_out(&self, effect: &Effect) -> Effect {
         self.effect(effect, false)
     }
 
@@ -267,7 +267,7 @@ impl Scales {
     ///
     /// # Errors
     /// A plant whose gain has no number then.
-    pub fn model(&self, model: &Model) -> Result<Model, ReconcileError> {
+    pub(crate) fn model(&self, model: &Model) -> Result<Model, ReconcileError> {
         if !self.is_of_records() {
             return Ok(model.clone());
         }
@@ -288,7 +288,7 @@ impl Scales {
     }
 
     /// Records as the search has them.
-    pub fn records(&self, records: &[Record]) -> Vec<Record> {
+    pub(crate) fn records(&self, records: &[Record]) -> Vec<Record> {
         let mut records = records.to_vec();
         if self.is_of_records() {
             for r in &mut records {

@@ -212,7 +212,7 @@ pub(crate) struct KeepWatch {
 }
 
 impl KeepWatch {
-    pub fn expecting(hold: Hold) -> Self {
+    pub(crate) fn expecting(hold: Hold) -> Self {
         Self {
             hold: Some(hold),
             ..Self::default()
@@ -220,13 +220,13 @@ impl KeepWatch {
     }
 
     /// Whether the bead of a record is to be held: the loop is closed, and nobody asked for a freeze.
-    pub fn is_held(record: &TickRecord) -> bool {
+    pub(crate) fn is_held(record: &TickRecord) -> bool {
         let asked = record.request != Request::None as u8 && record.request != Request::Skip as u8;
         record.is_running() && !(record.flags.has(TickFlags::FREEZE) && asked)
     }
 
     /// The bead of a tick is not to be held.
-    pub fn pause(&mut self) {
+    pub(crate) fn pause(&mut self) {
         if self.gap_counts {
             let open = self.gap.open();
             self.take(open);
@@ -238,7 +238,7 @@ impl KeepWatch {
     }
 
     /// Takes a record whose bead is to be held; `counts` says whether its error is one that counts.
-    pub fn add(&mut self, record: &TickRecord, counts: bool) {
+    pub(crate) fn add(&mut self, record: &TickRecord, counts: bool) {
         self.last_ns = record.time_ns;
         let frozen = record.flags.has(TickFlags::FREEZE);
         self.frozen_since_ns = frozen.then(|| self.frozen_since_ns.unwrap_or(record.time_ns));
@@ -386,29 +386,29 @@ impl KeepWatch {
     }
 
     /// Positions that the errors are of: fixes, and moments without one.
-    pub fn positions(&self) -> u64 {
+    pub(crate) fn positions(&self) -> u64 {
         self.all().n as u64
     }
 
     /// RMS of measured position less reference, moments without a fix by the estimate, nm.
-    pub fn rms_measured_nm(&self) -> Option<f64> {
+    pub(crate) fn rms_measured_nm(&self) -> Option<f64> {
         self.all().rms_nm(0.0)
     }
 
     /// Mean of the same, nm.
-    pub fn mean_nm(&self) -> Option<f64> {
+    pub(crate) fn mean_nm(&self) -> Option<f64> {
         let all = self.all();
         (all.n > 0.0).then(|| all.sum / all.n * 1e3)
     }
 
     /// Largest of the same, nm.
-    pub fn peak_nm(&self) -> Option<f64> {
+    pub(crate) fn peak_nm(&self) -> Option<f64> {
         let all = self.all();
         (all.n > 0.0).then_some(all.peak * 1e3)
     }
 
     /// What there is to say of the run so far.
-    pub fn kept(&self) -> Kept {
+    pub(crate) fn kept(&self) -> Kept {
         let all = self.all();
         let unseen_ns = self
             .blind_since_ns

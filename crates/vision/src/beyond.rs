@@ -48,7 +48,7 @@ pub(crate) struct Left {
 
 impl Left {
     /// What the window asks for besides place, contrast and level, where noise of a variance is all that is left.
-    pub fn asks(&self, variance: f64) -> Asked {
+    pub(crate) fn asks(&self, variance: f64) -> Asked {
         let [along, down, size] = self.scores.map(|z| z * z / variance);
         Asked {
             slopes: along.max(down) > LEAST_SLOPE * LEAST_SLOPE,

@@ -109,25 +109,25 @@ pub struct LocaliserConfig {
 }
 
 mod defaults {
-    pub fn min_snr() -> f64 {
+    pub(super) fn min_snr() -> f64 {
         3.0
     }
-    pub fn max_residual_ratio() -> f64 {
+    pub(super) fn max_residual_ratio() -> f64 {
         1.5
     }
-    pub fn template_tolerance() -> f64 {
+    pub(super) fn template_tolerance() -> f64 {
         0.06
     }
-    pub fn first_fixes() -> u32 {
+    pub(super) fn first_fixes() -> u32 {
         50
     }
-    pub fn refresh_fixes() -> u32 {
+    pub(super) fn refresh_fixes() -> u32 {
         5000
     }
-    pub fn max_change() -> f64 {
+    pub(super) fn max_change() -> f64 {
         0.2
     }
-    pub fn max_passes() -> u32 {
+    pub(super) fn max_passes() -> u32 {
         12
     }
 }

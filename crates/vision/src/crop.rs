@@ -34,7 +34,7 @@ pub(crate) struct Crop {
 }
 
 impl Crop {
-    pub fn new() -> Self {
+    pub(crate) fn new() -> Self {
         let rows = Box::new([[0.0; STRIDE]; MAX_WINDOW_PX]);
         Crop {
             rows,
@@ -51,7 +51,7 @@ impl Crop {
 
     /// Copies the window of side `side` centred on the pixel nearest to (`x_px`, `y_px`). False when less than 5 x 5
     /// pixels of it lie within the frame, or the frame holds fewer pixels than it claims.
-    pub fn take(&mut self, frame: &Frame, x_px: f64, y_px: f64, side: usize) -> bool {
+    pub(crate) fn take(&mut self, frame: &Frame, x_px: f64, y_px: f64, side: usize) -> bool {
         let half = (side.min(MAX_WINDOW_PX) / 2) as f64;
         let first = |c: f64| (c.round() - half).max(0.0) as usize;
         let end = |c: f64, len: usize| ((c.round() + half + 1.0).max(0.0) as usize).min(len);
@@ -77,7 +77,7 @@ impl Crop {
 
     /// Leaves a pixel out of the fits in this window, with `value` in its place for what does not ask. False where there is
     /// no more room.
-    pub fn leave_out(&mut self, (row, column): (usize, usize), value: f32) -> bool {
+    pub(crate) fn leave_out(&mut self, (row, column): (usize, usize), value: f32) -> bool {
         let slot = self.holes.get_mut(self.holes_used);
         let pixel = self.rows.get_mut(row).and_then(|r| r.get_mut(column));
         let (Some(slot), Some(pixel)) = (slot, pixel) else {
@@ -89,18 +89,18 @@ impl Crop {
     }
 
     /// Columns of a row that are left out.
-    pub fn left_out(&self, row: usize) -> impl Iterator<Item = usize> {
+    pub(crate) fn left_out(&self, row: usize) -> impl Iterator<Item = usize> {
         let holes = self.holes.iter().take(self.holes_used);
         holes.filter(move |hole| hole.0 == row).map(|hole| hole.1)
     }
 
     /// Whether any pixel is left out.
-    pub fn has_holes(&self) -> bool {
+    pub(crate) fn has_holes(&self) -> bool {
         self.holes_used > 0
     }
 
     /// Takes the image of a bead, drawn out along `comb`, off the window.
-    pub fn take_off(
+    pub(crate) fn take_off(
         &mut self,
         template: &Template,
         comb: &Comb,
@@ -140,7 +140,7 @@ impl Crop {
     }
 
     /// Takes off light that rises by so much a pixel along the row and along the column, and is 0 at a place of the window.
-    pub fn take_off_slope(&mut self, (x, y): (f32, f32), (along, down): (f32, f32)) {
+    pub(crate) fn take_off_slope(&mut self, (x, y): (f32, f32), (along, down): (f32, f32)) {
         let width = self.width;
         for (j, row) in self.rows.iter_mut().enumerate().take(self.height) {
             let start = down * (j as f32 - y) - along * x;
@@ -186,7 +186,7 @@ impl Crop {
 
     /// Noise variance of a pixel from differences of neighbours along the border, grey levels squared. Differences are
     /// blind to uneven light; those above four times the mean (another bead's edge) are left out.
-    pub fn noise_variance(&self) -> f64 {
+    pub(crate) fn noise_variance(&self) -> f64 {
         let mut limit = f32::INFINITY;
         for _ in 0..2 {
             let (mut previous, mut sum, mut count) = (0.0_f32, 0.0_f32, 0.0_f32);
@@ -207,7 +207,7 @@ impl Crop {
 
     /// Centroid of the pixels on the bead's side of half the largest contrast, within `reach_px` of the brightest, in
     /// frame coordinates. `sign` is -1 for a dark core.
-    pub fn centroid(&self, sign: f32, reach_px: f64) -> Option<(f64, f64)> {
+    pub(crate) fn centroid(&self, sign: f32, reach_px: f64) -> Option<(f64, f64)> {
         // A sum of three pixels in a row, so that one hot pixel does not lead astray.
         let (mut best, mut at) = (0.0_f32, None);
         for (j, row) in self.rows.iter().enumerate().take(self.height) {

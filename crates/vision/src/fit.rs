@@ -26,7 +26,7 @@ pub(crate) enum Weights {
 
 impl Weights {
     /// Weights of a row where they are the same everywhere.
-    pub fn of_even(self, crop: &Crop) -> Row {
+    pub(crate) fn of_even(self, crop: &Crop) -> Row {
         let mut weight = crop.mask;
         if let Weights::Even { variance } = self {
             weight.iter_mut().for_each(|w| *w /= variance);
@@ -36,7 +36,7 @@ impl Weights {
 
     /// Weights of a row where they depend on its light.
     #[inline(always)]
-    pub fn of_shot(self, crop: &Crop, value: &[f32], weight: &mut Row) {
+    pub(crate) fn of_shot(self, crop: &Crop, value: &[f32], weight: &mut Row) {
         if let Weights::Shot {
             base,
             gain_times_amplitude,
@@ -136,7 +136,7 @@ pub(crate) struct Image {
 }
 
 impl Image {
-    pub fn new(lanes_end: usize) -> Self {
+    pub(crate) fn new(lanes_end: usize) -> Self {
         Image {
             lanes_end,
             entry: [0; STRIDE],
@@ -149,7 +149,7 @@ impl Image {
 
     /// The row `dy` px below the centre, which lies in the column `x`.
     #[inline(always)]
-    pub fn draw_row(&mut self, template: &Template, comb: &Comb, x: f32, dy: f32) {
+    pub(crate) fn draw_row(&mut self, template: &Template, comb: &Comb, x: f32, dy: f32) {
         let n = self.lanes_end;
         let factor = -2.0 * template.slope_factor();
         let mut first = true;

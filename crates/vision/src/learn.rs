@@ -43,7 +43,7 @@ pub(crate) struct Learner {
 
 impl Learner {
     /// For windows of side `window_px`; `template` is the configured one.
-    pub fn new(settings: Learning, window_px: usize, template: &Template) -> Self {
+    pub(crate) fn new(settings: Learning, window_px: usize, template: &Template) -> Self {
         // The corner of the window is the last pixel that can contribute.
         let reach_px = window_px as f64 / 2.0 * core::f64::consts::SQRT_2;
         let knot_px = reach_px / (KNOTS - 1) as f64;
@@ -62,21 +62,21 @@ impl Learner {
         }
     }
 
-    pub fn max_change(&self) -> f64 {
+    pub(crate) fn max_change(&self) -> f64 {
         self.settings.max_change
     }
 
-    pub fn report(&self) -> LearningReport {
+    pub(crate) fn report(&self) -> LearningReport {
         self.report
     }
 
     /// Whether the first profile is still to be learnt.
-    pub fn is_first(&self) -> bool {
+    pub(crate) fn is_first(&self) -> bool {
         self.report.taken + self.report.confirmed == 0
     }
 
     /// Takes in a good fix: position in frame coordinates, amplitude and background (above the crop's pedestal).
-    pub fn take_in(
+    pub(crate) fn take_in(
         &mut self,
         crop: &Crop,
         (x_px, y_px): (f64, f64),
@@ -117,7 +117,7 @@ impl Learner {
 
     /// Replaces the template by what has been gathered, if that predicts beads better and does not differ too much.
     /// Allocates nothing.
-    pub fn refresh(&mut self, template: &mut Template) {
+    pub(crate) fn refresh(&mut self, template: &mut Template) {
         self.since = 0;
         let first = self.is_first();
         template.stretch_to(1.0);

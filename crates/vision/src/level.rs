@@ -22,7 +22,7 @@ pub(crate) struct Level {
 }
 
 impl Level {
-    pub fn new() -> Self {
+    pub(crate) fn new() -> Self {
         Level {
             columns: 1,
             rows: 1,
@@ -35,7 +35,7 @@ impl Level {
     }
 
     /// Takes the levels of a frame, for beads of a radius; `mean` is the level where there is but one tile.
-    pub fn take<T: Copy>(
+    pub(crate) fn take<T: Copy>(
         &mut self,
         pixels: &[T],
         (width, height): (usize, usize),
@@ -85,7 +85,7 @@ impl Level {
     }
 
     /// Level along a row.
-    pub fn row(&mut self, y: usize) -> &[f32] {
+    pub(crate) fn row(&mut self, y: usize) -> &[f32] {
         let one = self.columns * self.rows == 1;
         if self.y != y && !(one && self.row.len() == self.width) {
             self.fill(y);

@@ -42,7 +42,7 @@ pub(crate) struct Flat {
 }
 
 impl Flat {
-    pub fn new(frame: &Frame) -> Self {
+    pub(crate) fn new(frame: &Frame) -> Self {
         let (values, noise) = match frame.pixels {
             Pixels::Mono8(p) => (
                 p.iter().map(|v| f32::from(*v)).collect(),
@@ -65,7 +65,7 @@ impl Flat {
     }
 
     /// Takes off a parabola fitted to what is not an object.
-    pub fn flatten(&mut self) {
+    pub(crate) fn flatten(&mut self) {
         use nalgebra::{SMatrix, SVector};
         let (width, height) = (self.width.max(1) as f64, self.height.max(1) as f64);
         let terms = |k: usize| {
@@ -108,7 +108,7 @@ impl Flat {
     }
 
     /// Mean of the contrast's square over 5 x 5 pixels, as a root.
-    pub fn strength(&self) -> Vec<f32> {
+    pub(crate) fn strength(&self) -> Vec<f32> {
         let (w, h) = (self.width, self.height);
         let mut rows = vec![0.0; w * h];
         for (row, values) in rows.chunks_exact_mut(w).zip(self.values.chunks_exact(w)) {
@@ -127,7 +127,7 @@ impl Flat {
             .collect()
     }
 
-    pub fn objects(&self, frame: usize, objects: &mut Vec<Object>, refused: &mut Refused) {
+    pub(crate) fn objects(&self, frame: usize, objects: &mut Vec<Object>, refused: &mut Refused) {
         let strength = self.strength();
         let strongest = strength.iter().fold(0.0_f32, |a, b| a.max(*b));
         // The RMS of noise alone is `noise`, and scatters by a seventh of it.
@@ -165,7 +165,7 @@ impl Flat {
     }
 
     /// Centre of symmetry near a place.
-    pub fn centre(&self, (x, y): (f64, f64), side: usize) -> Option<(f64, f64)> {
+    pub(crate) fn centre(&self, (x, y): (f64, f64), side: usize) -> Option<(f64, f64)> {
         let scale = 20.0 / self.noise;
         let grey: Vec<u16> = self
             .values

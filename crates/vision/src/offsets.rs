@@ -13,12 +13,12 @@ pub(crate) struct Lines {
 
 impl Lines {
     /// Variance of the lines' offsets beyond noise of a variance; below 0 by chance.
-    pub fn excess(&self, variance: f64) -> f64 {
+    pub(crate) fn excess(&self, variance: f64) -> f64 {
         self.between - variance * self.of_noise
     }
 
     /// From the sums of each line beside the bead and their pixels, and the sums of the template's derivative along it.
-    pub fn of(
+    pub(crate) fn of(
         sums: &[f32],
         pixels: &[f32],
         derivative: &[f32],

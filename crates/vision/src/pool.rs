@@ -11,14 +11,14 @@ pub(crate) struct Pool {
 }
 
 impl Pool {
-    pub fn take_in(&mut self, value: f64) {
+    pub(crate) fn take_in(&mut self, value: f64) {
         self.fixes += 1.0;
         self.mean += (value - self.mean) * (1.0 / self.fixes).max(FORGETTING);
     }
 
     /// Takes in a value that is known from some fixes and gives it drawn towards the mean of all, as if that were known from
     /// `weight` of them.
-    pub fn shrink(&mut self, own: f64, fixes: f64, weight: f64) -> f64 {
+    pub(crate) fn shrink(&mut self, own: f64, fixes: f64, weight: f64) -> f64 {
         self.take_in(own);
         (fixes * own + weight * self.mean) / (fixes + weight)
     }

@@ -72,7 +72,7 @@ pub(crate) struct Residues {
 }
 
 impl Residues {
-    pub fn new() -> Self {
+    pub(crate) fn new() -> Self {
         Residues {
             looks: vec![Look::NONE; FEW_BEADS],
             fixes: 0,
@@ -82,7 +82,7 @@ impl Residues {
     }
 
     /// Makes room for the looks of so many beads.
-    pub fn reserve(&mut self, beads: usize) {
+    pub(crate) fn reserve(&mut self, beads: usize) {
         let room = beads.max(self.looks.len());
         self.looks.resize(room, Look::NONE);
     }
@@ -90,7 +90,7 @@ impl Residues {
     /// By how much the variance of the position is larger than from noise of the even `variance` (grey^2), judged by what
     /// the template leaves of this window and has left of the bead's windows before. `None` for a window with the bead far
     /// off its middle. Allocates nothing.
-    pub fn widening(
+    pub(crate) fn widening(
         &mut self,
         crop: &Crop,
         template: &Template,
@@ -151,7 +151,7 @@ impl Residues {
 
     /// Mean square of what the template leaves besides its mean all round: a bead in another focus has none, whatever it has made of
     /// the profile, and it moves no bead; two beads, or a bead and something else, have.
-    pub fn lopsided(
+    pub(crate) fn lopsided(
         &mut self,
         crop: &Crop,
         template: &Template,

@@ -64,7 +64,7 @@ pub(crate) struct Learnt {
 
 impl Learnt {
     /// Value at a distance; beyond the last bin its value.
-    pub fn value(&self, r_px: f64) -> f64 {
+    pub(crate) fn value(&self, r_px: f64) -> f64 {
         let u = (r_px / self.bin_px - 0.5).clamp(0.0, (BINS - 1) as f64);
         let k = (u as usize).min(BINS - 2);
         let t = u - k as f64;
@@ -93,7 +93,7 @@ impl Parametric {
 }
 
 impl Rings {
-    pub fn new(reach_px: f64) -> Self {
+    pub(crate) fn new(reach_px: f64) -> Self {
         Rings {
             reach_px,
             halves: [Half::EMPTY; 2],
@@ -102,19 +102,19 @@ impl Rings {
     }
 
     /// Forgets everything. Allocates nothing.
-    pub fn clear(&mut self) {
+    pub(crate) fn clear(&mut self) {
         self.halves = [Half::EMPTY; 2];
         self.beads = 0;
     }
 
     /// The next bead: every other one belongs to the second half.
-    pub fn next_bead(&mut self) {
+    pub(crate) fn next_bead(&mut self) {
         self.beads += 1;
     }
 
     /// A pixel of the bead at hand.
     #[inline]
-    pub fn add(&mut self, r_px: f64, value: f64, weight: f64) {
+    pub(crate) fn add(&mut self, r_px: f64, value: f64, weight: f64) {
         let bin = (r_px / self.reach_px * BINS as f64) as usize;
         let half = &mut self.halves[self.beads % 2];
         if let (Some(w), Some(s)) = (half.weight.get_mut(bin), half.sum.get_mut(bin)) {
@@ -130,7 +130,7 @@ impl Rings {
     }
 
     /// The Gaussian or ring that fits best.
-    pub fn parametric(&self) -> Option<Parametric> {
+    pub(crate) fn parametric(&self) -> Option<Parametric> {
         let left = |p: Parametric| {
             let at = p.at(self.bin_px())?;
             let fitted = self.scaled(&at, &[0, 1]);
@@ -168,12 +168,12 @@ impl Rings {
     }
 
     /// The profile: a parametric one with free contrast and level, plus the deviation that the halves confirm in each other.
-    pub fn learn_from(&self, parametric: Parametric) -> Option<Learnt> {
+    pub(crate) fn learn_from(&self, parametric: Parametric) -> Option<Learnt> {
         Some(self.learn(&parametric.at(self.bin_px())?))
     }
 
     /// The same from any function of the distance.
-    pub fn learn_beyond(&self, prior: impl Fn(f64) -> f64) -> Learnt {
+    pub(crate) fn learn_beyond(&self, prior: impl Fn(f64) -> f64) -> Learnt {
         let bin_px = self.bin_px();
         self.learn(&core::array::from_fn(|k| prior((k as f64 + 0.5) * bin_px)))
     }

@@ -21,14 +21,14 @@ pub(crate) struct Comb {
 
 impl Comb {
     /// A bead at rest.
-    pub const STILL: Comb = Comb {
+    pub(crate) const STILL: Comb = Comb {
         teeth: 1,
         step_x_px: 0.0,
         step_y_px: 0.0,
     };
 
     /// The comb of a way (px, from the start to the end of the exposure) for a bead of the radius `radius_px`.
-    pub fn new((x_px, y_px): (f64, f64), radius_px: f64) -> Self {
+    pub(crate) fn new((x_px, y_px): (f64, f64), radius_px: f64) -> Self {
         let length_px = f64::hypot(x_px, y_px);
         // The comparison also turns NaN away.
         if length_px > LEAST_RADII * radius_px && length_px.is_finite() {
@@ -45,17 +45,17 @@ impl Comb {
     }
 
     /// Whether the bead counts as at rest.
-    pub fn is_still(&self) -> bool {
+    pub(crate) fn is_still(&self) -> bool {
         self.teeth == 1
     }
 
     /// Share of each tooth in the image.
-    pub fn share(&self) -> f32 {
+    pub(crate) fn share(&self) -> f32 {
         1.0 / self.teeth as f32
     }
 
     /// Offsets of the teeth from the middle, px.
-    pub fn offsets(&self) -> impl Iterator<Item = (f32, f32)> {
+    pub(crate) fn offsets(&self) -> impl Iterator<Item = (f32, f32)> {
         let Comb {
             teeth,
             step_x_px,

@@ -14,7 +14,7 @@ pub struct Bench {
 }
 
 /// A board at the end of any port.
-pub type Board = BoardHost<Box<dyn Port>>;
+pub(crate) type Board = BoardHost<Box<dyn Port>>;
 
 impl Bench {
     /// A bench with the devices of a rig file; nothing is opened yet.

@@ -14,7 +14,7 @@ use std::str::FromStr;
 /// A whole rig in a box, in real time: the PZT board on a pseudo-terminal, the camera on a Unix socket.
 #[derive(Debug, Parser)]
 #[command(name = "firmware-sim", version, after_help = EXAMPLE)]
-pub struct Args {
+pub(crate) struct Args {
     /// Rig file; its tables `emulator` and `board` are used, the others belong to the host
     #[arg(long, value_name = "FILE")]
     pub rig: Option<PathBuf>,
@@ -135,7 +135,7 @@ and in another terminal a rig.toml that names `pzt` and `camera.sock`:
 
 /// From when on, and for how long.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Span {
+pub(crate) struct Span {
     /// Start.
     pub at: Seconds,
     /// Duration; `None`: for good.
@@ -159,7 +159,7 @@ impl FromStr for Span {
 
 /// A probability per frame, or a time span in which every frame is hit.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub enum RateOrSpan {
+pub(crate) enum RateOrSpan {
     /// Probability.
     Rate(f64),
     /// Every frame.
@@ -186,7 +186,7 @@ impl FromStr for RateOrSpan {
 
 /// A stall at a time, or stalls at random.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub enum StallOption {
+pub(crate) enum StallOption {
     /// From a time on.
     Span(Span),
     /// Now and then.
@@ -217,7 +217,7 @@ impl FromStr for StallOption {
 
 /// Bursts per second, or a time span.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub enum FrequencyOrSpan {
+pub(crate) enum FrequencyOrSpan {
     /// Mean number of bursts a second.
     Frequency(Hertz),
     /// One burst each millisecond.
@@ -239,7 +239,7 @@ impl FromStr for FrequencyOrSpan {
 
 /// What the box is made of.
 #[derive(Debug)]
-pub struct Setup {
+pub(crate) struct Setup {
     /// World.
     pub world: WorldConfig,
     /// Board.
@@ -262,7 +262,7 @@ impl Args {
     ///
     /// # Errors
     /// Files that cannot be read or do not read.
-    pub fn setup(&self) -> Result<Setup, ProgramError> {
+    pub(crate) fn setup(&self) -> Result<Setup, ProgramError> {
         let mut file = match &self.rig {
             Some(path) => read_rig_file(path)?,
             None => RigFile::default(),

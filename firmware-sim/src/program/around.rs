@@ -46,7 +46,7 @@ impl CodeDecoder {
 
 /// World and converter's terminal.
 #[derive(Debug)]
-pub struct Around {
+pub(super) struct Around {
     terminal: OwnedFd,
     world: World,
     decoder: CodeDecoder,
@@ -61,7 +61,7 @@ impl Around {
     ///
     /// # Errors
     /// A terminal that cannot be opened; a world or a board that cannot be.
-    pub fn open(path: &Path, setup: &Setup, start_ns: i64) -> Result<Self, ProgramError> {
+    pub(super) fn open(path: &Path, setup: &Setup, start_ns: i64) -> Result<Self, ProgramError> {
         let fail = |error: Errno| ProgramError::File {
             path: path.to_owned(),
             doing: "opening the converter's terminal",
@@ -90,12 +90,12 @@ impl Around {
     }
 
     /// Displacement at the converter, um.
-    pub fn applied_um(&self) -> f64 {
+    pub(super) fn applied_um(&self) -> f64 {
         self.applied_um
     }
 
     /// Codes heard.
-    pub fn heard(&self) -> u64 {
+    pub(super) fn heard(&self) -> u64 {
         self.heard
     }
 
@@ -124,7 +124,7 @@ impl Around {
     ///
     /// # Errors
     /// The board's terminal is gone; the log cannot be written.
-    pub fn pace(
+    pub(super) fn pace(
         &mut self,
         server: &mut FrameServer,
         mut log: Option<&mut Log>,

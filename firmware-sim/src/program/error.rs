@@ -6,7 +6,7 @@ use std::path::PathBuf;
 
 /// Why the box does not run.
 #[derive(Debug, thiserror::Error)]
-pub enum ProgramError {
+pub(crate) enum ProgramError {
     /// A file that cannot be used.
     #[error("{path}: {doing}: {source}")]
     File {
@@ -43,7 +43,7 @@ pub enum ProgramError {
 
 impl ProgramError {
     /// 2 for input that is wrong, 1 for everything else.
-    pub fn exit_code(&self) -> u8 {
+    pub(crate) fn exit_code(&self) -> u8 {
         match self {
             Self::RigFile { .. } | Self::Model(_) | Self::Box(_) => 2,
             Self::File { .. } | Self::System { .. } => 1,
@@ -51,7 +51,7 @@ impl ProgramError {
     }
 
     /// For [`Result::map_err`] on a call to the operating system.
-    pub fn system<E: Into<io::Error>>(doing: &'static str) -> impl FnOnce(E) -> Self {
+    pub(crate) fn system<E: Into<io::Error>>(doing: &'static str) -> impl FnOnce(E) -> Self {
         move |source| Self::System {
             doing,
             source: source.into(),

@@ -17,7 +17,7 @@ struct Client {
 
 /// Hands frames to whoever listens, without ever waiting for anybody.
 #[derive(Debug)]
-pub struct FrameServer {
+pub(super) struct FrameServer {
     listener: UnixListener,
     path: PathBuf,
     clients: Vec<Client>,
@@ -30,7 +30,7 @@ impl FrameServer {
     ///
     /// # Errors
     /// What the operating system refuses; something at `path` that is no socket.
-    pub fn listen(path: &Path) -> Result<Self, ProgramError> {
+    pub(super) fn listen(path: &Path) -> Result<Self, ProgramError> {
         let fail = |source| ProgramError::File {
             path: path.to_owned(),
             doing: "opening the camera's socket",
@@ -51,12 +51,12 @@ impl FrameServer {
     }
 
     /// Where it listens.
-    pub fn path(&self) -> &Path {
+    pub(super) fn path(&self) -> &Path {
         &self.path
     }
 
     /// Lets new clients in; whether there are any clients.
-    pub fn accept(&mut self) -> bool {
+    pub(super) fn accept(&mut self) -> bool {
         while let Ok((stream, _)) = self.listener.accept() {
             if stream.set_nonblocking(true).is_ok() {
                 self.clients.push(Client {
@@ -70,7 +70,7 @@ impl FrameServer {
     }
 
     /// Hands a frame to every client that has taken the one before; drops clients that have gone.
-    pub fn send(&mut self, header: &FrameHeader, pixels: &[u8]) {
+    pub(super) fn send(&mut self, header: &FrameHeader, pixels: &[u8]) {
         let skipped = &mut self.skipped;
         self.clients.retain_mut(|client| {
             if !client.push() {

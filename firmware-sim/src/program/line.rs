@@ -12,7 +12,7 @@ use std::path::{Path, PathBuf};
 
 /// A pseudo-terminal in raw mode. The host opens [`Line::path`] like a serial port, as often as it likes.
 #[derive(Debug)]
-pub struct Line {
+pub(super) struct Line {
     board_end: OwnedFd,
     /// Held open, so that a host that goes away leaves the line as it is.
     host_end: OwnedFd,
@@ -25,7 +25,7 @@ impl Line {
     ///
     /// # Errors
     /// What the operating system refuses; a `link` that exists and is no symbolic link.
-    pub fn open(link: Option<&Path>) -> Result<Self, ProgramError> {
+    pub(super) fn open(link: Option<&Path>) -> Result<Self, ProgramError> {
         let opening = "opening a pseudo-terminal";
         let flags = OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC;
         let board_end = openpt(flags).map_err(ProgramError::system(opening))?;
@@ -67,12 +67,12 @@ impl Line {
     }
 
     /// What the host opens.
-    pub fn path(&self) -> &Path {
+    pub(super) fn path(&self) -> &Path {
         &self.path
     }
 
     /// Becomes readable when the host has written.
-    pub fn readiness(&self) -> BorrowedFd<'_> {
+    pub(super) fn readiness(&self) -> BorrowedFd<'_> {
         self.board_end.as_fd()
     }
 
@@ -80,7 +80,7 @@ impl Line {
     ///
     /// # Errors
     /// What the operating system refuses.
-    pub fn read(&self, buffer: &mut [u8]) -> Result<usize, ProgramError> {
+    pub(super) fn read(&self, buffer: &mut [u8]) -> Result<usize, ProgramError> {
         match rustix::io::read(&self.board_end, buffer) {
             Ok(count) => Ok(count),
             Err(Errno::AGAIN | Errno::INTR | Errno::IO) => Ok(0),
@@ -94,7 +94,7 @@ impl Line {
     ///
     /// # Errors
     /// What the operating system refuses.
-    pub fn write(&self, bytes: &[u8]) -> Result<(), ProgramError> {
+    pub(super) fn write(&self, bytes: &[u8]) -> Result<(), ProgramError> {
         match rustix::io::write(&self.board_end, bytes) {
             Ok(count) if count == bytes.len() => Ok(()),
             Ok(_) | Err(Errno::AGAIN) => tcflush(&self.host_end, QueueSelector::IFlush)
@@ -110,13 +110,13 @@ impl Line {
     ///
     /// # Errors
     /// What the operating system refuses.
-    pub fn stall(&self, stalled: bool) -> Result<(), ProgramError> {
+    pub(super) fn stall(&self, stalled: bool) -> Result<(), ProgramError> {
         let action = if stalled { Action::OOff } else { Action::OOn };
         tcflow(&self.host_end, action).map_err(ProgramError::system("stopping the pseudo-terminal"))
     }
 
     /// Lifts the lock of exclusive use that a killed host leaves behind, so that the next one can open the line.
-    pub fn unlock(&self) {
+    pub(super) fn unlock(&self) {
         // Fails only when the terminal is gone, which reading reports.
         let _ = ioctl_tiocnxcl(&self.host_end);
     }

@@ -11,7 +11,7 @@ const FLUSH_NS: i64 = 1_000_000_000;
 
 /// A CSV file.
 #[derive(Debug)]
-pub struct Log {
+pub(super) struct Log {
     file: BufWriter<File>,
     path: PathBuf,
     start_ns: i64,
@@ -22,7 +22,7 @@ pub struct Log {
 
 /// What the log says of one instant.
 #[derive(Debug, Clone, Copy)]
-pub struct Instant<'a> {
+pub(super) struct Instant<'a> {
     /// Time, ns.
     pub now_ns: i64,
     /// Displacement at the converter, um.
@@ -42,7 +42,7 @@ impl Log {
     ///
     /// # Errors
     /// What the operating system refuses.
-    pub fn create(path: &Path, start_ns: i64) -> Result<Self, ProgramError> {
+    pub(super) fn create(path: &Path, start_ns: i64) -> Result<Self, ProgramError> {
         let file = File::create(path).map_err(|source| ProgramError::File {
             path: path.to_owned(),
             doing: "creating the log",
@@ -76,7 +76,7 @@ impl Log {
     ///
     /// # Errors
     /// What the operating system refuses, a full disk for example.
-    pub fn note(&mut self, instant: &Instant<'_>) -> Result<(), ProgramError> {
+    pub(super) fn note(&mut self, instant: &Instant<'_>) -> Result<(), ProgramError> {
         let now_ns = instant.now_ns;
         let changed = instant.state != self.last_state;
         if now_ns < self.next_ns && !changed {
@@ -110,7 +110,7 @@ impl Log {
     ///
     /// # Errors
     /// What the operating system refuses.
-    pub fn flush(&mut self) -> Result<(), ProgramError> {
+    pub(super) fn flush(&mut self) -> Result<(), ProgramError> {
         self.file.flush().map_err(|source| ProgramError::File {
             path: self.path.clone(),
             doing: "writing the log",

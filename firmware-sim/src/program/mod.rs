@@ -10,6 +10,6 @@ mod pace;
 mod run;
 mod usb;
 
-pub use args::Args;
-pub use error::ProgramError;
-pub use run::run;
+pub(crate) use args::Args;
+pub(crate) use error::ProgramError;
+pub(crate) use run::run;

@@ -10,18 +10,22 @@ use rustix::time::{ClockId, clock_gettime};
 use std::os::fd::BorrowedFd;
 
 /// Without anything to do the box still wakes up this often: exposures are not announced.
-pub const LONGEST_SLEEP_NS: i64 = 500_000;
+pub(super) const LONGEST_SLEEP_NS: i64 = 500_000;
 /// How often the line is unlocked and new clients are let in.
-pub const HOUSEKEEPING_NS: i64 = 20_000_000;
+pub(super) const HOUSEKEEPING_NS: i64 = 20_000_000;
 
 /// Now on the monotonic clock, ns.
-pub fn monotonic_ns() -> i64 {
+pub(super) fn monotonic_ns() -> i64 {
     let now = clock_gettime(ClockId::Monotonic);
     now.tv_sec * 1_000_000_000 + now.tv_nsec
 }
 
 /// Hands the frames that have been delivered by now to the clients; returns how many.
-pub fn send_frames(world: &mut World, server: &mut FrameServer, pixels: &mut Vec<u8>) -> u64 {
+pub(super) fn send_frames(
+    world: &mut World,
+    server: &mut FrameServer,
+    pixels: &mut Vec<u8>,
+) -> u64 {
     let (width, height) = (world.config().width_px, world.config().height_px);
     let mut frames = 0;
     while let Some(info) = world.take_frame(pixels) {
@@ -42,7 +46,10 @@ pub fn send_frames(world: &mut World, server: &mut FrameServer, pixels: &mut Vec
 
 /// Sleeps until `deadline_ns` or until `readiness` can be read. The time left is taken from the absolute deadline at the last
 /// moment, so that delays do not add up.
-pub fn wait(readiness: Option<BorrowedFd<'_>>, deadline_ns: i64) -> Result<(), ProgramError> {
+pub(super) fn wait(
+    readiness: Option<BorrowedFd<'_>>,
+    deadline_ns: i64,
+) -> Result<(), ProgramError> {
     let left_ns = (deadline_ns - monotonic_ns()).max(0);
     let timeout = Timespec {
         tv_sec: 0,

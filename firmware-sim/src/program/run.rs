@@ -25,7 +25,7 @@ const PRIORITY: u8 = 60;
 ///
 /// # Errors
 /// Wrong input, or what the operating system refuses.
-pub fn run(args: &Args) -> Result<(), ProgramError> {
+pub(crate) fn run(args: &Args) -> Result<(), ProgramError> {
     let setup = args.setup()?;
     let stop = Arc::new(AtomicBool::new(false));
     let asked = Arc::clone(&stop);

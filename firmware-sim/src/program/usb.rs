@@ -8,7 +8,7 @@ const MICROFRAME_NS: i64 = 125_000;
 
 /// When the line stalls, and how many bytes pass at a time.
 #[derive(Debug)]
-pub struct Usb {
+pub(super) struct Usb {
     /// Start and end of the stalls asked for, ns of the machine's clock.
     spans_ns: Vec<[i64; 2]>,
     random: Vec<RandomStalls>,
@@ -39,7 +39,12 @@ impl RandomStalls {
 
 impl Usb {
     /// Stalls that count from `start_ns`; `chunk`: most bytes of a packet.
-    pub fn new(stalls: &[StallOption], chunk: Option<usize>, seed: u64, start_ns: i64) -> Self {
+    pub(super) fn new(
+        stalls: &[StallOption],
+        chunk: Option<usize>,
+        seed: u64,
+        start_ns: i64,
+    ) -> Self {
         let mut this = Self {
             spans_ns: Vec::new(),
             random: Vec::new(),
@@ -70,7 +75,7 @@ impl Usb {
     }
 
     /// Whether the line takes and gives nothing at present.
-    pub fn is_stalled(&mut self, now_ns: i64) -> bool {
+    pub(super) fn is_stalled(&mut self, now_ns: i64) -> bool {
         let within = |[from_ns, until_ns]: &[i64; 2]| (*from_ns..*until_ns).contains(&now_ns);
         let mut stalled = self.spans_ns.iter().any(within);
         for random in &mut self.random {
@@ -83,7 +88,7 @@ impl Usb {
     }
 
     /// How many of `most` bytes may pass each way now.
-    pub fn packet(&mut self, most: usize, now_ns: i64) -> usize {
+    pub(super) fn packet(&mut self, most: usize, now_ns: i64) -> usize {
         let Some(chunk) = self.chunk else {
             return most;
         };
@@ -95,7 +100,7 @@ impl Usb {
     }
 
     /// When something of the line happens next, ns: the box must look then.
-    pub fn next_event_ns(&self, now_ns: i64) -> i64 {
+    pub(super) fn next_event_ns(&self, now_ns: i64) -> i64 {
         let packet_ns = match self.chunk {
             Some(_) => self.next_packet_ns.max(now_ns),
             None => i64::MAX,

@@ -21,7 +21,7 @@ pub struct Fresh {
 
 /// Runs both models over another large multisine than that of the records; `None` where nothing is hidden in the response
 /// to a command. A line has in every record a phase that nobody knows: it is taken off both errors.
-pub fn fresh(case: &Case, augmented: &Model, base: &Model, seed: u64) -> Option<Fresh> {
+pub(super) fn fresh(case: &Case, augmented: &Model, base: &Model, seed: u64) -> Option<Fresh> {
     if case.session.rig != Rig::Bead {
         return None;
     }

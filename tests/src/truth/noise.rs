@@ -49,14 +49,14 @@ pub(super) struct Localisation {
 }
 
 impl Localisation {
-    pub fn new(nuisance: Nuisance) -> Self {
+    pub(super) fn new(nuisance: Nuisance) -> Self {
         Self {
             nuisance,
             slow: 0.0,
         }
     }
 
-    pub fn next(&mut self, random: &mut Random) -> f64 {
+    pub(super) fn next(&mut self, random: &mut Random) -> f64 {
         let scale = self.nuisance.localisation_um;
         match self.nuisance.kind {
             Kind::White => scale * random.normal(),

@@ -153,7 +153,7 @@ pub(super) struct Memory {
 
 impl Memory {
     /// What leaves an effect ahead of the plant in a step of `h` seconds.
-    pub fn step(&mut self, effect: Second, x: Through, h: f64) -> Through {
+    pub(super) fn step(&mut self, effect: Second, x: Through, h: f64) -> Through {
         match effect {
             Second::CapacitiveLag(hz) => {
                 let tau = (1.0 + 0.05 * self.lag) / (TAU * hz);
@@ -210,7 +210,7 @@ impl Memory {
     }
 
     /// What a loose stand adds to the picture.
-    pub fn stand(&mut self, hz: f64, zeta: f64, x: Through, h: f64) -> f64 {
+    pub(super) fn stand(&mut self, hz: f64, zeta: f64, x: Through, h: f64) -> f64 {
         let w = TAU * hz;
         self.stand = dragged(self.stand, w, zeta, x.mean, h);
         let [at, speed] = self.stand;

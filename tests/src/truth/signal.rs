@@ -9,7 +9,7 @@ pub(super) struct Through {
 }
 
 impl Through {
-    pub fn held(x: f64) -> Self {
+    pub(super) fn held(x: f64) -> Self {
         Self {
             start: x,
             mean: x,
@@ -18,7 +18,7 @@ impl Through {
     }
 
     /// Through something without dynamics, which may remember the way it went.
-    pub fn map(self, mut f: impl FnMut(f64) -> f64) -> Self {
+    pub(super) fn map(self, mut f: impl FnMut(f64) -> f64) -> Self {
         if self.start == self.end {
             return Self::held(f(self.end));
         }
@@ -28,7 +28,7 @@ impl Through {
         Self { start, mean, end }
     }
 
-    pub fn plus(self, factor: f64, other: Self) -> Self {
+    pub(super) fn plus(self, factor: f64, other: Self) -> Self {
         Self {
             start: self.start + factor * other.start,
             mean: self.mean + factor * other.mean,

@@ -92,7 +92,7 @@ pub(super) struct Odd {
 }
 
 impl Odd {
-    pub fn new(random: Random) -> Self {
+    pub(super) fn new(random: Random) -> Self {
         Self {
             random,
             stuck: true,
@@ -107,7 +107,7 @@ impl Odd {
     }
 
     /// What leaves a stranger ahead of the plant in a step of row `row`.
-    pub fn step(&mut self, stranger: Stranger, x: Through, row: usize, h: f64) -> Through {
+    pub(super) fn step(&mut self, stranger: Stranger, x: Through, row: usize, h: f64) -> Through {
         match stranger {
             Stranger::DeadZone(c) => x.map(|x| x - x.clamp(-c, c)),
             Stranger::UnequalLag(hz, ratio) => {
@@ -146,7 +146,7 @@ impl Odd {
     }
 
     /// The bead's jump and speed behind a stranger.
-    pub fn behind(&mut self, stranger: Stranger, jump: f64, v: f64, h: f64) -> (f64, f64) {
+    pub(super) fn behind(&mut self, stranger: Stranger, jump: f64, v: f64, h: f64) -> (f64, f64) {
         match stranger {
             Stranger::StickSlip(start, stop) => {
                 self.stuck = v.abs() < if self.stuck { start } else { stop };

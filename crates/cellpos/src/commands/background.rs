@@ -13,7 +13,7 @@ use std::path::PathBuf;
     after_help = "Example:\n  cellpos background --rig rig.toml --out empty.tif\n\n\
     The channel must be empty and lit as in the experiment; then write into rig.toml:\n  [cell]\n  background = \"empty.tif\""
 )]
-pub struct Args {
+pub(crate) struct Args {
     /// Camera of this rig.toml.
     #[arg(long)]
     rig: PathBuf,
@@ -47,7 +47,7 @@ struct Taken {
 const PATIENCE_NS: i64 = 2_000_000_000;
 
 /// Takes the frames, looks whether the channel is empty, writes the stack.
-pub fn run(args: Args) -> CommandResult {
+pub(crate) fn run(args: Args) -> CommandResult {
     if args.frames < 2 {
         return Err(Failure::bad_input(
             format!("--frames {}: 2 or more are needed", args.frames),

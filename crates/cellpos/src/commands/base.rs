@@ -12,9 +12,9 @@ use serde_json::{Value, json};
 use std::collections::BTreeMap;
 
 /// Provenance of a model of other data: how its input was sampled, its form, and the output while its input rests.
-pub const HOLD: &str = "hold";
+pub(super) const HOLD: &str = "hold";
 const FORM: &str = "base";
-pub const REST_OUTPUT: &str = "rest_output";
+pub(super) const REST_OUTPUT: &str = "rest_output";
 
 /// Marks of the inputs that a base was fitted to.
 const RECORDS: &str = "records";
@@ -30,12 +30,12 @@ fn mark(input: &[f64]) -> String {
 }
 
 /// Whether a model says that it was fitted to a record of this input.
-pub fn was_fitted_to(model: &Model, input: &[f64]) -> bool {
+pub(super) fn was_fitted_to(model: &Model, input: &[f64]) -> bool {
     let marks = model.provenance.get(RECORDS);
     marks.is_some_and(|marks| marks.split(' ').any(|known| known == mark(input)))
 }
 
-pub fn hold_of(kind: HoldKind) -> Hold {
+pub(super) fn hold_of(kind: HoldKind) -> Hold {
     match kind {
         HoldKind::ZeroOrder => Hold::ZeroOrder,
         HoldKind::None => Hold::None,
@@ -50,12 +50,12 @@ fn hold_word(hold: Hold) -> &'static str {
 }
 
 /// The form that a model says it was fitted with.
-pub fn form_of(model: &Model) -> Option<Form> {
+pub(super) fn form_of(model: &Model) -> Option<Form> {
     model.provenance.get(FORM)?.parse().ok()
 }
 
 /// A fitted base model and its messages.
-pub struct Base {
+pub(super) struct Base {
     pub fit: BaseFit,
     pub hold: Hold,
     /// What a user should know before using it.
@@ -70,7 +70,7 @@ pub struct Base {
 ///
 /// # Errors
 /// Records that cannot be fitted.
-pub fn fit(
+pub(super) fn fit(
     records: &[Series],
     rate_hz: f64,
     hold: Hold,
@@ -184,7 +184,7 @@ fn too_poor(
 ///
 /// # Errors
 /// Records of different rates.
-pub fn common_rate(rates: impl Iterator<Item = f64>) -> Result<f64, Failure> {
+pub(super) fn common_rate(rates: impl Iterator<Item = f64>) -> Result<f64, Failure> {
     let rates: Vec<f64> = rates.collect();
     let first = rates.first().copied().unwrap_or(f64::NAN);
     match rates.iter().find(|rate| (*rate / first - 1.0).abs() > 1e-3) {
@@ -201,7 +201,7 @@ impl Base {
     ///
     /// # Errors
     /// A model that no file can hold.
-    pub fn model(&self) -> Result<Model, Failure> {
+    pub(super) fn model(&self) -> Result<Model, Failure> {
         let (low, high) = self.range;
         let span = high - low;
         let rest = self.fit.rest_input.filter(|rest| {
@@ -230,7 +230,7 @@ impl Base {
     }
 
     /// Messages about it.
-    pub fn words(&self) -> String {
+    pub(super) fn words(&self) -> String {
         let m = &self.fit.model;
         let mut text = format!(
             "base model {}: num {}, den {}, {}\n  its free run is off by {} RMS; the output moves by {} RMS",
@@ -261,7 +261,7 @@ impl Base {
     }
 
     /// The same as JSON.
-    pub fn to_json(&self) -> Value {
+    pub(super) fn to_json(&self) -> Value {
         let m = &self.fit.model;
         json!({
             "form": self.fit.form.to_string(), "order": m.order, "num": m.numerator, "num_sd": finite(&m.numerator_sd),
@@ -280,7 +280,7 @@ fn finite(values: &[f64]) -> Vec<Value> {
 }
 
 /// Coefficients with their 95 % intervals.
-pub fn coefficients(values: &[f64], sds: &[f64]) -> String {
+pub(super) fn coefficients(values: &[f64], sds: &[f64]) -> String {
     let terms: Vec<String> = values
         .iter()
         .zip(sds)
@@ -293,7 +293,7 @@ pub fn coefficients(values: &[f64], sds: &[f64]) -> String {
 }
 
 /// Says in a model with which form it was fitted.
-pub fn say_form(model: &mut Model, form: Form) {
+pub(super) fn say_form(model: &mut Model, form: Form) {
     model.provenance.insert(FORM.to_owned(), form.to_string());
 }
 
@@ -301,7 +301,7 @@ pub fn say_form(model: &mut Model, form: Form) {
 ///
 /// # Errors
 /// A model that no file can hold.
-pub fn model_of(best: &RationalFit, hold: Hold, at_rest: f64) -> Result<Model, Failure> {
+pub(super) fn model_of(best: &RationalFit, hold: Hold, at_rest: f64) -> Result<Model, Failure> {
     let plant = TransferFunction::new(best.numerator.clone(), best.denominator.clone())
         .map_err(Failure::failed)?;
     let delay_s = best.delay_s.max(0.0);

@@ -11,7 +11,7 @@ use std::path::PathBuf;
 #[command(
     after_help = "Nothing moves.\n\nExamples:\n  cellpos board --rig rig.toml\n  cellpos board --port /dev/ttyACM0 --led on"
 )]
-pub struct Args {
+pub(crate) struct Args {
     /// Board of this rig.toml.
     #[arg(long, required_unless_present = "port", conflicts_with = "port")]
     rig: Option<PathBuf>,
@@ -36,7 +36,7 @@ enum Led {
 }
 
 /// Asks the board and tests the line.
-pub fn run(args: Args) -> CommandResult {
+pub(crate) fn run(args: Args) -> CommandResult {
     let mut file = RigFile::load(args.rig.as_deref())?;
     if let Some(port) = args.port {
         file.actuator = ActuatorConfig::Serial {

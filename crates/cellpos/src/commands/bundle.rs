@@ -20,7 +20,7 @@ const INPUTS: &str = "inputs";
 
 A bundle is a plain folder: the run with all sessions, its unchanged input files, and MANIFEST.sha256, which sha256sum -c reads, too.
 Exit code 1: a bundle differs from its manifest.")]
-pub struct Args {
+pub(crate) struct Args {
     /// The run's folder.
     #[arg(required_unless_present = "verify", conflicts_with = "verify", value_parser = run_folder())]
     run: Option<PathBuf>,
@@ -36,7 +36,7 @@ pub struct Args {
 }
 
 /// Packs or checks.
-pub fn run(args: Args) -> CommandResult {
+pub(crate) fn run(args: Args) -> CommandResult {
     match (&args.run, &args.verify) {
         (_, Some(bundle)) => verify(bundle, args.json),
         (Some(run), None) => pack(run, args.out.as_deref(), args.json),

@@ -18,7 +18,7 @@ use std::path::PathBuf;
     Examples:\n  cellpos calibrate --rig rig.toml --micrometer lines.png --spacing 10um --out calibration.toml\n  \
     cellpos calibrate --rig rig.toml --pixel 0.1um --out calibration.toml"
 )]
-pub struct Args {
+pub(crate) struct Args {
     /// Rig.
     #[arg(long)]
     rig: PathBuf,
@@ -71,7 +71,7 @@ struct Calibrated {
 }
 
 /// Measures, writes the file.
-pub fn run(args: Args) -> CommandResult {
+pub(crate) fn run(args: Args) -> CommandResult {
     crate::output::ready([&args.out])?;
     let (pixel_um, pixel_um_sd, source) = match (&args.micrometer, args.spacing, args.pixel) {
         (Some(picture), Some(spacing), _) => {

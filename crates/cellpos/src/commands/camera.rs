@@ -15,7 +15,7 @@ use std::time::Duration;
     cellpos camera --socket /tmp/rig/camera.sock --duration 10s\n  cellpos camera --rig rig.toml --snapshot frame.png --overlay\n  \
     cellpos camera --rig rig.toml --record beads/ --duration 5s\n  cellpos camera --rig rig.toml --find-beads beads.png"
 )]
-pub struct Args {
+pub(crate) struct Args {
     /// IP address of a GigE camera, or identifier of a USB3 camera (needs the feature aravis).
     #[arg(long, group = "which")]
     address: Option<String>,
@@ -125,7 +125,7 @@ pub(super) struct Listed {
 }
 
 /// Lists cameras, or watches one.
-pub fn run(args: Args) -> CommandResult {
+pub(crate) fn run(args: Args) -> CommandResult {
     let duration_s = args.duration.value();
     if !(duration_s.is_finite() && (0.1..=86_400.0).contains(&duration_s)) {
         let error = format!("--duration {}s: cannot watch for that long", duration_s);

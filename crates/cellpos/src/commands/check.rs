@@ -16,7 +16,7 @@ use std::path::PathBuf;
     after_help = "Example:\n  cellpos check examples/scripts/fatigue.toml --model eq6 --report fatigue.html\n\n\
                   Exit code 0: the script can run; 1: the rig cannot do it; 2: the script has an error."
 )]
-pub struct Args {
+pub(crate) struct Args {
     /// The script.
     script: PathBuf,
     /// `eq6`, or a model file.
@@ -49,7 +49,7 @@ pub struct Args {
 }
 
 /// Checks, prints, and gives 1 if the rig cannot do it.
-pub fn run(args: Args) -> CommandResult {
+pub(crate) fn run(args: Args) -> CommandResult {
     output::ready(&args.report)?;
     let script = Script::read(&args.script).map_err(Failure::input)?;
     let model = Model::load(&args.model).map_err(Failure::input)?;

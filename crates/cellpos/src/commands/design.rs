@@ -40,7 +40,7 @@ enum Kind {
 The loop delay is the camera delay (from the middle of an exposure to the tick that uses it) plus half a sample of hold: 2 ms at 1 kHz
 give 2.5ms. A model.toml of cellpos identify contains its camera delay. Without gains, design finds the PI controller of largest
 integral gain within --max-ms and --max-mt. Exit code 1: the loop is unstable, or a limit is broken; 2: bad input.")]
-pub struct Args {
+pub(crate) struct Args {
     /// Model file, or `eq6` for the built-in nominal plant.
     #[arg(long, default_value = "eq6")]
     model: String,
@@ -111,7 +111,7 @@ pub struct Args {
 }
 
 /// Designs or checks a controller, prints its figures.
-pub fn run(args: Args) -> CommandResult {
+pub(crate) fn run(args: Args) -> CommandResult {
     output::ready(&args.out)?;
     output::ready(&args.report)?;
     let model = Model::load(&args.model).map_err(Failure::input)?;

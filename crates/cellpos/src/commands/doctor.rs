@@ -23,7 +23,7 @@ use std::path::{Path, PathBuf};
 
 Ctrl-C ends the measurement early.
 Exit code 0: fit; 1: not fit, or not measured for long enough.")]
-pub struct Args {
+pub(crate) struct Args {
     /// Duration of the measurement.
     #[arg(long = "for", alias = "duration", value_name = "DURATION", default_value = "5s", value_parser = positive::<Seconds>)]
     duration: Seconds,
@@ -55,7 +55,7 @@ struct Report {
 const SHORTEST_S: f64 = 2.0;
 
 /// Asks for everything that the control thread asks for, measures the timer, looks at the machine, gives a verdict.
-pub fn run(args: Args) -> CommandResult {
+pub(crate) fn run(args: Args) -> CommandResult {
     let request = Request::control_thread();
     let cpus = allowed_cpus().len();
     let machine = Machine {

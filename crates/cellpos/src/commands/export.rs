@@ -21,7 +21,7 @@ use std::path::{Path, PathBuf};
 
 Joins the sessions of a resumed run; the column session tells them apart. docs/data.md has columns, units and words. error_um is the
 error; do not subtract target_um from bead_um, which is some ms older. Exit code 1: rows of the run are missing.")]
-pub struct Args {
+pub(crate) struct Args {
     /// The run's folder.
     #[arg(value_parser = run_folder())]
     run: PathBuf,
@@ -142,7 +142,7 @@ fn selection(args: &Args) -> Result<Selection, Failure> {
 }
 
 /// Writes the file and reports missing rows.
-pub fn run(args: Args) -> CommandResult {
+pub(crate) fn run(args: Args) -> CommandResult {
     let format = chosen(&args)?;
     let selection = selection(&args)?;
     let mut sessions = Sessions::of(&args.run).map_err(Failure::input)?;

@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
   cellpos generate --out share
 
 Writes share/completions/ (cellpos.bash, _cellpos, cellpos.fish) and share/man/ (a page for each command).")]
-pub struct Args {
+pub(crate) struct Args {
     /// The folder to write into.
     #[arg(long)]
     out: PathBuf,
@@ -20,7 +20,7 @@ pub struct Args {
 }
 
 /// Writes the files.
-pub fn run(args: Args) -> CommandResult {
+pub(crate) fn run(args: Args) -> CommandResult {
     let completions = args.out.join("completions");
     let man = args.out.join("man");
     for folder in [&completions, &man] {

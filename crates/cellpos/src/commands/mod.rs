@@ -1,43 +1,43 @@
 //! One module a command: `Args` (read by clap), `run(args)` (calls the libraries, prints the result).
 
 mod arrays;
-pub mod background;
+pub(crate) mod background;
 mod base;
-pub mod board;
-pub mod bundle;
-pub mod calibrate;
-pub mod camera;
+pub(crate) mod board;
+pub(crate) mod bundle;
+pub(crate) mod calibrate;
+pub(crate) mod camera;
 mod camera_of_rig;
-pub mod check;
-pub mod circle;
+pub(crate) mod check;
+pub(crate) mod circle;
 mod columns;
-pub mod design;
-pub mod doctor;
-pub mod export;
-pub mod form;
-pub mod generate;
-pub mod identify;
-pub mod jog;
-pub mod paper;
+pub(crate) mod design;
+pub(crate) mod doctor;
+pub(crate) mod export;
+pub(crate) mod form;
+pub(crate) mod generate;
+pub(crate) mod identify;
+pub(crate) mod jog;
+pub(crate) mod paper;
 mod partner;
 mod prove;
-pub mod reconcile;
-pub mod replay;
-pub mod report;
-pub mod rig;
-pub mod run;
-pub mod simulate;
-pub mod track;
-pub mod vision;
+pub(crate) mod reconcile;
+pub(crate) mod replay;
+pub(crate) mod report;
+pub(crate) mod rig;
+pub(crate) mod run;
+pub(crate) mod simulate;
+pub(crate) mod track;
+pub(crate) mod vision;
 mod vision_sheet;
 mod vision_summary;
-pub mod watch;
+pub(crate) mod watch;
 
 use crate::outcome::CommandResult;
 
 /// The commands, in the order in which a lab needs them.
 #[derive(Debug, clap::Subcommand)]
-pub enum Command {
+pub(crate) enum Command {
     /// Hold a bead in closed loop: at a position, or on a sine.
     Track(track::Args),
     /// Run a setpoint script in closed loop, or resume one.
@@ -114,7 +114,7 @@ const GROUPS: [(&str, &[&str]); 6] = [
 ];
 
 /// The commands in groups, as the help shows them.
-pub fn groups(command: &clap::Command) -> String {
+pub(crate) fn groups(command: &clap::Command) -> String {
     let line = |name: &str| {
         let about = match name {
             "help" => "This text, or the help of a command".to_string(),
@@ -134,7 +134,7 @@ pub fn groups(command: &clap::Command) -> String {
 
 impl Command {
     /// Runs the command.
-    pub fn run(self) -> CommandResult {
+    pub(crate) fn run(self) -> CommandResult {
         match self {
             Self::Track(args) => track::run(args),
             Self::Run(args) => run::run(*args),

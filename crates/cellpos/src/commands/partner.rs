@@ -18,7 +18,7 @@ use std::path::PathBuf;
     Examples:\n  cellpos rig partner rig.toml\n  cellpos rig partner rig.toml --amplitude 0.5um --duration 60s --write\n\n\
     Exit code 0: measured; 1: the run failed, or the actuator cannot be told from noise; 2: bad input."
 )]
-pub struct Args {
+pub(super) struct Args {
     /// The rig file, with a table [partner].
     rig: PathBuf,
     /// The plant: a model.toml, or eq6.
@@ -63,7 +63,7 @@ struct Found<'a> {
 }
 
 /// Measures the slow actuator of a rig.
-pub fn run(args: &Args) -> CommandResult {
+pub(super) fn run(args: &Args) -> CommandResult {
     let mut file = RigFile::load(Some(&args.rig))?;
     file.emulate_as(args.seed, None)?;
     let model = Model::load(&args.model).map_err(crate::outcome::Failure::input)?;

@@ -23,7 +23,7 @@ use std::time::{Duration, Instant};
     cellpos rig prove rig.toml --camera --duration 10s   # does this server keep docs/camera-socket.md?\n\n\
     Exit code 0: every line that was tried passed; 1: a line failed."
 )]
-pub struct Args {
+pub(super) struct Args {
     /// The rig file.
     rig: PathBuf,
     /// Only the board: the conformance test of docs/board.md.
@@ -70,7 +70,7 @@ const LOOK_S: f64 = 5.0;
 const LED_EDGES: usize = 200;
 
 /// Tries what is asked for and writes the sheet.
-pub fn run(args: &Args) -> CommandResult {
+pub(super) fn run(args: &Args) -> CommandResult {
     if let Some(out) = &args.out {
         crate::output::ready([out])?;
     }

@@ -34,7 +34,7 @@ Examples:
 
 Verdicts: named; named-with-remainder (something small is left); ambiguous (the records fit several effects; the result names the experiment that decides);
 unknown (no effect of the catalogue explains enough); nothing-missing. Exit code 0: any verdict; 2: bad input.")]
-pub struct Args {
+pub(crate) struct Args {
     /// Model: eq6, the path of a model.toml, or `fit` for a constant gain fitted to the records.
     #[arg(long, default_value = "eq6")]
     model: String,
@@ -124,7 +124,7 @@ impl From<NoiseArg> for NoiseKind {
 }
 
 /// Runs the command.
-pub fn run(args: Args) -> CommandResult {
+pub(crate) fn run(args: Args) -> CommandResult {
     collectable(&args)?;
     let json = args.json.iter().filter(|path| path.as_os_str() != "-");
     let beside: Vec<PathBuf> = args

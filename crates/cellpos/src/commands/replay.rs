@@ -13,7 +13,7 @@ use std::path::PathBuf;
 #[command(after_help = "Example:\n  cellpos replay runs/20261121T090000Z-track\n
 Puts every recorded measurement through the recorded controller again and compares the commands. Exit code 0: equal to the last bit;
 1: different, or rows are missing. The result counts rows that cannot be replayed: missing, damaged, behind a gap, after a kill.")]
-pub struct Args {
+pub(crate) struct Args {
     /// The run folder.
     #[arg(value_parser = run_folder())]
     run: PathBuf,
@@ -58,7 +58,7 @@ struct Report {
 }
 
 /// Replays.
-pub fn run(args: Args) -> CommandResult {
+pub(crate) fn run(args: Args) -> CommandResult {
     let found = Sessions::of(&args.run).map_err(Failure::input)?;
     let sessions = found
         .readers

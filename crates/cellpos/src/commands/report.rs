@@ -21,7 +21,7 @@ use cellpos_report::{Axis, Column, Emphasis, Figure, Panel, Report, Series, Tabl
 use cellpos_runtime::Summary;
 use cellpos_runtime::summary::plan_warning;
 use cellpos_script::read_cycles;
-pub use cycles::with_interval;
+pub(crate) use cycles::with_interval;
 use session::{Session, events, provenance, timing};
 use std::path::{Path, PathBuf};
 use ticks::Ticks;
@@ -33,7 +33,7 @@ use ticks::Ticks;
 
 Writes report.html into the run folder, and report-figures/ with every figure as SVG and its data as CSV. It joins the sessions of a
 resumed run and shows the gaps.")]
-pub struct Args {
+pub(crate) struct Args {
     /// Run folder; `latest`, or `latest-NAME`: the newest in runs/.
     #[arg(value_parser = run_folder())]
     run: PathBuf,
@@ -46,7 +46,7 @@ pub struct Args {
 }
 
 /// Writes the page.
-pub fn run(args: Args) -> CommandResult {
+pub(crate) fn run(args: Args) -> CommandResult {
     output::ready(&args.out)?;
     let first = RunReader::open(&args.run).map_err(Failure::input)?;
     let text = std::fs::read_to_string(args.run.join(CYCLES_CSV)).unwrap_or_default();

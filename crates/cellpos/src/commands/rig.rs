@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 
 /// Arguments of `cellpos rig`.
 #[derive(Debug, clap::Args)]
-pub struct Args {
+pub(crate) struct Args {
     #[command(subcommand)]
     command: Command,
 }
@@ -67,7 +67,7 @@ struct Checked {
 }
 
 /// Prints a template, or checks a file.
-pub fn run(args: Args) -> CommandResult {
+pub(crate) fn run(args: Args) -> CommandResult {
     match args.command {
         Command::New(args) => new(args),
         Command::Check(args) => check(args),

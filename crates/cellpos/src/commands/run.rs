@@ -54,7 +54,7 @@ cellpos check runs first, with the limits of the rig. Keys on a terminal: p paus
 the bead, then parks the PZT. Signals do the same: SIGUSR1 (p), SIGUSR2 (s), Ctrl-C and SIGTERM (q); a second one parks at once.
 --resume continues after the last complete cycle in cycles.csv, after a crash too. Exit code 0: the script reached its end; 1: it did
 not; 2: bad input, or the rig cannot do it.")]
-pub struct Args {
+pub(crate) struct Args {
     /// The script.
     #[arg(required_unless_present = "resume", conflicts_with = "resume")]
     script: Option<PathBuf>,
@@ -121,7 +121,7 @@ pub struct Args {
 }
 
 /// Runs a script, resumes one, or runs it on one cell after another.
-pub fn run(args: Args) -> CommandResult {
+pub(crate) fn run(args: Args) -> CommandResult {
     if let Some(cells) = args.queue.cells {
         return queue::run(&args, cells);
     }

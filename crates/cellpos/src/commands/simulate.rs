@@ -20,7 +20,7 @@ use std::path::PathBuf;
                         cellpos simulate --model base.toml --input d.csv --input-column 'power [W]' --output-column 'T [degC]' --out s.csv\n\n\
                         The input needs the columns time_s and pzt_um; the output has time_s, pzt_um and bead_um, the position just before the row's command takes effect. The bead starts at rest at 0 um. With --input-column (another rig, a model of identify --data or reconcile --base) the plant starts at rest at the model's working point, and its output counts from the mean of the identified records."
 )]
-pub struct Args {
+pub(crate) struct Args {
     /// `eq6`, or a model file.
     #[arg(long)]
     model: String,
@@ -54,7 +54,7 @@ pub struct Args {
 }
 
 /// Reads, simulates, writes.
-pub fn run(args: Args) -> CommandResult {
+pub(crate) fn run(args: Args) -> CommandResult {
     output::ready([&args.out])?;
     let model = Model::load(&args.model).map_err(Failure::input)?;
     let input = if args.input.is_dir() {

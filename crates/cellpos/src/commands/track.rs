@@ -39,7 +39,7 @@ use std::path::{Path, PathBuf};
 Without --rig the rig is emulated. Ctrl-C freezes the bead, then parks the PZT; a second Ctrl-C parks at once. Keys on a terminal:
 f freezes and continues, q ends like Ctrl-C, the arrows move the target (left, right: 0.1 um; down, up: 1 um), a number and Enter
 sets it. Exit code 0: done; 1: Safe, or the bead was not kept; 2: bad input.")]
-pub struct Args {
+pub(crate) struct Args {
     /// Position to hold.
     #[arg(long, allow_hyphen_values = true)]
     target: Micrometers,
@@ -134,7 +134,7 @@ struct Report<'a> {
 }
 
 /// Holds the bead.
-pub fn run(args: Args) -> CommandResult {
+pub(crate) fn run(args: Args) -> CommandResult {
     let mut file = RigFile::load(args.rig.as_deref())?;
     file.emulate_as(args.seed, args.ideal)?;
     if let Some(near) = args.near {

@@ -30,7 +30,7 @@ const DIGITS: [u16; 10] = [
 
 /// A cell on the sheet.
 #[derive(Debug)]
-pub struct CellMark<'a> {
+pub(super) struct CellMark<'a> {
     pub number: u32,
     pub cell: Cell,
     /// Its outline, px.
@@ -40,14 +40,14 @@ pub struct CellMark<'a> {
 
 /// Gathers tiles.
 #[derive(Debug)]
-pub struct Sheet {
+pub(super) struct Sheet {
     wanted: Vec<usize>,
     tiles: Vec<RgbImage>,
 }
 
 impl Sheet {
     /// A contact sheet for a recording of `frames` frames: nine, evenly spread.
-    pub fn new(frames: usize) -> Self {
+    pub(super) fn new(frames: usize) -> Self {
         let last = frames.saturating_sub(1);
         let mut wanted: Vec<usize> = (0..TILES).map(|k| k * last / (TILES - 1)).collect();
         wanted.dedup();
@@ -59,7 +59,7 @@ impl Sheet {
 
     /// Takes the frame `n` if it is one of the sheet's; marks are (number, x, y, radius, good), px; what was refused and
     /// never numbered has none.
-    pub fn add(
+    pub(super) fn add(
         &mut self,
         n: usize,
         frame: &Frame,
@@ -82,7 +82,7 @@ impl Sheet {
     }
 
     /// Takes the frame `n` with its cells, if it is one of the sheet's: green or red.
-    pub fn add_cells(&mut self, n: usize, frame: &Frame, cells: &[CellMark<'_>]) {
+    pub(super) fn add_cells(&mut self, n: usize, frame: &Frame, cells: &[CellMark<'_>]) {
         if !self.wanted.contains(&n) {
             return;
         }
@@ -96,7 +96,7 @@ impl Sheet {
     }
 
     /// Writes the sheet as PNG.
-    pub fn save(&self, path: &Path) -> Result<(), image::ImageError> {
+    pub(super) fn save(&self, path: &Path) -> Result<(), image::ImageError> {
         let width = self.tiles.iter().map(RgbImage::width).max().unwrap_or(1) + GAP;
         let height = self.tiles.iter().map(RgbImage::height).max().unwrap_or(1) + GAP;
         let count = self.tiles.len().max(1) as u32;

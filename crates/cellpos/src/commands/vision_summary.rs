@@ -13,7 +13,7 @@ const BINS: usize = 10;
 
 /// What has been seen so far.
 #[derive(Debug, Default)]
-pub struct Tally {
+pub(super) struct Tally {
     /// Time per frame, us.
     pub time_us: Vec<f64>,
     tracks: BTreeMap<u32, Vec<(usize, f64, f64)>>,
@@ -29,7 +29,7 @@ pub struct Tally {
 
 /// Figures of the run, as printed and as JSON.
 #[derive(Debug, Serialize)]
-pub struct Summary {
+pub(super) struct Summary {
     /// Recording.
     pub source: String,
     /// Kind of recording.
@@ -71,7 +71,7 @@ pub struct Summary {
 
 /// Quality of bead fixes.
 #[derive(Debug, Serialize)]
-pub struct BeadFigures {
+pub(super) struct BeadFigures {
     /// Median signal-to-noise ratio.
     pub snr_median: f64,
     /// Least one.
@@ -92,7 +92,7 @@ pub struct BeadFigures {
 
 /// Sizes of cells.
 #[derive(Debug, Serialize)]
-pub struct CellFigures {
+pub(super) struct CellFigures {
     /// Median area, px.
     pub area_median_px: f64,
     /// Median length, px.
@@ -103,7 +103,7 @@ pub struct CellFigures {
 
 /// Quantiles of a time, us.
 #[derive(Debug, Serialize)]
-pub struct Times {
+pub(super) struct Times {
     /// Median.
     pub p50: f64,
     /// 99th percentile.
@@ -114,7 +114,7 @@ pub struct Times {
 
 impl Tally {
     /// A bead's fix in a frame.
-    pub fn fix(&mut self, frame: usize, bead: u32, fix: &Fix) {
+    pub(super) fn fix(&mut self, frame: usize, bead: u32, fix: &Fix) {
         if fix.verdict != FixQuality::Good {
             self.refuse(verdict_name(fix.verdict));
             return;
@@ -134,23 +134,23 @@ impl Tally {
     }
 
     /// Something that was looked at and not taken.
-    pub fn refuse(&mut self, reason: &'static str) {
+    pub(super) fn refuse(&mut self, reason: &'static str) {
         *self.refused.entry(reason).or_default() += 1;
     }
 
     /// A cell.
-    pub fn cell(&mut self, cell: &Cell) {
+    pub(super) fn cell(&mut self, cell: &Cell) {
         self.cells.push(*cell);
     }
 
     /// The end of a frame with `good` objects.
-    pub fn frame(&mut self, good: usize) {
+    pub(super) fn frame(&mut self, good: usize) {
         self.most_cells = self.most_cells.max(good);
         self.frames_without += u64::from(good == 0);
     }
 
     /// The figures.
-    pub fn summary(
+    pub(super) fn summary(
         &self,
         info: &RecordingInfo,
         frames: usize,
@@ -241,7 +241,7 @@ impl Tally {
 }
 
 /// The word for a verdict.
-pub fn verdict_name(verdict: FixQuality) -> &'static str {
+pub(super) fn verdict_name(verdict: FixQuality) -> &'static str {
     match verdict {
         FixQuality::Good => "good",
         FixQuality::NoSignal => "no-signal",

@@ -15,7 +15,7 @@ use std::time::{Duration, Instant};
   cellpos watch runs/20261121T090000Z-track --for 1min
 
 The run may be over, or running in another program. The page may only look. It shows the last ten minutes. Ctrl-C ends it.")]
-pub struct Args {
+pub(crate) struct Args {
     /// The run folder.
     #[arg(value_parser = run_folder())]
     run: PathBuf,
@@ -31,7 +31,7 @@ pub struct Args {
 }
 
 /// Serves the page.
-pub fn run(args: Args) -> CommandResult {
+pub(crate) fn run(args: Args) -> CommandResult {
     const LOOK_EVERY: Duration = Duration::from_millis(100);
     /// The page's own thread empties its ring 25 times a second.
     const WHILE_FILLING: Duration = Duration::from_millis(45);

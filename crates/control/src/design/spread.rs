@@ -17,7 +17,7 @@ pub struct SpreadRow {
 }
 
 /// Gain factors of the spread table.
-pub const GAIN_FACTORS: [f64; 5] = [0.5, 0.71, 1.0, 1.41, 2.0];
+pub(super) const GAIN_FACTORS: [f64; 5] = [0.5, 0.71, 1.0, 1.41, 2.0];
 
 /// Margins of one law over the spread of plants.
 ///

@@ -112,22 +112,22 @@ pub(super) fn turn(harmonic: u32, phase: f64) -> Complex<f64> {
 
 impl Evidence {
     /// Ticks so far.
-    pub fn ticks(&self) -> u32 {
+    pub(super) fn ticks(&self) -> u32 {
         self.ticks
     }
 
     /// A tick that does not count: the error is kept for the next.
-    pub fn pass(&mut self, error_um: f64) {
+    pub(super) fn pass(&mut self, error_um: f64) {
         self.before_um = Some(error_um);
     }
 
     /// A gap: what comes next has no error before it. What was gathered stays.
-    pub fn interrupt(&mut self) {
+    pub(super) fn interrupt(&mut self) {
         self.before_um = None;
     }
 
     /// The next stretch follows without a gap.
-    pub fn begin_again(&mut self) {
+    pub(super) fn begin_again(&mut self) {
         *self = Self {
             before_um: self.before_um,
             ..Self::default()
@@ -135,7 +135,7 @@ impl Evidence {
     }
 
     /// A tick: the error at its phase, and the feed-forward at the phase of the command.
-    pub fn add(
+    pub(super) fn add(
         &mut self,
         harmonics: impl Iterator<Item = u32>,
         (phase, error_um): (f64, f64),
@@ -164,7 +164,7 @@ impl Evidence {
     }
 
     /// Whether limits were met in so many ticks that an addition did not do what the response says.
-    pub fn is_limited(&self) -> bool {
+    pub(super) fn is_limited(&self) -> bool {
         self.limited * 10 > self.ticks
     }
 
@@ -175,18 +175,22 @@ impl Evidence {
     }
 
     /// Phasor of the error at a harmonic of a reference of so many cycles a tick, um.
-    pub fn error(&self, harmonic: u32, advance: f64) -> Complex<f64> {
+    pub(super) fn error(&self, harmonic: u32, advance: f64) -> Complex<f64> {
         self.differenced(harmonic) / through(harmonic, advance)
     }
 
     /// By how much the feed-forward was, in the mean, above one divided by `gain`, um of PZT.
-    pub fn forward_over(&self, harmonic: u32, gain: f64) -> Complex<f64> {
+    pub(super) fn forward_over(&self, harmonic: u32, gain: f64) -> Complex<f64> {
         let sums = &self.sums[harmonic as usize - 1];
         (sums.divided - sums.forward / gain) * (2.0 / f64::from(self.ticks.max(1)))
     }
 
     /// The noise with that of this stretch: what is left beside the harmonics.
-    pub fn noise(&self, harmonics: impl Iterator<Item = u32>, known: &ErrorNoise) -> ErrorNoise {
+    pub(super) fn noise(
+        &self,
+        harmonics: impl Iterator<Item = u32>,
+        known: &ErrorNoise,
+    ) -> ErrorNoise {
         let n = f64::from(self.ticks.max(1));
         let (mut square, mut free) = (self.squares / n - (self.sum / n).powi(2), n - 1.0);
         for h in harmonics {
@@ -200,7 +204,7 @@ impl Evidence {
     }
 
     /// Variance of [`Evidence::error`], `E|.|^2`, um^2.
-    pub fn variance_um2(&self, harmonic: u32, advance: f64, noise: &ErrorNoise) -> f64 {
+    pub(super) fn variance_um2(&self, harmonic: u32, advance: f64, noise: &ErrorNoise) -> f64 {
         4.0 * noise.um2 / f64::from(self.ticks.max(1)) / through(harmonic, advance).norm_sqr()
     }
 }

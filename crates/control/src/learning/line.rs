@@ -27,7 +27,7 @@ pub(super) struct Line {
 
 impl Line {
     /// What another run learned.
-    pub fn of_another_run(theta: Complex<f64>, response: Option<&HarmonicResponse>) -> Self {
+    pub(super) fn of_another_run(theta: Complex<f64>, response: Option<&HarmonicResponse>) -> Self {
         let size = |r: &HarmonicResponse| r.re_um_per_um.hypot(r.im_um_per_um) * theta.norm();
         Self {
             theta,
@@ -38,7 +38,7 @@ impl Line {
     }
 
     /// One harmonic at the end of a stretch.
-    pub fn correct(
+    pub(super) fn correct(
         &mut self,
         response: &HarmonicResponse,
         evidence: &Evidence,

@@ -111,7 +111,7 @@ impl Mpc {
 }
 
 impl Condensed {
-    pub fn new(mpc: &Mpc, model: &LoopModel) -> Result<Self, BuildError> {
+    pub(super) fn new(mpc: &Mpc, model: &LoopModel) -> Result<Self, BuildError> {
         mpc.validate()?;
         let d = Deviation::new(model);
         let scale = d.b[0] * d.b[0];

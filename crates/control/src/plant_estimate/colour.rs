@@ -30,7 +30,7 @@ pub(super) struct Colour {
 }
 
 impl Colour {
-    pub fn new(white_um2: f64) -> Self {
+    pub(super) fn new(white_um2: f64) -> Self {
         let mut correlations_um2 = [0.0; ORDER + 1];
         correlations_um2[0] = white_um2;
         Self {
@@ -44,7 +44,7 @@ impl Colour {
     }
 
     /// Takes what the past tells out of the series of a fix of which `left_um` is left.
-    pub fn take_out(&mut self, series: &mut [f64; SERIES], left_um: f64) {
+    pub(super) fn take_out(&mut self, series: &mut [f64; SERIES], left_um: f64) {
         let now = *series;
         for (past, part) in self.past_um.iter().zip(self.prediction) {
             series
@@ -73,12 +73,12 @@ impl Colour {
     }
 
     /// Residuals are clipped to this, um.
-    pub fn most_um(&self) -> f64 {
+    pub(super) fn most_um(&self) -> f64 {
         MOST * self.correlations_um2[0].sqrt()
     }
 
     /// The best prediction by the correlations so far (Levinson and Durbin).
-    pub fn solve(&mut self) {
+    pub(super) fn solve(&mut self) {
         let r = &self.correlations_um2;
         let mut error = r[0] * (1.0 + WHITE);
         let mut a = [0.0; ORDER];

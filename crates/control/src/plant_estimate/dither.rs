@@ -21,7 +21,7 @@ pub(super) struct Dither {
 }
 
 impl Dither {
-    pub fn new() -> Self {
+    pub(super) fn new() -> Self {
         Self {
             command_um: 0.0,
             given_um: 0.0,
@@ -33,7 +33,7 @@ impl Dither {
     }
 
     /// The model one tick on, and the next command: sides `side_um` of PZT and tick from the middle. Whether all is finite.
-    pub fn tick(&mut self, estimator: &Estimator, side_um: f64) -> bool {
+    pub(super) fn tick(&mut self, estimator: &Estimator, side_um: f64) -> bool {
         self.given_um = self.command_um;
         let finite = self.motion.drive(estimator, self.command_um);
         self.command_um = 0.0;
@@ -52,13 +52,13 @@ impl Dither {
     }
 
     /// Back to the middle, while the loop does not control the bead.
-    pub fn rest(&mut self) {
+    pub(super) fn rest(&mut self) {
         (self.command_um, self.given_um, self.side) = (0.0, 0.0, 0.0);
         self.motion = Motion::start(0.0);
     }
 
     /// State of the model that the dither made.
-    pub fn state(&self) -> &PredictedState {
+    pub(super) fn state(&self) -> &PredictedState {
         self.motion.state()
     }
 }

@@ -73,17 +73,17 @@ pub(super) struct Finding {
 
 impl Finding {
     /// Logarithm of the gain; one that is no gain counts as a small one.
-    pub fn log_gain(&self) -> f64 {
+    pub(super) fn log_gain(&self) -> f64 {
         self.gain.max(0.05).ln()
     }
 
     /// Standard deviation of the logarithm of the gain.
-    pub fn log_sd(&self) -> f64 {
+    pub(super) fn log_sd(&self) -> f64 {
         self.gain_sd / self.gain.max(0.05)
     }
 
     /// Logarithm of the likelihood ratio of two delays, samples.
-    pub fn ratio(&self, delay: f64, other: f64) -> f64 {
+    pub(super) fn ratio(&self, delay: f64, other: f64) -> f64 {
         let at = |delay: f64| {
             let k = ((delay - LAGS[0]) / STEP)
                 .round()
@@ -159,7 +159,7 @@ pub(super) struct Products {
 }
 
 impl Evidence {
-    pub fn new() -> Self {
+    pub(super) fn new() -> Self {
         Self {
             block: Sums::default(),
             fixes: 0,
@@ -171,7 +171,7 @@ impl Evidence {
     }
 
     /// A fix. Whether a block is complete, so that [`Evidence::conclude`] has something to say.
-    pub fn add(&mut self, fix: &Products) -> bool {
+    pub(super) fn add(&mut self, fix: &Products) -> bool {
         let block = &mut self.block;
         let w = fix.weight;
         let left2 = (w * fix.left_um).powi(2);
@@ -189,7 +189,7 @@ impl Evidence {
 
     /// At the end of a block, which `fix_s` from fix to fix have made: what is known now. `believed` is the gain and delay by which the
     /// block is judged, `delay` that in force, `least` the least that there can be, samples.
-    pub fn conclude(&mut self, fix_s: f64, believed: (f64, f64), delay: f64, least: f64) {
+    pub(super) fn conclude(&mut self, fix_s: f64, believed: (f64, f64), delay: f64, least: f64) {
         let mut block = std::mem::take(&mut self.block);
         self.fixes = 0;
         let e = weights(believed.1);

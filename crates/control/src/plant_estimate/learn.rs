@@ -35,7 +35,7 @@ pub(super) struct Noise {
 }
 
 impl Noise {
-    pub fn new(usual_um2: f64) -> Self {
+    pub(super) fn new(usual_um2: f64) -> Self {
         Self {
             usual_um2,
             yy: 0.0,

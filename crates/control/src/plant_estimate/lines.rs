@@ -116,7 +116,7 @@ fn unit(angle: f64) -> [f64; 2] {
 
 impl LineSettings {
     /// For a loop of this sample time, s, and so many ticks from fix to fix.
-    pub fn new(sample_s: f64, interval: f64) -> Self {
+    pub(super) fn new(sample_s: f64, interval: f64) -> Self {
         let ticks = (SAMPLE_S / sample_s).max(interval).round().max(1.0);
         let highest = (HIGHEST_HZ * WINDOW as f64 * ticks * sample_s) as usize;
         let beside = *BESIDE.end() + 1;
@@ -219,7 +219,7 @@ impl Line {
 }
 
 impl Lines {
-    pub fn new() -> Self {
+    pub(super) fn new() -> Self {
         Self {
             lines: [Line::default(); MOST],
             count: 0,
@@ -242,13 +242,13 @@ impl Lines {
     }
 
     /// Motion of the bead by the lines `ticks` ticks from now, um.
-    pub fn at_um(&self, ticks: f64) -> f64 {
+    pub(super) fn at_um(&self, ticks: f64) -> f64 {
         let of = |line: &Line| product(line.z, unit(line.turn * ticks))[0];
         self.now().iter().map(of).sum()
     }
 
     /// A tick on; a part of the search.
-    pub fn tick(&mut self, settings: &LineSettings) {
+    pub(super) fn tick(&mut self, settings: &LineSettings) {
         for line in &mut self.lines[..self.count] {
             line.z = product(line.z, unit(line.turn));
         }
@@ -266,7 +266,7 @@ impl Lines {
     }
 
     /// The residual of a fix that is `ago` ticks old, and its variance without lines, um and um^2.
-    pub fn learn(
+    pub(super) fn learn(
         &mut self,
         settings: &LineSettings,
         whitener: &Whitener,

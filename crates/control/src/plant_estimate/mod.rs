@@ -135,7 +135,7 @@ impl Adapter {
     ///
     /// # Errors
     /// As [`Estimator::new`].
-    pub fn new(
+    pub(crate) fn new(
         config: EstimatorConfig,
         model: LoopModel,
         cancels: bool,
@@ -166,7 +166,7 @@ impl Adapter {
     }
 
     /// Nothing known, the design in force, everything at rest at a command, um.
-    pub fn start(&self, command_um: f64) -> AdaptState {
+    pub(crate) fn start(&self, command_um: f64) -> AdaptState {
         AdaptState {
             model: Motion::start(command_um),
             instrument: Motion::start(0.0),
@@ -191,7 +191,7 @@ impl Adapter {
     }
 
     /// The estimator of the delay in force.
-    pub fn estimator(&self, state: &AdaptState) -> &Estimator {
+    pub(crate) fn estimator(&self, state: &AdaptState) -> &Estimator {
         self.estimators
             .get(state.force.member)
             .and_then(Option::as_ref)
@@ -199,7 +199,7 @@ impl Adapter {
     }
 
     /// The tuning in force.
-    pub fn tuning(&self, state: &AdaptState) -> Tuning {
+    pub(crate) fn tuning(&self, state: &AdaptState) -> Tuning {
         let design = self.delay_samples + 0.5;
         Tuning {
             gain: state.force.log_gain.exp(),
@@ -209,7 +209,7 @@ impl Adapter {
 
     /// How uncertain the gain in force is, as a part of `stated`: two standard deviations of the estimate and what is in force
     /// beside it. All of it while nothing is known.
-    pub fn gain_doubt(&self, state: &AdaptState, stated: f64) -> f64 {
+    pub(crate) fn gain_doubt(&self, state: &AdaptState, stated: f64) -> f64 {
         let sure = state.force.mode != AdaptMode::Learning;
         let Some(found) = state
             .evidence
@@ -223,17 +223,17 @@ impl Adapter {
     }
 
     /// What is to be added to the command of this tick, um.
-    pub fn dither_um(&self, state: &AdaptState) -> f64 {
+    pub(crate) fn dither_um(&self, state: &AdaptState) -> f64 {
         state.dither.command_um
     }
 
     /// Part of the command of this tick that cancels the lines, um.
-    pub fn cancel_um(&self, state: &AdaptState) -> f64 {
+    pub(crate) fn cancel_um(&self, state: &AdaptState) -> f64 {
         state.cancel_um
     }
 
     /// State of the model that the dither made, in the units of the law: the loop is not to undo it.
-    pub fn dithered(&self, state: &AdaptState) -> PredictedState {
+    pub(crate) fn dithered(&self, state: &AdaptState) -> PredictedState {
         let gain = state.force.log_gain.exp();
         let at = state.dither.state();
         PredictedState {
@@ -245,7 +245,7 @@ impl Adapter {
     }
 
     /// How far the dither moved the bead at the time of a fix, or of one that would come now, um.
-    pub fn dither_seen_um(&self, state: &AdaptState, fix: Option<&Fix>) -> f64 {
+    pub(crate) fn dither_seen_um(&self, state: &AdaptState, fix: Option<&Fix>) -> f64 {
         let age = fix.map_or(0.0, |fix| fix.age as f64 + fix.offset);
         let delay = self.delay_samples + DELAYS[state.force.member] + age;
         let seen = state.dither.motion.seen(delay, self.exposure_ticks);
@@ -253,7 +253,7 @@ impl Adapter {
     }
 
     /// Where it stands.
-    pub fn adaptation(&self, state: &AdaptState) -> Adaptation {
+    pub(crate) fn adaptation(&self, state: &AdaptState) -> Adaptation {
         let found = state.evidence.found;
         Adaptation {
             gain: state.force.log_gain.exp(),
@@ -267,7 +267,7 @@ impl Adapter {
 
     /// After the command of a tick: learns from the fix, and moves the tuning where it may. The tuning that it leaves is that
     /// of the next tick.
-    pub fn step(&self, state: &mut AdaptState, told: &Told) {
+    pub(crate) fn step(&self, state: &mut AdaptState, told: &Told) {
         state.news = None;
         let learned = self.learn(state, told.fix.filter(|_| told.free));
         let rest_um = told.command_um - told.cancel_um;
@@ -293,7 +293,7 @@ impl Adapter {
     }
 
     /// A tick that never came: the command was held.
-    pub fn skip(&self, state: &mut AdaptState, command_um: f64) {
+    pub(crate) fn skip(&self, state: &mut AdaptState, command_um: f64) {
         self.learn(state, None);
         // The dither stays for another tick. The command that cancels the lines should have changed, and what it lacks moves the bead.
         state.dither.command_um = state.dither.given_um;
@@ -329,7 +329,7 @@ impl Adapter {
     }
 
     /// The values of [`ADAPT_COLUMNS`].
-    pub fn record(&self, state: &AdaptState, out: &mut [f32]) {
+    pub(crate) fn record(&self, state: &AdaptState, out: &mut [f32]) {
         let now = self.adaptation(state);
         let [gain, sd] = now.gain_estimate.unwrap_or([f64::NAN; 2]);
         let values = [now.gain, now.delay_samples, gain, sd];

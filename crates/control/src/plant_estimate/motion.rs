@@ -21,7 +21,7 @@ pub(super) struct Motion {
 
 impl Motion {
     /// At rest at a command, um.
-    pub fn start(command_um: f64) -> Self {
+    pub(super) fn start(command_um: f64) -> Self {
         Self {
             model: PredictedState {
                 n: command_um,
@@ -36,7 +36,7 @@ impl Motion {
 
     /// One tick on with a command, um. Whether the model is still finite.
     #[must_use]
-    pub fn drive(&mut self, estimator: &Estimator, command_um: f64) -> bool {
+    pub(super) fn drive(&mut self, estimator: &Estimator, command_um: f64) -> bool {
         self.jumps_um.copy_within(0..PAST - 1, 1);
         let change_um = command_um - self.model.last_um;
         self.jumps_um[0] = estimator.model().feedthrough * change_um;
@@ -55,17 +55,17 @@ impl Motion {
     }
 
     /// State of the model now.
-    pub fn state(&self) -> &PredictedState {
+    pub(super) fn state(&self) -> &PredictedState {
         &self.model
     }
 
     /// Position at the exposure of a fix that is `delay` ticks old, um; `None` where that is not known any more.
-    pub fn seen(&self, delay: f64, exposure: f64) -> Option<f64> {
+    pub(super) fn seen(&self, delay: f64, exposure: f64) -> Option<f64> {
         exposure::mean(delay, exposure, |ago| self.past(ago))
     }
 
     /// The same for each lag beyond `delay`, ticks.
-    pub fn at(&self, fix: &Fix, delay: f64, exposure: f64) -> Option<[f64; MEMBERS]> {
+    pub(super) fn at(&self, fix: &Fix, delay: f64, exposure: f64) -> Option<[f64; MEMBERS]> {
         let ago = delay + fix.age as f64 + fix.offset;
         let mut at_um = [0.0; MEMBERS];
         for (at, lag) in at_um.iter_mut().zip(LAGS) {
@@ -75,12 +75,16 @@ impl Motion {
     }
 
     /// Series that begin at these positions.
-    pub fn begin(&mut self, at_um: [f64; MEMBERS]) {
+    pub(super) fn begin(&mut self, at_um: [f64; MEMBERS]) {
         self.tracks = Some(at_um.map(Whitener::begin));
     }
 
     /// What of the positions was not to be foreseen; `None` before [`Motion::begin`].
-    pub fn innovations(&self, fix: &Correction, at_um: &[f64; MEMBERS]) -> Option<[f64; MEMBERS]> {
+    pub(super) fn innovations(
+        &self,
+        fix: &Correction,
+        at_um: &[f64; MEMBERS],
+    ) -> Option<[f64; MEMBERS]> {
         let tracks = self.tracks.as_ref()?;
         Some(std::array::from_fn(|j| {
             fix.innovation(&tracks[j], at_um[j])
@@ -88,7 +92,7 @@ impl Motion {
     }
 
     /// A fix with those innovations.
-    pub fn follow(&mut self, fix: &Correction, innovations: &[f64; MEMBERS]) {
+    pub(super) fn follow(&mut self, fix: &Correction, innovations: &[f64; MEMBERS]) {
         let tracks = self.tracks.iter_mut().flatten();
         for (track, innovation) in tracks.zip(innovations) {
             fix.step(track, *innovation);

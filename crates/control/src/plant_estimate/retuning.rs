@@ -97,13 +97,13 @@ impl Default for Force {
 
 impl Force {
     /// A tick in which nothing may change.
-    pub fn wait(&mut self) {
+    pub(super) fn wait(&mut self) {
         self.mode = AdaptMode::Learning;
         self.moving = false;
     }
 
     /// A tick in which the estimate may come into force.
-    pub fn follow(&mut self, found: Option<&Finding>, usable: &[bool; TUNINGS]) {
+    pub(super) fn follow(&mut self, found: Option<&Finding>, usable: &[bool; TUNINGS]) {
         self.since_delay = self.since_delay.saturating_add(1);
         // What is surely less than any plant's is no gain: something holds the bead.
         let of_a_plant = |found: &&Finding| found.gain + found.gain_sd > GAINS[0];
@@ -133,7 +133,7 @@ impl Force {
     }
 
     /// Towards another gain, by the logarithm, no faster than it may.
-    pub fn go(&mut self, way: f64) {
+    pub(super) fn go(&mut self, way: f64) {
         self.log_gain = (self.log_gain + way.clamp(-DOWN_PER_TICK, UP_PER_TICK))
             .clamp(GAINS[0].ln(), GAINS[1].ln());
     }
@@ -163,7 +163,7 @@ impl Force {
     }
 
     /// What is worth telling of after this tick.
-    pub fn news(&mut self, found: Option<&Finding>) -> Option<AdaptNews> {
+    pub(super) fn news(&mut self, found: Option<&Finding>) -> Option<AdaptNews> {
         let (told_gain, told_member) = self.told;
         let gain_off = (self.log_gain - told_gain).abs();
         let moved = gain_off > 0.02 || self.member != told_member;

@@ -48,7 +48,7 @@ pub(super) struct Track {
 
 impl Whitener {
     /// For variances per tick of the walk and of the drift's change, and of a fix, um^2, of which one comes every so many ticks.
-    pub fn new(
+    pub(super) fn new(
         walk_um2: f64,
         drift_um2: f64,
         fix_um2: f64,
@@ -76,7 +76,7 @@ impl Whitener {
     }
 
     /// Its frequency response at an angle from fix to fix, rad: real and imaginary part.
-    pub fn response(&self, angle: f64) -> [f64; 2] {
+    pub(super) fn response(&self, angle: f64) -> [f64; 2] {
         // 1/(1 + L), L = w (K0/(1 - w) + T K1/(1 - w)^2) with w = exp(-i angle).
         let (sin, cos) = angle.sin_cos();
         let (w, beside) = ([cos, -sin], [1.0 - cos, sin]);
@@ -97,12 +97,17 @@ impl Whitener {
     }
 
     /// Covariance with which series begin.
-    pub fn settled(&self) -> Covariance {
+    pub(super) fn settled(&self) -> Covariance {
         self.settled
     }
 
     /// What a fix of this variance, um^2, does so many ticks after the one before.
-    pub fn correction(&self, [pp, pd, dd]: Covariance, ticks: f64, fix_um2: f64) -> Correction {
+    pub(super) fn correction(
+        &self,
+        [pp, pd, dd]: Covariance,
+        ticks: f64,
+        fix_um2: f64,
+    ) -> Correction {
         let fix_um2 = fix_um2.max(self.least_um2);
         let ticks = ticks.clamp(APART.0, APART.1);
         let prior = [
@@ -120,7 +125,7 @@ impl Whitener {
     }
 
     /// A series that begins here.
-    pub fn begin(value: f64) -> Track {
+    pub(super) fn begin(value: f64) -> Track {
         Track {
             at: value,
             drift: 0.0,
@@ -137,12 +142,12 @@ fn corrected([pp, pd, dd]: Covariance, fix_um2: f64) -> ([f64; 2], Covariance) {
 
 impl Correction {
     /// What of a value was not to be foreseen.
-    pub fn innovation(&self, track: &Track, value: f64) -> f64 {
+    pub(super) fn innovation(&self, track: &Track, value: f64) -> f64 {
         value - (track.at + track.drift * self.ticks)
     }
 
     /// A fix with that innovation.
-    pub fn step(&self, track: &mut Track, innovation: f64) {
+    pub(super) fn step(&self, track: &mut Track, innovation: f64) {
         track.at += track.drift * self.ticks + self.gain[0] * innovation;
         track.drift += self.gain[1] * innovation;
     }

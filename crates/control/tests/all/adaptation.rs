@@ -1,7 +1,9 @@
 //! The loop adapts: to a gain and a delay that change under a held bead, and to nothing where nothing changes.
 
 #[path = "../../../../benches/src/adaptation.rs"]
-pub mod trial;
+// shared with the bench, where it is public
+#[expect(unreachable_pub)]
+pub(crate) mod trial;
 
 use crate::common::{config, mpc};
 use cellpos_control::*;

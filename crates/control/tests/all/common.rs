@@ -3,7 +3,7 @@
 use cellpos_control::*;
 
 /// Of the paper's plant, with two samples of delay and the default limits.
-pub fn config(controller: ControllerConfig) -> LoopConfig {
+pub(crate) fn config(controller: ControllerConfig) -> LoopConfig {
     LoopConfig {
         model: LoopModel::eq6(2e-3),
         estimator: EstimatorConfig::default(),
@@ -13,7 +13,7 @@ pub fn config(controller: ControllerConfig) -> LoopConfig {
 }
 
 /// With a solver, and the PI that stands in for it.
-pub fn mpc(solver: SolverKind) -> ControllerConfig {
+pub(crate) fn mpc(solver: SolverKind) -> ControllerConfig {
     ControllerConfig::Mpc(
         Mpc {
             solver,

@@ -35,7 +35,7 @@ struct Packed {
 
 impl Rows {
     /// Prepares to read a dataset of the file at `path`.
-    pub fn new(dataset: Dataset, path: &Path) -> Result<Self, Error> {
+    pub(super) fn new(dataset: Dataset, path: &Path) -> Result<Self, Error> {
         let filters = dataset.filters();
         let known = |f: &u16| [SHUFFLE, CHECKSUM, ZSTANDARD].contains(f);
         // With a filter that is unknown here, too, the reader's own error names it.
@@ -63,16 +63,16 @@ impl Rows {
         })
     }
 
-    pub fn shape(&self) -> Result<Vec<u64>, Error> {
+    pub(super) fn shape(&self) -> Result<Vec<u64>, Error> {
         self.dataset.shape()
     }
 
-    pub fn element_size(&self) -> Result<u64, Error> {
+    pub(super) fn element_size(&self) -> Result<u64, Error> {
         self.dataset.element_size()
     }
 
     /// Bytes of one row.
-    pub fn bytes(&mut self, row: u64) -> Result<Vec<u8>, Error> {
+    pub(super) fn bytes(&mut self, row: u64) -> Result<Vec<u8>, Error> {
         match &mut self.packed {
             Some(packed) => packed.rows(row, 1).map_err(Error::from),
             None => self.dataset.read_raw_rows(row, 1),
@@ -80,7 +80,7 @@ impl Rows {
     }
 
     /// Numbers of two bytes in one row.
-    pub fn words(&mut self, row: u64) -> Result<Vec<u16>, Error> {
+    pub(super) fn words(&mut self, row: u64) -> Result<Vec<u16>, Error> {
         let Some(packed) = &mut self.packed else {
             return self.dataset.read_u16_rows(row, 1);
         };
@@ -95,7 +95,7 @@ impl Rows {
     }
 
     /// All numbers of a dataset of one side.
-    pub fn numbers(&mut self) -> Result<Vec<f64>, Error> {
+    pub(super) fn numbers(&mut self) -> Result<Vec<f64>, Error> {
         let Some(packed) = &mut self.packed else {
             return self.dataset.read_f64();
         };

@@ -34,7 +34,7 @@ fn describe(plan: &Plan) -> Vec<String> {
 }
 
 /// Writes the segments that are finished.
-pub fn save(path: &Path, plan: &Plan, records: &[RecordedSegment]) -> Result<(), Failure> {
+pub(super) fn save(path: &Path, plan: &Plan, records: &[RecordedSegment]) -> Result<(), Failure> {
     let partial = Partial {
         plan: describe(plan),
         segments: records
@@ -57,7 +57,7 @@ pub fn save(path: &Path, plan: &Plan, records: &[RecordedSegment]) -> Result<(),
 }
 
 /// Reads them back.
-pub fn load(path: &Path, plan: &Plan) -> Result<Vec<RecordedSegment>, Failure> {
+pub(super) fn load(path: &Path, plan: &Plan) -> Result<Vec<RecordedSegment>, Failure> {
     let refuse = |problem: String, help: &str| {
         Failure::bad_input(format!("{}: {problem}", path.display()), help)
     };

@@ -45,7 +45,7 @@ pub(super) struct Solved {
 impl Data {
     /// Cuts no more than `most` rows out of the records, in stretches spread over all records; the first `skipped` rows of each
     /// give the input that a delay reaches back to.
-    pub fn new(records: &[Series], hold: Hold, most: usize, skipped: usize) -> Self {
+    pub(super) fn new(records: &[Series], hold: Hold, most: usize, skipped: usize) -> Self {
         let all: usize = records.iter().map(|r| r.input.len()).sum();
         let share = (most as f64 / all.max(1) as f64).min(1.0);
         let mut stretches = Vec::new();
@@ -87,7 +87,7 @@ impl Data {
     }
 
     /// The same records with the first or the last halves alone counting: the others must be predicted.
-    pub fn half(&self, last: bool, delay: f64) -> Self {
+    pub(super) fn half(&self, last: bool, delay: f64) -> Self {
         // For these rows the delayed input is before the cut: they do not count.
         let late = if last { delay.ceil() as usize + 1 } else { 0 };
         let cut = |s: &Stretch| {
@@ -105,7 +105,7 @@ impl Data {
 
     /// Poles in `theta`: the logarithm of a real one where their number is odd, then of the two coefficients of each pair; then the
     /// delay. Time in rows.
-    pub fn denominator(&self, form: &Form, theta: &[f64]) -> Vec<f64> {
+    pub(super) fn denominator(&self, form: &Form, theta: &[f64]) -> Vec<f64> {
         let (low, high) = self.log_range();
         let at = |v: f64, power: f64| (v.clamp(power * low, power * high)).exp();
         let mut out = vec![1.0];
@@ -128,7 +128,7 @@ impl Data {
     }
 
     /// Whether a pole is at an end of the search range.
-    pub fn at_bound(&self, form: &Form, theta: &[f64]) -> bool {
+    pub(super) fn at_bound(&self, form: &Form, theta: &[f64]) -> bool {
         let (low, high) = self.log_range();
         let n = form.free_poles();
         theta[..n].iter().enumerate().any(|(i, &v)| {
@@ -139,14 +139,19 @@ impl Data {
     }
 
     /// Solves for what is linear; None where the records cannot tell it.
-    pub fn solve(&self, form: &Form, theta: &[f64], numerator: Option<&[f64]>) -> Option<Solved> {
+    pub(super) fn solve(
+        &self,
+        form: &Form,
+        theta: &[f64],
+        numerator: Option<&[f64]>,
+    ) -> Option<Solved> {
         let denominator = self.denominator(form, theta);
         let delay = theta.get(form.free_poles()).copied().unwrap_or(0.0);
         self.solve_at(form, &denominator, delay, numerator)
     }
 
     /// As [`Data::solve`], for a denominator; a `numerator` that is given stands, and the starts alone are solved for.
-    pub fn solve_at(
+    pub(super) fn solve_at(
         &self,
         form: &Form,
         denominator: &[f64],

@@ -18,7 +18,7 @@ pub(super) struct Table<'a, 'i> {
 }
 
 impl<'a, 'i> Table<'a, 'i> {
-    pub fn refuse(&self, span: Range<usize>, problem: ModelProblem) -> ModelError {
+    pub(super) fn refuse(&self, span: Range<usize>, problem: ModelProblem) -> ModelError {
         ModelError {
             file: self.file.to_owned(),
             at: Some(Position::of(self.text, span)),
@@ -26,7 +26,7 @@ impl<'a, 'i> Table<'a, 'i> {
         }
     }
 
-    pub fn key(&self, name: &str) -> String {
+    pub(super) fn key(&self, name: &str) -> String {
         if self.path.is_empty() {
             name.to_owned()
         } else {
@@ -34,7 +34,7 @@ impl<'a, 'i> Table<'a, 'i> {
         }
     }
 
-    pub fn only(&self, known: &[&str]) -> Result<(), ModelError> {
+    pub(super) fn only(&self, known: &[&str]) -> Result<(), ModelError> {
         for key in self.entries.keys() {
             let name: &str = key.get_ref();
             if !known.contains(&name) {
@@ -51,11 +51,15 @@ impl<'a, 'i> Table<'a, 'i> {
         Ok(())
     }
 
-    pub fn get(&self, name: &str) -> Option<&'a Value<'i>> {
+    pub(super) fn get(&self, name: &str) -> Option<&'a Value<'i>> {
         self.entries.get(name)
     }
 
-    pub fn need(&self, name: &str, what: impl Into<String>) -> Result<&'a Value<'i>, ModelError> {
+    pub(super) fn need(
+        &self,
+        name: &str,
+        what: impl Into<String>,
+    ) -> Result<&'a Value<'i>, ModelError> {
         self.get(name).ok_or_else(|| {
             self.refuse(
                 self.span.clone(),
@@ -67,7 +71,12 @@ impl<'a, 'i> Table<'a, 'i> {
         })
     }
 
-    pub fn wrong(&self, name: &str, value: &Value<'_>, expected: &'static str) -> ModelError {
+    pub(super) fn wrong(
+        &self,
+        name: &str,
+        value: &Value<'_>,
+        expected: &'static str,
+    ) -> ModelError {
         self.refuse(
             value.span(),
             ModelProblem::WrongType {
@@ -78,7 +87,7 @@ impl<'a, 'i> Table<'a, 'i> {
         )
     }
 
-    pub fn text_of(&self, name: &str, value: &Value<'_>) -> Result<String, ModelError> {
+    pub(super) fn text_of(&self, name: &str, value: &Value<'_>) -> Result<String, ModelError> {
         match value.get_ref() {
             DeValue::String(s) => Ok(s.to_string()),
             _ => Err(self.wrong(name, value, "a text in quotes")),
@@ -86,7 +95,7 @@ impl<'a, 'i> Table<'a, 'i> {
     }
 
     /// A number, which may be infinite or not a number.
-    pub fn raw(&self, name: &str, value: &Value<'_>) -> Result<f64, ModelError> {
+    pub(super) fn raw(&self, name: &str, value: &Value<'_>) -> Result<f64, ModelError> {
         let number = match value.get_ref() {
             DeValue::Float(f) => f.as_str().replace('_', "").parse().ok(),
             DeValue::Integer(i) => i128::from_str_radix(i.as_str(), i.radix())
@@ -97,7 +106,7 @@ impl<'a, 'i> Table<'a, 'i> {
         number.ok_or_else(|| self.wrong(name, value, "a number that fits 64 bits"))
     }
 
-    pub fn number(
+    pub(super) fn number(
         &self,
         name: &str,
         value: &Value<'_>,
@@ -119,7 +128,7 @@ impl<'a, 'i> Table<'a, 'i> {
         ))
     }
 
-    pub fn list<T>(
+    pub(super) fn list<T>(
         &self,
         name: &str,
         value: &'a Value<'i>,
@@ -136,7 +145,11 @@ impl<'a, 'i> Table<'a, 'i> {
             .collect()
     }
 
-    pub fn table(&self, name: &str, value: &'a Value<'i>) -> Result<Table<'a, 'i>, ModelError> {
+    pub(super) fn table(
+        &self,
+        name: &str,
+        value: &'a Value<'i>,
+    ) -> Result<Table<'a, 'i>, ModelError> {
         let DeValue::Table(entries) = value.get_ref() else {
             return Err(self.wrong(name, value, "a table"));
         };
@@ -149,7 +162,7 @@ impl<'a, 'i> Table<'a, 'i> {
         })
     }
 
-    pub fn inconsistent(&self, span: Range<usize>, message: String) -> ModelError {
+    pub(super) fn inconsistent(&self, span: Range<usize>, message: String) -> ModelError {
         self.refuse(span, ModelProblem::Inconsistent { message })
     }
 }

@@ -27,23 +27,23 @@ pub(crate) struct FrameCounts {
 }
 
 impl FrameCounts {
-    pub fn drop_rate(&self) -> f64 {
+    pub(crate) fn drop_rate(&self) -> f64 {
         self.missing as f64 / self.rows.max(1) as f64
     }
 
-    pub fn repeat_rate(&self) -> f64 {
+    pub(crate) fn repeat_rate(&self) -> f64 {
         ((self.repeats as f64 - self.by_chance) / self.pairs.max(1) as f64).max(0.0)
     }
 
     /// More missing frames than a start-up glitch.
-    pub fn drops_named(&self) -> bool {
+    pub(crate) fn drops_named(&self) -> bool {
         self.of_camera
             && self.missing >= THRESHOLDS.faults_least
             && self.drop_rate() > THRESHOLDS.faults_rate
     }
 
     /// Beyond chance by five standard deviations and by a half of what chance gives.
-    pub fn repeats_named(&self) -> bool {
+    pub(crate) fn repeats_named(&self) -> bool {
         let excess = self.repeats as f64 - self.by_chance;
         self.of_camera
             && self.repeats >= THRESHOLDS.faults_least

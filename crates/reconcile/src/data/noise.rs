@@ -165,7 +165,7 @@ struct Spread {
 
 impl Whitener {
     /// `present[k]`: the frame counts. `extra_walk[k]`: variance added to the walk before frame k \[um^2\].
-    pub fn new(noise: &NoiseModel, present: &[bool], extra_walk: Option<&[f64]>) -> Self {
+    pub(crate) fn new(noise: &NoiseModel, present: &[bool], extra_walk: Option<&[f64]>) -> Self {
         debug_assert!(noise.coloured.is_none() || noise.zero_flow.is_none());
         let n = present.len();
         let (mut gain, mut inverse_sigma) = (vec![0.0; n], vec![0.0; n]);
@@ -243,7 +243,7 @@ impl Whitener {
     }
 
     /// Innovations of a residual, in standard deviations. The filter is linear: columns of a Jacobian go through it too.
-    pub fn apply(&self, r: &[f64], e: &mut [f64]) {
+    pub(crate) fn apply(&self, r: &[f64], e: &mut [f64]) {
         let rows = r.iter().zip(e).zip(&self.gain).zip(&self.inverse_sigma);
         let (mut m, mut c) = (0.0, 0.0);
         match &self.second {
@@ -276,7 +276,7 @@ impl Whitener {
 
     /// The slow noise at every row from the rows before it alone: what a regressor may know without being correlated with the
     /// row's own innovation.
-    pub fn ahead(&self, r: &[f64]) -> Vec<f64> {
+    pub(crate) fn ahead(&self, r: &[f64]) -> Vec<f64> {
         let mut m = r.first().copied().unwrap_or(0.0);
         let mut c = 0.0;
         r.iter()
@@ -303,13 +303,13 @@ impl Whitener {
     }
 
     /// Sum of the logarithms of the innovations' variances, of the rows that count.
-    pub fn log_determinant(&self) -> f64 {
+    pub(crate) fn log_determinant(&self) -> f64 {
         let of = |s: &f64| if *s > 0.0 { -2.0 * s.ln() } else { 0.0 };
         self.inverse_sigma.iter().map(of).sum()
     }
 
     /// The walk at every row from the rows before and after it, but not from the row itself: independent of its noise.
-    pub fn around(&self, r: &[f64]) -> Vec<f64> {
+    pub(crate) fn around(&self, r: &[f64]) -> Vec<f64> {
         let pass = |forward: bool| {
             let mut m = None;
             let mut known = vec![None; r.len()];
@@ -339,7 +339,7 @@ impl Whitener {
     }
 
     /// The transpose of [`Self::apply`]: what a residual at each row adds to the weighted sum of innovations.
-    pub fn transpose(&self, weights: &[f64]) -> Vec<f64> {
+    pub(crate) fn transpose(&self, weights: &[f64]) -> Vec<f64> {
         let mut z = vec![0.0; weights.len()];
         // What the states before the next row add to the weighted sum.
         let (mut later, mut later_second) = (0.0, 0.0);
@@ -363,18 +363,18 @@ impl Whitener {
     }
 
     /// Number of innovations that count.
-    pub fn count(&self) -> usize {
+    pub(crate) fn count(&self) -> usize {
         self.inverse_sigma.iter().filter(|s| **s > 0.0).count()
     }
 
     /// Whether the innovation of row k counts.
-    pub fn counts(&self, k: usize) -> bool {
+    pub(crate) fn counts(&self, k: usize) -> bool {
         self.inverse_sigma[k] > 0.0
     }
 
     /// Innovation standard deviation of row k \[um\]; `None` when it does not count.
     #[cfg(test)]
-    pub fn sigma_um(&self, k: usize) -> Option<f64> {
+    pub(crate) fn sigma_um(&self, k: usize) -> Option<f64> {
         (self.inverse_sigma[k] > 0.0).then(|| 1.0 / self.inverse_sigma[k])
     }
 }

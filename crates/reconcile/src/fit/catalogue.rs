@@ -17,30 +17,30 @@ impl PartialEq for Variant {
 }
 
 impl Variant {
-    pub fn id(self) -> &'static str {
+    pub(crate) fn id(self) -> &'static str {
         self.kind.spec().id
     }
 
     /// Whether it is an effect of the user's own.
-    pub fn is_own(self) -> bool {
+    pub(crate) fn is_own(self) -> bool {
         self.kind.definition().is_some()
     }
 
     /// Whether slow motion gets another gain by it than fast motion.
-    pub fn has_two_gains(self) -> bool {
+    pub(crate) fn has_two_gains(self) -> bool {
         self.kind.has_two_gains()
     }
 
     /// Whether it is a curve of its input alone.
-    pub fn is_curve(self) -> bool {
+    pub(crate) fn is_curve(self) -> bool {
         self.kind.is_curve()
     }
 
-    pub fn candidate(self) -> &'static Candidate {
+    pub(crate) fn candidate(self) -> &'static Candidate {
         &self.kind.candidates()[self.form]
     }
 
-    pub fn starts(self, scope: &Scope) -> Vec<Part> {
+    pub(crate) fn starts(self, scope: &Scope) -> Vec<Part> {
         self.kind
             .starts(self.form, scope)
             .iter()
@@ -49,7 +49,7 @@ impl Variant {
     }
 
     /// The same for a form in the stead of another: where the kind knows what the other comes to, from there.
-    pub fn starts_from(self, part: &Part, scope: &Scope) -> Vec<Part> {
+    pub(crate) fn starts_from(self, part: &Part, scope: &Scope) -> Vec<Part> {
         match part
             .lag_s()
             .and_then(|lag_s| self.kind.start_of_lag(self.form, lag_s))
@@ -60,28 +60,28 @@ impl Variant {
     }
 
     /// Whether it is a factor on all motion.
-    pub fn is_gain(self) -> bool {
+    pub(crate) fn is_gain(self) -> bool {
         self.kind.is_gain()
     }
 
     /// The form of the same effect that has its static curve and none of its memory.
-    pub fn memoryless(self) -> Option<Self> {
+    pub(crate) fn memoryless(self) -> Option<Self> {
         let form = self.kind.memoryless()?;
         Some(Self { form, ..self })
     }
 
     /// How many simple forms of the effect are worth following beside a set: of forms that are limits of each other the best one.
-    pub fn forms_worth_following(self) -> usize {
+    pub(crate) fn forms_worth_following(self) -> usize {
         1 + usize::from(self.kind.has_unlike_forms())
     }
 
     /// Whether it is a richer form of an effect that no record tells from another.
-    pub fn is_rich_double_of(self, other: Self) -> bool {
+    pub(crate) fn is_rich_double_of(self, other: Self) -> bool {
         self.candidate().late && (self.kind.spec().inseparable_from).contains(&other.id())
     }
 
     /// The variant that is a factor on all motion, the base model's gain set free.
-    pub fn gain() -> Option<Self> {
+    pub(crate) fn gain() -> Option<Self> {
         let kind = effects::all().into_iter().find(|k| k.is_gain())?;
         Some(Self { kind, form: 0 })
     }
@@ -105,7 +105,7 @@ pub(crate) struct Part {
 
 impl Part {
     /// From natural values.
-    pub fn new(variant: Variant, natural: &[f64]) -> Self {
+    pub(crate) fn new(variant: Variant, natural: &[f64]) -> Self {
         let theta = variant
             .candidate()
             .params
@@ -116,16 +116,16 @@ impl Part {
         Self { variant, theta }
     }
 
-    pub fn id(&self) -> &'static str {
+    pub(crate) fn id(&self) -> &'static str {
         self.variant.id()
     }
 
-    pub fn variant(&self) -> &'static Candidate {
+    pub(crate) fn variant(&self) -> &'static Candidate {
         self.variant.candidate()
     }
 
     /// Parameter values in their units.
-    pub fn natural(&self) -> Vec<f64> {
+    pub(crate) fn natural(&self) -> Vec<f64> {
         self.variant()
             .params
             .iter()
@@ -135,7 +135,7 @@ impl Part {
     }
 
     /// By how much it delays a slow motion, if that is what it does \[s\].
-    pub fn lag_s(&self) -> Option<f64> {
+    pub(crate) fn lag_s(&self) -> Option<f64> {
         let lag_s = self
             .variant
             .kind
@@ -144,7 +144,7 @@ impl Part {
     }
 
     /// Whether it is at least as large as the smallest that matters.
-    pub fn matters(&self) -> bool {
+    pub(crate) fn matters(&self) -> bool {
         match self.variant().smallest {
             Some((at, least)) => {
                 let neutral = self.variant().neutral;
@@ -156,19 +156,19 @@ impl Part {
     }
 
     /// For how long it remembers what went into it \[s\].
-    pub fn memory_s(&self, scope: &Scope) -> f64 {
+    pub(crate) fn memory_s(&self, scope: &Scope) -> f64 {
         self.variant.kind.memory_s(&self.effect(scope))
     }
 
     /// Over how long the camera averages the motion with it \[s\].
-    pub fn averages_s(&self, scope: &Scope) -> f64 {
+    pub(crate) fn averages_s(&self, scope: &Scope) -> f64 {
         match self.effect(scope).act() {
             Action::Exposure(exposure_s) => exposure_s,
             _ => 0.0,
         }
     }
 
-    pub fn effect(&self, scope: &Scope) -> Effect {
+    pub(crate) fn effect(&self, scope: &Scope) -> Effect {
         self.variant
             .kind
             .build(self.variant.form, &self.natural(), scope)

@@ -44,7 +44,7 @@ pub(crate) struct WhiteEvidence {
 
 impl WhiteEvidence {
     /// Squared distance, in standard deviations, between the estimate and what a set of parts leads one to expect.
-    pub fn distance(&self, parts: &[Part], scope: &Scope) -> f64 {
+    pub(crate) fn distance(&self, parts: &[Part], scope: &Scope) -> f64 {
         let exposure_s: f64 = parts.iter().map(|p| p.averages_s(scope)).sum();
         let rows = (exposure_s / scope.sample_s).min(2.0);
         let expected = self.model_um2 - self.walk_um2 * rows / 6.0;
@@ -82,7 +82,7 @@ pub(crate) struct Fit {
 
 impl Fit {
     /// Free parameters that describe effects: of the parts, and the amplitudes of lines.
-    pub fn freedom(&self) -> usize {
+    pub(crate) fn freedom(&self) -> usize {
         self.parts
             .iter()
             .map(|p| freedom_of(p.variant(), self.innovations.len()))
@@ -90,16 +90,16 @@ impl Fit {
     }
 
     /// The parts that act in one way, in their order.
-    pub fn of_role(&self, role: Role) -> impl Iterator<Item = &Part> {
+    pub(crate) fn of_role(&self, role: Role) -> impl Iterator<Item = &Part> {
         self.parts.iter().filter(move |p| p.variant().role == role)
     }
 
-    pub fn has(&self, id: &str) -> bool {
+    pub(crate) fn has(&self, id: &str) -> bool {
         self.parts.iter().any(|p| p.id() == id)
     }
 
     /// Sum of squares of the innovations under another mask.
-    pub fn chi2_on(&self, mask: &Mask) -> f64 {
+    pub(crate) fn chi2_on(&self, mask: &Mask) -> f64 {
         self.innovations
             .iter()
             .zip(mask)
@@ -126,7 +126,7 @@ pub(crate) fn freedom_of(v: &Candidate, records: usize) -> usize {
 impl Context<'_> {
     /// Whether an effect is no candidate: behind a bare actuator there is neither a chip nor a bead, and a free gain
     /// is no error; a sensor that counts in steps has no pixels.
-    pub fn excludes(&self, id: &str) -> bool {
+    pub(crate) fn excludes(&self, id: &str) -> bool {
         let Some(kind) = find(id) else {
             return false;
         };
@@ -137,7 +137,7 @@ impl Context<'_> {
 
     /// The longest delay that is a number of these records \[s\]: a tenth of a second on this rig; of another plant as many rows as
     /// its slowest lag, at least a hundred, and at most a quarter of a record.
-    pub fn longest_delay_s(&self) -> f64 {
+    pub(crate) fn longest_delay_s(&self) -> f64 {
         const ON_THIS_RIG_S: f64 = 0.1;
         const LEAST_ROWS: f64 = 100.0;
         let base = &self.problem.base;
@@ -152,14 +152,14 @@ impl Context<'_> {
     }
 
     /// The effects of the model and of a set, as they are simulated.
-    pub fn effects(&self, parts: &[Part]) -> Vec<Effect> {
+    pub(crate) fn effects(&self, parts: &[Part]) -> Vec<Effect> {
         let mut effects = self.fixed.clone();
         effects.extend(parts.iter().map(|p| p.effect(&self.scope)));
         effects
     }
 
     /// Simulated positions of the records that count under a mask; empty for the others.
-    pub fn simulated(&self, parts: &[Part], mask: &Mask) -> Vec<Vec<f64>> {
+    pub(crate) fn simulated(&self, parts: &[Part], mask: &Mask) -> Vec<Vec<f64>> {
         let effects = self.effects(parts);
         self.problem
             .records

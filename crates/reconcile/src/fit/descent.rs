@@ -31,7 +31,7 @@ pub(crate) struct Until {
 
 impl Until {
     /// To the end.
-    pub fn done(iterations: usize) -> Self {
+    pub(crate) fn done(iterations: usize) -> Self {
         Self {
             iterations,
             least_chi2: f64::INFINITY,
@@ -62,22 +62,22 @@ fn covariance(information: &DMatrix<f64>) -> DMatrix<f64> {
 
 impl Context<'_> {
     /// Fits a set of candidates from starting values.
-    pub fn fit(&self, parts: Vec<Part>, mask: &Mask, iterations: usize) -> Fit {
+    pub(crate) fn fit(&self, parts: Vec<Part>, mask: &Mask, iterations: usize) -> Fit {
         self.fit_from(parts, None, mask, iterations)
     }
 
     /// Carries a fit on.
-    pub fn refit(&self, fit: &Fit, mask: &Mask, iterations: usize) -> Fit {
+    pub(crate) fn refit(&self, fit: &Fit, mask: &Mask, iterations: usize) -> Fit {
         self.run(fit.clone(), mask, Until::done(iterations))
     }
 
     /// Carries a fit on, as long as it may still come down to a sum of squares.
-    pub fn refit_towards(&self, fit: &Fit, mask: &Mask, until: Until) -> Fit {
+    pub(crate) fn refit_towards(&self, fit: &Fit, mask: &Mask, until: Until) -> Fit {
         self.run(fit.clone(), mask, until)
     }
 
     /// As [`Self::fit`], with the nuisances of an earlier fit as starting values where they apply.
-    pub fn fit_from(
+    pub(crate) fn fit_from(
         &self,
         parts: Vec<Part>,
         soft: Option<f64>,
@@ -88,7 +88,7 @@ impl Context<'_> {
     }
 
     /// As [`Self::fit_from`], given up where it can no longer come down to a sum of squares.
-    pub fn fit_towards(
+    pub(crate) fn fit_towards(
         &self,
         parts: Vec<Part>,
         soft: Option<f64>,
@@ -268,7 +268,7 @@ impl Context<'_> {
     }
 
     /// Tangents at a fit, for screening further candidates.
-    pub fn tangents(&self, fit: &Fit, mask: &Mask) -> Tangents {
+    pub(crate) fn tangents(&self, fit: &Fit, mask: &Mask) -> Tangents {
         let state = self.state(fit, mask);
         let (n, columns) = self.columns(fit, &state, mask);
         let (normal, gradient) = normal_equations(n, &columns, &state.innovations, mask);
@@ -288,18 +288,18 @@ impl Context<'_> {
     }
 
     /// Innovations of a set with given nuisances, without fitting.
-    pub fn innovations(&self, fit: &Fit, mask: &Mask) -> (Vec<Vec<f64>>, f64) {
+    pub(crate) fn innovations(&self, fit: &Fit, mask: &Mask) -> (Vec<Vec<f64>>, f64) {
         let s = self.state(fit, mask);
         (s.innovations, s.chi2)
     }
 
     /// Raw residual of a fit in the records that count under a mask; empty for the others.
-    pub fn residual_under(&self, fit: &Fit, mask: &Mask) -> Vec<Vec<f64>> {
+    pub(crate) fn residual_under(&self, fit: &Fit, mask: &Mask) -> Vec<Vec<f64>> {
         self.state(fit, mask).residual
     }
 
     /// Raw residual of a fit, and its position with the lines that shake it.
-    pub fn residual(&self, fit: &Fit) -> (Vec<Vec<f64>>, Vec<Vec<f64>>) {
+    pub(crate) fn residual(&self, fit: &Fit) -> (Vec<Vec<f64>>, Vec<Vec<f64>>) {
         let s = self.state(fit, &self.problem.all());
         (s.residual, s.path)
     }

@@ -22,7 +22,7 @@ pub(crate) struct State {
 }
 
 impl Context<'_> {
-    pub fn state(&self, fit: &Fit, mask: &Mask) -> State {
+    pub(crate) fn state(&self, fit: &Fit, mask: &Mask) -> State {
         let effects = self.effects(&fit.parts);
         let mut edge = Vec::new();
         let (mut sim, mut soft) = (Vec::new(), Vec::new());
@@ -110,7 +110,7 @@ impl Context<'_> {
     }
 
     /// Whitened derivative columns of the innovations at a state.
-    pub fn columns(&self, fit: &Fit, state: &State, mask: &Mask) -> (usize, Vec<Columns>) {
+    pub(crate) fn columns(&self, fit: &Fit, state: &State, mask: &Mask) -> (usize, Vec<Columns>) {
         let records = &self.problem.records;
         let counted = |i: usize| !mask[i].is_empty();
         let mut columns: Vec<Columns> = records.iter().map(|_| Vec::new()).collect();

@@ -26,7 +26,7 @@ pub(crate) struct Gain {
 
 impl Tangents {
     /// Projects a whitened direction `d` (change of the innovations) against the tangents.
-    pub fn gain(&self, d: &[Vec<f64>], e: &[Vec<f64>], mask: &Mask) -> Gain {
+    pub(crate) fn gain(&self, d: &[Vec<f64>], e: &[Vec<f64>], mask: &Mask) -> Gain {
         let n = self.gradient.len();
         let mut jd = DVector::zeros(n);
         let (mut dd, mut de) = (0.0, 0.0);

@@ -17,7 +17,7 @@ pub(crate) struct Locking {
 
 impl Locking {
     /// Amplitude in pixels and its standard error.
-    pub fn amplitude_px(&self) -> (f64, f64) {
+    pub(crate) fn amplitude_px(&self) -> (f64, f64) {
         let [a, b] = self.wave_um;
         let size = a.hypot(b).max(1e-12);
         let slope = Numbers::new(a / size, b / size, -size, 0.0, 0.0) / self.pixel_um;
@@ -26,7 +26,7 @@ impl Locking {
     }
 
     /// Standard error of the logarithm of the pixel.
-    pub fn log_pixel_error(&self) -> f64 {
+    pub(crate) fn log_pixel_error(&self) -> f64 {
         self.covariance[(2, 2)].max(0.0).sqrt()
     }
 }

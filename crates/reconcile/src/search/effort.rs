@@ -16,12 +16,12 @@ pub(crate) struct Effort {
 
 impl Effort {
     /// Whether the work is done up: nothing more is looked for.
-    pub fn is_spent(&self, ctx: &Context<'_>) -> bool {
+    pub(crate) fn is_spent(&self, ctx: &Context<'_>) -> bool {
         ctx.problem.spent() > self.work
     }
 
     /// Whether it is so far beyond that not even the rivals of a set are weighed any more, which is then no name.
-    pub fn is_over(&self, ctx: &Context<'_>) -> bool {
+    pub(crate) fn is_over(&self, ctx: &Context<'_>) -> bool {
         ctx.problem.spent() as f64 > BEYOND * self.work as f64
     }
 }

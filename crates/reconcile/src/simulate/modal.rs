@@ -131,7 +131,7 @@ impl Trace {
     }
 
     /// Adds another motion.
-    pub fn add(&mut self, other: &Self) {
+    pub(super) fn add(&mut self, other: &Self) {
         let add = |a: &mut [f64], b: &[f64]| a.iter_mut().zip(b).for_each(|(a, b)| *a += b);
         add(&mut self.pos, &other.pos);
         add(&mut self.jump, &other.jump);
@@ -140,7 +140,7 @@ impl Trace {
     }
 
     /// Takes the jumps of a grid of steps for the straight line that they stand for.
-    pub fn straighten(&mut self, h: f64) {
+    pub(super) fn straighten(&mut self, h: f64) {
         let n = self.pos.len();
         for j in 0..n {
             let slope = match self.pos.get(j + 1) {
@@ -156,7 +156,7 @@ impl Trace {
 
 impl Modal {
     /// Partial fractions of a proper transfer function, held-input recursion of step `h`.
-    pub fn new(zpk: &Zpk, h: f64) -> Self {
+    pub(super) fn new(zpk: &Zpk, h: f64) -> Self {
         let mut poles = zpk.poles.clone();
         separate(&mut poles);
         let proper = zpk.zeros.len() < poles.len();
@@ -215,7 +215,7 @@ impl Modal {
     }
 
     /// Positions just before each input acts: `y_k = C x_k + D u_(k-1)`, from rest.
-    pub fn run(&self, u: &[f64], y: &mut Vec<f64>) {
+    pub(super) fn run(&self, u: &[f64], y: &mut Vec<f64>) {
         y.clear();
         y.resize(u.len(), 0.0);
         let mut states = vec![[0.0; 4]; self.real.len()];
@@ -238,7 +238,7 @@ impl Modal {
     }
 
     /// The same chain seen `t` after the start of each step of `h`, 0 < t <= h: for [`Inside::run`].
-    pub fn inside(mut self, t: f64, h: f64) -> Inside {
+    pub(super) fn inside(mut self, t: f64, h: f64) -> Inside {
         let mut feed = self.direct;
         for four in &mut self.real {
             for i in 0..4 {
@@ -266,7 +266,7 @@ impl Modal {
     /// Positions with jumps and slopes, for what acts on the motion inside a step (adhesion, delay, exposure).
     ///
     /// `fine` steps make a sample: where the input is held over all of them, the modes go on by whole samples.
-    pub fn trace(&self, u: &[f64], fine: usize, t: &mut Trace) {
+    pub(super) fn trace(&self, u: &[f64], fine: usize, t: &mut Trace) {
         t.clear(u.len());
         let mut before = 0.0;
         for &u in u {
@@ -371,7 +371,7 @@ impl Modal {
     }
 
     /// The mean of the output over each step, for a smooth signal that goes into a nonlinear block next.
-    pub fn means(&self, u: &[f64]) -> Vec<f64> {
+    pub(super) fn means(&self, u: &[f64]) -> Vec<f64> {
         let mut t = Trace::default();
         self.trace(u, 1, &mut t);
         let n = u.len();
@@ -395,7 +395,7 @@ pub(crate) struct Inside {
 
 impl Inside {
     /// The position at that instant of every step.
-    pub fn run(&self, u: &[f64], y: &mut Vec<f64>) {
+    pub(super) fn run(&self, u: &[f64], y: &mut Vec<f64>) {
         let direct = self.modal.direct;
         self.modal.run(u, y);
         let mut before = 0.0;

@@ -48,7 +48,7 @@ pub(crate) struct Column {
 
 impl Column {
     /// Whether it bends: no linear plant makes it.
-    pub fn is_curved(&self) -> bool {
+    pub(crate) fn is_curved(&self) -> bool {
         let linear = matches!(self.name, "y" | "v" | "t" | "t d");
         !linear
     }

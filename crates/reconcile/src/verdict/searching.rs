@@ -37,7 +37,7 @@ pub(super) struct Searched {
 
 impl Searching<'_> {
     /// What a fit of a problem needs; `trusted` increments told its noise.
-    pub fn context<'a>(&self, problem: &'a Problem, trusted: usize) -> Context<'a> {
+    pub(super) fn context<'a>(&self, problem: &'a Problem, trusted: usize) -> Context<'a> {
         Context {
             problem,
             scope: self.scope,
@@ -51,7 +51,7 @@ impl Searching<'_> {
     }
 
     /// Searches, and once more with the noise that the first set leaves.
-    pub fn search(
+    pub(super) fn search(
         &self,
         mut problem: Problem,
         floor: &Floor,
@@ -96,7 +96,7 @@ impl Searching<'_> {
     /// What a zero flow does in a closed loop looks like slow effects of the response, and both explain it to the noise: the two are
     /// weighed with all that either takes. So the parts of a set are taken out again one by one, each time beside the zero flow that
     /// then goes best with the rest, and what stands is searched further.
-    pub fn beside_zero_flow(
+    pub(super) fn beside_zero_flow(
         &self,
         still: Searched,
         floor: &Floor,

@@ -80,7 +80,7 @@ pub(super) struct Clipped {
 
 impl Clipped {
     /// For an estimator and a plant, and fixes that are `delay_s` old, of a bead that is to be held so well.
-    pub fn new(config: &EstimatorConfig, model: &LoopModel, delay_s: f64) -> Self {
+    pub(super) fn new(config: &EstimatorConfig, model: &LoopModel, delay_s: f64) -> Self {
         let sample_s = model.sample_time_s;
         let delay = (delay_s / sample_s)
             .round()
@@ -120,19 +120,19 @@ impl Clipped {
     }
 
     /// Whether it was found that the bead does not follow.
-    pub fn is_told(&self) -> bool {
+    pub(super) fn is_told(&self) -> bool {
         self.told
     }
 
     /// The ticks before do not count: the loop did not run, the bead was held by something, or what stood at the PZT is not known.
-    pub fn clear(&mut self) {
+    pub(super) fn clear(&mut self) {
         (self.known, self.started) = (0, false);
         (self.error_um, self.away_s) = (0.0, 0.0);
     }
 
     /// Takes in a tick: position and variance of the fix, if one came on time, and reference, command and zero flow, um. Gives
     /// once the level beyond which the bead does not follow, um.
-    pub fn step(
+    pub(super) fn step(
         &mut self,
         fix: Option<(f64, f64)>,
         reference_um: f64,

@@ -231,7 +231,7 @@ pub(super) struct Following {
 
 impl Following {
     /// For an estimator and a plant, and fixes that are `delay_s` old.
-    pub fn new(config: &EstimatorConfig, model: &LoopModel, delay_s: f64) -> Self {
+    pub(super) fn new(config: &EstimatorConfig, model: &LoopModel, delay_s: f64) -> Self {
         let sample_s = model.sample_time_s;
         let delay = (delay_s / sample_s)
             .round()
@@ -268,14 +268,14 @@ impl Following {
     }
 
     /// The ticks before do not count: the loop did not run, the bead was held by something, or what stood at the PZT is not known.
-    pub fn clear(&mut self) {
+    pub(super) fn clear(&mut self) {
         self.known = 0;
         self.beliefs = None;
     }
 
     /// Takes in a tick: position and variance of the fix, if one came on time, um, and the command, um, which shows one delay later.
     /// True when the loop drives the bead away.
-    pub fn step(&mut self, fix: Option<(f64, f64)>, command_um: f64) -> bool {
+    pub(super) fn step(&mut self, fix: Option<(f64, f64)>, command_um: f64) -> bool {
         if self.gain == 0.0 {
             return false;
         }

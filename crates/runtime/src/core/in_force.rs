@@ -29,7 +29,7 @@ pub(super) struct Board {
 }
 
 impl Board {
-    pub fn new(displacement_um: f64, zero_flow_um: f64) -> Self {
+    pub(super) fn new(displacement_um: f64, zero_flow_um: f64) -> Self {
         Self {
             heard_ns: 0,
             applied_um: displacement_um,
@@ -41,13 +41,13 @@ impl Board {
     }
 
     /// The first tick: the board was heard when it was armed.
-    pub fn start(&mut self, now_ns: i64) {
+    pub(super) fn start(&mut self, now_ns: i64) {
         self.heard_ns = now_ns;
     }
 
     /// Takes in what was heard by `now_ns`; `told_um` is the zero flow that went with the last command. Gives what stood at the
     /// PZT where it was not what was commanded, for ticks of `period_ns`.
-    pub fn step(
+    pub(super) fn step(
         &mut self,
         now_ns: i64,
         report: Option<&ActuatorReport>,

@@ -20,7 +20,7 @@ pub(super) struct Rest {
 }
 
 impl Rest {
-    pub fn new(zero_flow_um: f64) -> Self {
+    pub(super) fn new(zero_flow_um: f64) -> Self {
         Self {
             quiet_um: zero_flow_um,
             agreeing: 0,
@@ -29,7 +29,7 @@ impl Rest {
 
     /// Takes in the estimate of a tick with a fix that was off its prediction by `innovation_um`, whose variance is
     /// `variance_um2` where nothing but the bead's walk and the noise of the fix moves it.
-    pub fn step(
+    pub(super) fn step(
         &mut self,
         zero_flow_um: f64,
         innovation_um: f64,
@@ -50,12 +50,12 @@ impl Rest {
     }
 
     /// The zero flow has moved by a known amount, um.
-    pub fn shift(&mut self, by_um: f64) {
+    pub(super) fn shift(&mut self, by_um: f64) {
         self.quiet_um += by_um;
     }
 
     /// The zero flow to stop at, um, when the newest estimate is `newest_um`.
-    pub fn zero_flow_um(&self, newest_um: f64) -> f64 {
+    pub(super) fn zero_flow_um(&self, newest_um: f64) -> f64 {
         if self.agreeing > AGREEING && newest_um.is_finite() {
             newest_um
         } else {

@@ -9,7 +9,7 @@ use std::path::Path;
 ///
 /// # Errors
 /// It cannot be opened: who has it, or what is missing.
-pub fn open(port: &str, baud: u32) -> Result<SerialLine, Failure> {
+pub(super) fn open(port: &str, baud: u32) -> Result<SerialLine, Failure> {
     SerialLine::open(port, baud).map_err(|error| cannot_open(port, &error))
 }
 

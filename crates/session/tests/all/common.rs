@@ -9,7 +9,7 @@ use cellpos_session::setup::ReferenceSpec;
 use cellpos_session::{EndKind, Options, Rig, RigFile};
 
 /// What a run leaves.
-pub struct Ran<S> {
+pub(crate) struct Ran<S> {
     /// The world goes on.
     pub emulated: EmulatedRig,
     pub summary: Summary,
@@ -19,7 +19,7 @@ pub struct Ran<S> {
 }
 
 /// A run of some ticks with a law designed on Eq. (6), to its orderly end.
-pub fn run<S: RunSink + Default + 'static>(
+pub(crate) fn run<S: RunSink + Default + 'static>(
     file: RigFile,
     law: &str,
     reference: ReferenceSpec,
@@ -58,6 +58,6 @@ pub fn run<S: RunSink + Default + 'static>(
 }
 
 /// A bead held in the middle.
-pub fn hold() -> ReferenceSpec {
+pub(crate) fn hold() -> ReferenceSpec {
     ReferenceSpec::Hold { position_um: 0.0 }
 }

@@ -9,7 +9,7 @@ use cellpos_session::quantities::quantities;
 use std::collections::BTreeSet;
 use std::path::Path;
 
-pub fn page() -> String {
+pub(crate) fn page() -> String {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../docs/rig-toml.md");
     std::fs::read_to_string(path).expect("docs/rig-toml.md")
 }

@@ -3,10 +3,10 @@
 use cellpos_session::RigFile;
 use std::collections::BTreeSet;
 
-pub const UNKNOWN: &str = "no_such_key";
+pub(crate) const UNKNOWN: &str = "no_such_key";
 
 /// Keys or variants in backquotes behind the word `expected`.
-pub fn expected(message: &str) -> Vec<String> {
+pub(crate) fn expected(message: &str) -> Vec<String> {
     let list = message.split("expected").nth(1).unwrap_or("");
     list.split('`')
         .skip(1)
@@ -15,7 +15,7 @@ pub fn expected(message: &str) -> Vec<String> {
         .collect()
 }
 
-pub fn refusal(text: &str) -> String {
+pub(crate) fn refusal(text: &str) -> String {
     match toml::from_str::<RigFile>(text) {
         Ok(_) => String::new(),
         Err(error) => error.message().to_string(),
@@ -23,7 +23,7 @@ pub fn refusal(text: &str) -> String {
 }
 
 /// What a table needs before it looks at its keys.
-pub fn needs(table: &str) -> &'static str {
+pub(crate) fn needs(table: &str) -> &'static str {
     match table {
         "camera.region" => "[camera]\nkind = \"industrial\"\naddress = \"a\"\n",
         "vision.noise" | "vision.learning" => {
@@ -34,10 +34,10 @@ pub fn needs(table: &str) -> &'static str {
 }
 
 /// Tables that look at nothing else before they know their `kind`; below them there is one table, with needs of its own.
-pub const OF_A_KIND: [&str; 4] = ["actuator", "camera", "vision.profile", "vision.noise"];
+pub(crate) const OF_A_KIND: [&str; 4] = ["actuator", "camera", "vision.profile", "vision.noise"];
 
 /// The kinds of a table that has kinds.
-pub fn kinds_of(table: &str) -> Vec<String> {
+pub(crate) fn kinds_of(table: &str) -> Vec<String> {
     let text = |kind: &str| format!("{}[{table}]\n{kind}{UNKNOWN} = 1\n", needs(table));
     if !refusal(&text("")).contains("missing field `kind`") {
         return Vec::new();
@@ -46,7 +46,7 @@ pub fn kinds_of(table: &str) -> Vec<String> {
 }
 
 /// The keys of a table (empty: of none) and of all its kinds; `None` where it is no table.
-pub fn keys_of(table: &str) -> Option<BTreeSet<String>> {
+pub(crate) fn keys_of(table: &str) -> Option<BTreeSet<String>> {
     let below = |of: &str| (table.strip_prefix(of)).is_some_and(|rest| rest.starts_with('.'));
     if OF_A_KIND.iter().any(|of| below(of)) && needs(table).is_empty() {
         return None;
@@ -77,7 +77,7 @@ pub fn keys_of(table: &str) -> Option<BTreeSet<String>> {
 }
 
 /// All keys of a table and below, with their tables.
-pub fn all_below(table: &str, all: &mut BTreeSet<String>) {
+pub(crate) fn all_below(table: &str, all: &mut BTreeSet<String>) {
     for key in keys_of(table).unwrap_or_default() {
         let whole = match table {
             "" => key,

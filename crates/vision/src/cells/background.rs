@@ -64,7 +64,7 @@ pub(super) struct Background {
 }
 
 impl Background {
-    pub fn new(width: usize, height: usize) -> Self {
+    pub(super) fn new(width: usize, height: usize) -> Self {
         let patches = width.div_ceil(PATCH) * height.div_ceil(PATCH);
         Background {
             width,
@@ -88,7 +88,7 @@ impl Background {
 
     /// Noise of a pixel, grey levels: the scatter of the background frames, restless patches left out, at least that of
     /// rounding.
-    pub fn noise_grey(&self) -> f64 {
+    pub(super) fn noise_grey(&self) -> f64 {
         self.scatter
             .max((1.0_f64 / 12.0).sqrt())
             .max(self.known_noise)
@@ -134,13 +134,13 @@ impl Background {
     }
 
     /// Whether a pixel belongs to a patch that changes by itself.
-    pub fn is_restless(&self, x: usize, y: usize) -> bool {
+    pub(super) fn is_restless(&self, x: usize, y: usize) -> bool {
         let patch = y / PATCH * self.width.div_ceil(PATCH) + x / PATCH;
         self.restless.get(patch).copied().unwrap_or(false)
     }
 
     /// Takes the restless patches out of a contrast.
-    pub fn calm(&self, contrast: &mut [f32]) {
+    pub(super) fn calm(&self, contrast: &mut [f32]) {
         if !self.restless.contains(&true) {
             return;
         }
@@ -155,7 +155,7 @@ impl Background {
     }
 
     /// Takes a picture that is a mean already for the background; its noise is that of a frame beside it.
-    pub fn be<T: Copy>(&mut self, pixels: &[T])
+    pub(super) fn be<T: Copy>(&mut self, pixels: &[T])
     where
         f32: From<T>,
     {
@@ -169,7 +169,7 @@ impl Background {
 
     /// Takes the noise from a frame: half of the differences from the background, about their median, are within 0.67
     /// standard deviations of it, whatever swims in it. The least of several frames counts.
-    pub fn learn_noise<T: Copy>(&mut self, pixels: &[T])
+    pub(super) fn learn_noise<T: Copy>(&mut self, pixels: &[T])
     where
         f32: From<T>,
     {
@@ -189,7 +189,7 @@ impl Background {
     }
 
     /// Takes a frame into the running mean.
-    pub fn average<T: Copy>(&mut self, pixels: &[T])
+    pub(super) fn average<T: Copy>(&mut self, pixels: &[T])
     where
         f32: From<T>,
     {
@@ -217,7 +217,7 @@ impl Background {
     }
 
     /// Follows a frame: a sixteenth of the rows at a time, by their share over `refresh_frames`.
-    pub fn refresh<T: Copy>(
+    pub(super) fn refresh<T: Copy>(
         &mut self,
         pixels: &[T],
         light: f32,
@@ -270,7 +270,7 @@ impl Background {
 
     /// Light of the frame relative to the background's: where most pixels' ratios lie. Its median is a start that no header,
     /// cell or wall within half of the frame draws away; then the mean of what lies within two standard deviations of it.
-    pub fn light_of<T: Copy>(&mut self, pixels: &[T]) -> f32
+    pub(super) fn light_of<T: Copy>(&mut self, pixels: &[T]) -> f32
     where
         f32: From<T>,
     {

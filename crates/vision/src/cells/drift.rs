@@ -165,7 +165,7 @@ impl Background {
     }
 
     /// Chooses the pixels at which the background is steep, now and then.
-    pub fn choose_steep(&mut self) {
+    pub(super) fn choose_steep(&mut self) {
         self.steep_age = self.steep_age.wrapping_add(1);
         if self.steep_age % CHOSEN_EVERY != 1 {
             return;
@@ -195,7 +195,7 @@ impl Background {
     }
 
     /// Shift of the frame against the background, px to the right and down; noughts where there is none to speak of.
-    pub fn drift_of<T: Copy>(&self, pixels: &[T], light: f32) -> (f64, f64)
+    pub(super) fn drift_of<T: Copy>(&self, pixels: &[T], light: f32) -> (f64, f64)
     where
         f32: From<T>,
     {
@@ -306,7 +306,7 @@ impl Background {
     }
 
     /// What a frame shifted by `shift` px differs by from the background at `light`, into `contrast`.
-    pub fn contrast_shifted<T: Copy>(
+    pub(super) fn contrast_shifted<T: Copy>(
         &self,
         pixels: &[T],
         light: f32,

@@ -43,7 +43,7 @@ pub(super) struct Regions {
 }
 
 impl Regions {
-    pub fn new(width: usize, height: usize, max_regions: usize) -> Self {
+    pub(super) fn new(width: usize, height: usize, max_regions: usize) -> Self {
         // The last patch of a row and of a column takes what is left over.
         let (columns, rows) = ((width / PATCH).max(1), (height / PATCH).max(1));
         // A region shaped like a comb takes a label for each tooth.
@@ -62,7 +62,7 @@ impl Regions {
 
     /// Joins the patches of a frame's contrast above `threshold` (grey levels RMS). Bounds are kept of those that
     /// are objects with the mean square `seed`.
-    pub fn find(&mut self, contrast: &[f32], width: usize, threshold: f32, seed: f64) {
+    pub(super) fn find(&mut self, contrast: &[f32], width: usize, threshold: f32, seed: f64) {
         self.sum_patches(contrast, width);
         self.close();
         let (closed, columns) = (&self.closed, self.columns);
@@ -189,17 +189,17 @@ impl Regions {
     }
 
     /// Regions, the largest sum of squared contrast first.
-    pub fn found(&self) -> &[Blob] {
+    pub(super) fn found(&self) -> &[Blob] {
         self.blobs.found()
     }
 
     /// Whether the frame held more than there was room for.
-    pub fn is_cluttered(&self) -> bool {
+    pub(super) fn is_cluttered(&self) -> bool {
         self.blobs.dropped_runs() > 0
     }
 
     /// Cuts a long region where, along it, hardly anything of its body is left between two objects whose halos meet.
-    pub fn parts(&self, blob: &Blob) -> Parts {
+    pub(super) fn parts(&self, blob: &Blob) -> Parts {
         let mut parts = Parts::whole();
         let Some(start) = self.start(blob, &parts.get(0)) else {
             return parts;
@@ -250,7 +250,7 @@ impl Regions {
 
     /// The ellipse with the same second moments as the part of a region that stands out at least by a share of its RMS
     /// contrast, holes filled: faint fringes do not count.
-    pub fn start(&self, blob: &Blob, part: &Part) -> Option<Start> {
+    pub(super) fn start(&self, blob: &Blob, part: &Part) -> Option<Start> {
         let (mut n, mut sx, mut sy, mut sxx, mut sxy, mut syy) = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0);
         let strong = (CORE * CORE * blob.contrast_sum / blob.area_px) as f32;
         for span in self.blobs.spans(blob) {
@@ -297,7 +297,7 @@ impl Regions {
 
     /// Columns and rows (first and last, px) that may hold the object: those of its region, and the outermost patches
     /// beside it unless a line of quite another contrast runs there.
-    pub fn room(&self, blob: &Blob, (width, height): (usize, usize)) -> [f32; 4] {
+    pub(super) fn room(&self, blob: &Blob, (width, height): (usize, usize)) -> [f32; 4] {
         let [left, top, right, bottom] = blob.bounds.map(|b| b as usize);
         let most = 2.0 * blob.peak as f32;
         let calm = |x: usize, y: usize| {
@@ -340,7 +340,12 @@ impl Regions {
     }
 
     /// Area of the region's strong patches (mean square above `strong`) for which `outside` holds, px.
-    pub fn area_where(&self, blob: &Blob, strong: f32, outside: impl Fn(f64, f64) -> bool) -> f64 {
+    pub(super) fn area_where(
+        &self,
+        blob: &Blob,
+        strong: f32,
+        outside: impl Fn(f64, f64) -> bool,
+    ) -> f64 {
         let mut patches = 0.0;
         for span in self.blobs.spans(blob) {
             for x in span.start..span.end {
@@ -399,11 +404,11 @@ impl Parts {
     }
 
     /// How many there are.
-    pub fn len(&self) -> usize {
+    pub(super) fn len(&self) -> usize {
         self.count
     }
 
-    pub fn get(&self, part: usize) -> Part {
+    pub(super) fn get(&self, part: usize) -> Part {
         let cut = |k: usize| self.cuts.get(k).copied().unwrap_or(f64::INFINITY);
         Part {
             along: self.along,
@@ -419,7 +424,7 @@ impl Parts {
 
 impl Part {
     /// Whether a point belongs to it.
-    pub fn holds(&self, x: f64, y: f64) -> bool {
+    pub(super) fn holds(&self, x: f64, y: f64) -> bool {
         let u = x * self.along[0] + y * self.along[1] - self.along[2];
         u >= self.from && u < self.to
     }

@@ -170,7 +170,7 @@ pub(crate) struct Outliner {
 }
 
 impl Outliner {
-    pub fn new() -> Self {
+    pub(crate) fn new() -> Self {
         Outliner {
             thorough: false,
             rays: 0,
@@ -190,13 +190,18 @@ impl Outliner {
     }
 
     /// Points of the last outline, px.
-    pub fn points(&self) -> &[(f64, f64)] {
+    pub(crate) fn points(&self) -> &[(f64, f64)] {
         &self.points
     }
 
     /// Outlines the object within `start`; `noise` is the standard deviation of a pixel, grey levels. `None` where there
     /// is no closed step.
-    pub fn outline(&mut self, contrast: &Contrast, start: &Start, noise: f64) -> Option<Outline> {
+    pub(crate) fn outline(
+        &mut self,
+        contrast: &Contrast,
+        start: &Start,
+        noise: f64,
+    ) -> Option<Outline> {
         let polarity = self.lay(contrast, start, noise)?;
         let (long_px, short_px) = self.half_axes_px();
         let trust = ((ROUND.1 - long_px / short_px.max(1.0)) / (ROUND.1 - ROUND.0)).clamp(0.0, 1.0);

@@ -18,7 +18,7 @@ pub(crate) struct Identity {
 }
 
 impl Identity {
-    pub fn new(fix: &Fix, size: Option<(f64, f64)>) -> Self {
+    pub(super) fn new(fix: &Fix, size: Option<(f64, f64)>) -> Self {
         Identity {
             amplitude: fix.amplitude,
             residual: fix.residual_ratio,
@@ -28,11 +28,16 @@ impl Identity {
     }
 
     /// Peak contrast, grey levels.
-    pub fn amplitude(&self) -> f64 {
+    pub(super) fn amplitude(&self) -> f64 {
         self.amplitude
     }
 
-    pub fn agrees(&self, config: &TrackerConfig, fix: &Fix, size: Option<(f64, f64)>) -> bool {
+    pub(super) fn agrees(
+        &self,
+        config: &TrackerConfig,
+        fix: &Fix,
+        size: Option<(f64, f64)>,
+    ) -> bool {
         let amplitude = (fix.amplitude / self.amplitude - 1.0).abs() <= config.max_amplitude_change;
         let residual = fix.residual_ratio <= config.max_residual_growth * self.residual.max(1.0);
         let size = match (self.size, size) {
@@ -45,7 +50,7 @@ impl Identity {
     }
 
     /// Follows slow changes of light and focus.
-    pub fn update(&mut self, fix: &Fix, size: Option<(f64, f64)>) {
+    pub(super) fn update(&mut self, fix: &Fix, size: Option<(f64, f64)>) {
         self.fixes += 1.0;
         let share = FORGETTING.max(1.0 / self.fixes);
         self.amplitude += share * (fix.amplitude - self.amplitude);

@@ -34,7 +34,7 @@ pub(crate) struct Randomness {
 }
 
 impl Randomness {
-    pub fn of(config: &TrackerConfig) -> Self {
+    pub(super) fn of(config: &TrackerConfig) -> Self {
         Randomness {
             diffusion_px2_per_s: config.diffusion_px2_per_s,
             velocity_walk: config.velocity_walk_px_per_s15,
@@ -129,7 +129,7 @@ pub(crate) struct Motion {
 }
 
 impl Motion {
-    pub fn new(fix: &Fix) -> Self {
+    pub(super) fn new(fix: &Fix) -> Self {
         let (rx, ry) = variances(fix);
         Motion {
             x: Axis::new(fix.x_px, rx),
@@ -138,51 +138,56 @@ impl Motion {
         }
     }
 
-    pub fn predict(&mut self, dt_s: f64, (flow_x, flow_y): (f64, f64), randomness: &Randomness) {
+    pub(super) fn predict(
+        &mut self,
+        dt_s: f64,
+        (flow_x, flow_y): (f64, f64),
+        randomness: &Randomness,
+    ) {
         self.x.predict(dt_s, flow_x, randomness);
         self.y.predict(dt_s, flow_y, randomness);
         self.since_s += dt_s;
     }
 
-    pub fn position(&self) -> (f64, f64) {
+    pub(super) fn position(&self) -> (f64, f64) {
         (self.x.p, self.y.p)
     }
 
     /// The way that goes with a commanded one, px, and with what no command explains, in `time_s`.
-    pub fn way_px(&self, (x, y): (f64, f64), time_s: f64) -> (f64, f64) {
+    pub(super) fn way_px(&self, (x, y): (f64, f64), time_s: f64) -> (f64, f64) {
         let way = |axis: &Axis, px: f64| px * (1.0 + axis.e) + axis.v * time_s;
         (way(&self.x, x), way(&self.y, y))
     }
 
     /// Time since the last fix that was taken in, s.
-    pub fn since_s(&self) -> f64 {
+    pub(super) fn since_s(&self) -> f64 {
         self.since_s
     }
 
     /// From the prediction to a fix, px.
-    pub fn way_to(&self, fix: &Fix) -> (f64, f64) {
+    pub(super) fn way_to(&self, fix: &Fix) -> (f64, f64) {
         (fix.x_px - self.x.p, fix.y_px - self.y.p)
     }
 
     /// Standard deviation of the predicted position, the larger axis, px.
-    pub fn sd_px(&self) -> f64 {
+    pub(super) fn sd_px(&self) -> f64 {
         self.x.pp.max(self.y.pp).sqrt()
     }
 
     /// Squared innovation over its variance, both axes.
-    pub fn distance2(&self, fix: &Fix) -> f64 {
+    pub(super) fn distance2(&self, fix: &Fix) -> f64 {
         let (rx, ry) = variances(fix);
         (fix.x_px - self.x.p).powi(2) / (self.x.pp + rx)
             + (fix.y_px - self.y.p).powi(2) / (self.y.pp + ry)
     }
 
     /// Minus twice the logarithm of the density of the fix (per px^2) while the flow is quiet.
-    pub fn quiet_cost(&self, fix: &Fix) -> f64 {
+    pub(super) fn quiet_cost(&self, fix: &Fix) -> f64 {
         self.distance2(fix) + self.cost_of_width(fix)
     }
 
     /// As [`Self::quiet_cost`], of a bead whose motion may not decide alone.
-    pub fn capped_cost(&self, fix: &Fix) -> f64 {
+    pub(super) fn capped_cost(&self, fix: &Fix) -> f64 {
         self.distance2(fix).min(MOST_DISTANCE2) + self.cost_of_width(fix)
     }
 
@@ -193,7 +198,7 @@ impl Motion {
 
     /// Minus twice the logarithm of the density of the fix (per px^2) when the flow has stepped since the last fix: the chance
     /// of a step in that time, and a speed of any magnitude in any direction, `1 / (LOG_RANGE 2 pi way^2)`.
-    pub fn step_cost(&self, fix: &Fix) -> f64 {
+    pub(super) fn step_cost(&self, fix: &Fix) -> f64 {
         let (x, y) = self.way_to(fix);
         // Nearer than the prediction is known no step can be told.
         let way2 = (x * x + y * y).max(self.x.pp + self.y.pp);
@@ -202,18 +207,18 @@ impl Motion {
     }
 
     /// Whether a step of the flow explains the fix better than the quiet walk.
-    pub fn has_stepped(&self, fix: &Fix) -> bool {
+    pub(super) fn has_stepped(&self, fix: &Fix) -> bool {
         self.step_cost(fix) < self.quiet_cost(fix)
     }
 
     /// Minus twice the logarithm of the density of the fix (per px^2) under the likelier hypothesis.
-    pub fn surprise(&self, fix: &Fix) -> f64 {
+    pub(super) fn surprise(&self, fix: &Fix) -> f64 {
         self.step_cost(fix).min(self.quiet_cost(fix))
     }
 
     /// Goes along with a step of the flow that has carried the bead this far from the prediction since its last fix: the
     /// velocity is as uncertain as what has been seen of it.
-    pub fn carry(&mut self, way_px: (f64, f64)) {
+    pub(super) fn carry(&mut self, way_px: (f64, f64)) {
         if self.since_s > 0.0 {
             self.x.carry(way_px.0, self.since_s);
             self.y.carry(way_px.1, self.since_s);
@@ -221,7 +226,7 @@ impl Motion {
     }
 
     /// Takes a fix in, with a step of the flow where that is the likelier hypothesis.
-    pub fn update(&mut self, fix: &Fix) {
+    pub(super) fn update(&mut self, fix: &Fix) {
         if self.has_stepped(fix) {
             self.carry(self.way_to(fix));
         }
@@ -232,7 +237,7 @@ impl Motion {
     }
 
     /// The motion as it is predicted when the flow has carried everything this far beside the prediction.
-    pub fn shifted(&self, way_px: (f64, f64)) -> Self {
+    pub(super) fn shifted(&self, way_px: (f64, f64)) -> Self {
         let mut shifted = *self;
         shifted.x.p += way_px.0;
         shifted.y.p += way_px.1;

@@ -24,7 +24,7 @@ pub(crate) struct Candidate {
 
 impl Candidate {
     /// A fit, whatever it started from.
-    pub fn new(fix: Fix, size: Option<(f64, f64)>) -> Self {
+    pub(super) fn new(fix: Fix, size: Option<(f64, f64)>) -> Self {
         Self {
             fix,
             size,
@@ -62,18 +62,23 @@ type Candidates = [Option<Candidate>; MAX_BEADS];
 
 impl Neighbours {
     /// Predicted positions (px) and amplitudes (grey levels) of the neighbours.
-    pub fn predictions(&self) -> impl Iterator<Item = (f64, f64, f64)> {
+    pub(super) fn predictions(&self) -> impl Iterator<Item = (f64, f64, f64)> {
         self.beads.iter().flatten().map(|n| {
             let (x, y) = n.motion.position();
             (x, y, n.amplitude)
         })
     }
 
-    pub fn count(&self) -> usize {
+    pub(super) fn count(&self) -> usize {
         self.beads.iter().flatten().count()
     }
 
-    pub fn predict(&mut self, dt_s: f64, flow_px_per_s: (f64, f64), randomness: &Randomness) {
+    pub(super) fn predict(
+        &mut self,
+        dt_s: f64,
+        flow_px_per_s: (f64, f64),
+        randomness: &Randomness,
+    ) {
         for n in self.beads.iter_mut().flatten() {
             n.motion.predict(dt_s, flow_px_per_s, randomness);
         }
@@ -82,7 +87,7 @@ impl Neighbours {
     /// Whether the candidate `best` is surely the chosen bead, whose motion is `ours`: every other reading of the frame
     /// (the chosen bead is another candidate, however badly fitted, or hidden, and `best` is a neighbour) must cost more
     /// by `certainty`.
-    pub fn claim(
+    pub(super) fn claim(
         &self,
         ours: &Motion,
         candidates: &Candidates,
@@ -111,7 +116,7 @@ impl Neighbours {
 
     /// Cost of the reading in which the chosen bead is the candidate `own`, or hidden. A flow that has stepped carries all beads
     /// alike: in that hypothesis the others are looked for as far from their predictions as the chosen one was found.
-    pub fn cost(&self, ours: &Motion, candidates: &Candidates, own: Option<usize>) -> f64 {
+    pub(super) fn cost(&self, ours: &Motion, candidates: &Candidates, own: Option<usize>) -> f64 {
         let own_fix = own.and_then(|k| Some(candidates.get(k)?.as_ref()?.fix));
         let Some(fix) = own_fix else {
             return MISS + self.cost_of_others(candidates, None, (0.0, 0.0));
@@ -155,7 +160,7 @@ impl Neighbours {
     }
 
     /// Goes along with a step of the flow that has carried the chosen bead this far.
-    pub fn carry(&mut self, way_px: (f64, f64)) {
+    pub(super) fn carry(&mut self, way_px: (f64, f64)) {
         for n in self.beads.iter_mut().flatten() {
             n.motion.carry(way_px);
         }
@@ -163,7 +168,7 @@ impl Neighbours {
 
     /// Takes in what was seen beside the chosen bead (`taken`, whose motion is `ours`). While the chosen bead itself is
     /// not seen, a candidate that it could be does not count as a sight of a neighbour.
-    pub fn update(
+    pub(super) fn update(
         &mut self,
         ours: &Motion,
         candidates: &Candidates,

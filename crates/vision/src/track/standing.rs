@@ -31,7 +31,7 @@ impl Default for Standing {
 
 impl Standing {
     /// Goes on to `time_s`: the step from the time before, and the time. A time that is past or no number is no step.
-    pub fn elapse(&mut self, time_s: f64) -> (f64, f64) {
+    pub(super) fn elapse(&mut self, time_s: f64) -> (f64, f64) {
         let dt_s = self.time_s.map_or(0.0, |before| (time_s - before).max(0.0));
         let dt_s = if dt_s.is_finite() { dt_s } else { 0.0 };
         let time_s = self
@@ -43,7 +43,7 @@ impl Standing {
     }
 
     /// The state after a frame's decision; `before` as predicted for the frame, `now` with its fix taken in.
-    pub fn settle(
+    pub(super) fn settle(
         &mut self,
         decision: Decision,
         fix: Option<Fix>,

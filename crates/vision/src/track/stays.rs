@@ -43,7 +43,7 @@ impl Still {
 impl Stays {
     /// Takes in the objects of a frame; `carried_px` is what the commanded flow moves in it since the frame before, and
     /// `followed` the cell that is followed where it was seen in this frame.
-    pub fn see(&mut self, cells: &[Cell], carried_px: (f64, f64), followed: Option<&Cell>) {
+    pub(super) fn see(&mut self, cells: &[Cell], carried_px: (f64, f64), followed: Option<&Cell>) {
         let place = followed.map(|c| (c.x_px, c.y_px));
         for slot in &mut self.still {
             let Some(still) = slot else { continue };
@@ -97,7 +97,7 @@ impl Stays {
     }
 
     /// Whether this is something that stays.
-    pub fn holds(&self, cell: &Cell) -> bool {
+    pub(super) fn holds(&self, cell: &Cell) -> bool {
         let mut still = self.still.iter().flatten();
         still.any(|still| still.passed && still.frames >= FRAMES && still.is(cell))
     }

@@ -9,20 +9,20 @@ use cellpos_vision::{
 };
 use nalgebra::{Matrix4, Vector4};
 
-pub const SIDE: usize = 200;
-pub const BACKGROUND: f64 = 20_000.0;
-pub const AMPLITUDE: f64 = 4000.0;
+pub(crate) const SIDE: usize = 200;
+pub(crate) const BACKGROUND: f64 = 20_000.0;
+pub(crate) const AMPLITUDE: f64 = 4000.0;
 /// Frames that settings are learnt from, and frames that are then measured.
 const LEARNT_FROM: usize = 20;
 
 /// A field of beads far enough from each other to have nothing in common.
-pub struct Field {
+pub(crate) struct Field {
     pub places: Vec<(f64, f64)>,
     pub pixels: Vec<u16>,
 }
 
 impl Field {
-    pub fn new(profile: &dyn RadialProfile, snr: f64, random: &mut Random) -> Self {
+    pub(crate) fn new(profile: &dyn RadialProfile, snr: f64, random: &mut Random) -> Self {
         let pitch = (2.6 * profile.support_px().min(4.5 * profile.radius_px())).max(24.0);
         let count = (SIDE as f64 / pitch) as usize;
         let pitch = SIDE as f64 / count as f64;
@@ -55,7 +55,7 @@ impl Field {
         }
     }
 
-    pub fn frame(&self) -> Frame<'_> {
+    pub(crate) fn frame(&self) -> Frame<'_> {
         Frame {
             width: SIDE,
             height: SIDE,
@@ -66,7 +66,7 @@ impl Field {
 
 /// Cramer-Rao bound of one coordinate, px, averaged over the places within a pixel: the whole picture is used, amplitude and
 /// background are free.
-pub fn bound(profile: &dyn RadialProfile, snr: f64) -> f64 {
+pub(crate) fn bound(profile: &dyn RadialProfile, snr: f64) -> f64 {
     let reach = profile.support_px().ceil() as i32 + 1;
     let mut sum = 0.0;
     let cells = 4;
@@ -90,7 +90,7 @@ pub fn bound(profile: &dyn RadialProfile, snr: f64) -> f64 {
 
 /// What became of the good fixes of a field.
 #[derive(Debug, Default, Clone)]
-pub struct Score {
+pub(crate) struct Score {
     pub beads: f64,
     pub good: f64,
     pub lies: f64,
@@ -117,15 +117,15 @@ impl Score {
             self.stated2 += 0.5 * (fix.var_x_px2 + fix.var_y_px2);
         }
     }
-    pub fn rms(&self) -> f64 {
+    pub(crate) fn rms(&self) -> f64 {
         (self.error2 / self.good).sqrt()
     }
-    pub fn stated(&self) -> f64 {
+    pub(crate) fn stated(&self) -> f64 {
         (self.stated2 / self.good).sqrt()
     }
 }
 
-pub fn measured_in(
+pub(crate) fn measured_in(
     localiser: &mut Localiser,
     profile: &dyn RadialProfile,
     snr: f64,
@@ -165,12 +165,12 @@ fn measured(
     measured_in(localiser, profile, snr, random, fixes, &|_| {})
 }
 
-pub fn gaussian(sigma_px: f64) -> (String, Box<dyn RadialProfile>) {
+pub(crate) fn gaussian(sigma_px: f64) -> (String, Box<dyn RadialProfile>) {
     let profile = GaussianProfile::new(sigma_px).unwrap();
     (format!("Gaussian {sigma_px} px"), Box::new(profile))
 }
 
-pub fn ring(edge_px: f64) -> (String, Box<dyn RadialProfile>) {
+pub(crate) fn ring(edge_px: f64) -> (String, Box<dyn RadialProfile>) {
     let profile = RingProfile::new(edge_px).unwrap();
     (format!("ring {edge_px} px"), Box::new(profile))
 }
@@ -197,7 +197,7 @@ impl RadialProfile for Disc {
     }
 }
 
-pub fn disc(radius_px: f64) -> (String, Box<dyn RadialProfile>) {
+pub(crate) fn disc(radius_px: f64) -> (String, Box<dyn RadialProfile>) {
     let edge_px = 0.6;
     (
         format!("disc {radius_px} px"),

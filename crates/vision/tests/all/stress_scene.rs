@@ -8,7 +8,7 @@ const BACKGROUND: f64 = 20_000.0;
 const AMPLITUDE: f64 = 4000.0;
 /// What spoils a picture.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Spoil {
+pub(crate) enum Spoil {
     Clean,
     /// Out of focus: this many times as large.
     Defocus(f64),
@@ -34,7 +34,7 @@ pub enum Spoil {
     TwelveBit,
 }
 
-pub const ALL: [Spoil; 12] = [
+pub(crate) const ALL: [Spoil; 12] = [
     Spoil::Clean,
     Spoil::Defocus(1.15),
     Spoil::Blur(0.5),
@@ -49,7 +49,7 @@ pub const ALL: [Spoil; 12] = [
     Spoil::TwelveBit,
 ];
 
-pub struct Scene<'a> {
+pub(crate) struct Scene<'a> {
     pub profile: &'a dyn RadialProfile,
     snr: f64,
     spoil: Spoil,
@@ -58,7 +58,7 @@ pub struct Scene<'a> {
     dust: Vec<[f64; 6]>,
 }
 
-pub struct Picture {
+pub(crate) struct Picture {
     pub places: Vec<(f64, f64)>,
     pixels: Vec<u16>,
     /// The same with 8 bits, where the picture has no more.
@@ -68,7 +68,7 @@ pub struct Picture {
 }
 
 impl<'a> Scene<'a> {
-    pub fn new(profile: &'a dyn RadialProfile, snr: f64, spoil: Spoil, seed: u64) -> Self {
+    pub(crate) fn new(profile: &'a dyn RadialProfile, snr: f64, spoil: Spoil, seed: u64) -> Self {
         let mut random = Random(seed);
         let hot = (0..SIDE * SIDE / 100).map(|_| {
             let at = (random.uniform() * (SIDE * SIDE) as f64) as usize;
@@ -117,7 +117,7 @@ impl<'a> Scene<'a> {
         }
     }
 
-    pub fn picture(&self, random: &mut Random) -> Picture {
+    pub(crate) fn picture(&self, random: &mut Random) -> Picture {
         let mut grey = vec![BACKGROUND; SIDE * SIDE];
         let radius = self.profile.radius_px();
         let reach = self.profile.support_px().min(4.5 * radius);
@@ -231,7 +231,7 @@ impl<'a> Scene<'a> {
 }
 
 impl Picture {
-    pub fn frame(&self) -> Frame<'_> {
+    pub(crate) fn frame(&self) -> Frame<'_> {
         Frame {
             width: SIDE,
             height: SIDE,
@@ -333,6 +333,6 @@ impl RadialProfile for Halo {
     }
 }
 
-pub fn halo(size_px: f64) -> (String, Box<dyn RadialProfile>) {
+pub(crate) fn halo(size_px: f64) -> (String, Box<dyn RadialProfile>) {
     (format!("table {size_px} px"), Box::new(Halo(size_px)))
 }

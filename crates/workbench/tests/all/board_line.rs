@@ -9,10 +9,10 @@ use std::sync::{Arc, Mutex};
 use std::time::Instant;
 
 /// What somebody does to messages: none is passed on, one, or another.
-pub type Tamper<M> = fn(M) -> Option<M>;
+pub(crate) type Tamper<M> = fn(M) -> Option<M>;
 
 /// A board that can be reset, shared by the ports to it.
-pub struct Desk {
+pub(crate) struct Desk {
     board: Board,
     start: Instant,
     out: VecDeque<u8>,
@@ -20,7 +20,7 @@ pub struct Desk {
 }
 
 impl Desk {
-    pub fn new() -> Arc<Mutex<Self>> {
+    pub(crate) fn new() -> Arc<Mutex<Self>> {
         Arc::new(Mutex::new(Self {
             board: BoardConfig::default().board().unwrap(),
             start: Instant::now(),
@@ -34,7 +34,7 @@ impl Desk {
     }
 
     /// The microcontroller is reset; its converter keeps its code. `forgets`: as a firmware that does not go to park.
-    pub fn reset(&mut self, forgets: bool) {
+    pub(crate) fn reset(&mut self, forgets: bool) {
         let (config, applied_pm) = (*self.board.config(), self.board.applied_pm());
         let again = if forgets {
             Board::new(cellpos_board::Config {
@@ -83,7 +83,7 @@ impl Desk {
 }
 
 /// A port to the board.
-pub struct DeskPort {
+pub(crate) struct DeskPort {
     desk: Arc<Mutex<Desk>>,
     to_board: Option<(Decoder<ToBoard>, Tamper<ToBoard>)>,
     to_host: Option<(Decoder<ToHost>, Tamper<ToHost>)>,
@@ -91,7 +91,7 @@ pub struct DeskPort {
 }
 
 impl DeskPort {
-    pub fn new(desk: &Arc<Mutex<Desk>>) -> Self {
+    pub(crate) fn new(desk: &Arc<Mutex<Desk>>) -> Self {
         Self {
             desk: Arc::clone(desk),
             to_board: None,
@@ -100,12 +100,12 @@ impl DeskPort {
         }
     }
 
-    pub fn changing_orders(mut self, tamper: Tamper<ToBoard>) -> Self {
+    pub(crate) fn changing_orders(mut self, tamper: Tamper<ToBoard>) -> Self {
         self.to_board = Some((Decoder::new(), tamper));
         self
     }
 
-    pub fn changing_answers(mut self, tamper: Tamper<ToHost>) -> Self {
+    pub(crate) fn changing_answers(mut self, tamper: Tamper<ToHost>) -> Self {
         self.to_host = Some((Decoder::new(), tamper));
         self
     }

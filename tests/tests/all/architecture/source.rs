@@ -98,7 +98,7 @@ fn without_tests(text: &str) -> String {
 }
 
 /// One module: a file, its path in the crate, what it defines and what it names of its crate.
-pub struct Module {
+pub(super) struct Module {
     pub file: PathBuf,
     pub defines: BTreeSet<String>,
     /// `pub use`: the name given, the path it stands for.
@@ -107,7 +107,7 @@ pub struct Module {
 }
 
 /// Path of a file as a module of its crate.
-pub fn module_path(source: &Path, file: &Path) -> Vec<String> {
+pub(super) fn module_path(source: &Path, file: &Path) -> Vec<String> {
     let inner = file.strip_prefix(source).unwrap().with_extension("");
     let mut parts: Vec<String> = inner
         .iter()
@@ -192,7 +192,7 @@ fn use_tree(words: &[String], prefix: &[String], found: &mut Vec<(String, Vec<St
 }
 
 /// Reads a file.
-pub fn read_module(file: &Path) -> Module {
+pub(super) fn read_module(file: &Path) -> Module {
     const ITEMS: [&str; 9] = [
         "fn",
         "struct",

@@ -8,10 +8,10 @@ use std::process::{Child, Command, ExitStatus, Stdio};
 use std::time::{Duration, Instant};
 
 /// The page says that the loop is closed, or that the PZT is moved.
-pub const RUNNING: &str = "return document.body.dataset.state === 'running'";
+pub(super) const RUNNING: &str = "return document.body.dataset.state === 'running'";
 
 /// A command with a live page.
-pub struct Watched {
+pub(super) struct Watched {
     pub child: Child,
     /// The link to act; none of a page that may look only.
     pub operator: String,
@@ -21,28 +21,28 @@ pub struct Watched {
 
 impl Watched {
     /// A command that prints both links.
-    pub fn start(folder: &Path, line: &str) -> Self {
+    pub(super) fn start(folder: &Path, line: &str) -> Self {
         let mut command = programs::cellpos(folder, line);
         command.stdin(Stdio::null());
         Self::printing(command, &["to act:", "to look:"])
     }
 
     /// `cellpos watch`: a page that may look only.
-    pub fn looking(folder: &Path, line: &str) -> Self {
+    pub(super) fn looking(folder: &Path, line: &str) -> Self {
         let mut command = programs::cellpos(folder, line);
         command.stdin(Stdio::null());
         Self::printing(command, &["to look:"])
     }
 
     /// A command that prints both links and reads standard input, which stays open.
-    pub fn open(folder: &Path, line: &str) -> Self {
+    pub(super) fn open(folder: &Path, line: &str) -> Self {
         let mut command = programs::cellpos(folder, line);
         command.stdin(Stdio::piped());
         Self::printing(command, &["to act:", "to look:"])
     }
 
     /// A command that prints the links behind these words.
-    pub fn printing(mut command: Command, links: &[&str]) -> Self {
+    pub(super) fn printing(mut command: Command, links: &[&str]) -> Self {
         let mut child = command
             .stderr(Stdio::piped())
             .stdout(Stdio::null())
@@ -65,7 +65,7 @@ impl Watched {
         }
     }
 
-    pub fn ended(mut self) -> ExitStatus {
+    pub(super) fn ended(mut self) -> ExitStatus {
         let deadline = Instant::now() + programs::PATIENCE;
         loop {
             if let Some(status) = self.child.try_wait().expect("a child") {
@@ -85,7 +85,7 @@ impl Drop for Watched {
 }
 
 /// Waits until something on the page says so.
-pub fn shows(page: &Browser, id: &str, pattern: &str) {
+pub(super) fn shows(page: &Browser, id: &str, pattern: &str) {
     page.wait_for(
         &format!("return /{pattern}/.test(document.getElementById('{id}').textContent)"),
         programs::PATIENCE,
@@ -93,7 +93,7 @@ pub fn shows(page: &Browser, id: &str, pattern: &str) {
 }
 
 /// Pictures of a page as it is, light and dark, on a wide and a narrow window, to be looked at.
-pub fn portraits(url: &str, name: &str) {
+pub(super) fn portraits(url: &str, name: &str) {
     for (width, height) in [(1400, 1900), (400, 3600)] {
         let page = Browser::start(1400, 1000);
         page.resize(width, height);
@@ -117,7 +117,7 @@ pub fn portraits(url: &str, name: &str) {
 }
 
 /// The folder of the only run below `runs`, and the summary in its `run.toml`.
-pub fn only_run(folder: &Path) -> (std::path::PathBuf, toml::Table) {
+pub(super) fn only_run(folder: &Path) -> (std::path::PathBuf, toml::Table) {
     let runs = std::fs::read_dir(folder.join("runs")).unwrap().flatten();
     let found: Vec<_> = runs.map(|entry| entry.path()).collect();
     let [run] = found.as_slice() else {
@@ -130,7 +130,7 @@ pub fn only_run(folder: &Path) -> (std::path::PathBuf, toml::Table) {
 }
 
 /// What the page says is what the run's summary says: counts, error, and the tails of the ticks' times.
-pub fn says_the_summary(page: &Browser, summary: &toml::Table) {
+pub(super) fn says_the_summary(page: &Browser, summary: &toml::Table) {
     for (id, key) in [
         ("f-late", "late"),
         ("f-skipped", "skipped"),
@@ -161,7 +161,7 @@ pub fn says_the_summary(page: &Browser, summary: &toml::Table) {
 }
 
 /// Where pictures of the page are kept, to be looked at.
-pub fn pictures() -> std::path::PathBuf {
+pub(super) fn pictures() -> std::path::PathBuf {
     let folder = programs::folder().join("live-page");
     std::fs::create_dir_all(&folder).expect("a folder for pictures");
     folder

@@ -26,7 +26,7 @@ use std::path::{Path, PathBuf};
 Designs a controller for the model as given, as identified, and as reconciled, and runs the rig with each. The hidden model (--hidden,
 or [emulator] model) drives the emulated rig and gives the true margins of the report; the steps never see it. Exit code 0: done; 1: the last
 loop ended in Safe, or there is no verdict.")]
-pub struct Args {
+pub(crate) struct Args {
     /// Hidden model of the emulated rig: a model.toml.
     #[arg(long)]
     hidden: Option<PathBuf>,
@@ -87,7 +87,7 @@ pub struct Args {
 }
 
 /// Runs the command.
-pub fn run(args: Args) -> CommandResult {
+pub(crate) fn run(args: Args) -> CommandResult {
     checked(&args)?;
     output::ready(args.out.iter().chain(&args.report))?;
     let given = Model::load(&args.model).map_err(Failure::input)?;

@@ -178,7 +178,7 @@ fn sentence(circle: &Circle) -> String {
 }
 
 /// The page.
-pub fn report(circle: &Circle, gap: &Path) -> Report {
+pub(super) fn report(circle: &Circle, gap: &Path) -> Report {
     let mut r = Report::new("Closed circle: identify, reconcile, design again, track");
     let status = match circle.reconciled.verdict {
         cellpos_reconcile::Verdict::Unknown => Emphasis::Bad,
@@ -344,7 +344,7 @@ fn margins_table(circle: &Circle) -> Table {
 }
 
 /// The same for a terminal.
-pub fn text(circle: &Circle, out: &Path, html: &Path) -> String {
+pub(super) fn text(circle: &Circle, out: &Path, html: &Path) -> String {
     use std::fmt::Write as _;
     let mut s = String::new();
     let _ = writeln!(s, "verdict: {}", verdict_and_names(circle));

@@ -6,7 +6,7 @@ use serde_json::{Value, json};
 use std::fmt::Write as _;
 
 /// One object; a figure that does not exist (no crossover, no settling) is null.
-pub fn json(model: &str, request: &DesignRequest, report: &DesignReport) -> Value {
+pub(super) fn json(model: &str, request: &DesignRequest, report: &DesignReport) -> Value {
     let m = &report.margins;
     let ts = request.plant.sample_time_s;
     let nm = |um: f64| um * 1e3;
@@ -104,7 +104,7 @@ fn line(out: &mut String, name: &str, value: f64, decimals: usize, unit: &str) {
 }
 
 /// The figures for a reader.
-pub fn table(model: &str, request: &DesignRequest, report: &DesignReport) -> String {
+pub(super) fn table(model: &str, request: &DesignRequest, report: &DesignReport) -> String {
     let (m, ts) = (&report.margins, request.plant.sample_time_s);
     let mut out = String::new();
     let loud: Vec<&DesignWarning> = report

@@ -6,7 +6,7 @@ use std::path::Path;
 /// How bad it is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "kebab-case")]
-pub enum Weight {
+pub(super) enum Weight {
     /// As it should be.
     Good,
     /// May cost some microseconds, or a run under other circumstances.
@@ -17,7 +17,7 @@ pub enum Weight {
 
 /// One thing that was looked at.
 #[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct Finding {
+pub(super) struct Finding {
     /// What was looked at.
     pub what: &'static str,
     /// What was found.
@@ -52,7 +52,7 @@ fn finding(
 }
 
 /// The files that tell: below `/` on a machine, below a folder in a test.
-pub struct Machine<'p> {
+pub(super) struct Machine<'p> {
     /// What stands for `/`.
     pub root: &'p Path,
     /// CPU that the control thread is pinned to.
@@ -62,7 +62,7 @@ pub struct Machine<'p> {
 }
 
 /// Bytes on the disk for each second of a run at 1 kHz: the stream of ticks while it runs, and the Parquet file at its end.
-pub const BYTES_PER_S: f64 = 450e3;
+pub(super) const BYTES_PER_S: f64 = 450e3;
 
 impl Machine<'_> {
     fn read(&self, path: &str) -> Option<String> {
@@ -83,7 +83,7 @@ impl Machine<'_> {
     }
 
     /// Looks at everything.
-    pub fn findings(&self) -> Vec<Finding> {
+    pub(super) fn findings(&self) -> Vec<Finding> {
         let looked = [
             Some(self.count()),
             Some(self.isolation()),
@@ -313,7 +313,7 @@ impl Machine<'_> {
     }
 
     /// Whether serial ports that are there may be opened.
-    pub fn serial_ports(&self) -> Option<Finding> {
+    pub(super) fn serial_ports(&self) -> Option<Finding> {
         let ports: Vec<std::path::PathBuf> = self
             .entries("/dev")
             .into_iter()
@@ -342,7 +342,7 @@ impl Machine<'_> {
 }
 
 /// Room on the disk for a run of this length, below a folder.
-pub fn disk(folder: &Path, run_s: f64) -> Option<Finding> {
+pub(super) fn disk(folder: &Path, run_s: f64) -> Option<Finding> {
     let there = folder
         .ancestors()
         .find(|path| path.exists())

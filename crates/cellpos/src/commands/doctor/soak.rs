@@ -10,11 +10,11 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
 /// A wake-up later than this is one to be explained, ns: a fifth of the period.
-pub const LATE_NS: u64 = 200_000;
+pub(super) const LATE_NS: u64 = 200_000;
 
 /// What the loop measured.
 #[derive(Debug, Clone, Serialize)]
-pub struct Soak {
+pub(super) struct Soak {
     /// What was obtained.
     pub conditions: Conditions,
     /// How long it ran, s.
@@ -35,7 +35,7 @@ pub struct Soak {
 }
 
 /// Runs the loop, until `stop` is raised. `why`: whether to look at what else runs (ten looks a second, at low priority).
-pub fn soak(
+pub(super) fn soak(
     request: Request,
     duration: Duration,
     why: bool,

@@ -13,14 +13,14 @@ const WAITING: usize = 128;
 
 /// Late wake-ups, handed over without a lock: from the due time to the wake-up, ns of the monotonic clock. When it is full,
 /// or two are written at once, one is forgotten.
-pub struct LateWindows {
+pub(super) struct LateWindows {
     from_ns: [AtomicI64; WAITING],
     to_ns: [AtomicI64; WAITING],
     next: std::sync::atomic::AtomicUsize,
 }
 
 impl LateWindows {
-    pub fn new() -> Self {
+    pub(super) fn new() -> Self {
         Self {
             from_ns: std::array::from_fn(|_| AtomicI64::new(0)),
             to_ns: std::array::from_fn(|_| AtomicI64::new(0)),
@@ -29,7 +29,7 @@ impl LateWindows {
     }
 
     /// A wake-up at `now_ns` that was `late_ns` late.
-    pub fn add(&self, now_ns: i64, late_ns: i64) {
+    pub(super) fn add(&self, now_ns: i64, late_ns: i64) {
         let place = self.next.fetch_add(1, Ordering::Relaxed) % WAITING;
         self.from_ns[place].store(now_ns - late_ns, Ordering::Relaxed);
         self.to_ns[place].store(now_ns, Ordering::Release);
@@ -47,7 +47,7 @@ impl LateWindows {
 }
 
 /// The trace instance; it goes away when dropped.
-pub struct Tracing {
+pub(super) struct Tracing {
     folder: PathBuf,
     cpu: Option<usize>,
     /// Late wake-ups that were evaluated, and those that the record no longer covered.
@@ -58,7 +58,7 @@ pub struct Tracing {
 
 impl Tracing {
     /// Starts to record on the CPU of the loop (on all if it is not pinned), or returns the reason.
-    pub fn start(cpu: Option<usize>) -> Result<Self, String> {
+    pub(super) fn start(cpu: Option<usize>) -> Result<Self, String> {
         let root = ["/sys/kernel/tracing", "/sys/kernel/debug/tracing"]
             .into_iter()
             .map(Path::new)
@@ -98,7 +98,7 @@ impl Tracing {
     }
 
     /// Looks at the late wake-ups that came since the last look.
-    pub fn look(&mut self, windows: &LateWindows) {
+    pub(super) fn look(&mut self, windows: &LateWindows) {
         let late = windows.take();
         if late.is_empty() {
             return;
@@ -127,7 +127,7 @@ impl Tracing {
     }
 
     /// Who had the CPU, the longest first.
-    pub fn suspects(&self) -> Vec<Suspect> {
+    pub(super) fn suspects(&self) -> Vec<Suspect> {
         const MOST: usize = 8;
         let mut all: Vec<Suspect> = self.found.values().cloned().collect();
         all.sort_by(|a, b| b.amount.total_cmp(&a.amount).then(b.times.cmp(&a.times)));

@@ -36,7 +36,7 @@ fn no_model(r: &ForeignResult) -> &'static str {
 }
 
 /// Runs the command on records.
-pub fn run(args: &Args) -> CommandResult {
+pub(super) fn run(args: &Args) -> CommandResult {
     let mut results = Vec::new();
     let mut sources = Vec::new();
     for path in &args.data {

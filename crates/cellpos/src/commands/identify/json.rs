@@ -22,7 +22,7 @@ fn ends(interval: [f64; 2]) -> Value {
 }
 
 /// The JSON object of an identification of the emulated rig.
-pub fn identification(done: &Done, job: &Job, model: &Path, report: &Path) -> Value {
+pub(crate) fn identification(done: &Done, job: &Job, model: &Path, report: &Path) -> Value {
     let result = &done.result;
     let eq6 = TransferFunction::eq6();
     let mut parameters = Map::new();
@@ -109,7 +109,7 @@ pub fn identification(done: &Done, job: &Job, model: &Path, report: &Path) -> Va
 }
 
 /// The same for reading.
-pub fn text(done: &Done, model: &Path, report: &Path) -> String {
+pub(crate) fn text(done: &Done, model: &Path, report: &Path) -> String {
     let result = &done.result;
     let mut out = format!("model  {}\n", result.selection.best().order.formula());
     for p in &result.judged.parameters {

@@ -1,8 +1,8 @@
 //! `cellpos identify`: excite, measure the frequency response, fit, write model.toml and a report.
 
 mod foreign;
-pub mod json;
-pub mod report;
+pub(crate) mod json;
+pub(crate) mod report;
 mod response;
 mod sources;
 mod tables;
@@ -27,7 +27,7 @@ use std::path::PathBuf;
 
 /// On or off.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
-pub enum Switch {
+pub(crate) enum Switch {
     /// On.
     On,
     /// Off.
@@ -48,7 +48,7 @@ const ON_RECORDS: &str = "To fit records of any rig";
     cellpos identify --data heater.csv --input 'power [W]' --output 'T [degC]' --base order=2,delay --out base.toml\n  \
     cellpos identify --response bode.csv --out base.toml\n  \
     cellpos identify --data Model_Vi_Do.dat --input 1 --output 5 --rate 200Hz --hold none")]
-pub struct Args {
+pub(crate) struct Args {
     /// Run folders, records of cellpos, or records of any rig with --input and --output.
     #[arg(long, num_args = 1.., value_parser = crate::arguments::run_folder(), help_heading = ON_RECORDS)]
     data: Vec<PathBuf>,
@@ -148,7 +148,7 @@ pub struct Args {
 
 /// What the records' input does between rows.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
-pub enum HoldKind {
+pub(crate) enum HoldKind {
     /// Held until the next row.
     ZeroOrder,
     /// Samples of a smooth signal.
@@ -156,7 +156,7 @@ pub enum HoldKind {
 }
 
 /// The command line as typed.
-pub fn command_line() -> String {
+pub(crate) fn command_line() -> String {
     provenance::command_line()
         .iter()
         .skip(1)
@@ -164,7 +164,7 @@ pub fn command_line() -> String {
 }
 
 /// A new folder below runs/, named by the time and `name`.
-pub fn new_run_folder(name: &str) -> Result<PathBuf, Failure> {
+pub(crate) fn new_run_folder(name: &str) -> Result<PathBuf, Failure> {
     let time = jiff::Timestamp::now()
         .strftime("%Y%m%dT%H%M%SZ")
         .to_string();
@@ -335,7 +335,7 @@ fn pages(args: &Args, job: &identification::Job) -> Result<Option<Pages>, Failur
 }
 
 /// Runs `cellpos identify`.
-pub fn run(args: Args) -> CommandResult {
+pub(crate) fn run(args: Args) -> CommandResult {
     output::ready(args.out.iter().chain(&args.report))?;
     if args.base.is_some() && args.input.is_none() && args.response.is_none() {
         return Err(Failure::bad_input(

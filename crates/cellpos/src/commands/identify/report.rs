@@ -1,7 +1,7 @@
 //! The report of an identification: Bode with bands, Nyquist, residuals, traces, delay test, parameters.
 
 use super::tables::interval;
-pub use super::tables::{candidates, lines, number, parameters};
+pub(crate) use super::tables::{candidates, lines, number, parameters};
 use cellpos_experiment::identify::Done;
 use cellpos_ident::candidate_model::CandidateModel;
 use cellpos_ident::identifiability::{Identifiability, IdentifiedParameter};
@@ -10,7 +10,7 @@ use cellpos_plant::{EQ5_VELOCITY_GAIN_PER_S, Hertz, TransferFunction};
 use cellpos_report::{Axis, Emphasis, Figure, Panel, Report, Series};
 
 /// Frequencies for curves, Hz: `count` evenly in the logarithm.
-pub fn log_grid(low_hz: f64, high_hz: f64, count: usize) -> Vec<f64> {
+pub(crate) fn log_grid(low_hz: f64, high_hz: f64, count: usize) -> Vec<f64> {
     (0..count)
         .map(|i| low_hz * (high_hz / low_hz).powf(i as f64 / (count - 1) as f64))
         .collect()
@@ -51,7 +51,7 @@ fn band(result: &Identification, grid: &[f64], phase: bool) -> [Vec<f64>; 2] {
 }
 
 /// Bode plot of the compensated points, the fitted model with its 95 % band, and, if asked for, Eq. (6) and 2 pi 63/s.
-pub fn bode(
+pub(crate) fn bode(
     name: &str,
     caption: &str,
     result: &Identification,
@@ -130,7 +130,7 @@ pub fn bode(
 }
 
 /// Nyquist plot of the record and the fitted model with hold and delay.
-pub fn nyquist(result: &Identification) -> Figure {
+pub(crate) fn nyquist(result: &Identification) -> Figure {
     let (re, im): (Vec<f64>, Vec<f64>) = result
         .measured
         .points
@@ -157,7 +157,7 @@ pub fn nyquist(result: &Identification) -> Figure {
 }
 
 /// Residuals of the fit over their standard deviations.
-pub fn residuals(result: &Identification) -> Figure {
+pub(crate) fn residuals(result: &Identification) -> Figure {
     let mut f = Vec::new();
     let (mut re, mut im) = (Vec::new(), Vec::new());
     for p in &result.measured.points {
@@ -182,7 +182,7 @@ pub fn residuals(result: &Identification) -> Figure {
 }
 
 /// Time traces: command about its mean and bead, the last part of each segment.
-pub fn traces(done: &Done) -> Figure {
+pub(crate) fn traces(done: &Done) -> Figure {
     let mut figure = Figure::new(
         "traces",
         "Commanded displacement (times 4) and bead position of each segment, about their means: three periods, 50 ms at least.",
@@ -225,7 +225,7 @@ pub fn traces(done: &Done) -> Figure {
 }
 
 /// The delay test: light sent and seen, and the intervals that the edges leave for the delay.
-pub fn delay_test(
+pub(crate) fn delay_test(
     name: &str,
     caption: &str,
     led: &cellpos_experiment::identify::led::DelayTest,
@@ -352,7 +352,7 @@ fn sentence(done: &Done) -> (Emphasis, String) {
 }
 
 /// The whole report.
-pub fn report(done: &Done, command_line: &str, eq6: bool) -> Report {
+pub(crate) fn report(done: &Done, command_line: &str, eq6: bool) -> Report {
     let result = &done.result;
     let mut report = Report::new("Identification");
     let (status, sentence) = sentence(done);

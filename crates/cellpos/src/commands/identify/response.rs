@@ -13,7 +13,7 @@ use std::f64::consts::TAU;
 use std::path::Path;
 
 /// Reads, fits, writes.
-pub fn run(args: &Args, path: &Path) -> CommandResult {
+pub(super) fn run(args: &Args, path: &Path) -> CommandResult {
     let points = read(path)?;
     let asked = args.base.and_then(Asked::form);
     let fit = fit_response(&points, asked, usize::from(args.order)).map_err(|e| {

@@ -14,7 +14,7 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 /// A record and its properties.
-pub struct Source {
+pub(super) struct Source {
     /// File or folder, and session where a run has several.
     pub name: String,
     /// Rows per second.
@@ -30,7 +30,7 @@ pub struct Source {
 }
 
 /// Reads a file or a run folder.
-pub fn read(path: &Path, args: &Args) -> Result<Vec<Source>, Failure> {
+pub(super) fn read(path: &Path, args: &Args) -> Result<Vec<Source>, Failure> {
     if path.is_dir() {
         return runs(path);
     }

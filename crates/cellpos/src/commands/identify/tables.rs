@@ -6,7 +6,7 @@ use cellpos_plant::{Hertz, TransferFunction};
 use cellpos_report::{Column, Emphasis, Table};
 
 /// A number with digits fit for reading.
-pub fn number(value: f64) -> String {
+pub(crate) fn number(value: f64) -> String {
     if value == 0.0 {
         "0".to_owned()
     } else if !value.is_finite() {
@@ -35,7 +35,7 @@ pub(super) fn interval(ends: [f64; 2]) -> String {
 }
 
 /// The table of parameters with verdicts.
-pub fn parameters(parameters: &[IdentifiedParameter]) -> Table {
+pub(crate) fn parameters(parameters: &[IdentifiedParameter]) -> Table {
     let mut table = Table::new([
         Column::left("parameter"),
         Column::right("value"),
@@ -68,7 +68,7 @@ pub fn parameters(parameters: &[IdentifiedParameter]) -> Table {
 }
 
 /// The table of frequencies, with Eq. (6) on request.
-pub fn lines(result: &Identification, eq6: bool) -> Table {
+pub(crate) fn lines(result: &Identification, eq6: bool) -> Table {
     let nominal = TransferFunction::eq6();
     let heads = [
         ("Hz", false),
@@ -109,7 +109,7 @@ pub fn lines(result: &Identification, eq6: bool) -> Table {
 }
 
 /// The table of candidate orders.
-pub fn candidates(result: &Identification) -> Table {
+pub(crate) fn candidates(result: &Identification) -> Table {
     let mut table = Table::new([
         Column::left("model"),
         Column::right("chi2"),

@@ -25,7 +25,7 @@ use typed::Typed;
     after_help = "Keys on a terminal, without --to: + and up one step up, - and down one step down, g goes to a displacement (g, 5um, Enter), q ends. From a pipe, lines do the same: `5um`, `+`, `-`, `+2um`, `-2um`, `q`. The PZT is parked at the end, also after Ctrl-C. In open loop the bead flows at some 400 um/s per um from zero flow: small steps keep it in view.\n\n\
     Examples:\n  cellpos jog --rig rig.toml --to 15um --to 20um\n  cellpos jog --rig rig.toml --step 0.5um"
 )]
-pub struct Args {
+pub(crate) struct Args {
     /// Rig.
     #[arg(long)]
     rig: PathBuf,
@@ -79,7 +79,7 @@ struct Jogged {
 const SETTLE: u32 = 30;
 
 /// Moves, shows, parks.
-pub fn run(args: Args) -> CommandResult {
+pub(crate) fn run(args: Args) -> CommandResult {
     let bench = Bench::of(RigFile::load(Some(&args.rig))?)?;
     let wanted = args.page.wanted(ClockKind::Real)?;
     // Before the board is armed: it does not wait for a camera.

@@ -21,7 +21,7 @@ const PATIENCE_NS: i64 = 200_000_000;
 
 /// What the operator's page asks for.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Asked {
+pub(super) enum Asked {
     /// Nothing.
     Nothing,
     /// To stand still until it is told to go on.
@@ -33,7 +33,7 @@ pub enum Asked {
 }
 
 /// The page and its source.
-pub struct Shown {
+pub(super) struct Shown {
     by_hand: ByHand,
     operator: Arc<Operator>,
     /// What was taken up of the operator's targets last, um.
@@ -46,7 +46,11 @@ pub struct Shown {
 
 impl Shown {
     /// Serves the page, if one is wanted; `blind`: without the camera.
-    pub fn open(wanted: &Wanted, bench: &Bench, blind: bool) -> Result<Option<Self>, Failure> {
+    pub(super) fn open(
+        wanted: &Wanted,
+        bench: &Bench,
+        blind: bool,
+    ) -> Result<Option<Self>, Failure> {
         if !wanted.is_any() {
             return Ok(None);
         }
@@ -88,7 +92,7 @@ impl Shown {
     }
 
     /// Request of the operator; a target is reported once.
-    pub fn asked(&self) -> Asked {
+    pub(super) fn asked(&self) -> Asked {
         match self.operator.asked() {
             Request::None | Request::Skip => {}
             Request::Pause => return Asked::Freeze,
@@ -103,7 +107,7 @@ impl Shown {
     }
 
     /// Shows one millisecond.
-    pub fn step(&mut self, mover: &Mover) {
+    pub(super) fn step(&mut self, mover: &Mover) {
         let time_ns = Clock::Real.now_ns() - self.start_ns;
         let seen = self.looking.as_mut().and_then(Looking::newest);
         let (state, reason) = match self.operator.asked() {
@@ -121,7 +125,7 @@ impl Shown {
     }
 
     /// What is seen at a stop. The PZT is held meanwhile.
-    pub fn look(&mut self, mover: &mut Mover, to_um: f64) -> Result<Option<Seen>, Failure> {
+    pub(super) fn look(&mut self, mover: &mut Mover, to_um: f64) -> Result<Option<Seen>, Failure> {
         /// How long a bead is looked for, ms.
         const LOOK_MS: u32 = 100;
         let mut seen = None;
@@ -141,13 +145,13 @@ impl Shown {
     }
 
     /// Tells what was found.
-    pub fn tell(&mut self, text: &str) {
+    pub(super) fn tell(&mut self, text: &str) {
         let time_ns = Clock::Real.now_ns() - self.start_ns;
         self.by_hand.tell(time_ns, text.to_string());
     }
 
     /// It is over: the PZT is at park or on its way there.
-    pub fn over(self) {
+    pub(super) fn over(self) {
         self.by_hand.over("the PZT is parked.");
     }
 }

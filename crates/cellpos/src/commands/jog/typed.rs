@@ -5,7 +5,7 @@ use std::io::BufRead;
 use std::sync::mpsc::{Receiver, channel};
 
 /// What single keys do, for the person at the terminal.
-pub const HELP: &str = "keys: + or up a step, - or down a step back, g goes to a displacement (5um, Enter), q parks and ends";
+pub(super) const HELP: &str = "keys: + or up a step, - or down a step back, g goes to a displacement (5um, Enter), q parks and ends";
 
 /// Makes commands of single keys.
 #[derive(Debug, Default)]
@@ -45,7 +45,7 @@ impl Keys {
 }
 
 /// Commands as they are typed. Dropped, it gives the terminal back as it was.
-pub struct Typed {
+pub(super) struct Typed {
     /// Lines: `5um`, `+`, `-`, `+2um`, `q`. Closed at the end of the input.
     pub lines: Receiver<String>,
     /// The keyboard, where there is one.
@@ -54,7 +54,7 @@ pub struct Typed {
 
 impl Typed {
     /// Single keys where standard input is a terminal, else its lines.
-    pub fn listen() -> Self {
+    pub(super) fn listen() -> Self {
         let (sender, lines) = channel();
         let of_keys = sender.clone();
         let mut keys = Keys::default();

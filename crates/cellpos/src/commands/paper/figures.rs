@@ -13,7 +13,7 @@ const RECORD_S: f64 = 1e-3;
 const GENERATOR_S: f64 = 1e-5;
 
 /// Fig. 4: each input over its own amplitude; each output over input amplitude and the gain at 2 Hz.
-pub fn fig4(done: &Done) -> Figure {
+pub(super) fn fig4(done: &Done) -> Figure {
     let mut figure = Figure::new(
         "fig4-traces",
         "Input over its own amplitude, output over input amplitude times the gain at 2 Hz, drift taken off: 0 to 500 ms below \
@@ -65,7 +65,7 @@ pub fn fig4(done: &Done) -> Figure {
 }
 
 /// Fig. 5a: 300 Hz as generated and as recorded at 1 kHz.
-pub fn fig5a() -> Figure {
+pub(super) fn fig5a() -> Figure {
     let f = 300.0;
     let fine: Vec<f64> = (0..1200).map(|i| i as f64 * GENERATOR_S * 1e3).collect();
     let generated: Vec<f64> = fine.iter().map(|t| (TWO_PI * f * t * 1e-3).sin()).collect();
@@ -87,7 +87,7 @@ pub fn fig5a() -> Figure {
 }
 
 /// What different ways of reading an amplitude make of a 1 kHz record, per frequency.
-pub struct Recorded {
+pub(super) struct Recorded {
     /// Frequency, Hz.
     pub frequency_hz: Vec<f64>,
     /// Amplitude of the signal averaged over (or held for) 1 ms, over the true one.
@@ -99,7 +99,7 @@ pub struct Recorded {
 }
 
 /// Simulates the record of a generator at 100 kHz through a 1 kHz computer with random phases.
-pub fn recorded_amplitudes() -> Recorded {
+pub(super) fn recorded_amplitudes() -> Recorded {
     let mut random = Random::new(5);
     let mut out = Recorded {
         frequency_hz: Vec::new(),
@@ -155,7 +155,7 @@ fn peak_amplitude(samples: &[f64], frequency_hz: f64) -> f64 {
 }
 
 /// Fig. 5b: amplitude on the computer over that on the PZT.
-pub fn fig5b(r: &Recorded) -> Figure {
+pub(super) fn fig5b(r: &Recorded) -> Figure {
     Figure::new(
         "fig5b-amplitude",
         "Amplitude on a 1 kHz record over the true one. Averaging or holding for 1 ms and picking peaks of perfect samples both \
@@ -171,7 +171,7 @@ pub fn fig5b(r: &Recorded) -> Figure {
 }
 
 /// Fig. A1: the spectrum of the bead's motion over the input phasor, in the complex plane.
-pub fn fig_a1(d: &Drifting) -> Figure {
+pub(super) fn fig_a1(d: &Drifting) -> Figure {
     let rows = d.record.from..d.record.input.len();
     let spectrum = bare_fft::spectrum(&d.record.output[rows.clone()], 1e-3);
     let input = bare_fft::spectrum(&d.record.input[rows], 1e-3);

@@ -24,7 +24,7 @@ use std::path::PathBuf;
 /// Arguments of `cellpos paper`.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Example:\n  cellpos paper --report paper.html")]
-pub struct Args {
+pub(crate) struct Args {
     /// Seed of the emulated rig.
     #[arg(long, default_value_t = 1)]
     seed: u64,
@@ -37,7 +37,7 @@ pub struct Args {
 }
 
 /// Appendix B repeated: an open-loop record at 10 Hz with drift.
-pub struct Drifting {
+pub(crate) struct Drifting {
     /// Commanded displacement, um, and bead, um.
     record: RecordedSegment,
     /// Phase by the bare FFT, hold taken off, recording delay left in, deg.
@@ -155,7 +155,7 @@ fn job(seed: u64) -> Job {
 }
 
 /// Runs `cellpos paper`.
-pub fn run(args: Args) -> CommandResult {
+pub(crate) fn run(args: Args) -> CommandResult {
     crate::output::ready(&args.report)?;
     let done = identify(&job(args.seed), |_, _| {})?;
     let delay_s = done.result.judged.model.delay_s;

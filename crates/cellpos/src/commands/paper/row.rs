@@ -6,7 +6,7 @@ use std::fmt::Write;
 use std::path::Path;
 
 /// One row.
-pub struct Row {
+pub(super) struct Row {
     /// Key for machines.
     pub key: &'static str,
     /// What it is.
@@ -29,12 +29,12 @@ pub struct Row {
 
 impl Row {
     /// Our value for reading.
-    pub fn ours_text(&self) -> String {
+    pub(super) fn ours_text(&self) -> String {
         number(self.ours)
     }
 
     /// The verdict in words.
-    pub fn verdict(&self) -> &'static str {
+    pub(super) fn verdict(&self) -> &'static str {
         match (self.holds, self.paper_is_wrong, self.identifiable) {
             (false, _, _) => "differs",
             (true, true, _) => "the paper is inconsistent",
@@ -45,7 +45,7 @@ impl Row {
 }
 
 /// A row that the paper and the data agree on, or not.
-pub fn row(
+pub(super) fn row(
     key: &'static str,
     quantity: &str,
     paper: &str,
@@ -68,7 +68,7 @@ pub fn row(
 }
 
 /// A row on which the paper contradicts itself.
-pub fn wrong(row: Row) -> Row {
+pub(super) fn wrong(row: Row) -> Row {
     Row {
         paper_is_wrong: true,
         ..row
@@ -76,7 +76,7 @@ pub fn wrong(row: Row) -> Row {
 }
 
 /// The JSON object.
-pub fn json(rows: &[Row], report: &Path, seed: u64) -> Value {
+pub(super) fn json(rows: &[Row], report: &Path, seed: u64) -> Value {
     let table: Vec<Value> = rows
         .iter()
         .map(|r| {
@@ -96,7 +96,7 @@ pub fn json(rows: &[Row], report: &Path, seed: u64) -> Value {
 }
 
 /// The same for reading.
-pub fn text(rows: &[Row], report: &Path) -> String {
+pub(super) fn text(rows: &[Row], report: &Path) -> String {
     let mut out = String::new();
     for r in rows {
         let _ = writeln!(

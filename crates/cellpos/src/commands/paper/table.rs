@@ -70,7 +70,11 @@ fn missing(what: &str) -> Failure {
 }
 
 /// All rows.
-pub fn rows(done: &Done, drifting: &Drifting, recorded: &Recorded) -> Result<Vec<Row>, Failure> {
+pub(super) fn rows(
+    done: &Done,
+    drifting: &Drifting,
+    recorded: &Recorded,
+) -> Result<Vec<Row>, Failure> {
     let mut rows = spectrum(done);
     rows.extend(delay_and_slope(done)?);
     rows.extend(coefficients(done)?);

@@ -7,7 +7,7 @@ use cellpos_runtime::Hold;
 
 /// What Brownian motion, delay and localisation noise leave to the best controller while holding.
 #[derive(Debug)]
-pub struct Bound {
+pub(super) struct Bound {
     pub diffusion_um2_per_s: f64,
     pub rms_um: f64,
 }
@@ -25,14 +25,14 @@ fn loop_of(meta: &RunMeta) -> Option<(f64, f64, f64)> {
 }
 
 /// How well the bead of a run is to be held, if its run.toml says enough.
-pub fn hold_of(meta: &RunMeta) -> Option<Hold> {
+pub(super) fn hold_of(meta: &RunMeta) -> Option<Hold> {
     let (diffusion_um2_per_s, delay_s, period_s) = loop_of(meta)?;
     Some(Hold::new(diffusion_um2_per_s, delay_s, period_s))
 }
 
 impl Bound {
     /// The bound of a run, if its run.toml says enough.
-    pub fn of(meta: Option<&RunMeta>, ticks: &Ticks) -> Option<Self> {
+    pub(super) fn of(meta: Option<&RunMeta>, ticks: &Ticks) -> Option<Self> {
         let (diffusion_um2_per_s, delay_s, period_s) = loop_of(meta?)?;
         Some(Self {
             diffusion_um2_per_s,

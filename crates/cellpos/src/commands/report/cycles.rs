@@ -89,7 +89,7 @@ const QUANTITIES: [Quantity; 12] = [
 ];
 
 /// Adds the section; gives the trends as they go into the JSON.
-pub fn section(page: &mut Report, read: &ReadCycles) -> serde_json::Value {
+pub(super) fn section(page: &mut Report, read: &ReadCycles) -> serde_json::Value {
     let (rows, unreadable) = (read.rows.as_slice(), read.unreadable);
     if rows.is_empty() && unreadable == 0 && read.head.is_none() {
         return serde_json::Value::Null;
@@ -223,13 +223,13 @@ struct Group<'r> {
 
 /// Whether bead or cell was away from the script: its mean distance from the target exceeds a tenth of the stroke. In a good cycle it
 /// is a few per cent. Its lengths are of another place in the channel.
-pub fn was_elsewhere(row: &CycleRow) -> bool {
+pub(super) fn was_elsewhere(row: &CycleRow) -> bool {
     const OF_STROKE: f64 = 0.1;
     row.arm == ArmKind::Cyclic && row.bias_um.abs() > OF_STROKE * row.stroke_um.abs()
 }
 
 /// Whether the bead moves to its load or back in a cycle of the static arm.
-pub fn on_the_way(row: &CycleRow) -> bool {
+pub(super) fn on_the_way(row: &CycleRow) -> bool {
     const STILL_UM: f64 = 0.01;
     row.arm == ArmKind::Static && row.stroke_um > STILL_UM
 }
@@ -301,7 +301,7 @@ fn short(value: f64) -> String {
 }
 
 /// A value with an interval, to the digits that the interval leaves it.
-pub fn with_interval(value: f64, ci95: f64) -> String {
+pub(crate) fn with_interval(value: f64, ci95: f64) -> String {
     let digits = if ci95 > 0.0 && ci95.is_finite() {
         (1.0 - ci95.log10().floor()).clamp(0.0, 9.0) as usize
     } else {

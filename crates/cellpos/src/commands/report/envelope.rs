@@ -10,7 +10,7 @@ const COLUMNS: usize = 700;
 
 /// A column as a figure shows it: an envelope and its middle, one entry for each stretch of time; NaN at a gap.
 #[derive(Debug, Clone, PartialEq, Default)]
-pub struct Course {
+pub(super) struct Course {
     pub time_s: Vec<f64>,
     pub low: Vec<f64>,
     pub median: Vec<f64>,
@@ -28,7 +28,7 @@ impl Course {
 
 /// Smallest and largest values of `N` columns over stretches of equal numbers of rows.
 #[derive(Debug)]
-pub struct Envelope<const N: usize> {
+pub(super) struct Envelope<const N: usize> {
     stretches: Vec<Stretch<N>>,
     /// Rows in a whole stretch.
     rows: u64,
@@ -59,14 +59,14 @@ impl<const N: usize> Default for Envelope<N> {
 
 impl<const N: usize> Envelope<N> {
     /// The record has a gap here.
-    pub fn gap(&mut self) {
+    pub(super) fn gap(&mut self) {
         if let Some(last) = self.stretches.last_mut() {
             last.last_before_gap = true;
         }
     }
 
     /// The next row; values that are not finite count as missing.
-    pub fn add(&mut self, time_s: f64, values: [f64; N]) {
+    pub(super) fn add(&mut self, time_s: f64, values: [f64; N]) {
         match self.stretches.last_mut() {
             Some(last) if last.rows < self.rows && !last.last_before_gap => {
                 // Evenly over the stretch: as many rows lie between two samples as it has room for.
@@ -116,7 +116,7 @@ impl<const N: usize> Envelope<N> {
     }
 
     /// A column for a figure of this width, px.
-    pub fn course(&self, column: usize) -> Course {
+    pub(super) fn course(&self, column: usize) -> Course {
         let at = |values: &[f64; N]| values.get(column).copied().unwrap_or(f64::NAN);
         let joined = self.stretches.len().div_ceil(COLUMNS).max(1);
         let mut course = Course::default();
@@ -141,7 +141,7 @@ impl<const N: usize> Envelope<N> {
     }
 
     /// Whether each point of a [`Course`] is one row: then there is no envelope.
-    pub fn is_bare(&self) -> bool {
+    pub(super) fn is_bare(&self) -> bool {
         self.rows == 1 && self.stretches.len() <= COLUMNS
     }
 }

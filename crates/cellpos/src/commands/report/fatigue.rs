@@ -6,7 +6,7 @@ use cellpos_report::{Axis, Figure, Panel, Report, Series};
 use cellpos_script::{ArmKind, AtRest, CycleFlags, CycleRow};
 
 /// The cycles that are drawn over each other: the first, the tenth, the hundredth, ... and the last one with records.
-pub fn courses(rows: &[CycleRow]) -> Vec<Course> {
+pub(super) fn courses(rows: &[CycleRow]) -> Vec<Course> {
     let cyclic: Vec<&CycleRow> = rows.iter().filter(is_whole).collect();
     let mut wanted = Vec::new();
     let mut number = 1;
@@ -65,7 +65,7 @@ fn tens(values: &[(f64, f64)]) -> [Vec<f64>; 4] {
 }
 
 /// The length of the cell over the run and over single cycles, where the run has cycles of a cell.
-pub fn section(page: &mut Report, rows: &[CycleRow], ticks: &Ticks) {
+pub(super) fn section(page: &mut Report, rows: &[CycleRow], ticks: &Ticks) {
     if AtRest::of(rows).length_um.is_nan() || !ticks.has_length {
         return;
     }
@@ -119,7 +119,7 @@ pub fn section(page: &mut Report, rows: &[CycleRow], ticks: &Ticks) {
 }
 
 /// Change of the cell over the cycles: the main figure of a run with a cell.
-pub fn figure(rows: &[CycleRow]) -> Option<Figure> {
+pub(super) fn figure(rows: &[CycleRow]) -> Option<Figure> {
     let rest = AtRest::of(rows);
     if rest.length_um.is_nan() {
         return None;

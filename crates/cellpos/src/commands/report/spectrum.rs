@@ -10,7 +10,7 @@ const SHORT: usize = 512;
 
 /// An amplitude density.
 #[derive(Debug)]
-pub struct Spectrum {
+pub(super) struct Spectrum {
     pub hz: Vec<f64>,
     pub nm_per_rthz: Vec<f64>,
 }
@@ -18,7 +18,7 @@ pub struct Spectrum {
 /// Averaged spectrum of values as they go by (Hann windows overlapping by half, each stretch less its mean); values that are
 /// missing are taken as the mean, and stretches of which more than a twentieth is missing are left out.
 #[derive(Debug, Default)]
-pub struct Welch {
+pub(super) struct Welch {
     /// What is behind the last whole stretch, and half of that.
     values_um: Vec<f64>,
     long: Option<Stretches>,
@@ -26,7 +26,7 @@ pub struct Welch {
 
 impl Welch {
     /// The next value; NaN if it is missing.
-    pub fn add(&mut self, value_um: f64) {
+    pub(super) fn add(&mut self, value_um: f64) {
         self.values_um.push(value_um);
         if self.values_um.len() == STRETCH {
             let long = self.long.get_or_insert_with(|| Stretches::of(STRETCH));
@@ -36,7 +36,7 @@ impl Welch {
     }
 
     /// The spectrum; None without a whole stretch. A run too short for one has shorter ones.
-    pub fn spectrum(&self, period_s: f64) -> Option<Spectrum> {
+    pub(super) fn spectrum(&self, period_s: f64) -> Option<Spectrum> {
         if let Some(long) = &self.long {
             return long.spectrum(period_s);
         }

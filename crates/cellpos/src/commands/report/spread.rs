@@ -9,7 +9,7 @@ const NARROW: usize = 1 << 14;
 
 /// Values of one quantity; those that are not finite are left out.
 #[derive(Debug, Default)]
-pub struct Spread {
+pub(super) struct Spread {
     kept: Vec<f64>,
     narrow: Option<Narrow>,
 }
@@ -26,7 +26,7 @@ struct Narrow {
 
 impl Spread {
     /// The next value.
-    pub fn add(&mut self, value: f64) {
+    pub(super) fn add(&mut self, value: f64) {
         if !value.is_finite() {
             return;
         }
@@ -42,13 +42,13 @@ impl Spread {
     }
 
     /// How many values there are.
-    pub fn count(&self) -> u64 {
+    pub(super) fn count(&self) -> u64 {
         let narrow = self.narrow.as_ref();
         narrow.map_or(self.kept.len() as u64, |narrow| narrow.counts.iter().sum())
     }
 
     /// Counts in equal bins between the smallest and the largest value.
-    pub fn histogram(&self, label: &str, bins: usize) -> Series {
+    pub(super) fn histogram(&self, label: &str, bins: usize) -> Series {
         let Some(narrow) = &self.narrow else {
             return Series::histogram(label, &self.kept, bins);
         };
@@ -69,7 +69,7 @@ impl Spread {
 
 /// Counts of positive values in bins of a twelfth of a decade: what spans decades is seen on logarithmic axes alone.
 #[derive(Debug, Default)]
-pub struct Decades {
+pub(super) struct Decades {
     counts: std::collections::BTreeMap<i32, u64>,
 }
 
@@ -77,12 +77,12 @@ impl Decades {
     const A_DECADE: f64 = 12.0;
 
     /// Whether there is no positive value.
-    pub fn is_empty(&self) -> bool {
+    pub(super) fn is_empty(&self) -> bool {
         self.counts.is_empty()
     }
 
     /// The next value; one that is not positive has no place on such an axis.
-    pub fn add(&mut self, value: f64) {
+    pub(super) fn add(&mut self, value: f64) {
         if value > 0.0 && value.is_finite() {
             *self
                 .counts
@@ -92,7 +92,7 @@ impl Decades {
     }
 
     /// Counts as steps, from the first bin to behind the last; a bin without values is a gap.
-    pub fn steps(&self, label: &str) -> Series {
+    pub(super) fn steps(&self, label: &str) -> Series {
         let edge = |bin: i32| 10f64.powf(f64::from(bin) / Self::A_DECADE);
         let ends = (self.counts.keys().next(), self.counts.keys().next_back());
         let (Some(&first), Some(&last)) = ends else {

@@ -7,7 +7,7 @@ use cellpos_runtime::{Hold, Statistics, TickRecord};
 
 /// A stretch of the run, tick by tick.
 #[derive(Debug, Default)]
-pub struct Excerpt {
+pub(super) struct Excerpt {
     pub time_s: Vec<f64>,
     pub target_um: Vec<f64>,
     pub measured_um: Vec<f64>,
@@ -16,7 +16,7 @@ pub struct Excerpt {
 
 /// The length of the cell over one cycle.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Course {
+pub(super) struct Course {
     /// Number of the cycle, from 1 as people count.
     pub number: u64,
     /// Session it is in, and where in it, ns.
@@ -29,7 +29,7 @@ pub struct Course {
 
 /// Columns of a run.
 #[derive(Debug, Default)]
-pub struct Ticks {
+pub(super) struct Ticks {
     /// Ticks in all.
     pub rows: u64,
     /// Reference, position, command and neutral over the whole run, um.
@@ -65,7 +65,7 @@ pub struct Ticks {
 
 impl Ticks {
     /// Nothing yet; the cycles whose course is wanted are known.
-    pub fn with_courses(courses: Vec<Course>) -> Self {
+    pub(super) fn with_courses(courses: Vec<Course>) -> Self {
         Self {
             courses,
             ..Self::default()
@@ -73,7 +73,7 @@ impl Ticks {
     }
 
     /// A session begins at a time of the run; its bead is to be held so well.
-    pub fn begin(&mut self, start_s: f64, hold: Option<Hold>) {
+    pub(super) fn begin(&mut self, start_s: f64, hold: Option<Hold>) {
         self.start_s = start_s;
         self.last_ns = None;
         self.traces.gap();
@@ -85,7 +85,7 @@ impl Ticks {
     }
 
     /// The next tick.
-    pub fn add(&mut self, r: &TickRecord) {
+    pub(super) fn add(&mut self, r: &TickRecord) {
         let time_s = self.start_s + r.time_ns as f64 * 1e-9;
         if let Some(last_ns) = self.last_ns.replace(r.time_ns) {
             self.period_s.0 += (r.time_ns - last_ns) as f64 * 1e-9;
@@ -147,17 +147,17 @@ impl Ticks {
     }
 
     /// Start of the last tick, s since the start of the run.
-    pub fn end_s(&self) -> f64 {
+    pub(super) fn end_s(&self) -> f64 {
         self.end_s
     }
 
     /// From the first tick to the end of the last, pauses between sessions included, s.
-    pub fn duration_s(&self) -> f64 {
+    pub(super) fn duration_s(&self) -> f64 {
         self.end_s + self.period_s()
     }
 
     /// Mean period of the ticks, s.
-    pub fn period_s(&self) -> f64 {
+    pub(super) fn period_s(&self) -> f64 {
         if self.period_s.1 > 0 {
             self.period_s.0 / self.period_s.1 as f64
         } else {
@@ -166,19 +166,19 @@ impl Ticks {
     }
 
     /// Localisation noise as stated, um RMS.
-    pub fn noise_um(&self) -> f64 {
+    pub(super) fn noise_um(&self) -> f64 {
         (self.variance_um2.0 / self.variance_um2.1.max(1) as f64).sqrt()
     }
 
     /// RMS error of all sessions together, um: of the very positions that the terminal's and run.toml's figures are of.
-    pub fn rms_um(&self) -> Option<f64> {
+    pub(super) fn rms_um(&self) -> Option<f64> {
         let (n, sum) = self.sums(|statistics| statistics.rms_measured_nm().map(|nm| nm * nm));
         (n > 0.0).then(|| (sum / n).sqrt() * 1e-3)
     }
 
     /// Half the 95 % interval of that RMS, um. The variance of a record of the length T has the variance 1/T times the integral of
     /// the squared one-sided power density (Bartlett).
-    pub fn rms_ci95_um(&self) -> Option<f64> {
+    pub(super) fn rms_ci95_um(&self) -> Option<f64> {
         let spectrum = self.error_um.spectrum(self.period_s())?;
         let [first, second, ..] = spectrum.hz.as_slice() else {
             return None;
@@ -191,7 +191,7 @@ impl Ticks {
     }
 
     /// Mean error, um.
-    pub fn mean_um(&self) -> Option<f64> {
+    pub(super) fn mean_um(&self) -> Option<f64> {
         let (n, sum) = self.sums(Statistics::mean_error_nm);
         (n > 0.0).then(|| sum / n * 1e-3)
     }
@@ -205,7 +205,7 @@ impl Ticks {
     }
 
     /// Largest error, um.
-    pub fn peak_um(&self) -> Option<f64> {
+    pub(super) fn peak_um(&self) -> Option<f64> {
         let peaks = self.statistics.iter().filter_map(Statistics::peak_error_nm);
         peaks.reduce(f64::max).map(|nm| nm * 1e-3)
     }

@@ -8,7 +8,9 @@ use cellpos_script::{PeriodicReference, Plan};
 use std::path::{Path, PathBuf};
 
 use crate::cyclic::save_learning;
-pub use crate::cyclic::{LEARNED_TOML, NamedTable, load_learned as load, save_learned as save};
+pub(crate) use crate::cyclic::{
+    LEARNED_TOML, NamedTable, load_learned as load, save_learned as save,
+};
 
 /// Fewest cycles in full swing of a motion that is learned: two are watched, and some must be left to learn from.
 const FEWEST_CYCLES: u64 = 5;
@@ -16,7 +18,7 @@ const FEWEST_CYCLES: u64 = 5;
 const MOST_MOTIONS: usize = 16;
 
 /// How the motions of a plan are learned, going on from `known`; what cannot be learned is a warning.
-pub fn motions(
+pub(crate) fn motions(
     plan: &Plan,
     setup: &Prepared,
     file: &RigFile,
@@ -68,7 +70,7 @@ pub fn motions(
 }
 
 /// Names and tables of the learned motions.
-pub fn named(specs: &[MotionSpec], tables: &[Option<LearnedTable>]) -> Vec<NamedTable> {
+pub(crate) fn named(specs: &[MotionSpec], tables: &[Option<LearnedTable>]) -> Vec<NamedTable> {
     let table = |spec: &MotionSpec| tables.get(usize::from(spec.motion))?.clone();
     specs
         .iter()
@@ -82,7 +84,7 @@ pub fn named(specs: &[MotionSpec], tables: &[Option<LearnedTable>]) -> Vec<Named
 }
 
 /// Keeps the file up to date while the loop learns.
-pub struct Keeper {
+pub(crate) struct Keeper {
     folder: PathBuf,
     specs: Vec<MotionSpec>,
     learners: Vec<Option<Learner>>,
@@ -92,7 +94,7 @@ pub struct Keeper {
 
 impl Keeper {
     /// Writer for the run's folder; None if nothing is learned.
-    pub fn new(folder: &Path, specs: &[MotionSpec], sample_s: f64) -> Option<Self> {
+    pub(crate) fn new(folder: &Path, specs: &[MotionSpec], sample_s: f64) -> Option<Self> {
         let count = specs
             .iter()
             .map(|spec| usize::from(spec.motion) + 1)
@@ -114,7 +116,7 @@ impl Keeper {
     }
 
     /// What the loop knows now.
-    pub fn take(&mut self, motion: u16, state: &LearnerState) {
+    pub(crate) fn take(&mut self, motion: u16, state: &LearnerState) {
         let number = usize::from(motion);
         if let (Some(Some(learner)), Some(table)) =
             (self.learners.get(number), self.tables.get_mut(number))
@@ -125,7 +127,7 @@ impl Keeper {
     }
 
     /// Writes what has changed. After a failed write the next change tries again; the run continues.
-    pub fn save(&mut self) {
+    pub(crate) fn save(&mut self) {
         if self.changed && save_learning(&self.folder, named(&self.specs, &self.tables)).is_ok() {
             self.changed = false;
         }

@@ -13,7 +13,7 @@ use cellpos_session::{EndKind, Ended, Finished, connect};
 use std::path::PathBuf;
 
 /// A run that is over.
-pub struct Over {
+pub(super) struct Over {
     pub outcome: &'static str,
     pub ended: Ended,
     /// The run's folder.

@@ -7,7 +7,7 @@ use cellpos_session::setup::{Prepared, ReferenceSpec};
 use std::path::PathBuf;
 
 /// A session before the board is armed.
-pub struct Ready {
+pub(crate) struct Ready {
     pub file: RigFile,
     pub prepared: Prepared,
     pub reference: ReferenceSpec,

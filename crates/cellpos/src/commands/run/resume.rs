@@ -19,7 +19,7 @@ use std::sync::Arc;
 const MOST_TABLE: u64 = 1 << 30;
 
 /// The acknowledged cycles of a run. Without the table, cycles are counted from the ticks: starting at cycle 0 would repeat all.
-pub fn cycles(folder: &Path) -> Result<Vec<CycleRow>, Failure> {
+pub(crate) fn cycles(folder: &Path) -> Result<Vec<CycleRow>, Failure> {
     let path = folder.join(CYCLES_CSV);
     let text = match read_text(&path, MOST_TABLE) {
         Ok(text) => text,
@@ -106,7 +106,7 @@ fn renew(folder: &Path) -> Result<(), Failure> {
 }
 
 /// The per-cycle table for other programs.
-pub fn cycles_parquet(folder: &Path, rows: &[CycleRow]) -> Result<(), RecordError> {
+pub(crate) fn cycles_parquet(folder: &Path, rows: &[CycleRow]) -> Result<(), RecordError> {
     let Some(first) = rows.first() else {
         return Ok(());
     };
@@ -133,7 +133,7 @@ pub fn cycles_parquet(folder: &Path, rows: &[CycleRow]) -> Result<(), RecordErro
 }
 
 /// The folders of a run's sessions, in order.
-pub fn sessions(folder: &Path) -> Vec<PathBuf> {
+pub(crate) fn sessions(folder: &Path) -> Vec<PathBuf> {
     let mut found: Vec<(u64, PathBuf)> = vec![(1, folder.to_owned())];
     let further = std::fs::read_dir(folder.join(SESSIONS))
         .into_iter()
@@ -152,13 +152,13 @@ pub fn sessions(folder: &Path) -> Vec<PathBuf> {
 }
 
 /// A session as described by its run.toml.
-pub fn session_config(reader: &RunReader) -> Option<SessionConfig> {
+pub(crate) fn session_config(reader: &RunReader) -> Option<SessionConfig> {
     let config = reader.meta().ok()?.config.get("session")?.clone();
     config.try_into().ok()
 }
 
 /// The next session of a run; None when nothing is left to do.
-pub fn ready(folder: &Path, best_effort: bool) -> Result<Option<Ready>, Failure> {
+pub(crate) fn ready(folder: &Path, best_effort: bool) -> Result<Option<Ready>, Failure> {
     let not_a_run = |problem: String| {
         Failure::bad_input(
             format!("{}: {problem}", folder.display()),

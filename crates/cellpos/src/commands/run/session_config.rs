@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 /// Settings of a session besides the loop's: the table `config.session` of run.toml.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct SessionConfig {
+pub(crate) struct SessionConfig {
     /// 1 for the first, one more each time that the run was resumed.
     pub(super) number: u64,
     /// The cycle that it begins with.
@@ -29,7 +29,7 @@ pub struct SessionConfig {
 
 impl SessionConfig {
     /// From the last write of the session before to the start of this one, s.
-    pub fn gap_s(&self) -> Option<f64> {
+    pub(crate) fn gap_s(&self) -> Option<f64> {
         self.gap_s
     }
 }

@@ -17,7 +17,7 @@ use std::ops::Range;
 use std::sync::Arc;
 
 /// Writes run folder and table, marks and alarms, and shows how far it is.
-pub struct ScriptSink {
+pub(super) struct ScriptSink {
     writer: RunWriter,
     lines: LineFile,
     cycles: CycleTable,
@@ -49,7 +49,7 @@ pub struct ScriptSink {
 }
 
 /// When the recorder takes nothing, to see what becomes of a run then.
-pub struct Stalls {
+pub(super) struct Stalls {
     /// Spans of the clock, ns.
     pub spans_ns: Vec<Range<i64>>,
     /// The clock of the run.
@@ -58,7 +58,7 @@ pub struct Stalls {
 
 /// How a script came to its end.
 #[derive(Debug, Clone, Copy)]
-pub struct End {
+pub(super) struct End {
     /// What it was doing last.
     pub stage: Stage,
     /// Why the rows of the per-cycle table stopped it, if they did.
@@ -69,17 +69,17 @@ pub struct End {
 
 impl End {
     /// In words.
-    pub fn name(&self) -> &'static str {
+    pub(super) fn name(&self) -> &'static str {
         self.row_stop.unwrap_or_else(|| self.stage.name())
     }
 
     /// Whether a condition of the script stopped it.
-    pub fn is_stop(&self) -> bool {
+    pub(super) fn is_stop(&self) -> bool {
         self.row_stop.is_some() || self.stage.is_over()
     }
 
     /// Whether the script reached its end.
-    pub fn complete(&self) -> bool {
+    pub(super) fn complete(&self) -> bool {
         let over = [Stage::Done, Stage::StoppedCycles, Stage::StoppedTime];
         self.row_stop.is_none() && over.contains(&self.stage)
     }
@@ -87,7 +87,7 @@ impl End {
 
 impl ScriptSink {
     /// A sink that has written the start of the session.
-    pub fn new(
+    pub(super) fn new(
         mut writer: RunWriter,
         lines: LineFile,
         cycles: CycleTable,
@@ -146,7 +146,7 @@ impl ScriptSink {
     }
 
     /// The same sink, that keeps what is learned: as the run goes, or not at all before its end.
-    pub fn with_keeper(self, keeper: Keeper, live: bool) -> Self {
+    pub(super) fn with_keeper(self, keeper: Keeper, live: bool) -> Self {
         Self {
             keeper: Some(keeper),
             keep_live: live,
@@ -155,7 +155,7 @@ impl ScriptSink {
     }
 
     /// The same sink, that keeps for a live page what only it knows.
-    pub fn with_page(self, page: bool) -> Self {
+    pub(super) fn with_page(self, page: bool) -> Self {
         Self {
             unshown: Unshown::new(page),
             ..self
@@ -163,7 +163,7 @@ impl ScriptSink {
     }
 
     /// The same sink, that takes nothing in some spans of time.
-    pub fn with_stalls(self, stalls: Stalls) -> Self {
+    pub(super) fn with_stalls(self, stalls: Stalls) -> Self {
         Self {
             stalls: Some(stalls),
             ..self
@@ -171,7 +171,7 @@ impl ScriptSink {
     }
 
     /// How it ended.
-    pub fn end(&self) -> End {
+    pub(super) fn end(&self) -> End {
         End {
             stage: self.stage,
             row_stop: self.row_stop,
@@ -180,7 +180,7 @@ impl ScriptSink {
     }
 
     /// Acknowledges finished rows and returns the writer, with the rows that could not be written.
-    pub fn close(mut self) -> (RunWriter, Faults) {
+    pub(super) fn close(mut self) -> (RunWriter, Faults) {
         self.acknowledge();
         self.lines.close();
         self.bar.finish_and_clear();
@@ -291,7 +291,7 @@ impl ScriptSink {
     }
 
     /// The same sink, that knows the cycles of the sessions before.
-    pub fn with_cycles_done(mut self, rows: &[CycleRow]) -> Self {
+    pub(super) fn with_cycles_done(mut self, rows: &[CycleRow]) -> Self {
         for row in rows {
             self.at_rest.take(row);
             if let Some(watch) = &mut self.fatigue {

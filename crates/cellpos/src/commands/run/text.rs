@@ -11,7 +11,7 @@ use serde::Serialize;
 
 /// How the session ended.
 #[derive(Debug, Serialize)]
-pub struct Ending<'a> {
+pub(crate) struct Ending<'a> {
     /// `done`, `stopped`, `aborted`, or the state of the life cycle.
     pub outcome: &'static str,
     /// What the script was doing last.
@@ -28,7 +28,7 @@ pub struct Ending<'a> {
 
 /// What `--json` prints.
 #[derive(Debug, Serialize)]
-pub struct Report<'a> {
+pub(crate) struct Report<'a> {
     #[serde(flatten)]
     ending: Ending<'a>,
     /// Cycles of the script.
@@ -60,7 +60,7 @@ fn mean(values: impl Iterator<Item = f64>) -> Option<f64> {
 impl<'a> Report<'a> {
     /// Joins what there is to say.
     #[allow(clippy::too_many_arguments, reason = "each is one part of the report")]
-    pub fn new(
+    pub(crate) fn new(
         ending: Ending<'a>,
         summary: &'a Summary,
         rows: &[CycleRow],
@@ -94,7 +94,7 @@ impl<'a> Report<'a> {
     }
 
     /// For people.
-    pub fn text(&self) -> String {
+    pub(crate) fn text(&self) -> String {
         let mut out = String::new();
         let mut line = |name: &str, value: String| out.push_str(&format!("{name:<18}{value}\n"));
         let or_dash = |value: Option<f64>, unit: &str| {

@@ -5,7 +5,7 @@ use serde::Serialize;
 
 /// Settings found in the recording.
 #[derive(Debug, Clone, Serialize)]
-pub struct Advice {
+pub(crate) struct Advice {
     /// The table `[vision]` for rig.toml.
     pub vision: LocaliserConfig,
     /// Objects that stood out in the frames looked at.
@@ -59,7 +59,7 @@ impl Advice {
     }
 
     /// The settings as a table to paste, with their basis.
-    pub fn text(&self) -> String {
+    pub(crate) fn text(&self) -> String {
         let given = self
             .given_px
             .map_or(String::new(), |px| format!(" (given: {px:.2} px)"));

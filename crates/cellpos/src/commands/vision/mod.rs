@@ -6,7 +6,7 @@ mod beads;
 mod cells;
 mod settings;
 
-pub use advice::Advice;
+pub(crate) use advice::Advice;
 pub(super) use advice::vision_table;
 
 use super::vision_sheet::Sheet;
@@ -27,7 +27,7 @@ use std::path::{Path, PathBuf};
     cellpos vision recording.cihx --region 64x64+200+120 --calibration calibration.toml\n  \
     cellpos vision cells.tif --cells --background-frames 50"
 )]
-pub struct Args {
+pub(crate) struct Args {
     /// Folder of PNG, TIFF or JPEG pictures, TIFF stack, Photron recording (.cihx, .cih, .mraw), AVI film, NumPy stack (.npy), or .rtdc
     /// file.
     source: PathBuf,
@@ -88,7 +88,7 @@ pub struct Args {
 }
 
 /// Reads the recording, writes the folder, prints the summary.
-pub fn run(args: Args) -> CommandResult {
+pub(crate) fn run(args: Args) -> CommandResult {
     if let Some(rig) = &args.as_loop {
         return as_loop::run(&args, rig);
     }

@@ -6,7 +6,7 @@ use std::path::Path;
 use std::process::Command;
 
 /// What a command left behind.
-pub struct Ran {
+pub(crate) struct Ran {
     /// Exit code.
     pub code: Option<i32>,
     /// Standard output.
@@ -17,14 +17,14 @@ pub struct Ran {
 
 impl Ran {
     /// The one JSON object on standard output.
-    pub fn json(&self) -> Value {
+    pub(crate) fn json(&self) -> Value {
         serde_json::from_str(&self.out)
             .unwrap_or_else(|error| panic!("{error}\n{}\n{}", self.out, self.err))
     }
 }
 
 /// Runs `cellpos` in a folder; the arguments are split at blanks.
-pub fn cellpos(folder: &Path, line: &str) -> Ran {
+pub(crate) fn cellpos(folder: &Path, line: &str) -> Ran {
     let out = Command::new(env!("CARGO_BIN_EXE_cellpos"))
         .args(line.split_whitespace())
         .current_dir(folder)
@@ -39,14 +39,14 @@ pub fn cellpos(folder: &Path, line: &str) -> Ran {
 }
 
 /// Runs `cellpos`, which must succeed.
-pub fn succeed(folder: &Path, line: &str) -> Ran {
+pub(crate) fn succeed(folder: &Path, line: &str) -> Ran {
     let ran = cellpos(folder, line);
     assert_eq!(ran.code, Some(0), "{line}\n{}\n{}", ran.out, ran.err);
     ran
 }
 
 /// A number of a JSON object.
-pub fn number(value: &Value, key: &str) -> f64 {
+pub(crate) fn number(value: &Value, key: &str) -> f64 {
     value[key]
         .as_f64()
         .unwrap_or_else(|| panic!("{key} is no number in {value}"))

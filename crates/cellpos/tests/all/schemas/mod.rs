@@ -4,7 +4,7 @@
 mod files;
 mod objects;
 
-pub use objects::hold;
+pub(crate) use objects::hold;
 
 use serde_json::Value;
 use std::path::{Path, PathBuf};

@@ -106,7 +106,7 @@ fn merged(a: &Value, b: &Value) -> Value {
 }
 
 /// Holds an object against its schema.
-pub fn hold(line: &str, object: &Value) {
+pub(crate) fn hold(line: &str, object: &Value) {
     let name = object["schema"]
         .as_str()
         .unwrap_or_else(|| panic!("{line}: no schema"));

@@ -6,28 +6,28 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 /// The program with arguments, to be run in a folder.
-pub fn command(folder: &Path, args: &[&str]) -> Command {
+pub(crate) fn command(folder: &Path, args: &[&str]) -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_cellpos"));
     command.args(args).current_dir(folder);
     command
 }
 
 /// Exit code, standard output and standard error of the program.
-pub fn cellpos(folder: &Path, args: &[&str]) -> (Option<i32>, String, String) {
+pub(crate) fn cellpos(folder: &Path, args: &[&str]) -> (Option<i32>, String, String) {
     let out = command(folder, args).output().unwrap();
     let text = |bytes: Vec<u8>| String::from_utf8(bytes).unwrap();
     (out.status.code(), text(out.stdout), text(out.stderr))
 }
 
 /// The JSON object of a command that must succeed.
-pub fn json(folder: &Path, args: &[&str]) -> Value {
+pub(crate) fn json(folder: &Path, args: &[&str]) -> Value {
     let (code, out, err) = cellpos(folder, args);
     assert_eq!(code, Some(0), "{args:?}: {out}\n{err}");
     serde_json::from_str(&out).unwrap()
 }
 
 /// The worked examples.
-pub fn examples() -> Vec<PathBuf> {
+pub(crate) fn examples() -> Vec<PathBuf> {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples/scripts");
     let mut files: Vec<PathBuf> = std::fs::read_dir(folder)
         .unwrap()
@@ -40,13 +40,13 @@ pub fn examples() -> Vec<PathBuf> {
 }
 
 /// The example rig with a cell.
-pub fn cell_rig() -> String {
+pub(crate) fn cell_rig() -> String {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples/cell.toml");
     std::fs::read_to_string(path).unwrap()
 }
 
 /// Cell `column` of every row of a run's per-cycle table.
-pub fn column(run: &Path, column: &str) -> Vec<String> {
+pub(crate) fn column(run: &Path, column: &str) -> Vec<String> {
     let text = std::fs::read_to_string(run.join("cycles.csv")).unwrap();
     let mut lines = text.lines();
     let at = lines
@@ -61,7 +61,7 @@ pub fn column(run: &Path, column: &str) -> Vec<String> {
 }
 
 /// The same as whole numbers.
-pub fn numbers(run: &Path, name: &str) -> Vec<u64> {
+pub(crate) fn numbers(run: &Path, name: &str) -> Vec<u64> {
     column(run, name)
         .iter()
         .map(|cell| cell.parse().unwrap())
@@ -69,7 +69,7 @@ pub fn numbers(run: &Path, name: &str) -> Vec<u64> {
 }
 
 /// The one run folder.
-pub fn only_run(folder: &Path) -> PathBuf {
+pub(crate) fn only_run(folder: &Path) -> PathBuf {
     let mut runs = std::fs::read_dir(folder.join("runs")).unwrap();
     let run = runs.next().unwrap().unwrap().path();
     assert!(runs.next().is_none(), "one run");
@@ -77,7 +77,7 @@ pub fn only_run(folder: &Path) -> PathBuf {
 }
 
 /// A script of 20 Hz cycles about the middle.
-pub fn script(folder: &Path, cycles: u32) {
+pub(crate) fn script(folder: &Path, cycles: u32) {
     let text = format!(
         "name = \"quick\"\n[[step]]\ndo = \"sine\"\namplitude = \"1um\"\nfrequency = \"20Hz\"\ncycles = {cycles}\n\
          [[step]]\ndo = \"hold\"\nduration = \"100ms\"\n"

@@ -6,7 +6,7 @@ use cellpos_numeric::Random;
 use cellpos_plant::{Complex, DiscretePlant, DiscreteState, Seconds, TransferFunction};
 
 /// Positions only, 1 kHz, held by PI.
-pub struct PositionRig {
+pub(crate) struct PositionRig {
     plant: DiscretePlant,
     state: DiscreteState,
     pub neutral_um: f64,
@@ -24,10 +24,10 @@ pub struct PositionRig {
     random: Random,
 }
 
-pub const PERIOD_S: f64 = 1e-3;
+pub(crate) const PERIOD_S: f64 = 1e-3;
 
 impl PositionRig {
-    pub fn new(plant: &TransferFunction, delay_s: f64, seed: u64) -> Self {
+    pub(crate) fn new(plant: &TransferFunction, delay_s: f64, seed: u64) -> Self {
         let plant = DiscretePlant::new(plant, Seconds(PERIOD_S), Seconds(delay_s)).unwrap();
         let state = plant.state(0.0);
         Self {
@@ -77,7 +77,7 @@ impl Bench for PositionRig {
 }
 
 /// Expected plant and loop gain of the nominal rig with the PI gains above.
-pub fn expected(delay_s: f64) -> impl Fn(f64) -> (Complex<f64>, Complex<f64>) {
+pub(crate) fn expected(delay_s: f64) -> impl Fn(f64) -> (Complex<f64>, Complex<f64>) {
     let model = CandidateModel::eq6(delay_s);
     move |f| {
         let sampling = cellpos_ident::sampled::Sampling::held(1.0 / PERIOD_S);

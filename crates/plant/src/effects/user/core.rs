@@ -38,7 +38,7 @@ pub(super) struct Core {
 type Values = [f64; SIGNALS.len() + MOST];
 
 impl Core {
-    pub fn new(compiled: Arc<Compiled>, parameters: &[f64], units: [f64; 3]) -> Self {
+    pub(super) fn new(compiled: Arc<Compiled>, parameters: &[f64], units: [f64; 3]) -> Self {
         let mut all = [0.0; MOST];
         for (slot, p) in all.iter_mut().zip(parameters) {
             *slot = *p;
@@ -61,11 +61,11 @@ impl Core {
         core
     }
 
-    pub fn has_states(&self) -> bool {
+    pub(super) fn has_states(&self) -> bool {
         !self.compiled.rates.is_empty()
     }
 
-    pub fn reset(&mut self) {
+    pub(super) fn reset(&mut self) {
         self.states = self.start;
         self.output = 0.0;
     }
@@ -87,7 +87,7 @@ impl Core {
     }
 
     /// The output at an instant; where the expression has no value, the last one holds.
-    pub fn output(&self, seen: &Seen) -> f64 {
+    pub(super) fn output(&self, seen: &Seen) -> f64 {
         self.output_with(seen, &self.states)
     }
 
@@ -101,7 +101,7 @@ impl Core {
     }
 
     /// The output expected `h_s` later, states gone on at their present rate.
-    pub fn output_ahead(&self, h_s: f64, now: &Seen, then: &Seen) -> f64 {
+    pub(super) fn output_ahead(&self, h_s: f64, now: &Seen, then: &Seen) -> f64 {
         let rates = self.rates(now, &self.states);
         self.output_with(then, &self.moved(&self.states, &rates, h_s))
     }
@@ -128,7 +128,7 @@ impl Core {
     }
 
     /// States and memory go on over a piece, by the trapezoidal rule of Heun.
-    pub fn advance(&mut self, h_s: f64, now: &Seen, then: &Seen) {
+    pub(super) fn advance(&mut self, h_s: f64, now: &Seen, then: &Seen) {
         if self.has_states() && h_s > 0.0 {
             let first = self.rates(now, &self.states);
             let second = self.rates(then, &self.moved(&self.states, &first, h_s));
@@ -138,13 +138,13 @@ impl Core {
     }
 
     /// Gives the output at an instant and remembers it.
-    pub fn give(&mut self, seen: &Seen) -> f64 {
+    pub(super) fn give(&mut self, seen: &Seen) -> f64 {
         self.output = self.output(seen);
         self.output
     }
 
     /// The outputs just after the beginning and at the end of a piece, states and memory gone on.
-    pub fn piece(&mut self, h_s: f64, now: &Seen, then: &Seen) -> (f64, f64) {
+    pub(super) fn piece(&mut self, h_s: f64, now: &Seen, then: &Seen) -> (f64, f64) {
         let start = self.give(now);
         if h_s <= 0.0 {
             return (start, start);
@@ -154,7 +154,7 @@ impl Core {
     }
 
     /// Derivatives of output and rates by input, position, velocity and states, at rest: for small motions.
-    pub fn slopes(&self, size: f64) -> Slopes {
+    pub(super) fn slopes(&self, size: f64) -> Slopes {
         let rest = Seen::default();
         let step = size.max(1e-9);
         let mut slopes = Slopes {

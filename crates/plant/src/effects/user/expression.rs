@@ -9,7 +9,7 @@ use fasteval3::{Compiler, EmptyNamespace, Parser, Slab};
 
 /// What is wrong with a part of a definition, and what would be right.
 #[derive(Debug, Clone, PartialEq)]
-pub struct ExpressionProblem(pub String);
+pub(super) struct ExpressionProblem(pub String);
 
 type OfOne = (&'static str, fn(f64) -> f64);
 
@@ -44,7 +44,7 @@ enum Step {
 
 /// A compiled expression.
 #[derive(Debug, Clone)]
-pub struct Program {
+pub(super) struct Program {
     steps: Vec<Step>,
     names: Vec<usize>,
 }
@@ -54,7 +54,7 @@ impl Program {
     ///
     /// # Errors
     /// A text that is no expression, an unknown name or function: what is wrong and what would be right.
-    pub fn new(text: &str, names: &[&str]) -> Result<Self, ExpressionProblem> {
+    pub(super) fn new(text: &str, names: &[&str]) -> Result<Self, ExpressionProblem> {
         minus_before_power(text)?;
         let mut slab = Slab::new();
         let parsed = Parser::new().parse(text, &mut slab.ps).map_err(|e| {
@@ -95,12 +95,12 @@ impl Program {
     }
 
     /// Whether the name of this place occurs.
-    pub fn uses(&self, name: usize) -> bool {
+    pub(super) fn uses(&self, name: usize) -> bool {
         self.names.contains(&name)
     }
 
     /// Its value, names standing for `values` in the order in which they were given. Allocates nothing.
-    pub fn value(&self, values: &[f64]) -> f64 {
+    pub(super) fn value(&self, values: &[f64]) -> f64 {
         let mut stack = [0.0_f64; DEEPEST];
         let mut top = 0;
         for step in &self.steps {

@@ -9,10 +9,10 @@ use cellpos_runtime::{ArmingConfig, Core, Timing};
 use cellpos_vision::FixQuality;
 
 /// Where the board stands at the start, um.
-pub const START_UM: f64 = 20.0;
+pub(crate) const START_UM: f64 = 20.0;
 
 /// A controller.toml for the nominal plant.
-pub fn controller(kind: ControllerKind) -> ControllerFile {
+pub(crate) fn controller(kind: ControllerKind) -> ControllerFile {
     let pi = Pi {
         lead: (kind == ControllerKind::Lead).then_some(Lead {
             zero_hz: 64.0,
@@ -27,7 +27,7 @@ pub fn controller(kind: ControllerKind) -> ControllerFile {
 }
 
 /// The loop of a controller, held at 0 um. With `check` off it closes as soon as the bead is steadily seen.
-pub fn core(file: &ControllerFile, check: bool) -> Core<Profile> {
+pub(crate) fn core(file: &ControllerFile, check: bool) -> Core<Profile> {
     let model = Model::eq6();
     Core::new(
         file.loop_config(&model).unwrap(),
@@ -45,7 +45,7 @@ pub fn core(file: &ControllerFile, check: bool) -> Core<Profile> {
 }
 
 /// A good position in the frame that arrives at tick `k`, 2 ms after its exposure.
-pub fn measurement(k: u64, position_um: f64) -> Measurement {
+pub(crate) fn measurement(k: u64, position_um: f64) -> Measurement {
     let now_ns = k as i64 * 1_000_000;
     Measurement {
         frame_id: k + 1,
@@ -66,7 +66,7 @@ pub fn measurement(k: u64, position_um: f64) -> Measurement {
 }
 
 /// What a board that follows says at tick `k`.
-pub fn report(k: u64) -> ActuatorReport {
+pub(crate) fn report(k: u64) -> ActuatorReport {
     ActuatorReport {
         state: ActuatorState::Running,
         fault: ActuatorFault::None,

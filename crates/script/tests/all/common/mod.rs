@@ -18,7 +18,7 @@ use std::ops::Range;
 use std::sync::Arc;
 
 /// Gathers rows; `deaf` in a span of run time: the recorder waits for its disk.
-pub struct Table {
+pub(crate) struct Table {
     cycles: CycleTable,
     /// The rows so far.
     pub rows: Vec<CycleRow>,
@@ -48,7 +48,7 @@ impl RunSink for Table {
 
 /// Runs a script with a PI controller; `deaf_s`: seconds in which the recorder takes nothing.
 #[allow(dead_code, reason = "not every test file has its scripts as text")]
-pub fn run(
+pub(crate) fn run(
     text: &str,
     world: &WorldConfig,
     timing: Timing,
@@ -63,7 +63,7 @@ pub fn run(
 }
 
 /// As [`run`], with a script that was read already.
-pub fn run_script(
+pub(crate) fn run_script(
     script: &Script,
     world: &WorldConfig,
     timing: Timing,

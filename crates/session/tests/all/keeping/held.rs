@@ -10,14 +10,14 @@ use cellpos_session::{Options, Rig, RigFile};
 use std::fmt;
 
 /// Gain of Eq. (6) at the frequencies of a hold, 1/s.
-pub const GAIN_PER_S: f64 = 379.0;
+pub(super) const GAIN_PER_S: f64 = 379.0;
 /// Start of the first event, and its errors count from there, s.
 const EVENT_S: f64 = 2.6;
 const FROM_NS: i64 = 2_550_000_000;
 
 /// What happens to a bead that is held.
 #[derive(Debug, Clone)]
-pub struct Row {
+pub(super) struct Row {
     pub law: &'static str,
     pub rate_hz: f64,
     pub pixel_um: f64,
@@ -45,7 +45,7 @@ impl Row {
     }
 
     /// The flow steps, and back after 0.7 s.
-    pub fn step(law: &'static str, flow_um_per_s: f64) -> Self {
+    pub(super) fn step(law: &'static str, flow_um_per_s: f64) -> Self {
         Self {
             flow_um_per_s,
             events: vec![(FaultKind::FlowStep, 0.7)],
@@ -54,7 +54,7 @@ impl Row {
     }
 
     /// A fault by its name in rig.toml, for a time.
-    pub fn event(law: &'static str, kind: &str, for_s: f64) -> Self {
+    pub(super) fn event(law: &'static str, kind: &str, for_s: f64) -> Self {
         let kind = toml::Value::String(kind.to_owned()).try_into();
         Self {
             events: vec![(kind.expect("a kind of fault"), for_s)],
@@ -63,7 +63,7 @@ impl Row {
     }
 
     /// The amplifier gives no more than this, um.
-    pub fn clipped(law: &'static str, clip_um: f64) -> Self {
+    pub(super) fn clipped(law: &'static str, clip_um: f64) -> Self {
         Self {
             clip_um,
             events: vec![(FaultKind::ClipAmplifier, 9.0)],
@@ -73,7 +73,7 @@ impl Row {
     }
 
     /// Whether the bead is not seen for a time.
-    pub fn is_blind(&self) -> bool {
+    pub(super) fn is_blind(&self) -> bool {
         let blind = [
             FaultKind::StallCamera,
             FaultKind::FrozenPicture,
@@ -84,7 +84,7 @@ impl Row {
         self.events.iter().any(|(kind, _)| blind.contains(kind))
     }
 
-    pub fn flow_step_um(&self) -> f64 {
+    pub(super) fn flow_step_um(&self) -> f64 {
         self.flow_um_per_s / GAIN_PER_S
     }
 
@@ -129,7 +129,7 @@ impl Row {
     }
 
     /// Delay of this loop with half a tick of hold, and a tick, s.
-    pub fn delay_and_tick_s(&self) -> (f64, f64) {
+    pub(super) fn delay_and_tick_s(&self) -> (f64, f64) {
         let tick_s = 1.0 / self.rate_hz;
         (2e-3 + 0.5 * tick_s, tick_s)
     }
@@ -170,7 +170,7 @@ impl RunSink for Ticks {
 
 /// How a run went.
 #[derive(Debug)]
-pub struct Held {
+pub(super) struct Held {
     pub state: String,
     pub why: Option<String>,
     pub as_asked: bool,
@@ -191,7 +191,7 @@ pub struct Held {
 }
 
 impl Held {
-    pub const HEAD: &'static str =
+    pub(super) const HEAD: &'static str =
         "row | worst um, RMS nm true (stated), held % true (stated), away ms, state";
 }
 
@@ -215,7 +215,7 @@ impl fmt::Display for Held {
 }
 
 /// Runs a row.
-pub fn hold(row: &Row, seed: u64) -> Held {
+pub(super) fn hold(row: &Row, seed: u64) -> Held {
     let options = Options {
         clock: ClockKind::Virtual,
         frames: Frames::On,

@@ -3,7 +3,7 @@
 use cellpos_control::{ControlLaw, LawInput, LawOutput};
 
 #[derive(Debug, Clone)]
-pub struct Proportional {
+pub(super) struct Proportional {
     pub kp_um_per_um: f64,
 }
 

@@ -3,10 +3,10 @@
 use super::held::{Held, Row};
 
 /// The laws: those of this project, and one of a user's own.
-pub const LAWS: [&str; 4] = ["lqg", "pi", "mpc", "own"];
+pub(super) const LAWS: [&str; 4] = ["lqg", "pi", "mpc", "own"];
 
 /// Every row of the nightly table.
-pub fn all() -> Vec<Row> {
+pub(super) fn all() -> Vec<Row> {
     let mut rows = Vec::new();
     for law in LAWS {
         for um_per_s in [38.0, -114.0, 190.0, -379.0, 568.0, -985.0] {
@@ -48,14 +48,14 @@ pub fn all() -> Vec<Row> {
 }
 
 /// What is asked of a run.
-pub struct Limits {
+pub(super) struct Limits {
     /// RMS of a quiet hold, um, and the largest error of the stated one.
     hold_um: f64,
     stated: f64,
 }
 
 impl Limits {
-    pub fn of_the_loop() -> Self {
+    pub(super) fn of_the_loop() -> Self {
         Self {
             hold_um: 0.057,
             stated: 0.1,
@@ -63,13 +63,13 @@ impl Limits {
     }
 
     /// The furthest that a bead may go when the flow steps, um.
-    pub fn furthest_um(&self, row: &Row) -> f64 {
+    pub(super) fn furthest_um(&self, row: &Row) -> f64 {
         let (delay_s, tick_s) = row.delay_and_tick_s();
         1.3 * row.flow_um_per_s.abs() * (delay_s + 2.0 * tick_s) + 4.0 * self.hold_um
     }
 
     /// What a run broke.
-    pub fn broken(&self, row: &Row, held: &Held) -> Vec<String> {
+    pub(super) fn broken(&self, row: &Row, held: &Held) -> Vec<String> {
         let mut broken = Vec::new();
         if held.changed || held.other_beads > 0 {
             broken.push(format!("another bead: {held}"));
@@ -90,7 +90,7 @@ impl Limits {
     }
 
     /// What is wrong with the stated errors of a row's runs: with their RMS, for the walk of a bead that nobody sees is chance.
-    pub fn stated(&self, row: &Row, held: &[&Held]) -> Option<String> {
+    pub(super) fn stated(&self, row: &Row, held: &[&Held]) -> Option<String> {
         let rms = |of: fn(&Held) -> f64| {
             let squares: f64 = held.iter().map(|held| of(held).powi(2)).sum();
             (squares / held.len() as f64).sqrt()

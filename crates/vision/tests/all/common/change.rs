@@ -4,7 +4,7 @@ use super::Random;
 
 /// A picture of real grey levels.
 #[derive(Debug, Clone)]
-pub struct Picture {
+pub(crate) struct Picture {
     pub width: usize,
     pub height: usize,
     pub grey: Vec<f64>,
@@ -12,7 +12,7 @@ pub struct Picture {
 
 /// What is done to the pictures before they are looked at, the background's and the cells' alike.
 #[derive(Debug, Clone, Copy)]
-pub enum Change {
+pub(crate) enum Change {
     None,
     /// Bright and dark exchanged.
     Inverted,
@@ -40,7 +40,7 @@ pub enum Change {
 
 impl Change {
     /// Factor of lengths.
-    pub fn size(self) -> f64 {
+    pub(crate) fn size(self) -> f64 {
         match self {
             Change::Resized(factor) => factor,
             _ => 1.0,
@@ -48,7 +48,7 @@ impl Change {
     }
 
     /// The changed picture; `empty` for one of the background.
-    pub fn apply(self, picture: &Picture, empty: bool, random: &mut Random) -> Picture {
+    pub(crate) fn apply(self, picture: &Picture, empty: bool, random: &mut Random) -> Picture {
         let p = picture;
         let each = |f: &mut dyn FnMut(f64) -> f64| Picture {
             grey: p.grey.iter().map(|v| f(*v)).collect(),
@@ -116,7 +116,7 @@ impl Change {
     }
 
     /// Where a place of the picture comes to lie.
-    pub fn place(self, (x, y): (f64, f64), height: usize) -> (f64, f64) {
+    pub(crate) fn place(self, (x, y): (f64, f64), height: usize) -> (f64, f64) {
         match self {
             Change::Flipped => (x, height as f64 - 1.0 - y),
             Change::Resized(f) => ((x + 0.5) * f - 0.5, (y + 0.5) * f - 0.5),
@@ -128,7 +128,7 @@ impl Change {
 }
 
 impl Picture {
-    pub fn of(pixels: &[u8], width: usize) -> Self {
+    pub(crate) fn of(pixels: &[u8], width: usize) -> Self {
         Picture {
             width,
             height: pixels.len() / width,
@@ -137,7 +137,7 @@ impl Picture {
     }
 
     /// As a camera of 8 bits gives it.
-    pub fn pixels(&self) -> Vec<u8> {
+    pub(crate) fn pixels(&self) -> Vec<u8> {
         let grey = self.grey.iter();
         grey.map(|v| v.round().clamp(0.0, 255.0) as u8).collect()
     }

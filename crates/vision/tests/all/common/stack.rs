@@ -5,21 +5,21 @@ use std::path::{Path, PathBuf};
 use tiff::decoder::{Decoder, DecodingResult, Limits};
 
 /// Folder of the cells in channels.
-pub const CELLS: &str = concat!(env!("MEASURED_DATA"), "/cells-in-channels");
+pub(crate) const CELLS: &str = concat!(env!("MEASURED_DATA"), "/cells-in-channels");
 
 /// Frames of 8 bits.
-pub struct Stack {
+pub(crate) struct Stack {
     pub width: usize,
     pub height: usize,
     pub pages: Vec<Vec<u8>>,
 }
 
 impl Stack {
-    pub fn open(folder: &str, file: &str) -> Self {
+    pub(crate) fn open(folder: &str, file: &str) -> Self {
         Self::read(&Path::new(CELLS).join(folder).join(file))
     }
 
-    pub fn read(path: &PathBuf) -> Self {
+    pub(crate) fn read(path: &PathBuf) -> Self {
         let file = std::fs::File::open(path).unwrap_or_else(|e| panic!("{}: {e}", path.display()));
         let mut decoder = Decoder::new(file).unwrap().with_limits(Limits::unlimited());
         let (width, height) = decoder.dimensions().unwrap();
@@ -42,7 +42,7 @@ impl Stack {
         }
     }
 
-    pub fn frames(&self) -> impl Iterator<Item = Frame<'_>> {
+    pub(crate) fn frames(&self) -> impl Iterator<Item = Frame<'_>> {
         self.pages.iter().map(|p| Frame {
             width: self.width,
             height: self.height,
@@ -52,6 +52,6 @@ impl Stack {
 }
 
 /// The instrument's masks of a folder.
-pub fn masks(folder: &str) -> Vec<Vec<u8>> {
+pub(crate) fn masks(folder: &str) -> Vec<Vec<u8>> {
     Stack::open(folder, "masks.tif").pages
 }
