@@ -9,9 +9,9 @@ const STAY_TICKS: u32 = 2;
 /// State of the dither.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Dither {
-    /// Command that is added in this tick, um.
+    /// Command that is added in the next tick, um.
     pub command_um: f64,
-    /// The one of the tick before, which a tick that never comes holds.
+    /// The one of the last tick, which is held if no tick follows, um.
     pub given_um: f64,
     /// What the model makes of it.
     pub motion: Motion,
@@ -49,6 +49,12 @@ impl Dither {
         self.command_um = side_um - self.side;
         self.side = side_um;
         finite
+    }
+
+    /// A tick that never came. The actuator holds the last command, and with it the part of the dither; the bead leaves its side. That
+    /// is an error for the loop to remove, so the motion that the loop is to leave alone does not have it. Whether all is finite.
+    pub(super) fn hold(&mut self, estimator: &Estimator) -> bool {
+        self.motion.drive(estimator, 0.0)
     }
 
     /// Back to the middle, while the loop does not control the bead.

@@ -295,10 +295,11 @@ impl Adapter {
     /// A tick that never came: the command was held.
     pub(crate) fn skip(&self, state: &mut AdaptState, command_um: f64) {
         self.learn(state, None);
-        // The dither stays for another tick. The command that cancels the lines should have changed, and what it lacks moves the bead.
-        state.dither.command_um = state.dither.given_um;
+        // The command that cancels the lines should have changed, and what it lacks moves the bead.
         let rest_um = command_um - state.cancel_um;
-        let finite = self.drive(state, rest_um, 0.0);
+        let finite = state.model.drive(&self.nominal, rest_um)
+            && (state.instrument).drive(&self.nominal, state.dither.given_um)
+            && state.dither.hold(&self.nominal);
         state.lines.tick(&self.lines);
         self.cancel_lines(state, state.inverse.is_some());
         if !finite {

@@ -8,6 +8,7 @@ mod live_threads;
 mod no_allocation;
 mod other_law;
 mod skipped_ticks;
+mod stalls;
 
 /// Counts by thread, so that tests beside each other do not disturb one another.
 #[global_allocator]
