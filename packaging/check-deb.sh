@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
-# Unpacks a package into a folder of its own and looks at what a user would get: programs that run and name their commit,
-# at most 20 MB each, completions and manual pages of every command, a unit that systemd accepts. As root it is installed, too, in
-# a copy of this system (an overlay that is gone afterwards): dpkg, its scripts, group and user, and removed again.
+# Unpacks a package into a separate folder and checks its content: programs that run and name their commit, at most 20 MB each;
+# completions and manual pages of every command; a unit that systemd accepts. As root it also installs and removes it in a copy of
+# this system (an overlay that is discarded): dpkg, its scripts, group and user.
 # usage: packaging/check-deb.sh target/debian/cellpos_*.deb
 set -euo pipefail
 deb=$1
@@ -36,7 +36,7 @@ if command -v systemd-analyze >/dev/null; then
     said=$(MANPATH="$root/usr/share/man" systemd-analyze verify "$root/cellpos-run@night.service" 2>&1) || true
     ! grep -i 'cellpos-run' <<< "$said" || fail "systemd does not accept the unit"
 fi
-# What stands in the copy: run by a shell whose mounts are its own.
+# The script for the copy, run by a shell with its own mounts.
 installed() {
     set -euo pipefail
     copy=$1 deb=$2

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# The Python package: installed into an environment of its own as a user would, then its tests, with the snippets of docs/python.md.
+# The Python package: installed into a separate environment as a user would, then its tests, with the snippets of docs/python.md.
 # The program is built with the profile and into the folder that the tests of the workspace use, so that nothing is built twice.
 # Skipped with the reason where the environment cannot be made.
 set -euo pipefail
@@ -14,5 +14,5 @@ cargo build -q --locked -p cellpos-firmware-sim
 CARGO_TARGET_DIR="$PWD/target" MATURIN_PEP517_ARGS="--profile dev" PATH="$PWD/$env/bin:$PATH" \
     "$env/bin/pip" install -q --disable-pip-version-check --no-build-isolation --no-deps --force-reinstall ./python
 cd python
-# Two at once: most of them wait for rigs in real time.
+# Two at once: most tests wait for rigs in real time.
 env -u CELLPOS_PROGRAM "../$env/bin/python" -m pytest -q -n 2 --dist loadfile "$@"

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Exports read by other programs, in an environment of their own; skipped with the reason where that cannot be installed.
+# Exports read by other programs, in a separate environment; skipped with the reason if that cannot be installed.
 # usage: scripts/check-readers.sh target/debug/cellpos [CYCLES]; 20000 cycles are a run of a million ticks
 set -euo pipefail
 program=$(realpath "$1")

@@ -76,7 +76,7 @@ addEventListener("load", () => {
       const across = Math.min(a.right, b.right) - Math.max(a.left, b.left), down = Math.min(a.bottom, b.bottom) - Math.max(a.top, b.top);
       if (across > 2 && down > 0.3 * Math.min(a.height, b.height)) found.push(`${name}: "${t.textContent}" lies upon "${u.textContent}"`);
     }));
-    // A legend's name stands behind its stroke.
+    // A legend's name follows its stroke.
     const names = texts.filter(t => t.previousElementSibling?.matches("line.ln, circle, rect.bnd, rect.bar")).map(t => t.textContent);
     names.filter((n, i) => names.indexOf(n) < i).forEach(n => found.push(`${name}: "${n}" stands twice in the legend`));
   }

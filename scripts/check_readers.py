@@ -112,7 +112,7 @@ def recipes(folder: Path, run: Path) -> None:
         if not shutil.which(program):
             print(f"skipped: {program} is not installed")
             continue
-        # Only what the program has by itself: packages for Parquet are another matter.
+        # Only formats that the program reads without packages; Parquet needs one.
         plain = [block for block in blocks if "arrow::" not in block and "parquet" not in block.lower()]
         for block in plain:
             subprocess.run([program, flag, block], cwd=folder, check=True, stdout=subprocess.DEVNULL)

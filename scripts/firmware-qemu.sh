@@ -1,7 +1,6 @@
 #!/usr/bin/env bash
-# The firmware for a Cortex-M4F: installs what it takes from Debian, builds, reports its size, checks what is linked, and
-# closes the loop through it on QEMU. The same for the RP2350 up to its size: no QEMU runs that. Nothing is installed where it
-# is there already.
+# The firmware for a Cortex-M4F: installs the tools from Debian, builds, reports the size, checks the linked symbols, and closes
+# the loop on QEMU. The same for the RP2350 up to its size: no QEMU runs that. Tools that exist are not installed again.
 #
 #   scripts/firmware-qemu.sh          all of it
 #   scripts/firmware-qemu.sh build    the firmware for QEMU only
@@ -27,7 +26,7 @@ build() { # folder, triple, linker script and further arguments of the linker
   local folder=$1 triple=$2 flags="-C linker-flavor=ld.lld -C linker=/usr/bin/ld.lld -C link-arg=--gc-sections"
   shift 2
   for argument in "$@"; do flags="$flags -C link-arg=$argument"; done
-  # The flags are the linker's alone: they go to the program, and what it is built of is built once for all.
+  # The flags are for the linker alone: they go to the program, and its dependencies are built once for all.
   (
     cd "firmware/$folder"
     PATH="/usr/bin:$PATH" RUSTC=/usr/bin/rustc RUSTC_BOOTSTRAP=1 RUSTFLAGS="" CARGO_TARGET_DIR="$target" \
@@ -59,8 +58,8 @@ ram=$(sum "$firmware" .data .bss)
 echo "firmware mps2-an386: $code bytes of code and constants (at most 65536), $ram bytes of static RAM (at most 8192, which" \
   "memory.x gives to stack and data together)"
 [ "$code" -le 65536 ] && [ "$ram" -le 8192 ] || { echo "firmware: too large" >&2; exit 1; }
-# A panic path would not have linked (see src/main.rs); f64 on this core is calls to these; nor is there an allocator. A file
-# without symbols would show none of them either, so the board's own must be among them.
+# A panic path would not have linked (see src/main.rs). On this core f64 means calls to these functions. There is no allocator
+# either. A file without symbols would also show none, so the board's own symbols must be present.
 symbols=$(readelf -sW "$firmware")
 grep -q 'FUNC.*cellpos_board' <<<"$symbols" || { echo "firmware: no symbols to judge by" >&2; exit 1; }
 if grep -E 'panic|__aeabi_(c?d|u?[il]2d|f2d)|__[a-z]*df|__rust_alloc|__rdl_alloc' <<<"$symbols"; then

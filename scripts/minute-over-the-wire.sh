@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# A loop of any period over a pseudo-terminal and a socket (firmware-sim in a process of its own, rendered frames), in real time,
-# and the bare sleep loop at the same period before and after it.
+# A loop of any period over a pseudo-terminal and a socket, in real time (firmware-sim in a separate process, rendered frames).
+# Before and after it, the bare sleep loop at the same period.
 #
 #     cargo build --release -p cellpos -p cellpos-firmware-sim -p cellpos-benches --bin cellpos --bin firmware-sim --bin minute-table
 #     scripts/minute-over-the-wire.sh              # 500 us, 60 s, lqg

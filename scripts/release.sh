@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Builds what a release consists of, looks at each part in a bare folder, and writes the SHA-256 sums.
+# Builds the parts of a release, checks each in a bare folder, and writes the SHA-256 sums.
 # usage: scripts/release.sh [FOLDER]      archive, Debian package and Python wheel; FOLDER is target/release-files if left out
 # Needs cargo-deb (cargo install cargo-deb) and Python 3 with venv. The version is that of Cargo.toml; all other files must agree with it.
 set -euo pipefail

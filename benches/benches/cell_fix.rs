@@ -1,5 +1,5 @@
-//! Time and error of measuring a cell in a whole frame, beside the centroid and moments of the pixels beyond the
-//! threshold. Run: `cargo bench -p cellpos-benches --bench cell_fix`.
+//! Time and error of measuring a cell in a whole frame, compared with centroid and moments of the pixels beyond the threshold.
+//! Run: `cargo bench -p cellpos-benches --bench cell_fix`.
 
 use cellpos_emulator::{CellConfig, World, WorldConfig};
 use cellpos_plant::Model;
@@ -11,7 +11,7 @@ const EMPTY: usize = 100;
 const WIDTH: usize = 256;
 const HEIGHT: usize = 96;
 
-/// A frame and what it shows: place, length and area, px.
+/// A frame with the true place, length and area, px.
 struct Scene {
     pixels: Vec<u8>,
     truth: [f64; 3],

@@ -1,4 +1,4 @@
-//! What a tick of MPC costs at 1 kHz: clarabel and the active-set solver, easy and constrained, beside a bare loop.
+//! Cost of an MPC tick at 1 kHz: clarabel and the active-set solver, easy and constrained, compared with a bare loop.
 //!
 //!     cargo bench -p cellpos-benches --bench solvers              60 s each
 //!     cargo bench -p cellpos-benches --bench solvers -- 10        10 s each
@@ -7,9 +7,9 @@
 //!
 //! The third solves the problems of 20 s of each loop one after another, without a loop around it, and writes them into the folder.
 //!
-//! Each tick sleeps to its due time, then takes one step of the whole controller (estimator, reference, vectors of the
-//! problem, solver, fallback, limits) on the simulated rig; only the step is timed. `easy` holds a position. `constrained`
-//! allows 1 um/ms and lets the reference leap so that most ticks lie at a bound. The competitor is the same loop with LQG,
+//! Each tick sleeps to its due time, then takes one step of the whole controller on the simulated rig: estimator, reference,
+//! problem, solver, fallback, limits. Only the step is timed. `easy` holds a position. `constrained`
+//! allows 1 um/ms and lets the reference jump so that most ticks are at a bound. The competitor is the same loop with LQG,
 //! which solves nothing, and a bare absolute-sleep loop of the same policy.
 
 use cellpos_benches::problems;

@@ -1,11 +1,11 @@
-//! The loop: how fast the virtual clock runs, and what a tick costs in real time.
+//! The loop: speed of the virtual clock, and cost of a tick in real time.
 //!
 //!     cargo bench -p cellpos-benches --bench the_loop               both, the real-time run for 60 s
 //!     cargo bench -p cellpos-benches --bench the_loop -- virtual    the virtual clock only
 //!     cargo bench -p cellpos-benches --bench the_loop -- 10         both, the real-time run for 10 s
 //!
-//! The competitor of the real-time run is a bare absolute-sleep loop of the same policy, priority and CPU, timed before
-//! and after it: a stall that shows there is the machine's.
+//! The competitor of the real-time run is a bare absolute-sleep loop of the same policy, priority and CPU. It is timed before and
+//! after the run: a stall there comes from the machine.
 
 use cellpos_benches::track;
 use cellpos_rig::Clock;

@@ -1,5 +1,5 @@
-//! Time of one fix on a 25 x 25 window, beside the same model fitted by a general Levenberg-Marquardt solver, and
-//! beside two methods without a template. Run: `cargo bench -p cellpos-benches --bench vision_fix`.
+//! Time of one fix on a 25 x 25 window, compared with the same model fitted by a general Levenberg-Marquardt solver and with two
+//! methods without a template. Run: `cargo bench -p cellpos-benches --bench vision_fix`.
 
 use cellpos_vision::{
     Detector, Frame, Localiser, LocaliserConfig, PixelNoise, PixelResponse, Pixels, Polarity,

@@ -23,7 +23,7 @@ pub struct Row {
     pub ms: f64,
     /// Largest error from the change on, um.
     pub peak_um: f64,
-    /// Where adaptation stands at the end.
+    /// State of adaptation at the end.
     pub adaptation: Option<Adaptation>,
 }
 

@@ -1,4 +1,4 @@
-//! Benchmarks with conditions and competitors: what they share.
+//! Benchmarks with conditions and competitors: shared code.
 #![forbid(unsafe_code)]
 
 pub mod adaptation;

@@ -1,4 +1,4 @@
-//! A run with a live page, and clients of it that behave and that do not, in processes of their own.
+//! A run with a live page, and its well-behaved and misbehaving clients, in separate processes.
 
 use cellpos_rig::Clock;
 use cellpos_runtime::{EndRule, NoSink, Summary};
@@ -88,7 +88,7 @@ pub fn was_a_client() -> bool {
     true
 }
 
-/// A client that reads nothing for five seconds is let go by the server, once its buffers are full.
+/// The server closes a client that reads nothing for five seconds, once its buffers are full.
 const LET_GO_AFTER: Duration = Duration::from_secs(7);
 
 type Socket = WebSocket<TcpStream>;

@@ -2,7 +2,7 @@
 
 pub use cellpos_parallel::map;
 
-/// Value of `--NAME VALUE` or `--NAME=VALUE` among the arguments of the program; `default` where it is not there.
+/// Value of `--NAME VALUE` or `--NAME=VALUE` among the arguments of the program; `default` without it.
 ///
 /// # Panics
 /// A value that is no number: the table would be another than was asked for.
@@ -23,7 +23,7 @@ pub fn option(name: &str, default: u64) -> u64 {
     default
 }
 
-/// Threads that `--parallel` asks for; 1 where it is not there, all cores for 0.
+/// Threads that `--parallel` requests; 1 without it, all cores for 0.
 pub fn threads() -> usize {
     cellpos_parallel::threads(usize::try_from(option("--parallel", 1)).unwrap_or(1))
 }

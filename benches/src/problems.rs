@@ -59,8 +59,8 @@ pub fn law(solver: SolverKind, limits: &Limits) -> MpcLaw {
     MpcLaw::new(&config, Pi::new(0.46, 19.5), &LoopModel::eq6(2e-3), limits).expect("a sound law")
 }
 
-/// The limits and the reference of a loop at rest, or of one at a limit in most ticks: 1 um/ms, and a leap of 16 um every
-/// 14 ms, in which the slew lets the bead go about as far.
+/// Limits and reference of a loop at rest, or of one at a limit in most ticks: 1 um/ms, and a jump of 16 um every 14 ms, about
+/// the time that this slew needs.
 pub fn terms(constrained: bool) -> (Limits, impl Fn(u64) -> f64) {
     let limits = Limits {
         slew_um_per_s: if constrained { 1000.0 } else { 10_000.0 },
@@ -76,7 +76,7 @@ pub fn terms(constrained: bool) -> (Limits, impl Fn(u64) -> f64) {
     (limits, reference)
 }
 
-/// The problems of so many ticks of a loop on the simulated rig.
+/// The problems of a number of ticks of a loop on the simulated rig.
 ///
 /// # Panics
 /// A rig or a loop that cannot be built: a defect.
@@ -112,8 +112,8 @@ pub fn collect(constrained: bool, ticks: u64) -> Vec<QpVectors> {
     std::mem::take(&mut *kept.lock().unwrap_or_else(PoisonError::into_inner))
 }
 
-/// Writes problems as numbers in lines: variables, rows and problems; the Hessian; the rows; for each problem the linear
-/// term, the lower and the upper bounds (1e5 and more: absent), and the first move by the active set.
+/// Writes problems as lines of numbers. First the numbers of variables, rows and problems, then the Hessian and the rows. Then
+/// for each problem the linear term, lower and upper bounds (1e5 and more: absent), and the first move of the active set.
 ///
 /// # Errors
 /// A file that cannot be written.

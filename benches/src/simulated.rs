@@ -64,8 +64,8 @@ pub struct Seen {
     pub output: LoopOutput,
 }
 
-/// Runs a controller along a profile, with a fix in every so many ticks as its estimator is told, with learning if a learner is given; `before` may change the rig at each tick, `each`
-/// sees what happened. What was learned is given back.
+/// Runs a controller along a profile, with a fix every few ticks as its estimator expects, and with learning if a learner is
+/// given. `before` may change the rig at each tick, `each` sees the result. Returns the learner.
 ///
 /// # Panics
 /// A rig or a controller that cannot be built: a defect.

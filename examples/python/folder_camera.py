@@ -31,6 +31,6 @@ def grey(picture):
     return picture if picture.ndim == 2 else picture[..., :3].mean(axis=-1).astype(np.uint8)
 
 
-# A webcam has a rate of its own; what lies in a folder has none.
+# A webcam has its own rate; pictures in a folder have none.
 paced = Path(options.source).exists()
 print(cellpos.serve_camera(map(grey, pictures()), options.rate, options.socket, pace=paced))

@@ -268,7 +268,7 @@ fn frames_come_over_the_socket_in_order_and_a_client_may_come_back() {
                 assert!(last_id.is_none_or(|last| header.frame_id > last));
                 last_id = Some(header.frame_id);
                 assert_eq!((header.width, header.height, header.bits), (256, 32, 8));
-                // The latency of 2 ms, and what the machine adds.
+                // The latency of 2 ms, and the delay that the machine adds.
                 assert!(header.sent_ns >= header.mid_exposure_ns + 2_000_000);
                 let brightest = pixels.iter().max().unwrap();
                 assert!(*brightest > 150, "the bead is in the picture");

@@ -66,7 +66,7 @@ def test_a_slow_reader_loses_whole_frames_that_are_counted_and_the_source_goes_o
     lost = np.diff(numbers) - 1
     assert lost.min() >= 0 and lost.max() > 150
     assert int(lost.sum()) <= stats.dropped
-    # What waited in the socket is a few frames, not a second of them.
+    # A few frames waited in the socket, not a second's worth.
     assert int(np.argmax(lost)) <= 12
 
 

@@ -60,7 +60,7 @@ def test_a_function_in_python_is_moved_within_its_slew_and_parked(lab):
     run = result.run
     sent = run.ticks["partner_command_um"]
     sent = sent[np.isfinite(sent)]
-    # The PZT stands at 20 um and is to be at 22: the slow one goes down.
+    # The PZT is at 20 um and must reach 22: the slow actuator goes down.
     assert sent[-1] < 49.9 and result["partner_lost"] < 0.2 * result["ticks"]
     values = np.array([um for _, um in calls])
     assert values.min() >= 0 and np.abs(np.diff(values)).max() <= 10.0 * 0.02 + 1e-6

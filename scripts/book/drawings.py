@@ -122,9 +122,10 @@ def crates() -> str:
     for level in range(levels):
         y = 14 + (levels - 1 - level) * 50
         members = [name for name in names if depth[name] == level]
+        each = min(110.0, 780 / len(members))
         for k, member in enumerate(members):
-            x = 395 + (k - len(members) / 2) * 110
-            body.append(box(x, y, 102, 36, member, "", ("gry", "box", "grn")[level % 3]))
+            x = 395 + (k - len(members) / 2) * each
+            body.append(box(x, y, each - 8, 36, member, "", ("gry", "box", "grn")[level % 3]))
     return page(790, 14 + levels * 50, "Crates: each row knows rows below it, and nothing above", body)
 
 

@@ -1,4 +1,4 @@
-"""Every figure that the project claims, measured: docs/measurements.json, docs/measurements.md, the README's table, outputs shown on pages.
+"""Every figure that the project claims, measured: docs/measurements.json, docs/measurements.md, the README's table, the README's figure, outputs shown on pages.
 
     scripts/book-measure                # all, some minutes
     scripts/book-measure hold vision    # some groups; the others keep their figures and dates
@@ -18,6 +18,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import plot
 from bench import DATA, ROOT, Bench, Skip
 
 FILE = ROOT / "docs/measurements.json"
@@ -197,6 +198,7 @@ def write(figures: Figures, bench: Bench):
     page += ["## Long tables", "", "These take minutes to hours:", "", "| command | shows |", "|---|---|"]
     page += [f"| `{line}` | {what} |" for line, what in LONG]
     (ROOT / "docs/measurements.md").write_text("\n".join(page) + "\n")
+    (ROOT / "docs/images/proof.svg").write_text(plot.proof(entries))
     readme = ROOT / "README.md"
     text = readme.read_text()
 

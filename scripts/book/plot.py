@@ -63,7 +63,7 @@ def lines(title: str, panels: list[dict], x_label: str, width: int = 760, panel_
 
 
 def bars(title: str, groups: list[dict], width: int = 860, height: int = 300) -> str:
-    """Groups of horizontal bars side by side. A group: `title`, `unit`, `bars` (name, value, colour index), optionally `limit` (name, value)."""
+    """Groups of horizontal bars side by side. A group: `title`, `bars` (name, value, its text, colour index), optionally `limit` (name, value, its text)."""
     body = [f'<text class="ttl" x="16" y="22">{escape(title)}</text>']
     each = width / len(groups)
     for n, group in enumerate(groups):
@@ -72,13 +72,22 @@ def bars(title: str, groups: list[dict], width: int = 860, height: int = 300) ->
         most = max([bar[1] for bar in group["bars"]] + [group.get("limit", ("", 0.0))[1]])
         body.append(f'<text x="{n * each + 16}" y="48">{escape(group["title"])}</text>')
         step = (height - y0 - 30) / len(group["bars"])
-        for k, (name, value, colour) in enumerate(group["bars"]):
+        for k, (name, value, text, colour) in enumerate(group["bars"]):
             y = y0 + k * step
             body.append(f'<text text-anchor="end" x="{x0 - 8}" y="{y + step / 2 + 1:.1f}">{escape(name)}</text>'
                         f'<rect fill="{COLOURS[colour]}" fill-opacity="0.85" x="{x0}" y="{y + 3:.1f}" width="{value / most * room:.1f}" height="{step - 12:.1f}"/>'
-                        f'<text x="{x0 + value / most * room + 6:.1f}" y="{y + step / 2 + 1:.1f}">{number(value)} {escape(group["unit"])}</text>')
+                        f'<text x="{x0 + value / most * room + 6:.1f}" y="{y + step / 2 + 1:.1f}">{escape(text)}</text>')
         if "limit" in group:
-            name, value = group["limit"]
+            name, value, text = group["limit"]
             x = x0 + value / most * room
-            body.append(f'<path class="ln dsh" stroke="#2b2f36" d="M{x:.1f} {y0 - 6}V{height - 26}"/><text class="mut" text-anchor="middle" x="{x:.1f}" y="{height - 10}">{escape(name)} {number(value)} {escape(group["unit"])}</text>')
+            body.append(f'<path class="ln dsh" stroke="#2b2f36" d="M{x:.1f} {y0 - 6}V{height - 26}"/><text class="mut" text-anchor="middle" x="{x:.1f}" y="{height - 10}">{escape(name)} {escape(text)}</text>')
     return svg(width, height, title, body)
+
+
+def proof(figures: list[dict]) -> str:
+    """Hold error of the four laws against the limit, and a fix compared with trackpy: figures of docs/measurements.json, with their texts."""
+    found = {entry["id"]: (entry["value"], entry["shown"]) for entry in figures}
+    laws = [(name, *found[f"hold.{name}"], k) for k, name in enumerate(("pi", "lead", "lqg", "mpc"))]
+    beads = [("cellpos", *found["vision.cellpos"], 2), ("trackpy", *found["vision.trackpy"], 1)]
+    return bars("How close to the limit", [{"title": "Bead held on the emulated rig: RMS error", "bars": laws, "limit": ("physical limit", *found["hold.bound"])},
+                                           {"title": "Bead located, SNR 10: RMS error", "bars": beads}])

@@ -1,6 +1,6 @@
 //! Build script of the crates whose tests read measured records: where those lie.
 //!
-//! `MEASURED_DATA` is the collection beside the project if it is there, else the small set of the repository (tests/data). With the
+//! `MEASURED_DATA` is the collection next to the project if it exists, else the small set of the repository (tests/data). With the
 //! small set `no_shared_data` is set, and tests that need more are listed as ignored, with the reason.
 
 use std::path::Path;

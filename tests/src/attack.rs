@@ -1,8 +1,8 @@
 //! The program under attack: killed, fed with damaged files, with boards and cameras that misbehave, stopped and signalled.
 //!
-//! Each attack says how many tries it made, how they ended, and what broke. A try breaks when the program panics, does not
-//! end, ends with an exit code that it does not have, moves the PZT out of its range, leaves a run that does not read, or
-//! does a cycle twice or not at all. `attack --help` runs them in the numbers of a night; the tests of this package run a few
+//! Each attack says how many tries it made, how they ended, and what broke. A try fails if the program panics, hangs, ends with
+//! an undocumented exit code, moves the PZT out of range, leaves an unreadable run, or does a cycle twice or not at all. `attack
+//! --help` runs them in the numbers of a night; the tests of this package run a few
 //! of each.
 
 pub mod inputs;
@@ -121,7 +121,7 @@ fn start(command: &mut Command) -> Child {
         .expect("cellpos starts")
 }
 
-/// Runs a command that must end with one of its own exit codes.
+/// Runs a command that must end with a documented exit code.
 fn run(folder: &Path, line: &str, what: &str, attacked: &mut Attacked) -> Option<Ended> {
     let ended = wait(start(&mut cellpos(folder, line)), what, attacked)?;
     if !matches!(ended.code, Some(0..=2)) {
@@ -155,8 +155,8 @@ fn cycles(run: &Path) -> Vec<u64> {
         .collect()
 }
 
-/// Times that a script is gone on with after it has been killed for the last time: a session that goes safe by itself, as one
-/// does on a machine that stalls, is one more interruption.
+/// How often a script is resumed after its last kill. A session that goes Safe, as happens on a machine that stalls, is one more
+/// interruption.
 const MOST_SESSIONS: u64 = 10;
 
 /// `kill -9` of the program in the middle of a script, and on again, until it has been killed so often; then to its end. How
@@ -400,7 +400,7 @@ pub fn hostile_cameras(folder: &Path, tries: u64, chance: &mut Chance) -> Attack
     attacked
 }
 
-/// Stopped, continued, interrupted, hung up on, poked: the program ends when it is told to, and what it did reads.
+/// Stopped, continued, interrupted, hung up on, poked: the program ends on request, and its run is readable.
 pub fn stalls_and_signals(folder: &Path, tries: u64, chance: &mut Chance) -> Attacked {
     let mut attacked = Attacked::default();
     let signals = [

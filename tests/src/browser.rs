@@ -37,7 +37,7 @@ impl Browser {
                 rest.trim_end_matches('.').parse().ok()
             })
             .expect("chromedriver says its port");
-        // What it says further must not fill the pipe.
+        // Further output must not fill the pipe.
         std::thread::spawn(move || lines.for_each(drop));
         let mut browser = Self {
             driver,
@@ -176,15 +176,14 @@ impl Browser {
         }
     }
 
-    /// What the page has written to its console since it was last asked, errors of loading included.
+    /// Console messages of the page since the last call, loading errors included.
     pub fn console(&self) -> Vec<String> {
         let log = self.on_session("POST", "/se/log", &json!({ "type": "browser" }));
         let lines = log.as_array().cloned().unwrap_or_default();
         lines.iter().map(|line| text(&line["message"])).collect()
     }
 
-    /// Memory of driver and browser together, kB: what their processes have in RAM, pages that they share counted once for each
-    /// that has them.
+    /// Memory of driver and browser together, kB: RAM of their processes, shared pages counted once per process.
     pub fn memory_kb(&self) -> u64 {
         let group = self.driver.id();
         let Ok(processes) = std::fs::read_dir("/proc") else {
@@ -220,7 +219,7 @@ impl Browser {
     }
 }
 
-/// What a process has in RAM, kB; 0 where it is gone. `process`: its folder in /proc.
+/// RAM of a process, kB; 0 if it is gone. `process`: its folder in /proc.
 pub fn resident_kb(process: &Path) -> u64 {
     let status = std::fs::read_to_string(process.join("status")).unwrap_or_default();
     let line = status.lines().find_map(|line| line.strip_prefix("VmRSS:"));
@@ -246,8 +245,8 @@ fn read_answer(mut from: impl BufRead) -> std::io::Result<String> {
 
 impl Drop for Browser {
     fn drop(&mut self) {
-        // Closing the session ends the browser in good order. Where that fails, and where the test did, driver and browser are
-        // one group of processes: none of them outlives the test.
+        // Closing the session ends the browser in good order. If that fails, or the test did, driver and browser are one group of
+        // processes: none outlives the test.
         if !self.session.is_empty() && !std::thread::panicking() {
             self.on_session("DELETE", "", &Value::Null);
         }

@@ -1,4 +1,4 @@
-//! Whole-system tests: what they share.
+//! Whole-system tests: shared code.
 #![forbid(unsafe_code)]
 
 pub mod attack;

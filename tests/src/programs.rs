@@ -16,7 +16,7 @@ pub const PATIENCE: Duration = Duration::from_secs(30);
 /// They are not there: a run of this package's tests alone does not build them.
 pub fn folder() -> PathBuf {
     let exe = std::env::current_exe().expect("a test knows its own path");
-    // A test is in target/<profile>/deps, a program of this package beside the others.
+    // A test is in target/<profile>/deps; the programs are one folder up.
     let beside = exe.parent().expect("target/<profile>");
     let folder = if beside.ends_with("deps") {
         beside.parent().expect("target/<profile>").to_path_buf()
@@ -60,8 +60,8 @@ pub fn wait_until(what: &str, mut holds: impl FnMut() -> bool) {
 
 /// A test that has the machine's real time to itself, among those of its program.
 ///
-/// Loop, camera and board ask for real-time priority: two rigs at once on two cores starve each other, and the one that is
-/// judged may be the one that had nothing. Whoever holds it may take it again.
+/// Loop, camera and board ask for real-time priority: two rigs at once on two cores starve each other, and the test may fail for
+/// that reason alone. Whoever holds it may take it again.
 #[must_use = "it ends when it is dropped"]
 pub struct Alone {
     _held: Option<MutexGuard<'static, ()>>,

@@ -4,8 +4,8 @@
 //!     cargo run --release -p cellpos-benches --bin adapt-table -- --hours 10    # the long hold alone
 //!
 //! Rig at the level of positions: Eq. (6), D = 0.33 um^2/s, 20 nm fixes, loop delay 2.5 ms. Each seed goes through every
-//! gain and delay of the spread in an order of its own, half of the ways stepped and half drifting over 20 s; a delay of one
-//! more sample is one that no time stamp tells. Each stay is 5 s to adapt and 10 s measured; errors are of the true position,
+//! gain and delay of the spread in a different order: half of the changes are steps, half drift over 20 s. No time stamp shows
+//! the additional sample of delay. Each stay is 5 s to adapt and 10 s measured; errors are of the true position,
 //! over the lowest possible on the plant in force. Ms is that of the tuning in force on that plant, each second.
 
 use cellpos_benches::adaptation::{Row, hold_through, regimes};
@@ -50,7 +50,7 @@ fn changes(threads: usize, seeds: u64) {
     }
 }
 
-/// A hold in which nothing happens: where the estimate is in its interval, what comes into force, what is told.
+/// A hold without a change: share of time with the estimate in its interval, tuning in force, events.
 fn long_hold(threads: usize, hours: u64) {
     println!(
         "{:<8} {:>12} {:>16} {:>14} {:>16} {:>7}",

@@ -1,12 +1,12 @@
-//! Cyclic motion with a wrong model: what preview alone leaves, and what learning makes of it.
+//! Cyclic motion with a wrong model: error with preview alone, and with learning.
 //!
 //!     cargo run --release -p cellpos-benches --bin cycle-table     # -- --adapt 0 --cycles 10 --seeds 10 --parallel 0
 //!
-//! Rig at the level of positions: Eq. (6) with the gain 20 % and the delay 0.25 ms off in either direction, D =
-//! 0.33 um^2/s, 20 nm fixes, loop delay 2.5 ms in the model. True positions; the learned error counts from the end of the
-//! 10th cycle (`--cycles`) at full amplitude for 1 s, the hold error on the same wrong rig for 4 s. Ten seeds and four
-//! directions each. "worst cycle": error of a cycle over that of the same cycle without learning, mean of squares over all
-//! runs, the largest of the first 40 cycles. "idle": runs that have nothing learned in force at the end.
+//! Rig without pictures: Eq. (6), gain wrong by 20 % and delay by 0.25 ms in either direction. D = 0.33 um^2/s, 20 nm fixes, loop
+//! delay 2.5 ms in the model. Errors are true. The learned error counts for 1 s from the end of the 10th cycle (`--cycles`) at
+//! full amplitude, the hold error for 4 s on the same rig. Ten seeds and four
+//! directions each. "worst cycle": error of a cycle relative to the same cycle without learning (mean of squares over all runs),
+//! largest of the first 40. "idle": runs without a learned feed-forward at the end.
 
 use cellpos_benches::parallel;
 use cellpos_benches::simulated::{controllers, loop_config, rms, run, sine};

@@ -3,9 +3,8 @@
 //!     cargo run --release -p cellpos-benches --bin hold-table     # -- --parallel 0
 //!
 //! Rig at the level of positions (no camera, no board): Eq. (6), D = 0.33 um^2/s, 20 nm fixes, loop delay 2.5 ms. True
-//! positions at the ticks, seeds 0 to 4. Errors count from 2 s on, for 10 s; a step is settled when the bead stays
-//! within the band until 60 ms after it, Brownian motion included (2 % are 4 standard deviations of the hold error, so
-//! that an excursion later on is no matter of the step).
+//! positions at the ticks, seeds 0 to 4. Errors count from 2 s on, for 10 s. A step is settled if the bead stays within the band
+//! until 60 ms after it, Brownian motion included. The band of 2 % is 4 standard deviations of the hold error.
 
 use cellpos_benches::parallel;
 use cellpos_benches::simulated::{controllers, loop_config, rms, run, sine};

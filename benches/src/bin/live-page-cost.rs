@@ -1,11 +1,12 @@
-//! What a live page costs the control thread: wake-up and computing time without a page, with one client, with one that stalls
-//! and with twenty that flood, in one run on the same machine, each beside a bare loop.
+//! Cost of a live page for the control thread: wake-up and computing time without a page, with one client, with a client that
+//! stalls, with twenty that flood. All in one run on one machine, each compared with a bare loop.
 //!
 //!     cargo run --release -p cellpos-benches --bin live-page-cost                     5 rounds of 20 s each: nine minutes
 //!     cargo run --release -p cellpos-benches --bin live-page-cost -- 3 2              3 s each, 2 rounds: to try it
 //!
-//! The conditions take turns, each round beginning with another one, so that what the machine does besides meets all of them.
-//! The clients are processes of their own by the ordinary scheduler, as browsers are; on a machine of two CPUs they share them
+//! The conditions take turns, and each round begins with another one, so that other load of the machine affects all conditions
+//! alike.
+//! The clients are separate processes of the ordinary scheduler, as browsers are. On a machine with two CPUs they share the CPUs
 //! with the loop. The yardstick is the bare loop: an absolute sleep of the same policy, priority and CPU.
 
 use cellpos_benches::live_page::{Client, Running, hold, was_a_client};

@@ -4,9 +4,9 @@
 //!     cargo run --release -p cellpos-benches --bin live-page-memory -- 10 browser     10 minutes, the page in chromium
 //!     cargo run --release -p cellpos-benches --bin live-page-memory -- 1              1 minute: to try it
 //!
-//! The run is a process of its own. What it, and what driver and browser together, have in RAM is sampled every five seconds,
-//! and so is the page's heap behind a collection. The slope is a least-squares line through what is sampled behind the first
-//! fifth of the time, in which rings and histories fill: the page's hold ten minutes of rows and are taken whole at the start.
+//! The run is a separate process. Its RAM, the RAM of driver and browser together, and the page's heap after a collection are
+//! sampled every five seconds. The slope is a least-squares line through all samples but those of the first fifth, in which rings
+//! and histories fill. The page allocates ten minutes of rows at the start.
 
 use cellpos_benches::live_page::{Client, Running, hold, now_s, slope, until_told, was_a_client};
 use cellpos_tests::browser::{Browser, resident_kb};
@@ -71,14 +71,14 @@ fn main() {
     tell(&samples, minutes);
 }
 
-/// The run: says its link, and goes on until it is told to end.
+/// The run: prints its link, and continues until it is asked to end.
 fn serve(seconds: u64) {
     let summary = hold(seconds, true, |url| {
         println!("{}", url.expect("it has a page"));
         std::io::stdout().flush().expect("whoever asked reads");
         std::thread::spawn(|| {
             until_told();
-            // Whoever asked is gone: the emulated rig is given up with the process.
+            // The parent is gone: the emulated rig ends with the process.
             std::process::exit(0);
         });
     });

@@ -1,4 +1,4 @@
-//! The loop at SCHED_FIFO beside a bare absolute-sleep loop, idle and under load, as one table.
+//! The loop at SCHED_FIFO compared with a bare absolute-sleep loop, idle and under load, as one table.
 //!
 //! ```text
 //! cargo run --release -p cellpos-benches --bin minute-table          a minute of each
@@ -8,8 +8,8 @@
 //! ```
 //!
 //! Late: woken, or a command handed over, more than half a period after its time. Skipped: periods without a tick. Lost: the
-//! two together, which is what both loops are compared by. The bare loop makes the tick of a wake-up that is 0.7 periods late
-//! all the same and counts it as late; cellpos makes the tick of the period that is nearest then and counts one skipped.
+//! two together, which is what both loops are compared by. If a wake-up is 0.7 periods late, the bare loop makes its tick and
+//! counts it as late. cellpos makes the tick of the nearest period and counts one skipped.
 //! Exit code 1: the loop lost more than the bare loop and one in ten thousand ticks.
 
 use cellpos_benches::track;
@@ -21,7 +21,7 @@ use std::io::{Seek, Write};
 use std::process::{Child, Command, ExitCode};
 use std::time::Duration;
 
-/// A load: what it does until it is told to stop.
+/// A load: its work until it is stopped.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Load {
     Idle,
@@ -53,7 +53,7 @@ impl Load {
     }
 }
 
-/// A load in a process of its own, whose memory nobody locks; ended when dropped.
+/// A load in a separate process, whose memory is not locked; ended when dropped.
 struct Loading(Child);
 
 impl Loading {
@@ -114,7 +114,7 @@ fn touch() -> ! {
 /// Period of the loop.
 const LOOP: Duration = Duration::from_millis(1);
 
-/// Late and skipped of so many ticks.
+/// Late and skipped ticks of a number of ticks.
 #[derive(Debug, Clone, Copy)]
 struct Figures {
     ticks: u64,
@@ -166,7 +166,7 @@ fn bare(seconds: u64, period: Duration) -> Figures {
 }
 
 fn looped(seconds: u64) -> Figures {
-    // On a thread of its own: the one that serves the board gets real-time rights, which loads must not inherit.
+    // On a separate thread: the thread that serves the board gets real-time rights, which loads must not inherit.
     let run = std::thread::spawn(move || track(Clock::Real, false, seconds * 1000));
     let (summary, _) = run.join().expect("the run is carried through");
     Figures {

@@ -1,11 +1,11 @@
-//! Hold error and step at 1, 2 and 5 kHz, beside the lowest hold error possible at each.
+//! Hold error and step at 1, 2 and 5 kHz, compared with the lowest possible hold error.
 //!
 //!     cargo run --release -p cellpos-benches --bin rate-table
 //!
-//! Rig at the level of positions: Eq. (6), D = 0.33 um^2/s, fixes of 5 nm, the camera path two samples at every rate (loop
-//! delay 2.5, 1.25 and 0.5 ms). Weights of the controllers are the defaults, in ticks; range and slew are in force. A step is
-//! of 10 um and previewed; its time is the worst of the seeds, Brownian motion included. The last rows are of loops faster than their
-//! camera: 1 kHz, a path of 2 ms; their bound is that of what is known, which grows older from fix to fix. The laws adapt.
+//! Rig without pictures: Eq. (6), D = 0.33 um^2/s, fixes of 5 nm. The camera path is two samples at every rate (loop delay 2.5,
+//! 1.25 and 0.5 ms). Weights of the controllers are the defaults, in ticks; range and slew are in force. A step is
+//! of 10 um and previewed; its time is the worst of the seeds, Brownian motion included. The last rows have loops faster than
+//! their camera: 1 kHz, a path of 2 ms. Their bound accounts for the age of the newest fix. The laws adapt.
 
 use cellpos_benches::simulated::{rms, run};
 use cellpos_control::design::bound_rms_um;

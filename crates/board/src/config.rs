@@ -1,4 +1,4 @@
-//! What a board is built and set up for, in whole numbers.
+//! Configuration of a board, in whole numbers.
 
 use cellpos_link::Limits;
 
@@ -52,7 +52,7 @@ impl Config {
 
     /// Highest code of the converter.
     pub const fn highest_code(&self) -> u16 {
-        // `dac_bits` is checked to be 8..=16; what is not is taken as 16.
+        // `dac_bits` must be 8..=16; any other value counts as 16.
         match self.dac_bits {
             8..=15 => (1 << self.dac_bits) - 1,
             _ => u16::MAX,

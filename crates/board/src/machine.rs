@@ -1,8 +1,8 @@
-//! The state machine: what the board does with each message, and by itself as time passes.
+//! The state machine: the reaction of the board to each message and to the passing of time.
 //!
 //! The board trusts nobody: it enforces range and slew itself, ignores commands that are old, doubled, reordered or of
-//! another session, and answers silence in two stages. First it goes to the host's last estimate of the zero-flow
-//! displacement and holds it, where the bead all but stops; a host that comes back takes up again with its next command.
+//! another session, and answers silence in two stages. First it goes to the host's last estimate of the zero-flow displacement
+//! and holds it: the bead almost stops. A host that returns continues with its next command.
 //! If none comes, it ramps to park and stays there until it is armed again.
 //!
 //! | state | output | left by |
@@ -84,8 +84,8 @@ impl Board {
         })
     }
 
-    /// A board whose microcontroller was reset while its converter stood at `applied_pm`: nobody moves a bead out of there, so
-    /// the output goes to park by the ramp before anything else. It is armed when it has arrived.
+    /// A board whose microcontroller was reset while its converter showed `applied_pm`. No host controls the bead from there, so
+    /// the output first ramps to park. It is armed when it has arrived.
     ///
     /// # Errors
     /// [`ConfigError`] names the first value that cannot be; a displacement outside the range is one.
@@ -113,10 +113,10 @@ impl Board {
         }
     }
 
-    /// Brings the output up to `now_us`; returns the code that stands at the converter from now on.
+    /// Brings the output up to `now_us`; returns the code that the converter shows from now on.
     ///
-    /// To be called every [`Config::update_us`] while the output moves. When calls come further apart, the output still
-    /// moves by no more than the slew of one update period per call: a stalled board slows down, it does not jump.
+    /// To be called every [`Config::update_us`] while the output moves. If calls come further apart, the output still moves by at
+    /// most the slew of one update period per call. So a stalled board slows down and does not jump.
     pub fn tick(&mut self, now_us: u64) -> u16 {
         self.now_us = self.now_us.max(now_us);
         self.watch();
@@ -132,7 +132,7 @@ impl Board {
         self.transmit.take(out)
     }
 
-    /// When the board next has something to do by itself, us: the next step of a moving output, the end of a watchdog
+    /// Next time at which the board must act without a message, us: the next step of a moving output, the end of a watchdog
     /// time, a status. Between events and messages, ticks change nothing.
     pub fn next_event_us(&self) -> u64 {
         let mut next = u64::MAX;
@@ -148,7 +148,7 @@ impl Board {
         next.max(self.now_us.saturating_add(1))
     }
 
-    /// Whether the output has not yet arrived where it is to be.
+    /// Whether the output is still moving to its target.
     pub fn is_moving(&self) -> bool {
         let (target_pm, _) = self.target();
         !self.output.arrived(target_pm) || self.trajectory.ends_after(self.now_us)
@@ -179,7 +179,7 @@ impl Board {
         self.led
     }
 
-    /// What the board is made of.
+    /// The board's configuration.
     pub fn config(&self) -> &Config {
         &self.config
     }
@@ -240,7 +240,7 @@ impl Board {
         }
     }
 
-    /// Acts on watchdog times that have run out; on both of them when the second has, too.
+    /// Acts on expired watchdogs; on both if the second has expired as well.
     fn watch(&mut self) {
         while let Some(deadline_us) = self.deadline_us().filter(|&end_us| self.now_us >= end_us) {
             match self.state {
@@ -380,7 +380,7 @@ impl Board {
                 self.hold(BoardState::Frozen, self.now_us);
                 Ok(())
             }
-            // A host that goes on saying freeze is alive.
+            // A host that repeats freeze is alive.
             BoardState::Frozen => {
                 self.held_since_us = self.now_us;
                 Ok(())

@@ -1,7 +1,7 @@
 //! The output stage: where the output is to be, and how it gets there within range, slew and converter steps.
 //!
-//! All in whole numbers: displacements before the converter in femtometres, so that the slew of a single microsecond at
-//! 1 nm/s is still a number (1 nm/s times 1 us is 1 fm), rates in nm/s, times in us.
+//! All numbers are integers: rates in nm/s, times in us, displacements before the converter in fm. So the slew of one microsecond
+//! at 1 nm/s is still 1 fm.
 
 use crate::Config;
 use core::num::NonZeroU64;
@@ -98,12 +98,12 @@ impl Output {
         output
     }
 
-    /// The code that stands at the converter.
+    /// The code at the converter.
     pub(crate) const fn code(&self) -> u16 {
         self.code
     }
 
-    /// The displacement that stands at the converter, pm.
+    /// The displacement at the converter, pm.
     pub(crate) fn applied_pm(&self) -> i32 {
         let range_pm = self.range_fm.get() / FM as u64;
         let half = self.highest_code.get() / 2;
@@ -114,7 +114,7 @@ impl Output {
 
     /// Moves towards `target_pm` for the time since the last call, at most one update period, at `rate_nm_per_s` at most.
     ///
-    /// What stands at the converter is always within half a converter step of a trajectory that keeps to the slew.
+    /// The converter's displacement is always within half a step of a trajectory that respects the slew limit.
     pub(crate) fn advance(&mut self, now_us: u64, target_pm: i32, rate_nm_per_s: u32) {
         let elapsed_us = now_us.saturating_sub(self.last_us);
         self.last_us = self.last_us.max(now_us);

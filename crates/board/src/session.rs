@@ -1,4 +1,4 @@
-//! What belongs to one session: its limits, its watchdog times, and which commands are fresh.
+//! State of one session: limits, watchdog times, and which commands are fresh.
 
 use crate::Config;
 use cellpos_link::{Arm, Command, Limits, Order, Refusal, order};
@@ -45,7 +45,7 @@ impl Session {
         }
     }
 
-    /// A session as a host asks for it, if that is within what the board is.
+    /// The session that a host requests, if it is within the board's limits.
     pub(crate) fn asked(arm: &Arm, config: &Config, now_us: u64) -> Result<Self, Refusal> {
         let own = config.limits;
         let inside = |pm: i32| pm >= own.low_pm && pm <= own.high_pm;
@@ -97,8 +97,8 @@ impl Session {
 
     /// Whether a command took `late_us` longer on its way than the fastest one.
     ///
-    /// The two clocks have no common zero, so only differences count; and the fastest transit time may creep by 200 ppm of
-    /// the elapsed time, because two crystals differ by no more than that.
+    /// The two clocks have no common zero, so only differences count. Two crystals differ by at most 200 ppm, so the fastest
+    /// transit time may grow by that share of the elapsed time.
     pub(crate) fn is_late(&mut self, command: &Command, now_us: u64, late_us: u32) -> bool {
         let transit_us = (now_us as i64).wrapping_sub(command.time_us as i64);
         let transit_ns = transit_us.saturating_mul(1000);

@@ -38,7 +38,7 @@ impl TransmitBuffer {
             self.unsent = self.unsent.saturating_add(1);
             return;
         };
-        // To the end of the ring, and what is left from its beginning.
+        // To the end of the ring, then the rest from its beginning.
         let end = (self.first + self.filled) % CAPACITY;
         let before = CAPACITY - end;
         for (place, byte) in self.bytes.iter_mut().skip(end).zip(frame) {

@@ -10,9 +10,8 @@
 //! assert_eq!(allocations_of(|| drop(std::hint::black_box(vec![1_u8; 64]))), 1);
 //! assert_eq!(allocations_of(|| assert_eq!(std::hint::black_box(2) + 2, 4)), 0);
 //! ```
-//! Where it is not installed the count stays zero, so a test that asserts a count of zero also shows that its counter
-//! counts. What is freed is not counted: what is freed was allocated before. Nor is it meant for finding out where an
-//! allocation comes from; a debugger stopped in [`CountingAllocator`]'s `alloc` tells that.
+//! Without the `global_allocator` the count stays zero. So a test that asserts a count of zero must also show a count above zero.
+//! Frees are not counted. To find where an allocation comes from, stop a debugger in [`CountingAllocator`]'s `alloc`.
 #![allow(unsafe_code)]
 
 use std::alloc::{GlobalAlloc, Layout, System};
@@ -26,9 +25,9 @@ thread_local! {
 #[derive(Debug, Clone, Copy, Default)]
 pub struct CountingAllocator;
 
-// SAFETY: every call is handed on unchanged to the system's allocator, so what holds for that holds here; the counter is a
-// thread-local of a plain number, without lazy initialisation and without a destructor, so counting can neither allocate
-// nor panic. `realloc` and `alloc_zeroed` are those of the trait, which come back to `alloc`: they count as allocations.
+// SAFETY: every call goes unchanged to the system's allocator, whose guarantees hold here, too. The counter is a thread-local
+// number without lazy initialisation and destructor, so counting can neither allocate nor panic. `realloc` and `alloc_zeroed` are
+// those of the trait, which come back to `alloc`: they count as allocations.
 unsafe impl GlobalAlloc for CountingAllocator {
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
         let _ = COUNT.try_with(|count| count.set(count.get().wrapping_add(1)));

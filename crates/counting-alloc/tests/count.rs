@@ -1,4 +1,4 @@
-//! What counts as an allocation, and whose it is.
+//! Which calls count as an allocation, and of which thread.
 #![forbid(unsafe_code)]
 
 use cellpos_counting_alloc::{CountingAllocator, allocations_of};

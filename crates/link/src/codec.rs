@@ -15,7 +15,7 @@ const MAX_ENCODED: usize = cobs::max_encoding_length(MAX_BODY);
 pub const MAX_FRAME: usize = MAX_ENCODED + 2;
 
 const DELIMITER: u8 = 0;
-/// One table of 256 entries: a kilobyte is what a board has to spare, and its look-up needs no bounds check.
+/// One table of 256 entries: a board can spare a kilobyte, and the look-up needs no bounds check.
 static CRC: Crc<u32> = Crc::<u32>::new(&CRC_32_ISO_HDLC);
 
 mod sealed {
@@ -95,8 +95,8 @@ pub fn encode<M: Message>(message: &M, out: &mut [u8]) -> Result<usize, EncodeEr
 
 /// Takes bytes as they come, in pieces of any size, and yields the messages of one direction.
 ///
-/// A frame that is too long, not COBS, fails the CRC, has the other direction's byte or does not read as a message is
-/// dropped and counted; decoding goes on at the next delimiter. Never panics, never allocates, holds at most one frame.
+/// Drops and counts a frame that is too long, not COBS, fails the CRC, has the other direction's byte or is no message. Decoding
+/// continues at the next delimiter. Never panics, never allocates, holds at most one frame.
 #[derive(Debug, Clone)]
 pub struct Decoder<M> {
     buffer: [u8; MAX_ENCODED],
@@ -203,8 +203,8 @@ fn open<M: Message>(encoded: &[u8]) -> Option<M> {
     }
 }
 
-/// The displacement `um` as whole picometres, rounded to nearest; the ends of `i32` (2147 um) for what lies beyond them, and
-/// `None` for a number that is none.
+/// The displacement `um` as whole picometres, rounded to nearest; the ends of `i32` (2147 um) for values beyond them, and `None`
+/// for NaN.
 pub fn picometres(um: f64) -> Option<i32> {
     if um.is_nan() {
         return None;

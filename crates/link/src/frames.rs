@@ -1,7 +1,7 @@
 //! Camera frames on a stream socket: how the emulated rig hands its frames to a host.
 //!
-//! Each frame is a header of [`HEADER_LEN`] bytes followed by `payload_len` bytes of pixels, rows contiguous, one byte per
-//! pixel up to 8 bits, else two in little-endian order. All numbers of the header are little-endian:
+//! Each frame is a header of [`HEADER_LEN`] bytes and `payload_len` bytes of pixels. Rows are contiguous. A pixel is one byte up
+//! to 8 bits, else two in little-endian order. All numbers of the header are little-endian:
 //!
 //! | offset | bytes | content |
 //! |---|---|---|
@@ -52,7 +52,7 @@ pub struct FrameHeader {
     pub bits: u16,
 }
 
-/// Why a header was refused. The stream is out of step: connect anew.
+/// Why a header was refused. The stream is out of step: connect again.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum HeaderError {
     /// The first bytes are not the magic.
@@ -208,7 +208,7 @@ impl FrameGatherer {
     /// Takes bytes off the front of `bytes` until a frame is complete; its pixels stay valid until the next call.
     ///
     /// # Errors
-    /// [`HeaderError`]; the stream is out of step, connect anew and start with a new gatherer.
+    /// [`HeaderError`]; the stream is out of step: connect again with a new gatherer.
     pub fn next_frame(
         &mut self,
         bytes: &mut &[u8],

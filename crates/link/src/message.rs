@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 /// another version.
 pub const PROTOCOL_VERSION: u16 = 2;
 
-/// What the host says to the board.
+/// A message from the host to the board.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub enum ToBoard {
     /// Opens the conversation; answered by [`ToHost::Identity`].
@@ -43,13 +43,13 @@ pub enum ToBoard {
 /// How a session is to be run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Arm {
-    /// Number of the session, drawn at random by the host, so that two hosts are told apart; a command of another
-    /// session is ignored and counted.
+    /// Number of the session, drawn at random by the host, so that two hosts differ. Commands of another session are ignored and
+    /// counted.
     pub session: u16,
     /// Without a fresh command for this long while running, the board goes to the last zero-flow estimate and holds it.
     /// `None`: the board's default.
     pub watchdog_ms: Option<u16>,
-    /// Held for this long (by itself, frozen, or armed without a first command), the board ramps to park. `None`: the
+    /// After it held for this long (holding, frozen, or armed without a first command) the board ramps to park. `None`: the
     /// board's default.
     pub hold_watchdog_ms: Option<u16>,
     /// Where a ramp to park ends. `None`: the board's default.
@@ -58,7 +58,7 @@ pub struct Arm {
     pub limits: Option<Limits>,
     /// Draw a straight line between commands instead of a step (costs half a command period of delay).
     pub interpolate: bool,
-    /// Send a [`ToHost::Status`] after each so many accepted commands; 0: none but on request or on a change of state.
+    /// Send a [`ToHost::Status`] after this number of accepted commands; 0: only on request or on a change of state.
     pub status_every: u16,
 }
 
@@ -104,7 +104,7 @@ pub struct Command {
     pub neutral_pm: i32,
 }
 
-/// What the board says to the host.
+/// A message from the board to the host.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub enum ToHost {
     /// Answer to [`ToBoard::Hello`].
@@ -123,7 +123,7 @@ pub enum ToHost {
     },
     /// How things stand.
     Status(Status),
-    /// Sent once, at the moment the board stops following by itself; also part of every status from then on.
+    /// Sent once, when the board stops following commands without a request; every later status repeats it.
     Fault {
         /// Which.
         fault: Fault,
@@ -139,7 +139,7 @@ pub enum ToHost {
     },
 }
 
-/// What the board is.
+/// Identity and limits of the board.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Identity {
     /// The board's [`PROTOCOL_VERSION`].
@@ -216,7 +216,7 @@ pub enum BoardState {
     Holding = 5,
 }
 
-/// Why the board stopped following by itself.
+/// Why the board stopped following commands without a request.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[repr(u8)]
 pub enum Fault {
@@ -230,7 +230,7 @@ pub enum Fault {
     ArmTimeout = 3,
 }
 
-/// How things stand on the board.
+/// State of the board.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Status {
     /// Session of the last [`ToBoard::Arm`].
@@ -241,7 +241,7 @@ pub struct Status {
     pub last_time_us: u64,
     /// State.
     pub state: BoardState,
-    /// Displacement that stands at the converter's output, pm.
+    /// Displacement at the converter's output, pm.
     pub applied_pm: i32,
     /// Last zero-flow estimate, pm.
     pub neutral_pm: i32,
@@ -261,6 +261,6 @@ pub struct Status {
     pub clipped: u32,
     /// Messages to the host dropped because they were not collected.
     pub unsent: u32,
-    /// How often in this session the board held by itself because commands stopped.
+    /// How often in this session the board held because commands stopped.
     pub holds: u16,
 }

@@ -1,6 +1,6 @@
 //! Arithmetic that several crates share: seeded random numbers, order statistics, distributions.
 //!
-//! Each exists once here, so that two crates cannot disagree about what a quantile or a seed means. It is not a
+//! Each exists once here, so that two crates cannot disagree about the meaning of a quantile or a seed. It is not a
 //! statistics library: distribution functions come from `statrs`.
 //!
 //! ```

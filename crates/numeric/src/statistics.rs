@@ -54,8 +54,7 @@ fn invert(target: f64, mut low: f64, mut high: f64, f: impl Fn(f64) -> f64) -> f
     0.5 * (low + high)
 }
 
-/// The `probability` quantile of the finite numbers of a sample, interpolated linearly between order statistics; NaN if
-/// there are none.
+/// The `probability` quantile of the finite numbers of a sample, interpolated linearly between order statistics; NaN without any.
 pub fn quantile(sample: &[f64], probability: f64) -> f64 {
     quantiles(sample, [probability])[0]
 }
@@ -74,7 +73,7 @@ pub fn quantiles<const N: usize>(sample: &[f64], probabilities: [f64; N]) -> [f6
     })
 }
 
-/// The median of the finite numbers of a sample; NaN if there are none.
+/// The median of the finite numbers of a sample; NaN without any.
 pub fn median(sample: &[f64]) -> f64 {
     quantile(sample, 0.5)
 }

@@ -1,7 +1,7 @@
 //! The PZT actuator as the loop's I/O thread sees it.
 //!
-//! The words are the loop's, not those of one board: an analogue output card, a network controller and the project's own
-//! board all report themselves as an [`ActuatorState`] and an [`ActuatorFault`].
+//! The types belong to the loop, not to one board. An analogue output card, a network controller and the project's own board all
+//! report an [`ActuatorState`] and an [`ActuatorFault`].
 
 use serde::Serialize;
 use std::time::Duration;
@@ -20,7 +20,7 @@ pub enum ActuatorState {
     Frozen = 3,
     /// Parks or is parked; latched: only a new session leaves this.
     Safe = 4,
-    /// Holds the zero-flow displacement by itself because commands stopped; a fresh command takes up again.
+    /// Holds the zero-flow displacement because commands stopped; continues with a fresh command.
     Holding = 5,
 }
 
@@ -49,7 +49,7 @@ impl ActuatorState {
     }
 }
 
-/// Why an actuator stopped following by itself. The numbers are those of a run's record.
+/// Why an actuator stopped following commands without a request. The numbers are those of a run's record.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[repr(u8)]
 pub enum ActuatorFault {
@@ -84,10 +84,10 @@ impl ActuatorFault {
     }
 }
 
-/// What an actuator can do, as it says itself.
+/// What an actuator can do, by its own report.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct ActuatorInfo {
-    /// What it is: kind, serial number, version of its firmware.
+    /// Kind, serial number, version of its firmware.
     pub name: String,
     /// Smallest displacement, um.
     pub low_um: f64,
@@ -95,7 +95,7 @@ pub struct ActuatorInfo {
     pub high_um: f64,
     /// Largest rate of displacement, um/s.
     pub slew_um_per_s: f64,
-    /// One step of the converter, um; 0 where that is not known.
+    /// One step of the converter, um; 0 if unknown.
     pub step_um: f64,
     /// Default time without a fresh command after which it stops following, ms.
     pub watchdog_ms: u16,
@@ -112,7 +112,7 @@ pub struct ActuatorReport {
     pub state: ActuatorState,
     /// Latched fault.
     pub fault: ActuatorFault,
-    /// Displacement that stands at the output, um.
+    /// Displacement at the output, um.
     pub applied_um: f64,
     /// Sequence number of the last command obeyed, counted from 0 at arming; `None` before the first.
     pub last_seq: Option<u32>,
@@ -124,7 +124,7 @@ pub struct ActuatorReport {
     pub bad_frames: u32,
     /// Commands that it ignored: old, doubled, of another session, or in a state that takes none.
     pub ignored: u32,
-    /// How often in this session it held by itself because commands stopped: a report in between may have been missed.
+    /// How often in this session it held because commands stopped. The count shows holds between two reports, too.
     pub holds: u16,
     /// When the report was read, ns of the run's clock.
     pub read_ns: i64,
@@ -135,11 +135,11 @@ pub struct ActuatorReport {
 pub struct PartnerReport {
     /// State.
     pub state: ActuatorState,
-    /// Where it stands, um of its own scale.
+    /// Its position on its own scale, um.
     pub applied_um: f64,
 }
 
-/// Why the actuator did not do what it was asked.
+/// Why the actuator refused or failed a request.
 #[derive(Debug, thiserror::Error)]
 pub enum ActuatorError {
     /// The line is gone or broken.
@@ -200,7 +200,7 @@ pub enum ActuatorError {
 /// How a session is to be run.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ArmRequest {
-    /// Number of the session, drawn at random so that two hosts at one actuator are told apart.
+    /// Number of the session, drawn at random so that two hosts at one actuator differ.
     pub session: u16,
     /// Where a ramp to park ends, um.
     pub park_um: f64,
@@ -243,8 +243,7 @@ impl CommandAccount {
 /// An error of the line is no end: what was to be sent is lost, and the next call tries again. Only silence of the actuator
 /// ends a run.
 ///
-/// An actuator enforces range and slew of its session itself, at its output, and acts on silence by itself: a killed
-/// host must end in park.
+/// An actuator enforces range and slew of its session at its output, and reacts to silence: a killed host must end in park.
 pub trait Actuator: Send {
     /// What it can do.
     fn info(&self) -> ActuatorInfo;
@@ -283,7 +282,8 @@ pub trait Actuator: Send {
     /// # Errors
     /// The line is broken.
     fn poll(&mut self) -> Result<Option<ActuatorReport>, ActuatorError>;
-    /// Hands a command to the slow partner, um of its own scale. What goes wrong there is silence of the partner, no error of this one.
+    /// Hands a command to the slow partner, um on the partner's scale. A failure there counts as silence of the partner, not as
+    /// an error of this actuator.
     fn command_partner(&mut self, _command_um: f64, _time_us: u64) {}
     /// What the slow partner can do; `None` without one.
     fn partner_info(&self) -> Option<ActuatorInfo> {

@@ -1,7 +1,7 @@
 //! The clock of a run: the machine's monotonic clock, or a virtual one that moves only when it is told to.
 //!
-//! Real-time stamps of cellpos are nanoseconds of `CLOCK_MONOTONIC`: a step of the calendar clock cannot touch them,
-//! and other processes on the machine (a camera server, the rig in a box) share them.
+//! Real-time stamps of cellpos are nanoseconds of `CLOCK_MONOTONIC`. A step of the calendar clock does not change them, and other
+//! processes on the machine (a camera server, the rig in a box) share them.
 
 use rustix::thread::clock_nanosleep_absolute;
 use rustix::time::{ClockId, Timespec, clock_gettime};

@@ -1,8 +1,8 @@
 //! Account of frames by their ids and time stamps: which are new, doubled, late, lost, stale, or from the future.
 //!
 //! The one place where this is decided: drivers that unwrap a camera's ids, vision and the loop all ask a
-//! [`FrameAccount`]. Camera stacks fall silently stale, restart and count anew, and stamp with clocks of their own: neither
-//! the id nor the time stamp is believed alone. Times are nanoseconds of the run's clock, which is monotonic: a change of
+//! [`FrameAccount`]. Camera stacks go stale silently, restart their count, and stamp with their own clocks. So neither the id nor
+//! the time stamp is trusted alone. Times are nanoseconds of the run's clock, which is monotonic: a change of
 //! the calendar clock cannot be seen here. Counting saturates and nothing is allocated.
 
 /// How a camera counts its frames.
@@ -16,17 +16,17 @@ pub enum IdKind {
     Wrapping16,
 }
 
-/// What a frame is, compared with those before it.
+/// Kind of a frame, compared with those before it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum FrameKind {
     /// The first frame.
     First,
     /// Newer than all before; `missed` ids lie between.
     New {
-        /// Frames that have not come (a late one is taken off again, see [`FrameKind::Late`]).
+        /// Missing frames (a late one is subtracted again, see [`FrameKind::Late`]).
         missed: u64,
     },
-    /// Newer than all before, by a camera that has begun to count anew: its ids go on from the last one. How many frames
+    /// Newer than all before, from a camera that restarted its count: its ids continue from the last one. How many frames
     /// were lost meanwhile is not known.
     Restarted,
     /// An id that has come already.
@@ -35,7 +35,7 @@ pub enum FrameKind {
     Late,
     /// A new id whose time stamp has not moved on, or an older id with a newer stamp: the picture is not to be trusted.
     Stale,
-    /// Its time stamp lies in the future, by so many ns.
+    /// Its time stamp is in the future, by this many ns.
     Future {
         /// By how much.
         ahead_ns: i64,
@@ -59,9 +59,9 @@ impl FrameKind {
 /// A frame as it was judged.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Judged {
-    /// What it is.
+    /// Its kind.
     pub kind: FrameKind,
-    /// Its id, unwrapped and going on over restarts of the camera; that of the newest frame where it is not a new one.
+    /// Its id, unwrapped and continued over restarts of the camera; the newest frame's id if this one is not new.
     pub id: u64,
 }
 
@@ -80,7 +80,7 @@ pub struct FrameCounts {
     pub stale: u64,
     /// Frames stamped with a time that has not come.
     pub future: u64,
-    /// Times that the camera began to count anew.
+    /// Number of restarts of the camera's count.
     pub restarts: u64,
     /// Frames with an id that does not exist.
     pub invalid: u64,
@@ -112,7 +112,7 @@ pub struct FrameAccount {
 const PERIOD_SKIPPING_ZERO: u64 = 65_535;
 /// Ids that are remembered one by one.
 const REMEMBERED: u64 = 64;
-/// A camera exposes at most so many frames in a period of the loop; ids that rise faster are those of a new count.
+/// Largest number of frames in a period of the loop; ids that rise faster belong to a new count.
 const MOST_PER_PERIOD: i64 = 16;
 
 impl FrameAccount {
@@ -376,7 +376,7 @@ mod tests {
             let future = FrameKind::Future { ahead_ns };
             assert_eq!(kind(id, 1100.0 + ahead_ms, 1100.0), future);
         }
-        // The stamps of those are not believed: the next one is newer than the last good one.
+        // Their stamps are not trusted: the next one is newer than the last good one.
         assert_eq!(kind(18, 1200.0, 1200.0), FrameKind::New { missed: 1 });
         let expected = FrameCounts {
             new: 3,

@@ -11,13 +11,13 @@ pub struct Measurement {
     pub mid_exposure_ns: i64,
     /// When the position was ready to be used.
     pub ready_ns: i64,
-    /// Position along the channel, um; NaN when there is none.
+    /// Position along the channel, um; NaN without one.
     pub position_um: f64,
-    /// Variance of the position, um^2; NaN when there is none.
+    /// Variance of the position, um^2; NaN without a position.
     pub variance_um2: f64,
     /// Verdict of vision on the fix itself.
     pub verdict: FixQuality,
-    /// State of the tracker after this frame, and what it decided of it; `None` without a tracker. A good fix that the
+    /// State of the tracker after this frame, and its decision; `None` without a tracker. A good fix that the
     /// tracker did not take (another bead, too far from the prediction) has no position.
     pub track: Option<(TrackState, Decision)>,
     /// Peak contrast over pixel noise; NaN without picture.

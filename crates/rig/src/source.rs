@@ -85,7 +85,7 @@ pub enum CameraError {
     },
 }
 
-/// What a source says of itself.
+/// Description of a source.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct SourceInfo {
     /// Kind and address.
@@ -119,7 +119,7 @@ pub trait Camera: Send {
         f64::NAN
     }
 
-    /// What the camera says of itself; `field_um` counts from the left border when the calibration is not known here.
+    /// Description of the camera; `field_um` counts from the left border if the calibration is unknown here.
     fn info(&self) -> SourceInfo;
 }
 
@@ -141,7 +141,7 @@ impl<C: Camera + ?Sized> Camera for Box<C> {
     }
 }
 
-/// A frame with what vision made of it.
+/// A frame with the result of vision.
 #[derive(Debug, Clone, Copy)]
 pub struct SeenFrame<'a> {
     /// The frame.
@@ -164,7 +164,7 @@ pub struct SeenFrame<'a> {
     pub scale: PictureScale,
 }
 
-/// Where the channel lies in a picture, to first order: what a scale bar and a click need.
+/// Position of the channel in a picture, to first order: enough for a scale bar and a click.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PictureScale {
     /// Position along the channel at the centre of the first pixel, um.
@@ -175,7 +175,7 @@ pub struct PictureScale {
     pub upright: bool,
 }
 
-/// Looks at each new frame beside the loop: a live picture, a ring of the last seconds. Called on the camera's thread between
+/// Sees each new frame without delaying the loop: a live picture, a ring of the last seconds. Called on the camera's thread between
 /// a frame and its position: it must not wait, lock or allocate.
 pub trait FrameWatch: Send {
     /// A new frame has been looked at.
@@ -195,7 +195,7 @@ pub trait PositionSource: Send {
         f64::NAN
     }
 
-    /// What the source says of itself.
+    /// Description of the source.
     fn info(&self) -> SourceInfo;
 
     /// Shows each new frame to `watch` from now on; `false` where the source has no frames.

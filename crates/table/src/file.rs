@@ -5,8 +5,8 @@ use std::fs::File;
 use std::io::{self, Read, Write};
 use std::path::Path;
 
-/// Writes a whole file so that no reader, and no crash, ever sees a part of it: into a temporary file beside it, synced
-/// to the disk, then renamed over `path`. Folders are made as needed. A device or a pipe of this name is written to, and stays.
+/// Writes a whole file so that no reader and no crash sees a partial one: into a temporary file in the same folder, synced to the
+/// disk, then renamed over `path`. Folders are made as needed. A device or a pipe of this name is written to, and stays.
 ///
 /// # Errors
 /// [`TableProblem::Write`] with the file's name; the temporary file is removed.
@@ -14,8 +14,8 @@ pub fn write_atomically(path: &Path, bytes: &[u8]) -> Result<(), TableError> {
     replace(path, bytes, File::sync_data)
 }
 
-/// As [`write_atomically`], without a wait for the disk: no reader ever sees a part of it, but after a crash of the system the
-/// file may be cut off. For what can be had again.
+/// As [`write_atomically`], without waiting for the disk: no reader sees a partial file, but after a system crash the file may be
+/// cut off. For what can be had again.
 ///
 /// # Errors
 /// As [`write_atomically`].

@@ -28,7 +28,7 @@ impl From<&str> for ColumnRef {
     }
 }
 
-/// What to do with rows that are missing from an otherwise even record.
+/// How to treat missing rows of an otherwise even record.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Gaps {
     /// Refuse the record.
@@ -55,7 +55,7 @@ pub struct Mapping {
     pub bead_factor: f64,
     /// Rows that are missing.
     pub gaps: Gaps,
-    /// Largest deviation of a step from the usual one, as a share of it (default 0.25). Smaller jitter is accepted and
+    /// Largest relative deviation of a step from the usual one (default 0.25). Smaller jitter is accepted and
     /// reported in [`crate::Record::jitter_s`].
     pub jitter: f64,
 }

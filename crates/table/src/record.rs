@@ -98,7 +98,7 @@ impl Record {
         Self::parse(path, &text, mapping)
     }
 
-    /// Reads a record from text; `path` gives the name and stands in messages.
+    /// Reads a record from text; `path` gives the name and appears in messages.
     ///
     /// # Errors
     /// As [`Record::read`].
@@ -167,8 +167,8 @@ impl Record {
         Ok(Self::laid_out(path, start_s, grid, [pzt_um, bead_um], more))
     }
 
-    /// A record of rows that a program has read, with the times at which they were taken: as from a table whose missing rows
-    /// are filled ([`Gaps::Hold`]) and whose steps may differ from the usual one by a share `jitter`.
+    /// A record of rows that a program has read, with their times. Missing rows are filled ([`Gaps::Hold`]); steps may differ
+    /// from the usual one by the share `jitter`.
     ///
     /// # Errors
     /// [`TableError`] with the file's name, as for a table.

@@ -12,7 +12,7 @@ pub(crate) struct Grid {
     pub(crate) jitter_s: f64,
 }
 
-/// Lays times on an even grid; `tolerance` is the largest deviation of a step as a share of it.
+/// Lays times on an even grid; `tolerance` is the largest relative deviation of a step.
 ///
 /// The error comes with the row at which it stands.
 pub(crate) fn grid(
@@ -36,7 +36,7 @@ pub(crate) fn grid(
     }
     let mut steps: Vec<f64> = time_s.windows(2).map(|pair| pair[1] - pair[0]).collect();
     steps.sort_by(f64::total_cmp);
-    // The median is the usual step whatever a few gaps do; gaps are whole multiples of it.
+    // The median is the usual step despite a few gaps; gaps are whole multiples of the step.
     let usual_s = steps[steps.len() / 2];
 
     let mut places = Vec::with_capacity(rows);
@@ -47,8 +47,8 @@ pub(crate) fn grid(
         let step_s = pair[1] - pair[0];
         let whole = (step_s / usual_s).round().max(1.0);
         let off_s = (step_s - whole * usual_s).abs();
-        // Times written with few decimals are rounded by up to one unit in the last place from step to step; that is
-        // within the tolerance as long as the step itself is written with two figures or more.
+        // Times written with few decimals are rounded by up to one unit in the last place per step. That is within the tolerance
+        // if the step has at least two significant figures.
         if off_s > tolerance * usual_s || (whole > 1.0 && !gaps) {
             let problem = TableProblem::Sampling {
                 step_s,

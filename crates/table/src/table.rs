@@ -5,8 +5,8 @@ use crate::mapping::ColumnRef;
 use std::path::{Path, PathBuf};
 
 /// A text file of rows and columns: separated by semicolons, tabs, commas or white space, with or without a header.
-/// Blank lines and lines that start with `#` or `%` are skipped, and so is a line of units below the header; a byte-order mark and
-/// Windows line ends do no harm. Where commas do not separate, a number may have a decimal comma.
+/// Blank lines, lines that start with `#` or `%`, and a line of units below the header are skipped. A byte-order mark and Windows
+/// line ends are accepted. Where commas do not separate, a number may have a decimal comma.
 #[derive(Debug, Clone)]
 pub struct Table<'a> {
     path: PathBuf,
@@ -26,7 +26,7 @@ struct Span {
     length: u32,
 }
 
-/// How fields are told apart.
+/// How fields are separated.
 #[derive(Debug, Clone, Copy)]
 enum Separator {
     Char(char),
@@ -58,8 +58,7 @@ impl Separator {
     }
 }
 
-/// Whether a character, one after the other of a line, is one of these separators and no part of a field in quotes: one that begins with
-/// a quote.
+/// For each character of a line in turn: whether it is a separator outside a quoted field (one that begins with a quote).
 fn bare(separators: &[char]) -> impl FnMut(char) -> bool {
     let (mut blank, mut quotes, mut open) = (true, false, false);
     move |c| {
@@ -352,7 +351,7 @@ impl<'a> Table<'a> {
     }
 }
 
-/// Whether the line below a header is one of units: as many fields, all of them short words, none a value or its absence.
+/// Whether the line below a header has the units: as many fields, all short words, none a value or a sign for a missing one.
 fn is_units(separator: Separator, line: &str, columns: usize) -> bool {
     let (mut fields, mut words) = (0, 0);
     separator.split(line, |field| {

@@ -100,7 +100,7 @@ impl Terminal {
         }
     }
 
-    /// A message of its own; a line end is added. Never waits.
+    /// A separate message; a line end is added. Never waits.
     pub fn say(&self, text: &str) {
         self.send(Message::Say(text.to_string()));
     }
@@ -171,7 +171,7 @@ pub fn stderr() -> &'static Terminal {
     })
 }
 
-/// Columns of the terminal behind standard error; 80 where it does not say.
+/// Columns of the terminal behind standard error; 80 if unknown.
 pub fn columns() -> usize {
     rustix::termios::tcgetwinsize(io::stderr())
         .ok()
@@ -180,7 +180,7 @@ pub fn columns() -> usize {
         .unwrap_or(80)
 }
 
-/// Columns and rows of the terminal behind standard error; 80 x 24 where it does not say.
+/// Columns and rows of the terminal behind standard error; 80 x 24 if unknown.
 pub fn size() -> (u16, u16) {
     rustix::termios::tcgetwinsize(io::stderr())
         .ok()
@@ -203,7 +203,7 @@ pub fn panics_do_not_wait() {
     }));
 }
 
-/// What the terminal's own thread has.
+/// State of the terminal's own thread.
 struct Writer<W> {
     out: W,
     live: bool,
@@ -306,8 +306,8 @@ pub enum Colours {
     Removed,
 }
 
-/// A text without anything that a terminal takes for an order: control characters but line ends and tabs, sequences that
-/// begin with escape, marks that turn the direction of writing.
+/// A text without terminal commands: removes control characters (except line ends and tabs), escape sequences, and marks that
+/// change the direction of writing.
 pub fn clean(text: &str, colours: Colours) -> Cow<'_, str> {
     if !text.chars().any(is_order) {
         return Cow::Borrowed(text);

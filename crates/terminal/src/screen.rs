@@ -8,7 +8,7 @@ use std::sync::{Arc, OnceLock};
 use std::thread;
 use std::time::Duration;
 
-/// Takes it: what was on it stays where it is, out of sight; the cursor is hidden.
+/// Takes the terminal: hides its content and the cursor.
 const TAKE: &str = "\x1b[?1049h\x1b[?25l\x1b[2J\x1b[H";
 /// Gives it back.
 const GIVE: &str = "\x1b[0m\x1b[?25h\x1b[?1049l";
@@ -18,8 +18,8 @@ const KEPT: usize = 200;
 /// Whether the terminal behind standard error is taken.
 static STDERR: OnceLock<Arc<AtomicBool>> = OnceLock::new();
 
-/// Gives the terminal behind standard error back if it is taken, for ends of the program on which nobody comes to it: a signal
-/// that ends or stops it, a panic of its main thread. Waits no longer than a fifth of a second.
+/// Releases the terminal behind standard error if it is taken. For ends of the program that skip the normal path: a signal that
+/// ends or stops it, a panic of the main thread. Waits no longer than a fifth of a second.
 pub fn give_back() {
     let taken = STDERR.get();
     if !taken.is_some_and(|taken| taken.swap(false, Ordering::AcqRel)) {

@@ -1,4 +1,4 @@
-//! An actuator: an analogue output of 12 bits, with range, slew and a watchdog of its own.
+//! An actuator: an analogue output of 12 bits, with its own range, slew and watchdog.
 
 use crate::bench::Bench;
 use cellpos_rig::{

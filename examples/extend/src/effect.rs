@@ -8,7 +8,7 @@ use cellpos_plant::effects::{
 /// Where it is known under its id: hand it to [`cellpos_plant::effects::register`].
 pub static KIND: SoftCoupling = SoftCoupling;
 
-/// The coupling that loses the share `give` of what it is pulled.
+/// The coupling, which loses the share `give` of every pull.
 pub fn soft_coupling(give: f64) -> Effect {
     Effect::new(&KIND, 0, &[give], &[])
 }

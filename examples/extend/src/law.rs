@@ -21,7 +21,7 @@ impl ControlLaw for DeadBand {
 
     fn step(&self, pushes: &mut bool, input: &LawInput) -> LawOutput {
         let error_um = input.reference_um - input.estimate.position_um;
-        // Once it pushes it goes on to the middle of the band.
+        // Once it pushes, it continues to the middle of the band.
         let edge_um = if *pushes {
             0.3 * self.rest_um
         } else {

@@ -1,5 +1,5 @@
-//! What a lab adds to cellpos without touching a file of it: [`bench`], a channel with its own camera ([`camera`]) and its own
-//! actuator ([`actuator`]); a control law ([`law`]); and an effect of the plant ([`effect`]). `tests/extend.rs` holds a bead
+//! What a lab can add without changing a file of cellpos: a channel ([`bench`]) with its own camera ([`camera`]) and actuator
+//! ([`actuator`]), a control law ([`law`]), an effect of the plant ([`effect`]). `tests/extend.rs` holds a bead
 //! with the first three, simulates the fourth, and lets the search for discrepancies find it.
 #![forbid(unsafe_code)]
 

@@ -26,7 +26,7 @@ fn a_bead_is_held_with_a_camera_an_actuator_and_a_law_from_outside() {
         Tracker::new(localiser, TrackerConfig::for_pixel_um(PIXEL_UM)).expect("a tracker");
     let camera = SpotCamera(bench.clone());
     let source = VisionSource::new(camera, tracker, calibration(), clock.clone());
-    // What is commanded moves the bead further than diffusion does: the tracker has to know of it.
+    // The commands move the bead further than diffusion does, so the tracker must know them.
     let flow = CommandedFlow::new(GAIN_PER_S);
     let source = source.with_flow(flow.clone());
     let actuator = FlowTap::new(AnalogOutput::new(bench), flow, clock.clone());

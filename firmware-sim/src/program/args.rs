@@ -237,7 +237,7 @@ impl FromStr for FrequencyOrSpan {
     }
 }
 
-/// What the box is made of.
+/// Parts of the box.
 #[derive(Debug)]
 pub(crate) struct Setup {
     /// World.

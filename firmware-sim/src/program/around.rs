@@ -1,7 +1,7 @@
 //! Plant and camera around a board that runs elsewhere: its converter's codes come in over a terminal.
 //!
-//! A code is three bytes, `1000 0Lcc`, `0ccc cccc`, `0ccc cccc` (L: LED, c: code, highest bit first): only the first has
-//! its highest bit set, so that a torn code is dropped and the next one read.
+//! A code is three bytes, `1000 0Lcc`, `0ccc cccc`, `0ccc cccc` (L: LED, c: code, highest bit first). Only the first byte has its
+//! highest bit set, so a torn code is dropped and the next one read.
 
 use super::ProgramError;
 use super::args::Setup;

@@ -14,7 +14,7 @@ pub(crate) enum ProgramError {
         path: PathBuf,
         /// What was being done.
         doing: &'static str,
-        /// What the operating system says.
+        /// Error of the operating system.
         source: io::Error,
     },
     /// A rig file that does not read.
@@ -36,7 +36,7 @@ pub(crate) enum ProgramError {
     System {
         /// What was being done.
         doing: &'static str,
-        /// What the operating system says.
+        /// Error of the operating system.
         source: io::Error,
     },
 }

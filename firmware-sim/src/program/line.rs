@@ -76,7 +76,7 @@ impl Line {
         self.board_end.as_fd()
     }
 
-    /// Reads what the host has written; 0 when nothing is there.
+    /// Reads the host's bytes; 0 without any.
     ///
     /// # Errors
     /// What the operating system refuses.

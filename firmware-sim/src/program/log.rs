@@ -1,4 +1,4 @@
-//! The box's own log: what really happened, for proofs that do not rest on what the host says.
+//! The box's own log: the truth, for proofs that do not rely on the host's word.
 
 use super::ProgramError;
 use std::fs::File;
@@ -20,7 +20,7 @@ pub(super) struct Log {
     last_state: String,
 }
 
-/// What the log says of one instant.
+/// One instant of the log.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Instant<'a> {
     /// Time, ns.
@@ -31,9 +31,9 @@ pub(super) struct Instant<'a> {
     pub pzt_um: f64,
     /// True bead position, um.
     pub bead_um: f64,
-    /// State of the board, where it is known.
+    /// State of the board, if known.
     pub state: &'a str,
-    /// Its fault, where it is known.
+    /// Its fault, if known.
     pub fault: &'a str,
 }
 

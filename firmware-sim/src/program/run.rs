@@ -24,7 +24,7 @@ const PRIORITY: u8 = 60;
 /// Runs the box until the duration is over or a signal comes.
 ///
 /// # Errors
-/// Wrong input, or what the operating system refuses.
+/// Wrong input, or an error of the operating system.
 pub(crate) fn run(args: &Args) -> Result<(), ProgramError> {
     let setup = args.setup()?;
     let stop = Arc::new(AtomicBool::new(false));

@@ -80,8 +80,8 @@ impl Counter {
     }
 }
 
-/// Some microseconds without an access to a device. QEMU serves accesses one at a time, under the lock that its own side of the
-/// serial ports needs, too: a firmware that polls without a pause starves the line that it polls.
+/// Some microseconds without an access to a device. QEMU serves accesses one at a time, under a lock that its serial ports need,
+/// too. A firmware that polls without a pause starves its own line.
 pub fn pause() {
     for _ in 0..500 {
         // SAFETY: does nothing.
@@ -120,7 +120,7 @@ impl Watchdog {
         Self(BASE)
     }
 
-    /// Begins the time anew.
+    /// Restarts the time.
     pub fn feed(&self) {
         set(self.0 + 0xc, 1); // clears a time-out and reloads
     }

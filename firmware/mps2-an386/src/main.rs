@@ -1,9 +1,9 @@
 //! The PZT board on ARM's MPS2 AN386 (Cortex-M4F, 25 MHz), as QEMU runs it.
 //!
-//! UART 0 is the line to the host. UART 1 stands for the converter's SPI: each new code, and every 10 ms the
-//! code that stands, goes out as three bytes `1000 0Lcc`, `0ccc cccc`, `0ccc cccc` (L: LED, c: code, highest bit first), so
-//! that a listener finds its place anywhere in the stream. A free-running counter is the clock; the output is updated every 100 us; a hardware watchdog resets a
-//! firmware that hangs, and the reset puts the output to its power-up code.
+//! UART 0 is the line to the host. UART 1 takes the place of the converter's SPI. Each new code, and every 10 ms the present one,
+//! is sent as three bytes `1000 0Lcc`, `0ccc cccc`, `0ccc cccc` (L: LED, c: code, highest bit first). So a listener can start
+//! anywhere in the stream. A free-running counter is the clock. The output is updated every 100 us. A hardware watchdog resets a
+//! firmware that hangs, and the reset sets the output to its power-up code.
 //!
 //! No interrupt, no allocation, no floating point. The panic handler calls a function that exists nowhere: were there a
 //! panic path anywhere in this firmware, it would not link.
@@ -15,7 +15,7 @@ mod hardware;
 use cellpos_board::{Board, Config};
 use hardware::{Counter, Led, Uart, Watchdog};
 
-/// The drive of the paper; mid-stroke is what the converter shows after power-up.
+/// The drive of the paper; the converter shows mid-stroke after power-up.
 const CONFIG: Config = Config {
     serial: 386,
     ..Config::DEFAULT

@@ -1,4 +1,4 @@
-//! The 16-bit converter on SPI 0, and a look at what it shows.
+//! The 16-bit converter on SPI 0, and the reading of its output.
 
 use embassy_rp::Peri;
 use embassy_rp::adc::{Adc, Channel, Config as AdcConfig};

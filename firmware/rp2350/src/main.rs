@@ -1,8 +1,8 @@
 //! The PZT board on a Raspberry Pi Pico 2 (RP2350): USB CDC to the host, a 16-bit converter on SPI.
 //!
-//! The output is updated every 100 us by a task that interrupts all else and alone feeds the hardware watchdog: a firmware that
-//! answers and no longer steps is reset after 5 ms. After such a reset the output ramps to park from where the ADC sees it; after
-//! power-up it stands at the converter's own code 0. Where the output does not show what was written, the board parks and
+//! A task that interrupts all others updates the output every 100 us; it alone feeds the hardware watchdog. So a firmware that
+//! answers but no longer steps is reset after 5 ms. After such a reset the output ramps to park from where the ADC sees it; after
+//! power-up it is at the converter's code 0. Where the output does not show what was written, the board parks and
 //! the Pico's LED blinks. A panic ends in the watchdog's reset.
 #![no_std]
 #![no_main]
@@ -185,7 +185,7 @@ async fn main(_spawner: Spawner) {
     static STATE: StaticCell<State> = StaticCell::new();
     static BUFFERS: StaticCell<[[u8; 256]; 3]> = StaticCell::new();
     let [descriptor, bos, control] = BUFFERS.init([[0; 256]; 3]);
-    // The test number of pid.codes: a lab that sells boards takes one of its own.
+    // The test number of pid.codes: a lab that sells boards needs its own number.
     let mut about = embassy_usb::Config::new(0x1209, 0x0001);
     about.manufacturer = Some("cellpos");
     about.product = Some("PZT board");

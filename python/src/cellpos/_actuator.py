@@ -20,8 +20,8 @@ _LATE_US = 2_000
 _LONGEST_WATCHDOG_MS = 10_000
 _PM = 1e6
 _KEPT = 100_000
-#: A command is handed over at once when the last call is nearly a period ago: a host of the same period jitters by less than this
-#: part of it.
+#: A command is passed on at once if the last call was at least this share of a period ago: a host of the same period jitters by
+#: less.
 _NEARLY = 0.9
 
 

@@ -62,7 +62,7 @@ class CameraStats(NamedTuple):
     unseen: int
     #: Connections so far.
     clients: int
-    #: Frames per second, over all of them.
+    #: Frames per second, over all frames.
     rate_hz: float
     #: Interval between frames less 1/rate: standard deviation, and 99 % and largest of its size.
     jitter_us: Dict[str, float]
@@ -169,7 +169,7 @@ class CameraServer:
             pixels, stamp_ns = item[0], int(item[1])
             frame_id = int(item[2]) if len(item) > 2 else number
         else:
-            # Without a stamp of the camera's: now, less half the exposure. What the transfer took is not in it.
+            # Without a stamp of the camera's: now, less half the exposure. The transfer time is not included.
             pixels, stamp_ns, frame_id = item, time.monotonic_ns() - self._exposure_ns // 2, number
         pixels = np.ascontiguousarray(pixels)
         if pixels.ndim != 2 or pixels.dtype not in (np.uint8, np.uint16):

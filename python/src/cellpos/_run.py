@@ -332,7 +332,7 @@ def read_csv(path: PathLike) -> Table:
         text = Path(path).read_text("utf-8")
     except FileNotFoundError:
         return _table({})
-    # The last line of a run that goes on may be half there.
+    # The last line of a running run may be incomplete.
     rows = list(csv.reader(text[: text.rfind("\n") + 1].splitlines()))
     if not rows:
         return _table({})

@@ -3,7 +3,7 @@
 use super::{Attacked, Chance, quick_script, run};
 use std::path::{Path, PathBuf};
 
-/// A copy of some bytes with a few of them changed, cut out, doubled or cut off.
+/// A copy of some bytes with a few changed, removed, doubled or truncated.
 fn mutated(bytes: &[u8], chance: &mut Chance) -> Vec<u8> {
     let mut out = bytes.to_vec();
     for _ in 0..=chance.below(4) {

@@ -1,4 +1,4 @@
-//! Cameras that misbehave over a real socket: a relay between the rig in a box and the program spoils what it passes on.
+//! Cameras that misbehave over a real socket: a relay between the rig in a box and the program spoils the frames.
 
 use super::{Attacked, Chance, OVER_THE_LINE, box_rig, emptied, holds_before, how, reads, run};
 use crate::programs::RigInABox;
@@ -11,7 +11,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-/// What a relay does to the frames, in thousandths of them, and once.
+/// Faults that a relay adds to the frames: rates in thousandths, and single events.
 #[derive(Debug, Clone, Copy, Default)]
 struct Spoils {
     lost: u64,
@@ -28,7 +28,7 @@ struct Spoils {
     halves: u64,
     /// The line is closed between two frames.
     closes: u64,
-    /// Ids begin anew at this frame.
+    /// Ids restart at this frame.
     restarts: Option<u64>,
     /// Bytes that are no frame come at this one.
     garbage: Option<u64>,
@@ -200,8 +200,8 @@ fn serve(
     }
 }
 
-/// Cameras behind a real socket that stamp frames wrongly, double, lose, hold back and cut them, count anew, talk nonsense, change
-/// their size and hang up.
+/// Cameras behind a real socket that stamp frames wrongly, double, lose, delay and truncate them, restart their count, send
+/// garbage, change their size and hang up.
 pub fn hostile_camera_lines(folder: &Path, tries: u64, chance: &mut Chance) -> Attacked {
     let mut attacked = Attacked::default();
     if !holds_before(folder, &mut attacked) {
@@ -237,7 +237,7 @@ pub fn hostile_camera_lines(folder: &Path, tries: u64, chance: &mut Chance) -> A
     attacked
 }
 
-/// What the program says of itself adds up: every tick is on the disk or counted, time is the clock's, an end has a name.
+/// The program's report is consistent: every tick is on the disk or counted, time is the clock's, an end has a name.
 fn account(out: &str, code: Option<i32>, took: Duration, what: &str, attacked: &mut Attacked) {
     let json: serde_json::Value = serde_json::from_str(out).unwrap_or_default();
     if json["ended"].is_null() {

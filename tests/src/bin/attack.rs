@@ -7,7 +7,7 @@
 use cellpos_tests::attack::{self, Attacked, Chance};
 use std::process::ExitCode;
 
-/// The number behind an option, or what it is without.
+/// The number after an option, or its default.
 fn option(name: &str, without: u64) -> u64 {
     let words: Vec<String> = std::env::args().collect();
     let at = words.iter().position(|word| word == name);

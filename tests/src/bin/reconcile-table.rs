@@ -79,7 +79,7 @@ fn group(name: &str, seed: u64) -> Vec<Case> {
 
 /// The cases of a group, each with the seed of its random numbers.
 fn selected(which: &str, seed: u64) -> Vec<(Case, u64)> {
-    // A case keeps its random numbers whatever else is run beside it.
+    // A case keeps its random numbers, whatever other cases run.
     let mut cases: Vec<(Case, u64)> = Vec::new();
     let mut number = 0;
     for name in GROUPS {

@@ -2,16 +2,16 @@
 
 use super::{Excitation, Hidden, Kind, Rig, Second};
 
-/// What a case's records are like beside what is hidden in them.
+/// Properties of a case's records other than the hidden effects.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Session {
-    /// What the rig is told to do.
+    /// The commands to the rig.
     pub excitation: Excitation,
-    /// What the rig is.
+    /// The rig.
     pub rig: Rig,
     /// Kind of the localisation noise.
     pub noise: Kind,
-    /// What a position is rounded to \[um\].
+    /// Rounding step of a position \[um\].
     pub step_um: f64,
 }
 

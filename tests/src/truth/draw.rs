@@ -132,7 +132,7 @@ fn behind(kind: usize, second: bool, random: &mut Random) -> Hidden {
     }
 }
 
-/// Effects whose order matters, from the driver to the bead: a stand shakes with the piezo, not with what a bubble leaves of it.
+/// Effects whose order matters, from the driver to the bead: a stand shakes with the piezo, not with the motion behind a bubble.
 const CHAIN: [&str; 17] = [
     "driver-lag",
     "slew-limit",
@@ -153,8 +153,8 @@ const CHAIN: [&str; 17] = [
     "flow-drift",
 ];
 
-/// Whether no record of command and position can tell two effects from one of them with other numbers: two lags with one
-/// exponential; an exposure beside a lag or a delay; a play beside play operators; a gain beside what has an anchoring of its own.
+/// Whether no record of command and position can separate two effects from one with other numbers. Examples: two lags with one
+/// exponential, an exposure with a lag or a delay, a play with play operators, a gain with an effect that has its own anchoring.
 fn merges(a: &str, b: &str) -> bool {
     let either = |x: &str, others: &[&str]| {
         (a == x && others.contains(&b)) || (b == x && others.contains(&a))
@@ -172,7 +172,7 @@ fn merges(a: &str, b: &str) -> bool {
         )
 }
 
-/// Sets of so many effects, drawn with their sizes, equations and excitations.
+/// Sets of the given number of effects, drawn with their sizes, equations and excitations.
 pub fn sets(group: &'static str, size: usize, count: usize, seed: u64) -> Vec<Case> {
     let mut random = Random::new(seed.wrapping_mul(31).wrapping_add(size as u64));
     random.uniform();

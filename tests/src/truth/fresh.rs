@@ -13,14 +13,14 @@ const NO_GAP_UM: f64 = 1e-3;
 pub struct Fresh {
     /// About the mean. A model that integrates makes a ramp of a nanometre that a piezo remembers from before the record.
     pub plain: f64,
-    /// About a straight line: what the record's start may be is no part of the response.
+    /// About a straight line: the unknown start of the record is not part of the response.
     pub response: f64,
-    /// RMS error about that line without the effects, and what the walk of the bead alone makes of a record as long \[um\].
+    /// RMS error about that line without the effects, and the RMS of the bead's walk over a record of that length \[um\].
     pub gap_um: [f64; 2],
 }
 
-/// Runs both models over another large multisine than that of the records; `None` where nothing is hidden in the response
-/// to a command. A line has in every record a phase that nobody knows: it is taken off both errors.
+/// Runs both models over a different large multisine; `None` if nothing is hidden in the response to a command. A line has an
+/// unknown phase in every record, so it is subtracted from both errors.
 pub(super) fn fresh(case: &Case, augmented: &Model, base: &Model, seed: u64) -> Option<Fresh> {
     if case.session.rig != Rig::Bead {
         return None;

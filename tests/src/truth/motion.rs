@@ -13,7 +13,7 @@ use std::f64::consts::TAU;
 /// Steps per millisecond.
 const FINE: usize = 64;
 
-/// What the rig is.
+/// The rig.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Rig {
     /// A bead in a cell: Eq. (6), the command held through each row.
@@ -83,7 +83,7 @@ impl Ahead {
         }
     }
 
-    /// What the plant is given in step `j` of `h` seconds.
+    /// The plant's input in step `j` of `h` seconds.
     fn step(&mut self, hidden: &[Hidden], mut x: Through, j: usize, h: f64) -> Through {
         for e in hidden {
             match *e {
@@ -221,7 +221,7 @@ fn behind(
                 jump *= swing;
             }
             Hidden::Second(second) => {
-                // A jump is no flow: what goes by the speed lets it pass, or sees it as fast.
+                // A jump is not a flow: an effect that depends on speed lets it pass, or treats it as fast.
                 jump *= second.gain(t, if jump == 0.0 { 0.0 } else { 1e6 * jump });
                 v = v * second.gain(t, v) + second.flow(t);
                 lost += second.lost(bead);
@@ -272,7 +272,7 @@ pub(super) fn positions(
             path.push([gain * x.end; 2]);
             continue;
         }
-        // What the direct path does at once is a jump of the bead, apart from the flow that follows.
+        // The instantaneous part of the direct path is a jump of the bead, separate from the flow that follows.
         let start = output(s, x.start);
         s = rk4(s, h, |s| derivative(s, x.mean));
         let end = output(s, x.end);

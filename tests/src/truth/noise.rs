@@ -1,4 +1,4 @@
-//! What the records' noise is made of.
+//! Components of the records' noise.
 
 use super::random::Random;
 
@@ -9,9 +9,9 @@ pub struct Nuisance {
     pub diffusion_um2_per_s: f64,
     /// Localisation noise \[um\].
     pub localisation_um: f64,
-    /// What the localisation noise is like.
+    /// Kind of the localisation noise.
     pub kind: Kind,
-    /// What a position is rounded to \[um\].
+    /// Rounding step of a position \[um\].
     pub step_um: f64,
 }
 
@@ -35,7 +35,7 @@ impl Nuisance {
         step_um: 1e-4,
     };
 
-    /// A position as it stands in the record.
+    /// A position as written in the record.
     pub(super) fn rounded(&self, y: f64) -> f64 {
         (y / self.step_um).round() * self.step_um
     }

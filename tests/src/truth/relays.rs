@@ -1,9 +1,8 @@
 //! Hysteresis of relays, for the simulator that hides effects.
 
 /// Classical Preisach model: relays over the half plane up > down, weights falling off from the diagonal and, slowly, from
-/// the middle of the stroke. Evaluated exactly through its Everett function and the stack of extremes that the relays
-/// remember (Mayergoyz, Mathematical Models of Hysteresis, 1991, ch. 1), because a grid of relays moves in steps that no
-/// piezo shows.
+/// the middle of the stroke. Evaluated exactly through its Everett function and the stack of remembered extremes (Mayergoyz,
+/// Mathematical Models of Hysteresis, 1991, ch. 1). A grid of relays would move in steps that no piezo shows.
 pub(super) struct Relays {
     width_um: f64,
     span: f64,
@@ -26,7 +25,7 @@ impl Relays {
             scale: 1.0,
             value: None,
         };
-        // Far from the last reversal the displacement goes with the input: the nominal gain is that of the large stroke.
+        // Far from the last reversal the displacement follows the input: the nominal gain is that of the large stroke.
         relays.scale = 0.5 / width_um;
         // Demagnetised by an oscillation that dies out.
         for k in 0..400 {
@@ -58,7 +57,7 @@ impl Relays {
             if rising != last_is_minimum {
                 self.extremes.push(self.at);
             }
-            // What the input passes is wiped out, pairs of extremes at a time.
+            // The input wipes out the extremes that it passes, in pairs.
             while self.extremes.len() >= 2 {
                 let before = self.extremes[self.extremes.len() - 2];
                 if (rising && u >= before) || (!rising && u <= before) {

@@ -1,4 +1,4 @@
-//! What the rig is told to do.
+//! The commands to the rig.
 
 use super::random::Random;
 use std::f64::consts::TAU;
@@ -95,7 +95,7 @@ pub enum Excitation {
     Standard,
     /// Amplitudes, frequencies, bands and lengths drawn.
     Drawn,
-    /// Likewise; nothing rests and nothing repeats, nor does a part of it.
+    /// The same, without rest and without any repetition.
     WithoutFloor,
 }
 
@@ -211,7 +211,7 @@ fn restless(random: &mut Random, rows: usize) -> Vec<f64> {
     out
 }
 
-/// A sine whose frequency grows by the same factor in equal times: no stretch of it comes twice.
+/// A sine whose frequency grows by the same factor in equal times: no part repeats.
 fn sweep(random: &mut Random, rows: usize) -> Vec<f64> {
     let (amplitude, first, last) = (
         random.between(0.5, 1.4),

@@ -3,8 +3,8 @@
 use super::signal::{Through, low_pass, rk4};
 use std::f64::consts::TAU;
 
-/// An effect of the vocabulary in another equation than that of [`Hidden`](super::Hidden) and of the catalogue. Numbers
-/// mean what they mean there.
+/// An effect of the vocabulary in another equation than that of [`Hidden`](super::Hidden) and of the catalogue. Numbers have the
+/// same meaning.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Second {
     /// A resistor before a piezo whose capacitance rises by 5 % per um. Hz.
@@ -25,7 +25,7 @@ pub enum Second {
     SpreadRelaxation(f64, f64),
     /// A gas that is stiffer compressed than expanded, 5 % per um. s.
     GasSpring(f64),
-    /// A leak whose flow rises faster than the displacement, by a part of it per 100 um. rad/s.
+    /// A leak whose flow rises faster than the displacement, relative per 100 um. rad/s.
     OrificeLeak(f64),
     /// The picture's scale instead of the flow's. Factor.
     Magnification(f64),
@@ -39,7 +39,7 @@ pub enum Second {
     UnsteadyDelay(f64),
     /// A shutter that opens and closes through a fifth of the exposure. s.
     ShutterRamps(f64),
-    /// A clock that is put right ten times a second, wrongly. ppm.
+    /// A clock that is corrected ten times a second, wrongly. ppm.
     SteppedSkew(f64),
     /// Missing frames in bursts of four. Rate.
     DropBursts(f64),
@@ -51,7 +51,7 @@ pub enum Second {
     RichHum(f64, f64),
     /// A stiffness that grows as a hyperbolic sine; its cubic term is the number. 1/um^2.
     Sinh(f64),
-    /// A gain that goes up and down in straight lines. Depth, s.
+    /// A gain that rises and falls linearly. Depth, s.
     StraightSwing(f64, f64),
     /// A valve that opens with the flow, half way at 20 um/s. Part.
     OpeningValve(f64),
@@ -101,7 +101,7 @@ impl Second {
         }
     }
 
-    /// What the bead's motion is multiplied by at a time and a speed.
+    /// Factor of the bead's motion at a time and a speed.
     pub(super) fn gain(&self, t: f64, v: f64) -> f64 {
         match *self {
             Self::ExponentialDrift(r) => (r * t).exp(),

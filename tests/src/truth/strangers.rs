@@ -4,7 +4,7 @@ use super::random::Random;
 use super::signal::{Through, low_pass, rk4};
 use std::f64::consts::TAU;
 
-/// A stranger, beside those of [`Hidden`](super::Hidden).
+/// A stranger, in addition to those of [`Hidden`](super::Hidden).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Stranger {
     /// A bead stuck until the flow is faster than the first speed, free until it is slower than the second \[um/s\].
@@ -77,7 +77,7 @@ impl Stranger {
     }
 }
 
-/// What strangers remember, and what they draw.
+/// Memory and random numbers of strangers.
 #[derive(Debug)]
 pub(super) struct Odd {
     random: Random,
@@ -117,7 +117,7 @@ impl Odd {
             Stranger::Notch(hz, depth) => {
                 let w = TAU * hz;
                 let old = self.notch;
-                // The band that is taken off: damping 0.3.
+                // The removed band: damping 0.3.
                 let f = |r: [f64; 2]| [r[1], w * w * (x.mean - r[0]) - 0.6 * w * r[1]];
                 self.notch = rk4(old, h, f);
                 let band = |r: [f64; 2]| 0.6 * r[1] / w;
@@ -170,7 +170,7 @@ impl Odd {
     }
 }
 
-/// What resists the outflow of the plant beyond what is in proportion to its speed, in parts of that.
+/// Resistance to the plant's outflow beyond the part proportional to speed, relative to that part.
 pub(super) fn turbulence(c: f64, outflow: f64) -> f64 {
     c * outflow * outflow
 }

@@ -34,7 +34,7 @@ pub struct Row {
     pub missed: Vec<String>,
     /// The numbers of what is named, in words.
     pub numbers: String,
-    /// What `where` says.
+    /// The value of `where`.
     pub reason: String,
     /// Time that the search had of a processor \[s\], one thread.
     pub seconds: f64,
@@ -89,7 +89,7 @@ fn base(case: &Case, records: &[Record]) -> Result<(Model, Options), String> {
     Ok((model, options))
 }
 
-/// What this thread has had of a processor until now \[s\]: does not count what others take.
+/// Processor time of this thread until now \[s\].
 fn processor_s() -> f64 {
     let t = rustix::time::clock_gettime(rustix::time::ClockId::ThreadCPUTime);
     t.tv_sec as f64 + 1e-9 * t.tv_nsec as f64
@@ -190,7 +190,7 @@ fn numbers(result: &Reconciliation) -> String {
     all.join(" + ")
 }
 
-/// By what the camera is wrong about the size of a pixel.
+/// The camera's relative error of the pixel size.
 fn magnified(behind: &[Hidden]) -> f64 {
     let factor = |h: &Hidden| match h {
         Hidden::Second(Second::Magnification(f)) => *f,

@@ -1,8 +1,8 @@
 //! How far a hidden effect lies above what can be detected at all, without a word from the engine.
 //!
-//! Noise-free records with and without the effect differ by some motion. In the innovations of the noise (a walk and
-//! white noise, at their nominal sizes, each record's start free, the frame's share of the newest command fitted) its sum of
-//! squares is the expected gain in twice the log-likelihood. The threshold is the gain that an addition must reach in a
+//! Noise-free records with and without the effect differ by some motion. Its sum of squares in the innovations of the noise is
+//! the expected gain in twice the log-likelihood. The noise is a walk and white noise at their nominal sizes; each record's start
+//! is free, and the frame's share of the newest command is fitted. The threshold is the gain that an addition must reach in a
 //! search over the whole vocabulary; distances are in amplitude, so the root of the ratio.
 
 use super::{Excitation, Hidden, Nuisance, Random, Rig, Second, run, scripts};
@@ -43,8 +43,8 @@ fn whitened(residual: &[f64]) -> Vec<f64> {
         .collect()
 }
 
-/// A weak saturation with its levels moved to twice the threshold: what is clipped are the few highest peaks of the
-/// excitation, whose height goes with its random phases. Everything else is weak enough by its number alone.
+/// A weak saturation with its levels moved to twice the threshold: only the few highest peaks of the excitation are clipped, and
+/// their height depends on its random phases. Everything else is weak enough by its number alone.
 pub fn weak(hidden: Hidden, seed: u64) -> Hidden {
     let Hidden::Saturation(..) = hidden else {
         return hidden;

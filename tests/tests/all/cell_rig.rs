@@ -1,4 +1,4 @@
-//! A cell on a rig with a camera of its own: the empty channel is recorded first, then the cell is followed against it.
+//! A cell on a rig with its own camera: the empty channel is recorded first, then the cell is followed against it.
 
 use cellpos_record::RunReader;
 use cellpos_tests::programs::{RigInABox, cellpos, stdout};

@@ -39,7 +39,7 @@ impl Rig {
     fn start(watchdog_ms: u32, hold_watchdog_ms: u32) -> Self {
         let firmware = std::env::var("CELLPOS_FIRMWARE")
             .expect("CELLPOS_FIRMWARE names the firmware: run scripts/firmware-qemu.sh");
-        // With a priority above other programs where that is allowed (below the loop's): a board waits for nobody's builds.
+        // With a priority above other programs if that is allowed (below the loop's): a board does not wait for builds.
         let allowed = Command::new("chrt")
             .args(["-r", "20", "true"])
             .stderr(Stdio::null())
@@ -153,7 +153,7 @@ impl Rig {
         });
     }
 
-    /// What the world saw, from the log; checks range and slew of all of it.
+    /// The output as the world saw it, from the log; checks its range and slew.
     fn rows(&self) -> Vec<Row> {
         let text = std::fs::read_to_string(self.folder.path().join("box.csv")).unwrap();
         let whole = text.rfind('\n').map_or(0, |end| end + 1);
@@ -286,8 +286,8 @@ fn garbage_on_the_line_costs_frames_and_not_the_bead() {
     assert_eq!(result["end"], "duration", "{result}");
     assert!(rig.events().contains("link-garbage"), "it was noticed");
     let rows = rig.settled_rows();
-    // The garbage came for three seconds and more from when the loop was closed; it ran for eight, and the bead found at the
-    // start was held for the last seven of them.
+    // Garbage came for at least three seconds after the loop was closed. The loop ran for eight seconds and held the same bead
+    // for the last seven.
     let away = |row: &&Row| (row.applied_um - PARK_UM).abs() > 0.1;
     let last_s = rows.iter().rev().find(away).expect("it was away").time_s;
     let furthest_um = rows

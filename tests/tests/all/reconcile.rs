@@ -1,5 +1,5 @@
-//! The discrepancy workflow on records of the truth simulator: what is not in the vocabulary gets no name, what cannot be
-//! separated gets all its names, and how the files are cut and ordered changes nothing.
+//! The discrepancy workflow on records of the truth simulator: an effect outside the catalogue gets no name, inseparable effects
+//! get all names, and the cut and order of the files change nothing.
 
 use cellpos_plant::Model;
 use cellpos_reconcile::{Options, ReconcileError, Reconciliation, Record, Verdict, reconcile};

@@ -1,7 +1,6 @@
 //! `cellpos track` on a board behind a real pseudo-terminal and a camera behind a real socket, in real time.
 //!
-//! The machine that runs this may stall for many milliseconds, so the limits that a stall would break are set wide
-//! where they are not what the test is about.
+//! The machine may stall for many milliseconds. So limits that a stall would break are wide, unless the test is about them.
 
 use cellpos_record::RunReader;
 use cellpos_tests::programs::{BoxRow, RigInABox, cellpos, stdout, wait_until};
@@ -142,7 +141,7 @@ fn a_line_that_stalls_now_and_then_ends_no_run_and_its_lost_commands_are_counted
     );
     let count = |key: &str| r[key].as_u64().unwrap_or_else(|| panic!("{key}: {r}"));
     let (lost, not_taken) = (count("commands_lost"), count("commands_not_taken"));
-    // The stall of 180 ms alone loses what the line did not take of it; what is lost is most of what was stalled.
+    // The stall of 180 ms alone loses the commands that the line did not take: most of those sent during the stall.
     assert!(
         not_taken > 20 && lost >= not_taken && lost < count("ticks") / 2,
         "{r}"
@@ -157,7 +156,7 @@ fn the_board_parks_by_itself_when_the_program_is_killed_and_the_record_reads_bac
     assert!(killed, "five times the run ended before it could be killed");
 }
 
-/// Kills a run and checks what it left behind; false when the run had ended by itself.
+/// Kills a run and checks its remains; false if the run had ended before.
 fn kill_and_look() -> bool {
     let folder = tempfile::tempdir().unwrap();
     write_rig(folder.path(), WATCHDOG_MS);
@@ -182,8 +181,8 @@ fn kill_and_look() -> bool {
     std::thread::sleep(Duration::from_millis(400));
     let rows = rig.finish();
 
-    // First the zero-flow displacement is held, where the bead all but stops; within both watchdog times plus the ramp
-    // the PZT stands at park. A stall of the box, which its log shows as a gap, may come on top.
+    // First the zero-flow displacement is held, and the bead almost stops. Within both watchdog times plus the ramp the PZT is at
+    // park. A stall of the box, which its log shows as a gap, may come on top.
     let stall_ms = 20.0 + longest_gap_ms(&rows, killed_ns);
     let before = rows
         .iter()
@@ -263,7 +262,7 @@ fn an_interrupt_freezes_the_bead_and_then_parks() {
     let rows = rig.finish();
     let r: Value = serde_json::from_str(&stdout(&output)).unwrap();
     assert_eq!(r["end"], "operator", "{r}");
-    // Half a second of freezing; a period in which the machine stalled has no tick of its own.
+    // Half a second of freezing; a period in which the machine stalled has no tick.
     let frozen = r["frozen"].as_f64().unwrap() + r["skipped"].as_f64().unwrap();
     assert!(frozen >= 499.0, "{r}");
     assert!((rows.last().unwrap().applied_um - PARK_UM).abs() < 0.01);

@@ -1,5 +1,5 @@
 //! docs/rig.md as a newcomer follows it: the chain from `rig new` to a held bead, copied from the page, with `firmware-sim` as
-//! the only hardware; and the files that the page shows are the ones that are installed.
+//! the only hardware. Also: the files on the page equal the installed ones.
 
 use cellpos_tests::programs::{self, RigInABox};
 use std::path::{Path, PathBuf};

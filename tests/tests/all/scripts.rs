@@ -49,7 +49,7 @@ fn monotonic_ns() -> i64 {
     now.tv_sec * 1_000_000_000 + now.tv_nsec
 }
 
-/// How long after a time the board stood in Safe, ms, as the board lived it: what the machine stalled it does not count.
+/// Time until the board was in Safe, ms, on the board's clock: stalls of the machine do not count.
 fn safe_after(rows: &[BoxRow], killed_ns: i64) -> Option<f64> {
     const STALL_MS: f64 = 3.0;
     let mut lived_ms = 0.0;
@@ -114,7 +114,7 @@ fn killed(kills: u32, cycles: u32) {
             child.wait().unwrap();
             in_vain = 0;
             killed_ns.push(monotonic_ns());
-            // The board has to notice by itself, before somebody arms it again.
+            // The board has to notice before somebody arms it again.
             std::thread::sleep(Duration::from_millis(300));
         }
         if let Some(run) = run_folder(folder) {

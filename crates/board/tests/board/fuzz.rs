@@ -104,7 +104,7 @@ proptest! {
             prop_assert!((after_um - before_um).abs() <= per_call_um + step_um + 2e-6, "{before_um} to {after_um} um in one call");
             let (anchor_us, anchor_um, anchor_state) = anchor;
             let calm = |state| matches!(state, BoardState::Safe | BoardState::Disarmed);
-            // A state that was left and entered again within one message cannot be: ticks lie in between.
+            // A state that was left and entered again within one message is impossible: there are ticks in between.
             let rate = if calm(anchor_state) && ticked && calm(board.state()) { 1_000.0 } else { 40_000.0 };
             let reach_um = rate * 1e-6 * (latest_us - anchor_us) as f64;
             prop_assert!(

@@ -1,4 +1,5 @@
-//! `docs/camera-vectors.json` is what the code says of the camera's socket: frames with their bytes, and streams that are refused.
+//! `docs/camera-vectors.json` holds the camera socket's test vectors: frames with their bytes, and streams to refuse. The code
+//! must agree.
 
 use crate::vectors::root;
 use cellpos_link::frames::{FrameGatherer, FrameHeader, HEADER_LEN};

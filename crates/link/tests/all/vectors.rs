@@ -1,5 +1,5 @@
-//! The wire as others see it: `docs/protocol-vectors.json` is what the code says, and the C99 file under `firmware/c`
-//! reads and writes the same bytes.
+//! The wire as others see it: the code agrees with `docs/protocol-vectors.json`, and the C99 file under `firmware/c` reads and
+//! writes the same bytes.
 
 use crate::wire_in_c::InC;
 use cellpos_link::*;
@@ -347,8 +347,8 @@ fn the_vectors_pass_in_c() {
     }
 }
 
-/// Byte strings of every kind that a line delivers: noise, noise rich in zeros, frames whose check sum fits around any
-/// payload and around payloads that are nearly messages, and real traffic that was cut, joined and overwritten.
+/// Byte strings of every kind that a line delivers: noise; noise rich in zeros; valid check sums around random payloads and
+/// near-messages. Also real traffic that was cut, joined and overwritten.
 fn any_bytes() -> impl Strategy<Value = (u8, Vec<u8>)> {
     let direction = prop_oneof![Just(TO_BOARD), Just(TO_HOST)];
     let payload = |direction: u8| {

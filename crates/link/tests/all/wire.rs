@@ -89,7 +89,7 @@ fn decode_all<M: Message>(mut bytes: &[u8]) -> (Vec<M>, u32) {
     (messages, decoder.bad_frames())
 }
 
-/// A stretch of what a host really sends in a session.
+/// Part of the messages of a real session.
 fn session_traffic() -> Vec<ToBoard> {
     let mut traffic = vec![
         ToBoard::Hello {
@@ -232,7 +232,7 @@ proptest! {
     fn no_byte_string_rich_in_zeros_makes_the_decoder_panic_or_believe_it(
         drawn in proptest::collection::vec(any::<u16>(), 0..2000),
     ) {
-        // A fifth each of zeros, ones, twos, bytes of 0xb1, and any byte. (A strategy of its own for each byte takes seconds.)
+        // A fifth each of zeros, ones, twos, bytes of 0xb1, and any byte. (A separate strategy for each byte takes seconds.)
         let bytes: Vec<u8> = drawn
             .iter()
             .map(|n| *[0, 1, 2, 0xb1].get(usize::from(n >> 8) % 5).unwrap_or(&(*n as u8)))

@@ -1,5 +1,5 @@
-//! The rules of the house that the compiler does not check: no circle between the files of a crate, and layers that do not know
-//! what stands above them.
+//! Rules of the project that the compiler does not check: no circle between the files of a crate, and layers that do not know the
+//! layers above.
 
 mod source;
 
@@ -40,7 +40,7 @@ fn sources(folder: &Path, found: &mut Vec<PathBuf>) {
 
 type Crate = BTreeMap<Vec<String>, Module>;
 
-/// The module whose file defines what a path names; none outside the crate.
+/// The module whose file defines the item of a path; none outside the crate.
 fn defined_in(
     house: &Crate,
     from: &[String],
@@ -125,7 +125,7 @@ fn reaches(
 fn circles(source: &Path) -> Vec<String> {
     let mut files = vec![];
     sources(source, &mut files);
-    // Within the crate: the folder that this very test lies in is called `tests` as well.
+    // Within the crate: the folder of this test is called `tests` as well.
     files.retain(|file| {
         let inner = file.strip_prefix(source).unwrap();
         !inner.with_extension("").iter().any(|part| {
@@ -140,7 +140,7 @@ fn circles(source: &Path) -> Vec<String> {
         .collect();
     let mut arrows: BTreeMap<Vec<String>, BTreeSet<Vec<String>>> = BTreeMap::new();
     for (from, module) in &house {
-        // What a module only passes on is no use of it.
+        // A re-export is not a use.
         let passed: BTreeSet<&Vec<String>> =
             module.passed_on.iter().map(|(_, path)| path).collect();
         for path in module.names.iter().filter(|path| !passed.contains(path)) {
@@ -200,7 +200,7 @@ fn no_files_of_a_crate_stand_in_a_circle() {
     );
 }
 
-/// Longest file, lines: what a reader takes in as one thing.
+/// Longest file, lines: as much as a reader can take in at once.
 const MOST_LINES: usize = 500;
 
 #[test]
@@ -268,7 +268,7 @@ fn a_circle_is_found_where_there_is_one() {
     write("a.rs", "use crate::b::second;\npub struct First;\n");
     write("b.rs", "// use crate::a::First;\npub fn second() {}\n");
     assert_eq!(circles(folder.path()), Vec::<String>::new());
-    // Through the crate's front page, beside another name.
+    // Through the crate's front page, together with another name.
     write("b.rs", "use crate::{First, x};\npub fn second() {}\n");
     assert_eq!(circles(folder.path()).len(), 1);
     // Named without `use`; in tests it does not count.

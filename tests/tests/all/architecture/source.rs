@@ -1,4 +1,4 @@
-//! What a source file defines and what it names of its crate.
+//! The items that a source file defines, and the items of its crate that it names.
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
@@ -97,7 +97,7 @@ fn without_tests(text: &str) -> String {
     out
 }
 
-/// One module: a file, its path in the crate, what it defines and what it names of its crate.
+/// One module: a file, its path in the crate, the items that it defines, and those of its crate that it names.
 pub(super) struct Module {
     pub file: PathBuf,
     pub defines: BTreeSet<String>,
@@ -245,7 +245,7 @@ pub(super) fn read_module(file: &Path) -> Module {
             }
             module.names.push(path);
         }
-        // `pub`, `pub(crate)`, `pub(super)` stand before what they make public.
+        // Skips `pub`, `pub(crate)`, `pub(super)` before an item.
         public = word == "pub" || (public && matches!(word, "(" | "crate" | "super" | ")"));
         i += 1;
     }

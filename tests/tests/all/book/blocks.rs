@@ -38,7 +38,7 @@ fn try_snippet(kind: &str, text: &str) -> Result<(), String> {
         String::from_utf8_lossy(&out.stderr)
     );
     let read = match kind {
-        // What the rig lacks is said; what cannot be read is another matter.
+        // The rig may lack keys; it must be readable.
         "rig" | "calibration" => out.status.code() != Some(2),
         // The record is not there, which is said after the effects were read.
         "effects" => said.contains("none.csv"),

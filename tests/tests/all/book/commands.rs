@@ -7,7 +7,7 @@ use std::path::Path;
 use std::process::Command;
 use std::time::Instant;
 
-/// What builds and installs has been done by whoever runs this.
+/// The caller of the tests has built and installed everything.
 const PRELUDE: &str = r#"
 set -euo pipefail
 cargo() {
@@ -116,7 +116,7 @@ fn the_slow_commands_of_the_pages_run() {
     run_pages(true);
 }
 
-/// `cellpos` commands of a text, one a line; a line that ends with a backslash goes on.
+/// `cellpos` commands of a text, one a line; a backslash at the end continues the line.
 fn cellpos_lines(text: &str) -> Vec<String> {
     let joined = text.replace("\\\n", " ");
     let lines = joined.lines().map(|line| line.trim_start_matches("$ "));

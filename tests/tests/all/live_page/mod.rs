@@ -207,7 +207,7 @@ fn a_script_and_its_folder_show_the_same_run() {
     );
     other.screenshot(&pictures().join("watch.png"));
     assert_eq!(other.console(), Vec::<String>::new());
-    // What the page says at the end is what the run's summary says.
+    // At the end the page agrees with the run's summary.
     says_the_summary(&other, &only_run(folder.path()).1);
 }
 

@@ -5,7 +5,7 @@ use cellpos_tests::browser::Browser;
 use cellpos_tests::programs;
 use std::time::Duration;
 
-/// What a rig file leaves out is emulated. A machine that is busy with a browser may be late for long.
+/// Tables that a rig file leaves out are emulated. A machine that is busy with a browser may be late for long.
 const EMULATED: &str = "first_neutral_um = 20.0\n[timing]\nfaults_in_a_row = 1000\n";
 
 #[test]

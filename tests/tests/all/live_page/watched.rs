@@ -1,4 +1,4 @@
-//! A command with a live page, and what its tests ask of the page.
+//! A command with a live page, and the questions of its tests to the page.
 
 use cellpos_tests::browser::Browser;
 use cellpos_tests::programs;
@@ -129,7 +129,7 @@ pub(super) fn only_run(folder: &Path) -> (std::path::PathBuf, toml::Table) {
     (run.clone(), summary)
 }
 
-/// What the page says is what the run's summary says: counts, error, and the tails of the ticks' times.
+/// The page agrees with the run's summary: counts, error, and the tails of the ticks' times.
 pub(super) fn says_the_summary(page: &Browser, summary: &toml::Table) {
     for (id, key) in [
         ("f-late", "late"),
