@@ -333,10 +333,10 @@ pub fn fit_orders(
         }
     }
     fits.sort_by(|a, b| a.aicc.total_cmp(&b.aicc));
-    // Among fits that the criterion hardly tells apart the one with fewest parameters leads: a zero that is not needed
-    // trades against the delay.
+    // Among fits that the criterion hardly tells apart the one with fewest parameters leads, and of those the one of lower
+    // order: a zero that is not needed trades against the delay, and so do poles.
     let best = fits[0].aicc;
-    let size = |f: &RationalFit| f.order + f.numerator.len();
+    let size = |f: &RationalFit| (f.order + f.numerator.len(), f.order);
     let simplest = (0..fits.len())
         .filter(|&i| fits[i].aicc <= best + 6.0)
         .min_by_key(|&i| size(&fits[i]));

@@ -183,7 +183,6 @@ pub fn welch(
     least_coherence: f64,
     difference: bool,
 ) -> Vec<FrequencyPoint> {
-    let stretch = stretch.max(16).min(input.len());
     let prepared = |x: &[f64]| -> Vec<f64> {
         if difference {
             x.windows(2).map(|w| w[1] - w[0]).collect()
@@ -192,58 +191,141 @@ pub fn welch(
         }
     };
     let (u, y) = (prepared(input), prepared(output));
-    let bins = stretch / 2 + 1;
-    let (mut uu, mut yy, mut yu) = (
-        vec![0.0; bins],
-        vec![0.0; bins],
-        vec![Complex::from(0.0); bins],
-    );
-    let mut count = 0.0;
-    let mut start = 0;
-    while start + stretch <= u.len() {
-        let (a, b) = (&u[start..start + stretch], &y[start..start + stretch]);
-        start += (stretch / 2).max(1);
-        if a.iter().chain(b).any(|v| !v.is_finite()) {
-            continue;
-        }
-        let (fu, fy) = (
-            windowed_spectrum(&detrended(a)),
-            windowed_spectrum(&detrended(b)),
-        );
-        for i in 0..bins.min(fu.len()) {
-            uu[i] += fu[i].norm_sqr();
-            yy[i] += fy[i].norm_sqr();
-            yu[i] += fy[i] * fu[i].conj();
-        }
-        count += 1.0;
+    by_instrument(&u, &u, &y, period_s, stretch, least_coherence)
+}
+
+/// Sums of spectra over stretches, of one bin or of bins that see one line: `r` the instrument, `u` the input, `y` the output.
+#[derive(Debug, Clone, Copy)]
+struct Sums {
+    rr: f64,
+    uu: f64,
+    yy: f64,
+    ur: Complex<f64>,
+    yr: Complex<f64>,
+    yu: Complex<f64>,
+    /// As `ur`, with the input one row later: the phase between the two is the frequency of the power in the bin.
+    later: Complex<f64>,
+}
+
+impl Sums {
+    const ZERO: Self = Self {
+        rr: 0.0,
+        uu: 0.0,
+        yy: 0.0,
+        ur: Complex::new(0.0, 0.0),
+        yr: Complex::new(0.0, 0.0),
+        yu: Complex::new(0.0, 0.0),
+        later: Complex::new(0.0, 0.0),
+    };
+
+    fn plus(mut self, other: &Self) -> Self {
+        self.rr += other.rr;
+        self.uu += other.uu;
+        self.yy += other.yy;
+        self.ur += other.ur;
+        self.yr += other.yr;
+        self.yu += other.yu;
+        self.later += other.later;
+        self
     }
+
+    /// Frequency of the power that input and instrument share, rad per row. A window spreads a line over some bins, and each of
+    /// them shows the response at the line, not at its own frequency.
+    fn turn(&self) -> f64 {
+        (self.later * self.ur.conj()).arg()
+    }
+}
+
+/// Response from input to output by way of an instrument that the noise is not in (the input, if it is free of noise), by averaged
+/// spectra as [`welch`]. Each point has the frequency of the power that its bins hold; bins that see one line are one point.
+pub(crate) fn by_instrument(
+    instrument: &[f64],
+    input: &[f64],
+    output: &[f64],
+    period_s: f64,
+    stretch: usize,
+    least_coherence: f64,
+) -> Vec<FrequencyPoint> {
+    let rows = input.len();
+    let stretch = stretch.max(16).min(rows.saturating_sub(1));
+    let (bins, count) = summed(instrument, input, output, stretch);
     // Half-overlapping Hann windows are worth about 0.53 (1 + n)/n independent stretches each, for long records.
     let independent: f64 = (0.53 * count + 0.5f64).max(1.0);
-    let gain_floor = uu.iter().copied().fold(0.0, f64::max) * 1e-9;
-    (2..bins.saturating_sub(1))
-        .filter_map(|i| {
-            if uu[i] <= gain_floor || yy[i] <= 0.0 {
-                return None;
-            }
-            let response = yu[i] / uu[i];
-            let coherence = (yu[i].norm_sqr() / (uu[i] * yy[i])).min(1.0 - 1e-12);
-            let variance = response.norm_sqr() * (1.0 - coherence) / (coherence * independent);
-            let scale = (2.0 * 8.0 / 3.0 / count).sqrt() / stretch as f64 * 2f64.sqrt();
-            (coherence >= least_coherence).then(|| FrequencyPoint {
-                frequency_hz: i as f64 / (stretch as f64 * period_s),
-                response,
-                scatter_variance: variance,
-                variance,
-                variance_dof: 2.0 * independent,
-                coherence,
-                input: Complex::from(uu[i].sqrt() * scale),
-                output: Complex::from(yy[i].sqrt() * scale),
-                block_errors: Vec::new(),
-                rows: input.len(),
-                later_s: 0.0,
-            })
+    let floor = bins.iter().map(|b| b.rr).fold(0.0, f64::max) * 1e-9;
+    let width = std::f64::consts::TAU / stretch as f64;
+    let inside = bins.len().saturating_sub(1);
+    let mut seen: Vec<(f64, Sums)> = (bins.iter().take(inside).skip(2))
+        .filter(|b| b.rr > floor && b.uu > 0.0 && b.yy > 0.0)
+        .map(|b| (b.turn(), *b))
+        .filter(|(turn, _)| *turn > 1.5 * width)
+        .collect();
+    // The noise bandwidth of the window is 1.5 bins: what is nearer to a stronger bin has its noise and is one point with it.
+    seen.sort_by(|a, b| b.1.rr.total_cmp(&a.1.rr));
+    let mut lines: Vec<(f64, Sums)> = Vec::new();
+    for (turn, bin) in seen {
+        let near = lines.iter_mut().find(|l| (turn - l.0).abs() < 1.5 * width);
+        match near {
+            Some((_, line)) => *line = line.plus(&bin),
+            None => lines.push((turn, bin)),
+        }
+    }
+    lines.sort_by(|a, b| a.0.total_cmp(&b.0));
+    let amplitude = (2.0 * 8.0 / 3.0 / count).sqrt() / stretch as f64 * 2f64.sqrt();
+    let point = |s: Sums| {
+        let of = |power: f64, cross: Complex<f64>| cross.norm_sqr() / (s.rr * power);
+        let coherence = of(s.yy, s.yr).min(of(s.uu, s.ur)).min(1.0 - 1e-12);
+        let response = s.yr / s.ur;
+        // The part of the output that the input does not make; in a loop that is the noise which the input answers.
+        let left = s.yy - 2.0 * (response.conj() * s.yu).re + response.norm_sqr() * s.uu;
+        let variance = left.max(0.0) * s.rr / (s.ur.norm_sqr() * independent);
+        (coherence >= least_coherence).then(|| FrequencyPoint {
+            frequency_hz: s.turn() / (std::f64::consts::TAU * period_s),
+            response,
+            scatter_variance: variance,
+            variance,
+            variance_dof: 2.0 * independent,
+            coherence,
+            input: Complex::from(s.uu.sqrt() * amplitude),
+            output: Complex::from(s.yy.sqrt() * amplitude),
+            block_errors: Vec::new(),
+            rows,
+            later_s: 0.0,
         })
-        .collect()
+    };
+    lines.into_iter().filter_map(|(_, s)| point(s)).collect()
+}
+
+/// The sums of every bin over the stretches without a gap, and the number of those.
+fn summed(r: &[f64], u: &[f64], y: &[f64], stretch: usize) -> (Vec<Sums>, f64) {
+    let mut bins = vec![Sums::ZERO; stretch / 2 + 1];
+    let mut count = 0.0;
+    let mut start = 0;
+    while start + stretch < u.len() {
+        let of = |x: &[f64]| detrended(&x[start..=start + stretch]);
+        let gap = [r, u, y]
+            .iter()
+            .any(|x| x[start..=start + stretch].iter().any(|v| !v.is_finite()));
+        if !gap {
+            let input = of(u);
+            let now = |x: &[f64]| windowed_spectrum(&x[..stretch]);
+            let (fr, fu, fy) = (now(&of(r)), now(&input), now(&of(y)));
+            let later = windowed_spectrum(&input[1..]);
+            for (i, bin) in bins.iter_mut().enumerate().take(fr.len()) {
+                *bin = bin.plus(&Sums {
+                    rr: fr[i].norm_sqr(),
+                    uu: fu[i].norm_sqr(),
+                    yy: fy[i].norm_sqr(),
+                    ur: fu[i] * fr[i].conj(),
+                    yr: fy[i] * fr[i].conj(),
+                    yu: fy[i] * fu[i].conj(),
+                    later: later[i] * fr[i].conj(),
+                });
+            }
+            count += 1.0;
+        }
+        start += (stretch / 2).max(1);
+    }
+    (bins, count)
 }
 
 #[cfg(test)]
@@ -284,7 +366,7 @@ mod tests {
             x = pole * x + (1.0 - pole) * input;
         }
         let points = welch(&u, &y, 1e-3, 512, 0.5, false);
-        assert!(points.len() > 150);
+        assert!(points.len() > 90);
         let mut outside = 0;
         for p in &points {
             let z = Complex::from_polar(1.0, 2.0 * std::f64::consts::PI * p.frequency_hz * 1e-3);
@@ -292,5 +374,33 @@ mod tests {
             outside += usize::from((p.response - exact).norm_sqr() > 4.0 * p.variance + 1e-5);
         }
         assert!(outside * 20 < points.len(), "{outside} of {}", points.len());
+    }
+
+    #[test]
+    fn bins_that_a_line_leaks_into_show_the_line_once_and_at_its_own_frequency() {
+        // Sines one after the other, as a script plays them, through an integrator of 400/s; none is on a bin.
+        let lines_hz = [3.3, 11.7, 47.1, 101.3];
+        let (mut u, mut y) = (Vec::new(), Vec::new());
+        let mut x = 0.0;
+        for k in 0..24_000 {
+            let line = lines_hz[k / 6000];
+            let input = (std::f64::consts::TAU * line * k as f64 * 1e-3).sin();
+            u.push(input);
+            y.push(x);
+            x += 0.4 * input;
+        }
+        let points = welch(&u, &y, 1e-3, 1400, 0.9, false);
+        for line in lines_hz {
+            let width = 1e3 / 1400.0;
+            let near: Vec<&FrequencyPoint> = (points.iter())
+                .filter(|p| (p.frequency_hz - line).abs() < width)
+                .collect();
+            assert_eq!(near.len(), 1, "{line} Hz: {near:?}");
+            let p = near[0];
+            assert!((p.frequency_hz - line).abs() < 0.02, "{line} Hz: {p:?}");
+            let z = Complex::from_polar(1.0, std::f64::consts::TAU * line * 1e-3);
+            let off = (p.response * (z - 1.0) / 0.4 - 1.0).norm();
+            assert!(off < 0.02, "{line} Hz: {off}");
+        }
     }
 }

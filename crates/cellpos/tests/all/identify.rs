@@ -230,3 +230,50 @@ fn wrong_arguments_end_with_code_2_and_a_sentence() {
     assert_eq!(code, Some(2));
     assert!(err.contains("needs a unit"), "{err}");
 }
+
+/// Gain of a model at a frequency \[Hz\].
+fn gain_at(model: &Value, hz: f64) -> f64 {
+    let polynomial = |key: &str| {
+        // Real and imaginary part of a polynomial in s = i w, by Horner's rule.
+        let w = std::f64::consts::TAU * hz;
+        let coefficients = model[key].as_array().unwrap();
+        let value = coefficients.iter().fold((0.0, 0.0), |(re, im), c| {
+            (c.as_f64().unwrap() - w * im, w * re)
+        });
+        f64::hypot(value.0, value.1)
+    };
+    polynomial("num") / polynomial("den")
+}
+
+#[test]
+fn the_run_of_a_sweep_of_sines_in_closed_loop_tells_the_plant_with_either_law() {
+    let folder = tempfile::tempdir().unwrap();
+    let script =
+        Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples/scripts/sine-sweep.toml");
+    let script = script.to_str().unwrap();
+    for law in ["pi", "lqg"] {
+        #[rustfmt::skip]
+        let ran = cellpos(folder.path(), &[
+            "run", script, "--clock", "virtual", "--frames", "off", "--seed", "5", "--controller", law, "--name", law,
+        ]);
+        assert_eq!(ran.0, Some(0), "{}\n{}", ran.1, ran.2);
+        let run = std::fs::read_dir(folder.path().join("runs"))
+            .unwrap()
+            .map(|run| run.unwrap().path())
+            .find(|run| run.to_str().unwrap().ends_with(law))
+            .unwrap();
+        let result = json(
+            folder.path(),
+            &["identify", "--data", run.to_str().unwrap(), "--json"],
+        );
+        let model = &result["files"][0]["models"][0];
+        // Eq. (6): 16.26 dB at 10 Hz, 1.67 at 50 Hz, -5.99 at 120 Hz.
+        for (hz, db) in [(10.0, 16.26), (50.0, 1.67), (120.0, -5.99)] {
+            let ratio = gain_at(model, hz) / 10f64.powf(db / 20.0);
+            assert!(
+                (ratio - 1.0).abs() < 0.1,
+                "{law}, {hz} Hz: {ratio} of {model}"
+            );
+        }
+    }
+}

@@ -199,7 +199,7 @@ pub fn bridged(series: &[f64]) -> Vec<f64> {
 }
 
 /// The models without those that the plant cannot be: a channel with a cell in it is passive, and an unstable pole is the
-/// noise's, or the controller's. An integrator whose pole the fit puts a hair to the right of zero is one.
+/// noise's, or the controller's. A pole that the fit puts to the right of zero by less than its error is an integrator's.
 fn stable(models: Vec<RationalFit>, points: &[FrequencyPoint]) -> Vec<RationalFit> {
     // One or two lines tell gain and lag there, and no model.
     if points.len() < 3 {
@@ -216,10 +216,19 @@ fn stable(models: Vec<RationalFit>, points: &[FrequencyPoint]) -> Vec<RationalFi
             if model.poles.iter().all(|pole| pole.re <= 0.0) {
                 return Some(model);
             }
+            // A small pole is -c/b of a denominator that ends in b s + c: twice its standard deviation is that of c over b.
+            let error = (model.denominator.iter().rev().nth(1))
+                .zip(model.denominator_sd.last())
+                .map_or(0.0, |(b, sd)| 2.0 * sd / b.abs());
+            let least = if error.is_finite() {
+                hair.max(error)
+            } else {
+                hair
+            };
             if model
                 .poles
                 .iter()
-                .any(|pole| pole.re > 0.0 && (pole.im != 0.0 || pole.re > hair))
+                .any(|pole| pole.re > 0.0 && (pole.im != 0.0 || pole.re > least))
             {
                 return None;
             }
