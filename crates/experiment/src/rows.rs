@@ -38,23 +38,67 @@ pub(crate) struct Rows {
     pub(crate) input: Vec<f64>,
     pub(crate) output: Vec<f64>,
     usable: Vec<bool>,
+    /// There was no tick at this row: the command before it was held.
+    skipped: Vec<bool>,
+    /// The command of this row's tick came late, or never.
+    late: Vec<bool>,
     /// The frame came, without a bead to be trusted.
     pub(crate) unseen: Vec<bool>,
     /// Age of each row's frame, ns, where it came in time.
     ages_ns: Vec<Option<i64>>,
+    /// Usual age of a frame at its tick, in rows.
+    usual_age_periods: f64,
     /// Row of each tick since the loop was closed.
     of_tick: Vec<usize>,
 }
 
-/// How old frames are at their ticks, by their own stamps: the median, which no stall moves; `None` without frames.
-fn usual_age_ns(ticks: &[TickRecord]) -> Option<i64> {
-    let mut ages_ns: Vec<i64> = ticks
-        .iter()
-        .filter(|t| !t.flags.has(TickFlags::TIMER) && !t.flags.has(TickFlags::STALE))
-        .map(|t| t.time_ns - t.mid_exposure_ns)
-        .collect();
-    ages_ns.sort_unstable();
-    ages_ns.get(ages_ns.len() / 2).copied()
+/// How much later than usual the command of each tick was handed over, counted from the exposure of its frame, ns: usual is the median
+/// of a second, in which no clock drifts by anything that counts. A tick without a frame comes when the frame is overdue.
+fn lateness_ns(ticks: &[TickRecord]) -> Vec<i64> {
+    const SECOND: usize = 1000;
+    let handed_over_ns = |tick: &TickRecord| age_ns(tick) + i64::from(tick.compute_ns);
+    let mut late_ns = Vec::with_capacity(ticks.len());
+    for ticks in ticks.chunks(SECOND) {
+        let fresh = ticks.iter().filter(|tick| is_new_frame(tick));
+        let usual_ns = median(fresh.map(handed_over_ns)).unwrap_or(0);
+        late_ns.extend(ticks.iter().map(|tick| match is_new_frame(tick) {
+            true => handed_over_ns(tick) - usual_ns,
+            false => i64::MAX,
+        }));
+    }
+    late_ns
+}
+
+/// Lateness from which a command counts as late, ns: a tenth of a period, which at 0.3 of the sampling rate turns the first image of
+/// the held command, the fastest part of a record, by 25 degrees; more on a machine where that would leave too little.
+fn tolerated_ns(late_ns: &[i64], period_ns: i64) -> i64 {
+    let mut sorted: Vec<i64> = late_ns.iter().map(|ns| ns.saturating_abs()).collect();
+    sorted.sort_unstable();
+    let ninth_tenth = sorted.get(sorted.len() * 9 / 10).copied().unwrap_or(0);
+    ninth_tenth.clamp(period_ns / 10, period_ns / 2)
+}
+
+/// From a command to its effect, in periods: less than this at 1 kHz over USB or a serial line, and the lateness of a tick beside it.
+const LINE_PERIODS: f64 = 1.0;
+
+fn is_new_frame(tick: &TickRecord) -> bool {
+    !tick.flags.has(TickFlags::TIMER) && !tick.flags.has(TickFlags::STALE)
+}
+
+/// How old a tick's frame is, by its own stamp, ns.
+fn age_ns(tick: &TickRecord) -> i64 {
+    tick.time_ns - tick.mid_exposure_ns
+}
+
+/// The median, which no stall moves; `None` of nothing.
+fn median(values: impl Iterator<Item = i64>) -> Option<i64> {
+    let mut values: Vec<i64> = values.collect();
+    values.sort_unstable();
+    values.get(values.len() / 2).copied()
+}
+
+fn frame_ages_ns(ticks: &[TickRecord]) -> impl Iterator<Item = i64> {
+    ticks.iter().filter(|tick| is_new_frame(tick)).map(age_ns)
 }
 
 /// Mean of the ages that are known, s.
@@ -70,22 +114,28 @@ impl Rows {
             input: Vec::new(),
             output: Vec::new(),
             usable: Vec::new(),
+            skipped: Vec::new(),
+            late: Vec::new(),
             unseen: Vec::new(),
             ages_ns: Vec::new(),
+            usual_age_periods: 0.0,
             of_tick: Vec::new(),
         };
         let closed = ticks
             .iter()
             .position(TickRecord::is_running)
             .unwrap_or(ticks.len());
-        let usual_ns = usual_age_ns(&ticks[closed..]).unwrap_or(0);
+        let usual_ns = median(frame_ages_ns(&ticks[closed..])).unwrap_or(0);
+        let late_ns = lateness_ns(&ticks[closed..]);
+        let tolerated_ns = tolerated_ns(&late_ns, period_ns);
+        rows.usual_age_periods = usual_ns.max(0) as f64 / period_ns as f64;
         let mut first_id = None;
         // The excitation is played by the clock: a tick's place in it is its number on the clock's grid.
         let grid = Grid::new(ticks.first().map_or(0, |t| t.time_ns), period_ns);
         let first_index = ticks.get(closed).map_or(0, |t| grid.index(t.time_ns));
-        for tick in &ticks[closed..] {
+        for (tick, late_ns) in ticks[closed..].iter().zip(late_ns) {
             let has = |flag| tick.flags.has(flag);
-            let new_frame = !has(TickFlags::TIMER) && !has(TickFlags::STALE);
+            let new_frame = is_new_frame(tick);
             let next = rows.input.len();
             let row = if new_frame {
                 let first = *first_id.get_or_insert(tick.frame_id.saturating_sub(next as u64));
@@ -100,14 +150,19 @@ impl Rows {
                 rows.input.push(held_um);
                 rows.output.push(f64::NAN);
                 rows.usable.push(true);
+                rows.skipped.push(true);
+                rows.late.push(true);
                 rows.unseen.push(false);
                 rows.ages_ns.push(None);
             }
-            let age_ns = tick.time_ns - tick.mid_exposure_ns;
+            let age_ns = age_ns(tick);
             // A frame that is half a period off the usual belongs to another row.
             let on_time =
                 new_frame && !has(TickFlags::LOST) && 2 * (age_ns - usual_ns).abs() < period_ns;
-            rows.ages_ns[row] = on_time.then_some(age_ns);
+            let late = late_ns.abs() > tolerated_ns;
+            rows.skipped[row] = false;
+            rows.late[row] = late;
+            rows.ages_ns[row] = (on_time && !late).then_some(age_ns);
             rows.input[row] = tick.command_um;
             rows.output[row] = if on_time { tick.measured_um } else { f64::NAN };
             rows.unseen[row] = is_unseen(tick);
@@ -153,13 +208,32 @@ impl Rows {
                 return Err(Spoilt::Unseen { at, rows: gap });
             }
         }
+        let (mut input, mut output) = (self.input[start..end].to_vec(), output.to_vec());
+        for row in (start..end).filter(|&row| self.late[row]) {
+            if self.skipped[row] {
+                input[row - start] = f64::NAN;
+            }
+            for shown in self
+                .acts_at(row)
+                .filter(|shown| (start..end).contains(shown))
+            {
+                output[shown - start] = f64::NAN;
+            }
+        }
         Ok(RecordedSegment {
             index: span.index,
             from: from - start,
             age_s: mean_s(&self.ages_ns[from..end]),
-            input: self.input[start..end].to_vec(),
-            output: output.to_vec(),
+            input,
+            output,
         })
+    }
+
+    /// The rows whose positions first show the command of `row`. Without them no increment of the record holds the moment at which it
+    /// acted; what it did stands in the later rows.
+    fn acts_at(&self, row: usize) -> std::ops::RangeInclusive<usize> {
+        let age = self.usual_age_periods;
+        row + age.floor() as usize + 1..=row + (age + LINE_PERIODS).floor() as usize + 1
     }
 }
 
@@ -195,3 +269,7 @@ impl Spoilt {
         }
     }
 }
+
+#[cfg(test)]
+#[path = "rows_tests.rs"]
+mod tests;

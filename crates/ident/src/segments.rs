@@ -42,7 +42,7 @@ pub struct RecordedSegment {
     pub from: usize,
     /// Mean time from the middle of an exposure to the tick that used it, s, by the frames' own stamps; `None`: not known.
     pub age_s: Option<f64>,
-    /// Commanded displacement per row, um.
+    /// Commanded displacement per row, um; `NaN` where there was no tick.
     pub input: Vec<f64>,
     /// Bead position per row, um; `NaN` where there was none.
     pub output: Vec<f64>,

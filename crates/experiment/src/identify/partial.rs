@@ -21,7 +21,7 @@ struct Kept {
     from: usize,
     #[serde(default)]
     age_s: Option<f64>,
-    input_um: Vec<f64>,
+    input_um: Vec<Option<f64>>,
     /// `null` where no frame showed the bead.
     output_um: Vec<Option<f64>>,
 }
@@ -43,12 +43,8 @@ pub(super) fn save(path: &Path, plan: &Plan, records: &[RecordedSegment]) -> Res
                 index: r.index,
                 from: r.from,
                 age_s: r.age_s,
-                input_um: r.input.clone(),
-                output_um: r
-                    .output
-                    .iter()
-                    .map(|y| y.is_finite().then_some(*y))
-                    .collect(),
+                input_um: known(&r.input),
+                output_um: known(&r.output),
             })
             .collect(),
     };
@@ -76,7 +72,7 @@ pub(super) fn load(path: &Path, plan: &Plan) -> Result<Vec<RecordedSegment>, Fai
             && k.input_um.len() == k.output_um.len()
             && k.from < k.input_um.len()
             && k.age_s.is_none_or(f64::is_finite)
-            && k.input_um.iter().all(|u| u.is_finite())
+            && k.input_um.iter().flatten().all(|u| u.is_finite())
     };
     if !partial.segments.iter().all(sound) {
         return Err(refuse("damaged".to_owned(), help));
@@ -88,12 +84,17 @@ pub(super) fn load(path: &Path, plan: &Plan) -> Result<Vec<RecordedSegment>, Fai
             index: k.index,
             from: k.from,
             age_s: k.age_s,
-            input: k.input_um,
-            output: k
-                .output_um
-                .into_iter()
-                .map(|y| y.unwrap_or(f64::NAN))
-                .collect(),
+            input: or_nan(k.input_um),
+            output: or_nan(k.output_um),
         })
         .collect())
+}
+
+/// JSON has no NaN.
+fn known(values: &[f64]) -> Vec<Option<f64>> {
+    values.iter().map(|v| v.is_finite().then_some(*v)).collect()
+}
+
+fn or_nan(values: Vec<Option<f64>>) -> Vec<f64> {
+    values.into_iter().map(|v| v.unwrap_or(f64::NAN)).collect()
 }

@@ -1,0 +1,158 @@
+//! Records of ticks that came at the wrong time.
+
+use super::*;
+use cellpos_ident::candidate_model::CandidateModel;
+use cellpos_ident::frequency_response::{DrivenStretch, Settings, measure};
+use cellpos_ident::sampled::{Hold, Sampling};
+use cellpos_runtime::life::Life;
+use std::f64::consts::TAU;
+
+const PERIOD_NS: i64 = 1_000_000;
+const GAIN_PER_S: f64 = 428.0;
+/// From a command to its effect, ns.
+const LINE_NS: i64 = 300_000;
+/// From the middle of an exposure to the tick that is on time, ns.
+const AGE_NS: i64 = 2_100_000;
+
+/// How a machine and a camera misbehave.
+struct Lateness {
+    /// Largest delay of a tick, ns.
+    most_ns: f64,
+    /// Share of ticks that never came.
+    skipped: f64,
+    /// Camera's clock against the loop's.
+    drift: f64,
+}
+
+/// Numbers between 0 and 1 without a pattern, by the multiples of an irrational one.
+fn spread(k: i64, step: f64) -> f64 {
+    (k as f64 * step).fract()
+}
+
+/// Ticks of an integrator that is driven by a sine of the loop's clock.
+fn ticks(frequency_hz: f64, count: i64, late: &Lateness) -> Vec<TickRecord> {
+    let mut ticks: Vec<TickRecord> = Vec::new();
+    // Position, and what drives it, up to `done_ns`.
+    let (mut position_um, mut done_ns) = (0.0, i64::MIN / 2);
+    let mut at = 0;
+    for k in 0..count {
+        let due_ns = k * PERIOD_NS;
+        let delay_ns = late.most_ns * spread(k, 0.618_033_988_75).powi(80);
+        if spread(k, 0.414_213_562_37) < late.skipped
+            || ticks.last().is_some_and(|last| due_ns < last.time_ns)
+        {
+            continue;
+        }
+        let time_ns = due_ns + delay_ns as i64;
+        // The newest frame that has come.
+        let frame =
+            ((due_ns - AGE_NS) as f64 * (1.0 + late.drift) / PERIOD_NS as f64).round() as i64;
+        let exposure_ns = (frame as f64 * PERIOD_NS as f64 / (1.0 + late.drift)) as i64;
+        // What has acted by the middle of its exposure.
+        let until_ns = exposure_ns - LINE_NS;
+        while at < ticks.len() {
+            let since_ns = ticks[at].time_ns.max(done_ns);
+            let next_ns = ticks.get(at + 1).map_or(i64::MAX, |next| next.time_ns);
+            let to_ns = next_ns.min(until_ns);
+            if to_ns > since_ns {
+                position_um += GAIN_PER_S * 1e-9 * ticks[at].command_um * (to_ns - since_ns) as f64;
+                done_ns = to_ns;
+            }
+            if next_ns > until_ns {
+                break;
+            }
+            at += 1;
+        }
+        ticks.push(TickRecord {
+            seq: k as u64,
+            time_ns,
+            frame_id: (frame + 10) as u64,
+            mid_exposure_ns: exposure_ns,
+            measured_um: position_um,
+            verdict: 0,
+            command_um: (TAU * frequency_hz * 1e-9 * due_ns as f64).sin(),
+            life: Life::Running as u8,
+            flags: TickFlags::default(),
+            wake_ns: delay_ns as u32,
+            compute_ns: 20_000,
+            ..TickRecord::unknown()
+        });
+    }
+    ticks
+}
+
+/// Response at one frequency over that of the integrator with the delay that the record has: gain, and phase in deg.
+fn over_the_true(frequency_hz: f64, late: &Lateness) -> (f64, f64) {
+    let ticks = ticks(frequency_hz, 8000, late);
+    let rows = Rows::of(&ticks, PERIOD_NS);
+    let span = Span {
+        index: 0,
+        start: 0,
+        settle: 200,
+        rows: 7000,
+    };
+    let record = rows.segment(&span, 50).unwrap();
+    let period_s = 1e-9 * PERIOD_NS as f64;
+    let stretch = DrivenStretch {
+        input: &record.input,
+        output: &record.output,
+        from: record.from,
+        to: record.input.len(),
+        period_s,
+        lines_hz: &[frequency_hz],
+        detection_hz: &[],
+    };
+    let point = &measure(&stretch, &Settings::default()).unwrap().points[0];
+    let delay_s = record.age_s.unwrap() + 1e-9 * LINE_NS as f64;
+    let sampling = Sampling {
+        period_s,
+        exposure_s: 0.0,
+        hold: Hold::ZeroOrder,
+    };
+    let truth = CandidateModel::integrator(GAIN_PER_S, delay_s);
+    let ratio = point.response / truth.sampled_response(frequency_hz, sampling);
+    (ratio.norm(), ratio.arg().to_degrees())
+}
+
+#[test]
+fn ticks_that_are_late_or_skipped_and_a_camera_that_drifts_bend_neither_gain_nor_phase() {
+    let kept = Lateness {
+        most_ns: 0.0,
+        skipped: 0.0,
+        drift: 0.0,
+    };
+    let late = [
+        Lateness {
+            most_ns: 0.9e6,
+            ..kept
+        },
+        Lateness {
+            most_ns: 4e6,
+            ..kept
+        },
+        Lateness {
+            skipped: 0.05,
+            ..kept
+        },
+        Lateness {
+            drift: 40e-6,
+            ..kept
+        },
+        Lateness {
+            most_ns: 0.9e6,
+            skipped: 0.02,
+            drift: -15e-6,
+        },
+        kept,
+    ];
+    for frequency_hz in [20.0, 100.0, 300.0] {
+        for (case, late) in late.iter().enumerate() {
+            let (gain, phase_deg) = over_the_true(frequency_hz, late);
+            println!(
+                "{frequency_hz} Hz, case {case}: gain {gain:.4} of the true one, phase {phase_deg:+.3} deg"
+            );
+            assert!((gain - 1.0).abs() < 1e-3, "{frequency_hz} Hz, case {case}");
+            assert!(phase_deg.abs() < 0.1, "{frequency_hz} Hz, case {case}");
+        }
+    }
+}
