@@ -324,6 +324,7 @@ impl<L: ControlLaw> ControlLoop<L> {
         let fix = input.measurement.as_ref().and_then(|m| self.fix(m));
         let tuning = self.tuning(state);
         let estimator = self.estimator_of(state);
+        let before_um = state.estimator.neutral_um;
         let mut estimate: Estimate = estimator.step(&mut state.estimator, fix);
         let Limits {
             low_um, high_um, ..
@@ -332,6 +333,11 @@ impl<L: ControlLaw> ControlLoop<L> {
         state.estimator.neutral_um = state.estimator.neutral_um.clamp(low, high);
         estimate.neutral_um = state.estimator.neutral_um;
         estimate.now.n = state.estimator.neutral_um;
+        if estimate.stepped {
+            // An integral learns a flow slowly; one that stepped is known at once.
+            let stepped_um = estimate.neutral_um - before_um;
+            (self.parts.controller).shift(&mut state.law, stepped_um);
+        }
         // Nor is the loop to undo the dither.
         let mut dithered_um = 0.0;
         if let (Some(adapter), Some(adapt)) = (&self.adapter, &state.adapt) {

@@ -23,6 +23,7 @@ use transition::Transition;
 pub use config::EstimatorConfig;
 pub(crate) use config::planned_gap;
 pub use flow_step::flow_step_log_density;
+pub use stuck::StillBead;
 pub use transition::PredictedState;
 
 /// Past commands held: a delay of up to 15 samples, which is 3 ms at 5 kHz.
@@ -30,9 +31,6 @@ pub const HISTORY: usize = 16;
 
 /// Ticks by which a frame may be late and still be used at its own time.
 const LONGEST_LAG: usize = 3;
-
-/// Ticks over which the fastest motion is looked for.
-const FASTEST_TICKS: usize = 6;
 
 /// Delay that a model may lack: a bead in fast motion is that many ticks of it away from where it is expected, and is still
 /// the same bead.
@@ -69,6 +67,8 @@ pub struct EstimatorState {
     pub history_um: [f64; HISTORY],
     /// Evidence that the bead is stuck, natural logarithm of the odds, 0 or more.
     pub stuck_evidence: f64,
+    /// Whether the bead stays where it is, or walks.
+    pub still: StillBead,
     /// Variance per tick that a wrong gain may cause, um^2.
     pub spread_um2: f64,
     /// Part of the stated uncertainty of the gain that is left; 1 where nothing more is known of it.
@@ -194,6 +194,7 @@ impl Estimator {
             modes: [0.0; MODES],
             history_um: [command_um; HISTORY],
             stuck_evidence: 0.0,
+            still: StillBead::default(),
             spread_um2: 0.0,
             gain_doubt: 1.0,
             lag: 0,
@@ -254,7 +255,8 @@ impl Estimator {
         let motion = self.tick.gain * (command - m.n);
         let ts = self.model.sample_time_s;
         let [p11, p12, p22] = state.covariance_um2;
-        let p22n = (p22 + self.config.neutral_walk_um_per_sqrt_s.powi(2) * ts).min(1e6);
+        let neutral_walk_um2 = self.config.neutral_walk_um_per_sqrt_s.powi(2) * ts;
+        let p22n = (p22 + neutral_walk_um2).min(1e6);
         state.lag = state.lag.saturating_sub(1);
         if state.stuck {
             state.modes = [0.0; MODES];
@@ -271,36 +273,14 @@ impl Estimator {
         // cycle of a motion would rectify the innovations of that cycle into a false neutral.
         let crest = (SPREAD_KEPT * state.spread_um2).max(spread * spread);
         state.spread_um2 = if crest > LEAST_SPREAD_UM2 { crest } else { 0.0 };
-        let p11n = p11 - 2.0 * g * p12
-            + g * g * p22
-            + 2.0 * self.config.diffusion_um2_per_s * ts
-            + state.spread_um2;
+        let walk_um2 = 2.0 * self.config.diffusion_um2_per_s * ts + state.spread_um2;
+        let p11n = p11 - 2.0 * g * p12 + g * g * p22 + walk_um2;
         state.covariance_um2 = if p11n < 1e6 {
             [p11n, p12 - g * p22, p22n]
         } else {
             [1e6, 0.0, p22n]
         };
         motion
-    }
-
-    /// Root of the mean square per tick that the net motion of the last ticks up to the one `back` ago amounts to, um.
-    /// A wrong gain errs in proportion to where the bead went, not to the way it made: motion to and fro, summed tick by
-    /// tick as if each erred on its own, would hide neutral and let it drift.
-    fn net_motion(&self, state: &EstimatorState, back: usize, neutral_um: f64) -> f64 {
-        const MOST: usize = 4;
-        let first = back.max(1);
-        let ticks = MOST.min((HISTORY + 1).saturating_sub(first)).max(1);
-        let sum: f64 = (first..first + ticks)
-            .map(|ago| self.tick.gain * (Self::command(state, ago) - neutral_um))
-            .sum();
-        sum / (ticks as f64).sqrt()
-    }
-
-    /// The furthest that the model says the bead has gone in one of the last ticks, um.
-    fn fastest_motion(&self, state: &EstimatorState) -> f64 {
-        let motion_um = |command: &f64| (self.tick.gain * (command - state.neutral_um)).abs();
-        let newest = state.history_um.iter().take(FASTEST_TICKS);
-        newest.map(motion_um).fold(0.0, f64::max)
     }
 
     /// From the filter's time to that of its measurement.
@@ -440,7 +420,7 @@ impl Estimator {
             return (true, innovation);
         }
         let was_stuck = state.stuck;
-        self.weigh_stuck(state, innovation, motion_um, fix.variance_um2);
+        self.weigh_stuck(state, innovation, motion_um, fix);
         if state.stuck {
             // The position is a constant to be averaged; it says nothing of neutral while something holds the bead.
             if was_stuck {

@@ -55,7 +55,7 @@ pub use control_loop::{ControlLoop, LoopState};
 pub use controller::{Controller, ControllerConfig, LoopConfig};
 pub use error::{BuildError, Parameter};
 pub use estimator::{
-    Estimate, Estimator, EstimatorConfig, EstimatorState, HISTORY, PredictedState,
+    Estimate, Estimator, EstimatorConfig, EstimatorState, HISTORY, PredictedState, StillBead,
     flow_step_log_density,
 };
 pub use feedforward::FeedForwardState;

@@ -21,7 +21,6 @@
 
 mod account;
 mod checks;
-mod clipped;
 mod following;
 mod in_force;
 mod life_cycle;
@@ -91,7 +90,8 @@ struct State {
     in_force: in_force::Board,
     told_um: f64,
     following: following::Following,
-    clipped: clipped::Clipped,
+    /// It was found that the bead does not feel the commands.
+    clipped: bool,
     /// Where the flow stands still, for a PZT that has to stop without a bead to tell.
     rest: rest::Rest,
     /// That of the freeze in force, um.
@@ -176,11 +176,6 @@ impl<R: ReferenceGenerator> Core<R> {
             &settings.model,
             timing.camera_delay_ms * 1e-3,
         );
-        let clipped = clipped::Clipped::new(
-            &settings.estimator,
-            &settings.model,
-            timing.camera_delay_ms * 1e-3,
-        );
         controller.start(displacement_um, neutral_um);
         Ok(Self {
             preview_um: vec![0.0; controller.preview_len()],
@@ -230,7 +225,7 @@ impl<R: ReferenceGenerator> Core<R> {
                 in_force: in_force::Board::new(displacement_um, neutral_um),
                 told_um: neutral_um,
                 following,
-                clipped,
+                clipped: false,
                 rest: rest::Rest::new(neutral_um),
                 rest_um: neutral_um,
                 pictures_repeated: 0,

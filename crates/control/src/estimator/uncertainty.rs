@@ -1,8 +1,31 @@
-//! How well the present position is known, and a zero flow that is believed instead of the estimate.
+//! What a wrong gain may cause, how well the present position is known, and a zero flow that is believed instead of the estimate.
 
 use super::{Estimator, EstimatorState, HISTORY};
 
+/// Ticks over which the fastest motion is looked for.
+const FASTEST_TICKS: usize = 6;
+
 impl Estimator {
+    /// Root of the mean square per tick that the net motion of the last ticks up to the one `back` ago amounts to, um.
+    /// A wrong gain errs in proportion to where the bead went, not to the way it made: motion to and fro, summed tick by
+    /// tick as if each erred on its own, would hide neutral and let it drift.
+    pub(super) fn net_motion(&self, state: &EstimatorState, back: usize, neutral_um: f64) -> f64 {
+        const MOST: usize = 4;
+        let first = back.max(1);
+        let ticks = MOST.min((HISTORY + 1).saturating_sub(first)).max(1);
+        let sum: f64 = (first..first + ticks)
+            .map(|ago| self.tick.gain * (Self::command(state, ago) - neutral_um))
+            .sum();
+        sum / (ticks as f64).sqrt()
+    }
+
+    /// The furthest that the model says the bead has gone in one of the last ticks, um.
+    pub(super) fn fastest_motion(&self, state: &EstimatorState) -> f64 {
+        let motion_um = |command: &f64| (self.tick.gain * (command - state.neutral_um)).abs();
+        let newest = state.history_um.iter().take(FASTEST_TICKS);
+        newest.map(motion_um).fold(0.0, f64::max)
+    }
+
     /// Standard deviation of the position `back` ticks after the filter's time: what is not known of the bead and of neutral then, and
     /// both their walks since, um.
     pub(super) fn present_sd_um(&self, state: &EstimatorState, back: usize) -> f64 {

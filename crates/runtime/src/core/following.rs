@@ -1,13 +1,16 @@
 //! Does the bead follow the commands, or is the loop itself what drives it away, as one whose sign is wrong does?
 //!
-//! Two hypotheses are weighed: the bead goes with the commands, or against them with the same gain. In both an unknown flow
-//! carries it, which walks, steps, or grows at a rate. Each is a Kalman filter of position, flow, its change, and gain; their
-//! likelihoods are compared from the time on at which the second began to be the better one (Page's test). A flow that rises
-//! makes the error grow as a wrong sign does, but it does not do so in proportion to the commands for long.
+//! Three hypotheses are weighed: the bead goes with the commands, against them with the same gain, or does not feel them, as when an
+//! amplifier clips. In each an unknown flow carries it, which walks, steps, or grows at a rate. Each is a Kalman filter of position,
+//! flow, its change, and gain; the likelihoods of the second and third are compared with that of the first from the time on at which
+//! they began to be the better ones (Page's test). A flow that rises makes the error grow as a wrong sign does, but it does not do so
+//! in proportion to the commands for long. Commands that cancel a flow look as if neither moved the bead: one that does not feel
+//! them is looked for only while it goes further and further away.
 //!
 //! Limit: a flow of more than 2 um that rises within 40 ms (1 % to 99 %) grows just as a loop with a wrong sign does, and can be taken
 //! for one.
 
+use crate::keeping::Hold;
 use cellpos_control::{EstimatorConfig, LoopModel, flow_step_log_density};
 
 /// Natural logarithm of the odds that are asked for, chosen among drawn flows: the beginning of a rise looks like a wrong sign, and
@@ -29,6 +32,11 @@ const CHANGES_PER_S: f64 = 0.01;
 const GROWTH_DELAYS: f64 = 2.0;
 /// A flow that has begun to change drives the bead as this displacement does, to the order of magnitude, um.
 const CHANGE_UM: f64 = 1.0;
+/// A bead goes further away if twice the time brings it so much further, the shorter of them so many delays of the loop. A flow that
+/// ramps brings a bead away only while the integral learns, with PI in twenty delays: 1 - e^-2 is 1.37 times 1 - e^-1. One that nothing
+/// brings back goes twice as far.
+const FURTHER: f64 = 1.5;
+const AWAY_DELAYS: f64 = 20.0;
 /// Ticks by which the delay may be wrong.
 const DELAY_ERROR: f64 = 0.5;
 /// Commands remembered: their way to a fix takes the camera's delay.
@@ -55,7 +63,7 @@ struct Noise {
 /// Position, flow, its change, and gain over the model's, with covariance.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct Path {
-    /// Sign of the gain.
+    /// Sign of the gain; 0: the bead does not feel the commands.
     sign: f64,
     x: [f64; 4],
     p: [[f64; 4]; 4],
@@ -72,6 +80,16 @@ impl Path {
             x: [position_um, 0.0, 0.0, 1.0],
             p,
         }
+    }
+
+    /// The same bead, which no longer feels the commands: it goes on as it goes, now that they drive it by `driven_um`.
+    fn adrift(mut self, driven_um: f64) -> Self {
+        self.add(1, 3, driven_um);
+        (self.sign, self.x[3]) = (0.0, 0.0);
+        for k in 0..4 {
+            (self.p[3][k], self.p[k][3]) = (0.0, 0.0);
+        }
+        self
     }
 
     /// The same bead with the opposite sign of its gain.
@@ -115,7 +133,7 @@ impl Path {
             self.p[3][k] *= kept;
             self.p[k][3] *= kept;
         }
-        self.p[3][3] += (1.0 - kept * kept) * GAIN_SD * GAIN_SD;
+        self.p[3][3] += (1.0 - kept * kept) * (self.sign * GAIN_SD).powi(2);
     }
 
     /// Takes a fix in, `ticks` after the one before; gives the logarithm of its likelihood.
@@ -176,6 +194,14 @@ impl Belief {
         }
     }
 
+    fn adrift(self, driven_um: f64) -> Self {
+        Self {
+            quiet: self.quiet.adrift(driven_um),
+            restless: self.restless.adrift(driven_um),
+            ..self
+        }
+    }
+
     /// Moves on by a tick; commands are counted from a displacement at which the model drives the bead `shift_um` further.
     fn advance(&mut self, driven_um: f64, doubt_um: f64, shift_um: f64, noise: &Noise) {
         for (path, restless) in [(&mut self.quiet, false), (&mut self.restless, true)] {
@@ -209,23 +235,91 @@ impl Belief {
     }
 }
 
+/// What the bead does instead of following.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) enum Instead {
+    /// It goes against the commands.
+    Against,
+    /// It does not feel them.
+    Adrift,
+}
+
+/// A hypothesis beside the usual one, and how much likelier it is, natural logarithm of the odds.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Rival {
+    belief: Belief,
+    evidence: f64,
+    /// Zero flow when it began to be the likelier one, um.
+    zero_flow_um: f64,
+}
+
+impl Rival {
+    fn of(belief: Belief, zero_flow_um: f64) -> Self {
+        Self {
+            belief,
+            evidence: 0.0,
+            zero_flow_um,
+        }
+    }
+}
+
+/// What is believed of a bead.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Beliefs {
+    with: Belief,
+    against: Rival,
+    adrift: Rival,
+    /// Ticks for which the bead has been away from its reference.
+    away: f64,
+    /// Those at which its distance was compared last, the distance, um, and whether it was going further away.
+    compared: (f64, f64, bool),
+}
+
+impl Beliefs {
+    /// Takes in a distance from the reference, um, `ticks` after the one before; `shortest` is the time that tells something.
+    fn watch_distance(&mut self, off_um: f64, ticks: f64, shortest: f64) {
+        let (at, before_um, _) = self.compared;
+        self.away += ticks;
+        if at == 0.0 && self.away >= shortest {
+            self.compared = (self.away, off_um, false);
+        } else if at > 0.0 && self.away >= 2.0 * at {
+            self.compared = (self.away, off_um, off_um > FURTHER * before_um);
+        }
+    }
+}
+
+/// The bead in a tick, um.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Seen {
+    /// Position and variance of the fix, if one came on time.
+    pub fix: Option<(f64, f64)>,
+    /// Where the bead is to be.
+    pub reference_um: f64,
+    /// The command of this tick, which shows one delay later.
+    pub command_um: f64,
+    /// Estimate of the zero flow.
+    pub zero_flow_um: f64,
+}
+
 /// The watch over a loop that runs.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Following {
     /// Way of the bead for a displacement of 1 um in a tick, um; 0 where the plant is too slow to be watched.
     gain: f64,
     noise: Noise,
+    hold: Hold,
     /// What the zero flow at the start is uncertain by, as a way in a tick, um.
     start_um: f64,
-    /// Ticks from a command to the fix that shows it.
+    /// Ticks from a command to the fix that shows it, and those after which the distance of a bead that is away tells something.
     delay: usize,
+    away_ticks: f64,
     /// Newest commands first, um, and how many there are.
     commands_um: [f64; COMMANDS],
     known: usize,
     mean_um: f64,
     mean_share: f64,
-    /// The bead that goes with the commands, the one that goes against them, and the evidence for that; none until a fix is known.
-    beliefs: Option<(Belief, Belief, f64)>,
+    /// None until a fix is known.
+    beliefs: Option<Beliefs>,
     since_fix: f64,
 }
 
@@ -244,7 +338,8 @@ impl Following {
             0.0
         };
         let walk_um2 = 2.0 * config.diffusion_um2_per_s * sample_s;
-        let growth = (sample_s / (GROWTH_DELAYS * (delay_s + 0.5 * sample_s))).min(1.0);
+        let delay_and_hold_s = delay_s + 0.5 * sample_s;
+        let growth = (sample_s / (GROWTH_DELAYS * delay_and_hold_s)).min(1.0);
         Self {
             gain,
             noise: Noise {
@@ -256,8 +351,10 @@ impl Following {
                 kept: (-sample_s / GAIN_MEMORY_S).exp(),
                 sample_s,
             },
+            hold: Hold::new(config.diffusion_um2_per_s, delay_s, sample_s),
             start_um: gain * config.neutral_initial_um,
             delay: delay as usize + 1,
+            away_ticks: AWAY_DELAYS * delay_and_hold_s / sample_s,
             commands_um: [0.0; COMMANDS],
             known: 0,
             mean_um: 0.0,
@@ -273,190 +370,79 @@ impl Following {
         self.beliefs = None;
     }
 
-    /// Takes in a tick: position and variance of the fix, if one came on time, um, and the command, um, which shows one delay later.
-    /// True when the loop drives the bead away.
-    pub(super) fn step(&mut self, fix: Option<(f64, f64)>, command_um: f64) -> bool {
+    /// Takes in a tick. Gives what the bead does instead of following the commands, and the zero flow of before, um.
+    pub(super) fn step(&mut self, seen: &Seen) -> Option<(Instead, f64)> {
         if self.gain == 0.0 {
-            return false;
+            return None;
         }
         self.commands_um.copy_within(..COMMANDS - 1, 1);
-        self.commands_um[0] = command_um;
+        self.commands_um[0] = seen.command_um;
         self.known = (self.known + 1).min(COMMANDS);
         let newest = self.commands_um.get(self.delay..self.delay + 2);
         let Some(&[now_um, before_um]) = newest.filter(|_| self.known > self.delay + 1) else {
-            self.mean_um = command_um;
-            return false;
+            self.mean_um = seen.command_um;
+            return None;
         };
         self.since_fix += 1.0;
         let shift_um = self.mean_share * (now_um - self.mean_um);
         self.mean_um += shift_um;
         let driven_um = self.gain * (now_um - self.mean_um);
         let doubt_um = DELAY_ERROR * self.gain * (now_um - before_um);
-        if let Some((with, against, _)) = &mut self.beliefs {
-            for belief in [with, against] {
-                belief.advance(driven_um, doubt_um, self.gain * shift_um, &self.noise);
-            }
+        if let Some(beliefs) = &mut self.beliefs {
+            let shift_um = self.gain * shift_um;
+            let Beliefs {
+                with,
+                against,
+                adrift,
+                ..
+            } = beliefs;
+            with.advance(driven_um, doubt_um, shift_um, &self.noise);
+            (against.belief).advance(driven_um, doubt_um, shift_um, &self.noise);
+            adrift.belief.advance(0.0, 0.0, 0.0, &self.noise);
         }
-        let Some((position_um, variance_um2)) = fix else {
-            return false;
-        };
+        let (position_um, variance_um2) = seen.fix?;
         let ticks = std::mem::take(&mut self.since_fix).max(1.0);
-        let Some((with, against, evidence)) = &mut self.beliefs else {
+        let zero_flow_um = seen.zero_flow_um;
+        let Some(beliefs) = &mut self.beliefs else {
             let with = Belief::of(Path::at(position_um, variance_um2, self.start_um));
-            self.beliefs = Some((with, with.against(), 0.0));
-            return false;
+            self.beliefs = Some(Beliefs {
+                with,
+                against: Rival::of(with.against(), zero_flow_um),
+                adrift: Rival::of(with.adrift(driven_um), zero_flow_um),
+                away: 0.0,
+                compared: (0.0, 0.0, false),
+            });
+            return None;
         };
-        let likely = with.correct(position_um, variance_um2, ticks, &self.noise);
-        *evidence += against.correct(position_um, variance_um2, ticks, &self.noise) - likely;
-        if *evidence <= 0.0 {
-            (*against, *evidence) = (with.against(), 0.0);
+        let off_um = (position_um - seen.reference_um).abs();
+        let is_away = off_um > self.hold.limit_um(variance_um2);
+        if is_away {
+            beliefs.watch_distance(off_um, ticks, self.away_ticks);
+        } else {
+            (beliefs.away, beliefs.compared) = (0.0, (0.0, 0.0, false));
         }
-        *evidence > EVIDENCE
+        let likely =
+            |belief: &mut Belief| belief.correct(position_um, variance_um2, ticks, &self.noise);
+        let usual = likely(&mut beliefs.with);
+        for rival in [&mut beliefs.against, &mut beliefs.adrift] {
+            rival.evidence += likely(&mut rival.belief) - usual;
+        }
+        if beliefs.against.evidence <= 0.0 {
+            beliefs.against = Rival::of(beliefs.with.against(), zero_flow_um);
+        }
+        if beliefs.adrift.evidence <= 0.0 || !is_away {
+            beliefs.adrift = Rival::of(beliefs.with.adrift(driven_um), zero_flow_um);
+        }
+        let Beliefs {
+            against, adrift, ..
+        } = beliefs;
+        if against.evidence > EVIDENCE.max(adrift.evidence) {
+            return Some((Instead::Against, against.zero_flow_um));
+        }
+        let goes = adrift.evidence > EVIDENCE && beliefs.compared.2;
+        goes.then_some((Instead::Adrift, beliefs.adrift.zero_flow_um))
     }
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::core::test_noise::noise;
-
-    /// What a loop meets, as functions of time.
-    struct World<'a> {
-        seed: u64,
-        /// Gain over the model's at a time.
-        gain_ratio: &'a dyn Fn(f64) -> f64,
-        axis: f64,
-        rate_hz: f64,
-        zero_flow: &'a dyn Fn(f64) -> f64,
-        reference: &'a dyn Fn(f64) -> f64,
-        seconds: f64,
-    }
-
-    impl Default for World<'_> {
-        fn default() -> Self {
-            Self {
-                seed: 1,
-                gain_ratio: &|_| 1.0,
-                axis: 1.0,
-                rate_hz: 1000.0,
-                zero_flow: &|_| 20.0,
-                reference: &|_| 0.0,
-                seconds: 11.0,
-            }
-        }
-    }
-
-    /// When it was told, s, and how far the bead was, um.
-    type Told = (f64, f64);
-
-    /// A proportional loop with an integral on an integrator.
-    fn told(world: &World<'_>) -> Option<Told> {
-        let mut state = world.seed;
-        let dt = 1.0 / world.rate_hz;
-        let model = LoopModel {
-            sample_time_s: dt,
-            ..LoopModel::integrator(380.0 * world.axis, 2e-3)
-        };
-        let config = EstimatorConfig::default();
-        let mut following = Following::new(&config, &model, 2e-3);
-        let late = (2e-3 * world.rate_hz).round() as usize;
-        let (mut bead_um, mut zero_um, mut command_um) = (0.0, 20.0, 20.0_f64);
-        let mut seen = std::collections::VecDeque::from(vec![0.0; late + 1]);
-        for k in 0..(world.seconds * world.rate_hz) as u64 {
-            let t = k as f64 * dt;
-            let pushed_um = command_um - (world.zero_flow)(t);
-            bead_um += world.axis * (world.gain_ratio)(t) * 380.0 * dt * pushed_um
-                + (0.66 * dt).sqrt() * noise(&mut state);
-            seen.push_back(bead_um);
-            seen.pop_front();
-            let fix_um = seen[0] + 0.015 * noise(&mut state);
-            let reference_um = (world.reference)(t);
-            let error_um = world.axis * (fix_um - reference_um);
-            zero_um -= 8.0 * dt * error_um;
-            command_um = (zero_um - 0.4 * error_um).clamp(0.0, 40.0);
-            let fix = Some((fix_um, 0.015_f64.powi(2)));
-            if following.step(fix, command_um) {
-                return Some((t, error_um));
-            }
-        }
-        None
-    }
-
-    #[test]
-    fn a_sign_that_flips_is_told_while_the_bead_is_in_the_picture() {
-        for rate_hz in [1000.0, 2000.0, 5000.0] {
-            for (gain, axis) in [(1.0, 1.0), (1.4, -1.0), (2.0, 1.0)] {
-                for seed in 1..=10 {
-                    let told = told(&World {
-                        seed,
-                        axis,
-                        rate_hz,
-                        gain_ratio: &|t| if t < 3.0 { gain } else { -gain },
-                        seconds: 3.5,
-                        ..World::default()
-                    });
-                    let in_time =
-                        told.is_some_and(|(s, um)| (3.0..3.12).contains(&s) && um.abs() < 12.0);
-                    assert!(in_time, "gain {gain}, {rate_hz} Hz, seed {seed}: {told:?}");
-                }
-            }
-        }
-    }
-
-    /// A flow that rises there and back every 2 s, from 1 % to 99 % in that time.
-    fn logistic(um: f64, rise_s: f64) -> impl Fn(f64) -> f64 {
-        move |t: f64| {
-            let p = (t % 2.0) - 1.0;
-            let since = (p.abs() - 0.5) * 9.2 / rise_s;
-            20.0 + um / (1.0 + since.exp())
-        }
-    }
-
-    /// A flow that goes to 2 um and back every second, with a time constant.
-    fn relaxes(tau_s: f64) -> impl Fn(f64) -> f64 {
-        move |t: f64| {
-            let since_s = t % 1.0;
-            let decays = 2.0 * (-since_s / tau_s).exp();
-            if t % 2.0 < 1.0 {
-                22.0 - decays
-            } else {
-                20.0 + decays
-            }
-        }
-    }
-
-    #[test]
-    fn half_to_twice_the_gain_and_flows_that_step_drift_or_rise_are_followed() {
-        let [fast, middle, slow] = [0.005, 0.02, 0.08].map(relaxes);
-        let [small, large] = [(2.6, 0.1), (-5.0, 0.1)].map(|(um, s)| logistic(um, s));
-        let flows: [&dyn Fn(f64) -> f64; 10] = [
-            &|_| 20.0,
-            &|t| 20.0 + 0.2 * t,
-            &|t| 10.0 + 6.0 * (t % 4.0 - 2.0).abs(),
-            &|t| 20.0 + 0.3 * (t.floor() % 2.0),
-            &|t| 20.0 + 2.6 * (t.floor() % 2.0),
-            &fast,
-            &middle,
-            &slow,
-            &small,
-            &large,
-        ];
-        for seed in 1..=2 {
-            for gain in [0.5, 1.0, 2.0] {
-                for (n, zero_flow) in flows.into_iter().enumerate() {
-                    for hz in [0.0, 1.0, 20.0] {
-                        let at = told(&World {
-                            seed,
-                            gain_ratio: &|_| gain,
-                            zero_flow,
-                            reference: &|t| 5.0 * (std::f64::consts::TAU * hz * t).sin(),
-                            seconds: 6.0,
-                            ..World::default()
-                        });
-                        assert_eq!(at, None, "flow {n}, gain {gain}, {hz} Hz, seed {seed}");
-                    }
-                }
-            }
-        }
-    }
-}
+mod tests;

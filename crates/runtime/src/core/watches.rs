@@ -1,6 +1,7 @@
 //! What is watched besides the bead: whether it follows the commands, and what its motion tells of the plant.
 
 use super::Core;
+use super::following::{Instead, Seen};
 use crate::life::{EventKind, FreezeReason, Life};
 use crate::reference::ReferenceGenerator;
 use crate::tick::Tick;
@@ -33,29 +34,34 @@ impl<R: ReferenceGenerator> Core<R> {
         tick: &mut Tick,
     ) {
         let state = &mut self.state;
-        if state.clipped.is_told() {
+        if state.clipped {
             tick.flags.set(TickFlags::CLIPPED);
         }
         let driven = state.life == Life::Running && !state.frozen.any();
         if !driven || !obeyed || output.flags.stuck {
-            state.clipped.clear();
             state.following.clear();
             return;
         }
         let on_time = fix.filter(|fix| {
             !tick.disturbed && fix.age_samples == 0 && fix.offset_samples.abs() < 0.2
         });
-        let seen = on_time.map(|fix| (fix.position_um, fix.variance_um2));
-        let against = state.following.step(seen, output.command_um);
-        let level_um =
-            (state.clipped).step(seen, reference_um, output.command_um, output.neutral_um);
-        if let Some(level_um) = level_um {
+        let found = state.following.step(&Seen {
+            fix: on_time.map(|fix| (fix.position_um, fix.variance_um2)),
+            reference_um,
+            command_um: output.command_um,
+            zero_flow_um: output.neutral_um,
+        });
+        let Some((instead, zero_flow_um)) = found else {
+            return;
+        };
+        if instead == Instead::Adrift {
+            state.clipped = true;
             tick.flags.set(TickFlags::CLIPPED);
-            tick.event(EventKind::ActuatorClipped { level_um });
+            tick.event(EventKind::ActuatorClipped {
+                level_um: zero_flow_um,
+            });
         }
-        if against || level_um.is_some() {
-            self.freeze(FreezeReason::NotFollowing, tick);
-        }
+        self.freeze(FreezeReason::NotFollowing, tick);
     }
 
     /// Gain and lag of the plant from its motion; their changes are events.

@@ -27,6 +27,8 @@ pub(super) struct Row {
     pub flow_um_per_s: f64,
     pub events: Vec<(FaultKind, f64)>,
     pub clip_um: f64,
+    /// The rig has none of the imperfections of a real one: the limits of the table are those of such a rig.
+    pub ideal: bool,
     pub seconds: f64,
 }
 
@@ -40,6 +42,7 @@ impl Row {
             flow_um_per_s: 0.0,
             events: Vec::new(),
             clip_um: 40.0,
+            ideal: true,
             seconds: 4.0,
         }
     }
@@ -101,8 +104,7 @@ impl Row {
         world.rate_hz = self.rate_hz;
         world.exposure_ms = world.exposure_ms.min(0.5e3 / self.rate_hz);
         world.pixel_um = self.pixel_um;
-        // The limits are those of a clean rig whose zero flow wanders.
-        world.ideal = true;
+        world.ideal = self.ideal;
         world.zero_flow_wander_um = Some(6e-3);
         world.zero_flow_drift_um_per_s = Some(1e-3);
         world.faults.flow_step_um = self.flow_step_um();

@@ -69,12 +69,29 @@ fn a_run_that_did_not_keep_its_bead_says_so_whatever_the_reason() {
             },
             "out-of-sight",
         ),
-        (Row::clipped("lqg", 19.98), "strayed"),
     ] {
         let held = hold(&row, 1);
         println!("{row} | {held}");
         assert_eq!(held.why.as_deref(), Some(why), "{row}: {held}");
         assert!(!held.as_asked, "{row}: {}", held.ended);
+    }
+}
+
+#[test]
+fn an_amplifier_that_clips_is_said_under_every_law_before_the_bead_is_out_of_sight() {
+    for (seed, law) in LAWS.into_iter().enumerate() {
+        for clip_um in [19.9, 19.98] {
+            let row = Row {
+                ideal: false,
+                ..Row::clipped(law, clip_um)
+            };
+            let held = hold(&row, 1 + seed as u64);
+            println!("{row}, {clip_um} um | {held}");
+            assert_eq!(held.why.as_deref(), Some("clipped"), "{row}: {held}");
+            assert_eq!(held.state, "safe", "{row}: {}", held.ended);
+            assert!(held.ended.contains("is clipped"), "{row}: {}", held.ended);
+            assert!(!held.as_asked, "{row}: {}", held.ended);
+        }
     }
 }
 

@@ -1,0 +1,178 @@
+//! Flows, signs and clips by hand.
+
+use super::*;
+use crate::core::test_noise::noise;
+
+/// What a loop meets, as functions of time.
+struct World<'a> {
+    seed: u64,
+    /// Gain over the model's at a time.
+    gain_ratio: &'a dyn Fn(f64) -> f64,
+    axis: f64,
+    rate_hz: f64,
+    /// Displacements that the actuator gives, um.
+    range: &'a dyn Fn(f64) -> [f64; 2],
+    zero_flow: &'a dyn Fn(f64) -> f64,
+    reference: &'a dyn Fn(f64) -> f64,
+    seconds: f64,
+}
+
+impl Default for World<'_> {
+    fn default() -> Self {
+        Self {
+            seed: 1,
+            gain_ratio: &|_| 1.0,
+            axis: 1.0,
+            rate_hz: 1000.0,
+            range: &|_| [0.0, 40.0],
+            zero_flow: &|_| 20.0,
+            reference: &|_| 0.0,
+            seconds: 11.0,
+        }
+    }
+}
+
+/// When it was found, s, how far the bead was, um, and what it was.
+type Told = (f64, f64, Instead);
+
+/// A proportional loop with an integral on an integrator.
+fn told(world: &World<'_>) -> Option<Told> {
+    let mut state = world.seed;
+    let dt = 1.0 / world.rate_hz;
+    let model = LoopModel {
+        sample_time_s: dt,
+        ..LoopModel::integrator(380.0 * world.axis, 2e-3)
+    };
+    let config = EstimatorConfig::default();
+    let mut following = Following::new(&config, &model, 2e-3);
+    let late = (2e-3 * world.rate_hz).round() as usize;
+    let (mut bead_um, mut zero_um, mut command_um) = (0.0, 20.0, 20.0_f64);
+    let mut seen = std::collections::VecDeque::from(vec![0.0; late + 1]);
+    for k in 0..(world.seconds * world.rate_hz) as u64 {
+        let t = k as f64 * dt;
+        let [low_um, high_um] = (world.range)(t);
+        let pushed_um = command_um.clamp(low_um, high_um) - (world.zero_flow)(t);
+        bead_um += world.axis * (world.gain_ratio)(t) * 380.0 * dt * pushed_um
+            + (0.66 * dt).sqrt() * noise(&mut state);
+        seen.push_back(bead_um);
+        seen.pop_front();
+        let fix_um = seen[0] + 0.015 * noise(&mut state);
+        let reference_um = (world.reference)(t);
+        let error_um = world.axis * (fix_um - reference_um);
+        zero_um -= 8.0 * dt * error_um;
+        command_um = (zero_um - 0.4 * error_um).clamp(0.0, 40.0);
+        let found = following.step(&Seen {
+            fix: Some((fix_um, 0.015_f64.powi(2))),
+            reference_um,
+            command_um,
+            zero_flow_um: zero_um,
+        });
+        if let Some((instead, _)) = found {
+            return Some((t, error_um, instead));
+        }
+    }
+    None
+}
+
+#[test]
+fn a_sign_that_flips_is_told_while_the_bead_is_in_the_picture() {
+    for rate_hz in [1000.0, 2000.0, 5000.0] {
+        for (gain, axis) in [(1.0, 1.0), (1.4, -1.0), (2.0, 1.0)] {
+            for seed in 1..=10 {
+                let told = told(&World {
+                    seed,
+                    axis,
+                    rate_hz,
+                    gain_ratio: &|t| if t < 3.0 { gain } else { -gain },
+                    seconds: 3.5,
+                    ..World::default()
+                });
+                let in_time = told.is_some_and(|(s, um, instead)| {
+                    (3.0..3.12).contains(&s) && um.abs() < 12.0 && instead == Instead::Against
+                });
+                assert!(in_time, "gain {gain}, {rate_hz} Hz, seed {seed}: {told:?}");
+            }
+        }
+    }
+}
+
+/// A flow that rises there and back every 2 s, from 1 % to 99 % in that time.
+fn logistic(um: f64, rise_s: f64) -> impl Fn(f64) -> f64 {
+    move |t: f64| {
+        let p = (t % 2.0) - 1.0;
+        let since = (p.abs() - 0.5) * 9.2 / rise_s;
+        20.0 + um / (1.0 + since.exp())
+    }
+}
+
+/// A flow that goes to 2 um and back every second, with a time constant.
+fn relaxes(tau_s: f64) -> impl Fn(f64) -> f64 {
+    move |t: f64| {
+        let since_s = t % 1.0;
+        let decays = 2.0 * (-since_s / tau_s).exp();
+        if t % 2.0 < 1.0 {
+            22.0 - decays
+        } else {
+            20.0 + decays
+        }
+    }
+}
+
+#[test]
+fn half_to_twice_the_gain_and_flows_that_step_drift_or_rise_are_followed() {
+    let [fast, middle, slow] = [0.005, 0.02, 0.08].map(relaxes);
+    let [small, large] = [(2.6, 0.1), (-5.0, 0.1)].map(|(um, s)| logistic(um, s));
+    let flows: [&dyn Fn(f64) -> f64; 10] = [
+        &|_| 20.0,
+        &|t| 20.0 + 0.2 * t,
+        &|t| 10.0 + 6.0 * (t % 4.0 - 2.0).abs(),
+        &|t| 20.0 + 0.3 * (t.floor() % 2.0),
+        &|t| 20.0 + 2.6 * (t.floor() % 2.0),
+        &fast,
+        &middle,
+        &slow,
+        &small,
+        &large,
+    ];
+    for seed in 1..=2 {
+        for gain in [0.5, 1.0, 2.0] {
+            for (n, zero_flow) in flows.into_iter().enumerate() {
+                for hz in [0.0, 1.0, 20.0] {
+                    let at = told(&World {
+                        seed,
+                        gain_ratio: &|_| gain,
+                        zero_flow,
+                        reference: &|t| 5.0 * (std::f64::consts::TAU * hz * t).sin(),
+                        seconds: 6.0,
+                        ..World::default()
+                    });
+                    assert_eq!(at, None, "flow {n}, gain {gain}, {hz} Hz, seed {seed}");
+                }
+            }
+        }
+    }
+}
+
+#[test]
+fn an_actuator_that_clips_near_zero_flow_is_told_under_a_slow_law_within_20_um() {
+    let levels = [19.8, 19.9, 19.98].map(|um| (um, -1.0)).into_iter();
+    for (level_um, side) in levels.chain([20.2, 20.1, 20.02].map(|um| (um, 1.0))) {
+        for (seed, axis) in [(1, 1.0), (2, -1.0), (3, 1.0)] {
+            let range = |t: f64| match (t > 3.0, side < 0.0) {
+                (false, _) => [0.0, 40.0],
+                (true, true) => [0.0, level_um],
+                (true, false) => [level_um, 40.0],
+            };
+            let found = told(&World {
+                seed,
+                axis,
+                range: &range,
+                ..World::default()
+            });
+            let in_time = found.is_some_and(|(s, um, instead)| {
+                s >= 3.0 && um.abs() < 20.0 && instead == Instead::Adrift
+            });
+            assert!(in_time, "{level_um} um, seed {seed}: {found:?}");
+        }
+    }
+}
