@@ -16,7 +16,7 @@ fn git(arguments: &[&str]) -> Option<String> {
 fn main() {
     println!("cargo:rerun-if-env-changed=CELLPOS_COMMIT");
     println!("cargo:rerun-if-changed=build.rs");
-    // Every commit is a line of this log; editing a file is none, so that editing does not build this crate again.
+    // Every commit adds a line to this log and an edit does not, so an edit does not build this crate again.
     if let Some(log) = git(&["rev-parse", "--git-path", "logs/HEAD"]) {
         println!("cargo:rerun-if-changed={log}");
     }

@@ -5,8 +5,8 @@ use cellpos_session::{Options, Rig, RigFile};
 use cellpos_workbench::check::{self, Finding, Weight};
 use std::path::Path;
 
-/// Opens a rig whose file was read from `path` (none: the emulated rig as it is). What does not fit together in the file is said before
-/// a device is opened, what its frames say against it before anything moves; an error ends it, unless `anyway`.
+/// Opens a rig whose file was read from `path` (none: the emulated rig as it is). Contradictions within the file are reported
+/// before a device is opened, those between file and frames before anything moves. An error ends the command, unless `anyway`.
 ///
 /// # Errors
 /// As [`Rig::open`], or a finding that is an error.

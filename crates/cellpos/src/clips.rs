@@ -5,7 +5,7 @@ use cellpos_session::clips::{ClipConfig, Clips, Schedule};
 use cellpos_session::{Failure, Rig};
 use std::path::Path;
 
-/// The clips of the next run on a rig, into its folder. There are none without frames or on the virtual clock.
+/// The clips of the next run on a rig, into its folder. Without frames or on the virtual clock there are no clips.
 pub(crate) fn of(
     rig: &mut Rig,
     folder: &Path,

@@ -12,9 +12,9 @@ pub(crate) struct Keyboard {
     thread: Option<JoinHandle<()>>,
 }
 
-/// Hands what was typed to `on_keys`, as much as came at once (the key of an arrow is several bytes), on a thread of its own, if standard input is a terminal and this program is in its
-/// foreground: one in the background is stopped by the system when it touches the terminal, and a stopped program cannot hold a
-/// bead.
+/// Passes typed bytes to `on_keys` on a separate thread, as many as came at once (an arrow key is several bytes). Only if
+/// standard input is a terminal and this program is in its foreground: the system stops a background program that touches the
+/// terminal, and a stopped program cannot hold a bead.
 pub(crate) fn listen(mut on_keys: impl FnMut(&[u8]) + Send + 'static) -> Option<Keyboard> {
     let stdin = rustix::stdio::stdin();
     if !termios::isatty(stdin) {

@@ -4,6 +4,18 @@
 //!
 //! Exit codes: 0 done, 1 failed or limits broken, 2 bad input. With `--json` standard output carries one JSON object
 //! and nothing else (an error is one too); progress, warnings and errors for people go to standard error.
+//!
+//! ```
+//! use cellpos::Outcome;
+//! // Design a controller for the paper's plant, as `cellpos design --model eq6 --delay 2.5ms` does.
+//! let done = cellpos::run(["cellpos", "--quiet", "design", "--model", "eq6", "--delay", "2.5ms"]);
+//! assert!(matches!(done, Ok(Outcome::Done)));
+//! ```
+//!
+//! The crates below this one, from a frame to a voltage: `cellpos-rig` (traits of devices), `cellpos-drivers` and
+//! `cellpos-emulator` (devices), `cellpos-vision` (frame to position), `cellpos-control` (estimator and laws),
+//! `cellpos-runtime` (the tick and its threads), `cellpos-session` (from rig file to finished run), `cellpos-record` (run
+//! folders). Off line: `cellpos-ident` and `cellpos-reconcile` (from records to models), `cellpos-plant` (the model).
 #![forbid(unsafe_code)]
 
 mod arguments;

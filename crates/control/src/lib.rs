@@ -9,6 +9,15 @@
 //! Sampling convention: at tick `k` a command `u_k` takes effect and is held until tick `k + 1`; the position `p_k` is
 //! that just before `u_k` takes effect. The measurement that arrives at tick `k` is of the position `delay` earlier.
 //!
+//! Start with:
+//!
+//! - [`ControllerFile`]: controller.toml. [`ControllerConfig`] and [`Controller`]: a law with its estimator, ready to step.
+//! - [`ControlLoop`]: estimator, law, feed-forward and limits in one step, from [`LoopInput`] to [`LoopOutput`].
+//! - [`Pi`], [`Lqg`], [`Mpc`]: the laws; [`ControlLaw`](law::ControlLaw) is the trait for your own.
+//! - [`LoopModel`]: the sampled plant with its delay. [`Adaptation`]: its gain and delay, estimated while the loop runs.
+//! - [`Reference`] and [`Profile`]: the motion. [`learning`]: the feed-forward learned over cycles.
+//! - [`design`]: gains, margins and the lowest possible error. [`SimulatedRig`]: a rig without pictures for tests.
+//!
 //! ```
 //! use cellpos_control::{Controller, ControllerFile, LoopInput, Pi};
 //! use cellpos_plant::Model;

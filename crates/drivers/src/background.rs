@@ -1,7 +1,7 @@
 //! Frames of the empty channel, against which cells are seen: recorded once per setting of the camera, kept as a stack.
 //!
-//! The frames are kept, not their mean: their scatter is the noise that decides what counts as a cell, and a frame in
-//! which something swam past is found and named.
+//! The frames are kept, not only their mean. Their scatter is the noise that decides what counts as a cell, and a frame in which
+//! something swam past is found and named.
 
 use crate::sources::{self, SourceError};
 use cellpos_rig::source::FrameBuffer;

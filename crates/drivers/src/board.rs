@@ -14,8 +14,8 @@ use std::time::Duration;
 
 /// How long an answer to a request may take.
 const ANSWER_WITHIN: Duration = Duration::from_millis(500);
-/// How long the answer to the first hello may take: a board that the opening of its port resets, or a line that wakes up
-/// when it is opened (a pseudo-terminal of QEMU looks once a second), is silent at first.
+/// Longest time until the answer to the first hello. A board that resets when its port is opened, or a line that wakes up slowly
+/// (a pseudo-terminal of QEMU looks once a second), is silent at first.
 const HELLO_WITHIN: Duration = Duration::from_secs(3);
 /// How often a request is sent again within that time.
 const REPEAT_EVERY: Duration = Duration::from_millis(50);

@@ -68,8 +68,8 @@ impl Outbox {
     /// Writes as much as the line takes now; whether nothing is left.
     ///
     /// # Errors
-    /// The line is gone. A frame that was cut off by that is lost if it is a command and is written again from its beginning if
-    /// it is an order: every frame begins with a delimiter, which ends the part that the board may have.
+    /// The line is gone. A truncated frame is lost if it is a command, and written again from its beginning if it is an order.
+    /// Every frame begins with a delimiter, which ends the part that the board may have.
     pub(crate) fn push(&mut self, port: &mut (impl Port + ?Sized)) -> std::io::Result<bool> {
         loop {
             let Some(frame) = &mut self.begun else {

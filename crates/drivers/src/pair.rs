@@ -8,16 +8,16 @@ use cellpos_rig::{
 /// How the partner is armed; the session's number is that of the fast one.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PartnerRequest {
-    /// Where a ramp to park ends, um of its own scale.
+    /// End of a ramp to park, on its own scale, um.
     pub park_um: f64,
     /// Smallest and largest displacement (um) and slew (um/s).
     pub limits: [f64; 3],
-    /// Silence after which it holds where it is, and time that it then holds before it parks, ms; `None`: its own.
+    /// Silence after which it holds its position, and holding time before it parks, ms; `None`: the device's default.
     pub watchdogs_ms: [Option<u16>; 2],
 }
 
-/// A fast actuator and a slow partner as one. What goes wrong with the partner never stops the fast one: it is silence of the partner,
-/// and the loop says so.
+/// A fast actuator and a slow partner as one. A failure of the partner never stops the fast one: it counts as silence of the
+/// partner, and the loop reports it.
 pub struct Pair {
     fast: Box<dyn Actuator>,
     slow: Box<dyn Actuator>,
@@ -71,7 +71,7 @@ impl Actuator for Pair {
         self.fast.command(command_um, neutral_um, time_us)
     }
 
-    /// The slow one stays where it is: it has no zero flow to go to.
+    /// The slow one keeps its position: it has no zero flow to go to.
     fn freeze(&mut self) -> Result<(), ActuatorError> {
         self.fast.freeze()
     }
@@ -98,7 +98,7 @@ impl Actuator for Pair {
 
     fn command_partner(&mut self, um: f64, time_us: u64) {
         if self.slow_is_armed {
-            // Where it holds when commands stop is where it is.
+            // If commands stop, it holds its position.
             let _ = self.slow.command(um, um, time_us);
         }
     }

@@ -13,8 +13,8 @@ use std::os::fd::OwnedFd;
 use std::path::Path;
 use std::time::{Duration, Instant};
 
-/// How long a line that takes nothing is waited for, ns: half a period of the loop, so that the answers that arrive meanwhile
-/// are still read in the period of their command.
+/// Longest wait for a line that takes nothing, ns: half a period of the loop. So answers that arrive meanwhile are still read in
+/// the period of their command.
 const WAIT_NS: i64 = 500_000;
 /// How often a line that is gone is looked for: opening a USB port takes milliseconds.
 const LOOK_EVERY: Duration = Duration::from_millis(20);

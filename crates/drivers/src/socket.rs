@@ -1,7 +1,7 @@
 //! A camera at the other end of a Unix socket: framing as in [`cellpos_link::frames`].
 //!
-//! When the server goes away the camera tries to connect again, so that a restarted camera process costs frames and
-//! not the run; the loop sees silence meanwhile and acts on it.
+//! If the server disappears, the camera tries to connect again. So a restarted camera process costs frames and not the run. The
+//! loop sees silence meanwhile and acts on it.
 
 use cellpos_link::frames::FrameGatherer;
 use cellpos_rig::clock::{Clock, monotonic_ns};

@@ -1,7 +1,7 @@
 //! A camera with a tracker: frames in, positions of one and the same bead, or cell, out.
 //!
 //! The tracker predicts the bead from the commanded flow, takes a fix only when place, intensity, size and residual
-//! agree, and says of every frame where it stands and why. A fix that it does not take gives no position, so that the
+//! agree, and reports its state and reason for every frame. A fix that it does not take gives no position, so that the
 //! loop coasts rather than follows another bead. Of a cell, length and area come with the position.
 
 use crate::calibration::{Axis, Calibration};

@@ -1,8 +1,8 @@
 //! What a cell and its channel look like: an ellipse with a soft edge, a rim and a halo, between two walls.
 //!
-//! Body: a step blurred by the microscope, the more the further the cell is out of focus. Out of focus the edge's phase
-//! shows as well, as the second derivative of that step (transport of intensity): a rim just inside the edge and a halo of
-//! the other sign just outside, which change places on the other side of the focus.
+//! Body: a step blurred by the microscope, the more the further the cell is out of focus. Out of focus the edge's phase shows as
+//! well, as the second derivative of that step (transport of intensity): a rim just inside the edge and a halo of the other sign
+//! just outside. They change places on the other side of the focus.
 
 use crate::cell::CellConfig;
 use crate::config::WorldConfig;

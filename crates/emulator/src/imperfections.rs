@@ -1,6 +1,6 @@
 //! Imperfections of a real rig: flow, light and clocks.
 //!
-//! Every key of `[emulator]` that stands for one of them may be left out. Then it is as on a real rig with `ideal = false`, and
+//! Every such key of `[emulator]` may be left out. Then it is as on a real rig with `ideal = false`, and
 //! nothing at all on an ideal rig. A given key holds on either rig.
 
 use crate::config::WorldConfig;

@@ -1,15 +1,15 @@
-//! The slow partner that is not there: a pressure controller of its own line, a regulator, a tube that stretches.
+//! The emulated slow partner: a pressure controller with its own line, a regulator, a tube that stretches.
 
 use crate::board_config::{BoardConfig, BoardConfigError};
 use cellpos_board::Board;
 use cellpos_link::um_from_picometres;
 
-/// An emulated pressure controller in parallel with the PZT. Displacements are um of its own scale.
+/// An emulated pressure controller in parallel with the PZT. Displacements are in um on its own scale.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PressureConfig {
     /// Its board: range, slew, watchdogs; it starts at `power_up_um`, where the flow is that of the PZT alone.
     pub board: BoardConfig,
-    /// um of PZT displacement that have the effect of 1 um of it.
+    /// um of PZT displacement with the same effect as 1 um of this actuator.
     pub gain: f64,
     /// Lags of regulator and tube (63 % of a step), ms; 0: none.
     pub lags_ms: [f64; 2],

@@ -223,10 +223,10 @@ impl World {
         Ok((0..count).map(draw).collect())
     }
 
-    /// Advances to `t_ns` while the board's output stands at `applied_um`; does nothing for a past time.
+    /// Advances to `t_ns` with the board's output at `applied_um`; does nothing for a past time.
     ///
     /// A new output takes effect at the world's present time: call this up to the instant of the change with the old output, then
-    /// go on with the new one.
+    /// continue with the new one.
     pub fn advance_to(&mut self, t_ns: i64, applied_um: f64) {
         loop {
             let sample_ns = self.camera.next_sample_ns();

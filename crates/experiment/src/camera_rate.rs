@@ -36,8 +36,8 @@ pub(crate) fn foreign_rate_hz(ticks: &[TickRecord], period_ns: i64) -> Option<f6
     (off.abs() > AGREES).then(|| 1e9 / spacing_ns)
 }
 
-/// Frames of a camera that is faster than the loop, counted in periods of the loop: each tick takes the newest of several, and a
-/// record has a row for each tick.
+/// Frames of a camera that is faster than the loop, counted in periods of the loop. Each tick takes the newest of several, and a
+/// record has a row per tick.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct InPeriods {
     period_ns: i64,

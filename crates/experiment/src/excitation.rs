@@ -30,8 +30,8 @@ const BAND_HZ: [f64; 14] = [
     1.5, 2.5, 4.5, 7.5, 12.5, 20.5, 33.5, 54.5, 87.5, 140.5, 197.5, 293.5, 353.5, 431.5,
 ];
 
-/// Largest speed of the bead, um/s: sums of lines peak higher than a sine, and a fix that the tracker refuses because the bead
-/// moved too far looks like a lost frame.
+/// Largest speed of the bead, um/s. Sums of lines peak higher than a sine, and a fix that the tracker refuses as too far looks
+/// like a lost frame.
 const BEAD_UM_PER_S: f64 = 250.0;
 
 impl Experiment {

@@ -12,7 +12,7 @@ use std::sync::mpsc::Sender;
 pub(crate) struct Handing {
     recording: Recording,
     ticks: Sender<TickRecord>,
-    /// The segments, by ticks since the first of them.
+    /// The segments, by ticks since the first segment.
     spans: Vec<Span>,
     /// The tick in which the loop was closed, and the newest.
     closed: Option<u64>,
@@ -21,7 +21,7 @@ pub(crate) struct Handing {
 }
 
 impl Handing {
-    /// Of a run that measures `spans`, by ticks since the first of them, at a period of `period_s`.
+    /// Of a run that measures `spans`, by ticks since the first span, at a period of `period_s`.
     pub(crate) fn new(
         writer: Option<RunWriter>,
         ticks: Sender<TickRecord>,
@@ -59,7 +59,7 @@ impl RunSink for Handing {
             self.closed = Some(record.seq);
         }
         self.newest = record.seq;
-        // Nobody who hears it: the run is given up already.
+        // No receiver: the run has ended already.
         let _ = self.ticks.send(*record);
     }
 

@@ -1,6 +1,10 @@
 //! Experiments on a rig: an identification, records for reconcile, and the whole circle of identify, reconcile, design and
 //! track.
 //!
+//! - [`identify`]: the whole identification, on the emulated rig or on yours ([`on_rig`]).
+//! - [`collect`]: the experiments that reconcile needs. [`excitation`]: their signals.
+//! - [`circle`]: identify, reconcile, design, track. [`partner`]: gain, lag and delay of a slow actuator.
+//!
 //! A segment of an experiment, on the emulated rig (another: `RigFile::load` with a path):
 //!
 //! ```

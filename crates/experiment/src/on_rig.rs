@@ -1,5 +1,5 @@
-//! An identification on the rig of a rig.toml, through the same loop, threads and safe states as `cellpos track`: the
-//! bead is held at 0 um and the excitation is added to the command.
+//! An identification on the rig of a rig.toml, through the same loop, threads and safe states as `cellpos track`. The bead is
+//! held at 0 um and the excitation is added to the command.
 //!
 //! The loop freezes and thaws by its own rules when the bead is lost; a segment in which it did is measured again.
 
@@ -52,8 +52,8 @@ pub struct Acquired {
     pub records: Vec<RecordedSegment>,
     /// Estimate of neutral at the end, um.
     pub neutral_um: f64,
-    /// Mean time from the middle of an exposure to the tick that used it, by the stamps of the frames, s; frames that a stall
-    /// has held up are left out. `None` before the first.
+    /// Mean time from the middle of an exposure to the tick that used it, by the stamps of the frames, s; without frames that a
+    /// stall delayed. `None` before the first.
     pub age_s: Option<f64>,
     /// Localisation noise as vision stated it, um RMS.
     pub fix_noise_um: Option<f64>,

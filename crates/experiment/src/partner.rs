@@ -1,9 +1,9 @@
 //! The slow partner of the PZT, measured: its gain, lag and delay, each with its interval.
 //!
-//! The loop holds a bead with the PZT while the partner makes a square wave that the loop is not told of. What the bead did that the PZT
-//! does not explain is the partner's: its command through a lag and a delay, times the gain, into the same plant. The command is no part
-//! of the loop, so that the feedback biases nothing; and since a held bead makes the PZT undo what the partner does, the gain holds in um
-//! of PZT whatever the error of the plant's own gain.
+//! The loop holds a bead with the PZT while the partner makes a square wave that the loop is not told of. The partner causes the
+//! motion that the PZT does not explain: its command through a lag and a delay, times the gain, into the same plant. The command
+//! is not part of the loop, so the feedback biases nothing. To hold the bead the PZT undoes the partner's motion, so the gain in
+//! um of PZT does not depend on the plant's gain.
 
 use crate::on_rig::OnRig;
 use crate::rows::fix_noise_um;
@@ -22,7 +22,7 @@ const Z95: f64 = 1.96;
 /// How the partner is moved.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Moves {
-    /// Half of peak to peak, um of its own scale.
+    /// Half of peak to peak on its own scale, um.
     pub amplitude_um: f64,
     /// Time up, and time down, s.
     pub half_period_s: f64,
@@ -38,7 +38,7 @@ struct Followed {
     slew_um_per_s: f64,
 }
 
-/// What was measured; intervals are half widths, 95 %.
+/// The result; intervals are half widths, 95 %.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Measured {
     /// um of PZT displacement that have the effect of 1 um of the partner.
@@ -62,7 +62,7 @@ struct Ticks(Sender<TickRecord>);
 
 impl RunSink for Ticks {
     fn tick(&mut self, record: &TickRecord) {
-        // Nobody who hears it: the run is given up already.
+        // No receiver: the run has ended already.
         let _ = self.0.send(*record);
     }
     fn event(&mut self, _: &Event) {}
@@ -72,7 +72,7 @@ impl RunSink for Ticks {
 /// Moves the partner of a rig while the bead is held, and measures it.
 ///
 /// # Errors
-/// The rig file has no partner, the run ended early, or the partner cannot be told from noise.
+/// The rig file has no partner, the run ended early, or the partner's effect is below the noise.
 pub fn measure(on: &OnRig, moves: Moves) -> Result<Measured, Failure> {
     let mut file = on.file.clone();
     let table = file.partner.as_mut().ok_or_else(no_partner)?;
@@ -196,7 +196,8 @@ fn fit(
 ) -> Result<Measured, Failure> {
     let data = data(ticks, moves).ok_or_else(too_little)?;
     let noise_um = fix_noise_um(ticks).unwrap_or(0.0);
-    // Increments over a quarter of the partner's period: a step of it is seen in several, and most of the noise of a fix is averaged out.
+    // Increments over a quarter of the partner's period: a step appears in several of them, and most of the noise of a fix
+    // averages out.
     let apart = ((0.25 * partner_period_s / period_s).round() as usize).max(1);
     let walk_um2 = 2.0 * model.noise.diffusion_um2_per_s * apart as f64 * period_s;
     let sd_um = (walk_um2 + 2.0 * noise_um * noise_um).max(1e-8).sqrt();
@@ -298,7 +299,7 @@ fn through(model: &Model, input: &[f64], period_s: f64, age_s: f64) -> Result<Ve
     Ok(earlier(&path, age_s / period_s))
 }
 
-/// A path seen so many rows before each row, between rows on the line that joins them.
+/// A path a number of rows before each row, linear between rows.
 fn earlier(path: &[f64], rows: f64) -> Vec<f64> {
     let at = |k: f64| {
         let k = k.clamp(0.0, (path.len() - 1) as f64);

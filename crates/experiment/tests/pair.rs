@@ -14,7 +14,7 @@ use std::collections::BTreeMap;
 
 const PARTNER: &str = "[partner]\nkind = \"emulated-pressure\"\nemulated_gain = 0.8\ngain = 0.8\ngain_ci95 = 0.01\nlag_ms = 50.0\n";
 
-/// Keeps all events, and every so many ticks.
+/// Keeps all events, and every n-th tick.
 struct Kept(Vec<TickRecord>, Vec<EventKind>, u64);
 
 impl RunSink for Kept {
@@ -235,7 +235,7 @@ fn the_slow_ones_moves_do_not_show_in_the_error() {
 
 #[test]
 fn a_staircase_of_ten_strokes_in_bead_and_in_flow() {
-    // A stroke of 2 um: ten of it up in the bead's position, and ten of it in the flow, which drifts meanwhile.
+    // A stroke of 2 um: ten strokes in the bead's position, and ten in the flow, which drifts meanwhile.
     let mut script = "name = \"stairs\"\n".to_owned();
     for step in 0..=10 {
         script += &format!(

@@ -5,6 +5,13 @@
 //! angular frequency only inside. A record follows the project's convention: row k holds the command applied from
 //! `t_k` on and the position just before it takes effect.
 //!
+//! - [`excitation`] and [`experiment`]: the signals, and the plan of a measurement.
+//! - [`frequency_response`], [`tone_fit`], [`spectral`]: gain and phase with standard deviations.
+//! - [`delay`]: the camera's delay from the edges of an LED.
+//! - [`rational`], [`from_response`], [`sampled`]: fits of a transfer function. [`base`]: a stated form, such as `order=2,delay`.
+//! - [`order_selection`]: how many poles the data support. [`identifiability`]: which parameters they determine.
+//! - [`summary`]: the result, ready for a model file.
+//!
 //! ```
 //! use cellpos_ident::tone_fit::{ToneFit, fit_block};
 //! // A sine of 2 um at 10 Hz on a drift of 5 um/s, as a record at 1 kHz.

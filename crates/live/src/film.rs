@@ -16,8 +16,8 @@ pub struct FilmFrame {
     pub pixels: Vec<u8>,
 }
 
-/// A clip on the wire, little-endian: width, height and number of frames (u32 each) and a word that is not used; for each frame
-/// its time (f64), the centre (two f32) and the pixels, padded with zeros to a multiple of eight bytes. Frames of another size
+/// A clip on the wire, little-endian: width, height and number of frames (u32 each) and an unused word. Then for each frame its
+/// time (f64), the centre (two f32) and the pixels, padded with zeros to a multiple of eight bytes. Frames of another size
 /// are left out.
 ///
 /// ```

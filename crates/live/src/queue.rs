@@ -6,7 +6,7 @@ use std::sync::{Condvar, Mutex, PoisonError};
 use std::time::Duration;
 use tungstenite::Message;
 
-/// Messages that wait for a client: about two seconds of them.
+/// Messages that wait for a client: about two seconds' worth.
 const MESSAGES: usize = 100;
 
 /// What waits for a client. When it is full the oldest message goes and is counted.

@@ -103,7 +103,7 @@ pub struct LastWord {
     pub how: &'static str,
     /// Observation, and expectation if different.
     pub seen: String,
-    /// What to do; empty if there is nothing.
+    /// The remedy; empty if there is none to name.
     pub to_do: String,
     /// Where the PZT is.
     pub pzt: String,

@@ -280,7 +280,7 @@ fn silent_connections_and_viewers_do_not_keep_an_operator_from_the_stop_key() {
     socket.send(Message::text(r#"{"do":"freeze"}"#)).unwrap();
     let asked = |request| page.asked.lock().unwrap().contains(&request);
     wait_for(|| asked(OperatorRequest::Freeze));
-    // Before any of them has been given up for its silence.
+    // Before the first one is closed for its silence.
     assert!(from.elapsed() < Duration::from_secs(2));
     drop((silent, socket));
     let origin = format!("http://{address}");

@@ -268,8 +268,8 @@ impl DiscretePlant {
         self.numerator_zeros(false)
     }
 
-    /// The zeros in z of the biproper form `y_k = C x_k + D u_k`, which is not what a camera records: it is here to
-    /// show why that form must not be inverted (Eq. (6) at 1 ms: z = -19.3).
+    /// The zeros in z of the biproper form `y_k = C x_k + D u_k`, which differs from a camera's record. It shows why that form
+    /// must not be inverted (Eq. (6) at 1 ms: z = -19.3).
     pub fn biproper_zeros(&self) -> Vec<Complex<f64>> {
         self.numerator_zeros(true)
     }

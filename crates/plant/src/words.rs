@@ -1,6 +1,6 @@
 //! Messages of the TOML reader in the words of people.
 
-/// A message of serde in the words of people: a reader of a TOML file need not know what an `f64` is.
+/// A message of serde in plain words: a reader of a TOML file need not know Rust types.
 pub fn in_words(message: &str) -> String {
     const WORDS: [(&str, &str); 19] = [
         ("f64", "a number"),

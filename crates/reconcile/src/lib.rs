@@ -7,6 +7,13 @@
 //!
 //! Not for identifying a plant from nothing (that is `cellpos-ident`), and not for files: records come as columns.
 //!
+//! - [`reconcile`] with [`Options`]: the search. [`report()`]: its page.
+//! - [`Record`]: command and position at equal steps. [`Units`]: what they are measured in.
+//! - [`NoiseModel`] and [`FloorSource`]: the noise, and where its size comes from.
+//! - [`DiscrepancyMap`]: where, in frequency and amplitude, the model falls short.
+//! - [`Hypothesis`]: a formula, if no effect of the catalogue has a name.
+//! - [`THRESHOLDS`]: every number that decides, with its reason.
+//!
 //! ```
 //! use cellpos_plant::Model;
 //! use cellpos_reconcile::{Options, ReconcileError, Record, reconcile};

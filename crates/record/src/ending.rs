@@ -47,11 +47,11 @@ fn no_answer(path: &Path, after: Duration) -> RecordError {
 impl RunWriter {
     /// Writes what waits, the end of `run.toml` (`ended_utc` and the counts are set here), and `ticks.parquet`.
     ///
-    /// The rows are read back: every row taken that does not come back is counted as lost, on top of what `end.rows_lost`
-    /// says was lost on the way here, and the figure `records_lost` of the summary is set to the sum. A failing disk is no
-    /// error here either: what could be written is there, and [`Finished`] says the rest. Nor does a disk that does not answer
-    /// keep it for ever: it is given 15 s for what was written last (a run on the virtual clock, which syncs only here, a
-    /// minute and a second for each 5 MB), and a minute and a second for each 5 MB for `ticks.parquet`.
+    /// The rows are read back. Every row that does not come back counts as lost, in addition to `end.rows_lost`; the summary's
+    /// `records_lost` is the sum. A failing disk is no
+    /// error here either: what could be written is there, and [`Finished`] says the rest. A disk that does not answer has 15 s
+    /// for the last rows. A run on the virtual clock, which syncs only here, waits a minute and a second for each 5 MB, and so
+    /// does `ticks.parquet`.
     pub fn finish(self, end: RunEnd) -> Finished {
         let Self {
             folder,

@@ -24,6 +24,19 @@
 //! Parquet; [`RunReader::to_record`] makes one from a run.
 //!
 //! Not for data that a tick waits for, and no locking: one writer a folder.
+//!
+//! ```
+//! use cellpos_record::{Event, RunEnd, RunMeta, RunReader, RunWriter};
+//! # let root = tempfile::tempdir()?;
+//! # let root = root.path();
+//! let mut run = RunWriter::create(root, RunMeta::new("hold", "virtual"))?;
+//! run.event(&Event::new(0.5, "bead-lost"));
+//! let finished = run.finish(RunEnd::new("done")); // `run.tick` takes the ticks
+//! let reader = RunReader::open(&finished.folder)?;
+//! assert_eq!(reader.meta().map(|meta| meta.name.as_str()), Ok("hold"));
+//! assert_eq!(reader.events()?.events[0].event, "bead-lost");
+//! # Ok::<(), Box<dyn std::error::Error>>(())
+//! ```
 #![forbid(unsafe_code)]
 
 mod blocks;

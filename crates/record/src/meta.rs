@@ -80,8 +80,8 @@ pub struct RunEnd {
     /// Rows on the disk. Set by [`crate::RunWriter::finish`].
     #[serde(default)]
     pub rows: u64,
-    /// Rows that are not on the disk: those lost on the way to the writer, to which [`crate::RunWriter::finish`] adds those
-    /// that could not be written or do not read back.
+    /// Rows that are not on the disk: those lost on the way to the writer. [`crate::RunWriter::finish`] adds those that could not
+    /// be written or read back.
     #[serde(default)]
     pub rows_lost: u64,
     /// Events that could not be written. Set by [`crate::RunWriter::finish`].
@@ -131,7 +131,7 @@ pub struct RunMeta {
     /// Versions of program and system.
     #[serde(default)]
     pub versions: BTreeMap<String, String>,
-    /// The groups of columns that the run has beside [`Group::Loop`]; all by default.
+    /// The groups of columns in addition to [`Group::Loop`]; all by default.
     #[serde(default = "all_groups")]
     pub columns: Vec<Group>,
     /// Names of the control law's own columns, in the order of [`cellpos_runtime::TickRecord::law`].

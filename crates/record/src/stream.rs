@@ -1,8 +1,8 @@
 //! A tolerant reader of `ticks.arrow`.
 //!
-//! The format is Arrow's IPC stream, which any Arrow library reads when it is whole. This reader takes the messages
-//! apart itself, because a file cut off in the middle of a message, or damaged, must give every row around the damage
-//! and must never panic or ask for absurd memory: every length is checked against the file before it is believed.
+//! The format is Arrow's IPC stream, which any Arrow library reads when it is whole. This reader parses the messages itself. A
+//! file that is truncated or damaged must give every row around the damage, without a panic and without absurd memory. So every
+//! length is checked against the file first.
 
 use crate::columns::{CHECK, COLUMNS, Column, Kind};
 use arrow_ipc::{MessageHeader, Type, root_as_message};

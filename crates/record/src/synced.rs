@@ -1,7 +1,7 @@
 //! A file whose syncs wait on a separate thread, so that a slow disk never holds the recorder.
 //!
-//! How long the disk leaves what was written unconfirmed is asked for ([`SyncedFile::unconfirmed`]); whether that is too long is
-//! for the run to say ([`cellpos_runtime::recorder::Unconfirmed`]), which also has the argument.
+//! [`SyncedFile::unconfirmed`] tells how long the disk has not confirmed a write. The run decides whether that is too long
+//! ([`cellpos_runtime::recorder::Unconfirmed`]), which also has the argument.
 
 use crate::blocks::Sink;
 use std::fs::File;

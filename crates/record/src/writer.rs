@@ -56,7 +56,7 @@ pub struct Finished {
     pub slowest_sync: Option<Duration>,
     /// Whether `run.toml` has the end of the run.
     pub closed: bool,
-    /// Why there is no `ticks.parquet`, if there is none.
+    /// Why `ticks.parquet` is missing, if it is.
     pub parquet: Result<(), RecordError>,
 }
 

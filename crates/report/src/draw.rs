@@ -13,8 +13,8 @@ impl Figure {
     }
 }
 
-/// The figure in a page: as wide as a screen has room for, and for a narrow one once more, its panels below each other and its
-/// letters as large as ever. A heat map has its numbers in a row: there it is moved sideways.
+/// The figure in a page: as wide as the screen. For narrow screens there is a second copy with the panels below each other and
+/// letters of the same size. A heat map has its numbers in a row: there it is moved sideways.
 pub(crate) fn in_page(shown: &Figure) -> String {
     let wide = figure(shown, false, WIDTH_PX);
     match &shown.content {

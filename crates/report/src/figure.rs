@@ -103,7 +103,7 @@ pub struct HeatMap {
 }
 
 impl HeatMap {
-    /// `values` row by row, `rows.len() * columns.len()` of them; missing values and NaN are left blank. `label` names
+    /// `rows.len() * columns.len()` `values`, row by row; missing values and NaN stay blank. `label` names
     /// the quantity and its unit. Values of both signs are coloured from blue over white to orange, about zero; values
     /// of one sign from pale to dark.
     pub fn new<R: AsRef<str>, C: AsRef<str>>(

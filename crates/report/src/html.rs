@@ -374,7 +374,7 @@ impl Report {
         write_file(path, &self.to_html())
     }
 
-    /// As [`Report::write`], and every figure beside it: `report.html` gets a folder `report-figures` with
+    /// As [`Report::write`], with every figure as a file: `report.html` gets a folder `report-figures` with
     /// `NAME.svg` and `NAME.csv`.
     ///
     /// # Errors

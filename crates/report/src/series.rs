@@ -1,6 +1,6 @@
 //! What is drawn in a panel: lines, steps, points, bands, bars.
 
-/// How a series is drawn, with its data beside `x`.
+/// How a series is drawn, with its data other than `x`.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Kind {
     /// Straight lines between neighbours; a value that is not finite breaks the line.

@@ -4,6 +4,12 @@
 //! a simulated clock, [`replay`] on a record; all three give the same bits for the same inputs. A tick never waits,
 //! allocates, locks, formats or logs. A full ring refuses, and the refusal is counted.
 //!
+//! - [`Core`] steps once per tick, from [`TickInput`] to [`TickOutput`]; [`Timing`] has its limits.
+//! - [`RunSink`] receives a [`TickRecord`] per tick, an [`Event`] per incident, and the [`Summary`] at the end.
+//! - [`Life`], [`Request`] and [`SafeReason`]: states of a run, the operator's wishes, and why it went Safe.
+//! - [`ReferenceGenerator`]: where the bead shall be. [`EndRule`]: when the run is over.
+//! - [`realtime`] asks for priority and locked memory; [`latency`] measures wake-ups.
+//!
 //! Ticks follow the clock's grid, whatever the frames do:
 //!
 //! ```

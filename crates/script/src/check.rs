@@ -1,6 +1,6 @@
 //! A plan against a model and limits, before anything moves.
 //!
-//! The PZT displacement that a plan asks for is that of the exact inverse of the model's plant under a zero-order hold
+//! The PZT displacement of a plan comes from the exact inverse of the model's plant under a zero-order hold
 //! (strictly proper form, minimum phase): u_k is solved from y_(k+1). A reserve covers noise, drift and a wrong gain.
 
 use crate::error::ScriptError;

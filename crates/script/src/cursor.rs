@@ -11,8 +11,8 @@ pub struct Seen {
     pub position_um: Option<f64>,
     /// Measured length of the cell, um; None: not seen, or a bead.
     pub length_um: Option<f64>,
-    /// Measured position less the reference of the time at which it was measured, um; None: the reference of now is
-    /// taken, which is wrong by the camera's delay while the reference moves.
+    /// Measured position minus the reference at its exposure, um. None: the present reference counts, which is wrong by the
+    /// camera's delay while the reference moves.
     pub error_um: Option<f64>,
 }
 

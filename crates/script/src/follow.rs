@@ -12,8 +12,8 @@ const TAIL_TICKS: u32 = 25;
 
 /// Walks a loop through a plan.
 ///
-/// Before the plan's clock starts, and after a step was skipped, the bead is led to where the plan begins or continues (a
-/// minimum-jerk move of at most [`Follower::APPROACH_UM_PER_S`]) and given time to settle there. While the bead is
+/// Before the plan's clock starts, and after a skipped step, the bead moves to the place where the plan begins or continues
+/// (minimum jerk, at most [`Follower::APPROACH_UM_PER_S`]) and settles there. While the bead is
 /// frozen the plan's clock stands still, so that no cycle is lost to a pause; running time and stop conditions go on.
 #[derive(Debug, Clone)]
 pub struct Follower {

@@ -295,7 +295,7 @@ pub fn warnings<S>(finished: &Finished<S>) -> Vec<String> {
     warnings
 }
 
-/// What the user should know of the slow partner of a run that is over.
+/// Warnings about the slow partner after a run.
 fn partner_warning(summary: &Summary) -> Option<String> {
     let counts = &summary.counts;
     let part = |ticks: u64| 100.0 * ticks as f64 / counts.ticks.max(1) as f64;

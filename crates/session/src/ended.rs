@@ -59,8 +59,8 @@ impl Ended {
         )
     }
 
-    /// Whether what ended it may be over by now, as a stall of this machine or of the line is: another run may go well, and
-    /// nobody need do anything for it. A bead that is lost or a board in the hands of another program is not that.
+    /// Whether the cause may be over by now, as a stall of this machine or of the line: another run may then succeed without a
+    /// person's action. A bead that is lost or a board in the hands of another program is not that.
     pub fn may_pass(&self) -> bool {
         self.refusal == Some(Refusal::Disturbed)
             || matches!(

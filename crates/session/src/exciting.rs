@@ -1,4 +1,4 @@
-//! An excitation on top of a held bead: what a run of an identification plays.
+//! An excitation on top of a held bead, for a run of an identification.
 
 use cellpos_ident::experiment::{Plan, Turn};
 use cellpos_runtime::{ReferenceGenerator, ReferenceInput, ReferenceOutput, Stage};
@@ -6,13 +6,13 @@ use cellpos_runtime::{ReferenceGenerator, ReferenceInput, ReferenceOutput, Stage
 /// Ticks at rest between closing the loop and the first segment.
 pub const SETTLE_TICKS: usize = 500;
 
-/// Ticks at rest behind the last segment: what the excitation has left is made good and the zero-flow displacement is known
-/// again before the bead is frozen there.
+/// Ticks at rest after the last segment: the effect of the excitation decays and zero flow is known again before the bead is
+/// frozen there.
 pub const REST_TICKS: usize = 400;
 
 /// Holds the bead at 0 um and plays the excitation, counted from where the loop was closed.
 ///
-/// A segment in which the bead is frozen is spoilt; what is left of it is not played. The bead that is found again is caught
+/// A segment in which the bead is frozen is invalid; its rest is not played. The bead that is found again is caught
 /// by a loop at rest, not by one that is being shaken, and the next segment begins from there.
 #[derive(Debug, Clone)]
 pub struct Exciting {

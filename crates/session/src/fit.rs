@@ -1,4 +1,4 @@
-//! A controller fitted to a rig: its limits, what the camera sees, how long a frame is exposed and how often one comes.
+//! A controller adapted to a rig: limits, field of view, exposure and frame rate.
 
 use crate::Failure;
 use crate::prepared::Prepared;
@@ -8,8 +8,8 @@ use cellpos_control::ControllerKind;
 use cellpos_plant::Model;
 use cellpos_plant::effects::Action;
 
-/// Narrows the controller's limits to what rig file and board allow, and the positions that MPC plans for to what the
-/// camera sees; tells the estimator how long a frame is exposed and how often one comes.
+/// Narrows the controller's limits to those of rig file and board, and MPC's positions to the field of view. Passes exposure and
+/// frame rate to the estimator.
 pub(crate) fn narrow(setup: &mut Prepared, file: &RigFile, rig: &Connected) {
     let board = rig.actuator.info();
     let own = setup.controller.limits;

@@ -11,6 +11,9 @@
 //! at the end. Real-time rights and locked memory end with the run. A program calls [`signals::listen`] first; then Ctrl-C
 //! freezes and parks.
 //!
+//! [`RigFile`] is rig.toml. [`setup`] joins model, controller and reference; [`recording`] makes the run folder; [`view`] serves the
+//! live page. [`Ended`] and [`EndKind`] say how a run ended, [`Failure`] why a call was refused.
+//!
 //! ```
 //! use cellpos_runtime::{EndRule, NoSink};
 //! use cellpos_session::setup::ReferenceSpec;

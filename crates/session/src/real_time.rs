@@ -1,9 +1,9 @@
 //! Real-time rights that end with the run they were asked for.
 //!
-//! The loop's threads ask for SCHED_FIFO themselves ([`cellpos_runtime::realtime`]) and end with the run; the thread that
-//! drives the board is made for the run too, so that the caller's own thread is never touched, and neither is anything that
-//! the caller starts later (Parquet, a search, a second run). Locked memory belongs to the process: it is locked before
-//! the board is armed, since locking a large process takes its time, and let go when the run is over.
+//! The loop's threads ask for SCHED_FIFO themselves ([`cellpos_runtime::realtime`]) and end with the run; the thread that drives
+//! the board exists for the run only, too. So the caller's thread and its later work (Parquet, a search, a second run) are never
+//! changed. Locked memory belongs to the process: it is locked before the board is armed, because that takes time for a large
+//! process, and released after the run.
 
 use rustix::mm::{MlockAllFlags, mlockall, munlockall};
 use std::sync::{Mutex, PoisonError};

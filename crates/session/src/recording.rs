@@ -14,7 +14,7 @@ pub struct Recording {
     writer: Option<RunWriter>,
     line: Option<LiveLine>,
     late: u64,
-    /// Target of the last tick, um, of a run whose operator may set it; and what the page is still to be told of it.
+    /// Target of the last tick, um, if the operator may set it, and whether the page must still be informed.
     steered: Option<f64>,
     told: VecDeque<EventLine>,
 }

@@ -136,8 +136,8 @@ impl Rig {
         Ok(prepared)
     }
 
-    /// Narrows a controller's limits to what rig file and board allow, and the positions that it plans for to what the camera
-    /// sees; tells the estimator how long a frame is exposed, and the tracker which plant to expect.
+    /// Narrows a controller's limits to those of rig file and board, and its planned positions to the field of view. Passes the
+    /// exposure to the estimator and the plant to the tracker.
     pub fn fit(&self, prepared: &mut Prepared) {
         self.devices.connected.expect(&prepared.model);
         fit::narrow(prepared, &self.file, &self.devices.connected);

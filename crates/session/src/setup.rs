@@ -67,7 +67,7 @@ pub enum ReferenceSpec {
     Excitation {
         /// The segments planned.
         plan: cellpos_ident::experiment::Plan,
-        /// Those of them that are played, in order.
+        /// The segments to play, in order.
         todo: Vec<Turn>,
     },
 }
@@ -341,8 +341,8 @@ impl Setup {
     }
 }
 
-/// The loop delay of a rig, s: its camera path (`camera_delay_ms`: from the middle of an exposure to the tick that uses it)
-/// and half a period of hold. The one definition: controllers are designed for it, and a run measures it.
+/// The loop delay of a rig, s: its camera path (`camera_delay_ms`, from the middle of an exposure to its tick) and half a period
+/// of hold. The one definition: controllers are designed for it, and a run measures it.
 pub fn loop_delay_s(timing: &Timing) -> f64 {
     timing.camera_delay_ms * 1e-3 + 0.5e-6 * timing.period_us
 }

@@ -10,8 +10,8 @@
 //! | PIPE | nothing: the write fails, the run goes on | the write fails |
 //! | HUP, inherited ignored (`nohup`) | nothing | nothing |
 //!
-//! A session registers before it arms the board and leaves when the board is parked; between the two there is no instant
-//! in which a signal ends the program with the board armed. Once a stop was asked for, nothing is armed any more.
+//! A session registers before it arms the board and leaves after the board is parked. In between no signal can end the program
+//! with the board armed. Once a stop was asked for, nothing is armed any more.
 
 use crate::say::say;
 use cellpos_runtime::Request;

@@ -1,7 +1,25 @@
-//! Bead position, covariance and verdict from a camera frame.
+//! From a camera frame to position, covariance and verdict of a bead or a cell.
 //!
-//! Pixel coordinates are 0-based with pixel centres at whole numbers, x along the row. Work per frame uses
-//! buffers that exist already and allocates nothing. Not for devices or files: frames come in as slices.
+//! - [`Frame`] borrows grey values. Pixel coordinates are 0-based with pixel centres at whole numbers, x along the row.
+//! - [`Localiser`] fits a [`Template`] and returns a [`Fix`]; [`LocaliserConfig`] has its settings.
+//! - [`Tracker`] keeps one bead from frame to frame, [`CellTracker`] one cell; [`ManyTracker`] follows all beads of a recording.
+//! - [`Detector`] and [`Blobs`] find objects in a whole frame; [`CellFinder`] finds cells against the empty channel.
+//! - [`suggest`] learns the profile and the settings from a recording.
+//!
+//! Work per frame uses existing buffers and allocates nothing. Devices and files are elsewhere: frames come in as slices.
+//!
+//! ```
+//! use cellpos_vision::{FixQuality, Frame, Localiser, LocaliserConfig, Pixels, ProfileSpec};
+//! let (width, height) = (64, 48);
+//! let config = LocaliserConfig::new(ProfileSpec::Gaussian { sigma_px: 2.0 });
+//! // A bead at (30.25, 20.5) px, 80 grey levels on a background of 100, with a pattern of one grey level as noise.
+//! let mut image: Vec<f32> = (0..width * height).map(|k| 100.0 + (k * k % 7 % 3) as f32 - 1.0).collect();
+//! config.template().unwrap().draw(&mut image, width, 30.25, 20.5, 80.0);
+//! let pixels: Vec<u8> = image.iter().map(|grey| grey.round() as u8).collect();
+//! let fix = Localiser::new(config).unwrap().locate(&Frame { width, height, pixels: Pixels::Mono8(&pixels) }, None);
+//! assert_eq!(fix.verdict, FixQuality::Good);
+//! assert!((fix.x_px - 30.25).abs() < 0.1 && (fix.y_px - 20.5).abs() < 0.1);
+//! ```
 #![forbid(unsafe_code)]
 
 mod beyond;

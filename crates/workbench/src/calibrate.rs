@@ -2,8 +2,8 @@
 //!
 //! The PZT sets the bead's velocity, v = K (x1 - neutral): pulses to both sides move it to and fro. The part of its motion that
 //! correlates with the pulses is a vector in the picture, independent of drift and Brownian motion. Its direction is axis, sign and
-//! tilt. Its length is K in pixels: with a pixel size from elsewhere it is compared with the model, so that a pixel size that is
-//! wrong by a factor is noticed.
+//! tilt. Its length is K in pixels. If the pixel size is known, it is compared with the model, so a pixel size that is wrong by a
+//! factor is noticed.
 
 use crate::bench::Bench;
 use crate::mover::Mover;
@@ -203,7 +203,7 @@ fn pulse(
 ) -> Result<Commanded, Failure> {
     let clock = Clock::Real;
     let (centre_um, a_um) = (mover.at_um(), pulses.amplitude_um);
-    // Nothing moves until a bead is well in view: one at the border would be out of it with the first pulse.
+    // Nothing moves until a bead is well in view: a bead at the border would leave the picture with the first pulse.
     for step in 0..FIND_MS {
         mover.step(centre_um, f64::INFINITY)?;
         watch.glance()?;
@@ -263,8 +263,8 @@ fn mean_offset(commands: &[(i64, f64)], from_ns: i64, to_ns: i64) -> f64 {
     sum / (to_ns - from_ns) as f64
 }
 
-/// Velocity against offset, by least squares with a constant for drift and for where zero flow is; the lag that leaves the
-/// least unexplained. (The slope is no guide: pulses averaged over a wrong lag are smaller, and so is what goes with them.)
+/// Velocity against offset, by least squares with a constant for drift and zero flow, at the lag with the smallest residual. (The
+/// slope does not show the lag: averaged over a wrong lag, pulses and responses both shrink.)
 fn fit(commands: &[(i64, f64)], sightings: &[Sighting], size_px: [usize; 2]) -> Option<Response> {
     const LONGEST_GAP_NS: i64 = 20_000_000;
     let mut sorted = sightings.to_vec();

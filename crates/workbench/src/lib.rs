@@ -1,8 +1,23 @@
-//! Work at the bench, before the loop is closed: check a rig file against its devices, test the board's line, move the PZT by
-//! hand, take pictures and recordings, find the settings of vision, calibrate.
+//! Work at the bench, before the loop is closed. Each task opens the devices of a rig file without a tracker ([`Bench`]) and
+//! leaves the board parked.
 //!
-//! Each task opens the devices of a rig file without a tracker ([`Bench`]) and leaves the board parked. Closed loops are in
-//! `cellpos-session`.
+//! - [`template`] writes a commented rig file, [`check`] compares one with itself and with its devices.
+//! - [`line_test`] measures the line to the board; [`mover`] moves the PZT by hand.
+//! - [`snapshot`] takes a picture, [`capture`] records frames, [`sight`] measures the noise of a position.
+//! - [`beads`] finds the look of the beads, [`calibrate`] axis, sign and scale; [`partner`] the slow actuator.
+//! - [`prove`] tests board, camera and vision line by line.
+//!
+//! Closed loops are in `cellpos-session`.
+//!
+//! ```
+//! use cellpos_session::RigFile;
+//! use cellpos_workbench::check::findings;
+//! // The emulated rig fits together. A camera that delivers after a frame is too old does not.
+//! let mut file = RigFile::default();
+//! assert!(findings(&file, "rig.toml".as_ref()).is_empty());
+//! file.timing.oldest_ms = 0.5;
+//! assert!(findings(&file, "rig.toml".as_ref()).iter().any(|finding| finding.key == "timing.oldest_ms"));
+//! ```
 #![forbid(unsafe_code)]
 
 pub mod beads;

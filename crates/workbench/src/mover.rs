@@ -93,8 +93,8 @@ impl Mover {
         &self.newest
     }
 
-    /// A millisecond: waits for its beginning, steps towards `to_um` by at most `speed_um_per_s`, and reads what the board
-    /// says. Whether it is there.
+    /// A millisecond: waits for its beginning, steps towards `to_um` by at most `speed_um_per_s`, and reads the board's messages.
+    /// Whether it is there.
     ///
     /// # Errors
     /// A displacement outside the limits, a signal to end, a broken line, or a board that is safe or belongs to another host.

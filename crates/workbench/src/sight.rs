@@ -77,8 +77,8 @@ impl Sight {
     }
 }
 
-/// Noise of a position from frames that follow each other: noise makes successive steps oppose each other, a free bead's motion
-/// does not, and the blur of the exposure makes them agree, so that this is a lower bound. `None` below twice its uncertainty.
+/// Noise of a position from successive frames. Noise makes successive steps opposite, free motion does not. The blur of the
+/// exposure makes them alike, so this is a lower bound. `None` below twice its uncertainty.
 fn noise_px(places: &[(u64, Option<f64>)]) -> Option<f64> {
     let steps: Vec<(f64, f64)> = places
         .windows(3)

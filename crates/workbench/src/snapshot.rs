@@ -267,8 +267,8 @@ pub fn line_spacing(path: &Path) -> Result<(f64, f64), Failure> {
         })
 }
 
-/// Spacing of what repeats in a profile, and its standard deviation: the places of the lines (centroids of what is darker, or
-/// brighter, than the middle) against their numbers.
+/// Spacing of the lines of a profile, and its standard deviation: a fit of the lines' places (centroids of the pixels darker or
+/// brighter than the middle) against their numbers.
 fn spacing(profile: &[f64]) -> Option<(f64, f64)> {
     let n = profile.len() as f64;
     let mean = profile.iter().sum::<f64>() / n;

@@ -8,8 +8,8 @@ use std::fmt::Write as _;
 use std::io;
 use std::path::Path;
 
-/// The text of a record's table: the file itself, or what stands in a `.npy` or `.mat` file. In the former columns have numbers
-/// (rows are samples), in the latter names: those of the variables, `NAME_1`, `NAME_2`, ... where one has several columns.
+/// The text of a record's table: the file itself, or the content of a `.npy` or `.mat` file. In the former columns have numbers
+/// (rows are samples), in the latter names: those of the variables, or `NAME_1`, `NAME_2`, ... for a variable with several columns.
 ///
 /// # Errors
 /// [`io::Error`] with a sentence.

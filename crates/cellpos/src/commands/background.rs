@@ -143,7 +143,7 @@ mod tests {
     use super::*;
     use serde_json::Value;
 
-    /// What is printed with `--json` is what its schema says (the other commands are run for theirs; this one needs a camera).
+    /// The output of `--json` follows its schema (tested here, because this command needs a camera).
     #[test]
     fn the_object_fits_its_schema() {
         let taken = Taken {

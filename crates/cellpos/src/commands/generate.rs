@@ -33,7 +33,7 @@ pub(crate) fn run(args: Args) -> CommandResult {
             .map_err(|error| refused(&completions, &error))?;
         files.push(path);
     }
-    // (A command of its own: what completions were made of has `help` and its commands in it, each of which would get a page.)
+    // (Built again: the command line for completions contains `help` and its commands, which would each get a page.)
     let mut command = crate::command_line().disable_help_subcommand(true);
     command.build();
     manual(&command, &man, &mut files).map_err(|error| refused(&man, &error))?;
@@ -46,7 +46,7 @@ pub(crate) fn run(args: Args) -> CommandResult {
     Ok(Outcome::Done)
 }
 
-/// Writes the pages of a command and its subcommands; `files` is told of each.
+/// Writes the pages of a command and its subcommands; adds each to `files`.
 fn manual(command: &clap::Command, to: &Path, files: &mut Vec<PathBuf>) -> std::io::Result<()> {
     files.push(clap_mangen::Man::new(command.clone()).generate_to(to)?);
     for one in command.get_subcommands().filter(|one| !one.is_hide_set()) {

@@ -57,8 +57,8 @@ impl Sheet {
         }
     }
 
-    /// Takes the frame `n` if it is one of the sheet's; marks are (number, x, y, radius, good), px; what was refused and
-    /// never numbered has none.
+    /// Takes the frame `n` if it is one of the sheet's; marks are (number, x, y, radius, good), px; a refused object without a
+    /// number has none.
     pub(super) fn add(
         &mut self,
         n: usize,

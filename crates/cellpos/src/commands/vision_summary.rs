@@ -1,4 +1,4 @@
-//! What `cellpos vision` counts, and the figures it draws from them.
+//! Counts of `cellpos vision`, and the figures drawn from them.
 
 use super::vision::Advice;
 use cellpos_drivers::CalibrationFile;

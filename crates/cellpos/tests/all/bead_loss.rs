@@ -180,7 +180,7 @@ fn a_bead_that_never_returns_ends_in_freeze_and_then_in_safe() {
         (safe_ms - lost_ms - 1000.0).abs() <= 1.5,
         "{lost_ms} {safe_ms}"
     );
-    // Frozen means that the PZT stands at neutral, so that the bead all but stops: it drifts and diffuses, no more.
+    // Frozen means that the PZT is at zero flow: the bead only drifts and diffuses.
     let at = |ms: f64| &run.ticks[ms as usize];
     let frozen = &run.ticks[freeze_ms as usize + 20..safe_ms as usize - 2];
     for tick in frozen {

@@ -241,7 +241,7 @@ fn frames_that_came_without_a_fix_are_no_dropped_frames() {
     assert_eq!(r["effects"].as_array().unwrap().len(), 0, "{r}");
     let words = r["where"].to_string();
     assert!(words.contains("best of the catalogue is time-delay"), "{r}");
-    // The noise of this rig stated, the delay is named, and nothing beside it.
+    // The noise of this rig stated, the delay is named, and nothing else.
     let quiet = Model {
         working_point_um: 20.0,
         noise: Noise {
@@ -276,7 +276,7 @@ fn what_identify_writes_reconcile_reads_and_what_that_writes_the_others_read() {
         ),
     )
     .json();
-    // The delay is in the model already: what is found of it is a correction, and is added, not counted twice.
+    // The delay is in the model already: the found one is a correction, and is added, not counted twice.
     let augmented = Model::load_file(&folder.path().join("a.toml")).unwrap();
     assert_eq!(augmented.camera_delay_s, None);
     let delays: Vec<_> = augmented

@@ -60,7 +60,7 @@ fn the_error_of_a_moving_bead_is_the_same_in_the_summary_and_in_the_exports() {
         (exported_nm / stated_nm - 1.0).abs() < 1e-2,
         "{exported_nm} exported, {stated_nm} stated"
     );
-    // The reference goes on by up to 1.2 um while a frame is on its way: what a row's own reference gives is another number.
+    // The reference moves by up to 1.2 um while a frame is on its way, so the reference of the row gives another number.
     let at_tick = bead_um.iter().zip(&target_um).map(|(b, t)| b - t);
     let apart = at_tick
         .zip(&error_um)

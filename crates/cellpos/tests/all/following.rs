@@ -1,4 +1,5 @@
-//! What a loop cannot follow is said before anything moves: `cellpos run` with a script, `track` with a rig that does not fit.
+//! A motion that the loop cannot follow is reported before anything moves: `cellpos run` with a script, `track` with a rig that
+//! does not fit.
 
 use crate::common::{cellpos, number, succeed};
 

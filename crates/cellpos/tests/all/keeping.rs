@@ -98,7 +98,7 @@ fn equal_pictures_are_no_frames_and_no_success() {
     assert_eq!(long.json["safe_reason"], "stale-frames", "{}", long.json);
     let frozen = long.events.iter().find(|e| e["event"] == "freeze-started");
     assert_eq!(frozen.unwrap()["data"]["reason"], "picture-frozen");
-    // From the third equal picture on nothing is asked of the PZT but to stand at the zero flow.
+    // From the third equal picture on the PZT stays at zero flow.
     let from = long
         .ticks
         .iter()

@@ -27,10 +27,10 @@ fn script(folder: &Path) {
     std::fs::write(folder.join("quick.toml"), text).unwrap();
 }
 
-/// What a program that is killed while it writes leaves behind.
+/// The remains of a program that is killed while it writes.
 const HALF_MADE: &str = ".ticks.parquet.1.part";
 
-/// Makes a run what a kill leaves: no end, and the beginning of its records.
+/// Turns a run into the remains of a kill: no end, and the beginning of its records.
 fn killed(run: &Path, share: f64) {
     let meta = std::fs::read_to_string(run.join("run.toml")).unwrap();
     std::fs::write(run.join("run.toml"), &meta[..meta.find("[end]").unwrap()]).unwrap();
@@ -59,7 +59,7 @@ fn lines(path: &Path) -> u64 {
     std::fs::read_to_string(path).unwrap().lines().count() as u64
 }
 
-/// The CSV has the control law's own columns, and docs/data.md says what they are.
+/// The CSV has the control law's own columns, and docs/data.md describes them.
 fn has_the_laws_columns(kind: &str, run: &Path, csv: &Path) {
     let text = std::fs::read_to_string(csv).unwrap();
     let head: Vec<&str> = text.lines().next().unwrap().split(',').collect();
@@ -110,7 +110,7 @@ fn compared(at: &Path, kind: &str, run: &Path) {
     let said = ran.json();
     let fits = matches!(ran.code, Some(0 | 1)) || !said["error"]["message"].is_null();
     assert!(fits && !ran.err.contains("panicked"), "{kind}: {}", ran.err);
-    // The CSV of the run says the same: where the loop was closed, and in which session, stands in it.
+    // The CSV of the run says the same: it shows where the loop was closed, and in which session.
     let of_csv = cellpos(at, &format!("identify --data {path}.csv --json"));
     let without_names = |object: Value| -> Vec<Value> {
         let mut files = object["files"].as_array().cloned().unwrap_or_default();

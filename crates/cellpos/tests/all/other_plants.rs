@@ -109,7 +109,7 @@ fn a_heater_goes_from_its_logger_through_identify_simulate_and_reconcile_and_bac
         );
         assert!(!said.contains(" um"), "{said}");
     }
-    // What reconcile has written the others read.
+    // The other commands read the files of reconcile.
     let again = [
         "simulate",
         "--model",
@@ -205,7 +205,7 @@ fn what_cannot_be_read_says_what_would_be_right() {
     fails(&both, &["--model"]);
 }
 
-/// A fan: its speed goes with the square of the voltage, behind a lag of half a second; levels, the whole twice.
+/// A fan: its speed varies with the square of the voltage, with a lag of half a second. Levels, all twice.
 fn fan(rows: usize) -> String {
     let volts = |k: usize| 5.5 + 4.5 * chance(k % (rows / 2) / 40);
     let mut rpm = 900.0;
@@ -243,7 +243,7 @@ fn a_fan_whose_speed_goes_with_the_square_gets_no_name_and_then_its_own() {
     assert_eq!(found["verdict"], "unknown", "{found}");
     let formula = found["hypothesis"]["formula"].as_str().unwrap();
     assert!(formula.contains("[1/V] d^2"), "{formula}");
-    // What it proposes, run again as it is, is a name.
+    // Its proposal, run again unchanged, gives a name.
     let again = [
         &args[..],
         &["--effects", "fan.effects.toml", "--max-effects", "1"],

@@ -14,7 +14,7 @@ fn held(folder: &Path, options: &str) -> PathBuf {
     runs.next().unwrap().path()
 }
 
-/// What a replay says as text and as JSON; both end alike.
+/// Result of a replay as text and as JSON; both end with the same code.
 fn replay(folder: &Path, run: &Path) -> (Ran, Ran) {
     let line = format!("replay {}", run.display());
     let (text, json) = (

@@ -1,4 +1,4 @@
-//! A run on the whole terminal: what it shows, that its keys act, and that the terminal is given back on every way out.
+//! A run on the whole terminal: its display, its keys, and the release of the terminal on every way out.
 
 use rustix::fs::OFlags;
 use rustix::termios::{self, LocalModes, Winsize};
@@ -19,7 +19,7 @@ const PATIENCE: Duration = Duration::from_secs(60);
 const TAKEN: &str = "\x1b[?1049h";
 const GIVEN: &str = "\x1b[?1049l";
 
-/// `cellpos` on a terminal of its own, which it may take for its controlling one.
+/// `cellpos` on a separate terminal, which may become its controlling terminal.
 struct OnTerminal {
     child: Child,
     keys: TTYPort,
@@ -36,7 +36,7 @@ impl OnTerminal {
             OpenOptions::new()
                 .read(true)
                 .write(true)
-                // The test's own terminal stays what it is.
+                // The test's own terminal stays unchanged.
                 .custom_flags(OFlags::NOCTTY.bits().cast_signed())
                 .open(slave.name().unwrap())
                 .unwrap()
@@ -179,7 +179,7 @@ fn a_run_fills_the_terminal_takes_keys_refuses_to_be_stopped_and_gives_the_termi
     run.press("\r");
     run.press("f");
     run.wait_for("FROZEN");
-    // Ctrl-Z: a stopped program cannot hold a bead, and the picture goes on.
+    // Ctrl-Z: a stopped program cannot hold a bead, and the picture continues.
     run.press("\x1a");
     run.wait_for("SIGTSTP: refused");
     run.press("f");

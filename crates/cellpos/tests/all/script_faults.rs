@@ -46,7 +46,7 @@ fn killed_and_resumed(folder: &Path, cycles: u32, most: u32, extra: &[&str]) -> 
         }
         let out = child.wait_with_output().unwrap();
         if run.is_none() && folder.join("runs").exists() {
-            // A first session that was killed before it had a table is begun anew.
+            // A first session that was killed before it had a table starts again.
             let first = only_run(folder);
             if first.join("cycles.csv").exists() {
                 run = Some(first);
@@ -189,7 +189,7 @@ fn a_full_disk_parks_the_rig_and_every_row_that_is_lost_is_said() {
     assert_eq!(result["summary"]["records_lost"], lost, "{result}");
 }
 
-/// A rig on which everything goes wrong again and again, and a controller whose optimiser is part of it.
+/// A rig with every fault, again and again, and a controller whose optimiser fails, too.
 fn write_night(folder: &Path, cycles: u32) {
     let mut rig = String::from(
         "[timing]\nfaults_in_a_row = 50\n[emulator]\nseed = 11\n[emulator.faults]\ndrop_rate = 0.002\nstale_rate = 0.001\n\

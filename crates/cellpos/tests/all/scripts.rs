@@ -4,7 +4,7 @@ use crate::script_runs::*;
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 
-/// The check and a rehearsal of an example, from a folder of its own: the run's folder.
+/// The check and a rehearsal of an example, from a separate folder: the run's folder.
 fn rehearsed(folder: &Path, script: &Path) -> PathBuf {
     let name = script.file_stem().unwrap().to_str().unwrap();
     let path = script.to_str().unwrap();
@@ -26,7 +26,7 @@ fn rehearsed(folder: &Path, script: &Path) -> PathBuf {
     assert_eq!(run["outcome"], "done", "{name}");
     let done = run["cycles_done"].as_u64().unwrap();
     let expected = match name {
-        // It stops by itself after ten minutes of 0.8 s cycles.
+        // It stops after ten minutes of 0.8 s cycles.
         "heartbeat" => 750,
         _ => check["cycles"].as_u64().unwrap(),
     };
@@ -64,7 +64,7 @@ fn example(name: &str) -> PathBuf {
     found.unwrap_or_else(|| panic!("no example {name}"))
 }
 
-/// The long ones have tests of their own.
+/// The long ones have separate tests.
 const LONG: [&str; 2] = ["fatigue.toml", "heartbeat.toml"];
 
 #[test]
@@ -116,7 +116,7 @@ fn replays_and_simulates(folder: &Path, run: &str) {
     );
 }
 
-/// What is hidden in the emulated cell is what the report finds, within 5 %, and nothing in the static arm.
+/// The report finds the emulated cell's hidden trends within 5 %, and none in the static arm.
 fn trends_of_the_cell(report: &Value) {
     let of = |quantity: &str, arm: &str| {
         let trends = report["trends"].as_array().unwrap();
@@ -128,7 +128,7 @@ fn trends_of_the_cell(report: &Value) {
     for (quantity, first, last) in [
         ("stretch", 3.80, 2.86),
         ("recovery time", 0.16, 0.37),
-        // The cell keeps its volume: its area goes with the root of its length.
+        // The cell keeps its volume: its area varies with the root of its length.
         ("areal stretch", 3.80f64.sqrt(), 2.86f64.sqrt()),
     ] {
         let found = of(quantity, "cyclic").unwrap();

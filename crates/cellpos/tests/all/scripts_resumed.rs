@@ -40,7 +40,7 @@ fn learning_takes_the_error_of_a_script_down_and_is_gone_on_from_after_a_cut() {
     let kept = std::fs::read_to_string(folder.join("learned.toml")).unwrap();
     assert!(kept.contains("sine of 2 um at 20 Hz") && kept.contains("triangle of 1 um at 10 Hz"));
 
-    // The end of the run is cut off: what is left is what a crash leaves.
+    // The end of the run is cut off, as by a crash.
     let meta = std::fs::read_to_string(folder.join("run.toml")).unwrap();
     let end = meta.find("[end]").expect("an end");
     std::fs::write(folder.join("run.toml"), &meta[..end]).unwrap();
@@ -157,7 +157,7 @@ fn a_run_that_an_older_version_began_is_gone_on_with_and_its_table_takes_on_the_
     assert!(page.contains("column `odour` is not known"));
 }
 
-/// Makes a run what a crash leaves: no end, the first cycles of its table, and the beginning of its records.
+/// Turns a run into the remains of a crash: no end, the first cycles of its table, and the beginning of its records.
 fn crash(run: &Path, cycles: usize, share: f64) {
     let meta = std::fs::read_to_string(run.join("run.toml")).unwrap();
     std::fs::write(run.join("run.toml"), &meta[..meta.find("[end]").unwrap()]).unwrap();
@@ -207,7 +207,7 @@ fn the_time_of_a_resumed_script_is_that_of_all_its_sessions() {
     json(at, &["run", "timed.toml", "--dry", "--json"]);
     let run = only_run(at);
     assert!(ran(&run).abs_diff(5000) <= 1, "{}", ran(&run));
-    // Three seconds of waiting and one of ten cycles, and what of the next ones was on the disk.
+    // Three seconds of waiting, one of ten cycles, and the part of the next ones that was on the disk.
     crash(&run, 10, 0.85);
     let before = ran(&run);
     assert!((3500..4900).contains(&before), "{before}");
@@ -249,7 +249,7 @@ fn a_run_is_gone_on_with_from_any_folder() {
         &["run", "--resume", run.to_str().unwrap(), "--json"],
     );
     assert_eq!(numbers(&run, "cycle"), (0..40).collect::<Vec<u64>>());
-    // What went in is packed from any folder too.
+    // The inputs are packed from any folder, too.
     let bundle = json(
         &elsewhere,
         &["bundle", run.to_str().unwrap(), "--out", "packed", "--json"],

@@ -24,7 +24,7 @@ fn tell(child: &Child, signal: Signal) {
     kill_process(Pid::from_child(child), signal).unwrap();
 }
 
-/// Waits for what the child does; one that ended before it did says here why.
+/// Waits for an action of the child; if the child ends before, the reason appears here.
 fn until<T>(child: &mut Child, what: &str, mut there: impl FnMut() -> Option<T>) -> T {
     let start = Instant::now();
     loop {
@@ -231,18 +231,18 @@ fn an_identification_keeps_its_segments_as_they_end_whatever_ends_it() {
     }
 }
 
-/// A command that holds a rig, what it needs in its folder, and how to see from outside that it holds it.
+/// A command that holds a rig, the files that it needs, and a sign from outside that it holds the rig.
 struct Holding {
     line: &'static str,
     /// A file whose appearing says so, in the folder or in its run; without one, that Ctrl-Z is refused.
     sign: &'static str,
-    /// What stands in that file then.
+    /// Content of that file then.
     text: &'static str,
     /// Whether it lets go of the rig to compute in between, on the virtual clock: then a stop ends it as it ends any program.
     lets_go: bool,
 }
 
-/// Every command that holds a rig, on the clock of the machine where it has a choice.
+/// Every command that holds a rig, on the clock of the machine if it has a choice.
 const HOLDING: [Holding; 7] = [
     Holding {
         line: "track --target 0um --rig rig.toml --duration 60s --frames off --best-effort --json",
@@ -362,7 +362,7 @@ fn no_command_that_holds_a_rig_is_ended_or_stopped_by_a_signal_that_is_no_stop()
         }
         tell(&child, Signal::INT);
         let (out, _) = end(child);
-        // An orderly end of its own: by no signal, with a code that it has.
+        // An orderly end: not by a signal, with a documented exit code.
         assert!(
             matches!(out.status.code(), Some(0 | 1)) || lets_go && out.status.signal() == Some(2),
             "{line}: {:?}\n{}",
@@ -401,7 +401,7 @@ fn a_stop_in_the_first_moments_of_any_command_that_holds_a_rig_is_an_end() {
     }
 }
 
-/// A soak of a night that is ended in the morning says what it has measured.
+/// A measurement of a night that is ended in the morning prints its result.
 #[test]
 fn doctor_that_is_interrupted_says_what_it_has() {
     let folder = tempfile::tempdir().unwrap();

@@ -56,7 +56,7 @@ fn a_terminal_that_takes_no_output_stops_neither_the_loop_nor_the_recorder() {
         assert!(began.elapsed() < Duration::from_secs(60), "it is held up");
         std::thread::sleep(Duration::from_millis(20));
     }
-    // Ctrl-Q: what it has to say at its end may be said.
+    // Ctrl-Q: the last messages may appear.
     let reading = std::thread::spawn(move || {
         master.set_timeout(Duration::from_millis(100)).unwrap();
         let mut bytes = [0; 4096];

@@ -215,7 +215,7 @@ fn each_fault_ends_as_it_should_and_is_named() {
             None,
             &["\"stuck-started\"", "\"stuck-ended\""],
         ),
-        // The board holds the bead by itself, says so once the line is back, and the loop takes up again.
+        // The board holds the bead, reports it once the line is back, and the loop continues.
         case(
             "event = [{ kind = \"link-loss\", at_s = 1.0, for_s = 0.05 }]",
             None,
@@ -310,7 +310,7 @@ fn the_example_files_load() {
         folder.path(),
         "--target 0um --duration 1s --frames off --no-record --controller controller.toml --model model.toml",
     );
-    // The example rig names a port that is not there; that this is what it stumbles over shows that the file was read.
+    // The example rig names a port that is not there; an error about that port shows that the file was read.
     let rig = examples.join("rig.toml").display().to_string();
     let ran = cellpos(folder.path(), &format!("track --target 0um --rig {rig}"));
     assert_eq!(ran.code, Some(2));

@@ -212,7 +212,7 @@ fn settings_come_out_of_the_recording_and_go_into_a_rig_whose_loop_sees_the_same
             .any(|um| (um - last[column("bead_um")]).abs() < 0.02),
         "{last:?}"
     );
-    // The same settings for all beads, and a rig that does not know what its beads look like.
+    // The same settings for all beads, and a rig without a look of its beads.
     let r = succeed(root, "vision beads --rig rig.toml --out again --json").json();
     hold("vision", &r);
     assert_eq!(number(&r, "fixes"), 58.0, "{r}");
@@ -255,7 +255,7 @@ fn cells_are_measured_against_the_background() {
         assert!(row[column("sd_area_px")] > 0.0 && row[column("sd_length_px")] < 0.2);
         assert_eq!(row[column("cell")], 0.0, "the number stays with the cell");
     }
-    // The same against the empty channel recorded by itself.
+    // The same against a recording of the empty channel.
     let empty = folder.path().join("empty");
     std::fs::create_dir(&empty).unwrap();
     for n in 0..8 {

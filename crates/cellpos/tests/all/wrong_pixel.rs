@@ -1,4 +1,4 @@
-//! A calibration that is wrong is told: rehearsed on the emulated rig, whose pixels are 0.1 um.
+//! A wrong calibration is reported: rehearsed on the emulated rig, whose pixels are 0.1 um.
 
 use serde_json::Value;
 use std::process::Command;

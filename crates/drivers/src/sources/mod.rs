@@ -89,7 +89,7 @@ pub enum SourceError {
         path: PathBuf,
         /// Which frame, from 0.
         frame: usize,
-        /// What it is.
+        /// The value found.
         found: String,
         /// What would be right.
         expected: &'static str,
@@ -160,7 +160,7 @@ pub enum SourceError {
         path: PathBuf,
         /// Which key.
         key: &'static str,
-        /// What it says.
+        /// Its text.
         value: String,
         /// What would be right.
         must_be: &'static str,

@@ -1,5 +1,5 @@
-//! Datasets whose chunks are compressed by Zstandard (HDF5 filter 32015), which the HDF5 reader does not decode: it says where
-//! the chunks lie, and they are read and decoded here. Other filters: shuffle, and a checksum, which Zstandard has already.
+//! Datasets whose chunks are compressed by Zstandard (HDF5 filter 32015), which the HDF5 reader does not decode: it gives the
+//! places of the chunks, and they are read and decoded here. Other filters: shuffle, and a checksum, which Zstandard has already.
 
 use hdf5_pure::{DType, Dataset, Error};
 use std::fs::File;

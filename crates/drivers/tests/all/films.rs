@@ -1,4 +1,4 @@
-//! Films, arrays, JPEG pictures and packed TIFF pages: what was written comes back, and what is not read is told with its way out.
+//! Films, arrays, JPEG pictures and packed TIFF pages: the content comes back, and an unreadable file gets an error with a remedy.
 
 use cellpos_drivers::sources::{self, SourceError};
 use cellpos_rig::FrameBuffer;
@@ -186,7 +186,7 @@ fn jpeg_folders_and_films_without_code_tables_come_back_to_the_rounding_of_the_f
         "{}",
         most_off(&buffer, &picture)
     );
-    // The same in colour: the channels differ by what the format rounds.
+    // The same in colour: the channels differ by the rounding of the format.
     let colour = image::DynamicImage::ImageLuma8(picture.clone()).to_rgb8();
     let path = folder.path().join("colour.jpeg");
     let encoder =
@@ -196,7 +196,7 @@ fn jpeg_folders_and_films_without_code_tables_come_back_to_the_rounding_of_the_f
     let text = folder.path().join("text.jpg");
     fs::write(&text, "no picture").unwrap();
     assert!(matches!(read(&text, 0), Err(SourceError::Damaged { .. })));
-    // A film's frames have no tables of their own.
+    // A film's frames have no tables.
     let picture = smooth(width, height);
     let whole = jpeg(&picture);
     let mut bare = whole.clone();
@@ -239,7 +239,7 @@ fn other_codecs_and_other_films_are_refused_with_the_command_that_converts_them(
         let error = sources::open(&path).unwrap_err().to_string();
         assert!(error.contains(name), "{error}");
     }
-    // A film that breaks off within a frame: the frames before it are read, that one is told.
+    // A film that breaks off within a frame: the frames before it are read, that one is reported.
     let whole = avi(*b"Y800", 8, HEIGHT as i32, &[grey(0), grey(1)]);
     let path = folder.path().join("broken.avi");
     fs::write(&path, &whole[..whole.len() - 24 - 40]).unwrap();

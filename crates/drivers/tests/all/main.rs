@@ -8,7 +8,7 @@ mod recordings;
 mod rtdc;
 mod vision_source;
 
-/// Counts by thread, so that tests beside each other do not disturb one another.
+/// Counts by thread, so that parallel tests do not disturb one another.
 #[global_allocator]
 static ALLOCATOR: cellpos_counting_alloc::CountingAllocator =
     cellpos_counting_alloc::CountingAllocator;

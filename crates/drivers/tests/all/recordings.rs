@@ -1,4 +1,4 @@
-//! Readers of recordings: what was written comes back, and what is broken is told, never a panic.
+//! Readers of recordings: the content comes back; a damaged file gives an error, never a panic.
 
 use cellpos_drivers::sources::{self, Playback, Region, SourceError};
 use cellpos_rig::{Camera, CameraError, Clock, FrameBuffer};

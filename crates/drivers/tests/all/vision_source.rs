@@ -21,7 +21,7 @@ fn ring() -> ProfileSpec {
     ProfileSpec::Ring { edge_px: EDGE_PX }
 }
 
-/// Frames drawn beforehand, handed over one by one with the stamps they are given.
+/// Frames drawn in advance, delivered one by one with the given stamps.
 struct Scripted {
     frames: Vec<(FrameStamp, Vec<u8>)>,
     next: usize,
@@ -252,7 +252,7 @@ fn a_watch_sees_each_new_frame_once_with_the_place_that_the_loop_gets() {
     let mut source = source(camera, calibration);
     assert!(source.watch(Box::new(notes.clone())));
     let mut positions = all(&mut source);
-    // What came twice gives no position, and is not shown again.
+    // A doubled frame gives no position, and is not shown again.
     positions.remove(6);
     let notes = notes.0.lock().unwrap();
     assert_eq!(notes.len(), 9);

@@ -33,7 +33,7 @@ fn a_rig_that_is_not_ideal_has_the_imperfections_of_a_real_one() {
     let mean = beyond_us.iter().sum::<f64>() / beyond_us.len() as f64;
     // Exponential with a mean of 30 us: five standard deviations of the mean of a thousand.
     assert!((mean - 30.0).abs() < 5.0, "{mean} us");
-    // The exposure's own jitter of 2 us, four of it at most, is the only thing before the fastest.
+    // The exposure's own jitter of 2 us, at most four times that, is the only delay before the fastest.
     assert!(beyond_us.iter().all(|us| *us >= -8.0), "{beyond_us:?}");
     assert_eq!(
         world(&WorldConfig::real()).config().imperfections(),

@@ -10,7 +10,7 @@ use std::sync::{Arc, Mutex};
 const MS: i64 = 1_000_000;
 const SLEW_UM_PER_S: f64 = 600.0;
 
-/// The firmware's board at the end of a perfect line, and what is true of it.
+/// The firmware's board at the end of a perfect line, with its true state.
 struct Bench {
     board: Board,
     /// Reads along what reaches the board.
@@ -50,7 +50,7 @@ impl Bench {
         }
     }
 
-    /// How fast the output has gone from where it was last seen to change, less what the converter rounds.
+    /// Speed of the output since its last change, minus the rounding of the converter.
     fn look(&mut self, now_us: u64) {
         let (pm, us) = self.last;
         let moved_um = f64::from(self.board.applied_pm().abs_diff(pm)) * 1e-6;
@@ -170,7 +170,7 @@ fn send(commands: u64, faults: LineFaults, seed: u64) {
     );
 }
 
-/// A line that does all of it.
+/// A line with all faults.
 fn bad() -> LineFaults {
     LineFaults {
         stalls_per_s: 1.0,

@@ -166,7 +166,7 @@ fn scheduled_garbage_comes_each_millisecond_of_its_span_and_harms_nothing() {
         bad.push(bench.rig.board().status().bad_frames);
     }
     assert_eq!(bad[48], 0);
-    // Each burst ends in a bad frame with the next command's delimiter; zeros among its bytes can make more of it.
+    // Each burst ends in a bad frame with the next command's delimiter; zeros among its bytes can make more bad frames.
     assert!((99..200).contains(&bad[160]), "{}", bad[160]);
     assert_eq!(bad[160], bad[240], "none after the span");
     assert_eq!(bench.rig.board().state(), BoardState::Running);

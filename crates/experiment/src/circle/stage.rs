@@ -45,7 +45,7 @@ pub struct Stage {
     pub name: &'static str,
     /// Ids of the model's effects.
     pub effects: Vec<&'static str>,
-    /// Delay from the middle of an exposure to its tick that the loop is set up for, ms.
+    /// Delay from the middle of an exposure to its tick in the loop's set-up, ms.
     pub delay_ms: f64,
     /// Proportional gain of a PI, um of PZT per um of bead.
     pub kp_um_per_um: Option<f64>,
@@ -78,8 +78,8 @@ impl Stage {
     }
 }
 
-/// The model with this delay from the middle of an exposure to the tick, and no other: the delay of an average over the
-/// exposure is part of it, and its roll-off (4 % at 300 Hz for half a millisecond) lies above what a loop does.
+/// The model with this delay from the middle of an exposure to the tick as its only delay. It includes the delay of the average
+/// over the exposure; the roll-off of that average (4 % at 300 Hz for half a millisecond) is above a loop's band.
 pub fn with_delay(mut model: Model, delay_s: f64) -> Model {
     model
         .effects
@@ -87,8 +87,9 @@ pub fn with_delay(mut model: Model, delay_s: f64) -> Model {
     model.with_effect(effects::time_delay(delay_s))
 }
 
-/// The linear model that a controller can be designed on: effects without a transfer function give way to the gain that
-/// they leave to motion, the largest from the size of holding to ten times that, so that no dead zone asks for more gain.
+/// The linear model for the design of a controller. An effect without a transfer function is replaced by the gain that it leaves
+/// to motion: the largest between the amplitude of holding and ten times that, so that a dead zone does not raise the
+/// controller's gain.
 fn designable(model: &Model, sample_s: f64) -> Result<Model, Failure> {
     /// Where the two are compared, Hz: about the crossover of a loop with these delays.
     const AT_HZ: f64 = 20.0;

@@ -105,7 +105,7 @@ pub fn run_shown(
         Some(rig) => on_rig(job, rig, &plan, records, &mut heard, pages)?,
         None => held_bead(job, &plan, records, &mut heard)?,
     };
-    // What the lines were brought to is what the delay is made of.
+    // The delay is computed from the common age of the lines.
     let age_s = common_age_s(&records).unwrap_or(age_s);
     let measured = plan
         .analyse(&records, &Settings::default())
@@ -214,8 +214,8 @@ fn led_delay(job: &Job, rig: &OnRig) -> Result<Option<DelayTest>, Failure> {
     })
 }
 
-/// Runs on the rig of a rig.toml until no segment is missing or four runs in a row have measured none: again where a bead was lost for a while,
-/// or the machine or the line stalled; not where somebody has to do something first.
+/// Runs on the rig of a rig.toml until no segment is missing or four runs in a row have measured none. It runs again after a lost
+/// bead or a stall of machine or line, but not if a person must act first.
 fn on_rig(
     job: &Job,
     rig: &OnRig,
@@ -316,16 +316,14 @@ fn on_rig(
     })
 }
 
-/// Whether another run may go well without anybody's doing: a stall may be over, and where a bead was held before, the next
-/// one comes as that one did.
+/// Whether another run may succeed without a person's action: a stall may be over, and after a held bead another one may come.
 fn may_go_on(ended: &Ended, had_bead: bool) -> bool {
     let lost = ended.refusal == Some(Refusal::NoBead) || ended.reason == Some(SafeReason::BeadLost);
     ended.may_pass() || had_bead && lost
 }
 
-/// Segments that are not measured yet. One that was spoilt once may have met with a stall and is run as it is planned; spoilt
-/// more often it flings the bead out of view, by whatever makes this rig livelier than the model: at half the amplitude
-/// then, and at a quarter.
+/// Segments that are not measured yet. A segment that failed once may have met a stall: it runs again as planned. If it fails
+/// again, this rig moves the bead further than the model says: it runs at half the amplitude, then at a quarter.
 fn missing(plan: &Plan, records: &[RecordedSegment], spoilt: &[u32]) -> Vec<Turn> {
     let is_missing = |index: &usize| records.iter().all(|r| r.index != *index);
     let indices = (0..plan.segments.len()).filter(is_missing);

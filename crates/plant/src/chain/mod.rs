@@ -2,8 +2,8 @@
 //!
 //! Between two changes of the command the linear part is propagated exactly, whatever the length of the step: the
 //! plant's far zero, a driver lag and a resonance need no small steps. Hysteresis and backlash on a held command are
-//! exact as well. Where a block that is not linear follows one with dynamics (a driver lag before hysteresis, the
-//! plant before wall adhesion), sub-steps are chosen from the fastest time constant before it.
+//! exact as well. If a nonlinear block follows one with dynamics (a driver lag before hysteresis, the plant before wall
+//! adhesion), the fastest time constant before it sets the sub-steps.
 //!
 //! Not here: the camera (see [`crate::Simulator`]).
 

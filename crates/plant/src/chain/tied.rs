@@ -6,8 +6,9 @@ use crate::modal::Zpk;
 
 /// A plant with effects that see its input and its position: its input may depend on its position.
 ///
-/// Between two steps what enters is a straight line from its value at the beginning to the one expected at the end, and the
-/// plant's answer to that is exact: second order in the step, whatever the plant's poles. [`Self::longest_s`] keeps the step
+/// Between two steps the input is a straight line from its value at the beginning to the expected one at the end, and the plant's
+/// answer to it is exact. So the error is second order in the step, whatever the plant's poles. [`Self::longest_s`] keeps the
+/// step
 /// to a fifth of the fastest time constant.
 #[derive(Debug, Clone)]
 pub struct TiedPlant {

@@ -122,7 +122,7 @@ impl Candidate {
         }
     }
 
-    /// The same beside a model of the slow and one of the fast gain, see [`super::Form::anchored`].
+    /// The same for a model with the gain of slow motion and one with that of fast motion, see [`super::Form::anchored`].
     pub const fn anchored(self) -> [Self; 2] {
         [
             Self {

@@ -223,13 +223,13 @@ pub trait EffectKind: fmt::Debug + Send + Sync {
     /// The effect that candidate `index` stands for, with these values of its parameters.
     fn build(&'static self, index: usize, values: &[f64], scope: &Scope) -> Effect;
 
-    /// By how much candidate `index` delays a slow motion \[s\], if that is what it does.
+    /// Delay of a slow motion by candidate `index` \[s\], if it has that effect.
     fn lag_s(&self, index: usize, values: &[f64]) -> Option<f64> {
         let _ = (index, values);
         None
     }
 
-    /// A start of one of its candidates in the stead of what delays a slow motion by `lag_s`, where that is all that can be said of it.
+    /// A start of one of its candidates that replaces an effect known only as a delay of slow motion by `lag_s`.
     fn start_of_lag(&self, index: usize, lag_s: f64) -> Option<Vec<f64>> {
         let _ = (index, lag_s);
         None
@@ -304,8 +304,8 @@ impl Effect {
         }
     }
 
-    /// The same in a chain where one unit of the records' command and of their position count for so many micrometres: a
-    /// user-defined effect keeps its numbers, and its signals are converted to its units.
+    /// The same in a chain with the given micrometres per unit of the records' command and position. A user-defined effect keeps
+    /// its numbers; its signals are converted to its units.
     pub fn counted_in(self, per_unit: [f64; 2]) -> Self {
         Self { per_unit, ..self }
     }
@@ -315,7 +315,7 @@ impl Effect {
         self.per_unit
     }
 
-    /// What kind of effect this is.
+    /// Kind of this effect.
     pub fn kind(&self) -> &'static dyn EffectKind {
         self.kind
     }

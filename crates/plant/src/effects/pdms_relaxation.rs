@@ -16,7 +16,7 @@ pub fn pdms_relaxation(time_s: f64, strength: f64) -> Effect {
     Effect::new(&KIND, AT_REST, &[time_s, strength], &[])
 }
 
-/// The same wall beside a model whose gain is that of fast motion: the factor of [`pdms_relaxation`] over `1 + strength`.
+/// The same wall for a model whose gain is that of fast motion: the factor of [`pdms_relaxation`] over `1 + strength`.
 pub fn pdms_relaxation_of_fast_gain(time_s: f64, strength: f64) -> Effect {
     Effect::new(&KIND, AT_SPEED, &[time_s, strength], &[])
 }

@@ -63,8 +63,8 @@ pub fn curved_play(thresholds_um: &[f64], weights: &[f64], curve: Curve) -> Effe
     Effect::new(&KIND, PLAY, &scalars, &[thresholds_um, weights])
 }
 
-/// Play operators whose density falls off exponentially with the threshold, `fraction/width exp(-r/width)`, beside
-/// `1 - fraction` of the input itself: large strokes keep their gain.
+/// Play operators whose density falls off exponentially with the threshold, `fraction/width exp(-r/width)`, plus `1 - fraction`
+/// of the input: large strokes keep their gain.
 pub fn exponential_play(fraction: f64, width_um: f64) -> Effect {
     let (radii, shares) = classes();
     let thresholds: Vec<f64> = std::iter::once(0.0)

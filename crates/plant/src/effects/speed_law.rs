@@ -10,13 +10,13 @@ pub(crate) trait SpeedLaw: fmt::Debug + Clone + Send + Sync + 'static {
         jump
     }
 
-    /// How far the output goes while the input goes by `moved` in `h_s` > 0, its speed running straight from `a` to `b`.
+    /// Motion of the output while the input moves by `moved` in `h_s` > 0 with a speed that changes linearly from `a` to `b`.
     fn travel(&mut self, moved: f64, a: f64, b: f64, h_s: f64) -> f64;
 
     /// Speed of the output at a speed of the input, as things stand.
     fn speed(&self, speed: f64) -> f64;
 
-    /// What [`Block::speed`] says: the same, for laws that stop nothing.
+    /// As [`Block::speed`], for laws that stop nothing.
     fn slope(&self, speed: f64) -> f64 {
         speed
     }

@@ -1,4 +1,4 @@
-//! The reference page of the data says what the data are.
+//! The reference page of the data agrees with the data.
 
 use cellpos_record::export::columns::{COLUMNS, OF_LAWS, Value, of_law};
 use cellpos_runtime::TickFlags;

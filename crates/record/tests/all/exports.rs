@@ -45,7 +45,7 @@ fn tick(seq: u64) -> TickRecord {
     }
 }
 
-/// A run with two sessions of so many rows.
+/// A run with two sessions of the given number of rows.
 fn run(root: &Path, rows: u64) -> PathBuf {
     let session = |root: &Path, number: i64| {
         let mut meta = RunMeta::new("t", "virtual");
@@ -77,7 +77,7 @@ fn source(run: &Path) -> Source {
     sessions.into_source().unwrap()
 }
 
-/// What every form must hold: for each column the values, NaN for none; words are their numbers.
+/// Content of every form: for each column the values, NaN if missing; words as their numbers.
 fn expected(run: &Path) -> Vec<Vec<f64>> {
     let mut all: Vec<Vec<f64>> = COLUMNS.iter().map(|_| Vec::new()).collect();
     source(run)

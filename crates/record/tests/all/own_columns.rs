@@ -52,7 +52,7 @@ fn recorded_without(root: &Path, missing: &str, row: impl Fn(u64) -> TickRecord)
 fn the_error_of_a_recording_from_before_it_was_kept_is_counted_from_the_reference_at_the_exposure()
 {
     let root = tempfile::tempdir().unwrap();
-    // A reference that goes on by 0.5 um each tick; the exposure is two ticks old.
+    // A reference that moves by 0.5 um each tick; the exposure is two ticks old.
     let folder = recorded_without(root.path(), "error_um", |seq| TickRecord {
         target_um: seq as f64 * 0.5,
         verdict: u8::from(seq == 30),

@@ -311,7 +311,7 @@ fn a_block_of_zeros_is_no_row() {
     let folder = cut_off(root.path(), 100, 10);
     let path = folder.join("ticks.arrow");
     let mut bytes = std::fs::read(&path).unwrap();
-    // What a file system leaves after a crash: the length is right, the last blocks were never written.
+    // A file after a crash of the system: the length is right, the last blocks were never written.
     let length = bytes.len();
     bytes[length - 1500..].fill(0);
     std::fs::write(&path, &bytes).unwrap();

@@ -73,8 +73,8 @@ impl SineFit {
     }
 }
 
-/// Time constant of a relaxation `end + height exp(-t / constant)`, by least squares in all three (the first two solved
-/// exactly for each constant tried); None if the data do not fall, or the constant is not within them.
+/// Time constant of a relaxation `end + height exp(-t / constant)`, by least squares in all three; the first two are solved
+/// exactly for each constant. None if the data do not fall, or the constant exceeds their length.
 pub(super) fn recovery_s(points: &[(f64, f64)]) -> Option<f64> {
     let first = points.first()?;
     let last = points.last()?;

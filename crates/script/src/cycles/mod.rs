@@ -1,7 +1,7 @@
 //! The per-cycle table: one row for each cycle of a plan, from the loop's records as they go by.
 //!
-//! Every cycle of the plan gets exactly one row, in order, once it is over: also one that was skipped, or of which the
-//! recorder lost every record; such a row says so and has no figures. A cycle that was not brought to its end has no
+//! Every cycle of the plan gets exactly one row, in order, once it is over. A cycle that was skipped, or whose records were all
+//! lost, has a row with a flag and without figures. A cycle that was not brought to its end has no
 //! row, so that a run that is resumed does it again.
 
 mod fatigue;

@@ -76,8 +76,8 @@ impl CycleFlags {
     const GRAVE: u32 =
         Self::FROZEN | Self::SKIPPED | Self::SAFE | Self::PAUSED | Self::STUCK | Self::OUTLIER;
 
-    /// Share of a cycle's ticks from which on trouble of one kind counts as having changed the cycle: a frame that is lost
-    /// now and then is bridged by the prediction, and moves the figures of a cycle by less than the bead's own wandering.
+    /// Share of a cycle's ticks from which one kind of trouble counts as a disturbance. The prediction bridges a frame that is
+    /// lost now and then, which changes a cycle's figures by less than Brownian motion does.
     pub const WORTH_COUNTING: f64 = 0.02;
 
     /// Whether all bits of `mask` are set.

@@ -35,8 +35,8 @@ pub struct Trend {
 }
 
 impl Trend {
-    /// Whether the change is beyond chance: the line's outside of three times its 95 % interval, so that residuals that are
-    /// a little correlated raise hardly a false alarm in a thousand static arms.
+    /// Whether the change is beyond chance: outside three times its 95 % interval. Then slightly correlated residuals cause
+    /// hardly a false alarm in a thousand static arms.
     pub fn is_significant(&self) -> bool {
         self.per_cycle.abs() > 3.0 * self.ci95_per_cycle
     }

@@ -326,8 +326,7 @@ impl Layout<'_> {
         Ok(())
     }
 
-    /// The points of a waveform in the plan: those that are there already, if they are the same, so that a repeat takes no
-    /// more room than one pass.
+    /// The points of a waveform in the plan. Equal points are stored once, so a repeat takes no more room than one pass.
     fn points(&mut self, step: &Step, points: &[(f64, f64)]) -> Result<usize, ScriptError> {
         let all = &self.plan.points;
         let mut known = self.plan.periodic.iter().filter_map(Periodic::span);
@@ -343,7 +342,7 @@ impl Layout<'_> {
         Ok(first)
     }
 
-    /// Says that the segment pushed last is a periodic motion, with `full` cycles of it in full swing.
+    /// Marks the segment pushed last as a periodic motion with `full` cycles at full amplitude.
     fn repeats(&mut self, motion: Periodic, full: u64) {
         let known = &mut self.plan.periodic;
         let number = match known.iter().position(|other| other.moves_as(&motion)) {

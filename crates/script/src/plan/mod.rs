@@ -25,8 +25,8 @@ impl Plan {
         Self::lay_out(script, false)
     }
 
-    /// With at most three passes of each repeat, six cycles at full amplitude of each wave, and short holds: it needs the same of
-    /// the rig and is short.
+    /// A short version with the same demands on the rig: at most three passes of each repeat, six cycles at full amplitude of
+    /// each wave, and short holds.
     pub(crate) fn shortened(script: &Script) -> Result<Self, ScriptError> {
         Self::lay_out(script, true)
     }

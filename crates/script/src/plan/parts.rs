@@ -84,8 +84,8 @@ pub enum ArmKind {
     Static,
 }
 
-/// One cycle: a period of a wave, or a pass of a repeat or of a sweep that holds no wave (of a sweep within a repeat: the
-/// repeat's pass); in a static arm, the mean time of a cycle of the cyclic arm.
+/// One cycle: a period of a wave, or a pass of a repeat or sweep without waves (of a sweep within a repeat: the repeat's pass).
+/// In a static arm: the mean duration of a cycle of the cyclic arm.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Cycle {
     /// Number, from 0.

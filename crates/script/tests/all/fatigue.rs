@@ -38,7 +38,7 @@ fn the_trends_of_stretch_area_and_recovery_are_found_and_the_static_arm_has_none
     for (name, found, first, last) in [
         ("stretch", of(ArmKind::Cyclic, &stretch), 3.80, 2.86),
         ("recovery", of(ArmKind::Cyclic, &recovery), 0.16, 0.37),
-        // The volume is kept: the projected area goes with the root of the length.
+        // The volume is kept: the projected area varies with the root of the length.
         (
             "area",
             of(ArmKind::Cyclic, &area),

@@ -63,7 +63,7 @@ fn mutate(text: &mut String, luck: &mut Luck) {
         blocks.get(first).copied().unwrap_or(0)..end
     };
     match luck.below(12) {
-        // A quantity of another size: what a person changes.
+        // A quantity of another size, as a person may change it.
         0..=6 => {
             let all = quantities(text);
             if let Some(place) = all.get(luck.below(all.len())) {

@@ -40,7 +40,7 @@ fn night(cycles: u32) -> (f64, common::Table) {
         faults,
         ..WorldConfig::default()
     };
-    // A fault is here to be got over: what latches Safe after few of them in a row is another test's subject.
+    // The run must survive each fault here; Safe after several faults in a row is the subject of another test.
     let timing = Timing {
         faults_in_a_row: 50,
         ..Timing::default()

@@ -14,7 +14,7 @@ pub(super) struct Shot {
     pub(super) deep: bool,
     pub(super) width: usize,
     pub(super) height: usize,
-    /// Where it lies in the camera's picture: column, row.
+    /// Its place in the camera's picture: column, row.
     pub(super) origin_px: (usize, usize),
     /// Where the bead or cell is in it; NaN: it was not seen.
     pub(super) centre_px: (f64, f64),

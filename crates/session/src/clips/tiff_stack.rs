@@ -15,8 +15,8 @@ pub(super) fn bytes(shots: &[&Shot]) -> Option<u64> {
     Some((page * shots.len()) as u64)
 }
 
-/// Writes `NAME.tif` and `NAME.csv` (time in the run, where the crop lies in the camera's picture, and the centre of the bead or
-/// cell in it). `offset_ns`: from the time of the run to that of the frames.
+/// Writes `NAME.tif` and `NAME.csv` (time in the run, place of the crop in the camera's picture, centre of the bead or cell in
+/// the crop). `offset_ns`: from the time of the run to that of the frames.
 pub(super) fn write(
     folder: &Path,
     moment: &Moment,

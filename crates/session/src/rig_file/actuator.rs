@@ -95,8 +95,8 @@ impl ActuatorConfig {
         }
     }
 
-    /// A plant as this actuator moves it: with the lags of regulator and tube, unless the model has effects for them, or was
-    /// measured with the actuator in it (then it knows the delay of its camera path).
+    /// The plant behind this actuator: with the lags of regulator and tube. Unless the model has effects for them, or was
+    /// measured with the actuator (then it states the delay of its camera path).
     #[must_use]
     pub fn before(&self, mut model: Model) -> Model {
         if model.camera_delay_s.is_some() {

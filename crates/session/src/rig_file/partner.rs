@@ -17,8 +17,8 @@ pub enum PartnerKind {
     Program,
 }
 
-/// The slow partner of the PZT: it takes up what lasts, and returns the PZT to the middle of its stroke. Lengths are um of its own scale
-/// unless said otherwise.
+/// The slow partner of the PZT: it takes up what lasts, and returns the PZT to the middle of its stroke. Lengths are in um on its
+/// own scale unless stated otherwise.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct PartnerTable {
@@ -42,7 +42,7 @@ pub struct PartnerTable {
     /// Where it rests unattended, um; left out: the middle of its range.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub park_um: Option<f64>,
-    /// PZT displacement that has the effect of 1 um of it; `cellpos rig partner` measures it.
+    /// PZT displacement with the effect of 1 um of this actuator; `cellpos rig partner` measures it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub gain: Option<f64>,
     /// Half width of the gain's 95 % interval.
@@ -112,7 +112,7 @@ impl PartnerTable {
                 ramp_um_per_s: self.slew_um_per_s,
                 power_up_um: self.park_um(),
                 park_um: self.park_um(),
-                // Half a millisecond: what a controller's own loop takes.
+                // Half a millisecond: the time of a controller's own loop.
                 update_us: 500,
                 ..BoardConfig::default()
             },

@@ -5,8 +5,8 @@ const STEPS: usize = 64;
 /// Octaves: all that fits in 32 bits of nanoseconds, four seconds.
 const OCTAVES: usize = 32;
 
-/// Times in octaves of 64 equal steps each. Counting touches one number, and the tail is looked for from above, so that neither
-/// costs the thread that does it anything to speak of; the run's summary has its own, finer account.
+/// Times in octaves of 64 equal steps each. Counting changes one number, and the tail is searched from above, so both cost the
+/// thread very little. The run's summary has its own, finer account.
 #[derive(Debug, Clone)]
 pub(super) struct Tail {
     counts: Box<[u32; STEPS * OCTAVES]>,

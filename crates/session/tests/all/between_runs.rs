@@ -27,7 +27,7 @@ impl RunSink for Kept {
     fn progress(&mut self, _: &Statistics) {}
 }
 
-/// A run with a PI: the world, which goes on, and what was kept.
+/// A run with PI: the world, which continues, and the recorded ticks.
 fn pi_run(file: RigFile, reference: ReferenceSpec, ticks: u64) -> (EmulatedRig, Kept) {
     let ran = run(file, "pi", reference, ticks);
     (ran.emulated, ran.sink)
@@ -63,7 +63,7 @@ fn after_a_run_the_bead_goes_with_the_flow_that_park_leaves_and_not_otherwise() 
         frequency_hz: 7.0,
         fade_s: 0.1,
     };
-    // The second of them ends in full motion.
+    // The second run ends in full motion.
     for (reference, ticks) in [(hold(), 2000), (sine, 2013)] {
         for park_um in [20.0, 19.99, 20.02] {
             let mut file = RigFile::default();
@@ -74,7 +74,7 @@ fn after_a_run_the_bead_goes_with_the_flow_that_park_leaves_and_not_otherwise() 
             let (emulated, kept) = pi_run(file, reference.clone(), ticks);
             let last_um = kept.ticks.last().expect("ticks").true_um;
             let at_um = |emulated: &EmulatedRig| emulated.now().world().bead_um();
-            // Frozen where it was, within the delay of the camera and what the bead goes while the command arrives.
+            // Frozen at its place, within the motion during the delays of camera and command.
             emulated.clock().sleep(Duration::from_millis(50));
             let parked_um = at_um(&emulated);
             assert!(

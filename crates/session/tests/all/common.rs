@@ -10,11 +10,11 @@ use cellpos_session::{EndKind, Options, Rig, RigFile};
 
 /// What a run leaves.
 pub(crate) struct Ran<S> {
-    /// The world goes on.
+    /// The world continues.
     pub emulated: EmulatedRig,
     pub summary: Summary,
     pub sink: S,
-    /// What the loop was told of the rates.
+    /// The rates that the loop expects.
     pub ticks_per_fix: f64,
 }
 

@@ -1,7 +1,6 @@
 //! Every key that the types of rig.toml take is in docs/rig-toml.md, and the page names none that they do not take.
 //!
-//! What the types take they say themselves: an unknown key is refused with the list of the known ones, for each table and each
-//! `kind` of one.
+//! The types name their keys: an unknown key is refused with the list of known ones, for each table and each `kind`.
 
 use crate::rig_walk::all_below;
 use cellpos_session::RigFile;
@@ -43,7 +42,7 @@ fn every_key_of_the_types_is_in_the_page_and_the_page_names_no_other() {
     ] {
         assert!(all.contains(key), "{key} was not found among {all:#?}");
     }
-    // The kinds of choices are told with the choice.
+    // The kinds of a choice are listed with the choice.
     all.retain(|key| !matches!(key.as_str(), "vision.profile.kind" | "vision.noise.kind"));
     let documented = documented();
     let missing: Vec<_> = all.difference(&documented).collect();
@@ -54,7 +53,7 @@ fn every_key_of_the_types_is_in_the_page_and_the_page_names_no_other() {
     );
 }
 
-/// The keys that take a quantity with a unit, with their tables, and the form of it.
+/// The keys that take a quantity with a unit, with their tables and the form of the quantity.
 fn of_code() -> BTreeSet<(String, String)> {
     quantities()
         .map(|known| {

@@ -1,4 +1,5 @@
-//! docs/schemas/rig.json is what the types of rig.toml take, with the words of docs/rig-toml.md: editors complete and check from it.
+//! docs/schemas/rig.json agrees with the types of rig.toml and has the words of docs/rig-toml.md: editors complete and check from
+//! it.
 
 use crate::rig_keys::page;
 use crate::rig_walk::{UNKNOWN, all_below, expected, keys_of, kinds_of, needs, refusal};
@@ -7,7 +8,7 @@ use serde_json::{Map, Value, json};
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
-/// What the page says of each key: the last cell of its line.
+/// The page's text for each key: the last cell of its line.
 fn descriptions() -> BTreeMap<String, String> {
     let page = page();
     let lines = page.lines().filter(|line| line.starts_with("| `"));

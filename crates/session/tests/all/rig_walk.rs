@@ -33,7 +33,7 @@ pub(crate) fn needs(table: &str) -> &'static str {
     }
 }
 
-/// Tables that look at nothing else before they know their `kind`; below them there is one table, with needs of its own.
+/// Tables that look at nothing else before they know their `kind`; below them there is one table with its own needs.
 pub(crate) const OF_A_KIND: [&str; 4] = ["actuator", "camera", "vision.profile", "vision.noise"];
 
 /// The kinds of a table that has kinds.
@@ -45,7 +45,7 @@ pub(crate) fn kinds_of(table: &str) -> Vec<String> {
     expected(&refusal(&text(&format!("kind = \"{UNKNOWN}\"\n"))))
 }
 
-/// The keys of a table (empty: of none) and of all its kinds; `None` where it is no table.
+/// The keys of a table (empty: of none) and of all its kinds; `None` if it is no table.
 pub(crate) fn keys_of(table: &str) -> Option<BTreeSet<String>> {
     let below = |of: &str| (table.strip_prefix(of)).is_some_and(|rest| rest.starts_with('.'));
     if OF_A_KIND.iter().any(|of| below(of)) && needs(table).is_empty() {
@@ -87,7 +87,7 @@ pub(crate) fn all_below(table: &str, all: &mut BTreeSet<String>) {
         if is_table {
             all_below(&whole, all);
         }
-        // A table as such is told where it stands for a choice; its keys say the rest.
+        // A table is listed if it is a choice; its keys show the rest.
         if !is_table || whole.contains('.') {
             all.insert(whole);
         }

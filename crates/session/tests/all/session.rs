@@ -1,4 +1,4 @@
-//! A session from open to finished, on the emulated rig, with devices in between that misbehave and tell what they were told.
+//! A session from open to finished, on the emulated rig, with devices in between that misbehave and record their calls.
 
 use cellpos_emulator::EmulatedRig;
 use cellpos_plant::Model;

@@ -292,8 +292,8 @@ fn bounds(sheet: &mut Sheet, t: &mut Talk, range: &Range) -> Result<(), Failure>
     Ok(())
 }
 
-/// Steepest slope between any two statuses, beyond what a step of the converter and one of its updates (100 us) explain; and the
-/// slope over the middle of the way, um/s.
+/// Steepest slope between any two statuses, minus a step of the converter and one update (100 us), and the slope over the middle
+/// of the way, um/s.
 fn slew(range: &Range, statuses: &[Status]) -> (f64, f64) {
     const UPDATE_US: f64 = 100.0;
     let slope = |a: &Status, b: &Status, slack_us: f64, slack_pm: f64| {

@@ -8,7 +8,7 @@ use std::collections::VecDeque;
 use std::sync::{Arc, Mutex};
 use std::time::Instant;
 
-/// What somebody does to messages: none is passed on, one, or another.
+/// A change to messages: drop it, pass it on, or replace it.
 pub(crate) type Tamper<M> = fn(M) -> Option<M>;
 
 /// A board that can be reset, shared by the ports to it.

@@ -226,6 +226,33 @@ fn no_file_is_longer_than_a_reader_takes_in() {
     );
 }
 
+/// `cargo doc` is read crate by crate: each front page says what the crate is for, and shows code that the tests run.
+#[test]
+fn every_library_has_a_front_page_with_an_example_that_runs() {
+    let mut pages = 0;
+    for folder in std::fs::read_dir(root().join("crates")).unwrap().flatten() {
+        let Ok(text) = std::fs::read_to_string(folder.path().join("src/lib.rs")) else {
+            continue;
+        };
+        let page: Vec<&str> = text
+            .lines()
+            .map_while(|line| line.strip_prefix("//!"))
+            .collect();
+        let name = folder.file_name().display().to_string();
+        assert!(
+            page.len() >= 8,
+            "{name}: a front page of {} lines",
+            page.len()
+        );
+        assert!(
+            page.contains(&" ```"),
+            "{name}: the front page has no example that runs"
+        );
+        pages += 1;
+    }
+    assert!(pages > 20, "only {pages} libraries");
+}
+
 /// What a test that lacks something prints before it returns green; broken in two, so that this file has no such line.
 const GREEN_FOR_NOTHING: &str = concat!("println!(\"", "skipped");
 

@@ -23,8 +23,8 @@ fn unwrapped_deg(phase: f64) -> f64 {
 /// A band wider than the intervals of its points by this factor does not describe the measurement.
 const WIDEST_BAND: f64 = 30.0;
 
-/// Ends of the fit's 95 % band (gain or phase) at each frequency; NaN beyond the measured frequencies, and if the nearest point is
-/// known far better: there the band shows a parameter that these data do not determine.
+/// Ends of the fit's 95 % band (gain or phase) at each frequency. NaN beyond the measured frequencies, and if the nearest point
+/// is known far better: there the band shows a parameter that these data do not determine.
 fn band(result: &Identification, grid: &[f64], phase: bool) -> [Vec<f64>; 2] {
     let points = &result.compensated;
     let mut ends = [Vec::new(), Vec::new()];

@@ -191,8 +191,8 @@ impl From<TickRecord> for Tick {
     }
 }
 
-/// The ticks of a session from where its loop was closed and had settled to where the operator or the script ended it; None
-/// where it was never closed. The ticks are asked for twice, so that a night's run needs no night's memory.
+/// The ticks of a session from its settled loop to the end by operator or script; None if the loop was never closed. The ticks
+/// are asked for twice, so that a night's run needs no night's memory.
 fn settled<T: Iterator<Item = Tick>>(
     name: String,
     referenced: bool,

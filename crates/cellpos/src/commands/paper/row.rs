@@ -9,7 +9,7 @@ use std::path::Path;
 pub(super) struct Row {
     /// Key for machines.
     pub key: &'static str,
-    /// What it is.
+    /// The compared quantity.
     pub quantity: String,
     /// The paper's value as printed.
     pub paper: String,

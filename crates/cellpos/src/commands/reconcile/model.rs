@@ -125,9 +125,9 @@ fn fit(
 /// Most times that the base is fitted again.
 const ROUNDS: usize = 3;
 
-/// Reconciles. Where a set is named of which a part is linear, and the model is a base that was fitted to these very records, that part may be
-/// no more than what the fit of the base got wrong, not knowing of the others: the base is fitted again, with the same form, behind
-/// what the others do to its input, and the records are looked at once more. What is then not needed any longer was no effect.
+/// Reconciles. The base was fitted to these records without the named effects, so a linear effect among them may only correct
+/// that fit. Therefore the base is fitted again, in the same form, to the input behind the other effects. Then the search runs
+/// once more. What is then not needed any longer was no effect.
 ///
 /// # Errors
 /// Records or a model about which no verdict is possible.
@@ -188,8 +188,8 @@ pub(super) fn reconcile_or_refit(
     Ok(found)
 }
 
-/// What is found beside a base of one pole or one delay more, where that needs fewer linear effects: of a base that was fitted to
-/// these very records, with a form that somebody stated, these are what the form has no place for, and no names.
+/// The result with a base of one more pole or delay, if that needs fewer linear effects. If the base was fitted to these records
+/// in a stated form, such effects only show that the form is too small; they are not names.
 fn of_a_richer_base(
     found: &Reconciliation,
     present: &Model,
@@ -223,8 +223,8 @@ fn of_a_richer_base(
     None
 }
 
-/// Whether a result without a name has a formula of no more terms than another has effects, which explains more of what is beyond the
-/// floor on data that it has not seen than those do.
+/// Whether a result without a name has a better formula: at most as many terms as the other result has effects, and a larger part
+/// of the held-out excess explained.
 fn has_better_formula(next: &Reconciliation, found: &Reconciliation) -> bool {
     let left = found.remainder.as_ref().map_or(0.0, |rest| rest.share);
     next.verdict == Verdict::Unknown

@@ -149,8 +149,8 @@ fn held(t: &TickRecord) -> bool {
     t.is_controlled() && t.command_um.is_finite()
 }
 
-/// Runs hold a bead wherever its rest is, and that is another place every day: where no record comes near the model's
-/// working point, the runs' own is taken. Whether it was: it is then no better known than these records tell.
+/// The rest of a held bead differs from day to day. If no record comes near the model's working point, that of the runs is used.
+/// Whether it was: it is then no better known than these records tell.
 pub(super) fn at_rest_of_runs(model: &mut Model, records: &[Record], rests_um: &[f64]) -> bool {
     let inside = records.iter().any(|r| {
         let (low, high) = r.pzt_range_um();
@@ -169,8 +169,8 @@ pub(super) fn at_rest_of_runs(model: &mut Model, records: &[Record], rests_um: &
     true
 }
 
-/// A run shows its bead as late as the camera path is: a model that was identified with that delay beside its plant has it as
-/// an effect here, or it would be found a second time and counted twice.
+/// A run shows its bead late by the camera path. If the model states that delay, it is added as an effect here; otherwise it
+/// would be found again and counted twice.
 pub(super) fn with_camera_delay(model: &mut Model) {
     if model.effect("time-delay").is_none()
         && let Some(delay_s) = model.camera_delay_s.take().filter(|d| *d > 0.0)

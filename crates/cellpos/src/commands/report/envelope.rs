@@ -2,8 +2,8 @@
 
 /// Stretches kept, at most twice this many.
 const STRETCHES: usize = 5_000;
-/// Values of a stretch that are kept for its median, evenly spaced in time: a column of a figure is some ten stretches, so that its
-/// median is one of fifty values or more, and off by less than a fifth of their standard deviation.
+/// Number of evenly spaced values kept for the median of a stretch. A column of a figure has about ten stretches, so its median
+/// comes from at least fifty values, with an error below a fifth of their standard deviation.
 const SAMPLES: usize = 8;
 /// Columns of a figure: as many as it has px for.
 const COLUMNS: usize = 700;

@@ -15,8 +15,8 @@ pub(super) struct Spectrum {
     pub nm_per_rthz: Vec<f64>,
 }
 
-/// Averaged spectrum of values as they go by (Hann windows overlapping by half, each stretch less its mean); values that are
-/// missing are taken as the mean, and stretches of which more than a twentieth is missing are left out.
+/// Averaged spectrum of a stream of values (Hann windows overlapping by half, each stretch minus its mean). A missing value
+/// counts as the mean; a stretch with more than a twentieth missing is left out.
 #[derive(Debug, Default)]
 pub(super) struct Welch {
     /// What is behind the last whole stretch, and half of that.

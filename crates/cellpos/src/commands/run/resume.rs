@@ -83,8 +83,8 @@ fn write_cycles(path: &Path, rows: &[CycleRow]) -> Result<(), Failure> {
     cellpos_table::write_atomically(path, text.as_bytes()).map_err(Failure::failed)
 }
 
-/// Gives the table of a run that an older version began the columns of this one, in one step: new rows have the same header, and
-/// values that the older version did not measure stay empty.
+/// Converts the table of an older version's run to the present columns, in one step. New rows then have the same header; values
+/// that the older version did not measure stay empty.
 fn renew(folder: &Path) -> Result<(), Failure> {
     let path = folder.join(CYCLES_CSV);
     let Ok(text) = read_text(&path, MOST_TABLE) else {
@@ -296,8 +296,8 @@ fn gap_s(session: &Path) -> Option<f64> {
     written.elapsed().ok().map(|gap| gap.as_secs_f64())
 }
 
-/// How long the script has run in some sessions, s: in each from its first tick to its last on the disk, with waits and
-/// pauses, without the approach. What lies between the sessions does not count.
+/// Running time of the script in some sessions, s: from the first to the last tick on the disk, with waits and pauses, without
+/// the approach. What lies between the sessions does not count.
 fn ran_s(sessions: &[PathBuf], period_s: f64) -> Result<f64, Failure> {
     let in_script = |row: &TickRecord| {
         [Stage::Running, Stage::Waiting, Stage::Paused].contains(&Stage::from_number(row.stage))

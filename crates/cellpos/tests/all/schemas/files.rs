@@ -89,7 +89,7 @@ fn with(place: &str, key: &str, value: &str) -> String {
     }
 }
 
-/// The schema of a key, from what the reader says to a number and to a word.
+/// The schema of a key, from the reader's reaction to a number and to a word.
 fn leaf(place: &str, key: &str) -> Value {
     let number = refusal(&with(place, key, "1.5"));
     let word = refusal(&with(place, key, &format!("\"{NOBODYS}\"")));

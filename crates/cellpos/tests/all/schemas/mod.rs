@@ -1,5 +1,5 @@
-//! docs/schemas is what the program takes and prints. With CELLPOS_WRITE_SCHEMAS=1 the tests write the schemas anew, those of
-//! JSON objects with what is new in them.
+//! docs/schemas agrees with the program's input and output. With CELLPOS_WRITE_SCHEMAS=1 the tests write the schemas again, those
+//! of JSON objects with their new keys.
 
 mod files;
 mod objects;

@@ -208,7 +208,7 @@ fn the_objects_of_quick_commands_fit_their_schemas() {
         "replay of a run that another version recorded with other gains",
         &replay_of_another_controller(at),
     );
-    // What goes wrong is an object, too; limits that are broken, and a machine that is not fit, are results.
+    // An error is an object, too. Broken limits and an unfit machine are results.
     for (line, code) in [
         ("track --target 900um", 2),
         ("check wild.toml", 1),

@@ -119,7 +119,7 @@ pub struct Definition {
     pub site: Site,
     /// What it means, in a few words.
     pub says: String,
-    /// What leaves the place in the stead of `input` (at `plant`: in the stead of `position`).
+    /// The output of the place, instead of `input` (at `plant`: instead of `position`).
     pub output: String,
     /// Quantities with their own equations.
     pub states: Vec<UserState>,

@@ -57,7 +57,7 @@ fn a_stuck_bead_does_not_move_below_the_break_and_follows_in_full_above() {
     assert!(slow[999].abs() < 1e-9, "{}", slow[999]);
     let fast = run(&model, &vec![80.0; 1000], 1e-3);
     assert!((fast[999] - 80.0 * 0.999).abs() < 1e-6, "{}", fast[999]);
-    // Once free it goes on below the break: up to 80, then at 20.
+    // Once free it continues below the break: up to 80, then at 20.
     let mut u = vec![80.0; 100];
     u.extend(vec![20.0; 900]);
     let y = run(&model, &u, 1e-3);

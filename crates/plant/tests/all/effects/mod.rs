@@ -1,4 +1,4 @@
-//! Every effect against its closed form and the signature by which it is told from the others.
+//! Every effect against its closed form and the signature that separates it from the others.
 
 mod camera;
 mod chip_and_bead;

@@ -15,7 +15,7 @@ pub(super) const GAIN_PER_S: f64 = 379.0;
 const EVENT_S: f64 = 2.6;
 const FROM_NS: i64 = 2_550_000_000;
 
-/// What happens to a bead that is held.
+/// Events around a held bead.
 #[derive(Debug, Clone)]
 pub(super) struct Row {
     pub law: &'static str,
@@ -182,7 +182,7 @@ pub(super) struct Held {
     /// RMS of the true distance over the ticks whose errors count, and the one that the run states, nm.
     pub true_rms_nm: f64,
     pub stated_rms_nm: f64,
-    /// Share of them within five standard deviations by the truth, and as stated, percent.
+    /// Share within five standard deviations, true and as stated, percent.
     pub true_held_percent: f64,
     pub stated_held_percent: f64,
     /// Longest time without a break further off than that, ms.

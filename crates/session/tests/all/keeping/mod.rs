@@ -1,7 +1,7 @@
 //! The table of beads that are in the picture and must be kept, judged by where the bead truly was: frames, tracker, loop and last
 //! word together, on the emulated rig and the virtual clock.
 //!
-//! A few rows run by default. All of them, with a number of seeds of one's own, from the folder of this crate:
+//! A few rows run by default. All rows with your number of seeds, from the folder of this crate:
 //! `KEEPING_SEEDS=200 cargo test --release --test all keeping_table -- --ignored --nocapture`.
 
 mod held;

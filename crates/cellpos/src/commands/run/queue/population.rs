@@ -26,7 +26,7 @@ pub(super) struct CellRow {
     stretch_last: Option<f64>,
     /// Half width of the 95 % interval of `stretch_first`: scatter of its cycles and the length at rest together.
     stretch_first_ci95: Option<f64>,
-    /// Recovery time, likewise \[s\].
+    /// Recovery time, in the same way \[s\].
     recovery_first_s: Option<f64>,
     recovery_last_s: Option<f64>,
     /// RMS of the tracking error over the cycles \[nm\].
