@@ -13,7 +13,7 @@
 //!
 //! - [`ControllerFile`]: controller.toml. [`ControllerConfig`] and [`Controller`]: a law with its estimator, ready to step.
 //! - [`ControlLoop`]: estimator, law, feed-forward and limits in one step, from [`LoopInput`] to [`LoopOutput`].
-//! - [`Pi`], [`Lqg`], [`Mpc`]: the laws; [`ControlLaw`](law::ControlLaw) is the trait for your own.
+//! - [`Pi`], [`Lqg`], [`Mpc`]: the laws; [`ControlLaw`] is the trait for your own.
 //! - [`LoopModel`]: the sampled plant with its delay. [`Adaptation`]: its gain and delay, estimated while the loop runs.
 //! - [`Reference`] and [`Profile`]: the motion. [`learning`]: the feed-forward learned over cycles.
 //! - [`design`]: gains, margins and the lowest possible error. [`SimulatedRig`]: a rig without pictures for tests.

@@ -23,4 +23,4 @@ __all__ = [
     "command", "identify", "open", "program", "read_camera", "read_csv", "reconcile", "run", "runs", "serve_actuator",
     "serve_camera", "track",
 ]  # fmt: skip
-__version__ = "0.1.0"
+__version__ = "0.2.0"

@@ -25,7 +25,7 @@ pub(crate) struct Args {
     /// The run's folder.
     #[arg(value_parser = run_folder())]
     run: PathBuf,
-    /// What to write; left out: what the name of --out ends in, else CSV.
+    /// Format; default: by the ending of --out, else CSV.
     #[arg(long, value_enum)]
     format: Option<ExportFormat>,
     /// File to write; default: the run's name, next to its folder.

@@ -16,7 +16,7 @@ use std::path::PathBuf;
 #[command(
     after_help = "The bead is held by the PZT while the slow actuator makes a square wave about where it stands.\n\n\
     Examples:\n  cellpos rig partner rig.toml\n  cellpos rig partner rig.toml --amplitude 0.5um --duration 60s --write\n\n\
-    Exit code 0: measured; 1: the run failed, or the actuator cannot be told from noise; 2: bad input."
+    Exit code 0: measured; 1: the run failed, or the effect of the actuator is below the noise; 2: bad input."
 )]
 pub(super) struct Args {
     /// The rig file, with a table [partner].
