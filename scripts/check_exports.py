@@ -6,7 +6,7 @@
     pip install pandas pyarrow h5py scipy
     scripts/check_exports.py t
 
-Exit code 1: two of them differ, or one cannot be read.
+Exit code 1: two exports differ, or one cannot be read.
 """
 
 import sys

@@ -4,7 +4,7 @@
     scripts/check_readers.py target/debug/cellpos [CYCLES]
 
 CYCLES of 50 ticks each, 2000 if left out; with 20000 it is a run of a million ticks. No export and no report may take more than
-300 MB, nor the report more than 10 s. Needs pandas, pyarrow, polars, h5py, scipy, dclab and jsonschema; R and Octave are used where they are installed. Exit code 1: something
+300 MB, nor the report more than 10 s. Needs pandas, pyarrow, polars, h5py, scipy, dclab and jsonschema; R and Octave are used if they are installed. Exit code 1: something
 cannot be read, or is not what another form says.
 """
 

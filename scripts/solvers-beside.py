@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""QP solvers beside each other on the problems that MPC solved in a loop.
+"""QP solvers compared on the problems that MPC solved in a loop.
 
     cargo bench -p cellpos-benches --bench solvers -- --problems FOLDER
     pip install numpy scipy daqp osqp quadprog piqp clarabel proxsuite

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""cellpos vision beside trackpy on the same frames: recall, error and time.
+"""cellpos vision compared with trackpy on the same frames: recall, error and time.
 
     pip install trackpy pillow tifffile
     scripts/vision-beside-trackpy.py [--cellpos PROGRAM] [--data ../shared/data]
@@ -119,7 +119,7 @@ def template_fits(path):
 
 
 def release():
-    """The program, built in release; where cargo put it is what it says."""
+    """The program, built in release; cargo names its place."""
     root = pathlib.Path(__file__).resolve().parent.parent
     built = subprocess.run(
         ["cargo", "build", "--release", "-p", "cellpos", "--bin", "cellpos", "--message-format", "json-render-diagnostics"],

@@ -2,8 +2,7 @@
 
     python examples/python/pylon_camera.py camera.sock [--rate 1000] [--bead box.sock]
 
-With --bead the picture of firmware-sim's camera takes the place of the emulated camera's test pattern, so that a bead can be held
-over the whole path of a Basler camera.
+With --bead the picture of firmware-sim's camera replaces the test pattern. So a bead can be held over the whole path of a Basler camera.
 """
 
 import argparse

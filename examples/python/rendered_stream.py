@@ -1,4 +1,4 @@
-"""Serves the frames of another camera socket, as a camera of one's own would be served.
+"""Serves the frames of another camera socket, as your own camera would be served.
 
     firmware-sim --rig examples/rig.toml --pty-link examples/pzt --socket box.sock &
     python examples/python/rendered_stream.py box.sock examples/camera.sock &

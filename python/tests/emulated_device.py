@@ -1,5 +1,4 @@
-"""A device for serve_actuator in tests: firmware-sim's board, driven over its pseudo-terminal. What moves the emulated bead is then a
-function in Python."""
+"""A device for serve_actuator in tests: firmware-sim's board, driven over its pseudo-terminal. A function in Python then moves the emulated bead."""
 
 import os
 import sys

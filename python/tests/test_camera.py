@@ -138,7 +138,7 @@ def watched(folder: Path, name: str):
 
 
 def held_over(folder: Path, script: str, *words: str):
-    """A bead held over a camera that an example serves from a process of its own."""
+    """A bead held over a camera that an example serves from a separate process."""
     env = dict(os.environ, PYTHONPATH=os.pathsep.join(sys.path), PYLON_CAMEMU="1")
     server = subprocess.Popen(
         [sys.executable, ROOT / "examples/python" / script, *words], cwd=folder, env=env, stdout=subprocess.PIPE, text=True

@@ -16,7 +16,7 @@ from cellpos import _wire
 
 
 class Pump:
-    """A New Era NE-1000 in basic mode: what it was told, and the flow that it makes, ul/min."""
+    """A New Era NE-1000 in basic mode: its commands, and its flow, ul/min."""
 
     def __init__(self) -> None:
         self.line, other = os.openpty()

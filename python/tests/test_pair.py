@@ -1,5 +1,6 @@
-"""A pair over firmware-sim: its board is the PZT, a function in Python the slow actuator. What the function does moves no bead here: the door is
-tested, not the physics (crates/experiment/tests/pair.rs)."""
+"""A pair over firmware-sim: its board is the PZT, a function in Python the slow actuator.
+
+The function moves no bead here: the interface is tested, not the physics (crates/experiment/tests/pair.rs)."""
 
 import re
 import threading

@@ -1,4 +1,4 @@
-"""The drawings of the book: what a rig is made of, which thread does what, in which order. Each function returns one SVG."""
+"""The drawings of the book: parts of a rig, threads, order of events. Each function returns one SVG."""
 
 import tomllib
 from html import escape
@@ -41,7 +41,7 @@ def loop() -> str:
 
 
 def rig() -> str:
-    """What a rig is made of."""
+    """Parts of a rig."""
     body = [box(20, 180, 120, 60, "syringe", "gas-tight glass", "grn"), box(20, 90, 120, 60, "PZT stack", "moves plunger", "alt"),
             '<path class="hot" d="M80 150V180"/>', '<path class="ln" stroke-width="4" d="M140 210H270"/><text class="mut" text-anchor="middle" x="205" y="200">stiff tube</text>',
             '<rect class="gry" x="270" y="180" width="300" height="60" rx="4"/><rect fill="#cfe6f5" x="270" y="202" width="300" height="16"/><circle cx="420" cy="210" r="5" fill="#d55e00"/>'

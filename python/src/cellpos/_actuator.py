@@ -105,7 +105,7 @@ class Board:
     # -- time
 
     def step(self, now_us: int) -> int:
-        """The displacement from now on, pm: towards where it is to be, by the slew of one period at most."""
+        """The next displacement, pm: towards the wanted one, by at most the slew of one period."""
         self.watch(now_us)
         self.commanded = False
         elapsed_us = min(now_us - self.stepped_us, self.step_us)
@@ -467,7 +467,7 @@ def serve_actuator(
     """Serves a function as an actuator until Ctrl-C, ramps to park, and gives figures.
 
     `set(um)` is called at most once a `period` (s) with a displacement from `low` to `high` (um) that moves by at most `slew` (um/s);
-    it may take a part of the period. What the device has in another unit, pressure or flow, `set` converts with a scale of its own.
+    it may take a part of the period. If the device has another unit, such as pressure or flow, `set` converts.
     `park` (`low` unless said) is where it goes at the start, at the end, and when the program falls silent.
     """
     server = ActuatorServer(set, low, high, slew, period, socket_path, park=park, real_time=real_time)

@@ -93,7 +93,7 @@ def _dtype(field: _Table) -> "np.dtype[Any]":
 
 
 class Stream:
-    """The batches of a file, and what of it is not there."""
+    """The batches of a file, and its missing parts."""
 
     def __init__(self, path: Path) -> None:
         self.path = path

@@ -28,7 +28,7 @@ _KEPT = 100_000
 
 
 class Frame(NamedTuple):
-    """A frame with what is known of it."""
+    """A frame with its number and times."""
 
     pixels: Array
     mid_exposure_ns: int
@@ -225,7 +225,7 @@ class CameraServer:
         self._flush(until_s)
 
     def _flush(self, until_s: float) -> bool:
-        """Writes what is left of a frame, for at most a period; a frame that was begun is always ended."""
+        """Writes the rest of a frame, for at most a period; a frame that was begun is always completed."""
         while len(self._left) and self._client is not None:
             try:
                 self._left = self._left[self._client.send(self._left) :]

@@ -1,4 +1,4 @@
-"""What the columns of a run are: docs/data.md, as code. A test compares the two."""
+"""The columns of a run: docs/data.md, as code. A test compares the two."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Starts the program, hands over rows as they are recorded, and gives what it printed at its end."""
+"""Starts the program, passes on rows as they are recorded, and returns its final output."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _LIBC = ctypes.CDLL(None) if sys.platform.startswith("linux") else None
 
 
 class Failed(RuntimeError):
-    """The program refused what it was asked, or could not do it. `error` is its JSON object, `code` its exit code."""
+    """The program refused or failed the request. `error` is its JSON object, `code` its exit code."""
 
     def __init__(self, message: str, code: int, error: Dict[str, Any]) -> None:
         super().__init__(message)
@@ -172,7 +172,7 @@ class Live:
         return self._folder
 
     def _look(self) -> None:
-        """Finds the run folder: the one of which the program has ticks.arrow open."""
+        """Finds the run folder: the program has its ticks.arrow open."""
         here = Path("/proc") / str(self.pid) / "fd"
         try:
             opened = [os.readlink(link) for link in here.iterdir()]
@@ -200,7 +200,7 @@ class Live:
         self._signal(signal.SIGUSR1)
 
     def skip(self) -> None:
-        """A script goes on with its next step."""
+        """A script continues with its next step."""
         self._signal(signal.SIGUSR2)
 
     def _signal(self, number: int) -> None:
@@ -355,7 +355,7 @@ def track(
 
 
 def run(script: Union[None, str, Path] = None, *, cwd: Optional[PathLike] = None, echo: bool = False, **options: Option) -> Live:
-    """Runs a setpoint script, or goes on with a run (`resume="latest"`)."""
+    """Runs a setpoint script, or continues a run (`resume="latest"`)."""
     return command("run", *([] if script is None else [script]), cwd=cwd, echo=echo, **options)
 
 

@@ -196,7 +196,7 @@ class Run:
 
     @property
     def outcome(self) -> Optional[str]:
-        """How the last session ended; None while it goes on, or when it was cut off."""
+        """How the last session ended; None while it runs, or if it was cut off."""
         outcome: Optional[str] = self.sessions[-1].meta.get("end", {}).get("outcome")
         return outcome
 
@@ -230,7 +230,7 @@ class Run:
         return self.ticks["error_um"]
 
     def settled(self, after_s: float = 2.0) -> Array:
-        """Ticks that the program's error figures count: from `after_s` after the loop was closed, or went on after a
+        """Ticks that the program's error figures count: from `after_s` after the loop was closed, or continued after a
         freeze by the operator, until the operator froze the bead or the PZT parked."""
         parts = []
         for session in self.sessions:
@@ -250,7 +250,7 @@ class Run:
 
     @property
     def rms_nm(self) -> float:
-        """RMS of error_um over the settled ticks, nm; NaN when there are none.
+        """RMS of error_um over the settled ticks, nm; NaN without any.
 
         Ticks without a fix do not count here; summary["rms_measured_nm"] counts them by the estimate.
         """
@@ -303,7 +303,7 @@ class Run:
 
     @property
     def lost(self) -> Dict[str, int]:
-        """What of the run is not there: rows missing in the numbering, rows and bytes that are damaged."""
+        """Missing parts of the run: rows missing in the numbering, damaged rows and bytes."""
         missing = 0
         for session in self.sessions:
             seq = session.stream.column("seq").astype(np.int64) if session.stream.batches else np.empty(0, np.int64)

@@ -1,4 +1,4 @@
-"""Clips: the pages of a TIFF as the program writes it (grey, 8 or 16 bits, not compressed), with the times beside it."""
+"""Clips: the pages of a TIFF as the program writes it (grey, 8 or 16 bits, not compressed), with the times in a CSV."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Clip:
 
     @property
     def times(self) -> Any:
-        """The table beside it: frame, time_s (on the axis of the ticks), frame_id, where the crop is, where the bead is."""
+        """The table of the CSV: frame, time_s (on the axis of the ticks), frame_id, place of the crop, place of the bead."""
         from ._run import Table, read_csv
 
         table = read_csv(self.path.with_suffix(".csv"))

@@ -130,3 +130,27 @@ fn a_value_that_cannot_be_is_named_with_its_line() {
         assert!(words.iter().all(|word| error.contains(word)), "{error}");
     }
 }
+
+/// docs/real-time.md names the defaults of `[timing]` as "`key` (value)".
+#[test]
+fn the_page_of_times_names_the_defaults() {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../docs/real-time.md");
+    let page = std::fs::read_to_string(path).expect("docs/real-time.md");
+    let timing = toml::Table::try_from(RigFile::default().timing).expect("a table");
+    let mut named = 0;
+    let mut rest = page.as_str();
+    while let Some((before, after)) = rest.split_once("` (") {
+        rest = after;
+        let key = before.rsplit('`').next().unwrap_or_default();
+        let value = after.split(')').next().unwrap_or_default();
+        let Some(default) = timing.get(key) else {
+            continue;
+        };
+        let default = default
+            .as_float()
+            .or(default.as_integer().map(|n| n as f64));
+        assert_eq!(value.parse().ok(), default, "docs/real-time.md: `{key}`");
+        named += 1;
+    }
+    assert!(named >= 6, "only {named} defaults on docs/real-time.md");
+}
