@@ -51,6 +51,7 @@ pub(crate) fn recorded(columns: &[f32]) -> Option<Adaptation> {
         gain_estimate: known.then_some([f64::from(found), f64::from(sd)]),
         delay_estimate_samples: None,
         mode,
+        lines: 0,
         news: None,
     })
 }

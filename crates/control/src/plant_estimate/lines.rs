@@ -27,23 +27,27 @@ const CHUNK: usize = 128;
 const AT_ONCE: usize = 8;
 /// Bins within which two lines are one: less than half a main lobe.
 const ONE_LINE: f64 = 1.5;
-/// Bins of the background on either side, beyond the main lobe.
-const BESIDE: std::ops::RangeInclusive<usize> = 3..=8;
-/// Power of a peak over the mean of the 12 background bins. Chance exceeds `x` with probability `(1 + x/12)^-12`: once in 10^7 bins, and ten
-/// hours have 5 10^6.
-const STANDS_OUT: f64 = 34.0;
+/// Bins on either side, beyond the main lobe. The median of all is the background: 11 Hz, of which the harmonics of a pump of 3 Hz fill less
+/// than half.
+const BESIDE: std::ops::RangeInclusive<usize> = 3..=22;
+/// The nearest of them, and the power of a peak over their mean from which on it is narrow. A tone that fills 0.4 of the window has 20 and one
+/// that fills half of it 41; before that two tones are one peak. Of two tones 1 Hz apart in a whole window one or both have it nine times in ten.
+const SKIRT: usize = 6;
+const NARROW: f64 = 34.0;
+/// Mean time between two lines that are none, s: 28 hours.
+const FALSE_S: f64 = 1e5;
 /// Memory of amplitude and phase, s: a line that stops is gone in that time, and each line adds 0.3 % to the hold error.
 const MEMORY_S: f64 = 0.5;
 /// Standard deviations of a new line: amplitude, um (the largest that a loop follows), and frequency, bins (interpolated peak of a
 /// line that fills a part of the window).
 const FIRST_UM: f64 = 1.0;
 const FIRST_BINS: f64 = 0.25;
+/// Square of an amplitude over its variance below which a line is removed: two standard deviations. What chance made is then gone within a
+/// second.
+const GONE: f64 = 4.0;
 /// Relative drift of a frequency, 1/s: a motor that warms up; and the time in which it changes by as much, s.
 const DRIFT_PER_S: f64 = 0.01;
 const STEADY_S: f64 = 1000.0;
-/// Square of an amplitude over its variance below which a line is removed: chance exceeds it with probability `exp(-2)`, a tenth of
-/// the power that it takes to be accepted.
-const GONE: f64 = 4.0;
 
 /// Sampling of the spectrum.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -53,6 +57,8 @@ pub(super) struct LineSettings {
     interval: f64,
     ticks: u32,
     bins: usize,
+    /// Power of a peak over the median of its background that chance exceeds once in [`FALSE_S`].
+    peak: f64,
 }
 
 /// One line.
@@ -120,11 +126,15 @@ impl LineSettings {
         let ticks = (SAMPLE_S / sample_s).max(interval).round().max(1.0);
         let highest = (HIGHEST_HZ * WINDOW as f64 * ticks * sample_s) as usize;
         let beside = *BESIDE.end() + 1;
+        let bins = (highest + beside).min(BINS).min(WINDOW / 2) / AT_ONCE * AT_ONCE;
+        let spectrum_s = (bins / AT_ONCE * (WINDOW / CHUNK + 1)) as f64 * sample_s;
+        let looks = (FALSE_S / spectrum_s * bins as f64).ln();
         Self {
             sample_s,
             interval,
             ticks: ticks as u32,
-            bins: (highest + beside).min(BINS).min(WINDOW / 2) / AT_ONCE * AT_ONCE,
+            bins,
+            peak: peak_over_median(2 * BESIDE.count(), looks),
         }
     }
 
@@ -136,6 +146,30 @@ impl LineSettings {
     fn turn(&self, bin: f64) -> f64 {
         TAU * bin / (WINDOW as f64 * f64::from(self.ticks))
     }
+}
+
+/// Power over the median of `bins` bins of background that chance exceeds in one peak of `exp(looks)`.
+///
+/// The power in a bin of noise is exponential. Under Hann's window it has a correlation of 4/9 with the next and of 1/36 with the second, so that the
+/// bins are worth `many` independent ones, of which the smallest has a mean of `1/many`, the next of `1/(many - 1)` more, and so on.
+fn peak_over_median(bins: usize, looks: f64) -> f64 {
+    let many = (bins as f64 / (1.0 + 8.0 / 9.0 + 2.0 / 36.0)).floor();
+    let median = (many / 2.0).ceil() as usize;
+    let logarithm = |x: f64| {
+        (0..median)
+            .map(|i| (x / (many - i as f64)).ln_1p())
+            .sum::<f64>()
+    };
+    let (mut low, mut high) = (0.0, 1e6);
+    for _ in 0..100 {
+        let middle = 0.5 * (low + high);
+        if logarithm(middle) < looks {
+            low = middle;
+        } else {
+            high = middle;
+        }
+    }
+    high
 }
 
 impl Line {
@@ -159,8 +193,8 @@ impl Line {
         }
     }
 
-    /// A fix with this residual, um, `ago` ticks old; `apart` is the angle in a tick to the nearest other component, rad. Whether
-    /// the amplitude is as well known as it will be.
+    /// A fix with this residual; `apart` is the angle in a tick to the nearest other component, rad. Whether the amplitude is as well known as
+    /// it will be.
     fn follow(&mut self, settings: &LineSettings, residual: &Residual, apart: f64) -> bool {
         let angle = self.turn * settings.interval;
         let seen2 = square(residual.seen);
@@ -235,6 +269,11 @@ impl Lines {
             spectrum: [[0.0; 2]; BINS],
             judged: BINS,
         }
+    }
+
+    /// How many there are.
+    pub(super) fn count(&self) -> usize {
+        self.count
     }
 
     fn now(&self) -> &[Line] {
@@ -360,6 +399,7 @@ impl Lines {
     /// Whether the next few bins hold lines.
     fn judge(&mut self, settings: &LineSettings) {
         let last = settings.bins - BESIDE.end() - 2;
+        let (aside, width) = (*BESIDE.start() as i64, 2 * *BESIDE.end() as i64);
         for bin in self.judged..self.judged + AT_ONCE {
             if bin == 0 || bin >= last {
                 continue;
@@ -370,10 +410,19 @@ impl Lines {
             if own < below || own <= above {
                 continue;
             }
-            let beside: f64 = BESIDE
-                .map(|by| self.power(bin - by as i64) + self.power(bin + by as i64))
-                .sum();
-            if own * 2.0 * BESIDE.count() as f64 > STANDS_OUT * beside {
+            // At a low frequency those above take the place of those that are missing below.
+            let first = (bin - *BESIDE.end() as i64).max(1);
+            let others = (first..=first + width).filter(|other| (other - bin).abs() >= aside);
+            let mut beside = [f64::INFINITY; 2 * *BESIDE.end() + 1];
+            let mut count = 0;
+            for other in others {
+                beside[count] = self.power(other);
+                count += 1;
+            }
+            let (_, median, _) = beside[..count].select_nth_unstable_by(count / 2, f64::total_cmp);
+            let skirt = |by: i64| self.power(bin - by) + self.power(bin + by);
+            let skirts: f64 = (aside..aside + SKIRT as i64).map(skirt).sum();
+            if own > settings.peak * *median && own * 2.0 * SKIRT as f64 > NARROW * skirts {
                 // Where the peak of Hann's window is between two bins.
                 let (side, sign) = if above > below {
                     (above, 1.0)
@@ -406,3 +455,7 @@ impl Lines {
         }
     }
 }
+
+#[cfg(test)]
+#[path = "lines_tests.rs"]
+mod tests;

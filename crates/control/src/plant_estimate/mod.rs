@@ -66,6 +66,9 @@ pub struct Adaptation {
     pub delay_estimate_samples: Option<[f64; 2]>,
     /// Where the tuning stands.
     pub mode: AdaptMode,
+    /// Periodic disturbances that the command cancels.
+    #[serde(skip)]
+    pub lines: usize,
     /// A change worth telling of, in this tick.
     #[serde(skip)]
     pub news: Option<AdaptNews>,
@@ -261,6 +264,7 @@ impl Adapter {
             gain_estimate: found.map(|f| [f.gain, f.gain_sd]),
             delay_estimate_samples: found.map(|f| [f.delay, f.delay_sd]),
             mode: state.force.mode,
+            lines: state.lines.count(),
             news: state.news.map(|news| news.in_ticks(self.interval)),
         }
     }

@@ -43,6 +43,19 @@ impl Held {
         }
     }
 
+    /// A tick, and the lines that are cancelled after it.
+    fn tick(&mut self) -> usize {
+        let input = LoopInput {
+            measurement: Some(self.rig.measure()),
+            preview_um: &self.preview,
+            ..LoopInput::default()
+        };
+        self.rig.advance(self.controller.step(&input).command_um);
+        let now = self.controller.adaptation();
+        self.told += usize::from(now.is_some_and(|now| now.news.is_some()));
+        now.map_or(0, |now| now.lines)
+    }
+
     /// Hold error over the bound from `from_s` on.
     fn over_bound(&mut self, seconds: f64, from_s: f64, flow: &dyn Fn(f64) -> f64) -> f64 {
         let ticks = |s: f64| (s / self.sample_s).round() as u64;
@@ -55,14 +68,7 @@ impl Held {
             if k >= from {
                 squares += self.rig.true_um().powi(2);
             }
-            let input = LoopInput {
-                measurement: Some(self.rig.measure()),
-                preview_um: &self.preview,
-                ..LoopInput::default()
-            };
-            self.rig.advance(self.controller.step(&input).command_um);
-            let news = self.controller.adaptation().and_then(|now| now.news);
-            self.told += usize::from(news.is_some());
+            self.tick();
         }
         let rms_um = (squares / (end - from) as f64).sqrt();
         rms_um / bound_rms_um(0.33, 0.0, 2e-3, self.sample_s)
@@ -186,7 +192,8 @@ fn every_periodic_flow_is_held_no_worse_than_without_and_most_as_if_there_were_n
                 1.0
             };
             let near = name.contains("and 41") && sample_s < 1e-3;
-            let cancelled = with < 1.15 * 1.02 * many || without < 1.2 || near;
+            // What adds less than a tenth to the hold error is not told from noise within seconds.
+            let cancelled = with < 1.15 * 1.02 * many || without < 1.1 * 1.12 || near;
             if with > most || !cancelled || told > 0 {
                 broken.push(format!(
                     "{name}, {sample_s} s: {without}, {with}, {told} told"
@@ -195,4 +202,37 @@ fn every_periodic_flow_is_held_no_worse_than_without_and_most_as_if_there_were_n
         }
     }
     assert!(broken.is_empty(), "{broken:#?}");
+}
+
+/// Lines found in hours of hold with nothing periodic in the flow, and the part of the time that they were there.
+fn false_lines(seed: u64, sample_s: f64, hours: f64) -> (usize, f64) {
+    let mut held = Held::new(lqg(), true, sample_s, seed);
+    let (mut found, mut before, mut there) = (0, 0, 0);
+    let ticks = (3600.0 * hours / sample_s) as u64;
+    for _ in 0..ticks {
+        let lines = held.tick();
+        found += lines.saturating_sub(before);
+        there += lines;
+        before = lines;
+    }
+    (found, there as f64 / ticks as f64)
+}
+
+#[test]
+fn at_rest_no_line_is_found_in_ten_minutes() {
+    let (found, _) = false_lines(5, 1e-3, 1.0 / 6.0);
+    assert_eq!(found, 0);
+}
+
+#[test]
+#[ignore = "thirty hours of hold at 1, 2 and 5 kHz: for the nightly run"]
+fn at_rest_fewer_lines_are_found_than_one_in_ten_hours() {
+    for sample_s in [1e-3, 5e-4, 2e-4] {
+        let of = |seed| false_lines(seed, sample_s, 5.0);
+        let stays = [of(1), of(2)];
+        let found: usize = stays.iter().map(|stay| stay.0).sum();
+        println!("{sample_s} s: {found} lines in 10 hours: {stays:?}");
+        // 0.4 are expected, and chance makes more than 2 once in 100.
+        assert!(found <= 2, "{sample_s} s: {stays:?}");
+    }
 }
