@@ -6,7 +6,7 @@ use crate::law::{ControlLaw, FAR_UM, LawInput, LawOutput};
 use crate::learning::Driven;
 use crate::limits::Limits;
 use crate::loop_io::{LoopFlags, LoopInput, LoopOutput, LoopParts, Measurement, Mode};
-use crate::plant_estimate::{AdaptState, Adaptation, Adapter, Told};
+use crate::plant_estimate::{AdaptState, Adaptation, Adapter, TickOutcome};
 use crate::tuning::Tuning;
 
 /// State of a loop whose law has the state `S`.
@@ -143,7 +143,7 @@ impl<L: ControlLaw> ControlLoop<L> {
 
     /// After the command of a tick: what it and the fix tell of the plant. A tuning that moved takes the states of estimator
     /// and law with it, so that the position believed and the command go on where they were.
-    fn adapt(&self, state: &mut LoopState<L::State>, told: &Told) {
+    fn adapt(&self, state: &mut LoopState<L::State>, told: &TickOutcome) {
         let (before, from) = (self.tuning(state), self.estimator_of(state));
         let (Some(adapter), Some(adapt)) = (&self.adapter, &mut state.adapt) else {
             return;
@@ -250,7 +250,7 @@ impl<L: ControlLaw> ControlLoop<L> {
         state.hidden_um = hidden_um;
         if state.adapt.is_some() {
             let estimate = &tick.law.estimate;
-            let told = Told {
+            let told = TickOutcome {
                 fix: tick.fix,
                 command_um: output.command_um,
                 chosen_um: if tick.controls {

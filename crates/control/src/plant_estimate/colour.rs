@@ -1,7 +1,7 @@
-//! What is left of the fixes may have a colour (a pump, the mains, a flow that wanders): its prediction from what was left before.
+//! Prediction of the residual of the fixes from its past: it may have a colour (a pump, the mains, a flow that wanders).
 //!
-//! All series of the regression go through the same filter, so that it changes no gain; a disturbance that can be predicted
-//! from its past then hides less of the motion that was chosen.
+//! All series of the regression pass the same filter, so it changes no gain. Without its predictable part a disturbance hides less of
+//! the dither.
 
 use super::evidence::MEMBERS;
 
@@ -9,9 +9,9 @@ use super::evidence::MEMBERS;
 const ORDER: usize = 8;
 /// Memory of the correlations, fixes: a line that drifts by one per cent in that time stays within the notch that it makes.
 const MEMORY_FIXES: f64 = 1000.0;
-/// Standard deviations of what is left from which on it counts for no more in the correlations.
+/// Residuals are clipped to this number of standard deviations in the correlations.
 const MOST: f64 = 4.0;
-/// Part of the variance that is taken for white: what a mean over [`MEMORY_FIXES`] does not know any better.
+/// Part of the variance that is taken for white: the relative error of a mean over [`MEMORY_FIXES`].
 const WHITE: f64 = 1.0 / MEMORY_FIXES;
 
 /// The series: fix, motion for each lag, instrument for each lag.
@@ -22,7 +22,7 @@ const SERIES: usize = 1 + 2 * MEMBERS;
 pub(super) struct Colour {
     correlations_um2: [f64; ORDER + 1],
     prediction: [f64; ORDER],
-    /// Mean square of what is left beside the prediction, um^2.
+    /// Mean square of the prediction error, um^2.
     pub white_um2: f64,
     left_um: [f64; ORDER],
     past_um: [[f64; SERIES]; ORDER],
@@ -43,7 +43,7 @@ impl Colour {
         }
     }
 
-    /// Takes what the past tells out of the series of a fix of which `left_um` is left.
+    /// Removes the part that the past predicts from the series of a fix with this residual.
     pub(super) fn take_out(&mut self, series: &mut [f64; SERIES], left_um: f64) {
         let now = *series;
         for (past, part) in self.past_um.iter().zip(self.prediction) {

@@ -13,7 +13,7 @@ pub(super) struct Dither {
     pub command_um: f64,
     /// The one of the last tick, which is held if no tick follows, um.
     pub given_um: f64,
-    /// What the model makes of it.
+    /// Motion of the model under the dither.
     pub motion: Motion,
     side: f64,
     stayed: u32,

@@ -1,29 +1,28 @@
 //! Evidence of gain and delay: moments of the whitened fixes with the whitened motion that was chosen.
 //!
-//! For lags `j` around the design's delay let `x_j` be the whitened motion that the model makes of the dither and the reference,
-//! `p_j` that of all commands, and `y` the whitened fix. `x` was chosen without regard to the fixes, so that it is independent of
-//! whatever shakes the bead, and `sum x_i y = gain * sum x_i p_j e_j(delay)` but for a term whose variance is that of
-//! the products `x r`, `r` being what the plant leaves of `y`. It is measured in blocks, longer than `x` remembers, so that the
-//! colour of the disturbance is in it.
+//! Let `j` be lags around the design's delay, `x_j` the whitened motion of the model under the dither and the reference, `p_j` that under
+//! all commands, and `y` the whitened fix. `x` does not depend on the fixes, so it is independent of the disturbance:
+//! `sum x_i y = gain * sum x_i p_j e_j(delay)`, plus a term with the variance of the products `x r`, where `r` is the residual of `y`.
+//! That variance is measured in blocks that are longer than the correlation of `x`, so it includes the colour of the disturbance.
 
 /// Lags of the instrument beyond the design's delay, samples. A position between two ticks is on the line through them, so that
 /// any delay between the first and the last is in their span.
 pub(super) const LAGS: [f64; MEMBERS] = [-1.0, 0.0, 1.0, 2.0];
 /// How many.
 pub(super) const MEMBERS: usize = 4;
-/// Fixes of a block: ten times the 3 ticks for which whitened binary dither is correlated with itself hold all but a tenth of the
-/// correlation of neighbouring products.
+/// Fixes of a block. Whitened binary dither is correlated with itself over 3 ticks; a block of five times that has all but a tenth of
+/// the correlation of neighbouring products.
 const BLOCK: u32 = 16;
-/// Memory, s. With the dither at one per cent of hold error a second tells the gain to 0.18 of it; a memory of five to 0.057, and it ages
-/// by less than that at [`GAIN_WALK`].
+/// Memory, s. With the dither at one per cent of hold error the gain is known to 0.18 after a second. A memory of five seconds knows it to
+/// 0.057. At [`GAIN_WALK`] the gain changes by less in that time.
 const MEMORY_S: f64 = 5.0;
 /// Jumps that are looked for: the ratio of gains, and the change of delay, samples. Half way to each is four standard deviations of
 /// the estimate, so that its own error starts no search; of less the memory tells in its time.
 const JUMPS: [(f64, f64); 4] = [(2.0, 0.0), (0.5, 0.0), (1.0, 1.0), (1.0, -1.0)];
 /// Time after which Page's test of a jump finds one by chance, s; it costs a second in which less is known.
 const CHANCE_S: f64 = 1200.0;
-/// Memory, s, of what the last blocks say beside the estimate: where they leave it by more than chance the estimate is as uncertain as that
-/// before the test of a jump has decided. A change of half the gain is two of its standard deviations.
+/// Memory of the newest blocks, s. If they leave the estimate by more than chance, their distance is added to its uncertainty until the
+/// test of a jump has decided. A change of half the gain is two standard deviations of this memory.
 const FAST_S: f64 = 1.0;
 /// Standard deviations of the estimate by which a jump must leave it.
 const APART: f64 = 2.5;
@@ -46,7 +45,7 @@ struct Sums {
     /// `sum x y`, `sum x p`.
     xy: Vector,
     xp: Matrix,
-    /// Squares of what blocks leave, and of what their fixes leave, weights squared.
+    /// Squares of the residuals of blocks and of fixes, with weights squared.
     blocks: Matrix,
     fixes: Matrix,
     /// Blocks, and the same with weights squared.
@@ -60,7 +59,7 @@ pub(super) struct Finding {
     /// Gain over the model's, and its standard deviation.
     pub gain: f64,
     pub gain_sd: f64,
-    /// The latter but for what the last blocks say beside it.
+    /// That standard deviation without the distance of the newest blocks.
     own_sd: f64,
     /// Delay beyond the design's, samples, and its standard deviation.
     pub delay: f64,
@@ -111,7 +110,7 @@ struct Jump {
     from: (f64, f64),
 }
 
-/// What the last blocks say of the gain beside the estimate: sums of scores, of their information, and of that with weights squared.
+/// The gain of the newest blocks compared with the estimate: sums of scores, of their information, and of that with weights squared.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 struct Fast {
     score: f64,
@@ -126,7 +125,7 @@ impl Fast {
         self.squares = keep * keep * self.squares + information;
     }
 
-    /// Square by which the gain left the estimate beyond what chance makes of it.
+    /// Square of the distance of the gain from the estimate, less the part that chance explains.
     fn beyond(&self) -> f64 {
         if self.information <= 0.0 {
             return 0.0;
@@ -147,12 +146,12 @@ pub(super) struct Evidence {
     pub found: Option<Finding>,
 }
 
-/// What a fix tells.
+/// The series of a fix.
 pub(super) struct Products {
     pub y_um: f64,
     pub p_um: Vector,
     pub x_um: Vector,
-    /// What the plant leaves of `y`, um.
+    /// Residual of `y`, um.
     pub left_um: f64,
     /// Of a fix that is too far off for its noise less is taken.
     pub weight: f64,
@@ -213,7 +212,7 @@ impl Evidence {
         }
     }
 
-    /// Page's test of each jump, from where the estimate stood when its evidence began. Nothing of what was before is then worth anything.
+    /// Page's test of each jump, from the estimate at which its evidence began. After a jump the memory starts anew.
     fn look_for_a_jump(&mut self, block: &Sums, found: &Finding, block_s: f64) {
         let quiet = (found.gain.max(0.1), found.delay);
         let of = |xp: &Matrix, by: &Vector| -> f64 {
@@ -282,7 +281,7 @@ impl Sums {
         self.n2 = keep2 * self.n2 + 1.0;
     }
 
-    /// What this memory says; `None` where it holds too little.
+    /// The estimate from this memory; `None` if it has too few blocks.
     fn finding(&self, in_force: f64, least: f64, block_s: f64) -> Option<Finding> {
         if self.n2 <= 0.0 {
             return None;
@@ -342,7 +341,7 @@ impl Sums {
         let (gain, delay) = (mean / sum, at / sum);
         // From sums to the mean of a block.
         let score = columns.map(|a| backward(&l, &a).map(|w| w * self.n2 / self.n));
-        // A mean with exponential weights is half its memory old, a quarter of what its blocks span.
+        // The age of a mean with exponential weights is half its memory, a quarter of the time of its blocks.
         let walk2 = (GAIN_WALK * gain).powi(2) * 0.25 * n * block_s;
         let gain_sd = ((square / sum - gain * gain).max(0.0) + walk2).sqrt();
         Some(Finding {
@@ -357,7 +356,7 @@ impl Sums {
     }
 }
 
-/// Factor of a variance; `None` where there is none at all.
+/// Factor of a variance; `None` if it is zero.
 fn cholesky(v: &Matrix) -> Option<Matrix> {
     let trace: f64 = (0..MEMBERS).map(|i| v[i][i]).sum();
     if trace.is_nan() || trace <= 0.0 {

@@ -1,4 +1,4 @@
-//! What a fix tells.
+//! A fix enters the estimate.
 
 use super::evidence::{MEMBERS, Products, dot, weights};
 use super::retuning::DELAYS;
@@ -12,18 +12,18 @@ const FAR: f64 = 3.0;
 const USUAL_FIXES: f64 = 2000.0;
 /// Memory of the mean square that is left now, fixes: three periods of the ringing that a gain that doubled makes.
 const NOW_FIXES: f64 = 60.0;
-/// The residual is larger than noise above so many times the usual mean square: ten standard deviations of a mean of that many
-/// squares would be 2.3.
+/// Mean square of the residual, over the usual one, above which it is larger than noise: ten standard deviations of a mean of
+/// [`NOW_FIXES`] squares would be 2.3.
 const LOUD: f64 = 2.5;
-/// Below this part of it the bead does not wander, and something holds it.
+/// Below this part of the usual mean square the bead does not wander: something holds it.
 const STILL: f64 = 0.5;
-/// Logarithm of the gain to which caution goes without knowing why: from 1.3 times the design's gain on a plant of twice that gain
-/// is held with Ms below 2, and a line is not answered by more.
+/// Largest logarithm of the gain to which caution goes before the estimate knows the cause. A law for 1.3 times the design's gain holds a
+/// plant of twice that gain with Ms below 2. A line causes no larger change.
 const ENOUGH: f64 = 0.26;
 /// Standard deviations by which the motion of the loop's own commands asks for caution.
 const CAUTION: f64 = 6.0;
 
-/// How much is left, now and usually, and what the loop's own commands have to do with it.
+/// Mean squares of the residual, now and usually, and their correlation with the loop's own commands.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Noise {
     usual_um2: f64,
@@ -46,7 +46,7 @@ impl Noise {
         }
     }
 
-    /// A fix beside the tuning in force. How far the logarithm of the gain must rise for caution.
+    /// Adds a fix. Gives the rise of the logarithm of the gain in force that caution asks for.
     fn add(&mut self, y: f64, p: f64, gain: f64) -> f64 {
         let keep = 1.0 - 1.0 / NOW_FIXES;
         self.yy = keep * self.yy + y * y;
@@ -66,7 +66,7 @@ impl Noise {
         }
     }
 
-    /// Mean square that is left beside a gain now, um^2.
+    /// Mean square of the residual for a gain now, um^2.
     fn left(&self, gain: f64) -> f64 {
         let left = self.yy - 2.0 * gain * self.py + gain * gain * self.pp;
         left.max(0.0) / self.n.max(1.0)

@@ -1,10 +1,10 @@
-//! Periodic disturbances (strokes of a pump and their harmonics, mains hum, a fan): detected in the residual of the fixes, tracked in
-//! amplitude, phase and frequency, and cancelled by the command.
+//! Periodic disturbances: strokes of a pump and their harmonics, mains hum, a fan. They are detected in the residual of the fixes, tracked
+//! in amplitude, phase and frequency, and cancelled by the command.
 //!
-//! Each line is an oscillator in the disturbance model. The residual of the fixes passes the filter of [`super::whiten`]; an error `dz` of
-//! an oscillator appears in it as `Re(S dz)` plus white noise, with `S` the response of that filter at the line's frequency. A Kalman
+//! Each line is an oscillator in the disturbance model. The residual of the fixes passes the filter of [`super::whiten`]; there an
+//! error `dz` of an oscillator is `Re(S dz)` plus white noise, with `S` the response of that filter at the line's frequency. A Kalman
 //! filter of amplitude, phase, frequency and drift of the frequency follows from that. The command cancels the line through the inverse of
-//! the model, and neither the estimator nor the regression is told of that part: disturbance and command cancel each other. A line is
+//! the model. Estimator and regression leave this part of the command out, because the disturbance cancels it. A line is
 //! accepted if its peak in a spectrum exceeds the neighbouring bins beyond chance, and removed if its amplitude is no larger than chance.
 //!
 //! Amplitudes are in units of the command (bead motion over the gain in force): they stay valid when the gain in force changes.
@@ -30,20 +30,20 @@ const ONE_LINE: f64 = 1.5;
 /// Bins on either side, beyond the main lobe. The median of all is the background: 11 Hz, of which the harmonics of a pump of 3 Hz fill less
 /// than half.
 const BESIDE: std::ops::RangeInclusive<usize> = 3..=22;
-/// The nearest of them, and the power of a peak over their mean from which on it is narrow. A tone that fills 0.4 of the window has 20 and one
-/// that fills half of it 41; before that two tones are one peak. Of two tones 1 Hz apart in a whole window one or both have it nine times in ten.
+/// Number of nearest bins on a side, and the ratio of a peak to their mean above which it is narrow. A tone that fills 0.4 of the window
+/// reaches 20, one that fills half the window 41; in less time two tones 1 Hz apart are one peak. Later nine in ten windows separate them.
 const SKIRT: usize = 6;
 const NARROW: f64 = 34.0;
-/// Mean time between two lines that are none, s: 28 hours.
+/// Mean time between two false positives, s: 28 hours.
 const FALSE_S: f64 = 1e5;
 /// Memory of amplitude and phase, s: a line that stops is gone in that time, and each line adds 0.3 % to the hold error.
 const MEMORY_S: f64 = 0.5;
-/// Standard deviations of a new line: amplitude, um (the largest that a loop follows), and frequency, bins (interpolated peak of a
-/// line that fills a part of the window).
+/// Standard deviations of a new line. Amplitude, um: the largest that a loop follows. Frequency, bins: the interpolated peak of a line
+/// that fills a part of the window.
 const FIRST_UM: f64 = 1.0;
 const FIRST_BINS: f64 = 0.25;
-/// Square of an amplitude over its variance below which a line is removed: two standard deviations. What chance made is then gone within a
-/// second.
+/// Square of an amplitude over its variance below which a line is removed: two standard deviations. A false positive is then
+/// removed within a second.
 const GONE: f64 = 4.0;
 /// Relative drift of a frequency, 1/s: a motor that warms up; and the time in which it changes by as much, s.
 const DRIFT_PER_S: f64 = 0.01;
@@ -76,7 +76,7 @@ struct Line {
     across: [[f64; 3]; 3],
 }
 
-/// What a fix tells of a line.
+/// A fix as a line sees it.
 struct Residual {
     left_um: f64,
     noise_um2: f64,
@@ -121,7 +121,7 @@ fn unit(angle: f64) -> [f64; 2] {
 }
 
 impl LineSettings {
-    /// For a loop of this sample time, s, and so many ticks from fix to fix.
+    /// For a loop of this sample time, s, and `interval` ticks from fix to fix.
     pub(super) fn new(sample_s: f64, interval: f64) -> Self {
         let ticks = (SAMPLE_S / sample_s).max(interval).round().max(1.0);
         let highest = (HIGHEST_HZ * WINDOW as f64 * ticks * sample_s) as usize;
@@ -150,8 +150,8 @@ impl LineSettings {
 
 /// Power over the median of `bins` bins of background that chance exceeds in one peak of `exp(looks)`.
 ///
-/// The power in a bin of noise is exponential. Under Hann's window it has a correlation of 4/9 with the next and of 1/36 with the second, so that the
-/// bins are worth `many` independent ones, of which the smallest has a mean of `1/many`, the next of `1/(many - 1)` more, and so on.
+/// The power in a bin of noise is exponential. Under Hann's window its correlation with the next bin is 4/9 and with the second 1/36, so the
+/// bins are worth `many` independent ones. The smallest of `many` powers has a mean of `1/many`, the next one `1/(many - 1)` more.
 fn peak_over_median(bins: usize, looks: f64) -> f64 {
     let many = (bins as f64 / (1.0 + 8.0 / 9.0 + 2.0 / 36.0)).floor();
     let median = (many / 2.0).ceil() as usize;
@@ -410,7 +410,7 @@ impl Lines {
             if own < below || own <= above {
                 continue;
             }
-            // At a low frequency those above take the place of those that are missing below.
+            // At a low frequency bins above take the place of the missing bins below.
             let first = (bin - *BESIDE.end() as i64).max(1);
             let others = (first..=first + width).filter(|other| (other - bin).abs() >= aside);
             let mut beside = [f64::INFINITY; 2 * *BESIDE.end() + 1];

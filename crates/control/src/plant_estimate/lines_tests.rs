@@ -1,4 +1,4 @@
-//! How often a line is found where there is none, and how long one is kept that is none any more.
+//! Rate of false positives in white noise, and the time until one is removed.
 
 use super::*;
 use cellpos_numeric::Random;

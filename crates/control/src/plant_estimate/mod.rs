@@ -1,15 +1,14 @@
-//! The estimate of the plant: gain and delay, while the loop runs, and what of them comes into force.
+//! The estimate of the plant's gain and delay while the loop runs, and the tuning that follows it.
 //!
-//! In a closed loop the command answers whatever shakes the bead, and a disturbance of the right colour is no different from a gain
-//! that fell or rose, for any estimate from fixes and commands alone. So the loop always moves the bead a little, at random
-//! ([`dither`]): what of the fixes goes with a motion that was chosen without regard to them is the plant's, whatever else
-//! shakes the bead. The dither is an instrument in the sense of instrumental variables, and so is a reference. The regression is
-//! that of [`evidence`]; the commands drive the model beside the loop ([`motion`]), and all series go through one filter that
-//! makes white noise of Brownian motion, drift and localisation noise ([`whiten`]), so that as much as can be is known of each fix.
+//! In a closed loop the command answers the disturbance. Fixes and commands alone cannot tell a disturbance of the right colour from a
+//! change of the gain. So the loop always moves the bead a little, at random ([`dither`]). The part of the fixes that correlates with
+//! this motion gives the plant's gain, whatever the disturbance. The dither is an instrument in the sense of instrumental variables,
+//! and so is a reference. The regression is in [`evidence`]. A model driven by the commands gives its inputs ([`motion`]). One filter
+//! whitens all series: it makes white noise of Brownian motion, drift and localisation noise ([`whiten`]).
 //!
-//! **In force.** See [`retuning`]. The law itself is not made again: a plant of `g` times the gain is the plant of the design
-//! for displacements counted in units of `1/g`, so that estimator, feedback, feed-forward and the plan of MPC stay those of the
-//! design, in other units; the delay changes the estimator, of which there is one for each, and the gains of PI.
+//! **In force.** See [`retuning`]. The law is not designed again. A plant with `g` times the gain is the plant of the design if
+//! displacements are counted in units of `1/g`. Estimator, feedback, feed-forward and the plan of MPC stay those of the design, in other
+//! units. For each delay there is an estimator; the gains of PI change with it.
 
 mod colour;
 mod dither;
@@ -32,7 +31,7 @@ use evidence::Evidence;
 use lines::{LineSettings, Lines};
 use motion::Motion;
 pub use retuning::{AdaptMode, AdaptNews};
-use retuning::{DELAYS, Force, NOMINAL, TUNINGS};
+use retuning::{DELAYS, NOMINAL, Retuning, TUNINGS};
 use serde::Serialize;
 use whiten::{Covariance, Track, Whitener};
 
@@ -46,8 +45,8 @@ pub const ADAPT_COLUMNS: [&str; 6] = [
     "adapt_dither_um",
 ];
 
-/// Standard deviation of the logarithm of the gain above which the dither is louder, and by how much at most: something shakes the
-/// bead more than noise does, or the plant has just changed, and then it costs four times as much for some seconds.
+/// Standard deviation of the logarithm of the gain above which the dither is louder, and its largest factor. The estimate is this vague
+/// under a strong disturbance or just after a change of the plant. The dither then costs four times as much for some seconds.
 const KNOWN: f64 = 0.075;
 const LOUDEST: f64 = 2.0;
 /// Part of the stated uncertainty of the gain that stays, whatever is found.
@@ -69,7 +68,7 @@ pub struct Adaptation {
     /// Periodic disturbances that the command cancels.
     #[serde(skip)]
     pub lines: usize,
-    /// A change worth telling of, in this tick.
+    /// A change that this tick reports.
     #[serde(skip)]
     pub news: Option<AdaptNews>,
 }
@@ -115,19 +114,19 @@ pub struct AdaptState {
     /// The model on the path that cancels the lines, and its next command, um; `None` while the loop does not control the bead.
     inverse: Option<FeedForwardState>,
     cancel_um: f64,
-    force: Force,
+    force: Retuning,
     news: Option<AdaptNews>,
 }
 
-/// What the estimate is told of a tick.
-pub(crate) struct Told {
+/// A tick as the estimate sees it.
+pub(crate) struct TickOutcome {
     /// The fix that came, whether or not it was used.
     pub fix: Option<Fix>,
     /// Command that takes effect now, um of PZT.
     pub command_um: f64,
-    /// Part of it that was chosen without regard to the fixes, but for the dither, um of PZT.
+    /// Part of the command that does not depend on the fixes, without the dither, um of PZT.
     pub chosen_um: f64,
-    /// Part of it that cancels the lines in the flow, um of PZT.
+    /// Part of the command that cancels the lines in the flow, um of PZT.
     pub cancel_um: f64,
     /// The law decides, and nothing holds the bead.
     pub free: bool,
@@ -184,7 +183,7 @@ impl Adapter {
             lines: Lines::new(),
             inverse: None,
             cancel_um: 0.0,
-            force: Force::default(),
+            force: Retuning::default(),
             news: None,
         }
     }
@@ -210,8 +209,8 @@ impl Adapter {
         }
     }
 
-    /// How uncertain the gain in force is, as a part of `stated`: two standard deviations of the estimate and what is in force
-    /// beside it. All of it while nothing is known.
+    /// Uncertainty of the gain in force as a part of `stated`: two standard deviations of the estimate, plus its distance from the gain in
+    /// force. 1 before the gain was measured.
     pub(crate) fn gain_doubt(&self, state: &AdaptState, stated: f64) -> f64 {
         let sure = state.force.mode != AdaptMode::Learning;
         let Some(found) = state
@@ -271,20 +270,20 @@ impl Adapter {
 
     /// After the command of a tick: learns from the fix, and moves the tuning where it may. The tuning that it leaves is that
     /// of the next tick.
-    pub(crate) fn step(&self, state: &mut AdaptState, told: &Told) {
+    pub(crate) fn step(&self, state: &mut AdaptState, tick: &TickOutcome) {
         state.news = None;
-        let learned = self.learn(state, told.fix.filter(|_| told.free));
-        let rest_um = told.command_um - told.cancel_um;
-        let finite = self.drive(state, rest_um, told.chosen_um);
+        let learned = self.learn(state, tick.fix.filter(|_| tick.free));
+        let rest_um = tick.command_um - tick.cancel_um;
+        let finite = self.drive(state, rest_um, tick.chosen_um);
         state.lines.tick(&self.lines);
-        self.cancel_lines(state, told.free);
-        if !told.free {
+        self.cancel_lines(state, tick.free);
+        if !tick.free {
             state.force.wait();
             state.dither.rest();
         }
         if !finite {
             let force = state.force;
-            *state = self.start(told.command_um);
+            *state = self.start(tick.command_um);
             state.force = force;
         }
         if learned {
@@ -299,7 +298,7 @@ impl Adapter {
     /// A tick that never came: the command was held.
     pub(crate) fn skip(&self, state: &mut AdaptState, command_um: f64) {
         self.learn(state, None);
-        // The command that cancels the lines should have changed, and what it lacks moves the bead.
+        // The command that cancels the lines should have changed; the difference moves the bead.
         let rest_um = command_um - state.cancel_um;
         let finite = state.model.drive(&self.nominal, rest_um)
             && (state.instrument).drive(&self.nominal, state.dither.given_um)
@@ -350,7 +349,7 @@ impl Adapter {
     }
 }
 
-/// The estimator for so many more samples of delay; `None` where there is none.
+/// The estimator for `extra` more samples of delay; `None` if the delay would be negative.
 fn delayed(config: EstimatorConfig, model: LoopModel, extra: f64) -> Option<Estimator> {
     let delay_s = model.delay_s + extra * model.sample_time_s;
     if delay_s < -1e-9 {
@@ -359,5 +358,5 @@ fn delayed(config: EstimatorConfig, model: LoopModel, extra: f64) -> Option<Esti
     Estimator::new(config, LoopModel { delay_s, ..model }).ok()
 }
 
-/// Checks that nominal is where it is said to be.
+/// The nominal delay is the design's.
 const _: () = assert!(DELAYS[NOMINAL] == 0.0);

@@ -1,4 +1,4 @@
-//! The model, driven with commands beside the loop, and what of its motion was not to be foreseen.
+//! A model driven by the commands, and the innovations of its motion.
 
 use super::evidence::{LAGS, MEMBERS};
 use super::whiten::{Correction, Track, Whitener};
@@ -14,7 +14,7 @@ pub(super) struct Motion {
     model: PredictedState,
     /// Positions of the model at this tick and those before, newest first, um.
     past_um: [f64; PAST],
-    /// What the command moved the model at once at the tick before each of these, um.
+    /// Jump of the model by the direct feedthrough at the tick before each of these positions, um.
     jumps_um: [f64; PAST],
     tracks: Option<[Track; MEMBERS]>,
 }
@@ -46,7 +46,7 @@ impl Motion {
         self.past_um[0].is_finite()
     }
 
-    /// Position so many ticks ago, um: between ticks the bead jumps by the direct feedthrough and then moves evenly.
+    /// Position `ago` ticks ago, um: between ticks the bead jumps by the direct feedthrough and then moves evenly.
     fn past(&self, ago: f64) -> Option<f64> {
         let newer = ago.max(0.0).floor();
         let (part, newer) = (ago.max(0.0) - newer, newer as usize);
@@ -59,7 +59,7 @@ impl Motion {
         &self.model
     }
 
-    /// Position at the exposure of a fix that is `delay` ticks old, um; `None` where that is not known any more.
+    /// Position at the exposure of a fix that is `delay` ticks old, um; `None` if that is longer ago than is kept.
     pub(super) fn seen(&self, delay: f64, exposure: f64) -> Option<f64> {
         exposure::mean(delay, exposure, |ago| self.past(ago))
     }
@@ -79,7 +79,7 @@ impl Motion {
         self.tracks = Some(at_um.map(Whitener::begin));
     }
 
-    /// What of the positions was not to be foreseen; `None` before [`Motion::begin`].
+    /// Innovations of the positions; `None` before [`Motion::begin`].
     pub(super) fn innovations(
         &self,
         fix: &Correction,

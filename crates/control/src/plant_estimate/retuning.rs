@@ -1,4 +1,4 @@
-//! What of an estimate comes into force, and how fast.
+//! The tuning follows the estimate.
 //!
 //! Towards caution (more gain than believed) at once and all the way; towards boldness slowly, and to the near end of the estimate's
 //! interval only. While the two agree the tuning settles at the estimate, no faster than the estimate itself changes.
@@ -11,17 +11,17 @@ use serde::Serialize;
 #[serde(rename_all = "kebab-case")]
 #[repr(u8)]
 pub enum AdaptMode {
-    /// Too little motion so far to say anything of the plant, or nothing to learn from: the bead is lost or held by something, or
-    /// the loop does not control it. Nothing changes.
+    /// Too little motion so far, or nothing to learn from: the bead is lost or held by something, or the loop does not control it.
+    /// Nothing changes.
     #[default]
     Learning = 0,
-    /// What is in force agrees with the estimate.
+    /// The tuning in force agrees with the estimate.
     Known = 1,
-    /// The estimate has left what is in force, which is on its way to it.
+    /// The estimate has left the tuning in force, which is on its way to it.
     Uncertain = 2,
 }
 
-/// Delays that the law is tuned to beside the design's, samples.
+/// Delays that the law can be tuned to, beyond the design's, samples.
 pub(super) const DELAYS: [f64; TUNINGS] = [-1.0, -0.5, 0.0, 0.5, 1.0, 1.5];
 /// How many.
 pub(super) const TUNINGS: usize = 6;
@@ -29,8 +29,8 @@ pub(super) const TUNINGS: usize = 6;
 pub(super) const NOMINAL: usize = 2;
 /// Gains, over the design's, that the law is tuned to.
 const GAINS: [f64; 2] = [0.4, 2.5];
-/// Standard deviations off the estimate at which the tuning sets out, towards caution and towards boldness; of a vague estimate, whose
-/// logarithm is known to this, twice as many. The way towards boldness ends at the last.
+/// Distance from the estimate at which the tuning sets out, towards caution and towards boldness, standard deviations. If the logarithm is
+/// known to [`VAGUE`] only, it is twice that. The way towards boldness ends at [`ARRIVED`].
 const SET_OUT: [f64; 2] = [1.5, 2.0];
 const VAGUE: f64 = 0.2;
 const ARRIVED: f64 = 0.7;
@@ -43,11 +43,12 @@ const DOWN_PER_TICK: f64 = 0.001;
 const DELAY_SURE: [f64; 2] = [3.0, 8.0];
 /// Ticks between two changes of the delay.
 const DELAY_TICKS: u16 = 20;
-/// What is told of: change of the logarithm of the gain; and how sure, standard deviations.
-const TOLD_GAIN: f64 = 0.14;
-const TOLD_SURE: f64 = 5.0;
+/// A change of the gain that is reported: of its logarithm, and of how many standard deviations. The tuning, and a standard deviation of the
+/// estimate, must first be within half of that change of the estimate, so that one step is reported once.
+const REPORTED_GAIN: f64 = 0.14;
+const REPORTED_SURE: f64 = 5.0;
 
-/// A change of the tuning that is worth telling of.
+/// A change of the tuning that a run reports.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct AdaptNews {
     /// Gain in force before and now, over the design's.
@@ -59,7 +60,7 @@ pub struct AdaptNews {
 }
 
 impl AdaptNews {
-    /// With times in ticks, of which there are so many from fix to fix.
+    /// With times in ticks, `interval` from fix to fix.
     pub(super) fn in_ticks(self, interval: f64) -> Self {
         Self {
             ticks: (self.ticks as f64 * interval).round() as u64,
@@ -70,18 +71,18 @@ impl AdaptNews {
 
 /// The tuning in force, and how it came to be.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Force {
+pub(super) struct Retuning {
     pub log_gain: f64,
     pub member: usize,
     pub mode: AdaptMode,
     moving: bool,
     since_delay: u16,
-    told: (f64, usize),
-    /// Ticks since what is in force left what was told.
+    reported: (f64, usize),
+    /// Ticks since the tuning in force left the one reported last.
     away: u64,
 }
 
-impl Default for Force {
+impl Default for Retuning {
     fn default() -> Self {
         Self {
             log_gain: 0.0,
@@ -89,13 +90,13 @@ impl Default for Force {
             mode: AdaptMode::Learning,
             moving: false,
             since_delay: u16::MAX,
-            told: (0.0, NOMINAL),
+            reported: (0.0, NOMINAL),
             away: 0,
         }
     }
 }
 
-impl Force {
+impl Retuning {
     /// A tick in which nothing may change.
     pub(super) fn wait(&mut self) {
         self.mode = AdaptMode::Learning;
@@ -162,34 +163,36 @@ impl Force {
         true
     }
 
-    /// What is worth telling of after this tick.
+    /// The change to report after this tick, if any.
     pub(super) fn news(&mut self, found: Option<&Finding>) -> Option<AdaptNews> {
-        let (told_gain, told_member) = self.told;
-        let gain_off = (self.log_gain - told_gain).abs();
-        let moved = gain_off > 0.02 || self.member != told_member;
+        let (reported_gain, reported_member) = self.reported;
+        let gain_off = (self.log_gain - reported_gain).abs();
+        let moved = gain_off > 0.02 || self.member != reported_member;
         self.away = if moved {
             self.away.saturating_add(1)
         } else {
             0
         };
         let found = found?;
-        if self.moving {
+        let off = (found.log_gain() - self.log_gain).abs();
+        if self.moving || off.max(found.log_sd()) > 0.5 * REPORTED_GAIN {
             return None;
         }
-        let sure = (found.log_gain() - told_gain).abs() > TOLD_SURE * found.log_sd();
-        let gain = gain_off > TOLD_GAIN && sure;
-        let late = DELAYS[self.member] - DELAYS[told_member];
+        let sure = (found.log_gain() - reported_gain).abs() > REPORTED_SURE * found.log_sd();
+        let gain = gain_off > REPORTED_GAIN && sure;
+        let late = DELAYS[self.member] - DELAYS[reported_member];
         let delay = late.abs() >= 0.5
-            && found.ratio(found.delay, DELAYS[told_member]) > 0.5 * TOLD_SURE * TOLD_SURE;
+            && found.ratio(found.delay, DELAYS[reported_member])
+                > 0.5 * REPORTED_SURE * REPORTED_SURE;
         if !(gain || delay) {
             return None;
         }
         let news = AdaptNews {
-            gain: [told_gain.exp(), self.log_gain.exp()],
-            delay_samples: [DELAYS[told_member], DELAYS[self.member]],
+            gain: [reported_gain.exp(), self.log_gain.exp()],
+            delay_samples: [DELAYS[reported_member], DELAYS[self.member]],
             ticks: self.away,
         };
-        self.told = (self.log_gain, self.member);
+        self.reported = (self.log_gain, self.member);
         self.away = 0;
         Some(news)
     }

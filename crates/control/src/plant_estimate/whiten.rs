@@ -19,14 +19,14 @@ pub(super) struct Whitener {
     /// Gain of such a fix on position and drift, and the ticks between two.
     gain: [f64; 2],
     ticks: f64,
-    /// Variance of what it makes of the wandering where fixes come as they should, um^2.
+    /// Variance of the innovations if fixes come regularly, um^2.
     pub noise_um2: f64,
 }
 
 /// Covariance after a fix: position, both, drift; um^2.
 pub(super) type Covariance = [f64; 3];
 
-/// What a fix does to every series: they were filtered alike and are.
+/// Correction of every series by a fix: all pass the same filter.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Correction {
     /// Ticks since the fix before.
@@ -47,7 +47,7 @@ pub(super) struct Track {
 }
 
 impl Whitener {
-    /// For variances per tick of the walk and of the drift's change, and of a fix, um^2, of which one comes every so many ticks.
+    /// For variances per tick of the walk and of the drift's change, and of a fix, um^2, with `ticks` from fix to fix.
     pub(super) fn new(
         walk_um2: f64,
         drift_um2: f64,
@@ -101,7 +101,7 @@ impl Whitener {
         self.settled
     }
 
-    /// What a fix of this variance, um^2, does so many ticks after the one before.
+    /// Correction by a fix of this variance, um^2, `ticks` after the one before.
     pub(super) fn correction(
         &self,
         [pp, pd, dd]: Covariance,
@@ -141,7 +141,7 @@ fn corrected([pp, pd, dd]: Covariance, fix_um2: f64) -> ([f64; 2], Covariance) {
 }
 
 impl Correction {
-    /// What of a value was not to be foreseen.
+    /// Innovation of a value.
     pub(super) fn innovation(&self, track: &Track, value: f64) -> f64 {
         value - (track.at + track.drift * self.ticks)
     }
