@@ -3,7 +3,7 @@
 //!
 //! A fix tells where the bead was when its frame was exposed. Between two fixes the estimate tells, with its uncertainty. If the
 //! second fix is of the same bead, the way between them is that of the estimate, bent to meet the fix, and its uncertainty is that
-//! of a Brownian bridge.
+//! of a Brownian bridge. A bead that does not feel the commands goes on as its last fixes went.
 
 use crate::life::Request;
 use crate::tick_record::{TickFlags, TickRecord};
@@ -185,6 +185,32 @@ struct Seen {
     error_um: f64,
 }
 
+/// A bead that does not feel the commands goes on as it goes: the way from the first fix of that time to the last.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Adrift {
+    first: Seen,
+    last: Seen,
+}
+
+impl Adrift {
+    /// Error at a time after the last fix and its standard deviation, um, for a bead whose walk has this variance in a second.
+    fn error_um(&self, now_ns: i64, walk_um2_per_s: f64) -> (f64, f64) {
+        let seconds = |from_ns: i64, to_ns: i64| (to_ns - from_ns) as f64 * 1e-9;
+        let watched_s = seconds(self.first.time_ns, self.last.time_ns);
+        let since_s = seconds(self.last.time_ns, now_ns);
+        if watched_s <= 0.0 {
+            return (self.last.error_um, (walk_um2_per_s * since_s).sqrt());
+        }
+        let speed = (self.last.error_um - self.first.error_um) / watched_s;
+        // Its own walk, and what the walk meanwhile left unknown of its speed.
+        let variance_um2 = walk_um2_per_s * since_s * (1.0 + since_s / watched_s);
+        (
+            self.last.error_um + speed * since_s,
+            variance_um2.max(0.0).sqrt(),
+        )
+    }
+}
+
 /// Watches how a run keeps its bead, record by record.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(crate) struct KeepWatch {
@@ -209,6 +235,7 @@ pub(crate) struct KeepWatch {
     /// Since when the bead has been frozen: nothing drives it back.
     frozen_since_ns: Option<i64>,
     clipped: bool,
+    adrift: Option<Adrift>,
 }
 
 impl KeepWatch {
@@ -234,6 +261,7 @@ impl KeepWatch {
         self.blind_over(self.last_ns);
         self.gap = Gap::default();
         (self.seen, self.still, self.between) = (None, None, 0);
+        self.adrift = None;
         (self.outside, self.away) = (0.0, false);
     }
 
@@ -252,8 +280,13 @@ impl KeepWatch {
         } else if record.flags.has(TickFlags::BETWEEN) && self.gap.ticks == 0.0 {
             self.between = self.between.saturating_add(1);
         } else {
-            let off_um = record.estimate_um - record.target_um;
-            let sd_um = record.estimate_sd_um.max(0.0);
+            let (off_um, sd_um) = match &self.adrift {
+                Some(adrift) => adrift.error_um(record.time_ns, self.walk_um2(1.0)),
+                None => (
+                    record.estimate_um - record.target_um,
+                    record.estimate_sd_um.max(0.0),
+                ),
+            };
             if off_um.is_finite() {
                 self.gap.add(off_um, sd_um, self.limit_um(f64::NAN));
                 self.gap_counts = counts;
@@ -313,9 +346,14 @@ impl KeepWatch {
         let walked_um = self.limit_um(record.variance_um2.max(0.0) + walk_um2);
         let strayed = self.outside_since(error_um, walked_um, record.time_ns);
         self.judge(strayed, error_um, record.time_ns);
-        self.seen = Some(Seen {
+        let seen = Seen {
             time_ns: record.time_ns,
             error_um,
+        };
+        self.seen = Some(seen);
+        self.adrift = record.flags.has(TickFlags::CLIPPED).then_some(Adrift {
+            first: self.adrift.map_or(seen, |adrift| adrift.first),
+            last: seen,
         });
     }
 

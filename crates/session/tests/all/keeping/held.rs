@@ -6,7 +6,7 @@ use cellpos_emulator::{FaultEvent, FaultKind};
 use cellpos_runtime::{EndRule, Event, RunSink, Statistics, TickFlags, TickRecord};
 use cellpos_session::rig_file::{ClockKind, Frames};
 use cellpos_session::setup::ReferenceSpec;
-use cellpos_session::{Options, Rig, RigFile};
+use cellpos_session::{Finished, Options, Rig, RigFile};
 use std::fmt;
 
 /// Gain of Eq. (6) at the frequencies of a hold, 1/s.
@@ -216,8 +216,31 @@ impl fmt::Display for Held {
     }
 }
 
-/// Runs a row.
+/// Runs a row, holding at 0 um.
 pub(super) fn hold(row: &Row, seed: u64) -> Held {
+    let finished = finish(row, seed, ReferenceSpec::Hold { position_um: 0.0 });
+    judged(
+        &finished.sink.0,
+        &finished.summary,
+        finished.ended.as_asked(),
+        finished.ended.to_string(),
+    )
+}
+
+/// The ticks of a row whose bead is to follow a script.
+pub(super) fn follow(row: &Row, seed: u64, text: String) -> Vec<TickRecord> {
+    let script = ReferenceSpec::Script {
+        file: "steps.toml".to_owned(),
+        text,
+        from_s: 0.0,
+        ran_s: None,
+        first_length_um: None,
+        waveforms: std::collections::BTreeMap::new(),
+    };
+    finish(row, seed, script).sink.0
+}
+
+fn finish(row: &Row, seed: u64, reference: ReferenceSpec) -> Finished<Ticks> {
     let options = Options {
         clock: ClockKind::Virtual,
         frames: Frames::On,
@@ -226,9 +249,8 @@ pub(super) fn hold(row: &Row, seed: u64) -> Held {
     let mut rig = Rig::open(row.file(seed), options).expect("an emulated rig");
     let own = row.law == "own";
     let prepared = rig.prepare("eq6", if own { "lqg" } else { row.law });
-    let hold = ReferenceSpec::Hold { position_um: 0.0 };
     let setup = rig
-        .set_up(prepared.expect("a law"), hold)
+        .set_up(prepared.expect("a law"), reference)
         .expect("a set-up");
     let core = if own {
         let config = setup
@@ -250,13 +272,7 @@ pub(super) fn hold(row: &Row, seed: u64) -> Held {
         .expect("armed")
         .start()
         .and_then(|run| run.wait());
-    let finished = finished.expect("a run");
-    judged(
-        &finished.sink.0,
-        &finished.summary,
-        finished.ended.as_asked(),
-        finished.ended.to_string(),
-    )
+    finished.expect("a run")
 }
 
 fn judged(

@@ -7,6 +7,7 @@
 mod held;
 mod law;
 mod rows;
+mod steps;
 
 use held::{Held, Row, hold};
 use rows::{LAWS, Limits};
@@ -91,7 +92,29 @@ fn an_amplifier_that_clips_is_said_under_every_law_before_the_bead_is_out_of_sig
             assert_eq!(held.state, "safe", "{row}: {}", held.ended);
             assert!(held.ended.contains("is clipped"), "{row}: {}", held.ended);
             assert!(!held.as_asked, "{row}: {}", held.ended);
+            let stated = held.stated_rms_nm / held.true_rms_nm;
+            assert!((0.9..1.1).contains(&stated), "{row}: {held}");
         }
+    }
+}
+
+#[test]
+fn steps_of_10_um_refuse_no_fix_and_are_over_in_12_ms_under_the_laws_that_know_them_in_advance() {
+    for (law, count, most_ms) in [
+        ("lqg", 100, 12.0),
+        ("mpc", 20, 12.0),
+        ("pi", 20, 60.0),
+        ("own", 20, 60.0),
+    ] {
+        let steps = steps::go(law, 1, count);
+        let worst_ms = steps.settled_ms.iter().copied().fold(0.0, f64::max);
+        println!(
+            "{law}: {} refused, over after {worst_ms:.1} ms",
+            steps.refused
+        );
+        assert_eq!(steps.settled_ms.len(), count, "{law}");
+        assert_eq!(steps.refused, 0, "{law}");
+        assert!(worst_ms <= most_ms, "{law}: {worst_ms} ms");
     }
 }
 

@@ -97,9 +97,23 @@ impl Limits {
         };
         let (stated, truth) = (rms(|h| h.stated_rms_nm), rms(|h| h.true_rms_nm));
         let error = stated / truth - 1.0;
-        // A bead that is not seen adds the square of one draw in a run; of few runs their mean says little.
+        // The walk of a bead that nobody sees is chance: what is stated is its expectation. Of so many runs their mean square may be off
+        // by twice its standard error.
+        let n = held.len() as f64;
+        let off = |h: &Held| h.stated_rms_nm.powi(2) - h.true_rms_nm.powi(2);
+        let mean = held.iter().map(|held| off(held)).sum::<f64>() / n;
+        let scatter = held
+            .iter()
+            .map(|held| (off(held) - mean).powi(2))
+            .sum::<f64>();
+        let chance = if row.is_blind() {
+            2.0 * (scatter / (n * (n - 1.0).max(1.0))).sqrt()
+        } else {
+            0.0
+        };
         let least = if row.is_blind() { 8 } else { 1 };
-        let wrong = held.len() >= least && error.abs() > self.stated || error.is_nan();
+        let beyond = error.abs() > self.stated && mean.abs() > chance;
+        let wrong = held.len() >= least && beyond || error.is_nan();
         wrong.then(|| {
             format!(
                 "the error is {truth:.1} nm, and {stated:.1} nm are stated ({:+.1} %)",
