@@ -43,6 +43,7 @@ mod quantities;
 mod render;
 mod rig_in_a_box;
 pub mod scene;
+mod second_bead;
 mod world;
 mod zero_flow;
 

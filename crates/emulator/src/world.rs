@@ -8,6 +8,7 @@ use crate::faults::FaultKind;
 use crate::imperfections::Wander;
 use crate::partner::PressurePartner;
 use crate::render::{Renderer, localisation_bound_um, mean_between};
+use crate::second_bead;
 use crate::zero_flow::{ZeroFlow, gain_per_s};
 use cellpos_numeric::Random;
 use cellpos_plant::effects::{Action, Shown};
@@ -294,13 +295,15 @@ impl World {
             let (along, across) = self
                 .second_um
                 .unwrap_or((self.config.faults.second_bead_um, 0.0));
-            // Both beads diffuse: their distance spreads with twice the variance.
-            Some((
-                along + std::f64::consts::SQRT_2 * spread_um * self.brownian.normal(),
-                confined(
-                    across + spread_um * self.brownian.normal(),
-                    self.most_lateral_um,
-                ),
+            let room_um = (2.0 * self.config.bead_radius_um, self.most_lateral_um);
+            let place_um = (along, across);
+            let own_um = self.lateral_um;
+            Some(second_bead::diffuse(
+                place_um,
+                own_um,
+                spread_um,
+                room_um,
+                &mut self.brownian,
             ))
         } else {
             None
@@ -490,7 +493,7 @@ fn renderer(config: &WorldConfig) -> Result<Renderer, WorldError> {
 }
 
 /// Reflects a position across the channel at the borders of the frame's range.
-fn confined(lateral_um: f64, limit_um: f64) -> f64 {
+pub(crate) fn confined(lateral_um: f64, limit_um: f64) -> f64 {
     if lateral_um.abs() <= limit_um {
         lateral_um
     } else {

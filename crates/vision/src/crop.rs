@@ -2,8 +2,6 @@
 
 use crate::config::MAX_WINDOW_PX;
 use crate::frame::{Frame, Pixels};
-use crate::streak::Comb;
-use crate::template::Template;
 
 /// Pixels that are computed on together.
 pub(crate) const LANES: usize = 4;
@@ -97,30 +95,6 @@ impl Crop {
     /// Whether any pixel is left out.
     pub(crate) fn has_holes(&self) -> bool {
         self.holes_used > 0
-    }
-
-    /// Takes the image of a bead, drawn out along `comb`, off the window.
-    pub(crate) fn take_off(
-        &mut self,
-        template: &Template,
-        comb: &Comb,
-        (x_px, y_px): (f64, f64),
-        amplitude: f64,
-    ) {
-        let (x, y) = (
-            (x_px - self.x0 as f64) as f32,
-            (y_px - self.y0 as f64) as f32,
-        );
-        let (width, amplitude) = (self.width, amplitude as f32 * comb.share());
-        for (ox, oy) in comb.offsets() {
-            for (j, row) in self.rows.iter_mut().enumerate().take(self.height) {
-                let dy = j as f32 - y - oy;
-                for (i, v) in row.iter_mut().enumerate().take(width) {
-                    let dx = i as f32 - x - ox;
-                    *v -= amplitude * template.value_at_squared(dx * dx + dy * dy);
-                }
-            }
-        }
     }
 
     fn copy<T: Copy>(&mut self, pixels: &[T], frame_width: usize) -> bool

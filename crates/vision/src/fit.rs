@@ -299,27 +299,34 @@ pub(crate) fn scale(
     (change.is_finite() && sd.is_finite()).then_some((change, sd))
 }
 
-/// Change of the comb's length, as a fraction of it, that fits the window best at a fixed position, beside amplitude and
-/// background: one secant step.
+/// Change of the comb's length, as a fraction of it, that fits the window best at fixed positions and relative contrasts of the
+/// beads (x and y in px, contrast), all in the same flow, beside a common contrast and background: one secant step.
 pub(crate) fn stretch(
     crop: &Crop,
     template: &Template,
     shorter: &Comb,
     longer: &Comb,
-    (x_px, y_px): (f64, f64),
+    beads: impl Iterator<Item = (f64, f64, f64)> + Clone,
 ) -> Option<f64> {
-    let (x, y) = (
-        (x_px - crop.x0 as f64) as f32,
-        (y_px - crop.y0 as f64) as f32,
-    );
     let lanes_end = crop.width.next_multiple_of(LANES).min(STRIDE);
-    let (mut a, mut b) = (Image::new(lanes_end), Image::new(lanes_end));
+    let mut image = Image::new(lanes_end);
     let (mut normal, mut right) = (Matrix3::zeros(), Vector3::zeros());
     for (j, row) in crop.rows.iter().enumerate().take(crop.height) {
-        let dy = j as f32 - y;
-        a.draw_row(template, shorter, x, dy);
-        b.draw_row(template, longer, x, dy);
-        for ((p, a), b) in row.iter().zip(&a.value).zip(&b.value).take(crop.width) {
+        let mut models = [[0.0_f32; STRIDE]; 2];
+        for (x_px, y_px, contrast) in beads.clone() {
+            let (x, y) = (
+                (x_px - crop.x0 as f64) as f32,
+                (y_px - crop.y0 as f64) as f32,
+            );
+            for (comb, model) in [shorter, longer].into_iter().zip(&mut models) {
+                image.draw_row(template, comb, x, j as f32 - y);
+                for (m, f) in model.iter_mut().zip(&image.value).take(lanes_end) {
+                    *m += contrast as f32 * f;
+                }
+            }
+        }
+        let [a, b] = &models;
+        for ((p, a), b) in row.iter().zip(a).zip(b).take(crop.width) {
             let g = Vector3::new(f64::from(0.5 * (a + b)), 1.0, f64::from(b - a));
             normal += g * g.transpose();
             right += g * f64::from(*p);

@@ -6,7 +6,7 @@ use crate::lines;
 
 /// Contrast of a bead over its own standard deviation. Noise alone exceeds it in one of 10^10 places: once in 10,000 frames
 /// of 500 x 500 px, whatever the size of the beads.
-const LEAST_SIGNIFICANCE: f64 = 6.4;
+pub(super) const LEAST_SIGNIFICANCE: f64 = 6.4;
 /// The same beyond what the lines through it explain: few places have one, and noise was asked before.
 const BEYOND_LINES: f64 = 5.5;
 /// From so much on, lines are not asked: they would have to be as strong as the bead.

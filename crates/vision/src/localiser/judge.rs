@@ -66,12 +66,17 @@ impl Localiser {
 
     /// Residual ratio up to which a template's error explains the residual of a bead of this contrast over the noise.
     fn tolerated(&self, snr: f64) -> f64 {
+        self.config.max_residual_ratio + self.tolerated_error(snr)
+    }
+
+    /// The part of it that is the template's error.
+    pub(super) fn tolerated_error(&self, snr: f64) -> f64 {
         let filled = self.filled[usize::from(self.crop.width < self.config.window_px)];
-        self.config.max_residual_ratio + filled * (self.template_tolerance() * snr).powi(2)
+        filled * (self.template_tolerance() * snr).powi(2)
     }
 
     /// The verdict on a place: good unless the border cuts the bead.
-    fn whole(&self, frame: &Frame, (x_px, y_px): (f64, f64)) -> FixQuality {
+    pub(super) fn whole(&self, frame: &Frame, (x_px, y_px): (f64, f64)) -> FixQuality {
         let margin_px = self.template.radius_px();
         let inside = |c: f64, len: usize| c >= margin_px && c <= len as f64 - 1.0 - margin_px;
         if inside(x_px, frame.width) && inside(y_px, frame.height) {

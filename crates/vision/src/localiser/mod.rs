@@ -4,9 +4,12 @@ mod certainty;
 mod judge;
 mod noise;
 mod refine;
+mod together;
+
+pub use together::{Start, Together};
 
 use crate::beyond::Left;
-use crate::config::{ConfigError, LocaliserConfig, PixelNoise};
+use crate::config::{ConfigError, LocaliserConfig};
 use crate::crop::Crop;
 use crate::fit::{self, Pass};
 use crate::fix::{Fix, FixQuality};
@@ -29,14 +32,11 @@ const MAX_RECENTRES: u32 = 4;
 const NARROW_RADII: f64 = 1.3;
 /// Steps in the length of a streak per fit.
 const STRETCHES: usize = 2;
-/// The same beside neighbours: what is taken off the window for them changes with the length, which slows the search down.
-const STRETCHES_BESIDE: usize = 4;
 /// A streak's length is looked for within this factor of the expected one.
 const MOST_STRETCH: f64 = 2.5;
 /// Relative difference of the lengths of the secant.
 const SECANT: f64 = 0.1;
-/// Beads that can be taken off a window.
-const MAX_OTHERS: usize = 8;
+
 /// Localises one bead per call. Buffers are made in [`Localiser::new`]; [`Localiser::locate`] allocates nothing.
 ///
 /// The position is the weighted least-squares fit of the template over the whole window in four parameters (x, y,
@@ -56,8 +56,6 @@ pub struct Localiser {
     comb: Comb,
     /// What the template leaves of the beads' windows.
     residues: Residues,
-    /// Beads taken off the window: x, y, amplitude.
-    others: [(f64, f64, f64); MAX_OTHERS],
     /// Whether specks that show without knowing the bead are replaced in the windows of this fix.
     cleans: bool,
     /// Whether a residual that is the same all round counts as none.
@@ -104,7 +102,6 @@ impl Localiser {
             streak_px: (0.0, 0.0),
             comb: Comb::STILL,
             residues: Residues::new(),
-            others: [(0.0, 0.0, 0.0); MAX_OTHERS],
             cleans: false,
             pardons: false,
             filled,
@@ -219,26 +216,7 @@ impl Localiser {
         Some((size * (1.0 + change), size * sd))
     }
 
-    /// Position of the bead `own` of `beads` (x and y in px, amplitude in grey levels) near `guess`, with the images of
-    /// the others taken off the window: for beads that overlap. The template is not learnt from such a fix.
-    pub fn locate_beside(
-        &mut self,
-        frame: &Frame,
-        guess: (f64, f64),
-        beads: &[(f64, f64, f64)],
-        own: usize,
-    ) -> Fix {
-        self.others = [(0.0, 0.0, 0.0); MAX_OTHERS];
-        let others = beads.iter().enumerate().filter(|(k, _)| *k != own);
-        for (slot, (_, bead)) in self.others.iter_mut().zip(others) {
-            *slot = *bead;
-        }
-        let fix = self.attempt(frame, guess, self.config.window_px);
-        self.others = [(0.0, 0.0, 0.0); MAX_OTHERS];
-        fix
-    }
-
-    /// Copies a window, with the images of other beads taken off.
+    /// Copies a window.
     fn take_window(&mut self, frame: &Frame, x_px: f64, y_px: f64, side_px: usize) -> bool {
         let taken = self.crop.take(frame, x_px, y_px, side_px);
         if taken
@@ -247,24 +225,10 @@ impl Localiser {
         {
             speckle::clean(&mut self.crop, variance.sqrt() as f32);
         }
-        for (x, y, amplitude) in self.others {
-            if taken && amplitude != 0.0 {
-                self.crop
-                    .take_off(&self.template, &self.comb, (x, y), amplitude);
-            }
-        }
         taken
     }
 
-    fn has_others(&self) -> bool {
-        self.others
-            .iter()
-            .any(|(_, _, amplitude)| *amplitude != 0.0)
-    }
-
     fn attempt(&mut self, frame: &Frame, (x_px, y_px): (f64, f64), side_px: usize) -> Fix {
-        // Before the window is taken: neighbours are taken off it as streaks of this length, not of one that an earlier
-        // attempt has come to on something else.
         self.comb = Comb::new(self.streak_px, self.template.radius_px());
         self.template.stretch_to(1.0);
         self.cleans = false;
@@ -311,33 +275,34 @@ impl Localiser {
         first: Option<Fitted>,
         side_px: usize,
     ) -> Option<Fitted> {
-        let radius_px = self.template.radius_px();
-        let (x_px, y_px) = self.streak_px;
-        let of = |factor: f64| Comb::new((factor * x_px, factor * y_px), radius_px);
         let (mut fitted, mut factor) = (first?, 1.0);
-        let stretches = if self.has_others() {
-            STRETCHES_BESIDE
-        } else {
-            STRETCHES
-        };
-        for _ in 0..stretches {
-            let (shorter, longer) = (of(factor * (1.0 - SECANT)), of(factor * (1.0 + SECANT)));
-            let at = (fitted.x_px, fitted.y_px);
-            let Some(change) = fit::stretch(&self.crop, &self.template, &shorter, &longer, at)
-            else {
+        for _ in 0..STRETCHES {
+            let bead = [(fitted.x_px, fitted.y_px, 1.0)];
+            let Some(better) = self.stretched(factor, bead.into_iter()) else {
                 break;
             };
-            factor =
-                (factor * (1.0 + 2.0 * SECANT * change)).clamp(1.0 / MOST_STRETCH, MOST_STRETCH);
-            self.comb = of(factor);
-            // The neighbours are in the same flow: their streaks are as long as this one.
-            let (x_px, y_px) = (fitted.x_px, fitted.y_px);
-            if self.has_others() && !self.take_window(frame, x_px, y_px, side_px) {
-                return Some(fitted);
-            }
+            factor = better;
             fitted = self.fit(frame, (fitted.x_px, fitted.y_px), side_px, MAX_RECENTRES)?;
         }
         Some(fitted)
+    }
+
+    /// Takes a better length of the streak for the beads in the window (x, y, contrast) into use: the factor of the expected
+    /// length, from the factor in use.
+    fn stretched(
+        &mut self,
+        factor: f64,
+        beads: impl Iterator<Item = (f64, f64, f64)> + Clone,
+    ) -> Option<f64> {
+        let radius_px = self.template.radius_px();
+        let (x_px, y_px) = self.streak_px;
+        let of = |factor: f64| Comb::new((factor * x_px, factor * y_px), radius_px);
+        let (shorter, longer) = (of(factor * (1.0 - SECANT)), of(factor * (1.0 + SECANT)));
+        let change = fit::stretch(&self.crop, &self.template, &shorter, &longer, beads)?;
+        let better =
+            (factor * (1.0 + 2.0 * SECANT * change)).clamp(1.0 / MOST_STRETCH, MOST_STRETCH);
+        self.comb = of(better);
+        Some(better)
     }
 
     fn learn(&mut self, fix: &Fix) {
@@ -371,7 +336,7 @@ impl Localiser {
         side_px: usize,
         max_recentres: u32,
     ) -> Option<Fitted> {
-        let shot = matches!(self.config.noise, PixelNoise::Known { shot_grey_per_electron, .. } if shot_grey_per_electron > 0.0);
+        let shot = self.has_shot_noise();
         let reach_px = 0.4 * self.template.radius_px();
         let (mut x_px, mut y_px) = (x_px, y_px);
         let mut before: Option<Pass> = None;

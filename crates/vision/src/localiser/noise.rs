@@ -25,6 +25,11 @@ impl Localiser {
 
     /// Weights for the next pass, given what the pass before found: relative to [`Localiser::weight_unit`].
     pub(super) fn weights(&self, before: Option<&Pass>) -> Weights {
+        self.weights_of(before.map(|p| (p.amplitude, p.background)))
+    }
+
+    /// The same, given the contrast that the model's values are multiplied by and the background.
+    pub(super) fn weights_of(&self, before: Option<(f64, f64)>) -> Weights {
         match (self.config.noise, before) {
             (
                 PixelNoise::Known {
@@ -32,13 +37,13 @@ impl Localiser {
                     shot_grey_per_electron: gain,
                     black_level_grey: black,
                 },
-                Some(p),
+                Some((amplitude, background)),
             ) if gain > 0.0 => {
                 let variance = read_sd_grey * read_sd_grey;
-                let light = p.background + f64::from(self.crop.pedestal) - black;
+                let light = background + f64::from(self.crop.pedestal) - black;
                 Weights::Shot {
                     base: (variance + gain * light.max(0.0)) as f32,
-                    gain_times_amplitude: (gain * p.amplitude) as f32,
+                    gain_times_amplitude: (gain * amplitude) as f32,
                     floor: variance as f32,
                 }
             }

@@ -15,6 +15,7 @@ mod motion;
 mod neighbours;
 mod standing;
 mod stays;
+mod touching;
 
 use crate::config::ConfigError;
 use crate::detector::Detector;
@@ -33,10 +34,6 @@ const SIZE_STRIDE: u32 = 8;
 
 /// Share of the chosen bead's amplitude below which a candidate is not a bead.
 const LEAST_SHARE: f64 = 0.3;
-/// Beads nearer than this many radii are fitted together.
-const TOUCHING_RADII: f64 = 4.0;
-/// Times that beads fitted together are each gone through.
-const SWEEPS: usize = 5;
 
 /// The bead chosen, or on the way to it.
 #[derive(Debug, Clone, Copy)]
@@ -193,8 +190,13 @@ impl Tracker {
         mut chosen: Chosen,
         time_s: f64,
     ) -> (Decision, Option<Fix>) {
-        let fix = self.localiser.locate(frame, Some(chosen.motion.position()));
-        let size = self.localiser.relative_size(&fix);
+        self.look_around(frame);
+        let (mut fix, mut size) = (Fix::none(0.0, 0.0, FixQuality::NoSignal), None);
+        let away = |c: &&Candidate| chosen.motion.distance2(&c.fix);
+        let seen = self.candidates.iter().flatten();
+        if let Some(c) = seen.min_by(|a, b| away(a).total_cmp(&away(b))) {
+            (fix, size) = (c.fix, c.size);
+        }
         let near = self.within_gate(&chosen.motion, &fix);
         if fix.verdict == FixQuality::Good
             && near
@@ -248,10 +250,18 @@ impl Tracker {
         time_s: f64,
     ) -> (Decision, Option<Fix>) {
         self.look_around(frame);
-        // The detector misses a bead that touches a stronger one; the fit at the prediction may still see it.
-        let fix = self.localiser.locate(frame, Some(chosen.motion.position()));
-        let size = self.localiser.relative_size(&fix);
-        self.add_candidate(Candidate::new(fix, size));
+        let (x, y) = chosen.motion.position();
+        let radius_px = self.localiser.template().radius_px();
+        let is_there = |c: &Candidate| {
+            c.fix.verdict == FixQuality::Good
+                && f64::hypot(c.fix.x_px - x, c.fix.y_px - y) < radius_px
+        };
+        if !self.candidates.iter().flatten().any(is_there) {
+            // The detector misses a bead that touches a stronger one; the fit at the prediction may still see it.
+            let fix = self.localiser.locate(frame, Some((x, y)));
+            let size = self.localiser.relative_size(&fix);
+            self.add_candidate(Candidate::new(fix, size));
+        }
         self.fit_as_carried(frame, &chosen);
         self.part_touching_beads(frame, &chosen);
 
@@ -284,7 +294,7 @@ impl Tracker {
                 best = Some(k);
             }
         }
-        let least_amplitude = LEAST_SHARE * chosen.identity.amplitude().abs();
+        let least_amplitude = LEAST_SHARE * chosen.identity.amplitude();
         let claim = best.map(|b| {
             let certainty = self.config.certainty;
             self.neighbours.claim(
@@ -339,77 +349,6 @@ impl Tracker {
         }
     }
 
-    /// Fits beads whose images overlap: in turn, each with the others' images taken off the frame. The results replace
-    /// the candidates near by that were fitted as if they were alone.
-    fn part_touching_beads(&mut self, frame: &Frame, chosen: &Chosen) {
-        let reach_px = TOUCHING_RADII * self.localiser.template().radius_px();
-        let apart_px = 0.5 * self.localiser.template().radius_px();
-        let own = (chosen.motion.position(), chosen.identity.amplitude());
-        let mut beads = [(0.0, 0.0, 0.0); MAX_BEADS];
-        let mut n = 0;
-        let neighbours = self.neighbours.predictions().filter(|(x, y, _)| {
-            let distance_px = f64::hypot(x - own.0.0, y - own.0.1);
-            distance_px < reach_px
-        });
-        for (slot, bead) in beads
-            .iter_mut()
-            .zip(std::iter::once((own.0.0, own.0.1, own.1)).chain(neighbours))
-        {
-            *slot = bead;
-            n += 1;
-        }
-        if n < 2 {
-            return;
-        }
-        let Some(beads) = beads.get_mut(..n) else {
-            return;
-        };
-        let mut fixes = [None; MAX_BEADS];
-        for _ in 0..SWEEPS {
-            for k in 0..n {
-                let Some(&(x, y, _)) = beads.get(k) else {
-                    continue;
-                };
-                let fix = self.localiser.locate_beside(frame, (x, y), beads, k);
-                let near = f64::hypot(fix.x_px - x, fix.y_px - y) < 2.0 * apart_px;
-                let usable =
-                    near && !matches!(fix.verdict, FixQuality::NoSignal | FixQuality::NotConverged);
-                if let (true, Some(bead)) = (usable, beads.get_mut(k)) {
-                    *bead = (fix.x_px, fix.y_px, fix.amplitude);
-                }
-                if let Some(slot) = fixes.get_mut(k) {
-                    *slot = Some(fix);
-                }
-            }
-        }
-        // Two fits that met are one image fitted twice: no better than before.
-        let met = beads.iter().enumerate().any(|(i, a)| {
-            beads
-                .iter()
-                .skip(i + 1)
-                .any(|b| f64::hypot(a.0 - b.0, a.1 - b.1) < apart_px)
-        });
-        if met {
-            return;
-        }
-        for fix in fixes
-            .iter()
-            .flatten()
-            .filter(|f| f.verdict == FixQuality::Good)
-        {
-            for slot in &mut self.candidates {
-                // A fit as if alone is drawn towards the other bead.
-                let beside = |c: &Candidate| {
-                    f64::hypot(c.fix.x_px - fix.x_px, c.fix.y_px - fix.y_px) < 2.0 * apart_px
-                };
-                if slot.is_some_and(|c| beside(&c) && !fixes.contains(&Some(c.fix))) {
-                    *slot = None;
-                }
-            }
-            self.add_candidate(Candidate::new(*fix, None));
-        }
-    }
-
     fn take(&mut self, mut chosen: Chosen, c: &Candidate, time_s: f64) {
         chosen.motion.update(&c.fix);
         chosen.identity.update(&c.fix, c.size);
@@ -428,21 +367,6 @@ impl Tracker {
         let (x, y) = motion.way_to(fix);
         f64::hypot(x, y) <= self.config.fastest_flow_px_per_s * motion.since_s()
             || self.within_gate(motion, fix)
-    }
-
-    /// Locates every bead that the detector sees.
-    fn look_around(&mut self, frame: &Frame) {
-        self.candidates = [None; MAX_BEADS];
-        self.detector.detect(frame);
-        for k in 0..MAX_BEADS {
-            let Some(blob) = self.detector.found().get(k).copied() else {
-                break;
-            };
-            let seen_px = (blob.x_px, blob.y_px);
-            let fix = self.localiser.locate(frame, Some(seen_px));
-            let size = self.localiser.relative_size(&fix);
-            self.add_candidate(Candidate { fix, size, seen_px });
-        }
     }
 
     /// Adds a candidate unless one is already there.

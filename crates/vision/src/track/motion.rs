@@ -19,10 +19,6 @@ const STEPS_PER_S: f64 = 1.0;
 /// Natural logarithm of the fastest step over the slowest that is told from the quiet walk: 400, from half a pixel a frame to
 /// the whole stroke. Any speed in between is as likely as any other on a logarithmic scale.
 const LOG_RANGE: f64 = 6.0;
-/// Largest squared distance of another bead that counts in a comparison of readings. A bead that is not followed may have
-/// met something; its prediction may not decide alone.
-const MOST_DISTANCE2: f64 = 16.0;
-
 /// Random parts of the motion.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Randomness {
@@ -184,11 +180,6 @@ impl Motion {
     /// Minus twice the logarithm of the density of the fix (per px^2) while the flow is quiet.
     pub(super) fn quiet_cost(&self, fix: &Fix) -> f64 {
         self.distance2(fix) + self.cost_of_width(fix)
-    }
-
-    /// As [`Self::quiet_cost`], of a bead whose motion may not decide alone.
-    pub(super) fn capped_cost(&self, fix: &Fix) -> f64 {
-        self.distance2(fix).min(MOST_DISTANCE2) + self.cost_of_width(fix)
     }
 
     fn cost_of_width(&self, fix: &Fix) -> f64 {

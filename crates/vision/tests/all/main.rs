@@ -13,6 +13,7 @@ mod stress;
 mod stress_scene;
 mod stress_table;
 mod suggested;
+mod touching;
 mod tracking;
 mod uncertainty;
 

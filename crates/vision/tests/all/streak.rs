@@ -3,7 +3,7 @@
 use crate::common::{BACKGROUND, Errors, Random};
 use cellpos_vision::{
     FixQuality, Frame, Localiser, LocaliserConfig, PixelNoise, Pixels, ProfileSpec, RadialProfile,
-    RingProfile,
+    RingProfile, Start,
 };
 use nalgebra::{Matrix4, Vector4};
 
@@ -147,11 +147,14 @@ fn of_two_beads_that_touch_and_move_fast_each_is_localised_at_its_own_bound() {
                 let at = (31.5 + random.uniform(), 15.5 + random.uniform());
                 let other = (at.0 + apart.0, at.1 + apart.1);
                 let pixels = render(&profile, &[at, other], way, snr, &mut random);
-                let guess = (at.0 + random.normal(), at.1 + random.normal());
-                let beads = [
-                    (guess.0, guess.1, snr * NOISE),
-                    (other.0, other.1, snr * NOISE),
-                ];
+                // As near as light is seen, or a bead is predicted.
+                let starts = [at, other].map(|(x, y)| Start {
+                    place_px: (
+                        x + random.normal().clamp(-2.0, 2.0),
+                        y + random.normal().clamp(-2.0, 2.0),
+                    ),
+                    contrast: None,
+                });
                 let [fresh, fix] = [false, true].map(|pair_first| {
                     let mut localiser = localiser();
                     localiser.expect_streak((known * way.0, known * way.1));
@@ -159,7 +162,12 @@ fn of_two_beads_that_touch_and_move_fast_each_is_localised_at_its_own_bound() {
                         let middle = (at.0 + 0.5 * apart.0, at.1 + 0.5 * apart.1);
                         localiser.locate(&frame(&pixels), Some(middle));
                     }
-                    localiser.locate_beside(&frame(&pixels), guess, &beads, 0)
+                    let together = localiser.locate_together(&frame(&pixels), &starts);
+                    *together
+                        .expect("two beads")
+                        .fixes()
+                        .next()
+                        .expect("the first")
                 });
                 assert_eq!(fresh, fix, "what was looked at before must not matter");
                 good += i32::from(fix.verdict == FixQuality::Good);
