@@ -52,6 +52,11 @@ fn steps_of_the_flow_and_stalls_keep_the_bead_under_every_law_and_the_last_word_
             ..Row::step(law, um_per_s)
         });
     }
+    // Three radii of the bead: the images overlap.
+    rows.push(Row {
+        second_um: Some(1.5),
+        ..Row::step("mpc", -379.0)
+    });
     rows.push(Row::event("lqg", "stall-camera", 0.15));
     rows.push(Row::event("mpc", "frozen-picture", 0.1));
     rows.push(Row::event("pi", "link-loss", 0.05));
