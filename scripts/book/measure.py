@@ -174,12 +174,8 @@ GROUPS = {"hold": hold, "sine": sine, "adapt": adapt, "cell": cell, "identify": 
 
 LONG = [
     ("cargo run --release -p cellpos-benches --bin hold-table", "hold, steps and sines of the four laws"),
-    ("cargo run --release -p cellpos-benches --bin cycle-table", "learning with wrong gain and delay"),
     ("cargo run --release -p cellpos-benches --bin adapt-table", "adaptation to changes of gain and delay; `--hours 10` for false alarms"),
-    ("cargo run --release -p cellpos-benches --bin rate-table", "2 and 5 kHz; a loop faster than its camera"),
-    ("cargo run --release -p cellpos-benches --bin minute-table", "lost ticks under load, next to a bare sleep loop"),
     ("cargo run --release -p cellpos-tests --bin reconcile-table all SEED", "hundreds of drawn hidden effects, nulls and strangers"),
-    ("cargo test --release -p cellpos-ident --test all closed_loop -- --nocapture", "coverage of the 95 % intervals"),
     ("cargo test --release -p cellpos-vision -- --nocapture", "error against the Cramér-Rao bound, cells against masks"),
     ("cargo bench -p cellpos-benches --bench solvers", "the solvers of MPC"),
 ]
