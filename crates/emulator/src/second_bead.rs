@@ -1,4 +1,4 @@
-//! A second bead beside the first, both carried by the same flow.
+//! A second bead near the first, both carried by the same flow.
 
 use crate::world::confined;
 use cellpos_numeric::Random;

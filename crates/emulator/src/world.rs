@@ -292,17 +292,12 @@ impl World {
 
     fn follow_events(&mut self, spread_um: f64) {
         self.second_um = if self.active(FaultKind::SecondBead) {
-            let (along, across) = self
-                .second_um
-                .unwrap_or((self.config.faults.second_bead_um, 0.0));
-            let room_um = (2.0 * self.config.bead_radius_um, self.most_lateral_um);
-            let place_um = (along, across);
-            let own_um = self.lateral_um;
+            let start_um = (self.config.faults.second_bead_um, 0.0);
             Some(second_bead::diffuse(
-                place_um,
-                own_um,
+                self.second_um.unwrap_or(start_um),
+                self.lateral_um,
                 spread_um,
-                room_um,
+                (2.0 * self.config.bead_radius_um, self.most_lateral_um),
                 &mut self.brownian,
             ))
         } else {

@@ -1,8 +1,8 @@
 //! Beads whose images overlap, fitted together.
 //!
-//! The model is `grey = b + sum_k A_k f(r_k)`. Like the fit of one bead it is linear in every contrast and in the background, so
-//! that a Gauss-Newton pass solves one linear problem with the columns (df/dx, df/dy, f) of each bead and 1. The inverse of
-//! the normal matrix holds what the beads take from each other's certainty.
+//! The model is `grey = b + sum_k A_k f(r_k)`. Like the fit of one bead it is linear in the contrasts and the background. A
+//! Gauss-Newton pass solves one linear problem with the columns (df/dx, df/dy, f) of each bead and 1. The inverse of the normal
+//! matrix is the covariance: overlap makes it larger.
 
 use crate::crop::{Crop, LANES, Row, STRIDE};
 use crate::fit::{Image, Weights};
@@ -137,7 +137,7 @@ fn pass_of<const N: usize, const P: usize>(
     })
 }
 
-/// Weighted residual sum of squares with the beads where they are: contrasts and background alone are free.
+/// Weighted residual sum of squares at the present places: only contrasts and background are free.
 fn misfit_at_rest<const P: usize>(
     mut normal: SMatrix<f64, P, P>,
     mut right: SVector<f64, P>,

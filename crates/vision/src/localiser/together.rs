@@ -9,12 +9,12 @@ use crate::joint::{self, Bead, MOST_TOGETHER, Rest};
 use crate::speckle;
 use crate::streak::Comb;
 
-/// Beads fitted nearer to each other than this are one image fitted twice, bead radii; and a fit that goes further from
-/// its start than the second has gone to another bead.
+/// Two fits nearer to each other than the first, in bead radii, are one image fitted twice. A fit further from its start than the
+/// second has gone to another bead.
 const APART_RADII: f64 = 0.5;
 const ASTRAY_RADII: f64 = 1.5;
 
-/// Places of the beads, px, and what the model leaves with them there.
+/// Places of the beads, px, and the misfit there.
 type Places = ([(f64, f64); MOST_TOGETHER], f64);
 
 /// Where one of several beads is looked for.
@@ -27,7 +27,7 @@ pub struct Start {
     pub contrast: Option<(f64, f64)>,
 }
 
-/// Positions found together, the first `count` of them.
+/// Positions found together, of which `count` are used.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Together {
     fixes: [Fix; MOST_TOGETHER],
@@ -53,7 +53,7 @@ impl Together {
 
 impl Localiser {
     /// Positions of two to four beads whose images overlap, near the places given (px), with what is known of their contrasts.
-    /// All are drawn out along the streak that is expected. `None` if the beads cannot be told from one another, or the fit goes
+    /// All are drawn out along the streak that is expected. `None` if two fits are one image, or one goes
     /// astray. The template is not learnt from such a fix. Allocates nothing.
     pub fn locate_together(&mut self, frame: &Frame, starts: &[Start]) -> Option<Together> {
         let (mut beads, count) = ([Bead::default(); MOST_TOGETHER], starts.len());

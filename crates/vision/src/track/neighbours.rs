@@ -1,4 +1,4 @@
-//! Other beads in the frame, followed so that the chosen one is not taken for one of them.
+//! Other beads in the frame, followed so that the chosen one is not mistaken for another.
 
 use super::config::TrackerConfig;
 use super::motion::{Motion, Randomness};
@@ -10,8 +10,7 @@ pub(crate) const MAX_BEADS: usize = 8;
 const MEMORY_S: f64 = 2.0;
 /// Share of a new fix in a neighbour's amplitude.
 const AMPLITUDE_SHARE: f64 = 0.05;
-/// Cost of not seeing a bead that should be there, and of seeing one that nobody knows, on the scale of minus twice the log
-/// likelihood: one new bead a second in 100 x 60 px at 1000 frames/s has 1.7e-7 a px^2 and frame, 31.
+/// Cost, as minus twice the log likelihood, of a known bead that is not seen, and of a bead that is seen but not known. One new bead a second in 100 x 60 px at 1000 frames/s has 1.7e-7 a px^2 and frame, 31.
 const MISS: f64 = 30.0;
 
 /// A bead seen in the frame, fitted.
@@ -62,7 +61,7 @@ impl Neighbour {
     }
 }
 
-/// Beads beside the chosen one.
+/// Beads near the chosen one.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct Neighbours {
     beads: [Option<Neighbour>; MAX_BEADS],
@@ -141,7 +140,7 @@ impl Neighbours {
         quiet.min(stepped)
     }
 
-    /// Cost of the other beads, all carried by `way_px` beside their predictions, and of candidates that are nobody.
+    /// Cost of the other beads, all carried by `way_px` from their predictions, and of unknown beads.
     fn cost_of_others(
         &self,
         candidates: &Candidates,
@@ -158,8 +157,8 @@ impl Neighbours {
         cost + MISS * candidates.iter().enumerate().filter(unknown).count() as f64
     }
 
-    /// Which candidate but `own` each bead is, the surest first and each candidate once, and what the reading costs. A bead that
-    /// no candidate explains better than a miss is none of them.
+    /// Assigns candidates other than `own` to the beads, the surest first, each candidate once; and the cost. A bead without a
+    /// candidate that explains it better than a miss counts as not seen.
     fn sights(
         &self,
         candidates: &Candidates,
@@ -200,7 +199,7 @@ impl Neighbours {
         }
     }
 
-    /// Takes in what was seen beside the chosen bead (`taken`, whose motion is `ours`). While the chosen bead itself is
+    /// Takes in the other beads seen with the chosen bead (`taken`, whose motion is `ours`). While the chosen bead itself is
     /// not seen, a candidate that it could be does not count as a sight of a neighbour.
     pub(super) fn update(
         &mut self,

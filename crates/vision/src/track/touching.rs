@@ -55,7 +55,7 @@ impl Tracker {
         let reach_px = TOUCHING_RADII * self.localiser.template().radius_px();
         let mut members = [false; MAX_BEADS];
         members[k] = true;
-        // As often as there are places: a chain of them grows by one a time at least.
+        // A chain of places grows by at least one in each round.
         for _ in 0..seen.len() {
             for i in 0..seen.len() {
                 members[i] |= (0..seen.len()).any(|o| {
@@ -84,7 +84,7 @@ impl Tracker {
         let starts = &starts[..n];
         let mut together = self.localiser.locate_together(frame, starts);
         if !together.is_some_and(|t| t.all_seen()) {
-            // A step of the flow that has carried the chosen bead to one of them draws them all out.
+            // A step of the flow that has carried the chosen bead to one of them draws every image out.
             let carried = |from: Chosen| starts.iter().map(move |to| way(from, to.place_px));
             for way_px in self.chosen.into_iter().flat_map(carried) {
                 let fitted = self.locate_carried(frame, starts, way_px);
@@ -124,8 +124,8 @@ impl Tracker {
         together
     }
 
-    /// Looks for the chosen bead and its neighbours where they are predicted, together, if the picture shows fewer beads there
-    /// than are known: at the predictions, and as far from them as the nearest light is. The results replace the
+    /// If the picture shows fewer beads than are known, fits the chosen bead and its neighbours together,
+    /// at the predictions, and shifted to the nearest light. The results replace the
     /// candidates near by that were fitted as if they were alone.
     pub(super) fn part_touching_beads(&mut self, frame: &Frame, chosen: &Chosen) {
         let radius_px = self.localiser.template().radius_px();

@@ -1,5 +1,5 @@
-//! Two beads whose images overlap: each is localised at the bound of the pair, and a step of the flow does not part the chosen
-//! one from its identity.
+//! Two beads whose images overlap. Each is localised at the bound of the pair. A step of the flow does not make the tracker change
+//! over to the other bead.
 
 use crate::common::Random;
 use cellpos_vision::{
@@ -99,7 +99,7 @@ struct Outcome {
     blind_frames: usize,
 }
 
-/// A loop holds the chosen bead while another diffuses beside it; the flow steps by `flow` (px/s) for three frames until the loop
+/// A loop holds the chosen bead while another diffuses near it; the flow steps by `flow` (px/s) for three frames until the loop
 /// has caught up. `contact_px` is how near the centres may come.
 fn run(seed: u64, flow: f64, contact_px: f64, outcome: &mut Outcome) {
     let (mut random, template) = (Random(seed), template());
@@ -144,7 +144,7 @@ fn run(seed: u64, flow: f64, contact_px: f64, outcome: &mut Outcome) {
         } else {
             0.0
         };
-        // The flow and the loop carry both alike; each has a Brownian motion of its own.
+        // The flow and the loop carry both alike; each has its own Brownian motion.
         let walk = [(); 4].map(|()| sd * random.normal());
         own.0 += step * DT_S + back_px + walk[0];
         own.1 += walk[1] - 0.02 * (own.1 - 32.0);
