@@ -64,6 +64,12 @@ pub(crate) fn run(args: Args) -> CommandResult {
         print_json(&json(&script, &result))?;
     } else {
         print_text(&text(&script, &result))?;
+        if args.view.is_none() && !knows_view(&args)? {
+            print_text(&format!(
+                "field of view: {} um to either side is assumed; `--view` says what the camera sees, and `cellpos run` asks the camera\n",
+                limits.view_um
+            ))?;
+        }
     }
     Ok(if result.violations.is_empty() {
         Outcome::Done
@@ -103,6 +109,14 @@ fn limits(args: &Args) -> Result<CheckLimits, Failure> {
     instead(&mut limits.slew_um_per_s, slew);
     instead(&mut limits.view_um, args.view.map(Micrometers::value));
     Ok(limits)
+}
+
+/// Whether the rig file says what the camera sees: a camera of its own tells it only when it is asked.
+fn knows_view(args: &Args) -> Result<bool, Failure> {
+    Ok(match &args.rig {
+        Some(path) => RigFile::load(Some(path))?.is_emulated(),
+        None => false,
+    })
 }
 
 /// Figures of a check as names and values.

@@ -16,9 +16,10 @@ pub(super) fn section(
     bound: Option<&Bound>,
 ) -> String {
     let (status, ended) = ending(sessions);
-    let lost = frames_lost(sessions);
+    let (lost, without) = (counted(sessions, "frames_lost"), counted(sessions, "fixes_lost"));
     let mut sentence = of_a_cell(rows)
-        .or_else(|| of_cycles(rows, ticks))
+        .or_else(|| of_waves(rows))
+        .or_else(|| of_cycles(rows))
         .or_else(|| of_a_hold(ticks, bound))
         .unwrap_or_else(|| {
             "The loop was not closed long enough for an error to be stated.".to_string()
@@ -28,6 +29,9 @@ pub(super) fn section(
         1 => " One frame was lost.".to_string(),
         many => format!(" {many} frames were lost."),
     });
+    if without > 0 {
+        sentence.push_str(&format!(" {without} frames showed no bead."));
+    }
     if let Some(ended) = ended {
         sentence.push_str(&format!(" The run did not end as planned: {ended}."));
     }
@@ -54,12 +58,13 @@ fn ending(sessions: &[Session]) -> (Emphasis, Option<String>) {
     }
 }
 
-fn frames_lost(sessions: &[Session]) -> u64 {
-    let lost = |session: &Session| {
+/// A count of the summaries, over all sessions.
+fn counted(sessions: &[Session], key: &str) -> u64 {
+    let count = |session: &Session| {
         let end = session.meta.as_ref()?.end.as_ref()?;
-        end.summary.get("frames_lost")?.as_integer()
+        end.summary.get(key)?.as_integer()
     };
-    (sessions.iter().filter_map(lost))
+    (sessions.iter().filter_map(count))
         .map(|n| n.max(0) as u64)
         .sum()
 }
@@ -100,16 +105,39 @@ fn of_a_cell(rows: &[CycleRow]) -> Option<String> {
     Some(text)
 }
 
-/// A bead over its cycles.
-fn of_cycles(rows: &[CycleRow], ticks: &Ticks) -> Option<String> {
+/// Error over all cycles, um RMS.
+fn cycle_rms_um(rows: &[CycleRow]) -> Option<f64> {
+    let squares = rows.iter().map(|row| row.rms_um.powi(2));
+    let known: Vec<f64> = squares.filter(|square| square.is_finite()).collect();
+    let sum: f64 = known.iter().sum();
+    (!known.is_empty()).then(|| (sum / known.len() as f64).sqrt())
+}
+
+/// A bead over cycles of waves, each with an amplitude of its own.
+fn of_waves(rows: &[CycleRow]) -> Option<String> {
     let reached = cyclic(rows, |row| row.reached_um / row.commanded_um)?;
-    let rms = nm(ticks.rms_um()?);
+    let rms = nm(cycle_rms_um(rows)?);
     Some(format!(
-        "{} cycles: {} of the commanded amplitude in the first {}, {} in the last; error {rms} nm RMS.",
+        "{} cycles: {} of the commanded amplitude in the first {}, {} in the last; error {rms} nm RMS over the cycles.",
         reached.cycles,
         super::with_interval(reached.first.mean, reached.first.ci95),
         reached.first.cycles,
         super::with_interval(reached.last.mean, reached.last.ci95),
+    ))
+}
+
+/// A bead over the cycles of a script. Its steps count, which the error of a hold leaves out.
+fn of_cycles(rows: &[CycleRow]) -> Option<String> {
+    let rms = nm(cycle_rms_um(rows)?);
+    let disturbed = rows.iter().filter(|row| row.flags.is_disturbed()).count();
+    let but = match disturbed {
+        0 => String::new(),
+        n => format!(", {n} of them disturbed"),
+    };
+    let cycles = if rows.len() == 1 { "cycle" } else { "cycles" };
+    Some(format!(
+        "{} {cycles}{but}: error {rms} nm RMS over the cycles, steps included.",
+        rows.len()
     ))
 }
 
