@@ -288,6 +288,7 @@ fn through(model: &Model, input: &[f64], period_s: f64, age_s: f64) -> Result<Ve
     let bare = Model {
         effects: Vec::new(),
         camera_delay_s: None,
+        frame_age_s: None,
         ..model.clone()
     };
     let mut simulator = Simulator::new(&bare, period_s, None).map_err(Failure::input)?;

@@ -309,6 +309,7 @@ impl Identification {
             effects: Vec::new(),
             noise,
             camera_delay_s: Some(best.delay_s),
+            frame_age_s: None,
             covariance: Some(self.coefficient_covariance()),
             intervals,
             provenance,

@@ -51,10 +51,12 @@ pub struct Model {
     pub effects: Vec<Effect>,
     /// Brownian motion and localisation noise.
     pub noise: Noise,
-    /// Delay of the camera path that was measured with the plant, s: from the middle of an exposure to the tick that uses it.
-    /// It is not in [`Self::plant`], belongs to the rig and is what `camera_delay_ms` of rig.toml says; a loop's delay is
-    /// this and half a period of hold.
+    /// Delay that was measured with the plant, s: from a command to the middle of the exposure that shows it, and on to the tick that
+    /// uses it. It is not in [`Self::plant`], for it belongs to the rig; a loop's delay is this and half a period of hold.
     pub camera_delay_s: Option<f64>,
+    /// Age of the frames when that delay was measured, s. What it leaves of the delay is the way of a command to the bead: line, board and
+    /// amplifier.
+    pub frame_age_s: Option<f64>,
     /// Covariance of the fitted parameters, if they were fitted.
     pub covariance: Option<Covariance>,
     /// 95 % confidence intervals \[low, high\] by parameter name.
@@ -96,6 +98,7 @@ impl Model {
                 localisation_um: 0.03,
             },
             camera_delay_s: None,
+            frame_age_s: None,
             covariance: None,
             intervals: BTreeMap::new(),
             provenance: BTreeMap::new(),

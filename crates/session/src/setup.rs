@@ -341,10 +341,21 @@ impl Setup {
     }
 }
 
-/// The loop delay of a rig, s: its camera path (`camera_delay_ms`, from the middle of an exposure to its tick) and half a period
-/// of hold. The one definition: controllers are designed for it, and a run measures it.
-pub fn loop_delay_s(timing: &Timing) -> f64 {
-    timing.camera_delay_ms * 1e-3 + 0.5e-6 * timing.period_us
+/// The loop delay of a rig, s: its camera path (`camera_delay_ms`: from the middle of an exposure to the tick that uses it), the way of
+/// a command to the bead as it was measured with the model, and half a period of hold. The one definition: controllers are
+/// designed for it.
+pub fn loop_delay_s(model: &Model, timing: &Timing) -> f64 {
+    timing.camera_delay_ms * 1e-3 + command_delay_s(model) + 0.5e-6 * timing.period_us
+}
+
+/// From a command to what it does to the bead, s: line, board and amplifier. 0 where the model does not tell.
+fn command_delay_s(model: &Model) -> f64 {
+    let beyond_s = |delay_s: f64| Some(delay_s - model.frame_age_s?);
+    model
+        .camera_delay_s
+        .and_then(beyond_s)
+        .unwrap_or(0.0)
+        .max(0.0)
 }
 
 /// Difference of a delay that gives a warning, as a fraction of the period: half a period costs a controller some degrees of margin.
@@ -363,17 +374,17 @@ pub fn camera_delay_advice(found_ms: f64, timing: &Timing) -> Option<String> {
     })
 }
 
-/// What is wrong when a model was measured with another delay than the rig has. The model's is from the command to the exposure that
-/// shows it and on to the tick; the rig file's begins at the exposure. So the model's may be the longer one, by line and amplifier.
+/// What is wrong when a model was measured with frames of another age than the rig file states, or, where the model does not tell that
+/// age, with another delay.
 pub fn model_delay_warning(model: &Model, timing: &Timing) -> Option<String> {
     let (measured_ms, rig_ms) = (model.camera_delay_s? * 1e3, timing.camera_delay_ms);
-    let beyond_ms = measured_ms - rig_ms;
-    (beyond_ms.abs() > WORTH_SAYING * timing.period_us * 1e-3).then(|| {
+    if let Some(age_s) = model.frame_age_s {
+        return camera_delay_advice(age_s * 1e3, timing);
+    }
+    ((measured_ms - rig_ms).abs() > WORTH_SAYING * timing.period_us * 1e-3).then(|| {
         format!(
-            "the model was measured with {measured_ms:.2} ms from the command to the tick that uses its picture, the camera's part of it \
-             is camera_delay_ms = {rig_ms} by the rig file: measure the plant again (cellpos identify), which says if that key is wrong; \
-             if it is right, line and amplifier take {beyond_ms:.2} ms: cellpos design --delay {:.2}ms",
-            measured_ms + 0.5e-3 * timing.period_us
+            "the model states a delay of {measured_ms:.2} ms from a command to the tick that uses its picture, rig.toml says \
+             camera_delay_ms = {rig_ms}: measure the plant again (cellpos identify), which tells the two parts of that delay apart"
         )
     })
 }
@@ -382,7 +393,7 @@ pub fn model_delay_warning(model: &Model, timing: &Timing) -> Option<String> {
 /// from a controller.toml.
 pub fn controller(name: &str, model: &Model, timing: &Timing) -> Result<ControllerFile, Failure> {
     let sample_s = timing.period_us * 1e-6;
-    let loop_delay_s = loop_delay_s(timing);
+    let loop_delay_s = loop_delay_s(model, timing);
     let mut kind = None;
     let lead = match name {
         "pi" => None,
@@ -398,7 +409,7 @@ pub fn controller(name: &str, model: &Model, timing: &Timing) -> Result<Controll
         }
         path if path.ends_with(".toml") => {
             let file = ControllerFile::load(Path::new(path)).map_err(Failure::input)?;
-            if (file.delay_ms * 1e-3 - loop_delay_s).abs() > 0.05 * sample_s {
+            if (file.delay_ms * 1e-3 - loop_delay_s).abs() > WORTH_SAYING * sample_s {
                 return Err(Failure::bad_input(
                     format!(
                         "{path}: made for a loop delay of {} ms, the rig has {} ms",

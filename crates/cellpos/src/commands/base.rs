@@ -322,6 +322,7 @@ pub(super) fn model_of(best: &RationalFit, hold: Hold, at_rest: f64) -> Result<M
         noise: Noise::NONE,
         // A delay that the record shows is not known to be the camera's.
         camera_delay_s: None,
+        frame_age_s: None,
         covariance: None,
         intervals,
         provenance: BTreeMap::from([

@@ -185,7 +185,9 @@ fn plant(args: &Args, model: &Model) -> Result<DesignPlant, Failure> {
             "the rig runs at 1ms",
         ));
     }
-    let of_rig = timing.as_ref().map(setup::loop_delay_s);
+    let of_rig = timing
+        .as_ref()
+        .map(|timing| setup::loop_delay_s(model, timing));
     let given_s = args.delay.map(Seconds::value).or(of_rig);
     if given_s.is_some_and(|delay_s| delay_s < 0.5 * sample_time_s) {
         return Err(Failure::bad_input(

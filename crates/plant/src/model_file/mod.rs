@@ -123,13 +123,16 @@ fn read(text: &str, file: &str) -> Result<Model, ModelError> {
         None => Noise::NONE,
         Some(v) => read_noise(&top.table("noise", v)?, &of_plant)?,
     };
-    let camera_delay_s = match top.get("camera") {
-        None => None,
+    let (camera_delay_s, frame_age_s) = match top.get("camera") {
+        None => (None, None),
         Some(v) => {
             let table = top.table("camera", v)?;
-            table.only(&["delay_ms"])?;
+            table.only(&["delay_ms", "frame_age_ms"])?;
             let delay = table.need("delay_ms", "the delay of the camera path, for example 2.0")?;
-            Some(1e-3 * table.number("delay_ms", delay, &CAMERA_DELAY)?)
+            let delay_s = 1e-3 * table.number("delay_ms", delay, &CAMERA_DELAY)?;
+            let age = table.get("frame_age_ms");
+            let age_ms = age.map(|age| table.number("frame_age_ms", age, &CAMERA_DELAY));
+            (Some(delay_s), age_ms.transpose()?.map(|ms| 1e-3 * ms))
         }
     };
     let covariance = top
@@ -148,6 +151,7 @@ fn read(text: &str, file: &str) -> Result<Model, ModelError> {
         effects,
         noise,
         camera_delay_s,
+        frame_age_s,
         covariance,
         intervals,
         provenance,

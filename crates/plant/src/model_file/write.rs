@@ -75,8 +75,15 @@ pub(crate) fn write(model: &Model) -> String {
         float(model.noise.localisation_um)
     ));
     if let Some(delay_s) = model.camera_delay_s {
-        line("\n# from the middle of an exposure to the tick that uses it: camera_delay_ms of rig.toml; no part of the plant\n[camera]".to_owned());
+        line("\n# from a command to the exposure that shows it and on to the tick that uses it; no part of the plant\n[camera]".to_owned());
         line(format!("delay_ms = {}", float(delay_s * 1e3)));
+        if let Some(age_s) = model.frame_age_s {
+            line(
+                "# of this, from the middle of the exposure on: camera_delay_ms of rig.toml\n"
+                    .to_owned()
+                    + &format!("frame_age_ms = {}", float(age_s * 1e3)),
+            );
+        }
     }
     let mut written: Vec<&str> = Vec::new();
     for effect in &model.effects {

@@ -409,10 +409,13 @@ pub(crate) fn run(args: Args) -> CommandResult {
             },
         ),
     ]);
-    let model = done
-        .result
-        .model("identified", done.neutral_um, provenance)
-        .map_err(Failure::failed)?;
+    let model = Model {
+        frame_age_s: Some(done.age_s),
+        ..done
+            .result
+            .model("identified", done.neutral_um, provenance)
+            .map_err(Failure::failed)?
+    };
     output::write(&model_path, &model.to_toml_string())?;
     report::report(&done, &command_line(), args.eq6)
         .write_with_figures(&report_path)

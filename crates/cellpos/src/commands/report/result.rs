@@ -16,7 +16,10 @@ pub(super) fn section(
     bound: Option<&Bound>,
 ) -> String {
     let (status, ended) = ending(sessions);
-    let (lost, without) = (counted(sessions, "frames_lost"), counted(sessions, "fixes_lost"));
+    let (lost, without) = (
+        counted(sessions, "frames_lost"),
+        counted(sessions, "fixes_lost"),
+    );
     let mut sentence = of_a_cell(rows)
         .or_else(|| of_waves(rows))
         .or_else(|| of_cycles(rows))

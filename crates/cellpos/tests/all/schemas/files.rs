@@ -231,7 +231,7 @@ fn the_schema_of_models_is_the_catalogue_of_effects() {
             "working_point_um": { "type": "number", "description": "PZT displacement at which the bead is at rest" },
             "plant": table(json!({ "num": numbers, "den": numbers })),
             "noise": table(json!({ "diffusion_um2_per_s": zero_up, "localisation_um": zero_up })),
-            "camera": table(json!({ "delay_ms": zero_up })),
+            "camera": table(json!({ "delay_ms": zero_up, "frame_age_ms": zero_up })),
             "effects": { "type": "array", "items": { "anyOf": kinds } },
             "definitions": { "type": "array", "items": { "type": "object" } },
             "covariance": table(json!({
