@@ -1,5 +1,6 @@
 //! Records made ready for fitting: commands from the working point, whitening filters, masks.
 
+use crate::data::free::Free;
 use crate::data::motion::parabola;
 use crate::data::noise::{NoiseModel, Whitener};
 use crate::data::record::{Record, command_range_um};
@@ -45,23 +46,19 @@ pub(crate) struct Prepared {
     pub whitener: Whitener,
     pub extra_walk: Option<Vec<f64>>,
     pub rest: bool,
-    /// Motions by which the plant may come to rest from where it was before the record, as they are, and what a drift of the zero
-    /// flow makes.
+    /// Motions by which the plant may come to rest from where it was before the record, as they are.
     transients: Vec<Vec<f64>>,
-    /// The same in the space of innovations, orthonormal.
-    free: Vec<Vec<f64>>,
+    /// What a drift of the zero flow makes, if the noise has one.
+    parabola: Option<Vec<f64>>,
+    /// Both in the space of innovations.
+    free: Free,
 }
 
 impl Prepared {
     /// Innovations of a residual, in standard deviations, without what an unknown state at the record's start makes.
     pub(crate) fn whiten(&self, r: &[f64], e: &mut [f64]) {
         self.whitener.apply(r, e);
-        for q in &self.free {
-            let share = dot(q, e);
-            for (e, q) in e.iter_mut().zip(q) {
-                *e -= share * q;
-            }
-        }
+        self.free.take_off(e);
     }
 
     /// The same in rows of their own.
@@ -75,26 +72,21 @@ impl Prepared {
     fn set_noise(&mut self, base: &Base, noise: &NoiseModel) {
         self.whitener = Whitener::new(noise, &self.present, self.extra_walk.as_deref());
         self.transients = transients(base, self.u.len());
-        if noise.zero_flow.is_some_and(|z| z.drifts) {
-            self.transients.push(parabola(self.u.len()));
-        }
-        let mut free: Vec<Vec<f64>> = Vec::new();
-        for t in &self.transients {
-            let mut w = vec![0.0; t.len()];
-            self.whitener.apply(t, &mut w);
-            let size = dot(&w, &w);
-            for q in &free {
-                let share = dot(q, &w);
-                w.iter_mut().zip(q).for_each(|(w, q)| *w -= share * q);
-            }
-            let left = dot(&w, &w);
-            if left > 1e-9 * size && left > 0.0 {
-                let scale = 1.0 / left.sqrt();
-                w.iter_mut().for_each(|w| *w *= scale);
-                free.push(w);
-            }
-        }
-        self.free = free;
+        self.parabola = noise
+            .zero_flow
+            .is_some_and(|z| z.drifts())
+            .then(|| parabola(self.u.len()));
+        self.free = Free::new(noise, &self.whitener, &self.transients, self.u.len());
+    }
+
+    /// Twice the negative log-likelihood of a residual under another noise, without a constant.
+    pub(crate) fn unlikelihood(&self, noise: &NoiseModel, residual: &[f64]) -> f64 {
+        let whitener = Whitener::new(noise, &self.present, self.extra_walk.as_deref());
+        let free = Free::new(noise, &whitener, &self.transients, residual.len());
+        let mut e = vec![0.0; residual.len()];
+        whitener.apply(residual, &mut e);
+        free.take_off(&mut e);
+        dot(&e, &e) + whitener.log_determinant() + free.log_determinant()
     }
 
     /// What the transients and a level (and, where asked for, a ramp) leave of a residual.
@@ -104,7 +96,7 @@ impl Prepared {
         if ramp {
             columns.push((0..n).map(|k| k as f64 / n as f64 - 0.5).collect());
         }
-        columns.extend(self.transients.iter().cloned());
+        columns.extend(self.transients.iter().chain(&self.parabola).cloned());
         let mut basis: Vec<Vec<f64>> = Vec::new();
         let mut left = residual.to_vec();
         let blank = |v: &mut Vec<f64>| {
@@ -133,13 +125,21 @@ impl Prepared {
     }
 }
 
-/// Decays of the poles of a plant that did not rest before the record, from its first row, and the ramp of a working point that is not
-/// known.
+/// Times of decays in lengths of a record, half a decade apart: faster is over at once, slower is a ramp.
+const DECAYS: [f64; 5] = [0.003, 0.01, 0.03, 0.1, 0.3];
+
+/// Decays of the poles of a plant that did not rest before the record, from its first row; the ramp of a working point that is not
+/// known, and the decays by which a chain that remembers (a leak, a relaxation, a creep) comes from there to the first command.
 fn transients(base: &Base, rows: usize) -> Vec<Vec<f64>> {
     let mut all = Vec::new();
     if base.free_working_point {
         // What a plant that integrates makes of a command that is off its rest, whatever else it does to it.
         all.push((0..rows).map(|k| k as f64).collect());
+        let decay = |part: f64| -> Vec<f64> {
+            let of = |k: usize| (-(k as f64) / (part * rows as f64)).exp();
+            (0..rows).map(of).collect()
+        };
+        all.extend(DECAYS.map(decay));
     }
     if !base.free_start {
         return all;
@@ -228,7 +228,8 @@ impl Problem {
                 let whitener = Whitener::new(&noise, &present, extra_walk.as_deref());
                 let mut prepared = Prepared {
                     transients: Vec::new(),
-                    free: Vec::new(),
+                    parabola: None,
+                    free: Free::default(),
                     name: r.name.clone(),
                     u,
                     y,
@@ -277,7 +278,7 @@ impl Problem {
 
     /// Sum of the logarithms of the innovations' variances: what a noise pays for its size.
     pub(crate) fn log_determinant(&self) -> f64 {
-        let of = |r: &Prepared| r.whitener.log_determinant();
+        let of = |r: &Prepared| r.whitener.log_determinant() + r.free.log_determinant();
         self.records.iter().map(of).sum()
     }
 

@@ -4,6 +4,7 @@ pub(crate) mod actuator;
 pub(crate) mod coloured;
 pub(crate) mod floor;
 pub(crate) mod frames;
+pub(crate) mod free;
 pub(crate) mod motion;
 pub(crate) mod noise;
 pub(crate) mod record;

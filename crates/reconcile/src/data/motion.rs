@@ -8,8 +8,8 @@ pub struct ZeroFlow {
     pub motion_um2: f64,
     /// Its correlation time \[rows\].
     pub time_rows: f64,
-    /// It changes steadily as well, by as much as each record asks for: a parabola of the position, projected out.
-    pub drifts: bool,
+    /// Standard deviation of a steady change of the motion from row to row, one of each record \[um\]; 0: there is none.
+    pub drift_um: f64,
 }
 
 impl ZeroFlow {
@@ -21,6 +21,11 @@ impl ZeroFlow {
     /// Variance gained in a row.
     pub(super) fn fresh_um2(&self) -> f64 {
         -(-2.0 / self.time_rows).exp_m1() * self.motion_um2
+    }
+
+    /// Whether it drifts as well.
+    pub fn drifts(&self) -> bool {
+        self.drift_um > 0.0
     }
 
     /// Mean square of the path that it makes of so many rows, about its mean or, with `ramp`, about its regression line \[um^2\].
@@ -37,8 +42,8 @@ impl ZeroFlow {
     }
 }
 
-/// What a velocity that changes steadily makes of the position.
+/// The path of a motion that changes by one from row to row.
 pub(crate) fn parabola(rows: usize) -> Vec<f64> {
-    let of = |k: usize| (k as f64 / rows as f64 - 0.5).powi(2);
+    let of = |k: usize| 0.5 * (k as f64 - 0.5 * rows as f64).powi(2);
     (0..rows).map(of).collect()
 }

@@ -87,6 +87,7 @@ impl NoiseModel {
             }),
             zero_flow: self.zero_flow.map(|z| ZeroFlow {
                 motion_um2: factor * z.motion_um2,
+                drift_um: factor.sqrt() * z.drift_um,
                 ..z
             }),
         }
@@ -449,7 +450,6 @@ mod tests {
         let filter = Whitener::new(&n, &[true; 3], None);
         let expected = (variance * variance - next * next).ln();
         assert!((filter.log_determinant() - expected).abs() < 1e-12);
-
         transposed_as_applied(&n);
     }
 
@@ -458,7 +458,7 @@ mod tests {
         let zero_flow = ZeroFlow {
             motion_um2: 4e-4,
             time_rows: 7.0,
-            drifts: false,
+            drift_um: 0.0,
         };
         let n = NoiseModel {
             zero_flow: Some(zero_flow),
@@ -483,7 +483,6 @@ mod tests {
             (filtered / by_hand - 1.0).abs() < 1e-12,
             "{filtered} {by_hand}"
         );
-
         transposed_as_applied(&n);
     }
 

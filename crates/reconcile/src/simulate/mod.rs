@@ -29,6 +29,14 @@ pub(crate) struct Base {
     pub free_working_point: bool,
 }
 
+impl Base {
+    /// Speed of a bead over displacement from the zero flow \[1/s\], of a plant that integrates: that at 1 Hz.
+    pub(crate) fn speed_per_um(&self) -> f64 {
+        let w = std::f64::consts::TAU;
+        (self.zpk.at(nalgebra::Complex::new(0.0, w)).norm() * w).max(1e-12)
+    }
+}
+
 /// Simulates a record: displacement from the working point \[um\] in, bead position \[um\] out.
 ///
 /// What the camera shows of a position (lines, pixel locking) is fitted elsewhere: left out here, unless it shows the same

@@ -156,17 +156,14 @@ fn slow_noise(ctx: &Context<'_>) -> Option<String> {
 fn zero_flow(ctx: &Context<'_>) -> Option<String> {
     let z = ctx.problem.noise.zero_flow?;
     let dt = ctx.problem.base.sample_s;
-    // A plant that integrates has one gain from displacement to speed in the middle of its range.
-    let middle = std::f64::consts::TAU;
-    let at = nalgebra::Complex::new(0.0, middle);
-    let speed_per_um = (ctx.problem.base.zpk.at(at).norm() * middle).max(1e-12);
+    let speed_per_um = ctx.problem.base.speed_per_um();
     let speed_um_per_s = z.motion_um2.sqrt() / dt;
     let time_s = z.time_rows * dt;
     let in_a_second_um = speed_um_per_s * (2.0 / time_s).min(1.0).sqrt() / speed_per_um;
     Some(format!(
         "the zero flow moves by {} of displacement in a second{}: noise, and no effect",
         ctx.scales.told(in_a_second_um),
-        if z.drifts { ", and drifts" } else { "" }
+        if z.drifts() { ", and drifts" } else { "" }
     ))
 }
 

@@ -3,7 +3,7 @@
 use crate::data::coloured::NoiseKind;
 use crate::data::floor::{Floor, from_residuals};
 use crate::data::noise::NoiseModel;
-use crate::data::zero_flow;
+use crate::data::zero_flow::Prior;
 use crate::fit::catalogue::{self, Part};
 use crate::fit::context::{Context, Fit, WhiteEvidence, freedom_of};
 use crate::problem::Problem;
@@ -126,12 +126,11 @@ impl Searching<'_> {
             let next = self.search(problem, floor, effort, start, &mut *progress);
             let weighed = self.with_zero_flow(&next.problem, &next.found.fit);
             let cost = self.cost(&next.problem, &next.found.fit);
-            let settled = weighed.as_ref().is_none_or(|w| w.cost > cost - SETTLED);
             searched = Some(next);
-            match weighed {
-                Some(w) if !settled => best = w,
-                _ => break,
+            if weighed.cost > cost - SETTLED {
+                break;
             }
+            best = weighed;
         }
         match searched {
             Some(s) if self.cost(&s.problem, &s.found.fit) < least => s,
@@ -150,7 +149,6 @@ impl Searching<'_> {
                 self.with_zero_flow(problem, fit)
             })
             .into_iter()
-            .flatten()
             .min_by(|a, b| a.cost.total_cmp(&b.cost))
         };
         let less = |fit: &Fit| -> Vec<Fit> {
@@ -176,30 +174,25 @@ impl Searching<'_> {
     }
 
     /// A set fitted again beside the zero flow that goes best with what it leaves.
-    fn with_zero_flow(&self, problem: &Problem, fit: &Fit) -> Option<Weighed> {
+    fn with_zero_flow(&self, problem: &Problem, fit: &Fit) -> Weighed {
         let (residual, _) = self.context(problem, 0).residual(fit);
-        let left: Vec<zero_flow::Left<'_>> = (problem.records.iter().zip(&residual))
-            .map(|(r, residual)| zero_flow::Left {
-                residual,
-                present: &r.present,
-                extra_walk: r.extra_walk.as_deref(),
-            })
-            .collect();
-        let noise = zero_flow::estimate(&problem.noise, &left, problem.base.sample_s)?;
+        let noise = prior_of(problem).estimate(&problem.noise, |noise| {
+            (problem.records.iter().zip(&residual))
+                .map(|(r, residual)| r.unlikelihood(noise, residual))
+                .sum()
+        });
         let problem = problem.clone().with_noise(noise);
         let fit = self.context(&problem, 0).refit(fit, &problem.all(), 8);
-        Some(Weighed {
+        Weighed {
             noise,
             cost: self.cost(&problem, &fit),
             fit,
-        })
+        }
     }
 
     /// Twice the negative log-likelihood of a set under a problem's noise, with the price of the noise's numbers and, for each part,
     /// what any addition must gain.
     fn cost(&self, problem: &Problem, fit: &Fit) -> f64 {
-        let numbers =
-            (problem.noise.zero_flow).map_or(0, |z| zero_flow::numbers(&z, problem.records.len()));
         let records = problem.records.len();
         let dearer = |p: &Part| {
             threshold_of(p.variant(), records) - NUMBER * freedom_of(p.variant(), records) as f64
@@ -207,8 +200,13 @@ impl Searching<'_> {
         penalised_cost(&self.context(problem, 0), fit)
             + fit.parts.iter().map(dearer).sum::<f64>().max(0.0)
             + problem.log_determinant()
-            + NUMBER * numbers as f64
+            + prior_of(problem).price(problem.noise.zero_flow.as_ref())
     }
+}
+
+/// What zero flows of the problem's rig are like.
+fn prior_of(problem: &Problem) -> Prior {
+    Prior::new(problem.base.speed_per_um(), problem.base.sample_s)
 }
 
 /// A set beside a noise, and what they cost together.

@@ -1,0 +1,112 @@
+//! Motions of a record that are of any size (its level, its start) or of a size with a prior (a drift), in the space of innovations.
+
+use crate::data::motion::parabola;
+use crate::data::noise::{NoiseModel, Whitener};
+use crate::dot::dot;
+
+/// Orthonormal innovations of those motions, each with the part of it that is noise.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct Free {
+    directions: Vec<(Vec<f64>, f64)>,
+    log_determinant: f64,
+}
+
+impl Free {
+    /// Of transients of any size, and of the drift that the noise has.
+    pub(crate) fn new(
+        noise: &NoiseModel,
+        whitener: &Whitener,
+        transients: &[Vec<f64>],
+        rows: usize,
+    ) -> Self {
+        let mut free = Self::default();
+        for t in transients {
+            if let Some((q, _)) = free.direction(whitener, t) {
+                free.directions.push((q, 1.0));
+            }
+        }
+        let drift_um = noise.zero_flow.map_or(0.0, |z| z.drift_um);
+        if drift_um > 0.0
+            && let Some((q, size)) = free.direction(whitener, &parabola(rows))
+        {
+            // A direction of that variance beside the innovation's own: squares along it count 1 / variance.
+            let variance = 1.0 + (drift_um * size).powi(2);
+            free.directions.push((q, 1.0 - 1.0 / variance.sqrt()));
+            free.log_determinant = variance.ln();
+        }
+        free
+    }
+
+    /// The direction of a motion that is none of those before, and its size.
+    fn direction(&self, whitener: &Whitener, motion: &[f64]) -> Option<(Vec<f64>, f64)> {
+        let mut w = vec![0.0; motion.len()];
+        whitener.apply(motion, &mut w);
+        let all = dot(&w, &w);
+        for (q, _) in &self.directions {
+            let share = dot(q, &w);
+            w.iter_mut().zip(q).for_each(|(w, q)| *w -= share * q);
+        }
+        let left = dot(&w, &w);
+        if left <= 1e-9 * all || left <= 0.0 {
+            return None;
+        }
+        let size = left.sqrt();
+        w.iter_mut().for_each(|w| *w /= size);
+        Some((w, size))
+    }
+
+    /// Takes those motions off innovations.
+    pub(crate) fn take_off(&self, e: &mut [f64]) {
+        for (q, part) in &self.directions {
+            let share = part * dot(q, e);
+            e.iter_mut().zip(q).for_each(|(e, q)| *e -= share * q);
+        }
+    }
+
+    /// What the drift adds to the logarithm of the determinant.
+    pub(crate) fn log_determinant(&self) -> f64 {
+        self.log_determinant
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::data::motion::ZeroFlow;
+
+    #[test]
+    fn squares_and_determinant_are_those_of_a_covariance_with_the_drift_in_it() {
+        // Two increments whose covariance with a drift is written out by hand.
+        let noise = NoiseModel {
+            zero_flow: Some(ZeroFlow {
+                motion_um2: 1e-12,
+                time_rows: 10.0,
+                drift_um: 0.05,
+            }),
+            ..NoiseModel::new(0.33, 1e-3, 0.0)
+        };
+        let y = [0.0, 0.03, 0.11];
+        let whitener = Whitener::new(&noise, &[true; 3], None);
+        let free = Free::new(&noise, &whitener, &[], 3);
+        let mut e = [0.0; 3];
+        whitener.apply(&y, &mut e);
+        free.take_off(&mut e);
+        let squares: f64 = e.iter().map(|e| e * e).sum();
+
+        // Motions of the parabola in the two increments: -1 and 0 of the drift's size.
+        let path = parabola(3);
+        let (a, b) = (path[1] - path[0], path[2] - path[1]);
+        let (q, d) = (noise.walk_um2, 0.05f64.powi(2));
+        let covariance = [q + d * a * a, d * a * b, q + d * b * b];
+        let determinant = covariance[0] * covariance[2] - covariance[1].powi(2);
+        let (s, t) = (y[1] - y[0], y[2] - y[1]);
+        let by_hand = (covariance[2] * s * s - 2.0 * covariance[1] * s * t + covariance[0] * t * t)
+            / determinant;
+        assert!(
+            (squares / by_hand - 1.0).abs() < 1e-6,
+            "{squares} {by_hand}"
+        );
+        let log = whitener.log_determinant() + free.log_determinant();
+        assert!((log - determinant.ln()).abs() < 1e-6, "{log}");
+    }
+}
