@@ -40,7 +40,7 @@ pub(crate) struct Prepared {
     pub name: String,
     /// Command from the working point \[um\].
     pub u: Vec<f64>,
-    /// Position, 0 where there is none \[um\].
+    /// Position, 0 if missing \[um\].
     pub y: Vec<f64>,
     pub present: Vec<bool>,
     pub whitener: Whitener,
@@ -48,9 +48,9 @@ pub(crate) struct Prepared {
     pub rest: bool,
     /// Motions by which the plant may come to rest from where it was before the record, as they are.
     transients: Vec<Vec<f64>>,
-    /// What a drift of the zero flow makes, if the noise has one.
+    /// Path of a drift of the zero flow, if the noise has one.
     parabola: Option<Vec<f64>>,
-    /// Both in the space of innovations.
+    /// Transients and path in the space of innovations.
     free: Free,
 }
 
@@ -125,15 +125,16 @@ impl Prepared {
     }
 }
 
-/// Times of decays in lengths of a record, half a decade apart: faster is over at once, slower is a ramp.
+/// Time constants of the free decays over the length of a record, half a decade apart. Faster decays are over at once, slower ones are
+/// a ramp.
 const DECAYS: [f64; 5] = [0.003, 0.01, 0.03, 0.1, 0.3];
 
-/// Decays of the poles of a plant that did not rest before the record, from its first row; the ramp of a working point that is not
-/// known, and the decays by which a chain that remembers (a leak, a relaxation, a creep) comes from there to the first command.
+/// Free motions of a record. A plant that did not rest before the record: the decays of its poles. An unknown working point: a ramp, and
+/// the decays with which a chain with memory (a leak, a relaxation, a creep) goes from its unknown start to the first command.
 fn transients(base: &Base, rows: usize) -> Vec<Vec<f64>> {
     let mut all = Vec::new();
     if base.free_working_point {
-        // What a plant that integrates makes of a command that is off its rest, whatever else it does to it.
+        // An error of the working point gives an integrating plant a ramp.
         all.push((0..rows).map(|k| k as f64).collect());
         let decay = |part: f64| -> Vec<f64> {
             let of = |k: usize| (-(k as f64) / (part * rows as f64)).exp();
@@ -177,7 +178,7 @@ pub(crate) struct Problem {
     /// The direct path of Eq. (6) acts at once; a frame whose exposure straddles the command's edge shows a part of it.
     /// It is a nuisance of every fit, the null included: worth at most 19 nm per um of command step.
     pub soft: (f64, f64),
-    /// The positions come in steps that are not small beside their increments.
+    /// The positions come in steps that are not small compared with their increments.
     pub quantised: bool,
     /// Work of all simulations until now; the copies of a problem count together.
     work: Arc<AtomicU64>,
@@ -276,7 +277,7 @@ impl Problem {
         self.records.iter().map(|r| r.present.clone()).collect()
     }
 
-    /// Sum of the logarithms of the innovations' variances: what a noise pays for its size.
+    /// Sum of the logarithms of the innovations' variances: the determinant in the likelihood.
     pub(crate) fn log_determinant(&self) -> f64 {
         let of = |r: &Prepared| r.whitener.log_determinant() + r.free.log_determinant();
         self.records.iter().map(of).sum()

@@ -4,7 +4,7 @@ use crate::data::motion::parabola;
 use crate::data::noise::{NoiseModel, Whitener};
 use crate::dot::dot;
 
-/// Orthonormal innovations of those motions, each with the part of it that is noise.
+/// Orthonormal innovations of the free motions, each with the part to remove.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Free {
     directions: Vec<(Vec<f64>, f64)>,
@@ -29,7 +29,7 @@ impl Free {
         if drift_um > 0.0
             && let Some((q, size)) = free.direction(whitener, &parabola(rows))
         {
-            // A direction of that variance beside the innovation's own: squares along it count 1 / variance.
+            // The drift adds to the variance along its direction. Squares there count 1 / variance.
             let variance = 1.0 + (drift_um * size).powi(2);
             free.directions.push((q, 1.0 - 1.0 / variance.sqrt()));
             free.log_determinant = variance.ln();
@@ -37,7 +37,7 @@ impl Free {
         free
     }
 
-    /// The direction of a motion that is none of those before, and its size.
+    /// The direction of a motion without its part along the earlier directions, and its size.
     fn direction(&self, whitener: &Whitener, motion: &[f64]) -> Option<(Vec<f64>, f64)> {
         let mut w = vec![0.0; motion.len()];
         whitener.apply(motion, &mut w);
@@ -55,7 +55,7 @@ impl Free {
         Some((w, size))
     }
 
-    /// Takes those motions off innovations.
+    /// Removes the free motions from innovations.
     pub(crate) fn take_off(&self, e: &mut [f64]) {
         for (q, part) in &self.directions {
             let share = part * dot(q, e);

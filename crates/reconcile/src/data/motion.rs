@@ -8,7 +8,7 @@ pub struct ZeroFlow {
     pub motion_um2: f64,
     /// Its correlation time \[rows\].
     pub time_rows: f64,
-    /// Standard deviation of a steady change of the motion from row to row, one of each record \[um\]; 0: there is none.
+    /// Standard deviation of a steady change of the motion from row to row, different in each record \[um\]; 0: no drift.
     pub drift_um: f64,
 }
 
@@ -28,7 +28,7 @@ impl ZeroFlow {
         self.drift_um > 0.0
     }
 
-    /// Mean square of the path that it makes of so many rows, about its mean or, with `ramp`, about its regression line \[um^2\].
+    /// Mean square of its path over `rows`, about the mean or, with `ramp`, about its regression line \[um^2\].
     pub fn path_um2(&self, rows: f64, ramp: bool) -> f64 {
         // A velocity kept for good is a ramp, n^2/12 about its mean; one that walks by q a row makes q n^3/30 and q n^3/420 about the
         // line; one forgotten at once is a walk of 2 V T a row. What it is in truth is below each of them.

@@ -1,20 +1,20 @@
-//! A zero flow that moves: its strength and time by maximum likelihood, from what a fit leaves over.
+//! A zero flow that moves: strength and time from the residuals of a fit, by maximum posterior probability.
 //!
-//! In a closed loop the command holds what the zero flow did: with noise that does not know of it, every slow effect of the response
-//! is biased, and one is found where there is none.
+//! In a closed loop the command follows the zero flow. A noise model without that state biases every slow effect of the response and
+//! gives false ones.
 
 use crate::data::motion::ZeroFlow;
 use crate::data::noise::NoiseModel;
 use crate::thresholds::NUMBER;
 
-/// What zero flows of syringe, tube and reservoir do, 95 % of them: 1 to 50 nm of displacement that is kept for 3 to 100 s. Median, and
-/// standard deviation of the logarithm. Without it a slow effect of the response (a leak) is taken for a zero flow that obeys.
+/// Zero flow of syringe, tube and reservoir (95 %): a displacement of 1 to 50 nm RMS with a correlation time of 3 to 100 s. Median, and
+/// standard deviation of the logarithm. Without this prior a leak is mistaken for a zero flow that follows the command.
 const DISPLACEMENT_UM: (f64, f64) = (0.007, 1.0);
 const TIME_S: (f64, f64) = (17.0, 0.9);
-/// They drift by up to 5 nm/s either way \[um/s\]: a standard deviation.
+/// Standard deviation of the drift \[um/s\]: 95 % of the rigs drift by less than 5 nm/s.
 const DRIFT_UM_PER_S: f64 = 0.0025;
 
-/// The numbers of a zero flow that rigs show, in rows and in motions of the bead.
+/// Prior of a zero flow, in rows and in motions of the bead.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Prior {
     sample_s: f64,
@@ -23,7 +23,7 @@ pub(crate) struct Prior {
 }
 
 impl Prior {
-    /// Of a bead that goes at `speed_per_um` \[1/s\] of the displacement.
+    /// For a bead whose speed is `speed_per_um` \[1/s\] times the displacement.
     pub(crate) fn new(speed_per_um: f64, sample_s: f64) -> Self {
         Self {
             sample_s,
@@ -31,7 +31,7 @@ impl Prior {
         }
     }
 
-    /// The zero flow whose displacement and time are so many standard deviations off the medians.
+    /// The zero flow at a number of standard deviations from the medians of displacement and time.
     fn at(&self, [size, time]: [f64; 2], drifts: bool) -> ZeroFlow {
         let displacement_um = DISPLACEMENT_UM.0 * (DISPLACEMENT_UM.1 * size).exp();
         let drift_um = DRIFT_UM_PER_S * self.sample_s * self.motion_per_um;
@@ -42,7 +42,7 @@ impl Prior {
         }
     }
 
-    /// The standard deviations of a zero flow.
+    /// Displacement and time as standard deviations from the medians.
     fn of(&self, z: &ZeroFlow) -> [f64; 2] {
         let displacement_um = z.motion_um2.sqrt() / self.motion_per_um;
         let time_s = z.time_rows * self.sample_s;
@@ -52,7 +52,7 @@ impl Prior {
         ]
     }
 
-    /// What a zero flow costs in twice the log-likelihood: its two numbers and how unlike those of rigs they are.
+    /// Cost of a zero flow in twice the log-likelihood: two numbers, and their distance from the medians.
     pub(crate) fn price(&self, z: Option<&ZeroFlow>) -> f64 {
         z.map_or(0.0, |z| {
             let off: f64 = self.of(z).iter().map(|x| x * x).sum();
@@ -60,7 +60,7 @@ impl Prior {
         })
     }
 
-    /// The same noise with the zero flow that makes residuals likeliest; `unlikelihood` is twice their negative log-likelihood.
+    /// The same noise with the most probable zero flow; `unlikelihood` is twice the negative log-likelihood of the residuals.
     pub(crate) fn estimate(
         &self,
         noise: &NoiseModel,
@@ -164,7 +164,7 @@ mod tests {
         for seed in 1..5 {
             let (noise, gain) = estimated(&series(40_000, 0.002, 5000.0, 0.0, seed));
             let z = noise.zero_flow.expect("a zero flow");
-            // What is gained in a second is told better than size and time apart: eight times of five seconds.
+            // The motion gained in a second is better known than size or time alone: the record has eight correlation times.
             let found = z.motion_um2 / z.time_rows / (4e-6 / 5000.0);
             assert!(gain > 20.0, "{gain}");
             assert!(found.ln().abs() < 1.4, "{found} {z:?}");

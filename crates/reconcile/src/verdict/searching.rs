@@ -67,7 +67,7 @@ impl Searching<'_> {
         loop {
             let ctx = self.context(&problem, floor.rows);
             let found = search(&ctx, &problem.all(), effort, start.as_ref(), &mut *progress);
-            // What the final residual shows is at least as good an estimate of the noise, if the fit is good.
+            // The residual of a good fit is at least as good an estimate of the noise.
             let (residual, _) = ctx.residual(&found.fit);
             let noise = problem.noise;
             let refined = NoiseModel {
@@ -91,11 +91,10 @@ impl Searching<'_> {
         }
     }
 
-    /// The set beside a zero flow that moves, where that is likelier than the set without.
+    /// The set with a moving zero flow, if that is more probable than the set without one.
     ///
-    /// What a zero flow does in a closed loop looks like slow effects of the response, and both explain it to the noise: the two are
-    /// weighed with all that either takes. So the parts of a set are taken out again one by one, each time beside the zero flow that
-    /// then goes best with the rest, and what stands is searched further.
+    /// In a closed loop a zero flow and a slow effect of the response explain much the same motion. So the joint cost of both decides:
+    /// parts are removed from the set one by one, each time with a new estimate of the zero flow, and the search goes on from the best.
     pub(super) fn beside_zero_flow(
         &self,
         still: Searched,
@@ -138,8 +137,8 @@ impl Searching<'_> {
         }
     }
 
-    /// The likeliest of a set, the first effect found, and none, and of what remains when parts are taken out one by one, each beside
-    /// its zero flow; `None` where the set alone is.
+    /// The best set with a moving zero flow, or `None` if the set without one is better. Starts: the set, its first effect, and no effect,
+    /// and the set without one part.
     fn taken_back(&self, still: &Searched, least: f64, effort: Effort) -> Option<Weighed> {
         let problem = &still.problem;
         let fit = &still.found.fit;
@@ -173,7 +172,7 @@ impl Searching<'_> {
         (best.cost < least).then_some(best)
     }
 
-    /// A set fitted again beside the zero flow that goes best with what it leaves.
+    /// A set fitted again with the most probable zero flow of its residuals.
     fn with_zero_flow(&self, problem: &Problem, fit: &Fit) -> Weighed {
         let (residual, _) = self.context(problem, 0).residual(fit);
         let noise = prior_of(problem).estimate(&problem.noise, |noise| {
@@ -204,12 +203,12 @@ impl Searching<'_> {
     }
 }
 
-/// What zero flows of the problem's rig are like.
+/// Prior of the zero flow of the problem's rig.
 fn prior_of(problem: &Problem) -> Prior {
     Prior::new(problem.base.speed_per_um(), problem.base.sample_s)
 }
 
-/// A set beside a noise, and what they cost together.
+/// A set with its noise, and their joint cost.
 struct Weighed {
     noise: NoiseModel,
     fit: Fit,

@@ -205,15 +205,20 @@ fn closed_loop(flow: Flow, hidden: Hidden, added: Added, seed: u64) -> Record {
 }
 
 fn run(record: Record) -> Reconciliation {
+    run_from(record, WORKING_POINT_UM, &Options::default())
+}
+
+/// With another working point of the model.
+fn run_from(record: Record, working_point_um: f64, options: &Options) -> Reconciliation {
     let model = Model {
-        working_point_um: WORKING_POINT_UM,
+        working_point_um,
         noise: Noise {
             diffusion_um2_per_s: 0.33,
             localisation_um: 0.012,
         },
         ..Model::eq6()
     };
-    reconcile(&model, &[record], &Options::default(), &mut |_| {}).unwrap()
+    reconcile(&model, &[record], options, &mut |_| {}).unwrap()
 }
 
 /// The names, of which the delay must be one, with its value.
@@ -259,6 +264,31 @@ fn what_is_missing_is_named_beside_a_zero_flow_that_moves() {
     let p = &gain.parameters["factor"];
     let half = 0.5 * (p.ci95[1] - p.ci95[0]);
     assert!(half < 0.01 && (p.value - 0.8).abs() < 1.5 * half, "{p:?}");
+}
+
+#[test]
+fn a_leak_is_told_from_a_zero_flow_that_moves_wherever_the_bead_rests() {
+    let flow = Flow {
+        wander_um: 0.006,
+        time_s: 20.0,
+        drift_um_per_s: 0.001,
+    };
+    let record = closed_loop(flow, Hidden::Leak(2.0), survey, 71);
+    let unknown = Options {
+        free_working_point: true,
+        ..Options::default()
+    };
+    let known = Options::default();
+    for (off_um, options) in [(0.0, &known), (0.3, &unknown)] {
+        let r = run_from(record.clone(), WORKING_POINT_UM + off_um, options);
+        let mut names = named(&r);
+        names.sort_unstable();
+        assert_eq!(names, ["leak", "time-delay"], "{off_um}: {:?}", r.places);
+        let leak = r.effects.iter().find(|e| e.id == "leak").unwrap();
+        let p = &leak.parameters["corner_rad_per_s"];
+        let half = 0.5 * (p.ci95[1] - p.ci95[0]);
+        assert!(half < 0.4 && (p.value - 2.0).abs() < 1.5 * half, "{p:?}");
+    }
 }
 
 #[test]
