@@ -26,13 +26,18 @@ impl Free {
             }
         }
         let drift_um = noise.zero_flow.map_or(0.0, |z| z.drift_um);
-        if drift_um > 0.0
-            && let Some((q, size)) = free.direction(whitener, &parabola(rows))
-        {
-            // The drift adds to the variance along its direction. Squares there count 1 / variance.
-            let variance = 1.0 + (drift_um * size).powi(2);
-            free.directions.push((q, 1.0 - 1.0 / variance.sqrt()));
-            free.log_determinant = variance.ln();
+        if drift_um <= 0.0 {
+            return free;
+        }
+        // The working point is as old as the record is long, or older: since then the zero flow drifted by as much again.
+        let ramp = (0..rows).map(|k| (k as f64 - 0.5 * (rows as f64 - 1.0)) * rows as f64);
+        for path in [parabola(rows), ramp.collect()] {
+            if let Some((q, size)) = free.direction(whitener, &path) {
+                // The drift adds to the variance along its direction. Squares there count 1 / variance.
+                let variance = 1.0 + (drift_um * size).powi(2);
+                free.directions.push((q, 1.0 - 1.0 / variance.sqrt()));
+                free.log_determinant += variance.ln();
+            }
         }
         free
     }
@@ -93,11 +98,15 @@ mod tests {
         free.take_off(&mut e);
         let squares: f64 = e.iter().map(|e| e * e).sum();
 
-        // Motions of the parabola in the two increments: -1 and 0 of the drift's size.
+        // Motions of the parabola in the two increments, and of the ramp: 3 in both.
         let path = parabola(3);
         let (a, b) = (path[1] - path[0], path[2] - path[1]);
         let (q, d) = (noise.walk_um2, 0.05f64.powi(2));
-        let covariance = [q + d * a * a, d * a * b, q + d * b * b];
+        let covariance = [
+            q + d * (a * a + 9.0),
+            d * (a * b + 9.0),
+            q + d * (b * b + 9.0),
+        ];
         let determinant = covariance[0] * covariance[2] - covariance[1].powi(2);
         let (s, t) = (y[1] - y[0], y[2] - y[1]);
         let by_hand = (covariance[2] * s * s - 2.0 * covariance[1] * s * t + covariance[0] * t * t)

@@ -44,6 +44,6 @@ impl ZeroFlow {
 
 /// The path of a motion that changes by one from row to row.
 pub(crate) fn parabola(rows: usize) -> Vec<f64> {
-    let of = |k: usize| 0.5 * (k as f64 - 0.5 * rows as f64).powi(2);
+    let of = |k: usize| 0.5 * (k as f64 - 0.5 * (rows as f64 - 1.0)).powi(2);
     (0..rows).map(of).collect()
 }
