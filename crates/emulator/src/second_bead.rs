@@ -1,6 +1,5 @@
-//! A second bead near the first, both carried by the same flow.
+//! How beads diffuse across the channel and next to each other, carried by the same flow.
 
-use crate::world::confined;
 use cellpos_numeric::Random;
 
 /// The place of the second bead after a step, along the channel from the first and across the channel, um. Both diffuse: their
@@ -24,6 +23,15 @@ pub(crate) fn diffuse(
         (along, across)
     } else {
         moved
+    }
+}
+
+/// Reflects a position across the channel at the borders of the frame's range.
+pub(crate) fn confined(lateral_um: f64, limit_um: f64) -> f64 {
+    if lateral_um.abs() <= limit_um {
+        lateral_um
+    } else {
+        (2.0 * limit_um.copysign(lateral_um) - lateral_um).clamp(-limit_um, limit_um)
     }
 }
 

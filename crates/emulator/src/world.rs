@@ -8,7 +8,7 @@ use crate::faults::FaultKind;
 use crate::imperfections::Wander;
 use crate::partner::PressurePartner;
 use crate::render::{Renderer, localisation_bound_um, mean_between};
-use crate::second_bead;
+use crate::second_bead::{self, confined};
 use crate::zero_flow::{ZeroFlow, gain_per_s};
 use cellpos_numeric::Random;
 use cellpos_plant::effects::{Action, Shown};
@@ -485,13 +485,4 @@ fn renderer(config: &WorldConfig) -> Result<Renderer, WorldError> {
         value: config.bead_radius_um,
         must: "above 0 um",
     })
-}
-
-/// Reflects a position across the channel at the borders of the frame's range.
-pub(crate) fn confined(lateral_um: f64, limit_um: f64) -> f64 {
-    if lateral_um.abs() <= limit_um {
-        lateral_um
-    } else {
-        (2.0 * limit_um.copysign(lateral_um) - lateral_um).clamp(-limit_um, limit_um)
-    }
 }
