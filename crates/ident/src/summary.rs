@@ -17,6 +17,7 @@ use crate::order_selection::{
     CandidateFits, CandidateOrder, DelayPrior, OrderSelection, index, model_of,
 };
 use crate::sampled::Sampling;
+use cellpos_numeric::statistics::f_exceeds;
 
 /// One line of the compensated response.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -181,6 +182,10 @@ pub fn literal_per_hertz(measured_per_s: f64, stated_per_s: f64) -> Option<f64> 
     ((ratio / turn - 1.0).abs() < 0.12).then_some(ratio)
 }
 
+/// Probability of residuals as large as these by the noise alone, below which they are said to be more: one false word in a thousand
+/// identifications.
+const BEYOND_NOISE: f64 = 1e-3;
+
 fn warnings(result: &Identification, stated_per_s: Option<f64>) -> Vec<String> {
     let mut out = Vec::new();
     if let (Some(gap), Some(led)) = (result.disagreement_s, result.led) {
@@ -195,7 +200,13 @@ fn warnings(result: &Identification, stated_per_s: Option<f64>) -> Vec<String> {
             360.0 * 200.0 * gap
         ));
     }
-    if result.selection.scale > 2.0 {
+    let best = result.selection.best();
+    let beyond_noise = f_exceeds(
+        best.chi2 / best.dof,
+        best.dof,
+        result.selection.interval_dof,
+    );
+    if beyond_noise < BEYOND_NOISE {
         out.push(format!(
             "the residuals of the best order are {:.1} times the noise (as standard deviations): the plant holds something that \
              Eq. (4) does not; the intervals were widened by that factor",
