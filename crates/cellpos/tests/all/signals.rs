@@ -238,7 +238,8 @@ struct Holding {
     sign: &'static str,
     /// Content of that file then.
     text: &'static str,
-    /// Whether it lets go of the rig to compute in between, on the virtual clock: then a stop ends it as it ends any program.
+    /// Whether it lets go of the rig in between, to compute on the virtual clock or before another run where a stall ended one: then a
+    /// stop ends it as it ends any program.
     lets_go: bool,
 }
 
@@ -260,7 +261,7 @@ const HOLDING: [Holding; 7] = [
         line: IDENTIFY,
         sign: "partial.json",
         text: "segments",
-        lets_go: false,
+        lets_go: true,
     },
     Holding {
         line: "circle --rig rig.toml --frames off --seed 3 --effort 1 --max-effects 1 --rounds 0 --out a.toml --report a.html \
