@@ -59,8 +59,7 @@ fn lateness_ns(ticks: &[TickRecord]) -> Vec<i64> {
     let handed_over_ns = |tick: &TickRecord| age_ns(tick) + i64::from(tick.compute_ns);
     let mut late_ns = Vec::with_capacity(ticks.len());
     for ticks in ticks.chunks(SECOND) {
-        let fresh = ticks.iter().filter(|tick| is_new_frame(tick));
-        let usual_ns = median(fresh.map(handed_over_ns)).unwrap_or(0);
+        let usual_ns = median(with_new_frame(ticks).map(handed_over_ns)).unwrap_or(0);
         late_ns.extend(ticks.iter().map(|tick| match is_new_frame(tick) {
             true => handed_over_ns(tick) - usual_ns,
             false => i64::MAX,
@@ -85,6 +84,10 @@ fn is_new_frame(tick: &TickRecord) -> bool {
     !tick.flags.has(TickFlags::TIMER) && !tick.flags.has(TickFlags::STALE)
 }
 
+fn with_new_frame(ticks: &[TickRecord]) -> impl Iterator<Item = &TickRecord> {
+    ticks.iter().filter(|tick| is_new_frame(tick))
+}
+
 /// How old a tick's frame is, by its own stamp, ns.
 fn age_ns(tick: &TickRecord) -> i64 {
     tick.time_ns - tick.mid_exposure_ns
@@ -95,10 +98,6 @@ fn median(values: impl Iterator<Item = i64>) -> Option<i64> {
     let mut values: Vec<i64> = values.collect();
     values.sort_unstable();
     values.get(values.len() / 2).copied()
-}
-
-fn frame_ages_ns(ticks: &[TickRecord]) -> impl Iterator<Item = i64> {
-    ticks.iter().filter(|tick| is_new_frame(tick)).map(age_ns)
 }
 
 /// Mean of the ages that are known, s.
@@ -125,7 +124,7 @@ impl Rows {
             .iter()
             .position(TickRecord::is_running)
             .unwrap_or(ticks.len());
-        let usual_ns = median(frame_ages_ns(&ticks[closed..])).unwrap_or(0);
+        let usual_ns = median(with_new_frame(&ticks[closed..]).map(age_ns)).unwrap_or(0);
         let late_ns = lateness_ns(&ticks[closed..]);
         let tolerated_ns = tolerated_ns(&late_ns, period_ns);
         rows.usual_age_periods = usual_ns.max(0) as f64 / period_ns as f64;

@@ -5,8 +5,7 @@
 //! reference or an added excitation, tells the plant from the controller: both input and output are projected on it, and
 //! their ratio is the plant's response (joint input-output, or instrument).
 
-use crate::frequency_response::FrequencyPoint;
-use crate::spectral::by_instrument;
+pub use crate::spectral::by_reference;
 use nalgebra::{DMatrix, DVector};
 
 /// Whether the input of a record answers its output.
@@ -76,22 +75,10 @@ pub fn feedback(input: &[f64], output: &[f64]) -> Option<Feedback> {
     })
 }
 
-/// The response from input to output by way of a reference that the noise is not in; stretches of `stretch` rows. Points
-/// where either is not coherent with the reference are left out.
-pub fn by_reference(
-    reference: &[f64],
-    input: &[f64],
-    output: &[f64],
-    period_s: f64,
-    stretch: usize,
-    least_coherence: f64,
-) -> Vec<FrequencyPoint> {
-    by_instrument(reference, input, output, period_s, stretch, least_coherence)
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::frequency_response::FrequencyPoint;
     use crate::spectral::welch;
     use cellpos_numeric::Random;
     use nalgebra::Complex;

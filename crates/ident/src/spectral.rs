@@ -191,7 +191,7 @@ pub fn welch(
         }
     };
     let (u, y) = (prepared(input), prepared(output));
-    by_instrument(&u, &u, &y, period_s, stretch, least_coherence)
+    by_reference(&u, &u, &y, period_s, stretch, least_coherence)
 }
 
 /// Sums of spectra over stretches, of one bin or of bins that see one line: `r` the instrument, `u` the input, `y` the output.
@@ -238,7 +238,7 @@ impl Sums {
 
 /// Response from input to output by way of an instrument that the noise is not in (the input, if it is free of noise), by averaged
 /// spectra as [`welch`]. Each point has the frequency of the power that its bins hold; bins that see one line are one point.
-pub(crate) fn by_instrument(
+pub fn by_reference(
     instrument: &[f64],
     input: &[f64],
     output: &[f64],

@@ -41,7 +41,7 @@ pub fn student_t_quantile(probability: f64, dof: f64) -> f64 {
 }
 
 /// The value at which a rising function reaches `target`, by bisection between `low` and `high`.
-fn invert(target: f64, mut low: f64, mut high: f64, f: impl Fn(f64) -> f64) -> f64 {
+pub fn invert(target: f64, mut low: f64, mut high: f64, f: impl Fn(f64) -> f64) -> f64 {
     // Two hundred halvings end at neighbouring numbers.
     for _ in 0..200 {
         let mid = 0.5 * (low + high);

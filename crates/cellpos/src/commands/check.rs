@@ -53,7 +53,7 @@ pub(crate) fn run(args: Args) -> CommandResult {
     output::ready(&args.report)?;
     let script = Script::read(&args.script).map_err(Failure::input)?;
     let model = Model::load(&args.model).map_err(Failure::input)?;
-    let limits = limits(&args)?;
+    let (limits, knows_view) = limits(&args)?;
     let result = check(&script, &model, &limits).map_err(Failure::input)?;
     if let Some(path) = &args.report {
         report(&script, &result, &limits)
@@ -64,7 +64,7 @@ pub(crate) fn run(args: Args) -> CommandResult {
         print_json(&json(&script, &result))?;
     } else {
         print_text(&text(&script, &result))?;
-        if args.view.is_none() && !knows_view(&args)? {
+        if !knows_view {
             print_text(&format!(
                 "field of view: {} um to either side is assumed; `--view` says what the camera sees, and `cellpos run` asks the camera\n",
                 limits.view_um
@@ -78,9 +78,11 @@ pub(crate) fn run(args: Args) -> CommandResult {
     })
 }
 
-/// The limits of the rig, and the options that replace them.
-fn limits(args: &Args) -> Result<CheckLimits, Failure> {
+/// The limits of the rig, and the options that replace them; whether they hold what the camera sees, which a camera of its own tells
+/// only when it is asked.
+fn limits(args: &Args) -> Result<(CheckLimits, bool), Failure> {
     let mut limits = CheckLimits::default();
+    let mut knows_view = args.view.is_some();
     if let Some(path) = &args.rig {
         let file = RigFile::load(Some(path))?;
         let rig = setup::within(
@@ -95,6 +97,7 @@ fn limits(args: &Args) -> Result<CheckLimits, Failure> {
         if file.is_emulated() {
             let world = &file.emulator;
             limits.view_um = 0.5 * f64::from(world.width_px) * world.pixel_um;
+            knows_view = true;
         }
     }
     let instead = |value: &mut f64, said: Option<f64>| {
@@ -108,15 +111,7 @@ fn limits(args: &Args) -> Result<CheckLimits, Failure> {
     let slew = args.slew.map(MicrometersPerSecond::value);
     instead(&mut limits.slew_um_per_s, slew);
     instead(&mut limits.view_um, args.view.map(Micrometers::value));
-    Ok(limits)
-}
-
-/// Whether the rig file says what the camera sees: a camera of its own tells it only when it is asked.
-fn knows_view(args: &Args) -> Result<bool, Failure> {
-    Ok(match &args.rig {
-        Some(path) => RigFile::load(Some(path))?.is_emulated(),
-        None => false,
-    })
+    Ok((limits, knows_view))
 }
 
 /// Figures of a check as names and values.

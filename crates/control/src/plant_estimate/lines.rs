@@ -10,6 +10,7 @@
 //! Amplitudes are in units of the command (bead motion over the gain in force): they stay valid when the gain in force changes.
 
 use super::whiten::Whitener;
+use cellpos_numeric::statistics::invert;
 use std::f64::consts::TAU;
 
 /// Lines at once: a pump with five harmonics, the mains, and one more.
@@ -160,16 +161,7 @@ fn peak_over_median(bins: usize, looks: f64) -> f64 {
             .map(|i| (x / (many - i as f64)).ln_1p())
             .sum::<f64>()
     };
-    let (mut low, mut high) = (0.0, 1e6);
-    for _ in 0..100 {
-        let middle = 0.5 * (low + high);
-        if logarithm(middle) < looks {
-            low = middle;
-        } else {
-            high = middle;
-        }
-    }
-    high
+    invert(looks, 0.0, 1e6, logarithm)
 }
 
 impl Line {

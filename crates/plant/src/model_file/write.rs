@@ -79,10 +79,10 @@ pub(crate) fn write(model: &Model) -> String {
         line(format!("delay_ms = {}", float(delay_s * 1e3)));
         if let Some(age_s) = model.frame_age_s {
             line(
-                "# of this, from the middle of the exposure on: camera_delay_ms of rig.toml\n"
-                    .to_owned()
-                    + &format!("frame_age_ms = {}", float(age_s * 1e3)),
+                "# of this, from the middle of the exposure on: camera_delay_ms of rig.toml"
+                    .to_owned(),
             );
+            line(format!("frame_age_ms = {}", float(age_s * 1e3)));
         }
     }
     let mut written: Vec<&str> = Vec::new();

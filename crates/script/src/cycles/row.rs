@@ -293,6 +293,17 @@ floats!(
 );
 
 impl CycleRow {
+    /// Error over cycles, um RMS; `None` where none of them has one.
+    pub fn rms_over_um(rows: &[Self]) -> Option<f64> {
+        let squares = rows.iter().map(|row| row.rms_um * row.rms_um);
+        let (count, sum) = squares
+            .filter(|square| square.is_finite())
+            .fold((0u64, 0.0), |(count, sum), square| {
+                (count + 1, sum + square)
+            });
+        (count > 0).then(|| (sum / count as f64).sqrt())
+    }
+
     /// A cycle of which nothing is known yet.
     pub fn empty(cycle: u64, session: u64, arm: ArmKind) -> Self {
         let mut row = Self {

@@ -55,13 +55,18 @@ impl Tracker {
         let reach_px = TOUCHING_RADII * self.localiser.template().radius_px();
         let mut members = [false; MAX_BEADS];
         members[k] = true;
-        // A chain of places grows by at least one in each round.
-        for _ in 0..seen.len() {
+        // A chain of places grows by at least one in each round, or is whole.
+        let mut grows = true;
+        while grows {
+            grows = false;
             for i in 0..seen.len() {
-                members[i] |= (0..seen.len()).any(|o| {
-                    members[o]
-                        && f64::hypot(seen[i].0 - seen[o].0, seen[i].1 - seen[o].1) < reach_px
-                });
+                let joins = !members[i]
+                    && (0..seen.len()).any(|o| {
+                        members[o]
+                            && f64::hypot(seen[i].0 - seen[o].0, seen[i].1 - seen[o].1) < reach_px
+                    });
+                members[i] |= joins;
+                grows |= joins;
             }
         }
         members

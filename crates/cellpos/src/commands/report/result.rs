@@ -108,18 +108,10 @@ fn of_a_cell(rows: &[CycleRow]) -> Option<String> {
     Some(text)
 }
 
-/// Error over all cycles, um RMS.
-fn cycle_rms_um(rows: &[CycleRow]) -> Option<f64> {
-    let squares = rows.iter().map(|row| row.rms_um.powi(2));
-    let known: Vec<f64> = squares.filter(|square| square.is_finite()).collect();
-    let sum: f64 = known.iter().sum();
-    (!known.is_empty()).then(|| (sum / known.len() as f64).sqrt())
-}
-
 /// A bead over cycles of waves, each with an amplitude of its own.
 fn of_waves(rows: &[CycleRow]) -> Option<String> {
     let reached = cyclic(rows, |row| row.reached_um / row.commanded_um)?;
-    let rms = nm(cycle_rms_um(rows)?);
+    let rms = nm(CycleRow::rms_over_um(rows)?);
     Some(format!(
         "{} cycles: {} of the commanded amplitude in the first {}, {} in the last; error {rms} nm RMS over the cycles.",
         reached.cycles,
@@ -131,7 +123,7 @@ fn of_waves(rows: &[CycleRow]) -> Option<String> {
 
 /// A bead over the cycles of a script. Its steps count, which the error of a hold leaves out.
 fn of_cycles(rows: &[CycleRow]) -> Option<String> {
-    let rms = nm(cycle_rms_um(rows)?);
+    let rms = nm(CycleRow::rms_over_um(rows)?);
     let disturbed = rows.iter().filter(|row| row.flags.is_disturbed()).count();
     let but = match disturbed {
         0 => String::new(),

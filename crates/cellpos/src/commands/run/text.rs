@@ -83,8 +83,7 @@ impl<'a> Report<'a> {
                 rows.iter()
                     .map(|r| 100.0 * (r.reached_um / r.commanded_um - 1.0)),
             ),
-            cycle_rms_nm: mean(rows.iter().map(|r| r.rms_um * r.rms_um))
-                .map(|mean| mean.sqrt() * 1e3),
+            cycle_rms_nm: CycleRow::rms_over_um(rows).map(|um| um * 1e3),
             bound_rms_nm,
             conditions,
             warnings,

@@ -66,12 +66,6 @@ impl CellRow {
             scatter.hypot(if of_rest.is_finite() { of_rest } else { 0.0 })
         });
         let (recovery_first_s, recovery_last_s) = ends(&|row| row.recovery_s);
-        let squares: Vec<f64> = rows
-            .iter()
-            .map(|row| row.rms_um * row.rms_um)
-            .filter(|square| square.is_finite())
-            .collect();
-        let mean = squares.iter().sum::<f64>() / squares.len() as f64;
         Self {
             cell,
             outcome: over.outcome.to_owned(),
@@ -84,7 +78,7 @@ impl CellRow {
             stretch_first_ci95: stretch_first_ci95.and_then(finite),
             recovery_first_s,
             recovery_last_s,
-            cycle_rms_nm: finite(mean.sqrt() * 1e3),
+            cycle_rms_nm: CycleRow::rms_over_um(rows).map(|um| um * 1e3),
             run: over.folder.display().to_string(),
         }
     }
