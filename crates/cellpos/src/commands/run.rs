@@ -30,7 +30,7 @@ use cellpos_session::adapt::{self, Adapt};
 use cellpos_session::clips::Clipped;
 use cellpos_session::live_line::Typed;
 use cellpos_session::rig_file::{ActuatorConfig, CameraConfig, ClockKind, Frames, RigFile};
-use cellpos_session::setup::{Prepared, Setup};
+use cellpos_session::setup::{self, Prepared, Setup};
 use cellpos_session::view::{Page, Viewed};
 use cellpos_session::{Options, Rig, connect};
 use cellpos_units::Micrometers;
@@ -64,8 +64,8 @@ pub(crate) struct Args {
     /// Rehearse on the virtual clock, on an emulated rig like --model.
     #[arg(long)]
     dry: bool,
-    /// pi, lead, lqg, mpc, or the path of a controller.toml.
-    #[arg(long, default_value = "pi")]
+    /// pi, lead, lqg, mpc, or the path of a controller.toml. lqg holds best; pi needs less of a model.
+    #[arg(long, default_value = setup::DEFAULT_LAW)]
     controller: String,
     /// Follow gain and delay of the plant; default: on for lqg and mpc, off for pi and lead, else as controller.toml says.
     #[arg(long, value_enum, conflicts_with = "resume")]

@@ -21,7 +21,7 @@ use cellpos_session::cyclic::{self, LearnSpec, Sine};
 use cellpos_session::live_line::{LiveLine, Typed};
 use cellpos_session::recording::Recording;
 use cellpos_session::rig_file::{ClockKind, Frames, RigFile};
-use cellpos_session::setup::{Prepared, ReferenceSpec, Setup};
+use cellpos_session::setup::{self, Prepared, ReferenceSpec, Setup};
 use cellpos_session::view::{Page, View, Viewed};
 use cellpos_session::{EndKind, Ended, Finished, Options, Rig, connect};
 use cellpos_units::{Micrometers, Seconds};
@@ -47,7 +47,7 @@ pub(crate) struct Args {
     #[arg(long, value_parser = positive::<Seconds>)]
     duration: Option<Seconds>,
     /// pi, lead, lqg, mpc, or the path of a controller.toml. lqg holds best; pi needs less of a model.
-    #[arg(long, default_value = "lqg")]
+    #[arg(long, default_value = setup::DEFAULT_LAW)]
     controller: String,
     /// Follow a sine about the target: amplitude@frequency.
     #[arg(long, value_name = "5um@50Hz")]

@@ -324,7 +324,10 @@ fn a_script_stops_when_the_amplitude_is_not_reached() {
     let text = "name = \"far\"\n[stop]\namplitude_error_above = \"40%\"\n[[step]]\ndo = \"sine\"\namplitude = \"2um\"\n\
                 frequency = \"120Hz\"\ncycles = 2000\n";
     std::fs::write(folder.path().join("far.toml"), text).unwrap();
-    let (code, out, err) = cellpos(folder.path(), &["run", "far.toml", "--dry", "--json"]);
+    let (code, out, err) = cellpos(
+        folder.path(),
+        &["run", "far.toml", "--dry", "--controller", "pi", "--json"],
+    );
     assert_eq!(code, Some(1), "{err}");
     let run: Value = serde_json::from_str(&out).unwrap();
     assert_eq!(

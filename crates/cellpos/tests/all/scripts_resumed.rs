@@ -14,7 +14,7 @@ fn learning_takes_the_error_of_a_script_down_and_is_gone_on_from_after_a_cut() {
                 [[step.step]]\ndo = \"triangle\"\namplitude = \"1um\"\nfrequency = \"10Hz\"\ncycles = 20\n\
                 [[step]]\ndo = \"sine\"\namplitude = \"1um\"\nfrequency = \"5Hz\"\ncycles = 4\n";
     std::fs::write(at.join("turns.toml"), text).unwrap();
-    let args = ["run", "turns.toml", "--dry", "--json"];
+    let args = ["run", "turns.toml", "--dry", "--controller", "pi", "--json"];
     let run = json(at, &args);
     let learned = run["learned"].as_array().unwrap();
     assert_eq!(learned.len(), 2, "{run}");

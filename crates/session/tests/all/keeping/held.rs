@@ -65,6 +65,14 @@ impl Row {
         }
     }
 
+    /// A fault that lasts until the run ends, before the bead counts as lost.
+    pub(super) fn to_the_end(law: &'static str, kind: &str) -> Self {
+        Self {
+            seconds: 3.2,
+            ..Self::event(law, kind, 9.0)
+        }
+    }
+
     /// The amplifier gives no more than this, um.
     pub(super) fn clipped(law: &'static str, clip_um: f64) -> Self {
         Self {
@@ -85,6 +93,16 @@ impl Row {
             FaultKind::LoseBead,
         ];
         self.events.iter().any(|(kind, _)| blind.contains(kind))
+    }
+
+    /// Whether the bead fades out of a picture that goes on, or is not seen until the end.
+    pub(super) fn ends_unseen(&self) -> bool {
+        let ends = |&(_, for_s): &(FaultKind, f64)| EVENT_S + for_s > self.seconds;
+        self.is_blind()
+            && self
+                .events
+                .iter()
+                .any(|event| event.0 == FaultKind::LoseBead || ends(event))
     }
 
     pub(super) fn flow_step_um(&self) -> f64 {

@@ -30,6 +30,9 @@ fn table(rows: &[Row], seeds: u64, limits: &Limits) -> Vec<String> {
             broken.extend(found.map(|what| format!("{row}, seed {seed}: {what}")));
         }
         let all: Vec<&Held> = runs.iter().map(|(_, held)| held).collect();
+        if seeds > 1 {
+            println!("    {}", limits.counts(row, &all));
+        }
         broken.extend((limits.stated(row, &all)).map(|what| format!("{row}: {what}")));
         count += runs.len();
     }

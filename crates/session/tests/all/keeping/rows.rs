@@ -43,6 +43,9 @@ pub(super) fn all() -> Vec<Row> {
         for kind in ["double-frames", "reorder-frames", "link-garbage"] {
             rows.push(Row::event(law, kind, 0.5));
         }
+        rows.push(Row::event(law, "lose-bead", 0.4));
+        rows.push(Row::to_the_end(law, "lose-bead"));
+        rows.push(Row::to_the_end(law, "stall-camera"));
     }
     rows
 }
@@ -71,6 +74,13 @@ impl Limits {
     /// What a run broke.
     pub(super) fn broken(&self, row: &Row, held: &Held) -> Vec<String> {
         let mut broken = Vec::new();
+        if row.ends_unseen() {
+            // What became of it nobody can say.
+            if held.as_asked {
+                broken.push(format!("a run that lost its bead is as asked: {held}"));
+            }
+            return broken;
+        }
         if held.changed || held.other_beads > 0 {
             broken.push(format!("another bead: {held}"));
         }
@@ -89,13 +99,34 @@ impl Limits {
         broken
     }
 
-    /// What is wrong with the stated errors of a row's runs: with their RMS, for the walk of a bead that nobody sees is chance.
-    pub(super) fn stated(&self, row: &Row, held: &[&Held]) -> Option<String> {
+    /// How the runs of a row went, in numbers.
+    pub(super) fn counts(&self, row: &Row, held: &[&Held]) -> String {
+        let count = |is: &dyn Fn(&Held) -> bool| held.iter().filter(|h| is(h)).count();
+        let most_um = self.furthest_um(row);
+        let [truth, stated] = Self::rms(held);
+        format!(
+            "{} seeds: {} not kept to the end, {} another bead, {} beyond {most_um:.2} um, {} said to be as asked; RMS {truth:.1} nm, stated {stated:.1} ({:+.1} %)",
+            held.len(),
+            count(&|h| h.state != "running"),
+            count(&|h| h.changed || h.other_beads > 0),
+            count(&|h| h.worst_um > most_um),
+            count(&|h| h.as_asked),
+            100.0 * (stated / truth - 1.0),
+        )
+    }
+
+    /// Root of the mean square of the runs' RMS errors, true and stated, nm.
+    fn rms(held: &[&Held]) -> [f64; 2] {
         let rms = |of: fn(&Held) -> f64| {
             let squares: f64 = held.iter().map(|held| of(held).powi(2)).sum();
             (squares / held.len() as f64).sqrt()
         };
-        let (stated, truth) = (rms(|h| h.stated_rms_nm), rms(|h| h.true_rms_nm));
+        [rms(|h| h.true_rms_nm), rms(|h| h.stated_rms_nm)]
+    }
+
+    /// What is wrong with the stated errors of a row's runs: with their RMS, for the walk of a bead that nobody sees is chance.
+    pub(super) fn stated(&self, row: &Row, held: &[&Held]) -> Option<String> {
+        let [truth, stated] = Self::rms(held);
         let error = stated / truth - 1.0;
         // The walk of a bead that nobody sees is chance: what is stated is its expectation. Of so many runs their mean square may be off
         // by twice its standard error.
