@@ -240,8 +240,7 @@ impl Clues {
                     "positions in half of the {} ticks of the pulse at least",
                     2 * arming.pulse_ticks
                 ),
-                "is it the bead that is followed, and not dirt? If vision refuses fast motion, see [tracking] in rig.toml; a \
-                 tracker must know what is commanded (CommandedFlow)",
+                "is it the bead that is followed, and not dirt? If vision refuses fast motion, see [tracking] in rig.toml",
             ),
             Refusal::NoBead => sentences(
                 format!(

@@ -445,6 +445,7 @@ pub fn controller(name: &str, model: &Model, timing: &Timing) -> Result<Controll
         }),
         setpoint_weight: None,
         command_limits: Limits::default(),
+        estimator: None,
         limits: Default::default(),
     };
     let report = design(&request).map_err(Failure::input)?;

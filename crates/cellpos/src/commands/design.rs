@@ -5,29 +5,58 @@ mod report;
 
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
 use crate::output;
+use crate::rig_file::RigFile;
 use crate::setup;
 use cellpos_control::design::{
     DesignLimits, DesignPlant, DesignReport, DesignRequest, DesignWarning, PiSearch, Requested,
     default_lead, design,
 };
 use cellpos_control::{
-    ConfigError, ControllerConfig, ControllerFile, ControllerKind, Lead, Limits, Lqg, Mpc, Pi,
+    ConfigError, ControllerConfig, ControllerFile, ControllerKind, Lead, Lqg, Mpc, Pi,
 };
 use cellpos_plant::Model;
 use cellpos_units::{Hertz, Seconds};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
-/// Which control law is designed.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
-enum Kind {
-    /// PI.
-    Pi,
-    /// PI with lead.
-    Lead,
-    /// State feedback on the estimate.
-    Lqg,
-    /// Model predictive control; margins without active constraints.
-    Mpc,
+/// Which controller is meant: a law to design, or a file to check.
+#[derive(Debug, Clone)]
+enum Choice {
+    /// A law.
+    Law(ControllerKind),
+    /// What a controller.toml holds.
+    File(Box<ControllerFile>),
+}
+
+impl Choice {
+    /// The law.
+    fn law(&self) -> ControllerKind {
+        match self {
+            Self::Law(law) => *law,
+            Self::File(file) => file.controller,
+        }
+    }
+
+    /// The file, where one is checked.
+    fn file(&self) -> Option<&ControllerFile> {
+        match self {
+            Self::Law(_) => None,
+            Self::File(file) => Some(file),
+        }
+    }
+}
+
+/// `pi`, `lead`, `lqg`, `mpc`, or a path.
+fn choice(text: &str) -> Result<Choice, String> {
+    match text {
+        "pi" => Ok(Choice::Law(ControllerKind::Pi)),
+        "lead" => Ok(Choice::Law(ControllerKind::Lead)),
+        "lqg" => Ok(Choice::Law(ControllerKind::Lqg)),
+        "mpc" => Ok(Choice::Law(ControllerKind::Mpc)),
+        path if path.ends_with(".toml") => ControllerFile::load(Path::new(path))
+            .map(|file| Choice::File(Box::new(file)))
+            .map_err(|error| error.to_string()),
+        _ => Err("write pi, lead, lqg, mpc, or the path of a controller.toml".to_owned()),
+    }
 }
 
 /// Arguments of `cellpos design`.
@@ -36,26 +65,28 @@ enum Kind {
   cellpos design --model eq6 --delay 2.5ms
   cellpos design --model eq6 --delay 2.5ms --kp 0.46 --ki 19.5 --json
   cellpos design --model model.toml --max-ms 1.6 --min-pm 40 --out controller.toml --report design.html
+  cellpos design --model model.toml --controller controller.toml
 
 The loop delay is the camera delay (from the middle of an exposure to the tick that uses it) plus half a sample of hold: 2 ms at 1 kHz
 give 2.5ms. A model.toml of cellpos identify contains its camera delay. Without gains, design finds the PI controller of largest
-integral gain within --max-ms and --max-mt. Exit code 1: the loop is unstable, or a limit is broken; 2: bad input.")]
+integral gain within --max-ms and --max-mt. A controller.toml is checked as it stands, for its own delay unless --delay or --rig states
+another; --out then writes it for that delay. Exit code 1: the loop is unstable, or a limit is broken; 2: bad input.")]
 pub(crate) struct Args {
     /// Model file, or `eq6` for the built-in nominal plant.
     #[arg(long, default_value = "eq6")]
     model: String,
-    /// Loop delay: camera delay and half a sample of hold; default: of --rig, else of the model, else 2.5ms.
+    /// Loop delay: camera delay and half a sample of hold; default: of --rig, else of controller.toml, of the model, or 2.5ms.
     #[arg(long, value_parser = crate::arguments::loop_delay)]
     delay: Option<Seconds>,
     /// Rig file with the camera delay and the period.
     #[arg(long, conflicts_with_all = ["delay", "sample"])]
     rig: Option<PathBuf>,
-    /// Sample time.
-    #[arg(long, default_value = "1ms")]
-    sample: Seconds,
-    /// Control law.
-    #[arg(long, value_enum, default_value = "pi")]
-    controller: Kind,
+    /// Sample time; default: of --rig, else of controller.toml, else 1ms.
+    #[arg(long)]
+    sample: Option<Seconds>,
+    /// Control law: pi, lead, lqg, mpc (margins without active constraints); or the path of a controller.toml to check.
+    #[arg(long, default_value = "pi", value_parser = choice)]
+    controller: Choice,
     /// Proportional gain, um of PZT per um of bead (needs --ki).
     #[arg(long, requires = "ki", allow_negative_numbers = true)]
     kp: Option<f64>,
@@ -115,27 +146,27 @@ pub(crate) fn run(args: Args) -> CommandResult {
     output::ready(&args.out)?;
     output::ready(&args.report)?;
     let model = Model::load(&args.model).map_err(Failure::input)?;
-    let plant = plant(&args, &model)?;
+    let rig = (args.rig.as_deref())
+        .map(|path| RigFile::load(Some(path)))
+        .transpose()?;
+    let plant = plant(&args, &model, rig.as_ref())?;
     let limits = limits(&args)?;
-    let gains = args.kp.is_some() || args.setpoint_weight.is_some();
-    if gains && matches!(args.controller, Kind::Lqg | Kind::Mpc) {
-        return Err(Failure::bad_input(
-            "--kp, --ki and --setpoint-weight are gains of PI, not of lqg or mpc",
-            "leave them out, or write --controller pi",
-        ));
-    }
+    gains_belong_to(&args)?;
     let lead = lead(&args, plant.loop_delay_s())?;
     let controller = requested(&args, &limits, lead);
+    let given = args.controller.file();
+    let of_rig = rig.as_ref().map(|file| file.limits);
     let request = DesignRequest {
         plant,
         controller,
         setpoint_weight: args.setpoint_weight,
-        command_limits: Limits::default(),
+        command_limits: given.map(|file| file.limits).or(of_rig).unwrap_or_default(),
+        estimator: given.map(|file| file.estimator),
         limits,
     };
     let report = design(&request).map_err(Failure::input)?;
     if let Some(path) = &args.out {
-        let file = controller_file(&request, &report);
+        let file = controller_file(given, &request, &report);
         output::write(path, &file.to_toml_string())?;
     }
     if let Some(path) = &args.report {
@@ -164,31 +195,46 @@ pub(crate) fn run(args: Args) -> CommandResult {
     })
 }
 
+/// Gains are of PI, and are not those of a file.
+fn gains_belong_to(args: &Args) -> Result<(), Failure> {
+    let given = args.kp.is_some() || args.setpoint_weight.is_some() || args.lead_zero.is_some();
+    match &args.controller {
+        Choice::File(_) if given => Err(Failure::bad_input(
+            "--kp, --ki, --setpoint-weight and the lead are in controller.toml already",
+            "leave them out, or change the file",
+        )),
+        Choice::Law(ControllerKind::Lqg | ControllerKind::Mpc) if given => Err(Failure::bad_input(
+            "--kp, --ki, --setpoint-weight and the lead are gains of PI, not of lqg or mpc",
+            "leave them out, or write --controller pi",
+        )),
+        _ => Ok(()),
+    }
+}
+
 /// The plant as the loop sees it: the model with the delay and the sample time of the rig, or those given.
-fn plant(args: &Args, model: &Model) -> Result<DesignPlant, Failure> {
-    let file = args
-        .rig
-        .as_deref()
-        .map(|path| crate::rig_file::RigFile::load(Some(path)))
-        .transpose()?;
-    let timing = file.as_ref().map(|file| file.timing);
-    let model = &match &file {
+fn plant(args: &Args, model: &Model, rig: Option<&RigFile>) -> Result<DesignPlant, Failure> {
+    let timing = rig.map(|file| file.timing);
+    let model = &match rig {
         Some(file) => file.actuator.before(model.clone()),
         None => model.clone(),
     };
-    let sample_time_s = timing
-        .as_ref()
-        .map_or(args.sample.value(), |timing| timing.period_us * 1e-6);
+    let given = args.controller.file();
+    let sample_time_s = (timing.map(|timing| timing.period_us * 1e-6))
+        .or(args.sample.map(Seconds::value))
+        .or(given.map(|file| file.sample_time_ms * 1e-3))
+        .unwrap_or(1e-3);
     if !(1e-5..=1.0).contains(&sample_time_s) {
         return Err(Failure::bad_input(
-            format!("--sample {}: must be 0.01ms to 1s", args.sample),
+            format!("--sample {}ms: must be 0.01ms to 1s", sample_time_s * 1e3),
             "the rig runs at 1ms",
         ));
     }
     let of_rig = timing
         .as_ref()
         .map(|timing| setup::loop_delay_s(model, timing));
-    let given_s = args.delay.map(Seconds::value).or(of_rig);
+    let given_s = (args.delay.map(Seconds::value))
+        .or(of_rig)
+        .or(given.map(|file| file.delay_ms * 1e-3));
     if given_s.is_some_and(|delay_s| delay_s < 0.5 * sample_time_s) {
         return Err(Failure::bad_input(
             format!(
@@ -220,11 +266,17 @@ fn plant(args: &Args, model: &Model) -> Result<DesignPlant, Failure> {
 
 /// The controller that is asked for.
 fn requested(args: &Args, limits: &DesignLimits, lead: Option<Lead>) -> Requested {
+    if let Some(file) = args.controller.file() {
+        return match file.controller_config() {
+            ControllerConfig::Pi(pi) => Requested::Pi(pi),
+            other => Requested::Given(other),
+        };
+    }
     match (args.kp, args.ki) {
-        _ if args.controller == Kind::Lqg => {
+        _ if args.controller.law() == ControllerKind::Lqg => {
             Requested::Given(ControllerConfig::Lqg(Lqg::default()))
         }
-        _ if args.controller == Kind::Mpc => {
+        _ if args.controller.law() == ControllerKind::Mpc => {
             Requested::Given(ControllerConfig::Mpc(Mpc::default(), Pi::new(0.33, 9.6)))
         }
         (Some(kp), Some(ki)) => Requested::Pi(Pi {
@@ -279,12 +331,13 @@ fn limits(args: &Args) -> Result<DesignLimits, Failure> {
 }
 
 fn lead(args: &Args, loop_delay_s: f64) -> Result<Option<Lead>, Failure> {
-    match (args.controller, args.lead_zero, args.lead_pole) {
-        (Kind::Lead, Some(zero), Some(pole)) => Ok(Some(Lead {
+    match (args.controller.law(), args.lead_zero, args.lead_pole) {
+        _ if args.controller.file().is_some() => Ok(None),
+        (ControllerKind::Lead, Some(zero), Some(pole)) => Ok(Some(Lead {
             zero_hz: zero.value(),
             pole_hz: pole.value(),
         })),
-        (Kind::Lead, ..) => Ok(Some(default_lead(loop_delay_s))),
+        (ControllerKind::Lead, ..) => Ok(Some(default_lead(loop_delay_s))),
         (_, None, None) => Ok(None),
         _ => Err(Failure::bad_input(
             "--lead-zero and --lead-pole belong to --controller lead",
@@ -293,8 +346,19 @@ fn lead(args: &Args, loop_delay_s: f64) -> Result<Option<Lead>, Failure> {
     }
 }
 
-fn controller_file(request: &DesignRequest, report: &DesignReport) -> ControllerFile {
+fn controller_file(
+    given: Option<&ControllerFile>,
+    request: &DesignRequest,
+    report: &DesignReport,
+) -> ControllerFile {
     let loop_delay_s = request.plant.loop_delay_s();
+    if let Some(given) = given {
+        return ControllerFile {
+            delay_ms: loop_delay_s * 1e3,
+            sample_time_ms: request.plant.sample_time_s * 1e3,
+            ..*given
+        };
+    }
     let mut file = match report.controller {
         ControllerConfig::Pi(pi) => ControllerFile::from_pi(pi, loop_delay_s),
         ControllerConfig::Lqg(lqg) => ControllerFile {

@@ -142,3 +142,63 @@ fn a_designed_controller_is_the_one_that_track_then_runs() {
         "set-point weights 0.6 and 0.85: {low} %, {high} %"
     );
 }
+
+#[test]
+fn a_controller_file_is_checked_as_it_stands_and_written_for_another_delay() {
+    let folder = tempfile::tempdir().unwrap();
+    let here = folder.path();
+    for law in ["pi", "lead", "lqg", "mpc"] {
+        let designed = succeed(
+            here,
+            &format!("design --delay 2.5ms --controller {law} --out {law}.toml --json"),
+        )
+        .json();
+        let checked = succeed(here, &format!("design --controller {law}.toml --json")).json();
+        for key in ["ms", "mt", "pm_deg", "predicted_rms_nm", "delay_ms"] {
+            assert_eq!(number(&checked, key), number(&designed, key), "{law} {key}");
+        }
+    }
+    // What is written in the file is what is judged: less weight on the effort holds better with less margin.
+    let text = std::fs::read_to_string(here.join("lqg.toml")).unwrap();
+    std::fs::write(
+        here.join("bold.toml"),
+        text.replace("effort = 3.0", "effort = 0.3"),
+    )
+    .unwrap();
+    let figures = |line: &str| {
+        let json = cellpos(here, line).json();
+        (number(&json, "predicted_rms_nm"), number(&json, "ms"))
+    };
+    let (bold, own) = (
+        figures("design --controller bold.toml --json"),
+        figures("design --controller lqg.toml --json"),
+    );
+    assert!(bold.0 < own.0 && bold.1 > own.1, "{bold:?} {own:?}");
+    succeed(
+        here,
+        "design --controller bold.toml --delay 3.2ms --out slow.toml",
+    );
+    let slow = std::fs::read_to_string(here.join("slow.toml")).unwrap();
+    assert!(
+        slow.contains("delay_ms = 3.2") && slow.contains("effort = 0.3"),
+        "{slow}"
+    );
+    let refused = cellpos(here, "design --controller bold.toml --kp 0.4 --ki 10");
+    assert_eq!(refused.code, Some(2));
+    assert!(
+        refused.err.contains("in controller.toml already"),
+        "{}",
+        refused.err
+    );
+}
+
+#[test]
+fn a_controller_for_a_rig_has_the_limits_of_the_rig() {
+    let folder = tempfile::tempdir().unwrap();
+    let rig = "[limits]\nlow = \"2um\"\nhigh = \"38um\"\nslew = \"20um/ms\"\npark = \"20um\"\n";
+    std::fs::write(folder.path().join("rig.toml"), rig).unwrap();
+    succeed(folder.path(), "design --rig rig.toml --out c.toml");
+    let written = std::fs::read_to_string(folder.path().join("c.toml")).unwrap();
+    let limits = "[limits]\nlow_um = 2.0\nhigh_um = 38.0\nslew_um_per_s = 20000.0\npark_um = 20.0";
+    assert!(written.contains(limits), "{written}");
+}

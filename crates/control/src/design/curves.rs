@@ -2,7 +2,7 @@
 
 use crate::controller::{ControllerConfig, LoopConfig};
 use crate::design::plant::DesignPlant;
-use crate::design::report::{DesignReport, estimator_config};
+use crate::design::report::DesignReport;
 use crate::design::step::{SetUpError, noise_free};
 use crate::linear::LinearLaw;
 use cellpos_plant::PlantError;
@@ -49,8 +49,10 @@ impl DesignReport {
                 sample_time_s: plant.sample_time_s,
             }),
             other => {
-                let model = plant.loop_model().ok()?;
-                other.linear(&estimator_config(plant), &model).ok()
+                let config = self.config.as_ref()?;
+                other
+                    .linear(&config.estimator, &plant.loop_model().ok()?)
+                    .ok()
             }
         }
     }

@@ -175,6 +175,8 @@ pub struct DesignRequest {
     pub setpoint_weight: Option<f64>,
     /// Limits of the command.
     pub command_limits: Limits,
+    /// The estimator, where not the one for the plant's noise.
+    pub estimator: Option<EstimatorConfig>,
     /// Limits of the design.
     pub limits: DesignLimits,
 }
@@ -248,15 +250,22 @@ pub fn design(request: &DesignRequest) -> Result<DesignReport, DesignError> {
             });
         }
     };
+    let estimator = request.estimator.unwrap_or_else(|| estimator_config(plant));
     let law = match controller {
         ControllerConfig::Pi(pi) => LinearLaw::Pi {
             pi,
             sample_time_s: plant.sample_time_s,
         },
-        other => other.linear(&estimator_config(plant), &plant.loop_model()?)?,
+        other => other.linear(&estimator, &plant.loop_model()?)?,
     };
     let mut warnings = plant.warnings.clone();
-    let config = loop_config(plant, controller, request.command_limits, &mut warnings);
+    let config = loop_config(
+        plant,
+        controller,
+        estimator,
+        request.command_limits,
+        &mut warnings,
+    );
     let (step, disturbance) = match &config {
         Some(config) => (
             Some(step_figures(plant, config, 10.0)?),
@@ -304,11 +313,11 @@ fn bound_um(plant: &DesignPlant) -> f64 {
 fn loop_config(
     plant: &DesignPlant,
     controller: ControllerConfig,
+    estimator: EstimatorConfig,
     limits: Limits,
     warnings: &mut Vec<DesignWarning>,
 ) -> Option<LoopConfig> {
     let built = plant.loop_model().and_then(|model| {
-        let estimator = estimator_config(plant);
         let config = LoopConfig {
             model,
             estimator,
@@ -323,7 +332,7 @@ fn loop_config(
 }
 
 /// The estimator for a plant's noise.
-pub(super) fn estimator_config(plant: &DesignPlant) -> EstimatorConfig {
+fn estimator_config(plant: &DesignPlant) -> EstimatorConfig {
     EstimatorConfig {
         diffusion_um2_per_s: positive_or(plant.diffusion_um2_per_s, 0.33),
         fix_noise_um: positive_or(plant.fix_noise_um, 0.020),

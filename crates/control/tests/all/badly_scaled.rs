@@ -62,6 +62,7 @@ fn request(plant: DesignPlant, controller: Requested) -> DesignRequest {
         controller,
         setpoint_weight: None,
         command_limits: Limits::default(),
+        estimator: None,
         limits: DesignLimits::default(),
     }
 }
