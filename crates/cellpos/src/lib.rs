@@ -126,6 +126,7 @@ fn execute(cli: Cli, command: String) -> CommandResult {
 /// The program: the process's own arguments, signals, log and exit code.
 pub fn main() -> ExitCode {
     cellpos_terminal::panics_do_not_wait();
+    outcome::set_for_people();
     if let Err(error) = signals::listen() {
         eprintln!(
             "signals cannot be caught ({error}): Ctrl-C ends the program, and the board parks by its own watchdog"

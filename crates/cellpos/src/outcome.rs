@@ -4,6 +4,7 @@ use crate::arguments::about_a_whole_number;
 pub use cellpos_session::Failure;
 use cellpos_terminal::{Colours, clean};
 use serde::Serialize;
+use std::borrow::Cow;
 use std::process::ExitCode;
 use std::time::Duration;
 
@@ -54,12 +55,27 @@ fn print_object(name: &str, value: &impl Serialize) -> Result<(), Failure> {
 /// Prints text on standard output; a closed pipe (`| head`) is no error. On a terminal people read, and units are as people write
 /// them; in a pipe or a file they are as programs write them.
 pub(crate) fn print_text(text: &str) -> Result<(), Failure> {
-    use std::io::IsTerminal;
-    if std::io::stdout().is_terminal() && reads_utf8() {
-        print(&cellpos_report::typeset(text))
-    } else {
-        print(text)
+    print(&for_people_at(&std::io::stdout(), text))
+}
+
+/// A text as it is written to a stream: on a terminal for people, else for programs.
+fn for_people_at<'a>(stream: &impl std::io::IsTerminal, text: &'a str) -> Cow<'a, str> {
+    match stream.is_terminal() && reads_utf8() {
+        true => Cow::Owned(cellpos_report::typeset(text)),
+        false => Cow::Borrowed(text),
     }
+}
+
+/// Text on standard error is set for people, if they read it.
+pub(crate) fn set_for_people() {
+    if std::io::IsTerminal::is_terminal(&std::io::stderr()) && reads_utf8() {
+        cellpos_terminal::typeset_with(cellpos_report::typeset);
+    }
+}
+
+/// Prints a line on standard error, for a command that holds no rig.
+pub(crate) fn print_err(line: &str) {
+    eprintln!("{}", cellpos_terminal::for_people(line));
 }
 
 /// Whether the terminal's locale has letters beyond ASCII.
@@ -151,7 +167,7 @@ pub(crate) fn exit(result: CommandResult, json: bool) -> ExitCode {
     let report = told_once(report);
     cellpos_terminal::stderr().flush(PATIENCE);
     // Files are quoted in it: nothing in them gives orders to the terminal.
-    eprintln!("{}", clean(&format!("{report:?}"), Colours::Kept));
+    print_err(&clean(&format!("{report:?}"), Colours::Kept));
     if json {
         // Nobody reads a message about a closed standard output.
         let _ = print_object("error", &error_object(kind, &report));
@@ -175,11 +191,37 @@ fn number_in_words(error: &clap::Error) -> Option<clap::Error> {
     ))
 }
 
+/// Prints help, version or what is wrong with the arguments, in colours where clap would use them.
+fn print_arguments(error: &clap::Error) {
+    use std::io::IsTerminal;
+    let seen = match error.use_stderr() {
+        true => std::io::stderr().is_terminal(),
+        false => std::io::stdout().is_terminal(),
+    };
+    if !seen || !reads_utf8() {
+        let _ = error.print();
+        return;
+    }
+    let plain = std::env::var_os("NO_COLOR").is_some_and(|value| !value.is_empty());
+    let styled = error.render();
+    let text = match plain {
+        true => styled.to_string(),
+        false => styled.ansi().to_string(),
+    };
+    let text = cellpos_report::typeset(&text);
+    match error.use_stderr() {
+        true => eprint!("{text}"),
+        false => {
+            let _ = print(&text);
+        }
+    }
+}
+
 /// Says what is wrong with the arguments, or shows the help or version that they ask for.
 pub(crate) fn exit_arguments(error: &clap::Error, json: bool) -> ExitCode {
     let in_words = number_in_words(error);
     let error = in_words.as_ref().unwrap_or(error);
-    let _ = error.print();
+    print_arguments(error);
     let surplus = error
         .get(clap::error::ContextKind::InvalidArg)
         .map(ToString::to_string)

@@ -130,6 +130,6 @@ fn eprintln_or_keep(view: &View, text: &str) {
     if view.has_screen() {
         cellpos_session::say::say(text);
     } else {
-        eprintln!("{text}");
+        crate::outcome::print_err(text);
     }
 }

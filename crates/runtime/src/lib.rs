@@ -63,4 +63,4 @@ pub use reference_history::ReferenceHistory;
 pub use run::{EndRule, Finished, NoSink, RunError, RunSink};
 pub use summary::{End, EndState, Statistics, Summary};
 pub use tick::Heard;
-pub use tick_record::{TickFlags, TickRecord};
+pub use tick_record::{TickCounts, TickFlags, TickRecord};

@@ -7,7 +7,7 @@
 use crate::reference::Stage;
 use cellpos_control::PlantVerdict;
 use cellpos_rig::{ActuatorFault, ActuatorState};
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 /// Where a run stands.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
@@ -83,7 +83,7 @@ impl Request {
 }
 
 /// Why Safe was latched.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum SafeReason {
     /// The operator asked for park.
@@ -171,7 +171,7 @@ impl FreezeReasons {
 }
 
 /// Why arming was refused.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Refusal {
     /// No steady bead was seen in the time given.

@@ -74,6 +74,17 @@ impl TickFlags {
     }
 }
 
+/// Counts of the loop up to this tick that its flags do not give, for displays of a run that is going on. They have no column.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct TickCounts {
+    /// Ticks that never came.
+    pub skipped: u64,
+    /// Frames lost on the way.
+    pub frames_lost: u64,
+    /// Stale frames.
+    pub stale: u64,
+}
+
 /// Everything about one tick, in a fixed size. Times are nanoseconds since the start of the run.
 ///
 /// A number that does not exist (no bead in the frame, no truth on a real rig) is NaN.
@@ -163,6 +174,8 @@ pub struct TickRecord {
     /// The control law's own columns after the tick, named by [`cellpos_control::Controller::columns`]; NaN where there is
     /// none.
     pub law: [f32; LAW_COLUMNS],
+    /// Counts so far; zeros in a row that is read from a folder.
+    pub counts: TickCounts,
 }
 
 impl TickRecord {
@@ -229,6 +242,7 @@ impl TickRecord {
             length_sd_um: f64::NAN,
             area_sd_um2: f64::NAN,
             law: [f32::NAN; LAW_COLUMNS],
+            counts: TickCounts::default(),
         }
     }
 }

@@ -8,11 +8,11 @@ use cellpos_runtime::recorder::RecorderFault;
 use cellpos_runtime::{
     ArmingConfig, End, EndState, Event, Kept, NotKept, RunError, Summary, Timing,
 };
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 use std::fmt;
 
 /// The kinds of end that a program may want to steer by.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum EndKind {
     /// It ran as long as it was to.
@@ -34,7 +34,7 @@ pub enum EndKind {
 }
 
 /// How a run ended.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Ended {
     /// In a word.
     pub kind: EndKind,
@@ -151,7 +151,13 @@ impl Clues {
 pub(crate) struct Expected {
     pub(crate) timing: Timing,
     pub(crate) arming: ArmingConfig,
+    /// Whether a cell is followed rather than a bead.
+    pub(crate) cell: bool,
 }
+
+/// What to do when no cell is found: the cell is the difference from the background.
+const NO_CELL: &str = "bring a cell into view and into focus, then start again; if one is in view, the background may be of another \
+    region, light or focus: record the empty channel again (cellpos background)";
 
 /// Three sentences: seen, expected, what to do.
 type Sentences = (String, String, String);
@@ -248,7 +254,11 @@ impl Clues {
                     arming.patience_ticks
                 ),
                 format!("{} good positions in a row", arming.steady_ticks),
-                "bring a bead into view and into focus (see cellpos camera --snapshot), then start again",
+                if expected.cell {
+                    NO_CELL
+                } else {
+                    "bring a bead into view and into focus (see cellpos camera --snapshot), then start again"
+                },
             ),
             Refusal::NoResponse => sentences(
                 format!(
@@ -299,7 +309,11 @@ impl Clues {
             SafeReason::BeadLost => sentences(
                 format!(" ({lost_ms:.0} ms)"),
                 "the bead in view",
-                "bring a bead into view and start again; a faster flow than the loop can hold shows as drift before the loss",
+                if expected.cell {
+                    NO_CELL
+                } else {
+                    "bring a bead into view and start again; a faster flow than the loop can hold shows as drift before the loss"
+                },
             ),
             SafeReason::CameraLost => sentences(
                 format!(" ({lost_ms:.0} ms)"),

@@ -246,6 +246,7 @@ impl Rig {
             timing.camera_delay_ms * 1e-3,
             timing.period_us * 1e-6,
         );
+        let cell = self.file.follows_a_cell();
         match self.try_arm(setup) {
             Ok((place, memory)) => Ok(Armed {
                 rig: self,
@@ -256,6 +257,7 @@ impl Rig {
                 expected: Expected {
                     timing: setup.config.timing,
                     arming: setup.config.arming,
+                    cell,
                 },
                 _memory: memory,
                 _place: place,

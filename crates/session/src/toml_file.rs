@@ -22,12 +22,18 @@ pub fn read<T: DeserializeOwned>(path: &Path) -> Result<T, Failure> {
 /// Reads a text; `name` is for the messages.
 pub fn parse<T: DeserializeOwned>(text: &str, name: &str) -> Result<T, Failure> {
     toml::from_str(text).map_err(|error| {
+        let missing = (error.message().strip_prefix("missing field `"))
+            .and_then(|rest| rest.strip_suffix('`'));
         let message = cellpos_plant::in_words(error.message());
         let span = error.span().unwrap_or(0..0);
         let line = Position::of(text, span.clone()).line;
-        let help = match cellpos_units::nearest_in(&message) {
-            Some(known) => format!("did you mean `{known}`?"),
-            None => "see the commented files under examples/".to_string(),
+        let help = match (missing, cellpos_units::nearest_in(&message)) {
+            (Some(key), _) => format!(
+                "write {key} = ... into this table, or leave a table of a rig.toml out for the emulated rig's; the files under \
+                 examples/ are commented"
+            ),
+            (None, Some(known)) => format!("did you mean `{known}`?"),
+            (None, None) => "see the commented files under examples/".to_string(),
         };
         let report = miette::miette!(
             labels = vec![LabeledSpan::at(span, "here")],

@@ -8,7 +8,8 @@
 //! A view can take the whole terminal ([`Terminal::open_screen`]). Messages that arrive meanwhile are kept and shown when the
 //! view ends, however the program ends ([`give_back`]).
 //!
-//! All text is cleaned ([`clean`]): text from a file cannot move the cursor, rename the window or hide other text. Not for the result of a command, which goes to standard output when nothing waits any more.
+//! All text is cleaned ([`clean`]): text from a file cannot move the cursor, rename the window or hide other
+//! text. The result of a command goes to standard output instead, when nothing waits any more.
 //!
 //! ```
 //! use cellpos_terminal::{Colours, clean};
@@ -171,6 +172,25 @@ pub fn stderr() -> &'static Terminal {
     })
 }
 
+/// The form in which people read a text: units with their signs.
+type Typeset = fn(&str) -> String;
+
+static TYPESET: OnceLock<Typeset> = OnceLock::new();
+
+/// From now on text for people goes through `typeset`: for a standard error that is a terminal with letters beyond ASCII. Only
+/// the first call counts.
+pub fn typeset_with(typeset: Typeset) {
+    let _ = TYPESET.set(typeset);
+}
+
+/// A text as people read it on the terminal.
+pub fn for_people(text: &str) -> Cow<'_, str> {
+    match TYPESET.get() {
+        Some(typeset) => Cow::Owned(typeset(text)),
+        None => Cow::Borrowed(text),
+    }
+}
+
 /// Columns of the terminal behind standard error; 80 if unknown.
 pub fn columns() -> usize {
     rustix::termios::tcgetwinsize(io::stderr())
@@ -244,6 +264,7 @@ impl<W: Write> Writer<W> {
             Message::Show(_) | Message::Leave if self.screen.is_open() => Ok(()),
             Message::Show(line) => {
                 self.live = !line.is_empty();
+                let line = for_people(&line);
                 let line = clean(&line, Colours::Kept);
                 write!(self.out, "\r\x1b[K{line}").and_then(|()| self.out.flush())
             }
@@ -266,6 +287,7 @@ impl<W: Write> Writer<W> {
 
     fn say(&mut self, text: &str) -> io::Result<()> {
         let text = text.strip_suffix('\n').unwrap_or(text);
+        let text = &*for_people(text);
         if self.screen.is_open() {
             let mut heard = self.heard.lock().unwrap_or_else(PoisonError::into_inner);
             *heard = clean(text.trim(), Colours::Removed).replace('\n', " ");

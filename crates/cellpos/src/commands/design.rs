@@ -3,7 +3,7 @@
 mod print;
 mod report;
 
-use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
+use crate::outcome::{CommandResult, Failure, Outcome, print_err, print_json, print_text};
 use crate::output;
 use crate::rig_file::RigFile;
 use crate::setup;
@@ -178,10 +178,10 @@ pub(crate) fn run(args: Args) -> CommandResult {
             })?;
     }
     for warning in &report.warnings {
-        eprintln!("WARNING: {warning}");
+        print_err(&format!("WARNING: {warning}"));
     }
     for broken in &report.limits_broken {
-        eprintln!("LIMIT BROKEN: {broken}");
+        print_err(&format!("LIMIT BROKEN: {broken}"));
     }
     if args.json {
         print_json(&print::json(&args.model, &request, &report))?;
@@ -250,7 +250,7 @@ fn plant(args: &Args, model: &Model, rig: Option<&RigFile>) -> Result<DesignPlan
         .as_ref()
         .and_then(|timing| setup::model_delay_warning(model, timing));
     if let Some(warning) = disagrees {
-        eprintln!("WARNING: {warning}");
+        print_err(&format!("WARNING: {warning}"));
     }
     if given_s.is_none() && model.camera_delay_s.is_none() && plant.delay_s == 0.0 {
         plant.delay_s = 2e-3;

@@ -124,7 +124,7 @@ pub(super) fn run(args: &Args) -> CommandResult {
 
 /// What is being done, on standard error.
 fn say(what: &str) {
-    eprintln!("{what}");
+    crate::outcome::print_err(what);
 }
 
 fn board(sheet: &mut Sheet, bench: &Bench, args: &Args) {

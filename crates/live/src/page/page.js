@@ -57,14 +57,17 @@ function buttons() {
   $("pause").textContent = frozen ? "Go on" : "Pause";
 }
 
-// What led to Safe is held on the screen by itself: the last half second before the PZT began to park.
+// The way to Safe is held on the screen: half a second of it, from the last position of the bead.
 let faulted = false;
 function holdFault(time) {
   if (faulted || hello?.recorded) return;
   faulted = true;
   setTimeout(() => {
-    view.holdSpan(time - 0.5, time + 0.1, time);
-    answer("Held: the last half second before the PZT began to park. Hold (space) goes on.", "view-answer");
+    // Of a bead that was lost, the last that was seen of it is shown too.
+    let seen = time;
+    for (let i = rows.after(time) - 1; i >= rows.first; i--) if (isFinite(rows.measured[rows.at(i)])) { seen = rows.time[rows.at(i)]; break; }
+    view.holdSpan(Math.min(time, seen) - 0.5, time + 0.1, time);
+    answer("Held: what came before the PZT began to park. Hold (space) goes on.", "view-answer");
   }, 400);
 }
 
@@ -82,6 +85,8 @@ function show(told) {
   if (word && !before?.last_word) sound.play(word.how === "done" || word.how === "stopped" ? "warning" : "fault");
   else if (!word && state.banner.state === "safe" && before?.banner.state !== "safe") sound.play("fault");
   buttons();
+  // The counters below are those of the record up to this tick.
+  document.body.dataset.ticks = state.ticks;
   $("f-time").textContent = clock(state.time_s);
   $("f-rms").textContent = state.rms_nm === null ? "-" : `${state.rms_nm.toFixed(1)} nm`;
   for (const [id, value, wrong] of [["late", state.late, true], ["skipped", state.skipped, true], ["lost", state.frames_lost, false],
@@ -228,6 +233,7 @@ function draw(now) {
     const k = rows.at(rows.count - 1);
     picture.target = hello.by_hand ? NaN : rows.target[k];
     drawGauge($("gauge"), hello.range_um, rows.command[k], rows.zeroFlow[k]);
+    $("gauge-text").dataset.seq = rows.lastSeq;
     $("gauge-text").textContent = `PZT ${rows.command[k].toFixed(3)} µm`
       + (isFinite(rows.zeroFlow[k]) ? `, at rest at ${rows.zeroFlow[k].toFixed(3)} µm` : "");
   }
@@ -237,6 +243,8 @@ function draw(now) {
   $("f-unshown").textContent = unheard === null ? rows.missing : `${rows.missing} rows, ${unheard} messages`;
   drawSpectrum($("spectrum"), rows, 1e6 / hello.period_us, hello.predicted_spectrum, state?.fix_noise_nm);
   lateness.draw($("lateness"), hello.budget_us);
+  document.body.dataset.held = rows.newest - rows.oldest;
+  document.body.dataset.painted = document.documentElement.dataset.theme ?? "auto";
   if (hello.script) {
     drawCycles($("cycles"), cycles);
     const last = cycles[cycles.length - 1];

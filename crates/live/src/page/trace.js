@@ -114,13 +114,15 @@ export class Traces {
       panel.series.forEach(([, , paint], n) => stroke(context, found[n], colour(paint), y, isRed() && ["target", "zero-flow"].includes(paint)));
       context.restore();
       context.textAlign = "left"; context.textBaseline = "top";
-      let at = LEFT + 6;
+      let at = LEFT + 6, line = top + 1;
       const names = panel.series.map(([, label, paint]) => [label, paint]);
       if (bound !== null) names.push([`lowest possible RMS, ${bound.toFixed(1)} nm`, "target"]);
       for (const [label, paint] of names) {
-        context.fillStyle = colour("card"); context.fillRect(at - 2, top + 1, context.measureText(label).width + 4, 15);
-        context.fillStyle = colour(paint); context.fillText(label, at, top + 2);
-        at += context.measureText(label).width + 14;
+        const long = context.measureText(label).width;
+        if (at + long > width - RIGHT && at > LEFT + 6) { at = LEFT + 6; line += 15; } // a narrow screen
+        context.fillStyle = colour("card"); context.fillRect(at - 2, line, long + 4, 15);
+        context.fillStyle = colour(paint); context.fillText(label, at, line + 1);
+        at += long + 14;
       }
       top += tall + GAP;
     }
@@ -162,9 +164,10 @@ function limits(panel, found, bound) {
 function grid(context, panel, { low, high, y, top, tall, width }) {
   context.strokeStyle = colour("line"); context.fillStyle = colour("quiet"); context.lineWidth = 1;
   context.textAlign = "right"; context.textBaseline = "middle";
-  for (const value of steps(low, high, Math.max(2, tall / 42))) {
+  const marks = steps(low, high, Math.max(2, tall / 42)), step = marks.length > 1 ? marks[1] - marks[0] : (high - low) / 10;
+  for (const value of marks) {
     context.beginPath(); context.moveTo(LEFT, y(value)); context.lineTo(width - RIGHT, y(value)); context.stroke();
-    context.fillText(number(value, high - low), LEFT - 6, y(value));
+    context.fillText(number(value, 100 * step), LEFT - 6, y(value)); // the digits that tell two marks apart
   }
   context.save();
   context.translate(13, top + tall / 2); context.rotate(-Math.PI / 2); context.textAlign = "center";

@@ -14,7 +14,7 @@ fn table() -> String {
         let parameters = form.scalars.iter().chain(form.lists).map(|parameter| {
             let unit = match parameter.unit {
                 "" | "1" => String::new(),
-                unit => format!(" ({unit})"),
+                unit => format!(" ({})", as_people_write(unit)),
             };
             format!("`{}`{unit}", parameter.name)
         });
@@ -28,6 +28,11 @@ fn table() -> String {
         );
     }
     text
+}
+
+/// The page is for people; the files of the catalogue have `um` and `deg`.
+fn as_people_write(unit: &str) -> String {
+    unit.replace("um", "µm").replace("deg", "°").replace("^2", "²")
 }
 
 #[test]

@@ -8,11 +8,20 @@ fn page() -> String {
     std::fs::read_to_string(path).unwrap()
 }
 
+/// The page is for people; the files have `um` and `us`.
+fn as_people_write(unit: &str) -> String {
+    match unit {
+        "us" => "µs".to_owned(),
+        unit => unit.replace("um", "µm").replace("m2", "m²"),
+    }
+}
+
 #[test]
 fn every_column_is_on_the_page_with_unit_words_and_meaning() {
     let page = page();
     for column in COLUMNS {
-        let line = format!("| `{}` | {} | {} |", column.name, column.unit, column.about);
+        let unit = as_people_write(column.unit);
+        let line = format!("| `{}` | {unit} | {} |", column.name, column.about);
         assert!(page.contains(&line), "docs/data.md lacks the line\n{line}");
         if let Value::Code(codes, _) = column.value {
             let words: Vec<String> = codes
@@ -26,7 +35,8 @@ fn every_column_is_on_the_page_with_unit_words_and_meaning() {
     for (name, about) in OF_LAWS {
         let name = [(*name).to_owned()];
         let columns = of_law(&name);
-        let line = format!("| `{}` | {} | {about} |", columns[0].name, columns[0].unit);
+        let unit = as_people_write(columns[0].unit);
+        let line = format!("| `{}` | {unit} | {about} |", columns[0].name);
         assert!(page.contains(&line), "docs/data.md lacks the line\n{line}");
     }
     let (_, behind) = page.split_once("### Ticks").expect("the heading");

@@ -4,7 +4,7 @@ use super::Core;
 use crate::life::{EventKind, Life};
 use crate::reference::{ReferenceGenerator, ReferenceOutput};
 use crate::tick::{Action, Tick, TickInput};
-use crate::tick_record::{TickFlags, TickRecord};
+use crate::tick_record::{TickCounts, TickFlags, TickRecord};
 use cellpos_control::{LoopOutput, SolverStatus};
 use cellpos_rig::{ActuatorFault, ActuatorState};
 
@@ -194,6 +194,11 @@ impl<R: ReferenceGenerator> Core<R> {
             solver_active: output.solver.active.min(255) as u8,
             solver_ns: output.solver.solve_ns,
             law: self.controller.record(),
+            counts: TickCounts {
+                skipped: self.state.counts.skipped,
+                frames_lost: self.state.counts.frames_lost,
+                stale: self.state.counts.stale,
+            },
         };
         TickRecord {
             error_um: record.error_at_exposure_um(&self.references),

@@ -11,7 +11,7 @@ use crate::reference::{ReferenceInput, ReferenceOutput, Stage};
 use crate::replay::Replay;
 use crate::run::{RunSink, close_session};
 use crate::summary::Statistics;
-use crate::tick_record::{TickFlags, TickRecord};
+use crate::tick_record::{TickCounts, TickFlags, TickRecord};
 use crate::ticker::RingSizes;
 use crate::timing::Timing;
 
@@ -224,6 +224,16 @@ fn frames_lost_are_counted_once_though_others_are_old() {
     let end = ran.end.expect("control lives");
     let lost = end.counts.frames_lost as f64;
     assert!((lost / 6000.0 - 0.05).abs() < 0.01, "{lost}");
+    // What a display counts with the last tick is what the run's summary says.
+    let counted = ran.records.last().expect("records").counts;
+    let TickCounts {
+        skipped,
+        frames_lost,
+        stale,
+    } = counted;
+    let summed = (end.counts.skipped, end.counts.frames_lost, end.counts.stale);
+    assert_eq!((skipped, frames_lost, stale), summed);
+    assert!(stale > 100, "{counted:?}");
 }
 
 #[test]

@@ -21,7 +21,8 @@ use cellpos_vision::{CellConfig, CellFinder, LocaliserConfig, TrackerConfig};
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 
-/// A rig.toml. Every table and key may be left out; the defaults are the emulated rig of the paper.
+/// A rig.toml. Every table may be left out; the defaults are the emulated rig of the paper. Within a table the keys without a default,
+/// such as `kind` of a device or `pixel_um` of a calibration, must be there.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct RigFile {

@@ -65,7 +65,7 @@ fn banner_line(history: &History) -> Paragraph<'_> {
         "running" => Color::Green,
         "armed" => Color::Blue,
         "frozen" | "paused" => Color::Yellow,
-        "safe" => Color::Red,
+        "safe" | "failed" => Color::Red,
         _ => Color::Gray,
     };
     let state = Span::raw(format!(" {} ", banner.state.to_uppercase()))
@@ -128,7 +128,7 @@ fn figure_parts(hello: &Hello, history: &History) -> Vec<(String, Style)> {
         parts.push((text, alarm(1)));
     }
     if let Some(wake_us) = state.wake_us {
-        parts.push((format!("wake-up 99.9 % {wake_us:.0} us"), quiet));
+        parts.push((format!("wake-up 99.9 % {wake_us:.0} µs"), quiet));
     }
     parts
 }
@@ -357,11 +357,14 @@ mod tests {
                 ..Tick::default()
             });
         }
-        history.event(EventLine {
-            time_s: 1.5,
-            level: "warning",
-            text: "A frame was lost.".to_string(),
-        });
+        history.event(
+            EventLine {
+                time_s: 1.5,
+                level: "warning",
+                text: "A frame was lost.".to_string(),
+            },
+            false,
+        );
         history.cycle(CycleRow {
             cycle: 11,
             amplitude_um: Some(1.987),

@@ -72,8 +72,21 @@ impl History {
         self.last = Some(*row);
     }
 
-    pub(super) fn event(&mut self, event: EventLine) {
-        self.events.push_front(event);
+    /// How the run stands; `cell`: a cell is followed rather than a bead.
+    pub(super) fn state(&mut self, mut state: State, cell: bool) {
+        state.banner.reason = words(&state.banner.reason, cell);
+        state.doing = state.doing.map(|text| words(&text, cell));
+        state.next = state.next.map(|text| words(&text, cell));
+        self.state = state;
+    }
+
+    /// What happened; `cell`: a cell is followed rather than a bead.
+    pub(super) fn event(&mut self, event: EventLine, cell: bool) {
+        let text = match event.text.starts_with("Note: ") || event.text.starts_with("Mark: ") {
+            true => event.text,
+            false => words(&event.text, cell),
+        };
+        self.events.push_front(EventLine { text, ..event });
         self.events.truncate(EVENTS);
     }
 
@@ -83,9 +96,47 @@ impl History {
     }
 }
 
+/// A sentence of the program as a person reads it: units with their signs, and the cell where one is followed.
+fn words(text: &str, cell: bool) -> String {
+    let set = cellpos_terminal::for_people(text);
+    if !cell {
+        return set.into_owned();
+    }
+    (set.split_inclusive(|c: char| !c.is_alphanumeric()))
+        .map(|part| {
+            let word = part.trim_end_matches(|c: char| !c.is_alphanumeric());
+            match word {
+                "bead" => part.replacen("bead", "cell", 1),
+                "Bead" => part.replacen("Bead", "Cell", 1),
+                _ => part.to_string(),
+            }
+        })
+        .collect()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_cell_is_called_a_cell_and_a_persons_words_stay() {
+        let mut history = History::default();
+        let line = |text: &str| EventLine {
+            time_s: 0.0,
+            level: "info",
+            text: text.to_string(),
+        };
+        history.event(line("The bead is back; beads, bead's."), true);
+        history.event(line("Note: a bead of 3 um"), true);
+        history.event(line("Bead lost"), false);
+        let texts: Vec<_> = history.events.iter().map(|e| e.text.as_str()).collect();
+        let expected = [
+            "Bead lost",
+            "Note: a bead of 3 um",
+            "The cell is back; beads, cell's.",
+        ];
+        assert_eq!(texts, expected);
+    }
 
     #[test]
     fn an_excursion_of_one_tick_is_kept_and_the_memory_is_bounded() {

@@ -4,7 +4,7 @@
 //! recorder thread -> ring -> screen thread (a picture of cells) -> terminal thread -> terminal
 //! ```
 //!
-//! The screen thread draws ten times a second and never writes: its drawing goes to [`cellpos_terminal`], , and only its thread
+//! The screen thread draws ten times a second and never writes: its drawing goes to [`cellpos_terminal`], and only its thread
 //! waits for the terminal. A picture that finds the one before it unwritten is left out, and the next one is drawn whole.
 
 mod ansi;
@@ -119,13 +119,14 @@ impl Shown {
     }
 
     fn take(&mut self) {
+        let cell = self.hub.hello().cell;
         while let Some(row) = self.hub.next_row() {
             self.history.row(&row);
         }
         while let Some(line) = self.hub.next_line() {
             match line {
-                Line::State(state) => self.history.state = *state,
-                Line::Event(event) => self.history.event(event),
+                Line::State(state) => self.history.state(*state, cell),
+                Line::Event(event) => self.history.event(event, cell),
                 Line::Cycle(cycle) => self.history.cycle(cycle),
                 Line::Clip(_) => {}
             }

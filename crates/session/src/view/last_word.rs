@@ -9,6 +9,8 @@ use cellpos_runtime::life::SafeReason;
 
 /// Where the PZT is when the board took the command to park.
 const AT_PARK: &str = "The PZT is at park, or ramps there.";
+/// Where it was when a run ended that is over for long.
+const PARKED_THEN: &str = "The program parked the PZT when the run ended.";
 /// Where it is when nobody could see that the board took it.
 const NOT_SEEN: &str =
     "The board was told to park and was not heard since; its own watchdog parks the PZT.";
@@ -58,9 +60,13 @@ pub(super) fn of_reason(how: &'static str, reason: &str) -> LastWord {
 
 /// Of a run whose board could not be armed.
 pub(super) fn of_refusal(failure: &Failure) -> LastWord {
+    not_armed(&failure.text())
+}
+
+fn not_armed(why: &str) -> LastWord {
     LastWord {
         how: "failed",
-        seen: format!("{}.", capital(&failure.text())),
+        seen: format!("{}.", capital(why)),
         to_do: String::new(),
         pzt: NOT_ARMED.to_string(),
     }
@@ -89,29 +95,31 @@ pub(super) fn of_gone(seconds: u64) -> LastWord {
     }
 }
 
-/// The recorded end of a run that is read from its folder.
+/// The recorded end of a run that is read from its folder: the words that its own page had.
 pub(super) fn of_record(end: &RunEnd) -> LastWord {
-    let ended = end.summary.get(ENDED).and_then(toml::Value::as_table);
-    let text = |key: &str| {
-        let value = ended.and_then(|ended| ended.get(key));
-        value.and_then(toml::Value::as_str).unwrap_or_default()
-    };
-    let how = match (end.outcome.as_str(), text("kind")) {
-        (_, "operator") | ("stopped" | "aborted", _) => "stopped",
-        ("done", _) | (_, "done" | "reference-over") => "done",
-        ("safe", _) => "safe",
+    let recorded = end.summary.get(ENDED).cloned();
+    if let Some(ended) = recorded.and_then(|ended| ended.try_into::<Ended>().ok()) {
+        let word = ended.last_word();
+        let pzt = match word.pzt == AT_PARK {
+            true => PARKED_THEN.to_string(),
+            false => word.pzt,
+        };
+        return LastWord { pzt, ..word };
+    }
+    if let Some(why) = end.summary.get("why").and_then(toml::Value::as_str) {
+        return not_armed(why);
+    }
+    let how = match end.outcome.as_str() {
+        "done" => "done",
+        "stopped" | "aborted" => "stopped",
+        "safe" => "safe",
         _ => "failed",
-    };
-    let seen = match (text("seen"), text("expected")) {
-        ("", _) => format!("The record ends: {}.", end.outcome),
-        (seen, "") => format!("{}.", capital(seen)),
-        (seen, expected) => format!("{}. Expected: {expected}.", capital(seen)),
     };
     LastWord {
         how,
-        seen,
-        to_do: capital(text("to_do")),
-        pzt: "The program parked the PZT when the run ended.".to_string(),
+        seen: format!("The record ends: {}.", end.outcome),
+        to_do: String::new(),
+        pzt: PARKED_THEN.to_string(),
     }
 }
 
@@ -120,5 +128,50 @@ fn capital(text: &str) -> String {
     match letters.next() {
         Some(first) => first.to_uppercase().chain(letters).collect(),
         None => String::new(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use cellpos_runtime::life::Refusal;
+
+    #[test]
+    fn a_recorded_end_has_the_words_that_the_page_of_the_run_had() {
+        let ends = [
+            (EndKind::Done, None, None),
+            (EndKind::Operator, None, Some(SafeReason::Operator)),
+            (EndKind::NotKept, None, None),
+            (EndKind::Safe, None, Some(SafeReason::LinkLost)),
+            (EndKind::Safe, None, Some(SafeReason::BoardForeign)),
+            (EndKind::ArmingRefused, Some(Refusal::NoBead), None),
+            (EndKind::Unrecorded, None, Some(SafeReason::Unrecorded)),
+            (EndKind::Failed, None, None),
+        ];
+        for (kind, refusal, reason) in ends {
+            let ended = Ended {
+                kind,
+                refusal,
+                reason,
+                seen: "the bead was lost".to_string(),
+                expected: "a bead".to_string(),
+                to_do: "start again".to_string(),
+            };
+            let mut end = RunEnd::new("any");
+            let value = toml::Value::try_from(&ended).unwrap();
+            end.summary.insert(ENDED.to_string(), value);
+            let (live, read) = (ended.last_word(), of_record(&end));
+            assert_eq!(
+                (live.how, &live.seen, &live.to_do),
+                (read.how, &read.seen, &read.to_do)
+            );
+            assert_eq!(live.pzt == AT_PARK, read.pzt == PARKED_THEN, "{read:?}");
+        }
+        let mut end = RunEnd::new("not-armed");
+        let why = toml::Value::String("the board did not answer".to_string());
+        end.summary.insert("why".to_string(), why);
+        let read = of_record(&end);
+        assert_eq!((read.how, read.pzt.as_str()), ("failed", NOT_ARMED));
+        assert_eq!(read.seen, "The board did not answer.");
     }
 }

@@ -62,6 +62,7 @@ impl<S: RunSink + Shown> RunSink for Viewed<S> {
         if let Some((watcher, _)) = &mut self.page {
             watcher.show(record);
             watcher.count(record);
+            watcher.take_counts(&record.counts);
             // A freeze is on the page when it is in force, not with the next look.
             if watcher.turns(record) {
                 watcher.stands(record, &self.sink);

@@ -10,7 +10,7 @@ use crate::failure::Failure;
 use crate::recorded;
 use cellpos_live::{Banner, EventLine, Feed, Server};
 use cellpos_record::{CYCLES_CSV, Event, Follow, RunEnd, Sessions};
-use cellpos_runtime::{Statistics, TickRecord};
+use cellpos_runtime::{Statistics, TickFlags, TickRecord};
 use cellpos_script::{AtRest, CycleRow, read_cycles};
 use std::collections::{BTreeSet, VecDeque};
 use std::io::{Read, Seek, SeekFrom};
@@ -144,6 +144,7 @@ impl Watch {
             *changed = Instant::now();
             for row in rows {
                 watcher.count(row);
+                watcher.state.stale += u64::from(row.flags.has(TickFlags::STALE));
                 statistics.add(row);
                 if waiting.len() == *most_waiting {
                     waiting.pop_front();

@@ -7,7 +7,9 @@ use crate::ended::Ended;
 use crate::words::{Level, safe_reason, sentence};
 use cellpos_live::{Banner, ClipLine, CycleRow, EventLine, Feed, LastWord, Row, State};
 use cellpos_runtime::life::EventKind;
-use cellpos_runtime::{Event, Life, NoSink, Statistics, Summary, TickFlags, TickRecord};
+use cellpos_runtime::{
+    Event, Life, NoSink, Statistics, Summary, TickCounts, TickFlags, TickRecord,
+};
 
 /// Further facts of a sink for the page, besides the rows.
 pub trait Shown {
@@ -45,8 +47,8 @@ pub(super) struct Watcher {
     told: u32,
     /// Life and freeze of the newest tick.
     standing: (u8, bool),
-    /// Ticks and time, s, of the runs before this one on the same page.
-    before: (u64, f64),
+    /// Ticks, time in s, and counts of the runs before this one on the same page.
+    before: (u64, f64, TickCounts),
     /// Where in the law's columns those of adaptation begin.
     adaptation_at: Option<usize>,
 }
@@ -62,7 +64,7 @@ impl Watcher {
             compute: Tail::new(),
             told: 0,
             standing: (0, false),
-            before: (0, 0.0),
+            before: (0, 0.0, TickCounts::default()),
             adaptation_at: None,
         }
     }
@@ -75,7 +77,12 @@ impl Watcher {
 
     /// The next rows belong to another run and are shown after the present ones.
     pub(super) fn next_run(&mut self) {
-        self.before = (self.state.ticks, self.state.time_s);
+        let counts = TickCounts {
+            skipped: self.state.skipped,
+            frames_lost: self.state.frames_lost,
+            stale: self.state.stale,
+        };
+        self.before = (self.state.ticks, self.state.time_s, counts);
         self.freeze.clear();
         self.safe.clear();
     }
@@ -152,8 +159,15 @@ impl Watcher {
         state.time_s = time_s;
         state.ticks = self.before.0 + record.seq + 1;
         state.late += u64::from(record.flags.has(TickFlags::LATE));
-        state.stale += u64::from(record.flags.has(TickFlags::STALE));
         state.coasted += u64::from(record.flags.has(TickFlags::COASTING));
+    }
+
+    /// Takes the loop's own counts: those of the summary, had the run ended with this tick.
+    pub(super) fn take_counts(&mut self, counts: &TickCounts) {
+        let (.., before) = &self.before;
+        self.state.skipped = before.skipped + counts.skipped;
+        self.state.frames_lost = before.frames_lost + counts.frames_lost;
+        self.state.stale = before.stale + counts.stale;
     }
 
     /// Whether a tick stands otherwise than the one before: frozen, parked, or going on.
@@ -172,8 +186,6 @@ impl Watcher {
     /// Shows an event and counts it.
     pub(super) fn event(&mut self, event: &Event, times: u64) {
         match event.kind {
-            EventKind::FramesDropped { count } => self.state.frames_lost += count * times,
-            EventKind::TicksSkipped { count } => self.state.skipped += count * times,
             EventKind::FreezeStarted { .. } => self.freeze = sentence(&event.kind).1,
             EventKind::SafeLatched { reason } => self.safe = safe_reason(reason).to_string(),
             _ => {}

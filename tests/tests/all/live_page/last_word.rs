@@ -130,12 +130,16 @@ fn the_picture_is_most_of_the_page_on_every_screen_and_every_theme() {
             "return document.getElementById('picture').width > 200",
             programs::PATIENCE,
         );
-        std::thread::sleep(Duration::from_secs(3));
+        // Some seconds of traces.
+        page.wait_for("return +document.body.dataset.held > 3", programs::PATIENCE);
         for theme in ["light", "dark", "red"] {
             page.run(&format!(
                 "document.documentElement.dataset.theme = '{theme}'"
             ));
-            std::thread::sleep(Duration::from_millis(700));
+            page.wait_for(
+                &format!("return document.body.dataset.painted === '{theme}'"),
+                programs::PATIENCE,
+            );
             page.screenshot(&pictures().join(format!("screen-{width}-{theme}.png")));
             let wide = page.run("return document.documentElement.scrollWidth <= innerWidth");
             assert_eq!(wide, true, "wider than {width} px");

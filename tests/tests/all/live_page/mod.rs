@@ -2,6 +2,7 @@
 //! `.ci/run` installs: `cargo test --workspace --test all live_page:: -- --ignored`.
 
 mod last_word;
+mod numbers;
 mod other_commands;
 mod watched;
 

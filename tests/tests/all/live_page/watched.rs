@@ -102,12 +102,14 @@ pub(super) fn portraits(url: &str, name: &str) {
             "return document.getElementById('f-time').textContent !== '-'",
             programs::PATIENCE,
         );
-        std::thread::sleep(Duration::from_secs(3));
         for theme in ["light", "dark"] {
             page.run(&format!(
                 "document.documentElement.dataset.theme = '{theme}'"
             ));
-            std::thread::sleep(Duration::from_millis(700));
+            page.wait_for(
+                &format!("return document.body.dataset.painted === '{theme}'"),
+                programs::PATIENCE,
+            );
             page.screenshot(&pictures().join(format!("{name}-{width}-{theme}.png")));
             let wide = page.run("return document.documentElement.scrollWidth <= innerWidth");
             assert_eq!(wide, true, "{name}: wider than {width} px");

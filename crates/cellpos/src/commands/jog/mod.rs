@@ -4,7 +4,7 @@ mod shown;
 mod sight;
 mod typed;
 
-use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
+use crate::outcome::{CommandResult, Failure, Outcome, print_err, print_json, print_text};
 use crate::rig_file::{ClockKind, RigFile};
 use crate::view_args::PageArgs;
 use cellpos_session::signals;
@@ -92,7 +92,7 @@ pub(crate) fn run(args: Args) -> CommandResult {
     let mut stops = Vec::new();
     let typed = args.to.is_empty().then(Typed::listen);
     if typed.as_ref().is_some_and(|typed| typed.keyboard.is_some()) {
-        eprintln!("{}", typed::HELP);
+        print_err(typed::HELP);
     }
     let mut given = args.to.iter();
     let mut at_um = mover.at_um();
@@ -207,7 +207,7 @@ fn next_line(
             (_, Some(by_um)) => return Ok(Some(at_um + by_um)),
             (text, None) => match text.parse::<Micrometers>() {
                 Ok(um) => return Ok(Some(um.0)),
-                Err(error) => eprintln!("{text}: {error}; or +, -, +2um, -2um, q"),
+                Err(error) => print_err(&format!("{text}: {error}; or +, -, +2um, -2um, q")),
             },
         }
     }
