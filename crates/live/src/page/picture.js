@@ -158,7 +158,8 @@ export class PictureView {
       context.restore();
     }
     context.font = "12px system-ui, sans-serif"; context.textBaseline = "top"; context.textAlign = "right";
-    outlined(context, `×${number(times * ratio / scale, 10)}`, wide - 6, 5);
+    inset.dataset.times = number(times * ratio / scale, 10);
+    outlined(context, `×${inset.dataset.times}`, wide - 6, 5);
     if (picture.umPerPx) {
       const um = 1, long = um / Math.abs(picture.umPerPx) * times;
       context.fillStyle = isRed() ? "#ff8a78" : "#fff";

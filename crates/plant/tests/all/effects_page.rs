@@ -32,7 +32,9 @@ fn table() -> String {
 
 /// The page is for people; the files of the catalogue have `um` and `deg`.
 fn as_people_write(unit: &str) -> String {
-    unit.replace("um", "µm").replace("deg", "°").replace("^2", "²")
+    unit.replace("um", "µm")
+        .replace("deg", "°")
+        .replace("^2", "²")
 }
 
 #[test]

@@ -157,6 +157,13 @@ fn the_picture_is_most_of_the_page_on_every_screen_and_every_theme() {
         );
         let share = share.as_f64().expect("a share");
         assert!(share >= 0.6, "{width} px: the picture has {share}");
+        // Beside it the bead, five times as large; on a phone as large as there is room.
+        let times = page.run("return +document.getElementById('inset').dataset.times");
+        let times = times.as_f64().expect("a scale");
+        assert!(
+            times >= if width < 600 { 2.0 } else { 5.0 },
+            "{width} px: {times}"
+        );
     }
     assert_eq!(page.console(), Vec::<String>::new());
 }
