@@ -31,7 +31,8 @@ fn cannot_open(port: &str, error: &Error) -> Failure {
     }
 }
 
-/// Name and process of the first program that has a file open, as far as this user may see it.
+/// Name and process of the program that has a file open, as far as this user may see it. Of several it is another process of this
+/// program: `firmware-sim` keeps its own end of the line open.
 fn holder(path: &str) -> String {
     let wanted = std::fs::canonicalize(path).unwrap_or_else(|_| path.into());
     let has_it = |process: &Path| {
@@ -39,18 +40,25 @@ fn holder(path: &str) -> String {
         (open.into_iter().flatten().flatten())
             .any(|file| std::fs::read_link(file.path()).is_ok_and(|file| file == wanted))
     };
+    let name_of = |process: &Path| {
+        let name = std::fs::read_to_string(process.join("comm")).unwrap_or_default();
+        name.trim().to_owned()
+    };
+    let own = name_of(Path::new("/proc/self"));
     let processes = std::fs::read_dir("/proc").into_iter().flatten().flatten();
-    let found = processes.map(|entry| entry.path()).find(|process| {
-        let number = process.file_name().and_then(|name| name.to_str());
-        number.is_some_and(|name| name.bytes().all(|c| c.is_ascii_digit())) && has_it(process)
-    });
-    match found {
-        Some(process) => {
-            let name = std::fs::read_to_string(process.join("comm")).unwrap_or_default();
-            let number = process.file_name().unwrap_or_default().to_string_lossy();
-            format!("{} (process {number})", name.trim())
-        }
-        None => "another program".to_owned(),
+    let found = (processes.map(|entry| entry.path()))
+        .filter(|process| {
+            let number = process.file_name().and_then(|name| name.to_str());
+            number.is_some_and(|name| name.bytes().all(|c| c.is_ascii_digit())) && has_it(process)
+        })
+        .min_by_key(|process| name_of(process) != own);
+    let Some(process) = found else {
+        return "another program".to_owned();
+    };
+    let number = process.file_name().unwrap_or_default().to_string_lossy();
+    match name_of(&process) {
+        name if name == own => format!("another {name} (process {number})"),
+        name => format!("{name} (process {number})"),
     }
 }
 
@@ -64,14 +72,22 @@ mod tests {
         let path = folder.path().join("port");
         let _held = std::fs::File::create(&path).expect("a file");
         let path = path.display().to_string();
+        // Another program has it too, such as the one at the other end of a pseudo-terminal.
+        let mut other = std::process::Command::new("sleep")
+            .arg("60")
+            .stdin(std::fs::File::open(&path).expect("a file"))
+            .spawn()
+            .expect("sleep");
         let own = format!("(process {})", std::process::id());
         for kind in [ErrorKind::WouldBlock, ErrorKind::ResourceBusy] {
             let said = cannot_open(&path, &kind.into()).text();
             assert!(
-                said.contains(&own) && said.contains("has it open"),
+                said.contains("another ") && said.contains(&own) && said.contains("has it open"),
                 "{said}"
             );
         }
+        other.kill().expect("sleep ends");
+        let _ = other.wait();
         assert_eq!(holder("/nowhere/at/all"), "another program");
         let said = format!(
             "{:?}",
