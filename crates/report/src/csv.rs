@@ -7,7 +7,7 @@ use std::fmt::Write;
 impl Figure {
     /// The data of the figure, undecimated, one line per point:
     /// `panel,series,x,x_axis,y,low,high,y_axis` with label and unit of the axes in `x_axis` and `y_axis`. A heat map
-    /// has its rows as series and its columns as x.
+    /// has its rows as series and its columns as x; so has a mosaic, whose y is what its label names.
     pub fn to_csv(&self) -> String {
         figure(self)
     }
@@ -50,6 +50,17 @@ pub(crate) fn figure(figure: &Figure) -> String {
                             number(high)
                         );
                     }
+                }
+            }
+        }
+        Content::Mosaic(mosaic) => {
+            let label = field(&mosaic.label);
+            for (row, row_name) in mosaic.rows.iter().enumerate() {
+                for (column, column_name) in mosaic.columns.iter().enumerate() {
+                    let value = mosaic.tile(row, column).map(|tile| tile.value);
+                    let (row_name, column_name) = (field(row_name), field(column_name));
+                    let value = number(value);
+                    let _ = writeln!(out, "1,{row_name},{column_name},,{value},,,{label}");
                 }
             }
         }

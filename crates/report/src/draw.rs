@@ -1,9 +1,11 @@
 //! Figures to SVG.
 
+use crate::drawing::Drawing;
 use crate::figure::{Content, Figure, Panel};
 use crate::heat::heat_map;
+use crate::mosaic::mosaic;
 use crate::panel::{Entry, Frame, LEFT_PX, RIGHT_PX, data_range, draw_panel, entries, legend};
-use crate::svg::{self, SLIM_PX, STYLE, Svg, WIDTH_PX, px};
+use crate::svg::{self, SLIM_PX, STYLE, WIDTH_PX, px};
 use std::fmt::Write;
 
 impl Figure {
@@ -19,7 +21,7 @@ pub(crate) fn in_page(shown: &Figure) -> String {
     let wide = figure(shown, false, WIDTH_PX);
     match &shown.content {
         Content::HeatMap(_) => format!("<div class=\"scroll\">{wide}</div>\n"),
-        Content::Panels(_) => format!(
+        Content::Panels(_) | Content::Mosaic(_) => format!(
             "<div class=\"wide\">{wide}</div>\n<div class=\"slim\">{}</div>\n",
             figure(shown, false, SLIM_PX)
         ),
@@ -28,11 +30,7 @@ pub(crate) fn in_page(shown: &Figure) -> String {
 
 /// The figure as SVG, of a width in px; `alone` adds the style sheet and the background that a page gives to inline figures.
 pub(crate) fn figure(figure: &Figure, alone: bool, width_px: f64) -> String {
-    let mut body = Svg { out: String::new() };
-    let height_px = match &figure.content {
-        Content::Panels(panels) => panels_grid(&mut body, figure, panels, width_px),
-        Content::HeatMap(map) => heat_map(&mut body, map),
-    };
+    let (body, height_px) = drawn(figure, width_px);
     let (w, h) = (px(width_px), px(height_px));
     let mut out = String::new();
     let _ = write!(
@@ -46,13 +44,24 @@ pub(crate) fn figure(figure: &Figure, alone: bool, width_px: f64) -> String {
             "<style>{STYLE}</style><rect class=\"bg\" width=\"{w}\" height=\"{h}\"/>"
         );
     }
-    out.push_str(&body.out);
+    out.push_str(&body.to_svg());
     out.push_str("</svg>\n");
     out
 }
 
+/// The elements of a figure of a width in px, and its height.
+pub(crate) fn drawn(figure: &Figure, width_px: f64) -> (Drawing, f64) {
+    let mut drawing = Drawing::default();
+    let height_px = match &figure.content {
+        Content::Panels(panels) => panels_grid(&mut drawing, figure, panels, width_px),
+        Content::HeatMap(map) => heat_map(&mut drawing, map),
+        Content::Mosaic(pictures) => mosaic(&mut drawing, pictures, width_px),
+    };
+    (drawing, height_px)
+}
+
 /// Draws the panels and returns the height of all.
-fn panels_grid(svg: &mut Svg, figure: &Figure, panels: &[Panel], width_px: f64) -> f64 {
+fn panels_grid(drawing: &mut Drawing, figure: &Figure, panels: &[Panel], width_px: f64) -> f64 {
     let shared = figure.share_x.then(|| {
         panels
             .iter()
@@ -73,7 +82,7 @@ fn panels_grid(svg: &mut Svg, figure: &Figure, panels: &[Panel], width_px: f64) 
         && others.iter().all(|panel| entries(panel) == entries(first))
     {
         let room = width_px - LEFT_PX - RIGHT_PX;
-        top += legend(svg, first, &told, (LEFT_PX, top), room);
+        top += legend(drawing, first, &told, (LEFT_PX, top), room);
         told = entries(first);
     }
     for (row_index, row) in panels.chunks(columns).enumerate() {
@@ -88,7 +97,7 @@ fn panels_grid(svg: &mut Svg, figure: &Figure, panels: &[Panel], width_px: f64) 
                 show_x: !(figure.share_x && columns == 1) || last_row,
                 told: &told,
             };
-            tallest = tallest.max(draw_panel(svg, panel, &frame));
+            tallest = tallest.max(draw_panel(drawing, panel, &frame));
             if columns == 1 {
                 told.extend(entries(panel));
             }

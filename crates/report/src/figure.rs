@@ -1,6 +1,7 @@
-//! Figures: panels of series or a heat map, with a name and a caption.
+//! Figures: panels of series, a heat map or pictures, with a name and a caption.
 
 use crate::axis::Axis;
+use crate::mosaic::Mosaic;
 use crate::series::Series;
 
 /// A marker line across a panel.
@@ -153,9 +154,10 @@ impl HeatMap {
 pub(crate) enum Content {
     Panels(Vec<Panel>),
     HeatMap(HeatMap),
+    Mosaic(Mosaic),
 }
 
-/// A figure: a name (for its files), a caption, and panels or a heat map.
+/// A figure: a name (for its files), a caption, and panels, a heat map or pictures.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Figure {
     pub(crate) name: String,
@@ -182,6 +184,14 @@ impl Figure {
     pub fn heat_map(name: &str, caption: &str, map: HeatMap) -> Self {
         Self {
             content: Content::HeatMap(map),
+            ..Self::new(name, caption)
+        }
+    }
+
+    /// Pictures in rows and columns.
+    pub fn mosaic(name: &str, caption: &str, mosaic: Mosaic) -> Self {
+        Self {
+            content: Content::Mosaic(mosaic),
             ..Self::new(name, caption)
         }
     }
@@ -258,6 +268,13 @@ impl Figure {
         {
             panel.series.push(series);
         }
+        self
+    }
+
+    /// Gives the figure another caption.
+    #[must_use]
+    pub fn caption(mut self, caption: &str) -> Self {
+        caption.clone_into(&mut self.caption);
         self
     }
 

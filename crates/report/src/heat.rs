@@ -1,11 +1,11 @@
-//! Heat maps to SVG.
+//! Heat maps.
 
+use crate::drawing::{Anchor, Drawing, Shape};
 use crate::figure::HeatMap;
-use crate::svg::{self, Anchor, Svg, WIDTH_PX, px};
-use std::fmt::Write;
+use crate::svg::{self, WIDTH_PX};
 
 /// Draws a heat map with its colour bar and returns the height.
-pub(crate) fn heat_map(svg: &mut Svg, map: &HeatMap) -> f64 {
+pub(crate) fn heat_map(drawing: &mut Drawing, map: &HeatMap) -> f64 {
     let widest = map
         .rows
         .iter()
@@ -19,7 +19,7 @@ pub(crate) fn heat_map(svg: &mut Svg, map: &HeatMap) -> f64 {
     let (low, high) = heat_range(map);
     for (column, name) in map.columns.iter().enumerate() {
         let x = left + (column as f64 + 0.5) * cell_w;
-        svg.text(
+        drawing.text(
             "",
             (x, top - 9.0),
             Anchor::Middle,
@@ -28,7 +28,7 @@ pub(crate) fn heat_map(svg: &mut Svg, map: &HeatMap) -> f64 {
     }
     for (row, name) in map.rows.iter().enumerate() {
         let y = top + row as f64 * cell_h;
-        svg.text(
+        drawing.text(
             "",
             (left - 8.0, y + cell_h / 2.0 + 4.0),
             Anchor::End,
@@ -37,16 +37,20 @@ pub(crate) fn heat_map(svg: &mut Svg, map: &HeatMap) -> f64 {
         for column in 0..map.columns.len() {
             let x = left + column as f64 * cell_w;
             let Some(value) = map.value(row, column) else {
-                svg.rect("nil", (x + 0.5, y + 0.5), (cell_w - 1.0, cell_h - 1.0));
+                drawing.rect("nil", (x + 0.5, y + 0.5), (cell_w - 1.0, cell_h - 1.0));
                 continue;
             };
             let (fill, dark) = heat_color(value, low, high);
-            heat_rect(svg, fill, (x + 0.5, y + 0.5), (cell_w - 1.0, cell_h - 1.0));
+            drawing.shapes.push(Shape::Filled {
+                rgb: fill,
+                at: (x + 0.5, y + 0.5),
+                size: (cell_w - 1.0, cell_h - 1.0),
+            });
             let text = format!("{value:.*}", map.decimals).replace('-', "\u{2212}");
             if svg::text_width_px(&text) < cell_w {
                 let class = if dark { "cellw" } else { "cell" };
                 let at = (x + cell_w / 2.0, y + cell_h / 2.0 + 4.0);
-                svg.text(class, at, Anchor::Middle, &text);
+                drawing.text(class, at, Anchor::Middle, &text);
             }
         }
     }
@@ -57,34 +61,27 @@ pub(crate) fn heat_map(svg: &mut Svg, map: &HeatMap) -> f64 {
         let share = f64::from(index) / 59.0;
         let (fill, _) = heat_color(low + share * (high - low), low, high);
         let x = left + f64::from(index) * bar_w / 60.0;
-        heat_rect(svg, fill, (x, bar_y), (bar_w / 60.0 + 0.3, 10.0));
+        drawing.shapes.push(Shape::Filled {
+            rgb: fill,
+            at: (x, bar_y),
+            size: (bar_w / 60.0 + 0.3, 10.0),
+        });
     }
     let number = |value: f64| format!("{value:.*}", map.decimals).replace('-', "\u{2212}");
-    svg.text("mut", (left, bar_y + 24.0), Anchor::Start, &number(low));
-    svg.text(
+    drawing.text("mut", (left, bar_y + 24.0), Anchor::Start, &number(low));
+    drawing.text(
         "mut",
         (left + bar_w, bar_y + 24.0),
         Anchor::End,
         &number(high),
     );
-    svg.text(
+    drawing.text(
         "",
         (left + bar_w + 12.0, bar_y + 10.0),
         Anchor::Start,
         &svg::fit(&map.label, WIDTH_PX - left - bar_w - 16.0),
     );
     bar_y + 34.0
-}
-
-fn heat_rect(svg: &mut Svg, (r, g, b): (u8, u8, u8), at: (f64, f64), size: (f64, f64)) {
-    let _ = write!(
-        svg.out,
-        "<rect fill=\"#{r:02x}{g:02x}{b:02x}\" x=\"{}\" y=\"{}\" width=\"{}\" height=\"{}\"/>",
-        px(at.0),
-        px(at.1),
-        px(size.0),
-        px(size.1)
-    );
 }
 
 /// Ends of the colours: symmetric about zero when the values have both signs.

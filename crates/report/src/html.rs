@@ -1,10 +1,12 @@
 //! The page: title, sections, paragraphs, notes, tables and figures.
 
 use crate::draw;
-use crate::figure::Figure;
+use crate::figure::{Figure, slug};
 use crate::picture::{Picture, base64};
 use crate::style::PAGE_STYLE;
 use crate::svg::{STYLE, escape, set};
+use crate::table::{Emphasis, Table};
+use crate::typeset::typeset;
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
 
@@ -21,156 +23,6 @@ pub enum ReportError {
     },
 }
 
-/// How a note or a row is meant.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub enum Emphasis {
-    /// Neither good nor bad.
-    #[default]
-    Plain,
-    /// Holds, passed.
-    Good,
-    /// To be looked at.
-    Warning,
-    /// Failed, broken.
-    Bad,
-}
-
-impl Emphasis {
-    fn class(self) -> &'static str {
-        match self {
-            Emphasis::Plain => "plain",
-            Emphasis::Good => "good",
-            Emphasis::Warning => "warning",
-            Emphasis::Bad => "bad",
-        }
-    }
-
-    /// A sign besides the colour, for colour-blind readers and for prints.
-    fn sign(self) -> &'static str {
-        match self {
-            Emphasis::Plain => "",
-            Emphasis::Good => "\u{2713} ",
-            Emphasis::Warning => "\u{25b2} ",
-            Emphasis::Bad => "\u{2717} ",
-        }
-    }
-}
-
-/// Header of a column and alignment of its cells.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Column {
-    head: String,
-    right: bool,
-}
-
-impl Column {
-    /// Text, on the left.
-    pub fn left(head: &str) -> Self {
-        Self {
-            head: head.to_owned(),
-            right: false,
-        }
-    }
-
-    /// Numbers, on the right, in figures of equal width. Write the unit in the head.
-    pub fn right(head: &str) -> Self {
-        Self {
-            head: head.to_owned(),
-            right: true,
-        }
-    }
-}
-
-/// A table.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Table {
-    columns: Vec<Column>,
-    rows: Vec<(Emphasis, Vec<String>)>,
-    caption: String,
-}
-
-impl Table {
-    /// A table without rows.
-    pub fn new<const N: usize>(columns: [Column; N]) -> Self {
-        Self::with_columns(columns.to_vec())
-    }
-
-    /// A table without rows, for a number of columns known only when running.
-    pub fn with_columns(columns: Vec<Column>) -> Self {
-        Self {
-            columns,
-            rows: Vec::new(),
-            caption: String::new(),
-        }
-    }
-
-    /// A table of names and values.
-    pub fn key_values<K: AsRef<str>, V: AsRef<str>>(pairs: &[(K, V)]) -> Self {
-        let mut table = Self::new([Column::left(""), Column::left("")]);
-        for (key, value) in pairs {
-            table.row([key.as_ref(), value.as_ref()]);
-        }
-        table
-    }
-
-    /// A line of text below the table.
-    pub fn caption(&mut self, caption: &str) -> &mut Self {
-        caption.clone_into(&mut self.caption);
-        self
-    }
-
-    /// Adds a row. Surplus cells are dropped, missing ones left empty.
-    pub fn row<I>(&mut self, cells: I) -> &mut Self
-    where
-        I: IntoIterator,
-        I::Item: AsRef<str>,
-    {
-        self.row_with(Emphasis::Plain, cells)
-    }
-
-    /// Adds a row that is marked as good, to be looked at, or bad.
-    pub fn row_with<I>(&mut self, status: Emphasis, cells: I) -> &mut Self
-    where
-        I: IntoIterator,
-        I::Item: AsRef<str>,
-    {
-        let cells = cells
-            .into_iter()
-            .take(self.columns.len())
-            .map(|cell| cell.as_ref().to_owned())
-            .collect();
-        self.rows.push((status, cells));
-        self
-    }
-
-    fn html(&self, out: &mut String) {
-        out.push_str("<div class=\"scroll\"><table>");
-        let side = |column: &Column| if column.right { " class=\"num\"" } else { "" };
-        if self.columns.iter().any(|column| !column.head.is_empty()) {
-            out.push_str("<thead><tr>");
-            for column in &self.columns {
-                let _ = write!(out, "<th{}>{}</th>", side(column), set(&column.head));
-            }
-            out.push_str("</tr></thead>");
-        }
-        out.push_str("<tbody>\n");
-        for (status, cells) in &self.rows {
-            let _ = write!(out, "<tr class=\"{}\">", status.class());
-            for (index, column) in self.columns.iter().enumerate() {
-                let cell = cells.get(index).map_or("", String::as_str);
-                let sign = if index == 0 { status.sign() } else { "" };
-                let _ = write!(out, "<td{}>{sign}{}</td>", side(column), set(cell));
-            }
-            out.push_str("</tr>\n");
-        }
-        out.push_str("</tbody></table></div>\n");
-        // Outside of what scrolls: on a narrow screen it is read whole.
-        if !self.caption.is_empty() {
-            let _ = writeln!(out, "<p class=\"caption\">{}</p>", set(&self.caption));
-        }
-    }
-}
-
 #[derive(Debug, Clone)]
 enum Block {
     Section(String),
@@ -183,6 +35,7 @@ enum Block {
     Figure(Figure),
     Picture(Picture),
     Result(Emphasis, String),
+    Lead(String),
     Fold(String),
     Unfold,
 }
@@ -233,6 +86,11 @@ impl Report {
         self.push(Block::Result(status, sentence.to_owned()))
     }
 
+    /// Adds what was done, in a line or two below the title: with what, how, when.
+    pub fn lead(&mut self, text: &str) -> &mut Self {
+        self.push(Block::Lead(text.to_owned()))
+    }
+
     /// What is added until [`Report::unfold`] is folded behind this title: it is there, and not in the way.
     pub fn fold(&mut self, title: &str) -> &mut Self {
         self.push(Block::Fold(title.to_owned()))
@@ -270,9 +128,11 @@ impl Report {
         self.push(Block::Figure(figure))
     }
 
-    /// Adds a picture of pixels, a PNG file, which the page carries within itself. `shows` describes it in a few words.
+    /// Adds a picture of pixels, a PNG file, which the page carries within itself. `shows` describes it in a few words, from which
+    /// the name of its file comes.
     pub fn picture(&mut self, shows: &str, caption: &str, png: Vec<u8>) -> &mut Self {
         self.push(Block::Picture(Picture {
+            name: slug(shows),
             shows: shows.to_owned(),
             caption: caption.to_owned(),
             png,
@@ -311,7 +171,7 @@ impl Report {
                 _ => None,
             })
             .collect();
-        let mut section = 0;
+        let (mut section, mut number) = (0, 0);
         for block in &self.blocks {
             match block {
                 Block::Section(title) => {
@@ -347,15 +207,25 @@ impl Report {
                     let (class, sign) = (status.class(), status.sign());
                     let _ = writeln!(out, "<p class=\"result {class}\">{sign}{}</p>", set(text));
                 }
+                Block::Lead(text) => {
+                    let _ = writeln!(out, "<p class=\"lead\">{}</p>", set(text));
+                }
                 Block::Fold(title) => {
                     let _ = writeln!(out, "<details><summary>{}</summary>", set(title));
                 }
                 Block::Unfold => out.push_str("</details>\n"),
-                Block::Picture(picture) => picture.html(&mut out, set),
+                Block::Picture(picture) => {
+                    number += 1;
+                    picture.html(&mut out, number);
+                }
                 Block::Figure(figure) => {
                     let _ = write!(out, "<figure>\n{}", draw::in_page(figure));
+                    number += 1;
                     let caption = set(&figure.caption);
-                    let _ = write!(out, "<figcaption>{caption} <span class=\"take\">");
+                    let _ = write!(
+                        out,
+                        "<figcaption>Figure {number}. {caption} <span class=\"take\">"
+                    );
                     take(&mut out, figure, beside);
                     out.push_str("</span></figcaption>\n</figure>\n");
                 }
@@ -371,11 +241,11 @@ impl Report {
     /// # Errors
     /// [`ReportError::Write`] names the file.
     pub fn write(&self, path: &Path) -> Result<(), ReportError> {
-        write_file(path, &self.to_html())
+        write_file(path, self.to_html().as_bytes())
     }
 
-    /// As [`Report::write`], with every figure as a file: `report.html` gets a folder `report-figures` with
-    /// `NAME.svg` and `NAME.csv`.
+    /// As [`Report::write`], with every figure as a file: `report.html` gets a folder `report-figures` with `NAME.svg`, `NAME.pdf`
+    /// and `NAME.csv`, and `captions.txt` with the captions of all.
     ///
     /// # Errors
     /// [`ReportError::Write`] names the file.
@@ -388,19 +258,76 @@ impl Report {
             |stem| stem.to_string_lossy().into_owned(),
         );
         let beside = format!("{stem}-figures");
-        write_file(path, &self.page(Some(&beside)))?;
+        write_file(path, self.page(Some(&beside)).as_bytes())?;
         let folder = path.with_file_name(&beside);
         for figure in self.figures() {
-            write_file(
-                &folder.join(format!("{}.svg", figure.name)),
-                &figure.to_svg(),
-            )?;
-            write_file(
-                &folder.join(format!("{}.csv", figure.name)),
-                &figure.to_csv(),
-            )?;
+            for form in [Form::Svg, Form::Pdf, Form::Csv] {
+                let name = format!("{}.{}", figure.name, form.ending());
+                write_file(&folder.join(name), &form.of(figure))?;
+            }
+        }
+        let captions = self.captions();
+        if captions.contains("Figure 1 ") {
+            write_file(&folder.join("captions.txt"), captions.as_bytes())?;
         }
         Ok(())
+    }
+
+    /// The captions with what was done, to be pasted.
+    fn captions(&self) -> String {
+        let mut out = typeset(&self.title);
+        let leads = self.blocks.iter().filter_map(|block| match block {
+            Block::Lead(text) | Block::Result(_, text) => Some(text),
+            _ => None,
+        });
+        for text in leads {
+            let _ = write!(out, "\n{}", typeset(text));
+        }
+        let shown = self.blocks.iter().filter_map(|block| match block {
+            Block::Figure(figure) => Some((figure.name.as_str(), &figure.caption)),
+            Block::Picture(picture) => Some((picture.name.as_str(), &picture.caption)),
+            _ => None,
+        });
+        for (number, (name, caption)) in (1..).zip(shown) {
+            let caption = typeset(caption);
+            let _ = write!(out, "\n\nFigure {number} ({name}). {caption}");
+        }
+        out.push('\n');
+        out
+    }
+}
+
+/// What a figure can be taken along as.
+#[derive(Debug, Clone, Copy)]
+enum Form {
+    Svg,
+    Pdf,
+    Csv,
+}
+
+impl Form {
+    fn ending(self) -> &'static str {
+        match self {
+            Form::Svg => "svg",
+            Form::Pdf => "pdf",
+            Form::Csv => "csv",
+        }
+    }
+
+    fn kind(self) -> &'static str {
+        match self {
+            Form::Svg => "image/svg+xml",
+            Form::Pdf => "application/pdf",
+            Form::Csv => "text/csv",
+        }
+    }
+
+    fn of(self, figure: &Figure) -> Vec<u8> {
+        match self {
+            Form::Svg => figure.to_svg().into_bytes(),
+            Form::Pdf => figure.to_pdf(),
+            Form::Csv => figure.to_csv().into_bytes(),
+        }
     }
 }
 
@@ -417,17 +344,11 @@ fn contents(out: &mut String, sections: &[&String]) {
 /// Download links of a figure: to the files next to the page, or to data within it.
 fn take(out: &mut String, figure: &Figure, beside: Option<&str>) {
     let name = figure.name();
-    for (ending, kind) in [("svg", "image/svg+xml"), ("csv", "text/csv")] {
+    for form in [Form::Svg, Form::Pdf, Form::Csv] {
+        let ending = form.ending();
         let target = match beside {
             Some(folder) => format!("{}/{name}.{ending}", encoded(folder)),
-            None => {
-                let data = if ending == "svg" {
-                    figure.to_svg()
-                } else {
-                    figure.to_csv()
-                };
-                format!("data:{kind};base64,{}", base64(data.as_bytes()))
-            }
+            None => format!("data:{};base64,{}", form.kind(), base64(&form.of(figure))),
         };
         let shown = ending.to_uppercase();
         let _ = write!(
@@ -455,10 +376,10 @@ fn is_device(path: &Path) -> bool {
     std::fs::metadata(path).is_ok_and(|found| !found.is_file() && !found.is_dir())
 }
 
-fn write_file(path: &Path, text: &str) -> Result<(), ReportError> {
+fn write_file(path: &Path, bytes: &[u8]) -> Result<(), ReportError> {
     let attempt = || {
         if is_device(path) {
-            return std::fs::write(path, text);
+            return std::fs::write(path, bytes);
         }
         if let Some(folder) = path.parent()
             && !folder.as_os_str().is_empty()
@@ -468,7 +389,7 @@ fn write_file(path: &Path, text: &str) -> Result<(), ReportError> {
         let mut name = path.file_name().unwrap_or_default().to_owned();
         name.push(".part");
         let part = path.with_file_name(name);
-        std::fs::write(&part, text)
+        std::fs::write(&part, bytes)
             .and_then(|()| std::fs::rename(&part, path))
             .inspect_err(|_| {
                 let _ = std::fs::remove_file(&part);

@@ -1,8 +1,8 @@
 //! Self-contained HTML reports with inline SVG plots.
 //!
 //! A [`Report`] is a title and a sequence of sections, paragraphs, notes, tables and [`Figure`]s. It becomes one
-//! HTML file that loads nothing from the network and suits light and dark screens. Every figure can also be written as SVG
-//! and CSV. The same calls always give the same bytes: nothing here reads a clock, a locale or a random number.
+//! HTML file that loads nothing from the network and suits light and dark screens. Every figure can also be written as SVG,
+//! PDF and CSV. The same calls always give the same bytes: nothing here reads a clock, a locale or a random number.
 //!
 //! Long traces are thinned to the minimum and maximum of each pixel column, so an hour at 1 kHz stays a small picture with
 //! every spike in it. [`Figure::to_csv`] writes the data as given. Axes carry their unit.
@@ -27,20 +27,26 @@
 mod axis;
 mod csv;
 mod draw;
+mod drawing;
 mod figure;
 mod heat;
 mod html;
 mod marks;
+mod mosaic;
 mod panel;
+mod pdf;
 mod picture;
 mod series;
 mod style;
 mod svg;
+mod table;
 mod thin;
 mod typeset;
 
 pub use axis::{Axis, Scale};
 pub use figure::{Figure, HeatMap, Panel};
-pub use html::{Column, Emphasis, Report, ReportError, Table};
+pub use html::{Report, ReportError};
+pub use mosaic::{Mosaic, Tile};
 pub use series::{Kind, Series};
+pub use table::{Column, Emphasis, Table};
 pub use typeset::typeset;

@@ -1,33 +1,27 @@
 //! Series to SVG: lines, points, bands, bars.
 
 use crate::axis::Placed;
+use crate::drawing::{Drawing, Join, Shape};
 use crate::series::{Kind, Series};
-use crate::svg::{Svg, px};
 use crate::thin;
-use std::fmt::Write;
 
 /// A point.
-pub(crate) fn dot(svg: &mut Svg, color: usize, at: (f64, f64), radius: f64) {
-    let _ = write!(
-        svg.out,
-        "<circle class=\"dot f{color}\" cx=\"{}\" cy=\"{}\" r=\"{}\"/>",
-        px(at.0),
-        px(at.1),
-        px(radius)
-    );
-}
-
-/// Many points as one path of zero-length strokes with round ends: a tenth of the bytes of circles.
-fn specks(svg: &mut Svg, color: usize, points: &[(f64, f64)]) {
-    let _ = write!(svg.out, "<path class=\"ln spk s{color}\" d=\"");
-    for (x, y) in points {
-        let _ = write!(svg.out, "M{} {}h0", px(*x), px(*y));
-    }
-    svg.out.push_str("\"/>");
+pub(crate) fn dot(drawing: &mut Drawing, color: usize, at: (f64, f64), radius: f64) {
+    drawing.shapes.push(Shape::Circle {
+        class: format!("dot f{color}"),
+        at,
+        radius,
+    });
 }
 
 /// The data of one series.
-pub(crate) fn draw_series(svg: &mut Svg, series: &Series, color: usize, x: &Placed, y: &Placed) {
+pub(crate) fn draw_series(
+    drawing: &mut Drawing,
+    series: &Series,
+    color: usize,
+    x: &Placed,
+    y: &Placed,
+) {
     let height = y.length_px;
     match &series.kind {
         Kind::Line { .. } | Kind::Step { .. } => {
@@ -40,16 +34,21 @@ pub(crate) fn draw_series(svg: &mut Svg, series: &Series, color: usize, x: &Plac
                 class.push_str(" thn");
             }
             for run in runs(series, x, y) {
-                path(
-                    svg,
-                    &class,
-                    &thin::line(if step { stairs(run) } else { run }),
-                );
+                let mut points = thin::line(if step { stairs(run) } else { run });
+                // A line of one point would not show; round ends make it a dot.
+                if let [only] = points.as_slice() {
+                    points.push(*only);
+                }
+                drawing.path(&class, points, Join::Open);
             }
         }
         Kind::Points { interval, .. } => {
             let all: thin::Run = runs(series, x, y).into_iter().flatten().collect();
-            let radius = if all.len() > 400 { 1.3 } else { 3.0 };
+            let radius = match (all.len() > 400, series.thin) {
+                (true, _) => 1.3,
+                (false, true) => 1.8,
+                (false, false) => 3.0,
+            };
             if interval.is_some() {
                 for index in 0..series.len() {
                     let (_, low, high) = series.values(index);
@@ -60,17 +59,22 @@ pub(crate) fn draw_series(svg: &mut Svg, series: &Series, color: usize, x: &Plac
                         && (high - low).abs() > 2.0 * radius
                     {
                         let class = format!("ln s{color}");
-                        svg.line(&class, (at, height - low), (at, height - high));
+                        drawing.line(&class, (at, height - low), (at, height - high));
                         for end in [low, high] {
-                            svg.line(&class, (at - 3.0, height - end), (at + 3.0, height - end));
+                            drawing.line(
+                                &class,
+                                (at - 3.0, height - end),
+                                (at + 3.0, height - end),
+                            );
                         }
                     }
                 }
             }
-            if radius > 2.0 {
-                all.iter().for_each(|at| dot(svg, color, *at, radius));
+            if radius > 1.5 {
+                all.iter().for_each(|at| dot(drawing, color, *at, radius));
             } else {
-                specks(svg, color, &thin::points(all));
+                let class = format!("ln spk s{color}");
+                drawing.path(&class, thin::points(all), Join::Specks);
             }
         }
         Kind::Band { .. } => {
@@ -78,7 +82,7 @@ pub(crate) fn draw_series(svg: &mut Svg, series: &Series, color: usize, x: &Plac
                 let run = thin::band(run);
                 let mut ring: thin::Run = run.iter().map(|(at, low, _)| (*at, *low)).collect();
                 ring.extend(run.iter().rev().map(|(at, _, high)| (*at, *high)));
-                path(svg, &format!("bnd f{color}"), &ring);
+                drawing.path(&format!("bnd f{color}"), ring, Join::Closed);
             }
         }
         Kind::Bars { y: heights, width } => {
@@ -88,7 +92,7 @@ pub(crate) fn draw_series(svg: &mut Svg, series: &Series, color: usize, x: &Plac
                 if let ((Some(from), Some(to)), Some(end)) = (ends, y.at(*value)) {
                     // A sliver between neighbours keeps the bars apart.
                     let gap = if to - from > 4.0 { 0.5 } else { 0.0 };
-                    svg.rect(
+                    drawing.rect(
                         &format!("bar f{color}"),
                         (from + gap, height - end.max(zero)),
                         (to - from - 2.0 * gap, (end - zero).abs()),
@@ -143,22 +147,4 @@ fn stairs(run: thin::Run) -> thin::Run {
         out.push((x, y));
     }
     out
-}
-
-fn path(svg: &mut Svg, class: &str, points: &[(f64, f64)]) {
-    let _ = write!(svg.out, "<path class=\"{class}\" d=\"");
-    for (index, (x, y)) in points.iter().enumerate() {
-        svg.out.push(if index == 0 { 'M' } else { 'L' });
-        svg.out.push_str(&px(*x));
-        svg.out.push(' ');
-        svg.out.push_str(&px(*y));
-    }
-    if let [(x, y)] = points {
-        // A line of one point would not show; round ends make it a dot.
-        let _ = write!(svg.out, "L{} {}", px(*x), px(*y));
-    }
-    if class.starts_with("bnd") {
-        svg.out.push('Z');
-    }
-    svg.out.push_str("\"/>");
 }

@@ -1,11 +1,11 @@
 //! One panel to SVG: title, legend, axes, data, markers.
 
 use crate::axis::{Placed, Scale};
+use crate::drawing::{Anchor, Drawing, Shape};
 use crate::figure::Panel;
 use crate::marks::{dot, draw_series};
 use crate::series::{Kind, Series};
-use crate::svg::{self, Anchor, COLORS, Svg, px};
-use std::fmt::Write;
+use crate::svg::{self, PALETTE};
 
 /// Room for the numbers and the title of the y axis, px.
 pub(crate) const LEFT_PX: f64 = 82.0;
@@ -82,10 +82,10 @@ pub(crate) fn data_range(panel: &Panel, along_x: bool) -> Option<(f64, f64)> {
 }
 
 /// Draws one panel and returns its height with title, legend and axis texts.
-pub(crate) fn draw_panel(svg: &mut Svg, panel: &Panel, frame: &Frame<'_>) -> f64 {
+pub(crate) fn draw_panel(drawing: &mut Drawing, panel: &Panel, frame: &Frame<'_>) -> f64 {
     let mut top = frame.top;
     if !panel.title.is_empty() {
-        svg.text(
+        drawing.text(
             "ttl",
             (frame.left, top + 13.0),
             Anchor::Start,
@@ -93,7 +93,7 @@ pub(crate) fn draw_panel(svg: &mut Svg, panel: &Panel, frame: &Frame<'_>) -> f64
         );
         top += LINE_PX;
     }
-    top += legend(svg, panel, frame.told, (frame.left, top), frame.width);
+    top += legend(drawing, panel, frame.told, (frame.left, top), frame.width);
     top += 4.0;
 
     let (mut width, mut height) = (frame.width, panel.height_px);
@@ -130,20 +130,15 @@ pub(crate) fn draw_panel(svg: &mut Svg, panel: &Panel, frame: &Frame<'_>) -> f64
         width,
         height,
     };
-    grid(svg, panel, frame, &area, &x, &y);
+    grid(drawing, panel, frame, &area, &x, &y);
 
-    // A nested svg clips what is drawn in it and needs no identifier, which would have to be unique in a page.
-    let _ = write!(
-        svg.out,
-        "<svg x=\"{}\" y=\"{}\" width=\"{w}\" height=\"{h}\" viewBox=\"0 0 {w} {h}\">",
-        px(left),
-        px(top),
-        w = px(width),
-        h = px(height)
-    );
+    drawing.shapes.push(Shape::Enter {
+        at: (left, top),
+        size: (width, height),
+    });
     let empty = panel.series.iter().all(Series::is_empty);
     if empty {
-        svg.text(
+        drawing.text(
             "mut",
             (width / 2.0, height / 2.0),
             Anchor::Middle,
@@ -154,17 +149,17 @@ pub(crate) fn draw_panel(svg: &mut Svg, panel: &Panel, frame: &Frame<'_>) -> f64
     for below in [true, false] {
         for (series, color) in panel.series.iter().zip(&colors) {
             if below == matches!(series.kind, Kind::Band { .. } | Kind::Bars { .. }) {
-                draw_series(svg, series, *color, &x, &y);
+                draw_series(drawing, series, *color, &x, &y);
             }
         }
     }
-    draw_markers(svg, panel, (width, height), &x, &y);
-    svg.out.push_str("</svg>");
-    svg.rect("frm", (left, top), (width, height));
+    draw_markers(drawing, panel, (width, height), &x, &y);
+    drawing.shapes.push(Shape::Leave);
+    drawing.rect("frm", (left, top), (width, height));
 
     let mut end = bottom + 10.0;
     if frame.show_x {
-        svg.text(
+        drawing.text(
             "",
             (left + width / 2.0, bottom + 33.0),
             Anchor::Middle,
@@ -172,7 +167,7 @@ pub(crate) fn draw_panel(svg: &mut Svg, panel: &Panel, frame: &Frame<'_>) -> f64
         );
         end = bottom + 44.0;
     }
-    svg.upright(
+    drawing.upright(
         "",
         (left - LEFT_PX + 16.0, top + height / 2.0),
         &svg::fit(&panel.y.title(), height + 20.0),
@@ -189,7 +184,14 @@ struct Area {
 }
 
 /// Grid lines and the numbers at them.
-fn grid(svg: &mut Svg, panel: &Panel, frame: &Frame<'_>, area: &Area, x: &Placed, y: &Placed) {
+fn grid(
+    drawing: &mut Drawing,
+    panel: &Panel,
+    frame: &Frame<'_>,
+    area: &Area,
+    x: &Placed,
+    y: &Placed,
+) {
     let Area {
         left,
         top,
@@ -201,58 +203,63 @@ fn grid(svg: &mut Svg, panel: &Panel, frame: &Frame<'_>, area: &Area, x: &Placed
         let Some(at) = x.at(tick.value) else { continue };
         let class = if tick.label.is_some() { "grd" } else { "grm" };
         if panel.x.scale == Scale::Linear || panel.x.scale == Scale::Log {
-            svg.line(class, (left + at, top), (left + at, bottom));
+            drawing.line(class, (left + at, top), (left + at, bottom));
         }
         if let (true, Some(label)) = (frame.show_x, &tick.label) {
             let room = match &panel.x.scale {
                 Scale::Categories(names) => width / names.len().max(1) as f64,
                 _ => f64::INFINITY,
             };
-            svg.text(
-                "mut",
-                (left + at, bottom + 15.0),
-                Anchor::Middle,
-                &svg::fit(label, room),
-            );
+            let label = svg::fit(label, room);
+            // Long numbers at the end of an axis stay within the figure.
+            let half = svg::text_width_px(&label) / 2.0;
+            let at = (left + at).min(left + width + RIGHT_PX - half);
+            drawing.text("mut", (at, bottom + 15.0), Anchor::Middle, &label);
         }
     }
     for tick in y.ticks(34.0) {
         let Some(at) = y.at(tick.value) else { continue };
         let class = if tick.label.is_some() { "grd" } else { "grm" };
-        svg.line(class, (left, bottom - at), (left + width, bottom - at));
+        drawing.line(class, (left, bottom - at), (left + width, bottom - at));
         if let Some(label) = &tick.label {
-            svg.text("mut", (left - 7.0, bottom - at + 4.0), Anchor::End, label);
+            drawing.text("mut", (left - 7.0, bottom - at + 4.0), Anchor::End, label);
         }
     }
 }
 
 /// Marker lines across the data, in its own coordinates.
-fn draw_markers(svg: &mut Svg, panel: &Panel, (width, height): (f64, f64), x: &Placed, y: &Placed) {
+fn draw_markers(
+    drawing: &mut Drawing,
+    panel: &Panel,
+    (width, height): (f64, f64),
+    x: &Placed,
+    y: &Placed,
+) {
     for marker in &panel.markers {
         let axis = if marker.vertical { x } else { y };
         let Some(at) = axis.at(marker.value) else {
             continue;
         };
         if marker.vertical {
-            svg.line("mrk", (at, 0.0), (at, height));
+            drawing.line("mrk", (at, 0.0), (at, height));
             let wide = svg::text_width_px(&marker.label);
             let (before, behind) = (at - 8.0, width - at - 8.0);
             if wide <= behind || behind >= before {
                 let label = svg::fit(&marker.label, behind);
-                svg.text("mut", (at + 4.0, 13.0), Anchor::Start, &label);
+                drawing.text("mut", (at + 4.0, 13.0), Anchor::Start, &label);
             } else {
                 let label = svg::fit(&marker.label, before);
-                svg.text("mut", (at - 4.0, 13.0), Anchor::End, &label);
+                drawing.text("mut", (at - 4.0, 13.0), Anchor::End, &label);
             }
         } else {
-            svg.line("mrk", (0.0, height - at), (width, height - at));
+            drawing.line("mrk", (0.0, height - at), (width, height - at));
             let y_text = if height - at < 16.0 {
                 height - at + 13.0
             } else {
                 height - at - 4.0
             };
             let label = svg::fit(&marker.label, width - 10.0);
-            svg.text("mut", (width - 5.0, y_text), Anchor::End, &label);
+            drawing.text("mut", (width - 5.0, y_text), Anchor::End, &label);
         }
     }
 }
@@ -290,14 +297,14 @@ fn colors(panel: &Panel) -> Vec<usize> {
             if series.color.is_none() {
                 next += 1;
             }
-            color % COLORS
+            color % PALETTE.len()
         })
         .collect()
 }
 
 /// Draws the new entries of the legend in lines above the panel, and returns their height.
 pub(crate) fn legend(
-    svg: &mut Svg,
+    drawing: &mut Drawing,
     panel: &Panel,
     told: &[Entry<'_>],
     (left, top): (f64, f64),
@@ -327,25 +334,25 @@ pub(crate) fn legend(
         match &series.kind {
             Kind::Line { .. } | Kind::Step { .. } => {
                 let dash = if series.dashed { " dsh" } else { "" };
-                svg.line(
+                drawing.line(
                     &format!("ln s{color}{dash}"),
                     (x, middle),
                     (x + 20.0, middle),
                 );
             }
-            Kind::Points { .. } => dot(svg, color, (x + 10.0, middle), 3.2),
+            Kind::Points { .. } => dot(drawing, color, (x + 10.0, middle), 3.2),
             Kind::Band { .. } => {
-                svg.rect(&format!("bnd f{color}"), (x, middle - 5.0), (20.0, 10.0));
+                drawing.rect(&format!("bnd f{color}"), (x, middle - 5.0), (20.0, 10.0));
             }
             Kind::Bars { .. } => {
-                svg.rect(
+                drawing.rect(
                     &format!("bar f{color}"),
                     (x + 4.0, middle - 5.0),
                     (12.0, 10.0),
                 );
             }
         }
-        svg.text("", (x + 25.0, middle + 4.0), Anchor::Start, &label);
+        drawing.text("", (x + 25.0, middle + 4.0), Anchor::Start, &label);
         x += wide;
     }
     y - top + LINE_PX

@@ -1,10 +1,13 @@
 //! Pictures of pixels within a page.
 
+use crate::svg::set;
 use std::fmt::Write;
 
 /// A picture that a page carries within itself.
 #[derive(Debug, Clone)]
 pub(crate) struct Picture {
+    /// Name of its file, when it is taken along.
+    pub(crate) name: String,
     /// What it shows, for whoever cannot see it.
     pub(crate) shows: String,
     pub(crate) caption: String,
@@ -32,14 +35,14 @@ pub(crate) fn base64(bytes: &[u8]) -> String {
 }
 
 impl Picture {
-    pub(crate) fn html(&self, out: &mut String, escape: impl Fn(&str) -> String) {
-        let (shows, caption) = (escape(&self.shows), escape(&self.caption));
+    pub(crate) fn html(&self, out: &mut String, number: usize) {
+        let (shows, caption, name) = (set(&self.shows), set(&self.caption), &self.name);
+        let data = format!("data:image/png;base64,{}", base64(&self.png));
         // Writing to a String cannot fail.
         let _ = writeln!(
             out,
-            "<figure>\n<img class=\"pixels\" alt=\"{shows}\" src=\"data:image/png;base64,{}\">\n<figcaption>{caption}</figcaption>\n\
-             </figure>",
-            base64(&self.png)
+            "<figure>\n<img class=\"pixels\" alt=\"{shows}\" src=\"{data}\">\n<figcaption>Figure {number}. {caption} \
+             <span class=\"take\"><a download=\"{name}.png\" href=\"{data}\">PNG</a></span></figcaption>\n</figure>"
         );
     }
 }

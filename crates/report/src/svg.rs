@@ -1,8 +1,6 @@
-//! Writing SVG elements: numbers, text, styles.
+//! What SVG elements have in common: numbers, text, styles.
 
 use crate::typeset::typeset;
-use std::fmt::Write;
-
 /// Style shared by all figures. Plain rules instead of CSS variables: several SVG viewers know no variables.
 pub(crate) const STYLE: &str = "\
 .fg{font-family:system-ui,'DejaVu Sans','Segoe UI',Helvetica,Arial,sans-serif;font-size:12px}\
@@ -12,13 +10,13 @@ pub(crate) const STYLE: &str = "\
 .fg .mrk{stroke:#5c6470;stroke-width:1;stroke-dasharray:2 3;fill:none}\
 .fg .ln{fill:none;stroke-width:1.6;stroke-linejoin:round;stroke-linecap:round}.fg .thn{stroke-width:.8}.fg .spk{stroke-width:2.4}\
 .fg .dsh{stroke-dasharray:6 4}.fg .bnd{stroke:none;fill-opacity:.2}.fg .bar{stroke:none;fill-opacity:.75}\
-.fg .dot{stroke:none}\
+.fg .dot{stroke:none}.fg .scl{fill:#2b2f36}\
 .fg .s0{stroke:#0072b2}.fg .s1{stroke:#d55e00}.fg .s2{stroke:#009e73}.fg .s3{stroke:#b2589a}\
 .fg .s4{stroke:#b98200}.fg .s5{stroke:#3f9bd1}.fg .s6{stroke:#6b5fc7}.fg .s7{stroke:#444b55}\
 .fg .f0{fill:#0072b2}.fg .f1{fill:#d55e00}.fg .f2{fill:#009e73}.fg .f3{fill:#b2589a}\
 .fg .f4{fill:#b98200}.fg .f5{fill:#3f9bd1}.fg .f6{fill:#6b5fc7}.fg .f7{fill:#444b55}\
 @media (prefers-color-scheme:dark){\
-.fg text{fill:#e4e7eb}.fg .mut{fill:#a3acb8}.fg .bg{fill:#14171b}.fg .frm{stroke:#6a7380}\
+.fg text,.fg .scl{fill:#e4e7eb}.fg .mut{fill:#a3acb8}.fg .bg{fill:#14171b}.fg .frm{stroke:#6a7380}\
 .fg .grd{stroke:#2a2f37}.fg .grm{stroke:#1f242a}.fg .mrk{stroke:#a3acb8}\
 .fg .s0{stroke:#4fb0ea}.fg .s1{stroke:#ff8a3d}.fg .s2{stroke:#2ecc9b}.fg .s3{stroke:#e093c6}\
 .fg .s4{stroke:#f0b429}.fg .s5{stroke:#8fd0f5}.fg .s6{stroke:#a89df5}.fg .s7{stroke:#c9ced6}\
@@ -31,16 +29,10 @@ pub(crate) const STYLE: &str = "\
 pub(crate) const WIDTH_PX: f64 = 820.0;
 /// Width of a figure for a narrow screen, px: shown on one of 400 px its letters keep ten of their twelve.
 pub(crate) const SLIM_PX: f64 = 400.0;
-/// Number of colours of the palette (Okabe and Ito's, darkened where white paper asks for it).
-pub(crate) const COLORS: usize = 8;
-
-/// Where a text is held.
-#[derive(Debug, Clone, Copy)]
-pub(crate) enum Anchor {
-    Start,
-    Middle,
-    End,
-}
+/// The palette on paper: Okabe and Ito's, darkened where white paper asks for it. The style sheet has the same colours.
+pub(crate) const PALETTE: [u32; 8] = [
+    0x0072b2, 0xd55e00, 0x009e73, 0xb2589a, 0xb98200, 0x3f9bd1, 0x6b5fc7, 0x444b55,
+];
 
 /// Text made safe for HTML and XML: markup escaped, characters that XML forbids replaced.
 pub(crate) fn escape(text: &str) -> String {
@@ -109,63 +101,6 @@ pub(crate) fn fit(text: &str, width_px: f64) -> String {
     }
     out.push('\u{2026}');
     out
-}
-
-/// Elements of one drawing.
-pub(crate) struct Svg {
-    pub(crate) out: String,
-}
-
-impl Svg {
-    pub(crate) fn line(&mut self, class: &str, from: (f64, f64), to: (f64, f64)) {
-        let _ = write!(
-            self.out,
-            "<path class=\"{class}\" d=\"M{} {}L{} {}\"/>",
-            px(from.0),
-            px(from.1),
-            px(to.0),
-            px(to.1)
-        );
-    }
-
-    pub(crate) fn rect(&mut self, class: &str, at: (f64, f64), size: (f64, f64)) {
-        let _ = write!(
-            self.out,
-            "<rect class=\"{class}\" x=\"{}\" y=\"{}\" width=\"{}\" height=\"{}\"/>",
-            px(at.0),
-            px(at.1),
-            px(size.0.max(0.0)),
-            px(size.1.max(0.0))
-        );
-    }
-
-    pub(crate) fn text(&mut self, class: &str, at: (f64, f64), anchor: Anchor, text: &str) {
-        if text.is_empty() {
-            return;
-        }
-        let anchor = match anchor {
-            Anchor::Start => "start",
-            Anchor::Middle => "middle",
-            Anchor::End => "end",
-        };
-        let _ = write!(
-            self.out,
-            "<text class=\"{class}\" x=\"{}\" y=\"{}\" text-anchor=\"{anchor}\">{}</text>",
-            px(at.0),
-            px(at.1),
-            set(text)
-        );
-    }
-
-    /// A text that reads upwards, centred on `at`.
-    pub(crate) fn upright(&mut self, class: &str, at: (f64, f64), text: &str) {
-        let (x, y) = (px(at.0), px(at.1));
-        let _ = write!(
-            self.out,
-            "<text class=\"{class}\" x=\"{x}\" y=\"{y}\" text-anchor=\"middle\" transform=\"rotate(-90 {x} {y})\">{}</text>",
-            set(text)
-        );
-    }
 }
 
 #[cfg(test)]

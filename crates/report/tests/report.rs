@@ -155,14 +155,28 @@ fn figures_are_written_beside_the_page_and_names_never_collide() {
     assert_eq!(
         names,
         [
+            "captions.txt",
             "same-name-2.csv",
+            "same-name-2.pdf",
             "same-name-2.svg",
             "same-name-3.csv",
+            "same-name-3.pdf",
             "same-name-3.svg",
             "same-name.csv",
-            "same-name.svg"
+            "same-name.pdf",
+            "same-name.svg",
         ]
     );
+    let beside =
+        |name: &str| std::fs::read(folder.path().join("deep/er/gap-figures").join(name)).unwrap();
+    assert!(beside("same-name.pdf").starts_with(b"%PDF-1.4"));
+    let captions = String::from_utf8(beside("captions.txt")).unwrap();
+    for number in 1..=3 {
+        assert!(
+            captions.contains(&format!("Figure {number} (same-name")),
+            "{captions}"
+        );
+    }
     assert!(path.exists());
     assert!(!folder.path().join("deep/er/gap.html.part").exists());
 }

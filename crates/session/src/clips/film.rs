@@ -87,13 +87,37 @@ pub fn read(run: &Path, name: &str, most: usize) -> io::Result<Film> {
         return Err(io::ErrorKind::NotFound.into());
     }
     let times = times(run, name)?;
+    frames(run, name, &times, chosen(times.len(), most))
+}
+
+/// The frame of a clip that was exposed nearest to a time of the run, s.
+///
+/// # Errors
+/// As [`read`]; a clip without frames.
+pub fn read_at(run: &Path, name: &str, time_s: f64) -> io::Result<Film> {
+    if !is_a_name(name) {
+        return Err(io::ErrorKind::NotFound.into());
+    }
+    let times = times(run, name)?;
+    let off = |n: &usize| (times[*n].0 - time_s).abs();
+    let nearest = (0..times.len()).min_by(|a, b| off(a).total_cmp(&off(b)));
+    let nearest = nearest.ok_or(io::ErrorKind::UnexpectedEof)?;
+    frames(run, name, &times, vec![nearest])
+}
+
+/// The frames of these numbers, in rising order.
+fn frames(
+    run: &Path,
+    name: &str,
+    times: &[(f64, [f32; 2])],
+    wanted: Vec<usize>,
+) -> io::Result<Film> {
     let file = File::open(run.join(CLIPS).join(format!("{name}.tif")))?;
     let mut stack = Decoder::new(BufReader::new(file)).map_err(io::Error::other)?;
     let (width, height) = stack.dimensions().map_err(io::Error::other)?;
     if width as usize * height as usize > MOST_PIXELS {
         return Err(io::Error::other("larger than a clip's frames are"));
     }
-    let wanted = chosen(times.len(), most);
     let mut deep = Vec::with_capacity(wanted.len());
     let mut at = 0;
     for number in wanted {

@@ -15,7 +15,7 @@ mod sink;
 mod tiff_stack;
 
 pub use cellpos_live::FilmFrame;
-pub use film::{Film, list, read};
+pub use film::{Film, list, read, read_at};
 pub use sink::{Clipped, Schedule};
 
 use crate::crop::{self, Crop};

@@ -1,5 +1,6 @@
 //! The cycles of a run: trends of each motion, and the static arm.
 
+use super::fatigue;
 use cellpos_report::{Axis, Column, Emphasis, Figure, Panel, Report, Series, Table};
 use cellpos_script::{ArmKind, AtRest, CycleFlags, CycleRow, ReadCycles, Trend, trend};
 use std::collections::BTreeMap;
@@ -88,8 +89,8 @@ const QUANTITIES: [Quantity; 12] = [
     },
 ];
 
-/// Adds the section; gives the trends as they go into the JSON.
-pub(super) fn section(page: &mut Report, read: &ReadCycles) -> serde_json::Value {
+/// Adds the section; gives the trends as they go into the JSON. `of_a_cell`: stretch, length and recovery have a figure of their own.
+pub(super) fn section(page: &mut Report, read: &ReadCycles, of_a_cell: bool) -> serde_json::Value {
     let (rows, unreadable) = (read.rows.as_slice(), read.unreadable);
     if rows.is_empty() && unreadable == 0 && read.head.is_none() {
         return serde_json::Value::Null;
@@ -175,7 +176,8 @@ pub(super) fn section(page: &mut Report, read: &ReadCycles) -> serde_json::Value
                 json.push(trend_json(quantity, group, &found));
             }
         }
-        if any {
+        let shown = of_a_cell && fatigue::QUANTITIES.contains(&quantity.name);
+        if any && !shown {
             figure = figure.panel(panel);
         }
     }
@@ -223,7 +225,7 @@ struct Group<'r> {
 
 /// Whether bead or cell was away from the script: its mean distance from the target exceeds a tenth of the stroke. In a good cycle it
 /// is a few per cent. Its lengths are of another place in the channel.
-pub(super) fn was_elsewhere(row: &CycleRow) -> bool {
+pub(crate) fn was_elsewhere(row: &CycleRow) -> bool {
     const OF_STROKE: f64 = 0.1;
     row.arm == ArmKind::Cyclic && row.bias_um.abs() > OF_STROKE * row.stroke_um.abs()
 }
@@ -238,6 +240,7 @@ pub(super) fn on_the_way(row: &CycleRow) -> bool {
 fn axis_name(name: &str) -> &str {
     match name {
         "reached over commanded amplitude" => "reached / commanded",
+        "neutral" => "zero flow",
         other => other,
     }
 }
@@ -314,6 +317,24 @@ pub(crate) fn with_interval(value: f64, ci95: f64) -> String {
     format!("{value:.digits$}\u{a0}±\u{a0}{ci95:.digits$}")
 }
 
+/// Half the width of the 95 % interval of a mean, by Student's t.
+pub(crate) fn half95(values: &[f64]) -> f64 {
+    const TABLE: [f64; 10] = [
+        12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262, 2.228,
+    ];
+    let n = values.len();
+    if n < 2 {
+        return f64::NAN;
+    }
+    let mean = values.iter().sum::<f64>() / n as f64;
+    let squares: f64 = values.iter().map(|value| (value - mean).powi(2)).sum();
+    let t = TABLE
+        .get(n - 2)
+        .copied()
+        .unwrap_or(1.96 + 2.5 / (n - 1) as f64);
+    t * (squares / (n - 1) as f64 / n as f64).sqrt()
+}
+
 fn trend_json(quantity: &Quantity, group: &Group, found: &Trend) -> serde_json::Value {
     serde_json::json!({
         "of": quantity.of_what,
@@ -351,10 +372,10 @@ fn trend_json(quantity: &Quantity, group: &Group, found: &Trend) -> serde_json::
 }
 
 fn row(table: &mut Table, quantity: &Quantity, motion: &str, found: &Trend) {
-    let name = if quantity.unit.is_empty() {
-        quantity.name.to_string()
-    } else {
-        format!("{} ({})", quantity.name, quantity.unit)
+    let name = match (quantity.name, quantity.unit) {
+        ("neutral", unit) => format!("zero flow ({unit})"),
+        (name, "") => name.to_string(),
+        (name, unit) => format!("{name} ({unit})"),
     };
     let law = found.saturating.map_or_else(String::new, |law| {
         format!(

@@ -8,6 +8,10 @@ const SAMPLES: usize = 8;
 /// Columns of a figure: as many as it has px for.
 const COLUMNS: usize = 700;
 
+/// Columns of a period that is drawn as a wave: with fewer its peaks are off by more than a twentieth of its amplitude,
+/// 1 - cos(pi / 10), and differ from period to period.
+const DRAWN: f64 = 10.0;
+
 /// A column as a figure shows it: an envelope and its middle, one entry for each stretch of time; NaN at a gap.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub(super) struct Course {
@@ -117,8 +121,14 @@ impl<const N: usize> Envelope<N> {
 
     /// A column for a figure of this width, px.
     pub(super) fn course(&self, column: usize) -> Course {
+        self.course_of(column, f64::INFINITY)
+    }
+
+    /// The same of a motion that repeats after so many rows. Where a period has too few columns to be drawn, a column has whole
+    /// periods, so that their beat with the columns is not drawn as if it were in the record.
+    pub(super) fn course_of(&self, column: usize, period_rows: f64) -> Course {
         let at = |values: &[f64; N]| values.get(column).copied().unwrap_or(f64::NAN);
-        let joined = self.stretches.len().div_ceil(COLUMNS).max(1);
+        let joined = self.joined(period_rows);
         let mut course = Course::default();
         for part in (self.stretches).chunk_by(|one, _| !one.last_before_gap) {
             for some in part.chunks(joined) {
@@ -138,6 +148,16 @@ impl<const N: usize> Envelope<N> {
             course.push(f64::NAN, f64::NAN, f64::NAN, f64::NAN);
         }
         course
+    }
+
+    /// Stretches in a column.
+    fn joined(&self, period_rows: f64) -> usize {
+        let joined = self.stretches.len().div_ceil(COLUMNS).max(1);
+        let column = (joined as u64 * self.rows) as f64;
+        if !period_rows.is_finite() || period_rows >= DRAWN * column {
+            return joined;
+        }
+        joined.max((period_rows / self.rows as f64).ceil() as usize)
     }
 
     /// Whether each point of a [`Course`] is one row: then there is no envelope.
@@ -213,6 +233,24 @@ mod tests {
                     assert!(course.low[k] < ramp - 0.8 && course.high[k] > ramp + 0.8);
                 }
             }
+        }
+    }
+
+    #[test]
+    fn a_fast_wave_is_an_even_area_and_a_slow_one_a_wave() {
+        for (period_rows, slow) in [(50.0, false), (47.3, false), (4000.0, true)] {
+            let mut envelope = Envelope::<1>::default();
+            for k in 0..8_000 {
+                let angle = std::f64::consts::TAU * f64::from(k) / period_rows;
+                envelope.add(f64::from(k) * 1e-3, [angle.sin()]);
+            }
+            let course = envelope.course_of(0, period_rows);
+            // The last column has what is left over.
+            let whole = course.high.len() - 2;
+            let even = course.high[..whole].iter().all(|high| *high > 0.98)
+                && course.low[..whole].iter().all(|low| *low < -0.98);
+            assert_eq!(even, !slow, "{period_rows}");
+            assert_eq!(course.high.len() > 600, slow, "{period_rows}");
         }
     }
 

@@ -43,7 +43,7 @@ pub(super) fn is_whole(row: &&CycleRow) -> bool {
 }
 
 /// Means of ten cycles each with their 95 % intervals: cycle, mean, low, high.
-fn tens(values: &[(f64, f64)]) -> [Vec<f64>; 4] {
+pub(super) fn tens(values: &[(f64, f64)]) -> [Vec<f64>; 4] {
     const TEN: usize = 10;
     // Student's t for nine degrees of freedom.
     const T95: f64 = 2.262;
@@ -118,6 +118,9 @@ pub(super) fn section(page: &mut Report, rows: &[CycleRow], ticks: &Ticks) {
     }
 }
 
+/// Quantities of the table of cycles that [`figure`] shows.
+pub(super) const QUANTITIES: [&str; 3] = ["stretch", "length at cycle start", "recovery time"];
+
 /// Change of the cell over the cycles: the main figure of a run with a cell.
 pub(super) fn figure(rows: &[CycleRow]) -> Option<Figure> {
     let rest = AtRest::of(rows);
@@ -131,6 +134,12 @@ pub(super) fn figure(rows: &[CycleRow]) -> Option<Figure> {
             .map(|row| (row.cycle as f64 + 1.0, value(row)))
             .filter(|(_, value)| value.is_finite())
             .collect()
+    };
+    let elsewhere = |value: &dyn Fn(&CycleRow) -> f64| -> (Vec<f64>, Vec<f64>) {
+        (rows.iter().filter(|row| was_elsewhere(row)))
+            .map(|row| (row.cycle as f64 + 1.0, value(row)))
+            .filter(|(_, value)| value.is_finite())
+            .unzip()
     };
     let of_arm = |arm: ArmKind| {
         rows.iter()
@@ -149,8 +158,8 @@ pub(super) fn figure(rows: &[CycleRow]) -> Option<Figure> {
     let mut figure = Figure::new(
         "fatigue",
         &format!(
-            "Stretch, length at the start and recovery time of every cycle (points), and of ten cycles in the mean with the 95 % \
-             interval of that mean.{same_cell}"
+            "Stretch, length at the start and recovery time of every cycle (small points), and of ten cycles in the mean (large) with \
+             the 95 % interval of that mean, where it is larger than the point.{same_cell}"
         ),
     );
     type Value<'v> = &'v dyn Fn(&CycleRow) -> f64;
@@ -179,6 +188,14 @@ pub(super) fn figure(rows: &[CycleRow]) -> Option<Figure> {
                     .series(Series::points("", &x, &y).color(color).thin())
                     .series(Series::intervals(label, &cycle, &mean, &low, &high).color(color));
             }
+        }
+        let (x, y) = elsewhere(value);
+        if !x.is_empty() {
+            panel = panel.series(
+                Series::points("elsewhere, in no mean", &x, &y)
+                    .color(7)
+                    .thin(),
+            );
         }
         figure = figure.panel(panel);
     }

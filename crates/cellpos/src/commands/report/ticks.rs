@@ -34,6 +34,13 @@ pub(super) struct Ticks {
     pub rows: u64,
     /// Reference, position, command and neutral over the whole run, um.
     pub traces: Envelope<4>,
+    /// Displacement of the slow partner as it reports it, on its own scale, and its effect, both um; empty without one.
+    pub partner: Envelope<2>,
+    pub has_partner: bool,
+    /// How often the reference turned back, and the rows of the first and the last time.
+    turns: (u64, u64, u64),
+    /// Reference of the last tick, um, and the direction in which it last moved.
+    moving: (f64, bool),
     pub excerpt: Excerpt,
     /// Errors of every tick whose error counts (see [`Statistics`]), nm.
     pub error_nm: Spread,
@@ -77,6 +84,7 @@ impl Ticks {
         self.start_s = start_s;
         self.last_ns = None;
         self.traces.gap();
+        self.partner.gap();
         self.length.gap();
         self.error.gap();
         self.session += 1;
@@ -93,6 +101,10 @@ impl Ticks {
         }
         let values = [r.target_um, r.measured_um, r.command_um, r.neutral_um];
         self.traces.add(time_s, values);
+        self.turn(r.target_um);
+        let partner = [r.partner_applied_um, r.partner_effect_um];
+        self.has_partner |= partner[0].is_finite();
+        self.partner.add(time_s, partner);
         self.rows += 1;
         self.end_s = time_s;
         self.wake_us.add(f64::from(r.wake_ns) * 1e-3);
@@ -143,6 +155,30 @@ impl Ticks {
         if r.variance_um2.is_finite() {
             self.variance_um2.0 += r.variance_um2;
             self.variance_um2.1 += 1;
+        }
+    }
+
+    fn turn(&mut self, target_um: f64) {
+        let (last_um, up) = self.moving;
+        // One that rests has not turned.
+        if target_um == last_um || !target_um.is_finite() {
+            return;
+        }
+        let now = target_um > last_um;
+        self.moving = (target_um, now);
+        if now != up {
+            let (count, first, _) = self.turns;
+            let first = if count == 0 { self.rows } else { first };
+            self.turns = (count + 1, first, self.rows);
+        }
+    }
+
+    /// Mean period of a reference that goes to and fro, in rows; infinite if it does not.
+    pub(super) fn period_rows(&self) -> f64 {
+        match self.turns {
+            // Two turns are a period.
+            (count, first, last) if count > 2 => 2.0 * (last - first) as f64 / (count - 1) as f64,
+            _ => f64::INFINITY,
         }
     }
 

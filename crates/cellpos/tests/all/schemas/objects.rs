@@ -187,6 +187,7 @@ fn the_objects_of_quick_commands_fit_their_schemas() {
         "run passages.toml --rig cell.toml --cells 2 --clock virtual --frames off",
         "report latest-hold",
         "report latest-wave",
+        "report latest-hold latest-wave --out comparison.html",
         "export latest-wave --out wave.csv",
         "replay latest-hold",
         "bundle latest-hold --out packed",

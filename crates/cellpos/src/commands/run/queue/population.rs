@@ -1,6 +1,6 @@
 //! Mean and spread of the cells of a queue: a row per cell, one page for all.
 
-use crate::commands::report::with_interval;
+use crate::commands::report::{half95, was_elsewhere, with_interval};
 use crate::commands::run::over::Over;
 use cellpos_report::{Axis, Column, Emphasis, Figure, Panel, Report, Series, Table};
 use cellpos_script::{ArmKind, AtRest, CycleFlags, CycleRow, Trend, trend};
@@ -35,10 +35,13 @@ pub(super) struct CellRow {
     run: String,
 }
 
-/// The whole, undisturbed cycles of the cyclic arm.
+/// The whole, undisturbed cycles of the cyclic arm, in which the cell was where the script had it.
 fn counted(rows: &[CycleRow]) -> impl Iterator<Item = &CycleRow> {
     rows.iter().filter(|row| {
-        row.arm == ArmKind::Cyclic && !row.flags.is_disturbed() && !row.flags.has(CycleFlags::RAMP)
+        row.arm == ArmKind::Cyclic
+            && !row.flags.is_disturbed()
+            && !row.flags.has(CycleFlags::RAMP)
+            && !was_elsewhere(row)
     })
 }
 
@@ -145,24 +148,6 @@ pub(super) fn text(rows: &[CellRow]) -> String {
         )
     };
     rows.iter().map(line).collect()
-}
-
-/// Half the width of the 95 % interval of a mean, by Student's t.
-fn half95(values: &[f64]) -> f64 {
-    const TABLE: [f64; 10] = [
-        12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262, 2.228,
-    ];
-    let n = values.len();
-    if n < 2 {
-        return f64::NAN;
-    }
-    let mean = values.iter().sum::<f64>() / n as f64;
-    let squares: f64 = values.iter().map(|value| (value - mean).powi(2)).sum();
-    let t = TABLE
-        .get(n - 2)
-        .copied()
-        .unwrap_or(1.96 + 2.5 / (n - 1) as f64);
-    t * (squares / (n - 1) as f64 / n as f64).sqrt()
 }
 
 /// Mean over the cells at each cycle that two cells or more have: cycle, mean, low, high.

@@ -1,0 +1,582 @@
+//! Several runs on one page: cells and beads of a study, each with its uncertainty.
+
+use super::bound::Bound;
+use super::cycles::{half95, on_the_way, was_elsewhere, with_interval};
+use super::fatigue::tens;
+use super::session::folder_name;
+use super::{Recorded, ending, origin};
+use crate::outcome::{CommandResult, Failure, Outcome, print_json_of, print_text};
+use cellpos_report::{Axis, Column, Emphasis, Figure, Panel, Report, Series, Table};
+use cellpos_script::{ArmKind, AtRest, CycleFlags, CycleRow, Trend, trend};
+use serde::Serialize;
+use std::path::{Path, PathBuf};
+
+/// A quantity of the cycles.
+struct Quantity {
+    name: &'static str,
+    unit: &'static str,
+    of: fn(&CycleRow, &AtRest) -> f64,
+}
+
+/// What a cell has.
+const CELL: [Quantity; 3] = [
+    Quantity {
+        name: "stretch",
+        unit: "",
+        of: |row, rest| rest.stretch(row),
+    },
+    Quantity {
+        name: "recovery time",
+        unit: "s",
+        of: |row, _| row.recovery_s,
+    },
+    Quantity {
+        name: "length at start",
+        unit: "um",
+        of: |row, _| row.length_start_um,
+    },
+];
+
+/// What a bead has.
+const BEAD: [Quantity; 2] = [
+    Quantity {
+        name: "reached / commanded",
+        unit: "",
+        of: |row, _| row.reached_um / row.commanded_um,
+    },
+    Quantity {
+        name: "error RMS",
+        unit: "um",
+        of: |row, _| row.rms_um,
+    },
+];
+
+/// Mean of the first and of the last ten cycles of a quantity, with half their 95 % intervals.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+struct Ends {
+    arm: &'static str,
+    quantity: &'static str,
+    unit: &'static str,
+    cycles: u64,
+    first: f64,
+    first_ci95: f64,
+    last: f64,
+    last_ci95: f64,
+}
+
+/// A run as the page compares it.
+#[derive(Debug, Serialize)]
+struct Compared {
+    run: PathBuf,
+    name: String,
+    outcome: String,
+    duration_s: f64,
+    cycles: usize,
+    cycles_elsewhere: usize,
+    rms_nm: Option<f64>,
+    rms_ci95_nm: Option<f64>,
+    bound_rms_nm: Option<f64>,
+    ends: Vec<Ends>,
+    #[serde(skip)]
+    emphasis: Emphasis,
+    #[serde(skip)]
+    lead: String,
+    #[serde(skip)]
+    rows: Vec<CycleRow>,
+}
+
+/// The cycles of an arm that count.
+fn counted(rows: &[CycleRow], arm: ArmKind) -> impl Iterator<Item = &CycleRow> {
+    rows.iter().filter(move |row| {
+        row.arm == arm
+            && !row.flags.has(CycleFlags::SKIPPED)
+            && !row.flags.has(CycleFlags::RAMP)
+            && !on_the_way(row)
+            && !was_elsewhere(row)
+    })
+}
+
+/// Cycle and value of a quantity.
+fn values(rows: &[CycleRow], arm: ArmKind, quantity: &Quantity) -> Vec<(f64, f64)> {
+    let rest = AtRest::of(rows);
+    counted(rows, arm)
+        .map(|row| (row.cycle as f64 + 1.0, (quantity.of)(row, &rest)))
+        .filter(|(_, value)| value.is_finite())
+        .collect()
+}
+
+fn arm_name(arm: ArmKind) -> &'static str {
+    match arm {
+        ArmKind::Cyclic => "cyclic",
+        ArmKind::Static => "static",
+    }
+}
+
+const ARMS: [ArmKind; 2] = [ArmKind::Cyclic, ArmKind::Static];
+
+impl Compared {
+    fn open(run: &Path, name: String) -> Result<Self, Failure> {
+        let recorded = Recorded::open(run)?;
+        let rows = recorded.cycles.rows.clone();
+        let last = recorded.sessions.last();
+        let (emphasis, outcome) = last.map_or((Emphasis::Plain, String::new()), ending);
+        let meta = recorded.first.meta().ok();
+        let ticks = &recorded.ticks;
+        let nm = |um: f64| um * 1e3;
+        let mut ends = Vec::new();
+        for quantity in CELL.iter().chain(&BEAD) {
+            for arm in ARMS {
+                let points = values(&rows, arm, quantity);
+                let found: Option<Trend> =
+                    trend(points.iter().map(|(cycle, value)| (*cycle as u64, *value)));
+                ends.extend(found.map(|found| Ends {
+                    arm: arm_name(arm),
+                    quantity: quantity.name,
+                    unit: quantity.unit,
+                    cycles: found.cycles,
+                    first: found.first.mean,
+                    first_ci95: found.first.ci95,
+                    last: found.last.mean,
+                    last_ci95: found.last.ci95,
+                }));
+            }
+        }
+        Ok(Self {
+            run: run.to_owned(),
+            name,
+            outcome,
+            duration_s: ticks.duration_s(),
+            cycles: rows.len(),
+            cycles_elsewhere: rows.iter().filter(|row| was_elsewhere(row)).count(),
+            rms_nm: ticks.rms_um().map(nm),
+            rms_ci95_nm: ticks.rms_ci95_um().map(nm),
+            bound_rms_nm: (!ticks.target_moves)
+                .then(|| Bound::of(meta, ticks).map(|bound| nm(bound.rms_um)))
+                .flatten(),
+            ends,
+            emphasis,
+            lead: meta.map_or_else(String::new, origin::lead),
+            rows,
+        })
+    }
+
+    fn end(&self, arm: ArmKind, quantity: &str) -> Option<&Ends> {
+        let of = |ends: &&Ends| ends.arm == arm_name(arm) && ends.quantity == quantity;
+        self.ends.iter().find(of)
+    }
+}
+
+/// Names of the runs; where two are alike, of their folders.
+fn names(runs: &[PathBuf]) -> Vec<String> {
+    let folders: Vec<String> = runs.iter().map(|run| folder_name(run)).collect();
+    let short = |folder: &str| match folder.split_once('-') {
+        Some((time, name)) if time.ends_with('Z') => name.to_owned(),
+        _ => folder.to_owned(),
+    };
+    let shorts: Vec<String> = folders.iter().map(|folder| short(folder)).collect();
+    (folders.iter().zip(&shorts))
+        .map(|(folder, name)| {
+            let alike = shorts.iter().filter(|other| *other == name).count() > 1;
+            if alike { folder.clone() } else { name.clone() }
+        })
+        .collect()
+}
+
+/// Writes the page.
+pub(super) fn run(runs: &[PathBuf], out: Option<&Path>, json: bool) -> CommandResult {
+    let mut compared = Vec::new();
+    for (run, name) in runs.iter().zip(names(runs)) {
+        compared.push(Compared::open(run, name)?);
+    }
+    let out = out.map_or_else(|| PathBuf::from("comparison.html"), Path::to_owned);
+    let (page, sentence) = page(&compared);
+    page.write_with_figures(&out)
+        .map_err(|error| Failure::bad_input(error, "name a page that you may write with --out"))?;
+    if json {
+        print_json_of(
+            "comparison",
+            &serde_json::json!({ "out": out, "result": sentence, "runs": compared }),
+        )?;
+    } else {
+        print_text(&format!("{}\n", out.display()))?;
+    }
+    Ok(Outcome::Done)
+}
+
+/// What the page compares: the quantities that at least one run has.
+fn quantities(compared: &[Compared]) -> &'static [Quantity] {
+    let has = |quantity: &Quantity| {
+        let mut runs = compared.iter();
+        runs.any(|run| {
+            ARMS.iter()
+                .any(|arm| run.end(*arm, quantity.name).is_some())
+        })
+    };
+    match (has(&CELL[0]), BEAD.iter().any(has)) {
+        (true, _) => &CELL,
+        (false, true) => &BEAD,
+        (false, false) => &[],
+    }
+}
+
+fn page(compared: &[Compared]) -> (Report, String) {
+    let mut page = Report::new(&format!("{} runs compared", compared.len()));
+    // What all have in common, or the first and how many others there are.
+    if let Some((first, others)) = compared.split_first() {
+        let rest = others.len();
+        page.lead(&format!(
+            "{}: {} And {rest} more, see below.",
+            first.name, first.lead
+        ));
+    }
+    let quantities = quantities(compared);
+    let mut parts: Vec<String> = ARMS
+        .iter()
+        .filter_map(|arm| of_an_arm(compared, *arm, quantities))
+        .collect();
+    if parts.is_empty() {
+        parts.extend(of_holds(compared));
+    }
+    let done = compared
+        .iter()
+        .filter(|run| run.emphasis == Emphasis::Good)
+        .count();
+    parts.push(match done == compared.len() {
+        true => "All runs came to their end.".to_owned(),
+        false => format!("{done} of {} runs came to their end.", compared.len()),
+    });
+    let sentence = parts.join(" ");
+    let status = match done == compared.len() {
+        true => Emphasis::Good,
+        false => Emphasis::Warning,
+    };
+    page.result(status, &sentence);
+    page.figure(match quantities.is_empty() {
+        true => errors(compared),
+        false => over_cycles(compared, quantities),
+    });
+    page.section("The runs");
+    if !quantities.is_empty() {
+        page.table(table_of_ends(compared, quantities));
+    }
+    page.table(table_of_runs(compared));
+    if !quantities.is_empty() {
+        page.figure(errors(compared));
+    }
+    page.section("What was run");
+    let said = compared
+        .iter()
+        .map(|run| format!("{}: {} {}", run.name, run.lead, run.run.display()));
+    page.list(&said.collect::<Vec<_>>());
+    (page, sentence)
+}
+
+/// What became of an arm: mean over the runs of the first and of the last cycles, and whether the change is beyond chance.
+fn of_an_arm(compared: &[Compared], arm: ArmKind, quantities: &[Quantity]) -> Option<String> {
+    let mut said = Vec::new();
+    let mut most = 0;
+    // The third of a cell's, its length, is in table and figure.
+    for quantity in quantities.iter().take(2) {
+        let ends: Vec<&Ends> = compared
+            .iter()
+            .filter_map(|run| run.end(arm, quantity.name))
+            .collect();
+        let count = ends.len() as f64;
+        most = most.max(ends.len());
+        let unit = match quantity.unit {
+            "" => String::new(),
+            unit => format!(" {unit}"),
+        };
+        let text = match ends.as_slice() {
+            [] => continue,
+            [one] => format!(
+                "{} from {} to {}{unit}",
+                quantity.name,
+                with_interval(one.first, one.first_ci95),
+                with_interval(one.last, one.last_ci95)
+            ),
+            many => {
+                let mean = |of: &dyn Fn(&Ends) -> f64| {
+                    let values: Vec<f64> = many.iter().map(|ends| of(ends)).collect();
+                    (values.iter().sum::<f64>() / count, half95(&values))
+                };
+                let (first, last) = (mean(&|ends| ends.first), mean(&|ends| ends.last));
+                let (change, ci95) = mean(&|ends| ends.last - ends.first);
+                let sure = match change.abs() > ci95 {
+                    true => format!("a change of {}", with_interval(change, ci95)),
+                    false => "no change beyond the scatter between runs".to_owned(),
+                };
+                format!(
+                    "{} from {} to {}{unit} ({sure})",
+                    quantity.name,
+                    with_interval(first.0, first.1),
+                    with_interval(last.0, last.1)
+                )
+            }
+        };
+        said.push(text);
+    }
+    let of = match (most, arm) {
+        (0, _) => return None,
+        (1, ArmKind::Cyclic) => "One run, cyclic".to_owned(),
+        (1, ArmKind::Static) => "One run, static".to_owned(),
+        (n, arm) => format!(
+            "{n} runs, {}, mean with 95 % interval between runs",
+            arm_name(arm)
+        ),
+    };
+    Some(format!("{of}: {}.", said.join(", ")))
+}
+
+/// Beads that were held: the smallest and the largest error.
+fn of_holds(compared: &[Compared]) -> Option<String> {
+    let held = || compared.iter().filter_map(|run| Some((run, run.rms_nm?)));
+    let least = held().min_by(|a, b| a.1.total_cmp(&b.1))?;
+    let most = held().max_by(|a, b| a.1.total_cmp(&b.1))?;
+    let said = |(run, nm): (&Compared, f64)| {
+        let error = with_interval(nm, run.rms_ci95_nm.unwrap_or(f64::NAN));
+        let possible = run
+            .bound_rms_nm
+            .map(|nm| format!(" where {nm:.0} are possible"));
+        format!(
+            "{error} nm RMS in {}{}",
+            run.name,
+            possible.unwrap_or_default()
+        )
+    };
+    Some(format!("Error from {} to {}.", said(least), said(most)))
+}
+
+/// A curve for each run and arm: means of ten cycles with their 95 % intervals.
+fn over_cycles(compared: &[Compared], quantities: &[Quantity]) -> Figure {
+    let mut figure = Figure::new(
+        "comparison",
+        "Each run over its cycles: means of ten cycles (lines) with the 95 % interval of each mean (areas); every cycle of a run \
+         with fewer than twenty. Dashed: the static arm. Cycles in which bead or cell was elsewhere than the script had it are left out.",
+    );
+    for quantity in quantities {
+        let y = Axis::linear(quantity.name, quantity.unit);
+        let mut panel = Panel::new(Axis::linear("cycle", ""), y).height_px(190.0);
+        for (color, run) in compared.iter().enumerate() {
+            for arm in ARMS {
+                let points = values(&run.rows, arm, quantity);
+                if points.is_empty() {
+                    continue;
+                }
+                let name = match arm {
+                    ArmKind::Cyclic => run.name.clone(),
+                    ArmKind::Static => format!("{}, static", run.name),
+                };
+                let [mut cycle, mut mean, low, high] = tens(&points);
+                if cycle.len() < 2 {
+                    (cycle, mean) = points.iter().copied().unzip();
+                } else {
+                    panel = panel.series(Series::band("", &cycle, &low, &high).color(color));
+                }
+                let line = Series::line(&name, &cycle, &mean).color(color);
+                panel = panel.series(match arm {
+                    ArmKind::Cyclic => line,
+                    ArmKind::Static => line.dashed(),
+                });
+            }
+        }
+        figure = figure.panel(panel);
+    }
+    figure.share_x()
+}
+
+/// The error of each run, with its interval and the bound.
+fn errors(compared: &[Compared]) -> Figure {
+    let names: Vec<String> = compared.iter().map(|run| run.name.clone()).collect();
+    let at: Vec<f64> = (0..compared.len()).map(|n| n as f64).collect();
+    let of = |pick: &dyn Fn(&Compared) -> Option<f64>| -> Vec<f64> {
+        compared
+            .iter()
+            .map(|run| pick(run).unwrap_or(f64::NAN))
+            .collect()
+    };
+    let rms = of(&|run| run.rms_nm);
+    let low = of(&|run| Some(run.rms_nm? - run.rms_ci95_nm?));
+    let high = of(&|run| Some(run.rms_nm? + run.rms_ci95_nm?));
+    let bound = of(&|run| run.bound_rms_nm);
+    let mut panel = Panel::new(
+        Axis::categories("run", &names),
+        Axis::linear("error", "nm RMS"),
+    )
+    .series(Series::intervals("measured", &at, &rms, &low, &high).color(0));
+    if bound.iter().any(|nm| nm.is_finite()) {
+        panel = panel.series(Series::points("lowest possible", &at, &bound).color(1));
+    }
+    Figure::new(
+        "errors",
+        "Error of the measured position of each run while the loop was closed, with its 95 % interval where it is larger than the \
+         point, and the lowest that Brownian motion, delay and localisation noise allow a bead at rest.",
+    )
+    .panel(panel)
+}
+
+fn table_of_ends(compared: &[Compared], quantities: &[Quantity]) -> Table {
+    let mut table = Table::new([
+        Column::left("run"),
+        Column::left("arm"),
+        Column::left("quantity"),
+        Column::right("cycles"),
+        Column::right("first ten"),
+        Column::right("last ten"),
+        Column::right("change"),
+    ]);
+    for run in compared {
+        for ends in &run.ends {
+            if !quantities
+                .iter()
+                .any(|quantity| quantity.name == ends.quantity)
+            {
+                continue;
+            }
+            let name = match ends.unit {
+                "" => ends.quantity.to_owned(),
+                unit => format!("{} ({unit})", ends.quantity),
+            };
+            let change = with_interval(
+                ends.last - ends.first,
+                ends.first_ci95.hypot(ends.last_ci95),
+            );
+            table.row([
+                run.name.as_str(),
+                ends.arm,
+                &name,
+                &ends.cycles.to_string(),
+                &with_interval(ends.first, ends.first_ci95),
+                &with_interval(ends.last, ends.last_ci95),
+                &change,
+            ]);
+        }
+    }
+    table.caption(
+        "Means of the first and the last ten cycles (of each half, where there are fewer than twenty) with their 95 % intervals, and \
+         the difference of the two.",
+    );
+    table
+}
+
+fn table_of_runs(compared: &[Compared]) -> Table {
+    let mut table = Table::new([
+        Column::left("run"),
+        Column::left("how it ended"),
+        Column::right("duration (s)"),
+        Column::right("cycles"),
+        Column::right("elsewhere"),
+        Column::right("error (nm RMS)"),
+        Column::right("possible (nm RMS)"),
+    ]);
+    for run in compared {
+        let error = run
+            .rms_nm
+            .map(|nm| with_interval(nm, run.rms_ci95_nm.unwrap_or(f64::NAN)));
+        table.row_with(
+            run.emphasis,
+            [
+                run.name.as_str(),
+                &run.outcome,
+                &format!("{:.1}", run.duration_s),
+                &run.cycles.to_string(),
+                &run.cycles_elsewhere.to_string(),
+                &error.unwrap_or_else(|| "-".to_owned()),
+                &run.bound_rms_nm
+                    .map_or_else(|| "-".to_owned(), |nm| format!("{nm:.1}")),
+            ],
+        );
+    }
+    table
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn run(name: &str, arm: ArmKind, fall: f64) -> Compared {
+        let rows: Vec<CycleRow> = (0..40)
+            .map(|cycle| {
+                let mut row = CycleRow::empty(cycle, 1, arm);
+                (row.start_s, row.duration_s) = (cycle as f64, 1.0);
+                row.length_start_um = 5.0;
+                row.recovery_s = 3.8 - fall * cycle as f64;
+                row
+            })
+            .collect();
+        let points = values(&rows, arm, &CELL[1]);
+        let found = trend(points.iter().map(|(cycle, value)| (*cycle as u64, *value))).unwrap();
+        Compared {
+            run: PathBuf::from(name),
+            name: name.to_owned(),
+            outcome: String::new(),
+            duration_s: 40.0,
+            cycles: rows.len(),
+            cycles_elsewhere: 0,
+            rms_nm: Some(50.0),
+            rms_ci95_nm: Some(1.0),
+            bound_rms_nm: Some(44.0),
+            ends: vec![Ends {
+                arm: arm_name(arm),
+                quantity: "recovery time",
+                unit: "s",
+                cycles: found.cycles,
+                first: found.first.mean,
+                first_ci95: found.first.ci95,
+                last: found.last.mean,
+                last_ci95: found.last.ci95,
+            }],
+            emphasis: Emphasis::Good,
+            lead: String::new(),
+            rows,
+        }
+    }
+
+    /// Cyclic cells that change alike have changed; static ones that scatter about nothing have not.
+    #[test]
+    fn a_change_is_stated_only_beyond_the_scatter_between_runs() {
+        let study = [
+            run("a", ArmKind::Cyclic, 0.010),
+            run("b", ArmKind::Cyclic, 0.011),
+            run("c", ArmKind::Cyclic, 0.009),
+            run("d", ArmKind::Static, 0.001),
+            run("e", ArmKind::Static, -0.001),
+        ];
+        let cyclic = of_an_arm(&study, ArmKind::Cyclic, &CELL).unwrap();
+        assert!(cyclic.starts_with("3 runs, cyclic"), "{cyclic}");
+        // Thirty cycles lie between the middles of the first and the last ten.
+        assert!(
+            cyclic.contains("a change of -0.300\u{a0}±\u{a0}0.075"),
+            "{cyclic}"
+        );
+        let fixed = of_an_arm(&study, ArmKind::Static, &CELL).unwrap();
+        assert!(fixed.contains("no change beyond the scatter"), "{fixed}");
+        assert!(of_an_arm(&study[..3], ArmKind::Static, &CELL).is_none());
+    }
+
+    #[test]
+    fn runs_of_one_name_are_told_apart_by_their_folders() {
+        let runs = |names: &[&str]| names.iter().map(PathBuf::from).collect::<Vec<_>>();
+        let two = runs(&["runs/20261121T190000Z-cell", "runs/20261122T190000Z-cell"]);
+        assert_eq!(
+            names(&two),
+            ["20261121T190000Z-cell", "20261122T190000Z-cell"]
+        );
+        let others = runs(&["runs/20261121T190000Z-a-b", "runs/other"]);
+        assert_eq!(names(&others), ["a-b", "other"]);
+    }
+
+    #[test]
+    fn holds_are_compared_by_their_errors() {
+        let mut study = [
+            run("a", ArmKind::Cyclic, 0.0),
+            run("b", ArmKind::Cyclic, 0.0),
+        ];
+        (study[1].rms_nm, study[1].bound_rms_nm) = (Some(80.0), None);
+        let text = of_holds(&study).unwrap();
+        assert_eq!(
+            text,
+            "Error from 50.0\u{a0}±\u{a0}1.0 nm RMS in a where 44 are possible to 80.0\u{a0}±\u{a0}1.0 nm RMS in b."
+        );
+    }
+}

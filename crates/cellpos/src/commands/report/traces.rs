@@ -1,0 +1,140 @@
+//! Traces and spectrum of a run.
+
+use super::ticks::Ticks;
+use cellpos_record::RunMeta;
+use cellpos_report::{Axis, Figure, Panel, Report, Series};
+
+/// A column as an envelope with its median, or as it is where each point is one tick.
+fn enveloped(panel: Panel, ticks: &Ticks, column: usize, name: &str, color: usize) -> Panel {
+    let course = ticks.traces.course_of(column, ticks.period_rows());
+    let median = Series::line(name, &course.time_s, &course.median).thin();
+    if ticks.traces.is_bare() {
+        return panel.series(median.color(color));
+    }
+    let band = Series::band("", &course.time_s, &course.low, &course.high);
+    panel.series(band.color(color)).series(median.color(color))
+}
+
+/// The slow partner of the PZT.
+fn partner(ticks: &Ticks) -> Panel {
+    let mut panel = Panel::new(Axis::linear("time", "s"), Axis::linear("partner", "um"));
+    for (column, name, color) in [(0, "displacement", 4), (1, "effect", 6)] {
+        let course = ticks.partner.course(column);
+        panel = panel.series(Series::line(name, &course.time_s, &course.median).color(color));
+    }
+    panel
+}
+
+pub(super) fn traces(page: &mut Report, ticks: &Ticks) {
+    page.section("Traces");
+    let time = || Axis::linear("time", "s");
+    let caption = match ticks.traces.is_bare() {
+        true => "Position and target (above), PZT and zero flow (below) over the whole run.".to_string(),
+        false => "Position and target (above), PZT and zero flow (below) over the whole run: area from the smallest to the largest \
+                  value of each stretch of time, line: median; the target by its two ends."
+            .to_string(),
+    };
+    // The target is thin and on top; one that moves fast has an upper and a lower end.
+    let target = ticks.traces.course_of(0, ticks.period_rows());
+    let mut bead = enveloped(
+        Panel::new(time(), Axis::linear("position", "um")),
+        ticks,
+        1,
+        "measured",
+        0,
+    )
+    .series(
+        Series::line("target", &target.time_s, &target.low)
+            .thin()
+            .color(1),
+    );
+    if !ticks.traces.is_bare() {
+        bead = bead.series(
+            Series::line("", &target.time_s, &target.high)
+                .thin()
+                .color(1),
+        );
+    }
+    let pzt = enveloped(
+        Panel::new(time(), Axis::linear("PZT", "um")),
+        ticks,
+        2,
+        "command",
+        2,
+    );
+    let neutral = ticks.traces.course(3);
+    let pzt = pzt.series(
+        Series::line("zero flow", &neutral.time_s, &neutral.median)
+            .thin()
+            .color(3),
+    );
+    let mut caption = caption;
+    let mut figure = Figure::new("traces", "").panel(bead).panel(pzt);
+    if ticks.has_partner {
+        caption.push_str(
+            " Below: displacement of the slow partner as it reports it, on its own scale, and what it does to the flow, in um of PZT.",
+        );
+        figure = figure.panel(partner(ticks));
+    }
+    page.figure(figure.caption(&caption).share_x());
+    let near = &ticks.excerpt;
+    page.figure(
+        Figure::new(
+            "excerpt",
+            "Every tick of the first two seconds of the closed loop.",
+        )
+        .panel(
+            Panel::new(time(), Axis::linear("position", "um"))
+                .series(
+                    Series::line("measured", &near.time_s, &near.measured_um)
+                        .thin()
+                        .color(0),
+                )
+                .series(
+                    Series::line("target", &near.time_s, &near.target_um)
+                        .thin()
+                        .color(1),
+                ),
+        )
+        .panel(
+            Panel::new(time(), Axis::linear("PZT", "um"))
+                .series(Series::step("command", &near.time_s, &near.command_um).color(2)),
+        )
+        .share_x(),
+    );
+}
+
+pub(super) fn spectrum(page: &mut Report, ticks: &Ticks, meta: Option<&RunMeta>) {
+    page.section("Spectrum of the error");
+    let Some(spectrum) = ticks.error_um.spectrum(ticks.period_s()) else {
+        page.paragraph("The run is too short for a spectrum.");
+        return;
+    };
+    let mut panel = Panel::new(
+        Axis::log("frequency", "Hz"),
+        Axis::log("density", "nm/rtHz"),
+    )
+    .series(Series::line("measured", &spectrum.hz, &spectrum.nm_per_rthz).color(0));
+    let mut caption = "Amplitude density of the measured error, one-sided.".to_string();
+    if let Some(predicted) = predicted(meta, ticks, &spectrum.hz) {
+        panel = panel.series(
+            Series::line("predicted", &spectrum.hz, &predicted)
+                .dashed()
+                .color(1),
+        );
+        caption.push_str(
+            " Dashed: what the linear model of this loop predicts for a hold, from Brownian motion and the localisation noise that \
+             vision stated.",
+        );
+    }
+    page.figure(Figure::new("error-spectrum", &caption).panel(panel));
+}
+
+/// The spectrum that the run's own set-up predicts; none where it cannot be set up again, or the target moves.
+fn predicted(meta: Option<&RunMeta>, ticks: &Ticks, hz: &[f64]) -> Option<Vec<f64>> {
+    let meta = meta.filter(|_| !ticks.target_moves)?;
+    let diffusion = cellpos_session::recorded::diffusion_of_run_um2_per_s(meta)?;
+    let setup = cellpos_session::recorded::setup_of(meta, "run.toml").ok()?;
+    let predicted = setup.predicted_density(diffusion, hz)?;
+    Some(predicted.with_noise_nm(ticks.noise_um() * 1e3))
+}
