@@ -86,9 +86,15 @@ impl Report {
         self.push(Block::Result(status, sentence.to_owned()))
     }
 
-    /// Adds what was done, in a line or two below the title: with what, how, when.
+    /// Says below the title what was done: with what, how, when. A text of more than 400 characters is cut.
     pub fn lead(&mut self, text: &str) -> &mut Self {
-        self.push(Block::Lead(text.to_owned()))
+        const MOST: usize = 400;
+        let mut shown: String = text.chars().take(MOST).collect();
+        if shown.len() < text.len() {
+            shown.push('\u{2026}');
+        }
+        self.blocks.insert(0, Block::Lead(shown));
+        self
     }
 
     /// What is added until [`Report::unfold`] is folded behind this title: it is there, and not in the way.

@@ -283,7 +283,12 @@ fn write(args: &Args, result: &Reconciliation, collected: &[Collected]) -> Resul
     if let Some(path) = &args.report {
         let collected = collected.iter().map(|one| one.file.as_path());
         let title = heading(args.data.iter().map(PathBuf::as_path).chain(collected));
-        output::write(path, &cellpos_reconcile::report(result, &title).to_html())?;
+        output::write(
+            path,
+            &cellpos_reconcile::report(result, &title)
+                .lead(&super::identify::command_line())
+                .to_html(),
+        )?;
     }
     let mut json = result.to_json();
     if args.collect.is_some() {

@@ -1,5 +1,6 @@
 //! The circle on one page: what was found, margins predicted and true, tracking errors, before and after.
 
+use crate::commands::identify::command_line;
 use cellpos_experiment::circle::Circle;
 use cellpos_experiment::circle::margins::{AMPLITUDES_UM, LoopMargins, Response};
 use cellpos_experiment::circle::stage::{Stage, Tracked};
@@ -185,6 +186,7 @@ pub(super) fn report(circle: &Circle, gap: &Path) -> Report {
         cellpos_reconcile::Verdict::Ambiguous => Emphasis::Warning,
         _ => Emphasis::Good,
     };
+    r.lead(&command_line());
     r.result(status, &sentence(circle));
     r.figure(traces(circle));
 

@@ -1,5 +1,6 @@
 //! The page of a design: whether it holds, by how much, and what error it leads one to expect.
 
+use crate::commands::identify::command_line;
 use cellpos_control::design::{
     DesignReport, DesignRequest, loop_response, predicted_density_um, step_response,
 };
@@ -19,6 +20,7 @@ pub(super) fn page(
     report: &DesignReport,
 ) -> Result<Report, PlantError> {
     let mut page = Report::new(&format!("Controller for {model}"));
+    page.lead(&command_line());
     let (status, sentence) = sentence(request, report);
     page.result(status, &sentence);
     let Some(law) = report.law(&request.plant) else {

@@ -20,34 +20,33 @@ fn unwrapped_deg(phase: f64) -> f64 {
     phase - 360.0 * ((phase + 90.0) / 360.0).round()
 }
 
-/// A band wider than the intervals of its points by this factor does not describe the measurement.
-const WIDEST_BAND: f64 = 30.0;
+/// A band wider than the intervals of its points by this factor shows a parameter that the points do not determine: a plant of
+/// `p` parameters through `n` points has a band of about sqrt(p/n) intervals, so one interval or less.
+const WIDEST_BAND: f64 = 3.0;
 
-/// Ends of the fit's 95 % band (gain or phase) at each frequency. NaN beyond the measured frequencies, and if the nearest point
-/// is known far better: there the band shows a parameter that these data do not determine.
+/// Ends of the fit's 95 % band (gain or phase) at each frequency, NaN beyond the measured ones; all NaN if the band describes the
+/// points nowhere near as well as they are known. Then there is no band: parts of one would look like a feature of the plant.
 fn band(result: &Identification, grid: &[f64], phase: bool) -> [Vec<f64>; 2] {
     let points = &result.compensated;
-    let mut ends = [Vec::new(), Vec::new()];
-    for f in grid {
-        let (gain, angle) = result.band(*f);
-        let here = if phase { angle } else { gain };
-        let nearest = points.iter().min_by(|a, b| {
-            let off = |hz: f64| (hz / f).ln().abs();
-            off(a.frequency_hz).total_cmp(&off(b.frequency_hz))
+    let at = |hz: f64| {
+        let (gain, angle) = result.band(hz);
+        if phase { angle } else { gain }
+    };
+    let describes = points.iter().all(|p| {
+        let sd = if phase { p.phase_sd_deg } else { p.gain_sd_db };
+        let [low, high] = at(p.frequency_hz);
+        high - low <= WIDEST_BAND * 2.0 * 1.96 * sd
+    });
+    let of = |pick: fn(f64, f64) -> f64| points.iter().map(|p| p.frequency_hz).fold(f64::NAN, pick);
+    let measured = of(f64::min)..=of(f64::max);
+    let ends = grid
+        .iter()
+        .map(|hz| match describes && measured.contains(hz) {
+            true => at(*hz),
+            false => [f64::NAN; 2],
         });
-        let sd = nearest.map_or(
-            f64::NAN,
-            |p| if phase { p.phase_sd_deg } else { p.gain_sd_db },
-        );
-        let of =
-            |pick: fn(f64, f64) -> f64| points.iter().map(|p| p.frequency_hz).fold(f64::NAN, pick);
-        let measured = (of(f64::min)..=of(f64::max)).contains(f);
-        let fits = here[1] - here[0] <= WIDEST_BAND * 2.0 * 1.96 * sd;
-        for (end, value) in ends.iter_mut().zip(here) {
-            end.push(if measured && fits { value } else { f64::NAN });
-        }
-    }
-    ends
+    let (low, high) = ends.map(|[low, high]| (low, high)).unzip();
+    [low, high]
 }
 
 /// Bode plot of the compensated points, the fitted model with its 95 % band, and, if asked for, Eq. (6) and 2 pi 63/s.
@@ -86,11 +85,16 @@ pub(crate) fn bode(
             .unzip()
     };
     let (model_gain, model_phase) = curve(&|f| model.response(f));
+    // What is not drawn is not in the legend.
+    let name_of = |ends: &[f64]| match ends.iter().any(|end| end.is_finite()) {
+        true => "95 % of the fit",
+        false => "",
+    };
     let delayed: Vec<f64> = points.iter().map(|p| p.delayed_phase_deg).collect();
     let figure = Figure::bode(name, caption)
         .bode_series(
-            Series::band("95 % of the fit", &grid, &gain_from, &gain_to),
-            Series::band("95 % of the fit", &grid, &phase_from, &phase_to),
+            Series::band(name_of(&gain_from), &grid, &gain_from, &gain_to),
+            Series::band(name_of(&phase_from), &grid, &phase_from, &phase_to),
         )
         .bode_series(
             Series::line("fit", &grid, &model_gain),
@@ -340,7 +344,7 @@ fn sentence(done: &Done) -> (Emphasis, String) {
     if unknown > 0 && !known.is_empty() {
         let all = result.judged.parameters.len();
         text.push_str(&format!(
-            " {unknown} of the {all} parameters cannot be told from these lines."
+            " {unknown} of the {all} parameters cannot be determined from these frequencies."
         ));
     }
     let status = match (known.is_empty(), result.warnings.is_empty()) {
@@ -355,12 +359,13 @@ fn sentence(done: &Done) -> (Emphasis, String) {
 pub(crate) fn report(done: &Done, command_line: &str, eq6: bool) -> Report {
     let result = &done.result;
     let mut report = Report::new("Identification");
+    report.lead(command_line);
     let (status, sentence) = sentence(done);
     report.result(status, &sentence);
     report.figure(bode(
         "bode",
-        "Gain and phase of the plant as measured (intervals 95 %, where they are larger than the points), and the fit with its 95 % \
-         band where these lines determine it; hold, exposure and delay are taken off.",
+        "Gain and phase of the plant as measured (intervals 95 %, where they are larger than the points), and the fit, with its 95 % \
+         band if these frequencies determine it; hold, exposure and delay are taken off.",
         result,
         (480.0, eq6),
     ));
@@ -406,8 +411,8 @@ pub(crate) fn report(done: &Done, command_line: &str, eq6: bool) -> Report {
         report.figure(delay_test("delay-test", "Light sent by the board and seen by the camera, and what each edge allows the delay to be.", led));
     }
     report.section("Traces").figure(traces(done));
-    report.section("How it was measured").paragraph(&format!(
-        "`{command_line}`; {} rows of record.",
+    report.paragraph(&format!(
+        "{} rows of record.",
         done.records.iter().map(|r| r.input.len()).sum::<usize>()
     ));
     report

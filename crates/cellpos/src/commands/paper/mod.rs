@@ -215,7 +215,7 @@ fn report(
         &done.result,
         (320.0, true),
     ));
-    report.paragraph(&format!(
+    report.lead(&format!(
         "`{}`. Every number comes from rendered frames of the emulated rig with Eq. (6) as its plant, through localiser, loop \
          and PZT board. The bead was held by PI while each line was driven, the amplitude shaped to keep it in view; Fig. A1 is \
          an open-loop record.",

@@ -162,7 +162,8 @@ impl Queue {
         };
         written(&self.folder.join(TABLE), &population::csv(&self.rows))?;
         let page = population::page(&self.name, &self.rows, &self.cycles);
-        written(&self.folder.join(PAGE), &page.to_html())
+        page.write_with_figures(&self.folder.join(PAGE))
+            .map_err(Failure::failed)
     }
 }
 

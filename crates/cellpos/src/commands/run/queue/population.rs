@@ -1,5 +1,6 @@
 //! Mean and spread of the cells of a queue: a row per cell, one page for all.
 
+use crate::commands::identify::command_line;
 use crate::commands::report::{half95, was_elsewhere, with_interval};
 use crate::commands::run::over::Over;
 use cellpos_report::{Axis, Column, Emphasis, Figure, Panel, Report, Series, Table};
@@ -221,6 +222,7 @@ pub(super) fn page(name: &str, rows: &[CellRow], cycles: &[Vec<CycleRow>]) -> Re
     } else {
         Emphasis::Warning
     };
+    page.lead(&command_line());
     page.result(status, &sentence(done, rows, cycles));
     type Value = fn(&CycleRow, &AtRest) -> f64;
     let quantities: [(&str, &str, Value); 3] = [
