@@ -19,6 +19,7 @@ mod uncertainty;
 use crate::error::BuildError;
 use crate::loop_model::{LoopModel, MODES};
 use transition::Transition;
+use uncertainty::{USUAL_WALK_UM_PER_SQRT_S, advanced, at_rest};
 
 pub use config::EstimatorConfig;
 pub(crate) use config::planned_gap;
@@ -42,10 +43,6 @@ const RELEASED_TICKS: u8 = 50;
 /// Weight of a fix in the average position of a stuck bead.
 const STUCK_AVERAGE: f64 = 0.05;
 
-/// Uncertainty of neutral after a bead came free, um: it may have drifted meanwhile, or the verdict may have been
-/// wrong because neutral was.
-const RELEASED_NEUTRAL_UM: f64 = 0.5;
-
 /// What the variance per tick that a wrong gain may cause keeps of itself from tick to tick: it halves in 8 ticks.
 const SPREAD_KEPT: f64 = 0.917_004_043_204_671_2;
 
@@ -59,8 +56,10 @@ pub struct EstimatorState {
     pub integrator_um: f64,
     /// Neutral at the filter's time, um.
     pub neutral_um: f64,
-    /// Covariance: position-position, position-neutral, neutral-neutral, um^2.
+    /// Covariance: position-position, position-neutral, neutral-neutral, um^2. It gives the gains, for a zero flow that may walk fast.
     pub covariance_um2: [f64; 3],
+    /// Covariance of the errors that these gains leave on a rig whose zero flow walks as usual, um^2.
+    pub stated_um2: [f64; 3],
     /// Fast modes at the filter's time, um s.
     pub modes: [f64; MODES],
     /// Commands of the previous ticks, newest first, um.
@@ -191,6 +190,7 @@ impl Estimator {
             integrator_um: 0.0,
             neutral_um,
             covariance_um2: [1e4, 0.0, self.config.neutral_initial_um.powi(2)],
+            stated_um2: [1e4, 0.0, self.config.neutral_initial_um.powi(2)],
             modes: [0.0; MODES],
             history_um: [command_um; HISTORY],
             stuck_evidence: 0.0,
@@ -254,13 +254,13 @@ impl Estimator {
         let m = self.filter_state(state);
         let motion = self.tick.gain * (command - m.n);
         let ts = self.model.sample_time_s;
-        let [p11, p12, p22] = state.covariance_um2;
         let neutral_walk_um2 = self.config.neutral_walk_um_per_sqrt_s.powi(2) * ts;
-        let p22n = (p22 + neutral_walk_um2).min(1e6);
+        let usual_um2 = USUAL_WALK_UM_PER_SQRT_S.powi(2) * ts;
         state.lag = state.lag.saturating_sub(1);
         if state.stuck {
             state.modes = [0.0; MODES];
-            state.covariance_um2 = [p11, 0.0, p22n];
+            state.covariance_um2 = at_rest(state.covariance_um2, neutral_walk_um2);
+            state.stated_um2 = at_rest(state.stated_um2, usual_um2);
             return motion;
         }
         let next = self.tick.advance(&m, command);
@@ -274,12 +274,8 @@ impl Estimator {
         let crest = (SPREAD_KEPT * state.spread_um2).max(spread * spread);
         state.spread_um2 = if crest > LEAST_SPREAD_UM2 { crest } else { 0.0 };
         let walk_um2 = 2.0 * self.config.diffusion_um2_per_s * ts + state.spread_um2;
-        let p11n = p11 - 2.0 * g * p12 + g * g * p22 + walk_um2;
-        state.covariance_um2 = if p11n < 1e6 {
-            [p11n, p12 - g * p22, p22n]
-        } else {
-            [1e6, 0.0, p22n]
-        };
+        state.covariance_um2 = advanced(state.covariance_um2, g, walk_um2, neutral_walk_um2);
+        state.stated_um2 = advanced(state.stated_um2, g, walk_um2, usual_um2);
         motion
     }
 
@@ -430,11 +426,12 @@ impl Estimator {
             }
             state.modes = [0.0; MODES];
             state.covariance_um2 = [fix.variance_um2, 0.0, p22];
+            state.stated_um2 = [fix.variance_um2, 0.0, state.stated_um2[2]];
             return (true, innovation);
         }
         if was_stuck {
             self.place(state, innovation, fix.variance_um2);
-            state.covariance_um2[2] = p22.max(RELEASED_NEUTRAL_UM.powi(2));
+            state.doubt_neutral();
             return (true, innovation);
         }
         self.correct(state, h, innovation, walk_um2, fix.variance_um2);
@@ -444,8 +441,9 @@ impl Estimator {
     /// Takes the position from the fix alone, keeping neutral.
     fn place(&self, state: &mut EstimatorState, innovation_um: f64, variance_um2: f64) {
         state.integrator_um += innovation_um;
-        state.covariance_um2[0] = variance_um2;
-        state.covariance_um2[1] = 0.0;
+        for covariance_um2 in [&mut state.covariance_um2, &mut state.stated_um2] {
+            (covariance_um2[0], covariance_um2[1]) = (variance_um2, 0.0);
+        }
         state.gated = 0;
         state.seen = true;
     }

@@ -226,7 +226,7 @@ impl<R: ReferenceGenerator> Core<R> {
                 told_um: neutral_um,
                 following,
                 clipped: false,
-                rest: rest::Rest::new(neutral_um),
+                rest: rest::Rest::new(neutral_um, timing.camera_delay_ms * 1e-3 / sample_s),
                 rest_um: neutral_um,
                 pictures_repeated: 0,
                 parked_at: None,

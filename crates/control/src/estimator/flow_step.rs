@@ -5,6 +5,7 @@
 //! any magnitude on a logarithmic scale. Where the step is likelier, neutral is as uncertain as the step that the innovation
 //! shows, and the filter learns the new one from the fixes that follow.
 
+use super::uncertainty::corrected;
 use super::{Estimator, EstimatorState, Fix, HISTORY};
 use std::f64::consts::TAU;
 
@@ -67,12 +68,11 @@ impl Estimator {
         state.stepped_ticks = HISTORY as u8;
         let way_per_um = self.tick.gain * f64::from(state.ticks_since_fix.max(1));
         let step_um = innovation_um / way_per_um;
-        let [p11, p12, p22] = state.covariance_um2;
-        state.covariance_um2 = [
-            p11 + innovation_um * innovation_um,
-            p12 - innovation_um * step_um,
-            p22 + step_um * step_um,
-        ];
+        for covariance_um2 in [&mut state.covariance_um2, &mut state.stated_um2] {
+            covariance_um2[0] += innovation_um * innovation_um;
+            covariance_um2[1] -= innovation_um * step_um;
+            covariance_um2[2] += step_um * step_um;
+        }
     }
 
     /// Corrects the estimate by an innovation; `h` is the sensitivity of the fix to neutral.
@@ -91,5 +91,6 @@ impl Estimator {
         state.integrator_um += k1 * innovation_um;
         state.neutral_um += k2 * innovation_um;
         state.covariance_um2 = [p11 - k1 * ph1, p12 - k1 * ph2, p22 - k2 * ph2];
+        state.stated_um2 = corrected(state.stated_um2, h, [k1, k2], walk_um2 + variance_um2);
     }
 }

@@ -37,8 +37,10 @@ impl Estimator {
         state.neutral_um *= ratio;
         state.modes.iter_mut().for_each(|x| *x *= ratio);
         state.history_um.iter_mut().for_each(|u| *u *= ratio);
-        state.covariance_um2[1] *= ratio;
-        state.covariance_um2[2] *= ratio * ratio;
+        for covariance_um2 in [&mut state.covariance_um2, &mut state.stated_um2] {
+            covariance_um2[1] *= ratio;
+            covariance_um2[2] *= ratio * ratio;
+        }
         state.integrator_um += before - position(state);
     }
 }

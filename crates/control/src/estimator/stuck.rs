@@ -1,6 +1,6 @@
 //! Whether something holds the bead, and how fast it may move while that is so and just after.
 
-use super::{Estimator, EstimatorState, Fix, HISTORY, RELEASED_NEUTRAL_UM, STUCK_AVERAGE};
+use super::{Estimator, EstimatorState, Fix, HISTORY, STUCK_AVERAGE};
 
 /// Evidence, natural logarithm of the odds, from which a bead that does not follow is taken to be held: a free one seems to be
 /// still so well once in e^8 times, and tries a hundred times a second.
@@ -104,8 +104,7 @@ impl Estimator {
             // Neither does it follow nor is it held: the flow has stepped by too little to be seen in one fix.
             state.stuck_evidence = 0.0;
             state.stepped_ticks = HISTORY as u8;
-            let neutral_um2 = &mut state.covariance_um2[2];
-            *neutral_um2 = neutral_um2.max(RELEASED_NEUTRAL_UM * RELEASED_NEUTRAL_UM);
+            state.doubt_neutral();
         }
     }
 

@@ -2,6 +2,61 @@
 
 use super::{Estimator, EstimatorState, HISTORY};
 
+/// Uncertainty of neutral after a bead came free, um: it may have drifted meanwhile, or the verdict may have been
+/// wrong because neutral was.
+const RELEASED_NEUTRAL_UM: f64 = 0.5;
+
+/// Walk of the zero flow that the stated uncertainty counts with: 6 nm about its mean within 20 s, sd sqrt(2 / time), as a rig at rest
+/// does. The gains are made for eight times of that, so that they follow a rig that is worse.
+pub(super) const USUAL_WALK_UM_PER_SQRT_S: f64 = 1.9e-3;
+
+/// A covariance one tick later: `gain` is the way for a displacement of 1 um, then the variances of the walks of bead and zero flow.
+pub(super) fn advanced(
+    [p11, p12, p22]: [f64; 3],
+    gain: f64,
+    walk_um2: f64,
+    flow_um2: f64,
+) -> [f64; 3] {
+    let far = (p22 + flow_um2).min(1e6);
+    let p11n = p11 - 2.0 * gain * p12 + gain * gain * p22 + walk_um2;
+    if p11n < 1e6 {
+        [p11n, p12 - gain * p22, far]
+    } else {
+        [1e6, 0.0, far]
+    }
+}
+
+/// The same for a bead that something holds.
+pub(super) fn at_rest([p11, _, p22]: [f64; 3], flow_um2: f64) -> [f64; 3] {
+    [p11, 0.0, (p22 + flow_um2).min(1e6)]
+}
+
+/// A covariance after a correction with any gains (Joseph's form); `h` is the sensitivity of a fix to neutral.
+pub(super) fn corrected(
+    [p11, p12, p22]: [f64; 3],
+    h: f64,
+    [k1, k2]: [f64; 2],
+    variance_um2: f64,
+) -> [f64; 3] {
+    // (1 - k h) P (1 - k h)^T + k r k^T, with the innovation's covariance s = h P h^T + r.
+    let (ph1, ph2) = (p11 + h * p12, p12 + h * p22);
+    let s = ph1 + h * ph2 + variance_um2;
+    [
+        (p11 - 2.0 * k1 * ph1 + k1 * k1 * s).max(0.0),
+        p12 - k1 * ph2 - k2 * ph1 + k1 * k2 * s,
+        (p22 - 2.0 * k2 * ph2 + k2 * k2 * s).max(0.0),
+    ]
+}
+
+impl EstimatorState {
+    /// Neutral may be anywhere near.
+    pub(super) fn doubt_neutral(&mut self) {
+        for covariance_um2 in [&mut self.covariance_um2, &mut self.stated_um2] {
+            covariance_um2[2] = covariance_um2[2].max(RELEASED_NEUTRAL_UM * RELEASED_NEUTRAL_UM);
+        }
+    }
+}
+
 /// Ticks over which the fastest motion is looked for.
 const FASTEST_TICKS: usize = 6;
 
@@ -29,19 +84,17 @@ impl Estimator {
     /// Standard deviation of the position `back` ticks after the filter's time: what is not known of the bead and of neutral then, and
     /// both their walks since, um.
     pub(super) fn present_sd_um(&self, state: &EstimatorState, back: usize) -> f64 {
-        let [mut p11, mut p12, mut p22] = state.covariance_um2;
+        let mut stated_um2 = state.stated_um2;
         if state.stuck {
-            return p11.max(0.0).sqrt();
+            return stated_um2[0].max(0.0).sqrt();
         }
         let (g, ts) = (self.tick.gain, self.model.sample_time_s);
         let walk_um2 = 2.0 * self.config.diffusion_um2_per_s * ts + state.spread_um2;
-        let neutral_walk_um2 = self.config.neutral_walk_um_per_sqrt_s.powi(2) * ts;
+        let flow_um2 = USUAL_WALK_UM_PER_SQRT_S.powi(2) * ts;
         for _ in 0..back {
-            p11 += g * (g * p22 - 2.0 * p12) + walk_um2;
-            p12 -= g * p22;
-            p22 += neutral_walk_um2;
+            stated_um2 = advanced(stated_um2, g, walk_um2, flow_um2);
         }
-        p11.max(0.0).sqrt()
+        stated_um2[0].max(0.0).sqrt()
     }
 
     /// Believes this zero flow, and that the PZT has been there since the newest fix.
@@ -49,6 +102,67 @@ impl Estimator {
         state.neutral_um = neutral_um;
         state.history_um = [neutral_um; HISTORY];
         state.modes = Default::default();
-        state.covariance_um2[1] = 0.0;
+        (state.covariance_um2[1], state.stated_um2[1]) = (0.0, 0.0);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::estimator::{EstimatorConfig, Fix};
+    use crate::loop_model::LoopModel;
+
+    /// Normal deviates, by the sum of twelve.
+    fn noise(state: &mut u64) -> f64 {
+        let mut next = || {
+            *state ^= *state << 13;
+            *state ^= *state >> 7;
+            *state ^= *state << 17;
+            (*state >> 11) as f64 / (1u64 << 53) as f64
+        };
+        (0..12).map(|_| next()).sum::<f64>() - 6.0
+    }
+
+    /// Square of the error over the stated variance, of a bead that is held for 2.5 s and not seen for 0.5 s.
+    fn squared(seed: u64) -> f64 {
+        let mut draw = seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) | 1;
+        let (gain, dt) = (380.0, 1e-3);
+        let config = EstimatorConfig::default();
+        let estimator = Estimator::new(config, LoopModel::integrator(gain, 2e-3)).unwrap();
+        let mut state = estimator.start(20.0, 20.0);
+        let (mut bead_um, mut zero_um, mut command_um) = (0.0, 20.0, 20.0);
+        let mut path = [0.0; 3];
+        for k in 0..3000 {
+            path = [bead_um, path[0], path[1]];
+            let fix = Fix {
+                position_um: path[2] + 0.015 * noise(&mut draw),
+                variance_um2: 0.015 * 0.015,
+                age: 0,
+                offset: 0.0,
+            };
+            let estimate = estimator.step(&mut state, (k < 2500).then_some(fix));
+            if k == 2999 {
+                let off_um: f64 = estimate.position_um - bead_um;
+                return (off_um / estimate.position_sd_um).powi(2);
+            }
+            command_um = if k < 2500 {
+                estimate.neutral_um - 0.4 * estimate.position_um
+            } else {
+                estimate.neutral_um
+            };
+            estimator.push(&mut state, command_um);
+            bead_um += gain * dt * (command_um - zero_um)
+                + (2.0 * config.diffusion_um2_per_s * dt).sqrt() * noise(&mut draw);
+            zero_um += USUAL_WALK_UM_PER_SQRT_S * dt.sqrt() * noise(&mut draw);
+        }
+        unreachable!("the last tick returns from {command_um} um")
+    }
+
+    #[test]
+    fn the_stated_uncertainty_of_a_bead_that_is_not_seen_is_its_error() {
+        let runs = 400_u32;
+        let mean = (1..=u64::from(runs)).map(squared).sum::<f64>() / f64::from(runs);
+        // The mean of so many squares is within 3 standard errors, sqrt(2 / 400) each.
+        assert!((mean - 1.0).abs() < 0.21, "{mean}");
     }
 }

@@ -35,6 +35,7 @@ impl<R: ReferenceGenerator> Core<R> {
             let held_um = self.controller.previous_command_um();
             self.monitor
                 .step(&mut self.state.plant, None, neutral_um, held_um);
+            self.state.following.skip(held_um);
             let told = ReferenceInput {
                 running,
                 frozen: self.state.frozen.any(),

@@ -13,8 +13,9 @@
 use crate::keeping::Hold;
 use cellpos_control::{EstimatorConfig, LoopModel, flow_step_log_density};
 
-/// Natural logarithm of the odds that are asked for, chosen among drawn flows: the beginning of a rise looks like a wrong sign, and
-/// a wrong sign is to be told before the bead is 10 um away at 1 kHz.
+/// Natural logarithm of the odds that are asked for. Where a model is exact, Page's test is wrong once in e^32 ticks, 2,500 years at 1 kHz;
+/// e^20 would do for a year. The rest is for flows that rise as no model here does: evidence of a wrong sign grows with the square of an
+/// error that grows e-fold in 8 ms, so that it costs 4 ms ln(32 / 20) = 2 ms.
 const EVIDENCE: f64 = 32.0;
 /// Standard deviation of the gain over the model's: loops are made for a half to twice of it; and its limits.
 const GAIN_SD: f64 = 0.35;
@@ -368,6 +369,16 @@ impl Following {
     pub(super) fn clear(&mut self) {
         self.known = 0;
         self.beliefs = None;
+    }
+
+    /// A tick that never came: the command before was held, and the bead moved on.
+    pub(super) fn skip(&mut self, held_um: f64) {
+        self.step(&Seen {
+            fix: None,
+            reference_um: f64::NAN,
+            command_um: held_um,
+            zero_flow_um: f64::NAN,
+        });
     }
 
     /// Takes in a tick. Gives what the bead does instead of following the commands, and the zero flow of before, um.

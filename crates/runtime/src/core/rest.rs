@@ -5,11 +5,13 @@
 
 use cellpos_control::LoopFlags;
 
-/// Time over which the quiet zero flow is averaged, s.
+/// Time over which the quiet zero flow is averaged, s: the estimate itself is an average over 0.14 s with the usual walk of the zero flow,
+/// and what is longer than that would only be older.
 const QUIET_S: f64 = 0.1;
-/// Fixes in a row that must agree with a newer estimate before it counts.
-const AGREEING: u32 = 5;
-/// Standard deviations that a fix may be off its prediction and agree.
+/// Ticks beyond the delay for which fixes must agree with a newer estimate: one of hold, and two in which the filter learns a step.
+const LEARNING_TICKS: f64 = 3.0;
+/// Standard deviations that a fix may be off its prediction and agree: a quiet one is further off once in 370, and the newest estimate
+/// then does not count for a few ticks.
 const AGREES_SIGMA: f64 = 3.0;
 
 /// The zero flow of the last quiet time, and how long the newest has been supported.
@@ -17,13 +19,17 @@ const AGREES_SIGMA: f64 = 3.0;
 pub(super) struct Rest {
     quiet_um: f64,
     agreeing: u32,
+    /// Fixes in a row that must agree with a newer estimate before it counts.
+    enough: u32,
 }
 
 impl Rest {
-    pub(super) fn new(zero_flow_um: f64) -> Self {
+    /// For fixes that are so many ticks old.
+    pub(super) fn new(zero_flow_um: f64, delay_ticks: f64) -> Self {
         Self {
             quiet_um: zero_flow_um,
             agreeing: 0,
+            enough: (delay_ticks.max(0.0).round() + LEARNING_TICKS) as u32,
         }
     }
 
@@ -43,7 +49,7 @@ impl Rest {
             return;
         }
         self.agreeing = self.agreeing.saturating_add(1);
-        if self.agreeing > AGREEING {
+        if self.agreeing > self.enough {
             let share = (sample_s / QUIET_S).min(1.0);
             self.quiet_um += share * (zero_flow_um - self.quiet_um);
         }
@@ -56,7 +62,7 @@ impl Rest {
 
     /// The zero flow to stop at, um, when the newest estimate is `newest_um`.
     pub(super) fn zero_flow_um(&self, newest_um: f64) -> f64 {
-        if self.agreeing > AGREEING && newest_um.is_finite() {
+        if self.agreeing > self.enough && newest_um.is_finite() {
             newest_um
         } else {
             self.quiet_um
@@ -70,7 +76,7 @@ mod tests {
 
     #[test]
     fn what_wound_up_while_fixes_disagreed_is_not_where_the_pzt_stops() {
-        let mut rest = Rest::new(20.0);
+        let mut rest = Rest::new(20.0, 2.0);
         let mut tick = |zero_flow_um, innovation_um| {
             rest.step(
                 zero_flow_um,

@@ -14,6 +14,8 @@ struct World<'a> {
     range: &'a dyn Fn(f64) -> [f64; 2],
     zero_flow: &'a dyn Fn(f64) -> f64,
     reference: &'a dyn Fn(f64) -> f64,
+    /// Ticks that never come.
+    lost: &'a dyn Fn(u64) -> bool,
     seconds: f64,
 }
 
@@ -27,6 +29,7 @@ impl Default for World<'_> {
             range: &|_| [0.0, 40.0],
             zero_flow: &|_| 20.0,
             reference: &|_| 0.0,
+            lost: &|_| false,
             seconds: 11.0,
         }
     }
@@ -56,6 +59,10 @@ fn told(world: &World<'_>) -> Option<Told> {
             + (0.66 * dt).sqrt() * noise(&mut state);
         seen.push_back(bead_um);
         seen.pop_front();
+        if (world.lost)(k) {
+            following.skip(command_um);
+            continue;
+        }
         let fix_um = seen[0] + 0.015 * noise(&mut state);
         let reference_um = (world.reference)(t);
         let error_um = world.axis * (fix_um - reference_um);
@@ -174,5 +181,24 @@ fn an_actuator_that_clips_near_zero_flow_is_told_under_a_slow_law_within_20_um()
             });
             assert!(in_time, "{level_um} um, seed {seed}: {found:?}");
         }
+    }
+}
+
+#[test]
+fn a_loop_that_loses_ticks_in_fast_motion_is_not_taken_for_one_with_a_wrong_sign() {
+    for seed in 1..=10 {
+        // A fifth of the ticks, up to eight in a row.
+        let lost = |k: u64| {
+            let mut state = seed * 7919 + k / 8;
+            let draw = noise(&mut state).abs();
+            draw < 0.5 && (k % 8) as f64 > 12.0 * draw + 2.0
+        };
+        let told = told(&World {
+            seed,
+            reference: &|t| 3.0 * (t * 95.0).sin() + 2.0 * (t * 311.0).sin(),
+            lost: &lost,
+            ..World::default()
+        });
+        assert_eq!(told, None, "seed {seed}");
     }
 }

@@ -11,6 +11,8 @@ use std::fmt;
 
 /// Gain of Eq. (6) at the frequencies of a hold, 1/s.
 pub(super) const GAIN_PER_S: f64 = 379.0;
+/// Where the bead rests before a step of the flow, um; it wanders by some nm.
+const ZERO_FLOW_UM: f64 = 20.0;
 /// Start of the first event, and its errors count from there, s.
 const EVENT_S: f64 = 2.6;
 const FROM_NS: i64 = 2_550_000_000;
@@ -83,6 +85,18 @@ impl Row {
         }
     }
 
+    /// The gain changes its sign.
+    pub(super) fn flipped(law: &'static str) -> Self {
+        Self {
+            seconds: 3.8,
+            ..Self::event(law, "gain-flip", 9.0)
+        }
+    }
+
+    pub(super) fn has(&self, kind: FaultKind) -> bool {
+        self.events.iter().any(|event| event.0 == kind)
+    }
+
     /// Whether the bead is not seen for a time.
     pub(super) fn is_blind(&self) -> bool {
         let blind = [
@@ -95,14 +109,10 @@ impl Row {
         self.events.iter().any(|(kind, _)| blind.contains(kind))
     }
 
-    /// Whether the bead fades out of a picture that goes on, or is not seen until the end.
+    /// Whether the bead goes from a picture that goes on, or is not seen until the end: nobody can say then that it was kept.
     pub(super) fn ends_unseen(&self) -> bool {
         let ends = |&(_, for_s): &(FaultKind, f64)| EVENT_S + for_s > self.seconds;
-        self.is_blind()
-            && self
-                .events
-                .iter()
-                .any(|event| event.0 == FaultKind::LoseBead || ends(event))
+        self.is_blind() && (self.has(FaultKind::LoseBead) || self.events.iter().any(ends))
     }
 
     pub(super) fn flow_step_um(&self) -> f64 {
@@ -203,6 +213,8 @@ pub(super) struct Held {
     /// Share within five standard deviations, true and as stated, percent.
     pub true_held_percent: f64,
     pub stated_held_percent: f64,
+    /// Time after the event with the PZT more than 1 um off the zero flow of before, ms.
+    pub pzt_off_ms: f64,
     /// Longest time without a break further off than that, ms.
     pub longest_away_ms: f64,
     pub other_beads: u64,
@@ -328,6 +340,11 @@ fn judged(
             since_ns = None;
         }
     }
+    let tick_ms = ticks.windows(2).last().map_or(0.0, |pair| {
+        (pair[1].time_ns - pair[0].time_ns) as f64 * 1e-6
+    });
+    let pzt_off = |t: &&TickRecord| (t.applied_um - ZERO_FLOW_UM).abs() > 1.0;
+    let pzt_off = ticks.iter().filter(|t| t.time_ns > FROM_NS).filter(pzt_off);
     let seen: Vec<&TickRecord> = after().filter(|t| t.measured_um.is_finite()).collect();
     let changed = seen.iter().rev().take(20).any(|t| {
         // The fix is of two milliseconds ago: a bead that is held has not gone far since.
@@ -346,6 +363,7 @@ fn judged(
         stated_rms_nm: kept.rms_nm.unwrap_or(f64::NAN),
         true_held_percent: 100.0 * held / n,
         stated_held_percent: kept.held_percent.unwrap_or(f64::NAN),
+        pzt_off_ms: pzt_off.count() as f64 * tick_ms,
         longest_away_ms: away_ns as f64 * 1e-6,
         other_beads: kept.other_beads,
         changed,

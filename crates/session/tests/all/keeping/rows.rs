@@ -1,6 +1,7 @@
 //! The rows of the table, and what must hold in them.
 
 use super::held::{Held, Row};
+use cellpos_emulator::FaultKind;
 
 /// The laws: those of this project, and one of a user's own.
 pub(super) const LAWS: [&str; 4] = ["lqg", "pi", "mpc", "own"];
@@ -46,9 +47,13 @@ pub(super) fn all() -> Vec<Row> {
         rows.push(Row::event(law, "lose-bead", 0.4));
         rows.push(Row::to_the_end(law, "lose-bead"));
         rows.push(Row::to_the_end(law, "stall-camera"));
+        rows.push(Row::flipped(law));
     }
     rows
 }
+
+/// Longest time that the PZT may be more than 1 um off zero flow after the gain changed its sign, ms.
+pub(super) const FLIPPED_MS: f64 = 50.0;
 
 /// What is asked of a run.
 pub(super) struct Limits {
@@ -74,10 +79,14 @@ impl Limits {
     /// What a run broke.
     pub(super) fn broken(&self, row: &Row, held: &Held) -> Vec<String> {
         let mut broken = Vec::new();
-        if row.ends_unseen() {
-            // What became of it nobody can say.
+        let frozen = row.has(FaultKind::GainFlip);
+        if row.ends_unseen() || frozen {
+            // What became of the bead nobody can say.
             if held.as_asked {
                 broken.push(format!("a run that lost its bead is as asked: {held}"));
+            }
+            if frozen && held.pzt_off_ms > FLIPPED_MS {
+                broken.push(format!("the PZT off for {:.0} ms: {held}", held.pzt_off_ms));
             }
             return broken;
         }
@@ -93,6 +102,11 @@ impl Limits {
             if held.state != "running" {
                 broken.push(format!("not kept: {}", held.ended));
             }
+        } else if row.has(FaultKind::StaleFrames) {
+            // Five old frames in a row end a run.
+            if held.state != "safe" {
+                broken.push(format!("not safe: {}", held.ended));
+            }
         } else if lost {
             broken.push(format!("lost: {}", held.ended));
         }
@@ -105,12 +119,13 @@ impl Limits {
         let most_um = self.furthest_um(row);
         let [truth, stated] = Self::rms(held);
         format!(
-            "{} seeds: {} not kept to the end, {} another bead, {} beyond {most_um:.2} um, {} said to be as asked; RMS {truth:.1} nm, stated {stated:.1} ({:+.1} %)",
+            "{} seeds: {} not kept to the end, {} another bead, {} beyond {most_um:.2} um, {} said to be as asked, PZT off for at most {:.0} ms; RMS {truth:.1} nm, stated {stated:.1} ({:+.1} %)",
             held.len(),
             count(&|h| h.state != "running"),
             count(&|h| h.changed || h.other_beads > 0),
             count(&|h| h.worst_um > most_um),
             count(&|h| h.as_asked),
+            held.iter().map(|h| h.pzt_off_ms).fold(0.0, f64::max),
             100.0 * (stated / truth - 1.0),
         )
     }
