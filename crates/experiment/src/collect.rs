@@ -7,6 +7,7 @@ use cellpos_ident::experiment::Turn;
 use cellpos_plant::{Hertz, Model};
 use cellpos_reconcile::{Options, ReconcileError, Reconciliation, Record, Verdict, reconcile};
 use cellpos_session::Failure;
+use cellpos_session::connect::stated_exposure_s;
 use serde::Serialize;
 use std::path::{Path, PathBuf};
 
@@ -78,6 +79,7 @@ pub fn run_experiment(
     let plan = experiment.plan(rig, share, seed)?;
     let all: Vec<Turn> = (0..plan.segments.len()).map(Turn::planned).collect();
     let total = plan.ticks();
+    let exposure_s = stated_exposure_s(&rig.file).unwrap_or(0.0);
     let name = file
         .file_stem()
         .map_or_else(String::new, |stem| stem.to_string_lossy().into_owned());
@@ -89,7 +91,8 @@ pub fn run_experiment(
         ));
     };
     let mut segment = |so_far: &Acquired| {
-        let kept = record(&name, so_far, plan.period_s).and_then(|r| write_record(&r, file));
+        let kept =
+            record(&name, so_far, plan.period_s, exposure_s).and_then(|r| write_record(&r, file));
         if let Err(failure) = kept {
             tracing::warn!("{}: {}", file.display(), failure.text());
         }
@@ -100,7 +103,8 @@ pub fn run_experiment(
     };
     let acquired = rig.acquire(&plan, &all, &mut listener)?;
     if let Some(Trouble::Ended(ended)) = &acquired.trouble {
-        let kept = record(&name, &acquired, plan.period_s).and_then(|r| write_record(&r, file));
+        let kept = record(&name, &acquired, plan.period_s, exposure_s)
+            .and_then(|r| write_record(&r, file));
         return Err(ended.failure(&match kept {
             Ok(()) => format!(
                 "the records are in {}: give them to --data, or run the command again",
@@ -109,7 +113,7 @@ pub fn run_experiment(
             Err(_) => "run the command again; records already collected are kept".to_string(),
         }));
     }
-    let record = record(&name, &acquired, plan.period_s)?;
+    let record = record(&name, &acquired, plan.period_s, exposure_s)?;
     write_record(&record, file)?;
     let missing = record.rows() - record.frames();
     if 50 * missing > record.rows() {
@@ -129,17 +133,24 @@ pub fn run_experiment(
 }
 
 /// A run as a record.
-fn record(name: &str, acquired: &Acquired, period_s: f64) -> Result<Record, Failure> {
+fn record(
+    name: &str,
+    acquired: &Acquired,
+    period_s: f64,
+    exposure_s: f64,
+) -> Result<Record, Failure> {
     let (pzt_um, bead_um) = &acquired.rows;
     let time_s: Vec<f64> = (0..pzt_um.len()).map(|k| k as f64 * period_s).collect();
     let mut record = Record::from_rows(name, &time_s, pzt_um, bead_um).map_err(refused)?;
     record.unseen.clone_from(&acquired.unseen);
+    record.frame_age_s.clone_from(&acquired.frame_age_s);
+    record.exposure_s = exposure_s;
     Ok(record)
 }
 
 /// Mean command of a held bead, less what moved the bead from where it was to where it came. The loop's own estimate follows
 /// Brownian motion, and an error of 4 nm would look like a drift of 1.7 um/s.
-fn neutral_um(record: &Record, gain_per_s: f64) -> f64 {
+pub fn neutral_um(record: &Record, gain_per_s: f64) -> f64 {
     let mean_um = record.pzt_um.iter().sum::<f64>() / record.rows().max(1) as f64;
     let mut seen = record.bead_um.iter().filter(|b| b.is_finite());
     match (seen.next(), seen.next_back()) {
@@ -150,10 +161,23 @@ fn neutral_um(record: &Record, gain_per_s: f64) -> f64 {
     }
 }
 
+/// Column of a record with the time from the exposure of a row's frame to the row's command.
+pub const FRAME_AGE: &str = "frame_age_s";
+/// Column of a record with the exposure of its frames.
+pub const EXPOSURE: &str = "exposure_s";
+
 /// Writes a record as the CSV that every command reads.
 pub fn write_record(record: &Record, path: &Path) -> Result<(), Failure> {
+    let mut more = Vec::new();
+    if !record.frame_age_s.is_empty() {
+        more.push((FRAME_AGE.to_owned(), record.frame_age_s.clone()));
+    }
+    if record.exposure_s > 0.0 {
+        more.push((EXPOSURE.to_owned(), vec![record.exposure_s; record.rows()]));
+    }
     let table = cellpos_table::Record {
         start_s: record.start_s,
+        more,
         ..cellpos_table::Record::new(
             &record.name,
             record.sample_s,
@@ -178,11 +202,13 @@ fn next(result: &Result<Reconciliation, ReconcileError>) -> Option<(Experiment, 
             Some((experiment, why))
         }),
         Ok(_) => None,
-        Err(
-            error @ (ReconcileError::NoRecords
-            | ReconcileError::ConstantInput
-            | ReconcileError::TooShort { .. }),
-        ) => Some((Experiment::Survey, error.to_string())),
+        Err(ReconcileError::NoRecords) => Some((
+            Experiment::Survey,
+            "there is no record yet, and a survey comes first".to_owned(),
+        )),
+        Err(error @ (ReconcileError::ConstantInput | ReconcileError::TooShort { .. })) => {
+            Some((Experiment::Survey, error.to_string()))
+        }
         Err(_) => None,
     }
 }

@@ -7,8 +7,8 @@ use crate::camera_rate::{InPeriods, foreign_rate_hz, other_rate};
 use crate::exciting::Handing;
 use crate::identify::held_bead::Setup;
 use crate::identify::led::{DelayTest, LitFrames};
-pub use crate::rows::is_unseen;
 use crate::rows::{Rows, ended_spans, fix_noise_um};
+pub use crate::rows::{frame_age_ns, is_unseen};
 use cellpos_control::{ControllerFile, Pi};
 use cellpos_emulator::WorldConfig;
 use cellpos_ident::delay::dithered_edges;
@@ -62,6 +62,8 @@ pub struct Acquired {
     pub rows: (Vec<f64>, Vec<f64>),
     /// Its rows whose frame came, but showed no bead to be trusted.
     pub unseen: Vec<bool>,
+    /// From the exposure of each row's frame to its command, s; NaN for a row whose frame did not come in time.
+    pub frame_age_s: Vec<f64>,
     /// Why segments are missing, if any are.
     pub trouble: Option<Trouble>,
     /// Folder of the run.
@@ -325,6 +327,7 @@ impl OnRig {
                 .map_or(self.file.first_neutral_um, |t| t.neutral_um),
             age_s: rows.age_s(),
             fix_noise_um: fix_noise_um(ticks),
+            frame_age_s: rows.frame_age_s(),
             rows: (rows.input, rows.output),
             unseen: rows.unseen,
             trouble: None,

@@ -88,6 +88,11 @@ fn with_new_frame(ticks: &[TickRecord]) -> impl Iterator<Item = &TickRecord> {
     ticks.iter().filter(|tick| is_new_frame(tick))
 }
 
+/// How old the frame of a tick is, by its own stamp, ns; `None` for a tick without a new frame.
+pub fn frame_age_ns(tick: &TickRecord) -> Option<i64> {
+    is_new_frame(tick).then(|| age_ns(tick))
+}
+
 /// How old a tick's frame is, by its own stamp, ns.
 fn age_ns(tick: &TickRecord) -> i64 {
     tick.time_ns - tick.mid_exposure_ns
@@ -108,6 +113,12 @@ fn mean_s(ages_ns: &[Option<i64>]) -> Option<f64> {
 }
 
 impl Rows {
+    /// From the exposure of each row's frame to its command, s; NaN for a row whose frame did not come in time.
+    pub(crate) fn frame_age_s(&self) -> Vec<f64> {
+        let seconds = |age: &Option<i64>| age.map_or(f64::NAN, |ns| 1e-9 * ns as f64);
+        self.ages_ns.iter().map(seconds).collect()
+    }
+
     pub(crate) fn of(ticks: &[TickRecord], period_ns: i64) -> Self {
         let mut rows = Self {
             input: Vec::new(),

@@ -4,8 +4,9 @@ use crate::data::free::Free;
 use crate::data::motion::parabola;
 use crate::data::noise::{NoiseModel, Whitener};
 use crate::data::record::{Record, command_range_um};
+use crate::data::waits::waits;
 use crate::dot::dot;
-use crate::simulate::Base;
+use crate::simulate::{Base, Sampling};
 use crate::thresholds::THRESHOLDS;
 use std::ops::Range;
 use std::sync::Arc;
@@ -46,6 +47,8 @@ pub(crate) struct Prepared {
     pub whitener: Whitener,
     pub extra_walk: Option<Vec<f64>>,
     pub rest: bool,
+    /// When its frames were exposed.
+    pub sampling: Sampling,
     /// Motions by which the plant may come to rest from where it was before the record, as they are.
     transients: Vec<Vec<f64>>,
     /// Path of a drift of the zero flow, if the noise has one.
@@ -203,7 +206,8 @@ impl Problem {
         let prepared = records
             .iter()
             .zip(repeated)
-            .map(|(r, repeated)| {
+            .zip(waits(records))
+            .map(|((r, repeated), waits_s)| {
                 // How a sampled analogue input came from where it was before the record to its first sample is not known.
                 let run_in = if base.interpolated_input {
                     ((RUN_IN_S / base.sample_s) as usize).min(r.rows() / 10)
@@ -238,6 +242,10 @@ impl Problem {
                     whitener,
                     extra_walk,
                     rest: r.rests_within(THRESHOLDS.rest_share * range_um),
+                    sampling: Sampling {
+                        exposure_s: r.exposure_s,
+                        waits_s,
+                    },
                 };
                 prepared.set_noise(&base, &noise);
                 prepared

@@ -2,7 +2,7 @@
 
 use super::arrays::read_table;
 use crate::outcome::Failure;
-use cellpos_experiment::collect::refused;
+use cellpos_experiment::collect::{EXPOSURE, FRAME_AGE, refused};
 use cellpos_reconcile::Record;
 use cellpos_table::{ColumnRef, Table};
 use cellpos_units::Hertz;
@@ -64,8 +64,12 @@ pub(super) fn read(path: &Path, wanted: &Wanted<'_>) -> Result<Record, Failure> 
             t
         }
     };
+    // What a loop knows of its frames stands beside position and command.
+    let beside = |name: &str| table.numbers_or_nan(&ColumnRef::from(name)).ok();
+    let (mut age, exposure) = (beside(FRAME_AGE).unwrap_or_default(), beside(EXPOSURE));
     if let Some(rows) = wanted.rows {
         let range = range_of(rows, u.len())?;
+        age = (age.get(range.clone())).map_or_else(Vec::new, <[f64]>::to_vec);
         (u, y, t) = (
             u[range.clone()].to_vec(),
             y[range.clone()].to_vec(),
@@ -80,6 +84,9 @@ pub(super) fn read(path: &Path, wanted: &Wanted<'_>) -> Result<Record, Failure> 
         .collect();
     let pick = |values: &[f64]| known.iter().map(|&k| values[k]).collect::<Vec<_>>();
     let (mut u, mut y, mut t) = (pick(&u), pick(&y), pick(&t));
+    if !age.is_empty() {
+        age = pick(&age);
+    }
     if let Some(even) = evened(&t, &u, &y, wanted.held) {
         tracing::warn!(
             "{}: sampled unevenly: taken every {:.6} s, between the rows by interpolation",
@@ -87,6 +94,7 @@ pub(super) fn read(path: &Path, wanted: &Wanted<'_>) -> Result<Record, Failure> 
             even.0[1] - even.0[0]
         );
         (t, u, y) = even;
+        age.clear();
     }
     let name = path.file_stem().map_or_else(
         || path.display().to_string(),
@@ -95,8 +103,26 @@ pub(super) fn read(path: &Path, wanted: &Wanted<'_>) -> Result<Record, Failure> 
     let mut record = Record::from_rows(&name, &t, &u, &y).map_err(refused)?;
     if wanted.held {
         hold_over_gaps(&mut record);
+        record.frame_age_s = in_rows(&record, &t, &age);
+        let exposure = exposure.iter().flatten().find(|s| s.is_finite());
+        record.exposure_s = exposure.map_or(0.0, |s| s.max(0.0));
     }
     Ok(record)
+}
+
+/// Values of rows with their times on the rows of a record; NaN for a row that was missing.
+fn in_rows(record: &Record, t: &[f64], values: &[f64]) -> Vec<f64> {
+    if values.is_empty() {
+        return Vec::new();
+    }
+    let mut out = vec![f64::NAN; record.rows()];
+    for (t, value) in t.iter().zip(values) {
+        let row = ((t - record.start_s) / record.sample_s).round();
+        if let Some(at) = out.get_mut(row as usize) {
+            *at = *value;
+        }
+    }
+    out
 }
 
 /// A command that was interpolated over missing rows keeps the value before them, as a held one does.

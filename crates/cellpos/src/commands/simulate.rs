@@ -8,7 +8,7 @@ use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
 use crate::output;
 use cellpos_ident::base::Grid;
 use cellpos_ident::sampled::Hold;
-use cellpos_plant::{Model, SimulateOptions, simulate};
+use cellpos_plant::{Hertz, Model, SimulateOptions, simulate};
 use cellpos_record::{RunReader, SESSIONS};
 use cellpos_table::{Mapping, Record, csv_field};
 use std::path::PathBuf;
@@ -87,6 +87,9 @@ pub(crate) fn run(args: Args) -> CommandResult {
             .get(base::HOLD)
             .is_none_or(|hold| hold != "none"),
     };
+    if let Some(warning) = away_from_rest(&model, &input) {
+        tracing::warn!("{warning}");
+    }
     let bead_um = response(&model, &input.pzt_um, input.step_s, held, &options)?;
     let mut answer = Record::new(&input.name, input.step_s, input.pzt_um, bead_um);
     answer.start_s = input.start_s;
@@ -107,6 +110,27 @@ pub(crate) fn run(args: Args) -> CommandResult {
         print_text(&format!("{}: {} rows\n", args.out.display(), answer.len()))?;
     }
     Ok(Outcome::Done)
+}
+
+/// What is said of commands that never come to the displacement at which the model's bead rests: it then goes one way only.
+fn away_from_rest(model: &Model, input: &Record) -> Option<String> {
+    let of_other_data = model.provenance.contains_key(base::HOLD);
+    let (low_um, high_um) = (input.pzt_um.iter())
+        .fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), u| {
+            (a.min(*u), b.max(*u))
+        });
+    let rest_um = model.working_point_um;
+    if of_other_data || !(high_um < rest_um || low_um > rest_um) {
+        return None;
+    }
+    // A plant that does not integrate comes to rest anywhere: its speed falls with the frequency.
+    let [slow, usual] = [0.02, 2.0].map(|hz| model.plant.velocity_gain_at(Hertz(hz)));
+    let mean_um = input.pzt_um.iter().sum::<f64>() / input.len() as f64;
+    let travel_um = usual * (mean_um - rest_um) * input.len() as f64 * input.step_s;
+    (slow > 0.3 * usual && travel_um.abs() > 1.0).then(|| format!(
+        "the command is from {low_um} to {high_um} um, and the model's bead rests at {rest_um} um only: it goes about {travel_um:.0} um \
+         away; check the unit of the column, or set working_point_um in the model"
+    ))
 }
 
 /// The input of another rig's record.
@@ -188,4 +212,23 @@ fn write_named(
         let _ = writeln!(text, "{t:.9},{u},{}", y + rest);
     }
     output::write(&args.out, &text)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use cellpos_plant::TransferFunction;
+
+    #[test]
+    fn commands_that_never_come_to_the_working_point_are_warned_of_where_the_bead_then_leaves() {
+        let at = |um: f64| Record::new("r", 1e-3, vec![um, um + 1.0, um, um + 1.0], Vec::new());
+        let away = away_from_rest(&Model::eq6(), &at(20.0));
+        assert!(away.is_some_and(|w| w.contains("rests at 4 um")));
+        assert_eq!(away_from_rest(&Model::eq6(), &at(3.5)), None);
+        let still = TransferFunction::new(vec![2.0], vec![1.0]).map(|plant| Model {
+            plant,
+            ..Model::eq6()
+        });
+        assert_eq!(away_from_rest(&still.unwrap(), &at(20.0)), None);
+    }
 }

@@ -111,6 +111,17 @@ fn without_data_collect_records_on_the_rig_and_keeps_what_it_recorded() {
     assert_eq!(collected.len(), 1);
     assert_eq!(collected[0]["experiment"], "survey");
     assert!(number(&collected[0], "rows_without_bead") < 20.0, "{r}");
+    let why = collected[0]["why"].as_str().unwrap();
+    assert!(!why.contains("give at least"), "no error's text: {why}");
+    // The records are read again as they were taken: with the rest of their bead, and the ages of their frames.
+    let again = succeed(
+        folder.path(),
+        "reconcile --model eq6 --data more --max-effects 1 --json",
+    )
+    .json();
+    let twice = &named(&again, "time-delay")["parameters"]["delay_s"];
+    let apart = number(twice, "value") - number(delay, "value");
+    assert!(apart.abs() < 2e-5, "{delay} {twice}");
     let csv = std::fs::read_to_string(folder.path().join("more/survey-1.csv")).unwrap();
     assert!(csv.starts_with("time_s,pzt_um,bead_um"), "{}", &csv[..60]);
     assert_eq!(

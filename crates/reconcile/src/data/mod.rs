@@ -9,4 +9,5 @@ pub(crate) mod motion;
 pub(crate) mod noise;
 pub(crate) mod record;
 pub(crate) mod repeats;
+pub(crate) mod waits;
 pub(crate) mod zero_flow;

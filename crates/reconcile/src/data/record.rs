@@ -23,6 +23,11 @@ pub struct Record {
     pub resolution_um: f64,
     /// Rows whose frame is known to have come, though it showed no bead that could be trusted: it was not dropped.
     pub unseen: Vec<bool>,
+    /// From the middle of the exposure of each row's frame to the row's command \[s\], by the stamps; NaN for a row without a frame,
+    /// empty if it is not known.
+    pub frame_age_s: Vec<f64>,
+    /// Exposure of every frame about its middle, if it is known \[s\]; else 0.
+    pub exposure_s: f64,
 }
 
 impl Record {
@@ -126,6 +131,8 @@ impl Record {
             filled,
             resolution_um,
             unseen: vec![false; rows],
+            frame_age_s: Vec::new(),
+            exposure_s: 0.0,
         })
     }
 
@@ -254,6 +261,8 @@ impl Record {
             filled: self.filled[from..to].to_vec(),
             resolution_um: self.resolution_um,
             unseen: self.unseen[from..to].to_vec(),
+            frame_age_s: (self.frame_age_s.get(from..to)).map_or_else(Vec::new, <[f64]>::to_vec),
+            exposure_s: self.exposure_s,
         }
     }
 }
@@ -355,6 +364,11 @@ pub(crate) fn canonical(mut records: Vec<Record>) -> Vec<Record> {
         match before {
             Some(i) => {
                 let j = &mut joined[i];
+                if !j.frame_age_s.is_empty() || !r.frame_age_s.is_empty() {
+                    j.frame_age_s.resize(j.rows(), f64::NAN);
+                    j.frame_age_s.extend_from_slice(&r.frame_age_s);
+                    j.frame_age_s.resize(j.rows() + r.rows(), f64::NAN);
+                }
                 j.pzt_um.extend_from_slice(&r.pzt_um);
                 j.bead_um.extend_from_slice(&r.bead_um);
                 j.filled.extend_from_slice(&r.filled);

@@ -2,7 +2,7 @@
 //! of effects holds them together.
 
 use super::catalogue::{Variant, variants};
-use crate::simulate::{Base, simulate};
+use crate::simulate::{Base, Sampling, simulate};
 use cellpos_plant::effects::{self, Action, Definition, Scope};
 use cellpos_plant::{Model, SimulateOptions, Zpk};
 
@@ -48,7 +48,13 @@ fn predicted(model: &Model, pzt_um: &[f64]) -> Vec<f64> {
     };
     let u: Vec<f64> = pzt_um.iter().map(|v| v - 4.0).collect();
     let mut y = Vec::new();
-    simulate(&base, &u, &model.effects, &mut y, None);
+    simulate(
+        &base,
+        (&u, &Sampling::default()),
+        &model.effects,
+        &mut y,
+        None,
+    );
     y
 }
 

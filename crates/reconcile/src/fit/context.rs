@@ -168,7 +168,13 @@ impl Context<'_> {
             .map(|(r, ranges)| {
                 let mut y = Vec::new();
                 if !ranges.is_empty() {
-                    let work = simulate(&self.problem.base, &r.u, &effects, &mut y, None);
+                    let work = simulate(
+                        &self.problem.base,
+                        (&r.u, &r.sampling),
+                        &effects,
+                        &mut y,
+                        None,
+                    );
                     self.problem.spend(work);
                 }
                 y

@@ -34,7 +34,13 @@ impl Context<'_> {
                 soft.push(Vec::new());
                 continue;
             }
-            let work = simulate(&self.problem.base, &r.u, &effects, &mut y, Some(&mut edge));
+            let work = simulate(
+                &self.problem.base,
+                (&r.u, &r.sampling),
+                &effects,
+                &mut y,
+                Some(&mut edge),
+            );
             self.problem.spend(work);
             if fit.gain != 1.0 {
                 y.iter_mut().for_each(|y| *y *= fit.gain);

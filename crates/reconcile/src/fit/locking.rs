@@ -242,7 +242,13 @@ fn tracks(ctx: &Context<'_>, fit: &Fit, at: usize) -> Vec<Track> {
         .zip(residual.into_iter().zip(sim))
         .map(|(r, (mut seen_um, path_um))| {
             let (mut edge, mut y) = (Vec::new(), Vec::new());
-            simulate(&ctx.problem.base, &r.u, &effects, &mut y, Some(&mut edge));
+            simulate(
+                &ctx.problem.base,
+                (&r.u, &r.sampling),
+                &effects,
+                &mut y,
+                Some(&mut edge),
+            );
             for (seen, edge) in seen_um.iter_mut().zip(&edge) {
                 *seen -= fit.soft * edge;
             }

@@ -4,6 +4,21 @@ use super::Frames;
 use super::modal::Trace;
 use cellpos_plant::effects::{Block, Piece};
 
+/// When the frames of a record were exposed, beyond what effects say.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct Sampling {
+    /// Exposure about the middle of each frame, if it is known \[s\].
+    pub exposure_s: f64,
+    /// How much older each frame is at its command than the frames that did not wait for it \[s\]; empty: none waited.
+    pub waits_s: Vec<f64>,
+}
+
+impl Sampling {
+    pub(super) fn is_plain(&self) -> bool {
+        self.exposure_s == 0.0 && self.waits_s.is_empty()
+    }
+}
+
 /// A block on a trace, step by step.
 pub(crate) fn advance(t: &mut Trace, block: &mut dyn Block, h: f64) {
     let n = t.pos.len();
@@ -32,10 +47,10 @@ pub(crate) fn advance(t: &mut Trace, block: &mut dyn Block, h: f64) {
     }
 }
 
-/// Positions at the frames: clock skew, delay and exposure on a trace with `fine` steps per sample.
+/// Positions at the frames: clock skew, delay, waits and exposure on a trace with `fine` steps per sample.
 pub(crate) fn sample(
     t: &Trace,
-    frames: Frames,
+    (frames, sampling): (Frames, &Sampling),
     h: f64,
     fine: usize,
     rows: usize,
@@ -48,7 +63,7 @@ pub(crate) fn sample(
     } = frames;
     y.clear();
     y.reserve(rows);
-    if skew == 0.0 && delay == 0.0 && exposure == 0.0 {
+    if skew == 0.0 && delay == 0.0 && exposure == 0.0 && sampling.is_plain() {
         y.extend(t.pos.iter().step_by(fine));
         return;
     }
@@ -56,12 +71,21 @@ pub(crate) fn sample(
     let sample_s = h * fine as f64;
     // A frame so close behind an edge shows what the share of the edge says, as one close before it does: else a delay of
     // whole frames would be a cliff, and a fit that stands on it takes no step.
-    let whole = near_whole(delay / sample_s);
+    let whole = near_whole(delay / sample_s).filter(|_| sampling.is_plain());
     let edge = whole.filter(|w| skew == 0.0 && exposure == 0.0 && delay / sample_s < *w as f64);
     for k in 0..rows {
-        let at = k as f64 * sample_s * (1.0 + skew) - delay;
-        y.push(if exposure > 0.0 {
-            (path.integral(at) - path.integral(at - exposure)) / exposure
+        let wait = sampling.waits_s.get(k).copied().unwrap_or(0.0);
+        let at = k as f64 * sample_s * (1.0 + skew) - delay - wait;
+        let seen = |at: f64| match exposure > 0.0 {
+            true => (path.integral(at) - path.integral(at - exposure)) / exposure,
+            false => path.position(at),
+        };
+        y.push(if sampling.exposure_s > 0.0 {
+            // Two points by Gauss: within 0.2 % of the mean up to half the rate, for an exposure of half a frame.
+            let apart = sampling.exposure_s / 12f64.sqrt();
+            0.5 * (seen(at - apart) + seen(at + apart))
+        } else if exposure > 0.0 {
+            seen(at)
         } else {
             let shown = edge
                 .and_then(|w| k.checked_sub(w))

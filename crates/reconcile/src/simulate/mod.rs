@@ -8,7 +8,7 @@
 mod camera;
 mod modal;
 
-pub(crate) use camera::near_whole;
+pub(crate) use camera::{Sampling, near_whole};
 use cellpos_plant::TiedPlant;
 use cellpos_plant::effects::{Action, Around, Block, Piece, Shown};
 pub(crate) use cellpos_plant::{Effect, Place, Zpk};
@@ -48,12 +48,17 @@ impl Base {
 /// Returns how much work it was, in the advances of one mode by one step, or as much: known beforehand, the same on every machine.
 pub(crate) fn simulate(
     base: &Base,
-    u: &[f64],
+    (u, sampling): (&[f64], &Sampling),
     effects: &[Effect],
     y: &mut Vec<f64>,
     edge: Option<&mut Vec<f64>>,
 ) -> u64 {
-    let chain = Chain::new(base, effects);
+    // What is not known to have rested before its record is no loop's record: nobody knows its frames.
+    let sampling = match base.free_start {
+        true => &Sampling::default(),
+        false => sampling,
+    };
+    let chain = Chain::new(base, sampling, effects);
     let work = u.len() as u64 * chain.work_per_row();
     let late = (chain.frames.delay_s / base.sample_s).ceil();
     if !base.free_start || late < 1.0 || u.is_empty() {
@@ -103,6 +108,7 @@ struct Frames {
 
 struct Chain<'a> {
     base: &'a Base,
+    sampling: &'a Sampling,
     before: Vec<Stage>,
     /// Plant and linear blocks behind it.
     plant: Zpk,
@@ -118,9 +124,10 @@ struct Chain<'a> {
 }
 
 impl<'a> Chain<'a> {
-    fn new(base: &'a Base, effects: &[Effect]) -> Self {
+    fn new(base: &'a Base, sampling: &'a Sampling, effects: &[Effect]) -> Self {
         let mut chain = Self {
             base,
+            sampling,
             before: Vec::new(),
             plant: base.zpk.clone(),
             motion: Vec::new(),
@@ -188,7 +195,8 @@ impl<'a> Chain<'a> {
             chain.fine = chain.fine.max(4);
         }
         let f = chain.frames;
-        let frames = f.skew != 0.0 || f.delay_s != 0.0 || f.exposure_s != 0.0;
+        let frames =
+            f.skew != 0.0 || f.delay_s != 0.0 || f.exposure_s != 0.0 || !sampling.is_plain();
         let within = frames && !chain.only_late();
         let slopes = chain.motion.iter().any(|b| b.needs_slopes() && b.bends());
         if (within || slopes) && has_fast_pole(&all, base.sample_s / chain.fine as f64) {
@@ -253,7 +261,8 @@ impl<'a> Chain<'a> {
             self.edges(&x, modal.direct, n, edge);
         }
         let f = self.frames;
-        let plain = f.skew == 0.0 && f.delay_s == 0.0 && f.exposure_s == 0.0;
+        let plain =
+            f.skew == 0.0 && f.delay_s == 0.0 && f.exposure_s == 0.0 && self.sampling.is_plain();
         if plain && self.motion.is_empty() {
             let mut pos = Vec::new();
             modal.run(&x, &mut pos);
@@ -276,7 +285,7 @@ impl<'a> Chain<'a> {
             t.straighten(h);
         }
         self.behind_plant(&mut t, &x, &pending, h);
-        camera::sample(&t, f, h, self.fine, n, y);
+        camera::sample(&t, (f, self.sampling), h, self.fine, n, y);
     }
 
     /// Whether a delay is all that lies between plant and record: it is exact without a fine grid.
@@ -285,6 +294,7 @@ impl<'a> Chain<'a> {
         f.delay_s > 0.0
             && f.skew == 0.0
             && f.exposure_s == 0.0
+            && self.sampling.is_plain()
             && self.motion.is_empty()
             && self.bypass.is_empty()
             && self.ties.is_empty()
@@ -394,7 +404,7 @@ impl<'a> Chain<'a> {
             }
         }
         self.behind_plant(&mut t, &x, &Zpk::one(), h);
-        camera::sample(&t, self.frames, h, self.fine, n, y);
+        camera::sample(&t, (self.frames, self.sampling), h, self.fine, n, y);
     }
 
     /// Blocks on the motion, and what goes beside the plant.
@@ -422,7 +432,8 @@ impl<'a> Chain<'a> {
             0.0
         };
         // The window of an exposure ends with the frame: its edge is already averaged.
-        if base == 0.0 || direct == 0.0 || self.frames.exposure_s != 0.0 {
+        let averaged = self.frames.exposure_s != 0.0 || !self.sampling.is_plain();
+        if base == 0.0 || direct == 0.0 || averaged {
             return;
         }
         // Edges lie on the grid of the samples: a delay between samples puts the frames between the edges.

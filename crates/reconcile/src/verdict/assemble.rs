@@ -87,7 +87,7 @@ pub(crate) fn assemble(
     if cut_short {
         places.push("the search ended with its budget of simulations, not because nothing more was to be found: --work 4 gives it four times as much".to_owned());
     }
-    let named = if verdict == Verdict::Unknown {
+    let named = if !verdict.names() {
         Vec::new()
     } else {
         let mut effects = names.effects;

@@ -149,7 +149,7 @@ pub(crate) fn augment(
     } else {
         out.provenance.remove(COLOURED);
     }
-    if verdict != Verdict::Unknown {
+    if verdict.names() {
         for i in 0..fit.parts.len() {
             if let Some(e) = effect_of(ctx, fit, i) {
                 add(&mut out.effects, ctx.scales.effect_out(&e));

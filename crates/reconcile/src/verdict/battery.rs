@@ -217,7 +217,7 @@ pub(crate) fn library(ctx: &Context<'_>, fit: &Fit) -> Vec<Column> {
                     let raw: Vec<f64> = rows.iter().map(formula).collect();
                     let moved = if place == "input" {
                         let mut y = Vec::new();
-                        simulate(&ctx.problem.base, &raw, &[], &mut y, None);
+                        simulate(&ctx.problem.base, (&raw, &r.sampling), &[], &mut y, None);
                         y
                     } else {
                         // A loop has set a row's command by its position: what shows at the output is that of the row before.
@@ -308,7 +308,7 @@ fn straight(ctx: &Context<'_>, library: &[Column], mask: &Mask) -> Vec<Vec<Vec<f
     }
     let gain = ctx.problem.records.iter().map(|r| {
         let (mut y, mut w) = (Vec::new(), vec![0.0; r.u.len()]);
-        simulate(&ctx.problem.base, &r.u, &[], &mut y, None);
+        simulate(&ctx.problem.base, (&r.u, &r.sampling), &[], &mut y, None);
         r.whiten(&y, &mut w);
         w
     });

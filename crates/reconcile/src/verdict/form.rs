@@ -243,7 +243,7 @@ fn bends(ctx: &Context<'_>) -> Vec<Vec<Vec<f64>>> {
                     let at = low + knot * (high - low);
                     let bent: Vec<f64> = r.u.iter().map(|u| (u - at).max(0.0)).collect();
                     let mut y = Vec::new();
-                    simulate(&ctx.problem.base, &bent, &[], &mut y, None);
+                    simulate(&ctx.problem.base, (&bent, &r.sampling), &[], &mut y, None);
                     r.whitened(&y)
                 })
                 .collect()

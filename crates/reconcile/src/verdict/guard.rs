@@ -60,22 +60,31 @@ pub(crate) fn records(records: &[Record], bead: bool) -> Result<(), ReconcileErr
     })
 }
 
+/// Smallest and largest command of all records.
+fn range_um(records: &[Record]) -> (f64, f64) {
+    records
+        .iter()
+        .map(Record::pzt_range_um)
+        .fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), (c, d)| {
+            (a.min(c), b.max(d))
+        })
+}
+
+/// Whether commands look like volts: within 0 to 10, and at 4 um per volt near the working point.
+pub fn looks_like_volts(records: &[Record], working_point_um: f64) -> bool {
+    let (low, high) = range_um(records);
+    low >= -0.5 && high <= 10.5 && (0.5 * (low + high) * 4.0 / working_point_um - 1.0).abs() < 0.5
+}
+
 /// What the working point says about the command's unit.
 pub(crate) fn working_point(
     records: &[Record],
     working_point_um: f64,
 ) -> Result<(), ReconcileError> {
-    let (low, high) = records
-        .iter()
-        .map(Record::pzt_range_um)
-        .fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), (c, d)| {
-            (a.min(c), b.max(d))
-        });
+    let (low, high) = range_um(records);
     let span = (high - low).max(1e-9);
     if working_point_um < low - 0.5 * span || working_point_um > high + 0.5 * span {
-        let volts = low >= -0.5
-            && high <= 10.5
-            && (0.5 * (low + high) * 4.0 / working_point_um - 1.0).abs() < 0.5;
+        let volts = looks_like_volts(records, working_point_um);
         return Err(ReconcileError::WorkingPoint {
             low_um: low,
             high_um: high,

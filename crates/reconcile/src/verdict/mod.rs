@@ -4,7 +4,7 @@ mod assemble;
 mod augment;
 pub(crate) mod battery;
 mod form;
-mod guard;
+pub(crate) mod guard;
 mod held_out;
 pub(crate) mod judge;
 pub(crate) mod map;

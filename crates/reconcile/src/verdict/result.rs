@@ -27,6 +27,11 @@ pub enum Verdict {
 }
 
 impl Verdict {
+    /// Whether effects are named with it.
+    pub(crate) fn names(self) -> bool {
+        !matches!(self, Self::Unknown | Self::NothingMissing)
+    }
+
     /// The word used in JSON.
     pub fn word(self) -> &'static str {
         match self {

@@ -221,6 +221,10 @@ fn evidence(
     trusted: usize,
     problem: &Problem,
 ) -> Option<WhiteEvidence> {
+    let exposure_s = problem
+        .records
+        .first()
+        .map_or(0.0, |r| r.sampling.exposure_s);
     let model_um2 = model.noise.localisation_um.powi(2);
     if trusted < 5000 || model_um2 <= 0.0 || noise.coloured.is_some() {
         return None;
@@ -234,7 +238,8 @@ fn evidence(
     Some(WhiteEvidence {
         estimate_um2: noise.white_um2,
         error_um2: 1.5 * variance / (trusted as f64).sqrt(),
-        model_um2,
+        // A known exposure averages a part of the walk off, as [`NoiseModel::from_increments`] says.
+        model_um2: model_um2 - noise.walk_um2 * exposure_s / (6.0 * problem.base.sample_s),
         walk_um2: noise.walk_um2,
     })
 }

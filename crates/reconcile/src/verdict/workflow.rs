@@ -166,6 +166,7 @@ fn within(
         "held-out check (the search took {:.2} of its work)",
         problem.spent() as f64 / (options.work.max(1e-9) * WORK)
     ));
+    explains_something(&mut found);
     take_back(&ctx, &mut found, effort);
     // Without a floor, and beside a model of another rig, nothing small is a name.
     let small = floor.source.is_known() && unlike.is_none();
@@ -256,6 +257,17 @@ fn free_of_start(ctx: &Context<'_>, fit: &Fit) -> Vec<Vec<f64>> {
         .zip(residual)
         .map(|(r, e)| r.without_start(&e, false))
         .collect()
+}
+
+/// Takes back the whole set if there is nothing to explain: without it the records are no further from the model than the noise,
+/// and what it gains is less than what counts as left over.
+fn explains_something(found: &mut Found) {
+    let excess = found.null.chi2 - found.null.count as f64;
+    let gained = found.null.chi2 - found.fit.chi2;
+    if excess <= 0.0 && gained < THRESHOLDS.term_least {
+        found.fit = found.null.clone();
+        found.rivals = Vec::new();
+    }
 }
 
 /// Takes back what is too small, and what stands at a bound.

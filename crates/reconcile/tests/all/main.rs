@@ -7,4 +7,5 @@ mod noise;
 mod traits;
 mod units;
 mod verdicts;
+mod waits;
 mod zero_flow;

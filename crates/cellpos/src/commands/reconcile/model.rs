@@ -1,7 +1,7 @@
 //! The model that a reconciliation extends: a file, a gain, or a base fitted to the records. The base is fitted again if that
 //! explains the difference.
 
-use super::records::{at_rest_of_runs, fitted, with_camera_delay};
+use super::records::{at_rest_of_records, fitted, with_camera_delay};
 use crate::commands::base::{self, Base};
 use crate::commands::form;
 use crate::commands::identify::HoldKind;
@@ -67,7 +67,9 @@ pub(super) fn model_of(
         Some(hold) => hold == HoldKind::None,
         None => stated.as_deref() == Some("none"),
     };
-    options.free_working_point = at_rest_of_runs(&mut model, data.records, data.rests_um);
+    // A rig's own records move what rests on it; the fit of another plant to its data does not.
+    let bead = !options.free_start && args.base.is_none();
+    options.free_working_point = at_rest_of_records(&mut model, data.records, data.rests_um, bead);
     if data.of_runs {
         with_camera_delay(&mut model);
     }

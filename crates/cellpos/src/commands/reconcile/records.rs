@@ -3,12 +3,12 @@
 use crate::commands::columns::{self, Wanted};
 use crate::commands::run::resume::sessions;
 use crate::outcome::Failure;
-use cellpos_experiment::collect::refused;
-use cellpos_experiment::on_rig::is_unseen;
+use cellpos_experiment::collect::{neutral_um, refused};
+use cellpos_experiment::on_rig::{frame_age_ns, is_unseen};
 use cellpos_plant::effects;
-use cellpos_plant::{Model, Noise, TransferFunction};
+use cellpos_plant::{Hertz, Model, Noise, TransferFunction};
 use cellpos_reconcile::Record;
-use cellpos_record::RunReader;
+use cellpos_record::{RunMeta, RunReader};
 use cellpos_runtime::TickRecord;
 use std::path::{Path, PathBuf};
 
@@ -125,16 +125,23 @@ pub(super) fn read_run(path: &Path) -> Result<(Record, Option<f64>), Failure> {
         .collect();
     let mut read = Record::from_rows(&record_name(path), &time_s, &record.pzt_um, &record.bead_um)
         .map_err(refused)?;
+    read.frame_age_s = vec![f64::NAN; read.rows()];
+    read.exposure_s = run.meta().map_or(0.0, exposure_s);
     let mut first_seq = None;
     // Where the bead of a closed loop rested: the mean of what was commanded while the loop ran, um.
     let (mut sum_um, mut count) = (0.0, 0_usize);
     for tick in run.batches().map_err(Failure::input)?.flatten() {
         let first_seq = *first_seq.get_or_insert(tick.seq);
-        if is_unseen(&tick) {
-            let row = usize::try_from(tick.seq.saturating_sub(first_seq)).unwrap_or(usize::MAX);
-            if let Some(unseen) = read.unseen.get_mut(row) {
-                *unseen = true;
-            }
+        let row = usize::try_from(tick.seq.saturating_sub(first_seq)).unwrap_or(usize::MAX);
+        if is_unseen(&tick)
+            && let Some(unseen) = read.unseen.get_mut(row)
+        {
+            *unseen = true;
+        }
+        if let Some(age_ns) = frame_age_ns(&tick)
+            && let Some(age_s) = read.frame_age_s.get_mut(row)
+        {
+            *age_s = 1e-9 * age_ns as f64;
         }
         if held(&tick) {
             (sum_um, count) = (sum_um + tick.command_um, count + 1);
@@ -144,29 +151,53 @@ pub(super) fn read_run(path: &Path) -> Result<(Record, Option<f64>), Failure> {
     Ok((read, (count >= 1000).then(|| sum_um / count as f64)))
 }
 
+/// Exposure of a run's frames as its loop knew it, s; 0 if it did not.
+fn exposure_s(meta: &RunMeta) -> f64 {
+    let table = |table: &toml::Table, key: &str| table.get(key)?.as_table().cloned();
+    let estimator = table(&meta.config, "controller").and_then(|c| table(&c, "estimator"));
+    let ms = estimator.and_then(|e| e.get("exposure_ms")?.as_float());
+    ms.map_or(0.0, |ms| 1e-3 * ms.max(0.0))
+}
+
 /// Whether the loop ran in a tick.
 fn held(t: &TickRecord) -> bool {
     t.is_controlled() && t.command_um.is_finite()
 }
 
-/// The rest of a held bead differs from day to day. If no record comes near the model's working point, that of the runs is used.
+/// The rest of a bead differs from day to day. If no record comes near the model's working point, that of the runs is used, else
+/// that of the records of `bead`: the command at which such a bead neither goes nor comes.
 /// Whether it was: it is then no better known than these records tell.
-pub(super) fn at_rest_of_runs(model: &mut Model, records: &[Record], rests_um: &[f64]) -> bool {
+pub(super) fn at_rest_of_records(
+    model: &mut Model,
+    records: &[Record],
+    rests_um: &[f64],
+    bead: bool,
+) -> bool {
     let inside = records.iter().any(|r| {
         let (low, high) = r.pzt_range_um();
         (low..=high).contains(&model.working_point_um)
     });
-    if inside || rests_um.is_empty() {
+    let gain_per_s = model.plant.velocity_gain_at(Hertz(2.0));
+    let of_records: Vec<f64> = match rests_um.is_empty() && bead && !in_volts(model, records) {
+        true => records.iter().map(|r| neutral_um(r, gain_per_s)).collect(),
+        false => rests_um.to_vec(),
+    };
+    if inside || of_records.is_empty() {
         return false;
     }
-    let rest_um = rests_um.iter().sum::<f64>() / rests_um.len() as f64;
+    let rest_um = of_records.iter().sum::<f64>() / of_records.len() as f64;
     tracing::warn!(
-        "the model's working point, {} um, lies outside what was commanded: the bead of these runs rested at {rest_um:.3} um, \
+        "the model's working point, {} um, is outside of what was commanded: the bead of these records rested at {rest_um:.3} um, \
          which is taken instead",
         model.working_point_um
     );
     model.working_point_um = rest_um;
     true
+}
+
+/// Whether the commands look like volts: at 4 um per volt they would be at the model's working point.
+fn in_volts(model: &Model, records: &[Record]) -> bool {
+    cellpos_reconcile::looks_like_volts(records, model.working_point_um)
 }
 
 /// A run shows its bead late by the camera path. If the model states that delay, it is added as an effect here; otherwise it

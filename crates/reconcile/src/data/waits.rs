@@ -1,0 +1,87 @@
+//! How long frames waited for their command.
+//!
+//! A loop that keeps the clock's time uses a frame when its own step begins: as camera and clock drift apart, frames wait for up to a
+//! third of a period, for seconds. That is no property of the rig, and its size is known from the stamps. A fit that does not know it
+//! finds another delay in every record.
+
+use crate::data::record::Record;
+
+/// Rows of the running median: long against the jitter of single frames, short against the drift of two clocks.
+const ROWS: usize = 51;
+/// Waits below this part of a row are the jitter of the stamps.
+const LEAST: f64 = 0.01;
+/// Share of the rows that are taken to have waited least: their age is that of the camera's path alone.
+const YOUNGEST: f64 = 0.1;
+
+/// Waits of the rows of every record \[s\]; none for a record without ages, and for all if no frame waited.
+pub(crate) fn waits(records: &[Record]) -> Vec<Vec<f64>> {
+    let mut ages: Vec<Vec<f64>> = records.iter().map(|r| smooth(&r.frame_age_s)).collect();
+    let mut sorted: Vec<f64> = ages.iter().flatten().copied().collect();
+    sorted.sort_by(f64::total_cmp);
+    let Some(&youngest_s) = sorted.get((YOUNGEST * sorted.len() as f64) as usize) else {
+        return ages;
+    };
+    for (ages, r) in ages.iter_mut().zip(records) {
+        ages.iter_mut().for_each(|age| *age -= youngest_s);
+        if ages.iter().all(|age| age.abs() < LEAST * r.sample_s) {
+            ages.clear();
+        }
+    }
+    ages
+}
+
+/// The median of the known ages about each row; before the first known one the first.
+fn smooth(age_s: &[f64]) -> Vec<f64> {
+    let mut before = match age_s.iter().find(|age| age.is_finite()) {
+        Some(first) => *first,
+        None => return Vec::new(),
+    };
+    let half = ROWS / 2;
+    (0..age_s.len())
+        .map(|k| {
+            let near = &age_s[k.saturating_sub(half)..(k + half + 1).min(age_s.len())];
+            let mut known: Vec<f64> = near.iter().copied().filter(|a| a.is_finite()).collect();
+            if !known.is_empty() {
+                let middle = known.len() / 2;
+                before = *known.select_nth_unstable_by(middle, f64::total_cmp).1;
+            }
+            before
+        })
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn record(age_s: Vec<f64>) -> Record {
+        let time_s: Vec<f64> = (0..age_s.len()).map(|k| k as f64 * 1e-3).collect();
+        let still = vec![0.0; age_s.len()];
+        let record = Record::from_rows("r", &time_s, &still, &still);
+        Record {
+            frame_age_s: age_s,
+            ..record.unwrap_or_else(|e| panic!("{e}"))
+        }
+    }
+
+    #[test]
+    fn waits_are_counted_from_the_youngest_frames_of_all_records_and_jitter_is_none() {
+        let jitter = |k: usize| 2e-5 * ((k * 7919) % 101) as f64 / 101.0;
+        let late = |k: usize| {
+            if (1000..1500).contains(&k) {
+                2.5e-4
+            } else {
+                0.0
+            }
+        };
+        let mut first: Vec<f64> = (0..2000).map(|k| 2e-3 + jitter(k) + late(k)).collect();
+        first[1200] = f64::NAN;
+        let second: Vec<f64> = (0..2000).map(|k| 2.1e-3 + jitter(k)).collect();
+        let all = waits(&[record(first.clone()), record(second), record(Vec::new())]);
+        assert!((all[0][1200] - 2.5e-4).abs() < 1e-5, "{}", all[0][1200]);
+        assert!(all[0][500].abs() < 1e-5 && (all[1][700] - 1e-4).abs() < 1e-5);
+        assert!(all[2].is_empty());
+        let calm: Vec<f64> = (0..2000).map(|k| 2e-3 + 0.3 * jitter(k)).collect();
+        assert!(waits(&[record(calm)])[0].is_empty());
+    }
+}
