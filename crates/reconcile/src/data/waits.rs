@@ -55,8 +55,8 @@ mod tests {
     use super::*;
 
     fn record(age_s: Vec<f64>) -> Record {
-        let time_s: Vec<f64> = (0..age_s.len()).map(|k| k as f64 * 1e-3).collect();
-        let still = vec![0.0; age_s.len()];
+        let time_s: Vec<f64> = (0..2000).map(|k| f64::from(k) * 1e-3).collect();
+        let still = vec![0.0; time_s.len()];
         let record = Record::from_rows("r", &time_s, &still, &still);
         Record {
             frame_age_s: age_s,
