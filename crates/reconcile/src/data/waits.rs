@@ -1,8 +1,8 @@
 //! How long frames waited for their command.
 //!
-//! A loop that keeps the clock's time uses a frame when its own step begins: as camera and clock drift apart, frames wait for up to a
-//! third of a period, for seconds. That is no property of the rig, and its size is known from the stamps. A fit that does not know it
-//! finds another delay in every record.
+//! A loop that keeps the clock's time uses a frame when its own step begins. As camera and clock drift apart, frames wait for up to a
+//! third of a period, for seconds at a time. This is no property of the rig, and the stamps tell its size. A fit that does not know
+//! the waits finds another delay in every record, and a lag that seems to vary with the amplitude.
 
 use crate::data::record::Record;
 

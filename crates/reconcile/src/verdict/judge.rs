@@ -54,8 +54,6 @@ pub(crate) fn judge(ctx: &Context<'_>, e: &Evidence<'_>, threads: usize) -> Judg
     let scatter = scatter(n);
     let excess = e.null.chi2 - n;
     let left = e.fit.chi2 - n;
-    // The size of the noise is itself known to a part only: what is left within it is no failure of the model.
-    let within_noise = excess <= THRESHOLDS.null_sd * scatter;
     let closed = if excess > 0.0 {
         1.0 - left.max(0.0) / excess
     } else {
@@ -86,8 +84,6 @@ pub(crate) fn judge(ctx: &Context<'_>, e: &Evidence<'_>, threads: usize) -> Judg
             // Missing frames are counted, whatever the rest is.
             out.verdict = Verdict::NamedWithRemainder;
             out.remainder = Some(remainder(ctx, e, &library, term, 1.0));
-        } else if beyond && within_noise {
-            out.reasons.push(too_small(excess / n));
         } else if beyond {
             out.verdict = Verdict::Unknown;
             out.reasons
@@ -112,10 +108,6 @@ pub(crate) fn judge(ctx: &Context<'_>, e: &Evidence<'_>, threads: usize) -> Judg
         .filter(|m| m.of_size)
         .map(|m| no_name(e.fit, &m.words));
     if let Some(reason) = refused.or(of_size) {
-        if within_noise && e.floor.source.is_known() && !e.counted {
-            out.reasons.push(too_small(excess / n));
-            return out;
-        }
         out.verdict = Verdict::Unknown;
         out.reasons.push(reason);
         describe(ctx, e.null, &battery::library(ctx, e.null), None, &mut out);
@@ -153,15 +145,6 @@ pub(crate) fn judge(ctx: &Context<'_>, e: &Evidence<'_>, threads: usize) -> Judg
         out.remainder = Some(left);
     }
     out
-}
-
-/// What is said of an excess, in parts of the noise's variance, that is within the uncertainty of the noise.
-fn too_small(excess: f64) -> String {
-    format!(
-        "a remainder of {:.1} % of the noise, too small to name: the noise itself is not known better",
-        // A share of the variance is half that of the RMS.
-        50.0 * excess.max(0.0)
-    )
 }
 
 /// That a set is no name, and why.

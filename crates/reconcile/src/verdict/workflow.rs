@@ -259,8 +259,8 @@ fn free_of_start(ctx: &Context<'_>, fit: &Fit) -> Vec<Vec<f64>> {
         .collect()
 }
 
-/// Takes back the whole set if there is nothing to explain: without it the records are no further from the model than the noise,
-/// and what it gains is less than what counts as left over.
+/// Takes back the whole set if there is nothing to explain. Without it the records are then no further from the model than the
+/// noise, and the set gains less than a term that counts as left over.
 fn explains_something(found: &mut Found) {
     let excess = found.null.chi2 - found.null.count as f64;
     let gained = found.null.chi2 - found.fit.chi2;

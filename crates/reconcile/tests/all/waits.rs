@@ -19,7 +19,7 @@ fn wait_s(row: usize) -> f64 {
     }
 }
 
-/// Eq. (6) on a grid of 50 us; frames that average over their exposure; walk and localisation noise.
+/// Eq. (6) on a grid of 50 us, with frames that average over their exposure, walk and localisation noise.
 fn record(seed: u64) -> Record {
     let lines = [1.5, 4.5, 12.5, 33.5, 87.5, 197.5, 293.5];
     let pzt_um: Vec<f64> = (0..ROWS)
@@ -53,7 +53,7 @@ fn record(seed: u64) -> Record {
     Record::from_rows("waits", &time_s, &pzt_um, &bead_um).unwrap()
 }
 
-/// The same with what the loop knows of its frames.
+/// The same with the ages and the exposure of its frames, as a loop knows them.
 fn with_frames(record: &Record) -> Record {
     Record {
         frame_age_s: (0..ROWS).map(|k| 2e-3 + wait_s(k)).collect(),
@@ -88,7 +88,7 @@ fn a_delay_is_that_of_the_rig_whatever_its_frames_waited_and_a_second_pass_finds
         "{:?}",
         again.effects
     );
-    // Without what the loop knows the delay of this record is another one.
+    // Without ages and exposure this record has another delay.
     let blind = delay(&look(&Model::eq6(), record)).0;
     assert!(blind > DELAY_S + 5e-5, "{blind}");
 }
