@@ -83,3 +83,17 @@ def test_values_that_cannot_be_are_named(rigs, text, said):
     (rigs / "wrong.toml").write_text(f'[actuator]\nkind = "emulated-pressure"\n{text}\n')
     with pytest.raises(cellpos.Failed, match=said):
         cellpos.track("0um", rig="wrong.toml", cwd=rigs).wait()
+
+
+def test_identify_finds_the_regulator_and_the_tube(rigs):
+    options = {"rig": "tube.toml", "model": "integrator.toml", "frames": "off", "led_edges": 0, "out": "m.toml"}
+    result = cellpos.identify(seed=1, cwd=rigs, **options).result
+    assert result["model_formula"] == "K/(s (1 + s/p)(1 + s/r)) e^(-sL)"
+    parameters = result["parameters"]
+    for name, truth in (("gain_per_s", 428.0), ("pair_pole_rad_per_s", 20.0), ("second_pole_rad_per_s", 50.0)):
+        low, high = parameters[name]["ci95"]
+        assert low <= truth <= high and high - low < 0.2 * truth, (name, parameters[name])
+    # The plant that was found holds the bead as the one that was told does.
+    told, _ = held(rigs, "tube.toml", "lqg", "integrator.toml")
+    found, _ = held(rigs, "tube.toml", "lqg", "m.toml")
+    assert found < 1.05 * told, (found, told)

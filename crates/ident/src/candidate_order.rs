@@ -10,6 +10,10 @@ pub enum CandidateOrder {
     Integrator,
     /// With a pole-zero pair.
     PoleZeroPair,
+    /// With two lags in the pair's place: a regulator and a tube that stretches. No far zero: such a plant moves nothing at once.
+    TwoLags,
+    /// With two lags and a zero.
+    TwoLagsZero,
     /// With the pair and the far zero (a feedthrough).
     FarZero,
     /// All of Eq. (4): with the slow pole too.
@@ -18,9 +22,11 @@ pub enum CandidateOrder {
 
 impl CandidateOrder {
     /// All orders, lowest first.
-    pub const ALL: [CandidateOrder; 4] = [
+    pub const ALL: [CandidateOrder; 6] = [
         CandidateOrder::Integrator,
         CandidateOrder::PoleZeroPair,
+        CandidateOrder::TwoLags,
+        CandidateOrder::TwoLagsZero,
         CandidateOrder::FarZero,
         CandidateOrder::Eq4,
     ];
@@ -29,10 +35,29 @@ impl CandidateOrder {
     pub fn parameters(self) -> usize {
         match self {
             CandidateOrder::Integrator => 2,
-            CandidateOrder::PoleZeroPair => 4,
+            CandidateOrder::PoleZeroPair | CandidateOrder::TwoLags => 4,
+            CandidateOrder::TwoLagsZero => 5,
             CandidateOrder::FarZero => 6,
             CandidateOrder::Eq4 => 7,
         }
+    }
+
+    /// The order of which this one is a case with more parameters.
+    pub fn below(self) -> Option<Self> {
+        match self {
+            CandidateOrder::Integrator => None,
+            CandidateOrder::PoleZeroPair | CandidateOrder::TwoLags => {
+                Some(CandidateOrder::Integrator)
+            }
+            CandidateOrder::TwoLagsZero => Some(CandidateOrder::TwoLags),
+            CandidateOrder::FarZero => Some(CandidateOrder::PoleZeroPair),
+            CandidateOrder::Eq4 => Some(CandidateOrder::FarZero),
+        }
+    }
+
+    /// Whether it has two lags.
+    pub fn two_lags(self) -> bool {
+        matches!(self, CandidateOrder::TwoLags | CandidateOrder::TwoLagsZero)
     }
 
     /// The model as a formula.
@@ -40,6 +65,8 @@ impl CandidateOrder {
         match self {
             CandidateOrder::Integrator => "K e^(-sL)/s",
             CandidateOrder::PoleZeroPair => "K (1 + s/z)/(s (1 + s/p)) e^(-sL)",
+            CandidateOrder::TwoLags => "K/(s (1 + s/p)(1 + s/r)) e^(-sL)",
+            CandidateOrder::TwoLagsZero => "K (1 + s/z)/(s (1 + s/p)(1 + s/r)) e^(-sL)",
             CandidateOrder::FarZero => "K (1 + s/z)(1 + s/f)/(s (1 + s/p)) e^(-sL)",
             CandidateOrder::Eq4 => "K (1 + s/z)(1 + s/f)/((s + q)(1 + s/p)) e^(-sL), Eq. (4)",
         }
@@ -47,7 +74,7 @@ impl CandidateOrder {
 }
 
 /// Index of each parameter in a parameter vector: `ln K`, effective delay (ms), `ln z`, `ln p`, far lead (ms),
-/// share of the feedthrough one row later, slow pole (rad/s).
+/// share of the feedthrough one row later, slow pole (rad/s). With two lags: `ln K`, effective delay (ms), `ln r`, `ln p`, `ln z`.
 pub mod index {
     /// `ln` of the integrator gain in 1/s.
     pub const LN_GAIN: usize = 0;
@@ -57,6 +84,10 @@ pub mod index {
     pub const LN_ZERO: usize = 2;
     /// `ln` of the pair's pole in rad/s.
     pub const LN_POLE: usize = 3;
+    /// `ln` of the second lag's pole in rad/s.
+    pub const LN_SECOND_POLE: usize = 2;
+    /// `ln` of the zero beside two lags in rad/s.
+    pub const LN_ZERO_OF_LAGS: usize = 4;
     /// Lead of the far zero, ms.
     pub const FAR_LEAD_MS: usize = 4;
     /// Share of the feedthrough that shows one row later (a nuisance, see the model).
@@ -126,6 +157,13 @@ impl CandidateFits {
 pub fn model_of(x: &[f64], order: CandidateOrder) -> CandidateModel {
     let mut model =
         CandidateModel::integrator(x[index::LN_GAIN].exp(), x[index::EFFECTIVE_DELAY_MS] * 1e-3);
+    if order.two_lags() {
+        model.second_pole_rad_per_s = Some(x[index::LN_SECOND_POLE].exp());
+        model.pole_rad_per_s = x[index::LN_POLE].exp();
+        let zero = x.get(index::LN_ZERO_OF_LAGS);
+        model.zero_rad_per_s = zero.map_or(f64::INFINITY, |ln| ln.exp());
+        return model;
+    }
     if order >= CandidateOrder::PoleZeroPair {
         model.zero_rad_per_s = x[index::LN_ZERO].exp();
         model.pole_rad_per_s = x[index::LN_POLE].exp();

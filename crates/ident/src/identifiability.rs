@@ -209,7 +209,13 @@ pub fn judge(
         },
     });
 
-    let lead = lead_ms.unwrap_or([0.0, f64::INFINITY]);
+    let two_lags = best.order.two_lags();
+    // A plant with two lags has no far zero that could trade against the delay.
+    let lead = if two_lags {
+        [0.0; 2]
+    } else {
+        lead_ms.unwrap_or([0.0, f64::INFINITY])
+    };
     let phase_low = effective + lead[0] - half;
     let phase_high = effective + lead[1] + half;
     let phase95_s = [phase_low * 1e-3, phase_high * 1e-3];
@@ -221,13 +227,15 @@ pub fn judge(
         contradicted(&mut delay, prior, [phase_low, phase_high], gap_s);
     }
     parameters.push(delay);
-    parameters.push(far_zero_parameter(
-        fit, &model, agreed, lead, half, period_ms,
-    ));
+    if !two_lags {
+        parameters.push(far_zero_parameter(
+            fit, &model, agreed, lead, half, period_ms,
+        ));
+    }
     if let Some(full) = fit
         .candidates
         .iter()
-        .find(|r| r.order == CandidateOrder::Eq4)
+        .find(|r| r.order == CandidateOrder::Eq4 && !two_lags)
     {
         parameters.push(slow_pole_parameter(
             full.parameters[index::SLOW_POLE],
@@ -294,19 +302,24 @@ fn contradicted(
 /// Zero and pole of the pair, where a fit has them.
 fn pair_parameters(fit: &CandidateFits, t: f64, drawn: &Drawn) -> Vec<IdentifiedParameter> {
     let best = fit.best();
+    let pole = (
+        "pair_pole_rad_per_s",
+        "pole of the pole-zero pair",
+        index::LN_POLE,
+    );
+    let zero = |i| ("pair_zero_rad_per_s", "zero of the pole-zero pair", i);
+    let second = (
+        "second_pole_rad_per_s",
+        "pole of a second lag, such as a tube that stretches",
+        index::LN_SECOND_POLE,
+    );
+    let wanted = match best.order {
+        CandidateOrder::TwoLags => vec![pole, second],
+        CandidateOrder::TwoLagsZero => vec![zero(index::LN_ZERO_OF_LAGS), pole, second],
+        _ => vec![zero(index::LN_ZERO), pole],
+    };
     let mut found = Vec::new();
-    for (name, meaning, i) in [
-        (
-            "pair_zero_rad_per_s",
-            "zero of the pole-zero pair",
-            index::LN_ZERO,
-        ),
-        (
-            "pair_pole_rad_per_s",
-            "pole of the pole-zero pair",
-            index::LN_POLE,
-        ),
-    ] {
+    for (name, meaning, i) in wanted {
         let source = if best.order >= CandidateOrder::PoleZeroPair {
             Some(best)
         } else {
@@ -356,7 +369,7 @@ fn with_prior(
     let far = fit
         .candidates
         .iter()
-        .find(|r| r.order == CandidateOrder::FarZero);
+        .find(|r| r.order == CandidateOrder::FarZero && !best.order.two_lags());
     let Some(far) = far else {
         let found = with.fit_from(&data, best.order, &best.parameters, None);
         return model_of(&found.parameters, best.order);

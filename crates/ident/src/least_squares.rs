@@ -75,8 +75,12 @@ impl<F: Fn(&[f64], &mut [f64])> LeastSquaresProblem<f64, Dyn, Dyn> for Problem<'
     }
 
     fn residuals(&self) -> Option<DVector<f64>> {
-        let r = self.evaluate(self.x.as_slice());
-        r.iter().all(|v| v.is_finite()).then_some(r)
+        // A step to where the model has no value is worse than any other: it is taken back and shortened.
+        let worst = 1e100;
+        Some(
+            self.evaluate(self.x.as_slice())
+                .map(|v| if v.is_finite() { v } else { worst }),
+        )
     }
 
     fn jacobian(&self) -> Option<DMatrix<f64>> {

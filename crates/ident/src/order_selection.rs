@@ -1,7 +1,7 @@
 //! Fit of candidate models of rising order to a frequency response, and the choice of the order that the data support.
 //!
 //! Complex, weighted least squares on the record's response (hold, delay and exposure are in the model, not removed from the data).
-//! Candidates: integrator with delay; with a pole-zero pair; with the far zero; full Eq. (4). A higher order is
+//! Candidates: integrator with delay; with a pole-zero pair; with two lags, and with a zero beside them; with the far zero; full Eq. (4). A higher order is
 //! taken only when an F-test rejects the lower one (1 %), AICc falls, and the fit to one half of the blocks predicts
 //! the other half better. The quality of a parameter comes from [`crate::identifiability`].
 
@@ -229,6 +229,20 @@ impl<'a> OrderSelection<'a> {
                     }
                 }
             }
+            (CandidateOrder::TwoLags, Some(x)) => {
+                let (low, high) = self.band_rad_per_s();
+                let at = |share: f64| low.ln() + share * (high / low).ln();
+                // The integrator's delay did for the lags.
+                for (second, first) in [(0.9, 0.4), (0.9, 0.7), (0.7, 0.5), (1.1, 0.9)] {
+                    extend(&[x[0], 0.0], &[at(second), at(first)]);
+                }
+            }
+            (CandidateOrder::TwoLagsZero, Some(x)) => {
+                let (low, high) = self.band_rad_per_s();
+                for share in [0.3, 0.6, 0.9, 1.2] {
+                    extend(x, &[low.ln() + share * (high / low).ln()]);
+                }
+            }
             (CandidateOrder::FarZero, Some(x)) => {
                 // First with the lead held: where the delay crosses half a sample the feedthrough moves to another
                 // row at once, and a long first step would cross into the wrong one.
@@ -260,7 +274,16 @@ impl<'a> OrderSelection<'a> {
             .iter()
             .map(|s| self.fit_from(data, order, s, None))
             .filter(sane);
-        fits.min_by(|a, b| a.chi2.total_cmp(&b.chi2))
+        let best = fits.min_by(|a, b| a.chi2.total_cmp(&b.chi2))?;
+        // The slower of two lags comes first.
+        let swapped = order.two_lags()
+            && best.parameters[index::LN_SECOND_POLE] < best.parameters[index::LN_POLE];
+        if !swapped {
+            return Some(best);
+        }
+        let mut start = best.parameters.clone();
+        start.swap(index::LN_POLE, index::LN_SECOND_POLE);
+        Some(self.fit_from(data, order, &start, None))
     }
 
     fn band_rad_per_s(&self) -> (f64, f64) {
@@ -279,11 +302,15 @@ impl<'a> OrderSelection<'a> {
             if 2 * self.points.len() <= order.parameters() {
                 break;
             }
-            let below = out.last().map(|(_, m)| m.parameters.clone());
-            let Some(found) = self.fit_rung(data, order, below.as_deref()) else {
-                break;
-            };
-            out.push((order, found));
+            let below = (out.iter())
+                .find(|(other, _)| Some(*other) == order.below())
+                .map(|(_, m)| m.parameters.clone());
+            if order.below().is_some() && below.is_none() {
+                continue;
+            }
+            if let Some(found) = self.fit_rung(data, order, below.as_deref()) {
+                out.push((order, found));
+            }
         }
         out
     }
@@ -353,7 +380,8 @@ impl<'a> OrderSelection<'a> {
         let mut orders: Vec<CandidateFit> = Vec::new();
         for ((order, m), held_out) in fits.into_iter().zip(held_out) {
             let k = order.parameters() as f64;
-            let step_p_value = orders.last().map_or(1.0, |below| {
+            let below = orders.iter().find(|o| Some(o.order) == order.below());
+            let step_p_value = below.map_or(1.0, |below| {
                 let gained =
                     (below.chi2 - m.chi2).max(0.0) / (k - below.order.parameters() as f64) / scale;
                 f_exceeds(
@@ -390,10 +418,17 @@ impl<'a> OrderSelection<'a> {
         for i in 1..orders.len() {
             let (low, high) = (&orders[chosen], &orders[i]);
             let more = (high.order.parameters() - low.order.parameters()) as f64;
-            let gained = (low.chi2 - high.chi2).max(0.0) / more / scale;
-            let p_value = f_exceeds(gained, more, interval_dof.min(1e4));
+            // Of two orders with as many parameters neither is a case of the other: the data alone decide.
+            let p_value = if more > 0.0 {
+                let gained = (low.chi2 - high.chi2).max(0.0) / more / scale;
+                f_exceeds(gained, more, interval_dof.min(1e4))
+            } else {
+                0.0
+            };
             // Eq. (1)-(3) are passive: an order that explains more with an unstable pole has found something else.
-            let passive = high.model.slow_pole_rad_per_s >= 0.0;
+            // Nor does a bead answer before the command.
+            let passive = high.model.slow_pole_rad_per_s >= 0.0
+                && (high.model.delay_s >= 0.0 || !high.order.two_lags());
             if p_value < 0.01 && high.aicc < low.aicc && high.held_out < low.held_out && passive {
                 chosen = i;
             }

@@ -332,6 +332,12 @@ impl Identification {
         let best = self.judged.model;
         let order = if best.slow_pole_rad_per_s != 0.0 {
             CandidateOrder::Eq4
+        } else if best.second_pole_rad_per_s.is_some() {
+            if best.zero_rad_per_s.is_finite() {
+                CandidateOrder::TwoLagsZero
+            } else {
+                CandidateOrder::TwoLags
+            }
         } else if best.far_lead_s != 0.0 {
             CandidateOrder::FarZero
         } else if best.zero_rad_per_s != best.pole_rad_per_s {
@@ -358,7 +364,13 @@ impl Identification {
             ),
             (index::SLOW_POLE, best.slow_pole_rad_per_s),
         ];
-        for (i, value) in values {
+        let lags = best.second_pole_rad_per_s.map(|second| {
+            [
+                (index::LN_SECOND_POLE, second.ln()),
+                (index::LN_ZERO_OF_LAGS, best.zero_rad_per_s.ln()),
+            ]
+        });
+        for (i, value) in values.into_iter().chain(lags.into_iter().flatten()) {
             if let Some(place) = x.get_mut(i) {
                 *place = value;
             }
