@@ -42,14 +42,47 @@ pub fn setup_of(meta: &RunMeta, name: &str) -> Result<Setup, Failure> {
     })
 }
 
+/// The emulated world, if the camera was emulated.
+fn emulated(meta: &RunMeta) -> Option<&toml::Value> {
+    let rig = meta.config.get("rig")?;
+    let camera = rig.get("camera")?.get("kind")?.as_str()?;
+    rig.get("emulator").filter(|_| camera == "emulated")
+}
+
+/// Whether a cell was followed rather than a bead.
+pub fn followed_a_cell(meta: &RunMeta) -> bool {
+    let place = emulated(meta).or_else(|| meta.config.get("rig"));
+    place.is_some_and(|place| place.get("cell").is_some())
+}
+
 /// Diffusion coefficient of the bead, um^2/s: the emulator's, or the model's where the rig was real.
 pub fn diffusion_of_run_um2_per_s(meta: &RunMeta) -> Option<f64> {
-    let rig = meta.config.get("rig");
-    let camera = rig.and_then(|rig| rig.get("camera")?.get("kind")?.as_str());
-    let place = if camera == Some("emulated") {
-        rig?.get("emulator")?
-    } else {
-        meta.model.get("noise")?
+    let place = match emulated(meta) {
+        Some(world) => world,
+        None => meta.model.get("noise")?,
     };
     place.get("diffusion_um2_per_s")?.as_float()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_run_tells_whether_it_followed_a_cell() {
+        let of = |rig: &str| {
+            let mut meta = RunMeta::new("a", "real");
+            meta.config = rig.parse().expect("TOML");
+            followed_a_cell(&meta)
+        };
+        let emulated = "[rig.camera]\nkind = \"emulated\"\n[rig.emulator]\nseed = 1\n";
+        assert!(!of(emulated));
+        assert!(of(&format!("{emulated}[rig.emulator.cell]\ngain = 1.5\n")));
+        let real = "[rig.camera]\nkind = \"socket\"\n[rig.emulator.cell]\ngain = 1.5\n";
+        assert!(!of(real), "the emulated world is not in use");
+        assert!(of(&format!(
+            "{real}[rig.cell]\nbackground = \"empty.tif\"\n"
+        )));
+        assert!(!of(""));
+    }
 }

@@ -168,9 +168,10 @@ export function drawCycles(canvas, cycles) {
     const top = n * tall + 3;
     const x = c => left + (c - 1) / (end - 1) * (width - left - 8), y = v => top + (high - v) / (high - low) * (tall - 8);
     context.strokeStyle = colour("line"); context.fillStyle = colour("quiet"); context.textAlign = "right"; context.textBaseline = "middle";
-    for (const v of steps(low, high, 3)) {
+    const marks = steps(low, high, 3), step = marks.length > 1 ? marks[1] - marks[0] : (high - low) / 10;
+    for (const v of marks) {
       context.beginPath(); context.moveTo(left, y(v)); context.lineTo(width - 8, y(v)); context.stroke();
-      context.fillText(number(v, high - low), left - 5, y(v));
+      context.fillText(number(v, 100 * step), left - 5, Math.max(top + 4, y(v))); // the digits that tell two marks apart
     }
     context.fillStyle = colour(strip.paint);
     for (const [c, v] of strip.points) context.fillRect(x(c) - 2, y(v) - 2, 4, 4);

@@ -108,7 +108,12 @@ export class TraceView {
     }
   }
   draw() {
-    const [from, to] = this.span();
+    const [from, to] = this.span(), panels = this.chosen().size;
+    // As much room for each of many panels as for one of three.
+    if (this.$("traces").dataset.panels !== String(panels)) {
+      this.$("traces").dataset.panels = panels;
+      this.$("traces").style.height = panels > 3 ? `calc(${panels} * var(--panel))` : "";
+    }
     this.traces.draw(from, to, this.mark);
     this.$("cursor").textContent = this.traces.read() ?? "Point at the traces to read values. Wheel: zoom; drag: move; wheel over the numbers: that panel's scale; double click: back.";
     // A panel without data is no choice.

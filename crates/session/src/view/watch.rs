@@ -72,6 +72,7 @@ impl Watch {
         };
         let mut hello = hello_of(&setup, diffusion, &page);
         hello.recorded = true;
+        hello.cell = meta.is_some_and(recorded::followed_a_cell);
         let most_waiting = (HELD_S * 1e6 / hello.period_us) as usize;
         let adaptation_at = hello.adaptation_at;
         let (feed, hub) = Feed::new(hello);
