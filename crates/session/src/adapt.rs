@@ -27,6 +27,7 @@ pub fn text(now: &Adaptation) -> String {
         AdaptMode::Learning => "learning",
         AdaptMode::Known => "known",
         AdaptMode::Uncertain => "uncertain",
+        AdaptMode::AtLimit => "at the end of its range",
     };
     let found = now.gain_estimate.map_or_else(String::new, |[gain, sd]| {
         format!(", estimated {gain:.2} +- {:.2}", 1.96 * sd)
@@ -42,7 +43,12 @@ pub(crate) fn recorded(columns: &[f32]) -> Option<Adaptation> {
     let [gain, delay_samples, found, sd, mode, ..] = *columns else {
         return None;
     };
-    let modes = [AdaptMode::Learning, AdaptMode::Known, AdaptMode::Uncertain];
+    let modes = [
+        AdaptMode::Learning,
+        AdaptMode::Known,
+        AdaptMode::Uncertain,
+        AdaptMode::AtLimit,
+    ];
     let mode = modes.into_iter().find(|m| f32::from(*m as u8) == mode)?;
     let known = found.is_finite() && sd.is_finite();
     Some(Adaptation {
@@ -119,6 +125,8 @@ mod tests {
             text(&now),
             "tuned to 0.50 of the model's gain, estimated 0.75 +- 0.04, +1.0 samples of delay; uncertain"
         );
+        let limit = recorded(&[2.5, 1.5, 3.1, 0.1, 3.0, 0.0]).expect("a tick that adapts");
+        assert!(text(&limit).ends_with("; at the end of its range"));
         let unknown = recorded(&[1.0, 0.0, f32::NAN, f32::NAN, 0.0]).expect("too little motion");
         assert!(!text(&unknown).contains("estimated"));
         assert_eq!(recorded(&[f32::NAN; 6]), None);

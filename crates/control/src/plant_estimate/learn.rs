@@ -117,9 +117,8 @@ impl Adapter {
         let usual_um2 = state.noise.usual_um2;
         // The usual mean square may hold a line that is cancelled by now; a bead that is held wanders less than a free one as well.
         let wanders_um2 = usual_um2.min(self.whitener.noise_um2);
-        let still =
-            state.noise.fixes > 2.0 * NOW_FIXES && state.noise.left(gain) < STILL * wanders_um2;
-        if still {
+        if state.noise.fixes > 2.0 * NOW_FIXES && state.noise.left(gain) < STILL * wanders_um2 {
+            state.force.wait();
             return false;
         }
         let believed = match state.evidence.found {
@@ -151,13 +150,12 @@ impl Adapter {
             y_um,
             p_um,
             x_um,
-            left_um,
             weight: 1.0 / far.max(1.0),
         });
         if complete {
             state.colour.solve();
             let fix_s = self.interval * self.sample_s;
-            (state.evidence).conclude(fix_s, believed, late, -delay);
+            state.evidence.conclude(fix_s, believed);
         }
         true
     }

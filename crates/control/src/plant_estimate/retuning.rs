@@ -1,9 +1,9 @@
 //! The tuning follows the estimate.
 //!
-//! Towards caution (more gain than believed) at once and all the way; towards boldness slowly, and to the near end of the estimate's
-//! interval only. While the two agree the tuning settles at the estimate, no faster than the estimate itself changes.
+//! Towards caution (more gain than tuned for) at once, towards boldness slowly, and both to the cautious side of the estimate. While the two
+//! agree the tuning settles there, no faster than the estimate itself changes.
 
-use super::evidence::Finding;
+use super::belief::Finding;
 use serde::Serialize;
 
 /// Where the tuning stands.
@@ -19,6 +19,8 @@ pub enum AdaptMode {
     Known = 1,
     /// The estimate has left the tuning in force, which is on its way to it.
     Uncertain = 2,
+    /// The estimate is beyond the gains or delays that the law can be tuned to. The tuning is at the end of its range.
+    AtLimit = 3,
 }
 
 /// Delays that the law can be tuned to, beyond the design's, samples.
@@ -29,24 +31,24 @@ pub(super) const TUNINGS: usize = 6;
 pub(super) const NOMINAL: usize = 2;
 /// Gains, over the design's, that the law is tuned to.
 const GAINS: [f64; 2] = [0.4, 2.5];
-/// Distance from the estimate at which the tuning sets out, towards caution and towards boldness, standard deviations. If the logarithm is
-/// known to [`VAGUE`] only, it is twice that. The way towards boldness ends at [`ARRIVED`].
-const SET_OUT: [f64; 2] = [1.5, 2.0];
+/// The tuning is for the gain that the plant exceeds with a probability of a third: a gain above the one tuned for costs margin, one below
+/// it a little hold error. Standard deviations of a normal distribution.
+const CAUTIOUS: f64 = 0.43;
+/// Distance from there at which the tuning sets out, standard deviations. If the logarithm is known to [`VAGUE`] only, it is twice that.
+const SET_OUT: f64 = 1.5;
 const VAGUE: f64 = 0.2;
-const ARRIVED: f64 = 0.7;
 /// Ticks in which the tuning settles at an estimate that it agrees with: less than the estimate needs to change.
 const SETTLE_TICKS: f64 = 1500.0;
 /// Largest change per tick of the logarithm of the gain in force, upwards and downwards.
 const UP_PER_TICK: f64 = 0.15;
 const DOWN_PER_TICK: f64 = 0.001;
-/// Logarithm of the likelihood ratio that makes a delay longer, and shorter.
+/// Logarithm of the odds that makes a delay longer, and shorter. A change that is reported must be as sure as the latter.
 const DELAY_SURE: [f64; 2] = [3.0, 8.0];
 /// Ticks between two changes of the delay.
 const DELAY_TICKS: u16 = 20;
-/// A change of the gain that is reported: of its logarithm, and of how many standard deviations. The tuning, and a standard deviation of the
-/// estimate, must first be within half of that change of the estimate, so that one step is reported once.
+/// A change of the gain that is reported, by its logarithm. The tuning, and a standard deviation of the estimate, must first be within half
+/// of that change of the estimate, so that one step is reported once.
 const REPORTED_GAIN: f64 = 0.14;
-const REPORTED_SURE: f64 = 5.0;
 
 /// A change of the tuning that a run reports.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -82,6 +84,14 @@ pub(super) struct Retuning {
     away: u64,
 }
 
+/// What a tick does to the delay in force.
+enum DelayStep {
+    None,
+    Taken,
+    /// The law cannot be tuned to the delay that the estimate asks for.
+    Blocked,
+}
+
 impl Default for Retuning {
     fn default() -> Self {
         Self {
@@ -112,55 +122,55 @@ impl Retuning {
             self.wait();
             return;
         };
-        let (off, sd) = (found.log_gain() - self.log_gain, found.log_sd());
-        let near = off.min(0.0) + ARRIVED * sd;
-        self.moving = if self.moving {
-            off > 0.0 || near < 0.0
+        let sd = found.log_sd;
+        let off = found.log_gain + CAUTIOUS * sd - self.log_gain;
+        let reach = if self.moving {
+            0.0
         } else {
-            off.abs() > SET_OUT[usize::from(off < 0.0)] * (1.0 + (sd / VAGUE).powi(2)) * sd
+            SET_OUT * (1.0 + (sd / VAGUE).powi(2)) * sd
         };
-        self.go(match self.moving {
-            true if off > 0.0 => off,
-            true => near.min(0.0),
-            false => off / SETTLE_TICKS,
-        });
-        self.moving &= off.abs() > UP_PER_TICK || off < 0.0;
-        let delay_moves = self.follow_delay(found, usable);
-        self.mode = if self.moving || delay_moves {
-            AdaptMode::Uncertain
-        } else {
-            AdaptMode::Known
+        let moving = off.abs() > reach;
+        self.go(if moving { off } else { off / SETTLE_TICKS });
+        self.moving = moving && off < -DOWN_PER_TICK;
+        // The range ends short of the estimate by more than its uncertainty.
+        let beyond = off.abs() > sd && self.log_gain == self.log_gain_after(off);
+        self.mode = match self.follow_delay(found, usable) {
+            DelayStep::Blocked => AdaptMode::AtLimit,
+            _ if beyond => AdaptMode::AtLimit,
+            DelayStep::Taken => AdaptMode::Uncertain,
+            DelayStep::None if self.moving => AdaptMode::Uncertain,
+            DelayStep::None => AdaptMode::Known,
         };
     }
 
     /// Towards another gain, by the logarithm, no faster than it may.
     pub(super) fn go(&mut self, way: f64) {
-        self.log_gain = (self.log_gain + way.clamp(-DOWN_PER_TICK, UP_PER_TICK))
-            .clamp(GAINS[0].ln(), GAINS[1].ln());
+        self.log_gain = self.log_gain_after(way);
     }
 
-    fn follow_delay(&mut self, found: &Finding, usable: &[bool; TUNINGS]) -> bool {
-        let off = found.delay - DELAYS[self.member];
-        let next = if off > 0.0 {
+    /// Where that leads, within [`GAINS`].
+    fn log_gain_after(&self, way: f64) -> f64 {
+        (self.log_gain + way.clamp(-DOWN_PER_TICK, UP_PER_TICK)).clamp(GAINS[0].ln(), GAINS[1].ln())
+    }
+
+    fn follow_delay(&mut self, found: &Finding, usable: &[bool; TUNINGS]) -> DelayStep {
+        let [longer, shorter] = found.delay_odds(DELAYS[self.member]);
+        let next = if longer > DELAY_SURE[0] {
             self.member + 1
-        } else {
+        } else if shorter > DELAY_SURE[1] {
             self.member.wrapping_sub(1)
+        } else {
+            return DelayStep::None;
         };
-        // Half way to the next, less towards caution.
-        let half = if off > 0.0 { 0.2 } else { 0.3 };
-        if off.abs() < half
-            || self.since_delay < DELAY_TICKS
-            || !usable.get(next).copied().unwrap_or(false)
-        {
-            return false;
+        if !usable.get(next).copied().unwrap_or(false) {
+            return DelayStep::Blocked;
         }
-        let sure = DELAY_SURE[usize::from(off < 0.0)];
-        if found.ratio(DELAYS[next], DELAYS[self.member]) < sure {
-            return false;
+        if self.since_delay < DELAY_TICKS {
+            return DelayStep::None;
         }
         self.member = next;
         self.since_delay = 0;
-        true
+        DelayStep::Taken
     }
 
     /// The change to report after this tick, if any.
@@ -174,16 +184,14 @@ impl Retuning {
             0
         };
         let found = found?;
-        let off = (found.log_gain() - self.log_gain).abs();
-        if self.moving || off.max(found.log_sd()) > 0.5 * REPORTED_GAIN {
+        let off = (found.log_gain - self.log_gain).abs();
+        if self.moving || off.max(found.log_sd) > 0.5 * REPORTED_GAIN {
             return None;
         }
-        let sure = (found.log_gain() - reported_gain).abs() > REPORTED_SURE * found.log_sd();
+        let sure = found.gain_odds(reported_gain, 0.5 * REPORTED_GAIN) > DELAY_SURE[1];
         let gain = gain_off > REPORTED_GAIN && sure;
-        let late = DELAYS[self.member] - DELAYS[reported_member];
-        let delay = late.abs() >= 0.5
-            && found.ratio(found.delay, DELAYS[reported_member])
-                > 0.5 * REPORTED_SURE * REPORTED_SURE;
+        let odds = found.delay_odds(DELAYS[reported_member]);
+        let delay = self.member != reported_member && odds[0].max(odds[1]) > DELAY_SURE[1];
         if !(gain || delay) {
             return None;
         }

@@ -296,7 +296,7 @@ pub const OF_LAWS: &[(&str, &str)] = &[
     ("adapt_gain_sd", "Standard deviation of the estimated gain."),
     (
         "adapt_mode",
-        "What is known of the plant: 0 learning, 1 known, 2 uncertain (on its way to the estimate).",
+        "What is known of the plant: 0 learning, 1 known, 2 uncertain (on its way to the estimate), 3 at the end of its range.",
     ),
     (
         "adapt_dither_um",
