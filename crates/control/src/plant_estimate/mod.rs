@@ -48,7 +48,7 @@ pub const ADAPT_COLUMNS: [&str; 6] = [
 
 /// Standard deviation of the logarithm of the gain above which the dither is louder, and its largest factor. In a quiet hold at 1 kHz the
 /// estimate reaches it. Under a strong disturbance and just after a change the dither costs up to four times as much for some seconds.
-const KNOWN: f64 = 0.05;
+const KNOWN: f64 = 0.04;
 const LOUDEST: f64 = 2.0;
 /// Part of the stated uncertainty of the gain that stays, whatever is found.
 const LEAST_DOUBT: f64 = 0.1;
