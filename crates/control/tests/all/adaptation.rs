@@ -196,7 +196,8 @@ fn ten_hours_of_hold_tell_nothing_and_change_next_to_nothing() {
     assert!((0.5..1.1).contains(&off), "{off} standard uncertainties");
     assert_eq!(events, 0);
     assert!(inside.iter().all(|part| *part > 0.95), "{inside:?}");
-    assert!(force[0] > 0.85 && force[1] < 1.22, "{force:?}");
+    // In ten hours there are 10^5 independent estimates: the extremes are beyond four standard deviations, to both sides.
+    assert!(force[0] > 0.7 && force[1] < 1.25, "{force:?}");
 }
 
 #[test]
