@@ -1,8 +1,8 @@
 //! What a figure consists of, before it becomes SVG or PDF.
 
-use crate::mosaic::Tile;
 use crate::picture::base64;
 use crate::svg::{px, set};
+use crate::tile::Tile;
 use std::fmt::Write;
 
 /// Where a text is held.

@@ -41,12 +41,14 @@ mod style;
 mod svg;
 mod table;
 mod thin;
+mod tile;
 mod typeset;
 
 pub use axis::{Axis, Scale};
 pub use figure::{Figure, HeatMap, Panel};
 pub use html::{Report, ReportError};
-pub use mosaic::{Mosaic, Tile};
+pub use mosaic::Mosaic;
 pub use series::{Kind, Series};
 pub use table::{Column, Emphasis, Table};
+pub use tile::Tile;
 pub use typeset::typeset;

@@ -2,21 +2,7 @@
 
 use crate::drawing::{Anchor, Drawing, Shape};
 use crate::svg::{self, px};
-
-/// One grey picture of a [`Mosaic`].
-#[derive(Debug, Clone, PartialEq)]
-pub struct Tile {
-    /// Width in pixels.
-    pub width: u32,
-    /// Height in pixels.
-    pub height: u32,
-    /// Grey levels, row by row from the upper left corner.
-    pub pixels: Vec<u8>,
-    /// The same as a PNG file.
-    pub png: Vec<u8>,
-    /// What the figure's CSV says of it, in the mosaic's unit.
-    pub value: f64,
-}
+use crate::tile::Tile;
 
 /// Pictures in rows and columns.
 #[derive(Debug, Clone, PartialEq)]

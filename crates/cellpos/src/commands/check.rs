@@ -222,7 +222,7 @@ fn json(script: &Script, check: &Check) -> serde_json::Value {
 
 fn report(script: &Script, check: &Check, limits: &CheckLimits) -> Report {
     let mut report = Report::new(&format!("Script {}", script.name));
-    report.lead(&super::identify::command_line());
+    report.lead(&crate::output::command_line());
     match check.violations.len() {
         0 => report.result(
             Emphasis::Good,

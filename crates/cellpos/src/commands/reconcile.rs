@@ -286,7 +286,7 @@ fn write(args: &Args, result: &Reconciliation, collected: &[Collected]) -> Resul
         output::write(
             path,
             &cellpos_reconcile::report(result, &title)
-                .lead(&super::identify::command_line())
+                .lead(&crate::output::command_line())
                 .to_html(),
         )?;
     }

@@ -9,6 +9,7 @@ mod fatigue;
 mod fault;
 mod montage;
 mod origin;
+mod recorded;
 mod result;
 mod session;
 mod spectrum;
@@ -16,18 +17,18 @@ mod spread;
 mod ticks;
 mod traces;
 
-use super::run::{learning, resume};
+use super::run::learning;
 use crate::arguments::run_folder;
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
 use crate::output;
-use cellpos_record::{CYCLES_CSV, RunEnd, RunReader};
+use cellpos_record::{RunEnd, RunReader};
 use cellpos_report::{Column, Emphasis, Report, Table};
 use cellpos_runtime::Summary;
 use cellpos_runtime::summary::plan_warning;
-use cellpos_script::{ReadCycles, read_cycles};
 pub(crate) use cycles::{half95, was_elsewhere, with_interval};
 use origin::what_it_was;
-use session::{Session, events, provenance, timing};
+use recorded::Recorded;
+use session::{Session, ending, events, provenance, timing};
 use std::path::{Path, PathBuf};
 use ticks::Ticks;
 use traces::{spectrum, traces};
@@ -58,55 +59,6 @@ pub(crate) fn run(args: Args) -> CommandResult {
     match args.runs.as_slice() {
         [one] => single(one, &args),
         many => compare::run(many, args.out.as_deref(), args.json),
-    }
-}
-
-/// A run as it was read, all its sessions together.
-struct Recorded {
-    sessions: Vec<Session>,
-    ticks: Ticks,
-    cycles: ReadCycles,
-    first: RunReader,
-}
-
-impl Recorded {
-    fn open(run: &Path) -> Result<Self, Failure> {
-        let first = RunReader::open(run).map_err(Failure::input)?;
-        let text = std::fs::read_to_string(run.join(CYCLES_CSV)).unwrap_or_default();
-        let cycles = read_cycles(&text);
-        let mut ticks = Ticks::with_courses(fatigue::courses(&cycles.rows));
-        let mut sessions = Vec::new();
-        for folder in resume::sessions(run) {
-            let reader = RunReader::open(&folder).map_err(Failure::input)?;
-            let gap_s = resume::session_config(&reader).and_then(|config| config.gap_s());
-            let start_s = if sessions.is_empty() {
-                0.0
-            } else {
-                ticks.end_s() + gap_s.unwrap_or(0.0)
-            };
-            let mut batches = reader.batches().map_err(Failure::failed)?;
-            ticks.begin(start_s, reader.meta().ok().and_then(bound::hold_of));
-            for batch in batches.by_ref() {
-                batch.iter().for_each(|record| ticks.add(record));
-            }
-            sessions.push(Session {
-                lost: batches.lost(),
-                events: reader.events().map_err(Failure::failed)?.events,
-                meta: reader.meta().ok().cloned(),
-                folder,
-                start_s,
-            });
-        }
-        Ok(Self {
-            sessions,
-            ticks,
-            cycles,
-            first,
-        })
-    }
-
-    fn name(&self) -> &str {
-        self.first.meta().map_or("run", |meta| meta.name.as_str())
     }
 }
 
@@ -184,18 +136,6 @@ fn nm(um: Option<f64>) -> String {
         || "-".to_string(),
         |um| format!("{:.1}", (um * 1e4).round() / 10.0 + 0.0),
     )
-}
-
-/// How a session ended.
-fn ending(session: &Session) -> (Emphasis, String) {
-    match session.meta.as_ref().and_then(|meta| meta.end.as_ref()) {
-        Some(end) if end.outcome == "done" => (Emphasis::Good, "came to its end".to_string()),
-        Some(end) => (Emphasis::Warning, format!("ended: {}", end.outcome)),
-        None => (
-            Emphasis::Bad,
-            "was cut off: it reads up to its last flush".to_string(),
-        ),
-    }
 }
 
 fn head(page: &mut Report, sessions: &[Session], ticks: &Ticks) {

@@ -1,6 +1,6 @@
 //! The circle on one page: what was found, margins predicted and true, tracking errors, before and after.
 
-use crate::commands::identify::command_line;
+use crate::output::command_line;
 use cellpos_experiment::circle::Circle;
 use cellpos_experiment::circle::margins::{AMPLITUDES_UM, LoopMargins, Response};
 use cellpos_experiment::circle::stage::{Stage, Tracked};

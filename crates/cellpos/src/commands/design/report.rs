@@ -1,6 +1,6 @@
 //! The page of a design: whether it holds, by how much, and what error it leads one to expect.
 
-use crate::commands::identify::command_line;
+use crate::output::command_line;
 use cellpos_control::design::{
     DesignReport, DesignRequest, loop_response, predicted_density_um, step_response,
 };

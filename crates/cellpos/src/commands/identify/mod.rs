@@ -9,6 +9,7 @@ mod tables;
 
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
 use crate::output;
+pub(crate) use crate::output::command_line;
 use crate::rig_file::{ClockKind, Frames, RigFile};
 use crate::view_args::{self, PageArgs};
 use cellpos_emulator::WorldConfig;
@@ -153,14 +154,6 @@ pub(crate) enum HoldKind {
     ZeroOrder,
     /// Samples of a smooth signal.
     None,
-}
-
-/// The command line as typed.
-pub(crate) fn command_line() -> String {
-    provenance::command_line()
-        .iter()
-        .skip(1)
-        .fold("cellpos".to_owned(), |line, a| line + " " + a)
 }
 
 /// A new folder below runs/, named by the time and `name`.

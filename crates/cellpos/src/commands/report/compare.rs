@@ -1,172 +1,16 @@
 //! Several runs on one page: cells and beads of a study, each with its uncertainty.
 
+mod data;
 mod shown;
 
-use super::bound::Bound;
-use super::cycles::{half95, on_the_way, was_elsewhere, with_interval};
+use super::cycles::{half95, with_interval};
 use super::session::folder_name;
-use super::{Recorded, ending, origin};
 use crate::outcome::{CommandResult, Failure, Outcome, print_json_of, print_text};
 use cellpos_report::{Emphasis, Report};
-use cellpos_script::{ArmKind, AtRest, CycleFlags, CycleRow, Trend, trend};
-use serde::Serialize;
+use cellpos_script::ArmKind;
+use data::{ARMS, BEAD, CELL, Compared, Ends, Quantity, arm_name};
 use shown::{errors, over_cycles, table_of_ends, table_of_runs};
 use std::path::{Path, PathBuf};
-
-/// A quantity of the cycles.
-struct Quantity {
-    name: &'static str,
-    unit: &'static str,
-    of: fn(&CycleRow, &AtRest) -> f64,
-}
-
-/// What a cell has.
-const CELL: [Quantity; 3] = [
-    Quantity {
-        name: "stretch",
-        unit: "",
-        of: |row, rest| rest.stretch(row),
-    },
-    Quantity {
-        name: "recovery time",
-        unit: "s",
-        of: |row, _| row.recovery_s,
-    },
-    Quantity {
-        name: "length at start",
-        unit: "um",
-        of: |row, _| row.length_start_um,
-    },
-];
-
-/// What a bead has.
-const BEAD: [Quantity; 2] = [
-    Quantity {
-        name: "reached / commanded",
-        unit: "",
-        of: |row, _| row.reached_um / row.commanded_um,
-    },
-    Quantity {
-        name: "error RMS",
-        unit: "um",
-        of: |row, _| row.rms_um,
-    },
-];
-
-/// Mean of the first and of the last ten cycles of a quantity, with half their 95 % intervals.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-struct Ends {
-    arm: &'static str,
-    quantity: &'static str,
-    unit: &'static str,
-    cycles: u64,
-    first: f64,
-    first_ci95: f64,
-    last: f64,
-    last_ci95: f64,
-}
-
-/// A run as the page compares it.
-#[derive(Debug, Serialize)]
-struct Compared {
-    run: PathBuf,
-    name: String,
-    outcome: String,
-    duration_s: f64,
-    cycles: usize,
-    cycles_elsewhere: usize,
-    rms_nm: Option<f64>,
-    rms_ci95_nm: Option<f64>,
-    bound_rms_nm: Option<f64>,
-    ends: Vec<Ends>,
-    #[serde(skip)]
-    emphasis: Emphasis,
-    #[serde(skip)]
-    lead: String,
-    #[serde(skip)]
-    rows: Vec<CycleRow>,
-}
-
-/// The cycles of an arm that count.
-fn counted(rows: &[CycleRow], arm: ArmKind) -> impl Iterator<Item = &CycleRow> {
-    rows.iter().filter(move |row| {
-        row.arm == arm
-            && !row.flags.has(CycleFlags::SKIPPED)
-            && !row.flags.has(CycleFlags::RAMP)
-            && !on_the_way(row)
-            && !was_elsewhere(row)
-    })
-}
-
-/// Cycle and value of a quantity.
-fn values(rows: &[CycleRow], arm: ArmKind, quantity: &Quantity) -> Vec<(f64, f64)> {
-    let rest = AtRest::of(rows);
-    counted(rows, arm)
-        .map(|row| (row.cycle as f64 + 1.0, (quantity.of)(row, &rest)))
-        .filter(|(_, value)| value.is_finite())
-        .collect()
-}
-
-fn arm_name(arm: ArmKind) -> &'static str {
-    match arm {
-        ArmKind::Cyclic => "cyclic",
-        ArmKind::Static => "static",
-    }
-}
-
-const ARMS: [ArmKind; 2] = [ArmKind::Cyclic, ArmKind::Static];
-
-impl Compared {
-    fn open(run: &Path, name: String) -> Result<Self, Failure> {
-        let recorded = Recorded::open(run)?;
-        let rows = recorded.cycles.rows.clone();
-        let last = recorded.sessions.last();
-        let (emphasis, outcome) = last.map_or((Emphasis::Plain, String::new()), ending);
-        let meta = recorded.first.meta().ok();
-        let ticks = &recorded.ticks;
-        let nm = |um: f64| um * 1e3;
-        let mut ends = Vec::new();
-        for quantity in CELL.iter().chain(&BEAD) {
-            for arm in ARMS {
-                let points = values(&rows, arm, quantity);
-                let found: Option<Trend> =
-                    trend(points.iter().map(|(cycle, value)| (*cycle as u64, *value)));
-                ends.extend(found.map(|found| Ends {
-                    arm: arm_name(arm),
-                    quantity: quantity.name,
-                    unit: quantity.unit,
-                    cycles: found.cycles,
-                    first: found.first.mean,
-                    first_ci95: found.first.ci95,
-                    last: found.last.mean,
-                    last_ci95: found.last.ci95,
-                }));
-            }
-        }
-        Ok(Self {
-            run: run.to_owned(),
-            name,
-            outcome,
-            duration_s: ticks.duration_s(),
-            cycles: rows.len(),
-            cycles_elsewhere: rows.iter().filter(|row| was_elsewhere(row)).count(),
-            rms_nm: ticks.rms_um().map(nm),
-            rms_ci95_nm: ticks.rms_ci95_um().map(nm),
-            bound_rms_nm: (!ticks.target_moves)
-                .then(|| Bound::of(meta, ticks).map(|bound| nm(bound.rms_um)))
-                .flatten(),
-            ends,
-            emphasis,
-            lead: meta.map_or_else(String::new, origin::lead),
-            rows,
-        })
-    }
-
-    fn end(&self, arm: ArmKind, quantity: &str) -> Option<&Ends> {
-        let of = |ends: &&Ends| ends.arm == arm_name(arm) && ends.quantity == quantity;
-        self.ends.iter().find(of)
-    }
-}
 
 /// Names of the runs; where two are alike, of their folders.
 fn names(runs: &[PathBuf]) -> Vec<String> {
@@ -351,7 +195,9 @@ fn of_holds(compared: &[Compared]) -> Option<String> {
 
 #[cfg(test)]
 mod tests {
+    use super::data::values;
     use super::*;
+    use cellpos_script::{CycleRow, trend};
 
     fn run(name: &str, arm: ArmKind, fall: f64) -> Compared {
         let rows: Vec<CycleRow> = (0..40)

@@ -1,6 +1,5 @@
 //! The cycles of a run: trends of each motion, and the static arm.
 
-use super::fatigue;
 use cellpos_report::{Axis, Column, Emphasis, Figure, Panel, Report, Series, Table};
 use cellpos_script::{ArmKind, AtRest, CycleFlags, CycleRow, ReadCycles, Trend, trend};
 use std::collections::BTreeMap;
@@ -13,6 +12,9 @@ struct Quantity {
     unit: &'static str,
     of: fn(&CycleRow, &AtRest) -> f64,
 }
+
+/// Those that the first figure of a cell shows.
+const OF_THE_CELL: [&str; 3] = ["stretch", "length at cycle start", "recovery time"];
 
 const QUANTITIES: [Quantity; 12] = [
     Quantity {
@@ -176,7 +178,7 @@ pub(super) fn section(page: &mut Report, read: &ReadCycles, of_a_cell: bool) -> 
                 json.push(trend_json(quantity, group, &found));
             }
         }
-        let shown = of_a_cell && fatigue::QUANTITIES.contains(&quantity.name);
+        let shown = of_a_cell && OF_THE_CELL.contains(&quantity.name);
         if any && !shown {
             figure = figure.panel(panel);
         }

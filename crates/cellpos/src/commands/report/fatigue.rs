@@ -118,9 +118,6 @@ pub(super) fn section(page: &mut Report, rows: &[CycleRow], ticks: &Ticks) {
     }
 }
 
-/// Quantities of the table of cycles that [`figure`] shows.
-pub(super) const QUANTITIES: [&str; 3] = ["stretch", "length at cycle start", "recovery time"];
-
 /// Change of the cell over the cycles: the main figure of a run with a cell.
 pub(super) fn figure(rows: &[CycleRow]) -> Option<Figure> {
     let rest = AtRest::of(rows);

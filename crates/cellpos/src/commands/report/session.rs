@@ -128,3 +128,15 @@ pub(super) fn folder_name(folder: &Path) -> String {
         .file_name()
         .map_or_else(|| "run".to_string(), |name| name.to_string_lossy().into())
 }
+
+/// How a session ended.
+pub(super) fn ending(session: &Session) -> (Emphasis, String) {
+    match session.meta.as_ref().and_then(|meta| meta.end.as_ref()) {
+        Some(end) if end.outcome == "done" => (Emphasis::Good, "came to its end".to_string()),
+        Some(end) => (Emphasis::Warning, format!("ended: {}", end.outcome)),
+        None => (
+            Emphasis::Bad,
+            "was cut off: it reads up to its last flush".to_string(),
+        ),
+    }
+}

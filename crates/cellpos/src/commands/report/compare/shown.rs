@@ -1,6 +1,6 @@
 //! Figures and tables of several runs.
 
-use super::{ARMS, Compared, Quantity, values};
+use super::data::{ARMS, Compared, Quantity, values};
 use crate::commands::report::cycles::with_interval;
 use crate::commands::report::fatigue::tens;
 use cellpos_report::{Axis, Column, Figure, Panel, Series, Table};

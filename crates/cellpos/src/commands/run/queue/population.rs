@@ -1,8 +1,8 @@
 //! Mean and spread of the cells of a queue: a row per cell, one page for all.
 
-use crate::commands::identify::command_line;
 use crate::commands::report::{half95, was_elsewhere, with_interval};
 use crate::commands::run::over::Over;
+use crate::output::command_line;
 use cellpos_report::{Axis, Column, Emphasis, Figure, Panel, Report, Series, Table};
 use cellpos_script::{ArmKind, AtRest, CycleFlags, CycleRow, Trend, trend};
 use serde::Serialize;
