@@ -20,8 +20,10 @@
 //! ```
 #![forbid(unsafe_code)]
 
+mod people;
 mod screen;
 
+pub use people::{for_people, typeset_with};
 pub use screen::give_back;
 
 use screen::Screen;
@@ -170,25 +172,6 @@ pub fn stderr() -> &'static Terminal {
         screen.is_that_of_stderr();
         Terminal::with(io::stderr(), screen)
     })
-}
-
-/// The form in which people read a text: units with their signs.
-type Typeset = fn(&str) -> String;
-
-static TYPESET: OnceLock<Typeset> = OnceLock::new();
-
-/// From now on text for people goes through `typeset`: for a standard error that is a terminal with letters beyond ASCII. Only
-/// the first call counts.
-pub fn typeset_with(typeset: Typeset) {
-    let _ = TYPESET.set(typeset);
-}
-
-/// A text as people read it on the terminal.
-pub fn for_people(text: &str) -> Cow<'_, str> {
-    match TYPESET.get() {
-        Some(typeset) => Cow::Owned(typeset(text)),
-        None => Cow::Borrowed(text),
-    }
 }
 
 /// Columns of the terminal behind standard error; 80 if unknown.

@@ -100,3 +100,15 @@ fn an_operator_who_stops_the_run_while_it_is_arming_ends_the_pulse_at_once() {
     }
     assert!(cut > 1, "no pulse was cut");
 }
+
+#[test]
+fn a_camera_that_restarts_does_not_end_the_run() {
+    let faults = Faults {
+        restarts_at: Some(1000),
+        ..Faults::default()
+    };
+    let ran = run(7, 3000, &faults, &[]);
+    let end = ran.end.expect("control lives");
+    assert_eq!((end.end, end.safe_reason), (End::Duration, None));
+    assert_eq!((end.counts.camera_restarts, end.counts.frames_lost), (1, 0));
+}

@@ -1,0 +1,23 @@
+//! Text for people: how units are written is given by the program.
+
+use std::borrow::Cow;
+use std::sync::OnceLock;
+
+/// The form in which people read a text: units with their signs.
+type Typeset = fn(&str) -> String;
+
+static TYPESET: OnceLock<Typeset> = OnceLock::new();
+
+/// From now on text for people goes through `typeset`: for a standard error that is a terminal with letters beyond ASCII. Only
+/// the first call counts.
+pub fn typeset_with(typeset: Typeset) {
+    let _ = TYPESET.set(typeset);
+}
+
+/// A text as people read it on the terminal.
+pub fn for_people(text: &str) -> Cow<'_, str> {
+    match TYPESET.get() {
+        Some(typeset) => Cow::Owned(typeset(text)),
+        None => Cow::Borrowed(text),
+    }
+}
