@@ -9,6 +9,7 @@
 //! the gain widens the covariance in proportion to the motion it predicts.
 
 mod config;
+mod covariance;
 mod exposure;
 mod flow_step;
 mod retune;
@@ -18,8 +19,8 @@ mod uncertainty;
 
 use crate::error::BuildError;
 use crate::loop_model::{LoopModel, MODES};
+use covariance::{USUAL_WALK_UM_PER_SQRT_S, advanced, at_rest};
 use transition::Transition;
-use uncertainty::{USUAL_WALK_UM_PER_SQRT_S, advanced, at_rest};
 
 pub use config::EstimatorConfig;
 pub(crate) use config::planned_gap;

@@ -156,6 +156,7 @@ impl OnRig {
                 self.controller.pi.kp_um_per_um,
                 self.controller.pi.ki_per_s,
             )),
+            two_lags: self.file.actuator.period_ms().is_some(),
         }
     }
 

@@ -26,6 +26,8 @@ pub struct OrderSelection<'a> {
     weights: Vec<f64>,
     /// By how much the two weak bounds (share, lead) are moved, in their standard deviations.
     bounds_moved: [f64; 2],
+    /// Orders with two lags are candidates.
+    two_lags: bool,
 }
 
 /// Finite-difference steps of the parameter vector.
@@ -74,6 +76,7 @@ impl<'a> OrderSelection<'a> {
             prior,
             weights,
             bounds_moved: [0.0; 2],
+            two_lags: false,
         })
     }
 
@@ -115,6 +118,13 @@ impl<'a> OrderSelection<'a> {
     /// The same problem with another delay prior.
     pub fn with_prior(mut self, prior: Option<DelayPrior>) -> Self {
         self.prior = prior;
+        self
+    }
+
+    /// The same problem with the orders of two lags among the candidates, or without them. A PZT has none: there they would take what
+    /// an unknown effect does for a part of the plant.
+    pub fn with_two_lags(mut self, two_lags: bool) -> Self {
+        self.two_lags = two_lags;
         self
     }
 
@@ -305,7 +315,7 @@ impl<'a> OrderSelection<'a> {
             let below = (out.iter())
                 .find(|(other, _)| Some(*other) == order.below())
                 .map(|(_, m)| m.parameters.clone());
-            if order.below().is_some() && below.is_none() {
+            if order.two_lags() && !self.two_lags || order.below().is_some() && below.is_none() {
                 continue;
             }
             if let Some(found) = self.fit_rung(data, order, below.as_deref()) {

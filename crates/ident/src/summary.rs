@@ -76,7 +76,7 @@ pub fn compensated(
 }
 
 /// Fits, judges and compensates. `bootstrap` replicates (0: none) are drawn with `seed`. `stated_per_s` is the velocity gain believed
-/// before, for a warning if it is the measured one divided by 2 pi.
+/// before, for a warning if it is the measured one divided by 2 pi. `two_lags`: the plant may be a regulator with a tube behind it.
 ///
 /// # Errors
 /// Those of [`OrderSelection::new`] and [`OrderSelection::fit`].
@@ -87,9 +87,10 @@ pub fn summarise(
     bootstrap: usize,
     seed: u64,
     stated_per_s: Option<f64>,
+    two_lags: bool,
 ) -> Result<Identification, IdentError> {
-    measured.points = of_one_delay(measured.points, sampling)?;
-    let problem = OrderSelection::new(&measured.points, sampling, None)?;
+    measured.points = of_one_delay(measured.points, sampling, two_lags)?;
+    let problem = OrderSelection::new(&measured.points, sampling, None)?.with_two_lags(two_lags);
     let selection = problem.fit()?;
     let prior = led.map(|l| DelayPrior {
         delay_s: l.delay_s,
@@ -146,6 +147,7 @@ pub fn summarise(
 fn of_one_delay(
     points: Vec<FrequencyPoint>,
     sampling: Sampling,
+    two_lags: bool,
 ) -> Result<Vec<FrequencyPoint>, IdentError> {
     if points.iter().all(|p| p.later_s == 0.0) {
         return Ok(points);
@@ -156,6 +158,7 @@ fn of_one_delay(
     });
     let turned: Vec<FrequencyPoint> = turned.collect();
     let model = OrderSelection::new(&turned, sampling, None)?
+        .with_two_lags(two_lags)
         .fit()?
         .best()
         .model;

@@ -349,7 +349,7 @@ fn several_runs_where_one_is_meant_get_a_sentence() {
     let at = folder.path();
     let make = format!("track --target 0um --duration 1s --name two {FAST}");
     let [one, other] = [made(at, &make), made(at, &make)];
-    for command in ["replay", "report", "export", "watch"] {
+    for command in ["replay", "export", "watch"] {
         // As a shell hands over runs/*-two*.
         let line = format!("{command} {} {}", one.display(), other.display());
         let ran = cellpos(at, &line);

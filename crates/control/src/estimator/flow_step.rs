@@ -5,7 +5,7 @@
 //! any magnitude on a logarithmic scale. Where the step is likelier, neutral is as uncertain as the step that the innovation
 //! shows, and the filter learns the new one from the fixes that follow.
 
-use super::uncertainty::corrected;
+use super::covariance::corrected;
 use super::{Estimator, EstimatorState, Fix, HISTORY};
 use std::f64::consts::TAU;
 

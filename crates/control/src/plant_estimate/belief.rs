@@ -18,8 +18,8 @@ const GRID: [f64; GAINS] = grid();
 /// Random walk of the logarithm of a plant's gain, 1/sqrt(s). A channel that clogs to half in a quarter of an hour is then followed
 /// within half a standard deviation of the estimate.
 const GAIN_WALK: f64 = 0.008;
-/// Changes of each kind (gain, delay, both) in a second: one an hour. Of those that are reported one in 3000 is then false, which is one in
-/// a thousand hours if the noise is as it is measured.
+/// Changes of each kind (gain, delay, both) in a second: one an hour. By the odds that a report needs one of 3000 would be false if the
+/// noise were as it is measured; in ten hours of hold two were.
 const CHANGES_PER_S: f64 = 1.0 / 3600.0;
 /// Standard deviation of the logarithm of a gain that is not known: twice and half the model's are usual.
 const GAIN_PRIOR: f64 = LN_2;

@@ -43,6 +43,8 @@ pub struct Setup {
     pub closed_loop: bool,
     /// The PI; left out: gains for a loop delay of 2.5 ms, scaled to the model's gain.
     pub pi: Option<Pi>,
+    /// An actuator with a regulator and a tube moves the bead, not a PZT: the plant may have two lags.
+    pub two_lags: bool,
 }
 
 impl Setup {

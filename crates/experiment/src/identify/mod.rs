@@ -207,6 +207,7 @@ fn led_delay(job: &Job, rig: &OnRig) -> Result<Option<DelayTest>, Failure> {
                 frames: true,
                 closed_loop: true,
                 pi: None,
+                two_lags: job.setup.two_lags,
             };
             Some(HeldBead::open(setup)?.delay_test(edges, job.seed)?)
         }
@@ -390,6 +391,7 @@ fn conclude(
         job.bootstrap,
         job.seed,
         Some(job.setup.model.plant.velocity_gain_at(Hertz(2.0))),
+        job.setup.two_lags,
     )
     .map_err(Failure::failed)
 }

@@ -240,7 +240,7 @@ fn a_literal_63_per_s_is_flagged_as_a_factor_of_two_pi() {
     let measured = plan.analyse(&records, &Settings::default()).unwrap();
     let with = |stated_per_s| {
         let sampling = Sampling::held(1.0 / PERIOD_S);
-        summarise(measured.clone(), sampling, None, 0, 1, stated_per_s).unwrap()
+        summarise(measured.clone(), sampling, None, 0, 1, stated_per_s, false).unwrap()
     };
     let flags = |stated_per_s| {
         let warnings = with(stated_per_s).warnings;

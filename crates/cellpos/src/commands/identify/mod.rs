@@ -270,6 +270,7 @@ fn job(args: &Args) -> Result<identification::Job, Failure> {
             },
             closed_loop: !args.open_loop,
             pi: None,
+            two_lags: false,
         },
     };
     setup.world.seed = seed;

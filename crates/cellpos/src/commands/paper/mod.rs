@@ -64,6 +64,7 @@ fn setup(seed: u64, drift_um_per_s: f64, start_um: f64, closed_loop: bool) -> Se
         clock: Clock::virtual_at(0),
         closed_loop,
         pi: None,
+        two_lags: false,
     }
 }
 
