@@ -170,7 +170,7 @@ class Lab:
         text = (ROOT / "examples/rig.toml").read_text().replace('model = "eq6"', 'model = "model.toml"')
         (folder / "model.toml").write_text(LAG)
         (folder / "box.toml").write_text(text)
-        text = re.sub(r"(?s)\[actuator\].*?\n\n", f'[actuator]\nkind = "program"\nsocket = "actuator.sock"\nperiod_ms = {PERIOD_MS}\n\n', text)
+        text = re.sub(r"(?ms)^\[actuator\].*?\n\n", f'[actuator]\nkind = "program"\nsocket = "actuator.sock"\nperiod_ms = {PERIOD_MS}\n\n', text)
         text = re.sub(r"(?m)^period_us.*\n", "", text).replace("oldest_ms = 5.0", "oldest_ms = 60.0")
         (folder / "rig.toml").write_text(text)
         quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
