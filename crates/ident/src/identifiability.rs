@@ -154,7 +154,6 @@ pub fn judge(
     let best = fit.best();
     let t = student_t_quantile(0.975, fit.interval_dof.min(1e6));
     let period_ms = problem.sampling().period_s * 1e3;
-    let lead_ms = lead_interval_ms(problem, fit, &data, period_ms);
     let draws = bootstrap(problem, fit, replicates, seed);
     // Replicates know the noise exactly, the data only estimate it: the spread is widened as Student's t is.
     let wider = t / 1.959_964;
@@ -214,7 +213,7 @@ pub fn judge(
     let lead = if two_lags {
         [0.0; 2]
     } else {
-        lead_ms.unwrap_or([0.0, f64::INFINITY])
+        lead_interval_ms(problem, fit, &data, period_ms).unwrap_or([0.0, f64::INFINITY])
     };
     let phase_low = effective + lead[0] - half;
     let phase_high = effective + lead[1] + half;
