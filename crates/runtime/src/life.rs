@@ -318,9 +318,9 @@ pub enum EventKind {
     },
     /// The loop was tuned to another gain or delay of the plant.
     Adapted {
-        /// Gain that it was tuned to, over the model's.
+        /// Estimated gain over the model's when a change was reported last; 1 at the start.
         gain_before: f64,
-        /// Gain that it is tuned to.
+        /// Estimated gain now.
         gain: f64,
         /// Delay beyond the model's that it was tuned to, ms.
         delay_before_ms: f64,

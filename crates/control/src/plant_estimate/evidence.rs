@@ -18,9 +18,9 @@ const BLOCK: u32 = 16;
 /// Memory of the variance of the products and of how the commands follow the motion that was chosen, blocks: two seconds at 1 kHz, so that
 /// the former is known to 6 %.
 const MEMORY: f64 = 128.0;
-/// Part of the mean power of the lags below which a combination of them is taken to be commanded as it was chosen: by dither alone the
-/// loop's answer in such a combination is not known in [`MEMORY`].
-const UNSEEN: f64 = 0.1;
+/// Standard deviation of the commanded motion over the chosen motion, a lag, before it was seen. The loop leaves the dither alone, so it
+/// answers what a wrong gain makes of it only: half of that in a tick, and the gain is wrong by half.
+const ANSWER: f64 = 0.25;
 /// Blocks after which the variance of the products is known to 25 %, so that they count as evidence.
 const LEARNED: f64 = 8.0;
 /// Square of a block's distance from the estimate, over the variance, that is too far for its noise: three standard deviations above its
@@ -57,23 +57,20 @@ struct Block {
 }
 
 impl Block {
-    fn power(&self) -> f64 {
-        (0..MEMBERS).map(|i| self.xx[i][i]).sum()
-    }
-
     fn take(&mut self, block: &Self) {
-        let (keep, part) = (1.0 - 1.0 / MEMORY, 1.0 / block.power());
+        let keep = 1.0 - 1.0 / MEMORY;
         for i in 0..MEMBERS {
             for j in 0..MEMBERS {
-                self.xp[i][j] = keep * self.xp[i][j] + part * block.xp[i][j];
-                self.xx[i][j] = keep * self.xx[i][j] + part * block.xx[i][j];
+                self.xp[i][j] = keep * self.xp[i][j] + block.xp[i][j];
+                self.xx[i][j] = keep * self.xx[i][j] + block.xx[i][j];
             }
         }
     }
 
-    /// How the commanded motion at each lag follows the chosen motion at all lags.
-    fn answer(&self) -> Matrix {
-        let unseen = (UNSEEN * self.power() / MEMBERS as f64).max(f64::MIN_POSITIVE);
+    /// How the commanded motion at each lag follows the chosen motion at all lags: the mean of a normal distribution, if the rest of the
+    /// commanded motion has this variance in the products.
+    fn answer(&self, noise_um2: f64) -> Matrix {
+        let unseen = (noise_um2 / (ANSWER * ANSWER)).max(f64::MIN_POSITIVE);
         let mut xx = self.xx;
         (0..MEMBERS).for_each(|i| xx[i][i] += unseen);
         let mut answer = [[0.0; MEMBERS]; MEMBERS];
@@ -100,7 +97,8 @@ pub(super) struct Evidence {
     /// Variance of the products over that of `x`, um^2, and the blocks that it is from.
     noise_um2: f64,
     blocks: f64,
-    /// Recent blocks, each with a power of 1.
+    /// The same of the commanded motion that was not chosen.
+    answer_um2: f64,
     recent: Block,
     belief: Belief,
     pub found: Option<Finding>,
@@ -114,6 +112,7 @@ impl Evidence {
             fixes: 0,
             noise_um2: 0.0,
             blocks: 0.0,
+            answer_um2: 0.0,
             recent: Block::default(),
             belief: Belief::new(least),
             found: None,
@@ -159,7 +158,12 @@ impl Evidence {
         let weight = 1.0 / noise_um2;
         // The commands answer the disturbance, so their products in this block correlate with its noise. How they follow the motion that was
         // chosen is known from the blocks before.
-        let answer = self.recent.answer();
+        let answered: Vector =
+            std::array::from_fn(|i| dot(&block.xp[i], &e) - dot(&block.xx[i], &e));
+        let white = forward(&l, &answered);
+        let answer_um2 = dot(&white, &white) / MEMBERS as f64;
+        self.answer_um2 += (answer_um2 - self.answer_um2) / self.blocks.min(MEMORY);
+        let answer = self.recent.answer(self.answer_um2);
         let commanded = |delay: f64| -> Vector {
             let e = weights(delay);
             std::array::from_fn(|i| dot(&answer[i], &e))
@@ -218,4 +222,52 @@ fn backward(l: &Matrix, b: &Vector) -> Vector {
         x[i] = (b[i] - sum) / l[i][i];
     }
     x
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use cellpos_numeric::Random;
+
+    /// Dither on sides of two fixes, and commands that wander as they answer a bead that wanders.
+    #[test]
+    fn what_the_commands_answer_by_chance_is_not_taken_for_an_answer_to_the_dither() {
+        for seed in 0..20 {
+            let mut random = Random::new(seed);
+            let mut evidence = Evidence::new(-2.0);
+            let mut x_um = [0.0; MEMBERS];
+            let (mut wander_um, mut side_um) = (0.0, 0.0);
+            let mut farthest = 0.0_f64;
+            for fix in 0..20_000 {
+                let before_um = side_um;
+                if fix % 2 == 0 {
+                    side_um = if random.uniform() < 0.5 { -3e-3 } else { 3e-3 };
+                }
+                x_um.rotate_right(1);
+                x_um[0] = side_um - before_um;
+                wander_um = 0.95 * wander_um + 5e-3 * random.normal();
+                let p_um = x_um.map(|x| x + wander_um);
+                let complete = evidence.add(&Products {
+                    y_um: p_um[1] + 0.03 * random.normal(),
+                    p_um,
+                    x_um,
+                    weight: 1.0,
+                });
+                if complete {
+                    evidence.conclude(1e-3, (1.0, 0.0));
+                    let answer = evidence.recent.answer(evidence.answer_um2);
+                    for (i, row) in answer.iter().enumerate() {
+                        for (j, part) in row.iter().enumerate() {
+                            let chosen = f64::from(u8::from(i == j));
+                            farthest = farthest.max((part - chosen).abs());
+                        }
+                    }
+                }
+            }
+            assert!(farthest < 3.0 * ANSWER, "seed {seed}: {farthest}");
+            let found = evidence.found.expect("an estimate after 20 s");
+            let off = (found.gain - 1.0).abs() / found.gain_sd;
+            assert!(off < 3.5 && found.gain_sd < 0.2, "seed {seed}: {found:?}");
+        }
+    }
 }

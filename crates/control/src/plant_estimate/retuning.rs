@@ -49,11 +49,13 @@ const DELAY_TICKS: u16 = 20;
 /// A change of the gain that is reported, by its logarithm. The tuning, and a standard deviation of the estimate, must first be within half
 /// of that change of the estimate, so that one step is reported once.
 const REPORTED_GAIN: f64 = 0.14;
+/// Standard deviations of a 95 % interval.
+const INTERVAL: f64 = 1.96;
 
 /// A change of the tuning that a run reports.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct AdaptNews {
-    /// Gain in force before and now, over the design's.
+    /// Estimated gain before and now, over the design's.
     pub gain: [f64; 2],
     /// Delay in force beyond the design's before and now, samples.
     pub delay_samples: [f64; 2],
@@ -79,9 +81,17 @@ pub(super) struct Retuning {
     pub mode: AdaptMode,
     moving: bool,
     since_delay: u16,
-    reported: (f64, usize),
+    reported: Reported,
     /// Ticks since the tuning in force left the one reported last.
     away: u64,
+}
+
+/// The plant as it was reported last.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Reported {
+    log_gain: f64,
+    log_sd: f64,
+    member: usize,
 }
 
 /// What a tick does to the delay in force.
@@ -100,7 +110,11 @@ impl Default for Retuning {
             mode: AdaptMode::Learning,
             moving: false,
             since_delay: u16::MAX,
-            reported: (0.0, NOMINAL),
+            reported: Reported {
+                log_gain: 0.0,
+                log_sd: 0.0,
+                member: NOMINAL,
+            },
             away: 0,
         }
     }
@@ -173,11 +187,11 @@ impl Retuning {
         DelayStep::Taken
     }
 
-    /// The change to report after this tick, if any.
+    /// The change to report after this tick, if any: the gain surely differs from the one reported last by more than that one's interval,
+    /// or the delay surely is another one.
     pub(super) fn news(&mut self, found: Option<&Finding>) -> Option<AdaptNews> {
-        let (reported_gain, reported_member) = self.reported;
-        let gain_off = (self.log_gain - reported_gain).abs();
-        let moved = gain_off > 0.02 || self.member != reported_member;
+        let before = self.reported;
+        let moved = (self.log_gain - before.log_gain).abs() > 0.02 || self.member != before.member;
         self.away = if moved {
             self.away.saturating_add(1)
         } else {
@@ -188,19 +202,28 @@ impl Retuning {
         if self.moving || off.max(found.log_sd) > 0.5 * REPORTED_GAIN {
             return None;
         }
-        let sure = found.gain_odds(reported_gain, 0.5 * REPORTED_GAIN) > DELAY_SURE[1];
-        let gain = gain_off > REPORTED_GAIN && sure;
-        let odds = found.delay_odds(DELAYS[reported_member]);
-        let delay = self.member != reported_member && odds[0].max(odds[1]) > DELAY_SURE[1];
+        let farther = 0.5 * REPORTED_GAIN + INTERVAL * before.log_sd;
+        let gain = (found.log_gain - before.log_gain).abs() > REPORTED_GAIN
+            && found.gain_odds(before.log_gain, farther) > DELAY_SURE[1];
+        let surely = |member: usize| {
+            let [longer, shorter] = found.delay_odds(DELAYS[member]);
+            longer.max(shorter) > DELAY_SURE[1]
+        };
+        let delay = surely(before.member) && !surely(self.member);
         if !(gain || delay) {
             return None;
         }
+        if gain {
+            (self.reported.log_gain, self.reported.log_sd) = (found.log_gain, found.log_sd);
+        }
+        if delay {
+            self.reported.member = self.member;
+        }
         let news = AdaptNews {
-            gain: [reported_gain.exp(), self.log_gain.exp()],
-            delay_samples: [DELAYS[reported_member], DELAYS[self.member]],
+            gain: [before, self.reported].map(|one| one.log_gain.exp()),
+            delay_samples: [before, self.reported].map(|one| DELAYS[one.member]),
             ticks: self.away,
         };
-        self.reported = (self.log_gain, self.member);
         self.away = 0;
         Some(news)
     }
