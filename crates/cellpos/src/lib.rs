@@ -129,7 +129,7 @@ pub fn main() -> ExitCode {
     outcome::set_for_people();
     if let Err(error) = signals::listen() {
         eprintln!(
-            "signals cannot be caught ({error}): Ctrl-C ends the program, and the board parks by its own watchdog"
+            "signals cannot be caught ({error}): Ctrl-C ends the program at once, and the board's watchdog parks the PZT"
         );
     }
     let words = arguments::joined(std::env::args_os());

@@ -89,7 +89,7 @@ fn wait(mut child: Child) -> Option<String> {
         }
     }
     Some(format!(
-        "the command still runs after {} s; it is left to itself",
+        "the command still runs after {} s; cellpos does not wait for it",
         PATIENCE.as_secs()
     ))
 }

@@ -53,7 +53,7 @@ fn on_real_clock(option: &str, clock: ClockKind) -> Result<(), Failure> {
     }
     Err(Failure::bad_input(
         format!(
-            "{option} shows a run as it happens, and on the virtual clock it is over before a page is drawn"
+            "{option} shows a run as it happens, but on the virtual clock the run is over before a page is drawn"
         ),
         "leave --clock virtual out, or look at the recorded run: cellpos watch RUN",
     ))

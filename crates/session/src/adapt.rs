@@ -7,7 +7,7 @@ use cellpos_runtime::life::EventKind;
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "clap", derive(clap::ValueEnum))]
 pub enum Adapt {
-    /// It does.
+    /// Follow them.
     On,
     /// It stays as it was designed.
     Off,

@@ -214,7 +214,7 @@ pub fn finish(
     }
     if let Some(slowest) = done.slowest_sync.filter(|took| *took >= Unconfirmed::SAID) {
         warnings.push(format!(
-            "the disk took up to {:.1} s to confirm what was written: a power failure then would have cost so much of the run",
+            "the disk took up to {:.1} s to confirm what was written: a power failure would have cost that much of the run",
             slowest.as_secs_f64()
         ));
     }
@@ -302,8 +302,7 @@ fn partner_warning(summary: &Summary) -> Option<String> {
     let (lost, limited) = (part(counts.partner_lost), part(counts.partner_limited));
     (lost + limited > 0.0).then(|| {
         format!(
-            "the slow actuator was missing for {lost:.1} % of the run and at an end of its range for {limited:.1} %: for that time the PZT \
-             was alone within its stroke; see the run's events"
+            "the slow actuator was missing for {lost:.1} % of the run and at an end of its range for {limited:.1} %: for that time the PZT worked alone; see the run's events"
         )
     })
 }

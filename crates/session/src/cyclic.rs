@@ -57,7 +57,7 @@ impl Sine {
         if hz >= 0.5 * rate_hz {
             return Err(Failure::bad_input(
                 format!(
-                    "--sine {}@{}: at {rate_hz:.0} ticks a second no motion from {:.0} Hz on can be told from a slower one",
+                    "--sine {}@{}: at {rate_hz:.0} ticks a second, motion at {:.0} Hz or faster looks like a slower one",
                     self.amplitude,
                     self.frequency,
                     0.5 * rate_hz
@@ -79,11 +79,11 @@ impl Sine {
             let which = if slew_um < stroke_um {
                 format!("a slew of {} um/s", limits.slew_um_per_s)
             } else {
-                format!("a range of {} to {} um", limits.low_um, limits.high_um)
+                format!("the range of {} to {} um", limits.low_um, limits.high_um)
             };
             return Err(Failure::bad_input(
                 format!(
-                    "--sine {}@{}: the PZT would have to swing by +-{drive_um:.1} um, and {which} does not carry that",
+                    "--sine {}@{}: the PZT would have to swing by +-{drive_um:.1} um, which exceeds {which}",
                     self.amplitude, self.frequency
                 ),
                 format!(
@@ -436,17 +436,18 @@ pub fn learned_text(table: &LearnedTable) -> String {
     let nm =
         |um: Option<f64>| um.map_or_else(|| "-".to_string(), |um| format!("{:.1} nm", um * 1e3));
     format!(
-        "{:.0} cycles, measured error {} RMS in the first few, {} in the last few{}{}",
+        "{:.0} cycles, measured error {} RMS in the first cycles, {} in the last{}{}",
         table.cycles,
         nm(table.error_before_um),
         nm(table.error_after_um),
         match table.retreats {
             0 => String::new(),
-            n => format!("; {n} retreats"),
+            1 => "; withdrawn once".to_owned(),
+            n => format!("; withdrawn {n} times"),
         },
         table
             .margins
-            .map_or_else(String::new, |margins| format!("; reckoned with: {margins}"))
+            .map_or_else(String::new, |margins| format!("; allowed for: {margins}"))
     )
 }
 

@@ -77,7 +77,7 @@ pub(crate) fn check_armed(
     if !armed || report.session != session {
         return Err(Failure::Failed(miette::miette!(
             help = "switch the board off and on; does another program use it?",
-            "the board was told to arm session {session} and is {:?} in session {}, with the fault {:?}",
+            "the board should be armed in session {session}, but is {:?} in session {}, with the fault {:?}",
             report.state,
             report.session,
             report.fault
@@ -87,7 +87,7 @@ pub(crate) fn check_armed(
     if (report.applied_um - expected_um).abs() > 2.0 * step_um.max(1e-6) {
         return Err(Failure::Failed(miette::miette!(
             help = "does another program use the board? Start again when the PZT is at rest",
-            "the PZT stood at {expected_um:.4} um and is at {:.4} um now that the board is armed",
+            "the PZT moved from {expected_um:.4} um to {:.4} um when the board was armed",
             report.applied_um
         )));
     }

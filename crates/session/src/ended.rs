@@ -246,7 +246,7 @@ impl Clues {
                     "positions in half of the {} ticks of the pulse at least",
                     2 * arming.pulse_ticks
                 ),
-                "is it the bead that is followed, and not dirt? If vision refuses fast motion, see [tracking] in rig.toml",
+                "is the tracked object the bead, and not dirt? If vision refuses fast motion, see [tracking] in rig.toml",
             ),
             Refusal::NoBead => sentences(
                 format!(
@@ -271,7 +271,7 @@ impl Clues {
             Refusal::WrongSign => sentences(
                 format!("the bead moved against the PZT: {gain}"),
                 format!("{range} of it: the same sign"),
-                "turn round `sign` in [calibration] of rig.toml: the camera's axis points the other way",
+                "change the sign of `sign` in [calibration] of rig.toml: the camera's axis points the other way",
             ),
             Refusal::WrongGain => sentences(
                 format!("the bead moved by {gain}"),
@@ -280,12 +280,12 @@ impl Clues {
                  design)",
             ),
             Refusal::Disturbed => sentences(
-                "ticks were skipped or frames came late in every arming pulse, so that nothing can be told from how the bead moved",
+                "ticks were skipped or frames came late in every arming pulse, so the motion of the bead says nothing about the plant",
                 format!(
                     "half of the {} ticks of a pulse undisturbed",
                     2 * arming.pulse_ticks
                 ),
-                "does something else keep this machine busy? cellpos doctor tells; start again",
+                "see with cellpos doctor what keeps this machine busy, then start again",
             ),
         }
     }
@@ -336,7 +336,7 @@ impl Clues {
             SafeReason::LinkLost => sentences(
                 format!(" ({} ms)", timing.board_silence_ms),
                 "a status every 10 ms",
-                "check cable and power of the board; by its own watchdogs it holds the bead at zero flow, and parks the PZT after that",
+                "check cable and power of the board; its watchdogs hold the bead at zero flow, then park the PZT",
             ),
             SafeReason::NotFinite => sentences(
                 "",
@@ -354,12 +354,12 @@ impl Clues {
             SafeReason::Stalled => sentences(
                 " (more than a second)",
                 format!("a tick every {} ms", timing.period_us * 1e-3),
-                "find out what suspended this program or this machine; the board has stopped the bead",
+                "find out why this program or this machine was suspended; the board has stopped the bead",
             ),
             SafeReason::BoardForeign => sentences(
                 "",
-                "a board in this run's session alone",
-                "see that one program uses the board, then start again",
+                "a board that only this run uses",
+                "make sure that only one program uses the board, then start again",
             ),
             SafeReason::BoardNotObeying => sentences(
                 format!(" (for {} ms)", timing.board_silence_ms),
@@ -394,15 +394,14 @@ impl Clues {
     fn board(&self) -> Sentences {
         let why = match self.board {
             Some((_, Fault::CommandTimeout)) => {
-                "the board parked the PZT by itself: no command came within both its watchdog times; this program was stopped, or the \
-                 line was blocked"
+                "the board parked the PZT: no command came within both its watchdog times; this program was stopped, or the line was blocked"
             }
             Some((_, Fault::FreezeTimeout)) => "the board parked the PZT: nothing ended a freeze",
             Some((_, Fault::ArmTimeout)) => "the board parked the PZT: no command followed arming",
             Some((State::Disarmed, _)) => {
                 "the board is disarmed: another host did it, or it was switched off and on"
             }
-            Some((State::Safe, _)) => "the board was told to park by another host",
+            Some((State::Safe, _)) => "another host told the board to park",
             Some((_, Fault::Device)) => {
                 "the board reports a fault: temperature, current, supply or converter"
             }
@@ -410,8 +409,8 @@ impl Clues {
         };
         sentences(
             why,
-            "a board that follows this run's commands alone",
-            "see that one program uses the board, and that this one is not suspended; then start again",
+            "a board that follows only this run's commands",
+            "make sure that only one program uses the board and that it is not suspended, then start again",
         )
     }
 }
@@ -446,11 +445,11 @@ fn not_kept(kept: &Kept, clipped_um: Option<f64>) -> Sentences {
     match kept.why {
         Some(NotKept::AnotherBead) => sentences(
             format!(
-                "the bead was lost, and {} a bead was taken that may be another",
+                "the bead was lost, and {} a bead was found that may be another one",
                 times(kept.other_beads)
             ),
             "one bead in view from beginning to end",
-            "look at the events and the clip of the loss; a smaller density of beads, or a larger field of view, keeps one in view",
+            "look at the events and the clip of the loss; use fewer beads, or a larger field of view",
         ),
         Some(NotKept::OutOfSight) => sentences(
             format!(
@@ -468,7 +467,7 @@ fn not_kept(kept: &Kept, clipped_um: Option<f64>) -> Sentences {
                 kept.furthest_um
             ),
             a_hold,
-            "look at the flow (leaks, taps, tubes), at the amplifier and at the model; cellpos report shows when it was",
+            "check the flow (leaks, taps, tubes), the amplifier and the model; cellpos report shows when it happened",
         ),
     }
 }
@@ -484,7 +483,7 @@ fn failed(error: &RunError) -> Sentences {
         RunError::Actuator(_) => sentences(
             seen,
             "a board that answers until the run ends",
-            "check its cable and power; by its own watchdogs it holds the bead at zero flow, and parks the PZT after that",
+            "check its cable and power; its watchdogs hold the bead at zero flow, then park the PZT",
         ),
         _ => sentences(
             seen,

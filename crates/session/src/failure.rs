@@ -26,8 +26,7 @@ impl Failure {
     pub fn of_run(error: RunError) -> Self {
         match error {
             RunError::RecorderHangs { .. } => Self::Failed(miette::miette!(
-                help = "expected a disk that answers; see that the disk with the run folder works (the system's log names a bad one), or name \
-                        another folder with --runs; what was written before is kept, and the PZT is parked",
+                help = "expected a disk that answers; check the disk with the run folder (see the system log), or name another folder with --runs; earlier rows are kept, and the PZT is parked",
                 "{error}"
             )),
             error => Self::failed(error),

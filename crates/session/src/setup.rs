@@ -383,8 +383,7 @@ pub fn model_delay_warning(model: &Model, timing: &Timing) -> Option<String> {
     }
     ((measured_ms - rig_ms).abs() > WORTH_SAYING * timing.period_us * 1e-3).then(|| {
         format!(
-            "the model states a delay of {measured_ms:.2} ms from a command to the tick that uses its picture, rig.toml says \
-             camera_delay_ms = {rig_ms}: measure the plant again (cellpos identify), which tells the two parts of that delay apart"
+            "the model has a delay of {measured_ms:.2} ms from a command to the tick that uses its picture, rig.toml says camera_delay_ms = {rig_ms}: run cellpos identify again, which separates the two parts of that delay"
         )
     })
 }
@@ -416,7 +415,7 @@ pub fn controller(name: &str, model: &Model, timing: &Timing) -> Result<Controll
             if (file.delay_ms * 1e-3 - loop_delay_s).abs() > WORTH_SAYING * sample_s {
                 return Err(Failure::bad_input(
                     format!(
-                        "{path}: made for a loop delay of {} ms, the rig has {} ms",
+                        "{path}: it is for a loop delay of {} ms, but the rig has {} ms",
                         file.delay_ms,
                         loop_delay_s * 1e3
                     ),

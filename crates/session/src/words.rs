@@ -47,7 +47,7 @@ pub fn safe_reason(reason: SafeReason) -> &'static str {
             "vision takes longer for a frame than the camera, and frames grew old"
         }
         SafeReason::Stalled => {
-            "the loop stood still for so long that the bead's place is not known"
+            "the loop was interrupted for so long that the position of the bead is unknown"
         }
     }
 }
@@ -70,8 +70,8 @@ fn refusal(reason: Refusal) -> &'static str {
     match reason {
         Refusal::NoBead => "no steady bead was seen",
         Refusal::NoResponse => "the bead did not move with the PZT beyond its own noise",
-        Refusal::WrongSign => "the bead moved the other way: is the sign in [calibration] right?",
-        Refusal::WrongGain => "the gain is outside what the controller is safe for",
+        Refusal::WrongSign => "the bead moved the wrong way: is the sign in [calibration] right?",
+        Refusal::WrongGain => "with this gain the controller may be unstable",
         Refusal::Disturbed => "ticks were skipped or frames came late in every pulse",
     }
 }
@@ -165,9 +165,9 @@ fn text(kind: &EventKind) -> String {
         } => format!("Vision takes {vision_ms:.2} ms for a frame of {period_ms:.2} ms."),
         EventKind::VisionSlowEnded { lasted_ms } => ended("Vision keeps up again", lasted_ms),
         EventKind::CameraRestarted => "The camera restarted its frame numbers.".to_string(),
-        EventKind::BeadReacquired { position_um } => format!(
-            "A bead was taken at {position_um:.3} um after the one followed had been lost: it may be another."
-        ),
+        EventKind::BeadReacquired { position_um } => {
+            format!("The bead was lost; the one found at {position_um:.3} um may be another.")
+        }
         EventKind::LateTick { compute_us } => {
             format!("A command was handed over {compute_us:.0} us after its tick began: late.")
         }
@@ -188,7 +188,7 @@ fn text(kind: &EventKind) -> String {
             "The bead does not follow the commands beyond about {level_um:.1} um: the amplifier or the PZT is clipped."
         ),
         EventKind::SaturationEnded { lasted_ms } => {
-            ended("The PZT is off the end of its range", lasted_ms)
+            ended("The PZT has left the end of its range", lasted_ms)
         }
         EventKind::BoardChanged { state, fault } => {
             format!("The board reports {state:?}, fault {fault:?}.")
@@ -213,7 +213,7 @@ fn text(kind: &EventKind) -> String {
         ),
         EventKind::Finished => "The time is up.".to_string(),
         EventKind::Script { stage } => format!("Script: {}.", stage.name()),
-        EventKind::StepSkipped => "The operator went on with the next step.".to_string(),
+        EventKind::StepSkipped => "The operator skipped to the next step.".to_string(),
     }
 }
 
@@ -222,13 +222,13 @@ fn partner(kind: &EventKind) -> String {
     match *kind {
         EventKind::PartnerBack { lasted_ms } => ended("The slow actuator obeys again", lasted_ms),
         EventKind::PartnerLimitStarted => {
-            "The slow actuator is at an end of its range: what comes beyond is the PZT's alone."
+            "The slow actuator is at an end of its range: the PZT takes the rest."
                 .to_string()
         }
         EventKind::PartnerLimitEnded { lasted_ms } => {
-            ended("The slow actuator is off the end of its range", lasted_ms)
+            ended("The slow actuator has left the end of its range", lasted_ms)
         }
-        _ => "The slow actuator is silent, parked or does not obey: the run goes on within the PZT's stroke.".to_string(),
+        _ => "The slow actuator is silent, parked or does not obey: the run continues within the PZT's stroke.".to_string(),
     }
 }
 
@@ -270,9 +270,7 @@ fn plant_changed(verdict: &str, gain_ratio: f64, lag_ms: f64) -> String {
 
 fn board_held(count: u16) -> String {
     let times = plural(u64::from(count), "time", "times");
-    format!(
-        "Commands had stopped for the board's watchdog, {count} {times}: it held the bead, and the loop takes up again."
-    )
+    format!("The board missed commands and held the bead {count} {times}; the loop continues.")
 }
 
 fn disk_slow(unconfirmed_ms: f64, rows: u64, limit_ms: f64) -> String {

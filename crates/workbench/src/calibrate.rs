@@ -150,9 +150,9 @@ fn pulsed(
     if !(centre_um - a_um >= low_um && centre_um + a_um <= high_um) {
         return Err(Failure::bad_input(
             format!(
-                "the PZT is at {centre_um:.2} um, limits are {low_um} to {high_um} um: no room for {a_um} um to both sides"
+                "the PZT is at {centre_um:.2} um, within limits of {low_um} to {high_um} um: no room for {a_um} um to both sides"
             ),
-            "move it first: park_um in [limits] of rig.toml near the middle of the range, then cellpos jog --to that",
+            "set park_um in [limits] of rig.toml near the middle of the range, then move there: cellpos jog --to",
         ));
     }
     let (commands, end_ns) = on_a_thread_of_its_own(&mut watch, &mut mover, pulses, progress)?;

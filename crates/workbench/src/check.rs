@@ -156,7 +156,7 @@ impl Findings<'_> {
                 (table, "hold_watchdog_ms"),
                 &hold,
                 format!("hold_watchdog_ms = {hold}: shorter than watchdog_ms = {watchdog}"),
-                "two seconds leave a stalled host time to take up again",
+                "two seconds give a stalled host time to continue",
             );
         }
     }
@@ -202,7 +202,7 @@ impl Findings<'_> {
                 ("actuator", "baud"),
                 baud,
                 format!("baud = {baud}: carries no command each {period_ms} ms (360 bits)"),
-                "921600 at least, 3000000 where the adapter can: the time on the wire is delay in the loop",
+                "write at least 921600, or 3000000 if the adapter can: the time on the wire adds to the loop delay",
             );
         }
         if port.is_empty() {

@@ -133,7 +133,7 @@ fn say_failure(found: &mut Found, of: (&str, &str), value: &str, failure: &Failu
     let (Failure::BadInput(report) | Failure::Failed(report)) = failure;
     let remedy = report.help().map_or_else(
         || {
-            "is it there and switched on, and has no other program opened it? docs/rig.md, What a refusal means"
+            "is it connected and switched on, and not open in another program? See docs/rig.md, What a refusal means"
                 .to_string()
         },
         |help| help.to_string(),
@@ -165,7 +165,7 @@ fn judge_board(found: &mut Found, file: &RigFile, line: &LineTest) {
                 ("limits", key),
                 &value,
                 format!("{key} = {value}: wider than the board's own, {of_board}"),
-                "the board's value holds; write it into the file",
+                "the board's value is in force; write it into the file",
             );
         }
     }

@@ -129,7 +129,7 @@ impl Mover {
         let report = &self.newest;
         if report.session != self.session {
             return Err(Failure::bad_input(
-                "another program has armed the board meanwhile",
+                "another program has armed the board",
                 "end it, and begin again",
             ));
         }

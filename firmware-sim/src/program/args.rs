@@ -11,33 +11,33 @@ use serde::Deserialize;
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
-/// A whole rig in a box, in real time: the PZT board on a pseudo-terminal, the camera on a Unix socket.
+/// A rig in a box, in real time: the PZT board on a pseudo-terminal, the camera on a Unix socket.
 #[derive(Debug, Parser)]
 #[command(name = "firmware-sim", version, after_help = EXAMPLE)]
 pub(crate) struct Args {
-    /// Rig file; its tables `emulator` and `board` are used, the others belong to the host
+    /// Rig file; only its tables `emulator` and `board` are used
     #[arg(long, value_name = "FILE")]
     pub rig: Option<PathBuf>,
     /// Plant and effects: eq6 or a model.toml
     #[arg(long, value_name = "MODEL")]
     pub model: Option<String>,
-    /// Fixes every random number
+    /// Random seed
     #[arg(long)]
     pub seed: Option<u64>,
-    /// Whether the rig stands still, or has the imperfections of a real one (false): flow, light, focus and clocks stray
+    /// false: the rig has the imperfections of a real one (flow, light, focus and clocks wander)
     #[arg(long, value_name = "BOOL", num_args = 0..=1, require_equals = true, default_missing_value = "true")]
     pub ideal: Option<bool>,
-    /// Make a symbolic link to the pseudo-terminal here, so that its name is always the same
+    /// Make a symbolic link to the pseudo-terminal, under a name that stays the same
     #[arg(long, value_name = "PATH")]
     pub pty_link: Option<PathBuf>,
-    /// Provide plant and camera only, around a board that runs elsewhere: the terminal on which it says the codes of its
-    /// converter (three bytes each, see firmware/README.md); the host talks to that board directly
+    /// Emulate plant and camera only; a real board is the PZT board. TTY is the terminal on which the board reports its
+    /// converter codes (three bytes each, see firmware/README.md). The host talks to the board directly
     #[arg(long, value_name = "TTY", conflicts_with_all = ["pty_link", "link_garbage", "link_loss", "line_stall", "usb_chunks"])]
     pub board: Option<PathBuf>,
     /// Unix socket for the camera's frames [default: firmware-sim-PID.sock in the directory for temporary files]
     #[arg(long, value_name = "PATH")]
     pub socket: Option<PathBuf>,
-    /// Write time, applied displacement, true positions and board state as CSV, each millisecond
+    /// Write time, applied displacement, true positions and board state as CSV, every millisecond
     #[arg(long, value_name = "FILE")]
     pub log: Option<PathBuf>,
     /// Stop after this time
@@ -46,7 +46,7 @@ pub(crate) struct Args {
     /// Do not ask for real-time scheduling
     #[arg(long)]
     pub best_effort: bool,
-    /// Bring a new bead when the old one has been out of the frame for this long and the flow is slow
+    /// A new bead appears after the old one has been out of the frame for this long, once the flow is slow
     #[arg(long, value_name = "TIME", default_value = "300ms")]
     pub new_bead_after: Seconds,
 
@@ -65,16 +65,16 @@ pub(crate) struct Args {
     /// The camera stalls and then delivers in a burst
     #[arg(long, value_name = "AT[,FOR]", help_heading = "Faults")]
     pub stall_camera: Vec<Span>,
-    /// The bead is not to be seen
+    /// The bead disappears
     #[arg(long, value_name = "AT[,FOR]", help_heading = "Faults")]
     pub lose_bead: Vec<Span>,
     /// The bead sticks to the wall
     #[arg(long, value_name = "AT[,FOR]", help_heading = "Faults")]
     pub stick_bead: Vec<Span>,
-    /// A second bead swims along
+    /// A second bead appears
     #[arg(long, value_name = "AT[,FOR]", help_heading = "Faults")]
     pub second_bead: Vec<Span>,
-    /// Where the second bead appears, from the first
+    /// Distance of the second bead from the first
     #[arg(
         long,
         value_name = "LENGTH",
@@ -82,13 +82,13 @@ pub(crate) struct Args {
         allow_hyphen_values = true
     )]
     pub second_bead_offset: Option<Micrometers>,
-    /// The same picture again and again under new ids and times
+    /// The camera repeats one picture, with new numbers and times
     #[arg(long, value_name = "AT[,FOR]", help_heading = "Faults")]
     pub frozen_picture: Vec<Span>,
-    /// The zero flow steps: a tap on the syringe
+    /// Zero flow steps, as after a tap on the syringe
     #[arg(long, value_name = "AT[,FOR]", help_heading = "Faults")]
     pub flow_step: Vec<Span>,
-    /// How far it steps, in displacement of the PZT [default: 0.3um]
+    /// Size of that step, as PZT displacement [default: 0.3um]
     #[arg(
         long,
         value_name = "LENGTH",
@@ -102,7 +102,7 @@ pub(crate) struct Args {
     /// The amplifier clips
     #[arg(long, value_name = "AT[,FOR]", help_heading = "Faults")]
     pub clip_amplifier: Vec<Span>,
-    /// Largest displacement of the amplifier that clips [default: 20.5um]
+    /// Displacement at which the amplifier clips [default: 20.5um]
     #[arg(
         long,
         value_name = "LENGTH",
@@ -110,17 +110,17 @@ pub(crate) struct Args {
         allow_hyphen_values = true
     )]
     pub clip_at: Option<Micrometers>,
-    /// Bursts of random bytes on the line: how many a second (2Hz), or a time span with one each millisecond
+    /// Bursts of random bytes on the line: at a rate (2Hz), or one every millisecond of a time span
     #[arg(long, value_name = "RATE|AT[,FOR]", help_heading = "Faults")]
     pub link_garbage: Vec<FrequencyOrSpan>,
-    /// No byte passes the line
+    /// The line loses every byte
     #[arg(long, value_name = "AT[,FOR]", help_heading = "Faults")]
     pub link_loss: Vec<Span>,
-    /// The line takes and gives nothing, and loses nothing: from a time on (5s,100ms), or at a mean rate and for up to a time
+    /// The line stalls and loses nothing: at a time for a duration (5s,100ms), or at a mean rate for up to a duration
     /// (0.5Hz,180ms)
     #[arg(long, value_name = "AT,FOR|RATE,LONGEST", help_heading = "Faults")]
     pub line_stall: Vec<StallOption>,
-    /// Bytes pass the line in packets of at most so many, one each way in 125 us
+    /// Bytes pass the line in packets of at most this size, one each way every 125 us
     #[arg(long, value_name = "BYTES", help_heading = "Faults", value_parser = clap::value_parser!(u16).range(1..=4096))]
     pub usb_chunks: Option<u16>,
 }

@@ -110,7 +110,7 @@ pub(super) fn fit(
     }
     if fit.residual_rms > 0.6 * fit.output_rms {
         advice.push(format!(
-            "the model explains little: its free run is off by {} of {} RMS; swapped columns, another input, or a plant that is not linear",
+            "the model explains little: its free run is off by {} of {} RMS; are the columns swapped, does another input act, or is the plant nonlinear?",
             number(fit.residual_rms),
             number(fit.output_rms)
         ));
@@ -135,7 +135,7 @@ pub(super) fn fit(
             && twin.residual_rms < 0.9 * fit.residual_rms
         {
             advice.push(format!(
-                "the same form with --hold {} leaves {} in the place of {}: if the input was {}, say so",
+                "the same form with --hold {} leaves {} instead of {}: use it if the input was {}",
                 hold_word(other),
                 number(twin.residual_rms),
                 number(fit.residual_rms),
@@ -174,7 +174,7 @@ fn too_poor(
     });
     let (richer, held_out) = better.min_by(|a, b| a.1.total_cmp(&b.1))?;
     Some(format!(
-        "the stated form is too poor: beside {form}, {richer} predicts halves of the records with an error of {} in the place of {}; state --base {richer}, or leave the form open",
+        "the stated form {form} is too simple: {richer} predicts held-out halves of the records with an error of {} instead of {}; write --base {richer}, or leave the form out",
         number(held_out),
         number(stated)
     ))

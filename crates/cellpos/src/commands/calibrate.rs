@@ -117,8 +117,7 @@ pub(crate) fn run(args: Args) -> CommandResult {
     let mut warnings = Vec::new();
     if !(1.0 / 1.3..=1.3).contains(&gain_ratio) {
         warnings.push(format!(
-            "with {pixel_um:.4} um a pixel the bead moves {gain_ratio:.2} times as fast as the model {} says: is the pixel size \
-             right (the model's would be {pixel_of_model_um:.4} um), the um per volt of the drive, the model of this chip?",
+            "with {pixel_um:.4} um a pixel the bead moves {gain_ratio:.2} times as fast as the model {} says. Check the pixel size (the model would need {pixel_of_model_um:.4} um), the um per volt of the drive, and whether the model is of this chip",
             args.model
         ));
     }

@@ -28,7 +28,7 @@ pub(super) fn run(job: &Job) -> CommandResult {
         (_, Some(path), _) => find_beads(job, path),
         (_, _, Some(path)) => take_snapshot(job, path),
         _ => Err(Failure::bad_input(
-            "--rig: nothing is asked of its camera",
+            "--rig: say what to do with its camera",
             "add --snapshot FILE, --record FOLDER or --find-beads FILE",
         )),
     }
@@ -204,7 +204,7 @@ fn take_snapshot(job: &Job, path: &Path) -> CommandResult {
         }
         (None, true) => {
             text += &format!(
-                "no bead or cell that vision believes in within 5 s: with a bead in view and in focus\n\
+                "no bead or cell was seen for 5 s. With a bead in view and in focus:\n\
                  cellpos camera --rig {rig} --find-beads beads.png    finds what it looks like and writes [vision]\n\
                  cellpos camera --rig {rig} --record beads/ --duration 5s    records frames for cellpos vision beads/\n\
                  docs/rig.md, Light and focus, says what a good picture is\n",

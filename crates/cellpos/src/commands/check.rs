@@ -22,7 +22,7 @@ pub(crate) struct Args {
     /// `eq6`, or a model file.
     #[arg(long, default_value = "eq6")]
     model: String,
-    /// Rig file with the limits; default: 0um to 40um, zero flow at 20um, 10000um/s, a view of 50um to either side.
+    /// Rig file with the limits; default: 0um to 40um, zero flow at 20um, 10000um/s, view from -50um to 50um.
     #[arg(long)]
     rig: Option<PathBuf>,
     /// Smallest PZT displacement, instead of the rig's.
@@ -37,7 +37,7 @@ pub(crate) struct Args {
     /// Largest speed of the PZT, instead of the rig's.
     #[arg(long)]
     slew: Option<MicrometersPerSecond>,
-    /// Half of the field of view along the channel.
+    /// Field of view along the channel: positions from minus this to plus this are in view.
     #[arg(long)]
     view: Option<Micrometers>,
     /// Write reference and PZT demand as a report.
@@ -66,7 +66,7 @@ pub(crate) fn run(args: Args) -> CommandResult {
         print_text(&text(&script, &result))?;
         if !knows_view {
             print_text(&format!(
-                "field of view: {} um to either side is assumed; `--view` says what the camera sees, and `cellpos run` asks the camera\n",
+                "field of view: assumed from -{0} to {0} um; give yours with --view (`cellpos run` asks the camera)\n",
                 limits.view_um
             ))?;
         }

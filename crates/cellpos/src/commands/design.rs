@@ -78,7 +78,7 @@ pub(crate) struct Args {
     /// Loop delay: camera delay and half a sample of hold; default: of --rig, else of controller.toml, of the model, or 2.5ms.
     #[arg(long, value_parser = crate::arguments::loop_delay)]
     delay: Option<Seconds>,
-    /// Rig file with the camera delay and the period.
+    /// Rig file: its camera delay, period and limits are used.
     #[arg(long, conflicts_with_all = ["delay", "sample"])]
     rig: Option<PathBuf>,
     /// Sample time; default: of --rig, else of controller.toml, else 1ms.
@@ -127,7 +127,7 @@ pub(crate) struct Args {
     /// Require stability for all of the spread (gain x 0.5..2, delay +0/+1 sample).
     #[arg(long)]
     stable_over_spread: bool,
-    /// Localisation noise; default: that of the model.
+    /// Localisation noise for the predicted errors; default: the model's (30 nm in eq6).
     #[arg(long)]
     fix_noise: Option<cellpos_units::Micrometers>,
     /// Write the controller to this file.

@@ -120,8 +120,7 @@ fn verdict(soak: &Soak, findings: &[Finding]) -> (bool, String) {
         return (
             false,
             format!(
-                "timing was good for {:.1} s, which is too short to call it fit: measure for {SHORTEST_S} s or more, and \
-                 overnight before a night's run (--for 10h)",
+                "timing was good, but {:.1} s are too short for a verdict: measure for {SHORTEST_S} s or more, and overnight before a night's run (--for 10h)",
                 soak.seconds
             ),
         );
@@ -129,7 +128,7 @@ fn verdict(soak: &Soak, findings: &[Finding]) -> (bool, String) {
     if !soak.conditions.degraded.is_empty() {
         return (
             false,
-            "timing is good now, but not everything asked for was granted: a busy machine will stall the loop".to_string(),
+            "timing is good now, but rights for real time are missing: a busy machine will stall the loop".to_string(),
         );
     }
     if !bad.is_empty() {

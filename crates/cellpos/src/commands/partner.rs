@@ -14,38 +14,38 @@ use std::path::PathBuf;
 /// Arguments of `cellpos rig partner`.
 #[derive(Debug, clap::Args)]
 #[command(
-    after_help = "The bead is held by the PZT while the slow actuator makes a square wave about where it stands.\n\n\
+    after_help = "The PZT holds the bead while the slow actuator makes a square wave about its present position.\n\n\
     Examples:\n  cellpos rig partner rig.toml\n  cellpos rig partner rig.toml --amplitude 0.5um --duration 60s --write\n\n\
     Exit code 0: measured; 1: the run failed, or the effect of the actuator is below the noise; 2: bad input."
 )]
 pub(super) struct Args {
     /// The rig file, with a table [partner].
     rig: PathBuf,
-    /// The plant: a model.toml, or eq6.
+    /// Model of the plant: a model.toml, or eq6.
     #[arg(long, default_value = "eq6")]
     model: String,
-    /// Half of peak to peak of the square wave, on the actuator's own scale.
+    /// Amplitude of the square wave (half of peak to peak), on the actuator's own scale.
     #[arg(long, default_value = "0.2um", value_parser = positive::<Micrometers>)]
     amplitude: Micrometers,
-    /// Time up, and time down.
+    /// Half of the period of the square wave.
     #[arg(long, default_value = "0.5s", value_parser = positive::<Seconds>)]
     half_period: Seconds,
-    /// How long it is measured.
+    /// Duration of the measurement.
     #[arg(long, default_value = "30s", value_parser = positive::<Seconds>)]
     duration: Seconds,
-    /// Write what was found into the rig file.
+    /// Write the result into the rig file.
     #[arg(long)]
     write: bool,
-    /// Seed of the emulated rig; left out: that of the rig file.
+    /// Seed of the emulated rig; default: that of rig.toml.
     #[arg(long)]
     seed: Option<u64>,
     /// Clock of the emulated rig [default: virtual].
     #[arg(long, value_enum)]
     clock: Option<ClockKind>,
-    /// Whether the emulated rig renders frames.
+    /// Render frames of the emulated rig.
     #[arg(long, value_enum, default_value = "on")]
     frames: Frames,
-    /// Do not ask the operating system for real time.
+    /// Run without real-time priority.
     #[arg(long)]
     best_effort: bool,
     /// Print one JSON object on standard output.

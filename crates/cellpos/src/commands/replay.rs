@@ -134,12 +134,12 @@ fn same_law(reader: &RunReader, columns: &[&'static str]) -> Result<(), Failure>
     let recorded: Vec<&str> = recorded.iter().map(String::as_str).collect();
     Err(Failure::bad_input(
         format!(
-            "{}: was driven by a control law with other columns ({}) than the one that run.toml describes ({})",
+            "{}: its control law has other columns ({}) than the law in run.toml ({})",
             reader.folder().display(),
             named(&recorded),
             named(columns)
         ),
-        "a law of another program is replayed by that program (cellpos_runtime::replay)",
+        "it is the law of another program: let that program replay it (cellpos_runtime::replay)",
     ))
 }
 
@@ -157,8 +157,7 @@ fn left_out(s: &SessionReport) -> Vec<String> {
     }
     if !s.complete {
         lines.push(format!(
-            "not replayed: what came after the last row; the record has no end ({} unreadable bytes): the run was killed, its \
-             disk was full, or it still goes on",
+            "not replayed: anything after the last row; the record has no end ({} unreadable bytes): the run was killed, its disk was full, or it is still running",
             s.unreadable_bytes
         ));
     } else if s.unreadable_bytes > 0 {
@@ -180,7 +179,7 @@ fn text(report: &Report) -> String {
     for s in &report.sessions {
         let verdict = match (s.first_mismatch, s.ended_at_gap) {
             (Some(m), _) => format!(
-                "differs first at tick {}: {} recorded {:?}, replayed {:?}",
+                "first difference at tick {}: {} recorded {:?}, replayed {:?}",
                 m.seq, m.column, m.recorded, m.replayed
             ),
             (None, None) if s.complete && s.lost_rows + s.damaged_rows == 0 => {
@@ -188,8 +187,7 @@ fn text(report: &Report) -> String {
             }
             (None, None) => "every command that the record has reproduced to the bit".to_string(),
             (None, Some(gap)) => format!(
-                "all that were replayed; the replay ended at tick {}, which is missing: {} ticks stand behind that gap ({} \
-                 rows missing, {} damaged), where the state of the loop is not known, and were not replayed",
+                "all that were replayed; the replay ended at tick {}, which is missing: {} ticks after that gap ({} rows missing, {} damaged) were not replayed, because the state of the loop is not known there",
                 gap.from_seq,
                 s.ticks - s.replayed,
                 s.missing_rows,

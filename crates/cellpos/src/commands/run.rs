@@ -384,8 +384,7 @@ fn measurable(script: &Script, plan: &Plan, file: &RigFile) -> Result<(), Failur
     }
     Err(Failure::bad_input(
         format!(
-            "{}: a wait for cell-length or a stop on length_change_above, and nobody measures a length here: the loop follows \
-             a bead",
+            "{}: it waits for cell-length or stops on length_change_above, but the loop follows a bead and measures no length",
             script.file
         ),
         "follow a cell: a table [cell] in rig.toml, or [emulator.cell] for the emulated rig",

@@ -128,8 +128,7 @@ fn away_from_rest(model: &Model, input: &Record) -> Option<String> {
     let mean_um = input.pzt_um.iter().sum::<f64>() / input.len() as f64;
     let travel_um = usual * (mean_um - rest_um) * input.len() as f64 * input.step_s;
     (slow > 0.3 * usual && travel_um.abs() > 1.0).then(|| format!(
-        "the command is from {low_um} to {high_um} um, and the model's bead rests at {rest_um} um only: it goes about {travel_um:.0} um \
-         away; check the unit of the column, or set working_point_um in the model"
+        "the command goes from {low_um} to {high_um} um, but the model's bead rests at {rest_um} um: it travels about {travel_um:.0} um; check the unit of the column, or working_point_um in the model"
     ))
 }
 

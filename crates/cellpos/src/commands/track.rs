@@ -419,7 +419,7 @@ fn text(report: &Report) -> String {
     line(
         "lowest possible",
         format!(
-            "{} RMS (Brownian motion, delay and noise in force)",
+            "{} RMS (Brownian motion, loop delay, noise of these fixes)",
             nm(report.bound_rms_nm)
         ),
     );
@@ -450,7 +450,7 @@ fn text(report: &Report) -> String {
     if s.records_lost > 0 {
         line(
             "LOST",
-            format!("{} rows are not on the disk", s.records_lost),
+            format!("{} rows could not be written", s.records_lost),
         );
     }
     if let Some(lost) = s.commands_lost.filter(|&lost| lost > 0) {

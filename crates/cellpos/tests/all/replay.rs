@@ -62,7 +62,7 @@ fn rows_behind_a_gap_are_said_to_be_not_replayed() {
     std::fs::write(&path, bytes).unwrap();
     let (text, json) = replay(folder.path(), &run);
     assert_eq!(text.code, Some(1), "{}", text.out);
-    assert!(text.out.contains("stand behind that gap"), "{}", text.out);
+    assert!(text.out.contains("after that gap"), "{}", text.out);
     let json = json.json();
     let session = &json["sessions"][0];
     assert!(session["ended_at_gap"].is_object(), "{json}");
@@ -130,7 +130,11 @@ fn another_controller_is_named_by_its_first_difference_and_another_law_is_refuse
     });
     let (text, json) = replay(folder.path(), &run);
     assert_eq!(text.code, Some(1), "{}", text.out);
-    assert!(text.out.contains("differs first at tick"), "{}", text.out);
+    assert!(
+        text.out.contains("first difference at tick"),
+        "{}",
+        text.out
+    );
     assert!(json.json()["first_mismatch"].is_object());
 
     std::fs::write(run.join("run.toml"), meta).unwrap();

@@ -13,9 +13,10 @@ const AT_PARK: &str = "The PZT is at park, or ramps there.";
 const PARKED_THEN: &str = "The program parked the PZT when the run ended.";
 /// Where it is when nobody could see that the board took it.
 const NOT_SEEN: &str =
-    "The board was told to park and was not heard since; its own watchdog parks the PZT.";
+    "The board was told to park and has been silent since; its own watchdog parks the PZT.";
 /// Where it is when another host has the board.
-const FOREIGN: &str = "Another program has the board: where the PZT is, this program cannot say.";
+const FOREIGN: &str =
+    "Another program uses the board: this program does not know where the PZT is.";
 /// Where it is when the board was never armed.
 const NOT_ARMED: &str = "The board was not armed: the PZT was not moved.";
 
@@ -87,7 +88,7 @@ pub(super) fn of_gone(seconds: u64) -> LastWord {
     LastWord {
         how: "failed",
         seen: format!(
-            "Nothing was written for {seconds} s, and the record has no end: the program is gone, or its disk is."
+            "Nothing was written for {seconds} s, and the record has no end: the program or its disk failed."
         ),
         to_do: "See whether the program still runs".to_string(),
         pzt: "Without commands the board's own watchdog holds the bead, then parks the PZT."

@@ -97,9 +97,9 @@ fn criterion(request: &DesignRequest) -> Option<String> {
 fn line(out: &mut String, name: &str, value: f64, decimals: usize, unit: &str) {
     // Writing into a String cannot fail.
     let _ = if value.is_finite() {
-        writeln!(out, "  {name:<34}{value:>10.decimals$} {unit}")
+        writeln!(out, "  {name:<35}{value:>10.decimals$} {unit}")
     } else {
-        writeln!(out, "  {name:<34}{:>10} {unit}", "none")
+        writeln!(out, "  {name:<35}{:>10} {unit}", "none")
     };
 }
 
@@ -130,10 +130,22 @@ pub(super) fn table(model: &str, request: &DesignRequest, report: &DesignReport)
     line(&mut out, "gain margin", m.gm_db, 1, "dB");
     line(&mut out, "delay margin", m.delay_margin_s * 1e3, 2, "ms");
     line(&mut out, "", m.delay_margin_s / ts, 2, "samples");
-    line(&mut out, "Ms", m.ms, 3, "");
-    line(&mut out, "Mt", m.mt, 3, "");
-    line(&mut out, "|S| < 1 below", m.s_below_1_hz, 1, "Hz");
-    line(&mut out, "-3 dB of T", m.bandwidth_3db_hz, 1, "Hz");
+    line(&mut out, "Ms (peak of the sensitivity)", m.ms, 3, "");
+    line(&mut out, "Mt (peak of T)", m.mt, 3, "");
+    line(
+        &mut out,
+        "disturbances reduced below (|S|<1)",
+        m.s_below_1_hz,
+        1,
+        "Hz",
+    );
+    line(
+        &mut out,
+        "bandwidth (-3 dB of T)",
+        m.bandwidth_3db_hz,
+        1,
+        "Hz",
+    );
     response_lines(&mut out, report);
     line(
         &mut out,
@@ -144,8 +156,15 @@ pub(super) fn table(model: &str, request: &DesignRequest, report: &DesignReport)
     );
     line(
         &mut out,
-        "minimum-variance bound on it",
+        "lowest possible (minimum variance)",
         report.bound_rms_um * 1e3,
+        1,
+        "nm",
+    );
+    line(
+        &mut out,
+        "  both with localisation noise of",
+        request.plant.fix_noise_um * 1e3,
         1,
         "nm",
     );

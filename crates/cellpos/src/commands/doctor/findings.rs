@@ -103,7 +103,7 @@ impl Machine<'_> {
         match self.cpus {
             0 | 1 => finding(
                 "CPUs",
-                "one: camera, control and recording share it",
+                "one CPU: camera, control and recording share it",
                 Weight::Bad,
                 "give the machine, or the process (taskset, cgroup cpuset), two CPUs or more",
             ),
@@ -217,7 +217,7 @@ impl Machine<'_> {
             if flags.split_whitespace().any(|flag| flag == "hypervisor") {
                 finding(
                     "virtual machine",
-                    "yes: the host may stop all CPUs at any time, and nothing in here can tell or prevent it",
+                    "yes: the host may stop all CPUs at any time; a program inside cannot notice or prevent it",
                     Weight::Bad,
                     "run on the machine itself",
                 )
@@ -303,7 +303,7 @@ impl Machine<'_> {
         Some(if swaps.lines().count() > 1 {
             finding(
                 "swap",
-                "on: other programs' pages come and go with the disk",
+                "on: other programs may wait for the disk",
                 Weight::Note,
                 "swapoff -a for the run (the loop's own memory is locked)",
             )

@@ -212,7 +212,7 @@ fn watch(late: &AtomicU64, done: &AtomicBool, cpu: Option<usize>) -> Vec<Suspect
 /// What is left without the kernel's record, and how to have it.
 fn tracing(error: &str) -> String {
     format!(
-        "the names are programs that ran within the same tenth of a second; the one that had the CPU is unknown: {error}"
+        "these programs ran within the same tenth of a second; which one had the CPU is unknown: {error}"
     )
 }
 

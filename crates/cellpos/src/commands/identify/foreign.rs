@@ -19,17 +19,17 @@ use serde_json::{Value, json};
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
 
-const NO_LINEAR: &str = "harmonics remain in the output that the input does not hold: no linear model of any order explains them (hysteresis, saturation and other nonlinearities do); `cellpos reconcile` looks for what is missing";
+const NO_LINEAR: &str = "the output has harmonics that the input has not: no linear model explains them, but hysteresis, saturation and other nonlinearities do; `cellpos reconcile` searches for them";
 
-const IN_LOOP: &str = "a record of a closed loop: input and output were both taken by way of the reference, which the noise is not in";
+const IN_LOOP: &str = "a record of a closed loop: input and output were both projected on the reference, which is free of the noise";
 const NOTHING: &str = "a record of a closed loop that nothing from outside moved: the position moves the actuator as much as the actuator the position, and what the record shows is the controller's inverse as well as the plant. No response and no model can be taken from it. A record with a moving reference (track --sine, a script), or cellpos identify, which excites the loop, can tell";
 
-const NO_MODEL: &str = "no linear model: each that fits has a pole that grows, and the plant has none (Eq. (1)-(3) are passive)";
+const NO_MODEL: &str = "no linear model: each one that fits is unstable, and the plant is not (Eq. (1)-(3) are passive)";
 
 /// Why there is no model.
 fn no_model(r: &ForeignResult) -> &'static str {
     if r.points.len() < 3 {
-        "no linear model: one or two frequencies tell gain and lag there, and no more"
+        "no linear model: one or two frequencies give gain and lag there only"
     } else {
         NO_MODEL
     }
@@ -223,7 +223,7 @@ fn model_verdict(m: &RationalFit) -> &'static str {
 fn model_of_response(result: &ForeignResult, at_rest: f64) -> Result<Model, Failure> {
     let Some(best) = result.models.first() else {
         return Err(Failure::bad_input(
-            "no model: every one that fits has a pole that grows",
+            "no model: every one that fits is unstable",
             "try another --order or --hold, or a record that excites more",
         ));
     };

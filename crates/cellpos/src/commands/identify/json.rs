@@ -125,12 +125,13 @@ pub(crate) fn text(done: &Done, model: &Path, report: &Path) -> String {
         );
     }
     if let Some(led) = result.led {
-        let _ = writeln!(
-            out,
-            "delay  LED test {:.3} ms; phase slope {:.3} ms or more",
-            led.delay_s * 1e3,
-            result.judged.phase_delay95_s[0] * 1e3
-        );
+        let least_ms = result.judged.phase_delay95_s[0] * 1e3;
+        let phase = if least_ms > 0.0 {
+            format!("phase slope {least_ms:.3} ms or more")
+        } else {
+            "the phase slope does not determine it".to_owned()
+        };
+        let _ = writeln!(out, "delay  LED test {:.3} ms; {phase}", led.delay_s * 1e3);
     }
     let _ = writeln!(out, "line Hz   gain dB   phase deg   coherence");
     for p in &result.compensated {

@@ -29,9 +29,9 @@ use std::path::PathBuf;
 /// On or off.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
 pub(crate) enum Switch {
-    /// On.
+    /// Render frames and find the bead in them.
     On,
-    /// Off.
+    /// Positions with equivalent noise: faster.
     Off,
 }
 
@@ -333,7 +333,7 @@ pub(crate) fn run(args: Args) -> CommandResult {
     output::ready(args.out.iter().chain(&args.report))?;
     if args.base.is_some() && args.input.is_none() && args.response.is_none() {
         return Err(Failure::bad_input(
-            "--base is the form of a model of other rigs' records, or of a response",
+            "--base is only for records of other rigs, or a response",
             "name them with --data, --input and --output, or with --response",
         ));
     }

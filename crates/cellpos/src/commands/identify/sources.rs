@@ -75,8 +75,8 @@ fn own_record(path: &Path) -> Result<Vec<Source>, Failure> {
     let text = text_of(path)?;
     let foreign = |error: String| {
         Failure::bad_input(
-            format!("{name}: is no record of cellpos: {error}"),
-            "say which columns are input and output, and which the time or how many rows a second: --input u --output y --rate 1kHz",
+            format!("{name} is not a record of cellpos: {error}"),
+            "name the columns of input and output, and the time column or the rate: --input u --output y --rate 1kHz",
         )
     };
     let table = Table::parse(path, &text).map_err(|error| foreign(error.to_string()))?;
@@ -256,8 +256,8 @@ fn runs(path: &Path) -> Result<Vec<Source>, Failure> {
         }) = config
         {
             return Err(Failure::bad_input(
-                format!("{}: is the run of an identification", path.display()),
-                "its model and report are what identify wrote; to measure again: cellpos identify --rig",
+                format!("{} is the run of an identification", path.display()),
+                "identify has already written its model and report; to measure again: cellpos identify --rig",
             ));
         }
         let ticks = || {

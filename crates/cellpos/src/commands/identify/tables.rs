@@ -17,6 +17,8 @@ pub(crate) fn number(value: f64) -> String {
         } else {
             "no lower bound".to_owned()
         }
+    } else if value.abs() >= 1e7 {
+        format!("{value:.2e}")
     } else if value.abs() >= 1000.0 {
         format!("{value:.0}")
     } else if value.abs() >= 100.0 {

@@ -22,7 +22,7 @@ pub(super) fn below_nyquist(script: &Script, check: &Check, file: &RigFile) -> R
     {
         Some(wave) => Err(Failure::bad_input(
             format!(
-                "{}:{}: a wave of {} Hz: at {rate_hz:.0} ticks a second no motion from {:.0} Hz on can be told from a slower one",
+                "{}:{}: a wave of {} Hz: at {rate_hz:.0} ticks a second, motion at {:.0} Hz or faster looks like a slower one",
                 script.file,
                 wave.line,
                 wave.frequency_hz,

@@ -180,5 +180,5 @@ impl<'a> Report<'a> {
 /// What became of commands on the way to the board, in words.
 pub(crate) fn commands_lost(lost: u64, not_taken: Option<u64>) -> String {
     let not_taken = not_taken.unwrap_or(0);
-    format!("{lost} lost on the way to the board, of which its line did not take {not_taken}")
+    format!("{lost} lost on the way to the board; its line refused {not_taken} of these")
 }

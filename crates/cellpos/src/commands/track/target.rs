@@ -26,8 +26,7 @@ pub(super) fn check(
         let most = (target.value() - low_um).min(high_um - target.value());
         return Err(Failure::bad_input(
             format!(
-                "--sine {reach}: about --target {target} it goes from {:.1}um to {:.1}um, and the camera sees {low_um:.1}um to \
-                 {high_um:.1}um",
+                "--sine {reach}: about --target {target} it goes from {:.1}um to {:.1}um, but the camera sees only {low_um:.1}um to {high_um:.1}um",
                 ends[0], ends[1]
             ),
             format!(

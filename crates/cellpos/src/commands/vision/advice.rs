@@ -47,13 +47,13 @@ impl Advice {
     fn profile(&self) -> &'static str {
         match self.vision.profile {
             ProfileSpec::Table { .. } => {
-                "profile: learnt; it predicts beads that it was not learnt from better than a Gaussian and the measured ring do"
+                "profile: learnt; it predicts unseen beads better than a Gaussian or the measured ring"
             }
             ProfileSpec::Gaussian { .. } => {
-                "profile: a Gaussian; a learnt one predicts beads that it was not learnt from no better"
+                "profile: a Gaussian; a learnt one predicts unseen beads no better"
             }
             ProfileSpec::Ring { .. } => {
-                "profile: the measured ring, scaled; a learnt one predicts beads that it was not learnt from no better"
+                "profile: the measured ring, scaled; a learnt one predicts unseen beads no better"
             }
         }
     }
