@@ -43,7 +43,7 @@ fn a_script_is_warned_of_a_motion_that_its_loop_will_miss_and_refused_beyond_hal
     let said: Vec<&str> = ran.err.split([' ', '\n', '│']).collect();
     let said: String = said.concat();
     assert!(
-        said.contains("from250Hzon") && said.contains("beyond.toml:5"),
+        said.contains("at250Hzorfaster") && said.contains("beyond.toml:5"),
         "{}",
         ran.err
     );
