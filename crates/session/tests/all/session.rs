@@ -170,7 +170,7 @@ fn an_answer_to_arm_that_is_not_this_session_armed_is_refused_and_disarmed() {
     let answers: [(Answer, &str); 3] = [
         (|r| r.state = ActuatorState::Safe, "Safe"),
         (|r| r.session = r.session.wrapping_add(1), "session"),
-        (|r| r.applied_um += 0.5, "stood at"),
+        (|r| r.applied_um += 0.5, "the PZT moved"),
     ];
     for (answer, word) in answers {
         let (mut rig, log) = rig(ClockKind::Virtual, |_| {}, answer);
