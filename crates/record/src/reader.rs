@@ -178,15 +178,49 @@ impl RunReader {
             pzt_um.push(tick.command_um);
             bead_um.push(crate::export::bead_um(&tick));
         }
-        // Rows have numbers: jitter of the real clock is no reason to refuse a run.
-        const JITTER: f64 = 0.49;
+        periods(&mut time_s);
         Ok(Record::from_rows(
             &self.folder,
             &time_s,
             [pzt_um, bead_um],
             vec![],
-            JITTER,
+            ROUNDING,
         )?)
+    }
+}
+
+/// Deviation of a step that comes of computing with it, in steps.
+const ROUNDING: f64 = 1e-3;
+
+/// Puts the times of ticks on the even grid of their periods. A tick waits for its frame, or for the timer, and the next one may be
+/// a quarter of a period behind it: each has a period of its own all the same. A period without a tick is one only if the ticks stay
+/// behind by it.
+fn periods(time_s: &mut [f64]) {
+    /// Lateness from which a period had no tick: halfway between a tick of the timer, 0.5 late at most, and one of the next period.
+    const SKIPPED: f64 = 0.75;
+    /// Share of the lateness that a tick keeps: the camera's clock and the computer's differ by some ppm.
+    const KEPT: f64 = 0.99;
+    let mut steps: Vec<f64> = time_s.windows(2).map(|pair| pair[1] - pair[0]).collect();
+    if steps.iter().any(|step| step.is_nan() || *step <= 0.0) {
+        return;
+    }
+    let mut sorted = steps.clone();
+    sorted.sort_by(f64::total_cmp);
+    let (Some(&usual_s), Some(&first_s)) = (sorted.get(sorted.len() / 2), time_s.first()) else {
+        return;
+    };
+    let (mut place, mut late) = (0.0, 0.0);
+    for step in &mut steps {
+        late = KEPT * late + *step / usual_s - 1.0;
+        let skipped = if late < SKIPPED { 0.0 } else { late.round() };
+        late -= skipped;
+        place += 1.0 + skipped;
+        *step = place;
+    }
+    let last_s = time_s.last().copied().unwrap_or(first_s);
+    let step_s = (last_s - first_s) / place;
+    for (time_s, place) in time_s.iter_mut().skip(1).zip(&steps) {
+        *time_s = first_s + place * step_s;
     }
 }
 
@@ -239,5 +273,51 @@ impl Iterator for Batches {
             self.last_seq = Some(row.seq);
         }
         Some(batch)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::periods;
+
+    fn places(steps: &[f64]) -> Vec<i64> {
+        let mut at_s = 0.0;
+        let mut time_s: Vec<f64> = std::iter::once(0.0)
+            .chain(steps.iter().map(|step| {
+                at_s += 1e-3 * step;
+                at_s
+            }))
+            .collect();
+        periods(&mut time_s);
+        let step_s = time_s[1] - time_s[0];
+        (time_s.iter())
+            .map(|s| (s / step_s).round() as i64)
+            .collect()
+    }
+
+    #[test]
+    fn a_tick_a_quarter_of_a_period_behind_another_has_a_period_of_its_own() {
+        // A frame that came too late for its tick, the ticks half a period behind for a while, and the way back.
+        let mut steps = vec![1.0, 1.2, 0.25, 0.85];
+        steps.extend([1.0; 50]);
+        steps.push(1.7);
+        steps.extend([1.0; 50]);
+        let there = places(&steps);
+        let wanted: Vec<i64> = (0..=steps.len() as i64).collect();
+        assert_eq!(there, wanted);
+    }
+
+    #[test]
+    fn a_period_without_a_tick_is_left_out() {
+        let there = places(&[1.0, 1.0, 2.1, 0.9, 1.0, 3.0, 1.0]);
+        assert_eq!(there, [0, 1, 2, 4, 5, 6, 9, 10]);
+    }
+
+    #[test]
+    fn a_camera_of_another_clock_has_no_gaps() {
+        let mut steps = vec![1.0; 20_000];
+        // The usual step is 1, the mean a little more.
+        steps.iter_mut().step_by(10).for_each(|step| *step = 1.001);
+        assert_eq!(places(&steps).last(), Some(&20_000));
     }
 }
