@@ -30,6 +30,19 @@ pub enum ControllerKind {
     Mpc,
 }
 
+impl ControllerKind {
+    /// The law of a name, as controller.toml and the command line write it.
+    pub fn from_name(name: &str) -> Option<Self> {
+        Some(match name {
+            "pi" => Self::Pi,
+            "lead" => Self::Lead,
+            "lqg" => Self::Lqg,
+            "mpc" => Self::Mpc,
+            _ => return None,
+        })
+    }
+}
+
 /// Gains of the PI controller as the file writes them.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]

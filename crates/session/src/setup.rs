@@ -397,43 +397,32 @@ pub const DEFAULT_LAW: &str = "lqg";
 pub fn controller(name: &str, model: &Model, timing: &Timing) -> Result<ControllerFile, Failure> {
     let sample_s = timing.period_us * 1e-6;
     let loop_delay_s = loop_delay_s(model, timing);
-    let mut kind = None;
-    let lead = match name {
-        "pi" => None,
-        "lead" => Some(default_lead(loop_delay_s)),
-        // The PI gains found below serve these two as the fallback.
-        "lqg" | "mpc" => {
-            kind = Some(if name == "lqg" {
-                ControllerKind::Lqg
-            } else {
-                ControllerKind::Mpc
-            });
-            None
-        }
-        path if path.ends_with(".toml") => {
-            let file = ControllerFile::load(Path::new(path)).map_err(Failure::input)?;
-            if (file.delay_ms * 1e-3 - loop_delay_s).abs() > WORTH_SAYING * sample_s {
-                return Err(Failure::bad_input(
-                    format!(
-                        "{path}: it is for a loop delay of {} ms, but the rig has {} ms",
-                        file.delay_ms,
-                        loop_delay_s * 1e3
-                    ),
-                    format!(
-                        "design it again: cellpos design --delay {}ms",
-                        loop_delay_s * 1e3
-                    ),
-                ));
-            }
-            return Ok(file);
-        }
-        other => {
+    let Some(kind) = ControllerKind::from_name(name) else {
+        if !name.ends_with(".toml") {
             return Err(Failure::bad_input(
-                format!("--controller {other}: not a controller"),
+                format!("--controller {name}: not a controller"),
                 "write pi, lead, lqg, mpc, or the path of a controller.toml",
             ));
         }
+        let path = name;
+        let file = ControllerFile::load(Path::new(path)).map_err(Failure::input)?;
+        if (file.delay_ms * 1e-3 - loop_delay_s).abs() > WORTH_SAYING * sample_s {
+            return Err(Failure::bad_input(
+                format!(
+                    "{path}: it is for a loop delay of {} ms, but the rig has {} ms",
+                    file.delay_ms,
+                    loop_delay_s * 1e3
+                ),
+                format!(
+                    "design it again: cellpos design --delay {}ms",
+                    loop_delay_s * 1e3
+                ),
+            ));
+        }
+        return Ok(file);
     };
+    // The PI gains found below serve LQG and MPC as the fallback.
+    let lead = (kind == ControllerKind::Lead).then(|| default_lead(loop_delay_s));
     let plant =
         DesignPlant::from_model(model, Some(loop_delay_s), sample_s).map_err(Failure::input)?;
     let request = DesignRequest {
@@ -452,15 +441,13 @@ pub fn controller(name: &str, model: &Model, timing: &Timing) -> Result<Controll
         unreachable!("a search for PI gains gives PI gains")
     };
     let mut file = ControllerFile::from_pi(pi, loop_delay_s);
-    if let Some(kind) = kind {
-        file.controller = kind;
-    }
+    file.controller = kind;
     file.sample_time_ms = sample_s * 1e3;
     if let Some(config) = &report.config {
         file.estimator = config.estimator;
     }
     // PI is robust without it, and is chosen for that.
-    file.estimator.adapt = kind.is_some();
+    file.estimator.adapt = matches!(kind, ControllerKind::Lqg | ControllerKind::Mpc);
     Ok(file)
 }
 

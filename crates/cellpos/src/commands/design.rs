@@ -47,11 +47,10 @@ impl Choice {
 
 /// `pi`, `lead`, `lqg`, `mpc`, or a path.
 fn choice(text: &str) -> Result<Choice, String> {
+    if let Some(kind) = ControllerKind::from_name(text) {
+        return Ok(Choice::Law(kind));
+    }
     match text {
-        "pi" => Ok(Choice::Law(ControllerKind::Pi)),
-        "lead" => Ok(Choice::Law(ControllerKind::Lead)),
-        "lqg" => Ok(Choice::Law(ControllerKind::Lqg)),
-        "mpc" => Ok(Choice::Law(ControllerKind::Mpc)),
         path if path.ends_with(".toml") => ControllerFile::load(Path::new(path))
             .map(|file| Choice::File(Box::new(file)))
             .map_err(|error| error.to_string()),
