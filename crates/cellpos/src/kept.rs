@@ -6,7 +6,7 @@ use cellpos_runtime::Kept;
 pub(crate) fn error(kept: &Kept) -> String {
     let nm = (kept.rms_nm).map_or_else(|| "-".to_owned(), |nm| format!("{nm:.1} nm"));
     let unseen = if kept.unseen_ms >= 0.5 {
-        format!(", of which {:.0} ms without a position", kept.unseen_ms)
+        format!(" ({:.0} ms without a position)", kept.unseen_ms)
     } else {
         String::new()
     };
@@ -25,6 +25,6 @@ pub(crate) fn held(kept: &Kept) -> String {
         String::new()
     };
     format!(
-        "{percent:.2} % of the time within {nm:.0} nm (five standard deviations of a hold){most}"
+        "{percent:.2} % of the time within {nm:.0} nm (five times the error of a PI hold){most}"
     )
 }

@@ -265,16 +265,12 @@ mod tests {
         let page = include_str!("../../../docs/camera-socket.md");
         let (_, after) = page.split_once("has the header\n\n```text\n").unwrap();
         let (hex, _) = after.split_once("```").unwrap();
-        let mut bytes = hex
-            .split_whitespace()
-            .map(|byte| u8::from_str_radix(byte, 16).unwrap());
-        assert!(
-            HEADER
-                .to_bytes()
-                .into_iter()
-                .all(|b| bytes.next() == Some(b))
-        );
-        assert_eq!(bytes.next(), None);
+        let mut digits = hex.chars().filter_map(|digit| digit.to_digit(16));
+        for byte in HEADER.to_bytes() {
+            let [high, low] = [digits.next(), digits.next()].map(|digit| digit.expect("a digit"));
+            assert_eq!(u32::from(byte), 16 * high + low);
+        }
+        assert_eq!(digits.next(), None);
     }
 
     #[test]
