@@ -65,7 +65,7 @@ def test_a_script_is_checked_rehearsed_and_run(rigs):
 
 def test_design_counts_the_lags_of_the_rig_file(rigs):
     def gains(rig):
-        return cellpos.command("design", model="eq6", rig=rig, out="c.toml", force=True, cwd=rigs).result
+        return cellpos.command("design", model="eq6", rig=rig, controller="pi", out="c.toml", force=True, cwd=rigs).result
 
     (rigs / "pzt.toml").write_text("[timing]\nperiod_us = 20000.0\n")
     slow, fast = gains("pressure.toml"), gains("pzt.toml")

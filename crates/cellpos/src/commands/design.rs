@@ -9,7 +9,7 @@ use crate::rig_file::RigFile;
 use crate::setup;
 use cellpos_control::design::{
     DesignLimits, DesignPlant, DesignReport, DesignRequest, DesignWarning, PiSearch, Requested,
-    default_lead, design,
+    default_lead, design, search_pi,
 };
 use cellpos_control::{
     ConfigError, ControllerConfig, ControllerFile, ControllerKind, Lead, Lqg, Mpc, Pi,
@@ -62,12 +62,13 @@ fn choice(text: &str) -> Result<Choice, String> {
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:
   cellpos design --model eq6 --delay 2.5ms
+  cellpos design --model eq6 --delay 2.5ms --controller pi
   cellpos design --model eq6 --delay 2.5ms --kp 0.46 --ki 19.5 --json
-  cellpos design --model model.toml --max-ms 1.6 --min-pm 40 --out controller.toml --report design.html
+  cellpos design --model model.toml --controller pi --max-ms 1.6 --min-pm 40 --out controller.toml --report design.html
   cellpos design --model model.toml --controller controller.toml
 
 The loop delay is the camera delay (from the middle of an exposure to the tick that uses it) plus half a sample of hold: 2 ms at 1 kHz
-give 2.5ms. A model.toml of cellpos identify contains its camera delay. Without gains, design finds the PI controller of largest
+give 2.5ms. A model.toml of cellpos identify contains its camera delay. For --controller pi without gains, design finds those of largest
 integral gain within --max-ms and --max-mt. A controller.toml is checked as it stands, for its own delay unless --delay or --rig states
 another; --out then writes it for that delay. Exit code 1: the loop is unstable, or a limit is broken; 2: bad input.")]
 pub(crate) struct Args {
@@ -83,9 +84,10 @@ pub(crate) struct Args {
     /// Sample time; default: of --rig, else of controller.toml, else 1ms.
     #[arg(long)]
     sample: Option<Seconds>,
-    /// Control law: pi, lead, lqg, mpc (margins without active constraints); or the path of a controller.toml to check.
-    #[arg(long, default_value = "pi", value_parser = choice)]
-    controller: Choice,
+    /// Control law: pi, lead, lqg, mpc (margins without active constraints); or the path of a controller.toml to check. Default: lqg,
+    /// as for a run; pi where gains or a lead are given.
+    #[arg(long, value_parser = choice)]
+    controller: Option<Choice>,
     /// Proportional gain, um of PZT per um of bead (needs --ki).
     #[arg(long, requires = "ki", allow_negative_numbers = true)]
     kp: Option<f64>,
@@ -140,6 +142,23 @@ pub(crate) struct Args {
     json: bool,
 }
 
+impl Args {
+    /// Gains of PI or a lead are given.
+    fn gives_gains(&self) -> bool {
+        self.kp.is_some() || self.setpoint_weight.is_some() || self.lead_zero.is_some()
+    }
+
+    /// What is to be designed or checked.
+    fn asked(&self) -> Choice {
+        let by_default = || {
+            ControllerKind::from_name(setup::DEFAULT_LAW)
+                .filter(|_| !self.gives_gains())
+                .unwrap_or(ControllerKind::Pi)
+        };
+        (self.controller.clone()).unwrap_or_else(|| Choice::Law(by_default()))
+    }
+}
+
 /// Designs or checks a controller, prints its figures.
 pub(crate) fn run(args: Args) -> CommandResult {
     output::ready(&args.out)?;
@@ -148,12 +167,13 @@ pub(crate) fn run(args: Args) -> CommandResult {
     let rig = (args.rig.as_deref())
         .map(|path| RigFile::load(Some(path)))
         .transpose()?;
-    let plant = plant(&args, &model, rig.as_ref())?;
+    let asked = args.asked();
+    let given = asked.file();
+    let plant = plant(&args, given, &model, rig.as_ref())?;
     let limits = limits(&args)?;
-    gains_belong_to(&args)?;
-    let lead = lead(&args, plant.loop_delay_s())?;
-    let controller = requested(&args, &limits, lead);
-    let given = args.controller.file();
+    gains_belong_to(&args, &asked)?;
+    let lead = lead(&args, &asked, plant.loop_delay_s())?;
+    let controller = requested(&args, &asked, &plant, &limits, lead)?;
     let of_rig = rig.as_ref().map(|file| file.limits);
     let request = DesignRequest {
         plant,
@@ -165,7 +185,7 @@ pub(crate) fn run(args: Args) -> CommandResult {
     };
     let report = design(&request).map_err(Failure::input)?;
     if let Some(path) = &args.out {
-        let file = controller_file(given, &request, &report);
+        let file = controller_file(given, &request, &report)?;
         output::write(path, &file.to_toml_string())?;
     }
     if let Some(path) = &args.report {
@@ -195,9 +215,9 @@ pub(crate) fn run(args: Args) -> CommandResult {
 }
 
 /// Gains are of PI, and are not those of a file.
-fn gains_belong_to(args: &Args) -> Result<(), Failure> {
-    let given = args.kp.is_some() || args.setpoint_weight.is_some() || args.lead_zero.is_some();
-    match &args.controller {
+fn gains_belong_to(args: &Args, asked: &Choice) -> Result<(), Failure> {
+    let given = args.gives_gains();
+    match asked {
         Choice::File(_) if given => Err(Failure::bad_input(
             "--kp, --ki, --setpoint-weight and the lead are in controller.toml already",
             "leave them out, or change the file",
@@ -211,13 +231,17 @@ fn gains_belong_to(args: &Args) -> Result<(), Failure> {
 }
 
 /// The plant as the loop sees it: the model with the delay and the sample time of the rig, or those given.
-fn plant(args: &Args, model: &Model, rig: Option<&RigFile>) -> Result<DesignPlant, Failure> {
+fn plant(
+    args: &Args,
+    given: Option<&ControllerFile>,
+    model: &Model,
+    rig: Option<&RigFile>,
+) -> Result<DesignPlant, Failure> {
     let timing = rig.map(|file| file.timing);
     let model = &match rig {
         Some(file) => file.actuator.before(model.clone()),
         None => model.clone(),
     };
-    let given = args.controller.file();
     let sample_time_s = (timing.map(|timing| timing.period_us * 1e-6))
         .or(args.sample.map(Seconds::value))
         .or(given.map(|file| file.sample_time_ms * 1e-3))
@@ -264,21 +288,25 @@ fn plant(args: &Args, model: &Model, rig: Option<&RigFile>) -> Result<DesignPlan
 }
 
 /// The controller that is asked for.
-fn requested(args: &Args, limits: &DesignLimits, lead: Option<Lead>) -> Requested {
-    if let Some(file) = args.controller.file() {
-        return match file.controller_config() {
+fn requested(
+    args: &Args,
+    asked: &Choice,
+    plant: &DesignPlant,
+    limits: &DesignLimits,
+    lead: Option<Lead>,
+) -> Result<Requested, Failure> {
+    if let Some(file) = asked.file() {
+        return Ok(match file.controller_config() {
             ControllerConfig::Pi(pi) => Requested::Pi(pi),
             other => Requested::Given(other),
-        };
+        });
     }
-    match (args.kp, args.ki) {
-        _ if args.controller.law() == ControllerKind::Lqg => {
-            Requested::Given(ControllerConfig::Lqg(Lqg::default()))
+    Ok(match (asked.law(), args.kp, args.ki) {
+        (ControllerKind::Lqg, ..) => Requested::Given(ControllerConfig::Lqg(Lqg::default())),
+        (ControllerKind::Mpc, ..) => {
+            Requested::Given(ControllerConfig::Mpc(Mpc::default(), fallback(plant)?))
         }
-        _ if args.controller.law() == ControllerKind::Mpc => {
-            Requested::Given(ControllerConfig::Mpc(Mpc::default(), Pi::new(0.33, 9.6)))
-        }
-        (Some(kp), Some(ki)) => Requested::Pi(Pi {
+        (_, Some(kp), Some(ki)) => Requested::Pi(Pi {
             lead,
             ..Pi::new(kp, ki)
         }),
@@ -290,7 +318,19 @@ fn requested(args: &Args, limits: &DesignLimits, lead: Option<Lead>) -> Requeste
                 lead,
             })
         }
-    }
+    })
+}
+
+/// Gains of PI for a plant: what runs where MPC has no plan, and what stands in the file beside LQG.
+fn fallback(plant: &DesignPlant) -> Result<Pi, Failure> {
+    search_pi(plant, PiSearch::default())
+        .map_err(Failure::input)?
+        .ok_or_else(|| {
+            Failure::bad_input(
+                "no PI gains are stable enough on this plant",
+                "design --controller pi with a larger --max-ms and --max-mt shows what can be had",
+            )
+        })
 }
 
 fn limits(args: &Args) -> Result<DesignLimits, Failure> {
@@ -329,9 +369,9 @@ fn limits(args: &Args) -> Result<DesignLimits, Failure> {
     Ok(limits)
 }
 
-fn lead(args: &Args, loop_delay_s: f64) -> Result<Option<Lead>, Failure> {
-    match (args.controller.law(), args.lead_zero, args.lead_pole) {
-        _ if args.controller.file().is_some() => Ok(None),
+fn lead(args: &Args, asked: &Choice, loop_delay_s: f64) -> Result<Option<Lead>, Failure> {
+    match (asked.law(), args.lead_zero, args.lead_pole) {
+        _ if asked.file().is_some() => Ok(None),
         (ControllerKind::Lead, Some(zero), Some(pole)) => Ok(Some(Lead {
             zero_hz: zero.value(),
             pole_hz: pole.value(),
@@ -349,21 +389,21 @@ fn controller_file(
     given: Option<&ControllerFile>,
     request: &DesignRequest,
     report: &DesignReport,
-) -> ControllerFile {
+) -> Result<ControllerFile, Failure> {
     let loop_delay_s = request.plant.loop_delay_s();
     if let Some(given) = given {
-        return ControllerFile {
+        return Ok(ControllerFile {
             delay_ms: loop_delay_s * 1e3,
             sample_time_ms: request.plant.sample_time_s * 1e3,
             ..*given
-        };
+        });
     }
     let mut file = match report.controller {
         ControllerConfig::Pi(pi) => ControllerFile::from_pi(pi, loop_delay_s),
         ControllerConfig::Lqg(lqg) => ControllerFile {
             controller: ControllerKind::Lqg,
             lqg,
-            ..ControllerFile::from_pi(Pi::new(0.33, 9.6), loop_delay_s)
+            ..ControllerFile::from_pi(fallback(&request.plant)?, loop_delay_s)
         },
         ControllerConfig::Mpc(mpc, fallback) => ControllerFile {
             controller: ControllerKind::Mpc,
@@ -378,5 +418,5 @@ fn controller_file(
     }
     let kind = file.controller;
     file.estimator.adapt = matches!(kind, ControllerKind::Lqg | ControllerKind::Mpc);
-    file
+    Ok(file)
 }

@@ -30,7 +30,11 @@ fn published_gains_on_eq6_have_the_published_margins() {
 
 #[test]
 fn a_search_keeps_its_limits_and_is_at_least_as_good_as_the_published_gains() {
-    let report = succeed(Path::new(HERE), "design --model eq6 --delay 2.5ms --json").json();
+    let report = succeed(
+        Path::new(HERE),
+        "design --model eq6 --delay 2.5ms --controller pi --json",
+    )
+    .json();
     assert!(number(&report, "ms") <= 1.6 + 1e-6 && number(&report, "mt") <= 1.3 + 1e-6);
     let controller = &report["controller"];
     assert!(number(controller, "ki_per_s") >= 19.5);
@@ -201,4 +205,36 @@ fn a_controller_for_a_rig_has_the_limits_of_the_rig() {
     let written = std::fs::read_to_string(folder.path().join("c.toml")).unwrap();
     let limits = "[limits]\nlow_um = 2.0\nhigh_um = 38.0\nslew_um_per_s = 20000.0\npark_um = 20.0";
     assert!(written.contains(limits), "{written}");
+}
+
+#[test]
+fn without_a_law_it_designs_that_of_a_run_and_the_gains_beside_it_are_made_for_the_plant() {
+    let folder = tempfile::tempdir().unwrap();
+    let here = folder.path();
+    std::fs::write(
+        here.join("rig.toml"),
+        "[actuator]\nkind = \"emulated-pressure\"\n",
+    )
+    .unwrap();
+    let file = |name: &str| -> toml::Table {
+        let text = std::fs::read_to_string(here.join(name)).unwrap();
+        text.parse().unwrap()
+    };
+    succeed(here, "design --rig rig.toml --out c.toml");
+    succeed(here, "design --rig rig.toml --controller pi --out pi.toml");
+    succeed(
+        here,
+        "design --rig rig.toml --controller mpc --out mpc.toml",
+    );
+    assert_eq!(file("c.toml")["controller"].as_str(), Some("lqg"));
+    assert_eq!(file("mpc.toml")["controller"].as_str(), Some("mpc"));
+    for name in ["c.toml", "mpc.toml"] {
+        for key in ["kp_um_per_um", "ki_per_s"] {
+            assert_eq!(
+                file(name)["pi"][key],
+                file("pi.toml")["pi"][key],
+                "{name}: {key}"
+            );
+        }
+    }
 }

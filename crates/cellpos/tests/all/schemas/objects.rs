@@ -194,6 +194,8 @@ fn the_objects_of_quick_commands_fit_their_schemas() {
         "bundle --verify packed",
         "check wave.toml",
         "design --model eq6",
+        "design --model eq6 --controller pi",
+        "design --model eq6 --controller mpc",
         "design --model eq6 --controller lead",
         "simulate --model eq6 --input latest-hold --out simulated.csv",
         "rig check rig.toml",
