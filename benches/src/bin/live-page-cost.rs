@@ -1,38 +1,42 @@
-//! Cost of a live page for the control thread: wake-up and computing time without a page, with one client, with a client that
-//! stalls, with twenty that flood. All in one run on one machine, each compared with a bare loop.
+//! Cost of a live page for the control thread: wake-up, computing time and lost ticks without a page, with one client, with the page
+//! in a browser, with a client that stalls, with twenty that flood.
 //!
-//!     cargo run --release -p cellpos-benches --bin live-page-cost                     5 rounds of 20 s each: nine minutes
+//!     cargo run --release -p cellpos-benches --bin live-page-cost                     5 rounds of 20 s each: twelve minutes
 //!     cargo run --release -p cellpos-benches --bin live-page-cost -- 3 2              3 s each, 2 rounds: to try it
 //!
 //! The conditions take turns, and each round begins with another one, so that other load of the machine affects all conditions
-//! alike.
+//! alike. Each round has the loop without a page twice. Every condition is compared with the first of them in its own round; the
+//! second one shows how much such a difference scatters by chance.
 //! The clients are separate processes of the ordinary scheduler, as browsers are. On a machine with two CPUs they share the CPUs
-//! with the loop. The yardstick is the bare loop: an absolute sleep of the same policy, priority and CPU.
+//! with the loop. The bare loop is an absolute sleep of the same policy, priority and CPU. Without `chromedriver` the browser is left
+//! out.
 
 use cellpos_benches::live_page::{Client, Running, hold, was_a_client};
 use cellpos_runtime::realtime::{self, bare_loop};
+use cellpos_tests::browser::Browser;
 use std::time::Duration;
 
 /// Clients that flood.
 const FLOOD: usize = 20;
-/// How much of the figure without a page a client may cost.
-const SHARE: f64 = 0.1;
-
 /// What is compared.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Condition {
     Bare,
     NoPage,
+    NoPageAgain,
     OneClient,
+    Browser,
     OneStalled,
     Flooded,
 }
 
 impl Condition {
-    const ALL: [Self; 5] = [
+    const ALL: [Self; 7] = [
         Self::Bare,
         Self::NoPage,
+        Self::NoPageAgain,
         Self::OneClient,
+        Self::Browser,
         Self::OneStalled,
         Self::Flooded,
     ];
@@ -41,7 +45,9 @@ impl Condition {
         match self {
             Self::Bare => "bare loop",
             Self::NoPage => "no page",
+            Self::NoPageAgain => "no page, again",
             Self::OneClient => "one client",
+            Self::Browser => "browser",
             Self::OneStalled => "one stalled client",
             Self::Flooded => "20 flooding clients",
         }
@@ -49,7 +55,7 @@ impl Condition {
 
     fn clients(self) -> Vec<Client> {
         match self {
-            Self::Bare | Self::NoPage => vec![],
+            Self::Bare | Self::NoPage | Self::NoPageAgain | Self::Browser => vec![],
             Self::OneClient => vec![Client::Reads],
             Self::OneStalled => vec![Client::Stalls],
             Self::Flooded => vec![Client::Floods; FLOOD],
@@ -57,12 +63,17 @@ impl Condition {
     }
 }
 
-/// Figures of one turn, us: wake-up p50 and p99.9, computing p50 and p99.9; and what went wrong.
-#[derive(Debug, Clone, Copy)]
-struct Turn {
-    figures: [f64; 4],
-    skipped: u64,
-}
+const FIGURES: [&str; 6] = [
+    "wake-up p50, us",
+    "wake-up p99.9, us",
+    "computing p50, us",
+    "computing p99.9, us",
+    "late of 1000 ticks",
+    "lost of 1000 ticks",
+];
+
+/// The [`FIGURES`] of one turn.
+type Turn = [f64; FIGURES.len()];
 
 fn main() {
     if was_a_client() {
@@ -75,29 +86,46 @@ fn main() {
         "{rounds} rounds of {seconds} s of each condition, holding with PI on frames of the emulated rig"
     );
     print!("{}", conditions());
-    let mut turns: Vec<(Condition, Turn)> = vec![];
+    let mut browser = has_browser().then(|| Browser::start(1400, 1000));
+    if browser.is_none() {
+        println!("no chromedriver: without a browser");
+    }
+    let mut table: Vec<[Turn; Condition::ALL.len()]> = vec![];
     for round in 0..rounds as usize {
-        let mut order = Condition::ALL;
-        order.rotate_left(round % Condition::ALL.len());
-        for condition in order {
-            let turn = turn(condition, seconds);
-            let [wake, wake_tail, compute, compute_tail] = turn.figures.map(|us| {
-                if us.is_nan() {
-                    "-".to_string()
-                } else {
-                    format!("{us:.1}")
-                }
-            });
+        let mut turns = [[f64::NAN; FIGURES.len()]; Condition::ALL.len()];
+        for n in 0..Condition::ALL.len() {
+            let at = (n + round) % Condition::ALL.len();
+            let condition = Condition::ALL[at];
+            if condition == Condition::Browser && browser.is_none() {
+                continue;
+            }
+            turns[at] = turn(condition, seconds, browser.as_mut());
+            let said: Vec<String> = (turns[at].iter()).map(|value| shown(*value)).collect();
             println!(
-                "  round {}: {:<20} wake-up {wake:>7} {wake_tail:>8}   computing {compute:>7} {compute_tail:>8} us, {} skipped",
+                "  round {}: {:<20} {}",
                 round + 1,
                 condition.name(),
-                turn.skipped
+                said.join("  ")
             );
-            turns.push((condition, turn));
         }
+        table.push(turns);
     }
-    tell(&turns);
+    tell(&table);
+}
+
+fn has_browser() -> bool {
+    let asked = std::process::Command::new("chromedriver")
+        .arg("--version")
+        .output();
+    asked.is_ok()
+}
+
+fn shown(value: f64) -> String {
+    if value.is_nan() {
+        format!("{:>8}", "-")
+    } else {
+        format!("{value:>8.2}")
+    }
 }
 
 fn conditions() -> String {
@@ -107,7 +135,7 @@ fn conditions() -> String {
         .map_or_else(|_| String::new(), |c| c.to_string())
 }
 
-fn turn(condition: Condition, seconds: u64) -> Turn {
+fn turn(condition: Condition, seconds: u64, browser: Option<&mut Browser>) -> Turn {
     if condition == Condition::Bare {
         let bare = std::thread::spawn(move || {
             realtime::apply(&realtime::Request::control_thread());
@@ -115,92 +143,75 @@ fn turn(condition: Condition, seconds: u64) -> Turn {
         });
         let (latency, missed) = bare.join().expect("a loop that only sleeps");
         let wake = latency.quantiles_us();
-        return Turn {
-            figures: [wake.p50, wake.p999, f64::NAN, f64::NAN],
-            skipped: missed,
-        };
+        let lost = missed as f64 / seconds as f64;
+        return [wake.p50, wake.p999, f64::NAN, f64::NAN, f64::NAN, lost];
     }
     let mut clients: Vec<Running> = vec![];
-    let page = condition != Condition::NoPage;
+    let page = !matches!(condition, Condition::NoPage | Condition::NoPageAgain);
     let summary = hold(seconds, page, |url| {
         let Some(url) = url else { return };
         let wanted = condition.clients();
         let started = wanted.iter().map(|client| client.start(url, seconds));
         clients = started.collect::<Result<_, _>>().expect("clients start");
+        if let (Condition::Browser, Some(browser)) = (condition, browser) {
+            browser.open(url);
+        }
     })
     .expect("the default rig runs");
     drop(clients);
-    Turn {
-        figures: [
-            summary.wake_us.p50,
-            summary.wake_us.p999,
-            summary.tick_us.p50,
-            summary.tick_us.p999,
-        ],
-        skipped: summary.counts.skipped,
-    }
-}
-
-/// Median, least and greatest of one figure over the rounds of a condition.
-fn over_rounds(turns: &[(Condition, Turn)], condition: Condition, figure: usize) -> [f64; 3] {
-    let mut values: Vec<f64> = (turns.iter())
-        .filter(|(of, _)| *of == condition)
-        .map(|(_, turn)| turn.figures[figure])
-        .collect();
-    values.sort_by(f64::total_cmp);
-    let at = |n: usize| values.get(n).copied().unwrap_or(f64::NAN);
+    let of_1000 = |count: u64| 1e3 * count as f64 / summary.counts.ticks.max(1) as f64;
     [
-        at(values.len() / 2),
-        at(0),
-        at(values.len().saturating_sub(1)),
+        summary.wake_us.p50,
+        summary.wake_us.p999,
+        summary.tick_us.p50,
+        summary.tick_us.p999,
+        of_1000(summary.counts.late),
+        of_1000(summary.counts.skipped),
     ]
 }
 
-fn tell(turns: &[(Condition, Turn)]) {
-    println!("\nmedian of the rounds (least..greatest), us:");
-    println!(
-        "  {:<20} {:>24} {:>26} {:>24} {:>26}",
-        "", "wake-up p50", "wake-up p99.9", "computing p50", "computing p99.9"
-    );
-    for condition in Condition::ALL {
-        let cells: Vec<String> = (0..4)
-            .map(|figure| {
-                let [median, least, greatest] = over_rounds(turns, condition, figure);
-                if median.is_nan() {
-                    "-".to_string()
-                } else {
-                    format!("{median:.1} ({least:.1}..{greatest:.1})")
-                }
-            })
-            .collect();
+/// Least, median and greatest.
+fn spread(mut values: Vec<f64>) -> [f64; 3] {
+    values.retain(|value| value.is_finite());
+    values.sort_by(f64::total_cmp);
+    let (Some(least), Some(greatest)) = (values.first(), values.last()) else {
+        return [f64::NAN; 3];
+    };
+    let half = values.len() / 2;
+    let upper = values.get(half).copied().unwrap_or(f64::NAN);
+    let lower = values.get((values.len() - 1) / 2).copied();
+    [*least, 0.5 * (upper + lower.unwrap_or(f64::NAN)), *greatest]
+}
+
+fn tell(table: &[[Turn; Condition::ALL.len()]]) {
+    let without = Condition::NoPage as usize;
+    for (figure, name) in FIGURES.iter().enumerate() {
+        let of = |at: usize| table.iter().map(move |turns| turns[at][figure]);
+        let more = |at: usize| spread(of(at).zip(of(without)).map(|(a, b)| a - b).collect());
+        let chance = more(Condition::NoPageAgain as usize);
         println!(
-            "  {:<20} {:>24} {:>26} {:>24} {:>26}",
-            condition.name(),
-            cells[0],
-            cells[1],
-            cells[2],
-            cells[3]
+            "\n{name}: median of the rounds (least..greatest); more than without a page in the same round"
         );
-    }
-    let [_, least, greatest] = over_rounds(turns, Condition::Bare, 1);
-    let scatter_us = greatest - least;
-    println!("\nscatter of the bare loop's p99.9 over the rounds: {scatter_us:.1} us");
-    for (figure, what) in [(1, "wake-up p99.9"), (3, "computing p99.9")] {
-        let [without_us, ..] = over_rounds(turns, Condition::NoPage, figure);
-        for condition in Condition::ALL.into_iter().skip(2) {
-            let [with_us, ..] = over_rounds(turns, condition, figure);
-            let more_us = with_us - without_us;
-            let verdict = if more_us <= SHARE * without_us {
-                "within 10 %"
-            } else if more_us <= scatter_us {
-                "within the bare loop's scatter"
-            } else {
-                "MORE"
-            };
-            println!(
-                "  {what:<16} {:<20} {with_us:8.1} us, without a page {without_us:8.1} us: {more_us:+7.1} us, {verdict}",
+        for (at, condition) in Condition::ALL.iter().enumerate() {
+            let [least, median, greatest] = spread(of(at).collect());
+            if median.is_nan() {
+                continue;
+            }
+            let mut line = format!(
+                "  {:<20} {median:9.2} ({least:.2}..{greatest:.2})",
                 condition.name()
             );
+            if !matches!(condition, Condition::Bare | Condition::NoPage) {
+                let [least, median, greatest] = more(at);
+                line.push_str(&format!("   {median:+9.2} ({least:+.2}..{greatest:+.2})"));
+                if *condition != Condition::NoPageAgain {
+                    line.push_str(match median <= chance[2].max(0.0) {
+                        true => "   within chance",
+                        false => "   MORE",
+                    });
+                }
+            }
+            println!("{line}");
         }
     }
 }
